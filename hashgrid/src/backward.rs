@@ -1,0 +1,75 @@
+use rayon::prelude::*;
+
+use crate::corners::{BLOCK, Corners, for_widths, row_mut};
+use crate::grid::{HashGrid, Level};
+
+impl<const D: usize> HashGrid<D> {
+    /// Adds the gradient of the table to `d_table` ([`HashGrid::num_parameters`]), given `points` (Q, D) and the
+    /// gradient of their features `d_features` (Q, L·F).
+    ///
+    /// Levels run in parallel on the current rayon pool; each adds its points in their order, so that the result
+    /// does not depend on the number of threads. The encoding is linear in the table: no table is needed.
+    ///
+    /// # Panics
+    /// Where a slice has another length.
+    pub fn encode_backward(&self, points: &[[f32; D]], d_features: &[f32], d_table: &mut [f32]) {
+        self.assert_table("d_table", d_table);
+        self.assert_features("d_features", d_features, points.len());
+        if points.is_empty() {
+            return;
+        }
+        let mut parts = Vec::with_capacity(self.levels.len());
+        let mut rest = d_table;
+        for (l, level) in self.levels.iter().enumerate() {
+            let (part, after) = rest.split_at_mut(level.rows * self.features);
+            parts.push((l, part));
+            rest = after;
+        }
+        let width = self.num_features();
+        let arch = pulp::Arch::new();
+        parts
+            .into_par_iter()
+            .with_max_len(1)
+            .for_each(|(l, d_table)| {
+                let level = &self.levels[l];
+                let first = l * self.features;
+                arch.dispatch(
+                    #[inline(always)]
+                    || {
+                        for_widths!(
+                            self.features,
+                            backward_level::<D>(level, points, d_features, d_table, width, first)
+                        )
+                    },
+                );
+            });
+    }
+}
+
+#[inline(always)]
+fn backward_level<const D: usize, const W: usize>(
+    level: &Level,
+    points: &[[f32; D]],
+    d_features: &[f32],
+    d_table: &mut [f32],
+    width: usize,
+    first: usize,
+    stride: usize,
+    offset: usize,
+) {
+    let mut corners = Corners::new();
+    let blocks = points.chunks(BLOCK).zip(d_features.chunks(BLOCK * width));
+    for (points, d_features) in blocks {
+        corners.fill(level, points);
+        for (b, d_features) in d_features.chunks_exact(width).enumerate() {
+            let d_sum: &[f32; W] = &d_features[first + offset..].as_chunks::<W>().0[0];
+            for k in 0..1 << D {
+                let weight = corners.weight[k][b];
+                let d_values = row_mut::<W>(d_table, stride, offset, corners.row[k][b]);
+                for f in 0..W {
+                    d_values[f] += weight * d_sum[f];
+                }
+            }
+        }
+    }
+}

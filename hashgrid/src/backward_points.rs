@@ -1,0 +1,122 @@
+use crate::corners::{BLOCK, Corners, Lanes, MAX_CORNERS, for_widths, row};
+use crate::encode::CHUNK;
+use crate::grid::{HashGrid, Level};
+
+impl<const D: usize> HashGrid<D> {
+    /// Adds the gradient of the coordinates to `d_points` (Q, D), given `table`, `points` (Q, D) and the gradient
+    /// of their features `d_features` (Q, L·F). Runs on the calling thread.
+    ///
+    /// The encoding is d-linear within a cell and only continuous across cells: on a face the derivative is that
+    /// of the upper cell (at x = 1, of the last cell). Coordinates outside \[0, 1\] and NaN get no gradient.
+    ///
+    /// # Panics
+    /// Where a slice has another length.
+    pub fn encode_backward_points(
+        &self,
+        table: &[f32],
+        points: &[[f32; D]],
+        d_features: &[f32],
+        d_points: &mut [[f32; D]],
+    ) {
+        self.assert_table("table", table);
+        self.assert_features("d_features", d_features, points.len());
+        assert_eq!(
+            d_points.len(),
+            points.len(),
+            "d_points has {} points, expected {}",
+            d_points.len(),
+            points.len()
+        );
+        let width = self.num_features();
+        let arch = pulp::Arch::new();
+        let chunks = points
+            .chunks(CHUNK)
+            .zip(d_features.chunks(CHUNK * width))
+            .zip(d_points.chunks_mut(CHUNK));
+        for ((points, d_features), d_points) in chunks {
+            for (l, level) in self.levels.iter().enumerate() {
+                let table = &table[self.level_range(l)];
+                let first = l * self.features;
+                arch.dispatch(
+                    #[inline(always)]
+                    || {
+                        for_widths!(
+                            self.features,
+                            level_backward_points::<D>(
+                                level, table, points, d_features, d_points, width, first
+                            )
+                        )
+                    },
+                );
+            }
+        }
+    }
+}
+
+#[inline(always)]
+fn level_backward_points<const D: usize, const W: usize>(
+    level: &Level,
+    table: &[f32],
+    points: &[[f32; D]],
+    d_features: &[f32],
+    d_points: &mut [[f32; D]],
+    width: usize,
+    first: usize,
+    stride: usize,
+    offset: usize,
+) {
+    let n = level.resolution as f32;
+    let mut corners = Corners::new();
+    let mut projected = [[0.0f32; BLOCK]; MAX_CORNERS];
+    let blocks = points
+        .chunks(BLOCK)
+        .zip(d_features.chunks(BLOCK * width))
+        .zip(d_points.chunks_mut(BLOCK));
+    for ((points, d_features), d_points) in blocks {
+        corners.fill(level, points);
+        for (b, d_features) in d_features.chunks_exact(width).enumerate() {
+            let d_sum: &[f32; W] = &d_features[first + offset..].as_chunks::<W>().0[0];
+            for k in 0..1 << D {
+                let values = row::<W>(table, stride, offset, corners.row[k][b]);
+                let mut dot = 0.0;
+                for f in 0..W {
+                    dot += values[f] * d_sum[f];
+                }
+                projected[k][b] = dot;
+            }
+        }
+        for j in 0..D {
+            let slope = slope::<D>(&projected, &corners.fraction, j);
+            for ((point, d_point), slope) in points.iter().zip(&mut *d_points).zip(slope) {
+                if (0.0..=1.0).contains(&point[j]) {
+                    d_point[j] += n * slope;
+                }
+            }
+        }
+    }
+}
+
+/// Derivative along axis `j` of the d-linear interpolation of corner `values`, a cell's side being 1.
+#[inline(always)]
+fn slope<const D: usize>(
+    values: &[Lanes<f32>; MAX_CORNERS],
+    fraction: &[Lanes<f32>; 4],
+    j: usize,
+) -> Lanes<f32> {
+    let mut folded = *values;
+    for axis in (0..D).rev() {
+        let half = 1 << axis;
+        let (low, high) = folded.split_at_mut(half);
+        for k in 0..half {
+            for b in 0..BLOCK {
+                let difference = high[k][b] - low[k][b];
+                if axis == j {
+                    low[k][b] = difference;
+                } else {
+                    low[k][b] += fraction[axis][b] * difference;
+                }
+            }
+        }
+    }
+    folded[0]
+}

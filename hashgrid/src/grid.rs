@@ -1,0 +1,152 @@
+use std::ops::Range;
+
+use rayon::prelude::*;
+
+use crate::config::{self, Error, HashGridConfig, MAX_PARAMETERS};
+
+/// A multiresolution hash encoding of D-dimensional points, D = 2, 3 or 4 (others do not compile).
+///
+/// Holds the shape only; the table of parameters belongs to the caller, so that optimisers and checkpoints see
+/// one flat slice.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct HashGrid<const D: usize> {
+    pub(crate) levels: Vec<Level>,
+    pub(crate) resolutions: Vec<u32>,
+    pub(crate) features: usize,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Level {
+    pub resolution: u32,
+    /// Rows of this level; a power of two where hashed.
+    pub rows: usize,
+    pub hashed: bool,
+    /// First number of this level in the flat table.
+    pub start: usize,
+}
+
+impl<const D: usize> HashGrid<D> {
+    /// A grid with geometrically growing resolutions.
+    ///
+    /// # Errors
+    /// A configuration that has no meaning (no levels, no features, `n_max` < `n_min`, a resolution of 0) or no
+    /// sensible size (see the limits of this crate).
+    pub fn new(config: &HashGridConfig) -> Result<Self, Error> {
+        let resolutions = config.resolutions()?;
+        Self::with_resolutions(&resolutions, config.features, config.log2_table_size)
+    }
+
+    /// A grid with the given cells an axis for each level (L), in any order.
+    ///
+    /// # Errors
+    /// As for [`HashGrid::new`].
+    pub fn with_resolutions(
+        resolutions: &[u32],
+        features: usize,
+        log2_table_size: u32,
+    ) -> Result<Self, Error> {
+        const {
+            assert!(2 <= D && D <= 4, "a hash grid has 2, 3 or 4 dimensions");
+        }
+        config::check(resolutions, features, log2_table_size)?;
+        let most_rows = 1u64 << log2_table_size;
+        let mut levels = Vec::with_capacity(resolutions.len());
+        // At most 64 levels · 2^28 rows · 256 features: no overflow.
+        let mut start = 0u64;
+        for &resolution in resolutions {
+            // A power beyond u64 is certainly beyond the table.
+            let corners = (u64::from(resolution) + 1).checked_pow(D as u32);
+            let dense = corners.filter(|&corners| corners <= most_rows);
+            let rows = dense.unwrap_or(most_rows);
+            levels.push(Level {
+                resolution,
+                rows: rows as usize,
+                hashed: dense.is_none(),
+                start: start as usize,
+            });
+            start += rows * features as u64;
+            if start > MAX_PARAMETERS as u64 {
+                return Err(Error::TooManyParameters { parameters: start });
+            }
+        }
+        Ok(Self {
+            levels,
+            resolutions: resolutions.to_vec(),
+            features,
+        })
+    }
+
+    /// Length of the flat table.
+    #[must_use]
+    pub fn num_parameters(&self) -> usize {
+        self.level_range(self.levels.len() - 1).end
+    }
+
+    /// L·F, the length of one encoded point.
+    #[must_use]
+    pub fn num_features(&self) -> usize {
+        self.levels.len() * self.features
+    }
+
+    /// Where level `level` lies in the flat table: min((N + 1)^D, 2^T) rows of F numbers.
+    ///
+    /// # Panics
+    /// Where there is no such level.
+    #[must_use]
+    pub fn level_range(&self, level: usize) -> Range<usize> {
+        assert!(
+            level < self.levels.len(),
+            "level {level} of {}",
+            self.levels.len()
+        );
+        let Level { start, rows, .. } = self.levels[level];
+        start..start + rows * self.features
+    }
+
+    /// Cells an axis of every level (L).
+    #[must_use]
+    pub fn resolutions(&self) -> &[u32] {
+        &self.resolutions
+    }
+
+    /// A table to start from: uniform in ±1e-4 (Müller et al. 2022, section 3), the same for the same seed.
+    #[must_use]
+    pub fn init_table(&self, seed: u64) -> Vec<f32> {
+        const AMPLITUDE: f32 = 1e-4;
+        let mut table = vec![0.0; self.num_parameters()];
+        // Every number depends on its index alone, so that threads cannot matter.
+        table.par_iter_mut().enumerate().for_each(|(i, value)| {
+            let bits = splitmix64(splitmix64(seed).wrapping_add(i as u64)) >> 40;
+            *value = (bits as f32 / (1u32 << 23) as f32 - 1.0) * AMPLITUDE;
+        });
+        table
+    }
+
+    pub(crate) fn assert_table(&self, what: &str, table: &[f32]) {
+        assert_eq!(
+            table.len(),
+            self.num_parameters(),
+            "{what} has {} numbers, expected num_parameters() = {}",
+            table.len(),
+            self.num_parameters()
+        );
+    }
+
+    pub(crate) fn assert_features(&self, what: &str, features: &[f32], points: usize) {
+        assert_eq!(
+            features.len(),
+            points * self.num_features(),
+            "{what} has {} numbers, expected {points} points × {} features",
+            features.len(),
+            self.num_features()
+        );
+    }
+}
+
+/// Steele, Lea, Flood: Fast splittable pseudorandom number generators, 2014.
+fn splitmix64(x: u64) -> u64 {
+    let mut z = x.wrapping_add(0x9E37_79B9_7F4A_7C15);
+    z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
+    z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
+    z ^ (z >> 31)
+}

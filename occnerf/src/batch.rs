@@ -1,0 +1,106 @@
+//! The rays of a training step: one frame, several square patches.
+
+use crate::config::Config;
+use crate::pixels::Label;
+use crate::random::Stream;
+use crate::scene::{PreparedFrame, Scene, bounds};
+
+/// Share of patches centred on a pixel of the subject; the rest fall anywhere in the body's box.
+const ON_SUBJECT: f32 = 0.8;
+const DRAW: u64 = 0x5041_5443;
+
+/// Pixels of a step.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Batch {
+    /// Index of the training frame.
+    pub frame: usize,
+    /// Side of the patches after clipping to the image.
+    pub size: usize,
+    /// Flat pixel index of each ray, patch after patch, row-major.
+    pub pixels: Vec<u32>,
+    /// Random background of the step.
+    pub background: glam::Vec3,
+}
+
+impl Batch {
+    /// Draws a step's rays from the seed and the step's number alone.
+    pub fn draw(&mut self, scene: &Scene, config: &Config, step: u64) {
+        let mut random = Stream::new(&[config.seed, DRAW, step]);
+        self.frame = frame_of(scene.train.len(), config.seed, step);
+        let frame = &scene.train[self.frame];
+        let (width, height) = (frame.camera.width, frame.camera.height);
+        let size = config.patch_size.min(width).min(height);
+        self.size = size as usize;
+        self.pixels.clear();
+        self.background = glam::Vec3::new(random.uniform(), random.uniform(), random.uniform());
+        let body = body_box(frame);
+        for _ in 0..config.patches {
+            let on_subject = random.uniform() < ON_SUBJECT && !frame.subject.is_empty();
+            let (x, y) = if on_subject {
+                let pixel = frame.subject[random.below(frame.subject.len())];
+                (pixel % width, pixel / width)
+            } else {
+                let [x0, y0, x1, y1] = body;
+                (x0 + random.below((x1 - x0) as usize) as u32, y0 + random.below((y1 - y0) as usize) as u32)
+            };
+            let left = x.saturating_sub(size / 2).min(width - size);
+            let top = y.saturating_sub(size / 2).min(height - size);
+            let rows = top..top + size;
+            self.pixels.extend(rows.flat_map(|row| (left..left + size).map(move |column| row * width + column)));
+        }
+    }
+}
+
+/// Frames come in a new random order each time round, so that none waits longer than two rounds.
+fn frame_of(frames: usize, seed: u64, step: u64) -> usize {
+    let (round, place) = (step / frames as u64, (step % frames as u64) as usize);
+    let mut random = Stream::new(&[seed, 0x4652_414D, round]);
+    let mut order: Vec<usize> = (0..frames).collect();
+    for i in (1..frames).rev() {
+        order.swap(i, random.below(i + 1));
+    }
+    order[place]
+}
+
+/// The image-space box [x0, y0, x1, y1) of the body's corners, at least one pixel, inside the image.
+pub(crate) fn body_box(frame: &PreparedFrame) -> [u32; 4] {
+    let (low, high) = bounds(&frame.posed.vertices);
+    let (width, height) = (frame.camera.width as f32, frame.camera.height as f32);
+    let mut found = [width, height, 0.0f32, 0.0f32];
+    for corner in 0..8 {
+        let pick = |axis: usize| if corner >> axis & 1 == 0 { low[axis] } else { high[axis] };
+        match frame.camera.project(glam::Vec3::new(pick(0), pick(1), pick(2))) {
+            Some(p) => {
+                found = [found[0].min(p.x), found[1].min(p.y), found[2].max(p.x), found[3].max(p.y)];
+            }
+            // A corner behind the camera: the box may reach anywhere.
+            None => found = [0.0, 0.0, width, height],
+        }
+    }
+    let x0 = found[0].clamp(0.0, width - 1.0).floor();
+    let y0 = found[1].clamp(0.0, height - 1.0).floor();
+    let x1 = found[2].clamp(x0 + 1.0, width).ceil();
+    let y1 = found[3].clamp(y0 + 1.0, height).ceil();
+    [x0 as u32, y0 as u32, x1 as u32, y1 as u32]
+}
+
+/// What a ray should show: premultiplied colour over `background`; `None` where nothing is known.
+pub(crate) fn target(frame: &PreparedFrame, pixel: u32, background: glam::Vec3) -> Option<glam::Vec3> {
+    let i = pixel as usize;
+    let colour = glam::Vec3::from_slice(&frame.pixels[3 * i..]);
+    (frame.labels[i] != Label::Unknown).then(|| colour + (1.0 - frame.mask[i]) * background)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::frame_of;
+
+    #[test]
+    fn every_round_shows_every_frame_once_in_another_order() {
+        let round = |r: u64| (0..10).map(|i| frame_of(10, 5, r * 10 + i)).collect::<Vec<_>>();
+        let mut sorted = round(3);
+        sorted.sort_unstable();
+        assert_eq!(sorted, (0..10).collect::<Vec<_>>());
+        assert_ne!(round(0), round(1));
+    }
+}

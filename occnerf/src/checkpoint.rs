@@ -1,0 +1,143 @@
+//! Checkpoints: safetensors with the configuration and a version in the header, replaced atomically.
+
+use std::collections::HashMap;
+use std::path::Path;
+
+use safetensors::tensor::{Dtype, SafeTensors, TensorView};
+
+use crate::Error;
+use crate::config::Config;
+use crate::parameters::PARTS;
+use crate::scene::Scene;
+use crate::trainer::Trainer;
+
+const FORMAT: &str = "occnerf-checkpoint";
+const VERSION: &str = "1";
+/// Larger files are not ours: the paper's table with both moments has 0.3 GB.
+const MAX_BYTES: u64 = 4 << 30;
+
+impl Trainer<'_> {
+    /// Writes everything that training goes on from. An old file survives until the new one is complete.
+    pub fn save(&self, path: &Path) -> Result<(), Error> {
+        let config = toml::to_string(&self.config).map_err(|e| file(path, format!("configuration: {e}")))?;
+        let header = HashMap::from([
+            ("format".to_owned(), FORMAT.to_owned()),
+            ("version".to_owned(), VERSION.to_owned()),
+            ("steps_done".to_owned(), self.steps_done.to_string()),
+            ("scene".to_owned(), self.scene.name.clone()),
+            ("config".to_owned(), config),
+        ]);
+        let mut arrays: Vec<(String, Vec<u8>, Dtype)> = Vec::new();
+        for (part, name) in PARTS {
+            let adam = &self.parameters.optimisers[part as usize];
+            let values = self.parameters.get(part);
+            for (suffix, array) in [("", values), (".first_moment", &adam.first), (".second_moment", &adam.second)] {
+                let bytes = array.iter().flat_map(|v| v.to_le_bytes()).collect();
+                arrays.push((format!("{name}{suffix}"), bytes, Dtype::F32));
+            }
+        }
+        let counts = self.counts.counts().iter().flat_map(|c| c.to_le_bytes()).collect();
+        arrays.push(("visibility_counts".to_owned(), counts, Dtype::U64));
+        let mut views = Vec::new();
+        for (name, bytes, dtype) in &arrays {
+            let shape = vec![bytes.len() / if *dtype == Dtype::F32 { 4 } else { 8 }];
+            let view = TensorView::new(*dtype, shape, bytes).map_err(|e| file(path, format!("`{name}`: {e}")))?;
+            views.push((name.as_str(), view));
+        }
+        let bytes = safetensors::serialize(views, Some(header)).map_err(|e| file(path, e.to_string()))?;
+        let partial = path.with_extension("safetensors.partial");
+        std::fs::write(&partial, bytes).map_err(|source| Error::Io { path: partial.clone(), source })?;
+        std::fs::rename(&partial, path).map_err(|source| Error::Io { path: path.to_owned(), source })
+    }
+}
+
+impl<'a> Trainer<'a> {
+    /// Goes on from a checkpoint of the same scene and configuration; the number of steps may differ.
+    pub fn resume(scene: &'a Scene, path: &Path) -> Result<Self, Error> {
+        let bytes = read(path)?;
+        let (header, tensors) = parse(path, &bytes)?;
+        let get = |key: &str| header.get(key).ok_or_else(|| file(path, format!("header lacks `{key}`")));
+        let steps_done = get("steps_done")?;
+        let steps_done: u64 = steps_done
+            .parse()
+            .map_err(|_| file(path, format!("header `steps_done` is {steps_done:?}, expected a whole number")))?;
+        let trained_on = get("scene")?;
+        if *trained_on != scene.name {
+            return Err(file(path, format!("was trained on scene {trained_on:?}, expected {:?}", scene.name)));
+        }
+        let mut trainer = Self::new(scene, config_of(path, &header)?)?;
+        trainer.steps_done = steps_done;
+        for (part, name) in PARTS {
+            let expected = trainer.parameters.get(part).len();
+            let read = |key: String| floats(path, &tensors, &key, expected);
+            *trainer.parameters.get_mut(part) = read(name.to_owned())?;
+            let adam = &mut trainer.parameters.optimisers[part as usize];
+            adam.first = read(format!("{name}.first_moment"))?;
+            adam.second = read(format!("{name}.second_moment"))?;
+            adam.steps = steps_done;
+        }
+        let counts = tensor(path, &tensors, "visibility_counts", Dtype::U64, scene.canonical.vertices.len())?;
+        let counts = counts.chunks_exact(8).map(|b| b.iter().rev().fold(0u64, |sum, &byte| sum << 8 | u64::from(byte)));
+        trainer.counts = visibility::VisibilityCounts::from_counts(counts.collect());
+        trainer.refresh_volume();
+        Ok(trainer)
+    }
+}
+
+/// The configuration that a checkpoint was written with.
+pub fn checkpoint_config(path: &Path) -> Result<Config, Error> {
+    let bytes = read(path)?;
+    let (header, _) = parse(path, &bytes)?;
+    config_of(path, &header)
+}
+
+fn read(path: &Path) -> Result<Vec<u8>, Error> {
+    let io = |source| Error::Io { path: path.to_owned(), source };
+    let size = std::fs::metadata(path).map_err(io)?.len();
+    if size > MAX_BYTES {
+        return Err(file(path, format!("has {size} bytes, expected at most {MAX_BYTES}")));
+    }
+    std::fs::read(path).map_err(io)
+}
+
+fn parse<'b>(path: &Path, bytes: &'b [u8]) -> Result<(HashMap<String, String>, SafeTensors<'b>), Error> {
+    let not_ours = |e: safetensors::SafeTensorError| file(path, format!("is not a whole safetensors file: {e}"));
+    let (_, metadata) = SafeTensors::read_metadata(bytes).map_err(not_ours)?;
+    let tensors = SafeTensors::deserialize(bytes).map_err(not_ours)?;
+    let header = metadata.metadata().clone().unwrap_or_default();
+    let found = |key: &str| header.get(key).map_or("nothing", String::as_str).to_owned();
+    if found("format") != FORMAT || found("version") != VERSION {
+        let (format, version) = (found("format"), found("version"));
+        return Err(file(path, format!("is {format} version {version}, expected {FORMAT} version {VERSION}")));
+    }
+    Ok((header, tensors))
+}
+
+fn config_of(path: &Path, header: &HashMap<String, String>) -> Result<Config, Error> {
+    let text = header.get("config").ok_or_else(|| file(path, "header lacks `config`".to_owned()))?;
+    let config: Config = toml::from_str(text).map_err(|e| file(path, format!("header `config`: {e}")))?;
+    config.validate()?;
+    Ok(config)
+}
+
+fn tensor<'b>(path: &Path, all: &SafeTensors<'b>, key: &str, dtype: Dtype, len: usize) -> Result<&'b [u8], Error> {
+    let view = all.tensor(key).map_err(|_| file(path, format!("lacks `{key}`")))?;
+    if view.dtype() != dtype || view.shape() != [len] {
+        let (found, shape) = (view.dtype(), view.shape());
+        return Err(file(path, format!("`{key}` is {found:?} {shape:?}, expected {dtype:?} [{len}]")));
+    }
+    Ok(view.data())
+}
+
+fn floats(path: &Path, all: &SafeTensors<'_>, key: &str, len: usize) -> Result<Vec<f32>, Error> {
+    let bytes = tensor(path, all, key, Dtype::F32, len)?;
+    let values: Vec<f32> = bytes.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect();
+    match values.iter().position(|v| !v.is_finite()) {
+        Some(at) => Err(file(path, format!("`{key}` is {} at {at}, expected finite numbers", values[at]))),
+        None => Ok(values),
+    }
+}
+
+fn file(path: &Path, what: String) -> Error {
+    Error::File { path: path.to_owned(), what }
+}

@@ -1,0 +1,415 @@
+//! Everything a run depends on, as one value that is written into its directory.
+
+use serde::{Deserialize, Serialize};
+
+/// Which model is trained; every method shares data, sampler, renderer, losses and budget.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Method {
+    /// No field: the posed prior mesh, each vertex the mean colour of the visible training pixels that saw it.
+    Prior,
+    /// Point-based: frequency encoding of x̂ with 10 bands and a perceptron (after Weng et al. 2022).
+    Humannerf,
+    /// Point-based: hash encoding of x̂ alone.
+    HashPoint,
+    /// The paper: point term and attended surface term.
+    Occnerf,
+}
+
+impl Method {
+    /// The name used on the command line and in results.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Prior => "prior",
+            Self::Humannerf => "humannerf",
+            Self::HashPoint => "hash-point",
+            Self::Occnerf => "occnerf",
+        }
+    }
+}
+
+/// What a pixel of the body's silhouette outside the mask is taken for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum OccludedRule {
+    /// Nothing is known of it: it enters no photometric term.
+    Unknown,
+    /// It is background, as the published code has it.
+    Background,
+}
+
+impl OccludedRule {
+    /// The name used on the command line and in results.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Unknown => "unknown",
+            Self::Background => "background",
+        }
+    }
+}
+
+/// How an observed point is mapped to the canonical pose.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum MotionKind {
+    /// Weight volume whose prior is the skinning weights diffused into space; learnable.
+    Volume,
+    /// Weight volume with the published oriented Gaussians, which has holes at the joints; learnable.
+    Gaussian,
+    /// Skinning weights of the nearest point of the posed surface.
+    Surface,
+}
+
+/// Where [v̂, d] comes from.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum DistanceKind {
+    /// The paper's blend of the k nearest vertices by normal similarity.
+    Blended,
+    /// The closest point of the triangle mesh and its signed distance.
+    Exact,
+}
+
+/// A named set of defaults.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Preset {
+    /// For a first look.
+    Fast,
+    /// The default.
+    Balanced,
+    /// The paper's setting.
+    Paper,
+}
+
+impl Preset {
+    /// The name used on the command line and in results.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Fast => "fast",
+            Self::Balanced => "balanced",
+            Self::Paper => "paper",
+        }
+    }
+}
+
+/// The paper's components that can be switched off one by one.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Component {
+    /// The surface term: F sees the point term alone.
+    Surface,
+    /// The attention: the surface term is the plain mean.
+    Attention,
+    /// The completeness loss.
+    Completeness,
+    /// The perceptual loss.
+    Perceptual,
+}
+
+/// The perceptron F.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct FieldConfig {
+    /// Units of each hidden layer.
+    pub width: usize,
+    /// Hidden layers.
+    pub depth: usize,
+    /// Density σ = `density_scale` · softplus(raw + bias), per normalised metre.
+    pub density_scale: f32,
+    /// Bias at and inside the prior's surface. Positive, or an image that starts empty stays empty.
+    pub density_bias: f32,
+    /// Bias at the outer end of the margin; linear in between.
+    pub density_bias_outside: f32,
+}
+
+/// The encoding γ.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct EncodingConfig {
+    /// Levels of the hash grid.
+    pub levels: usize,
+    /// Features a level.
+    pub features: usize,
+    /// log₂ of a level's largest table.
+    pub log2_table_size: u32,
+    /// Cells an axis of the coarsest level.
+    pub n_min: u32,
+    /// Cells an axis of the finest level.
+    pub n_max: u32,
+}
+
+/// Surface queries and the surface term.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct SurfaceConfig {
+    /// Nearest vertices a level.
+    pub k: usize,
+    /// Levels beyond the finest.
+    pub coarse_levels: usize,
+    /// Where [v̂, d] comes from.
+    pub distance: DistanceKind,
+    /// Whether F sees the surface term.
+    pub surface_term: bool,
+    /// Whether the surface term is weighted by the visibility counts.
+    pub attention: bool,
+}
+
+/// The motion field.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct MotionConfig {
+    /// Volume or surface.
+    pub kind: MotionKind,
+    /// Distance from the prior's surface up to which a point can belong to the subject, normalised metres.
+    pub margin: f32,
+    /// Width of the fall to zero beyond the margin, normalised metres.
+    pub falloff: f32,
+}
+
+/// Weights of the losses.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct LossConfig {
+    /// λ₁, mean squared error.
+    pub mse: f32,
+    /// λ₂, perceptual term.
+    pub perceptual: f32,
+    /// λ₃, completeness.
+    pub completeness: f32,
+    /// β of the completeness term, in units of the density.
+    pub beta: f32,
+}
+
+/// Adam's learning rates.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RateConfig {
+    /// The perceptron F.
+    pub field: f32,
+    /// The vertices of the surface term.
+    pub vertices: f32,
+    /// The hash table.
+    pub table: f32,
+    /// The motion volume's log-weights.
+    pub motion: f32,
+    /// Every rate falls exponentially to this fraction over the run.
+    pub final_fraction: f32,
+    /// Decay of the second moment.
+    pub beta_2: f32,
+}
+
+/// A run.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Config {
+    /// Named defaults that this started from.
+    pub preset: Preset,
+    /// Which model.
+    pub method: Method,
+    /// The pixel rule.
+    pub occluded: OccludedRule,
+    /// Of every random choice.
+    pub seed: u64,
+    /// Optimisation steps.
+    pub steps: u64,
+    /// Patches a step, all from one frame.
+    pub patches: usize,
+    /// Side of a patch in pixels.
+    pub patch_size: u32,
+    /// Samples a ray across the body's box.
+    pub samples: usize,
+    /// The perceptron.
+    pub field: FieldConfig,
+    /// The hash grid.
+    pub encoding: EncodingConfig,
+    /// Surface queries.
+    pub surface: SurfaceConfig,
+    /// Motion field.
+    pub motion: MotionConfig,
+    /// Losses.
+    pub loss: LossConfig,
+    /// Learning rates.
+    pub rates: RateConfig,
+}
+
+/// A configuration that cannot be run: the key and why.
+#[derive(Debug, thiserror::Error, PartialEq)]
+#[error("config: `{key}` is {value}: {expected}")]
+pub struct ConfigError {
+    /// Dotted name of the field.
+    pub key: &'static str,
+    /// What was given.
+    pub value: String,
+    /// What is allowed.
+    pub expected: &'static str,
+}
+
+impl Config {
+    /// The defaults of a preset for a method.
+    pub fn preset(preset: Preset, method: Method) -> Self {
+        let mut config = match preset {
+            Preset::Paper => paper(),
+            Preset::Balanced => balanced(),
+            Preset::Fast => fast(),
+        };
+        config.method = method;
+        if method != Method::Occnerf {
+            config.surface.surface_term = false;
+            config.surface.attention = false;
+            config.loss.completeness = 0.0;
+        }
+        if method == Method::Humannerf {
+            // Without a hash grid the perceptron has to hold the whole person.
+            (config.field.width, config.field.depth) = if preset == Preset::Paper { (256, 8) } else { (128, 4) };
+        }
+        config
+    }
+
+    /// Switches a component of the method off.
+    pub fn ablate(&mut self, component: Component) {
+        match component {
+            Component::Surface => self.surface.surface_term = false,
+            Component::Attention => self.surface.attention = false,
+            Component::Completeness => self.loss.completeness = 0.0,
+            Component::Perceptual => self.loss.perceptual = 0.0,
+        }
+    }
+
+    /// Checks every value that would otherwise fail later and less clearly.
+    pub fn validate(&self) -> Result<(), ConfigError> {
+        let whole: [(&'static str, usize, std::ops::RangeInclusive<usize>, &'static str); 8] = [
+            ("patches", self.patches, 1..=1024, "expected 1 to 1024"),
+            ("patch_size", self.patch_size as usize, 1..=256, "expected 1 to 256 pixels"),
+            ("samples", self.samples, 1..=1024, "expected 1 to 1024"),
+            ("field.width", self.field.width, 1..=1024, "expected 1 to 1024"),
+            ("field.depth", self.field.depth, 1..=16, "expected 1 to 16"),
+            ("surface.k", self.surface.k, 1..=32, "expected 1 to 32"),
+            ("surface.coarse_levels", self.surface.coarse_levels, 0..=6, "expected 0 to 6"),
+            ("steps", usize::try_from(self.steps).unwrap_or(usize::MAX), 0..=100_000_000, "expected at most 10^8"),
+        ];
+        for (key, value, range, expected) in whole {
+            if !range.contains(&value) {
+                return Err(ConfigError { key, value: value.to_string(), expected });
+            }
+        }
+        let at_least_zero = "expected a finite number of at least 0";
+        let above_zero = "expected a finite number above 0";
+        let any = "expected a finite number";
+        let real: [(&'static str, f32, f32, &'static str); 16] = [
+            ("field.density_scale", self.field.density_scale, f32::MIN_POSITIVE, above_zero),
+            ("field.density_bias", self.field.density_bias, f32::MIN, any),
+            ("field.density_bias_outside", self.field.density_bias_outside, f32::MIN, any),
+            ("motion.margin", self.motion.margin, f32::MIN_POSITIVE, above_zero),
+            ("motion.falloff", self.motion.falloff, f32::MIN_POSITIVE, above_zero),
+            ("loss.mse", self.loss.mse, 0.0, at_least_zero),
+            ("loss.perceptual", self.loss.perceptual, 0.0, at_least_zero),
+            ("loss.completeness", self.loss.completeness, 0.0, at_least_zero),
+            ("loss.beta", self.loss.beta, 0.0, at_least_zero),
+            ("rates.field", self.rates.field, 0.0, at_least_zero),
+            ("rates.vertices", self.rates.vertices, 0.0, at_least_zero),
+            ("rates.table", self.rates.table, 0.0, at_least_zero),
+            ("rates.motion", self.rates.motion, 0.0, at_least_zero),
+            ("rates.final_fraction", self.rates.final_fraction, f32::MIN_POSITIVE, above_zero),
+            ("rates.beta_2", self.rates.beta_2, 0.0, at_least_zero),
+            ("1 - rates.beta_2", 1.0 - self.rates.beta_2, f32::MIN_POSITIVE, above_zero),
+        ];
+        for (key, value, least, expected) in real {
+            if !(value.is_finite() && value >= least) {
+                return Err(ConfigError { key, value: value.to_string(), expected });
+            }
+        }
+        Ok(())
+    }
+}
+
+fn paper() -> Config {
+    Config {
+        preset: Preset::Paper,
+        method: Method::Occnerf,
+        occluded: OccludedRule::Unknown,
+        seed: 1,
+        steps: 10_000,
+        patches: 6,
+        patch_size: 32,
+        samples: 128,
+        field: FieldConfig {
+            width: 128,
+            depth: 4,
+            density_scale: 25.0,
+            density_bias: 2.0,
+            density_bias_outside: -2.0,
+        },
+        encoding: EncodingConfig { levels: 16, features: 2, log2_table_size: 19, n_min: 16, n_max: 2048 },
+        surface: SurfaceConfig {
+            k: 5,
+            coarse_levels: 3,
+            distance: DistanceKind::Blended,
+            surface_term: true,
+            attention: true,
+        },
+        motion: MotionConfig { kind: MotionKind::Volume, margin: 0.08, falloff: 0.02 },
+        loss: LossConfig { mse: 0.2, perceptual: 1.0, completeness: 10.0, beta: 10.0 },
+        rates: RateConfig {
+            field: 5e-4,
+            vertices: 1e-4,
+            table: 5e-5,
+            motion: 5e-5,
+            final_fraction: 1.0,
+            beta_2: 0.999,
+        },
+    }
+}
+
+fn balanced() -> Config {
+    Config {
+        preset: Preset::Balanced,
+        steps: 3000,
+        patches: 6,
+        samples: 64,
+        field: FieldConfig { width: 64, depth: 2, ..paper().field },
+        encoding: EncodingConfig { levels: 10, features: 2, log2_table_size: 16, n_min: 12, n_max: 384 },
+        surface: SurfaceConfig { distance: DistanceKind::Exact, ..paper().surface },
+        motion: MotionConfig { kind: MotionKind::Surface, margin: 0.06, falloff: 0.02 },
+        rates: RateConfig {
+            field: 2e-3,
+            vertices: 1e-4,
+            table: 1e-2,
+            motion: 1e-3,
+            final_fraction: 0.05,
+            beta_2: 0.99,
+        },
+        ..paper()
+    }
+}
+
+fn fast() -> Config {
+    Config { preset: Preset::Fast, steps: 800, patches: 4, samples: 48, ..balanced() }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_preset_of_every_method_is_valid_and_survives_toml() {
+        for preset in [Preset::Fast, Preset::Balanced, Preset::Paper] {
+            for method in [Method::Prior, Method::Humannerf, Method::HashPoint, Method::Occnerf] {
+                let config = Config::preset(preset, method);
+                config.validate().unwrap();
+                let text = toml::to_string(&config).unwrap();
+                assert_eq!(toml::from_str::<Config>(&text).unwrap(), config);
+            }
+        }
+    }
+
+    #[test]
+    fn a_bad_value_is_named_with_its_key() {
+        let mut config = Config::preset(Preset::Fast, Method::Occnerf);
+        config.rates.table = f32::NAN;
+        assert!(config.validate().unwrap_err().to_string().contains("rates.table"));
+        config = Config::preset(Preset::Fast, Method::Occnerf);
+        config.samples = 0;
+        assert!(config.validate().unwrap_err().to_string().contains("`samples` is 0"));
+    }
+}

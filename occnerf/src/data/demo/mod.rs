@@ -1,0 +1,327 @@
+//! A capture made on the spot: a clothed person walks and turns before a ring of cameras.
+
+mod clothes;
+mod face;
+mod landmarks;
+mod motion;
+mod noise;
+mod occlusion;
+mod person;
+mod render;
+#[cfg(test)]
+mod tests;
+mod texture;
+
+use std::f32::consts::TAU;
+
+use glam::Vec3;
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+use smpl::{BodyModel, Shaped};
+use volrender::Camera;
+
+use self::landmarks::joint;
+use self::motion::{Pose, TrackerError, track, walk};
+use self::noise::normal;
+use self::person::Person;
+use self::render::{Posture, look_at};
+use super::{Capture, DataError, EvalFrame, Frame, Image};
+use crate::random::Stream;
+
+/// Shape coefficients of the person and of the tracker's guess that are not zero.
+const BETAS: usize = 6;
+/// Focal length in picture sides.
+const FOCAL: f32 = 1.45;
+/// Distance of the cameras from the person's axis in heights of the person: fills three quarters of the picture.
+const DISTANCE: f32 = 1.97;
+/// Height of the cameras and of the point they look at, in heights of the person.
+const CAMERA_HEIGHT: f32 = 0.60;
+const TARGET_HEIGHT: f32 = 0.505;
+
+/// What the demo is made of. The default is the one that figures are quoted for.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct DemoConfig {
+    /// Pixels a side, 16 to 2048.
+    pub size: u32,
+    /// Frames of the training video, 1 to 10 000. However many, they show the same walk.
+    pub frames: usize,
+    /// Cameras kept back for evaluation, evenly around the person, with the training camera midway between the first
+    /// and the last of them: for five, 36° off it and 72° apart. At most 64.
+    pub eval_cameras: usize,
+    /// Evaluation cameras see one frame in this many, beginning with the first.
+    pub eval_every: usize,
+    /// Decides the person's shape and the errors of the prior.
+    pub seed: u64,
+    /// Root mean square error of each bone's orientation in the prior, degrees.
+    pub pose_noise_degrees: f32,
+    /// Root mean square error of the prior's position, metres of a person 1.7 m tall.
+    pub translation_noise: f32,
+    /// Standard deviation of the prior's error in each shape coefficient.
+    pub beta_noise: f32,
+    /// Part of the subject's pixels in the occluded frames that are hidden, 0 (no obstacle) to below 1.
+    pub occluded_fraction: f32,
+    /// Part of the training video, from its start, that is occluded, 0 to 1.
+    pub occluded_share: f32,
+    /// Whether training frames say which pixels the obstacle covers. Published captures do not.
+    pub known_occluder: bool,
+}
+
+impl Default for DemoConfig {
+    fn default() -> Self {
+        Self {
+            size: 192,
+            frames: 100,
+            eval_cameras: 5,
+            eval_every: 10,
+            seed: 0,
+            pose_noise_degrees: 1.5,
+            translation_noise: 0.005,
+            beta_noise: 0.15,
+            occluded_fraction: 0.5,
+            occluded_share: 0.8,
+            known_occluder: false,
+        }
+    }
+}
+
+impl DemoConfig {
+    fn check(&self, body: &BodyModel) -> Result<(), DataError> {
+        let within = |name, ok: bool, expected: &str, actual: &dyn ToString| {
+            if ok {
+                Ok(())
+            } else {
+                Err(DataError::setting(name, expected, actual.to_string()))
+            }
+        };
+        let size = &self.size;
+        within(
+            "size",
+            (16..=2048).contains(size),
+            "16 to 2048 pixels",
+            size,
+        )?;
+        within(
+            "frames",
+            (1..=10_000).contains(&self.frames),
+            "1 to 10000",
+            &self.frames,
+        )?;
+        within(
+            "eval_cameras",
+            self.eval_cameras <= 64,
+            "at most 64",
+            &self.eval_cameras,
+        )?;
+        within(
+            "eval_every",
+            self.eval_every > 0,
+            "at least 1",
+            &self.eval_every,
+        )?;
+        for (name, value, limit) in [
+            ("pose_noise_degrees", self.pose_noise_degrees, 45.0),
+            ("translation_noise", self.translation_noise, 1.0),
+            ("beta_noise", self.beta_noise, 3.0),
+            ("occluded_fraction", self.occluded_fraction, 0.95),
+            ("occluded_share", self.occluded_share, 1.0),
+        ] {
+            within(
+                name,
+                (0.0..=limit).contains(&value),
+                &format!("0 to {limit}"),
+                &value,
+            )?;
+        }
+        let joints = body.num_joints();
+        within("body", joints == joint::COUNT, "SMPL's 24 joints", &joints)
+    }
+}
+
+/// Makes a video of a clothed person who walks and turns, occluded as in the paper's simulation, with views of the
+/// same instants from other sides.
+///
+/// The person is `body` with a shape of its own, in clothes that stand 1 to 3 cm off it and that the body model knows
+/// nothing of. The returned poses and betas are not the true ones but a tracker's, with the errors of `config`; training
+/// and evaluation frames of one instant share them. Pictures are anti-aliased: the mask is the share of 4 rays a pixel
+/// that meet the person, the colour is on black. An obstacle as high as the picture covers the middle of the training
+/// view in the first frames. The result depends on `config` and `body` alone, not on the number of threads.
+///
+/// # Errors
+/// [`DataError::Setting`] for values outside the stated ranges, and for a body without SMPL's 24 joints.
+pub fn demo(config: &DemoConfig, body: &BodyModel) -> Result<Capture, DataError> {
+    config.check(body)?;
+    let (true_betas, betas) = shapes(config, body);
+    let shaped = body.shaped(&true_betas);
+    let person = Person::new(body, &shaped);
+    let unit = person.landmarks.unit;
+    let poses = grounded_walk(config.frames, body, &shaped);
+    let error = TrackerError {
+        seed: config.seed,
+        rotation: config.pose_noise_degrees.to_radians(),
+        translation: config.translation_noise * unit,
+    };
+    let priors = track(&poses, &body.parents, shaped.joints[joint::PELVIS], error);
+    let cameras = ring(config, &shaped)?;
+
+    let views: Vec<Result<Vec<Picture>, DataError>> = poses
+        .par_iter()
+        .enumerate()
+        .map(|(i, pose)| {
+            let posed = body.pose(&shaped, &pose.joints, pose.placement());
+            let posture = Posture::new(&person, &posed)?;
+            let seen = if i % config.eval_every == 0 {
+                cameras.len()
+            } else {
+                1
+            };
+            Ok(cameras[..seen]
+                .iter()
+                .map(|camera| posture.render(camera))
+                .collect())
+        })
+        .collect();
+
+    let mut train = Vec::with_capacity(config.frames);
+    let mut eval = Vec::new();
+    for (i, views) in views.into_iter().enumerate() {
+        for (c, (image, mask)) in views?.into_iter().enumerate() {
+            let frame = Frame {
+                name: format!("frame_{i:06}"),
+                image,
+                mask,
+                camera: cameras[c],
+                pose: priors[i].joints.clone(),
+                placement: priors[i].placement(),
+                betas: betas.clone(),
+                occluder: None,
+            };
+            if c == 0 {
+                train.push(frame);
+            } else {
+                eval.push((
+                    c,
+                    EvalFrame {
+                        camera_name: format!("Camera_B{}", c + 1),
+                        train_index: i,
+                        frame,
+                    },
+                ));
+            }
+        }
+    }
+    eval.sort_by_key(|(camera, frame)| (*camera, frame.train_index));
+    occlude(&mut train, config);
+    Ok(Capture {
+        name: "demo".to_owned(),
+        train,
+        eval: eval.into_iter().map(|(_, frame)| frame).collect(),
+        mean_betas: betas,
+    })
+}
+
+/// A picture and its mask.
+type Picture = (Image, Vec<f32>);
+
+/// The person's betas, and the tracker's.
+fn shapes(config: &DemoConfig, body: &BodyModel) -> (Vec<f32>, Vec<f32>) {
+    let count = body.num_betas().min(BETAS);
+    let mut stream = Stream::new(&[config.seed, 0x6265_7461]);
+    let truth: Vec<f32> = (0..count).map(|_| 1.6 * stream.uniform() - 0.8).collect();
+    let guess = truth
+        .iter()
+        .map(|b| b + config.beta_noise * normal(&mut stream))
+        .collect();
+    (truth, guess)
+}
+
+/// The walk with the lower foot on the floor at y = 0, and a slight sway.
+fn grounded_walk(frames: usize, body: &BodyModel, shaped: &Shaped) -> Vec<Pose> {
+    let pelvis = shaped.joints[joint::PELVIS];
+    (0..frames)
+        .into_par_iter()
+        .map(|frame| {
+            let mut pose = walk(frame, frames);
+            let posed = body.pose(shaped, &pose.joints, pose.placement());
+            let low = posed
+                .vertices
+                .iter()
+                .map(|v| v.y)
+                .fold(f32::INFINITY, f32::min);
+            let high = shaped
+                .vertices
+                .iter()
+                .map(|v| v.y)
+                .fold(f32::NEG_INFINITY, f32::max);
+            let turn = TAU * frame as f32 / frames as f32;
+            let sway = Vec3::new(turn.sin(), 0.0, (2.0 * turn).sin()) * (0.035 * (high - low));
+            let centred = pose.rotation * pelvis;
+            pose.translation = Vec3::new(-centred.x, -low, -centred.z) + sway;
+            pose
+        })
+        .collect()
+}
+
+/// The training camera, then the others around the circle.
+fn ring(config: &DemoConfig, shaped: &Shaped) -> Result<Vec<Camera>, DataError> {
+    let low = shaped
+        .vertices
+        .iter()
+        .map(|v| v.y)
+        .fold(f32::INFINITY, f32::min);
+    let high = shaped
+        .vertices
+        .iter()
+        .map(|v| v.y)
+        .fold(f32::NEG_INFINITY, f32::max);
+    let height = high - low;
+    (0..=config.eval_cameras)
+        .map(|c| {
+            let azimuth = if c == 0 {
+                0.0
+            } else {
+                TAU * (c as f32 - 0.5) / config.eval_cameras as f32
+            };
+            let eye = Vec3::new(
+                azimuth.sin() * DISTANCE,
+                CAMERA_HEIGHT,
+                azimuth.cos() * DISTANCE,
+            );
+            look_at(
+                eye * height,
+                Vec3::Y * (TARGET_HEIGHT * height),
+                config.size,
+                FOCAL,
+            )
+        })
+        .collect()
+}
+
+/// Puts the obstacle in front of the first frames.
+fn occlude(train: &mut [Frame], config: &DemoConfig) {
+    let affected = (config.occluded_share * train.len() as f32).round() as usize;
+    let masks: Vec<&[f32]> = train[..affected]
+        .iter()
+        .map(|f| f.mask.as_slice())
+        .collect();
+    let columns = occlusion::hidden_columns(&masks, config.size, config.occluded_fraction);
+    for (i, frame) in train.iter_mut().enumerate() {
+        let hidden: Vec<bool> = (0..frame.mask.len())
+            .map(|p| i < affected && columns.contains(&(p as u32 % config.size)))
+            .collect();
+        for (mask, _) in frame
+            .mask
+            .iter_mut()
+            .zip(&hidden)
+            .filter(|(_, hidden)| **hidden)
+        {
+            *mask = 0.0;
+        }
+        let seen: Vec<f32> = hidden
+            .iter()
+            .map(|&hidden| if hidden { 0.0 } else { 1.0 })
+            .collect();
+        frame.image.multiply(&seen);
+        frame.occluder = config.known_occluder.then_some(hidden);
+    }
+}

@@ -1,0 +1,100 @@
+//! The clothed person: a finer mesh than the body's, stood off it by the clothes, that follows the body's bones.
+
+use std::collections::HashMap;
+
+use glam::{Affine3A, Mat3A, Vec3, Vec3A};
+use smpl::{BodyModel, Posed, Shaped, SparseRows};
+
+use super::landmarks::Landmarks;
+
+/// A person at rest, ready to be posed.
+pub(super) struct Person {
+    pub landmarks: Landmarks,
+    /// Triangles of the finer mesh.
+    pub faces: Vec<[u32; 3]>,
+    /// Places on the naked body at rest, one a vertex of the finer mesh: what colours are looked up by.
+    pub rest: Vec<Vec3>,
+    /// `rest` with the clothes on.
+    clothed: Vec<Vec3>,
+    /// The two vertices of the body's mesh that a vertex lies halfway between; the same twice for an old one.
+    ends: Vec<[u32; 2]>,
+    weights: SparseRows<f32>,
+}
+
+/// Faces split in four at the midpoints of their edges, and the vertices that each new vertex lies between.
+fn subdivide(vertices: usize, faces: &[[u32; 3]]) -> (Vec<[u32; 3]>, Vec<[u32; 2]>) {
+    let mut ends: Vec<[u32; 2]> = (0..vertices as u32).map(|v| [v, v]).collect();
+    let mut middles: HashMap<[u32; 2], u32> = HashMap::new();
+    let mut finer = Vec::with_capacity(faces.len() * 4);
+    for &[a, b, c] in faces {
+        let [ab, bc, ca] = [[a, b], [b, c], [c, a]].map(|[i, j]| {
+            let edge = [i.min(j), i.max(j)];
+            *middles.entry(edge).or_insert_with(|| {
+                ends.push(edge);
+                ends.len() as u32 - 1
+            })
+        });
+        finer.extend([[a, ab, ca], [b, bc, ab], [c, ca, bc], [ab, bc, ca]]);
+    }
+    (finer, ends)
+}
+
+impl Person {
+    /// Dresses `shaped`, a body of `model` in SMPL's T-pose.
+    pub fn new(model: &BodyModel, shaped: &Shaped) -> Self {
+        let landmarks = Landmarks::new(shaped);
+        let (faces, ends) = subdivide(shaped.vertices.len(), &model.faces);
+        let rest: Vec<Vec3> = ends
+            .iter()
+            .map(|[a, b]| shaped.vertices[*a as usize].midpoint(shaped.vertices[*b as usize]))
+            .collect();
+        let normals = surface_query::vertex_normals(&rest, &faces);
+        let clothed = rest
+            .iter()
+            .zip(&normals)
+            .map(|(&p, &n)| p + n * (landmarks.thickness(landmarks.figure(p)) * landmarks.unit))
+            .collect();
+        let weights = SparseRows::from_rows(ends.iter().map(|[a, b]| {
+            let mut row: Vec<(u32, f32)> = Vec::new();
+            for v in [*a, *b] {
+                for (joint, w) in model.weights.row(v as usize) {
+                    match row.iter_mut().find(|(j, _)| *j == joint as u32) {
+                        Some((_, sum)) => *sum += 0.5 * w,
+                        None => row.push((joint as u32, 0.5 * w)),
+                    }
+                }
+            }
+            row.sort_unstable_by_key(|(joint, _)| *joint);
+            row
+        }));
+        Self {
+            landmarks,
+            faces,
+            rest,
+            clothed,
+            ends,
+            weights,
+        }
+    }
+
+    /// Vertices of the clothed mesh under the bones of `posed`, the same body posed.
+    pub fn posed(&self, posed: &Posed) -> Vec<Vec3> {
+        let offset = |v: u32| posed.pose_offsets[v as usize];
+        self.clothed
+            .iter()
+            .zip(&self.ends)
+            .enumerate()
+            .map(|(v, (&clothed, &[a, b]))| {
+                let mut blend = Affine3A {
+                    matrix3: Mat3A::ZERO,
+                    translation: Vec3A::ZERO,
+                };
+                for (joint, w) in self.weights.row(v) {
+                    blend.matrix3 += posed.bones[joint].matrix3 * w;
+                    blend.translation += posed.bones[joint].translation * w;
+                }
+                blend.transform_point3(clothed + offset(a).midpoint(offset(b)))
+            })
+            .collect()
+    }
+}

@@ -1,0 +1,121 @@
+//! Whether body model, cameras and pictures belong together.
+
+use std::path::Path;
+
+use glam::Vec3;
+use smpl::BodyModel;
+
+use super::records::{Record, triples};
+use crate::data::{DataError, Frame};
+
+/// How far a joint may be from where the file has it, as a fraction of the body's largest extent: 4 cm at 1.7 m.
+/// The same model agrees to rounding, another model of a person is several times as far off.
+const JOINT_TOLERANCE: f32 = 0.04 / 1.7;
+
+/// Shape coefficients that the model can take.
+pub(super) fn betas(
+    record: &Record<'_>,
+    key: &str,
+    body: &BodyModel,
+) -> Result<Vec<f32>, DataError> {
+    let (shape, values) = record.array(key)?;
+    if shape.len() != 1 || values.is_empty() || values.len() > body.num_betas() {
+        return Err(record.invalid(
+            key,
+            format!("1 to {} numbers, as the body model has", body.num_betas()),
+            format!("shape {shape:?}"),
+        ));
+    }
+    Ok(values)
+}
+
+/// Compares the T-pose joints under `key` with those of `body` for `betas`.
+pub(super) fn joints(
+    record: &Record<'_>,
+    key: &str,
+    betas: &[f32],
+    body: &BodyModel,
+) -> Result<(), DataError> {
+    let why = ": the body model's joints (is it the model that the capture was fitted with?)";
+    let expected = triples(&record.shaped(key, &[body.num_joints(), 3], why)?);
+    let shaped = body.shaped(betas);
+    let low = shaped
+        .vertices
+        .iter()
+        .copied()
+        .fold(Vec3::INFINITY, Vec3::min);
+    let high = shaped
+        .vertices
+        .iter()
+        .copied()
+        .fold(Vec3::NEG_INFINITY, Vec3::max);
+    let tolerance = JOINT_TOLERANCE * (high - low).max_element();
+    for (joint, (model, file)) in shaped.joints.iter().zip(&expected).enumerate() {
+        let distance = model.distance(*file);
+        if distance > tolerance {
+            return Err(record.invalid(
+                key,
+                format!(
+                    "the body model's joints for these betas within {tolerance:.3} (is it the model that the \
+                     capture was fitted with?)"
+                ),
+                format!("joint {joint} at {file}, {distance:.3} from the model's"),
+            ));
+        }
+    }
+    Ok(())
+}
+
+/// At least one mask shows the subject. `dir` holds the masks.
+pub(super) fn subject_is_seen(dir: &Path, frames: &[Frame]) -> Result<(), DataError> {
+    if frames.iter().flat_map(|f| &f.mask).any(|&m| m > 0.5) {
+        return Ok(());
+    }
+    let brightest = frames
+        .iter()
+        .flat_map(|f| &f.mask)
+        .copied()
+        .fold(0.0, f32::max);
+    Err(DataError::invalid(
+        dir,
+        "all masks",
+        "a subject pixel (value above 127 of 255) in at least one frame",
+        format!(
+            "none in {} frames, the largest value is {}",
+            frames.len(),
+            brightest * 255.0
+        ),
+    ))
+}
+
+/// At least one frame has a vertex of the posed body in its image. `path` holds the cameras.
+pub(super) fn body_is_seen(
+    path: &Path,
+    frames: &[Frame],
+    body: &BodyModel,
+) -> Result<(), DataError> {
+    let sees = |frame: &Frame| {
+        let shaped = body.shaped(&frame.betas);
+        let posed = body.pose(&shaped, &frame.pose, frame.placement);
+        let camera = &frame.camera;
+        posed.vertices.iter().any(|&v| {
+            camera.project(v).is_some_and(|p| {
+                let inside = |x: f32, size: u32| x >= 0.0 && x <= size as f32;
+                inside(p.x, camera.width) && inside(p.y, camera.height)
+            })
+        })
+    };
+    // Nearly always the first frame answers.
+    if frames.iter().any(sees) {
+        return Ok(());
+    }
+    Err(DataError::invalid(
+        path,
+        "all extrinsics",
+        "a camera that sees the posed body in at least one frame",
+        format!(
+            "no vertex of the body inside the image in any of {} frames",
+            frames.len()
+        ),
+    ))
+}

@@ -1,0 +1,126 @@
+//! Taking a lens's distortion out of pictures.
+
+use glam::Vec2;
+use volrender::{Camera, Distortion};
+
+use crate::data::Image;
+
+/// Fills a picture of `channels` values a pixel from `source` (H, W, channels), seen through `distortion`, bilinear;
+/// 0 beyond the border.
+fn resample(source: &[f32], channels: usize, camera: &Camera, distortion: &Distortion) -> Vec<f32> {
+    let (width, height) = (camera.width as usize, camera.height as usize);
+    let mut out = vec![0.0; source.len()];
+    for row in 0..height {
+        for column in 0..width {
+            let ideal = Vec2::new(column as f32 + 0.5, row as f32 + 0.5);
+            let at = camera.distort_pixel(distortion, ideal) - Vec2::splat(0.5);
+            let reach = Vec2::new(width as f32, height as f32);
+            if !(at.cmpgt(Vec2::NEG_ONE).all() && at.cmplt(reach).all()) {
+                continue;
+            }
+            let corner = at.floor();
+            let fraction = at - corner;
+            for (dx, dy) in [(0, 0), (1, 0), (0, 1), (1, 1)] {
+                let (x, y) = (corner.x as i64 + dx, corner.y as i64 + dy);
+                if x < 0 || y < 0 || x >= width as i64 || y >= height as i64 {
+                    continue;
+                }
+                let weight = if dx == 1 {
+                    fraction.x
+                } else {
+                    1.0 - fraction.x
+                } * if dy == 1 {
+                    fraction.y
+                } else {
+                    1.0 - fraction.y
+                };
+                let from = (y as usize * width + x as usize) * channels;
+                let to = (row * width + column) * channels;
+                for c in 0..channels {
+                    out[to + c] += weight * source[from + c];
+                }
+            }
+        }
+    }
+    out
+}
+
+/// Replaces picture and mask (H, W) by what a perfect lens would have shown.
+pub(super) fn undistort(
+    image: &mut Image,
+    mask: &mut Vec<f32>,
+    camera: &Camera,
+    distortion: &Distortion,
+) {
+    if distortion.is_none() {
+        return;
+    }
+    image.pixels = resample(&image.pixels, 3, camera, distortion);
+    *mask = resample(mask, 1, camera, distortion);
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::{Affine3A, Mat3, Vec3};
+
+    use super::*;
+
+    fn camera() -> Camera {
+        let k = Mat3::from_cols(Vec3::X * 60.0, Vec3::Y * 60.0, Vec3::new(32.0, 24.0, 1.0));
+        Camera::new(k, Affine3A::IDENTITY, 64, 48).unwrap()
+    }
+
+    /// A smooth picture as a function of ideal coordinates.
+    fn scene(p: Vec2) -> f32 {
+        0.5 + 0.3 * (p.x * 9.0).sin() * (p.y * 7.0).cos()
+    }
+
+    #[test]
+    fn undistorting_a_distorted_picture_gives_the_ideal_one() {
+        let camera = camera();
+        let distortion = Distortion::from_opencv([-0.25, 0.08, 0.002, -0.003, 0.0]);
+        let (mut seen, mut ideal) = (Vec::new(), Vec::new());
+        for i in 0..64 * 48 {
+            let pixel = Vec2::new((i % 64) as f32 + 0.5, (i / 64) as f32 + 0.5);
+            let p = (pixel - camera.centre) / camera.focal;
+            ideal.push(scene(p));
+            seen.push(scene(distortion.undistort(p).unwrap()));
+        }
+        let back = resample(&seen, 1, &camera, &distortion);
+        let error = |a: &[f32]| {
+            a.iter()
+                .zip(&ideal)
+                .map(|(a, b)| (a - b).abs())
+                .fold(0.0, f32::max)
+        };
+        // Bilinear: step² · f″ / 8 in each direction, (1/60)² · 0.3 · (81 + 49) / 8.
+        assert!(error(&back) < 2e-3, "{}", error(&back));
+        assert!(
+            error(&seen) > 2e-2,
+            "the distortion must matter for the test to say anything"
+        );
+    }
+
+    #[test]
+    fn what_the_lens_never_saw_is_empty() {
+        let camera = camera();
+        // Pincushion: ideal corners lie outside the photograph.
+        let distortion = Distortion::from_opencv([0.5, 0.0, 0.0, 0.0, 0.0]);
+        let mut image = Image::new(64, 48);
+        image.pixels.fill(1.0);
+        let mut mask = vec![1.0; 64 * 48];
+        undistort(&mut image, &mut mask, &camera, &distortion);
+        assert_eq!((mask[0], image.rgb(0, 0)), (0.0, [0.0; 3]));
+        assert!((mask[24 * 64 + 32] - 1.0).abs() < 1e-6);
+    }
+
+    #[test]
+    fn a_perfect_lens_changes_nothing() {
+        let mut image = Image::new(64, 48);
+        image.pixels[5] = 0.123;
+        let before = image.clone();
+        let mut mask = vec![0.7; 64 * 48];
+        undistort(&mut image, &mut mask, &camera(), &Distortion::default());
+        assert_eq!(image, before);
+    }
+}

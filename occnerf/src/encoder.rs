@@ -1,0 +1,177 @@
+//! The encoding γ of each method.
+
+use glam::Vec3;
+use hashgrid::{HashGrid, HashGridConfig};
+use volrender::Aabb;
+
+use crate::Error;
+use crate::config::{Config, EncodingConfig, Method};
+use crate::samples::Samples;
+
+/// d is clamped to this interval, normalised metres.
+const DISTANCE: (f32, f32) = (-0.2, 0.3);
+/// Bands of the frequency encoding (Weng et al. 2022).
+const BANDS: usize = 10;
+
+/// What F is fed with at a point.
+#[derive(Clone, Debug)]
+pub(crate) enum Encoder {
+    /// sin and cos of 2^b · x̂, and x̂ itself.
+    Frequency,
+    /// Hash grid on x̂.
+    Point(HashGrid<3>),
+    /// Hash grid on [v̂, d].
+    Surface(HashGrid<4>),
+}
+
+impl Encoder {
+    pub fn new(config: &Config) -> Result<Self, Error> {
+        let EncodingConfig { levels, features, log2_table_size, n_min, n_max } = config.encoding;
+        let grid = HashGridConfig { levels, features, log2_table_size, n_min, n_max };
+        Ok(match config.method {
+            Method::Prior | Method::Humannerf => Self::Frequency,
+            Method::HashPoint => Self::Point(HashGrid::new(&grid)?),
+            Method::Occnerf => Self::Surface(HashGrid::new(&grid)?),
+        })
+    }
+
+    #[cfg(test)]
+    pub fn num_parameters(&self) -> usize {
+        match self {
+            Self::Frequency => 0,
+            Self::Point(grid) => grid.num_parameters(),
+            Self::Surface(grid) => grid.num_parameters(),
+        }
+    }
+
+    pub fn num_features(&self) -> usize {
+        match self {
+            Self::Frequency => 3 + 6 * BANDS,
+            Self::Point(grid) => grid.num_features(),
+            Self::Surface(grid) => grid.num_features(),
+        }
+    }
+
+    pub fn initial_table(&self, seed: u64) -> Vec<f32> {
+        match self {
+            Self::Frequency => Vec::new(),
+            Self::Point(grid) => grid.init_table(seed),
+            Self::Surface(grid) => grid.init_table(seed),
+        }
+    }
+
+    /// The coordinates that samples are encoded at: x̂ for the frequencies, in the unit box for a grid.
+    pub fn coordinates(&self, samples: &Samples, region: &Aabb, out: &mut Coordinates) {
+        out.point.clear();
+        out.surface.clear();
+        match self {
+            Self::Frequency => out.point.extend(samples.canonical.iter().map(Vec3::to_array)),
+            Self::Point(_) => out.point.extend(samples.canonical.iter().map(|&x| in_box(x, region).to_array())),
+            Self::Surface(_) => out.surface.extend(
+                samples.closest.iter().zip(&samples.distance).map(|(&v, &d)| surface_coordinates(v, d, region)),
+            ),
+        }
+    }
+
+    /// Features (Q × F, row-major) of the coordinates.
+    pub fn encode(&self, table: &[f32], at: &Coordinates, features: &mut [f32]) {
+        match self {
+            Self::Frequency => {
+                for (x, row) in at.point.iter().zip(features.chunks_exact_mut(self.num_features())) {
+                    row[..3].copy_from_slice(x);
+                    for (band, pair) in row[3..].chunks_exact_mut(6).enumerate() {
+                        let frequency = (1u32 << band) as f32;
+                        for axis in 0..3 {
+                            (pair[axis], pair[3 + axis]) = (x[axis] * frequency).sin_cos();
+                        }
+                    }
+                }
+            }
+            Self::Point(grid) => grid.encode(table, &at.point, features),
+            Self::Surface(grid) => grid.encode(table, &at.surface, features),
+        }
+    }
+
+    /// Adds the gradient of the table.
+    pub fn encode_backward(&self, at: &Coordinates, d_features: &[f32], d_table: &mut [f32]) {
+        match self {
+            Self::Frequency => {}
+            Self::Point(grid) => grid.encode_backward(&at.point, d_features, d_table),
+            Self::Surface(grid) => grid.encode_backward(&at.surface, d_features, d_table),
+        }
+    }
+
+    /// Gradients of x̂, or of v̂ and d, in normalised metres.
+    pub fn encode_backward_points(
+        &self,
+        table: &[f32],
+        at: &Coordinates,
+        d_features: &[f32],
+        region: &Aabb,
+    ) -> Vec<(Vec3, f32)> {
+        let per_metre = (region.max - region.min).recip();
+        match self {
+            Self::Frequency => at
+                .point
+                .iter()
+                .zip(d_features.chunks_exact(self.num_features()))
+                .map(|(x, d_row)| {
+                    let mut d = Vec3::from_slice(d_row);
+                    for (band, pair) in d_row[3..].chunks_exact(6).enumerate() {
+                        let frequency = (1u32 << band) as f32;
+                        for axis in 0..3 {
+                            let (sin, cos) = (x[axis] * frequency).sin_cos();
+                            d[axis] += frequency * (cos * pair[axis] - sin * pair[3 + axis]);
+                        }
+                    }
+                    (d, 0.0)
+                })
+                .collect(),
+            Self::Point(grid) => {
+                let mut d = vec![[0.0; 3]; at.point.len()];
+                grid.encode_backward_points(table, &at.point, d_features, &mut d);
+                d.into_iter().map(|d| (Vec3::from_array(d) * per_metre, 0.0)).collect()
+            }
+            Self::Surface(grid) => {
+                let mut d = vec![[0.0; 4]; at.surface.len()];
+                grid.encode_backward_points(table, &at.surface, d_features, &mut d);
+                let per_distance = 1.0 / (DISTANCE.1 - DISTANCE.0);
+                d.into_iter().map(|[x, y, z, w]| (Vec3::new(x, y, z) * per_metre, w * per_distance)).collect()
+            }
+        }
+    }
+}
+
+/// Where samples are encoded; one of the two is filled.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Coordinates {
+    pub point: Vec<[f32; 3]>,
+    pub surface: Vec<[f32; 4]>,
+}
+
+impl Coordinates {
+    pub fn extend(&mut self, other: &Self) {
+        self.point.extend_from_slice(&other.point);
+        self.surface.extend_from_slice(&other.surface);
+    }
+
+    pub fn clear(&mut self) {
+        self.point.clear();
+        self.surface.clear();
+    }
+}
+
+fn in_box(x: Vec3, region: &Aabb) -> Vec3 {
+    (x - region.min) / (region.max - region.min)
+}
+
+/// [v̂, d] in the unit box.
+pub(crate) fn surface_coordinates(v: Vec3, d: f32, region: &Aabb) -> [f32; 4] {
+    let p = in_box(v, region);
+    [p.x, p.y, p.z, (d.clamp(DISTANCE.0, DISTANCE.1) - DISTANCE.0) / (DISTANCE.1 - DISTANCE.0)]
+}
+
+/// Whether d takes part: beyond the clamp its gradient is zero.
+pub(crate) fn distance_is_inside(d: f32) -> bool {
+    d > DISTANCE.0 && d < DISTANCE.1
+}

@@ -1,0 +1,48 @@
+//! What can go wrong outside the caller's control.
+
+use std::path::PathBuf;
+
+use crate::config::ConfigError;
+use crate::data::DataError;
+
+/// Any failure of preparing, training, saving or evaluating.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// A value of the configuration.
+    #[error(transparent)]
+    Config(#[from] ConfigError),
+    /// A capture.
+    #[error(transparent)]
+    Data(#[from] DataError),
+    /// The body model.
+    #[error(transparent)]
+    Body(#[from] smpl::Error),
+    /// The canonical or a posed mesh, as a set of points.
+    #[error("surface query: {0}")]
+    Surface(#[from] surface_query::Error),
+    /// The canonical or a posed mesh, as something rays hit.
+    #[error("ray casting: {0}")]
+    Visibility(#[from] visibility::Error),
+    /// The encoding.
+    #[error("hash grid: {0}")]
+    HashGrid(#[from] hashgrid::Error),
+    /// A capture that cannot be trained on.
+    #[error("scene: {0}")]
+    Scene(String),
+    /// A file that cannot be read or written.
+    #[error("{}: {source}", path.display())]
+    Io {
+        /// Which file.
+        path: PathBuf,
+        /// Why not.
+        source: std::io::Error,
+    },
+    /// A file that does not hold what it should.
+    #[error("{}: {what}", path.display())]
+    File {
+        /// Which file.
+        path: PathBuf,
+        /// Key, expected and actual.
+        what: String,
+    },
+}

@@ -1,0 +1,168 @@
+//! Scores of a trained person against pictures that training never saw.
+
+use std::time::Instant;
+
+use glam::Vec3;
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+use visibility::RayMesh;
+use volrender::metrics;
+
+use crate::Error;
+use crate::pixels::Label;
+use crate::render::{Renderer, Rendering};
+use crate::scene::{PreparedFrame, Scene};
+
+/// Opacity above which the paper counts a pixel as rendered.
+const VISIBLE: f32 = 0.001;
+/// Fewer hidden pixels than this in a frame give no figure for it: one pixel would weigh as much as a whole side.
+const MIN_HIDDEN_PIXELS: usize = 16;
+
+/// Scores of one picture; `None` where the set of pixels is empty.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct FrameMetrics {
+    /// Of the frame.
+    pub name: String,
+    /// Of the camera.
+    pub camera: String,
+    /// Over pixels whose predicted opacity is above 0.001, the paper's definition.
+    pub psnr_vis: Option<f64>,
+    /// The same pixels.
+    pub ssim_vis: Option<f64>,
+    /// Over the true subject's pixels.
+    pub psnr_mask: Option<f64>,
+    /// The same pixels.
+    pub ssim_mask: Option<f64>,
+    /// Over the subject's pixels on the quartile of vertices that the training video showed least.
+    pub psnr_hidden: Option<f64>,
+    /// The whole image.
+    pub psnr_full: f64,
+    /// The whole image.
+    pub ssim_full: Option<f64>,
+    /// Opacity above one half against the true mask.
+    pub mask_iou: f64,
+}
+
+/// Means over the pictures of a split.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct SplitMetrics {
+    /// Mean of the frames that have it, as all below.
+    pub psnr_vis: Option<f64>,
+    /// Mean.
+    pub ssim_vis: Option<f64>,
+    /// Mean.
+    pub psnr_mask: Option<f64>,
+    /// Mean.
+    pub ssim_mask: Option<f64>,
+    /// Mean.
+    pub psnr_hidden: Option<f64>,
+    /// Mean.
+    pub psnr_full: Option<f64>,
+    /// Mean.
+    pub ssim_full: Option<f64>,
+    /// Not measured without weights.
+    pub lpips_full: Option<f64>,
+    /// Mean.
+    pub mask_iou: Option<f64>,
+    /// Wall clock.
+    pub render_seconds_per_frame: f64,
+    /// Each picture.
+    pub frames: Vec<FrameMetrics>,
+}
+
+/// The vertices that the training video showed least: a quarter of them, ties by lower index.
+pub fn least_seen_quartile(scene: &Scene) -> Result<Vec<bool>, Error> {
+    let frequencies = scene.vertex_frequencies()?;
+    let mut order: Vec<usize> = (0..frequencies.len()).collect();
+    order.sort_by_key(|&v| (frequencies[v], v));
+    let mut least = vec![false; frequencies.len()];
+    order[..frequencies.len() / 4].iter().for_each(|&v| least[v] = true);
+    Ok(least)
+}
+
+/// Renders `frames` over black and scores them; `progress` hears of each finished picture.
+pub fn evaluate(
+    scene: &Scene,
+    renderer: &mut dyn Renderer,
+    frames: &[&PreparedFrame],
+    mut progress: impl FnMut(&PreparedFrame, &Rendering),
+) -> Result<SplitMetrics, Error> {
+    let least = least_seen_quartile(scene)?;
+    let (mut scores, mut seconds) = (Vec::new(), 0.0);
+    for frame in frames {
+        let start = Instant::now();
+        let mut rendering = renderer.render(frame, Vec3::ZERO)?;
+        seconds += start.elapsed().as_secs_f64();
+        progress(frame, &rendering);
+        let hidden = hidden_pixels(scene, frame, &least)?;
+        // What a training image does not show cannot be scored.
+        for (i, label) in frame.labels.iter().enumerate() {
+            if *label == Label::Unknown {
+                let truth = &frame.pixels[3 * i..3 * i + 3];
+                rendering.image.pixels[3 * i..3 * i + 3].copy_from_slice(truth);
+                rendering.opacity[i] = 0.0;
+            }
+        }
+        scores.push(score(frame, &rendering, &hidden));
+    }
+    let mean = |pick: &dyn Fn(&FrameMetrics) -> Option<f64>| {
+        let values: Vec<f64> = scores.iter().filter_map(pick).filter(|v| v.is_finite()).collect();
+        (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
+    };
+    Ok(SplitMetrics {
+        psnr_vis: mean(&|f| f.psnr_vis),
+        ssim_vis: mean(&|f| f.ssim_vis),
+        psnr_mask: mean(&|f| f.psnr_mask),
+        ssim_mask: mean(&|f| f.ssim_mask),
+        psnr_hidden: mean(&|f| f.psnr_hidden),
+        psnr_full: mean(&|f| Some(f.psnr_full)),
+        ssim_full: mean(&|f| f.ssim_full),
+        lpips_full: None,
+        mask_iou: mean(&|f| Some(f.mask_iou)),
+        render_seconds_per_frame: seconds / frames.len().max(1) as f64,
+        frames: scores,
+    })
+}
+
+fn score(frame: &PreparedFrame, rendering: &Rendering, hidden: &[bool]) -> FrameMetrics {
+    let (a, b) = (&rendering.image.pixels[..], &frame.pixels[..]);
+    let (width, height) = (frame.camera.width as usize, frame.camera.height as usize);
+    let visible: Vec<bool> = rendering.opacity.iter().map(|&o| o > VISIBLE).collect();
+    let mask: Vec<bool> = frame.mask.iter().map(|&m| m > 0.5).collect();
+    let solid: Vec<bool> = rendering.opacity.iter().map(|&o| o > 0.5).collect();
+    let count = |f: &dyn Fn(bool, bool) -> bool| solid.iter().zip(&mask).filter(|(s, m)| f(**s, **m)).count();
+    let union = count(&|s, m| s || m);
+    let hidden: Vec<bool> = hidden.iter().zip(&mask).map(|(&h, &m)| h && m).collect();
+    let enough = hidden.iter().filter(|h| **h).count() >= MIN_HIDDEN_PIXELS;
+    FrameMetrics {
+        name: frame.name.clone(),
+        camera: frame.camera_name.clone(),
+        psnr_vis: metrics::psnr_masked(a, b, &visible),
+        ssim_vis: metrics::ssim_masked(a, b, &visible, width, height),
+        psnr_mask: metrics::psnr_masked(a, b, &mask),
+        ssim_mask: metrics::ssim_masked(a, b, &mask, width, height),
+        psnr_hidden: if enough { metrics::psnr_masked(a, b, &hidden) } else { None },
+        psnr_full: metrics::psnr(a, b),
+        ssim_full: metrics::ssim(a, b, width, height).ok(),
+        mask_iou: if union == 0 { 1.0 } else { count(&|s, m| s && m) as f64 / union as f64 },
+    }
+}
+
+/// Pixels (H × W) whose first hit on the posed prior is nearest to a vertex of `least`.
+fn hidden_pixels(scene: &Scene, frame: &PreparedFrame, least: &[bool]) -> Result<Vec<bool>, Error> {
+    let mesh = RayMesh::new(&frame.posed.vertices, &scene.model.faces)?;
+    let width = frame.camera.width as usize;
+    let nearest = |i: usize| {
+        if frame.mask[i] <= 0.5 {
+            return false;
+        }
+        let ray = frame.camera.ray((i % width) as f32 + 0.5, (i / width) as f32 + 0.5);
+        mesh.first_hit(ray.origin, ray.direction).is_some_and(|hit| {
+            let corners = scene.model.faces[hit.face as usize];
+            let [a, b, c] = hit.barycentric;
+            let corner = if a >= b && a >= c { 0 } else if b >= c { 1 } else { 2 };
+            least[corners[corner] as usize]
+        })
+    };
+    Ok((0..width * frame.camera.height as usize).into_par_iter().map(nearest).collect())
+}

@@ -1,0 +1,340 @@
+//! The field F: [point term ‖ surface term] → density and colour, forward and backward over a group of rays.
+
+use glam::Vec3;
+use visibility::VisibilityCounts;
+use volrender::Aabb;
+
+use crate::Error;
+use crate::config::{Config, Method};
+use crate::encoder::{Coordinates, Encoder};
+use crate::gemm::LANES;
+use crate::mlp::{Activations, Mlp};
+use crate::samples::Samples;
+
+/// Samples that pass through the perceptron together; their activations fit a second-level cache.
+const BLOCK: usize = 256;
+/// Outputs of the head: raw density, raw red, green, blue.
+const OUTPUTS: usize = 4;
+
+/// Shape of the field; its parameters are the caller's.
+#[derive(Clone, Debug)]
+pub(crate) struct Field {
+    pub encoder: Encoder,
+    pub mlp: Mlp,
+    /// Whether the input has a surface term.
+    pub surface_term: bool,
+    attention: bool,
+    density_scale: f32,
+    /// Bias at d ≤ 0 and its change per metre up to the reach.
+    density_bias: (f32, f32),
+    reach: f32,
+    region: Aabb,
+}
+
+/// A group's samples with everything that its backward pass needs.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Group {
+    pub samples: Samples,
+    pub at: Coordinates,
+    /// Attention of each neighbour of each sample.
+    attention: Vec<f32>,
+    features: Vec<f32>,
+    blocks: Vec<Activations>,
+    /// Activated density and colour of each sample.
+    pub sigma: Vec<f32>,
+    pub rgb: Vec<Vec3>,
+    /// Cotangents, filled by the caller.
+    pub d_sigma: Vec<f32>,
+    pub d_rgb: Vec<Vec3>,
+    pub d_likelihood: Vec<f32>,
+    /// Gradient of the point term's features, N × F.
+    pub d_features: Vec<f32>,
+    /// Gradient of d through the density's bias.
+    pub d_distance: Vec<f32>,
+    d_output: Vec<f32>,
+    d_input: Vec<f32>,
+}
+
+impl Field {
+    pub fn new(config: &Config, region: Aabb) -> Result<Self, Error> {
+        let encoder = Encoder::new(config)?;
+        let surface_term = config.method == Method::Occnerf && config.surface.surface_term;
+        let inputs = encoder.num_features() * (1 + usize::from(surface_term));
+        let reach = config.motion.margin + config.motion.falloff;
+        let slope = (config.field.density_bias_outside - config.field.density_bias) / reach;
+        Ok(Self {
+            mlp: Mlp::new(inputs, &vec![config.field.width; config.field.depth], OUTPUTS),
+            encoder,
+            surface_term,
+            attention: config.surface.attention,
+            density_scale: config.field.density_scale,
+            density_bias: (config.field.density_bias, slope),
+            reach,
+            region,
+        })
+    }
+
+    /// Density and colour of every sample of the group. `vertex_features` (V × F) is read if there is a surface term.
+    pub fn forward(
+        &self,
+        mlp: &[f32],
+        table: &[f32],
+        vertex_features: &[f32],
+        counts: &VisibilityCounts,
+        group: &mut Group,
+    ) {
+        let (n, width) = (group.samples.len(), self.encoder.num_features());
+        self.encoder.coordinates(&group.samples, &self.region, &mut group.at);
+        group.features.resize(n * width, 0.0);
+        self.encoder.encode(table, &group.at, &mut group.features);
+        self.attend(counts, group);
+        group.sigma.resize(n, 0.0);
+        group.rgb.resize(n, Vec3::ZERO);
+        group.blocks.resize_with(n.div_ceil(BLOCK).max(group.blocks.len()), Activations::default);
+        let row = self.mlp.input_width();
+        let per_sample = group.attention.len().checked_div(n).unwrap_or(0);
+        for block in 0..n.div_ceil(BLOCK) {
+            let range = block * BLOCK..((block + 1) * BLOCK).min(n);
+            let activations = &mut group.blocks[block];
+            self.mlp.resize(activations, range.len());
+            for (s, input) in range.clone().zip(activations.layers[0].chunks_exact_mut(row)) {
+                input[..width].copy_from_slice(&group.features[s * width..][..width]);
+                input[width..].fill(0.0);
+            }
+            if self.surface_term {
+                let range = range.start * per_sample..range.end * per_sample;
+                let neighbours = &group.samples.neighbours[range.clone()];
+                let (attention, input) = (&group.attention[range], &mut activations.layers[0]);
+                let mix = Mix { width, per_sample, neighbours, attention, row };
+                pulp::Arch::new().dispatch(Gather { mix, rows: vertex_features, input });
+            }
+            self.mlp.forward(mlp, activations, range.len());
+            let outputs = activations.layers[activations.layers.len() - 1].chunks_exact(LANES);
+            for (s, raw) in range.zip(outputs) {
+                group.sigma[s] = self.density_scale * softplus(raw[0] + self.bias(group.samples.distance[s]));
+                group.rgb[s] = Vec3::new(sigmoid(raw[1]), sigmoid(raw[2]), sigmoid(raw[3]));
+            }
+        }
+    }
+
+    /// Backward of [`Field::forward`] from `d_sigma` and `d_rgb`: accumulates into `d_mlp` and `d_vertices` (V × F),
+    /// overwrites `d_features` and `d_distance` of the group.
+    pub fn backward(&self, transposed: &[f32], group: &mut Group, d_mlp: &mut [f32], d_vertices: &mut [f32]) {
+        let (n, width) = (group.samples.len(), self.encoder.num_features());
+        let row = self.mlp.input_width();
+        let per_sample = group.attention.len().checked_div(n).unwrap_or(0);
+        group.d_features.resize(n * width, 0.0);
+        group.d_distance.resize(n, 0.0);
+        for block in 0..n.div_ceil(BLOCK) {
+            let range = block * BLOCK..((block + 1) * BLOCK).min(n);
+            let activations = &group.blocks[block];
+            let outputs = activations.layers[activations.layers.len() - 1].chunks_exact(LANES);
+            group.d_output.clear();
+            group.d_output.resize(range.len() * LANES, 0.0);
+            for ((s, raw), d_raw) in range.clone().zip(outputs).zip(group.d_output.chunks_exact_mut(LANES)) {
+                let distance = group.samples.distance[s];
+                d_raw[0] = group.d_sigma[s] * self.density_scale * sigmoid(raw[0] + self.bias(distance));
+                let slopes = distance > 0.0 && distance < self.reach;
+                group.d_distance[s] = if slopes { d_raw[0] * self.density_bias.1 } else { 0.0 };
+                let (rgb, d_rgb) = (group.rgb[s], group.d_rgb[s]);
+                (d_rgb * rgb * (Vec3::ONE - rgb)).write_to_slice(&mut d_raw[1..4]);
+            }
+            let (d_output, d_input) = (&mut group.d_output, &mut group.d_input);
+            self.mlp.backward(transposed, activations, range.len(), d_output, d_input, d_mlp);
+            for (s, d_row) in range.clone().zip(d_input.chunks_exact(row)) {
+                group.d_features[s * width..][..width].copy_from_slice(&d_row[..width]);
+            }
+            if self.surface_term {
+                let range = range.start * per_sample..range.end * per_sample;
+                let neighbours = &group.samples.neighbours[range.clone()];
+                let attention = &group.attention[range];
+                let mix = Mix { width, per_sample, neighbours, attention, row };
+                pulp::Arch::new().dispatch(Scatter { mix, d_rows: d_vertices, d_input });
+            }
+        }
+    }
+
+    /// a_i / Σ a over the neighbours of each sample.
+    fn attend(&self, counts: &VisibilityCounts, group: &mut Group) {
+        group.attention.clear();
+        if !self.surface_term {
+            return;
+        }
+        let total = group.samples.neighbours.len();
+        let per_sample = total.checked_div(group.samples.len()).unwrap_or(1).max(1);
+        group.attention.resize(total, 1.0 / per_sample as f32);
+        if self.attention {
+            let rows = group.samples.neighbours.chunks_exact(per_sample);
+            for (neighbours, out) in rows.zip(group.attention.chunks_exact_mut(per_sample)) {
+                counts.attention(neighbours, out);
+            }
+        }
+    }
+
+    fn bias(&self, distance: f32) -> f32 {
+        self.density_bias.0 + self.density_bias.1 * distance.clamp(0.0, self.reach)
+    }
+}
+
+/// Which rows each sample mixes, and where the mix stands in its input row: after the point term.
+struct Mix<'a> {
+    width: usize,
+    per_sample: usize,
+    neighbours: &'a [u32],
+    attention: &'a [f32],
+    row: usize,
+}
+
+/// Adds Σ a_i · row i to the surface term of each input row.
+struct Gather<'a> {
+    mix: Mix<'a>,
+    rows: &'a [f32],
+    input: &'a mut [f32],
+}
+
+impl pulp::WithSimd for Gather<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: pulp::Simd>(self, _: S) {
+        let Mix { width, per_sample, neighbours, attention, row } = self.mix;
+        let each = neighbours.chunks_exact(per_sample).zip(attention.chunks_exact(per_sample));
+        for ((neighbours, attention), input) in each.zip(self.input.chunks_exact_mut(row)) {
+            let out = &mut input[width..2 * width];
+            for (&v, &a) in neighbours.iter().zip(attention) {
+                let from = &self.rows[v as usize * width..][..width];
+                for (out, &x) in out.iter_mut().zip(from) {
+                    *out = a.mul_add(x, *out);
+                }
+            }
+        }
+    }
+}
+
+/// Transpose of [`Gather`].
+struct Scatter<'a> {
+    mix: Mix<'a>,
+    d_rows: &'a mut [f32],
+    d_input: &'a [f32],
+}
+
+impl pulp::WithSimd for Scatter<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: pulp::Simd>(self, _: S) {
+        let Mix { width, per_sample, neighbours, attention, row } = self.mix;
+        let each = neighbours.chunks_exact(per_sample).zip(attention.chunks_exact(per_sample));
+        for ((neighbours, attention), d_input) in each.zip(self.d_input.chunks_exact(row)) {
+            let from = &d_input[width..2 * width];
+            for (&v, &a) in neighbours.iter().zip(attention) {
+                let d_row = &mut self.d_rows[v as usize * width..][..width];
+                for (d, &x) in d_row.iter_mut().zip(from) {
+                    *d = a.mul_add(x, *d);
+                }
+            }
+        }
+    }
+}
+
+/// ln(1 + eˣ) without overflow.
+fn softplus(x: f32) -> f32 {
+    x.max(0.0) + (-x.abs()).exp().ln_1p()
+}
+
+fn sigmoid(x: f32) -> f32 {
+    1.0 / (1.0 + (-x).exp())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::Preset;
+    use crate::random::Stream;
+
+    #[test]
+    fn softplus_and_sigmoid_stay_finite_and_agree_with_each_other() {
+        for x in [-1e30, -200.0, -3.0f32, -0.1, 0.0, 0.1, 3.0, 200.0] {
+            assert!(softplus(x).is_finite() && sigmoid(x).is_finite());
+            let (x, h) = (f64::from(x), 1e-4);
+            let exact = |x: f64| x.max(0.0) + (-x.abs()).exp().ln_1p();
+            let slope = (exact(x + h) - exact(x - h)) / (2.0 * h);
+            assert!((slope - f64::from(sigmoid(x as f32))).abs() < 1e-5);
+        }
+    }
+
+    fn group(n: usize, vertices: usize, per_sample: usize, random: &mut Stream) -> Group {
+        let mut group = Group::default();
+        let s = &mut group.samples;
+        for _ in 0..n {
+            s.t.push(1.0);
+            s.canonical.push(Vec3::new(random.uniform(), random.uniform(), random.uniform()));
+            s.closest.push(Vec3::new(random.uniform(), random.uniform(), random.uniform()));
+            s.distance.push(random.uniform() * 0.06 + 0.005);
+            s.neighbours.extend((0..per_sample).map(|_| random.below(vertices) as u32));
+        }
+        group
+    }
+
+    /// Every parameter group of every method at once, along random directions.
+    #[test]
+    fn gradients_of_weights_table_vertices_and_bias_agree_with_central_differences() {
+        let region = Aabb { min: Vec3::splat(-0.1), max: Vec3::splat(1.1) };
+        for method in [Method::Occnerf, Method::HashPoint, Method::Humannerf] {
+            let mut config = Config::preset(Preset::Fast, method);
+            (config.field.width, config.field.depth) = (20, 2);
+            (config.encoding.levels, config.encoding.n_max, config.encoding.log2_table_size) = (3, 20, 10);
+            let field = Field::new(&config, region).unwrap();
+            let mut random = Stream::new(&[3, method as u64]);
+            let (n, vertices) = (40, 12);
+            let mut group = group(n, vertices, 20, &mut random);
+            let mut counts = VisibilityCounts::new(vertices);
+            counts.add(&[1, 1, 1, 5, 7, 7]);
+            let width = field.encoder.num_features();
+            let mlp = field.mlp.initial(1);
+            let normal = |n: usize, random: &mut Stream| (0..n).map(|_| random.normal()).collect::<Vec<f32>>();
+            let table: Vec<f32> = normal(field.encoder.num_parameters(), &mut random);
+            let features = normal(vertices * width, &mut random);
+            let (c_sigma, c_rgb) = (normal(n, &mut random), normal(3 * n, &mut random));
+            let value = |group: &mut Group, mlp: &[f32], table: &[f32], features: &[f32]| -> f64 {
+                field.forward(mlp, table, features, &counts, group);
+                let sigma = group.sigma.iter().zip(&c_sigma).map(|(s, c)| f64::from(s * c) * 0.04);
+                let rgb = group.rgb.iter().zip(c_rgb.chunks(3)).map(|(s, c)| f64::from(s.dot(Vec3::from_slice(c))));
+                sigma.chain(rgb).sum()
+            };
+            value(&mut group, &mlp, &table, &features);
+            group.d_sigma = c_sigma.iter().map(|c| c * 0.04).collect();
+            group.d_rgb = c_rgb.chunks(3).map(Vec3::from_slice).collect();
+            let (mut transposed, mut d_mlp) = (Vec::new(), vec![0.0; mlp.len()]);
+            field.mlp.transposed_weights(&mlp, &mut transposed);
+            let mut d_features = vec![0.0; features.len()];
+            field.backward(&transposed, &mut group, &mut d_mlp, &mut d_features);
+            field.mlp.clear_padding(&mut d_mlp);
+            let mut d_table = vec![0.0; table.len()];
+            field.encoder.encode_backward(&group.at, &group.d_features, &mut d_table);
+            for direction in 0..6 {
+                let mut random = Stream::new(&[17, direction]);
+                let mut u_mlp = normal(mlp.len(), &mut random);
+                field.mlp.clear_padding(&mut u_mlp);
+                let (u_table, u_features) = (normal(table.len(), &mut random), normal(features.len(), &mut random));
+                let parts: [(&[f32], &[f32]); 3] =
+                    [(&d_mlp, &u_mlp), (&d_table, &u_table), (&d_features, &u_features)];
+                for part in 0..3 {
+                    let dot = parts[part].0.iter().zip(parts[part].1).map(|(a, b)| f64::from(a * b)).sum::<f64>();
+                    let mut at = |h: f32| {
+                        let moved = |which: usize, x: &[f32], u: &[f32]| -> Vec<f32> {
+                            x.iter().zip(u).map(|(x, u)| x + if which == part { h * u } else { 0.0 }).collect()
+                        };
+                        let (m, t) = (moved(0, &mlp, &u_mlp), moved(1, &table, &u_table));
+                        value(&mut group, &m, &t, &moved(2, &features, &u_features))
+                    };
+                    let h = 2e-4;
+                    let numeric = (at(h) - at(-h)) / (2.0 * f64::from(h));
+                    // Some ReLU of some sample switches within any step; their share of the derivative is small.
+                    let scale = 0.03 * dot.abs().max(1.0);
+                    assert!((numeric - dot).abs() < scale, "{method:?} part {part}: {numeric} {dot}");
+                }
+            }
+        }
+    }
+}

@@ -1,0 +1,62 @@
+//! Rendering humans from object-occluded monocular videos (OccNeRF, ICCV 2023), on a CPU.
+//!
+//! A video of a moving person, partly hidden behind objects, with a body model fitted to each frame, becomes a field
+//! of density and colour in the body's rest pose that renders from any side.
+//!
+//! ```
+//! use occnerf::{Config, Method, Preset, Scene, Trainer, data};
+//!
+//! # fn main() -> Result<(), Box<dyn std::error::Error>> {
+//! let body = smpl::BodyModel::embedded();
+//! let demo = data::DemoConfig { size: 48, frames: 4, eval_cameras: 1, ..data::DemoConfig::default() };
+//! let capture = data::demo(&demo, &body)?;
+//! let mut config = Config::preset(Preset::Fast, Method::Occnerf);
+//! config.steps = 2;
+//! let scene = Scene::new(&capture, &body, &config)?;
+//! let mut trainer = Trainer::new(&scene, config)?;
+//! let first = trainer.step();
+//! assert!(first.loss.is_finite() && first.live_samples > 0);
+//! # Ok(())
+//! # }
+//! ```
+//!
+//! # Conventions
+//! Right-handed, OpenCV cameras, pixel centres at integer + 0.5, sRGB in [0, 1]. Inside, lengths are divided by the
+//! canonical body's height / 1.7 m, so that a capture in centimetres trains the same. The same seed and inputs give
+//! the same bits on one instruction set, whatever the number of threads, and so does resuming from a checkpoint.
+
+mod adam;
+mod batch;
+mod checkpoint;
+mod config;
+pub mod data;
+mod encoder;
+mod error;
+mod evaluate;
+mod field;
+mod gemm;
+mod loss;
+mod mlp;
+mod occupancy;
+mod parameters;
+mod pixels;
+mod prior;
+mod random;
+mod render;
+mod samples;
+mod scene;
+mod trainer;
+mod vertices;
+
+pub use checkpoint::checkpoint_config;
+pub use config::{
+    Component, Config, ConfigError, DistanceKind, EncodingConfig, FieldConfig, LossConfig, Method, MotionConfig,
+    MotionKind, OccludedRule, Preset, RateConfig, SurfaceConfig,
+};
+pub use error::Error;
+pub use evaluate::{FrameMetrics, SplitMetrics, evaluate, least_seen_quartile};
+pub use pixels::{Label, label_pixels};
+pub use prior::VertexColors;
+pub use render::{FieldRenderer, PriorRenderer, Renderer, Rendering, view_of};
+pub use scene::{PreparedFrame, Scene};
+pub use trainer::{StepReport, Trainer};

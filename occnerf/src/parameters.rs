@@ -1,0 +1,73 @@
+//! The learnable arrays and their optimisers, in the paper's groups.
+
+use crate::adam::Adam;
+use crate::config::{Config, RateConfig};
+use crate::field::Field;
+
+/// A parameter group.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Part {
+    /// The perceptron F.
+    Field,
+    /// The hash table.
+    Table,
+    /// Offsets of the vertices, V × 3.
+    Vertices,
+    /// Log-weights of the motion volume.
+    Motion,
+}
+
+/// Every group with its name in checkpoints.
+pub(crate) const PARTS: [(Part, &str); 4] =
+    [(Part::Field, "field"), (Part::Table, "table"), (Part::Vertices, "vertices"), (Part::Motion, "motion")];
+
+/// Values, gradients and moments of every group.
+#[derive(Clone, Debug)]
+pub(crate) struct Parameters {
+    values: [Vec<f32>; 4],
+    gradients: [Vec<f32>; 4],
+    pub optimisers: [Adam; 4],
+}
+
+impl Parameters {
+    pub fn new(config: &Config, field: &Field, vertices: usize, motion: usize) -> Self {
+        let vertices = if field.surface_term { 3 * vertices } else { 0 };
+        let values = [
+            field.mlp.initial(config.seed),
+            field.encoder.initial_table(config.seed),
+            vec![0.0; vertices],
+            vec![0.0; motion],
+        ];
+        let gradients = values.clone().map(|v| vec![0.0; v.len()]);
+        let optimisers = [0, 1, 2, 3].map(|part: usize| Adam::new(values[part].len()));
+        Self { values, gradients, optimisers }
+    }
+
+    pub fn get(&self, part: Part) -> &[f32] {
+        &self.values[part as usize]
+    }
+
+    pub fn get_mut(&mut self, part: Part) -> &mut Vec<f32> {
+        &mut self.values[part as usize]
+    }
+
+    pub fn gradient(&mut self, part: Part) -> &mut [f32] {
+        &mut self.gradients[part as usize]
+    }
+
+    /// Values of one group and the gradient of another.
+    pub fn value_and_gradient(&mut self, value: Part, gradient: Part) -> (&[f32], &mut [f32]) {
+        (&self.values[value as usize], &mut self.gradients[gradient as usize])
+    }
+
+    pub fn clear_gradients(&mut self) {
+        self.gradients.iter_mut().for_each(|g| g.fill(0.0));
+    }
+
+    /// One Adam step of every group at its rate times `decay`; returns how many gradients were not finite.
+    pub fn step(&mut self, rates: &RateConfig, decay: f32) -> usize {
+        let each = [rates.field, rates.table, rates.vertices, rates.motion];
+        let groups = self.values.iter_mut().zip(&self.gradients).zip(&mut self.optimisers);
+        groups.zip(each).map(|(((v, g), adam), rate)| adam.step(rate * decay, rates.beta_2, v, g)).sum()
+    }
+}

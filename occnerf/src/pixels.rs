@@ -1,0 +1,176 @@
+//! What is known of each pixel of a training image: subject, background, or nothing.
+
+use crate::config::OccludedRule;
+
+/// A pixel of a training frame.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Label {
+    /// The mask shows the subject here.
+    Subject,
+    /// The subject is certainly not here.
+    Background,
+    /// Something stands in front: the subject may or may not be behind it.
+    Unknown,
+}
+
+/// Width below which a piece of silhouette outside the mask is taken for misregistration of the prior, metres.
+const SLIVER: f32 = 0.03;
+/// Thickness of clothes that an occluder may hide beyond the prior's silhouette, metres.
+const CLOTHES: f32 = 0.04;
+
+/// Labels the pixels of a frame of `width` × H pixels.
+///
+/// `mask`: subject coverage; `silhouette`: pixels that the posed prior covers; `occluder`: known occluder pixels;
+/// `pixels_per_metre`: image scale at the subject's depth. With a known occluder its pixels are unknown; else the
+/// silhouette outside the mask, opened by 3 cm and dilated by 4 cm.
+pub fn label_pixels(
+    rule: OccludedRule,
+    mask: &[f32],
+    silhouette: &[bool],
+    occluder: Option<&[bool]>,
+    width: usize,
+    pixels_per_metre: f32,
+) -> Vec<Label> {
+    assert_eq!(mask.len(), silhouette.len());
+    let subject: Vec<bool> = mask.iter().map(|&m| m > 0.5).collect();
+    let unknown: Vec<bool> = match (rule, occluder) {
+        (OccludedRule::Background, _) => vec![false; mask.len()],
+        (OccludedRule::Unknown, Some(occluder)) => occluder.to_vec(),
+        (OccludedRule::Unknown, None) => {
+            let missing: Vec<bool> = silhouette.iter().zip(&subject).map(|(&s, &m)| s && !m).collect();
+            let radius = 0.5 * SLIVER * pixels_per_metre;
+            let opened = dilate(&erode(&missing, width, radius), width, radius);
+            dilate(&opened, width, CLOTHES * pixels_per_metre)
+        }
+    };
+    subject
+        .iter()
+        .zip(unknown)
+        .map(|(&subject, unknown)| match (subject, unknown) {
+            (true, _) => Label::Subject,
+            (false, true) => Label::Unknown,
+            (false, false) => Label::Background,
+        })
+        .collect()
+}
+
+fn dilate(set: &[bool], width: usize, radius: f32) -> Vec<bool> {
+    squared_distance(set, width).iter().map(|&d| d <= radius * radius).collect()
+}
+
+/// Beyond the image nothing is known, so the border does not erode.
+fn erode(set: &[bool], width: usize, radius: f32) -> Vec<bool> {
+    let unset: Vec<bool> = set.iter().map(|s| !s).collect();
+    squared_distance(&unset, width).iter().map(|&d| d > radius * radius).collect()
+}
+
+/// Squared distance in pixels to the nearest set pixel, infinite where there is none (Felzenszwalb and
+/// Huttenlocher 2012: lower envelopes of parabolas, along columns, then rows).
+fn squared_distance(set: &[bool], width: usize) -> Vec<f32> {
+    let height = set.len().checked_div(width).unwrap_or(0);
+    let mut field: Vec<f32> = set.iter().map(|&s| if s { 0.0 } else { f32::INFINITY }).collect();
+    let mut line = vec![0.0; width.max(height)];
+    for column in 0..width {
+        for row in 0..height {
+            line[row] = field[row * width + column];
+        }
+        for (row, d) in lower_envelope(&line[..height]).into_iter().enumerate() {
+            field[row * width + column] = d;
+        }
+    }
+    for row in field.chunks_exact_mut(width.max(1)) {
+        let transformed = lower_envelope(row);
+        row.copy_from_slice(&transformed);
+    }
+    field
+}
+
+fn lower_envelope(f: &[f32]) -> Vec<f32> {
+    let mut parabolas: Vec<(usize, f32)> = Vec::with_capacity(f.len());
+    for (q, &value) in f.iter().enumerate().filter(|(_, v)| v.is_finite()) {
+        let mut from = f32::NEG_INFINITY;
+        while let Some(&(p, start)) = parabolas.last() {
+            let (pf, qf) = (p as f32, q as f32);
+            from = ((value + qf * qf) - (f[p] + pf * pf)) / (2.0 * (qf - pf));
+            if from > start {
+                break;
+            }
+            parabolas.pop();
+            from = f32::NEG_INFINITY;
+        }
+        parabolas.push((q, from));
+    }
+    let mut current = 0;
+    (0..f.len())
+        .map(|x| {
+            while current + 1 < parabolas.len() && parabolas[current + 1].1 < x as f32 {
+                current += 1;
+            }
+            parabolas.get(current).map_or(f32::INFINITY, |&(p, _)| {
+                let offset = x as f32 - p as f32;
+                offset * offset + f[p]
+            })
+        })
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(64))]
+
+        #[test]
+        fn distance_transform_equals_brute_force(
+            width in 1usize..12, height in 1usize..12, bits in prop::collection::vec(prop::bool::weighted(0.15), 144)
+        ) {
+            let set = &bits[..width * height];
+            let fast = squared_distance(set, width);
+            for (i, &d) in fast.iter().enumerate() {
+                let brute = (0..set.len()).filter(|&j| set[j]).map(|j| {
+                    let (x, y) = ((i % width) as f32 - (j % width) as f32, (i / width) as f32 - (j / width) as f32);
+                    x * x + y * y
+                }).fold(f32::INFINITY, f32::min);
+                prop_assert_eq!(d, brute);
+            }
+        }
+
+        #[test]
+        fn subject_pixels_are_never_unknown_and_background_rule_knows_everything(
+            mask in prop::collection::vec(0.0f32..1.0, 100), silhouette in prop::collection::vec(any::<bool>(), 100)
+        ) {
+            let unknown = label_pixels(OccludedRule::Unknown, &mask, &silhouette, None, 10, 100.0);
+            let background = label_pixels(OccludedRule::Background, &mask, &silhouette, None, 10, 100.0);
+            for i in 0..100 {
+                prop_assert_eq!(unknown[i] == Label::Subject, mask[i] > 0.5);
+                prop_assert!(background[i] != Label::Unknown);
+            }
+        }
+    }
+
+    /// A silhouette of 20 × 20 in 30 × 30 pixels at 1 cm a pixel, mask without its right half.
+    #[test]
+    fn hidden_half_is_unknown_and_a_thin_rim_is_background() {
+        let inside = |x: usize, y: usize| (5..25).contains(&x) && (5..25).contains(&y);
+        let silhouette: Vec<bool> = (0..900).map(|i| inside(i % 30, i / 30)).collect();
+        let hidden: Vec<f32> = (0..900).map(|i| f32::from(inside(i % 30, i / 30) && i % 30 < 15)).collect();
+        let labels = label_pixels(OccludedRule::Unknown, &hidden, &silhouette, None, 30, 100.0);
+        assert_eq!(labels[15 * 30 + 20], Label::Unknown);
+        assert_eq!(labels[15 * 30 + 27], Label::Unknown, "hidden clothes beyond the prior");
+        assert_eq!(labels[15 * 30 + 10], Label::Subject);
+        assert_eq!(labels[15 * 30 + 2], Label::Background, "visible outline keeps its background");
+        let rim: Vec<f32> = (0..900).map(|i| f32::from(inside(i % 30, i / 30) && i % 30 < 23)).collect();
+        let labels = label_pixels(OccludedRule::Unknown, &rim, &silhouette, None, 30, 100.0);
+        assert_eq!(labels[15 * 30 + 24], Label::Background, "misregistration is not occlusion");
+    }
+
+    #[test]
+    fn a_known_occluder_is_taken_as_it_is() {
+        let occluder = [true, false, true, false];
+        let labels =
+            label_pixels(OccludedRule::Unknown, &[1.0, 0.0, 0.0, 0.0], &[true; 4], Some(&occluder), 4, 1.0);
+        assert_eq!(labels, [Label::Subject, Label::Background, Label::Unknown, Label::Background]);
+    }
+}

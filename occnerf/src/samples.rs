@@ -1,0 +1,173 @@
+//! Live samples of rays: where a ray can meet the subject, and what the surface says of each point.
+
+use glam::{Affine3A, Vec3};
+use smpl::{Posed, SurfaceMotion, WeightVolume};
+use surface_query::MeshDistance;
+use volrender::Ray;
+
+use crate::Error;
+use crate::config::{Config, DistanceKind};
+use crate::occupancy::Occupancy;
+use crate::random::Stream;
+use crate::scene::Scene;
+
+/// Deepest point of a body that is looked up; no limb is 0.6 m thick.
+const DEPTH: f32 = 0.3;
+const CELL: f32 = 0.04;
+/// Σ w below which the weight volume says nothing.
+const VOLUME_THRESHOLD: f32 = 1e-3;
+
+/// A posed prior ready to be sampled; rebuilt in place for each frame.
+pub(crate) struct Stage {
+    mesh: MeshDistance,
+    pub occupancy: Occupancy,
+}
+
+impl Stage {
+    pub fn new(scene: &Scene) -> Result<Self, Error> {
+        let mesh = MeshDistance::new(&scene.canonical.vertices, &scene.model.faces)?;
+        Ok(Self { mesh, occupancy: Occupancy::default() })
+    }
+
+    pub fn set(&mut self, scene: &Scene, posed: &Posed, config: &Config) {
+        let reach = config.motion.margin + config.motion.falloff;
+        let (mesh, occupancy) = (&mut self.mesh, &mut self.occupancy);
+        rayon::join(
+            || mesh.refit(&posed.vertices),
+            || occupancy.rebuild(&posed.vertices, &scene.model.faces, reach, CELL),
+        );
+    }
+}
+
+/// Everything that tracing a ray reads.
+#[derive(Clone, Copy)]
+pub(crate) struct Tracer<'a> {
+    pub scene: &'a Scene,
+    pub config: &'a Config,
+    pub stage: &'a Stage,
+    pub posed: &'a Posed,
+    pub to_canonical: &'a [Affine3A],
+    pub volume: Option<&'a WeightVolume>,
+    /// Whether neighbours are wanted at all; the point-based methods do without unless v̂ is blended.
+    pub neighbours: bool,
+}
+
+/// Live samples of consecutive rays, structure of arrays.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Samples {
+    /// First sample of each ray, and the end of the last.
+    pub starts: Vec<usize>,
+    /// Depth along the ray.
+    pub t: Vec<f32>,
+    /// Width of the sample's bin.
+    pub delta: Vec<f32>,
+    /// Foreground likelihood f.
+    pub likelihood: Vec<f32>,
+    pub world: Vec<Vec3>,
+    /// x̂.
+    pub canonical: Vec<Vec3>,
+    /// v̂.
+    pub closest: Vec<Vec3>,
+    /// d.
+    pub distance: Vec<f32>,
+    /// All levels, finest first; empty where the tracer wants none.
+    pub neighbours: Vec<u32>,
+}
+
+impl Samples {
+    pub fn clear(&mut self) {
+        self.starts.clear();
+        self.starts.push(0);
+        self.t.clear();
+        self.delta.clear();
+        self.likelihood.clear();
+        self.world.clear();
+        self.canonical.clear();
+        self.closest.clear();
+        self.distance.clear();
+        self.neighbours.clear();
+    }
+
+    pub fn len(&self) -> usize {
+        self.t.len()
+    }
+
+    /// Appends the live samples of a ray; `jitter` places each sample in its bin, the middle without.
+    pub fn trace(&mut self, tracer: &Tracer<'_>, ray: &Ray, mut jitter: Option<Stream>) {
+        let bins = tracer.config.samples;
+        let span = tracer.stage.occupancy.region().and_then(|region| region.intersect(ray));
+        if let Some((near, far)) = span.filter(|(near, far)| far > near) {
+            let width = (far - near) / bins as f32;
+            for bin in 0..bins {
+                let place = jitter.as_mut().map_or(0.5, Stream::uniform);
+                let t = near + (bin as f32 + place) * width;
+                let point = ray.origin + t * ray.direction;
+                if tracer.stage.occupancy.is_live(point) && self.push(tracer, point) {
+                    self.t.push(t);
+                    self.delta.push(width);
+                    self.world.push(point);
+                }
+            }
+        }
+        self.starts.push(self.t.len());
+    }
+
+    /// Maps a point and looks up its surface; false, with nothing pushed, if the sample is dead.
+    fn push(&mut self, tracer: &Tracer<'_>, point: Vec3) -> bool {
+        let motion = &tracer.config.motion;
+        let reach = motion.margin + motion.falloff;
+        let exact = tracer.config.surface.distance == DistanceKind::Exact;
+        let query = &tracer.scene.query;
+        let (sample, on_surface) = if let Some(volume) = tracer.volume {
+            let Some(sample) = volume.map(tracer.to_canonical, point, VOLUME_THRESHOLD) else { return false };
+            let closest = exact.then(|| tracer.scene.surface.closest(sample.canonical, DEPTH.max(reach)));
+            match closest {
+                Some(None) => return false,
+                Some(Some(closest)) => (sample, Some((closest.point, closest.signed_distance))),
+                None => (sample, None),
+            }
+        } else {
+            let Some(closest) = tracer.stage.mesh.closest(point, DEPTH.max(reach)) else { return false };
+            if closest.signed_distance > reach {
+                return false;
+            }
+            let field = SurfaceMotion { margin: motion.margin, falloff: motion.falloff };
+            let mapped = field.map(
+                &tracer.scene.model,
+                tracer.posed,
+                point,
+                closest.face,
+                closest.barycentric,
+                closest.signed_distance,
+            );
+            let Some(sample) = mapped else { return false };
+            // The closest point keeps its face and barycentrics in the canonical pose.
+            let corners = tracer.scene.model.faces[closest.face as usize];
+            let on_canonical = exact.then(|| {
+                let weighted = corners.iter().zip(closest.barycentric);
+                let sum = weighted.map(|(&v, b)| b * tracer.scene.canonical.vertices[v as usize]).sum();
+                (sum, closest.signed_distance)
+            });
+            (sample, on_canonical)
+        };
+        let first = self.neighbours.len();
+        if tracer.neighbours {
+            self.neighbours.resize(first + query.neighbours_per_query(), 0);
+            query.neighbours(sample.canonical, &mut self.neighbours[first..]);
+        }
+        let (closest, distance) = on_surface.unwrap_or_else(|| {
+            let finest = &self.neighbours[first..][..tracer.config.surface.k];
+            let blended = query.blend(sample.canonical, finest);
+            (blended.point, blended.signed_distance)
+        });
+        if !(distance <= reach && sample.likelihood > 0.0) {
+            self.neighbours.truncate(first);
+            return false;
+        }
+        self.likelihood.push(sample.likelihood);
+        self.canonical.push(sample.canonical);
+        self.closest.push(closest);
+        self.distance.push(distance);
+        true
+    }
+}

@@ -1,0 +1,229 @@
+//! A capture made ready for training: normalised lengths, posed bodies, pixel labels and the canonical surface.
+
+use glam::{Affine3A, Vec3};
+use rayon::prelude::*;
+use smpl::{BodyModel, Posed};
+use surface_query::{MeshDistance, SurfaceQuery, SurfaceQueryConfig};
+use visibility::{RayMesh, View};
+use volrender::{Aabb, Camera};
+
+use crate::Error;
+use crate::config::Config;
+use crate::data::{Capture, Frame};
+use crate::pixels::{Label, label_pixels};
+
+/// Canonical height that every capture is scaled to, so that constants in metres mean the same for all.
+const NORMALISED_HEIGHT: f32 = 1.7;
+/// Share of its size by which the canonical box is inflated on each side.
+const BOX_INFLATION: f32 = 0.05;
+
+/// A frame with its posed prior, lengths normalised.
+pub struct PreparedFrame {
+    /// As in the capture.
+    pub name: String,
+    /// As in the capture; evaluation cameras only.
+    pub camera_name: String,
+    /// With its translation in normalised metres.
+    pub camera: Camera,
+    /// The posed prior in normalised metres.
+    pub posed: Posed,
+    /// Canonical ← world transform of each bone.
+    pub to_canonical: Vec<Affine3A>,
+    /// Premultiplied sRGB, H × W × 3.
+    pub pixels: Vec<f32>,
+    /// Subject coverage, H × W.
+    pub mask: Vec<f32>,
+    /// H × W; only training frames are labelled.
+    pub labels: Vec<Label>,
+    /// Pixels labelled subject.
+    pub subject: Vec<u32>,
+}
+
+/// Everything that training and rendering read and never change.
+pub struct Scene {
+    /// Of the capture.
+    pub name: String,
+    /// The prior as handed in (lengths not normalised).
+    pub model: BodyModel,
+    /// Normalised metres in one unit of the capture.
+    pub scale: f32,
+    /// Shape of the canonical body.
+    pub mean_betas: Vec<f32>,
+    /// Canonical (T-pose, mean betas) vertices, normalised.
+    pub canonical: smpl::Shaped,
+    /// The canonical box that encodings are relative to, inflated by 5 %.
+    pub canonical_box: Aabb,
+    /// Nearest vertices of the canonical mesh.
+    pub query: SurfaceQuery,
+    /// Exact distances to the canonical mesh.
+    pub surface: MeshDistance,
+    /// Training frames.
+    pub train: Vec<PreparedFrame>,
+    /// Evaluation frames, never seen in training.
+    pub eval: Vec<PreparedFrame>,
+}
+
+impl Scene {
+    /// Prepares a capture with its prior.
+    pub fn new(capture: &Capture, model: &BodyModel, config: &Config) -> Result<Self, Error> {
+        config.validate()?;
+        let mut canonical = model.shaped(&capture.mean_betas);
+        let (low, high) = bounds(&canonical.vertices);
+        let height = high.y - low.y;
+        if !(height.is_finite() && height > 0.0) {
+            return Err(Error::Scene(format!("canonical body is {height} high: expected a finite height above 0")));
+        }
+        let scale = NORMALISED_HEIGHT / height;
+        canonical.vertices.iter_mut().chain(&mut canonical.joints).for_each(|v| *v *= scale);
+        let (low, high) = (low * scale, high * scale);
+        let inflation = BOX_INFLATION * (high - low);
+        let reach = config.motion.margin + config.motion.falloff;
+        let query = SurfaceQuery::new(
+            &canonical.vertices,
+            &model.faces,
+            &SurfaceQueryConfig {
+                k: config.surface.k,
+                coarse_levels: config.surface.coarse_levels,
+                cell: 0.02,
+                margin: reach + 0.03,
+                ratio: 0.25,
+            },
+        )?;
+        let mut scene = Self {
+            name: capture.name.clone(),
+            mean_betas: capture.mean_betas.clone(),
+            model: model.clone(),
+            scale,
+            canonical_box: Aabb { min: low - inflation, max: high + inflation },
+            surface: MeshDistance::new(&canonical.vertices, &model.faces)?,
+            canonical,
+            query,
+            train: Vec::new(),
+            eval: Vec::new(),
+        };
+        let train: Result<Vec<_>, Error> = capture.train.par_iter().map(|f| scene.prepare(f, Some(config))).collect();
+        let eval: Result<Vec<_>, Error> = capture
+            .eval
+            .par_iter()
+            .map(|e| Ok(PreparedFrame { camera_name: e.camera_name.clone(), ..scene.prepare(&e.frame, None)? }))
+            .collect();
+        (scene.train, scene.eval) = (train?, eval?);
+        if scene.train.iter().all(|f| f.subject.is_empty()) {
+            return Err(Error::Scene(format!("{}: no training mask shows the subject", scene.name)));
+        }
+        Ok(scene)
+    }
+
+    /// Poses the prior for `frame`, and labels its pixels if it is for training with `config`.
+    fn prepare(&self, frame: &Frame, config: Option<&Config>) -> Result<PreparedFrame, Error> {
+        let posed = self.pose(&frame.betas, &frame.pose, frame.placement);
+        let camera = normalised_camera(&frame.camera, self.scale);
+        let mut prepared = PreparedFrame {
+            name: frame.name.clone(),
+            camera_name: String::new(),
+            to_canonical: posed.bones.iter().map(Affine3A::inverse).collect(),
+            camera,
+            posed,
+            pixels: frame.image.pixels.clone(),
+            mask: frame.mask.clone(),
+            labels: Vec::new(),
+            subject: Vec::new(),
+        };
+        if let Some(config) = config {
+            let silhouette = self.silhouette(&prepared)?;
+            let centre = prepared.posed.vertices.iter().sum::<Vec3>() / prepared.posed.vertices.len() as f32;
+            let depth = prepared.camera.world_to_camera.transform_point3(centre).z.max(1e-3);
+            prepared.labels = label_pixels(
+                config.occluded,
+                &prepared.mask,
+                &silhouette,
+                frame.occluder.as_deref(),
+                prepared.camera.width as usize,
+                prepared.camera.focal.x / depth,
+            );
+            let labels = prepared.labels.iter().enumerate();
+            prepared.subject = labels.filter(|(_, l)| **l == Label::Subject).map(|(i, _)| i as u32).collect();
+        }
+        Ok(prepared)
+    }
+
+    /// The prior in a pose, normalised.
+    pub fn pose(&self, betas: &[f32], pose: &[Vec3], placement: smpl::Placement) -> Posed {
+        let mut posed = self.model.pose(&self.model.shaped(betas), pose, placement);
+        let lengths = posed.vertices.iter_mut().chain(&mut posed.joints).chain(&mut posed.pose_offsets);
+        lengths.for_each(|v| *v *= self.scale);
+        posed.bones.iter_mut().for_each(|b| b.translation *= self.scale);
+        posed
+    }
+
+    /// Pixels (H × W) whose ray hits the posed prior.
+    fn silhouette(&self, frame: &PreparedFrame) -> Result<Vec<bool>, Error> {
+        let mesh = RayMesh::new(&frame.posed.vertices, &self.model.faces)?;
+        let region = bounds(&frame.posed.vertices);
+        let region = Aabb { min: region.0, max: region.1 };
+        let width = frame.camera.width as usize;
+        Ok((0..width * frame.camera.height as usize)
+            .map(|i| {
+                let ray = frame.camera.ray((i % width) as f32 + 0.5, (i / width) as f32 + 0.5);
+                region.intersect(&ray).is_some() && mesh.first_hit(ray.origin, ray.direction).is_some()
+            })
+            .collect())
+    }
+
+    /// The world's upward direction: the mean direction from the pelvis to the head over the training frames.
+    pub fn up(&self) -> Vec3 {
+        let upward = |f: &PreparedFrame| {
+            let (low, high) = head_and_root(&self.canonical.joints);
+            (f.posed.joints[high] - f.posed.joints[low]).normalize_or_zero()
+        };
+        let sum: Vec3 = self.train.iter().map(upward).sum();
+        // Leaning averages out in the plane; the world's axes are upright in every known layout.
+        let axis = [Vec3::X, Vec3::Y, Vec3::Z].into_iter().max_by(|a, b| sum.dot(*a).abs().total_cmp(&sum.dot(*b).abs()));
+        axis.map_or(Vec3::Y, |a| a * sum.dot(a).signum())
+    }
+
+    /// How many training frames show each vertex of the prior to the camera at a pixel of the subject, by ray casting.
+    pub fn vertex_frequencies(&self) -> Result<Vec<u64>, Error> {
+        let seen: Result<Vec<Vec<bool>>, Error> = self
+            .train
+            .par_iter()
+            .map(|frame| {
+                let mesh = RayMesh::new(&frame.posed.vertices, &self.model.faces)?;
+                let usable: Vec<bool> = frame.mask.iter().map(|&m| m > 0.5).collect();
+                Ok(visibility::visible_vertices(&mesh, &frame.posed.vertices, &view(&frame.camera), Some(&usable)))
+            })
+            .collect();
+        let mut counts = vec![0; self.canonical.vertices.len()];
+        for frame in seen? {
+            counts.iter_mut().zip(frame).for_each(|(count, seen)| *count += u64::from(seen));
+        }
+        Ok(counts)
+    }
+}
+
+/// The pinhole view that the visibility crate asks for.
+pub(crate) fn view(camera: &Camera) -> View {
+    View {
+        intrinsics: camera.intrinsics(),
+        extrinsics: camera.world_to_camera,
+        width: camera.width,
+        height: camera.height,
+    }
+}
+
+/// A camera with its lengths multiplied by `scale`.
+pub(crate) fn normalised_camera(camera: &Camera, scale: f32) -> Camera {
+    let mut camera = camera.clone();
+    camera.world_to_camera.translation *= scale;
+    camera
+}
+
+/// The root joint and the joint that is highest above it in the canonical pose.
+fn head_and_root(joints: &[Vec3]) -> (usize, usize) {
+    let highest = (0..joints.len()).max_by(|&a, &b| joints[a].y.total_cmp(&joints[b].y));
+    (0, highest.unwrap_or(0))
+}
+
+pub(crate) fn bounds(points: &[Vec3]) -> (Vec3, Vec3) {
+    points.iter().fold((Vec3::INFINITY, Vec3::NEG_INFINITY), |(low, high), &p| (low.min(p), high.max(p)))
+}

@@ -1,0 +1,92 @@
+//! The learnable vertices of the surface term: encoded once a step, gathered by every sample.
+
+use glam::Vec3;
+use rayon::prelude::*;
+
+use crate::config::{Config, DistanceKind};
+use crate::encoder::{Coordinates, Encoder, surface_coordinates, distance_is_inside};
+use crate::scene::Scene;
+
+const CHUNK: usize = 512;
+/// Farthest that a vertex's distance to its initial mesh is looked up; the encoding clamps earlier.
+const FARTHEST: f32 = 0.5;
+
+/// γ([v_i, d_i]) of every vertex.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct VertexCode {
+    /// Where each vertex is encoded.
+    pub at: Coordinates,
+    /// V × F.
+    pub features: Vec<f32>,
+    /// Position, signed distance, and its gradient by the position, of each vertex.
+    state: Vec<(Vec3, f32, Vec3)>,
+}
+
+impl VertexCode {
+    /// Encodes v_i = initial vertex + offset with its signed distance to the initial mesh.
+    pub fn encode(&mut self, scene: &Scene, config: &Config, encoder: &Encoder, table: &[f32], offsets: &[f32]) {
+        let vertices = &scene.canonical.vertices;
+        (0..vertices.len())
+            .into_par_iter()
+            .with_min_len(CHUNK)
+            .map(|i| {
+                let position = vertices[i] + Vec3::from_slice(&offsets[3 * i..]);
+                let (distance, gradient) = distance_with_gradient(scene, config, i, position);
+                (position, distance, gradient)
+            })
+            .collect_into_vec(&mut self.state);
+        self.at.clear();
+        self.at.surface.extend(self.state.iter().map(|&(v, d, _)| surface_coordinates(v, d, &scene.canonical_box)));
+        let width = encoder.num_features();
+        self.features.resize(vertices.len() * width, 0.0);
+        self.features.par_chunks_mut(CHUNK * width).enumerate().for_each(|(chunk, features)| {
+            let end = ((chunk + 1) * CHUNK).min(vertices.len());
+            let at = Coordinates { surface: self.at.surface[chunk * CHUNK..end].to_vec(), ..Coordinates::default() };
+            encoder.encode(table, &at, features);
+        });
+    }
+
+    /// Gradient of the offsets (V × 3) from that of the features; overwrites.
+    pub fn backward(
+        &self,
+        scene: &Scene,
+        encoder: &Encoder,
+        table: &[f32],
+        d_features: &[f32],
+        d_offsets: &mut [f32],
+    ) {
+        let width = encoder.num_features();
+        d_offsets.par_chunks_mut(3 * CHUNK).enumerate().for_each(|(chunk, d_offsets)| {
+            let range = chunk * CHUNK..chunk * CHUNK + d_offsets.len() / 3;
+            let at = Coordinates { surface: self.at.surface[range.clone()].to_vec(), ..Coordinates::default() };
+            let d_rows = &d_features[range.start * width..range.end * width];
+            let d_points = encoder.encode_backward_points(table, &at, d_rows, &scene.canonical_box);
+            for (((d_v, d_d), state), d_offset) in
+                d_points.into_iter().zip(&self.state[range]).zip(d_offsets.chunks_exact_mut(3))
+            {
+                let through_distance = if distance_is_inside(state.1) { d_d * state.2 } else { Vec3::ZERO };
+                (d_v + through_distance).write_to_slice(d_offset);
+            }
+        });
+    }
+}
+
+/// Signed distance of a point to the initial mesh and its gradient, by the query that samples use.
+fn distance_with_gradient(scene: &Scene, config: &Config, vertex: usize, position: Vec3) -> (f32, Vec3) {
+    match config.surface.distance {
+        DistanceKind::Blended => {
+            let mut neighbours = vec![0; scene.query.neighbours_per_query()];
+            scene.query.neighbours(position, &mut neighbours);
+            let finest = &neighbours[..config.surface.k];
+            let blended = scene.query.blend(position, finest);
+            (blended.signed_distance, scene.query.blend_backward(position, finest, Vec3::ZERO, 1.0))
+        }
+        DistanceKind::Exact => match scene.surface.closest(position, FARTHEST) {
+            Some(closest) => {
+                let away = (position - closest.point) * closest.signed_distance.signum();
+                (closest.signed_distance, away.normalize_or(scene.query.normals()[vertex]))
+            }
+            None => (FARTHEST, Vec3::ZERO),
+        },
+    }
+}

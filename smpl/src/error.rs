@@ -1,0 +1,124 @@
+//! What can be wrong with a file.
+
+use std::path::PathBuf;
+
+/// A file that cannot be read or does not hold what it should.
+///
+/// `file` is the path as given, or the name passed with bytes already in memory; `key` is the array's name.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum Error {
+    /// The operating system refused.
+    #[error("{}: {source}", path.display())]
+    Io {
+        /// The path as given.
+        path: PathBuf,
+        /// The cause.
+        source: std::io::Error,
+    },
+    /// The file name ends in nothing this crate reads.
+    #[error("{}: unknown kind of file (expected {expected})", path.display())]
+    Extension {
+        /// The path as given.
+        path: PathBuf,
+        /// The extensions that would do.
+        expected: &'static str,
+    },
+    /// An array that must be there is not.
+    #[error("{file}: no `{key}` (it holds {})", available.join(", "))]
+    MissingKey {
+        /// Which file.
+        file: String,
+        /// What was looked for.
+        key: String,
+        /// What there is instead.
+        available: Vec<String>,
+    },
+    /// An array of another shape than its use demands.
+    #[error("{file}: `{key}` has shape {actual:?}, expected {expected}")]
+    Shape {
+        /// Which file.
+        file: String,
+        /// Which array.
+        key: String,
+        /// Pattern, `_` standing for any size.
+        expected: String,
+        /// What the file says.
+        actual: Vec<usize>,
+    },
+    /// An array or object of another type than its use demands.
+    #[error("{file}: `{key}` is {actual}, expected {expected}")]
+    Type {
+        /// Which file.
+        file: String,
+        /// Which array.
+        key: String,
+        /// What would do.
+        expected: &'static str,
+        /// What it is.
+        actual: String,
+    },
+    /// NaN, an infinity, or a value too large for `f32`.
+    #[error("{file}: `{key}` is not finite at flat index {index}")]
+    NotFinite {
+        /// Which file.
+        file: String,
+        /// Which array.
+        key: String,
+        /// Position of the first such value, row-major.
+        index: usize,
+    },
+    /// Readable, but impossible: an index out of range, weights that do not sum to one, a tree with a cycle.
+    #[error("{file}: `{key}`: {message}")]
+    Invalid {
+        /// Which file.
+        file: String,
+        /// Which array.
+        key: String,
+        /// What is wrong with it.
+        message: String,
+    },
+    /// More memory than the reader's limit would be needed. Raised before the memory is asked for.
+    #[error("{file}: `{key}` claims {claimed} bytes, more than the limit of {limit}")]
+    TooLarge {
+        /// Which file.
+        file: String,
+        /// Which array; empty for the file as a whole.
+        key: String,
+        /// What the header claims.
+        claimed: u128,
+        /// What is allowed.
+        limit: u64,
+    },
+    /// Malformed or truncated `.npy` or `.npz` structure.
+    #[error("{file}: `{key}`: malformed array file: {message}")]
+    Npy {
+        /// Which file.
+        file: String,
+        /// Which array; empty for the archive as a whole.
+        key: String,
+        /// What was found.
+        message: String,
+    },
+    /// Malformed, truncated or disallowed pickle.
+    #[error("{file}: malformed pickle at byte {offset}: {message}")]
+    Pickle {
+        /// Which file.
+        file: String,
+        /// Offset of the opcode at fault from the start of the file.
+        offset: usize,
+        /// What was found.
+        message: String,
+    },
+}
+
+impl Error {
+    /// Shorthand for [`Error::Invalid`].
+    pub(crate) fn invalid(file: &str, key: &str, message: impl Into<String>) -> Self {
+        Self::Invalid {
+            file: file.to_owned(),
+            key: key.to_owned(),
+            message: message.into(),
+        }
+    }
+}

@@ -1,0 +1,46 @@
+//! Parametric bodies in SMPL's form.
+//!
+//! Load one (or take the embedded one), shape it, pose it, skin it, and carry points of the posed world back to the
+//! canonical pose.
+//!
+//! ```
+//! use glam::Vec3;
+//! use smpl::{BodyModel, Placement};
+//!
+//! let body = BodyModel::embedded();
+//! let shaped = body.shaped(&[0.5]);
+//! let mut pose = vec![Vec3::ZERO; body.num_joints()];
+//! pose[18] = Vec3::new(0.0, -1.2, 0.0); // left elbow
+//! let posed = body.pose(&shaped, &pose, Placement::default());
+//! assert_eq!(posed.vertices.len(), body.num_vertices());
+//! ```
+//!
+//! # Conventions
+//! Right-handed, y up, facing +z, the person's left at +x; angles in radians, rotations as axis-angle vectors. Lengths
+//! are in the model's unit: only the defaults of [`SurfaceMotion`] and [`WeightVolumeConfig`] assume metres. The canonical
+//! space is the rest pose of a [`Shaped`] body. Arithmetic is `f32` and independent of the number of threads.
+
+mod array;
+mod embedded;
+mod error;
+mod load;
+mod model;
+mod motion;
+pub mod npz;
+pub mod pickle;
+mod pose;
+mod rotation;
+mod sparse;
+
+/// The README's example, compiled as a test.
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+struct Readme;
+
+pub use array::{Data, NdArray};
+pub use error::Error;
+pub use model::{BodyModel, Shaped};
+pub use motion::{MotionSample, SurfaceMotion, WeightVolume, WeightVolumeConfig};
+pub use pose::{Placement, Posed};
+pub use rotation::rodrigues;
+pub use sparse::{SkinningWeights, SparseRows};

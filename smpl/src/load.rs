@@ -1,0 +1,153 @@
+//! Reading body models.
+
+use std::path::Path;
+
+use glam::Vec3;
+
+use crate::Error;
+use crate::array::NdArray;
+use crate::model::{BodyModel, TERMS_PER_JOINT};
+use crate::npz::Npz;
+use crate::pickle::{self, Value};
+use crate::sparse::SparseRows;
+
+impl BodyModel {
+    /// Reads an SMPL model, by its extension: `.npz`, or `.pkl` in the style of the original release (chumpy arrays,
+    /// sparse regressor). Nothing in a pickle is executed.
+    ///
+    /// Needed are `v_template` (V,3), `f` (F,3), `weights` (V,J), `J_regressor` (J,V), `kintree_table` (2,J),
+    /// `shapedirs` (V,3,B) and `posedirs` (V,3,9(J−1)).
+    ///
+    /// # Errors
+    /// Any [`Error`]; those about the content name the array.
+    pub fn load(path: &Path) -> Result<Self, Error> {
+        let file = path.display().to_string();
+        let extension = path.extension().and_then(|e| e.to_str()).unwrap_or("");
+        match extension.to_ascii_lowercase().as_str() {
+            "npz" => {
+                let mut npz = Npz::open(path)?;
+                build(&file, |key| npz.array(key))
+            }
+            "pkl" => {
+                let value = pickle::read(path)?;
+                build(&file, |key| from_pickle(&file, &value, key))
+            }
+            _ => Err(Error::Extension {
+                path: path.to_owned(),
+                expected: ".npz or .pkl",
+            }),
+        }
+    }
+}
+
+/// The array under `key` of the model's dictionary, made dense.
+fn from_pickle(file: &str, value: &Value, key: &str) -> Result<NdArray, Error> {
+    let wrong = |key: &str, expected, value: &Value| Error::Type {
+        file: file.to_owned(),
+        key: key.to_owned(),
+        expected,
+        actual: value.type_name().to_owned(),
+    };
+    let Value::Dict(entries) = value else {
+        return Err(wrong("", "a dictionary", value));
+    };
+    let Some(found) = value.get(key) else {
+        let names = entries.iter().filter_map(|(k, _)| k.as_str());
+        return Err(Error::MissingKey {
+            file: file.to_owned(),
+            key: key.to_owned(),
+            available: names.map(str::to_owned).collect(),
+        });
+    };
+    found
+        .to_dense(file, key)?
+        .ok_or_else(|| wrong(key, "an array", found))
+}
+
+fn build(
+    file: &str,
+    mut array: impl FnMut(&str) -> Result<NdArray, Error>,
+) -> Result<BodyModel, Error> {
+    let v_template = array("v_template")?.to_f32(file, "v_template", &[None, Some(3)])?;
+    let v = v_template.len() / 3;
+
+    let kintree = array("kintree_table")?.to_i64(file, "kintree_table", &[Some(2), None])?;
+    let j = kintree.len() / 2;
+    let parents = parents(file, &kintree)?;
+
+    let faces = array("f")?.to_i64(file, "f", &[None, Some(3)])?;
+    let faces = faces.iter().map(|&i| {
+        u32::try_from(i).map_err(|_| Error::invalid(file, "f", format!("vertex index {i}")))
+    });
+    let faces: Vec<u32> = faces.collect::<Result<_, _>>()?;
+
+    let weights = array("weights")?.to_f32(file, "weights", &[Some(v), Some(j)])?;
+    let regressor = array("J_regressor")?.to_f32(file, "J_regressor", &[Some(j), Some(v)])?;
+    let shapedirs = array("shapedirs")?.to_f32(file, "shapedirs", &[Some(v), Some(3), None])?;
+    let terms = TERMS_PER_JOINT * (j - 1);
+    let pattern = [Some(v), Some(3), Some(terms)];
+    let posedirs = array("posedirs")?.to_f32(file, "posedirs", &pattern)?;
+
+    let b = shapedirs.len() / (3 * v).max(1);
+    let shapedirs = (0..b * v)
+        .map(|i| {
+            let (beta, vertex) = (i / v, i % v);
+            Vec3::from([0, 1, 2].map(|axis| shapedirs[(3 * vertex + axis) * b + beta]))
+        })
+        .collect();
+    let posedirs = SparseRows::from_rows((0..v).map(|vertex| {
+        let axis = |axis: usize| &posedirs[(3 * vertex + axis) * terms..][..terms];
+        let (x, y, z) = (axis(0), axis(1), axis(2));
+        (0..terms)
+            .map(|t| (t as u32, Vec3::new(x[t], y[t], z[t])))
+            .filter(|(_, d)| *d != Vec3::ZERO)
+            .collect::<Vec<_>>()
+    }));
+    let model = BodyModel {
+        v_template: triples(&v_template).map(Vec3::from).collect(),
+        faces: triples(&faces).collect(),
+        shapedirs,
+        posedirs,
+        weights: sparse(&weights, j),
+        j_regressor: sparse(&regressor, v),
+        parents,
+    };
+    model.validate(file)?;
+    Ok(model)
+}
+
+/// Parents from the two rows of `kintree_table`: parent, joint.
+fn parents(file: &str, kintree: &[i64]) -> Result<Vec<Option<usize>>, Error> {
+    let (parents, joints) = kintree.split_at(kintree.len() / 2);
+    let invalid = |message| Err(Error::invalid(file, "kintree_table", message));
+    if joints.is_empty() {
+        return invalid("no joints".to_owned());
+    }
+    if let Some(i) = (0..joints.len()).find(|&i| joints[i] != i as i64) {
+        return invalid(format!("column {i} is for joint {}", joints[i]));
+    }
+    let mut out = vec![None];
+    for (i, &parent) in parents.iter().enumerate().skip(1) {
+        match usize::try_from(parent) {
+            Ok(p) if p < i => out.push(Some(p)),
+            _ => {
+                return invalid(format!(
+                    "parent of joint {i} is {parent}, expected a joint before it"
+                ));
+            }
+        }
+    }
+    Ok(out)
+}
+
+fn triples<T: Copy>(values: &[T]) -> impl Iterator<Item = [T; 3]> + '_ {
+    values.chunks_exact(3).map(|c| [c[0], c[1], c[2]])
+}
+
+/// Rows of a dense matrix with `columns` columns, without the zeros.
+fn sparse(dense: &[f32], columns: usize) -> SparseRows<f32> {
+    SparseRows::from_rows(dense.chunks_exact(columns.max(1)).map(|row| {
+        let entries = row.iter().enumerate().filter(|(_, w)| **w != 0.0);
+        entries.map(|(i, &w)| (i as u32, w))
+    }))
+}

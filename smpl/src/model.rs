@@ -1,0 +1,174 @@
+//! The body model: its arrays, their checks, and the shape step.
+
+use glam::Vec3;
+
+use crate::Error;
+use crate::sparse::{SkinningWeights, SparseRows};
+
+/// Pose blend-shape terms a non-root joint: the entries of R − I.
+pub(crate) const TERMS_PER_JOINT: usize = 9;
+
+/// A body in SMPL's form: V vertices, J joints, B shape and P pose blend shapes.
+///
+/// Lengths are in the model's own unit. Everything is public so that bodies can be put together from other
+/// sources; [`BodyModel::validate`] tells whether the parts fit.
+#[derive(Clone, Debug, PartialEq)]
+pub struct BodyModel {
+    /// Template, (V).
+    pub v_template: Vec<Vec3>,
+    /// Triangles, (F), counter-clockwise seen from outside.
+    pub faces: Vec<[u32; 3]>,
+    /// Shape blend shapes, (B·V): those of β_0 first, V each.
+    pub shapedirs: Vec<Vec3>,
+    /// Pose blend shapes, (V, P): row v holds the terms that move vertex v. Term 9(j−1) + 3r + c belongs to entry
+    /// (r, c) of R(θ_j) − I. P is 9(J−1), or no row has any entry.
+    pub posedirs: SparseRows<Vec3>,
+    /// Skinning weights, (V, J), rows non-negative and summing to 1.
+    pub weights: SkinningWeights,
+    /// Joint regressor, (J, V), rows summing to 1.
+    pub j_regressor: SparseRows<f32>,
+    /// Parent of each joint, (J): `None` for joint 0, a smaller index for all others.
+    pub parents: Vec<Option<usize>>,
+}
+
+/// A body of one person at rest: template plus shape blend shapes.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Shaped {
+    /// Vertices in the rest pose, (V).
+    pub vertices: Vec<Vec3>,
+    /// Joints in the rest pose, (J).
+    pub joints: Vec<Vec3>,
+}
+
+impl BodyModel {
+    /// V.
+    #[must_use]
+    pub fn num_vertices(&self) -> usize {
+        self.v_template.len()
+    }
+
+    /// J.
+    #[must_use]
+    pub fn num_joints(&self) -> usize {
+        self.parents.len()
+    }
+
+    /// B.
+    #[must_use]
+    pub fn num_betas(&self) -> usize {
+        self.shapedirs.len() / self.num_vertices().max(1)
+    }
+
+    /// Applies the shape blend shapes and regresses the joints: template + B_S(β), J = regressor · that.
+    ///
+    /// Betas beyond those given are 0.
+    ///
+    /// # Panics
+    /// With more betas than the model has: compare with [`BodyModel::num_betas`] first where they come from a file.
+    #[must_use]
+    pub fn shaped(&self, betas: &[f32]) -> Shaped {
+        assert!(
+            betas.len() <= self.num_betas(),
+            "shaped: {} betas, the model has {}",
+            betas.len(),
+            self.num_betas()
+        );
+        let mut vertices = self.v_template.clone();
+        for (&beta, directions) in betas
+            .iter()
+            .zip(self.shapedirs.chunks(vertices.len().max(1)))
+        {
+            if beta != 0.0 {
+                for (v, &d) in vertices.iter_mut().zip(directions) {
+                    *v += beta * d;
+                }
+            }
+        }
+        let joints = (0..self.j_regressor.num_rows())
+            .map(|j| {
+                let mut sum = glam::DVec3::ZERO;
+                for (v, w) in self.j_regressor.row(j) {
+                    sum += f64::from(w) * vertices[v].as_dvec3();
+                }
+                sum.as_vec3()
+            })
+            .collect();
+        Shaped { vertices, joints }
+    }
+
+    /// Checks that the parts fit together and every value is finite. `file` names the model in errors; keys are
+    /// those of SMPL's files.
+    ///
+    /// # Errors
+    /// [`Error::Invalid`], [`Error::NotFinite`].
+    pub fn validate(&self, file: &str) -> Result<(), Error> {
+        let invalid = |key: &str, message: String| Err(Error::invalid(file, key, message));
+        let (v, j) = (self.num_vertices(), self.num_joints());
+        if v == 0 {
+            return invalid("v_template", "no vertices".to_owned());
+        }
+        finite(file, "v_template", &self.v_template)?;
+        for (i, face) in self.faces.iter().enumerate() {
+            if let Some(bad) = face.iter().find(|&&index| index as usize >= v) {
+                return invalid("f", format!("face {i} names vertex {bad} of {v}"));
+            }
+        }
+        if !self.shapedirs.len().is_multiple_of(v) {
+            let n = self.shapedirs.len();
+            return invalid("shapedirs", format!("{n} directions for {v} vertices"));
+        }
+        finite(file, "shapedirs", &self.shapedirs)?;
+        if self.parents.first() != Some(&None) {
+            return invalid("kintree_table", "joint 0 is not the root".to_owned());
+        }
+        for (i, &parent) in self.parents.iter().enumerate().skip(1) {
+            if parent.is_none_or(|p| p >= i) {
+                let message =
+                    format!("parent of joint {i} is {parent:?}, expected a joint before it");
+                return invalid("kintree_table", message);
+            }
+        }
+        let terms = TERMS_PER_JOINT * (j - 1);
+        for (key, fault) in [
+            ("posedirs", self.posedirs.fault(v, terms)),
+            ("weights", self.weights.fault(v, j)),
+            ("J_regressor", self.j_regressor.fault(j, v)),
+        ] {
+            if let Some(message) = fault {
+                return invalid(key, message);
+            }
+        }
+        finite(file, "posedirs", &self.posedirs.values)?;
+        for i in 0..v {
+            let mut sum = 0.0;
+            for (_, w) in self.weights.row(i) {
+                // Rejects NaN as well.
+                if !(0.0..=1.01).contains(&w) {
+                    return invalid("weights", format!("vertex {i} has a weight of {w}"));
+                }
+                sum += w;
+            }
+            if (sum - 1.0).abs() > 1e-3 {
+                return invalid("weights", format!("those of vertex {i} sum to {sum}"));
+            }
+        }
+        for i in 0..j {
+            let sum: f32 = self.j_regressor.row(i).map(|(_, w)| w).sum();
+            if sum.is_nan() || (sum - 1.0).abs() > 1e-2 {
+                return invalid("J_regressor", format!("row {i} sums to {sum}"));
+            }
+        }
+        Ok(())
+    }
+}
+
+fn finite(file: &str, key: &str, values: &[Vec3]) -> Result<(), Error> {
+    match values.iter().position(|v| !v.is_finite()) {
+        Some(index) => Err(Error::NotFinite {
+            file: file.to_owned(),
+            key: key.to_owned(),
+            index: 3 * index,
+        }),
+        None => Ok(()),
+    }
+}

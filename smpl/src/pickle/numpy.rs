@@ -1,0 +1,301 @@
+//! The allowed globals: what they construct, and how their state is set.
+
+use std::borrow::Cow;
+
+use super::machine::{Id, Machine, Node};
+use super::reader::Step;
+use crate::array::{ElementType, element_count};
+
+/// A global on the allow-list.
+#[derive(Clone, Copy)]
+pub(super) enum Global {
+    Reconstruct,
+    Ndarray,
+    Dtype,
+    Scalar,
+    FromBuffer,
+    CopyReconstructor,
+    Object,
+    Set,
+    Bytes,
+    OrderedDict,
+    Encode,
+    Class(&'static str),
+}
+
+/// numpy's type of an array's elements.
+#[derive(Clone, Copy)]
+pub(super) enum Dtype {
+    Number(ElementType),
+    Object,
+    /// Latin-1 or ASCII, bytes an item.
+    ByteText(usize),
+    /// UTF-32, bytes an item.
+    WideText {
+        size: usize,
+        big_endian: bool,
+    },
+}
+
+impl Global {
+    pub(super) fn find(module: &str, name: &str) -> Step<Self> {
+        Ok(match (module, name) {
+            ("numpy.core.multiarray" | "numpy._core.multiarray", "_reconstruct") => {
+                Self::Reconstruct
+            }
+            ("numpy.core.multiarray" | "numpy._core.multiarray", "scalar") => Self::Scalar,
+            ("numpy.core.numeric" | "numpy._core.numeric", "_frombuffer") => Self::FromBuffer,
+            ("numpy", "ndarray") => Self::Ndarray,
+            ("numpy", "dtype") => Self::Dtype,
+            ("copy_reg" | "copyreg", "_reconstructor") => Self::CopyReconstructor,
+            ("__builtin__" | "builtins", "object") => Self::Object,
+            ("__builtin__" | "builtins", "set" | "frozenset") => Self::Set,
+            ("__builtin__" | "builtins", "bytes" | "bytearray") => Self::Bytes,
+            ("collections", "OrderedDict") => Self::OrderedDict,
+            ("_codecs", "encode") => Self::Encode,
+            ("chumpy.ch", "Ch") => Self::Class("chumpy.ch.Ch"),
+            ("scipy.sparse.csc" | "scipy.sparse._csc", "csc_matrix") => {
+                Self::Class("scipy.sparse.csc_matrix")
+            }
+            _ => return Err(format!("global `{module} {name}` is not allowed")),
+        })
+    }
+}
+
+impl Dtype {
+    fn parse(name: &str) -> Step<Self> {
+        if let Some(element) = ElementType::parse(name) {
+            return Ok(Self::Number(element));
+        }
+        let big_endian = name.starts_with('>');
+        let bare = name.trim_start_matches(['<', '>', '|', '=']);
+        let size = |s: &str| {
+            s.parse::<usize>()
+                .ok()
+                .filter(|n| (1..=1 << 20).contains(n))
+        };
+        let parsed = match bare.as_bytes().first() {
+            Some(b'O') => Some(Self::Object),
+            Some(b'S') => bare.get(1..).and_then(size).map(Self::ByteText),
+            Some(b'U') => bare.get(1..).and_then(size).map(|n| Self::WideText {
+                size: 4 * n,
+                big_endian,
+            }),
+            _ => None,
+        };
+        parsed.ok_or_else(|| format!("dtype {name:?} is not supported"))
+    }
+}
+
+impl<'a> Machine<'a> {
+    /// Calls `global` with `arguments`.
+    pub(super) fn construct(&mut self, global: Global, arguments: &[Id]) -> Step<Node<'a>> {
+        let wrong = |what: &str| Err(format!("arguments of {what}"));
+        Ok(match (global, arguments) {
+            // The arguments say shape 0 and type byte; BUILD brings the real ones.
+            (Global::Reconstruct | Global::Ndarray, _) => Node::BlankArray,
+            (Global::Dtype, [name, ..]) => Node::Dtype(Dtype::parse(&self.text(*name)?)?),
+            (Global::Scalar, [dtype, rest @ ..]) => {
+                let dtype = self.dtype(*dtype)?;
+                match rest {
+                    [raw] => self.array(dtype, Vec::new(), false, *raw)?,
+                    _ => return wrong("scalar"),
+                }
+            }
+            (Global::FromBuffer, [raw, dtype, shape, order]) => {
+                let (dtype, shape) = (self.dtype(*dtype)?, self.shape(*shape)?);
+                let fortran = self.text(*order)? == "F";
+                self.array(dtype, shape, fortran, *raw)?
+            }
+            (Global::CopyReconstructor, [class, ..]) => match self.nodes[*class] {
+                Node::Global(Global::Class(class)) => Node::Object(class, None),
+                Node::Global(Global::Ndarray) => Node::BlankArray,
+                _ => return wrong("_reconstructor"),
+            },
+            (Global::Class(class), _) => Node::Object(class, None),
+            (Global::Set, []) => Node::Set(Vec::new()),
+            (Global::Set, [items]) => match &self.nodes[*items] {
+                Node::List(items) | Node::Tuple(items) | Node::Set(items) => {
+                    let items = items.clone();
+                    self.spend(8 + 8 * items.len())?;
+                    Node::Set(items)
+                }
+                _ => return wrong("set"),
+            },
+            (Global::Bytes, []) => Node::Bytes(Cow::Borrowed(&[])),
+            (Global::Bytes, [raw]) => Node::Bytes(self.bytes(*raw)?),
+            (Global::OrderedDict, []) => Node::Dict(Vec::new()),
+            (Global::OrderedDict, [items]) => {
+                let Node::List(items) = &self.nodes[*items] else {
+                    return wrong("OrderedDict");
+                };
+                let pairs = items.iter().map(|&item| match &self.nodes[item] {
+                    Node::List(kv) | Node::Tuple(kv) if kv.len() == 2 => Some((kv[0], kv[1])),
+                    _ => None,
+                });
+                let Some(pairs) = pairs.collect::<Option<Vec<_>>>() else {
+                    return wrong("OrderedDict");
+                };
+                self.spend(16 * pairs.len())?;
+                Node::Dict(pairs)
+            }
+            (Global::Encode, [text, ..]) => {
+                let Node::Text(text) = &self.nodes[*text] else {
+                    return wrong("encode");
+                };
+                let bytes = text.chars().map(|c| u8::try_from(u32::from(c)));
+                let bytes: Result<Vec<u8>, _> = bytes.collect();
+                let bytes = bytes.map_err(|_| "text beyond Latin-1".to_owned())?;
+                self.spend(bytes.len())?;
+                Node::Bytes(Cow::Owned(bytes))
+            }
+            _ => return wrong("a constructor"),
+        })
+    }
+
+    /// Sets the state of the object `target`.
+    pub(super) fn build(&mut self, target: Id, state: Id) -> Step<()> {
+        match (&self.nodes[target], &self.nodes[state]) {
+            (Node::BlankArray, Node::Tuple(items)) => {
+                let &[_, shape, dtype, fortran, raw] = items.as_slice() else {
+                    return Err("state of an array".to_owned());
+                };
+                let (dtype, shape) = (self.dtype(dtype)?, self.shape(shape)?);
+                let fortran = match self.nodes[fortran] {
+                    Node::Bool(value) => value,
+                    Node::Int(value) => value != 0,
+                    _ => return Err("state of an array".to_owned()),
+                };
+                self.nodes[target] = self.array(dtype, shape, fortran, raw)?;
+            }
+            (Node::Dtype(dtype), Node::Tuple(items)) => {
+                let order = match items.get(1) {
+                    Some(&order) => self.text(order)?,
+                    None => return Err("state of a dtype".to_owned()),
+                };
+                let dtype = match *dtype {
+                    Dtype::Number(element) => Dtype::Number(element.with_order(&order)),
+                    Dtype::WideText { size, .. } => Dtype::WideText {
+                        size,
+                        big_endian: order == ">",
+                    },
+                    other => other,
+                };
+                self.nodes[target] = Node::Dtype(dtype);
+            }
+            (Node::Object(class, _), Node::Dict(_)) => {
+                self.nodes[target] = Node::Object(class, Some(state));
+            }
+            _ => return Err("state of something that has none".to_owned()),
+        }
+        Ok(())
+    }
+
+    fn array(&mut self, dtype: Dtype, shape: Vec<usize>, fortran: bool, raw: Id) -> Step<Node<'a>> {
+        let count = element_count(&shape).and_then(|n| usize::try_from(n).ok());
+        let count = count.ok_or_else(|| format!("shape {shape:?}"))?;
+        let mismatch =
+            |found: usize| format!("shape {shape:?} with {found} bytes or items of data");
+        match dtype {
+            Dtype::Number(element) => {
+                let length = match &self.nodes[raw] {
+                    Node::Bytes(b) | Node::ByteString(b) => b.len(),
+                    _ => return Err("data of an array".to_owned()),
+                };
+                self.spend(length / element.size() * 8)?;
+                let (Node::Bytes(bytes) | Node::ByteString(bytes)) = &self.nodes[raw] else {
+                    return Err("data of an array".to_owned());
+                };
+                let array = element.decode(bytes, &shape, fortran);
+                Ok(Node::Array(array.ok_or_else(|| mismatch(length))?))
+            }
+            // Objects and text in Fortran order do not occur in the formats this is for.
+            _ if fortran && shape.len() > 1 => Err("column-major array of objects".to_owned()),
+            Dtype::Object => {
+                let items = match &self.nodes[raw] {
+                    Node::List(items) if items.len() == count => items.clone(),
+                    Node::List(items) => return Err(mismatch(items.len())),
+                    // A scalar of object type holds the object itself.
+                    _ if shape.is_empty() => vec![raw],
+                    _ => return Err("data of an array".to_owned()),
+                };
+                self.spend(8 * items.len())?;
+                Ok(Node::Objects(shape, items))
+            }
+            Dtype::ByteText(size) | Dtype::WideText { size, .. } => {
+                let bytes = self.bytes(raw)?;
+                if count.checked_mul(size) != Some(bytes.len()) {
+                    return Err(mismatch(bytes.len()));
+                }
+                self.spend(bytes.len() + 64 * count)?;
+                let mut items = Vec::with_capacity(count);
+                for item in bytes.chunks_exact(size) {
+                    let text = match dtype {
+                        Dtype::WideText { big_endian, .. } => wide_text(item, big_endian)?,
+                        _ => item.iter().copied().map(char::from).collect(),
+                    };
+                    items.push(self.nodes.len());
+                    let text = text.trim_end_matches('\0').to_owned();
+                    self.nodes.push(Node::Text(Cow::Owned(text)));
+                }
+                Ok(Node::Objects(shape, items))
+            }
+        }
+    }
+
+    fn dtype(&self, id: Id) -> Step<Dtype> {
+        match &self.nodes[id] {
+            Node::Dtype(dtype) => Ok(*dtype),
+            _ => Err("array without a dtype".to_owned()),
+        }
+    }
+
+    fn shape(&self, id: Id) -> Step<Vec<usize>> {
+        let extent = |id: &Id| match self.nodes[*id] {
+            Node::Int(n) => usize::try_from(n).ok(),
+            _ => None,
+        };
+        let shape = match &self.nodes[id] {
+            Node::Tuple(items) if items.len() <= 64 => items.iter().map(extent).collect(),
+            Node::Int(_) => extent(&id).map(|n| vec![n]),
+            _ => None,
+        };
+        shape.ok_or_else(|| "shape of an array".to_owned())
+    }
+
+    /// A short text: the name of a type or an order.
+    fn text(&self, id: Id) -> Step<Cow<'_, str>> {
+        match &self.nodes[id] {
+            Node::Text(text) if text.len() <= 64 => Ok(Cow::Borrowed(text)),
+            Node::ByteString(bytes) | Node::Bytes(bytes) if bytes.len() <= 64 => {
+                let text = bytes.iter().map(|&b| char::from(b)).collect();
+                Ok(Cow::Owned(text))
+            }
+            _ => Err("expected a short text".to_owned()),
+        }
+    }
+
+    /// A copy of bytes, paid for.
+    fn bytes(&mut self, id: Id) -> Step<Cow<'a, [u8]>> {
+        let (Node::Bytes(bytes) | Node::ByteString(bytes)) = &self.nodes[id] else {
+            return Err("expected bytes".to_owned());
+        };
+        let bytes = bytes.clone();
+        self.spend(bytes.len())?;
+        Ok(bytes)
+    }
+}
+
+fn wide_text(bytes: &[u8], big_endian: bool) -> Step<String> {
+    let units = bytes.chunks_exact(4).map(|c| {
+        let unit = [c[0], c[1], c[2], c[3]];
+        let code = if big_endian {
+            u32::from_be_bytes(unit)
+        } else {
+            u32::from_le_bytes(unit)
+        };
+        char::from_u32(code)
+    });
+    let text: Option<String> = units.collect();
+    text.ok_or_else(|| "text is not UTF-32".to_owned())
+}

@@ -1,0 +1,70 @@
+//! Sparse rows.
+
+/// Compressed sparse rows: the non-zero entries of row i are `columns[offsets[i]..offsets[i + 1]]`, columns
+/// ascending, with their `values`.
+#[derive(Clone, Debug, PartialEq)]
+pub struct SparseRows<T> {
+    /// Start of each row, and the end of the last: (rows + 1), from 0, not decreasing.
+    pub offsets: Vec<u32>,
+    /// Column of each entry.
+    pub columns: Vec<u32>,
+    /// Value of each entry.
+    pub values: Vec<T>,
+}
+
+/// Skinning weights, (V, J): a row is a vertex, a column a joint.
+pub type SkinningWeights = SparseRows<f32>;
+
+impl<T: Copy> SparseRows<T> {
+    /// From the entries of each row in turn.
+    pub fn from_rows(rows: impl IntoIterator<Item = impl IntoIterator<Item = (u32, T)>>) -> Self {
+        let mut out = Self {
+            offsets: vec![0],
+            columns: Vec::new(),
+            values: Vec::new(),
+        };
+        for row in rows {
+            for (column, value) in row {
+                out.columns.push(column);
+                out.values.push(value);
+            }
+            out.offsets.push(out.columns.len() as u32);
+        }
+        out
+    }
+
+    /// Number of rows.
+    #[must_use]
+    pub fn num_rows(&self) -> usize {
+        self.offsets.len().saturating_sub(1)
+    }
+
+    /// The (column, value) pairs of row `row`.
+    ///
+    /// # Panics
+    /// If there is no such row.
+    #[inline]
+    pub fn row(&self, row: usize) -> impl Iterator<Item = (usize, T)> + '_ {
+        let range = self.offsets[row] as usize..self.offsets[row + 1] as usize;
+        self.columns[range.clone()]
+            .iter()
+            .zip(&self.values[range])
+            .map(|(&column, &value)| (column as usize, value))
+    }
+
+    /// What is wrong with the structure, if anything.
+    pub(crate) fn fault(&self, rows: usize, columns: usize) -> Option<String> {
+        if self.offsets.len() != rows + 1 {
+            return Some(format!("{} rows, expected {rows}", self.num_rows()));
+        }
+        if self.offsets[0] != 0
+            || self.offsets.windows(2).any(|w| w[0] > w[1])
+            || self.offsets[rows] as usize != self.columns.len()
+            || self.columns.len() != self.values.len()
+        {
+            return Some("row offsets do not partition the entries".to_owned());
+        }
+        let bad = self.columns.iter().find(|&&c| c as usize >= columns)?;
+        Some(format!("column {bad} of {columns}"))
+    }
+}

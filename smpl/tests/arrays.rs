@@ -1,0 +1,303 @@
+//! Array files and models in them: right values from good files, typed errors from bad ones.
+#![allow(clippy::unwrap_used, reason = "helpers of tests")]
+
+mod common;
+
+use std::io::Write;
+use std::path::{Path, PathBuf};
+
+use common::fixture;
+use proptest::prelude::*;
+use smpl::npz::{Npz, read_npy};
+use smpl::{BodyModel, Error};
+
+/// A file that is removed at the end of the test.
+struct Temporary(PathBuf);
+
+impl Temporary {
+    fn new(name: &str, bytes: &[u8]) -> Self {
+        let path = std::env::temp_dir().join(format!("smpl-{}-{name}", std::process::id()));
+        std::fs::write(&path, bytes).unwrap();
+        Self(path)
+    }
+}
+
+impl Drop for Temporary {
+    fn drop(&mut self) {
+        let _ = std::fs::remove_file(&self.0);
+    }
+}
+
+#[test]
+fn npz_arrays_are_read_with_shape_and_type() {
+    let mut npz = Npz::open(&fixture("numpy.npz")).unwrap();
+    assert_eq!(npz.keys()[0], "f4");
+    let (shape, values) = npz.f32("f4", &[None, Some(3)]).unwrap();
+    assert_eq!(
+        (shape.as_slice(), values.as_slice()),
+        (&[2, 3][..], &[0.0, 1.0, 2.0, 3.0, 4.0, 5.0][..])
+    );
+    assert_eq!(
+        npz.f32("f8_columns", &[Some(2), None]).unwrap().1,
+        [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]
+    );
+    assert_eq!(npz.i64("i2_big", &[None]).unwrap().1, [1, -2, 300]);
+    assert_eq!(npz.i64("bool", &[Some(2)]).unwrap().1, [1, 0]);
+    assert_eq!(npz.f32("scalar", &[]).unwrap().1, [0.25]);
+    assert!(npz.f32("empty", &[None, Some(3)]).unwrap().1.is_empty());
+}
+
+#[test]
+fn npz_errors_name_file_key_and_shapes() {
+    let mut npz = Npz::open(&fixture("numpy.npz")).unwrap();
+    let e = npz.f32("f4", &[Some(6890), None]).unwrap_err().to_string();
+    for part in ["numpy.npz", "`f4`", "[2, 3]", "[6890, _]"] {
+        assert!(e.contains(part), "{e:?} lacks {part:?}");
+    }
+    let e = npz.f32("nothing", &[]).unwrap_err();
+    assert!(
+        matches!(&e, Error::MissingKey { key, available, .. } if key == "nothing" && available.len() == 10)
+    );
+    assert!(
+        matches!(npz.f32("nan", &[None]), Err(Error::NotFinite { index: 1, key, .. }) if key == "nan")
+    );
+    assert!(matches!(
+        npz.f32("huge", &[None]),
+        Err(Error::NotFinite { index: 0, .. })
+    ));
+    assert!(matches!(
+        npz.i64("f4", &[None, None]),
+        Err(Error::Type { .. })
+    ));
+    assert!(matches!(npz.array("text"), Err(Error::Type { key, .. }) if key == "text"));
+    assert!(matches!(
+        Npz::open(Path::new("/no/such.npz")),
+        Err(Error::Io { .. })
+    ));
+}
+
+/// The bytes of a `.npy` file with the given header and data.
+fn npy(header: &str, data: &[u8]) -> Vec<u8> {
+    let mut out = b"\x93NUMPY\x01\x00".to_vec();
+    out.extend((header.len() as u16).to_le_bytes());
+    out.extend(header.as_bytes());
+    out.extend(data);
+    out
+}
+
+#[test]
+fn headers_that_claim_too_much_are_refused_before_memory_is_taken() {
+    for (i, (shape, large)) in [
+        ("(4611686018427387904, 4)", true),
+        (
+            "(18446744073709551615, 18446744073709551615, 18446744073709551615)",
+            true,
+        ),
+        ("(1000000000,)", true),
+        ("(99999999999999999999999,)", false),
+        ("(-1,)", false),
+        // Below the limit, but not there.
+        ("(100000000,)", false),
+        ("(0, 4611686018427387904)", false),
+    ]
+    .into_iter()
+    .enumerate()
+    {
+        let header = format!("{{'descr': '<f4', 'fortran_order': False, 'shape': {shape}, }}");
+        let file = Temporary::new(&format!("claim{i}.npy"), &npy(&header, &[0; 8]));
+        let error = read_npy(&file.0).expect_err(shape);
+        match error {
+            Error::TooLarge { .. } => assert!(large, "{shape}: {error}"),
+            Error::Npy { .. } => assert!(!large, "{shape}: {error}"),
+            _ => panic!("{shape}: {error}"),
+        }
+    }
+}
+
+#[test]
+fn malformed_npy_headers_are_errors() {
+    for (i, header) in [
+        "",
+        "{",
+        "{}",
+        "{'descr': '<f4'}",
+        "{'descr': '<f4', 'fortran_order': False}",
+        "{'descr': '<f4', 'fortran_order': Maybe, 'shape': (2,)}",
+        "{'descr': '<f4', 'fortran_order': False, 'shape': (2}",
+        "{'descr': '<f4', 'fortran_order': False, 'shape': (2,), 'more': 1}",
+        "{'descr': [('a', '<f4')], 'fortran_order': False, 'shape': (2,)}",
+        "{'descr': 'é', 'fortran_order': False, 'shape': (2,)}",
+        "{'descr': '<f', 'fortran_order': False, 'shape': (2,)}",
+        "{'descr': '', 'fortran_order': False, 'shape': (2,)}",
+        "{'descr': '<c8', 'fortran_order': False, 'shape': (1,)}",
+        "{'descr': '<f4', 'fortran_order': False, 'shape': (1,)}",
+        "{'descr': '<f4', 'fortran_order': False, 'shape': (3,)}",
+    ]
+    .into_iter()
+    .enumerate()
+    {
+        let file = Temporary::new(&format!("header{i}.npy"), &npy(header, &[0; 8]));
+        let error = read_npy(&file.0).expect_err(header);
+        assert!(
+            matches!(error, Error::Npy { .. } | Error::Type { .. }),
+            "{header}: {error}"
+        );
+    }
+}
+
+#[test]
+fn archives_cut_anywhere_are_errors() {
+    let bytes = std::fs::read(fixture("numpy.npz")).unwrap();
+    for length in 0..bytes.len() {
+        let read = Npz::from_bytes("cut", bytes[..length].to_vec()).and_then(|mut npz| {
+            let keys = npz.keys().to_vec();
+            keys.iter().try_for_each(|key| npz.array(key).map(drop))
+        });
+        assert!(
+            read.is_err(),
+            "{length} of {} bytes were accepted",
+            bytes.len()
+        );
+    }
+}
+
+#[test]
+fn a_changed_byte_of_data_fails_the_checksum() {
+    let bytes = std::fs::read(fixture("numpy.npz")).unwrap();
+    let mut npz = Npz::from_bytes("good", bytes.clone()).unwrap();
+    let good = npz.array("f4").unwrap();
+    for at in 0..bytes.len() {
+        let mut bad = bytes.clone();
+        bad[at] ^= 0x10;
+        let read = Npz::from_bytes("bad", bad).and_then(|mut npz| npz.array("f4"));
+        if let Ok(array) = read {
+            assert_eq!(array, good, "byte {at}");
+        }
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(2000))]
+
+    #[test]
+    fn random_bytes_are_no_archive(bytes in prop::collection::vec(any::<u8>(), 0..200)) {
+        prop_assert!(Npz::from_bytes("random", bytes).is_err());
+    }
+}
+
+/// Arrays of a body of three vertices and two joints.
+fn tiny_body() -> Vec<(&'static str, Vec<u64>, Vec<f64>)> {
+    vec![
+        (
+            "v_template",
+            vec![3, 3],
+            vec![0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0],
+        ),
+        ("f", vec![1, 3], vec![0.0, 1.0, 2.0]),
+        ("weights", vec![3, 2], vec![1.0, 0.0, 0.5, 0.5, 0.0, 1.0]),
+        (
+            "J_regressor",
+            vec![2, 3],
+            vec![1.0, 0.0, 0.0, 0.0, 0.5, 0.5],
+        ),
+        (
+            "kintree_table",
+            vec![2, 2],
+            vec![4294967295.0, 0.0, 0.0, 1.0],
+        ),
+        ("shapedirs", vec![3, 3, 1], vec![0.1; 9]),
+        ("posedirs", vec![3, 3, 9], vec![0.0; 81]),
+    ]
+}
+
+fn write_body(name: &str, arrays: &[(&str, Vec<u64>, Vec<f64>)]) -> Temporary {
+    let mut zip = zip::ZipWriter::new(std::io::Cursor::new(Vec::new()));
+    for (key, shape, values) in arrays {
+        let options = zip::write::SimpleFileOptions::default();
+        zip.start_file(format!("{key}.npy"), options).unwrap();
+        let integers = matches!(*key, "f" | "kintree_table");
+        let extents: Vec<String> = shape.iter().map(|n| format!("{n},")).collect();
+        let header = format!(
+            "{{'descr': '<{}', 'fortran_order': False, 'shape': ({}), }}",
+            if integers { "i8" } else { "f8" },
+            extents.concat()
+        );
+        let bytes = values.iter().flat_map(|&x| {
+            if integers {
+                (x as i64).to_le_bytes()
+            } else {
+                x.to_le_bytes()
+            }
+        });
+        zip.write_all(&npy(&header, &bytes.collect::<Vec<_>>()))
+            .unwrap();
+    }
+    Temporary::new(name, &zip.finish().unwrap().into_inner())
+}
+
+#[test]
+fn a_tiny_body_is_read() {
+    let file = write_body("tiny.npz", &tiny_body());
+    let body = BodyModel::load(&file.0).unwrap();
+    assert_eq!(
+        (body.num_vertices(), body.num_joints(), body.num_betas()),
+        (3, 2, 1)
+    );
+    assert_eq!(body.parents, [None, Some(0)]);
+}
+
+#[test]
+fn faults_of_a_model_name_the_array() {
+    let cases: [(&str, usize, f64); 11] = [
+        ("v_template", 4, f64::NAN),
+        ("v_template", 0, f64::INFINITY),
+        ("f", 2, 3.0),
+        ("f", 0, -1.0),
+        ("weights", 0, 0.5),
+        ("weights", 2, -0.5),
+        ("weights", 0, f64::NAN),
+        ("J_regressor", 0, 9.0),
+        ("kintree_table", 1, 1.0),
+        ("shapedirs", 3, f64::NEG_INFINITY),
+        ("posedirs", 80, f64::NAN),
+    ];
+    for (i, (key, index, value)) in cases.into_iter().enumerate() {
+        let mut arrays = tiny_body();
+        arrays.iter_mut().find(|a| a.0 == key).unwrap().2[index] = value;
+        let file = write_body(&format!("fault{i}.npz"), &arrays);
+        let message = BodyModel::load(&file.0).expect_err(key).to_string();
+        let name = format!("fault{i}.npz");
+        assert!(
+            message.contains(&format!("`{key}`")) && message.contains(&name),
+            "{message}"
+        );
+    }
+}
+
+#[test]
+fn missing_and_misshapen_arrays_of_a_model_are_named() {
+    for i in 0..tiny_body().len() {
+        let mut arrays = tiny_body();
+        let (key, shape, values) = &mut arrays[i];
+        let key = *key;
+        shape.push(1);
+        let shown = format!("{shape:?}");
+        let _ = values;
+        let file = write_body(&format!("shape{i}.npz"), &arrays);
+        let message = BodyModel::load(&file.0).expect_err(key).to_string();
+        assert!(
+            message.contains(&format!("`{key}`")) && message.contains(&shown),
+            "{message}"
+        );
+
+        arrays.remove(i);
+        let file = write_body(&format!("missing{i}.npz"), &arrays);
+        let error = BodyModel::load(&file.0).expect_err(key);
+        assert!(
+            matches!(&error, Error::MissingKey { key: k, .. } if k == key),
+            "{error}"
+        );
+    }
+    let other = BodyModel::load(Path::new("body.fbx")).unwrap_err();
+    assert!(matches!(other, Error::Extension { .. }));
+}

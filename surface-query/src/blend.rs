@@ -1,0 +1,90 @@
+use glam::Vec3;
+
+/// Below this sum of weights all normals are perpendicular to the query's directions, and what is left of the
+/// cosines is rounding.
+const MIN_WEIGHT: f32 = 1e-5;
+
+/// Blend of the nearest vertices, OccNeRF §3.2 (surface-based rendering).
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Blended {
+    /// v̂ = Σ w_i v_i / Σ w_i.
+    pub point: Vec3,
+    /// n̂ = normalise(Σ w_i n_i), unit.
+    pub normal: Vec3,
+    /// d = (x − v̂) · n̂, in the units of the vertices, positive on the side the normals point to.
+    pub signed_distance: f32,
+}
+
+/// Weights of the blend and what the backward pass needs of them.
+pub(crate) struct Sums {
+    pub weight: f32,
+    pub point: Vec3,
+    /// Σ w_i n_i, not normalised.
+    pub normal: Vec3,
+    /// Whether inverse distances stand in for the cosines.
+    pub inverse_distance: bool,
+}
+
+/// w_i = |cos(x − v_i, n_i)|; 1 where x = v_i.
+#[inline(always)]
+pub(crate) fn cosine_weight(offset: Vec3, normal: Vec3) -> f32 {
+    let length = offset.length();
+    if length > 0.0 {
+        (offset.dot(normal) / length).abs()
+    } else {
+        1.0
+    }
+}
+
+#[inline(always)]
+pub(crate) fn sums(vertices: &[Vec3], normals: &[Vec3], query: Vec3, finest: &[u32]) -> Sums {
+    let s = accumulate(vertices, normals, query, finest, cosine_weight);
+    if s.weight >= MIN_WEIGHT {
+        return s;
+    }
+    // No offset is zero here: it would have had weight 1.
+    let inverse = |offset: Vec3, _| 1.0 / offset.length();
+    Sums {
+        inverse_distance: true,
+        ..accumulate(vertices, normals, query, finest, inverse)
+    }
+}
+
+/// Σ w, Σ w v / Σ w and Σ w n. The points are averaged as offsets from the query, which keeps the digits of a
+/// small distance far from the origin.
+#[inline(always)]
+fn accumulate(
+    vertices: &[Vec3],
+    normals: &[Vec3],
+    query: Vec3,
+    finest: &[u32],
+    weight: impl Fn(Vec3, Vec3) -> f32,
+) -> Sums {
+    let mut sum = Sums {
+        weight: 0.0,
+        point: Vec3::ZERO,
+        normal: Vec3::ZERO,
+        inverse_distance: false,
+    };
+    for &i in finest {
+        let (v, n) = (vertices[i as usize], normals[i as usize]);
+        let offset = query - v;
+        let w = weight(offset, n);
+        sum.weight += w;
+        sum.point += offset * w;
+        sum.normal += n * w;
+    }
+    sum.point = query - sum.point / sum.weight;
+    sum
+}
+
+#[inline(always)]
+pub(crate) fn blend(vertices: &[Vec3], normals: &[Vec3], query: Vec3, finest: &[u32]) -> Blended {
+    let s = sums(vertices, normals, query, finest);
+    let normal = s.normal.normalize_or(normals[finest[0] as usize]);
+    Blended {
+        point: s.point,
+        normal,
+        signed_distance: (query - s.point).dot(normal),
+    }
+}

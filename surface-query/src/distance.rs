@@ -1,0 +1,384 @@
+use glam::{DVec3, Vec3, Vec4};
+
+use crate::Error;
+use crate::error::check_mesh;
+use crate::pseudonormal::Pseudonormals;
+use crate::tree::{Child, LANES, MAX_DEPTH, Tree};
+use crate::triangle::{Foot, Pack, closest_on_triangle};
+
+/// Queries farther than this many sizes of the mesh are answered in `f64`: from there `f32` would take faces for
+/// equally near of which one looks at the query and the other away.
+const FAR: f32 = 32.0;
+
+/// Faces kept for the exact comparison. Six meet at a usual vertex; more than this are compared in `f64` from the
+/// start.
+const MAX_CANDIDATES: usize = 32;
+
+/// The nearest point of a mesh.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Closest {
+    /// The face it lies on; one of them where several share the point.
+    pub face: u32,
+    /// Its weights of the face's corners: non-negative, sum 1.
+    pub barycentric: [f32; 3],
+    /// Its position.
+    pub point: Vec3,
+    /// Distance from it to the query, positive outside.
+    pub signed_distance: f32,
+}
+
+/// Exact signed distance to a triangle mesh: a bounding volume hierarchy finds the closest point, the
+/// angle-weighted pseudonormal of the face, edge or vertex it lies on gives the sign (Bærentzen and Aanæs 2005).
+///
+/// The faces keep their connectivity for life; [`MeshDistance::refit`] moves the vertices. Queries take `&self`
+/// and may run on any number of threads.
+///
+/// **Accuracy.** The tree is searched in `f32` with an allowance for rounding, and all faces it leaves are compared
+/// in `f64`: the distance is the true one rounded to `f32`. Only slivers, triangles more than 50 times as long as
+/// high, may lose to a face that is farther by a few 10⁻⁷ of their length.
+///
+/// **The sign** is that of inside and outside for a closed mesh without self-intersections. See the crate's
+/// README for what it means on others.
+pub struct MeshDistance {
+    faces: Vec<[u32; 3]>,
+    /// Multiplied by `scale`, a power of two, which is exact and brings products of four lengths into range.
+    vertices: Vec<Vec3>,
+    scale: f32,
+    /// Of the box of all faces, scaled.
+    centre: Vec3,
+    radius: f32,
+    /// What rounding may add to a distance measured in `f32`, scaled.
+    error: f32,
+    tree: Tree,
+    /// The triangles of each leaf of the tree.
+    packs: Vec<Pack>,
+    pseudonormals: Pseudonormals,
+}
+
+impl MeshDistance {
+    /// Takes a mesh of `vertices` (V) and `faces` (F), counter-clockwise seen from outside. Vertices at exactly
+    /// the same position are treated as one when the sign is decided, now and after every refit.
+    ///
+    /// # Errors
+    /// A vertex that is not finite, or a face that names no vertex.
+    pub fn new(vertices: &[Vec3], faces: &[[u32; 3]]) -> Result<Self, Error> {
+        check_mesh(vertices, faces)?;
+        let scale = power_of_two_scale(vertices);
+        let scaled: Vec<Vec3> = vertices.iter().map(|v| *v * scale).collect();
+        let mut this = Self {
+            faces: faces.to_vec(),
+            tree: Tree::new(&scaled, faces),
+            vertices: scaled,
+            scale,
+            centre: Vec3::ZERO,
+            radius: 0.0,
+            error: 0.0,
+            packs: Vec::new(),
+            pseudonormals: Pseudonormals::new(vertices, faces),
+        };
+        this.update();
+        Ok(this)
+    }
+
+    /// Moves the vertices (V); the faces stay. Linear in the size of the mesh.
+    ///
+    /// The tree keeps the shape it was built with: after a change that is no deformation queries stay exact but
+    /// become slow. Faces with a vertex that is not finite are nowhere until the next refit.
+    ///
+    /// # Panics
+    /// If the number of vertices is another than at the start.
+    pub fn refit(&mut self, vertices: &[Vec3]) {
+        assert_eq!(
+            vertices.len(),
+            self.vertices.len(),
+            "refit: {} vertices, the mesh has {}",
+            vertices.len(),
+            self.vertices.len()
+        );
+        self.scale = power_of_two_scale(vertices);
+        for (scaled, v) in self.vertices.iter_mut().zip(vertices) {
+            *scaled = *v * self.scale;
+        }
+        self.update();
+    }
+
+    fn update(&mut self) {
+        let Self {
+            faces,
+            vertices,
+            tree,
+            packs,
+            pseudonormals,
+            ..
+        } = self;
+        let corners = |face: u32| faces[face as usize].map(|v| vertices[v as usize]);
+        packs.clear();
+        packs.extend((tree.leaves.iter()).map(|leaf| {
+            Pack::new([0, 1, 2, 3].map(|lane| {
+                // Lanes that only fill up the leaf hold nothing.
+                let filler = lane > 0 && leaf[lane] == leaf[0];
+                if filler {
+                    [Vec3::NAN; 3]
+                } else {
+                    corners(leaf[lane])
+                }
+            }))
+        }));
+        let longest = (faces.iter())
+            .map(|face| face.map(|v| vertices[v as usize]))
+            .map(|[a, b, c]| {
+                let edges = [
+                    a.distance_squared(b),
+                    b.distance_squared(c),
+                    c.distance_squared(a),
+                ];
+                edges.into_iter().fold(0.0, f32::max)
+            })
+            .filter(|longest| longest.is_finite())
+            .fold(0.0, f32::max)
+            .sqrt();
+        tree.refit(|leaf| {
+            let mut bounds: Option<[Vec3; 2]> = None;
+            for &face in leaf {
+                let [a, b, c] = corners(face);
+                if !(a.is_finite() && b.is_finite() && c.is_finite()) {
+                    continue;
+                }
+                let [min, max] = bounds.unwrap_or([a, a]);
+                bounds = Some([min.min(a).min(b).min(c), max.max(a).max(b).max(c)]);
+            }
+            bounds
+        });
+        pseudonormals.update(vertices, faces);
+        if let Some([min, max]) = self.tree.bounds() {
+            self.centre = (min + max) / 2.0;
+            self.radius = ((max - min) / 2.0).max_element();
+            // A point of a triangle is built from the query's offset and two edges, each rounded a few times.
+            self.error = 16.0 * f32::EPSILON * longest;
+        }
+    }
+
+    /// The point of the mesh closest to `query`, if it is at most `max_distance` away (infinity: any).
+    ///
+    /// `None` for a mesh without faces, a query that is not finite, and a `max_distance` that is negative or NaN.
+    /// A tight `max_distance` makes queries that fail, and those that succeed, faster.
+    #[must_use]
+    pub fn closest(&self, query: Vec3, max_distance: f32) -> Option<Closest> {
+        let q = query * self.scale;
+        let reach = max_distance * self.scale;
+        if !(query.is_finite() && reach >= 0.0) || self.tree.nodes.is_empty() {
+            return None;
+        }
+        let exact = query.as_dvec3() * f64::from(self.scale);
+        let (face, foot) = if (q - self.centre).abs().max_element() <= self.radius * FAR {
+            // A little more than asked for: the exact comparison follows.
+            self.nearest(
+                q,
+                exact,
+                (reach * (1.0 + 1e-5) + f32::MIN_POSITIVE).min(1e18),
+            )?
+        } else {
+            self.nearest_to_far(exact)?
+        };
+        let scale = f64::from(self.scale);
+        let distance = foot.offset.length() / scale;
+        if distance > f64::from(max_distance) || distance > f64::from(f32::MAX) {
+            return None;
+        }
+        let side = foot
+            .offset
+            .dot(self.pseudonormals.of(face, foot.feature).as_dvec3());
+        Some(Closest {
+            face,
+            barycentric: foot.barycentric.map(|w| w as f32),
+            point: ((exact - foot.offset) / scale).as_vec3(),
+            signed_distance: if side < 0.0 { -distance } else { distance } as f32,
+        })
+    }
+
+    /// Nearest face and its closest point, scaled, if that is about as near as `reach`; `q` and `exact` are the scaled query.
+    fn nearest(&self, q: Vec3, exact: DVec3, reach: f32) -> Option<(u32, Foot)> {
+        // A face no farther than the best one by more than the error may be the nearest.
+        let allow = |distance: f32| {
+            let with_error = (distance + self.error) * (1.0 + 1e-6);
+            with_error * with_error + f32::MIN_POSITIVE
+        };
+        let q = [q.x, q.y, q.z].map(Vec4::splat);
+        let mut best = f32::INFINITY;
+        let mut bound = allow(reach);
+        let mut candidates = [(0.0f32, 0u32); MAX_CANDIDATES];
+        let mut count = 0;
+        let mut fixed = [(0.0f32, 0u32); MAX_DEPTH];
+        let mut spill;
+        let stack: &mut [(f32, u32)] = if self.tree.depth <= MAX_DEPTH {
+            &mut fixed
+        } else {
+            spill = vec![(0.0, 0); self.tree.depth];
+            &mut spill
+        };
+        let mut height = 0;
+        let mut node = Some(0u32);
+        while let Some(current) = node.take().or_else(|| pop(stack, &mut height, bound)) {
+            let n = &self.tree.nodes[current as usize];
+            let d = n.distance_squared(q);
+            let near = usize::from(d[1] < d[0]);
+            for side in [near, 1 - near] {
+                if d[side] > bound {
+                    break;
+                }
+                match n.child(side) {
+                    Child::Leaf(leaf) => {
+                        let d = self.packs[leaf as usize].distance_squared(q).to_array();
+                        for lane in 0..LANES {
+                            if d[lane] > bound || d[lane].is_nan() {
+                                continue;
+                            }
+                            if d[lane] < best {
+                                best = d[lane];
+                                bound = bound.min(allow(best.sqrt()));
+                            }
+                            if count == MAX_CANDIDATES {
+                                count = retain(&mut candidates, bound);
+                            }
+                            if count == MAX_CANDIDATES {
+                                return self.nearest_foot(exact, f64::from(bound));
+                            }
+                            candidates[count] = (d[lane], leaf * LANES as u32 + lane as u32);
+                            count += 1;
+                        }
+                    }
+                    Child::Node(child) if node.is_none() => node = Some(child),
+                    Child::Node(child) => {
+                        stack[height] = (d[side], child);
+                        height += 1;
+                    }
+                }
+            }
+        }
+        (candidates[..count].iter())
+            .filter(|(d, _)| *d <= bound)
+            .map(|&(_, slot)| {
+                let face = self.tree.leaves[slot as usize / LANES][slot as usize % LANES];
+                (face, self.foot(face, exact))
+            })
+            .min_by(|a, b| a.1.distance_squared.total_cmp(&b.1.distance_squared))
+    }
+
+    /// Closest point of one face to the scaled query `q`.
+    fn foot(&self, face: u32, q: DVec3) -> Foot {
+        let corners = self.faces[face as usize].map(|v| self.vertices[v as usize].as_dvec3());
+        closest_on_triangle(corners, q)
+    }
+
+    /// The same as [`MeshDistance::nearest`] for a query far outside.
+    fn nearest_to_far(&self, q: DVec3) -> Option<(u32, Foot)> {
+        // From here on the nearest point depends on the direction alone, and f64 still tells faces apart.
+        let (centre, horizon) = (self.centre.as_dvec3(), 1e7 * f64::from(self.radius));
+        let (face, foot) = self.nearest_foot(
+            centre + (q - centre).clamp_length_max(horizon),
+            f64::INFINITY,
+        )?;
+        let moved = q - centre - (q - centre).clamp_length_max(horizon);
+        let offset = foot.offset + moved;
+        Some((face, Foot { offset, ..foot }))
+    }
+
+    /// Nearest face and its closest point if its squared distance is at most `best`: the tree in `f64`.
+    fn nearest_foot(&self, q: DVec3, mut best: f64) -> Option<(u32, Foot)> {
+        let mut found = None;
+        let mut stack = vec![(0.0, 0u32)];
+        while let Some((d, node)) = stack.pop() {
+            if d > best {
+                continue;
+            }
+            let n = &self.tree.nodes[node as usize];
+            let mut sides = [0, 1].map(|side| {
+                let [min, max] = n.side(side).map(Vec3::as_dvec3);
+                (
+                    q.distance_squared(q.clamp(min, max.max(min))),
+                    n.child(side),
+                )
+            });
+            if sides[0].0 < sides[1].0 {
+                // The nearer one last, to be popped first.
+                sides.swap(0, 1);
+            }
+            for (d, child) in sides {
+                match child {
+                    Child::Node(child) => stack.push((d, child)),
+                    Child::Leaf(leaf) if d <= best => {
+                        for &face in &self.tree.leaves[leaf as usize] {
+                            let foot = self.foot(face, q);
+                            if foot.distance_squared <= best {
+                                best = foot.distance_squared;
+                                found = Some((face, foot));
+                            }
+                        }
+                    }
+                    Child::Leaf(_) => {}
+                }
+            }
+        }
+        found
+    }
+}
+
+/// Next node of the stack that is not beyond the bound.
+#[inline(always)]
+fn pop(stack: &[(f32, u32)], height: &mut usize, bound: f32) -> Option<u32> {
+    while *height > 0 {
+        *height -= 1;
+        let (d, node) = stack[*height];
+        if d <= bound {
+            return Some(node);
+        }
+    }
+    None
+}
+
+/// Moves the candidates within the bound to the front; returns how many they are.
+#[cold]
+fn retain(candidates: &mut [(f32, u32)], bound: f32) -> usize {
+    let mut kept = 0;
+    for i in 0..candidates.len() {
+        if candidates[i].0 <= bound {
+            candidates[kept] = candidates[i];
+            kept += 1;
+        }
+    }
+    kept
+}
+
+/// The power of two that brings the largest finite coordinate to about 1, within the exponents whose inverse
+/// and whose product with any coordinate are normal.
+fn power_of_two_scale(vertices: &[Vec3]) -> f32 {
+    let largest = vertices
+        .iter()
+        .filter(|v| v.is_finite())
+        .fold(0.0, |m: f32, v| m.max(v.abs().max_element()));
+    if largest == 0.0 {
+        return 1.0;
+    }
+    let exponent = (largest.to_bits() >> 23) as i32 - 127;
+    f32::from_bits(((127 - exponent.clamp(-126, 126)) as u32) << 23)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_scale_is_a_power_of_two_that_brings_the_largest_coordinate_to_one() {
+        for size in [1e-38, 1e-12, 0.3, 1.0, 1.7, 1e12, 3e38] {
+            let scale =
+                power_of_two_scale(&[Vec3::new(size, -size / 3.0, f32::NAN), Vec3::X * size]);
+            assert_eq!(scale.to_bits() & 0x7f_ffff, 0, "{size}");
+            assert!(
+                (0.5..=4.0).contains(&(scale * size)),
+                "{size}: {}",
+                scale * size
+            );
+        }
+        assert_eq!(power_of_two_scale(&[]), 1.0);
+    }
+}

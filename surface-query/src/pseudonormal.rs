@@ -1,0 +1,92 @@
+//! Angle-weighted pseudonormals of faces, edges and vertices (Bærentzen and Aanæs 2005): the side of the
+//! nearest feature's pseudonormal a point is on is the side of the surface.
+
+use std::collections::HashMap;
+
+use glam::{DVec3, Vec3};
+
+use crate::normals::{corner_angles, face_normal};
+use crate::triangle::Feature;
+
+/// What of the mesh's connectivity the normals need. Vertices at the same position count as one, so that the
+/// seams of textured meshes do not look like holes.
+struct Topology {
+    /// Edge i of a face goes from corner i to corner i+1.
+    edges: Vec<[u32; 3]>,
+    /// Faces with their vertices renumbered.
+    welded: Vec<[u32; 3]>,
+}
+
+pub(crate) struct Pseudonormals {
+    topology: Topology,
+    faces: Vec<Vec3>,
+    edges: Vec<Vec3>,
+    vertices: Vec<Vec3>,
+}
+
+impl Pseudonormals {
+    /// Connectivity of the mesh; the normals are those of [`Pseudonormals::update`].
+    pub fn new(vertices: &[Vec3], faces: &[[u32; 3]]) -> Self {
+        let mut positions: HashMap<[u32; 3], u32> = HashMap::with_capacity(vertices.len());
+        let names: Vec<u32> = (vertices.iter())
+            .map(|v| {
+                let next = positions.len() as u32;
+                // Adding zero makes −0 the same as 0.
+                *positions
+                    .entry((*v + 0.0).to_array().map(f32::to_bits))
+                    .or_insert(next)
+            })
+            .collect();
+        let welded: Vec<[u32; 3]> = (faces.iter())
+            .map(|face| face.map(|v| names[v as usize]))
+            .collect();
+        let mut numbers: HashMap<(u32, u32), u32> = HashMap::with_capacity(faces.len() * 3 / 2);
+        let edges = (welded.iter())
+            .map(|face| {
+                [0, 1, 2].map(|i| {
+                    let (a, b) = (face[i], face[(i + 1) % 3]);
+                    let next = numbers.len() as u32;
+                    *numbers.entry((a.min(b), a.max(b))).or_insert(next)
+                })
+            })
+            .collect();
+        Self {
+            faces: vec![Vec3::ZERO; faces.len()],
+            edges: vec![Vec3::ZERO; numbers.len()],
+            vertices: vec![Vec3::ZERO; positions.len()],
+            topology: Topology { edges, welded },
+        }
+    }
+
+    /// Normals of the same faces at new positions. None is normalised but those of the faces: only their side
+    /// matters.
+    pub fn update(&mut self, vertices: &[Vec3], faces: &[[u32; 3]]) {
+        self.edges.fill(Vec3::ZERO);
+        self.vertices.fill(Vec3::ZERO);
+        let topology = self.topology.welded.iter().zip(&self.topology.edges);
+        for ((face, normal), (welded, edges)) in faces.iter().zip(&mut self.faces).zip(topology) {
+            let corners: [DVec3; 3] = face.map(|i| vertices[i as usize].as_dvec3());
+            let n = face_normal(corners);
+            *normal = n.as_vec3();
+            if !n.is_finite() {
+                *normal = Vec3::ZERO;
+                continue;
+            }
+            let angles = corner_angles(corners);
+            for i in 0..3 {
+                self.vertices[welded[i] as usize] += (n * angles[i]).as_vec3();
+                self.edges[edges[i] as usize] += *normal;
+            }
+        }
+    }
+
+    /// Pseudonormal of a feature of a face; zero where all its faces are without area.
+    pub fn of(&self, face: u32, feature: Feature) -> Vec3 {
+        let face = face as usize;
+        match feature {
+            Feature::Face => self.faces[face],
+            Feature::Edge(i) => self.edges[self.topology.edges[face][i] as usize],
+            Feature::Vertex(i) => self.vertices[self.topology.welded[face][i] as usize],
+        }
+    }
+}

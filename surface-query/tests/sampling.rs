@@ -1,0 +1,97 @@
+//! Farthest point sampling against the plain algorithm.
+
+mod body;
+
+use glam::Vec3;
+use proptest::prelude::*;
+use surface_query::{Pyramid, farthest_points};
+use testkit::{oracle, strategy};
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(48))]
+
+    #[test]
+    fn sampling_equals_the_plain_algorithm(
+        points in strategy::cloud(0..250, 1.0), share in 0.0f32..1.2,
+    ) {
+        let count = (points.len() as f32 * share) as usize;
+        prop_assert_eq!(farthest_points(&points, count), oracle::farthest_points(&points, count));
+    }
+
+    #[test]
+    fn sampling_a_lattice_breaks_every_tie_by_index(
+        order in Just((0..216u32).collect::<Vec<_>>()).prop_shuffle(),
+    ) {
+        let points: Vec<Vec3> = (order.iter())
+            .map(|&i| Vec3::new((i % 6) as f32, (i / 6 % 6) as f32, (i / 36) as f32))
+            .collect();
+        prop_assert_eq!(farthest_points(&points, 216), oracle::farthest_points(&points, 216));
+    }
+
+    #[test]
+    fn a_level_is_the_sampling_of_the_level_above(
+        points in strategy::cloud(20..250, 1.0), ratio in 0.1f32..0.9,
+    ) {
+        let pyramid = Pyramid::new(&points, ratio, 3);
+        prop_assert_eq!(pyramid.levels.len(), 4);
+        prop_assert_eq!(&pyramid.levels[0], &(0..points.len() as u32).collect::<Vec<_>>());
+        for pair in pyramid.levels.windows(2) {
+            let above: Vec<Vec3> = pair[0].iter().map(|&i| points[i as usize]).collect();
+            let sampled: Vec<u32> = (oracle::farthest_points(&above, pair[1].len()).into_iter())
+                .map(|local| pair[0][local as usize])
+                .collect();
+            prop_assert_eq!(&pair[1], &sampled);
+        }
+    }
+}
+
+#[test]
+fn sampling_degenerate_clouds_gives_distinct_indices_and_takes_bad_points_last() {
+    for (name, points) in strategy::degenerate_clouds() {
+        let all = farthest_points(&points, points.len() + 3);
+        let finite = points.iter().filter(|p| p.is_finite()).count();
+        let mut sorted = all.clone();
+        sorted.sort_unstable();
+        assert_eq!(
+            sorted,
+            (0..points.len() as u32).collect::<Vec<_>>(),
+            "{name}"
+        );
+        for (position, &i) in all.iter().enumerate() {
+            assert_eq!(points[i as usize].is_finite(), position < finite, "{name}");
+        }
+        if finite == points.len() {
+            assert_eq!(
+                all,
+                oracle::farthest_points(&points, points.len()),
+                "{name}"
+            );
+        }
+    }
+}
+
+#[test]
+fn ratios_that_f32_rounds_down_give_the_decimal_size() {
+    let points: Vec<Vec3> = (0..10).map(|i| Vec3::X * i as f32).collect();
+    let size = |ratio| Pyramid::new(&points, ratio, 1).levels[1].len();
+    assert_eq!(
+        [0.7, 0.3, 0.1, 1.0, 0.0, 7.0, f32::NAN].map(size),
+        [7, 3, 1, 10, 1, 10, 10]
+    );
+}
+
+#[test]
+fn sampling_the_open_body_equals_the_plain_algorithm() {
+    let Some(body) = body::open_body() else {
+        return;
+    };
+    // The oracle is cubic, so every ninth vertex; mirror-symmetric ties are among them.
+    let points: Vec<Vec3> = body.vertices.iter().copied().step_by(9).collect();
+    assert_eq!(
+        farthest_points(&points, 200),
+        oracle::farthest_points(&points, 200)
+    );
+    let pyramid = Pyramid::new(&body.vertices, 0.25, 3);
+    let sizes: Vec<usize> = pyramid.levels.iter().map(Vec::len).collect();
+    assert_eq!(sizes, [6890, 1722, 430, 107]);
+}

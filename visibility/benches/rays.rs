@@ -1,0 +1,154 @@
+//! Cost of casting rays at a body of 13776 triangles (a ball of 20480 where that is not at hand), and at the same
+//! with every triangle split in two.
+
+#[path = "../tests/body/mod.rs"]
+mod body;
+
+use std::hint::black_box;
+
+use body::Random;
+use divan::Bencher;
+use divan::counter::ItemsCount;
+use glam::{Affine3A, Mat3, Quat, Vec3};
+use testkit::TriMesh;
+use visibility::{RayMesh, View, VisibilityCounts, visible_vertices};
+
+fn main() {
+    divan::main();
+}
+
+/// Looks at the origin from 3 m in front.
+fn view(size: u32) -> View {
+    let focal = size as f32 * 1.2;
+    let centre = size as f32 / 2.0;
+    View {
+        intrinsics: Mat3::from_cols(
+            Vec3::X * focal,
+            Vec3::Y * focal,
+            Vec3::new(centre, centre, 1.0),
+        ),
+        extrinsics: Affine3A::from_rotation_translation(
+            Quat::from_rotation_x(std::f32::consts::PI),
+            Vec3::new(0.0, -0.3, 3.0),
+        ),
+        width: size,
+        height: size,
+    }
+}
+
+/// Every triangle in two, at the middle of its longest edge's first half.
+fn split(mesh: &TriMesh) -> TriMesh {
+    let mut vertices = mesh.vertices.clone();
+    let faces = (mesh.faces.iter())
+        .flat_map(|&[a, b, c]| {
+            let m = vertices.len() as u32;
+            vertices.push((vertices[a as usize] + vertices[b as usize]) / 2.0);
+            [[a, m, c], [m, b, c]]
+        })
+        .collect();
+    TriMesh { vertices, faces }
+}
+
+fn coherent(bencher: Bencher<'_, '_>, mesh: &TriMesh) {
+    let rays = RayMesh::new(&mesh.vertices, &mesh.faces).unwrap();
+    let view = view(256);
+    let origin = view.centre().unwrap();
+    let to_world = view.extrinsics.inverse();
+    let inverse = view.intrinsics.inverse();
+    let directions: Vec<Vec3> = (0..256 * 256)
+        .map(|i| {
+            let pixel = Vec3::new((i % 256) as f32 + 0.5, (i / 256) as f32 + 0.5, 1.0);
+            to_world.transform_vector3(inverse * pixel)
+        })
+        .collect();
+    let hits = directions
+        .iter()
+        .filter(|d| rays.first_hit(origin, **d).is_some())
+        .count();
+    eprintln!(
+        "{} faces, {hits} of {} rays hit",
+        mesh.faces.len(),
+        directions.len()
+    );
+    bencher
+        .counter(ItemsCount::new(directions.len()))
+        .bench_local(|| {
+            for &d in &directions {
+                black_box(rays.first_hit(origin, d));
+            }
+        });
+}
+
+/// First hits of the pixels of a 256×256 image, one thread.
+#[divan::bench]
+fn first_hit_coherent(bencher: Bencher<'_, '_>) {
+    coherent(bencher, &body::body_or_ball());
+}
+
+/// The same at twice the faces.
+#[divan::bench]
+fn first_hit_coherent_split(bencher: Bencher<'_, '_>) {
+    coherent(bencher, &split(&body::body_or_ball()));
+}
+
+/// Random segments through the body's box, one thread.
+#[divan::bench]
+fn first_hit_random(bencher: Bencher<'_, '_>) {
+    let mesh = body::body_or_ball();
+    let rays = RayMesh::new(&mesh.vertices, &mesh.faces).unwrap();
+    let mut random = Random(3);
+    let segments: Vec<(Vec3, Vec3)> = (0..20_000)
+        .map(|_| (random.vec3(1.0), random.vec3(1.0)))
+        .collect();
+    bencher
+        .counter(ItemsCount::new(segments.len()))
+        .bench_local(|| {
+            for &(o, d) in &segments {
+                black_box(rays.first_hit(o, d));
+            }
+        });
+}
+
+/// All vertices of the body in one view, all threads.
+#[divan::bench]
+fn visible_vertices_of_a_view(bencher: Bencher<'_, '_>) {
+    let mesh = body::body_or_ball();
+    let rays = RayMesh::new(&mesh.vertices, &mesh.faces).unwrap();
+    let view = view(512);
+    bencher
+        .counter(ItemsCount::new(mesh.vertices.len()))
+        .bench_local(|| visible_vertices(&rays, &mesh.vertices, &view, None));
+}
+
+#[divan::bench]
+fn refit(bencher: Bencher<'_, '_>) {
+    let mesh = body::body_or_ball();
+    let mut rays = RayMesh::new(&mesh.vertices, &mesh.faces).unwrap();
+    bencher.bench_local(|| rays.refit(&mesh.vertices));
+}
+
+#[divan::bench]
+fn build(bencher: Bencher<'_, '_>) {
+    let mesh = body::body_or_ball();
+    bencher.bench_local(|| RayMesh::new(&mesh.vertices, &mesh.faces));
+}
+
+/// Attention of 20 neighbours, 10000 times.
+#[divan::bench]
+fn attention(bencher: Bencher<'_, '_>) {
+    let mut random = Random(9);
+    let counts =
+        VisibilityCounts::from_counts((0..6890).map(|_| (random.unit() * 1e6) as u64).collect());
+    let lists: Vec<[u32; 20]> = (0..10_000)
+        .map(|_| [0; 20].map(|_: u32| (random.unit() * 6890.0) as u32))
+        .collect();
+    bencher
+        .counter(ItemsCount::new(lists.len()))
+        .bench_local(|| {
+            let mut out = [0.0; 20];
+            for list in &lists {
+                counts.attention(list, &mut out);
+                black_box(&out);
+            }
+        });
+}

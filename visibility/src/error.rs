@@ -1,0 +1,51 @@
+/// What is wrong with a mesh.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+#[non_exhaustive]
+pub enum Error {
+    /// A face names a vertex that does not exist.
+    #[error("face {face} names vertex {vertex}, but there are only {vertices} vertices")]
+    FaceIndex {
+        /// The face.
+        face: usize,
+        /// The vertex it names.
+        vertex: u32,
+        /// Number of vertices.
+        vertices: usize,
+    },
+    /// A vertex has a NaN or infinite coordinate.
+    #[error("vertex {vertex} is not finite")]
+    NotFinite {
+        /// The vertex.
+        vertex: usize,
+    },
+    /// More vertices or faces than are supported.
+    #[error("{count} elements, at most 2^31 are supported")]
+    TooMany {
+        /// How many there are.
+        count: usize,
+    },
+}
+
+pub(crate) fn check_mesh(vertices: &[glam::Vec3], faces: &[[u32; 3]]) -> Result<(), Error> {
+    let limit = 1 << 31;
+    for count in [vertices.len(), faces.len()] {
+        if count > limit {
+            return Err(Error::TooMany { count });
+        }
+    }
+    if let Some(vertex) = vertices.iter().position(|v| !v.is_finite()) {
+        return Err(Error::NotFinite { vertex });
+    }
+    for (face, corners) in faces.iter().enumerate() {
+        for &vertex in corners {
+            if vertex as usize >= vertices.len() {
+                return Err(Error::FaceIndex {
+                    face,
+                    vertex,
+                    vertices: vertices.len(),
+                });
+            }
+        }
+    }
+    Ok(())
+}

@@ -1,0 +1,117 @@
+//! Watertight intersection of a ray with four triangles (Woop, Benthin and Wald 2013): a ray through an edge
+//! shared by two triangles hits at least one of them.
+
+use glam::{Vec3, Vec4};
+
+use crate::tree::LANES;
+
+/// Four triangles, lane by lane: corners a, b, c by axis.
+#[derive(Clone, Copy)]
+pub(crate) struct Pack {
+    corners: [[Vec4; 3]; 3],
+}
+
+/// A ray, sheared so that it runs along its longest axis.
+pub(crate) struct Ray {
+    pub origin: [Vec4; 3],
+    pub inverse: [Vec4; 3],
+    axes: [usize; 3],
+    shear: [Vec4; 3],
+}
+
+impl Ray {
+    /// `direction` has its largest component, by magnitude, in [1, 2).
+    pub fn new(origin: Vec3, direction: Vec3) -> Self {
+        let z = direction.abs().max_position();
+        let (x, y) = ((z + 1) % 3, (z + 2) % 3);
+        // A finite stand-in for 1/0: no 0 · ∞ where the origin lies on the side of a box.
+        let inverse = direction.to_array().map(|d| {
+            let d = if d.abs() < 1e-30 {
+                1e-30f32.copysign(d)
+            } else {
+                d
+            };
+            Vec4::splat(1.0 / d)
+        });
+        Self {
+            origin: origin.to_array().map(Vec4::splat),
+            inverse,
+            axes: [x, y, z],
+            shear: [
+                Vec4::splat(direction[x] / direction[z]),
+                Vec4::splat(direction[y] / direction[z]),
+                Vec4::splat(1.0 / direction[z]),
+            ],
+        }
+    }
+}
+
+/// Hits of four triangles: depth (infinite for a miss) and weights of the corners.
+pub(crate) struct Hits {
+    pub t: Vec4,
+    pub barycentric: [Vec4; 3],
+}
+
+impl Pack {
+    /// A triangle with a corner that is not finite is never hit.
+    pub fn new(mut triangles: [[Vec3; 3]; LANES]) -> Self {
+        for triangle in &mut triangles {
+            if triangle.iter().any(|v| !v.is_finite()) {
+                *triangle = [Vec3::NAN; 3];
+            }
+        }
+        Self {
+            corners: [0, 1, 2].map(|corner| {
+                [0, 1, 2].map(|axis| {
+                    Vec4::from([0, 1, 2, 3].map(|lane: usize| triangles[lane][corner][axis]))
+                })
+            }),
+        }
+    }
+
+    /// Intersects both sides; depths from 0 on.
+    #[inline(always)]
+    pub fn intersect(&self, ray: &Ray) -> Hits {
+        let [kx, ky, kz] = ray.axes;
+        let [sx, sy, sz] = ray.shear;
+        // Corners relative to the origin, sheared: the ray becomes the z axis.
+        let [a, b, c] = [0, 1, 2].map(|i| {
+            let corner = &self.corners[i];
+            let z = corner[kz] - ray.origin[kz];
+            let x = corner[kx] - ray.origin[kx] - sx * z;
+            let y = corner[ky] - ray.origin[ky] - sy * z;
+            [x, y, sz * z]
+        });
+        let mut u = c[0] * b[1] - c[1] * b[0];
+        let mut v = a[0] * c[1] - a[1] * c[0];
+        let mut w = b[0] * a[1] - b[1] * a[0];
+        let zero = Vec4::ZERO;
+        if (u.cmpeq(zero) | v.cmpeq(zero) | w.cmpeq(zero)).any() {
+            // Products of two f32 are exact in f64: the sign of an edge function is then right, and the same
+            // for both triangles of the edge.
+            u = exact(c, b);
+            v = exact(a, c);
+            w = exact(b, a);
+        }
+        let positive = u.cmpge(zero) & v.cmpge(zero) & w.cmpge(zero);
+        let negative = u.cmple(zero) & v.cmple(zero) & w.cmple(zero);
+        let determinant = u + v + w;
+        let inverse = 1.0 / determinant;
+        let barycentric = [u, v, w].map(|x| x * inverse);
+        let t = barycentric[0] * a[2] + barycentric[1] * b[2] + barycentric[2] * c[2];
+        let hit = (positive | negative) & determinant.cmpne(zero) & t.cmpge(zero);
+        Hits {
+            t: Vec4::select(hit, t, Vec4::INFINITY),
+            barycentric,
+        }
+    }
+}
+
+#[cold]
+fn exact(p: [Vec4; 3], q: [Vec4; 3]) -> Vec4 {
+    let lane = |i: usize| {
+        let [px, py, qx, qy] = [p[0][i], p[1][i], q[0][i], q[1][i]].map(f64::from);
+        (px * qy - py * qx) as f32
+    };
+    Vec4::new(lane(0), lane(1), lane(2), lane(3))
+}

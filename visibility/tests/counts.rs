@@ -1,0 +1,103 @@
+//! Counts and attention.
+
+use proptest::prelude::*;
+use visibility::VisibilityCounts;
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(64))]
+
+    #[test]
+    fn attention_is_a_distribution_in_the_order_of_the_counts(
+        counts in prop::collection::vec(any::<u64>(), 1..50),
+        picks in prop::collection::vec(any::<prop::sample::Index>(), 1..30),
+    ) {
+        let neighbours: Vec<u32> = picks.iter().map(|i| i.index(counts.len()) as u32).collect();
+        let seen = VisibilityCounts::from_counts(counts.clone());
+        let mut attention = vec![0.0; neighbours.len()];
+        seen.attention(&neighbours, &mut attention);
+        prop_assert!((attention.iter().sum::<f32>() - 1.0).abs() < 1e-5);
+        for (i, a) in neighbours.iter().zip(&attention) {
+            for (j, b) in neighbours.iter().zip(&attention) {
+                prop_assert!(counts[*i as usize] < counts[*j as usize] || a >= b);
+            }
+        }
+    }
+
+    #[test]
+    fn the_order_of_additions_does_not_matter(
+        (forward, shuffled) in prop::collection::vec(0u32..20, 0..200)
+            .prop_flat_map(|list| (Just(list.clone()), Just(list).prop_shuffle())),
+        cut in any::<prop::sample::Index>(),
+    ) {
+        let mut a = VisibilityCounts::new(20);
+        a.add(&forward);
+        let mut b = VisibilityCounts::new(20);
+        let (first, second) = shuffled.split_at(cut.index(shuffled.len() + 1));
+        b.add(first);
+        b.add(second);
+        prop_assert_eq!(a.total(), forward.len() as u128);
+        prop_assert_eq!(a, b);
+    }
+
+    #[test]
+    fn decay_never_adds(counts in prop::collection::vec(any::<u64>(), 0..20), keep in 0.0f64..=1.0) {
+        let mut seen = VisibilityCounts::from_counts(counts.clone());
+        seen.decay(keep);
+        for (after, before) in seen.counts().iter().zip(&counts) {
+            prop_assert!(after <= before);
+            prop_assert!((*after as f64 - keep * *before as f64).abs() <= 1.0 + 4e-16 * *before as f64);
+        }
+    }
+}
+
+#[test]
+fn attention_is_uniform_before_anything_was_seen() {
+    let mut out = [0.0; 5];
+    VisibilityCounts::new(9).attention(&[8, 1, 1, 0, 4], &mut out);
+    assert_eq!(out, [0.2; 5]);
+}
+
+#[test]
+fn attention_is_one_plus_count_over_the_sum() {
+    let seen = VisibilityCounts::from_counts(vec![0, 3, 11]);
+    let mut out = [0.0; 4];
+    seen.attention(&[0, 1, 2, 1], &mut out);
+    assert_eq!(out, [1.0, 4.0, 12.0, 4.0].map(|w: f32| w / 21.0));
+}
+
+#[test]
+fn counts_go_on_where_f32_stops_and_never_wrap() {
+    let mut seen = VisibilityCounts::from_counts(vec![1 << 24, u64::MAX, u64::MAX]);
+    seen.add(&[0, 0, 1]);
+    seen.add_visible(&[true, false, true]);
+    assert_eq!(seen.counts(), [(1 << 24) + 3, u64::MAX, u64::MAX]);
+    assert_eq!(seen.total(), 2 * u128::from(u64::MAX) + (1 << 24) + 3);
+    let mut out = [0.0; 2];
+    seen.attention(&[1, 2], &mut out);
+    assert_eq!(out, [0.5; 2]);
+    seen.decay(1.0);
+    assert_eq!(seen.counts()[1], u64::MAX);
+    seen.decay(0.0);
+    assert_eq!(seen.counts(), [0; 3]);
+    assert_eq!(seen.frequencies(), [0.0; 3]);
+}
+
+#[test]
+fn duplicates_count_each_time() {
+    let mut seen = VisibilityCounts::new(3);
+    seen.add(&[2, 2, 0, 2]);
+    assert_eq!(seen.counts(), [1, 0, 3]);
+    assert_eq!(seen.frequencies(), [0.25, 0.0, 0.75]);
+}
+
+#[test]
+#[should_panic(expected = "vertex 3 of 3")]
+fn a_vertex_that_does_not_exist_is_a_bug_of_the_caller() {
+    VisibilityCounts::new(3).add(&[0, 3]);
+}
+
+#[test]
+#[should_panic(expected = "keep = NaN")]
+fn decay_by_nan_is_a_bug_of_the_caller() {
+    VisibilityCounts::new(3).decay(f64::NAN);
+}

@@ -1,0 +1,50 @@
+//! The outer parts of a volume renderer: cameras and rays, bounds, samples along a ray, alpha compositing with
+//! its backward pass, and image metrics.
+//!
+//! ```
+//! use volrender::{Aabb, Camera, bin_edges, bin_midpoints, bin_widths, composite};
+//! use glam::{Affine3A, Mat3, Vec3};
+//!
+//! // 64×64 pixels, looking along +z from two metres before the origin.
+//! let intrinsics = Mat3::from_cols_array(&[80.0, 0.0, 0.0, 0.0, 80.0, 0.0, 32.0, 32.0, 1.0]);
+//! let camera = Camera::new(intrinsics, Affine3A::from_translation(Vec3::Z * 2.0), 64, 64)?;
+//! let ray = camera.ray(10.0 + 0.5, 32.0 + 0.5);
+//!
+//! let bounds = Aabb { min: Vec3::splat(-1.0), max: Vec3::splat(1.0) };
+//! if let Some((near, far)) = bounds.intersect(&ray) {
+//!     let (mut edges, mut t, mut delta) = ([0.0; 17], [0.0; 16], [0.0; 16]);
+//!     bin_edges(near, far, 16, &mut edges);
+//!     bin_midpoints(&edges, &mut t);
+//!     bin_widths(&edges, &mut delta);
+//!     // A ball of fog.
+//!     let sigma = t.map(|t| if ray.at(t).length() < 0.8 { 3.0 } else { 0.0 });
+//!     let mut weights = [0.0; 16];
+//!     let pixel = composite(&sigma, &[1.0; 16], &delta, &t, &[Vec3::X; 16], Vec3::ZERO, &mut weights);
+//!     assert!(pixel.opacity > 0.9);
+//! }
+//! # Ok::<(), volrender::Error>(())
+//! ```
+//!
+//! # Conventions
+//!
+//! * Cameras are OpenCV: x right, y down, z forward, extrinsics map world to camera. Pixel (column, row) has its
+//!   centre at (column + 0.5, row + 0.5).
+//! * Ray directions have unit length, so t, δ and depth are lengths in the unit of the world.
+//! * α_i = f_i (1 − exp(−σ_i δ_i)), w_i = α_i Π_{j<i} (1 − α_j), C = Σ w_i c_i + (1 − Σ w_i) · background.
+//! * Images are row-major H × W × 3, values in \[0, 1\].
+
+mod camera;
+mod composite;
+mod composite_backward;
+mod distortion;
+mod exponential;
+pub mod metrics;
+mod ray;
+mod sampling;
+
+pub use camera::{Camera, Error};
+pub use composite::{Composite, composite};
+pub use composite_backward::composite_backward;
+pub use distortion::Distortion;
+pub use ray::{Aabb, Ray};
+pub use sampling::{bin_edges, bin_midpoints, bin_widths, sample};

@@ -1,0 +1,57 @@
+//! `train --compare`: every method on one scene, both pixel rules, one table.
+
+use anyhow::Result;
+use occnerf::{Config, Method, OccludedRule};
+
+use crate::run::{METRICS, Metrics, RunConfig};
+use crate::settings::MethodName;
+use crate::train::{TrainArguments, run_one, scene_name};
+use crate::{run, source, table};
+
+const RUNS: [(MethodName, OccludedRule); 7] = [
+    (MethodName::Prior, OccludedRule::Unknown),
+    (MethodName::Humannerf, OccludedRule::Background),
+    (MethodName::Humannerf, OccludedRule::Unknown),
+    (MethodName::HashPoint, OccludedRule::Background),
+    (MethodName::HashPoint, OccludedRule::Unknown),
+    (MethodName::Occnerf, OccludedRule::Background),
+    (MethodName::Occnerf, OccludedRule::Unknown),
+];
+
+/// Trains what is missing under OUT/METHOD-RULE and prints all; a finished run is not trained again.
+pub fn compare(arguments: &TrainArguments) -> Result<()> {
+    anyhow::ensure!(arguments.settings.method.is_none(), "--compare trains every method: leave --method out");
+    let default = format!("runs/{}-compare", scene_name(arguments.scene.as_deref()));
+    let out = arguments.out.clone().unwrap_or_else(|| default.into());
+    let source = source::load(arguments.scene.as_deref(), arguments.body.as_deref())?;
+    let mut rows: Vec<(String, Metrics)> = Vec::new();
+    for (method, occluded) in RUNS {
+        let mut settings = arguments.settings.clone();
+        settings.method = Some(method);
+        let config = Config { occluded, ..settings.config()? };
+        let name = match config.method {
+            Method::Prior => config.method.name().to_owned(),
+            _ => format!("{}-{}", config.method.name(), occluded.name()),
+        };
+        let directory = out.join(&name);
+        let run = RunConfig { scene: source.scene.clone(), body: source.body.clone(), train: config };
+        let finished = directory.join(METRICS).is_file();
+        if finished && RunConfig::read(&directory)?.train == run.train {
+            println!("{name}: finished earlier");
+            rows.push((run.train.method.name().to_owned(), Metrics::read(&directory)?));
+            continue;
+        }
+        println!("{name}: training");
+        std::fs::create_dir_all(directory.join("renders"))?;
+        run.write(&directory)?;
+        if let Some(metrics) = run_one(&directory, &run, &source, false, None)? {
+            rows.push((metrics.method.clone(), metrics));
+        }
+    }
+    let rows: Vec<(String, &Metrics)> = rows.iter().map(|(name, metrics)| (name.clone(), metrics)).collect();
+    let text = table::markdown(&rows);
+    run::write(&out.join("comparison.md"), &text)?;
+    println!("\nnovel views of {}:\n{text}", source.scene);
+    println!("written: {}", out.join("comparison.md").display());
+    Ok(())
+}

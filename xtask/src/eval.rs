@@ -1,0 +1,193 @@
+//! `eval`: scores a run on frames that training did not see, or on those it saw.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::Result;
+use clap::{Args, ValueEnum};
+use image::RgbImage;
+use indicatif::ProgressBar;
+use occnerf::{
+    FieldRenderer, Method, PreparedFrame, PriorRenderer, Renderer, Rendering, Scene, SplitMetrics, Trainer,
+    VertexColors, evaluate,
+};
+
+use crate::run::{CHECKPOINT, METRICS, Metrics, RunConfig, Splits, peak_rss_bytes, use_threads};
+use crate::{pictures, table};
+
+/// Training frames are many and alike: every tenth is scored.
+const TRAIN_STRIDE: usize = 10;
+/// Pictures of a sheet: one row a camera, so many instants.
+const SHEET_INSTANTS: usize = 3;
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum Split {
+    /// Cameras that training never saw.
+    NovelView,
+    /// Every tenth training frame, on what it shows.
+    TrainView,
+}
+
+#[derive(Args)]
+pub struct EvalArguments {
+    /// Run directory
+    run: PathBuf,
+    /// Which frames [default: both]
+    #[arg(long)]
+    split: Option<Split>,
+    /// Threads [default: all cores]
+    #[arg(long)]
+    threads: Option<usize>,
+}
+
+/// Runs the command.
+pub fn eval(arguments: &EvalArguments) -> Result<()> {
+    use_threads(arguments.threads)?;
+    let directory = &arguments.run;
+    let run = RunConfig::read(directory)?;
+    let source = run.source()?;
+    let scene = Scene::new(&source.capture, &source.model, &run.train)?;
+    let trainer;
+    let model = if run.train.method == Method::Prior {
+        Model::Prior(VertexColors::measure(&scene)?)
+    } else {
+        trainer = Trainer::resume(&scene, &directory.join(CHECKPOINT))?;
+        Model::Field(&trainer)
+    };
+    let mut metrics = if directory.join(METRICS).is_file() {
+        Metrics::read(directory)?
+    } else {
+        let parameters = match &model {
+            Model::Prior(colors) => 3 * colors.colors.len(),
+            Model::Field(trainer) => trainer.num_parameters(),
+        };
+        let steps = match &model {
+            Model::Prior(_) => 0,
+            Model::Field(trainer) => trainer.steps_done(),
+        };
+        Metrics {
+            method: run.train.method.name().to_owned(),
+            preset: run.train.preset.name().to_owned(),
+            occluded: run.train.occluded.name().to_owned(),
+            scene: run.scene.clone(),
+            seed: run.train.seed,
+            steps,
+            train_seconds: 0.0,
+            peak_rss_bytes: peak_rss_bytes(),
+            parameters,
+            splits: Splits::default(),
+        }
+    };
+    if arguments.split != Some(Split::TrainView) {
+        metrics.splits.novel_view = Some(model.score_with_bar(&scene, Split::NovelView, |_, _| {})?);
+    }
+    if arguments.split != Some(Split::NovelView) {
+        metrics.splits.train_view = Some(model.score_with_bar(&scene, Split::TrainView, |_, _| {})?);
+    }
+    metrics.write(directory)?;
+    let mut one = metrics.clone();
+    for (name, split) in [("novel views", &metrics.splits.novel_view), ("train views", &metrics.splits.train_view)] {
+        if let Some(split) = split {
+            one.splits = Splits { novel_view: Some(split.clone()), train_view: None };
+            println!("{name}:\n{}", table::markdown(&[(one.method.clone(), &one)]));
+        }
+    }
+    Ok(())
+}
+
+/// What can be scored and drawn.
+pub enum Model<'a> {
+    Field(&'a Trainer<'a>),
+    Prior(VertexColors),
+}
+
+impl Model<'_> {
+    /// Something that draws it.
+    pub fn renderer<'s>(&'s self, scene: &'s Scene) -> Result<Box<dyn Renderer + 's>> {
+        Ok(match self {
+            Self::Field(trainer) => Box::new(FieldRenderer::new(trainer)?),
+            Self::Prior(colors) => Box::new(PriorRenderer::new(scene, colors)),
+        })
+    }
+
+    /// Scores a split; `seen` gets each picture.
+    pub fn score(
+        &self,
+        scene: &Scene,
+        split: Split,
+        seen: impl FnMut(&PreparedFrame, &Rendering),
+    ) -> Result<SplitMetrics> {
+        let frames: Vec<&PreparedFrame> = match split {
+            Split::NovelView => scene.eval.iter().collect(),
+            Split::TrainView => scene.train.iter().step_by(TRAIN_STRIDE).collect(),
+        };
+        Ok(evaluate(scene, self.renderer(scene)?.as_mut(), &frames, seen)?)
+    }
+
+    fn score_with_bar(
+        &self,
+        scene: &Scene,
+        split: Split,
+        mut seen: impl FnMut(&PreparedFrame, &Rendering),
+    ) -> Result<SplitMetrics> {
+        let frames = match split {
+            Split::NovelView => scene.eval.len(),
+            Split::TrainView => scene.train.len().div_ceil(TRAIN_STRIDE),
+        };
+        let bar = ProgressBar::new(frames as u64).with_message("scoring");
+        let metrics = self.score(scene, split, |frame, rendering| {
+            bar.inc(1);
+            seen(frame, rendering);
+        })?;
+        bar.finish_and_clear();
+        Ok(metrics)
+    }
+}
+
+/// Scores both splits, writes metrics.json and the pictures of unseen views beside the truth.
+pub fn score_run(
+    directory: &Path,
+    run: &RunConfig,
+    scene: &Scene,
+    model: &Model<'_>,
+    mut metrics: Metrics,
+) -> Result<Metrics> {
+    let mut cameras: Vec<(String, Vec<RgbImage>)> = Vec::new();
+    let per_camera = scene.eval.iter().filter(|f| f.camera_name == scene.eval[0].camera_name).count().max(1);
+    let stride = per_camera.div_ceil(SHEET_INSTANTS).max(1);
+    let mut index = 0;
+    let novel = model.score_with_bar(scene, Split::NovelView, |frame, rendering| {
+        if cameras.last().is_none_or(|(name, _)| *name != frame.camera_name) {
+            cameras.push((frame.camera_name.clone(), Vec::new()));
+            index = 0;
+        }
+        if index % stride == 0
+            && let Some((_, row)) = cameras.last_mut()
+        {
+            row.extend(beside_truth(frame, rendering));
+        }
+        index += 1;
+    })?;
+    let rows: Vec<Vec<RgbImage>> = cameras.into_iter().map(|(_, row)| row).collect();
+    pictures::save(&pictures::sheet(&rows), &directory.join("renders/novel_views.png"))?;
+    let mut row = Vec::new();
+    let train = model.score_with_bar(scene, Split::TrainView, |frame, rendering| {
+        if row.len() < 2 * 5 {
+            row.extend(beside_truth(frame, rendering));
+        }
+    })?;
+    pictures::save(&pictures::sheet(&[row]), &directory.join("renders/train_views.png"))?;
+    metrics.peak_rss_bytes = peak_rss_bytes();
+    metrics.splits = Splits { novel_view: (!scene.eval.is_empty()).then_some(novel), train_view: Some(train) };
+    metrics.scene.clone_from(&run.scene);
+    metrics.write(directory)?;
+    Ok(metrics)
+}
+
+/// Truth and rendering over grey.
+fn beside_truth(frame: &PreparedFrame, rendering: &Rendering) -> [RgbImage; 2] {
+    let (width, height) = (frame.camera.width, frame.camera.height);
+    [
+        pictures::over_grey(&frame.pixels, &frame.mask, width, height),
+        pictures::over_grey(&rendering.image.pixels, &rendering.opacity, width, height),
+    ]
+}

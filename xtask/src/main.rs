@@ -1,0 +1,46 @@
+//! `cargo xtask`: train, evaluate and render people from occluded videos.
+
+mod compare;
+mod eval;
+mod pictures;
+mod render;
+mod run;
+mod settings;
+mod source;
+mod table;
+mod train;
+
+use clap::{Parser, Subcommand};
+
+/// Turns a video of a moving person, partly hidden behind objects, into a 3-D person that renders from any side.
+#[derive(Parser)]
+#[command(name = "cargo xtask", bin_name = "cargo xtask", version)]
+struct Arguments {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Subcommand)]
+enum Command {
+    /// Trains on a scene, scores the result on unseen views, and draws it.
+    Train(train::TrainArguments),
+    /// Scores a run, prints a table and writes its metrics.json.
+    Eval(eval::EvalArguments),
+    /// Draws a run's person: its movement, from all around, or in the rest pose.
+    Render(render::RenderArguments),
+}
+
+fn main() -> std::process::ExitCode {
+    let outcome = match Arguments::parse().command {
+        Command::Train(arguments) => train::train(&arguments),
+        Command::Eval(arguments) => eval::eval(&arguments),
+        Command::Render(arguments) => render::render(&arguments),
+    };
+    match outcome {
+        Ok(()) => std::process::ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("error: {error:#}");
+            std::process::ExitCode::FAILURE
+        }
+    }
+}

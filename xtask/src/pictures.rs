@@ -1,0 +1,58 @@
+//! Contact sheets and short films.
+
+use std::path::Path;
+
+use anyhow::{Context, Result};
+use image::codecs::gif::{GifEncoder, Repeat};
+use image::{Delay, Frame, Rgb, RgbImage, imageops};
+use occnerf::data::Image;
+
+/// Gap between the cells of a sheet in pixels.
+const GAP: u32 = 4;
+
+/// 8-bit picture of sRGB values in [0, 1].
+pub fn to_rgb(image: &Image) -> RgbImage {
+    RgbImage::from_fn(image.width, image.height, |x, y| {
+        let at = 3 * (y * image.width + x) as usize;
+        Rgb(std::array::from_fn(|c| (image.pixels[at + c] * 255.0).round().clamp(0.0, 255.0) as u8))
+    })
+}
+
+/// A picture with `coverage` (H × W) composited over grey, so that dark clothes and empty space differ.
+pub fn over_grey(pixels: &[f32], coverage: &[f32], width: u32, height: u32) -> RgbImage {
+    let over = pixels.chunks_exact(3).zip(coverage).flat_map(|(p, &m)| p.iter().map(move |c| c + (1.0 - m) * 0.35));
+    to_rgb(&Image { width, height, pixels: over.collect() })
+}
+
+/// Rows of equally large pictures on white.
+pub fn sheet(rows: &[Vec<RgbImage>]) -> RgbImage {
+    let cell = |f: fn(&RgbImage) -> u32| rows.iter().flatten().map(f).max().unwrap_or(1);
+    let (width, height) = (cell(RgbImage::width), cell(RgbImage::height));
+    let columns = rows.iter().map(Vec::len).max().unwrap_or(0) as u32;
+    let size = (columns * (width + GAP) + GAP, rows.len() as u32 * (height + GAP) + GAP);
+    let mut sheet = RgbImage::from_pixel(size.0, size.1, Rgb([255; 3]));
+    for (r, row) in rows.iter().enumerate() {
+        for (c, picture) in row.iter().enumerate() {
+            let (x, y) = (GAP + c as u32 * (width + GAP), GAP + r as u32 * (height + GAP));
+            imageops::replace(&mut sheet, picture, i64::from(x), i64::from(y));
+        }
+    }
+    sheet
+}
+
+/// Writes a PNG.
+pub fn save(picture: &RgbImage, path: &Path) -> Result<()> {
+    picture.save(path).with_context(|| path.display().to_string())
+}
+
+/// Writes an endless GIF at `fps` frames a second.
+pub fn film(pictures: &[RgbImage], fps: u32, path: &Path) -> Result<()> {
+    let file = std::fs::File::create(path).with_context(|| path.display().to_string())?;
+    let mut encoder = GifEncoder::new_with_speed(std::io::BufWriter::new(file), 10);
+    encoder.set_repeat(Repeat::Infinite)?;
+    for picture in pictures {
+        let rgba = image::DynamicImage::ImageRgb8(picture.clone()).into_rgba8();
+        encoder.encode_frame(Frame::from_parts(rgba, 0, 0, Delay::from_numer_denom_ms(1000, fps)))?;
+    }
+    Ok(())
+}

@@ -1,0 +1,132 @@
+//! The run directory: what a run was trained with, its log, checkpoint, scores and pictures.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, Result, bail};
+use occnerf::{Config, SplitMetrics};
+use serde::{Deserialize, Serialize};
+
+use crate::source::{self, Source};
+
+pub const CHECKPOINT: &str = "checkpoint.safetensors";
+pub const METRICS: &str = "metrics.json";
+
+/// What config.toml holds.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub struct RunConfig {
+    /// `demo` or a directory.
+    pub scene: String,
+    /// The body model's file.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub body: Option<PathBuf>,
+    /// Everything else.
+    pub train: Config,
+}
+
+impl RunConfig {
+    /// Reads a run's config.toml.
+    pub fn read(run: &Path) -> Result<Self> {
+        let path = run.join("config.toml");
+        let text = std::fs::read_to_string(&path).with_context(|| format!("{} is not a run", path.display()))?;
+        let config: Self = toml::from_str(&text).with_context(|| path.display().to_string())?;
+        config.train.validate().with_context(|| path.display().to_string())?;
+        Ok(config)
+    }
+
+    /// Writes it.
+    pub fn write(&self, run: &Path) -> Result<()> {
+        write(&run.join("config.toml"), &toml::to_string(self)?)
+    }
+
+    /// The capture it was trained on.
+    pub fn source(&self) -> Result<Source> {
+        source::load(Some(&self.scene), self.body.as_deref())
+    }
+}
+
+/// What metrics.json holds.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub struct Metrics {
+    pub method: String,
+    pub preset: String,
+    pub occluded: String,
+    pub scene: String,
+    pub seed: u64,
+    pub steps: u64,
+    pub train_seconds: f64,
+    pub peak_rss_bytes: u64,
+    pub parameters: usize,
+    pub splits: Splits,
+}
+
+/// Scores of each split that was measured.
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
+pub struct Splits {
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub novel_view: Option<SplitMetrics>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub train_view: Option<SplitMetrics>,
+}
+
+impl Metrics {
+    /// Reads a run's metrics.json.
+    pub fn read(run: &Path) -> Result<Self> {
+        let path = run.join(METRICS);
+        let text = std::fs::read_to_string(&path).with_context(|| path.display().to_string())?;
+        serde_json::from_str(&text).with_context(|| path.display().to_string())
+    }
+
+    /// Writes it.
+    pub fn write(&self, run: &Path) -> Result<()> {
+        write(&run.join(METRICS), &serde_json::to_string_pretty(self)?)
+    }
+}
+
+/// A directory for a new run: `out`, or the first free `runs/NAME`, `runs/NAME-2`, …
+pub fn new_directory(out: Option<&Path>, name: &str) -> Result<PathBuf> {
+    let directory = match out {
+        Some(out) if out.join(CHECKPOINT).exists() => {
+            bail!("{} already holds a run: go on with --resume, or give another --out", out.display())
+        }
+        Some(out) => out.to_owned(),
+        None => candidates(name).find(|d| !d.exists()).context("no free directory under runs/")?,
+    };
+    std::fs::create_dir_all(directory.join("renders")).with_context(|| directory.display().to_string())?;
+    Ok(directory)
+}
+
+/// The run to go on with: `out`, or the latest of the default names.
+pub fn existing_directory(out: Option<&Path>, name: &str) -> Result<PathBuf> {
+    let directory = match out {
+        Some(out) => out.to_owned(),
+        None => candidates(name).take_while(|d| d.exists()).last().context("no run to resume under runs/")?,
+    };
+    if !directory.join(CHECKPOINT).is_file() {
+        bail!("{} has no {CHECKPOINT} to resume from", directory.display());
+    }
+    Ok(directory)
+}
+
+fn candidates(name: &str) -> impl Iterator<Item = PathBuf> {
+    let name = name.to_owned();
+    (1..10_000).map(move |i| Path::new("runs").join(if i == 1 { name.clone() } else { format!("{name}-{i}") }))
+}
+
+/// Largest resident set of this process so far; 0 where the system does not tell.
+pub fn peak_rss_bytes() -> u64 {
+    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
+    let line = status.lines().find_map(|l| l.strip_prefix("VmHWM:"));
+    line.and_then(|l| l.trim().trim_end_matches(" kB").parse::<u64>().ok()).unwrap_or(0) * 1024
+}
+
+pub fn write(path: &Path, text: &str) -> Result<()> {
+    std::fs::write(path, text).with_context(|| path.display().to_string())
+}
+
+/// Sets the number of threads of everything that follows.
+pub fn use_threads(threads: Option<usize>) -> Result<()> {
+    if let Some(threads) = threads {
+        rayon::ThreadPoolBuilder::new().num_threads(threads).build_global()?;
+    }
+    Ok(())
+}

@@ -1,0 +1,152 @@
+//! From the command line to a configuration.
+
+use anyhow::{Context, Result, bail};
+use clap::{Args, ValueEnum};
+use occnerf::{Component, Config, Method, OccludedRule, Preset};
+
+/// Which model is trained.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum MethodName {
+    /// The posed prior in mean vertex colours; nothing is trained.
+    Prior,
+    /// Point-based, frequency encoding.
+    Humannerf,
+    /// Point-based, hash encoding.
+    HashPoint,
+    /// Point term and attended surface term.
+    Occnerf,
+}
+
+impl From<MethodName> for Method {
+    fn from(name: MethodName) -> Self {
+        match name {
+            MethodName::Prior => Self::Prior,
+            MethodName::Humannerf => Self::Humannerf,
+            MethodName::HashPoint => Self::HashPoint,
+            MethodName::Occnerf => Self::Occnerf,
+        }
+    }
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum PresetName {
+    /// A first look: one to two minutes.
+    Fast,
+    /// The default.
+    Balanced,
+    /// The paper's setting: over an hour.
+    Paper,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum ComponentName {
+    Surface,
+    Attention,
+    Completeness,
+    Perceptual,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum OccludedName {
+    /// Pixels behind an occluder enter no photometric term.
+    Unknown,
+    /// They are taught to be background, as the published code has it.
+    Background,
+}
+
+/// What a run is trained with.
+#[derive(Args, Clone, Debug, Default)]
+pub struct SettingArguments {
+    /// Named settings [default: balanced]
+    #[arg(long)]
+    pub preset: Option<PresetName>,
+    /// Which model [default: occnerf]
+    #[arg(long)]
+    pub method: Option<MethodName>,
+    /// Components of the method to switch off, comma separated
+    #[arg(long, value_delimiter = ',')]
+    pub ablate: Vec<ComponentName>,
+    /// What a hidden pixel of the body's silhouette is taken for [default: unknown]
+    #[arg(long)]
+    pub occluded: Option<OccludedName>,
+    /// Optimisation steps [default: the preset's]
+    #[arg(long)]
+    pub steps: Option<u64>,
+    /// Seed of every random choice [default: 1]
+    #[arg(long)]
+    pub seed: Option<u64>,
+    /// Any other value of config.toml's [train] table, such as encoding.n_max=512; may be repeated
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    pub set: Vec<String>,
+}
+
+impl SettingArguments {
+    /// The preset with everything given on the command line applied.
+    pub fn config(&self) -> Result<Config> {
+        let preset = match self.preset.unwrap_or(PresetName::Balanced) {
+            PresetName::Fast => Preset::Fast,
+            PresetName::Balanced => Preset::Balanced,
+            PresetName::Paper => Preset::Paper,
+        };
+        let method = self.method.map_or(Method::Occnerf, Method::from);
+        self.apply(Config::preset(preset, method))
+    }
+
+    /// `config` with everything but preset and method applied.
+    pub fn apply(&self, mut config: Config) -> Result<Config> {
+        for component in &self.ablate {
+            config.ablate(match component {
+                ComponentName::Surface => Component::Surface,
+                ComponentName::Attention => Component::Attention,
+                ComponentName::Completeness => Component::Completeness,
+                ComponentName::Perceptual => Component::Perceptual,
+            });
+        }
+        match self.occluded {
+            Some(OccludedName::Unknown) => config.occluded = OccludedRule::Unknown,
+            Some(OccludedName::Background) => config.occluded = OccludedRule::Background,
+            None => {}
+        }
+        config.steps = self.steps.unwrap_or(config.steps);
+        config.seed = self.seed.unwrap_or(config.seed);
+        for assignment in &self.set {
+            config = set(&config, assignment).with_context(|| format!("--set {assignment}"))?;
+        }
+        config.validate()?;
+        Ok(config)
+    }
+
+    /// Checks that a run to be resumed was trained with what is asked for; the number of steps may change.
+    pub fn resumed(&self, saved: Config) -> Result<Config> {
+        let asked = if self.preset.is_some() || self.method.is_some() { self.config()? } else { saved.clone() };
+        let asked = self.apply(asked)?;
+        let steps = self.steps.unwrap_or(saved.steps);
+        let same = Config { steps, ..asked.clone() } == Config { steps, ..saved.clone() };
+        if !same {
+            bail!("the run to resume was trained with other settings; leave them out, or start a new run with --out");
+        }
+        Ok(Config { steps, ..saved })
+    }
+}
+
+/// Replaces one value by its dotted key.
+fn set(config: &Config, assignment: &str) -> Result<Config> {
+    let (key, value) = assignment.split_once('=').context("expected KEY=VALUE")?;
+    let mut table = toml::Table::try_from(config)?;
+    let mut at = &mut table;
+    let mut parts: Vec<&str> = key.split('.').collect();
+    let last = parts.pop().unwrap_or_default();
+    for part in parts {
+        at = at.get_mut(part).and_then(toml::Value::as_table_mut).with_context(|| format!("no table `{part}`"))?;
+    }
+    let known = at.keys().cloned().collect::<Vec<_>>().join(", ");
+    let old = at.get(last).with_context(|| format!("no key `{last}`; there are {known}"))?;
+    let new = match old {
+        toml::Value::Integer(_) => toml::Value::Integer(value.parse().context("expected a whole number")?),
+        toml::Value::Float(_) => toml::Value::Float(value.parse().context("expected a number")?),
+        toml::Value::Boolean(_) => toml::Value::Boolean(value.parse().context("expected true or false")?),
+        _ => toml::Value::String(value.to_owned()),
+    };
+    at.insert(last.to_owned(), new);
+    Ok(table.try_into()?)
+}

@@ -1,0 +1,51 @@
+//! Scores as a table.
+
+use crate::run::Metrics;
+
+fn cell(value: Option<f64>, digits: usize) -> String {
+    value.map_or("–".to_owned(), |v| format!("{v:.digits$}"))
+}
+
+/// A row for each run: novel views, ranked quantities first.
+pub fn markdown(rows: &[(String, &Metrics)]) -> String {
+    let header = [
+        "method", "occluded", "steps", "train s", "psnr_mask", "psnr_hidden", "ssim_mask", "psnr_vis", "ssim_vis",
+        "psnr_full", "ssim_full", "iou", "s/frame", "params",
+    ];
+    let mut lines: Vec<Vec<String>> = vec![header.map(str::to_owned).to_vec()];
+    for (name, m) in rows {
+        let Some(split) = m.splits.novel_view.as_ref().or(m.splits.train_view.as_ref()) else { continue };
+        lines.push(vec![
+            name.clone(),
+            if m.method == "prior" { "–".to_owned() } else { m.occluded.clone() },
+            m.steps.to_string(),
+            format!("{:.0}", m.train_seconds),
+            cell(split.psnr_mask, 2),
+            cell(split.psnr_hidden, 2),
+            cell(split.ssim_mask, 4),
+            cell(split.psnr_vis, 2),
+            cell(split.ssim_vis, 4),
+            cell(split.psnr_full, 2),
+            cell(split.ssim_full, 4),
+            cell(split.mask_iou, 3),
+            format!("{:.2}", split.render_seconds_per_frame),
+            m.parameters.to_string(),
+        ]);
+    }
+    let widths: Vec<usize> =
+        (0..header.len()).map(|c| lines.iter().map(|l| l[c].chars().count()).max().unwrap_or(0)).collect();
+    let mut text = String::new();
+    for (i, line) in lines.iter().enumerate() {
+        let cells = line.iter().zip(&widths).enumerate().map(|(c, (cell, &w))| {
+            if c < 2 { format!("{cell:<w$}") } else { format!("{cell:>w$}") }
+        });
+        text.push_str(&format!("| {} |\n", cells.collect::<Vec<_>>().join(" | ")));
+        if i == 0 {
+            let rules = widths.iter().enumerate().map(|(c, &w)| {
+                if c < 2 { "-".repeat(w) } else { format!("{}:", "-".repeat(w.saturating_sub(1))) }
+            });
+            text.push_str(&format!("| {} |\n", rules.collect::<Vec<_>>().join(" | ")));
+        }
+    }
+    text
+}

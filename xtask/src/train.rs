@@ -1,0 +1,248 @@
+//! `train`: from frames to a scored and drawn person.
+
+use std::io::{IsTerminal, Write};
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, Result};
+use clap::Args;
+use indicatif::{ProgressBar, ProgressStyle};
+use occnerf::{Method, Scene, StepReport, Trainer, VertexColors, checkpoint_config};
+
+use crate::compare::compare;
+use crate::eval::{Model, score_run};
+use crate::run::{
+    CHECKPOINT, Metrics, RunConfig, Splits, existing_directory, new_directory, peak_rss_bytes, use_threads,
+};
+use crate::settings::SettingArguments;
+use crate::source::{self, Source};
+use crate::{run, table};
+
+/// A checkpoint this often, so that a power cut costs little.
+const CHECKPOINT_EVERY: Duration = Duration::from_secs(30);
+const LOG_EVERY: u64 = 10;
+/// Without a terminal the progress is a line this often.
+const LINE_EVERY: Duration = Duration::from_secs(15);
+
+#[derive(Args)]
+pub struct TrainArguments {
+    /// A capture in HumanNeRF's prepared layout; the embedded demo if left out
+    pub scene: Option<String>,
+    /// Run directory [default: runs/SCENE-METHOD]
+    #[arg(long)]
+    pub out: Option<PathBuf>,
+    /// The body model of the capture, .npz or .pkl [default: SMPL_MODEL, or body.npz or body/*.npz near the scene]
+    #[arg(long)]
+    pub body: Option<PathBuf>,
+    #[command(flatten)]
+    pub settings: SettingArguments,
+    /// Threads [default: all cores]; the result does not depend on it
+    #[arg(long)]
+    pub threads: Option<usize>,
+    /// Go on with the run in --out from its checkpoint
+    #[arg(long)]
+    pub resume: bool,
+    /// Stop after this many steps in all, leaving a checkpoint to resume from
+    #[arg(long)]
+    pub stop_after: Option<u64>,
+    /// Train every method under both pixel rules and print one table
+    #[arg(long, conflicts_with_all = ["resume", "stop_after"])]
+    pub compare: bool,
+}
+
+/// Runs the command.
+pub fn train(arguments: &TrainArguments) -> Result<()> {
+    use_threads(arguments.threads)?;
+    if arguments.compare {
+        return compare(arguments);
+    }
+    let method = arguments.settings.config()?.method;
+    let name = format!("{}-{}", scene_name(arguments.scene.as_deref()), method.name());
+    let out = arguments.out.as_deref();
+    let (directory, config) = if arguments.resume {
+        let directory = existing_directory(out, &name)?;
+        let config = arguments.settings.resumed(checkpoint_config(&directory.join(CHECKPOINT))?)?;
+        (directory, config)
+    } else {
+        (PathBuf::new(), arguments.settings.config()?)
+    };
+    let source = if arguments.resume && arguments.scene.is_none() {
+        RunConfig::read(&directory)?.source()?
+    } else {
+        source::load(arguments.scene.as_deref(), arguments.body.as_deref())?
+    };
+    // The directory of a new run is made only now, so that bad input leaves nothing behind.
+    let directory = if arguments.resume { directory } else { new_directory(out, &name)? };
+    let run = RunConfig { scene: source.scene.clone(), body: source.body.clone(), train: config };
+    run.write(&directory)?;
+    println!("run: {}", directory.display());
+    let Some(metrics) = run_one(&directory, &run, &source, arguments.resume, arguments.stop_after)? else {
+        println!("stopped; go on with --resume --out {}", directory.display());
+        return Ok(());
+    };
+    let mut rows = vec![(metrics.method.clone(), &metrics)];
+    let prior;
+    if run.train.method != Method::Prior {
+        prior = prior_metrics(&run, &source)?;
+        rows.insert(0, (prior.method.clone(), &prior));
+    }
+    println!("\nnovel views:\n{}", table::markdown(&rows));
+    println!("pictures: {}", directory.join("renders").display());
+    Ok(())
+}
+
+/// A short name for default directories.
+pub fn scene_name(scene: Option<&str>) -> String {
+    let scene = scene.unwrap_or(source::DEMO);
+    let name = Path::new(scene).file_stem().map_or(source::DEMO.into(), |s| s.to_string_lossy());
+    name.chars().map(|c| if c.is_alphanumeric() || c == '_' { c } else { '-' }).collect()
+}
+
+/// Trains, scores and draws one run; `None` if it stopped early.
+pub fn run_one(
+    directory: &Path,
+    run: &RunConfig,
+    source: &Source,
+    resume: bool,
+    stop_after: Option<u64>,
+) -> Result<Option<Metrics>> {
+    let scene = Scene::new(&source.capture, &source.model, &run.train)?;
+    if run.train.method == Method::Prior {
+        let start = Instant::now();
+        let colors = VertexColors::measure(&scene)?;
+        let parameters = 3 * colors.colors.len();
+        let metrics = metrics(run, start.elapsed().as_secs_f64(), parameters);
+        return score_run(directory, run, &scene, &Model::Prior(colors), metrics).map(Some);
+    }
+    let checkpoint = directory.join(CHECKPOINT);
+    let mut trainer =
+        if resume { Trainer::resume(&scene, &checkpoint)? } else { Trainer::new(&scene, run.train.clone())? };
+    trainer.set_steps(run.train.steps);
+    let seconds = optimise(directory, &mut trainer, stop_after)?;
+    if trainer.steps_done() < run.train.steps {
+        return Ok(None);
+    }
+    let metrics = metrics(run, seconds, trainer.num_parameters());
+    score_run(directory, run, &scene, &Model::Field(&trainer), metrics).map(Some)
+}
+
+fn metrics(run: &RunConfig, train_seconds: f64, parameters: usize) -> Metrics {
+    let config = &run.train;
+    Metrics {
+        method: config.method.name().to_owned(),
+        preset: config.preset.name().to_owned(),
+        occluded: config.occluded.name().to_owned(),
+        scene: run.scene.clone(),
+        seed: config.seed,
+        steps: if config.method == Method::Prior { 0 } else { config.steps },
+        train_seconds,
+        peak_rss_bytes: peak_rss_bytes(),
+        parameters,
+        splits: Splits::default(),
+    }
+}
+
+/// The scores of the prior baseline on the same frames.
+fn prior_metrics(run: &RunConfig, source: &Source) -> Result<Metrics> {
+    let mut prior = run.clone();
+    prior.train.method = Method::Prior;
+    let scene = Scene::new(&source.capture, &source.model, &prior.train)?;
+    let start = Instant::now();
+    let colors = VertexColors::measure(&scene)?;
+    let mut metrics = metrics(&prior, start.elapsed().as_secs_f64(), 3 * colors.colors.len());
+    metrics.splits.novel_view = Some(Model::Prior(colors).score(&scene, crate::eval::Split::NovelView, |_, _| {})?);
+    Ok(metrics)
+}
+
+/// Takes steps until the end or `stop_after`, with a log, a bar and checkpoints; returns seconds of training, those
+/// of earlier sittings included.
+fn optimise(directory: &Path, trainer: &mut Trainer<'_>, stop_after: Option<u64>) -> Result<f64> {
+    let total = trainer.config().steps;
+    let end = stop_after.unwrap_or(total).min(total);
+    let log_path = directory.join("train.jsonl");
+    let earlier = earlier_log(&log_path, trainer.steps_done())?;
+    run::write(&log_path, &earlier.text)?;
+    let mut log = std::fs::File::options().append(true).open(&log_path).context("train.jsonl")?;
+    let bar = ProgressBar::new(total);
+    let style = "{bar:28} {pos}/{len} steps  {msg}  {elapsed} elapsed, {eta} left";
+    bar.set_style(ProgressStyle::with_template(style)?);
+    bar.set_position(trainer.steps_done());
+    bar.reset_eta();
+    let checkpoint = directory.join(CHECKPOINT);
+    let (start, mut saved, mut lined) = (Instant::now(), Instant::now(), Instant::now());
+    let (mut smooth, mut bad) = (None::<StepReport>, 0);
+    while trainer.steps_done() < end {
+        let report = trainer.step();
+        bad += report.bad_gradients;
+        let mean = blend(smooth, report);
+        smooth = Some(mean);
+        let seconds = earlier.seconds + start.elapsed().as_secs_f64();
+        if report.step.is_multiple_of(LOG_EVERY) || report.step == end {
+            let mut line = serde_json::to_value(mean)?;
+            line["step"] = report.step.into();
+            line["seconds"] = seconds.into();
+            line["live_samples"] = report.live_samples.into();
+            line["bad_gradients"] = bad.into();
+            writeln!(log, "{line}").context("train.jsonl")?;
+            let message = format!(
+                "loss {:.4} (mse {:.4}, perceptual {:.3}, completeness {:.4})  psnr {:.2}",
+                mean.loss, mean.mse, mean.perceptual, mean.completeness, mean.psnr
+            );
+            bar.set_position(report.step);
+            if !std::io::stderr().is_terminal() && lined.elapsed() >= LINE_EVERY {
+                lined = Instant::now();
+                let left = start.elapsed().as_secs_f64() / (bar.position() as f64 - earlier.steps as f64).max(1.0)
+                    * (total - report.step) as f64;
+                eprintln!("step {}/{total}  {message}  {seconds:.0} s, {left:.0} s left", report.step);
+            }
+            bar.set_message(message);
+        }
+        if saved.elapsed() >= CHECKPOINT_EVERY {
+            trainer.save(&checkpoint)?;
+            saved = Instant::now();
+        }
+    }
+    trainer.save(&checkpoint)?;
+    bar.finish();
+    if bad > 0 {
+        eprintln!("warning: {bad} gradients were not finite and were left out");
+    }
+    Ok(earlier.seconds + start.elapsed().as_secs_f64())
+}
+
+struct EarlierLog {
+    text: String,
+    seconds: f64,
+    steps: u64,
+}
+
+/// The log up to the checkpoint; lines of steps that the checkpoint does not hold are dropped.
+fn earlier_log(path: &Path, steps: u64) -> Result<EarlierLog> {
+    let mut log = EarlierLog { text: String::new(), seconds: 0.0, steps };
+    if steps == 0 || !path.exists() {
+        return Ok(log);
+    }
+    for line in std::fs::read_to_string(path).with_context(|| path.display().to_string())?.lines() {
+        let Ok(value) = serde_json::from_str::<serde_json::Value>(line) else { continue };
+        if value["step"].as_u64().is_some_and(|s| s <= steps) {
+            log.text.push_str(line);
+            log.text.push('\n');
+            log.seconds = value["seconds"].as_f64().unwrap_or(log.seconds);
+        }
+    }
+    Ok(log)
+}
+
+/// A running mean over about fifty steps.
+fn blend(mean: Option<StepReport>, new: StepReport) -> StepReport {
+    let Some(old) = mean else { return new };
+    let mix = |old: f64, new: f64| old + 0.02 * (new - old);
+    StepReport {
+        loss: mix(old.loss, new.loss),
+        mse: mix(old.mse, new.mse),
+        perceptual: mix(old.perceptual, new.perceptual),
+        completeness: mix(old.completeness, new.completeness),
+        psnr: mix(old.psnr, new.psnr),
+        ..new
+    }
+}
