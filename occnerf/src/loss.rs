@@ -83,8 +83,7 @@ fn ssim_backward(x: &[f32], y: &[f32], side: usize, scale: f32, d_x: &mut [f32])
             sum += f64::from(s);
             let d_vxy = 2.0 * a1 / (b1 * b2);
             let d_vx = -s / b2;
-            let d_mx = 2.0 * my * a2 / (b1 * b2) - s * 2.0 * mx / b1
-                - unbias * (d_vxy * my + d_vx * 2.0 * mx);
+            let d_mx = 2.0 * my * a2 / (b1 * b2) - s * 2.0 * mx / b1 - unbias * (d_vxy * my + d_vx * 2.0 * mx);
             *coefficient = [d_mx, unbias * d_vx, unbias * d_vxy];
         }
         for row in 0..side {
@@ -201,9 +200,8 @@ mod tests {
     #[test]
     fn dissimilarity_is_zero_for_equal_patches_and_grows_with_noise() {
         let a = patch(32, 3);
-        let noisy = |amount: f32| -> Vec<f32> {
-            a.iter().zip(patch(32, 4)).map(|(a, n)| a + amount * (n - 0.5)).collect()
-        };
+        let noisy =
+            |amount: f32| -> Vec<f32> { a.iter().zip(patch(32, 4)).map(|(a, n)| a + amount * (n - 0.5)).collect() };
         let value = |b: &[f32]| multiscale_dissimilarity(&a, b, 32, 0.0, &mut vec![0.0; a.len()]);
         assert!(value(&a).abs() < 1e-6);
         assert!(value(&noisy(0.1)) > 1e-4 && value(&noisy(0.4)) > value(&noisy(0.1)));

@@ -6,7 +6,7 @@ use volrender::Aabb;
 /// Cells an axis at most; a body with outstretched arms at 4 cm needs about 50.
 const MAX_CELLS: f32 = 96.0;
 
-/// Marks a superset of the points within a margin of a triangle mesh, or enclosed by it.
+/// Marks a superset of the points within a margin of a triangle mesh, or enclosed by it and not too deep.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Occupancy {
     min: Vec3,
@@ -19,8 +19,8 @@ pub(crate) struct Occupancy {
 
 impl Occupancy {
     /// Rebuilds in place for `vertices` (V) and `faces` (F), which may be open: cells within `margin` of a triangle
-    /// seal the inside off from the outside.
-    pub fn rebuild(&mut self, vertices: &[Vec3], faces: &[[u32; 3]], margin: f32, cell: f32) {
+    /// seal the inside off from the outside. Inside, points down to `depth` below the surface are wanted.
+    pub fn rebuild(&mut self, vertices: &[Vec3], faces: &[[u32; 3]], margin: f32, depth: f32, cell: f32) {
         let low = vertices.iter().copied().fold(Vec3::INFINITY, Vec3::min);
         let high = vertices.iter().copied().fold(Vec3::NEG_INFINITY, Vec3::max);
         self.live.clear();
@@ -49,7 +49,10 @@ impl Occupancy {
                 }
             }
         }
-        self.fill_enclosed();
+        // What is not deeper than the margin is marked already.
+        if depth > margin {
+            self.fill_enclosed();
+        }
     }
 
     /// Cells that the outside cannot reach without crossing a marked one are inside.
@@ -115,7 +118,7 @@ mod tests {
             queries in prop::collection::vec(testkit::strategy::vec3(1.6), 60)
         ) {
             let mut occupancy = Occupancy::default();
-            occupancy.rebuild(&mesh.vertices, &mesh.faces, margin, cell);
+            occupancy.rebuild(&mesh.vertices, &mesh.faces, margin, 10.0, cell);
             for q in queries {
                 let (_, _, distance) = oracle::closest_point(&mesh.vertices, &mesh.faces, q);
                 if distance < f64::from(margin) || oracle::inside(&mesh.vertices, &mesh.faces, q) {
@@ -131,10 +134,10 @@ mod tests {
     fn far_points_and_empty_meshes_are_dead() {
         let mut occupancy = Occupancy::default();
         assert!(!occupancy.is_live(Vec3::ZERO));
-        occupancy.rebuild(&[], &[], 0.1, 0.1);
+        occupancy.rebuild(&[], &[], 0.1, 1.0, 0.1);
         assert!(!occupancy.is_live(Vec3::ZERO) && occupancy.region().is_none());
         let mesh = testkit::mesh::icosphere(1);
-        occupancy.rebuild(&mesh.vertices, &mesh.faces, 0.1, 0.1);
+        occupancy.rebuild(&mesh.vertices, &mesh.faces, 0.1, 2.0, 0.1);
         assert!(occupancy.is_live(Vec3::ZERO) && !occupancy.is_live(Vec3::splat(1.4)));
         assert!(!occupancy.is_live(Vec3::splat(f32::NAN)) && !occupancy.is_live(Vec3::splat(1e30)));
     }

@@ -169,8 +169,7 @@ mod tests {
     #[test]
     fn a_known_occluder_is_taken_as_it_is() {
         let occluder = [true, false, true, false];
-        let labels =
-            label_pixels(OccludedRule::Unknown, &[1.0, 0.0, 0.0, 0.0], &[true; 4], Some(&occluder), 4, 1.0);
+        let labels = label_pixels(OccludedRule::Unknown, &[1.0, 0.0, 0.0, 0.0], &[true; 4], Some(&occluder), 4, 1.0);
         assert_eq!(labels, [Label::Subject, Label::Background, Label::Unknown, Label::Background]);
     }
 }

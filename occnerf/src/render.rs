@@ -118,25 +118,31 @@ impl Renderer for PriorRenderer<'_> {
         let faces = &self.scene.model.faces;
         let mesh = visibility::RayMesh::new(&frame.posed.vertices, faces)?;
         let share = 1.0 / (SUPERSAMPLING * SUPERSAMPLING) as f32;
-        paint(frame, background, || (), |(), row, columns| {
-            columns
-                .map(|column| {
-                    let (mut color, mut opacity) = (Vec3::ZERO, 0.0);
-                    for sub in 0..SUPERSAMPLING * SUPERSAMPLING {
-                        let offset = |i: u32| (i as f32 + 0.5) / SUPERSAMPLING as f32;
-                        let (u, v) = (offset(sub % SUPERSAMPLING), offset(sub / SUPERSAMPLING));
-                        let ray = frame.camera.ray(column as f32 + u, row as f32 + v);
-                        if let Some(hit) = mesh.first_hit(ray.origin, ray.direction) {
-                            let corners = faces[hit.face as usize];
-                            let weighted = corners.iter().zip(hit.barycentric);
-                            color += share * weighted.map(|(&v, b)| b * self.colors.colors[v as usize]).sum::<Vec3>();
-                            opacity += share;
+        paint(
+            frame,
+            background,
+            || (),
+            |(), row, columns| {
+                columns
+                    .map(|column| {
+                        let (mut color, mut opacity) = (Vec3::ZERO, 0.0);
+                        for sub in 0..SUPERSAMPLING * SUPERSAMPLING {
+                            let offset = |i: u32| (i as f32 + 0.5) / SUPERSAMPLING as f32;
+                            let (u, v) = (offset(sub % SUPERSAMPLING), offset(sub / SUPERSAMPLING));
+                            let ray = frame.camera.ray(column as f32 + u, row as f32 + v);
+                            if let Some(hit) = mesh.first_hit(ray.origin, ray.direction) {
+                                let corners = faces[hit.face as usize];
+                                let weighted = corners.iter().zip(hit.barycentric);
+                                color +=
+                                    share * weighted.map(|(&v, b)| b * self.colors.colors[v as usize]).sum::<Vec3>();
+                                opacity += share;
+                            }
                         }
-                    }
-                    (color + (1.0 - opacity) * background, opacity)
-                })
-                .collect()
-        })
+                        (color + (1.0 - opacity) * background, opacity)
+                    })
+                    .collect()
+            },
+        )
     }
 }
 

@@ -11,8 +11,6 @@ use crate::occupancy::Occupancy;
 use crate::random::Stream;
 use crate::scene::Scene;
 
-/// Deepest point of a body that is looked up; no limb is 0.6 m thick.
-const DEPTH: f32 = 0.3;
 const CELL: f32 = 0.04;
 /// Σ w below which the weight volume says nothing.
 const VOLUME_THRESHOLD: f32 = 1e-3;
@@ -34,7 +32,7 @@ impl Stage {
         let (mesh, occupancy) = (&mut self.mesh, &mut self.occupancy);
         rayon::join(
             || mesh.refit(&posed.vertices),
-            || occupancy.rebuild(&posed.vertices, &scene.model.faces, reach, CELL),
+            || occupancy.rebuild(&posed.vertices, &scene.model.faces, reach, config.motion.depth, CELL),
         );
     }
 }
@@ -98,11 +96,19 @@ impl Samples {
         let span = tracer.stage.occupancy.region().and_then(|region| region.intersect(ray));
         if let Some((near, far)) = span.filter(|(near, far)| far > near) {
             let width = (far - near) / bins as f32;
+            // The distance to the posed surface at a sample, which bounds the search at the next.
+            let mut known = None::<(f32, f32)>;
             for bin in 0..bins {
                 let place = jitter.as_mut().map_or(0.5, Stream::uniform);
                 let t = near + (bin as f32 + place) * width;
                 let point = ray.origin + t * ray.direction;
-                if tracer.stage.occupancy.is_live(point) && self.push(tracer, point) {
+                if !tracer.stage.occupancy.is_live(point) {
+                    continue;
+                }
+                let bound = known.map_or(f32::INFINITY, |(at, distance)| distance + (t - at));
+                let (live, distance) = self.push(tracer, point, bound * 1.0001 + 1e-6);
+                known = distance.map(|d| (t, d));
+                if live {
                     self.t.push(t);
                     self.delta.push(width);
                     self.world.push(point);
@@ -112,24 +118,32 @@ impl Samples {
         self.starts.push(self.t.len());
     }
 
-    /// Maps a point and looks up its surface; false, with nothing pushed, if the sample is dead.
-    fn push(&mut self, tracer: &Tracer<'_>, point: Vec3) -> bool {
+    /// Maps a point and looks up its surface; false, with nothing pushed, if the sample is dead. `bound` is a distance
+    /// within which the posed surface certainly lies; returns the true distance where it was looked up.
+    fn push(&mut self, tracer: &Tracer<'_>, point: Vec3, bound: f32) -> (bool, Option<f32>) {
         let motion = &tracer.config.motion;
         let reach = motion.margin + motion.falloff;
+        let farthest = reach.max(motion.depth);
+        let mut looked_up = None;
         let exact = tracer.config.surface.distance == DistanceKind::Exact;
         let query = &tracer.scene.query;
         let (sample, on_surface) = if let Some(volume) = tracer.volume {
-            let Some(sample) = volume.map(tracer.to_canonical, point, VOLUME_THRESHOLD) else { return false };
-            let closest = exact.then(|| tracer.scene.surface.closest(sample.canonical, DEPTH.max(reach)));
+            let Some(sample) = volume.map(tracer.to_canonical, point, VOLUME_THRESHOLD) else {
+                return (false, None);
+            };
+            let closest = exact.then(|| tracer.scene.surface.closest(sample.canonical, farthest));
             match closest {
-                Some(None) => return false,
+                Some(None) => return (false, None),
                 Some(Some(closest)) => (sample, Some((closest.point, closest.signed_distance))),
                 None => (sample, None),
             }
         } else {
-            let Some(closest) = tracer.stage.mesh.closest(point, DEPTH.max(reach)) else { return false };
-            if closest.signed_distance > reach {
-                return false;
+            let Some(closest) = tracer.stage.mesh.closest(point, farthest.min(bound)) else {
+                return (false, None);
+            };
+            looked_up = Some(closest.signed_distance.abs());
+            if closest.signed_distance > reach || closest.signed_distance < -motion.depth {
+                return (false, looked_up);
             }
             let field = SurfaceMotion { margin: motion.margin, falloff: motion.falloff };
             let mapped = field.map(
@@ -140,7 +154,7 @@ impl Samples {
                 closest.barycentric,
                 closest.signed_distance,
             );
-            let Some(sample) = mapped else { return false };
+            let Some(sample) = mapped else { return (false, looked_up) };
             // The closest point keeps its face and barycentrics in the canonical pose.
             let corners = tracer.scene.model.faces[closest.face as usize];
             let on_canonical = exact.then(|| {
@@ -160,14 +174,14 @@ impl Samples {
             let blended = query.blend(sample.canonical, finest);
             (blended.point, blended.signed_distance)
         });
-        if !(distance <= reach && sample.likelihood > 0.0) {
+        if !(distance <= reach && distance >= -motion.depth && sample.likelihood > 0.0) {
             self.neighbours.truncate(first);
-            return false;
+            return (false, looked_up);
         }
         self.likelihood.push(sample.likelihood);
         self.canonical.push(sample.canonical);
         self.closest.push(closest);
         self.distance.push(distance);
-        true
+        (true, looked_up)
     }
 }

@@ -178,7 +178,8 @@ impl Scene {
         };
         let sum: Vec3 = self.train.iter().map(upward).sum();
         // Leaning averages out in the plane; the world's axes are upright in every known layout.
-        let axis = [Vec3::X, Vec3::Y, Vec3::Z].into_iter().max_by(|a, b| sum.dot(*a).abs().total_cmp(&sum.dot(*b).abs()));
+        let axis =
+            [Vec3::X, Vec3::Y, Vec3::Z].into_iter().max_by(|a, b| sum.dot(*a).abs().total_cmp(&sum.dot(*b).abs()));
         axis.map_or(Vec3::Y, |a| a * sum.dot(a).signum())
     }
 

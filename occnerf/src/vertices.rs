@@ -4,7 +4,7 @@ use glam::Vec3;
 use rayon::prelude::*;
 
 use crate::config::{Config, DistanceKind};
-use crate::encoder::{Coordinates, Encoder, surface_coordinates, distance_is_inside};
+use crate::encoder::{Coordinates, Encoder, distance_is_inside, surface_coordinates};
 use crate::scene::Scene;
 
 const CHUNK: usize = 512;
@@ -47,14 +47,7 @@ impl VertexCode {
     }
 
     /// Gradient of the offsets (V × 3) from that of the features; overwrites.
-    pub fn backward(
-        &self,
-        scene: &Scene,
-        encoder: &Encoder,
-        table: &[f32],
-        d_features: &[f32],
-        d_offsets: &mut [f32],
-    ) {
+    pub fn backward(&self, scene: &Scene, encoder: &Encoder, table: &[f32], d_features: &[f32], d_offsets: &mut [f32]) {
         let width = encoder.num_features();
         d_offsets.par_chunks_mut(3 * CHUNK).enumerate().for_each(|(chunk, d_offsets)| {
             let range = chunk * CHUNK..chunk * CHUNK + d_offsets.len() / 3;

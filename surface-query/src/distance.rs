@@ -3,16 +3,13 @@ use glam::{DVec3, Vec3, Vec4};
 use crate::Error;
 use crate::error::check_mesh;
 use crate::pseudonormal::Pseudonormals;
-use crate::tree::{Child, LANES, MAX_DEPTH, Tree};
+use crate::search::Search;
+use crate::tree::{Child, MAX_DEPTH, Tree};
 use crate::triangle::{Foot, Pack, closest_on_triangle};
 
 /// Queries farther than this many sizes of the mesh are answered in `f64`: from there `f32` would take faces for
 /// equally near of which one looks at the query and the other away.
 const FAR: f32 = 32.0;
-
-/// Faces kept for the exact comparison. Six meet at a usual vertex; more than this are compared in `f64` from the
-/// start.
-const MAX_CANDIDATES: usize = 32;
 
 /// The nearest point of a mesh.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -196,18 +193,12 @@ impl MeshDistance {
         })
     }
 
-    /// Nearest face and its closest point, scaled, if that is about as near as `reach`; `q` and `exact` are the scaled query.
+    /// Nearest face and its closest point, scaled, if that is about as near as `reach`; `q` and `exact` are the
+    /// scaled query.
+    #[inline(always)]
     fn nearest(&self, q: Vec3, exact: DVec3, reach: f32) -> Option<(u32, Foot)> {
-        // A face no farther than the best one by more than the error may be the nearest.
-        let allow = |distance: f32| {
-            let with_error = (distance + self.error) * (1.0 + 1e-6);
-            with_error * with_error + f32::MIN_POSITIVE
-        };
         let q = [q.x, q.y, q.z].map(Vec4::splat);
-        let mut best = f32::INFINITY;
-        let mut bound = allow(reach);
-        let mut candidates = [(0.0f32, 0u32); MAX_CANDIDATES];
-        let mut count = 0;
+        let mut search = Search::new(reach, self.error);
         let mut fixed = [(0.0f32, 0u32); MAX_DEPTH];
         let mut spill;
         let stack: &mut [(f32, u32)] = if self.tree.depth <= MAX_DEPTH {
@@ -217,48 +208,50 @@ impl MeshDistance {
             &mut spill
         };
         let mut height = 0;
-        let mut node = Some(0u32);
-        while let Some(current) = node.take().or_else(|| pop(stack, &mut height, bound)) {
-            let n = &self.tree.nodes[current as usize];
+        let mut node = 0;
+        loop {
+            let n = &self.tree.nodes[node as usize];
             let d = n.distance_squared(q);
             let near = usize::from(d[1] < d[0]);
-            for side in [near, 1 - near] {
-                if d[side] > bound {
-                    break;
-                }
-                match n.child(side) {
+            let mut next = None;
+            if d[near] <= search.bound {
+                match n.child(near) {
                     Child::Leaf(leaf) => {
-                        let d = self.packs[leaf as usize].distance_squared(q).to_array();
-                        for lane in 0..LANES {
-                            if d[lane] > bound || d[lane].is_nan() {
-                                continue;
-                            }
-                            if d[lane] < best {
-                                best = d[lane];
-                                bound = bound.min(allow(best.sqrt()));
-                            }
-                            if count == MAX_CANDIDATES {
-                                count = retain(&mut candidates, bound);
-                            }
-                            if count == MAX_CANDIDATES {
-                                return self.nearest_foot(exact, f64::from(bound));
-                            }
-                            candidates[count] = (d[lane], leaf * LANES as u32 + lane as u32);
-                            count += 1;
-                        }
+                        search.visit(
+                            leaf,
+                            self.packs[leaf as usize].distance_squared(q).to_array(),
+                        );
                     }
-                    Child::Node(child) if node.is_none() => node = Some(child),
+                    Child::Node(child) => next = Some(child),
+                }
+            }
+            let far = 1 - near;
+            if d[far] <= search.bound {
+                match n.child(far) {
+                    Child::Leaf(leaf) => {
+                        search.visit(
+                            leaf,
+                            self.packs[leaf as usize].distance_squared(q).to_array(),
+                        );
+                    }
+                    Child::Node(child) if next.is_none() => next = Some(child),
                     Child::Node(child) => {
-                        stack[height] = (d[side], child);
+                        stack[height] = (d[far], child);
                         height += 1;
                     }
                 }
             }
+            node = match next.or_else(|| pop(stack, &mut height, search.bound)) {
+                Some(next) => next,
+                None => break,
+            };
         }
-        (candidates[..count].iter())
-            .filter(|(d, _)| *d <= bound)
-            .map(|&(_, slot)| {
-                let face = self.tree.leaves[slot as usize / LANES][slot as usize % LANES];
+        if search.crowded {
+            return self.nearest_foot(exact, f64::from(search.bound));
+        }
+        (search.candidates())
+            .map(|(leaf, lane)| {
+                let face = self.tree.leaves[leaf][lane];
                 (face, self.foot(face, exact))
             })
             .min_by(|a, b| a.1.distance_squared.total_cmp(&b.1.distance_squared))
@@ -334,19 +327,6 @@ fn pop(stack: &[(f32, u32)], height: &mut usize, bound: f32) -> Option<u32> {
         }
     }
     None
-}
-
-/// Moves the candidates within the bound to the front; returns how many they are.
-#[cold]
-fn retain(candidates: &mut [(f32, u32)], bound: f32) -> usize {
-    let mut kept = 0;
-    for i in 0..candidates.len() {
-        if candidates[i].0 <= bound {
-            candidates[kept] = candidates[i];
-            kept += 1;
-        }
-    }
-    kept
 }
 
 /// The power of two that brings the largest finite coordinate to about 1, within the exponents whose inverse

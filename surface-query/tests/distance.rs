@@ -60,7 +60,7 @@ fn build(mesh: &TriMesh) -> MeshDistance {
 
 /// A ball pulled into spikes: sharp convex and concave edges and corners.
 fn spiky() -> impl Strategy<Value = TriMesh> {
-    prop::collection::vec(0.2f32..1.5, 42).prop_map(|radii| {
+    prop::collection::vec(0.25f32..1.5, 42).prop_map(|radii| {
         let mut radii = radii.into_iter();
         mesh::icosphere(1).map(|p| p * radii.next().unwrap())
     })
@@ -170,7 +170,7 @@ proptest! {
         before in strategy::bumpy_sphere(),
         rotation in strategy::rotation(),
         shift in strategy::vec3(5.0),
-        size in 0.01f32..100.0,
+        size in 0.015625f32..100.0,
         queries in strategy::cloud(10..11, 2.0),
     ) {
         let mut refitted = build(&before);

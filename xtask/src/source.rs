@@ -29,7 +29,9 @@ pub fn load(scene: Option<&str>, body: Option<&Path>) -> Result<Source> {
     }
     let directory = Path::new(scene);
     if !directory.is_dir() {
-        bail!("{scene}: no such directory; expected a capture in HumanNeRF's prepared layout, or no SCENE for the demo");
+        bail!(
+            "{scene}: no such directory; expected a capture in HumanNeRF's prepared layout, or no SCENE for the demo"
+        );
     }
     if !directory.join("mesh_infos.pkl").is_file() {
         bail!(
@@ -39,7 +41,9 @@ pub fn load(scene: Option<&str>, body: Option<&Path>) -> Result<Source> {
     }
     let variable = std::env::var_os(BODY_VARIABLE).map(PathBuf::from);
     let body = body.map(Path::to_owned).or(variable).or_else(|| find_body(directory)).with_context(|| {
-        format!("{scene}: no body model: give one with --body FILE.npz or {BODY_VARIABLE}, or put body.npz beside images/")
+        format!(
+            "{scene}: no body model: give one with --body FILE.npz or {BODY_VARIABLE}, or put body.npz beside images/"
+        )
     })?;
     let model = BodyModel::load(&body)?;
     let capture = load_humannerf(directory, &model, &LoadOptions::default())?;

@@ -9,8 +9,20 @@ fn cell(value: Option<f64>, digits: usize) -> String {
 /// A row for each run: novel views, ranked quantities first.
 pub fn markdown(rows: &[(String, &Metrics)]) -> String {
     let header = [
-        "method", "occluded", "steps", "train s", "psnr_mask", "psnr_hidden", "ssim_mask", "psnr_vis", "ssim_vis",
-        "psnr_full", "ssim_full", "iou", "s/frame", "params",
+        "method",
+        "occluded",
+        "steps",
+        "train s",
+        "psnr_mask",
+        "psnr_hidden",
+        "ssim_mask",
+        "psnr_vis",
+        "ssim_vis",
+        "psnr_full",
+        "ssim_full",
+        "iou",
+        "s/frame",
+        "params",
     ];
     let mut lines: Vec<Vec<String>> = vec![header.map(str::to_owned).to_vec()];
     for (name, m) in rows {
@@ -36,14 +48,17 @@ pub fn markdown(rows: &[(String, &Metrics)]) -> String {
         (0..header.len()).map(|c| lines.iter().map(|l| l[c].chars().count()).max().unwrap_or(0)).collect();
     let mut text = String::new();
     for (i, line) in lines.iter().enumerate() {
-        let cells = line.iter().zip(&widths).enumerate().map(|(c, (cell, &w))| {
-            if c < 2 { format!("{cell:<w$}") } else { format!("{cell:>w$}") }
-        });
+        let cells = line
+            .iter()
+            .zip(&widths)
+            .enumerate()
+            .map(|(c, (cell, &w))| if c < 2 { format!("{cell:<w$}") } else { format!("{cell:>w$}") });
         text.push_str(&format!("| {} |\n", cells.collect::<Vec<_>>().join(" | ")));
         if i == 0 {
-            let rules = widths.iter().enumerate().map(|(c, &w)| {
-                if c < 2 { "-".repeat(w) } else { format!("{}:", "-".repeat(w.saturating_sub(1))) }
-            });
+            let rules = widths
+                .iter()
+                .enumerate()
+                .map(|(c, &w)| if c < 2 { "-".repeat(w) } else { format!("{}:", "-".repeat(w.saturating_sub(1))) });
             text.push_str(&format!("| {} |\n", rules.collect::<Vec<_>>().join(" | ")));
         }
     }

@@ -63,37 +63,18 @@ impl DataError {
         expected: impl Into<String>,
         actual: impl Into<String>,
     ) -> Self {
-        Self::Invalid {
-            path: path.to_owned(),
-            key: key.into(),
-            expected: expected.into(),
-            actual: actual.into(),
-        }
+        Self::Invalid { path: path.to_owned(), key: key.into(), expected: expected.into(), actual: actual.into() }
     }
 
     pub(super) fn missing(path: &Path, what: impl Into<String>) -> Self {
-        Self::Missing {
-            path: path.to_owned(),
-            what: what.into(),
-        }
+        Self::Missing { path: path.to_owned(), what: what.into() }
     }
 
-    pub(super) fn setting(
-        name: &'static str,
-        expected: impl Into<String>,
-        actual: impl ToString,
-    ) -> Self {
-        Self::Setting {
-            name,
-            expected: expected.into(),
-            actual: actual.to_string(),
-        }
+    pub(super) fn setting(name: &'static str, expected: impl Into<String>, actual: impl ToString) -> Self {
+        Self::Setting { name, expected: expected.into(), actual: actual.to_string() }
     }
 
     pub(super) fn io(path: &Path) -> impl FnOnce(std::io::Error) -> Self + '_ {
-        move |source| Self::Io {
-            path: path.to_owned(),
-            source,
-        }
+        move |source| Self::Io { path: path.to_owned(), source }
     }
 }

@@ -24,11 +24,7 @@ impl Image {
     /// A black picture.
     #[must_use]
     pub fn new(width: u32, height: u32) -> Self {
-        Self {
-            width,
-            height,
-            pixels: vec![0.0; width as usize * height as usize * 3],
-        }
+        Self { width, height, pixels: vec![0.0; width as usize * height as usize * 3] }
     }
 
     /// The colour at `column`, `row`.
@@ -54,11 +50,7 @@ impl Image {
     /// which is found before anything is decoded.
     pub fn load(path: &Path) -> Result<Self, DataError> {
         let decoded = decode(path)?.into_rgb32f();
-        Ok(Self {
-            width: decoded.width(),
-            height: decoded.height(),
-            pixels: decoded.into_raw(),
-        })
+        Ok(Self { width: decoded.width(), height: decoded.height(), pixels: decoded.into_raw() })
     }
 
     /// Writes an 8-bit PNG; values are clamped to 0 to 1 and NaN becomes 0.
@@ -73,9 +65,7 @@ impl Image {
             let expected = format!("{}×{}×3 values", self.height, self.width);
             DataError::setting("pixels", expected, self.pixels.len())
         })?;
-        picture
-            .save_with_format(path, image::ImageFormat::Png)
-            .map_err(|source| picture_error(path, source))
+        picture.save_with_format(path, image::ImageFormat::Png).map_err(|source| picture_error(path, source))
     }
 
     /// Multiplies every pixel by its entry of `mask` (H, W).
@@ -83,13 +73,7 @@ impl Image {
     /// # Panics
     /// Where `mask` has another size.
     pub fn multiply(&mut self, mask: &[f32]) {
-        assert_eq!(
-            mask.len() * 3,
-            self.pixels.len(),
-            "Image::multiply: mask is not ({}, {})",
-            self.height,
-            self.width
-        );
+        assert_eq!(mask.len() * 3, self.pixels.len(), "Image::multiply: mask is not ({}, {})", self.height, self.width);
         for (pixel, coverage) in self.pixels.chunks_exact_mut(3).zip(mask) {
             for channel in pixel {
                 *channel *= coverage;
@@ -105,28 +89,18 @@ fn to_byte(value: f32) -> u8 {
 
 fn picture_error(path: &Path, source: image::ImageError) -> DataError {
     match source {
-        image::ImageError::IoError(source) => DataError::Io {
-            path: path.to_owned(),
-            source,
-        },
-        source => DataError::Picture {
-            path: path.to_owned(),
-            source,
-        },
+        image::ImageError::IoError(source) => DataError::Io { path: path.to_owned(), source },
+        source => DataError::Picture { path: path.to_owned(), source },
     }
 }
 
 fn open(path: &Path) -> Result<ImageReader<std::io::BufReader<std::fs::File>>, DataError> {
-    ImageReader::open(path)
-        .and_then(ImageReader::with_guessed_format)
-        .map_err(DataError::io(path))
+    ImageReader::open(path).and_then(ImageReader::with_guessed_format).map_err(DataError::io(path))
 }
 
 /// Width and height from the header alone.
 fn dimensions(path: &Path) -> Result<(u32, u32), DataError> {
-    let (width, height) = open(path)?
-        .into_dimensions()
-        .map_err(|source| picture_error(path, source))?;
+    let (width, height) = open(path)?.into_dimensions().map_err(|source| picture_error(path, source))?;
     if width.min(height) == 0 || width.max(height) > MAX_SIDE {
         return Err(DataError::invalid(
             path,
@@ -140,20 +114,14 @@ fn dimensions(path: &Path) -> Result<(u32, u32), DataError> {
 
 fn decode(path: &Path) -> Result<DynamicImage, DataError> {
     dimensions(path)?;
-    open(path)?
-        .decode()
-        .map_err(|source| picture_error(path, source))
+    open(path)?.decode().map_err(|source| picture_error(path, source))
 }
 
 /// Coverage in [0,1] from a mask picture, with its width and height: the largest of a pixel's colour channels,
 /// full scale (255) being 1.
 pub(super) fn load_mask(path: &Path) -> Result<(u32, u32, Vec<f32>), DataError> {
     let picture = Image::load(path)?;
-    let mask = picture
-        .pixels
-        .chunks_exact(3)
-        .map(|p| p[0].max(p[1]).max(p[2]))
-        .collect();
+    let mask = picture.pixels.chunks_exact(3).map(|p| p[0].max(p[1]).max(p[2])).collect();
     Ok((picture.width, picture.height, mask))
 }
 
@@ -162,8 +130,7 @@ mod tests {
     use super::*;
 
     fn directory(name: &str) -> std::path::PathBuf {
-        let path =
-            std::env::temp_dir().join(format!("occnerf-image-{name}-{}", std::process::id()));
+        let path = std::env::temp_dir().join(format!("occnerf-image-{name}-{}", std::process::id()));
         std::fs::create_dir_all(&path).unwrap();
         path
     }
@@ -187,10 +154,7 @@ mod tests {
 
     #[test]
     fn values_outside_the_range_are_clamped() {
-        assert_eq!(
-            [-1.0, 0.0, 0.5, 1.0, 7.0, f32::NAN].map(to_byte),
-            [0, 0, 128, 255, 255, 0]
-        );
+        assert_eq!([-1.0, 0.0, 0.5, 1.0, 7.0, f32::NAN].map(to_byte), [0, 0, 128, 255, 255, 0]);
     }
 
     #[test]
@@ -207,21 +171,12 @@ mod tests {
         let path = directory("absurd").join("a.png");
         std::fs::write(&path, header).unwrap();
         let message = Image::load(&path).unwrap_err().to_string();
-        assert!(
-            message.contains("100000×100000") && message.contains("8192"),
-            "{message}"
-        );
+        assert!(message.contains("100000×100000") && message.contains("8192"), "{message}");
     }
 
     fn crc32(bytes: &[u8]) -> u32 {
         !bytes.iter().fold(!0u32, |crc, byte| {
-            (0..8).fold(crc ^ u32::from(*byte), |c, _| {
-                if c & 1 == 1 {
-                    c >> 1 ^ 0xEDB8_8320
-                } else {
-                    c >> 1
-                }
-            })
+            (0..8).fold(crc ^ u32::from(*byte), |c, _| if c & 1 == 1 { c >> 1 ^ 0xEDB8_8320 } else { c >> 1 })
         })
     }
 
@@ -232,8 +187,7 @@ mod tests {
         grey.save(dir.join("grey.jpg")).unwrap();
         // The format is told by content, not by extension.
         std::fs::copy(dir.join("grey.jpg"), dir.join("really_a_jpeg.png")).unwrap();
-        let deep =
-            image::ImageBuffer::<image::Rgb<u16>, _>::from_pixel(4, 2, image::Rgb([65535u16; 3]));
+        let deep = image::ImageBuffer::<image::Rgb<u16>, _>::from_pixel(4, 2, image::Rgb([65535u16; 3]));
         deep.save(dir.join("deep.png")).unwrap();
         for name in ["grey.jpg", "really_a_jpeg.png", "deep.png"] {
             let picture = Image::load(&dir.join(name)).unwrap();
@@ -241,9 +195,7 @@ mod tests {
             assert_eq!(load_mask(&dir.join(name)).unwrap().2.len(), 8);
         }
         std::fs::write(dir.join("rubbish.png"), b"not a picture").unwrap();
-        let message = Image::load(&dir.join("rubbish.png"))
-            .unwrap_err()
-            .to_string();
+        let message = Image::load(&dir.join("rubbish.png")).unwrap_err().to_string();
         assert!(message.contains("rubbish.png"), "{message}");
         let message = Image::load(&dir.join("none.png")).unwrap_err().to_string();
         assert!(message.contains("none.png"), "{message}");

@@ -50,9 +50,7 @@ impl Landmarks {
         let chin = 2.0 * (q.z - self.neck.z - 0.085).max(0.0);
         let collar = (from_root.length() - 0.088).min(self.neck.y + 0.060 - q.y - chin);
         let wave = 0.004 * (q.x * 38.0).sin();
-        (q.y - self.shirt_hem() - wave)
-            .min(self.sleeve_hem() - q.x.abs())
-            .min(collar)
+        (q.y - self.shirt_hem() - wave).min(self.sleeve_hem() - q.x.abs()).min(collar)
     }
 
     pub fn belt_inside(&self, q: Vec3) -> f32 {
@@ -81,11 +79,7 @@ impl Landmarks {
     /// there is none near), for the shade that hems cast.
     pub fn garment(&self, q: Vec3) -> (Garment, f32) {
         let (hair, shirt) = (self.hair_inside(q), self.shirt_inside(q));
-        let (belt, trousers, shoe) = (
-            self.belt_inside(q),
-            self.trousers_inside(q),
-            self.shoe_inside(q),
-        );
+        let (belt, trousers, shoe) = (self.belt_inside(q), self.trousers_inside(q), self.shoe_inside(q));
         if hair > 0.0 {
             (Garment::Hair, 1.0)
         } else if shirt > 0.0 {
@@ -119,8 +113,7 @@ impl Landmarks {
         let knee = smoothstep(0.14, 0.02, (q.y - self.knee.y).abs());
         let crease = (q.y * 75.0 + 9.0 * (q.z * 12.0).sin()).sin();
         let turn_up = 0.005 * smoothstep(0.040, 0.034, self.turn_up(q));
-        let trousers =
-            0.010 + 0.016 * down + 0.008 * folds + 0.003 * (knee + 0.6 * down) * crease + turn_up;
+        let trousers = 0.010 + 0.016 * down + 0.008 * folds + 0.003 * (knee + 0.6 * down) * crease + turn_up;
 
         let sole = smoothstep(self.sole_top() + 0.006, self.sole_top(), q.y);
         let shoe = 0.009 + 0.006 * sole;
@@ -128,8 +121,7 @@ impl Landmarks {
         let p = (q - self.head) / self.face;
         let parting = smoothstep(0.0, 0.012, (p.x - 0.022).abs());
         let strands = (p.x * 130.0 + 22.0 * p.z).sin();
-        let hair =
-            (0.014 + 0.012 * smoothstep(0.10, 0.18, p.y)) * (0.6 + 0.4 * parting) + 0.002 * strands;
+        let hair = (0.014 + 0.012 * smoothstep(0.10, 0.18, p.y)) * (0.6 + 0.4 * parting) + 0.002 * strands;
 
         let belt = 0.013;
         let mut thickness: f32 = 0.0;

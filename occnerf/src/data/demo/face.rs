@@ -55,19 +55,12 @@ fn front(p: Vec2, tone: Vec3) -> Vec3 {
     }
     let smile = 0.034 + 1.2 * p.x * p.x / 0.10;
     if p.x.abs() < 0.030 && (p.y - smile).abs() < 0.0085 - 0.15 * p.x.abs() {
-        return LIPS
-            * if (p.y - smile).abs() < 0.0018 {
-                0.55
-            } else {
-                1.0
-            };
+        return LIPS * if (p.y - smile).abs() < 0.0018 { 0.55 } else { 1.0 };
     }
     if ellipse(half, Vec2::new(0.008, 0.054), Vec2::new(0.006, 0.004)) {
         return tone * 0.5;
     }
-    let ridge = smoothstep(0.016, 0.009, half.x)
-        * smoothstep(0.11, 0.09, p.y)
-        * smoothstep(0.048, 0.056, p.y);
+    let ridge = smoothstep(0.016, 0.009, half.x) * smoothstep(0.11, 0.09, p.y) * smoothstep(0.048, 0.056, p.y);
     let cheek = smoothstep(0.030, 0.0, half.distance(Vec2::new(0.046, 0.062)));
     (tone * (1.0 + 0.08 * ridge)).lerp(Vec3::new(0.88, 0.48, 0.42), 0.45 * cheek)
 }
@@ -79,9 +72,5 @@ fn hand(landmarks: &Landmarks, q: Vec3, tone: Vec3) -> Vec3 {
         return Vec3::splat(0.10);
     }
     let finger = (q.z / 0.021 + 0.25).rem_euclid(1.0);
-    if along > 0.095 && finger < 0.16 {
-        tone * 0.72
-    } else {
-        tone
-    }
+    if along > 0.095 && finger < 0.16 { tone * 0.72 } else { tone }
 }

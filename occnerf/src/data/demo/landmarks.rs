@@ -50,16 +50,8 @@ pub(super) struct Landmarks {
 impl Landmarks {
     /// From a body in SMPL's T-pose: y up, arms along x.
     pub fn new(shaped: &Shaped) -> Self {
-        let low = shaped
-            .vertices
-            .iter()
-            .map(|v| v.y)
-            .fold(f32::INFINITY, f32::min);
-        let high = shaped
-            .vertices
-            .iter()
-            .map(|v| v.y)
-            .fold(f32::NEG_INFINITY, f32::max);
+        let low = shaped.vertices.iter().map(|v| v.y).fold(f32::INFINITY, f32::min);
+        let high = shaped.vertices.iter().map(|v| v.y).fold(f32::NEG_INFINITY, f32::max);
         let unit = (high - low) / FIGURE_HEIGHT;
         let pelvis = shaped.joints[joint::PELVIS];
         let at = |j: usize| (shaped.joints[j] - pelvis) / unit;

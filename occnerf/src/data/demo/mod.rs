@@ -88,37 +88,13 @@ impl Default for DemoConfig {
 impl DemoConfig {
     fn check(&self, body: &BodyModel) -> Result<(), DataError> {
         let within = |name, ok: bool, expected: &str, actual: &dyn ToString| {
-            if ok {
-                Ok(())
-            } else {
-                Err(DataError::setting(name, expected, actual.to_string()))
-            }
+            if ok { Ok(()) } else { Err(DataError::setting(name, expected, actual.to_string())) }
         };
         let size = &self.size;
-        within(
-            "size",
-            (16..=2048).contains(size),
-            "16 to 2048 pixels",
-            size,
-        )?;
-        within(
-            "frames",
-            (1..=10_000).contains(&self.frames),
-            "1 to 10000",
-            &self.frames,
-        )?;
-        within(
-            "eval_cameras",
-            self.eval_cameras <= 64,
-            "at most 64",
-            &self.eval_cameras,
-        )?;
-        within(
-            "eval_every",
-            self.eval_every > 0,
-            "at least 1",
-            &self.eval_every,
-        )?;
+        within("size", (16..=2048).contains(size), "16 to 2048 pixels", size)?;
+        within("frames", (1..=10_000).contains(&self.frames), "1 to 10000", &self.frames)?;
+        within("eval_cameras", self.eval_cameras <= 64, "at most 64", &self.eval_cameras)?;
+        within("eval_every", self.eval_every > 0, "at least 1", &self.eval_every)?;
         for (name, value, limit) in [
             ("pose_noise_degrees", self.pose_noise_degrees, 45.0),
             ("translation_noise", self.translation_noise, 1.0),
@@ -126,12 +102,7 @@ impl DemoConfig {
             ("occluded_fraction", self.occluded_fraction, 0.95),
             ("occluded_share", self.occluded_share, 1.0),
         ] {
-            within(
-                name,
-                (0.0..=limit).contains(&value),
-                &format!("0 to {limit}"),
-                &value,
-            )?;
+            within(name, (0.0..=limit).contains(&value), &format!("0 to {limit}"), &value)?;
         }
         let joints = body.num_joints();
         within("body", joints == joint::COUNT, "SMPL's 24 joints", &joints)
@@ -170,15 +141,8 @@ pub fn demo(config: &DemoConfig, body: &BodyModel) -> Result<Capture, DataError>
         .map(|(i, pose)| {
             let posed = body.pose(&shaped, &pose.joints, pose.placement());
             let posture = Posture::new(&person, &posed)?;
-            let seen = if i % config.eval_every == 0 {
-                cameras.len()
-            } else {
-                1
-            };
-            Ok(cameras[..seen]
-                .iter()
-                .map(|camera| posture.render(camera))
-                .collect())
+            let seen = if i % config.eval_every == 0 { cameras.len() } else { 1 };
+            Ok(cameras[..seen].iter().map(|camera| posture.render(camera)).collect())
         })
         .collect();
 
@@ -199,14 +163,7 @@ pub fn demo(config: &DemoConfig, body: &BodyModel) -> Result<Capture, DataError>
             if c == 0 {
                 train.push(frame);
             } else {
-                eval.push((
-                    c,
-                    EvalFrame {
-                        camera_name: format!("Camera_B{}", c + 1),
-                        train_index: i,
-                        frame,
-                    },
-                ));
+                eval.push((c, EvalFrame { camera_name: format!("Camera_B{}", c + 1), train_index: i, frame }));
             }
         }
     }
@@ -228,10 +185,7 @@ fn shapes(config: &DemoConfig, body: &BodyModel) -> (Vec<f32>, Vec<f32>) {
     let count = body.num_betas().min(BETAS);
     let mut stream = Stream::new(&[config.seed, 0x6265_7461]);
     let truth: Vec<f32> = (0..count).map(|_| 1.6 * stream.uniform() - 0.8).collect();
-    let guess = truth
-        .iter()
-        .map(|b| b + config.beta_noise * normal(&mut stream))
-        .collect();
+    let guess = truth.iter().map(|b| b + config.beta_noise * normal(&mut stream)).collect();
     (truth, guess)
 }
 
@@ -243,16 +197,8 @@ fn grounded_walk(frames: usize, body: &BodyModel, shaped: &Shaped) -> Vec<Pose> 
         .map(|frame| {
             let mut pose = walk(frame, frames);
             let posed = body.pose(shaped, &pose.joints, pose.placement());
-            let low = posed
-                .vertices
-                .iter()
-                .map(|v| v.y)
-                .fold(f32::INFINITY, f32::min);
-            let high = shaped
-                .vertices
-                .iter()
-                .map(|v| v.y)
-                .fold(f32::NEG_INFINITY, f32::max);
+            let low = posed.vertices.iter().map(|v| v.y).fold(f32::INFINITY, f32::min);
+            let high = shaped.vertices.iter().map(|v| v.y).fold(f32::NEG_INFINITY, f32::max);
             let turn = TAU * frame as f32 / frames as f32;
             let sway = Vec3::new(turn.sin(), 0.0, (2.0 * turn).sin()) * (0.035 * (high - low));
             let centred = pose.rotation * pelvis;
@@ -264,35 +210,14 @@ fn grounded_walk(frames: usize, body: &BodyModel, shaped: &Shaped) -> Vec<Pose> 
 
 /// The training camera, then the others around the circle.
 fn ring(config: &DemoConfig, shaped: &Shaped) -> Result<Vec<Camera>, DataError> {
-    let low = shaped
-        .vertices
-        .iter()
-        .map(|v| v.y)
-        .fold(f32::INFINITY, f32::min);
-    let high = shaped
-        .vertices
-        .iter()
-        .map(|v| v.y)
-        .fold(f32::NEG_INFINITY, f32::max);
+    let low = shaped.vertices.iter().map(|v| v.y).fold(f32::INFINITY, f32::min);
+    let high = shaped.vertices.iter().map(|v| v.y).fold(f32::NEG_INFINITY, f32::max);
     let height = high - low;
     (0..=config.eval_cameras)
         .map(|c| {
-            let azimuth = if c == 0 {
-                0.0
-            } else {
-                TAU * (c as f32 - 0.5) / config.eval_cameras as f32
-            };
-            let eye = Vec3::new(
-                azimuth.sin() * DISTANCE,
-                CAMERA_HEIGHT,
-                azimuth.cos() * DISTANCE,
-            );
-            look_at(
-                eye * height,
-                Vec3::Y * (TARGET_HEIGHT * height),
-                config.size,
-                FOCAL,
-            )
+            let azimuth = if c == 0 { 0.0 } else { TAU * (c as f32 - 0.5) / config.eval_cameras as f32 };
+            let eye = Vec3::new(azimuth.sin() * DISTANCE, CAMERA_HEIGHT, azimuth.cos() * DISTANCE);
+            look_at(eye * height, Vec3::Y * (TARGET_HEIGHT * height), config.size, FOCAL)
         })
         .collect()
 }
@@ -300,27 +225,15 @@ fn ring(config: &DemoConfig, shaped: &Shaped) -> Result<Vec<Camera>, DataError> 
 /// Puts the obstacle in front of the first frames.
 fn occlude(train: &mut [Frame], config: &DemoConfig) {
     let affected = (config.occluded_share * train.len() as f32).round() as usize;
-    let masks: Vec<&[f32]> = train[..affected]
-        .iter()
-        .map(|f| f.mask.as_slice())
-        .collect();
+    let masks: Vec<&[f32]> = train[..affected].iter().map(|f| f.mask.as_slice()).collect();
     let columns = occlusion::hidden_columns(&masks, config.size, config.occluded_fraction);
     for (i, frame) in train.iter_mut().enumerate() {
-        let hidden: Vec<bool> = (0..frame.mask.len())
-            .map(|p| i < affected && columns.contains(&(p as u32 % config.size)))
-            .collect();
-        for (mask, _) in frame
-            .mask
-            .iter_mut()
-            .zip(&hidden)
-            .filter(|(_, hidden)| **hidden)
-        {
+        let hidden: Vec<bool> =
+            (0..frame.mask.len()).map(|p| i < affected && columns.contains(&(p as u32 % config.size))).collect();
+        for (mask, _) in frame.mask.iter_mut().zip(&hidden).filter(|(_, hidden)| **hidden) {
             *mask = 0.0;
         }
-        let seen: Vec<f32> = hidden
-            .iter()
-            .map(|&hidden| if hidden { 0.0 } else { 1.0 })
-            .collect();
+        let seen: Vec<f32> = hidden.iter().map(|&hidden| if hidden { 0.0 } else { 1.0 }).collect();
         frame.image.multiply(&seen);
         frame.occluder = config.known_occluder.then_some(hidden);
     }

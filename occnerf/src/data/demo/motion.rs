@@ -27,10 +27,7 @@ pub(super) struct Pose {
 
 impl Pose {
     pub fn placement(&self) -> Placement {
-        Placement::Origin {
-            rotation: self.rotation.to_scaled_axis(),
-            translation: self.translation,
-        }
+        Placement::Origin { rotation: self.rotation.to_scaled_axis(), translation: self.translation }
     }
 }
 
@@ -45,22 +42,8 @@ pub(super) fn walk(frame: usize, frames: usize) -> Pose {
     let mut local = [Quat::IDENTITY; joint::COUNT];
 
     for (sign, hip, knee, ankle, shoulder, elbow) in [
-        (
-            1.0,
-            joint::LEFT_HIP,
-            joint::LEFT_KNEE,
-            joint::LEFT_ANKLE,
-            joint::LEFT_SHOULDER,
-            joint::LEFT_ELBOW,
-        ),
-        (
-            -1.0,
-            joint::RIGHT_HIP,
-            joint::RIGHT_KNEE,
-            joint::RIGHT_ANKLE,
-            joint::RIGHT_SHOULDER,
-            joint::RIGHT_ELBOW,
-        ),
+        (1.0, joint::LEFT_HIP, joint::LEFT_KNEE, joint::LEFT_ANKLE, joint::LEFT_SHOULDER, joint::LEFT_ELBOW),
+        (-1.0, joint::RIGHT_HIP, joint::RIGHT_KNEE, joint::RIGHT_ANKLE, joint::RIGHT_SHOULDER, joint::RIGHT_ELBOW),
     ] {
         let leg = if sign > 0.0 { phase } else { phase + TAU / 2.0 };
         let swing = leg.sin();
@@ -70,13 +53,8 @@ pub(super) fn walk(frame: usize, frames: usize) -> Pose {
         local[knee] = x(0.12 + 0.75 * lift * lift);
         local[ankle] = x(0.02 - 0.18 * lift * swing);
         // Arms swing against the legs; each is raised once during the video.
-        let raise = 0.55
-            * (TAU * time + if sign > 0.0 { 0.3 } else { 2.6 })
-                .sin()
-                .max(0.0)
-                .powi(2);
-        local[shoulder] =
-            x(0.42 * swing - 0.5 * raise) * Quat::from_rotation_z(-sign * (1.18 - raise));
+        let raise = 0.55 * (TAU * time + if sign > 0.0 { 0.3 } else { 2.6 }).sin().max(0.0).powi(2);
+        local[shoulder] = x(0.42 * swing - 0.5 * raise) * Quat::from_rotation_z(-sign * (1.18 - raise));
         local[elbow] = Quat::from_rotation_y(-sign * (0.40 - 0.25 * swing + 0.7 * raise));
     }
     for (i, j) in joint::SPINE.into_iter().enumerate() {
@@ -85,18 +63,12 @@ pub(super) fn walk(frame: usize, frames: usize) -> Pose {
         local[j] = twist * bend * x(0.02 + 0.015 * (2.0 * phase).sin());
     }
     local[joint::NECK] = Quat::from_rotation_y(0.22 * (TAU * 2.0 * time).sin());
-    local[joint::HEAD] =
-        x(0.10 * (TAU * 3.0 * time).sin()) * Quat::from_rotation_y(-0.08 * phase.sin());
+    local[joint::HEAD] = x(0.10 * (TAU * 3.0 * time).sin()) * Quat::from_rotation_y(-0.08 * phase.sin());
 
     let mut joints: Vec<Vec3> = local.iter().map(|q| q.to_scaled_axis()).collect();
     joints[joint::PELVIS] = Vec3::ZERO;
-    let rotation =
-        Quat::from_rotation_y(TAU * (TURNS * time - 0.05)) * x(0.03 * (2.0 * phase).cos());
-    Pose {
-        joints,
-        rotation,
-        translation: Vec3::ZERO,
-    }
+    let rotation = Quat::from_rotation_y(TAU * (TURNS * time - 0.05)) * x(0.03 * (2.0 * phase).cos());
+    Pose { joints, rotation, translation: Vec3::ZERO }
 }
 
 /// A smooth 3-vector of time with the given root mean square length over the video, (T). Periodic in twice the
@@ -113,9 +85,7 @@ fn wander(stream: &mut Stream, frames: usize, rms: f32) -> Vec<Vec3> {
             let angle = 0.5 * TAU * frame as f32 / frames as f32;
             waves
                 .iter()
-                .map(|(harmonic, amplitude, phase)| {
-                    *amplitude * (phase + Vec3::splat(harmonic * angle)).map(f32::sin)
-                })
+                .map(|(harmonic, amplitude, phase)| *amplitude * (phase + Vec3::splat(harmonic * angle)).map(f32::sin))
                 .sum()
         })
         .collect();
@@ -139,21 +109,10 @@ pub(super) struct TrackerError {
 
 /// What a tracker would report for `poses`: the errors of bones are independent of each other and smooth in time.
 /// `pelvis` is the pelvis joint at rest, about which the global error turns.
-pub(super) fn track(
-    poses: &[Pose],
-    parents: &[Option<usize>],
-    pelvis: Vec3,
-    error: TrackerError,
-) -> Vec<Pose> {
+pub(super) fn track(poses: &[Pose], parents: &[Option<usize>], pelvis: Vec3, error: TrackerError) -> Vec<Pose> {
     let joints = parents.len();
     let noise: Vec<Vec<Vec3>> = (0..joints as u64)
-        .map(|j| {
-            wander(
-                &mut Stream::new(&[error.seed, 0x706f_7365, j]),
-                poses.len(),
-                error.rotation,
-            )
-        })
+        .map(|j| wander(&mut Stream::new(&[error.seed, 0x706f_7365, j]), poses.len(), error.rotation))
         .collect();
     let mut stream = Stream::new(&[error.seed, 0x7472_616e]);
     let drift = wander(&mut stream, poses.len(), error.translation);
@@ -176,11 +135,7 @@ pub(super) fn track(
             let rotation = tracked.first().copied().unwrap_or(pose.rotation);
             // Keep the pelvis where it is, but for the drift.
             let kept = pose.rotation * pelvis - rotation * pelvis;
-            Pose {
-                joints: relative,
-                rotation,
-                translation: pose.translation + kept + drift[frame],
-            }
+            Pose { joints: relative, rotation, translation: pose.translation + kept + drift[frame] }
         })
         .collect()
 }
@@ -195,11 +150,7 @@ mod tests {
         let parents: Vec<Option<usize>> = (0..joint::COUNT).map(|j| j.checked_sub(1)).collect();
         let truth: Vec<Pose> = (0..frames).map(|f| walk(f, frames)).collect();
         let pelvis = Vec3::new(0.0, 0.9, 0.1);
-        let error = TrackerError {
-            seed: 4,
-            rotation: 0.03,
-            translation: 0.01,
-        };
+        let error = TrackerError { seed: 4, rotation: 0.03, translation: 0.01 };
         let tracked = track(&truth, &parents, pelvis, error);
         let global = |pose: &Pose| {
             let mut at = pose.rotation;
@@ -230,10 +181,7 @@ mod tests {
         let poses: Vec<Pose> = (0..100).map(|f| walk(f, 100)).collect();
         let mut turned = 0.0;
         for pair in poses.windows(2) {
-            let forward = pair
-                .iter()
-                .map(|p| p.rotation * Vec3::Z)
-                .collect::<Vec<_>>();
+            let forward = pair.iter().map(|p| p.rotation * Vec3::Z).collect::<Vec<_>>();
             turned += forward[0].angle_between(forward[1]);
             for (a, b) in pair[0].joints.iter().zip(&pair[1].joints) {
                 assert!(a.distance(*b) < 0.35, "{a} {b}");
@@ -246,11 +194,7 @@ mod tests {
     fn no_error_leaves_the_pose() {
         let truth = vec![walk(3, 10)];
         let parents: Vec<Option<usize>> = (0..joint::COUNT).map(|j| j.checked_sub(1)).collect();
-        let error = TrackerError {
-            seed: 1,
-            rotation: 0.0,
-            translation: 0.0,
-        };
+        let error = TrackerError { seed: 1, rotation: 0.0, translation: 0.0 };
         let tracked = track(&truth, &parents, Vec3::Y, error);
         for (a, b) in truth[0].joints.iter().zip(&tracked[0].joints) {
             assert!(a.distance(*b) < 1e-5);

@@ -27,18 +27,8 @@ pub(super) fn smooth_noise(p: Vec3) -> f32 {
     let f = p - cell;
     let t = f * f * (Vec3::splat(3.0) - 2.0 * f);
     let mix = |a: f32, b: f32, t: f32| a + (b - a) * t;
-    let along_x = |dy: i32, dz: i32| {
-        mix(
-            lattice(x, y + dy, z + dz),
-            lattice(x + 1, y + dy, z + dz),
-            t.x,
-        )
-    };
-    mix(
-        mix(along_x(0, 0), along_x(1, 0), t.y),
-        mix(along_x(0, 1), along_x(1, 1), t.y),
-        t.z,
-    )
+    let along_x = |dy: i32, dz: i32| mix(lattice(x, y + dy, z + dz), lattice(x + 1, y + dy, z + dz), t.x);
+    mix(mix(along_x(0, 0), along_x(1, 0), t.y), mix(along_x(0, 1), along_x(1, 1), t.y), t.z)
 }
 
 /// Standard normal (Box and Muller 1958).

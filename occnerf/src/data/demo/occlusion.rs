@@ -17,18 +17,12 @@ pub(super) fn hidden_columns(masks: &[&[f32]], width: u32, fraction: f32) -> Ran
     if total == 0 {
         return 0..0;
     }
-    let weighted: u64 = histogram
-        .iter()
-        .enumerate()
-        .map(|(x, n)| x as u64 * n)
-        .sum();
+    let weighted: u64 = histogram.iter().enumerate().map(|(x, n)| x as u64 * n).sum();
     // Centre of the subject's pixels, in pixels from the left edge.
     let centre = weighted as f64 / total as f64 + 0.5;
     let target = f64::from(fraction) * total as f64;
     let miss = |range: &Range<u32>| {
-        let hidden: u64 = histogram[range.start as usize..range.end as usize]
-            .iter()
-            .sum();
+        let hidden: u64 = histogram[range.start as usize..range.end as usize].iter().sum();
         (hidden as f64 - target).abs()
     };
     let start = (centre.round() as u32).min(width);
@@ -57,9 +51,7 @@ mod tests {
     #[test]
     fn half_of_a_bar_is_its_middle_half() {
         // 2 rows of 12 columns, subject on columns 2..10.
-        let mask: Vec<f32> = (0..24)
-            .map(|i| f32::from((2..10).contains(&(i % 12))))
-            .collect();
+        let mask: Vec<f32> = (0..24).map(|i| f32::from((2..10).contains(&(i % 12)))).collect();
         assert_eq!(hidden_columns(&[&mask], 12, 0.5), 4..8);
         assert_eq!(hidden_columns(&[&mask, &mask], 12, 0.25), 5..7);
         assert_eq!(hidden_columns(&[&mask], 12, 0.0).len(), 0);

@@ -44,10 +44,8 @@ impl Person {
     pub fn new(model: &BodyModel, shaped: &Shaped) -> Self {
         let landmarks = Landmarks::new(shaped);
         let (faces, ends) = subdivide(shaped.vertices.len(), &model.faces);
-        let rest: Vec<Vec3> = ends
-            .iter()
-            .map(|[a, b]| shaped.vertices[*a as usize].midpoint(shaped.vertices[*b as usize]))
-            .collect();
+        let rest: Vec<Vec3> =
+            ends.iter().map(|[a, b]| shaped.vertices[*a as usize].midpoint(shaped.vertices[*b as usize])).collect();
         let normals = surface_query::vertex_normals(&rest, &faces);
         let clothed = rest
             .iter()
@@ -67,14 +65,7 @@ impl Person {
             row.sort_unstable_by_key(|(joint, _)| *joint);
             row
         }));
-        Self {
-            landmarks,
-            faces,
-            rest,
-            clothed,
-            ends,
-            weights,
-        }
+        Self { landmarks, faces, rest, clothed, ends, weights }
     }
 
     /// Vertices of the clothed mesh under the bones of `posed`, the same body posed.
@@ -85,10 +76,7 @@ impl Person {
             .zip(&self.ends)
             .enumerate()
             .map(|(v, (&clothed, &[a, b]))| {
-                let mut blend = Affine3A {
-                    matrix3: Mat3A::ZERO,
-                    translation: Vec3A::ZERO,
-                };
+                let mut blend = Affine3A { matrix3: Mat3A::ZERO, translation: Vec3A::ZERO };
                 for (joint, w) in self.weights.row(v) {
                     blend.matrix3 += posed.bones[joint].matrix3 * w;
                     blend.translation += posed.bones[joint].translation * w;

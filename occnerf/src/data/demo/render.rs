@@ -25,11 +25,8 @@ pub(super) fn look_at(eye: Vec3, target: Vec3, size: u32, focal: f32) -> Result<
     let rotation = Mat3::from_cols(right, down, forward).transpose();
     let extrinsics = Affine3A::from_mat3_translation(rotation, -(rotation * eye));
     let side = size as f32;
-    let intrinsics = Mat3::from_cols(
-        Vec3::X * (focal * side),
-        Vec3::Y * (focal * side),
-        Vec3::new(side / 2.0, side / 2.0, 1.0),
-    );
+    let intrinsics =
+        Mat3::from_cols(Vec3::X * (focal * side), Vec3::Y * (focal * side), Vec3::new(side / 2.0, side / 2.0, 1.0));
     Camera::new(intrinsics, extrinsics, size, size)
         .map_err(|error| DataError::setting("camera", "a pinhole camera", error))
 }
@@ -47,12 +44,7 @@ impl<'a> Posture<'a> {
         let vertices = person.posed(posed);
         let mesh = RayMesh::new(&vertices, &person.faces)
             .map_err(|error| DataError::setting("body", "a mesh that rays can hit", error))?;
-        Ok(Self {
-            person,
-            normals: surface_query::vertex_normals(&vertices, &person.faces),
-            vertices,
-            mesh,
-        })
+        Ok(Self { person, normals: surface_query::vertex_normals(&vertices, &person.faces), vertices, mesh })
     }
 
     /// Colour on black, and the share of each pixel that the person covers.
@@ -102,13 +94,7 @@ impl<'a> Posture<'a> {
     fn color(&self, origin: Vec3, direction: Vec3) -> Option<Vec3> {
         let hit = self.mesh.first_hit(origin, direction)?;
         let corners = self.person.faces[hit.face as usize];
-        let mix = |of: &[Vec3]| -> Vec3 {
-            corners
-                .iter()
-                .zip(hit.barycentric)
-                .map(|(&v, w)| of[v as usize] * w)
-                .sum()
-        };
+        let mix = |of: &[Vec3]| -> Vec3 { corners.iter().zip(hit.barycentric).map(|(&v, w)| of[v as usize] * w).sum() };
         let normal = mix(&self.normals).normalize_or(-direction);
         let lamp = normal.dot(LAMP.normalize_or(Vec3::Y));
         // Half-Lambert: the terminator is soft and nothing is black.

@@ -9,21 +9,11 @@ fn body() -> &'static BodyModel {
 
 /// Full size, since whole columns are what the obstacle is made of; every fifth frame of the default.
 fn config() -> DemoConfig {
-    DemoConfig {
-        frames: 20,
-        eval_cameras: 2,
-        ..DemoConfig::default()
-    }
+    DemoConfig { frames: 20, eval_cameras: 2, ..DemoConfig::default() }
 }
 
 fn small() -> DemoConfig {
-    DemoConfig {
-        size: 48,
-        frames: 6,
-        eval_cameras: 3,
-        eval_every: 4,
-        ..DemoConfig::default()
-    }
+    DemoConfig { size: 48, frames: 6, eval_cameras: 3, eval_every: 4, ..DemoConfig::default() }
 }
 
 fn occluded() -> &'static Capture {
@@ -33,10 +23,7 @@ fn occluded() -> &'static Capture {
 
 fn clear() -> &'static Capture {
     static CAPTURE: OnceLock<Capture> = OnceLock::new();
-    let config = DemoConfig {
-        occluded_fraction: 0.0,
-        ..config()
-    };
+    let config = DemoConfig { occluded_fraction: 0.0, ..config() };
     CAPTURE.get_or_init(|| demo(&config, body()).unwrap())
 }
 
@@ -68,10 +55,7 @@ fn what_the_obstacle_hides_is_zero_and_the_rest_untouched() {
         }
     }
     for (with, without) in occluded().eval.iter().zip(&clear().eval) {
-        assert_eq!(
-            with.frame.image, without.frame.image,
-            "evaluation views are never occluded"
-        );
+        assert_eq!(with.frame.image, without.frame.image, "evaluation views are never occluded");
     }
 }
 
@@ -89,33 +73,17 @@ fn colours_are_premultiplied_and_edges_are_soft() {
 
 #[test]
 fn every_camera_sees_the_whole_person_filling_three_quarters_of_the_height() {
-    let frames = clear()
-        .train
-        .iter()
-        .chain(clear().eval.iter().map(|e| &e.frame));
+    let frames = clear().train.iter().chain(clear().eval.iter().map(|e| &e.frame));
     for frame in frames {
         let size = config().size as usize;
-        let rows: Vec<usize> = (0..size)
-            .filter(|row| {
-                frame.mask[row * size..(row + 1) * size]
-                    .iter()
-                    .any(|m| *m > 0.5)
-            })
-            .collect();
+        let rows: Vec<usize> =
+            (0..size).filter(|row| frame.mask[row * size..(row + 1) * size].iter().any(|m| *m > 0.5)).collect();
         let (top, bottom) = (rows[0], rows[rows.len() - 1]);
         let share = (bottom + 1 - top) as f32 / size as f32;
         assert!((0.68..0.84).contains(&share), "{}: {share}", frame.name);
-        assert!(
-            top > 4 && bottom < size - 5,
-            "{}: rows {top} to {bottom}",
-            frame.name
-        );
+        assert!(top > 4 && bottom < size - 5, "{}: rows {top} to {bottom}", frame.name);
         let border = |x: usize| (0..size).any(|row| frame.mask[row * size + x] > 0.0);
-        assert!(
-            !border(0) && !border(size - 1),
-            "{} is cut off at a side",
-            frame.name
-        );
+        assert!(!border(0) && !border(size - 1), "{} is cut off at a side", frame.name);
     }
 }
 
@@ -123,11 +91,7 @@ fn every_camera_sees_the_whole_person_filling_three_quarters_of_the_height() {
 fn the_prior_lies_within_the_picture_of_the_person_but_is_not_the_truth() {
     let mut inside = 0;
     let mut all = 0;
-    for frame in clear()
-        .train
-        .iter()
-        .chain(clear().eval.iter().map(|e| &e.frame))
-    {
+    for frame in clear().train.iter().chain(clear().eval.iter().map(|e| &e.frame)) {
         let posed = body().pose(&body().shaped(&frame.betas), &frame.pose, frame.placement);
         for &v in &posed.vertices {
             let p = frame.camera.project(v).unwrap();
@@ -140,33 +104,18 @@ fn the_prior_lies_within_the_picture_of_the_person_but_is_not_the_truth() {
     assert!((0.93..0.999).contains(&share), "{share}");
     let (truth, guess) = shapes(&config(), body());
     assert_eq!(guess, clear().mean_betas);
-    assert!(
-        truth
-            .iter()
-            .zip(&guess)
-            .all(|(t, g)| t != g && (t - g).abs() < 0.75)
-    );
+    assert!(truth.iter().zip(&guess).all(|(t, g)| t != g && (t - g).abs() < 0.75));
 }
 
 #[test]
 fn evaluation_frames_share_the_prior_of_their_instant() {
     let capture = demo(&small(), body()).unwrap();
     assert_eq!((capture.train.len(), capture.eval.len()), (6, 6));
-    let order: Vec<(&str, usize)> = capture
-        .eval
-        .iter()
-        .map(|e| (e.camera_name.as_str(), e.train_index))
-        .collect();
-    assert_eq!(
-        order[..3],
-        [("Camera_B2", 0), ("Camera_B2", 4), ("Camera_B3", 0)]
-    );
+    let order: Vec<(&str, usize)> = capture.eval.iter().map(|e| (e.camera_name.as_str(), e.train_index)).collect();
+    assert_eq!(order[..3], [("Camera_B2", 0), ("Camera_B2", 4), ("Camera_B3", 0)]);
     for eval in &capture.eval {
         let train = &capture.train[eval.train_index];
-        assert_eq!(
-            (&eval.frame.name, &eval.frame.pose),
-            (&train.name, &train.pose)
-        );
+        assert_eq!((&eval.frame.name, &eval.frame.pose), (&train.name, &train.pose));
         assert_eq!(eval.frame.placement, train.placement);
         assert_ne!(eval.frame.camera, train.camera);
     }
@@ -175,10 +124,7 @@ fn evaluation_frames_share_the_prior_of_their_instant() {
 #[test]
 fn the_same_config_gives_the_same_bits_on_any_number_of_threads() {
     let on = |threads: usize| {
-        let pool = rayon::ThreadPoolBuilder::new()
-            .num_threads(threads)
-            .build()
-            .unwrap();
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
         pool.install(|| demo(&small(), body()).unwrap())
     };
     let (one, three) = (on(1), on(3));
@@ -190,28 +136,15 @@ fn the_same_config_gives_the_same_bits_on_any_number_of_threads() {
 
 #[test]
 fn a_known_obstacle_is_marked_where_it_is() {
-    let known = DemoConfig {
-        known_occluder: true,
-        ..small()
-    };
+    let known = DemoConfig { known_occluder: true, ..small() };
     let capture = demo(&known, body()).unwrap();
-    assert!(
-        demo(&small(), body())
-            .unwrap()
-            .train
-            .iter()
-            .all(|f| f.occluder.is_none())
-    );
+    assert!(demo(&small(), body()).unwrap().train.iter().all(|f| f.occluder.is_none()));
     for (i, frame) in capture.train.iter().enumerate() {
         let occluder = frame.occluder.as_ref().unwrap();
         assert_eq!(occluder.iter().any(|o| *o), i < 5, "frame {i}");
         for (pixel, hidden) in occluder.iter().enumerate() {
             assert!(!hidden || frame.mask[pixel] == 0.0);
-            assert_eq!(
-                *hidden,
-                occluder[pixel % 48],
-                "the obstacle is as high as the picture"
-            );
+            assert_eq!(*hidden, occluder[pixel % 48], "the obstacle is as high as the picture");
         }
     }
 }
@@ -241,23 +174,15 @@ fn clothes_stand_off_by_at_most_three_centimetres_and_skin_does_not() {
 #[test]
 fn a_body_in_centimetres_gives_the_same_pictures() {
     let mut centimetres = body().clone();
-    for v in (centimetres.v_template.iter_mut())
-        .chain(&mut centimetres.shapedirs)
-        .chain(&mut centimetres.posedirs.values)
+    for v in
+        (centimetres.v_template.iter_mut()).chain(&mut centimetres.shapedirs).chain(&mut centimetres.posedirs.values)
     {
         *v *= 100.0;
     }
-    let (metres, centimetres) = (
-        demo(&small(), body()).unwrap(),
-        demo(&small(), &centimetres).unwrap(),
-    );
+    let (metres, centimetres) = (demo(&small(), body()).unwrap(), demo(&small(), &centimetres).unwrap());
     for (a, b) in metres.train.iter().zip(&centimetres.train) {
         let differences = a.mask.iter().zip(&b.mask).filter(|(a, b)| a != b).count();
-        assert!(
-            differences <= 3,
-            "{differences} pixels of {} differ",
-            a.name
-        );
+        assert!(differences <= 3, "{differences} pixels of {} differ", a.name);
         let distance = |f: &Frame| f.camera.centre_of_projection().length();
         assert!((distance(b) / distance(a) - 100.0).abs() < 1e-2);
     }
@@ -267,80 +192,25 @@ fn a_body_in_centimetres_gives_the_same_pictures() {
 fn impossible_settings_are_named() {
     for (word, config) in [
         ("size", DemoConfig { size: 4, ..small() }),
-        (
-            "size",
-            DemoConfig {
-                size: u32::MAX,
-                ..small()
-            },
-        ),
-        (
-            "frames",
-            DemoConfig {
-                frames: 0,
-                ..small()
-            },
-        ),
-        (
-            "eval_every",
-            DemoConfig {
-                eval_every: 0,
-                ..small()
-            },
-        ),
-        (
-            "eval_cameras",
-            DemoConfig {
-                eval_cameras: 1000,
-                ..small()
-            },
-        ),
-        (
-            "occluded_fraction",
-            DemoConfig {
-                occluded_fraction: 1.0,
-                ..small()
-            },
-        ),
-        (
-            "occluded_share",
-            DemoConfig {
-                occluded_share: -0.1,
-                ..small()
-            },
-        ),
-        (
-            "pose_noise_degrees",
-            DemoConfig {
-                pose_noise_degrees: f32::NAN,
-                ..small()
-            },
-        ),
+        ("size", DemoConfig { size: u32::MAX, ..small() }),
+        ("frames", DemoConfig { frames: 0, ..small() }),
+        ("eval_every", DemoConfig { eval_every: 0, ..small() }),
+        ("eval_cameras", DemoConfig { eval_cameras: 1000, ..small() }),
+        ("occluded_fraction", DemoConfig { occluded_fraction: 1.0, ..small() }),
+        ("occluded_share", DemoConfig { occluded_share: -0.1, ..small() }),
+        ("pose_noise_degrees", DemoConfig { pose_noise_degrees: f32::NAN, ..small() }),
     ] {
         let message = demo(&config, body()).unwrap_err().to_string();
-        assert!(
-            message.contains(word) && message.contains("expected"),
-            "{message}"
-        );
+        assert!(message.contains(word) && message.contains("expected"), "{message}");
     }
     let mut other = body().clone();
     other.parents.pop();
-    assert!(
-        demo(&small(), &other)
-            .unwrap_err()
-            .to_string()
-            .contains("24 joints")
-    );
+    assert!(demo(&small(), &other).unwrap_err().to_string().contains("24 joints"));
 }
 
 #[test]
 fn one_frame_and_no_evaluation_camera_make_a_capture() {
-    let least = DemoConfig {
-        size: 16,
-        frames: 1,
-        eval_cameras: 0,
-        ..small()
-    };
+    let least = DemoConfig { size: 16, frames: 1, eval_cameras: 0, ..small() };
     let capture = demo(&least, body()).unwrap();
     assert_eq!((capture.train.len(), capture.eval.len()), (1, 0));
 }

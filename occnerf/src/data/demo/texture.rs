@@ -82,10 +82,7 @@ fn logo(p: Vec2) -> Option<Vec3> {
     let angle = angle.min(sector - angle);
     let (tip, notch) = (0.050, 0.021);
     let at = Vec2::new(r * angle.cos(), r * angle.sin());
-    let (a, b) = (
-        Vec2::new(tip, 0.0),
-        Vec2::new(notch * (sector / 2.0).cos(), notch * (sector / 2.0).sin()),
-    );
+    let (a, b) = (Vec2::new(tip, 0.0), Vec2::new(notch * (sector / 2.0).cos(), notch * (sector / 2.0).sin()));
     let inside = (b - a).perp_dot(at - a) > 0.0;
     Some(if inside { CORAL } else { YELLOW })
 }
@@ -104,8 +101,7 @@ fn back_print(p: Vec2) -> Option<Vec3> {
     let digit = |p: Vec2, segments: [bool; 7]| {
         let (w, h, thick) = (0.025, 0.056, 0.009);
         let horizontal = |y: f32| (p.y - y).abs() < thick && p.x.abs() < w + thick;
-        let vertical =
-            |x: f32, y: f32| (p.x - x).abs() < thick && (p.y - y).abs() < h / 2.0 + thick;
+        let vertical = |x: f32, y: f32| (p.x - x).abs() < thick && (p.y - y).abs() < h / 2.0 + thick;
         let lit = [
             horizontal(h),
             vertical(-w, h / 2.0),
@@ -117,10 +113,7 @@ fn back_print(p: Vec2) -> Option<Vec3> {
         ];
         lit.iter().zip(segments).any(|(lit, on)| *lit && on)
     };
-    let three = digit(
-        p + Vec2::X * 0.045,
-        [true, false, true, true, false, true, true],
-    );
+    let three = digit(p + Vec2::X * 0.045, [true, false, true, true, false, true, true]);
     let eight = digit(p - Vec2::X * 0.045, [true; 7]);
     Some(if three || eight { YELLOW } else { NAVY })
 }
@@ -128,11 +121,7 @@ fn back_print(p: Vec2) -> Option<Vec3> {
 fn belt(q: Vec3) -> Vec3 {
     let buckle = q.z > 0.0 && q.x.abs() < 0.026;
     if buckle {
-        return if q.x.abs() < 0.013 {
-            LEATHER * 0.6
-        } else {
-            BRASS
-        };
+        return if q.x.abs() < 0.013 { LEATHER * 0.6 } else { BRASS };
     }
     LEATHER
 }
@@ -146,11 +135,7 @@ fn trousers(landmarks: &Landmarks, q: Vec3) -> Vec3 {
     }
     let outer = ax > axis.x + 0.02;
     if outer && (q.z - axis.z).abs() < 0.013 {
-        return if (q.z - axis.z).abs() < 0.005 {
-            CORAL
-        } else {
-            YELLOW
-        };
+        return if (q.z - axis.z).abs() < 0.005 { CORAL } else { YELLOW };
     }
     // Slanted front pockets and square back pockets.
     let hip = Vec2::new(ax, q.y - landmarks.hip.y);
@@ -187,9 +172,5 @@ fn shoe(landmarks: &Landmarks, q: Vec3) -> Vec3 {
     }
     // A swoosh along both sides.
     let swoosh = (q.y - landmarks.sole_top() - 0.022 - 0.12 * (forward - 0.02)).abs() < 0.007;
-    if swoosh && forward > -0.04 {
-        YELLOW
-    } else {
-        CORAL * 0.9
-    }
+    if swoosh && forward > -0.04 { YELLOW } else { CORAL * 0.9 }
 }

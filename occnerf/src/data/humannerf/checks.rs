@@ -13,11 +13,7 @@ use crate::data::{DataError, Frame};
 const JOINT_TOLERANCE: f32 = 0.04 / 1.7;
 
 /// Shape coefficients that the model can take.
-pub(super) fn betas(
-    record: &Record<'_>,
-    key: &str,
-    body: &BodyModel,
-) -> Result<Vec<f32>, DataError> {
+pub(super) fn betas(record: &Record<'_>, key: &str, body: &BodyModel) -> Result<Vec<f32>, DataError> {
     let (shape, values) = record.array(key)?;
     if shape.len() != 1 || values.is_empty() || values.len() > body.num_betas() {
         return Err(record.invalid(
@@ -30,25 +26,12 @@ pub(super) fn betas(
 }
 
 /// Compares the T-pose joints under `key` with those of `body` for `betas`.
-pub(super) fn joints(
-    record: &Record<'_>,
-    key: &str,
-    betas: &[f32],
-    body: &BodyModel,
-) -> Result<(), DataError> {
+pub(super) fn joints(record: &Record<'_>, key: &str, betas: &[f32], body: &BodyModel) -> Result<(), DataError> {
     let why = ": the body model's joints (is it the model that the capture was fitted with?)";
     let expected = triples(&record.shaped(key, &[body.num_joints(), 3], why)?);
     let shaped = body.shaped(betas);
-    let low = shaped
-        .vertices
-        .iter()
-        .copied()
-        .fold(Vec3::INFINITY, Vec3::min);
-    let high = shaped
-        .vertices
-        .iter()
-        .copied()
-        .fold(Vec3::NEG_INFINITY, Vec3::max);
+    let low = shaped.vertices.iter().copied().fold(Vec3::INFINITY, Vec3::min);
+    let high = shaped.vertices.iter().copied().fold(Vec3::NEG_INFINITY, Vec3::max);
     let tolerance = JOINT_TOLERANCE * (high - low).max_element();
     for (joint, (model, file)) in shaped.joints.iter().zip(&expected).enumerate() {
         let distance = model.distance(*file);
@@ -71,29 +54,17 @@ pub(super) fn subject_is_seen(dir: &Path, frames: &[Frame]) -> Result<(), DataEr
     if frames.iter().flat_map(|f| &f.mask).any(|&m| m > 0.5) {
         return Ok(());
     }
-    let brightest = frames
-        .iter()
-        .flat_map(|f| &f.mask)
-        .copied()
-        .fold(0.0, f32::max);
+    let brightest = frames.iter().flat_map(|f| &f.mask).copied().fold(0.0, f32::max);
     Err(DataError::invalid(
         dir,
         "all masks",
         "a subject pixel (value above 127 of 255) in at least one frame",
-        format!(
-            "none in {} frames, the largest value is {}",
-            frames.len(),
-            brightest * 255.0
-        ),
+        format!("none in {} frames, the largest value is {}", frames.len(), brightest * 255.0),
     ))
 }
 
 /// At least one frame has a vertex of the posed body in its image. `path` holds the cameras.
-pub(super) fn body_is_seen(
-    path: &Path,
-    frames: &[Frame],
-    body: &BodyModel,
-) -> Result<(), DataError> {
+pub(super) fn body_is_seen(path: &Path, frames: &[Frame], body: &BodyModel) -> Result<(), DataError> {
     let sees = |frame: &Frame| {
         let shaped = body.shaped(&frame.betas);
         let posed = body.pose(&shaped, &frame.pose, frame.placement);
@@ -113,9 +84,6 @@ pub(super) fn body_is_seen(
         path,
         "all extrinsics",
         "a camera that sees the posed body in at least one frame",
-        format!(
-            "no vertex of the body inside the image in any of {} frames",
-            frames.len()
-        ),
+        format!("no vertex of the body inside the image in any of {} frames", frames.len()),
     ))
 }

@@ -49,18 +49,10 @@ impl Default for LoadOptions {
 /// sizes or above 8192 pixels; arrays of the wrong shape, or not finite; cameras that no projection fits, or that
 /// see nothing of the body in any frame; a body model whose joints are not the file's; evaluation frames that
 /// training lacks.
-pub fn load_humannerf(
-    dir: &Path,
-    body: &BodyModel,
-    options: &LoadOptions,
-) -> Result<Capture, DataError> {
+pub fn load_humannerf(dir: &Path, body: &BodyModel, options: &LoadOptions) -> Result<Capture, DataError> {
     if !options.pixel_centre.is_finite() {
         let expected = "a finite number (0 or 0.5)";
-        return Err(DataError::setting(
-            "pixel_centre",
-            expected,
-            options.pixel_centre,
-        ));
+        return Err(DataError::setting("pixel_centre", expected, options.pixel_centre));
     }
     let train = view::load_view(dir, body, options)?;
     let mean_betas = mean_betas(dir, body)?;
@@ -75,10 +67,7 @@ pub fn load_humannerf(
                     DataError::invalid(
                         &camera.join("cameras.pkl"),
                         &frame.name,
-                        format!(
-                            "the name of a frame of {}",
-                            dir.join("cameras.pkl").display()
-                        ),
+                        format!("the name of a frame of {}", dir.join("cameras.pkl").display()),
                         "no such training frame",
                     )
                 })?,
@@ -86,12 +75,7 @@ pub fn load_humannerf(
             });
         }
     }
-    Ok(Capture {
-        name: view::file_name(dir),
-        train,
-        eval,
-        mean_betas,
-    })
+    Ok(Capture { name: view::file_name(dir), train, eval, mean_betas })
 }
 
 /// The shape of the canonical body, `avg_betas` of `canonical_joints.pkl`, its joints checked against the model's.
@@ -148,8 +132,5 @@ fn is_body(path: &Path) -> bool {
 
 /// ZJU-MoCap's way of placing a body: rotation and translation about the origin.
 fn placement(rotation: glam::Vec3, translation: glam::Vec3) -> Placement {
-    Placement::Origin {
-        rotation,
-        translation,
-    }
+    Placement::Origin { rotation, translation }
 }

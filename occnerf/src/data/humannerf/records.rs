@@ -30,17 +30,9 @@ impl Records {
         let root = pickle::read(path)?;
         if !matches!(root, Value::Dict(_)) {
             let expected = "a dictionary";
-            return Err(DataError::invalid(
-                path,
-                "the pickle",
-                expected,
-                root.type_name(),
-            ));
+            return Err(DataError::invalid(path, "the pickle", expected, root.type_name()));
         }
-        Ok(Self {
-            path: path.to_owned(),
-            root,
-        })
+        Ok(Self { path: path.to_owned(), root })
     }
 
     pub fn path(&self) -> &Path {
@@ -49,11 +41,7 @@ impl Records {
 
     /// The pickle itself as a record.
     pub fn whole(&self) -> Record<'_> {
-        Record {
-            path: &self.path,
-            prefix: String::new(),
-            value: &self.root,
-        }
+        Record { path: &self.path, prefix: String::new(), value: &self.root }
     }
 
     /// Names of the frames, sorted; at least one.
@@ -63,37 +51,27 @@ impl Records {
         };
         let mut names = Vec::with_capacity(items.len());
         for (key, _) in items {
-            names.push(key.as_str().ok_or_else(|| {
-                DataError::invalid(&self.path, "a key", "a frame's name", key.type_name())
-            })?);
+            names.push(
+                key.as_str()
+                    .ok_or_else(|| DataError::invalid(&self.path, "a key", "a frame's name", key.type_name()))?,
+            );
         }
         names.sort_unstable();
         names.dedup();
         if names.is_empty() {
-            return Err(DataError::invalid(
-                &self.path,
-                "the pickle",
-                "a frame",
-                "an empty dictionary",
-            ));
+            return Err(DataError::invalid(&self.path, "the pickle", "a frame", "an empty dictionary"));
         }
         Ok(names)
     }
 
     /// The dictionary of frame `name`.
     pub fn record(&self, name: &str) -> Result<Record<'_>, DataError> {
-        let error = |actual: &str| {
-            DataError::invalid(&self.path, name, "a dictionary for this frame", actual)
-        };
+        let error = |actual: &str| DataError::invalid(&self.path, name, "a dictionary for this frame", actual);
         let value = self.root.get(name).ok_or_else(|| error("no such key"))?;
         if !matches!(value, Value::Dict(_)) {
             return Err(error(value.type_name()));
         }
-        Ok(Record {
-            path: &self.path,
-            prefix: format!("{name}."),
-            value,
-        })
+        Ok(Record { path: &self.path, prefix: format!("{name}."), value })
     }
 }
 
@@ -103,12 +81,7 @@ impl Record<'_> {
         format!("{}{key}", self.prefix)
     }
 
-    pub fn invalid(
-        &self,
-        key: &str,
-        expected: impl Into<String>,
-        actual: impl Into<String>,
-    ) -> DataError {
+    pub fn invalid(&self, key: &str, expected: impl Into<String>, actual: impl Into<String>) -> DataError {
         DataError::invalid(self.path, self.full(key), expected, actual)
     }
 
@@ -126,15 +99,9 @@ impl Record<'_> {
                 Value::Dict(items) => items.iter().filter_map(|(k, _)| k.as_str()).collect(),
                 _ => Vec::new(),
             };
-            self.invalid(
-                key,
-                "an array",
-                format!("no such key (it has {})", held.join(", ")),
-            )
+            self.invalid(key, "an array", format!("no such key (it has {})", held.join(", ")))
         })?;
-        let array = value
-            .to_dense(&file, &full)?
-            .ok_or_else(|| self.invalid(key, "an array", value.type_name()))?;
+        let array = value.to_dense(&file, &full)?.ok_or_else(|| self.invalid(key, "an array", value.type_name()))?;
         let any = vec![None; array.shape.len()];
         let values = array.to_f32(&file, &full, &any)?;
         let mut shape = array.shape;
@@ -148,11 +115,7 @@ impl Record<'_> {
     pub fn shaped(&self, key: &str, shape: &[usize], what: &str) -> Result<Vec<f32>, DataError> {
         let (actual, values) = self.array(key)?;
         if actual != shape {
-            return Err(self.invalid(
-                key,
-                format!("shape {shape:?}{what}"),
-                format!("shape {actual:?}"),
-            ));
+            return Err(self.invalid(key, format!("shape {shape:?}{what}"), format!("shape {actual:?}")));
         }
         Ok(values)
     }

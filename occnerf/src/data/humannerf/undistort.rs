@@ -25,15 +25,8 @@ fn resample(source: &[f32], channels: usize, camera: &Camera, distortion: &Disto
                 if x < 0 || y < 0 || x >= width as i64 || y >= height as i64 {
                     continue;
                 }
-                let weight = if dx == 1 {
-                    fraction.x
-                } else {
-                    1.0 - fraction.x
-                } * if dy == 1 {
-                    fraction.y
-                } else {
-                    1.0 - fraction.y
-                };
+                let weight = if dx == 1 { fraction.x } else { 1.0 - fraction.x }
+                    * if dy == 1 { fraction.y } else { 1.0 - fraction.y };
                 let from = (y as usize * width + x as usize) * channels;
                 let to = (row * width + column) * channels;
                 for c in 0..channels {
@@ -46,12 +39,7 @@ fn resample(source: &[f32], channels: usize, camera: &Camera, distortion: &Disto
 }
 
 /// Replaces picture and mask (H, W) by what a perfect lens would have shown.
-pub(super) fn undistort(
-    image: &mut Image,
-    mask: &mut Vec<f32>,
-    camera: &Camera,
-    distortion: &Distortion,
-) {
+pub(super) fn undistort(image: &mut Image, mask: &mut Vec<f32>, camera: &Camera, distortion: &Distortion) {
     if distortion.is_none() {
         return;
     }
@@ -87,18 +75,10 @@ mod tests {
             seen.push(scene(distortion.undistort(p).unwrap()));
         }
         let back = resample(&seen, 1, &camera, &distortion);
-        let error = |a: &[f32]| {
-            a.iter()
-                .zip(&ideal)
-                .map(|(a, b)| (a - b).abs())
-                .fold(0.0, f32::max)
-        };
+        let error = |a: &[f32]| a.iter().zip(&ideal).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
         // Bilinear: step² · f″ / 8 in each direction, (1/60)² · 0.3 · (81 + 49) / 8.
         assert!(error(&back) < 2e-3, "{}", error(&back));
-        assert!(
-            error(&seen) > 2e-2,
-            "the distortion must matter for the test to say anything"
-        );
+        assert!(error(&seen) > 2e-2, "the distortion must matter for the test to say anything");
     }
 
     #[test]

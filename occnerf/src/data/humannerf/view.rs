@@ -24,11 +24,7 @@ pub(super) fn file_name(path: &Path) -> String {
 }
 
 /// All frames of a directory, sorted by name; checked one by one and together.
-pub(super) fn load_view(
-    dir: &Path,
-    body: &BodyModel,
-    options: &LoadOptions,
-) -> Result<Vec<Frame>, DataError> {
+pub(super) fn load_view(dir: &Path, body: &BodyModel, options: &LoadOptions) -> Result<Vec<Frame>, DataError> {
     if !dir.is_dir() {
         return Err(DataError::missing(dir, "directory"));
     }
@@ -38,17 +34,9 @@ pub(super) fn load_view(
     same_names(&names, &cameras, &bodies)?;
     let images = pictures(&dir.join("images"))?;
     let masks = pictures(&dir.join("masks"))?;
-    if let Some((name, path)) = images
-        .iter()
-        .find(|(name, _)| !names.contains(&name.as_str()))
-    {
+    if let Some((name, path)) = images.iter().find(|(name, _)| !names.contains(&name.as_str())) {
         let expected = format!("an entry `{name}` in {}", cameras.path().display());
-        return Err(DataError::invalid(
-            path,
-            "camera of the image",
-            expected,
-            "none",
-        ));
+        return Err(DataError::invalid(path, "camera of the image", expected, "none"));
     }
 
     // Collected as results first, so that the error reported is the first in order whatever finishes first.
@@ -58,10 +46,7 @@ pub(super) fn load_view(
             let picture = |of: &BTreeMap<String, PathBuf>, kind: &str| {
                 of.get(name).cloned().ok_or_else(|| {
                     let path = dir.join(kind).join(format!("{name}.png"));
-                    let what = format!(
-                        "picture (nor .jpg) of `{name}` in {}",
-                        cameras.path().display()
-                    );
+                    let what = format!("picture (nor .jpg) of `{name}` in {}", cameras.path().display());
                     DataError::missing(&path, what)
                 })
             };
@@ -77,12 +62,7 @@ pub(super) fn load_view(
         return Err(DataError::invalid(
             &images[&odd.name],
             "size",
-            format!(
-                "{}×{}, as of `{}`",
-                size(&frames[0]).0,
-                size(&frames[0]).1,
-                frames[0].name
-            ),
+            format!("{}×{}, as of `{}`", size(&frames[0]).0, size(&frames[0]).1, frames[0].name),
             format!("{}×{}", size(odd).0, size(odd).1),
         ));
     }
@@ -94,23 +74,11 @@ pub(super) fn load_view(
 /// Both pickles have the same frames.
 fn same_names(names: &[&str], cameras: &Records, bodies: &Records) -> Result<(), DataError> {
     let others = bodies.names()?;
-    let only = |a: &[&str], b: &[&str]| {
-        a.iter()
-            .find(|name| !b.contains(name))
-            .map(|n| (*n).to_owned())
-    };
-    for (odd, has, lacks) in [
-        (only(names, &others), cameras, bodies),
-        (only(&others, names), bodies, cameras),
-    ] {
+    let only = |a: &[&str], b: &[&str]| a.iter().find(|name| !b.contains(name)).map(|n| (*n).to_owned());
+    for (odd, has, lacks) in [(only(names, &others), cameras, bodies), (only(&others, names), bodies, cameras)] {
         if let Some(name) = odd {
             let expected = format!("an entry, as in {}", has.path().display());
-            return Err(DataError::invalid(
-                lacks.path(),
-                name,
-                expected,
-                "no such key",
-            ));
+            return Err(DataError::invalid(lacks.path(), name, expected, "no such key"));
         }
     }
     Ok(())
@@ -198,10 +166,7 @@ fn load_camera(
     let rotation = Mat3::from_cols(row(0), row(1), row(2)).transpose();
     let product = (rotation * rotation.transpose() - Mat3::IDENTITY).to_cols_array();
     let skewed = product.iter().any(|x| x.abs() > ORTHONORMAL) || rotation.determinant() < 0.0;
-    if skewed
-        || e.get(12..)
-            .is_some_and(|last| !last.is_empty() && last != [0.0, 0.0, 0.0, 1.0])
-    {
+    if skewed || e.get(12..).is_some_and(|last| !last.is_empty() && last != [0.0, 0.0, 0.0, 1.0]) {
         let expected = "a rotation and a translation, with a last row of 0 0 0 1";
         return Err(record.invalid("extrinsics", expected, format!("{e:?}")));
     }
@@ -214,13 +179,9 @@ fn load_camera(
     if record.has("distortions") {
         // Raw files store a column.
         let (shape, d) = record.array("distortions")?;
-        let five: [f32; 5] = d.try_into().map_err(|_| {
-            record.invalid(
-                "distortions",
-                "5 numbers (k1 k2 p1 p2 k3)",
-                format!("shape {shape:?}"),
-            )
-        })?;
+        let five: [f32; 5] = d
+            .try_into()
+            .map_err(|_| record.invalid("distortions", "5 numbers (k1 k2 p1 p2 k3)", format!("shape {shape:?}")))?;
         distortion = Distortion::from_opencv(five);
     }
     Ok((camera, distortion))

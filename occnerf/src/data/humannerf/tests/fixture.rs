@@ -8,27 +8,17 @@ use smpl::{BodyModel, SparseRows};
 /// A box with a joint at either end and one beta that lengthens it.
 pub fn body() -> BodyModel {
     let corner = |i: u32, axis: u32| if i >> axis & 1 == 1 { 1.0 } else { -1.0 };
-    let v_template: Vec<Vec3> = (0..8)
-        .map(|i| Vec3::new(corner(i, 0) * 0.2, corner(i, 1) * 0.85, corner(i, 2) * 0.1))
-        .collect();
+    let v_template: Vec<Vec3> =
+        (0..8).map(|i| Vec3::new(corner(i, 0) * 0.2, corner(i, 1) * 0.85, corner(i, 2) * 0.1)).collect();
     let face = |[a, b, c, d]: [u32; 4]| [[a, b, c], [a, c, d]];
-    let quads = [
-        [0, 4, 6, 2],
-        [1, 3, 7, 5],
-        [0, 1, 5, 4],
-        [2, 6, 7, 3],
-        [0, 2, 3, 1],
-        [4, 5, 7, 6],
-    ];
+    let quads = [[0, 4, 6, 2], [1, 3, 7, 5], [0, 1, 5, 4], [2, 6, 7, 3], [0, 2, 3, 1], [4, 5, 7, 6]];
     let top = |i: u32| u32::from(i >> 1 & 1 == 1);
     BodyModel {
         faces: quads.into_iter().flat_map(face).collect(),
         shapedirs: v_template.iter().map(|v| Vec3::Y * v.y * 0.1).collect(),
         posedirs: SparseRows::from_rows((0..8).map(|_| Vec::<(u32, Vec3)>::new())),
         weights: SparseRows::from_rows((0..8).map(|i| [(top(i), 1.0f32)])),
-        j_regressor: SparseRows::from_rows(
-            [[0, 1, 4, 5], [2, 3, 6, 7]].map(|row: [u32; 4]| row.map(|v| (v, 0.25f32))),
-        ),
+        j_regressor: SparseRows::from_rows([[0, 1, 4, 5], [2, 3, 6, 7]].map(|row: [u32; 4]| row.map(|v| (v, 0.25f32)))),
         parents: vec![None, Some(0)],
         v_template,
     }
@@ -45,9 +35,7 @@ pub enum Py {
 impl Py {
     /// Replaces the entry at a path of keys, or adds it.
     pub fn set(&mut self, keys: &[&str], value: Py) {
-        let Self::Dict(items) = self else {
-            panic!("not a dictionary")
-        };
+        let Self::Dict(items) = self else { panic!("not a dictionary") };
         let found = items.iter_mut().find(|(key, _)| key == keys[0]);
         match (found, &keys[1..]) {
             (Some((_, slot)), []) => *slot = value,
@@ -57,9 +45,7 @@ impl Py {
     }
 
     pub fn remove(&mut self, keys: &[&str]) {
-        let Self::Dict(items) = self else {
-            panic!("not a dictionary")
-        };
+        let Self::Dict(items) = self else { panic!("not a dictionary") };
         if let [last] = keys {
             items.retain(|(key, _)| key != last);
         } else if let Some((_, slot)) = items.iter_mut().find(|(key, _)| key == keys[0]) {
@@ -117,11 +103,7 @@ pub fn array(shape: &[u32], values: &[f64]) -> Py {
 }
 
 fn flat(points: &[Vec3]) -> Vec<f64> {
-    points
-        .iter()
-        .flat_map(|p| p.to_array())
-        .map(f64::from)
-        .collect()
+    points.iter().flat_map(|p| p.to_array()).map(f64::from).collect()
 }
 
 /// A capture of three frames with an evaluation camera at two of them, removed when dropped.
@@ -134,33 +116,21 @@ pub struct Fixture {
 
 impl Fixture {
     pub fn new(name: &str) -> Self {
-        let dir =
-            std::env::temp_dir().join(format!("occnerf-capture-{name}-{}", std::process::id()));
+        let dir = std::env::temp_dir().join(format!("occnerf-capture-{name}-{}", std::process::id()));
         let _ = std::fs::remove_dir_all(&dir);
         let names = [0, 1, 2].map(|i| format!("frame_{i:06}"));
         let joints = flat(&body().shaped(&[0.5]).joints);
         let record = |pairs: &[(&str, Py)]| {
-            Py::Dict(
-                pairs
-                    .iter()
-                    .map(|(key, value)| ((*key).to_owned(), value.clone()))
-                    .collect(),
-            )
+            Py::Dict(pairs.iter().map(|(key, value)| ((*key).to_owned(), value.clone())).collect())
         };
         let camera = record(&[
-            (
-                "intrinsics",
-                array(&[3, 3], &[8.0, 0.0, 3.0, 0.0, 8.0, 2.0, 0.0, 0.0, 1.0]),
-            ),
+            ("intrinsics", array(&[3, 3], &[8.0, 0.0, 3.0, 0.0, 8.0, 2.0, 0.0, 0.0, 1.0])),
             (
                 "extrinsics",
                 array(
                     &[4, 4],
                     // Looks along −z of the world from 4 in front of the body.
-                    &[
-                        1.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, -1.0, 4.0, 0.0, 0.0,
-                        0.0, 1.0,
-                    ],
+                    &[1.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, -1.0, 4.0, 0.0, 0.0, 0.0, 1.0],
                 ),
             ),
             ("distortions", array(&[5], &[0.0; 5])),
@@ -172,31 +142,17 @@ impl Fixture {
             ("betas", array(&[1], &[0.5])),
             ("tpose_joints", array(&[2, 3], &joints)),
         ]);
-        let all = |value: &Py| {
-            Py::Dict(
-                names
-                    .iter()
-                    .map(|name| (name.clone(), value.clone()))
-                    .collect(),
-            )
-        };
+        let all = |value: &Py| Py::Dict(names.iter().map(|name| (name.clone(), value.clone())).collect());
         let fixture = Self {
             cameras: all(&camera),
             mesh_infos: all(&info),
-            canonical: record(&[
-                ("joints", array(&[2, 3], &joints)),
-                ("avg_betas", array(&[1], &[0.5])),
-            ]),
+            canonical: record(&[("joints", array(&[2, 3], &joints)), ("avg_betas", array(&[1], &[0.5]))]),
             dir,
         };
         fixture.directory("");
         fixture.directory("eval/Camera_B2");
         for kind in ["images", "masks"] {
-            let path = fixture
-                .dir
-                .join("eval/Camera_B2")
-                .join(kind)
-                .join("frame_000001.png");
+            let path = fixture.dir.join("eval/Camera_B2").join(kind).join("frame_000001.png");
             std::fs::remove_file(path).unwrap();
         }
         fixture.write();
@@ -226,8 +182,7 @@ impl Fixture {
 
     /// Writes the pickles, after a test has changed what is in them.
     pub fn write(&self) {
-        let put =
-            |path: &str, value: &Py| std::fs::write(self.dir.join(path), value.pickle()).unwrap();
+        let put = |path: &str, value: &Py| std::fs::write(self.dir.join(path), value.pickle()).unwrap();
         put("cameras.pkl", &self.cameras);
         put("mesh_infos.pkl", &self.mesh_infos);
         put("canonical_joints.pkl", &self.canonical);

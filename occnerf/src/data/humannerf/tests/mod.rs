@@ -18,17 +18,11 @@ fn a_whole_capture_is_read() {
     assert_eq!(names, ["frame_000000", "frame_000001", "frame_000002"]);
     assert_eq!(capture.mean_betas, [0.5]);
     let frame = &capture.train[1];
-    assert_eq!(
-        (frame.image.width, frame.image.height, frame.mask.len()),
-        (6, 4, 24)
-    );
+    assert_eq!((frame.image.width, frame.image.height, frame.mask.len()), (6, 4, 24));
     assert_eq!(frame.pose, [Vec3::ZERO, Vec3::new(0.0, 0.25, 0.0)]);
     assert_eq!(
         frame.placement,
-        Placement::Origin {
-            rotation: Vec3::new(0.0, 0.5, 0.0),
-            translation: Vec3::new(0.125, 0.0, 0.0)
-        }
+        Placement::Origin { rotation: Vec3::new(0.0, 0.5, 0.0), translation: Vec3::new(0.125, 0.0, 0.0) }
     );
     assert_eq!(frame.betas, [0.5]);
     assert_eq!(frame.camera.centre.x, 3.0);
@@ -118,10 +112,7 @@ fn the_shared_capture_is_read() {
     for eval in &capture.eval {
         assert_eq!(capture.train[eval.train_index].name, eval.frame.name);
         assert_eq!(capture.train[eval.train_index].pose, eval.frame.pose);
-        assert_eq!(
-            capture.train[eval.train_index].placement,
-            eval.frame.placement
-        );
+        assert_eq!(capture.train[eval.train_index].placement, eval.frame.placement);
     }
     // The posed prior covers most of the unoccluded subject: poses, placement and cameras are read the right way.
     for eval in capture.eval.iter().step_by(9) {
@@ -137,11 +128,6 @@ fn the_shared_capture_is_read() {
         assert!(share > 0.9, "{} {}: {share}", eval.camera_name, frame.name);
     }
     // Another body is told apart.
-    let message = load_humannerf(&scene, &BodyModel::embedded(), &LoadOptions::default())
-        .unwrap_err()
-        .to_string();
-    assert!(
-        message.contains("tpose_joints") && message.contains("body model"),
-        "{message}"
-    );
+    let message = load_humannerf(&scene, &BodyModel::embedded(), &LoadOptions::default()).unwrap_err().to_string();
+    assert!(message.contains("tpose_joints") && message.contains("body model"), "{message}");
 }

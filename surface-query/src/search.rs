@@ -1,0 +1,89 @@
+//! What a closest-point search knows while it walks the tree.
+
+use crate::tree::LANES;
+
+/// Faces kept for the exact comparison. Six meet at a usual vertex; more than this are compared in `f64` from the
+/// start.
+const MAX_CANDIDATES: usize = 32;
+
+/// Faces that may be the nearest, given that `f32` distances are off by up to `error`.
+pub(crate) struct Search {
+    error: f32,
+    /// Smallest squared distance so far.
+    best: f32,
+    /// Squared distance up to which a face may still be the nearest.
+    pub bound: f32,
+    candidates: [(f32, u32); MAX_CANDIDATES],
+    count: usize,
+    /// Set when there were more candidates than fit.
+    pub crowded: bool,
+}
+
+impl Search {
+    /// Of faces about as near as `reach`.
+    #[inline(always)]
+    pub fn new(reach: f32, error: f32) -> Self {
+        Self {
+            error,
+            best: f32::INFINITY,
+            bound: allow(reach, error),
+            candidates: [(0.0, 0); MAX_CANDIDATES],
+            count: 0,
+            crowded: false,
+        }
+    }
+
+    /// Takes the squared distances of the faces of a leaf; NaN for none.
+    #[inline(always)]
+    pub fn visit(&mut self, leaf: u32, squared: [f32; LANES]) {
+        for (lane, d) in squared.into_iter().enumerate() {
+            if d <= self.bound {
+                self.keep(d, leaf * LANES as u32 + lane as u32);
+            }
+        }
+    }
+
+    #[inline(always)]
+    fn keep(&mut self, d: f32, slot: u32) {
+        if d < self.best {
+            self.best = d;
+            self.bound = self.bound.min(allow(d.sqrt(), self.error));
+        }
+        if self.count == MAX_CANDIDATES {
+            self.sift();
+        }
+        if let Some(free) = self.candidates.get_mut(self.count) {
+            *free = (d, slot);
+            self.count += 1;
+        } else {
+            self.crowded = true;
+        }
+    }
+
+    /// Drops the candidates that are out by now.
+    #[cold]
+    fn sift(&mut self) {
+        let mut kept = 0;
+        for i in 0..self.count {
+            if self.candidates[i].0 <= self.bound {
+                self.candidates[kept] = self.candidates[i];
+                kept += 1;
+            }
+        }
+        self.count = kept;
+    }
+
+    /// Leaf and lane of the candidates that are left.
+    pub fn candidates(&self) -> impl Iterator<Item = (usize, usize)> + '_ {
+        (self.candidates[..self.count].iter())
+            .filter(|(d, _)| *d <= self.bound)
+            .map(|&(_, slot)| (slot as usize / LANES, slot as usize % LANES))
+    }
+}
+
+/// Square of a distance with the error on top.
+#[inline(always)]
+fn allow(distance: f32, error: f32) -> f32 {
+    let with_error = (distance + error) * (1.0 + 1e-6);
+    with_error * with_error + f32::MIN_POSITIVE
+}
