@@ -11,13 +11,7 @@ use rayon::prelude::*;
 const POINTS: usize = 1 << 16;
 /// Points a task, as a caller that parallelises would choose.
 const TASK: usize = 16_384;
-const CONFIG: HashGridConfig = HashGridConfig {
-    levels: 16,
-    features: 2,
-    log2_table_size: 19,
-    n_min: 16,
-    n_max: 2048,
-};
+const CONFIG: HashGridConfig = HashGridConfig { levels: 16, features: 2, log2_table_size: 19, n_min: 16, n_max: 2048 };
 
 fn main() {
     // The targets are for two threads.
@@ -39,7 +33,7 @@ enum Points {
 }
 
 fn case(kind: Points) -> Case {
-    let grid = HashGrid::new(&CONFIG).unwrap();
+    let grid = HashGrid::new(&CONFIG).expect("a grid");
     let mut state = 1u64;
     let mut random = || {
         state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
@@ -93,13 +87,11 @@ fn encode_backward_points(bencher: Bencher<'_, '_>, kind: Points) {
     let width = grid.num_features();
     let mut d_points = vec![[0.0; 4]; POINTS];
     bencher.counter(ItemsCount::new(POINTS)).bench_local(|| {
-        points
-            .par_chunks(TASK)
-            .zip(d_features.par_chunks(TASK * width))
-            .zip(d_points.par_chunks_mut(TASK))
-            .for_each(|((points, d_features), d_points)| {
+        points.par_chunks(TASK).zip(d_features.par_chunks(TASK * width)).zip(d_points.par_chunks_mut(TASK)).for_each(
+            |((points, d_features), d_points)| {
                 grid.encode_backward_points(black_box(&table), points, d_features, d_points);
-            });
+            },
+        );
     });
 }
 

@@ -2,6 +2,7 @@ use rayon::prelude::*;
 
 use crate::corners::{BLOCK, Corners, for_widths, row_mut};
 use crate::grid::{HashGrid, Level};
+use crate::simd::Kernel;
 
 impl<const D: usize> HashGrid<D> {
     /// Adds the gradient of the table to `d_table` ([`HashGrid::num_parameters`]), given `points` (Q, D) and the
@@ -27,22 +28,14 @@ impl<const D: usize> HashGrid<D> {
         }
         let width = self.num_features();
         let arch = pulp::Arch::new();
-        parts
-            .into_par_iter()
-            .with_max_len(1)
-            .for_each(|(l, d_table)| {
-                let level = &self.levels[l];
-                let first = l * self.features;
-                arch.dispatch(
-                    #[inline(always)]
-                    || {
-                        for_widths!(
-                            self.features,
-                            backward_level::<D>(level, points, d_features, d_table, width, first)
-                        )
-                    },
-                );
-            });
+        parts.into_par_iter().with_max_len(1).for_each(|(l, d_table)| {
+            let level = &self.levels[l];
+            let first = l * self.features;
+            arch.dispatch(Kernel(
+                #[inline(always)]
+                || for_widths!(self.features, backward_level::<D>(level, points, d_features, d_table, width, first)),
+            ));
+        });
     }
 }
 

@@ -1,6 +1,7 @@
 use crate::corners::{BLOCK, Corners, Lanes, MAX_CORNERS, for_widths, row};
 use crate::encode::CHUNK;
 use crate::grid::{HashGrid, Level};
+use crate::simd::Kernel;
 
 impl<const D: usize> HashGrid<D> {
     /// Adds the gradient of the coordinates to `d_points` (Q, D), given `table`, `points` (Q, D) and the gradient
@@ -20,34 +21,23 @@ impl<const D: usize> HashGrid<D> {
     ) {
         self.assert_table("table", table);
         self.assert_features("d_features", d_features, points.len());
-        assert_eq!(
-            d_points.len(),
-            points.len(),
-            "d_points has {} points, expected {}",
-            d_points.len(),
-            points.len()
-        );
+        assert_eq!(d_points.len(), points.len(), "d_points has {} points, expected {}", d_points.len(), points.len());
         let width = self.num_features();
         let arch = pulp::Arch::new();
-        let chunks = points
-            .chunks(CHUNK)
-            .zip(d_features.chunks(CHUNK * width))
-            .zip(d_points.chunks_mut(CHUNK));
+        let chunks = points.chunks(CHUNK).zip(d_features.chunks(CHUNK * width)).zip(d_points.chunks_mut(CHUNK));
         for ((points, d_features), d_points) in chunks {
             for (l, level) in self.levels.iter().enumerate() {
                 let table = &table[self.level_range(l)];
                 let first = l * self.features;
-                arch.dispatch(
+                arch.dispatch(Kernel(
                     #[inline(always)]
                     || {
                         for_widths!(
                             self.features,
-                            level_backward_points::<D>(
-                                level, table, points, d_features, d_points, width, first
-                            )
+                            level_backward_points::<D>(level, table, points, d_features, d_points, width, first)
                         )
                     },
-                );
+                ));
             }
         }
     }
@@ -68,10 +58,7 @@ fn level_backward_points<const D: usize, const W: usize>(
     let n = level.resolution as f32;
     let mut corners = Corners::new();
     let mut projected = [[0.0f32; BLOCK]; MAX_CORNERS];
-    let blocks = points
-        .chunks(BLOCK)
-        .zip(d_features.chunks(BLOCK * width))
-        .zip(d_points.chunks_mut(BLOCK));
+    let blocks = points.chunks(BLOCK).zip(d_features.chunks(BLOCK * width)).zip(d_points.chunks_mut(BLOCK));
     for ((points, d_features), d_points) in blocks {
         corners.fill(level, points);
         for (b, d_features) in d_features.chunks_exact(width).enumerate() {
@@ -98,11 +85,7 @@ fn level_backward_points<const D: usize, const W: usize>(
 
 /// Derivative along axis `j` of the d-linear interpolation of corner `values`, a cell's side being 1.
 #[inline(always)]
-fn slope<const D: usize>(
-    values: &[Lanes<f32>; MAX_CORNERS],
-    fraction: &[Lanes<f32>; 4],
-    j: usize,
-) -> Lanes<f32> {
+fn slope<const D: usize>(values: &[Lanes<f32>; MAX_CORNERS], fraction: &[Lanes<f32>; 4], j: usize) -> Lanes<f32> {
     let mut folded = *values;
     for axis in (0..D).rev() {
         let half = 1 << axis;

@@ -29,12 +29,7 @@ pub struct HashGridConfig {
 
 impl HashGridConfig {
     pub(crate) fn resolutions(&self) -> Result<Vec<u32>, Error> {
-        let Self {
-            levels,
-            n_min,
-            n_max,
-            ..
-        } = *self;
+        let Self { levels, n_min, n_max, .. } = *self;
         if levels == 0 {
             return Err(Error::NoLevels);
         }
@@ -66,10 +61,7 @@ fn check_levels(levels: usize) -> Result<(), Error> {
     match levels {
         0 => Err(Error::NoLevels),
         1..=MAX_LEVELS => Ok(()),
-        _ => Err(Error::TooManyLevels {
-            levels,
-            most: MAX_LEVELS,
-        }),
+        _ => Err(Error::TooManyLevels { levels, most: MAX_LEVELS }),
     }
 }
 
@@ -81,17 +73,10 @@ fn check_resolution(level: usize, resolution: u32) -> Result<(), Error> {
 }
 
 /// Checks everything but the total size.
-pub(crate) fn check(
-    resolutions: &[u32],
-    features: usize,
-    log2_table_size: u32,
-) -> Result<(), Error> {
+pub(crate) fn check(resolutions: &[u32], features: usize, log2_table_size: u32) -> Result<(), Error> {
     check_levels(resolutions.len())?;
     if !(1..=MAX_FEATURES).contains(&features) {
-        return Err(Error::Features {
-            features,
-            most: MAX_FEATURES,
-        });
+        return Err(Error::Features { features, most: MAX_FEATURES });
     }
     if log2_table_size > MAX_LOG2_TABLE_SIZE {
         return Err(Error::TableSize { log2_table_size });

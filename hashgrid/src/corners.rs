@@ -23,11 +23,7 @@ pub(crate) struct Corners {
 
 impl Corners {
     pub fn new() -> Self {
-        Self {
-            row: [[0; BLOCK]; MAX_CORNERS],
-            weight: [[0.0; BLOCK]; MAX_CORNERS],
-            fraction: [[0.0; BLOCK]; 4],
-        }
+        Self { row: [[0; BLOCK]; MAX_CORNERS], weight: [[0.0; BLOCK]; MAX_CORNERS], fraction: [[0.0; BLOCK]; 4] }
     }
 
     /// Fills the block from up to [`BLOCK`] `points`; lanes beyond them hold the corners of the origin.
@@ -113,12 +109,7 @@ fn unit(x: f32) -> f32 {
 
 /// `W` numbers of row `row`, `offset` numbers into it, in a level whose rows have `stride` numbers.
 #[inline(always)]
-pub(crate) fn row<const W: usize>(
-    table: &[f32],
-    stride: usize,
-    offset: usize,
-    row: u32,
-) -> &[f32; W] {
+pub(crate) fn row<const W: usize>(table: &[f32], stride: usize, offset: usize, row: u32) -> &[f32; W] {
     if stride == W {
         // Known at compile time in the specialised kernels: one bounds check instead of two.
         return &table.as_chunks::<W>().0[row as usize];
@@ -129,12 +120,7 @@ pub(crate) fn row<const W: usize>(
 
 /// [`row`] for writing.
 #[inline(always)]
-pub(crate) fn row_mut<const W: usize>(
-    table: &mut [f32],
-    stride: usize,
-    offset: usize,
-    row: u32,
-) -> &mut [f32; W] {
+pub(crate) fn row_mut<const W: usize>(table: &mut [f32], stride: usize, offset: usize, row: u32) -> &mut [f32; W] {
     if stride == W {
         return &mut table.as_chunks_mut::<W>().0[row as usize];
     }

@@ -1,5 +1,6 @@
 use crate::corners::{BLOCK, Corners, for_widths, row};
 use crate::grid::{HashGrid, Level};
+use crate::simd::Kernel;
 
 /// Points that go through one level before the next level starts: enough for the level's table to stay in the
 /// cache from point to point, few enough for the features written to stay there too.
@@ -24,15 +25,10 @@ impl<const D: usize> HashGrid<D> {
             for (l, level) in self.levels.iter().enumerate() {
                 let table = &table[self.level_range(l)];
                 let first = l * self.features;
-                arch.dispatch(
+                arch.dispatch(Kernel(
                     #[inline(always)]
-                    || {
-                        for_widths!(
-                            self.features,
-                            encode_level::<D>(level, table, points, features, width, first)
-                        )
-                    },
-                );
+                    || for_widths!(self.features, encode_level::<D>(level, table, points, features, width, first)),
+                ));
             }
         }
     }
@@ -50,9 +46,7 @@ fn encode_level<const D: usize, const W: usize>(
     offset: usize,
 ) {
     let mut corners = Corners::new();
-    let blocks = points
-        .chunks(BLOCK)
-        .zip(features.chunks_mut(BLOCK * width));
+    let blocks = points.chunks(BLOCK).zip(features.chunks_mut(BLOCK * width));
     for (points, features) in blocks {
         corners.fill(level, points);
         for (b, features) in features.chunks_exact_mut(width).enumerate() {

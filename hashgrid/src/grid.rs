@@ -40,11 +40,7 @@ impl<const D: usize> HashGrid<D> {
     ///
     /// # Errors
     /// As for [`HashGrid::new`].
-    pub fn with_resolutions(
-        resolutions: &[u32],
-        features: usize,
-        log2_table_size: u32,
-    ) -> Result<Self, Error> {
+    pub fn with_resolutions(resolutions: &[u32], features: usize, log2_table_size: u32) -> Result<Self, Error> {
         const {
             assert!(2 <= D && D <= 4, "a hash grid has 2, 3 or 4 dimensions");
         }
@@ -58,22 +54,13 @@ impl<const D: usize> HashGrid<D> {
             let corners = (u64::from(resolution) + 1).checked_pow(D as u32);
             let dense = corners.filter(|&corners| corners <= most_rows);
             let rows = dense.unwrap_or(most_rows);
-            levels.push(Level {
-                resolution,
-                rows: rows as usize,
-                hashed: dense.is_none(),
-                start: start as usize,
-            });
+            levels.push(Level { resolution, rows: rows as usize, hashed: dense.is_none(), start: start as usize });
             start += rows * features as u64;
             if start > MAX_PARAMETERS as u64 {
                 return Err(Error::TooManyParameters { parameters: start });
             }
         }
-        Ok(Self {
-            levels,
-            resolutions: resolutions.to_vec(),
-            features,
-        })
+        Ok(Self { levels, resolutions: resolutions.to_vec(), features })
     }
 
     /// Length of the flat table.
@@ -94,11 +81,7 @@ impl<const D: usize> HashGrid<D> {
     /// Where there is no such level.
     #[must_use]
     pub fn level_range(&self, level: usize) -> Range<usize> {
-        assert!(
-            level < self.levels.len(),
-            "level {level} of {}",
-            self.levels.len()
-        );
+        assert!(level < self.levels.len(), "level {level} of {}", self.levels.len());
         let Level { start, rows, .. } = self.levels[level];
         start..start + rows * self.features
     }

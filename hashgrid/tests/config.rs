@@ -3,13 +3,7 @@
 use hashgrid::{Error, HashGrid, HashGridConfig, MAX_LOG2_TABLE_SIZE, MAX_RESOLUTION};
 use proptest::prelude::*;
 
-const CONFIG: HashGridConfig = HashGridConfig {
-    levels: 16,
-    features: 2,
-    log2_table_size: 19,
-    n_min: 16,
-    n_max: 2048,
-};
+const CONFIG: HashGridConfig = HashGridConfig { levels: 16, features: 2, log2_table_size: 19, n_min: 16, n_max: 2048 };
 
 #[test]
 fn resolutions_grow_geometrically_from_n_min_to_n_max() {
@@ -100,7 +94,7 @@ proptest! {
             prop_assert_eq!(resolutions[0], config.n_min);
             prop_assert!(resolutions.is_sorted());
             prop_assert!(levels == 1 || resolutions[levels - 1] == config.n_max);
-            prop_assert!(grid.num_parameters() <= levels * features << log2_table_size);
+            prop_assert!(grid.num_parameters() <= (levels * features) << log2_table_size);
         }
     }
 }

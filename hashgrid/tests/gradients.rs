@@ -14,15 +14,14 @@ const NESTED: [u32; 4] = [2, 8, 16, FINEST];
 /// Points at least a fifth of the finest cell away from every face.
 fn off_faces<const D: usize>(count: usize) -> impl Strategy<Value = Vec<[f32; D]>> {
     let coordinate = (0..FINEST, 0.2f32..0.8).prop_map(|(cell, f)| (cell as f32 + f) / FINEST as f32);
-    let point =
-        prop::collection::vec(coordinate, D).prop_map(|x| <[f32; D]>::try_from(x).unwrap());
+    let point = prop::collection::vec(coordinate, D).prop_map(|x| <[f32; D]>::try_from(x).expect("D coordinates"));
     prop::collection::vec(point, count)
 }
 
 /// Within a cell the encoding is linear in each coordinate, so the step may be large and only rounding is left:
 /// `terms` values of magnitude ≤ 1, each with an error of some ulps, over twice the step.
 fn check_points<const D: usize>(points: &[[f32; D]], log2: u32, features: usize, seed: u64) {
-    let grid = HashGrid::<D>::with_resolutions(&NESTED, features, log2).unwrap();
+    let grid = HashGrid::<D>::with_resolutions(&NESTED, features, log2).expect("a grid");
     let table = table(&grid, seed);
     let d_features = noise(points.len() * grid.num_features(), seed ^ 1);
     let mut d_points = vec![[0.0; D]; points.len()];
@@ -33,18 +32,13 @@ fn check_points<const D: usize>(points: &[[f32; D]], log2: u32, features: usize,
         abs: 8.0 * f64::from(f32::EPSILON) * (grid.num_features() as f64).sqrt() / f64::from(step),
         rel: 1e-4,
     };
-    assert_gradient(
-        "encode in x",
-        points.as_flattened(),
-        d_points.as_flattened(),
-        step,
-        tolerance,
-        |x| dot(&encode(&grid, &table, x.as_chunks::<D>().0), &d_features),
-    );
+    assert_gradient("encode in x", points.as_flattened(), d_points.as_flattened(), step, tolerance, |x| {
+        dot(&encode(&grid, &table, x.as_chunks::<D>().0), &d_features)
+    });
 }
 
 fn check_table<const D: usize>(points: &[[f32; D]], features: usize, seed: u64) {
-    let grid = HashGrid::<D>::with_resolutions(&[1, 2, 30], features, 5).unwrap();
+    let grid = HashGrid::<D>::with_resolutions(&[1, 2, 30], features, 5).expect("a grid");
     let table = table(&grid, seed);
     let d_features = noise(points.len() * grid.num_features(), seed ^ 1);
     let mut d_table = vec![0.0; grid.num_parameters()];
@@ -131,8 +125,7 @@ fn coordinates_that_were_clamped_get_no_gradient() {
 #[test]
 fn the_number_of_threads_changes_no_bit() {
     let grid = HashGrid::<4>::with_resolutions(&[2, 5, 9, 33, 100], 2, 10).unwrap();
-    let points: Vec<[f32; 4]> =
-        noise(4 * 20_000, 5).as_chunks::<4>().0.iter().map(|p| p.map(f32::abs)).collect();
+    let points: Vec<[f32; 4]> = noise(4 * 20_000, 5).as_chunks::<4>().0.iter().map(|p| p.map(f32::abs)).collect();
     let d_features = noise(points.len() * grid.num_features(), 6);
     let on = |threads| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();

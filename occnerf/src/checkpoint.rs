@@ -1,6 +1,6 @@
 //! Checkpoints: safetensors with the configuration and a version in the header, replaced atomically.
 
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap};
 use std::path::Path;
 
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
@@ -15,6 +15,8 @@ const FORMAT: &str = "occnerf-checkpoint";
 const VERSION: &str = "1";
 /// Larger files are not ours: the paper's table with both moments has 0.3 GB.
 const MAX_BYTES: u64 = 4 << 30;
+/// Far more than anybody trains, and far from where counting on would overflow.
+const MAX_STEPS: u64 = 1 << 40;
 
 impl Trainer<'_> {
     /// Writes everything that training goes on from. An old file survives until the new one is complete.
@@ -44,7 +46,8 @@ impl Trainer<'_> {
             let view = TensorView::new(*dtype, shape, bytes).map_err(|e| file(path, format!("`{name}`: {e}")))?;
             views.push((name.as_str(), view));
         }
-        let bytes = safetensors::serialize(views, Some(header)).map_err(|e| file(path, e.to_string()))?;
+        let mut bytes = safetensors::serialize(views, Some(header)).map_err(|e| file(path, e.to_string()))?;
+        sort_header(&mut bytes).map_err(|e| file(path, format!("header: {e}")))?;
         let partial = path.with_extension("safetensors.partial");
         std::fs::write(&partial, bytes).map_err(|source| Error::Io { path: partial.clone(), source })?;
         std::fs::rename(&partial, path).map_err(|source| Error::Io { path: path.to_owned(), source })
@@ -58,14 +61,14 @@ impl<'a> Trainer<'a> {
         let (header, tensors) = parse(path, &bytes)?;
         let get = |key: &str| header.get(key).ok_or_else(|| file(path, format!("header lacks `{key}`")));
         let steps_done = get("steps_done")?;
-        let steps_done: u64 = steps_done
-            .parse()
-            .map_err(|_| file(path, format!("header `steps_done` is {steps_done:?}, expected a whole number")))?;
+        let steps_done: u64 = steps_done.parse().ok().filter(|&steps| steps <= MAX_STEPS).ok_or_else(|| {
+            file(path, format!("header `steps_done` is {steps_done:?}, expected a whole number up to {MAX_STEPS}"))
+        })?;
         let trained_on = get("scene")?;
         if *trained_on != scene.name {
             return Err(file(path, format!("was trained on scene {trained_on:?}, expected {:?}", scene.name)));
         }
-        let mut trainer = Self::new(scene, config_of(path, &header)?)?;
+        let mut trainer = Self::new(scene, config_of(path, &header)?).map_err(|e| file(path, e.to_string()))?;
         trainer.steps_done = steps_done;
         for (part, name) in PARTS {
             let expected = trainer.parameters.get(part).len();
@@ -74,6 +77,10 @@ impl<'a> Trainer<'a> {
             let adam = &mut trainer.parameters.optimisers[part as usize];
             adam.first = read(format!("{name}.first_moment"))?;
             adam.second = read(format!("{name}.second_moment"))?;
+            if let Some(at) = adam.second.iter().position(|&v| v < 0.0) {
+                let what = format!("`{name}.second_moment` is {} at {at}, expected at least 0", adam.second[at]);
+                return Err(file(path, what));
+            }
             adam.steps = steps_done;
         }
         let counts = tensor(path, &tensors, "visibility_counts", Dtype::U64, scene.canonical.vertices.len())?;
@@ -82,6 +89,19 @@ impl<'a> Trainer<'a> {
         trainer.refresh_volume();
         Ok(trainer)
     }
+}
+
+/// Puts the header's keys in order: they come from a `HashMap`, and equal models are to be equal files.
+fn sort_header(bytes: &mut [u8]) -> Result<(), serde_json::Error> {
+    let Some((length, rest)) = bytes.split_first_chunk_mut::<8>() else { return Ok(()) };
+    let length = usize::try_from(u64::from_le_bytes(*length)).unwrap_or(usize::MAX).min(rest.len());
+    let header = &mut rest[..length];
+    let keys: BTreeMap<String, BTreeMap<String, serde_json::Value>> = serde_json::from_slice(header)?;
+    let sorted = serde_json::to_string(&keys)?;
+    // The same keys and values in the same notation, so the same length but for the padding.
+    header.fill(b' ');
+    header[..sorted.len()].copy_from_slice(sorted.as_bytes());
+    Ok(())
 }
 
 /// The configuration that a checkpoint was written with.
@@ -116,7 +136,7 @@ fn parse<'b>(path: &Path, bytes: &'b [u8]) -> Result<(HashMap<String, String>, S
 fn config_of(path: &Path, header: &HashMap<String, String>) -> Result<Config, Error> {
     let text = header.get("config").ok_or_else(|| file(path, "header lacks `config`".to_owned()))?;
     let config: Config = toml::from_str(text).map_err(|e| file(path, format!("header `config`: {e}")))?;
-    config.validate()?;
+    config.validate().map_err(|e| file(path, format!("header {e}")))?;
     Ok(config)
 }
 

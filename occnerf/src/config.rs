@@ -362,13 +362,14 @@ fn paper() -> Config {
 fn balanced() -> Config {
     Config {
         preset: Preset::Balanced,
-        steps: 3000,
+        steps: 2000,
         patches: 6,
         samples: 64,
         field: FieldConfig { width: 64, depth: 2, ..paper().field },
         encoding: EncodingConfig { levels: 10, features: 2, log2_table_size: 16, n_min: 12, n_max: 384 },
         surface: SurfaceConfig { distance: DistanceKind::Exact, ..paper().surface },
-        motion: MotionConfig { kind: MotionKind::Surface, margin: 0.06, falloff: 0.02, depth: 0.06 },
+        loss: LossConfig { mse: 5.0, ..paper().loss },
+        motion: MotionConfig { kind: MotionKind::Surface, margin: 0.04, falloff: 0.02, depth: 0.04 },
         rates: RateConfig {
             field: 2e-3,
             vertices: 1e-4,

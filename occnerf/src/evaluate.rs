@@ -35,8 +35,8 @@ pub struct FrameMetrics {
     pub ssim_mask: Option<f64>,
     /// Over the subject's pixels on the quartile of vertices that the training video showed least.
     pub psnr_hidden: Option<f64>,
-    /// The whole image.
-    pub psnr_full: f64,
+    /// The whole image. Like the others above it is `null` in JSON where there is no error at all.
+    pub psnr_full: Option<f64>,
     /// The whole image.
     pub ssim_full: Option<f64>,
     /// Opacity above one half against the true mask.
@@ -115,7 +115,7 @@ pub fn evaluate(
         psnr_mask: mean(&|f| f.psnr_mask),
         ssim_mask: mean(&|f| f.ssim_mask),
         psnr_hidden: mean(&|f| f.psnr_hidden),
-        psnr_full: mean(&|f| Some(f.psnr_full)),
+        psnr_full: mean(&|f| f.psnr_full),
         ssim_full: mean(&|f| f.ssim_full),
         lpips_full: None,
         mask_iou: mean(&|f| Some(f.mask_iou)),
@@ -142,7 +142,7 @@ fn score(frame: &PreparedFrame, rendering: &Rendering, hidden: &[bool]) -> Frame
         psnr_mask: metrics::psnr_masked(a, b, &mask),
         ssim_mask: metrics::ssim_masked(a, b, &mask, width, height),
         psnr_hidden: if enough { metrics::psnr_masked(a, b, &hidden) } else { None },
-        psnr_full: metrics::psnr(a, b),
+        psnr_full: Some(metrics::psnr(a, b)),
         ssim_full: metrics::ssim(a, b, width, height).ok(),
         mask_iou: if union == 0 { 1.0 } else { count(&|s, m| s && m) as f64 / union as f64 },
     }

@@ -90,8 +90,13 @@ impl Occupancy {
 
     /// Whether `point` can be within the margin or inside; false only where it certainly is not.
     pub fn is_live(&self, point: Vec3) -> bool {
-        let cell = self.cell(point);
-        cell.cmpge(IVec3::ZERO).all() && cell.cmplt(self.size).all() && self.live[self.index(cell)]
+        // Truncation is the floor of what is not negative; NaN fails the comparison, and huge values saturate.
+        let place = (point - self.min) * self.per_cell;
+        if !place.cmpge(Vec3::ZERO).all() {
+            return false;
+        }
+        let cell = place.as_ivec3();
+        cell.cmplt(self.size).all() && self.live[self.index(cell)]
     }
 
     fn cell(&self, point: Vec3) -> IVec3 {

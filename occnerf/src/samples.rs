@@ -96,8 +96,8 @@ impl Samples {
         let span = tracer.stage.occupancy.region().and_then(|region| region.intersect(ray));
         if let Some((near, far)) = span.filter(|(near, far)| far > near) {
             let width = (far - near) / bins as f32;
-            // The distance to the posed surface at a sample, which bounds the search at the next.
-            let mut known = None::<(f32, f32)>;
+            // The face that was closest to the last sample bounds the search for the next.
+            let mut known = None::<u32>;
             for bin in 0..bins {
                 let place = jitter.as_mut().map_or(0.5, Stream::uniform);
                 let t = near + (bin as f32 + place) * width;
@@ -105,9 +105,8 @@ impl Samples {
                 if !tracer.stage.occupancy.is_live(point) {
                     continue;
                 }
-                let bound = known.map_or(f32::INFINITY, |(at, distance)| distance + (t - at));
-                let (live, distance) = self.push(tracer, point, bound * 1.0001 + 1e-6);
-                known = distance.map(|d| (t, d));
+                let live;
+                (live, known) = self.push(tracer, point, known);
                 if live {
                     self.t.push(t);
                     self.delta.push(width);
@@ -118,9 +117,9 @@ impl Samples {
         self.starts.push(self.t.len());
     }
 
-    /// Maps a point and looks up its surface; false, with nothing pushed, if the sample is dead. `bound` is a distance
-    /// within which the posed surface certainly lies; returns the true distance where it was looked up.
-    fn push(&mut self, tracer: &Tracer<'_>, point: Vec3, bound: f32) -> (bool, Option<f32>) {
+    /// Maps a point and looks up its surface; false, with nothing pushed, if the sample is dead. `near` is a posed face
+    /// that is probably close; returns the closest one where it was looked up.
+    fn push(&mut self, tracer: &Tracer<'_>, point: Vec3, near: Option<u32>) -> (bool, Option<u32>) {
         let motion = &tracer.config.motion;
         let reach = motion.margin + motion.falloff;
         let farthest = reach.max(motion.depth);
@@ -138,10 +137,13 @@ impl Samples {
                 None => (sample, None),
             }
         } else {
-            let Some(closest) = tracer.stage.mesh.closest(point, farthest.min(bound)) else {
+            let mesh = &tracer.stage.mesh;
+            // Rounding may put the face itself a hair beyond its own distance.
+            let bound = near.map_or(f32::INFINITY, |face| 1.000_01 * mesh.distance_to_face(point, face) + 1e-6);
+            let Some(closest) = mesh.closest(point, farthest.min(bound)) else {
                 return (false, None);
             };
-            looked_up = Some(closest.signed_distance.abs());
+            looked_up = Some(closest.face);
             if closest.signed_distance > reach || closest.signed_distance < -motion.depth {
                 return (false, looked_up);
             }

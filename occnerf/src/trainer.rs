@@ -85,6 +85,13 @@ impl<'a> Trainer<'a> {
     /// A model at step 0.
     pub fn new(scene: &'a Scene, config: Config) -> Result<Self, Error> {
         config.validate()?;
+        let (levels, lists) = (scene.query.pyramid().levels.len(), scene.query.neighbours_per_query());
+        let (wanted, k) = (config.surface.coarse_levels + 1, config.surface.k);
+        if levels != wanted || lists != levels * k {
+            let k_of_scene = lists / levels.max(1);
+            let found = format!("was prepared for {k_of_scene} neighbours in each of {levels} levels");
+            return Err(Error::Scene(format!("{found}, the configuration asks for {k} in each of {wanted}")));
+        }
         let field = Field::new(&config, scene.canonical_box)?;
         let volume = match config.motion.kind {
             MotionKind::Surface => None,

@@ -14,15 +14,11 @@ use testkit::TriMesh;
 const SIZE: u32 = 480;
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
-    let path = std::env::args()
-        .nth(1)
-        .unwrap_or("distance_slice.png".into());
+    let path = std::env::args().nth(1).unwrap_or("distance_slice.png".into());
     let mesh = body::body_or_ball();
     let exact = MeshDistance::new(&mesh.vertices, &mesh.faces)?;
     let surface = SurfaceQuery::new(&mesh.vertices, &mesh.faces, &SurfaceQueryConfig::BODY)?;
-    let (min, max) = (mesh.vertices.iter()).fold((Vec3::MAX, Vec3::MIN), |(min, max), v| {
-        (min.min(*v), max.max(*v))
-    });
+    let (min, max) = (mesh.vertices.iter()).fold((Vec3::MAX, Vec3::MIN), |(min, max), v| (min.min(*v), max.max(*v)));
     // The upper half, cut between front and back.
     let centre = Vec3::new((min.x + max.x) / 2.0, max.y - 0.45, (min.z + max.z) / 2.0);
 
@@ -53,14 +49,8 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     picture.save(&path)?;
     let pixels = f64::from(SIZE * SIZE);
     println!("{path}: {SIZE} × {SIZE} points, {inside} inside");
-    println!(
-        "blended against exact: mean difference {:.2} mm",
-        error / pixels * 1e3
-    );
-    println!(
-        "sign differs at {:.3} %",
-        f64::from(flipped) / pixels * 100.0
-    );
+    println!("blended against exact: mean difference {:.2} mm", error / pixels * 1e3);
+    println!("sign differs at {:.3} %", f64::from(flipped) / pixels * 100.0);
     Ok(())
 }
 
@@ -83,20 +73,13 @@ fn compare(mesh: &TriMesh, exact: &MeshDistance, surface: &SurfaceQuery) {
             let face = areas.partition_point(|a| *a <= at).min(areas.len() - 1);
             let [a, b, c] = corners(&mesh.faces[face]);
             let (u, v) = (random.unit(), random.unit());
-            let (u, v) = if u + v > 1.0 {
-                (1.0 - u, 1.0 - v)
-            } else {
-                (u, v)
-            };
+            let (u, v) = if u + v > 1.0 { (1.0 - u, 1.0 - v) } else { (u, v) };
             let side = if random.unit() < 0.5 { -1.0 } else { 1.0 };
             let normal = (b - a).cross(c - a).normalize_or_zero();
             let x = a + (b - a) * u + (c - a) * v + normal * (side * distance);
             // Another part of the body may be nearer.
             let closest = exact.closest(x, 1.02 * distance);
-            let Some(d) = closest
-                .map(|c| c.signed_distance)
-                .filter(|d| d.abs() > 0.98 * distance)
-            else {
+            let Some(d) = closest.map(|c| c.signed_distance).filter(|d| d.abs() > 0.98 * distance) else {
                 continue;
             };
             surface.neighbours(x, &mut neighbours);
@@ -106,12 +89,7 @@ fn compare(mesh: &TriMesh, exact: &MeshDistance, surface: &SurfaceQuery) {
             error += (d - blended).abs();
         }
         let n = n as f32;
-        println!(
-            "{:5.0} mm {:12.2} % {:14.2} mm",
-            distance * 1e3,
-            flipped as f32 / n * 100.0,
-            error / n * 1e3
-        );
+        println!("{:5.0} mm {:12.2} % {:14.2} mm", distance * 1e3, flipped as f32 / n * 100.0, error / n * 1e3);
     }
 }
 
@@ -119,11 +97,7 @@ fn compare(mesh: &TriMesh, exact: &MeshDistance, surface: &SurfaceQuery) {
 fn colour(d: f32) -> Rgb<u8> {
     let fade = (-4.0 * d.abs()).exp();
     let line = 0.75 + 0.25 * ((d / 0.02 * std::f32::consts::TAU).cos() * 0.5 + 0.5).powf(0.3);
-    let base = if d < 0.0 {
-        [0.3, 0.55, 1.0]
-    } else {
-        [1.0, 0.7, 0.3]
-    };
+    let base = if d < 0.0 { [0.3, 0.55, 1.0] } else { [1.0, 0.7, 0.3] };
     let near = (1.0 - d.abs() / 0.003).max(0.0);
     Rgb(base.map(|c| ((c * fade * line * (1.0 - near) + near) * 255.0) as u8))
 }

@@ -29,11 +29,7 @@ pub(crate) struct Sums {
 #[inline(always)]
 pub(crate) fn cosine_weight(offset: Vec3, normal: Vec3) -> f32 {
     let length = offset.length();
-    if length > 0.0 {
-        (offset.dot(normal) / length).abs()
-    } else {
-        1.0
-    }
+    if length > 0.0 { (offset.dot(normal) / length).abs() } else { 1.0 }
 }
 
 #[inline(always)]
@@ -44,10 +40,7 @@ pub(crate) fn sums(vertices: &[Vec3], normals: &[Vec3], query: Vec3, finest: &[u
     }
     // No offset is zero here: it would have had weight 1.
     let inverse = |offset: Vec3, _| 1.0 / offset.length();
-    Sums {
-        inverse_distance: true,
-        ..accumulate(vertices, normals, query, finest, inverse)
-    }
+    Sums { inverse_distance: true, ..accumulate(vertices, normals, query, finest, inverse) }
 }
 
 /// Σ w, Σ w v / Σ w and Σ w n. The points are averaged as offsets from the query, which keeps the digits of a
@@ -60,12 +53,7 @@ fn accumulate(
     finest: &[u32],
     weight: impl Fn(Vec3, Vec3) -> f32,
 ) -> Sums {
-    let mut sum = Sums {
-        weight: 0.0,
-        point: Vec3::ZERO,
-        normal: Vec3::ZERO,
-        inverse_distance: false,
-    };
+    let mut sum = Sums { weight: 0.0, point: Vec3::ZERO, normal: Vec3::ZERO, inverse_distance: false };
     for &i in finest {
         let (v, n) = (vertices[i as usize], normals[i as usize]);
         let offset = query - v;
@@ -82,9 +70,5 @@ fn accumulate(
 pub(crate) fn blend(vertices: &[Vec3], normals: &[Vec3], query: Vec3, finest: &[u32]) -> Blended {
     let s = sums(vertices, normals, query, finest);
     let normal = s.normal.normalize_or(normals[finest[0] as usize]);
-    Blended {
-        point: s.point,
-        normal,
-        signed_distance: (query - s.point).dot(normal),
-    }
+    Blended { point: s.point, normal, signed_distance: (query - s.point).dot(normal) }
 }

@@ -64,11 +64,7 @@ pub(crate) fn check_mesh(vertices: &[glam::Vec3], faces: &[[u32; 3]]) -> Result<
     for (face, corners) in faces.iter().enumerate() {
         for &vertex in corners {
             if vertex as usize >= vertices.len() {
-                return Err(Error::FaceIndex {
-                    face,
-                    vertex,
-                    vertices: vertices.len(),
-                });
+                return Err(Error::FaceIndex { face, vertex, vertices: vertices.len() });
             }
         }
     }

@@ -42,11 +42,7 @@ impl CandidateGrid {
     /// Cells of side `cell` wherever a query may be within `margin` of a vertex.
     pub fn new(levels: &[Level], k: usize, cell: f32, margin: f32) -> Result<Option<Self>, Error> {
         let points = &levels[0].points;
-        let (min, max) = points
-            .iter()
-            .fold((Vec3::MAX, Vec3::MIN), |(min, max), &p| {
-                (min.min(p), max.max(p))
-            });
+        let (min, max) = points.iter().fold((Vec3::MAX, Vec3::MIN), |(min, max), &p| (min.min(p), max.max(p)));
         let reach = margin + cell;
         if min.abs().max(max.abs()).max_element() + reach > MAX_COORDINATE {
             return Ok(None);
@@ -69,9 +65,7 @@ impl CandidateGrid {
             cell: 1.0 / f64::from(per_cell),
             // The lookup rounds the offset from the origin three times; its cells reach that much further.
             // Half an ulp each, so four whole ulps are ample.
-            rounding: 4.0
-                * f64::from(f32::EPSILON)
-                * (blocks.max_element() * block_size + f64::from(reach)),
+            rounding: 4.0 * f64::from(f32::EPSILON) * (blocks.max_element() * block_size + f64::from(reach)),
             margin: f64::from(margin),
             k,
         };
@@ -91,10 +85,7 @@ impl CandidateGrid {
             slot += 1;
             let base = wide.len();
             if base + block.list.len() > u32::MAX as usize {
-                return Err(Error::GridTooLarge {
-                    cells: count * BLOCK_CELLS as f64,
-                    limit: f64::from(u32::MAX),
-                });
+                return Err(Error::GridTooLarge { cells: count * BLOCK_CELLS as f64, limit: f64::from(u32::MAX) });
             }
             offsets.extend(block.ends.iter().map(|&end| base as u32 + end));
             wide.extend(block.list);
@@ -152,9 +143,7 @@ impl CandidateGrid {
     /// Number of cells with lists, and of list entries in all of them.
     pub fn size(&self, levels: usize) -> (usize, usize) {
         let rows = self.offsets.len() / levels;
-        let filled = (0..rows)
-            .filter(|r| self.offsets[r * levels] != self.offsets[r * levels + 1])
-            .count();
+        let filled = (0..rows).filter(|r| self.offsets[r * levels] != self.offsets[r * levels + 1]).count();
         (filled, self.offsets.last().map_or(0, |&n| n as usize))
     }
 }
@@ -168,11 +157,7 @@ fn nearest_of_lists<I: Copy + Into<u32>>(
     q: Vec3,
     out: &mut [u32],
 ) {
-    for ((level, ends), out) in levels
-        .iter()
-        .zip(offsets.windows(2))
-        .zip(out.chunks_exact_mut(k))
-    {
+    for ((level, ends), out) in levels.iter().zip(offsets.windows(2)).zip(out.chunks_exact_mut(k)) {
         level.nearest_of(&lists[ends[0] as usize..ends[1] as usize], q, out);
     }
 }
@@ -197,8 +182,7 @@ impl Shape {
         let half = BLOCK as f64 * self.cell / 2.0;
         let centre = (low + half).as_vec3();
         // The centre is rounded: the block reaches further from it than from the true one.
-        let radius =
-            (half + self.rounding) * 3f64.sqrt() + (centre.as_dvec3() - (low + half)).length();
+        let radius = (half + self.rounding) * 3f64.sqrt() + (centre.as_dvec3() - (low + half)).length();
         if f64::from(levels[0].kth_distance(centre, 1)) - radius > self.margin {
             return None;
         }
@@ -215,10 +199,7 @@ impl Shape {
                 level.within(centre, ((kth + 2.0 * radius) * (1.0 + 1e-6)) as f32)
             })
             .collect();
-        let mut block = Block {
-            list: Vec::new(),
-            ends: Vec::with_capacity(BLOCK_CELLS * levels.len()),
-        };
+        let mut block = Block { list: Vec::new(), ends: Vec::with_capacity(BLOCK_CELLS * levels.len()) };
         let mut scratch = Vec::new();
         for cell in 0..BLOCK_CELLS {
             let offset = [cell % BLOCK, cell / BLOCK % BLOCK, cell / (BLOCK * BLOCK)];
@@ -285,9 +266,7 @@ impl Shape {
             scratch.retain(|c| c.min <= bound);
         }
         // Nearest to the centre first: the strongest rivals here, and well predicted branches in the query.
-        scratch.sort_unstable_by(|a, b| {
-            (a.length_squared.total_cmp(&b.length_squared)).then(a.local.cmp(&b.local))
-        });
+        scratch.sort_unstable_by(|a, b| (a.length_squared.total_cmp(&b.length_squared)).then(a.local.cmp(&b.local)));
         // Second sieve: j is closer than p everywhere in the cell if |q−p|² − |q−j|², which is linear in q,
         // is positive at its lowest corner. Of equal points the lower index wins every tie.
         for c in scratch.iter() {

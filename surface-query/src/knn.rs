@@ -38,8 +38,7 @@ impl Level {
         ids.sort_unstable();
         let points: Vec<Vec3> = ids.iter().map(|&i| vertices[i as usize]).collect();
         let coordinates: Vec<[f32; 3]> = points.iter().map(|p| p.to_array()).collect();
-        let tree = ImmutableKdTree::new_from_slice(&coordinates)
-            .map_err(|error| Error::Tree(error.to_string()))?;
+        let tree = ImmutableKdTree::new_from_slice(&coordinates).map_err(|error| Error::Tree(error.to_string()))?;
         Ok(Self { ids, points, tree })
     }
 
@@ -49,11 +48,7 @@ impl Level {
         let Some(k_nonzero) = NonZero::new(k) else {
             return 0.0;
         };
-        let found = self
-            .tree
-            .query(&centre.to_array())
-            .nearest_n::<SquaredEuclidean<f32>>(k_nonzero)
-            .execute();
+        let found = self.tree.query(&centre.to_array()).nearest_n::<SquaredEuclidean<f32>>(k_nonzero).execute();
         if found.len() < k {
             return f32::INFINITY;
         }
@@ -87,11 +82,8 @@ impl Level {
             return;
         }
         let radius = self.kth_distance(q, wanted);
-        let near = if radius < f32::INFINITY {
-            self.within(q, radius)
-        } else {
-            (0..self.points.len() as u32).collect()
-        };
+        let near =
+            if radius < f32::INFINITY { self.within(q, radius) } else { (0..self.points.len() as u32).collect() };
         self.nearest_of(&near, q, out);
     }
 

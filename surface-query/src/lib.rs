@@ -5,22 +5,27 @@
 //! use glam::Vec3;
 //! use surface_query::{MeshDistance, SurfaceQuery, SurfaceQueryConfig};
 //!
-//! // A tetrahedron, counter-clockwise seen from outside.
-//! let vertices = [Vec3::ZERO, Vec3::X, Vec3::Y, Vec3::Z];
-//! let faces = [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]];
-//! let x = Vec3::new(0.2, 0.2, -0.3);
+//! // An octahedron, counter-clockwise seen from outside.
+//! let vertices = [Vec3::X, Vec3::Y, Vec3::Z, -Vec3::X, -Vec3::Y, -Vec3::Z];
+//! let faces = [
+//!     [0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2],
+//!     [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5],
+//! ];
+//! let x = Vec3::splat(0.5);
 //!
-//! let surface = SurfaceQuery::new(&vertices, &faces, &SurfaceQueryConfig::TREES)?;
+//! // A mesh of six vertices takes a small neighbourhood.
+//! let config = SurfaceQueryConfig { k: 3, coarse_levels: 0, ..SurfaceQueryConfig::TREES };
+//! let surface = SurfaceQuery::new(&vertices, &faces, &config)?;
 //! let mut neighbours = vec![0; surface.neighbours_per_query()];
 //! surface.neighbours(x, &mut neighbours);
-//! assert_eq!(neighbours[..3], [0, 1, 2]);
-//! let blended = surface.blend(x, &neighbours[..5]);
-//! assert!(blended.signed_distance > 0.0);
+//! assert_eq!(neighbours, [0, 1, 2]);
+//! let blended = surface.blend(x, &neighbours);
+//! assert!((blended.signed_distance - 0.75f32.sqrt() + 1.0 / 3f32.sqrt()).abs() < 1e-6);
 //!
 //! let mesh = MeshDistance::new(&vertices, &faces)?;
 //! let closest = mesh.closest(x, f32::INFINITY).unwrap();
-//! assert_eq!(closest.point, Vec3::new(0.2, 0.2, 0.0));
-//! assert_eq!(closest.signed_distance, 0.3);
+//! assert!(closest.face == 0 && closest.point.distance(Vec3::splat(1.0 / 3.0)) < 1e-6);
+//! assert!((closest.signed_distance - blended.signed_distance).abs() < 1e-6);
 //! # Ok::<(), surface_query::Error>(())
 //! ```
 //!

@@ -23,9 +23,7 @@ pub fn vertex_normals(vertices: &[Vec3], faces: &[[u32; 3]]) -> Vec<Vec3> {
             sums[face[corner] as usize] += normal * angle;
         }
     }
-    sums.into_iter()
-        .map(|sum| sum.normalize_or(DVec3::Y).as_vec3())
-        .collect()
+    sums.into_iter().map(|sum| sum.normalize_or(DVec3::Y).as_vec3()).collect()
 }
 
 /// Unit normal of a triangle, zero where it has no area. Finite for any finite `f32` corners.

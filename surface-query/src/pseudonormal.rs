@@ -32,14 +32,10 @@ impl Pseudonormals {
             .map(|v| {
                 let next = positions.len() as u32;
                 // Adding zero makes −0 the same as 0.
-                *positions
-                    .entry((*v + 0.0).to_array().map(f32::to_bits))
-                    .or_insert(next)
+                *positions.entry((*v + 0.0).to_array().map(f32::to_bits)).or_insert(next)
             })
             .collect();
-        let welded: Vec<[u32; 3]> = (faces.iter())
-            .map(|face| face.map(|v| names[v as usize]))
-            .collect();
+        let welded: Vec<[u32; 3]> = (faces.iter()).map(|face| face.map(|v| names[v as usize])).collect();
         let mut numbers: HashMap<(u32, u32), u32> = HashMap::with_capacity(faces.len() * 3 / 2);
         let edges = (welded.iter())
             .map(|face| {

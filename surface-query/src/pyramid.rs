@@ -20,11 +20,7 @@ impl Pyramid {
     /// A `ratio` outside (0, 1] is clamped into it; NaN counts as 1.
     #[must_use]
     pub fn new(points: &[Vec3], ratio: f32, levels: usize) -> Self {
-        let ratio = if ratio.is_nan() {
-            1.0
-        } else {
-            ratio.clamp(0.0, 1.0)
-        };
+        let ratio = if ratio.is_nan() { 1.0 } else { ratio.clamp(0.0, 1.0) };
         // The factor undoes the rounding of a decimal ratio to f32: 10 · 0.7f32 is 6.9999998 in f64.
         let smaller = |n: usize| ((n as f64 * f64::from(ratio) * (1.0 + 1e-7)) as usize).max(1);
         let n = points.len();
@@ -69,11 +65,7 @@ pub fn farthest_points(points: &[Vec3], count: usize) -> Vec<u32> {
     let mut buckets = Vec::with_capacity(finite.len() / (BUCKET / 2) + 1);
     split(points, &mut finite, &mut buckets);
 
-    let mut next = buckets
-        .iter()
-        .enumerate()
-        .flat_map(|(b, bucket)| bucket.ids.iter().map(move |&i| (i, b)))
-        .min();
+    let mut next = buckets.iter().enumerate().flat_map(|(b, bucket)| bucket.ids.iter().map(move |&i| (i, b))).min();
     while let Some((index, bucket)) = next {
         chosen.push(index);
         buckets[bucket].take(index);
@@ -155,10 +147,7 @@ impl Bucket {
     }
 
     fn refresh(&mut self) {
-        let gap = self
-            .gaps
-            .iter()
-            .fold(-1.0, |m: f64, &g| if g > m { g } else { m });
+        let gap = self.gaps.iter().fold(-1.0, |m: f64, &g| if g > m { g } else { m });
         let at = self.gaps.iter().position(|&g| g == gap).unwrap_or(0);
         self.gap = gap;
         self.farthest = self.ids[at];
@@ -175,9 +164,7 @@ fn split(points: &[Vec3], ids: &mut [u32], buckets: &mut Vec<Bucket>) {
         return;
     }
     let at = |i: u32| points[i as usize];
-    let (min, max) = ids.iter().fold((Vec3::MAX, Vec3::MIN), |(min, max), &i| {
-        (min.min(at(i)), max.max(at(i)))
-    });
+    let (min, max) = ids.iter().fold((Vec3::MAX, Vec3::MIN), |(min, max), &i| (min.min(at(i)), max.max(at(i))));
     let axis = (max.as_dvec3() - min.as_dvec3()).max_position();
     let middle = ids.len() / 2;
     ids.select_nth_unstable_by(middle, |&a, &b| at(a)[axis].total_cmp(&at(b)[axis]));

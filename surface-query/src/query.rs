@@ -27,29 +27,13 @@ pub struct SurfaceQueryConfig {
 impl SurfaceQueryConfig {
     /// The paper's neighbourhoods (5 neighbours at 4 scales, ratio 0.25) with a grid for a body of 6890
     /// vertices in metres: cells of 2 cm to 12 cm from the skin.
-    pub const BODY: Self = Self {
-        k: 5,
-        coarse_levels: 3,
-        ratio: 0.25,
-        cell: 0.02,
-        margin: 0.12,
-    };
+    pub const BODY: Self = Self { k: 5, coarse_levels: 3, ratio: 0.25, cell: 0.02, margin: 0.12 };
 
     /// The paper's neighbourhoods without a grid: right for any unit and size.
-    pub const TREES: Self = Self {
-        cell: 0.0,
-        margin: 0.0,
-        ..Self::BODY
-    };
+    pub const TREES: Self = Self { cell: 0.0, margin: 0.0, ..Self::BODY };
 
     fn check(&self) -> Result<(), Error> {
-        let fail = |name, value, expected| {
-            Err(Error::Config {
-                name,
-                value,
-                expected,
-            })
-        };
+        let fail = |name, value, expected| Err(Error::Config { name, value, expected });
         if !(1..=MAX_K).contains(&self.k) {
             return fail("k", self.k as f64, "1 to 64");
         }
@@ -88,20 +72,14 @@ impl SurfaceQuery {
     /// # Errors
     /// No vertices, a vertex that is not finite, a face that names no vertex, a configuration out of range, or
     /// a cell too small for the extent of the vertices.
-    pub fn new(
-        vertices: &[Vec3],
-        faces: &[[u32; 3]],
-        config: &SurfaceQueryConfig,
-    ) -> Result<Self, Error> {
+    pub fn new(vertices: &[Vec3], faces: &[[u32; 3]], config: &SurfaceQueryConfig) -> Result<Self, Error> {
         config.check()?;
         check_mesh(vertices, faces)?;
         if vertices.is_empty() {
             return Err(Error::NoVertices);
         }
         let pyramid = Pyramid::new(vertices, config.ratio, config.coarse_levels);
-        let levels = (pyramid.levels.iter())
-            .map(|ids| Level::new(vertices, ids))
-            .collect::<Result<Vec<_>, _>>()?;
+        let levels = (pyramid.levels.iter()).map(|ids| Level::new(vertices, ids)).collect::<Result<Vec<_>, _>>()?;
         let grid = if config.cell > 0.0 && config.margin > 0.0 {
             CandidateGrid::new(&levels, config.k, config.cell, config.margin)?
         } else {
@@ -175,22 +153,9 @@ impl SurfaceQuery {
     /// # Panics
     /// If `finest` is empty or names no vertex.
     #[must_use]
-    pub fn blend_backward(
-        &self,
-        query: Vec3,
-        finest: &[u32],
-        d_point: Vec3,
-        d_signed_distance: f32,
-    ) -> Vec3 {
+    pub fn blend_backward(&self, query: Vec3, finest: &[u32], d_point: Vec3, d_signed_distance: f32) -> Vec3 {
         assert!(!finest.is_empty(), "blend_backward: no neighbours");
-        blend_backward::blend_backward(
-            &self.vertices,
-            &self.normals,
-            query,
-            finest,
-            d_point,
-            d_signed_distance,
-        )
+        blend_backward::blend_backward(&self.vertices, &self.normals, query, finest, d_point, d_signed_distance)
     }
 
     /// The vertices, (V).
@@ -214,8 +179,6 @@ impl SurfaceQuery {
     /// Cells of the candidate grid and entries of its lists; zeros without one. For judging `cell` and `margin`.
     #[must_use]
     pub fn grid_size(&self) -> (usize, usize) {
-        self.grid
-            .as_ref()
-            .map_or((0, 0), |grid| grid.size(self.levels.len()))
+        self.grid.as_ref().map_or((0, 0), |grid| grid.size(self.levels.len()))
     }
 }

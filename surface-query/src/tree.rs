@@ -34,11 +34,7 @@ impl Node {
     #[inline(always)]
     pub fn child(&self, side: usize) -> Child {
         let child = self.children[side];
-        if child & LEAF == 0 {
-            Child::Node(child)
-        } else {
-            Child::Leaf(child & !LEAF)
-        }
+        if child & LEAF == 0 { Child::Node(child) } else { Child::Leaf(child & !LEAF) }
     }
 
     /// Squared distance of a point to the boxes of both children; rounding never makes it more than the computed
@@ -79,18 +75,11 @@ impl Tree {
                 Aabb::new(a.min(b).min(c), a.max(b).max(c))
             })
             .collect();
-        let mut tree = Self {
-            nodes: Vec::new(),
-            leaves: Vec::new(),
-            depth: 0,
-        };
+        let mut tree = Self { nodes: Vec::new(), leaves: Vec::new(), depth: 0 };
         if boxes.is_empty() {
             return tree;
         }
-        let parameters = BvhBuildParams {
-            max_prims_per_leaf: LANES as u32,
-            ..BvhBuildParams::medium_build()
-        };
+        let parameters = BvhBuildParams { max_prims_per_leaf: LANES as u32, ..BvhBuildParams::medium_build() };
         let bvh = build_bvh2(&boxes, parameters, &mut Duration::default());
         tree.flatten(&bvh);
         tree
@@ -98,10 +87,7 @@ impl Tree {
 
     fn flatten(&mut self, bvh: &Bvh2) {
         let root = &bvh.nodes[0];
-        let blank = Node {
-            axes: [Vec4::ZERO; 3],
-            children: [0; 2],
-        };
+        let blank = Node { axes: [Vec4::ZERO; 3], children: [0; 2] };
         self.nodes.push(blank);
         if root.is_leaf() {
             let leaf = self.leaf(bvh, 0);
@@ -153,8 +139,7 @@ impl Tree {
                 Child::Leaf(leaf) => leaf_box(&self.leaves[leaf as usize]).unwrap_or(NOTHING),
                 Child::Node(child) => self.nodes[child as usize].bounds(),
             });
-            self.nodes[n].axes =
-                [0, 1, 2].map(|a| Vec4::new(left[0][a], right[0][a], left[1][a], right[1][a]));
+            self.nodes[n].axes = [0, 1, 2].map(|a| Vec4::new(left[0][a], right[0][a], left[1][a], right[1][a]));
         }
     }
 }
@@ -163,10 +148,7 @@ impl Node {
     /// Lowest and highest corner of one child's box.
     pub fn side(&self, side: usize) -> [Vec3; 2] {
         let [x, y, z] = self.axes;
-        [
-            Vec3::new(x[side], y[side], z[side]),
-            Vec3::new(x[side + 2], y[side + 2], z[side + 2]),
-        ]
+        [Vec3::new(x[side], y[side], z[side]), Vec3::new(x[side + 2], y[side + 2], z[side + 2])]
     }
 
     fn bounds(&self) -> [Vec3; 2] {

@@ -42,11 +42,7 @@ impl Pack {
             let v = [0, 1, 2, 3].map(|lane: usize| f(&triangles[lane]));
             [0, 1, 2].map(|axis| Vec4::from(v.map(|v| v[axis])))
         };
-        Self {
-            a: lanes(&|t| t[0]),
-            ab: lanes(&|t| t[1] - t[0]),
-            ac: lanes(&|t| t[2] - t[0]),
-        }
+        Self { a: lanes(&|t| t[0]), ab: lanes(&|t| t[1] - t[0]), ac: lanes(&|t| t[2] - t[0]) }
     }
 
     /// Squared distance of `q` to each triangle.
@@ -72,10 +68,8 @@ impl Pack {
 
         let determinant = bb * cc - bc * bc;
         let (s, t) = (d1 * cc - d2 * bc, d2 * bb - d1 * bc);
-        let inside = s.cmpge(Vec4::ZERO)
-            & t.cmpge(Vec4::ZERO)
-            & (s + t).cmple(determinant)
-            & determinant.cmpgt(Vec4::ZERO);
+        let inside =
+            s.cmpge(Vec4::ZERO) & t.cmpge(Vec4::ZERO) & (s + t).cmple(determinant) & determinant.cmpgt(Vec4::ZERO);
         let inverse = 1.0 / determinant;
         let foot = residual(ap, ab, ac, s * inverse, t * inverse);
         let edges = on_ab.min(on_ac).min(on_bc);
@@ -107,17 +101,10 @@ pub(crate) fn closest_on_triangle(corners: [DVec3; 3], q: DVec3) -> Foot {
     let mut best: Option<Foot> = None;
     let mut consider = |barycentric: [f64; 3], feature| {
         // Relative to the nearest corner in weight: no cancellation against the origin's distance.
-        let offset = (0..3).fold(DVec3::ZERO, |sum, i| {
-            sum + (q - corners[i]) * barycentric[i]
-        });
+        let offset = (0..3).fold(DVec3::ZERO, |sum, i| sum + (q - corners[i]) * barycentric[i]);
         let distance_squared = offset.length_squared();
         if best.is_none_or(|b| distance_squared < b.distance_squared) {
-            best = Some(Foot {
-                distance_squared,
-                barycentric,
-                feature,
-                offset,
-            });
+            best = Some(Foot { distance_squared, barycentric, feature, offset });
         }
     };
     let [a, b, c] = corners;
@@ -125,10 +112,7 @@ pub(crate) fn closest_on_triangle(corners: [DVec3; 3], q: DVec3) -> Foot {
     let (d1, d2) = (ab.dot(ap), ac.dot(ap));
     let (bb, bc, cc) = (ab.length_squared(), ab.dot(ac), ac.length_squared());
     let determinant = bb * cc - bc * bc;
-    let (v, w) = (
-        (d1 * cc - d2 * bc) / determinant,
-        (d2 * bb - d1 * bc) / determinant,
-    );
+    let (v, w) = ((d1 * cc - d2 * bc) / determinant, (d2 * bb - d1 * bc) / determinant);
     if determinant > 0.0 && v > 0.0 && w > 0.0 && v + w < 1.0 {
         consider([1.0 - v - w, v, w], Feature::Face);
     }
@@ -136,11 +120,7 @@ pub(crate) fn closest_on_triangle(corners: [DVec3; 3], q: DVec3) -> Foot {
         let j = (i + 1) % 3;
         let along = corners[j] - corners[i];
         let length_squared = along.length_squared();
-        let t = if length_squared > 0.0 {
-            (q - corners[i]).dot(along) / length_squared
-        } else {
-            0.0
-        };
+        let t = if length_squared > 0.0 { (q - corners[i]).dot(along) / length_squared } else { 0.0 };
         let mut barycentric = [0.0; 3];
         let t = t.clamp(0.0, 1.0);
         barycentric[i] = 1.0 - t;

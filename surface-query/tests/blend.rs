@@ -1,4 +1,5 @@
 //! The blend: its definition, its special cases, and its gradient.
+#![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
 
 use glam::{DVec3, Vec3};
 use proptest::prelude::*;
@@ -26,19 +27,11 @@ fn plain(query: &SurfaceQuery, q: Vec3, list: &[u32]) -> (DVec3, DVec3, f64) {
     let weights: Vec<f64> = list
         .iter()
         .map(at)
-        .map(|(v, n)| {
-            if q == v {
-                1.0
-            } else {
-                ((q - v).dot(n) / (q - v).length()).abs()
-            }
-        })
+        .map(|(v, n)| if q == v { 1.0 } else { ((q - v).dot(n) / (q - v).length()).abs() })
         .collect();
     let sum: f64 = weights.iter().sum();
     let mix = |pick: &dyn Fn((DVec3, DVec3)) -> DVec3| {
-        list.iter()
-            .zip(&weights)
-            .fold(DVec3::ZERO, |s, (i, w)| s + pick(at(i)) * *w)
+        list.iter().zip(&weights).fold(DVec3::ZERO, |s, (i, w)| s + pick(at(i)) * *w)
     };
     let point = mix(&|(v, _)| v) / sum;
     let normal = mix(&|(_, n)| n).normalize_or_zero();
@@ -134,14 +127,7 @@ fn the_gradient_of_inverse_distance_weights_is_that_of_finite_differences() {
     };
     let plane = [q.x, q.y];
     let analytic = [d_query.x, d_query.y];
-    testkit::gradient::assert_gradient(
-        "plane",
-        &plane,
-        &analytic,
-        1e-3,
-        Tolerance::default(),
-        weighted,
-    );
+    testkit::gradient::assert_gradient("plane", &plane, &analytic, 1e-3, Tolerance::default(), weighted);
     let blended = query.blend(q, &list);
     assert!(blended.point.distance(q) < 0.34, "{blended:?}");
     assert_eq!((blended.normal, blended.signed_distance), (Vec3::Z, 0.0));
@@ -156,10 +142,7 @@ fn a_query_on_a_vertex_has_weight_one_there() {
         assert_eq!(ball.vertices[list[0] as usize], v);
         let blended = query.blend(v, &list);
         // The neighbours' tangent planes pass close by, so their weights are small.
-        assert!(
-            blended.point.distance(v) < 0.05 && blended.signed_distance.abs() < 0.02,
-            "{blended:?}"
-        );
+        assert!(blended.point.distance(v) < 0.05 && blended.signed_distance.abs() < 0.02, "{blended:?}");
         assert!(query.blend_backward(v, &list, Vec3::ONE, 1.0).is_finite());
     }
 }
@@ -181,22 +164,11 @@ fn the_sign_is_positive_outside_a_ball_and_negative_inside() {
 fn normals_that_cancel_fall_back_to_the_nearest_vertex() {
     // Two faces back to back, vertices apart: the query in the middle sees opposite normals.
     let v = [Vec3::ZERO, Vec3::X, Vec3::Y];
-    let vertices: Vec<Vec3> = v
-        .iter()
-        .map(|p| *p - Vec3::Z)
-        .chain(v.iter().map(|p| *p + Vec3::Z))
-        .collect();
+    let vertices: Vec<Vec3> = v.iter().map(|p| *p - Vec3::Z).chain(v.iter().map(|p| *p + Vec3::Z)).collect();
     let faces = [[0, 2, 1], [3, 4, 5]];
-    let settings = SurfaceQueryConfig {
-        k: 2,
-        ..SurfaceQueryConfig::TREES
-    };
+    let settings = SurfaceQueryConfig { k: 2, ..SurfaceQueryConfig::TREES };
     let query = SurfaceQuery::new(&vertices, &faces, &settings).unwrap();
     let blended = query.blend(Vec3::ZERO, &[0, 3]);
     assert_eq!(blended.normal, -Vec3::Z);
-    assert!(
-        query
-            .blend_backward(Vec3::ZERO, &[0, 3], Vec3::ONE, 1.0)
-            .is_finite()
-    );
+    assert!(query.blend_backward(Vec3::ZERO, &[0, 3], Vec3::ONE, 1.0).is_finite());
 }

@@ -1,4 +1,5 @@
 //! Closest points and signs against brute force in `f64`.
+#![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
 
 mod body;
 
@@ -10,10 +11,7 @@ use testkit::{TriMesh, mesh, oracle, strategy};
 
 /// Rounding of the result to `f32`, and a share of it for the oracle's different route.
 fn tolerance(mesh: &TriMesh, q: Vec3) -> f64 {
-    let size = mesh
-        .vertices
-        .iter()
-        .fold(0.0, |m: f32, v| m.max(v.abs().max_element()));
+    let size = mesh.vertices.iter().fold(0.0, |m: f32, v| m.max(v.abs().max_element()));
     f64::from(size.max(q.abs().max_element())) * 1.2e-7 + 3e-45
 }
 
@@ -22,26 +20,16 @@ fn check(mesh: &TriMesh, q: Vec3, found: &Closest) -> Result<(), TestCaseError> 
     let eps = tolerance(mesh, q);
     let (_, _, distance) = oracle::closest_point(&mesh.vertices, &mesh.faces, q);
     let unsigned = f64::from(found.signed_distance.abs());
-    prop_assert!(
-        (unsigned - distance).abs() <= eps,
-        "{q}: {unsigned} instead of {distance}"
-    );
+    prop_assert!((unsigned - distance).abs() <= eps, "{q}: {unsigned} instead of {distance}");
     // The point is rounded along each axis.
     let eps = 3.0 * eps;
     let [a, b, c] = found.barycentric;
     prop_assert!(a >= 0.0 && b >= 0.0 && c >= 0.0 && (a + b + c - 1.0).abs() < 1e-6);
     let corners = mesh.faces[found.face as usize].map(|i| mesh.vertices[i as usize].as_dvec3());
     let point = corners[0] * f64::from(a) + corners[1] * f64::from(b) + corners[2] * f64::from(c);
-    prop_assert!(
-        point.distance(found.point.as_dvec3()) <= eps,
-        "{q}: {point} or {}",
-        found.point
-    );
+    prop_assert!(point.distance(found.point.as_dvec3()) <= eps, "{q}: {point} or {}", found.point);
     let reached = found.point.as_dvec3().distance(q.as_dvec3());
-    prop_assert!(
-        (reached - unsigned).abs() <= eps,
-        "{q}: {reached} or {unsigned}"
-    );
+    prop_assert!((reached - unsigned).abs() <= eps, "{q}: {reached} or {unsigned}");
     Ok(())
 }
 
@@ -56,6 +44,21 @@ fn check_sign(mesh: &TriMesh, q: Vec3, found: &Closest) -> Result<(), TestCaseEr
 
 fn build(mesh: &TriMesh) -> MeshDistance {
     MeshDistance::new(&mesh.vertices, &mesh.faces).unwrap()
+}
+
+#[test]
+fn distance_to_the_closest_face_is_the_distance_and_no_face_is_nearer() {
+    let sphere = mesh::icosphere(2);
+    let distance = build(&sphere);
+    let mut random = Random(5);
+    for _ in 0..300 {
+        let q = random.vec3(1.5);
+        let closest = distance.closest(q, f32::INFINITY).unwrap();
+        let to_face = |face| distance.distance_to_face(q, face);
+        assert_eq!(to_face(closest.face), closest.signed_distance.abs());
+        let nearest = (0..sphere.faces.len() as u32).map(to_face).fold(f32::INFINITY, f32::min);
+        assert!(nearest >= to_face(closest.face));
+    }
 }
 
 /// A ball pulled into spikes: sharp convex and concave edges and corners.
@@ -74,12 +77,7 @@ fn at_a_face() -> impl Strategy<Value = (prop::sample::Index, [f32; 3], f32, Vec
         (0.0f32..1.0).prop_map(|t| [t, 1.0 - t, 0.0]),
     ];
     let distance = prop::sample::select(vec![0.0f32, 1e-5, 1e-3, 0.05, 0.4]);
-    (
-        any::<prop::sample::Index>(),
-        weights,
-        distance,
-        strategy::unit_vec3(),
-    )
+    (any::<prop::sample::Index>(), weights, distance, strategy::unit_vec3())
 }
 
 fn place(mesh: &TriMesh, at: &(prop::sample::Index, [f32; 3], f32, Vec3)) -> Vec3 {
@@ -213,11 +211,7 @@ fn a_cube_is_measured_exactly() {
         (Vec3::X, 0.0),
         (Vec3::ONE, 0.0),
     ] {
-        assert_eq!(
-            distance.closest(q, 10.0).unwrap().signed_distance,
-            expected,
-            "{q}"
-        );
+        assert_eq!(distance.closest(q, 10.0).unwrap().signed_distance, expected, "{q}");
     }
 }
 
@@ -238,10 +232,7 @@ fn far_and_extreme_queries_are_finite_or_none() {
         let [a, b, c] = ball.faces[found.face as usize].map(|i| ball.vertices[i as usize]);
         let [u, v, w] = found.barycentric;
         let point = a * u + b * v + c * w;
-        assert!(
-            point.distance(Vec3::new(0.6, -0.8, 0.0)) < 0.1,
-            "{q}: {point}"
-        );
+        assert!(point.distance(Vec3::new(0.6, -0.8, 0.0)) < 0.1, "{q}: {point}");
     }
     let infinite = Vec3::new(f32::INFINITY, 0.0, 0.0);
     for q in [Vec3::NAN, infinite, Vec3::new(0.0, f32::NAN, 1.0)] {
@@ -250,10 +241,7 @@ fn far_and_extreme_queries_are_finite_or_none() {
     for bound in [f32::NAN, -1.0, f32::NEG_INFINITY] {
         assert_eq!(distance.closest(Vec3::X * 2.0, bound), None);
     }
-    assert!(
-        distance.closest(Vec3::MAX, f32::INFINITY).is_none(),
-        "farther than any f32"
-    );
+    assert!(distance.closest(Vec3::MAX, f32::INFINITY).is_none(), "farther than any f32");
 }
 
 #[test]
@@ -270,10 +258,7 @@ fn degenerate_meshes_are_answered_or_refused() {
             }
             Err(error) => panic!("{name}: {error}"),
         };
-        let size = soup
-            .vertices
-            .iter()
-            .fold(0.0, |m: f32, p| m.max(p.abs().max_element()));
+        let size = soup.vertices.iter().fold(0.0, |m: f32, p| m.max(p.abs().max_element()));
         let mut random = Random(5);
         for _ in 0..40 {
             let q = random.vec3(size * 2.0);
@@ -301,22 +286,15 @@ fn faces_that_become_infinite_disappear_until_the_next_refit() {
     distance.refit(&[Vec3::NAN; 8]);
     assert_eq!(distance.closest(q, f32::INFINITY), None);
     distance.refit(&cube.vertices);
-    assert_eq!(
-        distance.closest(Vec3::splat(2.0), 9.0).unwrap().point,
-        Vec3::ONE
-    );
+    assert_eq!(distance.closest(Vec3::splat(2.0), 9.0).unwrap().point, Vec3::ONE);
 }
 
 #[test]
 fn seams_of_duplicated_vertices_do_not_change_the_sign() {
     let ball = mesh::icosphere(2).map(|p| p * Vec3::new(1.0, 0.3, 1.0));
     // Every face gets corners of its own.
-    let vertices: Vec<Vec3> = (ball.faces.iter().flatten())
-        .map(|&i| ball.vertices[i as usize])
-        .collect();
-    let faces: Vec<[u32; 3]> = (0..ball.faces.len() as u32)
-        .map(|f| [3 * f, 3 * f + 1, 3 * f + 2])
-        .collect();
+    let vertices: Vec<Vec3> = (ball.faces.iter().flatten()).map(|&i| ball.vertices[i as usize]).collect();
+    let faces: Vec<[u32; 3]> = (0..ball.faces.len() as u32).map(|f| [3 * f, 3 * f + 1, 3 * f + 2]).collect();
     let (whole, torn) = (build(&ball), MeshDistance::new(&vertices, &faces).unwrap());
     let mut random = Random(2);
     for _ in 0..2000 {
@@ -344,25 +322,11 @@ fn an_open_sheet_is_positive_on_the_side_of_its_normals_even_beyond_its_border()
 
 #[test]
 fn a_mesh_without_faces_is_nowhere() {
-    assert_eq!(
-        MeshDistance::new(&[], &[])
-            .unwrap()
-            .closest(Vec3::ZERO, 1.0),
-        None
-    );
-    assert_eq!(
-        MeshDistance::new(&[Vec3::ZERO], &[])
-            .unwrap()
-            .closest(Vec3::ZERO, 1.0),
-        None
-    );
+    assert_eq!(MeshDistance::new(&[], &[]).unwrap().closest(Vec3::ZERO, 1.0), None);
+    assert_eq!(MeshDistance::new(&[Vec3::ZERO], &[]).unwrap().closest(Vec3::ZERO, 1.0), None);
     assert_eq!(
         MeshDistance::new(&[Vec3::ZERO], &[[0, 1, 0]]).map(|_| ()),
-        Err(Error::FaceIndex {
-            face: 0,
-            vertex: 1,
-            vertices: 1
-        })
+        Err(Error::FaceIndex { face: 0, vertex: 1, vertices: 1 })
     );
 }
 

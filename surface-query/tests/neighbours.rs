@@ -1,4 +1,5 @@
 //! Neighbour lists against brute force, bit for bit.
+#![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
 
 mod body;
 
@@ -14,14 +15,7 @@ fn brute_force(points: &[Vec3], level: &[u32], q: Vec3, k: usize) -> Vec<u32> {
         .map(|&i| {
             let d = q - points[i as usize];
             let squared = d.x * d.x + d.y * d.y + d.z * d.z;
-            (
-                if q.is_finite() {
-                    squared
-                } else {
-                    f32::INFINITY
-                },
-                i,
-            )
+            (if q.is_finite() { squared } else { f32::INFINITY }, i)
         })
         .collect();
     all.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
@@ -40,12 +34,7 @@ fn check(query: &SurfaceQuery, k: usize, q: Vec3) -> Result<(), TestCaseError> {
 }
 
 fn config(k: usize, cell: f32, margin: f32) -> SurfaceQueryConfig {
-    SurfaceQueryConfig {
-        k,
-        cell,
-        margin,
-        ..SurfaceQueryConfig::BODY
-    }
+    SurfaceQueryConfig { k, cell, margin, ..SurfaceQueryConfig::BODY }
 }
 
 proptest! {
@@ -112,9 +101,7 @@ fn neighbours_of_degenerate_clouds_equal_brute_force_or_are_refused() {
                 Err(error) => panic!("{name}: {error}"),
             };
             let mut random = Random(1);
-            let scale = points
-                .iter()
-                .fold(0.0, |m: f32, p| m.max(p.abs().max_element()));
+            let scale = points.iter().fold(0.0, |m: f32, p| m.max(p.abs().max_element()));
             let mut queries: Vec<Vec3> = (0..50).map(|_| random.vec3(scale * 1.5)).collect();
             queries.extend(&points);
             queries.extend([Vec3::NAN, Vec3::INFINITY, Vec3::MAX, Vec3::MIN, Vec3::ZERO]);
@@ -189,10 +176,7 @@ fn a_level_of_fewer_than_k_points_repeats_its_list() {
 fn neighbour_sets_overlap_less_with_distance_and_more_with_scales() {
     let ball = mesh::icosphere(4);
     let overlap = |coarse_levels: usize, step: f32| {
-        let settings = SurfaceQueryConfig {
-            coarse_levels,
-            ..SurfaceQueryConfig::TREES
-        };
+        let settings = SurfaceQueryConfig { coarse_levels, ..SurfaceQueryConfig::TREES };
         let query = SurfaceQuery::new(&ball.vertices, &ball.faces, &settings).unwrap();
         let n = query.neighbours_per_query();
         let mut random = Random(11);
@@ -204,11 +188,8 @@ fn neighbour_sets_overlap_less_with_distance_and_more_with_scales() {
             query.neighbours(p, &mut a);
             query.neighbours(p + aside * step, &mut b);
             // Within a level, a vertex stands once.
-            shared += a
-                .chunks(5)
-                .zip(b.chunks(5))
-                .map(|(a, b)| a.iter().filter(|i| b.contains(i)).count())
-                .sum::<usize>();
+            shared +=
+                a.chunks(5).zip(b.chunks(5)).map(|(a, b)| a.iter().filter(|i| b.contains(i)).count()).sum::<usize>();
         }
         shared as f32 / (300 * n) as f32
     };
@@ -217,10 +198,7 @@ fn neighbour_sets_overlap_less_with_distance_and_more_with_scales() {
     let scaled = steps.map(|s| overlap(3, s));
     assert_eq!((fine[0], scaled[0]), (1.0, 1.0));
     for i in 1..steps.len() {
-        assert!(
-            fine[i] < fine[i - 1] && scaled[i] < scaled[i - 1],
-            "{fine:?} {scaled:?}"
-        );
+        assert!(fine[i] < fine[i - 1] && scaled[i] < scaled[i - 1], "{fine:?} {scaled:?}");
         assert!(scaled[i] > fine[i], "{fine:?} {scaled:?}");
     }
     // At a third of the way to the next but one vertex most of the coarse neighbours are still the same.
@@ -232,91 +210,32 @@ fn bad_meshes_and_settings_are_errors() {
     let ball = mesh::icosphere(1);
     let build = |settings| SurfaceQuery::new(&ball.vertices, &ball.faces, &settings).map(|_| ());
     for (name, settings) in [
-        (
-            "k",
-            SurfaceQueryConfig {
-                k: 0,
-                ..SurfaceQueryConfig::BODY
-            },
-        ),
-        (
-            "k",
-            SurfaceQueryConfig {
-                k: 65,
-                ..SurfaceQueryConfig::BODY
-            },
-        ),
-        (
-            "ratio",
-            SurfaceQueryConfig {
-                ratio: 0.0,
-                ..SurfaceQueryConfig::BODY
-            },
-        ),
-        (
-            "ratio",
-            SurfaceQueryConfig {
-                ratio: f32::NAN,
-                ..SurfaceQueryConfig::BODY
-            },
-        ),
-        (
-            "cell",
-            SurfaceQueryConfig {
-                cell: -1.0,
-                ..SurfaceQueryConfig::BODY
-            },
-        ),
-        (
-            "margin",
-            SurfaceQueryConfig {
-                margin: f32::INFINITY,
-                ..SurfaceQueryConfig::BODY
-            },
-        ),
-        (
-            "coarse_levels",
-            SurfaceQueryConfig {
-                coarse_levels: 33,
-                ..SurfaceQueryConfig::BODY
-            },
-        ),
+        ("k", SurfaceQueryConfig { k: 0, ..SurfaceQueryConfig::BODY }),
+        ("k", SurfaceQueryConfig { k: 65, ..SurfaceQueryConfig::BODY }),
+        ("ratio", SurfaceQueryConfig { ratio: 0.0, ..SurfaceQueryConfig::BODY }),
+        ("ratio", SurfaceQueryConfig { ratio: f32::NAN, ..SurfaceQueryConfig::BODY }),
+        ("cell", SurfaceQueryConfig { cell: -1.0, ..SurfaceQueryConfig::BODY }),
+        ("margin", SurfaceQueryConfig { margin: f32::INFINITY, ..SurfaceQueryConfig::BODY }),
+        ("coarse_levels", SurfaceQueryConfig { coarse_levels: 33, ..SurfaceQueryConfig::BODY }),
     ] {
         match build(settings) {
             Err(Error::Config { name: found, .. }) => assert_eq!(found, name),
             other => panic!("{name}: {other:?}"),
         }
     }
-    assert!(matches!(
-        build(config(5, 1e-6, 1.0)),
-        Err(Error::GridTooLarge { .. })
-    ));
+    assert!(matches!(build(config(5, 1e-6, 1.0)), Err(Error::GridTooLarge { .. })));
     let outside = SurfaceQuery::new(&ball.vertices, &[[0, 1, 42]], &SurfaceQueryConfig::TREES);
-    assert_eq!(
-        outside.map(|_| ()),
-        Err(Error::FaceIndex {
-            face: 0,
-            vertex: 42,
-            vertices: 42
-        })
-    );
+    assert_eq!(outside.map(|_| ()), Err(Error::FaceIndex { face: 0, vertex: 42, vertices: 42 }));
 }
 
 #[test]
 fn vertex_normals_weigh_faces_by_angle() {
     // All faces at a cube's corner span 90° together, however they are triangulated.
     let cube = mesh::cuboid(Vec3::ONE);
-    for (v, n) in cube
-        .vertices
-        .iter()
-        .zip(vertex_normals(&cube.vertices, &cube.faces))
-    {
+    for (v, n) in cube.vertices.iter().zip(vertex_normals(&cube.vertices, &cube.faces)) {
         assert!(n.distance(v.normalize_or_zero()) < 1e-6, "{v}: {n}");
     }
-    let lonely = vertex_normals(
-        &[Vec3::ZERO, Vec3::X, Vec3::X * 2.0],
-        &[[0, 1, 2], [0, 0, 0]],
-    );
+    let lonely = vertex_normals(&[Vec3::ZERO, Vec3::X, Vec3::X * 2.0], &[[0, 1, 2], [0, 0, 0]]);
     assert_eq!(lonely, [Vec3::Y; 3]);
 }
 
@@ -324,11 +243,7 @@ fn vertex_normals_weigh_faces_by_angle() {
 fn levels_of_a_body_have_the_sizes_of_the_paper() {
     let sizes = |n: usize| {
         let points: Vec<Vec3> = (0..n).map(|i| Vec3::X * i as f32).collect();
-        Pyramid::new(&points, 0.25, 3)
-            .levels
-            .iter()
-            .map(Vec::len)
-            .collect::<Vec<_>>()
+        Pyramid::new(&points, 0.25, 3).levels.iter().map(Vec::len).collect::<Vec<_>>()
     };
     assert_eq!(sizes(6890), [6890, 1722, 430, 107]);
     assert_eq!(sizes(3), [3, 1, 1, 1]);

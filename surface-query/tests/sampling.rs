@@ -52,20 +52,12 @@ fn sampling_degenerate_clouds_gives_distinct_indices_and_takes_bad_points_last()
         let finite = points.iter().filter(|p| p.is_finite()).count();
         let mut sorted = all.clone();
         sorted.sort_unstable();
-        assert_eq!(
-            sorted,
-            (0..points.len() as u32).collect::<Vec<_>>(),
-            "{name}"
-        );
+        assert_eq!(sorted, (0..points.len() as u32).collect::<Vec<_>>(), "{name}");
         for (position, &i) in all.iter().enumerate() {
             assert_eq!(points[i as usize].is_finite(), position < finite, "{name}");
         }
         if finite == points.len() {
-            assert_eq!(
-                all,
-                oracle::farthest_points(&points, points.len()),
-                "{name}"
-            );
+            assert_eq!(all, oracle::farthest_points(&points, points.len()), "{name}");
         }
     }
 }
@@ -74,10 +66,7 @@ fn sampling_degenerate_clouds_gives_distinct_indices_and_takes_bad_points_last()
 fn ratios_that_f32_rounds_down_give_the_decimal_size() {
     let points: Vec<Vec3> = (0..10).map(|i| Vec3::X * i as f32).collect();
     let size = |ratio| Pyramid::new(&points, ratio, 1).levels[1].len();
-    assert_eq!(
-        [0.7, 0.3, 0.1, 1.0, 0.0, 7.0, f32::NAN].map(size),
-        [7, 3, 1, 10, 1, 10, 10]
-    );
+    assert_eq!([0.7, 0.3, 0.1, 1.0, 0.0, 7.0, f32::NAN].map(size), [7, 3, 1, 10, 1, 10, 10]);
 }
 
 #[test]
@@ -87,10 +76,7 @@ fn sampling_the_open_body_equals_the_plain_algorithm() {
     };
     // The oracle is cubic, so every ninth vertex; mirror-symmetric ties are among them.
     let points: Vec<Vec3> = body.vertices.iter().copied().step_by(9).collect();
-    assert_eq!(
-        farthest_points(&points, 200),
-        oracle::farthest_points(&points, 200)
-    );
+    assert_eq!(farthest_points(&points, 200), oracle::farthest_points(&points, 200));
     let pyramid = Pyramid::new(&body.vertices, 0.25, 3);
     let sizes: Vec<usize> = pyramid.levels.iter().map(Vec::len).collect();
     assert_eq!(sizes, [6890, 1722, 430, 107]);

@@ -18,11 +18,7 @@ fn circling(angle: f32, middle: Vec3) -> View {
     let rotation = Mat3::from_cols(right, -Vec3::Y, forward).transpose();
     let (focal, centre) = (SIZE as f32 * 1.45, SIZE as f32 / 2.0);
     View {
-        intrinsics: Mat3::from_cols(
-            Vec3::X * focal,
-            Vec3::Y * focal,
-            Vec3::new(centre, centre, 1.0),
-        ),
+        intrinsics: Mat3::from_cols(Vec3::X * focal, Vec3::Y * focal, Vec3::new(centre, centre, 1.0)),
         extrinsics: Affine3A::from_mat3_translation(rotation, rotation * -eye),
         width: SIZE,
         height: SIZE,
@@ -30,14 +26,10 @@ fn circling(angle: f32, middle: Vec3) -> View {
 }
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
-    let path = std::env::args()
-        .nth(1)
-        .unwrap_or("visibility_map.png".into());
+    let path = std::env::args().nth(1).unwrap_or("visibility_map.png".into());
     let body = body::body_or_ball();
     let mesh = RayMesh::new(&body.vertices, &body.faces)?;
-    let (min, max) = (body.vertices.iter()).fold((Vec3::MAX, Vec3::MIN), |(min, max), v| {
-        (min.min(*v), max.max(*v))
-    });
+    let (min, max) = (body.vertices.iter()).fold((Vec3::MAX, Vec3::MIN), |(min, max), v| (min.min(*v), max.max(*v)));
     let middle = (min + max) / 2.0;
 
     let mut counts = VisibilityCounts::new(body.vertices.len());
@@ -46,18 +38,10 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let frames = 60;
     for frame in 0..frames {
         let view = circling((frame as f32 / frames as f32 - 0.5) * 2.1, middle);
-        counts.add_visible(&visible_vertices(
-            &mesh,
-            &body.vertices,
-            &view,
-            Some(&usable),
-        ));
+        counts.add_visible(&visible_vertices(&mesh, &body.vertices, &view, Some(&usable)));
     }
     let never = counts.counts().iter().filter(|c| **c == 0).count();
-    println!(
-        "{frames} frames, {never} of {} vertices never seen",
-        body.vertices.len()
-    );
+    println!("{frames} frames, {never} of {} vertices never seen", body.vertices.len());
 
     let mut picture = RgbImage::new(2 * SIZE, SIZE);
     for (side, angle) in [(0, 0.3f32), (1, 0.3 + std::f32::consts::PI)] {
@@ -74,15 +58,11 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
             let [a, b, c] = face.map(|i| body.vertices[i as usize]);
             let normal = (b - a).cross(c - a).normalize_or(Vec3::Y);
             let light = 0.35 + 0.65 * normal.dot(-direction.normalize_or(Vec3::Z)).abs();
-            let seen: f32 = (0..3)
-                .map(|i| hit.barycentric[i] * counts.counts()[face[i] as usize] as f32)
-                .sum();
+            let seen: f32 = (0..3).map(|i| hit.barycentric[i] * counts.counts()[face[i] as usize] as f32).sum();
             let share = seen / frames as f32;
             // Red: never. Yellow to green: always.
             let colour = Vec3::new(1.0 - share, (share * 4.0).min(1.0) * 0.85, 0.15) * light;
-            let colour = colour
-                .to_array()
-                .map(|c| (c.clamp(0.0, 1.0).sqrt() * 255.0) as u8);
+            let colour = colour.to_array().map(|c| (c.clamp(0.0, 1.0).sqrt() * 255.0) as u8);
             picture.put_pixel(column + side * SIZE, row, Rgb(colour));
         }
     }

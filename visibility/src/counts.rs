@@ -61,10 +61,7 @@ impl VisibilityCounts {
     /// # Panics
     /// Unless 0 ≤ `keep` ≤ 1.
     pub fn decay(&mut self, keep: f64) {
-        assert!(
-            (0.0..=1.0).contains(&keep),
-            "decay: keep = {keep}, expected 0 to 1"
-        );
+        assert!((0.0..=1.0).contains(&keep), "decay: keep = {keep}, expected 0 to 1");
         if keep < 1.0 {
             for count in &mut self.counts {
                 // Truncates; the product is never above the count, which f64 may have rounded up.
@@ -80,13 +77,7 @@ impl VisibilityCounts {
     /// If the lengths differ or a vertex does not exist.
     #[inline]
     pub fn attention(&self, neighbours: &[u32], out: &mut [f32]) {
-        assert_eq!(
-            neighbours.len(),
-            out.len(),
-            "attention: {} neighbours, {} outputs",
-            neighbours.len(),
-            out.len()
-        );
+        assert_eq!(neighbours.len(), out.len(), "attention: {} neighbours, {} outputs", neighbours.len(), out.len());
         let weight = |v: u32| u128::from(self.counts[v as usize]) + 1;
         let sum: u128 = neighbours.iter().map(|&v| weight(v)).sum();
         let inverse = 1.0 / sum as f64;
@@ -105,8 +96,6 @@ impl VisibilityCounts {
     #[must_use]
     pub fn frequencies(&self) -> Vec<f32> {
         let total = self.total().max(1) as f64;
-        (self.counts.iter())
-            .map(|&c| (c as f64 / total) as f32)
-            .collect()
+        (self.counts.iter()).map(|&c| (c as f64 / total) as f32).collect()
     }
 }

@@ -46,13 +46,8 @@ impl RayMesh {
         check_mesh(vertices, faces)?;
         let scale = power_of_two_scale(vertices);
         let scaled: Vec<Vec3> = vertices.iter().map(|v| *v * scale).collect();
-        let mut mesh = Self {
-            faces: faces.to_vec(),
-            tree: Tree::new(&scaled, faces),
-            vertices: scaled,
-            scale,
-            packs: Vec::new(),
-        };
+        let mut mesh =
+            Self { faces: faces.to_vec(), tree: Tree::new(&scaled, faces), vertices: scaled, scale, packs: Vec::new() };
         mesh.update();
         Ok(mesh)
     }
@@ -80,13 +75,7 @@ impl RayMesh {
     }
 
     fn update(&mut self) {
-        let Self {
-            faces,
-            vertices,
-            tree,
-            packs,
-            ..
-        } = self;
+        let Self { faces, vertices, tree, packs, .. } = self;
         let corners = |face: u32| faces[face as usize].map(|v| vertices[v as usize]);
         packs.clear();
         packs.extend(tree.leaves.iter().map(|leaf| Pack::new(leaf.map(corners))));
@@ -216,20 +205,27 @@ impl RayMesh {
             let n = &self.tree.nodes[node as usize];
             let t = n.entry(ray.origin, ray.inverse, end);
             let near = usize::from(t[1] < t[0]);
+            let far = 1 - near;
             let mut next = None;
-            for side in [near, 1 - near] {
-                // A box may begin exactly where a face is hit, so only a later one is out.
-                if t[side] > end || t[side] == f32::INFINITY {
-                    break;
+            // A box may begin exactly where a face is hit, so only a later one is out.
+            if t[near] <= end && t[near] < f32::INFINITY {
+                match n.child(near) {
+                    Child::Leaf(leaf) => match visit(leaf as usize) {
+                        Some(new) => end = new,
+                        None => return,
+                    },
+                    Child::Node(child) => next = Some(child),
                 }
-                match n.child(side) {
+            }
+            if t[far] <= end && t[far] < f32::INFINITY {
+                match n.child(far) {
                     Child::Leaf(leaf) => match visit(leaf as usize) {
                         Some(new) => end = new,
                         None => return,
                     },
                     Child::Node(child) if next.is_none() => next = Some(child),
                     Child::Node(child) => {
-                        stack[height] = (t[side], child);
+                        stack[height] = (t[far], child);
                         height += 1;
                     }
                 }
@@ -252,12 +248,7 @@ impl RayMesh {
 
 /// The power of two that brings the largest finite coordinate to about 1.
 fn power_of_two_scale(vertices: &[Vec3]) -> f32 {
-    inverse_power_of_two(
-        vertices
-            .iter()
-            .filter(|v| v.is_finite())
-            .fold(0.0, |m: f32, v| m.max(v.abs().max_element())),
-    )
+    inverse_power_of_two(vertices.iter().filter(|v| v.is_finite()).fold(0.0, |m: f32, v| m.max(v.abs().max_element())))
 }
 
 /// 2^−n for a `length` in [2^n, 2^(n+1)), within the exponents whose inverse is normal; 1 for 0.

@@ -34,11 +34,7 @@ impl Node {
     #[inline(always)]
     pub fn child(&self, side: usize) -> Child {
         let child = self.children[side];
-        if child & LEAF == 0 {
-            Child::Node(child)
-        } else {
-            Child::Leaf(child & !LEAF)
-        }
+        if child & LEAF == 0 { Child::Node(child) } else { Child::Leaf(child & !LEAF) }
     }
 
     /// Where along the ray each child's box begins, not before its origin; infinity where it is missed or lies
@@ -56,16 +52,8 @@ impl Node {
         }
         let leave = leave * (1.0 + 1e-6);
         [
-            if enter.x <= leave.x {
-                enter.x
-            } else {
-                f32::INFINITY
-            },
-            if enter.y <= leave.y {
-                enter.y
-            } else {
-                f32::INFINITY
-            },
+            if enter.x <= leave.x { enter.x } else { f32::INFINITY },
+            if enter.y <= leave.y { enter.y } else { f32::INFINITY },
         ]
     }
 }
@@ -92,18 +80,11 @@ impl Tree {
                 Aabb::new(a.min(b).min(c), a.max(b).max(c))
             })
             .collect();
-        let mut tree = Self {
-            nodes: Vec::new(),
-            leaves: Vec::new(),
-            depth: 0,
-        };
+        let mut tree = Self { nodes: Vec::new(), leaves: Vec::new(), depth: 0 };
         if boxes.is_empty() {
             return tree;
         }
-        let parameters = BvhBuildParams {
-            max_prims_per_leaf: LANES as u32,
-            ..BvhBuildParams::medium_build()
-        };
+        let parameters = BvhBuildParams { max_prims_per_leaf: LANES as u32, ..BvhBuildParams::medium_build() };
         let bvh = build_bvh2(&boxes, parameters, &mut Duration::default());
         tree.flatten(&bvh);
         tree
@@ -111,10 +92,7 @@ impl Tree {
 
     fn flatten(&mut self, bvh: &Bvh2) {
         let root = &bvh.nodes[0];
-        let blank = Node {
-            axes: [Vec4::ZERO; 3],
-            children: [0; 2],
-        };
+        let blank = Node { axes: [Vec4::ZERO; 3], children: [0; 2] };
         self.nodes.push(blank);
         if root.is_leaf() {
             let leaf = self.leaf(bvh, 0);
@@ -160,8 +138,7 @@ impl Tree {
                 Child::Leaf(leaf) => leaf_box(&self.leaves[leaf as usize]).unwrap_or(NOTHING),
                 Child::Node(child) => self.nodes[child as usize].bounds(),
             });
-            self.nodes[n].axes =
-                [0, 1, 2].map(|a| Vec4::new(left[0][a], right[0][a], left[1][a], right[1][a]));
+            self.nodes[n].axes = [0, 1, 2].map(|a| Vec4::new(left[0][a], right[0][a], left[1][a], right[1][a]));
         }
     }
 }
@@ -169,9 +146,6 @@ impl Tree {
 impl Node {
     fn bounds(&self) -> [Vec3; 2] {
         let [x, y, z] = self.axes;
-        [
-            Vec3::new(x.x.min(x.y), y.x.min(y.y), z.x.min(z.y)),
-            Vec3::new(x.z.max(x.w), y.z.max(y.w), z.z.max(z.w)),
-        ]
+        [Vec3::new(x.x.min(x.y), y.x.min(y.y), z.x.min(z.y)), Vec3::new(x.z.max(x.w), y.z.max(y.w), z.z.max(z.w))]
     }
 }

@@ -26,11 +26,7 @@ impl Ray {
         let (x, y) = ((z + 1) % 3, (z + 2) % 3);
         // A finite stand-in for 1/0: no 0 · ∞ where the origin lies on the side of a box.
         let inverse = direction.to_array().map(|d| {
-            let d = if d.abs() < 1e-30 {
-                1e-30f32.copysign(d)
-            } else {
-                d
-            };
+            let d = if d.abs() < 1e-30 { 1e-30f32.copysign(d) } else { d };
             Vec4::splat(1.0 / d)
         });
         Self {
@@ -62,9 +58,7 @@ impl Pack {
         }
         Self {
             corners: [0, 1, 2].map(|corner| {
-                [0, 1, 2].map(|axis| {
-                    Vec4::from([0, 1, 2, 3].map(|lane: usize| triangles[lane][corner][axis]))
-                })
+                [0, 1, 2].map(|axis| Vec4::from([0, 1, 2, 3].map(|lane: usize| triangles[lane][corner][axis])))
             }),
         }
     }
@@ -100,10 +94,7 @@ impl Pack {
         let barycentric = [u, v, w].map(|x| x * inverse);
         let t = barycentric[0] * a[2] + barycentric[1] * b[2] + barycentric[2] * c[2];
         let hit = (positive | negative) & determinant.cmpne(zero) & t.cmpge(zero);
-        Hits {
-            t: Vec4::select(hit, t, Vec4::INFINITY),
-            barycentric,
-        }
+        Hits { t: Vec4::select(hit, t, Vec4::INFINITY), barycentric }
     }
 }
 

@@ -43,8 +43,7 @@ impl View {
         let projected = self.intrinsics * p;
         let (u, v) = (projected.x / projected.z, projected.y / projected.z);
         // False for NaN.
-        let inside =
-            p.z > 0.0 && u >= 0.0 && v >= 0.0 && u < self.width as f32 && v < self.height as f32;
+        let inside = p.z > 0.0 && u >= 0.0 && v >= 0.0 && u < self.width as f32 && v < self.height as f32;
         inside.then(|| v as usize * self.width as usize + u as usize)
     }
 }
@@ -60,12 +59,7 @@ impl View {
 /// # Panics
 /// If `usable` has not `width · height` entries.
 #[must_use]
-pub fn visible_vertices(
-    mesh: &RayMesh,
-    vertices: &[Vec3],
-    view: &View,
-    usable: Option<&[bool]>,
-) -> Vec<bool> {
+pub fn visible_vertices(mesh: &RayMesh, vertices: &[Vec3], view: &View, usable: Option<&[bool]>) -> Vec<bool> {
     let pixels = view.width as usize * view.height as usize;
     if let Some(usable) = usable {
         assert_eq!(

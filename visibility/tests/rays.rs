@@ -1,4 +1,5 @@
 //! Ray casts against brute force in `f64`.
+#![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
 
 mod body;
 
@@ -16,10 +17,7 @@ fn build(mesh: &TriMesh) -> RayMesh {
 /// graze an edge, and rounding decides.
 fn is_clear(mesh: &TriMesh, o: Vec3, d: Vec3) -> Option<Option<(u32, f64)>> {
     let answer = oracle::first_hit(&mesh.vertices, &mesh.faces, o, d);
-    let size = mesh
-        .vertices
-        .iter()
-        .fold(0.0, |m: f32, v| m.max(v.abs().max_element()));
+    let size = mesh.vertices.iter().fold(0.0, |m: f32, v| m.max(v.abs().max_element()));
     for axis in [Vec3::X, Vec3::Y, Vec3::Z] {
         for sign in [-1.0, 1.0] {
             let moved = o + axis * (sign * 4e-6 * size.max(o.abs().max_element()));
@@ -52,11 +50,7 @@ fn check(mesh: &TriMesh, rays: &RayMesh, o: Vec3, d: Vec3) -> Result<(), TestCas
         prop_assert_eq!(found.map(|h| h.face), expected.map(|e| e.0), "{} {}", o, d);
         if let (Some(found), Some((_, t))) = (found, expected) {
             let error = (f64::from(found.t) - t).abs() * f64::from(d.length());
-            prop_assert!(
-                error < 2e-5 * f64::from(o.length().max(1.0)),
-                "{o} {d}: {} or {t}",
-                found.t
-            );
+            prop_assert!(error < 2e-5 * f64::from(o.length().max(1.0)), "{o} {d}: {} or {t}", found.t);
         }
     }
     Ok(())
@@ -159,11 +153,7 @@ proptest! {
 #[test]
 fn both_sides_and_the_surface_itself_are_hit() {
     let sheet = build(&mesh::open_grid(2));
-    let from = |z: f32, dz: f32| {
-        sheet
-            .first_hit(Vec3::new(0.3, 0.1, z), Vec3::Z * dz)
-            .map(|h| h.t)
-    };
+    let from = |z: f32, dz: f32| sheet.first_hit(Vec3::new(0.3, 0.1, z), Vec3::Z * dz).map(|h| h.t);
     assert_eq!(from(2.0, -1.0), Some(2.0));
     assert_eq!(from(-2.0, 4.0), Some(0.5));
     assert_eq!(from(2.0, 1.0), None);
@@ -215,10 +205,7 @@ fn degenerate_meshes_are_answered_or_refused() {
         let soup = TriMesh { vertices, faces };
         match RayMesh::new(&soup.vertices, &soup.faces) {
             Ok(built) => {
-                let size = soup
-                    .vertices
-                    .iter()
-                    .fold(0.0, |m: f32, p| m.max(p.abs().max_element()));
+                let size = soup.vertices.iter().fold(0.0, |m: f32, p| m.max(p.abs().max_element()));
                 let mut random = Random(5);
                 for _ in 0..40 {
                     let (o, target) = (random.vec3(size * 2.0), random.vec3(size));
@@ -227,10 +214,7 @@ fn degenerate_meshes_are_answered_or_refused() {
                         let found = found.unwrap_or_else(|| panic!("{name}: {o} {target} missed"));
                         // Denormal coordinates have few digits.
                         let tolerance = if name == "denormal" { 0.1 } else { 1e-3 };
-                        assert!(
-                            (f64::from(found.t) - t).abs() < tolerance,
-                            "{name}: {found:?} {t}"
-                        );
+                        assert!((f64::from(found.t) - t).abs() < tolerance, "{name}: {found:?} {t}");
                     }
                 }
             }
@@ -242,11 +226,7 @@ fn degenerate_meshes_are_answered_or_refused() {
     }
     assert_eq!(
         RayMesh::new(&[Vec3::ZERO], &[[0, 0, 1]]).map(|_| ()),
-        Err(Error::FaceIndex {
-            face: 0,
-            vertex: 1,
-            vertices: 1
-        })
+        Err(Error::FaceIndex { face: 0, vertex: 1, vertices: 1 })
     );
 }
 

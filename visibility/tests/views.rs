@@ -1,4 +1,5 @@
 //! Visible vertices against brute force.
+#![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
 
 mod body;
 
@@ -15,11 +16,7 @@ fn look(eye: Vec3, target: Vec3, focal: f32, size: u32) -> View {
     let rotation = Mat3::from_cols(right, down, forward).transpose();
     let centre = size as f32 / 2.0;
     View {
-        intrinsics: Mat3::from_cols(
-            Vec3::X * focal,
-            Vec3::Y * focal,
-            Vec3::new(centre, centre, 1.0),
-        ),
+        intrinsics: Mat3::from_cols(Vec3::X * focal, Vec3::Y * focal, Vec3::new(centre, centre, 1.0)),
         extrinsics: Affine3A::from_mat3_translation(rotation, rotation * -eye),
         width: size,
         height: size,
@@ -35,18 +32,13 @@ fn visible(mesh: &TriMesh, view: &View) -> Vec<bool> {
 fn plain(mesh: &TriMesh, view: &View, vertex: usize) -> Option<bool> {
     let v = mesh.vertices[vertex];
     let eye = view.centre().unwrap();
-    let others: Vec<[u32; 3]> = (mesh.faces.iter().copied())
-        .filter(|f| !f.contains(&(vertex as u32)))
-        .collect();
-    let blocked = |o: Vec3, share: f64| {
-        oracle::first_hit(&mesh.vertices, &others, o, v - o).is_some_and(|(_, t)| t < share)
-    };
+    let others: Vec<[u32; 3]> = (mesh.faces.iter().copied()).filter(|f| !f.contains(&(vertex as u32))).collect();
+    let blocked =
+        |o: Vec3, share: f64| oracle::first_hit(&mesh.vertices, &others, o, v - o).is_some_and(|(_, t)| t < share);
     let answer = blocked(eye, 1.0 - 1e-5);
-    let clear = [Vec3::X, Vec3::Y, Vec3::Z].iter().all(|axis| {
-        [-3e-6, 3e-6]
-            .iter()
-            .all(|s| blocked(eye + *axis * *s, 1.0 - 1e-5 + f64::from(*s)) == answer)
-    });
+    let clear = [Vec3::X, Vec3::Y, Vec3::Z]
+        .iter()
+        .all(|axis| [-3e-6, 3e-6].iter().all(|s| blocked(eye + *axis * *s, 1.0 - 1e-5 + f64::from(*s)) == answer));
     clear.then_some(!answer)
 }
 
@@ -94,27 +86,16 @@ proptest! {
 
 #[test]
 fn outside_the_image_behind_the_camera_and_behind_occluders_nothing_is_visible() {
-    let points = [
-        Vec3::ZERO,
-        Vec3::new(0.6, 0.0, 0.0),
-        Vec3::new(0.0, -0.6, 0.0),
-        Vec3::new(0.0, 0.0, -9.0),
-        Vec3::NAN,
-    ];
+    let points =
+        [Vec3::ZERO, Vec3::new(0.6, 0.0, 0.0), Vec3::new(0.0, -0.6, 0.0), Vec3::new(0.0, 0.0, -9.0), Vec3::NAN];
     let rays = RayMesh::new(&[], &[]).unwrap();
     // One unit is 20 pixels, the image 20 wide.
     let mut view = look(-Vec3::Z, Vec3::ZERO, 20.0, 20);
-    assert_eq!(
-        visible_vertices(&rays, &points, &view, None),
-        [true, false, false, false, false]
-    );
+    assert_eq!(visible_vertices(&rays, &points, &view, None), [true, false, false, false, false]);
     assert_eq!(view.pixel(Vec3::ZERO), Some(10 * 20 + 10));
     let mut usable = vec![true; 400];
     usable[210] = false;
-    assert_eq!(
-        visible_vertices(&rays, &points[..1], &view, Some(&usable)),
-        [false]
-    );
+    assert_eq!(visible_vertices(&rays, &points[..1], &view, Some(&usable)), [false]);
     view.extrinsics = Affine3A::from_scale(Vec3::ZERO);
     assert_eq!(view.centre(), None);
     assert_eq!(visible_vertices(&rays, &points, &view, None), [false; 5]);
@@ -123,12 +104,7 @@ fn outside_the_image_behind_the_camera_and_behind_occluders_nothing_is_visible()
 #[test]
 fn image_borders_are_half_open() {
     let rays = RayMesh::new(&[], &[]).unwrap();
-    let view = View {
-        intrinsics: Mat3::IDENTITY,
-        extrinsics: Affine3A::IDENTITY,
-        width: 2,
-        height: 3,
-    };
+    let view = View { intrinsics: Mat3::IDENTITY, extrinsics: Affine3A::IDENTITY, width: 2, height: 3 };
     let at = |u: f32, v: f32| visible_vertices(&rays, &[Vec3::new(u, v, 1.0)], &view, None)[0];
     assert!(at(0.0, 0.0) && at(1.99, 2.99));
     assert!(!at(2.0, 0.0) && !at(0.0, 3.0) && !at(-0.01, 0.0) && !at(0.0, -0.01));
@@ -141,11 +117,7 @@ fn the_answer_does_not_depend_on_the_unit_of_length() {
     let metres = visible(&ball, &look(eye, Vec3::ZERO, 200.0, 400));
     for unit in [1e-9, 100.0, 1e9] {
         let scaled = ball.clone().map(|p| p * unit);
-        assert_eq!(
-            visible(&scaled, &look(eye * unit, Vec3::ZERO, 200.0, 400)),
-            metres,
-            "{unit}"
-        );
+        assert_eq!(visible(&scaled, &look(eye * unit, Vec3::ZERO, 200.0, 400)), metres, "{unit}");
     }
 }
 
@@ -162,12 +134,7 @@ fn about_half_of_the_open_body_is_visible_from_the_front() {
     let Some(body) = body::open_body() else {
         return;
     };
-    let view = look(
-        Vec3::new(0.0, -0.2, 4.0),
-        Vec3::new(0.0, -0.2, 0.0),
-        900.0,
-        1000,
-    );
+    let view = look(Vec3::new(0.0, -0.2, 4.0), Vec3::new(0.0, -0.2, 0.0), 900.0, 1000);
     let found = visible(&body, &view);
     let share = found.iter().filter(|v| **v).count() as f32 / found.len() as f32;
     assert!((0.35..0.6).contains(&share), "{share}");

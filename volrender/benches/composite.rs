@@ -1,1 +1,182 @@
-fn main() {}
+//! Compositing 6144 rays (six patches of 32×32) of 128 samples, forward and backward, on two threads, against a plain
+//! implementation. items/s are samples.
+
+use divan::counter::ItemsCount;
+use divan::{Bencher, black_box};
+use glam::Vec3;
+use rayon::prelude::*;
+use volrender::{composite, composite_backward};
+
+const RAYS: usize = 6 * 32 * 32;
+const SAMPLES: usize = 128;
+const TOTAL: usize = RAYS * SAMPLES;
+
+fn main() {
+    // The targets are for two threads.
+    let _ = rayon::ThreadPoolBuilder::new().num_threads(2).build_global();
+    divan::main();
+}
+
+/// Empty space, then a soft surface, then a solid inside.
+struct Rays {
+    sigma: Vec<f32>,
+    likelihood: Vec<f32>,
+    delta: Vec<f32>,
+    t: Vec<f32>,
+    rgb: Vec<Vec3>,
+}
+
+impl Rays {
+    fn new() -> Self {
+        let mut state = 1u64;
+        let mut random = || {
+            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            (state >> 40) as f32 / (1u32 << 24) as f32
+        };
+        let place = |i: usize| (i % SAMPLES) as f32 / SAMPLES as f32;
+        Self {
+            sigma: (0..TOTAL).map(|i| 100.0 * (place(i) - 0.3).max(0.0) * random()).collect(),
+            likelihood: (0..TOTAL).map(|_| 1.0 - 0.2 * random()).collect(),
+            delta: vec![1.0 / SAMPLES as f32; TOTAL],
+            t: (0..TOTAL).map(|i| 2.0 + place(i)).collect(),
+            rgb: (0..TOTAL).map(|_| Vec3::new(random(), random(), random())).collect(),
+        }
+    }
+}
+
+struct Outputs {
+    weights: Vec<f32>,
+    d_sigma: Vec<f32>,
+    d_rgb: Vec<Vec3>,
+    d_likelihood: Vec<f32>,
+}
+
+impl Outputs {
+    fn new() -> Self {
+        Self {
+            weights: vec![0.0; TOTAL],
+            d_sigma: vec![0.0; TOTAL],
+            d_rgb: vec![Vec3::ZERO; TOTAL],
+            d_likelihood: vec![0.0; TOTAL],
+        }
+    }
+}
+
+type Run<'a> =
+    dyn Fn(&[f32], &[f32], &[f32], &[f32], &[Vec3], &mut [f32], &mut [f32], &mut [Vec3], &mut [f32]) + Sync + 'a;
+
+/// One ray's inputs and outputs at a time, on the pool.
+fn each_ray(rays: &Rays, out: &mut Outputs, run: &Run<'_>) {
+    let Outputs { weights, d_sigma, d_rgb, d_likelihood } = out;
+    weights
+        .par_chunks_mut(SAMPLES)
+        .zip(d_sigma.par_chunks_mut(SAMPLES))
+        .zip(d_rgb.par_chunks_mut(SAMPLES))
+        .zip(d_likelihood.par_chunks_mut(SAMPLES))
+        .enumerate()
+        .with_min_len(64)
+        .for_each(|(i, (((weights, d_sigma), d_rgb), d_likelihood))| {
+            let ray = i * SAMPLES..(i + 1) * SAMPLES;
+            run(
+                &rays.sigma[ray.clone()],
+                &rays.likelihood[ray.clone()],
+                &rays.delta[ray.clone()],
+                &rays.t[ray.clone()],
+                &rays.rgb[ray],
+                weights,
+                d_sigma,
+                d_rgb,
+                d_likelihood,
+            );
+        });
+}
+
+#[divan::bench]
+fn forward(bencher: Bencher<'_, '_>) {
+    let (rays, mut out) = (Rays::new(), Outputs::new());
+    bencher.counter(ItemsCount::new(TOTAL)).bench_local(|| {
+        each_ray(&rays, &mut out, &|sigma, likelihood, delta, t, rgb, weights, _, _, _| {
+            black_box(composite(sigma, likelihood, delta, t, rgb, Vec3::ONE, weights));
+        });
+    });
+}
+
+#[divan::bench]
+fn forward_and_backward(bencher: Bencher<'_, '_>) {
+    let (rays, mut out) = (Rays::new(), Outputs::new());
+    bencher.counter(ItemsCount::new(TOTAL)).bench_local(|| {
+        each_ray(&rays, &mut out, &|sigma, likelihood, delta, t, rgb, weights, d_sigma, d_rgb, d_likelihood| {
+            let pixel = composite(sigma, likelihood, delta, t, rgb, Vec3::ONE, weights);
+            let d_color = 2.0 * (pixel.color - 0.5);
+            composite_backward(
+                sigma,
+                likelihood,
+                delta,
+                rgb,
+                Vec3::ONE,
+                weights,
+                d_color,
+                0.1,
+                d_sigma,
+                d_rgb,
+                d_likelihood,
+            );
+        });
+    });
+}
+
+/// The same from the definition: libm's exp, and a suffix sum divided by 1 − α.
+#[divan::bench]
+fn forward_and_backward_plain(bencher: Bencher<'_, '_>) {
+    let (rays, mut out) = (Rays::new(), Outputs::new());
+    bencher.counter(ItemsCount::new(TOTAL)).bench_local(|| {
+        each_ray(&rays, &mut out, &|sigma, likelihood, delta, _, rgb, weights, d_sigma, d_rgb, d_likelihood| {
+            let (mut color, mut transmittance) = (Vec3::ZERO, 1.0);
+            for i in 0..SAMPLES {
+                let alpha = likelihood[i] * (1.0 - (-sigma[i] * delta[i]).exp());
+                weights[i] = transmittance * alpha;
+                color += weights[i] * rgb[i];
+                transmittance *= 1.0 - alpha;
+            }
+            let d_color = 2.0 * (color + transmittance * Vec3::ONE - 0.5);
+            let mut behind = transmittance * d_color.element_sum();
+            for i in (0..SAMPLES).rev() {
+                let passed = (-sigma[i] * delta[i]).exp();
+                let alpha = likelihood[i] * (1.0 - passed);
+                transmittance /= 1.0 - alpha + 1e-10;
+                let value = rgb[i].dot(d_color) + 0.1;
+                let d_alpha = transmittance * value - behind / (1.0 - alpha + 1e-10);
+                behind += weights[i] * value;
+                d_sigma[i] = d_alpha * likelihood[i] * delta[i] * passed;
+                d_likelihood[i] = d_alpha * (1.0 - passed);
+                d_rgb[i] = weights[i] * d_color;
+            }
+        });
+    });
+}
+
+/// One ray again and again on one thread: the arithmetic without the memory.
+#[divan::bench]
+fn forward_and_backward_in_cache(bencher: Bencher<'_, '_>) {
+    let (rays, mut out) = (Rays::new(), Outputs::new());
+    let ray = 0..SAMPLES;
+    bencher.counter(ItemsCount::new(SAMPLES)).bench_local(|| {
+        let (sigma, likelihood) = (black_box(&rays.sigma[ray.clone()]), &rays.likelihood[ray.clone()]);
+        let (delta, t, rgb) = (&rays.delta[ray.clone()], &rays.t[ray.clone()], &rays.rgb[ray.clone()]);
+        let weights = &mut out.weights[ray.clone()];
+        let pixel = composite(sigma, likelihood, delta, t, rgb, Vec3::ONE, weights);
+        composite_backward(
+            sigma,
+            likelihood,
+            delta,
+            rgb,
+            Vec3::ONE,
+            weights,
+            pixel.color,
+            0.1,
+            &mut out.d_sigma[ray.clone()],
+            &mut out.d_rgb[ray.clone()],
+            &mut out.d_likelihood[ray.clone()],
+        );
+    });
+}

@@ -50,12 +50,7 @@ impl Camera {
     /// Skewed or otherwise unusual intrinsics, extrinsics that are not finite or not invertible, no pixels. A
     /// rotation that is not quite orthonormal, or scaled, is accepted: rays stay exact and of unit length, the
     /// depth of [`Camera::project`] is then in the camera's unit.
-    pub fn new(
-        intrinsics: Mat3,
-        world_to_camera: Affine3A,
-        width: u32,
-        height: u32,
-    ) -> Result<Self, Error> {
+    pub fn new(intrinsics: Mat3, world_to_camera: Affine3A, width: u32, height: u32) -> Result<Self, Error> {
         let k = intrinsics;
         let focal = Vec2::new(k.x_axis.x, k.y_axis.y);
         let usual = k.is_finite()
@@ -69,36 +64,19 @@ impl Camera {
             return Err(Error::Intrinsics(k));
         }
         let inverse = world_to_camera.inverse();
-        if !world_to_camera.is_finite()
-            || world_to_camera.matrix3.determinant() == 0.0
-            || !inverse.is_finite()
-        {
+        if !world_to_camera.is_finite() || world_to_camera.matrix3.determinant() == 0.0 || !inverse.is_finite() {
             return Err(Error::Extrinsics(world_to_camera));
         }
         if width == 0 || height == 0 {
-            return Err(Error::ImageSize {
-                width: width as usize,
-                height: height as usize,
-                least: 1,
-            });
+            return Err(Error::ImageSize { width: width as usize, height: height as usize, least: 1 });
         }
-        Ok(Self {
-            focal,
-            centre: Vec2::new(k.z_axis.x, k.z_axis.y),
-            world_to_camera,
-            width,
-            height,
-        })
+        Ok(Self { focal, centre: Vec2::new(k.z_axis.x, k.z_axis.y), world_to_camera, width, height })
     }
 
     /// The calibration matrix.
     #[must_use]
     pub fn intrinsics(&self) -> Mat3 {
-        Mat3::from_cols(
-            Vec3::new(self.focal.x, 0.0, 0.0),
-            Vec3::new(0.0, self.focal.y, 0.0),
-            self.centre.extend(1.0),
-        )
+        Mat3::from_cols(Vec3::new(self.focal.x, 0.0, 0.0), Vec3::new(0.0, self.focal.y, 0.0), self.centre.extend(1.0))
     }
 
     /// Where the camera stands, in the world.
@@ -114,10 +92,7 @@ impl Camera {
         let camera_to_world = self.world_to_camera.inverse();
         let p = (Vec2::new(u, v) - self.centre) / self.focal;
         let direction: Vec3 = camera_to_world.transform_vector3(p.extend(1.0));
-        Ray {
-            origin: camera_to_world.translation.into(),
-            direction: direction.normalize_or_zero(),
-        }
+        Ray { origin: camera_to_world.translation.into(), direction: direction.normalize_or_zero() }
     }
 
     /// Image position and depth (u, v, z) of a point of the world, whether inside the image or not. `None` where
@@ -137,17 +112,8 @@ impl Camera {
     #[must_use]
     pub fn resized(&self, width: u32, height: u32) -> Self {
         let (width, height) = (width.max(1), height.max(1));
-        let scale = Vec2::new(
-            width as f32 / self.width as f32,
-            height as f32 / self.height as f32,
-        );
-        Self {
-            focal: self.focal * scale,
-            centre: self.centre * scale,
-            width,
-            height,
-            ..*self
-        }
+        let scale = Vec2::new(width as f32 / self.width as f32, height as f32 / self.height as f32);
+        Self { focal: self.focal * scale, centre: self.centre * scale, width, height, ..*self }
     }
 
     /// Where a lens with `distortion` puts what a perfect lens puts at `pixel`: read a distorted photograph here

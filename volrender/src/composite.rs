@@ -1,9 +1,13 @@
-use glam::Vec3;
+use crate::simd::Kernel;
+use glam::{Vec3, Vec4};
 
 use crate::exponential::one_minus_exp;
 
 /// Samples whose exponentials are computed together in SIMD lanes.
 pub(crate) const BLOCK: usize = 32;
+
+/// Alphas compared together.
+const LANES: usize = 8;
 
 /// One composited ray.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -48,10 +52,10 @@ pub fn composite(
         rgb.len(),
         weights.len()
     );
-    pulp::Arch::new().dispatch(
+    pulp::Arch::new().dispatch(Kernel(
         #[inline(always)]
         || forward(sigma, likelihood, delta, t, rgb, background, weights),
-    )
+    ))
 }
 
 #[inline(always)]
@@ -64,50 +68,59 @@ fn forward(
     background: Vec3,
     weights: &mut [f32],
 ) -> Composite {
-    let n = sigma.len();
     let mut transmittance = 1.0;
-    let mut color = Vec3::ZERO;
-    let mut depth = 0.0;
+    let mut sum = Vec4::ZERO; // colour and depth
     let mut opacity = 0.0;
     let mut largest = 0.0;
     let mut termination = None;
     let mut alpha = [0.0f32; BLOCK];
-    for start in (0..n).step_by(BLOCK) {
-        let block = start..n.min(start + BLOCK);
-        let m = block.len();
-        let (sigma, delta) = (&sigma[block.clone()], &delta[block.clone()]);
-        let (likelihood, t) = (&likelihood[block.clone()], &t[block.clone()]);
-        let (rgb, weights) = (&rgb[block.clone()], &mut weights[block]);
-        for i in 0..m {
-            alpha[i] = likelihood[i] * one_minus_exp(sigma[i] * delta[i]).0;
+    let inputs = sigma.chunks(BLOCK).zip(likelihood.chunks(BLOCK));
+    let inputs = inputs.zip(delta.chunks(BLOCK)).zip(t.chunks(BLOCK));
+    let blocks = inputs.zip(rgb.chunks(BLOCK)).zip(weights.chunks_mut(BLOCK));
+    for (block, (((((sigma, likelihood), delta), t), rgb), weights)) in blocks.enumerate() {
+        let alpha = &mut alpha[..sigma.len()];
+        let inputs = sigma.iter().zip(likelihood).zip(delta);
+        for (alpha, ((&sigma, &likelihood), &delta)) in alpha.iter_mut().zip(inputs) {
+            *alpha = likelihood * one_minus_exp(sigma * delta).0;
         }
-        for i in 0..m {
-            let alpha = alpha[i];
-            if alpha > largest {
-                largest = alpha;
-                termination = Some((start + i) as u32);
-            }
-            let w = transmittance * alpha;
-            transmittance = next_transmittance(transmittance, alpha);
-            weights[i] = w;
-            color += w * rgb[i];
-            depth += w * t[i];
-            opacity += w;
+        if let Some(i) = first_largest(alpha, &mut largest) {
+            termination = Some((block * BLOCK + i) as u32);
         }
+        // One sum each, in the order of the samples: leaving out those with α = 0 then changes no bit.
+        let outputs = weights.iter_mut().zip(t).zip(rgb);
+        for (&alpha, ((weight, &t), &rgb)) in alpha.iter().zip(outputs) {
+            *weight = transmittance * alpha;
+            transmittance *= 1.0 - alpha;
+            sum += *weight * rgb.extend(t);
+            opacity += *weight;
+        }
+        transmittance = flushed(transmittance);
     }
     // Rounding may carry a sum of weights past 1.
     let opacity = if opacity > 1.0 { 1.0 } else { opacity };
-    Composite {
-        color: color + (1.0 - opacity) * background,
-        opacity,
-        depth,
-        termination,
-    }
+    Composite { color: sum.truncate() + (1.0 - opacity) * background, opacity, depth: sum.w, termination }
 }
 
-/// T_{i+1}. Denormal numbers are flushed: they change no pixel and are slow.
+/// The first index of the largest of `alpha` (at most [`BLOCK`]) that is larger than `largest`, which it then
+/// becomes; `None` where there is none. NaN is not larger than anything.
 #[inline(always)]
-pub(crate) fn next_transmittance(transmittance: f32, alpha: f32) -> f32 {
-    let next = transmittance * (1.0 - alpha);
-    if next < f32::MIN_POSITIVE { 0.0 } else { next }
+fn first_largest(alpha: &[f32], largest: &mut f32) -> Option<usize> {
+    let mut lanes = [0.0f32; LANES];
+    for alpha in alpha.chunks(LANES) {
+        for (lane, &alpha) in lanes.iter_mut().zip(alpha) {
+            *lane = if alpha > *lane { alpha } else { *lane };
+        }
+    }
+    let most = lanes.iter().fold(0.0, |most, &lane| if lane > most { lane } else { most });
+    if most <= *largest {
+        return None;
+    }
+    *largest = most;
+    alpha.iter().position(|&alpha| alpha == most)
+}
+
+/// Transmittance after a block. Denormal numbers are flushed: they change no pixel and are slow.
+#[inline(always)]
+pub(crate) fn flushed(transmittance: f32) -> f32 {
+    if transmittance < f32::MIN_POSITIVE { 0.0 } else { transmittance }
 }

@@ -1,6 +1,7 @@
+use crate::simd::Kernel;
 use glam::Vec3;
 
-use crate::composite::{BLOCK, next_transmittance};
+use crate::composite::{BLOCK, flushed};
 use crate::exponential::one_minus_exp;
 
 /// Gradients of [`composite`](crate::composite) of one ray, given those of its colour and its opacity, and the
@@ -39,15 +40,24 @@ pub fn composite_backward(
         d_rgb.len(),
         d_likelihood.len()
     );
-    pulp::Arch::new().dispatch(
+    pulp::Arch::new().dispatch(Kernel(
         #[inline(always)]
         || {
             backward(
-                sigma, likelihood, delta, rgb, background, weights, d_color, d_opacity, d_sigma,
-                d_rgb, d_likelihood,
+                sigma,
+                likelihood,
+                delta,
+                rgb,
+                background,
+                weights,
+                d_color,
+                d_opacity,
+                d_sigma,
+                d_rgb,
+                d_likelihood,
             )
         },
-    )
+    ))
 }
 
 #[inline(always)]
@@ -64,34 +74,35 @@ fn backward(
     d_rgb: &mut [Vec3],
     d_likelihood: &mut [f32],
 ) {
-    let n = sigma.len();
-    let mut transmittance = 1.0;
     // The outputs serve as scratch: dα/dσ, dα/df, and in d_rgb the transmittance in front of each sample.
-    for start in (0..n).step_by(BLOCK) {
-        let block = start..n.min(start + BLOCK);
-        let m = block.len();
-        let (sigma, delta) = (&sigma[block.clone()], &delta[block.clone()]);
-        let likelihood = &likelihood[block.clone()];
-        let (d_sigma, d_likelihood) = (&mut d_sigma[block.clone()], &mut d_likelihood[block.clone()]);
-        for i in 0..m {
-            let (absorbed, passed) = one_minus_exp(sigma[i] * delta[i]);
-            d_sigma[i] = likelihood[i] * delta[i] * passed;
-            d_likelihood[i] = absorbed;
+    let mut transmittance = 1.0;
+    let inputs = sigma.chunks(BLOCK).zip(likelihood.chunks(BLOCK)).zip(delta.chunks(BLOCK));
+    let outputs = d_sigma.chunks_mut(BLOCK).zip(d_likelihood.chunks_mut(BLOCK)).zip(d_rgb.chunks_mut(BLOCK));
+    for (((sigma, likelihood), delta), ((d_sigma, d_likelihood), d_rgb)) in inputs.zip(outputs) {
+        let inputs = sigma.iter().zip(likelihood).zip(delta);
+        let outputs = d_sigma.iter_mut().zip(&mut *d_likelihood);
+        for (((&sigma, &likelihood), &delta), (d_sigma, d_likelihood)) in inputs.zip(outputs) {
+            let (absorbed, passed) = one_minus_exp(sigma * delta);
+            *d_sigma = likelihood * delta * passed;
+            *d_likelihood = absorbed;
         }
-        let d_rgb = &mut d_rgb[block];
-        for i in 0..m {
-            d_rgb[i].x = transmittance;
-            transmittance = next_transmittance(transmittance, likelihood[i] * d_likelihood[i]);
+        for ((&likelihood, &d_likelihood), d_rgb) in likelihood.iter().zip(&*d_likelihood).zip(d_rgb) {
+            d_rgb.x = transmittance;
+            transmittance *= 1.0 - likelihood * d_likelihood;
         }
+        transmittance = flushed(transmittance);
     }
+
     let mut behind = background.dot(d_color);
-    for i in (0..n).rev() {
-        let value = rgb[i].dot(d_color) + d_opacity;
-        let d_alpha = d_rgb[i].x * (value - behind);
-        let alpha = likelihood[i] * d_likelihood[i];
+    let inputs = likelihood.iter().zip(rgb).zip(weights);
+    let outputs = d_sigma.iter_mut().zip(d_likelihood).zip(d_rgb);
+    for (((&likelihood, &rgb), &weight), ((d_sigma, d_likelihood), d_rgb)) in inputs.zip(outputs).rev() {
+        let value = rgb.dot(d_color) + d_opacity;
+        let d_alpha = d_rgb.x * (value - behind);
+        let alpha = likelihood * *d_likelihood;
         behind = alpha * value + (1.0 - alpha) * behind;
-        d_sigma[i] *= d_alpha;
-        d_likelihood[i] *= d_alpha;
-        d_rgb[i] = weights[i] * d_color;
+        *d_sigma *= d_alpha;
+        *d_likelihood *= d_alpha;
+        *d_rgb = weight * d_color;
     }
 }

@@ -80,15 +80,28 @@ impl Distortion {
         );
         let off_diagonal = 2.0 * (ds_dr2 * x * y + p1 * x + p2 * y);
         let jacobian = Mat2::from_cols(
-            Vec2::new(
-                s + 2.0 * ds_dr2 * x * x + 2.0 * p1 * y + 6.0 * p2 * x,
-                off_diagonal,
-            ),
-            Vec2::new(
-                off_diagonal,
-                s + 2.0 * ds_dr2 * y * y + 6.0 * p1 * y + 2.0 * p2 * x,
-            ),
+            Vec2::new(s + 2.0 * ds_dr2 * x * x + 2.0 * p1 * y + 6.0 * p2 * x, off_diagonal),
+            Vec2::new(off_diagonal, s + 2.0 * ds_dr2 * y * y + 6.0 * p1 * y + 2.0 * p2 * x),
         );
         (distorted, jacobian)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_jacobian_is_the_slope_of_distort() {
+        let lens = Distortion::from_opencv([0.3, -0.2, 0.1, -0.15, 0.25]);
+        for p in [Vec2::new(0.4, -0.3), Vec2::new(-0.6, 0.1), Vec2::ZERO] {
+            let (_, jacobian) = lens.distort_with_jacobian(p);
+            for (axis, column) in [(Vec2::X, jacobian.x_axis), (Vec2::Y, jacobian.y_axis)] {
+                const STEP: f32 = 1e-2;
+                let slope = (lens.distort(p + axis * STEP) - lens.distort(p - axis * STEP)) / (2.0 * STEP);
+                // Rounding over the step, and step² / 6 times third derivatives of up to 6.
+                assert!(slope.distance(column) < 2e-4, "{p}: {slope} {column}");
+            }
+        }
     }
 }

@@ -41,6 +41,7 @@ mod exponential;
 pub mod metrics;
 mod ray;
 mod sampling;
+mod simd;
 
 pub use camera::{Camera, Error};
 pub use composite::{Composite, composite};

@@ -11,13 +11,7 @@ use crate::camera::Error;
 /// Where the lengths differ.
 #[must_use]
 pub fn psnr(a: &[f32], b: &[f32]) -> f64 {
-    assert_eq!(
-        a.len(),
-        b.len(),
-        "images of {} and {} values",
-        a.len(),
-        b.len()
-    );
+    assert_eq!(a.len(), b.len(), "images of {} and {} values", a.len(), b.len());
     let sum: f64 = a.iter().zip(b).map(|(&a, &b)| squared(a, b)).sum();
     decibels(sum / a.len() as f64)
 }
@@ -63,11 +57,7 @@ const BORDER: usize = WINDOW / 2;
 /// Where the lengths are not 3·H·W.
 pub fn ssim(a: &[f32], b: &[f32], width: usize, height: usize) -> Result<f64, Error> {
     if width < WINDOW || height < WINDOW {
-        return Err(Error::ImageSize {
-            width,
-            height,
-            least: WINDOW,
-        });
+        return Err(Error::ImageSize { width, height, least: WINDOW });
     }
     let map = map_f64(a, b, width, height);
     let rows = map.chunks_exact(width).take(height - BORDER).skip(BORDER);
@@ -93,13 +83,7 @@ pub fn ssim_map(a: &[f32], b: &[f32], width: usize, height: usize) -> Vec<f32> {
 /// # Panics
 /// Where the lengths are not 3·H·W, 3·H·W and H·W.
 #[must_use]
-pub fn ssim_masked(
-    a: &[f32],
-    b: &[f32],
-    mask: &[bool],
-    width: usize,
-    height: usize,
-) -> Option<f64> {
+pub fn ssim_masked(a: &[f32], b: &[f32], mask: &[bool], width: usize, height: usize) -> Option<f64> {
     assert_mask(a, b, mask);
     let count = mask.iter().filter(|inside| **inside).count();
     if count == 0 {
@@ -137,27 +121,25 @@ fn map_f64(a: &[f32], b: &[f32], width: usize, height: usize) -> Vec<f64> {
     }
     let columns = mirrored(width);
     let lines = mirrored(height);
-    map.par_chunks_mut(width)
-        .enumerate()
-        .for_each_init(
-            || vec![[0.0; 3 * MOMENTS]; width],
-            |vertical, (y, map)| {
-                vertical.fill([0.0; 3 * MOMENTS]);
-                for &line in &lines[y..y + WINDOW] {
-                    let row = 3 * width * line..3 * width * (line + 1);
-                    add_line(&a[row.clone()], &b[row], vertical);
-                }
-                for (x, ssim) in map.iter_mut().enumerate() {
-                    let mut sums: Moments = [0.0; 3 * MOMENTS];
-                    for &column in &columns[x..x + WINDOW] {
-                        for (sum, value) in sums.iter_mut().zip(&vertical[column]) {
-                            *sum += value;
-                        }
+    map.par_chunks_mut(width).enumerate().for_each_init(
+        || vec![[0.0; 3 * MOMENTS]; width],
+        |vertical, (y, map)| {
+            vertical.fill([0.0; 3 * MOMENTS]);
+            for &line in &lines[y..y + WINDOW] {
+                let row = 3 * width * line..3 * width * (line + 1);
+                add_line(&a[row.clone()], &b[row], vertical);
+            }
+            for (x, ssim) in map.iter_mut().enumerate() {
+                let mut sums: Moments = [0.0; 3 * MOMENTS];
+                for &column in &columns[x..x + WINDOW] {
+                    for (sum, value) in sums.iter_mut().zip(&vertical[column]) {
+                        *sum += value;
                     }
-                    *ssim = mean_ssim(&sums);
                 }
-            },
-        );
+                *ssim = mean_ssim(&sums);
+            }
+        },
+    );
     map
 }
 

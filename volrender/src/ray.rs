@@ -28,10 +28,7 @@ pub struct Aabb {
 
 impl Aabb {
     /// The box without any point.
-    pub const EMPTY: Self = Self {
-        min: Vec3::INFINITY,
-        max: Vec3::NEG_INFINITY,
-    };
+    pub const EMPTY: Self = Self { min: Vec3::INFINITY, max: Vec3::NEG_INFINITY };
 
     /// The smallest box around `points`. Points that are not finite do not count; without any point it is
     /// [`Aabb::EMPTY`].
@@ -40,10 +37,7 @@ impl Aabb {
         points
             .iter()
             .filter(|p| p.is_finite())
-            .fold(Self::EMPTY, |bounds, &p| Self {
-                min: bounds.min.min(p),
-                max: bounds.max.max(p),
-            })
+            .fold(Self::EMPTY, |bounds, &p| Self { min: bounds.min.min(p), max: bounds.max.max(p) })
     }
 
     /// The box with every face moved outwards by `margin`. A negative margin shrinks it, an empty box stays empty.
@@ -52,10 +46,7 @@ impl Aabb {
         if self.is_empty() {
             return Self::EMPTY;
         }
-        Self {
-            min: self.min - margin,
-            max: self.max + margin,
-        }
+        Self { min: self.min - margin, max: self.max + margin }
     }
 
     /// Whether no point lies in the box.

@@ -4,13 +4,7 @@
 /// # Panics
 /// Where `edges` does not have n + 1 places.
 pub fn bin_edges(near: f32, far: f32, n: usize, edges: &mut [f32]) {
-    assert_eq!(
-        edges.len(),
-        n + 1,
-        "{} edges for {n} bins, expected {}",
-        edges.len(),
-        n + 1
-    );
+    assert_eq!(edges.len(), n + 1, "{} edges for {n} bins, expected {}", edges.len(), n + 1);
     edges[0] = near;
     for i in 1..n {
         edges[i] = near + (far - near) * (i as f32 / n as f32);
@@ -59,11 +53,5 @@ pub fn sample(edges: &[f32], mut jitter: impl FnMut() -> f32, t: &mut [f32]) {
 }
 
 fn assert_bins(edges: &[f32], values: &[f32]) {
-    assert_eq!(
-        edges.len(),
-        values.len() + 1,
-        "{} edges for {} bins",
-        edges.len(),
-        values.len()
-    );
+    assert_eq!(edges.len(), values.len() + 1, "{} edges for {} bins", edges.len(), values.len());
 }

@@ -15,13 +15,7 @@ pub fn padded<const D: usize>(grid: &HashGrid<D>, table: &[f32], log2: u32, f: u
     padded
 }
 
-pub fn oracle<const D: usize>(
-    grid: &HashGrid<D>,
-    table: &[f32],
-    points: &[[f32; D]],
-    log2: u32,
-    f: usize,
-) -> Vec<f64> {
+pub fn oracle<const D: usize>(grid: &HashGrid<D>, table: &[f32], points: &[[f32; D]], log2: u32, f: usize) -> Vec<f64> {
     let points: Vec<f64> = points.iter().flatten().map(|&x| f64::from(x)).collect();
     let table = padded(grid, table, log2, f);
     testkit::oracle::hash_encode(&points, D, grid.resolutions(), &table, log2, f)
@@ -53,8 +47,7 @@ pub fn coordinate() -> impl Strategy<Value = f32> {
 }
 
 pub fn points<const D: usize>(count: std::ops::Range<usize>) -> impl Strategy<Value = Vec<[f32; D]>> {
-    let point = prop::collection::vec(coordinate(), D)
-        .prop_map(|x| <[f32; D]>::try_from(x).unwrap());
+    let point = prop::collection::vec(coordinate(), D).prop_map(|x| <[f32; D]>::try_from(x).expect("D coordinates"));
     prop::collection::vec(point, count)
 }
 

@@ -1,4 +1,5 @@
 //! A mesh of realistic size for tests, benches and the example: the shared open body where it is at hand.
+#![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
 
 use std::io::Read;
 
@@ -7,10 +8,7 @@ use testkit::{TriMesh, mesh};
 
 /// The open body, 6890 vertices in metres; `None`, with the reason printed, where the file is not there.
 pub fn open_body() -> Option<TriMesh> {
-    let path = concat!(
-        env!("CARGO_MANIFEST_DIR"),
-        "/../../shared/data/body/open_body.npz"
-    );
+    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../../shared/data/body/open_body.npz");
     let file = match std::fs::File::open(path) {
         Ok(file) => file,
         Err(error) => {
@@ -21,56 +19,34 @@ pub fn open_body() -> Option<TriMesh> {
     let mut archive = zip::ZipArchive::new(file).unwrap();
     let mut rows = |name: &str| {
         let mut bytes = Vec::new();
-        (archive.by_name(name).unwrap())
-            .read_to_end(&mut bytes)
-            .unwrap();
+        (archive.by_name(name).unwrap()).read_to_end(&mut bytes).unwrap();
         // Magic (6), version (2), header length (2), header; then little-endian data.
         let start = 10 + usize::from(u16::from_le_bytes([bytes[8], bytes[9]]));
         let by_columns = String::from_utf8_lossy(&bytes[..start]).contains("'fortran_order': True");
-        let words: Vec<[u8; 4]> = bytes[start..]
-            .chunks_exact(4)
-            .map(|w| w.try_into().unwrap())
-            .collect();
+        let words: Vec<[u8; 4]> = bytes[start..].chunks_exact(4).map(|w| w.try_into().unwrap()).collect();
         let n = words.len() / 3;
         let (row, column) = if by_columns { (1, n) } else { (3, 1) };
-        (0..n)
-            .map(|i| [0, 1, 2].map(|j| words[i * row + j * column]))
-            .collect::<Vec<_>>()
+        (0..n).map(|i| [0, 1, 2].map(|j| words[i * row + j * column])).collect::<Vec<_>>()
     };
     let mesh = TriMesh {
-        vertices: (rows("v_template.npy").into_iter())
-            .map(|v| Vec3::from(v.map(f32::from_le_bytes)))
-            .collect(),
-        faces: (rows("f.npy").into_iter())
-            .map(|f| f.map(u32::from_le_bytes))
-            .collect(),
+        vertices: (rows("v_template.npy").into_iter()).map(|v| Vec3::from(v.map(f32::from_le_bytes))).collect(),
+        faces: (rows("f.npy").into_iter()).map(|f| f.map(u32::from_le_bytes)).collect(),
     };
     assert!(mesh.is_closed(), "{path} was misread");
     Some(mesh)
 }
 
 /// The open body, or a bumpy ball of similar size and resolution.
-#[allow(
-    dead_code,
-    reason = "not every target that includes this module needs it"
-)]
+#[allow(dead_code, reason = "not every target that includes this module needs it")]
 pub fn body_or_ball() -> TriMesh {
-    open_body().unwrap_or_else(|| {
-        mesh::icosphere(5).map(|p| p * (0.4 + 0.05 * (7.0 * p.x).sin() * (9.0 * p.y).cos()))
-    })
+    open_body().unwrap_or_else(|| mesh::icosphere(5).map(|p| p * (0.4 + 0.05 * (7.0 * p.x).sin() * (9.0 * p.y).cos())))
 }
 
 /// Splitmix64: points that are the same on every machine.
-#[allow(
-    dead_code,
-    reason = "not every target that includes this module needs it"
-)]
+#[allow(dead_code, reason = "not every target that includes this module needs it")]
 pub struct Random(pub u64);
 
-#[allow(
-    dead_code,
-    reason = "not every target that includes this module needs it"
-)]
+#[allow(dead_code, reason = "not every target that includes this module needs it")]
 impl Random {
     /// Uniform in [0, 1).
     pub fn unit(&mut self) -> f32 {
@@ -93,11 +69,7 @@ impl Random {
                 let face = mesh.faces[(self.unit() * mesh.faces.len() as f32) as usize];
                 let [a, b, c] = face.map(|i| mesh.vertices[i as usize]);
                 let (u, v) = (self.unit(), self.unit());
-                let (u, v) = if u + v > 1.0 {
-                    (1.0 - u, 1.0 - v)
-                } else {
-                    (u, v)
-                };
+                let (u, v) = if u + v > 1.0 { (1.0 - u, 1.0 - v) } else { (u, v) };
                 let offset = self.vec3(1.0).normalize_or(Vec3::X) * (distance * self.unit());
                 a + (b - a) * u + (c - a) * v + offset
             })

@@ -123,8 +123,9 @@ fn load_frame(
         ));
     }
     let (camera, distortion) = load_camera(camera, width, height, options)?;
-    undistort(&mut image, &mut mask, &camera, &distortion);
+    // Masked first, or interpolation would draw hidden colours into the mask's edge.
     image.multiply(&mask);
+    undistort(&mut image, &mut mask, &camera, &distortion);
 
     let betas = checks::betas(parameters, "betas", body)?;
     checks::joints(parameters, "tpose_joints", &betas, body)?;

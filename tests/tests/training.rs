@@ -1,0 +1,128 @@
+//! What a training run must do from its first step on.
+
+mod common;
+
+use common::{METHODS, body, capture, scene, silhouette, tiny};
+use glam::Vec3;
+use occnerf::{
+    Config, FieldRenderer, Method, MotionKind, PreparedFrame, Preset, Renderer, Scene, Trainer, evaluate,
+};
+
+/// Whole tables take a while to draw, and start near zero whatever their size.
+const SMALL_TABLE: u32 = 12;
+
+/// The least and the mean opacity over the prior's silhouette in a picture of an untrained field.
+fn initial_opacity(scene: &Scene, config: Config, frame: &PreparedFrame) -> (f32, f32) {
+    let trainer = Trainer::new(scene, config).unwrap();
+    let rendering = FieldRenderer::new(&trainer).unwrap().render(frame, Vec3::ZERO).unwrap();
+    let inside: Vec<f32> =
+        rendering.opacity.iter().zip(silhouette(scene, frame)).filter(|(_, s)| *s).map(|(o, _)| *o).collect();
+    assert!(inside.len() > 100);
+    (inside.iter().copied().fold(1.0, f32::min), inside.iter().sum::<f32>() / inside.len() as f32)
+}
+
+/// An image that starts empty stays empty: the published code is known for it.
+#[test]
+fn no_seed_starts_empty() {
+    for method in METHODS {
+        for motion in [MotionKind::Surface, MotionKind::Volume] {
+            for seed in 0..4 {
+                let mut config = Config::preset(Preset::Fast, method);
+                (config.seed, config.motion.kind) = (seed, motion);
+                config.encoding.log2_table_size = SMALL_TABLE;
+                let (least, mean) = initial_opacity(scene(), config, &scene().eval[0]);
+                println!("{method:?} {motion:?} {seed}: {least} {mean}");
+                assert!(least > 0.5, "{method:?} {motion:?} seed {seed}: least {least}, mean {mean}");
+            }
+        }
+    }
+}
+
+#[test]
+fn the_papers_preset_does_not_start_empty_either() {
+    for method in METHODS {
+        let mut config = Config::preset(Preset::Paper, method);
+        config.encoding.log2_table_size = SMALL_TABLE;
+        let (least, mean) = initial_opacity(scene(), config, &scene().eval[2]);
+        println!("{method:?}: {least} {mean}");
+        assert!(least > 0.5, "{method:?}: least {least}, mean {mean}");
+    }
+}
+
+/// Enough for every method to learn the outline.
+const STEPS: usize = 72;
+
+#[test]
+fn a_short_training_lowers_the_loss_and_beats_its_own_start() {
+    for method in METHODS {
+        let mut config = tiny(method, MotionKind::Surface);
+        (config.steps, config.patches, config.patch_size) = (STEPS as u64, 3, 24);
+        let mut trainer = Trainer::new(scene(), config).unwrap();
+        let psnr = |trainer: &Trainer<'_>| {
+            let frames: Vec<&PreparedFrame> = scene().eval.iter().collect();
+            let mut renderer = FieldRenderer::new(trainer).unwrap();
+            evaluate(scene(), &mut renderer, &frames, |_, _| {}).unwrap().psnr_mask.unwrap()
+        };
+        let start = psnr(&trainer);
+        let reports: Vec<_> = (0..STEPS).map(|_| trainer.step()).collect();
+        let end = psnr(&trainer);
+        // Four rounds of the six frames: easy and hard patches count alike.
+        let mean = |part: &[occnerf::StepReport]| part.iter().map(|r| r.loss).sum::<f64>() / part.len() as f64;
+        let (first, last) = (mean(&reports[..24]), mean(&reports[STEPS - 24..]));
+        println!("{method:?}: loss {first} {last}, psnr_mask {start} {end}");
+        assert!(last < 0.8 * first, "{method:?}: loss {first} to {last}");
+        assert!(end > start + 1.0, "{method:?}: psnr_mask {start} to {end} dB");
+        for report in &reports {
+            assert_eq!(report.bad_gradients, 0, "{method:?} step {}", report.step);
+            assert!(report.loss.is_finite() && report.live_samples > 0 && report.psnr.is_finite());
+        }
+    }
+}
+
+#[test]
+fn every_motion_and_distance_trains_without_bad_gradients() {
+    for motion in [MotionKind::Surface, MotionKind::Volume, MotionKind::Gaussian] {
+        for distance in [occnerf::DistanceKind::Blended, occnerf::DistanceKind::Exact] {
+            let mut config = tiny(Method::Occnerf, motion);
+            config.surface.distance = distance;
+            // Large steps reach strange parameters sooner.
+            (config.rates.vertices, config.rates.motion) = (1e-2, 1e-1);
+            let mut trainer = Trainer::new(scene(), config).unwrap();
+            for _ in 0..12 {
+                let report = trainer.step();
+                assert!(report.loss.is_finite(), "{motion:?} {distance:?}: {report:?}");
+                assert_eq!(report.bad_gradients, 0, "{motion:?} {distance:?}: {report:?}");
+            }
+        }
+    }
+}
+
+/// Only the paper's method counts; terminations on visible pixels are what it counts.
+#[test]
+fn vertices_near_visible_pixels_are_counted_and_the_rest_stay_behind() {
+    let mut trainer = Trainer::new(scene(), tiny(Method::Occnerf, MotionKind::Surface)).unwrap();
+    assert!(trainer.visibility_counts().iter().all(|&c| c == 0));
+    let mut rays = 0;
+    (0..24).for_each(|_| rays += trainer.step().rays as u64);
+    let counts = trainer.visibility_counts();
+    let total: u64 = counts.iter().sum();
+    assert!(total > 0 && total.is_multiple_of(5) && total <= 5 * rays, "{total} of {rays} rays");
+    // Vertices that ray casting never sees are hit by far fewer terminations than those it sees in many frames.
+    let seen = scene().vertex_frequencies().unwrap();
+    let mean = |wanted: &dyn Fn(u64) -> bool| {
+        let of: Vec<u64> = seen.iter().zip(counts).filter(|(s, _)| wanted(**s)).map(|(_, c)| *c).collect();
+        of.iter().sum::<u64>() as f64 / of.len() as f64
+    };
+    let (never, often) = (mean(&|s| s == 0), mean(&|s| s >= 3));
+    assert!(often > 2.0 * never, "never seen {never}, often seen {often}");
+}
+
+/// The demo's default scene at the fast preset: what a user tries first.
+#[test]
+fn the_scene_keeps_capture_and_labels_in_step() {
+    assert_eq!(scene().train.len(), capture().train.len());
+    assert_eq!(scene().eval.len(), capture().eval.len());
+    assert_eq!(scene().canonical.vertices.len(), body().num_vertices());
+    let (low, high) = scene().canonical.vertices.iter().fold((f32::MAX, f32::MIN), |(l, h), v| (l.min(v.y), h.max(v.y)));
+    assert!((high - low - 1.7).abs() < 1e-5);
+}

@@ -1,0 +1,267 @@
+//! Compositing against the plain one of the test kit, its gradients against finite differences of that.
+
+use glam::Vec3;
+use proptest::prelude::*;
+use testkit::gradient::{Tolerance, assert_gradient};
+use testkit::oracle;
+use volrender::{Composite, composite, composite_backward};
+
+#[derive(Clone, Debug, Default)]
+struct Samples {
+    sigma: Vec<f32>,
+    likelihood: Vec<f32>,
+    delta: Vec<f32>,
+    t: Vec<f32>,
+    rgb: Vec<Vec3>,
+}
+
+impl Samples {
+    fn push(&mut self, (sigma, likelihood, delta, rgb): (f32, f32, f32, Vec3)) {
+        let end = self.t.last().copied().unwrap_or(1.0);
+        self.sigma.push(sigma);
+        self.likelihood.push(likelihood);
+        self.delta.push(delta);
+        self.t.push(end + delta);
+        self.rgb.push(rgb);
+    }
+
+    fn composite(&self, background: Vec3) -> (Composite, Vec<f32>) {
+        let mut weights = vec![f32::NAN; self.sigma.len()];
+        let Self { sigma, likelihood, delta, t, rgb } = self;
+        let composite = composite(sigma, likelihood, delta, t, rgb, background, &mut weights);
+        (composite, weights)
+    }
+
+    fn backward(&self, background: Vec3, d_color: Vec3, d_opacity: f32) -> Gradients {
+        let n = self.sigma.len();
+        let (_, weights) = self.composite(background);
+        // Outputs are overwritten, whatever stood in them.
+        let mut d = Gradients { sigma: vec![f32::NAN; n], rgb: vec![Vec3::NAN; n], likelihood: vec![f32::NAN; n] };
+        composite_backward(
+            &self.sigma,
+            &self.likelihood,
+            &self.delta,
+            &self.rgb,
+            background,
+            &weights,
+            d_color,
+            d_opacity,
+            &mut d.sigma,
+            &mut d.rgb,
+            &mut d.likelihood,
+        );
+        d
+    }
+
+    /// The scalar whose gradient `backward` computes, in f64.
+    fn loss(&self, background: Vec3, d_color: Vec3, d_opacity: f32) -> f64 {
+        let Self { sigma, likelihood, delta, rgb, .. } = self;
+        let (color, opacity, ..) = oracle::composite(sigma, likelihood, delta, rgb, background);
+        color.dot(d_color.as_dvec3()) + opacity * f64::from(d_opacity)
+    }
+
+    fn check_gradients(&self, background: Vec3, d_color: Vec3, d_opacity: f32) {
+        let d = self.backward(background, d_color, d_opacity);
+        // The oracle is exact, so what is left is the backward's f32 rounding (a few ulps a sample, values up to
+        // about 4) and the third derivative of exp, δ³ step² / 6.
+        let ulps = 8.0 * f64::from(f32::EPSILON) * (4 + self.sigma.len()) as f64;
+        let tolerance = Tolerance { abs: ulps, rel: 1e-3 };
+        assert_gradient("likelihood", &self.likelihood, &d.likelihood, 1e-3, tolerance, |x| {
+            let moved = Self { likelihood: x.to_vec(), ..self.clone() };
+            moved.loss(background, d_color, d_opacity)
+        });
+        let colors: Vec<f32> = self.rgb.iter().flat_map(|c| c.to_array()).collect();
+        let d_colors: Vec<f32> = d.rgb.iter().flat_map(|c| c.to_array()).collect();
+        assert_gradient("rgb", &colors, &d_colors, 0.125, tolerance, |x| {
+            let rgb = x.as_chunks::<3>().0.iter().map(|&c| Vec3::from(c)).collect();
+            Self { rgb, ..self.clone() }.loss(background, d_color, d_opacity)
+        });
+        // A step lost to rounding is no test: the densities that are huge have their own below.
+        let movable: Vec<usize> = (0..self.sigma.len()).filter(|&i| self.sigma[i] < 1e4).collect();
+        let pick = |from: &[f32]| -> Vec<f32> { movable.iter().map(|&i| from[i]).collect() };
+        assert_gradient("sigma", &pick(&self.sigma), &pick(&d.sigma), 1e-2, tolerance, |x| {
+            let mut moved = self.clone();
+            for (&i, &sigma) in movable.iter().zip(x) {
+                moved.sigma[i] = sigma;
+            }
+            moved.loss(background, d_color, d_opacity)
+        });
+    }
+}
+
+struct Gradients {
+    sigma: Vec<f32>,
+    rgb: Vec<Vec3>,
+    likelihood: Vec<f32>,
+}
+
+fn color() -> impl Strategy<Value = Vec3> {
+    prop::array::uniform3(0.0f32..=1.0).prop_map(Vec3::from)
+}
+
+/// Rays through fog with empty space, walls, likelihoods of 0 and 1 and bins without width.
+fn ray(count: std::ops::Range<usize>) -> impl Strategy<Value = Samples> {
+    let sigma = prop_oneof![4 => 0.0f32..30.0, 1 => 0.0f32..1e-4, 1 => Just(0.0), 1 => Just(1e30), 1 => 50.0f32..2e3];
+    let likelihood = prop_oneof![2 => 0.0f32..=1.0, 2 => Just(1.0), 1 => Just(0.0)];
+    let delta = prop_oneof![6 => 1e-3f32..0.3, 1 => Just(0.0)];
+    prop::collection::vec((sigma, likelihood, delta, color()), count).prop_map(|samples| {
+        let mut ray = Samples::default();
+        samples.into_iter().for_each(|sample| ray.push(sample));
+        ray
+    })
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(256))]
+
+    #[test]
+    fn compositing_equals_the_plain_one(ray in ray(0..150), background in color()) {
+        let (got, weights) = ray.composite(background);
+        let (color, opacity, expected, _) =
+            oracle::composite(&ray.sigma, &ray.likelihood, &ray.delta, &ray.rgb, background);
+        // T is a product of up to 150 factors, each with a rounding error.
+        let tolerance = f64::from(f32::EPSILON) * (8 + ray.sigma.len()) as f64;
+        prop_assert!(got.color.as_dvec3().distance(color) <= 2.0 * tolerance, "{} {color}", got.color);
+        prop_assert!((f64::from(got.opacity) - opacity).abs() <= tolerance);
+        for (i, (w, expected)) in weights.iter().zip(&expected).enumerate() {
+            prop_assert!((f64::from(*w) - expected).abs() <= tolerance, "{i}: {w} {expected}");
+        }
+        let depth: f64 = expected.iter().zip(&ray.t).map(|(w, t)| w * f64::from(*t)).sum();
+        prop_assert!((f64::from(got.depth) - depth).abs() <= tolerance * (1.0 + depth.abs()));
+    }
+
+    #[test]
+    fn termination_is_the_lowest_index_of_the_largest_alpha(ray in ray(0..150)) {
+        let (got, _) = ray.composite(Vec3::ZERO);
+        let alpha: Vec<f64> = (0..ray.sigma.len())
+            .map(|i| f64::from(ray.likelihood[i]) * -(-f64::from(ray.sigma[i]) * f64::from(ray.delta[i])).exp_m1())
+            .collect();
+        let largest = alpha.iter().fold(0.0f64, |a, &b| a.max(b));
+        match got.termination {
+            None => prop_assert_eq!(largest, 0.0),
+            Some(i) => {
+                // Alphas that differ by less than f32 shows are ties, which the lower index wins.
+                prop_assert!(alpha[i as usize] >= largest * (1.0 - 5e-7));
+                prop_assert!(alpha[..i as usize].iter().all(|a| *a <= alpha[i as usize] * (1.0 + 5e-7)));
+                prop_assert!(largest < 1.0 || alpha[i as usize] >= 1.0 - 6e-8);
+            }
+        }
+    }
+
+    #[test]
+    fn opacity_lies_between_0_and_1_and_weights_sum_to_it(ray in ray(0..300)) {
+        let (got, weights) = ray.composite(Vec3::ONE);
+        prop_assert!((0.0..=1.0).contains(&got.opacity));
+        prop_assert!(weights.iter().all(|w| (0.0..=1.0).contains(w)));
+        prop_assert!((weights.iter().sum::<f32>() - got.opacity).abs() < 1e-5);
+    }
+
+    #[test]
+    fn leaving_out_dead_samples_changes_nothing(ray in ray(0..150), background in color()) {
+        let mut live = Samples::default();
+        for i in 0..ray.sigma.len() {
+            if ray.sigma[i] * ray.delta[i] * ray.likelihood[i] > 0.0 {
+                live.push((ray.sigma[i], ray.likelihood[i], ray.delta[i], ray.rgb[i]));
+                *live.t.last_mut().unwrap() = ray.t[i];
+            }
+        }
+        let (all, _) = ray.composite(background);
+        let (some, _) = live.composite(background);
+        prop_assert_eq!((all.color, all.opacity, all.depth), (some.color, some.opacity, some.depth));
+        prop_assert_eq!(all.termination.is_some(), some.termination.is_some());
+    }
+
+    #[test]
+    fn gradients_are_the_slopes(ray in ray(0..70), background in color(), d_color in color(), d_opacity in -1.0f32..1.0) {
+        ray.check_gradients(background, d_color - 0.5, d_opacity);
+    }
+}
+
+/// Three samples of fog around one that is opaque.
+fn wall(sigma: f32) -> Samples {
+    let mut ray = Samples::default();
+    for (i, sigma) in [1.0, sigma, 2.0, 0.0].into_iter().enumerate() {
+        let c = i as f32 * 0.2;
+        ray.push((sigma, 1.0, 0.25, Vec3::new(c, 1.0 - c, 0.5)));
+    }
+    ray
+}
+
+#[test]
+fn a_wall_has_exact_gradients() {
+    for sigma in [80.0, 1e3, 1e30, f32::MAX, f32::INFINITY] {
+        let ray = wall(sigma);
+        let (got, weights) = ray.composite(Vec3::ONE);
+        assert_eq!(got.opacity, 1.0);
+        assert_eq!(got.termination, Some(1));
+        assert_eq!(weights[2..], [0.0, 0.0]);
+        let d = ray.backward(Vec3::ONE, Vec3::new(1.0, -2.0, 0.5), 0.3);
+        // Nothing behind the wall matters, and the wall can not get denser.
+        assert_eq!(d.rgb[2..], [Vec3::ZERO; 2]);
+        assert_eq!(d.sigma[2..], [0.0; 2]);
+        assert_eq!(d.likelihood[2..], [0.0; 2]);
+        assert!(d.sigma[1].abs() < 1e-8);
+        // But it can get thinner: the division-by-(1 − α) form has 0/0 here.
+        assert!(d.likelihood[1].abs() > 0.1);
+        ray.check_gradients(Vec3::ONE, Vec3::new(1.0, -2.0, 0.5), 0.3);
+    }
+}
+
+#[test]
+fn empty_space_has_a_gradient() {
+    let mut ray = wall(0.0);
+    ray.sigma = vec![0.0; 4];
+    let (got, _) = ray.composite(Vec3::X);
+    assert_eq!((got.color, got.opacity, got.depth, got.termination), (Vec3::X, 0.0, 0.0, None));
+    let d = ray.backward(Vec3::X, Vec3::ONE, 0.0);
+    // dC/dσ_i = δ_i (c_i − background).
+    for i in 0..4 {
+        let expected = 0.25 * (ray.rgb[i] - Vec3::X).element_sum();
+        assert!((d.sigma[i] - expected).abs() < 1e-6);
+    }
+}
+
+#[test]
+fn no_samples_are_background() {
+    let (got, _) = Samples::default().composite(Vec3::new(0.1, 0.2, 0.3));
+    let expected = Composite { color: Vec3::new(0.1, 0.2, 0.3), opacity: 0.0, depth: 0.0, termination: None };
+    assert_eq!(got, expected);
+    Samples::default().backward(Vec3::ONE, Vec3::ONE, 1.0);
+}
+
+#[test]
+fn faint_fog_keeps_its_relative_accuracy() {
+    let mut ray = Samples::default();
+    ray.push((1e-6, 1.0, 1e-3, Vec3::ONE));
+    let (got, _) = ray.composite(Vec3::ZERO);
+    assert!((got.opacity / 1e-9 - 1.0).abs() < 1e-6, "{}", got.opacity);
+}
+
+#[test]
+fn thousands_of_half_transparent_samples_underflow_quietly() {
+    let mut ray = Samples::default();
+    for _ in 0..5000 {
+        ray.push((10.0, 0.9, 0.1, Vec3::ONE));
+    }
+    let (got, weights) = ray.composite(Vec3::ZERO);
+    assert!((got.opacity - 1.0).abs() < 1e-6);
+    assert_eq!(weights[4999], 0.0);
+    let d = ray.backward(Vec3::ZERO, Vec3::ONE, 1.0);
+    assert!(d.sigma.iter().chain(&d.likelihood).all(|d| d.is_finite()));
+}
+
+#[test]
+fn nan_is_passed_on_and_never_terminates_a_ray() {
+    let mut ray = wall(3.0);
+    ray.sigma[2] = f32::NAN;
+    let (got, weights) = ray.composite(Vec3::ZERO);
+    assert!(got.color.is_nan() && got.opacity.is_nan());
+    assert!(!weights[1].is_nan());
+    assert_eq!(got.termination, Some(1));
+}
+
+#[test]
+#[should_panic(expected = "2 sigma, 1 likelihood")]
+fn slices_of_different_lengths_are_the_callers_bug() {
+    composite(&[1.0; 2], &[1.0], &[1.0; 2], &[1.0; 2], &[Vec3::ONE; 2], Vec3::ZERO, &mut [0.0; 2]);
+}

@@ -1,0 +1,254 @@
+//! Cameras, boxes, bins and lenses.
+
+use glam::{Affine3A, Mat3, Quat, Vec2, Vec3};
+use proptest::prelude::*;
+use testkit::strategy::{degenerate_clouds, rotation, unit_vec3, vec3};
+use volrender::{Aabb, Camera, Distortion, Error, Ray, bin_edges, bin_midpoints, bin_widths, sample};
+
+fn intrinsics(fx: f32, fy: f32, cx: f32, cy: f32) -> Mat3 {
+    Mat3::from_cols_array(&[fx, 0.0, 0.0, 0.0, fy, 0.0, cx, cy, 1.0])
+}
+
+fn camera() -> impl Strategy<Value = Camera> {
+    let k = (50.0f32..500.0, 50.0f32..500.0, 20.0f32..80.0, 20.0f32..80.0);
+    (k, rotation(), vec3(3.0)).prop_map(|((fx, fy, cx, cy), rotation, translation)| {
+        let extrinsics = Affine3A::from_rotation_translation(rotation, translation);
+        Camera::new(intrinsics(fx, fy, cx, cy), extrinsics, 100, 90).expect("a camera")
+    })
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(256))]
+
+    #[test]
+    fn a_point_on_a_ray_projects_to_the_rays_pixel(camera in camera(), u in 0.0f32..100.0, v in 0.0f32..90.0, t in 0.5f32..10.0) {
+        let ray = camera.ray(u, v);
+        prop_assert!((ray.direction.length() - 1.0).abs() < 1e-6);
+        prop_assert!(ray.origin.distance(camera.centre_of_projection()) < 1e-6);
+        let projected = camera.project(ray.at(t)).unwrap();
+        // A millionth of a metre at half a metre, seen with a focal length of 500.
+        prop_assert!(projected.truncate().distance(Vec2::new(u, v)) < 2e-2, "{projected}");
+        prop_assert!(projected.z <= t * (1.0 + 1e-5));
+        prop_assert!(camera.project(ray.at(-t)).is_none(), "behind the camera");
+    }
+
+    #[test]
+    fn resizing_keeps_the_rays(camera in camera(), u in 0.0f32..100.0, v in 0.0f32..90.0, w in 1u32..400, h in 1u32..400) {
+        let resized = camera.resized(w, h);
+        prop_assert_eq!((resized.width, resized.height), (w, h));
+        let there = resized.ray(u * w as f32 / 100.0, v * h as f32 / 90.0).direction;
+        prop_assert!(there.distance(camera.ray(u, v).direction) < 1e-4);
+    }
+
+    #[test]
+    fn intrinsics_survive(camera in camera()) {
+        let again = Camera::new(camera.intrinsics(), camera.world_to_camera, 100, 90).unwrap();
+        prop_assert_eq!(again, camera);
+    }
+
+    #[test]
+    fn a_ray_is_in_the_box_exactly_between_near_and_far(
+        inside in vec3(1.0), direction in unit_vec3(), back in 0.0f32..5.0, half in vec3(2.0),
+    ) {
+        // From the answer: the ray passes through a point of the box.
+        let half = half.abs() + 0.01;
+        let bounds = Aabb { min: inside - half, max: inside + half };
+        let ray = Ray { origin: inside - direction * back, direction };
+        let (near, far) = bounds.intersect(&ray).unwrap();
+        prop_assert!(0.0 <= near && near < far);
+        prop_assert!(near <= back + 1e-4 && back <= far + 1e-4);
+        let roomy = bounds.inflated(1e-4);
+        for i in 0..=10 {
+            let t = near + (far - near) * i as f32 / 10.0;
+            prop_assert!(roomy.contains(ray.at(t)));
+        }
+        let tight = bounds.inflated(-1e-4);
+        prop_assert!(!tight.contains(ray.at(far)));
+        prop_assert!(near == 0.0 || !tight.contains(ray.at(near)));
+    }
+
+    #[test]
+    fn a_ray_without_a_point_in_the_box_misses(center in vec3(2.0), half in vec3(1.0), origin in vec3(4.0), direction in unit_vec3()) {
+        let half = half.abs() + 0.05;
+        let bounds = Aabb { min: center - half, max: center + half };
+        let ray = Ray { origin, direction };
+        let touched = (0..4000).map(|i| ray.at(i as f32 * 0.004)).any(|p| bounds.inflated(-1e-3).contains(p));
+        match bounds.intersect(&ray) {
+            None => prop_assert!(!touched),
+            Some((near, far)) => prop_assert!(touched || far - near < 0.02),
+        }
+    }
+
+    #[test]
+    fn bins_tile_the_range(near in 0.0f32..10.0, length in 0.0f32..5.0, n in 1usize..300) {
+        let far = near + length;
+        let (mut edges, mut middle, mut delta) = (vec![0.0; n + 1], vec![0.0; n], vec![0.0; n]);
+        bin_edges(near, far, n, &mut edges);
+        bin_midpoints(&edges, &mut middle);
+        bin_widths(&edges, &mut delta);
+        prop_assert_eq!((edges[0], edges[n]), (near, far));
+        prop_assert!(edges.is_sorted());
+        prop_assert!((delta.iter().sum::<f32>() - length).abs() < 1e-4);
+        for i in 0..n {
+            prop_assert!(edges[i] <= middle[i] && middle[i] <= edges[i + 1]);
+            // An ulp of an edge is up to 1e-6.
+            prop_assert!((delta[i] - length / n as f32).abs() < 3e-6);
+        }
+    }
+
+    #[test]
+    fn a_sample_stays_in_its_bin(near in 0.0f32..10.0, length in 0.0f32..5.0, jitter in prop::collection::vec(-0.5f32..1.5, 1..100)) {
+        let n = jitter.len();
+        let (mut edges, mut t) = (vec![0.0; n + 1], vec![0.0; n]);
+        bin_edges(near, near + length, n, &mut edges);
+        let mut numbers = jitter.iter();
+        sample(&edges, || *numbers.next().unwrap(), &mut t);
+        for i in 0..n {
+            prop_assert!(edges[i] <= t[i] && t[i] <= edges[i + 1]);
+            let expected = edges[i] + (edges[i + 1] - edges[i]) * jitter[i].clamp(0.0, 1.0);
+            prop_assert!((t[i] - expected).abs() < 2e-6);
+        }
+    }
+
+    #[test]
+    fn undistorting_inverts_distorting(x in -0.6f32..0.6, y in -0.6f32..0.6, k in prop::array::uniform5(-1.0f32..1.0)) {
+        let lens = Distortion::from_opencv([0.2 * k[0], 0.1 * k[1], 0.01 * k[2], 0.01 * k[3], 0.05 * k[4]]);
+        let p = Vec2::new(x, y);
+        let back = lens.undistort(lens.distort(p)).unwrap();
+        prop_assert!(back.distance(p) < 1e-5, "{p} {back}");
+    }
+}
+
+#[test]
+fn the_first_pixels_centre_is_half_a_pixel_in() {
+    let camera = Camera::new(intrinsics(100.0, 100.0, 32.0, 24.0), Affine3A::IDENTITY, 64, 48).unwrap();
+    assert_eq!(camera.ray(32.0, 24.0).direction, Vec3::Z);
+    let first = camera.ray(0.5, 0.5).direction;
+    let expected = Vec3::new(-0.315, -0.235, 1.0).normalize_or_zero();
+    assert!(first.distance(expected) < 1e-6);
+    assert_eq!(camera.project(Vec3::new(0.1, -0.2, 2.0)), Some(Vec3::new(37.0, 14.0, 2.0)));
+}
+
+#[test]
+fn cameras_that_are_none_are_errors() {
+    let good = intrinsics(100.0, 100.0, 32.0, 24.0);
+    let new = |k, e| Camera::new(k, e, 64, 48);
+    let mut skewed = good;
+    skewed.y_axis.x = 3.0;
+    let mut scaled = good;
+    scaled.z_axis.z = 2.0;
+    let bad = [skewed, scaled, good.transpose(), Mat3::ZERO, -good, intrinsics(f32::NAN, 1.0, 0.0, 0.0)];
+    for k in bad {
+        assert!(matches!(new(k, Affine3A::IDENTITY), Err(Error::Intrinsics(_))), "{k}");
+    }
+    let flat = Affine3A::from_scale(Vec3::new(1.0, 1.0, 0.0));
+    let nan = Affine3A::from_translation(Vec3::NAN);
+    for e in [flat, nan, Affine3A::from_scale(Vec3::INFINITY)] {
+        assert!(matches!(new(good, e), Err(Error::Extrinsics(_))), "{e}");
+    }
+    let none = Camera::new(good, Affine3A::IDENTITY, 0, 48);
+    assert_eq!(none, Err(Error::ImageSize { width: 0, height: 48, least: 1 }));
+}
+
+#[test]
+fn what_cannot_be_seen_has_no_projection() {
+    let camera = Camera::new(intrinsics(100.0, 100.0, 32.0, 24.0), Affine3A::IDENTITY, 64, 48).unwrap();
+    let unseen = [
+        Vec3::ZERO,
+        -Vec3::Z,
+        Vec3::X,
+        Vec3::NAN,
+        Vec3::INFINITY,
+        Vec3::new(1e30, 0.0, 1e-30),
+        Vec3::new(f32::NAN, 0.0, 1.0),
+    ];
+    for x in unseen {
+        assert_eq!(camera.project(x), None, "{x}");
+    }
+}
+
+#[test]
+fn rays_along_faces_and_degenerate_boxes_are_decided() {
+    let unit = Aabb { min: Vec3::ZERO, max: Vec3::ONE };
+    let ray = |origin: [f32; 3], direction: Vec3| Ray { origin: origin.into(), direction };
+    // In a face, and parallel to one just outside.
+    assert_eq!(unit.intersect(&ray([-1.0, 0.0, 0.5], Vec3::X)), Some((1.0, 2.0)));
+    assert_eq!(unit.intersect(&ray([-1.0, 1.0, 1.0], Vec3::X)), Some((1.0, 2.0)));
+    assert_eq!(unit.intersect(&ray([-1.0, -1e-6, 0.5], Vec3::X)), None);
+    assert_eq!(unit.intersect(&ray([-1.0, 0.5, 0.5], Vec3::new(1.0, -0.0, 0.0))), Some((1.0, 2.0)));
+    // From inside, from a face outwards, and behind.
+    assert_eq!(unit.intersect(&ray([0.5; 3], -Vec3::Y)), Some((0.0, 0.5)));
+    assert_eq!(unit.intersect(&ray([1.0, 0.5, 0.5], Vec3::X)), None);
+    assert_eq!(unit.intersect(&ray([2.0, 0.5, 0.5], Vec3::X)), None);
+    // Nothing to intersect.
+    let through = ray([0.5, 0.5, -1.0], Vec3::Z);
+    let flat = Aabb { min: Vec3::ZERO, max: Vec3::new(1.0, 1.0, 0.0) };
+    for bounds in [Aabb::EMPTY, flat, Aabb { min: Vec3::NAN, ..unit }, Aabb { max: Vec3::NAN, ..unit }] {
+        assert_eq!(bounds.intersect(&through), None, "{bounds:?}");
+    }
+    for bad in [
+        ray([0.5; 3], Vec3::ZERO),
+        ray([0.5; 3], Vec3::NAN),
+        ray([f32::NAN; 3], Vec3::X),
+        ray([0.5; 3], Vec3::INFINITY),
+    ] {
+        assert_eq!(unit.intersect(&bad), None, "{bad:?}");
+    }
+    let everywhere = Aabb { min: Vec3::NEG_INFINITY, max: Vec3::INFINITY };
+    assert_eq!(everywhere.intersect(&through), None, "an endless range can not be sampled");
+}
+
+#[test]
+fn boxes_of_degenerate_clouds_hold_their_finite_points() {
+    for (name, points) in degenerate_clouds() {
+        let bounds = Aabb::from_points(&points);
+        let finite: Vec<_> = points.iter().filter(|p| p.is_finite()).collect();
+        assert_eq!(bounds.is_empty(), finite.is_empty(), "{name}");
+        assert!(finite.iter().all(|p| bounds.contains(**p)), "{name}");
+        assert_eq!(bounds.inflated(1.0).is_empty(), finite.is_empty(), "{name}");
+        assert!(finite.iter().all(|p| bounds.inflated(1.0).contains(**p)), "{name}");
+    }
+    assert!(Aabb { min: Vec3::ZERO, max: Vec3::ONE }.inflated(-1.0).is_empty());
+}
+
+#[test]
+fn no_bins_and_odd_jitter_are_fine() {
+    let mut edge = [0.0];
+    bin_edges(2.0, 5.0, 0, &mut edge);
+    assert_eq!(edge, [2.0]);
+    bin_midpoints(&edge, &mut []);
+    let mut t = [0.0; 3];
+    let mut jitter = [f32::NAN, f32::INFINITY, f32::NEG_INFINITY].into_iter();
+    sample(&[0.0, 1.0, 2.0, 3.0], || jitter.next().unwrap(), &mut t);
+    assert_eq!(t, [0.0, 2.0, 2.0]);
+}
+
+#[test]
+fn a_lens_agrees_with_opencvs_formula() {
+    // x' = x (1 + k1 r² + k2 r⁴ + k3 r⁶) + 2 p1 x y + p2 (r² + 2 x²), by hand at (0.5, 0.25), r² = 0.3125.
+    let lens = Distortion::from_opencv([0.1, -0.2, 0.01, 0.02, 0.3]);
+    let s = 1.0 + 0.1 * 0.3125 - 0.2 * 0.097_656_25 + 0.3 * 0.030_517_578;
+    let expected = Vec2::new(
+        0.5 * s + 2.0 * 0.01 * 0.125 + 0.02 * (0.3125 + 0.5),
+        0.25 * s + 0.01 * (0.3125 + 0.125) + 2.0 * 0.02 * 0.125,
+    );
+    let p = Vec2::new(0.5, 0.25);
+    assert!(lens.distort(p).distance(expected) < 1e-6);
+    assert!(Distortion::default().is_none());
+    assert_eq!(Distortion::default().undistort(p), Some(p));
+
+    let camera =
+        Camera::new(intrinsics(100.0, 200.0, 32.0, 24.0), Affine3A::from_quat(Quat::from_rotation_y(1.0)), 64, 48);
+    let pixel = camera.unwrap().distort_pixel(&lens, Vec2::new(82.0, 74.0));
+    assert!(pixel.distance(expected * Vec2::new(100.0, 200.0) + Vec2::new(32.0, 24.0)) < 1e-3);
+}
+
+#[test]
+fn a_lens_that_folds_back_says_so() {
+    // r (1 − r²/3) has its largest value 2/3 at r = 1.
+    let lens = Distortion { k1: -1.0 / 3.0, ..Distortion::default() };
+    let near = lens.undistort(Vec2::new(0.6, 0.0)).unwrap();
+    assert!(lens.distort(near).distance(Vec2::new(0.6, 0.0)) < 1e-6 && near.x < 1.0);
+    assert_eq!(lens.undistort(Vec2::NAN), None);
+    assert_eq!(lens.undistort(Vec2::new(f32::INFINITY, 0.0)), None);
+}

@@ -1,0 +1,135 @@
+//! Metrics against scikit-image (`reference/ssim.py`) and the test kit's plain ones.
+
+use proptest::prelude::*;
+use testkit::oracle;
+use volrender::Error;
+use volrender::metrics::{psnr, psnr_masked, ssim, ssim_map, ssim_masked};
+
+/// The generator of `reference/ssim.py`.
+fn noise(n: usize, seed: u64) -> Vec<f32> {
+    let mut state = seed;
+    (0..n)
+        .map(|_| {
+            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            (state >> 40) as f32 / (1u32 << 24) as f32
+        })
+        .collect()
+}
+
+fn pair(kind: &str, width: usize, height: usize) -> (Vec<f32>, Vec<f32>) {
+    let n = width * height * 3;
+    let (a, b) = (noise(n, 1), noise(n, 2));
+    let scaled = |x: &[f32]| x.iter().map(|x| x / 64.0).collect();
+    match kind {
+        "noise" => (a, b),
+        "close" => {
+            let mixed = a.iter().zip(&b).map(|(a, b)| a * 0.875 + b * 0.125).collect();
+            (a, mixed)
+        }
+        "dark" => (scaled(&a), scaled(&b)),
+        "flat" => (vec![0.5; n], vec![0.25; n]),
+        _ => panic!("no such pair: {kind}"),
+    }
+}
+
+fn mask(width: usize, height: usize) -> Vec<bool> {
+    (0..width * height).map(|i| ((i % width) * 3 + (i / width) * 5) % 7 < 3).collect()
+}
+
+#[test]
+fn ssim_equals_scikit_image() {
+    // Both sides compute in f64; the reference is printed with 12 decimals.
+    const TOLERANCE: f64 = 1e-10;
+    let mut cases = 0;
+    for line in include_str!("reference/ssim.txt").lines() {
+        let mut words = line.split(' ');
+        let kind = words.next().unwrap();
+        let numbers: Vec<f64> = words.map(|word| word.parse().unwrap()).collect();
+        let (width, height) = (numbers[0] as usize, numbers[1] as usize);
+        let (a, b) = pair(kind, width, height);
+        let close = |what: &str, got: f64, expected: f64, tolerance: f64| {
+            assert!((got - expected).abs() <= tolerance, "{line}\n{what}: {got}");
+        };
+        close("ssim", ssim(&a, &b, width, height).unwrap(), numbers[2], TOLERANCE);
+        let masked = ssim_masked(&a, &b, &mask(width, height), width, height).unwrap();
+        close("masked", masked, numbers[3], TOLERANCE);
+        let map = ssim_map(&a, &b, width, height);
+        let places = [0, width / 2, height / 2 * width + width / 2, width * height - 1];
+        for (place, expected) in places.into_iter().zip(&numbers[4..]) {
+            close("map", f64::from(map[place]), *expected, f64::from(f32::EPSILON));
+        }
+        cases += 1;
+    }
+    assert_eq!(cases, 12);
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(32))]
+
+    #[test]
+    fn metrics_equal_the_plain_ones(width in 7usize..20, height in 7usize..20, seed: u64) {
+        let (a, b) = (noise(3 * width * height, seed), noise(3 * width * height, !seed));
+        prop_assert!((psnr(&a, &b) - oracle::psnr(&a, &b)).abs() < 1e-9);
+        let plain = oracle::ssim(&a, &b, width, height);
+        prop_assert!((ssim(&a, &b, width, height).unwrap() - plain).abs() < 1e-10);
+    }
+
+    #[test]
+    fn the_map_has_any_size(width in 1usize..12, height in 1usize..12, seed: u64) {
+        let (a, b) = (noise(3 * width * height, seed), noise(3 * width * height, !seed));
+        let plain = oracle::ssim_map(&a, &b, width, height);
+        for (got, plain) in ssim_map(&a, &b, width, height).into_iter().zip(plain) {
+            prop_assert!((f64::from(got) - plain).abs() < 1e-6);
+        }
+    }
+
+    #[test]
+    fn masked_psnr_is_the_psnr_of_the_pixels_picked(width in 1usize..12, height in 1usize..12, seed: u64) {
+        let (a, b) = (noise(3 * width * height, seed), noise(3 * width * height, !seed));
+        let mask = mask(width, height);
+        let picked = |image: &[f32]| -> Vec<f32> {
+            let pixels = image.chunks(3).zip(&mask);
+            pixels.filter(|(_, inside)| **inside).flat_map(|(pixel, _)| pixel.to_vec()).collect()
+        };
+        let expected = oracle::psnr(&picked(&a), &picked(&b));
+        prop_assert!((psnr_masked(&a, &b, &mask).unwrap() - expected).abs() < 1e-9);
+    }
+
+    #[test]
+    fn an_image_is_like_itself_and_metrics_are_symmetric(width in 7usize..20, height in 7usize..20, seed: u64) {
+        let (a, b) = (noise(3 * width * height, seed), noise(3 * width * height, !seed));
+        prop_assert_eq!(psnr(&a, &a), f64::INFINITY);
+        prop_assert!((ssim(&a, &a, width, height).unwrap() - 1.0).abs() < 1e-12);
+        let (there, back) = (ssim(&a, &b, width, height).unwrap(), ssim(&b, &a, width, height).unwrap());
+        prop_assert!((there - back).abs() < 1e-12);
+        prop_assert_eq!(psnr(&a, &b), psnr(&b, &a));
+    }
+}
+
+#[test]
+fn what_has_no_answer_says_so() {
+    let a = noise(3 * 6 * 20, 1);
+    let too_small = Error::ImageSize { width: 6, height: 20, least: 7 };
+    assert_eq!(ssim(&a, &a, 6, 20), Err(too_small));
+    assert_eq!(psnr_masked(&a, &a, &[false; 120]), None);
+    assert_eq!(ssim_masked(&a, &a, &[false; 120], 6, 20), None);
+    assert!(ssim_map(&[], &[], 0, 5).is_empty());
+    assert!(psnr(&[], &[]).is_nan());
+}
+
+#[test]
+fn a_nan_pixel_spoils_only_the_windows_that_see_it() {
+    let mut a = noise(3 * 20 * 20, 1);
+    let b = a.clone();
+    a[3 * (10 * 20 + 10)] = f32::NAN;
+    for (i, value) in ssim_map(&a, &b, 20, 20).into_iter().enumerate() {
+        let near = (i % 20).abs_diff(10) <= 3 && (i / 20).abs_diff(10) <= 3;
+        assert_eq!(value.is_nan(), near, "pixel {i}");
+    }
+}
+
+#[test]
+#[should_panic(expected = "expected 3 × 7 × 8")]
+fn an_image_of_another_size_is_the_callers_bug() {
+    let _ = ssim(&[0.0; 147], &[0.0; 147], 7, 8);
+}
