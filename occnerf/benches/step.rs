@@ -1,6 +1,7 @@
 //! A training step and a rendered frame on the demo at its default size, 192 × 192, two threads.
 //!
 //! `cargo bench -p occnerf`: items/s are rays of a step, and pixels of a frame.
+#![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
 
 use std::sync::OnceLock;
 

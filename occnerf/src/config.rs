@@ -2,6 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::presets;
+
 /// Which model is trained; every method shares data, sampler, renderer, losses and budget.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
@@ -137,6 +139,11 @@ pub struct EncodingConfig {
     pub n_min: u32,
     /// Cells an axis of the finest level.
     pub n_max: u32,
+    /// Least d that is told from smaller ones, normalised metres. A wide interval makes cells long in d, along which
+    /// appearance hardly changes, and leaves more of the table to the surface.
+    pub distance_min: f32,
+    /// Largest d that is told from greater ones, normalised metres.
+    pub distance_max: f32,
 }
 
 /// Surface queries and the surface term.
@@ -252,9 +259,9 @@ impl Config {
     /// The defaults of a preset for a method.
     pub fn preset(preset: Preset, method: Method) -> Self {
         let mut config = match preset {
-            Preset::Paper => paper(),
-            Preset::Balanced => balanced(),
-            Preset::Fast => fast(),
+            Preset::Paper => presets::paper(),
+            Preset::Balanced => presets::balanced(),
+            Preset::Fast => presets::fast(),
         };
         config.method = method;
         if method != Method::Occnerf {
@@ -299,10 +306,12 @@ impl Config {
         let at_least_zero = "expected a finite number of at least 0";
         let above_zero = "expected a finite number above 0";
         let any = "expected a finite number";
-        let real: [(&'static str, f32, f32, &'static str); 17] = [
+        let real: [(&'static str, f32, f32, &'static str); 19] = [
             ("field.density_scale", self.field.density_scale, f32::MIN_POSITIVE, above_zero),
             ("field.density_bias", self.field.density_bias, f32::MIN, any),
             ("field.density_bias_outside", self.field.density_bias_outside, f32::MIN, any),
+            ("encoding.distance_max", self.encoding.distance_max, f32::MIN_POSITIVE, above_zero),
+            ("-encoding.distance_min", -self.encoding.distance_min, f32::MIN_POSITIVE, above_zero),
             ("motion.margin", self.motion.margin, f32::MIN_POSITIVE, above_zero),
             ("motion.falloff", self.motion.falloff, f32::MIN_POSITIVE, above_zero),
             ("motion.depth", self.motion.depth, f32::MIN_POSITIVE, above_zero),
@@ -325,65 +334,6 @@ impl Config {
         }
         Ok(())
     }
-}
-
-fn paper() -> Config {
-    Config {
-        preset: Preset::Paper,
-        method: Method::Occnerf,
-        occluded: OccludedRule::Unknown,
-        seed: 1,
-        steps: 10_000,
-        patches: 6,
-        patch_size: 32,
-        samples: 128,
-        field: FieldConfig { width: 128, depth: 4, density_scale: 25.0, density_bias: 2.0, density_bias_outside: -2.0 },
-        encoding: EncodingConfig { levels: 16, features: 2, log2_table_size: 19, n_min: 16, n_max: 2048 },
-        surface: SurfaceConfig {
-            k: 5,
-            coarse_levels: 3,
-            distance: DistanceKind::Blended,
-            surface_term: true,
-            attention: true,
-        },
-        motion: MotionConfig { kind: MotionKind::Volume, margin: 0.08, falloff: 0.02, depth: 0.3 },
-        loss: LossConfig { mse: 0.2, perceptual: 1.0, completeness: 10.0, beta: 10.0 },
-        rates: RateConfig {
-            field: 5e-4,
-            vertices: 1e-4,
-            table: 5e-5,
-            motion: 5e-5,
-            final_fraction: 1.0,
-            beta_2: 0.999,
-        },
-    }
-}
-
-fn balanced() -> Config {
-    Config {
-        preset: Preset::Balanced,
-        steps: 2000,
-        patches: 6,
-        samples: 64,
-        field: FieldConfig { width: 64, depth: 2, ..paper().field },
-        encoding: EncodingConfig { levels: 10, features: 2, log2_table_size: 16, n_min: 12, n_max: 384 },
-        surface: SurfaceConfig { distance: DistanceKind::Exact, ..paper().surface },
-        loss: LossConfig { mse: 5.0, ..paper().loss },
-        motion: MotionConfig { kind: MotionKind::Surface, margin: 0.04, falloff: 0.02, depth: 0.04 },
-        rates: RateConfig {
-            field: 2e-3,
-            vertices: 1e-4,
-            table: 1e-2,
-            motion: 1e-3,
-            final_fraction: 0.05,
-            beta_2: 0.99,
-        },
-        ..paper()
-    }
-}
-
-fn fast() -> Config {
-    Config { preset: Preset::Fast, steps: 800, patches: 4, samples: 48, ..balanced() }
 }
 
 #[cfg(test)]

@@ -8,8 +8,6 @@ use crate::Error;
 use crate::config::{Config, EncodingConfig, Method};
 use crate::samples::Samples;
 
-/// d is clamped to this interval, normalised metres.
-const DISTANCE: (f32, f32) = (-0.2, 0.3);
 /// Bands of the frequency encoding (Weng et al. 2022).
 const BANDS: usize = 10;
 
@@ -20,18 +18,19 @@ pub(crate) enum Encoder {
     Frequency,
     /// Hash grid on x̂.
     Point(HashGrid<3>),
-    /// Hash grid on [v̂, d].
-    Surface(HashGrid<4>),
+    /// Hash grid on [v̂, d], and the interval that d is clamped to, normalised metres.
+    Surface(HashGrid<4>, (f32, f32)),
 }
 
 impl Encoder {
     pub fn new(config: &Config) -> Result<Self, Error> {
-        let EncodingConfig { levels, features, log2_table_size, n_min, n_max } = config.encoding;
+        let EncodingConfig { levels, features, log2_table_size, n_min, n_max, distance_min, distance_max } =
+            config.encoding;
         let grid = HashGridConfig { levels, features, log2_table_size, n_min, n_max };
         Ok(match config.method {
             Method::Prior | Method::Humannerf => Self::Frequency,
             Method::HashPoint => Self::Point(HashGrid::new(&grid)?),
-            Method::Occnerf => Self::Surface(HashGrid::new(&grid)?),
+            Method::Occnerf => Self::Surface(HashGrid::new(&grid)?, (distance_min, distance_max)),
         })
     }
 
@@ -40,7 +39,7 @@ impl Encoder {
         match self {
             Self::Frequency => 0,
             Self::Point(grid) => grid.num_parameters(),
-            Self::Surface(grid) => grid.num_parameters(),
+            Self::Surface(grid, _) => grid.num_parameters(),
         }
     }
 
@@ -48,7 +47,7 @@ impl Encoder {
         match self {
             Self::Frequency => 3 + 6 * BANDS,
             Self::Point(grid) => grid.num_features(),
-            Self::Surface(grid) => grid.num_features(),
+            Self::Surface(grid, _) => grid.num_features(),
         }
     }
 
@@ -56,7 +55,7 @@ impl Encoder {
         match self {
             Self::Frequency => Vec::new(),
             Self::Point(grid) => grid.init_table(seed),
-            Self::Surface(grid) => grid.init_table(seed),
+            Self::Surface(grid, _) => grid.init_table(seed),
         }
     }
 
@@ -67,10 +66,22 @@ impl Encoder {
         match self {
             Self::Frequency => out.point.extend(samples.canonical.iter().map(Vec3::to_array)),
             Self::Point(_) => out.point.extend(samples.canonical.iter().map(|&x| in_box(x, region).to_array())),
-            Self::Surface(_) => out.surface.extend(
-                samples.closest.iter().zip(&samples.distance).map(|(&v, &d)| surface_coordinates(v, d, region)),
+            Self::Surface(_, range) => out.surface.extend(
+                samples.closest.iter().zip(&samples.distance).map(|(&v, &d)| surface_coordinates(v, d, region, *range)),
             ),
         }
+    }
+
+    /// Adds a vertex with its signed distance; for the encoding of [v̂, d] alone.
+    pub fn push_vertex(&self, v: Vec3, d: f32, region: &Aabb, out: &mut Coordinates) {
+        if let Self::Surface(_, range) = self {
+            out.surface.push(surface_coordinates(v, d, region, *range));
+        }
+    }
+
+    /// Whether d takes part: beyond the clamp its gradient is zero.
+    pub fn distance_is_inside(&self, d: f32) -> bool {
+        matches!(self, Self::Surface(_, (low, high)) if d > *low && d < *high)
     }
 
     /// Features (Q × F, row-major) of the coordinates.
@@ -88,7 +99,7 @@ impl Encoder {
                 }
             }
             Self::Point(grid) => grid.encode(table, &at.point, features),
-            Self::Surface(grid) => grid.encode(table, &at.surface, features),
+            Self::Surface(grid, _) => grid.encode(table, &at.surface, features),
         }
     }
 
@@ -97,7 +108,7 @@ impl Encoder {
         match self {
             Self::Frequency => {}
             Self::Point(grid) => grid.encode_backward(&at.point, d_features, d_table),
-            Self::Surface(grid) => grid.encode_backward(&at.surface, d_features, d_table),
+            Self::Surface(grid, _) => grid.encode_backward(&at.surface, d_features, d_table),
         }
     }
 
@@ -132,10 +143,10 @@ impl Encoder {
                 grid.encode_backward_points(table, &at.point, d_features, &mut d);
                 d.into_iter().map(|d| (Vec3::from_array(d) * per_metre, 0.0)).collect()
             }
-            Self::Surface(grid) => {
+            Self::Surface(grid, range) => {
                 let mut d = vec![[0.0; 4]; at.surface.len()];
                 grid.encode_backward_points(table, &at.surface, d_features, &mut d);
-                let per_distance = 1.0 / (DISTANCE.1 - DISTANCE.0);
+                let per_distance = 1.0 / (range.1 - range.0);
                 d.into_iter().map(|[x, y, z, w]| (Vec3::new(x, y, z) * per_metre, w * per_distance)).collect()
             }
         }
@@ -166,12 +177,7 @@ fn in_box(x: Vec3, region: &Aabb) -> Vec3 {
 }
 
 /// [v̂, d] in the unit box.
-pub(crate) fn surface_coordinates(v: Vec3, d: f32, region: &Aabb) -> [f32; 4] {
+fn surface_coordinates(v: Vec3, d: f32, region: &Aabb, (low, high): (f32, f32)) -> [f32; 4] {
     let p = in_box(v, region);
-    [p.x, p.y, p.z, (d.clamp(DISTANCE.0, DISTANCE.1) - DISTANCE.0) / (DISTANCE.1 - DISTANCE.0)]
-}
-
-/// Whether d takes part: beyond the clamp its gradient is zero.
-pub(crate) fn distance_is_inside(d: f32) -> bool {
-    d > DISTANCE.0 && d < DISTANCE.1
+    [p.x, p.y, p.z, (d.clamp(low, high) - low) / (high - low)]
 }

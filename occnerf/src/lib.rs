@@ -40,11 +40,13 @@ mod mlp;
 mod occupancy;
 mod parameters;
 mod pixels;
+mod presets;
 mod prior;
 mod random;
 mod render;
 mod samples;
 mod scene;
+mod step;
 mod trainer;
 mod vertices;
 

@@ -210,7 +210,7 @@ mod tests {
     #[test]
     fn patches_smaller_than_the_window_cost_nothing() {
         let a = patch(4, 1);
-        assert_eq!(multiscale_dissimilarity(&a, &patch(4, 2), 4, 1.0, &mut vec![0.0; 48]), 0.0);
+        assert_eq!(multiscale_dissimilarity(&a, &patch(4, 2), 4, 1.0, &mut [0.0; 48]), 0.0);
     }
 
     #[test]

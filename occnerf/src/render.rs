@@ -36,7 +36,7 @@ pub fn view_of(scene: &Scene, camera: &Camera, posed: Posed) -> PreparedFrame {
     PreparedFrame {
         name: String::new(),
         camera_name: String::new(),
-        camera: camera.clone(),
+        camera: *camera,
         to_canonical: posed.bones.iter().map(glam::Affine3A::inverse).collect(),
         posed,
         pixels: Vec::new(),

@@ -214,7 +214,7 @@ pub(crate) fn view(camera: &Camera) -> View {
 
 /// A camera with its lengths multiplied by `scale`.
 pub(crate) fn normalised_camera(camera: &Camera, scale: f32) -> Camera {
-    let mut camera = camera.clone();
+    let mut camera = *camera;
     camera.world_to_camera.translation *= scale;
     camera
 }

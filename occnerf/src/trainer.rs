@@ -4,17 +4,14 @@ use glam::Vec3;
 use rayon::prelude::*;
 use smpl::WeightVolume;
 use visibility::VisibilityCounts;
-use volrender::{Composite, composite, composite_backward};
+use volrender::{Composite, composite};
 
 use crate::Error;
-use crate::batch::{Batch, target};
+use crate::batch::Batch;
 use crate::config::{Config, DistanceKind, MotionKind};
 use crate::encoder::Coordinates;
 use crate::field::{Field, Group};
-use crate::loss::{completeness, multiscale_dissimilarity};
 use crate::parameters::{PARTS, Parameters, Part};
-use crate::pixels::Label;
-use crate::random::Stream;
 use crate::samples::{Stage, Tracer};
 use crate::scene::{PreparedFrame, Scene};
 use crate::vertices::VertexCode;
@@ -22,7 +19,6 @@ use crate::vertices::VertexCode;
 /// Rays are dealt row by row to this many groups, each with its own gradient buffers, summed in order: the result
 /// does not depend on who computes a group. Eight keep two to eight threads busy.
 const GROUPS: usize = 8;
-const JITTER: u64 = 0x4A49_5454;
 
 /// What a step did.
 #[derive(Clone, Copy, Debug, Default, serde::Serialize)]
@@ -56,29 +52,29 @@ pub struct Trainer<'a> {
     pub(crate) counts: VisibilityCounts,
     pub(crate) volume: Option<WeightVolume>,
     pub(crate) steps_done: u64,
-    stage: Stage,
+    pub(crate) stage: Stage,
     batch: Batch,
-    groups: Vec<GroupState>,
-    vertex_code: VertexCode,
-    transposed: Vec<f32>,
-    all_at: Coordinates,
-    all_d_features: Vec<f32>,
+    pub(crate) groups: Vec<GroupState>,
+    pub(crate) vertex_code: VertexCode,
+    pub(crate) transposed: Vec<f32>,
+    pub(crate) all_at: Coordinates,
+    pub(crate) all_d_features: Vec<f32>,
 }
 
 #[derive(Default)]
-struct GroupState {
-    group: Group,
+pub(crate) struct GroupState {
+    pub group: Group,
     /// Indices into the batch of this group's rays.
-    rays: Vec<usize>,
-    composites: Vec<Composite>,
-    weights: Vec<f32>,
-    d_mlp: Vec<f32>,
-    d_vertices: Vec<f32>,
-    d_volume: Vec<f32>,
+    pub rays: Vec<usize>,
+    pub composites: Vec<Composite>,
+    pub weights: Vec<f32>,
+    pub d_mlp: Vec<f32>,
+    pub d_vertices: Vec<f32>,
+    pub d_volume: Vec<f32>,
     /// Sum of the completeness terms.
-    completeness: f64,
+    pub completeness: f64,
     /// Finest neighbours of the termination points.
-    terminations: Vec<u32>,
+    pub terminations: Vec<u32>,
 }
 
 impl<'a> Trainer<'a> {
@@ -210,183 +206,6 @@ impl<'a> Trainer<'a> {
         self.steps_done += 1;
         report
     }
-
-    /// Traces, encodes, evaluates and composites the rays of a group.
-    fn forward(&self, state: &mut GroupState, batch: &Batch, frame: &PreparedFrame) {
-        let tracer = self.tracer(&self.stage, frame);
-        state.group.samples.clear();
-        for &ray in &state.rays {
-            let pixel = batch.pixels[ray];
-            let jitter = Stream::new(&[self.config.seed, JITTER, self.steps_done, ray as u64]);
-            state.group.samples.trace(&tracer, &pixel_ray(frame, pixel), Some(jitter));
-        }
-        let (field, table) = (self.parameters.get(Part::Field), self.parameters.get(Part::Table));
-        self.field.forward(field, table, &self.vertex_code.features, &self.counts, &mut state.group);
-        composite_group(&state.group, batch.background, &mut state.weights, &mut state.composites);
-        state.terminations.clear();
-        let samples = &state.group.samples;
-        if samples.neighbours.is_empty() {
-            return;
-        }
-        let per_sample = samples.neighbours.len() / samples.len();
-        for (index, &ray) in state.rays.iter().enumerate() {
-            let composite = &state.composites[index];
-            let visible = frame.labels[batch.pixels[ray] as usize] == Label::Subject && composite.opacity > 0.5;
-            if let Some(t) = composite.termination.filter(|_| visible) {
-                let first = (samples.starts[index] + t as usize) * per_sample;
-                state.terminations.extend_from_slice(&samples.neighbours[first..][..self.config.surface.k]);
-            }
-        }
-    }
-
-    /// Photometric losses over the patches; returns d loss / d colour of each ray of the batch.
-    fn photometric(
-        &self,
-        groups: &[GroupState],
-        batch: &Batch,
-        frame: &PreparedFrame,
-        report: &mut StepReport,
-    ) -> Vec<Vec3> {
-        let mut colors = vec![Vec3::ZERO; batch.pixels.len()];
-        for state in groups {
-            for (&ray, composite) in state.rays.iter().zip(&state.composites) {
-                colors[ray] = composite.color;
-            }
-        }
-        let targets: Vec<Option<Vec3>> = batch.pixels.iter().map(|&p| target(frame, p, batch.background)).collect();
-        let known = targets.iter().flatten().count();
-        let loss = &self.config.loss;
-        let mut d_colors = vec![Vec3::ZERO; colors.len()];
-        let mut squares = 0.0f64;
-        for ((color, target), d) in colors.iter().zip(&targets).zip(&mut d_colors) {
-            if let Some(target) = target {
-                let error = *color - *target;
-                squares += f64::from(error.length_squared());
-                *d = loss.mse * 2.0 / (3 * known) as f32 * error;
-            }
-        }
-        report.mse = squares / (3 * known.max(1)) as f64;
-        report.psnr = -10.0 * report.mse.max(1e-12).log10();
-        if loss.perceptual > 0.0 {
-            let patch = batch.size * batch.size;
-            let scale = loss.perceptual / self.config.patches as f32;
-            let values: Vec<f64> = d_colors
-                .par_chunks_mut(patch)
-                .zip(colors.par_chunks(patch).zip(targets.par_chunks(patch)))
-                .map(|(d_colors, (colors, targets))| perceptual(colors, targets, batch.size, scale, d_colors))
-                .collect();
-            report.perceptual = values.iter().sum::<f64>() / self.config.patches as f64;
-        }
-        d_colors
-    }
-
-    /// Backward of [`Trainer::forward`] with the completeness term added.
-    fn backward(&self, state: &mut GroupState, batch: &Batch, frame: &PreparedFrame, d_colors: &[Vec3]) {
-        let group = &mut state.group;
-        let n = group.samples.len();
-        group.d_sigma.resize(n, 0.0);
-        group.d_rgb.resize(n, Vec3::ZERO);
-        group.d_likelihood.resize(n, 0.0);
-        let loss = &self.config.loss;
-        for (index, &ray) in state.rays.iter().enumerate() {
-            let range = group.samples.starts[index]..group.samples.starts[index + 1];
-            composite_backward(
-                &group.sigma[range.clone()],
-                &group.samples.likelihood[range.clone()],
-                &group.samples.delta[range.clone()],
-                &group.rgb[range.clone()],
-                batch.background,
-                &state.weights[range.clone()],
-                d_colors[ray],
-                0.0,
-                &mut group.d_sigma[range.clone()],
-                &mut group.d_rgb[range.clone()],
-                &mut group.d_likelihood[range],
-            );
-        }
-        state.completeness = 0.0;
-        if loss.completeness > 0.0 {
-            let scale = loss.completeness / (batch.pixels.len() * self.config.samples) as f32;
-            for s in (0..n).filter(|&s| group.samples.distance[s] < 0.0) {
-                let (value, slope) = completeness(group.sigma[s], loss.beta);
-                state.completeness += f64::from(value);
-                group.d_sigma[s] += scale * slope;
-            }
-        }
-        zero(&mut state.d_mlp, self.parameters.get(Part::Field).len());
-        zero(&mut state.d_vertices, self.vertex_code.features.len());
-        self.field.backward(&self.transposed, group, &mut state.d_mlp, &mut state.d_vertices);
-        if let Some(volume) = &self.volume {
-            zero(&mut state.d_volume, volume.weights.len());
-            self.motion_backward(volume, group, frame, &mut state.d_volume);
-        }
-    }
-
-    /// Carries the gradients of the encoding's coordinates and of f into the weight volume.
-    fn motion_backward(&self, volume: &WeightVolume, group: &Group, frame: &PreparedFrame, d_volume: &mut [f32]) {
-        let (table, region) = (self.parameters.get(Part::Table), &self.scene.canonical_box);
-        let d_points = self.field.encoder.encode_backward_points(table, &group.at, &group.d_features, region);
-        let samples = &group.samples;
-        let per_sample = samples.neighbours.len().checked_div(samples.len()).unwrap_or(0);
-        for (s, (d_point, d_coordinate)) in d_points.into_iter().enumerate() {
-            let d_distance = group.d_distance[s]
-                + if crate::encoder::distance_is_inside(samples.distance[s]) { d_coordinate } else { 0.0 };
-            let x = samples.canonical[s];
-            let on_surface = !group.at.surface.is_empty();
-            let d_closest = if on_surface { d_point } else { Vec3::ZERO };
-            let through_surface = match self.config.surface.distance {
-                DistanceKind::Blended => {
-                    let finest = &samples.neighbours[s * per_sample..][..self.config.surface.k];
-                    self.scene.query.blend_backward(x, finest, d_closest, d_distance)
-                }
-                DistanceKind::Exact => {
-                    let away = (x - samples.closest[s]) * samples.distance[s].signum();
-                    let normal = away.normalize_or_zero();
-                    d_distance * normal + d_closest - normal.dot(d_closest) * normal
-                }
-            };
-            let d_canonical = through_surface + if on_surface { Vec3::ZERO } else { d_point };
-            let d_likelihood = group.d_likelihood[s];
-            volume.map_backward(&frame.to_canonical, samples.world[s], d_canonical, d_likelihood, d_volume);
-        }
-    }
-
-    /// Sums the groups' gradients in order and runs the parts of the backward pass that all samples share.
-    fn reduce(&mut self, groups: &[GroupState]) {
-        self.parameters.clear_gradients();
-        let sum = |to: &mut [f32], from: &(dyn Fn(&GroupState) -> &[f32] + Sync)| {
-            to.par_chunks_mut(1 << 12).enumerate().for_each(|(chunk, to)| {
-                for state in groups {
-                    let from = &from(state)[chunk << 12..][..to.len()];
-                    to.iter_mut().zip(from).for_each(|(to, from)| *to += from);
-                }
-            });
-        };
-        let d_mlp = self.parameters.gradient(Part::Field);
-        sum(d_mlp, &|g| &g.d_mlp);
-        self.field.mlp.clear_padding(d_mlp);
-        self.all_at.clear();
-        self.all_d_features.clear();
-        for state in groups {
-            self.all_at.extend(&state.group.at);
-            self.all_d_features.extend_from_slice(&state.group.d_features);
-        }
-        if self.field.surface_term {
-            let mut d_vertices = vec![0.0; self.vertex_code.features.len()];
-            sum(&mut d_vertices, &|g| &g.d_vertices);
-            let (table, d_offsets) = self.parameters.value_and_gradient(Part::Table, Part::Vertices);
-            self.vertex_code.backward(self.scene, &self.field.encoder, table, &d_vertices, d_offsets);
-            self.all_at.extend(&self.vertex_code.at);
-            self.all_d_features.extend_from_slice(&d_vertices);
-        }
-        let d_table = self.parameters.gradient(Part::Table);
-        self.field.encoder.encode_backward(&self.all_at, &self.all_d_features, d_table);
-        if let Some(volume) = &self.volume {
-            let mut d_weights = vec![0.0; volume.weights.len()];
-            sum(&mut d_weights, &|g| &g.d_volume);
-            volume.softmax_backward(&d_weights, self.parameters.gradient(Part::Motion));
-        }
-    }
 }
 
 /// The ray through a pixel's centre.
@@ -417,24 +236,4 @@ pub(crate) fn composite_group(
             &mut weights[range],
         ));
     }
-}
-
-/// The perceptual term of one patch; unknown pixels show the prediction on both sides and get no gradient.
-fn perceptual(colors: &[Vec3], targets: &[Option<Vec3>], size: usize, scale: f32, d_colors: &mut [Vec3]) -> f64 {
-    let flat = |c: Vec3| c.to_array();
-    let a: Vec<f32> = colors.iter().flat_map(|&c| flat(c)).collect();
-    let b: Vec<f32> = colors.iter().zip(targets).flat_map(|(&c, t)| flat(t.unwrap_or(c))).collect();
-    let mut d = vec![0.0; a.len()];
-    let value = multiscale_dissimilarity(&a, &b, size, scale, &mut d);
-    for ((d_color, d), target) in d_colors.iter_mut().zip(d.chunks_exact(3)).zip(targets) {
-        if target.is_some() {
-            *d_color += Vec3::from_slice(d);
-        }
-    }
-    value
-}
-
-fn zero(buffer: &mut Vec<f32>, len: usize) {
-    buffer.clear();
-    buffer.resize(len, 0.0);
 }

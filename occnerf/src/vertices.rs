@@ -4,7 +4,7 @@ use glam::Vec3;
 use rayon::prelude::*;
 
 use crate::config::{Config, DistanceKind};
-use crate::encoder::{Coordinates, Encoder, distance_is_inside, surface_coordinates};
+use crate::encoder::{Coordinates, Encoder};
 use crate::scene::Scene;
 
 const CHUNK: usize = 512;
@@ -36,7 +36,9 @@ impl VertexCode {
             })
             .collect_into_vec(&mut self.state);
         self.at.clear();
-        self.at.surface.extend(self.state.iter().map(|&(v, d, _)| surface_coordinates(v, d, &scene.canonical_box)));
+        for &(v, d, _) in &self.state {
+            encoder.push_vertex(v, d, &scene.canonical_box, &mut self.at);
+        }
         let width = encoder.num_features();
         self.features.resize(vertices.len() * width, 0.0);
         self.features.par_chunks_mut(CHUNK * width).enumerate().for_each(|(chunk, features)| {
@@ -57,7 +59,7 @@ impl VertexCode {
             for (((d_v, d_d), state), d_offset) in
                 d_points.into_iter().zip(&self.state[range]).zip(d_offsets.chunks_exact_mut(3))
             {
-                let through_distance = if distance_is_inside(state.1) { d_d * state.2 } else { Vec3::ZERO };
+                let through_distance = if encoder.distance_is_inside(state.1) { d_d * state.2 } else { Vec3::ZERO };
                 (d_v + through_distance).write_to_slice(d_offset);
             }
         });

@@ -1,4 +1,5 @@
 //! The scores of renderers whose scores are known beforehand.
+#![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
 
 mod common;
 

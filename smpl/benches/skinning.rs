@@ -7,9 +7,7 @@ use divan::counter::ItemsCount;
 use divan::{Bencher, black_box};
 use glam::Vec3;
 use rayon::prelude::*;
-use smpl::{
-    BodyModel, Placement, Shaped, SparseRows, SurfaceMotion, WeightVolume, WeightVolumeConfig,
-};
+use smpl::{BodyModel, Placement, Shaped, SparseRows, SurfaceMotion, WeightVolume, WeightVolumeConfig};
 
 fn main() {
     divan::main();
@@ -24,16 +22,13 @@ fn body() -> BodyModel {
 
 fn dense() -> BodyModel {
     let mut body = body();
-    let row =
-        |v: usize| (0..207u32).map(move |t| (t, Vec3::splat(1e-4) * ((v + t as usize) % 7) as f32));
+    let row = |v: usize| (0..207u32).map(move |t| (t, Vec3::splat(1e-4) * ((v + t as usize) % 7) as f32));
     body.posedirs = SparseRows::from_rows((0..body.num_vertices()).map(row));
     body
 }
 
 fn pose(seed: usize) -> Vec<Vec3> {
-    (0..24)
-        .map(|i| Vec3::new(0.1, -0.2, 0.15) * ((i * 7 + seed) % 5) as f32 * 0.4)
-        .collect()
+    (0..24).map(|i| Vec3::new(0.1, -0.2, 0.15) * ((i * 7 + seed) % 5) as f32 * 0.4).collect()
 }
 
 mod one_frame {
@@ -74,9 +69,8 @@ mod batch_of_32 {
         bencher.counter(ItemsCount::new(32usize)).bench(|| {
             let shape = |_| body.shaped(black_box(&BETAS));
             let shaped: Vec<Shaped> = (0..32).into_par_iter().map(shape).collect();
-            let frames: Vec<_> = (shaped.iter().zip(&poses))
-                .map(|(s, p)| (s, p.as_slice(), Placement::default()))
-                .collect();
+            let frames: Vec<_> =
+                (shaped.iter().zip(&poses)).map(|(s, p)| (s, p.as_slice(), Placement::default())).collect();
             body.pose_batch(&frames)
         });
     }
@@ -100,18 +94,16 @@ mod motion {
         let body = body();
         let posed = body.pose(&body.shaped(&BETAS), &pose(0), Placement::default());
         let field = SurfaceMotion::default();
-        bencher
-            .counter(ItemsCount::new(body.faces.len()))
-            .bench(|| {
-                let mut sum = Vec3::ZERO;
-                for (i, face) in body.faces.iter().enumerate() {
-                    let x = posed.vertices[face[0] as usize];
-                    if let Some(s) = field.map(&body, &posed, x, i as u32, [0.4, 0.3, 0.3], 0.0) {
-                        sum += s.canonical;
-                    }
+        bencher.counter(ItemsCount::new(body.faces.len())).bench(|| {
+            let mut sum = Vec3::ZERO;
+            for (i, face) in body.faces.iter().enumerate() {
+                let x = posed.vertices[face[0] as usize];
+                if let Some(s) = field.map(&body, &posed, x, i as u32, [0.4, 0.3, 0.3], 0.0) {
+                    sum += s.canonical;
                 }
-                sum
-            });
+            }
+            sum
+        });
     }
 
     #[divan::bench]
@@ -121,17 +113,15 @@ mod motion {
         let posed = body.pose(&shaped, &pose(0), Placement::default());
         let to_canonical = posed.to_canonical();
         let volume = WeightVolume::diffused(&body, &shaped, &WeightVolumeConfig::default());
-        bencher
-            .counter(ItemsCount::new(posed.vertices.len()))
-            .bench(|| {
-                let mut sum = Vec3::ZERO;
-                for &x in &posed.vertices {
-                    if let Some(s) = volume.map(&to_canonical, x, 1e-3) {
-                        sum += s.canonical;
-                    }
+        bencher.counter(ItemsCount::new(posed.vertices.len())).bench(|| {
+            let mut sum = Vec3::ZERO;
+            for &x in &posed.vertices {
+                if let Some(s) = volume.map(&to_canonical, x, 1e-3) {
+                    sum += s.canonical;
                 }
-                sum
-            });
+            }
+            sum
+        });
     }
 
     #[divan::bench]
@@ -142,13 +132,11 @@ mod motion {
         let to_canonical = posed.to_canonical();
         let volume = WeightVolume::diffused(&body, &shaped, &WeightVolumeConfig::default());
         let mut d_weights = vec![0.0; volume.weights.len()];
-        bencher
-            .counter(ItemsCount::new(posed.vertices.len()))
-            .bench_local(|| {
-                for &x in &posed.vertices {
-                    volume.map_backward(&to_canonical, x, Vec3::ONE, 1.0, &mut d_weights);
-                }
-            });
+        bencher.counter(ItemsCount::new(posed.vertices.len())).bench_local(|| {
+            for &x in &posed.vertices {
+                volume.map_backward(&to_canonical, x, Vec3::ONE, 1.0, &mut d_weights);
+            }
+        });
     }
 
     #[divan::bench]

@@ -20,11 +20,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         Some(path) => BodyModel::load(&path)?,
         None => BodyModel::embedded(),
     };
-    println!(
-        "{} vertices, {} faces",
-        body.num_vertices(),
-        body.faces.len()
-    );
+    println!("{} vertices, {} faces", body.num_vertices(), body.faces.len());
 
     let joint = |rotations: &[(usize, [f32; 3])]| {
         let mut pose = vec![Vec3::ZERO; body.num_joints()];
@@ -96,8 +92,7 @@ fn draw(body: &BodyModel, posed: &Posed, turn: f32, centre: Vec3, scale: f32) ->
     let mut normals = vec![Vec3::ZERO; vertices.len()];
     for face in &body.faces {
         let [a, b, c] = face.map(|i| vertices[i as usize]);
-        face.iter()
-            .for_each(|&i| normals[i as usize] += (b - a).cross(c - a));
+        face.iter().for_each(|&i| normals[i as usize] += (b - a).cross(c - a));
     }
     let light = Vec3::new(0.4, 0.5, 0.8).normalize_or_zero();
     let middle = Vec2::new(WIDTH as f32, HEIGHT as f32) / 2.0;
@@ -112,11 +107,7 @@ fn draw(body: &BodyModel, posed: &Posed, turn: f32, centre: Vec3, scale: f32) ->
         for y in low.y as usize..(high.y as usize + 1).min(HEIGHT) {
             for x in low.x as usize..(high.x as usize + 1).min(WIDTH) {
                 let p = Vec2::new(x as f32 + 0.5, y as f32 + 0.5);
-                let w = [
-                    (c - b).perp_dot(p - b),
-                    (a - c).perp_dot(p - c),
-                    (b - a).perp_dot(p - a),
-                ];
+                let w = [(c - b).perp_dot(p - b), (a - c).perp_dot(p - c), (b - a).perp_dot(p - a)];
                 let w = w.map(|w| w / area);
                 if w.iter().any(|w| w.is_nan() || *w < 0.0) {
                     continue;
@@ -126,11 +117,7 @@ fn draw(body: &BodyModel, posed: &Posed, turn: f32, centre: Vec3, scale: f32) ->
                     depth[y * WIDTH + x] = z;
                     let normal: Vec3 = (0..3).map(|i| w[i] * normals[face[i] as usize]).sum();
                     let shade = normal.normalize_or_zero().dot(light).max(0.0);
-                    picture.put_pixel(
-                        x as u32,
-                        y as u32,
-                        image::Luma([(45.0 + 190.0 * shade) as u8]),
-                    );
+                    picture.put_pixel(x as u32, y as u32, image::Luma([(45.0 + 190.0 * shade) as u8]));
                 }
             }
         }

@@ -59,12 +59,7 @@ impl NdArray {
     ///
     /// # Errors
     /// [`Error::Shape`]; [`Error::NotFinite`] for NaN, infinities and values beyond `f32`.
-    pub fn to_f32(
-        &self,
-        file: &str,
-        key: &str,
-        pattern: &[Option<usize>],
-    ) -> Result<Vec<f32>, Error> {
+    pub fn to_f32(&self, file: &str, key: &str, pattern: &[Option<usize>]) -> Result<Vec<f32>, Error> {
         self.check_shape(file, key, pattern)?;
         let values: Vec<f32> = match &self.data {
             Data::F64(v) => v.iter().map(|&x| x as f32).collect(),
@@ -73,11 +68,7 @@ impl NdArray {
             Data::Bool(v) => v.iter().map(|&x| f32::from(u8::from(x))).collect(),
         };
         match values.iter().position(|x| !x.is_finite()) {
-            Some(index) => Err(Error::NotFinite {
-                file: file.to_owned(),
-                key: key.to_owned(),
-                index,
-            }),
+            Some(index) => Err(Error::NotFinite { file: file.to_owned(), key: key.to_owned(), index }),
             None => Ok(values),
         }
     }
@@ -86,12 +77,7 @@ impl NdArray {
     ///
     /// # Errors
     /// [`Error::Shape`]; [`Error::Type`] for floats.
-    pub fn to_i64(
-        &self,
-        file: &str,
-        key: &str,
-        pattern: &[Option<usize>],
-    ) -> Result<Vec<i64>, Error> {
+    pub fn to_i64(&self, file: &str, key: &str, pattern: &[Option<usize>]) -> Result<Vec<i64>, Error> {
         self.check_shape(file, key, pattern)?;
         match &self.data {
             Data::I64(v) => Ok(v.clone()),
@@ -113,10 +99,7 @@ impl NdArray {
         if fits {
             return Ok(());
         }
-        let sizes: Vec<String> = pattern
-            .iter()
-            .map(|p| p.map_or("_".to_owned(), |n| n.to_string()))
-            .collect();
+        let sizes: Vec<String> = pattern.iter().map(|p| p.map_or("_".to_owned(), |n| n.to_string())).collect();
         Err(Error::Shape {
             file: file.to_owned(),
             key: key.to_owned(),
@@ -163,11 +146,7 @@ impl ElementType {
             Kind::Signed | Kind::Unsigned => matches!(size, 1 | 2 | 4 | 8),
             Kind::Float => matches!(size, 2 | 4 | 8),
         };
-        known.then_some(Self {
-            kind,
-            size,
-            big_endian,
-        })
+        known.then_some(Self { kind, size, big_endian })
     }
 
     /// Bytes a value.
@@ -177,10 +156,7 @@ impl ElementType {
 
     /// The same type in the named byte order (`<`, `>`, `|` or `=`).
     pub(crate) fn with_order(self, order: &str) -> Self {
-        Self {
-            big_endian: order == ">",
-            ..self
-        }
+        Self { big_endian: order == ">", ..self }
     }
 
     /// Decodes an array. `None` unless `bytes` has exactly the length that `shape` demands.
@@ -202,20 +178,11 @@ impl ElementType {
                 _ => Data::F64(self.gather(bytes, shape, fortran, f64::from_bits)),
             },
         };
-        Some(NdArray {
-            shape: shape.to_vec(),
-            data,
-        })
+        Some(NdArray { shape: shape.to_vec(), data })
     }
 
     /// Values in row-major order, each from its bits in the low end of a word.
-    fn gather<T: Clone>(
-        self,
-        bytes: &[u8],
-        shape: &[usize],
-        fortran: bool,
-        value: impl Fn(u64) -> T,
-    ) -> Vec<T> {
+    fn gather<T: Clone>(self, bytes: &[u8], shape: &[usize], fortran: bool, value: impl Fn(u64) -> T) -> Vec<T> {
         let word = |chunk: &[u8]| {
             let mut buffer = [0u8; 8];
             buffer[..chunk.len()].copy_from_slice(chunk);
@@ -257,9 +224,7 @@ pub(crate) fn element_count(shape: &[usize]) -> Option<u128> {
     if shape.contains(&0) {
         return Some(0);
     }
-    shape
-        .iter()
-        .try_fold(1u128, |n, &extent| n.checked_mul(extent as u128))
+    shape.iter().try_fold(1u128, |n, &extent| n.checked_mul(extent as u128))
 }
 
 /// IEEE half precision.

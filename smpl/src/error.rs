@@ -115,10 +115,6 @@ pub enum Error {
 impl Error {
     /// Shorthand for [`Error::Invalid`].
     pub(crate) fn invalid(file: &str, key: &str, message: impl Into<String>) -> Self {
-        Self::Invalid {
-            file: file.to_owned(),
-            key: key.to_owned(),
-            message: message.into(),
-        }
+        Self::Invalid { file: file.to_owned(), key: key.to_owned(), message: message.into() }
     }
 }

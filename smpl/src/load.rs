@@ -32,10 +32,7 @@ impl BodyModel {
                 let value = pickle::read(path)?;
                 build(&file, |key| from_pickle(&file, &value, key))
             }
-            _ => Err(Error::Extension {
-                path: path.to_owned(),
-                expected: ".npz or .pkl",
-            }),
+            _ => Err(Error::Extension { path: path.to_owned(), expected: ".npz or .pkl" }),
         }
     }
 }
@@ -59,15 +56,10 @@ fn from_pickle(file: &str, value: &Value, key: &str) -> Result<NdArray, Error> {
             available: names.map(str::to_owned).collect(),
         });
     };
-    found
-        .to_dense(file, key)?
-        .ok_or_else(|| wrong(key, "an array", found))
+    found.to_dense(file, key)?.ok_or_else(|| wrong(key, "an array", found))
 }
 
-fn build(
-    file: &str,
-    mut array: impl FnMut(&str) -> Result<NdArray, Error>,
-) -> Result<BodyModel, Error> {
+fn build(file: &str, mut array: impl FnMut(&str) -> Result<NdArray, Error>) -> Result<BodyModel, Error> {
     let v_template = array("v_template")?.to_f32(file, "v_template", &[None, Some(3)])?;
     let v = v_template.len() / 3;
 
@@ -76,9 +68,8 @@ fn build(
     let parents = parents(file, &kintree)?;
 
     let faces = array("f")?.to_i64(file, "f", &[None, Some(3)])?;
-    let faces = faces.iter().map(|&i| {
-        u32::try_from(i).map_err(|_| Error::invalid(file, "f", format!("vertex index {i}")))
-    });
+    let faces =
+        faces.iter().map(|&i| u32::try_from(i).map_err(|_| Error::invalid(file, "f", format!("vertex index {i}"))));
     let faces: Vec<u32> = faces.collect::<Result<_, _>>()?;
 
     let weights = array("weights")?.to_f32(file, "weights", &[Some(v), Some(j)])?;
@@ -131,9 +122,7 @@ fn parents(file: &str, kintree: &[i64]) -> Result<Vec<Option<usize>>, Error> {
         match usize::try_from(parent) {
             Ok(p) if p < i => out.push(Some(p)),
             _ => {
-                return invalid(format!(
-                    "parent of joint {i} is {parent}, expected a joint before it"
-                ));
+                return invalid(format!("parent of joint {i} is {parent}, expected a joint before it"));
             }
         }
     }

@@ -67,17 +67,9 @@ impl BodyModel {
     /// With more betas than the model has: compare with [`BodyModel::num_betas`] first where they come from a file.
     #[must_use]
     pub fn shaped(&self, betas: &[f32]) -> Shaped {
-        assert!(
-            betas.len() <= self.num_betas(),
-            "shaped: {} betas, the model has {}",
-            betas.len(),
-            self.num_betas()
-        );
+        assert!(betas.len() <= self.num_betas(), "shaped: {} betas, the model has {}", betas.len(), self.num_betas());
         let mut vertices = self.v_template.clone();
-        for (&beta, directions) in betas
-            .iter()
-            .zip(self.shapedirs.chunks(vertices.len().max(1)))
-        {
+        for (&beta, directions) in betas.iter().zip(self.shapedirs.chunks(vertices.len().max(1))) {
             if beta != 0.0 {
                 for (v, &d) in vertices.iter_mut().zip(directions) {
                     *v += beta * d;
@@ -123,8 +115,7 @@ impl BodyModel {
         }
         for (i, &parent) in self.parents.iter().enumerate().skip(1) {
             if parent.is_none_or(|p| p >= i) {
-                let message =
-                    format!("parent of joint {i} is {parent:?}, expected a joint before it");
+                let message = format!("parent of joint {i} is {parent:?}, expected a joint before it");
                 return invalid("kintree_table", message);
             }
         }
@@ -164,11 +155,7 @@ impl BodyModel {
 
 fn finite(file: &str, key: &str, values: &[Vec3]) -> Result<(), Error> {
     match values.iter().position(|v| !v.is_finite()) {
-        Some(index) => Err(Error::NotFinite {
-            file: file.to_owned(),
-            key: key.to_owned(),
-            index: 3 * index,
-        }),
+        Some(index) => Err(Error::NotFinite { file: file.to_owned(), key: key.to_owned(), index: 3 * index }),
         None => Ok(()),
     }
 }

@@ -41,22 +41,14 @@ impl Npz {
     /// # Errors
     /// [`Error::Npy`] if they are no zip archive.
     pub fn from_bytes(file: &str, bytes: Vec<u8>) -> Result<Self, Error> {
-        let malformed = |message: String| Error::Npy {
-            file: file.to_owned(),
-            key: String::new(),
-            message,
-        };
+        let malformed = |message: String| Error::Npy { file: file.to_owned(), key: String::new(), message };
         let archive = ZipArchive::new(Cursor::new(bytes)).map_err(|e| malformed(e.to_string()))?;
         let mut keys = Vec::with_capacity(archive.len());
         for name in archive.file_names() {
             let name = name.map_err(|e| malformed(e.to_string()))?;
             keys.push(name.strip_suffix(".npy").unwrap_or(&name).to_owned());
         }
-        Ok(Self {
-            file: file.to_owned(),
-            archive,
-            keys,
-        })
+        Ok(Self { file: file.to_owned(), archive, keys })
     }
 
     /// The name used in errors.
@@ -97,11 +89,7 @@ impl Npz {
     ///
     /// # Errors
     /// Those of [`Npz::array`] and [`NdArray::to_f32`].
-    pub fn f32(
-        &mut self,
-        key: &str,
-        pattern: &[Option<usize>],
-    ) -> Result<(Vec<usize>, Vec<f32>), Error> {
+    pub fn f32(&mut self, key: &str, pattern: &[Option<usize>]) -> Result<(Vec<usize>, Vec<f32>), Error> {
         let array = self.array(key)?;
         let values = array.to_f32(&self.file, key, pattern)?;
         Ok((array.shape, values))
@@ -112,11 +100,7 @@ impl Npz {
     ///
     /// # Errors
     /// Those of [`Npz::array`] and [`NdArray::to_i64`].
-    pub fn i64(
-        &mut self,
-        key: &str,
-        pattern: &[Option<usize>],
-    ) -> Result<(Vec<usize>, Vec<i64>), Error> {
+    pub fn i64(&mut self, key: &str, pattern: &[Option<usize>]) -> Result<(Vec<usize>, Vec<i64>), Error> {
         let array = self.array(key)?;
         let values = array.to_i64(&self.file, key, pattern)?;
         Ok((array.shape, values))
@@ -134,10 +118,7 @@ pub fn read_npy(path: &Path) -> Result<NdArray, Error> {
 
 /// The whole file, if it is not too large.
 pub(crate) fn read_file(path: &Path) -> Result<Vec<u8>, Error> {
-    let io = |source| Error::Io {
-        path: path.to_owned(),
-        source,
-    };
+    let io = |source| Error::Io { path: path.to_owned(), source };
     let length = std::fs::metadata(path).map_err(io)?.len();
     if length > MAX_FILE_BYTES {
         return Err(Error::TooLarge {
@@ -159,16 +140,8 @@ pub(crate) struct NpyHeader {
 }
 
 /// Reads magic, version and header text, leaving `reader` at the data.
-pub(crate) fn read_header(
-    file: &str,
-    key: &str,
-    reader: &mut impl Read,
-) -> Result<NpyHeader, Error> {
-    let malformed = |message: String| Error::Npy {
-        file: file.to_owned(),
-        key: key.to_owned(),
-        message,
-    };
+pub(crate) fn read_header(file: &str, key: &str, reader: &mut impl Read) -> Result<NpyHeader, Error> {
+    let malformed = |message: String| Error::Npy { file: file.to_owned(), key: key.to_owned(), message };
     let truncated = |e: std::io::Error| malformed(format!("header: {e}"));
     let mut start = [0u8; 8];
     reader.read_exact(&mut start).map_err(truncated)?;
@@ -217,11 +190,7 @@ fn parse_header(text: &str) -> Option<NpyHeader> {
             "shape" => {
                 let (inside, after) = after.strip_prefix('(')?.split_once(')')?;
                 let extents = inside.split(',').map(str::trim).filter(|s| !s.is_empty());
-                shape = Some(
-                    extents
-                        .map(|s| s.parse().ok())
-                        .collect::<Option<Vec<_>>>()?,
-                );
+                shape = Some(extents.map(|s| s.parse().ok()).collect::<Option<Vec<_>>>()?);
                 after
             }
             _ => return None,
@@ -231,11 +200,7 @@ fn parse_header(text: &str) -> Option<NpyHeader> {
     }
     // numpy itself has no more than 64 axes.
     let shape: Vec<usize> = shape.filter(|s: &Vec<usize>| s.len() <= 64)?;
-    Some(NpyHeader {
-        descr: descr?,
-        fortran: fortran?,
-        shape,
-    })
+    Some(NpyHeader { descr: descr?, fortran: fortran?, shape })
 }
 
 /// A string literal without escapes, and what follows it.
@@ -246,11 +211,7 @@ fn quoted(text: &str) -> Option<(&str, &str)> {
 
 /// Reads one array of plain values to the end of `reader`.
 pub(crate) fn read_array(file: &str, key: &str, mut reader: impl Read) -> Result<NdArray, Error> {
-    let malformed = |message: String| Error::Npy {
-        file: file.to_owned(),
-        key: key.to_owned(),
-        message,
-    };
+    let malformed = |message: String| Error::Npy { file: file.to_owned(), key: key.to_owned(), message };
     let header = read_header(file, key, &mut reader)?;
     let Some(element) = ElementType::parse(&header.descr) else {
         return Err(Error::Type {
@@ -260,34 +221,20 @@ pub(crate) fn read_array(file: &str, key: &str, mut reader: impl Read) -> Result
             actual: format!("of element type {:?}", header.descr),
         });
     };
-    let claimed = element_count(&header.shape)
-        .and_then(|n| n.checked_mul(element.size() as u128))
-        .unwrap_or(u128::MAX);
+    let claimed = element_count(&header.shape).and_then(|n| n.checked_mul(element.size() as u128)).unwrap_or(u128::MAX);
     if claimed > u128::from(MAX_ARRAY_BYTES) {
-        return Err(Error::TooLarge {
-            file: file.to_owned(),
-            key: key.to_owned(),
-            claimed,
-            limit: MAX_ARRAY_BYTES,
-        });
+        return Err(Error::TooLarge { file: file.to_owned(), key: key.to_owned(), claimed, limit: MAX_ARRAY_BYTES });
     }
     // One byte more than claimed, so that trailing bytes are noticed and a zip entry's checksum is verified.
     let mut bytes = Vec::new();
-    (reader.take(claimed as u64 + 1).read_to_end(&mut bytes))
-        .map_err(|e| malformed(e.to_string()))?;
-    element
-        .decode(&bytes, &header.shape, header.fortran)
-        .ok_or_else(|| {
-            malformed(format!(
-                "shape {:?} of {} takes {claimed} bytes, found {}{}",
-                header.shape,
-                header.descr,
-                if bytes.len() as u128 > claimed {
-                    "at least "
-                } else {
-                    ""
-                },
-                bytes.len()
-            ))
-        })
+    (reader.take(claimed as u64 + 1).read_to_end(&mut bytes)).map_err(|e| malformed(e.to_string()))?;
+    element.decode(&bytes, &header.shape, header.fortran).ok_or_else(|| {
+        malformed(format!(
+            "shape {:?} of {} takes {claimed} bytes, found {}{}",
+            header.shape,
+            header.descr,
+            if bytes.len() as u128 > claimed { "at least " } else { "" },
+            bytes.len()
+        ))
+    })
 }

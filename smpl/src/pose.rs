@@ -36,9 +36,7 @@ pub enum Placement {
 impl Default for Placement {
     /// About the pelvis, without translation.
     fn default() -> Self {
-        Self::Pelvis {
-            translation: Vec3::ZERO,
-        }
+        Self::Pelvis { translation: Vec3::ZERO }
     }
 }
 
@@ -77,10 +75,8 @@ impl BodyModel {
         let frame = self.kinematics(shaped, pose, placement);
         let mut vertices = vec![Vec3::ZERO; self.num_vertices()];
         let mut pose_offsets = vec![Vec3::ZERO; self.num_vertices()];
-        (vertices.par_chunks_mut(CHUNK))
-            .zip(pose_offsets.par_chunks_mut(CHUNK))
-            .enumerate()
-            .for_each(|(chunk, (vertices, offsets))| {
+        (vertices.par_chunks_mut(CHUNK)).zip(pose_offsets.par_chunks_mut(CHUNK)).enumerate().for_each(
+            |(chunk, (vertices, offsets))| {
                 let arch = pulp::Arch::new();
                 arch.dispatch(|| {
                     let features = frame.features.as_flattened();
@@ -91,13 +87,9 @@ impl BodyModel {
                         *vertex = self.skin(v, &frame.bones, shaped.vertices[v] + *offset);
                     }
                 });
-            });
-        Posed {
-            vertices,
-            joints: frame.joints,
-            bones: frame.bones,
-            pose_offsets,
-        }
+            },
+        );
+        Posed { vertices, joints: frame.joints, bones: frame.bones, pose_offsets }
     }
 
     /// [`BodyModel::pose`] for many frames at once, which reads the pose blend shapes once for every 16 frames.
@@ -106,9 +98,7 @@ impl BodyModel {
     /// If a length is not the model's.
     #[must_use]
     pub fn pose_batch(&self, frames: &[(&Shaped, &[Vec3], Placement)]) -> Vec<Posed> {
-        let blocks: Vec<Vec<Posed>> = (frames.par_chunks(LANES))
-            .map(|block| self.pose_block(block))
-            .collect();
+        let blocks: Vec<Vec<Posed>> = (frames.par_chunks(LANES)).map(|block| self.pose_block(block)).collect();
         blocks.into_iter().flatten().collect()
     }
 
@@ -165,26 +155,18 @@ impl BodyModel {
     /// Σ w_i · bones_i · rest for vertex `v`.
     #[inline(always)]
     fn skin(&self, v: usize, bones: &[Affine3A], rest: Vec3) -> Vec3 {
-        blend(bones, self.weights.row(v))
-            .transform_point3a(Vec3A::from(rest))
-            .into()
+        blend(bones, self.weights.row(v)).transform_point3a(Vec3A::from(rest)).into()
     }
 
     fn kinematics(&self, shaped: &Shaped, pose: &[Vec3], placement: Placement) -> Kinematics {
         let joints = self.num_joints();
         assert_eq!(pose.len(), joints, "pose: rotations of joints");
-        assert_eq!(
-            shaped.joints.len(),
-            joints,
-            "pose: joints of the shaped body"
-        );
+        assert_eq!(shaped.joints.len(), joints, "pose: joints of the shaped body");
         let vertices = (shaped.vertices.len(), self.num_vertices());
         assert_eq!(vertices.0, vertices.1, "pose: vertices of the shaped body");
 
         let rotations: Vec<Mat3> = pose.iter().map(|&theta| rodrigues(theta)).collect();
-        let features = (rotations.iter().skip(1))
-            .map(|r| (*r - Mat3::IDENTITY).transpose().to_cols_array())
-            .collect();
+        let features = (rotations.iter().skip(1)).map(|r| (*r - Mat3::IDENTITY).transpose().to_cols_array()).collect();
 
         // Joint frames to world, root first.
         let mut frames: Vec<Affine3A> = Vec::with_capacity(joints);
@@ -198,14 +180,10 @@ impl BodyModel {
                     frames[*parent] * local
                 }
                 None => match placement {
-                    Placement::Pelvis { translation } => Affine3A::from_mat3_translation(
-                        rotations[joint],
-                        shaped.joints[joint] + translation,
-                    ),
-                    Placement::Origin {
-                        rotation,
-                        translation,
-                    } => {
+                    Placement::Pelvis { translation } => {
+                        Affine3A::from_mat3_translation(rotations[joint], shaped.joints[joint] + translation)
+                    }
+                    Placement::Origin { rotation, translation } => {
                         Affine3A::from_mat3_translation(rodrigues(rotation), translation)
                             * Affine3A::from_translation(shaped.joints[joint])
                     }
@@ -215,11 +193,7 @@ impl BodyModel {
         let bones = (frames.iter().zip(&shaped.joints))
             .map(|(&frame, &joint)| frame * Affine3A::from_translation(-joint))
             .collect();
-        Kinematics {
-            features,
-            joints: frames.iter().map(|f| f.translation.into()).collect(),
-            bones,
-        }
+        Kinematics { features, joints: frames.iter().map(|f| f.translation.into()).collect(), bones }
     }
 }
 
@@ -233,10 +207,7 @@ struct Kinematics {
 /// Σ w_i · bones_i.
 #[inline(always)]
 pub(crate) fn blend(bones: &[Affine3A], weights: impl Iterator<Item = (usize, f32)>) -> Affine3A {
-    let mut sum = Affine3A {
-        matrix3: Mat3A::ZERO,
-        translation: Vec3A::ZERO,
-    };
+    let mut sum = Affine3A { matrix3: Mat3A::ZERO, translation: Vec3A::ZERO };
     for (joint, w) in weights {
         let bone = &bones[joint];
         sum.matrix3.x_axis += bone.matrix3.x_axis * w;

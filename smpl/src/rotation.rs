@@ -13,32 +13,16 @@ pub fn rodrigues(axis_angle: Vec3) -> Mat3 {
     let v = axis_angle.as_dvec3();
     let theta = v.length();
     let sinc = |x: f64| {
-        if x < 1e-4 {
-            1.0 - x * x / 6.0
-        } else {
-            x.sin() / x
-        }
+        if x < 1e-4 { 1.0 - x * x / 6.0 } else { x.sin() / x }
     };
     let a = sinc(theta);
     // (1 − cos θ)/θ² = ½ sinc²(θ/2)
     let b = 0.5 * sinc(0.5 * theta).powi(2);
     let (x, y, z) = (v.x, v.y, v.z);
     let columns = [
-        [
-            1.0 - b * (y * y + z * z),
-            b * x * y + a * z,
-            b * x * z - a * y,
-        ],
-        [
-            b * x * y - a * z,
-            1.0 - b * (x * x + z * z),
-            b * y * z + a * x,
-        ],
-        [
-            b * x * z + a * y,
-            b * y * z - a * x,
-            1.0 - b * (x * x + y * y),
-        ],
+        [1.0 - b * (y * y + z * z), b * x * y + a * z, b * x * z - a * y],
+        [b * x * y - a * z, 1.0 - b * (x * x + z * z), b * y * z + a * x],
+        [b * x * z + a * y, b * y * z - a * x, 1.0 - b * (x * x + y * y)],
     ];
     Mat3::from_cols_array_2d(&columns.map(|c| c.map(|x| x as f32)))
 }
@@ -51,10 +35,7 @@ mod tests {
     fn tiny_rotations_keep_their_first_order() {
         for length in [0.0, 1e-30, 1e-12, 1e-6, 1e-4, 2e-4] {
             let r = rodrigues(Vec3::new(0.0, 0.0, length));
-            assert!(
-                (r.x_axis.y - length).abs() <= 1e-6 * length,
-                "{length}: {r}"
-            );
+            assert!((r.x_axis.y - length).abs() <= 1e-6 * length, "{length}: {r}");
         }
         assert_eq!(rodrigues(Vec3::ZERO), Mat3::IDENTITY);
     }

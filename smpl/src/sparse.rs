@@ -18,11 +18,7 @@ pub type SkinningWeights = SparseRows<f32>;
 impl<T: Copy> SparseRows<T> {
     /// From the entries of each row in turn.
     pub fn from_rows(rows: impl IntoIterator<Item = impl IntoIterator<Item = (u32, T)>>) -> Self {
-        let mut out = Self {
-            offsets: vec![0],
-            columns: Vec::new(),
-            values: Vec::new(),
-        };
+        let mut out = Self { offsets: vec![0], columns: Vec::new(), values: Vec::new() };
         for row in rows {
             for (column, value) in row {
                 out.columns.push(column);
@@ -46,10 +42,7 @@ impl<T: Copy> SparseRows<T> {
     #[inline]
     pub fn row(&self, row: usize) -> impl Iterator<Item = (usize, T)> + '_ {
         let range = self.offsets[row] as usize..self.offsets[row + 1] as usize;
-        self.columns[range.clone()]
-            .iter()
-            .zip(&self.values[range])
-            .map(|(&column, &value)| (column as usize, value))
+        self.columns[range.clone()].iter().zip(&self.values[range]).map(|(&column, &value)| (column as usize, value))
     }
 
     /// What is wrong with the structure, if anything.

@@ -33,14 +33,8 @@ fn npz_arrays_are_read_with_shape_and_type() {
     let mut npz = Npz::open(&fixture("numpy.npz")).unwrap();
     assert_eq!(npz.keys()[0], "f4");
     let (shape, values) = npz.f32("f4", &[None, Some(3)]).unwrap();
-    assert_eq!(
-        (shape.as_slice(), values.as_slice()),
-        (&[2, 3][..], &[0.0, 1.0, 2.0, 3.0, 4.0, 5.0][..])
-    );
-    assert_eq!(
-        npz.f32("f8_columns", &[Some(2), None]).unwrap().1,
-        [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]
-    );
+    assert_eq!((shape.as_slice(), values.as_slice()), (&[2, 3][..], &[0.0, 1.0, 2.0, 3.0, 4.0, 5.0][..]));
+    assert_eq!(npz.f32("f8_columns", &[Some(2), None]).unwrap().1, [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]);
     assert_eq!(npz.i64("i2_big", &[None]).unwrap().1, [1, -2, 300]);
     assert_eq!(npz.i64("bool", &[Some(2)]).unwrap().1, [1, 0]);
     assert_eq!(npz.f32("scalar", &[]).unwrap().1, [0.25]);
@@ -55,25 +49,12 @@ fn npz_errors_name_file_key_and_shapes() {
         assert!(e.contains(part), "{e:?} lacks {part:?}");
     }
     let e = npz.f32("nothing", &[]).unwrap_err();
-    assert!(
-        matches!(&e, Error::MissingKey { key, available, .. } if key == "nothing" && available.len() == 10)
-    );
-    assert!(
-        matches!(npz.f32("nan", &[None]), Err(Error::NotFinite { index: 1, key, .. }) if key == "nan")
-    );
-    assert!(matches!(
-        npz.f32("huge", &[None]),
-        Err(Error::NotFinite { index: 0, .. })
-    ));
-    assert!(matches!(
-        npz.i64("f4", &[None, None]),
-        Err(Error::Type { .. })
-    ));
+    assert!(matches!(&e, Error::MissingKey { key, available, .. } if key == "nothing" && available.len() == 10));
+    assert!(matches!(npz.f32("nan", &[None]), Err(Error::NotFinite { index: 1, key, .. }) if key == "nan"));
+    assert!(matches!(npz.f32("huge", &[None]), Err(Error::NotFinite { index: 0, .. })));
+    assert!(matches!(npz.i64("f4", &[None, None]), Err(Error::Type { .. })));
     assert!(matches!(npz.array("text"), Err(Error::Type { key, .. }) if key == "text"));
-    assert!(matches!(
-        Npz::open(Path::new("/no/such.npz")),
-        Err(Error::Io { .. })
-    ));
+    assert!(matches!(Npz::open(Path::new("/no/such.npz")), Err(Error::Io { .. })));
 }
 
 /// The bytes of a `.npy` file with the given header and data.
@@ -89,10 +70,7 @@ fn npy(header: &str, data: &[u8]) -> Vec<u8> {
 fn headers_that_claim_too_much_are_refused_before_memory_is_taken() {
     for (i, (shape, large)) in [
         ("(4611686018427387904, 4)", true),
-        (
-            "(18446744073709551615, 18446744073709551615, 18446744073709551615)",
-            true,
-        ),
+        ("(18446744073709551615, 18446744073709551615, 18446744073709551615)", true),
         ("(1000000000,)", true),
         ("(99999999999999999999999,)", false),
         ("(-1,)", false),
@@ -138,10 +116,7 @@ fn malformed_npy_headers_are_errors() {
     {
         let file = Temporary::new(&format!("header{i}.npy"), &npy(header, &[0; 8]));
         let error = read_npy(&file.0).expect_err(header);
-        assert!(
-            matches!(error, Error::Npy { .. } | Error::Type { .. }),
-            "{header}: {error}"
-        );
+        assert!(matches!(error, Error::Npy { .. } | Error::Type { .. }), "{header}: {error}");
     }
 }
 
@@ -153,11 +128,7 @@ fn archives_cut_anywhere_are_errors() {
             let keys = npz.keys().to_vec();
             keys.iter().try_for_each(|key| npz.array(key).map(drop))
         });
-        assert!(
-            read.is_err(),
-            "{length} of {} bytes were accepted",
-            bytes.len()
-        );
+        assert!(read.is_err(), "{length} of {} bytes were accepted", bytes.len());
     }
 }
 
@@ -188,23 +159,11 @@ proptest! {
 /// Arrays of a body of three vertices and two joints.
 fn tiny_body() -> Vec<(&'static str, Vec<u64>, Vec<f64>)> {
     vec![
-        (
-            "v_template",
-            vec![3, 3],
-            vec![0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0],
-        ),
+        ("v_template", vec![3, 3], vec![0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0]),
         ("f", vec![1, 3], vec![0.0, 1.0, 2.0]),
         ("weights", vec![3, 2], vec![1.0, 0.0, 0.5, 0.5, 0.0, 1.0]),
-        (
-            "J_regressor",
-            vec![2, 3],
-            vec![1.0, 0.0, 0.0, 0.0, 0.5, 0.5],
-        ),
-        (
-            "kintree_table",
-            vec![2, 2],
-            vec![4294967295.0, 0.0, 0.0, 1.0],
-        ),
+        ("J_regressor", vec![2, 3], vec![1.0, 0.0, 0.0, 0.0, 0.5, 0.5]),
+        ("kintree_table", vec![2, 2], vec![4294967295.0, 0.0, 0.0, 1.0]),
         ("shapedirs", vec![3, 3, 1], vec![0.1; 9]),
         ("posedirs", vec![3, 3, 9], vec![0.0; 81]),
     ]
@@ -222,15 +181,8 @@ fn write_body(name: &str, arrays: &[(&str, Vec<u64>, Vec<f64>)]) -> Temporary {
             if integers { "i8" } else { "f8" },
             extents.concat()
         );
-        let bytes = values.iter().flat_map(|&x| {
-            if integers {
-                (x as i64).to_le_bytes()
-            } else {
-                x.to_le_bytes()
-            }
-        });
-        zip.write_all(&npy(&header, &bytes.collect::<Vec<_>>()))
-            .unwrap();
+        let bytes = values.iter().flat_map(|&x| if integers { (x as i64).to_le_bytes() } else { x.to_le_bytes() });
+        zip.write_all(&npy(&header, &bytes.collect::<Vec<_>>())).unwrap();
     }
     Temporary::new(name, &zip.finish().unwrap().into_inner())
 }
@@ -239,10 +191,7 @@ fn write_body(name: &str, arrays: &[(&str, Vec<u64>, Vec<f64>)]) -> Temporary {
 fn a_tiny_body_is_read() {
     let file = write_body("tiny.npz", &tiny_body());
     let body = BodyModel::load(&file.0).unwrap();
-    assert_eq!(
-        (body.num_vertices(), body.num_joints(), body.num_betas()),
-        (3, 2, 1)
-    );
+    assert_eq!((body.num_vertices(), body.num_joints(), body.num_betas()), (3, 2, 1));
     assert_eq!(body.parents, [None, Some(0)]);
 }
 
@@ -267,10 +216,7 @@ fn faults_of_a_model_name_the_array() {
         let file = write_body(&format!("fault{i}.npz"), &arrays);
         let message = BodyModel::load(&file.0).expect_err(key).to_string();
         let name = format!("fault{i}.npz");
-        assert!(
-            message.contains(&format!("`{key}`")) && message.contains(&name),
-            "{message}"
-        );
+        assert!(message.contains(&format!("`{key}`")) && message.contains(&name), "{message}");
     }
 }
 
@@ -285,18 +231,12 @@ fn missing_and_misshapen_arrays_of_a_model_are_named() {
         let _ = values;
         let file = write_body(&format!("shape{i}.npz"), &arrays);
         let message = BodyModel::load(&file.0).expect_err(key).to_string();
-        assert!(
-            message.contains(&format!("`{key}`")) && message.contains(&shown),
-            "{message}"
-        );
+        assert!(message.contains(&format!("`{key}`")) && message.contains(&shown), "{message}");
 
         arrays.remove(i);
         let file = write_body(&format!("missing{i}.npz"), &arrays);
         let error = BodyModel::load(&file.0).expect_err(key);
-        assert!(
-            matches!(&error, Error::MissingKey { key: k, .. } if k == key),
-            "{error}"
-        );
+        assert!(matches!(&error, Error::MissingKey { key: k, .. } if k == key), "{error}");
     }
     let other = BodyModel::load(Path::new("body.fbx")).unwrap_err();
     assert!(matches!(other, Error::Extension { .. }));

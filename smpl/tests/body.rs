@@ -27,10 +27,7 @@ fn pelvis(translation: Vec3) -> Placement {
 
 fn largest(a: &[Vec3], b: &[Vec3]) -> f32 {
     assert_eq!(a.len(), b.len());
-    a.iter()
-        .zip(b)
-        .map(|(a, b)| a.distance(*b))
-        .fold(0.0, f32::max)
+    a.iter().zip(b).map(|(a, b)| a.distance(*b)).fold(0.0, f32::max)
 }
 
 fn moved(points: &[Vec3], by: Affine3A) -> Vec<Vec3> {
@@ -163,14 +160,9 @@ fn determinant(posed: &Posed, v: usize) -> f32 {
 #[test]
 fn poses_do_not_depend_on_the_number_of_threads() {
     let shaped = BODY.shaped(&[1.0]);
-    let pose: Vec<Vec3> = (0..24)
-        .map(|i| Vec3::new(0.1, -0.05, 0.02) * i as f32)
-        .collect();
+    let pose: Vec<Vec3> = (0..24).map(|i| Vec3::new(0.1, -0.05, 0.02) * i as f32).collect();
     let on = |threads: usize| {
-        let pool = rayon::ThreadPoolBuilder::new()
-            .num_threads(threads)
-            .build()
-            .unwrap();
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
         pool.install(|| BODY.pose(&shaped, &pose, Placement::default()))
     };
     assert_eq!(on(1), on(5));
@@ -194,10 +186,7 @@ fn too_many_betas_are_a_callers_bug() {
 
 #[test]
 fn likelihood_is_one_inside_then_falls_smoothly_to_nothing() {
-    let field = SurfaceMotion {
-        margin: 0.05,
-        falloff: 0.1,
-    };
+    let field = SurfaceMotion { margin: 0.05, falloff: 0.1 };
     for d in [-1.0, -0.01, 0.0, 0.05] {
         assert_eq!(field.likelihood(d), 1.0);
     }
@@ -213,10 +202,7 @@ fn likelihood_is_one_inside_then_falls_smoothly_to_nothing() {
         assert!((slope - last.1).abs() < 6.0 / 0.01 * 0.00012f32.powi(2) * 1.1 + 1e-6);
         last = (f, slope);
     }
-    let step = SurfaceMotion {
-        margin: 0.05,
-        falloff: 0.0,
-    };
+    let step = SurfaceMotion { margin: 0.05, falloff: 0.0 };
     assert_eq!((step.likelihood(0.05), step.likelihood(0.0501)), (1.0, 0.0));
 }
 
@@ -243,20 +229,9 @@ fn a_fold_gives_finite_points_of_the_heaviest_bone() {
     for (i, face) in BODY.faces.iter().enumerate() {
         let v = face[0] as usize;
         folded += usize::from(determinant(&posed, v) < 0.05);
-        let sample = SurfaceMotion::default()
-            .map(
-                &BODY,
-                &posed,
-                posed.vertices[v],
-                i as u32,
-                [1.0, 0.0, 0.0],
-                0.0,
-            )
-            .unwrap();
+        let sample =
+            SurfaceMotion::default().map(&BODY, &posed, posed.vertices[v], i as u32, [1.0, 0.0, 0.0], 0.0).unwrap();
         assert!(sample.canonical.distance(shaped.vertices[v]) < 0.15);
     }
-    assert!(
-        folded > 0,
-        "the fold reaches no vertex: the test tests nothing"
-    );
+    assert!(folded > 0, "the fold reaches no vertex: the test tests nothing");
 }

@@ -9,30 +9,17 @@ use smpl::{BodyModel, Placement};
 static BODY: LazyLock<BodyModel> = LazyLock::new(BodyModel::embedded);
 
 fn mesh(vertices: Vec<Vec3>) -> testkit::TriMesh {
-    testkit::TriMesh {
-        vertices,
-        faces: BODY.faces.clone(),
-    }
+    testkit::TriMesh { vertices, faces: BODY.faces.clone() }
 }
 
 #[test]
 fn it_is_valid_and_has_the_promised_size() {
     BODY.validate("embedded").unwrap();
     assert_eq!((BODY.num_joints(), BODY.num_betas()), (24, 10));
-    assert!(
-        (3000..5000).contains(&BODY.num_vertices()),
-        "{}",
-        BODY.num_vertices()
-    );
-    let (low, high) = BODY
-        .v_template
-        .iter()
-        .fold((Vec3::MAX, Vec3::MIN), |(l, h), v| (l.min(*v), h.max(*v)));
+    assert!((3000..5000).contains(&BODY.num_vertices()), "{}", BODY.num_vertices());
+    let (low, high) = BODY.v_template.iter().fold((Vec3::MAX, Vec3::MIN), |(l, h), v| (l.min(*v), h.max(*v)));
     let size = high - low;
-    assert!(
-        (1.66..1.76).contains(&size.y) && (1.66..1.78).contains(&size.x),
-        "{size}"
-    );
+    assert!((1.66..1.76).contains(&size.y) && (1.66..1.78).contains(&size.x), "{size}");
 }
 
 #[test]
@@ -41,11 +28,7 @@ fn it_is_closed_and_has_no_handles() {
     let v = BODY.num_vertices() as i64;
     let f = BODY.faces.len() as i64;
     assert_eq!(v - f * 3 / 2 + f, 2, "Euler characteristic of a sphere");
-    assert_eq!(
-        BODY.faces.iter().flatten().collect::<HashSet<_>>().len() as i64,
-        v,
-        "a stray vertex"
-    );
+    assert_eq!(BODY.faces.iter().flatten().collect::<HashSet<_>>().len() as i64, v, "a stray vertex");
     // The faces around every vertex form one fan: walking over them from edge to edge meets them all.
     let mut next: HashMap<(u32, u32), u32> = HashMap::new();
     let mut count = vec![0; v as usize];
@@ -62,10 +45,7 @@ fn it_is_closed_and_has_no_handles() {
             at = next[&(centre, at)];
             steps += 1;
         }
-        assert_eq!(
-            steps, count[centre as usize],
-            "vertex {centre} joins two sheets"
-        );
+        assert_eq!(steps, count[centre as usize], "vertex {centre} joins two sheets");
     }
 }
 
@@ -84,22 +64,9 @@ fn it_is_mirror_symmetric() {
         assert!(points.contains(&key(Vec3::new(-v.x, v.y, v.z))), "{v}");
     }
     let joints = BODY.shaped(&[]).joints;
-    for (left, right) in [
-        (1, 2),
-        (4, 5),
-        (7, 8),
-        (10, 11),
-        (13, 14),
-        (16, 17),
-        (18, 19),
-        (20, 21),
-        (22, 23),
-    ] {
+    for (left, right) in [(1, 2), (4, 5), (7, 8), (10, 11), (13, 14), (16, 17), (18, 19), (20, 21), (22, 23)] {
         let mirrored = Vec3::new(-joints[right].x, joints[right].y, joints[right].z);
-        assert!(
-            joints[left].distance(mirrored) < 2e-4,
-            "joints {left} and {right}"
-        );
+        assert!(joints[left].distance(mirrored) < 2e-4, "joints {left} and {right}");
         assert!(joints[left].x > 0.05, "left is at +x");
     }
 }
@@ -118,32 +85,18 @@ fn its_triangles_are_even() {
         worst = worst.min(quality);
     }
     lengths.sort_by(f32::total_cmp);
-    let (least, median, most) = (
-        lengths[0],
-        lengths[lengths.len() / 2],
-        lengths[lengths.len() - 1],
-    );
+    let (least, median, most) = (lengths[0], lengths[lengths.len() / 2], lengths[lengths.len() - 1]);
     println!("edges {least} {median} {most}, worst triangle {worst}");
-    assert!(
-        most < 0.06 && median > 0.015 && worst > 0.1,
-        "{least} {median} {most} {worst}"
-    );
+    assert!(most < 0.06 && median > 0.015 && worst > 0.1, "{least} {median} {most} {worst}");
 }
 
 #[test]
 fn its_joints_lie_inside_it_and_are_regressed_from_around_them() {
     let joints = BODY.shaped(&[]).joints;
     for (i, &joint) in joints.iter().enumerate() {
-        assert!(
-            testkit::oracle::inside(&BODY.v_template, &BODY.faces, joint),
-            "joint {i} at {joint}"
-        );
+        assert!(testkit::oracle::inside(&BODY.v_template, &BODY.faces, joint), "joint {i} at {joint}");
         assert!(BODY.j_regressor.row(i).all(|(_, w)| w >= 0.0));
-        let reach = BODY
-            .j_regressor
-            .row(i)
-            .map(|(v, _)| BODY.v_template[v].distance(joint))
-            .fold(0.0, f32::max);
+        let reach = BODY.j_regressor.row(i).map(|(v, _)| BODY.v_template[v].distance(joint)).fold(0.0, f32::max);
         assert!(reach < 0.21, "joint {i} depends on a vertex {reach} m away");
     }
 }
@@ -174,11 +127,8 @@ fn its_weights_are_sparse_smooth_and_sum_to_one() {
 #[test]
 fn every_bone_moves_something() {
     for joint in 0..24 {
-        let own: f32 = (0..BODY.num_vertices())
-            .flat_map(|v| BODY.weights.row(v))
-            .filter(|e| e.0 == joint)
-            .map(|e| e.1)
-            .sum();
+        let own: f32 =
+            (0..BODY.num_vertices()).flat_map(|v| BODY.weights.row(v)).filter(|e| e.0 == joint).map(|e| e.1).sum();
         assert!(own > 10.0, "joint {joint} has {own} vertices");
     }
 }
@@ -203,11 +153,7 @@ fn every_beta_does_something_smooth_and_bounded() {
                     (b - a).cross(c - a)
                 };
                 let turned = normal(&plain.vertices).angle_between(normal(&shaped.vertices));
-                assert!(
-                    turned < 1.0,
-                    "beta {beta} turns a face by {turned} at {}",
-                    plain.vertices[face[0] as usize]
-                );
+                assert!(turned < 1.0, "beta {beta} turns a face by {turned} at {}", plain.vertices[face[0] as usize]);
             }
         }
     }
@@ -234,18 +180,12 @@ fn bent_limbs_keep_their_volume() {
         };
         let (with, without) = (volume(&BODY), volume(&plain_model));
         println!("{name}: {with:.0} cm³ with, {without:.0} cm³ without blend shapes");
-        assert!(
-            with.abs() < 900.0 && with > without,
-            "{name}: {with} {without}"
-        );
+        assert!(with.abs() < 900.0 && with > without, "{name}: {with} {without}");
     }
 }
 
 #[test]
 fn it_is_the_same_every_time_and_on_any_number_of_threads() {
-    let one = rayon::ThreadPoolBuilder::new()
-        .num_threads(1)
-        .build()
-        .unwrap();
+    let one = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
     assert_eq!(*BODY, one.install(BodyModel::embedded));
 }

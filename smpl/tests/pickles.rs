@@ -9,10 +9,7 @@ use smpl::pickle::{self, Value};
 use smpl::{Data, Error, NdArray};
 
 fn array(shape: &[usize], data: Data) -> Value {
-    Value::Array(NdArray {
-        shape: shape.to_vec(),
-        data,
-    })
+    Value::Array(NdArray { shape: shape.to_vec(), data })
 }
 
 fn text(s: &str) -> Value {
@@ -24,20 +21,13 @@ fn every_protocol_gives_the_values_python_wrote() {
     for protocol in 0..6 {
         let path = fixture(&format!("values.protocol{protocol}.pkl"));
         let value = pickle::read(&path).unwrap_or_else(|e| panic!("protocol {protocol}: {e}"));
-        let get = |key: &str| {
-            value
-                .get(key)
-                .unwrap_or_else(|| panic!("{protocol}: no {key}"))
-        };
+        let get = |key: &str| value.get(key).unwrap_or_else(|| panic!("{protocol}: no {key}"));
         let expect = |key: &str, expected: Value| {
             assert_eq!(get(key), &expected, "protocol {protocol}, `{key}`");
         };
         let ints = |list: &[i64]| list.iter().map(|&i| Value::Int(i)).collect::<Vec<_>>();
         expect("none", Value::None);
-        expect(
-            "flags",
-            Value::Tuple(vec![Value::Bool(true), Value::Bool(false)]),
-        );
+        expect("flags", Value::Tuple(vec![Value::Bool(true), Value::Bool(false)]));
         let numbers = [0, -1, 255, 256, 65535, 65536, -(1 << 31), 1 << 40, i64::MIN];
         expect("ints", Value::List(ints(&numbers)));
         let floats = [0.0, -2.5, 1e300].map(Value::Float);
@@ -50,27 +40,13 @@ fn every_protocol_gives_the_values_python_wrote() {
         expect("ordered", Value::Dict(ordered));
         expect("twice", Value::List(vec![Value::List(ints(&[1, 2])); 2]));
         let six = [0, 1, 2, 3, 4, 5];
-        expect(
-            "f4",
-            array(&[2, 3], Data::F32(six.map(|i| i as f32).to_vec())),
-        );
-        expect(
-            "f8_columns",
-            array(&[2, 3], Data::F64(six.map(f64::from).to_vec())),
-        );
-        let Value::Array(NdArray {
-            data: Data::F32(halves),
-            ..
-        }) = get("f2")
-        else {
+        expect("f4", array(&[2, 3], Data::F32(six.map(|i| i as f32).to_vec())));
+        expect("f8_columns", array(&[2, 3], Data::F64(six.map(f64::from).to_vec())));
+        let Value::Array(NdArray { data: Data::F32(halves), .. }) = get("f2") else {
             panic!("f2: {:?}", get("f2"));
         };
         assert_eq!(halves[..2], [1.5, -0.25]);
-        assert!(
-            (halves[2] - 6e-8).abs() < 3e-8,
-            "subnormal half {}",
-            halves[2]
-        );
+        assert!((halves[2] - 6e-8).abs() < 3e-8, "subnormal half {}", halves[2]);
         expect("i2_big", array(&[3], Data::I64(vec![1, -2, 300])));
         expect("u1", array(&[2], Data::I64(vec![0, 255])));
         expect("bool", array(&[2], Data::Bool(vec![true, false])));
@@ -78,10 +54,7 @@ fn every_protocol_gives_the_values_python_wrote() {
         expect("zero_d", array(&[], Data::I64(vec![7])));
         expect("empty", array(&[0, 3], Data::F64(vec![])));
         let one = Value::Dict(vec![(text("k"), Value::Int(1))]);
-        let objects = |items: Vec<Value>| Value::Objects {
-            shape: vec![2],
-            items,
-        };
+        let objects = |items: Vec<Value>| Value::Objects { shape: vec![2], items };
         expect("objects", objects(vec![one, Value::None]));
         expect("strings", objects(vec![text("ab"), text("c")]));
         let dense = get("sparse").to_dense("values", "sparse").unwrap().unwrap();
@@ -96,14 +69,8 @@ fn captures_are_read() {
     if let Some(path) = shared(&format!("{demo}/cameras.pkl")) {
         let cameras = pickle::read(&path).unwrap();
         let first = cameras.get("frame_000000").unwrap();
-        assert_eq!(
-            first.get("intrinsics").unwrap().as_array().unwrap().shape,
-            [3, 3]
-        );
-        assert_eq!(
-            first.get("extrinsics").unwrap().as_array().unwrap().shape,
-            [4, 4]
-        );
+        assert_eq!(first.get("intrinsics").unwrap().as_array().unwrap().shape, [3, 3]);
+        assert_eq!(first.get("extrinsics").unwrap().as_array().unwrap().shape, [4, 4]);
     }
     if let Some(path) = shared(&format!("{demo}/mesh_infos.pkl")) {
         let infos = pickle::read(&path).unwrap();
@@ -114,24 +81,11 @@ fn captures_are_read() {
     }
     if let Some(path) = shared(&format!("{demo}/canonical_joints.pkl")) {
         let canonical = pickle::read(&path).unwrap();
-        assert_eq!(
-            canonical.get("joints").unwrap().as_array().unwrap().shape,
-            [24, 3]
-        );
+        assert_eq!(canonical.get("joints").unwrap().as_array().unwrap().shape, [24, 3]);
     }
     if let Some(path) = shared("captures/zju_demo/annots.npy") {
         let annots = pickle::read(&path).unwrap();
-        assert_eq!(
-            annots
-                .get("cams")
-                .unwrap()
-                .get("K")
-                .unwrap()
-                .items()
-                .unwrap()
-                .len(),
-            6
-        );
+        assert_eq!(annots.get("cams").unwrap().get("K").unwrap().items().unwrap().len(), 6);
         let ims = annots.get("ims").unwrap().items().unwrap();
         assert_eq!(ims.len(), 100);
         let paths = ims[0].get("ims").unwrap().items().unwrap();
@@ -139,10 +93,7 @@ fn captures_are_read() {
     }
     if let Some(path) = shared("captures/zju_demo/new_params/0.npy") {
         let params = pickle::read(&path).unwrap();
-        assert_eq!(
-            params.get("poses").unwrap().as_array().unwrap().shape,
-            [1, 72]
-        );
+        assert_eq!(params.get("poses").unwrap().as_array().unwrap().shape, [1, 72]);
         assert_eq!(params.get("Rh").unwrap().as_array().unwrap().shape, [1, 3]);
     }
     if let Some(path) = shared("captures/zju_demo/new_vertices/0.npy") {
@@ -217,9 +168,7 @@ fn malicious_pickles_end_in_errors() {
     let mut arrays = b"\x80\x02cnumpy\ndtype\nq\x00U\x02u1\x85Rq\x01B".to_vec();
     arrays.extend(1_000_000u32.to_le_bytes());
     arrays.extend(vec![0u8; 1_000_000]);
-    arrays.extend(
-        b"q\x02cnumpy.core.numeric\n_frombuffer\nq\x03J\x40\x42\x0f\x00\x85q\x04U\x01Cq\x05(",
-    );
+    arrays.extend(b"q\x02cnumpy.core.numeric\n_frombuffer\nq\x03J\x40\x42\x0f\x00\x85q\x04U\x01Cq\x05(");
     for _ in 0..10_000 {
         arrays.extend(b"h\x03(h\x02h\x01h\x04h\x05tR");
     }

@@ -58,11 +58,7 @@ fn the_diffused_prior_is_one_on_the_surface_and_inside() {
         let shaped = body.shaped(&[]);
         let volume = WeightVolume::diffused(&body, &shaped, &WeightVolumeConfig::default());
         let inside = inside_points(&body, &shaped);
-        let least = shaped
-            .vertices
-            .iter()
-            .map(|&v| f(&volume, v))
-            .fold(1.0, f32::min);
+        let least = shaped.vertices.iter().map(|&v| f(&volume, v)).fold(1.0, f32::min);
         println!("{name}: least f on the surface {least}");
         assert!(inside.len() > 200, "{name}: {} points inside", inside.len());
         for &x in shaped.vertices.iter().chain(&inside) {
@@ -82,11 +78,7 @@ fn the_diffused_prior_leaves_the_surroundings_to_the_background() {
     let (mut checked, mut least) = (0, f32::INFINITY);
     for i in 0..4000 {
         let t = i as f32;
-        let unit = Vec3::new(
-            (t * 0.618_034).fract(),
-            (t * 0.754_878).fract(),
-            (t * 0.569_84).fract(),
-        );
+        let unit = Vec3::new((t * 0.618_034).fract(), (t * 0.754_878).fract(), (t * 0.569_84).fract());
         let x = volume.min + unit * (volume.max - volume.min);
         let (_, d) = oracle::knn(&shaped.vertices, x, 1)[0];
         if d > f64::from(far) {
@@ -201,18 +193,13 @@ fn plain_map(volume: &WeightVolume, to_canonical: &[Affine3A], x: Vec3) -> ([f64
 /// A small volume with bones that disagree, and where to sample it.
 fn small() -> (WeightVolume, Vec<Affine3A>) {
     let (body, shaped) = &*BODY;
-    let config = WeightVolumeConfig {
-        resolution: 6,
-        ..WeightVolumeConfig::default()
-    };
+    let config = WeightVolumeConfig { resolution: 6, ..WeightVolumeConfig::default() };
     let mut volume = WeightVolume::diffused(body, shaped, &config);
     for (i, d) in volume.delta.iter_mut().enumerate() {
         *d = (i as f32 * 0.37).sin();
     }
     volume.update();
-    let pose: Vec<Vec3> = (0..24)
-        .map(|i| Vec3::new(0.2, 0.1, -0.1) * ((i * 7) % 5) as f32 * 0.3)
-        .collect();
+    let pose: Vec<Vec3> = (0..24).map(|i| Vec3::new(0.2, 0.1, -0.1) * ((i * 7) % 5) as f32 * 0.3).collect();
     let posed = body.pose(shaped, &pose, Placement::default());
     (volume, posed.to_canonical())
 }
@@ -242,10 +229,7 @@ fn update_is_a_softmax() {
     let samples = volume.resolution.pow(3);
     for i in 0..samples {
         let logits: Vec<f64> = (0..volume.channels)
-            .map(|c| {
-                f64::from(volume.log_prior[c * samples + i])
-                    + f64::from(volume.delta[c * samples + i])
-            })
+            .map(|c| f64::from(volume.log_prior[c * samples + i]) + f64::from(volume.delta[c * samples + i]))
             .collect();
         let total: f64 = logits.iter().map(|l| l.exp()).sum();
         for (c, logit) in logits.iter().enumerate() {
@@ -262,11 +246,7 @@ fn gradients_with_respect_to_the_weights_agree_with_finite_differences() {
     let mut checked = 0;
     for i in 0..40 {
         let t = i as f32;
-        let x = Vec3::new(
-            (t * 0.7).sin() * 0.4,
-            (t * 1.1).cos() * 0.8,
-            (t * 0.3).sin() * 0.15,
-        );
+        let x = Vec3::new((t * 0.7).sin() * 0.4, (t * 1.1).cos() * 0.8, (t * 0.3).sin() * 0.15);
         let mut d_weights = vec![0.0; volume.weights.len()];
         volume.map_backward(&bones, x, d_canonical, d_likelihood, &mut d_weights);
         let (_, f) = plain_map(&volume, &bones, x);
@@ -274,9 +254,7 @@ fn gradients_with_respect_to_the_weights_agree_with_finite_differences() {
         if !(0.1..0.98).contains(&f) {
             continue;
         }
-        let touched: Vec<usize> = (0..d_weights.len())
-            .filter(|&i| d_weights[i] != 0.0)
-            .collect();
+        let touched: Vec<usize> = (0..d_weights.len()).filter(|&i| d_weights[i] != 0.0).collect();
         if touched.is_empty() {
             continue;
         }
@@ -288,16 +266,11 @@ fn gradients_with_respect_to_the_weights_agree_with_finite_differences() {
                 moved.weights[i] = w;
             }
             let (canonical, f) = plain_map(&moved, &bones, x);
-            let dot: f64 = (0..3)
-                .map(|a| canonical[a] * f64::from(d_canonical[a]))
-                .sum();
+            let dot: f64 = (0..3).map(|a| canonical[a] * f64::from(d_canonical[a])).sum();
             dot + f * f64::from(d_likelihood)
         };
         // The oracle is in f64: what is left is the third-order term.
-        let tolerance = Tolerance {
-            abs: 2e-5,
-            rel: 1e-3,
-        };
+        let tolerance = Tolerance { abs: 2e-5, rel: 1e-3 };
         check("map", &start, &analytic, 1e-3, tolerance, loss).unwrap();
         checked += 1;
     }
@@ -307,10 +280,7 @@ fn gradients_with_respect_to_the_weights_agree_with_finite_differences() {
 #[test]
 fn likelihood_has_no_gradient_where_it_is_capped() {
     let (body, shaped) = &*BODY;
-    let config = WeightVolumeConfig {
-        resolution: 8,
-        ..WeightVolumeConfig::default()
-    };
+    let config = WeightVolumeConfig { resolution: 8, ..WeightVolumeConfig::default() };
     let mut volume = WeightVolume::diffused(body, shaped, &config);
     volume.weights.iter_mut().for_each(|w| *w = 1.0);
     let mut d_weights = vec![0.0; volume.weights.len()];
@@ -322,9 +292,7 @@ fn likelihood_has_no_gradient_where_it_is_capped() {
 fn gradients_with_respect_to_delta_agree_with_finite_differences() {
     let (mut volume, _) = small();
     let samples = volume.resolution.pow(3);
-    let d_weights: Vec<f32> = (0..volume.weights.len())
-        .map(|i| (i as f32 * 1.7).cos())
-        .collect();
+    let d_weights: Vec<f32> = (0..volume.weights.len()).map(|i| (i as f32 * 1.7).cos()).collect();
     let mut d_delta = vec![0.0; volume.weights.len()];
     volume.softmax_backward(&d_weights, &mut d_delta);
     // Samples where several channels compete.
@@ -342,16 +310,10 @@ fn gradients_with_respect_to_delta_agree_with_finite_differences() {
                 volume.delta[j] = d;
             }
             volume.update();
-            indices
-                .iter()
-                .map(|&j| f64::from(volume.weights[j]) * f64::from(d_weights[j]))
-                .sum()
+            indices.iter().map(|&j| f64::from(volume.weights[j]) * f64::from(d_weights[j])).sum()
         };
         // Weights are f32 of size 1: 6e-8 of rounding over a step of 1e-2.
-        let tolerance = Tolerance {
-            abs: 3e-5,
-            rel: 1e-3,
-        };
+        let tolerance = Tolerance { abs: 3e-5, rel: 1e-3 };
         check("softmax", &start, &analytic, 1e-2, tolerance, loss).unwrap();
         for (&j, &d) in indices.iter().zip(&start) {
             volume.delta[j] = d;
@@ -375,12 +337,7 @@ fn backward_accumulates() {
 #[test]
 fn points_that_are_nowhere_are_dead() {
     let (volume, bones) = small();
-    for x in [
-        Vec3::NAN,
-        Vec3::INFINITY,
-        Vec3::splat(1e30),
-        Vec3::splat(50.0),
-    ] {
+    for x in [Vec3::NAN, Vec3::INFINITY, Vec3::splat(1e30), Vec3::splat(50.0)] {
         assert_eq!(volume.map(&bones, x, 0.0), None, "{x}");
         let mut d_weights = vec![0.0; volume.weights.len()];
         volume.map_backward(&bones, x, Vec3::ONE, 1.0, &mut d_weights);
@@ -388,9 +345,5 @@ fn points_that_are_nowhere_are_dead() {
     }
     let inside = BODY.1.joints[0];
     assert!(volume.map(&IDENTITY, inside, 0.5).is_some());
-    assert_eq!(
-        volume.map(&IDENTITY, inside, 1.5),
-        None,
-        "a threshold above Σ w"
-    );
+    assert_eq!(volume.map(&IDENTITY, inside, 1.5), None, "a threshold above Σ w");
 }

@@ -15,10 +15,7 @@ pub struct Tolerance {
 impl Default for Tolerance {
     /// Fits functions of magnitude one evaluated in `f32` with a step of 1e-2.
     fn default() -> Self {
-        Self {
-            abs: 1e-3,
-            rel: 1e-2,
-        }
+        Self { abs: 1e-3, rel: 1e-2 }
     }
 }
 
@@ -50,11 +47,7 @@ pub fn check(
     mut f: impl FnMut(&[f32]) -> f64,
 ) -> Result<(), String> {
     if x.len() != analytic.len() {
-        return Err(format!(
-            "{name}: {} inputs but {} derivatives",
-            x.len(),
-            analytic.len()
-        ));
+        return Err(format!("{name}: {} inputs but {} derivatives", x.len(), analytic.len()));
     }
     let mut failures = String::new();
     let mut count = 0;
@@ -69,11 +62,7 @@ pub fn check(
         let numeric = (f_above - f_below) / (f64::from(above) - f64::from(below));
         if !tolerance.accepts(f64::from(analytic[i]), numeric) {
             count += 1;
-            let _ = write!(
-                failures,
-                "\n  [{i}] x = {}: analytic {}, numeric {numeric}",
-                x[i], analytic[i]
-            );
+            let _ = write!(failures, "\n  [{i}] x = {}: analytic {}, numeric {numeric}", x[i], analytic[i]);
         }
     }
     if count == 0 {
@@ -122,10 +111,7 @@ mod tests {
 
     #[test]
     fn a_right_gradient_passes() {
-        let tight = Tolerance {
-            abs: 1e-5,
-            rel: 1e-4,
-        };
+        let tight = Tolerance { abs: 1e-5, rel: 1e-4 };
         assert_gradient("f", &X, &gradient(&X), 1e-2, tight, f);
     }
 
@@ -152,9 +138,8 @@ mod tests {
         assert!(check("f", &X, &[0.0; 2], 1e-2, Tolerance::default(), f).is_err());
         let flat = check("flat", &[1e9], &[0.0], 1e-3, Tolerance::default(), |_| 0.0);
         assert!(flat.is_err(), "a step that vanishes in f32 must not pass");
-        let infinite = check("inf", &[1.0], &[0.0], 1e-2, Tolerance::default(), |x| {
-            if x[0] > 1.0 { f64::INFINITY } else { 0.0 }
-        });
+        let infinite =
+            check("inf", &[1.0], &[0.0], 1e-2, Tolerance::default(), |x| if x[0] > 1.0 { f64::INFINITY } else { 0.0 });
         assert!(infinite.is_err());
     }
 }

@@ -43,9 +43,7 @@ impl TriMesh {
                 *edges.entry((face[i], face[(i + 1) % 3])).or_default() += 1;
             }
         }
-        edges
-            .iter()
-            .all(|(&(a, b), &count)| count == 1 && edges.get(&(b, a)) == Some(&1))
+        edges.iter().all(|(&(a, b), &count)| count == 1 && edges.get(&(b, a)) == Some(&1))
     }
 }
 
@@ -122,17 +120,10 @@ pub fn cuboid(half: Vec3) -> TriMesh {
             half * Vec3::new(sign(0), sign(1), sign(2))
         })
         .collect();
-    let faces = [
-        [0, 4, 6, 2],
-        [1, 3, 7, 5],
-        [0, 1, 5, 4],
-        [2, 6, 7, 3],
-        [0, 2, 3, 1],
-        [4, 5, 7, 6],
-    ]
-    .iter()
-    .flat_map(|&[a, b, c, d]| [[a, b, c], [a, c, d]])
-    .collect();
+    let faces = [[0, 4, 6, 2], [1, 3, 7, 5], [0, 1, 5, 4], [2, 6, 7, 3], [0, 2, 3, 1], [4, 5, 7, 6]]
+        .iter()
+        .flat_map(|&[a, b, c, d]| [[a, b, c], [a, c, d]])
+        .collect();
     TriMesh { vertices, faces }
 }
 
@@ -142,10 +133,7 @@ pub fn cuboid(half: Vec3) -> TriMesh {
 /// Unless both counts are at least 3.
 #[must_use]
 pub fn torus(ring: f32, radius: f32, around: u32, tube: u32) -> TriMesh {
-    assert!(
-        around >= 3 && tube >= 3,
-        "torus: {around} × {tube}, need ≥ 3"
-    );
+    assert!(around >= 3 && tube >= 3, "torus: {around} × {tube}, need ≥ 3");
     let angle = |i: u32, n: u32| i as f32 / n as f32 * std::f32::consts::TAU;
     let mut vertices = Vec::new();
     let mut faces = Vec::new();
@@ -201,11 +189,7 @@ mod tests {
         ] {
             assert!(mesh.is_closed(), "{name} is open");
             let difference = (mesh.volume() - volume).abs();
-            assert!(
-                difference < tolerance,
-                "{name}: volume {} of {volume}",
-                mesh.volume()
-            );
+            assert!(difference < tolerance, "{name}: volume {} of {volume}", mesh.volume());
         }
     }
 

@@ -31,10 +31,7 @@ pub fn bumpy_sphere() -> impl Strategy<Value = TriMesh> {
     let wave = (vec3(4.0), 0.0..std::f32::consts::TAU, 0.0f32..0.15);
     prop::collection::vec(wave, 3).prop_map(|waves| {
         icosphere(2).map(|p| {
-            let bump: f32 = waves
-                .iter()
-                .map(|(k, phase, height)| height * (k.dot(p) + phase).sin())
-                .sum();
+            let bump: f32 = waves.iter().map(|(k, phase, height)| height * (k.dot(p) + phase).sin()).sum();
             p * (1.0 + bump)
         })
     })
@@ -55,11 +52,7 @@ pub fn degenerate_clouds() -> Vec<(&'static str, Vec<Vec3>)> {
         // A Halton-like set: no two points and no coordinates alike.
         (1..50).map(|i| {
             let t = i as f32;
-            Vec3::new(
-                (t * 0.618_034).fract(),
-                (t * 0.754_878).fract(),
-                (t * 0.569_840_3).fract(),
-            )
+            Vec3::new((t * 0.618_034).fract(), (t * 0.754_878).fract(), (t * 0.569_840_3).fract())
         })
     };
     let with = |bad: Vec3| {

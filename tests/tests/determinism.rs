@@ -1,4 +1,5 @@
 //! The same seed and the same inputs give the same bits: on any number of threads, and with a stop in between.
+#![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
 
 mod common;
 
@@ -28,7 +29,7 @@ fn name(config: &Config) -> String {
 #[test]
 fn training_gives_the_same_bits_on_one_and_on_two_threads() {
     for config in configs() {
-        let [one, two] = [1, 2].map(|threads| on_threads(threads, || train(scene(), &config, 8)));
+        let [one, two] = [1, 2].map(|threads| on_threads(threads, || train(scene(), &config, 6)));
         assert_eq!(bits(&one.0), bits(&two.0), "{}: losses", name(&config));
         assert!(one.1 == two.1, "{}: checkpoints differ", name(&config));
     }
@@ -59,7 +60,7 @@ fn stopping_and_going_on_equals_never_having_stopped() {
     let dir = TempDir::new("resume");
     let path = dir.path().join("half.safetensors");
     for config in configs() {
-        let (reports, whole) = train(scene(), &config, 8);
+        let (reports, whole) = train(scene(), &config, 6);
         let mut first = Trainer::new(scene(), config.clone()).unwrap();
         for _ in 0..3 {
             first.step();
@@ -69,7 +70,7 @@ fn stopping_and_going_on_equals_never_having_stopped() {
         let mut second = Trainer::resume(scene(), &path).unwrap();
         assert_eq!(second.steps_done(), 3);
         assert_eq!(second.visibility_counts(), first.visibility_counts());
-        let rest: Vec<_> = (0..5).map(|_| second.step()).collect();
+        let rest: Vec<_> = (0..3).map(|_| second.step()).collect();
         assert_eq!(bits(&rest), bits(&reports[3..]), "{}: losses", name(&config));
         assert!(checkpoint(&second) == whole, "{}: checkpoints differ", name(&config));
     }

@@ -1,8 +1,9 @@
 //! What an occluder hides must not reach training by any way.
+#![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
 
-mod common;
 #[path = "common/capture_on_disk.rs"]
 mod capture_on_disk;
+mod common;
 
 use common::{TempDir, body, capture, scene, tiny, train};
 use glam::Vec3;
@@ -110,8 +111,7 @@ fn colours_of_unknown_pixels_have_no_influence_and_those_of_known_ones_have() {
 #[test]
 fn vertex_colours_do_not_depend_on_unknown_pixels() {
     let config = tiny(Method::Prior, MotionKind::Surface);
-    let measure =
-        |capture: &Capture| VertexColors::measure(&Scene::new(capture, body(), &config).unwrap()).unwrap();
+    let measure = |capture: &Capture| VertexColors::measure(&Scene::new(capture, body(), &config).unwrap()).unwrap();
     assert_eq!(measure(capture()), measure(&repainted(Label::Unknown)));
     assert_ne!(measure(capture()), measure(&repainted(Label::Subject)));
 }

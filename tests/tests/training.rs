@@ -1,11 +1,12 @@
 //! What a training run must do from its first step on.
+#![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
 
 mod common;
 
 use common::{METHODS, body, capture, scene, silhouette, tiny};
 use glam::Vec3;
 use occnerf::{
-    Config, FieldRenderer, Method, MotionKind, PreparedFrame, Preset, Renderer, Scene, Trainer, evaluate,
+    Config, FieldRenderer, Method, MotionKind, PreparedFrame, Preset, Renderer, Scene, StepReport, Trainer, evaluate,
 };
 
 /// Whole tables take a while to draw, and start near zero whatever their size.
@@ -50,13 +51,15 @@ fn the_papers_preset_does_not_start_empty_either() {
 }
 
 /// Enough for every method to learn the outline.
-const STEPS: usize = 72;
+const STEPS: usize = 64;
 
 #[test]
 fn a_short_training_lowers_the_loss_and_beats_its_own_start() {
     for method in METHODS {
         let mut config = tiny(method, MotionKind::Surface);
         (config.steps, config.patches, config.patch_size) = (STEPS as u64, 3, 24);
+        let mut frozen = config.clone();
+        (frozen.rates.field, frozen.rates.vertices, frozen.rates.table) = (0.0, 0.0, 0.0);
         let mut trainer = Trainer::new(scene(), config).unwrap();
         let psnr = |trainer: &Trainer<'_>| {
             let frames: Vec<&PreparedFrame> = scene().eval.iter().collect();
@@ -66,12 +69,14 @@ fn a_short_training_lowers_the_loss_and_beats_its_own_start() {
         let start = psnr(&trainer);
         let reports: Vec<_> = (0..STEPS).map(|_| trainer.step()).collect();
         let end = psnr(&trainer);
-        // Four rounds of the six frames: easy and hard patches count alike.
-        let mean = |part: &[occnerf::StepReport]| part.iter().map(|r| r.loss).sum::<f64>() / part.len() as f64;
-        let (first, last) = (mean(&reports[..24]), mean(&reports[STEPS - 24..]));
-        println!("{method:?}: loss {first} {last}, psnr_mask {start} {end}");
-        assert!(last < 0.8 * first, "{method:?}: loss {first} to {last}");
-        assert!(end > start + 1.0, "{method:?}: psnr_mask {start} to {end} dB");
+        // One that never learns sees the same patches over the same backgrounds, hard or easy.
+        let mut frozen = Trainer::new(scene(), frozen).unwrap();
+        let still: Vec<_> = (0..STEPS).map(|_| frozen.step()).collect();
+        let mean = |of: &[StepReport]| of[STEPS - 12..].iter().map(|r| r.loss).sum::<f64>() / 12.0;
+        let (before, after) = (mean(&still), mean(&reports));
+        println!("{method:?}: loss {before} {after}, psnr_mask {start} {end}");
+        assert!(after < 0.95 * before, "{method:?}: loss {before} to {after}");
+        assert!(end > start + 0.5, "{method:?}: psnr_mask {start} to {end} dB");
         for report in &reports {
             assert_eq!(report.bad_gradients, 0, "{method:?} step {}", report.step);
             assert!(report.loss.is_finite() && report.live_samples > 0 && report.psnr.is_finite());
@@ -117,12 +122,12 @@ fn vertices_near_visible_pixels_are_counted_and_the_rest_stay_behind() {
     assert!(often > 2.0 * never, "never seen {never}, often seen {often}");
 }
 
-/// The demo's default scene at the fast preset: what a user tries first.
 #[test]
 fn the_scene_keeps_capture_and_labels_in_step() {
     assert_eq!(scene().train.len(), capture().train.len());
     assert_eq!(scene().eval.len(), capture().eval.len());
     assert_eq!(scene().canonical.vertices.len(), body().num_vertices());
-    let (low, high) = scene().canonical.vertices.iter().fold((f32::MAX, f32::MIN), |(l, h), v| (l.min(v.y), h.max(v.y)));
+    let (low, high) =
+        scene().canonical.vertices.iter().fold((f32::MAX, f32::MIN), |(l, h), v| (l.min(v.y), h.max(v.y)));
     assert!((high - low - 1.7).abs() < 1e-5);
 }

@@ -12,7 +12,7 @@ use occnerf::{
 };
 
 use crate::run::{CHECKPOINT, METRICS, Metrics, RunConfig, Splits, peak_rss_bytes, use_threads};
-use crate::{pictures, table};
+use crate::{pictures, report, table};
 
 /// Training frames are many and alike: every tenth is scored.
 const TRAIN_STRIDE: usize = 10;
@@ -84,6 +84,7 @@ pub fn eval(arguments: &EvalArguments) -> Result<()> {
         metrics.splits.train_view = Some(model.score_with_bar(&scene, Split::TrainView, |_, _| {})?);
     }
     metrics.write(directory)?;
+    report::write(directory, &metrics)?;
     let mut one = metrics.clone();
     for (name, split) in [("novel views", &metrics.splits.novel_view), ("train views", &metrics.splits.train_view)] {
         if let Some(split) = split {
@@ -180,6 +181,7 @@ pub fn score_run(
     metrics.splits = Splits { novel_view: (!scene.eval.is_empty()).then_some(novel), train_view: Some(train) };
     metrics.scene.clone_from(&run.scene);
     metrics.write(directory)?;
+    report::write(directory, &metrics)?;
     Ok(metrics)
 }
 

@@ -4,6 +4,7 @@ mod compare;
 mod eval;
 mod pictures;
 mod render;
+mod report;
 mod run;
 mod settings;
 mod source;

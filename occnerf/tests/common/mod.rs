@@ -1,4 +1,5 @@
 //! A capture small enough to prepare in no time: an upright ellipsoid with two joints, seen by three cameras.
+#![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
 #![allow(dead_code, reason = "not every test file uses everything")]
 
 use std::path::{Path, PathBuf};
@@ -98,6 +99,15 @@ pub fn config(method: Method) -> Config {
 pub fn scene() -> &'static Scene {
     static SCENE: OnceLock<Scene> = OnceLock::new();
     SCENE.get_or_init(|| Scene::new(&capture(), body(), &config(Method::Occnerf)).unwrap())
+}
+
+/// `text` with its first line that sets `key`, or opens the table `key`, replaced.
+pub fn replace_line(text: &str, key: &str, by: &str) -> String {
+    let setting = format!("{key} = ");
+    let mut lines: Vec<&str> = text.lines().collect();
+    let found = lines.iter().position(|line| *line == key || line.starts_with(&setting));
+    lines[found.unwrap_or_else(|| panic!("no `{key}` in\n{text}"))] = by;
+    lines.join("\n")
 }
 
 /// A directory that is removed when dropped.

@@ -9,17 +9,11 @@ use crate::sparse::SparseRows;
 /// (10·V): displacement of every vertex for one unit of each beta. `vertices` stand on the floor y = 0.
 pub(super) fn shape_directions(vertices: &[Vec3], faces: &[[u32; 3]]) -> Vec<Vec3> {
     let normals = normals(vertices, faces);
-    let directions: [fn(Vec3, Vec3) -> Vec3; 10] = [
-        height, weight, sex, muscle, head, belly, chest, width, leg_length, arm_length,
-    ];
+    let directions: [fn(Vec3, Vec3) -> Vec3; 10] =
+        [height, weight, sex, muscle, head, belly, chest, width, leg_length, arm_length];
     let mut out = Vec::with_capacity(10 * vertices.len());
     for direction in directions {
-        out.extend(
-            vertices
-                .iter()
-                .zip(&normals)
-                .map(|(&p, &n)| direction(p, n)),
-        );
+        out.extend(vertices.iter().zip(&normals).map(|(&p, &n)| direction(p, n)));
     }
     out
 }
@@ -62,10 +56,9 @@ fn muscle(p: Vec3, n: Vec3) -> Vec3 {
     let arm = bump(p, [0.30, 1.38, -0.01], [0.09, 0.1, 0.1])
         + 0.6 * bump(p, [0.52, 1.38, -0.01], [0.06, 0.1, 0.1])
         + 0.8 * bump(p, [0.18, 1.38, -0.01], [0.05, 0.06, 0.08]);
-    let leg = 1.2 * bump(p, [0.09, 0.65, 0.0], [0.1, 0.12, 0.2])
-        + bump(p, [0.10, 0.34, -0.06], [0.06, 0.06, 0.06]);
-    let torso = bump(p, [0.075, 1.26, 0.1], [0.05, 0.05, 0.06])
-        + 0.8 * bump(p, [0.12, 1.25, -0.08], [0.08, 0.08, 0.06]);
+    let leg = 1.2 * bump(p, [0.09, 0.65, 0.0], [0.1, 0.12, 0.2]) + bump(p, [0.10, 0.34, -0.06], [0.06, 0.06, 0.06]);
+    let torso =
+        bump(p, [0.075, 1.26, 0.1], [0.05, 0.05, 0.06]) + 0.8 * bump(p, [0.12, 1.25, -0.08], [0.08, 0.08, 0.06]);
     n * (0.006 * (arm + leg + torso))
 }
 

@@ -26,11 +26,7 @@ struct Quadric {
 }
 
 impl Quadric {
-    const ZERO: Self = Self {
-        a: DMat3::ZERO,
-        b: DVec3::ZERO,
-        c: 0.0,
-    };
+    const ZERO: Self = Self { a: DMat3::ZERO, b: DVec3::ZERO, c: 0.0 };
 
     fn plane(normal: DVec3, point: DVec3, weight: f64) -> Self {
         let d = -normal.dot(point);
@@ -42,11 +38,7 @@ impl Quadric {
     }
 
     fn plus(self, other: Self) -> Self {
-        Self {
-            a: self.a + other.a,
-            b: self.b + other.b,
-            c: self.c + other.c,
-        }
+        Self { a: self.a + other.a, b: self.b + other.b, c: self.c + other.c }
     }
 
     fn at(&self, x: DVec3) -> f64 {
@@ -142,9 +134,7 @@ impl Collapser {
     }
 
     fn faces_of(&self, v: u32) -> impl Iterator<Item = [u32; 3]> + '_ {
-        (self.around[v as usize].iter())
-            .filter(|&&f| self.alive[f as usize])
-            .map(|&f| self.faces[f as usize])
+        (self.around[v as usize].iter()).filter(|&&f| self.alive[f as usize]).map(|&f| self.faces[f as usize])
     }
 
     /// Ascending.
@@ -180,11 +170,7 @@ impl Collapser {
         }
         // Area times area: of the size of a quadric's error.
         let cost = quadric.at(position).max(0.0) + LENGTH_COST * length * length;
-        let detail = if position.y > FACE && position.z > 0.03 {
-            FACE_COST
-        } else {
-            1.0
-        };
+        let detail = if position.y > FACE && position.z > 0.03 { FACE_COST } else { 1.0 };
         let cost = detail * cost;
         self.heap.push(Candidate {
             cost,
@@ -208,9 +194,10 @@ impl Collapser {
             return false;
         }
         let position = candidate.position;
-        let long = nu.iter().chain(&nv).any(|&n| {
-            n != u && n != v && self.positions[n as usize].distance(position) > MAX_LENGTH
-        });
+        let long = nu
+            .iter()
+            .chain(&nv)
+            .any(|&n| n != u && n != v && self.positions[n as usize].distance(position) > MAX_LENGTH);
         if long || self.flips(u, v, position) || self.flips(v, u, position) {
             return false;
         }
@@ -245,23 +232,13 @@ impl Collapser {
     fn flips(&self, u: u32, v: u32, position: DVec3) -> bool {
         self.faces_of(u).filter(|f| !f.contains(&v)).any(|face| {
             let old = face.map(|i| self.positions[i as usize]);
-            let new = face.map(|i| {
-                if i == u {
-                    position
-                } else {
-                    self.positions[i as usize]
-                }
-            });
+            let new = face.map(|i| if i == u { position } else { self.positions[i as usize] });
             let cross = |[a, b, c]: [DVec3; 3]| (b - a).cross(c - a);
             let (old, new) = (cross(old), cross(new));
             let longest = (0..3)
                 .map(|i| {
                     let p = |i: usize| {
-                        if face[i] == u {
-                            position
-                        } else {
-                            self.positions[face[i] as usize]
-                        }
+                        if face[i] == u { position } else { self.positions[face[i] as usize] }
                     };
                     p(i).distance_squared(p((i + 1) % 3))
                 })
@@ -274,12 +251,7 @@ impl Collapser {
         let mut index = vec![u32::MAX; self.positions.len()];
         let mut vertices = Vec::new();
         let mut faces = Vec::new();
-        for (face, _) in self
-            .faces
-            .iter()
-            .zip(&self.alive)
-            .filter(|(_, alive)| **alive)
-        {
+        for (face, _) in self.faces.iter().zip(&self.alive).filter(|(_, alive)| **alive) {
             faces.push(face.map(|v| {
                 let slot = &mut index[v as usize];
                 if *slot == u32::MAX {

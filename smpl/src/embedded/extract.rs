@@ -92,11 +92,7 @@ fn sample(corners: [usize; 3]) -> Vec<f32> {
                         for y in first[1]..corners[1].min(first[1] + BLOCK) {
                             for x in first[0]..corners[0].min(first[0] + BLOCK) {
                                 let here = [x, y, first[2] + z].map(|i| i as f32);
-                                let value = if far {
-                                    centre
-                                } else {
-                                    distance(position(here))
-                                };
+                                let value = if far { centre } else { distance(position(here)) };
                                 slab[(z * corners[1] + y) * corners[0] + x] = value;
                             }
                         }
@@ -141,11 +137,7 @@ fn cell_vertex(cell: [usize; 3], value: impl Fn([usize; 3]) -> f32) -> Option<Ve
 /// Two triangles along the shorter diagonal.
 fn split([a, b, c, d]: [u32; 4], vertices: &[Vec3]) -> [[u32; 3]; 2] {
     let length = |i: u32, j: u32| vertices[i as usize].distance_squared(vertices[j as usize]);
-    if length(a, c) <= length(b, d) {
-        [[a, b, c], [a, c, d]]
-    } else {
-        [[a, b, d], [b, c, d]]
-    }
+    if length(a, c) <= length(b, d) { [[a, b, c], [a, c, d]] } else { [[a, b, d], [b, c, d]] }
 }
 
 /// Newton's method along the gradient; vertices in the plane of symmetry stay there.

@@ -39,10 +39,7 @@ const ROUNDS: usize = 12;
 const MAX_JOINTS: usize = 4;
 
 pub(super) fn parents() -> Vec<Option<usize>> {
-    JOINTS
-        .iter()
-        .map(|&(parent, ..)| (parent != usize::MAX).then_some(parent))
-        .collect()
+    JOINTS.iter().map(|&(parent, ..)| (parent != usize::MAX).then_some(parent)).collect()
 }
 
 /// Vertices joined to each by an edge, ascending.
@@ -113,10 +110,7 @@ pub(super) fn skinning_weights(vertices: &[Vec3], faces: &[[u32; 3]]) -> SparseR
                 let mut row = weights[i];
                 let share = 1.0 / neighbours[i].len().max(1) as f32;
                 for joint in 0..24 {
-                    let around: f32 = neighbours[i]
-                        .iter()
-                        .map(|&n| weights[n as usize][joint])
-                        .sum();
+                    let around: f32 = neighbours[i].iter().map(|&n| weights[n as usize][joint]).sum();
                     row[joint] = 0.4 * row[joint] + 0.6 * share * around;
                 }
                 row
@@ -124,10 +118,8 @@ pub(super) fn skinning_weights(vertices: &[Vec3], faces: &[[u32; 3]]) -> SparseR
             .collect();
     }
     SparseRows::from_rows(weights.iter().map(|row| {
-        let mut kept: Vec<(u32, f32)> = (0..24u32)
-            .map(|joint| (joint, row[joint as usize]))
-            .filter(|&(_, w)| w > 0.01)
-            .collect();
+        let mut kept: Vec<(u32, f32)> =
+            (0..24u32).map(|joint| (joint, row[joint as usize])).filter(|&(_, w)| w > 0.01).collect();
         kept.sort_by(|a, b| b.1.total_cmp(&a.1).then(a.0.cmp(&b.0)));
         kept.truncate(MAX_JOINTS);
         kept.sort_by_key(|&(joint, _)| joint);
@@ -162,9 +154,7 @@ pub(super) fn joint_regressor(vertices: &[Vec3]) -> SparseRows<f32> {
 
 /// The most even weights that sum to 1 and whose mean of the vertices is `target`.
 fn least_norm(slab: &[u32], vertices: &[Vec3], target: Vec3) -> Vec<f32> {
-    let rows: Vec<DVec4> = (slab.iter())
-        .map(|&v| (vertices[v as usize] - target).as_dvec3().extend(1.0))
-        .collect();
+    let rows: Vec<DVec4> = (slab.iter()).map(|&v| (vertices[v as usize] - target).as_dvec3().extend(1.0)).collect();
     let even = 1.0 / rows.len().max(1) as f64;
     let mut gram = DMat4::ZERO;
     let mut rest = DVec4::W;
@@ -173,7 +163,5 @@ fn least_norm(slab: &[u32], vertices: &[Vec3], target: Vec3) -> Vec<f32> {
         rest -= row * even;
     }
     let multipliers = gram.inverse() * rest;
-    rows.iter()
-        .map(|row| (even + row.dot(multipliers)) as f32)
-        .collect()
+    rows.iter().map(|row| (even + row.dot(multipliers)) as f32).collect()
 }

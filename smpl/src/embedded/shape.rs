@@ -130,11 +130,7 @@ fn ellipsoid(p: Vec3, centre: [f32; 3], radii: [f32; 3]) -> f32 {
     let r = Vec3::from(radii);
     let q = (p - Vec3::from(centre)) / r;
     let (k0, k1) = (q.length(), (q / r).length());
-    if k0 < 1e-3 {
-        -r.min_element()
-    } else {
-        k0 * (k0 - 1.0) / k1
-    }
+    if k0 < 1e-3 { -r.min_element() } else { k0 * (k0 - 1.0) / k1 }
 }
 
 /// A cone with round ends.
@@ -159,61 +155,26 @@ fn carve(a: f32, b: f32, k: f32) -> f32 {
 const FAR: f32 = 0.3;
 
 /// Joins a part that lies in the box from `low` to `high`, unless that is too far to matter.
-fn join_near(
-    d: f32,
-    p: Vec3,
-    low: [f32; 3],
-    high: [f32; 3],
-    k: f32,
-    part: impl Fn() -> f32,
-) -> f32 {
+fn join_near(d: f32, p: Vec3, low: [f32; 3], high: [f32; 3], k: f32, part: impl Fn() -> f32) -> f32 {
     let outside = p - p.clamp(Vec3::from(low), Vec3::from(high));
-    if outside.length() > d + k {
-        d
-    } else {
-        join(d, part(), k)
-    }
+    if outside.length() > d + k { d } else { join(d, part(), k) }
 }
 
 /// Signed distance to first order, negative inside, symmetric in x.
 pub(super) fn distance(p: Vec3) -> f32 {
     let p = Vec3::new(p.x.abs(), p.y, p.z);
-    let d = join_near(FAR, p, [0.0, 0.75, -0.2], [0.2, 1.48, 0.2], 0.05, || {
-        torso(p)
-    });
-    let d = join_near(d, p, [0.0, 1.34, -0.1], [0.08, 1.60, 0.1], 0.03, || {
-        NECK.distance(p)
-    });
+    let d = join_near(FAR, p, [0.0, 0.75, -0.2], [0.2, 1.48, 0.2], 0.05, || torso(p));
+    let d = join_near(d, p, [0.0, 1.34, -0.1], [0.08, 1.60, 0.1], 0.03, || NECK.distance(p));
     let d = join_near(d, p, [0.0, 0.0, -0.15], [0.2, 0.95, 0.2], 0.035, || legs(p));
     let d = join_near(d, p, [0.08, 1.28, -0.1], [0.9, 1.45, 0.1], 0.055, || arm(p));
-    join_near(d, p, [0.0, 1.46, -0.12], [0.1, 1.72, 0.15], 0.022, || {
-        head(p)
-    })
+    join_near(d, p, [0.0, 1.46, -0.12], [0.1, 1.72, 0.15], 0.022, || head(p))
 }
 
 fn torso(p: Vec3) -> f32 {
     let mut d = TORSO.distance(p);
-    d = join(
-        d,
-        ellipsoid(p, [0.072, 0.865, -0.062], [0.078, 0.085, 0.068]),
-        0.05,
-    );
-    d = join(
-        d,
-        ellipsoid(p, [0.072, 1.265, 0.066], [0.072, 0.055, 0.036]),
-        0.05,
-    );
-    join(
-        d,
-        capsule(
-            p,
-            [0.025, 1.455, -0.028],
-            [0.150, 1.392, -0.022],
-            0.030,
-            0.038,
-        ),
-        0.045,
-    )
+    d = join(d, ellipsoid(p, [0.072, 0.865, -0.062], [0.078, 0.085, 0.068]), 0.05);
+    d = join(d, ellipsoid(p, [0.072, 1.265, 0.066], [0.072, 0.055, 0.036]), 0.05);
+    join(d, capsule(p, [0.025, 1.455, -0.028], [0.150, 1.392, -0.022], 0.030, 0.038), 0.045)
 }
 
 fn legs(p: Vec3) -> f32 {
@@ -227,16 +188,8 @@ fn legs(p: Vec3) -> f32 {
 fn leg(p: Vec3) -> f32 {
     let mut d = LEG.distance(p);
     // Kneecap and ankle bones.
-    d = join(
-        d,
-        ellipsoid(p, [0.098, 0.485, 0.036], [0.030, 0.035, 0.026]),
-        0.03,
-    );
-    d = join(
-        d,
-        ellipsoid(p, [0.104, 0.088, -0.018], [0.037, 0.018, 0.020]),
-        0.02,
-    );
+    d = join(d, ellipsoid(p, [0.098, 0.485, 0.036], [0.030, 0.035, 0.026]), 0.03);
+    d = join(d, ellipsoid(p, [0.104, 0.088, -0.018], [0.037, 0.018, 0.020]), 0.02);
     let foot = FOOT.distance(p);
     d = join(d, foot, 0.035);
     // Flat sole.
@@ -245,26 +198,10 @@ fn leg(p: Vec3) -> f32 {
 
 fn arm(p: Vec3) -> f32 {
     let mut d = ARM.distance(p);
-    d = join(
-        d,
-        ellipsoid(p, [0.185, 1.378, -0.016], [0.060, 0.056, 0.056]),
-        0.03,
-    );
+    d = join(d, ellipsoid(p, [0.185, 1.378, -0.016], [0.060, 0.056, 0.056]), 0.03);
     let mut hand = HAND.distance(p);
-    let thumb = capsule(
-        p,
-        [0.722, 1.372, 0.020],
-        [0.752, 1.366, 0.048],
-        0.015,
-        0.012,
-    );
-    let tip = capsule(
-        p,
-        [0.752, 1.366, 0.048],
-        [0.786, 1.361, 0.058],
-        0.012,
-        0.0095,
-    );
+    let thumb = capsule(p, [0.722, 1.372, 0.020], [0.752, 1.366, 0.048], 0.015, 0.012);
+    let tip = capsule(p, [0.752, 1.366, 0.048], [0.786, 1.361, 0.058], 0.012, 0.0095);
     hand = join(hand, join(thumb, tip, 0.006), 0.012);
     d = join(d, hand, 0.02);
     d
@@ -273,56 +210,16 @@ fn arm(p: Vec3) -> f32 {
 fn head(p: Vec3) -> f32 {
     let mut d = HEAD.distance(p);
     // Brow, cheekbones, chin.
-    d = join(
-        d,
-        ellipsoid(p, [0.022, 1.605, 0.088], [0.034, 0.011, 0.013]),
-        0.02,
-    );
-    d = join(
-        d,
-        ellipsoid(p, [0.040, 1.558, 0.068], [0.024, 0.020, 0.022]),
-        0.025,
-    );
-    d = join(
-        d,
-        ellipsoid(p, [0.0, 1.492, 0.089], [0.020, 0.014, 0.014]),
-        0.02,
-    );
+    d = join(d, ellipsoid(p, [0.022, 1.605, 0.088], [0.034, 0.011, 0.013]), 0.02);
+    d = join(d, ellipsoid(p, [0.040, 1.558, 0.068], [0.024, 0.020, 0.022]), 0.025);
+    d = join(d, ellipsoid(p, [0.0, 1.492, 0.089], [0.020, 0.014, 0.014]), 0.02);
     // Eye sockets with eyes.
-    d = carve(
-        d,
-        ellipsoid(p, [0.031, 1.587, 0.112], [0.017, 0.010, 0.020]),
-        0.014,
-    );
-    d = join(
-        d,
-        ellipsoid(p, [0.031, 1.585, 0.087], [0.013, 0.011, 0.012]),
-        0.003,
-    );
+    d = carve(d, ellipsoid(p, [0.031, 1.587, 0.112], [0.017, 0.010, 0.020]), 0.014);
+    d = join(d, ellipsoid(p, [0.031, 1.585, 0.087], [0.013, 0.011, 0.012]), 0.003);
     // Nose and lips.
-    d = join(
-        d,
-        capsule(p, [0.0, 1.596, 0.101], [0.0, 1.555, 0.118], 0.007, 0.011),
-        0.014,
-    );
-    d = join(
-        d,
-        ellipsoid(p, [0.010, 1.549, 0.108], [0.009, 0.007, 0.009]),
-        0.008,
-    );
-    d = join(
-        d,
-        ellipsoid(p, [0.0, 1.524, 0.100], [0.023, 0.012, 0.014]),
-        0.010,
-    );
-    d = carve(
-        d,
-        ellipsoid(p, [0.0, 1.524, 0.114], [0.024, 0.003, 0.010]),
-        0.005,
-    );
-    join(
-        d,
-        ellipsoid(p, [0.075, 1.572, 0.000], [0.009, 0.029, 0.017]),
-        0.008,
-    )
+    d = join(d, capsule(p, [0.0, 1.596, 0.101], [0.0, 1.555, 0.118], 0.007, 0.011), 0.014);
+    d = join(d, ellipsoid(p, [0.010, 1.549, 0.108], [0.009, 0.007, 0.009]), 0.008);
+    d = join(d, ellipsoid(p, [0.0, 1.524, 0.100], [0.023, 0.012, 0.014]), 0.010);
+    d = carve(d, ellipsoid(p, [0.0, 1.524, 0.114], [0.024, 0.003, 0.010]), 0.005);
+    join(d, ellipsoid(p, [0.075, 1.572, 0.000], [0.009, 0.029, 0.017]), 0.008)
 }

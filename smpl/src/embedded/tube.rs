@@ -48,17 +48,10 @@ impl Tube {
             1 => (p.y, p.x, p.z),
             _ => (p.z, p.x, p.y),
         };
-        let (first, last) = (
-            self.sections[0][0],
-            self.sections[self.sections.len() - 1][0],
-        );
+        let (first, last) = (self.sections[0][0], self.sections[self.sections.len() - 1][0]);
         let inside = t.clamp(first, last);
         let [cu, cv, ru, rv] = self.section(inside);
-        let cap = if t < first {
-            self.caps[0]
-        } else {
-            self.caps[1]
-        };
+        let cap = if t < first { self.caps[0] } else { self.caps[1] };
         let radii = [ru, rv, cap];
         let q = [(u - cu) / ru, (v - cv) / rv, (t - inside) / cap].map(f32::abs);
         let powers = q.map(|q| if q > 0.0 { q.powf(self.power) } else { 0.0 });
@@ -69,11 +62,7 @@ impl Tube {
         }
         // ∂k/∂q = (q/k)^(power−1)
         let slope = |i: usize| {
-            if q[i] > 0.0 {
-                powers[i] / q[i] * k / (sum * radii[i])
-            } else {
-                0.0
-            }
+            if q[i] > 0.0 { powers[i] / q[i] * k / (sum * radii[i]) } else { 0.0 }
         };
         let gradient = Vec3::new(slope(0), slope(1), slope(2)).length();
         (k - 1.0) / gradient

@@ -35,16 +35,8 @@ impl Grid {
         let n = config.resolution;
         assert!(n >= 2, "weight volume: resolution {n}, need at least 2");
         assert!(!shaped.vertices.is_empty(), "weight volume: no vertices");
-        let low = shaped
-            .vertices
-            .iter()
-            .copied()
-            .fold(Vec3::INFINITY, Vec3::min);
-        let high = shaped
-            .vertices
-            .iter()
-            .copied()
-            .fold(Vec3::NEG_INFINITY, Vec3::max);
+        let low = shaped.vertices.iter().copied().fold(Vec3::INFINITY, Vec3::min);
+        let high = shaped.vertices.iter().copied().fold(Vec3::NEG_INFINITY, Vec3::max);
         // The margin follows from the cell and the cell from the margin. At the coarsest resolutions they run away from
         // each other, hence the fixed number of rounds.
         let mut margin = config.margin;
@@ -54,12 +46,7 @@ impl Grid {
             margin = config.margin.max(CELL_SHARE * cell.length());
             pad = margin + config.falloff;
         }
-        Self {
-            n,
-            min: low - pad,
-            max: high + pad,
-            margin,
-        }
+        Self { n, min: low - pad, max: high + pad, margin }
     }
 
     fn samples(&self) -> usize {
@@ -100,9 +87,7 @@ impl WeightVolume {
                 if ends.is_empty() {
                     ends.push(2.0 * own_centre(model, shaped, joint) - start);
                 }
-                ends.iter()
-                    .map(|&end| Gaussian::new(start, end, config))
-                    .collect()
+                ends.iter().map(|&end| Gaussian::new(start, end, config)).collect()
             })
             .collect();
         let samples = grid.samples();
@@ -138,10 +123,7 @@ impl WeightVolume {
         let joints = model.num_joints();
         let samples = grid.samples();
         let cloud = Cloud::new(&shaped.vertices);
-        let nearest: Vec<f32> = (0..samples)
-            .into_par_iter()
-            .map(|i| cloud.nearest_squared(grid.position(i)))
-            .collect();
+        let nearest: Vec<f32> = (0..samples).into_par_iter().map(|i| cloud.nearest_squared(grid.position(i))).collect();
         let outside = flood(&grid, &nearest);
         // Wide enough to be smooth from sample to sample.
         let width = 0.25 * grid.cell().length_squared();
@@ -161,8 +143,7 @@ impl WeightVolume {
                     let body = &mut row[..joints];
                     gather(model, shaped, grid.position(i), nearest[i], width, body);
                     let sum: f32 = body.iter().sum();
-                    body.iter_mut()
-                        .for_each(|w| *w = if *w < DIFFUSED_CUT * sum { 0.0 } else { *w });
+                    body.iter_mut().for_each(|w| *w = if *w < DIFFUSED_CUT * sum { 0.0 } else { *w });
                     let sum: f32 = body.iter().sum();
                     let share = 1.0 - row[joints];
                     row[..joints].iter_mut().for_each(|w| *w *= share / sum);
@@ -216,11 +197,7 @@ fn own_centre(model: &BodyModel, shaped: &Shaped, joint: usize) -> Vec3 {
             }
         }
     }
-    if total > 0.0 {
-        sum / total
-    } else {
-        shaped.joints[joint]
-    }
+    if total > 0.0 { sum / total } else { shaped.joints[joint] }
 }
 
 /// Points by coordinate, padded with the first to a multiple of [`LANES`].
@@ -253,11 +230,7 @@ impl Cloud {
                 for i in 0..LANES {
                     let d = Vec3::new(x[i] - q.x, y[i] - q.y, z[i] - q.z);
                     let squared = d.x * d.x + d.y * d.y + d.z * d.z;
-                    least[i] = if squared < least[i] {
-                        squared
-                    } else {
-                        least[i]
-                    };
+                    least[i] = if squared < least[i] { squared } else { least[i] };
                 }
             }
             least.into_iter().fold(f32::INFINITY, f32::min)
@@ -266,14 +239,7 @@ impl Cloud {
 }
 
 /// Adds the skinning weights of vertices near `x`, weighted by exp(−(d² − d_min²)/2h²) with h² = `width`.
-fn gather(
-    model: &BodyModel,
-    shaped: &Shaped,
-    x: Vec3,
-    nearest_squared: f32,
-    width: f32,
-    out: &mut [f32],
-) {
+fn gather(model: &BodyModel, shaped: &Shaped, x: Vec3, nearest_squared: f32, width: f32, out: &mut [f32]) {
     for (v, vertex) in shaped.vertices.iter().enumerate() {
         let excess = (vertex.distance_squared(x) - nearest_squared) / (2.0 * width);
         if excess < 8.0 {

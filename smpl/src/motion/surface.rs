@@ -25,10 +25,7 @@ pub struct SurfaceMotion {
 impl Default for SurfaceMotion {
     /// 5 cm, then 5 cm more, for models in metres.
     fn default() -> Self {
-        Self {
-            margin: 0.05,
-            falloff: 0.05,
-        }
+        Self { margin: 0.05, falloff: 0.05 }
     }
 }
 
@@ -66,14 +63,9 @@ impl SurfaceMotion {
         if to_world.matrix3.determinant() < MIN_DETERMINANT {
             to_world = posed.bones[heaviest(weights())];
         }
-        let offset: Vec3 = (corners.iter().zip(barycentric))
-            .map(|(&v, b)| b * posed.pose_offsets[v])
-            .sum();
+        let offset: Vec3 = (corners.iter().zip(barycentric)).map(|(&v, b)| b * posed.pose_offsets[v]).sum();
         let canonical = to_world.inverse().transform_point3(point) - offset;
-        canonical.is_finite().then_some(MotionSample {
-            canonical,
-            likelihood,
-        })
+        canonical.is_finite().then_some(MotionSample { canonical, likelihood })
     }
 
     /// f of DESIGN §3 at a signed distance (outside positive); NaN for NaN.

@@ -27,13 +27,7 @@ pub struct WeightVolumeConfig {
 
 impl Default for WeightVolumeConfig {
     fn default() -> Self {
-        Self {
-            resolution: 32,
-            margin: 0.03,
-            falloff: 0.03,
-            gaussian_along: 0.18,
-            gaussian_across: 0.09,
-        }
+        Self { resolution: 32, margin: 0.03, falloff: 0.03, gaussian_along: 0.18, gaussian_across: 0.09 }
     }
 }
 
@@ -112,36 +106,29 @@ impl WeightVolume {
                 blocks[block].push(part);
             }
         }
-        blocks
-            .par_iter_mut()
-            .enumerate()
-            .for_each(|(block, parts)| {
-                let start = block * BLOCK;
-                let length = parts[0].len();
-                let mut most = vec![f32::NEG_INFINITY; length];
-                for channel in 0..parts.len() {
-                    for i in 0..length {
-                        most[i] = most[i].max(logit(channel * samples + start + i));
-                    }
+        blocks.par_iter_mut().enumerate().for_each(|(block, parts)| {
+            let start = block * BLOCK;
+            let length = parts[0].len();
+            let mut most = vec![f32::NEG_INFINITY; length];
+            for channel in 0..parts.len() {
+                for i in 0..length {
+                    most[i] = most[i].max(logit(channel * samples + start + i));
                 }
-                let mut sum = vec![0.0f32; length];
-                for (channel, part) in parts.iter_mut().enumerate() {
-                    for i in 0..length {
-                        let index = channel * samples + start + i;
-                        part[i] = if log_prior[index] == f32::NEG_INFINITY {
-                            0.0
-                        } else {
-                            (logit(index) - most[i]).exp()
-                        };
-                        sum[i] += part[i];
-                    }
+            }
+            let mut sum = vec![0.0f32; length];
+            for (channel, part) in parts.iter_mut().enumerate() {
+                for i in 0..length {
+                    let index = channel * samples + start + i;
+                    part[i] = if log_prior[index] == f32::NEG_INFINITY { 0.0 } else { (logit(index) - most[i]).exp() };
+                    sum[i] += part[i];
                 }
-                for part in parts {
-                    for i in 0..length {
-                        part[i] /= sum[i];
-                    }
+            }
+            for part in parts {
+                for i in 0..length {
+                    part[i] /= sum[i];
                 }
-            });
+            }
+        });
     }
 
     /// Maps `point` in the world: w_i = w^c_i(y_i) with y_i = `to_canonical`_i · x ([`crate::Posed::to_canonical`]),
@@ -152,17 +139,8 @@ impl WeightVolume {
     /// # Panics
     /// Unless there are K transforms.
     #[must_use]
-    pub fn map(
-        &self,
-        to_canonical: &[Affine3A],
-        point: Vec3,
-        threshold: f32,
-    ) -> Option<MotionSample> {
-        assert_eq!(
-            to_canonical.len(),
-            self.channels - 1,
-            "map: transforms of bones"
-        );
+    pub fn map(&self, to_canonical: &[Affine3A], point: Vec3, threshold: f32) -> Option<MotionSample> {
+        assert_eq!(to_canonical.len(), self.channels - 1, "map: transforms of bones");
         let samples = self.resolution.pow(3);
         let (mut sum, mut mean) = (0.0f32, Vec3::ZERO);
         for (bone, transform) in to_canonical.iter().enumerate() {
@@ -179,10 +157,7 @@ impl WeightVolume {
             return None;
         }
         let canonical = mean / sum;
-        canonical.is_finite().then_some(MotionSample {
-            canonical,
-            likelihood: sum.min(1.0),
-        })
+        canonical.is_finite().then_some(MotionSample { canonical, likelihood: sum.min(1.0) })
     }
 
     #[inline(always)]
@@ -198,17 +173,7 @@ impl WeightVolume {
     #[inline(always)]
     pub(super) fn corners(&self, first: usize) -> [usize; 8] {
         let (row, slice) = (self.resolution, self.resolution * self.resolution);
-        [
-            0,
-            1,
-            row,
-            row + 1,
-            slice,
-            slice + 1,
-            slice + row,
-            slice + row + 1,
-        ]
-        .map(|o| first + o)
+        [0, 1, row, row + 1, slice, slice + 1, slice + row, slice + row + 1].map(|o| first + o)
     }
 
     /// The cell that holds `y`, if it is in the box and any of its corners in the support of `bone`.
@@ -226,10 +191,8 @@ impl WeightVolume {
         let t = at - base;
         let [x, y, z] = base.to_array().map(|c| c as usize);
         let support = &self.support[bone];
-        let outside = [x, y, z]
-            .iter()
-            .enumerate()
-            .any(|(axis, &c)| c + 1 < support.low[axis] || c > support.high[axis]);
+        let outside =
+            [x, y, z].iter().enumerate().any(|(axis, &c)| c + 1 < support.low[axis] || c > support.high[axis]);
         if outside {
             return None;
         }
@@ -244,19 +207,13 @@ impl WeightVolume {
             s.x * t.y * t.z,
             t.x * t.y * t.z,
         ];
-        Some(Cell {
-            corner: (z * n + y) * n + x,
-            mix,
-        })
+        Some(Cell { corner: (z * n + y) * n + x, mix })
     }
 }
 
 impl Support {
     fn of(log_prior: &[f32], n: usize) -> Self {
-        let mut out = Self {
-            low: [usize::MAX; 3],
-            high: [0; 3],
-        };
+        let mut out = Self { low: [usize::MAX; 3], high: [0; 3] };
         for (i, &p) in log_prior.iter().enumerate() {
             if p > f32::NEG_INFINITY {
                 for (axis, at) in [i % n, i / n % n, i / (n * n)].into_iter().enumerate() {

@@ -21,16 +21,8 @@ impl WeightVolume {
         d_likelihood: f32,
         d_weights: &mut [f32],
     ) {
-        assert_eq!(
-            to_canonical.len(),
-            self.channels - 1,
-            "map_backward: transforms of bones"
-        );
-        assert_eq!(
-            d_weights.len(),
-            self.weights.len(),
-            "map_backward: d_weights"
-        );
+        assert_eq!(to_canonical.len(), self.channels - 1, "map_backward: transforms of bones");
+        assert_eq!(d_weights.len(), self.weights.len(), "map_backward: d_weights");
         let samples = self.resolution.pow(3);
         let (mut sum, mut mean) = (0.0f32, Vec3::ZERO);
         for (bone, transform) in to_canonical.iter().enumerate() {
@@ -63,16 +55,8 @@ impl WeightVolume {
     /// # Panics
     /// If a length does not fit.
     pub fn softmax_backward(&self, d_weights: &[f32], d_delta: &mut [f32]) {
-        assert_eq!(
-            d_weights.len(),
-            self.weights.len(),
-            "softmax_backward: d_weights"
-        );
-        assert_eq!(
-            d_delta.len(),
-            self.weights.len(),
-            "softmax_backward: d_delta"
-        );
+        assert_eq!(d_weights.len(), self.weights.len(), "softmax_backward: d_weights");
+        assert_eq!(d_delta.len(), self.weights.len(), "softmax_backward: d_delta");
         let samples = self.resolution.pow(3);
         let mut mean = vec![0.0f32; samples];
         for (w, d) in (self.weights.chunks_exact(samples)).zip(d_weights.chunks_exact(samples)) {
@@ -80,10 +64,7 @@ impl WeightVolume {
                 mean[i] += w[i] * d[i];
             }
         }
-        let channels = self
-            .weights
-            .chunks_exact(samples)
-            .zip(d_weights.chunks_exact(samples));
+        let channels = self.weights.chunks_exact(samples).zip(d_weights.chunks_exact(samples));
         for (out, (w, d)) in d_delta.chunks_exact_mut(samples).zip(channels) {
             for i in 0..samples {
                 out[i] += w[i] * (d[i] - mean[i]);

@@ -128,10 +128,7 @@ impl<'a> Machine<'a> {
     }
 
     fn get(&mut self, key: u64) -> Step<()> {
-        let id = self
-            .memo
-            .get(&key)
-            .ok_or_else(|| format!("no memo {key}"))?;
+        let id = self.memo.get(&key).ok_or_else(|| format!("no memo {key}"))?;
         self.stack.push(*id);
         Ok(())
     }
@@ -340,9 +337,7 @@ impl<'a> Machine<'a> {
                         self.construct(global, &items)?
                     }
                     _ => {
-                        return Err(
-                            "call of something other than a global with a few arguments".to_owned()
-                        );
+                        return Err("call of something other than a global with a few arguments".to_owned());
                     }
                 };
                 self.push(node);

@@ -72,11 +72,7 @@ pub fn read(path: &Path) -> Result<Value, Error> {
     if bytes.starts_with(b"\x93NUMPY") {
         let mut rest = bytes.as_slice();
         let header = read_header(&file, "", &mut rest)?;
-        if !header
-            .descr
-            .trim_start_matches(['|', '<', '>', '='])
-            .starts_with('O')
-        {
+        if !header.descr.trim_start_matches(['|', '<', '>', '=']).starts_with('O') {
             return read_array(&file, "", bytes.as_slice()).map(Value::Array);
         }
         let start = bytes.len() - rest.len();
@@ -95,9 +91,5 @@ pub fn parse(file: &str, bytes: &[u8]) -> Result<Value, Error> {
 
 fn parse_at(file: &str, bytes: &[u8], start: usize) -> Result<Value, Error> {
     let mut machine = Machine::new(bytes, start);
-    machine.run().map_err(|message| Error::Pickle {
-        file: file.to_owned(),
-        offset: machine.offset(),
-        message,
-    })
+    machine.run().map_err(|message| Error::Pickle { file: file.to_owned(), offset: machine.offset(), message })
 }

@@ -40,9 +40,7 @@ pub(super) enum Dtype {
 impl Global {
     pub(super) fn find(module: &str, name: &str) -> Step<Self> {
         Ok(match (module, name) {
-            ("numpy.core.multiarray" | "numpy._core.multiarray", "_reconstruct") => {
-                Self::Reconstruct
-            }
+            ("numpy.core.multiarray" | "numpy._core.multiarray", "_reconstruct") => Self::Reconstruct,
             ("numpy.core.multiarray" | "numpy._core.multiarray", "scalar") => Self::Scalar,
             ("numpy.core.numeric" | "numpy._core.numeric", "_frombuffer") => Self::FromBuffer,
             ("numpy", "ndarray") => Self::Ndarray,
@@ -54,9 +52,7 @@ impl Global {
             ("collections", "OrderedDict") => Self::OrderedDict,
             ("_codecs", "encode") => Self::Encode,
             ("chumpy.ch", "Ch") => Self::Class("chumpy.ch.Ch"),
-            ("scipy.sparse.csc" | "scipy.sparse._csc", "csc_matrix") => {
-                Self::Class("scipy.sparse.csc_matrix")
-            }
+            ("scipy.sparse.csc" | "scipy.sparse._csc", "csc_matrix") => Self::Class("scipy.sparse.csc_matrix"),
             _ => return Err(format!("global `{module} {name}` is not allowed")),
         })
     }
@@ -69,18 +65,11 @@ impl Dtype {
         }
         let big_endian = name.starts_with('>');
         let bare = name.trim_start_matches(['<', '>', '|', '=']);
-        let size = |s: &str| {
-            s.parse::<usize>()
-                .ok()
-                .filter(|n| (1..=1 << 20).contains(n))
-        };
+        let size = |s: &str| s.parse::<usize>().ok().filter(|n| (1..=1 << 20).contains(n));
         let parsed = match bare.as_bytes().first() {
             Some(b'O') => Some(Self::Object),
             Some(b'S') => bare.get(1..).and_then(size).map(Self::ByteText),
-            Some(b'U') => bare.get(1..).and_then(size).map(|n| Self::WideText {
-                size: 4 * n,
-                big_endian,
-            }),
+            Some(b'U') => bare.get(1..).and_then(size).map(|n| Self::WideText { size: 4 * n, big_endian }),
             _ => None,
         };
         parsed.ok_or_else(|| format!("dtype {name:?} is not supported"))
@@ -175,10 +164,7 @@ impl<'a> Machine<'a> {
                 };
                 let dtype = match *dtype {
                     Dtype::Number(element) => Dtype::Number(element.with_order(&order)),
-                    Dtype::WideText { size, .. } => Dtype::WideText {
-                        size,
-                        big_endian: order == ">",
-                    },
+                    Dtype::WideText { size, .. } => Dtype::WideText { size, big_endian: order == ">" },
                     other => other,
                 };
                 self.nodes[target] = Node::Dtype(dtype);
@@ -194,8 +180,7 @@ impl<'a> Machine<'a> {
     fn array(&mut self, dtype: Dtype, shape: Vec<usize>, fortran: bool, raw: Id) -> Step<Node<'a>> {
         let count = element_count(&shape).and_then(|n| usize::try_from(n).ok());
         let count = count.ok_or_else(|| format!("shape {shape:?}"))?;
-        let mismatch =
-            |found: usize| format!("shape {shape:?} with {found} bytes or items of data");
+        let mismatch = |found: usize| format!("shape {shape:?} with {found} bytes or items of data");
         match dtype {
             Dtype::Number(element) => {
                 let length = match &self.nodes[raw] {
@@ -289,11 +274,7 @@ impl<'a> Machine<'a> {
 fn wide_text(bytes: &[u8], big_endian: bool) -> Step<String> {
     let units = bytes.chunks_exact(4).map(|c| {
         let unit = [c[0], c[1], c[2], c[3]];
-        let code = if big_endian {
-            u32::from_be_bytes(unit)
-        } else {
-            u32::from_le_bytes(unit)
-        };
+        let code = if big_endian { u32::from_be_bytes(unit) } else { u32::from_le_bytes(unit) };
         char::from_u32(code)
     });
     let text: Option<String> = units.collect();

@@ -51,10 +51,7 @@ impl Machine<'_> {
                 let (shape, items) = (shape.clone(), items.clone());
                 match items.as_slice() {
                     &[only] if shape.is_empty() => self.value(only, depth)?,
-                    _ => Value::Objects {
-                        items: self.values(items, depth)?,
-                        shape,
-                    },
+                    _ => Value::Objects { items: self.values(items, depth)?, shape },
                 }
             }
             Node::Dict(items) => {
@@ -142,10 +139,7 @@ impl Value {
     pub fn as_array(&self) -> Option<&NdArray> {
         match self {
             Self::Array(array) => Some(array),
-            Self::Object {
-                class: "chumpy.ch.Ch",
-                state,
-            } => match state.get("x") {
+            Self::Object { class: "chumpy.ch.Ch", state } => match state.get("x") {
                 Some(Self::Array(array)) => Some(array),
                 _ => None,
             },
@@ -162,12 +156,9 @@ impl Value {
             return Ok(Some(array.clone()));
         }
         match self {
-            Self::Object {
-                class: "scipy.sparse.csc_matrix",
-                state,
-            } => dense_columns(state)
-                .map(Some)
-                .map_err(|message| Error::invalid(file, key, message)),
+            Self::Object { class: "scipy.sparse.csc_matrix", state } => {
+                dense_columns(state).map(Some).map_err(|message| Error::invalid(file, key, message))
+            }
             _ => Ok(None),
         }
     }
@@ -176,10 +167,7 @@ impl Value {
 /// Compressed sparse columns, made dense.
 fn dense_columns(state: &Value) -> Result<NdArray, String> {
     let integers = |name: &str| match state.get(name).and_then(Value::as_array) {
-        Some(NdArray {
-            data: Data::I64(values),
-            ..
-        }) => Ok(values.as_slice()),
+        Some(NdArray { data: Data::I64(values), .. }) => Ok(values.as_slice()),
         _ => Err(format!("sparse matrix without `{name}`")),
     };
     let (starts, rows) = (integers("indptr")?, integers("indices")?);
@@ -197,8 +185,7 @@ fn dense_columns(state: &Value) -> Result<NdArray, String> {
         return Err("sparse matrix without a shape of two axes".to_owned());
     };
     let count = height.checked_mul(width).filter(|&n| n <= MAX_DENSE);
-    let count =
-        count.ok_or_else(|| format!("sparse matrix of shape [{height}, {width}] is too large"))?;
+    let count = count.ok_or_else(|| format!("sparse matrix of shape [{height}, {width}] is too large"))?;
     if starts.len() != width.saturating_add(1) || rows.len() != data.len() {
         return Err(format!(
             "sparse matrix of {width} columns with {} starts, {} rows, {} values",
@@ -219,8 +206,5 @@ fn dense_columns(state: &Value) -> Result<NdArray, String> {
             dense[row * width + column] += data[i];
         }
     }
-    Ok(NdArray {
-        shape: vec![height, width],
-        data: Data::F64(dense),
-    })
+    Ok(NdArray { shape: vec![height, width], data: Data::F64(dense) })
 }

@@ -9,12 +9,7 @@ const PRIMES: [u32; 4] = [1, 2_654_435_761, 805_459_861, 3_674_653_429];
 /// For more than 4 dimensions.
 #[must_use]
 pub fn hash_index(corner: &[u32], resolution: u32, log2_table_size: u32) -> usize {
-    assert!(
-        corner.len() <= PRIMES.len(),
-        "hash_index: {} dimensions, at most {}",
-        corner.len(),
-        PRIMES.len()
-    );
+    assert!(corner.len() <= PRIMES.len(), "hash_index: {} dimensions, at most {}", corner.len(), PRIMES.len());
     let side = u128::from(resolution) + 1;
     let rows = 1u128 << log2_table_size;
     if side.pow(corner.len() as u32) <= rows {
@@ -46,27 +41,15 @@ pub fn hash_encode(
     features: usize,
 ) -> Vec<f64> {
     let rows = 1usize << log2_table_size;
-    assert_eq!(
-        table.len(),
-        resolutions.len() * rows * features,
-        "hash_encode: table is not (L, 2^T, F)"
-    );
-    assert_eq!(
-        points.len() % dims,
-        0,
-        "hash_encode: points are not (Q, {dims})"
-    );
+    assert_eq!(table.len(), resolutions.len() * rows * features, "hash_encode: table is not (L, 2^T, F)");
+    assert_eq!(points.len() % dims, 0, "hash_encode: points are not (Q, {dims})");
     let mut encoded = Vec::new();
     for point in points.chunks(dims) {
         for (level, &resolution) in resolutions.iter().enumerate() {
             let mut cell = vec![0u32; dims];
             let mut fraction = vec![0.0f64; dims];
             for j in 0..dims {
-                let x = if point[j].is_nan() {
-                    0.0
-                } else {
-                    point[j].clamp(0.0, 1.0)
-                };
+                let x = if point[j].is_nan() { 0.0 } else { point[j].clamp(0.0, 1.0) };
                 let p = x * f64::from(resolution);
                 cell[j] = (p.floor() as u32).min(resolution - 1);
                 fraction[j] = p - f64::from(cell[j]);
@@ -109,20 +92,14 @@ mod tests {
         }
         for (x, y) in [(0.0, 0.0), (1.0, 1.0), (0.3, 0.77), (1.0, 0.0), (0.25, 0.5)] {
             let got = hash_encode(&[x, y], 2, &[4], &table, 5, 1)[0];
-            assert!(
-                (got - (3.0 * x - 2.0 * y + 1.0)).abs() < 1e-6,
-                "{x} {y}: {got}"
-            );
+            assert!((got - (3.0 * x - 2.0 * y + 1.0)).abs() < 1e-6, "{x} {y}: {got}");
         }
     }
 
     #[test]
     fn fine_levels_hash_by_xor_of_primes() {
         assert_eq!(hash_index(&[5, 0, 0], 64, 10), 5);
-        assert_eq!(
-            hash_index(&[0, 1, 0], 64, 10),
-            (2_654_435_761u64 % 1024) as usize
-        );
+        assert_eq!(hash_index(&[0, 1, 0], 64, 10), (2_654_435_761u64 % 1024) as usize);
         let two = 2u32.wrapping_mul(2_654_435_761);
         assert_eq!(hash_index(&[1, 2], 64, 8), ((1 ^ two) % 256) as usize);
         // (N+1)^D is exactly the table size: dense.

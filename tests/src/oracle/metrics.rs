@@ -5,11 +5,7 @@
 #[must_use]
 pub fn psnr(a: &[f32], b: &[f32]) -> f64 {
     assert_eq!(a.len(), b.len(), "psnr: different lengths");
-    let squared: f64 = a
-        .iter()
-        .zip(b)
-        .map(|(a, b)| (f64::from(*a) - f64::from(*b)).powi(2))
-        .sum();
+    let squared: f64 = a.iter().zip(b).map(|(a, b)| (f64::from(*a) - f64::from(*b)).powi(2)).sum();
     -10.0 * (squared / a.len() as f64).log10()
 }
 
@@ -54,8 +50,7 @@ pub fn ssim_map(a: &[f32], b: &[f32], width: usize, height: usize) -> Vec<f64> {
                     bb += (pb - mean_b) * (pb - mean_b) / (n - 1.0);
                     ab += (pa - mean_a) * (pb - mean_b) / (n - 1.0);
                 }
-                let luminance =
-                    (2.0 * mean_a * mean_b + c1) / (mean_a.powi(2) + mean_b.powi(2) + c1);
+                let luminance = (2.0 * mean_a * mean_b + c1) / (mean_a.powi(2) + mean_b.powi(2) + c1);
                 let structure = (2.0 * ab + c2) / (aa + bb + c2);
                 map[y * width + x] += luminance * structure / 3.0;
             }
@@ -71,10 +66,7 @@ pub fn ssim_map(a: &[f32], b: &[f32], width: usize, height: usize) -> Vec<f64> {
 #[must_use]
 pub fn ssim(a: &[f32], b: &[f32], width: usize, height: usize) -> f64 {
     let border = WINDOW as usize / 2;
-    assert!(
-        width.min(height) > 2 * border,
-        "ssim: {width}×{height} is smaller than the 7×7 window"
-    );
+    assert!(width.min(height) > 2 * border, "ssim: {width}×{height} is smaller than the 7×7 window");
     let map = ssim_map(a, b, width, height);
     let mut sum = 0.0;
     for y in border..height - border {
@@ -90,9 +82,7 @@ mod tests {
     use super::*;
 
     fn pattern(seed: usize) -> Vec<f32> {
-        (0..12 * 10 * 3)
-            .map(|i| ((i * 7919 + seed * 104_729) % 1009) as f32 / 1009.0)
-            .collect()
+        (0..12 * 10 * 3).map(|i| ((i * 7919 + seed * 104_729) % 1009) as f32 / 1009.0).collect()
     }
 
     #[test]
@@ -109,11 +99,7 @@ mod tests {
         assert!((ssim(&a, &a, 12, 10) - 1.0).abs() < 1e-12);
         // scikit-image 0.26.0: structural_similarity(a, b, data_range=1, channel_axis=-1) of the same patterns,
         // and the mean of its full map.
-        assert!(
-            (ssim(&a, &b, 12, 10) + 0.434_589_531_787).abs() < 1e-6,
-            "{}",
-            ssim(&a, &b, 12, 10)
-        );
+        assert!((ssim(&a, &b, 12, 10) + 0.434_589_531_787).abs() < 1e-6, "{}", ssim(&a, &b, 12, 10));
         let map = ssim_map(&a, &b, 12, 10);
         let mean = map.iter().sum::<f64>() / map.len() as f64;
         assert!((mean + 0.441_420_788_028).abs() < 1e-6, "{mean}");

@@ -4,11 +4,8 @@ use glam::Vec3;
 /// there are fewer than `k`. A distance that is NaN sorts last.
 #[must_use]
 pub fn knn(points: &[Vec3], q: Vec3, k: usize) -> Vec<(u32, f64)> {
-    let mut all: Vec<(u32, f64)> = points
-        .iter()
-        .enumerate()
-        .map(|(i, p)| (i as u32, p.as_dvec3().distance(q.as_dvec3()).abs()))
-        .collect();
+    let mut all: Vec<(u32, f64)> =
+        points.iter().enumerate().map(|(i, p)| (i as u32, p.as_dvec3().distance(q.as_dvec3()).abs())).collect();
     all.sort_by(|a, b| a.1.total_cmp(&b.1).then(a.0.cmp(&b.0)));
     all.truncate(k);
     all
@@ -28,11 +25,7 @@ pub fn farthest_points(points: &[Vec3], count: usize) -> Vec<u32> {
             // An empty set is infinitely far from everything, so the first choice is index 0.
             let gap = chosen
                 .iter()
-                .map(|&c| {
-                    points[c as usize]
-                        .as_dvec3()
-                        .distance_squared(points[i as usize].as_dvec3())
-                })
+                .map(|&c| points[c as usize].as_dvec3().distance_squared(points[i as usize].as_dvec3()))
                 .fold(f64::INFINITY, f64::min);
             if best.is_none_or(|(farthest, _)| gap > farthest) {
                 best = Some((gap, i));

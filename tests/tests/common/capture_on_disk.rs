@@ -1,4 +1,5 @@
 //! A capture in HumanNeRF's prepared layout, written with pickles made here.
+#![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
 
 use std::path::Path;
 
@@ -42,8 +43,7 @@ pub fn write(
         save("images", &|x, y| image(i, x, y));
         save("masks", &|x, y| [mask(i, x, y); 3]);
     }
-    let joints: Vec<f64> =
-        body().shaped(&[0.5]).joints.iter().flat_map(|j| j.to_array()).map(f64::from).collect();
+    let joints: Vec<f64> = body().shaped(&[0.5]).joints.iter().flat_map(|j| j.to_array()).map(f64::from).collect();
     let names: Vec<String> = (0..FRAMES).map(|i| format!("frame_{i:06}")).collect();
     let every_frame = |record: Vec<u8>| dictionary(names.iter().map(|name| (name.as_str(), record.clone())));
     let camera = dictionary([

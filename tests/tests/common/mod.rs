@@ -1,4 +1,5 @@
 //! A small demo capture, settings that train it in milliseconds a step, and places for files.
+#![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
 #![allow(dead_code, reason = "not every test file uses everything")]
 
 use std::path::{Path, PathBuf};

@@ -1,0 +1,84 @@
+//! The named settings, every value in one place.
+
+use crate::config::{
+    Config, DistanceKind, EncodingConfig, FieldConfig, LossConfig, Method, MotionConfig, MotionKind, OccludedRule,
+    Preset, RateConfig, SurfaceConfig,
+};
+
+/// The paper's setting; what it leaves open is named in ARCHITECTURE.
+pub(crate) fn paper() -> Config {
+    Config {
+        preset: Preset::Paper,
+        method: Method::Occnerf,
+        occluded: OccludedRule::Unknown,
+        seed: 1,
+        steps: 10_000,
+        patches: 6,
+        patch_size: 32,
+        samples: 128,
+        field: FieldConfig { width: 128, depth: 4, density_scale: 25.0, density_bias: 2.0, density_bias_outside: -2.0 },
+        encoding: EncodingConfig {
+            levels: 16,
+            features: 2,
+            log2_table_size: 19,
+            n_min: 16,
+            n_max: 2048,
+            distance_min: -0.2,
+            distance_max: 0.3,
+        },
+        surface: SurfaceConfig {
+            k: 5,
+            coarse_levels: 3,
+            distance: DistanceKind::Blended,
+            surface_term: true,
+            attention: true,
+        },
+        motion: MotionConfig { kind: MotionKind::Volume, margin: 0.08, falloff: 0.02, depth: 0.3 },
+        loss: LossConfig { mse: 0.2, perceptual: 1.0, completeness: 10.0, beta: 10.0 },
+        rates: RateConfig {
+            field: 5e-4,
+            vertices: 1e-4,
+            table: 5e-5,
+            motion: 5e-5,
+            final_fraction: 1.0,
+            beta_2: 0.999,
+        },
+    }
+}
+
+/// The default.
+pub(crate) fn balanced() -> Config {
+    Config {
+        preset: Preset::Balanced,
+        steps: 2000,
+        patches: 6,
+        samples: 64,
+        field: FieldConfig { width: 64, depth: 2, ..paper().field },
+        encoding: EncodingConfig {
+            levels: 10,
+            features: 2,
+            log2_table_size: 16,
+            n_min: 12,
+            n_max: 384,
+            distance_min: -0.2,
+            distance_max: 0.3,
+        },
+        surface: SurfaceConfig { distance: DistanceKind::Exact, ..paper().surface },
+        loss: LossConfig { mse: 5.0, ..paper().loss },
+        motion: MotionConfig { kind: MotionKind::Surface, margin: 0.04, falloff: 0.02, depth: 0.04 },
+        rates: RateConfig {
+            field: 2e-3,
+            vertices: 1e-4,
+            table: 1e-2,
+            motion: 1e-3,
+            final_fraction: 0.05,
+            beta_2: 0.99,
+        },
+        ..paper()
+    }
+}
+
+/// A first look.
+pub(crate) fn fast() -> Config {
+    Config { preset: Preset::Fast, steps: 800, patches: 4, samples: 48, ..balanced() }
+}

@@ -1,0 +1,89 @@
+//! The command line as somebody meets it: help, and one clear line for whatever is wrong.
+#![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
+
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+fn xtask(arguments: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_xtask")).args(arguments).env_remove("SMPL_MODEL").output().unwrap()
+}
+
+/// Fails with one line on standard error that names every one of `words`, and without a panic.
+fn refused(arguments: &[&str], words: &[&str]) {
+    let output = xtask(arguments);
+    let text = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(!output.status.success(), "{arguments:?} succeeded");
+    assert_eq!(text.trim_end().lines().count(), 1, "{arguments:?}: {text}");
+    assert!(text.starts_with("error: ") && !text.contains("panicked"), "{arguments:?}: {text}");
+    for word in words {
+        assert!(text.contains(word), "{arguments:?} should name {word}: {text}");
+    }
+}
+
+fn folder(name: &str) -> PathBuf {
+    let path = Path::new(env!("CARGO_TARGET_TMPDIR")).join(name);
+    let _ = std::fs::remove_dir_all(&path);
+    std::fs::create_dir_all(&path).unwrap();
+    path
+}
+
+fn text(path: &Path) -> &str {
+    path.to_str().unwrap()
+}
+
+#[test]
+fn help_names_the_commands_and_every_option_of_train() {
+    let help = |arguments: &[&str]| String::from_utf8(xtask(arguments).stdout).unwrap();
+    let general = help(&["--help"]);
+    for command in ["train", "eval", "render"] {
+        assert!(general.contains(command), "{general}");
+    }
+    let train = help(&["train", "--help"]);
+    let options = [
+        "--out",
+        "--preset",
+        "--method",
+        "--ablate",
+        "--occluded",
+        "--steps",
+        "--seed",
+        "--threads",
+        "--resume",
+        "--compare",
+    ];
+    for option in options {
+        assert!(train.contains(option), "{train}");
+    }
+}
+
+#[test]
+fn scenes_that_are_none_are_refused_and_leave_no_run_behind() {
+    let out = folder("no-scene").join("run");
+    refused(&["train", "/no/such/place", "--out", text(&out)], &["/no/such/place", "no such directory"]);
+    let empty = folder("empty-scene");
+    refused(&["train", text(&empty), "--out", text(&out)], &[text(&empty), "mesh_infos.pkl"]);
+    std::fs::write(empty.join("mesh_infos.pkl"), b"not a pickle").unwrap();
+    refused(&["train", text(&empty), "--out", text(&out)], &[text(&empty), "body model", "--body"]);
+    let body = empty.join("none.npz");
+    refused(&["train", text(&empty), "--body", text(&body), "--out", text(&out)], &["none.npz"]);
+    assert!(!out.exists());
+}
+
+#[test]
+fn settings_that_cannot_be_are_refused_by_key() {
+    refused(&["train", "--set", "encoding.nmax=5"], &["encoding.nmax", "no key"]);
+    refused(&["train", "--set", "samples=0"], &["samples", "1 to 1024"]);
+    refused(&["train", "--set", "rates.table=nan"], &["rates.table"]);
+    refused(&["train", "--set", "samples=many"], &["samples=many", "whole number"]);
+}
+
+#[test]
+fn runs_that_are_none_are_refused() {
+    let empty = folder("no-run");
+    refused(&["train", "--resume", "--out", text(&empty)], &["checkpoint.safetensors", "no-run"]);
+    refused(&["eval", text(&empty)], &["config.toml", "not a run"]);
+    refused(&["render", text(&empty), "tpose"], &["config.toml", "not a run"]);
+    std::fs::write(empty.join("checkpoint.safetensors"), [0xff; 64]).unwrap();
+    refused(&["train", "--resume", "--out", text(&empty)], &["checkpoint.safetensors", "safetensors"]);
+    refused(&["train", "--out", text(&empty)], &["already holds a run", "--resume"]);
+}
