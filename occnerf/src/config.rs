@@ -160,6 +160,11 @@ pub struct SurfaceConfig {
     pub surface_term: bool,
     /// Whether the surface term is weighted by the visibility counts.
     pub attention: bool,
+    /// The point term is multiplied by c / (c + `point_gate` · mean count), c the mean count of the finest
+    /// neighbours: where nothing was seen the surface term decides. 0 leaves it whole, as the paper does.
+    pub point_gate: f32,
+    /// Share of the training rays without a point term, so that F learns to do without. 0 in the paper.
+    pub point_dropout: f32,
 }
 
 /// The motion field.
@@ -306,12 +311,15 @@ impl Config {
         let at_least_zero = "expected a finite number of at least 0";
         let above_zero = "expected a finite number above 0";
         let any = "expected a finite number";
-        let real: [(&'static str, f32, f32, &'static str); 19] = [
+        let real: [(&'static str, f32, f32, &'static str); 22] = [
             ("field.density_scale", self.field.density_scale, f32::MIN_POSITIVE, above_zero),
             ("field.density_bias", self.field.density_bias, f32::MIN, any),
             ("field.density_bias_outside", self.field.density_bias_outside, f32::MIN, any),
             ("encoding.distance_max", self.encoding.distance_max, f32::MIN_POSITIVE, above_zero),
             ("-encoding.distance_min", -self.encoding.distance_min, f32::MIN_POSITIVE, above_zero),
+            ("surface.point_gate", self.surface.point_gate, 0.0, at_least_zero),
+            ("surface.point_dropout", self.surface.point_dropout, 0.0, at_least_zero),
+            ("1 - surface.point_dropout", 1.0 - self.surface.point_dropout, 0.0, at_least_zero),
             ("motion.margin", self.motion.margin, f32::MIN_POSITIVE, above_zero),
             ("motion.falloff", self.motion.falloff, f32::MIN_POSITIVE, above_zero),
             ("motion.depth", self.motion.depth, f32::MIN_POSITIVE, above_zero),

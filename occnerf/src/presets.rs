@@ -32,6 +32,8 @@ pub(crate) fn paper() -> Config {
             distance: DistanceKind::Blended,
             surface_term: true,
             attention: true,
+            point_gate: 0.0,
+            point_dropout: 0.0,
         },
         motion: MotionConfig { kind: MotionKind::Volume, margin: 0.08, falloff: 0.02, depth: 0.3 },
         loss: LossConfig { mse: 0.2, perceptual: 1.0, completeness: 10.0, beta: 10.0 },

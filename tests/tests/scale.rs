@@ -6,7 +6,7 @@ mod common;
 use common::{bits, body, capture, tiny, train};
 use glam::Vec3;
 use occnerf::data::{Capture, Frame};
-use occnerf::{Config, Method, MotionKind, Scene, StepReport};
+use occnerf::{Config, Method, MotionKind, Scene};
 use smpl::{BodyModel, Placement, SparseRows};
 
 const STEPS: u64 = 6;
@@ -33,10 +33,11 @@ fn scaled_capture(scale: f32) -> Capture {
     capture
 }
 
-fn trained(scale: f32, config: &Config) -> (Vec<StepReport>, Vec<u8>) {
-    let scene = Scene::new(&scaled_capture(scale), &scaled_body(scale), config).unwrap();
+/// The scene in another unit; it does not depend on method or motion.
+fn scaled_scene(scale: f32) -> Scene {
+    let scene = Scene::new(&scaled_capture(scale), &scaled_body(scale), &configs()[0]).unwrap();
     assert!((scene.scale * scale - common::scene().scale).abs() < 1e-6);
-    train(&scene, config, STEPS)
+    scene
 }
 
 fn configs() -> [Config; 3] {
@@ -50,9 +51,10 @@ fn configs() -> [Config; 3] {
 /// Powers of two scale without rounding, so that nothing at all may change.
 #[test]
 fn a_unit_that_is_a_power_of_two_changes_no_bit() {
+    let scene = scaled_scene(128.0);
     for config in configs() {
         let (metres, ours) = train(common::scene(), &config, STEPS);
-        let (units, theirs) = trained(128.0, &config);
+        let (units, theirs) = train(&scene, &config, STEPS);
         assert_eq!(bits(&metres), bits(&units), "{:?} {:?}", config.method, config.motion.kind);
         assert!(ours == theirs, "{:?} {:?}: checkpoints differ", config.method, config.motion.kind);
     }
@@ -60,9 +62,10 @@ fn a_unit_that_is_a_power_of_two_changes_no_bit() {
 
 #[test]
 fn a_scene_in_centimetres_trains_the_same_within_rounding() {
+    let scene = scaled_scene(100.0);
     for config in configs() {
         let (metres, _) = train(common::scene(), &config, STEPS);
-        let (centimetres, _) = trained(100.0, &config);
+        let (centimetres, _) = train(&scene, &config, STEPS);
         for (a, b) in metres.iter().zip(&centimetres) {
             let kind = (config.method, config.motion.kind);
             println!("{kind:?} {}: {} {} {} {}", a.step, a.loss, b.loss, a.live_samples, b.live_samples);
@@ -76,8 +79,7 @@ fn a_scene_in_centimetres_trains_the_same_within_rounding() {
 
 #[test]
 fn vertices_and_joints_of_a_frame_are_the_same_in_any_unit() {
-    let config = tiny(Method::Occnerf, MotionKind::Surface);
-    let scene = Scene::new(&scaled_capture(1000.0), &scaled_body(1000.0), &config).unwrap();
+    let scene = scaled_scene(1000.0);
     for (ours, theirs) in common::scene().train.iter().zip(&scene.train) {
         let far = |a: &[Vec3], b: &[Vec3]| a.iter().zip(b).map(|(a, b)| a.distance(*b)).fold(0.0, f32::max);
         // A few units in the last place of coordinates of at most 2.
