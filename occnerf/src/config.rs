@@ -160,11 +160,6 @@ pub struct SurfaceConfig {
     pub surface_term: bool,
     /// Whether the surface term is weighted by the visibility counts.
     pub attention: bool,
-    /// The point term is multiplied by c / (c + `point_gate` · mean count), c the mean count of the finest
-    /// neighbours: where nothing was seen the surface term decides. 0 leaves it whole, as the paper does.
-    pub point_gate: f32,
-    /// Share of the training rays without a point term, so that F learns to do without. 0 in the paper.
-    pub point_dropout: f32,
 }
 
 /// The motion field.
@@ -308,18 +303,33 @@ impl Config {
                 return Err(ConfigError { key, value: value.to_string(), expected });
             }
         }
+        // Products that decide about memory: 2²⁷ table entries are 2 GB with both moments, 2²⁶ samples several.
+        let table = (self.encoding.levels as u64).saturating_mul(self.encoding.features as u64);
+        let table = table.saturating_mul(1u64.checked_shl(self.encoding.log2_table_size).unwrap_or(u64::MAX));
+        if table > 1 << 27 {
+            let expected = "levels · features · 2^log2_table_size may be at most 2^27";
+            return Err(ConfigError { key: "encoding.log2_table_size", value: table.to_string(), expected });
+        }
+        let samples = self.patches * (self.patch_size as usize).pow(2) * self.samples;
+        if samples > 1 << 26 {
+            let expected = "patches · patch_size² · samples may be at most 2^26";
+            return Err(ConfigError { key: "patches", value: samples.to_string(), expected });
+        }
+        for (key, value) in [("motion.margin", self.motion.margin), ("motion.falloff", self.motion.falloff)] {
+            if value > 0.3 {
+                let expected = "expected at most 0.3 normalised metres";
+                return Err(ConfigError { key, value: value.to_string(), expected });
+            }
+        }
         let at_least_zero = "expected a finite number of at least 0";
         let above_zero = "expected a finite number above 0";
         let any = "expected a finite number";
-        let real: [(&'static str, f32, f32, &'static str); 22] = [
+        let real: [(&'static str, f32, f32, &'static str); 19] = [
             ("field.density_scale", self.field.density_scale, f32::MIN_POSITIVE, above_zero),
             ("field.density_bias", self.field.density_bias, f32::MIN, any),
             ("field.density_bias_outside", self.field.density_bias_outside, f32::MIN, any),
             ("encoding.distance_max", self.encoding.distance_max, f32::MIN_POSITIVE, above_zero),
             ("-encoding.distance_min", -self.encoding.distance_min, f32::MIN_POSITIVE, above_zero),
-            ("surface.point_gate", self.surface.point_gate, 0.0, at_least_zero),
-            ("surface.point_dropout", self.surface.point_dropout, 0.0, at_least_zero),
-            ("1 - surface.point_dropout", 1.0 - self.surface.point_dropout, 0.0, at_least_zero),
             ("motion.margin", self.motion.margin, f32::MIN_POSITIVE, above_zero),
             ("motion.falloff", self.motion.falloff, f32::MIN_POSITIVE, above_zero),
             ("motion.depth", self.motion.depth, f32::MIN_POSITIVE, above_zero),
@@ -365,6 +375,12 @@ mod tests {
         let mut config = Config::preset(Preset::Fast, Method::Occnerf);
         config.rates.table = f32::NAN;
         assert!(config.validate().unwrap_err().to_string().contains("rates.table"));
+        config = Config::preset(Preset::Fast, Method::Occnerf);
+        config.encoding.log2_table_size = 40;
+        assert!(config.validate().unwrap_err().to_string().contains("encoding.log2_table_size"));
+        config = Config::preset(Preset::Fast, Method::Occnerf);
+        config.motion.margin = 5.0;
+        assert!(config.validate().unwrap_err().to_string().contains("motion.margin"));
         config = Config::preset(Preset::Fast, Method::Occnerf);
         config.samples = 0;
         assert!(config.validate().unwrap_err().to_string().contains("`samples` is 0"));

@@ -24,10 +24,7 @@ pub(crate) struct Field {
     /// Whether the input has a surface term.
     pub surface_term: bool,
     attention: bool,
-    /// Share of the mean visibility count at which the point term counts half; 0 keeps it whole.
-    point_gate: f32,
     density_scale: f32,
-    k: usize,
     /// Bias at d ≤ 0 and its change per metre up to the reach.
     density_bias: (f32, f32),
     reach: f32,
@@ -38,10 +35,6 @@ pub(crate) struct Field {
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Group {
     pub samples: Samples,
-    /// Rays whose point term is dropped, one a ray; empty for none.
-    pub dropped: Vec<bool>,
-    /// Weight of each sample's point term.
-    point_weight: Vec<f32>,
     pub at: Coordinates,
     /// Attention of each neighbour of each sample.
     attention: Vec<f32>,
@@ -74,8 +67,6 @@ impl Field {
             encoder,
             surface_term,
             attention: config.surface.attention,
-            point_gate: if surface_term { config.surface.point_gate } else { 0.0 },
-            k: config.surface.k,
             density_scale: config.field.density_scale,
             density_bias: (config.field.density_bias, slope),
             reach,
@@ -97,7 +88,6 @@ impl Field {
         group.features.resize(n * width, 0.0);
         self.encoder.encode(table, &group.at, &mut group.features);
         self.attend(counts, group);
-        self.weigh_points(counts, group);
         group.sigma.resize(n, 0.0);
         group.rgb.resize(n, Vec3::ZERO);
         group.blocks.resize_with(n.div_ceil(BLOCK).max(group.blocks.len()), Activations::default);
@@ -108,9 +98,7 @@ impl Field {
             let activations = &mut group.blocks[block];
             self.mlp.resize(activations, range.len());
             for (s, input) in range.clone().zip(activations.layers[0].chunks_exact_mut(row)) {
-                let weight = group.point_weight[s];
-                let features = &group.features[s * width..][..width];
-                input[..width].iter_mut().zip(features).for_each(|(input, f)| *input = weight * f);
+                input[..width].copy_from_slice(&group.features[s * width..][..width]);
                 input[width..].fill(0.0);
             }
             if self.surface_term {
@@ -154,9 +142,7 @@ impl Field {
             let (d_output, d_input) = (&mut group.d_output, &mut group.d_input);
             self.mlp.backward(transposed, activations, range.len(), d_output, d_input, d_mlp);
             for (s, d_row) in range.clone().zip(d_input.chunks_exact(row)) {
-                let weight = group.point_weight[s];
-                let d_features = &mut group.d_features[s * width..][..width];
-                d_features.iter_mut().zip(d_row).for_each(|(d, from)| *d = weight * from);
+                group.d_features[s * width..][..width].copy_from_slice(&d_row[..width]);
             }
             if self.surface_term {
                 let range = range.start * per_sample..range.end * per_sample;
@@ -182,29 +168,6 @@ impl Field {
             for (neighbours, out) in rows.zip(group.attention.chunks_exact_mut(per_sample)) {
                 counts.attention(neighbours, out);
             }
-        }
-    }
-
-    /// How far the point term of each sample is to be trusted: its finest neighbours' mean count against the mean of
-    /// all vertices. Where the video showed nothing, the surface term of what it did show near by decides.
-    fn weigh_points(&self, counts: &VisibilityCounts, group: &mut Group) {
-        let n = group.samples.len();
-        group.point_weight.clear();
-        group.point_weight.resize(n, 1.0);
-        let all = counts.counts();
-        let total: u64 = all.iter().sum();
-        if self.point_gate > 0.0 && total > 0 {
-            let half = f64::from(self.point_gate) * total as f64 / all.len() as f64;
-            let per_sample = group.samples.neighbours.len().checked_div(n).unwrap_or(1).max(1);
-            let rows = group.samples.neighbours.chunks_exact(per_sample);
-            for (weight, neighbours) in group.point_weight.iter_mut().zip(rows) {
-                let seen: u64 = neighbours[..self.k].iter().map(|&v| all[v as usize]).sum();
-                let mean = seen as f64 / self.k as f64;
-                *weight = (mean / (mean + half)) as f32;
-            }
-        }
-        for (ends, _) in group.samples.starts.windows(2).zip(&group.dropped).filter(|(_, dropped)| **dropped) {
-            group.point_weight[ends[0]..ends[1]].fill(0.0);
         }
     }
 

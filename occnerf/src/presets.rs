@@ -32,8 +32,6 @@ pub(crate) fn paper() -> Config {
             distance: DistanceKind::Blended,
             surface_term: true,
             attention: true,
-            point_gate: 0.0,
-            point_dropout: 0.0,
         },
         motion: MotionConfig { kind: MotionKind::Volume, margin: 0.08, falloff: 0.02, depth: 0.3 },
         loss: LossConfig { mse: 0.2, perceptual: 1.0, completeness: 10.0, beta: 10.0 },
@@ -52,7 +50,7 @@ pub(crate) fn paper() -> Config {
 pub(crate) fn balanced() -> Config {
     Config {
         preset: Preset::Balanced,
-        steps: 2000,
+        steps: 1500,
         patches: 6,
         samples: 64,
         field: FieldConfig { width: 64, depth: 2, ..paper().field },

@@ -16,7 +16,6 @@ use crate::scene::PreparedFrame;
 use crate::trainer::{GroupState, StepReport, Trainer, composite_group, pixel_ray};
 
 const JITTER: u64 = 0x4A49_5454;
-const DROPOUT: u64 = 0x4452_4F50;
 
 impl Trainer<'_> {
     /// Traces, encodes, evaluates and composites the rays of a group.
@@ -28,12 +27,6 @@ impl Trainer<'_> {
             let jitter = Stream::new(&[self.config.seed, JITTER, self.steps_done, ray as u64]);
             state.group.samples.trace(&tracer, &pixel_ray(frame, pixel), Some(jitter));
         }
-        let share = if self.field.surface_term { self.config.surface.point_dropout } else { 0.0 };
-        let drop = |&ray: &usize| {
-            share > 0.0 && Stream::new(&[self.config.seed, DROPOUT, self.steps_done, ray as u64]).uniform() < share
-        };
-        state.group.dropped.clear();
-        state.group.dropped.extend(state.rays.iter().map(drop));
         let (field, table) = (self.parameters.get(Part::Field), self.parameters.get(Part::Table));
         self.field.forward(field, table, &self.vertex_code.features, &self.counts, &mut state.group);
         composite_group(&state.group, batch.background, &mut state.weights, &mut state.composites);
