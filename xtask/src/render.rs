@@ -97,7 +97,7 @@ fn parse_size(text: &str) -> Result<(u32, u32)> {
 }
 
 fn views(scene: &Scene, arguments: &RenderArguments, size: Option<(u32, u32)>) -> Vec<PreparedFrame> {
-    let resized = |camera: &Camera| size.map_or_else(|| camera.clone(), |(w, h)| camera.resized(w, h));
+    let resized = |camera: &Camera| size.map_or(*camera, |(w, h)| camera.resized(w, h));
     let frame = &scene.train[arguments.frame];
     match arguments.what {
         What::Movement => {
@@ -110,7 +110,7 @@ fn views(scene: &Scene, arguments: &RenderArguments, size: Option<(u32, u32)>) -
                 let turn = Mat3::from_axis_angle(up, i as f32 / TURN as f32 * std::f32::consts::TAU);
                 let centre = frame.posed.vertices.iter().sum::<Vec3>() / frame.posed.vertices.len() as f32;
                 let about = Affine3A::from_mat3_translation(turn, centre - turn * centre);
-                let mut camera = frame.camera.clone();
+                let mut camera = frame.camera;
                 camera.world_to_camera *= about;
                 view_of(scene, &resized(&camera), frame.posed.clone())
             })
@@ -140,7 +140,7 @@ fn camera_at(frame: &PreparedFrame, centre: Vec3, angle: f32) -> Camera {
     let eye = centre + distance * back;
     let (right, down, forward) = (Vec3::Y.cross(back), -Vec3::Y, -back);
     let rotation = Mat3::from_cols(right, down, forward).transpose();
-    let mut camera = frame.camera.clone();
+    let mut camera = frame.camera;
     camera.world_to_camera = Affine3A::from_mat3_translation(rotation, -(rotation * eye));
     camera
 }
