@@ -75,7 +75,7 @@ pub struct SettingArguments {
     /// Seed of every random choice [default: 1]
     #[arg(long)]
     pub seed: Option<u64>,
-    /// Any other value of config.toml's [train] table, such as encoding.n_max=512; may be repeated
+    /// Any other value of the train table in config.toml, such as encoding.n_max=512; may be repeated
     #[arg(long = "set", value_name = "KEY=VALUE")]
     pub set: Vec<String>,
 }
