@@ -33,6 +33,7 @@ pub trait Renderer: Sync {
 
 /// A frame that only says pose and camera, for pictures that no camera took.
 pub fn view_of(scene: &Scene, camera: &Camera, posed: Posed) -> PreparedFrame {
+    assert_eq!(posed.vertices.len(), scene.canonical.vertices.len(), "posed body of another model");
     PreparedFrame {
         name: String::new(),
         camera_name: String::new(),
@@ -40,17 +41,9 @@ pub fn view_of(scene: &Scene, camera: &Camera, posed: Posed) -> PreparedFrame {
         to_canonical: posed.bones.iter().map(glam::Affine3A::inverse).collect(),
         posed,
         pixels: Vec::new(),
-        mask: vec![0.0; 0],
+        mask: Vec::new(),
         labels: Vec::new(),
         subject: Vec::new(),
-    }
-    .checked(scene)
-}
-
-impl PreparedFrame {
-    fn checked(self, scene: &Scene) -> Self {
-        assert_eq!(self.posed.vertices.len(), scene.canonical.vertices.len(), "posed body of another model");
-        self
     }
 }
 
