@@ -175,6 +175,9 @@ pub struct MotionConfig {
     /// Depth below the prior's surface down to which there are samples, normalised metres. What lies deeper is hidden
     /// behind that much body; a body is nowhere 0.3 deep, so 0.3 keeps every sample.
     pub depth: f32,
+    /// Frames from one knot of the learnt pose corrections to the next; 0 leaves the prior's poses as they are, and the
+    /// volume kinds ask for that.
+    pub correction_spacing: usize,
 }
 
 /// Weights of the losses.
@@ -203,6 +206,8 @@ pub struct RateConfig {
     pub table: f32,
     /// The motion volume's log-weights.
     pub motion: f32,
+    /// The pose corrections, radians and normalised metres.
+    pub pose: f32,
     /// Every rate falls exponentially to this fraction over the run.
     pub final_fraction: f32,
     /// Decay of the second moment.
@@ -268,6 +273,8 @@ impl Config {
             config.surface.surface_term = false;
             config.surface.attention = false;
             config.loss.completeness = 0.0;
+            // A field of x̂ alone does not know how far the prior's surface is.
+            config.field.density_bias_outside = config.field.density_bias;
         }
         if method == Method::Humannerf {
             // Without a hash grid the perceptron has to hold the whole person.
@@ -315,6 +322,11 @@ impl Config {
             let expected = "patches · patch_size² · samples may be at most 2^26";
             return Err(ConfigError { key: "patches", value: samples.to_string(), expected });
         }
+        if self.motion.correction_spacing > 0 && self.motion.kind != MotionKind::Surface {
+            let value = self.motion.correction_spacing.to_string();
+            let expected = "expected 0 unless motion.kind is surface";
+            return Err(ConfigError { key: "motion.correction_spacing", value, expected });
+        }
         for (key, value) in [("motion.margin", self.motion.margin), ("motion.falloff", self.motion.falloff)] {
             if value > 0.3 {
                 let expected = "expected at most 0.3 normalised metres";
@@ -324,7 +336,7 @@ impl Config {
         let at_least_zero = "expected a finite number of at least 0";
         let above_zero = "expected a finite number above 0";
         let any = "expected a finite number";
-        let real: [(&'static str, f32, f32, &'static str); 19] = [
+        let real: [(&'static str, f32, f32, &'static str); 20] = [
             ("field.density_scale", self.field.density_scale, f32::MIN_POSITIVE, above_zero),
             ("field.density_bias", self.field.density_bias, f32::MIN, any),
             ("field.density_bias_outside", self.field.density_bias_outside, f32::MIN, any),
@@ -341,6 +353,7 @@ impl Config {
             ("rates.vertices", self.rates.vertices, 0.0, at_least_zero),
             ("rates.table", self.rates.table, 0.0, at_least_zero),
             ("rates.motion", self.rates.motion, 0.0, at_least_zero),
+            ("rates.pose", self.rates.pose, 0.0, at_least_zero),
             ("rates.final_fraction", self.rates.final_fraction, f32::MIN_POSITIVE, above_zero),
             ("rates.beta_2", self.rates.beta_2, 0.0, at_least_zero),
             ("1 - rates.beta_2", 1.0 - self.rates.beta_2, f32::MIN_POSITIVE, above_zero),

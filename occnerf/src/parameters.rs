@@ -15,31 +15,39 @@ pub(crate) enum Part {
     Vertices,
     /// Log-weights of the motion volume.
     Motion,
+    /// Corrections of the poses.
+    Pose,
 }
 
 /// Every group with its name in checkpoints.
-pub(crate) const PARTS: [(Part, &str); 4] =
-    [(Part::Field, "field"), (Part::Table, "table"), (Part::Vertices, "vertices"), (Part::Motion, "motion")];
+pub(crate) const PARTS: [(Part, &str); 5] = [
+    (Part::Field, "field"),
+    (Part::Table, "table"),
+    (Part::Vertices, "vertices"),
+    (Part::Motion, "motion"),
+    (Part::Pose, "pose"),
+];
 
 /// Values, gradients and moments of every group.
 #[derive(Clone, Debug)]
 pub(crate) struct Parameters {
-    values: [Vec<f32>; 4],
-    gradients: [Vec<f32>; 4],
-    pub optimisers: [Adam; 4],
+    values: [Vec<f32>; 5],
+    gradients: [Vec<f32>; 5],
+    pub optimisers: [Adam; 5],
 }
 
 impl Parameters {
-    pub fn new(config: &Config, field: &Field, vertices: usize, motion: usize) -> Self {
+    pub fn new(config: &Config, field: &Field, vertices: usize, motion: usize, pose: usize) -> Self {
         let vertices = if field.surface_term { 3 * vertices } else { 0 };
         let values = [
             field.mlp.initial(config.seed),
             field.encoder.initial_table(config.seed),
             vec![0.0; vertices],
             vec![0.0; motion],
+            vec![0.0; pose],
         ];
         let gradients = values.clone().map(|v| vec![0.0; v.len()]);
-        let optimisers = [0, 1, 2, 3].map(|part: usize| Adam::new(values[part].len()));
+        let optimisers = [0, 1, 2, 3, 4].map(|part: usize| Adam::new(values[part].len()));
         Self { values, gradients, optimisers }
     }
 
@@ -66,7 +74,7 @@ impl Parameters {
 
     /// One Adam step of every group at its rate times `decay`; returns how many gradients were not finite.
     pub fn step(&mut self, rates: &RateConfig, decay: f32) -> usize {
-        let each = [rates.field, rates.table, rates.vertices, rates.motion];
+        let each = [rates.field, rates.table, rates.vertices, rates.motion, rates.pose];
         let groups = self.values.iter_mut().zip(&self.gradients).zip(&mut self.optimisers);
         groups.zip(each).map(|(((v, g), adam), rate)| adam.step(rate * decay, rates.beta_2, v, g)).sum()
     }

@@ -34,17 +34,7 @@ pub trait Renderer: Sync {
 /// A frame that only says pose and camera, for pictures that no camera took.
 pub fn view_of(scene: &Scene, camera: &Camera, posed: Posed) -> PreparedFrame {
     assert_eq!(posed.vertices.len(), scene.canonical.vertices.len(), "posed body of another model");
-    PreparedFrame {
-        name: String::new(),
-        camera_name: String::new(),
-        camera: *camera,
-        to_canonical: posed.bones.iter().map(glam::Affine3A::inverse).collect(),
-        posed,
-        pixels: Vec::new(),
-        mask: Vec::new(),
-        labels: Vec::new(),
-        subject: Vec::new(),
-    }
+    PreparedFrame::bare(camera, posed)
 }
 
 /// Draws with a trained field.
@@ -73,8 +63,9 @@ struct Scratch {
 impl Renderer for FieldRenderer<'_> {
     fn render(&mut self, frame: &PreparedFrame, background: Vec3) -> Result<Rendering, Error> {
         let trainer = self.trainer;
-        self.stage.set(trainer.scene, &frame.posed, &trainer.config);
-        let tracer = trainer.tracer(&self.stage, frame);
+        let posed = trainer.corrected(frame);
+        self.stage.set(trainer.scene, &posed, &trainer.config);
+        let tracer = trainer.tracer(&self.stage, frame, &posed);
         let (field, table) = (trainer.parameters.get(Part::Field), trainer.parameters.get(Part::Table));
         let features = &self.code.features;
         paint(frame, background, Scratch::default, |scratch, row, columns| {

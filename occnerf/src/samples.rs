@@ -48,6 +48,8 @@ pub(crate) struct Tracer<'a> {
     pub volume: Option<&'a WeightVolume>,
     /// Whether neighbours are wanted at all; the point-based methods do without unless v̂ is blended.
     pub neighbours: bool,
+    /// Whether [`Samples::faces`] are wanted; the surface motion alone has them.
+    pub faces: bool,
 }
 
 /// Live samples of consecutive rays, structure of arrays.
@@ -70,6 +72,8 @@ pub(crate) struct Samples {
     pub distance: Vec<f32>,
     /// All levels, finest first; empty where the tracer wants none.
     pub neighbours: Vec<u32>,
+    /// Face of the posed prior that each sample is mapped by, with barycentrics; empty where the tracer wants none.
+    pub faces: Vec<(u32, [f32; 3])>,
 }
 
 impl Samples {
@@ -84,6 +88,7 @@ impl Samples {
         self.closest.clear();
         self.distance.clear();
         self.neighbours.clear();
+        self.faces.clear();
     }
 
     pub fn len(&self) -> usize {
@@ -117,13 +122,23 @@ impl Samples {
         self.starts.push(self.t.len());
     }
 
+    /// Appends one point of space, if it lives.
+    #[cfg(test)]
+    pub fn push_point(&mut self, tracer: &Tracer<'_>, point: Vec3) -> bool {
+        let live = self.push(tracer, point, None).0;
+        if live {
+            self.world.push(point);
+        }
+        live
+    }
+
     /// Maps a point and looks up its surface; false, with nothing pushed, if the sample is dead. `near` is a posed face
     /// that is probably close; returns the closest one where it was looked up.
     fn push(&mut self, tracer: &Tracer<'_>, point: Vec3, near: Option<u32>) -> (bool, Option<u32>) {
         let motion = &tracer.config.motion;
         let reach = motion.margin + motion.falloff;
         let farthest = reach.max(motion.depth);
-        let mut looked_up = None;
+        let (mut looked_up, mut mapped_by) = (None, None);
         let exact = tracer.config.surface.distance == DistanceKind::Exact;
         let query = &tracer.scene.query;
         let (sample, on_surface) = if let Some(volume) = tracer.volume {
@@ -144,6 +159,7 @@ impl Samples {
                 return (false, None);
             };
             looked_up = Some(closest.face);
+            mapped_by = Some((closest.face, closest.barycentric));
             if closest.signed_distance > reach || closest.signed_distance < -motion.depth {
                 return (false, looked_up);
             }
@@ -184,6 +200,7 @@ impl Samples {
         self.canonical.push(sample.canonical);
         self.closest.push(closest);
         self.distance.push(distance);
+        self.faces.extend(mapped_by.filter(|_| tracer.faces));
         (true, looked_up)
     }
 }

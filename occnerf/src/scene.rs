@@ -1,8 +1,10 @@
 //! A capture made ready for training: normalised lengths, posed bodies, pixel labels and the canonical surface.
 
+use std::sync::Arc;
+
 use glam::{Affine3A, Vec3};
 use rayon::prelude::*;
-use smpl::{BodyModel, Posed};
+use smpl::{BodyModel, Posed, Shaped};
 use surface_query::{MeshDistance, SurfaceQuery, SurfaceQueryConfig};
 use visibility::{RayMesh, View};
 use volrender::{Aabb, Camera};
@@ -25,8 +27,13 @@ pub struct PreparedFrame {
     pub camera_name: String,
     /// With its translation in normalised metres.
     pub camera: Camera,
-    /// The posed prior in normalised metres.
+    /// Index of the training frame of the same instant, whose learnt pose correction holds for this one too; `None` for
+    /// poses that no training frame has.
+    pub instant: Option<usize>,
+    /// The posed prior in normalised metres, as handed in.
     pub posed: Posed,
+    /// Its body at rest, normalised; empty where `instant` is `None`.
+    pub shape: Arc<Shaped>,
     /// Canonical ← world transform of each bone.
     pub to_canonical: Vec<Affine3A>,
     /// Premultiplied sRGB, H × W × 3.
@@ -37,6 +44,32 @@ pub struct PreparedFrame {
     pub labels: Vec<Label>,
     /// Pixels labelled subject.
     pub subject: Vec<u32>,
+}
+
+impl PreparedFrame {
+    /// A frame that only says pose and camera: the same moment from another camera.
+    #[must_use]
+    pub fn seen_by(&self, camera: &Camera) -> Self {
+        let (posed, to_canonical, shape) = (self.posed.clone(), self.to_canonical.clone(), self.shape.clone());
+        Self { instant: self.instant, shape, to_canonical, ..Self::bare(camera, posed) }
+    }
+
+    /// A pose and a camera.
+    pub(crate) fn bare(camera: &Camera, posed: Posed) -> Self {
+        Self {
+            name: String::new(),
+            camera_name: String::new(),
+            camera: *camera,
+            instant: None,
+            to_canonical: posed.to_canonical(),
+            shape: Arc::new(Shaped { vertices: Vec::new(), joints: Vec::new() }),
+            posed,
+            pixels: Vec::new(),
+            mask: Vec::new(),
+            labels: Vec::new(),
+            subject: Vec::new(),
+        }
+    }
 }
 
 /// Everything that training and rendering read and never change.
@@ -101,11 +134,17 @@ impl Scene {
             train: Vec::new(),
             eval: Vec::new(),
         };
-        let train: Result<Vec<_>, Error> = capture.train.par_iter().map(|f| scene.prepare(f, Some(config))).collect();
+        let train: Result<Vec<_>, Error> =
+            capture.train.par_iter().enumerate().map(|(i, f)| scene.prepare(f, Some(i), Some(config))).collect();
         let eval: Result<Vec<_>, Error> = capture
             .eval
             .par_iter()
-            .map(|e| Ok(PreparedFrame { camera_name: e.camera_name.clone(), ..scene.prepare(&e.frame, None)? }))
+            .map(|e| {
+                Ok(PreparedFrame {
+                    camera_name: e.camera_name.clone(),
+                    ..scene.prepare(&e.frame, Some(e.train_index), None)?
+                })
+            })
             .collect();
         (scene.train, scene.eval) = (train?, eval?);
         if scene.train.iter().all(|f| f.subject.is_empty()) {
@@ -115,15 +154,17 @@ impl Scene {
     }
 
     /// Poses the prior for `frame`, and labels its pixels if it is for training with `config`.
-    fn prepare(&self, frame: &Frame, config: Option<&Config>) -> Result<PreparedFrame, Error> {
-        let posed = self.pose(&frame.betas, &frame.pose, frame.placement);
+    fn prepare(&self, frame: &Frame, instant: Option<usize>, config: Option<&Config>) -> Result<PreparedFrame, Error> {
+        let (shape, posed) = self.shape_and_pose(&frame.betas, &frame.pose, frame.placement);
         let camera = normalised_camera(&frame.camera, self.scale);
         let mut prepared = PreparedFrame {
             name: frame.name.clone(),
             camera_name: String::new(),
             to_canonical: posed.bones.iter().map(Affine3A::inverse).collect(),
             camera,
+            instant,
             posed,
+            shape: Arc::new(shape),
             pixels: frame.image.pixels.clone(),
             mask: frame.mask.clone(),
             labels: Vec::new(),
@@ -149,11 +190,17 @@ impl Scene {
 
     /// The prior in a pose, normalised.
     pub fn pose(&self, betas: &[f32], pose: &[Vec3], placement: smpl::Placement) -> Posed {
-        let mut posed = self.model.pose(&self.model.shaped(betas), pose, placement);
+        self.shape_and_pose(betas, pose, placement).1
+    }
+
+    fn shape_and_pose(&self, betas: &[f32], pose: &[Vec3], placement: smpl::Placement) -> (Shaped, Posed) {
+        let mut shape = self.model.shaped(betas);
+        let mut posed = self.model.pose(&shape, pose, placement);
+        shape.vertices.iter_mut().chain(&mut shape.joints).for_each(|v| *v *= self.scale);
         let lengths = posed.vertices.iter_mut().chain(&mut posed.joints).chain(&mut posed.pose_offsets);
         lengths.for_each(|v| *v *= self.scale);
         posed.bones.iter_mut().for_each(|b| b.translation *= self.scale);
-        posed
+        (shape, posed)
     }
 
     /// Pixels (H × W) whose ray hits the posed prior.

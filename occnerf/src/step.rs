@@ -2,11 +2,12 @@
 
 use glam::Vec3;
 use rayon::prelude::*;
-use smpl::WeightVolume;
+use smpl::{Posed, WeightVolume};
 use volrender::composite_backward;
 
 use crate::batch::{Batch, target};
 use crate::config::DistanceKind;
+use crate::correction::{Wrench, correct_backward};
 use crate::field::Group;
 use crate::loss::{completeness, multiscale_dissimilarity};
 use crate::parameters::Part;
@@ -19,8 +20,8 @@ const JITTER: u64 = 0x4A49_5454;
 
 impl Trainer<'_> {
     /// Traces, encodes, evaluates and composites the rays of a group.
-    pub(crate) fn forward(&self, state: &mut GroupState, batch: &Batch, frame: &PreparedFrame) {
-        let tracer = self.tracer(&self.stage, frame);
+    pub(crate) fn forward(&self, state: &mut GroupState, batch: &Batch, frame: &PreparedFrame, posed: &Posed) {
+        let tracer = self.tracer(&self.stage, frame, posed);
         state.group.samples.clear();
         for &ray in &state.rays {
             let pixel = batch.pixels[ray];
@@ -88,7 +89,14 @@ impl Trainer<'_> {
     }
 
     /// Backward of [`Trainer::forward`] with the completeness term added.
-    pub(crate) fn backward(&self, state: &mut GroupState, batch: &Batch, frame: &PreparedFrame, d_colors: &[Vec3]) {
+    pub(crate) fn backward(
+        &self,
+        state: &mut GroupState,
+        batch: &Batch,
+        frame: &PreparedFrame,
+        posed: &Posed,
+        d_colors: &[Vec3],
+    ) {
         let group = &mut state.group;
         let n = group.samples.len();
         group.d_sigma.resize(n, 0.0);
@@ -127,6 +135,9 @@ impl Trainer<'_> {
             zero(&mut state.d_volume, volume.weights.len());
             self.motion_backward(volume, group, frame, &mut state.d_volume);
         }
+        if !self.parameters.get(Part::Pose).is_empty() {
+            self.pose_backward(group, posed, &mut state.wrenches);
+        }
     }
 
     /// Carries the gradients of the encoding's coordinates and of f into the weight volume.
@@ -159,7 +170,7 @@ impl Trainer<'_> {
     }
 
     /// Sums the groups' gradients in order and runs the parts of the backward pass that all samples share.
-    pub(crate) fn reduce(&mut self, groups: &[GroupState]) {
+    pub(crate) fn reduce(&mut self, groups: &[GroupState], frame: &PreparedFrame, posed: &Posed) {
         self.parameters.clear_gradients();
         let sum = |to: &mut [f32], from: &(dyn Fn(&GroupState) -> &[f32] + Sync)| {
             to.par_chunks_mut(1 << 12).enumerate().for_each(|(chunk, to)| {
@@ -192,6 +203,14 @@ impl Trainer<'_> {
             let mut d_weights = vec![0.0; volume.weights.len()];
             sum(&mut d_weights, &|g| &g.d_volume);
             volume.softmax_backward(&d_weights, self.parameters.gradient(Part::Motion));
+        }
+        if let (Some(correction), Some(instant)) = (self.correction(frame), frame.instant) {
+            let mut wrenches = vec![Wrench::default(); posed.bones.len()];
+            for state in groups {
+                wrenches.iter_mut().zip(&state.wrenches).for_each(|(to, from)| to.add(from));
+            }
+            let d_correction = correct_backward(&self.scene.model, &frame.posed, &correction, posed, &wrenches);
+            self.corrections.at_backward(instant, &d_correction, self.parameters.gradient(Part::Pose));
         }
     }
 }

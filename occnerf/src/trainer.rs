@@ -1,14 +1,17 @@
 //! Training: the step from rays to gradients, deterministic whatever the number of threads.
 
+use std::borrow::Cow;
+
 use glam::Vec3;
 use rayon::prelude::*;
-use smpl::WeightVolume;
+use smpl::{Posed, WeightVolume};
 use visibility::VisibilityCounts;
 use volrender::{Composite, composite};
 
 use crate::Error;
 use crate::batch::Batch;
 use crate::config::{Config, DistanceKind, MotionKind};
+use crate::correction::{Corrections, Wrench, correct};
 use crate::encoder::Coordinates;
 use crate::field::{Field, Group};
 use crate::parameters::{PARTS, Parameters, Part};
@@ -19,6 +22,8 @@ use crate::vertices::VertexCode;
 /// Rays are dealt row by row to this many groups, each with its own gradient buffers, summed in order: the result
 /// does not depend on who computes a group. Eight keep two to eight threads busy.
 const GROUPS: usize = 8;
+/// Part of a run after which poses are corrected.
+const SETTLED: f32 = 0.1;
 
 /// What a step did.
 #[derive(Clone, Copy, Debug, Default, serde::Serialize)]
@@ -51,6 +56,7 @@ pub struct Trainer<'a> {
     pub(crate) parameters: Parameters,
     pub(crate) counts: VisibilityCounts,
     pub(crate) volume: Option<WeightVolume>,
+    pub(crate) corrections: Corrections,
     pub(crate) steps_done: u64,
     pub(crate) stage: Stage,
     batch: Batch,
@@ -71,6 +77,8 @@ pub(crate) struct GroupState {
     pub d_mlp: Vec<f32>,
     pub d_vertices: Vec<f32>,
     pub d_volume: Vec<f32>,
+    /// What the samples ask of each bone.
+    pub wrenches: Vec<Wrench>,
     /// Sum of the completeness terms.
     pub completeness: f64,
     /// Finest neighbours of the termination points.
@@ -96,8 +104,10 @@ impl<'a> Trainer<'a> {
         };
         let vertices = scene.canonical.vertices.len();
         let motion = volume.as_ref().map_or(0, |v| v.delta.len());
+        let spacing = config.motion.correction_spacing;
+        let corrections = Corrections::new(scene.train.len(), spacing, scene.model.num_joints());
         Ok(Self {
-            parameters: Parameters::new(&config, &field, vertices, motion),
+            parameters: Parameters::new(&config, &field, vertices, motion, corrections.len()),
             counts: VisibilityCounts::new(vertices),
             stage: Stage::new(scene)?,
             batch: Batch::default(),
@@ -111,6 +121,7 @@ impl<'a> Trainer<'a> {
             scene,
             field,
             volume,
+            corrections,
         })
     }
 
@@ -156,14 +167,29 @@ impl<'a> Trainer<'a> {
         }
     }
 
-    pub(crate) fn tracer<'b>(&'b self, stage: &'b Stage, frame: &'b PreparedFrame) -> Tracer<'b> {
+    /// Shift and turns that training has found for the moment of a frame.
+    pub(crate) fn correction(&self, frame: &PreparedFrame) -> Option<Vec<Vec3>> {
+        let pose = self.parameters.get(Part::Pose);
+        frame.instant.filter(|_| !pose.is_empty()).map(|instant| self.corrections.at(pose, instant))
+    }
+
+    /// The posed prior of a frame as training has corrected it; as handed in where nothing is corrected.
+    pub fn corrected<'b>(&self, frame: &'b PreparedFrame) -> Cow<'b, Posed> {
+        match self.correction(frame) {
+            Some(correction) => Cow::Owned(correct(&self.scene.model, &frame.shape, &frame.posed, &correction)),
+            None => Cow::Borrowed(&frame.posed),
+        }
+    }
+
+    pub(crate) fn tracer<'b>(&'b self, stage: &'b Stage, frame: &'b PreparedFrame, posed: &'b Posed) -> Tracer<'b> {
         Tracer {
             scene: self.scene,
             config: &self.config,
             stage,
-            posed: &frame.posed,
+            posed,
             to_canonical: &frame.to_canonical,
             volume: self.volume.as_ref(),
+            faces: !self.parameters.get(Part::Pose).is_empty(),
             neighbours: self.field.surface_term || self.config.surface.distance == DistanceKind::Blended,
         }
     }
@@ -175,7 +201,8 @@ impl<'a> Trainer<'a> {
         batch.draw(self.scene, &self.config, step);
         let frame = &self.scene.train[batch.frame];
         let mut stage_code = std::mem::take(&mut self.vertex_code);
-        self.stage.set(self.scene, &frame.posed, &self.config);
+        let posed = self.corrected(frame);
+        self.stage.set(self.scene, &posed, &self.config);
         self.encode_vertices(&mut stage_code);
         self.vertex_code = stage_code;
         let mut groups = std::mem::take(&mut self.groups);
@@ -183,11 +210,11 @@ impl<'a> Trainer<'a> {
             state.rays.clear();
             state.rays.extend((0..batch.pixels.len()).filter(|ray| ray / batch.size % GROUPS == index));
         }
-        groups.par_iter_mut().for_each(|state| self.forward(state, &batch, frame));
+        groups.par_iter_mut().for_each(|state| self.forward(state, &batch, frame, &posed));
         let mut report = StepReport { step: step + 1, rays: batch.pixels.len(), ..StepReport::default() };
         let d_colors = self.photometric(&groups, &batch, frame, &mut report);
         self.field.mlp.transposed_weights(self.parameters.get(Part::Field), &mut self.transposed);
-        groups.par_iter_mut().for_each(|state| self.backward(state, &batch, frame, &d_colors));
+        groups.par_iter_mut().for_each(|state| self.backward(state, &batch, frame, &posed, &d_colors));
         let nominal = (batch.pixels.len() * self.config.samples) as f64;
         report.completeness = groups.iter().map(|g| g.completeness).sum::<f64>() / nominal;
         report.live_samples = groups.iter().map(|g| g.group.samples.len()).sum();
@@ -195,11 +222,15 @@ impl<'a> Trainer<'a> {
         report.loss = f64::from(loss.mse) * report.mse
             + f64::from(loss.perceptual) * report.perceptual
             + f64::from(loss.completeness) * report.completeness;
-        self.reduce(&groups);
+        self.reduce(&groups, frame, &posed);
         for state in &groups {
             self.counts.add(&state.terminations);
         }
         let decay = self.config.rates.final_fraction.powf(step as f32 / self.config.steps.max(1) as f32);
+        // What a field says of poses before it has taken shape would only lead them astray.
+        if (step as f32) < SETTLED * self.config.steps as f32 {
+            self.parameters.gradient(Part::Pose).fill(0.0);
+        }
         report.bad_gradients = self.parameters.step(&self.config.rates, decay);
         self.refresh_volume();
         (self.groups, self.batch) = (groups, batch);

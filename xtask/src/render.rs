@@ -101,7 +101,7 @@ fn views(scene: &Scene, arguments: &RenderArguments, size: Option<(u32, u32)>) -
     let frame = &scene.train[arguments.frame];
     match arguments.what {
         What::Movement => {
-            let view = |f: &PreparedFrame| view_of(scene, &resized(&f.camera), f.posed.clone());
+            let view = |f: &PreparedFrame| f.seen_by(&resized(&f.camera));
             scene.train.iter().map(view).collect()
         }
         What::Freeview => (0..TURN)
@@ -112,7 +112,7 @@ fn views(scene: &Scene, arguments: &RenderArguments, size: Option<(u32, u32)>) -
                 let about = Affine3A::from_mat3_translation(turn, centre - turn * centre);
                 let mut camera = frame.camera;
                 camera.world_to_camera *= about;
-                view_of(scene, &resized(&camera), frame.posed.clone())
+                frame.seen_by(&resized(&camera))
             })
             .collect(),
         What::Tpose => {

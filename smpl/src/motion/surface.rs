@@ -81,6 +81,13 @@ impl SurfaceMotion {
         let s = beyond / self.falloff;
         1.0 - s * s * (3.0 - 2.0 * s)
     }
+
+    /// Derivative of [`SurfaceMotion::likelihood`] with respect to the distance; 0 where that has none.
+    #[must_use]
+    pub fn likelihood_slope(&self, signed_distance: f32) -> f32 {
+        let s = (signed_distance - self.margin) / self.falloff;
+        if s > 0.0 && s < 1.0 { -6.0 * s * (1.0 - s) / self.falloff } else { 0.0 }
+    }
 }
 
 /// The joint with the largest total weight, the lower of equals.
