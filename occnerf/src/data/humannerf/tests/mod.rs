@@ -1,19 +1,18 @@
 mod errors;
 mod fixture;
 
-use std::path::Path;
-
 use glam::Vec3;
 use smpl::{BodyModel, Placement};
 
-use self::fixture::{Fixture, body};
-use super::{LoadOptions, find_body, load_humannerf};
+use self::fixture::Fixture;
+use crate::data::testing::{body, shared};
+use crate::data::{LoadOptions, find_body, load_capture};
 
 #[test]
 fn a_whole_capture_is_read() {
     let fixture = Fixture::new("whole");
-    let capture = load_humannerf(&fixture.dir, &body(), &LoadOptions::default()).unwrap();
-    assert_eq!(capture.name, super::view::file_name(&fixture.dir));
+    let capture = load_capture(&fixture.dir, &body(), &LoadOptions::default()).unwrap();
+    assert_eq!(capture.name, crate::data::pictures::file_name(&fixture.dir));
     let names: Vec<&str> = capture.train.iter().map(|f| f.name.as_str()).collect();
     assert_eq!(names, ["frame_000000", "frame_000001", "frame_000002"]);
     assert_eq!(capture.mean_betas, [0.5]);
@@ -37,7 +36,7 @@ fn a_whole_capture_is_read() {
 #[test]
 fn images_hold_nothing_of_what_masks_hide() {
     let fixture = Fixture::new("hidden");
-    let capture = load_humannerf(&fixture.dir, &body(), &LoadOptions::default()).unwrap();
+    let capture = load_capture(&fixture.dir, &body(), &LoadOptions::default()).unwrap();
     for frame in &capture.train {
         let (mut shown, mut hidden) = (0, 0);
         for (pixel, &mask) in frame.image.pixels.chunks(3).zip(&frame.mask) {
@@ -56,8 +55,8 @@ fn images_hold_nothing_of_what_masks_hide() {
 #[test]
 fn the_pixel_centre_moves_the_principal_point() {
     let fixture = Fixture::new("centre");
-    let options = LoadOptions { pixel_centre: 0.0 };
-    let capture = load_humannerf(&fixture.dir, &body(), &options).unwrap();
+    let options = LoadOptions { pixel_centre: 0.0, ..LoadOptions::default() };
+    let capture = load_capture(&fixture.dir, &body(), &options).unwrap();
     assert_eq!(capture.train[0].camera.centre, glam::Vec2::new(3.5, 2.5));
 }
 
@@ -65,7 +64,7 @@ fn the_pixel_centre_moves_the_principal_point() {
 fn a_frame_in_which_the_subject_is_wholly_hidden_is_kept() {
     let fixture = Fixture::new("one-hidden");
     fixture.mask("masks/frame_000001.png", 6, 4, 0);
-    let capture = load_humannerf(&fixture.dir, &body(), &LoadOptions::default()).unwrap();
+    let capture = load_capture(&fixture.dir, &body(), &LoadOptions::default()).unwrap();
     assert_eq!(capture.train.len(), 3);
 }
 
@@ -77,7 +76,7 @@ fn jpeg_frames_and_a_capture_without_eval_are_read() {
     decoded.save(path.with_extension("jpg")).unwrap();
     std::fs::remove_file(path).unwrap();
     std::fs::remove_dir_all(fixture.dir.join("eval")).unwrap();
-    let capture = load_humannerf(&fixture.dir, &body(), &LoadOptions::default()).unwrap();
+    let capture = load_capture(&fixture.dir, &body(), &LoadOptions::default()).unwrap();
     assert_eq!((capture.train.len(), capture.eval.len()), (3, 0));
 }
 
@@ -89,24 +88,26 @@ fn the_nearest_body_is_found() {
     std::fs::create_dir_all(fixture.dir.join("body")).unwrap();
     // Not an archive: passed over.
     std::fs::write(fixture.dir.join("body/a.npz"), b"no").unwrap();
-    let found = find_body(&scene);
-    assert!(found.is_none_or(|path| !path.starts_with(&fixture.dir)));
-    std::fs::write(scene.join("body.npz"), b"own").unwrap();
-    assert_eq!(find_body(&scene), Some(scene.join("body.npz")));
+    let message = find_body(&scene).unwrap_err().to_string();
+    assert!(message.contains("annots.npy") && message.contains("metadata.json"), "no capture: {message}");
+    for layout in ["annots.npy", "metadata.json", "mesh_infos.pkl"] {
+        std::fs::write(scene.join(layout), b"").unwrap();
+        let found = find_body(&scene);
+        assert!(found.is_ok_and(|path| !path.starts_with(&fixture.dir)) || find_body(&scene).is_err());
+        std::fs::write(scene.join("body.npz"), b"own").unwrap();
+        assert_eq!(find_body(&scene).unwrap(), scene.join("body.npz"));
+        std::fs::remove_file(scene.join("body.npz")).unwrap();
+        std::fs::remove_file(scene.join(layout)).unwrap();
+    }
 }
 
 #[test]
 fn the_shared_capture_is_read() {
-    let data = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared/data");
-    let scene = data.join("captures/humannerf_demo");
-    if !scene.is_dir() {
-        println!("skipped: {} is absent", scene.display());
-        return;
-    }
+    let Some(scene) = shared("captures/humannerf_demo") else { return };
     let file = find_body(&scene).unwrap();
     assert_eq!(file.file_name().unwrap(), "open_body.npz");
     let body = BodyModel::load(&file).unwrap();
-    let capture = load_humannerf(&scene, &body, &LoadOptions::default()).unwrap();
+    let capture = load_capture(&scene, &body, &LoadOptions::default()).unwrap();
     assert_eq!((capture.train.len(), capture.eval.len()), (100, 100));
     assert_eq!(capture.mean_betas.len(), 10);
     for eval in &capture.eval {
@@ -128,6 +129,6 @@ fn the_shared_capture_is_read() {
         assert!(share > 0.9, "{} {}: {share}", eval.camera_name, frame.name);
     }
     // Another body is told apart.
-    let message = load_humannerf(&scene, &BodyModel::embedded(), &LoadOptions::default()).unwrap_err().to_string();
+    let message = load_capture(&scene, &BodyModel::embedded(), &LoadOptions::default()).unwrap_err().to_string();
     assert!(message.contains("tpose_joints") && message.contains("body model"), "{message}");
 }
