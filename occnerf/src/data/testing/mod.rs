@@ -190,6 +190,24 @@ impl Drop for Directory {
     }
 }
 
+/// Variants of a file, each with a few bytes replaced, left out or repeated; always the same ones.
+pub fn damaged(whole: &[u8], count: usize) -> impl Iterator<Item = Vec<u8>> + '_ {
+    (0..count).map(|case| {
+        let mut stream = crate::random::Stream::new(&[0x6461_6d61, case as u64]);
+        let mut bytes = whole.to_vec();
+        for _ in 0..=case % 3 {
+            let at = (stream.uniform() * bytes.len() as f32) as usize % bytes.len().max(1);
+            let end = (at + (stream.uniform() * 40.0) as usize).min(bytes.len());
+            match case % 4 {
+                0 => drop(bytes.drain(at..end)),
+                1 => bytes.extend_from_within(at..end),
+                _ => bytes[at] = (stream.uniform() * 256.0) as u8,
+            }
+        }
+        bytes
+    })
+}
+
 /// The directory of shared test data; `None`, with a message, where it is absent.
 pub fn shared(below: &str) -> Option<PathBuf> {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared/data").join(below);

@@ -1,7 +1,7 @@
 //! Every fault of a capture is one line that names the file, the key, what was expected and what was found.
 
 use super::fixture::{Fixture, SIZE, record};
-use crate::data::testing::{Py, array, body};
+use crate::data::testing::{Py, array, body, damaged};
 use crate::data::{LoadOptions, load_capture};
 
 /// Breaks a fresh capture, writes its pickles, and checks that the message holds all of `words` and is one line.
@@ -64,6 +64,20 @@ fn broken_pickles() {
     fails("cycle", &["annots.npy", "nested deeper"], |f| {
         f.dir.write("annots.npy", b"\x80\x02}X\x03\0\0\0ims]q\0h\0as.")
     });
+}
+
+#[test]
+fn no_damage_to_a_pickle_is_a_panic() {
+    let fixture = Fixture::new("zju-damaged");
+    for (file, whole) in [("annots.npy", fixture.annots.npy()), ("new_params/1.npy", fixture.params.npy())] {
+        let mut refused = 0;
+        for bytes in damaged(&whole, 300) {
+            fixture.dir.write(file, bytes);
+            refused += usize::from(load_capture(fixture.dir.path(), &body(), &LoadOptions::default()).is_err());
+        }
+        fixture.dir.write(file, whole);
+        assert!((75..300).contains(&refused), "{file}: {refused} of 300 refused");
+    }
 }
 
 #[test]
