@@ -72,6 +72,17 @@ impl LoadArguments {
             ..LoadOptions::default()
         }
     }
+
+    /// How a run to be resumed read its capture, checked against what is asked for.
+    pub fn resumed(&self, saved: &LoadOptions) -> Result<LoadOptions> {
+        let asked = self.options();
+        if asked != LoadOptions::default() && asked != *saved {
+            bail!(
+                "the run to resume read its capture with other options; leave them out, or start a new run with --out"
+            );
+        }
+        Ok(saved.clone())
+    }
 }
 
 /// Loads `scene` (the demo if `None`); the body is `body`, the variable SMPL_MODEL, or what lies near the scene.

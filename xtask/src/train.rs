@@ -68,8 +68,11 @@ pub fn train(arguments: &TrainArguments) -> Result<()> {
     } else {
         (PathBuf::new(), arguments.settings.config()?)
     };
-    let source = if arguments.resume && arguments.scene.is_none() {
-        RunConfig::read(&directory)?.source()?
+    let source = if arguments.resume {
+        let saved = RunConfig::read(&directory)?;
+        let load = arguments.load.resumed(&saved.load)?;
+        let scene = arguments.scene.as_deref().unwrap_or(&saved.scene);
+        source::load(Some(scene), arguments.body.as_deref().or(saved.body.as_deref()), &load)?
     } else {
         source::load(arguments.scene.as_deref(), arguments.body.as_deref(), &arguments.load.options())?
     };

@@ -25,11 +25,15 @@ pub(super) fn betas(record: &Record<'_>, key: &str, body: &BodyModel) -> Result<
     Ok(values)
 }
 
-/// The rotation of every joint, (3J) under `poses`.
+/// The rotation of every joint, (3J) or (J,3) under `poses`.
 pub(super) fn pose(record: &Record<'_>, body: &BodyModel) -> Result<Vec<Vec3>, DataError> {
     let joints = body.num_joints();
-    let why = format!(", 3 for each of the body model's {joints} joints");
-    Ok(triples(&record.shaped("poses", &[3 * joints], &why)?))
+    let (shape, values) = record.array("poses")?;
+    if shape != [3 * joints] && shape != [joints, 3] {
+        let expected = format!("shape [{}], 3 for each of the body model's {joints} joints", 3 * joints);
+        return Err(record.invalid("poses", expected, format!("shape {shape:?}")));
+    }
+    Ok(triples(&values))
 }
 
 /// [`pose`] where the global rotation is elsewhere.

@@ -72,6 +72,18 @@ fn a_whole_capture_is_read() {
 }
 
 #[test]
+fn poses_may_be_rows_and_a_pixel_that_an_occluder_touches_is_covered() {
+    let (dir, mut metadata) = fixture("wild-rows");
+    metadata["01"]["poses"] = json!([[0.0, 0.5, 0.0], [0.0, 0.25, 0.0]]);
+    dir.write("metadata.json", metadata.to_string());
+    let options = LoadOptions { resize: Some(3), ..LoadOptions::default() };
+    let capture = load_capture(dir.path(), &body(), &options).unwrap();
+    assert_eq!(capture.train[1].pose, capture.train[0].pose);
+    // Half of the first column was covered.
+    assert_eq!(capture.train[1].occluder.as_deref().unwrap(), [true, false, false, true, false, false]);
+}
+
+#[test]
 fn stride_and_limit_keep_frames_and_their_views_together() {
     let (dir, _) = fixture("wild-stride");
     let options = LoadOptions { stride: 2, max_frames: Some(2), ..LoadOptions::default() };

@@ -87,17 +87,18 @@ fn lenses(cams: &Record<'_>, options: &LoadOptions) -> Result<Vec<Lens>, DataErr
     if count == 0 {
         return Err(cams.invalid("K", "a camera", "none"));
     }
-    let per_camera = |key: &str, shapes: [&[usize]; 2]| {
+    // Vectors are stored as rows, columns or neither.
+    let per_camera = |key: &str, wanted: &[usize]| {
         let (shape, values) = cams.stacked(key)?;
-        if shape.first() == Some(&count) && shapes.contains(&&shape[1..]) {
+        let axes: Vec<usize> = shape.iter().skip(1).copied().filter(|&n| n != 1).collect();
+        if shape.first() == Some(&count) && axes == wanted {
             return Ok(values);
         }
-        let expected = format!("shape {:?} for each of the {count} cameras of K", shapes[0]);
+        let expected = format!("shape {wanted:?} for each of the {count} cameras of K");
         Err(cams.invalid(key, expected, format!("shape {shape:?}")))
     };
-    let r = per_camera("R", [&[3, 3], &[3, 3]])?;
-    let t = per_camera("T", [&[3, 1], &[3]])?;
-    let d = if cams.has("D") { per_camera("D", [&[5, 1], &[5]])? } else { vec![0.0; 5 * count] };
+    let (r, t) = (per_camera("R", &[3, 3])?, per_camera("T", &[3])?);
+    let d = if cams.has("D") { per_camera("D", &[5])? } else { vec![0.0; 5 * count] };
     (0..count)
         .map(|camera| {
             let key = |name: &str| format!("{name}[{camera}]");

@@ -90,7 +90,7 @@ fn cameras_of_the_wrong_shape_or_kind() {
         f.write();
     });
     let one = Py::List(vec![array(&[3, 1], &[0.0; 3])]);
-    fails("t-count", &["cams.T", "[3, 1]", "2 cameras", "[1, 3, 1]"], annots(&["cams", "T"], one));
+    fails("t-count", &["cams.T", "[3]", "2 cameras", "[1, 3, 1]"], annots(&["cams", "T"], one));
     fails("text", &["cams.K", "an array", "str"], annots(&["cams", "K"], Py::Text("none")));
     fails("cams", &["annots.npy", "cams", "dictionary", "str"], annots(&["cams"], Py::Text("none")));
     fails("r", &["cams.R[1]", "a rotation"], annots(&["cams", "R", "1"], array(&[3, 3], &[0.5; 9])));

@@ -83,13 +83,16 @@ fn parameters_counted_from_one_and_the_names_of_newer_numpy_are_read() {
 }
 
 #[test]
-fn cameras_may_be_nested_lists() {
+fn cameras_may_be_nested_lists_or_whole_arrays() {
     let mut fixture = Fixture::new("zju-lists");
     let row = |values: [f64; 3]| array(&[3], &values);
     *fixture.annots.at(&["cams", "K", "1"]) =
         Py::List(vec![row([16.0, 0.0, 6.0]), row([0.0, 16.0, 4.0]), row([0.0, 0.0, 1.0])]);
+    *fixture.annots.at(&["cams", "T"]) = array(&[2, 3], &[0.0, 0.0, 4000.0, 0.0, 0.0, 4000.0]);
+    *fixture.annots.at(&["cams", "D"]) = array(&[2, 1, 5], &[0.0; 10]);
     fixture.write();
-    assert!(load_capture(fixture.dir.path(), &body(), &clear()).is_ok());
+    let capture = load_capture(fixture.dir.path(), &body(), &clear()).unwrap();
+    assert_eq!(capture.eval[0].frame.camera, capture.train[0].camera);
 }
 
 #[test]
