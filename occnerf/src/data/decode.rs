@@ -113,9 +113,9 @@ fn decode(plan: Planned, size: (u32, u32), first: &str, options: &LoadOptions) -
         }
     }
     if let Some([(x0, y0), (x1, y1)]) = plan.hidden {
-        for (y, row) in (0..).zip(mask.chunks_exact_mut(size.0 as usize)).filter(|(y, _)| (y0..y1).contains(y)) {
-            debug_assert!(y < size.1);
-            row[x0.min(size.0) as usize..x1.min(size.0) as usize].fill(0.0);
+        let columns = x0.min(size.0) as usize..x1.min(size.0) as usize;
+        for row in mask.chunks_exact_mut(size.0 as usize).take(y1 as usize).skip(y0 as usize) {
+            row[columns.clone()].fill(0.0);
         }
     }
     let occluder = match &plan.occluder {

@@ -70,11 +70,11 @@ fn index(names: &[&String], name: &str) -> Option<usize> {
 }
 
 /// The frames of a directory that `choose` keeps of their sorted names; `None` where it keeps none.
-fn plan<'a>(
+fn plan(
     dir: &Path,
     body: &BodyModel,
     options: &LoadOptions,
-    choose: impl FnOnce(Vec<&str>) -> Result<Vec<&str>, DataError> + 'a,
+    choose: impl FnOnce(Vec<&str>) -> Result<Vec<&str>, DataError>,
 ) -> Result<Option<View>, DataError> {
     if !dir.is_dir() {
         return Err(DataError::missing(dir, "directory"));

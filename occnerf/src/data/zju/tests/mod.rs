@@ -124,6 +124,11 @@ fn hidden_pixels_never_reach_training_and_kept_back_views_are_whole() {
     fixture.occlusion("Camera_B1", [12, 8], [4, 0, 5, 8], &[1]);
     assert_eq!(hidden(&LoadOptions::default()), [whole.clone(), vec![5, 6, 7], whole.clone()]);
     assert_eq!(hidden(&options)[0], [6, 7]);
+    // Rows as well as columns: the upper half of a column.
+    fixture.occlusion("Camera_B1", [12, 8], [4, 0, 5, 4], &[0]);
+    let capture = load_capture(fixture.dir.path(), &body(), &LoadOptions::default()).unwrap();
+    let column: Vec<f32> = (0..8).map(|y| capture.train[0].mask[y * 12 + 4]).collect();
+    assert_eq!(column, [0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 1.0]);
     fixture.occlusion("Camera_B2", [12, 8], [4, 0, 5, 8], &[1]);
     assert_eq!(hidden(&LoadOptions::default())[1], [4, 7], "about another camera");
 }
