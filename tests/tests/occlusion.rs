@@ -7,7 +7,7 @@ mod common;
 
 use common::{TempDir, body, capture, scene, tiny, train};
 use glam::Vec3;
-use occnerf::data::{Capture, DemoConfig, LoadOptions, demo, load_humannerf};
+use occnerf::data::{Capture, DemoConfig, LoadOptions, demo, load_capture};
 use occnerf::{Label, Method, MotionKind, OccludedRule, Scene, VertexColors};
 
 const NO_DISTORTION: [f64; 5] = [0.0; 5];
@@ -30,7 +30,7 @@ fn load(hidden: u32, distortion: [f64; 5]) -> Capture {
         [0, 1, 2].map(|c| noise(3 * (y * 24 + x) + c + 3000 * frame, salt))
     };
     capture_on_disk::write(dir.path(), distortion, color, |frame, x, y| 255 * u8::from(shown(frame, x, y)));
-    load_humannerf(dir.path(), &capture_on_disk::body(), &LoadOptions::default()).unwrap()
+    load_capture(dir.path(), &capture_on_disk::body(), &LoadOptions::default()).unwrap()
 }
 
 #[test]

@@ -23,7 +23,7 @@ pub fn compare(arguments: &TrainArguments) -> Result<()> {
     anyhow::ensure!(arguments.settings.method.is_none(), "--compare trains every method: leave --method out");
     let default = format!("runs/{}-compare", scene_name(arguments.scene.as_deref()));
     let out = arguments.out.clone().unwrap_or_else(|| default.into());
-    let source = source::load(arguments.scene.as_deref(), arguments.body.as_deref())?;
+    let source = source::load(arguments.scene.as_deref(), arguments.body.as_deref(), &arguments.load.options())?;
     let mut rows: Vec<(String, Metrics)> = Vec::new();
     for (method, occluded) in RUNS {
         let mut settings = arguments.settings.clone();
@@ -34,9 +34,14 @@ pub fn compare(arguments: &TrainArguments) -> Result<()> {
             _ => format!("{}-{}", config.method.name(), occluded.name()),
         };
         let directory = out.join(&name);
-        let run = RunConfig { scene: source.scene.clone(), body: source.body.clone(), train: config };
+        let run = RunConfig {
+            scene: source.scene.clone(),
+            body: source.body.clone(),
+            load: source.load.clone(),
+            train: config,
+        };
         let finished = directory.join(METRICS).is_file();
-        if finished && RunConfig::read(&directory)?.train == run.train {
+        if finished && RunConfig::read(&directory).is_ok_and(|old| old.train == run.train && old.load == run.load) {
             println!("{name}: finished earlier");
             rows.push((run.train.method.name().to_owned(), Metrics::read(&directory)?));
             continue;

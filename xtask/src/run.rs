@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
+use occnerf::data::LoadOptions;
 use occnerf::{Config, SplitMetrics};
 use serde::{Deserialize, Serialize};
 
@@ -19,6 +20,9 @@ pub struct RunConfig {
     /// The body model's file.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub body: Option<PathBuf>,
+    /// How the capture is read.
+    #[serde(default, skip_serializing_if = "is_default")]
+    pub load: LoadOptions,
     /// Everything else.
     pub train: Config,
 }
@@ -40,8 +44,12 @@ impl RunConfig {
 
     /// The capture it was trained on.
     pub fn source(&self) -> Result<Source> {
-        source::load(Some(&self.scene), self.body.as_deref())
+        source::load(Some(&self.scene), self.body.as_deref(), &self.load)
     }
+}
+
+fn is_default(options: &LoadOptions) -> bool {
+    *options == LoadOptions::default()
 }
 
 /// What metrics.json holds.

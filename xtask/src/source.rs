@@ -3,7 +3,8 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
-use occnerf::data::{Capture, DemoConfig, LoadOptions, demo, find_body, load_humannerf};
+use clap::{Args, ValueEnum};
+use occnerf::data::{Capture, DemoConfig, LoadOptions, Obstacle, demo, find_body, load_capture};
 use smpl::BodyModel;
 
 /// Name of the scene that needs no files.
@@ -15,37 +16,99 @@ const BODY_VARIABLE: &str = "SMPL_MODEL";
 pub struct Source {
     pub scene: String,
     pub body: Option<PathBuf>,
+    pub load: LoadOptions,
     pub capture: Capture,
     pub model: BodyModel,
 }
 
+/// What a capture's files leave open.
+#[derive(Args, Clone, Debug)]
+pub struct LoadArguments {
+    /// Longest side in pixels that pictures are reduced to [default: as they are]
+    #[arg(long, value_name = "PIXELS")]
+    resize: Option<u32>,
+    /// Train on every n-th frame
+    #[arg(long, value_name = "N", default_value_t = 1)]
+    stride: usize,
+    /// Train on at most this many frames [default: all]
+    #[arg(long, value_name = "N")]
+    max_frames: Option<usize>,
+    /// Keep back views of every n-th training frame
+    #[arg(long, value_name = "N", default_value_t = 1)]
+    eval_stride: usize,
+    /// Training camera of a ZJU-MoCap capture, by folder or by number from 1 [default: the first]
+    #[arg(long, value_name = "NAME")]
+    camera: Option<String>,
+    /// Simulated obstacle before the training camera of a ZJU-MoCap capture [default: occlusion.json, else central]
+    #[arg(long)]
+    occlusion: Option<ObstacleName>,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+enum ObstacleName {
+    /// No obstacle.
+    None,
+    /// The paper's: half of the person on four fifths of the frames.
+    Central,
+    /// The same, moving by three tenths of the picture.
+    Moving,
+}
+
+impl LoadArguments {
+    /// The same for the library.
+    pub fn options(&self) -> LoadOptions {
+        let obstacle = |name| match name {
+            ObstacleName::None => Obstacle { fraction: 0.0, ..Obstacle::default() },
+            ObstacleName::Central => Obstacle::default(),
+            ObstacleName::Moving => Obstacle { travel: 0.3, ..Obstacle::default() },
+        };
+        LoadOptions {
+            resize: self.resize,
+            stride: self.stride,
+            max_frames: self.max_frames,
+            eval_stride: self.eval_stride,
+            camera: self.camera.clone(),
+            occlusion: self.occlusion.map(obstacle),
+            ..LoadOptions::default()
+        }
+    }
+
+    /// How a run to be resumed read its capture, checked against what is asked for.
+    pub fn resumed(&self, saved: &LoadOptions) -> Result<LoadOptions> {
+        let asked = self.options();
+        if asked != LoadOptions::default() && asked != *saved {
+            bail!(
+                "the run to resume read its capture with other options; leave them out, or start a new run with --out"
+            );
+        }
+        Ok(saved.clone())
+    }
+}
+
 /// Loads `scene` (the demo if `None`); the body is `body`, the variable SMPL_MODEL, or what lies near the scene.
-pub fn load(scene: Option<&str>, body: Option<&Path>) -> Result<Source> {
+pub fn load(scene: Option<&str>, body: Option<&Path>, options: &LoadOptions) -> Result<Source> {
     let scene = scene.unwrap_or(DEMO);
+    let name = scene.to_owned();
     if scene == DEMO && !Path::new(scene).exists() {
+        if *options != LoadOptions::default() {
+            bail!("the demo takes none of the options that say how a capture is read");
+        }
         let model = BodyModel::embedded();
         let capture = demo(&DemoConfig::default(), &model)?;
-        return Ok(Source { scene: scene.to_owned(), body: None, capture, model });
+        return Ok(Source { scene: name, body: None, load: options.clone(), capture, model });
     }
     let directory = Path::new(scene);
     if !directory.is_dir() {
-        bail!(
-            "{scene}: no such directory; expected a capture in HumanNeRF's prepared layout, or no SCENE for the demo"
-        );
-    }
-    if !directory.join("mesh_infos.pkl").is_file() {
-        bail!(
-            "{scene}: format not recognised: expected HumanNeRF's prepared layout \
-             (images/ masks/ cameras.pkl mesh_infos.pkl canonical_joints.pkl), but mesh_infos.pkl is missing"
-        );
+        bail!("{scene}: no such directory; expected a capture, or no SCENE for the demo");
     }
     let variable = std::env::var_os(BODY_VARIABLE).map(PathBuf::from);
-    let body = body.map(Path::to_owned).or(variable).or_else(|| find_body(directory)).with_context(|| {
-        format!(
-            "{scene}: no body model: give one with --body FILE.npz or {BODY_VARIABLE}, or put body.npz beside images/"
-        )
-    })?;
+    let body = match body.map(Path::to_owned).or(variable) {
+        Some(body) => body,
+        None => find_body(directory).with_context(|| {
+            format!("a capture needs the body model it was fitted with (--body FILE.npz, or {BODY_VARIABLE})")
+        })?,
+    };
     let model = BodyModel::load(&body)?;
-    let capture = load_humannerf(directory, &model, &LoadOptions::default())?;
-    Ok(Source { scene: scene.to_owned(), body: Some(body), capture, model })
+    let capture = load_capture(directory, &model, options)?;
+    Ok(Source { scene: name, body: Some(body), load: options.clone(), capture, model })
 }

@@ -15,7 +15,7 @@ use crate::run::{
     CHECKPOINT, Metrics, RunConfig, Splits, existing_directory, new_directory, peak_rss_bytes, use_threads,
 };
 use crate::settings::SettingArguments;
-use crate::source::{self, Source};
+use crate::source::{self, LoadArguments, Source};
 use crate::{run, table};
 
 /// A checkpoint this often, so that a power cut costs little.
@@ -26,7 +26,7 @@ const LINE_EVERY: Duration = Duration::from_secs(15);
 
 #[derive(Args)]
 pub struct TrainArguments {
-    /// A capture in HumanNeRF's prepared layout; the embedded demo if left out
+    /// A capture (raw ZJU-MoCap, or HumanNeRF's prepared or wild layout); the embedded demo if left out
     pub scene: Option<String>,
     /// Run directory [default: runs/SCENE-METHOD]
     #[arg(long)]
@@ -34,6 +34,8 @@ pub struct TrainArguments {
     /// The body model of the capture, .npz or .pkl [default: SMPL_MODEL, or body.npz or body/*.npz near the scene]
     #[arg(long)]
     pub body: Option<PathBuf>,
+    #[command(flatten)]
+    pub load: LoadArguments,
     #[command(flatten)]
     pub settings: SettingArguments,
     /// Threads [default: all cores]; the result does not depend on it
@@ -66,14 +68,18 @@ pub fn train(arguments: &TrainArguments) -> Result<()> {
     } else {
         (PathBuf::new(), arguments.settings.config()?)
     };
-    let source = if arguments.resume && arguments.scene.is_none() {
-        RunConfig::read(&directory)?.source()?
+    let source = if arguments.resume {
+        let saved = RunConfig::read(&directory)?;
+        let load = arguments.load.resumed(&saved.load)?;
+        let scene = arguments.scene.as_deref().unwrap_or(&saved.scene);
+        source::load(Some(scene), arguments.body.as_deref().or(saved.body.as_deref()), &load)?
     } else {
-        source::load(arguments.scene.as_deref(), arguments.body.as_deref())?
+        source::load(arguments.scene.as_deref(), arguments.body.as_deref(), &arguments.load.options())?
     };
     // The directory of a new run is made only now, so that bad input leaves nothing behind.
     let directory = if arguments.resume { directory } else { new_directory(out, &name)? };
-    let run = RunConfig { scene: source.scene.clone(), body: source.body.clone(), train: config };
+    let run =
+        RunConfig { scene: source.scene.clone(), body: source.body.clone(), load: source.load.clone(), train: config };
     run.write(&directory)?;
     println!("run: {}", directory.display());
     let Some(metrics) = run_one(&directory, &run, &source, arguments.resume, arguments.stop_after)? else {

@@ -50,6 +50,12 @@ fn help_names_the_commands_and_every_option_of_train() {
         "--threads",
         "--resume",
         "--compare",
+        "--resize",
+        "--stride",
+        "--max-frames",
+        "--eval-stride",
+        "--camera",
+        "--occlusion",
     ];
     for option in options {
         assert!(train.contains(option), "{train}");
@@ -61,7 +67,8 @@ fn scenes_that_are_none_are_refused_and_leave_no_run_behind() {
     let out = folder("no-scene").join("run");
     refused(&["train", "/no/such/place", "--out", text(&out)], &["/no/such/place", "no such directory"]);
     let empty = folder("empty-scene");
-    refused(&["train", text(&empty), "--out", text(&out)], &[text(&empty), "mesh_infos.pkl"]);
+    let layouts = ["annots.npy", "metadata.json", "mesh_infos.pkl"];
+    refused(&["train", text(&empty), "--out", text(&out)], &[&[text(&empty)], &layouts[..]].concat());
     std::fs::write(empty.join("mesh_infos.pkl"), b"not a pickle").unwrap();
     refused(&["train", text(&empty), "--out", text(&out)], &[text(&empty), "body model", "--body"]);
     let body = empty.join("none.npz");
@@ -75,6 +82,7 @@ fn settings_that_cannot_be_are_refused_by_key() {
     refused(&["train", "--set", "samples=0"], &["samples", "1 to 1024"]);
     refused(&["train", "--set", "rates.table=nan"], &["rates.table"]);
     refused(&["train", "--set", "samples=many"], &["samples=many", "whole number"]);
+    refused(&["train", "--resize", "64"], &["demo", "options"]);
 }
 
 #[test]

@@ -2,12 +2,13 @@
 
 use std::path::Path;
 
-use image::{DynamicImage, ImageReader};
+use image::imageops::{FilterType, resize as resize_picture};
+use image::{DynamicImage, ImageBuffer, ImageReader, Luma, Rgb};
 
 use super::DataError;
 
 /// Longest side that is decoded; anything larger is taken for a broken or hostile file.
-const MAX_SIDE: u32 = 8192;
+pub(super) const MAX_SIDE: u32 = 8192;
 
 /// An sRGB picture with values from 0 to 1.
 #[derive(Clone, Debug, PartialEq)]
@@ -99,7 +100,7 @@ fn open(path: &Path) -> Result<ImageReader<std::io::BufReader<std::fs::File>>, D
 }
 
 /// Width and height from the header alone.
-fn dimensions(path: &Path) -> Result<(u32, u32), DataError> {
+pub(super) fn dimensions(path: &Path) -> Result<(u32, u32), DataError> {
     let (width, height) = open(path)?.into_dimensions().map_err(|source| picture_error(path, source))?;
     if width.min(height) == 0 || width.max(height) > MAX_SIDE {
         return Err(DataError::invalid(
@@ -123,6 +124,23 @@ pub(super) fn load_mask(path: &Path) -> Result<(u32, u32, Vec<f32>), DataError> 
     let picture = Image::load(path)?;
     let mask = picture.pixels.chunks_exact(3).map(|p| p[0].max(p[1]).max(p[2])).collect();
     Ok((picture.width, picture.height, mask))
+}
+
+/// Resamples values of `channels` (1 or 3) a pixel with a tent filter as wide as the reduction needs; the outer edges
+/// of both pictures coincide. Linear, so that what is premultiplied by its mask stays so.
+pub(super) fn resize(values: Vec<f32>, channels: usize, from: (u32, u32), to: (u32, u32)) -> Vec<f32> {
+    fn resample<P>(values: Vec<f32>, from: (u32, u32), to: (u32, u32)) -> Vec<f32>
+    where
+        P: image::Pixel<Subpixel = f32> + 'static,
+    {
+        let picture = ImageBuffer::<P, _>::from_raw(from.0, from.1, values);
+        picture.map_or(Vec::new(), |p| resize_picture(&p, to.0, to.1, FilterType::Triangle).into_raw())
+    }
+    if from == to {
+        return values;
+    }
+    assert_eq!(values.len(), channels * from.0 as usize * from.1 as usize, "resize: values of {from:?}");
+    if channels == 1 { resample::<Luma<f32>>(values, from, to) } else { resample::<Rgb<f32>>(values, from, to) }
 }
 
 #[cfg(test)]
@@ -150,6 +168,27 @@ mod tests {
         }
         back.save_png(&path).unwrap();
         assert_eq!(Image::load(&path).unwrap(), back, "levels are kept exactly");
+    }
+
+    #[test]
+    fn resizing_keeps_ramps_and_means() {
+        // 12 × 8 to 6 × 4: a ramp across the columns, inside the border that the tent leaves.
+        let ramp: Vec<f32> = (0..96).map(|i| (i % 12) as f32 / 16.0).collect();
+        let small = resize(ramp.clone(), 1, (12, 8), (6, 4));
+        for (i, value) in small.iter().enumerate().filter(|(i, _)| (1..5).contains(&(i % 6))) {
+            // Column c of the small picture is centred at 2c + 1 − 0.5 of the large one's indices.
+            let expected = (2.0 * (i % 6) as f32 + 0.5) / 16.0;
+            assert!((value - expected).abs() < 1e-6, "{i}: {value} {expected}");
+        }
+        let colour: Vec<f32> = ramp.iter().flat_map(|&r| [r, 0.5, 1.0 - r]).collect();
+        let both = resize(colour, 3, (12, 8), (6, 4));
+        for (pixel, value) in both.chunks(3).zip(&small) {
+            assert!((pixel[0] - value).abs() < 1e-6 && (pixel[1] - 0.5).abs() < 1e-6);
+        }
+        assert_eq!(resize(ramp.clone(), 1, (12, 8), (12, 8)), ramp);
+        let stripes: Vec<f32> = (0..96).map(|i| (i % 2) as f32).collect();
+        // Every second column lit: an unfiltered reduction would give all or nothing.
+        assert!(resize(stripes, 1, (12, 8), (6, 4)).iter().all(|v| (0.3..0.7).contains(v)));
     }
 
     #[test]

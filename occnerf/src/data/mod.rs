@@ -1,17 +1,34 @@
 //! Captures: frames with images, masks, cameras and body parameters.
 //!
-//! A [`Capture`] comes from a directory ([`load_humannerf`]) or is made on the spot ([`demo`]). Either way the
+//! A [`Capture`] comes from a directory ([`load_capture`]) or is made on the spot ([`demo`]). Either way the
 //! images hold nothing of what the masks hide, so that no hidden pixel can reach training.
 
+mod camera;
+mod checks;
+mod decode;
 mod demo;
 mod error;
+mod find;
 mod humannerf;
 mod image;
+mod obstacle;
+mod options;
+mod pictures;
+mod records;
+#[cfg(test)]
+mod testing;
+mod undistort;
+mod wild;
+mod zju;
 
 pub use self::demo::{DemoConfig, demo};
 pub use self::error::DataError;
-pub use self::humannerf::{LoadOptions, find_body, load_humannerf};
+pub use self::find::find_body;
 pub use self::image::Image;
+pub use self::obstacle::Obstacle;
+pub use self::options::LoadOptions;
+
+use std::path::Path;
 
 use glam::Vec3;
 
@@ -59,4 +76,33 @@ pub struct Capture {
     pub eval: Vec<EvalFrame>,
     /// Shape of the canonical body (T-pose).
     pub mean_betas: Vec<f32>,
+}
+
+/// Reads a capture from a directory in one of three published layouts, told apart by the files in it:
+///
+/// - **raw ZJU-MoCap** (Peng et al. 2021; `annots.npy`, pictures by camera, `mask_cihp` or `mask`, `new_params`): one
+///   camera is for training, the others are kept back. The training camera is occluded as in the paper, see
+///   [`LoadOptions::occlusion`]. Kept-back pictures that are not there are left out.
+/// - **HumanNeRF's prepared layout** (Weng et al. 2022; `cameras.pkl`, `mesh_infos.pkl`, `canonical_joints.pkl`,
+///   `images`, `masks`), cameras kept back in `eval/*`.
+/// - **HumanNeRF's wild layout** (`metadata.json`, `images`, `masks`), with `occluders` where it is known what
+///   stands in front, and `clean/images`, `clean/masks` of the training camera kept back.
+///
+/// Images are multiplied by their masks. Lens distortion is taken out of both, and both are reduced to
+/// [`LoadOptions::resize`]. A frame without any subject pixel is kept (the subject may be wholly hidden for a while); a
+/// camera without any in all its frames is an error. No views kept back leave [`Capture::eval`] empty.
+///
+/// # Errors
+/// The first problem in the order files are read, training view before views kept back: a directory of no known layout;
+/// files that are missing, unreadable, truncated or name anything to execute; frames without camera or body parameters;
+/// images and masks of unequal sizes or above 8192 pixels, or more of them than [`LoadOptions::max_bytes`]; arrays of
+/// the wrong shape, or not finite; cameras that no projection fits, or that see nothing of the body in any frame; a
+/// body model whose joints or vertices are not the file's; options outside their ranges.
+pub fn load_capture(dir: &Path, body: &smpl::BodyModel, options: &LoadOptions) -> Result<Capture, DataError> {
+    options.check()?;
+    match find::Layout::detect(dir)? {
+        find::Layout::ZjuMocap => zju::load(dir, body, options),
+        find::Layout::Wild => wild::load(dir, body, options),
+        find::Layout::HumanNerf => humannerf::load(dir, body, options),
+    }
 }

@@ -5,7 +5,6 @@ mod face;
 mod landmarks;
 mod motion;
 mod noise;
-mod occlusion;
 mod person;
 mod render;
 #[cfg(test)]
@@ -25,7 +24,7 @@ use self::motion::{Pose, TrackerError, track, walk};
 use self::noise::normal;
 use self::person::Person;
 use self::render::{Posture, look_at};
-use super::{Capture, DataError, EvalFrame, Frame, Image};
+use super::{Capture, DataError, EvalFrame, Frame, Image, Obstacle};
 use crate::random::Stream;
 
 /// Shape coefficients of the person and of the tracker's guess that are not zero.
@@ -224,17 +223,12 @@ fn ring(config: &DemoConfig, shaped: &Shaped) -> Result<Vec<Camera>, DataError> 
 
 /// Puts the obstacle in front of the first frames.
 fn occlude(train: &mut [Frame], config: &DemoConfig) {
-    let affected = (config.occluded_share * train.len() as f32).round() as usize;
-    let masks: Vec<&[f32]> = train[..affected].iter().map(|f| f.mask.as_slice()).collect();
-    let columns = occlusion::hidden_columns(&masks, config.size, config.occluded_fraction);
-    for (i, frame) in train.iter_mut().enumerate() {
-        let hidden: Vec<bool> =
-            (0..frame.mask.len()).map(|p| i < affected && columns.contains(&(p as u32 % config.size))).collect();
-        for (mask, _) in frame.mask.iter_mut().zip(&hidden).filter(|(_, hidden)| **hidden) {
-            *mask = 0.0;
+    let obstacle = Obstacle { fraction: config.occluded_fraction, share: config.occluded_share, ..Obstacle::default() };
+    let columns = obstacle.hide(train);
+    if config.known_occluder {
+        for (frame, hidden) in train.iter_mut().zip(columns) {
+            let covered = (0..frame.mask.len()).map(|p| hidden.contains(&(p as u32 % config.size))).collect();
+            frame.occluder = Some(covered);
         }
-        let seen: Vec<f32> = hidden.iter().map(|&hidden| if hidden { 0.0 } else { 1.0 }).collect();
-        frame.image.multiply(&seen);
-        frame.occluder = config.known_occluder.then_some(hidden);
     }
 }

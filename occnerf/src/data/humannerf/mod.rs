@@ -7,75 +7,134 @@
 //! canonical_joints.pkl        {joints (J,3), avg_betas (≤ B)}
 //! eval/Camera_…/              images, masks, cameras.pkl and mesh_infos.pkl again, nothing occluded
 //! ```
+//!
+//! Frames are the entries of `cameras.pkl` in the order of their names.
 
-mod checks;
-mod records;
 #[cfg(test)]
 mod tests;
-mod undistort;
-mod view;
 
 use std::path::{Path, PathBuf};
 
-use smpl::{BodyModel, Placement};
+use rayon::prelude::*;
+use smpl::BodyModel;
 
-use self::records::Records;
-use super::{Capture, DataError, EvalFrame};
+use super::camera::Lens;
+use super::decode::{Planned, View, check_memory};
+use super::pictures::{Pictures, file_name};
+use super::records::{Record, Records};
+use super::{Capture, DataError, EvalFrame, LoadOptions, checks};
 
-/// What a capture's files leave open.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct LoadOptions {
-    /// Where the intrinsics put the centre of the first pixel: 0.5 where they count from the image's corner, 0
-    /// where they count from the first pixel's centre, as HumanNeRF's own rays do.
-    pub pixel_centre: f32,
-}
-
-impl Default for LoadOptions {
-    fn default() -> Self {
-        Self { pixel_centre: 0.5 }
-    }
-}
-
-/// Reads a capture in HumanNeRF's prepared layout.
-///
-/// Frames are the entries of `cameras.pkl` in the order of their names. Images are multiplied by their masks.
-/// Lens distortion is taken out of both. A frame without any subject pixel is kept (the subject may be wholly
-/// hidden for a while); a camera without any in all its frames is an error. A missing `eval` directory leaves
-/// [`Capture::eval`] empty.
-///
-/// # Errors
-/// The first problem, training view before evaluation views: files that are missing, unreadable or truncated;
-/// frames that have an image but no camera or body parameters, or the other way round; images and masks of unequal
-/// sizes or above 8192 pixels; arrays of the wrong shape, or not finite; cameras that no projection fits, or that
-/// see nothing of the body in any frame; a body model whose joints are not the file's; evaluation frames that
-/// training lacks.
-pub fn load_humannerf(dir: &Path, body: &BodyModel, options: &LoadOptions) -> Result<Capture, DataError> {
-    if !options.pixel_centre.is_finite() {
-        let expected = "a finite number (0 or 0.5)";
-        return Err(DataError::setting("pixel_centre", expected, options.pixel_centre));
-    }
-    let train = view::load_view(dir, body, options)?;
+/// Reads a capture in this layout.
+pub(super) fn load(dir: &Path, body: &BodyModel, options: &LoadOptions) -> Result<Capture, DataError> {
+    options.only_zju("HumanNeRF's prepared layout")?;
+    let mut all = Vec::new();
+    let train = plan(dir, body, options, |names| {
+        all = names.iter().map(|n| (*n).to_owned()).collect();
+        Ok(options.select(names))
+    })?;
+    let names = options.select(all.iter());
     let mean_betas = mean_betas(dir, body)?;
-    let mut eval = Vec::new();
+
+    let (mut cameras, mut eval) = (Vec::new(), Vec::new());
     for camera in eval_directories(dir)? {
-        let camera_name = view::file_name(&camera);
-        for frame in view::load_view(&camera, body, options)? {
-            let train_index = train.binary_search_by(|t| t.name.cmp(&frame.name));
-            eval.push(EvalFrame {
-                camera_name: camera_name.clone(),
-                train_index: train_index.map_err(|_| {
-                    DataError::invalid(
-                        &camera.join("cameras.pkl"),
-                        &frame.name,
-                        format!("the name of a frame of {}", dir.join("cameras.pkl").display()),
-                        "no such training frame",
-                    )
-                })?,
-                frame,
-            });
+        let view = plan(&camera, body, options, |mut seen| {
+            if let Some(odd) = seen.iter().find(|name| all.binary_search_by(|n| n.as_str().cmp(name)).is_err()) {
+                let expected = format!("the name of a frame of {}", dir.join("cameras.pkl").display());
+                let file = camera.join("cameras.pkl");
+                return Err(DataError::invalid(&file, *odd, expected, "no such training frame"));
+            }
+            seen.retain(|name| index(&names, name).is_some_and(|i| i % options.eval_stride == 0));
+            Ok(seen)
+        })?;
+        if let Some(view) = view {
+            cameras.push(file_name(&camera));
+            eval.push(view);
         }
     }
-    Ok(Capture { name: view::file_name(dir), train, eval, mean_betas })
+
+    let train = train.ok_or_else(|| DataError::missing(&dir.join("cameras.pkl"), "frame"))?;
+    check_memory(&train, &eval, options)?;
+    let train = train.decode(body, options)?;
+    let mut frames = Vec::new();
+    for (camera_name, view) in cameras.into_iter().zip(eval) {
+        for frame in view.decode(body, options)? {
+            let train_index = index(&names, &frame.name).unwrap_or_default();
+            frames.push(EvalFrame { camera_name: camera_name.clone(), train_index, frame });
+        }
+    }
+    Ok(Capture { name: file_name(dir), train, eval: frames, mean_betas })
+}
+
+fn index(names: &[&String], name: &str) -> Option<usize> {
+    names.binary_search_by(|n| n.as_str().cmp(name)).ok()
+}
+
+/// The frames of a directory that `choose` keeps of their sorted names; `None` where it keeps none.
+fn plan(
+    dir: &Path,
+    body: &BodyModel,
+    options: &LoadOptions,
+    choose: impl FnOnce(Vec<&str>) -> Result<Vec<&str>, DataError>,
+) -> Result<Option<View>, DataError> {
+    if !dir.is_dir() {
+        return Err(DataError::missing(dir, "directory"));
+    }
+    let cameras = Records::load(&dir.join("cameras.pkl"))?;
+    let bodies = Records::load(&dir.join("mesh_infos.pkl"))?;
+    let (lenses, infos) = (cameras.frames()?, bodies.frames()?);
+    for (has, lacks, has_path, lacks_path) in
+        [(&lenses, &infos, cameras.path(), bodies.path()), (&infos, &lenses, bodies.path(), cameras.path())]
+    {
+        if let Some(name) = has.keys().find(|name| !lacks.contains_key(*name)) {
+            let expected = format!("an entry, as in {}", has_path.display());
+            return Err(DataError::invalid(lacks_path, *name, expected, "no such key"));
+        }
+    }
+    let images = Pictures::list(&dir.join("images"))?;
+    let masks = Pictures::list(&dir.join("masks"))?;
+    if let Some((name, path)) = images.iter().find(|(name, _)| !lenses.contains_key(name.as_str())) {
+        let expected = format!("an entry `{name}` in {}", cameras.path().display());
+        return Err(DataError::invalid(path, "camera of the image", expected, "none"));
+    }
+    let chosen = choose(lenses.keys().copied().collect())?;
+    // Collected as results first, so that the error reported is the first in order whatever finishes first.
+    let frames: Vec<Result<Planned, DataError>> = chosen
+        .par_iter()
+        .map(|&name| {
+            let (image, mask) = (images.demand(name, cameras.path())?, masks.demand(name, cameras.path())?);
+            plan_frame(name, image, mask, &lenses[name], &infos[name], body, options)
+        })
+        .collect();
+    let frames: Vec<Planned> = frames.into_iter().collect::<Result<_, _>>()?;
+    if frames.is_empty() {
+        return Ok(None);
+    }
+    View::new(frames, &dir.join("masks"), cameras.path()).map(Some)
+}
+
+fn plan_frame(
+    name: &str,
+    image: PathBuf,
+    mask: PathBuf,
+    lens: &Record<'_>,
+    parameters: &Record<'_>,
+    body: &BodyModel,
+    options: &LoadOptions,
+) -> Result<Planned, DataError> {
+    let betas = checks::betas(parameters, "betas", body)?;
+    checks::joints(parameters, "tpose_joints", &betas, body)?;
+    Ok(Planned {
+        name: name.to_owned(),
+        image,
+        masks: vec![mask],
+        labels: false,
+        occluder: None,
+        hidden: None,
+        lens: Lens::read(lens, "intrinsics", "extrinsics", options)?,
+        pose: checks::rootless_pose(parameters, body)?,
+        placement: checks::origin(parameters)?,
+        betas,
+    })
 }
 
 /// The shape of the canonical body, `avg_betas` of `canonical_joints.pkl`, its joints checked against the model's.
@@ -102,35 +161,4 @@ fn eval_directories(dir: &Path) -> Result<Vec<PathBuf>, DataError> {
     }
     found.sort();
     Ok(found)
-}
-
-/// The body model that belongs to the capture in `scene`: its own `body.npz`, else the first `.npz` with a body in
-/// a directory `body` beside it or beside the nearest of the directories above it. `None` where there is none.
-#[must_use]
-pub fn find_body(scene: &Path) -> Option<PathBuf> {
-    let own = scene.join("body.npz");
-    if own.is_file() {
-        return Some(own);
-    }
-    // Ancestors of a relative path end where the path does, not at the root of the file system.
-    let scene = scene.canonicalize().ok()?;
-    scene.ancestors().find_map(|above| {
-        let mut files: Vec<PathBuf> = std::fs::read_dir(above.join("body"))
-            .ok()?
-            .filter_map(|entry| Some(entry.ok()?.path()))
-            .filter(|path| path.extension().is_some_and(|e| e == "npz"))
-            .collect();
-        files.sort();
-        files.into_iter().find(|path| is_body(path))
-    })
-}
-
-/// Whether an archive holds a template; poses and reference values may lie beside the body.
-fn is_body(path: &Path) -> bool {
-    smpl::npz::Npz::open(path).is_ok_and(|npz| npz.keys().iter().any(|key| key == "v_template"))
-}
-
-/// ZJU-MoCap's way of placing a body: rotation and translation about the origin.
-fn placement(rotation: glam::Vec3, translation: glam::Vec3) -> Placement {
-    Placement::Origin { rotation, translation }
 }

@@ -1,14 +1,15 @@
 //! Every fault of a capture is one line that names the file, the key, what was expected and what was found.
 
-use super::fixture::{Fixture, Py, array, body};
-use crate::data::{LoadOptions, load_humannerf};
+use super::fixture::Fixture;
+use crate::data::testing::{Py, array, body};
+use crate::data::{LoadOptions, load_capture};
 
 /// Breaks a fresh capture and checks that the message holds all of `words` and is one line.
 #[track_caller]
 fn fails(name: &str, words: &[&str], breakage: impl FnOnce(&mut Fixture)) {
     let mut fixture = Fixture::new(name);
     breakage(&mut fixture);
-    let message = load_humannerf(&fixture.dir, &body(), &LoadOptions::default()).expect_err(name).to_string();
+    let message = load_capture(&fixture.dir, &body(), &LoadOptions::default()).expect_err(name).to_string();
     assert!(!message.contains('\n'), "{message}");
     for word in words {
         assert!(message.contains(word), "`{word}` is not in: {message}");
@@ -183,7 +184,7 @@ fn cameras_that_cannot_be() {
     let mut fixture = Fixture::new("once-blind");
     fixture.cameras.set(&[FRAME, "extrinsics"], matrix([1.0, -1.0, -1.0], -40.0));
     fixture.write();
-    assert!(load_humannerf(&fixture.dir, &body(), &LoadOptions::default()).is_ok());
+    assert!(load_capture(&fixture.dir, &body(), &LoadOptions::default()).is_ok());
 
     fails("mirror", &["frame_000000.extrinsics", "rotation"], everywhere(matrix([1.0, 1.0, -1.0], 4.0)));
     fails("scaled", &["frame_000000.extrinsics", "rotation"], everywhere(matrix([1.1, -1.1, -1.1], 4.0)));
@@ -215,7 +216,7 @@ fn broken_pickles() {
 #[test]
 fn settings_that_cannot_be() {
     let fixture = Fixture::new("setting");
-    let options = LoadOptions { pixel_centre: f32::NAN };
-    let message = load_humannerf(&fixture.dir, &body(), &options).unwrap_err().to_string();
+    let options = LoadOptions { pixel_centre: f32::NAN, ..LoadOptions::default() };
+    let message = load_capture(&fixture.dir, &body(), &options).unwrap_err().to_string();
     assert!(message.contains("pixel_centre"), "{message}");
 }

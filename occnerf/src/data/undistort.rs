@@ -3,11 +3,12 @@
 use glam::Vec2;
 use volrender::{Camera, Distortion};
 
-use crate::data::Image;
-
-/// Fills a picture of `channels` values a pixel from `source` (H, W, channels), seen through `distortion`, bilinear;
-/// 0 beyond the border.
-fn resample(source: &[f32], channels: usize, camera: &Camera, distortion: &Distortion) -> Vec<f32> {
+/// What a perfect lens would have shown in place of `source` (H, W, channels), which `camera` saw through
+/// `distortion`: bilinear, 0 beyond the border.
+pub(super) fn undistort(source: Vec<f32>, channels: usize, camera: &Camera, distortion: &Distortion) -> Vec<f32> {
+    if distortion.is_none() {
+        return source;
+    }
     let (width, height) = (camera.width as usize, camera.height as usize);
     let mut out = vec![0.0; source.len()];
     for row in 0..height {
@@ -38,15 +39,6 @@ fn resample(source: &[f32], channels: usize, camera: &Camera, distortion: &Disto
     out
 }
 
-/// Replaces picture and mask (H, W) by what a perfect lens would have shown.
-pub(super) fn undistort(image: &mut Image, mask: &mut Vec<f32>, camera: &Camera, distortion: &Distortion) {
-    if distortion.is_none() {
-        return;
-    }
-    image.pixels = resample(&image.pixels, 3, camera, distortion);
-    *mask = resample(mask, 1, camera, distortion);
-}
-
 #[cfg(test)]
 mod tests {
     use glam::{Affine3A, Mat3, Vec3};
@@ -74,7 +66,7 @@ mod tests {
             ideal.push(scene(p));
             seen.push(scene(distortion.undistort(p).unwrap()));
         }
-        let back = resample(&seen, 1, &camera, &distortion);
+        let back = undistort(seen.clone(), 1, &camera, &distortion);
         let error = |a: &[f32]| a.iter().zip(&ideal).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
         // Bilinear: step² · f″ / 8 in each direction, (1/60)² · 0.3 · (81 + 49) / 8.
         assert!(error(&back) < 2e-3, "{}", error(&back));
@@ -83,24 +75,18 @@ mod tests {
 
     #[test]
     fn what_the_lens_never_saw_is_empty() {
-        let camera = camera();
         // Pincushion: ideal corners lie outside the photograph.
         let distortion = Distortion::from_opencv([0.5, 0.0, 0.0, 0.0, 0.0]);
-        let mut image = Image::new(64, 48);
-        image.pixels.fill(1.0);
-        let mut mask = vec![1.0; 64 * 48];
-        undistort(&mut image, &mut mask, &camera, &distortion);
-        assert_eq!((mask[0], image.rgb(0, 0)), (0.0, [0.0; 3]));
+        let (image, mask) = (vec![1.0; 64 * 48 * 3], vec![1.0; 64 * 48]);
+        let (image, mask) = (undistort(image, 3, &camera(), &distortion), undistort(mask, 1, &camera(), &distortion));
+        assert_eq!((mask[0], &image[..3]), (0.0, &[0.0; 3][..]));
         assert!((mask[24 * 64 + 32] - 1.0).abs() < 1e-6);
     }
 
     #[test]
     fn a_perfect_lens_changes_nothing() {
-        let mut image = Image::new(64, 48);
-        image.pixels[5] = 0.123;
-        let before = image.clone();
-        let mut mask = vec![0.7; 64 * 48];
-        undistort(&mut image, &mut mask, &camera(), &Distortion::default());
-        assert_eq!(image, before);
+        let mut image = vec![0.0; 64 * 48 * 3];
+        image[5] = 0.123;
+        assert_eq!(undistort(image.clone(), 3, &camera(), &Distortion::default()), image);
     }
 }

@@ -3,10 +3,10 @@
 use std::path::Path;
 
 use glam::Vec3;
-use smpl::BodyModel;
+use smpl::{BodyModel, Placement};
 
 use super::records::{Record, triples};
-use crate::data::{DataError, Frame};
+use super::{DataError, Frame};
 
 /// How far a joint may be from where the file has it, as a fraction of the body's largest extent: 4 cm at 1.7 m.
 /// The same model agrees to rounding, another model of a person is several times as far off.
@@ -23,6 +23,43 @@ pub(super) fn betas(record: &Record<'_>, key: &str, body: &BodyModel) -> Result<
         ));
     }
     Ok(values)
+}
+
+/// The rotation of every joint, (3J) or (J,3) under `poses`.
+pub(super) fn pose(record: &Record<'_>, body: &BodyModel) -> Result<Vec<Vec3>, DataError> {
+    let joints = body.num_joints();
+    let (shape, values) = record.array("poses")?;
+    if shape != [3 * joints] && shape != [joints, 3] {
+        let expected = format!("shape [{}], 3 for each of the body model's {joints} joints", 3 * joints);
+        return Err(record.invalid("poses", expected, format!("shape {shape:?}")));
+    }
+    Ok(triples(&values))
+}
+
+/// [`pose`] where the global rotation is elsewhere.
+pub(super) fn rootless_pose(record: &Record<'_>, body: &BodyModel) -> Result<Vec<Vec3>, DataError> {
+    let pose = pose(record, body)?;
+    if let Some(root) = pose.first().filter(|root| **root != Vec3::ZERO) {
+        let expected = "a zero root (the global rotation is Rh)";
+        return Err(record.invalid("poses", expected, format!("{root} for joint 0")));
+    }
+    Ok(pose)
+}
+
+/// ZJU-MoCap's way of placing a body: rotation `Rh` and translation `Th` about the origin.
+pub(super) fn origin(record: &Record<'_>) -> Result<Placement, DataError> {
+    Ok(Placement::Origin { rotation: record.vec3("Rh")?, translation: record.vec3("Th")? })
+}
+
+/// The mean of all frames' shape coefficients, those that a frame lacks being 0.
+pub(super) fn mean_betas<'a>(frames: impl ExactSizeIterator<Item = &'a [f32]>) -> Vec<f32> {
+    let count = frames.len() as f64;
+    let mut sums = Vec::new();
+    for betas in frames {
+        sums.resize(sums.len().max(betas.len()), 0.0f64);
+        sums.iter_mut().zip(betas).for_each(|(sum, &beta)| *sum += f64::from(beta));
+    }
+    sums.iter().map(|sum| (sum / count) as f32).collect()
 }
 
 /// Compares the T-pose joints under `key` with those of `body` for `betas`.

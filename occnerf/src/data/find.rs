@@ -1,0 +1,65 @@
+//! Which layout a directory has, and where its body model is.
+
+use std::path::{Path, PathBuf};
+
+use super::DataError;
+
+/// A published dataset format.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Layout {
+    ZjuMocap,
+    Wild,
+    HumanNerf,
+}
+
+impl Layout {
+    /// In the order in which they are looked for: HumanNeRF's tool puts its files beside the `metadata.json` that it
+    /// made them from.
+    const ALL: [(&'static [&'static str], &'static str, Self); 3] = [
+        (&["annots.npy"], "raw ZJU-MoCap", Self::ZjuMocap),
+        (&["metadata.json"], "HumanNeRF's wild layout", Self::Wild),
+        (&["mesh_infos.pkl", "cameras.pkl"], "HumanNeRF's prepared layout", Self::HumanNerf),
+    ];
+
+    pub fn detect(dir: &Path) -> Result<Self, DataError> {
+        if !dir.is_dir() {
+            return Err(DataError::missing(dir, "directory"));
+        }
+        let found = Self::ALL.iter().find(|(files, _, _)| files.iter().any(|file| dir.join(file).is_file()));
+        found.map(|(_, _, layout)| *layout).ok_or_else(|| {
+            let expected = Self::ALL.map(|(files, name, _)| format!("{} ({name})", files.join(" and "))).join(", or ");
+            DataError::invalid(dir, "format", expected, "none of them")
+        })
+    }
+}
+
+/// The body model that belongs to the capture in `dir`: its own `body.npz`, else the first `.npz` with a body in a
+/// directory `body` beside it or beside the nearest of the directories above it.
+///
+/// # Errors
+/// [`DataError::Missing`] or [`DataError::Invalid`] where `dir` is no capture of a known layout, and
+/// [`DataError::Missing`] where no body is found.
+pub fn find_body(dir: &Path) -> Result<PathBuf, DataError> {
+    Layout::detect(dir)?;
+    let own = dir.join("body.npz");
+    if own.is_file() {
+        return Ok(own);
+    }
+    // Ancestors of a relative path end where the path does, not at the root of the file system.
+    let whole = dir.canonicalize().map_err(DataError::io(dir))?;
+    let found = whole.ancestors().find_map(|above| {
+        let mut files: Vec<PathBuf> = std::fs::read_dir(above.join("body"))
+            .ok()?
+            .filter_map(|entry| Some(entry.ok()?.path()))
+            .filter(|path| path.extension().is_some_and(|e| e == "npz"))
+            .collect();
+        files.sort();
+        files.into_iter().find(|path| is_body(path))
+    });
+    found.ok_or_else(|| DataError::missing(&own, "body model (nor any body/*.npz near the capture)"))
+}
+
+/// Whether an archive holds a template; poses and reference values may lie beside the body.
+fn is_body(path: &Path) -> bool {
+    smpl::npz::Npz::open(path).is_ok_and(|npz| npz.keys().iter().any(|key| key == "v_template"))
+}

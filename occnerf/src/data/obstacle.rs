@@ -1,0 +1,225 @@
+//! The paper's simulated obstacle (§4, Datasets): a box in front of the camera that hides a rectangle as high as the
+//! picture.
+
+use std::ops::Range;
+
+use serde::{Deserialize, Serialize};
+
+use super::{DataError, Frame};
+
+/// A simulated obstacle in front of the training camera. The default is the paper's: fixed, central, hiding half of
+/// the subject's pixels in the first 80 % of the frames.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Obstacle {
+    /// Part of the subject's pixels in the occluded frames that is hidden, 0 (no obstacle) to 0.95.
+    pub fraction: f32,
+    /// Part of the video, from its start, that is occluded, 0 to 1.
+    pub share: f32,
+    /// How far the obstacle's middle stands to the right of the subject's mean column, in picture widths, −1 to 1.
+    pub position: f32,
+    /// How far it moves to the right, evenly over the occluded frames, in picture widths, −2 to 2. It is at `position`
+    /// half-way through.
+    pub travel: f32,
+}
+
+impl Default for Obstacle {
+    fn default() -> Self {
+        Self { fraction: 0.5, share: 0.8, position: 0.0, travel: 0.0 }
+    }
+}
+
+impl Obstacle {
+    pub(super) fn check(&self) -> Result<(), DataError> {
+        for (name, value, low, high) in [
+            ("occlusion.fraction", self.fraction, 0.0, 0.95),
+            ("occlusion.share", self.share, 0.0, 1.0),
+            ("occlusion.position", self.position, -1.0, 1.0),
+            ("occlusion.travel", self.travel, -2.0, 2.0),
+        ] {
+            if !(low..=high).contains(&value) {
+                return Err(DataError::setting(name, format!("{low} to {high}"), value));
+            }
+        }
+        Ok(())
+    }
+
+    /// The columns that are hidden in each frame, given the subject's coverage (H, `width`) in each.
+    ///
+    /// The obstacle has one width, such that the part of all subject pixels of the occluded frames that it hides is as
+    /// near to `fraction` as whole columns come. Ranges are empty where nothing is hidden.
+    pub(super) fn columns(&self, masks: &[&[f32]], width: u32) -> Vec<Range<u32>> {
+        let affected = ((self.share * masks.len() as f32).round() as usize).min(masks.len());
+        let w = i64::from(width);
+        let last = affected.saturating_sub(1) as f64;
+        let step = f64::from(self.travel) * w as f64 / last.max(1.0);
+        // In frame i the obstacle is `shifts[i]` columns to the right of where it is half-way.
+        let shifts: Vec<i64> = (0..affected).map(|i| ((i as f64 - 0.5 * last) * step).round() as i64).collect();
+        let reach = shifts.iter().map(|s| s.abs()).max().unwrap_or(0) + w;
+        // Subject pixels by column relative to the moving obstacle, from −reach on.
+        let mut histogram = vec![0u64; (2 * reach + w) as usize];
+        let (mut total, mut weighted) = (0u64, 0u64);
+        for (mask, shift) in masks.iter().zip(&shifts) {
+            for (i, _) in mask.iter().enumerate().filter(|(_, m)| **m > 0.5) {
+                let column = i as i64 % w;
+                histogram[(column - shift + reach) as usize] += 1;
+                total += 1;
+                weighted += column as u64;
+            }
+        }
+        let mut hidden = vec![0..0; masks.len()];
+        if total == 0 {
+            return hidden;
+        }
+        // Mean of the subject's pixels, in pixels from the left edge.
+        let mean = weighted as f64 / total as f64 + 0.5;
+        let centre = mean + f64::from(self.position) * w as f64 + reach as f64;
+        let window = grow(&histogram, centre, f64::from(self.fraction) * total as f64);
+        for (range, shift) in hidden.iter_mut().zip(&shifts) {
+            let clip = |x: usize| (x as i64 - reach + shift).clamp(0, w) as u32;
+            *range = clip(window.start)..clip(window.end);
+        }
+        hidden
+    }
+
+    /// Hides what the obstacle covers in a video of equally large frames; returns the hidden columns of each.
+    pub(super) fn hide(&self, frames: &mut [Frame]) -> Vec<Range<u32>> {
+        let width = frames.first().map_or(0, |f| f.image.width);
+        if width == 0 {
+            return Vec::new();
+        }
+        let masks: Vec<&[f32]> = frames.iter().map(|f| f.mask.as_slice()).collect();
+        let columns = self.columns(&masks, width);
+        for (frame, hidden) in frames.iter_mut().zip(&columns) {
+            let visible: Vec<f32> =
+                (0..frame.mask.len()).map(|p| if hidden.contains(&(p as u32 % width)) { 0.0 } else { 1.0 }).collect();
+            frame.mask.iter_mut().zip(&visible).for_each(|(mask, seen)| *mask *= seen);
+            frame.image.multiply(&visible);
+        }
+        columns
+    }
+}
+
+/// The range around `centre` whose sum is nearest to `target`; of several, the narrowest.
+fn grow(histogram: &[u64], centre: f64, target: f64) -> Range<usize> {
+    let start = (centre.round().max(0.0) as usize).min(histogram.len());
+    let (mut range, mut sum) = (start..start, 0u64);
+    let (mut best, mut miss) = (range.clone(), target);
+    while range.start > 0 || range.end < histogram.len() {
+        // Grow on the side that keeps the middle nearest to the centre.
+        let left_arm = centre - range.start as f64;
+        let right_arm = range.end as f64 - centre;
+        if range.end == histogram.len() || (range.start > 0 && left_arm <= right_arm) {
+            range.start -= 1;
+            sum += histogram[range.start];
+        } else {
+            sum += histogram[range.end];
+            range.end += 1;
+        }
+        if (sum as f64 - target).abs() < miss {
+            (best, miss) = (range.clone(), (sum as f64 - target).abs());
+        }
+    }
+    best
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    fn bar(width: usize, rows: usize, columns: Range<usize>) -> Vec<f32> {
+        (0..width * rows).map(|i| f32::from(columns.contains(&(i % width)))).collect()
+    }
+
+    fn always(fraction: f32) -> Obstacle {
+        Obstacle { fraction, share: 1.0, ..Obstacle::default() }
+    }
+
+    #[test]
+    fn half_of_a_bar_is_its_middle_half() {
+        let mask = bar(12, 2, 2..10);
+        assert_eq!(always(0.5).columns(&[&mask], 12)[0], 4..8);
+        assert_eq!(always(0.25).columns(&[&mask, &mask], 12), [5..7, 5..7]);
+        assert!(always(0.0).columns(&[&mask], 12)[0].is_empty());
+    }
+
+    #[test]
+    fn an_empty_video_hides_nothing() {
+        assert!(always(0.5).columns(&[&[0.0; 8]], 4)[0].is_empty());
+        assert!(always(0.5).columns(&[], 4).is_empty());
+        assert!(always(0.5).hide(&mut []).is_empty());
+    }
+
+    #[test]
+    fn a_subject_at_the_border_is_covered_from_there() {
+        let mask = bar(10, 1, 0..4);
+        assert_eq!(always(0.5).columns(&[&mask], 10)[0], 1..3);
+        let columns = always(0.95).columns(&[&mask], 10);
+        assert!(columns[0].start == 0 && columns[0].end >= 4);
+    }
+
+    #[test]
+    fn the_first_share_of_the_frames_is_occluded() {
+        let mask = bar(12, 2, 2..10);
+        for (share, affected) in [(0.0, 0), (0.3, 3), (0.8, 8), (1.0, 10)] {
+            let columns = Obstacle { share, ..Obstacle::default() }.columns(&[&mask[..]; 10], 12);
+            let hidden: Vec<bool> = columns.iter().map(|c| !c.is_empty()).collect();
+            assert_eq!(hidden, (0..10).map(|i| i < affected).collect::<Vec<_>>());
+        }
+    }
+
+    #[test]
+    fn position_moves_the_middle() {
+        let mask = bar(40, 3, 10..30);
+        assert_eq!(always(0.5).columns(&[&mask], 40)[0], 15..25);
+        assert_eq!(Obstacle { position: 0.125, ..always(0.5) }.columns(&[&mask], 40)[0], 20..30);
+        assert_eq!(Obstacle { position: -0.125, ..always(0.5) }.columns(&[&mask], 40)[0], 10..20);
+    }
+
+    #[test]
+    fn a_moving_obstacle_travels_evenly_and_is_central_half_way() {
+        let mask = bar(40, 3, 10..30);
+        let moving = Obstacle { travel: 0.2, ..always(0.5) };
+        let columns = moving.columns(&[&mask[..]; 5], 40);
+        let starts: Vec<u32> = columns.iter().map(|c| c.start).collect();
+        assert_eq!(starts.windows(2).map(|s| s[1] - s[0]).collect::<Vec<_>>(), [2; 4]);
+        assert_eq!(columns[2], 15..25);
+        assert!(columns.iter().all(|c| c.len() == 10));
+    }
+
+    #[test]
+    fn settings_that_cannot_be_are_named() {
+        for (name, obstacle) in [
+            ("fraction", Obstacle { fraction: 1.0, ..Obstacle::default() }),
+            ("share", Obstacle { share: -0.1, ..Obstacle::default() }),
+            ("position", Obstacle { position: f32::NAN, ..Obstacle::default() }),
+            ("travel", Obstacle { travel: f32::INFINITY, ..Obstacle::default() }),
+        ] {
+            let message = obstacle.check().unwrap_err().to_string();
+            assert!(message.contains(name) && message.contains(" to "), "{message}");
+        }
+        assert!(Obstacle::default().check().is_ok());
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(128))]
+
+        #[test]
+        fn the_hidden_part_is_the_fraction_to_within_a_column(
+            bits in prop::collection::vec(prop::bool::weighted(0.3), 24 * 6 * 4),
+            fraction in 0.0f32..0.75, travel in -0.125f32..0.125,
+        ) {
+            let masks: Vec<Vec<f32>> = bits.chunks(24 * 6).map(|b| b.iter().map(|&b| f32::from(b)).collect()).collect();
+            let slices: Vec<&[f32]> = masks.iter().map(Vec::as_slice).collect();
+            let columns = Obstacle { travel, ..always(fraction) }.columns(&slices, 24);
+            let subject = |i: usize, columns: &Range<u32>| masks[i].iter().enumerate()
+                .filter(|(p, m)| **m > 0.5 && columns.contains(&(*p as u32 % 24))).count() as f32;
+            let total: f32 = (0..4).map(|i| subject(i, &(0..24))).sum();
+            let hidden: f32 = (0..4).map(|i| subject(i, &columns[i])).sum();
+            // Half a column of four frames of six rows.
+            prop_assert!((hidden - fraction * total).abs() <= 12.0, "{hidden} of {total}");
+        }
+    }
+}
