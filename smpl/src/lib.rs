@@ -29,6 +29,7 @@ mod motion;
 pub mod npz;
 pub mod pickle;
 mod pose;
+mod pose_backward;
 mod rotation;
 mod sparse;
 
@@ -42,5 +43,6 @@ pub use error::Error;
 pub use model::{BodyModel, Shaped};
 pub use motion::{MotionSample, SurfaceMotion, WeightVolume, WeightVolumeConfig};
 pub use pose::{Placement, Posed};
+pub use pose_backward::PoseGradient;
 pub use rotation::rodrigues;
 pub use sparse::{SkinningWeights, SparseRows};
