@@ -21,9 +21,11 @@
 //! space is the rest pose of a [`Shaped`] body. Arithmetic is `f32` and independent of the number of threads.
 
 mod array;
+mod character;
 mod embedded;
 mod error;
 mod load;
+mod mesh;
 mod model;
 mod motion;
 pub mod npz;
@@ -39,7 +41,9 @@ mod sparse;
 struct Readme;
 
 pub use array::{Data, NdArray};
+pub use character::{Animation, Character, CharacterPose, Texture};
 pub use error::Error;
+pub use mesh::{Mesh, load_mesh};
 pub use model::{BodyModel, Shaped};
 pub use motion::{MotionSample, SurfaceMotion, WeightVolume, WeightVolumeConfig};
 pub use pose::{Placement, Posed};
