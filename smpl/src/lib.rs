@@ -33,6 +33,7 @@ pub mod pickle;
 mod pose;
 mod pose_backward;
 mod rotation;
+mod saved;
 mod sparse;
 
 /// The README's example, compiled as a test.
