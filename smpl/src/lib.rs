@@ -22,6 +22,7 @@
 
 mod array;
 mod character;
+mod clip;
 mod embedded;
 mod error;
 mod load;
@@ -43,10 +44,13 @@ struct Readme;
 
 pub use array::{Data, NdArray};
 pub use character::{Animation, Character, CharacterPose, Texture};
+pub use clip::MotionClip;
 pub use error::Error;
 pub use mesh::{Mesh, load_mesh};
 pub use model::{BodyModel, Shaped};
-pub use motion::{MotionSample, SurfaceMotion, WeightVolume, WeightVolumeConfig};
+pub use motion::{
+    MotionField, MotionFrame, MotionSample, SurfaceMotion, SurfacePoint, WeightVolume, WeightVolumeConfig,
+};
 pub use pose::{Placement, Posed};
 pub use pose_backward::PoseGradient;
 pub use rotation::rodrigues;

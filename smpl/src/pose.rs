@@ -12,8 +12,12 @@ pub(crate) const CHUNK: usize = 1024;
 /// Frames that share one pass over the pose blend shapes: a cache line of coefficients.
 const LANES: usize = 16;
 
-/// Vertices whose offsets for all lanes stay in the first-level cache between the two passes of a batch.
+/// Vertices a parallel task of a batch. Their blend shapes stay in the second-level cache from one block of frames to the
+/// next, their offsets for all lanes in the first between the two passes.
 const TILE: usize = 64;
+
+/// Dense rows of blend shapes that are summed side by side, so that additions do not wait for each other.
+const GROUP: usize = 4;
 
 /// Where a posed body stands in the world. The two differ in the point that the global rotation turns about.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -79,12 +83,12 @@ impl BodyModel {
             |(chunk, (vertices, offsets))| {
                 let arch = pulp::Arch::new();
                 arch.dispatch(|| {
-                    let features = frame.features.as_flattened();
+                    let start = chunk * CHUNK;
+                    self.offsets::<1>(start, offsets.len(), frame.features.as_flattened(), |v, [x, y, z]| {
+                        offsets[v - start] = Vec3::new(x[0], y[0], z[0]);
+                    });
                     for (i, (vertex, offset)) in vertices.iter_mut().zip(offsets).enumerate() {
-                        let v = chunk * CHUNK + i;
-                        let [x, y, z] = self.offsets::<1>(v, features);
-                        *offset = Vec3::new(x[0], y[0], z[0]);
-                        *vertex = self.skin(v, &frame.bones, shaped.vertices[v] + *offset);
+                        *vertex = self.skin(start + i, &frame.bones, shaped.vertices[start + i] + *offset);
                     }
                 });
             },
@@ -92,64 +96,91 @@ impl BodyModel {
         Posed { vertices, joints: frame.joints, bones: frame.bones, pose_offsets }
     }
 
-    /// [`BodyModel::pose`] for many frames at once, which reads the pose blend shapes once for every 16 frames.
+    /// [`BodyModel::pose`] for many frames at once, which reads the pose blend shapes from memory once for all of them.
     ///
     /// # Panics
     /// If a length is not the model's.
     #[must_use]
     pub fn pose_batch(&self, frames: &[(&Shaped, &[Vec3], Placement)]) -> Vec<Posed> {
-        let blocks: Vec<Vec<Posed>> = (frames.par_chunks(LANES)).map(|block| self.pose_block(block)).collect();
-        blocks.into_iter().flatten().collect()
-    }
-
-    fn pose_block(&self, block: &[(&Shaped, &[Vec3], Placement)]) -> Vec<Posed> {
-        let mut features = vec![0.0f32; LANES * TERMS_PER_JOINT * (self.num_joints() - 1)];
-        let mut out: Vec<Posed> = Vec::with_capacity(block.len());
-        for (lane, &(shaped, pose, placement)) in block.iter().enumerate() {
-            let frame = self.kinematics(shaped, pose, placement);
+        let kinematics: Vec<Kinematics> =
+            frames.par_iter().map(|&(shaped, pose, placement)| self.kinematics(shaped, pose, placement)).collect();
+        // A block of frames is (P, LANES).
+        let terms = TERMS_PER_JOINT * (self.num_joints() - 1);
+        let mut features = vec![0.0f32; frames.len().div_ceil(LANES) * terms * LANES];
+        for (i, frame) in kinematics.iter().enumerate() {
+            let block = &mut features[i / LANES * terms * LANES..][..terms * LANES];
             for (term, &value) in frame.features.as_flattened().iter().enumerate() {
-                features[LANES * term + lane] = value;
+                block[LANES * term + i % LANES] = value;
             }
-            out.push(Posed {
-                vertices: vec![Vec3::ZERO; self.num_vertices()],
-                joints: frame.joints,
-                bones: frame.bones,
-                pose_offsets: vec![Vec3::ZERO; self.num_vertices()],
-            });
         }
-        let arch = pulp::Arch::new();
-        arch.dispatch(|| {
-            let mut offsets = vec![[[0.0f32; LANES]; 3]; TILE];
-            for start in (0..self.num_vertices()).step_by(TILE) {
-                let end = (start + TILE).min(self.num_vertices());
-                for (offset, v) in offsets.iter_mut().zip(start..end) {
-                    *offset = self.offsets::<LANES>(v, &features);
-                }
-                for (lane, (posed, &(shaped, ..))) in out.iter_mut().zip(block).enumerate() {
-                    for ([x, y, z], v) in offsets.iter().zip(start..end) {
-                        let offset = Vec3::new(x[lane], y[lane], z[lane]);
-                        posed.vertices[v] = self.skin(v, &posed.bones, shaped.vertices[v] + offset);
-                        posed.pose_offsets[v] = offset;
+        let zeros = || vec![Vec3::ZERO; self.num_vertices()];
+        let mut arrays: Vec<(Vec<Vec3>, Vec<Vec3>)> = frames.par_iter().map(|_| (zeros(), zeros())).collect();
+        // A task owns one tile of vertices in every frame.
+        let mut tiles: Vec<Vec<(&mut [Vec3], &mut [Vec3])>> = Vec::new();
+        tiles.resize_with(self.num_vertices().div_ceil(TILE), || Vec::with_capacity(frames.len()));
+        for (vertices, offsets) in &mut arrays {
+            let parts = vertices.chunks_mut(TILE).zip(offsets.chunks_mut(TILE));
+            tiles.iter_mut().zip(parts).for_each(|(tile, part)| tile.push(part));
+        }
+        tiles.par_iter_mut().enumerate().for_each(|(tile, parts)| {
+            pulp::Arch::new().dispatch(|| {
+                let start = tile * TILE;
+                let mut offsets = [[[0.0f32; LANES]; 3]; TILE];
+                for (block, parts) in parts.chunks_mut(LANES).enumerate() {
+                    let features = &features[block * terms * LANES..][..terms * LANES];
+                    let count = parts.first().map_or(0, |part| part.0.len());
+                    self.offsets::<LANES>(start, count, features, |v, offset| offsets[v - start] = *offset);
+                    for (lane, (vertices, out)) in parts.iter_mut().enumerate() {
+                        let frame = block * LANES + lane;
+                        let (bones, rest) = (&kinematics[frame].bones, &frames[frame].0.vertices[start..]);
+                        for (i, [x, y, z]) in offsets[..count].iter().enumerate() {
+                            let offset = Vec3::new(x[lane], y[lane], z[lane]);
+                            out[i] = offset;
+                            vertices[i] = self.skin(start + i, bones, rest[i] + offset);
+                        }
                     }
                 }
-            }
+            });
         });
-        out
+        drop(tiles);
+        (kinematics.into_iter().zip(arrays))
+            .map(|(Kinematics { joints, bones, .. }, (vertices, pose_offsets))| Posed {
+                vertices,
+                joints,
+                bones,
+                pose_offsets,
+            })
+            .collect()
     }
 
-    /// B_P of vertex `v` for N frames; `features` is (P, N).
+    /// B_P of `count` vertices from `start` for N frames, given to `out` vertex by vertex; `features` is (P, N).
     #[inline(always)]
-    fn offsets<const N: usize>(&self, v: usize, features: &[f32]) -> [[f32; N]; 3] {
-        let [mut x, mut y, mut z] = [[0.0f32; N]; 3];
-        for (term, direction) in self.posedirs.row(v) {
-            let coefficients = &features[N * term..N * term + N];
-            for lane in 0..N {
-                x[lane] += coefficients[lane] * direction.x;
-                y[lane] += coefficients[lane] * direction.y;
-                z[lane] += coefficients[lane] * direction.z;
+    fn offsets<const N: usize>(
+        &self,
+        start: usize,
+        count: usize,
+        features: &[f32],
+        mut out: impl FnMut(usize, &[[f32; N]; 3]),
+    ) {
+        let rows = &self.posedirs.offsets[start..=start + count];
+        let terms = features.len() / N;
+        let mut i = 0;
+        while i < count {
+            // Rows of full length need no columns. Terms are added in the same order either way.
+            let dense = i + GROUP <= count && (rows[i + GROUP] - rows[i]) as usize == GROUP * terms;
+            if dense && rows[i..=i + GROUP].windows(2).all(|w| (w[1] - w[0]) as usize == terms) {
+                let values = &self.posedirs.values[rows[i] as usize..][..GROUP * terms];
+                dense_offsets(values, features).iter().enumerate().for_each(|(k, sum)| out(start + i + k, sum));
+                i += GROUP;
+            } else {
+                let mut sum = [[0.0f32; N]; 3];
+                for (term, direction) in self.posedirs.row(start + i) {
+                    accumulate(&mut sum, &features[N * term..N * term + N], direction);
+                }
+                out(start + i, &sum);
+                i += 1;
             }
         }
-        [x, y, z]
     }
 
     /// Σ w_i · bones_i · rest for vertex `v`.
@@ -202,6 +233,30 @@ struct Kinematics {
     features: Vec<[f32; TERMS_PER_JOINT]>,
     joints: Vec<Vec3>,
     bones: Vec<Affine3A>,
+}
+
+/// Blend shapes of a group of vertices whose rows, `values`, hold every term.
+#[inline(always)]
+fn dense_offsets<const N: usize>(values: &[Vec3], features: &[f32]) -> [[[f32; N]; 3]; GROUP] {
+    let mut sums = [[[0.0f32; N]; 3]; GROUP];
+    let terms = values.len() / GROUP;
+    let rows: [&[Vec3]; GROUP] = std::array::from_fn(|k| &values[k * terms..(k + 1) * terms]);
+    for (term, coefficients) in features.chunks_exact(N).enumerate().take(terms) {
+        for (sum, row) in sums.iter_mut().zip(rows) {
+            accumulate(sum, coefficients, row[term]);
+        }
+    }
+    sums
+}
+
+/// Adds coefficient · direction for every frame.
+#[inline(always)]
+fn accumulate<const N: usize>(sum: &mut [[f32; N]; 3], coefficients: &[f32], direction: Vec3) {
+    for lane in 0..N {
+        sum[0][lane] += coefficients[lane] * direction.x;
+        sum[1][lane] += coefficients[lane] * direction.y;
+        sum[2][lane] += coefficients[lane] * direction.z;
+    }
 }
 
 /// Σ w_i · bones_i.
