@@ -81,16 +81,8 @@ impl BodyModel {
         let mut pose_offsets = vec![Vec3::ZERO; self.num_vertices()];
         (vertices.par_chunks_mut(CHUNK)).zip(pose_offsets.par_chunks_mut(CHUNK)).enumerate().for_each(
             |(chunk, (vertices, offsets))| {
-                let arch = pulp::Arch::new();
-                arch.dispatch(|| {
-                    let start = chunk * CHUNK;
-                    self.offsets::<1>(start, offsets.len(), frame.features.as_flattened(), |v, [x, y, z]| {
-                        offsets[v - start] = Vec3::new(x[0], y[0], z[0]);
-                    });
-                    for (i, (vertex, offset)) in vertices.iter_mut().zip(offsets).enumerate() {
-                        *vertex = self.skin(start + i, &frame.bones, shaped.vertices[start + i] + *offset);
-                    }
-                });
+                let (start, rest) = (chunk * CHUNK, &shaped.vertices);
+                pulp::Arch::new().dispatch(OneFrame { body: self, frame: &frame, rest, start, vertices, offsets });
             },
         );
         Posed { vertices, joints: frame.joints, bones: frame.bones, pose_offsets }
@@ -122,25 +114,10 @@ impl BodyModel {
             let parts = vertices.chunks_mut(TILE).zip(offsets.chunks_mut(TILE));
             tiles.iter_mut().zip(parts).for_each(|(tile, part)| tile.push(part));
         }
+        let features = features.as_slice();
         tiles.par_iter_mut().enumerate().for_each(|(tile, parts)| {
-            pulp::Arch::new().dispatch(|| {
-                let start = tile * TILE;
-                let mut offsets = [[[0.0f32; LANES]; 3]; TILE];
-                for (block, parts) in parts.chunks_mut(LANES).enumerate() {
-                    let features = &features[block * terms * LANES..][..terms * LANES];
-                    let count = parts.first().map_or(0, |part| part.0.len());
-                    self.offsets::<LANES>(start, count, features, |v, offset| offsets[v - start] = *offset);
-                    for (lane, (vertices, out)) in parts.iter_mut().enumerate() {
-                        let frame = block * LANES + lane;
-                        let (bones, rest) = (&kinematics[frame].bones, &frames[frame].0.vertices[start..]);
-                        for (i, [x, y, z]) in offsets[..count].iter().enumerate() {
-                            let offset = Vec3::new(x[lane], y[lane], z[lane]);
-                            out[i] = offset;
-                            vertices[i] = self.skin(start + i, bones, rest[i] + offset);
-                        }
-                    }
-                }
-            });
+            let (start, kinematics) = (tile * TILE, &kinematics);
+            pulp::Arch::new().dispatch(Tile { body: self, frames, kinematics, features, start, parts });
         });
         drop(tiles);
         (kinematics.into_iter().zip(arrays))
@@ -153,34 +130,19 @@ impl BodyModel {
             .collect()
     }
 
-    /// B_P of `count` vertices from `start` for N frames, given to `out` vertex by vertex; `features` is (P, N).
+    /// B_P of vertex `v` for N frames; `features` is (P, N).
     #[inline(always)]
-    fn offsets<const N: usize>(
-        &self,
-        start: usize,
-        count: usize,
-        features: &[f32],
-        mut out: impl FnMut(usize, &[[f32; N]; 3]),
-    ) {
-        let rows = &self.posedirs.offsets[start..=start + count];
-        let terms = features.len() / N;
-        let mut i = 0;
-        while i < count {
-            // Rows of full length need no columns. Terms are added in the same order either way.
-            let dense = i + GROUP <= count && (rows[i + GROUP] - rows[i]) as usize == GROUP * terms;
-            if dense && rows[i..=i + GROUP].windows(2).all(|w| (w[1] - w[0]) as usize == terms) {
-                let values = &self.posedirs.values[rows[i] as usize..][..GROUP * terms];
-                dense_offsets(values, features).iter().enumerate().for_each(|(k, sum)| out(start + i + k, sum));
-                i += GROUP;
-            } else {
-                let mut sum = [[0.0f32; N]; 3];
-                for (term, direction) in self.posedirs.row(start + i) {
-                    accumulate(&mut sum, &features[N * term..N * term + N], direction);
-                }
-                out(start + i, &sum);
-                i += 1;
+    fn offset<const N: usize>(&self, v: usize, features: &[f32]) -> [[f32; N]; 3] {
+        let [mut x, mut y, mut z] = [[0.0f32; N]; 3];
+        for (term, direction) in self.posedirs.row(v) {
+            let coefficients = &features[N * term..N * term + N];
+            for lane in 0..N {
+                x[lane] += coefficients[lane] * direction.x;
+                y[lane] += coefficients[lane] * direction.y;
+                z[lane] += coefficients[lane] * direction.z;
             }
         }
+        [x, y, z]
     }
 
     /// Σ w_i · bones_i · rest for vertex `v`.
@@ -235,27 +197,96 @@ struct Kinematics {
     bones: Vec<Affine3A>,
 }
 
-/// Blend shapes of a group of vertices whose rows, `values`, hold every term.
+// What runs under pulp's dispatch is a type of its own: a closure would not be inlined into the function that carries the
+// wide instructions, and be compiled without them.
+
+/// A run of vertices in one frame.
+struct OneFrame<'a> {
+    body: &'a BodyModel,
+    frame: &'a Kinematics,
+    rest: &'a [Vec3],
+    start: usize,
+    vertices: &'a mut [Vec3],
+    offsets: &'a mut [Vec3],
+}
+
+impl pulp::NullaryFnOnce for OneFrame<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn call(self) {
+        let features = self.frame.features.as_flattened();
+        let rows = &self.body.posedirs.offsets[self.start..];
+        let count = self.offsets.len();
+        let mut i = 0;
+        while i < count {
+            // Rows of full length need no columns. Terms are added in the same order either way.
+            let full = |k: usize| (rows[k + 1] - rows[k]) as usize == features.len();
+            if i + GROUP <= count && (i..i + GROUP).all(full) {
+                let values = &self.body.posedirs.values[rows[i] as usize..][..GROUP * features.len()];
+                self.offsets[i..i + GROUP].copy_from_slice(&dense_offsets(values, features));
+                i += GROUP;
+            } else {
+                let [[x], [y], [z]] = self.body.offset::<1>(self.start + i, features);
+                self.offsets[i] = Vec3::new(x, y, z);
+                i += 1;
+            }
+        }
+        for (i, (vertex, offset)) in self.vertices.iter_mut().zip(self.offsets).enumerate() {
+            let v = self.start + i;
+            *vertex = self.body.skin(v, &self.frame.bones, self.rest[v] + *offset);
+        }
+    }
+}
+
+/// B_P of a group of vertices whose rows, `values`, hold every term.
 #[inline(always)]
-fn dense_offsets<const N: usize>(values: &[Vec3], features: &[f32]) -> [[[f32; N]; 3]; GROUP] {
-    let mut sums = [[[0.0f32; N]; 3]; GROUP];
-    let terms = values.len() / GROUP;
-    let rows: [&[Vec3]; GROUP] = std::array::from_fn(|k| &values[k * terms..(k + 1) * terms]);
-    for (term, coefficients) in features.chunks_exact(N).enumerate().take(terms) {
-        for (sum, row) in sums.iter_mut().zip(rows) {
-            accumulate(sum, coefficients, row[term]);
+fn dense_offsets(values: &[Vec3], features: &[f32]) -> [Vec3; GROUP] {
+    let mut sums = [Vec3::ZERO; GROUP];
+    let rows: [&[Vec3]; GROUP] = std::array::from_fn(|k| &values[k * features.len()..][..features.len()]);
+    for (term, &coefficient) in features.iter().enumerate() {
+        for k in 0..GROUP {
+            sums[k] += coefficient * rows[k][term];
         }
     }
     sums
 }
 
-/// Adds coefficient · direction for every frame.
-#[inline(always)]
-fn accumulate<const N: usize>(sum: &mut [[f32; N]; 3], coefficients: &[f32], direction: Vec3) {
-    for lane in 0..N {
-        sum[0][lane] += coefficients[lane] * direction.x;
-        sum[1][lane] += coefficients[lane] * direction.y;
-        sum[2][lane] += coefficients[lane] * direction.z;
+/// A tile of vertices in every frame of a batch.
+struct Tile<'a, 'b> {
+    body: &'a BodyModel,
+    frames: &'a [(&'a Shaped, &'a [Vec3], Placement)],
+    kinematics: &'a [Kinematics],
+    /// Blocks of (P, LANES).
+    features: &'a [f32],
+    start: usize,
+    /// Vertices and offsets of each frame.
+    parts: &'a mut [(&'b mut [Vec3], &'b mut [Vec3])],
+}
+
+impl pulp::NullaryFnOnce for Tile<'_, '_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn call(self) {
+        let size = LANES * TERMS_PER_JOINT * (self.body.num_joints() - 1);
+        let mut offsets = [[[0.0f32; LANES]; 3]; TILE];
+        for (block, parts) in self.parts.chunks_mut(LANES).enumerate() {
+            let features = &self.features[block * size..][..size];
+            let count = parts.first().map_or(0, |part| part.0.len());
+            for (i, offset) in offsets[..count].iter_mut().enumerate() {
+                *offset = self.body.offset::<LANES>(self.start + i, features);
+            }
+            for (lane, (vertices, out)) in parts.iter_mut().enumerate() {
+                let frame = block * LANES + lane;
+                let (bones, rest) = (&self.kinematics[frame].bones, &self.frames[frame].0.vertices[self.start..]);
+                for (i, [x, y, z]) in offsets[..count].iter().enumerate() {
+                    let offset = Vec3::new(x[lane], y[lane], z[lane]);
+                    out[i] = offset;
+                    vertices[i] = self.body.skin(self.start + i, bones, rest[i] + offset);
+                }
+            }
+        }
     }
 }
 

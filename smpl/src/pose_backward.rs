@@ -85,7 +85,8 @@ impl BodyModel {
         let mut d_rest = vec![Vec3::ZERO; vertices];
         let partials: Vec<Partial> = (d_rest.par_chunks_mut(CHUNK).enumerate())
             .map(|(chunk, d_rest)| {
-                pulp::Arch::new().dispatch(|| self.skin_backward(shaped, posed, d_vertices, chunk * CHUNK, d_rest))
+                let start = chunk * CHUNK;
+                pulp::Arch::new().dispatch(Run { body: self, shaped, posed, d_vertices, start, d_rest })
             })
             .collect();
         // Chunks have a fixed size and are summed in order, so threads do not show.
@@ -217,6 +218,25 @@ impl BodyModel {
             terms.sum::<f64>() as f32
         };
         self.shapedirs.par_chunks_exact(self.num_vertices().max(1)).map(component).collect()
+    }
+}
+
+/// A run of vertices, as a type of its own for pulp's dispatch.
+struct Run<'a> {
+    body: &'a BodyModel,
+    shaped: &'a Shaped,
+    posed: &'a Posed,
+    d_vertices: &'a [Vec3],
+    start: usize,
+    d_rest: &'a mut [Vec3],
+}
+
+impl pulp::NullaryFnOnce for Run<'_> {
+    type Output = Partial;
+
+    #[inline(always)]
+    fn call(self) -> Partial {
+        self.body.skin_backward(self.shaped, self.posed, self.d_vertices, self.start, self.d_rest)
     }
 }
 
