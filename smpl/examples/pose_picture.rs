@@ -80,7 +80,9 @@ fn main() -> Result<(), Box<dyn Error>> {
         let corner = ((i % 4) * WIDTH, (i / 4) * HEIGHT);
         image::imageops::replace(&mut sheet, &picture, corner.0 as i64, corner.1 as i64);
     }
-    sheet.save(&out)?;
+    // Drawn larger, for smooth edges.
+    let (width, height) = (sheet.width() * 2 / 5, sheet.height() * 2 / 5);
+    image::imageops::resize(&sheet, width, height, image::imageops::FilterType::Triangle).save(&out)?;
     println!("wrote {}", out.display());
     Ok(())
 }

@@ -1,7 +1,8 @@
 //! Parametric bodies in SMPL's form.
 //!
 //! Load one (or take the embedded one), shape it, pose it, skin it, and carry points of the posed world back to the
-//! canonical pose.
+//! canonical pose; or go backward from vertices to pose and shape. Beside them: rigged glTF characters ([`Character`]),
+//! motion capture ([`MotionClip`]) and plain meshes ([`load_mesh`]).
 //!
 //! ```
 //! use glam::Vec3;
@@ -21,15 +22,20 @@
 //! space is the rest pose of a [`Shaped`] body. Arithmetic is `f32` and independent of the number of threads.
 
 mod array;
+mod character;
+mod clip;
 mod embedded;
 mod error;
 mod load;
+mod mesh;
 mod model;
 mod motion;
 pub mod npz;
 pub mod pickle;
 mod pose;
+mod pose_backward;
 mod rotation;
+mod saved;
 mod sparse;
 
 /// The README's example, compiled as a test.
@@ -38,9 +44,15 @@ mod sparse;
 struct Readme;
 
 pub use array::{Data, NdArray};
+pub use character::{Animation, Character, CharacterPose, Texture};
+pub use clip::MotionClip;
 pub use error::Error;
+pub use mesh::{Mesh, load_mesh};
 pub use model::{BodyModel, Shaped};
-pub use motion::{MotionSample, SurfaceMotion, WeightVolume, WeightVolumeConfig};
+pub use motion::{
+    MotionField, MotionFrame, MotionSample, SurfaceMotion, SurfacePoint, WeightVolume, WeightVolumeConfig,
+};
 pub use pose::{Placement, Posed};
+pub use pose_backward::PoseGradient;
 pub use rotation::rodrigues;
 pub use sparse::{SkinningWeights, SparseRows};

@@ -129,6 +129,11 @@ impl BodyModel {
                 return invalid(key, message);
             }
         }
+        // Posing takes a row of P entries for one that has every column in its place.
+        let ascends = |row: usize| self.posedirs.row(row).zip(self.posedirs.row(row).skip(1)).all(|(a, b)| a.0 < b.0);
+        if let Some(row) = (0..v).find(|&row| !ascends(row)) {
+            return invalid("posedirs", format!("columns of row {row} do not ascend"));
+        }
         finite(file, "posedirs", &self.posedirs.values)?;
         for i in 0..v {
             let mut sum = 0.0;

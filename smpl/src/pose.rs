@@ -7,13 +7,17 @@ use crate::model::{BodyModel, Shaped, TERMS_PER_JOINT};
 use crate::rotation::rodrigues;
 
 /// Vertices a parallel task.
-const CHUNK: usize = 1024;
+pub(crate) const CHUNK: usize = 1024;
 
 /// Frames that share one pass over the pose blend shapes: a cache line of coefficients.
 const LANES: usize = 16;
 
-/// Vertices whose offsets for all lanes stay in the first-level cache between the two passes of a batch.
+/// Vertices a parallel task of a batch. Their blend shapes stay in the second-level cache from one block of frames to the
+/// next, their offsets for all lanes in the first between the two passes.
 const TILE: usize = 64;
+
+/// Dense rows of blend shapes that are summed side by side, so that additions do not wait for each other.
+const GROUP: usize = 4;
 
 /// Where a posed body stands in the world. The two differ in the point that the global rotation turns about.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -77,69 +81,58 @@ impl BodyModel {
         let mut pose_offsets = vec![Vec3::ZERO; self.num_vertices()];
         (vertices.par_chunks_mut(CHUNK)).zip(pose_offsets.par_chunks_mut(CHUNK)).enumerate().for_each(
             |(chunk, (vertices, offsets))| {
-                let arch = pulp::Arch::new();
-                arch.dispatch(|| {
-                    let features = frame.features.as_flattened();
-                    for (i, (vertex, offset)) in vertices.iter_mut().zip(offsets).enumerate() {
-                        let v = chunk * CHUNK + i;
-                        let [x, y, z] = self.offsets::<1>(v, features);
-                        *offset = Vec3::new(x[0], y[0], z[0]);
-                        *vertex = self.skin(v, &frame.bones, shaped.vertices[v] + *offset);
-                    }
-                });
+                let (start, rest) = (chunk * CHUNK, &shaped.vertices);
+                pulp::Arch::new().dispatch(OneFrame { body: self, frame: &frame, rest, start, vertices, offsets });
             },
         );
         Posed { vertices, joints: frame.joints, bones: frame.bones, pose_offsets }
     }
 
-    /// [`BodyModel::pose`] for many frames at once, which reads the pose blend shapes once for every 16 frames.
+    /// [`BodyModel::pose`] for many frames at once, which reads the pose blend shapes from memory once for all of them.
     ///
     /// # Panics
     /// If a length is not the model's.
     #[must_use]
     pub fn pose_batch(&self, frames: &[(&Shaped, &[Vec3], Placement)]) -> Vec<Posed> {
-        let blocks: Vec<Vec<Posed>> = (frames.par_chunks(LANES)).map(|block| self.pose_block(block)).collect();
-        blocks.into_iter().flatten().collect()
-    }
-
-    fn pose_block(&self, block: &[(&Shaped, &[Vec3], Placement)]) -> Vec<Posed> {
-        let mut features = vec![0.0f32; LANES * TERMS_PER_JOINT * (self.num_joints() - 1)];
-        let mut out: Vec<Posed> = Vec::with_capacity(block.len());
-        for (lane, &(shaped, pose, placement)) in block.iter().enumerate() {
-            let frame = self.kinematics(shaped, pose, placement);
+        let kinematics: Vec<Kinematics> =
+            frames.par_iter().map(|&(shaped, pose, placement)| self.kinematics(shaped, pose, placement)).collect();
+        // A block of frames is (P, LANES).
+        let terms = TERMS_PER_JOINT * (self.num_joints() - 1);
+        let mut features = vec![0.0f32; frames.len().div_ceil(LANES) * terms * LANES];
+        for (i, frame) in kinematics.iter().enumerate() {
+            let block = &mut features[i / LANES * terms * LANES..][..terms * LANES];
             for (term, &value) in frame.features.as_flattened().iter().enumerate() {
-                features[LANES * term + lane] = value;
+                block[LANES * term + i % LANES] = value;
             }
-            out.push(Posed {
-                vertices: vec![Vec3::ZERO; self.num_vertices()],
-                joints: frame.joints,
-                bones: frame.bones,
-                pose_offsets: vec![Vec3::ZERO; self.num_vertices()],
-            });
         }
-        let arch = pulp::Arch::new();
-        arch.dispatch(|| {
-            let mut offsets = vec![[[0.0f32; LANES]; 3]; TILE];
-            for start in (0..self.num_vertices()).step_by(TILE) {
-                let end = (start + TILE).min(self.num_vertices());
-                for (offset, v) in offsets.iter_mut().zip(start..end) {
-                    *offset = self.offsets::<LANES>(v, &features);
-                }
-                for (lane, (posed, &(shaped, ..))) in out.iter_mut().zip(block).enumerate() {
-                    for ([x, y, z], v) in offsets.iter().zip(start..end) {
-                        let offset = Vec3::new(x[lane], y[lane], z[lane]);
-                        posed.vertices[v] = self.skin(v, &posed.bones, shaped.vertices[v] + offset);
-                        posed.pose_offsets[v] = offset;
-                    }
-                }
-            }
+        let zeros = || vec![Vec3::ZERO; self.num_vertices()];
+        let mut arrays: Vec<(Vec<Vec3>, Vec<Vec3>)> = frames.par_iter().map(|_| (zeros(), zeros())).collect();
+        // A task owns one tile of vertices in every frame.
+        let mut tiles: Vec<Vec<(&mut [Vec3], &mut [Vec3])>> = Vec::new();
+        tiles.resize_with(self.num_vertices().div_ceil(TILE), || Vec::with_capacity(frames.len()));
+        for (vertices, offsets) in &mut arrays {
+            let parts = vertices.chunks_mut(TILE).zip(offsets.chunks_mut(TILE));
+            tiles.iter_mut().zip(parts).for_each(|(tile, part)| tile.push(part));
+        }
+        let features = features.as_slice();
+        tiles.par_iter_mut().enumerate().for_each(|(tile, parts)| {
+            let (start, kinematics) = (tile * TILE, &kinematics);
+            pulp::Arch::new().dispatch(Tile { body: self, frames, kinematics, features, start, parts });
         });
-        out
+        drop(tiles);
+        (kinematics.into_iter().zip(arrays))
+            .map(|(Kinematics { joints, bones, .. }, (vertices, pose_offsets))| Posed {
+                vertices,
+                joints,
+                bones,
+                pose_offsets,
+            })
+            .collect()
     }
 
     /// B_P of vertex `v` for N frames; `features` is (P, N).
     #[inline(always)]
-    fn offsets<const N: usize>(&self, v: usize, features: &[f32]) -> [[f32; N]; 3] {
+    fn offset<const N: usize>(&self, v: usize, features: &[f32]) -> [[f32; N]; 3] {
         let [mut x, mut y, mut z] = [[0.0f32; N]; 3];
         for (term, direction) in self.posedirs.row(v) {
             let coefficients = &features[N * term..N * term + N];
@@ -202,6 +195,99 @@ struct Kinematics {
     features: Vec<[f32; TERMS_PER_JOINT]>,
     joints: Vec<Vec3>,
     bones: Vec<Affine3A>,
+}
+
+// What runs under pulp's dispatch is a type of its own: a closure would not be inlined into the function that carries the
+// wide instructions, and be compiled without them.
+
+/// A run of vertices in one frame.
+struct OneFrame<'a> {
+    body: &'a BodyModel,
+    frame: &'a Kinematics,
+    rest: &'a [Vec3],
+    start: usize,
+    vertices: &'a mut [Vec3],
+    offsets: &'a mut [Vec3],
+}
+
+impl pulp::NullaryFnOnce for OneFrame<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn call(self) {
+        let features = self.frame.features.as_flattened();
+        let rows = &self.body.posedirs.offsets[self.start..];
+        let count = self.offsets.len();
+        let mut i = 0;
+        while i < count {
+            // Rows of full length need no columns. Terms are added in the same order either way.
+            let full = |k: usize| (rows[k + 1] - rows[k]) as usize == features.len();
+            if i + GROUP <= count && (i..i + GROUP).all(full) {
+                let values = &self.body.posedirs.values[rows[i] as usize..][..GROUP * features.len()];
+                self.offsets[i..i + GROUP].copy_from_slice(&dense_offsets(values, features));
+                i += GROUP;
+            } else {
+                let [[x], [y], [z]] = self.body.offset::<1>(self.start + i, features);
+                self.offsets[i] = Vec3::new(x, y, z);
+                i += 1;
+            }
+        }
+        for (i, (vertex, offset)) in self.vertices.iter_mut().zip(self.offsets).enumerate() {
+            let v = self.start + i;
+            *vertex = self.body.skin(v, &self.frame.bones, self.rest[v] + *offset);
+        }
+    }
+}
+
+/// B_P of a group of vertices whose rows, `values`, hold every term.
+#[inline(always)]
+fn dense_offsets(values: &[Vec3], features: &[f32]) -> [Vec3; GROUP] {
+    let mut sums = [Vec3::ZERO; GROUP];
+    let rows: [&[Vec3]; GROUP] = std::array::from_fn(|k| &values[k * features.len()..][..features.len()]);
+    for (term, &coefficient) in features.iter().enumerate() {
+        for k in 0..GROUP {
+            sums[k] += coefficient * rows[k][term];
+        }
+    }
+    sums
+}
+
+/// A tile of vertices in every frame of a batch.
+struct Tile<'a, 'b> {
+    body: &'a BodyModel,
+    frames: &'a [(&'a Shaped, &'a [Vec3], Placement)],
+    kinematics: &'a [Kinematics],
+    /// Blocks of (P, LANES).
+    features: &'a [f32],
+    start: usize,
+    /// Vertices and offsets of each frame.
+    parts: &'a mut [(&'b mut [Vec3], &'b mut [Vec3])],
+}
+
+impl pulp::NullaryFnOnce for Tile<'_, '_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn call(self) {
+        let size = LANES * TERMS_PER_JOINT * (self.body.num_joints() - 1);
+        let mut offsets = [[[0.0f32; LANES]; 3]; TILE];
+        for (block, parts) in self.parts.chunks_mut(LANES).enumerate() {
+            let features = &self.features[block * size..][..size];
+            let count = parts.first().map_or(0, |part| part.0.len());
+            for (i, offset) in offsets[..count].iter_mut().enumerate() {
+                *offset = self.body.offset::<LANES>(self.start + i, features);
+            }
+            for (lane, (vertices, out)) in parts.iter_mut().enumerate() {
+                let frame = block * LANES + lane;
+                let (bones, rest) = (&self.kinematics[frame].bones, &self.frames[frame].0.vertices[self.start..]);
+                for (i, [x, y, z]) in offsets[..count].iter().enumerate() {
+                    let offset = Vec3::new(x[lane], y[lane], z[lane]);
+                    out[i] = offset;
+                    vertices[i] = self.body.skin(self.start + i, bones, rest[i] + offset);
+                }
+            }
+        }
+    }
 }
 
 /// Σ w_i · bones_i.

@@ -1,10 +1,11 @@
 //! Properties of shaping, posing and the surface motion field.
+#![allow(clippy::unwrap_used, reason = "helpers of tests")]
 
 use std::sync::LazyLock;
 
 use glam::{Affine3A, Quat, Vec3};
 use proptest::prelude::*;
-use smpl::{BodyModel, Placement, Posed, SurfaceMotion, rodrigues};
+use smpl::{BodyModel, Placement, Posed, SparseRows, SurfaceMotion, rodrigues};
 use testkit::strategy::{rotation, vec3};
 
 static BODY: LazyLock<BodyModel> = LazyLock::new(BodyModel::embedded);
@@ -166,6 +167,42 @@ fn poses_do_not_depend_on_the_number_of_threads() {
         pool.install(|| BODY.pose(&shaped, &pose, Placement::default()))
     };
     assert_eq!(on(1), on(5));
+}
+
+#[test]
+fn dense_rows_are_summed_like_any_other() {
+    // Full rows, which go four at a time, with a sparse and an empty one among them.
+    let mut body = BODY.clone();
+    let wave = |i: usize| (i as f32 * 0.618).sin();
+    body.posedirs = SparseRows::from_rows((0..body.num_vertices()).map(|v| {
+        let kept = move |t: &usize| v % 11 != 5 || (v & 1 == 0 && t.is_multiple_of(3));
+        (0..207).filter(kept).map(move |t| (t as u32, 0.01 * Vec3::new(wave(v + t), wave(v * t), wave(t))))
+    }));
+    body.validate("dense").unwrap();
+    let shaped = body.shaped(&[]);
+    let poses: Vec<Vec<Vec3>> = (0..37)
+        .map(|f| (0..24).map(|j| 0.3 * Vec3::new(wave(f + j), wave(2 * f + j), wave(f * j))).collect())
+        .collect();
+    let frames: Vec<_> = poses.iter().map(|p| (&shaped, p.as_slice(), pelvis(Vec3::Z))).collect();
+    let on = |threads: usize| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        pool.install(|| body.pose_batch(&frames))
+    };
+    let batch = on(1);
+    assert_eq!(batch, on(3));
+    for (posed, pose) in batch.iter().zip(&poses) {
+        assert_eq!(posed, &body.pose(&shaped, pose, pelvis(Vec3::Z)));
+        for v in (0..body.num_vertices()).step_by(7) {
+            let mut expected = glam::DVec3::ZERO;
+            for (term, direction) in body.posedirs.row(v) {
+                let entry = rodrigues(pose[1 + term / 9]).transpose().to_cols_array()[term % 9];
+                let identity = f32::from(u8::from(term % 9 % 4 == 0));
+                expected += f64::from(entry - identity) * direction.as_dvec3();
+            }
+            assert!(posed.pose_offsets[v].as_dvec3().distance(expected) < 1e-6);
+        }
+    }
+    assert!(body.pose_batch(&[]).is_empty());
 }
 
 #[test]

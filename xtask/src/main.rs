@@ -1,6 +1,7 @@
 //! `cargo xtask`: train, evaluate and render people from occluded videos.
 
 mod compare;
+mod convert;
 mod eval;
 mod pictures;
 mod render;
@@ -29,6 +30,8 @@ enum Command {
     Eval(eval::EvalArguments),
     /// Draws a run's person: its movement, from all around, or in the rest pose.
     Render(render::RenderArguments),
+    /// Converts a body model, .npz or .pkl, to .safetensors.
+    Convert(convert::ConvertArguments),
 }
 
 fn main() -> std::process::ExitCode {
@@ -36,6 +39,7 @@ fn main() -> std::process::ExitCode {
         Command::Train(arguments) => train::train(&arguments),
         Command::Eval(arguments) => eval::eval(&arguments),
         Command::Render(arguments) => render::render(&arguments),
+        Command::Convert(arguments) => convert::convert(&arguments),
     };
     match outcome {
         Ok(()) => std::process::ExitCode::SUCCESS,

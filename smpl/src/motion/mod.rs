@@ -1,5 +1,7 @@
 //! Motion fields: from a point in the world to the canonical pose.
 
+mod field;
+mod jacobian;
 mod prior;
 mod surface;
 mod volume;
@@ -7,6 +9,7 @@ mod volume_backward;
 
 use glam::Vec3;
 
+pub use field::{MotionField, MotionFrame, SurfacePoint};
 pub use surface::SurfaceMotion;
 pub use volume::{WeightVolume, WeightVolumeConfig};
 

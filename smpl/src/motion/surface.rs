@@ -8,7 +8,7 @@ use crate::pose::{Posed, blend};
 
 /// Blended bones with a determinant below this are replaced by the heaviest bone alone. Two rigid bones in equal parts
 /// reach it at a relative turn of 154°.
-const MIN_DETERMINANT: f32 = 0.05;
+pub(super) const MIN_DETERMINANT: f32 = 0.05;
 
 /// Motion field whose weights are those of the nearest point of the posed surface (DESIGN §3, surface kind).
 ///
@@ -91,7 +91,7 @@ impl SurfaceMotion {
 }
 
 /// The joint with the largest total weight, the lower of equals.
-fn heaviest(weights: impl Iterator<Item = (usize, f32)>) -> usize {
+pub(super) fn heaviest(weights: impl Iterator<Item = (usize, f32)>) -> usize {
     let mut totals: Vec<(usize, f32)> = Vec::new();
     for (joint, w) in weights {
         match totals.iter_mut().find(|(j, _)| *j == joint) {

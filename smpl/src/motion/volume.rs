@@ -68,6 +68,8 @@ pub(super) struct Cell {
     pub(super) corner: usize,
     /// Weights of the eight corners, x fastest.
     pub(super) mix: [f32; 8],
+    /// Position in the cell, 0 to 1.
+    pub(super) t: Vec3,
 }
 
 impl WeightVolume {
@@ -207,7 +209,7 @@ impl WeightVolume {
             s.x * t.y * t.z,
             t.x * t.y * t.z,
         ];
-        Some(Cell { corner: (z * n + y) * n + x, mix })
+        Some(Cell { corner: (z * n + y) * n + x, mix, t })
     }
 }
 

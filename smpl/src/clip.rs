@@ -1,0 +1,117 @@
+//! Motion capture in SMPL's parameters.
+
+use std::path::Path;
+
+use glam::{Quat, Vec3};
+
+use crate::Error;
+use crate::npz::Npz;
+use crate::pose::Placement;
+
+/// Joints that SMPL, SMPL-H and SMPL-X share: the body without hands and face.
+const SHARED: usize = 22;
+/// Finger joints of both hands in SMPL-H and SMPL-X.
+const FINGERS: usize = 30;
+/// Longest rotation that is taken for one, in radians.
+const MAX_ANGLE: f32 = 1e3;
+
+/// A motion of T frames and J joints, for bodies in SMPL's form.
+#[derive(Clone, Debug, PartialEq)]
+pub struct MotionClip {
+    /// Axis-angle rotations relative to the parent, (T·J): those of the first frame first.
+    pub poses: Vec<Vec3>,
+    /// J.
+    pub num_joints: usize,
+    /// Translation of the body, (T), in metres.
+    pub trans: Vec<Vec3>,
+    /// Frames a second.
+    pub fps: f32,
+}
+
+impl MotionClip {
+    /// Reads an `.npz` with `poses` (T, 3J), `trans` (T, 3) and one of `fps`, `mocap_framerate` and `mocap_frame_rate`, as
+    /// AMASS has them (156 columns for SMPL-H, 165 for SMPL-X). Other arrays are left alone. AMASS has z up.
+    ///
+    /// # Errors
+    /// Any [`Error`] of arrays; [`Error::Invalid`] without frames, for a rate that is not positive, and for rotations
+    /// beyond 1000 rad.
+    pub fn load(path: &Path) -> Result<Self, Error> {
+        let mut npz = Npz::open(path)?;
+        let file = npz.file().to_owned();
+        let (shape, poses) = npz.f32("poses", &[None, None])?;
+        if shape[0] == 0 || shape[1] == 0 || !shape[1].is_multiple_of(3) {
+            return Err(Error::invalid(&file, "poses", format!("shape {shape:?}, expected frames of three a joint")));
+        }
+        let (_, trans) = npz.f32("trans", &[Some(shape[0]), Some(3)])?;
+        let rates = ["fps", "mocap_framerate", "mocap_frame_rate"];
+        let key = rates.into_iter().find(|r| npz.keys().iter().any(|k| k == r)).unwrap_or("fps");
+        let rate = npz.array(key)?.to_f64();
+        let fps = match rate.as_slice() {
+            [rate] if *rate > 0.0 && *rate <= 1e6 => *rate as f32,
+            _ => return Err(Error::invalid(&file, key, format!("{rate:?} frames a second"))),
+        };
+        let vectors = |values: Vec<f32>| values.chunks_exact(3).map(Vec3::from_slice).collect::<Vec<_>>();
+        let clip = Self { poses: vectors(poses), num_joints: shape[1] / 3, trans: vectors(trans), fps };
+        match clip.poses.iter().position(|r| r.length() > MAX_ANGLE) {
+            Some(i) => Err(Error::invalid(&file, "poses", format!("a rotation of {} rad", clip.poses[i].length()))),
+            None => Ok(clip),
+        }
+    }
+
+    /// T.
+    #[must_use]
+    pub fn num_frames(&self) -> usize {
+        self.trans.len()
+    }
+
+    /// From the first frame to the last, in seconds.
+    #[must_use]
+    pub fn duration(&self) -> f32 {
+        self.num_frames().saturating_sub(1) as f32 / self.fps
+    }
+
+    /// The pose at `seconds` for a body of `joints` joints, and where it stands: the root turns about the pelvis.
+    ///
+    /// Between frames, rotations are interpolated along the shorter great arc and translations linearly; the clip is
+    /// held before its first and after its last frame. A body with as many joints as the clip gets all of them. Otherwise the
+    /// first 22 are the body's and the same in SMPL, SMPL-H and SMPL-X; fingers go from SMPL-H (52 joints) to SMPL-X (55) and
+    /// back; every other joint (SMPL's two hands, jaw and eyes) stays at rest.
+    ///
+    /// # Panics
+    /// If the clip has no frame, or `poses` is not T·J long.
+    #[must_use]
+    pub fn at(&self, seconds: f32, joints: usize) -> (Vec<Vec3>, Placement) {
+        let frames = self.num_frames();
+        assert!(frames > 0, "at: a clip without frames");
+        assert_eq!(self.poses.len(), frames * self.num_joints, "at: rotations of the clip");
+        // NaN counts as the start.
+        let position = (f64::from(seconds) * f64::from(self.fps)).max(0.0).min((frames - 1) as f64);
+        let first = position.floor() as usize;
+        let second = (first + 1).min(frames - 1);
+        let s = (position - first as f64) as f32;
+        let turn = |joint: usize| {
+            let at = |frame: usize| self.poses[frame * self.num_joints + joint];
+            if s == 0.0 {
+                return at(first);
+            }
+            let [a, b] = [at(first), at(second)].map(Quat::from_scaled_axis);
+            a.slerp(b, s).to_scaled_axis()
+        };
+        let pose = (0..joints).map(|j| source(self.num_joints, joints, j).map_or(Vec3::ZERO, turn)).collect();
+        (pose, Placement::Pelvis { translation: self.trans[first].lerp(self.trans[second], s) })
+    }
+}
+
+/// The joint of a clip of `clip` joints that drives joint `joint` of a body of `body` joints.
+fn source(clip: usize, body: usize, joint: usize) -> Option<usize> {
+    if clip == body || joint < SHARED {
+        return Some(joint).filter(|&j| j < clip);
+    }
+    let fingers = |joints: usize| match joints {
+        52 => Some(SHARED),
+        55 => Some(SHARED + 3),
+        _ => None,
+    };
+    let finger = joint.checked_sub(fingers(body)?).filter(|&f| f < FINGERS)?;
+    Some(fingers(clip)? + finger)
+}
