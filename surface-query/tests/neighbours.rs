@@ -211,7 +211,7 @@ fn bad_meshes_and_settings_are_errors() {
     let build = |settings| SurfaceQuery::new(&ball.vertices, &ball.faces, &settings).map(|_| ());
     for (name, settings) in [
         ("k", SurfaceQueryConfig { k: 0, ..SurfaceQueryConfig::BODY }),
-        ("k", SurfaceQueryConfig { k: 65, ..SurfaceQueryConfig::BODY }),
+        ("k", SurfaceQueryConfig { k: 65_537, ..SurfaceQueryConfig::BODY }),
         ("ratio", SurfaceQueryConfig { ratio: 0.0, ..SurfaceQueryConfig::BODY }),
         ("ratio", SurfaceQueryConfig { ratio: f32::NAN, ..SurfaceQueryConfig::BODY }),
         ("cell", SurfaceQueryConfig { cell: -1.0, ..SurfaceQueryConfig::BODY }),

@@ -3,6 +3,7 @@
 mod compare;
 mod eval;
 mod pictures;
+mod probe;
 mod render;
 mod report;
 mod run;
@@ -29,6 +30,8 @@ enum Command {
     Eval(eval::EvalArguments),
     /// Draws a run's person: its movement, from all around, or in the rest pose.
     Render(render::RenderArguments),
+    /// Runs one function of one crate on numpy arrays.
+    Probe(probe::ProbeArguments),
 }
 
 fn main() -> std::process::ExitCode {
@@ -36,6 +39,7 @@ fn main() -> std::process::ExitCode {
         Command::Train(arguments) => train::train(&arguments),
         Command::Eval(arguments) => eval::eval(&arguments),
         Command::Render(arguments) => render::render(&arguments),
+        Command::Probe(arguments) => probe::probe(&arguments),
     };
     match outcome {
         Ok(()) => std::process::ExitCode::SUCCESS,
