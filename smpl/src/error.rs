@@ -68,7 +68,8 @@ pub enum Error {
         /// Position of the first such value, row-major.
         index: usize,
     },
-    /// Readable, but impossible: an index out of range, weights that do not sum to one, a tree with a cycle.
+    /// Readable, but impossible: an index out of range, weights that do not sum to one, a tree with a cycle. Also what
+    /// cannot be read of a glTF, OBJ or safetensors file; `key` is then the part or the line.
     #[error("{file}: `{key}`: {message}")]
     Invalid {
         /// Which file.

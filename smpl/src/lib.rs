@@ -21,15 +21,19 @@
 //! space is the rest pose of a [`Shaped`] body. Arithmetic is `f32` and independent of the number of threads.
 
 mod array;
+mod character;
 mod embedded;
 mod error;
 mod load;
+mod mesh;
 mod model;
 mod motion;
 pub mod npz;
 pub mod pickle;
 mod pose;
+mod pose_backward;
 mod rotation;
+mod saved;
 mod sparse;
 
 /// The README's example, compiled as a test.
@@ -38,9 +42,12 @@ mod sparse;
 struct Readme;
 
 pub use array::{Data, NdArray};
+pub use character::{Animation, Character, CharacterPose, Texture};
 pub use error::Error;
+pub use mesh::{Mesh, load_mesh};
 pub use model::{BodyModel, Shaped};
 pub use motion::{MotionSample, SurfaceMotion, WeightVolume, WeightVolumeConfig};
 pub use pose::{Placement, Posed};
+pub use pose_backward::PoseGradient;
 pub use rotation::rodrigues;
 pub use sparse::{SkinningWeights, SparseRows};

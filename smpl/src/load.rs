@@ -7,33 +7,50 @@ use glam::Vec3;
 use crate::Error;
 use crate::array::NdArray;
 use crate::model::{BodyModel, TERMS_PER_JOINT};
-use crate::npz::Npz;
+use crate::npz::{Npz, read_file};
 use crate::pickle::{self, Value};
+use crate::saved;
 use crate::sparse::SparseRows;
 
 impl BodyModel {
-    /// Reads an SMPL model, by its extension: `.npz`, or `.pkl` in the style of the original release (chumpy arrays,
-    /// sparse regressor). Nothing in a pickle is executed.
+    /// Reads a body in SMPL's form: an `.npz`, a `.pkl` in the style of the original release (chumpy arrays, sparse
+    /// regressor), or this crate's own `.safetensors` ([`BodyModel::save`]). The first bytes tell which; where they do
+    /// not, the extension. Nothing in a pickle is executed.
     ///
-    /// Needed are `v_template` (V,3), `f` (F,3), `weights` (V,J), `J_regressor` (J,V), `kintree_table` (2,J),
-    /// `shapedirs` (V,3,B) and `posedirs` (V,3,9(J−1)).
+    /// An npz or pickle needs `v_template` (V,3), `f` (F,3), `weights` (V,J), `J_regressor` (J,V), `kintree_table` (2,J),
+    /// `shapedirs` (V,3,B) and `posedirs` (V,3,9(J−1)), for any J and B: SMPL (24), SMPL-H (52) and SMPL-X (55, its
+    /// expressions among the B) alike. Other arrays are left alone. Whatever stands for the root's parent will do.
     ///
     /// # Errors
     /// Any [`Error`]; those about the content name the array.
     pub fn load(path: &Path) -> Result<Self, Error> {
         let file = path.display().to_string();
-        let extension = path.extension().and_then(|e| e.to_str()).unwrap_or("");
-        match extension.to_ascii_lowercase().as_str() {
-            "npz" => {
-                let mut npz = Npz::open(path)?;
+        let extension = path.extension().and_then(|e| e.to_str()).unwrap_or("").to_ascii_lowercase();
+        let known = ["npz", "pkl", "safetensors"].into_iter().find(|e| *e == extension);
+        let bytes = read_file(path)?;
+        match kind(&bytes).or(known) {
+            Some("npz") => {
+                let mut npz = Npz::from_bytes(&file, bytes)?;
                 build(&file, |key| npz.array(key))
             }
-            "pkl" => {
-                let value = pickle::read(path)?;
+            Some("safetensors") => saved::parse(&file, &bytes),
+            Some(_) => {
+                let value = pickle::parse(&file, &bytes)?;
                 build(&file, |key| from_pickle(&file, &value, key))
             }
-            _ => Err(Error::Extension { path: path.to_owned(), expected: ".npz or .pkl" }),
+            None => Err(Error::Extension { path: path.to_owned(), expected: ".npz, .pkl or .safetensors" }),
         }
+    }
+}
+
+/// The usual extension for what the bytes begin like: a zip archive, a pickle of protocol 2 or later, or the length and
+/// the opening brace of a safetensors header.
+fn kind(bytes: &[u8]) -> Option<&'static str> {
+    match bytes {
+        [b'P', b'K', 3 | 5, 4 | 6, ..] => Some("npz"),
+        [_, _, _, _, 0, 0, 0, 0, b'{', ..] => Some("safetensors"),
+        [0x80, 2..=5, ..] => Some("pkl"),
+        _ => None,
     }
 }
 

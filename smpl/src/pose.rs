@@ -7,7 +7,7 @@ use crate::model::{BodyModel, Shaped, TERMS_PER_JOINT};
 use crate::rotation::rodrigues;
 
 /// Vertices a parallel task.
-const CHUNK: usize = 1024;
+pub(crate) const CHUNK: usize = 1024;
 
 /// Frames that share one pass over the pose blend shapes: a cache line of coefficients.
 const LANES: usize = 16;

@@ -1,6 +1,7 @@
 //! `cargo xtask`: train, evaluate and render people from occluded videos.
 
 mod compare;
+mod convert;
 mod eval;
 mod pictures;
 mod probe;
@@ -32,6 +33,8 @@ enum Command {
     Render(render::RenderArguments),
     /// Runs one function of one crate on numpy arrays.
     Probe(probe::ProbeArguments),
+    /// Converts a body model, .npz or .pkl, to .safetensors.
+    Convert(convert::ConvertArguments),
 }
 
 fn main() -> std::process::ExitCode {
@@ -40,6 +43,7 @@ fn main() -> std::process::ExitCode {
         Command::Eval(arguments) => eval::eval(&arguments),
         Command::Render(arguments) => render::render(&arguments),
         Command::Probe(arguments) => probe::probe(&arguments),
+        Command::Convert(arguments) => convert::convert(&arguments),
     };
     match outcome {
         Ok(()) => std::process::ExitCode::SUCCESS,

@@ -11,8 +11,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
 use clap::{Args, ValueEnum};
-use glam::Vec3;
-use smpl::BodyModel;
+use smpl::{BodyModel, load_mesh};
 
 use input::Input;
 use output::Output;
@@ -53,10 +52,10 @@ pub struct ProbeArguments {
     /// Where to write the results
     #[arg(long, value_name = "OUT.npz")]
     out: PathBuf,
-    /// Mesh, for surface and visible: the template of a body model
+    /// Mesh, for surface and visible: .obj, .glb or .gltf at rest, or a body model's template
     #[arg(long)]
     mesh: Option<PathBuf>,
-    /// Body model, for skin and motion: SMPL's .npz or .pkl
+    /// Body model, for skin and motion: .npz or .pkl in SMPL's form
     #[arg(long)]
     model: Option<PathBuf>,
 }
@@ -74,7 +73,7 @@ pub fn probe(arguments: &ProbeArguments) -> Result<()> {
         }
     }
     let path = &arguments.input;
-    let mesh = || load_mesh(arguments.mesh.as_deref().context("no --mesh")?);
+    let mesh = || Ok::<_, anyhow::Error>(load_mesh(arguments.mesh.as_deref().context("no --mesh")?)?);
     let model = || Ok::<_, anyhow::Error>(BodyModel::load(arguments.model.as_deref().context("no --model")?)?);
     let mut output = Output::default();
     match arguments.op {
@@ -101,15 +100,4 @@ pub fn probe(arguments: &ProbeArguments) -> Result<()> {
         Op::Metrics => picture::metrics(Input::open(path, &["a", "b", "mask"], &[])?, &mut output)?,
     }
     output.write(&arguments.out)
-}
-
-/// A triangle mesh.
-struct Mesh {
-    vertices: Vec<Vec3>,
-    faces: Vec<[u32; 3]>,
-}
-
-fn load_mesh(path: &Path) -> Result<Mesh> {
-    let model = BodyModel::load(path)?;
-    Ok(Mesh { vertices: model.v_template, faces: model.faces })
 }

@@ -2,11 +2,11 @@
 
 use anyhow::{Context, Result, ensure};
 use glam::{Affine3A, Mat3, Vec3};
+use smpl::Mesh;
 use visibility::{RayMesh, View, visible_vertices};
 use volrender::metrics;
 use volrender::{bin_midpoints, bin_widths, composite_backward};
 
-use super::Mesh;
 use super::input::{Input, vec3s};
 use super::output::{Output, count};
 

@@ -3,9 +3,9 @@
 use anyhow::{Context, Result, ensure};
 use glam::Vec3;
 use rayon::prelude::*;
+use smpl::Mesh;
 use surface_query::{MeshDistance, Pyramid, SurfaceQuery, SurfaceQueryConfig};
 
-use super::Mesh;
 use super::input::Input;
 use super::output::{Output, count};
 

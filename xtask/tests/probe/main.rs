@@ -199,8 +199,8 @@ fn knn_breaks_ties_by_index_for_every_k() {
 fn surface_gives_neighbours_blend_and_exact_distance() {
     let folder = folder("surface");
     let mesh = octahedron(&folder);
-    let queries = floats(&[2, 3], &[2.0, 0.0, 0.0, 0.1, 0.1, 0.1]);
-    let mut out = probe(&folder, "surface", &vec![("queries", queries)], &["--mesh", mesh.to_str().unwrap()]);
+    let queries = vec![("queries", floats(&[2, 3], &[2.0, 0.0, 0.0, 0.1, 0.1, 0.1]))];
+    let mut out = probe(&folder, "surface", &queries, &["--mesh", mesh.to_str().unwrap()]);
     let indices = out.i64("indices", &[Some(2), Some(4), Some(5)]).unwrap().1;
     // Nearest first, then four as near as each other; the single vertex of the coarser levels is repeated.
     assert_eq!(indices[..10], [0, 1, 2, 4, 5, 0, 0, 0, 0, 0]);
@@ -213,7 +213,17 @@ fn surface_gives_neighbours_blend_and_exact_distance() {
     let closest = out.f32("closest_point", &[Some(2), Some(3)]).unwrap().1;
     close(&closest, &[1.0, 0.0, 0.0, third, third, third], 1e-6);
     let inside = -(third - 0.1) * 3f64.sqrt();
-    close(&out.f32("exact_signed_distance", &[Some(2)]).unwrap().1, &[1.0, inside], 1e-6);
+    let exact = out.f32("exact_signed_distance", &[Some(2)]).unwrap().1;
+    close(&exact, &[1.0, inside], 1e-6);
+
+    // The same mesh as an OBJ file.
+    let mut text: String = CORNERS.iter().map(|[x, y, z]| format!("v {x} {y} {z}\n")).collect();
+    text += "f 1 2 3\nf 2 4 3\nf 4 5 3\nf 5 1 3\nf 2 1 6\nf 4 2 6\nf 5 4 6\nf 1 5 6\n";
+    let obj = folder.join("octahedron.obj");
+    std::fs::write(&obj, text).unwrap();
+    let mut again = probe(&folder, "surface", &queries, &["--mesh", obj.to_str().unwrap()]);
+    assert_eq!(again.f32("exact_signed_distance", &[Some(2)]).unwrap().1, exact);
+    assert_eq!(again.i64("indices", &[None; 3]).unwrap().1, indices);
 }
 
 fn visible() -> Arrays {

@@ -1,0 +1,180 @@
+//! Buffers and accessors of glTF, with every range checked before it is read.
+
+use std::cell::Cell;
+use std::path::{Component, Path};
+
+use base64::Engine;
+use gltf_json::accessor::{Accessor, ComponentType};
+use gltf_json::buffer::View;
+use gltf_json::validation::Checked;
+use gltf_json::{Index, Root};
+
+use crate::Error;
+use crate::npz::read_file;
+
+/// What all accessors together may decode to, in bytes: 256 MiB.
+const MAX_DECODED_BYTES: u64 = 1 << 28;
+
+/// A document and the bytes that its accessors and images point into. Nothing in it is taken on trust: every index and
+/// range is checked where it is used.
+pub(super) struct Source<'a> {
+    pub(super) file: &'a str,
+    pub(super) root: &'a Root,
+    /// Where other files may lie; `None` admits none.
+    folder: Option<&'a Path>,
+    data: Vec<Vec<u8>>,
+    /// Bytes that may still be decoded: many accessors may share one range.
+    left: Cell<u64>,
+}
+
+impl<'a> Source<'a> {
+    /// `blob` is the binary chunk of a `.glb`; other buffers are data URIs or files in `folder`.
+    pub(super) fn new(
+        file: &'a str,
+        root: &'a Root,
+        mut blob: Option<Vec<u8>>,
+        folder: Option<&'a Path>,
+    ) -> Result<Self, Error> {
+        let mut source = Self { file, root, folder, data: Vec::new(), left: Cell::new(MAX_DECODED_BYTES) };
+        for (i, buffer) in root.buffers.iter().enumerate() {
+            let place = format!("buffer {i}");
+            let bytes = match &buffer.uri {
+                Some(uri) => source.resolve(&place, uri)?.1,
+                None => blob.take().ok_or_else(|| source.invalid(&place, "neither an address nor a chunk"))?,
+            };
+            if buffer.byte_length.0 > bytes.len() as u64 {
+                let message = format!("{} bytes announced, {} there", buffer.byte_length.0, bytes.len());
+                return Err(source.invalid(&place, message));
+            }
+            source.data.push(bytes);
+        }
+        Ok(source)
+    }
+
+    /// The item that `index` names, for what stands at `place`.
+    pub(super) fn get<'b, T>(&self, items: &'b [T], index: Index<T>, place: &str) -> Result<&'b T, Error> {
+        let missing = || self.invalid(place, format!("it names item {index} of {}", items.len()));
+        items.get(index.value()).ok_or_else(missing)
+    }
+
+    /// The bytes of a buffer view.
+    pub(super) fn view(&self, index: Index<View>, place: &str) -> Result<(&View, &[u8]), Error> {
+        let view = self.get(&self.root.buffer_views, index, place)?;
+        let bytes = self.data.get(view.buffer.value()).map(Vec::as_slice);
+        let start = view.byte_offset.unwrap_or_default().0;
+        let range = start
+            .checked_add(view.byte_length.0)
+            .and_then(|end| Some(usize::try_from(start).ok()?..usize::try_from(end).ok()?));
+        let bytes = bytes.zip(range).and_then(|(bytes, range)| bytes.get(range));
+        let outside = || self.invalid(place, format!("buffer view {index} leaves its buffer"));
+        Ok((view, bytes.ok_or_else(outside)?))
+    }
+
+    /// Elements of N components, decoded by `component` from the bytes of one; `None` from it is an error.
+    fn elements<const N: usize, T: Copy + Default>(
+        &self,
+        index: Index<Accessor>,
+        place: &str,
+        component: impl Fn(ComponentType, bool, &[u8]) -> Option<T>,
+    ) -> Result<Vec<[T; N]>, Error> {
+        let accessor = self.get(&self.root.accessors, index, place)?;
+        let place = format!("{place} (accessor {index})");
+        let invalid = |message: &str| Err(self.invalid(&place, message.to_owned()));
+        let (Checked::Valid(dimensions), Checked::Valid(kind)) = (accessor.type_, accessor.component_type) else {
+            return invalid("of an unknown type");
+        };
+        if dimensions.multiplicity() != N {
+            return invalid(&format!("{dimensions:?}, expected {N} components"));
+        }
+        if accessor.sparse.is_some() {
+            return invalid("sparse accessors are not read");
+        }
+        let Some(view) = accessor.buffer_view else {
+            return invalid("no data");
+        };
+        let (view, bytes) = self.view(view, &place)?;
+        let kind = kind.0;
+        let width = kind.size();
+        let size = N * width;
+        let stride = view.byte_stride.map_or(size, |stride| stride.0);
+        let count = accessor.count.0;
+        let start = accessor.byte_offset.unwrap_or_default().0;
+        let last = count.checked_sub(1).and_then(|n| n.checked_mul(stride as u64));
+        let end = last.and_then(|n| n.checked_add(size as u64)).and_then(|n| n.checked_add(start));
+        if count > 0 && end.is_none_or(|end| end > bytes.len() as u64) {
+            return invalid(&format!("{count} elements leave its buffer view"));
+        }
+        if stride < size {
+            return invalid(&format!("a stride of {stride} for elements of {size} bytes"));
+        }
+        let cost = count * (N * size_of::<T>()) as u64;
+        let Some(left) = self.left.get().checked_sub(cost) else {
+            return Err(Error::TooLarge {
+                file: self.file.to_owned(),
+                key: place,
+                claimed: u128::from(cost),
+                limit: MAX_DECODED_BYTES,
+            });
+        };
+        self.left.set(left);
+        // Both fit: they lie within the bytes.
+        let (count, start) = (count as usize, start as usize);
+        let mut out = Vec::with_capacity(count);
+        for i in 0..count {
+            let element = &bytes[start + i * stride..][..size];
+            let mut values = [T::default(); N];
+            for (value, bytes) in values.iter_mut().zip(element.chunks_exact(width)) {
+                let Some(decoded) = component(kind, accessor.normalized, bytes) else {
+                    return invalid(&format!("element {i} is of the wrong type ({kind:?}) or not finite"));
+                };
+                *value = decoded;
+            }
+            out.push(values);
+        }
+        Ok(out)
+    }
+
+    /// Finite floats; integers are taken only as normalised.
+    pub(super) fn floats<const N: usize>(&self, index: Index<Accessor>, place: &str) -> Result<Vec<[f32; N]>, Error> {
+        self.elements(index, place, |kind, normalized, bytes| match kind {
+            ComponentType::F32 => Some(f32::from_le_bytes(bytes.try_into().ok()?)).filter(|x| x.is_finite()),
+            _ if !normalized => None,
+            ComponentType::U8 => Some(f32::from(*bytes.first()?) / 255.0),
+            ComponentType::U16 => Some(f32::from(u16::from_le_bytes(bytes.try_into().ok()?)) / 65535.0),
+            ComponentType::I8 => Some((f32::from(*bytes.first()? as i8) / 127.0).max(-1.0)),
+            ComponentType::I16 => Some((f32::from(i16::from_le_bytes(bytes.try_into().ok()?)) / 32767.0).max(-1.0)),
+            ComponentType::U32 => None,
+        })
+    }
+
+    /// Unsigned integers.
+    pub(super) fn indices<const N: usize>(&self, index: Index<Accessor>, place: &str) -> Result<Vec<[u32; N]>, Error> {
+        self.elements(index, place, |kind, _, bytes| match kind {
+            ComponentType::U8 => Some(u32::from(*bytes.first()?)),
+            ComponentType::U16 => Some(u32::from(u16::from_le_bytes(bytes.try_into().ok()?))),
+            ComponentType::U32 => Some(u32::from_le_bytes(bytes.try_into().ok()?)),
+            _ => None,
+        })
+    }
+
+    /// Media type and bytes of a data URI, or of a file in the folder. Addresses that leave the folder are refused.
+    pub(super) fn resolve(&self, place: &str, uri: &str) -> Result<(String, Vec<u8>), Error> {
+        if let Some(rest) = uri.strip_prefix("data:") {
+            let Some((mime, text)) = rest.split_once(";base64,") else {
+                return Err(self.invalid(place, "a data address that is not base64"));
+            };
+            let bytes = base64::engine::general_purpose::STANDARD.decode(text);
+            return Ok((mime.to_owned(), bytes.map_err(|e| self.invalid(place, e.to_string()))?));
+        }
+        let path = Path::new(uri);
+        let inside = path.components().all(|c| matches!(c, Component::Normal(_) | Component::CurDir));
+        match self.folder {
+            Some(folder) if inside => Ok((String::new(), read_file(&folder.join(path))?)),
+            _ => Err(self.invalid(place, format!("the address {uri:?} does not lead to a file beside it"))),
+        }
+    }
+
+    pub(super) fn invalid(&self, place: &str, message: impl Into<String>) -> Error {
+        Error::invalid(self.file, place, message)
+    }
+}

@@ -1,0 +1,158 @@
+//! The mesh of a character, part by part.
+
+use glam::{Vec2, Vec3};
+use gltf_json::accessor::Accessor;
+use gltf_json::mesh::{Mode, Primitive, Semantic};
+use gltf_json::validation::Checked;
+use gltf_json::{Index, material};
+
+use super::accessor::Source;
+use super::read::Joints;
+use super::{Character, Texture};
+use crate::Error;
+
+impl Character {
+    /// Appends a primitive's vertices and triangles. `skinned`: its own joints and weights count, within `joints`; else
+    /// it follows the first of those.
+    pub(super) fn add_primitive(
+        &mut self,
+        source: &Source<'_>,
+        place: &str,
+        primitive: &Primitive,
+        joints: Joints,
+        skinned: bool,
+    ) -> Result<(), Error> {
+        let invalid = |message: String| source.invalid(place, message);
+        match primitive.mode {
+            Checked::Valid(Mode::Triangles) => {}
+            Checked::Valid(Mode::TriangleStrip | Mode::TriangleFan) => {
+                return Err(invalid("triangle strips and fans are not read".to_owned()));
+            }
+            _ => return Ok(()),
+        }
+        let attribute = |semantic| primitive.attributes.get(&Checked::Valid(semantic)).copied();
+        let positions = attribute(Semantic::Positions).ok_or_else(|| invalid("no positions".to_owned()))?;
+        let positions = source.floats::<3>(positions, &format!("{place}, POSITION"))?;
+        let (first, count) = (self.vertices.len() as u32, positions.len());
+        self.vertices.extend(positions.into_iter().map(Vec3::from));
+        let fits = |n: usize, name: &str| {
+            if n == count { Ok(()) } else { Err(invalid(format!("{n} of {name} for {count} positions"))) }
+        };
+        if let Some(normals) = attribute(Semantic::Normals) {
+            let normals = source.floats::<3>(normals, &format!("{place}, NORMAL"))?;
+            fits(normals.len(), "NORMAL")?;
+            self.normals.extend(normals.into_iter().map(Vec3::from));
+        }
+        let colour = match primitive.material {
+            Some(index) => base_colour(source.get(&source.root.materials, index, place)?),
+            None => None,
+        };
+        if let Some(uvs) = attribute(Semantic::TexCoords(colour.map_or(0, |c| c.tex_coord))) {
+            let uvs = source.floats::<2>(uvs, &format!("{place}, TEXCOORD"))?;
+            fits(uvs.len(), "TEXCOORD")?;
+            self.uvs.extend(uvs.into_iter().map(Vec2::from));
+        }
+        if let (None, Some(colour)) = (&self.texture, colour) {
+            self.texture = Some(texture(source, place, colour)?);
+        }
+        let corners: Vec<u32> = match primitive.indices {
+            Some(accessor) => {
+                source.indices::<1>(accessor, &format!("{place}, indices"))?.into_iter().flatten().collect()
+            }
+            None => (0..count as u32).collect(),
+        };
+        if !corners.len().is_multiple_of(3) {
+            return Err(invalid(format!("{} corners of triangles", corners.len())));
+        }
+        if let Some(bad) = corners.iter().find(|&&c| c as usize >= count) {
+            return Err(invalid(format!("index {bad} of {count} vertices")));
+        }
+        self.faces.extend(corners.chunks_exact(3).map(|c| [c[0], c[1], c[2]].map(|i| first + i)));
+
+        let mut rows: Vec<Vec<(u32, f32)>> = vec![Vec::new(); count];
+        for set in 0.. {
+            let Some(indices) = attribute(Semantic::Joints(set)).filter(|_| skinned) else {
+                break;
+            };
+            let Some(weights) = attribute(Semantic::Weights(set)) else {
+                return Err(invalid(format!("JOINTS_{set} without weights")));
+            };
+            influences(source, &format!("{place}, set {set}"), indices, weights, joints, &mut rows)?;
+        }
+        for row in rows {
+            self.push_weights(row, joints.0);
+        }
+        Ok(())
+    }
+
+    /// Appends a vertex's weights, normalised, one entry a joint. Without any weight, where glTF leaves it open, `default`
+    /// keeps the vertex with the body.
+    fn push_weights(&mut self, mut row: Vec<(u32, f32)>, default: u32) {
+        if row.is_empty() {
+            row.push((default, 1.0));
+        }
+        row.sort_by_key(|&(joint, _)| joint);
+        row.dedup_by(|next, kept| {
+            let same = next.0 == kept.0;
+            kept.1 += if same { next.1 } else { 0.0 };
+            same
+        });
+        let sum: f64 = row.iter().map(|&(_, w)| f64::from(w)).sum();
+        for (joint, weight) in row {
+            self.weights.columns.push(joint);
+            self.weights.values.push((f64::from(weight) / sum) as f32);
+        }
+        self.weights.offsets.push(self.weights.columns.len() as u32);
+    }
+}
+
+/// Adds one set of four joints and weights a vertex.
+fn influences(
+    source: &Source<'_>,
+    place: &str,
+    indices: Index<Accessor>,
+    weights: Index<Accessor>,
+    joints: Joints,
+    rows: &mut [Vec<(u32, f32)>],
+) -> Result<(), Error> {
+    let (indices, weights) = (source.indices::<4>(indices, place)?, source.floats::<4>(weights, place)?);
+    if indices.len() != rows.len() || weights.len() != rows.len() {
+        let message = format!("{} joints and {} weights for {} positions", indices.len(), weights.len(), rows.len());
+        return Err(source.invalid(place, message));
+    }
+    for (row, (indices, weights)) in rows.iter_mut().zip(indices.into_iter().zip(weights)) {
+        for (index, weight) in indices.into_iter().zip(weights) {
+            if !(0.0..=1e6).contains(&weight) {
+                return Err(source.invalid(place, format!("a weight of {weight}")));
+            }
+            if weight == 0.0 {
+                continue;
+            }
+            if index >= joints.1 {
+                return Err(source.invalid(place, format!("joint {index} of {}", joints.1)));
+            }
+            row.push((joints.0 + index, weight));
+        }
+    }
+    Ok(())
+}
+
+fn base_colour(material: &material::Material) -> Option<&gltf_json::texture::Info> {
+    material.pbr_metallic_roughness.base_color_texture.as_ref()
+}
+
+fn texture(source: &Source<'_>, place: &str, colour: &gltf_json::texture::Info) -> Result<Texture, Error> {
+    let root = source.root;
+    let index = source.get(&root.textures, colour.index, place)?.source;
+    let image = source.get(&root.images, index, place)?;
+    let place = format!("image {index}");
+    let mime = image.mime_type.as_ref().map(|m| m.0.clone());
+    match (image.buffer_view, &image.uri) {
+        (Some(view), _) => Ok(Texture { mime: mime.unwrap_or_default(), bytes: source.view(view, &place)?.1.to_vec() }),
+        (None, Some(uri)) => {
+            let (found, bytes) = source.resolve(&place, uri)?;
+            Ok(Texture { mime: mime.unwrap_or(found), bytes })
+        }
+        (None, None) => Err(source.invalid(&place, "neither an address nor a buffer view")),
+    }
+}

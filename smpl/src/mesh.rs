@@ -1,0 +1,113 @@
+//! Plain triangle meshes from files.
+
+use std::path::Path;
+
+use glam::Vec3;
+
+use crate::Error;
+use crate::character::Character;
+use crate::model::BodyModel;
+use crate::npz::read_file;
+
+/// A triangle mesh.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Mesh {
+    /// Positions, (V), in the file's order.
+    pub vertices: Vec<Vec3>,
+    /// Triangles, (F).
+    pub faces: Vec<[u32; 3]>,
+}
+
+/// Reads a mesh, by its extension: Wavefront `.obj`; `.glb` and `.gltf`, every triangle mesh of the scene at rest in the
+/// world; a body model (see [`BodyModel::load`]), its template.
+///
+/// Of an OBJ file the statements `v` and `f` count; polygons become fans. Vertices keep the file's order, so that
+/// results by vertex index compare with those of other programs.
+///
+/// # Errors
+/// Any [`Error`]; those about an OBJ file name the line.
+pub fn load_mesh(path: &Path) -> Result<Mesh, Error> {
+    let extension = path.extension().and_then(|e| e.to_str()).unwrap_or("").to_ascii_lowercase();
+    match extension.as_str() {
+        "obj" => parse_obj(&path.display().to_string(), &read_file(path)?),
+        "glb" | "gltf" => {
+            let character = Character::load(path)?;
+            let mesh = Mesh { vertices: character.rest().vertices, faces: character.faces };
+            match mesh.vertices.iter().position(|v| !v.is_finite()) {
+                Some(v) => {
+                    Err(Error::NotFinite { file: path.display().to_string(), key: "vertices".to_owned(), index: 3 * v })
+                }
+                None => Ok(mesh),
+            }
+        }
+        "npz" | "pkl" | "safetensors" => {
+            let body = BodyModel::load(path)?;
+            Ok(Mesh { vertices: body.v_template, faces: body.faces })
+        }
+        _ => Err(Error::Extension { path: path.to_owned(), expected: ".obj, .glb, .gltf, .npz, .pkl or .safetensors" }),
+    }
+}
+
+fn parse_obj(file: &str, bytes: &[u8]) -> Result<Mesh, Error> {
+    let text = String::from_utf8_lossy(bytes);
+    let mut mesh = Mesh { vertices: Vec::new(), faces: Vec::new() };
+    let mut polygon: Vec<u32> = Vec::new();
+    // Where each triangle comes from: an index may name a vertex that follows.
+    let mut lines: Vec<usize> = Vec::new();
+    let mut joined = String::new();
+    for (number, line) in text.lines().enumerate().map(|(i, line)| (i + 1, line)) {
+        let invalid = |message: String| Error::invalid(file, &format!("line {number}"), message);
+        let statement = line.split('#').next().unwrap_or("").trim();
+        if let Some(start) = statement.strip_suffix('\\') {
+            joined.push_str(start);
+            joined.push(' ');
+            continue;
+        }
+        joined.push_str(statement);
+        let statement = std::mem::take(&mut joined);
+        let mut words = statement.split_ascii_whitespace();
+        match words.next() {
+            Some("v") => {
+                let mut position = [0.0f32; 3];
+                for value in &mut position {
+                    let word = words.next().ok_or_else(|| invalid("fewer than three coordinates".to_owned()))?;
+                    *value = word.parse().map_err(|_| invalid(format!("{word:?} is no number")))?;
+                    if !value.is_finite() {
+                        return Err(invalid(format!("{word:?} is not finite")));
+                    }
+                }
+                mesh.vertices.push(position.into());
+            }
+            Some("f") => {
+                polygon.clear();
+                for word in words {
+                    let index: i64 = (word.split('/').next().and_then(|w| w.parse().ok()))
+                        .ok_or_else(|| invalid(format!("{word:?} is no vertex")))?;
+                    // From 1, or from the end of the vertices so far.
+                    let from_zero = if index < 0 { mesh.vertices.len() as i64 + index } else { index - 1 };
+                    let vertex = u32::try_from(from_zero).map_err(|_| invalid(format!("{word:?} is no vertex")))?;
+                    polygon.push(vertex);
+                }
+                if polygon.len() < 3 {
+                    return Err(invalid(format!("a face of {} corners", polygon.len())));
+                }
+                for pair in polygon[1..].windows(2) {
+                    mesh.faces.push([polygon[0], pair[0], pair[1]]);
+                    lines.push(number);
+                }
+            }
+            _ => {}
+        }
+    }
+    let count = mesh.vertices.len();
+    for (face, line) in mesh.faces.iter().zip(lines) {
+        if let Some(&bad) = face.iter().find(|&&v| v as usize >= count) {
+            let message = format!("vertex {} of {count}", u64::from(bad) + 1);
+            return Err(Error::invalid(file, &format!("line {line}"), message));
+        }
+    }
+    if mesh.faces.is_empty() {
+        return Err(Error::invalid(file, "faces", "no faces"));
+    }
+    Ok(mesh)
+}
