@@ -110,9 +110,9 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     Ok(())
 }
 
-/// White to red.
+/// White to red, in sixteen steps.
 fn heat(error: f32) -> Vec3 {
-    let t = (error / FULL).clamp(0.0, 1.0);
+    let t = (error / FULL * 16.0).round().clamp(0.0, 16.0) / 16.0;
     Vec3::new(1.0, 1.0 - 0.9 * t, 0.95 - 0.9 * t)
 }
 
@@ -146,13 +146,13 @@ fn portraits(mesh: &MeshDistance, faces: &[[u32; 3]], errors: &[f32], low: Vec3,
     })
 }
 
-/// The error at depth `z`, from the head to below the crotch; inside is darker.
+/// The error at depth `z` within 10 cm of the skin, from the head to below the crotch; inside is darker.
 fn slice(mesh: &MeshDistance, mut blended: impl FnMut(Vec3) -> f32, z: f32, low: Vec3, high: Vec3) -> RgbImage {
-    let (width, scale) = (640, (high.x - low.x) / 640.0);
+    let (width, scale) = (480, (high.x - low.x) / 480.0);
     let height = (1.15 / scale) as u32;
     RgbImage::from_fn(width, height, |column, row| {
         let x = Vec3::new(low.x + (column as f32 + 0.5) * scale, high.y - (row as f32 + 0.5) * scale, z);
-        let Some(closest) = mesh.closest(x, f32::INFINITY) else {
+        let Some(closest) = mesh.closest(x, 2.0 * REACH) else {
             return Rgb([255; 3]);
         };
         let (d, b) = (closest.signed_distance, blended(x));

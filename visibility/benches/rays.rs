@@ -131,6 +131,27 @@ fn visible_vertices_of_a_view(bencher: Bencher<'_, '_>) {
         .bench_local(|| visible_vertices(&rays, &mesh.vertices, &view, None));
 }
 
+/// Counts of all vertices over 100 views around the body, all threads.
+#[divan::bench(sample_count = 10)]
+fn frequency_over_a_capture(bencher: Bencher<'_, '_>) {
+    let mesh = body::body_or_ball();
+    let rays = RayMesh::new(&mesh.vertices, &mesh.faces).unwrap();
+    let views: Vec<View> = (0..100)
+        .map(|i| {
+            let mut view = view(512, 1.2);
+            view.extrinsics = view.extrinsics * Affine3A::from_rotation_y(i as f32 * 0.0628);
+            view
+        })
+        .collect();
+    bencher.counter(ItemsCount::new(views.len() * mesh.vertices.len())).bench_local(|| {
+        let mut counts = VisibilityCounts::new(mesh.vertices.len());
+        for view in &views {
+            counts.add_visible(&visible_vertices(&rays, &mesh.vertices, view, None));
+        }
+        counts
+    });
+}
+
 #[divan::bench]
 fn refit(bencher: Bencher<'_, '_>) {
     let mesh = body::body_or_ball();

@@ -1,4 +1,4 @@
-//! First hits of many rays: sixteen at a time walk the tree together, in the lanes of wide registers.
+//! First hits of many rays: eight at a time walk the tree together, in the lanes of wide registers.
 
 use glam::Vec3;
 use rayon::prelude::*;
@@ -9,7 +9,7 @@ use crate::tree::{Child, LANES, Node};
 use crate::triangle::{Pack, Ray};
 
 /// Rays that walk together.
-const WIDTH: usize = 16;
+const WIDTH: usize = 8;
 /// Rays of a parallel task.
 const TASK: usize = 64 * WIDTH;
 
@@ -18,7 +18,7 @@ type Lanes = [f32; WIDTH];
 impl RayMesh {
     /// [`RayMesh::first_hit`] of many `rays` (R), each an origin and a direction, into `hits` (R), overwritten.
     ///
-    /// Work is spread over the current rayon pool; the result does not depend on its size. Sixteen consecutive rays
+    /// Work is spread over the current rayon pool; the result does not depend on its size. Eight consecutive rays
     /// share one walk through the tree, so put rays that are near each other side by side: the pixels of a row, or better
     /// of a tile. Where faces are hit within rounding of the same depth another one may be found than for a single ray.
     ///
@@ -51,14 +51,14 @@ impl RayMesh {
         }
         // Rays of one longest axis at a time; nearly always that is all of them.
         for z in 0..3 {
-            let mine = |lane: usize| to_t[lane] > 0.0 && axes[lane][2] == z;
-            if let Some(first) = (0..WIDTH).find(|&lane| mine(lane)) {
+            let mine: [bool; WIDTH] = std::array::from_fn(|lane| to_t[lane] > 0.0 && axes[lane][2] == z);
+            if let Some(first) = (0..WIDTH).find(|&lane| mine[lane]) {
                 packet.axes = axes[first];
                 for lane in 0..WIDTH {
-                    packet.end[lane] = if mine(lane) { f32::INFINITY } else { -1.0 };
+                    packet.end[lane] = if mine[lane] { f32::INFINITY } else { -1.0 };
                 }
                 self.walk_packet(&mut packet, stack);
-                for lane in (0..WIDTH).filter(|&lane| mine(lane)) {
+                for lane in (0..WIDTH).filter(|&lane| mine[lane]) {
                     to_t[lane] *= f64::from(packet.end[lane]);
                     axes[lane][2] = 3;
                 }
