@@ -19,8 +19,11 @@ const POINTS: u32 = 6_000_000;
 /// An error shown in full red.
 const FULL: f32 = 0.004;
 
+/// Whether a point belongs to a region, given the joints.
+type Holds = fn(Vec3, &[Vec3]) -> bool;
+
 /// Regions by SMPL's joints, first match counts; lengths in metres.
-const REGIONS: [(&str, fn(Vec3, &[Vec3]) -> bool); 5] = [
+const REGIONS: [(&str, Holds); 5] = [
     ("armpits: 9 cm about a point 8 cm below a shoulder", |x, joints| {
         [16, 17].iter().any(|&shoulder| x.distance(joints[shoulder] - Vec3::Y * 0.08) < 0.09)
     }),

@@ -139,7 +139,7 @@ fn frequency_over_a_capture(bencher: Bencher<'_, '_>) {
     let views: Vec<View> = (0..100)
         .map(|i| {
             let mut view = view(512, 1.2);
-            view.extrinsics = view.extrinsics * Affine3A::from_rotation_y(i as f32 * 0.0628);
+            view.extrinsics *= Affine3A::from_rotation_y(i as f32 * 0.0628);
             view
         })
         .collect();

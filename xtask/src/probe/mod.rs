@@ -7,7 +7,7 @@ mod output;
 mod picture;
 mod points;
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use anyhow::{Context, Result, bail};
 use clap::{Args, ValueEnum};
