@@ -1,5 +1,7 @@
 //! Arrays as files hold them, and the checks between a file and a use.
 
+use std::io::Write;
+
 use crate::Error;
 
 /// Values of an [`NdArray`], widened to the four types that are told apart.
@@ -22,6 +24,41 @@ pub struct NdArray {
     pub shape: Vec<usize>,
     /// The values, last axis fastest.
     pub data: Data,
+}
+
+impl Data {
+    /// numpy's name of the type in a file.
+    pub(crate) fn descr(&self) -> &'static str {
+        match self {
+            Self::F64(_) => "<f8",
+            Self::F32(_) => "<f4",
+            Self::I64(_) => "<i8",
+            Self::Bool(_) => "|b1",
+        }
+    }
+
+    /// Writes the values as [`Data::descr`] says.
+    pub(crate) fn write(&self, out: &mut impl Write) -> std::io::Result<()> {
+        fn chunks<T: Copy, const N: usize>(
+            v: &[T],
+            out: &mut impl Write,
+            bytes: fn(T) -> [u8; N],
+        ) -> std::io::Result<()> {
+            let mut buffer = Vec::new();
+            for chunk in v.chunks(8192) {
+                buffer.clear();
+                buffer.extend(chunk.iter().flat_map(|&x| bytes(x)));
+                out.write_all(&buffer)?;
+            }
+            Ok(())
+        }
+        match self {
+            Self::F64(v) => chunks(v, out, f64::to_le_bytes),
+            Self::F32(v) => chunks(v, out, f32::to_le_bytes),
+            Self::I64(v) => chunks(v, out, i64::to_le_bytes),
+            Self::Bool(v) => chunks(v, out, |x| [u8::from(x)]),
+        }
+    }
 }
 
 impl NdArray {
@@ -152,6 +189,15 @@ impl ElementType {
     /// Bytes a value.
     pub(crate) fn size(self) -> usize {
         self.size
+    }
+
+    /// Bytes a value once decoded, when it is widened to one of the types of [`Data`].
+    pub(crate) fn size_in_memory(self) -> usize {
+        match self.kind {
+            Kind::Bool => 1,
+            Kind::Signed | Kind::Unsigned => 8,
+            Kind::Float => self.size.max(4),
+        }
     }
 
     /// The same type in the named byte order (`<`, `>`, `|` or `=`).

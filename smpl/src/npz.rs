@@ -1,17 +1,18 @@
-//! Reading numpy's `.npy` and `.npz`, with limits and errors that name the file and the array.
+//! Numpy's `.npy` and `.npz`: reading, with limits and errors that name the file and the array, and writing.
 //!
 //! Headers are not believed: memory grows with the bytes that really arrive, and never beyond
 //! [`MAX_ARRAY_BYTES`] for one array.
 
-use std::io::{Cursor, Read};
+use std::io::{Cursor, Read, Write};
 use std::path::Path;
 
-use zip::ZipArchive;
+use zip::write::SimpleFileOptions;
+use zip::{CompressionMethod, ZipArchive, ZipWriter};
 
 use crate::Error;
 use crate::array::{ElementType, NdArray, element_count};
 
-/// Largest array that is read, in bytes: 1 GiB.
+/// Largest array that is read, in bytes of the file and of memory: 1 GiB.
 pub const MAX_ARRAY_BYTES: u64 = 1 << 30;
 
 /// Largest file that is read, in bytes: 2 GiB.
@@ -116,10 +117,16 @@ pub fn read_npy(path: &Path) -> Result<NdArray, Error> {
     read_array(&path.display().to_string(), "", bytes.as_slice())
 }
 
-/// The whole file, if it is not too large.
+/// The whole file, if it is not too large. Devices and pipes, which have no length, are read up to the limit.
 pub(crate) fn read_file(path: &Path) -> Result<Vec<u8>, Error> {
     let io = |source| Error::Io { path: path.to_owned(), source };
-    let length = std::fs::metadata(path).map_err(io)?.len();
+    let file = std::fs::File::open(path).map_err(io)?;
+    let mut length = file.metadata().map_err(io)?.len();
+    let mut bytes = Vec::new();
+    if length <= MAX_FILE_BYTES {
+        bytes.reserve_exact(length as usize);
+        length = file.take(MAX_FILE_BYTES + 1).read_to_end(&mut bytes).map_err(io)? as u64;
+    }
     if length > MAX_FILE_BYTES {
         return Err(Error::TooLarge {
             file: path.display().to_string(),
@@ -128,7 +135,49 @@ pub(crate) fn read_file(path: &Path) -> Result<Vec<u8>, Error> {
             limit: MAX_FILE_BYTES,
         });
     }
-    std::fs::read(path).map_err(io)
+    Ok(bytes)
+}
+
+/// Writes an uncompressed `.npz` of named arrays, as numpy's `savez` does. The same arrays give the same bytes.
+///
+/// # Errors
+/// [`Error::Io`]; [`Error::Invalid`] for an array whose shape does not fit its values; [`Error::Npy`] for two of one name.
+pub fn write<K: AsRef<str>>(path: &Path, arrays: &[(K, NdArray)]) -> Result<(), Error> {
+    let file = path.display().to_string();
+    let mut archive = ZipWriter::new(Cursor::new(Vec::new()));
+    let options = SimpleFileOptions::default().compression_method(CompressionMethod::Stored);
+    for (key, array) in arrays {
+        let key = key.as_ref();
+        if element_count(&array.shape) != Some(array.len() as u128) {
+            let message = format!("{} values for shape {:?}", array.len(), array.shape);
+            return Err(Error::invalid(&file, key, message));
+        }
+        let malformed = |message: String| Error::Npy { file: file.clone(), key: key.to_owned(), message };
+        archive.start_file(format!("{key}.npy"), options).map_err(|e| malformed(e.to_string()))?;
+        let io = |source| Error::Io { path: path.to_owned(), source };
+        archive.write_all(&header(array)).and_then(|()| array.data.write(&mut archive)).map_err(io)?;
+    }
+    let whole =
+        |e: zip::result::ZipError| Error::Npy { file: file.clone(), key: String::new(), message: e.to_string() };
+    let bytes = archive.finish().map_err(whole)?.into_inner();
+    std::fs::write(path, bytes).map_err(|source| Error::Io { path: path.to_owned(), source })
+}
+
+/// Magic, version 1.0 and the dict literal, padded so that the data begin at a multiple of 64 bytes.
+fn header(array: &NdArray) -> Vec<u8> {
+    let extents: Vec<String> = array.shape.iter().map(usize::to_string).collect();
+    // A tuple of one needs its comma.
+    let comma = if extents.len() == 1 { "," } else { "" };
+    let text = format!(
+        "{{'descr': '{}', 'fortran_order': False, 'shape': ({}{comma}), }}",
+        array.data.descr(),
+        extents.join(", ")
+    );
+    let length = (10 + text.len() + 1).next_multiple_of(64) - 10;
+    let mut out = b"\x93NUMPY\x01\x00".to_vec();
+    out.extend((length as u16).to_le_bytes());
+    out.extend(format!("{text:<width$}\n", width = length - 1).into_bytes());
+    out
 }
 
 /// What precedes the data of a `.npy` file.
@@ -221,9 +270,12 @@ pub(crate) fn read_array(file: &str, key: &str, mut reader: impl Read) -> Result
             actual: format!("of element type {:?}", header.descr),
         });
     };
-    let claimed = element_count(&header.shape).and_then(|n| n.checked_mul(element.size() as u128)).unwrap_or(u128::MAX);
-    if claimed > u128::from(MAX_ARRAY_BYTES) {
-        return Err(Error::TooLarge { file: file.to_owned(), key: key.to_owned(), claimed, limit: MAX_ARRAY_BYTES });
+    let bytes_of = |size: usize| element_count(&header.shape).and_then(|n| n.checked_mul(size as u128));
+    let claimed = bytes_of(element.size()).unwrap_or(u128::MAX);
+    let in_memory = bytes_of(element.size_in_memory()).unwrap_or(u128::MAX);
+    if in_memory > u128::from(MAX_ARRAY_BYTES) {
+        let (file, key) = (file.to_owned(), key.to_owned());
+        return Err(Error::TooLarge { file, key, claimed: in_memory, limit: MAX_ARRAY_BYTES });
     }
     // One byte more than claimed, so that trailing bytes are noticed and a zip entry's checksum is verified.
     let mut bytes = Vec::new();

@@ -8,8 +8,8 @@ use std::path::{Path, PathBuf};
 
 use common::fixture;
 use proptest::prelude::*;
-use smpl::npz::{Npz, read_npy};
-use smpl::{BodyModel, Error};
+use smpl::npz::{self, Npz, read_npy};
+use smpl::{BodyModel, Data, Error, NdArray};
 
 /// A file that is removed at the end of the test.
 struct Temporary(PathBuf);
@@ -240,4 +240,54 @@ fn missing_and_misshapen_arrays_of_a_model_are_named() {
     }
     let other = BodyModel::load(&fixture("make_pickles.py")).unwrap_err();
     assert!(matches!(other, Error::Extension { .. }));
+}
+
+fn any_array() -> impl Strategy<Value = NdArray> {
+    (prop::collection::vec(0usize..5, 0..4), 0..4, any::<u64>()).prop_map(|(shape, kind, seed)| {
+        let bits = (0..shape.iter().product::<usize>() as u64).map(|i| (seed ^ i).wrapping_mul(0x9E37_79B9_7F4A_7C15));
+        let data = match kind {
+            0 => Data::F64(bits.map(|b| b as i64 as f64 / 3.0).collect()),
+            1 => Data::F32(bits.map(|b| b as i32 as f32 / 3.0).collect()),
+            2 => Data::I64(bits.map(|b| b as i64).collect()),
+            _ => Data::Bool(bits.map(|b| b & 1 == 1).collect()),
+        };
+        NdArray { shape, data }
+    })
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(48))]
+
+    #[test]
+    fn written_arrays_are_read_back_with_type_shape_and_bits(arrays in prop::collection::vec(any_array(), 0..4)) {
+        let file = Temporary::new("written.npz", b"");
+        let names = ["a", "b_1", "ü", "last"];
+        let named: Vec<_> = names.into_iter().zip(arrays).collect();
+        npz::write(&file.0, &named).unwrap();
+        let mut read = Npz::open(&file.0).unwrap();
+        prop_assert_eq!(read.keys().len(), named.len());
+        for (key, array) in &named {
+            prop_assert_eq!(&read.array(key).unwrap(), array);
+        }
+    }
+}
+
+#[test]
+fn arrays_that_cannot_be_written_are_errors() {
+    let array = |shape| NdArray { shape, data: Data::I64(vec![1, 2, 3]) };
+    let file = Temporary::new("unwritten.npz", b"");
+    let error = npz::write(&file.0, &[("x", array(vec![2, 2]))]).unwrap_err();
+    assert!(matches!(&error, Error::Invalid { key, .. } if key == "x"), "{error}");
+    let error = npz::write(&file.0, &[("x", array(vec![3])), ("x", array(vec![3]))]).unwrap_err();
+    assert!(matches!(&error, Error::Npy { key, .. } if key == "x"), "{error}");
+    let error = npz::write(Path::new("/no/such/place.npz"), &[("x", array(vec![3]))]).unwrap_err();
+    assert!(matches!(error, Error::Io { .. }), "{error}");
+}
+
+#[test]
+fn the_limit_of_an_array_counts_the_memory_it_takes_decoded() {
+    // 200 MB of bytes in the file, 1.6 GB once they are 64-bit integers.
+    let header = "{'descr': '|u1', 'fortran_order': False, 'shape': (200000000,), }";
+    let file = Temporary::new("widened.npy", &npy(header, &[]));
+    assert!(matches!(read_npy(&file.0), Err(Error::TooLarge { claimed: 1_600_000_000, .. })));
 }

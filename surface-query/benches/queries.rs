@@ -5,13 +5,16 @@
 mod body;
 
 use std::hint::black_box;
+use std::num::NonZero;
 
 use body::Random;
 use divan::Bencher;
 use divan::counter::ItemsCount;
 use glam::Vec3;
-use surface_query::{MeshDistance, SurfaceQuery, SurfaceQueryConfig, farthest_points};
-use testkit::TriMesh;
+use kiddo::{ImmutableKdTree, SquaredEuclidean};
+use rayon::prelude::*;
+use surface_query::{MeshDistance, Pyramid, SurfaceQuery, SurfaceQueryConfig, farthest_points};
+use testkit::{TriMesh, oracle};
 
 fn main() {
     divan::main();
@@ -48,6 +51,70 @@ fn neighbours_and_blend_trees(bencher: Bencher<'_, '_>) {
     whole_query(bencher, &SurfaceQueryConfig::TREES);
 }
 
+/// As many queries as the peers were given, on two threads.
+#[divan::bench(sample_count = 10)]
+fn neighbours_and_blend_two_threads(bencher: Bencher<'_, '_>) {
+    let mesh = body::body_or_ball();
+    let query = SurfaceQuery::new(&mesh.vertices, &mesh.faces, &SurfaceQueryConfig::BODY).unwrap();
+    let points = Random(1).near_surface(&mesh, 200_000, 0.05);
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(2).build().unwrap();
+    let one = |p: &Vec3| {
+        let mut out = [0; 20];
+        query.neighbours(*p, &mut out);
+        query.blend(*p, &out[..5]).signed_distance
+    };
+    bencher
+        .counter(ItemsCount::new(points.len()))
+        .bench_local(|| pool.install(|| points.par_iter().with_min_len(1024).map(one).collect::<Vec<f32>>()));
+}
+
+/// Points of the four levels, for the plain searches below.
+fn level_points(mesh: &TriMesh) -> Vec<Vec<[f32; 3]>> {
+    let pyramid = Pyramid::new(&mesh.vertices, 0.25, 3);
+    (pyramid.levels.iter()).map(|ids| ids.iter().map(|&i| mesh.vertices[i as usize].to_array()).collect()).collect()
+}
+
+/// The 20 neighbours alone, from four trees of plain kiddo (ties as they fall).
+#[divan::bench]
+fn neighbours_plain_kiddo(bencher: Bencher<'_, '_>) {
+    let mesh = body::body_or_ball();
+    let trees: Vec<ImmutableKdTree<f32, 3>> =
+        level_points(&mesh).iter().map(|points| ImmutableKdTree::new_from_slice(points).unwrap()).collect();
+    let points = near(&mesh);
+    let k = NonZero::new(5).unwrap();
+    bencher.counter(ItemsCount::new(points.len())).bench_local(|| {
+        for p in &points {
+            for tree in &trees {
+                black_box(tree.query(&p.to_array()).nearest_n::<SquaredEuclidean<f32>>(k).execute());
+            }
+        }
+    });
+}
+
+/// The 20 neighbours alone, by looking at every vertex.
+#[divan::bench(sample_count = 10)]
+fn neighbours_brute_force(bencher: Bencher<'_, '_>) {
+    let mesh = body::body_or_ball();
+    let levels = level_points(&mesh);
+    let points = &near(&mesh)[..500];
+    bencher.counter(ItemsCount::new(points.len())).bench_local(|| {
+        for p in points {
+            for level in &levels {
+                let mut best = [(f32::INFINITY, 0); 5];
+                for (i, v) in (0u32..).zip(level) {
+                    let d = Vec3::from(*v).distance_squared(*p);
+                    if d < best[4].0 {
+                        let at = best.partition_point(|b| b.0 <= d);
+                        best.copy_within(at..4, at + 1);
+                        best[at] = (d, i);
+                    }
+                }
+                black_box(best);
+            }
+        }
+    });
+}
+
 #[divan::bench]
 fn blend(bencher: Bencher<'_, '_>) {
     let mesh = body::body_or_ball();
@@ -80,7 +147,41 @@ fn mesh_distance(bencher: Bencher<'_, '_>, reach: u32) {
     });
 }
 
-/// The same for points along lines, as the samples of rays are.
+/// The same at twice the faces, on two threads.
+#[divan::bench(sample_count = 10)]
+fn mesh_distance_split_two_threads(bencher: Bencher<'_, '_>) {
+    let mesh = body::body_or_ball();
+    let points = Random(1).near_surface(&mesh, 200_000, 0.05);
+    let mut vertices = mesh.vertices.clone();
+    // Every triangle in two, at the middle of its first edge.
+    let faces: Vec<[u32; 3]> = (mesh.faces.iter())
+        .flat_map(|&[a, b, c]| {
+            let m = vertices.len() as u32;
+            vertices.push((vertices[a as usize] + vertices[b as usize]) / 2.0);
+            [[a, m, c], [m, b, c]]
+        })
+        .collect();
+    let distance = MeshDistance::new(&vertices, &faces).unwrap();
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(2).build().unwrap();
+    let one = |p: &Vec3| distance.closest(*p, f32::INFINITY);
+    bencher
+        .counter(ItemsCount::new(points.len()))
+        .bench_local(|| pool.install(|| points.par_iter().with_min_len(1024).map(one).collect::<Vec<_>>()));
+}
+
+/// Exact closest point by looking at every face.
+#[divan::bench(sample_count = 5)]
+fn mesh_distance_brute_force(bencher: Bencher<'_, '_>) {
+    let mesh = body::body_or_ball();
+    let points = &near(&mesh)[..50];
+    bencher.counter(ItemsCount::new(points.len())).bench_local(|| {
+        for &p in points {
+            black_box(oracle::closest_point(&mesh.vertices, &mesh.faces, p));
+        }
+    });
+}
+
+/// Along lines, as the samples of rays are; one thread.
 #[divan::bench]
 fn mesh_distance_along_rays(bencher: Bencher<'_, '_>) {
     let mesh = body::body_or_ball();

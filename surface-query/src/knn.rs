@@ -7,8 +7,11 @@ use kiddo::{ImmutableKdTree, SquaredEuclidean};
 
 use crate::Error;
 
-/// Largest supported k: the length of the buffers on the stack.
-pub(crate) const MAX_K: usize = 64;
+/// Largest supported k.
+pub(crate) const MAX_K: usize = 1 << 16;
+
+/// Largest k whose list is kept on the stack.
+const SMALL_K: usize = 64;
 
 /// Squared distance of a query to a point. Everything that ranks points goes through this one expression, so
 /// that the grid, the tree and brute force agree to the last bit.
@@ -97,10 +100,20 @@ impl Level {
             4 => self.select::<I, 4>(list, q, out),
             5 => self.select::<I, 5>(list, q, out),
             8 => self.select::<I, 8>(list, q, out),
-            k => {
-                let mut best = [u64::MAX; MAX_K];
+            k if k <= SMALL_K => {
+                let mut best = [u64::MAX; SMALL_K];
                 collect(&self.points, list, q, &mut best[..k]);
                 self.write(out, |j| best[j], list.len().min(k));
+            }
+            k => {
+                let key_of = |local: u32| key(distance_squared(self.points[local as usize], q), local);
+                let mut keys: Vec<u64> = list.iter().map(|&local| key_of(local.into())).collect();
+                if k < keys.len() {
+                    keys.select_nth_unstable(k);
+                }
+                keys.truncate(k);
+                keys.sort_unstable();
+                self.write(out, |j| keys[j], keys.len());
             }
         }
     }

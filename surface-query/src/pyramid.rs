@@ -44,55 +44,46 @@ impl Pyramid {
 /// Distances are compared in `f64`, in which the squared distance of two `f32` points is exact or nearly so.
 /// Points that are not finite are chosen last, in the order of their indices.
 ///
-/// The work is that of a bucket k-d tree (Han et al., *QuickFPS*, 2023): a bucket whose box is farther from the
-/// new sample than any of its points is from the chosen ones is skipped.
+/// The work is that of a k-d tree of buckets (Han et al., *QuickFPS*, 2023): whatever lies in a box that is farther
+/// from the new sample than any point in it is from the chosen ones is skipped.
 #[must_use]
 pub fn farthest_points(points: &[Vec3], count: usize) -> Vec<u32> {
     let count = count.min(points.len());
+    let (mut finite, others): (Vec<u32>, Vec<u32>) =
+        (0..points.len() as u32).partition(|&i| points[i as usize].is_finite());
     let mut chosen = Vec::with_capacity(count);
-    if count == 0 {
-        return chosen;
-    }
-    let mut finite: Vec<u32> = Vec::with_capacity(points.len());
-    let mut others: Vec<u32> = Vec::new();
-    for (i, p) in (0u32..).zip(points) {
-        if p.is_finite() {
-            finite.push(i);
-        } else {
-            others.push(i);
-        }
-    }
-    let mut buckets = Vec::with_capacity(finite.len() / (BUCKET / 2) + 1);
-    split(points, &mut finite, &mut buckets);
-
-    let mut next = buckets.iter().enumerate().flat_map(|(b, bucket)| bucket.ids.iter().map(move |&i| (i, b))).min();
-    while let Some((index, bucket)) = next {
-        chosen.push(index);
-        buckets[bucket].take(index);
-        if chosen.len() == count {
-            return chosen;
-        }
-        let sample = points[index as usize].as_dvec3();
-        next = None;
-        let mut best = (-1.0, u32::MAX);
-        for (b, bucket) in buckets.iter_mut().enumerate() {
-            if bucket.distance_squared(sample) < bucket.gap {
-                bucket.update(sample);
-            }
-            if bucket.gap > best.0 || bucket.gap == best.0 && bucket.farthest < best.1 {
-                best = (bucket.gap, bucket.farthest);
-                next = (bucket.gap >= 0.0).then_some((bucket.farthest, b));
-            }
+    if !finite.is_empty() {
+        let mut root = Node::new(points, &mut finite);
+        while chosen.len() < count && root.gap >= 0.0 {
+            let index = root.farthest;
+            chosen.push(index);
+            root.take_farthest();
+            root.update(points[index as usize].as_dvec3());
         }
     }
     chosen.extend(others.into_iter().take(count - chosen.len()));
     chosen
 }
 
-/// A few neighbouring points and how far each is from the chosen ones.
-struct Bucket {
+/// Some points, their box, and how far they are from the chosen ones.
+struct Node {
     min: DVec3,
     max: DVec3,
+    /// Largest squared distance of a point to the nearest chosen one, infinite before the first; −1 where all are
+    /// chosen themselves.
+    gap: f64,
+    /// The lowest index of the points that have it.
+    farthest: u32,
+    content: Content,
+}
+
+enum Content {
+    Bucket(Bucket),
+    Halves(Box<[Node; 2]>),
+}
+
+/// A few neighbouring points.
+struct Bucket {
     /// Ascending.
     ids: Vec<u32>,
     x: Vec<f64>,
@@ -100,75 +91,91 @@ struct Bucket {
     z: Vec<f64>,
     /// Squared distance to the nearest chosen point; −1 once chosen itself.
     gaps: Vec<f64>,
-    /// Largest of `gaps`, and the lowest id that has it.
-    gap: f64,
-    farthest: u32,
 }
 
-impl Bucket {
+impl Node {
+    /// Halves `ids` (one at least) at the median of the widest axis until they fit a bucket.
     fn new(points: &[Vec3], ids: &mut [u32]) -> Self {
-        ids.sort_unstable();
-        let at = || ids.iter().map(|&i| points[i as usize].as_dvec3());
-        Self {
-            min: at().fold(DVec3::INFINITY, DVec3::min),
-            max: at().fold(DVec3::NEG_INFINITY, DVec3::max),
-            ids: ids.to_vec(),
-            x: at().map(|p| p.x).collect(),
-            y: at().map(|p| p.y).collect(),
-            z: at().map(|p| p.z).collect(),
-            gaps: vec![f64::INFINITY; ids.len()],
-            gap: f64::INFINITY,
-            farthest: ids.first().copied().unwrap_or(u32::MAX),
-        }
+        let at = |i: &u32| points[*i as usize].as_dvec3();
+        let min = ids.iter().map(at).fold(DVec3::INFINITY, DVec3::min);
+        let max = ids.iter().map(at).fold(DVec3::NEG_INFINITY, DVec3::max);
+        let content = if ids.len() <= BUCKET {
+            ids.sort_unstable();
+            Content::Bucket(Bucket {
+                ids: ids.to_vec(),
+                x: ids.iter().map(|i| at(i).x).collect(),
+                y: ids.iter().map(|i| at(i).y).collect(),
+                z: ids.iter().map(|i| at(i).z).collect(),
+                gaps: vec![f64::INFINITY; ids.len()],
+            })
+        } else {
+            let axis = (max - min).max_position();
+            let middle = ids.len() / 2;
+            ids.select_nth_unstable_by(middle, |a, b| at(a)[axis].total_cmp(&at(b)[axis]));
+            let (low, high) = ids.split_at_mut(middle);
+            Content::Halves(Box::new([Self::new(points, low), Self::new(points, high)]))
+        };
+        let mut node = Self { min, max, gap: f64::INFINITY, farthest: 0, content };
+        node.refresh();
+        node
     }
 
     /// Squared distance to the box. Rounding is monotone and the terms are summed in the same order as in
-    /// [`Bucket::update`], so this is never above the computed distance of any point in the box.
+    /// [`Node::update`], so this is never above the computed distance of any point in the box.
     #[inline]
     fn distance_squared(&self, p: DVec3) -> f64 {
         let d = p - p.clamp(self.min, self.max);
         d.x * d.x + d.y * d.y + d.z * d.z
     }
 
-    fn take(&mut self, index: u32) {
-        if let Ok(at) = self.ids.binary_search(&index) {
-            self.gaps[at] = -1.0;
+    /// Marks the farthest point as chosen.
+    fn take_farthest(&mut self) {
+        match &mut self.content {
+            Content::Bucket(bucket) => {
+                if let Ok(at) = bucket.ids.binary_search(&self.farthest) {
+                    bucket.gaps[at] = -1.0;
+                }
+            }
+            Content::Halves(halves) => {
+                let side = usize::from(halves[0].farthest != self.farthest);
+                halves[side].take_farthest();
+            }
         }
         self.refresh();
     }
 
+    /// Takes account of a new sample.
     fn update(&mut self, s: DVec3) {
-        for (((gap, x), y), z) in self.gaps.iter_mut().zip(&self.x).zip(&self.y).zip(&self.z) {
-            let (dx, dy, dz) = (s.x - x, s.y - y, s.z - z);
-            let d = dx * dx + dy * dy + dz * dz;
-            *gap = if d < *gap { d } else { *gap };
+        if self.distance_squared(s) >= self.gap {
+            return;
+        }
+        match &mut self.content {
+            Content::Bucket(bucket) => {
+                let points = bucket.x.iter().zip(&bucket.y).zip(&bucket.z);
+                for (gap, ((x, y), z)) in bucket.gaps.iter_mut().zip(points) {
+                    let (dx, dy, dz) = (s.x - x, s.y - y, s.z - z);
+                    let d = dx * dx + dy * dy + dz * dz;
+                    *gap = if d < *gap { d } else { *gap };
+                }
+            }
+            Content::Halves(halves) => halves.iter_mut().for_each(|half| half.update(s)),
         }
         self.refresh();
     }
 
     fn refresh(&mut self) {
-        let gap = self.gaps.iter().fold(-1.0, |m: f64, &g| if g > m { g } else { m });
-        let at = self.gaps.iter().position(|&g| g == gap).unwrap_or(0);
-        self.gap = gap;
-        self.farthest = self.ids[at];
+        match &self.content {
+            Content::Bucket(bucket) => {
+                self.gap = bucket.gaps.iter().fold(-1.0, |m: f64, &g| if g > m { g } else { m });
+                let at = bucket.gaps.iter().position(|&g| g == self.gap).unwrap_or(0);
+                self.farthest = bucket.ids[at];
+            }
+            Content::Halves(halves) => {
+                let [a, b] = halves.as_ref();
+                let second = b.gap > a.gap || b.gap == a.gap && b.farthest < a.farthest;
+                let of = if second { b } else { a };
+                (self.gap, self.farthest) = (of.gap, of.farthest);
+            }
+        }
     }
-}
-
-/// Halves `ids` at the median of the widest axis until they fit a bucket.
-fn split(points: &[Vec3], ids: &mut [u32], buckets: &mut Vec<Bucket>) {
-    if ids.is_empty() {
-        return;
-    }
-    if ids.len() <= BUCKET {
-        buckets.push(Bucket::new(points, ids));
-        return;
-    }
-    let at = |i: u32| points[i as usize];
-    let (min, max) = ids.iter().fold((Vec3::MAX, Vec3::MIN), |(min, max), &i| (min.min(at(i)), max.max(at(i))));
-    let axis = (max.as_dvec3() - min.as_dvec3()).max_position();
-    let middle = ids.len() / 2;
-    ids.select_nth_unstable_by(middle, |&a, &b| at(a)[axis].total_cmp(&at(b)[axis]));
-    let (low, high) = ids.split_at_mut(middle);
-    split(points, low, buckets);
-    split(points, high, buckets);
 }

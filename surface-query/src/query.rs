@@ -10,7 +10,7 @@ use crate::{Error, Pyramid, vertex_normals};
 /// How a [`SurfaceQuery`] searches.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SurfaceQueryConfig {
-    /// Neighbours a level, 1 to 64.
+    /// Neighbours a level, 1 to 65536.
     pub k: usize,
     /// Levels beyond the finest.
     pub coarse_levels: usize,
@@ -35,7 +35,7 @@ impl SurfaceQueryConfig {
     fn check(&self) -> Result<(), Error> {
         let fail = |name, value, expected| Err(Error::Config { name, value, expected });
         if !(1..=MAX_K).contains(&self.k) {
-            return fail("k", self.k as f64, "1 to 64");
+            return fail("k", self.k as f64, "1 to 65536");
         }
         if !(self.ratio > 0.0 && self.ratio <= 1.0) {
             return fail("ratio", f64::from(self.ratio), "above 0, at most 1");

@@ -320,6 +320,37 @@ fn an_open_sheet_is_positive_on_the_side_of_its_normals_even_beyond_its_border()
     }
 }
 
+/// Two meshes as one.
+fn together(mut a: TriMesh, b: TriMesh) -> TriMesh {
+    let first = a.vertices.len() as u32;
+    a.vertices.extend(b.vertices);
+    a.faces.extend(b.faces.into_iter().map(|face| face.map(|v| v + first)));
+    a
+}
+
+#[test]
+fn the_surroundings_of_a_component_inside_another_are_positive() {
+    let distance = build(&together(mesh::cuboid(Vec3::splat(3.0)), mesh::cuboid(Vec3::ONE)));
+    let at = |x: f32| distance.closest(Vec3::X * x, 9.0).unwrap().signed_distance;
+    assert_eq!([0.5, 1.5, 2.5, 4.0].map(at), [-0.5, 0.5, -0.5, 1.0]);
+}
+
+#[test]
+fn outside_two_boxes_that_share_a_wall_every_distance_is_positive() {
+    // Along the rim of the wall four faces meet at each edge.
+    let boxes = together(mesh::cuboid(Vec3::ONE), mesh::cuboid(Vec3::ONE).map(|p| p + 2.0 * Vec3::X));
+    let distance = build(&boxes);
+    let mut random = Random(4);
+    let rim = (0..500).map(|_| Vec3::X + (random.vec3(2.0) * Vec3::new(0.0, 1.0, 1.0)));
+    for q in rim.collect::<Vec<_>>().into_iter().chain((0..2000).map(|_| random.vec3(4.0))) {
+        let beyond = ((q - Vec3::X).abs() - Vec3::new(2.0, 1.0, 1.0)).max(Vec3::ZERO).length();
+        if beyond > 0.0 {
+            let found = distance.closest(q, 9.0).unwrap().signed_distance;
+            assert!((found - beyond).abs() <= 1e-6, "{q}: {found}, expected {beyond}");
+        }
+    }
+}
+
 #[test]
 fn a_mesh_without_faces_is_nowhere() {
     assert_eq!(MeshDistance::new(&[], &[]).unwrap().closest(Vec3::ZERO, 1.0), None);

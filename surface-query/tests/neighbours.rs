@@ -161,6 +161,23 @@ fn more_than_65536_vertices_are_searched_too() {
 }
 
 #[test]
+fn long_lists_equal_brute_force() {
+    let mut random = Random(6);
+    let mut points: Vec<Vec3> = (0..200).map(|_| random.vec3(1.0)).collect();
+    points.extend_from_within(50..150);
+    for k in [64, 65, 150, 300] {
+        for cell in [0.0, 0.5] {
+            let query =
+                SurfaceQuery::new(&points, &[], &SurfaceQueryConfig { coarse_levels: 0, ..config(k, cell, 0.3) });
+            let query = query.unwrap();
+            for _ in 0..20 {
+                check(&query, k, random.vec3(1.5)).unwrap();
+            }
+        }
+    }
+}
+
+#[test]
 fn a_level_of_fewer_than_k_points_repeats_its_list() {
     let points = [Vec3::ZERO, Vec3::X, Vec3::X * 3.0];
     for cell in [0.0, 0.5] {
@@ -211,7 +228,7 @@ fn bad_meshes_and_settings_are_errors() {
     let build = |settings| SurfaceQuery::new(&ball.vertices, &ball.faces, &settings).map(|_| ());
     for (name, settings) in [
         ("k", SurfaceQueryConfig { k: 0, ..SurfaceQueryConfig::BODY }),
-        ("k", SurfaceQueryConfig { k: 65, ..SurfaceQueryConfig::BODY }),
+        ("k", SurfaceQueryConfig { k: 65_537, ..SurfaceQueryConfig::BODY }),
         ("ratio", SurfaceQueryConfig { ratio: 0.0, ..SurfaceQueryConfig::BODY }),
         ("ratio", SurfaceQueryConfig { ratio: f32::NAN, ..SurfaceQueryConfig::BODY }),
         ("cell", SurfaceQueryConfig { cell: -1.0, ..SurfaceQueryConfig::BODY }),

@@ -46,41 +46,64 @@ fn split(mesh: &TriMesh) -> TriMesh {
     TriMesh { vertices, faces }
 }
 
-fn coherent(bencher: Bencher<'_, '_>, mesh: &TriMesh, focal: f32) {
-    let rays = RayMesh::new(&mesh.vertices, &mesh.faces).unwrap();
+/// The rays through the pixels of a 256×256 image, row by row.
+fn image_rays(focal: f32) -> Vec<(Vec3, Vec3)> {
     let view = view(256, focal);
     let origin = view.centre().unwrap();
     let to_world = view.extrinsics.inverse();
     let inverse = view.intrinsics.inverse();
-    let directions: Vec<Vec3> = (0..256 * 256)
+    (0..256 * 256)
         .map(|i| {
             let pixel = Vec3::new((i % 256) as f32 + 0.5, (i / 256) as f32 + 0.5, 1.0);
-            to_world.transform_vector3(inverse * pixel)
+            (origin, to_world.transform_vector3(inverse * pixel))
         })
-        .collect();
-    bencher.counter(ItemsCount::new(directions.len())).bench_local(|| {
-        for &d in &directions {
-            black_box(rays.first_hit(origin, d));
+        .collect()
+}
+
+/// The whole body in view, of which most rays miss, and the chest filling the image, every ray a hit.
+const FOCALS: [f32; 2] = [1.2, 12.0];
+
+/// One ray at a time, one thread.
+#[divan::bench(args = FOCALS)]
+fn first_hit(bencher: Bencher<'_, '_>, focal: f32) {
+    single(bencher, &body::body_or_ball(), focal);
+}
+
+/// The same at twice the faces.
+#[divan::bench(args = FOCALS)]
+fn first_hit_split(bencher: Bencher<'_, '_>, focal: f32) {
+    single(bencher, &split(&body::body_or_ball()), focal);
+}
+
+fn single(bencher: Bencher<'_, '_>, mesh: &TriMesh, focal: f32) {
+    let mesh = RayMesh::new(&mesh.vertices, &mesh.faces).unwrap();
+    let rays = image_rays(focal);
+    bencher.counter(ItemsCount::new(rays.len())).bench_local(|| {
+        for &(origin, direction) in &rays {
+            black_box(mesh.first_hit(origin, direction));
         }
     });
 }
 
-/// First hits of the pixels of a 256×256 image of the whole body, most of which miss; one thread.
-#[divan::bench]
-fn first_hit_whole_body(bencher: Bencher<'_, '_>) {
-    coherent(bencher, &body::body_or_ball(), 1.2);
+/// All together, at twice the faces, one thread.
+#[divan::bench(args = FOCALS)]
+fn first_hits_split_one_thread(bencher: Bencher<'_, '_>, focal: f32) {
+    together(bencher, 1, focal);
 }
 
-/// The same of an image that the chest fills, every ray a hit.
-#[divan::bench]
-fn first_hit_chest(bencher: Bencher<'_, '_>) {
-    coherent(bencher, &body::body_or_ball(), 12.0);
+/// The same on two threads.
+#[divan::bench(args = FOCALS)]
+fn first_hits_split_two_threads(bencher: Bencher<'_, '_>, focal: f32) {
+    together(bencher, 2, focal);
 }
 
-/// The same at twice the faces.
-#[divan::bench]
-fn first_hit_chest_split(bencher: Bencher<'_, '_>) {
-    coherent(bencher, &split(&body::body_or_ball()), 12.0);
+fn together(bencher: Bencher<'_, '_>, threads: usize, focal: f32) {
+    let mesh = split(&body::body_or_ball());
+    let mesh = RayMesh::new(&mesh.vertices, &mesh.faces).unwrap();
+    let rays = image_rays(focal);
+    let mut hits = vec![None; rays.len()];
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+    bencher.counter(ItemsCount::new(rays.len())).bench_local(|| pool.install(|| mesh.first_hits(&rays, &mut hits)));
 }
 
 /// Random segments through the body's box, one thread.
@@ -106,6 +129,27 @@ fn visible_vertices_of_a_view(bencher: Bencher<'_, '_>) {
     bencher
         .counter(ItemsCount::new(mesh.vertices.len()))
         .bench_local(|| visible_vertices(&rays, &mesh.vertices, &view, None));
+}
+
+/// Counts of all vertices over 100 views around the body, all threads.
+#[divan::bench(sample_count = 10)]
+fn frequency_over_a_capture(bencher: Bencher<'_, '_>) {
+    let mesh = body::body_or_ball();
+    let rays = RayMesh::new(&mesh.vertices, &mesh.faces).unwrap();
+    let views: Vec<View> = (0..100)
+        .map(|i| {
+            let mut view = view(512, 1.2);
+            view.extrinsics *= Affine3A::from_rotation_y(i as f32 * 0.0628);
+            view
+        })
+        .collect();
+    bencher.counter(ItemsCount::new(views.len() * mesh.vertices.len())).bench_local(|| {
+        let mut counts = VisibilityCounts::new(mesh.vertices.len());
+        for view in &views {
+            counts.add_visible(&visible_vertices(&rays, &mesh.vertices, view, None));
+        }
+        counts
+    });
 }
 
 #[divan::bench]

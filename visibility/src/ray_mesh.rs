@@ -33,8 +33,8 @@ pub struct RayMesh {
     /// Multiplied by `scale`, a power of two, so that products neither overflow nor vanish.
     vertices: Vec<Vec3>,
     scale: f32,
-    tree: Tree,
-    packs: Vec<Pack>,
+    pub(crate) tree: Tree,
+    pub(crate) packs: Vec<Pack>,
 }
 
 impl RayMesh {
@@ -97,7 +97,7 @@ impl RayMesh {
     ///
     /// `None` where it meets none; a ray in the plane of a triangle does not meet it. Also `None` for a
     /// direction of zero, an origin or direction that is not finite, and an origin farther than 10¹⁵ times the
-    /// size of the mesh. Where faces are hit at the same t it is one of them, always the same.
+    /// size of the mesh. Of faces hit at the same t it is the lowest.
     #[must_use]
     pub fn first_hit(&self, origin: Vec3, direction: Vec3) -> Option<Hit> {
         let (ray, to_t) = self.ray(origin, direction)?;
@@ -107,11 +107,13 @@ impl RayMesh {
             let hits = self.packs[leaf].intersect(&ray);
             let t = hits.t.to_array();
             for lane in 0..LANES {
-                if t[lane] < end {
+                let face = self.tree.leaves[leaf][lane];
+                let lower = || t[lane] == end && first.is_some_and(|first| face < first.face);
+                if t[lane] < end || lower() {
                     end = t[lane];
                     first = Some(Hit {
                         t: (f64::from(end) * to_t) as f32,
-                        face: self.tree.leaves[leaf][lane],
+                        face,
                         barycentric: hits.barycentric.map(|b| b[lane]),
                     });
                 }
@@ -163,7 +165,7 @@ impl RayMesh {
     /// The ray in the units of the tree, its direction multiplied by a power of two; and the factor that turns a
     /// depth along it into one in units of `direction`.
     #[inline(always)]
-    fn ray(&self, origin: Vec3, direction: Vec3) -> Option<(Ray, f64)> {
+    pub(crate) fn ray(&self, origin: Vec3, direction: Vec3) -> Option<(Ray, f64)> {
         let longest = direction.abs().max_element();
         let o = origin * self.scale;
         // Written so that NaN falls through.

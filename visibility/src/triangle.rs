@@ -8,15 +8,15 @@ use crate::tree::LANES;
 /// Four triangles, lane by lane: corners a, b, c by axis.
 #[derive(Clone, Copy)]
 pub(crate) struct Pack {
-    corners: [[Vec4; 3]; 3],
+    pub corners: [[Vec4; 3]; 3],
 }
 
 /// A ray, sheared so that it runs along its longest axis.
 pub(crate) struct Ray {
     pub origin: [Vec4; 3],
     pub inverse: [Vec4; 3],
-    axes: [usize; 3],
-    shear: [Vec4; 3],
+    pub axes: [usize; 3],
+    pub shear: [Vec4; 3],
 }
 
 impl Ray {
@@ -83,9 +83,9 @@ impl Pack {
         if (u.cmpeq(zero) | v.cmpeq(zero) | w.cmpeq(zero)).any() {
             // Products of two f32 are exact in f64: the sign of an edge function is then right, and the same
             // for both triangles of the edge.
-            u = exact(c, b);
-            v = exact(a, c);
-            w = exact(b, a);
+            u = exact(u, c, b);
+            v = exact(v, a, c);
+            w = exact(w, b, a);
         }
         let positive = u.cmpge(zero) & v.cmpge(zero) & w.cmpge(zero);
         let negative = u.cmple(zero) & v.cmple(zero) & w.cmple(zero);
@@ -99,8 +99,11 @@ impl Pack {
 }
 
 #[cold]
-fn exact(p: [Vec4; 3], q: [Vec4; 3]) -> Vec4 {
+fn exact(rounded: Vec4, p: [Vec4; 3], q: [Vec4; 3]) -> Vec4 {
     let lane = |i: usize| {
+        if rounded[i] != 0.0 {
+            return rounded[i];
+        }
         let [px, py, qx, qy] = [p[0][i], p[1][i], q[0][i], q[1][i]].map(f64::from);
         (px * qy - py * qx) as f32
     };

@@ -6,7 +6,7 @@ mod body;
 use glam::{Affine3A, Mat3, Vec3};
 use proptest::prelude::*;
 use testkit::{TriMesh, mesh, oracle, strategy};
-use visibility::{RayMesh, View, visible_vertices};
+use visibility::{RayMesh, View, VisibilityCounts, visible_vertices};
 
 /// A camera at `eye` that looks at `target`.
 fn look(eye: Vec3, target: Vec3, focal: f32, size: u32) -> View {
@@ -59,6 +59,37 @@ proptest! {
                 prop_assert_eq!(found, expected, "vertex {}", i);
             }
         }
+    }
+
+    #[test]
+    fn counts_over_a_capture_are_the_frames_in_which_brute_force_sees_a_vertex(
+        mesh in strategy::bumpy_sphere(), tilt in -0.5f32..0.5, r in 2.0f32..4.0,
+    ) {
+        let rays = RayMesh::new(&mesh.vertices, &mesh.faces).unwrap();
+        // The image's right third is hidden.
+        let usable: Vec<bool> = (0..300 * 300).map(|pixel| pixel % 300 < 200).collect();
+        let views: Vec<View> = (0..5)
+            .map(|i| {
+                let (sin, cos) = (i as f32 * 1.25 + tilt).sin_cos();
+                look(Vec3::new(sin, tilt, cos) * r, Vec3::ZERO, 90.0, 300)
+            })
+            .collect();
+        let mut counts = VisibilityCounts::new(mesh.vertices.len());
+        for view in &views {
+            counts.add_visible(&visible_vertices(&rays, &mesh.vertices, view, Some(&usable)));
+        }
+        for (i, &count) in counts.counts().iter().enumerate() {
+            let seen = |view: &View| match view.pixel(mesh.vertices[i]) {
+                Some(pixel) if usable[pixel] => plain(&mesh, view, i),
+                _ => Some(false),
+            };
+            let answers: Option<Vec<bool>> = views.iter().map(seen).collect();
+            if let Some(answers) = answers {
+                prop_assert_eq!(count, answers.into_iter().filter(|seen| *seen).count() as u64, "vertex {}", i);
+            }
+        }
+        let share: f32 = counts.frequencies().iter().sum();
+        prop_assert!(counts.total() == 0 || (share - 1.0).abs() < 1e-4, "{}", share);
     }
 
     #[test]

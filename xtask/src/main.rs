@@ -4,6 +4,7 @@ mod compare;
 mod convert;
 mod eval;
 mod pictures;
+mod probe;
 mod render;
 mod report;
 mod run;
@@ -30,6 +31,8 @@ enum Command {
     Eval(eval::EvalArguments),
     /// Draws a run's person: its movement, from all around, or in the rest pose.
     Render(render::RenderArguments),
+    /// Runs one function of one crate on numpy arrays.
+    Probe(probe::ProbeArguments),
     /// Converts a body model, .npz or .pkl, to .safetensors.
     Convert(convert::ConvertArguments),
 }
@@ -39,6 +42,7 @@ fn main() -> std::process::ExitCode {
         Command::Train(arguments) => train::train(&arguments),
         Command::Eval(arguments) => eval::eval(&arguments),
         Command::Render(arguments) => render::render(&arguments),
+        Command::Probe(arguments) => probe::probe(&arguments),
         Command::Convert(arguments) => convert::convert(&arguments),
     };
     match outcome {

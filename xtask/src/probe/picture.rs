@@ -1,0 +1,110 @@
+//! Functions of `visibility` and `volrender`: what a camera sees, compositing, image metrics.
+
+use anyhow::{Context, Result, ensure};
+use glam::{Affine3A, Mat3, Vec3};
+use smpl::Mesh;
+use visibility::{RayMesh, View, visible_vertices};
+use volrender::metrics;
+use volrender::{bin_midpoints, bin_widths, composite_backward};
+
+use super::input::{Input, vec3s};
+use super::output::{Output, count};
+
+/// Most pixels along a side of an image.
+const MAX_SIDE: i64 = 1 << 24;
+
+pub fn visible(mut input: Input, mesh: &Mesh, output: &mut Output) -> Result<()> {
+    let (_, k) = input.floats("K", &[Some(3), Some(3)])?;
+    let (_, e) = input.floats("E", &[Some(3), Some(4)])?;
+    // Both are row-major, glam's constructors take columns.
+    let intrinsics = Mat3::from_cols_slice(&k).transpose();
+    ensure!(
+        k[6..] == [0.0, 0.0, 1.0] && intrinsics.determinant() != 0.0,
+        input.wrong("K", "is no calibration matrix: expected a last row of 0, 0, 1 and an inverse")
+    );
+    let column = |c: usize| Vec3::new(e[c], e[4 + c], e[8 + c]);
+    let extrinsics = Affine3A::from_mat3_translation(Mat3::from_cols(column(0), column(1), column(2)), column(3));
+    let width = input.integer("width", 1..=MAX_SIDE)? as u32;
+    let height = input.integer("height", 1..=MAX_SIDE)? as u32;
+    let view = View { intrinsics, extrinsics, width, height };
+    ensure!(view.centre().is_some(), input.wrong("E", "has no inverse"));
+    let rays = RayMesh::new(&mesh.vertices, &mesh.faces).context("the mesh")?;
+    let visible = visible_vertices(&rays, &mesh.vertices, &view, None);
+    output.booleans("visible", &[visible.len()], visible)
+}
+
+pub fn composite(mut input: Input, output: &mut Output) -> Result<()> {
+    let (shape, sigma) = input.floats_in("sigma", &[None, None], 0.0..=f32::MAX)?;
+    let (rays, samples) = (shape[0], shape[1]);
+    ensure!(samples > 0, input.wrong("sigma", "has no samples a ray"));
+    let (_, rgb) = input.floats("rgb", &[Some(rays), Some(samples), Some(3)])?;
+    let (_, edges) = input.floats("edges", &[Some(rays), Some(samples + 1)])?;
+    if let Some(ray) = edges.chunks(samples + 1).position(|row| !row.is_sorted()) {
+        return Err(input.wrong("edges", &format!("decreases along ray {ray}")));
+    }
+    let (_, background) = input.floats("background", &[Some(3)])?;
+    let background = Vec3::from_slice(&background);
+    let d_color = if input.has("d_color") { Some(input.floats("d_color", &[Some(rays), Some(3)])?.1) } else { None };
+    let (rgb, d_color) = (vec3s(&rgb), d_color.map(|d| vec3s(&d)));
+
+    count("rgb", &[rays, samples, 3])?;
+    let likelihood = vec![1.0; samples];
+    let (mut t, mut delta) = (vec![0.0; samples], vec![0.0; samples]);
+    let mut weights = vec![0.0; rays * samples];
+    let mut d_sigma = vec![0.0; d_color.as_ref().map_or(0, |_| rays * samples)];
+    let mut d_rgb = vec![Vec3::ZERO; d_sigma.len()];
+    let mut d_likelihood = vec![0.0; samples];
+    let mut pixels = Vec::with_capacity(rays);
+    for ray in 0..rays {
+        let row = ray * samples..(ray + 1) * samples;
+        let edges = &edges[ray * (samples + 1)..][..samples + 1];
+        bin_midpoints(edges, &mut t);
+        bin_widths(edges, &mut delta);
+        let (sigma, rgb, weights) = (&sigma[row.clone()], &rgb[row.clone()], &mut weights[row.clone()]);
+        pixels.push(volrender::composite(sigma, &likelihood, &delta, &t, rgb, background, weights));
+        if let Some(d_color) = &d_color {
+            composite_backward(
+                sigma,
+                &likelihood,
+                &delta,
+                rgb,
+                background,
+                weights,
+                d_color[ray],
+                0.0,
+                &mut d_sigma[row.clone()],
+                &mut d_rgb[row],
+                &mut d_likelihood,
+            );
+        }
+    }
+    output.vectors("color", &[rays, 3], &pixels.iter().map(|p| p.color).collect::<Vec<_>>())?;
+    output.floats("opacity", &[rays], pixels.iter().map(|p| p.opacity).collect())?;
+    output.floats("depth", &[rays], pixels.iter().map(|p| p.depth).collect())?;
+    output.floats("weights", &[rays, samples], weights)?;
+    // Where every alpha is 0 they are all the largest.
+    output.indices("termination", &[rays], pixels.iter().map(|p| p.termination.unwrap_or(0)))?;
+    if d_color.is_some() {
+        output.floats("d_sigma", &[rays, samples], d_sigma)?;
+        output.vectors("d_rgb", &[rays, samples, 3], &d_rgb)?;
+    }
+    Ok(())
+}
+
+pub fn metrics(mut input: Input, output: &mut Output) -> Result<()> {
+    let (shape, a) = input.floats_in("a", &[None, None, Some(3)], 0.0..=1.0)?;
+    let (height, width) = (shape[0], shape[1]);
+    let (_, b) = input.floats_in("b", &[Some(height), Some(width), Some(3)], 0.0..=1.0)?;
+    let mask = input.booleans("mask", height, width)?;
+    ensure!(mask.contains(&true), input.wrong("mask", "is true nowhere"));
+    let ssim = metrics::ssim(&a, &b, width, height).context("a and b")?;
+    let psnr_mask = metrics::psnr_masked(&a, &b, &mask).context("mask")?;
+    let ssim_mask = metrics::ssim_masked(&a, &b, &mask, width, height).context("mask")?;
+    for (key, value) in
+        [("psnr", metrics::psnr(&a, &b)), ("ssim", ssim), ("psnr_mask", psnr_mask), ("ssim_mask", ssim_mask)]
+    {
+        // The PSNR of equal images is infinite.
+        output.numbers(key, &[], vec![value as f32])?;
+    }
+    Ok(())
+}
