@@ -1,5 +1,6 @@
 //! Shapes of grids, and configurations that are none.
 
+use approx::assert_abs_diff_eq;
 use hashgrid::{Error, HashGrid, HashGridConfig, MAX_LOG2_TABLE_SIZE, MAX_RESOLUTION};
 use proptest::prelude::*;
 
@@ -75,7 +76,7 @@ fn the_first_table_is_small_spread_and_the_seeds() {
     let variance = table.iter().map(|&x| f64::from(x).powi(2)).sum::<f64>() / table.len() as f64;
     // A uniform distribution in ±a has variance a²/3; 32 k samples.
     assert!(mean.abs() < 2e-6, "{mean}");
-    assert!((variance / (1e-8 / 3.0) - 1.0).abs() < 0.03, "{variance}");
+    assert_abs_diff_eq!(variance / (1e-8 / 3.0), 1.0, epsilon = 0.03);
     assert_eq!(table, grid.init_table(1));
     assert_ne!(table, grid.init_table(2));
 }

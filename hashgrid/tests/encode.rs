@@ -2,6 +2,7 @@
 
 mod common;
 
+use approx::{abs_diff_eq, assert_abs_diff_eq};
 use common::{encode, oracle, points, table};
 use hashgrid::HashGrid;
 use proptest::prelude::*;
@@ -66,7 +67,7 @@ proptest! {
         let grid = HashGrid::<4>::with_resolutions(&[3, 17, 300], 2, 9).unwrap();
         let features = encode(&grid, &vec![0.75; grid.num_parameters()], &points);
         for feature in features {
-            prop_assert!((feature - 0.75).abs() < 1e-6);
+            prop_assert!(abs_diff_eq!(feature, 0.75, epsilon = 1e-6));
         }
     }
 
@@ -84,7 +85,7 @@ proptest! {
             }
         }
         for (point, feature) in points.iter().zip(encode(&grid, &table, &points)) {
-            prop_assert!((feature - f(point[0], point[1], point[2])).abs() < 2e-6);
+            prop_assert!(abs_diff_eq!(feature, f(point[0], point[1], point[2]), epsilon = 2e-6));
         }
     }
 }
@@ -99,7 +100,7 @@ fn both_dense_and_hashed_levels_are_compared() {
     // Corner (0, 0, 1) has row 64 in the dense level, π_3 mod 2^9 in the hashed one.
     let dense = encode(&grid, &table, &[[0.0, 0.0, 1.0 / 7.0]])[0];
     let hashed = encode(&grid, &table, &[[0.0, 0.0, 1.0 / 8.0]])[1];
-    assert!((dense - table[64]).abs() < 1e-6);
+    assert_abs_diff_eq!(dense, table[64], epsilon = 1e-6);
     assert_eq!(hashed, table[512 + 805_459_861 % 512]);
 }
 

@@ -2,6 +2,7 @@
 
 mod common;
 
+use approx::abs_diff_eq;
 use common::{dot, encode, noise, points, table};
 use hashgrid::HashGrid;
 use proptest::prelude::*;
@@ -82,7 +83,7 @@ proptest! {
         let backward = dot(&table, &d_table);
         // Each of up to 200 · 48 products of magnitude ≤ 1 carries some ulps; errors of both signs.
         let tolerance = 1e-6 * (1.0 + d_features.len() as f64).sqrt() * 4.0;
-        prop_assert!((forward - backward).abs() <= tolerance, "{forward} {backward}");
+        prop_assert!(abs_diff_eq!(forward, backward, epsilon = tolerance), "{forward} {backward}");
     }
 
     #[test]
@@ -94,13 +95,13 @@ proptest! {
         grid.encode_backward(&points, &d_features, &mut once);
         grid.encode_backward(&points, &d_features, &mut onto);
         for (once, onto) in once.iter().zip(&onto) {
-            prop_assert!((once + 5.0 - onto).abs() < 1e-4);
+            prop_assert!(abs_diff_eq!(once + 5.0, onto, epsilon = 1e-4));
         }
         let (mut once, mut onto) = (vec![[0.0; 3]; points.len()], vec![[5.0; 3]; points.len()]);
         grid.encode_backward_points(&values, &points, &d_features, &mut once);
         grid.encode_backward_points(&values, &points, &d_features, &mut onto);
         for (once, onto) in once.as_flattened().iter().zip(onto.as_flattened()) {
-            prop_assert!((once + 5.0 - onto).abs() < 1e-4, "{once} {onto}");
+            prop_assert!(abs_diff_eq!(once + 5.0, onto, epsilon = 1e-4), "{once} {onto}");
         }
     }
 }

@@ -50,6 +50,40 @@ fn wrong_obj_files_are_refused_by_line() {
     assert!(load_mesh(Path::new("/no/such.obj")).is_err());
 }
 
+/// tobj numbers vertices anew in the order of their first use, so corners are compared by position.
+fn by_tobj(text: &str) -> Vec<Vec3> {
+    let options = tobj::LoadOptions { triangulate: true, ..tobj::LoadOptions::default() };
+    let (models, _) = tobj::load_obj_buf(&mut text.as_bytes(), &options, |_| Ok(Default::default())).unwrap();
+    let corners = |model: tobj::Model| {
+        let at: Vec<Vec3> = model.mesh.positions.chunks_exact(3).map(Vec3::from_slice).collect();
+        model.mesh.indices.into_iter().map(move |i| at[i as usize])
+    };
+    models.into_iter().flat_map(corners).collect()
+}
+
+proptest! {
+    #[test]
+    fn triangles_of_obj_files_are_those_that_tobj_reads(
+        vertices in prop::collection::vec((-8i8..8, -8i8..8, any::<i8>()), 3..12),
+        polygons in prop::collection::vec(prop::collection::vec(any::<(prop::sample::Index, bool)>(), 3..6), 1..9),
+    ) {
+        let count = vertices.len();
+        let mut text: String = vertices.iter().map(|(x, y, z)| format!("v {x} {y}.25 {z}e-2\nvn 0 1 0\n")).collect();
+        for (number, polygon) in polygons.iter().enumerate() {
+            text += "f";
+            for (corner, from_end) in polygon {
+                let index = corner.index(count);
+                let index = if *from_end { index as i64 - count as i64 } else { index as i64 + 1 };
+                text += &if number % 2 == 0 { format!(" {index}") } else { format!(" {index}//{index}") };
+            }
+            text += "\n";
+        }
+        let mesh = load_mesh(&written("tobj.obj", &text)).unwrap();
+        let corners: Vec<Vec3> = mesh.faces.iter().flatten().map(|&v| mesh.vertices[v as usize]).collect();
+        prop_assert_eq!(corners, by_tobj(&text));
+    }
+}
+
 proptest! {
     #[test]
     fn anything_named_obj_gives_a_mesh_or_an_error(text in "([vf #/0-9.-]{0,12}\n){0,8}", bytes in any::<[u8; 8]>()) {

@@ -82,14 +82,15 @@ pub fn degenerate_clouds() -> Vec<(&'static str, Vec<Vec3>)> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use approx::abs_diff_eq;
 
     proptest! {
         #![proptest_config(ProptestConfig::with_cases(32))]
 
         #[test]
         fn unit_vectors_and_rotations_are_unit(v in unit_vec3(), q in rotation()) {
-            prop_assert!((v.length() - 1.0).abs() < 1e-5);
-            prop_assert!((q.length() - 1.0).abs() < 1e-5);
+            prop_assert!(abs_diff_eq!(v.length(), 1.0, epsilon = 1e-5));
+            prop_assert!(abs_diff_eq!(q.length(), 1.0, epsilon = 1e-5));
         }
 
         #[test]

@@ -3,6 +3,7 @@
 
 mod common;
 
+use approx::assert_abs_diff_eq;
 use common::{bits, body, capture, tiny, train};
 use glam::Vec3;
 use occnerf::data::{Capture, Frame};
@@ -36,7 +37,7 @@ fn scaled_capture(scale: f32) -> Capture {
 /// The scene in another unit; it does not depend on method or motion.
 fn scaled_scene(scale: f32) -> Scene {
     let scene = Scene::new(&scaled_capture(scale), &scaled_body(scale), &configs()[0]).unwrap();
-    assert!((scene.scale * scale - common::scene().scale).abs() < 1e-6);
+    assert_abs_diff_eq!(scene.scale * scale, common::scene().scale, epsilon = 1e-6);
     scene
 }
 

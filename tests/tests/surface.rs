@@ -3,6 +3,7 @@
 
 mod common;
 
+use approx::assert_abs_diff_eq;
 use std::collections::BTreeSet;
 
 use common::{body, placement, scene, silhouette, walking};
@@ -137,7 +138,7 @@ fn the_prior_renderers_silhouette_is_that_of_the_ray_casts() {
             inside += usize::from(hits == 4);
             wrong += usize::from(rendering.opacity[i] != f32::from(hits) / 4.0);
             // White on black shows the opacity.
-            assert!((rendering.image.pixels[3 * i] - rendering.opacity[i]).abs() < 1e-6);
+            assert_abs_diff_eq!(rendering.image.pixels[3 * i], rendering.opacity[i], epsilon = 1e-6);
         }
         assert!(inside > 50, "{inside}");
         assert_eq!(wrong, 0, "pixels in {}", frame.name);

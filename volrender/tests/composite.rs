@@ -1,5 +1,6 @@
 //! Compositing against the plain one of the test kit, its gradients against finite differences of that.
 
+use approx::{abs_diff_eq, assert_abs_diff_eq};
 use glam::Vec3;
 use proptest::prelude::*;
 use testkit::gradient::{Tolerance, assert_gradient};
@@ -122,9 +123,9 @@ proptest! {
         // T is a product of up to 150 factors, each with a rounding error.
         let tolerance = f64::from(f32::EPSILON) * (8 + ray.sigma.len()) as f64;
         prop_assert!(got.color.as_dvec3().distance(color) <= 2.0 * tolerance, "{} {color}", got.color);
-        prop_assert!((f64::from(got.opacity) - opacity).abs() <= tolerance);
+        prop_assert!(abs_diff_eq!(f64::from(got.opacity), opacity, epsilon = tolerance));
         for (i, (w, expected)) in weights.iter().zip(&expected).enumerate() {
-            prop_assert!((f64::from(*w) - expected).abs() <= tolerance, "{i}: {w} {expected}");
+            prop_assert!(abs_diff_eq!(f64::from(*w), expected, epsilon = tolerance), "{i}: {w} {expected}");
         }
         let depth: f64 = expected.iter().zip(&ray.t).map(|(w, t)| w * f64::from(*t)).sum();
         prop_assert!((f64::from(got.depth) - depth).abs() <= tolerance * (1.0 + depth.abs()));
@@ -153,7 +154,7 @@ proptest! {
         let (got, weights) = ray.composite(Vec3::ONE);
         prop_assert!((0.0..=1.0).contains(&got.opacity));
         prop_assert!(weights.iter().all(|w| (0.0..=1.0).contains(w)));
-        prop_assert!((weights.iter().sum::<f32>() - got.opacity).abs() < 1e-5);
+        prop_assert!(abs_diff_eq!(weights.iter().sum::<f32>(), got.opacity, epsilon = 1e-5));
     }
 
     #[test]
@@ -217,7 +218,7 @@ fn empty_space_has_a_gradient() {
     // dC/dσ_i = δ_i (c_i − background).
     for i in 0..4 {
         let expected = 0.25 * (ray.rgb[i] - Vec3::X).element_sum();
-        assert!((d.sigma[i] - expected).abs() < 1e-6);
+        assert_abs_diff_eq!(d.sigma[i], expected, epsilon = 1e-6);
     }
 }
 
@@ -234,7 +235,7 @@ fn faint_fog_keeps_its_relative_accuracy() {
     let mut ray = Samples::default();
     ray.push((1e-6, 1.0, 1e-3, Vec3::ONE));
     let (got, _) = ray.composite(Vec3::ZERO);
-    assert!((got.opacity / 1e-9 - 1.0).abs() < 1e-6, "{}", got.opacity);
+    assert_abs_diff_eq!(got.opacity / 1e-9, 1.0, epsilon = 1e-6);
 }
 
 #[test]
@@ -244,7 +245,7 @@ fn thousands_of_half_transparent_samples_underflow_quietly() {
         ray.push((10.0, 0.9, 0.1, Vec3::ONE));
     }
     let (got, weights) = ray.composite(Vec3::ZERO);
-    assert!((got.opacity - 1.0).abs() < 1e-6);
+    assert_abs_diff_eq!(got.opacity, 1.0, epsilon = 1e-6);
     assert_eq!(weights[4999], 0.0);
     let d = ray.backward(Vec3::ZERO, Vec3::ONE, 1.0);
     assert!(d.sigma.iter().chain(&d.likelihood).all(|d| d.is_finite()));

@@ -1,5 +1,6 @@
 //! Cameras, boxes, bins and lenses.
 
+use approx::abs_diff_eq;
 use glam::{Affine3A, Mat3, Quat, Vec2, Vec3};
 use proptest::prelude::*;
 use testkit::strategy::{degenerate_clouds, rotation, unit_vec3, vec3};
@@ -23,7 +24,7 @@ proptest! {
     #[test]
     fn a_point_on_a_ray_projects_to_the_rays_pixel(camera in camera(), u in 0.0f32..100.0, v in 0.0f32..90.0, t in 0.5f32..10.0) {
         let ray = camera.ray(u, v);
-        prop_assert!((ray.direction.length() - 1.0).abs() < 1e-6);
+        prop_assert!(abs_diff_eq!(ray.direction.length(), 1.0, epsilon = 1e-6));
         prop_assert!(ray.origin.distance(camera.centre_of_projection()) < 1e-6);
         let projected = camera.project(ray.at(t)).unwrap();
         // A millionth of a metre at half a metre, seen with a focal length of 500.
@@ -88,11 +89,11 @@ proptest! {
         bin_widths(&edges, &mut delta);
         prop_assert_eq!((edges[0], edges[n]), (near, far));
         prop_assert!(edges.is_sorted());
-        prop_assert!((delta.iter().sum::<f32>() - length).abs() < 1e-4);
+        prop_assert!(abs_diff_eq!(delta.iter().sum::<f32>(), length, epsilon = 1e-4));
         for i in 0..n {
             prop_assert!(edges[i] <= middle[i] && middle[i] <= edges[i + 1]);
             // An ulp of an edge is up to 1e-6.
-            prop_assert!((delta[i] - length / n as f32).abs() < 3e-6);
+            prop_assert!(abs_diff_eq!(delta[i], length / n as f32, epsilon = 3e-6));
         }
     }
 
@@ -106,7 +107,7 @@ proptest! {
         for i in 0..n {
             prop_assert!(edges[i] <= t[i] && t[i] <= edges[i + 1]);
             let expected = edges[i] + (edges[i + 1] - edges[i]) * jitter[i].clamp(0.0, 1.0);
-            prop_assert!((t[i] - expected).abs() < 2e-6);
+            prop_assert!(abs_diff_eq!(t[i], expected, epsilon = 2e-6));
         }
     }
 

@@ -1,5 +1,6 @@
 //! Metrics against scikit-image (`reference/ssim.py`) and the test kit's plain ones.
 
+use approx::{abs_diff_eq, assert_abs_diff_eq};
 use proptest::prelude::*;
 use testkit::oracle;
 use volrender::Error;
@@ -48,7 +49,7 @@ fn ssim_equals_scikit_image() {
         let (width, height) = (numbers[0] as usize, numbers[1] as usize);
         let (a, b) = pair(kind, width, height);
         let close = |what: &str, got: f64, expected: f64, tolerance: f64| {
-            assert!((got - expected).abs() <= tolerance, "{line}\n{what}: {got}");
+            assert_abs_diff_eq!(got, expected, epsilon = tolerance);
         };
         close("ssim", ssim(&a, &b, width, height).unwrap(), numbers[2], TOLERANCE);
         let masked = ssim_masked(&a, &b, &mask(width, height), width, height).unwrap();
@@ -69,9 +70,9 @@ proptest! {
     #[test]
     fn metrics_equal_the_plain_ones(width in 7usize..20, height in 7usize..20, seed: u64) {
         let (a, b) = (noise(3 * width * height, seed), noise(3 * width * height, !seed));
-        prop_assert!((psnr(&a, &b) - oracle::psnr(&a, &b)).abs() < 1e-9);
+        prop_assert!(abs_diff_eq!(psnr(&a, &b), oracle::psnr(&a, &b), epsilon = 1e-9));
         let plain = oracle::ssim(&a, &b, width, height);
-        prop_assert!((ssim(&a, &b, width, height).unwrap() - plain).abs() < 1e-10);
+        prop_assert!(abs_diff_eq!(ssim(&a, &b, width, height).unwrap(), plain, epsilon = 1e-10));
     }
 
     #[test]
@@ -79,7 +80,7 @@ proptest! {
         let (a, b) = (noise(3 * width * height, seed), noise(3 * width * height, !seed));
         let plain = oracle::ssim_map(&a, &b, width, height);
         for (got, plain) in ssim_map(&a, &b, width, height).into_iter().zip(plain) {
-            prop_assert!((f64::from(got) - plain).abs() < 1e-6);
+            prop_assert!(abs_diff_eq!(f64::from(got), plain, epsilon = 1e-6));
         }
     }
 
@@ -92,16 +93,16 @@ proptest! {
             pixels.filter(|(_, inside)| **inside).flat_map(|(pixel, _)| pixel.to_vec()).collect()
         };
         let expected = oracle::psnr(&picked(&a), &picked(&b));
-        prop_assert!((psnr_masked(&a, &b, &mask).unwrap() - expected).abs() < 1e-9);
+        prop_assert!(abs_diff_eq!(psnr_masked(&a, &b, &mask).unwrap(), expected, epsilon = 1e-9));
     }
 
     #[test]
     fn an_image_is_like_itself_and_metrics_are_symmetric(width in 7usize..20, height in 7usize..20, seed: u64) {
         let (a, b) = (noise(3 * width * height, seed), noise(3 * width * height, !seed));
         prop_assert_eq!(psnr(&a, &a), f64::INFINITY);
-        prop_assert!((ssim(&a, &a, width, height).unwrap() - 1.0).abs() < 1e-12);
+        prop_assert!(abs_diff_eq!(ssim(&a, &a, width, height).unwrap(), 1.0, epsilon = 1e-12));
         let (there, back) = (ssim(&a, &b, width, height).unwrap(), ssim(&b, &a, width, height).unwrap());
-        prop_assert!((there - back).abs() < 1e-12);
+        prop_assert!(abs_diff_eq!(there, back, epsilon = 1e-12));
         prop_assert_eq!(psnr(&a, &b), psnr(&b, &a));
     }
 }

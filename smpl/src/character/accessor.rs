@@ -4,10 +4,10 @@ use std::cell::Cell;
 use std::path::{Component, Path};
 
 use base64::Engine;
-use gltf_json::accessor::{Accessor, ComponentType};
-use gltf_json::buffer::View;
-use gltf_json::validation::Checked;
-use gltf_json::{Index, Root};
+use gltf::json::accessor::{Accessor, ComponentType};
+use gltf::json::buffer::View;
+use gltf::json::validation::Checked;
+use gltf::json::{Index, Root};
 
 use crate::Error;
 use crate::npz::read_file;

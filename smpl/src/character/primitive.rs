@@ -1,10 +1,10 @@
 //! The mesh of a character, part by part.
 
 use glam::{Vec2, Vec3};
-use gltf_json::accessor::Accessor;
-use gltf_json::mesh::{Mode, Primitive, Semantic};
-use gltf_json::validation::Checked;
-use gltf_json::{Index, material};
+use gltf::json::accessor::Accessor;
+use gltf::json::mesh::{Mode, Primitive, Semantic};
+use gltf::json::validation::Checked;
+use gltf::json::{Index, material};
 
 use super::accessor::Source;
 use super::read::Joints;
@@ -137,11 +137,11 @@ fn influences(
     Ok(())
 }
 
-fn base_colour(material: &material::Material) -> Option<&gltf_json::texture::Info> {
+fn base_colour(material: &material::Material) -> Option<&gltf::json::texture::Info> {
     material.pbr_metallic_roughness.base_color_texture.as_ref()
 }
 
-fn texture(source: &Source<'_>, place: &str, colour: &gltf_json::texture::Info) -> Result<Texture, Error> {
+fn texture(source: &Source<'_>, place: &str, colour: &gltf::json::texture::Info) -> Result<Texture, Error> {
     let root = source.root;
     let index = source.get(&root.textures, colour.index, place)?.source;
     let image = source.get(&root.images, index, place)?;

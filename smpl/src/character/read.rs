@@ -4,9 +4,9 @@ use std::collections::HashMap;
 use std::path::Path;
 
 use glam::{Affine3A, Mat4, Quat, Vec3, Vec4};
-use gltf_json::animation::{Interpolation as Kind, Property};
-use gltf_json::validation::Checked;
-use gltf_json::{Index, Root};
+use gltf::json::animation::{Interpolation as Kind, Property};
+use gltf::json::validation::Checked;
+use gltf::json::{Index, Root};
 
 use super::accessor::Source;
 use super::animation::{Animation, Channel, Interpolation, Part, unit, widen};
@@ -36,7 +36,7 @@ impl Character {
 fn read(file: &str, bytes: &[u8], folder: Option<&Path>) -> Result<Character, Error> {
     let (json, blob) = if bytes.starts_with(b"glTF") { chunks(file, bytes)? } else { (bytes, None) };
     let root: Root =
-        gltf_json::deserialize::from_slice(json).map_err(|e| Error::invalid(file, "document", e.to_string()))?;
+        gltf::json::deserialize::from_slice(json).map_err(|e| Error::invalid(file, "document", e.to_string()))?;
     let source = Source::new(file, &root, blob, folder)?;
     let nodes = nodes(&source)?;
     let order = order(&source, &nodes)?;
@@ -189,7 +189,7 @@ impl Character {
         (first, 1)
     }
 
-    fn add_skin(&mut self, source: &Source<'_>, index: Index<gltf_json::Skin>, place: &str) -> Result<Joints, Error> {
+    fn add_skin(&mut self, source: &Source<'_>, index: Index<gltf::json::Skin>, place: &str) -> Result<Joints, Error> {
         let skin = source.get(&source.root.skins, index, place)?;
         let place = format!("skin {index}");
         let matrices = match skin.inverse_bind_matrices {

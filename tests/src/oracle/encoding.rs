@@ -80,6 +80,7 @@ pub fn hash_encode(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use approx::assert_abs_diff_eq;
 
     #[test]
     fn a_dense_level_interpolates_a_linear_function_exactly() {
@@ -92,7 +93,7 @@ mod tests {
         }
         for (x, y) in [(0.0, 0.0), (1.0, 1.0), (0.3, 0.77), (1.0, 0.0), (0.25, 0.5)] {
             let got = hash_encode(&[x, y], 2, &[4], &table, 5, 1)[0];
-            assert!((got - (3.0 * x - 2.0 * y + 1.0)).abs() < 1e-6, "{x} {y}: {got}");
+            assert_abs_diff_eq!(got, (3.0 * x - 2.0 * y + 1.0), epsilon = 1e-6);
         }
     }
 

@@ -100,6 +100,7 @@ pub fn inside(vertices: &[Vec3], faces: &[[u32; 3]], q: Vec3) -> bool {
 mod tests {
     use super::*;
     use crate::mesh::{cuboid, open_grid, torus};
+    use approx::assert_abs_diff_eq;
 
     #[test]
     fn closest_points_of_a_box_are_found_on_face_edge_and_corner() {
@@ -112,7 +113,7 @@ mod tests {
         ] {
             let (_, point, distance) = closest_point(&mesh.vertices, &mesh.faces, q);
             assert!(point.distance(expected) < 1e-6, "{q}: {point}");
-            assert!((distance - expected.distance(q.as_dvec3())).abs() < 1e-6);
+            assert_abs_diff_eq!(distance, expected.distance(q.as_dvec3()), epsilon = 1e-6);
         }
     }
 
@@ -139,7 +140,7 @@ mod tests {
     fn winding_is_one_inside_zero_outside_and_zero_in_the_hole_of_a_torus() {
         let mesh = torus(2.0, 0.5, 24, 12);
         let winding = |q| winding_number(&mesh.vertices, &mesh.faces, q);
-        assert!((winding(Vec3::X * 2.0) - 1.0).abs() < 1e-9);
+        assert_abs_diff_eq!(winding(Vec3::X * 2.0), 1.0, epsilon = 1e-9);
         assert!(winding(Vec3::ZERO).abs() < 1e-9);
         assert!(winding(Vec3::X * 4.0).abs() < 1e-9);
         assert!(inside(&mesh.vertices, &mesh.faces, Vec3::Z * 1.9));
@@ -149,6 +150,6 @@ mod tests {
     fn an_open_sheet_covers_half_the_sky_from_close_by() {
         let sheet = open_grid(1);
         let w = winding_number(&sheet.vertices, &sheet.faces, -Vec3::Z * 1e-4);
-        assert!((w - 0.5).abs() < 1e-3, "{w}");
+        assert_abs_diff_eq!(w, 0.5, epsilon = 1e-3);
     }
 }

@@ -44,6 +44,7 @@ pub fn composite(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use approx::assert_abs_diff_eq;
 
     #[test]
     fn a_uniform_fog_follows_beer_and_lambert() {
@@ -51,7 +52,7 @@ mod tests {
         let (color, opacity, weights, termination) =
             composite(&vec![2.0; n], &vec![1.0; n], &vec![0.01; n], &vec![Vec3::X; n], Vec3::Y);
         let expected = 1.0 - (-1.0f64).exp();
-        assert!((opacity - expected).abs() < 1e-6);
+        assert_abs_diff_eq!(opacity, expected, epsilon = 1e-6);
         assert!(color.distance(DVec3::new(expected, 1.0 - expected, 0.0)) < 1e-6);
         assert!(weights.windows(2).all(|w| w[0] > w[1]));
         assert_eq!(termination, Some(0));
