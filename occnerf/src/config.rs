@@ -72,6 +72,16 @@ pub enum DistanceKind {
     Exact,
 }
 
+/// Where the attention's counts come from.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum VisibilityKind {
+    /// The paper's running counts: neighbours of the samples in which training rays end.
+    Counted,
+    /// The number of training frames that show a vertex, by ray casting, from the first step on.
+    Exact,
+}
+
 /// A named set of defaults.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
@@ -160,6 +170,8 @@ pub struct SurfaceConfig {
     pub surface_term: bool,
     /// Whether the surface term is weighted by the visibility counts.
     pub attention: bool,
+    /// Where those counts come from.
+    pub visibility: VisibilityKind,
 }
 
 /// The motion field.

@@ -96,7 +96,7 @@ mod tests {
     use crate::config::{Config, Method, Preset};
     use crate::correction::{correct, correct_backward};
     use crate::random::Stream;
-    use crate::samples::{Samples, Stage};
+    use crate::samples::Stage;
     use crate::scene::Scene;
 
     /// Value = Σ c · features(x) + e · d(x) + p · f(x) of points x that keep still while the pose is corrected.

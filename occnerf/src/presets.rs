@@ -2,7 +2,7 @@
 
 use crate::config::{
     Config, DistanceKind, EncodingConfig, FieldConfig, LossConfig, Method, MotionConfig, MotionKind, OccludedRule,
-    Preset, RateConfig, SurfaceConfig,
+    Preset, RateConfig, SurfaceConfig, VisibilityKind,
 };
 
 /// The paper's setting; what it leaves open is named in ARCHITECTURE.
@@ -32,6 +32,7 @@ pub(crate) fn paper() -> Config {
             distance: DistanceKind::Blended,
             surface_term: true,
             attention: true,
+            visibility: VisibilityKind::Counted,
         },
         motion: MotionConfig {
             kind: MotionKind::Volume,

@@ -3,7 +3,7 @@
 use glam::Vec3;
 use rayon::prelude::*;
 use smpl::Posed;
-use volrender::{Camera, Composite};
+use volrender::{Camera, Composite, Ray};
 
 use crate::Error;
 use crate::batch::body_box;
@@ -11,7 +11,7 @@ use crate::data::Image;
 use crate::field::Group;
 use crate::parameters::Part;
 use crate::prior::VertexColors;
-use crate::samples::Stage;
+use crate::samples::{March, Stage};
 use crate::scene::{PreparedFrame, Scene};
 use crate::trainer::{Trainer, composite_group, pixel_ray};
 use crate::vertices::VertexCode;
@@ -58,7 +58,27 @@ struct Scratch {
     group: Group,
     weights: Vec<f32>,
     composites: Vec<Composite>,
+    rays: Vec<Progress>,
 }
+
+/// A ray on its way through the scene, front to back.
+struct Progress {
+    ray: Ray,
+    march: March,
+    color: Vec3,
+    transmittance: f32,
+}
+
+impl Progress {
+    fn goes_on(&self) -> bool {
+        !self.march.ended && self.transmittance > HIDDEN
+    }
+}
+
+/// Live samples of a ray that are evaluated before it is asked whether it goes on.
+const RUN: usize = 4;
+/// Transmittance behind which nothing is looked at: it could change a colour by a thousandth, a quarter of a level of 8 bits.
+const HIDDEN: f32 = 1e-3;
 
 impl Renderer for FieldRenderer<'_> {
     fn render(&mut self, frame: &PreparedFrame, background: Vec3) -> Result<Rendering, Error> {
@@ -69,14 +89,32 @@ impl Renderer for FieldRenderer<'_> {
         let (field, table) = (trainer.parameters.get(Part::Field), trainer.parameters.get(Part::Table));
         let features = &self.code.features;
         paint(frame, background, Scratch::default, |scratch, row, columns| {
-            scratch.group.samples.clear();
-            for column in columns {
-                let ray = pixel_ray(frame, row * frame.camera.width + column);
-                scratch.group.samples.trace(&tracer, &ray, None);
+            let start = |column| Progress {
+                ray: pixel_ray(frame, row * frame.camera.width + column),
+                march: March::default(),
+                color: Vec3::ZERO,
+                transmittance: 1.0,
+            };
+            let Scratch { group, weights, composites, rays } = scratch;
+            rays.clear();
+            rays.extend(columns.map(start));
+            loop {
+                let mut going: Vec<&mut Progress> = rays.iter_mut().filter(|p| p.goes_on()).collect();
+                if going.is_empty() {
+                    break;
+                }
+                group.samples.clear();
+                for p in &mut going {
+                    group.samples.trace_on(&tracer, &p.ray, None, RUN, &mut p.march);
+                }
+                trainer.field.forward(field, table, features, &trainer.counts, group);
+                composite_group(group, Vec3::ZERO, weights, composites);
+                for (p, run) in going.into_iter().zip(composites.iter()) {
+                    p.color += p.transmittance * run.color;
+                    p.transmittance *= (1.0 - run.opacity).max(0.0);
+                }
             }
-            trainer.field.forward(field, table, features, &trainer.counts, &mut scratch.group);
-            composite_group(&scratch.group, background, &mut scratch.weights, &mut scratch.composites);
-            scratch.composites.iter().map(|c| (c.color, c.opacity)).collect()
+            rays.iter().map(|p| (p.color + p.transmittance * background, 1.0 - p.transmittance)).collect()
         })
     }
 }
@@ -161,4 +199,46 @@ fn margin_box(frame: &PreparedFrame) -> [u32; 4] {
     let room = (y1 - y0).max(x1 - x0) / 8 + 4;
     let (width, height) = (frame.camera.width, frame.camera.height);
     [x0.saturating_sub(room), y0.saturating_sub(room), (x1 + room).min(width), (y1 + room).min(height)]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::{Config, Method, Preset};
+
+    #[test]
+    fn a_picture_drawn_front_to_back_is_that_of_all_samples_at_once() {
+        let body = smpl::BodyModel::embedded();
+        let demo = crate::data::DemoConfig { size: 32, frames: 3, eval_cameras: 1, ..Default::default() };
+        let capture = crate::data::demo(&demo, &body).unwrap();
+        let config = Config { steps: 40, ..Config::preset(Preset::Fast, Method::Occnerf) };
+        let scene = Scene::new(&capture, &body, &config).unwrap();
+        let mut trainer = Trainer::new(&scene, config).unwrap();
+        for _ in 0..40 {
+            trainer.step();
+        }
+        let (frame, background) = (&scene.eval[0], Vec3::new(0.3, 0.6, 0.9));
+        let mut renderer = FieldRenderer::new(&trainer).unwrap();
+        let picture = renderer.render(frame, background).unwrap();
+        let posed = trainer.corrected(frame);
+        renderer.stage.set(&scene, &posed, &trainer.config);
+        let tracer = trainer.tracer(&renderer.stage, frame, &posed);
+        let mut all = Scratch::default();
+        all.group.samples.clear();
+        for pixel in 0..32 * 32 {
+            all.group.samples.trace(&tracer, &pixel_ray(frame, pixel), None);
+        }
+        let (field, table) = (trainer.parameters.get(Part::Field), trainer.parameters.get(Part::Table));
+        trainer.field.forward(field, table, &renderer.code.features, &trainer.counts, &mut all.group);
+        composite_group(&all.group, background, &mut all.weights, &mut all.composites);
+        let (mut worst, mut solid) = (0.0f32, 0);
+        for (pixel, expected) in all.composites.iter().enumerate() {
+            let found = Vec3::from_slice(&picture.image.pixels[3 * pixel..]);
+            worst = worst.max((found - expected.color).abs().max_element());
+            worst = worst.max((picture.opacity[pixel] - expected.opacity).abs());
+            solid += usize::from(expected.opacity > 1.0 - HIDDEN);
+        }
+        assert!(solid > 50, "{solid} rays end early");
+        assert!(worst < HIDDEN + 1e-5, "{worst}");
+    }
 }

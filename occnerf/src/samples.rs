@@ -76,6 +76,15 @@ pub(crate) struct Samples {
     pub faces: Vec<(u32, [f32; 3])>,
 }
 
+/// How far along its bins a ray has been traced.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct March {
+    bin: usize,
+    /// The face that was closest to the last sample bounds the search for the next.
+    known: Option<u32>,
+    pub ended: bool,
+}
+
 impl Samples {
     pub fn clear(&mut self) {
         self.starts.clear();
@@ -96,14 +105,27 @@ impl Samples {
     }
 
     /// Appends the live samples of a ray; `jitter` places each sample in its bin, the middle without.
-    pub fn trace(&mut self, tracer: &Tracer<'_>, ray: &Ray, mut jitter: Option<Stream>) {
+    pub fn trace(&mut self, tracer: &Tracer<'_>, ray: &Ray, jitter: Option<Stream>) {
+        self.trace_on(tracer, ray, jitter, usize::MAX, &mut March::default());
+    }
+
+    /// Appends the next live samples of a ray, at most `most`, and takes the march to where they end.
+    pub fn trace_on(
+        &mut self,
+        tracer: &Tracer<'_>,
+        ray: &Ray,
+        mut jitter: Option<Stream>,
+        most: usize,
+        march: &mut March,
+    ) {
         let bins = tracer.config.samples;
+        let first = self.len();
         let span = tracer.stage.occupancy.region().and_then(|region| region.intersect(ray));
         if let Some((near, far)) = span.filter(|(near, far)| far > near) {
             let width = (far - near) / bins as f32;
-            // The face that was closest to the last sample bounds the search for the next.
-            let mut known = None::<u32>;
-            for bin in 0..bins {
+            while march.bin < bins && self.len() - first < most {
+                let bin = march.bin;
+                march.bin += 1;
                 let place = jitter.as_mut().map_or(0.5, Stream::uniform);
                 let t = near + (bin as f32 + place) * width;
                 let point = ray.origin + t * ray.direction;
@@ -111,13 +133,16 @@ impl Samples {
                     continue;
                 }
                 let live;
-                (live, known) = self.push(tracer, point, known);
+                (live, march.known) = self.push(tracer, point, march.known);
                 if live {
                     self.t.push(t);
                     self.delta.push(width);
                     self.world.push(point);
                 }
             }
+            march.ended = march.bin == bins;
+        } else {
+            march.ended = true;
         }
         self.starts.push(self.t.len());
     }

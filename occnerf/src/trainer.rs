@@ -10,7 +10,7 @@ use volrender::{Composite, composite};
 
 use crate::Error;
 use crate::batch::Batch;
-use crate::config::{Config, DistanceKind, MotionKind};
+use crate::config::{Config, DistanceKind, MotionKind, VisibilityKind};
 use crate::correction::{Corrections, Wrench, correct};
 use crate::encoder::Coordinates;
 use crate::field::{Field, Group};
@@ -103,12 +103,14 @@ impl<'a> Trainer<'a> {
             MotionKind::Gaussian => Some(WeightVolume::gaussian(&scene.model, &scene.canonical, &Default::default())),
         };
         let vertices = scene.canonical.vertices.len();
+        let exact = config.surface.attention && config.surface.visibility == VisibilityKind::Exact;
+        let counts = if exact { scene.vertex_frequencies()? } else { vec![0; vertices] };
         let motion = volume.as_ref().map_or(0, |v| v.delta.len());
         let spacing = config.motion.correction_spacing;
         let corrections = Corrections::new(scene.train.len(), spacing, scene.model.num_joints());
         Ok(Self {
             parameters: Parameters::new(&config, &field, vertices, motion, corrections.len()),
-            counts: VisibilityCounts::new(vertices),
+            counts: VisibilityCounts::from_counts(counts),
             stage: Stage::new(scene)?,
             batch: Batch::default(),
             groups: (0..GROUPS).map(|_| GroupState::default()).collect(),
@@ -146,7 +148,7 @@ impl<'a> Trainer<'a> {
             + self.field.mlp.num_true_parameters()
     }
 
-    /// How often each vertex was near a termination point.
+    /// How often each vertex was near a termination point, or in how many frames it is seen: see [`VisibilityKind`].
     pub fn visibility_counts(&self) -> &[u64] {
         self.counts.counts()
     }
@@ -223,8 +225,8 @@ impl<'a> Trainer<'a> {
             + f64::from(loss.perceptual) * report.perceptual
             + f64::from(loss.completeness) * report.completeness;
         self.reduce(&groups, frame, &posed);
-        for state in &groups {
-            self.counts.add(&state.terminations);
+        if self.config.surface.visibility == VisibilityKind::Counted {
+            groups.iter().for_each(|state| self.counts.add(&state.terminations));
         }
         let decay = self.config.rates.final_fraction.powf(step as f32 / self.config.steps.max(1) as f32);
         // What a field says of poses before it has taken shape would only lead them astray.

@@ -47,9 +47,13 @@ fn table() -> String {
         row("λ of squared error, perceptual, completeness", |c| {
             format!("{}, {}, {}", c.loss.mse, c.loss.perceptual, c.loss.completeness)
         }),
-        row("rates of F, vertices, table, motion", |c| {
+        row("frames between knots of the pose corrections", |c| match c.motion.correction_spacing {
+            0 => "none".to_owned(),
+            frames => frames.to_string(),
+        }),
+        row("rates of F, vertices, table, motion, poses", |c| {
             let r = &c.rates;
-            format!("{:e}, {:e}, {:e}, {:e}", r.field, r.vertices, r.table, r.motion)
+            format!("{:e}, {:e}, {:e}, {:e}, {:e}", r.field, r.vertices, r.table, r.motion, r.pose)
         }),
         row("rates fall to", |c| c.rates.final_fraction.to_string()),
     ];

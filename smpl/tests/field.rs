@@ -224,6 +224,19 @@ proptest! {
 }
 
 #[test]
+fn the_slope_of_the_likelihood_agrees_with_differences() {
+    let field = SurfaceMotion { margin: 0.25, falloff: 0.125 };
+    for i in -8..40 {
+        // Off the kinks of the second derivative at both ends of the fall.
+        let (d, h) = (i as f32 / 64.0 + 1.0 / 128.0, 1.0 / 1024.0);
+        let numeric = (field.likelihood(d + h) - field.likelihood(d - h)) / (2.0 * h);
+        let slope = field.likelihood_slope(d);
+        assert!((numeric - slope).abs() < 0.05 * (1.0 + slope.abs()), "{d}: {numeric} {slope}");
+    }
+    assert_eq!(SurfaceMotion { margin: 0.25, falloff: 0.0 }.likelihood_slope(0.25), 0.0);
+}
+
+#[test]
 fn dead_points_have_no_gradient() {
     let scene = &*SCENE;
     let frame = MotionFrame::new(&scene.body, &scene.posed);
