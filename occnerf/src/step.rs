@@ -135,7 +135,7 @@ impl Trainer<'_> {
             zero(&mut state.d_volume, volume.weights.len());
             self.motion_backward(volume, group, frame, &mut state.d_volume);
         }
-        if !self.parameters.get(Part::Pose).is_empty() {
+        if self.teaches_poses() {
             self.pose_backward(group, posed, &mut state.wrenches);
         }
     }
@@ -204,7 +204,9 @@ impl Trainer<'_> {
             sum(&mut d_weights, &|g| &g.d_volume);
             volume.softmax_backward(&d_weights, self.parameters.gradient(Part::Motion));
         }
-        if let (Some(correction), Some(instant)) = (self.correction(frame), frame.instant) {
+        if let (Some(correction), Some(instant)) =
+            (self.correction(frame).filter(|_| self.teaches_poses()), frame.instant)
+        {
             let mut wrenches = vec![Wrench::default(); posed.bones.len()];
             for state in groups {
                 wrenches.iter_mut().zip(&state.wrenches).for_each(|(to, from)| to.add(from));

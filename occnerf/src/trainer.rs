@@ -196,6 +196,11 @@ impl<'a> Trainer<'a> {
         }
     }
 
+    /// Whether this step teaches the poses: what a field says of them before it has taken shape would lead them astray.
+    pub(crate) fn teaches_poses(&self) -> bool {
+        !self.parameters.get(Part::Pose).is_empty() && self.steps_done as f32 >= SETTLED * self.config.steps as f32
+    }
+
     /// One optimisation step.
     pub fn step(&mut self) -> StepReport {
         let step = self.steps_done;
@@ -229,10 +234,6 @@ impl<'a> Trainer<'a> {
             groups.iter().for_each(|state| self.counts.add(&state.terminations));
         }
         let decay = self.config.rates.final_fraction.powf(step as f32 / self.config.steps.max(1) as f32);
-        // What a field says of poses before it has taken shape would only lead them astray.
-        if (step as f32) < SETTLED * self.config.steps as f32 {
-            self.parameters.gradient(Part::Pose).fill(0.0);
-        }
         report.bad_gradients = self.parameters.step(&self.config.rates, decay);
         self.refresh_volume();
         (self.groups, self.batch) = (groups, batch);
