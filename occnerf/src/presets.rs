@@ -58,7 +58,7 @@ pub(crate) fn paper() -> Config {
 pub(crate) fn balanced() -> Config {
     Config {
         preset: Preset::Balanced,
-        steps: 1500,
+        steps: 1100,
         patches: 6,
         samples: 64,
         field: FieldConfig { width: 64, depth: 2, ..paper().field },

@@ -49,7 +49,7 @@ fn ssim_equals_scikit_image() {
         let (width, height) = (numbers[0] as usize, numbers[1] as usize);
         let (a, b) = pair(kind, width, height);
         let close = |what: &str, got: f64, expected: f64, tolerance: f64| {
-            assert_abs_diff_eq!(got, expected, epsilon = tolerance);
+            assert!(abs_diff_eq!(got, expected, epsilon = tolerance), "{line}\n{what}: {got}");
         };
         close("ssim", ssim(&a, &b, width, height).unwrap(), numbers[2], TOLERANCE);
         let masked = ssim_masked(&a, &b, &mask(width, height), width, height).unwrap();
