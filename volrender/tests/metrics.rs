@@ -1,6 +1,6 @@
 //! Metrics against scikit-image (`reference/ssim.py`) and the test kit's plain ones.
 
-use approx::{abs_diff_eq, assert_abs_diff_eq};
+use approx::abs_diff_eq;
 use proptest::prelude::*;
 use testkit::oracle;
 use volrender::Error;
