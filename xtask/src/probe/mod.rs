@@ -32,13 +32,13 @@ enum Op {
     Surface,
     /// What a camera sees: K (3,3), E (3,4), width, height -> visible (V); --mesh
     Visible,
-    /// Hash encoding: points (Q,D) in [0,1], D = 2, 3 or 4, resolutions (L), table (L,2^T,F), optional d_features (Q,L*F)
+    /// Hash encoding: points (Q,D) from 0 to 1, D = 2, 3 or 4, resolutions (L), table (L,2^T,F), optional d_features (Q,L*F)
     /// -> features (Q,L*F), d_table, d_points
     HashEncode,
     /// Volume rendering: sigma (R,S), rgb (R,S,3), edges (R,S+1), background (3), optional d_color (R,3) -> color (R,3),
     /// opacity (R), depth (R), weights (R,S), termination (R), d_sigma, d_rgb
     Composite,
-    /// Image metrics: a, b (H,W,3) in [0,1], mask (H,W) of booleans -> psnr, ssim, psnr_mask, ssim_mask
+    /// Image metrics: a, b (H,W,3) from 0 to 1, mask (H,W) of booleans -> psnr, ssim, psnr_mask, ssim_mask
     Metrics,
 }
 
