@@ -41,6 +41,9 @@ pub fn tiny(method: Method, motion: MotionKind) -> Config {
     (config.field.width, config.field.depth) = (32, 2);
     (config.encoding.levels, config.encoding.log2_table_size, config.encoding.n_max) = (6, 12, 96);
     config.motion.kind = motion;
+    if motion != MotionKind::Surface {
+        config.motion.correction_spacing = 0;
+    }
     config
 }
 
