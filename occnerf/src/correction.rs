@@ -229,7 +229,7 @@ mod tests {
         };
         let mut wrenches = vec![Wrench::default(); model.num_joints()];
         for (face, bary, x, a) in &points {
-            let at = crate::pose_backward::Anchor::new(&model, &corrected, *face, *bary, *x);
+            let at = crate::pose_backward::Anchor::new(&model, &corrected, *face, *bary, *x).unwrap();
             at.push(at.to_world(*a), &mut wrenches);
         }
         let gradient = correct_backward(&model, &posed, &correction, &corrected, &wrenches);

@@ -2,8 +2,8 @@
 
 use std::path::PathBuf;
 
-use crate::config::ConfigError;
 use crate::data::DataError;
+use crate::validate::ConfigError;
 
 /// Any failure of preparing, training, saving or evaluating.
 #[derive(Debug, thiserror::Error)]

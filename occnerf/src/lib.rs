@@ -50,12 +50,13 @@ mod samples;
 mod scene;
 mod step;
 mod trainer;
+mod validate;
 mod vertices;
 
 pub use checkpoint::checkpoint_config;
 pub use config::{
-    Component, Config, ConfigError, DistanceKind, EncodingConfig, FieldConfig, LossConfig, Method, MotionConfig,
-    MotionKind, OccludedRule, Preset, RateConfig, SurfaceConfig, VisibilityKind,
+    Component, Config, DistanceKind, EncodingConfig, FieldConfig, LossConfig, Method, MotionConfig, MotionKind,
+    OccludedRule, Preset, RateConfig, SurfaceConfig, VisibilityKind,
 };
 pub use error::Error;
 pub use evaluate::{FrameMetrics, SplitMetrics, evaluate, least_seen_quartile};
@@ -64,3 +65,4 @@ pub use prior::VertexColors;
 pub use render::{FieldRenderer, PriorRenderer, Renderer, Rendering, view_of};
 pub use scene::{PreparedFrame, Scene};
 pub use trainer::{StepReport, Trainer};
+pub use validate::ConfigError;

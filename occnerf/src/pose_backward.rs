@@ -22,7 +22,7 @@ impl Trainer<'_> {
         let field = SurfaceMotion { margin: motion.margin, falloff: motion.falloff };
         for (s, (d_canonical, d_coordinate)) in d_points.into_iter().enumerate() {
             let ((face, barycentric), x, d) = (samples.faces[s], samples.world[s], samples.distance[s]);
-            let anchor = Anchor::new(model, posed, face, barycentric, x);
+            let Some(anchor) = Anchor::new(model, posed, face, barycentric, x) else { continue };
             let corners = model.faces[face as usize].iter().zip(barycentric);
             let foot: Vec3 = corners.map(|(&v, b)| b * posed.vertices[v as usize]).sum();
             let normal = Vec3A::from((x - foot).normalize_or_zero() * d.signum());
@@ -52,17 +52,21 @@ pub(crate) struct Anchor<'a> {
 }
 
 impl<'a> Anchor<'a> {
-    /// Of the point `x` whose nearest surface point lies on `face` at `barycentric`.
-    pub fn new(model: &'a BodyModel, posed: &'a Posed, face: u32, barycentric: [f32; 3], x: Vec3) -> Self {
+    /// Of the point `x` whose nearest surface point lies on `face` at `barycentric`; `None` where a fold is so sharp that the
+    /// map takes one bone for all.
+    pub fn new(model: &'a BodyModel, posed: &'a Posed, face: u32, barycentric: [f32; 3], x: Vec3) -> Option<Self> {
         let (corners, bones) = (model.faces[face as usize], &posed.bones[..]);
         let mut to_world = Affine3A { matrix3: Mat3A::ZERO, translation: Vec3A::ZERO };
         for (joint, w) in weights(model, corners, barycentric) {
             to_world.matrix3 += bones[joint].matrix3 * w;
             to_world.translation += bones[joint].translation * w;
         }
+        if to_world.matrix3.determinant() < SurfaceMotion::MIN_DETERMINANT {
+            return None;
+        }
         let inverse = to_world.inverse();
         let (rest, transposed) = (inverse.transform_point3a(x.into()), inverse.matrix3.transpose());
-        Self { model, bones, corners, barycentric, rest, transposed }
+        Some(Self { model, bones, corners, barycentric, rest, transposed })
     }
 
     /// A gradient with respect to x̂, as one with respect to x.
@@ -70,10 +74,9 @@ impl<'a> Anchor<'a> {
         self.transposed * Vec3A::from(d_canonical)
     }
 
-    /// Shares the gradient of the point among its bones. A gradient that is not finite, as where the blended bones are
-    /// singular, is left out.
+    /// Shares the gradient of the point among its bones. One that is not finite is left out.
     pub fn push(&self, d_point: Vec3A, wrenches: &mut [Wrench]) {
-        if !(d_point.is_finite() && self.rest.is_finite()) {
+        if !d_point.is_finite() {
             return;
         }
         for (joint, w) in weights(self.model, self.corners, self.barycentric) {

@@ -100,6 +100,10 @@ impl Scene {
     /// Prepares a capture with its prior.
     pub fn new(capture: &Capture, model: &BodyModel, config: &Config) -> Result<Self, Error> {
         config.validate()?;
+        if let Some(lost) = capture.eval.iter().find(|e| e.train_index >= capture.train.len()) {
+            let (name, at, frames) = (&lost.frame.name, lost.train_index, capture.train.len());
+            return Err(Error::Scene(format!("view {name} is of training frame {at}, expected one of {frames}")));
+        }
         let mut canonical = model.shaped(&capture.mean_betas);
         let (low, high) = bounds(&canonical.vertices);
         let height = high.y - low.y;

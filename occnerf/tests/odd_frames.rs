@@ -107,3 +107,12 @@ fn pictures_of_a_single_pixel_and_long_thin_ones_are_drawn() {
         assert!(picture.opacity[middle] > 0.9, "{width}×{height}: {}", picture.opacity[middle]);
     }
 }
+
+#[test]
+fn a_view_of_a_frame_that_training_has_not_is_refused() {
+    let mut capture = capture();
+    capture.eval[1].train_index = capture.train.len();
+    let refused = Scene::new(&capture, body(), &config(Method::Occnerf));
+    let message = refused.err().map(|e| e.to_string()).unwrap_or_default();
+    assert!(message.contains("training frame 2") && message.contains("expected one of 2"), "{message}");
+}

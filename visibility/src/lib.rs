@@ -37,7 +37,6 @@ mod counts;
 mod error;
 mod packet;
 mod ray_mesh;
-mod simd;
 mod tree;
 mod triangle;
 mod view;

@@ -4,7 +4,6 @@ use glam::Vec3;
 use rayon::prelude::*;
 
 use crate::ray_mesh::{Hit, RayMesh};
-use crate::simd::Kernel;
 use crate::tree::{Child, LANES, Node};
 use crate::triangle::{Pack, Ray};
 
@@ -14,6 +13,24 @@ const WIDTH: usize = 8;
 const TASK: usize = 64 * WIDTH;
 
 type Lanes = [f32; WIDTH];
+
+/// A packet, compiled for the widest instructions of the machine. A struct, since the shim through which pulp calls a
+/// closure is compiled for the baseline.
+struct Walk<'a> {
+    mesh: &'a RayMesh,
+    rays: &'a [(Vec3, Vec3)],
+    hits: &'a mut [Option<Hit>],
+    stack: &'a mut Vec<(f32, u32)>,
+}
+
+impl pulp::WithSimd for Walk<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: pulp::Simd>(self, _: S) {
+        self.mesh.packet(self.rays, self.hits, self.stack);
+    }
+}
 
 impl RayMesh {
     /// [`RayMesh::first_hit`] of many `rays` (R), each an origin and a direction, into `hits` (R), overwritten.
@@ -29,10 +46,7 @@ impl RayMesh {
         rays.par_chunks(TASK).zip(hits.par_chunks_mut(TASK)).for_each(|(rays, hits)| {
             let mut stack = Vec::with_capacity(self.tree.depth);
             for (rays, hits) in rays.chunks(WIDTH).zip(hits.chunks_mut(WIDTH)) {
-                pulp::Arch::new().dispatch(Kernel(
-                    #[inline(always)]
-                    || self.packet(rays, hits, &mut stack),
-                ));
+                pulp::Arch::new().dispatch(Walk { mesh: self, rays, hits, stack: &mut stack });
             }
         });
     }

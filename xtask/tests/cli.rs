@@ -1,30 +1,19 @@
 //! The command line as somebody meets it: help, and one clear line for whatever is wrong.
 #![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
 
-use std::path::{Path, PathBuf};
+mod common;
+
+use std::path::Path;
 use std::process::{Command, Output};
+
+use common::folder;
 
 fn xtask(arguments: &[&str]) -> Output {
     Command::new(env!("CARGO_BIN_EXE_xtask")).args(arguments).env_remove("SMPL_MODEL").output().unwrap()
 }
 
-/// Fails with one line on standard error that names every one of `words`, and without a panic.
 fn refused(arguments: &[&str], words: &[&str]) {
-    let output = xtask(arguments);
-    let text = String::from_utf8_lossy(&output.stderr).into_owned();
-    assert!(!output.status.success(), "{arguments:?} succeeded");
-    assert_eq!(text.trim_end().lines().count(), 1, "{arguments:?}: {text}");
-    assert!(text.starts_with("error: ") && !text.contains("panicked"), "{arguments:?}: {text}");
-    for word in words {
-        assert!(text.contains(word), "{arguments:?} should name {word}: {text}");
-    }
-}
-
-fn folder(name: &str) -> PathBuf {
-    let path = Path::new(env!("CARGO_TARGET_TMPDIR")).join(name);
-    let _ = std::fs::remove_dir_all(&path);
-    std::fs::create_dir_all(&path).unwrap();
-    path
+    common::refused(&xtask(arguments), &format!("{arguments:?}"), words);
 }
 
 fn text(path: &Path) -> &str {

@@ -3,7 +3,6 @@
 use glam::{Affine3A, Mat3, Mat3A, Vec3, Vec3A};
 
 use super::field::{MotionFrame, SurfacePoint};
-use super::surface::MIN_DETERMINANT;
 use super::{MotionSample, SurfaceMotion, WeightVolume};
 use crate::pose::blend;
 
@@ -83,7 +82,7 @@ impl SurfaceMotion {
             linear += bones[k].matrix3 * barycentric[k];
         }
         let mut matrix;
-        if linear.determinant() < MIN_DETERMINANT {
+        if linear.determinant() < Self::MIN_DETERMINANT {
             let weights = || {
                 (corners.iter().zip(barycentric))
                     .flat_map(|(&v, b)| model.weights.row(v).map(move |(joint, w)| (joint, b * w)))
@@ -102,9 +101,7 @@ impl SurfaceMotion {
         }
         // f falls along the outward normal, only beyond the margin, where the distance is not 0.
         let foot: Vec3 = (0..3).map(|k| barycentric[k] * positions[k]).sum();
-        let s = (signed_distance - self.margin) / self.falloff;
-        let slope = if s > 0.0 && s < 1.0 { -6.0 * s * (1.0 - s) / self.falloff } else { 0.0 };
-        let gradient = slope * (point - foot).normalize_or_zero();
+        let gradient = self.likelihood_slope(signed_distance) * (point - foot).normalize_or_zero();
         matrix.is_finite().then_some((sample, matrix, gradient))
     }
 }

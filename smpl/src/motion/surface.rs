@@ -6,10 +6,6 @@ use super::MotionSample;
 use crate::model::BodyModel;
 use crate::pose::{Posed, blend};
 
-/// Blended bones with a determinant below this are replaced by the heaviest bone alone. Two rigid bones in equal parts
-/// reach it at a relative turn of 154°.
-pub(super) const MIN_DETERMINANT: f32 = 0.05;
-
 /// Motion field whose weights are those of the nearest point of the posed surface (DESIGN §3, surface kind).
 ///
 /// The likelihood is 1 inside the body and outside up to `margin` from it, then falls with a continuous derivative to 0
@@ -30,6 +26,10 @@ impl Default for SurfaceMotion {
 }
 
 impl SurfaceMotion {
+    /// Blended bones with a determinant below this are replaced by the heaviest bone alone. Two rigid bones in equal parts
+    /// reach it at a relative turn of 154°.
+    pub const MIN_DETERMINANT: f32 = 0.05;
+
     /// Maps `point`, whose nearest surface point lies on `face` at `barycentric` and is `signed_distance` away (outside
     /// positive): x̂ = (Σ w_i A_i)⁻¹ x − B_P, with weights w and pose offset B_P interpolated on the face.
     ///
@@ -60,7 +60,7 @@ impl SurfaceMotion {
                 .flat_map(|(&v, b)| model.weights.row(v).map(move |(joint, w)| (joint, b * w)))
         };
         let mut to_world = blend(&posed.bones, weights());
-        if to_world.matrix3.determinant() < MIN_DETERMINANT {
+        if to_world.matrix3.determinant() < Self::MIN_DETERMINANT {
             to_world = posed.bones[heaviest(weights())];
         }
         let offset: Vec3 = (corners.iter().zip(barycentric)).map(|(&v, b)| b * posed.pose_offsets[v]).sum();

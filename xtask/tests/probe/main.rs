@@ -2,6 +2,8 @@
 //! whatever is wrong.
 #![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
 
+#[path = "../common/mod.rs"]
+mod common;
 mod refusals;
 
 use std::path::{Path, PathBuf};
@@ -43,10 +45,7 @@ fn without(mut arrays: Arrays, key: &str) -> Arrays {
 
 /// An empty folder of a test's own.
 fn folder(name: &str) -> PathBuf {
-    let path = Path::new(env!("CARGO_TARGET_TMPDIR")).join("probe").join(name);
-    let _ = std::fs::remove_dir_all(&path);
-    std::fs::create_dir_all(&path).unwrap();
-    path
+    common::folder(&format!("probe/{name}"))
 }
 
 fn run(op: &str, input: &Path, out: &Path, options: &[&str]) -> Output {

@@ -1,19 +1,7 @@
 //! One clear line for whatever is wrong.
 
-use std::process::Output;
-
+use super::common::refused;
 use super::*;
-
-/// Fails with one line on standard error that names every one of `words`, and without a panic.
-fn refused(output: &Output, what: &str, words: &[&str]) {
-    let text = String::from_utf8_lossy(&output.stderr).into_owned();
-    assert!(!output.status.success(), "{what} succeeded");
-    assert_eq!(text.trim_end().lines().count(), 1, "{what}: {text}");
-    assert!(text.starts_with("error: ") && !text.contains("panicked"), "{what}: {text}");
-    for word in words {
-        assert!(text.contains(word), "{what} should name {word}: {text}");
-    }
-}
 
 #[test]
 fn whatever_is_wrong_with_the_arrays_is_named_in_one_line() {
