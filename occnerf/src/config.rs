@@ -68,8 +68,20 @@ pub enum MotionKind {
 pub enum DistanceKind {
     /// The paper's blend of the k nearest vertices by normal similarity.
     Blended,
+    /// The blended vertex, and the mean distance to the k nearest with the sign of the majority, as the published code has it.
+    Mean,
     /// The closest point of the triangle mesh and its signed distance.
     Exact,
+}
+
+/// How counts become weights of the surface term.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum AttentionKind {
+    /// The paper's: each vertex its share in the counts of all neighbours.
+    Share,
+    /// The published code's: a softmax of the counts scaled to [0, 1], nearly uniform.
+    Softmax,
 }
 
 /// Where the attention's counts come from.
@@ -92,6 +104,8 @@ pub enum Preset {
     Balanced,
     /// The paper's setting.
     Paper,
+    /// The same with the departures of the code that was published with it.
+    PublishedCode,
 }
 
 impl Preset {
@@ -101,6 +115,7 @@ impl Preset {
             Self::Fast => "fast",
             Self::Balanced => "balanced",
             Self::Paper => "paper",
+            Self::PublishedCode => "published-code",
         }
     }
 }
@@ -170,6 +185,8 @@ pub struct SurfaceConfig {
     pub surface_term: bool,
     /// Whether the surface term is weighted by the visibility counts.
     pub attention: bool,
+    /// How.
+    pub attention_kind: AttentionKind,
     /// Where those counts come from.
     pub visibility: VisibilityKind,
 }
@@ -265,6 +282,7 @@ impl Config {
     pub fn preset(preset: Preset, method: Method) -> Self {
         let mut config = match preset {
             Preset::Paper => presets::paper(),
+            Preset::PublishedCode => presets::published_code(),
             Preset::Balanced => presets::balanced(),
             Preset::Fast => presets::fast(),
         };
@@ -278,9 +296,21 @@ impl Config {
         }
         if method == Method::Humannerf {
             // Without a hash grid the perceptron has to hold the whole person.
-            (config.field.width, config.field.depth) = if preset == Preset::Paper { (256, 8) } else { (128, 4) };
+            (config.field.width, config.field.depth) = match preset {
+                Preset::Paper | Preset::PublishedCode => (256, 8),
+                Preset::Fast | Preset::Balanced => (128, 4),
+            };
         }
         config
+    }
+
+    /// Departs from the paper as the code published with it does, as far as that is more than a defect: attention
+    /// through a softmax, ten neighbours a level, mean distances with the sign of the majority, hidden pixels taught as background.
+    pub fn depart_as_published(&mut self) {
+        self.surface.attention_kind = AttentionKind::Softmax;
+        self.surface.k = 10;
+        self.surface.distance = DistanceKind::Mean;
+        self.occluded = OccludedRule::Background;
     }
 
     /// Switches a component of the method off.
@@ -300,7 +330,7 @@ mod tests {
 
     #[test]
     fn every_preset_of_every_method_is_valid_and_survives_toml() {
-        for preset in [Preset::Fast, Preset::Balanced, Preset::Paper] {
+        for preset in [Preset::Fast, Preset::Balanced, Preset::Paper, Preset::PublishedCode] {
             for method in [Method::Prior, Method::Humannerf, Method::HashPoint, Method::Occnerf] {
                 let config = Config::preset(preset, method);
                 config.validate().unwrap();

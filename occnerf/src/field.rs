@@ -5,7 +5,7 @@ use visibility::VisibilityCounts;
 use volrender::Aabb;
 
 use crate::Error;
-use crate::config::{Config, Method};
+use crate::config::{AttentionKind, Config, Method};
 use crate::encoder::{Coordinates, Encoder};
 use crate::gemm::LANES;
 use crate::mlp::{Activations, Mlp};
@@ -23,7 +23,7 @@ pub(crate) struct Field {
     pub mlp: Mlp,
     /// Whether the input has a surface term.
     pub surface_term: bool,
-    attention: bool,
+    attention: Option<AttentionKind>,
     density_scale: f32,
     /// Bias at d ≤ 0 and its change per metre up to the reach.
     density_bias: (f32, f32),
@@ -66,7 +66,7 @@ impl Field {
             mlp: Mlp::new(inputs, &vec![config.field.width; config.field.depth], OUTPUTS),
             encoder,
             surface_term,
-            attention: config.surface.attention,
+            attention: config.surface.attention.then_some(config.surface.attention_kind),
             density_scale: config.field.density_scale,
             density_bias: (config.field.density_bias, slope),
             reach,
@@ -163,10 +163,12 @@ impl Field {
         let total = group.samples.neighbours.len();
         let per_sample = total.checked_div(group.samples.len()).unwrap_or(1).max(1);
         group.attention.resize(total, 1.0 / per_sample as f32);
-        if self.attention {
-            let rows = group.samples.neighbours.chunks_exact(per_sample);
-            for (neighbours, out) in rows.zip(group.attention.chunks_exact_mut(per_sample)) {
-                counts.attention(neighbours, out);
+        let Some(kind) = self.attention else { return };
+        let rows = group.samples.neighbours.chunks_exact(per_sample);
+        for (neighbours, out) in rows.zip(group.attention.chunks_exact_mut(per_sample)) {
+            match kind {
+                AttentionKind::Share => counts.attention(neighbours, out),
+                AttentionKind::Softmax => counts.softmax_attention(neighbours, out),
             }
         }
     }

@@ -55,8 +55,8 @@ mod vertices;
 
 pub use checkpoint::checkpoint_config;
 pub use config::{
-    Component, Config, DistanceKind, EncodingConfig, FieldConfig, LossConfig, Method, MotionConfig, MotionKind,
-    OccludedRule, Preset, RateConfig, SurfaceConfig, VisibilityKind,
+    AttentionKind, Component, Config, DistanceKind, EncodingConfig, FieldConfig, LossConfig, Method, MotionConfig,
+    MotionKind, OccludedRule, Preset, RateConfig, SurfaceConfig, VisibilityKind,
 };
 pub use error::Error;
 pub use evaluate::{FrameMetrics, SplitMetrics, evaluate, least_seen_quartile};

@@ -1,6 +1,6 @@
 //! The field's multilayer perceptron: ReLU hidden layers, a linear head, both directions by hand.
 
-use crate::gemm::{LANES, Strided, multiply_add};
+use crate::gemm::{LANES, Left, multiply_add};
 use crate::random::Stream;
 
 /// Shape of a perceptron and where its weights lie in one flat slice.
@@ -94,7 +94,7 @@ impl Mlp {
             for row in y.chunks_exact_mut(outputs) {
                 row.copy_from_slice(biases);
             }
-            multiply_add(samples, outputs, inputs, Strided::rows(x, inputs), weights, y);
+            multiply_add(samples, outputs, inputs, Left::Rows(x), weights, y);
             if layer + 1 < self.num_layers() {
                 y.iter_mut().for_each(|v| *v = v.max(0.0));
             }
@@ -119,14 +119,14 @@ impl Mlp {
             let d_y = &d_output[..samples * outputs];
             let weight_range = self.offsets[layer]..self.offsets[layer + 1];
             let (d_weights, d_biases) = d_parameters[weight_range].split_at_mut(inputs * outputs);
-            multiply_add(inputs, outputs, samples, Strided::transposed(x, inputs), d_y, d_weights);
+            multiply_add(inputs, outputs, samples, Left::Transposed(x), d_y, d_weights);
             for row in d_y.chunks_exact(outputs) {
                 d_biases.iter_mut().zip(row).for_each(|(sum, d)| *sum += d);
             }
             d_input.clear();
             d_input.resize(samples * inputs, 0.0);
             let weights = &transposed[self.offsets[layer]..][..inputs * outputs];
-            multiply_add(samples, inputs, outputs, Strided::rows(d_y, outputs), weights, d_input);
+            multiply_add(samples, inputs, outputs, Left::Rows(d_y), weights, d_input);
             if layer > 0 {
                 d_input.iter_mut().zip(x).for_each(|(d, &x)| {
                     if x <= 0.0 {

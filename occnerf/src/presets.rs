@@ -1,8 +1,8 @@
 //! The named settings, every value in one place.
 
 use crate::config::{
-    Config, DistanceKind, EncodingConfig, FieldConfig, LossConfig, Method, MotionConfig, MotionKind, OccludedRule,
-    Preset, RateConfig, SurfaceConfig, VisibilityKind,
+    AttentionKind, Config, DistanceKind, EncodingConfig, FieldConfig, LossConfig, Method, MotionConfig, MotionKind,
+    OccludedRule, Preset, RateConfig, SurfaceConfig, VisibilityKind,
 };
 
 /// The paper's setting; what it leaves open is named in ARCHITECTURE.
@@ -32,6 +32,7 @@ pub(crate) fn paper() -> Config {
             distance: DistanceKind::Blended,
             surface_term: true,
             attention: true,
+            attention_kind: AttentionKind::Share,
             visibility: VisibilityKind::Counted,
         },
         motion: MotionConfig {
@@ -52,6 +53,13 @@ pub(crate) fn paper() -> Config {
             beta_2: 0.999,
         },
     }
+}
+
+/// The paper's setting as the published code has it.
+pub(crate) fn published_code() -> Config {
+    let mut config = Config { preset: Preset::PublishedCode, ..paper() };
+    config.depart_as_published();
+    config
 }
 
 /// The default.

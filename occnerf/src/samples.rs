@@ -215,7 +215,9 @@ impl Samples {
         let (closest, distance) = on_surface.unwrap_or_else(|| {
             let finest = &self.neighbours[first..][..tracer.config.surface.k];
             let blended = query.blend(sample.canonical, finest);
-            (blended.point, blended.signed_distance)
+            let mean = tracer.config.surface.distance == DistanceKind::Mean;
+            let distance = if mean { query.mean_distance(sample.canonical, finest).0 } else { blended.signed_distance };
+            (blended.point, distance)
         });
         if !(distance <= reach && distance >= -motion.depth && sample.likelihood > 0.0) {
             self.neighbours.truncate(first);

@@ -157,6 +157,11 @@ impl Trainer<'_> {
                     let finest = &samples.neighbours[s * per_sample..][..self.config.surface.k];
                     self.scene.query.blend_backward(x, finest, d_closest, d_distance)
                 }
+                DistanceKind::Mean => {
+                    let finest = &samples.neighbours[s * per_sample..][..self.config.surface.k];
+                    let query = &self.scene.query;
+                    d_distance * query.mean_distance(x, finest).1 + query.blend_backward(x, finest, d_closest, 0.0)
+                }
                 DistanceKind::Exact => {
                     let away = (x - samples.closest[s]) * samples.distance[s].signum();
                     let normal = away.normalize_or_zero();

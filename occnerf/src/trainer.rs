@@ -192,7 +192,7 @@ impl<'a> Trainer<'a> {
             to_canonical: &frame.to_canonical,
             volume: self.volume.as_ref(),
             faces: !self.parameters.get(Part::Pose).is_empty(),
-            neighbours: self.field.surface_term || self.config.surface.distance == DistanceKind::Blended,
+            neighbours: self.field.surface_term || self.config.surface.distance != DistanceKind::Exact,
         }
     }
 

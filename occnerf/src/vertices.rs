@@ -69,10 +69,13 @@ impl VertexCode {
 /// Signed distance of a point to the initial mesh and its gradient, by the query that samples use.
 fn distance_with_gradient(scene: &Scene, config: &Config, vertex: usize, position: Vec3) -> (f32, Vec3) {
     match config.surface.distance {
-        DistanceKind::Blended => {
+        kind @ (DistanceKind::Blended | DistanceKind::Mean) => {
             let mut neighbours = vec![0; scene.query.neighbours_per_query()];
             scene.query.neighbours(position, &mut neighbours);
             let finest = &neighbours[..config.surface.k];
+            if kind == DistanceKind::Mean {
+                return scene.query.mean_distance(position, finest);
+            }
             let blended = scene.query.blend(position, finest);
             (blended.signed_distance, scene.query.blend_backward(position, finest, Vec3::ZERO, 1.0))
         }

@@ -1,4 +1,4 @@
-//! Test kit of the workspace: meshes, proptest strategies, a finite-difference gradient checker and
+//! Test kit of the workspace: meshes, proptest strategies, a finite-difference gradient checker, rank statistics and
 //! brute-force oracles.
 //!
 //! Everything here is written to be obviously right rather than fast. The oracles take slices and glam values
@@ -21,6 +21,7 @@
 pub mod gradient;
 pub mod mesh;
 pub mod oracle;
+pub mod statistics;
 pub mod strategy;
 
 pub use glam;

@@ -6,7 +6,8 @@ mod common;
 use common::{METHODS, body, capture, scene, silhouette, tiny};
 use glam::Vec3;
 use occnerf::{
-    Config, FieldRenderer, Method, MotionKind, PreparedFrame, Preset, Renderer, Scene, StepReport, Trainer, evaluate,
+    Config, DistanceKind, FieldRenderer, Method, MotionKind, PreparedFrame, Preset, Renderer, Scene, StepReport,
+    Trainer, evaluate,
 };
 
 /// Whole tables take a while to draw, and start near zero whatever their size.
@@ -89,7 +90,7 @@ fn a_short_training_lowers_the_loss_and_beats_its_own_start() {
 #[test]
 fn every_motion_and_distance_trains_without_bad_gradients() {
     for motion in [MotionKind::Surface, MotionKind::Volume, MotionKind::Gaussian] {
-        for distance in [occnerf::DistanceKind::Blended, occnerf::DistanceKind::Exact] {
+        for distance in [DistanceKind::Blended, DistanceKind::Mean, DistanceKind::Exact] {
             let mut config = tiny(Method::Occnerf, motion);
             config.surface.distance = distance;
             // Large steps reach strange parameters sooner.

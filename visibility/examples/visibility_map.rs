@@ -15,6 +15,7 @@ use body::Random;
 use glam::{Affine3A, Mat3, Vec3};
 use image::{Rgb, RgbImage};
 use smpl::BodyModel;
+use testkit::statistics::{ranks, spearman};
 use visibility::{RayMesh, View, VisibilityCounts, visible_vertices};
 
 const SIZE: u32 = 240;
@@ -85,7 +86,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let never = |counts: &VisibilityCounts| counts.counts().iter().filter(|c| **c == 0).count();
     println!("{FRAMES} frames of {} vertices cast in {:.0} ms", vertices.len(), casting.as_secs_f64() * 1e3);
     println!("never seen: {} vertices, never counted: {}", never(&exact), never(&counted));
-    println!("Spearman's rank correlation: {:.3}", correlation(&ranks(exact.counts()), &ranks(counted.counts())));
+    println!("Spearman's rank correlation: {:.3}", spearman(exact.counts(), counted.counts()));
 
     let mut picture = RgbImage::from_pixel(4 * SIZE, SIZE, Rgb([255; 3]));
     for (panel, (counts, angle)) in
@@ -128,27 +129,4 @@ fn nearest(vertices: &[Vec3], x: Vec3) -> [u32; K] {
         }
     }
     best.map(|b| b.1)
-}
-
-/// Ranks from 1; equal counts share their mean rank.
-fn ranks(counts: &[u64]) -> Vec<f64> {
-    let mut order: Vec<usize> = (0..counts.len()).collect();
-    order.sort_by_key(|&i| counts[i]);
-    let mut ranks = vec![0.0; counts.len()];
-    let mut first = 0;
-    for group in order.chunk_by(|&a, &b| counts[a] == counts[b]) {
-        for &i in group {
-            ranks[i] = first as f64 + (group.len() + 1) as f64 / 2.0;
-        }
-        first += group.len();
-    }
-    ranks
-}
-
-/// Pearson's, of ranks: Spearman's.
-fn correlation(a: &[f64], b: &[f64]) -> f64 {
-    let mean = |x: &[f64]| x.iter().sum::<f64>() / x.len() as f64;
-    let (mean_a, mean_b) = (mean(a), mean(b));
-    let sum = |f: &dyn Fn(f64, f64) -> f64| a.iter().zip(b).map(|(a, b)| f(a - mean_a, b - mean_b)).sum::<f64>();
-    sum(&|a, b| a * b) / (sum(&|a, _| a * a) * sum(&|_, b| b * b)).sqrt()
 }

@@ -3,9 +3,9 @@
 use anyhow::Result;
 use occnerf::{Config, Method, OccludedRule};
 
-use crate::run::{METRICS, Metrics, RunConfig};
+use crate::run::{Metrics, RunConfig};
 use crate::settings::MethodName;
-use crate::train::{TrainArguments, run_one, scene_name};
+use crate::train::{TrainArguments, run_unless_finished, scene_name};
 use crate::{run, source, table};
 
 const RUNS: [(MethodName, OccludedRule); 7] = [
@@ -40,18 +40,7 @@ pub fn compare(arguments: &TrainArguments) -> Result<()> {
             load: source.load.clone(),
             train: config,
         };
-        let finished = directory.join(METRICS).is_file();
-        if finished && RunConfig::read(&directory).is_ok_and(|old| old.train == run.train && old.load == run.load) {
-            println!("{name}: finished earlier");
-            rows.push((run.train.method.name().to_owned(), Metrics::read(&directory)?));
-            continue;
-        }
-        println!("{name}: training");
-        std::fs::create_dir_all(directory.join("renders"))?;
-        run.write(&directory)?;
-        if let Some(metrics) = run_one(&directory, &run, &source, false, None)? {
-            rows.push((metrics.method.clone(), metrics));
-        }
+        rows.push((run.train.method.name().to_owned(), run_unless_finished(&directory, &name, &run, &source)?));
     }
     let rows: Vec<(String, &Metrics)> = rows.iter().map(|(name, metrics)| (name.clone(), metrics)).collect();
     let text = table::markdown(&rows);

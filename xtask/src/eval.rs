@@ -95,6 +95,15 @@ pub fn eval(arguments: &EvalArguments) -> Result<()> {
     Ok(())
 }
 
+fn scored_train_frames(scene: &Scene) -> impl Iterator<Item = &PreparedFrame> {
+    scene.train.iter().step_by(TRAIN_STRIDE)
+}
+
+/// Every frame that a finished run is scored on.
+pub fn scored_frames(scene: &Scene) -> impl Iterator<Item = &PreparedFrame> {
+    scene.eval.iter().chain(scored_train_frames(scene))
+}
+
 /// What can be scored and drawn.
 pub enum Model<'a> {
     Field(&'a Trainer<'a>),
@@ -119,7 +128,7 @@ impl Model<'_> {
     ) -> Result<SplitMetrics> {
         let frames: Vec<&PreparedFrame> = match split {
             Split::NovelView => scene.eval.iter().collect(),
-            Split::TrainView => scene.train.iter().step_by(TRAIN_STRIDE).collect(),
+            Split::TrainView => scored_train_frames(scene).collect(),
         };
         Ok(evaluate(scene, self.renderer(scene)?.as_mut(), &frames, seen)?)
     }
@@ -132,7 +141,7 @@ impl Model<'_> {
     ) -> Result<SplitMetrics> {
         let frames = match split {
             Split::NovelView => scene.eval.len(),
-            Split::TrainView => scene.train.len().div_ceil(TRAIN_STRIDE),
+            Split::TrainView => scored_train_frames(scene).count(),
         };
         let bar = ProgressBar::new(frames as u64).with_message("scoring");
         let metrics = self.score(scene, split, |frame, rendering| {

@@ -7,6 +7,7 @@ mod pictures;
 mod probe;
 mod render;
 mod report;
+mod reproduce;
 mod run;
 mod settings;
 mod source;
@@ -31,6 +32,8 @@ enum Command {
     Eval(eval::EvalArguments),
     /// Draws a run's person: its movement, from all around, or in the rest pose.
     Render(render::RenderArguments),
+    /// The paper's table on captures: every baseline and ablation, several seeds, one budget.
+    Reproduce(reproduce::ReproduceArguments),
     /// Runs one function of one crate on numpy arrays.
     Probe(probe::ProbeArguments),
     /// Converts a body model, .npz or .pkl, to .safetensors.
@@ -42,6 +45,7 @@ fn main() -> std::process::ExitCode {
         Command::Train(arguments) => train::train(&arguments),
         Command::Eval(arguments) => eval::eval(&arguments),
         Command::Render(arguments) => render::render(&arguments),
+        Command::Reproduce(arguments) => reproduce::reproduce(&arguments),
         Command::Probe(arguments) => probe::probe(&arguments),
         Command::Convert(arguments) => convert::convert(&arguments),
     };

@@ -40,6 +40,14 @@ pub fn sheet(rows: &[Vec<RgbImage>]) -> RgbImage {
     sheet
 }
 
+/// The pictures of one column of a [`sheet`] whose largest picture has the size `cell`.
+pub fn column(sheet: &RgbImage, column: u32, cell: (u32, u32)) -> Vec<RgbImage> {
+    let rows = sheet.height().saturating_sub(GAP) / (cell.1 + GAP);
+    let x = GAP + column * (cell.0 + GAP);
+    let at = |row| imageops::crop_imm(sheet, x, GAP + row * (cell.1 + GAP), cell.0, cell.1).to_image();
+    (0..rows).map(at).collect()
+}
+
 /// Writes a PNG.
 pub fn save(picture: &RgbImage, path: &Path) -> Result<()> {
     picture.save(path).with_context(|| path.display().to_string())
@@ -55,4 +63,16 @@ pub fn film(pictures: &[RgbImage], fps: u32, path: &Path) -> Result<()> {
         encoder.encode_frame(Frame::from_parts(rgba, 0, 0, Delay::from_numer_denom_ms(1000, fps)))?;
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn columns_of_a_sheet_are_the_pictures_it_was_made_of() {
+        let picture = |value| RgbImage::from_pixel(5, 3, Rgb([value; 3]));
+        let sheet = sheet(&[vec![picture(1), picture(2)], vec![picture(3), picture(4)]]);
+        assert_eq!(column(&sheet, 1, (5, 3)), [picture(2), picture(4)]);
+    }
 }

@@ -36,6 +36,19 @@ pub enum PresetName {
     Balanced,
     /// The paper's setting: over an hour.
     Paper,
+    /// The same with the choices of the code that was published with the paper.
+    PublishedCode,
+}
+
+impl From<PresetName> for Preset {
+    fn from(name: PresetName) -> Self {
+        match name {
+            PresetName::Fast => Self::Fast,
+            PresetName::Balanced => Self::Balanced,
+            PresetName::Paper => Self::Paper,
+            PresetName::PublishedCode => Self::PublishedCode,
+        }
+    }
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
@@ -83,11 +96,7 @@ pub struct SettingArguments {
 impl SettingArguments {
     /// The preset with everything given on the command line applied.
     pub fn config(&self) -> Result<Config> {
-        let preset = match self.preset.unwrap_or(PresetName::Balanced) {
-            PresetName::Fast => Preset::Fast,
-            PresetName::Balanced => Preset::Balanced,
-            PresetName::Paper => Preset::Paper,
-        };
+        let preset = self.preset.unwrap_or(PresetName::Balanced).into();
         let method = self.method.map_or(Method::Occnerf, Method::from);
         self.apply(Config::preset(preset, method))
     }

@@ -44,21 +44,27 @@ pub fn markdown(rows: &[(String, &Metrics)]) -> String {
             m.parameters.to_string(),
         ]);
     }
+    aligned(&lines, 2)
+}
+
+/// Lines of cells, the first of them the header, as a Markdown table; all columns but the first `left` are aligned right.
+pub fn aligned(lines: &[Vec<String>], left: usize) -> String {
+    let columns = lines.first().map_or(0, Vec::len);
     let widths: Vec<usize> =
-        (0..header.len()).map(|c| lines.iter().map(|l| l[c].chars().count()).max().unwrap_or(0)).collect();
+        (0..columns).map(|c| lines.iter().map(|l| l[c].chars().count()).max().unwrap_or(0)).collect();
     let mut text = String::new();
     for (i, line) in lines.iter().enumerate() {
         let cells = line
             .iter()
             .zip(&widths)
             .enumerate()
-            .map(|(c, (cell, &w))| if c < 2 { format!("{cell:<w$}") } else { format!("{cell:>w$}") });
+            .map(|(c, (cell, &w))| if c < left { format!("{cell:<w$}") } else { format!("{cell:>w$}") });
         text.push_str(&format!("| {} |\n", cells.collect::<Vec<_>>().join(" | ")));
         if i == 0 {
             let rules = widths
                 .iter()
                 .enumerate()
-                .map(|(c, &w)| if c < 2 { "-".repeat(w) } else { format!("{}:", "-".repeat(w.saturating_sub(1))) });
+                .map(|(c, &w)| if c < left { "-".repeat(w) } else { format!("{}:", "-".repeat(w.saturating_sub(1))) });
             text.push_str(&format!("| {} |\n", rules.collect::<Vec<_>>().join(" | ")));
         }
     }

@@ -12,7 +12,7 @@ use occnerf::{Method, Scene, StepReport, Trainer, VertexColors, checkpoint_confi
 use crate::compare::compare;
 use crate::eval::{Model, score_run};
 use crate::run::{
-    CHECKPOINT, Metrics, RunConfig, Splits, existing_directory, new_directory, peak_rss_bytes, use_threads,
+    CHECKPOINT, METRICS, Metrics, RunConfig, Splits, existing_directory, new_directory, peak_rss_bytes, use_threads,
 };
 use crate::settings::SettingArguments;
 use crate::source::{self, LoadArguments, Source};
@@ -130,6 +130,22 @@ pub fn run_one(
     }
     let metrics = metrics(run, seconds, trainer.num_parameters());
     score_run(directory, run, &scene, &Model::Field(&trainer), metrics).map(Some)
+}
+
+/// The scores of a run under `directory`: those it has if it finished earlier with the same settings; else it goes on from its
+/// checkpoint, or starts.
+pub fn run_unless_finished(directory: &Path, name: &str, run: &RunConfig, source: &Source) -> Result<Metrics> {
+    let earlier = RunConfig::read(directory).is_ok_and(|old| old.train == run.train && old.load == run.load);
+    if earlier && directory.join(METRICS).is_file() {
+        println!("{name}: finished earlier");
+        return Metrics::read(directory);
+    }
+    println!("{name}: training");
+    std::fs::create_dir_all(directory.join("renders"))?;
+    run.write(directory)?;
+    let resume = earlier && directory.join(CHECKPOINT).is_file();
+    let metrics = run_one(directory, run, source, resume, None)?;
+    metrics.with_context(|| format!("{name}: stopped before its end"))
 }
 
 fn metrics(run: &RunConfig, train_seconds: f64, parameters: usize) -> Metrics {

@@ -1,0 +1,143 @@
+//! How many steps a budget pays for, by a measurement on this machine.
+
+use std::collections::BTreeMap;
+use std::fmt;
+use std::path::Path;
+use std::time::Instant;
+
+use anyhow::{Context, Result};
+use glam::Vec3;
+use occnerf::{FieldRenderer, Method, PreparedFrame, Preset, Renderer, Scene, Trainer};
+use serde::{Deserialize, Serialize};
+
+use super::rows::{Length, Row};
+use crate::run;
+use crate::source::Source;
+
+/// Steps before and of a measurement.
+const WARM: u64 = 4;
+const TIMED: u64 = 10;
+/// Fewer steps than this say nothing about any method.
+const FEWEST: u64 = 20;
+/// Part of the budget that is planned for; the rest is for preparing scenes and for slow moments.
+const SPARE: f64 = 0.85;
+
+/// What every row of a scene is given.
+#[derive(Debug, PartialEq, Serialize, Deserialize)]
+pub struct Plan {
+    preset: String,
+    seeds: u64,
+    /// Minutes; none where the number of steps was given.
+    budget: Option<f64>,
+    /// Of a row that is not longer than the others.
+    pub steps: u64,
+    /// Seconds of a step and of a scored picture of each method, measured before everything else.
+    cost: BTreeMap<String, (f64, f64)>,
+}
+
+impl Plan {
+    /// The plan that an earlier sitting left under `directory` for the same request, or a new one.
+    pub fn read_or_make(
+        directory: &Path,
+        source: &Source,
+        rows: &[&Row],
+        preset: Preset,
+        seeds: u64,
+        minutes: f64,
+        steps: Option<u64>,
+    ) -> Result<Self> {
+        let path = directory.join("plan.json");
+        let budget = if steps.is_some() { None } else { Some(minutes) };
+        if path.is_file() {
+            let text = std::fs::read_to_string(&path).with_context(|| path.display().to_string())?;
+            let old: Self = serde_json::from_str(&text).with_context(|| path.display().to_string())?;
+            let same_steps = steps.is_none_or(|s| s == old.steps);
+            if old.preset == preset.name() && old.seeds == seeds && old.budget == budget && same_steps {
+                return Ok(old);
+            }
+        }
+        let (mut cost, mut pictures) = (BTreeMap::new(), 0);
+        for method in [Method::Humannerf, Method::HashPoint, Method::Occnerf] {
+            if let Some(row) = rows.iter().find(|row| row.method == method) {
+                let (seconds, scored) = measure(source, row, preset)?;
+                cost.insert(method.name().to_owned(), seconds);
+                pictures = scored;
+            }
+        }
+        let mut plan = Self { preset: preset.name().to_owned(), seeds, budget, steps: 1, cost };
+        let (mut a_step, mut fixed) = (0.0, 0.0);
+        for row in rows.iter().filter(|row| row.learns()) {
+            let (step, picture) = plan.cost(row);
+            // At one step `factor` is the number of steps.
+            a_step += row.runs(seeds) as f64 * plan.factor(row) * step;
+            fixed += row.runs(seeds) as f64 * pictures as f64 * picture;
+        }
+        let affordable = (SPARE * 60.0 * minutes - fixed) / a_step.max(1e-9);
+        plan.steps = steps.unwrap_or(affordable.clamp(FEWEST as f64, 1e6) as u64);
+        if steps.is_none() && affordable < FEWEST as f64 {
+            eprintln!(
+                "warning: {minutes:.0} minutes do not pay for {FEWEST} steps a run beside {:.0} minutes of scoring; \
+                 fewer --seeds, a larger --eval-stride or --without would",
+                fixed / 60.0
+            );
+        }
+        run::write(&path, &serde_json::to_string_pretty(&plan)?)?;
+        Ok(plan)
+    }
+
+    fn cost(&self, row: &Row) -> (f64, f64) {
+        self.cost.get(row.method.name()).copied().unwrap_or_default()
+    }
+
+    fn factor(&self, row: &Row) -> f64 {
+        match row.length {
+            Length::Steps => 1.0,
+            Length::FourTimes => 4.0,
+            Length::Seconds => {
+                let reference = self.cost.get(Method::Occnerf.name()).map_or(0.0, |c| c.0);
+                let own = self.cost(row).0;
+                if reference > 0.0 && own > 0.0 { reference / own } else { 1.0 }
+            }
+        }
+    }
+
+    /// Steps of a row.
+    pub fn steps_of(&self, row: &Row) -> u64 {
+        ((self.steps as f64 * self.factor(row)).round() as u64).max(1)
+    }
+}
+
+impl fmt::Display for Plan {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "plan: preset {}, {} steps a run, {} seeds", self.preset, self.steps, self.seeds)?;
+        if let Some(budget) = self.budget {
+            write!(f, ", sized for {budget:.0} minutes")?;
+        }
+        for (method, (step, picture)) in &self.cost {
+            write!(f, "; {method} {step:.3} s a step, {picture:.2} s a picture")?;
+        }
+        Ok(())
+    }
+}
+
+/// Seconds of a step and of a picture, and how many pictures a run is scored on.
+fn measure(source: &Source, row: &Row, preset: Preset) -> Result<((f64, f64), usize)> {
+    let config = row.settings(preset);
+    let scene = Scene::new(&source.capture, &source.model, &config)?;
+    let mut trainer = Trainer::new(&scene, config)?;
+    for _ in 0..WARM {
+        trainer.step();
+    }
+    let start = Instant::now();
+    for _ in 0..TIMED {
+        trainer.step();
+    }
+    let step = start.elapsed().as_secs_f64() / TIMED as f64;
+    let scored: Vec<&PreparedFrame> = crate::eval::scored_frames(&scene).collect();
+    let mut renderer = FieldRenderer::new(&trainer)?;
+    let start = Instant::now();
+    if let Some(frame) = scored.first() {
+        renderer.render(frame, Vec3::ZERO)?;
+    }
+    Ok(((step, start.elapsed().as_secs_f64()), scored.len()))
+}

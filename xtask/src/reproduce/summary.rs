@@ -1,0 +1,163 @@
+//! Means and spreads over seeds, as Markdown, JSON and a picture.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, Result};
+use image::RgbImage;
+use occnerf::SplitMetrics;
+use serde::Serialize;
+
+use super::plan::Plan;
+use super::rows::Row;
+use crate::run::{self, Metrics};
+use crate::source::Source;
+use crate::{pictures, table};
+
+/// Rows whose pictures stand beside the truth, as in the paper's figures.
+const SHOWN: [&str; 6] = ["prior", "humannerf-bg", "humannerf", "hash-point", "occnerf-bg", "occnerf"];
+
+/// Results of a scene.
+#[derive(Serialize)]
+pub struct Summary<'a> {
+    scene: &'a str,
+    plan: &'a Plan,
+    perceptual: &'static str,
+    /// Size of the largest picture, and so of the cells of sheets.
+    #[serde(skip)]
+    cell: (u32, u32),
+    rows: Vec<Entry>,
+}
+
+#[derive(Serialize)]
+struct Entry {
+    name: &'static str,
+    occluded: String,
+    steps: u64,
+    runs: Vec<Metrics>,
+    #[serde(skip)]
+    pictures: PathBuf,
+}
+
+type PickSplit = fn(&Metrics) -> Option<&SplitMetrics>;
+/// What a column shows of a split.
+type Column = (&'static str, fn(&SplitMetrics) -> Option<f64>, usize);
+
+const COLUMNS: [Column; 9] = [
+    ("psnr_mask", |s| s.psnr_mask, 2),
+    ("psnr_hidden", |s| s.psnr_hidden, 2),
+    ("ssim_mask", |s| s.ssim_mask, 4),
+    ("psnr_vis", |s| s.psnr_vis, 2),
+    ("ssim_vis", |s| s.ssim_vis, 4),
+    ("psnr_full", |s| s.psnr_full, 2),
+    ("ssim_full", |s| s.ssim_full, 4),
+    ("lpips_full", |s| s.lpips_full, 4),
+    ("iou", |s| s.mask_iou, 3),
+];
+
+impl<'a> Summary<'a> {
+    pub fn new(source: &'a Source, plan: &'a Plan) -> Self {
+        let cameras = || source.capture.eval.iter().map(|view| &view.frame.camera);
+        let cell = (cameras().map(|c| c.width).max().unwrap_or(0), cameras().map(|c| c.height).max().unwrap_or(0));
+        Self { scene: &source.scene, plan, perceptual: "multi-scale SSIM", cell, rows: Vec::new() }
+    }
+
+    /// Adds a run of a row.
+    pub fn add(&mut self, row: &Row, directory: &Path, metrics: Metrics) {
+        if self.rows.last().is_none_or(|entry| entry.name != row.name) {
+            self.rows.push(Entry {
+                name: row.name,
+                occluded: if row.learns() { metrics.occluded.clone() } else { "–".to_owned() },
+                steps: metrics.steps,
+                runs: Vec::new(),
+                pictures: directory.join("renders/novel_views.png"),
+            });
+        }
+        if let Some(entry) = self.rows.last_mut() {
+            entry.runs.push(metrics);
+        }
+    }
+
+    /// The table: novel views where the capture has them, and training views on what they show.
+    pub fn markdown(&self) -> String {
+        let mut text = format!("# {}\n\n{}; perceptual term: {}.\n", self.scene, self.plan, self.perceptual);
+        let splits: [(&str, PickSplit); 2] = [
+            ("Novel views", |m| m.splits.novel_view.as_ref()),
+            ("Training views, over visible pixels", |m| m.splits.train_view.as_ref()),
+        ];
+        for (title, split) in splits {
+            let mut lines =
+                vec![vec!["row".to_owned(), "occluded".to_owned(), "steps".to_owned(), "train s".to_owned()]];
+            lines[0].extend(COLUMNS.iter().map(|column| column.0.to_owned()));
+            for entry in &self.rows {
+                let scores: Vec<&SplitMetrics> = entry.runs.iter().filter_map(split).collect();
+                if scores.is_empty() {
+                    continue;
+                }
+                let seconds = entry.runs.iter().map(|m| m.train_seconds).sum::<f64>() / entry.runs.len() as f64;
+                let mut line = vec![
+                    entry.name.to_owned(),
+                    entry.occluded.clone(),
+                    entry.steps.to_string(),
+                    format!("{seconds:.0}"),
+                ];
+                line.extend(COLUMNS.iter().map(|(_, pick, digits)| {
+                    let values: Vec<f64> = scores.iter().filter_map(|s| pick(s)).collect();
+                    cell(&values, *digits)
+                }));
+                lines.push(line);
+            }
+            if lines.len() > 1 {
+                text.push_str(&format!("\n{title}:\n\n{}", table::aligned(&lines, 2)));
+            }
+        }
+        text
+    }
+
+    /// Writes reproduce.md, .json and .png.
+    pub fn write(&self, directory: &Path) -> Result<()> {
+        run::write(&directory.join("reproduce.md"), &self.markdown())?;
+        run::write(&directory.join("reproduce.json"), &serde_json::to_string_pretty(self)?)?;
+        if self.cell.0 == 0 {
+            return Ok(());
+        }
+        // A row a camera: the truth, then what each method makes of it.
+        let mut columns: Vec<Vec<RgbImage>> = Vec::new();
+        for entry in SHOWN.iter().filter_map(|name| self.rows.iter().find(|entry| entry.name == *name)) {
+            let sheet = image::open(&entry.pictures).with_context(|| entry.pictures.display().to_string())?.into_rgb8();
+            if columns.is_empty() {
+                columns.push(pictures::column(&sheet, 0, self.cell));
+            }
+            columns.push(pictures::column(&sheet, 1, self.cell));
+        }
+        let cameras = columns.iter().map(Vec::len).min().unwrap_or(0);
+        let rows: Vec<Vec<RgbImage>> =
+            (0..cameras).map(|camera| columns.iter().map(|column| column[camera].clone()).collect()).collect();
+        pictures::save(&pictures::sheet(&rows), &directory.join("reproduce.png"))
+    }
+}
+
+/// Mean and, of several, standard deviation.
+fn cell(values: &[f64], digits: usize) -> String {
+    let n = values.len() as f64;
+    let mean = values.iter().sum::<f64>() / n;
+    match values.len() {
+        0 => "–".to_owned(),
+        1 => format!("{mean:.digits$}"),
+        _ => {
+            let variance = values.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / (n - 1.0);
+            format!("{mean:.digits$} ± {:.digits$}", variance.sqrt())
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn cells_show_mean_and_standard_deviation() {
+        assert_eq!(cell(&[], 2), "–");
+        assert_eq!(cell(&[1.234], 2), "1.23");
+        assert_eq!(cell(&[1.0, 2.0, 3.0], 2), "2.00 ± 1.00");
+    }
+}
