@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
 use clap::{Args, ValueEnum};
-use occnerf::data::{Capture, DemoConfig, LoadOptions, Obstacle, demo, find_body, load_capture};
+use occnerf::data::{Capture, DemoConfig, LoadOptions, Obstacle, Wrong, demo, find_body, load_capture};
 use smpl::BodyModel;
 
 /// Name of the scene that needs no files.
@@ -42,6 +42,15 @@ pub struct LoadArguments {
     /// Simulated obstacle before the training camera of a ZJU-MoCap capture [default: occlusion.json, else central]
     #[arg(long)]
     occlusion: Option<ObstacleName>,
+    /// Turn every bone of the prior by so many degrees (root mean square), to see what a method bears
+    #[arg(long, value_name = "DEGREES", default_value_t = 0.0)]
+    wrong_pose: f32,
+    /// Change every shape coefficient of the prior by so many standard deviations
+    #[arg(long, value_name = "N", default_value_t = 0.0)]
+    wrong_shape: f32,
+    /// Grow the training masks by so many pixels, or shrink them
+    #[arg(long, value_name = "PIXELS", default_value_t = 0, allow_negative_numbers = true)]
+    wrong_mask: i32,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
@@ -69,6 +78,11 @@ impl LoadArguments {
             eval_stride: self.eval_stride,
             camera: self.camera.clone(),
             occlusion: self.occlusion.map(obstacle),
+            wrong: Wrong {
+                pose_degrees: self.wrong_pose,
+                shape: self.wrong_shape,
+                mask_pixels: self.wrong_mask,
+            },
             ..LoadOptions::default()
         }
     }
@@ -90,11 +104,12 @@ pub fn load(scene: Option<&str>, body: Option<&Path>, options: &LoadOptions) -> 
     let scene = scene.unwrap_or(DEMO);
     let name = scene.to_owned();
     if scene == DEMO && !Path::new(scene).exists() {
-        if *options != LoadOptions::default() {
+        if *options != (LoadOptions { wrong: options.wrong, ..LoadOptions::default() }) {
             bail!("the demo takes none of the options that say how a capture is read");
         }
         let model = BodyModel::embedded();
-        let capture = demo(&DemoConfig::default(), &model)?;
+        let mut capture = demo(&DemoConfig::default(), &model)?;
+        options.wrong.apply(&mut capture, &model)?;
         return Ok(Source { scene: name, body: None, load: options.clone(), capture, model });
     }
     let directory = Path::new(scene);

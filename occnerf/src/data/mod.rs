@@ -19,6 +19,7 @@ mod records;
 mod testing;
 mod undistort;
 mod wild;
+mod wrong;
 mod zju;
 
 pub use self::demo::{DemoConfig, demo};
@@ -27,6 +28,7 @@ pub use self::find::find_body;
 pub use self::image::Image;
 pub use self::obstacle::Obstacle;
 pub use self::options::LoadOptions;
+pub use self::wrong::Wrong;
 
 use std::path::Path;
 
@@ -100,9 +102,11 @@ pub struct Capture {
 /// body model whose joints or vertices are not the file's; options outside their ranges.
 pub fn load_capture(dir: &Path, body: &smpl::BodyModel, options: &LoadOptions) -> Result<Capture, DataError> {
     options.check()?;
-    match find::Layout::detect(dir)? {
+    let mut capture = match find::Layout::detect(dir)? {
         find::Layout::ZjuMocap => zju::load(dir, body, options),
         find::Layout::Wild => wild::load(dir, body, options),
         find::Layout::HumanNerf => humannerf::load(dir, body, options),
-    }
+    }?;
+    options.wrong.apply(&mut capture, body)?;
+    Ok(capture)
 }

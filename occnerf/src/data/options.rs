@@ -3,6 +3,7 @@ use serde::{Deserialize, Serialize};
 use super::DataError;
 use super::image::MAX_SIDE;
 use super::obstacle::Obstacle;
+use super::wrong::Wrong;
 
 /// What a capture's files leave open, and how much of them is read. Every layout obeys all of it, but `camera` and
 /// `occlusion`, which only raw ZJU-MoCap leaves open.
@@ -27,6 +28,8 @@ pub struct LoadOptions {
     /// The simulated obstacle before the training camera. `None`: what the capture's `occlusion.json` says, or the
     /// default [`Obstacle`] where there is none.
     pub occlusion: Option<Obstacle>,
+    /// Errors added on purpose.
+    pub wrong: Wrong,
 }
 
 impl Default for LoadOptions {
@@ -40,6 +43,7 @@ impl Default for LoadOptions {
             max_bytes: 1 << 30,
             camera: None,
             occlusion: None,
+            wrong: Wrong::default(),
         }
     }
 }
@@ -59,6 +63,7 @@ impl LoadOptions {
         if let Some(frames) = &self.max_frames {
             within("max_frames", *frames > 0, "at least 1".to_owned(), frames)?;
         }
+        self.wrong.check()?;
         self.occlusion.as_ref().map_or(Ok(()), Obstacle::check)
     }
 

@@ -8,13 +8,14 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Result, ensure};
 use clap::Args;
+use occnerf::data::{LoadOptions, Wrong};
 
-use crate::run::RunConfig;
+use crate::run::{self, RunConfig};
 use crate::settings::PresetName;
-use crate::source::{self, LoadArguments};
+use crate::source::{self, LoadArguments, Source};
 use crate::train::{run_unless_finished, scene_name};
 use plan::Plan;
-use rows::ROWS;
+use rows::{ROWS, Row};
 use summary::Summary;
 
 #[derive(Args)]
@@ -44,7 +45,28 @@ pub struct ReproduceArguments {
     /// Rows to leave out, comma separated, by the names of the table
     #[arg(long, value_delimiter = ',', value_name = "ROW")]
     without: Vec<String>,
+    /// How much wrong poses, shapes and masks cost: the main methods at each, one table
+    #[arg(long)]
+    robustness: bool,
 }
+
+/// A prior made wrong, and its directory.
+const LEVELS: [(&str, Wrong); 9] = {
+    let none = Wrong { pose_degrees: 0.0, shape: 0.0, mask_pixels: 0 };
+    [
+        ("as-it-is", none),
+        ("pose-2", Wrong { pose_degrees: 2.0, ..none }),
+        ("pose-5", Wrong { pose_degrees: 5.0, ..none }),
+        ("pose-10", Wrong { pose_degrees: 10.0, ..none }),
+        ("shape-1", Wrong { shape: 1.0, ..none }),
+        ("shape-2", Wrong { shape: 2.0, ..none }),
+        ("mask-minus-3", Wrong { mask_pixels: -3, ..none }),
+        ("mask-minus-1", Wrong { mask_pixels: -1, ..none }),
+        ("mask-plus-3", Wrong { mask_pixels: 3, ..none }),
+    ]
+};
+/// The methods themselves, each by its best pixel rule, and the published baseline.
+const MAIN: [&str; 5] = ["prior", "humannerf-bg", "humannerf", "hash-point", "occnerf"];
 
 /// Runs the command.
 pub fn reproduce(arguments: &ReproduceArguments) -> Result<()> {
@@ -59,7 +81,11 @@ pub fn reproduce(arguments: &ReproduceArguments) -> Result<()> {
     for (index, scene) in scenes.iter().enumerate() {
         println!("scene {} of {}: {scene}", index + 1, scenes.len());
         let directory = arguments.out.join(directory_name(scenes, index));
-        one_scene(arguments, scene, &directory, minutes)?;
+        if arguments.robustness {
+            robustness(arguments, scene, &directory.join("robustness"), minutes)?;
+        } else {
+            one_scene(arguments, scene, &directory, minutes)?;
+        }
     }
     Ok(())
 }
@@ -76,26 +102,80 @@ fn directory_name(scenes: &[String], index: usize) -> String {
 fn one_scene(arguments: &ReproduceArguments, scene: &str, directory: &Path, minutes: f64) -> Result<()> {
     let source = source::load(Some(scene), arguments.body.as_deref(), &arguments.load.options())?;
     std::fs::create_dir_all(directory)?;
-    let rows: Vec<_> = ROWS.iter().filter(|row| arguments.without.iter().all(|name| name != row.name)).collect();
-    let preset = arguments.preset.into();
-    let plan = Plan::read_or_make(directory, &source, &rows, preset, arguments.seeds, minutes, arguments.steps)?;
+    let rows = arguments.rows(|_| true);
+    let plan = arguments.plan(directory, &source, &rows, minutes)?;
     println!("{plan}");
-    let mut summary = Summary::new(&source, &plan);
+    let summary = run_rows(arguments, &rows, &plan, &source, directory)?;
+    println!("\n{}", summary.markdown());
+    for name in ["reproduce.md", "reproduce.json", "reproduce.png"].map(|name| directory.join(name)) {
+        if name.is_file() {
+            println!("written: {}", name.display());
+        }
+    }
+    Ok(())
+}
+
+fn robustness(arguments: &ReproduceArguments, scene: &str, directory: &Path, minutes: f64) -> Result<()> {
+    let options = arguments.load.options();
+    ensure!(options.wrong == Wrong::default(), "--robustness goes through its own errors: leave --wrong-… out");
+    let rows = arguments.rows(|row| MAIN.contains(&row.name));
+    std::fs::create_dir_all(directory)?;
+    let mut plan = None;
+    let mut levels = Vec::new();
+    for (name, wrong) in LEVELS {
+        println!("{name}");
+        let source = source::load(Some(scene), arguments.body.as_deref(), &LoadOptions { wrong, ..options.clone() })?;
+        let plan = match &mut plan {
+            Some(plan) => plan,
+            none => none.insert(arguments.plan(directory, &source, &rows, minutes / LEVELS.len() as f64)?),
+        };
+        println!("{plan}");
+        let at = directory.join(name);
+        std::fs::create_dir_all(&at)?;
+        levels.push((name, run_rows(arguments, &rows, plan, &source, &at)?.scores()));
+        let text = summary::by_level(scene, &levels);
+        run::write(&directory.join("robustness.md"), &text)?;
+        run::write(&directory.join("robustness.json"), &serde_json::to_string_pretty(&levels)?)?;
+    }
+    println!("\n{}", summary::by_level(scene, &levels));
+    println!("written: {}", directory.join("robustness.md").display());
+    Ok(())
+}
+
+impl ReproduceArguments {
+    fn rows(&self, wanted: impl Fn(&Row) -> bool) -> Vec<&'static Row> {
+        let kept = |row: &&Row| self.without.iter().all(|name| name != row.name) && wanted(row);
+        ROWS.iter().filter(kept).collect()
+    }
+
+    fn plan(&self, directory: &Path, source: &Source, rows: &[&Row], minutes: f64) -> Result<Plan> {
+        Plan::read_or_make(directory, source, rows, self.preset.into(), self.seeds, minutes, self.steps)
+    }
+}
+
+/// Trains and scores every row that is not finished, with all its seeds.
+fn run_rows<'a>(
+    arguments: &ReproduceArguments,
+    rows: &[&Row],
+    plan: &'a Plan,
+    source: &'a Source,
+    directory: &Path,
+) -> Result<Summary<'a>> {
+    let mut summary = Summary::new(source, plan);
     for row in rows {
         for seed in 1..=row.runs(arguments.seeds) {
-            let train = row.config(preset, seed, &plan);
             let name = if row.learns() { format!("{}-s{seed}", row.name) } else { row.name.to_owned() };
-            let run =
-                RunConfig { scene: source.scene.clone(), body: source.body.clone(), load: source.load.clone(), train };
-            let metrics = run_unless_finished(&directory.join(&name), &name, &run, &source)?;
+            let run = RunConfig {
+                scene: source.scene.clone(),
+                body: source.body.clone(),
+                load: source.load.clone(),
+                train: row.config(arguments.preset.into(), seed, plan),
+            };
+            let metrics = run_unless_finished(&directory.join(&name), &name, &run, source)?;
             summary.add(row, &directory.join(&name), metrics);
         }
         // After every row, so that an end before the last leaves a table.
         summary.write(directory)?;
     }
-    println!("\n{}", summary.markdown());
-    for name in ["reproduce.md", "reproduce.json", "reproduce.png"] {
-        println!("written: {}", directory.join(name).display());
-    }
-    Ok(())
+    Ok(summary)
 }

@@ -113,6 +113,20 @@ impl<'a> Summary<'a> {
         text
     }
 
+    /// What is ranked, row by row.
+    pub fn scores(&self) -> Vec<Score> {
+        let of = |entry: &Entry, pick: fn(&SplitMetrics) -> Option<f64>| {
+            let splits = entry.runs.iter().filter_map(|m| m.splits.novel_view.as_ref().or(m.splits.train_view.as_ref()));
+            splits.filter_map(pick).collect()
+        };
+        let score = |entry: &Entry| Score {
+            name: entry.name,
+            psnr_mask: of(entry, |s| s.psnr_mask),
+            psnr_hidden: of(entry, |s| s.psnr_hidden),
+        };
+        self.rows.iter().map(score).collect()
+    }
+
     /// Writes reproduce.md, .json and .png.
     pub fn write(&self, directory: &Path) -> Result<()> {
         run::write(&directory.join("reproduce.md"), &self.markdown())?;
@@ -134,6 +148,27 @@ impl<'a> Summary<'a> {
             (0..cameras).map(|camera| columns.iter().map(|column| column[camera].clone()).collect()).collect();
         pictures::save(&pictures::sheet(&rows), &directory.join("reproduce.png"))
     }
+}
+
+/// What is ranked, of one row at one level.
+#[derive(Serialize)]
+pub struct Score {
+    name: &'static str,
+    psnr_mask: Vec<f64>,
+    psnr_hidden: Vec<f64>,
+}
+
+/// A table with a line a level and two columns a row: psnr_mask and psnr_hidden.
+pub fn by_level(scene: &str, levels: &[(&str, Vec<Score>)]) -> String {
+    let mut lines = vec![vec!["prior".to_owned()]];
+    for (level, scores) in levels {
+        if lines.len() == 1 {
+            lines[0].extend(scores.iter().flat_map(|s| [s.name.to_owned(), "hidden".to_owned()]));
+        }
+        let cells = scores.iter().flat_map(|s| [cell(&s.psnr_mask, 2), cell(&s.psnr_hidden, 2)]);
+        lines.push(std::iter::once((*level).to_owned()).chain(cells).collect());
+    }
+    format!("# {scene}: psnr_mask and psnr_hidden of novel views with a wrong prior\n\n{}", table::aligned(&lines, 1))
 }
 
 /// Mean and, of several, standard deviation.
