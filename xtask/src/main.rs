@@ -10,6 +10,7 @@ mod report;
 mod run;
 mod settings;
 mod source;
+mod synth;
 mod table;
 mod train;
 
@@ -31,6 +32,8 @@ enum Command {
     Eval(eval::EvalArguments),
     /// Draws a run's person: its movement, from all around, or in the rest pose.
     Render(render::RenderArguments),
+    /// Writes an occluded capture of a synthetic person to disk, in a published dataset format.
+    Synth(synth::SynthArguments),
     /// Runs one function of one crate on numpy arrays.
     Probe(probe::ProbeArguments),
     /// Converts a body model, .npz or .pkl, to .safetensors.
@@ -42,6 +45,7 @@ fn main() -> std::process::ExitCode {
         Command::Train(arguments) => train::train(&arguments),
         Command::Eval(arguments) => eval::eval(&arguments),
         Command::Render(arguments) => render::render(&arguments),
+        Command::Synth(arguments) => synth::synth(&arguments),
         Command::Probe(arguments) => probe::probe(&arguments),
         Command::Convert(arguments) => convert::convert(&arguments),
     };
