@@ -1,6 +1,5 @@
 //! `synth`: a capture made to order, in a published dataset format.
 
-use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail, ensure};
@@ -202,9 +201,6 @@ pub fn synth(arguments: &SynthArguments) -> Result<()> {
 fn write(synthetic: &Synthetic, directory: &Path, layout: Layout) -> Result<()> {
     std::fs::create_dir_all(directory).with_context(|| directory.display().to_string())?;
     let bar = bar("writing", synthetic.num_pictures(layout));
-    if !std::io::stderr().is_terminal() {
-        bar.set_draw_target(indicatif::ProgressDrawTarget::hidden());
-    }
     synthetic.write(directory, layout, &|_| bar.inc(1))?;
     bar.finish_and_clear();
     let mark = serde_json::json!({ "config": synthetic.config, "hidden_fraction": synthetic.hidden_fraction });

@@ -79,8 +79,14 @@ fn settings_that_cannot_be_are_named() {
         ("shape_noise", SynthConfig { shape_noise: f32::NAN, ..small() }),
         ("turns", SynthConfig { turns: f32::INFINITY, ..small() }),
         ("pose_noise", SynthConfig { pose_noise_degrees: -1.0, ..small() }),
-        ("occlusion.fraction", SynthConfig { occlusion: Occlusion::Objects { fraction: 1.0, position: 0.0 }, ..small() }),
-        ("occlusion.position", SynthConfig { occlusion: Occlusion::Objects { fraction: 0.5, position: 2.0 }, ..small() }),
+        (
+            "occlusion.fraction",
+            SynthConfig { occlusion: Occlusion::Objects { fraction: 1.0, position: 0.0 }, ..small() },
+        ),
+        (
+            "occlusion.position",
+            SynthConfig { occlusion: Occlusion::Objects { fraction: 0.5, position: 2.0 }, ..small() },
+        ),
         ("occlusion.share", {
             let occlusion = Occlusion::Rectangle(Obstacle { share: 2.0, ..Obstacle::default() });
             SynthConfig { occlusion, ..small() }
@@ -187,24 +193,32 @@ fn threads_and_runs_do_not_change_a_character() {
     assert_ne!(other.capture.train[0].pose, one.capture.train[0].pose);
 }
 
-/// A square plate on one joint, as glTF with everything in it.
+/// Two triangles over four positions on one joint, as a .glb.
 fn plate(matrix: &str, positions: &[[f32; 3]]) -> Character {
-    use base64::Engine;
     let mut bytes: Vec<u8> = positions.as_flattened().iter().flat_map(|v| v.to_le_bytes()).collect();
-    let faces = bytes.len();
+    let (faces, count) = (bytes.len(), positions.len());
     bytes.extend([0u16, 1, 2, 0, 2, 3].iter().flat_map(|v| v.to_le_bytes()));
-    let data = base64::engine::general_purpose::STANDARD.encode(&bytes);
-    let json = format!(
+    let all = bytes.len();
+    let mut json = format!(
         r#"{{"asset":{{"version":"2.0"}},"scene":0,"scenes":[{{"nodes":[0]}}],
-        "nodes":[{{"mesh":0,"matrix":{matrix}}}],"meshes":[{{"primitives":[{{"attributes":{{"POSITION":0}},"indices":1}}]}}],
-        "buffers":[{{"byteLength":{0},"uri":"data:application/octet-stream;base64,{data}"}}],
+        "nodes":[{{"mesh":0,"matrix":{matrix}}}],
+        "meshes":[{{"primitives":[{{"attributes":{{"POSITION":0}},"indices":1}}]}}],
+        "buffers":[{{"byteLength":{all}}}],
         "bufferViews":[{{"buffer":0,"byteLength":{faces}}},{{"buffer":0,"byteOffset":{faces},"byteLength":12}}],
-        "accessors":[{{"bufferView":0,"componentType":5126,"count":{1},"type":"VEC3","min":[0,0,0],"max":[0,0,0]}},
-        {{"bufferView":1,"componentType":5123,"count":6,"type":"SCALAR"}}]}}"#,
-        bytes.len(),
-        positions.len()
+        "accessors":[{{"bufferView":0,"componentType":5126,"count":{count},"type":"VEC3","min":[0,0,0],"max":[0,0,0]}},
+        {{"bufferView":1,"componentType":5123,"count":6,"type":"SCALAR"}}]}}"#
     );
-    Character::from_bytes("plate.gltf", json.as_bytes()).unwrap()
+    while json.len() % 4 > 0 {
+        json.push(' ');
+    }
+    let mut file = b"glTF\x02\0\0\0".to_vec();
+    file.extend((28 + json.len() as u32 + all as u32).to_le_bytes());
+    for (kind, chunk) in [(b"JSON", json.as_bytes()), (b"BIN\0", bytes.as_slice())] {
+        file.extend((chunk.len() as u32).to_le_bytes());
+        file.extend(kind);
+        file.extend(chunk);
+    }
+    Character::from_bytes("plate.glb", &file).unwrap()
 }
 
 const UNIT: &str = "[1,0,0,0, 0,1,0,0, 0,0,1,0, 0,0,0,1]";

@@ -30,7 +30,11 @@ fn make(occlusion: Occlusion) -> Synthetic {
 fn round(synthetic: &Synthetic, layout: Layout, name: &str) -> (Directory, BodyModel, Capture) {
     let dir = Directory::new(name);
     let count = std::sync::atomic::AtomicUsize::new(0);
-    synthetic.write(dir.path(), layout, &|_| drop(count.fetch_add(1, std::sync::atomic::Ordering::Relaxed))).unwrap();
+    synthetic
+        .write(dir.path(), layout, &|_| {
+            count.fetch_add(1, std::sync::atomic::Ordering::Relaxed);
+        })
+        .unwrap();
     assert_eq!(count.into_inner(), synthetic.num_pictures(layout), "{layout:?}");
     let body = BodyModel::load(&find_body(dir.path()).unwrap()).unwrap();
     let capture = load_capture(dir.path(), &body, &LoadOptions::default()).unwrap();
