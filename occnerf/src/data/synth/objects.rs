@@ -12,7 +12,9 @@ use crate::data::{DataError, Frame, Image};
 /// Distance of the objects' far and near sides from the person's axis, in heights of the person: beyond a
 /// stretched arm, before the camera.
 const FAR: f32 = 0.72;
-const NEAR: f32 = 0.86;
+const NEAR: f32 = 0.90;
+/// Between the pillars, behind, and the desk.
+const MIDDLE: f32 = 0.80;
 /// Corners of a box, and its triangles, outside counter-clockwise.
 const QUADS: [[u32; 4]; 6] = [[0, 4, 6, 2], [1, 3, 7, 5], [0, 1, 5, 4], [2, 6, 7, 3], [0, 2, 3, 1], [4, 5, 7, 6]];
 const TRIANGLES_A_BOX: u32 = 12;
@@ -105,16 +107,16 @@ fn picture(camera: &Camera, height: f32, size: f32, right: f32) -> Result<Pictur
         return Ok((Image::new(camera.width, camera.height), vec![0.0; pixels]));
     }
     let pillar = |x: f32| {
-        let half = 0.035 * size;
-        [Vec3::new(x - half, 0.0, FAR), Vec3::new(x + half, 1.6, NEAR)]
+        let half = 0.022 * size;
+        [Vec3::new(x - half, 0.0, FAR), Vec3::new(x + half, 1.6, MIDDLE)]
     };
-    let desk = 0.26 * size.min(1.5);
-    let top = 0.12 + 0.14 * size.min(2.0);
+    let desk = 0.26 * size.min(1.3);
+    let top = 0.10 + 0.11 * size.min(2.0);
     let boxes = [
-        [Vec3::new(0.02 - desk, 0.06, FAR + 0.01), Vec3::new(0.02 + desk, top, NEAR - 0.02)],
-        [Vec3::new(-desk, top, FAR), Vec3::new(0.04 + desk, top + 0.02, NEAR)],
-        pillar(-0.13),
-        pillar(0.17),
+        [Vec3::new(0.02 - desk, 0.04, MIDDLE + 0.01), Vec3::new(0.02 + desk, top, NEAR - 0.01)],
+        [Vec3::new(-desk, top, MIDDLE), Vec3::new(0.04 + desk, top + 0.02, NEAR)],
+        pillar(-0.05),
+        pillar(0.15),
     ];
     let (mut vertices, mut faces) = (Vec::new(), Vec::new());
     for [low, high] in boxes {

@@ -1,5 +1,8 @@
 //! Python pickles of dictionaries, lists, texts and numpy arrays.
 
+/// _reconstruct(ndarray, (0,), b'b'), and the beginning of its state (1, shape, dtype, False, bytes or items).
+const ARRAY: &[u8] = b"cnumpy.core.multiarray\n_reconstruct\ncnumpy\nndarray\nK\0\x85C\x01b\x87R(K\x01(";
+
 /// What a pickle is made of.
 #[derive(Clone, Debug)]
 pub(in crate::data) enum Py {
@@ -34,7 +37,8 @@ impl Py {
         out
     }
 
-    /// The same as `numpy.save` writes it for an object: a header, then the pickle.
+    /// The same as `numpy.save` writes it for an object: a header, then the pickle of an array of no axes with the object
+    /// as its item.
     pub fn npy(&self) -> Vec<u8> {
         let dictionary = "{'descr': '|O', 'fortran_order': False, 'shape': (), }";
         // The pickle starts at a multiple of 64.
@@ -42,7 +46,14 @@ impl Py {
         let mut out = b"\x93NUMPY\x01\x00".to_vec();
         out.extend((length as u16).to_le_bytes());
         out.extend(format!("{dictionary:<width$}\n", width = length - 1).into_bytes());
-        out.extend(self.pickle());
+        out.extend([0x80, 3]);
+        out.extend(ARRAY);
+        out.push(b't');
+        // The state of dtype('O'): flags 63 say that items are references.
+        dtype("O8", "|", b"K\x3f", &mut out);
+        out.extend(b"\x89](");
+        self.write(&mut out);
+        out.extend(b"etb.");
         out
     }
 
@@ -63,23 +74,31 @@ impl Py {
                 out.push(b'e');
             }
             Self::Array(shape, values) => {
-                // _reconstruct(ndarray, (0,), b'b'), then its state (1, shape, dtype('<f8'), False, bytes).
-                out.extend(b"cnumpy.core.multiarray\n_reconstruct\ncnumpy\nndarray\nK\0\x85C\x01b\x87R(K\x01(");
+                out.extend(ARRAY);
                 for &n in shape {
                     out.push(b'J');
                     out.extend(n.to_le_bytes());
                 }
-                out.extend(b"tcnumpy\ndtype\n");
-                text("f8", out);
-                out.extend(b"K\0K\x01\x87R(K\x03");
-                text("<", out);
-                out.extend(b"NNNJ\xff\xff\xff\xffJ\xff\xff\xff\xffK\0tb\x89B");
+                out.push(b't');
+                dtype("f8", "<", b"K\0", out);
+                out.extend(b"\x89B");
                 out.extend((values.len() as u32 * 8).to_le_bytes());
                 out.extend(values.iter().flat_map(|v| v.to_le_bytes()));
                 out.extend(b"tb");
             }
         }
     }
+}
+
+/// The type of an array's elements: name, byte order, flags.
+fn dtype(name: &str, order: &str, flags: &[u8], out: &mut Vec<u8>) {
+    out.extend(b"cnumpy\ndtype\n");
+    text(name, out);
+    out.extend(b"K\0K\x01\x87R(K\x03");
+    text(order, out);
+    out.extend(b"NNNJ\xff\xff\xff\xffJ\xff\xff\xff\xff");
+    out.extend(flags);
+    out.extend(b"tb");
 }
 
 fn text(words: &str, out: &mut Vec<u8>) {
