@@ -109,8 +109,8 @@ fn a_character_without_errors_is_its_own_prior() {
         let views = made.capture.eval.iter().map(|e| &e.frame);
         for frame in views {
             let overlap = overlap(frame, &made.body);
-            // The translation noise of 5 mm, and edges of pixels.
-            assert!(overlap > 0.9, "{name} {}: {overlap}", frame.name);
+            // The translation noise of 5 mm, and edges of pixels of 4 cm.
+            assert!(overlap > 0.85, "{name} {}: {overlap}", frame.name);
         }
     }
 }
@@ -124,12 +124,12 @@ fn a_characters_prior_lies_inside_it_by_centimetres() {
     let (own, prior) = (body.shaped(&[0.0]), body.shaped(&[1.0]));
     let mut depths: Vec<f32> = own.vertices.iter().zip(&prior.vertices).map(|(a, b)| a.distance(*b)).collect();
     depths.sort_by(f32::total_cmp);
-    assert!(depths[depths.len() - 1] <= 0.0305, "{}", depths[depths.len() - 1]);
+    assert!(depths[depths.len() - 1] <= 0.033, "{}", depths[depths.len() - 1]);
     let median = depths[depths.len() / 2];
-    assert!((0.004..0.025).contains(&median), "{median}");
+    assert!((0.003..0.025).contains(&median), "{median}");
     // Joints are where the rig has them, nearly the same for the sunken shape.
     for (j, (a, b)) in own.joints.iter().zip(&prior.joints).enumerate() {
-        assert!(a.distance(*b) < 0.02, "joint {j}: {a} {b}");
+        assert!(a.distance(*b) < 0.03, "joint {j}: {a} {b}");
     }
     let inside = |f: &Frame| {
         let posed = body.pose(&body.shaped(&f.betas), &f.pose, f.placement);
@@ -140,7 +140,7 @@ fn a_characters_prior_lies_inside_it_by_centimetres() {
         hit.count() as f32 / posed.vertices.len() as f32
     };
     for view in &made.capture.eval {
-        assert!(inside(&view.frame) > 0.95, "{}", inside(&view.frame));
+        assert!(inside(&view.frame) > 0.9, "{}", inside(&view.frame));
     }
     let numbers = made.capture.train[0].pose.len();
     assert_eq!(numbers, 31);
@@ -159,7 +159,7 @@ fn motion_capture_drives_the_person_and_characters_with_known_names() {
         for view in &made.capture.eval {
             let overlap = overlap(&view.frame, &made.body);
             // Clothes are wider than the body.
-            assert!(overlap > if actor.is_some() { 0.9 } else { 0.7 }, "{overlap}");
+            assert!(overlap > if actor.is_some() { 0.85 } else { 0.6 }, "{overlap}");
         }
         let poses: Vec<_> = made.capture.train.iter().map(|f| &f.pose).collect();
         assert_ne!(poses[0], poses[3]);
@@ -173,7 +173,7 @@ fn motion_capture_drives_the_person_and_characters_with_known_names() {
         let joints = |f: &Frame| own.body.pose(&own.body.shaped(&[0.0]), &f.pose, f.placement).joints;
         let (p, q) = (joints(a), joints(b));
         let mean = p.iter().zip(&q).map(|(p, q)| p.distance(*q)).sum::<f32>() / p.len() as f32;
-        assert!(mean < 0.12, "{}: {mean}", a.name);
+        assert!(mean < 0.06, "{}: {mean}", a.name);
     }
     let message = synthesise(Some(&cesium), Some(&clip), &exact, &|_| {}).err().unwrap().to_string();
     assert!(message.contains("motion") && message.contains("hips"), "{message}");
