@@ -11,6 +11,7 @@ mod reproduce;
 mod run;
 mod settings;
 mod source;
+mod synth;
 mod table;
 mod train;
 
@@ -34,6 +35,8 @@ enum Command {
     Render(render::RenderArguments),
     /// The paper's table on captures: every baseline and ablation, several seeds, one budget.
     Reproduce(reproduce::ReproduceArguments),
+    /// Writes an occluded capture of a synthetic person to disk, in a published dataset format.
+    Synth(synth::SynthArguments),
     /// Runs one function of one crate on numpy arrays.
     Probe(probe::ProbeArguments),
     /// Converts a body model, .npz or .pkl, to .safetensors.
@@ -46,6 +49,7 @@ fn main() -> std::process::ExitCode {
         Command::Eval(arguments) => eval::eval(&arguments),
         Command::Render(arguments) => render::render(&arguments),
         Command::Reproduce(arguments) => reproduce::reproduce(&arguments),
+        Command::Synth(arguments) => synth::synth(&arguments),
         Command::Probe(arguments) => probe::probe(&arguments),
         Command::Convert(arguments) => convert::convert(&arguments),
     };

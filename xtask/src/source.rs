@@ -1,11 +1,15 @@
-//! Where the frames come from: the embedded demo, or a capture on disk with its body model.
+//! Where the frames come from: the embedded demo, a character filmed on the spot, or a capture on disk with its body model.
 
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
 use clap::{Args, ValueEnum};
-use occnerf::data::{Capture, DemoConfig, LoadOptions, Obstacle, Wrong, demo, find_body, load_capture};
+use occnerf::data::{
+    Capture, DemoConfig, LoadOptions, Obstacle, SynthConfig, Synthetic, Wrong, demo, find_body, load_capture,
+};
 use smpl::BodyModel;
+
+use crate::synth;
 
 /// Name of the scene that needs no files.
 pub const DEMO: &str = "demo";
@@ -78,11 +82,7 @@ impl LoadArguments {
             eval_stride: self.eval_stride,
             camera: self.camera.clone(),
             occlusion: self.occlusion.map(obstacle),
-            wrong: Wrong {
-                pose_degrees: self.wrong_pose,
-                shape: self.wrong_shape,
-                mask_pixels: self.wrong_mask,
-            },
+            wrong: Wrong { pose_degrees: self.wrong_pose, shape: self.wrong_shape, mask_pixels: self.wrong_mask },
             ..LoadOptions::default()
         }
     }
@@ -113,8 +113,16 @@ pub fn load(scene: Option<&str>, body: Option<&Path>, options: &LoadOptions) -> 
         return Ok(Source { scene: name, body: None, load: options.clone(), capture, model });
     }
     let directory = Path::new(scene);
+    if directory.is_file() && synth::is_character(directory) {
+        if *options != (LoadOptions { wrong: options.wrong, ..LoadOptions::default() }) || body.is_some() {
+            bail!("{scene}: a character takes none of the options of a capture; use synth to choose how it is filmed");
+        }
+        let Synthetic { mut capture, body, .. } = synth::film(Some(directory), None, &SynthConfig::default())?;
+        options.wrong.apply(&mut capture, &body)?;
+        return Ok(Source { scene: name, body: None, load: options.clone(), capture, model: body });
+    }
     if !directory.is_dir() {
-        bail!("{scene}: no such directory; expected a capture, or no SCENE for the demo");
+        bail!("{scene}: no such directory; expected a capture, a .glb or .gltf character, or no SCENE for the demo");
     }
     let variable = std::env::var_os(BODY_VARIABLE).map(PathBuf::from);
     let body = match body.map(Path::to_owned).or(variable) {

@@ -26,7 +26,8 @@ const LINE_EVERY: Duration = Duration::from_secs(15);
 
 #[derive(Args)]
 pub struct TrainArguments {
-    /// A capture (raw ZJU-MoCap, or HumanNeRF's prepared or wild layout); the embedded demo if left out
+    /// A capture (raw ZJU-MoCap, or HumanNeRF's prepared or wild layout), or a rigged .glb or .gltf character, of which one
+    /// is made as synth does; the embedded demo if left out
     pub scene: Option<String>,
     /// Run directory [default: runs/SCENE-METHOD]
     #[arg(long)]

@@ -4,11 +4,14 @@ use std::path::{Path, PathBuf};
 
 use super::DataError;
 
-/// A published dataset format.
+/// A published dataset format, see [`load_capture`](super::load_capture).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Layout {
+pub enum Layout {
+    /// Raw ZJU-MoCap.
     ZjuMocap,
+    /// HumanNeRF's layout for videos from anywhere, in which OcMotion is distributed too.
     Wild,
+    /// HumanNeRF's prepared layout.
     HumanNerf,
 }
 
@@ -21,7 +24,7 @@ impl Layout {
         (&["mesh_infos.pkl", "cameras.pkl"], "HumanNeRF's prepared layout", Self::HumanNerf),
     ];
 
-    pub fn detect(dir: &Path) -> Result<Self, DataError> {
+    pub(super) fn detect(dir: &Path) -> Result<Self, DataError> {
         if !dir.is_dir() {
             return Err(DataError::missing(dir, "directory"));
         }
@@ -33,7 +36,7 @@ impl Layout {
     }
 }
 
-/// The body model that belongs to the capture in `dir`: its own `body.npz`, else the first `.npz` with a body in a
+/// The body model that belongs to the capture in `dir`: its own `body.npz` or `body.safetensors`, else the first `.npz` with a body in a
 /// directory `body` beside it or beside the nearest of the directories above it.
 ///
 /// # Errors
@@ -42,8 +45,8 @@ impl Layout {
 pub fn find_body(dir: &Path) -> Result<PathBuf, DataError> {
     Layout::detect(dir)?;
     let own = dir.join("body.npz");
-    if own.is_file() {
-        return Ok(own);
+    if let Some(found) = [&own, &dir.join("body.safetensors")].into_iter().find(|path| path.is_file()) {
+        return Ok(found.clone());
     }
     // Ancestors of a relative path end where the path does, not at the root of the file system.
     let whole = dir.canonicalize().map_err(DataError::io(dir))?;
@@ -56,7 +59,9 @@ pub fn find_body(dir: &Path) -> Result<PathBuf, DataError> {
         files.sort();
         files.into_iter().find(|path| is_body(path))
     });
-    found.ok_or_else(|| DataError::missing(&own, "body model (nor any body/*.npz near the capture)"))
+    found.ok_or_else(|| {
+        DataError::missing(&own, "body model (nor body.safetensors, nor any body/*.npz near the capture)")
+    })
 }
 
 /// Whether an archive holds a template; poses and reference values may lie beside the body.

@@ -15,19 +15,22 @@ mod obstacle;
 mod options;
 mod pictures;
 mod records;
+mod synth;
 #[cfg(test)]
 mod testing;
 mod undistort;
 mod wild;
+mod write;
 mod wrong;
 mod zju;
 
 pub use self::demo::{DemoConfig, demo};
 pub use self::error::DataError;
-pub use self::find::find_body;
+pub use self::find::{Layout, find_body};
 pub use self::image::Image;
 pub use self::obstacle::Obstacle;
 pub use self::options::LoadOptions;
+pub use self::synth::{Occlusion, SynthConfig, Synthetic, synthesise};
 pub use self::wrong::Wrong;
 
 use std::path::Path;

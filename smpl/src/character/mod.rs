@@ -89,6 +89,30 @@ impl Character {
         self.joint_nodes.len()
     }
 
+    /// The nearest joint above each, (J): that of the nearest node above which is a joint. Of joints that share a node the
+    /// first is above the others.
+    #[must_use]
+    pub fn joint_parents(&self) -> Vec<Option<usize>> {
+        let mut first = vec![None; self.nodes.len()];
+        for (joint, &node) in self.joint_nodes.iter().enumerate().rev() {
+            first[node] = Some(joint);
+        }
+        let above = |(joint, &node): (usize, &usize)| {
+            if first[node] != Some(joint) {
+                return first[node];
+            }
+            let mut up = self.nodes[node].parent;
+            while let Some(node) = up {
+                if first[node].is_some() {
+                    return first[node];
+                }
+                up = self.nodes[node].parent;
+            }
+            None
+        };
+        self.joint_nodes.iter().enumerate().map(above).collect()
+    }
+
     /// The character as its nodes stand in the file.
     #[must_use]
     pub fn rest(&self) -> CharacterPose {

@@ -116,7 +116,8 @@ impl<'a> Summary<'a> {
     /// What is ranked, row by row.
     pub fn scores(&self) -> Vec<Score> {
         let of = |entry: &Entry, pick: fn(&SplitMetrics) -> Option<f64>| {
-            let splits = entry.runs.iter().filter_map(|m| m.splits.novel_view.as_ref().or(m.splits.train_view.as_ref()));
+            let splits =
+                entry.runs.iter().filter_map(|m| m.splits.novel_view.as_ref().or(m.splits.train_view.as_ref()));
             splits.filter_map(pick).collect()
         };
         let score = |entry: &Entry| Score {

@@ -6,7 +6,7 @@
 use glam::Vec3;
 
 use super::landmarks::Landmarks;
-use super::noise::{smooth_noise, smoothstep};
+use crate::data::synth::noise::{smooth_noise, smoothstep};
 
 /// Width of the step at a hem.
 const HEM: f32 = 0.010;

@@ -3,7 +3,7 @@
 use glam::{Vec2, Vec3};
 
 use super::landmarks::Landmarks;
-use super::noise::{smooth_noise, smoothstep};
+use crate::data::synth::noise::{smooth_noise, smoothstep};
 
 const SKIN: Vec3 = Vec3::new(0.86, 0.63, 0.50);
 const LIPS: Vec3 = Vec3::new(0.66, 0.24, 0.24);

@@ -7,7 +7,7 @@ use smpl::Shaped;
 const FIGURE_HEIGHT: f32 = 1.695;
 
 /// SMPL's joints, by index.
-pub(super) mod joint {
+pub(in crate::data) mod joint {
     pub const PELVIS: usize = 0;
     pub const LEFT_HIP: usize = 1;
     pub const RIGHT_HIP: usize = 2;

@@ -2,11 +2,9 @@
 
 mod clothes;
 mod face;
-mod landmarks;
-mod motion;
-mod noise;
+pub(super) mod landmarks;
+pub(super) mod motion;
 mod person;
-mod render;
 #[cfg(test)]
 mod tests;
 mod texture;
@@ -17,26 +15,19 @@ use glam::Vec3;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use smpl::{BodyModel, Shaped};
-use volrender::Camera;
 
 use self::landmarks::joint;
 use self::motion::{Pose, TrackerError, track, walk};
-use self::noise::normal;
 use self::person::Person;
-use self::render::{Posture, look_at};
-use super::{Capture, DataError, EvalFrame, Frame, Image, Obstacle};
+use self::texture::albedo;
+use super::synth::noise::normal;
+use super::synth::render::Posture;
+use super::synth::stage::{Progress, Stage, ring};
+use super::{Capture, DataError, Frame, Obstacle};
 use crate::random::Stream;
 
 /// Shape coefficients of the person and of the tracker's guess that are not zero.
 const BETAS: usize = 6;
-/// Focal length in picture sides.
-const FOCAL: f32 = 1.45;
-/// Distance of the cameras from the person's axis in heights of the person: fills three quarters of the picture.
-const DISTANCE: f32 = 1.97;
-/// Height of the cameras and of the point they look at, in heights of the person.
-const CAMERA_HEIGHT: f32 = 0.60;
-const TARGET_HEIGHT: f32 = 0.505;
-
 /// What the demo is made of. The default is the one that figures are quoted for.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
@@ -85,7 +76,7 @@ impl Default for DemoConfig {
 }
 
 impl DemoConfig {
-    fn check(&self, body: &BodyModel) -> Result<(), DataError> {
+    pub(super) fn check(&self) -> Result<(), DataError> {
         let within = |name, ok: bool, expected: &str, actual: &dyn ToString| {
             if ok { Ok(()) } else { Err(DataError::setting(name, expected, actual.to_string())) }
         };
@@ -103,8 +94,7 @@ impl DemoConfig {
         ] {
             within(name, (0.0..=limit).contains(&value), &format!("0 to {limit}"), &value)?;
         }
-        let joints = body.num_joints();
-        within("body", joints == joint::COUNT, "SMPL's 24 joints", &joints)
+        Ok(())
     }
 }
 
@@ -120,64 +110,52 @@ impl DemoConfig {
 /// # Errors
 /// [`DataError::Setting`] for values outside the stated ranges, and for a body without SMPL's 24 joints.
 pub fn demo(config: &DemoConfig, body: &BodyModel) -> Result<Capture, DataError> {
-    config.check(body)?;
+    config.check()?;
+    let joints = body.num_joints();
+    if joints != joint::COUNT {
+        return Err(DataError::setting("body", "SMPL's 24 joints", joints));
+    }
+    let mut capture = film(config, body, grounded_walk, &|_| {})?.0;
+    occlude(&mut capture.train, config);
+    Ok(capture)
+}
+
+/// The demo before anything stands in front of it, and the height that the cameras stand for. `perform` gives poses of a
+/// number of frames for a body of that shape, and that height.
+pub(super) fn film(
+    config: &DemoConfig,
+    body: &BodyModel,
+    perform: impl FnOnce(usize, &BodyModel, &Shaped) -> (Vec<Pose>, f32),
+    progress: &Progress<'_>,
+) -> Result<(Capture, f32), DataError> {
     let (true_betas, betas) = shapes(config, body);
     let shaped = body.shaped(&true_betas);
     let person = Person::new(body, &shaped);
-    let unit = person.landmarks.unit;
-    let poses = grounded_walk(config.frames, body, &shaped);
+    let (poses, height) = perform(config.frames, body, &shaped);
     let error = TrackerError {
         seed: config.seed,
         rotation: config.pose_noise_degrees.to_radians(),
-        translation: config.translation_noise * unit,
+        translation: config.translation_noise * person.landmarks.unit,
     };
-    let priors = track(&poses, &body.parents, shaped.joints[joint::PELVIS], error);
-    let cameras = ring(config, &shaped)?;
-
-    let views: Vec<Result<Vec<Picture>, DataError>> = poses
-        .par_iter()
-        .enumerate()
-        .map(|(i, pose)| {
-            let posed = body.pose(&shaped, &pose.joints, pose.placement());
-            let posture = Posture::new(&person, &posed)?;
-            let seen = if i % config.eval_every == 0 { cameras.len() } else { 1 };
-            Ok(cameras[..seen].iter().map(|camera| posture.render(camera)).collect())
-        })
-        .collect();
-
-    let mut train = Vec::with_capacity(config.frames);
-    let mut eval = Vec::new();
-    for (i, views) in views.into_iter().enumerate() {
-        for (c, (image, mask)) in views?.into_iter().enumerate() {
-            let frame = Frame {
-                name: format!("frame_{i:06}"),
-                image,
-                mask,
-                camera: cameras[c],
-                pose: priors[i].joints.clone(),
-                placement: priors[i].placement(),
-                betas: betas.clone(),
-                occluder: None,
-            };
-            if c == 0 {
-                train.push(frame);
-            } else {
-                eval.push((c, EvalFrame { camera_name: format!("Camera_B{}", c + 1), train_index: i, frame }));
-            }
-        }
-    }
-    eval.sort_by_key(|(camera, frame)| (*camera, frame.train_index));
-    occlude(&mut train, config);
-    Ok(Capture {
-        name: "demo".to_owned(),
-        train,
-        eval: eval.into_iter().map(|(_, frame)| frame).collect(),
-        mean_betas: betas,
-    })
+    let stage = Stage {
+        cameras: ring(config.size, config.eval_cameras, height)?,
+        eval_every: config.eval_every,
+        priors: track(&poses, &body.parents, shaped.joints[joint::PELVIS], error),
+        betas,
+        progress,
+    };
+    let color = |face: u32, weights: [f32; 3]| {
+        let corners = person.faces[face as usize].iter().zip(weights);
+        albedo(&person.landmarks, corners.map(|(&v, w)| person.rest[v as usize] * w).sum())
+    };
+    let capture = stage.film("demo", |i| {
+        let posed = body.pose(&shaped, &poses[i].joints, poses[i].placement());
+        let vertices = person.posed(&posed);
+        let normals = surface_query::vertex_normals(&vertices, &person.faces);
+        Posture::new(vertices, normals, &person.faces, &color)
+    })?;
+    Ok((capture, height))
 }
-
-/// A picture and its mask.
-type Picture = (Image, Vec<f32>);
 
 /// The person's betas, and the tracker's.
 fn shapes(config: &DemoConfig, body: &BodyModel) -> (Vec<f32>, Vec<f32>) {
@@ -189,36 +167,24 @@ fn shapes(config: &DemoConfig, body: &BodyModel) -> (Vec<f32>, Vec<f32>) {
 }
 
 /// The walk with the lower foot on the floor at y = 0, and a slight sway.
-fn grounded_walk(frames: usize, body: &BodyModel, shaped: &Shaped) -> Vec<Pose> {
+pub(super) fn grounded_walk(frames: usize, body: &BodyModel, shaped: &Shaped) -> (Vec<Pose>, f32) {
     let pelvis = shaped.joints[joint::PELVIS];
-    (0..frames)
+    let lowest = shaped.vertices.iter().map(|v| v.y).fold(f32::INFINITY, f32::min);
+    let high = shaped.vertices.iter().map(|v| v.y).fold(f32::NEG_INFINITY, f32::max);
+    let poses = (0..frames)
         .into_par_iter()
         .map(|frame| {
             let mut pose = walk(frame, frames);
             let posed = body.pose(shaped, &pose.joints, pose.placement());
             let low = posed.vertices.iter().map(|v| v.y).fold(f32::INFINITY, f32::min);
-            let high = shaped.vertices.iter().map(|v| v.y).fold(f32::NEG_INFINITY, f32::max);
             let turn = TAU * frame as f32 / frames as f32;
             let sway = Vec3::new(turn.sin(), 0.0, (2.0 * turn).sin()) * (0.035 * (high - low));
             let centred = pose.rotation * pelvis;
             pose.translation = Vec3::new(-centred.x, -low, -centred.z) + sway;
             pose
         })
-        .collect()
-}
-
-/// The training camera, then the others around the circle.
-fn ring(config: &DemoConfig, shaped: &Shaped) -> Result<Vec<Camera>, DataError> {
-    let low = shaped.vertices.iter().map(|v| v.y).fold(f32::INFINITY, f32::min);
-    let high = shaped.vertices.iter().map(|v| v.y).fold(f32::NEG_INFINITY, f32::max);
-    let height = high - low;
-    (0..=config.eval_cameras)
-        .map(|c| {
-            let azimuth = if c == 0 { 0.0 } else { TAU * (c as f32 - 0.5) / config.eval_cameras as f32 };
-            let eye = Vec3::new(azimuth.sin() * DISTANCE, CAMERA_HEIGHT, azimuth.cos() * DISTANCE);
-            look_at(eye * height, Vec3::Y * (TARGET_HEIGHT * height), config.size, FOCAL)
-        })
-        .collect()
+        .collect();
+    (poses, high - lowest)
 }
 
 /// Puts the obstacle in front of the first frames.

@@ -6,7 +6,7 @@ use glam::{Quat, Vec3};
 use smpl::Placement;
 
 use super::landmarks::joint;
-use super::noise::normal;
+use crate::data::synth::noise::normal;
 use crate::random::Stream;
 
 /// Turns of the person during the video: every side comes to face the camera, and some twice.
@@ -18,7 +18,7 @@ const HARMONICS: usize = 6;
 
 /// Rotations of all joints, global rotation, and translation.
 #[derive(Clone, Debug, PartialEq)]
-pub(super) struct Pose {
+pub(in crate::data) struct Pose {
     /// Axis-angle relative to the parent, (J); joint 0 is zero.
     pub joints: Vec<Vec3>,
     pub rotation: Quat,
@@ -35,7 +35,7 @@ impl Pose {
 ///
 /// The T-pose's left arm points along +x: turning about −z lowers it, about −x then swings it forward; a knee
 /// bends about +x, a left elbow about −y.
-pub(super) fn walk(frame: usize, frames: usize) -> Pose {
+pub(in crate::data) fn walk(frame: usize, frames: usize) -> Pose {
     let time = frame as f32 / frames as f32;
     let phase = TAU * time * 100.0 / STRIDE;
     let x = Quat::from_rotation_x;
@@ -99,7 +99,7 @@ fn wander(stream: &mut Stream, frames: usize, rms: f32) -> Vec<Vec3> {
 
 /// Errors of the tracker.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct TrackerError {
+pub(in crate::data) struct TrackerError {
     pub seed: u64,
     /// Root mean square angle between true and tracked *global* orientation of each bone, radians.
     pub rotation: f32,
@@ -109,7 +109,12 @@ pub(super) struct TrackerError {
 
 /// What a tracker would report for `poses`: the errors of bones are independent of each other and smooth in time.
 /// `pelvis` is the pelvis joint at rest, about which the global error turns.
-pub(super) fn track(poses: &[Pose], parents: &[Option<usize>], pelvis: Vec3, error: TrackerError) -> Vec<Pose> {
+pub(in crate::data) fn track(
+    poses: &[Pose],
+    parents: &[Option<usize>],
+    pelvis: Vec3,
+    error: TrackerError,
+) -> Vec<Pose> {
     let joints = parents.len();
     let noise: Vec<Vec<Vec3>> = (0..joints as u64)
         .map(|j| wander(&mut Stream::new(&[error.seed, 0x706f_7365, j]), poses.len(), error.rotation))

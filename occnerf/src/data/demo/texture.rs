@@ -5,7 +5,7 @@ use glam::{Vec2, Vec3};
 use super::clothes::Garment;
 use super::face;
 use super::landmarks::Landmarks;
-use super::noise::{smooth_noise, smoothstep};
+use crate::data::synth::noise::{smooth_noise, smoothstep};
 
 const TEAL: Vec3 = Vec3::new(0.07, 0.40, 0.47);
 const CREAM: Vec3 = Vec3::new(0.94, 0.90, 0.78);

@@ -24,14 +24,7 @@ pub fn body() -> BodyModel {
     }
 }
 
-/// What a test pickle is made of.
-#[derive(Clone)]
-pub enum Py {
-    Dict(Vec<(String, Py)>),
-    Array(Vec<u32>, Vec<f64>),
-    Text(&'static str),
-    List(Vec<Py>),
-}
+pub use crate::data::write::pickle::Py;
 
 impl Py {
     /// Replaces the entry at a path of keys, or adds it.
@@ -54,41 +47,6 @@ impl Py {
         }
     }
 
-    fn write(&self, out: &mut Vec<u8>) {
-        match self {
-            Self::Dict(items) => {
-                out.extend(b"}(");
-                for (key, value) in items {
-                    text(key, out);
-                    value.write(out);
-                }
-                out.push(b'u');
-            }
-            Self::Text(words) => text(words, out),
-            Self::List(items) => {
-                out.extend(b"](");
-                items.iter().for_each(|item| item.write(out));
-                out.push(b'e');
-            }
-            Self::Array(shape, values) => {
-                // _reconstruct(ndarray, (0,), b'b'), then its state (1, shape, dtype('<f8'), False, bytes).
-                out.extend(b"cnumpy.core.multiarray\n_reconstruct\ncnumpy\nndarray\nK\0\x85C\x01b\x87R(K\x01(");
-                for &n in shape {
-                    out.push(b'J');
-                    out.extend(n.to_le_bytes());
-                }
-                out.extend(b"tcnumpy\ndtype\n");
-                text("f8", out);
-                out.extend(b"K\0K\x01\x87R(K\x03");
-                text("<", out);
-                out.extend(b"NNNJ\xff\xff\xff\xffJ\xff\xff\xff\xffK\0tb\x89B");
-                out.extend((values.len() as u32 * 8).to_le_bytes());
-                out.extend(values.iter().flat_map(|v| v.to_le_bytes()));
-                out.extend(b"tb");
-            }
-        }
-    }
-
     /// The item at a path of keys; a number is a place in a list.
     pub fn at(&mut self, keys: &[&str]) -> &mut Py {
         let Some((first, rest)) = keys.split_first() else { return self };
@@ -98,21 +56,6 @@ impl Py {
             _ => None,
         };
         found.expect("no such item").at(rest)
-    }
-
-    /// The same as `numpy.save` writes it: a header, then the pickle.
-    pub fn npy(&self) -> Vec<u8> {
-        let mut out = npy_header("|O", "()");
-        out.extend(self.pickle());
-        out
-    }
-
-    /// A pickle of protocol 3.
-    pub fn pickle(&self) -> Vec<u8> {
-        let mut out = vec![0x80, 3];
-        self.write(&mut out);
-        out.push(b'.');
-        out
     }
 }
 
@@ -129,12 +72,6 @@ pub fn points_npy(points: &[Vec3]) -> Vec<u8> {
     let mut out = npy_header("<f4", &format!("({}, 3)", points.len()));
     out.extend(points.iter().flat_map(|p| p.to_array()).flat_map(f32::to_le_bytes));
     out
-}
-
-fn text(words: &str, out: &mut Vec<u8>) {
-    out.push(b'X');
-    out.extend((words.len() as u32).to_le_bytes());
-    out.extend(words.as_bytes());
 }
 
 pub fn array(shape: &[u32], values: &[f64]) -> Py {

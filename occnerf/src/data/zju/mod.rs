@@ -6,14 +6,15 @@
 //! mask_cihp/Camera_B1/… .png   labels, 0 being background; or mask/, and where there are both, either
 //! new_params/0.npy …           {poses (1,3J), Rh (1,3), Th (1,3), shapes (1,≤B)}, counted from 0, or all from 1
 //! new_vertices/0.npy …         (V,3), where present compared with the model
-//! occlusion.json               {camera, image_size (w,h), rect {x0, y0, x1, y1}, frames}, where present
+//! occlusion.json               {camera, image_size (w,h), rect {x0, y0, x1, y1}, frames}, where present; of one that
+//!                              moves, also rects, one for each of frames
 //! ```
 
 mod annots;
 #[cfg(test)]
 mod tests;
 
-use std::collections::BTreeSet;
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use glam::Vec3;
@@ -66,7 +67,7 @@ pub(super) fn load(dir: &Path, body: &BodyModel, options: &LoadOptions) -> Resul
     };
     if let Some(recorded) = &recorded {
         for (frame, instant) in train.iter_mut().zip(&instants) {
-            frame.hidden = recorded.frames.contains(instant).then_some(recorded.corners);
+            frame.hidden = recorded.corners.get(instant).copied();
         }
     }
     let mask_dir = |frame: &Planned| frame.masks[0].parent().unwrap_or(dir).to_owned();
@@ -184,10 +185,9 @@ fn compare(path: &Path, fitted: &Fitted, body: &BodyModel) -> Result<(), DataErr
     Ok(())
 }
 
-/// The obstacle of `occlusion.json`, in pixels of the files.
+/// The obstacle of `occlusion.json` by instant, in pixels of the files.
 struct Recorded {
-    corners: [(u32, u32); 2],
-    frames: BTreeSet<usize>,
+    corners: BTreeMap<usize, [(u32, u32); 2]>,
 }
 
 #[derive(Deserialize)]
@@ -196,9 +196,10 @@ struct OcclusionFile {
     image_size: [u32; 2],
     rect: Rectangle,
     frames: Vec<usize>,
+    rects: Option<Vec<Rectangle>>,
 }
 
-#[derive(Deserialize)]
+#[derive(Clone, Copy, Deserialize)]
 struct Rectangle {
     x0: u32,
     y0: u32,
@@ -217,10 +218,11 @@ impl Recorded {
             return Err(DataError::invalid(&path, "size", expected, length.to_string()));
         }
         let text = std::fs::read(&path).map_err(DataError::io(&path))?;
-        let OcclusionFile { camera: name, image_size, rect, frames } = serde_json::from_slice(&text).map_err(|e| {
-            let expected = "camera, image_size (width, height), rect with x0 y0 x1 y1, and frames";
-            DataError::invalid(&path, "the file", expected, e.to_string())
-        })?;
+        let OcclusionFile { camera: name, image_size, rect, frames, rects } =
+            serde_json::from_slice(&text).map_err(|e| {
+                let expected = "camera, image_size (width, height), rect with x0 y0 x1 y1, and frames";
+                DataError::invalid(&path, "the file", expected, e.to_string())
+            })?;
         if name != annots.names[camera] {
             return Ok(None);
         }
@@ -229,17 +231,24 @@ impl Recorded {
             let expected = format!("[{width}, {height}], as of {}", first.image.display());
             return Err(DataError::invalid(&path, "image_size", expected, format!("{image_size:?}")));
         }
-        if rect.x0 > rect.x1 || rect.y0 > rect.y1 || rect.x1 > width || rect.y1 > height {
-            let expected = format!("0 ≤ x0 ≤ x1 ≤ {width} and 0 ≤ y0 ≤ y1 ≤ {height}");
-            let actual = format!("{} {} {} {}", rect.x0, rect.y0, rect.x1, rect.y1);
-            return Err(DataError::invalid(&path, "rect", expected, actual));
+        for rect in rects.iter().flatten().chain([&rect]) {
+            if rect.x0 > rect.x1 || rect.y0 > rect.y1 || rect.x1 > width || rect.y1 > height {
+                let expected = format!("0 ≤ x0 ≤ x1 ≤ {width} and 0 ≤ y0 ≤ y1 ≤ {height}");
+                let actual = format!("{} {} {} {}", rect.x0, rect.y0, rect.x1, rect.y1);
+                return Err(DataError::invalid(&path, "rect", expected, actual));
+            }
+        }
+        let rects = rects.unwrap_or_else(|| vec![rect; frames.len()]);
+        if rects.len() != frames.len() {
+            let expected = format!("{}, as many as frames", frames.len());
+            return Err(DataError::invalid(&path, "rects", expected, rects.len().to_string()));
         }
         let count = annots.num_instants();
         if let Some(beyond) = frames.iter().find(|&&frame| frame >= count) {
             let expected = format!("indices below {count}, as of ims in {}", annots.path.display());
             return Err(DataError::invalid(&path, "frames", expected, beyond.to_string()));
         }
-        let corners = [(rect.x0, rect.y0), (rect.x1, rect.y1)];
-        Ok(Some(Self { corners, frames: frames.into_iter().collect() }))
+        let corners = |r: Rectangle| [(r.x0, r.y0), (r.x1, r.y1)];
+        Ok(Some(Self { corners: frames.into_iter().zip(rects.into_iter().map(corners)).collect() }))
     }
 }

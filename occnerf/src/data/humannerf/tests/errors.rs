@@ -131,7 +131,7 @@ fn values_of_the_wrong_shape_or_type() {
         infos(&[FRAME, "poses"], array(&[72], &[0.0; 72])),
     );
     fails("betas", &["frame_000001.betas", "1 to 1", "[10]"], infos(&[FRAME, "betas"], array(&[10], &[0.0; 10])));
-    fails("text", &["frame_000001.Rh", "an array", "str"], infos(&[FRAME, "Rh"], Py::Text("nothing")));
+    fails("text", &["frame_000001.Rh", "an array", "str"], infos(&[FRAME, "Rh"], Py::text("nothing")));
     fails("record", &["mesh_infos.pkl", FRAME, "dictionary", "numpy array"], infos(&[FRAME], array(&[1], &[0.0])));
     fails("no-key", &["frame_000001.Rh", "no such key", "Th, poses"], |f| {
         f.mesh_infos.remove(&[FRAME, "Rh"]);
@@ -201,7 +201,7 @@ fn broken_pickles() {
         });
     }
     fails("list", &["cameras.pkl", "dictionary", "str"], |f| {
-        std::fs::write(f.dir.join("cameras.pkl"), Py::Text("x").pickle()).unwrap();
+        std::fs::write(f.dir.join("cameras.pkl"), Py::text("x").pickle()).unwrap();
     });
     fails("empty", &["cameras.pkl", "empty"], |f| {
         f.cameras = Py::Dict(vec![]);

@@ -91,8 +91,8 @@ fn cameras_of_the_wrong_shape_or_kind() {
     });
     let one = Py::List(vec![array(&[3, 1], &[0.0; 3])]);
     fails("t-count", &["cams.T", "[3]", "2 cameras", "[1, 3, 1]"], annots(&["cams", "T"], one));
-    fails("text", &["cams.K", "an array", "str"], annots(&["cams", "K"], Py::Text("none")));
-    fails("cams", &["annots.npy", "cams", "dictionary", "str"], annots(&["cams"], Py::Text("none")));
+    fails("text", &["cams.K", "an array", "str"], annots(&["cams", "K"], Py::text("none")));
+    fails("cams", &["annots.npy", "cams", "dictionary", "str"], annots(&["cams"], Py::text("none")));
     fails("r", &["cams.R[1]", "a rotation"], annots(&["cams", "R", "1"], array(&[3, 3], &[0.5; 9])));
     fails("k-focal", &["cams.K[0]", "pinhole"], annots(&["cams", "K", "0"], array(&[3, 3], &[0.0; 9])));
     fails("t-nan", &["cams.T", "not finite", "4"], annots(&["cams", "T", "1"], array(&[3, 1], &[0.0, f64::NAN, 0.0])));
@@ -105,7 +105,7 @@ fn cameras_of_the_wrong_shape_or_kind() {
 
 #[test]
 fn frames_that_name_the_wrong_pictures() {
-    let list = |paths: &[&'static str]| Py::List(paths.iter().map(|p| Py::Text(p)).collect());
+    let list = |paths: &[&str]| Py::List(paths.iter().map(|p| Py::text(p)).collect());
     let three = list(&["Camera_B1/000001.png", "Camera_B2/000001.png", "Camera_B3/000001.png"]);
     fails("beyond", &["annots.npy", "ims", "2 pictures", "up to 3"], annots(&["ims", "1", "ims"], three));
     let other = list(&["Camera_B7/000001.png"]);
@@ -118,7 +118,7 @@ fn frames_that_name_the_wrong_pictures() {
         fails("outside", &["ims[1].ims", "below the capture"], annots(&["ims", "1", "ims"], list(&[path])));
     }
     fails("number", &["ims[2].ims", "a list of pictures"], annots(&["ims", "2"], record(&[])));
-    fails("no-ims", &["annots.npy", "ims", "a list of frames", "str"], annots(&["ims"], Py::Text("none")));
+    fails("no-ims", &["annots.npy", "ims", "a list of frames", "str"], annots(&["ims"], Py::text("none")));
     fails("no-frames", &["annots.npy", "ims", "empty"], annots(&["ims"], Py::List(Vec::new())));
     let few = list(&["Camera_B1/000000.png"]);
     fails("never-all", &["annots.npy", "ims", "all cameras see"], |f| {

@@ -20,7 +20,7 @@ fn both(value: Py) -> Py {
 
 impl Fixture {
     pub fn new(name: &str) -> Self {
-        let paths = |list: &[&'static str]| record(&[("ims", Py::List(list.iter().map(|p| Py::Text(p)).collect()))]);
+        let paths = |list: &[&str]| record(&[("ims", Py::List(list.iter().map(|p| Py::text(p)).collect()))]);
         let annots = record(&[
             (
                 "cams",

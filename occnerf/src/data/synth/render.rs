@@ -1,11 +1,9 @@
-//! Pictures of the person by ray casting.
+//! Pictures of a mesh by ray casting.
 
 use glam::{Affine3A, Mat3, Vec2, Vec3};
 use visibility::RayMesh;
 use volrender::Camera;
 
-use super::person::Person;
-use super::texture::albedo;
 use crate::data::{DataError, Image};
 
 /// Rays a pixel, along each axis.
@@ -18,7 +16,7 @@ const SKY: f32 = 0.07;
 const DIRECT: f32 = 0.42;
 
 /// A camera at `eye` that looks at `target`, upright, square, with the focal length in picture sides.
-pub(super) fn look_at(eye: Vec3, target: Vec3, size: u32, focal: f32) -> Result<Camera, DataError> {
+pub(in crate::data) fn look_at(eye: Vec3, target: Vec3, size: u32, focal: f32) -> Result<Camera, DataError> {
     let forward = (target - eye).normalize_or(Vec3::NEG_Z);
     let right = forward.cross(Vec3::Y).normalize_or(Vec3::X);
     let down = forward.cross(right);
@@ -31,24 +29,36 @@ pub(super) fn look_at(eye: Vec3, target: Vec3, size: u32, focal: f32) -> Result<
         .map_err(|error| DataError::setting("camera", "a pinhole camera", error))
 }
 
-/// The person in one pose, ready to be looked at.
-pub(super) struct Posture<'a> {
-    person: &'a Person,
+/// A picture, colours premultiplied, and its coverage.
+pub(in crate::data) type Picture = (Image, Vec<f32>);
+
+/// The unlit colour of a face at a point given by barycentric weights.
+pub(in crate::data) type Albedo<'a> = dyn Fn(u32, [f32; 3]) -> Vec3 + Sync + 'a;
+
+/// A mesh in one pose, ready to be looked at.
+pub(in crate::data) struct Posture<'a> {
     vertices: Vec<Vec3>,
     normals: Vec<Vec3>,
+    faces: &'a [[u32; 3]],
+    albedo: &'a Albedo<'a>,
     mesh: RayMesh,
 }
 
 impl<'a> Posture<'a> {
-    pub fn new(person: &'a Person, posed: &smpl::Posed) -> Result<Self, DataError> {
-        let vertices = person.posed(posed);
-        let mesh = RayMesh::new(&vertices, &person.faces)
+    /// `vertices` and their `normals`, which need not be of unit length.
+    pub fn new(
+        vertices: Vec<Vec3>,
+        normals: Vec<Vec3>,
+        faces: &'a [[u32; 3]],
+        albedo: &'a Albedo<'a>,
+    ) -> Result<Self, DataError> {
+        let mesh = RayMesh::new(&vertices, faces)
             .map_err(|error| DataError::setting("body", "a mesh that rays can hit", error))?;
-        Ok(Self { person, normals: surface_query::vertex_normals(&vertices, &person.faces), vertices, mesh })
+        Ok(Self { vertices, normals, faces, albedo, mesh })
     }
 
-    /// Colour on black, and the share of each pixel that the person covers.
-    pub fn render(&self, camera: &Camera) -> (Image, Vec<f32>) {
+    /// Colour on black, and the share of each pixel that the mesh covers.
+    pub fn render(&self, camera: &Camera) -> Picture {
         let (width, height) = (camera.width, camera.height);
         let mut image = Image::new(width, height);
         let mut mask = vec![0.0; (width * height) as usize];
@@ -93,14 +103,14 @@ impl<'a> Posture<'a> {
 
     fn color(&self, origin: Vec3, direction: Vec3) -> Option<Vec3> {
         let hit = self.mesh.first_hit(origin, direction)?;
-        let corners = self.person.faces[hit.face as usize];
+        let corners = self.faces[hit.face as usize];
         let mix = |of: &[Vec3]| -> Vec3 { corners.iter().zip(hit.barycentric).map(|(&v, w)| of[v as usize] * w).sum() };
         let normal = mix(&self.normals).normalize_or(-direction);
         let lamp = normal.dot(LAMP.normalize_or(Vec3::Y));
         // Half-Lambert: the terminator is soft and nothing is black.
         let direct = (0.5 + 0.5 * lamp).powi(2);
         let light = AMBIENT + SKY * normal.y + DIRECT * direct;
-        let color = albedo(&self.person.landmarks, mix(&self.person.rest)) * light;
+        let color = (self.albedo)(hit.face, hit.barycentric) * light;
         Some(color.clamp(Vec3::ZERO, Vec3::ONE))
     }
 }

@@ -5,7 +5,7 @@ use glam::Vec3;
 use crate::random::Stream;
 
 /// Hermite step from 0 at `from` to 1 at `to`, which may be the smaller one.
-pub(super) fn smoothstep(from: f32, to: f32, x: f32) -> f32 {
+pub(in crate::data) fn smoothstep(from: f32, to: f32, x: f32) -> f32 {
     let t = ((x - from) / (to - from)).clamp(0.0, 1.0);
     t * t * (3.0 - 2.0 * t)
 }
@@ -21,7 +21,7 @@ fn lattice(x: i32, y: i32, z: i32) -> f32 {
 }
 
 /// Value noise in [0, 1) that varies over a distance of one.
-pub(super) fn smooth_noise(p: Vec3) -> f32 {
+pub(in crate::data) fn smooth_noise(p: Vec3) -> f32 {
     let cell = p.floor();
     let [x, y, z] = cell.to_array().map(|c| c as i32);
     let f = p - cell;
@@ -32,7 +32,7 @@ pub(super) fn smooth_noise(p: Vec3) -> f32 {
 }
 
 /// Standard normal (Box and Muller 1958).
-pub(super) fn normal(stream: &mut Stream) -> f32 {
+pub(in crate::data) fn normal(stream: &mut Stream) -> f32 {
     let radius = (-2.0 * (1.0 - stream.uniform()).ln()).sqrt();
     radius * (std::f32::consts::TAU * stream.uniform()).cos()
 }

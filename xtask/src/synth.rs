@@ -1,0 +1,230 @@
+//! `synth`: a capture made to order, in a published dataset format.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, Result, bail, ensure};
+use clap::{Args, ValueEnum};
+use indicatif::{ProgressBar, ProgressStyle};
+use occnerf::data::{Layout, Obstacle, Occlusion, SynthConfig, Synthetic, synthesise};
+use smpl::{Character, MotionClip};
+
+/// What a finished directory holds, and nothing else does.
+const MARK: &str = "synth.json";
+/// Default width of the path of a moving rectangle, in picture widths.
+const TRAVEL: f32 = 0.3;
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+enum FormatName {
+    /// HumanNeRF's prepared layout, with eval/ cameras.
+    Humannerf,
+    /// Raw ZJU-MoCap, with occlusion.json.
+    ZjuMocap,
+    /// HumanNeRF's wild layout, in which OcMotion is distributed: one camera, occluders/, clean/ frames of the same camera.
+    Ocmotion,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+enum OcclusionName {
+    /// Nothing in front of the person.
+    None,
+    /// The paper's fixed rectangle as high as the picture.
+    Central,
+    /// The same, moving by three tenths of the picture.
+    Moving,
+    /// A desk and pillars of 3-D geometry, in every frame.
+    Objects,
+}
+
+/// What to make, and where to.
+#[derive(Args)]
+pub struct SynthArguments {
+    /// A rigged .glb or .gltf; the embedded person if left out. Its mesh at rest becomes the body model, with as many
+    /// joints as the rig has (poses are then 3 numbers a joint, not 72)
+    character: Option<PathBuf>,
+    /// Directory to write, new or empty
+    #[arg(long)]
+    out: PathBuf,
+    /// Replace what an earlier synth wrote to --out
+    #[arg(long)]
+    force: bool,
+    /// Layout of the files
+    #[arg(long, default_value = "humannerf")]
+    format: FormatName,
+    /// What hides the person
+    #[arg(long, default_value = "central")]
+    occlusion: OcclusionName,
+    /// Part of the person's pixels that is hidden [default: 0.5]
+    #[arg(long, value_name = "0 to 0.95")]
+    fraction: Option<f32>,
+    /// Part of the video, from its start, that is occluded [default: 0.8]; objects stand in all of it
+    #[arg(long, value_name = "0 to 1")]
+    share: Option<f32>,
+    /// How far what hides stands to the right of the person, in picture widths [default: 0]
+    #[arg(long, value_name = "-1 to 1", allow_negative_numbers = true)]
+    position: Option<f32>,
+    /// Frames of the video [default: 100]
+    #[arg(long, value_name = "N")]
+    frames: Option<usize>,
+    /// Pixels a side [default: 192]
+    #[arg(long, value_name = "PIXELS")]
+    size: Option<u32>,
+    /// Cameras kept back [default: 5]; the ocmotion layout has none
+    #[arg(long, value_name = "N")]
+    eval_cameras: Option<usize>,
+    /// Views kept back show every n-th frame [default: 10]
+    #[arg(long, value_name = "N")]
+    eval_every: Option<usize>,
+    /// Motion capture (.npz with poses, trans, fps), for the embedded person or joints with MakeHuman's, Mixamo's, Unreal's or
+    /// SMPL's names [default: a walk; a character's first animation]
+    #[arg(long, value_name = "CLIP.npz")]
+    motion: Option<PathBuf>,
+    /// Full turns added to the motion of a clip or a character over the video, so that all sides are seen [default: 1.15]
+    #[arg(long, value_name = "N", allow_negative_numbers = true)]
+    turns: Option<f32>,
+    /// Error of each bone's orientation in the poses that are written, degrees rms [default: 1.5]
+    #[arg(long, value_name = "DEGREES")]
+    pose_noise: Option<f32>,
+    /// Error of the body's shape: at 1 a character's body lies 1 to 3 cm inside it, the embedded person's betas are off by
+    /// 0.15 under the clothes [default: 1]
+    #[arg(long, value_name = "0 to 3")]
+    shape_noise: Option<f32>,
+    /// Decides the embedded person's shape and all errors [default: 0]
+    #[arg(long, value_name = "N")]
+    seed: Option<u64>,
+}
+
+impl SynthArguments {
+    fn config(&self) -> Result<SynthConfig> {
+        let usual = SynthConfig::default();
+        let paper = Obstacle::default();
+        let obstacle = Obstacle {
+            fraction: self.fraction.unwrap_or(paper.fraction),
+            share: self.share.unwrap_or(paper.share),
+            position: self.position.unwrap_or(paper.position),
+            travel: 0.0,
+        };
+        let occlusion = match self.occlusion {
+            OcclusionName::None => {
+                let given = self.fraction.or(self.share).or(self.position);
+                ensure!(given.is_none(), "--occlusion none has no --fraction, --share or --position");
+                Occlusion::Rectangle(Obstacle { fraction: 0.0, ..paper })
+            }
+            OcclusionName::Central => Occlusion::Rectangle(obstacle),
+            OcclusionName::Moving => Occlusion::Rectangle(Obstacle { travel: TRAVEL, ..obstacle }),
+            OcclusionName::Objects => {
+                ensure!(self.share.is_none(), "--occlusion objects has no --share: they stand in every frame");
+                Occlusion::Objects { fraction: obstacle.fraction, position: obstacle.position }
+            }
+        };
+        Ok(SynthConfig {
+            size: self.size.unwrap_or(usual.size),
+            frames: self.frames.unwrap_or(usual.frames),
+            eval_cameras: self.eval_cameras.unwrap_or(usual.eval_cameras),
+            eval_every: self.eval_every.unwrap_or(usual.eval_every),
+            seed: self.seed.unwrap_or(usual.seed),
+            pose_noise_degrees: self.pose_noise.unwrap_or(usual.pose_noise_degrees),
+            shape_noise: self.shape_noise.unwrap_or(usual.shape_noise),
+            turns: self.turns.unwrap_or(usual.turns),
+            occlusion,
+        })
+    }
+}
+
+/// Whether `path` is named like a rigged character.
+pub fn is_character(path: &Path) -> bool {
+    let extension = path.extension().and_then(|e| e.to_str()).unwrap_or("");
+    ["glb", "gltf"].iter().any(|known| extension.eq_ignore_ascii_case(known))
+}
+
+/// Films `character`, or the embedded person, with a bar.
+pub fn film(character: Option<&Path>, motion: Option<&Path>, config: &SynthConfig) -> Result<Synthetic> {
+    let named = |path: &Path| path.display().to_string();
+    let character = character.map(|path| Character::load(path).map(|c| (c, named(path)))).transpose()?;
+    let motion = motion.map(MotionClip::load).transpose()?;
+    let bar = bar("filming", config.frames);
+    let synthetic = synthesise(character.as_ref().map(|(c, _)| c), motion.as_ref(), config, &|_| bar.inc(1));
+    bar.finish_and_clear();
+    match character {
+        Some((_, name)) => synthetic.context(name),
+        None => Ok(synthetic?),
+    }
+}
+
+fn bar(what: &'static str, length: usize) -> ProgressBar {
+    let bar = ProgressBar::new(length as u64);
+    if let Ok(style) = ProgressStyle::with_template("{bar:28} {pos}/{len} {msg}  {elapsed}") {
+        bar.set_style(style);
+    }
+    bar.with_message(what)
+}
+
+/// Runs the command: everything is written beside --out and takes its place when it is complete.
+pub fn synth(arguments: &SynthArguments) -> Result<()> {
+    let config = arguments.config()?;
+    let out = &arguments.out;
+    if let Some(path) = arguments.character.as_deref().filter(|path| !is_character(path)) {
+        bail!("{}: not a character; expected a .glb or .gltf", path.display());
+    }
+    vacant(out, arguments.force)?;
+    let layout = match arguments.format {
+        FormatName::Humannerf => Layout::HumanNerf,
+        FormatName::ZjuMocap => Layout::ZjuMocap,
+        FormatName::Ocmotion => Layout::Wild,
+    };
+    let synthetic = film(arguments.character.as_deref(), arguments.motion.as_deref(), &config)?;
+    let partial = beside(out)?;
+    let written = write(&synthetic, &partial, layout).and_then(|()| {
+        if out.exists() {
+            vacant(out, arguments.force)?;
+            std::fs::remove_dir_all(out).with_context(|| out.display().to_string())?;
+        }
+        std::fs::rename(&partial, out).with_context(|| out.display().to_string())
+    });
+    if let Err(error) = written {
+        let _ = std::fs::remove_dir_all(&partial);
+        return Err(error);
+    }
+    let capture = &synthetic.capture;
+    println!(
+        "{}: {} frames, {} views kept back, {:.1} % of the person hidden where anything is, {} joints, {} vertices",
+        out.display(),
+        capture.train.len(),
+        if layout == Layout::Wild { capture.train.len().div_ceil(config.eval_every) } else { capture.eval.len() },
+        100.0 * synthetic.hidden_fraction,
+        synthetic.body.num_joints(),
+        synthetic.body.num_vertices(),
+    );
+    println!("train on it: cargo xtask train {}", out.display());
+    Ok(())
+}
+
+fn write(synthetic: &Synthetic, directory: &Path, layout: Layout) -> Result<()> {
+    std::fs::create_dir_all(directory).with_context(|| directory.display().to_string())?;
+    let bar = bar("writing", synthetic.num_pictures(layout));
+    synthetic.write(directory, layout, &|_| bar.inc(1))?;
+    bar.finish_and_clear();
+    let mark = serde_json::json!({ "config": synthetic.config, "hidden_fraction": synthetic.hidden_fraction });
+    crate::run::write(&directory.join(MARK), &serde_json::to_string_pretty(&mark)?)
+}
+
+/// Errors unless `out` may be written: absent, empty, or an earlier result that is to be replaced.
+fn vacant(out: &Path, force: bool) -> Result<()> {
+    let Ok(entries) = std::fs::read_dir(out) else {
+        ensure!(!out.exists(), "{}: not a directory", out.display());
+        return Ok(());
+    };
+    if entries.count() == 0 {
+        return Ok(());
+    }
+    ensure!(out.join(MARK).is_file(), "{}: not empty, and not written by synth (no {MARK})", out.display());
+    ensure!(force, "{}: already holds a capture (--force replaces it)", out.display());
+    Ok(())
+}
+
+/// A free name in the same folder.
+fn beside(out: &Path) -> Result<PathBuf> {
+    let Some(name) = out.file_name() else { bail!("{}: not a name for a directory", out.display()) };
+    let partial = out.with_file_name(format!("{}.partial-{}", name.to_string_lossy(), std::process::id()));
+    ensure!(!partial.exists(), "{}: in the way", partial.display());
+    Ok(partial)
+}

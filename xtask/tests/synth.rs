@@ -1,0 +1,123 @@
+//! `synth` as somebody meets it: what it writes is trained on, and nothing of the user's is lost.
+#![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
+
+mod common;
+
+use std::path::Path;
+use std::process::{Command, Output};
+
+use common::folder;
+
+fn xtask(arguments: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_xtask")).args(arguments).env_remove("SMPL_MODEL").output().unwrap()
+}
+
+fn refused(arguments: &[&str], words: &[&str]) {
+    common::refused(&xtask(arguments), &format!("{arguments:?}"), words);
+}
+
+fn text(path: &Path) -> &str {
+    path.to_str().unwrap()
+}
+
+/// Runs `synth` with few small frames, which must succeed; returns what it says.
+fn small(out: &Path, more: &[&str]) -> String {
+    let usual = ["--size", "32", "--eval-cameras", "1", "--eval-every", "2"];
+    let frames: &[&str] = if more.contains(&"--frames") { &[] } else { &["--frames", "4"] };
+    let output = xtask(&[&["synth", "--out", text(out)], &usual[..], frames, more].concat());
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    String::from_utf8(output.stdout).unwrap()
+}
+
+fn files(directory: &Path) -> usize {
+    std::fs::read_dir(directory).unwrap().count()
+}
+
+#[test]
+fn every_format_is_written_and_trained_on() {
+    let place = folder("synth-formats");
+    for format in ["humannerf", "zju-mocap", "ocmotion"] {
+        let (out, run) = (place.join(format), place.join(format!("{format}-run")));
+        let said = small(&out, &["--format", format]);
+        assert!(said.contains("4 frames, 2 views") && said.contains("24 joints"), "{said}");
+        let output = xtask(&[
+            "train",
+            text(&out),
+            "--out",
+            text(&run),
+            "--preset",
+            "fast",
+            "--steps",
+            "1",
+            "--set",
+            "patches=1",
+            "--set",
+            "patch_size=8",
+        ]);
+        assert!(output.status.success(), "{format}: {}", String::from_utf8_lossy(&output.stderr));
+        let metrics = std::fs::read_to_string(run.join("metrics.json")).unwrap();
+        assert!(metrics.contains("psnr_mask") && metrics.contains("novel_view"), "{metrics}");
+    }
+    assert_eq!(files(&place), 6, "nothing else is left beside them");
+}
+
+#[test]
+fn a_character_is_written_and_keeps_its_joints() {
+    let character = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared/data/character/CesiumMan.glb");
+    if !character.is_file() {
+        println!("skipped: {} is absent", character.display());
+        return;
+    }
+    let out = folder("synth-character").join("capture");
+    let said = small(&out, &[text(&character), "--occlusion", "objects", "--fraction", "0.4", "--format", "ocmotion"]);
+    assert!(said.contains("19 joints"), "{said}");
+    let metadata = std::fs::read_to_string(out.join("metadata.json")).unwrap();
+    let frames: serde_json::Value = serde_json::from_str(&metadata).unwrap();
+    assert_eq!(frames["000003"]["poses"].as_array().unwrap().len(), 3 * 19);
+    assert_eq!(files(&out.join("occluders")), 4);
+    refused(&["train", text(&character), "--resize", "64"], &["CesiumMan.glb", "none of the options"]);
+}
+
+#[test]
+fn nothing_is_overwritten_unasked() {
+    let place = folder("synth-force");
+    let out = place.join("capture");
+    small(&out, &[]);
+    let frame = out.join("images/frame_000003.png");
+    assert!(frame.is_file());
+    refused(&["synth", "--out", text(&out)], &["already holds a capture", "--force"]);
+    small(&out, &["--force", "--frames", "2"]);
+    assert!(!frame.exists() && out.join("images/frame_000001.png").is_file(), "the old capture is gone as a whole");
+
+    let precious = place.join("precious");
+    std::fs::create_dir_all(&precious).unwrap();
+    std::fs::write(precious.join("thesis.txt"), "years of work").unwrap();
+    refused(&["synth", "--out", text(&precious), "--force"], &["precious", "not empty", "synth.json"]);
+    refused(&["synth", "--out", text(&precious.join("thesis.txt"))], &["thesis.txt", "not a directory"]);
+    assert_eq!(std::fs::read_to_string(precious.join("thesis.txt")).unwrap(), "years of work");
+    // An empty directory may be there already.
+    let empty = folder("synth-force-empty");
+    small(&empty, &[]);
+    assert_eq!(files(&place), 2, "nothing half-written is left");
+}
+
+#[test]
+fn what_cannot_be_made_is_refused_and_leaves_nothing_behind() {
+    let place = folder("synth-refused");
+    let out = place.join("capture");
+    let with = |more: &[&str], words: &[&str]| refused(&[&["synth", "--out", text(&out)], more].concat(), words);
+    with(&["--fraction", "1.5"], &["fraction", "0.95"]);
+    with(&["--position", "-3"], &["position", "-1 to 1"]);
+    with(&["--size", "3"], &["size", "16 to 2048"]);
+    with(&["--frames", "10000", "--size", "2048"], &["frames", "MiB"]);
+    with(&["--pose-noise", "nan"], &["pose_noise"]);
+    with(&["--occlusion", "none", "--share", "0.5"], &["--share"]);
+    with(&["--occlusion", "objects", "--share", "0.5"], &["--share", "every frame"]);
+    with(&["/no/such.glb"], &["/no/such.glb"]);
+    with(&["picture.png"], &["picture.png", ".glb"]);
+    with(&["--motion", "/no/such.npz"], &["/no/such.npz"]);
+    let broken = place.join("broken.glb");
+    std::fs::write(&broken, b"glTF, but not for long").unwrap();
+    with(&[text(&broken)], &["broken.glb"]);
+    assert_eq!(files(&place), 1);
+}
