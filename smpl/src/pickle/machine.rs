@@ -3,7 +3,7 @@
 use std::borrow::Cow;
 use std::collections::HashMap;
 
-use super::Value;
+use super::{PERSISTENT, Value};
 use super::numpy::{Dtype, Global};
 use super::reader::{Reader, Step, long, unescape, unquote};
 use crate::array::NdArray;
@@ -327,6 +327,10 @@ impl<'a> Machine<'a> {
                     _ => return Err("global without a name".to_owned()),
                 };
                 self.push(Node::Global(global));
+            }
+            b'Q' => {
+                let id = self.pop()?;
+                self.push(Node::Object(PERSISTENT, Some(id)));
             }
             b'R' | 0x81 => {
                 let arguments = self.pop()?;
