@@ -61,7 +61,7 @@ pub use config::{
     OccludedRule, Preset, RateConfig, SurfaceConfig, VisibilityKind,
 };
 pub use error::Error;
-pub use evaluate::{FrameMetrics, SplitMetrics, evaluate, least_seen_quartile};
+pub use evaluate::{FrameMetrics, SplitMetrics, evaluate, evaluate_with, least_seen_quartile};
 pub use lpips::{Lpips, Trunk};
 pub use pixels::{Label, label_pixels};
 pub use prior::VertexColors;

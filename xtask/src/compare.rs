@@ -1,7 +1,7 @@
 //! `train --compare`: every method on one scene, both pixel rules, one table.
 
 use anyhow::Result;
-use occnerf::{Config, Method, OccludedRule};
+use occnerf::{Config, Lpips, Method, OccludedRule};
 
 use crate::run::{METRICS, Metrics, RunConfig};
 use crate::settings::MethodName;
@@ -19,7 +19,7 @@ const RUNS: [(MethodName, OccludedRule); 7] = [
 ];
 
 /// Trains what is missing under OUT/METHOD-RULE and prints all; a finished run is not trained again.
-pub fn compare(arguments: &TrainArguments) -> Result<()> {
+pub fn compare(arguments: &TrainArguments, lpips: Option<&Lpips>) -> Result<()> {
     anyhow::ensure!(arguments.settings.method.is_none(), "--compare trains every method: leave --method out");
     let default = format!("runs/{}-compare", scene_name(arguments.scene.as_deref()));
     let out = arguments.out.clone().unwrap_or_else(|| default.into());
@@ -49,7 +49,7 @@ pub fn compare(arguments: &TrainArguments) -> Result<()> {
         println!("{name}: training");
         std::fs::create_dir_all(directory.join("renders"))?;
         run.write(&directory)?;
-        if let Some(metrics) = run_one(&directory, &run, &source, false, None)? {
+        if let Some(metrics) = run_one(&directory, &run, &source, lpips, false, None)? {
             rows.push((metrics.method.clone(), metrics));
         }
     }
