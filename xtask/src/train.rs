@@ -86,7 +86,8 @@ pub fn train(arguments: &TrainArguments) -> Result<()> {
         RunConfig { scene: source.scene.clone(), body: source.body.clone(), load: source.load.clone(), train: config };
     run.write(&directory)?;
     println!("run: {}", directory.display());
-    let Some(metrics) = run_one(&directory, &run, &source, lpips.as_ref(), arguments.resume, arguments.stop_after)? else {
+    let Some(metrics) = run_one(&directory, &run, &source, lpips.as_ref(), arguments.resume, arguments.stop_after)?
+    else {
         println!("stopped; go on with --resume --out {}", directory.display());
         return Ok(());
     };
@@ -165,7 +166,8 @@ fn prior_metrics(run: &RunConfig, source: &Source, lpips: Option<&Lpips>) -> Res
     let colors = VertexColors::measure(&scene)?;
     let mut metrics = metrics(&prior, start.elapsed().as_secs_f64(), 3 * colors.colors.len(), String::new());
     metrics.lpips = lpips.map(|lpips| lpips.trunk().name().to_owned());
-    metrics.splits.novel_view = Some(Model::Prior(colors).score(&scene, crate::eval::Split::NovelView, lpips, |_, _| {})?);
+    metrics.splits.novel_view =
+        Some(Model::Prior(colors).score(&scene, crate::eval::Split::NovelView, lpips, |_, _| {})?);
     Ok(metrics)
 }
 

@@ -49,7 +49,9 @@ impl Conv {
             let mut seen = Vec::new();
             if !self.is_pointwise() {
                 seen = vec![0.0; out.nrows() * columns];
-                seen.par_chunks_mut(16 * columns).enumerate().for_each(|(i, seen)| self.gather(input, size, 16 * i, seen));
+                seen.par_chunks_mut(16 * columns)
+                    .enumerate()
+                    .for_each(|(i, seen)| self.gather(input, size, 16 * i, seen));
             }
             let seen = view(if self.is_pointwise() { &input.data } else { &seen }, columns);
             let weight = self.weight.view();

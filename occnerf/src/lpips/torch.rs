@@ -91,9 +91,9 @@ pub(super) fn legacy(path: &Path, file: &mut File) -> Result<BTreeMap<String, Te
     for key in keys.items().unwrap_or_default() {
         let key = key.as_str().unwrap_or_default();
         let mut count = [0; 8];
-        file.seek(SeekFrom::Start(at)).and_then(|_| file.read_exact(&mut count)).map_err(|e| {
-            fault(path, format!("storage {key:?} at byte {at}: {e}"))
-        })?;
+        file.seek(SeekFrom::Start(at))
+            .and_then(|_| file.read_exact(&mut count))
+            .map_err(|e| fault(path, format!("storage {key:?} at byte {at}: {e}")))?;
         let size = sizes.get(key).copied().unwrap_or(1);
         let size = u64::from_le_bytes(count).checked_mul(size).filter(|&n| n <= length.saturating_sub(at + 8));
         let size = size.ok_or_else(|| fault(path, format!("is cut: storage {key:?} at byte {at} ends beyond it")))?;
@@ -121,7 +121,8 @@ fn items(value: &Value) -> &[(Value, Value)] {
 /// Storage, offset, extents and strides of a tensor.
 fn parts(value: &Value) -> Option<(&[Value], &Value, &Value, &Value)> {
     let Value::Object { class: "torch.Tensor", state } = value else { return None };
-    let [Value::Object { class: pickle::PERSISTENT, state: storage }, offset, shape, strides, ..] = state.items()? else {
+    let [Value::Object { class: pickle::PERSISTENT, state: storage }, offset, shape, strides, ..] = state.items()?
+    else {
         return None;
     };
     Some((storage.items()?, offset, shape, strides))

@@ -81,7 +81,10 @@ pub(super) fn load(path: &Path) -> Result<Lpips, Error> {
 
 fn no_lin(path: &Path, trunk: Trunk) -> Error {
     let name = trunk.name();
-    fault(path, format!("is {name} without LPIPS's linear layers: no `lin0.weight` of {name} in it or in a file beside it"))
+    fault(
+        path,
+        format!("is {name} without LPIPS's linear layers: no `lin0.weight` of {name} in it or in a file beside it"),
+    )
 }
 
 fn build(trunk: Trunk, trunk_file: &mut Weights, mut lin: Option<&mut Weights>) -> Result<Lpips, Error> {
@@ -200,7 +203,11 @@ fn number(dtype: Dtype, word: &[u8]) -> f32 {
 fn half(bits: u16) -> f32 {
     let (sign, rest) = (u32::from(bits & 0x8000) << 16, u32::from(bits & 0x7fff));
     // As a float with a wrong bias it is too small by 2¹¹², subnormal numbers included.
-    let magnitude = if rest >= 0x7c00 { f32::from_bits(rest << 13 | 0x7f80_0000) } else { f32::from_bits(rest << 13) * 2f32.powi(112) };
+    let magnitude = if rest >= 0x7c00 {
+        f32::from_bits(rest << 13 | 0x7f80_0000)
+    } else {
+        f32::from_bits(rest << 13) * 2f32.powi(112)
+    };
     f32::from_bits(sign | magnitude.to_bits())
 }
 

@@ -44,7 +44,8 @@ fn bytes(values: &[f32]) -> Vec<u8> {
 
 fn safetensors(tensors: &Tensors) -> Vec<u8> {
     let data: Vec<_> = tensors.iter().map(|(name, (shape, values))| (name, shape, bytes(values))).collect();
-    let views = data.iter().map(|(name, shape, data)| (name, TensorView::new(Dtype::F32, (*shape).clone(), data).unwrap()));
+    let views =
+        data.iter().map(|(name, shape, data)| (name, TensorView::new(Dtype::F32, (*shape).clone(), data).unwrap()));
     serialize(views.collect::<Vec<_>>(), None).unwrap()
 }
 
@@ -140,7 +141,11 @@ fn every_form_of_file_and_directory_gives_the_same_network() {
         let two = folder(&format!("two-{end}"));
         std::fs::write(two.join(format!("squeezenet1_1.{end}")), form(&trunk)).unwrap();
         std::fs::write(two.join(format!("a.{end}")), form(&lin)).unwrap();
-        assert_eq!(value(&Lpips::load(&two.join(format!("squeezenet1_1.{end}"))).unwrap()), expected, "{end}, two files");
+        assert_eq!(
+            value(&Lpips::load(&two.join(format!("squeezenet1_1.{end}"))).unwrap()),
+            expected,
+            "{end}, two files"
+        );
         assert_eq!(value(&Lpips::load(&two).unwrap()), expected, "{end}, two files in a directory");
     }
 }

@@ -47,7 +47,9 @@ fn compare(lpips: &Lpips, golden: &mut Npz, name: &str, set: &str) {
 
 #[test]
 fn squeezenet_gives_the_golden_values_and_gradients() {
-    let (Some(weights), Some(golden)) = (shared("squeezenet1_1_lpips.safetensors"), shared("golden.npz")) else { return };
+    let (Some(weights), Some(golden)) = (shared("squeezenet1_1_lpips.safetensors"), shared("golden.npz")) else {
+        return;
+    };
     let lpips = Lpips::load(&weights).unwrap();
     assert_eq!(lpips.trunk(), Trunk::SqueezeNet);
     let mut golden = Npz::open(&golden).unwrap();
@@ -90,10 +92,14 @@ fn gradients_of_every_trunk_agree_with_central_differences() {
         let mut d_a = vec![0.0; a.len()];
         lpips.distance_backward(&a, &b, w, h, 1.0, &mut d_a).unwrap();
         // Along smooth directions: single pixels of noise meet a kink within any step that single precision resolves.
-        let waves: Vec<Vec<f32>> =
-            (0..4).map(|k| (0..a.len()).map(|i| ((i / 3 % w + k * (i / 3 / w)) as f32 * 0.2 + k as f32).sin()).collect()).collect();
+        let waves: Vec<Vec<f32>> = (0..4)
+            .map(|k| (0..a.len()).map(|i| ((i / 3 % w + k * (i / 3 / w)) as f32 * 0.2 + k as f32).sin()).collect())
+            .collect();
         let along = |x: &[f32]| -> Vec<f32> {
-            a.iter().enumerate().map(|(i, a)| a + waves.iter().zip(x).map(|(wave, x)| x * wave[i]).sum::<f32>()).collect()
+            a.iter()
+                .enumerate()
+                .map(|(i, a)| a + waves.iter().zip(x).map(|(wave, x)| x * wave[i]).sum::<f32>())
+                .collect()
         };
         let analytic: Vec<f32> =
             waves.iter().map(|wave| wave.iter().zip(&d_a).map(|(w, d)| f64::from(w * d)).sum::<f64>() as f32).collect();

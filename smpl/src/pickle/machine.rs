@@ -3,9 +3,9 @@
 use std::borrow::Cow;
 use std::collections::HashMap;
 
-use super::{PERSISTENT, Value};
 use super::numpy::{Dtype, Global};
 use super::reader::{Reader, Step, long, unescape, unquote};
+use super::{PERSISTENT, Value};
 use crate::array::NdArray;
 
 /// Index of a node. Nodes live in one arena, because a container can be referred to before it is filled.

@@ -108,7 +108,7 @@ pub fn probe(arguments: &ProbeArguments) -> Result<()> {
         Op::Metrics => {
             let lpips = load_lpips(arguments.lpips.as_deref())?;
             picture::metrics(Input::open(path, &["a", "b", "mask"], &[])?, lpips.as_ref(), &mut output)?;
-        },
+        }
     }
     output.write(&arguments.out)
 }
