@@ -217,6 +217,10 @@ pub struct LossConfig {
     pub mse: f32,
     /// λ₂, perceptual term.
     pub perceptual: f32,
+    /// File or directory of weights that makes the perceptual term LPIPS (see [`crate::Lpips::load`]); empty: multi-scale
+    /// SSIM, which needs none.
+    #[serde(default)]
+    pub perceptual_weights: String,
     /// λ₃, completeness.
     pub completeness: f32,
     /// β of the completeness term, in units of the density.

@@ -29,6 +29,9 @@ pub enum Error {
     /// A capture that cannot be trained on.
     #[error("scene: {0}")]
     Scene(String),
+    /// Pictures or weights that LPIPS cannot take.
+    #[error("LPIPS: {0}")]
+    Lpips(String),
     /// A file that cannot be read or written.
     #[error("{}: {source}", path.display())]
     Io {

@@ -9,6 +9,7 @@ use visibility::RayMesh;
 use volrender::metrics;
 
 use crate::Error;
+use crate::lpips::Lpips;
 use crate::pixels::Label;
 use crate::render::{Renderer, Rendering};
 use crate::scene::{PreparedFrame, Scene};
@@ -39,6 +40,9 @@ pub struct FrameMetrics {
     pub psnr_full: Option<f64>,
     /// The whole image.
     pub ssim_full: Option<f64>,
+    /// LPIPS over the whole image; not measured without weights.
+    #[serde(default)]
+    pub lpips_full: Option<f64>,
     /// Opacity above one half against the true mask.
     pub mask_iou: f64,
 }
@@ -85,6 +89,17 @@ pub fn evaluate(
     scene: &Scene,
     renderer: &mut dyn Renderer,
     frames: &[&PreparedFrame],
+    progress: impl FnMut(&PreparedFrame, &Rendering),
+) -> Result<SplitMetrics, Error> {
+    evaluate_with(scene, renderer, frames, None, progress)
+}
+
+/// [`evaluate`], with LPIPS over the whole image where `lpips` is given.
+pub fn evaluate_with(
+    scene: &Scene,
+    renderer: &mut dyn Renderer,
+    frames: &[&PreparedFrame],
+    lpips: Option<&Lpips>,
     mut progress: impl FnMut(&PreparedFrame, &Rendering),
 ) -> Result<SplitMetrics, Error> {
     let least = least_seen_quartile(scene)?;
@@ -103,7 +118,7 @@ pub fn evaluate(
                 rendering.opacity[i] = 0.0;
             }
         }
-        scores.push(score(frame, &rendering, &hidden));
+        scores.push(score(frame, &rendering, &hidden, lpips)?);
     }
     let mean = |pick: &dyn Fn(&FrameMetrics) -> Option<f64>| {
         let values: Vec<f64> = scores.iter().filter_map(pick).filter(|v| v.is_finite()).collect();
@@ -117,14 +132,19 @@ pub fn evaluate(
         psnr_hidden: mean(&|f| f.psnr_hidden),
         psnr_full: mean(&|f| f.psnr_full),
         ssim_full: mean(&|f| f.ssim_full),
-        lpips_full: None,
+        lpips_full: mean(&|f| f.lpips_full),
         mask_iou: mean(&|f| Some(f.mask_iou)),
         render_seconds_per_frame: seconds / frames.len().max(1) as f64,
         frames: scores,
     })
 }
 
-fn score(frame: &PreparedFrame, rendering: &Rendering, hidden: &[bool]) -> FrameMetrics {
+fn score(
+    frame: &PreparedFrame,
+    rendering: &Rendering,
+    hidden: &[bool],
+    lpips: Option<&Lpips>,
+) -> Result<FrameMetrics, Error> {
     let (a, b) = (&rendering.image.pixels[..], &frame.pixels[..]);
     let (width, height) = (frame.camera.width as usize, frame.camera.height as usize);
     let visible: Vec<bool> = rendering.opacity.iter().map(|&o| o > VISIBLE).collect();
@@ -134,7 +154,8 @@ fn score(frame: &PreparedFrame, rendering: &Rendering, hidden: &[bool]) -> Frame
     let union = count(&|s, m| s || m);
     let hidden: Vec<bool> = hidden.iter().zip(&mask).map(|(&h, &m)| h && m).collect();
     let enough = hidden.iter().filter(|h| **h).count() >= MIN_HIDDEN_PIXELS;
-    FrameMetrics {
+    let lpips_full = lpips.map(|lpips| lpips.distance(a, b, width, height)).transpose()?;
+    Ok(FrameMetrics {
         name: frame.name.clone(),
         camera: frame.camera_name.clone(),
         psnr_vis: metrics::psnr_masked(a, b, &visible),
@@ -144,8 +165,9 @@ fn score(frame: &PreparedFrame, rendering: &Rendering, hidden: &[bool]) -> Frame
         psnr_hidden: if enough { metrics::psnr_masked(a, b, &hidden) } else { None },
         psnr_full: Some(metrics::psnr(a, b)),
         ssim_full: metrics::ssim(a, b, width, height).ok(),
+        lpips_full: lpips_full.and_then(|values| values.first().copied()),
         mask_iou: if union == 0 { 1.0 } else { count(&|s, m| s && m) as f64 / union as f64 },
-    }
+    })
 }
 
 /// Pixels (H × W) whose first hit on the posed prior is nearest to a vertex of `least`.

@@ -37,6 +37,8 @@ mod evaluate;
 mod field;
 mod gemm;
 mod loss;
+#[cfg_attr(not(feature = "lpips"), path = "lpips/absent.rs")]
+mod lpips;
 mod mlp;
 mod occupancy;
 mod parameters;
@@ -59,7 +61,8 @@ pub use config::{
     MotionKind, OccludedRule, Preset, RateConfig, SurfaceConfig, VisibilityKind,
 };
 pub use error::Error;
-pub use evaluate::{FrameMetrics, SplitMetrics, evaluate, least_seen_quartile};
+pub use evaluate::{FrameMetrics, SplitMetrics, evaluate, evaluate_with, least_seen_quartile};
+pub use lpips::{Lpips, Trunk};
 pub use pixels::{Label, label_pixels};
 pub use prior::VertexColors;
 pub use render::{FieldRenderer, PriorRenderer, Renderer, Rendering, view_of};

@@ -42,7 +42,13 @@ pub(crate) fn paper() -> Config {
             depth: 0.3,
             correction_spacing: 0,
         },
-        loss: LossConfig { mse: 0.2, perceptual: 1.0, completeness: 10.0, beta: 10.0 },
+        loss: LossConfig {
+            mse: 0.2,
+            perceptual: 1.0,
+            perceptual_weights: String::new(),
+            completeness: 10.0,
+            beta: 10.0,
+        },
         rates: RateConfig {
             field: 5e-4,
             vertices: 1e-4,

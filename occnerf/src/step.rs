@@ -10,6 +10,7 @@ use crate::config::DistanceKind;
 use crate::correction::{Wrench, correct_backward};
 use crate::field::Group;
 use crate::loss::{completeness, multiscale_dissimilarity};
+use crate::lpips::Lpips;
 use crate::parameters::Part;
 use crate::pixels::Label;
 use crate::random::Stream;
@@ -78,11 +79,14 @@ impl Trainer<'_> {
         if loss.perceptual > 0.0 {
             let patch = batch.size * batch.size;
             let scale = loss.perceptual / self.config.patches as f32;
-            let values: Vec<f64> = d_colors
-                .par_chunks_mut(patch)
-                .zip(colors.par_chunks(patch).zip(targets.par_chunks(patch)))
-                .map(|(d_colors, (colors, targets))| perceptual(colors, targets, batch.size, scale, d_colors))
-                .collect();
+            let values: Vec<f64> = match &self.lpips {
+                Some(lpips) => learned_perceptual(lpips, &colors, &targets, batch.size, scale, &mut d_colors),
+                None => d_colors
+                    .par_chunks_mut(patch)
+                    .zip(colors.par_chunks(patch).zip(targets.par_chunks(patch)))
+                    .map(|(d_colors, (colors, targets))| perceptual(colors, targets, batch.size, scale, d_colors))
+                    .collect(),
+            };
             report.perceptual = values.iter().sum::<f64>() / self.config.patches as f64;
         }
         d_colors
@@ -222,19 +226,46 @@ impl Trainer<'_> {
     }
 }
 
-/// The perceptual term of one patch; unknown pixels show the prediction on both sides and get no gradient.
+/// The embedded perceptual term of one patch.
 fn perceptual(colors: &[Vec3], targets: &[Option<Vec3>], size: usize, scale: f32, d_colors: &mut [Vec3]) -> f64 {
-    let flat = |c: Vec3| c.to_array();
-    let a: Vec<f32> = colors.iter().flat_map(|&c| flat(c)).collect();
-    let b: Vec<f32> = colors.iter().zip(targets).flat_map(|(&c, t)| flat(t.unwrap_or(c))).collect();
+    let (a, b) = both_sides(colors, targets);
     let mut d = vec![0.0; a.len()];
     let value = multiscale_dissimilarity(&a, &b, size, scale, &mut d);
+    add_known(&d, targets, d_colors);
+    value
+}
+
+/// LPIPS of every patch of the step.
+fn learned_perceptual(
+    lpips: &Lpips,
+    colors: &[Vec3],
+    targets: &[Option<Vec3>],
+    size: usize,
+    scale: f32,
+    d_colors: &mut [Vec3],
+) -> Vec<f64> {
+    let (a, b) = both_sides(colors, targets);
+    let mut d = vec![0.0; a.len()];
+    // The size was checked when the weights were loaded.
+    let values = lpips.distance_backward(&a, &b, size, size, scale, &mut d).unwrap_or_default();
+    add_known(&d, targets, d_colors);
+    values
+}
+
+/// Prediction and target for a perceptual term; unknown pixels show the prediction on both sides.
+fn both_sides(colors: &[Vec3], targets: &[Option<Vec3>]) -> (Vec<f32>, Vec<f32>) {
+    let a = colors.iter().flat_map(|c| c.to_array());
+    let b = colors.iter().zip(targets).flat_map(|(&c, t)| t.unwrap_or(c).to_array());
+    (a.collect(), b.collect())
+}
+
+/// Adds the gradient of a perceptual term where the target is known.
+fn add_known(d: &[f32], targets: &[Option<Vec3>], d_colors: &mut [Vec3]) {
     for ((d_color, d), target) in d_colors.iter_mut().zip(d.chunks_exact(3)).zip(targets) {
         if target.is_some() {
             *d_color += Vec3::from_slice(d);
         }
     }
-    value
 }
 
 fn zero(buffer: &mut Vec<f32>, len: usize) {

@@ -14,6 +14,7 @@ use crate::config::{Config, DistanceKind, MotionKind, VisibilityKind};
 use crate::correction::{Corrections, Wrench, correct};
 use crate::encoder::Coordinates;
 use crate::field::{Field, Group};
+use crate::lpips::Lpips;
 use crate::parameters::{PARTS, Parameters, Part};
 use crate::samples::{Stage, Tracer};
 use crate::scene::{PreparedFrame, Scene};
@@ -57,6 +58,8 @@ pub struct Trainer<'a> {
     pub(crate) counts: VisibilityCounts,
     pub(crate) volume: Option<WeightVolume>,
     pub(crate) corrections: Corrections,
+    /// The perceptual term, where it is not the embedded one.
+    pub(crate) lpips: Option<Lpips>,
     pub(crate) steps_done: u64,
     pub(crate) stage: Stage,
     batch: Batch,
@@ -124,7 +127,33 @@ impl<'a> Trainer<'a> {
             field,
             volume,
             corrections,
+            lpips: None,
         })
+    }
+
+    /// Loads the weights that `loss.perceptual_weights` names, if it names any: before the first [`Trainer::step`], also of a
+    /// resumed run. Drawing and scoring do not need them.
+    ///
+    /// # Errors
+    /// Those of [`Lpips::load`]; [`Error::Lpips`] for patches too small for the network.
+    pub fn load_perceptual(&mut self) -> Result<(), Error> {
+        if self.config.loss.perceptual > 0.0 && !self.config.loss.perceptual_weights.is_empty() {
+            let lpips = Lpips::load(self.config.loss.perceptual_weights.as_ref())?;
+            let sides = self.scene.train.iter().map(|f| f.camera.width.min(f.camera.height));
+            let side = sides.min().unwrap_or(0).min(self.config.patch_size) as usize;
+            lpips.check_size(side, side)?;
+            self.lpips = Some(lpips);
+        }
+        Ok(())
+    }
+
+    /// Which perceptual term the run is trained with: `ms-ssim`, `lpips` with the network's name, or `none`.
+    pub fn perceptual(&self) -> String {
+        match &self.lpips {
+            Some(lpips) => format!("lpips {}", lpips.trunk().name()),
+            None if self.config.loss.perceptual == 0.0 => "none".to_owned(),
+            None => "ms-ssim".to_owned(),
+        }
     }
 
     /// The run's configuration.
@@ -202,7 +231,13 @@ impl<'a> Trainer<'a> {
     }
 
     /// One optimisation step.
+    ///
+    /// # Panics
+    /// If the configuration names weights of the perceptual term and [`Trainer::load_perceptual`] was not called.
     pub fn step(&mut self) -> StepReport {
+        let loss = &self.config.loss;
+        let loaded = self.lpips.is_some() || loss.perceptual_weights.is_empty() || loss.perceptual == 0.0;
+        assert!(loaded, "weights of the perceptual term were not loaded");
         let step = self.steps_done;
         let mut batch = std::mem::take(&mut self.batch);
         batch.draw(self.scene, &self.config, step);

@@ -1,7 +1,7 @@
 //! `train --compare`: every method on one scene, both pixel rules, one table.
 
 use anyhow::Result;
-use occnerf::{Config, Method, OccludedRule};
+use occnerf::{Config, Lpips, Method, OccludedRule};
 
 use crate::run::{Metrics, RunConfig};
 use crate::settings::MethodName;
@@ -19,7 +19,7 @@ const RUNS: [(MethodName, OccludedRule); 7] = [
 ];
 
 /// Trains what is missing under OUT/METHOD-RULE and prints all; a finished run is not trained again.
-pub fn compare(arguments: &TrainArguments) -> Result<()> {
+pub fn compare(arguments: &TrainArguments, lpips: Option<&Lpips>) -> Result<()> {
     anyhow::ensure!(arguments.settings.method.is_none(), "--compare trains every method: leave --method out");
     let default = format!("runs/{}-compare", scene_name(arguments.scene.as_deref()));
     let out = arguments.out.clone().unwrap_or_else(|| default.into());
@@ -40,7 +40,7 @@ pub fn compare(arguments: &TrainArguments) -> Result<()> {
             load: source.load.clone(),
             train: config,
         };
-        rows.push((run.train.method.name().to_owned(), run_unless_finished(&directory, &name, &run, &source)?));
+        rows.push((run.train.method.name().to_owned(), run_unless_finished(&directory, &name, &run, &source, lpips)?));
     }
     let rows: Vec<(String, &Metrics)> = rows.iter().map(|(name, metrics)| (name.clone(), metrics)).collect();
     let text = table::markdown(&rows);

@@ -7,8 +7,8 @@ use clap::{Args, ValueEnum};
 use image::RgbImage;
 use indicatif::ProgressBar;
 use occnerf::{
-    FieldRenderer, Method, PreparedFrame, PriorRenderer, Renderer, Rendering, Scene, SplitMetrics, Trainer,
-    VertexColors, evaluate,
+    FieldRenderer, Lpips, Method, PreparedFrame, PriorRenderer, Renderer, Rendering, Scene, SplitMetrics, Trainer,
+    VertexColors, evaluate_with,
 };
 
 use crate::run::{CHECKPOINT, METRICS, Metrics, RunConfig, Splits, peak_rss_bytes, use_threads};
@@ -34,6 +34,9 @@ pub struct EvalArguments {
     /// Which frames [default: both]
     #[arg(long)]
     split: Option<Split>,
+    /// Weights to score LPIPS with, as for `train`
+    #[arg(long, value_name = "PATH")]
+    lpips: Option<PathBuf>,
     /// Threads [default: all cores]
     #[arg(long)]
     threads: Option<usize>,
@@ -42,6 +45,7 @@ pub struct EvalArguments {
 /// Runs the command.
 pub fn eval(arguments: &EvalArguments) -> Result<()> {
     use_threads(arguments.threads)?;
+    let lpips = load_lpips(arguments.lpips.as_deref())?;
     let directory = &arguments.run;
     let run = RunConfig::read(directory)?;
     let source = run.source()?;
@@ -52,6 +56,11 @@ pub fn eval(arguments: &EvalArguments) -> Result<()> {
     } else {
         trainer = Trainer::resume(&scene, &directory.join(CHECKPOINT))?;
         Model::Field(&trainer)
+    };
+    let network = network_name(lpips.as_ref());
+    let perceptual = match &model {
+        Model::Prior(_) => String::new(),
+        Model::Field(trainer) => trainer.perceptual(),
     };
     let mut metrics = if directory.join(METRICS).is_file() {
         Metrics::read(directory)?
@@ -74,14 +83,19 @@ pub fn eval(arguments: &EvalArguments) -> Result<()> {
             train_seconds: 0.0,
             peak_rss_bytes: peak_rss_bytes(),
             parameters,
+            perceptual,
+            lpips: None,
             splits: Splits::default(),
         }
     };
     if arguments.split != Some(Split::TrainView) {
-        metrics.splits.novel_view = Some(model.score_with_bar(&scene, Split::NovelView, |_, _| {})?);
+        metrics.splits.novel_view = Some(model.score_with_bar(&scene, Split::NovelView, lpips.as_ref(), |_, _| {})?);
     }
     if arguments.split != Some(Split::NovelView) {
-        metrics.splits.train_view = Some(model.score_with_bar(&scene, Split::TrainView, |_, _| {})?);
+        metrics.splits.train_view = Some(model.score_with_bar(&scene, Split::TrainView, lpips.as_ref(), |_, _| {})?);
+    }
+    if network.is_some() {
+        metrics.lpips = network;
     }
     metrics.write(directory)?;
     report::write(directory, &metrics)?;
@@ -104,6 +118,15 @@ pub fn scored_frames(scene: &Scene) -> impl Iterator<Item = &PreparedFrame> {
     scene.eval.iter().chain(scored_train_frames(scene))
 }
 
+/// The network that `--lpips` names.
+pub fn load_lpips(path: Option<&Path>) -> Result<Option<Lpips>> {
+    Ok(path.map(Lpips::load).transpose()?)
+}
+
+fn network_name(lpips: Option<&Lpips>) -> Option<String> {
+    lpips.map(|lpips| lpips.trunk().name().to_owned())
+}
+
 /// What can be scored and drawn.
 pub enum Model<'a> {
     Field(&'a Trainer<'a>),
@@ -124,19 +147,21 @@ impl Model<'_> {
         &self,
         scene: &Scene,
         split: Split,
+        lpips: Option<&Lpips>,
         seen: impl FnMut(&PreparedFrame, &Rendering),
     ) -> Result<SplitMetrics> {
         let frames: Vec<&PreparedFrame> = match split {
             Split::NovelView => scene.eval.iter().collect(),
             Split::TrainView => scored_train_frames(scene).collect(),
         };
-        Ok(evaluate(scene, self.renderer(scene)?.as_mut(), &frames, seen)?)
+        Ok(evaluate_with(scene, self.renderer(scene)?.as_mut(), &frames, lpips, seen)?)
     }
 
     fn score_with_bar(
         &self,
         scene: &Scene,
         split: Split,
+        lpips: Option<&Lpips>,
         mut seen: impl FnMut(&PreparedFrame, &Rendering),
     ) -> Result<SplitMetrics> {
         let frames = match split {
@@ -144,7 +169,7 @@ impl Model<'_> {
             Split::TrainView => scored_train_frames(scene).count(),
         };
         let bar = ProgressBar::new(frames as u64).with_message("scoring");
-        let metrics = self.score(scene, split, |frame, rendering| {
+        let metrics = self.score(scene, split, lpips, |frame, rendering| {
             bar.inc(1);
             seen(frame, rendering);
         })?;
@@ -159,13 +184,14 @@ pub fn score_run(
     run: &RunConfig,
     scene: &Scene,
     model: &Model<'_>,
+    lpips: Option<&Lpips>,
     mut metrics: Metrics,
 ) -> Result<Metrics> {
     let mut cameras: Vec<(String, Vec<RgbImage>)> = Vec::new();
     let per_camera = scene.eval.iter().filter(|f| f.camera_name == scene.eval[0].camera_name).count().max(1);
     let stride = per_camera.div_ceil(SHEET_INSTANTS).max(1);
     let mut index = 0;
-    let novel = model.score_with_bar(scene, Split::NovelView, |frame, rendering| {
+    let novel = model.score_with_bar(scene, Split::NovelView, lpips, |frame, rendering| {
         if cameras.last().is_none_or(|(name, _)| *name != frame.camera_name) {
             cameras.push((frame.camera_name.clone(), Vec::new()));
             index = 0;
@@ -180,13 +206,14 @@ pub fn score_run(
     let rows: Vec<Vec<RgbImage>> = cameras.into_iter().map(|(_, row)| row).collect();
     pictures::save(&pictures::sheet(&rows), &directory.join("renders/novel_views.png"))?;
     let mut row = Vec::new();
-    let train = model.score_with_bar(scene, Split::TrainView, |frame, rendering| {
+    let train = model.score_with_bar(scene, Split::TrainView, lpips, |frame, rendering| {
         if row.len() < 2 * 5 {
             row.extend(beside_truth(frame, rendering));
         }
     })?;
     pictures::save(&pictures::sheet(&[row]), &directory.join("renders/train_views.png"))?;
     metrics.peak_rss_bytes = peak_rss_bytes();
+    metrics.lpips = network_name(lpips);
     metrics.splits = Splits { novel_view: (!scene.eval.is_empty()).then_some(novel), train_view: Some(train) };
     metrics.scene.clone_from(&run.scene);
     metrics.write(directory)?;

@@ -64,6 +64,12 @@ pub struct Metrics {
     pub train_seconds: f64,
     pub peak_rss_bytes: u64,
     pub parameters: usize,
+    /// Perceptual term of the training.
+    #[serde(default)]
+    pub perceptual: String,
+    /// Network of `lpips_full`.
+    #[serde(default)]
+    pub lpips: Option<String>,
     pub splits: Splits,
 }
 

@@ -88,6 +88,10 @@ pub struct SettingArguments {
     /// Seed of every random choice [default: 1]
     #[arg(long)]
     pub seed: Option<u64>,
+    /// Weights that make the perceptual term LPIPS: SqueezeNet 1.1, VGG16 or AlexNet with LPIPS's linear layers, .safetensors
+    /// or .pth, a file or a directory [default: multi-scale SSIM]
+    #[arg(long, value_name = "PATH")]
+    pub perceptual_weights: Option<String>,
     /// Any other value of the train table in config.toml, such as encoding.n_max=512; may be repeated
     #[arg(long = "set", value_name = "KEY=VALUE")]
     pub set: Vec<String>,
@@ -118,6 +122,9 @@ impl SettingArguments {
         }
         config.steps = self.steps.unwrap_or(config.steps);
         config.seed = self.seed.unwrap_or(config.seed);
+        if let Some(path) = &self.perceptual_weights {
+            config.loss.perceptual_weights.clone_from(path);
+        }
         for assignment in &self.set {
             config = set(&config, assignment).with_context(|| format!("--set {assignment}"))?;
         }

@@ -8,7 +8,8 @@ fn cell(value: Option<f64>, digits: usize) -> String {
 
 /// A row for each run: novel views, ranked quantities first.
 pub fn markdown(rows: &[(String, &Metrics)]) -> String {
-    let header = [
+    let networks: Vec<&str> = rows.iter().filter_map(|(_, m)| m.lpips.as_deref()).collect();
+    let mut header = vec![
         "method",
         "occluded",
         "steps",
@@ -23,11 +24,15 @@ pub fn markdown(rows: &[(String, &Metrics)]) -> String {
         "iou",
         "s/frame",
         "params",
+        "perceptual term",
     ];
-    let mut lines: Vec<Vec<String>> = vec![header.map(str::to_owned).to_vec()];
+    if !networks.is_empty() {
+        header.push("lpips_full");
+    }
+    let mut lines: Vec<Vec<String>> = vec![header.iter().map(|&name| name.to_owned()).collect()];
     for (name, m) in rows {
         let Some(split) = m.splits.novel_view.as_ref().or(m.splits.train_view.as_ref()) else { continue };
-        lines.push(vec![
+        let mut line = vec![
             name.clone(),
             if m.method == "prior" { "–".to_owned() } else { m.occluded.clone() },
             m.steps.to_string(),
@@ -42,7 +47,13 @@ pub fn markdown(rows: &[(String, &Metrics)]) -> String {
             cell(split.mask_iou, 3),
             format!("{:.2}", split.render_seconds_per_frame),
             m.parameters.to_string(),
-        ]);
+            if m.perceptual.is_empty() { "–".to_owned() } else { m.perceptual.clone() },
+        ];
+        if !networks.is_empty() {
+            let network = m.lpips.as_deref().filter(|_| split.lpips_full.is_some());
+            line.push(network.map_or("–".to_owned(), |n| format!("{} ({n})", cell(split.lpips_full, 4))));
+        }
+        lines.push(line);
     }
     aligned(&lines, 2)
 }

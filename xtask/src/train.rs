@@ -7,10 +7,10 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, Result};
 use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
-use occnerf::{Method, Scene, StepReport, Trainer, VertexColors, checkpoint_config};
+use occnerf::{Lpips, Method, Scene, StepReport, Trainer, VertexColors, checkpoint_config};
 
 use crate::compare::compare;
-use crate::eval::{Model, score_run};
+use crate::eval::{Model, load_lpips, score_run};
 use crate::run::{
     CHECKPOINT, METRICS, Metrics, RunConfig, Splits, existing_directory, new_directory, peak_rss_bytes, use_threads,
 };
@@ -42,6 +42,9 @@ pub struct TrainArguments {
     /// Threads [default: all cores]; the result does not depend on it
     #[arg(long)]
     pub threads: Option<usize>,
+    /// Weights to score LPIPS with: SqueezeNet 1.1, VGG16 or AlexNet, .safetensors or .pth, a file or a directory
+    #[arg(long, value_name = "PATH")]
+    pub lpips: Option<PathBuf>,
     /// Go on with the run in --out from its checkpoint
     #[arg(long)]
     pub resume: bool,
@@ -56,8 +59,9 @@ pub struct TrainArguments {
 /// Runs the command.
 pub fn train(arguments: &TrainArguments) -> Result<()> {
     use_threads(arguments.threads)?;
+    let lpips = load_lpips(arguments.lpips.as_deref())?;
     if arguments.compare {
-        return compare(arguments);
+        return compare(arguments, lpips.as_ref());
     }
     let method = arguments.settings.config()?.method;
     let name = format!("{}-{}", scene_name(arguments.scene.as_deref()), method.name());
@@ -83,14 +87,15 @@ pub fn train(arguments: &TrainArguments) -> Result<()> {
         RunConfig { scene: source.scene.clone(), body: source.body.clone(), load: source.load.clone(), train: config };
     run.write(&directory)?;
     println!("run: {}", directory.display());
-    let Some(metrics) = run_one(&directory, &run, &source, arguments.resume, arguments.stop_after)? else {
+    let Some(metrics) = run_one(&directory, &run, &source, lpips.as_ref(), arguments.resume, arguments.stop_after)?
+    else {
         println!("stopped; go on with --resume --out {}", directory.display());
         return Ok(());
     };
     let mut rows = vec![(metrics.method.clone(), &metrics)];
     let prior;
     if run.train.method != Method::Prior {
-        prior = prior_metrics(&run, &source)?;
+        prior = prior_metrics(&run, &source, lpips.as_ref())?;
         rows.insert(0, (prior.method.clone(), &prior));
     }
     println!("\nnovel views:\n{}", table::markdown(&rows));
@@ -110,6 +115,7 @@ pub fn run_one(
     directory: &Path,
     run: &RunConfig,
     source: &Source,
+    lpips: Option<&Lpips>,
     resume: bool,
     stop_after: Option<u64>,
 ) -> Result<Option<Metrics>> {
@@ -118,38 +124,49 @@ pub fn run_one(
         let start = Instant::now();
         let colors = VertexColors::measure(&scene)?;
         let parameters = 3 * colors.colors.len();
-        let metrics = metrics(run, start.elapsed().as_secs_f64(), parameters);
-        return score_run(directory, run, &scene, &Model::Prior(colors), metrics).map(Some);
+        let metrics = metrics(run, start.elapsed().as_secs_f64(), parameters, String::new());
+        return score_run(directory, run, &scene, &Model::Prior(colors), lpips, metrics).map(Some);
     }
     let checkpoint = directory.join(CHECKPOINT);
     let mut trainer =
         if resume { Trainer::resume(&scene, &checkpoint)? } else { Trainer::new(&scene, run.train.clone())? };
     trainer.set_steps(run.train.steps);
+    trainer.load_perceptual()?;
     let seconds = optimise(directory, &mut trainer, stop_after)?;
     if trainer.steps_done() < run.train.steps {
         return Ok(None);
     }
-    let metrics = metrics(run, seconds, trainer.num_parameters());
-    score_run(directory, run, &scene, &Model::Field(&trainer), metrics).map(Some)
+    let metrics = metrics(run, seconds, trainer.num_parameters(), trainer.perceptual());
+    score_run(directory, run, &scene, &Model::Field(&trainer), lpips, metrics).map(Some)
 }
 
 /// The scores of a run under `directory`: those it has if it finished earlier with the same settings; else it goes on from its
 /// checkpoint, or starts.
-pub fn run_unless_finished(directory: &Path, name: &str, run: &RunConfig, source: &Source) -> Result<Metrics> {
+pub fn run_unless_finished(
+    directory: &Path,
+    name: &str,
+    run: &RunConfig,
+    source: &Source,
+    lpips: Option<&Lpips>,
+) -> Result<Metrics> {
     let earlier = RunConfig::read(directory).is_ok_and(|old| old.train == run.train && old.load == run.load);
     if earlier && directory.join(METRICS).is_file() {
-        println!("{name}: finished earlier");
-        return Metrics::read(directory);
+        let metrics = Metrics::read(directory)?;
+        // Scores that lack what is asked for now are made anew from the checkpoint.
+        if lpips.is_none() || metrics.lpips.is_some() {
+            println!("{name}: finished earlier");
+            return Ok(metrics);
+        }
     }
     println!("{name}: training");
     std::fs::create_dir_all(directory.join("renders"))?;
     run.write(directory)?;
     let resume = earlier && directory.join(CHECKPOINT).is_file();
-    let metrics = run_one(directory, run, source, resume, None)?;
+    let metrics = run_one(directory, run, source, lpips, resume, None)?;
     metrics.with_context(|| format!("{name}: stopped before its end"))
 }
 
-fn metrics(run: &RunConfig, train_seconds: f64, parameters: usize) -> Metrics {
+fn metrics(run: &RunConfig, train_seconds: f64, parameters: usize, perceptual: String) -> Metrics {
     let config = &run.train;
     Metrics {
         method: config.method.name().to_owned(),
@@ -161,19 +178,23 @@ fn metrics(run: &RunConfig, train_seconds: f64, parameters: usize) -> Metrics {
         train_seconds,
         peak_rss_bytes: peak_rss_bytes(),
         parameters,
+        perceptual,
+        lpips: None,
         splits: Splits::default(),
     }
 }
 
 /// The scores of the prior baseline on the same frames.
-fn prior_metrics(run: &RunConfig, source: &Source) -> Result<Metrics> {
+fn prior_metrics(run: &RunConfig, source: &Source, lpips: Option<&Lpips>) -> Result<Metrics> {
     let mut prior = run.clone();
     prior.train.method = Method::Prior;
     let scene = Scene::new(&source.capture, &source.model, &prior.train)?;
     let start = Instant::now();
     let colors = VertexColors::measure(&scene)?;
-    let mut metrics = metrics(&prior, start.elapsed().as_secs_f64(), 3 * colors.colors.len());
-    metrics.splits.novel_view = Some(Model::Prior(colors).score(&scene, crate::eval::Split::NovelView, |_, _| {})?);
+    let mut metrics = metrics(&prior, start.elapsed().as_secs_f64(), 3 * colors.colors.len(), String::new());
+    metrics.lpips = lpips.map(|lpips| lpips.trunk().name().to_owned());
+    metrics.splits.novel_view =
+        Some(Model::Prior(colors).score(&scene, crate::eval::Split::NovelView, lpips, |_, _| {})?);
     Ok(metrics)
 }
 

@@ -3,9 +3,9 @@
 use std::borrow::Cow;
 use std::collections::HashMap;
 
-use super::Value;
 use super::numpy::{Dtype, Global};
 use super::reader::{Reader, Step, long, unescape, unquote};
+use super::{PERSISTENT, Value};
 use crate::array::NdArray;
 
 /// Index of a node. Nodes live in one arena, because a container can be referred to before it is filled.
@@ -327,6 +327,10 @@ impl<'a> Machine<'a> {
                     _ => return Err("global without a name".to_owned()),
                 };
                 self.push(Node::Global(global));
+            }
+            b'Q' => {
+                let id = self.pop()?;
+                self.push(Node::Object(PERSISTENT, Some(id)));
             }
             b'R' | 0x81 => {
                 let arguments = self.pop()?;

@@ -1,7 +1,7 @@
 //! Python pickles as plain data.
 //!
 //! A small stack machine reads protocols 0 to 5 and understands the few constructors that numpy arrays, chumpy
-//! arrays and scipy's `csc_matrix` need. Every other global is refused by name and nothing is ever executed.
+//! arrays, scipy's `csc_matrix` and descriptions of PyTorch tensors need. Every other global is refused by name and nothing is ever executed.
 //! Memory is bounded by a multiple of the input's size, nesting by [`MAX_DEPTH`]; malformed input gives
 //! [`Error::Pickle`] with the offset of the opcode.
 
@@ -19,6 +19,9 @@ use machine::Machine;
 
 /// Deepest nesting of containers in a [`Value`].
 pub const MAX_DEPTH: usize = 100;
+
+/// Class of a [`Value::Object`] that stands for something outside the pickle; its state is what names it.
+pub const PERSISTENT: &str = "persistent id";
 
 /// A Python value.
 #[derive(Clone, Debug, PartialEq)]
@@ -53,11 +56,12 @@ pub enum Value {
         /// The items, last axis fastest.
         items: Vec<Value>,
     },
-    /// Instance of one of the allowed classes: `chumpy.ch.Ch` or `scipy.sparse.csc_matrix`.
+    /// Instance of one of the allowed classes: `chumpy.ch.Ch`, `scipy.sparse.csc_matrix`, `torch.Tensor`, [`PERSISTENT`]; or
+    /// such a class itself, or one of PyTorch's storage classes, without attributes.
     Object {
         /// Full name of the class.
         class: &'static str,
-        /// Its attributes, a [`Value::Dict`].
+        /// Its attributes, a [`Value::Dict`]; the arguments that a `torch.Tensor` is made from.
         state: Box<Value>,
     },
 }
@@ -89,7 +93,18 @@ pub fn parse(file: &str, bytes: &[u8]) -> Result<Value, Error> {
     parse_at(file, bytes, 0)
 }
 
+/// Reads the pickle that starts at byte `start` and says where it ends, for files of several; `file` names them in errors.
+///
+/// # Errors
+/// [`Error::Pickle`].
+pub fn parse_from(file: &str, bytes: &[u8], start: usize) -> Result<(Value, usize), Error> {
+    let mut machine = Machine::new(bytes, start.min(bytes.len()));
+    match machine.run() {
+        Ok(value) => Ok((value, machine.offset() + 1)),
+        Err(message) => Err(Error::Pickle { file: file.to_owned(), offset: machine.offset(), message }),
+    }
+}
+
 fn parse_at(file: &str, bytes: &[u8], start: usize) -> Result<Value, Error> {
-    let mut machine = Machine::new(bytes, start);
-    machine.run().map_err(|message| Error::Pickle { file: file.to_owned(), offset: machine.offset(), message })
+    parse_from(file, bytes, start).map(|(value, _)| value)
 }

@@ -20,6 +20,10 @@ pub(super) enum Global {
     Bytes,
     OrderedDict,
     Encode,
+    /// `torch.Tensor` from storage, offset, extents and strides.
+    RebuildTensor,
+    /// A tensor under another name.
+    RebuildParameter,
     Class(&'static str),
 }
 
@@ -53,6 +57,18 @@ impl Global {
             ("_codecs", "encode") => Self::Encode,
             ("chumpy.ch", "Ch") => Self::Class("chumpy.ch.Ch"),
             ("scipy.sparse.csc" | "scipy.sparse._csc", "csc_matrix") => Self::Class("scipy.sparse.csc_matrix"),
+            ("torch._utils", "_rebuild_tensor" | "_rebuild_tensor_v2") => Self::RebuildTensor,
+            ("torch._utils", "_rebuild_parameter") => Self::RebuildParameter,
+            ("torch", "FloatStorage") => Self::Class("torch.FloatStorage"),
+            ("torch", "DoubleStorage") => Self::Class("torch.DoubleStorage"),
+            ("torch", "HalfStorage") => Self::Class("torch.HalfStorage"),
+            ("torch", "BFloat16Storage") => Self::Class("torch.BFloat16Storage"),
+            ("torch", "LongStorage") => Self::Class("torch.LongStorage"),
+            ("torch", "IntStorage") => Self::Class("torch.IntStorage"),
+            ("torch", "ShortStorage") => Self::Class("torch.ShortStorage"),
+            ("torch", "CharStorage") => Self::Class("torch.CharStorage"),
+            ("torch", "ByteStorage") => Self::Class("torch.ByteStorage"),
+            ("torch", "BoolStorage") => Self::Class("torch.BoolStorage"),
             _ => return Err(format!("global `{module} {name}` is not allowed")),
         })
     }
@@ -138,6 +154,16 @@ impl<'a> Machine<'a> {
                 self.spend(bytes.len())?;
                 Node::Bytes(Cow::Owned(bytes))
             }
+            (Global::RebuildTensor, [_, _, _, _, ..]) => {
+                let state = self.nodes.len();
+                self.spend(8 * arguments.len())?;
+                self.nodes.push(Node::Tuple(arguments.to_vec()));
+                Node::Object("torch.Tensor", Some(state))
+            }
+            (Global::RebuildParameter, [tensor, ..]) => match self.nodes[*tensor] {
+                Node::Object(class, state) => Node::Object(class, state),
+                _ => return wrong("_rebuild_parameter"),
+            },
             _ => return wrong("a constructor"),
         })
     }
@@ -172,6 +198,8 @@ impl<'a> Machine<'a> {
             (Node::Object(class, _), Node::Dict(_)) => {
                 self.nodes[target] = Node::Object(class, Some(state));
             }
+            // Attributes of an `OrderedDict`, such as a state dictionary's versions, are no part of what it holds.
+            (Node::Dict(_), Node::Dict(_)) => {}
             _ => return Err("state of something that has none".to_owned()),
         }
         Ok(())

@@ -1,6 +1,7 @@
 //! From the machine's arena to an owned value, and what can be asked of one.
 
 use super::machine::{Id, Machine, Node};
+use super::numpy::Global;
 use super::reader::Step;
 use super::{MAX_DEPTH, Value};
 use crate::Error;
@@ -68,6 +69,7 @@ impl Machine<'_> {
                     None => Value::Dict(Vec::new()),
                 }),
             },
+            &Node::Global(Global::Class(class)) => Value::Object { class, state: Box::new(Value::Dict(Vec::new())) },
             Node::Global(_) => return Err("a class or function as a value".to_owned()),
             Node::Dtype(_) => return Err("a dtype as a value".to_owned()),
             Node::BlankArray => return Err("array without data".to_owned()),

@@ -13,6 +13,7 @@ use anyhow::{Context, Result, bail};
 use clap::{Args, ValueEnum};
 use smpl::{BodyModel, load_mesh};
 
+use crate::eval::load_lpips;
 use input::Input;
 use output::Output;
 
@@ -38,7 +39,8 @@ enum Op {
     /// Volume rendering: sigma (R,S), rgb (R,S,3), edges (R,S+1), background (3), optional d_color (R,3) -> color (R,3),
     /// opacity (R), depth (R), weights (R,S), termination (R), d_sigma, d_rgb
     Composite,
-    /// Image metrics: a, b (H,W,3) from 0 to 1, mask (H,W) of booleans -> psnr, ssim, psnr_mask, ssim_mask
+    /// Image metrics: a, b (H,W,3) from 0 to 1, mask (H,W) of booleans -> psnr, ssim, psnr_mask, ssim_mask;
+    /// with --lpips: lpips
     Metrics,
 }
 
@@ -58,6 +60,9 @@ pub struct ProbeArguments {
     /// Body model, for skin and motion: .npz or .pkl in SMPL's form
     #[arg(long)]
     model: Option<PathBuf>,
+    /// Weights of LPIPS, for metrics: a file or a directory, .safetensors or .pth
+    #[arg(long)]
+    lpips: Option<PathBuf>,
 }
 
 /// Runs the command.
@@ -71,6 +76,9 @@ pub fn probe(arguments: &ProbeArguments) -> Result<()> {
         if given != taken {
             bail!("probe {name} {} {option}", if taken { "needs" } else { "takes no" });
         }
+    }
+    if arguments.lpips.is_some() && arguments.op != Op::Metrics {
+        bail!("probe {name} takes no --lpips");
     }
     let path = &arguments.input;
     let mesh = || Ok::<_, anyhow::Error>(load_mesh(arguments.mesh.as_deref().context("no --mesh")?)?);
@@ -97,7 +105,10 @@ pub fn probe(arguments: &ProbeArguments) -> Result<()> {
             let input = Input::open(path, &["sigma", "rgb", "edges", "background"], &["d_color"])?;
             picture::composite(input, &mut output)?;
         }
-        Op::Metrics => picture::metrics(Input::open(path, &["a", "b", "mask"], &[])?, &mut output)?,
+        Op::Metrics => {
+            let lpips = load_lpips(arguments.lpips.as_deref())?;
+            picture::metrics(Input::open(path, &["a", "b", "mask"], &[])?, lpips.as_ref(), &mut output)?;
+        }
     }
     output.write(&arguments.out)
 }

@@ -2,6 +2,7 @@
 
 use anyhow::{Context, Result, ensure};
 use glam::{Affine3A, Mat3, Vec3};
+use occnerf::Lpips;
 use smpl::Mesh;
 use visibility::{RayMesh, View, visible_vertices};
 use volrender::metrics;
@@ -91,7 +92,7 @@ pub fn composite(mut input: Input, output: &mut Output) -> Result<()> {
     Ok(())
 }
 
-pub fn metrics(mut input: Input, output: &mut Output) -> Result<()> {
+pub fn metrics(mut input: Input, lpips: Option<&Lpips>, output: &mut Output) -> Result<()> {
     let (shape, a) = input.floats_in("a", &[None, None, Some(3)], 0.0..=1.0)?;
     let (height, width) = (shape[0], shape[1]);
     let (_, b) = input.floats_in("b", &[Some(height), Some(width), Some(3)], 0.0..=1.0)?;
@@ -105,6 +106,10 @@ pub fn metrics(mut input: Input, output: &mut Output) -> Result<()> {
     {
         // The PSNR of equal images is infinite.
         output.numbers(key, &[], vec![value as f32])?;
+    }
+    if let Some(lpips) = lpips {
+        let values = lpips.distance(&a, &b, width, height).context("a and b")?;
+        output.numbers("lpips", &[], values.iter().map(|&v| v as f32).collect())?;
     }
     Ok(())
 }

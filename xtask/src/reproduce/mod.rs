@@ -10,6 +10,7 @@ use anyhow::{Result, ensure};
 use clap::Args;
 use occnerf::data::{LoadOptions, Wrong};
 
+use crate::eval::load_lpips;
 use crate::run::{self, RunConfig};
 use crate::settings::PresetName;
 use crate::source::{self, LoadArguments, Source};
@@ -42,6 +43,12 @@ pub struct ReproduceArguments {
     /// Steps of a row, in place of a budget
     #[arg(long)]
     steps: Option<u64>,
+    /// Weights to measure LPIPS with, as in train
+    #[arg(long, value_name = "PATH")]
+    lpips: Option<PathBuf>,
+    /// Weights that make the perceptual term of all rows LPIPS, as in train
+    #[arg(long, value_name = "PATH")]
+    perceptual_weights: Option<String>,
     /// Rows to leave out, comma separated, by the names of the table
     #[arg(long, value_delimiter = ',', value_name = "ROW")]
     without: Vec<String>,
@@ -161,17 +168,21 @@ fn run_rows<'a>(
     source: &'a Source,
     directory: &Path,
 ) -> Result<Summary<'a>> {
+    let lpips = load_lpips(arguments.lpips.as_deref())?;
     let mut summary = Summary::new(source, plan);
     for row in rows {
         for seed in 1..=row.runs(arguments.seeds) {
             let name = if row.learns() { format!("{}-s{seed}", row.name) } else { row.name.to_owned() };
-            let run = RunConfig {
+            let mut run = RunConfig {
                 scene: source.scene.clone(),
                 body: source.body.clone(),
                 load: source.load.clone(),
                 train: row.config(arguments.preset.into(), seed, plan),
             };
-            let metrics = run_unless_finished(&directory.join(&name), &name, &run, source)?;
+            if let Some(path) = &arguments.perceptual_weights {
+                run.train.loss.perceptual_weights.clone_from(path);
+            }
+            let metrics = run_unless_finished(&directory.join(&name), &name, &run, source, lpips.as_ref())?;
             summary.add(row, &directory.join(&name), metrics);
         }
         // After every row, so that an end before the last leaves a table.

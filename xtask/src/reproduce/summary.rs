@@ -21,7 +21,9 @@ const SHOWN: [&str; 6] = ["prior", "humannerf-bg", "humannerf", "hash-point", "o
 pub struct Summary<'a> {
     scene: &'a str,
     plan: &'a Plan,
-    perceptual: &'static str,
+    /// Network of lpips_full, and the perceptual term of training.
+    lpips: Option<String>,
+    perceptual: String,
     /// Size of the largest picture, and so of the cells of sheets.
     #[serde(skip)]
     cell: (u32, u32),
@@ -58,7 +60,7 @@ impl<'a> Summary<'a> {
     pub fn new(source: &'a Source, plan: &'a Plan) -> Self {
         let cameras = || source.capture.eval.iter().map(|view| &view.frame.camera);
         let cell = (cameras().map(|c| c.width).max().unwrap_or(0), cameras().map(|c| c.height).max().unwrap_or(0));
-        Self { scene: &source.scene, plan, perceptual: "multi-scale SSIM", cell, rows: Vec::new() }
+        Self { scene: &source.scene, plan, lpips: None, perceptual: String::new(), cell, rows: Vec::new() }
     }
 
     /// Adds a run of a row.
@@ -72,6 +74,10 @@ impl<'a> Summary<'a> {
                 pictures: directory.join("renders/novel_views.png"),
             });
         }
+        self.lpips.clone_from(&metrics.lpips);
+        if !metrics.perceptual.is_empty() {
+            self.perceptual.clone_from(&metrics.perceptual);
+        }
         if let Some(entry) = self.rows.last_mut() {
             entry.runs.push(metrics);
         }
@@ -79,7 +85,11 @@ impl<'a> Summary<'a> {
 
     /// The table: novel views where the capture has them, and training views on what they show.
     pub fn markdown(&self) -> String {
-        let mut text = format!("# {}\n\n{}; perceptual term: {}.\n", self.scene, self.plan, self.perceptual);
+        let mut text = format!("# {}\n\n{}; perceptual term: {}", self.scene, self.plan, self.perceptual);
+        if let Some(network) = &self.lpips {
+            text.push_str(&format!("; lpips_full by {network}"));
+        }
+        text.push_str(".\n");
         let splits: [(&str, PickSplit); 2] = [
             ("Novel views", |m| m.splits.novel_view.as_ref()),
             ("Training views, over visible pixels", |m| m.splits.train_view.as_ref()),

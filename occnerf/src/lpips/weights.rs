@@ -1,0 +1,236 @@
+//! Files of weights: which tensors there are, and reading those that are asked for.
+
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::{Read, Seek, SeekFrom};
+use std::path::{Path, PathBuf};
+
+use safetensors::tensor::{Dtype, SafeTensors};
+
+use super::{Lpips, Trunk, torch};
+use crate::Error;
+
+/// Longest header of a safetensors file, as in the format's own library.
+const MAX_HEADER: u64 = 100_000_000;
+/// Files of a directory that are looked into.
+const MAX_FILES: usize = 256;
+
+/// A tensor of a file.
+#[derive(Clone, Debug)]
+pub(super) struct Tensor {
+    pub dtype: Dtype,
+    pub shape: Vec<usize>,
+    /// Where its bytes start: in the file, or in an entry of the zip archive that the file is.
+    pub at: u64,
+    pub entry: Option<String>,
+}
+
+/// An open file and what it holds.
+pub(super) struct Weights {
+    path: PathBuf,
+    file: File,
+    tensors: BTreeMap<String, Tensor>,
+}
+
+pub(super) fn fault(path: &Path, what: impl Into<String>) -> Error {
+    Error::File { path: path.to_owned(), what: what.into() }
+}
+
+pub(super) fn io(path: &Path) -> impl Fn(std::io::Error) -> Error {
+    move |source| Error::Io { path: path.to_owned(), source }
+}
+
+/// [`Lpips::load`].
+pub(super) fn load(path: &Path) -> Result<Lpips, Error> {
+    if !std::fs::metadata(path).map_err(io(path))?.is_dir() {
+        let mut trunk_file = Weights::open(path)?;
+        let trunk = trunk_file.trunk().ok_or_else(|| {
+            let names: Vec<&str> = trunk_file.tensors.keys().take(4).map(String::as_str).collect();
+            let expected = "expected `features.0.weight` and the other layers of SqueezeNet 1.1, VGG16 or AlexNet";
+            fault(path, format!("holds no trunk: {expected}; it starts with {}", names.join(", ")))
+        })?;
+        if trunk_file.has_lin(trunk) {
+            return build(trunk, &mut trunk_file, None);
+        }
+        let beside = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+        let mut others = files(beside)?.into_iter().filter_map(|other| Weights::open(&other).ok());
+        let mut lin = others.find(|other| other.has_lin(trunk)).ok_or_else(|| no_lin(path, trunk))?;
+        return build(trunk, &mut trunk_file, Some(&mut lin));
+    }
+    let paths = files(path)?;
+    let mut open = Vec::new();
+    for path in &paths {
+        open.push(Weights::open(path)?);
+    }
+    let mut lonely = None;
+    for i in 0..open.len() {
+        let Some(trunk) = open[i].trunk() else { continue };
+        if open[i].has_lin(trunk) {
+            return build(trunk, &mut open[i], None);
+        }
+        if let Some(other) = (0..open.len()).find(|&other| open[other].has_lin(trunk)) {
+            let mut trunk_file = open.swap_remove(i);
+            // The last file has moved to the place that became free.
+            let other = if other == open.len() { i } else { other };
+            return build(trunk, &mut trunk_file, open.get_mut(other));
+        }
+        lonely = lonely.or(Some(no_lin(&paths[i], trunk)));
+    }
+    Err(lonely.unwrap_or_else(|| fault(path, "has no .safetensors, .pth or .pt file with a trunk in it")))
+}
+
+fn no_lin(path: &Path, trunk: Trunk) -> Error {
+    let name = trunk.name();
+    fault(
+        path,
+        format!("is {name} without LPIPS's linear layers: no `lin0.weight` of {name} in it or in a file beside it"),
+    )
+}
+
+fn build(trunk: Trunk, trunk_file: &mut Weights, mut lin: Option<&mut Weights>) -> Result<Lpips, Error> {
+    let path = trunk_file.path.clone();
+    let built = Lpips::new(trunk, |name, shape| match &mut lin {
+        Some(lin) if name.starts_with("lin") => lin.read(name, shape),
+        _ => trunk_file.read(name, shape),
+    });
+    built.map_err(|error| match error {
+        Error::Lpips(what) => fault(&path, what),
+        other => other,
+    })
+}
+
+/// Files of weights in a directory, by name.
+fn files(directory: &Path) -> Result<Vec<PathBuf>, Error> {
+    let mut found = Vec::new();
+    for entry in std::fs::read_dir(directory).map_err(io(directory))? {
+        let path = entry.map_err(io(directory))?.path();
+        if path.extension().is_some_and(|e| e == "safetensors" || e == "pth" || e == "pt") && path.is_file() {
+            found.push(path);
+        }
+    }
+    found.sort();
+    found.truncate(MAX_FILES);
+    Ok(found)
+}
+
+impl Weights {
+    /// Finds out what a file holds, without reading more than that.
+    pub fn open(path: &Path) -> Result<Self, Error> {
+        let mut file = File::open(path).map_err(io(path))?;
+        let mut start = Vec::new();
+        (&mut file).take(torch::LEGACY.len() as u64).read_to_end(&mut start).map_err(io(path))?;
+        let tensors = if start.starts_with(b"PK") {
+            torch::archive(path, &file)?
+        } else if start == torch::LEGACY {
+            torch::legacy(path, &mut file)?
+        } else {
+            safetensors(path, &mut file)?
+        };
+        Ok(Self { path: path.to_owned(), file, tensors })
+    }
+
+    /// Which trunk this is: all of its first and last layers' names tell it from its relatives.
+    pub fn trunk(&self) -> Option<Trunk> {
+        let has = |name: &str| self.tensors.contains_key(name);
+        let first = self.tensors.get("features.0.weight")?;
+        match first.shape.last() {
+            Some(11) => Some(Trunk::AlexNet),
+            _ if has("features.3.squeeze.weight") => Some(Trunk::SqueezeNet),
+            _ if has("features.28.weight") && !has("features.34.weight") => Some(Trunk::Vgg16),
+            _ => None,
+        }
+    }
+
+    /// Whether the linear layers of `trunk` are here.
+    pub fn has_lin(&self, trunk: Trunk) -> bool {
+        let channels: &[usize] = match trunk {
+            Trunk::Vgg16 => &[64, 128, 256, 512, 512],
+            Trunk::AlexNet => &[64, 192, 384, 256, 256],
+            Trunk::SqueezeNet => &[64, 128, 256, 384, 384, 512, 512],
+        };
+        let fits = |(i, &channels): (usize, &usize)| {
+            let tensor = self.find(&format!("lin{i}.weight"));
+            tensor.is_some_and(|(_, t)| t.shape.iter().product::<usize>() == channels)
+        };
+        channels.iter().enumerate().all(fits) && self.find(&format!("lin{}.weight", channels.len())).is_none()
+    }
+
+    /// The tensor `name`; the package's own files put `model.1` into the names of linear layers.
+    fn find(&self, name: &str) -> Option<(&String, &Tensor)> {
+        let found = self.tensors.get_key_value(name);
+        found.or_else(|| self.tensors.get_key_value(&name.replace(".weight", ".model.1.weight")))
+    }
+
+    /// Reads a tensor of exactly `shape`, axes of one beside.
+    fn read(&mut self, name: &str, shape: &[usize]) -> Result<Vec<f32>, Error> {
+        let path = &self.path;
+        let found = self.find(name).map(|(name, tensor)| (name.clone(), tensor.clone()));
+        let (name, tensor) = found.ok_or_else(|| fault(path, format!("lacks `{name}`, of shape {shape:?}")))?;
+        let bare = |shape: &[usize]| shape.iter().copied().filter(|&n| n != 1).collect::<Vec<_>>();
+        let known = matches!(tensor.dtype, Dtype::F16 | Dtype::BF16 | Dtype::F32 | Dtype::F64);
+        let flat = shape.len() == 1 && bare(&tensor.shape) == bare(shape);
+        if !known || (tensor.shape != shape && !flat) {
+            let (dtype, found) = (tensor.dtype, &tensor.shape);
+            return Err(fault(path, format!("`{name}` is {dtype:?} {found:?}, expected floats {shape:?}")));
+        }
+        // The shape is one of ours, so this is at most a few megabytes.
+        let size = tensor.dtype.bitsize() / 8;
+        let mut bytes = vec![0; size * shape.iter().product::<usize>()];
+        let cut = |e: std::io::Error| fault(path, format!("`{name}`, {dtype:?} {shape:?}: {e}", dtype = tensor.dtype));
+        match &tensor.entry {
+            Some(entry) => torch::read_entry(path, &self.file, entry, tensor.at, &mut bytes)?,
+            None => {
+                self.file.seek(SeekFrom::Start(tensor.at)).map_err(cut)?;
+                self.file.read_exact(&mut bytes).map_err(cut)?;
+            }
+        }
+        Ok(bytes.chunks_exact(size).map(|word| number(tensor.dtype, word)).collect())
+    }
+}
+
+/// A little-endian float.
+fn number(dtype: Dtype, word: &[u8]) -> f32 {
+    match (dtype, word) {
+        (Dtype::F16, &[a, b]) => half(u16::from_le_bytes([a, b])),
+        (Dtype::BF16, &[a, b]) => f32::from_le_bytes([0, 0, a, b]),
+        (Dtype::F32, &[a, b, c, d]) => f32::from_le_bytes([a, b, c, d]),
+        (Dtype::F64, &[a, b, c, d, e, f, g, h]) => f64::from_le_bytes([a, b, c, d, e, f, g, h]) as f32,
+        _ => f32::NAN,
+    }
+}
+
+/// IEEE half precision: the exponent's bias is 15 instead of 127.
+fn half(bits: u16) -> f32 {
+    let (sign, rest) = (u32::from(bits & 0x8000) << 16, u32::from(bits & 0x7fff));
+    // As a float with a wrong bias it is too small by 2¹¹², subnormal numbers included.
+    let magnitude = if rest >= 0x7c00 {
+        f32::from_bits(rest << 13 | 0x7f80_0000)
+    } else {
+        f32::from_bits(rest << 13) * 2f32.powi(112)
+    };
+    f32::from_bits(sign | magnitude.to_bits())
+}
+
+fn safetensors(path: &Path, file: &mut File) -> Result<BTreeMap<String, Tensor>, Error> {
+    let length = file.metadata().map_err(io(path))?.len();
+    let mut start = [0; 8];
+    let not_ours = "is neither a safetensors file nor one that torch.save has written";
+    file.seek(SeekFrom::Start(0)).and_then(|_| file.read_exact(&mut start)).map_err(|_| fault(path, not_ours))?;
+    let header = u64::from_le_bytes(start);
+    if header > MAX_HEADER || header > length.saturating_sub(8) {
+        return Err(fault(path, format!("{not_ours}, or is cut: a header of {header} bytes in a file of {length}")));
+    }
+    let mut bytes = start.to_vec();
+    file.take(header).read_to_end(&mut bytes).map_err(io(path))?;
+    let (_, metadata) = SafeTensors::read_metadata(&bytes).map_err(|e| fault(path, format!("{not_ours}: {e}")))?;
+    let end = metadata.tensors().values().map(|t| t.data_offsets.1 as u64).max().unwrap_or(0);
+    if end > length - 8 - header {
+        let found = length - 8 - header;
+        return Err(fault(path, format!("is cut: its tensors take {end} bytes, found {found}")));
+    }
+    let tensors = metadata.tensors().into_iter().map(|(name, info)| {
+        let at = 8 + header + info.data_offsets.0 as u64;
+        (name, Tensor { dtype: info.dtype, shape: info.shape.clone(), at, entry: None })
+    });
+    Ok(tensors.collect())
+}

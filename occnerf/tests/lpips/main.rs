@@ -1,0 +1,24 @@
+//! LPIPS against golden values and gradients, and against damaged files.
+#![cfg(feature = "lpips")]
+#![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
+
+mod files;
+mod formula;
+mod golden;
+
+use std::path::{Path, PathBuf};
+
+/// A file of the shared data, or `None` with a message where it is absent.
+fn shared(name: &str) -> Option<PathBuf> {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared/data/lpips").join(name);
+    if !path.exists() {
+        eprintln!("skipped: {} is absent", path.display());
+        return None;
+    }
+    Some(path)
+}
+
+/// Noise in [0, 1], a function of its seed.
+fn noise(count: usize, seed: u64) -> Vec<f32> {
+    (0..count as u64).map(|i| formula::uniform(seed << 40 | i) * 0.5 + 0.5).collect()
+}
