@@ -40,6 +40,28 @@ pub fn sheet(rows: &[Vec<RgbImage>]) -> RgbImage {
     sheet
 }
 
+/// The pictures of a [`sheet`], told apart by its white gaps; a sheet whose pictures are of unequal sizes, or white
+/// where they begin, comes apart otherwise.
+pub fn cells(sheet: &RgbImage) -> Vec<Vec<RgbImage>> {
+    let white = |x, y| sheet.get_pixel(x, y).0 == [255; 3];
+    let column = |x| (0..sheet.height()).all(|y| white(x, y));
+    let row = |y| (0..sheet.width()).all(|x| white(x, y));
+    let spans = |length: u32, gap: &dyn Fn(u32) -> bool| {
+        let mut spans: Vec<(u32, u32)> = Vec::new();
+        for at in (0..length).filter(|&at| !gap(at)) {
+            match spans.last_mut() {
+                Some((start, size)) if *start + *size == at => *size += 1,
+                _ => spans.push((at, 1)),
+            }
+        }
+        spans
+    };
+    let (columns, rows) = (spans(sheet.width(), &column), spans(sheet.height(), &row));
+    let cell =
+        |&(x, width): &(u32, u32), &(y, height): &(u32, u32)| imageops::crop_imm(sheet, x, y, width, height).to_image();
+    rows.iter().map(|row| columns.iter().map(|column| cell(column, row)).collect()).collect()
+}
+
 /// Writes a PNG.
 pub fn save(picture: &RgbImage, path: &Path) -> Result<()> {
     picture.save(path).with_context(|| path.display().to_string())
@@ -55,4 +77,18 @@ pub fn film(pictures: &[RgbImage], fps: u32, path: &Path) -> Result<()> {
         encoder.encode_frame(Frame::from_parts(rgba, 0, 0, Delay::from_numer_denom_ms(1000, fps)))?;
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_sheet_comes_apart_into_its_pictures() {
+        let picture = |i: u8| RgbImage::from_fn(5, 7, |x, y| Rgb([i, x as u8, y as u8]));
+        let rows = vec![vec![picture(1), picture(2), picture(3)], vec![picture(4), picture(5), picture(6)]];
+        assert_eq!(cells(&sheet(&rows)), rows);
+        assert!(cells(&sheet(&[])).is_empty());
+        assert!(cells(&RgbImage::from_pixel(9, 9, Rgb([255; 3]))).is_empty());
+    }
 }

@@ -62,6 +62,8 @@ pub struct DemoConfig {
     pub occluded_fraction: f32,
     /// Part of the training video, from its start, that is occluded, 0 to 1.
     pub occluded_share: f32,
+    /// How far arms and legs are pressed against the body and each other, 0 (a free walk) to 1.
+    pub pressed: f32,
     /// Whether training frames say which pixels the obstacle covers. Published captures do not.
     pub known_occluder: bool,
 }
@@ -79,6 +81,7 @@ impl Default for DemoConfig {
             beta_noise: 0.15,
             occluded_fraction: 0.5,
             occluded_share: 0.8,
+            pressed: 0.0,
             known_occluder: false,
         }
     }
@@ -100,6 +103,7 @@ impl DemoConfig {
             ("beta_noise", self.beta_noise, 3.0),
             ("occluded_fraction", self.occluded_fraction, 0.95),
             ("occluded_share", self.occluded_share, 1.0),
+            ("pressed", self.pressed, 1.0),
         ] {
             within(name, (0.0..=limit).contains(&value), &format!("0 to {limit}"), &value)?;
         }
@@ -125,7 +129,7 @@ pub fn demo(config: &DemoConfig, body: &BodyModel) -> Result<Capture, DataError>
     let shaped = body.shaped(&true_betas);
     let person = Person::new(body, &shaped);
     let unit = person.landmarks.unit;
-    let poses = grounded_walk(config.frames, body, &shaped);
+    let poses = grounded_walk(config, body, &shaped);
     let error = TrackerError {
         seed: config.seed,
         rotation: config.pose_noise_degrees.to_radians(),
@@ -189,12 +193,12 @@ fn shapes(config: &DemoConfig, body: &BodyModel) -> (Vec<f32>, Vec<f32>) {
 }
 
 /// The walk with the lower foot on the floor at y = 0, and a slight sway.
-fn grounded_walk(frames: usize, body: &BodyModel, shaped: &Shaped) -> Vec<Pose> {
-    let pelvis = shaped.joints[joint::PELVIS];
+fn grounded_walk(config: &DemoConfig, body: &BodyModel, shaped: &Shaped) -> Vec<Pose> {
+    let (pelvis, frames) = (shaped.joints[joint::PELVIS], config.frames);
     (0..frames)
         .into_par_iter()
         .map(|frame| {
-            let mut pose = walk(frame, frames);
+            let mut pose = walk(frame, frames, config.pressed);
             let posed = body.pose(shaped, &pose.joints, pose.placement());
             let low = posed.vertices.iter().map(|v| v.y).fold(f32::INFINITY, f32::min);
             let high = shaped.vertices.iter().map(|v| v.y).fold(f32::NEG_INFINITY, f32::max);
