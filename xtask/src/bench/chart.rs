@@ -19,7 +19,7 @@ const TITLE: i32 = 34;
 const ROW: i32 = 20;
 const SMALL: i32 = 11;
 /// Mean width of a letter as a share of its height.
-const LETTER: f64 = 0.52;
+const LETTER: f64 = 0.56;
 
 /// Colours that are told apart by colour-blind people too (Okabe and Ito 2008).
 pub const COLORS: [RGBColor; 7] = [
@@ -39,6 +39,8 @@ pub enum Shape {
     Square,
     Triangle,
     Cross,
+    /// A piece of a line, for the legend.
+    Dash,
 }
 
 /// Colour and shape.
@@ -176,7 +178,7 @@ impl Panel {
         for label in arrange(&spots, (width as i32, height as i32), scale) {
             if let Some(from) = label.leader {
                 let grey = RGBColor(170, 170, 170).stroke_width(scale as u32);
-                plain.draw(&PathElement::new(vec![from, label.middle()], grey))?;
+                plain.draw(&PathElement::new(vec![from, label.nearest(from)], grey))?;
             }
             let color = COLORS[marks[label.index].0.style.0];
             let text = font(SMALL, scale).color(&color);
@@ -202,6 +204,7 @@ fn mark<B: DrawingBackend>(area: &DrawingArea<B, Shift>, at: (i32, i32), style: 
         Shape::Ring => area.draw(&Circle::new(at, r, line)),
         Shape::Square => area.draw(&Rectangle::new([(at.0 - r, at.1 - r), (at.0 + r, at.1 + r)], color.filled())),
         Shape::Triangle => area.draw(&TriangleMarker::new(at, r + 2 * scale, color.filled())),
+        Shape::Dash => area.draw(&PathElement::new(vec![(at.0 - 2 * r, at.1), (at.0 + r, at.1)], line)),
         Shape::Cross => area.draw(&plotters::element::Cross::new(at, r + scale, line)),
     }
 }
@@ -216,8 +219,10 @@ struct Label {
 }
 
 impl Label {
-    fn middle(&self) -> (i32, i32) {
-        (self.corner.0 + self.size.0 / 2, self.corner.1 + self.size.1 / 2)
+    /// The place of its edge that is nearest to a point.
+    fn nearest(&self, at: (i32, i32)) -> (i32, i32) {
+        let (x, y) = self.corner;
+        (at.0.clamp(x, x + self.size.0), at.1.clamp(y, y + self.size.1))
     }
 
     fn overlap(&self, low: (i32, i32), high: (i32, i32)) -> i64 {

@@ -58,7 +58,7 @@ fn on_front(lines: &[Line], cost: Pick, worth: Pick) -> Vec<bool> {
 /// One picture for each cost, a panel for each worth: STEM-training and STEM-frame.
 pub fn charts(scene: &str, lines: &[Line], stem: &Path) -> Result<()> {
     let legend = [
-        ("front", Style(5, Shape::Cross)),
+        ("front", Style(5, Shape::Dash)),
         ("base", Style(6, Shape::Square)),
         ("one change", Style(0, Shape::Circle)),
         ("combination", Style(3, Shape::Circle)),
@@ -77,32 +77,48 @@ pub fn charts(scene: &str, lines: &[Line], stem: &Path) -> Result<()> {
                 .collect();
             let mut along: Vec<(f64, f64)> = scored.iter().filter(|s| s.2).map(|s| s.1).collect();
             along.sort_by(|a, b| a.0.total_cmp(&b.0));
-            let mark = |(line, at, _): &(&Line, (f64, f64), bool)| Mark {
-                at: *at,
-                name: line.point.name.clone(),
-                style: style(line),
+            let close = close_to_base(&scored);
+            let panel = |title: &str, zoom: bool| {
+                let shown = || scored.iter().zip(&close).filter(move |(_, close)| !zoom || **close);
+                let mark = |((line, at, _), close): (&(&Line, (f64, f64), bool), &bool)| {
+                    let named = zoom || !close || line.point.kind == Kind::Base;
+                    let name = if named { line.point.name.clone() } else { String::new() };
+                    Mark { at: *at, name, style: style(line) }
+                };
+                Panel {
+                    title: title.to_owned(),
+                    labels: [label.to_owned(), name.to_owned()],
+                    scales: [
+                        Scale::around(shown().map(|s| s.0.1.0), true),
+                        Scale::around(shown().map(|s| s.0.1.1), false),
+                    ],
+                    lines: vec![chart::Line { points: along.clone(), color: 5 }],
+                    marks: shown().map(mark).collect(),
+                }
             };
-            panels.push(Panel {
-                title: String::new(),
-                labels: [label.to_owned(), name.to_owned()],
-                scales: [
-                    Scale::around(scored.iter().map(|s| s.1.0), true),
-                    Scale::around(scored.iter().map(|s| s.1.1), false),
-                ],
-                lines: vec![chart::Line { points: along, color: 5 }],
-                marks: scored.iter().map(mark).collect(),
-            });
+            panels.extend([panel("everything", false), panel("around the base", true)]);
         }
         let picture = Picture {
             title: format!("{scene}: {label} against accuracy on unseen views"),
             legend: legend.iter().map(|(name, style)| ((*name).to_owned(), *style)).collect(),
-            columns: 1,
-            size: (1000, 560),
+            columns: 2,
+            size: (640, 460),
             panels,
         };
         picture.write(Path::new(&format!("{}-{suffix}", stem.display())))?;
     }
     Ok(())
+}
+
+/// Which points crowd around the base: at most 1.6 times slower or faster, and not much farther off than most changes.
+fn close_to_base(scored: &[(&Line, (f64, f64), bool)]) -> Vec<bool> {
+    let base = scored.iter().find(|s| s.0.point.kind == Kind::Base).map(|s| s.1);
+    let Some(base) = base else { return vec![true; scored.len()] };
+    let off = |s: &(&Line, (f64, f64), bool)| (s.1.1 - base.1).abs();
+    let mut changes: Vec<f64> = scored.iter().filter(|s| s.0.point.kind == Kind::Change).map(off).collect();
+    changes.sort_by(f64::total_cmp);
+    let most = changes.get(changes.len() / 2).map_or(f64::INFINITY, |median| 4.0 * median);
+    scored.iter().map(|s| off(s) <= most && (s.1.0 / base.0).ln().abs() <= 1.6f64.ln()).collect()
 }
 
 /// A row a point, differences to the base in brackets; the last column says on which fronts of training time it is.
@@ -168,14 +184,14 @@ mod tests {
         let stem = std::env::temp_dir().join(format!("xtask-pareto-{}", std::process::id()));
         for count in [0, 1, 40] {
             let name = |i: usize| format!("point <{i}> & more");
-            let of = |i: usize| line(&name(i), "k", Kind::Change, 20.0 + (i % 7) as f64, (i % 5) as f64);
+            let of = |i: usize| line(&name(i), "k", Kind::Change, 20.0 + (i % 7) as f64, 1.0 + (i % 5) as f64);
             let lines: Vec<Line> = (0..count).map(of).collect();
             charts("a scene", &lines, &stem).unwrap();
             for suffix in ["training", "frame"] {
                 let path = format!("{}-{suffix}", stem.display());
                 let svg = std::fs::read_to_string(format!("{path}.svg")).unwrap();
                 assert!(svg.contains("</svg>") && (count == 0 || svg.contains("point &lt;0&gt; &amp; more")));
-                assert_eq!(image::open(format!("{path}.png")).unwrap().width(), 1000);
+                assert_eq!(image::open(format!("{path}.png")).unwrap().width(), 1280);
                 std::fs::remove_file(format!("{path}.svg")).unwrap();
                 std::fs::remove_file(format!("{path}.png")).unwrap();
             }

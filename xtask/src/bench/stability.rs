@@ -56,7 +56,6 @@ impl Runs<'_> {
 
 /// How one method fared along one axis.
 pub struct Course {
-    pub method: Method,
     /// (index of the level, psnr_mask of every seed, why it counts as broken).
     pub levels: Vec<(usize, Vec<f64>, Option<String>)>,
 }
@@ -147,7 +146,7 @@ pub fn course(axis: &Axis, method: Method, lines: &[Line]) -> Course {
         easiest = easiest.or(value);
         levels.push((level, values, why));
     }
-    Course { method, levels }
+    Course { levels }
 }
 
 /// Breaking points as a Markdown table, a row an axis.

@@ -191,6 +191,20 @@ mod tests {
     }
 
     #[test]
+    fn pressed_limbs_are_close_to_the_trunk_and_each_other() {
+        let body = smpl::BodyModel::embedded();
+        let shaped = body.shaped(&[]);
+        let wrists = |pressed| {
+            let pose = walk(30, 100, pressed);
+            let joints = body.pose(&shaped, &pose.joints, Placement::default()).joints;
+            let across = |a: usize, b: usize| joints[a].distance(joints[b]);
+            (across(joint::LEFT_ELBOW, joint::RIGHT_ELBOW), across(joint::LEFT_KNEE, joint::RIGHT_KNEE))
+        };
+        let (free, pressed) = (wrists(0.0), wrists(1.0));
+        assert!(pressed.0 < 0.9 * free.0 && pressed.1 < free.1, "{free:?} {pressed:?}");
+    }
+
+    #[test]
     fn no_error_leaves_the_pose() {
         let truth = vec![walk(3, 10, 0.0)];
         let parents: Vec<Option<usize>> = (0..joint::COUNT).map(|j| j.checked_sub(1)).collect();

@@ -151,7 +151,10 @@ pub fn run(directory: &Path, quick: bool) -> Result<()> {
         Panel {
             title: kernel.name.to_owned(),
             labels: [kernel.cost.to_owned(), kernel.error.to_owned()],
-            scales: [Scale::around(of(|s| s.nanoseconds), true), Scale::around(of(|s| s.error), false)],
+            scales: [
+                Scale::around(of(|s| s.nanoseconds), true),
+                Scale::around(of(|s| s.error), of(|s| s.error).all(|e| e > 0.0)),
+            ],
             lines: Vec::new(),
             marks: (kernel.samples.iter())
                 .map(|s| Mark {
