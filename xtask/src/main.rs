@@ -1,5 +1,6 @@
 //! `cargo xtask`: train, evaluate and render people from occluded videos.
 
+mod bench;
 mod compare;
 mod convert;
 mod eval;
@@ -39,6 +40,10 @@ enum Command {
     Synth(synth::SynthArguments),
     /// Runs one function of one crate on numpy arrays.
     Probe(probe::ProbeArguments),
+    /// Measures what every approximation costs and is worth, and where methods break.
+    Bench(bench::BenchArguments),
+    /// Puts runs and benches on one HTML page that needs no other file.
+    Report(report::ReportArguments),
     /// Converts a body model, .npz or .pkl, to .safetensors.
     Convert(convert::ConvertArguments),
 }
@@ -51,6 +56,8 @@ fn main() -> std::process::ExitCode {
         Command::Reproduce(arguments) => reproduce::reproduce(&arguments),
         Command::Synth(arguments) => synth::synth(&arguments),
         Command::Probe(arguments) => probe::probe(&arguments),
+        Command::Bench(arguments) => bench::bench(&arguments),
+        Command::Report(arguments) => report::report(&arguments),
         Command::Convert(arguments) => convert::convert(&arguments),
     };
     match outcome {

@@ -40,12 +40,26 @@ pub fn sheet(rows: &[Vec<RgbImage>]) -> RgbImage {
     sheet
 }
 
-/// The pictures of one column of a [`sheet`] whose largest picture has the size `cell`.
-pub fn column(sheet: &RgbImage, column: u32, cell: (u32, u32)) -> Vec<RgbImage> {
-    let rows = sheet.height().saturating_sub(GAP) / (cell.1 + GAP);
-    let x = GAP + column * (cell.0 + GAP);
-    let at = |row| imageops::crop_imm(sheet, x, GAP + row * (cell.1 + GAP), cell.0, cell.1).to_image();
-    (0..rows).map(at).collect()
+/// The pictures of a [`sheet`], told apart by its white gaps; a sheet whose pictures are of unequal sizes, or white
+/// where they begin, comes apart otherwise.
+pub fn cells(sheet: &RgbImage) -> Vec<Vec<RgbImage>> {
+    let white = |x, y| sheet.get_pixel(x, y).0 == [255; 3];
+    let column = |x| (0..sheet.height()).all(|y| white(x, y));
+    let row = |y| (0..sheet.width()).all(|x| white(x, y));
+    let spans = |length: u32, gap: &dyn Fn(u32) -> bool| {
+        let mut spans: Vec<(u32, u32)> = Vec::new();
+        for at in (0..length).filter(|&at| !gap(at)) {
+            match spans.last_mut() {
+                Some((start, size)) if *start + *size == at => *size += 1,
+                _ => spans.push((at, 1)),
+            }
+        }
+        spans
+    };
+    let (columns, rows) = (spans(sheet.width(), &column), spans(sheet.height(), &row));
+    let cell =
+        |&(x, width): &(u32, u32), &(y, height): &(u32, u32)| imageops::crop_imm(sheet, x, y, width, height).to_image();
+    rows.iter().map(|row| columns.iter().map(|column| cell(column, row)).collect()).collect()
 }
 
 /// Writes a PNG.
@@ -70,9 +84,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn columns_of_a_sheet_are_the_pictures_it_was_made_of() {
-        let picture = |value| RgbImage::from_pixel(5, 3, Rgb([value; 3]));
-        let sheet = sheet(&[vec![picture(1), picture(2)], vec![picture(3), picture(4)]]);
-        assert_eq!(column(&sheet, 1, (5, 3)), [picture(2), picture(4)]);
+    fn a_sheet_comes_apart_into_its_pictures() {
+        let picture = |i: u8| RgbImage::from_fn(5, 7, |x, y| Rgb([i, x as u8, y as u8]));
+        let rows = vec![vec![picture(1), picture(2), picture(3)], vec![picture(4), picture(5), picture(6)]];
+        assert_eq!(cells(&sheet(&rows)), rows);
+        assert!(cells(&sheet(&[])).is_empty());
+        assert!(cells(&RgbImage::from_pixel(9, 9, Rgb([255; 3]))).is_empty());
     }
 }

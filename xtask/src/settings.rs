@@ -146,7 +146,7 @@ impl SettingArguments {
 }
 
 /// Replaces one value by its dotted key.
-fn set(config: &Config, assignment: &str) -> Result<Config> {
+pub fn set(config: &Config, assignment: &str) -> Result<Config> {
     let (key, value) = assignment.split_once('=').context("expected KEY=VALUE")?;
     let mut table = toml::Table::try_from(config)?;
     let mut at = &mut table;

@@ -87,6 +87,23 @@ impl LoadArguments {
         }
     }
 
+    /// The same as on the command line.
+    pub fn command_line(&self) -> String {
+        let mut text = String::new();
+        let mut add = |name: &str, value: Option<String>| {
+            text.extend(value.map(|value| format!(" --{name} {value}")));
+        };
+        let not_one = |n: usize| (n != 1).then(|| n.to_string());
+        add("resize", self.resize.map(|n| n.to_string()));
+        add("stride", not_one(self.stride));
+        add("max-frames", self.max_frames.map(|n| n.to_string()));
+        add("eval-stride", not_one(self.eval_stride));
+        add("camera", self.camera.clone());
+        let name = self.occlusion.and_then(|o| o.to_possible_value());
+        add("occlusion", name.map(|n| n.get_name().to_owned()));
+        text
+    }
+
     /// How a run to be resumed read its capture, checked against what is asked for.
     pub fn resumed(&self, saved: &LoadOptions) -> Result<LoadOptions> {
         let asked = self.options();

@@ -24,9 +24,6 @@ pub struct Summary<'a> {
     /// Network of lpips_full, and the perceptual term of training.
     lpips: Option<String>,
     perceptual: String,
-    /// Size of the largest picture, and so of the cells of sheets.
-    #[serde(skip)]
-    cell: (u32, u32),
     rows: Vec<Entry>,
 }
 
@@ -58,9 +55,7 @@ const COLUMNS: [Column; 9] = [
 
 impl<'a> Summary<'a> {
     pub fn new(source: &'a Source, plan: &'a Plan) -> Self {
-        let cameras = || source.capture.eval.iter().map(|view| &view.frame.camera);
-        let cell = (cameras().map(|c| c.width).max().unwrap_or(0), cameras().map(|c| c.height).max().unwrap_or(0));
-        Self { scene: &source.scene, plan, lpips: None, perceptual: String::new(), cell, rows: Vec::new() }
+        Self { scene: &source.scene, plan, lpips: None, perceptual: String::new(), rows: Vec::new() }
     }
 
     /// Adds a run of a row.
@@ -142,21 +137,23 @@ impl<'a> Summary<'a> {
     pub fn write(&self, directory: &Path) -> Result<()> {
         run::write(&directory.join("reproduce.md"), &self.markdown())?;
         run::write(&directory.join("reproduce.json"), &serde_json::to_string_pretty(self)?)?;
-        if self.cell.0 == 0 {
-            return Ok(());
-        }
         // A row a camera: the truth, then what each method makes of it.
         let mut columns: Vec<Vec<RgbImage>> = Vec::new();
         for entry in SHOWN.iter().filter_map(|name| self.rows.iter().find(|entry| entry.name == *name)) {
             let sheet = image::open(&entry.pictures).with_context(|| entry.pictures.display().to_string())?.into_rgb8();
+            let cells = pictures::cells(&sheet);
+            let column = |c: usize| cells.iter().filter_map(|row| row.get(c).cloned()).collect();
             if columns.is_empty() {
-                columns.push(pictures::column(&sheet, 0, self.cell));
+                columns.push(column(0));
             }
-            columns.push(pictures::column(&sheet, 1, self.cell));
+            columns.push(column(1));
         }
         let cameras = columns.iter().map(Vec::len).min().unwrap_or(0);
         let rows: Vec<Vec<RgbImage>> =
             (0..cameras).map(|camera| columns.iter().map(|column| column[camera].clone()).collect()).collect();
+        if rows.is_empty() {
+            return Ok(());
+        }
         pictures::save(&pictures::sheet(&rows), &directory.join("reproduce.png"))
     }
 }

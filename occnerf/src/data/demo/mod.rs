@@ -53,6 +53,8 @@ pub struct DemoConfig {
     pub occluded_fraction: f32,
     /// Part of the training video, from its start, that is occluded, 0 to 1.
     pub occluded_share: f32,
+    /// How far arms and legs are pressed against the body and each other, 0 (a free walk) to 1.
+    pub pressed: f32,
     /// Whether training frames say which pixels the obstacle covers. Published captures do not.
     pub known_occluder: bool,
 }
@@ -70,6 +72,7 @@ impl Default for DemoConfig {
             beta_noise: 0.15,
             occluded_fraction: 0.5,
             occluded_share: 0.8,
+            pressed: 0.0,
             known_occluder: false,
         }
     }
@@ -91,6 +94,7 @@ impl DemoConfig {
             ("beta_noise", self.beta_noise, 3.0),
             ("occluded_fraction", self.occluded_fraction, 0.95),
             ("occluded_share", self.occluded_share, 1.0),
+            ("pressed", self.pressed, 1.0),
         ] {
             within(name, (0.0..=limit).contains(&value), &format!("0 to {limit}"), &value)?;
         }
@@ -120,18 +124,18 @@ pub fn demo(config: &DemoConfig, body: &BodyModel) -> Result<Capture, DataError>
     Ok(capture)
 }
 
-/// The demo before anything stands in front of it, and the height that the cameras stand for. `perform` gives poses of a
-/// number of frames for a body of that shape, and that height.
+/// The demo before anything stands in front of it, and the height that the cameras stand for. `perform` gives the
+/// poses for a body of that shape, and that height.
 pub(super) fn film(
     config: &DemoConfig,
     body: &BodyModel,
-    perform: impl FnOnce(usize, &BodyModel, &Shaped) -> (Vec<Pose>, f32),
+    perform: impl FnOnce(&DemoConfig, &BodyModel, &Shaped) -> (Vec<Pose>, f32),
     progress: &Progress<'_>,
 ) -> Result<(Capture, f32), DataError> {
     let (true_betas, betas) = shapes(config, body);
     let shaped = body.shaped(&true_betas);
     let person = Person::new(body, &shaped);
-    let (poses, height) = perform(config.frames, body, &shaped);
+    let (poses, height) = perform(config, body, &shaped);
     let error = TrackerError {
         seed: config.seed,
         rotation: config.pose_noise_degrees.to_radians(),
@@ -167,14 +171,14 @@ fn shapes(config: &DemoConfig, body: &BodyModel) -> (Vec<f32>, Vec<f32>) {
 }
 
 /// The walk with the lower foot on the floor at y = 0, and a slight sway.
-pub(super) fn grounded_walk(frames: usize, body: &BodyModel, shaped: &Shaped) -> (Vec<Pose>, f32) {
-    let pelvis = shaped.joints[joint::PELVIS];
+pub(super) fn grounded_walk(config: &DemoConfig, body: &BodyModel, shaped: &Shaped) -> (Vec<Pose>, f32) {
+    let (pelvis, frames) = (shaped.joints[joint::PELVIS], config.frames);
     let lowest = shaped.vertices.iter().map(|v| v.y).fold(f32::INFINITY, f32::min);
     let high = shaped.vertices.iter().map(|v| v.y).fold(f32::NEG_INFINITY, f32::max);
     let poses = (0..frames)
         .into_par_iter()
         .map(|frame| {
-            let mut pose = walk(frame, frames);
+            let mut pose = walk(frame, frames, config.pressed);
             let posed = body.pose(shaped, &pose.joints, pose.placement());
             let low = posed.vertices.iter().map(|v| v.y).fold(f32::INFINITY, f32::min);
             let turn = TAU * frame as f32 / frames as f32;

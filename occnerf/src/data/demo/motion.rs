@@ -34,8 +34,8 @@ impl Pose {
 /// Walking on the spot while turning, at frame `frame` of `frames`. The translation is 0.
 ///
 /// The T-pose's left arm points along +x: turning about −z lowers it, about −x then swings it forward; a knee
-/// bends about +x, a left elbow about −y.
-pub(in crate::data) fn walk(frame: usize, frames: usize) -> Pose {
+/// bends about +x, a left elbow about −y. `pressed` (0 to 1) brings the arms to the trunk and the thighs together.
+pub(in crate::data) fn walk(frame: usize, frames: usize, pressed: f32) -> Pose {
     let time = frame as f32 / frames as f32;
     let phase = TAU * time * 100.0 / STRIDE;
     let x = Quat::from_rotation_x;
@@ -49,12 +49,12 @@ pub(in crate::data) fn walk(frame: usize, frames: usize) -> Pose {
         let swing = leg.sin();
         // The knee bends while the leg comes forward.
         let lift = (leg + 0.9).cos().max(0.0);
-        local[hip] = x(-0.10 - 0.40 * swing) * Quat::from_rotation_z(sign * 0.05);
+        local[hip] = x(-0.10 - 0.40 * swing) * Quat::from_rotation_z(sign * (0.05 - 0.09 * pressed));
         local[knee] = x(0.12 + 0.75 * lift * lift);
         local[ankle] = x(0.02 - 0.18 * lift * swing);
         // Arms swing against the legs; each is raised once during the video.
-        let raise = 0.55 * (TAU * time + if sign > 0.0 { 0.3 } else { 2.6 }).sin().max(0.0).powi(2);
-        local[shoulder] = x(0.42 * swing - 0.5 * raise) * Quat::from_rotation_z(-sign * (1.18 - raise));
+        let raise = 0.55 * (TAU * time + if sign > 0.0 { 0.3 } else { 2.6 }).sin().max(0.0).powi(2) * (1.0 - pressed);
+        local[shoulder] = x(0.42 * swing - 0.5 * raise) * Quat::from_rotation_z(-sign * (1.18 + 0.3 * pressed - raise));
         local[elbow] = Quat::from_rotation_y(-sign * (0.40 - 0.25 * swing + 0.7 * raise));
     }
     for (i, j) in joint::SPINE.into_iter().enumerate() {
@@ -153,7 +153,7 @@ mod tests {
     fn tracked_bones_are_off_by_the_stated_angle_in_the_world() {
         let frames = 60;
         let parents: Vec<Option<usize>> = (0..joint::COUNT).map(|j| j.checked_sub(1)).collect();
-        let truth: Vec<Pose> = (0..frames).map(|f| walk(f, frames)).collect();
+        let truth: Vec<Pose> = (0..frames).map(|f| walk(f, frames, 0.0)).collect();
         let pelvis = Vec3::new(0.0, 0.9, 0.1);
         let error = TrackerError { seed: 4, rotation: 0.03, translation: 0.01 };
         let tracked = track(&truth, &parents, pelvis, error);
@@ -183,7 +183,7 @@ mod tests {
 
     #[test]
     fn the_walk_turns_more_than_once_and_moves_smoothly() {
-        let poses: Vec<Pose> = (0..100).map(|f| walk(f, 100)).collect();
+        let poses: Vec<Pose> = (0..100).map(|f| walk(f, 100, 0.0)).collect();
         let mut turned = 0.0;
         for pair in poses.windows(2) {
             let forward = pair.iter().map(|p| p.rotation * Vec3::Z).collect::<Vec<_>>();
@@ -196,8 +196,22 @@ mod tests {
     }
 
     #[test]
+    fn pressed_limbs_are_close_to_the_trunk_and_each_other() {
+        let body = smpl::BodyModel::embedded();
+        let shaped = body.shaped(&[]);
+        let wrists = |pressed| {
+            let pose = walk(30, 100, pressed);
+            let joints = body.pose(&shaped, &pose.joints, Placement::default()).joints;
+            let across = |a: usize, b: usize| joints[a].distance(joints[b]);
+            (across(joint::LEFT_ELBOW, joint::RIGHT_ELBOW), across(joint::LEFT_KNEE, joint::RIGHT_KNEE))
+        };
+        let (free, pressed) = (wrists(0.0), wrists(1.0));
+        assert!(pressed.0 < 0.9 * free.0 && pressed.1 < free.1, "{free:?} {pressed:?}");
+    }
+
+    #[test]
     fn no_error_leaves_the_pose() {
-        let truth = vec![walk(3, 10)];
+        let truth = vec![walk(3, 10, 0.0)];
         let parents: Vec<Option<usize>> = (0..joint::COUNT).map(|j| j.checked_sub(1)).collect();
         let error = TrackerError { seed: 1, rotation: 0.0, translation: 0.0 };
         let tracked = track(&truth, &parents, Vec3::Y, error);

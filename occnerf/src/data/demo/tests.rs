@@ -198,6 +198,7 @@ fn impossible_settings_are_named() {
         ("eval_cameras", DemoConfig { eval_cameras: 1000, ..small() }),
         ("occluded_fraction", DemoConfig { occluded_fraction: 1.0, ..small() }),
         ("occluded_share", DemoConfig { occluded_share: -0.1, ..small() }),
+        ("pressed", DemoConfig { pressed: f32::NAN, ..small() }),
         ("pose_noise_degrees", DemoConfig { pose_noise_degrees: f32::NAN, ..small() }),
     ] {
         let message = demo(&config, body()).unwrap_err().to_string();

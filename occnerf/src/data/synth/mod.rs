@@ -169,8 +169,9 @@ pub fn synthesise(
             let (capture, height) = match motion {
                 None => film(&config.demo(), &body, grounded_walk, progress)?,
                 Some(clip) => {
-                    let perform =
-                        |frames, body: &_, shaped: &_| perform::embedded(clip, frames, config.turns, body, shaped);
+                    let perform = |demo: &DemoConfig, body: &_, shaped: &_| {
+                        perform::embedded(clip, demo.frames, config.turns, body, shaped)
+                    };
                     film(&config.demo(), &body, perform, progress)?
                 }
             };

@@ -1,0 +1,202 @@
+//! Captures made as hard as one likes.
+
+use anyhow::{Result, ensure};
+use glam::{Quat, Vec3};
+use occnerf::data::{Capture, DemoConfig, Frame, demo};
+use serde::{Deserialize, Serialize};
+use smpl::{BodyModel, Placement};
+
+/// Moments that a frame's exposure can be made of.
+const MOMENTS: usize = 8;
+
+/// A variation of the demo.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Difficulty {
+    pub demo: DemoConfig,
+    /// Pixels by which training masks are eaten away from their border.
+    pub erosion: u32,
+    /// Exposure of a training frame as a share of the time from one frame to the next, 0 to 1.
+    pub shutter: f32,
+    /// Keep only training frames in which the person's front is within this angle of the camera; 180 keeps all.
+    pub facing_degrees: f32,
+    /// Length of one metre in the capture's unit.
+    pub unit: f32,
+}
+
+impl Default for Difficulty {
+    fn default() -> Self {
+        Self { demo: DemoConfig::default(), erosion: 0, shutter: 0.0, facing_degrees: 180.0, unit: 1.0 }
+    }
+}
+
+impl Difficulty {
+    /// The capture and its body model.
+    pub fn make(&self) -> Result<(Capture, BodyModel)> {
+        ensure!(self.unit.is_finite() && self.unit > 0.0, "unit is {}: expected a length above 0", self.unit);
+        ensure!((0.0..=1.0).contains(&self.shutter), "shutter is {}: expected 0 to 1", self.shutter);
+        let mut body = BodyModel::embedded();
+        if self.unit != 1.0 {
+            enlarge(&mut body, self.unit);
+        }
+        let mut capture = if self.shutter > 0.0 { self.exposed(&body)? } else { demo(&self.demo, &body)? };
+        capture.train.iter_mut().for_each(|frame| erode(frame, self.erosion));
+        if self.facing_degrees < 180.0 {
+            keep(&mut capture, |frame| facing(frame) <= self.facing_degrees);
+            let degrees = self.facing_degrees;
+            ensure!(!capture.train.is_empty(), "no frame has the front within {degrees}° of the camera");
+        }
+        Ok((capture, body))
+    }
+
+    /// Frames that are means over their exposure, with pose and camera of its middle.
+    fn exposed(&self, body: &BodyModel) -> Result<Capture> {
+        let (frames, every) = (self.demo.frames, self.demo.eval_every);
+        let fine = DemoConfig { frames: frames * MOMENTS, eval_every: every * MOMENTS, ..self.demo };
+        let mut capture = demo(&fine, body)?;
+        let half = (self.shutter * MOMENTS as f32 / 2.0).round() as usize;
+        let moments = std::mem::take(&mut capture.train);
+        capture.train = (0..frames)
+            .map(|i| {
+                let middle = i * MOMENTS;
+                let exposure = &moments[middle.saturating_sub(half)..=(middle + half).min(moments.len() - 1)];
+                let mut frame = moments[middle].clone();
+                let mean = |sum: &mut [f32], pick: fn(&Frame) -> &[f32]| {
+                    sum.fill(0.0);
+                    for moment in exposure {
+                        sum.iter_mut().zip(pick(moment)).for_each(|(s, x)| *s += x / exposure.len() as f32);
+                    }
+                };
+                mean(&mut frame.image.pixels, |f| &f.image.pixels);
+                mean(&mut frame.mask, |f| &f.mask);
+                frame
+            })
+            .collect();
+        capture.eval.iter_mut().for_each(|view| view.train_index /= MOMENTS);
+        Ok(capture)
+    }
+}
+
+/// Multiplies every length of a body.
+fn enlarge(body: &mut BodyModel, unit: f32) {
+    let lengths = body.v_template.iter_mut().chain(&mut body.shapedirs).chain(&mut body.posedirs.values);
+    lengths.for_each(|v| *v *= unit);
+}
+
+/// Takes `pixels` pixels off the mask's border, and the picture with them.
+fn erode(frame: &mut Frame, pixels: u32) {
+    let (width, height) = (frame.image.width as usize, frame.image.height as usize);
+    for _ in 0..pixels {
+        let old = frame.mask.clone();
+        let at = |x: usize, y: usize, dx: isize, dy: isize| {
+            let inside = |a: usize, d: isize, n: usize| a.checked_add_signed(d).filter(|&a| a < n);
+            inside(x, dx, width).zip(inside(y, dy, height)).map_or(1.0, |(x, y)| old[y * width + x])
+        };
+        for y in 0..height {
+            for x in 0..width {
+                let least = [(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)].map(|(dx, dy)| at(x, y, dx, dy));
+                let least = least.into_iter().fold(1.0, f32::min);
+                let i = y * width + x;
+                // The picture is premultiplied by the mask.
+                let share = if old[i] > 0.0 { least / old[i] } else { 0.0 };
+                frame.mask[i] = least;
+                frame.image.pixels[3 * i..3 * i + 3].iter_mut().for_each(|c| *c *= share);
+            }
+        }
+    }
+}
+
+/// Angle in degrees between the person's front and the direction to the camera, seen from above.
+fn facing(frame: &Frame) -> f32 {
+    let (rotation, at) = match frame.placement {
+        Placement::Origin { rotation, translation } => (rotation, translation),
+        _ => (frame.pose.first().copied().unwrap_or(Vec3::ZERO), Vec3::ZERO),
+    };
+    let level = |v: Vec3| Vec3::new(v.x, 0.0, v.z);
+    let front = level(Quat::from_scaled_axis(rotation) * Vec3::Z);
+    let eye = Vec3::from(frame.camera.world_to_camera.inverse().translation);
+    front.angle_between(level(eye - at)).to_degrees()
+}
+
+/// Drops training frames, and the views of their instants.
+fn keep(capture: &mut Capture, wanted: impl Fn(&Frame) -> bool) {
+    let mut index = vec![None; capture.train.len()];
+    let mut kept = Vec::new();
+    for (i, frame) in std::mem::take(&mut capture.train).into_iter().enumerate() {
+        if wanted(&frame) {
+            index[i] = Some(kept.len());
+            kept.push(frame);
+        }
+    }
+    capture.train = kept;
+    let views = std::mem::take(&mut capture.eval).into_iter();
+    capture.eval = views
+        .filter_map(|mut view| {
+            view.train_index = index[view.train_index]?;
+            Some(view)
+        })
+        .collect();
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn small() -> Difficulty {
+        let demo = DemoConfig { size: 24, frames: 8, eval_cameras: 1, eval_every: 2, ..DemoConfig::default() };
+        Difficulty { demo, ..Difficulty::default() }
+    }
+
+    fn coverage(capture: &Capture) -> f32 {
+        capture.train.iter().flat_map(|f| &f.mask).sum()
+    }
+
+    #[test]
+    fn erosion_takes_mask_and_picture_away_together() {
+        let (whole, _) = small().make().unwrap();
+        let (eroded, _) = Difficulty { erosion: 1, ..small() }.make().unwrap();
+        assert!(coverage(&eroded) < 0.9 * coverage(&whole) && coverage(&eroded) > 0.0);
+        for frame in &eroded.train {
+            for (colour, &m) in frame.image.pixels.chunks_exact(3).zip(&frame.mask) {
+                assert!(colour.iter().all(|&c| c <= m + 1e-5));
+            }
+        }
+    }
+
+    #[test]
+    fn an_exposure_smears_the_picture_and_keeps_its_sum() {
+        let (sharp, _) = small().make().unwrap();
+        let (smeared, _) = Difficulty { shutter: 1.0, ..small() }.make().unwrap();
+        assert_eq!((smeared.train.len(), smeared.eval.len()), (sharp.train.len(), sharp.eval.len()));
+        let partial = |c: &Capture| c.train.iter().flat_map(|f| &f.mask).filter(|m| (0.05..0.95).contains(*m)).count();
+        assert!(partial(&smeared) > partial(&sharp) * 3 / 2, "{} {}", partial(&smeared), partial(&sharp));
+        assert!((coverage(&smeared) / coverage(&sharp) - 1.0).abs() < 0.2);
+        for (a, b) in smeared.eval.iter().zip(&sharp.eval) {
+            assert_eq!(a.train_index, b.train_index);
+        }
+    }
+
+    #[test]
+    fn a_side_that_is_never_seen_is_left_out_and_views_stay_with_their_frames() {
+        let (all, _) = small().make().unwrap();
+        let (some, _) = Difficulty { facing_degrees: 80.0, ..small() }.make().unwrap();
+        assert!(!some.train.is_empty() && some.train.len() < all.train.len());
+        assert!(some.train.iter().all(|f| facing(f) <= 80.0));
+        for view in &some.eval {
+            assert_eq!(some.train[view.train_index].name, view.frame.name);
+        }
+        assert!(Difficulty { facing_degrees: 0.0, ..small() }.make().is_err());
+    }
+
+    #[test]
+    fn another_unit_of_length_gives_the_same_pictures() {
+        let (metres, body) = small().make().unwrap();
+        let (large, big) = Difficulty { unit: 128.0, ..small() }.make().unwrap();
+        assert!((big.v_template[5] / 128.0).distance(body.v_template[5]) < 1e-6);
+        for (a, b) in metres.train.iter().zip(&large.train) {
+            let off = a.mask.iter().zip(&b.mask).filter(|(a, b)| (*a - *b).abs() > 0.3).count();
+            assert!(off * 100 < a.mask.len(), "{off} pixels differ");
+        }
+        assert!(Difficulty { unit: 0.0, ..small() }.make().is_err());
+    }
+}

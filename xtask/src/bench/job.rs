@@ -1,0 +1,199 @@
+//! One measured run: what it is, and what came of it.
+
+use std::io::{Read, Write};
+use std::path::PathBuf;
+use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, Result, bail};
+use glam::Vec3;
+use occnerf::data::{Capture, LoadOptions};
+use occnerf::{
+    Config, FieldRenderer, Method, PreparedFrame, PriorRenderer, Renderer, Scene, Trainer, VertexColors, evaluate,
+};
+use serde::{Deserialize, Serialize};
+use smpl::BodyModel;
+
+use super::difficulty::Difficulty;
+use crate::run::peak_rss_bytes;
+use crate::source;
+
+/// A job on standard input may be this long.
+const MAX_JOB_BYTES: u64 = 1 << 20;
+
+/// Where the frames come from.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Place {
+    /// As `train` reads them.
+    Scene { scene: String, body: Option<PathBuf>, load: LoadOptions },
+    /// Made for the purpose.
+    Made(Difficulty),
+}
+
+impl Place {
+    /// What charts and tables call it.
+    pub fn name(&self) -> &str {
+        match self {
+            Self::Scene { scene, .. } => scene,
+            Self::Made(_) => source::DEMO,
+        }
+    }
+
+    fn load(&self) -> Result<(Capture, BodyModel)> {
+        match self {
+            Self::Scene { scene, body, load } => {
+                let source = source::load(Some(scene), body.as_deref(), load)?;
+                Ok((source.capture, source.model))
+            }
+            Self::Made(difficulty) => difficulty.make(),
+        }
+    }
+}
+
+/// A run to be measured.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Job {
+    pub place: Place,
+    /// At most so many unseen views are scored, evenly chosen.
+    pub views: usize,
+    pub config: Config,
+}
+
+/// What came of it; all zero or none where there is an error.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct Outcome {
+    pub error: Option<String>,
+    /// From the capture to the first step.
+    pub prepare_seconds: f64,
+    pub train_seconds: f64,
+    pub seconds_per_frame: f64,
+    pub psnr_mask: Option<f64>,
+    pub ssim_mask: Option<f64>,
+    pub psnr_hidden: Option<f64>,
+    pub mask_iou: Option<f64>,
+    pub parameters: usize,
+    pub peak_rss_bytes: u64,
+    /// Mean of a step.
+    pub live_samples: f64,
+    /// Left out by the optimiser.
+    pub bad_gradients: usize,
+    /// Losses of steps and numbers of scored pictures that are not finite.
+    pub non_finite: usize,
+}
+
+/// Trains and scores.
+pub fn measure(job: &Job) -> Result<Outcome> {
+    let (mut capture, model) = job.place.load()?;
+    let stride = capture.eval.len().div_ceil(job.views.max(1)).max(1);
+    capture.eval = capture.eval.into_iter().step_by(stride).collect();
+    let start = Instant::now();
+    let scene = Scene::new(&capture, &model, &job.config)?;
+    drop(capture);
+    let mut outcome = Outcome { prepare_seconds: start.elapsed().as_secs_f64(), ..Outcome::default() };
+    let start = Instant::now();
+    if job.config.method == Method::Prior {
+        let colors = VertexColors::measure(&scene)?;
+        outcome.train_seconds = start.elapsed().as_secs_f64();
+        outcome.parameters = 3 * colors.colors.len();
+        score(&scene, &mut PriorRenderer::new(&scene, &colors), &mut outcome)?;
+    } else {
+        let mut trainer = Trainer::new(&scene, job.config.clone())?;
+        for _ in 0..job.config.steps {
+            let report = trainer.step();
+            outcome.non_finite += usize::from(!report.loss.is_finite());
+            outcome.bad_gradients += report.bad_gradients;
+            outcome.live_samples += report.live_samples as f64 / job.config.steps as f64;
+        }
+        outcome.train_seconds = start.elapsed().as_secs_f64();
+        outcome.parameters = trainer.num_parameters();
+        score(&scene, &mut FieldRenderer::new(&trainer)?, &mut outcome)?;
+    }
+    outcome.peak_rss_bytes = peak_rss_bytes();
+    Ok(outcome)
+}
+
+fn score(scene: &Scene, renderer: &mut dyn Renderer, outcome: &mut Outcome) -> Result<()> {
+    let frames: Vec<&PreparedFrame> = scene.eval.iter().collect();
+    let mut bad = 0;
+    // The first picture pays for what later ones find ready.
+    if let Some(first) = frames.first() {
+        renderer.render(first, Vec3::ZERO)?;
+    }
+    let metrics = evaluate(scene, renderer, &frames, |_, rendering| {
+        let numbers = rendering.image.pixels.iter().chain(&rendering.opacity);
+        bad += numbers.filter(|x| !x.is_finite()).count();
+    })?;
+    outcome.non_finite += bad;
+    outcome.seconds_per_frame = metrics.render_seconds_per_frame;
+    outcome.psnr_mask = metrics.psnr_mask;
+    outcome.ssim_mask = metrics.ssim_mask;
+    outcome.psnr_hidden = metrics.psnr_hidden;
+    outcome.mask_iou = metrics.mask_iou;
+    Ok(())
+}
+
+/// The child's part: a job on standard input, its outcome as one line on standard output.
+pub fn serve() -> Result<()> {
+    let mut text = String::new();
+    std::io::stdin().take(MAX_JOB_BYTES).read_to_string(&mut text).context("standard input")?;
+    let job: Job = serde_json::from_str(&text).context("standard input is not a job")?;
+    println!("{}", serde_json::to_string(&measure(&job)?)?);
+    Ok(())
+}
+
+/// Runs a job in a process of its own, so that its peak of memory is its own and nothing it does ends a sweep: an
+/// error, a panic, and a run longer than `limit` come back as [`Outcome::error`].
+///
+/// # Errors
+/// Only where no process can be started.
+pub fn run(job: &Job, threads: Option<usize>, limit: Duration) -> Result<Outcome> {
+    let program = std::env::current_exe().context("the path of this program")?;
+    let mut command = Command::new(program);
+    command.args(["bench", "point"]);
+    if let Some(threads) = threads {
+        command.args(["--threads", &threads.to_string()]);
+    }
+    command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped());
+    let mut child = command.spawn().context("cannot start a run")?;
+    let outcome = converse(&mut child, job, limit);
+    // Whatever happened, nothing is left running.
+    if outcome.is_err() {
+        let _ = child.kill();
+        let _ = child.wait();
+    }
+    Ok(outcome.unwrap_or_else(|error| Outcome { error: Some(format!("{error:#}")), ..Outcome::default() }))
+}
+
+fn converse(child: &mut Child, job: &Job, limit: Duration) -> Result<Outcome> {
+    let read = |mut pipe: Box<dyn Read + Send>| {
+        std::thread::spawn(move || {
+            let mut bytes = Vec::new();
+            let _ = pipe.read_to_end(&mut bytes);
+            String::from_utf8_lossy(&bytes).into_owned()
+        })
+    };
+    let (out, err) = (child.stdout.take().context("no output")?, child.stderr.take().context("no output")?);
+    let (out, err) = (read(Box::new(out)), read(Box::new(err)));
+    let mut input = child.stdin.take().context("no input")?;
+    input.write_all(serde_json::to_string(job)?.as_bytes()).context("handing over the job")?;
+    drop(input);
+    let start = Instant::now();
+    let status = loop {
+        if let Some(status) = child.try_wait()? {
+            break status;
+        }
+        if start.elapsed() > limit {
+            bail!("stopped after {:.0} s", limit.as_secs_f64());
+        }
+        std::thread::sleep(Duration::from_millis(20));
+    };
+    let (out, err) = (out.join().unwrap_or_default(), err.join().unwrap_or_default());
+    if !status.success() {
+        let lines: Vec<&str> = err.lines().filter(|l| !l.trim().is_empty() && !l.starts_with("note:")).collect();
+        let reason = lines.iter().take(3).copied().collect::<Vec<_>>().join(" ");
+        bail!("{}", if reason.is_empty() { status.to_string() } else { reason });
+    }
+    serde_json::from_str(out.trim()).context("unexpected answer of a run")
+}

@@ -1,0 +1,226 @@
+//! `bench`: what every approximation costs and is worth, and where methods break.
+
+mod axes;
+mod chart;
+mod difficulty;
+mod front;
+mod job;
+mod kernels;
+mod pareto;
+mod points;
+mod runner;
+mod scale;
+mod stability;
+
+use std::path::PathBuf;
+use std::time::Duration;
+
+use anyhow::Result;
+use clap::{Args, Subcommand};
+
+use self::job::Place;
+use self::runner::Bench;
+use crate::run::{use_threads, write};
+use crate::source::LoadArguments;
+use crate::{source, train};
+
+pub use self::kernels::RESULTS;
+pub use self::runner::{LOG, read};
+pub use self::scale::{Scale, number};
+
+/// Steps of a point of `pareto` at which presets run their own number of steps.
+const FULL_STEPS: u64 = 300;
+/// Unseen views that a point of `pareto` is scored on.
+const VIEWS: usize = 50;
+
+#[derive(Args)]
+pub struct BenchArguments {
+    #[command(subcommand)]
+    what: What,
+}
+
+#[derive(Subcommand)]
+enum What {
+    /// Seconds against accuracy of every named approximation, each preset and each method: a table and charts.
+    Pareto(ParetoArguments),
+    /// What happens as it gets hard: less to see, worse poses, odd units, …; a table of breaking points and charts.
+    Stability(StabilityArguments),
+    /// Cost against error of the geometric kernels; `pareto` draws it too.
+    Kernels(KernelArguments),
+    /// One run, handed over on standard input.
+    #[command(hide = true)]
+    Point {
+        #[arg(long)]
+        threads: Option<usize>,
+    },
+}
+
+#[derive(Args)]
+struct ParetoArguments {
+    /// Captures, as `train` takes them [default: the embedded demo]
+    scenes: Vec<String>,
+    /// The body model of the captures
+    #[arg(long)]
+    body: Option<PathBuf>,
+    #[command(flatten)]
+    load: LoadArguments,
+    /// Where to write; what is there is not run again
+    #[arg(long, default_value = "runs/bench-pareto")]
+    out: PathBuf,
+    /// Fewer points and fewer steps: under 10 minutes on 2 cores
+    #[arg(long)]
+    quick: bool,
+    /// Steps of each point; presets run their own number at 300 and in proportion otherwise [default: 300, quick: 60]
+    #[arg(long)]
+    steps: Option<u64>,
+    /// Seed of every point
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+    /// Threads of each point [default: all cores]
+    #[arg(long)]
+    threads: Option<usize>,
+    /// Begin no point after so many minutes; the same command goes on later [default: no limit]
+    #[arg(long)]
+    minutes: Option<f64>,
+    /// Only draw what has been run
+    #[arg(long)]
+    draw: bool,
+}
+
+#[derive(Args)]
+struct StabilityArguments {
+    /// Where to write; what is there is not run again
+    #[arg(long, default_value = "runs/bench-stability")]
+    out: PathBuf,
+    /// Only the easy case and the hardest level of each axis, fewer steps, one seed: under 10 minutes on 2 cores
+    #[arg(long)]
+    quick: bool,
+    /// Steps of each run [default: 200, quick: 100]
+    #[arg(long)]
+    steps: Option<u64>,
+    /// Only these axes, comma separated, such as hidden,"pose noise" [default: all]
+    #[arg(long, value_delimiter = ',')]
+    axes: Vec<String>,
+    /// Pixels a side of the pictures, 64 to 512 for figures that mean something
+    #[arg(long, default_value_t = 96)]
+    side: u32,
+    /// Trained runs at most; those of more seeds are left out first
+    #[arg(long, default_value_t = 60)]
+    max_runs: usize,
+    /// Threads of each run [default: all cores]
+    #[arg(long)]
+    threads: Option<usize>,
+    /// Begin no run after so many minutes; the same command goes on later [default: no limit]
+    #[arg(long)]
+    minutes: Option<f64>,
+    /// Only draw what has been run
+    #[arg(long)]
+    draw: bool,
+}
+
+#[derive(Args)]
+struct KernelArguments {
+    /// Where to write
+    #[arg(long, default_value = "runs/bench-kernels")]
+    out: PathBuf,
+    /// Fewer queries
+    #[arg(long)]
+    quick: bool,
+}
+
+/// Runs the command.
+pub fn bench(arguments: &BenchArguments) -> Result<()> {
+    match &arguments.what {
+        What::Pareto(arguments) => pareto(arguments),
+        What::Stability(arguments) => stability(arguments),
+        What::Kernels(arguments) => kernels::run(&arguments.out, arguments.quick),
+        What::Point { threads } => {
+            use_threads(*threads)?;
+            job::serve()
+        }
+    }
+}
+
+/// Seconds that a sweep may take.
+fn budget(minutes: Option<f64>, draw: bool) -> Result<Duration> {
+    let minutes = if draw { 0.0 } else { minutes.unwrap_or(1e6) };
+    anyhow::ensure!((0.0..=1e6).contains(&minutes), "--minutes {minutes}: expected 0 to 1000000");
+    Ok(Duration::from_secs_f64(60.0 * minutes))
+}
+
+fn pareto(arguments: &ParetoArguments) -> Result<()> {
+    let out = &arguments.out;
+    let steps = arguments.steps.unwrap_or(if arguments.quick { FULL_STEPS / 5 } else { FULL_STEPS });
+    anyhow::ensure!((1..=1_000_000).contains(&steps), "--steps {steps}: expected 1 to 1000000");
+    let scenes = if arguments.scenes.is_empty() { vec![source::DEMO.to_owned()] } else { arguments.scenes.clone() };
+    // What is wrong with a capture is said before anything is run.
+    for scene in scenes.iter().filter(|s| *s != source::DEMO || !arguments.load.command_line().is_empty()) {
+        source::load(Some(scene), arguments.body.as_deref(), &arguments.load.options())?;
+    }
+    let mut bench = Bench::open(out, arguments.threads, budget(arguments.minutes, arguments.draw)?)?;
+    let mut text = String::new();
+    for scene in &scenes {
+        let (body, load) = (arguments.body.clone(), arguments.load.options());
+        let sweep = points::Sweep {
+            scene_arguments: scene_arguments(scene, arguments),
+            place: Place::Scene { scene: scene.clone(), body, load },
+            views: VIEWS,
+            steps,
+            full_steps: FULL_STEPS,
+            seed: arguments.seed,
+            quick: arguments.quick,
+        };
+        let lines = pareto::run(&sweep, &mut bench)?;
+        pareto::charts(scene, &lines, &out.join(format!("pareto-{}", train::scene_name(Some(scene)))))?;
+        text.push_str(&format!("## {scene}\n\n{}\n", pareto::table(&lines)));
+    }
+    finish(&bench, &text, "pareto.md")?;
+    if !arguments.draw {
+        kernels::run(out, arguments.quick)?;
+    }
+    Ok(())
+}
+
+/// What makes `train` read the same capture.
+fn scene_arguments(scene: &str, arguments: &ParetoArguments) -> String {
+    let mut text = if scene == source::DEMO { String::new() } else { format!(" {scene}") };
+    if let Some(body) = &arguments.body {
+        text.push_str(&format!(" --body {}", body.display()));
+    }
+    text + &arguments.load.command_line()
+}
+
+fn stability(arguments: &StabilityArguments) -> Result<()> {
+    let out = &arguments.out;
+    let steps = arguments.steps.unwrap_or(if arguments.quick { 100 } else { 200 });
+    anyhow::ensure!((1..=1_000_000).contains(&steps), "--steps {steps}: expected 1 to 1000000");
+    anyhow::ensure!((16..=2048).contains(&arguments.side), "--side {}: expected 16 to 2048", arguments.side);
+    let mut axes = axes::all(arguments.side, arguments.quick);
+    if !arguments.axes.is_empty() {
+        let known = axes.iter().map(|a| a.name).collect::<Vec<_>>().join(", ");
+        if let Some(unknown) = arguments.axes.iter().find(|name| axes.iter().all(|a| a.name != name.trim())) {
+            anyhow::bail!("--axes {unknown}: there are {known}");
+        }
+        axes.retain(|axis| arguments.axes.iter().any(|name| name.trim() == axis.name));
+    }
+    let sweep = stability::Sweep { axes, steps, quick: arguments.quick, max_runs: arguments.max_runs };
+    let mut bench = Bench::open(out, arguments.threads, budget(arguments.minutes, arguments.draw)?)?;
+    let lines = sweep.run(&mut bench)?;
+    stability::charts(&sweep.axes, &lines, &out.join("stability"))?;
+    let text = format!("{}\n{}\n", stability::table(&sweep.axes, &lines), stability::finite(&lines));
+    finish(&bench, &text, "stability.md")
+}
+
+/// Prints and writes the table, and says what there is.
+fn finish(bench: &Bench, text: &str, name: &str) -> Result<()> {
+    let path = bench.path().with_file_name(name);
+    write(&path, text)?;
+    println!("\n{text}");
+    println!("written: {}\nwritten: {}", bench.path().display(), path.display());
+    let (begun, left) = bench.counts();
+    println!("{begun} runs in {:.1} minutes", bench.seconds() / 60.0);
+    if left > 0 {
+        println!("{left} points are left: the same command goes on with them");
+    }
+    Ok(())
+}

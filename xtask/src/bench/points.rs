@@ -1,0 +1,231 @@
+//! The sweep of `bench pareto`: one factor at a time, then what is worth combining.
+
+use anyhow::Result;
+use occnerf::{Config, Method, Preset};
+
+use super::job::{Job, Place};
+use super::runner::{Kind, Line, Point};
+use crate::settings;
+
+/// One change of one factor.
+pub struct Change {
+    pub factor: &'static str,
+    pub name: &'static str,
+    /// As `train --set` takes it.
+    pub set: &'static [&'static str],
+    /// Whether the quick form has it.
+    pub quick: bool,
+}
+
+const fn change(factor: &'static str, name: &'static str, set: &'static [&'static str], quick: bool) -> Change {
+    Change { factor, name, set, quick }
+}
+
+/// Every change but of the number of steps, most telling first.
+pub const CHANGES: [Change; 19] = [
+    change("distance", "blended distance", &["surface.distance=blended"], true),
+    change("motion", "volume motion", &["motion.kind=volume", "motion.correction_spacing=0"], true),
+    change("motion", "poses as given", &["motion.correction_spacing=0"], true),
+    change("samples", "24 samples", &["samples=24"], true),
+    change("samples", "96 samples", &["samples=96"], false),
+    change("span", "span 6 cm", &["motion.margin=0.06", "motion.depth=0.06"], false),
+    change("neighbours", "k 1", &["surface.k=1"], true),
+    change("neighbours", "1 level", &["surface.coarse_levels=0"], true),
+    change("visibility", "exact visibility", &["surface.visibility=exact"], true),
+    change("table", "table 2^13", &["encoding.log2_table_size=13"], true),
+    change("table", "table 2^19", &["encoding.log2_table_size=19"], false),
+    change("resolution", "6 levels", &["encoding.levels=6"], false),
+    change("resolution", "16 levels to 2048", &["encoding.levels=16", "encoding.n_max=2048"], false),
+    change("features", "4 features", &["encoding.features=4"], false),
+    change("field", "width 32", &["field.width=32"], true),
+    change("field", "width 128", &["field.width=128"], false),
+    change("depth", "depth 1", &["field.depth=1"], false),
+    change("loss", "no perceptual term", &["loss.perceptual=0"], true),
+    change("surface term", "no surface term", &["surface.surface_term=false", "surface.attention=false"], true),
+];
+
+/// A change that loses less than this, in dB, can be part of the lean combination, and one that gains more of the rich.
+const NOTHING: f64 = 0.03;
+/// A change that takes more than this part of the base's time does not save any.
+const SAVING: f64 = 0.98;
+
+/// What the sweep is made of.
+pub struct Sweep {
+    pub place: Place,
+    /// Arguments that make `train` read the same capture.
+    pub scene_arguments: String,
+    pub views: usize,
+    /// Of the base and its changes.
+    pub steps: u64,
+    /// Steps of the base at which presets run their own number of steps.
+    pub full_steps: u64,
+    pub seed: u64,
+    pub quick: bool,
+}
+
+/// Settings on top of a preset.
+struct Setting<'a> {
+    preset: Preset,
+    method: Method,
+    steps: u64,
+    set: &'a [&'a str],
+}
+
+impl Sweep {
+    fn point(&self, name: &str, factor: &str, kind: Kind, setting: &Setting<'_>) -> Result<Point> {
+        let Setting { preset, method, steps, set } = *setting;
+        let mut config = Config { steps, seed: self.seed, ..Config::preset(preset, method) };
+        for assignment in set {
+            config = settings::set(&config, assignment)?;
+        }
+        config.validate()?;
+        let mut command = format!(
+            "cargo xtask train{} --preset {} --method {} --steps {steps} --seed {}",
+            self.scene_arguments,
+            preset.name(),
+            method.name(),
+            self.seed
+        );
+        set.iter().for_each(|assignment| command.push_str(&format!(" --set {assignment}")));
+        Ok(Point {
+            bench: "pareto".to_owned(),
+            name: name.to_owned(),
+            factor: factor.to_owned(),
+            level: None,
+            kind,
+            command: Some(command),
+            job: Job { place: self.place.clone(), views: self.views, config },
+        })
+    }
+
+    /// Everything that does not depend on what others gave.
+    pub fn first(&self) -> Result<Vec<Point>> {
+        let fast = |method, steps, set| Setting { preset: Preset::Fast, method, steps, set };
+        let own = |kind, factor: &str, name: &str, method, steps, set: &'static [&'static str]| {
+            self.point(name, factor, kind, &fast(method, steps, set))
+        };
+        let steps = self.steps;
+        let mut points = vec![own(Kind::Base, "base", "base", Method::Occnerf, steps, &[])?];
+        for (name, method) in
+            [("prior", Method::Prior), ("hash-point", Method::HashPoint), ("humannerf", Method::Humannerf)]
+        {
+            points.push(own(Kind::Baseline, "method", name, method, steps, &[])?);
+        }
+        for (name, steps) in [("half the steps", steps.div_ceil(2)), ("twice the steps", 2 * steps)] {
+            points.push(own(Kind::Change, "steps", name, Method::Occnerf, steps, &[])?);
+        }
+        for change in CHANGES.iter().filter(|c| c.quick || !self.quick) {
+            points.push(own(Kind::Change, change.factor, change.name, Method::Occnerf, steps, change.set)?);
+        }
+        // A hundredth of the paper's steps: all of them take longer than the rest of the sweep.
+        for (preset, divisor) in [(Preset::Fast, 1), (Preset::Balanced, 1), (Preset::Paper, 100)] {
+            let whole = Config::preset(preset, Method::Occnerf).steps;
+            let steps = (whole * self.steps / (self.full_steps * divisor)).max(1);
+            let name = if steps == whole {
+                preset.name().to_owned()
+            } else {
+                format!("{}, {steps} of {whole} steps", preset.name())
+            };
+            let setting = Setting { preset, method: Method::Occnerf, steps, set: &[] };
+            points.push(self.point(&name, "preset", Kind::Preset, &setting)?);
+        }
+        Ok(points)
+    }
+
+    /// The best combinations of single changes: `lean` takes of each factor the fastest that loses nothing, `rich` the
+    /// one that gains most, `lean and rich` both, gain before speed. None where they would be a point there is.
+    pub fn combinations(&self, lines: &[Line]) -> Result<Vec<Point>> {
+        let Some(base) = lines.iter().find(|l| l.point.kind == Kind::Base) else { return Ok(Vec::new()) };
+        let tried: Vec<(&Change, f64, f64)> = CHANGES
+            .iter()
+            .filter_map(|change| {
+                let line = lines.iter().find(|l| l.point.kind == Kind::Change && l.point.name == change.name)?;
+                let gain = worth(line)? - worth(base)?;
+                Some((change, gain, line.outcome.train_seconds / base.outcome.train_seconds))
+            })
+            .collect();
+        let of_factor = |wanted: &dyn Fn(f64, f64) -> bool, rank: &dyn Fn(f64, f64) -> f64| -> Vec<&Change> {
+            let mut best: Vec<(&Change, f64)> = Vec::new();
+            for &(change, gain, time) in tried.iter().filter(|t| wanted(t.1, t.2)) {
+                let rank = rank(gain, time);
+                match best.iter_mut().find(|(b, _)| b.factor == change.factor) {
+                    Some(old) if old.1 < rank => *old = (change, rank),
+                    Some(_) => {}
+                    None => best.push((change, rank)),
+                }
+            }
+            best.into_iter().map(|(change, _)| change).collect()
+        };
+        let lean = of_factor(&|gain, time| gain >= -NOTHING && time < SAVING, &|_, time| -time);
+        let rich = of_factor(&|gain, _| gain > NOTHING, &|gain, _| gain);
+        let mut both = rich.clone();
+        both.extend(lean.iter().copied().filter(|l| rich.iter().all(|r| r.factor != l.factor)));
+        let mut points: Vec<Point> = Vec::new();
+        for (name, changes) in [("lean", lean), ("rich", rich), ("lean and rich", both)] {
+            let set: Vec<&str> = changes.iter().flat_map(|c| c.set.iter().copied()).collect();
+            let setting = Setting { preset: Preset::Fast, method: Method::Occnerf, steps: self.steps, set: &set };
+            let point = self.point(name, "combination", Kind::Combination, &setting)?;
+            if changes.len() > 1 && points.iter().all(|p| p.job.config != point.job.config) {
+                points.push(point);
+            }
+        }
+        Ok(points)
+    }
+}
+
+/// What combinations go by: the mean of the two quantities that methods are ranked by, dB.
+pub fn worth(line: &Line) -> Option<f64> {
+    Some(0.5 * (line.outcome.psnr_mask? + line.outcome.psnr_hidden?))
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
+mod tests {
+    use super::*;
+    use crate::bench::difficulty::Difficulty;
+    use crate::bench::runner::tests::line;
+
+    fn sweep(quick: bool) -> Sweep {
+        let place = Place::Made(Difficulty::default());
+        Sweep { place, scene_arguments: String::new(), views: 5, steps: 300, full_steps: 300, seed: 1, quick }
+    }
+
+    #[test]
+    fn every_point_is_valid_has_a_name_of_its_own_and_a_command() {
+        for quick in [false, true] {
+            let points = sweep(quick).first().unwrap();
+            // "About 25 runs of the fast kind", beside presets and baselines.
+            let fast = points.iter().filter(|p| matches!(p.kind, Kind::Base | Kind::Change)).count();
+            assert!(fast <= if quick { 15 } else { 23 }, "{fast}");
+            for (i, a) in points.iter().enumerate() {
+                assert!(points[..i].iter().all(|b| b.name != a.name && b.job != a.job), "{}", a.name);
+                assert!(a.command.as_ref().unwrap().contains(a.job.config.method.name()));
+            }
+            for preset in ["fast", "balanced", "paper"] {
+                assert!(points.iter().any(|p| p.kind == Kind::Preset && p.name.starts_with(preset)));
+            }
+        }
+    }
+
+    #[test]
+    fn combinations_take_what_loses_nothing_and_what_gains() {
+        let lines = [
+            line("base", "base", Kind::Base, 20.0, 10.0),
+            line("24 samples", "samples", Kind::Change, 20.0, 6.0),
+            line("width 32", "field", Kind::Change, 19.0, 5.0),
+            line("k 1", "neighbours", Kind::Change, 20.0, 9.0),
+            line("1 level", "neighbours", Kind::Change, 20.0, 8.0),
+            line("4 features", "features", Kind::Change, 20.5, 12.0),
+            line("exact visibility", "visibility", Kind::Change, 20.2, 9.0),
+        ];
+        let points = sweep(false).combinations(&lines).unwrap();
+        let set = |name: &str| &points.iter().find(|p| p.name == name).unwrap().job.config;
+        let lean = set("lean");
+        assert_eq!((lean.samples, lean.surface.k, lean.surface.coarse_levels), (24, 5, 0));
+        assert_eq!((lean.field.width, lean.encoding.features), (64, 2));
+        assert_eq!((set("rich").samples, set("rich").encoding.features), (48, 4));
+        assert_eq!((set("lean and rich").samples, set("lean and rich").encoding.features), (24, 4));
+        assert!(sweep(false).combinations(&lines[1..]).unwrap().is_empty());
+        assert!(sweep(false).combinations(&lines[..1]).unwrap().is_empty());
+    }
+}

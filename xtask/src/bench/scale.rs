@@ -1,0 +1,148 @@
+//! An axis: linear, logarithmic, or a row of names.
+
+use std::ops::Range;
+
+use plotters::coord::ranged1d::{KeyPointHint, NoDefaultFormatting, Ranged, ValueFormatter};
+
+/// Share of its extent by which a linear or logarithmic axis reaches beyond its values.
+const ROOM: f64 = 0.06;
+
+/// From values to places.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Scale {
+    Linear(Range<f64>),
+    Logarithmic(Range<f64>),
+    /// The values are 0, 1, …, each with a name.
+    Named(Vec<String>),
+}
+
+impl Scale {
+    /// A scale that shows all of `values` that it can: finite ones, above 0 on a logarithmic scale.
+    pub fn around(values: impl Iterator<Item = f64>, logarithmic: bool) -> Self {
+        let values = values.filter(|v| v.is_finite() && (!logarithmic || *v > 0.0));
+        let place = |v: f64| if logarithmic { v.ln() } else { v };
+        let (low, high) = values.map(place).fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), v| (a.min(v), b.max(v)));
+        let (low, high) = if low <= high { (low, high) } else { (0.0, 1.0) };
+        let room = (ROOM * (high - low)).max(if logarithmic { 0.1 } else { 1e-3 + 1e-3 * high.abs() });
+        let (low, high) = (low - room, high + room);
+        if logarithmic { Self::Logarithmic(low.exp()..high.exp()) } else { Self::Linear(low..high) }
+    }
+
+    /// Whether a value has a place on it.
+    pub fn shows(&self, value: f64) -> bool {
+        value.is_finite() && (!matches!(self, Self::Logarithmic(_)) || value > 0.0)
+    }
+
+    /// 0 at the low end, 1 at the high end.
+    pub fn share(&self, value: f64) -> f64 {
+        match self {
+            Self::Linear(r) => (value - r.start) / (r.end - r.start),
+            Self::Logarithmic(r) => (value / r.start).ln() / (r.end / r.start).ln(),
+            Self::Named(names) => (value + 0.5) / names.len().max(1) as f64,
+        }
+    }
+
+    /// Values that get a line and a number.
+    pub fn ticks(&self) -> Vec<f64> {
+        match self {
+            Self::Named(names) => (0..names.len()).map(|i| i as f64).collect(),
+            Self::Linear(r) => {
+                let rough = (r.end - r.start) / 6.0;
+                let power = 10f64.powf(rough.log10().floor());
+                let step = [1.0, 2.0, 5.0, 10.0].map(|m| m * power).into_iter().find(|s| *s >= rough);
+                let step = step.unwrap_or(rough);
+                let (first, last) = ((r.start / step).ceil() as i64, (r.end / step).floor() as i64);
+                (first..=last).map(|i| i as f64 * step).collect()
+            }
+            Self::Logarithmic(r) => {
+                let decades = (r.end / r.start).log10();
+                let digits: &[f64] = match decades {
+                    d if d < 0.5 => &[1.0, 1.2, 1.4, 1.6, 1.8, 2.0, 2.5, 3.0, 3.5, 4.0, 4.5, 5.0, 6.0, 7.0, 8.0, 9.0],
+                    d if d < 1.0 => &[1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0],
+                    d if d < 3.0 => &[1.0, 2.0, 5.0],
+                    _ => &[1.0],
+                };
+                let powers = (r.start.log10().floor() as i32)..=(r.end.log10().ceil() as i32);
+                let all = powers.flat_map(|p| digits.iter().map(move |d| d * 10f64.powi(p)));
+                all.filter(|v| r.contains(v)).collect()
+            }
+        }
+    }
+}
+
+impl Ranged for Scale {
+    type FormatOption = NoDefaultFormatting;
+    type ValueType = f64;
+
+    fn map(&self, value: &f64, limit: (i32, i32)) -> i32 {
+        limit.0 + (self.share(*value) * f64::from(limit.1 - limit.0)).round() as i32
+    }
+
+    fn key_points<Hint: KeyPointHint>(&self, _: Hint) -> Vec<f64> {
+        self.ticks()
+    }
+
+    fn range(&self) -> Range<f64> {
+        match self {
+            Self::Linear(r) | Self::Logarithmic(r) => r.clone(),
+            Self::Named(names) => -0.5..names.len() as f64 - 0.5,
+        }
+    }
+}
+
+impl ValueFormatter<f64> for Scale {
+    fn format_ext(&self, value: &f64) -> String {
+        if let Self::Named(names) = self {
+            return names.get(value.round().max(0.0) as usize).cloned().unwrap_or_default();
+        }
+        number(*value)
+    }
+}
+
+/// Four digits at most, no zeros at the end.
+pub fn number(value: f64) -> String {
+    if value == 0.0 || !value.is_finite() {
+        return value.abs().to_string();
+    }
+    let digits = (3 - value.abs().log10().floor() as i32).clamp(0, 12) as usize;
+    let text = format!("{value:.digits$}");
+    if text.contains('.') { text.trim_end_matches('0').trim_end_matches('.').to_owned() } else { text }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    #[test]
+    fn numbers_are_short() {
+        let written = [0.0, 0.1 + 0.2, 17.5, 1200.0, 1e-5, -2.25].map(number);
+        assert_eq!(written, ["0", "0.3", "17.5", "1200", "0.00001", "-2.25"]);
+    }
+
+    proptest! {
+        #[test]
+        fn an_axis_shows_every_value_and_has_a_few_ticks(
+            values in prop::collection::vec(0.001f64..1e6, 1..20), logarithmic: bool,
+        ) {
+            let scale = Scale::around(values.iter().copied(), logarithmic);
+            for value in values {
+                prop_assert!((0.0..=1.0).contains(&scale.share(value)));
+            }
+            let ticks = scale.ticks();
+            prop_assert!((1..=20).contains(&ticks.len()), "{:?}: {:?}", scale, ticks);
+            prop_assert!(ticks.iter().all(|t| (-1e-9..=1.0 + 1e-9).contains(&scale.share(*t))));
+        }
+    }
+
+    #[test]
+    fn nothing_and_one_value_have_an_axis_too() {
+        for logarithmic in [false, true] {
+            for values in [vec![], vec![5.0], vec![f64::NAN, -1.0, 5.0]] {
+                let scale = Scale::around(values.into_iter(), logarithmic);
+                assert!(scale.share(5.0).is_finite() && scale.ticks().len() < 40, "{scale:?}");
+            }
+        }
+    }
+}

@@ -1,0 +1,260 @@
+//! `report`: runs and benches on one page that needs no other file.
+
+mod curves;
+mod page;
+mod viewer;
+
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, Result, bail, ensure};
+use clap::Args;
+
+use self::curves::{Log, curves};
+use self::page::Page;
+use self::viewer::{Views, viewers};
+use crate::bench;
+use crate::run::{self, METRICS, Metrics, RunConfig};
+use crate::table;
+
+/// Charts and pictures larger than this are left out, and named.
+const MAX_BYTES: u64 = 16 << 20;
+const NOVEL: &str = "renders/novel_views.png";
+const CAPTIONS: [(&str, &str); 2] = [
+    ("novel_views.png", "Views that training never saw: truth left, result right; a row a camera"),
+    ("train_views.png", "Training views: what the video showed left, result right"),
+];
+
+#[derive(Args)]
+pub struct ReportArguments {
+    /// Directories of runs, of `train --compare`, or of benches
+    #[arg(required = true, value_name = "RUN")]
+    runs: Vec<PathBuf>,
+    /// The page [default: report.html in RUN, or beside the first of several]
+    #[arg(long)]
+    out: Option<PathBuf>,
+}
+
+/// Runs the command.
+pub fn report(arguments: &ReportArguments) -> Result<()> {
+    let mut directories = Vec::new();
+    for directory in &arguments.runs {
+        directories.extend(expand(directory)?);
+    }
+    let (benches, runs): (Vec<PathBuf>, Vec<PathBuf>) = directories.into_iter().partition(|d| is_bench(d));
+    let mut page = Page::new();
+    let runs: Vec<Run> = runs.iter().map(|d| Run::read(d)).collect::<Result<_>>()?;
+    if !runs.is_empty() {
+        add_runs(&mut page, &runs)?;
+    }
+    for directory in &benches {
+        add_bench(&mut page, directory)?;
+    }
+    let title = match (&runs[..], &benches[..]) {
+        ([one], []) => one.title(),
+        ([], [one]) => name(one),
+        _ => format!("{} runs and benches", runs.len() + benches.len()),
+    };
+    let out = match (&arguments.out, &arguments.runs[..]) {
+        (Some(out), _) => out.clone(),
+        (None, [one]) => one.join("report.html"),
+        (None, several) => several[0].parent().unwrap_or(Path::new("")).join("report.html"),
+    };
+    run::write(&out, &page.finish(&title))?;
+    println!("written: {}", out.display());
+    Ok(())
+}
+
+/// The page of a run that has just been scored.
+pub fn write(directory: &Path, metrics: &Metrics) -> Result<()> {
+    let run = Run { name: metrics.method.clone(), directory: directory.to_owned(), metrics: metrics.clone() };
+    let mut page = Page::new();
+    let title = run.title();
+    add_runs(&mut page, &[run])?;
+    run::write(&directory.join("report.html"), &page.finish(&title))
+}
+
+fn is_bench(directory: &Path) -> bool {
+    directory.join(bench::LOG).is_file() || directory.join(bench::RESULTS).is_file()
+}
+
+/// The directory itself if it is a run or a bench, else the runs in it.
+fn expand(directory: &Path) -> Result<Vec<PathBuf>> {
+    ensure!(directory.is_dir(), "{}: no such directory", directory.display());
+    let is_run = |d: &Path| d.join(METRICS).exists() || d.join("config.toml").exists();
+    if is_bench(directory) || is_run(directory) {
+        return Ok(vec![directory.to_owned()]);
+    }
+    let entries = std::fs::read_dir(directory).with_context(|| directory.display().to_string())?;
+    let mut inside: Vec<PathBuf> = entries.filter_map(|e| Some(e.ok()?.path())).filter(|p| is_run(p)).collect();
+    inside.sort();
+    if inside.is_empty() {
+        let (metrics, log) = (METRICS, bench::LOG);
+        bail!("{}: neither a run ({metrics}) nor a bench ({log}), nor are there runs in it", directory.display());
+    }
+    Ok(inside)
+}
+
+fn name(directory: &Path) -> String {
+    directory.file_name().map_or_else(|| directory.display().to_string(), |n| n.to_string_lossy().into_owned())
+}
+
+/// A scored run.
+struct Run {
+    name: String,
+    directory: PathBuf,
+    metrics: Metrics,
+}
+
+impl Run {
+    fn read(directory: &Path) -> Result<Self> {
+        RunConfig::read(directory)?;
+        let metrics = Metrics::read(directory)?;
+        Ok(Self { name: name(directory), directory: directory.to_owned(), metrics })
+    }
+
+    fn title(&self) -> String {
+        let m = &self.metrics;
+        format!("{} on {}, {} steps", m.method, m.scene, m.steps)
+    }
+}
+
+fn add_runs(page: &mut Page, runs: &[Run]) -> Result<()> {
+    page.heading("Scores");
+    let rows: Vec<(String, &Metrics)> = runs.iter().map(|r| (r.name.clone(), &r.metrics)).collect();
+    page.paragraph("Views that training never saw. Methods are ranked by psnr_mask and psnr_hidden, dB.");
+    page.table(&cells(&table::markdown(&rows)));
+    let memory = |r: &Run| format!("{:.0}", r.metrics.peak_rss_bytes as f64 / 1e6);
+    let more = ["", "scene", "preset", "seed", "peak memory, MB"].map(str::to_owned).to_vec();
+    let row = |r: &Run| {
+        let m = &r.metrics;
+        vec![r.name.clone(), m.scene.clone(), m.preset.clone(), m.seed.to_string(), memory(r)]
+    };
+    page.table(&std::iter::once(more).chain(runs.iter().map(row)).collect::<Vec<_>>());
+    let (mut views, mut logs) = (Vec::new(), Vec::new());
+    for run in runs {
+        views.extend(Views::read(&run.directory.join(NOVEL))?.map(|v| (run.name.clone(), v)));
+        logs.extend(Log::read(&run.directory.join("train.jsonl"))?.map(|l| (run.name.clone(), l)));
+    }
+    let viewer = viewers(&views)?;
+    if !viewer.is_empty() {
+        page.heading("Truth and result");
+        page.paragraph("Drag the line over the picture; choose the view and what stands on either side.");
+        page.raw(&viewer);
+    }
+    let drawn = [
+        curves(&logs, "psnr", "PSNR of the training patches, dB", false),
+        curves(&logs, "loss", "Weighted loss", true),
+        curves(&logs, "live_samples", "Live samples a step", false),
+    ];
+    if drawn.iter().any(|d| !d.is_empty()) {
+        page.heading("Training");
+        drawn.iter().for_each(|d| page.raw(d));
+    }
+    page.heading("Pictures");
+    for run in runs {
+        if runs.len() > 1 {
+            page.subheading(&run.name);
+        }
+        add_pictures(page, &run.directory.join("renders"))?;
+    }
+    page.heading("Configuration");
+    for run in runs {
+        let path = run.directory.join("config.toml");
+        let text = std::fs::read_to_string(&path).with_context(|| path.display().to_string())?;
+        page.folded(&format!("{}: config.toml", run.name), &text);
+    }
+    Ok(())
+}
+
+/// Every PNG of a directory, if it is there.
+fn add_pictures(page: &mut Page, directory: &Path) -> Result<()> {
+    for path in files(directory, "png")? {
+        let file = name(&path);
+        let caption = CAPTIONS.iter().find(|(n, _)| *n == file).map_or(file.as_str(), |(_, c)| c);
+        if let Some(bytes) = bytes(page, &path)? {
+            ensure!(bytes.starts_with(b"\x89PNG"), "{}: not a PNG", path.display());
+            page.picture("image/png", &bytes, caption);
+        }
+    }
+    Ok(())
+}
+
+fn add_bench(page: &mut Page, directory: &Path) -> Result<()> {
+    page.heading(&name(directory));
+    let mut lines = Vec::new();
+    let log = directory.join(bench::LOG);
+    if log.is_file() {
+        lines = bench::read(&log)?;
+    }
+    for path in files(directory, "md")? {
+        let text = std::fs::read_to_string(&path).with_context(|| path.display().to_string())?;
+        add_markdown(page, &text);
+    }
+    for path in files(directory, "svg")? {
+        if let Some(bytes) = bytes(page, &path)? {
+            ensure!(bytes.starts_with(b"<svg"), "{}: not an SVG", path.display());
+            page.picture("image/svg+xml", &bytes, &name(&path));
+        }
+    }
+    let commands: Vec<String> =
+        lines.iter().filter_map(|l| Some(format!("{:<24} {}", l.point.name, l.point.command.as_ref()?))).collect();
+    if !commands.is_empty() {
+        page.folded("What runs each point alone", &commands.join("\n"));
+    }
+    if let Some(line) = lines.first() {
+        page.folded("Configuration of the first point", &serde_json::to_string_pretty(&line.point.job)?);
+    }
+    Ok(())
+}
+
+/// Files of one kind, by name; none where there is no such directory.
+fn files(directory: &Path, extension: &str) -> Result<Vec<PathBuf>> {
+    if !directory.is_dir() {
+        return Ok(Vec::new());
+    }
+    let entries = std::fs::read_dir(directory).with_context(|| directory.display().to_string())?;
+    let mut paths: Vec<PathBuf> = entries.filter_map(|e| Some(e.ok()?.path())).collect();
+    paths.retain(|p| p.is_file() && p.extension().is_some_and(|e| e.eq_ignore_ascii_case(extension)));
+    paths.sort();
+    Ok(paths)
+}
+
+/// The file's bytes; where there are too many, the page says so.
+fn bytes(page: &mut Page, path: &Path) -> Result<Option<Vec<u8>>> {
+    let size = std::fs::metadata(path).with_context(|| path.display().to_string())?.len();
+    if size > MAX_BYTES {
+        page.paragraph(&format!("{} is left out: {} MB.", path.display(), size >> 20));
+        return Ok(None);
+    }
+    std::fs::read(path).map(Some).with_context(|| path.display().to_string())
+}
+
+/// Headings, tables and paragraphs, as benches write them.
+fn add_markdown(page: &mut Page, text: &str) {
+    let mut rows = String::new();
+    for line in text.lines().chain([""]) {
+        if line.starts_with('|') {
+            rows.push_str(line);
+            rows.push('\n');
+            continue;
+        }
+        if !rows.is_empty() {
+            page.table(&cells(&std::mem::take(&mut rows)));
+        }
+        if let Some(heading) = line.strip_prefix("## ") {
+            page.subheading(heading);
+        } else if !line.trim().is_empty() {
+            page.paragraph(line);
+        }
+    }
+}
+
+/// The cells of a Markdown table, without its rule.
+fn cells(table: &str) -> Vec<Vec<String>> {
+    let row = |line: &str| -> Vec<String> {
+        let inner = line.trim().trim_start_matches('|');
+        inner.strip_suffix('|').unwrap_or(inner).split('|').map(|c| c.trim().to_owned()).collect()
+    };
+    let rule = |cells: &Vec<String>| cells.iter().all(|c| !c.is_empty() && c.chars().all(|c| "-:".contains(c)));
+    table.lines().map(row).filter(|cells| !rule(cells)).collect()
+}

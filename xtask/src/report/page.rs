@@ -1,0 +1,121 @@
+//! The page around everything: style, script, and what keeps text from files text.
+
+use std::fmt::Write as _;
+
+use base64::Engine;
+use base64::engine::general_purpose::STANDARD;
+
+const STYLE: &str = include_str!("page.css");
+const SCRIPT: &str = include_str!("page.js");
+
+/// A page in the making.
+pub struct Page {
+    body: String,
+    headings: Vec<String>,
+}
+
+/// Text as text, wherever it comes from.
+pub fn escape(text: &str) -> String {
+    let mut out = String::with_capacity(text.len());
+    for c in text.chars() {
+        match c {
+            '&' => out.push_str("&amp;"),
+            '<' => out.push_str("&lt;"),
+            '>' => out.push_str("&gt;"),
+            '"' => out.push_str("&quot;"),
+            '\'' => out.push_str("&#39;"),
+            c => out.push(c),
+        }
+    }
+    out
+}
+
+/// Bytes as an address that needs no network.
+pub fn data_uri(kind: &str, bytes: &[u8]) -> String {
+    format!("data:{kind};base64,{}", STANDARD.encode(bytes))
+}
+
+impl Page {
+    pub fn new() -> Self {
+        Self { body: String::new(), headings: Vec::new() }
+    }
+
+    /// A section's heading, which the page's top links to.
+    pub fn heading(&mut self, text: &str) {
+        let _ = write!(self.body, "<h2 id=\"s{}\">{}</h2>\n", self.headings.len(), escape(text));
+        self.headings.push(text.to_owned());
+    }
+
+    pub fn subheading(&mut self, text: &str) {
+        let _ = write!(self.body, "<h3>{}</h3>\n", escape(text));
+    }
+
+    pub fn paragraph(&mut self, text: &str) {
+        let _ = write!(self.body, "<p>{}</p>\n", escape(text));
+    }
+
+    /// Cells of text; the first row is the head, columns that hold numbers only are aligned right.
+    pub fn table(&mut self, rows: &[Vec<String>]) {
+        let Some((head, rows)) = rows.split_first() else { return };
+        let numeric =
+            |cell: &str| cell.starts_with(|c: char| c.is_ascii_digit() || "-–+".contains(c)) || cell.is_empty();
+        let right = |column: usize| rows.iter().all(|row| row.get(column).is_none_or(|c| numeric(c)));
+        let class = |column: usize| if right(column) { " class=n" } else { "" };
+        self.body.push_str("<div class=wide><table><tr>");
+        for (i, cell) in head.iter().enumerate() {
+            let _ = write!(self.body, "<th{}>{}</th>", class(i), escape(cell));
+        }
+        for row in rows {
+            self.body.push_str("</tr>\n<tr>");
+            for (i, cell) in row.iter().enumerate() {
+                let _ = write!(self.body, "<td{}>{}</td>", class(i), strong(&escape(cell)));
+            }
+        }
+        self.body.push_str("</tr></table></div>\n");
+    }
+
+    /// Text that keeps its lines, folded away.
+    pub fn folded(&mut self, title: &str, text: &str) {
+        let (title, text) = (escape(title), escape(text));
+        let _ = write!(self.body, "<details><summary>{title}</summary><pre>{text}</pre></details>\n");
+    }
+
+    /// A picture with its caption; `kind` is its media type.
+    pub fn picture(&mut self, kind: &str, bytes: &[u8], caption: &str) {
+        let (caption, source) = (escape(caption), data_uri(kind, bytes));
+        let _ = write!(
+            self.body,
+            "<figure><div class=wide><img alt=\"{caption}\" src=\"{source}\"></div><figcaption>{caption}</figcaption></figure>\n"
+        );
+    }
+
+    /// Markup made here, not read from anywhere.
+    pub fn raw(&mut self, markup: &str) {
+        self.body.push_str(markup);
+    }
+
+    /// The whole file.
+    pub fn finish(&self, title: &str) -> String {
+        let title = escape(title);
+        let links: Vec<String> = (self.headings.iter().enumerate())
+            .map(|(i, text)| format!("<a href=\"#s{i}\">{}</a>", escape(text)))
+            .collect();
+        let links = if links.len() > 2 { format!("<nav>{}</nav>\n", links.join(" ")) } else { String::new() };
+        format!(
+            "<!doctype html>\n<html lang=en>\n<meta charset=\"utf-8\">\n\
+             <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\n\
+             <title>{title}</title>\n<style>{STYLE}</style>\n<h1>{title}</h1>\n{links}{}<script>{SCRIPT}</script>\n</html>\n",
+            self.body
+        )
+    }
+}
+
+/// **This** of escaped text as bold.
+fn strong(text: &str) -> String {
+    let parts: Vec<&str> = text.split("**").collect();
+    if parts.len() % 2 == 0 {
+        return text.to_owned();
+    }
+    let wrap = |(i, part): (usize, &&str)| if i % 2 == 1 { format!("<b>{part}</b>") } else { (*part).to_owned() };
+    parts.iter().enumerate().map(wrap).collect()
+}

@@ -1,0 +1,82 @@
+//! Two pictures of one view under a slider.
+
+use std::io::Cursor;
+use std::path::Path;
+
+use anyhow::{Context, Result};
+use base64::Engine;
+use base64::engine::general_purpose::STANDARD;
+use image::{ImageFormat, RgbImage};
+
+use crate::pictures;
+
+/// Views of a viewer at most.
+const MOST: usize = 15;
+
+/// Truth and results of some unseen views, as `eval` draws them side by side.
+pub struct Views {
+    /// Name of a view, truth, result.
+    pairs: Vec<(String, RgbImage, RgbImage)>,
+}
+
+impl Views {
+    /// Takes a sheet of pairs apart; none if there is no such file.
+    pub fn read(path: &Path) -> Result<Option<Self>> {
+        if !path.exists() {
+            return Ok(None);
+        }
+        let sheet = image::open(path).with_context(|| path.display().to_string())?.into_rgb8();
+        let mut pairs = Vec::new();
+        for (row, cells) in pictures::cells(&sheet).into_iter().enumerate() {
+            for (column, pair) in cells.chunks_exact(2).enumerate() {
+                pairs.push((format!("camera {}, moment {}", row + 1, column + 1), pair[0].clone(), pair[1].clone()));
+            }
+        }
+        let stride = pairs.len().div_ceil(MOST).max(1);
+        Ok(Some(Self { pairs: pairs.into_iter().step_by(stride).collect() }))
+    }
+
+    /// Whether both show the same views.
+    fn alike(&self, other: &Self) -> bool {
+        self.pairs.len() == other.pairs.len() && self.pairs.iter().zip(&other.pairs).all(|(a, b)| a.1 == b.1)
+    }
+}
+
+fn encode(picture: &RgbImage) -> Result<String> {
+    let mut bytes = Cursor::new(Vec::new());
+    picture.write_to(&mut bytes, ImageFormat::Png)?;
+    Ok(STANDARD.encode(bytes.into_inner()))
+}
+
+/// A viewer for each set of views: truth and every run that drew it can be put on either side.
+pub fn viewers(runs: &[(String, Views)]) -> Result<String> {
+    let mut text = String::new();
+    let mut groups: Vec<Vec<&(String, Views)>> = Vec::new();
+    for run in runs.iter().filter(|r| !r.1.pairs.is_empty()) {
+        match groups.iter_mut().find(|g| g[0].1.alike(&run.1)) {
+            Some(group) => group.push(run),
+            None => groups.push(vec![run]),
+        }
+    }
+    for group in groups {
+        let first = &group[0].1.pairs;
+        let side = |name: &str, pictures: Vec<&RgbImage>| -> Result<serde_json::Value> {
+            let images: Vec<String> = pictures.into_iter().map(encode).collect::<Result<_>>()?;
+            Ok(serde_json::json!({ "name": name, "images": images }))
+        };
+        let mut sides = vec![side("truth", first.iter().map(|p| &p.1).collect())?];
+        for (name, views) in &group {
+            sides.push(side(name, views.pairs.iter().map(|p| &p.2).collect())?);
+        }
+        let views: Vec<&str> = first.iter().map(|p| p.0.as_str()).collect();
+        // Within a script only `<` could end it.
+        let data = serde_json::json!({ "views": views, "sides": sides }).to_string().replace('<', "\\u003c");
+        text.push_str("<div class=viewer><div><select aria-label=\"view\"></select>");
+        text.push_str("<select aria-label=\"left\"></select><select aria-label=\"right\"></select></div>");
+        text.push_str("<div class=pair><img alt=\"left\"><img alt=\"right\"><b></b>");
+        text.push_str("<input type=range min=0 max=100 step=0.5 value=50 aria-label=\"left to right\"></div>");
+        text.push_str("<div class=ends><span></span><span></span></div>");
+        text.push_str(&format!("<script type=\"application/json\">{data}</script></div>\n"));
+    }
+    Ok(text)
+}
