@@ -5,7 +5,7 @@ const ARRAY: &[u8] = b"cnumpy.core.multiarray\n_reconstruct\ncnumpy\nndarray\nK\
 
 /// What a pickle is made of.
 #[derive(Clone, Debug)]
-pub(in crate::data) enum Py {
+pub enum Py {
     Dict(Vec<(String, Py)>),
     /// Shape and values, `float64`, row-major.
     Array(Vec<u32>, Vec<f64>),
