@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context, Result, bail};
+use anyhow::{Context, Result, anyhow, bail};
 use occnerf::data::LoadOptions;
 use occnerf::{Config, SplitMetrics};
 use serde::{Deserialize, Serialize};
@@ -32,7 +32,8 @@ impl RunConfig {
     pub fn read(run: &Path) -> Result<Self> {
         let path = run.join("config.toml");
         let text = std::fs::read_to_string(&path).with_context(|| format!("{} is not a run", path.display()))?;
-        let config: Self = toml::from_str(&text).with_context(|| path.display().to_string())?;
+        let config = toml::from_str(&text).map_err(|error| anyhow!("{}: {}", path.display(), error.message()));
+        let config: Self = config?;
         config.train.validate().with_context(|| path.display().to_string())?;
         Ok(config)
     }

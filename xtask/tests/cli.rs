@@ -24,7 +24,7 @@ fn text(path: &Path) -> &str {
 fn help_names_the_commands_and_every_option_of_train() {
     let help = |arguments: &[&str]| String::from_utf8(xtask(arguments).stdout).unwrap();
     let general = help(&["--help"]);
-    for command in ["train", "eval", "render", "convert"] {
+    for command in ["train", "eval", "render", "bench", "report", "convert"] {
         assert!(general.contains(command), "{general}");
     }
     let train = help(&["train", "--help"]);

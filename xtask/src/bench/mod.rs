@@ -30,8 +30,8 @@ pub use self::scale::{Scale, number};
 
 /// Steps of a point of `pareto` at which presets run their own number of steps.
 const FULL_STEPS: u64 = 300;
-/// Unseen views that a point of `pareto` is scored on.
-const VIEWS: usize = 50;
+/// Unseen views that a point of `pareto` is scored on, and in the quick form.
+const VIEWS: (usize, usize) = (50, 20);
 
 #[derive(Args)]
 pub struct BenchArguments {
@@ -164,7 +164,7 @@ fn pareto(arguments: &ParetoArguments) -> Result<()> {
         let sweep = points::Sweep {
             scene_arguments: scene_arguments(scene, arguments),
             place: Place::Scene { scene: scene.clone(), body, load },
-            views: VIEWS,
+            views: if arguments.quick { VIEWS.1 } else { VIEWS.0 },
             steps,
             full_steps: FULL_STEPS,
             seed: arguments.seed,

@@ -124,10 +124,10 @@ fn add_runs(page: &mut Page, runs: &[Run]) -> Result<()> {
     page.paragraph("Views that training never saw. Methods are ranked by psnr_mask and psnr_hidden, dB.");
     page.table(&cells(&table::markdown(&rows)));
     let memory = |r: &Run| format!("{:.0}", r.metrics.peak_rss_bytes as f64 / 1e6);
-    let more = ["", "scene", "preset", "seed", "peak memory, MB"].map(str::to_owned).to_vec();
+    let more = ["", "method", "scene", "preset", "seed", "peak memory, MB"].map(str::to_owned).to_vec();
     let row = |r: &Run| {
         let m = &r.metrics;
-        vec![r.name.clone(), m.scene.clone(), m.preset.clone(), m.seed.to_string(), memory(r)]
+        vec![r.name.clone(), m.method.clone(), m.scene.clone(), m.preset.clone(), m.seed.to_string(), memory(r)]
     };
     page.table(&std::iter::once(more).chain(runs.iter().map(row)).collect::<Vec<_>>());
     let (mut views, mut logs) = (Vec::new(), Vec::new());

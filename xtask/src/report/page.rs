@@ -42,16 +42,16 @@ impl Page {
 
     /// A section's heading, which the page's top links to.
     pub fn heading(&mut self, text: &str) {
-        let _ = write!(self.body, "<h2 id=\"s{}\">{}</h2>\n", self.headings.len(), escape(text));
+        let _ = writeln!(self.body, "<h2 id=\"s{}\">{}</h2>", self.headings.len(), escape(text));
         self.headings.push(text.to_owned());
     }
 
     pub fn subheading(&mut self, text: &str) {
-        let _ = write!(self.body, "<h3>{}</h3>\n", escape(text));
+        let _ = writeln!(self.body, "<h3>{}</h3>", escape(text));
     }
 
     pub fn paragraph(&mut self, text: &str) {
-        let _ = write!(self.body, "<p>{}</p>\n", escape(text));
+        let _ = writeln!(self.body, "<p>{}</p>", escape(text));
     }
 
     /// Cells of text; the first row is the head, columns that hold numbers only are aligned right.
@@ -77,15 +77,15 @@ impl Page {
     /// Text that keeps its lines, folded away.
     pub fn folded(&mut self, title: &str, text: &str) {
         let (title, text) = (escape(title), escape(text));
-        let _ = write!(self.body, "<details><summary>{title}</summary><pre>{text}</pre></details>\n");
+        let _ = writeln!(self.body, "<details><summary>{title}</summary><pre>{text}</pre></details>");
     }
 
     /// A picture with its caption; `kind` is its media type.
     pub fn picture(&mut self, kind: &str, bytes: &[u8], caption: &str) {
         let (caption, source) = (escape(caption), data_uri(kind, bytes));
-        let _ = write!(
+        let _ = writeln!(
             self.body,
-            "<figure><div class=wide><img alt=\"{caption}\" src=\"{source}\"></div><figcaption>{caption}</figcaption></figure>\n"
+            "<figure><div class=wide><img alt=\"{caption}\" src=\"{source}\"></div><figcaption>{caption}</figcaption></figure>"
         );
     }
 
@@ -113,7 +113,7 @@ impl Page {
 /// **This** of escaped text as bold.
 fn strong(text: &str) -> String {
     let parts: Vec<&str> = text.split("**").collect();
-    if parts.len() % 2 == 0 {
+    if parts.len().is_multiple_of(2) {
         return text.to_owned();
     }
     let wrap = |(i, part): (usize, &&str)| if i % 2 == 1 { format!("<b>{part}</b>") } else { (*part).to_owned() };
