@@ -45,6 +45,8 @@ fn help_names_the_commands_and_every_option_of_train() {
         "--eval-stride",
         "--camera",
         "--occlusion",
+        "--lpips",
+        "--perceptual-weights",
     ];
     for option in options {
         assert!(train.contains(option), "{train}");

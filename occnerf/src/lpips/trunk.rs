@@ -137,13 +137,13 @@ impl Network {
         self.layers.iter().fold(Some([height, width]), step).is_some()
     }
 
-    /// Runs the layers up to the last tap. `keep` gets the number and the output of each, and gives it back where it is
-    /// all that is left of it.
-    pub fn forward(&self, input: &Maps, mut keep: impl FnMut(usize, &Maps), all: bool) -> Vec<Maps> {
+    /// Runs the layers up to the last tap; `seen` gets the number and the output of each. Returns the outputs, of the last
+    /// layer alone unless `all` are to be kept.
+    pub fn forward(&self, input: &Maps, mut seen: impl FnMut(usize, &Maps), all: bool) -> Vec<Maps> {
         let mut outputs: Vec<Maps> = Vec::new();
         for (number, layer) in self.layers.iter().enumerate() {
             let out = layer.forward(outputs.last().unwrap_or(input));
-            keep(number, &out);
+            seen(number, &out);
             if !all {
                 outputs.clear();
             }

@@ -5,7 +5,7 @@ use std::fs::File;
 use std::io::{Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
-use safetensors::tensor::{Dtype, SafeTensors};
+use safetensors::tensor::{Dtype, Metadata};
 
 use super::{Lpips, Trunk, torch};
 use crate::Error;
@@ -220,17 +220,23 @@ fn safetensors(path: &Path, file: &mut File) -> Result<BTreeMap<String, Tensor>,
     if header > MAX_HEADER || header > length.saturating_sub(8) {
         return Err(fault(path, format!("{not_ours}, or is cut: a header of {header} bytes in a file of {length}")));
     }
-    let mut bytes = start.to_vec();
+    let mut bytes = Vec::new();
     file.take(header).read_to_end(&mut bytes).map_err(io(path))?;
-    let (_, metadata) = SafeTensors::read_metadata(&bytes).map_err(|e| fault(path, format!("{not_ours}: {e}")))?;
-    let end = metadata.tensors().values().map(|t| t.data_offsets.1 as u64).max().unwrap_or(0);
-    if end > length - 8 - header {
-        let found = length - 8 - header;
-        return Err(fault(path, format!("is cut: its tensors take {end} bytes, found {found}")));
+    let metadata: Metadata = serde_json::from_slice(&bytes).map_err(|e| fault(path, format!("{not_ours}: {e}")))?;
+    let found = length - 8 - header;
+    let mut tensors = BTreeMap::new();
+    for (name, info) in metadata.tensors() {
+        let (start, end) = (info.data_offsets.0 as u64, info.data_offsets.1 as u64);
+        let bits = info.shape.iter().try_fold(info.dtype.bitsize(), |n, &extent| n.checked_mul(extent));
+        if end > found || end.checked_sub(start).and_then(|n| n.checked_mul(8)) != bits.map(|n| n as u64) {
+            let (dtype, shape) = (info.dtype, &info.shape);
+            let what = format!(
+                "`{name}`, {dtype:?} {shape:?}, at bytes {start} to {end} of {found}: the file is cut or damaged"
+            );
+            return Err(fault(path, what));
+        }
+        tensors
+            .insert(name, Tensor { dtype: info.dtype, shape: info.shape.clone(), at: 8 + header + start, entry: None });
     }
-    let tensors = metadata.tensors().into_iter().map(|(name, info)| {
-        let at = 8 + header + info.data_offsets.0 as u64;
-        (name, Tensor { dtype: info.dtype, shape: info.shape.clone(), at, entry: None })
-    });
-    Ok(tensors.collect())
+    Ok(tensors)
 }

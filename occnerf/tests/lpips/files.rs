@@ -122,6 +122,12 @@ fn legacy(tensors: &Tensors) -> Vec<u8> {
     out
 }
 
+/// Writes a SqueezeNet of formula weights.
+pub fn squeezenet_file(path: &Path) {
+    let (trunk, lin) = weights();
+    std::fs::write(path, safetensors(&trunk.into_iter().chain(lin).collect())).unwrap();
+}
+
 fn value(lpips: &Lpips) -> f64 {
     lpips.distance(&noise(3 * 32 * 32, 8), &noise(3 * 32 * 32, 9), 32, 32).unwrap()[0]
 }

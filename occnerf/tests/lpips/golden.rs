@@ -104,8 +104,8 @@ fn gradients_of_every_trunk_agree_with_central_differences() {
         let analytic: Vec<f32> =
             waves.iter().map(|wave| wave.iter().zip(&d_a).map(|(w, d)| f64::from(w * d)).sum::<f64>() as f32).collect();
         let size = analytic.iter().fold(0.0f32, |m, d| m.max(d.abs()));
-        let tolerance = Tolerance { abs: 0.02 * f64::from(size), rel: 0.02 };
-        assert_gradient(trunk.name(), &[0.0; 4], &analytic, 1e-3, tolerance, |x| {
+        let tolerance = Tolerance { abs: 0.03 * f64::from(size), rel: 0.02 };
+        assert_gradient(trunk.name(), &[0.0; 4], &analytic, 1e-4, tolerance, |x| {
             lpips.distance(&along(x), &b, w, h).unwrap()[0]
         });
     }

@@ -5,6 +5,7 @@
 mod files;
 mod formula;
 mod golden;
+mod training;
 
 use std::path::{Path, PathBuf};
 

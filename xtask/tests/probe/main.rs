@@ -340,6 +340,30 @@ fn metrics_are_those_of_the_whole_and_of_the_mask() {
 }
 
 #[test]
+fn metrics_with_weights_give_the_golden_lpips() {
+    let shared = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared/data/lpips");
+    if !cfg!(feature = "lpips") || !shared.exists() {
+        eprintln!("skipped: {} is absent", shared.display());
+        return;
+    }
+    let folder = folder("lpips");
+    let mut golden = Npz::open(&shared.join("golden.npz")).unwrap();
+    let mut picture = |key: &str| {
+        let (_, values) = golden.f32(key, &[Some(1), Some(3), Some(75), Some(50)]).unwrap();
+        let last: Vec<f32> = (0..values.len()).map(|i| 0.5 * values[i % 3 * 75 * 50 + i / 3] + 0.5).collect();
+        floats(&[75, 50, 3], &last)
+    };
+    let arrays = vec![("a", picture("a_hw")), ("b", picture("b_hw")), ("mask", flags(&[75, 50], &[true; 75 * 50]))];
+    let mut out = probe(&folder, "metrics", &arrays, &["--lpips", shared.to_str().unwrap()]);
+    let expected = golden.array("lpips_squeeze_hw").unwrap().to_f64();
+    close(&out.f32("lpips", &[]).unwrap().1, &expected, 2e-4);
+    npz::write(&folder.join("in.npz"), &metrics()).unwrap();
+    let options = ["--lpips", shared.to_str().unwrap()];
+    let small = run("metrics", &folder.join("in.npz"), &folder.join("small.npz"), &options);
+    common::refused(&small, "a small picture", &["9 × 8", "at least 17"]);
+}
+
+#[test]
 fn empty_lists_of_queries_have_empty_answers() {
     let folder = folder("empty");
     let mut out = probe(&folder, "knn", &with(knn(), "queries", floats(&[0, 3], &[])), &[]);
