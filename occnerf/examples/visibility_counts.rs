@@ -70,7 +70,11 @@ fn turnaround(scene: &Scene, counts: &[u64]) -> Result<Image, Box<dyn Error>> {
     for side in 0..4u8 {
         let angle = f32::from(side) * std::f32::consts::FRAC_PI_2;
         let eye = middle + 2.6 * Vec3::new(angle.sin(), 0.1, angle.cos());
-        let camera = Camera::new(intrinsics, Affine3A::look_at_lh(eye, middle, -Vec3::Y), SIZE, SIZE)?;
+        let forward = (middle - eye).normalize_or(Vec3::Z);
+        let right = forward.cross(Vec3::Y).normalize_or(Vec3::X);
+        let rotation = Mat3::from_cols(right, forward.cross(right), forward).transpose();
+        let extrinsics = Affine3A::from_mat3_translation(rotation, rotation * -eye);
+        let camera = Camera::new(intrinsics, extrinsics, SIZE, SIZE)?;
         let picture = renderer.render(&view_of(scene, &camera, body.clone()), Vec3::ONE)?.image.pixels;
         for (y, row) in picture.chunks_exact(3 * SIZE as usize).enumerate() {
             pixels[3 * SIZE as usize * (4 * y + usize::from(side))..][..row.len()].copy_from_slice(row);
