@@ -291,3 +291,17 @@ fn cut_characters_are_refused() {
         assert!(Character::from_bytes("cut", &bytes[..part]).is_err(), "{part} bytes");
     }
 }
+
+#[test]
+fn joints_hang_on_the_nearest_joint_above() {
+    let Some(character) = shared_character("makehuman_walk.glb") else { return };
+    let (names, parents) = (&character.joint_names, character.joint_parents());
+    let above = |name: &str| {
+        let joint = names.iter().position(|n| n == name).unwrap();
+        parents[joint].map(|p| names[p].as_str())
+    };
+    assert_eq!(above("Hips"), None);
+    assert_eq!(above("LeftForeArm"), Some("LeftArm"));
+    assert_eq!(above("RightUpLeg"), Some("RHipJoint"));
+    assert_eq!(parents.iter().filter(|p| p.is_none()).count(), 1);
+}

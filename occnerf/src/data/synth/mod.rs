@@ -95,7 +95,6 @@ impl SynthConfig {
     }
 
     fn check(&self) -> Result<(), DataError> {
-        self.demo().check()?;
         let (fraction, position) = match self.occlusion {
             Occlusion::Rectangle(obstacle) => {
                 obstacle.check()?;
@@ -113,6 +112,7 @@ impl SynthConfig {
                 return Err(DataError::setting(name, format!("{low} to {high}"), value));
             }
         }
+        self.demo().check()?;
         // What the loaders would refuse is not made.
         let views = self.frames + self.frames.div_ceil(self.eval_every) * self.eval_cameras;
         let bytes = views as u64 * u64::from(self.size).pow(2) * 16;
