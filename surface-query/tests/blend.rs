@@ -17,7 +17,13 @@ fn finest(query: &SurfaceQuery, q: Vec3) -> [u32; 5] {
     [0, 1, 2, 3, 4].map(|i| all[i])
 }
 
-/// DESIGN's equations in `f64`: v̂, n̂, d.
+/// No vertex and no tangent plane within reach of a difference's step.
+fn off_the_kinks(query: &SurfaceQuery, q: Vec3, list: &[u32]) -> bool {
+    let height = |i: u32| (q - query.vertices()[i as usize]).dot(query.normals()[i as usize]);
+    list.iter().all(|&i| height(i).abs() > 0.03)
+}
+
+/// The blend's equations in `f64`: v̂, n̂, d.
 fn plain(query: &SurfaceQuery, q: Vec3, list: &[u32]) -> (DVec3, DVec3, f64) {
     let q = q.as_dvec3();
     let at = |i: &u32| {
@@ -68,12 +74,7 @@ proptest! {
         let query = build(&mesh);
         let q = direction * r;
         let list = finest(&query, q);
-        // Off the kinks: no vertex and no tangent plane within reach of the step.
-        let clear = list.iter().all(|&i| {
-            let offset = q - query.vertices()[i as usize];
-            offset.dot(query.normals()[i as usize]).abs() > 0.03
-        });
-        prop_assume!(clear);
+        prop_assume!(off_the_kinks(&query, q, &list));
         let d_query = query.blend_backward(q, &list, d_point, d_signed_distance);
         let step = 2e-3;
         // Third derivatives are of the order of 1/r³ with r ≥ 0.03, reached by few samples.
@@ -94,11 +95,7 @@ proptest! {
         let query = build(&mesh);
         let q = direction * r;
         let list = finest(&query, q);
-        let clear = list.iter().all(|&i| {
-            let offset = q - query.vertices()[i as usize];
-            offset.dot(query.normals()[i as usize]).abs() > 0.03
-        });
-        prop_assume!(clear);
+        prop_assume!(off_the_kinks(&query, q, &list));
         let (distance, gradient) = query.mean_distance(q, &list);
         let sides = list.iter().map(|&i| {
             let v = i as usize;

@@ -4,26 +4,10 @@
 mod common;
 
 use std::path::{Path, PathBuf};
-use std::process::{Command, Output};
 
-use common::folder;
+use common::{done, folder, refused};
 use image::{Rgb, RgbImage};
 use occnerf::{Config, Method, Preset};
-
-fn xtask(arguments: &[&str]) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_xtask")).args(arguments).env_remove("SMPL_MODEL").output().unwrap()
-}
-
-fn done(arguments: &[&str]) -> String {
-    let output = xtask(arguments);
-    let errors = String::from_utf8_lossy(&output.stderr);
-    assert!(output.status.success(), "{arguments:?}: {errors}");
-    String::from_utf8(output.stdout).unwrap()
-}
-
-fn refused(arguments: &[&str], words: &[&str]) {
-    common::refused(&xtask(arguments), &format!("{arguments:?}"), words);
-}
 
 /// Nothing on the page comes from elsewhere, and nothing in it is markup that a file brought along.
 fn self_contained(page: &str) {

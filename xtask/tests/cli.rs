@@ -3,22 +3,7 @@
 
 mod common;
 
-use std::path::Path;
-use std::process::{Command, Output};
-
-use common::folder;
-
-fn xtask(arguments: &[&str]) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_xtask")).args(arguments).env_remove("SMPL_MODEL").output().unwrap()
-}
-
-fn refused(arguments: &[&str], words: &[&str]) {
-    common::refused(&xtask(arguments), &format!("{arguments:?}"), words);
-}
-
-fn text(path: &Path) -> &str {
-    path.to_str().unwrap()
-}
+use common::{folder, refused, text, xtask};
 
 #[test]
 fn help_names_the_commands_and_every_option_of_train() {

@@ -6,7 +6,7 @@ use super::MotionSample;
 use crate::model::BodyModel;
 use crate::pose::{Posed, blend};
 
-/// Motion field whose weights are those of the nearest point of the posed surface (DESIGN §3, surface kind).
+/// Motion field whose weights are those of the nearest point of the posed surface.
 ///
 /// The likelihood is 1 inside the body and outside up to `margin` from it, then falls with a continuous derivative to 0
 /// at `margin + falloff`.
@@ -68,7 +68,7 @@ impl SurfaceMotion {
         canonical.is_finite().then_some(MotionSample { canonical, likelihood })
     }
 
-    /// f of DESIGN §3 at a signed distance (outside positive); NaN for NaN.
+    /// The foreground likelihood f at a signed distance (outside positive); NaN for NaN.
     #[must_use]
     pub fn likelihood(&self, signed_distance: f32) -> f32 {
         let beyond = signed_distance - self.margin;

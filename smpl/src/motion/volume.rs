@@ -31,7 +31,7 @@ impl Default for WeightVolumeConfig {
     }
 }
 
-/// Motion field of learnable weights on a grid in canonical space (DESIGN §3, volume kind).
+/// Motion field of learnable weights on a grid in canonical space.
 ///
 /// K + 1 channels, one a joint and the background last, on `resolution`³ samples that span `min` to `max` with samples on
 /// the faces of the box. Layout of every array: (K+1, n, n, n) for channel, z, y, x.

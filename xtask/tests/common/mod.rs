@@ -1,10 +1,34 @@
-//! What the tests of the command line share.
+//! What the tests of the command line share; each uses a part of it.
+#![allow(dead_code, reason = "each test uses a part")]
 
 use std::path::{Path, PathBuf};
-use std::process::Output;
+use std::process::{Command, Output};
+
+/// Runs the program.
+pub fn xtask(arguments: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_xtask")).args(arguments).env_remove("SMPL_MODEL").output().unwrap()
+}
+
+/// Runs the program, which must succeed; returns what it prints.
+pub fn done(arguments: &[&str]) -> String {
+    let output = xtask(arguments);
+    let errors = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{arguments:?}: {errors}");
+    String::from_utf8(output.stdout).unwrap()
+}
+
+/// Runs the program, which must refuse its arguments as [`refusal`] says.
+pub fn refused(arguments: &[&str], words: &[&str]) {
+    refusal(&xtask(arguments), &format!("{arguments:?}"), words);
+}
+
+/// A path as an argument.
+pub fn text(path: &Path) -> &str {
+    path.to_str().unwrap()
+}
 
 /// Fails unless the program ended with one line on standard error that names every one of `words`, and without a panic.
-pub fn refused(output: &Output, what: &str, words: &[&str]) {
+pub fn refusal(output: &Output, what: &str, words: &[&str]) {
     let text = String::from_utf8_lossy(&output.stderr).into_owned();
     assert!(!output.status.success(), "{what} succeeded");
     assert_eq!(text.trim_end().lines().count(), 1, "{what}: {text}");

@@ -360,7 +360,7 @@ fn metrics_with_weights_give_the_golden_lpips() {
     npz::write(&folder.join("in.npz"), &metrics()).unwrap();
     let options = ["--lpips", shared.to_str().unwrap()];
     let small = run("metrics", &folder.join("in.npz"), &folder.join("small.npz"), &options);
-    common::refused(&small, "a small picture", &["9 × 8", "at least 17"]);
+    common::refusal(&small, "a small picture", &["9 × 8", "at least 17"]);
 }
 
 #[test]

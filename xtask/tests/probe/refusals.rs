@@ -1,6 +1,6 @@
 //! One clear line for whatever is wrong.
 
-use super::common::refused;
+use super::common::refusal;
 use super::*;
 
 #[test]
@@ -85,7 +85,7 @@ fn whatever_is_wrong_with_the_arrays_is_named_in_one_line() {
     let (input, out) = (folder.join("in.npz"), folder.join("out.npz"));
     for (op, arrays, options, words) in cases {
         npz::write(&input, &arrays).unwrap();
-        refused(&run(op, &input, &out, options), &format!("{op} without {words:?}"), words);
+        refusal(&run(op, &input, &out, options), &format!("{op} without {words:?}"), words);
         assert!(!out.exists(), "{op} left something behind");
     }
     let small = vec![
@@ -94,7 +94,7 @@ fn whatever_is_wrong_with_the_arrays_is_named_in_one_line() {
         ("mask", flags(&[6, 9], &[true; 54])),
     ];
     npz::write(&input, &small).unwrap();
-    refused(&run("metrics", &input, &out, &[]), "a small image", &["9×6", "7×7"]);
+    refusal(&run("metrics", &input, &out, &[]), "a small image", &["9×6", "7×7"]);
 }
 
 #[test]
@@ -103,26 +103,26 @@ fn files_and_options_that_do_not_fit_are_named_in_one_line() {
     let body = octahedron(&folder);
     let (input, out) = (folder.join("in.npz"), folder.join("out.npz"));
     let missing = folder.join("none.npz");
-    refused(&run("fps", &missing, &out, &[]), "no file", &["none.npz"]);
-    refused(&run("fps", &folder, &out, &[]), "a folder", &[folder.to_str().unwrap()]);
+    refusal(&run("fps", &missing, &out, &[]), "no file", &["none.npz"]);
+    refusal(&run("fps", &folder, &out, &[]), "a folder", &[folder.to_str().unwrap()]);
     std::fs::write(&input, b"PK\x03\x04 and no more").unwrap();
-    refused(&run("fps", &input, &out, &[]), "no archive", &["in.npz"]);
+    refusal(&run("fps", &input, &out, &[]), "no archive", &["in.npz"]);
     npz::write(&input, &fps()).unwrap();
     let bytes = std::fs::read(&input).unwrap();
     for length in [0, 30, bytes.len() / 2, bytes.len() - 1] {
         std::fs::write(&input, &bytes[..length]).unwrap();
-        refused(&run("fps", &input, &out, &[]), "a truncated archive", &["in.npz"]);
+        refusal(&run("fps", &input, &out, &[]), "a truncated archive", &["in.npz"]);
     }
     std::fs::write(&input, &bytes).unwrap();
-    refused(&run("fps", &input, &folder.join("no/such/out.npz"), &[]), "nowhere to write", &["no/such/out.npz"]);
-    refused(&run("fps", &input, &out, &["--mesh", body.to_str().unwrap()]), "a mesh too many", &["fps", "--mesh"]);
-    refused(&run("skin", &input, &out, &[]), "no model", &["skin", "--model"]);
-    refused(
+    refusal(&run("fps", &input, &folder.join("no/such/out.npz"), &[]), "nowhere to write", &["no/such/out.npz"]);
+    refusal(&run("fps", &input, &out, &["--mesh", body.to_str().unwrap()]), "a mesh too many", &["fps", "--mesh"]);
+    refusal(&run("skin", &input, &out, &[]), "no model", &["skin", "--model"]);
+    refusal(
         &run("surface", &input, &out, &["--mesh", missing.to_str().unwrap()]),
         "other arrays",
         &["points", "queries"],
     );
     npz::write(&input, &[("queries", floats(&[0, 3], &[]))]).unwrap();
-    refused(&run("surface", &input, &out, &["--mesh", missing.to_str().unwrap()]), "no mesh", &["none.npz"]);
-    refused(&run("surface", &input, &out, &["--mesh", input.to_str().unwrap()]), "no model", &["v_template"]);
+    refusal(&run("surface", &input, &out, &["--mesh", missing.to_str().unwrap()]), "no mesh", &["none.npz"]);
+    refusal(&run("surface", &input, &out, &["--mesh", input.to_str().unwrap()]), "no model", &["v_template"]);
 }

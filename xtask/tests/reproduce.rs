@@ -1,0 +1,50 @@
+//! `reproduce` on a tiny capture: the whole way from frames to tables, twice.
+#![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
+
+mod common;
+
+use common::{done, folder, refused, text};
+
+const LEFT_OUT: &str = "humannerf-bg-4x,humannerf-bg-time,humannerf-4x,humannerf-time,hash-point-bg,occnerf-bg,no-surface,\
+                        no-attention,no-completeness,no-perceptual";
+
+#[test]
+fn tables_have_every_row_once_and_a_second_call_trains_nothing() {
+    let folder = folder("reproduce");
+    let (capture, out) = (folder.join("capture"), folder.join("out"));
+    done(&["synth", "--out", text(&capture), "--size", "32", "--frames", "4", "--eval-cameras", "1"]);
+    let arguments = ["reproduce", text(&capture), "--out", text(&out), "--steps", "2", "--seeds", "2"];
+    let arguments = [&arguments[..], &["--without", LEFT_OUT]].concat();
+    let first = done(&arguments);
+    assert_eq!(first.matches(": training\n").count(), 1 + 2 * 5, "{first}");
+    let table = std::fs::read_to_string(out.join("capture/reproduce.md")).unwrap();
+    for row in ["prior", "humannerf-bg", "humannerf", "hash-point", "occnerf-published", "occnerf"] {
+        assert_eq!(table.matches(&format!("| {row} ")).count(), 2, "{row}, novel and training views: {table}");
+    }
+    assert!(table.contains(" ± "), "{table}");
+    let json: serde_json::Value =
+        serde_json::from_str(&std::fs::read_to_string(out.join("capture/reproduce.json")).unwrap()).unwrap();
+    assert_eq!(json["rows"].as_array().unwrap().len(), 6);
+    assert!(out.join("capture/reproduce.png").is_file());
+    let second = done(&arguments);
+    assert_eq!(second.matches(": finished earlier\n").count(), 11, "{second}");
+    assert_eq!(std::fs::read_to_string(out.join("capture/reproduce.md")).unwrap(), table);
+}
+
+#[test]
+fn robustness_is_a_line_for_each_error_of_the_prior() {
+    let folder = folder("robustness");
+    let (capture, out) = (folder.join("capture"), folder.join("out"));
+    done(&["synth", "--out", text(&capture), "--size", "48", "--frames", "3", "--eval-cameras", "1"]);
+    let arguments = ["reproduce", text(&capture), "--robustness", "--out", text(&out), "--steps", "1", "--seeds", "1"];
+    done(&[&arguments[..], &["--without", "humannerf-bg,humannerf,hash-point"]].concat());
+    let table = std::fs::read_to_string(out.join("capture/robustness/robustness.md")).unwrap();
+    assert_eq!(table.lines().filter(|line| line.starts_with('|')).count(), 2 + 9, "{table}");
+}
+
+#[test]
+fn unknown_rows_and_impossible_budgets_are_refused() {
+    refused(&["reproduce", "--without", "occnerv"], &["occnerv", "hash-point"]);
+    refused(&["reproduce", "--budget", "0"], &["--budget"]);
+    refused(&["reproduce", "/nowhere"], &["/nowhere"]);
+}
