@@ -24,6 +24,7 @@ fn table() -> String {
             let e = &c.encoding;
             format!("{} × {}, 2^{}, {} to {}", e.levels, e.features, e.log2_table_size, e.n_min, e.n_max)
         }),
+        row("d is told apart in, m", |c| format!("{} to {}", c.encoding.distance_min, c.encoding.distance_max)),
         row("neighbours × levels", |c| format!("{} × {}", c.surface.k, c.surface.coarse_levels + 1)),
         row("[v̂, d]", |c| {
             let name = match c.surface.distance {

@@ -101,6 +101,10 @@ impl LoadArguments {
         add("camera", self.camera.clone());
         let name = self.occlusion.and_then(|o| o.to_possible_value());
         add("occlusion", name.map(|n| n.get_name().to_owned()));
+        let not_zero = |x: f32| (x != 0.0).then(|| x.to_string());
+        add("wrong-pose", not_zero(self.wrong_pose));
+        add("wrong-shape", not_zero(self.wrong_shape));
+        add("wrong-mask", (self.wrong_mask != 0).then(|| self.wrong_mask.to_string()));
         text
     }
 
@@ -151,4 +155,29 @@ pub fn load(scene: Option<&str>, body: Option<&Path>, options: &LoadOptions) -> 
     let model = BodyModel::load(&body)?;
     let capture = load_capture(directory, &model, options)?;
     Ok(Source { scene: name, body: Some(body), load: options.clone(), capture, model })
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::Parser;
+
+    use super::*;
+
+    #[derive(Parser)]
+    struct Line {
+        #[command(flatten)]
+        load: LoadArguments,
+    }
+
+    #[test]
+    fn a_command_line_made_of_options_says_all_of_them() {
+        let words = "x --resize 64 --stride 2 --max-frames 9 --eval-stride 3 --camera B2 --occlusion moving --wrong-pose 2.5 \
+                     --wrong-shape 1 --wrong-mask -3";
+        for words in [words, "x"] {
+            let load = Line::parse_from(words.split_whitespace()).load;
+            let again = format!("x{}", load.command_line());
+            assert_eq!(again.split_whitespace().count(), words.split_whitespace().count(), "{again}");
+            assert_eq!(Line::parse_from(again.split_whitespace()).load.options(), load.options());
+        }
+    }
 }

@@ -2,7 +2,7 @@
 
 use anyhow::{Result, ensure};
 use glam::{Quat, Vec3};
-use occnerf::data::{Capture, DemoConfig, Frame, demo};
+use occnerf::data::{Capture, DemoConfig, Frame, Wrong, demo};
 use serde::{Deserialize, Serialize};
 use smpl::{BodyModel, Placement};
 
@@ -40,7 +40,8 @@ impl Difficulty {
             enlarge(&mut body, self.unit);
         }
         let mut capture = if self.shutter > 0.0 { self.exposed(&body)? } else { demo(&self.demo, &body)? };
-        capture.train.iter_mut().for_each(|frame| erode(frame, self.erosion));
+        let mask_pixels = i32::try_from(self.erosion).map_or(i32::MIN, |pixels| -pixels);
+        Wrong { mask_pixels, ..Wrong::default() }.apply(&mut capture, &body)?;
         if self.facing_degrees < 180.0 {
             keep(&mut capture, |frame| facing(frame) <= self.facing_degrees);
             let degrees = self.facing_degrees;
@@ -81,29 +82,6 @@ impl Difficulty {
 fn enlarge(body: &mut BodyModel, unit: f32) {
     let lengths = body.v_template.iter_mut().chain(&mut body.shapedirs).chain(&mut body.posedirs.values);
     lengths.for_each(|v| *v *= unit);
-}
-
-/// Takes `pixels` pixels off the mask's border, and the picture with them.
-fn erode(frame: &mut Frame, pixels: u32) {
-    let (width, height) = (frame.image.width as usize, frame.image.height as usize);
-    for _ in 0..pixels {
-        let old = frame.mask.clone();
-        let at = |x: usize, y: usize, dx: isize, dy: isize| {
-            let inside = |a: usize, d: isize, n: usize| a.checked_add_signed(d).filter(|&a| a < n);
-            inside(x, dx, width).zip(inside(y, dy, height)).map_or(1.0, |(x, y)| old[y * width + x])
-        };
-        for y in 0..height {
-            for x in 0..width {
-                let least = [(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)].map(|(dx, dy)| at(x, y, dx, dy));
-                let least = least.into_iter().fold(1.0, f32::min);
-                let i = y * width + x;
-                // The picture is premultiplied by the mask.
-                let share = if old[i] > 0.0 { least / old[i] } else { 0.0 };
-                frame.mask[i] = least;
-                frame.image.pixels[3 * i..3 * i + 3].iter_mut().for_each(|c| *c *= share);
-            }
-        }
-    }
 }
 
 /// Angle in degrees between the person's front and the direction to the camera, seen from above.

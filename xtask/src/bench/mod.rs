@@ -12,7 +12,7 @@ mod runner;
 mod scale;
 mod stability;
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use anyhow::Result;
@@ -76,15 +76,8 @@ struct ParetoArguments {
     /// Seed of every point
     #[arg(long, default_value_t = 1)]
     seed: u64,
-    /// Threads of each point [default: all cores]
-    #[arg(long)]
-    threads: Option<usize>,
-    /// Begin no point after so many minutes; the same command goes on later [default: no limit]
-    #[arg(long)]
-    minutes: Option<f64>,
-    /// Only draw what has been run
-    #[arg(long)]
-    draw: bool,
+    #[command(flatten)]
+    sitting: SittingArguments,
 }
 
 #[derive(Args)]
@@ -107,6 +100,13 @@ struct StabilityArguments {
     /// Trained runs at most; those of more seeds are left out first
     #[arg(long, default_value_t = 60)]
     max_runs: usize,
+    #[command(flatten)]
+    sitting: SittingArguments,
+}
+
+/// How a sweep is run this time.
+#[derive(Args)]
+struct SittingArguments {
     /// Threads of each run [default: all cores]
     #[arg(long)]
     threads: Option<usize>,
@@ -141,11 +141,12 @@ pub fn bench(arguments: &BenchArguments) -> Result<()> {
     }
 }
 
-/// Seconds that a sweep may take.
-fn budget(minutes: Option<f64>, draw: bool) -> Result<Duration> {
-    let minutes = if draw { 0.0 } else { minutes.unwrap_or(1e6) };
-    anyhow::ensure!((0.0..=1e6).contains(&minutes), "--minutes {minutes}: expected 0 to 1000000");
-    Ok(Duration::from_secs_f64(60.0 * minutes))
+impl SittingArguments {
+    fn open(&self, out: &Path) -> Result<Bench> {
+        let minutes = if self.draw { 0.0 } else { self.minutes.unwrap_or(1e6) };
+        anyhow::ensure!((0.0..=1e6).contains(&minutes), "--minutes {minutes}: expected 0 to 1000000");
+        Bench::open(out, self.threads, Duration::from_secs_f64(60.0 * minutes))
+    }
 }
 
 fn pareto(arguments: &ParetoArguments) -> Result<()> {
@@ -157,7 +158,7 @@ fn pareto(arguments: &ParetoArguments) -> Result<()> {
     for scene in scenes.iter().filter(|s| *s != source::DEMO || !arguments.load.command_line().is_empty()) {
         source::load(Some(scene), arguments.body.as_deref(), &arguments.load.options())?;
     }
-    let mut bench = Bench::open(out, arguments.threads, budget(arguments.minutes, arguments.draw)?)?;
+    let mut bench = arguments.sitting.open(out)?;
     let mut text = String::new();
     for scene in &scenes {
         let (body, load) = (arguments.body.clone(), arguments.load.options());
@@ -175,7 +176,7 @@ fn pareto(arguments: &ParetoArguments) -> Result<()> {
         text.push_str(&format!("## {scene}\n\n{}\n", pareto::table(&lines)));
     }
     finish(&bench, &text, "pareto.md")?;
-    if !arguments.draw {
+    if !arguments.sitting.draw {
         kernels::run(out, arguments.quick)?;
     }
     Ok(())
@@ -204,7 +205,7 @@ fn stability(arguments: &StabilityArguments) -> Result<()> {
         axes.retain(|axis| arguments.axes.iter().any(|name| name.trim() == axis.name));
     }
     let sweep = stability::Sweep { axes, steps, quick: arguments.quick, max_runs: arguments.max_runs };
-    let mut bench = Bench::open(out, arguments.threads, budget(arguments.minutes, arguments.draw)?)?;
+    let mut bench = arguments.sitting.open(out)?;
     let lines = sweep.run(&mut bench)?;
     stability::charts(&sweep.axes, &lines, &out.join("stability"))?;
     let text = format!("{}\n{}\n", stability::table(&sweep.axes, &lines), stability::finite(&lines));

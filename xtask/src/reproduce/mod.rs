@@ -8,6 +8,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Result, ensure};
 use clap::Args;
+use occnerf::Lpips;
 use occnerf::data::{LoadOptions, Wrong};
 
 use crate::eval::load_lpips;
@@ -82,6 +83,7 @@ pub fn reproduce(arguments: &ReproduceArguments) -> Result<()> {
         let known = ROWS.iter().map(|row| row.name).collect::<Vec<_>>().join(", ");
         ensure!(ROWS.iter().any(|row| row.name == name), "--without {name}: no such row; there are {known}");
     }
+    let lpips = load_lpips(arguments.lpips.as_deref())?;
     let demo = [source::DEMO.to_owned()];
     let scenes = if arguments.scenes.is_empty() { &demo[..] } else { &arguments.scenes };
     let minutes = arguments.budget / scenes.len() as f64;
@@ -89,9 +91,9 @@ pub fn reproduce(arguments: &ReproduceArguments) -> Result<()> {
         println!("scene {} of {}: {scene}", index + 1, scenes.len());
         let directory = arguments.out.join(directory_name(scenes, index));
         if arguments.robustness {
-            robustness(arguments, scene, &directory.join("robustness"), minutes)?;
+            robustness(arguments, lpips.as_ref(), scene, &directory.join("robustness"), minutes)?;
         } else {
-            one_scene(arguments, scene, &directory, minutes)?;
+            one_scene(arguments, lpips.as_ref(), scene, &directory, minutes)?;
         }
     }
     Ok(())
@@ -106,13 +108,19 @@ fn directory_name(scenes: &[String], index: usize) -> String {
     }
 }
 
-fn one_scene(arguments: &ReproduceArguments, scene: &str, directory: &Path, minutes: f64) -> Result<()> {
+fn one_scene(
+    arguments: &ReproduceArguments,
+    lpips: Option<&Lpips>,
+    scene: &str,
+    directory: &Path,
+    minutes: f64,
+) -> Result<()> {
     let source = source::load(Some(scene), arguments.body.as_deref(), &arguments.load.options())?;
     std::fs::create_dir_all(directory)?;
     let rows = arguments.rows(|_| true);
     let plan = arguments.plan(directory, &source, &rows, minutes)?;
     println!("{plan}");
-    let summary = run_rows(arguments, &rows, &plan, &source, directory)?;
+    let summary = run_rows(arguments, lpips, &rows, &plan, &source, directory)?;
     println!("\n{}", summary.markdown());
     for name in ["reproduce.md", "reproduce.json", "reproduce.png"].map(|name| directory.join(name)) {
         if name.is_file() {
@@ -122,7 +130,13 @@ fn one_scene(arguments: &ReproduceArguments, scene: &str, directory: &Path, minu
     Ok(())
 }
 
-fn robustness(arguments: &ReproduceArguments, scene: &str, directory: &Path, minutes: f64) -> Result<()> {
+fn robustness(
+    arguments: &ReproduceArguments,
+    lpips: Option<&Lpips>,
+    scene: &str,
+    directory: &Path,
+    minutes: f64,
+) -> Result<()> {
     let options = arguments.load.options();
     ensure!(options.wrong == Wrong::default(), "--robustness goes through its own errors: leave --wrong-… out");
     let rows = arguments.rows(|row| MAIN.contains(&row.name));
@@ -139,7 +153,7 @@ fn robustness(arguments: &ReproduceArguments, scene: &str, directory: &Path, min
         println!("{plan}");
         let at = directory.join(name);
         std::fs::create_dir_all(&at)?;
-        levels.push((name, run_rows(arguments, &rows, plan, &source, &at)?.scores()));
+        levels.push((name, run_rows(arguments, lpips, &rows, plan, &source, &at)?.scores()));
         let text = summary::by_level(scene, &levels);
         run::write(&directory.join("robustness.md"), &text)?;
         run::write(&directory.join("robustness.json"), &serde_json::to_string_pretty(&levels)?)?;
@@ -163,12 +177,12 @@ impl ReproduceArguments {
 /// Trains and scores every row that is not finished, with all its seeds.
 fn run_rows<'a>(
     arguments: &ReproduceArguments,
+    lpips: Option<&Lpips>,
     rows: &[&Row],
     plan: &'a Plan,
     source: &'a Source,
     directory: &Path,
 ) -> Result<Summary<'a>> {
-    let lpips = load_lpips(arguments.lpips.as_deref())?;
     let mut summary = Summary::new(source, plan);
     for row in rows {
         for seed in 1..=row.runs(arguments.seeds) {
@@ -182,7 +196,7 @@ fn run_rows<'a>(
             if let Some(path) = &arguments.perceptual_weights {
                 run.train.loss.perceptual_weights.clone_from(path);
             }
-            let metrics = run_unless_finished(&directory.join(&name), &name, &run, source, lpips.as_ref())?;
+            let metrics = run_unless_finished(&directory.join(&name), &name, &run, source, lpips)?;
             summary.add(row, &directory.join(&name), metrics);
         }
         // After every row, so that an end before the last leaves a table.

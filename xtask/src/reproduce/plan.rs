@@ -68,7 +68,6 @@ impl Plan {
         let (mut a_step, mut fixed) = (0.0, 0.0);
         for row in rows.iter().filter(|row| row.learns()) {
             let (step, picture) = plan.cost(row);
-            // At one step `factor` is the number of steps.
             a_step += row.runs(seeds) as f64 * plan.factor(row) * step;
             fixed += row.runs(seeds) as f64 * pictures as f64 * picture;
         }
