@@ -5,7 +5,6 @@ use smpl::{BodyModel, Posed, SurfaceMotion};
 
 use crate::correction::Wrench;
 use crate::field::Group;
-use crate::parameters::Part;
 use crate::trainer::Trainer;
 
 impl Trainer<'_> {
@@ -14,8 +13,7 @@ impl Trainer<'_> {
     pub(crate) fn pose_backward(&self, group: &Group, posed: &Posed, wrenches: &mut Vec<Wrench>) {
         wrenches.clear();
         wrenches.resize(posed.bones.len(), Wrench::default());
-        let (table, region) = (self.parameters.get(Part::Table), &self.scene.canonical_box);
-        let d_points = self.field.encoder.encode_backward_points(table, &group.at, &group.d_features, region);
+        let d_points = self.d_coordinates(group);
         let samples = &group.samples;
         let (model, motion) = (&self.scene.model, &self.config.motion);
         let on_surface = !group.at.surface.is_empty();
