@@ -55,8 +55,7 @@ impl<const D: usize> HashGrid<D> {
         self.assert_jacobian(jacobian, d_points.len());
         self.assert_features("d_features", d_features, d_points.len());
         let (points, width, block) = (d_points.len(), self.num_features(), self.features * D);
-        for (part, (d_points, d_features)) in
-            d_points.chunks_mut(ROWS).zip(d_features.chunks(ROWS * width)).enumerate()
+        for (part, (d_points, d_features)) in d_points.chunks_mut(ROWS).zip(d_features.chunks(ROWS * width)).enumerate()
         {
             for l in 0..self.levels.len() {
                 let jacobian = &jacobian[(l * points + part * ROWS) * block..];

@@ -43,6 +43,8 @@ mod mlp;
 mod occupancy;
 mod parameters;
 mod pixels;
+#[cfg(test)]
+mod plain;
 mod pose_backward;
 mod presets;
 mod prior;

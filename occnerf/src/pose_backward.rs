@@ -96,6 +96,7 @@ mod tests {
     use super::*;
     use crate::config::{Config, Method, Preset};
     use crate::correction::{correct, correct_backward};
+    use crate::parameters::Part;
     use crate::random::Stream;
     use crate::samples::Stage;
     use crate::scene::Scene;
@@ -138,6 +139,8 @@ mod tests {
             let live = trace(&corrected, &mut group);
             assert!(live.len() > 500, "{}", live.len());
             let width = trainer.field.encoder.num_features();
+            let (table, mut features) = (trainer.parameters.get(Part::Table), vec![0.0; live.len() * width]);
+            trainer.field.encoder.encode_jacobian(table, &group.at, &mut features, &mut group.jacobian);
             group.d_features = (0..live.len() * width).map(|_| random(1.0).x).collect();
             group.d_distance = live.iter().map(|_| random(3.0).x).collect();
             group.d_likelihood = live.iter().map(|_| random(0.3).x).collect();

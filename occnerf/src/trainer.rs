@@ -65,7 +65,7 @@ pub struct Trainer<'a> {
     pub(crate) lpips: Option<Lpips>,
     pub(crate) steps_done: u64,
     pub(crate) stage: Stage,
-    batch: Batch,
+    pub(crate) batch: Batch,
     pub(crate) groups: Vec<GroupState>,
     pub(crate) vertex_code: VertexCode,
     pub(crate) transposed: Vec<f32>,
