@@ -22,7 +22,7 @@ const fn change(factor: &'static str, name: &'static str, set: &'static [&'stati
 }
 
 /// Every change but of the number of steps, most telling first.
-pub const CHANGES: [Change; 19] = [
+pub const CHANGES: [Change; 20] = [
     change("distance", "blended distance", &["surface.distance=blended"], true),
     change("motion", "volume motion", &["motion.kind=volume", "motion.correction_spacing=0"], true),
     change("motion", "poses as given", &["motion.correction_spacing=0"], true),
@@ -40,6 +40,7 @@ pub const CHANGES: [Change; 19] = [
     change("field", "width 32", &["field.width=32"], true),
     change("field", "width 128", &["field.width=128"], false),
     change("depth", "depth 1", &["field.depth=1"], false),
+    change("rates", "rates × 3", &["rates.field=6e-3", "rates.table=3e-2"], true),
     change("loss", "no perceptual term", &["loss.perceptual=0"], true),
     change("surface term", "no surface term", &["surface.surface_term=false", "surface.attention=false"], true),
 ];
