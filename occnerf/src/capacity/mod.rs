@@ -13,18 +13,21 @@ use crate::Error;
 use crate::config::{Config, Method};
 use crate::scene::Scene;
 
-/// Width of the finest cell, in pixels of the video at the subject.
-const PIXELS_A_CELL: f32 = 0.5;
-/// Pixel-sized cells of the seen surface that share a row of a level's table.
-const CELLS_A_ROW: f64 = 4.0;
-/// log₂ of the smallest table.
-const MIN_LOG2_TABLE_SIZE: u32 = 8;
-/// Pixel-sized cells of the seen surface for each unit of a hidden layer.
-const CELLS_A_UNIT: f64 = 256.0;
-/// Widths are multiples of it: narrower ones are padded to it.
+/// Longest side of the finest cell, in pixels of the video at the subject.
+const PIXELS_A_CELL: f32 = 0.8;
+/// Length of the finest cell in d, normalised metres: what density needs to end at a surface. Finer layers only take rows.
+const CELL_IN_D: f32 = 0.0085;
+/// Rows of a level's table for the shape that every body has, before any detail.
+const ROWS_OF_A_BODY: f64 = 4096.0;
+/// Pixel-wide places of the seen surface for each row on top of those.
+const PLACES_A_ROW: f64 = 2.5;
+/// Pixel-wide places for each unit of a hidden layer.
+const PLACES_A_UNIT: f64 = 400.0;
+/// Least width of a hidden layer, and what it is a multiple of: the kernels' lanes are filled up anyway.
+const MIN_WIDTH: usize = 32;
 const UNITS: usize = 16;
-/// Samples that are alive on a mean ray.
-const ALIVE_SAMPLES: f32 = 10.0;
+/// Mean distance of samples along a ray, normalised metres: a third of the shell around the surface.
+const STEP: f32 = 0.027;
 
 /// What was measured of a scene, and the sizes that follow from it, none above those it started from.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -44,9 +47,9 @@ pub struct Choice {
     /// Dotted name in [`Config`].
     pub key: String,
     /// Value before.
-    pub preset: u64,
-    /// Value that the scene needs, at most `preset`.
-    pub chosen: u64,
+    pub preset: f64,
+    /// Value from now on; of a size at most `preset`.
+    pub chosen: f64,
     /// Why.
     pub why: String,
 }
@@ -66,52 +69,64 @@ impl Capacity {
     /// The sizes that follow from what was measured.
     pub fn choose(measured: Measured, config: &Config) -> Self {
         let mut choices = Vec::new();
-        let mut add = |key: &str, preset: u64, chosen: u64, why: String| {
-            choices.push(Choice { key: key.to_owned(), preset, chosen: chosen.min(preset), why });
+        let mut add = |key: &str, preset: f64, chosen: f64, why: String| {
+            choices.push(Choice { key: key.to_owned(), preset, chosen, why });
         };
-        let cells = measured.cells.max(1);
-        let millimetres = 1e3 * measured.metres_a_pixel;
+        let cells = measured.cells.max(1) as f64;
         if matches!(config.method, Method::Occnerf | Method::HashPoint) {
             let grid = &config.encoding;
-            let wanted = measured.extent / (PIXELS_A_CELL * measured.metres_a_pixel);
-            let n_max = (wanted.round() as u32).clamp(grid.n_min, grid.n_max.max(grid.n_min));
-            let why =
-                format!("a pixel is {millimetres:.1} mm of {:.2} m: cells of {PIXELS_A_CELL} pixel", measured.extent);
-            add("encoding.n_max", grid.n_max.into(), n_max.into(), why);
-            let (levels, growth) = levels(grid.levels, grid.n_min, grid.n_max, n_max);
-            let why = format!("each level {growth:.2} times finer than the one before, as in the preset");
-            add("encoding.levels", grid.levels as u64, levels as u64, why);
-            let rows = (cells as f64 / CELLS_A_ROW).max(1.0);
-            let size = (rows.log2().ceil() as u32).max(MIN_LOG2_TABLE_SIZE);
+            let finest = (measured.extent / (PIXELS_A_CELL * measured.metres_a_pixel)).ceil() as u32;
+            let n_max = finest.clamp(grid.n_min, grid.n_max.max(grid.n_min));
+            let (pixel, extent) = (1e3 * measured.metres_a_pixel, measured.extent);
             let why = format!(
-                "{} pixels show {cells} cells as wide as a pixel, {CELLS_A_ROW} for each row",
-                measured.subject_pixels
+                "a pixel shows {pixel:.1} mm of {extent:.2} m; the finest cells are {PIXELS_A_CELL} pixel long"
             );
-            add("encoding.log2_table_size", grid.log2_table_size.into(), size.into(), why);
-            let units = (cells as f64 / CELLS_A_UNIT).ceil() as usize;
-            let why = format!("{cells} cells, {CELLS_A_UNIT} for each unit, a multiple of {UNITS}");
-            add("field.width", config.field.width as u64, units.next_multiple_of(UNITS) as u64, why);
+            add("encoding.n_max", grid.n_max.into(), n_max.min(grid.n_max).into(), why);
+            let (levels, growth) = levels(grid.levels, grid.n_min, grid.n_max, n_max);
+            let why = format!("each is {growth:.2} times finer than the one before, as in the preset");
+            add("encoding.levels", grid.levels as f64, levels as f64, why);
+            let size = (ROWS_OF_A_BODY + cells / PLACES_A_ROW).log2().ceil() as u32;
+            let pixels = measured.subject_pixels;
+            let why = format!(
+                "{pixels} pixels show {cells} places a pixel wide: a row for {PLACES_A_ROW} of them, and {ROWS_OF_A_BODY} for the shape"
+            );
+            add("encoding.log2_table_size", grid.log2_table_size.into(), size.min(grid.log2_table_size).into(), why);
+            if config.method == Method::Occnerf {
+                // The interval never shrinks; rounded, so that it is short to write.
+                let interval = CELL_IN_D * n_max as f32;
+                let wider = (interval / (grid.distance_max - grid.distance_min)).max(1.0);
+                let why =
+                    format!("cells {:.1} mm long in d: finer layers of a surface only take rows", 1e3 * CELL_IN_D);
+                for (key, d) in
+                    [("encoding.distance_min", grid.distance_min), ("encoding.distance_max", grid.distance_max)]
+                {
+                    let before = (1e6 * f64::from(d)).round() / 1e6;
+                    let after = if wider > 1.0 { (100.0 * f64::from(d * wider)).round() / 100.0 } else { before };
+                    add(key, before, after, why.clone());
+                }
+            }
+            let units = ((cells / PLACES_A_UNIT).ceil() as usize).next_multiple_of(UNITS).max(MIN_WIDTH);
+            let why = format!("a unit for {PLACES_A_UNIT} such places, at least {MIN_WIDTH}");
+            add("field.width", config.field.width as f64, units.min(config.field.width) as f64, why);
         }
-        let samples = (ALIVE_SAMPLES / measured.alive.max(1e-3)).ceil() as u64;
-        let why = format!(
-            "{:.0} % of the {:.2} m of a ray are near the body: {ALIVE_SAMPLES} samples there",
-            100.0 * measured.alive,
-            measured.span
-        );
-        add("samples", config.samples as u64, samples.max(1), why);
+        let samples = (measured.span / STEP).ceil() as usize;
+        let why = format!("{:.2} m of a ray cross the body's box: a sample every {:.0} mm", measured.span, 1e3 * STEP);
+        add("samples", config.samples as f64, samples.clamp(1, config.samples) as f64, why);
         Self { measured, choices, pruned: None }
     }
 
     /// Puts the chosen sizes into a configuration; keys that are none of its sizes are left alone.
     pub fn apply(&self, config: &mut Config) {
-        for choice in &self.choices {
-            let small = u32::try_from(choice.chosen).unwrap_or(u32::MAX);
-            match choice.key.as_str() {
-                "encoding.n_max" => config.encoding.n_max = small,
-                "encoding.levels" => config.encoding.levels = small as usize,
-                "encoding.log2_table_size" => config.encoding.log2_table_size = small,
-                "field.width" => config.field.width = small as usize,
-                "samples" => config.samples = small as usize,
+        for Choice { key, chosen, .. } in &self.choices {
+            let encoding = &mut config.encoding;
+            match key.as_str() {
+                "encoding.n_max" => encoding.n_max = *chosen as u32,
+                "encoding.levels" => encoding.levels = *chosen as usize,
+                "encoding.log2_table_size" => encoding.log2_table_size = *chosen as u32,
+                "encoding.distance_min" => encoding.distance_min = *chosen as f32,
+                "encoding.distance_max" => encoding.distance_max = *chosen as f32,
+                "field.width" => config.field.width = *chosen as usize,
+                "samples" => config.samples = *chosen as usize,
                 _ => {}
             }
         }
@@ -125,7 +140,7 @@ fn levels(most: usize, n_min: u32, preset_max: u32, n_max: u32) -> (usize, f64) 
         return (most, 1.0);
     }
     let growth = octaves(preset_max) / (most - 1) as f64;
-    let levels = 1 + (octaves(n_max) / growth - 1e-9).ceil().max(0.0) as usize;
+    let levels = 1 + (octaves(n_max) / growth).round().max(0.0) as usize;
     (levels.min(most), growth.exp())
 }
 
