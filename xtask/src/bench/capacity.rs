@@ -7,7 +7,7 @@ use anyhow::Result;
 use occnerf::{Method, Preset};
 
 use super::chart::{self, Mark, Panel, Picture, Shape, Style};
-use super::pareto::on_front;
+use super::pareto::{Pick, on_front};
 use super::points::{Setting, Sweep};
 use super::runner::{Bench, Kind, Line, Point};
 use super::scale::Scale;
@@ -25,7 +25,7 @@ const AROUND: [(&str, &[&str], bool); 7] = [
     ("width 32", &["field.width=32"], true),
 ];
 
-const WORTHS: [(&str, fn(&Line) -> Option<f64>); 2] =
+const WORTHS: [(&str, Pick); 2] =
     [("psnr_mask, dB", |l| l.outcome.psnr_mask), ("psnr_hidden, dB", |l| l.outcome.psnr_hidden)];
 
 /// Every point of one capture. `paper_steps`: of the preset `paper` and what is chosen from it, if they are wanted.
