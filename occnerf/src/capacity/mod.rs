@@ -149,7 +149,7 @@ impl fmt::Display for Capacity {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         for Choice { key, preset, chosen, why } in &self.choices {
             let change =
-                if chosen == preset { format!("{chosen}, the preset's") } else { format!("{chosen} of {preset}") };
+                if chosen == preset { format!("{chosen}, the preset's") } else { format!("{preset} → {chosen}") };
             writeln!(f, "  {key:<24} {change:<18} {why}")?;
         }
         Ok(())
