@@ -38,6 +38,7 @@ mod config;
 mod corners;
 mod encode;
 mod grid;
+mod jacobian;
 mod simd;
 
 pub use config::{Error, HashGridConfig, MAX_LOG2_TABLE_SIZE, MAX_PARAMETERS, MAX_RESOLUTION};

@@ -87,6 +87,29 @@ proptest! {
     }
 
     #[test]
+    fn the_jacobian_carries_gradients_as_the_table_does(
+        points in points::<4>(0..300), features in 1usize..12, log2 in 0u32..12, seed: u64,
+    ) {
+        let grid = HashGrid::<4>::with_resolutions(&[1, 4, 9, 700], features, log2).unwrap();
+        let table = table(&grid, seed);
+        let d_features = noise(points.len() * grid.num_features(), seed ^ 1);
+        let mut expected = vec![[1.0; 4]; points.len()];
+        let mut found = expected.clone();
+        grid.encode_backward_points(&table, &points, &d_features, &mut expected);
+        let mut encoded = vec![0.0; d_features.len()];
+        let mut jacobian = vec![f32::NAN; grid.jacobian_len(points.len())];
+        grid.encode_jacobian(&table, &points, &mut encoded, &mut jacobian);
+        grid.jacobian_backward(&jacobian, &d_features, &mut found);
+        for (found, expected) in encoded.iter().zip(encode(&grid, &table, &points)) {
+            prop_assert!(abs_diff_eq!(found, &expected, epsilon = 2e-6), "{found} {expected}");
+        }
+        for (found, expected) in found.as_flattened().iter().zip(expected.as_flattened()) {
+            // Slopes are up to twice the finest resolution times the features of a level.
+            prop_assert!(abs_diff_eq!(found, expected, epsilon = 1e-6 * 1400.0 * features as f32), "{found} {expected}");
+        }
+    }
+
+    #[test]
     fn gradients_accumulate(points in points::<3>(1..30), seed: u64) {
         let grid = HashGrid::<3>::with_resolutions(&[4, 40], 2, 8).unwrap();
         let values = table(&grid, seed);

@@ -103,6 +103,22 @@ impl Encoder {
         }
     }
 
+    /// [`Encoder::encode`] with what [`Encoder::encode_backward_points`] needs to leave the table alone; empty where it does not
+    /// read one.
+    pub fn encode_jacobian(&self, table: &[f32], at: &Coordinates, features: &mut [f32], jacobian: &mut Vec<f32>) {
+        match self {
+            Self::Frequency => self.encode(table, at, features),
+            Self::Point(grid) => {
+                jacobian.resize(grid.jacobian_len(at.point.len()), 0.0);
+                grid.encode_jacobian(table, &at.point, features, jacobian);
+            }
+            Self::Surface(grid, _) => {
+                jacobian.resize(grid.jacobian_len(at.surface.len()), 0.0);
+                grid.encode_jacobian(table, &at.surface, features, jacobian);
+            }
+        }
+    }
+
     /// Adds the gradient of the table.
     pub fn encode_backward(&self, at: &Coordinates, d_features: &[f32], d_table: &mut [f32]) {
         match self {
@@ -115,7 +131,7 @@ impl Encoder {
     /// Gradients of x̂, or of v̂ and d, in normalised metres.
     pub fn encode_backward_points(
         &self,
-        table: &[f32],
+        slopes: Slopes<'_>,
         at: &Coordinates,
         d_features: &[f32],
         region: &Aabb,
@@ -140,17 +156,32 @@ impl Encoder {
                 .collect(),
             Self::Point(grid) => {
                 let mut d = vec![[0.0; 3]; at.point.len()];
-                grid.encode_backward_points(table, &at.point, d_features, &mut d);
+                match slopes {
+                    Slopes::Table(table) => grid.encode_backward_points(table, &at.point, d_features, &mut d),
+                    Slopes::Jacobian(jacobian) => grid.jacobian_backward(jacobian, d_features, &mut d),
+                }
                 d.into_iter().map(|d| (Vec3::from_array(d) * per_metre, 0.0)).collect()
             }
             Self::Surface(grid, range) => {
                 let mut d = vec![[0.0; 4]; at.surface.len()];
-                grid.encode_backward_points(table, &at.surface, d_features, &mut d);
+                match slopes {
+                    Slopes::Table(table) => grid.encode_backward_points(table, &at.surface, d_features, &mut d),
+                    Slopes::Jacobian(jacobian) => grid.jacobian_backward(jacobian, d_features, &mut d),
+                }
                 let per_distance = 1.0 / (range.1 - range.0);
                 d.into_iter().map(|[x, y, z, w]| (Vec3::new(x, y, z) * per_metre, w * per_distance)).collect()
             }
         }
     }
+}
+
+/// Where the derivatives of a grid's features by the coordinates come from.
+#[derive(Clone, Copy)]
+pub(crate) enum Slopes<'a> {
+    /// They are worked out from the table.
+    Table(&'a [f32]),
+    /// [`Encoder::encode_jacobian`] has written them.
+    Jacobian(&'a [f32]),
 }
 
 /// Where samples are encoded; one of the two is filled.

@@ -10,6 +10,7 @@ use crate::encoder::{Coordinates, Encoder};
 use crate::gemm::LANES;
 use crate::mlp::{Activations, Mlp};
 use crate::samples::Samples;
+use crate::times::{StepTimes, Stopwatch};
 
 /// Samples that pass through the perceptron together; their activations fit a second-level cache.
 const BLOCK: usize = 256;
@@ -39,6 +40,9 @@ pub(crate) struct Group {
     /// Attention of each neighbour of each sample.
     attention: Vec<f32>,
     features: Vec<f32>,
+    /// Whether gradients of the coordinates will be asked for, and the derivatives that they take.
+    pub wants_jacobian: bool,
+    pub jacobian: Vec<f32>,
     blocks: Vec<Activations>,
     /// Activated density and colour of each sample.
     pub sigma: Vec<f32>,
@@ -53,6 +57,8 @@ pub(crate) struct Group {
     pub d_distance: Vec<f32>,
     d_output: Vec<f32>,
     d_input: Vec<f32>,
+    /// Where the time of this step went.
+    pub times: StepTimes,
 }
 
 impl Field {
@@ -84,9 +90,15 @@ impl Field {
         group: &mut Group,
     ) {
         let (n, width) = (group.samples.len(), self.encoder.num_features());
+        let mut watch = Stopwatch::start();
         self.encoder.coordinates(&group.samples, &self.region, &mut group.at);
         group.features.resize(n * width, 0.0);
-        self.encoder.encode(table, &group.at, &mut group.features);
+        if group.wants_jacobian {
+            self.encoder.encode_jacobian(table, &group.at, &mut group.features, &mut group.jacobian);
+        } else {
+            self.encoder.encode(table, &group.at, &mut group.features);
+        }
+        watch.lap(&mut group.times.encode);
         self.attend(counts, group);
         group.sigma.resize(n, 0.0);
         group.rgb.resize(n, Vec3::ZERO);
@@ -115,6 +127,7 @@ impl Field {
                 group.rgb[s] = Vec3::new(sigmoid(raw[1]), sigmoid(raw[2]), sigmoid(raw[3]));
             }
         }
+        watch.lap(&mut group.times.perceptron);
     }
 
     /// Backward of [`Field::forward`] from `d_sigma` and `d_rgb`: accumulates into `d_mlp` and `d_vertices` (V × F),

@@ -5,7 +5,6 @@ use smpl::{BodyModel, Posed, SurfaceMotion};
 
 use crate::correction::Wrench;
 use crate::field::Group;
-use crate::parameters::Part;
 use crate::trainer::Trainer;
 
 impl Trainer<'_> {
@@ -14,8 +13,7 @@ impl Trainer<'_> {
     pub(crate) fn pose_backward(&self, group: &Group, posed: &Posed, wrenches: &mut Vec<Wrench>) {
         wrenches.clear();
         wrenches.resize(posed.bones.len(), Wrench::default());
-        let (table, region) = (self.parameters.get(Part::Table), &self.scene.canonical_box);
-        let d_points = self.field.encoder.encode_backward_points(table, &group.at, &group.d_features, region);
+        let d_points = self.d_coordinates(group);
         let samples = &group.samples;
         let (model, motion) = (&self.scene.model, &self.config.motion);
         let on_surface = !group.at.surface.is_empty();
@@ -98,6 +96,7 @@ mod tests {
     use super::*;
     use crate::config::{Config, Method, Preset};
     use crate::correction::{correct, correct_backward};
+    use crate::parameters::Part;
     use crate::random::Stream;
     use crate::samples::Stage;
     use crate::scene::Scene;
@@ -140,6 +139,8 @@ mod tests {
             let live = trace(&corrected, &mut group);
             assert!(live.len() > 500, "{}", live.len());
             let width = trainer.field.encoder.num_features();
+            let (table, mut features) = (trainer.parameters.get(Part::Table), vec![0.0; live.len() * width]);
+            trainer.field.encoder.encode_jacobian(table, &group.at, &mut features, &mut group.jacobian);
             group.d_features = (0..live.len() * width).map(|_| random(1.0).x).collect();
             group.d_distance = live.iter().map(|_| random(3.0).x).collect();
             group.d_likelihood = live.iter().map(|_| random(0.3).x).collect();

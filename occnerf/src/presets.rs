@@ -16,7 +16,7 @@ pub(crate) fn paper() -> Config {
         patches: 6,
         patch_size: 32,
         samples: 128,
-        field: FieldConfig { width: 128, depth: 4, density_scale: 25.0, density_bias: 2.0, density_bias_outside: -2.0 },
+        field: FieldConfig { width: 64, depth: 2, density_scale: 25.0, density_bias: 2.0, density_bias_outside: -2.0 },
         encoding: EncodingConfig {
             levels: 16,
             features: 2,

@@ -8,6 +8,7 @@ use volrender::composite_backward;
 use crate::batch::{Batch, target};
 use crate::config::DistanceKind;
 use crate::correction::{Wrench, correct_backward};
+use crate::encoder::Slopes;
 use crate::field::Group;
 use crate::loss::{completeness, multiscale_dissimilarity};
 use crate::lpips::Lpips;
@@ -15,6 +16,7 @@ use crate::parameters::Part;
 use crate::pixels::Label;
 use crate::random::Stream;
 use crate::scene::PreparedFrame;
+use crate::times::{StepTimes, Stopwatch};
 use crate::trainer::{GroupState, StepReport, Trainer, composite_group, pixel_ray};
 
 const JITTER: u64 = 0x4A49_5454;
@@ -23,15 +25,21 @@ impl Trainer<'_> {
     /// Traces, encodes, evaluates and composites the rays of a group.
     pub(crate) fn forward(&self, state: &mut GroupState, batch: &Batch, frame: &PreparedFrame, posed: &Posed) {
         let tracer = self.tracer(&self.stage, frame, posed);
+        state.group.times = StepTimes::default();
+        let mut watch = Stopwatch::start();
         state.group.samples.clear();
         for &ray in &state.rays {
             let pixel = batch.pixels[ray];
             let jitter = Stream::new(&[self.config.seed, JITTER, self.steps_done, ray as u64]);
             state.group.samples.trace(&tracer, &pixel_ray(frame, pixel), Some(jitter));
         }
+        watch.lap(&mut state.group.times.trace);
+        state.group.wants_jacobian = self.volume.is_some() || self.teaches_poses();
         let (field, table) = (self.parameters.get(Part::Field), self.parameters.get(Part::Table));
         self.field.forward(field, table, &self.vertex_code.features, &self.counts, &mut state.group);
+        let mut watch = Stopwatch::start();
         composite_group(&state.group, batch.background, &mut state.weights, &mut state.composites);
+        watch.lap(&mut state.group.times.losses);
         state.terminations.clear();
         let samples = &state.group.samples;
         if samples.neighbours.is_empty() {
@@ -101,6 +109,7 @@ impl Trainer<'_> {
         posed: &Posed,
         d_colors: &[Vec3],
     ) {
+        let mut watch = Stopwatch::start();
         let group = &mut state.group;
         let n = group.samples.len();
         group.d_sigma.resize(n, 0.0);
@@ -132,9 +141,11 @@ impl Trainer<'_> {
                 group.d_sigma[s] += scale * slope;
             }
         }
+        watch.lap(&mut group.times.losses);
         zero(&mut state.d_mlp, self.parameters.get(Part::Field).len());
         zero(&mut state.d_vertices, self.vertex_code.features.len());
         self.field.backward(&self.transposed, group, &mut state.d_mlp, &mut state.d_vertices);
+        watch.lap(&mut group.times.perceptron_backward);
         if let Some(volume) = &self.volume {
             zero(&mut state.d_volume, volume.weights.len());
             self.motion_backward(volume, group, frame, &mut state.d_volume);
@@ -142,12 +153,18 @@ impl Trainer<'_> {
         if self.teaches_poses() {
             self.pose_backward(group, posed, &mut state.wrenches);
         }
+        watch.lap(&mut state.group.times.motion_backward);
+    }
+
+    /// Gradients of the coordinates that the samples of a group were encoded at.
+    pub(crate) fn d_coordinates(&self, group: &Group) -> Vec<(Vec3, f32)> {
+        let slopes = Slopes::Jacobian(&group.jacobian);
+        self.field.encoder.encode_backward_points(slopes, &group.at, &group.d_features, &self.scene.canonical_box)
     }
 
     /// Carries the gradients of the encoding's coordinates and of f into the weight volume.
     fn motion_backward(&self, volume: &WeightVolume, group: &Group, frame: &PreparedFrame, d_volume: &mut [f32]) {
-        let (table, region) = (self.parameters.get(Part::Table), &self.scene.canonical_box);
-        let d_points = self.field.encoder.encode_backward_points(table, &group.at, &group.d_features, region);
+        let d_points = self.d_coordinates(group);
         let samples = &group.samples;
         let per_sample = samples.neighbours.len().checked_div(samples.len()).unwrap_or(0);
         for (s, (d_point, d_coordinate)) in d_points.into_iter().enumerate() {
@@ -179,7 +196,14 @@ impl Trainer<'_> {
     }
 
     /// Sums the groups' gradients in order and runs the parts of the backward pass that all samples share.
-    pub(crate) fn reduce(&mut self, groups: &[GroupState], frame: &PreparedFrame, posed: &Posed) {
+    pub(crate) fn reduce(
+        &mut self,
+        groups: &[GroupState],
+        frame: &PreparedFrame,
+        posed: &Posed,
+        times: &mut StepTimes,
+    ) {
+        let mut watch = Stopwatch::start();
         self.parameters.clear_gradients();
         let sum = |to: &mut [f32], from: &(dyn Fn(&GroupState) -> &[f32] + Sync)| {
             to.par_chunks_mut(1 << 12).enumerate().for_each(|(chunk, to)| {
@@ -192,6 +216,7 @@ impl Trainer<'_> {
         let d_mlp = self.parameters.gradient(Part::Field);
         sum(d_mlp, &|g| &g.d_mlp);
         self.field.mlp.clear_padding(d_mlp);
+        watch.lap(&mut times.update);
         self.all_at.clear();
         self.all_d_features.clear();
         for state in groups {
@@ -208,6 +233,7 @@ impl Trainer<'_> {
         }
         let d_table = self.parameters.gradient(Part::Table);
         self.field.encoder.encode_backward(&self.all_at, &self.all_d_features, d_table);
+        watch.lap(&mut times.encode_backward);
         if let Some(volume) = &self.volume {
             let mut d_weights = vec![0.0; volume.weights.len()];
             sum(&mut d_weights, &|g| &g.d_volume);
@@ -223,6 +249,7 @@ impl Trainer<'_> {
             let d_correction = correct_backward(&self.scene.model, &frame.posed, &correction, posed, &wrenches);
             self.corrections.at_backward(instant, &d_correction, self.parameters.gradient(Part::Pose));
         }
+        watch.lap(&mut times.update);
     }
 }
 

@@ -18,6 +18,7 @@ use crate::lpips::Lpips;
 use crate::parameters::{PARTS, Parameters, Part};
 use crate::samples::{Stage, Tracer};
 use crate::scene::{PreparedFrame, Scene};
+use crate::times::{StepTimes, Stopwatch};
 use crate::vertices::VertexCode;
 
 /// Rays are dealt row by row to this many groups, each with its own gradient buffers, summed in order: the result
@@ -47,6 +48,8 @@ pub struct StepReport {
     pub rays: usize,
     /// Gradients that were not finite and were left out.
     pub bad_gradients: usize,
+    /// Where the time went.
+    pub times: StepTimes,
 }
 
 /// A model in training, or trained.
@@ -62,7 +65,7 @@ pub struct Trainer<'a> {
     pub(crate) lpips: Option<Lpips>,
     pub(crate) steps_done: u64,
     pub(crate) stage: Stage,
-    batch: Batch,
+    pub(crate) batch: Batch,
     pub(crate) groups: Vec<GroupState>,
     pub(crate) vertex_code: VertexCode,
     pub(crate) transposed: Vec<f32>,
@@ -239,6 +242,7 @@ impl<'a> Trainer<'a> {
         let loaded = self.lpips.is_some() || loss.perceptual_weights.is_empty() || loss.perceptual == 0.0;
         assert!(loaded, "weights of the perceptual term were not loaded");
         let step = self.steps_done;
+        let (mut times, mut watch) = (StepTimes::default(), Stopwatch::start());
         let mut batch = std::mem::take(&mut self.batch);
         batch.draw(self.scene, &self.config, step);
         let frame = &self.scene.train[batch.frame];
@@ -252,11 +256,15 @@ impl<'a> Trainer<'a> {
             state.rays.clear();
             state.rays.extend((0..batch.pixels.len()).filter(|ray| ray / batch.size % GROUPS == index));
         }
+        watch.lap(&mut times.prepare);
         groups.par_iter_mut().for_each(|state| self.forward(state, &batch, frame, &posed));
+        let mut watch = Stopwatch::start();
         let mut report = StepReport { step: step + 1, rays: batch.pixels.len(), ..StepReport::default() };
         let d_colors = self.photometric(&groups, &batch, frame, &mut report);
         self.field.mlp.transposed_weights(self.parameters.get(Part::Field), &mut self.transposed);
+        watch.lap(&mut times.losses);
         groups.par_iter_mut().for_each(|state| self.backward(state, &batch, frame, &posed, &d_colors));
+        groups.iter().for_each(|state| times += state.group.times);
         let nominal = (batch.pixels.len() * self.config.samples) as f64;
         report.completeness = groups.iter().map(|g| g.completeness).sum::<f64>() / nominal;
         report.live_samples = groups.iter().map(|g| g.group.samples.len()).sum();
@@ -264,13 +272,16 @@ impl<'a> Trainer<'a> {
         report.loss = f64::from(loss.mse) * report.mse
             + f64::from(loss.perceptual) * report.perceptual
             + f64::from(loss.completeness) * report.completeness;
-        self.reduce(&groups, frame, &posed);
+        self.reduce(&groups, frame, &posed, &mut times);
+        let mut watch = Stopwatch::start();
         if self.config.surface.visibility == VisibilityKind::Counted {
             groups.iter().for_each(|state| self.counts.add(&state.terminations));
         }
         let decay = self.config.rates.final_fraction.powf(step as f32 / self.config.steps.max(1) as f32);
         report.bad_gradients = self.parameters.step(&self.config.rates, decay);
         self.refresh_volume();
+        watch.lap(&mut times.update);
+        report.times = times;
         (self.groups, self.batch) = (groups, batch);
         self.steps_done += 1;
         report

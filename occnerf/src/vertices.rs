@@ -4,7 +4,7 @@ use glam::Vec3;
 use rayon::prelude::*;
 
 use crate::config::{Config, DistanceKind};
-use crate::encoder::{Coordinates, Encoder};
+use crate::encoder::{Coordinates, Encoder, Slopes};
 use crate::scene::Scene;
 
 const CHUNK: usize = 512;
@@ -55,7 +55,7 @@ impl VertexCode {
             let range = chunk * CHUNK..chunk * CHUNK + d_offsets.len() / 3;
             let at = Coordinates { surface: self.at.surface[range.clone()].to_vec(), ..Coordinates::default() };
             let d_rows = &d_features[range.start * width..range.end * width];
-            let d_points = encoder.encode_backward_points(table, &at, d_rows, &scene.canonical_box);
+            let d_points = encoder.encode_backward_points(Slopes::Table(table), &at, d_rows, &scene.canonical_box);
             for (((d_v, d_d), state), d_offset) in
                 d_points.into_iter().zip(&self.state[range]).zip(d_offsets.chunks_exact_mut(3))
             {

@@ -25,7 +25,7 @@ impl WeightVolume {
         let (mut sum, mut matrix, mut gradient) = (0.0f32, Mat3::ZERO, Vec3::ZERO);
         for (bone, transform) in to_canonical.iter().enumerate() {
             let y = transform.transform_point3(point);
-            let Some(cell) = self.cell(bone, y) else {
+            let Some(cell) = self.cell(bone, y.into()) else {
                 continue;
             };
             let channel = &self.weights[bone * samples..][..samples];

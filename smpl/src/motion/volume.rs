@@ -1,6 +1,6 @@
 //! The volume kind: canonical weight volumes.
 
-use glam::{Affine3A, Vec3};
+use glam::{Affine3A, Vec3, Vec3A};
 use rayon::prelude::*;
 
 use super::MotionSample;
@@ -55,11 +55,12 @@ pub struct WeightVolume {
     pub(super) support: Vec<Support>,
 }
 
-/// Inclusive range of samples, low and high for x, y, z. Empty where low is above high.
+/// Box, in steps of the grid from its first sample and inclusive, outside which interpolated weights are 0. Empty where low is
+/// above high.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Support {
-    pub(super) low: [usize; 3],
-    pub(super) high: [usize; 3],
+    low: Vec3A,
+    high: Vec3A,
 }
 
 /// A cell and a position in it.
@@ -144,9 +145,10 @@ impl WeightVolume {
     pub fn map(&self, to_canonical: &[Affine3A], point: Vec3, threshold: f32) -> Option<MotionSample> {
         assert_eq!(to_canonical.len(), self.channels - 1, "map: transforms of bones");
         let samples = self.resolution.pow(3);
-        let (mut sum, mut mean) = (0.0f32, Vec3::ZERO);
+        let (mut sum, mut mean) = (0.0f32, Vec3A::ZERO);
+        let point = Vec3A::from(point);
         for (bone, transform) in to_canonical.iter().enumerate() {
-            let y = transform.transform_point3(point);
+            let y = transform.transform_point3a(point);
             let Some(cell) = self.cell(bone, y) else {
                 continue;
             };
@@ -158,7 +160,7 @@ impl WeightVolume {
         if !(sum >= threshold && sum > 0.0) {
             return None;
         }
-        let canonical = mean / sum;
+        let canonical = Vec3::from(mean / sum);
         canonical.is_finite().then_some(MotionSample { canonical, likelihood: sum.min(1.0) })
     }
 
@@ -180,24 +182,18 @@ impl WeightVolume {
 
     /// The cell that holds `y`, if it is in the box and any of its corners in the support of `bone`.
     #[inline(always)]
-    pub(super) fn cell(&self, bone: usize, y: Vec3) -> Option<Cell> {
+    pub(super) fn cell(&self, bone: usize, y: Vec3A) -> Option<Cell> {
         let n = self.resolution;
-        let scale = (n - 1) as f32 / (self.max - self.min);
-        let at = (y - self.min) * scale;
-        let last = Vec3::splat((n - 1) as f32);
-        // NaN fails both comparisons.
-        if !(at.cmpge(Vec3::ZERO).all() && at.cmple(last).all()) {
-            return None;
-        }
-        let base = at.floor().min(last - 1.0);
-        let t = at - base;
-        let [x, y, z] = base.to_array().map(|c| c as usize);
+        let scale = (n - 1) as f32 / Vec3A::from(self.max - self.min);
+        let at = (y - Vec3A::from(self.min)) * scale;
         let support = &self.support[bone];
-        let outside =
-            [x, y, z].iter().enumerate().any(|(axis, &c)| c + 1 < support.low[axis] || c > support.high[axis]);
-        if outside {
+        // NaN fails both comparisons.
+        if !(at.cmpge(support.low) & at.cmple(support.high)).all() {
             return None;
         }
+        // Truncation is the floor of what is not negative, without a call.
+        let [x, y, z] = at.to_array().map(|c| (c as usize).min(n - 2));
+        let t = Vec3::from(at) - Vec3::new(x as f32, y as f32, z as f32);
         let s = 1.0 - t;
         let mix = [
             s.x * s.y * s.z,
@@ -215,15 +211,14 @@ impl WeightVolume {
 
 impl Support {
     fn of(log_prior: &[f32], n: usize) -> Self {
-        let mut out = Self { low: [usize::MAX; 3], high: [0; 3] };
+        let mut out = Self { low: Vec3A::INFINITY, high: Vec3A::NEG_INFINITY };
         for (i, &p) in log_prior.iter().enumerate() {
             if p > f32::NEG_INFINITY {
-                for (axis, at) in [i % n, i / n % n, i / (n * n)].into_iter().enumerate() {
-                    out.low[axis] = out.low[axis].min(at);
-                    out.high[axis] = out.high[axis].max(at);
-                }
+                let at = Vec3A::new((i % n) as f32, (i / n % n) as f32, (i / (n * n)) as f32);
+                out.low = out.low.min(at - 1.0);
+                out.high = out.high.max(at + 1.0);
             }
         }
-        out
+        Self { low: out.low.max(Vec3A::ZERO), high: out.high.min(Vec3A::splat((n - 1) as f32)) }
     }
 }

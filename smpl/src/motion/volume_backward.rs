@@ -1,8 +1,8 @@
 //! Gradients of the weight volumes.
 
-use glam::{Affine3A, Vec3};
+use glam::{Affine3A, Vec3, Vec3A};
 
-use super::volume::WeightVolume;
+use super::volume::{Cell, WeightVolume};
 
 impl WeightVolume {
     /// Backward of [`WeightVolume::map`] with respect to the softmaxed weights: ∂x̂/∂w_i = (y_i − x̂)/Σw, and
@@ -24,13 +24,22 @@ impl WeightVolume {
         assert_eq!(to_canonical.len(), self.channels - 1, "map_backward: transforms of bones");
         assert_eq!(d_weights.len(), self.weights.len(), "map_backward: d_weights");
         let samples = self.resolution.pow(3);
-        let (mut sum, mut mean) = (0.0f32, Vec3::ZERO);
+        let (mut sum, mut mean) = (0.0f32, Vec3A::ZERO);
+        let point = Vec3A::from(point);
+        // Few bones reach a point; where more do, the rest are looked up again.
+        const KEPT: usize = 8;
+        let mut kept = [const { None }; KEPT];
+        let mut reached = 0;
         for (bone, transform) in to_canonical.iter().enumerate() {
-            let y = transform.transform_point3(point);
+            let y = transform.transform_point3a(point);
             if let Some(cell) = self.cell(bone, y) {
                 let w = self.sample(&self.weights[bone * samples..][..samples], &cell);
                 sum += w;
                 mean += w * y;
+                if let Some(slot) = kept.get_mut(reached) {
+                    *slot = Some((bone, y, cell));
+                }
+                reached += 1;
             }
         }
         if sum.is_nan() || sum <= 0.0 {
@@ -38,15 +47,23 @@ impl WeightVolume {
         }
         let canonical = mean / sum;
         let d_sum = if sum < 1.0 { d_likelihood } else { 0.0 };
-        for (bone, transform) in to_canonical.iter().enumerate() {
-            let y = transform.transform_point3(point);
-            if let Some(cell) = self.cell(bone, y) {
-                let d_w = d_canonical.dot(y - canonical) / sum + d_sum;
-                let channel = &mut d_weights[bone * samples..][..samples];
-                for (corner, mix) in self.corners(cell.corner).into_iter().zip(cell.mix) {
-                    channel[corner] += mix * d_w;
-                }
+        let d_canonical = Vec3A::from(d_canonical);
+        let mut push = |bone: usize, y: Vec3A, cell: &Cell| {
+            let d_w = d_canonical.dot(y - canonical) / sum + d_sum;
+            let channel = &mut d_weights[bone * samples..][..samples];
+            for (corner, mix) in self.corners(cell.corner).into_iter().zip(cell.mix) {
+                channel[corner] += mix * d_w;
             }
+        };
+        for (bone, y, cell) in kept.iter().flatten() {
+            push(*bone, *y, cell);
+        }
+        if reached > KEPT {
+            let again = to_canonical.iter().enumerate().filter_map(|(bone, transform)| {
+                let y = transform.transform_point3a(point);
+                Some((bone, y, self.cell(bone, y)?))
+            });
+            again.skip(KEPT).for_each(|(bone, y, cell)| push(bone, y, &cell));
         }
     }
 

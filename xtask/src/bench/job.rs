@@ -9,7 +9,8 @@ use anyhow::{Context, Result, bail};
 use glam::Vec3;
 use occnerf::data::{Capture, LoadOptions};
 use occnerf::{
-    Config, FieldRenderer, Method, PreparedFrame, PriorRenderer, Renderer, Scene, Trainer, VertexColors, evaluate,
+    Config, FieldRenderer, Method, PreparedFrame, PriorRenderer, Renderer, Scene, StepTimes, Trainer, VertexColors,
+    evaluate,
 };
 use serde::{Deserialize, Serialize};
 use smpl::BodyModel;
@@ -78,8 +79,14 @@ pub struct Outcome {
     pub mask_iou: Option<f64>,
     pub parameters: usize,
     pub peak_rss_bytes: u64,
+    /// Median of a step in the second half of the run, when buffers have grown to size.
+    pub step_seconds: f64,
+    /// Mean seconds of each stage of those steps, summed over threads.
+    pub stages: Vec<(String, f64)>,
     /// Mean of a step.
     pub live_samples: f64,
+    /// Of the body model.
+    pub vertices: usize,
     /// Left out by the optimiser.
     pub bad_gradients: usize,
     /// Losses of steps and numbers of scored pictures that are not finite.
@@ -94,7 +101,8 @@ pub fn measure(job: &Job) -> Result<Outcome> {
     let start = Instant::now();
     let scene = Scene::new(&capture, &model, &job.config)?;
     drop(capture);
-    let mut outcome = Outcome { prepare_seconds: start.elapsed().as_secs_f64(), ..Outcome::default() };
+    let prepare_seconds = start.elapsed().as_secs_f64();
+    let mut outcome = Outcome { prepare_seconds, vertices: model.num_vertices(), ..Outcome::default() };
     let start = Instant::now();
     if job.config.method == Method::Prior {
         let colors = VertexColors::measure(&scene)?;
@@ -103,8 +111,14 @@ pub fn measure(job: &Job) -> Result<Outcome> {
         score(&scene, &mut PriorRenderer::new(&scene, &colors), &mut outcome)?;
     } else {
         let mut trainer = Trainer::new(&scene, job.config.clone())?;
-        for _ in 0..job.config.steps {
+        let (mut seconds, mut times) = (Vec::new(), StepTimes::default());
+        for step in 0..job.config.steps {
+            let begun = Instant::now();
             let report = trainer.step();
+            if 2 * step >= job.config.steps {
+                seconds.push(begun.elapsed().as_secs_f64());
+                times += report.times;
+            }
             outcome.non_finite += usize::from(!report.loss.is_finite());
             outcome.bad_gradients += report.bad_gradients;
             outcome.live_samples += report.live_samples as f64 / job.config.steps as f64;
@@ -113,6 +127,10 @@ pub fn measure(job: &Job) -> Result<Outcome> {
         if job.prune {
             trainer.prune();
         }
+        seconds.sort_by(f64::total_cmp);
+        outcome.step_seconds = seconds.get(seconds.len() / 2).copied().unwrap_or(0.0);
+        let mean = |total: f64| total / seconds.len().max(1) as f64;
+        outcome.stages = times.stages().map(|(name, total)| (name.to_owned(), mean(total))).to_vec();
         outcome.parameters = trainer.num_parameters();
         score(&scene, &mut FieldRenderer::new(&trainer)?, &mut outcome)?;
     }

@@ -3,6 +3,7 @@
 mod axes;
 mod capacity;
 mod chart;
+mod cost;
 mod difficulty;
 mod front;
 mod job;
@@ -50,6 +51,8 @@ enum What {
     Stability(StabilityArguments),
     /// Cost against error of the geometric kernels; `pareto` draws it too.
     Kernels(KernelArguments),
+    /// Where the time of a step goes, and how time and memory grow with rays, samples, table, vertices, frames and pixels.
+    Cost(CostArguments),
     /// One run, handed over on standard input.
     #[command(hide = true)]
     Point {
@@ -152,6 +155,15 @@ struct SittingArguments {
 }
 
 #[derive(Args)]
+struct CostArguments {
+    /// Where to write; what is there is not run again
+    #[arg(long, default_value = "runs/bench-cost")]
+    out: PathBuf,
+    #[command(flatten)]
+    sitting: SittingArguments,
+}
+
+#[derive(Args)]
 struct KernelArguments {
     /// Where to write
     #[arg(long, default_value = "runs/bench-kernels")]
@@ -168,6 +180,12 @@ pub fn bench(arguments: &BenchArguments) -> Result<()> {
         What::Capacity(arguments) => capacity_bench(arguments),
         What::Stability(arguments) => stability(arguments),
         What::Kernels(arguments) => kernels::run(&arguments.out, arguments.quick),
+        What::Cost(arguments) => {
+            use_threads(arguments.sitting.threads)?;
+            let mut bench = arguments.sitting.open(&arguments.out)?;
+            let text = cost::run(&mut bench, &arguments.out)?;
+            finish(&bench, &text, "cost.md")
+        }
         What::Point { threads } => {
             use_threads(*threads)?;
             job::serve()

@@ -1,0 +1,195 @@
+//! `bench cost`: where the time of a training step goes, what that is of what the machine can do, and how time and
+//! memory grow with the work.
+
+mod machine;
+
+use std::fmt::Write as _;
+use std::path::Path;
+
+use anyhow::{Result, bail};
+use occnerf::data::DemoConfig;
+use occnerf::{Config, Method, Preset};
+
+use self::machine::Machine;
+use super::chart::{Line, Mark, Panel, Picture, Shape, Style};
+use super::difficulty::Difficulty;
+use super::job::{Job, Place};
+use super::runner::{Bench, Kind, Point};
+use super::scale::Scale;
+
+/// Steps of each run; the median is over the second half, when buffers have grown to size.
+const STEPS: u64 = 10;
+
+/// A quantity that is doubled again and again.
+struct Growth {
+    name: &'static str,
+    levels: &'static [f64],
+    set: fn(&mut Config, &mut Difficulty, f64),
+}
+
+/// Around the preset `fast` on a demo of few frames.
+const GROWTHS: [Growth; 6] = [
+    Growth {
+        name: "rays a step",
+        levels: &[1024.0, 2048.0, 4096.0, 8192.0, 16384.0],
+        set: |c, _, l| c.patches = l as usize / 1024,
+    },
+    Growth { name: "samples a ray", levels: &[24.0, 48.0, 96.0, 192.0, 384.0], set: |c, _, l| c.samples = l as usize },
+    Growth {
+        name: "parameters of the hash grid",
+        levels: &[14.0, 16.0, 18.0, 20.0],
+        set: |c, _, l| (c.encoding.log2_table_size, c.encoding.n_max) = (l as u32, 2048),
+    },
+    Growth { name: "vertices", levels: &[0.0, 1.0, 2.0], set: |_, d, l| d.refined = l as u32 },
+    Growth { name: "frames", levels: &[10.0, 20.0, 40.0, 80.0, 160.0], set: |_, d, l| d.demo.frames = l as usize },
+    Growth {
+        name: "pixels of a frame",
+        levels: &[96.0, 136.0, 192.0, 272.0, 384.0],
+        set: |_, d, l| d.demo.size = l as u32,
+    },
+];
+
+/// Runs everything, writes cost.md, growth.svg and growth.png.
+pub fn run(bench: &mut Bench, out: &Path) -> Result<String> {
+    let machine = Machine::measure();
+    let mut text = format!(
+        "A plain product of 256×64 by 64×64 runs at {:.0} GFLOP/s on one thread, {:.0} on all;\n",
+        machine.gflops.0, machine.gflops.1
+    ) + &format!(
+        "a plain copy of 64 MB at {:.1} GB/s read and {:.1} GB/s on all threads.\n\n",
+        machine.copy.0, machine.copy.1
+    );
+    for preset in [Preset::Fast, Preset::Balanced, Preset::Paper] {
+        text.push_str(&profile(preset, bench)?);
+    }
+    let mut panels = Vec::new();
+    let mut table = String::from(
+        "| what grows | level | step s | step exponent | MB | samples |\n| --- | ---: | ---: | ---: | ---: | ---: |\n",
+    );
+    for growth in &GROWTHS {
+        panels.extend(grow(growth, bench, &mut table)?);
+    }
+    let picture = Picture {
+        title: "One step of training as the work grows".to_owned(),
+        legend: vec![("measured".to_owned(), Style(0, Shape::Circle)), ("linear".to_owned(), Style(5, Shape::Dash))],
+        columns: 4,
+        size: (330, 280),
+        panels,
+    };
+    picture.write(&out.join("growth"))?;
+    let _ = write!(text, "{table}");
+    Ok(text)
+}
+
+fn point(name: String, factor: &str, config: Config, difficulty: Difficulty) -> Point {
+    let place = Place::Made(difficulty);
+    let job = Job { place, views: 1, config, prune: false };
+    Point {
+        bench: "cost".to_owned(),
+        name,
+        factor: factor.to_owned(),
+        level: None,
+        kind: Kind::Level,
+        command: None,
+        job,
+    }
+}
+
+fn small() -> Difficulty {
+    let demo = DemoConfig { frames: 12, eval_cameras: 1, eval_every: 12, ..DemoConfig::default() };
+    Difficulty { demo, ..Difficulty::default() }
+}
+
+/// Shares of the stages at a preset.
+fn profile(preset: Preset, bench: &mut Bench) -> Result<String> {
+    // So few that poses are taught too, as in all but the first tenth of a run.
+    let config = Config { steps: STEPS, ..Config::preset(preset, Method::Occnerf) };
+    let Some(line) = bench.run(point(preset.name().to_owned(), "profile", config.clone(), small()))? else {
+        return Ok(String::new());
+    };
+    let outcome = &line.outcome;
+    if let Some(error) = &outcome.error {
+        bail!("{}: {error}", preset.name());
+    }
+    let live = outcome.live_samples;
+    let total: f64 = outcome.stages.iter().map(|s| s.1).sum();
+    let mut text = format!(
+        "### `{}`: {:.3} s a step, {live:.0} live samples, {:.0} ns each; {:.0} MB\n\n| stage | share | µs a sample and thread | achieved |\n| --- | ---: | ---: | --- |\n",
+        preset.name(),
+        outcome.step_seconds,
+        1e9 * outcome.step_seconds / live,
+        outcome.peak_rss_bytes as f64 / 1e6,
+    );
+    let flops = flops(&config);
+    let bytes = (config.encoding.levels * 16 * config.encoding.features * 4) as f64;
+    for (stage, seconds) in &outcome.stages {
+        let each = seconds / live;
+        let achieved = match stage.as_str() {
+            "perceptron" => format!("{:.1} GFLOP/s a thread", 1e-9 * flops / each),
+            "perceptron backward" => format!("{:.1} GFLOP/s a thread", 2e-9 * flops / each),
+            "encode" => format!("{:.2} GB/s of table entries a thread", 1e-9 * bytes / each),
+            // Every entry is read and written.
+            "encode backward" => format!("{:.2} GB/s of table entries a thread", 2e-9 * bytes / each),
+            _ => String::new(),
+        };
+        let _ = writeln!(text, "| {stage} | {:.1} % | {:.2} | {achieved} |", 100.0 * seconds / total, 1e6 * each);
+    }
+    text.push('\n');
+    Ok(text)
+}
+
+/// Floating-point operations of a sample through F, forward.
+fn flops(config: &Config) -> f64 {
+    let encoded = config.encoding.levels * config.encoding.features;
+    let mut widths = vec![2 * encoded];
+    widths.extend(vec![config.field.width; config.field.depth]);
+    widths.push(4);
+    widths.windows(2).map(|w| 2.0 * (w[0] * w[1]) as f64).sum()
+}
+
+/// Two panels, time and memory, and rows of the table.
+fn grow(growth: &Growth, bench: &mut Bench, table: &mut String) -> Result<Vec<Panel>> {
+    let (mut time, mut memory) = (Vec::new(), Vec::new());
+    for &level in growth.levels {
+        let (mut config, mut difficulty) = (Config::preset(Preset::Fast, Method::Occnerf), small());
+        config.steps = STEPS;
+        (growth.set)(&mut config, &mut difficulty, level);
+        let Some(line) = bench.run(point(format!("{} {level}", growth.name), growth.name, config, difficulty))? else {
+            continue;
+        };
+        if let Some(error) = &line.outcome.error {
+            bail!("{} {level}: {error}", growth.name);
+        }
+        let at = match growth.name {
+            "vertices" => line.outcome.vertices as f64,
+            "parameters of the hash grid" => line.outcome.parameters as f64,
+            "pixels of a frame" => level * level,
+            _ => level,
+        };
+        time.push((at, line.outcome.step_seconds));
+        memory.push((at, line.outcome.peak_rss_bytes as f64 / 1e6));
+        let exponent = match time.as_slice() {
+            [.., a, b] => format!("{:.2}", (b.1 / a.1).ln() / (b.0 / a.0).ln()),
+            _ => String::new(),
+        };
+        let (step, megabytes) = (line.outcome.step_seconds, line.outcome.peak_rss_bytes as f64 / 1e6);
+        let _ = writeln!(
+            table,
+            "| {} | {at:.0} | {step:.3} | {exponent} | {megabytes:.0} | {:.0} |",
+            growth.name, line.outcome.live_samples
+        );
+    }
+    let panel = |what: &str, points: Vec<(f64, f64)>| {
+        // Through the last point, so that what grows faster than linearly lies below it before.
+        let linear =
+            points.last().map_or(Vec::new(), |end| points.iter().map(|p| (p.0, end.1 * p.0 / end.0)).collect());
+        Panel {
+            title: format!("{what} against {}", growth.name),
+            labels: [growth.name.to_owned(), what.to_owned()],
+            scales: [Scale::around(points.iter().map(|p| p.0), true), Scale::around(points.iter().map(|p| p.1), true)],
+            lines: vec![Line { points: linear, color: 5 }, Line { points: points.clone(), color: 0 }],
+            marks: points.iter().map(|&at| Mark { at, name: String::new(), style: Style(0, Shape::Circle) }).collect(),
+        }
+    };
+    Ok(vec![panel("seconds a step", time), panel("MB", memory)])
+}
