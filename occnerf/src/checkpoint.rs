@@ -7,12 +7,15 @@ use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 
 use crate::Error;
 use crate::config::Config;
-use crate::parameters::PARTS;
+use crate::parameters::{PARTS, Part};
 use crate::scene::Scene;
 use crate::trainer::Trainer;
 
 const FORMAT: &str = "occnerf-checkpoint";
 const VERSION: &str = "1";
+/// Of pruned models: a bit for each row of the table, lowest first in each byte, and the rows whose bit is set.
+const PRUNED: &str = "2";
+const KEPT: &str = "table.kept";
 /// Larger files are not ours: the paper's table with both moments has 0.3 GB.
 const MAX_BYTES: u64 = 4 << 30;
 /// Far more than anybody trains, and far from where counting on would overflow.
@@ -22,9 +25,10 @@ impl Trainer<'_> {
     /// Writes everything that training goes on from. An old file survives until the new one is complete.
     pub fn save(&self, path: &Path) -> Result<(), Error> {
         let config = toml::to_string(&self.config).map_err(|e| file(path, format!("configuration: {e}")))?;
+        let kept = self.parameters.kept_rows.as_deref();
         let header = HashMap::from([
             ("format".to_owned(), FORMAT.to_owned()),
-            ("version".to_owned(), VERSION.to_owned()),
+            ("version".to_owned(), if kept.is_some() { PRUNED } else { VERSION }.to_owned()),
             ("steps_done".to_owned(), self.steps_done.to_string()),
             ("scene".to_owned(), self.scene.name.clone()),
             ("config".to_owned(), config),
@@ -34,15 +38,27 @@ impl Trainer<'_> {
             let adam = &self.parameters.optimisers[part as usize];
             let values = self.parameters.get(part);
             for (suffix, array) in [("", values), (".first_moment", &adam.first), (".second_moment", &adam.second)] {
-                let bytes = array.iter().flat_map(|v| v.to_le_bytes()).collect();
+                let bytes = match kept.filter(|_| part == Part::Table) {
+                    Some(kept) => rows_left(array, kept).iter().flat_map(|v| v.to_le_bytes()).collect(),
+                    None => array.iter().flat_map(|v| v.to_le_bytes()).collect(),
+                };
                 arrays.push((format!("{name}{suffix}"), bytes, Dtype::F32));
             }
+        }
+        if let Some(kept) = kept {
+            let byte = |bits: &[bool]| bits.iter().rev().fold(0, |byte, &bit| byte << 1 | u8::from(bit));
+            arrays.push((KEPT.to_owned(), kept.chunks(8).map(byte).collect(), Dtype::U8));
         }
         let counts = self.counts.counts().iter().flat_map(|c| c.to_le_bytes()).collect();
         arrays.push(("visibility_counts".to_owned(), counts, Dtype::U64));
         let mut views = Vec::new();
         for (name, bytes, dtype) in &arrays {
-            let shape = vec![bytes.len() / if *dtype == Dtype::F32 { 4 } else { 8 }];
+            let size = match dtype {
+                Dtype::U8 => 1,
+                Dtype::F32 => 4,
+                _ => 8,
+            };
+            let shape = vec![bytes.len() / size];
             let view = TensorView::new(*dtype, shape, bytes).map_err(|e| file(path, format!("`{name}`: {e}")))?;
             views.push((name.as_str(), view));
         }
@@ -70,9 +86,23 @@ impl<'a> Trainer<'a> {
         }
         let mut trainer = Self::new(scene, config_of(path, &header)?).map_err(|e| file(path, e.to_string()))?;
         trainer.steps_done = steps_done;
+        if get("version")? == PRUNED {
+            let rows = trainer.parameters.get(Part::Table).len() / trainer.config.encoding.features.max(1);
+            let bits = tensor(path, &tensors, KEPT, Dtype::U8, rows.div_ceil(8))?;
+            let kept = (0..rows).map(|row| bits[row / 8] >> (row % 8) & 1 == 1);
+            trainer.parameters.kept_rows = Some(kept.collect());
+        }
         for (part, name) in PARTS {
-            let expected = trainer.parameters.get(part).len();
-            let read = |key: String| floats(path, &tensors, &key, expected);
+            let all = trainer.parameters.get(part).len();
+            let expected = trainer.parameters.count(part);
+            let kept = trainer.parameters.kept_rows.clone().filter(|_| part == Part::Table);
+            let read = |key: String| {
+                let values = floats(path, &tensors, &key, expected)?;
+                Ok::<_, Error>(match &kept {
+                    Some(kept) => rows_filled(&values, kept, all),
+                    None => values,
+                })
+            };
             *trainer.parameters.get_mut(part) = read(name.to_owned())?;
             let adam = &mut trainer.parameters.optimisers[part as usize];
             adam.first = read(format!("{name}.first_moment"))?;
@@ -89,6 +119,22 @@ impl<'a> Trainer<'a> {
         trainer.refresh_volume();
         Ok(trainer)
     }
+}
+
+/// The kept rows of `array`, one after another.
+fn rows_left(array: &[f32], kept: &[bool]) -> Vec<f32> {
+    let rows = array.chunks_exact((array.len() / kept.len().max(1)).max(1));
+    rows.zip(kept).filter(|(_, kept)| **kept).flat_map(|(row, _)| row).copied().collect()
+}
+
+/// All rows, `all` numbers, those that were not kept zero.
+fn rows_filled(values: &[f32], kept: &[bool], all: usize) -> Vec<f32> {
+    let width = (all / kept.len().max(1)).max(1);
+    let (mut rows, mut array) = (values.chunks_exact(width), vec![0.0; all]);
+    for (row, _) in array.chunks_exact_mut(width).zip(kept).filter(|(_, kept)| **kept) {
+        rows.next().into_iter().for_each(|values| row.copy_from_slice(values));
+    }
+    array
 }
 
 /// Puts the header's keys in order: they come from a `HashMap`, and equal models are to be equal files.
@@ -126,7 +172,7 @@ fn parse<'b>(path: &Path, bytes: &'b [u8]) -> Result<(HashMap<String, String>, S
     let tensors = SafeTensors::deserialize(bytes).map_err(not_ours)?;
     let header = metadata.metadata().clone().unwrap_or_default();
     let found = |key: &str| header.get(key).map_or("nothing", String::as_str).to_owned();
-    if found("format") != FORMAT || found("version") != VERSION {
+    if found("format") != FORMAT || ![VERSION, PRUNED].contains(&found("version").as_str()) {
         let (format, version) = (found("format"), found("version"));
         return Err(file(path, format!("is {format} version {version}, expected {FORMAT} version {VERSION}")));
     }

@@ -27,6 +27,7 @@
 
 mod adam;
 mod batch;
+mod capacity;
 mod checkpoint;
 mod config;
 mod correction;
@@ -58,6 +59,7 @@ mod trainer;
 mod validate;
 mod vertices;
 
+pub use capacity::{Capacity, Choice, Measured, Pruned};
 pub use checkpoint::checkpoint_config;
 pub use config::{
     AttentionKind, Component, Config, DistanceKind, EncodingConfig, FieldConfig, LossConfig, Method, MotionConfig,

@@ -34,6 +34,8 @@ pub(crate) struct Parameters {
     values: [Vec<f32>; 5],
     gradients: [Vec<f32>; 5],
     pub optimisers: [Adam; 5],
+    /// Rows of the table that pruning has left, if it took any; the others are zero.
+    pub kept_rows: Option<Vec<bool>>,
 }
 
 impl Parameters {
@@ -48,11 +50,20 @@ impl Parameters {
         ];
         let gradients = values.clone().map(|v| vec![0.0; v.len()]);
         let optimisers = [0, 1, 2, 3, 4].map(|part: usize| Adam::new(values[part].len()));
-        Self { values, gradients, optimisers }
+        Self { values, gradients, optimisers, kept_rows: None }
     }
 
     pub fn get(&self, part: Part) -> &[f32] {
         &self.values[part as usize]
+    }
+
+    /// Numbers of a group that carry something.
+    pub fn count(&self, part: Part) -> usize {
+        let all = self.get(part).len();
+        match &self.kept_rows {
+            Some(kept) if part == Part::Table => all / kept.len().max(1) * kept.iter().filter(|kept| **kept).count(),
+            _ => all,
+        }
     }
 
     pub fn get_mut(&mut self, part: Part) -> &mut Vec<f32> {
@@ -74,6 +85,7 @@ impl Parameters {
 
     /// One Adam step of every group at its rate times `decay`; returns how many gradients were not finite.
     pub fn step(&mut self, rates: &RateConfig, decay: f32) -> usize {
+        self.kept_rows = None;
         let each = [rates.field, rates.table, rates.vertices, rates.motion, rates.pose];
         let groups = self.values.iter_mut().zip(&self.gradients).zip(&mut self.optimisers);
         groups.zip(each).map(|(((v, g), adam), rate)| adam.step(rate * decay, rates.beta_2, v, g)).sum()

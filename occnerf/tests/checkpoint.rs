@@ -178,7 +178,8 @@ fn foreign_headers_are_refused_and_say_what_was_expected() {
     };
     for (key, value, hint) in [
         ("format", "something-else", "something-else"),
-        ("version", "2", "version 2"),
+        ("version", "3", "version 3"),
+        ("version", "2", "table.kept"),
         ("scene", "another", "another"),
         ("steps_done", "-1", "-1"),
         ("steps_done", "many", "many"),
@@ -295,4 +296,35 @@ fn an_old_checkpoint_survives_a_save_that_fails() {
     let trainer = Trainer::new(scene(), config(Method::Occnerf)).unwrap();
     assert!(trainer.save(&path).is_err());
     assert!(std::fs::read(&path).unwrap() == bytes);
+}
+
+#[test]
+fn a_pruned_checkpoint_must_say_which_rows_it_holds() {
+    let dir = TempDir::new("pruned");
+    let path = dir.path("pruned.safetensors");
+    let mut trainer = Trainer::new(scene(), config(Method::Occnerf)).unwrap();
+    assert!(trainer.prune().dropped > 0, "nothing has moved yet");
+    trainer.step();
+    trainer.prune();
+    trainer.save(&path).unwrap();
+    let bytes = std::fs::read(&path).unwrap();
+    assert!(resume(scene(), &path, &forged(&bytes, |_, _| ())).is_ok());
+    let kept = |change: fn(&mut Vec<u8>)| {
+        forged(&bytes, |_, arrays| {
+            let (_, shape, data) = arrays.get_mut("table.kept").unwrap();
+            change(data);
+            *shape = vec![data.len()];
+        })
+    };
+    for (case, change) in [
+        ("too few rows", (|data| data.truncate(1)) as fn(&mut Vec<u8>)),
+        ("too many rows", |data| data.extend([0; 99])),
+        ("another number of them", |data| data.fill(0xff)),
+        ("none", Vec::clear),
+    ] {
+        let message = refused(scene(), &path, &kept(change), case);
+        assert!(message.contains("`table"), "{case}: {message}");
+    }
+    let floats = forged(&bytes, |_, arrays| arrays.get_mut("table.kept").unwrap().0 = Dtype::I8);
+    assert!(refused(scene(), &path, &floats, "signed bits").contains("table.kept"));
 }

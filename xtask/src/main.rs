@@ -1,6 +1,7 @@
 //! `cargo xtask`: train, evaluate and render people from occluded videos.
 
 mod bench;
+mod capacity;
 mod compare;
 mod convert;
 mod eval;

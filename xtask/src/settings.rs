@@ -2,7 +2,7 @@
 
 use anyhow::{Context, Result, bail};
 use clap::{Args, ValueEnum};
-use occnerf::{Component, Config, Method, OccludedRule, Preset};
+use occnerf::{Capacity, Component, Config, Method, OccludedRule, Preset};
 
 /// Which model is trained.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
@@ -132,9 +132,11 @@ impl SettingArguments {
         Ok(config)
     }
 
-    /// Checks that a run to be resumed was trained with what is asked for; the number of steps may change.
-    pub fn resumed(&self, saved: Config) -> Result<Config> {
-        let asked = if self.preset.is_some() || self.method.is_some() { self.config()? } else { saved.clone() };
+    /// Checks that a run to be resumed was trained with what is asked for; the number of steps may change. `capacity`
+    /// replaced the preset's sizes when the run began.
+    pub fn resumed(&self, saved: Config, capacity: Option<&Capacity>) -> Result<Config> {
+        let mut asked = if self.preset.is_some() || self.method.is_some() { self.config()? } else { saved.clone() };
+        capacity.into_iter().for_each(|capacity| capacity.apply(&mut asked));
         let asked = self.apply(asked)?;
         let steps = self.steps.unwrap_or(saved.steps);
         let same = Config { steps, ..asked.clone() } == Config { steps, ..saved.clone() };

@@ -9,6 +9,7 @@ use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
 use occnerf::{Lpips, Method, Scene, StepReport, Trainer, VertexColors, checkpoint_config};
 
+use crate::capacity::{self, CapacityName};
 use crate::compare::compare;
 use crate::eval::{Model, load_lpips, score_run};
 use crate::run::{
@@ -39,6 +40,9 @@ pub struct TrainArguments {
     pub load: LoadArguments,
     #[command(flatten)]
     pub settings: SettingArguments,
+    /// Sizes of the model [default: preset]
+    #[arg(long, conflicts_with = "compare")]
+    pub capacity: Option<CapacityName>,
     /// Threads [default: all cores]; the result does not depend on it
     #[arg(long)]
     pub threads: Option<usize>,
@@ -66,9 +70,11 @@ pub fn train(arguments: &TrainArguments) -> Result<()> {
     let method = arguments.settings.config()?.method;
     let name = format!("{}-{}", scene_name(arguments.scene.as_deref()), method.name());
     let out = arguments.out.as_deref();
-    let (directory, config) = if arguments.resume {
+    let (directory, mut config) = if arguments.resume {
         let directory = existing_directory(out, &name)?;
-        let config = arguments.settings.resumed(checkpoint_config(&directory.join(CHECKPOINT))?)?;
+        let capacity = capacity::resumed(&directory, arguments.capacity)?;
+        let saved = checkpoint_config(&directory.join(CHECKPOINT))?;
+        let config = arguments.settings.resumed(saved, capacity.as_ref())?;
         (directory, config)
     } else {
         (PathBuf::new(), arguments.settings.config()?)
@@ -81,12 +87,23 @@ pub fn train(arguments: &TrainArguments) -> Result<()> {
     } else {
         source::load(arguments.scene.as_deref(), arguments.body.as_deref(), &arguments.load.options())?
     };
+    let mut chosen = None;
+    if !arguments.resume && arguments.capacity == Some(CapacityName::Auto) {
+        let capacity = capacity::measure(&source, &config, &arguments.settings.set)?;
+        capacity.apply(&mut config);
+        config.validate()?;
+        chosen = Some(capacity);
+    }
     // The directory of a new run is made only now, so that bad input leaves nothing behind.
     let directory = if arguments.resume { directory } else { new_directory(out, &name)? };
     let run =
         RunConfig { scene: source.scene.clone(), body: source.body.clone(), load: source.load.clone(), train: config };
     run.write(&directory)?;
     println!("run: {}", directory.display());
+    if let Some(capacity) = &chosen {
+        capacity::save(&directory, capacity)?;
+        print!("capacity from the scene:\n{capacity}");
+    }
     let Some(metrics) = run_one(&directory, &run, &source, lpips.as_ref(), arguments.resume, arguments.stop_after)?
     else {
         println!("stopped; go on with --resume --out {}", directory.display());
@@ -136,6 +153,7 @@ pub fn run_one(
     if trainer.steps_done() < run.train.steps {
         return Ok(None);
     }
+    capacity::prune(directory, &mut trainer, &checkpoint)?;
     let metrics = metrics(run, seconds, trainer.num_parameters(), trainer.perceptual());
     score_run(directory, run, &scene, &Model::Field(&trainer), lpips, metrics).map(Some)
 }

@@ -32,6 +32,7 @@ fn help_names_the_commands_and_every_option_of_train() {
         "--occlusion",
         "--lpips",
         "--perceptual-weights",
+        "--capacity",
     ];
     for option in options {
         assert!(train.contains(option), "{train}");

@@ -78,7 +78,7 @@ impl Level {
             level: Some(self.value),
             kind: if self.easy { Kind::Base } else { Kind::Level },
             command: None,
-            job: Job { place: Place::Made(self.difficulty), views: VIEWS, config },
+            job: Job { place: Place::Made(self.difficulty), views: VIEWS, config, prune: false },
         }
     }
 }

@@ -83,7 +83,7 @@ pub fn run(bench: &mut Bench, out: &Path) -> Result<String> {
 
 fn point(name: String, factor: &str, config: Config, difficulty: Difficulty) -> Point {
     let place = Place::Made(difficulty);
-    let job = Job { place, views: 1, config };
+    let job = Job { place, views: 1, config, prune: false };
     Point {
         bench: "cost".to_owned(),
         name,

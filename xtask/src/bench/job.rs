@@ -59,6 +59,9 @@ pub struct Job {
     /// At most so many unseen views are scored, evenly chosen.
     pub views: usize,
     pub config: Config,
+    /// Whether the trained model is pruned.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub prune: bool,
 }
 
 /// What came of it; all zero or none where there is an error.
@@ -121,6 +124,9 @@ pub fn measure(job: &Job) -> Result<Outcome> {
             outcome.live_samples += report.live_samples as f64 / job.config.steps as f64;
         }
         outcome.train_seconds = start.elapsed().as_secs_f64();
+        if job.prune {
+            trainer.prune();
+        }
         seconds.sort_by(f64::total_cmp);
         outcome.step_seconds = seconds.get(seconds.len() / 2).copied().unwrap_or(0.0);
         let mean = |total: f64| total / seconds.len().max(1) as f64;

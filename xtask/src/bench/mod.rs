@@ -1,6 +1,7 @@
 //! `bench`: what every approximation costs and is worth, and where methods break.
 
 mod axes;
+mod capacity;
 mod chart;
 mod cost;
 mod difficulty;
@@ -22,7 +23,7 @@ use clap::{Args, Subcommand};
 use self::job::Place;
 use self::runner::Bench;
 use crate::run::{use_threads, write};
-use crate::source::LoadArguments;
+use crate::source::{LoadArguments, Source};
 use crate::{source, train};
 
 pub use self::kernels::RESULTS;
@@ -44,6 +45,8 @@ pub struct BenchArguments {
 enum What {
     /// Seconds against accuracy of every named approximation, each preset and each method: a table and charts.
     Pareto(ParetoArguments),
+    /// Parameters and memory against accuracy, of fixed sizes and of `train --capacity auto`: a table and charts.
+    Capacity(CapacityArguments),
     /// What happens as it gets hard: less to see, worse poses, odd units, …; a table of breaking points and charts.
     Stability(StabilityArguments),
     /// Cost against error of the geometric kernels; `pareto` draws it too.
@@ -58,8 +61,9 @@ enum What {
     },
 }
 
+/// What a sweep over captures is run on.
 #[derive(Args)]
-struct ParetoArguments {
+struct SceneArguments {
     /// Captures, as `train` takes them [default: the embedded demo]
     scenes: Vec<String>,
     /// The body model of the captures
@@ -67,6 +71,35 @@ struct ParetoArguments {
     body: Option<PathBuf>,
     #[command(flatten)]
     load: LoadArguments,
+}
+
+#[derive(Args)]
+struct CapacityArguments {
+    #[command(flatten)]
+    on: SceneArguments,
+    /// Where to write; what is there is not run again
+    #[arg(long, default_value = "runs/bench-capacity")]
+    out: PathBuf,
+    /// Fewer points and fewer steps: about 10 minutes on 2 cores
+    #[arg(long)]
+    quick: bool,
+    /// Steps of each point [default: 300, quick: 60]
+    #[arg(long)]
+    steps: Option<u64>,
+    /// The preset `paper` too, and what is chosen from it, with so many steps
+    #[arg(long, value_name = "STEPS")]
+    paper: Option<u64>,
+    /// Seed of every point
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+    #[command(flatten)]
+    sitting: SittingArguments,
+}
+
+#[derive(Args)]
+struct ParetoArguments {
+    #[command(flatten)]
+    on: SceneArguments,
     /// Where to write; what is there is not run again
     #[arg(long, default_value = "runs/bench-pareto")]
     out: PathBuf,
@@ -144,6 +177,7 @@ struct KernelArguments {
 pub fn bench(arguments: &BenchArguments) -> Result<()> {
     match &arguments.what {
         What::Pareto(arguments) => pareto(arguments),
+        What::Capacity(arguments) => capacity_bench(arguments),
         What::Stability(arguments) => stability(arguments),
         What::Kernels(arguments) => kernels::run(&arguments.out, arguments.quick),
         What::Cost(arguments) => {
@@ -167,46 +201,81 @@ impl SittingArguments {
     }
 }
 
-fn pareto(arguments: &ParetoArguments) -> Result<()> {
-    let out = &arguments.out;
-    let steps = arguments.steps.unwrap_or(if arguments.quick { FULL_STEPS / 5 } else { FULL_STEPS });
-    anyhow::ensure!((1..=1_000_000).contains(&steps), "--steps {steps}: expected 1 to 1000000");
-    let scenes = if arguments.scenes.is_empty() { vec![source::DEMO.to_owned()] } else { arguments.scenes.clone() };
-    // What is wrong with a capture is said before anything is run.
-    for scene in scenes.iter().filter(|s| *s != source::DEMO || !arguments.load.command_line().is_empty()) {
-        source::load(Some(scene), arguments.body.as_deref(), &arguments.load.options())?;
+impl SceneArguments {
+    /// The scenes; what is wrong with a capture is said before anything is run.
+    fn checked(&self) -> Result<Vec<String>> {
+        let scenes = if self.scenes.is_empty() { vec![source::DEMO.to_owned()] } else { self.scenes.clone() };
+        for scene in scenes.iter().filter(|s| *s != source::DEMO || !self.load.command_line().is_empty()) {
+            self.read(scene)?;
+        }
+        Ok(scenes)
     }
+
+    fn read(&self, scene: &str) -> Result<Source> {
+        source::load(Some(scene), self.body.as_deref(), &self.load.options())
+    }
+
+    fn sweep(&self, scene: &str, steps: u64, seed: u64, quick: bool) -> points::Sweep {
+        let (body, load) = (self.body.clone(), self.load.options());
+        points::Sweep {
+            scene_arguments: self.command_line(scene),
+            place: Place::Scene { scene: scene.to_owned(), body, load },
+            views: if quick { VIEWS.1 } else { VIEWS.0 },
+            steps,
+            full_steps: FULL_STEPS,
+            seed,
+            quick,
+        }
+    }
+
+    /// What makes `train` read the same capture.
+    fn command_line(&self, scene: &str) -> String {
+        let mut text = if scene == source::DEMO { String::new() } else { format!(" {scene}") };
+        if let Some(body) = &self.body {
+            text.push_str(&format!(" --body {}", body.display()));
+        }
+        text + &self.load.command_line()
+    }
+}
+
+/// Steps of a point: as asked, or the usual number.
+fn steps(asked: Option<u64>, quick: bool) -> Result<u64> {
+    let steps = asked.unwrap_or(if quick { FULL_STEPS / 5 } else { FULL_STEPS });
+    anyhow::ensure!((1..=1_000_000).contains(&steps), "--steps {steps}: expected 1 to 1000000");
+    Ok(steps)
+}
+
+fn pareto(arguments: &ParetoArguments) -> Result<()> {
+    let ParetoArguments { on, out, quick, seed, .. } = arguments;
+    let steps = steps(arguments.steps, *quick)?;
+    let scenes = on.checked()?;
     let mut bench = arguments.sitting.open(out)?;
     let mut text = String::new();
     for scene in &scenes {
-        let (body, load) = (arguments.body.clone(), arguments.load.options());
-        let sweep = points::Sweep {
-            scene_arguments: scene_arguments(scene, arguments),
-            place: Place::Scene { scene: scene.clone(), body, load },
-            views: if arguments.quick { VIEWS.1 } else { VIEWS.0 },
-            steps,
-            full_steps: FULL_STEPS,
-            seed: arguments.seed,
-            quick: arguments.quick,
-        };
-        let lines = pareto::run(&sweep, &mut bench)?;
+        let lines = pareto::run(&on.sweep(scene, steps, *seed, *quick), &mut bench)?;
         pareto::charts(scene, &lines, &out.join(format!("pareto-{}", train::scene_name(Some(scene)))))?;
         text.push_str(&format!("## {scene}\n\n{}\n", pareto::table(&lines)));
     }
     finish(&bench, &text, "pareto.md")?;
     if !arguments.sitting.draw {
-        kernels::run(out, arguments.quick)?;
+        kernels::run(out, *quick)?;
     }
     Ok(())
 }
 
-/// What makes `train` read the same capture.
-fn scene_arguments(scene: &str, arguments: &ParetoArguments) -> String {
-    let mut text = if scene == source::DEMO { String::new() } else { format!(" {scene}") };
-    if let Some(body) = &arguments.body {
-        text.push_str(&format!(" --body {}", body.display()));
+fn capacity_bench(arguments: &CapacityArguments) -> Result<()> {
+    let CapacityArguments { on, out, quick, seed, paper, .. } = arguments;
+    let steps = steps(arguments.steps, *quick)?;
+    let scenes = on.checked()?;
+    let mut bench = arguments.sitting.open(out)?;
+    let mut text = String::new();
+    for scene in &scenes {
+        let points = capacity::points(&on.sweep(scene, steps, *seed, *quick), &on.read(scene)?, *paper)?;
+        let lines = capacity::run(points, &mut bench)?;
+        capacity::chart(scene, &lines, &out.join(format!("capacity-{}", train::scene_name(Some(scene)))))?;
+        text.push_str(&format!("## {scene}\n\n{}\n", capacity::table(&lines)));
     }
-    text + &arguments.load.command_line()
+    finish(&bench, &text, "capacity.md")
 }
 
 fn stability(arguments: &StabilityArguments) -> Result<()> {

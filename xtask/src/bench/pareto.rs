@@ -12,7 +12,7 @@ use super::runner::{Bench, Kind, Line};
 use super::scale::Scale;
 
 /// A measured quantity of a run.
-type Pick = fn(&Line) -> Option<f64>;
+pub type Pick = fn(&Line) -> Option<f64>;
 
 /// What is worth having, with its digits in tables.
 const WORTHS: [(&str, Pick, usize); 3] = [
@@ -31,7 +31,7 @@ fn style(line: &Line) -> Style {
         Kind::Base => Style(6, Shape::Square),
         Kind::Change | Kind::Level => Style(0, Shape::Circle),
         Kind::Combination => Style(3, Shape::Circle),
-        Kind::Preset => Style(2, Shape::Triangle),
+        Kind::Preset | Kind::Auto => Style(2, Shape::Triangle),
         Kind::Baseline => Style(1, Shape::Ring),
     }
 }
@@ -49,7 +49,7 @@ pub fn run(sweep: &Sweep, bench: &mut Bench) -> Result<Vec<Line>> {
 }
 
 /// Which lines are on the front of a cost and a worth.
-fn on_front(lines: &[Line], cost: Pick, worth: Pick) -> Vec<bool> {
+pub fn on_front(lines: &[Line], cost: Pick, worth: Pick) -> Vec<bool> {
     let of = |line: &Line, pick: Pick| if line.outcome.error.is_some() { None } else { pick(line) };
     let points = lines.iter().map(|l| (of(l, cost).unwrap_or(f64::NAN), of(l, worth).unwrap_or(f64::NAN)));
     front(&points.collect::<Vec<_>>())

@@ -65,15 +65,16 @@ pub struct Sweep {
 }
 
 /// Settings on top of a preset.
-struct Setting<'a> {
-    preset: Preset,
-    method: Method,
-    steps: u64,
-    set: &'a [&'a str],
+pub struct Setting<'a> {
+    pub preset: Preset,
+    pub method: Method,
+    pub steps: u64,
+    pub set: &'a [&'a str],
 }
 
 impl Sweep {
-    fn point(&self, name: &str, factor: &str, kind: Kind, setting: &Setting<'_>) -> Result<Point> {
+    /// A point of `bench pareto`.
+    pub fn point(&self, name: &str, factor: &str, kind: Kind, setting: &Setting<'_>) -> Result<Point> {
         let Setting { preset, method, steps, set } = *setting;
         let mut config = Config { steps, seed: self.seed, ..Config::preset(preset, method) };
         for assignment in set {
@@ -95,7 +96,7 @@ impl Sweep {
             level: None,
             kind,
             command: Some(command),
-            job: Job { place: self.place.clone(), views: self.views, config },
+            job: Job { place: self.place.clone(), views: self.views, config, prune: false },
         })
     }
 

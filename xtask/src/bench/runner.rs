@@ -26,6 +26,8 @@ pub enum Kind {
     Combination,
     /// A named preset as it is.
     Preset,
+    /// Sizes chosen from the scene.
+    Auto,
     /// Another method.
     Baseline,
     /// A level of difficulty.
@@ -35,7 +37,7 @@ pub enum Kind {
 /// A named run.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Point {
-    /// `pareto` or `stability`.
+    /// `pareto`, `stability` or `capacity`.
     pub bench: String,
     pub name: String,
     /// What is changed.
@@ -197,7 +199,7 @@ pub mod tests {
             level: Some(1.0),
             kind,
             command: Some("cargo xtask train".to_owned()),
-            job: Job { place: Place::Made(Difficulty::default()), views: 3, config },
+            job: Job { place: Place::Made(Difficulty::default()), views: 3, config, prune: false },
         };
         let (psnr_mask, psnr_hidden) = (Some(psnr), Some(psnr));
         let outcome = Outcome {

@@ -8,11 +8,13 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail, ensure};
 use clap::Args;
+use occnerf::{Capacity, Choice, Pruned};
 
 use self::curves::{Log, curves};
 use self::page::Page;
 use self::viewer::{Views, viewers};
 use crate::bench;
+use crate::capacity;
 use crate::run::{self, METRICS, Metrics, RunConfig};
 use crate::table;
 
@@ -130,6 +132,12 @@ fn add_runs(page: &mut Page, runs: &[Run]) -> Result<()> {
         vec![r.name.clone(), m.method.clone(), m.scene.clone(), m.preset.clone(), m.seed.to_string(), memory(r)]
     };
     page.table(&std::iter::once(more).chain(runs.iter().map(row)).collect::<Vec<_>>());
+    for run in runs {
+        if let Some(capacity) = capacity::read(&run.directory)? {
+            page.subheading(&format!("{}: sizes from the scene", run.name));
+            add_capacity(page, &capacity);
+        }
+    }
     let (mut views, mut logs) = (Vec::new(), Vec::new());
     for run in runs {
         views.extend(Views::read(&run.directory.join(NOVEL))?.map(|v| (run.name.clone(), v)));
@@ -164,6 +172,18 @@ fn add_runs(page: &mut Page, runs: &[Run]) -> Result<()> {
         page.folded(&format!("{}: config.toml", run.name), &text);
     }
     Ok(())
+}
+
+/// Each size that was chosen, with its reason, and what pruning took.
+fn add_capacity(page: &mut Page, capacity: &Capacity) {
+    let header = ["size", "preset", "chosen", "why"].map(str::to_owned).to_vec();
+    let row = |c: &Choice| vec![c.key.clone(), c.preset.to_string(), c.chosen.to_string(), c.why.clone()];
+    page.table(&std::iter::once(header).chain(capacity.choices.iter().map(row)).collect::<Vec<_>>());
+    if let Some(Pruned { rows, dropped, parameters }) = capacity.pruned {
+        page.paragraph(&format!(
+            "Pruned after training: {dropped} of {rows} rows of the table, which no ray touched; {parameters} parameters left."
+        ));
+    }
 }
 
 /// Every PNG of a directory, if it is there.

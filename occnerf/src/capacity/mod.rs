@@ -1,0 +1,157 @@
+//! How much model a scene needs: sizes of the encoding, the perceptron and the sampling from what its video shows.
+
+mod measure;
+mod prune;
+
+use std::fmt;
+
+use serde::{Deserialize, Serialize};
+
+pub use self::measure::Measured;
+pub use self::prune::Pruned;
+use crate::Error;
+use crate::config::{Config, Method};
+use crate::scene::Scene;
+
+/// Longest side of the finest cell, in pixels of the video at the subject.
+const PIXELS_A_CELL: f32 = 0.75;
+/// Length of the finest cell in d, normalised metres: what density needs to end at a surface. Finer layers only take rows.
+const CELL_IN_D: f32 = 0.0083;
+/// Rows of a level's table for the shape that every body has, before any detail.
+const ROWS_OF_A_BODY: f64 = 4096.0;
+/// Pixel-wide places of the seen surface for each row on top of those. At 2.5 the demo loses 0.3 dB.
+const PLACES_A_ROW: f64 = 1.0;
+/// Pixel-wide places for each unit of a hidden layer.
+const PLACES_A_UNIT: f64 = 400.0;
+/// Least width of a hidden layer, whatever the scene: 32 loses 0.3 dB and saves a thirtieth of the parameters. Widths are
+/// multiples of `UNITS`, for the kernels fill up their lanes anyway.
+const MIN_WIDTH: usize = 64;
+const UNITS: usize = 16;
+/// Mean distance of samples along a ray, normalised metres: that of `fast` on a walking person.
+const STEP: f32 = 0.018;
+
+/// What was measured of a scene, and the sizes that follow from it, none above those it started from.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Capacity {
+    /// What the video shows.
+    pub measured: Measured,
+    /// Sizes with their reasons.
+    pub choices: Vec<Choice>,
+    /// What pruning took away after training.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub pruned: Option<Pruned>,
+}
+
+/// One size.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Choice {
+    /// Dotted name in [`Config`].
+    pub key: String,
+    /// Value before.
+    pub preset: f64,
+    /// Value from now on; of a size at most `preset`.
+    pub chosen: f64,
+    /// Why.
+    pub why: String,
+}
+
+impl Capacity {
+    /// Measures a scene and chooses sizes at most those of `config`; the same for the same scene, whatever the threads.
+    ///
+    /// Of the encodings the hash grids have sizes to choose; `humannerf` keeps its perceptron, which holds the whole person.
+    ///
+    /// # Errors
+    /// A configuration that is not valid, and those of [`Measured::of`].
+    pub fn measure(scene: &Scene, config: &Config) -> Result<Self, Error> {
+        config.validate()?;
+        Ok(Self::choose(Measured::of(scene, config)?, config))
+    }
+
+    /// The sizes that follow from what was measured.
+    pub fn choose(measured: Measured, config: &Config) -> Self {
+        let mut choices = Vec::new();
+        let mut add = |key: &str, preset: f64, chosen: f64, why: String| {
+            choices.push(Choice { key: key.to_owned(), preset, chosen, why });
+        };
+        let cells = measured.cells.max(1) as f64;
+        if matches!(config.method, Method::Occnerf | Method::HashPoint) {
+            let grid = &config.encoding;
+            let finest = (measured.extent / (PIXELS_A_CELL * measured.metres_a_pixel)).ceil() as u32;
+            let n_max = finest.clamp(grid.n_min, grid.n_max.max(grid.n_min));
+            let (pixel, extent) = (1e3 * measured.metres_a_pixel, measured.extent);
+            let why = format!(
+                "a pixel shows {pixel:.1} mm of {extent:.2} m; the finest cells are {PIXELS_A_CELL} pixel long"
+            );
+            add("encoding.n_max", grid.n_max.into(), n_max.min(grid.n_max).into(), why);
+            let (levels, growth) = levels(grid.levels, grid.n_min, grid.n_max, n_max);
+            let why = format!("each is {growth:.2} times finer than the one before, as in the preset");
+            add("encoding.levels", grid.levels as f64, levels as f64, why);
+            let size = (ROWS_OF_A_BODY + cells / PLACES_A_ROW).log2().ceil() as u32;
+            let pixels = measured.subject_pixels;
+            let why = format!(
+                "{pixels} pixels show {cells} places a pixel wide: {PLACES_A_ROW} to a row, and {ROWS_OF_A_BODY} rows for the shape"
+            );
+            add("encoding.log2_table_size", grid.log2_table_size.into(), size.min(grid.log2_table_size).into(), why);
+            if config.method == Method::Occnerf {
+                // The interval never shrinks; rounded, so that it is short to write.
+                let interval = CELL_IN_D * n_max as f32;
+                let wider = (interval / (grid.distance_max - grid.distance_min)).max(1.0);
+                let why =
+                    format!("cells {:.1} mm long in d: finer layers of a surface only take rows", 1e3 * CELL_IN_D);
+                for (key, d) in
+                    [("encoding.distance_min", grid.distance_min), ("encoding.distance_max", grid.distance_max)]
+                {
+                    let before = (1e6 * f64::from(d)).round() / 1e6;
+                    let after = if wider > 1.0 { (100.0 * f64::from(d * wider)).round() / 100.0 } else { before };
+                    add(key, before, after, why.clone());
+                }
+            }
+            let units = ((cells / PLACES_A_UNIT).ceil() as usize).next_multiple_of(UNITS).max(MIN_WIDTH);
+            let why = format!("a unit for {PLACES_A_UNIT} such places, at least {MIN_WIDTH}");
+            add("field.width", config.field.width as f64, units.min(config.field.width) as f64, why);
+        }
+        let samples = (measured.span / STEP).ceil() as usize;
+        let why = format!("{:.2} m of a ray cross the body's box: a sample every {:.0} mm", measured.span, 1e3 * STEP);
+        add("samples", config.samples as f64, samples.clamp(1, config.samples) as f64, why);
+        Self { measured, choices, pruned: None }
+    }
+
+    /// Puts the chosen sizes into a configuration; keys that are none of its sizes are left alone.
+    pub fn apply(&self, config: &mut Config) {
+        for Choice { key, chosen, .. } in &self.choices {
+            let encoding = &mut config.encoding;
+            match key.as_str() {
+                "encoding.n_max" => encoding.n_max = *chosen as u32,
+                "encoding.levels" => encoding.levels = *chosen as usize,
+                "encoding.log2_table_size" => encoding.log2_table_size = *chosen as u32,
+                "encoding.distance_min" => encoding.distance_min = *chosen as f32,
+                "encoding.distance_max" => encoding.distance_max = *chosen as f32,
+                "field.width" => config.field.width = *chosen as usize,
+                "samples" => config.samples = *chosen as usize,
+                _ => {}
+            }
+        }
+    }
+}
+
+/// Levels up to `n_max` cells that keep the growth from level to level of `most` levels up to `preset_max` cells.
+fn levels(most: usize, n_min: u32, preset_max: u32, n_max: u32) -> (usize, f64) {
+    let octaves = |n: u32| (f64::from(n.max(1)) / f64::from(n_min.max(1))).ln();
+    if most < 2 || preset_max <= n_min {
+        return (most, 1.0);
+    }
+    let growth = octaves(preset_max) / (most - 1) as f64;
+    let levels = 1 + (octaves(n_max) / growth).round().max(0.0) as usize;
+    (levels.min(most), growth.exp())
+}
+
+impl fmt::Display for Capacity {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        for Choice { key, preset, chosen, why } in &self.choices {
+            let change =
+                if chosen == preset { format!("{chosen}, the preset's") } else { format!("{preset} → {chosen}") };
+            writeln!(f, "  {key:<24} {change:<18} {why}")?;
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,67 @@
+//! `--capacity auto`: sizes from the scene before training, pruning after it, and both on record.
+
+use std::path::Path;
+
+use anyhow::{Context, Result, bail};
+use clap::ValueEnum;
+use occnerf::{Capacity, Config, Method, Scene, Trainer};
+
+use crate::run::write;
+use crate::source::Source;
+
+/// What was measured, chosen and pruned, in a run directory.
+pub const FILE: &str = "capacity.json";
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum CapacityName {
+    /// The preset's sizes.
+    Preset,
+    /// At most the preset's: table, levels, width and samples from what the scene shows, and pruned after training.
+    Auto,
+}
+
+/// What a scene needs, starting from `config`; sizes that `set` names stay as they are.
+pub fn measure(source: &Source, config: &Config, set: &[String]) -> Result<Capacity> {
+    if config.method == Method::Prior {
+        bail!("--capacity auto: the prior has no sizes to choose");
+    }
+    let scene = Scene::new(&source.capture, &source.model, config)?;
+    let mut capacity = Capacity::measure(&scene, config)?;
+    capacity.choices.retain(|choice| set.iter().all(|set| set.split('=').next() != Some(&choice.key)));
+    Ok(capacity)
+}
+
+/// That of a run whose sizes were chosen; `None` for one with its preset's.
+pub fn read(directory: &Path) -> Result<Option<Capacity>> {
+    let path = directory.join(FILE);
+    if !path.is_file() {
+        return Ok(None);
+    }
+    let text = std::fs::read_to_string(&path).with_context(|| path.display().to_string())?;
+    serde_json::from_str(&text).map(Some).with_context(|| path.display().to_string())
+}
+
+/// Writes it into a run directory.
+pub fn save(directory: &Path, capacity: &Capacity) -> Result<()> {
+    write(&directory.join(FILE), &serde_json::to_string_pretty(capacity)?)
+}
+
+/// Checks what is asked of a run that goes on against what it was begun with.
+pub fn resumed(directory: &Path, asked: Option<CapacityName>) -> Result<Option<Capacity>> {
+    let capacity = read(directory)?;
+    let begun = if capacity.is_some() { CapacityName::Auto } else { CapacityName::Preset };
+    if asked.is_some_and(|asked| asked != begun) {
+        bail!("the run to resume has other sizes; leave --capacity out, or start a new run with --out");
+    }
+    Ok(capacity)
+}
+
+/// Prunes a trained run whose sizes were chosen, saves it and says what that gave.
+pub fn prune(directory: &Path, trainer: &mut Trainer<'_>, checkpoint: &Path) -> Result<()> {
+    let Some(mut capacity) = read(directory)? else { return Ok(()) };
+    let pruned = trainer.prune();
+    trainer.save(checkpoint)?;
+    println!("pruned: {} of {} rows of the table; {} parameters", pruned.dropped, pruned.rows, pruned.parameters);
+    capacity.pruned = Some(pruned);
+    save(directory, &capacity)
+}

@@ -1,0 +1,86 @@
+//! `train --capacity auto` and `bench capacity` on a tiny capture.
+#![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
+
+mod common;
+
+use std::path::{Path, PathBuf};
+
+use common::{done, folder, refused, text};
+use serde_json::Value;
+
+fn capture(folder: &Path) -> PathBuf {
+    let out = folder.join("capture");
+    let size = ["--size", "32", "--frames", "4", "--eval-cameras", "1", "--eval-every", "2"];
+    done(&[&["synth", "--out", text(&out)], &size[..]].concat());
+    out
+}
+
+fn json(path: &Path) -> Value {
+    serde_json::from_str(&std::fs::read_to_string(path).unwrap()).unwrap()
+}
+
+fn config(run: &Path) -> toml::Table {
+    std::fs::read_to_string(run.join("config.toml")).unwrap().parse().unwrap()
+}
+
+#[test]
+fn sizes_are_chosen_once_recorded_kept_on_resuming_and_pruned_at_the_end() {
+    let folder = folder("capacity");
+    let (capture, run) = (capture(&folder), folder.join("run"));
+    let small = ["--preset", "fast", "--steps", "2", "--set", "patches=1", "--set", "patch_size=8"];
+    let auto = ["train", text(&capture), "--out", text(&run), "--capacity", "auto", "--set", "encoding.levels=5"];
+    let said = done(&[&auto[..], &small, &["--stop-after", "1"]].concat());
+    assert!(said.contains("capacity from the scene") && said.contains("encoding.log2_table_size"), "{said}");
+    let begun = json(&run.join("capacity.json"));
+    let choice = |key: &str| begun["choices"].as_array().unwrap().iter().find(|c| c["key"] == key);
+    assert!(choice("encoding.levels").is_none(), "{begun}: --set has the last word");
+    let size = choice("encoding.log2_table_size").unwrap();
+    assert!(size["chosen"].as_f64() < size["preset"].as_f64() && size["why"].as_str().unwrap().len() > 20);
+    let train = &config(&run)["train"];
+    assert_eq!(train["encoding"]["levels"].as_integer(), Some(5));
+    assert_eq!(train["encoding"]["log2_table_size"].as_integer(), size["chosen"].as_f64().map(|v| v as i64));
+    assert!(begun["pruned"].is_null());
+
+    refused(&["train", "--resume", "--out", text(&run), "--capacity", "preset"], &["--capacity"]);
+    let before = config(&run);
+    let said = done(&[&auto[..], &small, &["--resume"]].concat());
+    assert!(!said.contains("capacity from the scene") && said.contains("pruned: "), "{said}");
+    assert_eq!(config(&run), before);
+    let ended = json(&run.join("capacity.json"));
+    assert_eq!(ended["choices"], begun["choices"]);
+    let metrics = json(&run.join("metrics.json"));
+    assert!(metrics["parameters"].as_u64().unwrap() > 0);
+    assert_eq!(ended["pruned"]["parameters"], metrics["parameters"]);
+    let page = std::fs::read_to_string(run.join("report.html")).unwrap();
+    assert!(page.contains("sizes from the scene") && page.contains("Pruned after training"), "{page}");
+    // The pruned checkpoint is read like any other.
+    done(&["eval", text(&run), "--split", "novel-view"]);
+    assert_eq!(json(&run.join("metrics.json"))["parameters"], metrics["parameters"]);
+
+    std::fs::write(run.join("capacity.json"), "{\"measured\": 3}").unwrap();
+    refused(&["report", text(&run)], &["capacity.json"]);
+    refused(&["train", text(&capture), "--capacity", "auto", "--method", "prior"], &["prior", "--capacity"]);
+}
+
+#[test]
+fn the_bench_has_every_preset_and_its_scene_sized_form() {
+    let folder = folder("bench-capacity");
+    let (capture, out) = (capture(&folder), folder.join("out"));
+    let bench = ["bench", "capacity", text(&capture), "--quick", "--steps", "1", "--out", text(&out)];
+    let said = done(&bench);
+    assert!(said.contains("7 runs in"), "{said}");
+    let table = std::fs::read_to_string(out.join("capacity.md")).unwrap();
+    for row in ["| fast |", "| fast, auto |", "| balanced |", "| balanced, auto |", "| table 2^13 |", "| width 32 |"] {
+        assert!(table.contains(row), "{row}: {table}");
+    }
+    assert!(out.join("capacity-capture.svg").is_file() && out.join("capacity-capture.png").is_file());
+    let log = std::fs::read_to_string(out.join("bench.jsonl")).unwrap();
+    let lines: Vec<Value> = log.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+    let of = |name: &str| lines.iter().find(|l| l["name"] == name).unwrap();
+    let (fixed, auto) = (of("fast"), of("fast, auto"));
+    assert!(auto["error"].is_null() && auto["parameters"].as_u64() < fixed["parameters"].as_u64(), "{auto}");
+    assert!(auto["command"].as_str().unwrap().ends_with("--capacity auto"), "{auto}");
+    assert!(done(&bench).contains("0 runs in"));
+    refused(&["bench", "capacity", "/no/such/place"], &["/no/such/place"]);
+    refused(&["bench", "capacity", "--steps", "0"], &["--steps 0"]);
+}
