@@ -304,6 +304,10 @@ impl Config {
                 Preset::Paper | Preset::PublishedCode => (256, 8),
                 Preset::Fast | Preset::Balanced => (128, 4),
             };
+            if matches!(preset, Preset::Fast | Preset::Balanced) {
+                // The higher rate was chosen for a small F behind a hash grid.
+                config.rates.field = 2e-3;
+            }
         }
         config
     }

@@ -95,9 +95,9 @@ pub(crate) fn balanced() -> Config {
             correction_spacing: 4,
         },
         rates: RateConfig {
-            field: 2e-3,
+            field: 6e-3,
             vertices: 1e-4,
-            table: 1e-2,
+            table: 3e-2,
             motion: 1e-3,
             pose: 2e-4,
             final_fraction: 0.05,

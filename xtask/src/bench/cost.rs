@@ -15,7 +15,7 @@ use super::chart::{Line, Mark, Panel, Picture, Shape, Style};
 use super::difficulty::Difficulty;
 use super::job::{Job, Place};
 use super::runner::{Bench, Kind, Point};
-use super::scale::Scale;
+use super::scale::{Scale, number};
 
 /// Steps of each run; the median is over the second half, when buffers have grown to size.
 const STEPS: u64 = 10;
@@ -36,7 +36,7 @@ const GROWTHS: [Growth; 6] = [
     },
     Growth { name: "samples a ray", levels: &[24.0, 48.0, 96.0, 192.0, 384.0], set: |c, _, l| c.samples = l as usize },
     Growth {
-        name: "parameters of the hash grid",
+        name: "million parameters",
         levels: &[14.0, 16.0, 18.0, 20.0],
         set: |c, _, l| (c.encoding.log2_table_size, c.encoding.n_max) = (l as u32, 2048),
     },
@@ -162,7 +162,7 @@ fn grow(growth: &Growth, bench: &mut Bench, table: &mut String) -> Result<Vec<Pa
         }
         let at = match growth.name {
             "vertices" => line.outcome.vertices as f64,
-            "parameters of the hash grid" => line.outcome.parameters as f64,
+            "million parameters" => 1e-6 * line.outcome.parameters as f64,
             "pixels of a frame" => level * level,
             _ => level,
         };
@@ -175,8 +175,10 @@ fn grow(growth: &Growth, bench: &mut Bench, table: &mut String) -> Result<Vec<Pa
         let (step, megabytes) = (line.outcome.step_seconds, line.outcome.peak_rss_bytes as f64 / 1e6);
         let _ = writeln!(
             table,
-            "| {} | {at:.0} | {step:.3} | {exponent} | {megabytes:.0} | {:.0} |",
-            growth.name, line.outcome.live_samples
+            "| {} | {} | {step:.3} | {exponent} | {megabytes:.0} | {:.0} |",
+            growth.name,
+            number(at),
+            line.outcome.live_samples
         );
     }
     let panel = |what: &str, points: Vec<(f64, f64)>| {

@@ -40,7 +40,7 @@ pub const CHANGES: [Change; 20] = [
     change("field", "width 32", &["field.width=32"], true),
     change("field", "width 128", &["field.width=128"], false),
     change("depth", "depth 1", &["field.depth=1"], false),
-    change("rates", "rates × 3", &["rates.field=6e-3", "rates.table=3e-2"], true),
+    change("rates", "rates / 3", &["rates.field=2e-3", "rates.table=1e-2"], true),
     change("loss", "no perceptual term", &["loss.perceptual=0"], true),
     change("surface term", "no surface term", &["surface.surface_term=false", "surface.attention=false"], true),
 ];
