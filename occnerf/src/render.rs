@@ -211,7 +211,9 @@ mod tests {
         let body = smpl::BodyModel::embedded();
         let demo = crate::data::DemoConfig { size: 32, frames: 3, eval_cameras: 1, ..Default::default() };
         let capture = crate::data::demo(&demo, &body).unwrap();
-        let config = Config { steps: 40, ..Config::preset(Preset::Fast, Method::Occnerf) };
+        let mut config = Config { steps: 40, ..Config::preset(Preset::Fast, Method::Occnerf) };
+        // Dense enough for rays to end, however little was learnt.
+        config.field.density_scale *= 4.0;
         let scene = Scene::new(&capture, &body, &config).unwrap();
         let mut trainer = Trainer::new(&scene, config).unwrap();
         for _ in 0..40 {
