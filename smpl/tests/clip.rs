@@ -31,15 +31,15 @@ fn archive(name: &str, arrays: &[(&str, Vec<u8>)]) -> PathBuf {
     path
 }
 
-/// Two frames in which joint j has the rotation (j, 0, 0) / 100, then twice that.
-fn clip(joints: usize, rate: &str) -> PathBuf {
+/// Two frames in which joint j has the rotation (j, 0, 0) / 100, then twice that. Tests run at once: each has files of its own.
+fn clip(test: &str, joints: usize, rate: &str) -> PathBuf {
     let mut poses = vec![0.0; 6 * joints];
     for j in 0..joints {
         poses[3 * j] = j as f32 / 100.0;
         poses[3 * (joints + j)] = j as f32 / 50.0;
     }
     archive(
-        &format!("clip-{joints}.npz"),
+        &format!("clip-{test}-{joints}.npz"),
         &[
             ("poses", floats(&[2, 3 * joints], &poses)),
             ("trans", floats(&[2, 3], &[0.0, 1.0, 0.0, 0.0, 1.0, 4.0])),
@@ -54,7 +54,7 @@ fn clips_of_every_form_drive_bodies_of_every_form() {
     let x = |pose: &[Vec3]| pose.iter().map(|r| (100.0 * r.x).round() as i32).collect::<Vec<_>>();
     let all = |n: i32| (0..n).collect::<Vec<_>>();
     let on = |rate, clip_joints, body| {
-        let clip = MotionClip::load(&clip(clip_joints, rate)).unwrap();
+        let clip = MotionClip::load(&clip("rates", clip_joints, rate)).unwrap();
         assert_eq!((clip.num_frames(), clip.num_joints, clip.fps), (2, clip_joints, 120.0));
         x(&clip.at(0.0, body).0)
     };
@@ -72,7 +72,7 @@ fn clips_of_every_form_drive_bodies_of_every_form() {
 
 #[test]
 fn frames_are_interpolated_and_held_at_the_ends() {
-    let clip = MotionClip::load(&clip(24, "fps")).unwrap();
+    let clip = MotionClip::load(&clip("ends", 24, "fps")).unwrap();
     assert!((clip.duration() - 1.0 / 120.0).abs() < 1e-9);
     let (pose, placement) = clip.at(0.5 / 120.0, 24);
     assert!((pose[20].x - 0.3).abs() < 1e-6 && pose[20].y == 0.0);
