@@ -253,7 +253,8 @@ fn pareto(arguments: &ParetoArguments) -> Result<()> {
     let mut text = String::new();
     for scene in &scenes {
         let lines = pareto::run(&on.sweep(scene, steps, *seed, *quick), &mut bench)?;
-        pareto::charts(scene, &lines, &out.join(format!("pareto-{}", train::scene_name(Some(scene)))))?;
+        let name = train::scene_name(Some(scene));
+        pareto::charts(&name, &lines, &out.join(format!("pareto-{name}")))?;
         text.push_str(&format!("## {scene}\n\n{}\n", pareto::table(&lines)));
     }
     finish(&bench, &text, "pareto.md")?;
@@ -272,7 +273,8 @@ fn capacity_bench(arguments: &CapacityArguments) -> Result<()> {
     for scene in &scenes {
         let points = capacity::points(&on.sweep(scene, steps, *seed, *quick), &on.read(scene)?, *paper)?;
         let lines = capacity::run(points, &mut bench)?;
-        capacity::chart(scene, &lines, &out.join(format!("capacity-{}", train::scene_name(Some(scene)))))?;
+        let name = train::scene_name(Some(scene));
+        capacity::chart(&name, &lines, &out.join(format!("capacity-{name}")))?;
         text.push_str(&format!("## {scene}\n\n{}\n", capacity::table(&lines)));
     }
     finish(&bench, &text, "capacity.md")
