@@ -174,7 +174,10 @@ fn parse<'b>(path: &Path, bytes: &'b [u8]) -> Result<(HashMap<String, String>, S
     let found = |key: &str| header.get(key).map_or("nothing", String::as_str).to_owned();
     if found("format") != FORMAT || ![VERSION, PRUNED].contains(&found("version").as_str()) {
         let (format, version) = (found("format"), found("version"));
-        return Err(file(path, format!("is {format} version {version}, expected {FORMAT} version {VERSION}")));
+        return Err(file(
+            path,
+            format!("is {format} version {version}, expected {FORMAT} version {VERSION} or {PRUNED}"),
+        ));
     }
     Ok((header, tensors))
 }

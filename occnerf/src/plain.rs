@@ -1,7 +1,10 @@
 //! A training step written straight from the definitions, in f64 and sample by sample, to test the fast one against: from where
 //! samples lie to the loss, with the gradients taken by central differences.
 
+use std::ops::Range;
+
 use glam::{DVec3, Vec3};
+use hashgrid::HashGrid;
 use testkit::oracle;
 use visibility::VisibilityCounts;
 
@@ -24,7 +27,7 @@ impl Plain<'_, '_> {
     fn encode<const D: usize>(&self, table: &[f32], points: &[[f32; D]]) -> Vec<Vec<f64>> {
         let encoding = &self.trainer.config.encoding;
         let flat: Vec<f64> = points.iter().flatten().map(|&x| f64::from(x)).collect();
-        let (ranges, resolutions): (Vec<_>, Vec<u32>) = match &self.trainer.field.encoder {
+        let (ranges, resolutions) = match &self.trainer.field.encoder {
             Encoder::Frequency => {
                 let row = |x: &[f64]| {
                     let bands = (0..10).flat_map(|band| {
@@ -36,12 +39,8 @@ impl Plain<'_, '_> {
                 };
                 return flat.chunks(3).map(row).collect();
             }
-            Encoder::Point(grid) => {
-                (grid.resolutions().iter().enumerate()).map(|(l, &n)| (grid.level_range(l), n)).unzip()
-            }
-            Encoder::Surface(grid, _) => {
-                (grid.resolutions().iter().enumerate()).map(|(l, &n)| (grid.level_range(l), n)).unzip()
-            }
+            Encoder::Point(grid) => levels(grid),
+            Encoder::Surface(grid, _) => levels(grid),
         };
         let (log2, features) = (encoding.log2_table_size, encoding.features);
         let mut padded = vec![0.0; (resolutions.len() << log2) * features];
@@ -113,6 +112,11 @@ impl Plain<'_, '_> {
     }
 }
 
+/// Where each level lies in the table, and its cells an axis.
+fn levels<const D: usize>(grid: &HashGrid<D>) -> (Vec<Range<usize>>, Vec<u32>) {
+    grid.resolutions().iter().enumerate().map(|(l, &n)| (grid.level_range(l), n)).unzip()
+}
+
 fn tiny(method: Method, motion: MotionKind, seed: u64) -> Config {
     let mut config = Config::preset(Preset::Fast, method);
     (config.seed, config.patches, config.patch_size, config.samples) = (seed, 2, 12, 20);
@@ -164,24 +168,18 @@ fn a_step_agrees_with_one_written_straight_from_the_definitions() {
         }
         for direction in 0..3 {
             let mut random = Stream::new(&[seed, 22, direction]);
-            let mut moved = |from: &[f32], h: f32, on: bool| -> [Vec<f32>; 2] {
-                let step: Vec<f32> = from.iter().map(|_| if on { h * random.normal() } else { 0.0 }).collect();
-                [1.0, -1.0].map(|sign| from.iter().zip(&step).map(|(x, s)| x + sign * s).collect())
-            };
-            for part in 0..2 {
-                let (fields, tables) = (moved(field, 1e-4, part == 0), moved(table, 1e-4, part == 1));
-                if (part == 0 && field.is_empty()) || (part == 1 && table.is_empty()) {
-                    continue;
+            for part in [0, 1].into_iter().filter(|&part| ![field, table][part].is_empty()) {
+                let from = [field, table][part];
+                let mut step: Vec<f32> = from.iter().map(|_| 1e-4 * random.normal()).collect();
+                if part == 0 {
+                    trainer.field.mlp.clear_padding(&mut step);
                 }
-                let padding = |x: &[f32]| {
-                    let mut x = x.to_vec();
-                    trainer.field.mlp.clear_padding(&mut x);
-                    x
-                };
-                let numeric =
-                    plain.step(&padding(&fields[0]), &tables[0]).0 - plain.step(&padding(&fields[1]), &tables[1]).0;
-                let (high, low) = if part == 0 { (&fields[0], &fields[1]) } else { (&tables[0], &tables[1]) };
-                let each = gradients[part].iter().zip(high.iter().zip(low));
+                let moved = |sign: f32| from.iter().zip(&step).map(|(x, s)| x + sign * s).collect::<Vec<f32>>();
+                let (high, low) = (moved(1.0), moved(-1.0));
+                let loss =
+                    |moved: &[f32]| if part == 0 { plain.step(moved, table).0 } else { plain.step(field, moved).0 };
+                let numeric = loss(&high) - loss(&low);
+                let each = gradients[part].iter().zip(high.iter().zip(&low));
                 let analytic: f64 = each.map(|(g, (h, l))| f64::from(*g) * (f64::from(*h) - f64::from(*l))).sum();
                 let scale = 1e-2 * numeric.abs().max(1e-6);
                 assert!((numeric - analytic).abs() < scale, "{method:?} {motion:?} part {part}: {numeric} {analytic}");

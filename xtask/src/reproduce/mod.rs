@@ -90,10 +90,11 @@ pub fn reproduce(arguments: &ReproduceArguments) -> Result<()> {
     for (index, scene) in scenes.iter().enumerate() {
         println!("scene {} of {}: {scene}", index + 1, scenes.len());
         let directory = arguments.out.join(directory_name(scenes, index));
+        let experiment = Experiment { arguments, lpips: lpips.as_ref(), scene, minutes };
         if arguments.robustness {
-            robustness(arguments, lpips.as_ref(), scene, &directory.join("robustness"), minutes)?;
+            experiment.robustness(&directory.join("robustness"))?;
         } else {
-            one_scene(arguments, lpips.as_ref(), scene, &directory, minutes)?;
+            experiment.table(&directory)?;
         }
     }
     Ok(())
@@ -108,59 +109,90 @@ fn directory_name(scenes: &[String], index: usize) -> String {
     }
 }
 
-fn one_scene(
-    arguments: &ReproduceArguments,
-    lpips: Option<&Lpips>,
-    scene: &str,
-    directory: &Path,
+/// What is asked for one scene.
+struct Experiment<'a> {
+    arguments: &'a ReproduceArguments,
+    lpips: Option<&'a Lpips>,
+    scene: &'a str,
+    /// That everything may take.
     minutes: f64,
-) -> Result<()> {
-    let source = source::load(Some(scene), arguments.body.as_deref(), &arguments.load.options())?;
-    std::fs::create_dir_all(directory)?;
-    let rows = arguments.rows(|_| true);
-    let plan = arguments.plan(directory, &source, &rows, minutes)?;
-    println!("{plan}");
-    let summary = run_rows(arguments, lpips, &rows, &plan, &source, directory)?;
-    println!("\n{}", summary.markdown());
-    for name in ["reproduce.md", "reproduce.json", "reproduce.png"].map(|name| directory.join(name)) {
-        if name.is_file() {
-            println!("written: {}", name.display());
-        }
-    }
-    Ok(())
 }
 
-fn robustness(
-    arguments: &ReproduceArguments,
-    lpips: Option<&Lpips>,
-    scene: &str,
-    directory: &Path,
-    minutes: f64,
-) -> Result<()> {
-    let options = arguments.load.options();
-    ensure!(options.wrong == Wrong::default(), "--robustness goes through its own errors: leave --wrong-… out");
-    let rows = arguments.rows(|row| MAIN.contains(&row.name));
-    std::fs::create_dir_all(directory)?;
-    let mut plan = None;
-    let mut levels = Vec::new();
-    for (name, wrong) in LEVELS {
-        println!("{name}");
-        let source = source::load(Some(scene), arguments.body.as_deref(), &LoadOptions { wrong, ..options.clone() })?;
-        let plan = match &mut plan {
-            Some(plan) => plan,
-            none => none.insert(arguments.plan(directory, &source, &rows, minutes / LEVELS.len() as f64)?),
-        };
-        println!("{plan}");
-        let at = directory.join(name);
-        std::fs::create_dir_all(&at)?;
-        levels.push((name, run_rows(arguments, lpips, &rows, plan, &source, &at)?.scores()));
-        let text = summary::by_level(scene, &levels);
-        run::write(&directory.join("robustness.md"), &text)?;
-        run::write(&directory.join("robustness.json"), &serde_json::to_string_pretty(&levels)?)?;
+impl Experiment<'_> {
+    fn load(&self, options: &LoadOptions) -> Result<Source> {
+        source::load(Some(self.scene), self.arguments.body.as_deref(), options)
     }
-    println!("\n{}", summary::by_level(scene, &levels));
-    println!("written: {}", directory.join("robustness.md").display());
-    Ok(())
+
+    /// The paper's table.
+    fn table(&self, directory: &Path) -> Result<()> {
+        let source = self.load(&self.arguments.load.options())?;
+        std::fs::create_dir_all(directory)?;
+        let rows = self.arguments.rows(|_| true);
+        let plan = self.arguments.plan(directory, &source, &rows, self.minutes)?;
+        println!("{plan}");
+        let summary = self.run_rows(&rows, &plan, &source, directory)?;
+        println!("\n{}", summary.markdown());
+        for name in ["reproduce.md", "reproduce.json", "reproduce.png"].map(|name| directory.join(name)) {
+            if name.is_file() {
+                println!("written: {}", name.display());
+            }
+        }
+        Ok(())
+    }
+
+    /// The main rows at each level of wrongness.
+    fn robustness(&self, directory: &Path) -> Result<()> {
+        let options = self.arguments.load.options();
+        ensure!(options.wrong == Wrong::default(), "--robustness goes through its own errors: leave --wrong-… out");
+        let rows = self.arguments.rows(|row| MAIN.contains(&row.name));
+        std::fs::create_dir_all(directory)?;
+        let mut plan = None;
+        let mut levels = Vec::new();
+        for (name, wrong) in LEVELS {
+            println!("{name}");
+            let source = self.load(&LoadOptions { wrong, ..options.clone() })?;
+            let plan = match &mut plan {
+                Some(plan) => plan,
+                none => {
+                    none.insert(self.arguments.plan(directory, &source, &rows, self.minutes / LEVELS.len() as f64)?)
+                }
+            };
+            println!("{plan}");
+            let at = directory.join(name);
+            std::fs::create_dir_all(&at)?;
+            levels.push((name, self.run_rows(&rows, plan, &source, &at)?.scores()));
+            let text = summary::by_level(self.scene, &levels);
+            run::write(&directory.join("robustness.md"), &text)?;
+            run::write(&directory.join("robustness.json"), &serde_json::to_string_pretty(&levels)?)?;
+        }
+        println!("\n{}", summary::by_level(self.scene, &levels));
+        println!("written: {}", directory.join("robustness.md").display());
+        Ok(())
+    }
+
+    /// Trains and scores every row that is not finished, with all its seeds.
+    fn run_rows<'a>(&self, rows: &[&Row], plan: &'a Plan, source: &'a Source, directory: &Path) -> Result<Summary<'a>> {
+        let mut summary = Summary::new(source, plan);
+        for row in rows {
+            for seed in 1..=row.runs(self.arguments.seeds) {
+                let name = if row.learns() { format!("{}-s{seed}", row.name) } else { row.name.to_owned() };
+                let mut run = RunConfig {
+                    scene: source.scene.clone(),
+                    body: source.body.clone(),
+                    load: source.load.clone(),
+                    train: row.config(self.arguments.preset.into(), seed, plan),
+                };
+                if let Some(path) = &self.arguments.perceptual_weights {
+                    run.train.loss.perceptual_weights.clone_from(path);
+                }
+                let metrics = run_unless_finished(&directory.join(&name), &name, &run, source, self.lpips)?;
+                summary.add(row, &directory.join(&name), metrics);
+            }
+            // After every row, so that an end before the last leaves a table.
+            summary.write(directory)?;
+        }
+        Ok(summary)
+    }
 }
 
 impl ReproduceArguments {
@@ -172,35 +204,4 @@ impl ReproduceArguments {
     fn plan(&self, directory: &Path, source: &Source, rows: &[&Row], minutes: f64) -> Result<Plan> {
         Plan::read_or_make(directory, source, rows, self.preset.into(), self.seeds, minutes, self.steps)
     }
-}
-
-/// Trains and scores every row that is not finished, with all its seeds.
-fn run_rows<'a>(
-    arguments: &ReproduceArguments,
-    lpips: Option<&Lpips>,
-    rows: &[&Row],
-    plan: &'a Plan,
-    source: &'a Source,
-    directory: &Path,
-) -> Result<Summary<'a>> {
-    let mut summary = Summary::new(source, plan);
-    for row in rows {
-        for seed in 1..=row.runs(arguments.seeds) {
-            let name = if row.learns() { format!("{}-s{seed}", row.name) } else { row.name.to_owned() };
-            let mut run = RunConfig {
-                scene: source.scene.clone(),
-                body: source.body.clone(),
-                load: source.load.clone(),
-                train: row.config(arguments.preset.into(), seed, plan),
-            };
-            if let Some(path) = &arguments.perceptual_weights {
-                run.train.loss.perceptual_weights.clone_from(path);
-            }
-            let metrics = run_unless_finished(&directory.join(&name), &name, &run, source, lpips)?;
-            summary.add(row, &directory.join(&name), metrics);
-        }
-        // After every row, so that an end before the last leaves a table.
-        summary.write(directory)?;
-    }
-    Ok(summary)
 }
