@@ -9,6 +9,7 @@ use crate::Error;
 use crate::config::Config;
 use crate::parameters::{PARTS, Part};
 use crate::scene::Scene;
+use crate::shell::Shell;
 use crate::trainer::Trainer;
 
 const FORMAT: &str = "occnerf-checkpoint";
@@ -16,6 +17,8 @@ const VERSION: &str = "1";
 /// Of pruned models: a bit for each row of the table, lowest first in each byte, and the rows whose bit is set.
 const PRUNED: &str = "2";
 const KEPT: &str = "table.kept";
+/// Where `motion.shell_interval` is not 0: how far the field reaches over each vertex.
+const SHELL: &str = "shell";
 /// Larger files are not ours: the paper's table with both moments has 0.3 GB.
 const MAX_BYTES: u64 = 4 << 30;
 /// Far more than anybody trains, and far from where counting on would overflow.
@@ -48,6 +51,13 @@ impl Trainer<'_> {
         if let Some(kept) = kept {
             let byte = |bits: &[bool]| bits.iter().rev().fold(0, |byte, &bit| byte << 1 | u8::from(bit));
             arrays.push((KEPT.to_owned(), kept.chunks(8).map(byte).collect(), Dtype::U8));
+        }
+        if self.config.motion.shell_interval > 0 {
+            arrays.push((
+                SHELL.to_owned(),
+                self.shell.vertices.iter().flat_map(|v| v.to_le_bytes()).collect(),
+                Dtype::F32,
+            ));
         }
         let counts = self.counts.counts().iter().flat_map(|c| c.to_le_bytes()).collect();
         arrays.push(("visibility_counts".to_owned(), counts, Dtype::U64));
@@ -116,6 +126,14 @@ impl<'a> Trainer<'a> {
         let counts = tensor(path, &tensors, "visibility_counts", Dtype::U64, scene.canonical.vertices.len())?;
         let counts = counts.chunks_exact(8).map(|b| b.iter().rev().fold(0u64, |sum, &byte| sum << 8 | u64::from(byte)));
         trainer.counts = visibility::VisibilityCounts::from_counts(counts.collect());
+        if trainer.config.motion.shell_interval > 0 {
+            let ends = floats(path, &tensors, SHELL, scene.canonical.vertices.len())?;
+            let whole = trainer.shell.farthest;
+            if let Some(at) = ends.iter().position(|end| !(0.0..=whole).contains(end)) {
+                return Err(file(path, format!("`{SHELL}` is {} at {at}, expected 0 to {whole}", ends[at])));
+            }
+            trainer.shell = Shell::new(scene, ends);
+        }
         trainer.refresh_volume();
         Ok(trainer)
     }

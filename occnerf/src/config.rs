@@ -207,6 +207,10 @@ pub struct MotionConfig {
     /// Frames from one knot of the learnt pose corrections to the next; 0 leaves the prior's poses as they are, and the
     /// volume kinds ask for that.
     pub correction_spacing: usize,
+    /// Steps from one look at how far from the prior's surface the field has any density to the next: what lies farther out
+    /// is skipped until then. 0 never looks and keeps every sample, and the volume kinds ask for that.
+    #[serde(default)]
+    pub shell_interval: usize,
 }
 
 /// Weights of the losses.

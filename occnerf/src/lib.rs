@@ -53,6 +53,7 @@ mod random;
 mod render;
 mod samples;
 mod scene;
+mod shell;
 mod step;
 mod times;
 mod trainer;

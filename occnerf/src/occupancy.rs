@@ -3,8 +3,8 @@
 use glam::{IVec3, Vec3};
 use volrender::Aabb;
 
-/// Cells an axis at most; a body with outstretched arms at 4 cm needs about 50.
-const MAX_CELLS: f32 = 96.0;
+/// Cells an axis at most; a body with outstretched arms at 2 cm needs about 100.
+const MAX_CELLS: f32 = 128.0;
 
 /// Marks a superset of the points within a margin of a triangle mesh, or enclosed by it and not too deep.
 #[derive(Clone, Debug, Default)]
@@ -18,9 +18,18 @@ pub(crate) struct Occupancy {
 }
 
 impl Occupancy {
-    /// Rebuilds in place for `vertices` (V) and `faces` (F), which may be open: cells within `margin` of a triangle
-    /// seal the inside off from the outside. Inside, points down to `depth` below the surface are wanted.
-    pub fn rebuild(&mut self, vertices: &[Vec3], faces: &[[u32; 3]], margin: f32, depth: f32, cell: f32) {
+    /// Rebuilds in place for `vertices` (V) and `faces` (F), which may be open: the cells at a triangle seal the inside off
+    /// from the outside. Wanted are points outside within the `margins` (F) of the triangles they are closest to (where they
+    /// are closest to an edge or a corner, of all triangles there), none above `margin`, and inside down to `depth`.
+    pub fn rebuild(
+        &mut self,
+        vertices: &[Vec3],
+        faces: &[[u32; 3]],
+        margins: &[f32],
+        margin: f32,
+        depth: f32,
+        cell: f32,
+    ) {
         let low = vertices.iter().copied().fold(Vec3::INFINITY, Vec3::min);
         let high = vertices.iter().copied().fold(Vec3::NEG_INFINITY, Vec3::max);
         self.live.clear();
@@ -37,10 +46,16 @@ impl Occupancy {
         self.per_cell = 1.0 / cell;
         self.size = ((high - low + 2.0 * border) * self.per_cell).ceil().as_ivec3().max(IVec3::ONE);
         self.live.resize((self.size.x * self.size.y * self.size.z) as usize, false);
-        for face in faces {
+        // Deeper than any margin: the whole inside, sealed off.
+        let fills = depth > margin;
+        let depth = if fills { 0.0 } else { depth };
+        for (face, &margin) in faces.iter().zip(margins) {
             let corners = face.map(|v| vertices[v as usize]);
-            let first = self.cell(corners[0].min(corners[1]).min(corners[2]) - Vec3::splat(margin));
-            let last = self.cell(corners[0].max(corners[1]).max(corners[2]) + Vec3::splat(margin));
+            let normal = (corners[1] - corners[0]).cross(corners[2] - corners[0]).normalize_or_zero();
+            let ahead = (margin * support(normal)).max(depth * support(-normal));
+            let behind = (margin * support(-normal)).max(depth * support(normal));
+            let first = self.cell(corners[0].min(corners[1]).min(corners[2]) - behind);
+            let last = self.cell(corners[0].max(corners[1]).max(corners[2]) + ahead);
             let (first, last) = (first.max(IVec3::ZERO), last.min(self.size - IVec3::ONE));
             for z in first.z..=last.z {
                 for y in first.y..=last.y {
@@ -49,8 +64,7 @@ impl Occupancy {
                 }
             }
         }
-        // What is not deeper than the margin is marked already.
-        if depth > margin {
+        if fills {
             self.fill_enclosed();
         }
     }
@@ -108,6 +122,17 @@ impl Occupancy {
     }
 }
 
+/// How far the unit vectors within 60° of `normal` reach along each axis, at least 0. A point lies in the direction of the
+/// normal from a closest point inside a face, and between the normals around from one on an edge or a corner: within 60° of
+/// one of them unless the surface turns by more than 120° there.
+fn support(normal: Vec3) -> Vec3 {
+    const COS: f32 = 0.5;
+    const SIN: f32 = 0.866_025_4;
+    // cos(a − 60°) for the angle a between the axis and the normal, where that is larger than 60°.
+    let turned = COS * normal + SIN * (Vec3::ONE - normal * normal).max(Vec3::ZERO).map(f32::sqrt);
+    Vec3::select(normal.cmpge(Vec3::splat(COS)), Vec3::ONE, turned.max(Vec3::ZERO))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -123,7 +148,7 @@ mod tests {
             queries in prop::collection::vec(testkit::strategy::vec3(1.6), 60)
         ) {
             let mut occupancy = Occupancy::default();
-            occupancy.rebuild(&mesh.vertices, &mesh.faces, margin, 10.0, cell);
+            occupancy.rebuild(&mesh.vertices, &mesh.faces, &vec![margin; mesh.faces.len()], margin, 10.0, cell);
             for q in queries {
                 let (_, _, distance) = oracle::closest_point(&mesh.vertices, &mesh.faces, q);
                 if distance < f64::from(margin) || oracle::inside(&mesh.vertices, &mesh.faces, q) {
@@ -135,14 +160,42 @@ mod tests {
         }
     }
 
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(24))]
+
+        #[test]
+        fn every_point_within_its_faces_margin_or_the_depth_is_live(
+            mesh in testkit::strategy::bumpy_sphere(), near in 0.0f32..0.3, far in 0.0f32..0.3,
+            depth in 0.0f32..0.3, cell in 0.02f32..0.1,
+            places in prop::collection::vec((any::<prop::sample::Index>(), -0.3f32..0.3, testkit::strategy::vec3(0.1)), 200)
+        ) {
+            // One margin above, another below: they differ at few edges.
+            let above = |face: &[u32; 3]| face.iter().map(|&v| mesh.vertices[v as usize].z).sum::<f32>() > 0.0;
+            let margins: Vec<f32> = mesh.faces.iter().map(|f| if above(f) { near } else { far }).collect();
+            let mut occupancy = Occupancy::default();
+            occupancy.rebuild(&mesh.vertices, &mesh.faces, &margins, 0.3, depth, cell);
+            let distance = surface_query::MeshDistance::new(&mesh.vertices, &mesh.faces).unwrap();
+            for (face, along, shift) in places {
+                let [a, b, c] = mesh.faces[face.index(mesh.faces.len())].map(|v| mesh.vertices[v as usize]);
+                let q = (a + b + c) / 3.0 + along * (b - a).cross(c - a).normalize_or_zero() + shift;
+                let Some(closest) = distance.closest(q, f32::INFINITY) else { continue };
+                let (d, margin) = (closest.signed_distance, margins[closest.face as usize]);
+                let least = if q.z.abs() < 0.5 { near.min(far) } else { margin };
+                if d <= margin.min(least) && -d <= depth {
+                    prop_assert!(occupancy.is_live(q), "{q} at {d}: margin {margin}, depth {depth}");
+                }
+            }
+        }
+    }
+
     #[test]
     fn far_points_and_empty_meshes_are_dead() {
         let mut occupancy = Occupancy::default();
         assert!(!occupancy.is_live(Vec3::ZERO));
-        occupancy.rebuild(&[], &[], 0.1, 1.0, 0.1);
+        occupancy.rebuild(&[], &[], &[], 0.1, 1.0, 0.1);
         assert!(!occupancy.is_live(Vec3::ZERO) && occupancy.region().is_none());
         let mesh = testkit::mesh::icosphere(1);
-        occupancy.rebuild(&mesh.vertices, &mesh.faces, 0.1, 2.0, 0.1);
+        occupancy.rebuild(&mesh.vertices, &mesh.faces, &vec![0.1; mesh.faces.len()], 0.1, 2.0, 0.1);
         assert!(occupancy.is_live(Vec3::ZERO) && !occupancy.is_live(Vec3::splat(1.4)));
         assert!(!occupancy.is_live(Vec3::splat(f32::NAN)) && !occupancy.is_live(Vec3::splat(1e30)));
     }

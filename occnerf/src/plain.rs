@@ -122,7 +122,7 @@ fn tiny(method: Method, motion: MotionKind, seed: u64) -> Config {
     (config.seed, config.patches, config.patch_size, config.samples) = (seed, 2, 12, 20);
     (config.field.width, config.field.depth) = (24, 2);
     (config.encoding.levels, config.encoding.log2_table_size, config.encoding.n_max) = (5, 11, 96);
-    (config.motion.kind, config.motion.correction_spacing) = (motion, 0);
+    (config.motion.kind, config.motion.correction_spacing, config.motion.shell_interval) = (motion, 0, 0);
     // The perceptual term has an oracle of its own.
     (config.loss.perceptual, config.loss.beta) = (0.0, 60.0);
     config

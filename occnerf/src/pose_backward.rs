@@ -127,8 +127,8 @@ mod tests {
             // Which points live, and on which face, is decided once: the value jumps where that changes.
             let mut stage = Stage::new(&scene).unwrap();
             let mut trace = |posed: &Posed, group: &mut Group| -> Vec<usize> {
-                stage.set(&scene, posed, &config);
-                let tracer = trainer.tracer(&stage, frame, posed);
+                stage.set(&scene, posed, &trainer.shell, &config);
+                let tracer = trainer.tracer(&stage, &trainer.shell, frame, posed);
                 group.samples.clear();
                 let live = (0..points.len()).filter(|&i| group.samples.push_point(&tracer, points[i]));
                 let live = live.collect();

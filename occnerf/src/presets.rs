@@ -41,6 +41,7 @@ pub(crate) fn paper() -> Config {
             falloff: 0.02,
             depth: 0.3,
             correction_spacing: 0,
+            shell_interval: 0,
         },
         loss: LossConfig {
             mse: 0.2,
@@ -93,6 +94,7 @@ pub(crate) fn balanced() -> Config {
             falloff: 0.02,
             depth: 0.04,
             correction_spacing: 4,
+            shell_interval: 32,
         },
         rates: RateConfig {
             field: 6e-3,

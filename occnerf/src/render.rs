@@ -13,6 +13,7 @@ use crate::parameters::Part;
 use crate::prior::VertexColors;
 use crate::samples::{March, Stage};
 use crate::scene::{PreparedFrame, Scene};
+use crate::shell::Shell;
 use crate::trainer::{Trainer, composite_group, pixel_ray};
 use crate::vertices::VertexCode;
 
@@ -41,15 +42,17 @@ pub fn view_of(scene: &Scene, camera: &Camera, posed: Posed) -> PreparedFrame {
 pub struct FieldRenderer<'a> {
     trainer: &'a Trainer<'a>,
     code: VertexCode,
+    shell: Shell,
     stage: Stage,
 }
 
 impl<'a> FieldRenderer<'a> {
-    /// Encodes the vertices once for every picture to come.
+    /// Encodes the vertices once for every picture to come, and looks where the field is empty.
     pub fn new(trainer: &'a Trainer<'a>) -> Result<Self, Error> {
         let mut code = VertexCode::default();
         trainer.encode_vertices(&mut code);
-        Ok(Self { trainer, code, stage: Stage::new(trainer.scene)? })
+        let shell = trainer.measure_shell(&code.features);
+        Ok(Self { trainer, code, shell, stage: Stage::new(trainer.scene)? })
     }
 }
 
@@ -84,8 +87,8 @@ impl Renderer for FieldRenderer<'_> {
     fn render(&mut self, frame: &PreparedFrame, background: Vec3) -> Result<Rendering, Error> {
         let trainer = self.trainer;
         let posed = trainer.corrected(frame);
-        self.stage.set(trainer.scene, &posed, &trainer.config);
-        let tracer = trainer.tracer(&self.stage, frame, &posed);
+        self.stage.set(trainer.scene, &posed, &self.shell, &trainer.config);
+        let tracer = trainer.tracer(&self.stage, &self.shell, frame, &posed);
         let (field, table) = (trainer.parameters.get(Part::Field), trainer.parameters.get(Part::Table));
         let features = &self.code.features;
         paint(frame, background, Scratch::default, |scratch, row, columns| {
@@ -223,8 +226,9 @@ mod tests {
         let mut renderer = FieldRenderer::new(&trainer).unwrap();
         let picture = renderer.render(frame, background).unwrap();
         let posed = trainer.corrected(frame);
-        renderer.stage.set(&scene, &posed, &trainer.config);
-        let tracer = trainer.tracer(&renderer.stage, frame, &posed);
+        renderer.shell = Shell::whole(&scene, &trainer.config);
+        renderer.stage.set(&scene, &posed, &renderer.shell, &trainer.config);
+        let tracer = trainer.tracer(&renderer.stage, &renderer.shell, frame, &posed);
         let mut all = Scratch::default();
         all.group.samples.clear();
         for pixel in 0..32 * 32 {

@@ -10,8 +10,9 @@ use crate::config::{Config, DistanceKind};
 use crate::occupancy::Occupancy;
 use crate::random::Stream;
 use crate::scene::Scene;
+use crate::shell::Shell;
 
-const CELL: f32 = 0.04;
+const CELL: f32 = 0.02;
 /// Σ w below which the weight volume says nothing.
 const VOLUME_THRESHOLD: f32 = 1e-3;
 
@@ -27,12 +28,12 @@ impl Stage {
         Ok(Self { mesh, occupancy: Occupancy::default() })
     }
 
-    pub fn set(&mut self, scene: &Scene, posed: &Posed, config: &Config) {
-        let reach = config.motion.margin + config.motion.falloff;
+    pub fn set(&mut self, scene: &Scene, posed: &Posed, shell: &Shell, config: &Config) {
+        let (margin, depth) = (config.motion.margin + config.motion.falloff, config.motion.depth);
         let (mesh, occupancy) = (&mut self.mesh, &mut self.occupancy);
         rayon::join(
             || mesh.refit(&posed.vertices),
-            || occupancy.rebuild(&posed.vertices, &scene.model.faces, reach, config.motion.depth, CELL),
+            || occupancy.rebuild(&posed.vertices, &scene.model.faces, &shell.faces, margin, depth, CELL),
         );
     }
 }
@@ -46,6 +47,7 @@ pub(crate) struct Tracer<'a> {
     pub posed: &'a Posed,
     pub to_canonical: &'a [Affine3A],
     pub volume: Option<&'a WeightVolume>,
+    pub shell: &'a Shell,
     /// Whether neighbours are wanted at all; the point-based methods do without unless v̂ is blended.
     pub neighbours: bool,
     /// Whether [`Samples::faces`] are wanted; the surface motion alone has them.
@@ -147,6 +149,22 @@ impl Samples {
         self.starts.push(self.t.len());
     }
 
+    /// Appends a point of the canonical space whose surface is known, as of a ray of no length.
+    pub fn push_canonical(&mut self, scene: &Scene, at: Vec3, closest: Vec3, distance: f32, neighbours: bool) {
+        if neighbours {
+            let first = self.neighbours.len();
+            self.neighbours.resize(first + scene.query.neighbours_per_query(), 0);
+            scene.query.neighbours(at, &mut self.neighbours[first..]);
+        }
+        self.t.push(0.0);
+        self.delta.push(0.0);
+        self.likelihood.push(1.0);
+        self.world.push(at);
+        self.canonical.push(at);
+        self.closest.push(closest);
+        self.distance.push(distance);
+    }
+
     /// Appends one point of space, if it lives.
     #[cfg(test)]
     pub fn push_point(&mut self, tracer: &Tracer<'_>, point: Vec3) -> bool {
@@ -180,12 +198,15 @@ impl Samples {
             let mesh = &tracer.stage.mesh;
             // Rounding may put the face itself a hair beyond its own distance.
             let bound = near.map_or(f32::INFINITY, |face| 1.000_01 * mesh.distance_to_face(point, face) + 1e-6);
+            let farthest = tracer.shell.farthest.max(motion.depth);
             let Some(closest) = mesh.closest(point, farthest.min(bound)) else {
                 return (false, None);
             };
             looked_up = Some(closest.face);
             mapped_by = Some((closest.face, closest.barycentric));
-            if closest.signed_distance > reach || closest.signed_distance < -motion.depth {
+            if closest.signed_distance > tracer.shell.faces[closest.face as usize]
+                || closest.signed_distance < -motion.depth
+            {
                 return (false, looked_up);
             }
             let field = SurfaceMotion { margin: motion.margin, falloff: motion.falloff };

@@ -24,7 +24,7 @@ const JITTER: u64 = 0x4A49_5454;
 impl Trainer<'_> {
     /// Traces, encodes, evaluates and composites the rays of a group.
     pub(crate) fn forward(&self, state: &mut GroupState, batch: &Batch, frame: &PreparedFrame, posed: &Posed) {
-        let tracer = self.tracer(&self.stage, frame, posed);
+        let tracer = self.tracer(&self.stage, &self.shell, frame, posed);
         state.group.times = StepTimes::default();
         let mut watch = Stopwatch::start();
         state.group.samples.clear();

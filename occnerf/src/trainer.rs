@@ -18,6 +18,7 @@ use crate::lpips::Lpips;
 use crate::parameters::{PARTS, Parameters, Part};
 use crate::samples::{Stage, Tracer};
 use crate::scene::{PreparedFrame, Scene};
+use crate::shell::Shell;
 use crate::times::{StepTimes, Stopwatch};
 use crate::vertices::VertexCode;
 
@@ -65,6 +66,8 @@ pub struct Trainer<'a> {
     pub(crate) lpips: Option<Lpips>,
     pub(crate) steps_done: u64,
     pub(crate) stage: Stage,
+    /// Where the field ended when it was last looked at.
+    pub(crate) shell: Shell,
     pub(crate) batch: Batch,
     pub(crate) groups: Vec<GroupState>,
     pub(crate) vertex_code: VertexCode,
@@ -118,6 +121,7 @@ impl<'a> Trainer<'a> {
             parameters: Parameters::new(&config, &field, vertices, motion, corrections.len()),
             counts: VisibilityCounts::from_counts(counts),
             stage: Stage::new(scene)?,
+            shell: Shell::whole(scene, &config),
             batch: Batch::default(),
             groups: (0..GROUPS).map(|_| GroupState::default()).collect(),
             vertex_code: VertexCode::default(),
@@ -215,7 +219,18 @@ impl<'a> Trainer<'a> {
         }
     }
 
-    pub(crate) fn tracer<'b>(&'b self, stage: &'b Stage, frame: &'b PreparedFrame, posed: &'b Posed) -> Tracer<'b> {
+    /// Whether samples are to have their neighbours.
+    pub(crate) fn needs_neighbours(&self) -> bool {
+        self.field.surface_term || self.config.surface.distance != DistanceKind::Exact
+    }
+
+    pub(crate) fn tracer<'b>(
+        &'b self,
+        stage: &'b Stage,
+        shell: &'b Shell,
+        frame: &'b PreparedFrame,
+        posed: &'b Posed,
+    ) -> Tracer<'b> {
         Tracer {
             scene: self.scene,
             config: &self.config,
@@ -223,8 +238,9 @@ impl<'a> Trainer<'a> {
             posed,
             to_canonical: &frame.to_canonical,
             volume: self.volume.as_ref(),
+            shell,
             faces: !self.parameters.get(Part::Pose).is_empty(),
-            neighbours: self.field.surface_term || self.config.surface.distance != DistanceKind::Exact,
+            neighbours: self.needs_neighbours(),
         }
     }
 
@@ -248,9 +264,13 @@ impl<'a> Trainer<'a> {
         let frame = &self.scene.train[batch.frame];
         let mut stage_code = std::mem::take(&mut self.vertex_code);
         let posed = self.corrected(frame);
-        self.stage.set(self.scene, &posed, &self.config);
         self.encode_vertices(&mut stage_code);
         self.vertex_code = stage_code;
+        let interval = self.config.motion.shell_interval as u64;
+        if interval > 0 && step > 0 && step.is_multiple_of(interval) {
+            self.shell = self.measure_shell(&self.vertex_code.features);
+        }
+        self.stage.set(self.scene, &posed, &self.shell, &self.config);
         let mut groups = std::mem::take(&mut self.groups);
         for (index, state) in groups.iter_mut().enumerate() {
             state.rays.clear();

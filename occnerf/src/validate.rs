@@ -44,10 +44,15 @@ impl Config {
             let expected = "patches · patch_size² · samples may be at most 2^26";
             return Err(ConfigError { key: "patches", value: samples.to_string(), expected });
         }
-        if self.motion.correction_spacing > 0 && self.motion.kind != MotionKind::Surface {
-            let value = self.motion.correction_spacing.to_string();
-            let expected = "expected 0 unless motion.kind is surface";
-            return Err(ConfigError { key: "motion.correction_spacing", value, expected });
+        let of_the_surface = [
+            ("motion.correction_spacing", self.motion.correction_spacing),
+            ("motion.shell_interval", self.motion.shell_interval),
+        ];
+        for (key, value) in of_the_surface {
+            if value > 0 && self.motion.kind != MotionKind::Surface {
+                let expected = "expected 0 unless motion.kind is surface";
+                return Err(ConfigError { key, value: value.to_string(), expected });
+            }
         }
         for (key, value) in [("motion.margin", self.motion.margin), ("motion.falloff", self.motion.falloff)] {
             if value > 0.3 {

@@ -299,6 +299,28 @@ fn an_old_checkpoint_survives_a_save_that_fails() {
 }
 
 #[test]
+fn a_checkpoint_must_say_how_far_its_field_reaches() {
+    let dir = TempDir::new("shell");
+    let path = dir.path("shell.safetensors");
+    let mut config = config(Method::Occnerf);
+    config.motion.shell_interval = 1;
+    let mut trainer = Trainer::new(scene(), config).unwrap();
+    trainer.step();
+    trainer.step();
+    trainer.save(&path).unwrap();
+    let bytes = std::fs::read(&path).unwrap();
+    assert!(resume(scene(), &path, &forged(&bytes, |_, _| ())).is_ok());
+    for end in [-0.01f32, 7.0, f32::NAN, f32::INFINITY] {
+        let forged =
+            forged(&bytes, |_, arrays| arrays.get_mut("shell").unwrap().2[4..8].copy_from_slice(&end.to_le_bytes()));
+        let message = refused(scene(), &path, &forged, "an end beyond the margin");
+        assert!(message.contains("`shell` is") && message.contains("at 1"), "{message}");
+    }
+    let without = forged(&bytes, |_, arrays| drop(arrays.remove("shell")));
+    assert!(refused(scene(), &path, &without, "no shell").contains("`shell`"));
+}
+
+#[test]
 fn a_pruned_checkpoint_must_say_which_rows_it_holds() {
     let dir = TempDir::new("pruned");
     let path = dir.path("pruned.safetensors");

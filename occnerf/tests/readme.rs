@@ -46,6 +46,10 @@ fn table() -> String {
             let [margin, falloff, depth] = [c.motion.margin, c.motion.falloff, c.motion.depth].map(centimetres);
             format!("{margin} + {falloff}, {depth}")
         }),
+        row("steps between looks at where the field is empty", |c| match c.motion.shell_interval {
+            0 => "none".to_owned(),
+            steps => steps.to_string(),
+        }),
         row("λ of squared error, perceptual, completeness", |c| {
             format!("{}, {}, {}", c.loss.mse, c.loss.perceptual, c.loss.completeness)
         }),

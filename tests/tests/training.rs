@@ -30,7 +30,8 @@ fn no_seed_starts_empty() {
         for (motion, seeds) in [(MotionKind::Surface, 0..5), (MotionKind::Volume, 5..7)] {
             for seed in seeds {
                 let mut config = Config::preset(Preset::Fast, method);
-                (config.seed, config.motion.kind, config.motion.correction_spacing) = (seed, motion, 0);
+                (config.seed, config.motion.kind) = (seed, motion);
+                (config.motion.correction_spacing, config.motion.shell_interval) = (0, 0);
                 config.encoding.log2_table_size = SMALL_TABLE;
                 let (least, mean) = initial_opacity(scene(), config, &scene().eval[0]);
                 println!("{method:?} {motion:?} {seed}: {least} {mean}");

@@ -41,8 +41,9 @@ pub fn tiny(method: Method, motion: MotionKind) -> Config {
     (config.field.width, config.field.depth) = (32, 2);
     (config.encoding.levels, config.encoding.log2_table_size, config.encoding.n_max) = (6, 12, 96);
     config.motion.kind = motion;
+    config.motion.shell_interval = 2;
     if motion != MotionKind::Surface {
-        config.motion.correction_spacing = 0;
+        (config.motion.correction_spacing, config.motion.shell_interval) = (0, 0);
     }
     config
 }
