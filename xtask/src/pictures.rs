@@ -6,6 +6,10 @@ use anyhow::{Context, Result};
 use image::codecs::gif::{GifEncoder, Repeat};
 use image::{Delay, Frame, Rgb, RgbImage, imageops};
 use occnerf::data::Image;
+use plotters::prelude::*;
+use plotters::style::text_anchor::{HPos, Pos, VPos};
+
+use crate::bench::chart;
 
 /// Gap between the cells of a sheet in pixels.
 const GAP: u32 = 4;
@@ -38,6 +42,31 @@ pub fn sheet(rows: &[Vec<RgbImage>]) -> RgbImage {
         }
     }
     sheet
+}
+
+/// A sheet with a name above each column.
+pub fn captioned(sheet: &RgbImage, names: &[&str]) -> Result<RgbImage> {
+    const STRIP: u32 = 20;
+    /// Largest height of a letter in pixels.
+    const LARGEST: f64 = 14.0;
+    chart::register_font()?;
+    let (width, column) = (sheet.width(), (sheet.width() - GAP) as f64 / names.len().max(1) as f64);
+    let longest = names.iter().map(|name| name.chars().count()).max().unwrap_or(0).max(1);
+    let letter = LARGEST.min((column - f64::from(GAP)) / (chart::LETTER * longest as f64));
+    let mut strip = vec![255; 3 * (width * STRIP) as usize];
+    let area = BitMapBackend::with_buffer(&mut strip, (width, STRIP)).into_drawing_area();
+    let style = (chart::FONT, letter).into_font().color(&BLACK).pos(Pos::new(HPos::Center, VPos::Center));
+    for (c, name) in names.iter().enumerate() {
+        let middle = f64::from(GAP) / 2.0 + (c as f64 + 0.5) * column;
+        area.draw_text(name, &style, (middle as i32, STRIP as i32 / 2))?;
+    }
+    area.present()?;
+    drop(area);
+    let strip = RgbImage::from_raw(width, STRIP, strip).context("captions of no size")?;
+    let mut out = RgbImage::new(width, STRIP + sheet.height());
+    imageops::replace(&mut out, &strip, 0, 0);
+    imageops::replace(&mut out, sheet, 0, i64::from(STRIP));
+    Ok(out)
 }
 
 /// The pictures of a [`sheet`], told apart by its white gaps; a sheet whose pictures are of unequal sizes, or white
@@ -82,6 +111,19 @@ pub fn film(pictures: &[RgbImage], fps: u32, path: &Path) -> Result<()> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn captions_stand_above_their_columns_and_change_nothing_below() {
+        let plain = sheet(&[vec![RgbImage::from_pixel(60, 30, Rgb([9; 3])); 3]]);
+        for names in [&["truth", "a", "a-longer-name"][..], &[]] {
+            let whole = captioned(&plain, names).unwrap();
+            let strip = whole.height() - plain.height();
+            assert_eq!(imageops::crop_imm(&whole, 0, strip, plain.width(), plain.height()).to_image(), plain);
+            let third = |c: u32| (c * whole.width() / 3..(c + 1) * whole.width() / 3).collect::<Vec<_>>();
+            let ink = |c| third(c).iter().any(|&x| (0..strip).any(|y| whole.get_pixel(x, y).0[0] < 128));
+            assert!((0..3).all(|c| ink(c) != names.is_empty()));
+        }
+    }
 
     #[test]
     fn a_sheet_comes_apart_into_its_pictures() {

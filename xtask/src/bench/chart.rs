@@ -13,13 +13,13 @@ use super::scale::Scale;
 
 /// PNGs are drawn so much larger and reduced, for smooth edges.
 const OVERSAMPLING: i32 = 2;
-const FONT: &str = "sans-serif";
+pub const FONT: &str = "sans-serif";
 /// Height of the title and of each legend row, and sizes of text, in pixels.
 const TITLE: i32 = 34;
 const ROW: i32 = 20;
 const SMALL: i32 = 11;
 /// Mean width of a letter as a share of its height.
-const LETTER: f64 = 0.56;
+pub const LETTER: f64 = 0.56;
 
 /// Colours that are told apart by colour-blind people too (Okabe and Ito 2008).
 pub const COLORS: [RGBColor; 7] = [
@@ -79,6 +79,12 @@ pub struct Picture {
     pub panels: Vec<Panel>,
 }
 
+/// SVG text is measured, and PNG text drawn, with a font that comes along: systems may have none.
+pub fn register_font() -> Result<()> {
+    plotters::style::register_font(FONT, FontStyle::Normal, dejavu::sans::regular())
+        .map_err(|_| anyhow!("the font cannot be read"))
+}
+
 impl Picture {
     fn head(&self) -> i32 {
         TITLE + if self.legend.is_empty() { 0 } else { ROW }
@@ -92,9 +98,7 @@ impl Picture {
 
     /// Writes STEM.svg and STEM.png and says so.
     pub fn write(&self, stem: &Path) -> Result<[PathBuf; 2]> {
-        // SVG text is measured, and PNG text drawn, with a font that comes along: systems may have none.
-        plotters::style::register_font(FONT, FontStyle::Normal, dejavu::sans::regular())
-            .map_err(|_| anyhow!("the font cannot be read"))?;
+        register_font()?;
         let (svg, png) = (stem.with_extension("svg"), stem.with_extension("png"));
         let size = self.extent();
         let mut text = String::new();

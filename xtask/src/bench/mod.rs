@@ -2,7 +2,7 @@
 
 mod axes;
 mod capacity;
-mod chart;
+pub mod chart;
 mod cost;
 mod difficulty;
 mod front;

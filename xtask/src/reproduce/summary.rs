@@ -138,7 +138,7 @@ impl<'a> Summary<'a> {
         run::write(&directory.join("reproduce.md"), &self.markdown())?;
         run::write(&directory.join("reproduce.json"), &serde_json::to_string_pretty(self)?)?;
         // A row a camera: the truth, then what each method makes of it.
-        let mut columns: Vec<Vec<RgbImage>> = Vec::new();
+        let (mut columns, mut names): (Vec<Vec<RgbImage>>, _) = (Vec::new(), vec!["truth"]);
         for entry in SHOWN.iter().filter_map(|name| self.rows.iter().find(|entry| entry.name == *name)) {
             let sheet = image::open(&entry.pictures).with_context(|| entry.pictures.display().to_string())?.into_rgb8();
             let cells = pictures::cells(&sheet);
@@ -147,6 +147,7 @@ impl<'a> Summary<'a> {
                 columns.push(column(0));
             }
             columns.push(column(1));
+            names.push(entry.name);
         }
         let cameras = columns.iter().map(Vec::len).min().unwrap_or(0);
         let rows: Vec<Vec<RgbImage>> =
@@ -154,7 +155,7 @@ impl<'a> Summary<'a> {
         if rows.is_empty() {
             return Ok(());
         }
-        pictures::save(&pictures::sheet(&rows), &directory.join("reproduce.png"))
+        pictures::save(&pictures::captioned(&pictures::sheet(&rows), &names)?, &directory.join("reproduce.png"))
     }
 }
 
