@@ -148,6 +148,10 @@ pub struct FieldConfig {
     pub density_bias: f32,
     /// Bias at the outer end of the margin; linear in between.
     pub density_bias_outside: f32,
+    /// Whether colours start from those that the video showed of the prior's nearest surface point (see
+    /// [`crate::VertexColors`]): the perceptron adds to them before the sigmoid. Asks for `motion.kind = surface`.
+    #[serde(default)]
+    pub prior_colors: bool,
 }
 
 /// The encoding γ.
@@ -301,6 +305,7 @@ impl Config {
             config.loss.completeness = 0.0;
             // A field of x̂ alone does not know how far the prior's surface is.
             config.field.density_bias_outside = config.field.density_bias;
+            config.field.prior_colors = false;
         }
         if method == Method::Humannerf {
             // Without a hash grid the perceptron has to hold the whole person.

@@ -124,7 +124,8 @@ impl Field {
             let outputs = activations.layers[activations.layers.len() - 1].chunks_exact(LANES);
             for (s, raw) in range.zip(outputs) {
                 group.sigma[s] = self.density_scale * softplus(raw[0] + self.bias(group.samples.distance[s]));
-                group.rgb[s] = Vec3::new(sigmoid(raw[1]), sigmoid(raw[2]), sigmoid(raw[3]));
+                let base = group.samples.base.get(s).copied().unwrap_or(Vec3::ZERO);
+                group.rgb[s] = (base + Vec3::from_slice(&raw[1..4])).map(sigmoid);
             }
         }
         watch.lap(&mut group.times.perceptron);

@@ -88,7 +88,8 @@ impl Plain<'_, '_> {
                     let bias = inside + (outside - inside) * d.clamp(0.0, reach) / reach;
                     let sigma = f64::from(f.density_scale) * (raw[0] + bias).exp().ln_1p();
                     let alpha = f64::from(samples.likelihood[s]) * (1.0 - (-sigma * f64::from(samples.delta[s])).exp());
-                    let rgb = DVec3::new(raw[1], raw[2], raw[3]);
+                    let base = samples.base.get(s).copied().unwrap_or_default().as_dvec3();
+                    let rgb = base + DVec3::new(raw[1], raw[2], raw[3]);
                     color += transmittance * alpha * rgb.map(|x| 1.0 / (1.0 + (-x).exp()));
                     transmittance *= 1.0 - alpha;
                     if d < 0.0 {
@@ -123,6 +124,7 @@ fn tiny(method: Method, motion: MotionKind, seed: u64) -> Config {
     (config.field.width, config.field.depth) = (24, 2);
     (config.encoding.levels, config.encoding.log2_table_size, config.encoding.n_max) = (5, 11, 96);
     (config.motion.kind, config.motion.correction_spacing, config.motion.shell_interval) = (motion, 0, 0);
+    config.field.prior_colors &= motion == MotionKind::Surface;
     // The perceptual term has an oracle of its own.
     (config.loss.perceptual, config.loss.beta) = (0.0, 60.0);
     config

@@ -9,7 +9,8 @@ use crate::trainer::Trainer;
 
 impl Trainer<'_> {
     /// Carries the gradients of the encoding's coordinates, of d and of f to the bones that the samples hang on. The
-    /// closest surface point is taken to slide along the tangent plane, as it does to first order on a flat surface.
+    /// closest surface point is taken to slide along the tangent plane, as it does to first order on a flat surface,
+    /// and what colours start from to be the same all around it.
     pub(crate) fn pose_backward(&self, group: &Group, posed: &Posed, wrenches: &mut Vec<Wrench>) {
         wrenches.clear();
         wrenches.resize(posed.bones.len(), Wrench::default());

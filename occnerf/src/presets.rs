@@ -16,7 +16,14 @@ pub(crate) fn paper() -> Config {
         patches: 6,
         patch_size: 32,
         samples: 128,
-        field: FieldConfig { width: 64, depth: 2, density_scale: 25.0, density_bias: 2.0, density_bias_outside: -2.0 },
+        field: FieldConfig {
+            width: 64,
+            depth: 2,
+            density_scale: 25.0,
+            density_bias: 2.0,
+            density_bias_outside: -2.0,
+            prior_colors: false,
+        },
         encoding: EncodingConfig {
             levels: 16,
             features: 2,
@@ -76,7 +83,7 @@ pub(crate) fn balanced() -> Config {
         steps: 1100,
         patches: 6,
         samples: 64,
-        field: FieldConfig { width: 64, depth: 2, ..paper().field },
+        field: FieldConfig { width: 64, depth: 2, prior_colors: true, ..paper().field },
         encoding: EncodingConfig {
             levels: 10,
             features: 2,

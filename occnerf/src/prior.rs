@@ -1,6 +1,6 @@
 //! The baseline without a field: the posed prior mesh in the mean colours that the video showed of it.
 
-use glam::Vec3;
+use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 
 use crate::Error;
@@ -14,8 +14,8 @@ pub struct VertexColors {
 }
 
 impl VertexColors {
-    /// The mean colour of the visible training pixels that saw each vertex, by ray casting; a vertex that none saw
-    /// takes the colour of the nearest one that some saw.
+    /// The mean colour of the visible training pixels that saw each vertex, by ray casting; a vertex that none saw takes
+    /// the mean of those that some saw, weighted by their canonical distances to the power of −4 (Shepard 1968).
     pub fn measure(scene: &Scene) -> Result<Self, Error> {
         let per_frame: Result<Vec<Vec<(Vec3, u32)>>, Error> = scene
             .train
@@ -51,11 +51,68 @@ impl VertexColors {
                 if count > 0 {
                     return sum / count as f32;
                 }
-                let distance = |&&k: &&usize| vertices[k].distance_squared(vertices[v]);
-                let nearest = known.iter().min_by(|a, b| distance(a).total_cmp(&distance(b)));
-                nearest.map_or(Vec3::splat(0.5), |&k| sums[k].0 / sums[k].1 as f32)
+                let (mut sum, mut weights) = (DVec3::ZERO, 0.0);
+                for &k in &known {
+                    // Vertices of a seam may coincide.
+                    let squared = f64::from(vertices[k].distance_squared(vertices[v])).max(1e-12);
+                    let weight = 1.0 / (squared * squared);
+                    sum += weight * (sums[k].0 / sums[k].1 as f32).as_dvec3();
+                    weights += weight;
+                }
+                if weights > 0.0 { (sum / weights).as_vec3() } else { Vec3::splat(0.5) }
             })
             .collect();
         Ok(Self { colors })
+    }
+
+    /// What a sigmoid makes the colours of, black and white taken for nearly so.
+    pub(crate) fn before_sigmoid(&self) -> Vec<Vec3> {
+        /// 5 levels of 255.
+        const LEAST: f32 = 0.02;
+        let inverse = |x: f32| (x / (1.0 - x)).ln();
+        self.colors.iter().map(|c| c.clamp(Vec3::splat(LEAST), Vec3::splat(1.0 - LEAST)).map(inverse)).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::{Config, Method, Preset};
+    use crate::trainer::Trainer;
+    use crate::vertices::VertexCode;
+
+    #[test]
+    fn an_untrained_field_has_the_colours_that_it_starts_from() {
+        let body = smpl::BodyModel::embedded();
+        let demo = crate::data::DemoConfig { size: 48, frames: 4, eval_cameras: 1, ..Default::default() };
+        let capture = crate::data::demo(&demo, &body).unwrap();
+        let config = Config::preset(Preset::Fast, Method::Occnerf);
+        let scene = Scene::new(&capture, &body, &config).unwrap();
+        let mut trainer = Trainer::new(&scene, config).unwrap();
+        let mut code = VertexCode::default();
+        trainer.encode_vertices(&mut code);
+        let shown = VertexColors::measure(&scene).unwrap();
+        assert!(shown.colors.iter().all(|c| (c.cmpge(Vec3::ZERO) & c.cmple(Vec3::ONE)).all()));
+        let frame = &scene.train[0];
+        let posed = trainer.corrected(frame);
+        let mut stage = std::mem::replace(&mut trainer.stage, crate::samples::Stage::new(&scene).unwrap());
+        stage.set(&scene, &posed, &trainer.shell, &trainer.config);
+        let mut group = crate::field::Group::default();
+        group.samples.clear();
+        let tracer = trainer.tracer(&stage, &trainer.shell, frame, &posed);
+        for pixel in 0..48 * 48 {
+            group.samples.trace(&tracer, &crate::trainer::pixel_ray(frame, pixel), None);
+        }
+        let parameter = |part| trainer.parameters.get(part);
+        let (field, table) = (parameter(crate::parameters::Part::Field), parameter(crate::parameters::Part::Table));
+        trainer.field.forward(field, table, &code.features, &trainer.counts, &mut group);
+        assert!(group.samples.len() > 500);
+        for (&(face, _), rgb) in group.samples.faces.iter().zip(&group.rgb) {
+            let corners = scene.model.faces[face as usize].map(|v| shown.colors[v as usize]);
+            let low = corners[0].min(corners[1]).min(corners[2]).clamp(Vec3::splat(0.02), Vec3::splat(0.98));
+            let high = corners[0].max(corners[1]).max(corners[2]).clamp(Vec3::splat(0.02), Vec3::splat(0.98));
+            // What the perceptron's first values add is small.
+            assert!((rgb.cmpge(low - 0.03) & rgb.cmple(high + 0.03)).all(), "{rgb} of {corners:?}");
+        }
     }
 }

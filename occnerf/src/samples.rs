@@ -48,6 +48,8 @@ pub(crate) struct Tracer<'a> {
     pub to_canonical: &'a [Affine3A],
     pub volume: Option<&'a WeightVolume>,
     pub shell: &'a Shell,
+    /// What colours start from at each vertex, before the sigmoid; empty where they start from nothing.
+    pub base: &'a [Vec3],
     /// Whether neighbours are wanted at all; the point-based methods do without unless v̂ is blended.
     pub neighbours: bool,
     /// Whether [`Samples::faces`] are wanted; the surface motion alone has them.
@@ -74,6 +76,8 @@ pub(crate) struct Samples {
     pub distance: Vec<f32>,
     /// All levels, finest first; empty where the tracer wants none.
     pub neighbours: Vec<u32>,
+    /// What the colour starts from, before the sigmoid; empty where that is nothing.
+    pub base: Vec<Vec3>,
     /// Face of the posed prior that each sample is mapped by, with barycentrics; empty where the tracer wants none.
     pub faces: Vec<(u32, [f32; 3])>,
 }
@@ -99,6 +103,7 @@ impl Samples {
         self.closest.clear();
         self.distance.clear();
         self.neighbours.clear();
+        self.base.clear();
         self.faces.clear();
     }
 
@@ -248,6 +253,10 @@ impl Samples {
         self.canonical.push(sample.canonical);
         self.closest.push(closest);
         self.distance.push(distance);
+        if let Some((face, barycentric)) = mapped_by.filter(|_| !tracer.base.is_empty()) {
+            let corners = tracer.scene.model.faces[face as usize];
+            self.base.push(corners.iter().zip(barycentric).map(|(&v, b)| b * tracer.base[v as usize]).sum());
+        }
         self.faces.extend(mapped_by.filter(|_| tracer.faces));
         (true, looked_up)
     }

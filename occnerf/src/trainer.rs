@@ -16,6 +16,7 @@ use crate::encoder::Coordinates;
 use crate::field::{Field, Group};
 use crate::lpips::Lpips;
 use crate::parameters::{PARTS, Parameters, Part};
+use crate::prior::VertexColors;
 use crate::samples::{Stage, Tracer};
 use crate::scene::{PreparedFrame, Scene};
 use crate::shell::Shell;
@@ -68,6 +69,8 @@ pub struct Trainer<'a> {
     pub(crate) stage: Stage,
     /// Where the field ended when it was last looked at.
     pub(crate) shell: Shell,
+    /// What colours start from, V; empty where they start from nothing.
+    pub(crate) base: Vec<Vec3>,
     pub(crate) batch: Batch,
     pub(crate) groups: Vec<GroupState>,
     pub(crate) vertex_code: VertexCode,
@@ -122,6 +125,7 @@ impl<'a> Trainer<'a> {
             counts: VisibilityCounts::from_counts(counts),
             stage: Stage::new(scene)?,
             shell: Shell::whole(scene, &config),
+            base: if config.field.prior_colors { VertexColors::measure(scene)?.before_sigmoid() } else { Vec::new() },
             batch: Batch::default(),
             groups: (0..GROUPS).map(|_| GroupState::default()).collect(),
             vertex_code: VertexCode::default(),
@@ -239,6 +243,7 @@ impl<'a> Trainer<'a> {
             to_canonical: &frame.to_canonical,
             volume: self.volume.as_ref(),
             shell,
+            base: &self.base,
             faces: !self.parameters.get(Part::Pose).is_empty(),
             neighbours: self.needs_neighbours(),
         }

@@ -54,6 +54,10 @@ impl Config {
                 return Err(ConfigError { key, value: value.to_string(), expected });
             }
         }
+        if self.field.prior_colors && self.motion.kind != MotionKind::Surface {
+            let expected = "expected false unless motion.kind is surface";
+            return Err(ConfigError { key: "field.prior_colors", value: "true".to_owned(), expected });
+        }
         for (key, value) in [("motion.margin", self.motion.margin), ("motion.falloff", self.motion.falloff)] {
             if value > 0.3 {
                 let expected = "expected at most 0.3 normalised metres";

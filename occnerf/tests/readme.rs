@@ -46,6 +46,7 @@ fn table() -> String {
             let [margin, falloff, depth] = [c.motion.margin, c.motion.falloff, c.motion.depth].map(centimetres);
             format!("{margin} + {falloff}, {depth}")
         }),
+        row("colours start from", |c| if c.field.prior_colors { "vertex colours" } else { "grey" }.to_owned()),
         row("steps between looks at where the field is empty", |c| match c.motion.shell_interval {
             0 => "none".to_owned(),
             steps => steps.to_string(),

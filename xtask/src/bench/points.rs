@@ -22,15 +22,16 @@ const fn change(factor: &'static str, name: &'static str, set: &'static [&'stati
 }
 
 /// Every change but of the number of steps, most telling first.
-pub const CHANGES: [Change; 21] = [
+pub const CHANGES: [Change; 22] = [
     change("distance", "blended distance", &["surface.distance=blended"], true),
     change(
         "motion",
         "volume motion",
-        &["motion.kind=volume", "motion.correction_spacing=0", "motion.shell_interval=0"],
+        &["motion.kind=volume", "motion.correction_spacing=0", "motion.shell_interval=0", "field.prior_colors=false"],
         true,
     ),
     change("span", "every sample", &["motion.shell_interval=0"], true),
+    change("colours", "colours from grey", &["field.prior_colors=false"], true),
     change("motion", "poses as given", &["motion.correction_spacing=0"], true),
     change("samples", "24 samples", &["samples=24"], true),
     change("samples", "96 samples", &["samples=96"], false),

@@ -70,7 +70,8 @@ impl<'a> Summary<'a> {
             });
         }
         self.lpips.clone_from(&metrics.lpips);
-        if !metrics.perceptual.is_empty() {
+        // The ablation of the term does not speak for the table.
+        if !["", "none"].contains(&metrics.perceptual.as_str()) || self.perceptual.is_empty() {
             self.perceptual.clone_from(&metrics.perceptual);
         }
         if let Some(entry) = self.rows.last_mut() {
