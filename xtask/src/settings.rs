@@ -30,9 +30,9 @@ impl From<MethodName> for Method {
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum PresetName {
-    /// A first look: one to two minutes.
+    /// A first look: about a minute.
     Fast,
-    /// The default.
+    /// The default: about two minutes.
     Balanced,
     /// The paper's setting: over an hour.
     Paper,
