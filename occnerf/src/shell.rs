@@ -14,7 +14,7 @@ use crate::trainer::Trainer;
 
 /// From one looked at distance to the next, normalised metres.
 const LAYER: f32 = 0.005;
-/// Opacity below which a sample shows nothing: as much as pictures may miss at the end of a ray.
+/// Opacity below which a sample shows nothing: half a level of 8 bits.
 const EMPTY: f32 = 2e-3;
 /// Length of ray that a sample is taken to stand for, normalised metres.
 const LENGTH: f32 = 0.04;
