@@ -4,7 +4,7 @@ use glam::Vec3;
 use rayon::prelude::*;
 
 use crate::ray_mesh::{Hit, RayMesh};
-use crate::tree::{Child, LANES, Node};
+use crate::tree::{Child, FARTHER, LANES, NEARER, Node};
 use crate::triangle::{Pack, Ray};
 
 /// Rays that walk together.
@@ -173,7 +173,8 @@ impl Packet {
         }
         let mut nearest = [f32::INFINITY; WIDTH];
         for i in 0..WIDTH {
-            nearest[i] = if enter[i] <= leave[i] * (1.0 + 1e-6) { enter[i] } else { f32::INFINITY };
+            let enter = enter[i] * NEARER;
+            nearest[i] = if enter <= leave[i] * FARTHER { enter } else { f32::INFINITY };
         }
         nearest.iter().fold(f32::INFINITY, |nearest, &t| less(nearest, t))
     }

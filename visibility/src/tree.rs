@@ -38,7 +38,8 @@ impl Node {
     }
 
     /// Where along the ray each child's box begins, not before its origin; infinity where it is missed or lies
-    /// beyond `end`. Widened by more than rounding can take away, so no box that holds a hit is missed.
+    /// beyond `end`. Widened at both ends by more than rounding can take away, so no box that holds a hit is missed, nor
+    /// seems to begin behind it.
     #[inline(always)]
     pub fn entry(&self, origin: [Vec4; 3], inverse: [Vec4; 3], end: f32) -> [f32; 2] {
         let mut enter = Vec4::ZERO;
@@ -50,13 +51,17 @@ impl Node {
             enter = enter.max(t.min(other));
             leave = leave.min(t.max(other));
         }
-        let leave = leave * (1.0 + 1e-6);
+        let (enter, leave) = (enter * NEARER, leave * FARTHER);
         [
             if enter.x <= leave.x { enter.x } else { f32::INFINITY },
             if enter.y <= leave.y { enter.y } else { f32::INFINITY },
         ]
     }
 }
+
+/// Factors that widen what of a ray is in a box.
+pub(crate) const NEARER: f32 = 1.0 - 1e-6;
+pub(crate) const FARTHER: f32 = 1.0 + 1e-6;
 
 /// Box of a child that holds nothing: turned inside out, so that no ray meets it.
 const NOTHING: [Vec3; 2] = [Vec3::MAX, Vec3::MIN];
