@@ -33,7 +33,7 @@ fn a_sweep_goes_on_where_it_was_cut_off() {
     // Two levels of the prior and of three methods.
     assert!(first.contains("8 runs in"), "{first}");
     assert!(first.contains("every loss, gradient and pixel was finite"), "{first}");
-    for name in ["bench.jsonl", "stability.md", "stability.svg", "stability.png"] {
+    for name in ["bench.jsonl", "stability.md", "stability-demo.svg", "stability-demo.png"] {
         assert!(out.join(name).is_file(), "{name}");
         assert!(first.contains(out.join(name).to_str().unwrap()), "{first}");
     }

@@ -14,7 +14,7 @@ use super::scale::Scale;
 use crate::capacity;
 use crate::source::Source;
 
-/// Fixed sizes around `fast`: name, as `train --set` takes it, whether the quick form has it.
+/// Fixed sizes around `balanced`: name, as `train --set` takes it, whether the quick form has it.
 const AROUND: [(&str, &[&str], bool); 7] = [
     ("table 2^11", &["encoding.log2_table_size=11"], true),
     ("table 2^13", &["encoding.log2_table_size=13"], true),
@@ -33,7 +33,8 @@ pub fn points(sweep: &Sweep, source: &Source, paper_steps: Option<u64>) -> Resul
     let steps = sweep.steps;
     let setting = |preset, steps, set| Setting { preset, method: Method::Occnerf, steps, set };
     let mut points = Vec::new();
-    let presets = [(Preset::Fast, Some(steps)), (Preset::Balanced, Some(steps)), (Preset::Paper, paper_steps)];
+    // `fast` is `balanced` with fewer steps.
+    let presets = [(Preset::Balanced, Some(steps)), (Preset::Paper, paper_steps)];
     for (preset, steps) in presets.into_iter().filter_map(|(preset, steps)| Some((preset, steps?))) {
         let (name, setting) = (preset.name(), setting(preset, steps, &[]));
         points.push(sweep.point(name, name, Kind::Preset, &setting)?);
@@ -44,10 +45,10 @@ pub fn points(sweep: &Sweep, source: &Source, paper_steps: Option<u64>) -> Resul
         auto.command.iter_mut().for_each(|command| command.push_str(" --capacity auto"));
         points.push(auto);
     }
-    let fast = Preset::Fast.name();
+    let balanced = Preset::Balanced.name();
     for (name, set, quick) in AROUND {
         if quick || !sweep.quick {
-            points.push(sweep.point(name, fast, Kind::Change, &setting(Preset::Fast, steps, set))?);
+            points.push(sweep.point(name, balanced, Kind::Change, &setting(Preset::Balanced, steps, set))?);
         }
     }
     points.iter_mut().for_each(|point| point.bench = "capacity".to_owned());
@@ -78,7 +79,7 @@ pub fn chart(scene: &str, lines: &[Line], stem: &Path) -> Result<()> {
         ("front", Style(5, Shape::Dash)),
         ("preset", Style(2, Shape::Triangle)),
         ("auto: sizes from the scene", Style(1, Shape::Square)),
-        ("fast with one size changed", Style(0, Shape::Circle)),
+        ("balanced with one size changed", Style(0, Shape::Circle)),
     ];
     let panels = WORTHS.map(|(name, worth)| {
         let scored = lines.iter().filter(|l| l.outcome.error.is_none());

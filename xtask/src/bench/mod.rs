@@ -19,6 +19,7 @@ use std::time::Duration;
 
 use anyhow::Result;
 use clap::{Args, Subcommand};
+use occnerf::data::{LoadOptions, Obstacle};
 
 use self::job::Place;
 use self::runner::Bench;
@@ -30,8 +31,8 @@ pub use self::kernels::RESULTS;
 pub use self::runner::{LOG, read};
 pub use self::scale::{Scale, number};
 
-/// Steps of a point of `pareto` at which presets run their own number of steps.
-const FULL_STEPS: u64 = 300;
+/// Steps of a point of `pareto` at which presets run their own number of steps: those of `fast`.
+const FULL_STEPS: u64 = 400;
 /// Unseen views that a point of `pareto` is scored on, and in the quick form.
 const VIEWS: (usize, usize) = (50, 20);
 
@@ -83,7 +84,7 @@ struct CapacityArguments {
     /// Fewer points and fewer steps: about 10 minutes on 2 cores
     #[arg(long)]
     quick: bool,
-    /// Steps of each point [default: 300, quick: 60]
+    /// Steps of each point [default: 400, quick: 80]
     #[arg(long)]
     steps: Option<u64>,
     /// The preset `paper` too, and what is chosen from it, with so many steps
@@ -106,7 +107,7 @@ struct ParetoArguments {
     /// Fewer points and fewer steps: under 10 minutes on 2 cores
     #[arg(long)]
     quick: bool,
-    /// Steps of each point; presets run their own number at 300 and in proportion otherwise [default: 300, quick: 60]
+    /// Steps of each point; presets run their own number at 400 and in proportion otherwise [default: 400, quick: 80]
     #[arg(long)]
     steps: Option<u64>,
     /// Seed of every point
@@ -118,6 +119,8 @@ struct ParetoArguments {
 
 #[derive(Args)]
 struct StabilityArguments {
+    #[command(flatten)]
+    on: SceneArguments,
     /// Where to write; what is there is not run again
     #[arg(long, default_value = "runs/bench-stability")]
     out: PathBuf,
@@ -130,10 +133,10 @@ struct StabilityArguments {
     /// Only these axes, comma separated, such as hidden,"pose noise" [default: all]
     #[arg(long, value_delimiter = ',')]
     axes: Vec<String>,
-    /// Pixels a side of the pictures, 64 to 512 for figures that mean something
+    /// Pixels a side of the pictures, 64 to 512 for figures that mean something; of captures, where --resize is not given
     #[arg(long, default_value_t = 96)]
     side: u32,
-    /// Trained runs at most; those of more seeds are left out first
+    /// Trained runs at most of each scene; those of more seeds are left out first
     #[arg(long, default_value_t = 60)]
     max_runs: usize,
     #[command(flatten)]
@@ -228,6 +231,26 @@ impl SceneArguments {
         }
     }
 
+    /// What `bench stability` does to a scene.
+    fn axes(&self, scene: &str, side: u32, quick: bool) -> Result<Vec<axes::Axis>> {
+        if scene == source::DEMO {
+            anyhow::ensure!(
+                self.load.command_line().is_empty(),
+                "bench stability makes the demo anew, without options"
+            );
+            return Ok(axes::of_demo(side, quick));
+        }
+        anyhow::ensure!(
+            Path::new(scene).is_dir(),
+            "{scene}: expected the demo, or a capture on disk (synth makes one)"
+        );
+        let load = self.load.options();
+        let hidden = LoadOptions { occlusion: Some(Obstacle::default()), ..load.clone() };
+        let obstacle = source::load(Some(scene), self.body.as_deref(), &hidden).is_ok();
+        let place = Place::Scene { scene: scene.to_owned(), body: self.body.clone(), load };
+        Ok(axes::of_capture(&place, side, obstacle, quick))
+    }
+
     /// What makes `train` read the same capture.
     fn command_line(&self, scene: &str) -> String {
         let mut text = if scene == source::DEMO { String::new() } else { format!(" {scene}") };
@@ -281,23 +304,32 @@ fn capacity_bench(arguments: &CapacityArguments) -> Result<()> {
 }
 
 fn stability(arguments: &StabilityArguments) -> Result<()> {
-    let out = &arguments.out;
-    let steps = arguments.steps.unwrap_or(if arguments.quick { 100 } else { 200 });
+    let StabilityArguments { on, out, quick, side, max_runs, .. } = arguments;
+    let steps = arguments.steps.unwrap_or(if *quick { 100 } else { 200 });
     anyhow::ensure!((1..=1_000_000).contains(&steps), "--steps {steps}: expected 1 to 1000000");
-    anyhow::ensure!((16..=2048).contains(&arguments.side), "--side {}: expected 16 to 2048", arguments.side);
-    let mut axes = axes::all(arguments.side, arguments.quick);
-    if !arguments.axes.is_empty() {
-        let known = axes.iter().map(|a| a.name).collect::<Vec<_>>().join(", ");
-        if let Some(unknown) = arguments.axes.iter().find(|name| axes.iter().all(|a| a.name != name.trim())) {
-            anyhow::bail!("--axes {unknown}: there are {known}");
+    anyhow::ensure!((16..=2048).contains(side), "--side {side}: expected 16 to 2048");
+    let mut of_scenes = Vec::new();
+    for scene in on.checked()? {
+        let mut axes = on.axes(&scene, *side, *quick)?;
+        if !arguments.axes.is_empty() {
+            let known = axes.iter().map(|a| a.name).collect::<Vec<_>>().join(", ");
+            if let Some(unknown) = arguments.axes.iter().find(|name| axes.iter().all(|a| a.name != name.trim())) {
+                anyhow::bail!("--axes {unknown}: of {scene} there are {known}");
+            }
+            axes.retain(|axis| arguments.axes.iter().any(|name| name.trim() == axis.name));
         }
-        axes.retain(|axis| arguments.axes.iter().any(|name| name.trim() == axis.name));
+        of_scenes.push((scene, axes));
     }
-    let sweep = stability::Sweep { axes, steps, quick: arguments.quick, max_runs: arguments.max_runs };
     let mut bench = arguments.sitting.open(out)?;
-    let lines = sweep.run(&mut bench)?;
-    stability::charts(&sweep.axes, &lines, &out.join("stability"))?;
-    let text = format!("{}\n{}\n", stability::table(&sweep.axes, &lines), stability::finite(&lines));
+    let mut text = String::new();
+    for (scene, axes) in of_scenes {
+        let sweep = stability::Sweep { axes, steps, quick: *quick, max_runs: *max_runs };
+        let lines = sweep.run(&mut bench)?;
+        let name = train::scene_name(Some(&scene));
+        stability::charts(&name, &sweep.axes, &lines, &out.join(format!("stability-{name}")))?;
+        let (table, finite) = (stability::table(&sweep.axes, &lines), stability::finite(&lines));
+        text.push_str(&format!("## {scene}\n\n{table}\n{finite}\n\n"));
+    }
     finish(&bench, &text, "stability.md")
 }
 

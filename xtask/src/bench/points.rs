@@ -134,7 +134,18 @@ impl Sweep {
                 format!("{}, {steps} of {whole} steps", preset.name())
             };
             let setting = Setting { preset, method: Method::Occnerf, steps, set: &[] };
-            points.push(self.point(&name, "preset", Kind::Preset, &setting)?);
+            let point = self.point(&name, "preset", Kind::Preset, &setting)?;
+            // Presets that differ by their steps alone are the base, and a change of its steps.
+            match points.iter_mut().find(|p| p.job.config == point.job.config) {
+                Some(same) => {
+                    same.name = format!("{name} ({})", same.name);
+                    same.command = point.command;
+                    if same.kind != Kind::Base {
+                        same.kind = Kind::Preset;
+                    }
+                }
+                None => points.push(point),
+            }
         }
         Ok(points)
     }
@@ -194,7 +205,7 @@ mod tests {
 
     fn sweep(quick: bool) -> Sweep {
         let place = Place::Made(Difficulty::default());
-        Sweep { place, scene_arguments: String::new(), views: 5, steps: 300, full_steps: 300, seed: 1, quick }
+        Sweep { place, scene_arguments: String::new(), views: 5, steps: 400, full_steps: 400, seed: 1, quick }
     }
 
     #[test]
@@ -208,8 +219,8 @@ mod tests {
                 assert!(points[..i].iter().all(|b| b.name != a.name && b.job != a.job), "{}", a.name);
                 assert!(a.command.as_ref().unwrap().contains(a.job.config.method.name()));
             }
-            for preset in ["fast", "balanced", "paper"] {
-                assert!(points.iter().any(|p| p.kind == Kind::Preset && p.name.starts_with(preset)));
+            for (preset, kind) in [("fast", Kind::Base), ("balanced", Kind::Preset), ("paper", Kind::Preset)] {
+                assert!(points.iter().any(|p| p.kind == kind && p.name.starts_with(preset)), "{preset}");
             }
         }
     }

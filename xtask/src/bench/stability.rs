@@ -209,7 +209,7 @@ pub fn finite(lines: &[Line]) -> String {
 }
 
 /// A panel an axis: psnr_mask of every method, breaking points crossed.
-pub fn charts(axes: &[Axis], lines: &[Line], stem: &Path) -> Result<()> {
+pub fn charts(scene: &str, axes: &[Axis], lines: &[Line], stem: &Path) -> Result<()> {
     let methods = [(Method::Prior, 5), (Method::Occnerf, 0), (Method::HashPoint, 4), (Method::Humannerf, 1)];
     let mut legend: Vec<(String, Style)> =
         methods.iter().map(|&(m, color)| (m.name().to_owned(), Style(color, Shape::Circle))).collect();
@@ -240,7 +240,7 @@ pub fn charts(axes: &[Axis], lines: &[Line], stem: &Path) -> Result<()> {
         panel.scales[1] = Scale::around(panel.marks.iter().map(|m| m.at.1), false);
         panels.push(panel);
     }
-    let title = "As it gets harder, left to right: psnr_mask of unseen views".to_owned();
+    let title = format!("{scene} as it gets harder, left to right: psnr_mask of unseen views");
     Picture { title, legend, columns: 3, size: (400, 270), panels }.write(stem).map(|_| ())
 }
 
@@ -265,7 +265,7 @@ mod tests {
 
     #[test]
     fn a_method_breaks_below_the_prior_by_three_decibels_or_at_anything_not_finite() {
-        let axis = axes::all(96, false).remove(0);
+        let axis = axes::of_demo(96, false).remove(0);
         let prior = lines(&axis, Method::Prior, &[Some(15.0), Some(15.0), Some(14.0), Some(10.0)]);
         let mut all = prior.clone();
         all.extend(lines(&axis, Method::Occnerf, &[Some(19.0), Some(18.0), Some(16.5), Some(15.5)]));

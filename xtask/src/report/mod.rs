@@ -261,8 +261,8 @@ fn add_markdown(page: &mut Page, text: &str) {
         if !rows.is_empty() {
             page.table(&cells(&std::mem::take(&mut rows)));
         }
-        if let Some(heading) = line.strip_prefix("## ") {
-            page.subheading(heading);
+        if line.starts_with("##") {
+            page.subheading(line.trim_start_matches('#').trim());
         } else if !line.trim().is_empty() {
             page.paragraph(line);
         }
@@ -277,4 +277,18 @@ fn cells(table: &str) -> Vec<Vec<String>> {
     };
     let rule = |cells: &Vec<String>| cells.iter().all(|c| !c.is_empty() && c.chars().all(|c| "-:".contains(c)));
     table.lines().map(row).filter(|cells| !rule(cells)).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn markdown_becomes_headings_of_any_depth_tables_and_paragraphs() {
+        let mut page = Page::new();
+        add_markdown(&mut page, "## a\n\ntext\n\n### `b`: c\n| d | e |\n| --- | ---: |\n| f | 1.5 |");
+        let page = page.finish("title");
+        assert!(page.contains("<h3>a</h3>") && page.contains("<h3>`b`: c</h3>") && !page.contains("##"), "{page}");
+        assert!(page.contains("<p>text</p>") && page.matches("<tr>").count() == 2, "{page}");
+    }
 }
