@@ -5,30 +5,45 @@ use ndarray::{Array2, ArrayView2, ArrayViewMut2, Axis, Slice};
 use rayon::prelude::*;
 
 use super::maps::{Maps, Window};
+use super::winograd::Winograd;
 
 /// Pixels of one product.
 const PIXELS: usize = 256;
 /// A product of fewer blocks of pixels is split along the other axis too, into about so many parts in all.
 const PARTS: usize = 4;
+/// Input channels from which on minimal filtering pays.
+const MINIMAL: usize = 16;
 
 /// A convolution followed by max(·, 0).
 #[derive(Clone, Debug)]
 pub(super) struct Conv {
     pub window: Window,
     pub inputs: usize,
-    /// Kernel row, kernel column and input channel by output channel.
-    weight: Array2<f32>,
+    weight: Weight,
     bias: Vec<f32>,
+}
+
+#[derive(Clone, Debug)]
+enum Weight {
+    /// Kernel row, kernel column and input channel by output channel.
+    Plain(Array2<f32>),
+    /// With less to multiply.
+    Minimal(Winograd),
 }
 
 impl Conv {
     /// From PyTorch's order of the weights: (outputs, inputs, size, size).
     pub fn new(window: Window, inputs: usize, weight: &[f32], bias: Vec<f32>) -> Self {
         let taps = window.size * window.size;
-        let turned = Array2::from_shape_fn((taps * inputs, bias.len()), |(row, output)| {
+        let outputs = bias.len();
+        if window == Window::THREE && inputs >= MINIMAL {
+            let minimal = Winograd::new(inputs, outputs, weight);
+            return Self { window, inputs, weight: Weight::Minimal(minimal), bias };
+        }
+        let turned = Array2::from_shape_fn((taps * inputs, outputs), |(row, output)| {
             weight[(output * inputs + row % inputs) * taps + row / inputs]
         });
-        Self { window, inputs, weight: turned, bias }
+        Self { window, inputs, weight: Weight::Plain(turned), bias }
     }
 
     pub fn outputs(&self) -> usize {
@@ -36,13 +51,22 @@ impl Conv {
     }
 
     /// Writes the rectified convolution of `input` into `out` (pixels of `size` × outputs).
-    pub fn forward(&self, input: &Maps, size: [usize; 2], out: ArrayViewMut2<'_, f32>) {
-        let columns = self.weight.nrows();
+    pub fn forward(&self, input: &Maps, size: [usize; 2], mut out: ArrayViewMut2<'_, f32>) {
         let finish = |out: &mut ArrayViewMut2<'_, f32>, first: usize| {
             for mut row in out.rows_mut() {
                 row.iter_mut().zip(&self.bias[first..]).for_each(|(v, b)| *v = (*v + b).max(0.0));
             }
         };
+        let weight = match &self.weight {
+            Weight::Plain(weight) => weight.view(),
+            Weight::Minimal(minimal) => {
+                minimal.forward(input, out.view_mut());
+                let blocks: Vec<_> = out.axis_chunks_iter_mut(Axis(0), PIXELS).collect();
+                blocks.into_par_iter().for_each(|mut out| finish(&mut out, 0));
+                return;
+            }
+        };
+        let columns = weight.nrows();
         let blocks = out.nrows().div_ceil(PIXELS);
         if blocks < PARTS || self.is_pointwise() {
             // Few pixels and many channels: what the kernel sees is laid out once for all parts.
@@ -54,7 +78,6 @@ impl Conv {
                     .for_each(|(i, seen)| self.gather(input, size, 16 * i, seen));
             }
             let seen = view(if self.is_pointwise() { &input.data } else { &seen }, columns);
-            let weight = self.weight.view();
             tiles(out).into_par_iter().for_each(|(row, column, mut out)| {
                 let seen = seen.slice_axis(Axis(0), Slice::from(row..row + out.nrows()));
                 let weight = weight.slice_axis(Axis(1), Slice::from(column..column + out.ncols()));
@@ -62,13 +85,12 @@ impl Conv {
                 finish(&mut out, column);
             });
         } else {
-            let mut out = out;
             let blocks: Vec<_> = out.axis_chunks_iter_mut(Axis(0), PIXELS).enumerate().collect();
             blocks.into_par_iter().for_each_init(Vec::new, |seen, (block, mut out)| {
                 seen.clear();
                 seen.resize(out.nrows() * columns, 0.0);
                 self.gather(input, size, block * PIXELS, seen);
-                general_mat_mul(1.0, &view(seen, columns), &self.weight, 0.0, &mut out);
+                general_mat_mul(1.0, &view(seen, columns), &weight, 0.0, &mut out);
                 finish(&mut out, 0);
             });
         }
@@ -77,16 +99,25 @@ impl Conv {
     /// Adds the gradient by the input to `d_input`; `d_out` (pixels of `size` × outputs) is that by the convolution,
     /// before rectification.
     pub fn backward(&self, d_out: ArrayView2<'_, f32>, size: [usize; 2], d_input: &mut Maps) {
-        let columns = self.weight.nrows();
+        let weight = match &self.weight {
+            Weight::Plain(weight) => weight.view(),
+            Weight::Minimal(minimal) => return minimal.backward(d_out, d_input),
+        };
+        let columns = weight.nrows();
         let mut d_seen = vec![0.0; d_out.nrows() * columns];
         if let Ok(d_seen) = ArrayViewMut2::from_shape((d_out.nrows(), columns), &mut d_seen) {
             tiles(d_seen).into_par_iter().for_each(|(row, column, mut d_seen)| {
                 let d_out = d_out.slice_axis(Axis(0), Slice::from(row..row + d_seen.nrows()));
-                let weight = self.weight.slice_axis(Axis(0), Slice::from(column..column + d_seen.ncols()));
+                let weight = weight.slice_axis(Axis(0), Slice::from(column..column + d_seen.ncols()));
                 general_mat_mul(1.0, &d_out, &weight.t(), 0.0, &mut d_seen);
             });
         }
         self.scatter(&d_seen, size, d_input);
+    }
+
+    /// What the kernel sees at a pixel.
+    fn columns(&self) -> usize {
+        self.window.size * self.window.size * self.inputs
     }
 
     /// A kernel of one pixel sees the input as it is.
@@ -97,7 +128,7 @@ impl Conv {
     /// What the kernel sees at the output pixels from `first` on, a row each, into zeros.
     fn gather(&self, input: &Maps, size: [usize; 2], first: usize, seen: &mut [f32]) {
         let c = self.inputs;
-        for (i, seen) in seen.chunks_exact_mut(self.weight.nrows()).enumerate() {
+        for (i, seen) in seen.chunks_exact_mut(self.columns()).enumerate() {
             let pixel = first + i;
             let (image, y, x) = (pixel / (size[0] * size[1]), pixel / size[1] % size[0], pixel % size[1]);
             let (skip, column, run) = self.span(x, input.width);
@@ -115,7 +146,7 @@ impl Conv {
     /// The reverse of [`Self::gather`]: adds to each row of the input what the output pixels that saw it hand back, in
     /// an order that does not depend on who does it.
     fn scatter(&self, d_seen: &[f32], size: [usize; 2], d_input: &mut Maps) {
-        let (c, columns) = (self.inputs, self.weight.nrows());
+        let (c, columns) = (self.inputs, self.columns());
         let (height, width) = (d_input.height, d_input.width);
         d_input.data.par_chunks_mut(width * c).enumerate().for_each(|(row, d_input)| {
             let (image, row) = (row / height, row % height);
@@ -144,7 +175,7 @@ impl Conv {
     }
 }
 
-fn view(data: &[f32], columns: usize) -> ArrayView2<'_, f32> {
+pub(super) fn view(data: &[f32], columns: usize) -> ArrayView2<'_, f32> {
     // Every caller hands whole rows; were it not so, the product's own check of shapes would speak up.
     let rows = data.len() / columns;
     ArrayView2::from_shape((rows, columns), &data[..rows * columns]).unwrap_or(ArrayView2::from(&[[0.0; 0]; 0]))

@@ -39,6 +39,9 @@ pub(super) struct Window {
 }
 
 impl Window {
+    /// Three pixels, every pixel, with a border of one.
+    pub const THREE: Self = Self { size: 3, stride: 1, padding: 1, ceil: false };
+
     /// Positions along an axis of `length`; `None` if there is not one.
     pub fn positions(&self, length: usize) -> Option<usize> {
         let more = if self.ceil { self.stride - 1 } else { 0 };

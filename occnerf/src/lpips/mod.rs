@@ -6,6 +6,7 @@ mod torch;
 mod trunk;
 mod unit;
 mod weights;
+mod winograd;
 
 use std::path::Path;
 
