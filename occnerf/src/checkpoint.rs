@@ -19,6 +19,8 @@ const PRUNED: &str = "2";
 const KEPT: &str = "table.kept";
 /// Where `motion.shell_interval` is not 0: how far the field reaches over each vertex.
 const SHELL: &str = "shell";
+/// What is known of restarts, in the header as JSON; files from before there were any have none.
+const RESTARTS: &str = "restarts";
 /// Larger files are not ours: the paper's table with both moments has 0.3 GB.
 const MAX_BYTES: u64 = 4 << 30;
 /// Far more than anybody trains, and far from where counting on would overflow.
@@ -29,12 +31,14 @@ impl Trainer<'_> {
     pub fn save(&self, path: &Path) -> Result<(), Error> {
         let config = toml::to_string(&self.config).map_err(|e| file(path, format!("configuration: {e}")))?;
         let kept = self.parameters.kept_rows.as_deref();
+        let restarts = serde_json::to_string(&self.restarts).map_err(|e| file(path, format!("{RESTARTS}: {e}")))?;
         let header = HashMap::from([
             ("format".to_owned(), FORMAT.to_owned()),
             ("version".to_owned(), if kept.is_some() { PRUNED } else { VERSION }.to_owned()),
             ("steps_done".to_owned(), self.steps_done.to_string()),
             ("scene".to_owned(), self.scene.name.clone()),
             ("config".to_owned(), config),
+            (RESTARTS.to_owned(), restarts),
         ]);
         let mut arrays: Vec<(String, Vec<u8>, Dtype)> = Vec::new();
         for (part, name) in PARTS {
@@ -96,6 +100,11 @@ impl<'a> Trainer<'a> {
         }
         let mut trainer = Self::new(scene, config_of(path, &header)?).map_err(|e| file(path, e.to_string()))?;
         trainer.steps_done = steps_done;
+        if let Some(text) = header.get(RESTARTS) {
+            let wrong = |what: String| file(path, format!("header `{RESTARTS}`: {what}"));
+            trainer.restarts = serde_json::from_str(text).map_err(|e| wrong(e.to_string()))?;
+            trainer.restarts.check(steps_done).map_err(wrong)?;
+        }
         if get("version")? == PRUNED {
             let rows = trainer.parameters.get(Part::Table).len() / trainer.config.encoding.features.max(1);
             let bits = tensor(path, &tensors, KEPT, Dtype::U8, rows.div_ceil(8))?;
@@ -121,7 +130,7 @@ impl<'a> Trainer<'a> {
                 let what = format!("`{name}.second_moment` is {} at {at}, expected at least 0", adam.second[at]);
                 return Err(file(path, what));
             }
-            adam.steps = steps_done;
+            adam.steps = steps_done - trainer.restarts.begun;
         }
         let counts = tensor(path, &tensors, "visibility_counts", Dtype::U64, scene.canonical.vertices.len())?;
         let counts = counts.chunks_exact(8).map(|b| b.iter().rev().fold(0u64, |sum, &byte| sum << 8 | u64::from(byte)));

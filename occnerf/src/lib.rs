@@ -51,6 +51,7 @@ mod presets;
 mod prior;
 mod random;
 mod render;
+mod restarts;
 mod samples;
 mod scene;
 mod shell;

@@ -16,7 +16,9 @@ use crate::encoder::Coordinates;
 use crate::field::{Field, Group};
 use crate::lpips::Lpips;
 use crate::parameters::{PARTS, Parameters, Part};
+use crate::pixels::Label;
 use crate::prior::VertexColors;
+use crate::restarts::Restarts;
 use crate::samples::{Stage, Tracer};
 use crate::scene::{PreparedFrame, Scene};
 use crate::shell::Shell;
@@ -50,6 +52,8 @@ pub struct StepReport {
     pub rays: usize,
     /// Gradients that were not finite and were left out.
     pub bad_gradients: usize,
+    /// How often training has begun anew so far, each time at a tenth of the rates, because the field had become empty.
+    pub restarts: u32,
     /// Where the time went.
     pub times: StepTimes,
 }
@@ -66,6 +70,7 @@ pub struct Trainer<'a> {
     /// The perceptual term, where it is not the embedded one.
     pub(crate) lpips: Option<Lpips>,
     pub(crate) steps_done: u64,
+    pub(crate) restarts: Restarts,
     pub(crate) stage: Stage,
     /// Where the field ended when it was last looked at.
     pub(crate) shell: Shell,
@@ -133,6 +138,7 @@ impl<'a> Trainer<'a> {
             all_at: Coordinates::default(),
             all_d_features: Vec::new(),
             steps_done: 0,
+            restarts: Restarts::default(),
             config,
             scene,
             field,
@@ -254,6 +260,17 @@ impl<'a> Trainer<'a> {
         !self.parameters.get(Part::Pose).is_empty() && self.steps_done as f32 >= SETTLED * self.config.steps as f32
     }
 
+    /// Forgets what was learnt.
+    fn begin_anew(&mut self) {
+        let (motion, pose) = (self.parameters.get(Part::Motion).len(), self.parameters.get(Part::Pose).len());
+        let vertices = self.scene.canonical.vertices.len();
+        self.parameters = Parameters::new(&self.config, &self.field, vertices, motion, pose);
+        self.shell = Shell::whole(self.scene, &self.config);
+        if self.config.surface.visibility == VisibilityKind::Counted {
+            self.counts = VisibilityCounts::from_counts(vec![0; vertices]);
+        }
+    }
+
     /// One optimisation step.
     ///
     /// # Panics
@@ -303,7 +320,16 @@ impl<'a> Trainer<'a> {
             groups.iter().for_each(|state| self.counts.add(&state.terminations));
         }
         let decay = self.config.rates.final_fraction.powf(step as f32 / self.config.steps.max(1) as f32);
-        report.bad_gradients = self.parameters.step(&self.config.rates, decay);
+        report.bad_gradients = self.parameters.step(&self.config.rates, decay * self.restarts.rates());
+        for state in &groups {
+            let subject = |ray: &&usize| frame.labels[batch.pixels[**ray] as usize] == Label::Subject;
+            let composites = state.rays.iter().zip(&state.composites).filter(|(ray, _)| subject(ray));
+            composites.for_each(|(_, composite)| self.restarts.note(composite.opacity));
+        }
+        if self.restarts.due(step + 1) {
+            self.begin_anew();
+        }
+        report.restarts = self.restarts.count;
         self.refresh_volume();
         watch.lap(&mut times.update);
         report.times = times;

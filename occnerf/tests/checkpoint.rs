@@ -186,6 +186,9 @@ fn foreign_headers_are_refused_and_say_what_was_expected() {
         ("steps_done", "2.5", "2.5"),
         ("config", "seed = 1", "config"),
         ("config", "not toml at all [", "config"),
+        ("restarts", "{}", "`restarts`"),
+        ("restarts", r#"{"count":1,"begun":3,"rays":0,"met":0}"#, "after 2 steps"),
+        ("restarts", r#"{"count":9,"begun":1,"rays":0,"met":0}"#, "after 2 steps"),
     ] {
         let message = refused(scene(), &path, &set(key, value), key);
         assert!(message.contains(hint), "{key} = {value}: {message}");

@@ -232,10 +232,14 @@ fn optimise(directory: &Path, trainer: &mut Trainer<'_>, stop_after: Option<u64>
     bar.reset_eta();
     let checkpoint = directory.join(CHECKPOINT);
     let (start, mut saved, mut lined) = (Instant::now(), Instant::now(), Instant::now());
-    let (mut smooth, mut bad) = (None::<StepReport>, 0);
+    let (mut smooth, mut bad, mut restarts) = (None::<StepReport>, 0, None);
     while trainer.steps_done() < end {
         let report = trainer.step();
         bad += report.bad_gradients;
+        if restarts.replace(report.restarts).is_some_and(|before| before < report.restarts) {
+            let said = format!("step {}: nothing was left of the person", report.step);
+            bar.suspend(|| eprintln!("{said}; begun anew at a tenth of the learning rates"));
+        }
         let mean = blend(smooth, report);
         smooth = Some(mean);
         let seconds = earlier.seconds + start.elapsed().as_secs_f64();

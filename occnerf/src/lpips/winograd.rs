@@ -140,16 +140,8 @@ impl Winograd {
                 // A pixel is in up to four tiles; row by row they come in one order.
                 for (pixel, d_input) in d_input.chunks_exact_mut(c).enumerate() {
                     let [y, x] = [pixel / tiling.width, pixel % tiling.width];
-                    let seen = |at: usize, tiles: usize| {
-                        // The tile that the pixel is in sees it at 1 or 2, that before or after it at 3 or 0.
-                        let (own, beside) =
-                            (at / 2, if at % 2 == 0 { (at / 2).checked_sub(1) } else { Some(at / 2 + 1) });
-                        let beside =
-                            beside.filter(|&tile| tile < tiles).map(|tile| (tile, if at % 2 == 0 { 3 } else { 0 }));
-                        [Some((own, 1 + at % 2)), beside]
-                    };
-                    for (row, i) in seen(y, tiling.rows).into_iter().flatten() {
-                        for (column, j) in seen(x, tiling.columns).into_iter().flatten() {
+                    for (row, i) in seen(y, tiling.rows) {
+                        for (column, j) in seen(x, tiling.columns) {
                             let tile = image * of_image + row * tiling.columns + column;
                             let product = |p: usize, q: usize| products.get(((4 * p + q) * tiles + tile) * c..);
                             let column = |i: usize| LIFT.map(|row| row[i]);
@@ -160,6 +152,13 @@ impl Winograd {
             });
         }
     }
+}
+
+/// The tiles that see a pixel along an axis of so many `tiles`, and where they see it: tile t sees 2 t − 1 to 2 t + 2.
+fn seen(at: usize, tiles: usize) -> impl Iterator<Item = (usize, usize)> {
+    (at.saturating_sub(1) / 2..=at.div_ceil(2))
+        .filter(move |&tile| tile < tiles)
+        .map(move |tile| (tile, at + 1 - 2 * tile))
 }
 
 /// `out` = rows of `lifted` × `weight`.

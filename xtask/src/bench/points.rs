@@ -136,7 +136,9 @@ impl Sweep {
             let setting = Setting { preset, method: Method::Occnerf, steps, set: &[] };
             let point = self.point(&name, "preset", Kind::Preset, &setting)?;
             // Presets that differ by their steps alone are the base, and a change of its steps.
-            match points.iter_mut().find(|p| p.job.config == point.job.config) {
+            let same =
+                |p: &&mut Point| p.job.config == Config { preset: p.job.config.preset, ..point.job.config.clone() };
+            match points.iter_mut().find(same) {
                 Some(same) => {
                     same.name = format!("{name} ({})", same.name);
                     same.command = point.command;
@@ -222,6 +224,10 @@ mod tests {
             for (preset, kind) in [("fast", Kind::Base), ("balanced", Kind::Preset), ("paper", Kind::Preset)] {
                 assert!(points.iter().any(|p| p.kind == kind && p.name.starts_with(preset)), "{preset}");
             }
+            assert!(
+                points.iter().any(|p| p.name == "balanced (twice the steps)")
+                    && points.iter().all(|p| p.name != "balanced")
+            );
         }
     }
 
