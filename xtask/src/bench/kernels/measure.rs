@@ -5,6 +5,7 @@ use std::hint::black_box;
 use anyhow::Result;
 use glam::{Affine3A, Vec3};
 use hashgrid::{HashGrid, HashGridConfig};
+use occnerf::{Config, Method, Preset};
 use smpl::{MotionField, MotionFrame, SurfaceMotion, SurfacePoint, WeightVolume, WeightVolumeConfig};
 use surface_query::{MeshDistance, SurfaceQuery, SurfaceQueryConfig};
 use volrender::{Aabb, Ray, bin_edges, bin_midpoints, bin_widths, composite};
@@ -174,6 +175,7 @@ pub fn samples(figure: &Figure, rays: usize) -> Result<Kernel> {
         composite(&sigma[..n], &ones, &delta[..n], &t[..n], &rgb[..n], Vec3::ZERO, &mut weights[..n]).color
     };
     let truth: Vec<Vec3> = rays.iter().map(|r| color(r, MOST)).collect();
+    let ours = [Preset::Balanced, Preset::Paper].map(|preset| Config::preset(preset, Method::Occnerf).samples);
     for n in [8, 16, 24, 32, 48, 64, 96, 128, 256] {
         let off = |(r, truth): (&Ray, &Vec3)| {
             let difference = (color(r, n) - *truth).abs();
@@ -185,7 +187,7 @@ pub fn samples(figure: &Figure, rays: usize) -> Result<Kernel> {
                 black_box(color(r, n));
             })
         });
-        kernel.add(n.to_string(), seconds, rays.len(), error, n == 48 || n == 64);
+        kernel.add(n.to_string(), seconds, rays.len(), error, ours.contains(&n));
     }
     Ok(kernel)
 }
