@@ -66,18 +66,19 @@ fn sizes_are_chosen_once_recorded_kept_on_resuming_and_pruned_at_the_end() {
 fn the_bench_has_every_preset_and_its_scene_sized_form() {
     let folder = folder("bench-capacity");
     let (capture, out) = (capture(&folder), folder.join("out"));
-    let bench = ["bench", "capacity", text(&capture), "--quick", "--steps", "1", "--out", text(&out)];
+    let bench = ["bench", "capacity", text(&capture), "--quick", "--steps", "1", "--paper", "1", "--out", text(&out)];
     let said = done(&bench);
     assert!(said.contains("7 runs in"), "{said}");
     let table = std::fs::read_to_string(out.join("capacity.md")).unwrap();
-    for row in ["| fast |", "| fast, auto |", "| balanced |", "| balanced, auto |", "| table 2^13 |", "| width 32 |"] {
+    for row in ["| balanced |", "| balanced, auto |", "| paper |", "| paper, auto |", "| table 2^13 |", "| width 32 |"]
+    {
         assert!(table.contains(row), "{row}: {table}");
     }
     assert!(out.join("capacity-capture.svg").is_file() && out.join("capacity-capture.png").is_file());
     let log = std::fs::read_to_string(out.join("bench.jsonl")).unwrap();
     let lines: Vec<Value> = log.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
     let of = |name: &str| lines.iter().find(|l| l["name"] == name).unwrap();
-    let (fixed, auto) = (of("fast"), of("fast, auto"));
+    let (fixed, auto) = (of("balanced"), of("balanced, auto"));
     assert!(auto["error"].is_null() && auto["parameters"].as_u64() < fixed["parameters"].as_u64(), "{auto}");
     assert!(auto["command"].as_str().unwrap().ends_with("--capacity auto"), "{auto}");
     assert!(done(&bench).contains("0 runs in"));
