@@ -5,7 +5,7 @@ mod common;
 
 use std::path::{Path, PathBuf};
 
-use common::{done, folder, refused};
+use common::{done, folder, refused, text};
 use image::{Rgb, RgbImage};
 use occnerf::{Config, Method, Preset};
 
@@ -52,6 +52,30 @@ fn a_sweep_goes_on_where_it_was_cut_off() {
     let page = std::fs::read_to_string(out.join("report.html")).unwrap();
     self_contained(&page);
     assert!(page.contains("limbs pressed") && page.contains("data:image/svg+xml;base64,"));
+}
+
+#[test]
+fn captures_are_made_hard_as_their_layout_allows() {
+    let folder = folder("hard-captures");
+    let made = |format: &str, occlusion: &str| {
+        let out = folder.join(format);
+        let size =
+            ["--size", "32", "--frames", "4", "--eval-cameras", "1", "--format", format, "--occlusion", occlusion];
+        done(&[&["synth", "--out", text(&out)], &size[..]].concat());
+        out
+    };
+    let (zju, prepared) = (made("zju-mocap", "central"), made("humannerf", "central"));
+    let out = folder.join("out");
+    let sweep = ["bench", "stability", text(&zju), "--quick", "--side", "24", "--steps", "1", "--out", text(&out)];
+    let said = done(&[&sweep[..], &["--axes", "hidden,one frame of"]].concat());
+    // The easy case that both share and two hard ones, of the prior and of three methods.
+    assert!(said.contains("12 runs in") && said.contains("every loss, gradient and pixel was finite"), "{said}");
+    let log = std::fs::read_to_string(out.join("bench.jsonl")).unwrap();
+    assert!(log.lines().all(|line| line.contains("\"resize\":24")), "{log}");
+    assert!(out.join("stability-zju-mocap.svg").is_file() && out.join("stability.md").is_file());
+    let of_prepared = ["bench", "stability", text(&prepared), "--axes", "hidden", "--out", text(&out)];
+    refused(&of_prepared, &["hidden", "mask growth"]);
+    refused(&["bench", "stability", text(&folder), "--out", text(&out)], &["hard-captures"]);
 }
 
 #[test]

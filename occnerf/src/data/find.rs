@@ -24,7 +24,11 @@ impl Layout {
         (&["mesh_infos.pkl", "cameras.pkl"], "HumanNeRF's prepared layout", Self::HumanNerf),
     ];
 
-    pub(super) fn detect(dir: &Path) -> Result<Self, DataError> {
+    /// The layout of the capture in `dir`, by the files that are there.
+    ///
+    /// # Errors
+    /// [`DataError::Missing`] where there is no such directory, [`DataError::Invalid`] where it has no known layout.
+    pub fn detect(dir: &Path) -> Result<Self, DataError> {
         if !dir.is_dir() {
             return Err(DataError::missing(dir, "directory"));
         }

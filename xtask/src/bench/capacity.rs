@@ -4,7 +4,7 @@ use std::fmt::Write as _;
 use std::path::Path;
 
 use anyhow::Result;
-use occnerf::{Method, Preset};
+use occnerf::{Config, Method, Preset};
 
 use super::chart::{self, Mark, Panel, Picture, Shape, Style};
 use super::pareto::{Pick, on_front};
@@ -25,10 +25,6 @@ const AROUND: [(&str, &[&str], bool); 7] = [
     ("width 32", &["field.width=32"], true),
 ];
 
-/// What `balanced` has in place of the rates and weights of `paper`, with which a few hundred steps teach next to nothing.
-const RATES: [&str; 5] =
-    ["rates.field=6e-3", "rates.table=3e-2", "rates.final_fraction=0.05", "rates.beta_2=0.99", "loss.mse=5"];
-
 const WORTHS: [(&str, Pick); 2] =
     [("psnr_mask, dB", |l| l.outcome.psnr_mask), ("psnr_hidden, dB", |l| l.outcome.psnr_hidden)];
 
@@ -37,8 +33,18 @@ pub fn points(sweep: &Sweep, source: &Source, paper_steps: Option<u64>) -> Resul
     let steps = sweep.steps;
     let setting = |preset, steps, set| Setting { preset, method: Method::Occnerf, steps, set };
     let mut points = Vec::new();
+    // At its own rates a few hundred steps of `paper` teach next to nothing.
+    let Config { rates, loss, .. } = Config::preset(Preset::Balanced, Method::Occnerf);
+    let rates = [
+        format!("rates.field={}", rates.field),
+        format!("rates.table={}", rates.table),
+        format!("rates.final_fraction={}", rates.final_fraction),
+        format!("rates.beta_2={}", rates.beta_2),
+        format!("loss.mse={}", loss.mse),
+    ];
+    let rates = rates.each_ref().map(String::as_str);
     // `fast` is `balanced` with fewer steps.
-    let presets = [(Preset::Balanced, Some(steps), &[][..]), (Preset::Paper, paper_steps, &RATES)];
+    let presets = [(Preset::Balanced, Some(steps), &[][..]), (Preset::Paper, paper_steps, &rates)];
     for (preset, steps, set) in presets.into_iter().filter_map(|(preset, steps, set)| Some((preset, steps?, set))) {
         let (name, setting) = (preset.name(), setting(preset, steps, set));
         points.push(sweep.point(name, name, Kind::Preset, &setting)?);

@@ -19,7 +19,7 @@ use std::time::Duration;
 
 use anyhow::Result;
 use clap::{Args, Subcommand};
-use occnerf::data::{LoadOptions, Obstacle};
+use occnerf::data::Layout;
 
 use self::job::Place;
 use self::runner::Bench;
@@ -244,10 +244,9 @@ impl SceneArguments {
             Path::new(scene).is_dir(),
             "{scene}: expected the demo, or a capture on disk (synth makes one)"
         );
-        let load = self.load.options();
-        let hidden = LoadOptions { occlusion: Some(Obstacle::default()), ..load.clone() };
-        let obstacle = source::load(Some(scene), self.body.as_deref(), &hidden).is_ok();
-        let place = Place::Scene { scene: scene.to_owned(), body: self.body.clone(), load };
+        // The one layout that leaves open what hides the person.
+        let obstacle = Layout::detect(Path::new(scene))? == Layout::ZjuMocap;
+        let place = Place::Scene { scene: scene.to_owned(), body: self.body.clone(), load: self.load.options() };
         Ok(axes::of_capture(&place, side, obstacle, quick))
     }
 
