@@ -15,8 +15,6 @@ use crate::scene::Scene;
 
 /// Longest side of the finest cell, in pixels of the video at the subject.
 const PIXELS_A_CELL: f32 = 0.75;
-/// Length of the finest cell in d, normalised metres: what density needs to end at a surface. Finer layers only take rows.
-const CELL_IN_D: f32 = 0.0083;
 /// Rows of a level's table for the shape that every body has, before any detail.
 const ROWS_OF_A_BODY: f64 = 4096.0;
 /// Pixel-wide places of the seen surface for each row on top of those. At 2.5 the demo loses 0.3 dB.
@@ -49,7 +47,7 @@ pub struct Choice {
     pub key: String,
     /// Value before.
     pub preset: f64,
-    /// Value from now on; of a size at most `preset`.
+    /// Value from now on, at most `preset`.
     pub chosen: f64,
     /// Why.
     pub why: String,
@@ -92,20 +90,6 @@ impl Capacity {
                 "{pixels} pixels show {cells} places a pixel wide: {PLACES_A_ROW} to a row, and {ROWS_OF_A_BODY} rows for the shape"
             );
             add("encoding.log2_table_size", grid.log2_table_size.into(), size.min(grid.log2_table_size).into(), why);
-            if config.method == Method::Occnerf {
-                // The interval never shrinks; rounded, so that it is short to write.
-                let interval = CELL_IN_D * n_max as f32;
-                let wider = (interval / (grid.distance_max - grid.distance_min)).max(1.0);
-                let why =
-                    format!("cells {:.1} mm long in d: finer layers of a surface only take rows", 1e3 * CELL_IN_D);
-                for (key, d) in
-                    [("encoding.distance_min", grid.distance_min), ("encoding.distance_max", grid.distance_max)]
-                {
-                    let before = (1e6 * f64::from(d)).round() / 1e6;
-                    let after = if wider > 1.0 { (100.0 * f64::from(d * wider)).round() / 100.0 } else { before };
-                    add(key, before, after, why.clone());
-                }
-            }
             let units = ((cells / PLACES_A_UNIT).ceil() as usize).next_multiple_of(UNITS).max(MIN_WIDTH);
             let why = format!("a unit for {PLACES_A_UNIT} such places, at least {MIN_WIDTH}");
             add("field.width", config.field.width as f64, units.min(config.field.width) as f64, why);
@@ -124,8 +108,6 @@ impl Capacity {
                 "encoding.n_max" => encoding.n_max = *chosen as u32,
                 "encoding.levels" => encoding.levels = *chosen as usize,
                 "encoding.log2_table_size" => encoding.log2_table_size = *chosen as u32,
-                "encoding.distance_min" => encoding.distance_min = *chosen as f32,
-                "encoding.distance_max" => encoding.distance_max = *chosen as f32,
                 "field.width" => config.field.width = *chosen as usize,
                 "samples" => config.samples = *chosen as usize,
                 _ => {}
