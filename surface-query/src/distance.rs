@@ -4,7 +4,7 @@ use crate::Error;
 use crate::error::check_mesh;
 use crate::pseudonormal::Pseudonormals;
 use crate::search::Search;
-use crate::tree::{Child, MAX_DEPTH, Tree};
+use crate::tree::{Child, STACK, Tree, WIDTH};
 use crate::triangle::{Foot, Pack, closest_on_triangle};
 
 /// Queries farther than this many sizes of the mesh are answered in `f64`: from there `f32` would take faces for
@@ -152,7 +152,8 @@ impl MeshDistance {
             return None;
         }
         let exact = query.as_dvec3() * f64::from(self.scale);
-        let (face, foot) = if (q - self.centre).abs().max_element() <= self.radius * FAR {
+        let is_near = (q - self.centre).abs().max_element() <= self.radius * FAR;
+        let (face, foot) = if is_near && self.tree.stack <= STACK {
             // A little more than asked for: the exact comparison follows.
             self.nearest(q, exact, (reach * (1.0 + 1e-5) + f32::MIN_POSITIVE).min(1e18))?
         } else {
@@ -189,46 +190,34 @@ impl MeshDistance {
     fn nearest(&self, q: Vec3, exact: DVec3, reach: f32) -> Option<(u32, Foot)> {
         let q = [q.x, q.y, q.z].map(Vec4::splat);
         let mut search = Search::new(reach, self.error);
-        let mut fixed = [(0.0f32, 0u32); MAX_DEPTH];
-        let mut spill;
-        let stack: &mut [(f32, u32)] = if self.tree.depth <= MAX_DEPTH {
-            &mut fixed
-        } else {
-            spill = vec![(0.0, 0); self.tree.depth];
-            &mut spill
-        };
-        let mut height = 0;
-        let mut node = 0;
-        loop {
-            let n = &self.tree.nodes[node as usize];
-            let d = n.distance_squared(q);
-            let near = usize::from(d[1] < d[0]);
-            let mut next = None;
-            if d[near] <= search.bound {
-                match n.child(near) {
-                    Child::Leaf(leaf) => {
-                        search.visit(leaf, self.packs[leaf as usize].distance_squared(q).to_array());
-                    }
-                    Child::Node(child) => next = Some(child),
-                }
-            }
-            let far = 1 - near;
-            if d[far] <= search.bound {
-                match n.child(far) {
-                    Child::Leaf(leaf) => {
-                        search.visit(leaf, self.packs[leaf as usize].distance_squared(q).to_array());
-                    }
-                    Child::Node(child) if next.is_none() => next = Some(child),
-                    Child::Node(child) => {
-                        stack[height] = (d[far], child);
-                        height += 1;
+        let mut stack = [(0.0f32, 0u32); STACK];
+        // The root.
+        let mut height = 1;
+        while let Some(child) = pop(&stack, &mut height, search.bound) {
+            match Child::new(child) {
+                Child::Leaf(leaf) => search.visit(leaf, self.packs[leaf as usize].distance_squared(q).to_array()),
+                Child::Node(node) => {
+                    let node = &self.tree.nodes[node as usize];
+                    let bound = Vec4::splat(search.bound);
+                    let base = height;
+                    for (half, d) in node.distance_squared(q).into_iter().enumerate() {
+                        let mut within = d.cmple(bound).bitmask();
+                        while within != 0 {
+                            let lane = within.trailing_zeros() as usize;
+                            within &= within - 1;
+                            // The nearest on top.
+                            let entry = (d[lane], node.child(WIDTH / 2 * half + lane));
+                            let mut place = height;
+                            while place > base && stack[place - 1].0 < entry.0 {
+                                stack[place] = stack[place - 1];
+                                place -= 1;
+                            }
+                            stack[place] = entry;
+                            height += 1;
+                        }
                     }
                 }
             }
-            node = match next.or_else(|| pop(stack, &mut height, search.bound)) {
-                Some(next) => next,
-                None => break,
-            };
         }
         if search.crowded {
             return self.nearest_foot(exact, f64::from(search.bound));
@@ -247,7 +236,7 @@ impl MeshDistance {
         closest_on_triangle(corners, q)
     }
 
-    /// The same as [`MeshDistance::nearest`] for a query far outside.
+    /// The same as [`MeshDistance::nearest`] for a query far outside, and for a tree too deep for that.
     fn nearest_to_far(&self, q: DVec3) -> Option<(u32, Foot)> {
         // From here on the nearest point depends on the direction alone, and f64 still tells faces apart.
         let (centre, horizon) = (self.centre.as_dvec3(), 1e7 * f64::from(self.radius));
@@ -265,28 +254,25 @@ impl MeshDistance {
             if d > best {
                 continue;
             }
-            let n = &self.tree.nodes[node as usize];
-            let mut sides = [0, 1].map(|side| {
-                let [min, max] = n.side(side).map(Vec3::as_dvec3);
-                (q.distance_squared(q.clamp(min, max.max(min))), n.child(side))
-            });
-            if sides[0].0 < sides[1].0 {
-                // The nearer one last, to be popped first.
-                sides.swap(0, 1);
-            }
-            for (d, child) in sides {
-                match child {
-                    Child::Node(child) => stack.push((d, child)),
-                    Child::Leaf(leaf) if d <= best => {
-                        for &face in &self.tree.leaves[leaf as usize] {
-                            let foot = self.foot(face, q);
-                            if foot.distance_squared <= best {
-                                best = foot.distance_squared;
-                                found = Some((face, foot));
-                            }
+            match Child::new(node) {
+                Child::Node(node) => {
+                    let node = &self.tree.nodes[node as usize];
+                    let base = stack.len();
+                    stack.extend((0..node.count).map(|place| {
+                        let [min, max] = node.side(place).map(Vec3::as_dvec3);
+                        (q.distance_squared(q.clamp(min, max.max(min))), node.child(place))
+                    }));
+                    // The nearest last, to be popped first.
+                    stack[base..].sort_unstable_by(|a, b| b.0.total_cmp(&a.0));
+                }
+                Child::Leaf(leaf) => {
+                    for &face in &self.tree.leaves[leaf as usize] {
+                        let foot = self.foot(face, q);
+                        if foot.distance_squared <= best {
+                            best = foot.distance_squared;
+                            found = Some((face, foot));
                         }
                     }
-                    Child::Leaf(_) => {}
                 }
             }
         }

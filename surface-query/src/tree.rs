@@ -1,5 +1,5 @@
-//! Binary tree of boxes over triangles, built by obvhs and laid out for this crate's traversal: one cache line
-//! a node with the boxes of both children, four triangles a leaf.
+//! Tree of boxes over triangles, built by obvhs and laid out for this crate's traversal: eight children a node, whose
+//! boxes are tested together, four triangles a leaf.
 
 use std::time::Duration;
 
@@ -11,16 +11,21 @@ use obvhs::bvh2::builder::build_bvh2;
 
 /// Triangles of a leaf: the lanes of a `Vec4`.
 pub(crate) const LANES: usize = 4;
+/// Children of a node.
+pub(crate) const WIDTH: usize = 8;
 /// Marks a child that is a leaf; the other bits are its number.
 const LEAF: u32 = 1 << 31;
-/// Deepest tree that is walked with a stack of fixed size.
-pub(crate) const MAX_DEPTH: usize = 96;
+/// Places of a stack of fixed size: of a tree 18 nodes deep, which not even triangles over all scales of `f32` make.
+pub(crate) const STACK: usize = 128;
 
-/// Bounds of two children: `axes[a]` = (lowest of left, of right, highest of left, of right) along axis a.
+/// Bounds of the children: lowest and highest corner along each axis, a lane for each child.
 #[derive(Clone, Copy)]
 pub(crate) struct Node {
-    pub axes: [Vec4; 3],
-    children: [u32; 2],
+    low: [[Vec4; WIDTH / 4]; 3],
+    high: [[Vec4; WIDTH / 4]; 3],
+    /// The first `count` are there; the boxes of the others are infinitely far away.
+    children: [u32; WIDTH],
+    pub count: usize,
 }
 
 /// A child of a node.
@@ -30,26 +35,51 @@ pub(crate) enum Child {
     Leaf(u32),
 }
 
-impl Node {
+impl Child {
     #[inline(always)]
-    pub fn child(&self, side: usize) -> Child {
-        let child = self.children[side];
-        if child & LEAF == 0 { Child::Node(child) } else { Child::Leaf(child & !LEAF) }
+    pub fn new(code: u32) -> Self {
+        if code & LEAF == 0 { Self::Node(code) } else { Self::Leaf(code & !LEAF) }
+    }
+}
+
+impl Node {
+    /// Without children: all are nowhere.
+    const EMPTY: Self = Self { low: [[Vec4::MAX; 2]; 3], high: [[Vec4::MIN; 2]; 3], children: [0; WIDTH], count: 0 };
+
+    /// [`Child::new`]'s argument for one of the children.
+    #[inline(always)]
+    pub fn child(&self, place: usize) -> u32 {
+        self.children[place]
     }
 
-    /// Squared distance of a point to the boxes of both children; rounding never makes it more than the computed
+    /// Squared distance of a point to the box of each child; rounding never makes it more than the computed
     /// distance of a point inside.
     #[inline(always)]
-    pub fn distance_squared(&self, q: [Vec4; 3]) -> [f32; 2] {
-        let mut sum = Vec4::ZERO;
-        for (axis, q) in self.axes.iter().zip(q) {
-            // (low − q) and (q − high) of a child sit two lanes apart; at most one of them is positive.
-            let below = *axis - q;
-            let above = -Vec4::new(below.z, below.w, below.x, below.y);
-            let d = below.max(above).max(Vec4::ZERO);
-            sum += d * d;
+    pub fn distance_squared(&self, q: [Vec4; 3]) -> [Vec4; WIDTH / 4] {
+        let mut sum = [Vec4::ZERO; WIDTH / 4];
+        for axis in 0..3 {
+            for (half, sum) in sum.iter_mut().enumerate() {
+                let d = (self.low[axis][half] - q[axis]).max(q[axis] - self.high[axis][half]).max(Vec4::ZERO);
+                *sum += d * d;
+            }
         }
-        [sum.x, sum.y]
+        sum
+    }
+
+    /// Lowest and highest corner of one child's box.
+    pub fn side(&self, place: usize) -> [Vec3; 2] {
+        [&self.low, &self.high].map(|corner| Vec3::from(corner.map(|lanes| lanes[place / 4][place % 4])))
+    }
+
+    fn set_side(&mut self, place: usize, [low, high]: [Vec3; 2]) {
+        for axis in 0..3 {
+            self.low[axis][place / 4][place % 4] = low[axis];
+            self.high[axis][place / 4][place % 4] = high[axis];
+        }
+    }
+
+    fn bounds(&self) -> [Vec3; 2] {
+        (0..WIDTH).map(|place| self.side(place)).fold(NOTHING, |a, b| [a[0].min(b[0]), a[1].max(b[1])])
     }
 }
 
@@ -61,7 +91,8 @@ pub(crate) struct Tree {
     pub nodes: Vec<Node>,
     /// Faces of each leaf; a leaf of fewer than four repeats its first.
     pub leaves: Vec<[u32; LANES]>,
-    pub depth: usize,
+    /// Children that can wait for their turn at once, at most.
+    pub stack: usize,
 }
 
 impl Tree {
@@ -75,7 +106,7 @@ impl Tree {
                 Aabb::new(a.min(b).min(c), a.max(b).max(c))
             })
             .collect();
-        let mut tree = Self { nodes: Vec::new(), leaves: Vec::new(), depth: 0 };
+        let mut tree = Self { nodes: Vec::new(), leaves: Vec::new(), stack: 0 };
         if boxes.is_empty() {
             return tree;
         }
@@ -86,39 +117,52 @@ impl Tree {
     }
 
     fn flatten(&mut self, bvh: &Bvh2) {
-        let root = &bvh.nodes[0];
-        let blank = Node { axes: [Vec4::ZERO; 3], children: [0; 2] };
-        self.nodes.push(blank);
-        if root.is_leaf() {
-            let leaf = self.leaf(bvh, 0);
-            self.nodes[0].children = [leaf, leaf];
-            self.depth = 1;
-            return;
-        }
+        let counts = triangles(bvh);
         // (their node, our node, depth)
         let mut stack = vec![(0usize, 0usize, 1usize)];
-        while let Some((theirs, ours, depth)) = stack.pop() {
-            self.depth = self.depth.max(depth);
-            let first = bvh.nodes[theirs].first_index as usize;
-            for side in 0..2 {
-                let child = first + side;
-                self.nodes[ours].children[side] = if bvh.nodes[child].is_leaf() {
+        self.nodes.push(Node::EMPTY);
+        let mut depth = 0;
+        while let Some((theirs, ours, level)) = stack.pop() {
+            depth = level.max(depth);
+            let mut children = vec![theirs];
+            // The largest are opened until the node is full.
+            while children.len() < WIDTH {
+                let area = |child: &usize| bvh.nodes[*child].aabb().half_area();
+                let inner = |(_, child): &(usize, &usize)| counts[**child] > LANES;
+                let largest = (children.iter().enumerate()).filter(inner);
+                let Some((place, _)) = largest.max_by(|a, b| area(a.1).total_cmp(&area(b.1))) else { break };
+                let first = bvh.nodes[children[place]].first_index as usize;
+                children[place] = first;
+                children.push(first + 1);
+            }
+            self.nodes[ours].count = children.len();
+            for (place, child) in children.into_iter().enumerate() {
+                self.nodes[ours].children[place] = if counts[child] <= LANES {
                     self.leaf(bvh, child)
                 } else {
-                    self.nodes.push(blank);
-                    stack.push((child, self.nodes.len() - 1, depth + 1));
+                    self.nodes.push(Node::EMPTY);
+                    stack.push((child, self.nodes.len() - 1, level + 1));
                     self.nodes.len() as u32 - 1
                 };
             }
         }
+        self.stack = depth * (WIDTH - 1) + 1;
     }
 
+    /// Makes a leaf of all triangles below their node.
     fn leaf(&mut self, bvh: &Bvh2, node: usize) -> u32 {
-        let node = &bvh.nodes[node];
-        let first = node.first_index as usize;
-        let primitives = &bvh.primitive_indices[first..first + node.prim_count as usize];
+        let (mut stack, mut primitives) = (vec![node], Vec::with_capacity(LANES));
+        while let Some(node) = stack.pop() {
+            let node = &bvh.nodes[node];
+            let first = node.first_index as usize;
+            if node.is_leaf() {
+                primitives.extend_from_slice(&bvh.primitive_indices[first..first + node.prim_count as usize]);
+            } else {
+                stack.extend([first, first + 1]);
+            }
+        }
         let mut faces = [primitives[0]; LANES];
-        for (slot, &face) in faces.iter_mut().zip(primitives) {
+        for (slot, face) in faces.iter_mut().zip(primitives) {
             *slot = face;
         }
         self.leaves.push(faces);
@@ -135,24 +179,33 @@ impl Tree {
     /// all of them are nowhere.
     pub fn refit(&mut self, leaf_box: impl Fn(&[u32; LANES]) -> Option<[Vec3; 2]>) {
         for n in (0..self.nodes.len()).rev() {
-            let [left, right] = [0, 1].map(|side| match self.nodes[n].child(side) {
-                Child::Leaf(leaf) => leaf_box(&self.leaves[leaf as usize]).unwrap_or(NOTHING),
-                Child::Node(child) => self.nodes[child as usize].bounds(),
-            });
-            self.nodes[n].axes = [0, 1, 2].map(|a| Vec4::new(left[0][a], right[0][a], left[1][a], right[1][a]));
+            for place in 0..self.nodes[n].count {
+                let side = match Child::new(self.nodes[n].child(place)) {
+                    Child::Leaf(leaf) => leaf_box(&self.leaves[leaf as usize]).unwrap_or(NOTHING),
+                    Child::Node(child) => self.nodes[child as usize].bounds(),
+                };
+                self.nodes[n].set_side(place, side);
+            }
         }
     }
 }
 
-impl Node {
-    /// Lowest and highest corner of one child's box.
-    pub fn side(&self, side: usize) -> [Vec3; 2] {
-        let [x, y, z] = self.axes;
-        [Vec3::new(x[side], y[side], z[side]), Vec3::new(x[side + 2], y[side + 2], z[side + 2])]
+/// Triangles below each node of `bvh`.
+fn triangles(bvh: &Bvh2) -> Vec<usize> {
+    // Parents before their children.
+    let mut order = vec![0usize];
+    let mut next = 0;
+    while let Some(node) = order.get(next).map(|&node| &bvh.nodes[node]) {
+        if !node.is_leaf() {
+            order.extend([node.first_index as usize, node.first_index as usize + 1]);
+        }
+        next += 1;
     }
-
-    fn bounds(&self) -> [Vec3; 2] {
-        let ([min, max], [other_min, other_max]) = (self.side(0), self.side(1));
-        [min.min(other_min), max.max(other_max)]
+    let mut counts = vec![0; bvh.nodes.len()];
+    for place in order.into_iter().rev() {
+        let node = &bvh.nodes[place];
+        let first = node.first_index as usize;
+        counts[place] = if node.is_leaf() { node.prim_count as usize } else { counts[first] + counts[first + 1] };
     }
+    counts
 }

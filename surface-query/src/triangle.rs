@@ -96,17 +96,17 @@ pub(crate) struct Foot {
     pub offset: DVec3,
 }
 
+/// Squared sine of the angle at the first corner from which on a triangle is no sliver.
+const WELL_SHAPED: f64 = 1e-4;
+
 /// Closest point of the triangle to `q`, in `f64`; the same case distinction as [`Pack::distance_squared`].
 pub(crate) fn closest_on_triangle(corners: [DVec3; 3], q: DVec3) -> Foot {
-    let mut best: Option<Foot> = None;
-    let mut consider = |barycentric: [f64; 3], feature| {
+    let foot = |barycentric: [f64; 3], feature| {
         // Relative to the nearest corner in weight: no cancellation against the origin's distance.
         let offset = (0..3).fold(DVec3::ZERO, |sum, i| sum + (q - corners[i]) * barycentric[i]);
-        let distance_squared = offset.length_squared();
-        if best.is_none_or(|b| distance_squared < b.distance_squared) {
-            best = Some(Foot { distance_squared, barycentric, feature, offset });
-        }
+        Foot { distance_squared: offset.length_squared(), barycentric, feature, offset }
     };
+    let mut best: Option<Foot> = None;
     let [a, b, c] = corners;
     let (ab, ac, ap) = (b - a, c - a, q - a);
     let (d1, d2) = (ab.dot(ap), ac.dot(ap));
@@ -114,7 +114,12 @@ pub(crate) fn closest_on_triangle(corners: [DVec3; 3], q: DVec3) -> Foot {
     let determinant = bb * cc - bc * bc;
     let (v, w) = ((d1 * cc - d2 * bc) / determinant, (d2 * bb - d1 * bc) / determinant);
     if determinant > 0.0 && v > 0.0 && w > 0.0 && v + w < 1.0 {
-        consider([1.0 - v - w, v, w], Feature::Face);
+        let inside = foot([1.0 - v - w, v, w], Feature::Face);
+        if determinant > WELL_SHAPED * bb * cc {
+            // Rounding cannot have moved it beyond an edge by more than itself: no edge is nearer.
+            return inside;
+        }
+        best = Some(inside);
     }
     for i in 0..3 {
         let j = (i + 1) % 3;
@@ -132,7 +137,10 @@ pub(crate) fn closest_on_triangle(corners: [DVec3; 3], q: DVec3) -> Foot {
         } else {
             Feature::Edge(i)
         };
-        consider(barycentric, feature);
+        let found = foot(barycentric, feature);
+        if best.is_none_or(|b| found.distance_squared < b.distance_squared) {
+            best = Some(found);
+        }
     }
     best.unwrap_or(Foot {
         distance_squared: f64::NAN,
