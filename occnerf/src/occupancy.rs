@@ -3,8 +3,8 @@
 use glam::{IVec3, Vec3};
 use volrender::Aabb;
 
-/// Cells an axis at most; a body with outstretched arms at 2 cm needs about 100.
-const MAX_CELLS: f32 = 128.0;
+/// Cells an axis at most; a body with outstretched arms at 1 cm needs about 200.
+const MAX_CELLS: f32 = 256.0;
 
 /// Marks a superset of the points within a margin of a triangle mesh that turns by no more than 120° at its edges, or
 /// enclosed by it and not too deep.

@@ -99,7 +99,7 @@ mod tests {
     use crate::correction::{correct, correct_backward};
     use crate::parameters::Part;
     use crate::random::Stream;
-    use crate::samples::Stage;
+    use crate::samples::{CELL, Stage};
     use crate::scene::Scene;
 
     /// Value = Σ c · features(x) + e · d(x) + p · f(x) of points x that keep still while the pose is corrected.
@@ -126,7 +126,7 @@ mod tests {
                 points.push((a + b + c) / 3.0 + ((f % 9) as f32 / 8.0 * 0.024 - 0.012) * normal);
             }
             // Which points live, and on which face, is decided once: the value jumps where that changes.
-            let mut stage = Stage::new(&scene).unwrap();
+            let mut stage = Stage::new(&scene, CELL).unwrap();
             let mut trace = |posed: &Posed, group: &mut Group| -> Vec<usize> {
                 stage.set(&scene, posed, &trainer.shell, &config);
                 let tracer = trainer.tracer(&stage, &trainer.shell, frame, posed);

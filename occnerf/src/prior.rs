@@ -95,7 +95,8 @@ mod tests {
         assert!(shown.colors.iter().all(|c| (c.cmpge(Vec3::ZERO) & c.cmple(Vec3::ONE)).all()));
         let frame = &scene.train[0];
         let posed = trainer.corrected(frame);
-        let mut stage = std::mem::replace(&mut trainer.stage, crate::samples::Stage::new(&scene).unwrap());
+        let mut stage =
+            std::mem::replace(&mut trainer.stage, crate::samples::Stage::new(&scene, crate::samples::CELL).unwrap());
         stage.set(&scene, &posed, &trainer.shell, &trainer.config);
         let mut group = crate::field::Group::default();
         group.samples.clear();

@@ -11,7 +11,7 @@ use crate::data::Image;
 use crate::field::Group;
 use crate::parameters::Part;
 use crate::prior::VertexColors;
-use crate::samples::{March, Stage};
+use crate::samples::{FINE_CELL, March, Stage};
 use crate::scene::{PreparedFrame, Scene};
 use crate::shell::Shell;
 use crate::trainer::{Trainer, composite_group, pixel_ray};
@@ -52,7 +52,7 @@ impl<'a> FieldRenderer<'a> {
         let mut code = VertexCode::default();
         trainer.encode_vertices(&mut code);
         let shell = trainer.measure_shell(&code.features);
-        Ok(Self { trainer, code, shell, stage: Stage::new(trainer.scene)? })
+        Ok(Self { trainer, code, shell, stage: Stage::new(trainer.scene, FINE_CELL)? })
     }
 }
 

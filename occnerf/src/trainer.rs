@@ -19,7 +19,7 @@ use crate::parameters::{PARTS, Parameters, Part};
 use crate::pixels::Label;
 use crate::prior::VertexColors;
 use crate::restarts::Restarts;
-use crate::samples::{Stage, Tracer};
+use crate::samples::{CELL, Stage, Tracer};
 use crate::scene::{PreparedFrame, Scene};
 use crate::shell::Shell;
 use crate::times::{StepTimes, Stopwatch};
@@ -128,7 +128,7 @@ impl<'a> Trainer<'a> {
         Ok(Self {
             parameters: Parameters::new(&config, &field, vertices, motion, corrections.len()),
             counts: VisibilityCounts::from_counts(counts),
-            stage: Stage::new(scene)?,
+            stage: Stage::new(scene, CELL)?,
             shell: Shell::whole(scene, &config),
             base: if config.field.prior_colors { VertexColors::measure(scene)?.before_sigmoid() } else { Vec::new() },
             batch: Batch::default(),
