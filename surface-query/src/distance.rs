@@ -317,4 +317,22 @@ mod tests {
         }
         assert_eq!(power_of_two_scale(&[]), 1.0);
     }
+
+    #[test]
+    fn a_tree_too_deep_for_the_stack_is_searched_all_the_same() {
+        let ball = testkit::mesh::icosphere(3);
+        let usual = MeshDistance::new(&ball.vertices, &ball.faces).unwrap();
+        assert!(usual.tree.stack <= STACK, "{} places", usual.tree.stack);
+        let mut deep = MeshDistance::new(&ball.vertices, &ball.faces).unwrap();
+        deep.tree.stack = STACK + 1;
+        for i in 0..400 {
+            let turn = i as f32 * 2.4;
+            let q = Vec3::new(turn.cos(), turn.sin(), i as f32 / 200.0 - 1.0) * (0.3 + i as f32 * 0.003);
+            for reach in [0.2, f32::INFINITY] {
+                let (one, other) = (usual.closest(q, reach), deep.closest(q, reach));
+                let distance = |c: Closest| c.signed_distance;
+                assert_eq!(one.map(distance), other.map(distance), "{q}");
+            }
+        }
+    }
 }
