@@ -202,6 +202,7 @@ impl MeshDistance {
                     let base = height;
                     for (half, d) in node.distance_squared(q).into_iter().enumerate() {
                         let mut within = d.cmple(bound).bitmask();
+                        let d = d.to_array();
                         while within != 0 {
                             let lane = within.trailing_zeros() as usize;
                             within &= within - 1;
