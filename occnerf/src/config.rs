@@ -275,6 +275,9 @@ pub struct Config {
     pub patch_size: u32,
     /// Samples a ray across the body's box.
     pub samples: usize,
+    /// Transmittance of a ray behind which training leaves samples out, below 1; 0 leaves out none.
+    #[serde(default)]
+    pub min_transmittance: f32,
     /// The perceptron.
     pub field: FieldConfig,
     /// The hash grid.

@@ -52,6 +52,7 @@ mod prior;
 mod random;
 mod render;
 mod restarts;
+mod runs;
 mod samples;
 mod scene;
 mod shell;

@@ -11,6 +11,7 @@ use visibility::VisibilityCounts;
 use crate::batch::target;
 use crate::config::{Config, Method, MotionKind, Preset};
 use crate::encoder::Encoder;
+use crate::field::Group;
 use crate::parameters::Part;
 use crate::random::Stream;
 use crate::scene::Scene;
@@ -61,8 +62,8 @@ impl Plain<'_, '_> {
         let mut colors = vec![DVec3::ZERO; batch.pixels.len()];
         let mut completeness = 0.0;
         for state in &trainer.groups {
-            let samples = &state.group.samples;
-            let at = &state.group.at;
+            // All samples are one run.
+            let Some(Group { samples, at, .. }) = state.runs.groups().next() else { continue };
             let points =
                 if at.surface.is_empty() { self.encode(table, &at.point) } else { self.encode(table, &at.surface) };
             let per_sample = samples.neighbours.len().checked_div(samples.len()).unwrap_or(0);
@@ -124,6 +125,7 @@ fn tiny(method: Method, motion: MotionKind, seed: u64) -> Config {
     (config.field.width, config.field.depth) = (24, 2);
     (config.encoding.levels, config.encoding.log2_table_size, config.encoding.n_max) = (5, 11, 96);
     (config.motion.kind, config.motion.correction_spacing, config.motion.shell_interval) = (motion, 0, 0);
+    config.min_transmittance = 0.0;
     config.field.prior_colors &= motion == MotionKind::Surface;
     // The perceptual term has an oracle of its own.
     (config.loss.perceptual, config.loss.beta) = (0.0, 60.0);

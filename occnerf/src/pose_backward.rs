@@ -8,12 +8,10 @@ use crate::field::Group;
 use crate::trainer::Trainer;
 
 impl Trainer<'_> {
-    /// Carries the gradients of the encoding's coordinates, of d and of f to the bones that the samples hang on. The
+    /// Adds the gradients of the encoding's coordinates, of d and of f to those of the bones that the samples hang on. The
     /// closest surface point is taken to slide along the tangent plane, as it does to first order on a flat surface,
     /// and what colours start from to be the same all around it.
-    pub(crate) fn pose_backward(&self, group: &Group, posed: &Posed, wrenches: &mut Vec<Wrench>) {
-        wrenches.clear();
-        wrenches.resize(posed.bones.len(), Wrench::default());
+    pub(crate) fn pose_backward(&self, group: &Group, posed: &Posed, wrenches: &mut [Wrench]) {
         let d_points = self.d_coordinates(group);
         let samples = &group.samples;
         let (model, motion) = (&self.scene.model, &self.config.motion);
@@ -145,7 +143,7 @@ mod tests {
             group.d_features = (0..live.len() * width).map(|_| random(1.0).x).collect();
             group.d_distance = live.iter().map(|_| random(3.0).x).collect();
             group.d_likelihood = live.iter().map(|_| random(0.3).x).collect();
-            let mut wrenches = Vec::new();
+            let mut wrenches = vec![Wrench::default(); corrected.bones.len()];
             trainer.pose_backward(&group, &corrected, &mut wrenches);
             let gradient = correct_backward(&body, &frame.posed, &correction, &corrected, &wrenches);
 

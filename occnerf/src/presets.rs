@@ -16,6 +16,7 @@ pub(crate) fn paper() -> Config {
         patches: 6,
         patch_size: 32,
         samples: 128,
+        min_transmittance: 0.0,
         field: FieldConfig {
             width: 64,
             depth: 2,
@@ -83,6 +84,7 @@ pub(crate) fn balanced() -> Config {
         steps: 800,
         patches: 4,
         samples: 48,
+        min_transmittance: 0.01,
         field: FieldConfig { width: 64, depth: 2, prior_colors: true, ..paper().field },
         encoding: EncodingConfig {
             levels: 10,

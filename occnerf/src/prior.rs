@@ -102,7 +102,7 @@ mod tests {
         group.samples.clear();
         let tracer = trainer.tracer(&stage, &trainer.shell, frame, &posed);
         for pixel in 0..48 * 48 {
-            group.samples.trace(&tracer, &crate::trainer::pixel_ray(frame, pixel), None);
+            group.samples.trace(&tracer, &crate::trainer::pixel_ray(frame, pixel));
         }
         let parameter = |part| trainer.parameters.get(part);
         let (field, table) = (parameter(crate::parameters::Part::Field), parameter(crate::parameters::Part::Table));

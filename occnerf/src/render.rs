@@ -108,7 +108,7 @@ impl Renderer for FieldRenderer<'_> {
                 }
                 group.samples.clear();
                 for p in &mut going {
-                    group.samples.trace_on(&tracer, &p.ray, None, RUN, &mut p.march);
+                    group.samples.trace_on(&tracer, &p.ray, RUN, &mut p.march);
                 }
                 trainer.field.forward(field, table, features, &trainer.counts, group);
                 composite_group(group, Vec3::ZERO, weights, composites);
@@ -232,7 +232,7 @@ mod tests {
         let mut all = Scratch::default();
         all.group.samples.clear();
         for pixel in 0..32 * 32 {
-            all.group.samples.trace(&tracer, &pixel_ray(frame, pixel), None);
+            all.group.samples.trace(&tracer, &pixel_ray(frame, pixel));
         }
         let (field, table) = (trainer.parameters.get(Part::Field), trainer.parameters.get(Part::Table));
         trainer.field.forward(field, table, &renderer.code.features, &trainer.counts, &mut all.group);

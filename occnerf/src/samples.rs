@@ -88,12 +88,21 @@ pub(crate) struct Samples {
 }
 
 /// How far along its bins a ray has been traced.
-#[derive(Clone, Copy, Debug, Default)]
+#[derive(Clone, Debug, Default)]
 pub(crate) struct March {
     bin: usize,
     /// The face that was closest to the last sample bounds the search for the next.
     known: Option<u32>,
+    /// Places each sample in its bin, the middle without.
+    jitter: Option<Stream>,
     pub ended: bool,
+}
+
+impl March {
+    /// Nothing of the ray is traced yet; `jitter` places each sample in its bin, the middle without.
+    pub fn new(jitter: Option<Stream>) -> Self {
+        Self { jitter, ..Self::default() }
+    }
 }
 
 impl Samples {
@@ -116,20 +125,14 @@ impl Samples {
         self.t.len()
     }
 
-    /// Appends the live samples of a ray; `jitter` places each sample in its bin, the middle without.
-    pub fn trace(&mut self, tracer: &Tracer<'_>, ray: &Ray, jitter: Option<Stream>) {
-        self.trace_on(tracer, ray, jitter, usize::MAX, &mut March::default());
+    /// Appends all live samples of a ray, in the middle of their bins.
+    #[cfg(test)]
+    pub fn trace(&mut self, tracer: &Tracer<'_>, ray: &Ray) {
+        self.trace_on(tracer, ray, usize::MAX, &mut March::default());
     }
 
     /// Appends the next live samples of a ray, at most `most`, and takes the march to where they end.
-    pub fn trace_on(
-        &mut self,
-        tracer: &Tracer<'_>,
-        ray: &Ray,
-        mut jitter: Option<Stream>,
-        most: usize,
-        march: &mut March,
-    ) {
+    pub fn trace_on(&mut self, tracer: &Tracer<'_>, ray: &Ray, most: usize, march: &mut March) {
         let bins = tracer.config.samples;
         let first = self.len();
         let span = tracer.stage.occupancy.region().and_then(|region| region.intersect(ray));
@@ -138,7 +141,7 @@ impl Samples {
             while march.bin < bins && self.len() - first < most {
                 let bin = march.bin;
                 march.bin += 1;
-                let place = jitter.as_mut().map_or(0.5, Stream::uniform);
+                let place = march.jitter.as_mut().map_or(0.5, Stream::uniform);
                 let t = near + (bin as f32 + place) * width;
                 let point = ray.origin + t * ray.direction;
                 if !tracer.stage.occupancy.is_live(point) {

@@ -3,7 +3,6 @@
 use glam::Vec3;
 use rayon::prelude::*;
 use smpl::{Posed, WeightVolume};
-use volrender::composite_backward;
 
 use crate::batch::{Batch, target};
 use crate::config::DistanceKind;
@@ -17,7 +16,7 @@ use crate::pixels::Label;
 use crate::random::Stream;
 use crate::scene::PreparedFrame;
 use crate::times::{StepTimes, Stopwatch};
-use crate::trainer::{GroupState, StepReport, Trainer, composite_group, pixel_ray};
+use crate::trainer::{GroupState, StepReport, Trainer, pixel_ray};
 
 const JITTER: u64 = 0x4A49_5454;
 
@@ -25,33 +24,31 @@ impl Trainer<'_> {
     /// Traces, encodes, evaluates and composites the rays of a group.
     pub(crate) fn forward(&self, state: &mut GroupState, batch: &Batch, frame: &PreparedFrame, posed: &Posed) {
         let tracer = self.tracer(&self.stage, &self.shell, frame, posed);
-        state.group.times = StepTimes::default();
-        let mut watch = Stopwatch::start();
-        state.group.samples.clear();
-        for &ray in &state.rays {
-            let pixel = batch.pixels[ray];
-            let jitter = Stream::new(&[self.config.seed, JITTER, self.steps_done, ray as u64]);
-            state.group.samples.trace(&tracer, &pixel_ray(frame, pixel), Some(jitter));
-        }
-        watch.lap(&mut state.group.times.trace);
-        state.group.wants_jacobian = self.volume.is_some() || self.teaches_poses();
+        let GroupState { rays, runs, along, composites, terminations, times, .. } = state;
+        let ray = |index: usize| {
+            let jitter = Stream::new(&[self.config.seed, JITTER, self.steps_done, rays[index] as u64]);
+            (pixel_ray(frame, batch.pixels[rays[index]]), jitter)
+        };
+        let wants_jacobian = self.volume.is_some() || self.teaches_poses();
         let (field, table) = (self.parameters.get(Part::Field), self.parameters.get(Part::Table));
-        self.field.forward(field, table, &self.vertex_code.features, &self.counts, &mut state.group);
-        let mut watch = Stopwatch::start();
-        composite_group(&state.group, batch.background, &mut state.weights, &mut state.composites);
-        watch.lap(&mut state.group.times.losses);
-        state.terminations.clear();
-        let samples = &state.group.samples;
-        if samples.neighbours.is_empty() {
-            return;
+        runs.march(&tracer, ray, rays.len(), self.config.min_transmittance, |group| {
+            group.wants_jacobian = wants_jacobian;
+            self.field.forward(field, table, &self.vertex_code.features, &self.counts, group);
+        });
+        *times = StepTimes::default();
+        for group in runs.groups_mut() {
+            *times += std::mem::take(&mut group.times);
         }
-        let per_sample = samples.neighbours.len() / samples.len();
-        for (index, &ray) in state.rays.iter().enumerate() {
-            let composite = &state.composites[index];
+        let mut watch = Stopwatch::start();
+        along.gather(runs, rays.len());
+        along.composite(batch.background, composites);
+        watch.lap(&mut times.losses);
+        terminations.clear();
+        for (index, &ray) in rays.iter().enumerate() {
+            let composite = &composites[index];
             let visible = frame.labels[batch.pixels[ray] as usize] == Label::Subject && composite.opacity > 0.5;
             if let Some(t) = composite.termination.filter(|_| visible) {
-                let first = (samples.starts[index] + t as usize) * per_sample;
-                state.terminations.extend_from_slice(&samples.neighbours[first..][..self.config.surface.k]);
+                terminations.extend_from_slice(along.neighbours(runs, index, t as usize, self.config.surface.k));
             }
         }
     }
@@ -110,50 +107,37 @@ impl Trainer<'_> {
         d_colors: &[Vec3],
     ) {
         let mut watch = Stopwatch::start();
-        let group = &mut state.group;
-        let n = group.samples.len();
-        group.d_sigma.resize(n, 0.0);
-        group.d_rgb.resize(n, Vec3::ZERO);
-        group.d_likelihood.resize(n, 0.0);
-        let loss = &self.config.loss;
-        for (index, &ray) in state.rays.iter().enumerate() {
-            let range = group.samples.starts[index]..group.samples.starts[index + 1];
-            composite_backward(
-                &group.sigma[range.clone()],
-                &group.samples.likelihood[range.clone()],
-                &group.samples.delta[range.clone()],
-                &group.rgb[range.clone()],
-                batch.background,
-                &state.weights[range.clone()],
-                d_colors[ray],
-                0.0,
-                &mut group.d_sigma[range.clone()],
-                &mut group.d_rgb[range.clone()],
-                &mut group.d_likelihood[range],
-            );
-        }
-        state.completeness = 0.0;
-        if loss.completeness > 0.0 {
-            let scale = loss.completeness / (batch.pixels.len() * self.config.samples) as f32;
-            for s in (0..n).filter(|&s| group.samples.distance[s] < 0.0) {
-                let (value, slope) = completeness(group.sigma[s], loss.beta);
-                state.completeness += f64::from(value);
-                group.d_sigma[s] += scale * slope;
-            }
-        }
-        watch.lap(&mut group.times.losses);
+        let GroupState { rays, runs, along, times, .. } = state;
+        along.composite_backward(batch.background, rays.iter().map(|&ray| d_colors[ray]), runs);
         zero(&mut state.d_mlp, self.parameters.get(Part::Field).len());
         zero(&mut state.d_vertices, self.vertex_code.features.len());
-        self.field.backward(&self.transposed, group, &mut state.d_mlp, &mut state.d_vertices);
-        watch.lap(&mut group.times.perceptron_backward);
         if let Some(volume) = &self.volume {
             zero(&mut state.d_volume, volume.weights.len());
-            self.motion_backward(volume, group, frame, &mut state.d_volume);
         }
-        if self.teaches_poses() {
-            self.pose_backward(group, posed, &mut state.wrenches);
+        state.wrenches.clear();
+        state.wrenches.resize(posed.bones.len(), Wrench::default());
+        state.completeness = 0.0;
+        let loss = &self.config.loss;
+        let scale = loss.completeness / (batch.pixels.len() * self.config.samples) as f32;
+        for group in runs.groups_mut() {
+            if loss.completeness > 0.0 {
+                for s in (0..group.samples.len()).filter(|&s| group.samples.distance[s] < 0.0) {
+                    let (value, slope) = completeness(group.sigma[s], loss.beta);
+                    state.completeness += f64::from(value);
+                    group.d_sigma[s] += scale * slope;
+                }
+            }
+            watch.lap(&mut times.losses);
+            self.field.backward(&self.transposed, group, &mut state.d_mlp, &mut state.d_vertices);
+            watch.lap(&mut times.perceptron_backward);
+            if let Some(volume) = &self.volume {
+                self.motion_backward(volume, group, frame, &mut state.d_volume);
+            }
+            if self.teaches_poses() {
+                self.pose_backward(group, posed, &mut state.wrenches);
+            }
+            watch.lap(&mut times.motion_backward);
         }
-        watch.lap(&mut state.group.times.motion_backward);
     }
 
     /// Gradients of the coordinates that the samples of a group were encoded at.
@@ -219,9 +203,9 @@ impl Trainer<'_> {
         watch.lap(&mut times.update);
         self.all_at.clear();
         self.all_d_features.clear();
-        for state in groups {
-            self.all_at.extend(&state.group.at);
-            self.all_d_features.extend_from_slice(&state.group.d_features);
+        for group in groups.iter().flat_map(|state| state.runs.groups()) {
+            self.all_at.extend(&group.at);
+            self.all_d_features.extend_from_slice(&group.d_features);
         }
         if self.field.surface_term {
             let mut d_vertices = vec![0.0; self.vertex_code.features.len()];

@@ -19,6 +19,7 @@ use crate::parameters::{PARTS, Parameters, Part};
 use crate::pixels::Label;
 use crate::prior::VertexColors;
 use crate::restarts::Restarts;
+use crate::runs::{Along, Runs};
 use crate::samples::{CELL, Stage, Tracer};
 use crate::scene::{PreparedFrame, Scene};
 use crate::shell::Shell;
@@ -86,11 +87,14 @@ pub struct Trainer<'a> {
 
 #[derive(Default)]
 pub(crate) struct GroupState {
-    pub group: Group,
     /// Indices into the batch of this group's rays.
     pub rays: Vec<usize>,
+    /// Samples evaluated together, front to back.
+    pub runs: Runs,
+    /// The same ray by ray.
+    pub along: Along,
     pub composites: Vec<Composite>,
-    pub weights: Vec<f32>,
+    pub times: StepTimes,
     pub d_mlp: Vec<f32>,
     pub d_vertices: Vec<f32>,
     pub d_volume: Vec<f32>,
@@ -306,10 +310,10 @@ impl<'a> Trainer<'a> {
         self.field.mlp.transposed_weights(self.parameters.get(Part::Field), &mut self.transposed);
         watch.lap(&mut times.losses);
         groups.par_iter_mut().for_each(|state| self.backward(state, &batch, frame, &posed, &d_colors));
-        groups.iter().for_each(|state| times += state.group.times);
+        groups.iter().for_each(|state| times += state.times);
         let nominal = (batch.pixels.len() * self.config.samples) as f64;
         report.completeness = groups.iter().map(|g| g.completeness).sum::<f64>() / nominal;
-        report.live_samples = groups.iter().map(|g| g.group.samples.len()).sum();
+        report.live_samples = groups.iter().map(|g| g.along.len()).sum();
         let loss = &self.config.loss;
         report.loss = f64::from(loss.mse) * report.mse
             + f64::from(loss.perceptual) * report.perceptual

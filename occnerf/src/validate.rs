@@ -58,6 +58,11 @@ impl Config {
             let expected = "expected false unless motion.kind is surface";
             return Err(ConfigError { key: "field.prior_colors", value: "true".to_owned(), expected });
         }
+        let transmittance = self.min_transmittance;
+        if !(0.0..1.0).contains(&transmittance) {
+            let expected = "expected at least 0 and below 1";
+            return Err(ConfigError { key: "min_transmittance", value: transmittance.to_string(), expected });
+        }
         for (key, value) in [("motion.margin", self.motion.margin), ("motion.falloff", self.motion.falloff)] {
             if value > 0.3 {
                 let expected = "expected at most 0.3 normalised metres";

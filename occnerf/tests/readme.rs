@@ -47,6 +47,10 @@ fn table() -> String {
             format!("{margin} + {falloff}, {depth}")
         }),
         row("colours start from", |c| if c.field.prior_colors { "vertex colours" } else { "grey" }.to_owned()),
+        row("transmittance behind which samples are left out", |c| match c.min_transmittance {
+            0.0 => "none".to_owned(),
+            t => t.to_string(),
+        }),
         row("steps between looks at where the field is empty", |c| match c.motion.shell_interval {
             0 => "none".to_owned(),
             steps => steps.to_string(),

@@ -30,7 +30,7 @@ pub const CHANGES: [Change; 20] = [
         &["motion.kind=volume", "motion.correction_spacing=0", "motion.shell_interval=0", "field.prior_colors=false"],
         true,
     ),
-    change("span", "every sample", &["motion.shell_interval=0"], false),
+    change("span", "every sample", &["motion.shell_interval=0", "min_transmittance=0"], false),
     change("colours", "colours from grey", &["field.prior_colors=false"], true),
     change("samples", "24 samples", &["samples=24"], true),
     change("samples", "96 samples", &["samples=96"], false),

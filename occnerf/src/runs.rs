@@ -1,0 +1,274 @@
+//! The samples of a step's rays, evaluated front to back in runs, so that those behind an opaque surface need not be.
+
+use glam::Vec3;
+use volrender::{Composite, composite, composite_backward};
+
+use crate::field::Group;
+use crate::random::Stream;
+use crate::samples::{March, Tracer};
+use crate::times::Stopwatch;
+use crate::trainer::composite_group;
+
+/// Live samples of a ray that are evaluated before it is asked whether it goes on: about as many as there are from one
+/// side of a surface to the other.
+const RUN: usize = 6;
+
+/// Runs of samples, each a few more of every ray that goes on.
+#[derive(Default)]
+pub(crate) struct Runs {
+    /// Those of this step come first; the others are room for steps that need more.
+    all: Vec<Run>,
+    count: usize,
+    marches: Vec<March>,
+    transmittance: Vec<f32>,
+    weights: Vec<f32>,
+    composites: Vec<Composite>,
+}
+
+/// The next samples of some rays.
+#[derive(Default)]
+struct Run {
+    /// Which of the rays these are, in order.
+    rays: Vec<usize>,
+    group: Group,
+}
+
+impl Runs {
+    /// Traces `rays`, given with their jitter, and has `evaluate` give every sample its density and colour, until all rays have
+    /// ended or their transmittance is at most `min_transmittance`. With 0 all samples are one run.
+    pub fn march(
+        &mut self,
+        tracer: &Tracer<'_>,
+        rays: impl Fn(usize) -> (volrender::Ray, Stream),
+        count: usize,
+        min_transmittance: f32,
+        mut evaluate: impl FnMut(&mut Group),
+    ) {
+        self.count = 0;
+        self.transmittance.clear();
+        self.transmittance.resize(count, 1.0);
+        self.marches.clear();
+        self.marches.extend((0..count).map(|ray| March::new(Some(rays(ray).1))));
+        let most = if min_transmittance > 0.0 { RUN } else { usize::MAX };
+        loop {
+            if self.count == self.all.len() {
+                self.all.push(Run::default());
+            }
+            let Run { rays: going, group } = &mut self.all[self.count];
+            let goes_on = |&ray: &usize| !self.marches[ray].ended && self.transmittance[ray] > min_transmittance;
+            going.clear();
+            going.extend((0..count).filter(goes_on));
+            if going.is_empty() && self.count > 0 {
+                return;
+            }
+            let mut watch = Stopwatch::start();
+            group.samples.clear();
+            for &ray in &*going {
+                group.samples.trace_on(tracer, &rays(ray).0, most, &mut self.marches[ray]);
+            }
+            watch.lap(&mut group.times.trace);
+            evaluate(group);
+            self.count += 1;
+            if min_transmittance == 0.0 {
+                return;
+            }
+            let mut watch = Stopwatch::start();
+            composite_group(group, Vec3::ZERO, &mut self.weights, &mut self.composites);
+            for (&ray, composite) in going.iter().zip(&self.composites) {
+                self.transmittance[ray] *= (1.0 - composite.opacity).max(0.0);
+            }
+            watch.lap(&mut group.times.losses);
+        }
+    }
+
+    /// The groups of the runs, front to back.
+    pub fn groups(&self) -> impl Iterator<Item = &Group> {
+        self.all[..self.count].iter().map(|run| &run.group)
+    }
+
+    /// [`Runs::groups`], to be changed.
+    pub fn groups_mut(&mut self) -> impl Iterator<Item = &mut Group> {
+        self.all[..self.count].iter_mut().map(|run| &mut run.group)
+    }
+}
+
+/// The samples of runs, ray by ray, and their gradients.
+#[derive(Default)]
+pub(crate) struct Along {
+    /// First sample of each ray, and the end of the last.
+    starts: Vec<usize>,
+    /// Run, and place in it, of each sample.
+    places: Vec<(usize, usize)>,
+    sigma: Vec<f32>,
+    likelihood: Vec<f32>,
+    delta: Vec<f32>,
+    t: Vec<f32>,
+    rgb: Vec<Vec3>,
+    weights: Vec<f32>,
+    d_sigma: Vec<f32>,
+    d_rgb: Vec<Vec3>,
+    d_likelihood: Vec<f32>,
+}
+
+impl Along {
+    pub fn len(&self) -> usize {
+        self.places.len()
+    }
+
+    /// Takes the samples of `count` rays from their runs.
+    pub fn gather(&mut self, runs: &Runs, count: usize) {
+        self.starts.clear();
+        self.starts.push(0);
+        self.places.clear();
+        // How many rays of each run have had their turn.
+        let mut done = vec![0; runs.count];
+        for ray in 0..count {
+            for (r, run) in runs.all[..runs.count].iter().enumerate() {
+                if run.rays.get(done[r]) != Some(&ray) {
+                    break;
+                }
+                let samples = run.group.samples.starts[done[r]]..run.group.samples.starts[done[r] + 1];
+                self.places.extend(samples.map(|s| (r, s)));
+                done[r] += 1;
+            }
+            self.starts.push(self.places.len());
+        }
+        let places = &self.places;
+        let group = |r: usize| &runs.all[r].group;
+        let fill = |to: &mut Vec<f32>, from: &dyn Fn(&Group) -> &[f32]| {
+            to.clear();
+            to.extend(places.iter().map(|&(r, s)| from(group(r))[s]));
+        };
+        fill(&mut self.sigma, &|g| &g.sigma);
+        fill(&mut self.likelihood, &|g| &g.samples.likelihood);
+        fill(&mut self.delta, &|g| &g.samples.delta);
+        fill(&mut self.t, &|g| &g.samples.t);
+        self.rgb.clear();
+        self.rgb.extend(places.iter().map(|&(r, s)| group(r).rgb[s]));
+    }
+
+    /// Composites every ray.
+    pub fn composite(&mut self, background: Vec3, composites: &mut Vec<Composite>) {
+        self.weights.resize(self.places.len(), 0.0);
+        composites.clear();
+        for ends in self.starts.windows(2) {
+            let range = ends[0]..ends[1];
+            composites.push(composite(
+                &self.sigma[range.clone()],
+                &self.likelihood[range.clone()],
+                &self.delta[range.clone()],
+                &self.t[range.clone()],
+                &self.rgb[range.clone()],
+                background,
+                &mut self.weights[range],
+            ));
+        }
+    }
+
+    /// Backward of [`Along::composite`], into the runs' groups; `d_colors` of each ray.
+    pub fn composite_backward(&mut self, background: Vec3, d_colors: impl Iterator<Item = Vec3>, runs: &mut Runs) {
+        let n = self.places.len();
+        self.d_sigma.resize(n, 0.0);
+        self.d_rgb.resize(n, Vec3::ZERO);
+        self.d_likelihood.resize(n, 0.0);
+        for (ends, d_color) in self.starts.windows(2).zip(d_colors) {
+            let range = ends[0]..ends[1];
+            composite_backward(
+                &self.sigma[range.clone()],
+                &self.likelihood[range.clone()],
+                &self.delta[range.clone()],
+                &self.rgb[range.clone()],
+                background,
+                &self.weights[range.clone()],
+                d_color,
+                0.0,
+                &mut self.d_sigma[range.clone()],
+                &mut self.d_rgb[range.clone()],
+                &mut self.d_likelihood[range],
+            );
+        }
+        for group in runs.groups_mut() {
+            let n = group.samples.len();
+            group.d_sigma.resize(n, 0.0);
+            group.d_rgb.resize(n, Vec3::ZERO);
+            group.d_likelihood.resize(n, 0.0);
+        }
+        for (i, &(r, s)) in self.places.iter().enumerate() {
+            let group = &mut runs.all[r].group;
+            group.d_sigma[s] = self.d_sigma[i];
+            group.d_rgb[s] = self.d_rgb[i];
+            group.d_likelihood[s] = self.d_likelihood[i];
+        }
+    }
+
+    /// The finest `k` neighbours of a ray's sample; none where samples have no neighbours.
+    pub fn neighbours<'a>(&self, runs: &'a Runs, ray: usize, sample: usize, k: usize) -> &'a [u32] {
+        let (r, s) = self.places[self.starts[ray] + sample];
+        let samples = &runs.all[r].group.samples;
+        let per_sample = samples.neighbours.len() / samples.len();
+        if per_sample == 0 { &[] } else { &samples.neighbours[s * per_sample..][..k] }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use crate::config::{Config, Method, Preset};
+    use crate::data::{DemoConfig, demo};
+    use crate::parameters::Part;
+    use crate::scene::Scene;
+    use crate::trainer::Trainer;
+
+    /// Some steps with all samples, to make the surface opaque, and one more as `config` has it: its report, the colours of its
+    /// rays and the gradients.
+    fn step(scene: &Scene, config: &Config) -> (crate::StepReport, Vec<glam::Vec3>, [Vec<f32>; 3]) {
+        let mut trainer = Trainer::new(scene, Config { min_transmittance: 0.0, ..config.clone() }).unwrap();
+        for _ in 0..60 {
+            trainer.step();
+        }
+        trainer.config.min_transmittance = config.min_transmittance;
+        let report = trainer.step();
+        let colors = trainer.groups.iter().flat_map(|g| g.composites.iter().map(|c| c.color)).collect();
+        let gradients = [Part::Field, Part::Table, Part::Pose].map(|part| trainer.parameters.gradient(part).to_vec());
+        (report, colors, gradients)
+    }
+
+    fn largest_difference(a: &[f32], b: &[f32]) -> f32 {
+        assert_eq!(a.len(), b.len());
+        let largest = a.iter().map(|x| x.abs()).fold(0.0, f32::max);
+        a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max) / largest
+    }
+
+    #[test]
+    fn runs_change_nothing_and_samples_behind_an_opaque_surface_next_to_nothing() {
+        let body = smpl::BodyModel::embedded();
+        let capture = demo(&DemoConfig { size: 40, frames: 4, eval_cameras: 1, ..Default::default() }, &body).unwrap();
+        let mut config = Config::preset(Preset::Fast, Method::Occnerf);
+        (config.patches, config.patch_size, config.steps) = (2, 24, 100);
+        config.field.density_scale *= 20.0;
+        let scene = Scene::new(&capture, &body, &config).unwrap();
+        let at = |min_transmittance| step(&scene, &Config { min_transmittance, ..config.clone() });
+        let (all, all_colors, all_gradients) = at(0.0);
+        // In many runs, until nothing at all shines through.
+        let (same, same_colors, same_gradients) = at(f32::MIN_POSITIVE);
+        assert!(same.live_samples <= all.live_samples && all.live_samples > 1000, "{}", same.live_samples);
+        for (a, b) in all_colors.iter().zip(&same_colors) {
+            assert!((*a - *b).abs().max_element() < 1e-6, "{a} {b}");
+        }
+        // Completeness is that of the samples that are evaluated.
+        assert!((same.loss - all.loss).abs() < 1e-4 * all.loss, "{} {}", same.loss, all.loss);
+        for (all, same) in all_gradients.iter().zip(&same_gradients) {
+            let difference = largest_difference(all, same);
+            assert!(difference < 1e-4, "{difference}");
+        }
+        let (less, less_colors, less_gradients) = at(1e-3);
+        let share = less.live_samples as f64 / all.live_samples as f64;
+        assert!(share < 0.9, "{share} of the samples");
+        for (a, b) in all_colors.iter().zip(&less_colors) {
+            assert!((*a - *b).abs().max_element() < 1.1e-3, "{a} {b}");
+        }
+        for (all, less) in all_gradients.iter().zip(&less_gradients) {
+            let difference = largest_difference(all, less);
+            assert!(difference < 0.02, "{difference}");
+        }
+    }
+}
