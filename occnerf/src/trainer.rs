@@ -47,7 +47,7 @@ pub struct StepReport {
     pub completeness: f64,
     /// Of the known pixels of the step, decibels.
     pub psnr: f64,
-    /// Samples that were alive.
+    /// Live samples that were evaluated.
     pub live_samples: usize,
     /// Rays traced.
     pub rays: usize,
