@@ -11,10 +11,11 @@ use crate::data::Image;
 use crate::field::Group;
 use crate::parameters::Part;
 use crate::prior::VertexColors;
+use crate::runs::composite_group;
 use crate::samples::{FINE_CELL, March, Stage};
 use crate::scene::{PreparedFrame, Scene};
 use crate::shell::Shell;
-use crate::trainer::{Trainer, composite_group, pixel_ray};
+use crate::trainer::{Trainer, pixel_ray};
 use crate::vertices::VertexCode;
 
 /// A picture with the opacity of each of its pixels.

@@ -5,9 +5,8 @@ use volrender::{Composite, composite, composite_backward};
 
 use crate::field::Group;
 use crate::random::Stream;
-use crate::samples::{March, Tracer};
+use crate::samples::{March, Samples, Tracer};
 use crate::times::Stopwatch;
-use crate::trainer::composite_group;
 
 /// Live samples of a ray that are evaluated before it is asked whether it goes on: about as many as there are from one
 /// side of a surface to the other.
@@ -149,20 +148,8 @@ impl Along {
 
     /// Composites every ray.
     pub fn composite(&mut self, background: Vec3, composites: &mut Vec<Composite>) {
-        self.weights.resize(self.places.len(), 0.0);
-        composites.clear();
-        for ends in self.starts.windows(2) {
-            let range = ends[0]..ends[1];
-            composites.push(composite(
-                &self.sigma[range.clone()],
-                &self.likelihood[range.clone()],
-                &self.delta[range.clone()],
-                &self.t[range.clone()],
-                &self.rgb[range.clone()],
-                background,
-                &mut self.weights[range],
-            ));
-        }
+        let Self { starts, sigma, likelihood, delta, t, rgb, weights, .. } = self;
+        composite_rays(starts, sigma, likelihood, delta, t, rgb, background, weights, composites);
     }
 
     /// Backward of [`Along::composite`], into the runs' groups; `d_colors` of each ray.
@@ -207,6 +194,45 @@ impl Along {
         let samples = &runs.all[r].group.samples;
         let per_sample = samples.neighbours.len() / samples.len();
         if per_sample == 0 { &[] } else { &samples.neighbours[s * per_sample..][..k] }
+    }
+}
+
+/// Composites every ray of a group.
+pub(crate) fn composite_group(
+    group: &Group,
+    background: Vec3,
+    weights: &mut Vec<f32>,
+    composites: &mut Vec<Composite>,
+) {
+    let Samples { starts, likelihood, delta, t, .. } = &group.samples;
+    composite_rays(starts, &group.sigma, likelihood, delta, t, &group.rgb, background, weights, composites);
+}
+
+/// Composites rays whose samples begin at `starts`.
+fn composite_rays(
+    starts: &[usize],
+    sigma: &[f32],
+    likelihood: &[f32],
+    delta: &[f32],
+    t: &[f32],
+    rgb: &[Vec3],
+    background: Vec3,
+    weights: &mut Vec<f32>,
+    composites: &mut Vec<Composite>,
+) {
+    weights.resize(t.len(), 0.0);
+    composites.clear();
+    for ends in starts.windows(2) {
+        let range = ends[0]..ends[1];
+        composites.push(composite(
+            &sigma[range.clone()],
+            &likelihood[range.clone()],
+            &delta[range.clone()],
+            &t[range.clone()],
+            &rgb[range.clone()],
+            background,
+            &mut weights[range],
+        ));
     }
 }
 

@@ -6,14 +6,14 @@ use glam::Vec3;
 use rayon::prelude::*;
 use smpl::{Posed, WeightVolume};
 use visibility::VisibilityCounts;
-use volrender::{Composite, composite};
+use volrender::Composite;
 
 use crate::Error;
 use crate::batch::Batch;
 use crate::config::{Config, DistanceKind, MotionKind, VisibilityKind};
 use crate::correction::{Corrections, Wrench, correct};
 use crate::encoder::Coordinates;
-use crate::field::{Field, Group};
+use crate::field::Field;
 use crate::lpips::Lpips;
 use crate::parameters::{PARTS, Parameters, Part};
 use crate::pixels::Label;
@@ -347,28 +347,4 @@ impl<'a> Trainer<'a> {
 pub(crate) fn pixel_ray(frame: &PreparedFrame, pixel: u32) -> volrender::Ray {
     let width = frame.camera.width;
     frame.camera.ray((pixel % width) as f32 + 0.5, (pixel / width) as f32 + 0.5)
-}
-
-/// Composites every ray of a group.
-pub(crate) fn composite_group(
-    group: &Group,
-    background: Vec3,
-    weights: &mut Vec<f32>,
-    composites: &mut Vec<Composite>,
-) {
-    let samples = &group.samples;
-    weights.resize(samples.len(), 0.0);
-    composites.clear();
-    for ends in samples.starts.windows(2) {
-        let range = ends[0]..ends[1];
-        composites.push(composite(
-            &group.sigma[range.clone()],
-            &samples.likelihood[range.clone()],
-            &samples.delta[range.clone()],
-            &samples.t[range.clone()],
-            &group.rgb[range.clone()],
-            background,
-            &mut weights[range],
-        ));
-    }
 }
