@@ -3,7 +3,7 @@
 use glam::Vec3;
 use rayon::prelude::*;
 use smpl::Posed;
-use volrender::{Camera, Composite, Ray};
+use volrender::{Camera, Composite};
 
 use crate::Error;
 use crate::batch::body_box;
@@ -65,18 +65,10 @@ struct Scratch {
     rays: Vec<Progress>,
 }
 
-/// A ray on its way through the scene, front to back.
+/// A ray and the colour before what it has yet to meet.
 struct Progress {
-    ray: Ray,
     march: March,
     color: Vec3,
-    transmittance: f32,
-}
-
-impl Progress {
-    fn goes_on(&self) -> bool {
-        !self.march.ended && self.transmittance > HIDDEN
-    }
 }
 
 /// Live samples of a ray that are evaluated before it is asked whether it goes on.
@@ -94,31 +86,30 @@ impl Renderer for FieldRenderer<'_> {
         let features = &self.code.features;
         paint(frame, background, Scratch::default, |scratch, row, columns| {
             let start = |column| Progress {
-                ray: pixel_ray(frame, row * frame.camera.width + column),
-                march: March::default(),
+                march: March::new(pixel_ray(frame, row * frame.camera.width + column), None),
                 color: Vec3::ZERO,
-                transmittance: 1.0,
             };
             let Scratch { group, weights, composites, rays } = scratch;
             rays.clear();
             rays.extend(columns.map(start));
             loop {
-                let mut going: Vec<&mut Progress> = rays.iter_mut().filter(|p| p.goes_on()).collect();
+                let mut going: Vec<&mut Progress> = rays.iter_mut().filter(|p| p.march.goes_on(HIDDEN)).collect();
                 if going.is_empty() {
                     break;
                 }
                 group.samples.clear();
                 for p in &mut going {
-                    group.samples.trace_on(&tracer, &p.ray, RUN, &mut p.march);
+                    group.samples.trace_on(&tracer, RUN, &mut p.march);
                 }
                 trainer.field.forward(field, table, features, &trainer.counts, group);
                 composite_group(group, Vec3::ZERO, weights, composites);
                 for (p, run) in going.into_iter().zip(composites.iter()) {
-                    p.color += p.transmittance * run.color;
-                    p.transmittance *= (1.0 - run.opacity).max(0.0);
+                    p.color += p.march.transmittance * run.color;
+                    p.march.pass(run.opacity);
                 }
             }
-            rays.iter().map(|p| (p.color + p.transmittance * background, 1.0 - p.transmittance)).collect()
+            let shown = |p: &Progress| (p.color + p.march.transmittance * background, 1.0 - p.march.transmittance);
+            rays.iter().map(shown).collect()
         })
     }
 }

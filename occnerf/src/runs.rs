@@ -4,7 +4,6 @@ use glam::Vec3;
 use volrender::{Composite, composite, composite_backward};
 
 use crate::field::Group;
-use crate::random::Stream;
 use crate::samples::{March, Samples, Tracer};
 use crate::times::Stopwatch;
 
@@ -19,7 +18,6 @@ pub(crate) struct Runs {
     all: Vec<Run>,
     count: usize,
     marches: Vec<March>,
-    transmittance: Vec<f32>,
     weights: Vec<f32>,
     composites: Vec<Composite>,
 }
@@ -33,37 +31,33 @@ struct Run {
 }
 
 impl Runs {
-    /// Traces `rays`, given with their jitter, and has `evaluate` give every sample its density and colour, until all rays have
-    /// ended or their transmittance is at most `min_transmittance`. With 0 all samples are one run.
+    /// Traces `rays` and has `evaluate` give every sample its density and colour, until all rays have ended or their transmittance
+    /// is at most `min_transmittance`. With 0 all samples are one run.
     pub fn march(
         &mut self,
         tracer: &Tracer<'_>,
-        rays: impl Fn(usize) -> (volrender::Ray, Stream),
-        count: usize,
+        rays: impl Iterator<Item = March>,
         min_transmittance: f32,
         mut evaluate: impl FnMut(&mut Group),
     ) {
         self.count = 0;
-        self.transmittance.clear();
-        self.transmittance.resize(count, 1.0);
         self.marches.clear();
-        self.marches.extend((0..count).map(|ray| March::new(Some(rays(ray).1))));
+        self.marches.extend(rays);
         let most = if min_transmittance > 0.0 { RUN } else { usize::MAX };
         loop {
             if self.count == self.all.len() {
                 self.all.push(Run::default());
             }
             let Run { rays: going, group } = &mut self.all[self.count];
-            let goes_on = |&ray: &usize| !self.marches[ray].ended && self.transmittance[ray] > min_transmittance;
             going.clear();
-            going.extend((0..count).filter(goes_on));
+            going.extend((0..self.marches.len()).filter(|&ray| self.marches[ray].goes_on(min_transmittance)));
             if going.is_empty() && self.count > 0 {
                 return;
             }
             let mut watch = Stopwatch::start();
             group.samples.clear();
             for &ray in &*going {
-                group.samples.trace_on(tracer, &rays(ray).0, most, &mut self.marches[ray]);
+                group.samples.trace_on(tracer, most, &mut self.marches[ray]);
             }
             watch.lap(&mut group.times.trace);
             evaluate(group);
@@ -74,7 +68,7 @@ impl Runs {
             let mut watch = Stopwatch::start();
             composite_group(group, Vec3::ZERO, &mut self.weights, &mut self.composites);
             for (&ray, composite) in going.iter().zip(&self.composites) {
-                self.transmittance[ray] *= (1.0 - composite.opacity).max(0.0);
+                self.marches[ray].pass(composite.opacity);
             }
             watch.lap(&mut group.times.losses);
         }
@@ -96,6 +90,8 @@ impl Runs {
 pub(crate) struct Along {
     /// First sample of each ray, and the end of the last.
     starts: Vec<usize>,
+    /// How many rays of each run have had their turn.
+    done: Vec<usize>,
     /// Run, and place in it, of each sample.
     places: Vec<(usize, usize)>,
     sigma: Vec<f32>,
@@ -114,14 +110,15 @@ impl Along {
         self.places.len()
     }
 
-    /// Takes the samples of `count` rays from their runs.
-    pub fn gather(&mut self, runs: &Runs, count: usize) {
+    /// Takes the samples from their runs.
+    pub fn gather(&mut self, runs: &Runs) {
         self.starts.clear();
         self.starts.push(0);
         self.places.clear();
-        // How many rays of each run have had their turn.
-        let mut done = vec![0; runs.count];
-        for ray in 0..count {
+        let done = &mut self.done;
+        done.clear();
+        done.resize(runs.count, 0);
+        for ray in 0..runs.marches.len() {
             for (r, run) in runs.all[..runs.count].iter().enumerate() {
                 if run.rays.get(done[r]) != Some(&ray) {
                     break;
@@ -149,7 +146,7 @@ impl Along {
     /// Composites every ray.
     pub fn composite(&mut self, background: Vec3, composites: &mut Vec<Composite>) {
         let Self { starts, sigma, likelihood, delta, t, rgb, weights, .. } = self;
-        composite_rays(starts, sigma, likelihood, delta, t, rgb, background, weights, composites);
+        Rays { starts, sigma, likelihood, delta, t, rgb }.composite(background, weights, composites);
     }
 
     /// Backward of [`Along::composite`], into the runs' groups; `d_colors` of each ray.
@@ -205,34 +202,37 @@ pub(crate) fn composite_group(
     composites: &mut Vec<Composite>,
 ) {
     let Samples { starts, likelihood, delta, t, .. } = &group.samples;
-    composite_rays(starts, &group.sigma, likelihood, delta, t, &group.rgb, background, weights, composites);
+    Rays { starts, sigma: &group.sigma, likelihood, delta, t, rgb: &group.rgb }
+        .composite(background, weights, composites);
 }
 
-/// Composites rays whose samples begin at `starts`.
-fn composite_rays(
-    starts: &[usize],
-    sigma: &[f32],
-    likelihood: &[f32],
-    delta: &[f32],
-    t: &[f32],
-    rgb: &[Vec3],
-    background: Vec3,
-    weights: &mut Vec<f32>,
-    composites: &mut Vec<Composite>,
-) {
-    weights.resize(t.len(), 0.0);
-    composites.clear();
-    for ends in starts.windows(2) {
-        let range = ends[0]..ends[1];
-        composites.push(composite(
-            &sigma[range.clone()],
-            &likelihood[range.clone()],
-            &delta[range.clone()],
-            &t[range.clone()],
-            &rgb[range.clone()],
-            background,
-            &mut weights[range],
-        ));
+/// The samples of rays, ray by ray, as far as compositing reads them.
+struct Rays<'a> {
+    /// First sample of each ray, and the end of the last.
+    starts: &'a [usize],
+    sigma: &'a [f32],
+    likelihood: &'a [f32],
+    delta: &'a [f32],
+    t: &'a [f32],
+    rgb: &'a [Vec3],
+}
+
+impl Rays<'_> {
+    fn composite(&self, background: Vec3, weights: &mut Vec<f32>, composites: &mut Vec<Composite>) {
+        weights.resize(self.t.len(), 0.0);
+        composites.clear();
+        for ends in self.starts.windows(2) {
+            let range = ends[0]..ends[1];
+            composites.push(composite(
+                &self.sigma[range.clone()],
+                &self.likelihood[range.clone()],
+                &self.delta[range.clone()],
+                &self.t[range.clone()],
+                &self.rgb[range.clone()],
+                background,
+                &mut weights[range],
+            ));
+        }
     }
 }
 

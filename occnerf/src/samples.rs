@@ -87,21 +87,36 @@ pub(crate) struct Samples {
     pub faces: Vec<(u32, [f32; 3])>,
 }
 
-/// How far along its bins a ray has been traced.
-#[derive(Clone, Debug, Default)]
+/// A ray on its way through the scene, front to back.
+#[derive(Clone, Debug)]
 pub(crate) struct March {
+    ray: Ray,
+    /// The first that is not traced yet.
     bin: usize,
     /// The face that was closest to the last sample bounds the search for the next.
     known: Option<u32>,
     /// Places each sample in its bin, the middle without.
     jitter: Option<Stream>,
-    pub ended: bool,
+    /// Whether all bins are traced.
+    ended: bool,
+    /// Of what was traced and evaluated.
+    pub transmittance: f32,
 }
 
 impl March {
     /// Nothing of the ray is traced yet; `jitter` places each sample in its bin, the middle without.
-    pub fn new(jitter: Option<Stream>) -> Self {
-        Self { jitter, ..Self::default() }
+    pub fn new(ray: Ray, jitter: Option<Stream>) -> Self {
+        Self { ray, bin: 0, known: None, jitter, ended: false, transmittance: 1.0 }
+    }
+
+    /// Whether there are bins left that can be seen through what is before them.
+    pub fn goes_on(&self, min_transmittance: f32) -> bool {
+        !self.ended && self.transmittance > min_transmittance
+    }
+
+    /// Takes in how opaque the samples are that were traced last.
+    pub fn pass(&mut self, opacity: f32) {
+        self.transmittance *= (1.0 - opacity).max(0.0);
     }
 }
 
@@ -128,14 +143,15 @@ impl Samples {
     /// Appends all live samples of a ray, in the middle of their bins.
     #[cfg(test)]
     pub fn trace(&mut self, tracer: &Tracer<'_>, ray: &Ray) {
-        self.trace_on(tracer, ray, usize::MAX, &mut March::default());
+        self.trace_on(tracer, usize::MAX, &mut March::new(*ray, None));
     }
 
     /// Appends the next live samples of a ray, at most `most`, and takes the march to where they end.
-    pub fn trace_on(&mut self, tracer: &Tracer<'_>, ray: &Ray, most: usize, march: &mut March) {
+    pub fn trace_on(&mut self, tracer: &Tracer<'_>, most: usize, march: &mut March) {
+        let ray = march.ray;
         let bins = tracer.config.samples;
         let first = self.len();
-        let span = tracer.stage.occupancy.region().and_then(|region| region.intersect(ray));
+        let span = tracer.stage.occupancy.region().and_then(|region| region.intersect(&ray));
         if let Some((near, far)) = span.filter(|(near, far)| far > near) {
             let width = (far - near) / bins as f32;
             while march.bin < bins && self.len() - first < most {

@@ -14,6 +14,7 @@ use crate::lpips::Lpips;
 use crate::parameters::Part;
 use crate::pixels::Label;
 use crate::random::Stream;
+use crate::samples::March;
 use crate::scene::PreparedFrame;
 use crate::times::{StepTimes, Stopwatch};
 use crate::trainer::{GroupState, StepReport, Trainer, pixel_ray};
@@ -25,13 +26,13 @@ impl Trainer<'_> {
     pub(crate) fn forward(&self, state: &mut GroupState, batch: &Batch, frame: &PreparedFrame, posed: &Posed) {
         let tracer = self.tracer(&self.stage, &self.shell, frame, posed);
         let GroupState { rays, runs, along, composites, terminations, times, .. } = state;
-        let ray = |index: usize| {
-            let jitter = Stream::new(&[self.config.seed, JITTER, self.steps_done, rays[index] as u64]);
-            (pixel_ray(frame, batch.pixels[rays[index]]), jitter)
-        };
+        let marches = rays.iter().map(|&ray| {
+            let jitter = Stream::new(&[self.config.seed, JITTER, self.steps_done, ray as u64]);
+            March::new(pixel_ray(frame, batch.pixels[ray]), Some(jitter))
+        });
         let wants_jacobian = self.volume.is_some() || self.teaches_poses();
         let (field, table) = (self.parameters.get(Part::Field), self.parameters.get(Part::Table));
-        runs.march(&tracer, ray, rays.len(), self.config.min_transmittance, |group| {
+        runs.march(&tracer, marches, self.config.min_transmittance, |group| {
             group.wants_jacobian = wants_jacobian;
             self.field.forward(field, table, &self.vertex_code.features, &self.counts, group);
         });
@@ -40,7 +41,7 @@ impl Trainer<'_> {
             *times += std::mem::take(&mut group.times);
         }
         let mut watch = Stopwatch::start();
-        along.gather(runs, rays.len());
+        along.gather(runs);
         along.composite(batch.background, composites);
         watch.lap(&mut times.losses);
         terminations.clear();

@@ -57,14 +57,13 @@ fn a_sweep_goes_on_where_it_was_cut_off() {
 #[test]
 fn captures_are_made_hard_as_their_layout_allows() {
     let folder = folder("hard-captures");
-    let made = |format: &str, occlusion: &str| {
+    let made = |format: &str| {
         let out = folder.join(format);
-        let size =
-            ["--size", "32", "--frames", "4", "--eval-cameras", "1", "--format", format, "--occlusion", occlusion];
+        let size = ["--size", "32", "--frames", "4", "--eval-cameras", "1", "--format", format];
         done(&[&["synth", "--out", text(&out)], &size[..]].concat());
         out
     };
-    let (zju, prepared) = (made("zju-mocap", "central"), made("humannerf", "central"));
+    let (zju, prepared) = (made("zju-mocap"), made("humannerf"));
     let out = folder.join("out");
     let sweep = ["bench", "stability", text(&zju), "--quick", "--side", "24", "--steps", "1", "--out", text(&out)];
     let said = done(&[&sweep[..], &["--axes", "hidden,one frame of"]].concat());
