@@ -20,13 +20,15 @@ pub(crate) struct Batch {
     pub pixels: Vec<u32>,
     /// Random background of the step.
     pub background: glam::Vec3,
+    /// The frames of the current round.
+    order: Vec<usize>,
 }
 
 impl Batch {
     /// Draws a step's rays from the seed and the step's number alone.
     pub fn draw(&mut self, scene: &Scene, config: &Config, step: u64) {
         let mut random = Stream::new(&[config.seed, DRAW, step]);
-        self.frame = frame_of(scene.train.len(), config.seed, step);
+        self.frame = frame_of(scene.train.len(), config.seed, step, &mut self.order);
         let frame = &scene.train[self.frame];
         let (width, height) = (frame.camera.width, frame.camera.height);
         let size = config.patch_size.min(width).min(height);
@@ -52,10 +54,11 @@ impl Batch {
 }
 
 /// Frames come in a new random order each time round, so that none waits longer than two rounds.
-fn frame_of(frames: usize, seed: u64, step: u64) -> usize {
+fn frame_of(frames: usize, seed: u64, step: u64, order: &mut Vec<usize>) -> usize {
     let (round, place) = (step / frames as u64, (step % frames as u64) as usize);
     let mut random = Stream::new(&[seed, 0x4652_414D, round]);
-    let mut order: Vec<usize> = (0..frames).collect();
+    order.clear();
+    order.extend(0..frames);
     for i in (1..frames).rev() {
         order.swap(i, random.below(i + 1));
     }
@@ -97,7 +100,7 @@ mod tests {
 
     #[test]
     fn every_round_shows_every_frame_once_in_another_order() {
-        let round = |r: u64| (0..10).map(|i| frame_of(10, 5, r * 10 + i)).collect::<Vec<_>>();
+        let round = |r: u64| (0..10).map(|i| frame_of(10, 5, r * 10 + i, &mut Vec::new())).collect::<Vec<_>>();
         let mut sorted = round(3);
         sorted.sort_unstable();
         assert_eq!(sorted, (0..10).collect::<Vec<_>>());

@@ -92,26 +92,37 @@ fn changes(model: &BodyModel, posed: &Posed, correction: &[Vec3]) -> Vec<Affine3
 }
 
 /// `posed` (of `shape`) with its bones corrected: shift in its unit, turns in radians.
-pub(crate) fn correct(model: &BodyModel, shape: &Shaped, posed: &Posed, correction: &[Vec3]) -> Posed {
-    let changes = changes(model, posed, correction);
-    let bones: Vec<Affine3A> = changes.iter().zip(&posed.bones).map(|(change, bone)| *change * *bone).collect();
-    let joints = changes.iter().zip(&posed.joints).map(|(change, &joint)| change.transform_point3(joint)).collect();
-    let rest = shape.vertices.iter().zip(&posed.pose_offsets);
-    let vertices = rest.enumerate().map(|(v, (rest, offset))| {
-        let rest = Vec3A::from(*rest + *offset);
-        Vec3::from(model.weights.row(v).map(|(j, w)| w * bones[j].transform_point3a(rest)).sum::<Vec3A>())
-    });
-    Posed { vertices: vertices.collect(), joints, pose_offsets: posed.pose_offsets.clone(), bones }
+pub(crate) fn corrected(model: &BodyModel, shape: &Shaped, posed: &Posed, correction: &[Vec3]) -> Posed {
+    let mut out = Posed::default();
+    correct(model, shape, posed, correction, &mut out);
+    out
 }
 
-/// Backward of [`correct`] for points that keep still while the body moves: `wrenches` (J) gather, over all points, the
+/// [`corrected`], in the place of `out`.
+pub(crate) fn correct(model: &BodyModel, shape: &Shaped, posed: &Posed, correction: &[Vec3], out: &mut Posed) {
+    let changes = changes(model, posed, correction);
+    let Posed { vertices, joints, bones, pose_offsets } = out;
+    bones.clear();
+    bones.extend(changes.iter().zip(&posed.bones).map(|(change, bone)| *change * *bone));
+    joints.clear();
+    joints.extend(changes.iter().zip(&posed.joints).map(|(change, &joint)| change.transform_point3(joint)));
+    pose_offsets.clone_from(&posed.pose_offsets);
+    let rest = shape.vertices.iter().zip(&*pose_offsets);
+    vertices.clear();
+    vertices.extend(rest.enumerate().map(|(v, (rest, offset))| {
+        let rest = Vec3A::from(*rest + *offset);
+        Vec3::from(model.weights.row(v).map(|(j, w)| w * bones[j].transform_point3a(rest)).sum::<Vec3A>())
+    }));
+}
+
+/// Backward of [`corrected`] for points that keep still while the body moves: `wrenches` (J) gather, over all points, the
 /// gradients with respect to the points' place *relative to the body*, in world axes, shared out by skinning weight.
-/// `corrected` is the result of [`correct`].
+/// `after` is the result of [`corrected`].
 pub(crate) fn correct_backward(
     model: &BodyModel,
     posed: &Posed,
     correction: &[Vec3],
-    corrected: &Posed,
+    after: &Posed,
     wrenches: &[Wrench],
 ) -> Vec<Vec3> {
     let mut subtree = wrenches.to_vec();
@@ -120,7 +131,7 @@ pub(crate) fn correct_backward(
     for j in (0..subtree.len()).rev() {
         let Wrench { force, moment } = subtree[j];
         // A turn of the joint by ω carries the body along by ω × (x − J), and a still point the other way.
-        let d_turn = Vec3A::from(corrected.joints[j]).cross(force) - moment;
+        let d_turn = Vec3A::from(after.joints[j]).cross(force) - moment;
         let axes = posed.bones[j].matrix3;
         let before = model.parents[j].map_or(axes, |parent| changes[parent].matrix3 * axes);
         out[1 + j] = left_jacobian_transposed(correction[1 + j], (before.transpose() * d_turn).into());
@@ -170,12 +181,12 @@ mod tests {
         let shape = model.shaped(&[0.5]);
         let posed = posed(&model, &shape, &mut Stream::new(&[3]));
         let mut correction = vec![Vec3::ZERO; model.num_joints() + 1];
-        let same = correct(&model, &shape, &posed, &correction);
+        let same = corrected(&model, &shape, &posed, &correction);
         let far =
             |a: &[Vec3], b: &[Vec3], by: Vec3| a.iter().zip(b).map(|(a, b)| a.distance(*b + by)).fold(0.0, f32::max);
         assert!(far(&same.vertices, &posed.vertices, Vec3::ZERO) < 2e-6);
         correction[0] = Vec3::new(0.1, 0.0, 0.0);
-        let moved = correct(&model, &shape, &posed, &correction);
+        let moved = corrected(&model, &shape, &posed, &correction);
         let by = Vec3::from(0.1 * posed.bones[0].matrix3.x_axis);
         assert!(far(&moved.vertices, &posed.vertices, by) < 2e-6 && far(&moved.joints, &posed.joints, by) < 2e-6);
     }
@@ -195,7 +206,7 @@ mod tests {
             .map(|(&pose, &turn)| (Quat::from_scaled_axis(pose) * Quat::from_scaled_axis(turn)).to_scaled_axis())
             .collect();
         let expected = model.pose(&shape, &turned, smpl::Placement::default());
-        let found = correct(&model, &shape, &model.pose(&shape, &pose, smpl::Placement::default()), &correction);
+        let found = corrected(&model, &shape, &model.pose(&shape, &pose, smpl::Placement::default()), &correction);
         let worst = expected.vertices.iter().zip(&found.vertices).map(|(a, b)| a.distance(*b)).fold(0.0, f32::max);
         assert!(worst < 5e-6, "{worst}");
     }
@@ -209,18 +220,18 @@ mod tests {
         let posed = posed(&model, &shape, &mut stream);
         let motion = SurfaceMotion { margin: 0.2, falloff: 0.1 };
         let correction: Vec<Vec3> = (0..=model.num_joints()).map(|_| random(&mut stream, 0.1)).collect();
-        let corrected = correct(&model, &shape, &posed, &correction);
+        let after = corrected(&model, &shape, &posed, &correction);
         let points: Vec<(u32, [f32; 3], Vec3, Vec3)> = (0..200)
             .map(|_| {
                 let face = stream.below(model.faces.len()) as u32;
                 let bary = [0.25, 0.5, 0.25];
-                let on = model.faces[face as usize].iter().zip(bary).map(|(&v, b)| b * corrected.vertices[v as usize]);
+                let on = model.faces[face as usize].iter().zip(bary).map(|(&v, b)| b * after.vertices[v as usize]);
                 let x = on.sum::<Vec3>() + random(&mut stream, 0.01);
                 (face, bary, x, random(&mut stream, 1.0))
             })
             .collect();
         let value = |correction: &[Vec3]| -> f64 {
-            let posed = correct(&model, &shape, &posed, correction);
+            let posed = corrected(&model, &shape, &posed, correction);
             let each = points.iter().map(|(face, bary, x, a)| {
                 let sample = motion.map(&model, &posed, *x, *face, *bary, 0.0).unwrap();
                 f64::from(sample.canonical.dot(*a))
@@ -229,10 +240,10 @@ mod tests {
         };
         let mut wrenches = vec![Wrench::default(); model.num_joints()];
         for (face, bary, x, a) in &points {
-            let at = crate::pose_backward::Anchor::new(&model, &corrected, *face, *bary, *x).unwrap();
+            let at = crate::pose_backward::Anchor::new(&model, &after, *face, *bary, *x).unwrap();
             at.push(at.to_world(*a), &mut wrenches);
         }
-        let gradient = correct_backward(&model, &posed, &correction, &corrected, &wrenches);
+        let gradient = correct_backward(&model, &posed, &correction, &after, &wrenches);
         let mut failures = Vec::new();
         for j in 0..correction.len() {
             for axis in 0..3 {

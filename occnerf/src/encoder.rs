@@ -1,5 +1,7 @@
 //! The encoding γ of each method.
 
+use std::ops::Range;
+
 use glam::Vec3;
 use hashgrid::{HashGrid, HashGridConfig};
 use volrender::Aabb;
@@ -85,7 +87,7 @@ impl Encoder {
     }
 
     /// Features (Q × F, row-major) of the coordinates.
-    pub fn encode(&self, table: &[f32], at: &Coordinates, features: &mut [f32]) {
+    pub fn encode(&self, table: &[f32], at: At<'_>, features: &mut [f32]) {
         match self {
             Self::Frequency => {
                 for (x, row) in at.point.iter().zip(features.chunks_exact_mut(self.num_features())) {
@@ -98,52 +100,46 @@ impl Encoder {
                     }
                 }
             }
-            Self::Point(grid) => grid.encode(table, &at.point, features),
-            Self::Surface(grid, _) => grid.encode(table, &at.surface, features),
+            Self::Point(grid) => grid.encode(table, at.point, features),
+            Self::Surface(grid, _) => grid.encode(table, at.surface, features),
         }
     }
 
     /// [`Encoder::encode`] with what [`Encoder::encode_backward_points`] needs to leave the table alone; empty where it does not
     /// read one.
-    pub fn encode_jacobian(&self, table: &[f32], at: &Coordinates, features: &mut [f32], jacobian: &mut Vec<f32>) {
+    pub fn encode_jacobian(&self, table: &[f32], at: At<'_>, features: &mut [f32], jacobian: &mut Vec<f32>) {
         match self {
             Self::Frequency => self.encode(table, at, features),
             Self::Point(grid) => {
                 jacobian.resize(grid.jacobian_len(at.point.len()), 0.0);
-                grid.encode_jacobian(table, &at.point, features, jacobian);
+                grid.encode_jacobian(table, at.point, features, jacobian);
             }
             Self::Surface(grid, _) => {
                 jacobian.resize(grid.jacobian_len(at.surface.len()), 0.0);
-                grid.encode_jacobian(table, &at.surface, features, jacobian);
+                grid.encode_jacobian(table, at.surface, features, jacobian);
             }
         }
     }
 
     /// Adds the gradient of the table.
-    pub fn encode_backward(&self, at: &Coordinates, d_features: &[f32], d_table: &mut [f32]) {
+    pub fn encode_backward(&self, at: At<'_>, d_features: &[f32], d_table: &mut [f32]) {
         match self {
             Self::Frequency => {}
-            Self::Point(grid) => grid.encode_backward(&at.point, d_features, d_table),
-            Self::Surface(grid, _) => grid.encode_backward(&at.surface, d_features, d_table),
+            Self::Point(grid) => grid.encode_backward(at.point, d_features, d_table),
+            Self::Surface(grid, _) => grid.encode_backward(at.surface, d_features, d_table),
         }
     }
 
-    /// Gradients of x̂, or of v̂ and d, in normalised metres.
-    pub fn encode_backward_points(
-        &self,
-        slopes: Slopes<'_>,
-        at: &Coordinates,
-        d_features: &[f32],
-        region: &Aabb,
-    ) -> Vec<(Vec3, f32)> {
-        let per_metre = (region.max - region.min).recip();
+    /// Gradients of the coordinates; overwrites `d_at`.
+    pub fn encode_backward_points(&self, slopes: Slopes<'_>, at: At<'_>, d_features: &[f32], d_at: &mut Coordinates) {
+        d_at.clear();
+        d_at.point.resize(at.point.len(), [0.0; 3]);
+        d_at.surface.resize(at.surface.len(), [0.0; 4]);
         match self {
-            Self::Frequency => at
-                .point
-                .iter()
-                .zip(d_features.chunks_exact(self.num_features()))
-                .map(|(x, d_row)| {
-                    let mut d = Vec3::from_slice(d_row);
+            Self::Frequency => {
+                let rows = d_features.chunks_exact(self.num_features());
+                for ((d, x), d_row) in d_at.point.iter_mut().zip(at.point).zip(rows) {
+                    d.copy_from_slice(&d_row[..3]);
                     for (band, pair) in d_row[3..].chunks_exact(6).enumerate() {
                         let frequency = (1u32 << band) as f32;
                         for axis in 0..3 {
@@ -151,25 +147,28 @@ impl Encoder {
                             d[axis] += frequency * (cos * pair[axis] - sin * pair[3 + axis]);
                         }
                     }
-                    (d, 0.0)
-                })
-                .collect(),
-            Self::Point(grid) => {
-                let mut d = vec![[0.0; 3]; at.point.len()];
-                match slopes {
-                    Slopes::Table(table) => grid.encode_backward_points(table, &at.point, d_features, &mut d),
-                    Slopes::Jacobian(jacobian) => grid.jacobian_backward(jacobian, d_features, &mut d),
                 }
-                d.into_iter().map(|d| (Vec3::from_array(d) * per_metre, 0.0)).collect()
             }
-            Self::Surface(grid, range) => {
-                let mut d = vec![[0.0; 4]; at.surface.len()];
-                match slopes {
-                    Slopes::Table(table) => grid.encode_backward_points(table, &at.surface, d_features, &mut d),
-                    Slopes::Jacobian(jacobian) => grid.jacobian_backward(jacobian, d_features, &mut d),
-                }
-                let per_distance = 1.0 / (range.1 - range.0);
-                d.into_iter().map(|[x, y, z, w]| (Vec3::new(x, y, z) * per_metre, w * per_distance)).collect()
+            Self::Point(grid) => match slopes {
+                Slopes::Table(table) => grid.encode_backward_points(table, at.point, d_features, &mut d_at.point),
+                Slopes::Jacobian(jacobian) => grid.jacobian_backward(jacobian, d_features, &mut d_at.point),
+            },
+            Self::Surface(grid, _) => match slopes {
+                Slopes::Table(table) => grid.encode_backward_points(table, at.surface, d_features, &mut d_at.surface),
+                Slopes::Jacobian(jacobian) => grid.jacobian_backward(jacobian, d_features, &mut d_at.surface),
+            },
+        }
+    }
+
+    /// Gradient `index` of coordinates as that of x̂, or of v̂ and d, in normalised metres.
+    pub fn d_metres(&self, d_at: &Coordinates, index: usize, region: &Aabb) -> (Vec3, f32) {
+        let per_metre = (region.max - region.min).recip();
+        match self {
+            Self::Frequency => (Vec3::from_array(d_at.point[index]), 0.0),
+            Self::Point(_) => (Vec3::from_array(d_at.point[index]) * per_metre, 0.0),
+            Self::Surface(_, (low, high)) => {
+                let [x, y, z, w] = d_at.surface[index];
+                (Vec3::new(x, y, z) * per_metre, w * (1.0 / (high - low)))
             }
         }
     }
@@ -191,7 +190,23 @@ pub(crate) struct Coordinates {
     pub surface: Vec<[f32; 4]>,
 }
 
+/// Some of [`Coordinates`].
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct At<'a> {
+    pub point: &'a [[f32; 3]],
+    pub surface: &'a [[f32; 4]],
+}
+
 impl Coordinates {
+    pub fn all(&self) -> At<'_> {
+        At { point: &self.point, surface: &self.surface }
+    }
+
+    /// Those of vertices `range`, which are encoded on the surface.
+    pub fn vertices(&self, range: Range<usize>) -> At<'_> {
+        At { point: &[], surface: &self.surface[range] }
+    }
+
     pub fn extend(&mut self, other: &Self) {
         self.point.extend_from_slice(&other.point);
         self.surface.extend_from_slice(&other.surface);

@@ -55,6 +55,8 @@ pub(crate) struct Group {
     pub d_features: Vec<f32>,
     /// Gradient of d through the density's bias.
     pub d_distance: Vec<f32>,
+    /// Gradient of `at`, where it is asked for.
+    pub d_at: Coordinates,
     d_output: Vec<f32>,
     d_input: Vec<f32>,
     /// Where the time of this step went.
@@ -94,9 +96,9 @@ impl Field {
         self.encoder.coordinates(&group.samples, &self.region, &mut group.at);
         group.features.resize(n * width, 0.0);
         if group.wants_jacobian {
-            self.encoder.encode_jacobian(table, &group.at, &mut group.features, &mut group.jacobian);
+            self.encoder.encode_jacobian(table, group.at.all(), &mut group.features, &mut group.jacobian);
         } else {
-            self.encoder.encode(table, &group.at, &mut group.features);
+            self.encoder.encode(table, group.at.all(), &mut group.features);
         }
         watch.lap(&mut group.times.encode);
         self.attend(counts, group);
@@ -327,7 +329,7 @@ mod tests {
             field.backward(&transposed, &mut group, &mut d_mlp, &mut d_features);
             field.mlp.clear_padding(&mut d_mlp);
             let mut d_table = vec![0.0; table.len()];
-            field.encoder.encode_backward(&group.at, &group.d_features, &mut d_table);
+            field.encoder.encode_backward(group.at.all(), &group.d_features, &mut d_table);
             for direction in 0..6 {
                 let mut random = Stream::new(&[17, direction]);
                 let mut u_mlp = normal(mlp.len(), &mut random);

@@ -43,6 +43,7 @@ mod lpips;
 mod mlp;
 mod occupancy;
 mod parameters;
+mod photometric;
 mod pixels;
 #[cfg(test)]
 mod plain;

@@ -11,13 +11,14 @@ impl Trainer<'_> {
     /// Adds the gradients of the encoding's coordinates, of d and of f to those of the bones that the samples hang on. The
     /// closest surface point is taken to slide along the tangent plane, as it does to first order on a flat surface,
     /// and what colours start from to be the same all around it.
-    pub(crate) fn pose_backward(&self, group: &Group, posed: &Posed, wrenches: &mut [Wrench]) {
-        let d_points = self.d_coordinates(group);
+    pub(crate) fn pose_backward(&self, group: &mut Group, posed: &Posed, wrenches: &mut [Wrench]) {
+        self.d_coordinates(group);
         let samples = &group.samples;
         let (model, motion) = (&self.scene.model, &self.config.motion);
         let on_surface = !group.at.surface.is_empty();
         let field = SurfaceMotion { margin: motion.margin, falloff: motion.falloff };
-        for (s, (d_canonical, d_coordinate)) in d_points.into_iter().enumerate() {
+        for s in 0..samples.world.len() {
+            let (d_canonical, d_coordinate) = self.field.encoder.d_metres(&group.d_at, s, &self.scene.canonical_box);
             let ((face, barycentric), x, d) = (samples.faces[s], samples.world[s], samples.distance[s]);
             let Some(anchor) = Anchor::new(model, posed, face, barycentric, x) else { continue };
             let corners = model.faces[face as usize].iter().zip(barycentric);
@@ -94,7 +95,7 @@ fn weights(model: &BodyModel, corners: [u32; 3], barycentric: [f32; 3]) -> impl 
 mod tests {
     use super::*;
     use crate::config::{Config, Method, Preset};
-    use crate::correction::{correct, correct_backward};
+    use crate::correction::{correct_backward, corrected};
     use crate::parameters::Part;
     use crate::random::Stream;
     use crate::samples::{CELL, Stage};
@@ -116,10 +117,10 @@ mod tests {
             let mut stream = Stream::new(&[11, method as u64]);
             let mut random = |size: f32| size * Vec3::new(stream.normal(), stream.normal(), stream.normal());
             let correction: Vec<Vec3> = (0..=body.num_joints()).map(|_| random(0.03)).collect();
-            let corrected = correct(&body, &frame.shape, &frame.posed, &correction);
+            let after = corrected(&body, &frame.shape, &frame.posed, &correction);
             let mut points = Vec::new();
             for (f, corners) in body.faces.iter().enumerate().step_by(7) {
-                let [a, b, c] = corners.map(|v| corrected.vertices[v as usize]);
+                let [a, b, c] = corners.map(|v| after.vertices[v as usize]);
                 let normal = (b - a).cross(c - a).normalize_or_zero();
                 points.push((a + b + c) / 3.0 + ((f % 9) as f32 / 8.0 * 0.024 - 0.012) * normal);
             }
@@ -135,23 +136,23 @@ mod tests {
                 live
             };
             let mut group = Group::default();
-            let live = trace(&corrected, &mut group);
+            let live = trace(&after, &mut group);
             assert!(live.len() > 500, "{}", live.len());
             let width = trainer.field.encoder.num_features();
             let (table, mut features) = (trainer.parameters.get(Part::Table), vec![0.0; live.len() * width]);
-            trainer.field.encoder.encode_jacobian(table, &group.at, &mut features, &mut group.jacobian);
+            trainer.field.encoder.encode_jacobian(table, group.at.all(), &mut features, &mut group.jacobian);
             group.d_features = (0..live.len() * width).map(|_| random(1.0).x).collect();
             group.d_distance = live.iter().map(|_| random(3.0).x).collect();
             group.d_likelihood = live.iter().map(|_| random(0.3).x).collect();
-            let mut wrenches = vec![Wrench::default(); corrected.bones.len()];
-            trainer.pose_backward(&group, &corrected, &mut wrenches);
-            let gradient = correct_backward(&body, &frame.posed, &correction, &corrected, &wrenches);
+            let mut wrenches = vec![Wrench::default(); after.bones.len()];
+            trainer.pose_backward(&mut group, &after, &mut wrenches);
+            let gradient = correct_backward(&body, &frame.posed, &correction, &after, &wrenches);
 
             let mut value = |correction: &[Vec3]| -> f64 {
                 let mut moved = Group::default();
-                let found = trace(&correct(&body, &frame.shape, &frame.posed, correction), &mut moved);
+                let found = trace(&corrected(&body, &frame.shape, &frame.posed, correction), &mut moved);
                 let mut features = vec![0.0; found.len() * width];
-                trainer.field.encoder.encode(trainer.parameters.get(Part::Table), &moved.at, &mut features);
+                trainer.field.encoder.encode(trainer.parameters.get(Part::Table), moved.at.all(), &mut features);
                 let at = |i: usize| live.binary_search(&i).ok();
                 let terms = found.iter().enumerate().filter_map(|(s, &i)| {
                     let l = at(i)?;

@@ -4,20 +4,19 @@ use glam::Vec3;
 use rayon::prelude::*;
 use smpl::{Posed, WeightVolume};
 
-use crate::batch::{Batch, target};
+use crate::batch::Batch;
 use crate::config::DistanceKind;
 use crate::correction::{Wrench, correct_backward};
 use crate::encoder::Slopes;
 use crate::field::Group;
-use crate::loss::{completeness, multiscale_dissimilarity};
-use crate::lpips::Lpips;
+use crate::loss::completeness;
 use crate::parameters::Part;
 use crate::pixels::Label;
 use crate::random::Stream;
 use crate::samples::March;
 use crate::scene::PreparedFrame;
 use crate::times::{StepTimes, Stopwatch};
-use crate::trainer::{GroupState, StepReport, Trainer, pixel_ray};
+use crate::trainer::{GroupState, Trainer, pixel_ray};
 
 const JITTER: u64 = 0x4A49_5454;
 
@@ -52,50 +51,6 @@ impl Trainer<'_> {
                 terminations.extend_from_slice(along.neighbours(runs, index, t as usize, self.config.surface.k));
             }
         }
-    }
-
-    /// Photometric losses over the patches; returns d loss / d colour of each ray of the batch.
-    pub(crate) fn photometric(
-        &self,
-        groups: &[GroupState],
-        batch: &Batch,
-        frame: &PreparedFrame,
-        report: &mut StepReport,
-    ) -> Vec<Vec3> {
-        let mut colors = vec![Vec3::ZERO; batch.pixels.len()];
-        for state in groups {
-            for (&ray, composite) in state.rays.iter().zip(&state.composites) {
-                colors[ray] = composite.color;
-            }
-        }
-        let targets: Vec<Option<Vec3>> = batch.pixels.iter().map(|&p| target(frame, p, batch.background)).collect();
-        let known = targets.iter().flatten().count();
-        let loss = &self.config.loss;
-        let mut d_colors = vec![Vec3::ZERO; colors.len()];
-        let mut squares = 0.0f64;
-        for ((color, target), d) in colors.iter().zip(&targets).zip(&mut d_colors) {
-            if let Some(target) = target {
-                let error = *color - *target;
-                squares += f64::from(error.length_squared());
-                *d = loss.mse * 2.0 / (3 * known) as f32 * error;
-            }
-        }
-        report.mse = squares / (3 * known.max(1)) as f64;
-        report.psnr = -10.0 * report.mse.max(1e-12).log10();
-        if loss.perceptual > 0.0 {
-            let patch = batch.size * batch.size;
-            let scale = loss.perceptual / self.config.patches as f32;
-            let values: Vec<f64> = match &self.lpips {
-                Some(lpips) => learned_perceptual(lpips, &colors, &targets, batch.size, scale, &mut d_colors),
-                None => d_colors
-                    .par_chunks_mut(patch)
-                    .zip(colors.par_chunks(patch).zip(targets.par_chunks(patch)))
-                    .map(|(d_colors, (colors, targets))| perceptual(colors, targets, batch.size, scale, d_colors))
-                    .collect(),
-            };
-            report.perceptual = values.iter().sum::<f64>() / self.config.patches as f64;
-        }
-        d_colors
     }
 
     /// Backward of [`Trainer::forward`] with the completeness term added.
@@ -141,18 +96,19 @@ impl Trainer<'_> {
         }
     }
 
-    /// Gradients of the coordinates that the samples of a group were encoded at.
-    pub(crate) fn d_coordinates(&self, group: &Group) -> Vec<(Vec3, f32)> {
-        let slopes = Slopes::Jacobian(&group.jacobian);
-        self.field.encoder.encode_backward_points(slopes, &group.at, &group.d_features, &self.scene.canonical_box)
+    /// Fills `d_at` of a group: the gradients of the coordinates that its samples were encoded at.
+    pub(crate) fn d_coordinates(&self, group: &mut Group) {
+        let Group { at, d_at, jacobian, d_features, .. } = group;
+        self.field.encoder.encode_backward_points(Slopes::Jacobian(jacobian), at.all(), d_features, d_at);
     }
 
     /// Carries the gradients of the encoding's coordinates and of f into the weight volume.
-    fn motion_backward(&self, volume: &WeightVolume, group: &Group, frame: &PreparedFrame, d_volume: &mut [f32]) {
-        let d_points = self.d_coordinates(group);
+    fn motion_backward(&self, volume: &WeightVolume, group: &mut Group, frame: &PreparedFrame, d_volume: &mut [f32]) {
+        self.d_coordinates(group);
         let samples = &group.samples;
         let per_sample = samples.neighbours.len().checked_div(samples.len()).unwrap_or(0);
-        for (s, (d_point, d_coordinate)) in d_points.into_iter().enumerate() {
+        for s in 0..samples.len() {
+            let (d_point, d_coordinate) = self.field.encoder.d_metres(&group.d_at, s, &self.scene.canonical_box);
             let d_distance = group.d_distance[s]
                 + if self.field.encoder.distance_is_inside(samples.distance[s]) { d_coordinate } else { 0.0 };
             let x = samples.canonical[s];
@@ -209,20 +165,20 @@ impl Trainer<'_> {
             self.all_d_features.extend_from_slice(&group.d_features);
         }
         if self.field.surface_term {
-            let mut d_vertices = vec![0.0; self.vertex_code.features.len()];
-            sum(&mut d_vertices, &|g| &g.d_vertices);
+            zero(&mut self.vertex_code.d_features, self.vertex_code.features.len());
+            sum(&mut self.vertex_code.d_features, &|g| &g.d_vertices);
             let (table, d_offsets) = self.parameters.value_and_gradient(Part::Table, Part::Vertices);
-            self.vertex_code.backward(self.scene, &self.field.encoder, table, &d_vertices, d_offsets);
+            self.vertex_code.backward(self.scene, &self.field.encoder, table, d_offsets);
             self.all_at.extend(&self.vertex_code.at);
-            self.all_d_features.extend_from_slice(&d_vertices);
+            self.all_d_features.extend_from_slice(&self.vertex_code.d_features);
         }
         let d_table = self.parameters.gradient(Part::Table);
-        self.field.encoder.encode_backward(&self.all_at, &self.all_d_features, d_table);
+        self.field.encoder.encode_backward(self.all_at.all(), &self.all_d_features, d_table);
         watch.lap(&mut times.encode_backward);
         if let Some(volume) = &self.volume {
-            let mut d_weights = vec![0.0; volume.weights.len()];
-            sum(&mut d_weights, &|g| &g.d_volume);
-            volume.softmax_backward(&d_weights, self.parameters.gradient(Part::Motion));
+            zero(&mut self.d_volume, volume.weights.len());
+            sum(&mut self.d_volume, &|g| &g.d_volume);
+            volume.softmax_backward(&self.d_volume, self.parameters.gradient(Part::Motion));
         }
         if let (Some(correction), Some(instant)) =
             (self.correction(frame).filter(|_| self.teaches_poses()), frame.instant)
@@ -235,48 +191,6 @@ impl Trainer<'_> {
             self.corrections.at_backward(instant, &d_correction, self.parameters.gradient(Part::Pose));
         }
         watch.lap(&mut times.update);
-    }
-}
-
-/// The embedded perceptual term of one patch.
-fn perceptual(colors: &[Vec3], targets: &[Option<Vec3>], size: usize, scale: f32, d_colors: &mut [Vec3]) -> f64 {
-    let (a, b) = both_sides(colors, targets);
-    let mut d = vec![0.0; a.len()];
-    let value = multiscale_dissimilarity(&a, &b, size, scale, &mut d);
-    add_known(&d, targets, d_colors);
-    value
-}
-
-/// LPIPS of every patch of the step.
-fn learned_perceptual(
-    lpips: &Lpips,
-    colors: &[Vec3],
-    targets: &[Option<Vec3>],
-    size: usize,
-    scale: f32,
-    d_colors: &mut [Vec3],
-) -> Vec<f64> {
-    let (a, b) = both_sides(colors, targets);
-    let mut d = vec![0.0; a.len()];
-    // The size was checked when the weights were loaded.
-    let values = lpips.distance_backward(&a, &b, size, size, scale, &mut d).unwrap_or_default();
-    add_known(&d, targets, d_colors);
-    values
-}
-
-/// Prediction and target for a perceptual term; unknown pixels show the prediction on both sides.
-fn both_sides(colors: &[Vec3], targets: &[Option<Vec3>]) -> (Vec<f32>, Vec<f32>) {
-    let a = colors.iter().flat_map(|c| c.to_array());
-    let b = colors.iter().zip(targets).flat_map(|(&c, t)| t.unwrap_or(c).to_array());
-    (a.collect(), b.collect())
-}
-
-/// Adds the gradient of a perceptual term where the target is known.
-fn add_known(d: &[f32], targets: &[Option<Vec3>], d_colors: &mut [Vec3]) {
-    for ((d_color, d), target) in d_colors.iter_mut().zip(d.chunks_exact(3)).zip(targets) {
-        if target.is_some() {
-            *d_color += Vec3::from_slice(d);
-        }
     }
 }
 

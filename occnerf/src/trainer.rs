@@ -11,11 +11,12 @@ use volrender::Composite;
 use crate::Error;
 use crate::batch::Batch;
 use crate::config::{Config, DistanceKind, MotionKind, VisibilityKind};
-use crate::correction::{Corrections, Wrench, correct};
+use crate::correction::{Corrections, Wrench, correct, corrected};
 use crate::encoder::Coordinates;
 use crate::field::Field;
 use crate::lpips::Lpips;
 use crate::parameters::{PARTS, Parameters, Part};
+use crate::photometric::Photometric;
 use crate::pixels::Label;
 use crate::prior::VertexColors;
 use crate::restarts::Restarts;
@@ -83,6 +84,10 @@ pub struct Trainer<'a> {
     pub(crate) transposed: Vec<f32>,
     pub(crate) all_at: Coordinates,
     pub(crate) all_d_features: Vec<f32>,
+    pub(crate) d_volume: Vec<f32>,
+    photometric: Photometric,
+    /// The corrected prior of a step.
+    posed: Posed,
 }
 
 #[derive(Default)]
@@ -141,6 +146,9 @@ impl<'a> Trainer<'a> {
             transposed: Vec::new(),
             all_at: Coordinates::default(),
             all_d_features: Vec::new(),
+            d_volume: Vec::new(),
+            photometric: Photometric::default(),
+            posed: Posed::default(),
             steps_done: 0,
             restarts: Restarts::default(),
             config,
@@ -228,7 +236,7 @@ impl<'a> Trainer<'a> {
     /// The posed prior of a frame as training has corrected it; as handed in where nothing is corrected.
     pub fn corrected<'b>(&self, frame: &'b PreparedFrame) -> Cow<'b, Posed> {
         match self.correction(frame) {
-            Some(correction) => Cow::Owned(correct(&self.scene.model, &frame.shape, &frame.posed, &correction)),
+            Some(correction) => Cow::Owned(corrected(&self.scene.model, &frame.shape, &frame.posed, &correction)),
             None => Cow::Borrowed(&frame.posed),
         }
     }
@@ -289,27 +297,36 @@ impl<'a> Trainer<'a> {
         batch.draw(self.scene, &self.config, step);
         let frame = &self.scene.train[batch.frame];
         let mut stage_code = std::mem::take(&mut self.vertex_code);
-        let posed = self.corrected(frame);
+        let mut own_posed = std::mem::take(&mut self.posed);
+        let posed = match self.correction(frame) {
+            Some(correction) => {
+                correct(&self.scene.model, &frame.shape, &frame.posed, &correction, &mut own_posed);
+                &own_posed
+            }
+            None => &frame.posed,
+        };
         self.encode_vertices(&mut stage_code);
         self.vertex_code = stage_code;
         let interval = self.config.motion.shell_interval as u64;
         if interval > 0 && step > 0 && step.is_multiple_of(interval) {
             self.shell = self.measure_shell(&self.vertex_code.features);
         }
-        self.stage.set(self.scene, &posed, &self.shell, &self.config);
+        self.stage.set(self.scene, posed, &self.shell, &self.config);
         let mut groups = std::mem::take(&mut self.groups);
         for (index, state) in groups.iter_mut().enumerate() {
             state.rays.clear();
             state.rays.extend((0..batch.pixels.len()).filter(|ray| ray / batch.size % GROUPS == index));
         }
         watch.lap(&mut times.prepare);
-        groups.par_iter_mut().for_each(|state| self.forward(state, &batch, frame, &posed));
+        groups.par_iter_mut().for_each(|state| self.forward(state, &batch, frame, posed));
         let mut watch = Stopwatch::start();
         let mut report = StepReport { step: step + 1, rays: batch.pixels.len(), ..StepReport::default() };
-        let d_colors = self.photometric(&groups, &batch, frame, &mut report);
+        let mut photometric = std::mem::take(&mut self.photometric);
+        photometric.measure(&self.config.loss, self.lpips.as_ref(), &groups, &batch, frame, &mut report);
+        let d_colors = &photometric.d_colors;
         self.field.mlp.transposed_weights(self.parameters.get(Part::Field), &mut self.transposed);
         watch.lap(&mut times.losses);
-        groups.par_iter_mut().for_each(|state| self.backward(state, &batch, frame, &posed, &d_colors));
+        groups.par_iter_mut().for_each(|state| self.backward(state, &batch, frame, posed, d_colors));
         groups.iter().for_each(|state| times += state.times);
         let nominal = (batch.pixels.len() * self.config.samples) as f64;
         report.completeness = groups.iter().map(|g| g.completeness).sum::<f64>() / nominal;
@@ -318,7 +335,7 @@ impl<'a> Trainer<'a> {
         report.loss = f64::from(loss.mse) * report.mse
             + f64::from(loss.perceptual) * report.perceptual
             + f64::from(loss.completeness) * report.completeness;
-        self.reduce(&groups, frame, &posed, &mut times);
+        self.reduce(&groups, frame, posed, &mut times);
         let mut watch = Stopwatch::start();
         if self.config.surface.visibility == VisibilityKind::Counted {
             groups.iter().for_each(|state| self.counts.add(&state.terminations));
@@ -337,7 +354,7 @@ impl<'a> Trainer<'a> {
         self.refresh_volume();
         watch.lap(&mut times.update);
         report.times = times;
-        (self.groups, self.batch) = (groups, batch);
+        (self.groups, self.batch, self.photometric, self.posed) = (groups, batch, photometric, own_posed);
         self.steps_done += 1;
         report
     }

@@ -16,10 +16,13 @@ const FARTHEST: f32 = 0.5;
 pub(crate) struct VertexCode {
     /// Where each vertex is encoded.
     pub at: Coordinates,
-    /// V × F.
+    /// V × F, and their gradient.
     pub features: Vec<f32>,
+    pub d_features: Vec<f32>,
     /// Position, signed distance, and its gradient by the position, of each vertex.
     state: Vec<(Vec3, f32, Vec3)>,
+    /// Gradients of where the vertices of each chunk are encoded.
+    d_at: Vec<Coordinates>,
 }
 
 impl VertexCode {
@@ -43,22 +46,21 @@ impl VertexCode {
         self.features.resize(vertices.len() * width, 0.0);
         self.features.par_chunks_mut(CHUNK * width).enumerate().for_each(|(chunk, features)| {
             let end = ((chunk + 1) * CHUNK).min(vertices.len());
-            let at = Coordinates { surface: self.at.surface[chunk * CHUNK..end].to_vec(), ..Coordinates::default() };
-            encoder.encode(table, &at, features);
+            encoder.encode(table, self.at.vertices(chunk * CHUNK..end), features);
         });
     }
 
     /// Gradient of the offsets (V × 3) from that of the features; overwrites.
-    pub fn backward(&self, scene: &Scene, encoder: &Encoder, table: &[f32], d_features: &[f32], d_offsets: &mut [f32]) {
+    pub fn backward(&mut self, scene: &Scene, encoder: &Encoder, table: &[f32], d_offsets: &mut [f32]) {
+        let Self { at, d_features, state, d_at, .. } = self;
         let width = encoder.num_features();
-        d_offsets.par_chunks_mut(3 * CHUNK).enumerate().for_each(|(chunk, d_offsets)| {
+        d_at.resize_with(state.len().div_ceil(CHUNK), Coordinates::default);
+        d_offsets.par_chunks_mut(3 * CHUNK).zip(d_at).enumerate().for_each(|(chunk, (d_offsets, d_at))| {
             let range = chunk * CHUNK..chunk * CHUNK + d_offsets.len() / 3;
-            let at = Coordinates { surface: self.at.surface[range.clone()].to_vec(), ..Coordinates::default() };
             let d_rows = &d_features[range.start * width..range.end * width];
-            let d_points = encoder.encode_backward_points(Slopes::Table(table), &at, d_rows, &scene.canonical_box);
-            for (((d_v, d_d), state), d_offset) in
-                d_points.into_iter().zip(&self.state[range]).zip(d_offsets.chunks_exact_mut(3))
-            {
+            encoder.encode_backward_points(Slopes::Table(table), at.vertices(range.clone()), d_rows, d_at);
+            for (v, (state, d_offset)) in state[range].iter().zip(d_offsets.chunks_exact_mut(3)).enumerate() {
+                let (d_v, d_d) = encoder.d_metres(d_at, v, &scene.canonical_box);
                 let through_distance = if encoder.distance_is_inside(state.1) { d_d * state.2 } else { Vec3::ZERO };
                 (d_v + through_distance).write_to_slice(d_offset);
             }

@@ -45,7 +45,7 @@ impl Default for Placement {
 }
 
 /// A posed body in the world.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct Posed {
     /// Vertices, (V).
     pub vertices: Vec<Vec3>,
