@@ -269,7 +269,8 @@ impl<'a> Trainer<'a> {
 
     /// Whether this step teaches the poses: what a field says of them before it has taken shape would lead them astray.
     pub(crate) fn teaches_poses(&self) -> bool {
-        !self.parameters.get(Part::Pose).is_empty() && self.steps_done as f32 >= SETTLED * self.config.steps as f32
+        let settled = (self.steps_done - self.restarts.begun) as f32 >= SETTLED * self.config.steps as f32;
+        settled && !self.parameters.get(Part::Pose).is_empty()
     }
 
     /// Forgets what was learnt.

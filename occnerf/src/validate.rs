@@ -32,7 +32,8 @@ impl Config {
                 return Err(ConfigError { key, value: value.to_string(), expected });
             }
         }
-        // Products that decide about memory: 2²⁷ table entries are 2 GB with both moments, 2²⁶ samples several.
+        // Products that decide about memory: 2²⁷ table entries are 2 GB with both moments; a live sample takes 2 to 4 kB,
+        // and about a third live, so 2²³ samples are 6 to 12 GB.
         let table = (self.encoding.levels as u64).saturating_mul(self.encoding.features as u64);
         let table = table.saturating_mul(1u64.checked_shl(self.encoding.log2_table_size).unwrap_or(u64::MAX));
         if table > 1 << 27 {
@@ -40,8 +41,8 @@ impl Config {
             return Err(ConfigError { key: "encoding.log2_table_size", value: table.to_string(), expected });
         }
         let samples = self.patches * (self.patch_size as usize).pow(2) * self.samples;
-        if samples > 1 << 26 {
-            let expected = "patches · patch_size² · samples may be at most 2^26";
+        if samples > 1 << 23 {
+            let expected = "patches · patch_size² · samples may be at most 2^23";
             return Err(ConfigError { key: "patches", value: samples.to_string(), expected });
         }
         let of_the_surface = [

@@ -32,9 +32,9 @@ impl VertexCode {
         (0..vertices.len())
             .into_par_iter()
             .with_min_len(CHUNK)
-            .map(|i| {
+            .map_init(Vec::new, |neighbours, i| {
                 let position = vertices[i] + Vec3::from_slice(&offsets[3 * i..]);
-                let (distance, gradient) = distance_with_gradient(scene, config, i, position);
+                let (distance, gradient) = distance_with_gradient(scene, config, i, position, neighbours);
                 (position, distance, gradient)
             })
             .collect_into_vec(&mut self.state);
@@ -68,12 +68,18 @@ impl VertexCode {
     }
 }
 
-/// Signed distance of a point to the initial mesh and its gradient, by the query that samples use.
-fn distance_with_gradient(scene: &Scene, config: &Config, vertex: usize, position: Vec3) -> (f32, Vec3) {
+/// Signed distance of a point to the initial mesh and its gradient, by the query that samples use; `neighbours` is scratch.
+fn distance_with_gradient(
+    scene: &Scene,
+    config: &Config,
+    vertex: usize,
+    position: Vec3,
+    neighbours: &mut Vec<u32>,
+) -> (f32, Vec3) {
     match config.surface.distance {
         kind @ (DistanceKind::Blended | DistanceKind::Mean) => {
-            let mut neighbours = vec![0; scene.query.neighbours_per_query()];
-            scene.query.neighbours(position, &mut neighbours);
+            neighbours.resize(scene.query.neighbours_per_query(), 0);
+            scene.query.neighbours(position, neighbours);
             let finest = &neighbours[..config.surface.k];
             if kind == DistanceKind::Mean {
                 return scene.query.mean_distance(position, finest);

@@ -34,6 +34,39 @@ impl Distortion {
         *self == Self::default()
     }
 
+    /// Ideal distance from the axis from which on the radial part folds back, so that a picture would show the same twice:
+    /// the first at which r · (1 + k1 r² + k2 r⁴ + k3 r⁶) no longer grows; infinite where it always does.
+    #[must_use]
+    pub fn fold_radius(&self) -> f32 {
+        let [a, b, c] = [3.0 * f64::from(self.k1), 5.0 * f64::from(self.k2), 7.0 * f64::from(self.k3)];
+        let slope = |u: f64| 1.0 + u * (a + u * (b + u * c));
+        // Between its turning points the slope, a cubic in u = r², crosses zero at most once.
+        let discriminant = (b * b - 3.0 * a * c).max(0.0).sqrt();
+        let mut ends = if c == 0.0 {
+            vec![-a / (2.0 * b)]
+        } else {
+            vec![(-b - discriminant) / (3.0 * c), (-b + discriminant) / (3.0 * c)]
+        };
+        ends.retain(|u| u.is_finite() && *u > 0.0);
+        ends.sort_by(f64::total_cmp);
+        ends.push(f64::from(f32::MAX).sqrt());
+        let mut low = 0.0;
+        for mut high in ends {
+            if slope(high) <= 0.0 {
+                while high - low > 1e-12 * high {
+                    let middle = 0.5 * (low + high);
+                    if middle <= low || middle >= high {
+                        break;
+                    }
+                    if slope(middle) <= 0.0 { high = middle } else { low = middle }
+                }
+                return high.sqrt() as f32;
+            }
+            low = high;
+        }
+        f32::INFINITY
+    }
+
     /// Ideal to distorted coordinates.
     #[must_use]
     pub fn distort(&self, p: Vec2) -> Vec2 {
@@ -89,7 +122,34 @@ impl Distortion {
 
 #[cfg(test)]
 mod tests {
+    use proptest::prelude::*;
+
     use super::*;
+
+    proptest! {
+        #[test]
+        fn the_radius_grows_up_to_the_fold_and_no_farther(
+            k1 in prop_oneof![Just(0.0f32), -1.0f32..1.0],
+            k2 in prop_oneof![Just(0.0f32), -1.0f32..1.0],
+            k3 in prop_oneof![Just(0.0f32), -1.0f32..1.0],
+        ) {
+            let lens = Distortion { k1, k2, k3, ..Distortion::default() };
+            let slope = |r: f64| {
+                let u = r * r;
+                1.0 + u * (3.0 * f64::from(k1) + u * (5.0 * f64::from(k2) + u * 7.0 * f64::from(k3)))
+            };
+            let fold = f64::from(lens.fold_radius());
+            let end = fold.min(1e3);
+            for i in 0..1000 {
+                let r = end * f64::from(i) / 1000.0;
+                // Where the slope touches zero without crossing it, rounding decides.
+                prop_assert!(slope(r) > -1e-6 * (1.0 + r.powi(6)), "{r} of {fold}: {}", slope(r));
+            }
+            if fold.is_finite() {
+                prop_assert!(slope(fold * 1.0001) < 1e-3, "{fold}: {}", slope(fold * 1.0001));
+            }
+        }
+    }
 
     #[test]
     fn the_jacobian_is_the_slope_of_distort() {

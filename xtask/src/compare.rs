@@ -23,7 +23,7 @@ pub fn compare(arguments: &TrainArguments, lpips: Option<&Lpips>) -> Result<()> 
     anyhow::ensure!(arguments.settings.method.is_none(), "--compare trains every method: leave --method out");
     let default = format!("runs/{}-compare", scene_name(arguments.scene.as_deref()));
     let out = arguments.out.clone().unwrap_or_else(|| default.into());
-    let source = source::load(arguments.scene.as_deref(), arguments.body.as_deref(), &arguments.load.options())?;
+    let source = source::load(arguments.scene.as_deref(), arguments.body.as_deref(), &arguments.load.options()?)?;
     let mut rows: Vec<(String, Metrics)> = Vec::new();
     for (method, occluded) in RUNS {
         let mut settings = arguments.settings.clone();
@@ -45,7 +45,8 @@ pub fn compare(arguments: &TrainArguments, lpips: Option<&Lpips>) -> Result<()> 
     let rows: Vec<(String, &Metrics)> = rows.iter().map(|(name, metrics)| (name.clone(), metrics)).collect();
     let text = table::markdown(&rows);
     run::write(&out.join("comparison.md"), &text)?;
-    println!("\nnovel views of {}:\n{text}", source.scene);
+    let title = rows.first().map_or("scores", |(_, metrics)| metrics.splits.title());
+    println!("\n{}, {title}:\n{text}", source.scene);
     println!("written: {}", out.join("comparison.md").display());
     Ok(())
 }

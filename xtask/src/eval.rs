@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use anyhow::Result;
+use anyhow::{Result, ensure};
 use clap::{Args, ValueEnum};
 use image::RgbImage;
 use indicatif::ProgressBar;
@@ -11,7 +11,9 @@ use occnerf::{
     VertexColors, evaluate_with,
 };
 
-use crate::run::{CHECKPOINT, METRICS, Metrics, RunConfig, Splits, peak_rss_bytes, use_threads};
+use crate::run::{
+    CHECKPOINT, METRICS, Metrics, NOVEL_VIEWS, RunConfig, Splits, TRAINING_VIEWS, peak_rss_bytes, use_threads,
+};
 use crate::{pictures, report, table};
 
 /// Training frames are many and alike: every tenth is scored.
@@ -25,6 +27,16 @@ pub enum Split {
     NovelView,
     /// Every tenth training frame, on what it shows.
     TrainView,
+}
+
+impl Split {
+    /// Where its scores are kept.
+    pub fn of(self, splits: &mut Splits) -> &mut Option<SplitMetrics> {
+        match self {
+            Self::NovelView => &mut splits.novel_view,
+            Self::TrainView => &mut splits.train_view,
+        }
+    }
 }
 
 #[derive(Args)]
@@ -57,7 +69,7 @@ pub fn eval(arguments: &EvalArguments) -> Result<()> {
         trainer = Trainer::resume(&scene, &directory.join(CHECKPOINT))?;
         Model::Field(&trainer)
     };
-    let network = network_name(lpips.as_ref());
+    let mut network = network_name(lpips.as_ref());
     let perceptual = match &model {
         Model::Prior(_) => String::new(),
         Model::Field(trainer) => trainer.perceptual(),
@@ -88,19 +100,29 @@ pub fn eval(arguments: &EvalArguments) -> Result<()> {
             splits: Splits::default(),
         }
     };
-    if arguments.split != Some(Split::TrainView) {
-        metrics.splits.novel_view = Some(model.score_with_bar(&scene, Split::NovelView, lpips.as_ref(), |_, _| {})?);
+    ensure!(
+        !scene.eval.is_empty() || arguments.split != Some(Split::NovelView),
+        "{}: the capture keeps no views back; --split train-view scores those that training saw",
+        run.scene
+    );
+    for split in [Split::NovelView, Split::TrainView] {
+        let empty = split == Split::NovelView && scene.eval.is_empty();
+        if arguments.split.is_none_or(|only| only == split) {
+            let scores = model.score_with_bar(&scene, split, lpips.as_ref(), |_, _| {})?;
+            *split.of(&mut metrics.splits) = (!empty).then_some(scores);
+        } else if let Some(scores) = split.of(&mut metrics.splits).as_mut().filter(|s| s.lpips_full.is_some()) {
+            // One name stands for both splits: what another network measured goes.
+            match &network {
+                Some(network) if metrics.lpips.as_ref() != Some(network) => scores.lpips_full = None,
+                _ => network = metrics.lpips.clone(),
+            }
+        }
     }
-    if arguments.split != Some(Split::NovelView) {
-        metrics.splits.train_view = Some(model.score_with_bar(&scene, Split::TrainView, lpips.as_ref(), |_, _| {})?);
-    }
-    if network.is_some() {
-        metrics.lpips = network;
-    }
+    metrics.lpips = network;
     metrics.write(directory)?;
     report::write(directory, &metrics)?;
     let mut one = metrics.clone();
-    for (name, split) in [("novel views", &metrics.splits.novel_view), ("train views", &metrics.splits.train_view)] {
+    for (name, split) in [(NOVEL_VIEWS, &metrics.splits.novel_view), (TRAINING_VIEWS, &metrics.splits.train_view)] {
         if let Some(split) = split {
             one.splits = Splits { novel_view: Some(split.clone()), train_view: None };
             println!("{name}:\n{}", table::markdown(&[(one.method.clone(), &one)]));
@@ -123,7 +145,7 @@ pub fn load_lpips(path: Option<&Path>) -> Result<Option<Lpips>> {
     Ok(path.map(Lpips::load).transpose()?)
 }
 
-fn network_name(lpips: Option<&Lpips>) -> Option<String> {
+pub fn network_name(lpips: Option<&Lpips>) -> Option<String> {
     lpips.map(|lpips| lpips.trunk().name().to_owned())
 }
 

@@ -43,6 +43,13 @@ impl RunConfig {
         write(&run.join("config.toml"), &toml::to_string(self)?)
     }
 
+    /// Whether two runs are of the same files.
+    pub fn same_scene(&self, other: &Self) -> bool {
+        let place = |path: &Path| path.canonicalize().unwrap_or_else(|_| path.to_owned());
+        place(self.scene.as_ref()) == place(other.scene.as_ref())
+            && self.body.as_deref().map(place) == other.body.as_deref().map(place)
+    }
+
     /// The capture it was trained on.
     pub fn source(&self) -> Result<Source> {
         source::load(Some(&self.scene), self.body.as_deref(), &self.load)
@@ -74,6 +81,9 @@ pub struct Metrics {
     pub splits: Splits,
 }
 
+pub const NOVEL_VIEWS: &str = "novel views";
+pub const TRAINING_VIEWS: &str = "training views, over visible pixels";
+
 /// Scores of each split that was measured.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub struct Splits {
@@ -81,6 +91,19 @@ pub struct Splits {
     pub novel_view: Option<SplitMetrics>,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub train_view: Option<SplitMetrics>,
+}
+
+impl Splits {
+    /// The views that are shown first, and what they are called: novel ones where the capture keeps any back.
+    pub fn first(&self) -> Option<(&'static str, &SplitMetrics)> {
+        let novel = self.novel_view.as_ref().map(|split| (NOVEL_VIEWS, split));
+        novel.or(self.train_view.as_ref().map(|split| (TRAINING_VIEWS, split)))
+    }
+
+    /// What [`Splits::first`] calls them.
+    pub fn title(&self) -> &'static str {
+        self.first().map_or("nothing to score", |(title, _)| title)
+    }
 }
 
 impl Metrics {

@@ -34,7 +34,7 @@ pub enum PresetName {
     Fast,
     /// The default: about two minutes.
     Balanced,
-    /// The paper's setting: over an hour.
+    /// The paper's setting: over two hours.
     Paper,
     /// The same with the choices of the code that was published with the paper.
     PublishedCode,

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, Result, bail};
 use clap::{Args, ValueEnum};
 use occnerf::data::{
-    Capture, DemoConfig, LoadOptions, Obstacle, SynthConfig, Synthetic, Wrong, demo, find_body, load_capture,
+    Capture, DemoConfig, LoadOptions, Obstacle, SynthConfig, Synthetic, Wrong, demo, find_body, load_capture, own_body,
 };
 use smpl::BodyModel;
 
@@ -46,6 +46,15 @@ pub struct LoadArguments {
     /// Simulated obstacle before the training camera of a ZJU-MoCap capture [default: occlusion.json, else central]
     #[arg(long)]
     occlusion: Option<ObstacleName>,
+    /// Part of the person that the obstacle hides in the frames that it stands in, 0 to 0.95 [default: 0.5]
+    #[arg(long, value_name = "PART")]
+    fraction: Option<f32>,
+    /// Part of the frames that it stands in, from the first, 0 to 1 [default: 0.8]
+    #[arg(long, value_name = "PART")]
+    share: Option<f32>,
+    /// How far it stands to the right of the person's middle, in picture widths, -1 to 1 [default: 0]
+    #[arg(long, value_name = "WIDTHS", allow_negative_numbers = true)]
+    position: Option<f32>,
     /// Turn every bone of the prior by so many degrees (root mean square), to see what a method bears
     #[arg(long, value_name = "DEGREES", default_value_t = 0.0)]
     wrong_pose: f32,
@@ -69,22 +78,34 @@ enum ObstacleName {
 
 impl LoadArguments {
     /// The same for the library.
-    pub fn options(&self) -> LoadOptions {
-        let obstacle = |name| match name {
-            ObstacleName::None => Obstacle { fraction: 0.0, ..Obstacle::default() },
-            ObstacleName::Central => Obstacle::default(),
-            ObstacleName::Moving => Obstacle { travel: 0.3, ..Obstacle::default() },
+    pub fn options(&self) -> Result<LoadOptions> {
+        let central = Obstacle::default();
+        let shaped = Obstacle {
+            fraction: self.fraction.unwrap_or(central.fraction),
+            share: self.share.unwrap_or(central.share),
+            position: self.position.unwrap_or(central.position),
+            ..central
         };
-        LoadOptions {
+        let is_shaped = self.fraction.or(self.share).or(self.position).is_some();
+        let occlusion = match self.occlusion {
+            Some(ObstacleName::None) if is_shaped => {
+                bail!("--occlusion none has no --fraction, --share or --position")
+            }
+            Some(ObstacleName::None) => Some(Obstacle { fraction: 0.0, ..central }),
+            Some(ObstacleName::Moving) => Some(Obstacle { travel: 0.3, ..shaped }),
+            Some(ObstacleName::Central) => Some(shaped),
+            None => is_shaped.then_some(shaped),
+        };
+        Ok(LoadOptions {
             resize: self.resize,
             stride: self.stride,
             max_frames: self.max_frames,
             eval_stride: self.eval_stride,
             camera: self.camera.clone(),
-            occlusion: self.occlusion.map(obstacle),
+            occlusion,
             wrong: Wrong { pose_degrees: self.wrong_pose, shape: self.wrong_shape, mask_pixels: self.wrong_mask },
             ..LoadOptions::default()
-        }
+        })
     }
 
     /// The same as on the command line.
@@ -101,6 +122,10 @@ impl LoadArguments {
         add("camera", self.camera.clone());
         let name = self.occlusion.and_then(|o| o.to_possible_value());
         add("occlusion", name.map(|n| n.get_name().to_owned()));
+        let number = |x: Option<f32>| x.map(|x| x.to_string());
+        add("fraction", number(self.fraction));
+        add("share", number(self.share));
+        add("position", number(self.position));
         let not_zero = |x: f32| (x != 0.0).then(|| x.to_string());
         add("wrong-pose", not_zero(self.wrong_pose));
         add("wrong-shape", not_zero(self.wrong_shape));
@@ -110,7 +135,7 @@ impl LoadArguments {
 
     /// How a run to be resumed read its capture, checked against what is asked for.
     pub fn resumed(&self, saved: &LoadOptions) -> Result<LoadOptions> {
-        let asked = self.options();
+        let asked = self.options()?;
         if asked != LoadOptions::default() && asked != *saved {
             bail!(
                 "the run to resume read its capture with other options; leave them out, or start a new run with --out"
@@ -120,7 +145,8 @@ impl LoadArguments {
     }
 }
 
-/// Loads `scene` (the demo if `None`); the body is `body`, the variable SMPL_MODEL, or what lies near the scene.
+/// Loads `scene` (the demo if `None`); the body is `body`, the capture's own, that of the variable SMPL_MODEL, or what lies near
+/// the scene.
 pub fn load(scene: Option<&str>, body: Option<&Path>, options: &LoadOptions) -> Result<Source> {
     let scene = scene.unwrap_or(DEMO);
     let name = scene.to_owned();
@@ -146,7 +172,7 @@ pub fn load(scene: Option<&str>, body: Option<&Path>, options: &LoadOptions) -> 
         bail!("{scene}: no such directory; expected a capture, a .glb or .gltf character, or no SCENE for the demo");
     }
     let variable = std::env::var_os(BODY_VARIABLE).map(PathBuf::from);
-    let body = match body.map(Path::to_owned).or(variable) {
+    let body = match body.map(Path::to_owned).or_else(|| own_body(directory)).or(variable) {
         Some(body) => body,
         None => find_body(directory).with_context(|| {
             format!("a capture needs the body model it was fitted with (--body FILE.npz, or {BODY_VARIABLE})")
@@ -171,13 +197,14 @@ mod tests {
 
     #[test]
     fn a_command_line_made_of_options_says_all_of_them() {
-        let words = "x --resize 64 --stride 2 --max-frames 9 --eval-stride 3 --camera B2 --occlusion moving --wrong-pose 2.5 \
-                     --wrong-shape 1 --wrong-mask -3";
+        let words = "x --resize 64 --stride 2 --max-frames 9 --eval-stride 3 --camera B2 --occlusion moving --fraction 0.4 \
+                     --share 0.7 --position -0.1 --wrong-pose 2.5 --wrong-shape 1 --wrong-mask -3";
         for words in [words, "x"] {
             let load = Line::parse_from(words.split_whitespace()).load;
             let again = format!("x{}", load.command_line());
             assert_eq!(again.split_whitespace().count(), words.split_whitespace().count(), "{again}");
-            assert_eq!(Line::parse_from(again.split_whitespace()).load.options(), load.options());
+            let options = load.options().unwrap();
+            assert_eq!(Line::parse_from(again.split_whitespace()).load.options().unwrap(), options);
         }
     }
 }

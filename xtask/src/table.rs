@@ -6,7 +6,7 @@ fn cell(value: Option<f64>, digits: usize) -> String {
     value.map_or("–".to_owned(), |v| format!("{v:.digits$}"))
 }
 
-/// A row for each run: novel views, ranked quantities first.
+/// A row for each run: novel views where there are any, ranked quantities first.
 pub fn markdown(rows: &[(String, &Metrics)]) -> String {
     let networks: Vec<&str> = rows.iter().filter_map(|(_, m)| m.lpips.as_deref()).collect();
     let mut header = vec![
@@ -31,7 +31,7 @@ pub fn markdown(rows: &[(String, &Metrics)]) -> String {
     }
     let mut lines: Vec<Vec<String>> = vec![header.iter().map(|&name| name.to_owned()).collect()];
     for (name, m) in rows {
-        let Some(split) = m.splits.novel_view.as_ref().or(m.splits.train_view.as_ref()) else { continue };
+        let Some((_, split)) = m.splits.first() else { continue };
         let mut line = vec![
             name.clone(),
             if m.method == "prior" { "–".to_owned() } else { m.occluded.clone() },

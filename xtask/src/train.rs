@@ -4,14 +4,14 @@ use std::io::{IsTerminal, Write};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, bail};
 use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
 use occnerf::{Lpips, Method, Scene, StepReport, Trainer, VertexColors, checkpoint_config};
 
 use crate::capacity::{self, CapacityName};
 use crate::compare::compare;
-use crate::eval::{Model, load_lpips, score_run};
+use crate::eval::{Model, Split, load_lpips, network_name, score_run, scored_frames};
 use crate::run::{
     CHECKPOINT, METRICS, Metrics, RunConfig, Splits, existing_directory, new_directory, peak_rss_bytes, use_threads,
 };
@@ -33,7 +33,8 @@ pub struct TrainArguments {
     /// Run directory [default: runs/SCENE-METHOD]
     #[arg(long)]
     pub out: Option<PathBuf>,
-    /// The body model of the capture, .npz or .pkl [default: SMPL_MODEL, or body.npz or body/*.npz near the scene]
+    /// The body model of the capture, .npz, .pkl or .safetensors [default: body.npz or
+    /// body.safetensors in the capture, the variable SMPL_MODEL, or body/*.npz near the capture]
     #[arg(long)]
     pub body: Option<PathBuf>,
     #[command(flatten)]
@@ -85,7 +86,7 @@ pub fn train(arguments: &TrainArguments) -> Result<()> {
         let scene = arguments.scene.as_deref().unwrap_or(&saved.scene);
         source::load(Some(scene), arguments.body.as_deref().or(saved.body.as_deref()), &load)?
     } else {
-        source::load(arguments.scene.as_deref(), arguments.body.as_deref(), &arguments.load.options())?
+        source::load(arguments.scene.as_deref(), arguments.body.as_deref(), &arguments.load.options()?)?
     };
     let mut chosen = None;
     if !arguments.resume && arguments.capacity == Some(CapacityName::Auto) {
@@ -115,7 +116,7 @@ pub fn train(arguments: &TrainArguments) -> Result<()> {
         prior = prior_metrics(&run, &source, lpips.as_ref())?;
         rows.insert(0, (prior.method.clone(), &prior));
     }
-    println!("\nnovel views:\n{}", table::markdown(&rows));
+    println!("\n{}:\n{}", metrics.splits.title(), table::markdown(&rows));
     println!("pictures: {}", directory.join("renders").display());
     Ok(())
 }
@@ -137,6 +138,12 @@ pub fn run_one(
     stop_after: Option<u64>,
 ) -> Result<Option<Metrics>> {
     let scene = Scene::new(&source.capture, &source.model, &run.train)?;
+    if let Some(lpips) = lpips {
+        // Before the training, not after it.
+        for frame in scored_frames(&scene) {
+            lpips.check_size(frame.camera.width as usize, frame.camera.height as usize)?;
+        }
+    }
     if run.train.method == Method::Prior {
         let start = Instant::now();
         let colors = VertexColors::measure(&scene)?;
@@ -167,11 +174,23 @@ pub fn run_unless_finished(
     source: &Source,
     lpips: Option<&Lpips>,
 ) -> Result<Metrics> {
-    let earlier = RunConfig::read(directory).is_ok_and(|old| old.train == run.train && old.load == run.load);
+    let old = if directory.join("config.toml").is_file() { Some(RunConfig::read(directory)?) } else { None };
+    if let Some(old) = old.as_ref().filter(|old| !old.same_scene(run)) {
+        let body = |run: &RunConfig| run.body.as_ref().map_or(String::new(), |b| format!(" with {}", b.display()));
+        bail!(
+            "{} holds a run of {}{}; for {}{} give another --out",
+            directory.display(),
+            old.scene,
+            body(old),
+            run.scene,
+            body(run)
+        );
+    }
+    let earlier = old.is_some_and(|old| old.train == run.train && old.load == run.load);
     if earlier && directory.join(METRICS).is_file() {
         let metrics = Metrics::read(directory)?;
         // Scores that lack what is asked for now are made anew from the checkpoint.
-        if lpips.is_none() || metrics.lpips.is_some() {
+        if lpips.is_none() || metrics.lpips == network_name(lpips) {
             println!("{name}: finished earlier");
             return Ok(metrics);
         }
@@ -210,9 +229,9 @@ fn prior_metrics(run: &RunConfig, source: &Source, lpips: Option<&Lpips>) -> Res
     let start = Instant::now();
     let colors = VertexColors::measure(&scene)?;
     let mut metrics = metrics(&prior, start.elapsed().as_secs_f64(), 3 * colors.colors.len(), String::new());
-    metrics.lpips = lpips.map(|lpips| lpips.trunk().name().to_owned());
-    metrics.splits.novel_view =
-        Some(Model::Prior(colors).score(&scene, crate::eval::Split::NovelView, lpips, |_, _| {})?);
+    metrics.lpips = network_name(lpips);
+    let split = if scene.eval.is_empty() { Split::TrainView } else { Split::NovelView };
+    *split.of(&mut metrics.splits) = Some(Model::Prior(colors).score(&scene, split, lpips, |_, _| {})?);
     Ok(metrics)
 }
 

@@ -32,6 +32,34 @@ fn tables_have_every_row_once_and_a_second_call_trains_nothing() {
 }
 
 #[test]
+fn rows_of_any_length_without_views_kept_back_fit_a_budget_and_another_capture_of_the_name_is_refused() {
+    let folder = folder("reproduce-lengths");
+    let (capture, other) = (folder.join("one/person"), folder.join("two/person"));
+    for capture in [&capture, &other] {
+        let size = ["--size", "32", "--frames", "3", "--format", "ocmotion"];
+        done(&[&["synth", "--out", text(capture)], &size[..]].concat());
+        std::fs::remove_dir_all(capture.join("clean")).unwrap();
+    }
+    let out = folder.join("out");
+    let rest = ["--out", text(&out), "--seeds", "1", "--budget", "0.01", "--without"];
+    let without = "humannerf-bg,humannerf-bg-4x,humannerf-bg-time,hash-point-bg,hash-point,occnerf-bg,occnerf-published,no-surface,\
+                   no-attention,no-completeness,no-perceptual";
+    let arguments = |capture| [&["reproduce", capture], &rest[..], &[without]].concat();
+    done(&arguments(text(&capture)));
+    let table = std::fs::read_to_string(out.join("person/reproduce.md")).unwrap();
+    let steps = |row: &str| {
+        let line = table.lines().find(|line| line.starts_with(&format!("| {row} "))).unwrap();
+        line.split('|').nth(3).unwrap().trim().parse::<u64>().unwrap()
+    };
+    assert_eq!(steps("humannerf-4x"), 4 * steps("humannerf"));
+    assert!(steps("humannerf-time") > 0 && steps("occnerf") == steps("humannerf"));
+    assert!(!table.contains("Novel views") && out.join("person/reproduce.png").is_file(), "{table}");
+    let refusal = common::xtask(&arguments(text(&other)));
+    let said = String::from_utf8_lossy(&refusal.stderr);
+    assert!(!refusal.status.success() && said.contains("one/person") && said.contains("two/person"), "{said}");
+}
+
+#[test]
 fn robustness_is_a_line_for_each_error_of_the_prior() {
     let folder = folder("robustness");
     let (capture, out) = (folder.join("capture"), folder.join("out"));

@@ -131,6 +131,9 @@ fn decode(plan: Planned, size: (u32, u32), first: &str, options: &LoadOptions) -
     let resample = |values: Vec<f32>, channels: usize| {
         resize(undistort(values, channels, &camera, &distortion), channels, size, to)
     };
+    // What the lens never saw is as unknown as what an occluder hides; without known occluders the silhouette tells.
+    let seen = occluder.as_ref().map(|o: &Vec<f32>| resample(vec![1.0; o.len()], 1));
+    let unknown = |covered: Vec<f32>| covered.into_iter().zip(seen.unwrap_or_default());
     Ok(Frame {
         name: plan.name,
         image: Image { width: to.0, height: to.1, pixels: resample(image.pixels, 3) },
@@ -140,6 +143,7 @@ fn decode(plan: Planned, size: (u32, u32), first: &str, options: &LoadOptions) -
         placement: plan.placement,
         betas: plan.betas,
         // A pixel that an occluder touches is not known to show background.
-        occluder: occluder.map(|o: Vec<f32>| resample(o, 1).into_iter().map(|covered| covered > 0.0).collect()),
+        occluder: occluder
+            .map(|o| unknown(resample(o, 1)).map(|(covered, seen)| covered > 0.0 || seen < 0.5).collect()),
     })
 }

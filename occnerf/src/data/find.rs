@@ -48,9 +48,8 @@ impl Layout {
 /// [`DataError::Missing`] where no body is found.
 pub fn find_body(dir: &Path) -> Result<PathBuf, DataError> {
     Layout::detect(dir)?;
-    let own = dir.join("body.npz");
-    if let Some(found) = [&own, &dir.join("body.safetensors")].into_iter().find(|path| path.is_file()) {
-        return Ok(found.clone());
+    if let Some(found) = own_body(dir) {
+        return Ok(found);
     }
     // Ancestors of a relative path end where the path does, not at the root of the file system.
     let whole = dir.canonicalize().map_err(DataError::io(dir))?;
@@ -64,8 +63,16 @@ pub fn find_body(dir: &Path) -> Result<PathBuf, DataError> {
         files.into_iter().find(|path| is_body(path))
     });
     found.ok_or_else(|| {
-        DataError::missing(&own, "body model (nor body.safetensors, nor any body/*.npz near the capture)")
+        DataError::missing(
+            &dir.join("body.npz"),
+            "body model (nor body.safetensors, nor any body/*.npz near the capture)",
+        )
     })
+}
+
+/// The body model in a capture's directory: `body.npz` or `body.safetensors`.
+pub fn own_body(dir: &Path) -> Option<PathBuf> {
+    ["body.npz", "body.safetensors"].map(|name| dir.join(name)).into_iter().find(|path| path.is_file())
 }
 
 /// Whether an archive holds a template; poses and reference values may lie beside the body.

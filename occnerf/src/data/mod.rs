@@ -11,6 +11,7 @@ mod error;
 mod find;
 mod humannerf;
 mod image;
+mod names;
 mod obstacle;
 mod options;
 mod pictures;
@@ -26,7 +27,7 @@ mod zju;
 
 pub use self::demo::{DemoConfig, demo};
 pub use self::error::DataError;
-pub use self::find::{Layout, find_body};
+pub use self::find::{Layout, find_body, own_body};
 pub use self::image::Image;
 pub use self::obstacle::Obstacle;
 pub use self::options::LoadOptions;

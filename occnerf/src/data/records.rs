@@ -8,6 +8,7 @@ use smpl::pickle::{self, Value};
 use smpl::{Data, NdArray};
 
 use super::DataError;
+use super::names::FrameName;
 
 /// A pickle whose root is a dictionary.
 pub(super) struct Records {
@@ -50,15 +51,15 @@ impl Records {
         Record { path: &self.path, prefix: String::new(), value: &self.root }
     }
 
-    /// The frames by name, sorted; at least one.
-    pub fn frames(&self) -> Result<BTreeMap<&str, Record<'_>>, DataError> {
+    /// The frames in the order of their names; at least one.
+    pub fn frames(&self) -> Result<BTreeMap<FrameName<'_>, Record<'_>>, DataError> {
         let mut frames = BTreeMap::new();
         if let Value::Dict(items) = &self.root {
             for (key, value) in items {
                 let name = key
                     .as_str()
                     .ok_or_else(|| DataError::invalid(&self.path, "a key", "a frame's name", key.type_name()))?;
-                frames.insert(name, self.dictionary(name, value)?);
+                frames.insert(FrameName(name), self.dictionary(name, value)?);
             }
         }
         if frames.is_empty() {

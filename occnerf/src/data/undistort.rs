@@ -4,16 +4,20 @@ use glam::Vec2;
 use volrender::{Camera, Distortion};
 
 /// What a perfect lens would have shown in place of `source` (H, W, channels), which `camera` saw through
-/// `distortion`: bilinear, 0 beyond the border.
+/// `distortion`: bilinear, 0 beyond the border and where the model of the lens folds back.
 pub(super) fn undistort(source: Vec<f32>, channels: usize, camera: &Camera, distortion: &Distortion) -> Vec<f32> {
     if distortion.is_none() {
         return source;
     }
     let (width, height) = (camera.width as usize, camera.height as usize);
+    let fold = distortion.fold_radius();
     let mut out = vec![0.0; source.len()];
     for row in 0..height {
         for column in 0..width {
             let ideal = Vec2::new(column as f32 + 0.5, row as f32 + 0.5);
+            if ((ideal - camera.centre) / camera.focal).length() >= fold {
+                continue;
+            }
             let at = camera.distort_pixel(distortion, ideal) - Vec2::splat(0.5);
             let reach = Vec2::new(width as f32, height as f32);
             if !(at.cmpgt(Vec2::NEG_ONE).all() && at.cmplt(reach).all()) {
@@ -81,6 +85,14 @@ mod tests {
         let (image, mask) = (undistort(image, 3, &camera(), &distortion), undistort(mask, 1, &camera(), &distortion));
         assert_eq!((mask[0], &image[..3]), (0.0, &[0.0; 3][..]));
         assert!((mask[24 * 64 + 32] - 1.0).abs() < 1e-6);
+    }
+
+    #[test]
+    fn nothing_is_shown_twice() {
+        // r − 0.8 r³ turns at r = 0.645; the corner of the picture is at 0.667.
+        let distortion = Distortion::from_opencv([-0.8, 0.0, 0.0, 0.0, 0.0]);
+        let out = undistort(vec![1.0; 64 * 48], 1, &camera(), &distortion);
+        assert_eq!((out[0], out[24 * 64]), (0.0, 1.0));
     }
 
     #[test]

@@ -53,15 +53,12 @@ pub(super) fn load(path: &Path) -> Result<Lpips, Error> {
             return build(trunk, &mut trunk_file, None);
         }
         let beside = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-        let mut others = files(beside)?.into_iter().filter_map(|other| Weights::open(&other).ok());
-        let mut lin = others.find(|other| other.has_lin(trunk)).ok_or_else(|| no_lin(path, trunk))?;
+        let (others, damaged) = open_all(&files(beside)?);
+        let lin = others.into_iter().find(|other| other.has_lin(trunk));
+        let mut lin = lin.ok_or_else(|| damaged.unwrap_or_else(|| no_lin(path, trunk)))?;
         return build(trunk, &mut trunk_file, Some(&mut lin));
     }
-    let paths = files(path)?;
-    let mut open = Vec::new();
-    for path in &paths {
-        open.push(Weights::open(path)?);
-    }
+    let (mut open, damaged) = open_all(&files(path)?);
     let mut lonely = None;
     for i in 0..open.len() {
         let Some(trunk) = open[i].trunk() else { continue };
@@ -74,9 +71,22 @@ pub(super) fn load(path: &Path) -> Result<Lpips, Error> {
             let other = if other == open.len() { i } else { other };
             return build(trunk, &mut trunk_file, open.get_mut(other));
         }
-        lonely = lonely.or(Some(no_lin(&paths[i], trunk)));
+        lonely = lonely.or_else(|| Some(no_lin(&open[i].path, trunk)));
     }
-    Err(lonely.unwrap_or_else(|| fault(path, "has no .safetensors, .pth or .pt file with a trunk in it")))
+    Err(damaged.or(lonely).unwrap_or_else(|| fault(path, "has no .safetensors, .pth or .pt file with a trunk in it")))
+}
+
+/// The files that can be read, and what is wrong with the first that cannot: it matters where what is needed is in none of the
+/// others.
+fn open_all(paths: &[PathBuf]) -> (Vec<Weights>, Option<Error>) {
+    let (mut open, mut damaged) = (Vec::new(), None);
+    for path in paths {
+        match Weights::open(path) {
+            Ok(weights) => open.push(weights),
+            Err(error) => damaged = damaged.or(Some(error)),
+        }
+    }
+    (open, damaged)
 }
 
 fn no_lin(path: &Path, trunk: Trunk) -> Error {

@@ -167,6 +167,7 @@ fn refused(path: &Path, words: &[&str]) {
 fn what_is_wrong_is_named_with_file_tensor_and_shapes() {
     let folder = folder("wrong");
     let (trunk, lin) = weights();
+    let lin_only = lin.clone();
     let all: Tensors = trunk.clone().into_iter().chain(lin).collect();
     let path = folder.join("net.pth");
     let check = |tensors: &Tensors, words: &[&str]| {
@@ -187,6 +188,19 @@ fn what_is_wrong_is_named_with_file_tensor_and_shapes() {
     std::fs::write(&path, b"not weights at all, but long enough to be").unwrap();
     refused(&path, &["neither"]);
     refused(&folder.join("none.pth"), &[]);
+    // A damaged file beside the trunk is named where what is missing may be in it, and matters to nobody else.
+    let beside = self::folder("beside");
+    let (lonely, cut) = (beside.join("trunk.pth"), beside.join("zlin.pth"));
+    std::fs::write(&lonely, archive(&trunk)).unwrap();
+    std::fs::write(&cut, &archive(&lin_only)[..200]).unwrap();
+    for path in [&lonely, &beside] {
+        let error = Lpips::load(path).err().unwrap().to_string();
+        assert!(error.contains("zlin.pth"), "{error}");
+    }
+    std::fs::write(beside.join("lin.pth"), archive(&lin_only)).unwrap();
+    for path in [&lonely, &beside] {
+        Lpips::load(path).unwrap();
+    }
     let empty = self::folder("empty");
     refused(&empty, &["no .safetensors"]);
 }

@@ -215,12 +215,12 @@ impl SceneArguments {
     }
 
     fn read(&self, scene: &str) -> Result<Source> {
-        source::load(Some(scene), self.body.as_deref(), &self.load.options())
+        source::load(Some(scene), self.body.as_deref(), &self.load.options()?)
     }
 
-    fn sweep(&self, scene: &str, steps: u64, seed: u64, quick: bool) -> points::Sweep {
-        let (body, load) = (self.body.clone(), self.load.options());
-        points::Sweep {
+    fn sweep(&self, scene: &str, steps: u64, seed: u64, quick: bool) -> Result<points::Sweep> {
+        let (body, load) = (self.body.clone(), self.load.options()?);
+        Ok(points::Sweep {
             scene_arguments: self.command_line(scene),
             place: Place::Scene { scene: scene.to_owned(), body, load },
             views: if quick { VIEWS.1 } else { VIEWS.0 },
@@ -228,7 +228,7 @@ impl SceneArguments {
             full_steps: FULL_STEPS,
             seed,
             quick,
-        }
+        })
     }
 
     /// What `bench stability` does to a scene.
@@ -246,7 +246,7 @@ impl SceneArguments {
         );
         // The one layout that leaves open what hides the person.
         let obstacle = Layout::detect(Path::new(scene))? == Layout::ZjuMocap;
-        let place = Place::Scene { scene: scene.to_owned(), body: self.body.clone(), load: self.load.options() };
+        let place = Place::Scene { scene: scene.to_owned(), body: self.body.clone(), load: self.load.options()? };
         Ok(axes::of_capture(&place, side, obstacle, quick))
     }
 
@@ -274,7 +274,7 @@ fn pareto(arguments: &ParetoArguments) -> Result<()> {
     let mut bench = arguments.sitting.open(out)?;
     let mut text = String::new();
     for scene in &scenes {
-        let lines = pareto::run(&on.sweep(scene, steps, *seed, *quick), &mut bench)?;
+        let lines = pareto::run(&on.sweep(scene, steps, *seed, *quick)?, &mut bench)?;
         let name = train::scene_name(Some(scene));
         pareto::charts(&name, &lines, &out.join(format!("pareto-{name}")))?;
         text.push_str(&format!("## {scene}\n\n{}\n", pareto::table(&lines)));
@@ -293,7 +293,7 @@ fn capacity_bench(arguments: &CapacityArguments) -> Result<()> {
     let mut bench = arguments.sitting.open(out)?;
     let mut text = String::new();
     for scene in &scenes {
-        let points = capacity::points(&on.sweep(scene, steps, *seed, *quick), &on.read(scene)?, *paper)?;
+        let points = capacity::points(&on.sweep(scene, steps, *seed, *quick)?, &on.read(scene)?, *paper)?;
         let lines = capacity::run(points, &mut bench)?;
         let name = train::scene_name(Some(scene));
         capacity::chart(&name, &lines, &out.join(format!("capacity-{name}")))?;

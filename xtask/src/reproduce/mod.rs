@@ -8,15 +8,15 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Result, ensure};
 use clap::Args;
-use occnerf::Lpips;
 use occnerf::data::{LoadOptions, Wrong};
+use occnerf::{Lpips, Preset};
 
-use crate::eval::load_lpips;
+use crate::eval::{load_lpips, network_name};
 use crate::run::{self, RunConfig};
 use crate::settings::PresetName;
 use crate::source::{self, LoadArguments, Source};
 use crate::train::{run_unless_finished, scene_name};
-use plan::Plan;
+use plan::{Plan, Request};
 use rows::{ROWS, Row};
 use summary::Summary;
 
@@ -119,16 +119,30 @@ struct Experiment<'a> {
 }
 
 impl Experiment<'_> {
+    fn plan(&self, directory: &Path, source: &Source, rows: &[&Row], minutes: f64) -> Result<Plan> {
+        let preset = self.arguments.preset.into();
+        let request = Request {
+            preset: Preset::name(preset).to_owned(),
+            seeds: self.arguments.seeds,
+            budget: self.arguments.steps.is_none().then_some(minutes),
+            rows: rows.iter().map(|row| row.name.to_owned()).collect(),
+            load: source.load.clone(),
+            perceptual_weights: self.arguments.perceptual_weights.clone().unwrap_or_default(),
+            lpips: network_name(self.lpips),
+        };
+        Plan::read_or_make(directory, source, rows, request, preset, self.arguments.steps, self.lpips)
+    }
+
     fn load(&self, options: &LoadOptions) -> Result<Source> {
         source::load(Some(self.scene), self.arguments.body.as_deref(), options)
     }
 
     /// The paper's table.
     fn table(&self, directory: &Path) -> Result<()> {
-        let source = self.load(&self.arguments.load.options())?;
+        let source = self.load(&self.arguments.load.options()?)?;
         std::fs::create_dir_all(directory)?;
         let rows = self.arguments.rows(|_| true);
-        let plan = self.arguments.plan(directory, &source, &rows, self.minutes)?;
+        let plan = self.plan(directory, &source, &rows, self.minutes)?;
         println!("{plan}");
         let summary = self.run_rows(&rows, &plan, &source, directory)?;
         println!("\n{}", summary.markdown());
@@ -142,7 +156,7 @@ impl Experiment<'_> {
 
     /// The main rows at each level of wrongness.
     fn robustness(&self, directory: &Path) -> Result<()> {
-        let options = self.arguments.load.options();
+        let options = self.arguments.load.options()?;
         ensure!(options.wrong == Wrong::default(), "--robustness goes through its own errors: leave --wrong-… out");
         let rows = self.arguments.rows(|row| MAIN.contains(&row.name));
         std::fs::create_dir_all(directory)?;
@@ -153,9 +167,7 @@ impl Experiment<'_> {
             let source = self.load(&LoadOptions { wrong, ..options.clone() })?;
             let plan = match &mut plan {
                 Some(plan) => plan,
-                none => {
-                    none.insert(self.arguments.plan(directory, &source, &rows, self.minutes / LEVELS.len() as f64)?)
-                }
+                none => none.insert(self.plan(directory, &source, &rows, self.minutes / LEVELS.len() as f64)?),
             };
             println!("{plan}");
             let at = directory.join(name);
@@ -199,9 +211,5 @@ impl ReproduceArguments {
     fn rows(&self, wanted: impl Fn(&Row) -> bool) -> Vec<&'static Row> {
         let kept = |row: &&Row| self.without.iter().all(|name| name != row.name) && wanted(row);
         ROWS.iter().filter(kept).collect()
-    }
-
-    fn plan(&self, directory: &Path, source: &Source, rows: &[&Row], minutes: f64) -> Result<Plan> {
-        Plan::read_or_make(directory, source, rows, self.preset.into(), self.seeds, minutes, self.steps)
     }
 }

@@ -6,8 +6,8 @@ use std::path::Path;
 use std::time::Instant;
 
 use anyhow::{Context, Result};
-use glam::Vec3;
-use occnerf::{FieldRenderer, Method, PreparedFrame, Preset, Renderer, Scene, Trainer};
+use occnerf::data::LoadOptions;
+use occnerf::{Config, FieldRenderer, Lpips, Method, PreparedFrame, Preset, Scene, Trainer, evaluate_with};
 use serde::{Deserialize, Serialize};
 
 use super::rows::{Length, Row};
@@ -22,13 +22,27 @@ const FEWEST: u64 = 20;
 /// Part of the budget that is planned for; the rest is for preparing scenes and for slow moments.
 const SPARE: f64 = 0.85;
 
+/// What a plan is made for.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Request {
+    pub preset: String,
+    pub seeds: u64,
+    /// Minutes; none where the number of steps is given.
+    pub budget: Option<f64>,
+    /// Names of the rows.
+    pub rows: Vec<String>,
+    /// How the capture is read.
+    pub load: LoadOptions,
+    /// Weights of the perceptual term, empty for the embedded one, and network of the score.
+    pub perceptual_weights: String,
+    pub lpips: Option<String>,
+}
+
 /// What every row of a scene is given.
 #[derive(Debug, PartialEq, Serialize, Deserialize)]
 pub struct Plan {
-    preset: String,
-    seeds: u64,
-    /// Minutes; none where the number of steps was given.
-    budget: Option<f64>,
+    #[serde(flatten)]
+    request: Request,
     /// Of a row that is not longer than the others.
     pub steps: u64,
     /// Seconds of a step and of a scored picture of each method, measured before everything else.
@@ -41,30 +55,32 @@ impl Plan {
         directory: &Path,
         source: &Source,
         rows: &[&Row],
+        request: Request,
         preset: Preset,
-        seeds: u64,
-        minutes: f64,
         steps: Option<u64>,
+        lpips: Option<&Lpips>,
     ) -> Result<Self> {
         let path = directory.join("plan.json");
-        let budget = if steps.is_some() { None } else { Some(minutes) };
         if path.is_file() {
             let text = std::fs::read_to_string(&path).with_context(|| path.display().to_string())?;
-            let old: Self = serde_json::from_str(&text).with_context(|| path.display().to_string())?;
-            let same_steps = steps.is_none_or(|s| s == old.steps);
-            if old.preset == preset.name() && old.seeds == seeds && old.budget == budget && same_steps {
+            // One that an older version wrote lacks what this one asks: it is made anew.
+            let old = serde_json::from_str::<Self>(&text).ok();
+            if let Some(old) = old.filter(|old| old.request == request && steps.is_none_or(|s| s == old.steps)) {
                 return Ok(old);
             }
         }
         let (mut cost, mut pictures) = (BTreeMap::new(), 0);
         for method in [Method::Humannerf, Method::HashPoint, Method::Occnerf] {
             if let Some(row) = rows.iter().find(|row| row.method == method) {
-                let (seconds, scored) = measure(source, row, preset)?;
+                let mut config = row.settings(preset);
+                config.loss.perceptual_weights.clone_from(&request.perceptual_weights);
+                let (seconds, scored) = measure(source, config, lpips)?;
                 cost.insert(method.name().to_owned(), seconds);
                 pictures = scored;
             }
         }
-        let mut plan = Self { preset: preset.name().to_owned(), seeds, budget, steps: 1, cost };
+        let (seeds, minutes) = (request.seeds, request.budget.unwrap_or_default());
+        let mut plan = Self { request, steps: 1, cost };
         let (mut a_step, mut fixed) = (0.0, 0.0);
         for row in rows.iter().filter(|row| row.learns()) {
             let (step, picture) = plan.cost(row);
@@ -108,8 +124,9 @@ impl Plan {
 
 impl fmt::Display for Plan {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "plan: preset {}, {} steps a run, {} seeds", self.preset, self.steps, self.seeds)?;
-        if let Some(budget) = self.budget {
+        let Request { preset, seeds, budget, .. } = &self.request;
+        write!(f, "plan: preset {preset}, {} steps a run, {seeds} seeds", self.steps)?;
+        if let Some(budget) = budget {
             write!(f, ", sized for {budget:.0} minutes")?;
         }
         for (method, (step, picture)) in &self.cost {
@@ -119,11 +136,11 @@ impl fmt::Display for Plan {
     }
 }
 
-/// Seconds of a step and of a picture, and how many pictures a run is scored on.
-fn measure(source: &Source, row: &Row, preset: Preset) -> Result<((f64, f64), usize)> {
-    let config = row.settings(preset);
+/// Seconds of a step and of a scored picture, and how many pictures a run is scored on.
+fn measure(source: &Source, config: Config, lpips: Option<&Lpips>) -> Result<((f64, f64), usize)> {
     let scene = Scene::new(&source.capture, &source.model, &config)?;
     let mut trainer = Trainer::new(&scene, config)?;
+    trainer.load_perceptual()?;
     for _ in 0..WARM {
         trainer.step();
     }
@@ -133,10 +150,9 @@ fn measure(source: &Source, row: &Row, preset: Preset) -> Result<((f64, f64), us
     }
     let step = start.elapsed().as_secs_f64() / TIMED as f64;
     let scored: Vec<&PreparedFrame> = crate::eval::scored_frames(&scene).collect();
+    let first = &scored[..scored.len().min(1)];
     let mut renderer = FieldRenderer::new(&trainer)?;
     let start = Instant::now();
-    if let Some(frame) = scored.first() {
-        renderer.render(frame, Vec3::ZERO)?;
-    }
+    evaluate_with(&scene, &mut renderer, first, lpips, |_, _| {})?;
     Ok(((step, start.elapsed().as_secs_f64()), scored.len()))
 }

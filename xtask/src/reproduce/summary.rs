@@ -61,12 +61,13 @@ impl<'a> Summary<'a> {
     /// Adds a run of a row.
     pub fn add(&mut self, row: &Row, directory: &Path, metrics: Metrics) {
         if self.rows.last().is_none_or(|entry| entry.name != row.name) {
+            let sheet = if metrics.splits.novel_view.is_some() { "novel_views.png" } else { "train_views.png" };
             self.rows.push(Entry {
                 name: row.name,
                 occluded: if row.learns() { metrics.occluded.clone() } else { "–".to_owned() },
                 steps: metrics.steps,
                 runs: Vec::new(),
-                pictures: directory.join("renders/novel_views.png"),
+                pictures: directory.join("renders").join(sheet),
             });
         }
         self.lpips.clone_from(&metrics.lpips);
@@ -122,9 +123,7 @@ impl<'a> Summary<'a> {
     /// What is ranked, row by row.
     pub fn scores(&self) -> Vec<Score> {
         let of = |entry: &Entry, pick: fn(&SplitMetrics) -> Option<f64>| {
-            let splits =
-                entry.runs.iter().filter_map(|m| m.splits.novel_view.as_ref().or(m.splits.train_view.as_ref()));
-            splits.filter_map(pick).collect()
+            entry.runs.iter().filter_map(|m| m.splits.first()).filter_map(|(_, split)| pick(split)).collect()
         };
         let score = |entry: &Entry| Score {
             name: entry.name,
@@ -178,7 +177,7 @@ pub fn by_level(scene: &str, levels: &[(&str, Vec<Score>)]) -> String {
         let cells = scores.iter().flat_map(|s| [cell(&s.psnr_mask, 2), cell(&s.psnr_hidden, 2)]);
         lines.push(std::iter::once((*level).to_owned()).chain(cells).collect());
     }
-    format!("# {scene}: psnr_mask and psnr_hidden of novel views with a wrong prior\n\n{}", table::aligned(&lines, 1))
+    format!("# {scene}: psnr_mask and psnr_hidden with a wrong prior\n\n{}", table::aligned(&lines, 1))
 }
 
 /// Mean and, of several, standard deviation.

@@ -8,7 +8,7 @@
 //! eval/Camera_…/              images, masks, cameras.pkl and mesh_infos.pkl again, nothing occluded
 //! ```
 //!
-//! Frames are the entries of `cameras.pkl` in the order of their names.
+//! Frames are the entries of `cameras.pkl` in the order of their names, `10` after `9`.
 
 #[cfg(test)]
 mod tests;
@@ -20,6 +20,7 @@ use smpl::BodyModel;
 
 use super::camera::Lens;
 use super::decode::{Planned, View, check_memory};
+use super::names::FrameName;
 use super::pictures::{Pictures, file_name};
 use super::records::{Record, Records};
 use super::{Capture, DataError, EvalFrame, LoadOptions, checks};
@@ -38,7 +39,8 @@ pub(super) fn load(dir: &Path, body: &BodyModel, options: &LoadOptions) -> Resul
     let (mut cameras, mut eval) = (Vec::new(), Vec::new());
     for camera in eval_directories(dir)? {
         let view = plan(&camera, body, options, |mut seen| {
-            if let Some(odd) = seen.iter().find(|name| all.binary_search_by(|n| n.as_str().cmp(name)).is_err()) {
+            let all: Vec<&String> = all.iter().collect();
+            if let Some(odd) = seen.iter().find(|name| index(&all, name).is_none()) {
                 let expected = format!("the name of a frame of {}", dir.join("cameras.pkl").display());
                 let file = camera.join("cameras.pkl");
                 return Err(DataError::invalid(&file, *odd, expected, "no such training frame"));
@@ -66,7 +68,7 @@ pub(super) fn load(dir: &Path, body: &BodyModel, options: &LoadOptions) -> Resul
 }
 
 fn index(names: &[&String], name: &str) -> Option<usize> {
-    names.binary_search_by(|n| n.as_str().cmp(name)).ok()
+    names.binary_search_by(|n| FrameName(n).cmp(&FrameName(name))).ok()
 }
 
 /// The frames of a directory that `choose` keeps of their sorted names; `None` where it keeps none.
@@ -87,22 +89,22 @@ fn plan(
     {
         if let Some(name) = has.keys().find(|name| !lacks.contains_key(*name)) {
             let expected = format!("an entry, as in {}", has_path.display());
-            return Err(DataError::invalid(lacks_path, *name, expected, "no such key"));
+            return Err(DataError::invalid(lacks_path, name.0, expected, "no such key"));
         }
     }
     let images = Pictures::list(&dir.join("images"))?;
     let masks = Pictures::list(&dir.join("masks"))?;
-    if let Some((name, path)) = images.iter().find(|(name, _)| !lenses.contains_key(name.as_str())) {
+    if let Some((name, path)) = images.iter().find(|(name, _)| !lenses.contains_key(&FrameName(name))) {
         let expected = format!("an entry `{name}` in {}", cameras.path().display());
         return Err(DataError::invalid(path, "camera of the image", expected, "none"));
     }
-    let chosen = choose(lenses.keys().copied().collect())?;
+    let chosen = choose(lenses.keys().map(|name| name.0).collect())?;
     // Collected as results first, so that the error reported is the first in order whatever finishes first.
     let frames: Vec<Result<Planned, DataError>> = chosen
         .par_iter()
         .map(|&name| {
             let (image, mask) = (images.demand(name, cameras.path())?, masks.demand(name, cameras.path())?);
-            plan_frame(name, image, mask, &lenses[name], &infos[name], body, options)
+            plan_frame(name, image, mask, &lenses[&FrameName(name)], &infos[&FrameName(name)], body, options)
         })
         .collect();
     let frames: Vec<Planned> = frames.into_iter().collect::<Result<_, _>>()?;

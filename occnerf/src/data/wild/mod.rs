@@ -8,7 +8,7 @@
 //! ```
 //!
 //! The pose's first joint turns the body about its pelvis; the extrinsics hold the body's translation. Frames are the
-//! entries of `metadata.json` in the order of their names; pictures that it does not mention are left out.
+//! entries of `metadata.json` in the order of their names, `10` after `9`; pictures that it does not mention are left out.
 
 mod metadata;
 #[cfg(test)]
@@ -20,6 +20,7 @@ use smpl::{BodyModel, Placement};
 
 use super::camera::Lens;
 use super::decode::{Planned, View, check_memory};
+use super::names::FrameName;
 use super::pictures::{Pictures, file_name};
 use super::records::Record;
 use super::{Capture, DataError, EvalFrame, LoadOptions, checks};
@@ -38,7 +39,7 @@ pub(super) fn load(dir: &Path, body: &BodyModel, options: &LoadOptions) -> Resul
     let occluders = optional(&dir.join("occluders"))?;
     let train: Result<Vec<Planned>, DataError> = frames
         .iter()
-        .map(|(name, record)| {
+        .map(|(FrameName(name), record)| {
             let mut frame = plan(name, record, [&images, &masks], &path, body, options)?;
             frame.occluder = occluders.as_ref().and_then(|o| o.get(name));
             Ok(frame)
@@ -50,7 +51,7 @@ pub(super) fn load(dir: &Path, body: &BodyModel, options: &LoadOptions) -> Resul
     let (mut indices, mut kept) = (Vec::new(), Vec::new());
     if let Some(images) = optional(&clean.join("images"))? {
         let masks = Pictures::list(&clean.join("masks"))?;
-        for (index, (name, record)) in frames.iter().enumerate().step_by(options.eval_stride) {
+        for (index, (FrameName(name), record)) in frames.iter().enumerate().step_by(options.eval_stride) {
             if images.get(name).is_some() {
                 indices.push(index);
                 kept.push(plan(name, record, [&images, &masks], &path, body, options)?);

@@ -52,6 +52,31 @@ fn fails(dir: &Directory, words: &[&str]) {
 }
 
 #[test]
+fn frames_come_in_the_order_of_their_numbers() {
+    let (dir, _) = fixture("wild-numbers");
+    let mut entries = serde_json::Map::new();
+    for name in ["1", "2", "9", "10"] {
+        dir.stripe(&format!("images/{name}.png"), SIZE, 200);
+        dir.stripe(&format!("masks/{name}.png"), SIZE, 255);
+        entries.insert(name.to_owned(), frame());
+    }
+    dir.write("metadata.json", Value::Object(entries).to_string());
+    let names: Vec<String> = load(&dir).unwrap().train.into_iter().map(|f| f.name).collect();
+    assert_eq!(names, ["1", "2", "9", "10"]);
+}
+
+#[test]
+fn what_the_lens_never_saw_is_unknown_where_occluders_are_known() {
+    let (dir, mut metadata) = fixture("wild-lens");
+    metadata["01"]["distortions"] = json!([2.0, 0.0, 0.0, 0.0, 0.0]);
+    dir.write("metadata.json", metadata.to_string());
+    let capture = load(&dir).unwrap();
+    let occluder = capture.train[1].occluder.as_ref().unwrap();
+    // Corners lie beyond the photograph; the middle right does not, and nothing covers it.
+    assert!(occluder[5] && occluder[23] && !occluder[6 + 3], "{occluder:?}");
+}
+
+#[test]
 fn a_whole_capture_is_read() {
     let (dir, _) = fixture("wild-whole");
     let capture = load(&dir).unwrap();

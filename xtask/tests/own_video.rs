@@ -1,0 +1,26 @@
+//! A video of one's own: no views are kept back, and what is scored says so.
+#![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
+
+mod common;
+
+use common::{done, folder, refused, text};
+
+const TITLE: &str = "training views, over visible pixels:";
+
+#[test]
+fn scores_are_called_what_they_are() {
+    let folder = folder("own-video");
+    let (capture, run) = (folder.join("capture"), folder.join("run"));
+    done(&["synth", "--out", text(&capture), "--size", "32", "--frames", "3", "--format", "ocmotion"]);
+    std::fs::remove_dir_all(capture.join("clean")).unwrap();
+    let quick = ["--preset", "fast", "--method", "hash-point", "--steps", "1"];
+    let said = done(&[&["train", text(&capture), "--out", text(&run)], &quick[..]].concat());
+    assert!(said.contains(TITLE) && !said.contains("novel"), "{said}");
+    let prior = said.lines().find(|line| line.starts_with("| prior")).unwrap();
+    assert!(prior.split('|').nth(5).is_some_and(|cell| cell.trim().parse::<f64>().is_ok()), "{prior}");
+    let said = done(&["eval", text(&run)]);
+    assert!(said.contains(TITLE) && !said.contains("novel"), "{said}");
+    let metrics = std::fs::read_to_string(run.join("metrics.json")).unwrap();
+    assert!(!metrics.contains("novel_view") && metrics.contains("train_view"), "{metrics}");
+    refused(&["eval", text(&run), "--split", "novel-view"], &["keeps no views back", "train-view"]);
+}
