@@ -55,6 +55,9 @@ pub struct LoadArguments {
     /// How far it stands to the right of the person's middle, in picture widths, -1 to 1 [default: 0]
     #[arg(long, value_name = "WIDTHS", allow_negative_numbers = true)]
     position: Option<f32>,
+    /// Most memory that the pictures of a capture may take, in MiB; more is refused before anything is decoded [default: 1024]
+    #[arg(long, value_name = "MIB", value_parser = clap::value_parser!(u64).range(1..=1 << 24))]
+    memory: Option<u64>,
     /// Turn every bone of the prior by so many degrees (root mean square), to see what a method bears
     #[arg(long, value_name = "DEGREES", default_value_t = 0.0)]
     wrong_pose: f32,
@@ -104,6 +107,7 @@ impl LoadArguments {
             camera: self.camera.clone(),
             occlusion,
             wrong: Wrong { pose_degrees: self.wrong_pose, shape: self.wrong_shape, mask_pixels: self.wrong_mask },
+            max_bytes: self.memory.map_or(LoadOptions::default().max_bytes, |mib| mib << 20),
             ..LoadOptions::default()
         })
     }
@@ -122,6 +126,7 @@ impl LoadArguments {
         add("camera", self.camera.clone());
         let name = self.occlusion.and_then(|o| o.to_possible_value());
         add("occlusion", name.map(|n| n.get_name().to_owned()));
+        add("memory", self.memory.map(|n| n.to_string()));
         let number = |x: Option<f32>| x.map(|x| x.to_string());
         add("fraction", number(self.fraction));
         add("share", number(self.share));
@@ -198,7 +203,7 @@ mod tests {
     #[test]
     fn a_command_line_made_of_options_says_all_of_them() {
         let words = "x --resize 64 --stride 2 --max-frames 9 --eval-stride 3 --camera B2 --occlusion moving --fraction 0.4 \
-                     --share 0.7 --position -0.1 --wrong-pose 2.5 --wrong-shape 1 --wrong-mask -3";
+                     --share 0.7 --position -0.1 --memory 2048 --wrong-pose 2.5 --wrong-shape 1 --wrong-mask -3";
         for words in [words, "x"] {
             let load = Line::parse_from(words.split_whitespace()).load;
             let again = format!("x{}", load.command_line());

@@ -85,6 +85,7 @@ pub(super) fn check_memory(train: &View, eval: &[View], options: &LoadOptions) -
         ways.push(format!("eval_stride {}", every.saturating_mul(options.eval_stride as u64)));
     }
     let mebibytes = |bytes: u64| bytes.div_ceil(1 << 20);
+    ways.push(format!("memory {}", mebibytes(total)));
     let kept = eval.iter().map(|view| view.frames.len()).sum::<usize>();
     Err(DataError::setting(
         "max_bytes",

@@ -139,7 +139,7 @@ fn memory_beyond_the_bound_names_options_that_fit() {
     assert!(load_capture(dir.path(), &body(), &fits).is_ok());
     let tight = LoadOptions { max_bytes: 5 * 24 * 16, ..LoadOptions::default() };
     let message = load_capture(dir.path(), &body(), &tight).unwrap_err().to_string();
-    for word in ["max_bytes", "resize 5", "stride 2", "eval_stride 2", "4 training frames", "2 views"] {
+    for word in ["max_bytes", "resize 5", "stride 2", "eval_stride 2", "memory 1", "4 training frames", "2 views"] {
         assert!(message.contains(word), "{word}: {message}");
     }
     for options in [
