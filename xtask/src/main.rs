@@ -5,6 +5,7 @@ mod capacity;
 mod compare;
 mod convert;
 mod eval;
+mod obstacle;
 mod pictures;
 mod probe;
 mod render;

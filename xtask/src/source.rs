@@ -5,10 +5,11 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, Result, bail};
 use clap::{Args, ValueEnum};
 use occnerf::data::{
-    Capture, DemoConfig, LoadOptions, Obstacle, SynthConfig, Synthetic, Wrong, demo, find_body, load_capture, own_body,
+    Capture, DemoConfig, LoadOptions, SynthConfig, Synthetic, Wrong, demo, find_body, load_capture, own_body,
 };
 use smpl::BodyModel;
 
+use crate::obstacle::ObstacleArguments;
 use crate::synth;
 
 /// Name of the scene that needs no files.
@@ -46,15 +47,8 @@ pub struct LoadArguments {
     /// Simulated obstacle before the training camera of a ZJU-MoCap capture [default: occlusion.json, else central]
     #[arg(long)]
     occlusion: Option<ObstacleName>,
-    /// Part of the person that the obstacle hides in the frames that it stands in, 0 to 0.95 [default: 0.5]
-    #[arg(long, value_name = "PART")]
-    fraction: Option<f32>,
-    /// Part of the frames that it stands in, from the first, 0 to 1 [default: 0.8]
-    #[arg(long, value_name = "PART")]
-    share: Option<f32>,
-    /// How far it stands to the right of the person's middle, in picture widths, -1 to 1 [default: 0]
-    #[arg(long, value_name = "WIDTHS", allow_negative_numbers = true)]
-    position: Option<f32>,
+    #[command(flatten)]
+    obstacle: ObstacleArguments,
     /// Most memory that the pictures of a capture may take, in MiB; more is refused before anything is decoded [default: 1024]
     #[arg(long, value_name = "MIB", value_parser = clap::value_parser!(u64).range(1..=1 << 24))]
     memory: Option<u64>,
@@ -82,22 +76,11 @@ enum ObstacleName {
 impl LoadArguments {
     /// The same for the library.
     pub fn options(&self) -> Result<LoadOptions> {
-        let central = Obstacle::default();
-        let shaped = Obstacle {
-            fraction: self.fraction.unwrap_or(central.fraction),
-            share: self.share.unwrap_or(central.share),
-            position: self.position.unwrap_or(central.position),
-            ..central
-        };
-        let is_shaped = self.fraction.or(self.share).or(self.position).is_some();
         let occlusion = match self.occlusion {
-            Some(ObstacleName::None) if is_shaped => {
-                bail!("--occlusion none has no --fraction, --share or --position")
-            }
-            Some(ObstacleName::None) => Some(Obstacle { fraction: 0.0, ..central }),
-            Some(ObstacleName::Moving) => Some(Obstacle { travel: 0.3, ..shaped }),
-            Some(ObstacleName::Central) => Some(shaped),
-            None => is_shaped.then_some(shaped),
+            Some(ObstacleName::None) => Some(self.obstacle.none()?),
+            Some(ObstacleName::Moving) => Some(self.obstacle.moving()),
+            Some(ObstacleName::Central) => Some(self.obstacle.central()),
+            None => self.obstacle.given().then(|| self.obstacle.central()),
         };
         Ok(LoadOptions {
             resize: self.resize,
@@ -128,9 +111,9 @@ impl LoadArguments {
         add("occlusion", name.map(|n| n.get_name().to_owned()));
         add("memory", self.memory.map(|n| n.to_string()));
         let number = |x: Option<f32>| x.map(|x| x.to_string());
-        add("fraction", number(self.fraction));
-        add("share", number(self.share));
-        add("position", number(self.position));
+        add("fraction", number(self.obstacle.fraction));
+        add("share", number(self.obstacle.share));
+        add("position", number(self.obstacle.position));
         let not_zero = |x: f32| (x != 0.0).then(|| x.to_string());
         add("wrong-pose", not_zero(self.wrong_pose));
         add("wrong-shape", not_zero(self.wrong_shape));

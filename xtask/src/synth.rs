@@ -8,10 +8,10 @@ use indicatif::{ProgressBar, ProgressStyle};
 use occnerf::data::{Layout, Obstacle, Occlusion, SynthConfig, Synthetic, synthesise};
 use smpl::{Character, MotionClip};
 
+use crate::obstacle::ObstacleArguments;
+
 /// What a finished directory holds, and nothing else does.
 const MARK: &str = "synth.json";
-/// Default width of the path of a moving rectangle, in picture widths.
-const TRAVEL: f32 = 0.3;
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 enum FormatName {
@@ -53,15 +53,8 @@ pub struct SynthArguments {
     /// What hides the person
     #[arg(long, default_value = "central")]
     occlusion: OcclusionName,
-    /// Part of the person's pixels that is hidden [default: 0.5]
-    #[arg(long, value_name = "0 to 0.95")]
-    fraction: Option<f32>,
-    /// Part of the video, from its start, that is occluded [default: 0.8]; objects stand in all of it
-    #[arg(long, value_name = "0 to 1")]
-    share: Option<f32>,
-    /// How far what hides stands to the right of the person, in picture widths [default: 0]
-    #[arg(long, value_name = "-1 to 1", allow_negative_numbers = true)]
-    position: Option<f32>,
+    #[command(flatten)]
+    obstacle: ObstacleArguments,
     /// Frames of the video [default: 100]
     #[arg(long, value_name = "N")]
     frames: Option<usize>,
@@ -96,24 +89,15 @@ pub struct SynthArguments {
 impl SynthArguments {
     fn config(&self) -> Result<SynthConfig> {
         let usual = SynthConfig::default();
-        let paper = Obstacle::default();
-        let obstacle = Obstacle {
-            fraction: self.fraction.unwrap_or(paper.fraction),
-            share: self.share.unwrap_or(paper.share),
-            position: self.position.unwrap_or(paper.position),
-            travel: 0.0,
-        };
         let occlusion = match self.occlusion {
-            OcclusionName::None => {
-                let given = self.fraction.or(self.share).or(self.position);
-                ensure!(given.is_none(), "--occlusion none has no --fraction, --share or --position");
-                Occlusion::Rectangle(Obstacle { fraction: 0.0, ..paper })
-            }
-            OcclusionName::Central => Occlusion::Rectangle(obstacle),
-            OcclusionName::Moving => Occlusion::Rectangle(Obstacle { travel: TRAVEL, ..obstacle }),
+            OcclusionName::None => Occlusion::Rectangle(self.obstacle.none()?),
+            OcclusionName::Central => Occlusion::Rectangle(self.obstacle.central()),
+            OcclusionName::Moving => Occlusion::Rectangle(self.obstacle.moving()),
             OcclusionName::Objects => {
-                ensure!(self.share.is_none(), "--occlusion objects has no --share: they stand in every frame");
-                Occlusion::Objects { fraction: obstacle.fraction, position: obstacle.position }
+                let said = "--occlusion objects has no --share: they stand in every frame";
+                ensure!(self.obstacle.share.is_none(), said);
+                let Obstacle { fraction, position, .. } = self.obstacle.central();
+                Occlusion::Objects { fraction, position }
             }
         };
         Ok(SynthConfig {

@@ -132,9 +132,17 @@ fn decode(plan: Planned, size: (u32, u32), first: &str, options: &LoadOptions) -
     let resample = |values: Vec<f32>, channels: usize| {
         resize(undistort(values, channels, &camera, &distortion), channels, size, to)
     };
-    // What the lens never saw is as unknown as what an occluder hides; without known occluders the silhouette tells.
-    let seen = occluder.as_ref().map(|o: &Vec<f32>| resample(vec![1.0; o.len()], 1));
-    let unknown = |covered: Vec<f32>| covered.into_iter().zip(seen.unwrap_or_default());
+    // Without known occluders the silhouette tells what is unknown.
+    let occluder = occluder.map(|covered: Vec<f32>| {
+        let everything = (!distortion.is_none()).then(|| vec![1.0; covered.len()]);
+        // A pixel that an occluder touches is not known to show background.
+        let mut unknown: Vec<bool> = resample(covered, 1).into_iter().map(|covered| covered > 0.0).collect();
+        if let Some(everything) = everything {
+            // Nor is one that the lens never saw.
+            unknown.iter_mut().zip(resample(everything, 1)).for_each(|(unknown, seen)| *unknown |= seen < 0.5);
+        }
+        unknown
+    });
     Ok(Frame {
         name: plan.name,
         image: Image { width: to.0, height: to.1, pixels: resample(image.pixels, 3) },
@@ -143,8 +151,6 @@ fn decode(plan: Planned, size: (u32, u32), first: &str, options: &LoadOptions) -
         pose: plan.pose,
         placement: plan.placement,
         betas: plan.betas,
-        // A pixel that an occluder touches is not known to show background.
-        occluder: occluder
-            .map(|o| unknown(resample(o, 1)).map(|(covered, seen)| covered > 0.0 || seen < 0.5).collect()),
+        occluder,
     })
 }

@@ -120,9 +120,9 @@ struct Experiment<'a> {
 
 impl Experiment<'_> {
     fn plan(&self, directory: &Path, source: &Source, rows: &[&Row], minutes: f64) -> Result<Plan> {
-        let preset = self.arguments.preset.into();
+        let preset: Preset = self.arguments.preset.into();
         let request = Request {
-            preset: Preset::name(preset).to_owned(),
+            preset: preset.name().to_owned(),
             seeds: self.arguments.seeds,
             budget: self.arguments.steps.is_none().then_some(minutes),
             rows: rows.iter().map(|row| row.name.to_owned()).collect(),

@@ -39,7 +39,6 @@ pub(super) fn load(dir: &Path, body: &BodyModel, options: &LoadOptions) -> Resul
     let (mut cameras, mut eval) = (Vec::new(), Vec::new());
     for camera in eval_directories(dir)? {
         let view = plan(&camera, body, options, |mut seen| {
-            let all: Vec<&String> = all.iter().collect();
             if let Some(odd) = seen.iter().find(|name| index(&all, name).is_none()) {
                 let expected = format!("the name of a frame of {}", dir.join("cameras.pkl").display());
                 let file = camera.join("cameras.pkl");
@@ -67,8 +66,8 @@ pub(super) fn load(dir: &Path, body: &BodyModel, options: &LoadOptions) -> Resul
     Ok(Capture { name: file_name(dir), train, eval: frames, mean_betas })
 }
 
-fn index(names: &[&String], name: &str) -> Option<usize> {
-    names.binary_search_by(|n| FrameName(n).cmp(&FrameName(name))).ok()
+fn index(names: &[impl AsRef<str>], name: &str) -> Option<usize> {
+    names.binary_search_by(|n| FrameName(n.as_ref()).cmp(&FrameName(name))).ok()
 }
 
 /// The frames of a directory that `choose` keeps of their sorted names; `None` where it keeps none.

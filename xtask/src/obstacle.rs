@@ -1,0 +1,50 @@
+//! The simulated obstacle on the command line.
+
+use anyhow::{Result, ensure};
+use clap::Args;
+use occnerf::data::Obstacle;
+
+/// How far a moving obstacle moves to the right over the video, in picture widths.
+const TRAVEL: f32 = 0.3;
+
+#[derive(Args, Clone, Debug)]
+pub struct ObstacleArguments {
+    /// Part of the person's pixels that is hidden in the frames that the obstacle stands in [default: 0.5]
+    #[arg(long, value_name = "0 to 0.95")]
+    pub fraction: Option<f32>,
+    /// Part of the video, from its start, that it stands in [default: 0.8]
+    #[arg(long, value_name = "0 to 1")]
+    pub share: Option<f32>,
+    /// How far it stands to the right of the person, in picture widths [default: 0]
+    #[arg(long, value_name = "-1 to 1", allow_negative_numbers = true)]
+    pub position: Option<f32>,
+}
+
+impl ObstacleArguments {
+    /// Whether anything was asked for.
+    pub fn given(&self) -> bool {
+        self.fraction.or(self.share).or(self.position).is_some()
+    }
+
+    /// No obstacle at all.
+    pub fn none(&self) -> Result<Obstacle> {
+        ensure!(!self.given(), "--occlusion none has no --fraction, --share or --position");
+        Ok(Obstacle { fraction: 0.0, ..Obstacle::default() })
+    }
+
+    /// The paper's, but for what was asked for.
+    pub fn central(&self) -> Obstacle {
+        let paper = Obstacle::default();
+        Obstacle {
+            fraction: self.fraction.unwrap_or(paper.fraction),
+            share: self.share.unwrap_or(paper.share),
+            position: self.position.unwrap_or(paper.position),
+            ..paper
+        }
+    }
+
+    /// The same in motion.
+    pub fn moving(&self) -> Obstacle {
+        Obstacle { travel: TRAVEL, ..self.central() }
+    }
+}
