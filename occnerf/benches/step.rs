@@ -31,7 +31,7 @@ fn trainer(preset: Preset, method: Method) -> Trainer<'static> {
     let mut trainer = Trainer::new(scene(), Config::preset(preset, method)).unwrap();
     // Buffers have grown to size, and the field is no longer the even fog it starts as.
     for _ in 0..8 {
-        trainer.step();
+        trainer.step().unwrap();
     }
     trainer
 }
@@ -45,14 +45,14 @@ mod occnerf_demo {
         let mut trainer = trainer(preset, Method::Occnerf);
         let config = trainer.config();
         let rays = config.patches * (config.patch_size * config.patch_size) as usize;
-        bencher.counter(ItemsCount::new(rays)).bench_local(|| trainer.step());
+        bencher.counter(ItemsCount::new(rays)).bench_local(|| trainer.step().unwrap());
     }
 
     /// The methods under comparison, at the fast preset.
     #[divan::bench(args = [Method::HashPoint, Method::Humannerf])]
     fn training_step_of(bencher: Bencher<'_, '_>, method: Method) {
         let mut trainer = trainer(Preset::Fast, method);
-        bencher.bench_local(|| trainer.step());
+        bencher.bench_local(|| trainer.step().unwrap());
     }
 
     #[divan::bench(args = [Preset::Fast, Preset::Balanced])]

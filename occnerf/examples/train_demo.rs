@@ -22,7 +22,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let mut trainer = Trainer::new(&scene, config)?;
     println!("{} parameters, {} frames", trainer.num_parameters(), scene.train.len());
     for _ in 0..STEPS {
-        let report = trainer.step();
+        let report = trainer.step()?;
         if report.step % 20 == 0 {
             println!("step {:4}  loss {:.3}  {:.1} dB in training", report.step, report.loss, report.psnr);
         }
@@ -35,16 +35,17 @@ fn main() -> Result<(), Box<dyn Error>> {
         println!("{} {}: {psnr:.1} dB over the subject", view.camera_name, view.name);
     }
     let rendering = renderer.render(view, Vec3::splat(GREY))?;
-    side_by_side(&truth(view), &rendering.image).save_png(&out)?;
+    side_by_side(&truth(view)?, &rendering.image).save_png(&out)?;
     println!("{}", out.display());
     Ok(())
 }
 
 /// The frame over grey.
-fn truth(frame: &PreparedFrame) -> Image {
-    let each = frame.pixels.chunks_exact(3).zip(&frame.mask);
+fn truth(frame: &PreparedFrame) -> Result<Image, occnerf::Error> {
+    let shown = frame.pixels()?;
+    let each = shown.image.pixels.chunks_exact(3).zip(&shown.mask);
     let pixels = each.flat_map(|(p, m)| p.iter().map(move |c| c + (1.0 - m) * GREY)).collect();
-    Image { width: frame.camera.width, height: frame.camera.height, pixels }
+    Ok(Image { width: frame.camera.width, height: frame.camera.height, pixels })
 }
 
 fn side_by_side(left: &Image, right: &Image) -> Image {

@@ -35,7 +35,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     println!("{} frames of {} vertices cast in {:.0?}", scene.train.len(), exact.len(), start.elapsed());
     let mut trainer = Trainer::new(&scene, config)?;
     for step in 1..=steps {
-        trainer.step();
+        trainer.step()?;
         if step == steps || (step % 50 == 0 && (step / 50).is_power_of_two()) {
             let counts = trainer.visibility_counts();
             let never = counts.iter().zip(&exact).filter(|(c, e)| **c > 0 && **e == 0).count();

@@ -1,7 +1,8 @@
 //! The rays of a training step: one frame, several square patches.
 
 use crate::config::Config;
-use crate::pixels::Label;
+use crate::data::Pixels;
+use crate::pixels::{Label, Labels};
 use crate::random::Stream;
 use crate::scene::{PreparedFrame, Scene, bounds};
 
@@ -37,9 +38,9 @@ impl Batch {
         self.background = glam::Vec3::new(random.uniform(), random.uniform(), random.uniform());
         let body = body_box(frame);
         for _ in 0..config.patches {
-            let on_subject = random.uniform() < ON_SUBJECT && !frame.subject.is_empty();
+            let on_subject = random.uniform() < ON_SUBJECT && frame.labels.num_subject() > 0;
             let (x, y) = if on_subject {
-                let pixel = frame.subject[random.below(frame.subject.len())];
+                let pixel = frame.labels.subject(random.below(frame.labels.num_subject()));
                 (pixel % width, pixel / width)
             } else {
                 let [x0, y0, x1, y1] = body;
@@ -88,10 +89,10 @@ pub(crate) fn body_box(frame: &PreparedFrame) -> [u32; 4] {
 }
 
 /// What a ray should show: premultiplied colour over `background`; `None` where nothing is known.
-pub(crate) fn target(frame: &PreparedFrame, pixel: u32, background: glam::Vec3) -> Option<glam::Vec3> {
+pub(crate) fn target(labels: &Labels, shown: &Pixels, pixel: u32, background: glam::Vec3) -> Option<glam::Vec3> {
     let i = pixel as usize;
-    let colour = glam::Vec3::from_slice(&frame.pixels[3 * i..]);
-    (frame.labels[i] != Label::Unknown).then(|| colour + (1.0 - frame.mask[i]) * background)
+    let colour = glam::Vec3::from_slice(&shown.image.pixels[3 * i..]);
+    (labels.at(pixel) != Label::Unknown).then(|| colour + (1.0 - shown.mask[i]) * background)
 }
 
 #[cfg(test)]

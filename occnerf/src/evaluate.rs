@@ -9,6 +9,7 @@ use visibility::RayMesh;
 use volrender::metrics;
 
 use crate::Error;
+use crate::data::Pixels;
 use crate::lpips::Lpips;
 use crate::pixels::Label;
 use crate::render::{Renderer, Rendering};
@@ -109,16 +110,17 @@ pub fn evaluate_with(
         let mut rendering = renderer.render(frame, Vec3::ZERO)?;
         seconds += start.elapsed().as_secs_f64();
         progress(frame, &rendering);
-        let hidden = hidden_pixels(scene, frame, &least)?;
+        let truth = frame.pixels()?;
+        let hidden = hidden_pixels(scene, frame, &truth.mask, &least)?;
         // What a training image does not show cannot be scored.
         for (i, label) in frame.labels.iter().enumerate() {
-            if *label == Label::Unknown {
-                let truth = &frame.pixels[3 * i..3 * i + 3];
+            if label == Label::Unknown {
+                let truth = &truth.image.pixels[3 * i..3 * i + 3];
                 rendering.image.pixels[3 * i..3 * i + 3].copy_from_slice(truth);
                 rendering.opacity[i] = 0.0;
             }
         }
-        scores.push(score(frame, &rendering, &hidden, lpips)?);
+        scores.push(score(frame, &truth, &rendering, &hidden, lpips)?);
     }
     let mean = |pick: &dyn Fn(&FrameMetrics) -> Option<f64>| {
         let values: Vec<f64> = scores.iter().filter_map(pick).filter(|v| v.is_finite()).collect();
@@ -141,14 +143,15 @@ pub fn evaluate_with(
 
 fn score(
     frame: &PreparedFrame,
+    truth: &Pixels,
     rendering: &Rendering,
     hidden: &[bool],
     lpips: Option<&Lpips>,
 ) -> Result<FrameMetrics, Error> {
-    let (a, b) = (&rendering.image.pixels[..], &frame.pixels[..]);
+    let (a, b) = (&rendering.image.pixels[..], &truth.image.pixels[..]);
     let (width, height) = (frame.camera.width as usize, frame.camera.height as usize);
     let visible: Vec<bool> = rendering.opacity.iter().map(|&o| o > VISIBLE).collect();
-    let mask: Vec<bool> = frame.mask.iter().map(|&m| m > 0.5).collect();
+    let mask: Vec<bool> = truth.mask.iter().map(|&m| m > 0.5).collect();
     let solid: Vec<bool> = rendering.opacity.iter().map(|&o| o > 0.5).collect();
     let count = |f: &dyn Fn(bool, bool) -> bool| solid.iter().zip(&mask).filter(|(s, m)| f(**s, **m)).count();
     let union = count(&|s, m| s || m);
@@ -171,11 +174,11 @@ fn score(
 }
 
 /// Pixels (H × W) whose first hit on the posed prior is nearest to a vertex of `least`.
-fn hidden_pixels(scene: &Scene, frame: &PreparedFrame, least: &[bool]) -> Result<Vec<bool>, Error> {
+fn hidden_pixels(scene: &Scene, frame: &PreparedFrame, mask: &[f32], least: &[bool]) -> Result<Vec<bool>, Error> {
     let mesh = RayMesh::new(&frame.posed.vertices, &scene.model.faces)?;
     let width = frame.camera.width as usize;
     let nearest = |i: usize| {
-        if frame.mask[i] <= 0.5 {
+        if mask[i] <= 0.5 {
             return false;
         }
         let ray = frame.camera.ray((i % width) as f32 + 0.5, (i / width) as f32 + 0.5);

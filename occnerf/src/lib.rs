@@ -14,7 +14,7 @@
 //! config.steps = 2;
 //! let scene = Scene::new(&capture, &body, &config)?;
 //! let mut trainer = Trainer::new(&scene, config)?;
-//! let first = trainer.step();
+//! let first = trainer.step()?;
 //! assert!(first.loss.is_finite() && first.live_samples > 0);
 //! # Ok(())
 //! # }
@@ -72,7 +72,7 @@ pub use config::{
 pub use error::Error;
 pub use evaluate::{FrameMetrics, SplitMetrics, evaluate, evaluate_with, least_seen_quartile};
 pub use lpips::{Lpips, Trunk};
-pub use pixels::{Label, label_pixels};
+pub use pixels::{Label, Labels, label_pixels};
 pub use prior::VertexColors;
 pub use render::{FieldRenderer, PriorRenderer, Renderer, Rendering, view_of};
 pub use scene::{PreparedFrame, Scene};

@@ -5,9 +5,10 @@ use rayon::prelude::*;
 
 use crate::batch::{Batch, target};
 use crate::config::LossConfig;
+use crate::data::Pixels;
 use crate::loss::Dissimilarity;
 use crate::lpips::Lpips;
-use crate::scene::PreparedFrame;
+use crate::pixels::Labels;
 use crate::trainer::{GroupState, StepReport};
 
 /// What the losses of a step read and write, kept from step to step; of each ray of the batch.
@@ -34,7 +35,7 @@ impl Photometric {
         lpips: Option<&Lpips>,
         groups: &[GroupState],
         batch: &Batch,
-        frame: &PreparedFrame,
+        (labels, pixels): (&Labels, &Pixels),
         report: &mut StepReport,
     ) {
         let Self { targets, d_colors, prediction, .. } = self;
@@ -45,7 +46,7 @@ impl Photometric {
             }
         }
         targets.clear();
-        targets.extend(batch.pixels.iter().map(|&p| target(frame, p, batch.background)));
+        targets.extend(batch.pixels.iter().map(|&p| target(labels, pixels, p, batch.background)));
         let known = targets.iter().flatten().count();
         let mut squares = 0.0f64;
         d_colors.clear();

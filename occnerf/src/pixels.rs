@@ -13,6 +13,76 @@ pub enum Label {
     Unknown,
 }
 
+/// The labels of a frame's pixels, as runs of equal ones: a person has few in a row.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Labels {
+    runs: Vec<Run>,
+    subject: u32,
+}
+
+/// Pixels from the end of the run before to `end`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+struct Run {
+    end: u32,
+    label: Label,
+    /// Subject pixels up to `end`.
+    subject: u32,
+}
+
+impl Labels {
+    /// Of pixels in row-major order.
+    pub fn new(labels: &[Label]) -> Self {
+        let (mut runs, mut end, mut subject) = (Vec::new(), 0, 0);
+        for equal in labels.chunk_by(|a, b| a == b) {
+            end += equal.len() as u32;
+            subject += if equal[0] == Label::Subject { equal.len() as u32 } else { 0 };
+            runs.push(Run { end, label: equal[0], subject });
+        }
+        Self { runs, subject }
+    }
+
+    /// How many pixels are labelled.
+    pub fn len(&self) -> usize {
+        self.runs.last().map_or(0, |run| run.end as usize)
+    }
+
+    /// Whether no pixel is.
+    pub fn is_empty(&self) -> bool {
+        self.runs.is_empty()
+    }
+
+    /// The label of a pixel.
+    ///
+    /// # Panics
+    /// For a pixel beyond the last.
+    pub fn at(&self, pixel: u32) -> Label {
+        self.runs[self.runs.partition_point(|run| run.end <= pixel)].label
+    }
+
+    /// All labels in order.
+    pub fn iter(&self) -> impl Iterator<Item = Label> + '_ {
+        let mut start = 0;
+        self.runs.iter().flat_map(move |run| {
+            let length = run.end - std::mem::replace(&mut start, run.end);
+            std::iter::repeat_n(run.label, length as usize)
+        })
+    }
+
+    /// How many pixels show the subject.
+    pub fn num_subject(&self) -> usize {
+        self.subject as usize
+    }
+
+    /// The `n`-th of them in order.
+    ///
+    /// # Panics
+    /// From [`Labels::num_subject`] on.
+    pub fn subject(&self, n: usize) -> u32 {
+        let run = self.runs[self.runs.partition_point(|run| run.subject as usize <= n)];
+        run.end - (run.subject - n as u32)
+    }
+}
+
 /// Width below which a piece of silhouette outside the mask is taken for misregistration of the prior, metres.
 const SLIVER: f32 = 0.03;
 /// Thickness of clothes that an occluder may hide beyond the prior's silhouette, metres.

@@ -101,10 +101,11 @@ impl Plain<'_, '_> {
                 colors[ray] = color + transmittance * background;
             }
         }
-        let known = |&(pixel, _): &(&u32, &DVec3)| target(frame, *pixel, batch.background).is_some();
+        let shown = frame.pixels().unwrap();
+        let known = |&(pixel, _): &(&u32, &DVec3)| target(&frame.labels, &shown, *pixel, batch.background).is_some();
         let rays: Vec<(&u32, &DVec3)> = batch.pixels.iter().zip(&colors).filter(known).collect();
         let error = |&(&pixel, color): &(&u32, &DVec3)| {
-            let target: Vec3 = target(frame, pixel, batch.background).unwrap_or_default();
+            let target: Vec3 = target(&frame.labels, &shown, pixel, batch.background).unwrap_or_default();
             (color - target.as_dvec3()).length_squared()
         };
         let mse = rays.iter().map(error).sum::<f64>() / (3 * rays.len()) as f64;
@@ -151,13 +152,13 @@ fn a_step_agrees_with_one_written_straight_from_the_definitions() {
         let scene = Scene::new(&capture, &body, &config).unwrap();
         let mut trainer = Trainer::new(&scene, config).unwrap();
         for _ in 0..3 {
-            trainer.step();
+            trainer.step().unwrap();
         }
         let mut random = Stream::new(&[seed, 21]);
         trainer.parameters.get_mut(Part::Table).iter_mut().for_each(|x| *x += 0.3 * random.normal());
         let before = trainer.parameters.clone();
         let counts = trainer.counts.clone();
-        let report = trainer.step();
+        let report = trainer.step().unwrap();
         let gradients = [Part::Field, Part::Table].map(|part| trainer.parameters.gradient(part).to_vec());
         let plain = Plain { trainer: &trainer, counts: &counts };
         let (field, table) = (before.get(Part::Field), before.get(Part::Table));

@@ -22,15 +22,16 @@ impl VertexColors {
             .par_iter()
             .map(|frame| {
                 let mesh = visibility::RayMesh::new(&frame.posed.vertices, &scene.model.faces)?;
-                let usable: Vec<bool> = frame.mask.iter().map(|&m| m > 0.5).collect();
+                let pixels = frame.pixels()?;
+                let usable: Vec<bool> = pixels.mask.iter().map(|&m| m > 0.5).collect();
                 let view = view(&frame.camera);
                 let seen = visibility::visible_vertices(&mesh, &frame.posed.vertices, &view, Some(&usable));
                 let colour = |(vertex, seen): (&Vec3, bool)| {
                     let at = seen.then(|| frame.camera.project(*vertex)).flatten()?;
                     let pixel = at.y as usize * frame.camera.width as usize + at.x as usize;
-                    let coverage = *frame.mask.get(pixel)?;
+                    let coverage = *pixels.mask.get(pixel)?;
                     // Edge pixels are mixed with black in proportion to what the mask leaves free.
-                    Some(Vec3::from_slice(&frame.pixels[3 * pixel..]) / coverage.max(0.5))
+                    Some(Vec3::from_slice(&pixels.image.pixels[3 * pixel..]) / coverage.max(0.5))
                 };
                 let colors = frame.posed.vertices.iter().zip(seen).map(colour);
                 Ok(colors.map(|c| c.map_or((Vec3::ZERO, 0), |c| (c, 1))).collect())

@@ -212,7 +212,7 @@ mod tests {
         let scene = Scene::new(&capture, &body, &config).unwrap();
         let mut trainer = Trainer::new(&scene, config).unwrap();
         for _ in 0..40 {
-            trainer.step();
+            trainer.step().unwrap();
         }
         let (frame, background) = (&scene.eval[0], Vec3::new(0.3, 0.6, 0.9));
         let mut renderer = FieldRenderer::new(&trainer).unwrap();

@@ -249,10 +249,10 @@ mod tests {
     fn step(scene: &Scene, config: &Config) -> (crate::StepReport, Vec<glam::Vec3>, [Vec<f32>; 3]) {
         let mut trainer = Trainer::new(scene, Config { min_transmittance: 0.0, ..config.clone() }).unwrap();
         for _ in 0..60 {
-            trainer.step();
+            trainer.step().unwrap();
         }
         trainer.config.min_transmittance = config.min_transmittance;
-        let report = trainer.step();
+        let report = trainer.step().unwrap();
         let colors = trainer.groups.iter().flat_map(|g| g.composites.iter().map(|c| c.color)).collect();
         let gradients = [Part::Field, Part::Table, Part::Pose].map(|part| trainer.parameters.gradient(part).to_vec());
         (report, colors, gradients)

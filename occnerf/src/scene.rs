@@ -11,8 +11,8 @@ use volrender::{Aabb, Camera};
 
 use crate::Error;
 use crate::config::Config;
-use crate::data::{Capture, Frame};
-use crate::pixels::{Label, label_pixels};
+use crate::data::{Capture, Frame, PixelSource, Pixels};
+use crate::pixels::{Label, Labels, label_pixels};
 
 /// Canonical height that every capture is scaled to, so that constants in metres mean the same for all.
 const NORMALISED_HEIGHT: f32 = 1.7;
@@ -36,14 +36,10 @@ pub struct PreparedFrame {
     pub shape: Arc<Shaped>,
     /// Canonical ← world transform of each bone.
     pub to_canonical: Vec<Affine3A>,
-    /// Premultiplied sRGB, H × W × 3.
-    pub pixels: Vec<f32>,
-    /// Subject coverage, H × W.
-    pub mask: Vec<f32>,
+    /// Picture and mask, as in the capture; `None` where nothing was photographed.
+    pub source: Option<PixelSource>,
     /// H × W; only training frames are labelled.
-    pub labels: Vec<Label>,
-    /// Pixels labelled subject.
-    pub subject: Vec<u32>,
+    pub labels: Labels,
 }
 
 impl PreparedFrame {
@@ -64,11 +60,18 @@ impl PreparedFrame {
             to_canonical: posed.to_canonical(),
             shape: Arc::new(Shaped { vertices: Vec::new(), joints: Vec::new() }),
             posed,
-            pixels: Vec::new(),
-            mask: Vec::new(),
-            labels: Vec::new(),
-            subject: Vec::new(),
+            source: None,
+            labels: Labels::default(),
         }
+    }
+
+    /// What was photographed.
+    ///
+    /// # Errors
+    /// [`Error::Data`] for files that cannot be read; [`Error::Scene`] where nothing was photographed.
+    pub fn pixels(&self) -> Result<Arc<Pixels>, Error> {
+        let source = self.source.as_ref().ok_or_else(|| Error::Scene("a view without a picture".to_owned()))?;
+        Ok(source.pixels()?)
     }
 }
 
@@ -151,7 +154,7 @@ impl Scene {
             })
             .collect();
         (scene.train, scene.eval) = (train?, eval?);
-        if scene.train.iter().all(|f| f.subject.is_empty()) {
+        if scene.train.iter().all(|f| f.labels.num_subject() == 0) {
             return Err(Error::Scene(format!("{}: no training mask shows the subject", scene.name)));
         }
         Ok(scene)
@@ -169,25 +172,22 @@ impl Scene {
             instant,
             posed,
             shape: Arc::new(shape),
-            pixels: frame.image.pixels.clone(),
-            mask: frame.mask.clone(),
-            labels: Vec::new(),
-            subject: Vec::new(),
+            source: Some(frame.source.clone()),
+            labels: Labels::default(),
         };
         if let Some(config) = config {
             let silhouette = self.silhouette(&prepared)?;
             let centre = prepared.posed.vertices.iter().sum::<Vec3>() / prepared.posed.vertices.len() as f32;
             let depth = prepared.camera.world_to_camera.transform_point3(centre).z.max(1e-3);
-            prepared.labels = label_pixels(
+            let pixels = frame.pixels()?;
+            prepared.labels = Labels::new(&label_pixels(
                 config.occluded,
-                &prepared.mask,
+                &pixels.mask,
                 &silhouette,
-                frame.occluder.as_deref(),
+                pixels.occluder.as_deref(),
                 prepared.camera.width as usize,
                 prepared.camera.focal.x / depth,
-            );
-            let labels = prepared.labels.iter().enumerate();
-            prepared.subject = labels.filter(|(_, l)| **l == Label::Subject).map(|(i, _)| i as u32).collect();
+            ));
         }
         Ok(prepared)
     }
@@ -241,7 +241,7 @@ impl Scene {
             .par_iter()
             .map(|frame| {
                 let mesh = RayMesh::new(&frame.posed.vertices, &self.model.faces)?;
-                let usable: Vec<bool> = frame.mask.iter().map(|&m| m > 0.5).collect();
+                let usable: Vec<bool> = frame.labels.iter().map(|label| label == Label::Subject).collect();
                 Ok(visibility::visible_vertices(&mesh, &frame.posed.vertices, &view(&frame.camera), Some(&usable)))
             })
             .collect();

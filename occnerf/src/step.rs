@@ -46,7 +46,7 @@ impl Trainer<'_> {
         terminations.clear();
         for (index, &ray) in rays.iter().enumerate() {
             let composite = &composites[index];
-            let visible = frame.labels[batch.pixels[ray] as usize] == Label::Subject && composite.opacity > 0.5;
+            let visible = frame.labels.at(batch.pixels[ray]) == Label::Subject && composite.opacity > 0.5;
             if let Some(t) = composite.termination.filter(|_| visible) {
                 terminations.extend_from_slice(along.neighbours(runs, index, t as usize, self.config.surface.k));
             }

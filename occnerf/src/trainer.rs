@@ -286,17 +286,21 @@ impl<'a> Trainer<'a> {
 
     /// One optimisation step.
     ///
+    /// # Errors
+    /// [`Error::Data`] where the step's picture cannot be decoded (any more). The trainer is then as it was before.
+    ///
     /// # Panics
     /// If the configuration names weights of the perceptual term and [`Trainer::load_perceptual`] was not called.
-    pub fn step(&mut self) -> StepReport {
+    pub fn step(&mut self) -> Result<StepReport, Error> {
         let loss = &self.config.loss;
         let loaded = self.lpips.is_some() || loss.perceptual_weights.is_empty() || loss.perceptual == 0.0;
         assert!(loaded, "weights of the perceptual term were not loaded");
         let step = self.steps_done;
         let (mut times, mut watch) = (StepTimes::default(), Stopwatch::start());
-        let mut batch = std::mem::take(&mut self.batch);
-        batch.draw(self.scene, &self.config, step);
-        let frame = &self.scene.train[batch.frame];
+        self.batch.draw(self.scene, &self.config, step);
+        let frame = &self.scene.train[self.batch.frame];
+        let shown = frame.pixels()?;
+        let batch = std::mem::take(&mut self.batch);
         let mut stage_code = std::mem::take(&mut self.vertex_code);
         let mut own_posed = std::mem::take(&mut self.posed);
         let posed = match self.correction(frame) {
@@ -323,7 +327,14 @@ impl<'a> Trainer<'a> {
         let mut watch = Stopwatch::start();
         let mut report = StepReport { step: step + 1, rays: batch.pixels.len(), ..StepReport::default() };
         let mut photometric = std::mem::take(&mut self.photometric);
-        photometric.measure(&self.config.loss, self.lpips.as_ref(), &groups, &batch, frame, &mut report);
+        photometric.measure(
+            &self.config.loss,
+            self.lpips.as_ref(),
+            &groups,
+            &batch,
+            (&frame.labels, &shown),
+            &mut report,
+        );
         let d_colors = &photometric.d_colors;
         self.field.mlp.transposed_weights(self.parameters.get(Part::Field), &mut self.transposed);
         watch.lap(&mut times.losses);
@@ -344,7 +355,7 @@ impl<'a> Trainer<'a> {
         let decay = self.config.rates.final_fraction.powf(step as f32 / self.config.steps.max(1) as f32);
         report.bad_gradients = self.parameters.step(&self.config.rates, decay * self.restarts.rates());
         for state in &groups {
-            let subject = |ray: &&usize| frame.labels[batch.pixels[**ray] as usize] == Label::Subject;
+            let subject = |ray: &&usize| frame.labels.at(batch.pixels[**ray]) == Label::Subject;
             let composites = state.rays.iter().zip(&state.composites).filter(|(ray, _)| subject(ray));
             composites.for_each(|(_, composite)| self.restarts.note(composite.opacity));
         }
@@ -357,7 +368,7 @@ impl<'a> Trainer<'a> {
         report.times = times;
         (self.groups, self.batch, self.photometric, self.posed) = (groups, batch, photometric, own_posed);
         self.steps_done += 1;
-        report
+        Ok(report)
     }
 }
 

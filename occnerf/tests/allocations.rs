@@ -20,7 +20,7 @@ fn a_step_allocates_next_to_nothing() {
     let mut trainer = Trainer::new(&scene, config).unwrap();
     // What counts allocations sees one thread.
     let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
-    let mut steps = |count: usize| (0..count).map(|_| trainer.step().live_samples).sum::<usize>();
+    let mut steps = |count: usize| (0..count).map(|_| trainer.step().unwrap().live_samples).sum::<usize>();
     pool.install(|| {
         assert!(steps(30) > 0);
         let quietest = (0..4).map(|_| measure(|| assert!(steps(5) > 0))).min_by_key(|found| found.count_total).unwrap();

@@ -131,7 +131,7 @@ fn trained() -> Trainer<'static> {
     (config.encoding.log2_table_size, config.encoding.n_max, config.steps) = (15, 96, 12);
     let mut trainer = Trainer::new(scene(), config).unwrap();
     for _ in 0..12 {
-        trainer.step();
+        trainer.step().unwrap();
     }
     trainer
 }
@@ -168,14 +168,14 @@ fn a_pruned_model_draws_the_same_pictures_with_fewer_parameters_also_from_its_fi
     resumed.save(&again).unwrap();
     assert!(std::fs::read(&again).unwrap() == std::fs::read(&file).unwrap());
     // Training on, all rows can be learnt again, and both go the same way.
-    assert_eq!(resumed.step().loss.to_bits(), trainer.step().loss.to_bits());
+    assert_eq!(resumed.step().unwrap().loss.to_bits(), trainer.step().unwrap().loss.to_bits());
     assert_eq!(resumed.num_parameters(), whole);
 }
 
 #[test]
 fn methods_without_a_table_have_nothing_to_prune() {
     let mut trainer = Trainer::new(scene(), config(Method::Humannerf)).unwrap();
-    trainer.step();
+    trainer.step().unwrap();
     let whole = trainer.num_parameters();
     let pruned = trainer.prune();
     assert_eq!((pruned.rows, pruned.dropped, pruned.parameters as usize), (0, 0, whole));

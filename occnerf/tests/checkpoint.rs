@@ -13,8 +13,8 @@ use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 /// A checkpoint after two steps.
 fn good(dir: &TempDir) -> Vec<u8> {
     let mut trainer = Trainer::new(scene(), config(Method::Occnerf)).unwrap();
-    trainer.step();
-    trainer.step();
+    trainer.step().unwrap();
+    trainer.step().unwrap();
     let path = dir.path("good.safetensors");
     trainer.save(&path).unwrap();
     std::fs::read(path).unwrap()
@@ -100,7 +100,7 @@ fn a_bit_flipped_in_the_header_never_panics() {
             // Another seed, rate or space is as good as any; it must train.
             Ok(mut trainer) => {
                 accepted += 1;
-                trainer.step();
+                trainer.step().unwrap();
             }
             Err(error) => {
                 refused += 1;
@@ -308,8 +308,8 @@ fn a_checkpoint_must_say_how_far_its_field_reaches() {
     let mut config = config(Method::Occnerf);
     config.motion.shell_interval = 1;
     let mut trainer = Trainer::new(scene(), config).unwrap();
-    trainer.step();
-    trainer.step();
+    trainer.step().unwrap();
+    trainer.step().unwrap();
     trainer.save(&path).unwrap();
     let bytes = std::fs::read(&path).unwrap();
     assert!(resume(scene(), &path, &forged(&bytes, |_, _| ())).is_ok());
@@ -329,7 +329,7 @@ fn a_pruned_checkpoint_must_say_which_rows_it_holds() {
     let path = dir.path("pruned.safetensors");
     let mut trainer = Trainer::new(scene(), config(Method::Occnerf)).unwrap();
     assert!(trainer.prune().dropped > 0, "nothing has moved yet");
-    trainer.step();
+    trainer.step().unwrap();
     trainer.prune();
     trainer.save(&path).unwrap();
     let bytes = std::fs::read(&path).unwrap();

@@ -94,7 +94,7 @@ fn every_component_can_be_switched_off_and_the_rest_still_trains() {
         config.ablate(component);
         assert_ne!(config, common::config(Method::Occnerf), "{component:?}");
         let mut trainer = Trainer::new(common::scene(), config).unwrap();
-        let report = (0..3).map(|_| trainer.step()).last().unwrap();
+        let report = (0..3).map(|_| trainer.step().unwrap()).last().unwrap();
         assert!(report.loss.is_finite() && report.bad_gradients == 0, "{component:?}: {report:?}");
         assert_eq!(report.completeness == 0.0, component == Component::Completeness);
         assert_eq!(report.perceptual == 0.0, component == Component::Perceptual);
@@ -115,7 +115,7 @@ fn the_smallest_run_of_every_method_trains_and_the_odd_sizes_too() {
             let scene = Scene::new(&common::capture(), common::body(), &config).unwrap();
             let mut trainer = Trainer::new(&scene, config).unwrap();
             for _ in 0..3 {
-                let report = trainer.step();
+                let report = trainer.step().unwrap();
                 assert!(report.loss.is_finite() && report.bad_gradients == 0, "{method:?}: {report:?}");
             }
         }

@@ -16,7 +16,8 @@ struct Truth<F: Fn(&PreparedFrame, usize, &mut [f32], &mut f32) + Sync>(F);
 impl<F: Fn(&PreparedFrame, usize, &mut [f32], &mut f32) + Sync> Renderer for Truth<F> {
     fn render(&mut self, frame: &PreparedFrame, background: Vec3) -> Result<Rendering, Error> {
         assert_eq!(background, Vec3::ZERO, "pictures are compared on black");
-        let (mut pixels, mut opacity) = (frame.pixels.clone(), frame.mask.clone());
+        let truth = frame.pixels()?;
+        let (mut pixels, mut opacity) = (truth.image.pixels.clone(), truth.mask.clone());
         for (i, (pixel, opacity)) in pixels.chunks_exact_mut(3).zip(&mut opacity).enumerate() {
             self.0(frame, i, pixel, opacity);
         }
@@ -82,7 +83,7 @@ fn a_constant_error_has_its_decibels_in_every_set() {
 #[test]
 fn errors_outside_the_subject_count_in_the_whole_picture_alone() {
     let outside = |frame: &PreparedFrame, i: usize, pixel: &mut [f32], _: &mut f32| {
-        if frame.mask[i] <= 0.5 {
+        if frame.pixels().unwrap().mask[i] <= 0.5 {
             pixel.fill(0.5);
         }
     };
@@ -103,7 +104,10 @@ fn overlap_is_that_of_the_solid_pixels() {
     assert_eq!(empty.mask_iou, Some(0.0));
     assert_eq!((empty.psnr_vis, empty.ssim_vis), (None, None), "nothing is visible in an empty picture");
     let full = scores(&scene().eval, |_, _, _, opacity| *opacity = 1.0);
-    let covered = |f: &PreparedFrame| f.mask.iter().filter(|m| **m > 0.5).count() as f64 / f.mask.len() as f64;
+    let covered = |f: &PreparedFrame| {
+        let mask = &f.pixels().unwrap().mask;
+        mask.iter().filter(|m| **m > 0.5).count() as f64 / mask.len() as f64
+    };
     let expected = scene().eval.iter().map(covered).sum::<f64>() / scene().eval.len() as f64;
     assert!((full.mask_iou.unwrap() - expected).abs() < 1e-9);
 }
@@ -112,9 +116,9 @@ fn overlap_is_that_of_the_solid_pixels() {
 #[test]
 fn unknown_pixels_of_training_views_are_not_scored() {
     let train = &scene().train[1..];
-    assert!(train[0].labels.iter().filter(|l| **l == Label::Unknown).count() > 50);
+    assert!(train[0].labels.iter().filter(|l| *l == Label::Unknown).count() > 50);
     let split = scores(train, |frame, i, pixel, opacity| {
-        if frame.labels[i] == Label::Unknown {
+        if frame.labels.at(i as u32) == Label::Unknown {
             pixel.fill(0.9);
             *opacity = 1.0;
         }
@@ -122,7 +126,7 @@ fn unknown_pixels_of_training_views_are_not_scored() {
     assert_eq!(split.frames[0].psnr_full, Some(f64::INFINITY));
     assert_eq!(split.frames[0].mask_iou, 1.0);
     let known = scores(train, |frame, i, pixel, _| {
-        if frame.labels[i] == Label::Background {
+        if frame.labels.at(i as u32) == Label::Background {
             pixel.fill(0.9);
         }
     });
@@ -188,7 +192,7 @@ fn an_error_of_the_renderer_comes_through() {
 #[test]
 fn captures_that_show_nobody_are_refused() {
     let mut blank = capture();
-    blank.train.iter_mut().for_each(|f| f.mask.fill(0.0));
+    blank.train.iter_mut().for_each(|f| f.source.change(|pixels| pixels.mask.fill(0.0)).unwrap());
     let message = Scene::new(&blank, body(), &config(Method::Occnerf)).err().unwrap().to_string();
     assert!(message.contains("ellipsoid") && message.contains("mask"), "{message}");
     blank.train.clear();

@@ -1,6 +1,6 @@
 //! Subject, background or unknown: properties of the rule that no single picture shows.
 
-use occnerf::{Label, OccludedRule, label_pixels};
+use occnerf::{Label, Labels, OccludedRule, label_pixels};
 use proptest::prelude::*;
 
 const WIDTH: usize = 24;
@@ -39,6 +39,19 @@ fn near(set: &[bool], at: usize, radius: f32) -> bool {
 
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(48))]
+
+    #[test]
+    fn runs_of_labels_say_what_the_labels_say(
+        runs in prop::collection::vec((prop::sample::select(vec![Label::Subject, Label::Background, Label::Unknown]), 1..9usize), 0..12),
+    ) {
+        let plain: Vec<Label> = runs.into_iter().flat_map(|(label, length)| std::iter::repeat_n(label, length)).collect();
+        let labels = Labels::new(&plain);
+        prop_assert_eq!(labels.iter().collect::<Vec<_>>(), plain.clone());
+        prop_assert_eq!((labels.len(), labels.is_empty()), (plain.len(), plain.is_empty()));
+        prop_assert!((0..plain.len()).all(|i| labels.at(i as u32) == plain[i]));
+        let subject: Vec<u32> = (0..plain.len() as u32).filter(|&i| plain[i as usize] == Label::Subject).collect();
+        prop_assert_eq!((0..labels.num_subject()).map(|n| labels.subject(n)).collect::<Vec<_>>(), subject);
+    }
 
     #[test]
     fn hiding_more_of_the_subject_never_makes_an_unknown_pixel_known(

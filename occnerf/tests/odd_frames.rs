@@ -5,15 +5,18 @@ mod common;
 
 use common::{SIZE, body, capture, config, scene};
 use glam::{Affine3A, Mat3, Vec3};
-use occnerf::data::Frame;
+use occnerf::data::{Frame, Pixels};
 use occnerf::{FieldRenderer, Label, Method, PriorRenderer, Renderer, Scene, Trainer, VertexColors, view_of};
 use volrender::Camera;
 
 /// The person wholly hidden, behind the camera, far beside the picture, and around the camera.
 fn odd(kind: &str) -> Frame {
     let mut frame = capture().train[0].clone();
-    frame.mask.fill(0.0);
-    frame.image.pixels.fill(0.0);
+    let empty = |pixels: &mut Pixels| {
+        pixels.mask.fill(0.0);
+        pixels.image.pixels.fill(0.0);
+    };
+    frame.source.change(empty).unwrap();
     let camera = &mut frame.camera.world_to_camera;
     match kind {
         "hidden" => {}
@@ -33,10 +36,10 @@ fn training_goes_on_over_frames_that_show_nobody() {
             capture.train.push(odd(kind));
             let config = config(method);
             let scene = Scene::new(&capture, body(), &config).unwrap();
-            assert!(scene.train[2].subject.is_empty());
+            assert_eq!(scene.train[2].labels.num_subject(), 0);
             let mut trainer = Trainer::new(&scene, config).unwrap();
             for _ in 0..6 {
-                let report = trainer.step();
+                let report = trainer.step().unwrap();
                 assert!(report.loss.is_finite() && report.psnr.is_finite(), "{kind} {method:?}: {report:?}");
                 assert_eq!(report.bad_gradients, 0, "{kind} {method:?}: {report:?}");
             }
@@ -51,17 +54,20 @@ fn training_goes_on_over_frames_that_show_nobody() {
 fn a_capture_that_is_nearly_all_unknown_still_trains() {
     let mut capture = capture();
     for frame in &mut capture.train {
-        let mut first = true;
-        frame.mask.iter_mut().filter(|m| **m > 0.5).for_each(|m| *m = f32::from(std::mem::take(&mut first)));
-        frame.occluder = Some(vec![true; (SIZE * SIZE) as usize]);
+        let nearly_all = |pixels: &mut Pixels| {
+            let mut first = true;
+            pixels.mask.iter_mut().filter(|m| **m > 0.5).for_each(|m| *m = f32::from(std::mem::take(&mut first)));
+            pixels.occluder = Some(vec![true; (SIZE * SIZE) as usize]);
+        };
+        frame.source.change(nearly_all).unwrap();
     }
     let config = config(Method::Occnerf);
     let scene = Scene::new(&capture, body(), &config).unwrap();
-    let known = scene.train.iter().flat_map(|f| &f.labels).filter(|l| **l != Label::Unknown).count();
+    let known = scene.train.iter().flat_map(|f| f.labels.iter()).filter(|l| *l != Label::Unknown).count();
     assert_eq!(known, 2, "one pixel of each frame");
     let mut trainer = Trainer::new(&scene, config).unwrap();
     for _ in 0..6 {
-        let report = trainer.step();
+        let report = trainer.step().unwrap();
         assert!(report.loss.is_finite() && report.psnr.is_finite() && report.bad_gradients == 0, "{report:?}");
     }
 }

@@ -48,7 +48,7 @@ fn captures_scenes_colours_and_pictures_are_the_same_on_one_and_on_three_threads
             let colors = VertexColors::measure(&scene).unwrap();
             let prior = PriorRenderer::new(&scene, &colors).render(&scene.eval[0], Vec3::X).unwrap();
             let counts = scene.vertex_frequencies().unwrap();
-            let frames: Vec<_> = capture.train.into_iter().map(|f| (f.image, f.mask, f.pose)).collect();
+            let frames: Vec<_> = capture.train.into_iter().map(|f| (f.pixels().unwrap(), f.pose)).collect();
             (frames, colors, counts, [field, prior].map(|r| (r.image, r.opacity)), bits(&trained.0), trained.1)
         })
     });
@@ -63,14 +63,14 @@ fn stopping_and_going_on_equals_never_having_stopped() {
         let (reports, whole) = train(scene(), &config, 6);
         let mut first = Trainer::new(scene(), config.clone()).unwrap();
         for _ in 0..3 {
-            first.step();
+            first.step().unwrap();
         }
         first.save(&path).unwrap();
         assert_eq!(checkpoint_config(&path).unwrap(), config);
         let mut second = Trainer::resume(scene(), &path).unwrap();
         assert_eq!(second.steps_done(), 3);
         assert_eq!(second.visibility_counts(), first.visibility_counts());
-        let rest: Vec<_> = (0..3).map(|_| second.step()).collect();
+        let rest: Vec<_> = (0..3).map(|_| second.step().unwrap()).collect();
         assert_eq!(bits(&rest), bits(&reports[3..]), "{}: losses", name(&config));
         assert!(checkpoint(&second) == whole, "{}: checkpoints differ", name(&config));
     }
@@ -83,7 +83,7 @@ fn a_resumed_model_draws_the_same_picture() {
     let path = dir.path().join("model.safetensors");
     let mut trainer = Trainer::new(scene(), config).unwrap();
     for _ in 0..4 {
-        trainer.step();
+        trainer.step().unwrap();
     }
     trainer.save(&path).unwrap();
     let resumed = Trainer::resume(scene(), &path).unwrap();

@@ -7,7 +7,7 @@ mod common;
 
 use common::{TempDir, body, capture, scene, tiny, train};
 use glam::Vec3;
-use occnerf::data::{Capture, DemoConfig, LoadOptions, demo, load_capture};
+use occnerf::data::{Capture, DemoConfig, LoadOptions, Pixels, demo, load_capture};
 use occnerf::{Label, Method, MotionKind, OccludedRule, Scene, VertexColors};
 
 const NO_DISTORTION: [f64; 5] = [0.0; 5];
@@ -38,9 +38,17 @@ fn the_picture_under_the_mask_never_leaves_the_loader() {
     for distortion in [NO_DISTORTION, BARREL] {
         let (one, other) = (load(2, distortion), load(3, distortion));
         for (a, b) in one.train.iter().zip(&other.train) {
-            assert_eq!(a.mask, b.mask);
-            assert!(a.mask.iter().any(|&m| m > 0.5));
-            let differing = a.image.pixels.iter().zip(&b.image.pixels).filter(|(a, b)| a != b).count();
+            assert_eq!(a.pixels().unwrap().mask, b.pixels().unwrap().mask);
+            assert!(a.pixels().unwrap().mask.iter().any(|&m| m > 0.5));
+            let differing = a
+                .pixels()
+                .unwrap()
+                .image
+                .pixels
+                .iter()
+                .zip(&b.pixels().unwrap().image.pixels)
+                .filter(|(a, b)| a != b)
+                .count();
             assert_eq!(differing, 0, "{}: values that depend on what is hidden, {distortion:?}", a.name);
         }
     }
@@ -65,10 +73,10 @@ fn the_demo_shows_nothing_behind_its_obstacle() {
     let clear = demo(&DemoConfig { occluded_fraction: 0.0, ..common::demo_config() }, body()).unwrap();
     let mut hidden = 0;
     for (with, without) in capture().train.iter().zip(&clear.train) {
-        for (i, (&m, &full)) in with.mask.iter().zip(&without.mask).enumerate() {
+        for (i, (&m, &full)) in with.pixels().unwrap().mask.iter().zip(&without.pixels().unwrap().mask).enumerate() {
             if m == 0.0 {
                 hidden += usize::from(full > 0.0);
-                assert_eq!(with.image.pixels[3 * i..][..3], [0.0; 3]);
+                assert_eq!(with.pixels().unwrap().image.pixels[3 * i..][..3], [0.0; 3]);
             }
         }
     }
@@ -81,15 +89,18 @@ fn repainted(label: Label) -> Capture {
     let mut changed = capture().clone();
     let mut count = 0;
     for (frame, prepared) in changed.train.iter_mut().zip(&scene().train) {
-        for (i, _) in prepared.labels.iter().enumerate().filter(|(_, l)| **l == label) {
-            count += 1;
-            for c in 0..3 {
-                frame.image.pixels[3 * i + c] = f32::from(noise((3 * i + c) as u32, 9)) / 255.0;
+        let repaint = |pixels: &mut Pixels| {
+            for (i, _) in prepared.labels.iter().enumerate().filter(|(_, l)| *l == label) {
+                count += 1;
+                for c in 0..3 {
+                    pixels.image.pixels[3 * i + c] = f32::from(noise((3 * i + c) as u32, 9)) / 255.0;
+                }
+                if label != Label::Subject {
+                    pixels.mask[i] = 0.4;
+                }
             }
-            if label != Label::Subject {
-                frame.mask[i] = 0.4;
-            }
-        }
+        };
+        frame.source.change(repaint).unwrap();
     }
     assert!(count > 50, "{count} pixels of {label:?}");
     changed
@@ -122,7 +133,7 @@ fn the_background_rule_leaves_nothing_unknown_and_changes_training() {
     let mut background = config.clone();
     background.occluded = OccludedRule::Background;
     let known = Scene::new(capture(), body(), &background).unwrap();
-    assert!(known.train.iter().flat_map(|f| &f.labels).all(|l| *l != Label::Unknown));
+    assert!(known.train.iter().flat_map(|f| f.labels.iter()).all(|l| l != Label::Unknown));
     let [(a, _), (b, _)] = [train(scene(), &config, 4), train(&known, &background, 4)];
     assert_ne!(common::bits(&a), common::bits(&b));
 }
@@ -134,8 +145,9 @@ fn a_known_occluder_is_what_is_unknown() {
     let known = demo(&DemoConfig { known_occluder: true, ..common::demo_config() }, body()).unwrap();
     let scene = Scene::new(&known, body(), &config).unwrap();
     for (frame, prepared) in known.train.iter().zip(&scene.train) {
-        let occluder = frame.occluder.as_ref().unwrap();
-        for ((&occluded, &label), &m) in occluder.iter().zip(&prepared.labels).zip(&frame.mask) {
+        let pixels = frame.pixels().unwrap();
+        let occluder = pixels.occluder.as_ref().unwrap();
+        for ((&occluded, label), &m) in occluder.iter().zip(prepared.labels.iter()).zip(&pixels.mask) {
             let expected = match (m > 0.5, occluded) {
                 (true, _) => Label::Subject,
                 (false, true) => Label::Unknown,

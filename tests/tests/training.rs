@@ -72,11 +72,11 @@ fn a_short_training_lowers_the_loss_and_beats_its_own_start() {
             evaluate(scene(), &mut renderer, &frames, |_, _| {}).unwrap().psnr_mask.unwrap()
         };
         let start = psnr(&trainer);
-        let reports: Vec<_> = (0..STEPS).map(|_| trainer.step()).collect();
+        let reports: Vec<_> = (0..STEPS).map(|_| trainer.step().unwrap()).collect();
         let end = psnr(&trainer);
         // One that never learns sees the same patches over the same backgrounds, hard or easy.
         let mut frozen = Trainer::new(scene(), frozen).unwrap();
-        let still: Vec<_> = (0..STEPS).map(|_| frozen.step()).collect();
+        let still: Vec<_> = (0..STEPS).map(|_| frozen.step().unwrap()).collect();
         let mean = |of: &[StepReport]| of[STEPS - 12..].iter().map(|r| r.loss).sum::<f64>() / 12.0;
         let (before, after) = (mean(&still), mean(&reports));
         println!("{method:?}: loss {before} {after}, psnr_mask {start} {end}");
@@ -99,7 +99,7 @@ fn every_motion_and_distance_trains_without_bad_gradients() {
             (config.rates.vertices, config.rates.motion) = (1e-2, 1e-1);
             let mut trainer = Trainer::new(scene(), config).unwrap();
             for _ in 0..12 {
-                let report = trainer.step();
+                let report = trainer.step().unwrap();
                 assert!(report.loss.is_finite(), "{motion:?} {distance:?}: {report:?}");
                 assert_eq!(report.bad_gradients, 0, "{motion:?} {distance:?}: {report:?}");
             }
@@ -113,7 +113,7 @@ fn vertices_near_visible_pixels_are_counted_and_the_rest_stay_behind() {
     let mut trainer = Trainer::new(scene(), tiny(Method::Occnerf, MotionKind::Surface)).unwrap();
     assert!(trainer.visibility_counts().iter().all(|&c| c == 0));
     let mut rays = 0;
-    (0..24).for_each(|_| rays += trainer.step().rays as u64);
+    (0..24).for_each(|_| rays += trainer.step().unwrap().rays as u64);
     let counts = trainer.visibility_counts();
     let total: u64 = counts.iter().sum();
     assert!(total > 0 && total.is_multiple_of(5) && total <= 5 * rays, "{total} of {rays} rays");

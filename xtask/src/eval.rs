@@ -209,7 +209,7 @@ pub fn score_run(
     lpips: Option<&Lpips>,
     mut metrics: Metrics,
 ) -> Result<Metrics> {
-    let mut cameras: Vec<(String, Vec<RgbImage>)> = Vec::new();
+    let mut cameras: Vec<(String, Vec<Result<[RgbImage; 2]>>)> = Vec::new();
     let per_camera = scene.eval.iter().filter(|f| f.camera_name == scene.eval[0].camera_name).count().max(1);
     let stride = per_camera.div_ceil(SHEET_INSTANTS).max(1);
     let mut index = 0;
@@ -221,19 +221,19 @@ pub fn score_run(
         if index % stride == 0
             && let Some((_, row)) = cameras.last_mut()
         {
-            row.extend(beside_truth(frame, rendering));
+            row.push(beside_truth(frame, rendering));
         }
         index += 1;
     })?;
-    let rows: Vec<Vec<RgbImage>> = cameras.into_iter().map(|(_, row)| row).collect();
+    let rows = cameras.into_iter().map(|(_, row)| pairs(row)).collect::<Result<Vec<_>>>()?;
     pictures::save(&pictures::sheet(&rows), &directory.join("renders/novel_views.png"))?;
     let mut row = Vec::new();
     let train = model.score_with_bar(scene, Split::TrainView, lpips, |frame, rendering| {
-        if row.len() < 2 * 5 {
-            row.extend(beside_truth(frame, rendering));
+        if row.len() < 5 {
+            row.push(beside_truth(frame, rendering));
         }
     })?;
-    pictures::save(&pictures::sheet(&[row]), &directory.join("renders/train_views.png"))?;
+    pictures::save(&pictures::sheet(&[pairs(row)?]), &directory.join("renders/train_views.png"))?;
     metrics.peak_rss_bytes = peak_rss_bytes();
     metrics.lpips = network_name(lpips);
     metrics.splits = Splits { novel_view: (!scene.eval.is_empty()).then_some(novel), train_view: Some(train) };
@@ -244,10 +244,16 @@ pub fn score_run(
 }
 
 /// Truth and rendering over grey.
-fn beside_truth(frame: &PreparedFrame, rendering: &Rendering) -> [RgbImage; 2] {
+fn beside_truth(frame: &PreparedFrame, rendering: &Rendering) -> Result<[RgbImage; 2]> {
     let (width, height) = (frame.camera.width, frame.camera.height);
-    [
-        pictures::over_grey(&frame.pixels, &frame.mask, width, height),
+    let truth = frame.pixels()?;
+    Ok([
+        pictures::over_grey(&truth.image.pixels, &truth.mask, width, height),
         pictures::over_grey(&rendering.image.pixels, &rendering.opacity, width, height),
-    ]
+    ])
+}
+
+/// Pictures one after the other.
+fn pairs(row: Vec<Result<[RgbImage; 2]>>) -> Result<Vec<RgbImage>> {
+    row.into_iter().collect::<Result<Vec<_>>>().map(|pairs| pairs.into_iter().flatten().collect())
 }

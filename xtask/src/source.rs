@@ -49,7 +49,8 @@ pub struct LoadArguments {
     occlusion: Option<ObstacleName>,
     #[command(flatten)]
     obstacle: ObstacleArguments,
-    /// Most memory that the pictures of a capture may take, in MiB; more is refused before anything is decoded [default: 1024]
+    /// Most memory that a capture's bodies and decoded pictures may take, in MiB; pictures beyond it are decoded whenever
+    /// they are needed [default: 1024]
     #[arg(long, value_name = "MIB", value_parser = clap::value_parser!(u64).range(1..=1 << 24))]
     memory: Option<u64>,
     /// Turn every bone of the prior by so many degrees (root mean square), to see what a method bears
@@ -123,13 +124,17 @@ impl LoadArguments {
 
     /// How a run to be resumed read its capture, checked against what is asked for.
     pub fn resumed(&self, saved: &LoadOptions) -> Result<LoadOptions> {
-        let asked = self.options()?;
-        if asked != LoadOptions::default() && asked != *saved {
+        let mut asked = self.options()?;
+        // How much memory there is has no influence on what is learnt.
+        let max_bytes = if self.memory.is_some() { asked.max_bytes } else { saved.max_bytes };
+        asked.max_bytes = max_bytes;
+        let saved = LoadOptions { max_bytes, ..saved.clone() };
+        if asked != (LoadOptions { max_bytes, ..LoadOptions::default() }) && asked != saved {
             bail!(
                 "the run to resume read its capture with other options; leave them out, or start a new run with --out"
             );
         }
-        Ok(saved.clone())
+        Ok(saved)
     }
 }
 
@@ -194,5 +199,17 @@ mod tests {
             let options = load.options().unwrap();
             assert_eq!(Line::parse_from(again.split_whitespace()).load.options().unwrap(), options);
         }
+    }
+
+    #[test]
+    fn a_run_is_resumed_with_its_own_options_and_any_memory() {
+        let load = |words: &str| Line::parse_from(words.split_whitespace()).load;
+        let saved = load("x --resize 64 --memory 9").options().unwrap();
+        assert_eq!(load("x").resumed(&saved).unwrap(), saved);
+        assert_eq!(load("x --resize 64").resumed(&saved).unwrap(), saved);
+        for words in ["x --memory 20", "x --memory 20 --resize 64"] {
+            assert_eq!(load(words).resumed(&saved).unwrap(), LoadOptions { max_bytes: 20 << 20, ..saved.clone() });
+        }
+        assert!(load("x --resize 65").resumed(&saved).is_err() && load("x --stride 2").resumed(&saved).is_err());
     }
 }

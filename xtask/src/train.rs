@@ -253,7 +253,15 @@ fn optimise(directory: &Path, trainer: &mut Trainer<'_>, stop_after: Option<u64>
     let (start, mut saved, mut lined) = (Instant::now(), Instant::now(), Instant::now());
     let (mut smooth, mut bad, mut restarts) = (None::<StepReport>, 0, None);
     while trainer.steps_done() < end {
-        let report = trainer.step();
+        let report = match trainer.step() {
+            Ok(report) => report,
+            Err(error) => {
+                trainer.save(&checkpoint)?;
+                bar.abandon();
+                let kept = format!("step {}; what was learnt is in {}", trainer.steps_done() + 1, checkpoint.display());
+                return Err(anyhow::Error::from(error).context(kept));
+            }
+        };
         bad += report.bad_gradients;
         if restarts.replace(report.restarts).is_some_and(|before| before < report.restarts) {
             let said = format!("step {}: nothing was left of the person", report.step);

@@ -44,7 +44,7 @@ impl Measured {
         let Some(&width) = widths.get(widths.len() / 2) else {
             return Err(none("no training frame has the body before its camera"));
         };
-        let subject_pixels: usize = scene.train.iter().map(|f| f.subject.len()).sum();
+        let subject_pixels: usize = scene.train.iter().map(|f| f.labels.num_subject()).sum();
         let extent = (scene.canonical_box.max - scene.canonical_box.min).max_element();
         let cell = width.max(extent / MAX_CELLS);
         let stride = subject_pixels.div_ceil(MAX_PIXELS).max(1);
@@ -93,14 +93,14 @@ struct Seen {
 impl Seen {
     fn of(scene: &Scene, frame: &PreparedFrame, cell: f32, stride: usize, reach: f32) -> Result<Self, Error> {
         let mut seen = Self::default();
-        if frame.subject.is_empty() {
+        if frame.labels.num_subject() == 0 {
             return Ok(seen);
         }
         let mesh = RayMesh::new(&frame.posed.vertices, &scene.model.faces)?;
         let (low, high) = bounds(&frame.posed.vertices);
         let region = Aabb { min: low - reach, max: high + reach };
-        for &pixel in frame.subject.iter().step_by(stride) {
-            let ray = pixel_ray(frame, pixel);
+        for n in (0..frame.labels.num_subject()).step_by(stride) {
+            let ray = pixel_ray(frame, frame.labels.subject(n));
             if let Some((near, far)) = region.intersect(&ray).filter(|(near, far)| far > near) {
                 seen.span += f64::from(far - near);
                 seen.rays += 1;

@@ -1,6 +1,7 @@
 //! From a list of files to frames: the part that all layouts share.
 
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use glam::Vec3;
 use rayon::prelude::*;
@@ -8,11 +9,14 @@ use smpl::{BodyModel, Placement};
 
 use super::camera::Lens;
 use super::image::{dimensions, load_mask, resize};
+use super::source::{PixelSource, Pixels};
 use super::undistort::undistort;
 use super::{DataError, Frame, Image, LoadOptions, checks};
 
 /// Bytes that a pixel of a frame takes: three colours and coverage.
 const PIXEL_BYTES: u64 = 16;
+/// Bytes that a vertex of a frame's body takes once it is prepared: at rest, its pose offset, and posed.
+const VERTEX_BYTES: u64 = 36;
 
 /// A frame whose pictures have not been read.
 pub(super) struct Planned {
@@ -29,6 +33,33 @@ pub(super) struct Planned {
     pub pose: Vec<Vec3>,
     pub placement: Placement,
     pub betas: Vec<f32>,
+}
+
+/// The files of a frame, and how they become its pixels.
+#[derive(Debug)]
+pub(super) struct Files {
+    image: PathBuf,
+    masks: Vec<PathBuf>,
+    labels: bool,
+    occluder: Option<PathBuf>,
+    hidden: Option<[(u32, u32); 2]>,
+    lens: Lens,
+    /// Columns and rows of every file, and what they are reduced to.
+    size: (u32, u32),
+    to: (u32, u32),
+    /// Name of the frame that `size` was read from.
+    first: Arc<str>,
+}
+
+/// Bytes of memory, shared out first come, first served.
+pub(super) struct Budget(u64);
+
+impl Budget {
+    fn take(&mut self, bytes: u64) -> bool {
+        let left = self.0.checked_sub(bytes);
+        self.0 = left.unwrap_or(self.0);
+        left.is_some()
+    }
 }
 
 /// The frames of one camera, all of one size.
@@ -48,109 +79,133 @@ impl View {
         Ok(Self { frames, size, masks: masks.to_owned(), cameras: cameras.to_owned() })
     }
 
-    fn bytes(&self, options: &LoadOptions) -> u64 {
+    /// Bytes of a frame's pixels.
+    fn picture_bytes(&self, options: &LoadOptions) -> u64 {
         let (width, height) = options.resized(self.size);
-        self.frames.len() as u64 * u64::from(width) * u64::from(height) * PIXEL_BYTES
+        u64::from(width) * u64::from(height) * PIXEL_BYTES
     }
 
-    /// Reads the pictures and checks them together.
-    pub fn decode(self, body: &BodyModel, options: &LoadOptions) -> Result<Vec<Frame>, DataError> {
-        let first = self.frames[0].name.clone();
+    /// The frames, checked together. Pictures that `budget` has room for are decoded; headers are read of all.
+    pub fn frames(self, body: &BodyModel, options: &LoadOptions, budget: &mut Budget) -> Result<Vec<Frame>, DataError> {
+        let bytes = self.picture_bytes(options);
+        let first = Arc::from(self.frames[0].name.as_str());
+        let (size, to) = (self.size, options.resized(self.size));
+        let frame = |plan: Planned| {
+            let Planned { name, image, masks, labels, occluder, hidden, lens, pose, placement, betas } = plan;
+            let camera = volrender::Camera { width: size.0, height: size.1, ..lens.camera };
+            let first = Arc::clone(&first);
+            let files = Files { image, masks, labels, occluder, hidden, lens, size, to, first };
+            let source = PixelSource::on_disk(files, budget.take(bytes));
+            Frame { name, source, camera: camera.resized(to.0, to.1), pose, placement, betas }
+        };
+        let frames: Vec<Frame> = self.frames.into_iter().map(frame).collect();
         // Collected as results first, so that the error reported is the first in order whatever finishes first.
-        let frames: Vec<_> = self.frames.into_par_iter().map(|f| decode(f, self.size, &first, options)).collect();
-        let frames: Vec<Frame> = frames.into_iter().collect::<Result<_, _>>()?;
+        let checked: Vec<Result<(), DataError>> = frames.par_iter().map(|f| f.source.check()).collect();
+        checked.into_iter().collect::<Result<(), DataError>>()?;
         checks::subject_is_seen(&self.masks, &frames)?;
         checks::body_is_seen(&self.cameras, &frames, body)?;
         Ok(frames)
     }
 }
 
-/// Errors where the pixels of all views would take more than [`LoadOptions::max_bytes`], naming values that fit.
-pub(super) fn check_memory(train: &View, eval: &[View], options: &LoadOptions) -> Result<(), DataError> {
-    let (train_bytes, limit) = (train.bytes(options), options.max_bytes);
-    let total = train_bytes + eval.iter().map(|view| view.bytes(options)).sum::<u64>();
-    if total <= limit {
-        return Ok(());
+/// Bytes for pixels that [`LoadOptions::max_bytes`] leaves beside the bodies of all views. Errors where that is not one picture,
+/// naming values that fit.
+pub(super) fn budget(
+    train: &View,
+    eval: &[View],
+    body: &BodyModel,
+    options: &LoadOptions,
+) -> Result<Budget, DataError> {
+    let limit = options.max_bytes;
+    let body_bytes = body.num_vertices() as u64 * VERTEX_BYTES;
+    let views = || std::iter::once(train).chain(eval);
+    let frames = views().map(|view| view.frames.len() as u64).sum::<u64>();
+    let bodies = frames * body_bytes;
+    let picture = views().map(|view| view.picture_bytes(options)).max().unwrap_or(0);
+    if bodies + picture <= limit {
+        return Ok(Budget(limit - bodies));
     }
-    let longest = |view: &View| options.resized(view.size);
-    let side = std::iter::once(train).chain(eval).map(longest).map(|(w, h)| w.max(h)).max().unwrap_or(1);
-    let resize = (f64::from(side) * (limit as f64 / total as f64).sqrt()).floor();
     let mut ways = Vec::new();
-    if resize >= 1.0 {
-        ways.push(format!("resize {resize}"));
+    if bodies < limit {
+        let side = views().map(|view| options.resized(view.size)).map(|(w, h)| w.max(h)).max().unwrap_or(1);
+        let resize = (f64::from(side) * ((limit - bodies) as f64 / picture as f64).sqrt()).floor();
+        if resize >= 1.0 {
+            ways.push(format!("resize {resize}"));
+        }
     }
-    ways.push(format!("stride {}", total.div_ceil(limit.max(1)).saturating_mul(options.stride as u64)));
-    if train_bytes < limit {
-        let every = (total - train_bytes).div_ceil(limit - train_bytes);
-        ways.push(format!("eval_stride {}", every.saturating_mul(options.eval_stride as u64)));
+    // As many bodies fit beside a picture.
+    let fit = limit.saturating_sub(picture) / body_bytes.max(1);
+    if fit > 0 {
+        ways.push(format!("stride {}", frames.div_ceil(fit).saturating_mul(options.stride as u64)));
+    }
+    if let (kept @ 1.., Some(fit @ 1..)) =
+        (frames - train.frames.len() as u64, fit.checked_sub(train.frames.len() as u64))
+    {
+        ways.push(format!("eval_stride {}", kept.div_ceil(fit).saturating_mul(options.eval_stride as u64)));
     }
     let mebibytes = |bytes: u64| bytes.div_ceil(1 << 20);
-    ways.push(format!("memory {}", mebibytes(total)));
-    let kept = eval.iter().map(|view| view.frames.len()).sum::<usize>();
-    Err(DataError::setting(
-        "max_bytes",
-        format!("pixels of at most {} MiB (would fit: {})", mebibytes(limit), ways.join(", or ")),
-        format!("{} MiB in {} training frames and {kept} views kept back", mebibytes(total), train.frames.len()),
-    ))
+    ways.push(format!("memory {}", mebibytes(bodies + picture)));
+    let expected =
+        format!("all bodies and a picture within {} MiB (would fit: {})", mebibytes(limit), ways.join(", or "));
+    let actual = format!("{frames} bodies of {} vertices and {picture} bytes a picture", body.num_vertices());
+    Err(DataError::setting("max_bytes", expected, actual))
 }
 
-fn decode(plan: Planned, size: (u32, u32), first: &str, options: &LoadOptions) -> Result<Frame, DataError> {
-    let same_size = |path: &Path, found: (u32, u32), of: &str| {
-        let text = |(w, h): (u32, u32)| format!("{w}×{h}");
-        let expected = || format!("{}, as of {of}", text(size));
-        if found == size { Ok(()) } else { Err(DataError::invalid(path, "size", expected(), text(found))) }
-    };
-    // Headers before pictures: nothing is decoded that the memory check did not count.
-    same_size(&plan.image, dimensions(&plan.image)?, &format!("`{first}`"))?;
-    for path in plan.masks.iter().chain(&plan.occluder) {
-        same_size(path, dimensions(path)?, "its image")?;
+impl Files {
+    /// Whether the headers say what they should; nothing is decoded that the memory check did not count.
+    pub fn check(&self) -> Result<(), DataError> {
+        let same_size = |path: &Path, of: &str| {
+            let (found, text) = (dimensions(path)?, |(w, h): (u32, u32)| format!("{w}×{h}"));
+            let expected = || format!("{}, as of {of}", text(self.size));
+            if found == self.size { Ok(()) } else { Err(DataError::invalid(path, "size", expected(), text(found))) }
+        };
+        same_size(&self.image, &format!("`{}`", self.first))?;
+        self.masks.iter().chain(&self.occluder).try_for_each(|path| same_size(path, "its image"))
     }
-    let mut image = Image::load(&plan.image)?;
-    let mut mask = vec![0.0f32; size.0 as usize * size.1 as usize];
-    for path in &plan.masks {
-        for (out, level) in mask.iter_mut().zip(load_mask(path)?.2) {
-            let level = if plan.labels && level > 0.0 { 1.0 } else { level };
-            *out = out.max(level);
-        }
-    }
-    if let Some([(x0, y0), (x1, y1)]) = plan.hidden {
-        let columns = x0.min(size.0) as usize..x1.min(size.0) as usize;
-        for row in mask.chunks_exact_mut(size.0 as usize).take(y1 as usize).skip(y0 as usize) {
-            row[columns.clone()].fill(0.0);
-        }
-    }
-    let occluder = match &plan.occluder {
-        Some(path) => Some(load_mask(path)?.2.into_iter().map(|level| f32::from(level > 0.5)).collect()),
-        None => None,
-    };
-    // Masked first, or interpolation would draw hidden colours into the mask's edge.
-    image.multiply(&mask);
 
-    let Lens { camera, distortion } = plan.lens;
-    let camera = volrender::Camera { width: size.0, height: size.1, ..camera };
-    let to = options.resized(size);
-    let resample = |values: Vec<f32>, channels: usize| {
-        resize(undistort(values, channels, &camera, &distortion), channels, size, to)
-    };
-    // Without known occluders the silhouette tells what is unknown.
-    let occluder = occluder.map(|covered: Vec<f32>| {
-        let everything = (!distortion.is_none()).then(|| vec![1.0; covered.len()]);
-        // A pixel that an occluder touches is not known to show background.
-        let mut unknown: Vec<bool> = resample(covered, 1).into_iter().map(|covered| covered > 0.0).collect();
-        if let Some(everything) = everything {
-            // Nor is one that the lens never saw.
-            unknown.iter_mut().zip(resample(everything, 1)).for_each(|(unknown, seen)| *unknown |= seen < 0.5);
+    /// Reads the pictures.
+    pub fn decode(&self) -> Result<Pixels, DataError> {
+        self.check()?;
+        let size = self.size;
+        let mut image = Image::load(&self.image)?;
+        let mut mask = vec![0.0f32; size.0 as usize * size.1 as usize];
+        for path in &self.masks {
+            for (out, level) in mask.iter_mut().zip(load_mask(path)?.2) {
+                let level = if self.labels && level > 0.0 { 1.0 } else { level };
+                *out = out.max(level);
+            }
         }
-        unknown
-    });
-    Ok(Frame {
-        name: plan.name,
-        image: Image { width: to.0, height: to.1, pixels: resample(image.pixels, 3) },
-        mask: resample(mask, 1),
-        camera: camera.resized(to.0, to.1),
-        pose: plan.pose,
-        placement: plan.placement,
-        betas: plan.betas,
-        occluder,
-    })
+        if let Some([(x0, y0), (x1, y1)]) = self.hidden {
+            let columns = x0.min(size.0) as usize..x1.min(size.0) as usize;
+            for row in mask.chunks_exact_mut(size.0 as usize).take(y1 as usize).skip(y0 as usize) {
+                row[columns.clone()].fill(0.0);
+            }
+        }
+        let occluder = match &self.occluder {
+            Some(path) => Some(load_mask(path)?.2.into_iter().map(|level| f32::from(level > 0.5)).collect()),
+            None => None,
+        };
+        // Masked first, or interpolation would draw hidden colours into the mask's edge.
+        image.multiply(&mask);
+
+        let Lens { camera, distortion } = self.lens;
+        let camera = volrender::Camera { width: size.0, height: size.1, ..camera };
+        let to = self.to;
+        let resample = |values: Vec<f32>, channels: usize| {
+            resize(undistort(values, channels, &camera, &distortion), channels, size, to)
+        };
+        // Without known occluders the silhouette tells what is unknown.
+        let occluder = occluder.map(|covered: Vec<f32>| {
+            let everything = (!distortion.is_none()).then(|| vec![1.0; covered.len()]);
+            // A pixel that an occluder touches is not known to show background.
+            let mut unknown: Vec<bool> = resample(covered, 1).into_iter().map(|covered| covered > 0.0).collect();
+            if let Some(everything) = everything {
+                // Nor is one that the lens never saw.
+                unknown.iter_mut().zip(resample(everything, 1)).for_each(|(unknown, seen)| *unknown |= seen < 0.5);
+            }
+            unknown
+        });
+        let image = Image { width: to.0, height: to.1, pixels: resample(image.pixels, 3) };
+        Ok(Pixels { image, mask: resample(mask, 1), occluder })
+    }
 }

@@ -16,6 +16,7 @@ mod obstacle;
 mod options;
 mod pictures;
 mod records;
+mod source;
 mod synth;
 #[cfg(test)]
 mod testing;
@@ -31,10 +32,12 @@ pub use self::find::{Layout, find_body, own_body};
 pub use self::image::Image;
 pub use self::obstacle::Obstacle;
 pub use self::options::LoadOptions;
+pub use self::source::{PixelSource, Pixels};
 pub use self::synth::{Occlusion, SynthConfig, Synthetic, synthesise};
 pub use self::wrong::Wrong;
 
 use std::path::Path;
+use std::sync::Arc;
 
 use glam::Vec3;
 
@@ -43,11 +46,8 @@ use glam::Vec3;
 pub struct Frame {
     /// Name within its camera, such as `frame_000012`.
     pub name: String,
-    /// Picture multiplied by `mask`: colours are premultiplied by coverage, and 0 where the mask is 0. Over a
-    /// background B the picture is `image + (1 − mask) · B`.
-    pub image: Image,
-    /// Coverage of each pixel by the *visible* subject, 0 to 1, (H, W); above 0.5 the pixel counts as subject.
-    pub mask: Vec<f32>,
+    /// Picture, mask and occluder, each as large as the camera's image.
+    pub source: PixelSource,
     /// The camera, OpenCV convention, pixel centres at integer + 0.5.
     pub camera: volrender::Camera,
     /// Axis-angle rotation of each joint, (J). Joint 0 is zero where `placement` carries the global rotation.
@@ -56,8 +56,16 @@ pub struct Frame {
     pub placement: smpl::Placement,
     /// Shape coefficients, at most as many as the body model has.
     pub betas: Vec<f32>,
-    /// Pixels known to be covered by something in front of the subject, (H, W); `None` where nobody marked them.
-    pub occluder: Option<Vec<bool>>,
+}
+
+impl Frame {
+    /// What it shows; see [`PixelSource::pixels`].
+    ///
+    /// # Errors
+    /// For files that cannot be read; none for pixels in memory.
+    pub fn pixels(&self) -> Result<Arc<Pixels>, DataError> {
+        self.source.pixels()
+    }
 }
 
 /// A picture kept back for evaluation: nothing occluded, black background.
@@ -94,6 +102,9 @@ pub struct Capture {
 /// - **HumanNeRF's wild layout** (`metadata.json`, `images`, `masks`), with `occluders` where it is known what
 ///   stands in front, and `clean/images`, `clean/masks` of the training camera kept back.
 ///
+/// Pictures are decoded at once, in parallel, as far as [`LoadOptions::max_bytes`] admits; of the rest the headers are
+/// looked at, and each is decoded whenever it is asked for.
+///
 /// Images are multiplied by their masks. Lens distortion is taken out of both, and both are reduced to
 /// [`LoadOptions::resize`]. A frame without any subject pixel is kept (the subject may be wholly hidden for a while); a
 /// camera without any in all its frames is an error. No views kept back leave [`Capture::eval`] empty.
@@ -101,7 +112,7 @@ pub struct Capture {
 /// # Errors
 /// The first problem in the order files are read, training view before views kept back: a directory of no known layout;
 /// files that are missing, unreadable, truncated or name anything to execute; frames without camera or body parameters;
-/// images and masks of unequal sizes or above 8192 pixels, or more of them than [`LoadOptions::max_bytes`]; arrays of
+/// images and masks of unequal sizes or above 8192 pixels; more bodies than [`LoadOptions::max_bytes`] admits; arrays of
 /// the wrong shape, or not finite; cameras that no projection fits, or that see nothing of the body in any frame; a
 /// body model whose joints or vertices are not the file's; options outside their ranges.
 pub fn load_capture(dir: &Path, body: &smpl::BodyModel, options: &LoadOptions) -> Result<Capture, DataError> {

@@ -3,8 +3,10 @@
 
 use std::ops::Range;
 
+use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
+use super::source::Edit;
 use super::{DataError, Frame};
 
 /// A simulated obstacle in front of the training camera. The default is the paper's: fixed, central, hiding half of
@@ -44,13 +46,13 @@ impl Obstacle {
         Ok(())
     }
 
-    /// The columns that are hidden in each frame, given the subject's coverage (H, `width`) in each.
+    /// The columns that are hidden in each frame, given how many pixels of the subject each column of each frame has.
     ///
     /// The obstacle has one width, such that the part of all subject pixels of the occluded frames that it hides is as
     /// near to `fraction` as whole columns come. Ranges are empty where nothing is hidden.
-    pub(super) fn columns(&self, masks: &[&[f32]], width: u32) -> Vec<Range<u32>> {
-        let affected = ((self.share * masks.len() as f32).round() as usize).min(masks.len());
-        let w = i64::from(width);
+    fn columns(&self, subject: &[Vec<u32>]) -> Vec<Range<u32>> {
+        let affected = ((self.share * subject.len() as f32).round() as usize).min(subject.len());
+        let w = subject.first().map_or(0, |columns| columns.len() as i64);
         let last = affected.saturating_sub(1) as f64;
         let step = f64::from(self.travel) * w as f64 / last.max(1.0);
         // In frame i the obstacle is `shifts[i]` columns to the right of where it is half-way.
@@ -59,15 +61,15 @@ impl Obstacle {
         // Subject pixels by column relative to the moving obstacle, from −reach on.
         let mut histogram = vec![0u64; (2 * reach + w) as usize];
         let (mut total, mut weighted) = (0u64, 0u64);
-        for (mask, shift) in masks.iter().zip(&shifts) {
-            for (i, _) in mask.iter().enumerate().filter(|(_, m)| **m > 0.5) {
-                let column = i as i64 % w;
-                histogram[(column - shift + reach) as usize] += 1;
-                total += 1;
-                weighted += column as u64;
+        for (columns, shift) in subject.iter().zip(&shifts) {
+            for (column, &count) in columns.iter().enumerate() {
+                let count = u64::from(count);
+                histogram[(column as i64 - shift + reach) as usize] += count;
+                total += count;
+                weighted += column as u64 * count;
             }
         }
-        let mut hidden = vec![0..0; masks.len()];
+        let mut hidden = vec![0..0; subject.len()];
         if total == 0 {
             return hidden;
         }
@@ -83,21 +85,27 @@ impl Obstacle {
     }
 
     /// Hides what the obstacle covers in a video of equally large frames; returns the hidden columns of each.
-    pub(super) fn hide(&self, frames: &mut [Frame]) -> Vec<Range<u32>> {
-        let width = frames.first().map_or(0, |f| f.image.width);
-        if width == 0 {
-            return Vec::new();
+    pub(super) fn hide(&self, frames: &mut [Frame]) -> Result<Vec<Range<u32>>, DataError> {
+        let counted: Vec<Result<Vec<u32>, DataError>> = frames.par_iter().map(subject_by_column).collect();
+        let columns = self.columns(&counted.into_iter().collect::<Result<Vec<_>, _>>()?);
+        for (frame, hidden) in frames.iter_mut().zip(&columns).filter(|(_, hidden)| !hidden.is_empty()) {
+            frame.source.edit(Edit::Hide(hidden.clone()));
         }
-        let masks: Vec<&[f32]> = frames.iter().map(|f| f.mask.as_slice()).collect();
-        let columns = self.columns(&masks, width);
-        for (frame, hidden) in frames.iter_mut().zip(&columns) {
-            let visible: Vec<f32> =
-                (0..frame.mask.len()).map(|p| if hidden.contains(&(p as u32 % width)) { 0.0 } else { 1.0 }).collect();
-            frame.mask.iter_mut().zip(&visible).for_each(|(mask, seen)| *mask *= seen);
-            frame.image.multiply(&visible);
-        }
-        columns
+        Ok(columns)
     }
+}
+
+/// How many pixels of the subject each column of a frame has.
+fn subject_by_column(frame: &Frame) -> Result<Vec<u32>, DataError> {
+    Ok(by_column(&frame.pixels()?.mask, frame.camera.width))
+}
+
+fn by_column(mask: &[f32], width: u32) -> Vec<u32> {
+    let mut counts = vec![0; width as usize];
+    for row in mask.chunks_exact(counts.len().max(1)) {
+        counts.iter_mut().zip(row).for_each(|(count, &m)| *count += u32::from(m > 0.5));
+    }
+    counts
 }
 
 /// The range around `centre` whose sum is nearest to `target`; of several, the narrowest.
@@ -140,23 +148,23 @@ mod tests {
     #[test]
     fn half_of_a_bar_is_its_middle_half() {
         let mask = bar(12, 2, 2..10);
-        assert_eq!(always(0.5).columns(&[&mask], 12)[0], 4..8);
-        assert_eq!(always(0.25).columns(&[&mask, &mask], 12), [5..7, 5..7]);
-        assert!(always(0.0).columns(&[&mask], 12)[0].is_empty());
+        assert_eq!(always(0.5).columns(&[by_column(&mask, 12)])[0], 4..8);
+        assert_eq!(always(0.25).columns(&vec![by_column(&mask, 12); 2]), [5..7, 5..7]);
+        assert!(always(0.0).columns(&[by_column(&mask, 12)])[0].is_empty());
     }
 
     #[test]
     fn an_empty_video_hides_nothing() {
-        assert!(always(0.5).columns(&[&[0.0; 8]], 4)[0].is_empty());
-        assert!(always(0.5).columns(&[], 4).is_empty());
-        assert!(always(0.5).hide(&mut []).is_empty());
+        assert!(always(0.5).columns(&[by_column(&[0.0; 8], 4)])[0].is_empty());
+        assert!(always(0.5).columns(&[]).is_empty());
+        assert!(always(0.5).hide(&mut []).unwrap().is_empty());
     }
 
     #[test]
     fn a_subject_at_the_border_is_covered_from_there() {
         let mask = bar(10, 1, 0..4);
-        assert_eq!(always(0.5).columns(&[&mask], 10)[0], 1..3);
-        let columns = always(0.95).columns(&[&mask], 10);
+        assert_eq!(always(0.5).columns(&[by_column(&mask, 10)])[0], 1..3);
+        let columns = always(0.95).columns(&[by_column(&mask, 10)]);
         assert!(columns[0].start == 0 && columns[0].end >= 4);
     }
 
@@ -164,7 +172,7 @@ mod tests {
     fn the_first_share_of_the_frames_is_occluded() {
         let mask = bar(12, 2, 2..10);
         for (share, affected) in [(0.0, 0), (0.3, 3), (0.8, 8), (1.0, 10)] {
-            let columns = Obstacle { share, ..Obstacle::default() }.columns(&[&mask[..]; 10], 12);
+            let columns = Obstacle { share, ..Obstacle::default() }.columns(&vec![by_column(&mask, 12); 10]);
             let hidden: Vec<bool> = columns.iter().map(|c| !c.is_empty()).collect();
             assert_eq!(hidden, (0..10).map(|i| i < affected).collect::<Vec<_>>());
         }
@@ -173,16 +181,16 @@ mod tests {
     #[test]
     fn position_moves_the_middle() {
         let mask = bar(40, 3, 10..30);
-        assert_eq!(always(0.5).columns(&[&mask], 40)[0], 15..25);
-        assert_eq!(Obstacle { position: 0.125, ..always(0.5) }.columns(&[&mask], 40)[0], 20..30);
-        assert_eq!(Obstacle { position: -0.125, ..always(0.5) }.columns(&[&mask], 40)[0], 10..20);
+        assert_eq!(always(0.5).columns(&[by_column(&mask, 40)])[0], 15..25);
+        assert_eq!(Obstacle { position: 0.125, ..always(0.5) }.columns(&[by_column(&mask, 40)])[0], 20..30);
+        assert_eq!(Obstacle { position: -0.125, ..always(0.5) }.columns(&[by_column(&mask, 40)])[0], 10..20);
     }
 
     #[test]
     fn a_moving_obstacle_travels_evenly_and_is_central_half_way() {
         let mask = bar(40, 3, 10..30);
         let moving = Obstacle { travel: 0.2, ..always(0.5) };
-        let columns = moving.columns(&[&mask[..]; 5], 40);
+        let columns = moving.columns(&vec![by_column(&mask, 40); 5]);
         let starts: Vec<u32> = columns.iter().map(|c| c.start).collect();
         assert_eq!(starts.windows(2).map(|s| s[1] - s[0]).collect::<Vec<_>>(), [2; 4]);
         assert_eq!(columns[2], 15..25);
@@ -212,8 +220,8 @@ mod tests {
             fraction in 0.0f32..0.75, travel in -0.125f32..0.125,
         ) {
             let masks: Vec<Vec<f32>> = bits.chunks(24 * 6).map(|b| b.iter().map(|&b| f32::from(b)).collect()).collect();
-            let slices: Vec<&[f32]> = masks.iter().map(Vec::as_slice).collect();
-            let columns = Obstacle { travel, ..always(fraction) }.columns(&slices, 24);
+            let counts: Vec<Vec<u32>> = masks.iter().map(|mask| by_column(mask, 24)).collect();
+            let columns = Obstacle { travel, ..always(fraction) }.columns(&counts);
             let subject = |i: usize, columns: &Range<u32>| masks[i].iter().enumerate()
                 .filter(|(p, m)| **m > 0.5 && columns.contains(&(*p as u32 % 24))).count() as f32;
             let total: f32 = (0..4).map(|i| subject(i, &(0..24))).sum();

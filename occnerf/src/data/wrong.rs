@@ -5,6 +5,7 @@ use serde::{Deserialize, Serialize};
 use smpl::{BodyModel, Placement};
 
 use super::demo::motion::{Pose, TrackerError, track};
+use super::source::Edit;
 use super::synth::noise::normal;
 use super::{Capture, DataError, Frame};
 use crate::random::Stream;
@@ -60,7 +61,9 @@ impl Wrong {
         if self.pose_degrees > 0.0 {
             self.turn(capture, body);
         }
-        capture.train.iter_mut().for_each(|frame| resize_mask(frame, self.mask_pixels));
+        if self.mask_pixels != 0 {
+            capture.train.iter_mut().for_each(|frame| frame.source.edit(Edit::Grow(self.mask_pixels)));
+        }
         Ok(())
     }
 
@@ -107,31 +110,6 @@ fn about_origin(frame: &Frame, pelvis: Vec3) -> Pose {
     Pose { joints, rotation, translation }
 }
 
-/// Grows or shrinks the mask by so many pixels along the axes, and the picture with it.
-fn resize_mask(frame: &mut Frame, pixels: i32) {
-    let (width, height) = (frame.image.width as usize, frame.image.height as usize);
-    for _ in 0..pixels.unsigned_abs() {
-        let old = frame.mask.clone();
-        for i in 0..old.len() {
-            let (x, y) = (i % width, i / width);
-            let around = [
-                (x > 0).then(|| i - 1),
-                (x + 1 < width).then(|| i + 1),
-                (y > 0).then(|| i - width),
-                (y + 1 < height).then(|| i + width),
-            ];
-            let values = around.into_iter().flatten().map(|j| old[j]);
-            let new = if pixels > 0 { values.fold(old[i], f32::max) } else { values.fold(old[i], f32::min) };
-            if new < old[i] {
-                // The picture is premultiplied by the mask.
-                let share = new / old[i];
-                frame.image.pixels[3 * i..3 * i + 3].iter_mut().for_each(|c| *c *= share);
-            }
-            frame.mask[i] = new;
-        }
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::super::{DemoConfig, demo};
@@ -148,7 +126,12 @@ mod tests {
         let (before, mut after) = (capture(&body), capture(&body));
         Wrong::default().apply(&mut after, &body).unwrap();
         for (a, b) in before.train.iter().zip(&after.train) {
-            assert!(a.pose == b.pose && a.betas == b.betas && a.mask == b.mask && a.placement == b.placement);
+            assert!(
+                a.pose == b.pose
+                    && a.betas == b.betas
+                    && a.shown().mask == b.shown().mask
+                    && a.placement == b.placement
+            );
         }
     }
 
@@ -189,14 +172,15 @@ mod tests {
     fn masks_grow_and_shrink_and_pictures_stay_within_them() {
         let body = BodyModel::embedded();
         let before = capture(&body);
-        let area = |c: &Capture| c.train.iter().flat_map(|f| &f.mask).sum::<f32>();
+        let area = |c: &Capture| c.train.iter().map(|f| f.shown().mask.iter().sum::<f32>()).sum::<f32>();
         for (mask_pixels, grows) in [(2, true), (-2, false)] {
             let mut after = before.clone();
             Wrong { mask_pixels, ..Wrong::default() }.apply(&mut after, &body).unwrap();
             assert_eq!(area(&after) > 1.1 * area(&before), grows);
             assert_eq!(area(&after) < 0.9 * area(&before), !grows);
             for frame in &after.train {
-                let mut each = frame.image.pixels.chunks_exact(3).zip(&frame.mask);
+                let pixels = frame.shown();
+                let mut each = pixels.image.pixels.chunks_exact(3).zip(&pixels.mask);
                 assert!(each.all(|(p, m)| p.iter().all(|c| *c <= m + 1e-5)));
             }
         }

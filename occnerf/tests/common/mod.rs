@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 
 use glam::{Affine3A, Mat3, Vec3};
-use occnerf::data::{Capture, EvalFrame, Frame, Image};
+use occnerf::data::{Capture, EvalFrame, Frame, Image, Pixels};
 use occnerf::{Config, Method, MotionKind, Preset, Scene};
 use smpl::{BodyModel, Placement, SparseRows};
 use visibility::RayMesh;
@@ -65,7 +65,7 @@ fn frame(index: usize, turn: f32, hidden: usize, metres: f32) -> Frame {
         }
     }
     let name = format!("frame_{index:06}");
-    Frame { name, image, mask, camera, pose, placement, betas: vec![0.0], occluder: None }
+    Frame { name, source: Pixels { image, mask, occluder: None }.into(), camera, pose, placement, betas: vec![0.0] }
 }
 
 /// Two training frames three metres away, the second half hidden, and two frames kept back.

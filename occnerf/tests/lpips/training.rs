@@ -31,13 +31,13 @@ fn training_with_lpips_goes_on_after_a_stop_as_if_there_was_none_on_any_number_o
             let mut trainer = Trainer::new(common::scene(), config(&weights)).unwrap();
             trainer.load_perceptual().unwrap();
             assert_eq!(trainer.perceptual(), "lpips squeezenet");
-            let mut reports: Vec<StepReport> = (0..2).map(|_| trainer.step()).collect();
+            let mut reports: Vec<StepReport> = (0..2).map(|_| trainer.step().unwrap()).collect();
             if stop {
                 trainer.save(&half).unwrap();
                 trainer = Trainer::resume(common::scene(), &half).unwrap();
                 trainer.load_perceptual().unwrap();
             }
-            reports.extend((0..2).map(|_| trainer.step()));
+            reports.extend((0..2).map(|_| trainer.step().unwrap()));
             losses(&reports)
         })
     };
@@ -48,7 +48,7 @@ fn training_with_lpips_goes_on_after_a_stop_as_if_there_was_none_on_any_number_o
         Trainer::new(common::scene(), Config { loss: common::config(Method::Occnerf).loss, ..config(&weights) })
             .unwrap();
     assert_eq!(embedded.perceptual(), "ms-ssim");
-    assert_ne!(embedded.step().perceptual.to_bits(), whole[0][1]);
+    assert_ne!(embedded.step().unwrap().perceptual.to_bits(), whole[0][1]);
 }
 
 #[test]
@@ -76,7 +76,8 @@ fn scoring_reports_lpips_where_weights_are_given() {
     let mut renderer = FieldRenderer::new(&trainer).unwrap();
     let scores = evaluate_with(scene, &mut renderer, &frames, Some(&lpips), |frame, rendering| {
         let size = (frame.camera.width as usize, frame.camera.height as usize);
-        seen.push(lpips.distance(&rendering.image.pixels, &frame.pixels, size.0, size.1).unwrap()[0]);
+        let truth = frame.pixels().unwrap();
+        seen.push(lpips.distance(&rendering.image.pixels, &truth.image.pixels, size.0, size.1).unwrap()[0]);
     });
     let scores = scores.unwrap();
     let found: Vec<f64> = scores.frames.iter().filter_map(|f| f.lpips_full).collect();

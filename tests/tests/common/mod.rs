@@ -52,7 +52,7 @@ pub fn tiny(method: Method, motion: MotionKind) -> Config {
 /// Trains from the start for `steps` and returns the reports and the checkpoint.
 pub fn train(scene: &Scene, config: &Config, steps: u64) -> (Vec<StepReport>, Vec<u8>) {
     let mut trainer = Trainer::new(scene, config.clone()).unwrap();
-    let reports = (0..steps).map(|_| trainer.step()).collect();
+    let reports = (0..steps).map(|_| trainer.step().unwrap()).collect();
     (reports, checkpoint(&trainer))
 }
 

@@ -5,7 +5,7 @@ use std::ops::{Add, Mul};
 
 use anyhow::{Result, ensure};
 use glam::{Quat, Vec3};
-use occnerf::data::{Capture, DemoConfig, Frame, Wrong, demo};
+use occnerf::data::{Capture, DemoConfig, Frame, Pixels, Wrong, demo};
 use serde::{Deserialize, Serialize};
 use smpl::{BodyModel, Placement, SparseRows};
 
@@ -66,20 +66,21 @@ impl Difficulty {
         let mut capture = demo(&fine, body)?;
         let half = (self.shutter * MOMENTS as f32 / 2.0).round() as usize;
         let moments = std::mem::take(&mut capture.train);
+        let pixels = moments.iter().map(Frame::pixels).collect::<Result<Vec<_>, _>>()?;
         capture.train = (0..frames)
             .map(|i| {
                 let middle = i * MOMENTS;
-                let exposure = &moments[middle.saturating_sub(half)..=(middle + half).min(moments.len() - 1)];
-                let mut frame = moments[middle].clone();
-                let mean = |sum: &mut [f32], pick: fn(&Frame) -> &[f32]| {
+                let exposure = &pixels[middle.saturating_sub(half)..=(middle + half).min(moments.len() - 1)];
+                let mut shown = Pixels::clone(&pixels[middle]);
+                let mean = |sum: &mut [f32], pick: fn(&Pixels) -> &[f32]| {
                     sum.fill(0.0);
                     for moment in exposure {
                         sum.iter_mut().zip(pick(moment)).for_each(|(s, x)| *s += x / exposure.len() as f32);
                     }
                 };
-                mean(&mut frame.image.pixels, |f| &f.image.pixels);
-                mean(&mut frame.mask, |f| &f.mask);
-                frame
+                mean(&mut shown.image.pixels, |p| &p.image.pixels);
+                mean(&mut shown.mask, |p| &p.mask);
+                Frame { source: shown.into(), ..moments[middle].clone() }
             })
             .collect();
         capture.eval.iter_mut().for_each(|view| view.train_index /= MOMENTS);
@@ -179,7 +180,7 @@ mod tests {
     }
 
     fn coverage(capture: &Capture) -> f32 {
-        capture.train.iter().flat_map(|f| &f.mask).sum()
+        capture.train.iter().map(|f| f.pixels().unwrap().mask.iter().sum::<f32>()).sum()
     }
 
     #[test]
@@ -208,7 +209,8 @@ mod tests {
         let (eroded, _) = Difficulty { erosion: 1, ..small() }.make().unwrap();
         assert!(coverage(&eroded) < 0.9 * coverage(&whole) && coverage(&eroded) > 0.0);
         for frame in &eroded.train {
-            for (colour, &m) in frame.image.pixels.chunks_exact(3).zip(&frame.mask) {
+            for (colour, &m) in frame.pixels().unwrap().image.pixels.chunks_exact(3).zip(&frame.pixels().unwrap().mask)
+            {
                 assert!(colour.iter().all(|&c| c <= m + 1e-5));
             }
         }
@@ -219,7 +221,10 @@ mod tests {
         let (sharp, _) = small().make().unwrap();
         let (smeared, _) = Difficulty { shutter: 1.0, ..small() }.make().unwrap();
         assert_eq!((smeared.train.len(), smeared.eval.len()), (sharp.train.len(), sharp.eval.len()));
-        let partial = |c: &Capture| c.train.iter().flat_map(|f| &f.mask).filter(|m| (0.05..0.95).contains(*m)).count();
+        let partial = |c: &Capture| {
+            let of = |f: &Frame| f.pixels().unwrap().mask.iter().filter(|m| (0.05..0.95).contains(*m)).count();
+            c.train.iter().map(of).sum::<usize>()
+        };
         assert!(partial(&smeared) > partial(&sharp) * 3 / 2, "{} {}", partial(&smeared), partial(&sharp));
         assert!((coverage(&smeared) / coverage(&sharp) - 1.0).abs() < 0.2);
         for (a, b) in smeared.eval.iter().zip(&sharp.eval) {
@@ -245,8 +250,15 @@ mod tests {
         let (large, big) = Difficulty { unit: 128.0, ..small() }.make().unwrap();
         assert!((big.v_template[5] / 128.0).distance(body.v_template[5]) < 1e-6);
         for (a, b) in metres.train.iter().zip(&large.train) {
-            let off = a.mask.iter().zip(&b.mask).filter(|(a, b)| (*a - *b).abs() > 0.3).count();
-            assert!(off * 100 < a.mask.len(), "{off} pixels differ");
+            let off = a
+                .pixels()
+                .unwrap()
+                .mask
+                .iter()
+                .zip(&b.pixels().unwrap().mask)
+                .filter(|(a, b)| (*a - *b).abs() > 0.3)
+                .count();
+            assert!(off * 100 < a.pixels().unwrap().mask.len(), "{off} pixels differ");
         }
         assert!(Difficulty { unit: 0.0, ..small() }.make().is_err());
     }

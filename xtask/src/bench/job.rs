@@ -114,7 +114,7 @@ pub fn measure(job: &Job) -> Result<Outcome> {
         let (mut seconds, mut times) = (Vec::new(), StepTimes::default());
         for step in 0..job.config.steps {
             let begun = Instant::now();
-            let report = trainer.step();
+            let report = trainer.step()?;
             if 2 * step >= job.config.steps {
                 seconds.push(begun.elapsed().as_secs_f64());
                 times += report.times;

@@ -142,11 +142,11 @@ fn measure(source: &Source, config: Config, lpips: Option<&Lpips>) -> Result<((f
     let mut trainer = Trainer::new(&scene, config)?;
     trainer.load_perceptual()?;
     for _ in 0..WARM {
-        trainer.step();
+        trainer.step()?;
     }
     let start = Instant::now();
     for _ in 0..TIMED {
-        trainer.step();
+        trainer.step()?;
     }
     let step = start.elapsed().as_secs_f64() / TIMED as f64;
     let scored: Vec<&PreparedFrame> = crate::eval::scored_frames(&scene).collect();

@@ -120,7 +120,7 @@ pub fn demo(config: &DemoConfig, body: &BodyModel) -> Result<Capture, DataError>
         return Err(DataError::setting("body", "SMPL's 24 joints", joints));
     }
     let mut capture = film(config, body, grounded_walk, &|_| {})?.0;
-    occlude(&mut capture.train, config);
+    occlude(&mut capture.train, config)?;
     Ok(capture)
 }
 
@@ -192,13 +192,16 @@ pub(super) fn grounded_walk(config: &DemoConfig, body: &BodyModel, shaped: &Shap
 }
 
 /// Puts the obstacle in front of the first frames.
-fn occlude(train: &mut [Frame], config: &DemoConfig) {
+fn occlude(train: &mut [Frame], config: &DemoConfig) -> Result<(), DataError> {
     let obstacle = Obstacle { fraction: config.occluded_fraction, share: config.occluded_share, ..Obstacle::default() };
-    let columns = obstacle.hide(train);
+    let columns = obstacle.hide(train)?;
     if config.known_occluder {
         for (frame, hidden) in train.iter_mut().zip(columns) {
-            let covered = (0..frame.mask.len()).map(|p| hidden.contains(&(p as u32 % config.size))).collect();
-            frame.occluder = Some(covered);
+            frame.source.change(|pixels| {
+                let covered = (0..pixels.mask.len()).map(|p| hidden.contains(&(p as u32 % config.size))).collect();
+                pixels.occluder = Some(covered);
+            })?;
         }
     }
+    Ok(())
 }

@@ -28,7 +28,7 @@ fn clear() -> &'static Capture {
 }
 
 fn subject(frame: &Frame) -> usize {
-    frame.mask.iter().filter(|m| **m > 0.5).count()
+    frame.shown().mask.iter().filter(|m| **m > 0.5).count()
 }
 
 #[test]
@@ -37,25 +37,25 @@ fn half_of_the_subject_is_hidden_in_the_first_four_fifths() {
     let hidden = 1.0 - count(occluded()) / count(clear());
     assert!((hidden - 0.5).abs() < 0.03, "{hidden}");
     for (with, without) in occluded().train.iter().zip(&clear().train).skip(16) {
-        assert_eq!(with.image, without.image);
-        assert_eq!(with.mask, without.mask);
+        assert_eq!(with.shown().image, without.shown().image);
+        assert_eq!(with.shown().mask, without.shown().mask);
     }
 }
 
 #[test]
 fn what_the_obstacle_hides_is_zero_and_the_rest_untouched() {
     for (with, without) in occluded().train.iter().zip(&clear().train) {
-        for pixel in 0..with.mask.len() {
-            let color = |f: &Frame| [0, 1, 2].map(|c| f.image.pixels[3 * pixel + c]);
-            if with.mask[pixel] == without.mask[pixel] {
+        for pixel in 0..with.shown().mask.len() {
+            let color = |f: &Frame| [0, 1, 2].map(|c| f.shown().image.pixels[3 * pixel + c]);
+            if with.shown().mask[pixel] == without.shown().mask[pixel] {
                 assert_eq!(color(with), color(without));
             } else {
-                assert_eq!((with.mask[pixel], color(with)), (0.0, [0.0; 3]));
+                assert_eq!((with.shown().mask[pixel], color(with)), (0.0, [0.0; 3]));
             }
         }
     }
     for (with, without) in occluded().eval.iter().zip(&clear().eval) {
-        assert_eq!(with.frame.image, without.frame.image, "evaluation views are never occluded");
+        assert_eq!(with.frame.shown().image, without.frame.shown().image, "evaluation views are never occluded");
     }
 }
 
@@ -63,7 +63,7 @@ fn what_the_obstacle_hides_is_zero_and_the_rest_untouched() {
 fn colours_are_premultiplied_and_edges_are_soft() {
     let mut soft = 0;
     for frame in &clear().train {
-        for (pixel, &mask) in frame.image.pixels.chunks(3).zip(&frame.mask) {
+        for (pixel, &mask) in frame.shown().image.pixels.chunks(3).zip(&frame.shown().mask) {
             assert!(pixel.iter().all(|c| (0.0..=mask).contains(c)));
             soft += usize::from(mask > 0.0 && mask < 1.0);
         }
@@ -77,12 +77,12 @@ fn every_camera_sees_the_whole_person_filling_three_quarters_of_the_height() {
     for frame in frames {
         let size = config().size as usize;
         let rows: Vec<usize> =
-            (0..size).filter(|row| frame.mask[row * size..(row + 1) * size].iter().any(|m| *m > 0.5)).collect();
+            (0..size).filter(|row| frame.shown().mask[row * size..(row + 1) * size].iter().any(|m| *m > 0.5)).collect();
         let (top, bottom) = (rows[0], rows[rows.len() - 1]);
         let share = (bottom + 1 - top) as f32 / size as f32;
         assert!((0.68..0.84).contains(&share), "{}: {share}", frame.name);
         assert!(top > 4 && bottom < size - 5, "{}: rows {top} to {bottom}", frame.name);
-        let border = |x: usize| (0..size).any(|row| frame.mask[row * size + x] > 0.0);
+        let border = |x: usize| (0..size).any(|row| frame.shown().mask[row * size + x] > 0.0);
         assert!(!border(0) && !border(size - 1), "{} is cut off at a side", frame.name);
     }
 }
@@ -96,7 +96,7 @@ fn the_prior_lies_within_the_picture_of_the_person_but_is_not_the_truth() {
         for &v in &posed.vertices {
             let p = frame.camera.project(v).unwrap();
             let pixel = p.y as usize * config().size as usize + p.x as usize;
-            inside += usize::from(frame.mask[pixel] > 0.5);
+            inside += usize::from(frame.shown().mask[pixel] > 0.5);
             all += 1;
         }
     }
@@ -130,7 +130,7 @@ fn the_same_config_gives_the_same_bits_on_any_number_of_threads() {
     let (one, three) = (on(1), on(3));
     assert_eq!(format!("{one:?}"), format!("{three:?}"));
     let other = demo(&DemoConfig { seed: 1, ..small() }, body()).unwrap();
-    assert_ne!(other.train[0].image, one.train[0].image);
+    assert_ne!(other.train[0].shown().image, one.train[0].shown().image);
     assert_ne!(other.train[0].pose, one.train[0].pose);
 }
 
@@ -138,12 +138,13 @@ fn the_same_config_gives_the_same_bits_on_any_number_of_threads() {
 fn a_known_obstacle_is_marked_where_it_is() {
     let known = DemoConfig { known_occluder: true, ..small() };
     let capture = demo(&known, body()).unwrap();
-    assert!(demo(&small(), body()).unwrap().train.iter().all(|f| f.occluder.is_none()));
+    assert!(demo(&small(), body()).unwrap().train.iter().all(|f| f.shown().occluder.is_none()));
     for (i, frame) in capture.train.iter().enumerate() {
-        let occluder = frame.occluder.as_ref().unwrap();
+        let pixels = frame.shown();
+        let occluder = pixels.occluder.as_ref().unwrap();
         assert_eq!(occluder.iter().any(|o| *o), i < 5, "frame {i}");
         for (pixel, hidden) in occluder.iter().enumerate() {
-            assert!(!hidden || frame.mask[pixel] == 0.0);
+            assert!(!hidden || frame.shown().mask[pixel] == 0.0);
             assert_eq!(*hidden, occluder[pixel % 48], "the obstacle is as high as the picture");
         }
     }
@@ -181,7 +182,7 @@ fn a_body_in_centimetres_gives_the_same_pictures() {
     }
     let (metres, centimetres) = (demo(&small(), body()).unwrap(), demo(&small(), &centimetres).unwrap());
     for (a, b) in metres.train.iter().zip(&centimetres.train) {
-        let differences = a.mask.iter().zip(&b.mask).filter(|(a, b)| a != b).count();
+        let differences = a.shown().mask.iter().zip(&b.shown().mask).filter(|(a, b)| a != b).count();
         assert!(differences <= 3, "{differences} pixels of {} differ", a.name);
         let distance = |f: &Frame| f.camera.centre_of_projection().length();
         assert!((distance(b) / distance(a) - 100.0).abs() < 1e-2);

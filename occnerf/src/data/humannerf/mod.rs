@@ -19,7 +19,7 @@ use rayon::prelude::*;
 use smpl::BodyModel;
 
 use super::camera::Lens;
-use super::decode::{Planned, View, check_memory};
+use super::decode::{Planned, View, budget};
 use super::names::FrameName;
 use super::pictures::{Pictures, file_name};
 use super::records::{Record, Records};
@@ -54,11 +54,11 @@ pub(super) fn load(dir: &Path, body: &BodyModel, options: &LoadOptions) -> Resul
     }
 
     let train = train.ok_or_else(|| DataError::missing(&dir.join("cameras.pkl"), "frame"))?;
-    check_memory(&train, &eval, options)?;
-    let train = train.decode(body, options)?;
+    let mut budget = budget(&train, &eval, body, options)?;
+    let train = train.frames(body, options, &mut budget)?;
     let mut frames = Vec::new();
     for (camera_name, view) in cameras.into_iter().zip(eval) {
-        for frame in view.decode(body, options)? {
+        for frame in view.frames(body, options, &mut budget)? {
             let train_index = index(&names, &frame.name).unwrap_or_default();
             frames.push(EvalFrame { camera_name: camera_name.clone(), train_index, frame });
         }

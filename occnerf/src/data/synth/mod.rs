@@ -11,6 +11,7 @@ mod tests;
 mod texture;
 
 use std::ops::Range;
+use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 use smpl::{BodyModel, Character, MotionClip};
@@ -18,7 +19,7 @@ use smpl::{BodyModel, Character, MotionClip};
 use self::objects::Objects;
 use self::render::Picture;
 use super::demo::{DemoConfig, film, grounded_walk};
-use super::{Capture, DataError, Frame, LoadOptions, Obstacle};
+use super::{Capture, DataError, Frame, LoadOptions, Obstacle, Pixels};
 
 /// What stands in front of the person in the training view.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -178,23 +179,27 @@ pub fn synthesise(
             (capture, height, body)
         }
     };
-    let clear: Vec<Picture> = capture.train.iter().map(|f| (f.image.clone(), f.mask.clone())).collect();
+    let clear: Vec<Picture> = pixels(&capture.train)?.iter().map(|p| (p.image.clone(), p.mask.clone())).collect();
     let mut columns = Vec::new();
     let mut objects = None;
     match config.occlusion {
-        Occlusion::Rectangle(obstacle) => columns = obstacle.hide(&mut capture.train),
+        Occlusion::Rectangle(obstacle) => columns = obstacle.hide(&mut capture.train)?,
         Occlusion::Objects { fraction, position } => {
             let made = Objects::new(&capture.train, height, fraction, position)?;
-            made.hide(&mut capture.train);
+            made.hide(&mut capture.train)?;
             objects = Some(made);
         }
     }
-    let hidden_fraction = hidden_fraction(&clear, &capture.train);
+    let hidden_fraction = hidden_fraction(&clear, &pixels(&capture.train)?);
     Ok(Synthetic { capture, body, config: *config, hidden_fraction, clear, columns, objects })
 }
 
+fn pixels(frames: &[Frame]) -> Result<Vec<Arc<Pixels>>, DataError> {
+    frames.iter().map(Frame::pixels).collect()
+}
+
 /// Part of the subject's pixels that is gone, over the frames that lost any.
-fn hidden_fraction(clear: &[Picture], train: &[Frame]) -> f32 {
+fn hidden_fraction(clear: &[Picture], train: &[Arc<Pixels>]) -> f32 {
     let count = |mask: &[f32]| mask.iter().filter(|m| **m > 0.5).count() as u64;
     let (mut whole, mut gone) = (0u64, 0u64);
     for ((_, before), frame) in clear.iter().zip(train) {

@@ -46,9 +46,10 @@ impl Objects {
         // A picture's width where the objects stand.
         let width = (eye.z - NEAR * height) / camera.focal.x * camera.width as f32;
         let at = |size: f32| picture(&camera, height, size, position * width);
+        let pixels = frames.iter().map(Frame::pixels).collect::<Result<Vec<_>, _>>()?;
         let hidden = |front: &Picture| {
             let (mut whole, mut gone) = (0u64, 0u64);
-            for frame in frames {
+            for frame in &pixels {
                 for (mask, cover) in frame.mask.iter().zip(&front.1).filter(|(mask, _)| **mask > 0.5) {
                     whole += 1;
                     gone += u64::from(mask * (1.0 - cover) <= 0.5);
@@ -71,13 +72,15 @@ impl Objects {
     }
 
     /// Hides what the objects cover, and marks it as covered where they take more than half of a pixel.
-    pub fn hide(&self, frames: &mut [Frame]) {
+    pub fn hide(&self, frames: &mut [Frame]) -> Result<(), DataError> {
         let visible: Vec<f32> = self.front.1.iter().map(|cover| 1.0 - cover).collect();
-        for frame in frames {
-            frame.mask.iter_mut().zip(&visible).for_each(|(mask, seen)| *mask *= seen);
-            frame.image.multiply(&visible);
-            frame.occluder = Some(self.front.1.iter().map(|&cover| cover > 0.5).collect());
-        }
+        frames.iter_mut().try_for_each(|frame| {
+            frame.source.change(|pixels| {
+                pixels.mask.iter_mut().zip(&visible).for_each(|(mask, seen)| *mask *= seen);
+                pixels.image.multiply(&visible);
+                pixels.occluder = Some(self.front.1.iter().map(|&cover| cover > 0.5).collect());
+            })
+        })
     }
 
     /// Coverage by the objects, (H, W).

@@ -8,7 +8,7 @@ use volrender::Camera;
 
 use super::render::{Picture, Posture, look_at};
 use crate::data::demo::motion::Pose;
-use crate::data::{Capture, DataError, EvalFrame, Frame};
+use crate::data::{Capture, DataError, EvalFrame, Frame, Pixels};
 
 /// Focal length in picture sides.
 const FOCAL: f32 = 1.45;
@@ -69,13 +69,11 @@ impl Stage<'_> {
             for (c, (image, mask)) in views?.into_iter().enumerate() {
                 let frame = Frame {
                     name: format!("frame_{i:06}"),
-                    image,
-                    mask,
+                    source: Pixels { image, mask, occluder: None }.into(),
                     camera: self.cameras[c],
                     pose: self.priors[i].joints.clone(),
                     placement: self.priors[i].placement(),
                     betas: self.betas.clone(),
-                    occluder: None,
                 };
                 if c == 0 {
                     train.push(frame);

@@ -40,7 +40,7 @@ fn the_fraction_hidden_is_the_one_asked_for() {
         }
     }
     let share = |frames: &[Frame], clear: &[Picture]| {
-        frames.iter().zip(clear).filter(|(frame, clear)| frame.mask != clear.1).count()
+        frames.iter().zip(clear).filter(|(frame, clear)| frame.shown().mask != clear.1).count()
     };
     let half = Obstacle { share: 0.5, ..Obstacle::default() };
     let made = make(&SynthConfig { occlusion: Occlusion::Rectangle(half), ..small() });
@@ -60,9 +60,9 @@ fn objects_move_where_they_are_told_and_cover_what_they_hide() {
     for (frame, (image, mask)) in right.capture.train.iter().zip(&right.clear) {
         let cover = right.objects.as_ref().unwrap().coverage();
         for (i, &c) in cover.iter().enumerate() {
-            assert_eq!(frame.mask[i], mask[i] * (1.0 - c));
-            assert_eq!(frame.image.pixels[3 * i], image.pixels[3 * i] * (1.0 - c));
-            assert_eq!(frame.occluder.as_ref().unwrap()[i], c > 0.5);
+            assert_eq!(frame.shown().mask[i], mask[i] * (1.0 - c));
+            assert_eq!(frame.shown().image.pixels[3 * i], image.pixels[3 * i] * (1.0 - c));
+            assert_eq!(frame.shown().occluder.as_ref().unwrap()[i], c > 0.5);
         }
     }
     let none = make(&SynthConfig { occlusion: Occlusion::Objects { fraction: 0.0, position: 0.0 }, ..small() });
@@ -135,7 +135,7 @@ fn a_characters_prior_lies_inside_it_by_centimetres() {
         let posed = body.pose(&body.shaped(&f.betas), &f.pose, f.placement);
         let hit = posed.vertices.iter().filter(|&&v| {
             let p = f.camera.project(v).unwrap();
-            f.mask[p.y as usize * 64 + p.x as usize] > 0.0
+            f.shown().mask[p.y as usize * 64 + p.x as usize] > 0.0
         });
         hit.count() as f32 / posed.vertices.len() as f32
     };

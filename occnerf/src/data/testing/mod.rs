@@ -155,16 +155,24 @@ pub fn shared(below: &str) -> Option<PathBuf> {
     None
 }
 
+impl super::Frame {
+    /// Its pixels, which can be read.
+    #[track_caller]
+    pub fn shown(&self) -> std::sync::Arc<super::Pixels> {
+        self.pixels().unwrap()
+    }
+}
+
 /// Overlap of the posed body's silhouette with the mask, over the pixels that no known occluder covers.
 pub fn overlap(frame: &super::Frame, body: &BodyModel) -> f32 {
     let posed = body.pose(&body.shaped(&frame.betas), &frame.pose, frame.placement);
     let mesh = visibility::RayMesh::new(&posed.vertices, &body.faces).unwrap();
     let (mut both, mut either) = (0, 0);
-    for (i, &mask) in frame.mask.iter().enumerate() {
-        if frame.occluder.as_ref().is_some_and(|o| o[i]) {
+    for (i, &mask) in frame.shown().mask.iter().enumerate() {
+        if frame.shown().occluder.as_ref().is_some_and(|o| o[i]) {
             continue;
         }
-        let (column, row) = (i as u32 % frame.image.width, i as u32 / frame.image.width);
+        let (column, row) = (i as u32 % frame.shown().image.width, i as u32 / frame.shown().image.width);
         let ray = frame.camera.ray(column as f32 + 0.5, row as f32 + 0.5);
         let (covered, subject) = (mesh.first_hit(ray.origin, ray.direction).is_some(), mask > 0.5);
         both += usize::from(covered && subject);

@@ -19,7 +19,7 @@ use std::path::Path;
 use smpl::{BodyModel, Placement};
 
 use super::camera::Lens;
-use super::decode::{Planned, View, check_memory};
+use super::decode::{Planned, View, budget};
 use super::names::FrameName;
 use super::pictures::{Pictures, file_name};
 use super::records::Record;
@@ -63,11 +63,11 @@ pub(super) fn load(dir: &Path, body: &BodyModel, options: &LoadOptions) -> Resul
         false => vec![View::new(kept, &clean.join("masks"), &path)?],
     };
 
-    check_memory(&train, &eval, options)?;
-    let train = train.decode(body, options)?;
+    let mut budget = budget(&train, &eval, body, options)?;
+    let train = train.frames(body, options, &mut budget)?;
     let mut kept = Vec::new();
     for view in eval {
-        for (train_index, frame) in indices.iter().copied().zip(view.decode(body, options)?) {
+        for (train_index, frame) in indices.iter().copied().zip(view.frames(body, options, &mut budget)?) {
             kept.push(EvalFrame { camera_name: CLEAN.to_owned(), train_index, frame });
         }
     }

@@ -71,7 +71,8 @@ fn what_the_lens_never_saw_is_unknown_where_occluders_are_known() {
     metadata["01"]["distortions"] = json!([2.0, 0.0, 0.0, 0.0, 0.0]);
     dir.write("metadata.json", metadata.to_string());
     let capture = load(&dir).unwrap();
-    let occluder = capture.train[1].occluder.as_ref().unwrap();
+    let pixels = capture.train[1].shown();
+    let occluder = pixels.occluder.as_ref().unwrap();
     // Corners lie beyond the photograph; the middle right does not, and nothing covers it.
     assert!(occluder[5] && occluder[23] && !occluder[6 + 3], "{occluder:?}");
 }
@@ -87,13 +88,14 @@ fn a_whole_capture_is_read() {
     assert_eq!(frame.placement, Placement::Pelvis { translation: Vec3::ZERO });
     assert_eq!(frame.pose, [Vec3::new(0.0, 0.5, 0.0), Vec3::new(0.0, 0.25, 0.0)]);
     assert_eq!(frame.camera.world_to_camera.translation.z, 4.0);
-    let occluder = frame.occluder.as_ref().unwrap();
+    let pixels = frame.shown();
+    let occluder = pixels.occluder.as_ref().unwrap();
     assert_eq!(occluder.iter().filter(|o| **o).count(), 4, "one column");
-    assert!(capture.train[0].occluder.is_none());
+    assert!(capture.train[0].shown().occluder.is_none());
     let eval: Vec<(usize, &str)> = capture.eval.iter().map(|e| (e.train_index, e.frame.name.as_str())).collect();
     assert_eq!(eval, [(0, "00"), (2, "02")]);
     assert_eq!(capture.eval[0].frame.camera, capture.train[0].camera);
-    assert!((capture.eval[0].frame.image.rgb(3, 0)[0] - 100.0 / 255.0).abs() < 1e-6);
+    assert!((capture.eval[0].frame.shown().image.rgb(3, 0)[0] - 100.0 / 255.0).abs() < 1e-6);
 }
 
 #[test]
@@ -105,7 +107,7 @@ fn poses_may_be_rows_and_a_pixel_that_an_occluder_touches_is_covered() {
     let capture = load_capture(dir.path(), &body(), &options).unwrap();
     assert_eq!(capture.train[1].pose, capture.train[0].pose);
     // Half of the first column was covered.
-    assert_eq!(capture.train[1].occluder.as_deref().unwrap(), [true, false, false, true, false, false]);
+    assert_eq!(capture.train[1].shown().occluder.as_deref().unwrap(), [true, false, false, true, false, false]);
 }
 
 #[test]
@@ -134,12 +136,14 @@ fn stride_and_limit_keep_frames_and_their_views_together() {
 #[test]
 fn memory_beyond_the_bound_names_options_that_fit() {
     let (dir, _) = fixture("wild-memory");
-    // 4 + 2 frames of 24 pixels of 16 bytes.
-    let fits = LoadOptions { max_bytes: 6 * 24 * 16, ..LoadOptions::default() };
+    // 4 + 2 frames whose bodies have 8 vertices of 36 bytes, and a picture of 24 pixels of 16 bytes.
+    let fits = LoadOptions { max_bytes: 6 * 8 * 36 + 24 * 16, ..LoadOptions::default() };
     assert!(load_capture(dir.path(), &body(), &fits).is_ok());
-    let tight = LoadOptions { max_bytes: 5 * 24 * 16, ..LoadOptions::default() };
+    let tight = LoadOptions { max_bytes: fits.max_bytes - 1, ..fits };
     let message = load_capture(dir.path(), &body(), &tight).unwrap_err().to_string();
-    for word in ["max_bytes", "resize 5", "stride 2", "eval_stride 2", "memory 1", "4 training frames", "2 views"] {
+    for word in
+        ["max_bytes", "resize 5", "stride 2", "eval_stride 2", "memory 1", "6 bodies of 8 vertices", "384 bytes"]
+    {
         assert!(message.contains(word), "{word}: {message}");
     }
     for options in [
@@ -149,6 +153,33 @@ fn memory_beyond_the_bound_names_options_that_fit() {
     ] {
         assert!(load_capture(dir.path(), &body(), &options).is_ok(), "{options:?}");
     }
+    let nothing = LoadOptions { max_bytes: 0, ..LoadOptions::default() };
+    let message = load_capture(dir.path(), &body(), &nothing).unwrap_err().to_string();
+    assert!(message.contains("would fit: memory 1)"), "{message}");
+}
+
+/// As many pictures as fit stay in memory, training frames first; the others are read each time.
+#[test]
+fn what_is_not_in_memory_is_read_when_asked_for() {
+    let (dir, _) = fixture("wild-demand");
+    let options = LoadOptions { max_bytes: 6 * 8 * 36 + 2 * 24 * 16, ..LoadOptions::default() };
+    let capture = load_capture(dir.path(), &body(), &options).unwrap();
+    let level = |i: usize| capture.train[i].pixels().map(|pixels| (pixels.image.rgb(3, 0)[0] * 255.0).round());
+    assert_eq!(level(3).unwrap(), 200.0);
+    for i in 0..4 {
+        dir.stripe(&format!("images/{i:02}.png"), SIZE, 100);
+    }
+    assert_eq!((0..4).map(|i| level(i).unwrap()).collect::<Vec<_>>(), [200.0, 200.0, 100.0, 100.0]);
+    // Damage that came later is told when it is met, as that of headers was at once.
+    dir.write("images/02.png", "no picture");
+    dir.stripe("masks/03.png", (5, 4), 255);
+    for (i, words) in [(2, ["images/02.png", "picture"]), (3, ["masks/03.png", "5×4"])] {
+        let message = level(i).unwrap_err().to_string();
+        assert!(words.iter().all(|word| message.contains(word)), "{message}");
+    }
+    let message = load_capture(dir.path(), &body(), &options).unwrap_err().to_string();
+    assert!(message.contains("images/02.png"), "{message}");
+    assert!(level(0).is_ok() && capture.clone().train[1].pixels().is_ok());
 }
 
 #[test]
@@ -255,8 +286,9 @@ fn the_shared_captures_are_read_and_the_body_covers_the_subject() {
         }
         // The published person also where the occluders are known, which are never on the subject's mask.
         for frame in capture.train.iter().step_by(13) {
-            let occluder = frame.occluder.as_ref().unwrap();
-            assert!(frame.mask.iter().zip(occluder).all(|(&mask, &occluded)| !(occluded && mask > 0.5)));
+            let pixels = frame.shown();
+            let occluder = pixels.occluder.as_ref().unwrap();
+            assert!(pixels.mask.iter().zip(occluder).all(|(&mask, &occluded)| !(occluded && mask > 0.5)));
             assert!(overlap(frame, &body) > 0.6, "{} {}", frame.name, overlap(frame, &body));
         }
     }

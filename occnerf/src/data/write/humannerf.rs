@@ -1,6 +1,6 @@
 //! HumanNeRF's prepared layout.
 
-use super::{Folder, Py, extrinsics, flat, mask_rgb, origin, rows, unmixed};
+use super::{Folder, Py, extrinsics, flat, frame_mask, origin, rows, unmixed};
 use crate::data::synth::Synthetic;
 use crate::data::{DataError, Frame};
 
@@ -12,7 +12,7 @@ pub(super) fn write(synthetic: &Synthetic, folder: &Folder<'_>) -> Result<(), Da
         frames.iter().map(|f| format!("{below}{kind}/{}.png", f.name)).collect()
     };
     folder.pictures(&names("images", "", &train), |i| synthetic.photograph(i, true))?;
-    folder.pictures(&names("masks", "", &train), |i| mask_rgb(&train[i].mask, &train[i].image))?;
+    folder.pictures(&names("masks", "", &train), |i| frame_mask(train[i]))?;
     let shaped = synthetic.body.shaped(&capture.mean_betas);
     let canonical = Py::record([
         ("joints", Py::floats(&[shaped.joints.len(), 3], &flat(&shaped.joints))),
@@ -24,9 +24,9 @@ pub(super) fn write(synthetic: &Synthetic, folder: &Folder<'_>) -> Result<(), Da
         let below = format!("eval/{}/", frames[0].camera_name);
         let frames: Vec<&Frame> = frames.iter().map(|e| &e.frame).collect();
         view(synthetic, folder, &below, &frames)?;
-        let picture = |i: usize| unmixed(&frames[i].image, &frames[i].mask);
+        let picture = |i: usize| frames[i].pixels().map(|p| unmixed(&p.image, &p.mask));
         folder.pictures(&names("images", &below, &frames), picture)?;
-        folder.pictures(&names("masks", &below, &frames), |i| mask_rgb(&frames[i].mask, &frames[i].image))?;
+        folder.pictures(&names("masks", &below, &frames), |i| frame_mask(frames[i]))?;
     }
     Ok(())
 }

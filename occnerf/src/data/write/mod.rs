@@ -16,7 +16,6 @@ use smpl::Placement;
 
 use self::pickle::Py;
 use super::synth::Synthetic;
-use super::synth::render::Picture;
 use super::{DataError, Frame, Image, Layout};
 
 /// The body model's file, found by [`super::find_body`].
@@ -56,13 +55,16 @@ impl Synthetic {
     }
 
     /// What a camera takes of training frame `i`.
-    fn photograph(&self, i: usize, occluded: bool) -> RgbImage {
+    fn photograph(&self, i: usize, occluded: bool) -> Result<RgbImage, DataError> {
         let clear = &self.clear[i];
         if let Some(objects) = &self.objects {
-            return rgb(&objects.photograph(clear, occluded));
+            return Ok(rgb(&objects.photograph(clear, occluded)));
         }
-        let frame = &self.capture.train[i];
-        if occluded { unmixed(&frame.image, &frame.mask) } else { unmixed(&clear.0, &clear.1) }
+        if occluded {
+            let pixels = self.capture.train[i].pixels()?;
+            return Ok(unmixed(&pixels.image, &pixels.mask));
+        }
+        Ok(unmixed(&clear.0, &clear.1))
     }
 }
 
@@ -89,11 +91,11 @@ impl Folder<'_> {
     fn pictures<P: Into<image::DynamicImage>>(
         &self,
         names: &[String],
-        paint: impl Fn(usize) -> P + Sync,
+        paint: impl Fn(usize) -> Result<P, DataError> + Sync,
     ) -> Result<(), DataError> {
         let save = |(i, name): (usize, &String)| {
             let path = self.dir.join(name);
-            let picture: image::DynamicImage = paint(i).into();
+            let picture: image::DynamicImage = paint(i)?.into();
             picture.save_with_format(&path, ImageFormat::Png).map_err(|source| match source {
                 image::ImageError::IoError(source) => DataError::Io { path, source },
                 source => DataError::Picture { path, source },
@@ -134,6 +136,11 @@ fn mask_rgb(mask: &[f32], like: &Image) -> RgbImage {
     image::DynamicImage::ImageLuma8(grey(mask, like)).into_rgb8()
 }
 
+/// The mask of a frame's visible subject.
+fn frame_mask(frame: &Frame) -> Result<RgbImage, DataError> {
+    frame.pixels().map(|pixels| mask_rgb(&pixels.mask, &pixels.image))
+}
+
 /// A matrix row by row.
 fn rows(matrix: Mat3) -> [f32; 9] {
     matrix.transpose().to_cols_array()
@@ -154,9 +161,4 @@ fn origin(frame: &Frame) -> (Vec3, Vec3) {
         Placement::Origin { rotation, translation } => (rotation, translation),
         Placement::Pelvis { translation } => (Vec3::ZERO, translation),
     }
-}
-
-/// A frame's mask before occlusion.
-fn coverage(picture: &Picture) -> &[f32] {
-    &picture.1
 }

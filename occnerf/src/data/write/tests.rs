@@ -7,8 +7,8 @@ use smpl::BodyModel;
 use super::byte;
 use crate::data::testing::Directory;
 use crate::data::{
-    Capture, Frame, Layout, LoadOptions, Obstacle, Occlusion, SynthConfig, Synthetic, find_body, load_capture,
-    synthesise,
+    Capture, Frame, Layout, LoadOptions, Obstacle, Occlusion, Pixels, SynthConfig, Synthetic, Wrong, find_body,
+    load_capture, synthesise,
 };
 
 const LAYOUTS: [Layout; 3] = [Layout::HumanNerf, Layout::ZjuMocap, Layout::Wild];
@@ -58,7 +58,7 @@ fn same_view(body: &BodyModel, a: &Frame, b: &Frame) {
 /// Pictures as near as 8 bits and the layout's masks allow.
 #[track_caller]
 fn same_picture(layout: Layout, made: &Frame, read: &Frame) {
-    for (i, (m, r)) in made.mask.iter().zip(&read.mask).enumerate() {
+    for (i, (m, r)) in made.shown().mask.iter().zip(&read.shown().mask).enumerate() {
         let subject = (*m > 0.5, *r > 0.5);
         assert_eq!(subject.0, subject.1, "{layout:?} {}: pixel {i}, {m} {r}", made.name);
         let labels = layout == Layout::ZjuMocap;
@@ -68,7 +68,7 @@ fn same_picture(layout: Layout, made: &Frame, read: &Frame) {
             continue;
         }
         for c in 0..3 {
-            let (p, q) = (made.image.pixels[3 * i + c], read.image.pixels[3 * i + c]);
+            let (p, q) = (made.shown().image.pixels[3 * i + c], read.shown().image.pixels[3 * i + c]);
             assert!((p - q).abs() < 1.5 / 255.0, "{layout:?} {}: {p} {q}", made.name);
         }
     }
@@ -92,7 +92,8 @@ fn every_layout_reads_back_as_it_was_made() {
             for view in &read.eval {
                 let i = view.train_index;
                 let (image, mask) = made.clear[i].clone();
-                let clear = Frame { image, mask, ..made.capture.train[i].clone() };
+                let clear =
+                    Frame { source: Pixels { image, mask, occluder: None }.into(), ..made.capture.train[i].clone() };
                 same_view(&body, &clear, &view.frame);
                 same_picture(layout, &clear, &view.frame);
             }
@@ -126,7 +127,7 @@ fn without_occlusion_nothing_is_hidden() {
     for layout in LAYOUTS {
         let (_dir, _, read) = round(&made, layout, &format!("write-none-{layout:?}"));
         for (clear, b) in made.clear.iter().zip(&read.train) {
-            assert!(clear.1.iter().zip(&b.mask).all(|(c, m)| (*c > 0.5) == (*m > 0.5)), "{layout:?}");
+            assert!(clear.1.iter().zip(&b.shown().mask).all(|(c, m)| (*c > 0.5) == (*m > 0.5)), "{layout:?}");
         }
     }
 }
@@ -137,12 +138,12 @@ fn objects_are_in_the_pictures_and_marked_in_the_wild_layout() {
     for layout in LAYOUTS {
         let (dir, _, read) = round(&made, layout, &format!("write-objects-{layout:?}"));
         for (i, (a, b)) in made.capture.train.iter().zip(&read.train).enumerate() {
-            for (p, (m, r)) in a.mask.iter().zip(&b.mask).enumerate() {
+            for (p, (m, r)) in a.shown().mask.iter().zip(&b.shown().mask).enumerate() {
                 assert_eq!(*m > 0.5, *r > 0.5, "{layout:?} {i} {p}");
             }
-            assert_eq!(b.occluder.is_some(), layout == Layout::Wild);
-            if b.occluder.is_some() {
-                assert_eq!(a.occluder, b.occluder);
+            assert_eq!(b.shown().occluder.is_some(), layout == Layout::Wild);
+            if b.shown().occluder.is_some() {
+                assert_eq!(a.shown().occluder, b.shown().occluder);
             }
         }
         // The room and the objects are in the file, not in what is read.
@@ -153,8 +154,8 @@ fn objects_are_in_the_pictures_and_marked_in_the_wild_layout() {
         };
         let picture = image::open(dir.path().join(path)).unwrap().into_rgb8();
         assert!(picture.pixels().all(|p| p.0 != [0; 3]), "{layout:?}");
-        let mask = &read.train[0].mask;
-        assert!(read.train[0].image.pixels.chunks(3).zip(mask).all(|(p, m)| *m > 0.0 || p == [0.0; 3]));
+        let mask = &read.train[0].shown().mask;
+        assert!(read.train[0].shown().image.pixels.chunks(3).zip(mask).all(|(p, m)| *m > 0.0 || p == [0.0; 3]));
     }
 }
 
@@ -199,4 +200,34 @@ fn a_place_that_cannot_be_written_is_named() {
 #[test]
 fn half_covered_pixels_stay_on_their_side() {
     assert_eq!([0.0, 0.25, 0.5, 0.75, 1.0, -1.0, 7.0, f32::NAN].map(byte), [0, 64, 127, 191, 255, 0, 255, 0]);
+}
+
+/// Whatever is done to them: resized, behind an obstacle that moves, with masks too large or too small.
+#[test]
+fn pictures_decoded_on_demand_are_those_decoded_at_once() {
+    for (layout, made) in LAYOUTS.map(|layout| (layout, central())) {
+        let (dir, body, _) = round(made, layout, &format!("write-demand-{layout:?}"));
+        let moving = Obstacle { travel: 0.2, ..Obstacle::default() };
+        for mask_pixels in [0, 2, -1] {
+            let at_once = LoadOptions {
+                resize: Some(40),
+                occlusion: (layout == Layout::ZjuMocap).then_some(moving),
+                wrong: Wrong { mask_pixels, ..Wrong::default() },
+                ..LoadOptions::default()
+            };
+            let read = |options: &LoadOptions| load_capture(dir.path(), &body, options).unwrap();
+            let all = read(&at_once);
+            let bodies = (all.train.len() + all.eval.len()) * body.num_vertices() * 36;
+            // Room for the pictures of two frames.
+            let on_demand = LoadOptions { max_bytes: (bodies + 2 * 40 * 40 * 16) as u64, ..at_once };
+            let few = read(&on_demand);
+            let frames = |capture: &Capture| -> Vec<Frame> {
+                capture.train.iter().chain(capture.eval.iter().map(|e| &e.frame)).cloned().collect()
+            };
+            assert_eq!(all.train.len() + all.eval.len(), few.train.len() + few.eval.len());
+            for (a, b) in frames(&all).iter().zip(&frames(&few)) {
+                assert!(a.shown() == b.shown(), "{layout:?} {mask_pixels}: {}", a.name);
+            }
+        }
+    }
 }

@@ -4,7 +4,7 @@ use glam::{Affine3A, Vec3};
 use serde_json::{Map, Value, json};
 use smpl::{BodyModel, rodrigues};
 
-use super::{Folder, coverage, extrinsics, grey, mask_rgb, origin, rows};
+use super::{Folder, extrinsics, frame_mask, grey, mask_rgb, origin, rows};
 use crate::data::synth::Synthetic;
 use crate::data::{DataError, Frame};
 
@@ -20,22 +20,25 @@ pub(super) fn write(synthetic: &Synthetic, folder: &Folder<'_>) -> Result<(), Da
     }
     let all = |kind: &str| -> Vec<String> { (0..train.len()).map(|i| format!("{kind}/{i:06}.png")).collect() };
     folder.pictures(&all("images"), |i| synthetic.photograph(i, true))?;
-    folder.pictures(&all("masks"), |i| mask_rgb(&train[i].mask, &train[i].image))?;
+    folder.pictures(&all("masks"), |i| frame_mask(&train[i]))?;
     folder.pictures(&all("occluders"), |i| {
-        let image = &train[i].image;
-        match &synthetic.objects {
+        let (image, mask) = &synthetic.clear[i];
+        Ok(match &synthetic.objects {
             Some(objects) => grey(objects.coverage(), image),
             None => {
                 let columns = &synthetic.columns[i];
                 let covered = |p: usize| f32::from(columns.contains(&(p as u32 % image.width)));
-                grey(&(0..train[i].mask.len()).map(covered).collect::<Vec<f32>>(), image)
+                grey(&(0..mask.len()).map(covered).collect::<Vec<f32>>(), image)
             }
-        }
+        })
     })?;
     let every = synthetic.config.eval_every;
     let kept = |kind: &str| -> Vec<String> { all(kind).into_iter().step_by(every).collect() };
     folder.pictures(&kept("clean/images"), |i| synthetic.photograph(i * every, false))?;
-    folder.pictures(&kept("clean/masks"), |i| mask_rgb(coverage(&synthetic.clear[i * every]), &train[i].image))
+    folder.pictures(&kept("clean/masks"), |i| {
+        let (image, mask) = &synthetic.clear[i * every];
+        Ok(mask_rgb(mask, image))
+    })
 }
 
 /// Body and camera of a frame. The layout has no translation of the body, so the camera moves instead.

@@ -4,7 +4,7 @@ use glam::{Mat3, Vec3};
 use image::GrayImage;
 use serde_json::{Value, json};
 
-use super::{Folder, Py, coverage, flat, origin, rgb, rows};
+use super::{Folder, Py, flat, origin, rgb, rows};
 use crate::data::synth::Synthetic;
 use crate::data::{DataError, Frame, Image};
 
@@ -37,9 +37,9 @@ pub(super) fn write(synthetic: &Synthetic, folder: &Folder<'_>) -> Result<(), Da
         folder.make(camera)?;
         let training = *camera == TRAINING;
         let picture = |i: usize| match &synthetic.objects {
-            Some(objects) if training => rgb(&objects.photograph(&synthetic.clear[i], true)),
-            _ if training => rgb(&synthetic.clear[i].0),
-            _ => rgb(&frames[i].1.image),
+            Some(objects) if training => Ok(rgb(&objects.photograph(&synthetic.clear[i], true))),
+            _ if training => Ok(rgb(&synthetic.clear[i].0)),
+            _ => frames[i].1.pixels().map(|pixels| rgb(&pixels.image)),
         };
         let name = |kind: &str, i: &usize| format!("{kind}{camera}/{i:06}.png");
         let names = |kind: &str| -> Vec<String> { frames.iter().map(|(i, _)| name(kind, i)).collect() };
@@ -47,10 +47,12 @@ pub(super) fn write(synthetic: &Synthetic, folder: &Folder<'_>) -> Result<(), Da
         for kind in ["mask_cihp/", "mask/"] {
             folder.make(&format!("{kind}{camera}"))?;
             folder.pictures(&names(kind), |i| {
-                let frame = frames[i].1;
                 // A rectangle is left to occlusion.json.
-                let whole = training && synthetic.objects.is_none();
-                labels(if whole { coverage(&synthetic.clear[i]) } else { &frame.mask }, &frame.image)
+                if training && synthetic.objects.is_none() {
+                    let (image, mask) = &synthetic.clear[i];
+                    return Ok(labels(mask, image));
+                }
+                frames[i].1.pixels().map(|pixels| labels(&pixels.mask, &pixels.image))
             })?;
         }
     }

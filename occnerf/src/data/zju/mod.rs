@@ -23,7 +23,7 @@ use serde::Deserialize;
 use smpl::{BodyModel, Placement};
 
 use self::annots::Annots;
-use super::decode::{Planned, View, check_memory};
+use super::decode::{Planned, View, budget};
 use super::image::dimensions;
 use super::pictures::file_name;
 use super::records::{Record, Records, triples};
@@ -90,15 +90,15 @@ pub(super) fn load(dir: &Path, body: &BodyModel, options: &LoadOptions) -> Resul
         }
     }
 
-    check_memory(&train, &views, options)?;
-    let mut train = train.decode(body, options)?;
+    let mut budget = budget(&train, &views, body, options)?;
+    let mut train = train.frames(body, options, &mut budget)?;
     if recorded.is_none() {
-        options.occlusion.unwrap_or_default().hide(&mut train);
+        options.occlusion.unwrap_or_default().hide(&mut train)?;
     }
     let mut eval = Vec::with_capacity(indices.len());
     let mut indices = indices.into_iter();
     for view in views {
-        for (frame, (other, train_index)) in view.decode(body, options)?.into_iter().zip(&mut indices) {
+        for (frame, (other, train_index)) in view.frames(body, options, &mut budget)?.into_iter().zip(&mut indices) {
             eval.push(EvalFrame { camera_name: annots.names[other].clone(), train_index, frame });
         }
     }

@@ -17,7 +17,7 @@ fn a_whole_capture_is_read() {
     assert_eq!(names, ["frame_000000", "frame_000001", "frame_000002"]);
     assert_eq!(capture.mean_betas, [0.5]);
     let frame = &capture.train[1];
-    assert_eq!((frame.image.width, frame.image.height, frame.mask.len()), (6, 4, 24));
+    assert_eq!((frame.shown().image.width, frame.shown().image.height, frame.shown().mask.len()), (6, 4, 24));
     assert_eq!(frame.pose, [Vec3::ZERO, Vec3::new(0.0, 0.25, 0.0)]);
     assert_eq!(
         frame.placement,
@@ -25,7 +25,7 @@ fn a_whole_capture_is_read() {
     );
     assert_eq!(frame.betas, [0.5]);
     assert_eq!(frame.camera.centre.x, 3.0);
-    assert!(frame.occluder.is_none());
+    assert!(frame.shown().occluder.is_none());
 
     assert_eq!(capture.eval.len(), 2);
     assert_eq!(capture.eval[1].camera_name, "Camera_B2");
@@ -39,7 +39,7 @@ fn images_hold_nothing_of_what_masks_hide() {
     let capture = load_capture(&fixture.dir, &body(), &LoadOptions::default()).unwrap();
     for frame in &capture.train {
         let (mut shown, mut hidden) = (0, 0);
-        for (pixel, &mask) in frame.image.pixels.chunks(3).zip(&frame.mask) {
+        for (pixel, &mask) in frame.shown().image.pixels.chunks(3).zip(&frame.shown().mask) {
             if mask > 0.5 {
                 shown += 1;
                 assert!(pixel.iter().all(|&c| (c - 200.0 / 255.0).abs() < 1e-6));

@@ -29,10 +29,12 @@ fn a_whole_capture_is_read() {
     assert_eq!(frame.camera.world_to_camera.translation, Vec3::new(0.0, 0.0, 4.0).into(), "millimetres");
     assert_eq!((frame.camera.width, frame.camera.height), SIZE);
     // Labels 1 and 2 of one mask and the other mask are all the subject.
-    let subject: Vec<usize> = (0..SIZE.0 as usize).filter(|&x| frame.mask[x] > 0.5).collect();
+    let subject: Vec<usize> = (0..SIZE.0 as usize).filter(|&x| frame.shown().mask[x] > 0.5).collect();
     assert_eq!(subject, [4, 5, 6, 7]);
-    assert!(frame.mask.iter().all(|m| [0.0, 1.0].contains(m)));
-    assert!((frame.image.rgb(5, 0)[0] - 200.0 / 255.0).abs() < 0.02 && frame.image.rgb(0, 0) == [0.0; 3]);
+    assert!(frame.shown().mask.iter().all(|m| [0.0, 1.0].contains(m)));
+    assert!(
+        (frame.shown().image.rgb(5, 0)[0] - 200.0 / 255.0).abs() < 0.02 && frame.shown().image.rgb(0, 0) == [0.0; 3]
+    );
 
     // The second camera lacks frame 1; the last picture that the file lists is not on disk.
     let eval: Vec<(&str, usize)> = capture.eval.iter().map(|e| (e.camera_name.as_str(), e.train_index)).collect();
@@ -101,12 +103,13 @@ fn hidden_pixels_never_reach_training_and_kept_back_views_are_whole() {
     let hidden = |options: &LoadOptions| {
         let capture = load_capture(fixture.dir.path(), &body(), options).unwrap();
         for frame in &capture.train {
-            for (pixel, mask) in frame.image.pixels.chunks(3).zip(&frame.mask) {
+            for (pixel, mask) in frame.shown().image.pixels.chunks(3).zip(&frame.shown().mask) {
                 assert!(*mask > 0.0 || pixel == [0.0; 3], "a hidden colour");
             }
         }
-        assert_eq!(capture.eval[0].frame.mask.iter().filter(|m| **m > 0.5).count(), 4 * SIZE.1 as usize);
-        let columns = |f: &crate::data::Frame| (0..SIZE.0 as usize).filter(|&x| f.mask[x] > 0.5).collect::<Vec<_>>();
+        assert_eq!(capture.eval[0].frame.shown().mask.iter().filter(|m| **m > 0.5).count(), 4 * SIZE.1 as usize);
+        let columns =
+            |f: &crate::data::Frame| (0..SIZE.0 as usize).filter(|&x| f.shown().mask[x] > 0.5).collect::<Vec<_>>();
         capture.train.iter().map(columns).collect::<Vec<_>>()
     };
     let (whole, halved) = (vec![4, 5, 6, 7], vec![4, 7]);
@@ -127,7 +130,7 @@ fn hidden_pixels_never_reach_training_and_kept_back_views_are_whole() {
     // Rows as well as columns: the upper half of a column.
     fixture.occlusion("Camera_B1", [12, 8], [4, 0, 5, 4], &[0]);
     let capture = load_capture(fixture.dir.path(), &body(), &LoadOptions::default()).unwrap();
-    let column: Vec<f32> = (0..8).map(|y| capture.train[0].mask[y * 12 + 4]).collect();
+    let column: Vec<f32> = (0..8).map(|y| capture.train[0].shown().mask[y * 12 + 4]).collect();
     assert_eq!(column, [0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 1.0]);
     fixture.occlusion("Camera_B2", [12, 8], [4, 0, 5, 8], &[1]);
     assert_eq!(hidden(&LoadOptions::default())[1], [4, 7], "about another camera");
@@ -158,7 +161,8 @@ fn lens_distortion_is_undone() {
         let capture = load_capture(fixture.dir.path(), &body(), &clear()).unwrap();
         let frame = &capture.train[0];
         let (mut worst, mut seen) = (0.0f32, 0);
-        for (i, pixel) in frame.image.pixels.chunks(3).enumerate().filter(|(i, _)| frame.mask[*i] > 0.999) {
+        let shown = frame.shown();
+        for (i, pixel) in shown.image.pixels.chunks(3).enumerate().filter(|(i, _)| shown.mask[*i] > 0.999) {
             let at = Vec2::new((i % 96) as f32 + 0.5, (i / 96) as f32 + 0.5);
             worst = worst.max((pixel[0] - pattern((at - frame.camera.centre) / frame.camera.focal)).abs());
             seen += 1;
@@ -183,7 +187,7 @@ fn resizing_scales_projections_exactly() {
     let options = LoadOptions { resize: Some(6), ..clear() };
     let small = load_capture(fixture.dir.path(), &body(), &options).unwrap();
     for (a, b) in large.train.iter().zip(&small.train) {
-        assert_eq!((b.image.width, b.image.height, b.mask.len()), (6, 4, 24));
+        assert_eq!((b.shown().image.width, b.shown().image.height, b.shown().mask.len()), (6, 4, 24));
         let posed = body().pose(&body().shaped(&a.betas), &a.pose, a.placement);
         for v in posed.vertices {
             let (p, q) = (a.camera.project(v).unwrap(), b.camera.project(v).unwrap());
@@ -191,12 +195,12 @@ fn resizing_scales_projections_exactly() {
         }
         // Coverage and premultiplied colour shrink alike.
         let sum = |values: &[f32]| values.iter().sum::<f32>();
-        assert!((sum(&b.mask) - 0.25 * sum(&a.mask)).abs() < 1e-4);
-        for (pixel, mask) in b.image.pixels.chunks(3).zip(&b.mask) {
+        assert!((sum(&b.shown().mask) - 0.25 * sum(&a.shown().mask)).abs() < 1e-4);
+        for (pixel, mask) in b.shown().image.pixels.chunks(3).zip(&b.shown().mask) {
             assert!((pixel[0] - mask * 200.0 / 255.0).abs() < 0.02);
         }
     }
     let options = LoadOptions { resize: Some(100), ..clear() };
     let same = load_capture(fixture.dir.path(), &body(), &options).unwrap();
-    assert_eq!(same.train[0].image, large.train[0].image, "nothing is enlarged");
+    assert_eq!(same.train[0].shown().image, large.train[0].shown().image, "nothing is enlarged");
 }

@@ -1,0 +1,66 @@
+//! Captures whose pictures do not all fit in memory train as those do that fit.
+#![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
+
+mod common;
+
+use common::{TempDir, config};
+use occnerf::data::{Capture, Layout, LoadOptions, SynthConfig, load_capture, synthesise};
+use occnerf::{FieldRenderer, Method, Scene, Trainer, VertexColors, evaluate};
+use smpl::BodyModel;
+
+const SIZE: u32 = 32;
+const STEPS: u64 = 8;
+
+/// A capture on disk, read with room for the pictures of so many frames.
+fn read(dir: &TempDir, body: &BodyModel, pictures: u64) -> Capture {
+    let bodies = 8 * body.num_vertices() as u64 * 36;
+    let max_bytes = bodies + pictures * u64::from(SIZE * SIZE) * 16;
+    load_capture(&dir.path("capture"), body, &LoadOptions { max_bytes, ..LoadOptions::default() }).unwrap()
+}
+
+/// Checkpoint after all steps, and the scores of the views kept back.
+fn trained(dir: &TempDir, trainer: &Trainer<'_>, scene: &Scene) -> (Vec<u8>, Option<f64>) {
+    trainer.save(&dir.path("checkpoint")).unwrap();
+    let frames: Vec<_> = scene.eval.iter().collect();
+    let scores = evaluate(scene, &mut FieldRenderer::new(trainer).unwrap(), &frames, |_, _| {}).unwrap();
+    (std::fs::read(dir.path("checkpoint")).unwrap(), scores.psnr_mask)
+}
+
+#[test]
+fn training_from_files_is_training_from_memory() {
+    let dir = TempDir::new("on-demand");
+    let synth = SynthConfig { size: SIZE, frames: 4, eval_cameras: 2, eval_every: 2, ..SynthConfig::default() };
+    let made = synthesise(None, None, &synth, &|_| {}).unwrap();
+    made.write(&dir.path("capture"), Layout::HumanNerf, &|_| {}).unwrap();
+    let config = occnerf::Config { steps: STEPS, ..config(Method::Occnerf) };
+
+    let capture = read(&dir, &made.body, 8);
+    assert_eq!((capture.train.len(), capture.eval.len()), (4, 4));
+    let scene = Scene::new(&capture, &made.body, &config).unwrap();
+    let mut trainer = Trainer::new(&scene, config.clone()).unwrap();
+    (0..STEPS).for_each(|_| assert!(trainer.step().unwrap().loss.is_finite()));
+    let in_memory = trained(&dir, &trainer, &scene);
+
+    let capture = read(&dir, &made.body, 1);
+    let few = Scene::new(&capture, &made.body, &config).unwrap();
+    assert_eq!(VertexColors::measure(&few).unwrap(), VertexColors::measure(&scene).unwrap());
+    let mut trainer = Trainer::new(&few, config).unwrap();
+    // A picture that goes missing stops training where it was, and nothing is lost when it comes back.
+    let (picture, away) = (dir.path("capture/images/frame_000002.png"), dir.path("away.png"));
+    let mut missed = 0;
+    while trainer.steps_done() < STEPS {
+        if trainer.steps_done() == 2 && missed == 0 {
+            std::fs::rename(&picture, &away).unwrap();
+        }
+        if let Err(error) = trainer.step() {
+            assert!(error.to_string().contains("frame_000002.png"), "{error}");
+            missed += 1;
+            std::fs::rename(&away, &picture).unwrap();
+        }
+    }
+    assert_eq!(missed, 1);
+    assert!(trained(&dir, &trainer, &few) == in_memory);
+    std::fs::remove_file(&picture).unwrap();
+    let message = VertexColors::measure(&few).unwrap_err().to_string();
+    assert!(message.contains("frame_000002.png"), "{message}");
+}
