@@ -18,17 +18,20 @@ pub struct ObstacleArguments {
     /// How far it stands to the right of the person, in picture widths [default: 0]
     #[arg(long, value_name = "-1 to 1", allow_negative_numbers = true)]
     pub position: Option<f32>,
+    /// How high it is, in picture heights, about the person's middle row [default: 1, a strip as high as the picture]
+    #[arg(long, value_name = "above 0 to 1")]
+    pub height: Option<f32>,
 }
 
 impl ObstacleArguments {
     /// Whether anything was asked for.
     pub fn given(&self) -> bool {
-        self.fraction.or(self.share).or(self.position).is_some()
+        self.fraction.or(self.share).or(self.position).or(self.height).is_some()
     }
 
     /// No obstacle at all.
     pub fn none(&self) -> Result<Obstacle> {
-        ensure!(!self.given(), "--occlusion none has no --fraction, --share or --position");
+        ensure!(!self.given(), "--occlusion none has no --fraction, --share, --position or --height");
         Ok(Obstacle { fraction: 0.0, ..Obstacle::default() })
     }
 
@@ -39,6 +42,7 @@ impl ObstacleArguments {
             fraction: self.fraction.unwrap_or(paper.fraction),
             share: self.share.unwrap_or(paper.share),
             position: self.position.unwrap_or(paper.position),
+            height: self.height.unwrap_or(paper.height),
             ..paper
         }
     }

@@ -115,6 +115,7 @@ impl LoadArguments {
         add("fraction", number(self.obstacle.fraction));
         add("share", number(self.obstacle.share));
         add("position", number(self.obstacle.position));
+        add("height", number(self.obstacle.height));
         let not_zero = |x: f32| (x != 0.0).then(|| x.to_string());
         add("wrong-pose", not_zero(self.wrong_pose));
         add("wrong-shape", not_zero(self.wrong_shape));
@@ -191,7 +192,7 @@ mod tests {
     #[test]
     fn a_command_line_made_of_options_says_all_of_them() {
         let words = "x --resize 64 --stride 2 --max-frames 9 --eval-stride 3 --camera B2 --occlusion moving --fraction 0.4 \
-                     --share 0.7 --position -0.1 --memory 2048 --wrong-pose 2.5 --wrong-shape 1 --wrong-mask -3";
+                     --share 0.7 --position -0.1 --height 0.5 --memory 2048 --wrong-pose 2.5 --wrong-shape 1 --wrong-mask -3";
         for words in [words, "x"] {
             let load = Line::parse_from(words.split_whitespace()).load;
             let again = format!("x{}", load.command_line());

@@ -94,8 +94,8 @@ impl SynthArguments {
             OcclusionName::Central => Occlusion::Rectangle(self.obstacle.central()),
             OcclusionName::Moving => Occlusion::Rectangle(self.obstacle.moving()),
             OcclusionName::Objects => {
-                let said = "--occlusion objects has no --share: they stand in every frame";
-                ensure!(self.obstacle.share.is_none(), said);
+                let said = "--occlusion objects has no --share (they stand in every frame) and no --height";
+                ensure!(self.obstacle.share.or(self.obstacle.height).is_none(), said);
                 let Obstacle { fraction, position, .. } = self.obstacle.central();
                 Occlusion::Objects { fraction, position }
             }

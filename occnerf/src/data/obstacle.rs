@@ -1,5 +1,4 @@
-//! The paper's simulated obstacle (§4, Datasets): a box in front of the camera that hides a rectangle as high as the
-//! picture.
+//! The paper's simulated obstacle (§4, Datasets): a box in front of the camera that hides a rectangle.
 
 use std::ops::Range;
 
@@ -10,7 +9,7 @@ use super::source::Edit;
 use super::{DataError, Frame};
 
 /// A simulated obstacle in front of the training camera. The default is the paper's: fixed, central, hiding half of
-/// the subject's pixels in the first 80 % of the frames.
+/// the subject's pixels in the first 80 % of the frames, and as high as the picture, as in the code published with it.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Obstacle {
@@ -23,11 +22,55 @@ pub struct Obstacle {
     /// How far it moves to the right, evenly over the occluded frames, in picture widths, −2 to 2. It is at `position`
     /// half-way through.
     pub travel: f32,
+    /// Its height in picture heights, above 0 to 1; its middle is at the subject's mean row, or as near as the picture allows.
+    pub height: f32,
+}
+
+/// A rectangle of pixels.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) struct Area {
+    pub columns: Range<u32>,
+    pub rows: Range<u32>,
+}
+
+impl Area {
+    pub fn is_empty(&self) -> bool {
+        self.columns.is_empty() || self.rows.is_empty()
+    }
+
+    /// Whether the pixel of this index is inside, in a picture of this width.
+    pub fn contains(&self, pixel: usize, width: u32) -> bool {
+        let pixel = pixel as u32;
+        self.columns.contains(&(pixel % width)) && self.rows.contains(&(pixel / width))
+    }
+}
+
+/// Where a frame's subject is.
+struct Subject {
+    /// Pixels by column, of the rows looked at.
+    columns: Vec<u32>,
+    /// Pixels in other rows.
+    elsewhere: u32,
+}
+
+impl Subject {
+    fn count(mask: &[f32], width: u32, rows: &Range<u32>) -> Self {
+        let mut found = Self { columns: vec![0; width as usize], elsewhere: 0 };
+        for (row, pixels) in (0..).zip(mask.chunks_exact(width.max(1) as usize)) {
+            let subject = pixels.iter().map(|&m| u32::from(m > 0.5));
+            if rows.contains(&row) {
+                found.columns.iter_mut().zip(subject).for_each(|(count, here)| *count += here);
+            } else {
+                found.elsewhere += subject.sum::<u32>();
+            }
+        }
+        found
+    }
 }
 
 impl Default for Obstacle {
     fn default() -> Self {
-        Self { fraction: 0.5, share: 0.8, position: 0.0, travel: 0.0 }
+        Self { fraction: 0.5, share: 0.8, position: 0.0, travel: 0.0, height: 1.0 }
     }
 }
 
@@ -38,21 +81,47 @@ impl Obstacle {
             ("occlusion.share", self.share, 0.0, 1.0),
             ("occlusion.position", self.position, -1.0, 1.0),
             ("occlusion.travel", self.travel, -2.0, 2.0),
+            ("occlusion.height", self.height, f32::MIN_POSITIVE, 1.0),
         ] {
             if !(low..=high).contains(&value) {
-                return Err(DataError::setting(name, format!("{low} to {high}"), value));
+                let least = if low == f32::MIN_POSITIVE { "above 0".to_owned() } else { low.to_string() };
+                return Err(DataError::setting(name, format!("{least} to {high}"), value));
             }
         }
         Ok(())
     }
 
-    /// The columns that are hidden in each frame, given how many pixels of the subject each column of each frame has.
+    /// How many of the frames it stands in, from the first.
+    fn affected(&self, frames: usize) -> usize {
+        ((self.share * frames as f32).round() as usize).min(frames)
+    }
+
+    /// The rows that it hides in frames of this size.
+    fn rows(&self, frames: &[Frame], (width, height): (u32, u32)) -> Result<Range<u32>, DataError> {
+        if self.height >= 1.0 {
+            return Ok(0..height);
+        }
+        let (mut total, mut weighted) = (0u64, 0u64);
+        for frame in &frames[..self.affected(frames.len())] {
+            for (row, pixels) in (0..).zip(frame.pixels()?.mask.chunks_exact(width.max(1) as usize)) {
+                let count = pixels.iter().filter(|m| **m > 0.5).count() as u64;
+                total += count;
+                weighted += row * count;
+            }
+        }
+        let mean = weighted as f64 / total.max(1) as f64 + 0.5;
+        let rows = (f64::from(self.height) * f64::from(height)).round().clamp(1.0, f64::from(height)) as u32;
+        let start = (mean - 0.5 * f64::from(rows)).round().clamp(0.0, f64::from(height - rows)) as u32;
+        Ok(start..start + rows)
+    }
+
+    /// The columns that are hidden in each frame.
     ///
     /// The obstacle has one width, such that the part of all subject pixels of the occluded frames that it hides is as
     /// near to `fraction` as whole columns come. Ranges are empty where nothing is hidden.
-    fn columns(&self, subject: &[Vec<u32>]) -> Vec<Range<u32>> {
-        let affected = ((self.share * subject.len() as f32).round() as usize).min(subject.len());
-        let w = subject.first().map_or(0, |columns| columns.len() as i64);
+    fn columns(&self, subject: &[Subject]) -> Vec<Range<u32>> {
+        let affected = self.affected(subject.len());
+        let w = subject.first().map_or(0, |first| first.columns.len() as i64);
         let last = affected.saturating_sub(1) as f64;
         let step = f64::from(self.travel) * w as f64 / last.max(1.0);
         // In frame i the obstacle is `shifts[i]` columns to the right of where it is half-way.
@@ -61,8 +130,8 @@ impl Obstacle {
         // Subject pixels by column relative to the moving obstacle, from −reach on.
         let mut histogram = vec![0u64; (2 * reach + w) as usize];
         let (mut total, mut weighted) = (0u64, 0u64);
-        for (columns, shift) in subject.iter().zip(&shifts) {
-            for (column, &count) in columns.iter().enumerate() {
+        for (subject, shift) in subject.iter().zip(&shifts) {
+            for (column, &count) in subject.columns.iter().enumerate() {
                 let count = u64::from(count);
                 histogram[(column as i64 - shift + reach) as usize] += count;
                 total += count;
@@ -76,7 +145,8 @@ impl Obstacle {
         // Mean of the subject's pixels, in pixels from the left edge.
         let mean = weighted as f64 / total as f64 + 0.5;
         let centre = mean + f64::from(self.position) * w as f64 + reach as f64;
-        let window = grow(&histogram, centre, f64::from(self.fraction) * total as f64);
+        let all = total + subject[..affected].iter().map(|s| u64::from(s.elsewhere)).sum::<u64>();
+        let window = grow(&histogram, centre, f64::from(self.fraction) * all as f64);
         for (range, shift) in hidden.iter_mut().zip(&shifts) {
             let clip = |x: usize| (x as i64 - reach + shift).clamp(0, w) as u32;
             *range = clip(window.start)..clip(window.end);
@@ -84,28 +154,21 @@ impl Obstacle {
         hidden
     }
 
-    /// Hides what the obstacle covers in a video of equally large frames; returns the hidden columns of each.
-    pub(super) fn hide(&self, frames: &mut [Frame]) -> Result<Vec<Range<u32>>, DataError> {
-        let counted: Vec<Result<Vec<u32>, DataError>> = frames.par_iter().map(subject_by_column).collect();
+    /// Hides what the obstacle covers in a video of equally large frames; returns what is hidden of each.
+    pub(super) fn hide(&self, frames: &mut [Frame]) -> Result<Vec<Area>, DataError> {
+        let Some((width, height)) = frames.first().map(|f| (f.camera.width, f.camera.height)) else {
+            return Ok(Vec::new());
+        };
+        let rows = self.rows(frames, (width, height))?;
+        let subject = |frame: &Frame| Ok(Subject::count(&frame.pixels()?.mask, width, &rows));
+        let counted: Vec<Result<Subject, DataError>> = frames.par_iter().map(subject).collect();
         let columns = self.columns(&counted.into_iter().collect::<Result<Vec<_>, _>>()?);
-        for (frame, hidden) in frames.iter_mut().zip(&columns).filter(|(_, hidden)| !hidden.is_empty()) {
-            frame.source.edit(Edit::Hide(hidden.clone()));
+        let areas: Vec<Area> = columns.into_iter().map(|columns| Area { columns, rows: rows.clone() }).collect();
+        for (frame, area) in frames.iter_mut().zip(&areas).filter(|(_, area)| !area.is_empty()) {
+            frame.source.edit(Edit::Hide(area.clone()));
         }
-        Ok(columns)
+        Ok(areas)
     }
-}
-
-/// How many pixels of the subject each column of a frame has.
-fn subject_by_column(frame: &Frame) -> Result<Vec<u32>, DataError> {
-    Ok(by_column(&frame.pixels()?.mask, frame.camera.width))
-}
-
-fn by_column(mask: &[f32], width: u32) -> Vec<u32> {
-    let mut counts = vec![0; width as usize];
-    for row in mask.chunks_exact(counts.len().max(1)) {
-        counts.iter_mut().zip(row).for_each(|(count, &m)| *count += u32::from(m > 0.5));
-    }
-    counts
 }
 
 /// The range around `centre` whose sum is nearest to `target`; of several, the narrowest.
@@ -141,6 +204,10 @@ mod tests {
         (0..width * rows).map(|i| f32::from(columns.contains(&(i % width)))).collect()
     }
 
+    fn whole(mask: &[f32], width: u32) -> Subject {
+        Subject::count(mask, width, &(0..u32::MAX))
+    }
+
     fn always(fraction: f32) -> Obstacle {
         Obstacle { fraction, share: 1.0, ..Obstacle::default() }
     }
@@ -148,14 +215,14 @@ mod tests {
     #[test]
     fn half_of_a_bar_is_its_middle_half() {
         let mask = bar(12, 2, 2..10);
-        assert_eq!(always(0.5).columns(&[by_column(&mask, 12)])[0], 4..8);
-        assert_eq!(always(0.25).columns(&vec![by_column(&mask, 12); 2]), [5..7, 5..7]);
-        assert!(always(0.0).columns(&[by_column(&mask, 12)])[0].is_empty());
+        assert_eq!(always(0.5).columns(&[whole(&mask, 12)])[0], 4..8);
+        assert_eq!(always(0.25).columns(&[(); 2].map(|()| whole(&mask, 12))), [5..7, 5..7]);
+        assert!(always(0.0).columns(&[whole(&mask, 12)])[0].is_empty());
     }
 
     #[test]
     fn an_empty_video_hides_nothing() {
-        assert!(always(0.5).columns(&[by_column(&[0.0; 8], 4)])[0].is_empty());
+        assert!(always(0.5).columns(&[whole(&[0.0; 8], 4)])[0].is_empty());
         assert!(always(0.5).columns(&[]).is_empty());
         assert!(always(0.5).hide(&mut []).unwrap().is_empty());
     }
@@ -163,8 +230,8 @@ mod tests {
     #[test]
     fn a_subject_at_the_border_is_covered_from_there() {
         let mask = bar(10, 1, 0..4);
-        assert_eq!(always(0.5).columns(&[by_column(&mask, 10)])[0], 1..3);
-        let columns = always(0.95).columns(&[by_column(&mask, 10)]);
+        assert_eq!(always(0.5).columns(&[whole(&mask, 10)])[0], 1..3);
+        let columns = always(0.95).columns(&[whole(&mask, 10)]);
         assert!(columns[0].start == 0 && columns[0].end >= 4);
     }
 
@@ -172,7 +239,7 @@ mod tests {
     fn the_first_share_of_the_frames_is_occluded() {
         let mask = bar(12, 2, 2..10);
         for (share, affected) in [(0.0, 0), (0.3, 3), (0.8, 8), (1.0, 10)] {
-            let columns = Obstacle { share, ..Obstacle::default() }.columns(&vec![by_column(&mask, 12); 10]);
+            let columns = Obstacle { share, ..Obstacle::default() }.columns(&[(); 10].map(|()| whole(&mask, 12)));
             let hidden: Vec<bool> = columns.iter().map(|c| !c.is_empty()).collect();
             assert_eq!(hidden, (0..10).map(|i| i < affected).collect::<Vec<_>>());
         }
@@ -181,16 +248,16 @@ mod tests {
     #[test]
     fn position_moves_the_middle() {
         let mask = bar(40, 3, 10..30);
-        assert_eq!(always(0.5).columns(&[by_column(&mask, 40)])[0], 15..25);
-        assert_eq!(Obstacle { position: 0.125, ..always(0.5) }.columns(&[by_column(&mask, 40)])[0], 20..30);
-        assert_eq!(Obstacle { position: -0.125, ..always(0.5) }.columns(&[by_column(&mask, 40)])[0], 10..20);
+        assert_eq!(always(0.5).columns(&[whole(&mask, 40)])[0], 15..25);
+        assert_eq!(Obstacle { position: 0.125, ..always(0.5) }.columns(&[whole(&mask, 40)])[0], 20..30);
+        assert_eq!(Obstacle { position: -0.125, ..always(0.5) }.columns(&[whole(&mask, 40)])[0], 10..20);
     }
 
     #[test]
     fn a_moving_obstacle_travels_evenly_and_is_central_half_way() {
         let mask = bar(40, 3, 10..30);
         let moving = Obstacle { travel: 0.2, ..always(0.5) };
-        let columns = moving.columns(&vec![by_column(&mask, 40); 5]);
+        let columns = moving.columns(&[(); 5].map(|()| whole(&mask, 40)));
         let starts: Vec<u32> = columns.iter().map(|c| c.start).collect();
         assert_eq!(starts.windows(2).map(|s| s[1] - s[0]).collect::<Vec<_>>(), [2; 4]);
         assert_eq!(columns[2], 15..25);
@@ -204,6 +271,7 @@ mod tests {
             ("share", Obstacle { share: -0.1, ..Obstacle::default() }),
             ("position", Obstacle { position: f32::NAN, ..Obstacle::default() }),
             ("travel", Obstacle { travel: f32::INFINITY, ..Obstacle::default() }),
+            ("height", Obstacle { height: 0.0, ..Obstacle::default() }),
         ] {
             let message = obstacle.check().unwrap_err().to_string();
             assert!(message.contains(name) && message.contains(" to "), "{message}");
@@ -220,7 +288,7 @@ mod tests {
             fraction in 0.0f32..0.75, travel in -0.125f32..0.125,
         ) {
             let masks: Vec<Vec<f32>> = bits.chunks(24 * 6).map(|b| b.iter().map(|&b| f32::from(b)).collect()).collect();
-            let counts: Vec<Vec<u32>> = masks.iter().map(|mask| by_column(mask, 24)).collect();
+            let counts: Vec<Subject> = masks.iter().map(|mask| whole(mask, 24)).collect();
             let columns = Obstacle { travel, ..always(fraction) }.columns(&counts);
             let subject = |i: usize, columns: &Range<u32>| masks[i].iter().enumerate()
                 .filter(|(p, m)| **m > 0.5 && columns.contains(&(*p as u32 % 24))).count() as f32;

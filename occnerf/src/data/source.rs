@@ -1,9 +1,9 @@
 //! The pixels of frames: in memory, or in files that are decoded when asked for.
 
-use std::ops::Range;
 use std::sync::{Arc, OnceLock};
 
 use super::decode::Files;
+use super::obstacle::Area;
 use super::{DataError, Image};
 
 /// What a frame shows.
@@ -19,11 +19,10 @@ pub struct Pixels {
 }
 
 impl Pixels {
-    /// Lets nothing be seen in `columns`.
-    fn hide(&mut self, columns: &Range<u32>) {
+    /// Lets nothing be seen in an area.
+    fn hide(&mut self, area: &Area) {
         let width = self.image.width;
-        let visible: Vec<f32> =
-            (0..self.mask.len()).map(|p| if columns.contains(&(p as u32 % width)) { 0.0 } else { 1.0 }).collect();
+        let visible: Vec<f32> = (0..self.mask.len()).map(|p| if area.contains(p, width) { 0.0 } else { 1.0 }).collect();
         self.mask.iter_mut().zip(&visible).for_each(|(mask, seen)| *mask *= seen);
         self.image.multiply(&visible);
     }
@@ -57,8 +56,8 @@ impl Pixels {
 /// A change of pixels that can be made whenever they are decoded.
 #[derive(Clone, Debug)]
 pub(super) enum Edit {
-    /// Something stands before these columns.
-    Hide(Range<u32>),
+    /// Something stands before these pixels.
+    Hide(Area),
     /// The mask is larger, or smaller, by so many pixels.
     Grow(i32),
 }
@@ -66,7 +65,7 @@ pub(super) enum Edit {
 impl Edit {
     fn apply(&self, pixels: &mut Pixels) {
         match self {
-            Self::Hide(columns) => pixels.hide(columns),
+            Self::Hide(area) => pixels.hide(area),
             Self::Grow(by) => pixels.grow(*by),
         }
     }

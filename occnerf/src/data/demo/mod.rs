@@ -194,11 +194,11 @@ pub(super) fn grounded_walk(config: &DemoConfig, body: &BodyModel, shaped: &Shap
 /// Puts the obstacle in front of the first frames.
 fn occlude(train: &mut [Frame], config: &DemoConfig) -> Result<(), DataError> {
     let obstacle = Obstacle { fraction: config.occluded_fraction, share: config.occluded_share, ..Obstacle::default() };
-    let columns = obstacle.hide(train)?;
+    let areas = obstacle.hide(train)?;
     if config.known_occluder {
-        for (frame, hidden) in train.iter_mut().zip(columns) {
+        for (frame, hidden) in train.iter_mut().zip(areas) {
             frame.source.change(|pixels| {
-                let covered = (0..pixels.mask.len()).map(|p| hidden.contains(&(p as u32 % config.size))).collect();
+                let covered = (0..pixels.mask.len()).map(|p| hidden.contains(p, config.size)).collect();
                 pixels.occluder = Some(covered);
             })?;
         }

@@ -10,7 +10,6 @@ pub(super) mod stage;
 mod tests;
 mod texture;
 
-use std::ops::Range;
 use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
@@ -19,6 +18,7 @@ use smpl::{BodyModel, Character, MotionClip};
 use self::objects::Objects;
 use self::render::Picture;
 use super::demo::{DemoConfig, film, grounded_walk};
+use super::obstacle::Area;
 use super::{Capture, DataError, Frame, LoadOptions, Obstacle, Pixels};
 
 /// What stands in front of the person in the training view.
@@ -139,8 +139,8 @@ pub struct Synthetic {
     pub hidden_fraction: f32,
     /// The training view without the occlusion.
     pub(super) clear: Vec<Picture>,
-    /// Columns that the rectangle hides in each training frame; empty for objects.
-    pub(super) columns: Vec<Range<u32>>,
+    /// What the rectangle hides in each training frame; empty for objects.
+    pub(super) hidden: Vec<Area>,
     /// The objects and the room.
     pub(super) objects: Option<Objects>,
 }
@@ -180,10 +180,10 @@ pub fn synthesise(
         }
     };
     let clear: Vec<Picture> = pixels(&capture.train)?.iter().map(|p| (p.image.clone(), p.mask.clone())).collect();
-    let mut columns = Vec::new();
+    let mut hidden = Vec::new();
     let mut objects = None;
     match config.occlusion {
-        Occlusion::Rectangle(obstacle) => columns = obstacle.hide(&mut capture.train)?,
+        Occlusion::Rectangle(obstacle) => hidden = obstacle.hide(&mut capture.train)?,
         Occlusion::Objects { fraction, position } => {
             let made = Objects::new(&capture.train, height, fraction, position)?;
             made.hide(&mut capture.train)?;
@@ -191,7 +191,7 @@ pub fn synthesise(
         }
     }
     let hidden_fraction = hidden_fraction(&clear, &pixels(&capture.train)?);
-    Ok(Synthetic { capture, body, config: *config, hidden_fraction, clear, columns, objects })
+    Ok(Synthetic { capture, body, config: *config, hidden_fraction, clear, hidden, objects })
 }
 
 fn pixels(frames: &[Frame]) -> Result<Vec<Arc<Pixels>>, DataError> {

@@ -26,8 +26,7 @@ pub(super) fn write(synthetic: &Synthetic, folder: &Folder<'_>) -> Result<(), Da
         Ok(match &synthetic.objects {
             Some(objects) => grey(objects.coverage(), image),
             None => {
-                let columns = &synthetic.columns[i];
-                let covered = |p: usize| f32::from(columns.contains(&(p as u32 % image.width)));
+                let covered = |p: usize| f32::from(synthetic.hidden[i].contains(p, image.width));
                 grey(&(0..mask.len()).map(covered).collect::<Vec<f32>>(), image)
             }
         })

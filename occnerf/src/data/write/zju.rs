@@ -5,6 +5,7 @@ use image::GrayImage;
 use serde_json::{Value, json};
 
 use super::{Folder, Py, flat, origin, rgb, rows};
+use crate::data::obstacle::Area;
 use crate::data::synth::Synthetic;
 use crate::data::{DataError, Frame, Image};
 
@@ -89,18 +90,19 @@ fn annots(instants: usize, cameras: &[(&str, Vec<(usize, &Frame)>)]) -> Py {
 /// The rectangle; of one that moves, its place in each frame.
 fn occlusion(synthetic: &Synthetic) -> Value {
     let size = synthetic.config.size;
-    let hiding = synthetic.columns.iter().enumerate().filter(|(_, columns)| !columns.is_empty());
-    let (frames, columns): (Vec<usize>, Vec<_>) = hiding.map(|(i, columns)| (i, columns.clone())).unzip();
-    let corners = |x0: u32, x1: u32| json!({"x0": x0, "y0": 0, "x1": x1, "y1": size});
-    let first = columns.first().cloned().unwrap_or(0..0);
+    let hiding = synthetic.hidden.iter().enumerate().filter(|(_, area)| !area.is_empty());
+    let (frames, areas): (Vec<usize>, Vec<&Area>) = hiding.unzip();
+    let corners = |a: &Area| json!({"x0": a.columns.start, "y0": a.rows.start, "x1": a.columns.end, "y1": a.rows.end});
+    let none = Area { columns: 0..0, rows: 0..size };
+    let first = areas.first().copied().unwrap_or(&none);
     let mut file = json!({
         "camera": TRAINING,
         "image_size": [size, size],
-        "rect": corners(first.start, first.end),
+        "rect": corners(first),
         "frames": frames,
     });
-    if columns.iter().any(|c| *c != first) {
-        file["rects"] = columns.iter().map(|c| corners(c.start, c.end)).collect();
+    if areas.iter().any(|area| *area != first) {
+        file["rects"] = areas.iter().map(|area| corners(area)).collect();
     }
     file
 }

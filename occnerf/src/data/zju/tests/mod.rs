@@ -137,6 +137,24 @@ fn hidden_pixels_never_reach_training_and_kept_back_views_are_whole() {
 }
 
 #[test]
+fn a_lower_obstacle_hides_its_part_about_the_middle_row() {
+    let fixture = Fixture::new("zju-low");
+    // The subject is four columns of eight rows; of the four rows in the middle two columns are a quarter of it.
+    let low = Obstacle { fraction: 0.25, share: 1.0, height: 0.5, ..Obstacle::default() };
+    for (fraction, columns) in [(0.25, 5..7), (0.5, 4..8), (0.9, 4..8)] {
+        let options = LoadOptions { occlusion: Some(Obstacle { fraction, ..low }), ..LoadOptions::default() };
+        let capture = load_capture(fixture.dir.path(), &body(), &options).unwrap();
+        for frame in &capture.train {
+            for (i, m) in frame.shown().mask.iter().enumerate() {
+                let (x, y) = (i % SIZE.0 as usize, i / SIZE.0 as usize);
+                let subject = (4..8).contains(&x) && !((2..6).contains(&y) && columns.contains(&x));
+                assert_eq!(*m > 0.5, subject, "{fraction}: {x} {y}");
+            }
+        }
+    }
+}
+
+#[test]
 fn lens_distortion_is_undone() {
     let size = (96, 64);
     let mut fixture = Fixture::new("zju-lens");
