@@ -3,6 +3,7 @@
 use glam::Vec3;
 use rayon::prelude::*;
 
+use crate::Error;
 use crate::batch::{Batch, target};
 use crate::config::LossConfig;
 use crate::data::Pixels;
@@ -37,7 +38,7 @@ impl Photometric {
         batch: &Batch,
         (labels, pixels): (&Labels, &Pixels),
         report: &mut StepReport,
-    ) {
+    ) -> Result<(), Error> {
         let Self { targets, d_colors, prediction, .. } = self;
         prediction.resize(3 * batch.pixels.len(), 0.0);
         for state in groups {
@@ -59,12 +60,13 @@ impl Photometric {
         report.mse = squares / (3 * known.max(1)) as f64;
         report.psnr = -10.0 * report.mse.max(1e-12).log10();
         if loss.perceptual > 0.0 {
-            report.perceptual = self.perceptual(loss.perceptual, lpips, batch.size);
+            report.perceptual = self.perceptual(loss.perceptual, lpips, batch.size)?;
         }
+        Ok(())
     }
 
     /// Mean of the patches' perceptual terms; adds `weight` times its gradient to `d_colors` where the target is known.
-    fn perceptual(&mut self, weight: f32, lpips: Option<&Lpips>, size: usize) -> f64 {
+    fn perceptual(&mut self, weight: f32, lpips: Option<&Lpips>, size: usize) -> Result<f64, Error> {
         let Self { targets, d_colors, prediction, shown, d_prediction, dissimilarities, values } = self;
         shown.clear();
         shown.extend_from_slice(prediction);
@@ -79,10 +81,8 @@ impl Photometric {
         let count = prediction.len() / patch;
         let scale = weight / count as f32;
         match lpips {
-            // The size was checked when the weights were loaded.
             Some(lpips) => {
-                *values =
-                    lpips.distance_backward(prediction, shown, size, size, scale, d_prediction).unwrap_or_default();
+                *values = lpips.distance_backward(prediction, shown, size, size, scale, d_prediction)?;
             }
             None => {
                 dissimilarities.resize_with(count, Dissimilarity::default);
@@ -99,6 +99,6 @@ impl Photometric {
                 *d_color += Vec3::from_slice(d);
             }
         }
-        values.iter().sum::<f64>() / count as f64
+        Ok(values.iter().sum::<f64>() / count as f64)
     }
 }

@@ -287,14 +287,14 @@ impl<'a> Trainer<'a> {
     /// One optimisation step.
     ///
     /// # Errors
-    /// [`Error::Data`] where the step's picture cannot be decoded (any more). The trainer is then as it was before.
-    ///
-    /// # Panics
-    /// If the configuration names weights of the perceptual term and [`Trainer::load_perceptual`] was not called.
+    /// [`Error::Data`] where the step's picture cannot be decoded (any more); [`Error::Lpips`] where the configuration names
+    /// weights of the perceptual term and [`Trainer::load_perceptual`] was not called. The trainer is then as it was before.
     pub fn step(&mut self) -> Result<StepReport, Error> {
         let loss = &self.config.loss;
         let loaded = self.lpips.is_some() || loss.perceptual_weights.is_empty() || loss.perceptual == 0.0;
-        assert!(loaded, "weights of the perceptual term were not loaded");
+        if !loaded {
+            return Err(Error::Lpips("the weights of the perceptual term were not loaded".to_owned()));
+        }
         let step = self.steps_done;
         let (mut times, mut watch) = (StepTimes::default(), Stopwatch::start());
         self.batch.draw(self.scene, &self.config, step);
@@ -334,7 +334,7 @@ impl<'a> Trainer<'a> {
             &batch,
             (&frame.labels, &shown),
             &mut report,
-        );
+        )?;
         let d_colors = &photometric.d_colors;
         self.field.mlp.transposed_weights(self.parameters.get(Part::Field), &mut self.transposed);
         watch.lap(&mut times.losses);

@@ -61,6 +61,8 @@ fn weights_that_are_gone_and_patches_that_are_too_small_are_errors_before_the_fi
     let mut trainer = Trainer::new(common::scene(), Config { patch_size: 16, ..config(&weights) }).unwrap();
     let error = trainer.load_perceptual().unwrap_err().to_string();
     assert!(error.contains("16 × 16") && error.contains("at least 17"), "{error}");
+    let error = trainer.step().unwrap_err().to_string();
+    assert!(error.contains("not loaded") && trainer.steps_done() == 0, "{error}");
 }
 
 #[test]
