@@ -46,10 +46,7 @@ impl Batch {
                 let [x0, y0, x1, y1] = body;
                 (x0 + random.below((x1 - x0) as usize) as u32, y0 + random.below((y1 - y0) as usize) as u32)
             };
-            let left = x.saturating_sub(size / 2).min(width - size);
-            let top = y.saturating_sub(size / 2).min(height - size);
-            let rows = top..top + size;
-            self.pixels.extend(rows.flat_map(|row| (left..left + size).map(move |column| row * width + column)));
+            self.pixels.extend(volrender::patch((x, y), size, (width, height)));
         }
     }
 }

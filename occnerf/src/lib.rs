@@ -41,7 +41,6 @@ mod loss;
 #[cfg_attr(not(feature = "lpips"), path = "lpips/absent.rs")]
 mod lpips;
 mod mlp;
-mod occupancy;
 mod parameters;
 mod photometric;
 mod pixels;

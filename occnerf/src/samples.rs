@@ -3,11 +3,10 @@
 use glam::{Affine3A, Vec3};
 use smpl::{Posed, SurfaceMotion, WeightVolume};
 use surface_query::MeshDistance;
-use volrender::Ray;
+use volrender::{Occupancy, Ray};
 
 use crate::Error;
 use crate::config::{Config, DistanceKind};
-use crate::occupancy::Occupancy;
 use crate::random::Stream;
 use crate::scene::Scene;
 use crate::shell::Shell;

@@ -1,4 +1,5 @@
-//! The outer parts of a volume renderer: cameras and rays, bounds, samples along a ray, alpha compositing with
+//! The outer parts of a volume renderer: cameras and rays, patches of pixels, bounds, the cells worth sampling, samples along
+//! a ray, alpha compositing with
 //! its backward pass, and image metrics.
 //!
 //! ```
@@ -39,6 +40,7 @@ mod composite_backward;
 mod distortion;
 mod exponential;
 pub mod metrics;
+mod occupancy;
 mod ray;
 mod sampling;
 mod simd;
@@ -47,5 +49,6 @@ pub use camera::{Camera, Error};
 pub use composite::{Composite, composite};
 pub use composite_backward::composite_backward;
 pub use distortion::Distortion;
+pub use occupancy::Occupancy;
 pub use ray::{Aabb, Ray};
-pub use sampling::{bin_edges, bin_midpoints, bin_widths, sample};
+pub use sampling::{bin_edges, bin_midpoints, bin_widths, patch, sample};

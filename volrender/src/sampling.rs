@@ -1,3 +1,17 @@
+/// The pixels of a square of side `size` around the pixel (column, row) `around`, moved and cut as much as it takes to be
+/// inside an image of (W, H): row-major indices into (H, W), row by row. What the square is around may be outside.
+///
+/// ```
+/// let corner = volrender::patch((0, 1), 2, (4, 3));
+/// assert_eq!(corner.collect::<Vec<_>>(), [0, 1, 4, 5]);
+/// ```
+pub fn patch(around: (u32, u32), size: u32, (width, height): (u32, u32)) -> impl Iterator<Item = u32> {
+    let size = size.min(width).min(height);
+    let left = around.0.saturating_sub(size / 2).min(width - size);
+    let top = around.1.saturating_sub(size / 2).min(height - size);
+    (top..top + size).flat_map(move |row| (left..left + size).map(move |column| row * width + column))
+}
+
 /// Writes the n + 1 edges of `n` equal bins between `near` and `far` into `edges`. The first is `near` and the
 /// last `far`, exactly; with `n` 0 there is one edge, `near`.
 ///

@@ -4,7 +4,7 @@ use approx::abs_diff_eq;
 use glam::{Affine3A, Mat3, Quat, Vec2, Vec3};
 use proptest::prelude::*;
 use testkit::strategy::{degenerate_clouds, rotation, unit_vec3, vec3};
-use volrender::{Aabb, Camera, Distortion, Error, Ray, bin_edges, bin_midpoints, bin_widths, sample};
+use volrender::{Aabb, Camera, Distortion, Error, Ray, bin_edges, bin_midpoints, bin_widths, patch, sample};
 
 fn intrinsics(fx: f32, fy: f32, cx: f32, cy: f32) -> Mat3 {
     Mat3::from_cols_array(&[fx, 0.0, 0.0, 0.0, fy, 0.0, cx, cy, 1.0])
@@ -31,6 +31,23 @@ proptest! {
         prop_assert!(projected.truncate().distance(Vec2::new(u, v)) < 2e-2, "{projected}");
         prop_assert!(projected.z <= t * (1.0 + 1e-5));
         prop_assert!(camera.project(ray.at(-t)).is_none(), "behind the camera");
+    }
+
+    #[test]
+    fn a_patch_is_a_square_in_the_image_as_near_to_its_middle_as_that_allows(
+        (width, height) in (1u32..40, 1u32..40), x in 0u32..50, y in 0u32..50, size in 0u32..45,
+    ) {
+        let pixels: Vec<u32> = patch((x, y), size, (width, height)).collect();
+        let side = size.min(width).min(height);
+        prop_assert_eq!(pixels.len(), (side * side) as usize);
+        if side > 0 {
+            let (left, top) = (pixels[0] % width, pixels[0] / width);
+            let square = (0..side * side).map(|i| (top + i / side) * width + left + i % side);
+            prop_assert!(left + side <= width && square.eq(pixels));
+            // No square of this side that is inside begins nearer to where it should.
+            let nearest = |at: u32, limit: u32| (0..=limit - side).min_by_key(|first| (first + side / 2).abs_diff(at)).unwrap();
+            prop_assert_eq!((left, top), (nearest(x, width), nearest(y, height)));
+        }
     }
 
     #[test]

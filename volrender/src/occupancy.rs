@@ -1,15 +1,17 @@
-//! A coarse grid of the cells in which a posed body can be, so that empty space costs nothing.
-
 use glam::{IVec3, Vec3};
-use volrender::Aabb;
+
+use crate::Aabb;
 
 /// Cells an axis at most; a body with outstretched arms at 1 cm needs about 200.
 const MAX_CELLS: f32 = 256.0;
 
-/// Marks a superset of the points within a margin of a triangle mesh that turns by no more than 120° at its edges, or
+/// A coarse grid of the cells in which a body can be, so that samples in empty space cost nothing (Müller et al. 2022,
+/// section 5.1, made from a mesh rather than from a field).
+///
+/// It marks a superset of the points within a margin of a triangle mesh that turns by no more than 120° at its edges, or
 /// enclosed by it and not too deep.
 #[derive(Clone, Debug, Default)]
-pub(crate) struct Occupancy {
+pub struct Occupancy {
     min: Vec3,
     per_cell: f32,
     size: IVec3,
@@ -21,7 +23,13 @@ pub(crate) struct Occupancy {
 impl Occupancy {
     /// Rebuilds in place for `vertices` (V) and `faces` (F), which may be open: the cells at a triangle seal the inside off
     /// from the outside. Wanted are points outside within the `margins` (F) of the triangles they are closest to (where they
-    /// are closest to an edge or a corner, of all triangles there), none above `margin`, and inside down to `depth`.
+    /// are closest to an edge or a corner, of all triangles there), none above `margin`, and inside down to `depth`. Cells
+    /// have sides of `cell`, or so long that no axis has more than about 256. All lengths are in the unit of the vertices.
+    ///
+    /// A mesh without vertices, or with one that is not finite, is nowhere.
+    ///
+    /// # Panics
+    /// Where `margins` has not one entry a face, or a face names a vertex that is not there.
     pub fn rebuild(
         &mut self,
         vertices: &[Vec3],
@@ -31,16 +39,18 @@ impl Occupancy {
         depth: f32,
         cell: f32,
     ) {
+        assert_eq!(margins.len(), faces.len(), "{} margins for {} faces", margins.len(), faces.len());
         let low = vertices.iter().copied().fold(Vec3::INFINITY, Vec3::min);
         let high = vertices.iter().copied().fold(Vec3::NEG_INFINITY, Vec3::max);
         self.live.clear();
         self.region = None;
-        if !(low.is_finite() && high.is_finite()) {
-            self.size = IVec3::ZERO;
+        self.size = IVec3::ZERO;
+        let (margin, depth) = (margin.max(0.0), depth.max(0.0));
+        let extent = (high - low).max_element() + 2.0 * margin;
+        if !(extent.is_finite() && vertices.iter().all(|v| v.is_finite())) {
             return;
         }
-        let extent = (high - low).max_element() + 2.0 * margin;
-        let cell = cell.max(extent / MAX_CELLS);
+        let cell = cell.max(extent / MAX_CELLS).max(f32::MIN_POSITIVE);
         let border = Vec3::splat(margin + 1.5 * cell);
         self.region = Some(Aabb { min: low - Vec3::splat(margin), max: high + Vec3::splat(margin) });
         self.min = low - border;
@@ -50,7 +60,8 @@ impl Occupancy {
         // Deeper than any margin: the whole inside, sealed off.
         let fills = depth > margin;
         let depth = if fills { 0.0 } else { depth };
-        for (face, &margin) in faces.iter().zip(margins) {
+        for (face, &own) in faces.iter().zip(margins) {
+            let margin = own.max(0.0).min(margin);
             let corners = face.map(|v| vertices[v as usize]);
             let normal = (corners[1] - corners[0]).cross(corners[2] - corners[0]).normalize_or_zero();
             let ahead = (margin * support(normal)).max(depth * support(-normal));
@@ -98,12 +109,15 @@ impl Occupancy {
         self.live.iter_mut().zip(&outside).for_each(|(live, outside)| *live = !outside);
     }
 
-    /// The box of everything within the margin of the mesh; `None` for a mesh without finite vertices.
+    /// The box of everything within the margin of the mesh, where rays can meet anything; `None` for a mesh that is nowhere.
+    #[must_use]
     pub fn region(&self) -> Option<Aabb> {
         self.region
     }
 
     /// Whether `point` can be within the margin or inside; false only where it certainly is not.
+    #[inline]
+    #[must_use]
     pub fn is_live(&self, point: Vec3) -> bool {
         // Truncation is the floor of what is not negative; NaN fails the comparison, and huge values saturate.
         let place = (point - self.min) * self.per_cell;
@@ -118,6 +132,7 @@ impl Occupancy {
         ((point - self.min) * self.per_cell).floor().as_ivec3()
     }
 
+    #[inline]
     fn index(&self, cell: IVec3) -> usize {
         ((cell.z * self.size.y + cell.y) * self.size.x + cell.x) as usize
     }
@@ -132,72 +147,4 @@ fn support(normal: Vec3) -> Vec3 {
     // cos(a − 60°) for the angle a between the axis and the normal, where that is larger than 60°.
     let turned = COS * normal + SIN * (Vec3::ONE - normal * normal).max(Vec3::ZERO).map(f32::sqrt);
     Vec3::select(normal.cmpge(Vec3::splat(COS)), Vec3::ONE, turned.max(Vec3::ZERO))
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use proptest::prelude::*;
-    use testkit::oracle;
-
-    proptest! {
-        #![proptest_config(ProptestConfig::with_cases(24))]
-
-        #[test]
-        fn every_point_inside_or_within_the_margin_is_live(
-            mesh in testkit::strategy::bumpy_sphere(), margin in 0.02f32..0.3, cell in 0.03f32..0.3,
-            queries in prop::collection::vec(testkit::strategy::vec3(1.6), 60)
-        ) {
-            let mut occupancy = Occupancy::default();
-            occupancy.rebuild(&mesh.vertices, &mesh.faces, &vec![margin; mesh.faces.len()], margin, 10.0, cell);
-            for q in queries {
-                let (_, _, distance) = oracle::closest_point(&mesh.vertices, &mesh.faces, q);
-                if distance < f64::from(margin) || oracle::inside(&mesh.vertices, &mesh.faces, q) {
-                    prop_assert!(occupancy.is_live(q), "{q} at {distance}");
-                } else if distance > f64::from(margin) * 2.0 + 4.0 * f64::from(cell) + 1.0 {
-                    prop_assert!(!occupancy.is_live(q), "{q} at {distance}");
-                }
-            }
-        }
-    }
-
-    proptest! {
-        #![proptest_config(ProptestConfig::with_cases(24))]
-
-        #[test]
-        fn every_point_within_its_faces_margin_or_the_depth_is_live(
-            mesh in testkit::strategy::bumpy_sphere(), near in 0.0f32..0.3, far in 0.0f32..0.3,
-            depth in 0.0f32..0.3, cell in 0.02f32..0.1,
-            places in prop::collection::vec((any::<prop::sample::Index>(), -0.3f32..0.3, testkit::strategy::vec3(0.1)), 200)
-        ) {
-            // One margin above, another below: they differ at few edges.
-            let above = |face: &[u32; 3]| face.iter().map(|&v| mesh.vertices[v as usize].z).sum::<f32>() > 0.0;
-            let margins: Vec<f32> = mesh.faces.iter().map(|f| if above(f) { near } else { far }).collect();
-            let mut occupancy = Occupancy::default();
-            occupancy.rebuild(&mesh.vertices, &mesh.faces, &margins, 0.3, depth, cell);
-            let distance = surface_query::MeshDistance::new(&mesh.vertices, &mesh.faces).unwrap();
-            for (face, along, shift) in places {
-                let [a, b, c] = mesh.faces[face.index(mesh.faces.len())].map(|v| mesh.vertices[v as usize]);
-                let q = (a + b + c) / 3.0 + along * (b - a).cross(c - a).normalize_or_zero() + shift;
-                let Some(closest) = distance.closest(q, f32::INFINITY) else { continue };
-                let d = closest.signed_distance;
-                let margin = if q.z.abs() < 0.5 { near.min(far) } else { margins[closest.face as usize] };
-                if d <= margin && -d <= depth {
-                    prop_assert!(occupancy.is_live(q), "{q} at {d}: margin {margin}, depth {depth}");
-                }
-            }
-        }
-    }
-
-    #[test]
-    fn far_points_and_empty_meshes_are_dead() {
-        let mut occupancy = Occupancy::default();
-        assert!(!occupancy.is_live(Vec3::ZERO));
-        occupancy.rebuild(&[], &[], &[], 0.1, 1.0, 0.1);
-        assert!(!occupancy.is_live(Vec3::ZERO) && occupancy.region().is_none());
-        let mesh = testkit::mesh::icosphere(1);
-        occupancy.rebuild(&mesh.vertices, &mesh.faces, &vec![0.1; mesh.faces.len()], 0.1, 2.0, 0.1);
-        assert!(occupancy.is_live(Vec3::ZERO) && !occupancy.is_live(Vec3::splat(1.4)));
-        assert!(!occupancy.is_live(Vec3::splat(f32::NAN)) && !occupancy.is_live(Vec3::splat(1e30)));
-    }
 }

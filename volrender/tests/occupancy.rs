@@ -1,0 +1,86 @@
+//! The cells in which a body can be, against brute force.
+
+use glam::Vec3;
+use proptest::prelude::*;
+use testkit::oracle;
+use volrender::Occupancy;
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(24))]
+
+    #[test]
+    fn every_point_inside_or_within_the_margin_is_live(
+        mesh in testkit::strategy::bumpy_sphere(), margin in 0.02f32..0.3, cell in 0.03f32..0.3,
+        queries in prop::collection::vec(testkit::strategy::vec3(1.6), 60)
+    ) {
+        let mut occupancy = Occupancy::default();
+        occupancy.rebuild(&mesh.vertices, &mesh.faces, &vec![margin; mesh.faces.len()], margin, 10.0, cell);
+        for q in queries {
+            let (_, _, distance) = oracle::closest_point(&mesh.vertices, &mesh.faces, q);
+            if distance < f64::from(margin) || oracle::inside(&mesh.vertices, &mesh.faces, q) {
+                prop_assert!(occupancy.is_live(q), "{q} at {distance}");
+            } else if distance > f64::from(margin) * 2.0 + 4.0 * f64::from(cell) + 1.0 {
+                prop_assert!(!occupancy.is_live(q), "{q} at {distance}");
+            }
+        }
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(24))]
+
+    #[test]
+    fn every_point_within_its_faces_margin_or_the_depth_is_live(
+        mesh in testkit::strategy::bumpy_sphere(), near in 0.0f32..0.3, far in 0.0f32..0.3,
+        depth in 0.0f32..0.3, cell in 0.02f32..0.1,
+        places in prop::collection::vec((any::<prop::sample::Index>(), -0.3f32..0.3, testkit::strategy::vec3(0.1)), 200)
+    ) {
+        // One margin above, another below: they differ at few edges.
+        let above = |face: &[u32; 3]| face.iter().map(|&v| mesh.vertices[v as usize].z).sum::<f32>() > 0.0;
+        let margins: Vec<f32> = mesh.faces.iter().map(|f| if above(f) { near } else { far }).collect();
+        let mut occupancy = Occupancy::default();
+        occupancy.rebuild(&mesh.vertices, &mesh.faces, &margins, 0.3, depth, cell);
+        let distance = surface_query::MeshDistance::new(&mesh.vertices, &mesh.faces).unwrap();
+        for (face, along, shift) in places {
+            let [a, b, c] = mesh.faces[face.index(mesh.faces.len())].map(|v| mesh.vertices[v as usize]);
+            let q = (a + b + c) / 3.0 + along * (b - a).cross(c - a).normalize_or_zero() + shift;
+            let Some(closest) = distance.closest(q, f32::INFINITY) else { continue };
+            let d = closest.signed_distance;
+            let margin = if q.z.abs() < 0.5 { near.min(far) } else { margins[closest.face as usize] };
+            if d <= margin && -d <= depth {
+                prop_assert!(occupancy.is_live(q), "{q} at {d}: margin {margin}, depth {depth}");
+            }
+        }
+    }
+}
+
+#[test]
+fn far_points_and_empty_meshes_are_dead() {
+    let mut occupancy = Occupancy::default();
+    assert!(!occupancy.is_live(Vec3::ZERO));
+    occupancy.rebuild(&[], &[], &[], 0.1, 1.0, 0.1);
+    assert!(!occupancy.is_live(Vec3::ZERO) && occupancy.region().is_none());
+    let mesh = testkit::mesh::icosphere(1);
+    occupancy.rebuild(&mesh.vertices, &mesh.faces, &vec![0.1; mesh.faces.len()], 0.1, 2.0, 0.1);
+    assert!(occupancy.is_live(Vec3::ZERO) && !occupancy.is_live(Vec3::splat(1.4)));
+    assert!(!occupancy.is_live(Vec3::splat(f32::NAN)) && !occupancy.is_live(Vec3::splat(1e30)));
+}
+
+#[test]
+fn lengths_and_vertices_that_are_none_mark_nothing_or_the_mesh_alone() {
+    let mesh = testkit::mesh::icosphere(1);
+    let margins = vec![f32::NAN; mesh.faces.len()];
+    let mut occupancy = Occupancy::default();
+    for [margin, depth, cell] in [[f32::NAN, -1.0, -1.0], [0.0, f32::NAN, f32::NAN], [-1.0, 0.0, 0.0]] {
+        occupancy.rebuild(&mesh.vertices, &mesh.faces, &margins, margin, depth, cell);
+        assert!(occupancy.is_live(mesh.vertices[0]) && !occupancy.is_live(2.0 * mesh.vertices[0]));
+    }
+    occupancy.rebuild(&[Vec3::ONE; 3], &[[0, 1, 2]], &[0.0], 0.0, 0.0, 0.0);
+    assert!(occupancy.is_live(Vec3::ONE) && !occupancy.is_live(Vec3::ZERO));
+    occupancy.rebuild(&mesh.vertices, &mesh.faces, &margins, f32::INFINITY, 0.1, 0.1);
+    assert!(occupancy.region().is_none() && !occupancy.is_live(Vec3::ZERO));
+    let mut broken = mesh.vertices.clone();
+    broken[3].y = f32::NAN;
+    occupancy.rebuild(&broken, &mesh.faces, &margins, 0.1, 0.1, 0.1);
+    assert!(occupancy.region().is_none() && !occupancy.is_live(mesh.vertices[0]));
+}
