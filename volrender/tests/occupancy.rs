@@ -40,13 +40,12 @@ proptest! {
         let margins: Vec<f32> = mesh.faces.iter().map(|f| if above(f) { near } else { far }).collect();
         let mut occupancy = Occupancy::default();
         occupancy.rebuild(&mesh.vertices, &mesh.faces, &margins, 0.3, depth, cell);
-        let distance = surface_query::MeshDistance::new(&mesh.vertices, &mesh.faces).unwrap();
         for (face, along, shift) in places {
             let [a, b, c] = mesh.faces[face.index(mesh.faces.len())].map(|v| mesh.vertices[v as usize]);
             let q = (a + b + c) / 3.0 + along * (b - a).cross(c - a).normalize_or_zero() + shift;
-            let Some(closest) = distance.closest(q, f32::INFINITY) else { continue };
-            let d = closest.signed_distance;
-            let margin = if q.z.abs() < 0.5 { near.min(far) } else { margins[closest.face as usize] };
+            let (face, _, distance) = oracle::closest_point(&mesh.vertices, &mesh.faces, q);
+            let d = if oracle::inside(&mesh.vertices, &mesh.faces, q) { -distance } else { distance } as f32;
+            let margin = if q.z.abs() < 0.5 { near.min(far) } else { margins[face as usize] };
             if d <= margin && -d <= depth {
                 prop_assert!(occupancy.is_live(q), "{q} at {d}: margin {margin}, depth {depth}");
             }
