@@ -13,73 +13,91 @@ pub enum Label {
     Unknown,
 }
 
-/// The labels of a frame's pixels, as runs of equal ones: a person has few in a row.
+/// The labels of a frame's pixels, 3 bits each.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Labels {
-    runs: Vec<Run>,
-    subject: u32,
+    words: Vec<Word>,
+    len: usize,
 }
 
-/// Pixels from the end of the run before to `end`.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-struct Run {
-    end: u32,
-    label: Label,
-    /// Subject pixels up to `end`.
-    subject: u32,
+/// 64 pixels.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+struct Word {
+    subject: u64,
+    unknown: u64,
+    /// Subject pixels of all words before.
+    before: u32,
 }
 
 impl Labels {
     /// Of pixels in row-major order.
+    #[must_use]
     pub fn new(labels: &[Label]) -> Self {
-        let (mut runs, mut end, mut subject) = (Vec::new(), 0, 0);
-        for equal in labels.chunk_by(|a, b| a == b) {
-            end += equal.len() as u32;
-            subject += if equal[0] == Label::Subject { equal.len() as u32 } else { 0 };
-            runs.push(Run { end, label: equal[0], subject });
-        }
-        Self { runs, subject }
+        let mut subject = 0;
+        let word = |labels: &[Label]| {
+            let bits = |wanted: Label| {
+                labels.iter().enumerate().fold(0, |bits, (i, label)| bits | u64::from(*label == wanted) << i)
+            };
+            let word = Word { subject: bits(Label::Subject), unknown: bits(Label::Unknown), before: subject };
+            subject += word.subject.count_ones();
+            word
+        };
+        Self { words: labels.chunks(64).map(word).collect(), len: labels.len() }
     }
 
     /// How many pixels are labelled.
+    #[must_use]
     pub fn len(&self) -> usize {
-        self.runs.last().map_or(0, |run| run.end as usize)
+        self.len
     }
 
     /// Whether no pixel is.
+    #[must_use]
     pub fn is_empty(&self) -> bool {
-        self.runs.is_empty()
+        self.len == 0
     }
 
     /// The label of a pixel.
     ///
     /// # Panics
     /// For a pixel beyond the last.
+    #[must_use]
     pub fn at(&self, pixel: u32) -> Label {
-        self.runs[self.runs.partition_point(|run| run.end <= pixel)].label
+        assert!((pixel as usize) < self.len, "pixel {pixel} of {}", self.len);
+        let (word, bit) = (self.words[pixel as usize / 64], 1 << (pixel % 64));
+        match (word.subject & bit != 0, word.unknown & bit != 0) {
+            (true, _) => Label::Subject,
+            (false, true) => Label::Unknown,
+            (false, false) => Label::Background,
+        }
     }
 
     /// All labels in order.
     pub fn iter(&self) -> impl Iterator<Item = Label> + '_ {
-        let mut start = 0;
-        self.runs.iter().flat_map(move |run| {
-            let length = run.end - std::mem::replace(&mut start, run.end);
-            std::iter::repeat_n(run.label, length as usize)
-        })
+        (0..self.len as u32).map(|pixel| self.at(pixel))
     }
 
     /// How many pixels show the subject.
+    #[must_use]
     pub fn num_subject(&self) -> usize {
-        self.subject as usize
+        self.words.last().map_or(0, |word| word.before + word.subject.count_ones()) as usize
     }
 
     /// The `n`-th of them in order.
     ///
     /// # Panics
     /// From [`Labels::num_subject`] on.
+    #[must_use]
     pub fn subject(&self, n: usize) -> u32 {
-        let run = self.runs[self.runs.partition_point(|run| run.subject as usize <= n)];
-        run.end - (run.subject - n as u32)
+        assert!(n < self.num_subject(), "subject pixel {n} of {}", self.num_subject());
+        let after = self.words.partition_point(|word| word.before as usize <= n);
+        let word = self.words[after - 1];
+        let mut bits = word.subject;
+        for _ in word.before as usize..n {
+            // Clears the lowest bit that is set.
+            bits &= bits - 1;
+        }
+        (after - 1) as u32 * 64 + bits.trailing_zeros()
     }
 }
 

@@ -327,14 +327,12 @@ impl<'a> Trainer<'a> {
         let mut watch = Stopwatch::start();
         let mut report = StepReport { step: step + 1, rays: batch.pixels.len(), ..StepReport::default() };
         let mut photometric = std::mem::take(&mut self.photometric);
-        photometric.measure(
-            &self.config.loss,
-            self.lpips.as_ref(),
-            &groups,
-            &batch,
-            (&frame.labels, &shown),
-            &mut report,
-        )?;
+        let measured =
+            photometric.measure(loss, self.lpips.as_ref(), &groups, &batch, (&frame.labels, &shown), &mut report);
+        if let Err(error) = measured {
+            (self.groups, self.batch, self.photometric, self.posed) = (groups, batch, photometric, own_posed);
+            return Err(error);
+        }
         let d_colors = &photometric.d_colors;
         self.field.mlp.transposed_weights(self.parameters.get(Part::Field), &mut self.transposed);
         watch.lap(&mut times.losses);

@@ -41,8 +41,8 @@ proptest! {
     #![proptest_config(ProptestConfig::with_cases(48))]
 
     #[test]
-    fn runs_of_labels_say_what_the_labels_say(
-        runs in prop::collection::vec((prop::sample::select(vec![Label::Subject, Label::Background, Label::Unknown]), 1..9usize), 0..12),
+    fn packed_labels_say_what_the_labels_say(
+        runs in prop::collection::vec((prop::sample::select(vec![Label::Subject, Label::Background, Label::Unknown]), 1..90usize), 0..12),
     ) {
         let plain: Vec<Label> = runs.into_iter().flat_map(|(label, length)| std::iter::repeat_n(label, length)).collect();
         let labels = Labels::new(&plain);

@@ -14,7 +14,8 @@ const STEPS: u64 = 8;
 /// A capture on disk, read with room for the pictures of so many frames.
 fn read(dir: &TempDir, body: &BodyModel, pictures: u64) -> Capture {
     let bodies = 8 * body.num_vertices() as u64 * 36;
-    let max_bytes = bodies + pictures * u64::from(SIZE * SIZE) * 16;
+    let picture = u64::from(SIZE * SIZE) * 16;
+    let max_bytes = bodies + 4 * picture.div_ceil(42) + pictures * picture;
     load_capture(&dir.path("capture"), body, &LoadOptions { max_bytes, ..LoadOptions::default() }).unwrap()
 }
 

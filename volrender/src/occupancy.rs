@@ -26,7 +26,7 @@ impl Occupancy {
     /// are closest to an edge or a corner, of all triangles there), none above `margin`, and inside down to `depth`. Cells
     /// have sides of `cell`, or so long that no axis has more than about 256. All lengths are in the unit of the vertices.
     ///
-    /// A mesh without vertices, or with one that is not finite, is nowhere.
+    /// A mesh without vertices, or with one that is not finite, is nowhere, and so is one so large that lengths overflow.
     ///
     /// # Panics
     /// Where `margins` has not one entry a face, or a face names a vertex that is not there.
@@ -47,15 +47,18 @@ impl Occupancy {
         self.size = IVec3::ZERO;
         let (margin, depth) = (margin.max(0.0), depth.max(0.0));
         let extent = (high - low).max_element() + 2.0 * margin;
-        if !(extent.is_finite() && vertices.iter().all(|v| v.is_finite())) {
-            return;
-        }
         let cell = cell.max(extent / MAX_CELLS).max(f32::MIN_POSITIVE);
         let border = Vec3::splat(margin + 1.5 * cell);
+        let per_cell = 1.0 / cell;
+        let size = (high - low + 2.0 * border) * per_cell;
+        // Infinite where any length is, and where there are no vertices.
+        if !(size.is_finite() && vertices.iter().all(|v| v.is_finite())) {
+            return;
+        }
         self.region = Some(Aabb { min: low - Vec3::splat(margin), max: high + Vec3::splat(margin) });
         self.min = low - border;
-        self.per_cell = 1.0 / cell;
-        self.size = ((high - low + 2.0 * border) * self.per_cell).ceil().as_ivec3().max(IVec3::ONE);
+        self.per_cell = per_cell;
+        self.size = size.ceil().as_ivec3().max(IVec3::ONE);
         self.live.resize((self.size.x * self.size.y * self.size.z) as usize, false);
         // Deeper than any margin: the whole inside, sealed off.
         let fills = depth > margin;

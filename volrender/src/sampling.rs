@@ -1,5 +1,6 @@
 /// The pixels of a square of side `size` around the pixel (column, row) `around`, moved and cut as much as it takes to be
-/// inside an image of (W, H): row-major indices into (H, W), row by row. What the square is around may be outside.
+/// inside an image of (W, H), of at most 2^32 pixels: row-major indices into (H, W), row by row. What the square is around may be
+/// outside.
 ///
 /// ```
 /// let corner = volrender::patch((0, 1), 2, (4, 3));

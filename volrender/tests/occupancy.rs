@@ -53,6 +53,32 @@ proptest! {
     }
 }
 
+/// What a cell is marked for is within its face's box and the margin, so in each axis nearer than this.
+#[test]
+fn space_away_from_the_surface_is_dead_on_both_sides() {
+    let mesh = testkit::mesh::icosphere(3);
+    let (margin, cell) = (0.05, 0.03);
+    let edge = |[a, b, _]: &[u32; 3]| mesh.vertices[*a as usize].distance(mesh.vertices[*b as usize]);
+    let longest = mesh.faces.iter().map(edge).fold(0.0, f32::max);
+    let far = 3.0f32.sqrt() * (longest + margin + 2.0 * cell);
+    let mut occupancy = Occupancy::default();
+    occupancy.rebuild(&mesh.vertices, &mesh.faces, &vec![margin; mesh.faces.len()], margin, 0.04, cell);
+    let (mut dead, mut total) = (0, 0);
+    for i in 0..24 * 24 * 24 {
+        let q = (Vec3::new((i % 24) as f32, (i / 24 % 24) as f32, (i / 576) as f32) + 0.5) / 12.0 - 1.0;
+        let from_surface = (q.length() - 1.0).abs();
+        total += 1;
+        dead += usize::from(!occupancy.is_live(q));
+        if from_surface > far {
+            assert!(!occupancy.is_live(q), "{q}");
+        } else if from_surface < 0.03 {
+            assert!(occupancy.is_live(q), "{q}");
+        }
+    }
+    // A shell 9 cm thick is an eighth of the cube.
+    assert!(dead * 2 > total, "{dead} of {total}");
+}
+
 #[test]
 fn far_points_and_empty_meshes_are_dead() {
     let mut occupancy = Occupancy::default();
@@ -77,6 +103,9 @@ fn lengths_and_vertices_that_are_none_mark_nothing_or_the_mesh_alone() {
     occupancy.rebuild(&[Vec3::ONE; 3], &[[0, 1, 2]], &[0.0], 0.0, 0.0, 0.0);
     assert!(occupancy.is_live(Vec3::ONE) && !occupancy.is_live(Vec3::ZERO));
     occupancy.rebuild(&mesh.vertices, &mesh.faces, &margins, f32::INFINITY, 0.1, 0.1);
+    assert!(occupancy.region().is_none() && !occupancy.is_live(Vec3::ZERO));
+    let huge: Vec<Vec3> = mesh.vertices.iter().map(|v| 1.69e38 * *v).collect();
+    occupancy.rebuild(&huge, &mesh.faces, &margins, 0.1, 0.1, 0.1);
     assert!(occupancy.region().is_none() && !occupancy.is_live(Vec3::ZERO));
     let mut broken = mesh.vertices.clone();
     broken[3].y = f32::NAN;

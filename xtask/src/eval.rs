@@ -10,6 +10,7 @@ use occnerf::{
     FieldRenderer, Lpips, Method, PreparedFrame, PriorRenderer, Renderer, Rendering, Scene, SplitMetrics, Trainer,
     VertexColors, evaluate_with,
 };
+use rayon::prelude::*;
 
 use crate::run::{
     CHECKPOINT, METRICS, Metrics, NOVEL_VIEWS, RunConfig, Splits, TRAINING_VIEWS, peak_rss_bytes, use_threads,
@@ -138,6 +139,14 @@ fn scored_train_frames(scene: &Scene) -> impl Iterator<Item = &PreparedFrame> {
 /// Every frame that a finished run is scored on.
 pub fn scored_frames(scene: &Scene) -> impl Iterator<Item = &PreparedFrame> {
     scene.eval.iter().chain(scored_train_frames(scene))
+}
+
+/// Reads every picture that a run is scored on, as those that are not kept in memory have not been read yet.
+pub fn check_pictures(scene: &Scene) -> Result<()> {
+    let frames: Vec<&PreparedFrame> = scored_frames(scene).collect();
+    // Collected as results first, so that the error reported is the first in order whatever finishes first.
+    let read: Vec<Result<(), occnerf::Error>> = frames.par_iter().map(|frame| frame.pixels().map(drop)).collect();
+    Ok(read.into_iter().collect::<Result<(), _>>()?)
 }
 
 /// The network that `--lpips` names.

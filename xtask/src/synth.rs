@@ -27,7 +27,7 @@ enum FormatName {
 enum OcclusionName {
     /// Nothing in front of the person.
     None,
-    /// The paper's fixed rectangle as high as the picture.
+    /// The paper's fixed rectangle.
     Central,
     /// The same, moving by three tenths of the picture.
     Moving,

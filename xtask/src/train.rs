@@ -11,7 +11,7 @@ use occnerf::{Lpips, Method, Scene, StepReport, Trainer, VertexColors, checkpoin
 
 use crate::capacity::{self, CapacityName};
 use crate::compare::compare;
-use crate::eval::{Model, Split, load_lpips, network_name, score_run, scored_frames};
+use crate::eval::{Model, Split, check_pictures, load_lpips, network_name, score_run, scored_frames};
 use crate::run::{
     CHECKPOINT, METRICS, Metrics, RunConfig, Splits, existing_directory, new_directory, peak_rss_bytes, use_threads,
 };
@@ -138,8 +138,9 @@ pub fn run_one(
     stop_after: Option<u64>,
 ) -> Result<Option<Metrics>> {
     let scene = Scene::new(&source.capture, &source.model, &run.train)?;
+    // Before the training, not after it.
+    check_pictures(&scene)?;
     if let Some(lpips) = lpips {
-        // Before the training, not after it.
         for frame in scored_frames(&scene) {
             lpips.check_size(frame.camera.width as usize, frame.camera.height as usize)?;
         }
@@ -256,10 +257,13 @@ fn optimise(directory: &Path, trainer: &mut Trainer<'_>, stop_after: Option<u64>
         let report = match trainer.step() {
             Ok(report) => report,
             Err(error) => {
-                trainer.save(&checkpoint)?;
                 bar.abandon();
-                let kept = format!("step {}; what was learnt is in {}", trainer.steps_done() + 1, checkpoint.display());
-                return Err(anyhow::Error::from(error).context(kept));
+                let learnt = match trainer.save(&checkpoint) {
+                    Ok(()) => format!("is in {}", checkpoint.display()),
+                    Err(error) => format!("could not be saved ({error})"),
+                };
+                let place = format!("step {}; what was learnt {learnt}", trainer.steps_done() + 1);
+                return Err(anyhow::Error::from(error).context(place));
             }
         };
         bad += report.bad_gradients;

@@ -17,6 +17,8 @@ use super::{DataError, Frame, Image, LoadOptions, checks};
 const PIXEL_BYTES: u64 = 16;
 /// Bytes that a vertex of a frame's body takes once it is prepared: at rest, its pose offset, and posed.
 const VERTEX_BYTES: u64 = 36;
+/// A training frame's labels take this part of the bytes of its pixels: see [`crate::Labels`].
+const LABELS_SHARE: u64 = 42;
 
 /// A frame whose pictures have not been read.
 pub(super) struct Planned {
@@ -119,8 +121,13 @@ pub(super) fn budget(
     let limit = options.max_bytes;
     let body_bytes = body.num_vertices() as u64 * VERTEX_BYTES;
     let views = || std::iter::once(train).chain(eval);
-    let frames = views().map(|view| view.frames.len() as u64).sum::<u64>();
-    let bodies = frames * body_bytes;
+    // Bytes of what is kept of every frame: of every n-th in training, and of every m-th view kept back.
+    let kept = |n: usize, m: usize| {
+        let (frames, views) =
+            (train.frames.len().div_ceil(n), eval.iter().map(|v| v.frames.len().div_ceil(m)).sum::<usize>());
+        (frames + views) as u64 * body_bytes + frames as u64 * train.picture_bytes(options).div_ceil(LABELS_SHARE)
+    };
+    let bodies = kept(1, 1);
     let picture = views().map(|view| view.picture_bytes(options)).max().unwrap_or(0);
     if bodies + picture <= limit {
         return Ok(Budget(limit - bodies));
@@ -133,18 +140,20 @@ pub(super) fn budget(
             ways.push(format!("resize {resize}"));
         }
     }
-    // As many bodies fit beside a picture.
-    let fit = limit.saturating_sub(picture) / body_bytes.max(1);
-    if fit > 0 {
-        ways.push(format!("stride {}", frames.div_ceil(fit).saturating_mul(options.stride as u64)));
+    let longest = views().map(|view| view.frames.len()).max().unwrap_or(1);
+    let fits = |n: usize, m: usize| kept(n, m) + picture <= limit;
+    if let Some(n) = (2..=longest).find(|&n| fits(n, n)) {
+        match options.max_frames {
+            Some(_) => ways.push(format!("max_frames {}", train.frames.len().div_ceil(n))),
+            None => ways.push(format!("stride {}", n.saturating_mul(options.stride))),
+        }
     }
-    if let (kept @ 1.., Some(fit @ 1..)) =
-        (frames - train.frames.len() as u64, fit.checked_sub(train.frames.len() as u64))
-    {
-        ways.push(format!("eval_stride {}", kept.div_ceil(fit).saturating_mul(options.eval_stride as u64)));
+    if let Some(m) = (2..=longest).find(|&m| !eval.is_empty() && fits(1, m)) {
+        ways.push(format!("eval_stride {}", m.saturating_mul(options.eval_stride)));
     }
     let mebibytes = |bytes: u64| bytes.div_ceil(1 << 20);
     ways.push(format!("memory {}", mebibytes(bodies + picture)));
+    let frames: usize = views().map(|view| view.frames.len()).sum();
     let expected =
         format!("all bodies and a picture within {} MiB (would fit: {})", mebibytes(limit), ways.join(", or "));
     let actual = format!("{frames} bodies of {} vertices and {picture} bytes a picture", body.num_vertices());
@@ -154,13 +163,23 @@ pub(super) fn budget(
 impl Files {
     /// Whether the headers say what they should; nothing is decoded that the memory check did not count.
     pub fn check(&self) -> Result<(), DataError> {
-        let same_size = |path: &Path, of: &str| {
-            let (found, text) = (dimensions(path)?, |(w, h): (u32, u32)| format!("{w}×{h}"));
-            let expected = || format!("{}, as of {of}", text(self.size));
-            if found == self.size { Ok(()) } else { Err(DataError::invalid(path, "size", expected(), text(found))) }
-        };
-        same_size(&self.image, &format!("`{}`", self.first))?;
-        self.masks.iter().chain(&self.occluder).try_for_each(|path| same_size(path, "its image"))
+        self.same_size(&self.image, dimensions(&self.image)?)?;
+        self.masks.iter().chain(&self.occluder).try_for_each(|path| self.same_size(path, dimensions(path)?))
+    }
+
+    fn same_size(&self, path: &Path, found: (u32, u32)) -> Result<(), DataError> {
+        if found == self.size {
+            return Ok(());
+        }
+        let text = |(w, h): (u32, u32)| format!("{w}×{h}");
+        let of = if path == self.image { format!("`{}`", self.first) } else { "its image".to_owned() };
+        Err(DataError::invalid(path, "size", format!("{}, as of {of}", text(self.size)), text(found)))
+    }
+
+    /// A mask, which may have changed since its header was read.
+    fn mask(&self, path: &Path) -> Result<Vec<f32>, DataError> {
+        let (width, height, levels) = load_mask(path)?;
+        self.same_size(path, (width, height)).map(|()| levels)
     }
 
     /// Reads the pictures.
@@ -168,9 +187,10 @@ impl Files {
         self.check()?;
         let size = self.size;
         let mut image = Image::load(&self.image)?;
+        self.same_size(&self.image, (image.width, image.height))?;
         let mut mask = vec![0.0f32; size.0 as usize * size.1 as usize];
         for path in &self.masks {
-            for (out, level) in mask.iter_mut().zip(load_mask(path)?.2) {
+            for (out, level) in mask.iter_mut().zip(self.mask(path)?) {
                 let level = if self.labels && level > 0.0 { 1.0 } else { level };
                 *out = out.max(level);
             }
@@ -182,7 +202,7 @@ impl Files {
             }
         }
         let occluder = match &self.occluder {
-            Some(path) => Some(load_mask(path)?.2.into_iter().map(|level| f32::from(level > 0.5)).collect()),
+            Some(path) => Some(self.mask(path)?.into_iter().map(|level| f32::from(level > 0.5)).collect()),
             None => None,
         };
         // Masked first, or interpolation would draw hidden colours into the mask's edge.

@@ -111,7 +111,8 @@ pub struct Capture {
 ///
 /// # Errors
 /// The first problem in the order files are read, training view before views kept back: a directory of no known layout;
-/// files that are missing, unreadable, truncated or name anything to execute; frames without camera or body parameters;
+/// files that are missing, unreadable, truncated (but for pictures that there is no room for, whose headers alone are read) or name
+/// anything to execute; frames without camera or body parameters;
 /// images and masks of unequal sizes or above 8192 pixels; more bodies than [`LoadOptions::max_bytes`] admits; arrays of
 /// the wrong shape, or not finite; cameras that no projection fits, or that see nothing of the body in any frame; a
 /// body model whose joints or vertices are not the file's; options outside their ranges.

@@ -13,11 +13,12 @@ use super::{DataError, Frame};
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Obstacle {
-    /// Part of the subject's pixels in the occluded frames that is hidden, 0 (no obstacle) to 0.95.
+    /// Part of the subject's pixels in the occluded frames that is hidden, 0 (no obstacle) to 0.95; no more than the obstacle's rows
+    /// have.
     pub fraction: f32,
     /// Part of the video, from its start, that is occluded, 0 to 1.
     pub share: f32,
-    /// How far the obstacle's middle stands to the right of the subject's mean column, in picture widths, −1 to 1.
+    /// How far the obstacle's middle stands to the right of the subject's mean column in the obstacle's rows, in picture widths, −1 to 1.
     pub position: f32,
     /// How far it moves to the right, evenly over the occluded frames, in picture widths, −2 to 2. It is at `position`
     /// half-way through.
@@ -91,23 +92,26 @@ impl Obstacle {
         Ok(())
     }
 
-    /// How many of the frames it stands in, from the first.
-    fn affected(&self, frames: usize) -> usize {
-        ((self.share * frames as f32).round() as usize).min(frames)
-    }
-
-    /// The rows that it hides in frames of this size.
+    /// The rows that it hides of `frames`, all of which are of this size.
     fn rows(&self, frames: &[Frame], (width, height): (u32, u32)) -> Result<Range<u32>, DataError> {
         if self.height >= 1.0 {
             return Ok(0..height);
         }
-        let (mut total, mut weighted) = (0u64, 0u64);
-        for frame in &frames[..self.affected(frames.len())] {
-            for (row, pixels) in (0..).zip(frame.pixels()?.mask.chunks_exact(width.max(1) as usize)) {
-                let count = pixels.iter().filter(|m| **m > 0.5).count() as u64;
-                total += count;
-                weighted += row * count;
-            }
+        let sums = |frame: &Frame| -> Result<[u64; 2], DataError> {
+            let pixels = frame.pixels()?;
+            let counts = pixels
+                .mask
+                .chunks_exact(width.max(1) as usize)
+                .map(|row| row.iter().filter(|m| **m > 0.5).count() as u64);
+            Ok((0..)
+                .zip(counts)
+                .fold([0, 0], |[total, weighted], (row, count)| [total + count, weighted + row * count]))
+        };
+        let found: Vec<Result<[u64; 2], DataError>> = frames.par_iter().map(sums).collect();
+        let (mut total, mut weighted) = (0, 0);
+        for sums in found {
+            let [count, rows] = sums?;
+            (total, weighted) = (total + count, weighted + rows);
         }
         let mean = weighted as f64 / total.max(1) as f64 + 0.5;
         let rows = (f64::from(self.height) * f64::from(height)).round().clamp(1.0, f64::from(height)) as u32;
@@ -115,12 +119,12 @@ impl Obstacle {
         Ok(start..start + rows)
     }
 
-    /// The columns that are hidden in each frame.
+    /// The columns that are hidden in each of the occluded frames.
     ///
     /// The obstacle has one width, such that the part of all subject pixels of the occluded frames that it hides is as
     /// near to `fraction` as whole columns come. Ranges are empty where nothing is hidden.
-    fn columns(&self, subject: &[Subject]) -> Vec<Range<u32>> {
-        let affected = self.affected(subject.len());
+    fn columns(&self, subject: &[Subject]) -> Result<Vec<Range<u32>>, DataError> {
+        let affected = subject.len();
         let w = subject.first().map_or(0, |first| first.columns.len() as i64);
         let last = affected.saturating_sub(1) as f64;
         let step = f64::from(self.travel) * w as f64 / last.max(1.0);
@@ -139,19 +143,26 @@ impl Obstacle {
             }
         }
         let mut hidden = vec![0..0; subject.len()];
+        let all = total + subject.iter().map(|s| u64::from(s.elsewhere)).sum::<u64>();
+        let wanted = f64::from(self.fraction) * all as f64;
+        if wanted > total as f64 {
+            let most = (100.0 * total as f64 / all as f64).floor() / 100.0;
+            let expected =
+                format!("at most {most}, the part of the subject in the rows of an obstacle of height {}", self.height);
+            return Err(DataError::setting("occlusion.fraction", expected, self.fraction));
+        }
         if total == 0 {
-            return hidden;
+            return Ok(hidden);
         }
         // Mean of the subject's pixels, in pixels from the left edge.
         let mean = weighted as f64 / total as f64 + 0.5;
         let centre = mean + f64::from(self.position) * w as f64 + reach as f64;
-        let all = total + subject[..affected].iter().map(|s| u64::from(s.elsewhere)).sum::<u64>();
-        let window = grow(&histogram, centre, f64::from(self.fraction) * all as f64);
+        let window = grow(&histogram, centre, wanted);
         for (range, shift) in hidden.iter_mut().zip(&shifts) {
             let clip = |x: usize| (x as i64 - reach + shift).clamp(0, w) as u32;
             *range = clip(window.start)..clip(window.end);
         }
-        hidden
+        Ok(hidden)
     }
 
     /// Hides what the obstacle covers in a video of equally large frames; returns what is hidden of each.
@@ -159,11 +170,19 @@ impl Obstacle {
         let Some((width, height)) = frames.first().map(|f| (f.camera.width, f.camera.height)) else {
             return Ok(Vec::new());
         };
-        let rows = self.rows(frames, (width, height))?;
+        let mut areas = vec![Area { columns: 0..0, rows: 0..height }; frames.len()];
+        let affected = ((self.share * frames.len() as f32).round() as usize).min(frames.len());
+        if self.fraction == 0.0 || affected == 0 {
+            return Ok(areas);
+        }
+        let occluded = &frames[..affected];
+        let rows = self.rows(occluded, (width, height))?;
         let subject = |frame: &Frame| Ok(Subject::count(&frame.pixels()?.mask, width, &rows));
-        let counted: Vec<Result<Subject, DataError>> = frames.par_iter().map(subject).collect();
-        let columns = self.columns(&counted.into_iter().collect::<Result<Vec<_>, _>>()?);
-        let areas: Vec<Area> = columns.into_iter().map(|columns| Area { columns, rows: rows.clone() }).collect();
+        let counted: Vec<Result<Subject, DataError>> = occluded.par_iter().map(subject).collect();
+        let columns = self.columns(&counted.into_iter().collect::<Result<Vec<_>, _>>()?)?;
+        for (area, columns) in areas.iter_mut().zip(columns) {
+            *area = Area { columns, rows: rows.clone() };
+        }
         for (frame, area) in frames.iter_mut().zip(&areas).filter(|(_, area)| !area.is_empty()) {
             frame.source.edit(Edit::Hide(area.clone()));
         }
@@ -199,6 +218,7 @@ mod tests {
     use proptest::prelude::*;
 
     use super::*;
+    use crate::data::{DemoConfig, demo};
 
     fn bar(width: usize, rows: usize, columns: Range<usize>) -> Vec<f32> {
         (0..width * rows).map(|i| f32::from(columns.contains(&(i % width)))).collect()
@@ -215,49 +235,58 @@ mod tests {
     #[test]
     fn half_of_a_bar_is_its_middle_half() {
         let mask = bar(12, 2, 2..10);
-        assert_eq!(always(0.5).columns(&[whole(&mask, 12)])[0], 4..8);
-        assert_eq!(always(0.25).columns(&[(); 2].map(|()| whole(&mask, 12))), [5..7, 5..7]);
-        assert!(always(0.0).columns(&[whole(&mask, 12)])[0].is_empty());
+        assert_eq!(always(0.5).columns(&[whole(&mask, 12)]).unwrap()[0], 4..8);
+        assert_eq!(always(0.25).columns(&[(); 2].map(|()| whole(&mask, 12))).unwrap(), [5..7, 5..7]);
+        assert!(always(0.0).columns(&[whole(&mask, 12)]).unwrap()[0].is_empty());
     }
 
     #[test]
     fn an_empty_video_hides_nothing() {
-        assert!(always(0.5).columns(&[whole(&[0.0; 8], 4)])[0].is_empty());
-        assert!(always(0.5).columns(&[]).is_empty());
+        assert!(always(0.5).columns(&[whole(&[0.0; 8], 4)]).unwrap()[0].is_empty());
+        assert!(always(0.5).columns(&[]).unwrap().is_empty());
         assert!(always(0.5).hide(&mut []).unwrap().is_empty());
     }
 
     #[test]
     fn a_subject_at_the_border_is_covered_from_there() {
         let mask = bar(10, 1, 0..4);
-        assert_eq!(always(0.5).columns(&[whole(&mask, 10)])[0], 1..3);
-        let columns = always(0.95).columns(&[whole(&mask, 10)]);
+        assert_eq!(always(0.5).columns(&[whole(&mask, 10)]).unwrap()[0], 1..3);
+        let columns = always(0.95).columns(&[whole(&mask, 10)]).unwrap();
         assert!(columns[0].start == 0 && columns[0].end >= 4);
     }
 
     #[test]
     fn the_first_share_of_the_frames_is_occluded() {
-        let mask = bar(12, 2, 2..10);
+        let body = smpl::BodyModel::embedded();
+        let clear =
+            DemoConfig { size: 32, frames: 10, eval_cameras: 1, occluded_fraction: 0.0, ..DemoConfig::default() };
+        let clear = demo(&clear, &body).unwrap();
         for (share, affected) in [(0.0, 0), (0.3, 3), (0.8, 8), (1.0, 10)] {
-            let columns = Obstacle { share, ..Obstacle::default() }.columns(&[(); 10].map(|()| whole(&mask, 12)));
-            let hidden: Vec<bool> = columns.iter().map(|c| !c.is_empty()).collect();
-            assert_eq!(hidden, (0..10).map(|i| i < affected).collect::<Vec<_>>());
+            let mut frames = clear.train.clone();
+            let areas = Obstacle { share, ..Obstacle::default() }.hide(&mut frames).unwrap();
+            for (i, (hidden, whole)) in frames.iter().zip(&clear.train).enumerate() {
+                assert_eq!(
+                    (hidden.shown() != whole.shown(), !areas[i].is_empty()),
+                    (i < affected, i < affected),
+                    "{share} {i}"
+                );
+            }
         }
     }
 
     #[test]
     fn position_moves_the_middle() {
         let mask = bar(40, 3, 10..30);
-        assert_eq!(always(0.5).columns(&[whole(&mask, 40)])[0], 15..25);
-        assert_eq!(Obstacle { position: 0.125, ..always(0.5) }.columns(&[whole(&mask, 40)])[0], 20..30);
-        assert_eq!(Obstacle { position: -0.125, ..always(0.5) }.columns(&[whole(&mask, 40)])[0], 10..20);
+        assert_eq!(always(0.5).columns(&[whole(&mask, 40)]).unwrap()[0], 15..25);
+        assert_eq!(Obstacle { position: 0.125, ..always(0.5) }.columns(&[whole(&mask, 40)]).unwrap()[0], 20..30);
+        assert_eq!(Obstacle { position: -0.125, ..always(0.5) }.columns(&[whole(&mask, 40)]).unwrap()[0], 10..20);
     }
 
     #[test]
     fn a_moving_obstacle_travels_evenly_and_is_central_half_way() {
         let mask = bar(40, 3, 10..30);
         let moving = Obstacle { travel: 0.2, ..always(0.5) };
-        let columns = moving.columns(&[(); 5].map(|()| whole(&mask, 40)));
+        let columns = moving.columns(&[(); 5].map(|()| whole(&mask, 40))).unwrap();
         let starts: Vec<u32> = columns.iter().map(|c| c.start).collect();
         assert_eq!(starts.windows(2).map(|s| s[1] - s[0]).collect::<Vec<_>>(), [2; 4]);
         assert_eq!(columns[2], 15..25);
@@ -289,7 +318,7 @@ mod tests {
         ) {
             let masks: Vec<Vec<f32>> = bits.chunks(24 * 6).map(|b| b.iter().map(|&b| f32::from(b)).collect()).collect();
             let counts: Vec<Subject> = masks.iter().map(|mask| whole(mask, 24)).collect();
-            let columns = Obstacle { travel, ..always(fraction) }.columns(&counts);
+            let columns = Obstacle { travel, ..always(fraction) }.columns(&counts).unwrap();
             let subject = |i: usize, columns: &Range<u32>| masks[i].iter().enumerate()
                 .filter(|(p, m)| **m > 0.5 && columns.contains(&(*p as u32 % 24))).count() as f32;
             let total: f32 = (0..4).map(|i| subject(i, &(0..24))).sum();

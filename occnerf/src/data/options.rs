@@ -6,8 +6,8 @@ use super::obstacle::Obstacle;
 use super::wrong::Wrong;
 
 /// What a capture's files leave open, and how much of them is read. Every layout obeys all of it, but `camera` and
-/// `occlusion`, which only raw ZJU-MoCap leaves open.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+/// `occlusion`, which only raw ZJU-MoCap leaves open. Two are equal where they read the same: `max_bytes` is not compared.
+#[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct LoadOptions {
     /// Where the intrinsics put the centre of the first pixel: 0.5 where they count from the image's corner, 0
@@ -21,7 +21,8 @@ pub struct LoadOptions {
     pub max_frames: Option<usize>,
     /// Views kept back are those of every n-th training frame, beginning with the first.
     pub eval_stride: usize,
-    /// Most bytes that the bodies of all frames (36 a vertex) and pictures kept in memory (16 a pixel) may take. Pictures
+    /// Most bytes that the bodies of all frames (36 a vertex), the labels of the training frames (3 bits a pixel) and pictures
+    /// kept in memory (16 a pixel) may take. Pictures
     /// beyond it are decoded whenever they are asked for.
     pub max_bytes: u64,
     /// The training camera: its folder's name, or its number counted from 1. The first if `None`.
@@ -46,6 +47,26 @@ impl Default for LoadOptions {
             occlusion: None,
             wrong: Wrong::default(),
         }
+    }
+}
+
+impl PartialEq for LoadOptions {
+    fn eq(&self, other: &Self) -> bool {
+        fn read(options: &LoadOptions) -> impl PartialEq + '_ {
+            let LoadOptions {
+                pixel_centre,
+                resize,
+                stride,
+                max_frames,
+                eval_stride,
+                max_bytes: _,
+                camera,
+                occlusion,
+                wrong,
+            } = options;
+            (pixel_centre, resize, stride, max_frames, eval_stride, camera, occlusion, wrong)
+        }
+        read(self) == read(other)
     }
 }
 

@@ -146,7 +146,10 @@ impl PixelSource {
         match &mut self.0 {
             Place::Memory(pixels) => edit.apply(Arc::make_mut(pixels)),
             Place::Disk(disk) => {
-                let mut kept = disk.kept.get().cloned();
+                let mut kept = match Arc::get_mut(disk) {
+                    Some(own) => own.kept.take(),
+                    None => disk.kept.get().cloned(),
+                };
                 if let Some(pixels) = &mut kept {
                     edit.apply(Arc::make_mut(pixels));
                 }

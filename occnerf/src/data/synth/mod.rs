@@ -25,7 +25,7 @@ use super::{Capture, DataError, Frame, LoadOptions, Obstacle, Pixels};
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Occlusion {
-    /// The paper's: a rectangle as high as the picture.
+    /// The paper's rectangle.
     Rectangle(Obstacle),
     /// A desk and two pillars of 3-D geometry, lit as the person is, before a room; in every frame.
     Objects {
@@ -114,12 +114,13 @@ impl SynthConfig {
             }
         }
         self.demo().check()?;
-        // What the loaders would refuse is not made.
+        // All of it is in memory until it is written.
         let views = self.frames + self.frames.div_ceil(self.eval_every) * self.eval_cameras;
         let bytes = views as u64 * u64::from(self.size).pow(2) * 16;
         let limit = LoadOptions::default().max_bytes;
         if bytes > limit {
-            let expected = format!("pixels of at most {} MiB (fewer frames or views, or a smaller size)", limit >> 20);
+            let expected =
+                format!("at most {} MiB of pixels in memory (fewer frames or views, or a smaller size)", limit >> 20);
             let actual = format!("{} MiB in {views} pictures of {1}×{1}", bytes >> 20, self.size);
             return Err(DataError::setting("frames", expected, actual));
         }

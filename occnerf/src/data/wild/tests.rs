@@ -136,8 +136,8 @@ fn stride_and_limit_keep_frames_and_their_views_together() {
 #[test]
 fn memory_beyond_the_bound_names_options_that_fit() {
     let (dir, _) = fixture("wild-memory");
-    // 4 + 2 frames whose bodies have 8 vertices of 36 bytes, and a picture of 24 pixels of 16 bytes.
-    let fits = LoadOptions { max_bytes: 6 * 8 * 36 + 24 * 16, ..LoadOptions::default() };
+    // 4 + 2 frames whose bodies have 8 vertices of 36 bytes, labels of 4 frames, and a picture of 24 pixels of 16 bytes.
+    let fits = LoadOptions { max_bytes: 6 * 8 * 36 + 4 * 10 + 24 * 16, ..LoadOptions::default() };
     assert!(load_capture(dir.path(), &body(), &fits).is_ok());
     let tight = LoadOptions { max_bytes: fits.max_bytes - 1, ..fits };
     let message = load_capture(dir.path(), &body(), &tight).unwrap_err().to_string();
@@ -162,7 +162,7 @@ fn memory_beyond_the_bound_names_options_that_fit() {
 #[test]
 fn what_is_not_in_memory_is_read_when_asked_for() {
     let (dir, _) = fixture("wild-demand");
-    let options = LoadOptions { max_bytes: 6 * 8 * 36 + 2 * 24 * 16, ..LoadOptions::default() };
+    let options = LoadOptions { max_bytes: 6 * 8 * 36 + 4 * 10 + 2 * 24 * 16, ..LoadOptions::default() };
     let capture = load_capture(dir.path(), &body(), &options).unwrap();
     let level = |i: usize| capture.train[i].pixels().map(|pixels| (pixels.image.rgb(3, 0)[0] * 255.0).round());
     assert_eq!(level(3).unwrap(), 200.0);
