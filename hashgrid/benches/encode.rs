@@ -63,6 +63,7 @@ fn case(kind: Points) -> Case {
 fn encode(bencher: Bencher<'_, '_>, kind: Points) {
     let Case { grid, table, points, .. } = case(kind);
     let width = grid.num_features();
+    // A call writes all levels of its points.
     let mut features = vec![0.0; POINTS * width];
     bencher.counter(ItemsCount::new(POINTS)).bench_local(|| {
         points

@@ -28,10 +28,11 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         grid.encode(&table, &points, &mut features);
         let mut loss = 0.0;
         for (i, &point) in points.iter().enumerate() {
-            let row = i * width..(i + 1) * width;
-            let (color, target) = (sum_levels(&features[row.clone()]), picture(point));
-            for (k, d) in d_features[row].iter_mut().enumerate() {
-                *d = (color[k % 3] - target[k % 3]) / BATCH as f32;
+            let (color, target) = (sum_levels(&features, i, BATCH), picture(point));
+            for level in d_features.chunks_exact_mut(3 * BATCH) {
+                for c in 0..3 {
+                    level[3 * i + c] = (color[c] - target[c]) / BATCH as f32;
+                }
             }
             loss += (0..3).map(|c| (color[c] - target[c]).powi(2)).sum::<f32>() / (3 * BATCH) as f32;
         }
@@ -55,7 +56,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         let points: Vec<[f32; 2]> = (0..SIDE).map(|x| [x, y].map(|i| (i as f32 + 0.5) / SIDE as f32)).collect();
         grid.encode(&table, &points, &mut line);
         for x in 0..SIDE {
-            let fitted = sum_levels(&line[x * width..(x + 1) * width]);
+            let fitted = sum_levels(&line, x, SIDE);
             for (column, color) in [(x, picture(points[x])), (x + SIDE, fitted)] {
                 pixels.put_pixel(column as u32, y as u32, image::Rgb(color.map(|c| (c * 255.0 + 0.5) as u8)));
             }
@@ -66,11 +67,12 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     Ok(())
 }
 
-fn sum_levels(features: &[f32]) -> [f32; 3] {
+/// The colour of point `i`: the sum of its features over the levels.
+fn sum_levels(features: &[f32], i: usize, points: usize) -> [f32; 3] {
     let mut color = [0.0; 3];
-    for level in features.as_chunks::<3>().0 {
+    for level in features.chunks_exact(3 * points) {
         for c in 0..3 {
-            color[c] += level[c];
+            color[c] += level[3 * i + c];
         }
     }
     color

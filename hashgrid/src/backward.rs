@@ -6,7 +6,7 @@ use crate::simd::Kernel;
 
 impl<const D: usize> HashGrid<D> {
     /// Adds the gradient of the table to `d_table` ([`HashGrid::num_parameters`]), given `points` (Q, D) and the
-    /// gradient of their features `d_features` (Q, L·F).
+    /// gradient of their features `d_features` (L, Q, F).
     ///
     /// Levels run in parallel on the current rayon pool; each adds its points in their order, so that the result
     /// does not depend on the number of threads. The encoding is linear in the table: no table is needed.
@@ -14,27 +14,43 @@ impl<const D: usize> HashGrid<D> {
     /// # Panics
     /// Where a slice has another length.
     pub fn encode_backward(&self, points: &[[f32; D]], d_features: &[f32], d_table: &mut [f32]) {
+        self.encode_backward_parts(std::iter::once((points, d_features)), d_table);
+    }
+
+    /// [`HashGrid::encode_backward`] of points that lie in several places, one part after the other: a level's part of the
+    /// table comes to the cache once for all of them.
+    ///
+    /// # Panics
+    /// As [`HashGrid::encode_backward`].
+    pub fn encode_backward_parts<'a>(
+        &self,
+        parts: impl Iterator<Item = (&'a [[f32; D]], &'a [f32])> + Clone + Sync,
+        d_table: &mut [f32],
+    ) {
         self.assert_table("d_table", d_table);
-        self.assert_features("d_features", d_features, points.len());
-        if points.is_empty() {
+        for (points, d_features) in parts.clone() {
+            self.assert_features("d_features", d_features, points.len());
+        }
+        if parts.clone().all(|(points, _)| points.is_empty()) {
             return;
         }
-        let mut parts = Vec::with_capacity(self.levels.len());
+        let mut levels = Vec::with_capacity(self.levels.len());
         let mut rest = d_table;
         for (l, level) in self.levels.iter().enumerate() {
-            let (part, after) = rest.split_at_mut(level.rows * self.features);
-            parts.push((l, part));
+            let (d_table, after) = rest.split_at_mut(level.rows * self.features);
+            levels.push((l, d_table));
             rest = after;
         }
-        let width = self.num_features();
         let arch = pulp::Arch::new();
-        parts.into_par_iter().with_max_len(1).for_each(|(l, d_table)| {
+        levels.into_par_iter().with_max_len(1).for_each(|(l, d_table)| {
             let level = &self.levels[l];
-            let first = l * self.features;
-            arch.dispatch(Kernel(
-                #[inline(always)]
-                || for_widths!(self.features, backward_level::<D>(level, points, d_features, d_table, width, first)),
-            ));
+            for (points, d_features) in parts.clone() {
+                let d_features = &d_features[self.features_range(l, points.len(), 0, points.len())];
+                arch.dispatch(Kernel(
+                    #[inline(always)]
+                    || for_widths!(self.features, backward_level::<D>(level, points, d_features, d_table)),
+                ));
+            }
         });
     }
 }
@@ -45,19 +61,18 @@ fn backward_level<const D: usize, const W: usize>(
     points: &[[f32; D]],
     d_features: &[f32],
     d_table: &mut [f32],
-    width: usize,
-    first: usize,
     stride: usize,
     offset: usize,
 ) {
     let mut corners = Corners::new();
-    let blocks = points.chunks(BLOCK).zip(d_features.chunks(BLOCK * width));
+    let blocks = points.chunks(BLOCK).zip(d_features.chunks(BLOCK * stride));
     for (points, d_features) in blocks {
         corners.fill(level, points);
-        for (b, d_features) in d_features.chunks_exact(width).enumerate() {
-            let d_sum: &[f32; W] = &d_features[first + offset..].as_chunks::<W>().0[0];
+        let weight = corners.weights::<D>();
+        for (b, d_features) in d_features.chunks_exact(stride).enumerate() {
+            let d_sum: &[f32; W] = &d_features[offset..].as_chunks::<W>().0[0];
             for k in 0..1 << D {
-                let weight = corners.weight[k][b];
+                let weight = weight[k][b];
                 let d_values = row_mut::<W>(d_table, stride, offset, corners.row[k][b]);
                 for f in 0..W {
                     d_values[f] += weight * d_sum[f];

@@ -5,7 +5,7 @@ use crate::simd::Kernel;
 
 impl<const D: usize> HashGrid<D> {
     /// Adds the gradient of the coordinates to `d_points` (Q, D), given `table`, `points` (Q, D) and the gradient
-    /// of their features `d_features` (Q, L·F). Runs on the calling thread.
+    /// of their features `d_features` (L, Q, F). Runs on the calling thread.
     ///
     /// The encoding is d-linear within a cell and only continuous across cells: on a face the derivative is that
     /// of the upper cell (at x = 1, of the last cell). Coordinates outside \[0, 1\] and NaN get no gradient.
@@ -22,21 +22,15 @@ impl<const D: usize> HashGrid<D> {
         self.assert_table("table", table);
         self.assert_features("d_features", d_features, points.len());
         assert_eq!(d_points.len(), points.len(), "d_points has {} points, expected {}", d_points.len(), points.len());
-        let width = self.num_features();
         let arch = pulp::Arch::new();
-        let chunks = points.chunks(CHUNK).zip(d_features.chunks(CHUNK * width)).zip(d_points.chunks_mut(CHUNK));
-        for ((points, d_features), d_points) in chunks {
+        let chunks = points.chunks(CHUNK).zip(d_points.chunks_mut(CHUNK));
+        for (chunk, (part, d_points)) in chunks.enumerate() {
             for (l, level) in self.levels.iter().enumerate() {
                 let table = &table[self.level_range(l)];
-                let first = l * self.features;
+                let d_features = &d_features[self.features_range(l, points.len(), chunk * CHUNK, part.len())];
                 arch.dispatch(Kernel(
                     #[inline(always)]
-                    || {
-                        for_widths!(
-                            self.features,
-                            level_backward_points::<D>(level, table, points, d_features, d_points, width, first)
-                        )
-                    },
+                    || for_widths!(self.features, level_backward_points::<D>(level, table, part, d_features, d_points)),
                 ));
             }
         }
@@ -50,19 +44,17 @@ fn level_backward_points<const D: usize, const W: usize>(
     points: &[[f32; D]],
     d_features: &[f32],
     d_points: &mut [[f32; D]],
-    width: usize,
-    first: usize,
     stride: usize,
     offset: usize,
 ) {
     let n = level.resolution as f32;
     let mut corners = Corners::new();
     let mut projected = [[0.0f32; BLOCK]; MAX_CORNERS];
-    let blocks = points.chunks(BLOCK).zip(d_features.chunks(BLOCK * width)).zip(d_points.chunks_mut(BLOCK));
+    let blocks = points.chunks(BLOCK).zip(d_features.chunks(BLOCK * stride)).zip(d_points.chunks_mut(BLOCK));
     for ((points, d_features), d_points) in blocks {
         corners.fill(level, points);
-        for (b, d_features) in d_features.chunks_exact(width).enumerate() {
-            let d_sum: &[f32; W] = &d_features[first + offset..].as_chunks::<W>().0[0];
+        for (b, d_features) in d_features.chunks_exact(stride).enumerate() {
+            let d_sum: &[f32; W] = &d_features[offset..].as_chunks::<W>().0[0];
             for k in 0..1 << D {
                 let values = row::<W>(table, stride, offset, corners.row[k][b]);
                 let mut dot = 0.0;

@@ -10,20 +10,20 @@ const PRIMES: [u32; 4] = [1, 2_654_435_761, 805_459_861, 3_674_653_429];
 
 /// One number for every point of a block.
 pub(crate) type Lanes<T> = [T; BLOCK];
+/// The rows of a block's corners, corner by corner.
+pub(crate) type Values<const W: usize> = [Lanes<[f32; W]>; MAX_CORNERS];
 
 /// Corner k lies at c_j + 1 where bit j of k is set, at c_j where it is not.
 pub(crate) struct Corners {
     /// Rows of the level's table.
     pub row: [Lanes<u32>; MAX_CORNERS],
-    /// Products of the D factors; their sum is 1.
-    pub weight: [Lanes<f32>; MAX_CORNERS],
     /// Place of the point within its cell, an axis each, in [0, 1].
     pub fraction: [Lanes<f32>; 4],
 }
 
 impl Corners {
     pub fn new() -> Self {
-        Self { row: [[0; BLOCK]; MAX_CORNERS], weight: [[0.0; BLOCK]; MAX_CORNERS], fraction: [[0.0; BLOCK]; 4] }
+        Self { row: [[0; BLOCK]; MAX_CORNERS], fraction: [[0.0; BLOCK]; 4] }
     }
 
     /// Fills the block from up to [`BLOCK`] `points`; lanes beyond them hold the corners of the origin.
@@ -79,25 +79,61 @@ impl Corners {
             if j == 0 {
                 self.row[0] = low;
                 self.row[1] = high;
-                for b in 0..BLOCK {
-                    self.weight[0][b] = 1.0 - fraction[b];
-                    self.weight[1][b] = fraction[b];
-                }
                 continue;
             }
             let half = 1 << j;
             let (row_low, row_high) = self.row.split_at_mut(half);
-            let (weight_low, weight_high) = self.weight.split_at_mut(half);
             for k in 0..half {
                 for b in 0..BLOCK {
                     row_high[k][b] = combine(row_low[k][b], high[b]);
                     row_low[k][b] = combine(row_low[k][b], low[b]);
-                    weight_high[k][b] = weight_low[k][b] * fraction[b];
-                    weight_low[k][b] *= 1.0 - fraction[b];
                 }
             }
         }
     }
+
+    /// Products of the D factors of each corner; their sum is 1.
+    #[inline(always)]
+    pub fn weights<const D: usize>(&self) -> [Lanes<f32>; MAX_CORNERS] {
+        let mut weight = [[1.0; BLOCK]; MAX_CORNERS];
+        for j in 0..D {
+            let (low, high) = weight.split_at_mut(1 << j);
+            for k in 0..1 << j {
+                for b in 0..BLOCK {
+                    high[k][b] = low[k][b] * self.fraction[j][b];
+                    low[k][b] *= 1.0 - self.fraction[j][b];
+                }
+            }
+        }
+        weight
+    }
+
+    /// Reads the rows of all corners before anything is done with them: more of them are on their way at a time where the
+    /// table is larger than the cache.
+    #[inline(always)]
+    pub fn gather<const D: usize, const W: usize>(
+        &self,
+        table: &[f32],
+        stride: usize,
+        offset: usize,
+        values: &mut Values<W>,
+    ) {
+        for k in 0..1 << D {
+            for b in 0..BLOCK {
+                values[k][b] = *row::<W>(table, stride, offset, self.row[k][b]);
+            }
+        }
+    }
+}
+
+/// A number of each point, once for each of its features.
+#[inline(always)]
+pub(crate) fn spread<const W: usize>(lanes: &Lanes<f32>) -> Lanes<[f32; W]> {
+    let mut wide = [[0.0; W]; BLOCK];
+    for b in 0..BLOCK {
+        wide[b] = [lanes[b]; W];
+    }
+    wide
 }
 
 /// Clamped to [0, 1]; NaN is 0.

@@ -3,6 +3,7 @@ use std::ops::Range;
 use rayon::prelude::*;
 
 use crate::config::{self, Error, HashGridConfig, MAX_PARAMETERS};
+use crate::layout::Layout;
 
 /// A multiresolution hash encoding of D-dimensional points, D = 2, 3 or 4 (others do not compile).
 ///
@@ -86,6 +87,12 @@ impl<const D: usize> HashGrid<D> {
         start..start + rows * self.features
     }
 
+    /// How the features of `points` points lie.
+    #[must_use]
+    pub fn layout(&self, points: usize) -> Layout {
+        Layout { levels: self.levels.len(), points, features: self.features }
+    }
+
     /// Cells an axis of every level (L).
     #[must_use]
     pub fn resolutions(&self) -> &[u32] {
@@ -113,6 +120,12 @@ impl<const D: usize> HashGrid<D> {
             table.len(),
             self.num_parameters()
         );
+    }
+
+    /// Where level `level` of the features of `points` points lies, from point `first` on.
+    pub(crate) fn features_range(&self, level: usize, points: usize, first: usize, count: usize) -> Range<usize> {
+        let start = (level * points + first) * self.features;
+        start..start + count * self.features
     }
 
     pub(crate) fn assert_features(&self, what: &str, features: &[f32], points: usize) {

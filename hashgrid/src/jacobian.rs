@@ -1,4 +1,4 @@
-use crate::corners::{BLOCK, Corners, MAX_CORNERS, for_widths, row};
+use crate::corners::{BLOCK, Corners, Lanes, MAX_CORNERS, Values, for_widths, spread};
 use crate::encode::CHUNK;
 use crate::grid::{HashGrid, Level};
 use crate::simd::Kernel;
@@ -22,50 +22,38 @@ impl<const D: usize> HashGrid<D> {
         self.assert_table("table", table);
         self.assert_features("features", features, points.len());
         self.assert_jacobian(jacobian, points.len());
-        let (width, block) = (self.num_features(), self.features * D);
         let arch = pulp::Arch::new();
-        let chunks = points.chunks(CHUNK).zip(features.chunks_mut(CHUNK * width));
-        for (chunk, (points_of, features)) in chunks.enumerate() {
+        for (chunk, part) in points.chunks(CHUNK).enumerate() {
             for (l, level) in self.levels.iter().enumerate() {
                 let table = &table[self.level_range(l)];
-                let first = l * self.features;
-                let start = (l * points.len() + chunk * CHUNK) * block;
-                let jacobian = &mut jacobian[start..][..points_of.len() * block];
+                let range = self.features_range(l, points.len(), chunk * CHUNK, part.len());
+                let jacobian = &mut jacobian[range.start * D..range.end * D];
+                let features = &mut features[range];
                 arch.dispatch(Kernel(
                     #[inline(always)]
-                    || {
-                        for_widths!(
-                            self.features,
-                            level_jacobian::<D>(level, table, points_of, features, jacobian, width, first)
-                        )
-                    },
+                    || for_widths!(self.features, level_jacobian::<D>(level, table, part, features, jacobian)),
                 ));
             }
         }
     }
 
     /// Adds the gradient of the coordinates to `d_points` (Q, D), given what [`HashGrid::encode_jacobian`] wrote and the gradient
-    /// of the features `d_features` (Q, L·F). Runs on the calling thread.
+    /// of the features `d_features` (L, Q, F). Runs on the calling thread.
     ///
     /// # Panics
     /// Where a slice has another length.
     pub fn jacobian_backward(&self, jacobian: &[f32], d_features: &[f32], d_points: &mut [[f32; D]]) {
-        /// Rows of `d_features` that stay in the first-level cache while all levels pass over them.
-        const ROWS: usize = 128;
+        /// Points whose gradients stay in the first-level cache while all levels pass over them.
+        const PART: usize = 512;
         self.assert_jacobian(jacobian, d_points.len());
         self.assert_features("d_features", d_features, d_points.len());
-        let (points, width, block) = (d_points.len(), self.num_features(), self.features * D);
-        for (part, (d_points, d_features)) in d_points.chunks_mut(ROWS).zip(d_features.chunks(ROWS * width)).enumerate()
-        {
+        let points = d_points.len();
+        for (part, d_points) in d_points.chunks_mut(PART).enumerate() {
             for l in 0..self.levels.len() {
-                let jacobian = &jacobian[(l * points + part * ROWS) * block..];
-                let rows = d_features.chunks_exact(width).zip(jacobian.chunks_exact(block));
-                for (d_point, (d_row, jacobian)) in d_points.iter_mut().zip(rows) {
-                    let d_row = &d_row[l * self.features..][..self.features];
-                    for (d, slopes) in d_point.iter_mut().zip(jacobian.chunks_exact(self.features)) {
-                        *d += slopes.iter().zip(d_row).map(|(slope, d)| slope * d).sum::<f32>();
-                    }
-                }
+                let range = self.features_range(l, points, part * PART, d_points.len());
+                let jacobian = &jacobian[range.start * D..range.end * D];
+                let d_features = &d_features[range];
+                for_widths!(self.features, project::<D>(jacobian, d_features, d_points));
             }
         }
     }
@@ -83,62 +71,80 @@ fn level_jacobian<const D: usize, const W: usize>(
     points: &[[f32; D]],
     features: &mut [f32],
     jacobian: &mut [f32],
-    width: usize,
-    first: usize,
     stride: usize,
     offset: usize,
 ) {
     let n = level.resolution as f32;
     let mut corners = Corners::new();
-    let blocks = points.chunks(BLOCK).zip(features.chunks_mut(BLOCK * width));
+    let mut values = [[[0.0f32; W]; BLOCK]; MAX_CORNERS];
+    let blocks = points.chunks(BLOCK).zip(features.chunks_mut(BLOCK * stride));
     for ((points, features), jacobian) in blocks.zip(jacobian.chunks_mut(BLOCK * D * stride)) {
         corners.fill(level, points);
-        let rows = features.chunks_exact_mut(width).zip(jacobian.chunks_exact_mut(D * stride));
+        corners.gather::<D, W>(table, stride, offset, &mut values);
+        let slopes = fold::<D, W>(&mut values, &corners.fraction);
+        let rows = features.chunks_exact_mut(stride).zip(jacobian.chunks_exact_mut(D * stride));
         for (b, (point, (features, jacobian))) in points.iter().zip(rows).enumerate() {
-            let mut values = [[0.0f32; W]; MAX_CORNERS];
-            for k in 0..1 << D {
-                values[k] = *row::<W>(table, stride, offset, corners.row[k][b]);
-            }
-            let mut fraction = [0.0; D];
-            for j in 0..D {
-                fraction[j] = corners.fraction[j][b];
-            }
-            let slopes = fold(&mut values, fraction);
-            features[first + offset..][..W].copy_from_slice(&values[0]);
+            features[offset..][..W].copy_from_slice(&values[0][b]);
             for j in 0..D {
                 let scale = if (0.0..=1.0).contains(&point[j]) { n } else { 0.0 };
                 let out = &mut jacobian[j * stride + offset..][..W];
                 for f in 0..W {
-                    out[f] = scale * slopes[j][f];
+                    out[f] = scale * slopes[j][b][f];
                 }
             }
         }
     }
 }
 
+/// Adds the Jacobian of one level, transposed, times the gradients of its features.
+#[inline(always)]
+fn project<const D: usize, const W: usize>(
+    jacobian: &[f32],
+    d_features: &[f32],
+    d_points: &mut [[f32; D]],
+    stride: usize,
+    offset: usize,
+) {
+    let rows = d_features.chunks_exact(stride).zip(jacobian.chunks_exact(D * stride));
+    for (d_point, (d_features, jacobian)) in d_points.iter_mut().zip(rows) {
+        let d_features: &[f32; W] = &d_features[offset..].as_chunks::<W>().0[0];
+        for (d, slopes) in d_point.iter_mut().zip(jacobian.chunks_exact(stride)) {
+            let slopes: &[f32; W] = &slopes[offset..].as_chunks::<W>().0[0];
+            *d += slopes.iter().zip(d_features).map(|(slope, d)| slope * d).sum::<f32>();
+        }
+    }
+}
+
 /// Interpolates the corners' values into `values[0]`; returns its derivatives along the axes, a cell's side being 1.
 #[inline(always)]
-fn fold<const D: usize, const W: usize>(values: &mut [[f32; W]; MAX_CORNERS], fraction: [f32; D]) -> [[f32; W]; D] {
-    let mut slopes = [[[0.0f32; W]; MAX_CORNERS / 2]; D];
+fn fold<const D: usize, const W: usize>(values: &mut Values<W>, fraction: &[Lanes<f32>; 4]) -> [Lanes<[f32; W]>; D] {
+    let mut slopes = [[[[0.0f32; W]; BLOCK]; MAX_CORNERS / 2]; D];
     for axis in (0..D).rev() {
-        let (half, t) = (1 << axis, fraction[axis]);
+        let half = 1 << axis;
+        let t = spread::<W>(&fraction[axis]);
+        let t = t.as_flattened();
         // The derivatives along the axes that are folded already are interpolated along this one.
         for slope in &mut slopes[axis + 1..] {
+            let (low, high) = slope.split_at_mut(half);
             for k in 0..half {
-                for f in 0..W {
-                    slope[k][f] += t * (slope[half + k][f] - slope[k][f]);
+                let (low, high) = (low[k].as_flattened_mut(), high[k].as_flattened());
+                for i in 0..BLOCK * W {
+                    low[i] += t[i] * (high[i] - low[i]);
                 }
             }
         }
+        let (low, high) = values.split_at_mut(half);
         for k in 0..half {
-            for f in 0..W {
-                let difference = values[half + k][f] - values[k][f];
-                slopes[axis][k][f] = difference;
-                values[k][f] += t * difference;
+            let (low, high) = (low[k].as_flattened_mut(), high[k].as_flattened());
+            let slope = slopes[axis][k].as_flattened_mut();
+            for i in 0..BLOCK * W {
+                let difference = high[i] - low[i];
+                slope[i] = difference;
+                low[i] += t[i] * difference;
             }
         }
     }
-    let mut first = [[0.0; W]; D];
+    let mut first = [[[0.0; W]; BLOCK]; D];
     for j in 0..D {
         first[j] = slopes[j][0];
     }

@@ -29,7 +29,8 @@
 //!   (⊕_j c_j · π_j) mod 2^T in wrapping `u32`, π = 1, 2654435761, 805459861, 3674653429 (*hashed*).
 //! * Coordinates are clamped to \[0, 1\]; NaN counts as 0. Neither gets a gradient.
 //! * The table is one flat slice owned by the caller, level after level, a dense level holding only the rows it
-//!   has: [`HashGrid::level_range`] says where. Features are Q × (L·F), row-major.
+//!   has: [`HashGrid::level_range`] says where. Features are (L, Q, F), a level's features of all points after each other;
+//!   [`Layout`] copies them to rows of a point each, and back.
 //! * Results do not depend on the number of threads, bit for bit.
 
 mod backward;
@@ -39,7 +40,9 @@ mod corners;
 mod encode;
 mod grid;
 mod jacobian;
+mod layout;
 mod simd;
 
 pub use config::{Error, HashGridConfig, MAX_LOG2_TABLE_SIZE, MAX_PARAMETERS, MAX_RESOLUTION};
 pub use grid::HashGrid;
+pub use layout::Layout;

@@ -3,7 +3,7 @@
 mod common;
 
 use approx::{abs_diff_eq, assert_abs_diff_eq};
-use common::{encode, oracle, points, table};
+use common::{encode, encode_rows, oracle, points, table};
 use hashgrid::HashGrid;
 use proptest::prelude::*;
 
@@ -19,7 +19,7 @@ fn compare<const D: usize>(
 ) -> Result<(), TestCaseError> {
     let table = table(grid, seed);
     let expected = oracle(grid, &table, points, log2, features);
-    for (i, (got, expected)) in encode(grid, &table, points).iter().zip(&expected).enumerate() {
+    for (i, (got, expected)) in encode_rows(grid, &table, points).iter().zip(&expected).enumerate() {
         prop_assert!(
             (f64::from(*got) - expected).abs() <= TOLERANCE,
             "feature {} of point {:?}: {got}, expected {expected}",

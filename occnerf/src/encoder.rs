@@ -3,7 +3,7 @@
 use std::ops::Range;
 
 use glam::Vec3;
-use hashgrid::{HashGrid, HashGridConfig};
+use hashgrid::{HashGrid, HashGridConfig, Layout};
 use volrender::Aabb;
 
 use crate::Error;
@@ -86,7 +86,16 @@ impl Encoder {
         matches!(self, Self::Surface(_, (low, high)) if d > *low && d < *high)
     }
 
-    /// Features (Q × F, row-major) of the coordinates.
+    /// How the features of `points` points lie; a frequency encoding is one level.
+    pub fn layout(&self, points: usize) -> Layout {
+        match self {
+            Self::Frequency => Layout { levels: 1, points, features: self.num_features() },
+            Self::Point(grid) => grid.layout(points),
+            Self::Surface(grid, _) => grid.layout(points),
+        }
+    }
+
+    /// Features ([`Encoder::layout`]) of the coordinates.
     pub fn encode(&self, table: &[f32], at: At<'_>, features: &mut [f32]) {
         match self {
             Self::Frequency => {
@@ -121,12 +130,16 @@ impl Encoder {
         }
     }
 
-    /// Adds the gradient of the table.
-    pub fn encode_backward(&self, at: At<'_>, d_features: &[f32], d_table: &mut [f32]) {
+    /// Adds the gradient of the table from all parts, in their order.
+    pub fn encode_backward<'a>(
+        &self,
+        parts: impl Iterator<Item = (At<'a>, &'a [f32])> + Clone + Sync,
+        d_table: &mut [f32],
+    ) {
         match self {
             Self::Frequency => {}
-            Self::Point(grid) => grid.encode_backward(at.point, d_features, d_table),
-            Self::Surface(grid, _) => grid.encode_backward(at.surface, d_features, d_table),
+            Self::Point(grid) => grid.encode_backward_parts(parts.map(|(at, d)| (at.point, d)), d_table),
+            Self::Surface(grid, _) => grid.encode_backward_parts(parts.map(|(at, d)| (at.surface, d)), d_table),
         }
     }
 
@@ -205,11 +218,6 @@ impl Coordinates {
     /// Those of vertices `range`, which are encoded on the surface.
     pub fn vertices(&self, range: Range<usize>) -> At<'_> {
         At { point: &[], surface: &self.surface[range] }
-    }
-
-    pub fn extend(&mut self, other: &Self) {
-        self.point.extend_from_slice(&other.point);
-        self.surface.extend_from_slice(&other.surface);
     }
 
     pub fn clear(&mut self) {

@@ -51,7 +51,7 @@ pub(crate) struct Group {
     pub d_sigma: Vec<f32>,
     pub d_rgb: Vec<Vec3>,
     pub d_likelihood: Vec<f32>,
-    /// Gradient of the point term's features, N × F.
+    /// Gradient of the point term's features, as they lie ([`Encoder::layout`]).
     pub d_features: Vec<f32>,
     /// Gradient of d through the density's bias.
     pub d_distance: Vec<f32>,
@@ -105,16 +105,15 @@ impl Field {
         group.sigma.resize(n, 0.0);
         group.rgb.resize(n, Vec3::ZERO);
         group.blocks.resize_with(n.div_ceil(BLOCK).max(group.blocks.len()), Activations::default);
-        let row = self.mlp.input_width();
+        let (row, layout) = (self.mlp.input_width(), self.encoder.layout(n));
         let per_sample = group.attention.len().checked_div(n).unwrap_or(0);
         for block in 0..n.div_ceil(BLOCK) {
             let range = block * BLOCK..((block + 1) * BLOCK).min(n);
             let activations = &mut group.blocks[block];
             self.mlp.resize(activations, range.len());
-            for (s, input) in range.clone().zip(activations.layers[0].chunks_exact_mut(row)) {
-                input[..width].copy_from_slice(&group.features[s * width..][..width]);
-                input[width..].fill(0.0);
-            }
+            let inputs = &mut activations.layers[0];
+            layout.to_rows(&group.features, range.clone(), inputs, row);
+            inputs.chunks_exact_mut(row).for_each(|input| input[width..].fill(0.0));
             if self.surface_term {
                 let range = range.start * per_sample..range.end * per_sample;
                 let neighbours = &group.samples.neighbours[range.clone()];
@@ -137,7 +136,7 @@ impl Field {
     /// overwrites `d_features` and `d_distance` of the group.
     pub fn backward(&self, transposed: &[f32], group: &mut Group, d_mlp: &mut [f32], d_vertices: &mut [f32]) {
         let (n, width) = (group.samples.len(), self.encoder.num_features());
-        let row = self.mlp.input_width();
+        let (row, layout) = (self.mlp.input_width(), self.encoder.layout(n));
         let per_sample = group.attention.len().checked_div(n).unwrap_or(0);
         group.d_features.resize(n * width, 0.0);
         group.d_distance.resize(n, 0.0);
@@ -157,9 +156,7 @@ impl Field {
             }
             let (d_output, d_input) = (&mut group.d_output, &mut group.d_input);
             self.mlp.backward(transposed, activations, range.len(), d_output, d_input, d_mlp);
-            for (s, d_row) in range.clone().zip(d_input.chunks_exact(row)) {
-                group.d_features[s * width..][..width].copy_from_slice(&d_row[..width]);
-            }
+            layout.from_rows(d_input, row, range.clone(), &mut group.d_features);
             if self.surface_term {
                 let range = range.start * per_sample..range.end * per_sample;
                 let neighbours = &group.samples.neighbours[range.clone()];
@@ -329,7 +326,7 @@ mod tests {
             field.backward(&transposed, &mut group, &mut d_mlp, &mut d_features);
             field.mlp.clear_padding(&mut d_mlp);
             let mut d_table = vec![0.0; table.len()];
-            field.encoder.encode_backward(group.at.all(), &group.d_features, &mut d_table);
+            field.encoder.encode_backward(std::iter::once((group.at.all(), &group.d_features[..])), &mut d_table);
             for direction in 0..6 {
                 let mut random = Stream::new(&[17, direction]);
                 let mut u_mlp = normal(mlp.len(), &mut random);

@@ -101,6 +101,14 @@ mod tests {
     use crate::samples::{CELL, Stage};
     use crate::scene::Scene;
 
+    /// Features, or their gradient, a row for each point.
+    fn rows(encoder: &crate::encoder::Encoder, features: &[f32]) -> Vec<f32> {
+        let mut rows = vec![0.0; features.len()];
+        let (width, points) = (encoder.num_features(), features.len() / encoder.num_features());
+        encoder.layout(points).to_rows(features, 0..points, &mut rows, width);
+        rows
+    }
+
     /// Value = Σ c · features(x) + e · d(x) + p · f(x) of points x that keep still while the pose is corrected.
     #[test]
     fn gradient_of_the_pose_agrees_with_finite_differences() {
@@ -142,6 +150,7 @@ mod tests {
             let (table, mut features) = (trainer.parameters.get(Part::Table), vec![0.0; live.len() * width]);
             trainer.field.encoder.encode_jacobian(table, group.at.all(), &mut features, &mut group.jacobian);
             group.d_features = (0..live.len() * width).map(|_| random(1.0).x).collect();
+            let d_rows = rows(&trainer.field.encoder, &group.d_features);
             group.d_distance = live.iter().map(|_| random(3.0).x).collect();
             group.d_likelihood = live.iter().map(|_| random(0.3).x).collect();
             let mut wrenches = vec![Wrench::default(); after.bones.len()];
@@ -153,10 +162,11 @@ mod tests {
                 let found = trace(&corrected(&body, &frame.shape, &frame.posed, correction), &mut moved);
                 let mut features = vec![0.0; found.len() * width];
                 trainer.field.encoder.encode(trainer.parameters.get(Part::Table), moved.at.all(), &mut features);
+                let features = rows(&trainer.field.encoder, &features);
                 let at = |i: usize| live.binary_search(&i).ok();
                 let terms = found.iter().enumerate().filter_map(|(s, &i)| {
                     let l = at(i)?;
-                    let (cotangent, row) = (&group.d_features[l * width..][..width], &features[s * width..][..width]);
+                    let (cotangent, row) = (&d_rows[l * width..][..width], &features[s * width..][..width]);
                     let dot: f64 = cotangent.iter().zip(row).map(|(c, v)| f64::from(c * v)).sum();
                     let d = f64::from(group.d_distance[l] * moved.samples.distance[s]);
                     Some(dot + d + f64::from(group.d_likelihood[l] * moved.samples.likelihood[s]))

@@ -5,6 +5,9 @@ use crate::config::{
     OccludedRule, Preset, RateConfig, SurfaceConfig, VisibilityKind,
 };
 
+/// 2⁻²⁵: what remains behind it is lost when it is added to an f32 near 1.
+const NOTHING: f32 = 1.0 / (1 << 25) as f32;
+
 /// The paper's setting; what it leaves open is named in ARCHITECTURE.
 pub(crate) fn paper() -> Config {
     Config {
@@ -16,7 +19,7 @@ pub(crate) fn paper() -> Config {
         patches: 6,
         patch_size: 32,
         samples: 128,
-        min_transmittance: 0.0,
+        min_transmittance: NOTHING,
         field: FieldConfig {
             width: 64,
             depth: 2,

@@ -107,7 +107,7 @@ mod tests {
         }
         let parameter = |part| trainer.parameters.get(part);
         let (field, table) = (parameter(crate::parameters::Part::Field), parameter(crate::parameters::Part::Table));
-        trainer.field.forward(field, table, &code.features, &trainer.counts, &mut group);
+        trainer.field.forward(field, table, &code.rows, &trainer.counts, &mut group);
         assert!(group.samples.len() > 500);
         for (&(face, _), rgb) in group.samples.faces.iter().zip(&group.rgb) {
             let corners = scene.model.faces[face as usize].map(|v| shown.colors[v as usize]);

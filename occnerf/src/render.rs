@@ -52,7 +52,7 @@ impl<'a> FieldRenderer<'a> {
     pub fn new(trainer: &'a Trainer<'a>) -> Result<Self, Error> {
         let mut code = VertexCode::default();
         trainer.encode_vertices(&mut code);
-        let shell = trainer.measure_shell(&code.features);
+        let shell = trainer.measure_shell(&code.rows);
         Ok(Self { trainer, code, shell, stage: Stage::new(trainer.scene, FINE_CELL)? })
     }
 }
@@ -83,7 +83,7 @@ impl Renderer for FieldRenderer<'_> {
         self.stage.set(trainer.scene, &posed, &self.shell, &trainer.config);
         let tracer = trainer.tracer(&self.stage, &self.shell, frame, &posed);
         let (field, table) = (trainer.parameters.get(Part::Field), trainer.parameters.get(Part::Table));
-        let features = &self.code.features;
+        let features = &self.code.rows;
         paint(frame, background, Scratch::default, |scratch, row, columns| {
             let start = |column| Progress {
                 march: March::new(pixel_ray(frame, row * frame.camera.width + column), None),
@@ -227,7 +227,7 @@ mod tests {
             all.group.samples.trace(&tracer, &pixel_ray(frame, pixel));
         }
         let (field, table) = (trainer.parameters.get(Part::Field), trainer.parameters.get(Part::Table));
-        trainer.field.forward(field, table, &renderer.code.features, &trainer.counts, &mut all.group);
+        trainer.field.forward(field, table, &renderer.code.rows, &trainer.counts, &mut all.group);
         composite_group(&all.group, background, &mut all.weights, &mut all.composites);
         let (mut worst, mut solid) = (0.0f32, 0);
         for (pixel, expected) in all.composites.iter().enumerate() {

@@ -75,7 +75,7 @@ impl Runs {
     }
 
     /// The groups of the runs, front to back.
-    pub fn groups(&self) -> impl Iterator<Item = &Group> {
+    pub fn groups(&self) -> impl Iterator<Item = &Group> + Clone {
         self.all[..self.count].iter().map(|run| &run.group)
     }
 

@@ -111,7 +111,7 @@ mod tests {
         let trainer = Trainer::new(scene, config.clone()).unwrap();
         let mut code = VertexCode::default();
         trainer.encode_vertices(&mut code);
-        trainer.measure_shell(&code.features)
+        trainer.measure_shell(&code.rows)
     }
 
     #[test]

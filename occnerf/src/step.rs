@@ -33,7 +33,7 @@ impl Trainer<'_> {
         let (field, table) = (self.parameters.get(Part::Field), self.parameters.get(Part::Table));
         runs.march(&tracer, marches, self.config.min_transmittance, |group| {
             group.wants_jacobian = wants_jacobian;
-            self.field.forward(field, table, &self.vertex_code.features, &self.counts, group);
+            self.field.forward(field, table, &self.vertex_code.rows, &self.counts, group);
         });
         *times = StepTimes::default();
         for group in runs.groups_mut() {
@@ -66,7 +66,7 @@ impl Trainer<'_> {
         let GroupState { rays, runs, along, times, .. } = state;
         along.composite_backward(batch.background, rays.iter().map(|&ray| d_colors[ray]), runs);
         zero(&mut state.d_mlp, self.parameters.get(Part::Field).len());
-        zero(&mut state.d_vertices, self.vertex_code.features.len());
+        zero(&mut state.d_vertices, self.vertex_code.rows.len());
         if let Some(volume) = &self.volume {
             zero(&mut state.d_volume, volume.weights.len());
         }
@@ -158,22 +158,16 @@ impl Trainer<'_> {
         sum(d_mlp, &|g| &g.d_mlp);
         self.field.mlp.clear_padding(d_mlp);
         watch.lap(&mut times.update);
-        self.all_at.clear();
-        self.all_d_features.clear();
-        for group in groups.iter().flat_map(|state| state.runs.groups()) {
-            self.all_at.extend(&group.at);
-            self.all_d_features.extend_from_slice(&group.d_features);
-        }
         if self.field.surface_term {
-            zero(&mut self.vertex_code.d_features, self.vertex_code.features.len());
-            sum(&mut self.vertex_code.d_features, &|g| &g.d_vertices);
+            zero(&mut self.vertex_code.d_rows, self.vertex_code.rows.len());
+            sum(&mut self.vertex_code.d_rows, &|g| &g.d_vertices);
             let (table, d_offsets) = self.parameters.value_and_gradient(Part::Table, Part::Vertices);
             self.vertex_code.backward(self.scene, &self.field.encoder, table, d_offsets);
-            self.all_at.extend(&self.vertex_code.at);
-            self.all_d_features.extend_from_slice(&self.vertex_code.d_features);
         }
         let d_table = self.parameters.gradient(Part::Table);
-        self.field.encoder.encode_backward(self.all_at.all(), &self.all_d_features, d_table);
+        let samples = groups.iter().flat_map(|state| state.runs.groups());
+        let parts = samples.map(|group| (group.at.all(), &group.d_features[..])).chain(self.vertex_code.parts());
+        self.field.encoder.encode_backward(parts, d_table);
         watch.lap(&mut times.encode_backward);
         if let Some(volume) = &self.volume {
             zero(&mut self.d_volume, volume.weights.len());

@@ -12,7 +12,6 @@ use crate::Error;
 use crate::batch::Batch;
 use crate::config::{Config, DistanceKind, MotionKind, VisibilityKind};
 use crate::correction::{Corrections, Wrench, correct, corrected};
-use crate::encoder::Coordinates;
 use crate::field::Field;
 use crate::lpips::Lpips;
 use crate::parameters::{PARTS, Parameters, Part};
@@ -82,8 +81,6 @@ pub struct Trainer<'a> {
     pub(crate) groups: Vec<GroupState>,
     pub(crate) vertex_code: VertexCode,
     pub(crate) transposed: Vec<f32>,
-    pub(crate) all_at: Coordinates,
-    pub(crate) all_d_features: Vec<f32>,
     pub(crate) d_volume: Vec<f32>,
     photometric: Photometric,
     /// The corrected prior of a step.
@@ -144,8 +141,6 @@ impl<'a> Trainer<'a> {
             groups: (0..GROUPS).map(|_| GroupState::default()).collect(),
             vertex_code: VertexCode::default(),
             transposed: Vec::new(),
-            all_at: Coordinates::default(),
-            all_d_features: Vec::new(),
             d_volume: Vec::new(),
             photometric: Photometric::default(),
             posed: Posed::default(),
@@ -314,7 +309,7 @@ impl<'a> Trainer<'a> {
         self.vertex_code = stage_code;
         let interval = self.config.motion.shell_interval as u64;
         if interval > 0 && step > 0 && step.is_multiple_of(interval) {
-            self.shell = self.measure_shell(&self.vertex_code.features);
+            self.shell = self.measure_shell(&self.vertex_code.rows);
         }
         self.stage.set(self.scene, posed, &self.shell, &self.config);
         let mut groups = std::mem::take(&mut self.groups);

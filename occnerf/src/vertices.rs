@@ -4,7 +4,7 @@ use glam::Vec3;
 use rayon::prelude::*;
 
 use crate::config::{Config, DistanceKind};
-use crate::encoder::{Coordinates, Encoder, Slopes};
+use crate::encoder::{At, Coordinates, Encoder, Slopes};
 use crate::scene::Scene;
 
 const CHUNK: usize = 512;
@@ -16,13 +16,22 @@ const FARTHEST: f32 = 0.5;
 pub(crate) struct VertexCode {
     /// Where each vertex is encoded.
     pub at: Coordinates,
-    /// V × F, and their gradient.
-    pub features: Vec<f32>,
-    pub d_features: Vec<f32>,
+    /// Features, V × F, and their gradient.
+    pub rows: Vec<f32>,
+    pub d_rows: Vec<f32>,
     /// Position, signed distance, and its gradient by the position, of each vertex.
     state: Vec<(Vec3, f32, Vec3)>,
-    /// Gradients of where the vertices of each chunk are encoded.
-    d_at: Vec<Coordinates>,
+    /// The vertices chunk by chunk.
+    chunks: Vec<Chunk>,
+}
+
+/// Vertices that are encoded together.
+#[derive(Clone, Debug, Default)]
+struct Chunk {
+    /// Features, or their gradient, as they are encoded.
+    features: Vec<f32>,
+    /// Gradient of where the vertices are encoded.
+    d_at: Coordinates,
 }
 
 impl VertexCode {
@@ -43,22 +52,36 @@ impl VertexCode {
             encoder.push_vertex(v, d, &scene.canonical_box, &mut self.at);
         }
         let width = encoder.num_features();
-        self.features.resize(vertices.len() * width, 0.0);
-        self.features.par_chunks_mut(CHUNK * width).enumerate().for_each(|(chunk, features)| {
-            let end = ((chunk + 1) * CHUNK).min(vertices.len());
-            encoder.encode(table, self.at.vertices(chunk * CHUNK..end), features);
+        self.rows.resize(vertices.len() * width, 0.0);
+        self.chunks.resize_with(vertices.len().div_ceil(CHUNK), Chunk::default);
+        let chunks = self.rows.par_chunks_mut(CHUNK * width).zip(&mut self.chunks);
+        chunks.enumerate().for_each(|(chunk, (rows, Chunk { features, .. }))| {
+            let n = rows.len() / width;
+            features.resize(rows.len(), 0.0);
+            encoder.encode(table, self.at.vertices(chunk * CHUNK..chunk * CHUNK + n), features);
+            encoder.layout(n).to_rows(features, 0..n, rows, width);
         });
+    }
+
+    /// Where vertices are encoded, and after [`VertexCode::backward`] the gradients of their features, chunk by chunk.
+    pub fn parts(&self) -> impl Iterator<Item = (At<'_>, &[f32])> + Clone + Sync {
+        self.chunks.iter().enumerate().map(|(chunk, Chunk { features, d_at })| {
+            let start = chunk * CHUNK;
+            (self.at.vertices(start..start + d_at.surface.len()), &features[..])
+        })
     }
 
     /// Gradient of the offsets (V × 3) from that of the features; overwrites.
     pub fn backward(&mut self, scene: &Scene, encoder: &Encoder, table: &[f32], d_offsets: &mut [f32]) {
-        let Self { at, d_features, state, d_at, .. } = self;
+        let Self { at, d_rows, state, chunks, .. } = self;
         let width = encoder.num_features();
-        d_at.resize_with(state.len().div_ceil(CHUNK), Coordinates::default);
-        d_offsets.par_chunks_mut(3 * CHUNK).zip(d_at).enumerate().for_each(|(chunk, (d_offsets, d_at))| {
-            let range = chunk * CHUNK..chunk * CHUNK + d_offsets.len() / 3;
-            let d_rows = &d_features[range.start * width..range.end * width];
-            encoder.encode_backward_points(Slopes::Table(table), at.vertices(range.clone()), d_rows, d_at);
+        let d_rows = d_rows.par_chunks(CHUNK * width);
+        let chunks = d_offsets.par_chunks_mut(3 * CHUNK).zip(d_rows).zip(chunks).enumerate();
+        chunks.for_each(|(chunk, ((d_offsets, d_rows), Chunk { features, d_at }))| {
+            let n = d_offsets.len() / 3;
+            let range = chunk * CHUNK..chunk * CHUNK + n;
+            encoder.layout(n).from_rows(d_rows, width, 0..n, features);
+            encoder.encode_backward_points(Slopes::Table(table), at.vertices(range.clone()), features, d_at);
             for (v, (state, d_offset)) in state[range].iter().zip(d_offsets.chunks_exact_mut(3)).enumerate() {
                 let (d_v, d_d) = encoder.d_metres(d_at, v, &scene.canonical_box);
                 let through_distance = if encoder.distance_is_inside(state.1) { d_d * state.2 } else { Vec3::ZERO };

@@ -27,6 +27,14 @@ pub fn encode<const D: usize>(grid: &HashGrid<D>, table: &[f32], points: &[[f32;
     features
 }
 
+/// [`encode`], a row for each point.
+pub fn encode_rows<const D: usize>(grid: &HashGrid<D>, table: &[f32], points: &[[f32; D]]) -> Vec<f32> {
+    let features = encode(grid, table, points);
+    let mut rows = vec![f32::NAN; features.len()];
+    grid.layout(points.len()).to_rows(&features, 0..points.len(), &mut rows, grid.num_features());
+    rows
+}
+
 /// A table with values of magnitude one: those of `init_table` are too small to show an error.
 pub fn table<const D: usize>(grid: &HashGrid<D>, seed: u64) -> Vec<f32> {
     grid.init_table(seed).iter().map(|x| x * 1e4).collect()

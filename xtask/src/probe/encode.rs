@@ -35,11 +35,16 @@ fn encode_in<const D: usize>(mut input: Input, points: &[f32], output: &mut Outp
         .copied()
         .collect();
     grid.encode(&flat, points, &mut encoded);
-    output.floats("features", &[points.len(), width], encoded)?;
+    let layout = grid.layout(points.len());
+    let mut feature_rows = vec![0.0; encoded.len()];
+    layout.to_rows(&encoded, 0..points.len(), &mut feature_rows, width);
+    output.floats("features", &[points.len(), width], feature_rows)?;
     if !input.has("d_features") {
         return Ok(());
     }
-    let (_, d_features) = input.floats("d_features", &[Some(points.len()), Some(width)])?;
+    let (_, d_rows) = input.floats("d_features", &[Some(points.len()), Some(width)])?;
+    let mut d_features = encoded;
+    layout.from_rows(&d_rows, width, 0..points.len(), &mut d_features);
     let mut d_flat = vec![0.0; flat.len()];
     grid.encode_backward(points, &d_features, &mut d_flat);
     let mut d_table = vec![0.0; table.len()];

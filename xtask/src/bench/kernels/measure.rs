@@ -225,9 +225,11 @@ pub fn table(figure: &Figure, steps: usize) -> Result<Kernel> {
         for step in 0..steps {
             // The prediction is the sum of all features; its error goes back to each of them.
             grid.encode(&values, &fitted_at, &mut features);
-            let rows = features.chunks_exact(width).zip(d_features.chunks_exact_mut(width));
-            for ((row, d_row), &i) in rows.zip(&fitted) {
-                d_row.fill(row.iter().sum::<f32>() - near[i].2);
+            let predicted = sums(&features, fitted.len());
+            for d_level in d_features.chunks_exact_mut(2 * fitted.len()) {
+                for (j, (p, &i)) in predicted.iter().zip(&fitted).enumerate() {
+                    d_level[2 * j..][..2].fill(p - near[i].2);
+                }
             }
             d_table.fill(0.0);
             grid.encode_backward(&fitted_at, &d_features, &mut d_table);
@@ -239,11 +241,17 @@ pub fn table(figure: &Figure, steps: usize) -> Result<Kernel> {
         }
         let mut found = vec![0.0; held_at.len() * width];
         let seconds = median(|| grid.encode(&values, &held_at, black_box(&mut found)));
-        let off = |(row, &i): (&[f32], &usize)| f64::from(row.iter().sum::<f32>() - near[i].2).powi(2);
-        let error = 100.0 * mean(found.chunks_exact(width).zip(&held).map(off)).sqrt();
+        let off = |(found, &i): (&f32, &usize)| f64::from(found - near[i].2).powi(2);
+        let error = 100.0 * mean(sums(&found, held.len()).iter().zip(&held).map(off)).sqrt();
         kernel.add(format!("2^{log2_table_size}"), seconds, held_at.len(), error, log2_table_size == 16);
     }
     Ok(kernel)
+}
+
+/// The sum of all features of each point, two a level.
+fn sums(features: &[f32], points: usize) -> Vec<f32> {
+    let levels = || features.chunks_exact(2 * points);
+    (0..points).map(|i| levels().map(|level| level[2 * i] + level[2 * i + 1]).sum()).collect()
 }
 
 #[cfg(test)]

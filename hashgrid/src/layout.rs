@@ -1,0 +1,109 @@
+use std::ops::Range;
+
+/// Shape of encoded points, (L, Q, F): levels, points, features of a level.
+///
+/// A pass over one level reads and writes what belongs together; perceptrons want a row for each point, Q × (L·F). The two
+/// functions here go from one to the other, a range of points at a time, so that rows need never be more than fit a cache.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Layout {
+    /// L.
+    pub levels: usize,
+    /// Q.
+    pub points: usize,
+    /// F.
+    pub features: usize,
+}
+
+impl Layout {
+    /// Length of all features, and of the rows of all points without gaps.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.levels * self.points * self.features
+    }
+
+    /// Whether there are none.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// Copies the features of the points in `range` to the starts of `rows`, `stride` numbers apart.
+    ///
+    /// # Panics
+    /// Where a slice is too short, or `stride` is less than L·F.
+    pub fn to_rows(&self, features: &[f32], range: Range<usize>, rows: &mut [f32], stride: usize) {
+        self.check(features.len(), &range, rows.len(), stride);
+        for l in 0..self.levels {
+            let from = &features[(l * self.points + range.start) * self.features..][..range.len() * self.features];
+            let rows = rows.chunks_mut(stride);
+            match self.features {
+                // Known lengths are copied without a call.
+                2 => from.as_chunks::<2>().0.iter().zip(rows).for_each(|(x, row)| row[2 * l..][..2].copy_from_slice(x)),
+                f => from.chunks_exact(f).zip(rows).for_each(|(x, row)| row[f * l..][..f].copy_from_slice(x)),
+            }
+        }
+    }
+
+    /// The way back: `features` of the points in `range` from the starts of `rows`, `stride` numbers apart.
+    ///
+    /// # Panics
+    /// As [`Layout::to_rows`].
+    pub fn from_rows(&self, rows: &[f32], stride: usize, range: Range<usize>, features: &mut [f32]) {
+        self.check(features.len(), &range, rows.len(), stride);
+        for l in 0..self.levels {
+            let start = (l * self.points + range.start) * self.features;
+            let to = &mut features[start..][..range.len() * self.features];
+            let rows = rows.chunks(stride);
+            match self.features {
+                2 => to.as_chunks_mut::<2>().0.iter_mut().zip(rows).for_each(|(x, row)| {
+                    x.copy_from_slice(&row[2 * l..][..2]);
+                }),
+                f => to.chunks_exact_mut(f).zip(rows).for_each(|(x, row)| x.copy_from_slice(&row[f * l..][..f])),
+            }
+        }
+    }
+
+    fn check(&self, features: usize, range: &Range<usize>, rows: usize, stride: usize) {
+        assert_eq!(features, self.len(), "features of {self:?}");
+        assert!(range.start <= range.end && range.end <= self.points, "points {range:?} of {}", self.points);
+        let width = self.levels * self.features;
+        assert!(stride >= width && stride > 0, "rows {stride} apart hold no {width} numbers");
+        let least = if range.is_empty() { 0 } else { (range.len() - 1) * stride + width };
+        assert!(rows >= least, "rows have {rows} numbers, expected at least {least}");
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    proptest! {
+        #[test]
+        fn rows_hold_each_feature_where_they_should_and_go_back(
+            levels in 1usize..5, points in 0usize..20, features in 1usize..5, gap in 0usize..3,
+            cut in (0usize..=20, 0usize..=20),
+        ) {
+            let layout = Layout { levels, points, features };
+            let values: Vec<f32> = (0..layout.len()).map(|i| i as f32).collect();
+            let (start, end) = (cut.0.min(cut.1).min(points), cut.0.max(cut.1).min(points));
+            let stride = levels * features + gap;
+            let mut rows = vec![-1.0; (end - start) * stride];
+            layout.to_rows(&values, start..end, &mut rows, stride);
+            for (i, row) in rows.chunks(stride).enumerate() {
+                for l in 0..levels {
+                    for f in 0..features {
+                        prop_assert_eq!(row[l * features + f], values[(l * points + start + i) * features + f]);
+                    }
+                }
+                prop_assert!(row[levels * features..].iter().all(|&x| x == -1.0));
+            }
+            let mut back = values.clone();
+            for l in 0..levels {
+                back[(l * points + start) * features..(l * points + end) * features].fill(-2.0);
+            }
+            layout.from_rows(&rows, stride, start..end, &mut back);
+            prop_assert_eq!(back, values);
+        }
+    }
+}
