@@ -2,8 +2,8 @@ use crate::corners::{BLOCK, Corners, MAX_CORNERS, for_widths, spread};
 use crate::grid::{HashGrid, Level};
 use crate::simd::Kernel;
 
-/// Points that go through one level before the next level starts: enough for the level's table to stay in the
-/// cache from point to point and what it takes to get there to be shared, few enough for the points to stay there too.
+/// Points that go through one level before the next level starts: enough to share what it takes to bring a level's
+/// table to the cache, few enough for their coordinates to stay there from level to level.
 pub(crate) const CHUNK: usize = 1 << 15;
 
 impl<const D: usize> HashGrid<D> {
@@ -11,7 +11,7 @@ impl<const D: usize> HashGrid<D> {
     ///
     /// Runs on the calling thread; split the points to use more. Thousands of points a call are faster a point
     /// than a few, because a level's part of the table then stays in the cache (a third faster with 16 k than with 4 k
-    /// where the table is far larger than the cache).
+    /// where the table is far larger than the cache), and is brought there once for all of them.
     ///
     /// # Panics
     /// Where a slice has another length.

@@ -147,6 +147,47 @@ fn coordinates_that_were_clamped_get_no_gradient() {
 }
 
 #[test]
+fn splitting_the_points_changes_no_bit() {
+    let grid = HashGrid::<4>::with_resolutions(&[2, 5, 9, 33, 100], 3, 10).unwrap();
+    let table = table(&grid, 2);
+    let points: Vec<[f32; 4]> = noise(4 * 40_000, 5).as_chunks::<4>().0.iter().map(|p| p.map(f32::abs)).collect();
+    let d_features = noise(points.len() * grid.num_features(), 6);
+    let run = |points: &[[f32; 4]], d_features: &[f32]| {
+        let (mut by_table, mut by_jacobian) = (vec![[0.0; 4]; points.len()], vec![[0.0; 4]; points.len()]);
+        grid.encode_backward_points(&table, points, d_features, &mut by_table);
+        let mut features = vec![0.0; d_features.len()];
+        let mut jacobian = vec![0.0; grid.jacobian_len(points.len())];
+        grid.encode_jacobian(&table, points, &mut features, &mut jacobian);
+        grid.jacobian_backward(&jacobian, d_features, &mut by_jacobian);
+        (by_table, by_jacobian, features)
+    };
+    let whole = run(&points, &d_features);
+    let mut d_whole = vec![0.0; table.len()];
+    grid.encode_backward(&points, &d_features, &mut d_whole);
+    for size in [17, 5000] {
+        let (layout, width) = (grid.layout(points.len()), grid.num_features());
+        // Features of some of the points, and gradients like them.
+        let cut = |all: &[f32], first: usize, count: usize| {
+            let (mut rows, mut part) = (vec![0.0; count * width], vec![0.0; count * width]);
+            layout.to_rows(all, first..first + count, &mut rows, width);
+            grid.layout(count).from_rows(&rows, width, 0..count, &mut part);
+            part
+        };
+        let parts: Vec<Vec<f32>> =
+            (0..points.len()).step_by(size).map(|i| cut(&d_features, i, size.min(points.len() - i))).collect();
+        for (part, (points, d_features)) in points.chunks(size).zip(&parts).enumerate() {
+            let (first, count) = (part * size, points.len());
+            let (by_table, by_jacobian, features) = run(points, d_features);
+            assert!(by_table == whole.0[first..][..count] && by_jacobian == whole.1[first..][..count], "{size}");
+            assert!(features == cut(&whole.2, first, count), "{size}");
+        }
+        let mut d_table = vec![0.0; table.len()];
+        grid.encode_backward_parts(points.chunks(size).zip(parts.iter().map(Vec::as_slice)), &mut d_table);
+        assert!(d_table == d_whole, "in parts of {size}");
+    }
+}
+
+#[test]
 fn the_number_of_threads_changes_no_bit() {
     let grid = HashGrid::<4>::with_resolutions(&[2, 5, 9, 33, 100], 2, 10).unwrap();
     let points: Vec<[f32; 4]> = noise(4 * 20_000, 5).as_chunks::<4>().0.iter().map(|p| p.map(f32::abs)).collect();

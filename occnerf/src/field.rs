@@ -1,5 +1,7 @@
 //! The field F: [point term ‖ surface term] → density and colour, forward and backward over a group of rays.
 
+use std::ops::Range;
+
 use glam::Vec3;
 use visibility::VisibilityCounts;
 use volrender::Aabb;
@@ -39,11 +41,13 @@ pub(crate) struct Group {
     pub at: Coordinates,
     /// Attention of each neighbour of each sample.
     attention: Vec<f32>,
-    features: Vec<f32>,
+    /// The point term, as it lies ([`Encoder::layout`]); after the backward pass its gradient.
+    pub features: Vec<f32>,
     /// Whether gradients of the coordinates will be asked for, and the derivatives that they take.
     pub wants_jacobian: bool,
     pub jacobian: Vec<f32>,
-    blocks: Vec<Activations>,
+    /// Of one block, worked out anew for the backward pass: writing those of all blocks to memory and reading them again takes as long.
+    activations: Activations,
     /// Activated density and colour of each sample.
     pub sigma: Vec<f32>,
     pub rgb: Vec<Vec3>,
@@ -51,8 +55,6 @@ pub(crate) struct Group {
     pub d_sigma: Vec<f32>,
     pub d_rgb: Vec<Vec3>,
     pub d_likelihood: Vec<f32>,
-    /// Gradient of the point term's features, as they lie ([`Encoder::layout`]).
-    pub d_features: Vec<f32>,
     /// Gradient of d through the density's bias.
     pub d_distance: Vec<f32>,
     /// Gradient of `at`, where it is asked for.
@@ -104,26 +106,9 @@ impl Field {
         self.attend(counts, group);
         group.sigma.resize(n, 0.0);
         group.rgb.resize(n, Vec3::ZERO);
-        group.blocks.resize_with(n.div_ceil(BLOCK).max(group.blocks.len()), Activations::default);
-        let (row, layout) = (self.mlp.input_width(), self.encoder.layout(n));
-        let per_sample = group.attention.len().checked_div(n).unwrap_or(0);
-        for block in 0..n.div_ceil(BLOCK) {
-            let range = block * BLOCK..((block + 1) * BLOCK).min(n);
-            let activations = &mut group.blocks[block];
-            self.mlp.resize(activations, range.len());
-            let inputs = &mut activations.layers[0];
-            layout.to_rows(&group.features, range.clone(), inputs, row);
-            inputs.chunks_exact_mut(row).for_each(|input| input[width..].fill(0.0));
-            if self.surface_term {
-                let range = range.start * per_sample..range.end * per_sample;
-                let neighbours = &group.samples.neighbours[range.clone()];
-                let (attention, input) = (&group.attention[range], &mut activations.layers[0]);
-                let mix = Mix { width, per_sample, neighbours, attention, row };
-                pulp::Arch::new().dispatch(Gather { mix, rows: vertex_features, input });
-            }
-            self.mlp.forward(mlp, activations, range.len());
-            let outputs = activations.layers[activations.layers.len() - 1].chunks_exact(LANES);
-            for (s, raw) in range.zip(outputs) {
+        for range in blocks(n) {
+            self.activate(mlp, vertex_features, range.clone(), group);
+            for (s, raw) in range.zip(group.activations.outputs()) {
                 group.sigma[s] = self.density_scale * softplus(raw[0] + self.bias(group.samples.distance[s]));
                 let base = group.samples.base.get(s).copied().unwrap_or(Vec3::ZERO);
                 group.rgb[s] = (base + Vec3::from_slice(&raw[1..4])).map(sigmoid);
@@ -132,20 +117,40 @@ impl Field {
         watch.lap(&mut group.times.perceptron);
     }
 
-    /// Backward of [`Field::forward`] from `d_sigma` and `d_rgb`: accumulates into `d_mlp` and `d_vertices` (V × F),
-    /// overwrites `d_features` and `d_distance` of the group.
-    pub fn backward(&self, transposed: &[f32], group: &mut Group, d_mlp: &mut [f32], d_vertices: &mut [f32]) {
+    /// Fills the activations of the samples in `range`.
+    fn activate(&self, mlp: &[f32], vertex_features: &[f32], range: Range<usize>, group: &mut Group) {
+        let (n, width) = (group.samples.len(), self.encoder.num_features());
+        let (row, activations) = (self.mlp.input_width(), &mut group.activations);
+        self.mlp.resize(activations, range.len());
+        let input = &mut activations.layers[0];
+        self.encoder.layout(n).to_rows(&group.features, range.clone(), input, row);
+        input.chunks_exact_mut(row).for_each(|input| input[width..].fill(0.0));
+        if self.surface_term {
+            let mix = Mix::new(width, row, range.clone(), &group.samples, &group.attention);
+            pulp::Arch::new().dispatch(Gather { mix, rows: vertex_features, input });
+        }
+        self.mlp.forward(mlp, activations, range.len());
+    }
+
+    /// Backward of [`Field::forward`], with the same parameters, from `d_sigma` and `d_rgb`: accumulates into `d_mlp` and
+    /// `d_vertices` (V × F), overwrites `features` by their gradient, and `d_distance`.
+    pub fn backward(
+        &self,
+        mlp: &[f32],
+        transposed: &[f32],
+        vertex_features: &[f32],
+        group: &mut Group,
+        d_mlp: &mut [f32],
+        d_vertices: &mut [f32],
+    ) {
         let (n, width) = (group.samples.len(), self.encoder.num_features());
         let (row, layout) = (self.mlp.input_width(), self.encoder.layout(n));
-        let per_sample = group.attention.len().checked_div(n).unwrap_or(0);
-        group.d_features.resize(n * width, 0.0);
         group.d_distance.resize(n, 0.0);
-        for block in 0..n.div_ceil(BLOCK) {
-            let range = block * BLOCK..((block + 1) * BLOCK).min(n);
-            let activations = &group.blocks[block];
-            let outputs = activations.layers[activations.layers.len() - 1].chunks_exact(LANES);
+        for range in blocks(n) {
+            self.activate(mlp, vertex_features, range.clone(), group);
             group.d_output.clear();
             group.d_output.resize(range.len() * LANES, 0.0);
+            let outputs = group.activations.outputs();
             for ((s, raw), d_raw) in range.clone().zip(outputs).zip(group.d_output.chunks_exact_mut(LANES)) {
                 let distance = group.samples.distance[s];
                 d_raw[0] = group.d_sigma[s] * self.density_scale * sigmoid(raw[0] + self.bias(distance));
@@ -155,13 +160,10 @@ impl Field {
                 (d_rgb * rgb * (Vec3::ONE - rgb)).write_to_slice(&mut d_raw[1..4]);
             }
             let (d_output, d_input) = (&mut group.d_output, &mut group.d_input);
-            self.mlp.backward(transposed, activations, range.len(), d_output, d_input, d_mlp);
-            layout.from_rows(d_input, row, range.clone(), &mut group.d_features);
+            self.mlp.backward(transposed, &group.activations, range.len(), d_output, d_input, d_mlp);
+            layout.from_rows(d_input, row, range.clone(), &mut group.features);
             if self.surface_term {
-                let range = range.start * per_sample..range.end * per_sample;
-                let neighbours = &group.samples.neighbours[range.clone()];
-                let attention = &group.attention[range];
-                let mix = Mix { width, per_sample, neighbours, attention, row };
+                let mix = Mix::new(width, row, range, &group.samples, &group.attention);
                 pulp::Arch::new().dispatch(Scatter { mix, d_rows: d_vertices, d_input });
             }
         }
@@ -198,6 +200,14 @@ struct Mix<'a> {
     neighbours: &'a [u32],
     attention: &'a [f32],
     row: usize,
+}
+
+impl<'a> Mix<'a> {
+    fn new(width: usize, row: usize, range: Range<usize>, samples: &'a Samples, attention: &'a [f32]) -> Self {
+        let per_sample = attention.len().checked_div(samples.len()).unwrap_or(0);
+        let range = range.start * per_sample..range.end * per_sample;
+        Self { width, per_sample, neighbours: &samples.neighbours[range.clone()], attention: &attention[range], row }
+    }
 }
 
 /// Adds Σ a_i · row i to the surface term of each input row.
@@ -250,6 +260,11 @@ impl pulp::WithSimd for Scatter<'_> {
             }
         }
     }
+}
+
+/// Runs of samples that pass through the perceptron together.
+fn blocks(samples: usize) -> impl Iterator<Item = Range<usize>> {
+    (0..samples).step_by(BLOCK).map(move |start| start..(start + BLOCK).min(samples))
 }
 
 /// ln(1 + eˣ) without overflow.
@@ -323,10 +338,10 @@ mod tests {
             let (mut transposed, mut d_mlp) = (Vec::new(), vec![0.0; mlp.len()]);
             field.mlp.transposed_weights(&mlp, &mut transposed);
             let mut d_features = vec![0.0; features.len()];
-            field.backward(&transposed, &mut group, &mut d_mlp, &mut d_features);
+            field.backward(&mlp, &transposed, &features, &mut group, &mut d_mlp, &mut d_features);
             field.mlp.clear_padding(&mut d_mlp);
             let mut d_table = vec![0.0; table.len()];
-            field.encoder.encode_backward(std::iter::once((group.at.all(), &group.d_features[..])), &mut d_table);
+            field.encoder.encode_backward(std::iter::once((group.at.all(), &group.features[..])), &mut d_table);
             for direction in 0..6 {
                 let mut random = Stream::new(&[17, direction]);
                 let mut u_mlp = normal(mlp.len(), &mut random);

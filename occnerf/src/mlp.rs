@@ -19,11 +19,18 @@ fn pad(width: usize) -> usize {
     width.next_multiple_of(LANES)
 }
 
-/// Activations of a block of samples, kept for the backward pass.
+/// Activations of a block of samples.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Activations {
     /// One row-major buffer (samples × padded width) for the input and for each layer's output.
     pub layers: Vec<Vec<f32>>,
+}
+
+impl Activations {
+    /// The linear outputs, a padded row a sample.
+    pub fn outputs(&self) -> impl Iterator<Item = &[f32]> {
+        self.layers.last().into_iter().flat_map(|layer| layer.chunks_exact(LANES))
+    }
 }
 
 impl Mlp {

@@ -101,14 +101,6 @@ mod tests {
     use crate::samples::{CELL, Stage};
     use crate::scene::Scene;
 
-    /// Features, or their gradient, a row for each point.
-    fn rows(encoder: &crate::encoder::Encoder, features: &[f32]) -> Vec<f32> {
-        let mut rows = vec![0.0; features.len()];
-        let (width, points) = (encoder.num_features(), features.len() / encoder.num_features());
-        encoder.layout(points).to_rows(features, 0..points, &mut rows, width);
-        rows
-    }
-
     /// Value = Σ c · features(x) + e · d(x) + p · f(x) of points x that keep still while the pose is corrected.
     #[test]
     fn gradient_of_the_pose_agrees_with_finite_differences() {
@@ -149,8 +141,10 @@ mod tests {
             let width = trainer.field.encoder.num_features();
             let (table, mut features) = (trainer.parameters.get(Part::Table), vec![0.0; live.len() * width]);
             trainer.field.encoder.encode_jacobian(table, group.at.all(), &mut features, &mut group.jacobian);
-            group.d_features = (0..live.len() * width).map(|_| random(1.0).x).collect();
-            let d_rows = rows(&trainer.field.encoder, &group.d_features);
+            let d_rows: Vec<f32> = (0..live.len() * width).map(|_| random(1.0).x).collect();
+            group.features = vec![0.0; d_rows.len()];
+            let layout = trainer.field.encoder.layout(live.len());
+            layout.from_rows(&d_rows, width, 0..live.len(), &mut group.features);
             group.d_distance = live.iter().map(|_| random(3.0).x).collect();
             group.d_likelihood = live.iter().map(|_| random(0.3).x).collect();
             let mut wrenches = vec![Wrench::default(); after.bones.len()];
@@ -162,11 +156,13 @@ mod tests {
                 let found = trace(&corrected(&body, &frame.shape, &frame.posed, correction), &mut moved);
                 let mut features = vec![0.0; found.len() * width];
                 trainer.field.encoder.encode(trainer.parameters.get(Part::Table), moved.at.all(), &mut features);
-                let features = rows(&trainer.field.encoder, &features);
+                let mut rows = vec![0.0; features.len()];
+                let layout = trainer.field.encoder.layout(found.len());
+                layout.to_rows(&features, 0..found.len(), &mut rows, width);
                 let at = |i: usize| live.binary_search(&i).ok();
                 let terms = found.iter().enumerate().filter_map(|(s, &i)| {
                     let l = at(i)?;
-                    let (cotangent, row) = (&d_rows[l * width..][..width], &features[s * width..][..width]);
+                    let (cotangent, row) = (&d_rows[l * width..][..width], &rows[s * width..][..width]);
                     let dot: f64 = cotangent.iter().zip(row).map(|(c, v)| f64::from(c * v)).sum();
                     let d = f64::from(group.d_distance[l] * moved.samples.distance[s]);
                     Some(dot + d + f64::from(group.d_likelihood[l] * moved.samples.likelihood[s]))

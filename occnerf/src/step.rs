@@ -65,7 +65,8 @@ impl Trainer<'_> {
         let mut watch = Stopwatch::start();
         let GroupState { rays, runs, along, times, .. } = state;
         along.composite_backward(batch.background, rays.iter().map(|&ray| d_colors[ray]), runs);
-        zero(&mut state.d_mlp, self.parameters.get(Part::Field).len());
+        let field = self.parameters.get(Part::Field);
+        zero(&mut state.d_mlp, field.len());
         zero(&mut state.d_vertices, self.vertex_code.rows.len());
         if let Some(volume) = &self.volume {
             zero(&mut state.d_volume, volume.weights.len());
@@ -84,7 +85,14 @@ impl Trainer<'_> {
                 }
             }
             watch.lap(&mut times.losses);
-            self.field.backward(&self.transposed, group, &mut state.d_mlp, &mut state.d_vertices);
+            self.field.backward(
+                field,
+                &self.transposed,
+                &self.vertex_code.rows,
+                group,
+                &mut state.d_mlp,
+                &mut state.d_vertices,
+            );
             watch.lap(&mut times.perceptron_backward);
             if let Some(volume) = &self.volume {
                 self.motion_backward(volume, group, frame, &mut state.d_volume);
@@ -98,8 +106,8 @@ impl Trainer<'_> {
 
     /// Fills `d_at` of a group: the gradients of the coordinates that its samples were encoded at.
     pub(crate) fn d_coordinates(&self, group: &mut Group) {
-        let Group { at, d_at, jacobian, d_features, .. } = group;
-        self.field.encoder.encode_backward_points(Slopes::Jacobian(jacobian), at.all(), d_features, d_at);
+        let Group { at, d_at, jacobian, features, .. } = group;
+        self.field.encoder.encode_backward_points(Slopes::Jacobian(jacobian), at.all(), features, d_at);
     }
 
     /// Carries the gradients of the encoding's coordinates and of f into the weight volume.
@@ -166,7 +174,7 @@ impl Trainer<'_> {
         }
         let d_table = self.parameters.gradient(Part::Table);
         let samples = groups.iter().flat_map(|state| state.runs.groups());
-        let parts = samples.map(|group| (group.at.all(), &group.d_features[..])).chain(self.vertex_code.parts());
+        let parts = samples.map(|group| (group.at.all(), &group.features[..])).chain(self.vertex_code.parts());
         self.field.encoder.encode_backward(parts, d_table);
         watch.lap(&mut times.encode_backward);
         if let Some(volume) = &self.volume {

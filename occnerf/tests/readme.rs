@@ -49,6 +49,7 @@ fn table() -> String {
         row("colours start from", |c| if c.field.prior_colors { "vertex colours" } else { "grey" }.to_owned()),
         row("transmittance behind which samples are left out", |c| match c.min_transmittance {
             0.0 => "none".to_owned(),
+            t if t < 1e-4 => format!("{t:.0e}"),
             t => t.to_string(),
         }),
         row("steps between looks at where the field is empty", |c| match c.motion.shell_interval {
