@@ -16,6 +16,9 @@ use crate::times::{StepTimes, Stopwatch};
 
 /// Samples that pass through the perceptron together; their activations fit a second-level cache.
 const BLOCK: usize = 256;
+/// Widest layers whose activations are worked out anew for the backward pass: to write them to memory and to read them again
+/// takes as long, and as much memory as all else that is known of a sample. Of wider ones it takes less time.
+const NARROW: usize = 64;
 /// Outputs of the head: raw density, raw red, green, blue.
 const OUTPUTS: usize = 4;
 
@@ -24,6 +27,8 @@ const OUTPUTS: usize = 4;
 pub(crate) struct Field {
     pub encoder: Encoder,
     pub mlp: Mlp,
+    /// Whether the backward pass works out the activations anew.
+    narrow: bool,
     /// Whether the input has a surface term.
     pub surface_term: bool,
     attention: Option<AttentionKind>,
@@ -46,8 +51,8 @@ pub(crate) struct Group {
     /// Whether gradients of the coordinates will be asked for, and the derivatives that they take.
     pub wants_jacobian: bool,
     pub jacobian: Vec<f32>,
-    /// Of one block, worked out anew for the backward pass: writing those of all blocks to memory and reading them again takes as long.
-    activations: Activations,
+    /// Of each block, or of the last one where they are worked out anew.
+    blocks: Vec<Activations>,
     /// Activated density and colour of each sample.
     pub sigma: Vec<f32>,
     pub rgb: Vec<Vec3>,
@@ -74,6 +79,7 @@ impl Field {
         let slope = (config.field.density_bias_outside - config.field.density_bias) / reach;
         Ok(Self {
             mlp: Mlp::new(inputs, &vec![config.field.width; config.field.depth], OUTPUTS),
+            narrow: config.field.width <= NARROW,
             encoder,
             surface_term,
             attention: config.surface.attention.then_some(config.surface.attention_kind),
@@ -106,9 +112,11 @@ impl Field {
         self.attend(counts, group);
         group.sigma.resize(n, 0.0);
         group.rgb.resize(n, Vec3::ZERO);
-        for range in blocks(n) {
-            self.activate(mlp, vertex_features, range.clone(), group);
-            for (s, raw) in range.zip(group.activations.outputs()) {
+        let kept = if self.narrow { 1 } else { n.div_ceil(BLOCK) };
+        group.blocks.resize_with(kept.max(group.blocks.len()), Activations::default);
+        for (block, range) in self.blocks(n) {
+            self.activate(mlp, vertex_features, range.clone(), group, block);
+            for (s, raw) in range.zip(group.blocks[block].outputs()) {
                 group.sigma[s] = self.density_scale * softplus(raw[0] + self.bias(group.samples.distance[s]));
                 let base = group.samples.base.get(s).copied().unwrap_or(Vec3::ZERO);
                 group.rgb[s] = (base + Vec3::from_slice(&raw[1..4])).map(sigmoid);
@@ -117,10 +125,16 @@ impl Field {
         watch.lap(&mut group.times.perceptron);
     }
 
-    /// Fills the activations of the samples in `range`.
-    fn activate(&self, mlp: &[f32], vertex_features: &[f32], range: Range<usize>, group: &mut Group) {
+    /// Samples that pass through the perceptron together, and which of [`Group::blocks`] is theirs.
+    fn blocks(&self, samples: usize) -> impl Iterator<Item = (usize, Range<usize>)> {
+        let kept = usize::from(!self.narrow);
+        (0..samples).step_by(BLOCK).map(move |start| (kept * start / BLOCK, start..(start + BLOCK).min(samples)))
+    }
+
+    /// Fills the activations `block` with those of the samples in `range`.
+    fn activate(&self, mlp: &[f32], vertex_features: &[f32], range: Range<usize>, group: &mut Group, block: usize) {
         let (n, width) = (group.samples.len(), self.encoder.num_features());
-        let (row, activations) = (self.mlp.input_width(), &mut group.activations);
+        let (row, activations) = (self.mlp.input_width(), &mut group.blocks[block]);
         self.mlp.resize(activations, range.len());
         let input = &mut activations.layers[0];
         self.encoder.layout(n).to_rows(&group.features, range.clone(), input, row);
@@ -146,11 +160,13 @@ impl Field {
         let (n, width) = (group.samples.len(), self.encoder.num_features());
         let (row, layout) = (self.mlp.input_width(), self.encoder.layout(n));
         group.d_distance.resize(n, 0.0);
-        for range in blocks(n) {
-            self.activate(mlp, vertex_features, range.clone(), group);
+        for (block, range) in self.blocks(n) {
+            if self.narrow {
+                self.activate(mlp, vertex_features, range.clone(), group, block);
+            }
             group.d_output.clear();
             group.d_output.resize(range.len() * LANES, 0.0);
-            let outputs = group.activations.outputs();
+            let outputs = group.blocks[block].outputs();
             for ((s, raw), d_raw) in range.clone().zip(outputs).zip(group.d_output.chunks_exact_mut(LANES)) {
                 let distance = group.samples.distance[s];
                 d_raw[0] = group.d_sigma[s] * self.density_scale * sigmoid(raw[0] + self.bias(distance));
@@ -160,7 +176,7 @@ impl Field {
                 (d_rgb * rgb * (Vec3::ONE - rgb)).write_to_slice(&mut d_raw[1..4]);
             }
             let (d_output, d_input) = (&mut group.d_output, &mut group.d_input);
-            self.mlp.backward(transposed, &group.activations, range.len(), d_output, d_input, d_mlp);
+            self.mlp.backward(transposed, &group.blocks[block], range.len(), d_output, d_input, d_mlp);
             layout.from_rows(d_input, row, range.clone(), &mut group.features);
             if self.surface_term {
                 let mix = Mix::new(width, row, range, &group.samples, &group.attention);
@@ -262,11 +278,6 @@ impl pulp::WithSimd for Scatter<'_> {
     }
 }
 
-/// Runs of samples that pass through the perceptron together.
-fn blocks(samples: usize) -> impl Iterator<Item = Range<usize>> {
-    (0..samples).step_by(BLOCK).map(move |start| start..(start + BLOCK).min(samples))
-}
-
 /// ln(1 + eˣ) without overflow.
 fn softplus(x: f32) -> f32 {
     x.max(0.0) + (-x.abs()).exp().ln_1p()
@@ -304,6 +315,32 @@ mod tests {
             s.neighbours.extend((0..per_sample).map(|_| random.below(vertices) as u32));
         }
         group
+    }
+
+    #[test]
+    fn activations_that_are_kept_and_those_worked_out_anew_give_the_same_bits() {
+        let config = Config::preset(Preset::Fast, Method::Occnerf);
+        let mut field = Field::new(&config, Aabb { min: Vec3::splat(-0.1), max: Vec3::splat(1.1) }).unwrap();
+        let (n, vertices) = (3 * BLOCK - 100, 12);
+        let mut random = Stream::new(&[4]);
+        let mut normal = |n: usize| (0..n).map(|_| random.normal()).collect::<Vec<f32>>();
+        let (mlp, table) = (field.mlp.initial(1), normal(field.encoder.num_parameters()));
+        let features = normal(vertices * field.encoder.num_features());
+        let (d_sigma, d_rgb) = (normal(n), normal(3 * n));
+        let mut transposed = Vec::new();
+        field.mlp.transposed_weights(&mlp, &mut transposed);
+        let [anew, kept] = [true, false].map(|narrow| {
+            field.narrow = narrow;
+            let mut group = group(n, vertices, 20, &mut Stream::new(&[5]));
+            field.forward(&mlp, &table, &features, &VisibilityCounts::new(vertices), &mut group);
+            group.d_sigma.clone_from(&d_sigma);
+            group.d_rgb = d_rgb.chunks(3).map(Vec3::from_slice).collect();
+            let (mut d_mlp, mut d_features) = (vec![0.0; mlp.len()], vec![0.0; features.len()]);
+            field.backward(&mlp, &transposed, &features, &mut group, &mut d_mlp, &mut d_features);
+            assert_eq!(group.blocks.len(), if narrow { 1 } else { 3 });
+            (group.features, d_mlp, d_features)
+        });
+        assert!(anew == kept && anew.1.iter().any(|&d| d != 0.0));
     }
 
     /// Every parameter group of every method at once, along random directions.
