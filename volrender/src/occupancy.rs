@@ -72,10 +72,14 @@ impl Occupancy {
             let first = self.cell(corners[0].min(corners[1]).min(corners[2]) - behind);
             let last = self.cell(corners[0].max(corners[1]).max(corners[2]) + ahead);
             let (first, last) = (first.max(IVec3::ZERO), last.min(self.size - IVec3::ONE));
+            let slab = Slab::new(normal, (corners[0] - self.min) * per_cell, depth * per_cell, margin * per_cell);
             for z in first.z..=last.z {
                 for y in first.y..=last.y {
-                    let row = self.index(IVec3::new(first.x, y, z));
-                    self.live[row..=row + (last.x - first.x) as usize].fill(true);
+                    let (from, to) = slab.cells(y, z, first.x, last.x);
+                    if from <= to {
+                        let row = self.index(IVec3::new(from, y, z));
+                        self.live[row..=row + (to - from) as usize].fill(true);
+                    }
                 }
             }
         }
@@ -138,6 +142,37 @@ impl Occupancy {
     #[inline]
     fn index(&self, cell: IVec3) -> usize {
         ((cell.z * self.size.y + cell.y) * self.size.x + cell.x) as usize
+    }
+}
+
+/// What lies between two planes parallel to a triangle, in cells. What is closest to a triangle, or to one of its edges or corners,
+/// is no farther from its plane than from itself.
+struct Slab {
+    normal: Vec3,
+    /// One over the first coordinate of the normal, finite.
+    per_x: f32,
+    /// Bounds of normal · (centre of a cell).
+    low: f32,
+    high: f32,
+}
+
+impl Slab {
+    fn new(normal: Vec3, corner: Vec3, behind: f32, ahead: f32) -> Self {
+        // A cell is in the slab where any of it is: half its extent along the normal, and more than rounding takes.
+        let half = 0.5 * normal.abs().element_sum() + 0.01;
+        let at = normal.dot(corner);
+        let x = if normal.x.abs() < 1e-6 { 1e-6 } else { normal.x };
+        Self { normal, per_x: 1.0 / x, low: at - behind - half, high: at + ahead + half }
+    }
+
+    /// First and last cell of row (y, z) between `first` and `last` that are in the slab; none where the first lies after the
+    /// last.
+    #[inline]
+    fn cells(&self, y: i32, z: i32, first: i32, last: i32) -> (i32, i32) {
+        let rest = self.normal.y * (y as f32 + 0.5) + self.normal.z * (z as f32 + 0.5);
+        let (a, b) = ((self.low - rest) * self.per_x - 0.5, (self.high - rest) * self.per_x - 0.5);
+        // Conversions saturate.
+        (first.max(a.min(b).ceil() as i32), last.min(a.max(b).floor() as i32))
     }
 }
 
