@@ -127,6 +127,10 @@ fn tiny(method: Method, motion: MotionKind, seed: u64) -> Config {
     (config.encoding.levels, config.encoding.log2_table_size, config.encoding.n_max) = (5, 11, 96);
     (config.motion.kind, config.motion.correction_spacing, config.motion.shell_interval) = (motion, 0, 0);
     config.min_transmittance = 0.0;
+    if motion == MotionKind::Volume {
+        // As in the presets that have one.
+        config.motion.depth = Config::preset(Preset::Paper, method).motion.depth;
+    }
     config.field.prior_colors &= motion == MotionKind::Surface;
     // The perceptual term has an oracle of its own.
     (config.loss.perceptual, config.loss.beta) = (0.0, 60.0);

@@ -72,7 +72,9 @@ impl Occupancy {
             let first = self.cell(corners[0].min(corners[1]).min(corners[2]) - behind);
             let last = self.cell(corners[0].max(corners[1]).max(corners[2]) + ahead);
             let (first, last) = (first.max(IVec3::ZERO), last.min(self.size - IVec3::ONE));
-            let slab = Slab::new(normal, (corners[0] - self.min) * per_cell, depth * per_cell, margin * per_cell);
+            // Whole boxes seal the inside off.
+            let planes = if fills { [f32::INFINITY; 2] } else { [depth, margin].map(|d| d * per_cell) };
+            let slab = Slab::new(normal, (corners[0] - self.min) * per_cell, planes);
             for z in first.z..=last.z {
                 for y in first.y..=last.y {
                     let (from, to) = slab.cells(y, z, first.x, last.x);
@@ -157,7 +159,8 @@ struct Slab {
 }
 
 impl Slab {
-    fn new(normal: Vec3, corner: Vec3, behind: f32, ahead: f32) -> Self {
+    /// Between the planes `behind` and `ahead` of the one of a triangle with this corner.
+    fn new(normal: Vec3, corner: Vec3, [behind, ahead]: [f32; 2]) -> Self {
         // A cell is in the slab where any of it is: half its extent along the normal, and more than rounding takes.
         let half = 0.5 * normal.abs().element_sum() + 0.01;
         let at = normal.dot(corner);
