@@ -30,7 +30,7 @@ impl Layout {
     /// Copies the features of the points in `range` to the starts of `rows`, `stride` numbers apart.
     ///
     /// # Panics
-    /// Where a slice is too short, or `stride` is less than L·F.
+    /// Where a slice has another length or is too short, a point is not there, `stride` is less than L·F, or that is 0.
     pub fn to_rows(&self, features: &[f32], range: Range<usize>, rows: &mut [f32], stride: usize) {
         self.check(features.len(), &range, rows.len(), stride);
         for l in 0..self.levels {
@@ -63,11 +63,12 @@ impl Layout {
         }
     }
 
+    /// Panics unless there is something to copy from and to.
     fn check(&self, features: usize, range: &Range<usize>, rows: usize, stride: usize) {
         assert_eq!(features, self.len(), "features of {self:?}");
         assert!(range.start <= range.end && range.end <= self.points, "points {range:?} of {}", self.points);
         let width = self.levels * self.features;
-        assert!(stride >= width && stride > 0, "rows {stride} apart hold no {width} numbers");
+        assert!(stride >= width && width > 0, "rows {stride} apart, {width} numbers each");
         let least = if range.is_empty() { 0 } else { (range.len() - 1) * stride + width };
         assert!(rows >= least, "rows have {rows} numbers, expected at least {least}");
     }

@@ -10,6 +10,7 @@ use crate::Error;
 use crate::config::{AttentionKind, Config, Method};
 use crate::encoder::{Coordinates, Encoder};
 use crate::gemm::LANES;
+use crate::mix::{Gather, Mix, Scatter};
 use crate::mlp::{Activations, Mlp};
 use crate::samples::Samples;
 use crate::times::{StepTimes, Stopwatch};
@@ -206,75 +207,6 @@ impl Field {
 
     fn bias(&self, distance: f32) -> f32 {
         self.density_bias.0 + self.density_bias.1 * distance.clamp(0.0, self.reach)
-    }
-}
-
-/// Which rows each sample mixes, and where the mix stands in its input row: after the point term.
-struct Mix<'a> {
-    width: usize,
-    per_sample: usize,
-    neighbours: &'a [u32],
-    attention: &'a [f32],
-    row: usize,
-}
-
-impl<'a> Mix<'a> {
-    fn new(width: usize, row: usize, range: Range<usize>, samples: &'a Samples, attention: &'a [f32]) -> Self {
-        let per_sample = attention.len().checked_div(samples.len()).unwrap_or(0);
-        let range = range.start * per_sample..range.end * per_sample;
-        Self { width, per_sample, neighbours: &samples.neighbours[range.clone()], attention: &attention[range], row }
-    }
-}
-
-/// Adds Σ a_i · row i to the surface term of each input row.
-struct Gather<'a> {
-    mix: Mix<'a>,
-    rows: &'a [f32],
-    input: &'a mut [f32],
-}
-
-impl pulp::WithSimd for Gather<'_> {
-    type Output = ();
-
-    #[inline(always)]
-    fn with_simd<S: pulp::Simd>(self, _: S) {
-        let Mix { width, per_sample, neighbours, attention, row } = self.mix;
-        let each = neighbours.chunks_exact(per_sample).zip(attention.chunks_exact(per_sample));
-        for ((neighbours, attention), input) in each.zip(self.input.chunks_exact_mut(row)) {
-            let out = &mut input[width..2 * width];
-            for (&v, &a) in neighbours.iter().zip(attention) {
-                let from = &self.rows[v as usize * width..][..width];
-                for (out, &x) in out.iter_mut().zip(from) {
-                    *out = a.mul_add(x, *out);
-                }
-            }
-        }
-    }
-}
-
-/// Transpose of [`Gather`].
-struct Scatter<'a> {
-    mix: Mix<'a>,
-    d_rows: &'a mut [f32],
-    d_input: &'a [f32],
-}
-
-impl pulp::WithSimd for Scatter<'_> {
-    type Output = ();
-
-    #[inline(always)]
-    fn with_simd<S: pulp::Simd>(self, _: S) {
-        let Mix { width, per_sample, neighbours, attention, row } = self.mix;
-        let each = neighbours.chunks_exact(per_sample).zip(attention.chunks_exact(per_sample));
-        for ((neighbours, attention), d_input) in each.zip(self.d_input.chunks_exact(row)) {
-            let from = &d_input[width..2 * width];
-            for (&v, &a) in neighbours.iter().zip(attention) {
-                let d_row = &mut self.d_rows[v as usize * width..][..width];
-                for (d, &x) in d_row.iter_mut().zip(from) {
-                    *d = a.mul_add(x, *d);
-                }
-            }
-        }
     }
 }
 

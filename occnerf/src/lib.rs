@@ -40,6 +40,7 @@ mod gemm;
 mod loss;
 #[cfg_attr(not(feature = "lpips"), path = "lpips/absent.rs")]
 mod lpips;
+mod mix;
 mod mlp;
 mod parameters;
 mod photometric;
