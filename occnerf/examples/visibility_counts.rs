@@ -59,7 +59,8 @@ fn main() -> Result<(), Box<dyn Error>> {
 fn turnaround(scene: &Scene, counts: &[u64]) -> Result<Image, Box<dyn Error>> {
     let share = |rank: f64| (rank / counts.len() as f64) as f32;
     let colour = |share: f32| Vec3::new((2.0 - 2.0 * share).min(1.0), (1.7 * share).min(0.85), 0.15);
-    let colors = VertexColors { colors: ranks(counts).into_iter().map(|r| colour(share(r))).collect() };
+    let colors = ranks(counts).into_iter().map(|r| colour(share(r))).collect();
+    let colors = VertexColors { colors, seen: vec![true; counts.len()] };
     let mut renderer = PriorRenderer::new(scene, &colors);
     let pose = vec![Vec3::ZERO; scene.model.num_joints()];
     let body = scene.pose(&scene.mean_betas, &pose, Placement::default());

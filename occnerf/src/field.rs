@@ -119,8 +119,8 @@ impl Field {
             self.activate(mlp, vertex_features, range.clone(), group, block);
             for (s, raw) in range.zip(group.blocks[block].outputs()) {
                 group.sigma[s] = self.density_scale * softplus(raw[0] + self.bias(group.samples.distance[s]));
-                let base = group.samples.base.get(s).copied().unwrap_or(Vec3::ZERO);
-                group.rgb[s] = (base + Vec3::from_slice(&raw[1..4])).map(sigmoid);
+                let base = group.samples.base(s);
+                group.rgb[s] = (base.truncate() + base.w * Vec3::from_slice(&raw[1..4])).map(sigmoid);
             }
         }
         watch.lap(&mut group.times.perceptron);
@@ -174,7 +174,8 @@ impl Field {
                 let slopes = distance > 0.0 && distance < self.reach;
                 group.d_distance[s] = if slopes { d_raw[0] * self.density_bias.1 } else { 0.0 };
                 let (rgb, d_rgb) = (group.rgb[s], group.d_rgb[s]);
-                (d_rgb * rgb * (Vec3::ONE - rgb)).write_to_slice(&mut d_raw[1..4]);
+                let share = group.samples.base(s).w;
+                (share * d_rgb * rgb * (Vec3::ONE - rgb)).write_to_slice(&mut d_raw[1..4]);
             }
             let (d_output, d_input) = (&mut group.d_output, &mut group.d_input);
             self.mlp.backward(transposed, &group.blocks[block], range.len(), d_output, d_input, d_mlp);

@@ -89,8 +89,8 @@ impl Plain<'_, '_> {
                     let bias = inside + (outside - inside) * d.clamp(0.0, reach) / reach;
                     let sigma = f64::from(f.density_scale) * (raw[0] + bias).exp().ln_1p();
                     let alpha = f64::from(samples.likelihood[s]) * (1.0 - (-sigma * f64::from(samples.delta[s])).exp());
-                    let base = samples.base.get(s).copied().unwrap_or_default().as_dvec3();
-                    let rgb = base + DVec3::new(raw[1], raw[2], raw[3]);
+                    let base = samples.base(s).as_dvec4();
+                    let rgb = base.truncate() + base.w * DVec3::new(raw[1], raw[2], raw[3]);
                     color += transmittance * alpha * rgb.map(|x| 1.0 / (1.0 + (-x).exp()));
                     transmittance *= 1.0 - alpha;
                     if d < 0.0 {

@@ -1,6 +1,6 @@
 //! The baseline without a field: the posed prior mesh in the mean colours that the video showed of it.
 
-use glam::{DVec3, Vec3};
+use glam::{DVec3, Vec3, Vec4};
 use rayon::prelude::*;
 
 use crate::Error;
@@ -11,6 +11,8 @@ use crate::scene::{Scene, view};
 pub struct VertexColors {
     /// sRGB in [0, 1], V.
     pub colors: Vec<Vec3>,
+    /// Whether some training frame saw the vertex, V: its colour is inferred where none did.
+    pub seen: Vec<bool>,
 }
 
 impl VertexColors {
@@ -63,15 +65,18 @@ impl VertexColors {
                 if weights > 0.0 { (sum / weights).as_vec3() } else { Vec3::splat(0.5) }
             })
             .collect();
-        Ok(Self { colors })
+        Ok(Self { colors, seen: sums.iter().map(|sum| sum.1 > 0).collect() })
     }
 
-    /// What a sigmoid makes the colours of, black and white taken for nearly so.
-    pub(crate) fn before_sigmoid(&self) -> Vec<Vec3> {
+    /// What a sigmoid makes the colours of, black and white taken for nearly so, and as w how much of what a perceptron
+    /// says is to be added: nothing where no frame saw the vertex, for there nothing has taught it.
+    pub(crate) fn before_sigmoid(&self) -> Vec<Vec4> {
         /// 5 levels of 255.
         const LEAST: f32 = 0.02;
         let inverse = |x: f32| (x / (1.0 - x)).ln();
-        self.colors.iter().map(|c| c.clamp(Vec3::splat(LEAST), Vec3::splat(1.0 - LEAST)).map(inverse)).collect()
+        let each = self.colors.iter().zip(&self.seen);
+        let between = |c: &Vec3| c.clamp(Vec3::splat(LEAST), Vec3::splat(1.0 - LEAST));
+        each.map(|(c, &seen)| between(c).map(inverse).extend(f32::from(u8::from(seen)))).collect()
     }
 }
 
@@ -82,23 +87,16 @@ mod tests {
     use crate::trainer::Trainer;
     use crate::vertices::VertexCode;
 
-    #[test]
-    fn an_untrained_field_has_the_colours_that_it_starts_from() {
-        let body = smpl::BodyModel::embedded();
-        let demo = crate::data::DemoConfig { size: 48, frames: 4, eval_cameras: 1, ..Default::default() };
-        let capture = crate::data::demo(&demo, &body).unwrap();
-        let config = Config::preset(Preset::Fast, Method::Occnerf);
-        let scene = Scene::new(&capture, &body, &config).unwrap();
-        let mut trainer = Trainer::new(&scene, config).unwrap();
+    /// Face, barycentrics and colour of every sample of the first training frame.
+    fn colours_of_samples(trainer: &mut Trainer<'_>) -> Vec<((u32, [f32; 3]), Vec3)> {
+        let scene = trainer.scene;
         let mut code = VertexCode::default();
         trainer.encode_vertices(&mut code);
-        let shown = VertexColors::measure(&scene).unwrap();
-        assert!(shown.colors.iter().all(|c| (c.cmpge(Vec3::ZERO) & c.cmple(Vec3::ONE)).all()));
         let frame = &scene.train[0];
         let posed = trainer.corrected(frame);
         let mut stage =
-            std::mem::replace(&mut trainer.stage, crate::samples::Stage::new(&scene, crate::samples::CELL).unwrap());
-        stage.set(&scene, &posed, &trainer.shell, &trainer.config);
+            std::mem::replace(&mut trainer.stage, crate::samples::Stage::new(scene, crate::samples::CELL).unwrap());
+        stage.set(scene, &posed, &trainer.shell, &trainer.config);
         let mut group = crate::field::Group::default();
         group.samples.clear();
         let tracer = trainer.tracer(&stage, &trainer.shell, frame, &posed);
@@ -109,12 +107,38 @@ mod tests {
         let (field, table) = (parameter(crate::parameters::Part::Field), parameter(crate::parameters::Part::Table));
         trainer.field.forward(field, table, &code.rows, &trainer.counts, &mut group);
         assert!(group.samples.len() > 500);
-        for (&(face, _), rgb) in group.samples.faces.iter().zip(&group.rgb) {
-            let corners = scene.model.faces[face as usize].map(|v| shown.colors[v as usize]);
-            let low = corners[0].min(corners[1]).min(corners[2]).clamp(Vec3::splat(0.02), Vec3::splat(0.98));
-            let high = corners[0].max(corners[1]).max(corners[2]).clamp(Vec3::splat(0.02), Vec3::splat(0.98));
-            // What the perceptron's first values add is small.
-            assert!((rgb.cmpge(low - 0.03) & rgb.cmple(high + 0.03)).all(), "{rgb} of {corners:?}");
+        group.samples.faces.into_iter().zip(group.rgb).collect()
+    }
+
+    #[test]
+    fn colours_start_from_those_of_the_prior_and_stay_with_them_where_no_frame_saw_it() {
+        let body = smpl::BodyModel::embedded();
+        let demo = crate::data::DemoConfig { size: 48, frames: 4, eval_cameras: 1, ..Default::default() };
+        let capture = crate::data::demo(&demo, &body).unwrap();
+        let config = Config::preset(Preset::Fast, Method::Occnerf);
+        let scene = Scene::new(&capture, &body, &config).unwrap();
+        let shown = VertexColors::measure(&scene).unwrap();
+        assert!(shown.colors.iter().all(|c| (c.cmpge(Vec3::ZERO) & c.cmple(Vec3::ONE)).all()));
+        let mut trainer = Trainer::new(&scene, config).unwrap();
+        let between = |c: Vec3| c.clamp(Vec3::splat(0.02), Vec3::splat(0.98));
+        // How far each colour lies outside of those at the corners of its face, and whether none of them was seen.
+        let strays = |trainer: &mut Trainer<'_>| -> Vec<(f32, bool)> {
+            let stray = |((face, _), rgb): ((u32, [f32; 3]), Vec3)| {
+                let corners = scene.model.faces[face as usize];
+                let colors = corners.map(|v| between(shown.colors[v as usize]));
+                let (low, high) = (colors[0].min(colors[1]).min(colors[2]), colors[0].max(colors[1]).max(colors[2]));
+                let outside = (low - rgb).max(rgb - high).max_element();
+                (outside, corners.iter().all(|&v| !shown.seen[v as usize]))
+            };
+            colours_of_samples(trainer).into_iter().map(stray).collect()
+        };
+        // What the perceptron's first values add is small.
+        assert!(strays(&mut trainer).iter().all(|stray| stray.0 <= 0.03));
+        for _ in 0..20 {
+            trainer.step().unwrap();
         }
+        let (unseen, seen): (Vec<_>, Vec<_>) = strays(&mut trainer).into_iter().partition(|stray| stray.1);
+        assert!(unseen.len() > 50 && unseen.iter().all(|stray| stray.0 <= 1e-6), "{}", unseen.len());
+        assert!(seen.iter().any(|stray| stray.0 > 0.03));
     }
 }

@@ -1,6 +1,6 @@
 //! Live samples of rays: where a ray can meet the subject, and what the surface says of each point.
 
-use glam::{Affine3A, Vec3};
+use glam::{Affine3A, Vec3, Vec4};
 use smpl::{Posed, SurfaceMotion, WeightVolume};
 use surface_query::MeshDistance;
 use volrender::{Occupancy, Ray};
@@ -52,8 +52,9 @@ pub(crate) struct Tracer<'a> {
     pub to_canonical: &'a [Affine3A],
     pub volume: Option<&'a WeightVolume>,
     pub shell: &'a Shell,
-    /// What colours start from at each vertex, before the sigmoid; empty where they start from nothing.
-    pub base: &'a [Vec3],
+    /// What colours start from at each vertex, before the sigmoid, and the share w of what the perceptron adds; empty where
+    /// they start from nothing and it adds all.
+    pub base: &'a [Vec4],
     /// Whether neighbours are wanted at all; the point-based methods do without unless v̂ is blended.
     pub neighbours: bool,
     /// Whether [`Samples::faces`] are wanted; the surface motion alone has them.
@@ -80,8 +81,8 @@ pub(crate) struct Samples {
     pub distance: Vec<f32>,
     /// All levels, finest first; empty where the tracer wants none.
     pub neighbours: Vec<u32>,
-    /// What the colour starts from, before the sigmoid; empty where that is nothing.
-    pub base: Vec<Vec3>,
+    /// What the colour starts from, and the share w of what the perceptron adds, as [`Tracer::base`]; empty where that is.
+    pub base: Vec<Vec4>,
     /// Face of the posed prior that each sample is mapped by, with barycentrics; empty where the tracer wants none.
     pub faces: Vec<(u32, [f32; 3])>,
 }
@@ -120,6 +121,11 @@ impl March {
 }
 
 impl Samples {
+    /// What the colour of sample `s` starts from, and the share w of what the perceptron adds.
+    pub fn base(&self, s: usize) -> Vec4 {
+        self.base.get(s).copied().unwrap_or(Vec4::W)
+    }
+
     pub fn clear(&mut self) {
         self.starts.clear();
         self.starts.push(0);

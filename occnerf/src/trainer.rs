@@ -2,7 +2,7 @@
 
 use std::borrow::Cow;
 
-use glam::Vec3;
+use glam::{Vec3, Vec4};
 use rayon::prelude::*;
 use smpl::{Posed, WeightVolume};
 use visibility::VisibilityCounts;
@@ -76,7 +76,7 @@ pub struct Trainer<'a> {
     /// Where the field ended when it was last looked at.
     pub(crate) shell: Shell,
     /// What colours start from, V; empty where they start from nothing.
-    pub(crate) base: Vec<Vec3>,
+    pub(crate) base: Vec<Vec4>,
     pub(crate) batch: Batch,
     pub(crate) groups: Vec<GroupState>,
     pub(crate) vertex_code: VertexCode,

@@ -121,7 +121,8 @@ fn distance_structure_and_ray_structure_agree_on_a_walking_body_after_a_refit() 
 #[test]
 fn the_prior_renderers_silhouette_is_that_of_the_ray_casts() {
     let scene = scene();
-    let colors = VertexColors { colors: vec![Vec3::ONE; scene.canonical.vertices.len()] };
+    let vertices = scene.canonical.vertices.len();
+    let colors = VertexColors { colors: vec![Vec3::ONE; vertices], seen: vec![true; vertices] };
     for frame in [&scene.eval[0], &scene.train[5]] {
         let (vertices, faces) = (&frame.posed.vertices, &scene.model.faces);
         let rendering = PriorRenderer::new(scene, &colors).render(frame, Vec3::ZERO).unwrap();
