@@ -8,7 +8,7 @@ use volrender::Aabb;
 
 use crate::Error;
 use crate::config::{AttentionKind, Config, Method};
-use crate::encoder::{Coordinates, Encoder};
+use crate::encoder::{Coordinates, Encoder, fit};
 use crate::gemm::LANES;
 use crate::mix::{Gather, Mix, Scatter};
 use crate::mlp::{Activations, Mlp};
@@ -103,7 +103,7 @@ impl Field {
         let (n, width) = (group.samples.len(), self.encoder.num_features());
         let mut watch = Stopwatch::start();
         self.encoder.coordinates(&group.samples, &self.region, &mut group.at);
-        group.features.resize(n * width, 0.0);
+        fit(&mut group.features, n * width);
         if group.wants_jacobian {
             self.encoder.encode_jacobian(table, group.at.all(), &mut group.features, &mut group.jacobian);
         } else {

@@ -75,16 +75,17 @@ pub fn eval(arguments: &EvalArguments) -> Result<()> {
         Model::Prior(_) => String::new(),
         Model::Field(trainer) => trainer.perceptual(),
     };
+    let steps = match &model {
+        Model::Prior(_) => 0,
+        Model::Field(trainer) => trainer.steps_done(),
+    };
     let mut metrics = if directory.join(METRICS).is_file() {
-        Metrics::read(directory)?
+        // Training may have gone on since it was last scored.
+        Metrics { steps, ..Metrics::read(directory)? }
     } else {
         let parameters = match &model {
             Model::Prior(colors) => 3 * colors.colors.len(),
             Model::Field(trainer) => trainer.num_parameters(),
-        };
-        let steps = match &model {
-            Model::Prior(_) => 0,
-            Model::Field(trainer) => trainer.steps_done(),
         };
         Metrics {
             method: run.train.method.name().to_owned(),

@@ -40,3 +40,18 @@ fn scores_are_called_what_they_are() {
     assert!(!metrics.contains("novel_view") && metrics.contains("train_view"), "{metrics}");
     refused(&["eval", text(&run), "--split", "novel-view"], &["keeps no views back", "train-view"]);
 }
+
+#[test]
+fn scores_of_a_run_that_went_on_are_those_of_its_last_step() {
+    let folder = folder("scored-twice");
+    let (capture, run) = (folder.join("capture"), folder.join("run"));
+    done(&["synth", "--out", text(&capture), "--size", "32", "--frames", "3"]);
+    let quick = ["--preset", "fast", "--method", "hash-point", "--steps", "3"];
+    let train = [&["train", text(&capture), "--out", text(&run)], &quick[..]].concat();
+    for (stop, more) in [("1", &[][..]), ("2", &["--resume"][..])] {
+        done(&[&train[..], more, &["--stop-after", stop]].concat());
+        done(&["eval", text(&run)]);
+        let metrics = std::fs::read_to_string(run.join("metrics.json")).unwrap();
+        assert!(metrics.contains(&format!("\"steps\": {stop},")), "{metrics}");
+    }
+}
