@@ -222,6 +222,8 @@ fn sigmoid(x: f32) -> f32 {
 
 #[cfg(test)]
 mod tests {
+    use glam::Vec4;
+
     use super::*;
     use crate::config::Preset;
     use crate::random::Stream;
@@ -246,6 +248,7 @@ mod tests {
             s.closest.push(Vec3::new(random.uniform(), random.uniform(), random.uniform()));
             s.distance.push(random.uniform() * 0.06 + 0.005);
             s.neighbours.extend((0..per_sample).map(|_| random.below(vertices) as u32));
+            s.base.push(Vec4::new(random.normal(), random.normal(), random.normal(), random.uniform()));
         }
         group
     }
