@@ -172,8 +172,8 @@ fn paint<S>(
 ) -> Result<Rendering, Error> {
     let (width, height) = (frame.camera.width, frame.camera.height);
     let [x0, y0, x1, y1] = margin_box(frame);
-    let mut pixels: Vec<f32> = (0..width * height).flat_map(|_| background.to_array()).collect();
-    let mut opacity = vec![0.0; (width * height) as usize];
+    let count = (width * height) as usize;
+    let (mut pixels, mut opacity) = (background.to_array().repeat(count), vec![0.0; count]);
     let rows = pixels.par_chunks_mut(3 * width as usize).zip(opacity.par_chunks_mut(width as usize)).enumerate();
     rows.for_each_init(scratch, |scratch, (y, (pixels, opacity))| {
         let y = y as u32;

@@ -1,9 +1,12 @@
 use glam::{IVec3, Vec3};
+use rayon::prelude::*;
 
 use crate::Aabb;
 
 /// Cells an axis at most; a body with outstretched arms at 1 cm needs about 200.
 const MAX_CELLS: f32 = 256.0;
+/// Layers of cells that are marked together.
+const LAYERS: usize = 8;
 
 /// A coarse grid of the cells in which a body can be, so that samples in empty space cost nothing (Müller et al. 2022,
 /// section 5.1, made from a mesh rather than from a field).
@@ -15,7 +18,11 @@ pub struct Occupancy {
     min: Vec3,
     per_cell: f32,
     size: IVec3,
-    live: Vec<bool>,
+    /// A bit a cell, z by z, y by y: `words` for the cells of a row. All of them together fit a second-level cache.
+    live: Vec<u64>,
+    words: usize,
+    reaches: Vec<Reach>,
+    outside: Vec<bool>,
     queue: Vec<usize>,
     region: Option<Aabb>,
 }
@@ -59,32 +66,24 @@ impl Occupancy {
         self.min = low - border;
         self.per_cell = per_cell;
         self.size = size.ceil().as_ivec3().max(IVec3::ONE);
-        self.live.resize((self.size.x * self.size.y * self.size.z) as usize, false);
+        self.words = (self.size.x as usize).div_ceil(64);
+        let layer = self.words * self.size.y as usize;
+        self.live.resize(layer * self.size.z as usize, 0);
         // Deeper than any margin: the whole inside, sealed off.
         let fills = depth > margin;
         let depth = if fills { 0.0 } else { depth };
-        for (face, &own) in faces.iter().zip(margins) {
-            let margin = own.max(0.0).min(margin);
-            let corners = face.map(|v| vertices[v as usize]);
-            let normal = (corners[1] - corners[0]).cross(corners[2] - corners[0]).normalize_or_zero();
-            let ahead = (margin * support(normal)).max(depth * support(-normal));
-            let behind = (margin * support(-normal)).max(depth * support(normal));
-            let first = self.cell(corners[0].min(corners[1]).min(corners[2]) - behind);
-            let last = self.cell(corners[0].max(corners[1]).max(corners[2]) + ahead);
-            let (first, last) = (first.max(IVec3::ZERO), last.min(self.size - IVec3::ONE));
-            // Whole boxes seal the inside off.
-            let planes = if fills { [f32::INFINITY; 2] } else { [depth, margin].map(|d| d * per_cell) };
-            let slab = Slab::new(normal, (corners[0] - self.min) * per_cell, planes);
-            for z in first.z..=last.z {
-                for y in first.y..=last.y {
-                    let (from, to) = slab.cells(y, z, first.x, last.x);
-                    if from <= to {
-                        let row = self.index(IVec3::new(from, y, z));
-                        self.live[row..=row + (to - from) as usize].fill(true);
-                    }
-                }
-            }
-        }
+        let Self { min, size, words, reaches, live, .. } = self;
+        (faces.par_iter().zip(margins))
+            .map(|(face, &own)| {
+                let corners = face.map(|v| (vertices[v as usize] - *min) * per_cell);
+                Reach::new(corners, own.max(0.0).min(margin) * per_cell, depth * per_cell, fills, *size)
+            })
+            .collect_into_vec(reaches);
+        live.par_chunks_mut(LAYERS * layer).enumerate().for_each(|(chunk, live)| {
+            let z = (chunk * LAYERS) as i32;
+            let layers = z..z + (live.len() / layer) as i32;
+            reaches.iter().for_each(|reach| reach.mark(layers.clone(), size.y as usize, *words, live));
+        });
         if fills {
             self.fill_enclosed();
         }
@@ -92,30 +91,40 @@ impl Occupancy {
 
     /// Cells that the outside cannot reach without crossing a marked one are inside.
     fn fill_enclosed(&mut self) {
-        let mut outside = vec![false; self.live.len()];
+        let size = self.size;
+        let mut outside = std::mem::take(&mut self.outside);
+        outside.clear();
+        outside.resize((size.x * size.y * size.z) as usize, false);
         self.queue.clear();
         // The border is wider than a cell, so the outermost layer is empty and the first cell reaches all of it.
         self.queue.push(0);
         outside[0] = true;
         while let Some(index) = self.queue.pop() {
             let at = index as i32;
-            let (sx, sxy) = (self.size.x, self.size.x * self.size.y);
-            let cell = IVec3::new(at % sx, at / sx % self.size.y, at / sxy);
+            let (sx, sxy) = (size.x, size.x * size.y);
+            let cell = IVec3::new(at % sx, at / sx % size.y, at / sxy);
             for (axis, stride) in [(0, 1), (1, sx), (2, sxy)] {
                 for step in [-1, 1] {
-                    let next = cell[axis] + step;
-                    if next < 0 || next >= self.size[axis] {
+                    let mut next = cell;
+                    next[axis] += step;
+                    if next[axis] < 0 || next[axis] >= size[axis] {
                         continue;
                     }
-                    let next = (at + step * stride) as usize;
-                    if !outside[next] && !self.live[next] {
-                        outside[next] = true;
-                        self.queue.push(next);
+                    let index = (at + step * stride) as usize;
+                    if !outside[index] && !self.is_marked(next) {
+                        outside[index] = true;
+                        self.queue.push(index);
                     }
                 }
             }
         }
-        self.live.iter_mut().zip(&outside).for_each(|(live, outside)| *live = !outside);
+        let rows = outside.chunks_exact(size.x as usize);
+        for (live, outside) in self.live.chunks_exact_mut(self.words).zip(rows) {
+            for (word, outside) in live.iter_mut().zip(outside.chunks(64)) {
+                *word = outside.iter().enumerate().fold(0, |word, (bit, &outside)| word | u64::from(!outside) << bit);
+            }
+        }
+        self.outside = outside;
     }
 
     /// The box of everything within the margin of the mesh, where rays can meet anything; `None` for a mesh that is nowhere.
@@ -134,48 +143,111 @@ impl Occupancy {
             return false;
         }
         let cell = place.as_ivec3();
-        cell.cmplt(self.size).all() && self.live[self.index(cell)]
-    }
-
-    fn cell(&self, point: Vec3) -> IVec3 {
-        ((point - self.min) * self.per_cell).floor().as_ivec3()
+        cell.cmplt(self.size).all() && self.is_marked(cell)
     }
 
     #[inline]
-    fn index(&self, cell: IVec3) -> usize {
-        ((cell.z * self.size.y + cell.y) * self.size.x + cell.x) as usize
+    fn is_marked(&self, cell: IVec3) -> bool {
+        let row = (cell.z * self.size.y + cell.y) as usize * self.words;
+        self.live[row + cell.x as usize / 64] >> (cell.x % 64) & 1 == 1
     }
 }
 
-/// What lies between two planes parallel to a triangle, in cells. What is closest to a triangle, or to one of its edges or corners,
-/// is no farther from its plane than from itself.
-struct Slab {
-    normal: Vec3,
-    /// One over the first coordinate of the normal, finite.
-    per_x: f32,
+/// The cells that are within a triangle's margins, in units of cells: those that three bodies have in common.
+///
+/// - A box: what is closest to the triangle lies in the direction of its normal, or within 60° of it.
+/// - What lies between two planes parallel to the triangle: what is closest to it, or to one of its edges or corners, is no
+///   farther from its plane than from itself.
+/// - What is no farther than the larger margin from the triangle's box.
+#[derive(Clone, Copy, Debug)]
+struct Reach {
+    /// Of the first body, cut off where the grid ends.
+    first: IVec3,
+    last: IVec3,
     /// Bounds of normal · (centre of a cell).
+    normal: Vec3,
     low: f32,
     high: f32,
+    /// One over the first coordinate of the normal, finite.
+    per_x: f32,
+    /// Corners of the triangle's box, and the square of the larger margin; infinite where the inside is to be sealed off,
+    /// which whole boxes do.
+    box_low: Vec3,
+    box_high: Vec3,
+    farthest: f32,
 }
 
-impl Slab {
-    /// Between the planes `behind` and `ahead` of the one of a triangle with this corner.
-    fn new(normal: Vec3, corner: Vec3, [behind, ahead]: [f32; 2]) -> Self {
-        // A cell is in the slab where any of it is: half its extent along the normal, and more than rounding takes.
-        let half = 0.5 * normal.abs().element_sum() + 0.01;
-        let at = normal.dot(corner);
+impl Reach {
+    /// More than rounding takes, cells.
+    const ROUNDING: f32 = 0.01;
+
+    fn new(corners: [Vec3; 3], margin: f32, depth: f32, fills: bool, size: IVec3) -> Self {
+        let normal = (corners[1] - corners[0]).cross(corners[2] - corners[0]).normalize_or_zero();
+        let ahead = (margin * support(normal)).max(depth * support(-normal));
+        let behind = (margin * support(-normal)).max(depth * support(normal));
+        let box_low = corners[0].min(corners[1]).min(corners[2]);
+        let box_high = corners[0].max(corners[1]).max(corners[2]);
+        // A cell is between the planes where any of it is: half its extent along the normal.
+        let half = 0.5 * normal.abs().element_sum() + Self::ROUNDING;
+        let at = normal.dot(corners[0]);
         let x = if normal.x.abs() < 1e-6 { 1e-6 } else { normal.x };
-        Self { normal, per_x: 1.0 / x, low: at - behind - half, high: at + ahead + half }
+        Self {
+            first: (box_low - behind).floor().as_ivec3().max(IVec3::ZERO),
+            last: (box_high + ahead).floor().as_ivec3().min(size - IVec3::ONE),
+            normal,
+            low: if fills { f32::NEG_INFINITY } else { at - depth - half },
+            high: if fills { f32::INFINITY } else { at + margin + half },
+            per_x: 1.0 / x,
+            box_low,
+            box_high,
+            farthest: if fills { f32::INFINITY } else { (margin.max(depth) + Self::ROUNDING).powi(2) },
+        }
     }
 
-    /// First and last cell of row (y, z) between `first` and `last` that are in the slab; none where the first lies after the
-    /// last.
+    /// Marks the cells of some layers, whose rows are `live`.
+    fn mark(&self, layers: std::ops::Range<i32>, rows: usize, words: usize, live: &mut [u64]) {
+        // Between a row of cells and the triangle's box.
+        let gap = |axis: usize, cell: i32| {
+            (self.box_low[axis] - (cell + 1) as f32).max(cell as f32 - self.box_high[axis]).max(0.0)
+        };
+        for z in self.first.z.max(layers.start)..=self.last.z.min(layers.end - 1) {
+            let left_z = self.farthest - gap(2, z).powi(2);
+            for y in self.first.y..=self.last.y {
+                let left = left_z - gap(1, y).powi(2);
+                if left < 0.0 {
+                    continue;
+                }
+                let (from, to) = self.row(y, z, left.sqrt());
+                if from <= to {
+                    let row = ((z - layers.start) as usize * rows + y as usize) * words;
+                    set_bits(&mut live[row..row + words], from as usize, to as usize);
+                }
+            }
+        }
+    }
+
+    /// First and last cell of row (y, z) that are no farther than `left` along x; none where the first lies after the last.
     #[inline]
-    fn cells(&self, y: i32, z: i32, first: i32, last: i32) -> (i32, i32) {
+    fn row(&self, y: i32, z: i32, left: f32) -> (i32, i32) {
         let rest = self.normal.y * (y as f32 + 0.5) + self.normal.z * (z as f32 + 0.5);
         let (a, b) = ((self.low - rest) * self.per_x - 0.5, (self.high - rest) * self.per_x - 0.5);
         // Conversions saturate.
-        (first.max(a.min(b).ceil() as i32), last.min(a.max(b).floor() as i32))
+        let from = (self.box_low.x - left).floor().max(a.min(b).ceil()) as i32;
+        let to = (self.box_high.x + left).floor().min(a.max(b).floor()) as i32;
+        (self.first.x.max(from), self.last.x.min(to))
+    }
+}
+
+/// Sets bits `from` to `to`, the last one too.
+fn set_bits(words: &mut [u64], from: usize, to: usize) {
+    let (first, last) = (from / 64, to / 64);
+    let (low, high) = (u64::MAX << (from % 64), u64::MAX >> (63 - to % 64));
+    if first == last {
+        words[first] |= low & high;
+    } else {
+        words[first] |= low;
+        words[first + 1..last].fill(u64::MAX);
+        words[last] |= high;
     }
 }
 

@@ -53,14 +53,14 @@ proptest! {
     }
 }
 
-/// What a cell is marked for is within the margin of its face's plane, and within its face's box and the margin in each axis.
+/// What a cell is marked for is within the margin of its face's plane, and of its face's box.
 #[test]
 fn space_away_from_the_surface_is_dead_on_both_sides() {
     let mesh = testkit::mesh::icosphere(3);
     let (margin, cell) = (0.05, 0.03);
     let edge = |[a, b, _]: &[u32; 3]| mesh.vertices[*a as usize].distance(mesh.vertices[*b as usize]);
     let longest = mesh.faces.iter().map(edge).fold(0.0, f32::max);
-    let beside = 3.0f32.sqrt() * (longest + margin + 2.0 * cell);
+    let beside = 3.0f32.sqrt() * (longest + 2.0 * cell) + margin;
     // The plane leaves the sphere.
     let far = margin + 2.0 * cell + 0.5 * beside * beside;
     let mut occupancy = Occupancy::default();
