@@ -1,9 +1,12 @@
 //! Checkpoints: safetensors with the configuration and a version in the header, replaced atomically.
 
+use std::borrow::Cow;
 use std::collections::{BTreeMap, HashMap};
+use std::fs::File;
+use std::io::{BufWriter, Write};
 use std::path::Path;
 
-use safetensors::tensor::{Dtype, SafeTensors, TensorView};
+use safetensors::tensor::{Dtype, SafeTensors};
 
 use crate::Error;
 use crate::config::Config;
@@ -32,56 +35,101 @@ impl Trainer<'_> {
         let config = toml::to_string(&self.config).map_err(|e| file(path, format!("configuration: {e}")))?;
         let kept = self.parameters.kept_rows.as_deref();
         let restarts = serde_json::to_string(&self.restarts).map_err(|e| file(path, format!("{RESTARTS}: {e}")))?;
-        let header = HashMap::from([
-            ("format".to_owned(), FORMAT.to_owned()),
-            ("version".to_owned(), if kept.is_some() { PRUNED } else { VERSION }.to_owned()),
-            ("steps_done".to_owned(), self.steps_done.to_string()),
-            ("scene".to_owned(), self.scene.name.clone()),
-            ("config".to_owned(), config),
-            (RESTARTS.to_owned(), restarts),
+        let header = BTreeMap::from([
+            ("format", FORMAT.to_owned()),
+            ("version", if kept.is_some() { PRUNED } else { VERSION }.to_owned()),
+            ("steps_done", self.steps_done.to_string()),
+            ("scene", self.scene.name.clone()),
+            ("config", config),
+            (RESTARTS, restarts),
         ]);
-        let mut arrays: Vec<(String, Vec<u8>, Dtype)> = Vec::new();
+        let mut tensors: Vec<(String, Array<'_>)> = Vec::new();
         for (part, name) in PARTS {
             let adam = &self.parameters.optimisers[part as usize];
             let values = self.parameters.get(part);
             for (suffix, array) in [("", values), (".first_moment", &adam.first), (".second_moment", &adam.second)] {
-                let bytes = match kept.filter(|_| part == Part::Table) {
-                    Some(kept) => rows_left(array, kept).iter().flat_map(|v| v.to_le_bytes()).collect(),
-                    None => array.iter().flat_map(|v| v.to_le_bytes()).collect(),
+                let left = match kept.filter(|_| part == Part::Table) {
+                    Some(kept) => Cow::Owned(rows_left(array, kept)),
+                    None => Cow::Borrowed(array),
                 };
-                arrays.push((format!("{name}{suffix}"), bytes, Dtype::F32));
+                tensors.push((format!("{name}{suffix}"), Array::Floats(left)));
             }
         }
         if let Some(kept) = kept {
             let byte = |bits: &[bool]| bits.iter().rev().fold(0, |byte, &bit| byte << 1 | u8::from(bit));
-            arrays.push((KEPT.to_owned(), kept.chunks(8).map(byte).collect(), Dtype::U8));
+            tensors.push((KEPT.to_owned(), Array::Bits(kept.chunks(8).map(byte).collect())));
         }
         if self.config.motion.shell_interval > 0 {
-            arrays.push((
-                SHELL.to_owned(),
-                self.shell.vertices.iter().flat_map(|v| v.to_le_bytes()).collect(),
-                Dtype::F32,
-            ));
+            tensors.push((SHELL.to_owned(), Array::Floats(Cow::Borrowed(&self.shell.vertices))));
         }
-        let counts = self.counts.counts().iter().flat_map(|c| c.to_le_bytes()).collect();
-        arrays.push(("visibility_counts".to_owned(), counts, Dtype::U64));
-        let mut views = Vec::new();
-        for (name, bytes, dtype) in &arrays {
-            let size = match dtype {
-                Dtype::U8 => 1,
-                Dtype::F32 => 4,
-                _ => 8,
-            };
-            let shape = vec![bytes.len() / size];
-            let view = TensorView::new(*dtype, shape, bytes).map_err(|e| file(path, format!("`{name}`: {e}")))?;
-            views.push((name.as_str(), view));
-        }
-        let mut bytes = safetensors::serialize(views, Some(header)).map_err(|e| file(path, e.to_string()))?;
-        sort_header(&mut bytes).map_err(|e| file(path, format!("header: {e}")))?;
+        tensors.push(("visibility_counts".to_owned(), Array::Counts(self.counts.counts())));
         let partial = path.with_extension("safetensors.partial");
-        std::fs::write(&partial, bytes).map_err(|source| Error::Io { path: partial.clone(), source })?;
+        write(&partial, &header, tensors).map_err(|source| Error::Io { path: partial.clone(), source })?;
         std::fs::rename(&partial, path).map_err(|source| Error::Io { path: path.to_owned(), source })
     }
+}
+
+/// One of a checkpoint's arrays.
+enum Array<'a> {
+    Floats(Cow<'a, [f32]>),
+    Counts(&'a [u64]),
+    Bits(Vec<u8>),
+}
+
+impl Array<'_> {
+    fn dtype(&self) -> Dtype {
+        match self {
+            Self::Floats(_) => Dtype::F32,
+            Self::Counts(_) => Dtype::U64,
+            Self::Bits(_) => Dtype::U8,
+        }
+    }
+
+    fn len(&self) -> usize {
+        match self {
+            Self::Floats(values) => values.len(),
+            Self::Counts(counts) => counts.len(),
+            Self::Bits(bits) => bits.len(),
+        }
+    }
+
+    fn write(&self, to: &mut impl Write) -> std::io::Result<()> {
+        match self {
+            Self::Floats(values) => values.iter().try_for_each(|v| to.write_all(&v.to_le_bytes())),
+            Self::Counts(counts) => counts.iter().try_for_each(|c| to.write_all(&c.to_le_bytes())),
+            Self::Bits(bits) => to.write_all(bits),
+        }
+    }
+}
+
+/// What a safetensors header says of an array, its keys in order.
+#[derive(serde::Serialize)]
+struct Entry {
+    data_offsets: [usize; 2],
+    dtype: Dtype,
+    shape: [usize; 1],
+}
+
+/// Writes a safetensors file array by array (the crate's own writers want all of them as bytes, or make a file that nobody else may
+/// read). Equal models are equal files: keys are in order.
+fn write(path: &Path, header: &BTreeMap<&str, String>, mut tensors: Vec<(String, Array<'_>)>) -> std::io::Result<()> {
+    // The widest first: all are aligned.
+    tensors.sort_by(|(a_name, a), (b_name, b)| b.dtype().cmp(&a.dtype()).then(a_name.cmp(b_name)));
+    let mut keys = BTreeMap::from([("__metadata__", serde_json::to_value(header)?)]);
+    let mut end = 0;
+    for (name, array) in &tensors {
+        let start = end;
+        end += array.len() * array.dtype().bitsize() / 8;
+        let entry = Entry { data_offsets: [start, end], dtype: array.dtype(), shape: [array.len()] };
+        keys.insert(name, serde_json::to_value(entry)?);
+    }
+    let mut text = serde_json::to_vec(&keys)?;
+    text.resize(text.len().next_multiple_of(8), b' ');
+    let mut to = BufWriter::with_capacity(1 << 20, File::create(path)?);
+    to.write_all(&(text.len() as u64).to_le_bytes())?;
+    to.write_all(&text)?;
+    tensors.iter().try_for_each(|(_, array)| array.write(&mut to))?;
+    to.flush()
 }
 
 impl<'a> Trainer<'a> {
@@ -162,19 +210,6 @@ fn rows_filled(values: &[f32], kept: &[bool], all: usize) -> Vec<f32> {
         rows.next().into_iter().for_each(|values| row.copy_from_slice(values));
     }
     array
-}
-
-/// Puts the header's keys in order: they come from a `HashMap`, and equal models are to be equal files.
-fn sort_header(bytes: &mut [u8]) -> Result<(), serde_json::Error> {
-    let Some((length, rest)) = bytes.split_first_chunk_mut::<8>() else { return Ok(()) };
-    let length = usize::try_from(u64::from_le_bytes(*length)).unwrap_or(usize::MAX).min(rest.len());
-    let header = &mut rest[..length];
-    let keys: BTreeMap<String, BTreeMap<String, serde_json::Value>> = serde_json::from_slice(header)?;
-    let sorted = serde_json::to_string(&keys)?;
-    // The same keys and values in the same notation, so the same length but for the padding.
-    header.fill(b' ');
-    header[..sorted.len()].copy_from_slice(sorted.as_bytes());
-    Ok(())
 }
 
 /// The configuration that a checkpoint was written with.

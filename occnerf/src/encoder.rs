@@ -114,19 +114,21 @@ impl Encoder {
         }
     }
 
-    /// [`Encoder::encode`] with what [`Encoder::encode_backward_points`] needs to leave the table alone; empty where it does not
-    /// read one.
-    pub fn encode_jacobian(&self, table: &[f32], at: At<'_>, features: &mut [f32], jacobian: &mut Vec<f32>) {
+    /// Derivatives that [`Encoder::encode_jacobian`] writes for each point; none where there is no table.
+    pub fn jacobian_width(&self) -> usize {
+        match self {
+            Self::Frequency => 0,
+            Self::Point(grid) => grid.jacobian_len(1),
+            Self::Surface(grid, _) => grid.jacobian_len(1),
+        }
+    }
+
+    /// [`Encoder::encode`] with what [`Encoder::encode_backward_points`] needs to leave the table alone.
+    pub fn encode_jacobian(&self, table: &[f32], at: At<'_>, features: &mut [f32], jacobian: &mut [f32]) {
         match self {
             Self::Frequency => self.encode(table, at, features),
-            Self::Point(grid) => {
-                fit(jacobian, grid.jacobian_len(at.point.len()));
-                grid.encode_jacobian(table, at.point, features, jacobian);
-            }
-            Self::Surface(grid, _) => {
-                fit(jacobian, grid.jacobian_len(at.surface.len()));
-                grid.encode_jacobian(table, at.surface, features, jacobian);
-            }
+            Self::Point(grid) => grid.encode_jacobian(table, at.point, features, jacobian),
+            Self::Surface(grid, _) => grid.encode_jacobian(table, at.surface, features, jacobian),
         }
     }
 

@@ -7,6 +7,7 @@ use visibility::VisibilityCounts;
 use volrender::Aabb;
 
 use crate::Error;
+use crate::arena::Arena;
 use crate::config::{AttentionKind, Config, Method};
 use crate::encoder::{Coordinates, Encoder, fit};
 use crate::gemm::LANES;
@@ -49,9 +50,8 @@ pub(crate) struct Group {
     attention: Vec<f32>,
     /// The point term, as it lies ([`Encoder::layout`]); after the backward pass its gradient.
     pub features: Vec<f32>,
-    /// Whether gradients of the coordinates will be asked for, and the derivatives that they take.
-    pub wants_jacobian: bool,
-    pub jacobian: Vec<f32>,
+    /// Where the derivatives of the features by the coordinates are in the arena that [`Field::forward`] was given.
+    pub jacobian: Range<usize>,
     /// Of each block, or of the last one where they are worked out anew.
     blocks: Vec<Activations>,
     /// Activated density and colour of each sample.
@@ -91,7 +91,8 @@ impl Field {
         })
     }
 
-    /// Density and colour of every sample of the group. `vertex_features` (V × F) is read if there is a surface term.
+    /// Density and colour of every sample of the group. `vertex_features` (V × F) is read if there is a surface term. Where
+    /// gradients of the coordinates will be asked for, the derivatives that they take are left in `jacobians`.
     pub fn forward(
         &self,
         mlp: &[f32],
@@ -99,13 +100,16 @@ impl Field {
         vertex_features: &[f32],
         counts: &VisibilityCounts,
         group: &mut Group,
+        jacobians: Option<&mut Arena>,
     ) {
         let (n, width) = (group.samples.len(), self.encoder.num_features());
         let mut watch = Stopwatch::start();
         self.encoder.coordinates(&group.samples, &self.region, &mut group.at);
         fit(&mut group.features, n * width);
-        if group.wants_jacobian {
-            self.encoder.encode_jacobian(table, group.at.all(), &mut group.features, &mut group.jacobian);
+        if let Some(arena) = jacobians {
+            group.jacobian = arena.take(n * self.encoder.jacobian_width());
+            let jacobian = arena.piece_mut(&group.jacobian);
+            self.encoder.encode_jacobian(table, group.at.all(), &mut group.features, jacobian);
         } else {
             self.encoder.encode(table, group.at.all(), &mut group.features);
         }
@@ -268,7 +272,7 @@ mod tests {
         let [anew, kept] = [true, false].map(|narrow| {
             field.narrow = narrow;
             let mut group = group(n, vertices, 20, &mut Stream::new(&[5]));
-            field.forward(&mlp, &table, &features, &VisibilityCounts::new(vertices), &mut group);
+            field.forward(&mlp, &table, &features, &VisibilityCounts::new(vertices), &mut group, None);
             group.d_sigma.clone_from(&d_sigma);
             group.d_rgb = d_rgb.chunks(3).map(Vec3::from_slice).collect();
             let (mut d_mlp, mut d_features) = (vec![0.0; mlp.len()], vec![0.0; features.len()]);
@@ -300,7 +304,7 @@ mod tests {
             let features = normal(vertices * width, &mut random);
             let (c_sigma, c_rgb) = (normal(n, &mut random), normal(3 * n, &mut random));
             let value = |group: &mut Group, mlp: &[f32], table: &[f32], features: &[f32]| -> f64 {
-                field.forward(mlp, table, features, &counts, group);
+                field.forward(mlp, table, features, &counts, group, None);
                 let sigma = group.sigma.iter().zip(&c_sigma).map(|(s, c)| f64::from(s * c) * 0.04);
                 let rgb = group.rgb.iter().zip(c_rgb.chunks(3)).map(|(s, c)| f64::from(s.dot(Vec3::from_slice(c))));
                 sigma.chain(rgb).sum()

@@ -26,6 +26,7 @@
 //! the same bits on one instruction set, whatever the number of threads, and so does resuming from a checkpoint.
 
 mod adam;
+mod arena;
 mod batch;
 mod capacity;
 mod checkpoint;

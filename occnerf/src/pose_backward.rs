@@ -3,6 +3,7 @@
 use glam::{Affine3A, Mat3A, Vec3, Vec3A};
 use smpl::{BodyModel, Posed, SurfaceMotion};
 
+use crate::arena::Arena;
 use crate::correction::Wrench;
 use crate::field::Group;
 use crate::trainer::Trainer;
@@ -11,8 +12,8 @@ impl Trainer<'_> {
     /// Adds the gradients of the encoding's coordinates, of d and of f to those of the bones that the samples hang on. The
     /// closest surface point is taken to slide along the tangent plane, as it does to first order on a flat surface,
     /// and what colours start from to be the same all around it.
-    pub(crate) fn pose_backward(&self, group: &mut Group, posed: &Posed, wrenches: &mut [Wrench]) {
-        self.d_coordinates(group);
+    pub(crate) fn pose_backward(&self, group: &mut Group, jacobians: &Arena, posed: &Posed, wrenches: &mut [Wrench]) {
+        self.d_coordinates(group, jacobians);
         let samples = &group.samples;
         let (model, motion) = (&self.scene.model, &self.config.motion);
         let on_surface = !group.at.surface.is_empty();
@@ -140,7 +141,10 @@ mod tests {
             assert!(live.len() > 500, "{}", live.len());
             let width = trainer.field.encoder.num_features();
             let (table, mut features) = (trainer.parameters.get(Part::Table), vec![0.0; live.len() * width]);
-            trainer.field.encoder.encode_jacobian(table, group.at.all(), &mut features, &mut group.jacobian);
+            let mut jacobians = Arena::default();
+            group.jacobian = jacobians.take(live.len() * trainer.field.encoder.jacobian_width());
+            let jacobian = jacobians.piece_mut(&group.jacobian);
+            trainer.field.encoder.encode_jacobian(table, group.at.all(), &mut features, jacobian);
             let d_rows: Vec<f32> = (0..live.len() * width).map(|_| random(1.0).x).collect();
             group.features = vec![0.0; d_rows.len()];
             let layout = trainer.field.encoder.layout(live.len());
@@ -148,7 +152,7 @@ mod tests {
             group.d_distance = live.iter().map(|_| random(3.0).x).collect();
             group.d_likelihood = live.iter().map(|_| random(0.3).x).collect();
             let mut wrenches = vec![Wrench::default(); after.bones.len()];
-            trainer.pose_backward(&mut group, &after, &mut wrenches);
+            trainer.pose_backward(&mut group, &jacobians, &after, &mut wrenches);
             let gradient = correct_backward(&body, &frame.posed, &correction, &after, &wrenches);
 
             let mut value = |correction: &[Vec3]| -> f64 {

@@ -105,7 +105,7 @@ mod tests {
         }
         let parameter = |part| trainer.parameters.get(part);
         let (field, table) = (parameter(crate::parameters::Part::Field), parameter(crate::parameters::Part::Table));
-        trainer.field.forward(field, table, &code.rows, &trainer.counts, &mut group);
+        trainer.field.forward(field, table, &code.rows, &trainer.counts, &mut group, None);
         assert!(group.samples.len() > 500);
         group.samples.faces.into_iter().zip(group.rgb).collect()
     }

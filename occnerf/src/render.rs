@@ -101,7 +101,7 @@ impl Renderer for FieldRenderer<'_> {
                 for p in &mut going {
                     group.samples.trace_on(&tracer, RUN, &mut p.march);
                 }
-                trainer.field.forward(field, table, features, &trainer.counts, group);
+                trainer.field.forward(field, table, features, &trainer.counts, group, None);
                 composite_group(group, Vec3::ZERO, weights, composites);
                 for (p, run) in going.into_iter().zip(composites.iter()) {
                     p.color += p.march.transmittance * run.color;
@@ -227,7 +227,7 @@ mod tests {
             all.group.samples.trace(&tracer, &pixel_ray(frame, pixel));
         }
         let (field, table) = (trainer.parameters.get(Part::Field), trainer.parameters.get(Part::Table));
-        trainer.field.forward(field, table, &renderer.code.rows, &trainer.counts, &mut all.group);
+        trainer.field.forward(field, table, &renderer.code.rows, &trainer.counts, &mut all.group, None);
         composite_group(&all.group, background, &mut all.weights, &mut all.composites);
         let (mut worst, mut solid) = (0.0f32, 0);
         for (pixel, expected) in all.composites.iter().enumerate() {

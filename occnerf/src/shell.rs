@@ -71,7 +71,7 @@ impl Trainer<'_> {
                         group.samples.push_canonical(scene, at, positions[v], distance, needs_neighbours);
                     }
                 }
-                self.field.forward(field, table, vertex_features, &self.counts, group);
+                self.field.forward(field, table, vertex_features, &self.counts, group, None);
                 let shows = |sigma: &f32| 1.0 - (-sigma * LENGTH).exp() >= EMPTY;
                 // Of nothing at all the skin is kept.
                 let last = |sigmas: &[f32]| sigmas.iter().rposition(shows).unwrap_or(0);

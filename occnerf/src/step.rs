@@ -4,6 +4,7 @@ use glam::Vec3;
 use rayon::prelude::*;
 use smpl::{Posed, WeightVolume};
 
+use crate::arena::Arena;
 use crate::batch::Batch;
 use crate::config::DistanceKind;
 use crate::correction::{Wrench, correct_backward};
@@ -24,16 +25,19 @@ impl Trainer<'_> {
     /// Traces, encodes, evaluates and composites the rays of a group.
     pub(crate) fn forward(&self, state: &mut GroupState, batch: &Batch, frame: &PreparedFrame, posed: &Posed) {
         let tracer = self.tracer(&self.stage, &self.shell, frame, posed);
-        let GroupState { rays, runs, along, composites, terminations, times, .. } = state;
+        let GroupState { rays, runs, along, composites, terminations, times, jacobians, .. } = state;
         let marches = rays.iter().map(|&ray| {
             let jitter = Stream::new(&[self.config.seed, JITTER, self.steps_done, ray as u64]);
             March::new(pixel_ray(frame, batch.pixels[ray]), Some(jitter))
         });
-        let wants_jacobian = self.volume.is_some() || self.teaches_poses();
+        let mut jacobians = (self.volume.is_some() || self.teaches_poses()).then_some(jacobians);
+        if let Some(arena) = &mut jacobians {
+            arena.clear(rays.len() * self.config.samples * self.field.encoder.jacobian_width());
+        }
         let (field, table) = (self.parameters.get(Part::Field), self.parameters.get(Part::Table));
         runs.march(&tracer, marches, self.config.min_transmittance, |group| {
-            group.wants_jacobian = wants_jacobian;
-            self.field.forward(field, table, &self.vertex_code.rows, &self.counts, group);
+            let jacobians = jacobians.as_deref_mut();
+            self.field.forward(field, table, &self.vertex_code.rows, &self.counts, group, jacobians);
         });
         *times = StepTimes::default();
         for group in runs.groups_mut() {
@@ -63,7 +67,7 @@ impl Trainer<'_> {
         d_colors: &[Vec3],
     ) {
         let mut watch = Stopwatch::start();
-        let GroupState { rays, runs, along, times, .. } = state;
+        let GroupState { rays, runs, along, times, jacobians, .. } = state;
         along.composite_backward(batch.background, rays.iter().map(|&ray| d_colors[ray]), runs);
         let field = self.parameters.get(Part::Field);
         zero(&mut state.d_mlp, field.len());
@@ -95,24 +99,32 @@ impl Trainer<'_> {
             );
             watch.lap(&mut times.perceptron_backward);
             if let Some(volume) = &self.volume {
-                self.motion_backward(volume, group, frame, &mut state.d_volume);
+                self.motion_backward(volume, group, jacobians, frame, &mut state.d_volume);
             }
             if self.teaches_poses() {
-                self.pose_backward(group, posed, &mut state.wrenches);
+                self.pose_backward(group, jacobians, posed, &mut state.wrenches);
             }
             watch.lap(&mut times.motion_backward);
         }
     }
 
     /// Fills `d_at` of a group: the gradients of the coordinates that its samples were encoded at.
-    pub(crate) fn d_coordinates(&self, group: &mut Group) {
+    pub(crate) fn d_coordinates(&self, group: &mut Group, jacobians: &Arena) {
         let Group { at, d_at, jacobian, features, .. } = group;
-        self.field.encoder.encode_backward_points(Slopes::Jacobian(jacobian), at.all(), features, d_at);
+        let slopes = Slopes::Jacobian(jacobians.piece(jacobian));
+        self.field.encoder.encode_backward_points(slopes, at.all(), features, d_at);
     }
 
     /// Carries the gradients of the encoding's coordinates and of f into the weight volume.
-    fn motion_backward(&self, volume: &WeightVolume, group: &mut Group, frame: &PreparedFrame, d_volume: &mut [f32]) {
-        self.d_coordinates(group);
+    fn motion_backward(
+        &self,
+        volume: &WeightVolume,
+        group: &mut Group,
+        jacobians: &Arena,
+        frame: &PreparedFrame,
+        d_volume: &mut [f32],
+    ) {
+        self.d_coordinates(group, jacobians);
         let samples = &group.samples;
         let per_sample = samples.neighbours.len().checked_div(samples.len()).unwrap_or(0);
         for s in 0..samples.len() {

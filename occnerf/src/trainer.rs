@@ -9,6 +9,7 @@ use visibility::VisibilityCounts;
 use volrender::Composite;
 
 use crate::Error;
+use crate::arena::Arena;
 use crate::batch::Batch;
 use crate::config::{Config, DistanceKind, MotionKind, VisibilityKind};
 use crate::correction::{Corrections, Wrench, correct, corrected};
@@ -96,6 +97,8 @@ pub(crate) struct GroupState {
     /// The same ray by ray.
     pub along: Along,
     pub composites: Vec<Composite>,
+    /// Derivatives of the encoding of all runs.
+    pub jacobians: Arena,
     pub times: StepTimes,
     pub d_mlp: Vec<f32>,
     pub d_vertices: Vec<f32>,

@@ -149,7 +149,7 @@ pub fn run_one(
         let start = Instant::now();
         let colors = VertexColors::measure(&scene)?;
         let parameters = 3 * colors.colors.len();
-        let metrics = metrics(run, start.elapsed().as_secs_f64(), parameters, String::new());
+        let metrics = metrics(run, 0, start.elapsed().as_secs_f64(), parameters, String::new());
         return score_run(directory, run, &scene, &Model::Prior(colors), lpips, metrics).map(Some);
     }
     let checkpoint = directory.join(CHECKPOINT);
@@ -162,7 +162,7 @@ pub fn run_one(
         return Ok(None);
     }
     capacity::prune(directory, &mut trainer, &checkpoint)?;
-    let metrics = metrics(run, seconds, trainer.num_parameters(), trainer.perceptual());
+    let metrics = metrics(run, trainer.steps_done(), seconds, trainer.num_parameters(), trainer.perceptual());
     score_run(directory, run, &scene, &Model::Field(&trainer), lpips, metrics).map(Some)
 }
 
@@ -204,7 +204,7 @@ pub fn run_unless_finished(
     metrics.with_context(|| format!("{name}: stopped before its end"))
 }
 
-fn metrics(run: &RunConfig, train_seconds: f64, parameters: usize, perceptual: String) -> Metrics {
+fn metrics(run: &RunConfig, steps: u64, train_seconds: f64, parameters: usize, perceptual: String) -> Metrics {
     let config = &run.train;
     Metrics {
         method: config.method.name().to_owned(),
@@ -212,7 +212,7 @@ fn metrics(run: &RunConfig, train_seconds: f64, parameters: usize, perceptual: S
         occluded: config.occluded.name().to_owned(),
         scene: run.scene.clone(),
         seed: config.seed,
-        steps: if config.method == Method::Prior { 0 } else { config.steps },
+        steps,
         train_seconds,
         peak_rss_bytes: peak_rss_bytes(),
         parameters,
@@ -229,7 +229,7 @@ fn prior_metrics(run: &RunConfig, source: &Source, lpips: Option<&Lpips>) -> Res
     let scene = Scene::new(&source.capture, &source.model, &prior.train)?;
     let start = Instant::now();
     let colors = VertexColors::measure(&scene)?;
-    let mut metrics = metrics(&prior, start.elapsed().as_secs_f64(), 3 * colors.colors.len(), String::new());
+    let mut metrics = metrics(&prior, 0, start.elapsed().as_secs_f64(), 3 * colors.colors.len(), String::new());
     metrics.lpips = network_name(lpips);
     let split = if scene.eval.is_empty() { Split::TrainView } else { Split::NovelView };
     *split.of(&mut metrics.splits) = Some(Model::Prior(colors).score(&scene, split, lpips, |_, _| {})?);

@@ -48,10 +48,15 @@ fn scores_of_a_run_that_went_on_are_those_of_its_last_step() {
     done(&["synth", "--out", text(&capture), "--size", "32", "--frames", "3"]);
     let quick = ["--preset", "fast", "--method", "hash-point", "--steps", "3"];
     let train = [&["train", text(&capture), "--out", text(&run)], &quick[..]].concat();
+    let steps_are = |steps: &str| {
+        std::fs::read_to_string(run.join("metrics.json")).unwrap().contains(&format!("\"steps\": {steps},"))
+    };
     for (stop, more) in [("1", &[][..]), ("2", &["--resume"][..])] {
         done(&[&train[..], more, &["--stop-after", stop]].concat());
         done(&["eval", text(&run)]);
-        let metrics = std::fs::read_to_string(run.join("metrics.json")).unwrap();
-        assert!(metrics.contains(&format!("\"steps\": {stop},")), "{metrics}");
+        assert!(steps_are(stop));
     }
+    // Of a run that is asked for fewer steps than it has taken, too.
+    done(&["train", "--resume", "--out", text(&run), "--steps", "1"]);
+    assert!(steps_are("2"));
 }
