@@ -239,7 +239,7 @@ fn surface_coordinates(v: Vec3, d: f32, region: &Aabb, (low, high): (f32, f32)) 
 }
 
 /// Makes a buffer of `len` values that the caller writes all of. One that grows makes room for an eighth more, where a vector
-/// would for twice as many: of what a step keeps of its samples these are the most.
+/// would for twice as many: of what each run of samples keeps for itself, features are the most.
 pub(crate) fn fit(buffer: &mut Vec<f32>, len: usize) {
     if buffer.capacity() < len {
         *buffer = Vec::new();
