@@ -55,6 +55,29 @@ pub struct EvalArguments {
     threads: Option<usize>,
 }
 
+/// What is known of a run before it is scored.
+pub fn unscored(run: &RunConfig, model: &Model<'_>, train_seconds: f64) -> Metrics {
+    let config = &run.train;
+    let (steps, parameters, perceptual) = match model {
+        Model::Prior(colors) => (0, 3 * colors.colors.len(), String::new()),
+        Model::Field(trainer) => (trainer.steps_done(), trainer.num_parameters(), trainer.perceptual()),
+    };
+    Metrics {
+        method: config.method.name().to_owned(),
+        preset: config.preset.name().to_owned(),
+        occluded: config.occluded.name().to_owned(),
+        scene: run.scene.clone(),
+        seed: config.seed,
+        steps,
+        train_seconds,
+        peak_rss_bytes: peak_rss_bytes(),
+        parameters,
+        perceptual,
+        lpips: None,
+        splits: Splits::default(),
+    }
+}
+
 /// Runs the command.
 pub fn eval(arguments: &EvalArguments) -> Result<()> {
     use_threads(arguments.threads)?;
@@ -71,37 +94,11 @@ pub fn eval(arguments: &EvalArguments) -> Result<()> {
         Model::Field(&trainer)
     };
     let mut network = network_name(lpips.as_ref());
-    let perceptual = match &model {
-        Model::Prior(_) => String::new(),
-        Model::Field(trainer) => trainer.perceptual(),
-    };
-    let steps = match &model {
-        Model::Prior(_) => 0,
-        Model::Field(trainer) => trainer.steps_done(),
-    };
-    let mut metrics = if directory.join(METRICS).is_file() {
+    let mut metrics = unscored(&run, &model, 0.0);
+    if directory.join(METRICS).is_file() {
         // Training may have gone on since it was last scored.
-        Metrics { steps, ..Metrics::read(directory)? }
-    } else {
-        let parameters = match &model {
-            Model::Prior(colors) => 3 * colors.colors.len(),
-            Model::Field(trainer) => trainer.num_parameters(),
-        };
-        Metrics {
-            method: run.train.method.name().to_owned(),
-            preset: run.train.preset.name().to_owned(),
-            occluded: run.train.occluded.name().to_owned(),
-            scene: run.scene.clone(),
-            seed: run.train.seed,
-            steps,
-            train_seconds: 0.0,
-            peak_rss_bytes: peak_rss_bytes(),
-            parameters,
-            perceptual,
-            lpips: None,
-            splits: Splits::default(),
-        }
-    };
+        metrics = Metrics { steps: metrics.steps, ..Metrics::read(directory)? };
+    }
     ensure!(
         !scene.eval.is_empty() || arguments.split != Some(Split::NovelView),
         "{}: the capture keeps no views back; --split train-view scores those that training saw",

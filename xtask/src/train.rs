@@ -11,10 +11,8 @@ use occnerf::{Lpips, Method, Scene, StepReport, Trainer, VertexColors, checkpoin
 
 use crate::capacity::{self, CapacityName};
 use crate::compare::compare;
-use crate::eval::{Model, Split, check_pictures, load_lpips, network_name, score_run, scored_frames};
-use crate::run::{
-    CHECKPOINT, METRICS, Metrics, RunConfig, Splits, existing_directory, new_directory, peak_rss_bytes, use_threads,
-};
+use crate::eval::{Model, Split, check_pictures, load_lpips, network_name, score_run, scored_frames, unscored};
+use crate::run::{CHECKPOINT, METRICS, Metrics, RunConfig, existing_directory, new_directory, use_threads};
 use crate::settings::SettingArguments;
 use crate::source::{self, LoadArguments, Source};
 use crate::{run, table};
@@ -148,9 +146,9 @@ pub fn run_one(
     if run.train.method == Method::Prior {
         let start = Instant::now();
         let colors = VertexColors::measure(&scene)?;
-        let parameters = 3 * colors.colors.len();
-        let metrics = metrics(run, 0, start.elapsed().as_secs_f64(), parameters, String::new());
-        return score_run(directory, run, &scene, &Model::Prior(colors), lpips, metrics).map(Some);
+        let model = Model::Prior(colors);
+        let metrics = unscored(run, &model, start.elapsed().as_secs_f64());
+        return score_run(directory, run, &scene, &model, lpips, metrics).map(Some);
     }
     let checkpoint = directory.join(CHECKPOINT);
     let mut trainer =
@@ -162,8 +160,9 @@ pub fn run_one(
         return Ok(None);
     }
     capacity::prune(directory, &mut trainer, &checkpoint)?;
-    let metrics = metrics(run, trainer.steps_done(), seconds, trainer.num_parameters(), trainer.perceptual());
-    score_run(directory, run, &scene, &Model::Field(&trainer), lpips, metrics).map(Some)
+    let model = Model::Field(&trainer);
+    let metrics = unscored(run, &model, seconds);
+    score_run(directory, run, &scene, &model, lpips, metrics).map(Some)
 }
 
 /// The scores of a run under `directory`: those it has if it finished earlier with the same settings; else it goes on from its
@@ -204,24 +203,6 @@ pub fn run_unless_finished(
     metrics.with_context(|| format!("{name}: stopped before its end"))
 }
 
-fn metrics(run: &RunConfig, steps: u64, train_seconds: f64, parameters: usize, perceptual: String) -> Metrics {
-    let config = &run.train;
-    Metrics {
-        method: config.method.name().to_owned(),
-        preset: config.preset.name().to_owned(),
-        occluded: config.occluded.name().to_owned(),
-        scene: run.scene.clone(),
-        seed: config.seed,
-        steps,
-        train_seconds,
-        peak_rss_bytes: peak_rss_bytes(),
-        parameters,
-        perceptual,
-        lpips: None,
-        splits: Splits::default(),
-    }
-}
-
 /// The scores of the prior baseline on the same frames.
 fn prior_metrics(run: &RunConfig, source: &Source, lpips: Option<&Lpips>) -> Result<Metrics> {
     let mut prior = run.clone();
@@ -229,10 +210,11 @@ fn prior_metrics(run: &RunConfig, source: &Source, lpips: Option<&Lpips>) -> Res
     let scene = Scene::new(&source.capture, &source.model, &prior.train)?;
     let start = Instant::now();
     let colors = VertexColors::measure(&scene)?;
-    let mut metrics = metrics(&prior, 0, start.elapsed().as_secs_f64(), 3 * colors.colors.len(), String::new());
+    let model = Model::Prior(colors);
+    let mut metrics = unscored(&prior, &model, start.elapsed().as_secs_f64());
     metrics.lpips = network_name(lpips);
     let split = if scene.eval.is_empty() { Split::TrainView } else { Split::NovelView };
-    *split.of(&mut metrics.splits) = Some(Model::Prior(colors).score(&scene, split, lpips, |_, _| {})?);
+    *split.of(&mut metrics.splits) = Some(model.score(&scene, split, lpips, |_, _| {})?);
     Ok(metrics)
 }
 
