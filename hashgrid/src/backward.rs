@@ -67,6 +67,9 @@ fn backward_level<const D: usize, const W: usize>(
     let mut corners = Corners::new();
     let blocks = points.chunks(BLOCK).zip(d_features.chunks(BLOCK * stride));
     for (points, d_features) in blocks {
+        if d_features.iter().all(|&d| d == 0.0) {
+            continue;
+        }
         corners.fill(level, points);
         let weight = corners.weights::<D>();
         for (b, d_features) in d_features.chunks_exact(stride).enumerate() {

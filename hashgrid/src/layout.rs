@@ -63,6 +63,19 @@ impl Layout {
         }
     }
 
+    /// Zeroes `features` of the points in `range`.
+    ///
+    /// # Panics
+    /// Where the slice has another length or a point is not there.
+    pub fn clear(&self, range: Range<usize>, features: &mut [f32]) {
+        assert_eq!(features.len(), self.len(), "features of {self:?}");
+        assert!(range.end <= self.points, "points {range:?} of {}", self.points);
+        for l in 0..self.levels {
+            let first = l * self.points;
+            features[(first + range.start) * self.features..(first + range.end) * self.features].fill(0.0);
+        }
+    }
+
     /// Panics unless there is something to copy from and to.
     fn check(&self, features: usize, range: &Range<usize>, rows: usize, stride: usize) {
         assert_eq!(features, self.len(), "features of {self:?}");
@@ -100,8 +113,10 @@ mod tests {
                 prop_assert!(row[levels * features..].iter().all(|&x| x == -1.0));
             }
             let mut back = values.clone();
-            for l in 0..levels {
-                back[(l * points + start) * features..(l * points + end) * features].fill(-2.0);
+            layout.clear(start..end, &mut back);
+            for (i, (&cleared, value)) in back.iter().zip(&values).enumerate() {
+                let inside = (start..end).contains(&(i / features % points));
+                prop_assert_eq!(cleared, if inside { 0.0 } else { *value });
             }
             layout.from_rows(&rows, stride, start..end, &mut back);
             prop_assert_eq!(back, values);

@@ -152,7 +152,8 @@ impl Field {
     }
 
     /// Backward of [`Field::forward`], with the same parameters, from `d_sigma` and `d_rgb`: accumulates into `d_mlp` and
-    /// `d_vertices` (V × F), overwrites `features` by their gradient, and `d_distance`.
+    /// `d_vertices` (V × F), overwrites `features` by their gradient, and `d_distance`. Samples at the end that have no gradient are
+    /// passed over.
     pub fn backward(
         &self,
         mlp: &[f32],
@@ -165,7 +166,11 @@ impl Field {
         let (n, width) = (group.samples.len(), self.encoder.num_features());
         let (row, layout) = (self.mlp.input_width(), self.encoder.layout(n));
         group.d_distance.resize(n, 0.0);
-        for (block, range) in self.blocks(n) {
+        let reached = |s: &usize| group.d_sigma[*s] != 0.0 || group.d_rgb[*s] != Vec3::ZERO;
+        let ends = (0..n).rev().find(reached).map_or(0, |s| s + 1);
+        group.d_distance[ends..n].fill(0.0);
+        layout.clear(ends..n, &mut group.features);
+        for (block, range) in self.blocks(ends) {
             if self.narrow {
                 self.activate(mlp, vertex_features, range.clone(), group, block);
             }

@@ -97,6 +97,8 @@ pub(crate) struct March {
     known: Option<u32>,
     /// Places each sample in its bin, the middle without.
     jitter: Option<Stream>,
+    /// Whether samples outside the prior are dead.
+    inside: bool,
     /// Whether all bins are traced.
     ended: bool,
     /// Of what was traced and evaluated.
@@ -106,7 +108,12 @@ pub(crate) struct March {
 impl March {
     /// Nothing of the ray is traced yet; `jitter` places each sample in its bin, the middle without.
     pub fn new(ray: Ray, jitter: Option<Stream>) -> Self {
-        Self { ray, bin: 0, known: None, jitter, ended: false, transmittance: 1.0 }
+        Self { ray, bin: 0, known: None, jitter, inside: false, ended: false, transmittance: 1.0 }
+    }
+
+    /// With samples inside the prior alone, d < 0, if `inside`.
+    pub fn only_inside(self, inside: bool) -> Self {
+        Self { inside, ..self }
     }
 
     /// Whether there are bins left that can be seen through what is before them.
@@ -169,7 +176,7 @@ impl Samples {
                     continue;
                 }
                 let live;
-                (live, march.known) = self.push(tracer, point, march.known);
+                (live, march.known) = self.push(tracer, point, march.known, march.inside);
                 if live {
                     self.t.push(t);
                     self.delta.push(width);
@@ -202,7 +209,7 @@ impl Samples {
     /// Appends one point of space, if it lives.
     #[cfg(test)]
     pub fn push_point(&mut self, tracer: &Tracer<'_>, point: Vec3) -> bool {
-        let live = self.push(tracer, point, None).0;
+        let live = self.push(tracer, point, None, false).0;
         if live {
             self.world.push(point);
         }
@@ -210,8 +217,8 @@ impl Samples {
     }
 
     /// Maps a point and looks up its surface; false, with nothing pushed, if the sample is dead. `near` is a posed face
-    /// that is probably close; returns the closest one where it was looked up.
-    fn push(&mut self, tracer: &Tracer<'_>, point: Vec3, near: Option<u32>) -> (bool, Option<u32>) {
+    /// that is probably close; returns the closest one where it was looked up. `inside`: only d < 0 lives.
+    fn push(&mut self, tracer: &Tracer<'_>, point: Vec3, near: Option<u32>, inside: bool) -> (bool, Option<u32>) {
         let motion = &tracer.config.motion;
         let reach = motion.margin + motion.falloff;
         let farthest = reach.max(motion.depth);
@@ -274,7 +281,8 @@ impl Samples {
             let distance = if mean { query.mean_distance(sample.canonical, finest).0 } else { blended.signed_distance };
             (blended.point, distance)
         });
-        if !(distance <= reach && distance >= -motion.depth && sample.likelihood > 0.0) {
+        let within = distance <= reach && distance >= -motion.depth && !(inside && distance >= 0.0);
+        if !(within && sample.likelihood > 0.0) {
             self.neighbours.truncate(first);
             return (false, looked_up);
         }

@@ -22,20 +22,22 @@ use crate::trainer::{GroupState, Trainer, pixel_ray};
 const JITTER: u64 = 0x4A49_5454;
 
 impl Trainer<'_> {
-    /// Traces, encodes, evaluates and composites the rays of a group.
+    /// Traces, encodes, evaluates and composites the rays of a group. What lies outside the prior on a ray at an unknown pixel is dead:
+    /// no photometric term asks for the ray's colour, and completeness for the inside alone.
     pub(crate) fn forward(&self, state: &mut GroupState, batch: &Batch, frame: &PreparedFrame, posed: &Posed) {
         let tracer = self.tracer(&self.stage, &self.shell, frame, posed);
         let GroupState { rays, runs, along, composites, terminations, times, jacobians, .. } = state;
         let marches = rays.iter().map(|&ray| {
             let jitter = Stream::new(&[self.config.seed, JITTER, self.steps_done, ray as u64]);
-            March::new(pixel_ray(frame, batch.pixels[ray]), Some(jitter))
+            let hidden = frame.labels.at(batch.pixels[ray]) == Label::Unknown && !self.evaluates_all;
+            March::new(pixel_ray(frame, batch.pixels[ray]), Some(jitter)).only_inside(hidden)
         });
         let mut jacobians = (self.volume.is_some() || self.teaches_poses()).then_some(jacobians);
         if let Some(arena) = &mut jacobians {
             arena.clear(rays.len() * self.config.samples * self.field.encoder.jacobian_width());
         }
         let (field, table) = (self.parameters.get(Part::Field), self.parameters.get(Part::Table));
-        runs.march(&tracer, marches, self.config.min_transmittance, |group| {
+        runs.march(&tracer, marches, self.config.min_transmittance, self.run, |group| {
             let jacobians = jacobians.as_deref_mut();
             self.field.forward(field, table, &self.vertex_code.rows, &self.counts, group, jacobians);
         });
@@ -129,6 +131,10 @@ impl Trainer<'_> {
         let per_sample = samples.neighbours.len().checked_div(samples.len()).unwrap_or(0);
         for s in 0..samples.len() {
             let (d_point, d_coordinate) = self.field.encoder.d_metres(&group.d_at, s, &self.scene.canonical_box);
+            let d_likelihood = group.d_likelihood[s];
+            if d_point == Vec3::ZERO && [d_coordinate, group.d_distance[s], d_likelihood] == [0.0; 3] {
+                continue;
+            }
             let d_distance = group.d_distance[s]
                 + if self.field.encoder.distance_is_inside(samples.distance[s]) { d_coordinate } else { 0.0 };
             let x = samples.canonical[s];
@@ -151,7 +157,6 @@ impl Trainer<'_> {
                 }
             };
             let d_canonical = through_surface + if on_surface { Vec3::ZERO } else { d_point };
-            let d_likelihood = group.d_likelihood[s];
             volume.map_backward(&frame.to_canonical, samples.world[s], d_canonical, d_likelihood, d_volume);
         }
     }

@@ -20,7 +20,7 @@ use crate::photometric::Photometric;
 use crate::pixels::Label;
 use crate::prior::VertexColors;
 use crate::restarts::Restarts;
-use crate::runs::{Along, Runs};
+use crate::runs::{Along, Runs, run_length};
 use crate::samples::{CELL, Stage, Tracer};
 use crate::scene::{PreparedFrame, Scene};
 use crate::shell::Shell;
@@ -73,6 +73,10 @@ pub struct Trainer<'a> {
     pub(crate) lpips: Option<Lpips>,
     pub(crate) steps_done: u64,
     pub(crate) restarts: Restarts,
+    /// [`run_length`], but in tests.
+    pub(crate) run: usize,
+    /// Whether rays at unknown pixels have all their samples evaluated; for tests.
+    pub(crate) evaluates_all: bool,
     pub(crate) stage: Stage,
     /// Where the field ended when it was last looked at.
     pub(crate) shell: Shell,
@@ -149,6 +153,8 @@ impl<'a> Trainer<'a> {
             posed: Posed::default(),
             steps_done: 0,
             restarts: Restarts::default(),
+            run: run_length(config.min_transmittance),
+            evaluates_all: false,
             config,
             scene,
             field,
@@ -318,7 +324,12 @@ impl<'a> Trainer<'a> {
         let mut groups = std::mem::take(&mut self.groups);
         for (index, state) in groups.iter_mut().enumerate() {
             state.rays.clear();
-            state.rays.extend((0..batch.pixels.len()).filter(|ray| ray / batch.size % GROUPS == index));
+            // Those at unknown pixels come last, so that samples without a gradient are next to each other.
+            for unknown in [false, true] {
+                let is_due = |&ray: &usize| (frame.labels.at(batch.pixels[ray]) == Label::Unknown) == unknown;
+                let rays = (0..batch.pixels.len()).filter(|ray| ray / batch.size % GROUPS == index);
+                state.rays.extend(rays.filter(is_due));
+            }
         }
         watch.lap(&mut times.prepare);
         groups.par_iter_mut().for_each(|state| self.forward(state, &batch, frame, posed));
