@@ -48,7 +48,7 @@ pub(crate) fn paper() -> Config {
         },
         motion: MotionConfig {
             kind: MotionKind::Volume,
-            margin: 0.08,
+            margin: 0.04,
             falloff: 0.02,
             depth: 0.3,
             correction_spacing: 0,

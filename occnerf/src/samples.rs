@@ -15,6 +15,14 @@ use crate::shell::Shell;
 pub(crate) const CELL: f32 = 0.02;
 /// The same for those of a picture, a tenth of whose time it saves.
 pub(crate) const FINE_CELL: f32 = 0.01;
+/// Cells near the canonical prior, which are marked once and for all.
+pub(crate) fn near_canonical(scene: &Scene, config: &Config) -> Occupancy {
+    let (mut occupancy, whole) = (Occupancy::default(), Shell::whole(scene, config));
+    let (vertices, faces, motion) = (&scene.canonical.vertices, &scene.model.faces, &config.motion);
+    occupancy.rebuild(vertices, faces, &whole.faces, whole.farthest, motion.depth, FINE_CELL);
+    occupancy
+}
+
 /// Σ w below which the weight volume says nothing.
 const VOLUME_THRESHOLD: f32 = 1e-3;
 
@@ -51,6 +59,8 @@ pub(crate) struct Tracer<'a> {
     pub posed: &'a Posed,
     pub to_canonical: &'a [Affine3A],
     pub volume: Option<&'a WeightVolume>,
+    /// Where the canonical prior is near; asked where there is a volume, of which it is not known from the point in space.
+    pub near_canonical: &'a Occupancy,
     pub shell: &'a Shell,
     /// What colours start from at each vertex, before the sigmoid, and the share w of what the perceptron adds; empty where
     /// they start from nothing and it adds all.
@@ -229,6 +239,9 @@ impl Samples {
             let Some(sample) = volume.map(tracer.to_canonical, point, VOLUME_THRESHOLD) else {
                 return (false, None);
             };
+            if !tracer.near_canonical.is_live(sample.canonical) {
+                return (false, None);
+            }
             let closest = exact.then(|| tracer.scene.surface.closest(sample.canonical, farthest));
             match closest {
                 Some(None) => return (false, None),
@@ -296,5 +309,55 @@ impl Samples {
         }
         self.faces.extend(mapped_by.filter(|_| tracer.faces));
         (true, looked_up)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::{Method, Preset};
+    use crate::data::{DemoConfig, demo};
+    use crate::trainer::Trainer;
+
+    #[test]
+    fn with_a_volume_a_sample_lives_where_the_canonical_prior_is_near() {
+        let body = smpl::BodyModel::embedded();
+        let capture = demo(&DemoConfig { size: 32, frames: 2, eval_cameras: 1, ..Default::default() }, &body).unwrap();
+        for distance in [DistanceKind::Blended, DistanceKind::Exact] {
+            let mut config = Config::preset(Preset::Paper, Method::Occnerf);
+            (config.surface.distance, config.encoding.log2_table_size) = (distance, 8);
+            let scene = Scene::new(&capture, &body, &config).unwrap();
+            let trainer = Trainer::new(&scene, config.clone()).unwrap();
+            let frame = &scene.train[1];
+            let tracer = trainer.tracer(&trainer.stage, &trainer.shell, frame, &frame.posed);
+            let (reach, k) = (config.motion.margin + config.motion.falloff, config.surface.k);
+            let low = frame.posed.vertices.iter().copied().reduce(Vec3::min).unwrap() - 2.0 * reach;
+            let size = frame.posed.vertices.iter().copied().reduce(Vec3::max).unwrap() + 2.0 * reach - low;
+            let mut random = Stream::new(&[5]);
+            let (mut counts, mut samples) = ([0; 3], Samples::default());
+            for _ in 0..20_000 {
+                let point = low + size * Vec3::new(random.uniform(), random.uniform(), random.uniform());
+                let Some(mapped) = tracer.volume.unwrap().map(tracer.to_canonical, point, VOLUME_THRESHOLD) else {
+                    assert!(!samples.push_point(&tracer, point));
+                    continue;
+                };
+                let exact = scene.surface.closest(mapped.canonical, f32::INFINITY).unwrap().signed_distance;
+                let mut neighbours = vec![0; scene.query.neighbours_per_query()];
+                scene.query.neighbours(mapped.canonical, &mut neighbours);
+                let blended = scene.query.blend(mapped.canonical, &neighbours[..k]).signed_distance;
+                let used = if distance == DistanceKind::Exact { exact } else { blended };
+                let within = |d: f32| d <= reach && d >= -config.motion.depth;
+                let live = samples.push_point(&tracer, point);
+                // A little beyond the margin, as far as a cell or the corner of a box, either is right; nobody is as deep as `depth`.
+                if within(exact) {
+                    assert_eq!(live, within(used), "{point}: {exact}, {used}");
+                    counts[usize::from(live)] += 1;
+                } else if exact > 2.0 * reach {
+                    assert!(!live, "{point}: {exact}, {used}");
+                    counts[2] += 1;
+                }
+            }
+            assert!(counts[1] > 500 && counts[2] > 100, "{counts:?}");
+        }
     }
 }

@@ -6,7 +6,7 @@ use glam::{Vec3, Vec4};
 use rayon::prelude::*;
 use smpl::{Posed, WeightVolume};
 use visibility::VisibilityCounts;
-use volrender::Composite;
+use volrender::{Composite, Occupancy};
 
 use crate::Error;
 use crate::arena::Arena;
@@ -21,7 +21,7 @@ use crate::pixels::Label;
 use crate::prior::VertexColors;
 use crate::restarts::Restarts;
 use crate::runs::{Along, Runs, run_length};
-use crate::samples::{CELL, Stage, Tracer};
+use crate::samples::{CELL, Stage, Tracer, near_canonical};
 use crate::scene::{PreparedFrame, Scene};
 use crate::shell::Shell;
 use crate::times::{StepTimes, Stopwatch};
@@ -68,6 +68,8 @@ pub struct Trainer<'a> {
     pub(crate) parameters: Parameters,
     pub(crate) counts: VisibilityCounts,
     pub(crate) volume: Option<WeightVolume>,
+    /// [`near_canonical`] where there is a volume, else empty.
+    near_canonical: Occupancy,
     pub(crate) corrections: Corrections,
     /// The perceptual term, where it is not the embedded one.
     pub(crate) lpips: Option<Lpips>,
@@ -155,6 +157,7 @@ impl<'a> Trainer<'a> {
             restarts: Restarts::default(),
             run: run_length(config.min_transmittance),
             evaluates_all: false,
+            near_canonical: if volume.is_some() { near_canonical(scene, &config) } else { Occupancy::default() },
             config,
             scene,
             field,
@@ -264,6 +267,7 @@ impl<'a> Trainer<'a> {
             posed,
             to_canonical: &frame.to_canonical,
             volume: self.volume.as_ref(),
+            near_canonical: &self.near_canonical,
             shell,
             base: &self.base,
             faces: !self.parameters.get(Part::Pose).is_empty(),
