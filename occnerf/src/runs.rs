@@ -34,8 +34,8 @@ struct Run {
 }
 
 impl Runs {
-    /// Traces `rays`, `run` samples of each at a time, and has `evaluate` give every sample its density and colour, until all rays have ended or their transmittance
-    /// is at most `min_transmittance`. With 0 all samples are one run.
+    /// Traces `rays`, `run` samples of each at a time, and has `evaluate` give every sample its density and colour, until all rays
+    /// have ended or their transmittance is at most `min_transmittance`. With 0 all samples are one run.
     pub fn march(
         &mut self,
         tracer: &Tracer<'_>,
@@ -267,7 +267,6 @@ mod tests {
     fn what_lies_outside_the_prior_at_unknown_pixels_has_no_gradient() {
         let body = smpl::BodyModel::embedded();
         let capture = demo(&DemoConfig { size: 40, frames: 4, eval_cameras: 1, ..Default::default() }, &body).unwrap();
-
         for (preset, density_scale) in [(Preset::Fast, 25.0), (Preset::Paper, 25.0), (Preset::Paper, 4.0)] {
             let mut config = Config::preset(preset, Method::Occnerf);
             (config.patches, config.patch_size, config.samples, config.seed) = (4, 24, 48, 2);

@@ -15,14 +15,6 @@ use crate::shell::Shell;
 pub(crate) const CELL: f32 = 0.02;
 /// The same for those of a picture, a tenth of whose time it saves.
 pub(crate) const FINE_CELL: f32 = 0.01;
-/// Cells near the canonical prior, which are marked once and for all.
-pub(crate) fn near_canonical(scene: &Scene, config: &Config) -> Occupancy {
-    let (mut occupancy, whole) = (Occupancy::default(), Shell::whole(scene, config));
-    let (vertices, faces, motion) = (&scene.canonical.vertices, &scene.model.faces, &config.motion);
-    occupancy.rebuild(vertices, faces, &whole.faces, whole.farthest, motion.depth, FINE_CELL);
-    occupancy
-}
-
 /// Σ w below which the weight volume says nothing.
 const VOLUME_THRESHOLD: f32 = 1e-3;
 
@@ -48,6 +40,14 @@ impl Stage {
             || occupancy.rebuild(&posed.vertices, &scene.model.faces, &shell.faces, margin, depth, *cell),
         );
     }
+}
+
+/// Cells near the canonical prior, which are marked once and for all.
+pub(crate) fn near_canonical(scene: &Scene, config: &Config) -> Occupancy {
+    let (mut occupancy, whole) = (Occupancy::default(), Shell::whole(scene, config));
+    let (vertices, faces, motion) = (&scene.canonical.vertices, &scene.model.faces, &config.motion);
+    occupancy.rebuild(vertices, faces, &whole.faces, whole.farthest, motion.depth, FINE_CELL);
+    occupancy
 }
 
 /// Everything that tracing a ray reads.

@@ -15,6 +15,7 @@ use rayon::prelude::*;
 use crate::run::{
     CHECKPOINT, METRICS, Metrics, NOVEL_VIEWS, RunConfig, Splits, TRAINING_VIEWS, peak_rss_bytes, use_threads,
 };
+use crate::train::logged_seconds;
 use crate::{pictures, report, table};
 
 /// Training frames are many and alike: every tenth is scored.
@@ -95,9 +96,14 @@ pub fn eval(arguments: &EvalArguments) -> Result<()> {
     };
     let mut network = network_name(lpips.as_ref());
     let mut metrics = unscored(&run, &model, 0.0);
+    metrics.train_seconds = logged_seconds(directory, metrics.steps)?;
     if directory.join(METRICS).is_file() {
-        // Training may have gone on since it was last scored.
-        metrics = Metrics { steps: metrics.steps, ..Metrics::read(directory)? };
+        let Metrics { steps, train_seconds, .. } = metrics;
+        metrics = Metrics::read(directory)?;
+        if metrics.steps != steps {
+            // Training has gone on since it was last scored.
+            (metrics.steps, metrics.train_seconds) = (steps, train_seconds);
+        }
     }
     ensure!(
         !scene.eval.is_empty() || arguments.split != Some(Split::NovelView),

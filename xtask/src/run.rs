@@ -11,6 +11,7 @@ use crate::source::{self, Source};
 
 pub const CHECKPOINT: &str = "checkpoint.safetensors";
 pub const METRICS: &str = "metrics.json";
+pub const LOG: &str = "train.jsonl";
 
 /// What config.toml holds.
 #[derive(Clone, Debug, Serialize, Deserialize)]

@@ -12,7 +12,7 @@ use occnerf::{Lpips, Method, Scene, StepReport, Trainer, VertexColors, checkpoin
 use crate::capacity::{self, CapacityName};
 use crate::compare::compare;
 use crate::eval::{Model, Split, check_pictures, load_lpips, network_name, score_run, scored_frames, unscored};
-use crate::run::{CHECKPOINT, METRICS, Metrics, RunConfig, existing_directory, new_directory, use_threads};
+use crate::run::{CHECKPOINT, LOG, METRICS, Metrics, RunConfig, existing_directory, new_directory, use_threads};
 use crate::settings::SettingArguments;
 use crate::source::{self, LoadArguments, Source};
 use crate::{run, table};
@@ -223,10 +223,10 @@ fn prior_metrics(run: &RunConfig, source: &Source, lpips: Option<&Lpips>) -> Res
 fn optimise(directory: &Path, trainer: &mut Trainer<'_>, stop_after: Option<u64>) -> Result<f64> {
     let total = trainer.config().steps;
     let end = stop_after.unwrap_or(total).min(total);
-    let log_path = directory.join("train.jsonl");
+    let log_path = directory.join(LOG);
     let earlier = earlier_log(&log_path, trainer.steps_done())?;
     run::write(&log_path, &earlier.text)?;
-    let mut log = std::fs::File::options().append(true).open(&log_path).context("train.jsonl")?;
+    let mut log = std::fs::File::options().append(true).open(&log_path).context(LOG)?;
     let bar = ProgressBar::new(total);
     let style = "{bar:28} {pos}/{len} steps  {msg}  {elapsed} elapsed, {eta} left";
     bar.set_style(ProgressStyle::with_template(style)?);
@@ -262,7 +262,7 @@ fn optimise(directory: &Path, trainer: &mut Trainer<'_>, stop_after: Option<u64>
             line["seconds"] = seconds.into();
             line["live_samples"] = report.live_samples.into();
             line["bad_gradients"] = bad.into();
-            writeln!(log, "{line}").context("train.jsonl")?;
+            writeln!(log, "{line}").context(LOG)?;
             let message = format!(
                 "loss {:.4} (mse {:.4}, perceptual {:.3}, completeness {:.4})  psnr {:.2}",
                 mean.loss, mean.mse, mean.perceptual, mean.completeness, mean.psnr
@@ -287,6 +287,11 @@ fn optimise(directory: &Path, trainer: &mut Trainer<'_>, stop_after: Option<u64>
         eprintln!("warning: {bad} gradients were not finite and were left out");
     }
     Ok(earlier.seconds + start.elapsed().as_secs_f64())
+}
+
+/// Seconds of training that the first `steps` steps of the run in `directory` took, as far as its log knows.
+pub fn logged_seconds(directory: &Path, steps: u64) -> Result<f64> {
+    Ok(earlier_log(&directory.join(LOG), steps)?.seconds)
 }
 
 struct EarlierLog {

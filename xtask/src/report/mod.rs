@@ -15,7 +15,7 @@ use self::page::Page;
 use self::viewer::{Views, viewers};
 use crate::bench;
 use crate::capacity;
-use crate::run::{self, METRICS, Metrics, RunConfig};
+use crate::run::{self, LOG, METRICS, Metrics, RunConfig};
 use crate::table;
 
 /// Charts and pictures larger than this are left out, and named.
@@ -141,7 +141,7 @@ fn add_runs(page: &mut Page, runs: &[Run]) -> Result<()> {
     let (mut views, mut logs) = (Vec::new(), Vec::new());
     for run in runs {
         views.extend(Views::read(&run.directory.join(NOVEL))?.map(|v| (run.name.clone(), v)));
-        logs.extend(Log::read(&run.directory.join("train.jsonl"))?.map(|l| (run.name.clone(), l)));
+        logs.extend(Log::read(&run.directory.join(LOG))?.map(|l| (run.name.clone(), l)));
     }
     let viewer = viewers(&views)?;
     if !viewer.is_empty() {
