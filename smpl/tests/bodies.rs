@@ -5,6 +5,7 @@ mod common;
 
 use std::io::Write;
 use std::path::{Path, PathBuf};
+use std::sync::LazyLock;
 
 use common::shared;
 use glam::Vec3;
@@ -137,12 +138,13 @@ fn models_that_are_none_are_not_saved() {
     assert!(BodyModel::embedded().save(Path::new("/no/such/folder/a.safetensors")).is_err());
 }
 
-fn small() -> Vec<u8> {
+/// The saved form of a body of three joints: written once, as tests run at once and would read what another is writing.
+static SMALL: LazyLock<Vec<u8>> = LazyLock::new(|| {
     let body = BodyModel::load(&archive("small.npz", 3, 2, Root::U32)).unwrap();
     let path = temporary("small.safetensors");
     body.save(&path).unwrap();
     std::fs::read(path).unwrap()
-}
+});
 
 fn load(name: &str, bytes: &[u8]) -> Result<BodyModel, smpl::Error> {
     let path = temporary(name);
@@ -152,7 +154,7 @@ fn load(name: &str, bytes: &[u8]) -> Result<BodyModel, smpl::Error> {
 
 #[test]
 fn truncated_and_foreign_files_are_refused() {
-    let bytes = small();
+    let bytes = SMALL.clone();
     for n in (0..bytes.len()).step_by(7) {
         assert!(load("cut.safetensors", &bytes[..n]).is_err(), "{n} bytes");
     }
@@ -177,7 +179,7 @@ proptest! {
     fn damaged_files_give_errors_or_bodies_that_pose(
         edits in prop::collection::vec((any::<prop::sample::Index>(), any::<u8>()), 1..5),
     ) {
-        let mut bytes = small();
+        let mut bytes = SMALL.clone();
         for (at, value) in edits {
             let at = at.index(bytes.len());
             bytes[at] = value;
