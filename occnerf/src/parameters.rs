@@ -1,5 +1,7 @@
 //! The learnable arrays and their optimisers, in the paper's groups.
 
+use rayon::prelude::*;
+
 use crate::adam::Adam;
 use crate::config::{Config, RateConfig};
 use crate::field::Field;
@@ -80,7 +82,7 @@ impl Parameters {
     }
 
     pub fn clear_gradients(&mut self) {
-        self.gradients.iter_mut().for_each(|g| g.fill(0.0));
+        self.gradients.iter_mut().for_each(|g| g.par_chunks_mut(1 << 16).for_each(|chunk| chunk.fill(0.0)));
     }
 
     /// One Adam step of every group at its rate times `decay`; returns how many gradients were not finite.

@@ -336,7 +336,7 @@ impl<'a> Trainer<'a> {
             }
         }
         watch.lap(&mut times.prepare);
-        groups.par_iter_mut().for_each(|state| self.forward(state, &batch, frame, posed));
+        groups.par_iter_mut().with_max_len(1).for_each(|state| self.forward(state, &batch, frame, posed));
         let mut watch = Stopwatch::start();
         let mut report = StepReport { step: step + 1, rays: batch.pixels.len(), ..StepReport::default() };
         let mut photometric = std::mem::take(&mut self.photometric);
@@ -349,7 +349,8 @@ impl<'a> Trainer<'a> {
         let d_colors = &photometric.d_colors;
         self.field.mlp.transposed_weights(self.parameters.get(Part::Field), &mut self.transposed);
         watch.lap(&mut times.losses);
-        groups.par_iter_mut().for_each(|state| self.backward(state, &batch, frame, posed, d_colors));
+        let each = groups.par_iter_mut().with_max_len(1);
+        each.for_each(|state| self.backward(state, &batch, frame, posed, d_colors));
         groups.iter().for_each(|state| times += state.times);
         let nominal = (batch.pixels.len() * self.config.samples) as f64;
         report.completeness = groups.iter().map(|g| g.completeness).sum::<f64>() / nominal;
