@@ -2,7 +2,7 @@ use rayon::prelude::*;
 
 use crate::corners::{BLOCK, Corners, for_widths, row_mut};
 use crate::grid::{HashGrid, Level};
-use crate::simd::Kernel;
+use crate::simd::{Kernel, arch};
 
 impl<const D: usize> HashGrid<D> {
     /// Adds the gradient of the table to `d_table` ([`HashGrid::num_parameters`]), given `points` (Q, D) and the
@@ -41,7 +41,7 @@ impl<const D: usize> HashGrid<D> {
             levels.push((l, d_table));
             rest = after;
         }
-        let arch = pulp::Arch::new();
+        let arch = arch();
         levels.into_par_iter().with_max_len(1).for_each(|(l, d_table)| {
             let level = &self.levels[l];
             for (points, d_features) in parts.clone() {

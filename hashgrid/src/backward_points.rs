@@ -1,7 +1,7 @@
 use crate::corners::{BLOCK, Corners, Lanes, MAX_CORNERS, for_widths, row};
 use crate::encode::CHUNK;
 use crate::grid::{HashGrid, Level};
-use crate::simd::Kernel;
+use crate::simd::{Kernel, arch};
 
 impl<const D: usize> HashGrid<D> {
     /// Adds the gradient of the coordinates to `d_points` (Q, D), given `table`, `points` (Q, D) and the gradient
@@ -22,7 +22,7 @@ impl<const D: usize> HashGrid<D> {
         self.assert_table("table", table);
         self.assert_features("d_features", d_features, points.len());
         assert_eq!(d_points.len(), points.len(), "d_points has {} points, expected {}", d_points.len(), points.len());
-        let arch = pulp::Arch::new();
+        let arch = arch();
         let chunks = points.chunks(CHUNK).zip(d_points.chunks_mut(CHUNK));
         for (chunk, (part, d_points)) in chunks.enumerate() {
             for (l, level) in self.levels.iter().enumerate() {

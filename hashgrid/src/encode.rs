@@ -1,6 +1,6 @@
 use crate::corners::{BLOCK, Corners, MAX_CORNERS, for_widths, spread};
 use crate::grid::{HashGrid, Level};
-use crate::simd::Kernel;
+use crate::simd::{Kernel, arch};
 
 /// Points that go through one level before the next level starts: enough to share what it takes to bring a level's
 /// table to the cache, few enough for their coordinates to stay there from level to level.
@@ -18,7 +18,7 @@ impl<const D: usize> HashGrid<D> {
     pub fn encode(&self, table: &[f32], points: &[[f32; D]], features: &mut [f32]) {
         self.assert_table("table", table);
         self.assert_features("features", features, points.len());
-        let arch = pulp::Arch::new();
+        let arch = arch();
         for (chunk, part) in points.chunks(CHUNK).enumerate() {
             for (l, level) in self.levels.iter().enumerate() {
                 let table = &table[self.level_range(l)];

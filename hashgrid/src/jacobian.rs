@@ -1,7 +1,7 @@
 use crate::corners::{BLOCK, Corners, Lanes, MAX_CORNERS, Values, for_widths, spread};
 use crate::encode::CHUNK;
 use crate::grid::{HashGrid, Level};
-use crate::simd::Kernel;
+use crate::simd::{Kernel, arch};
 
 impl<const D: usize> HashGrid<D> {
     /// Length of the Jacobian of `points` points: L·Q·D·F.
@@ -22,7 +22,7 @@ impl<const D: usize> HashGrid<D> {
         self.assert_table("table", table);
         self.assert_features("features", features, points.len());
         self.assert_jacobian(jacobian, points.len());
-        let arch = pulp::Arch::new();
+        let arch = arch();
         for (chunk, part) in points.chunks(CHUNK).enumerate() {
             for (l, level) in self.levels.iter().enumerate() {
                 let table = &table[self.level_range(l)];

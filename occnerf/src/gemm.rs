@@ -3,35 +3,49 @@
 /// Widths are padded to this: two AVX2 registers, or one of AVX-512.
 pub(crate) const LANES: usize = 16;
 
-/// A left operand (m × k), or the transpose of a matrix (k × m) that lies in memory row by row.
+/// A left operand (m × k), the transpose of a matrix (k × m) that lies in memory row by row, or ones everywhere.
 #[derive(Clone, Copy)]
 pub(crate) enum Left<'a> {
     Rows(&'a [f32]),
     Transposed(&'a [f32]),
+    Ones,
 }
 
-/// `c (m × n) += a (m × k) · b (k × n)`, `b` and `c` row-major, `n` a multiple of 16.
+/// What an element of the result is before anything is added.
+#[derive(Clone, Copy)]
+pub(crate) enum Start<'a> {
+    /// What it holds.
+    Held,
+    Zero,
+    /// The number of its column (n).
+    Row(&'a [f32]),
+}
+
+/// What becomes of the sums.
+#[derive(Clone, Copy)]
+pub(crate) enum Finish<'a> {
+    Plain,
+    Relu,
+    /// They pass where this (m × n) is above zero: the derivative of [`Finish::Relu`], given its result.
+    Gate(&'a [f32]),
+}
+
+/// `c (m × n) = finish(start + a (m × k) · b (k × n))`, `b` and `c` row-major, `n` a multiple of 16.
 ///
 /// The order of the additions into an element depends on neither `m` nor the instruction set, so a block of rows gives the
 /// same bits wherever it is cut.
-pub(crate) fn multiply_add(m: usize, n: usize, k: usize, a: Left<'_>, b: &[f32], c: &mut [f32]) {
-    let (Left::Rows(left) | Left::Transposed(left)) = a;
-    assert!(n.is_multiple_of(LANES), "columns {n} must be a multiple of {LANES}");
-    assert!(left.len() >= m * k && b.len() >= k * n && c.len() >= m * n, "operands too short for {m}x{k} by {k}x{n}");
-    if k > 0 && n > 0 {
-        pulp::Arch::new().dispatch(Product { m, n, k, a, b, c });
-    }
-}
-
+///
 /// A struct and not a closure: the shim through which a closure is called is compiled without the wide
 /// instructions, and a fused multiply-add becomes a function call there.
-struct Product<'a> {
-    m: usize,
-    n: usize,
-    k: usize,
-    a: Left<'a>,
-    b: &'a [f32],
-    c: &'a mut [f32],
+pub(crate) struct Product<'a> {
+    pub m: usize,
+    pub n: usize,
+    pub k: usize,
+    pub a: Left<'a>,
+    pub b: &'a [f32],
+    pub start: Start<'a>,
+    pub finish: Finish<'a>,
+    pub c: &'a mut [f32],
 }
 
 impl pulp::WithSimd for Product<'_> {
@@ -49,6 +63,18 @@ impl pulp::WithSimd for Product<'_> {
 }
 
 impl Product<'_> {
+    pub fn run(self) {
+        let (m, n, k) = (self.m, self.n, self.k);
+        assert!(n.is_multiple_of(LANES), "columns {n} must be a multiple of {LANES}");
+        assert!(self.b.len() >= k * n && self.c.len() >= m * n, "operands too short for {m}x{k} by {k}x{n}");
+        if let Left::Rows(left) | Left::Transposed(left) = self.a {
+            assert!(left.len() >= m * k, "left operand of {} too short for {m}x{k}", left.len());
+        }
+        if m > 0 && n > 0 {
+            pulp::Arch::new().dispatch(self);
+        }
+    }
+
     /// `V` vectors of columns at a time, and what is left of them one at a time.
     #[inline(always)]
     fn columns<S: pulp::Simd, const R: usize, const V: usize>(&mut self, simd: S) {
@@ -81,8 +107,20 @@ impl Product<'_> {
         let (m, n, k) = (self.m, self.n, self.k);
         let width = V * S::F32_LANES;
         let mut sum = [[simd.splat_f32s(0.0); V]; R];
-        for (r, sum) in sum.iter_mut().enumerate() {
-            sum.copy_from_slice(S::as_simd_f32s(&self.c[(row + r) * n + column..][..width]).0);
+        // One loop for each case: a case for each row would keep the sums in memory.
+        match self.start {
+            Start::Held => {
+                for (r, sum) in sum.iter_mut().enumerate() {
+                    sum.copy_from_slice(S::as_simd_f32s(&self.c[(row + r) * n + column..][..width]).0);
+                }
+            }
+            Start::Zero => {}
+            Start::Row(values) => {
+                let values = S::as_simd_f32s(&values[column..column + width]).0;
+                for sum in &mut sum {
+                    sum.copy_from_slice(values);
+                }
+            }
         }
         let b_rows = self.b[..k * n].chunks_exact(n);
         // No closures: they are compiled for the baseline instruction set.
@@ -113,6 +151,35 @@ impl Product<'_> {
                     }
                 }
             }
+            Left::Ones => {
+                for b_row in b_rows {
+                    let b = S::as_simd_f32s(&b_row[column..column + width]).0;
+                    for sum in &mut sum {
+                        for v in 0..V {
+                            sum[v] = simd.add_f32s(sum[v], b[v]);
+                        }
+                    }
+                }
+            }
+        }
+        let zero = simd.splat_f32s(0.0);
+        match self.finish {
+            Finish::Plain => {}
+            Finish::Relu => {
+                for sum in &mut sum {
+                    for v in 0..V {
+                        sum[v] = simd.max_f32s(sum[v], zero);
+                    }
+                }
+            }
+            Finish::Gate(x) => {
+                for (r, sum) in sum.iter_mut().enumerate() {
+                    let x = S::as_simd_f32s(&x[(row + r) * n + column..][..width]).0;
+                    for v in 0..V {
+                        sum[v] = simd.select_f32s(simd.greater_than_f32s(x[v], zero), sum[v], zero);
+                    }
+                }
+            }
         }
         for (r, sum) in sum.iter().enumerate() {
             S::as_mut_simd_f32s(&mut self.c[(row + r) * n + column..][..width]).0.copy_from_slice(sum);
@@ -129,23 +196,38 @@ mod tests {
         #![proptest_config(ProptestConfig::with_cases(48))]
 
         #[test]
-        fn product_equals_the_triple_loop_for_both_strides(
+        fn product_equals_the_triple_loop_for_every_left_start_and_finish(
             m in 1usize..19, lanes in 1usize..6, k in 1usize..20, seed in any::<u64>()
         ) {
             let n = lanes * LANES;
             let mut random = crate::random::Stream::new(&[seed]);
             let mut fill = |count: usize| (0..count).map(|_| random.uniform() * 2.0 - 1.0).collect::<Vec<f32>>();
-            let (a, b, c) = (fill(m * k), fill(k * n), fill(m * n));
+            let (a, b, c, row, gate) = (fill(m * k), fill(k * n), fill(m * n), fill(n), fill(m * n));
             let transposed: Vec<f32> = (0..k * m).map(|i| a[(i % m) * k + i / m]).collect();
-            for view in [Left::Rows(&a), Left::Transposed(&transposed)] {
-                let mut out = c.clone();
-                multiply_add(m, n, k, view, &b, &mut out);
-                for i in 0..m {
-                    for j in 0..n {
-                        let exact = (0..k).fold(f64::from(c[i * n + j]), |sum, l| {
-                            sum + f64::from(a[i * k + l]) * f64::from(b[l * n + j])
-                        });
-                        prop_assert!((f64::from(out[i * n + j]) - exact).abs() < 1e-5 * (k as f64 + 1.0));
+            for left in [Left::Rows(&a), Left::Transposed(&transposed), Left::Ones] {
+                for start in [Start::Held, Start::Zero, Start::Row(&row)] {
+                    for finish in [Finish::Plain, Finish::Relu, Finish::Gate(&gate)] {
+                        let mut out = c.clone();
+                        Product { m, n, k, a: left, b: &b, start, finish, c: &mut out }.run();
+                        for i in 0..m {
+                            for j in 0..n {
+                                let from = match start {
+                                    Start::Held => c[i * n + j],
+                                    Start::Zero => 0.0,
+                                    Start::Row(values) => values[j],
+                                };
+                                let exact = (0..k).fold(f64::from(from), |sum, l| {
+                                    let a = if matches!(left, Left::Ones) { 1.0 } else { a[i * k + l] };
+                                    sum + f64::from(a) * f64::from(b[l * n + j])
+                                });
+                                let exact = match finish {
+                                    Finish::Plain => exact,
+                                    Finish::Relu => exact.max(0.0),
+                                    Finish::Gate(x) => if x[i * n + j] > 0.0 { exact } else { 0.0 },
+                                };
+                                prop_assert!((f64::from(out[i * n + j]) - exact).abs() < 1e-5 * (k as f64 + 1.0));
+                            }
+                        }
                     }
                 }
             }

@@ -1,6 +1,6 @@
 //! The field's multilayer perceptron: ReLU hidden layers, a linear head, both directions by hand.
 
-use crate::gemm::{LANES, Left, multiply_add};
+use crate::gemm::{Finish, LANES, Left, Product, Start};
 use crate::random::Stream;
 
 /// Shape of a perceptron and where its weights lie in one flat slice.
@@ -98,13 +98,9 @@ impl Mlp {
             let (weights, biases) = self.layer(parameters, layer);
             let (before, after) = activations.layers.split_at_mut(layer + 1);
             let (x, y) = (&before[layer][..samples * inputs], &mut after[0][..samples * outputs]);
-            for row in y.chunks_exact_mut(outputs) {
-                row.copy_from_slice(biases);
-            }
-            multiply_add(samples, outputs, inputs, Left::Rows(x), weights, y);
-            if layer + 1 < self.num_layers() {
-                y.iter_mut().for_each(|v| *v = v.max(0.0));
-            }
+            let finish = if layer + 1 < self.num_layers() { Finish::Relu } else { Finish::Plain };
+            let (a, start) = (Left::Rows(x), Start::Row(biases));
+            Product { m: samples, n: outputs, k: inputs, a, b: weights, start, finish, c: y }.run();
         }
     }
 
@@ -126,20 +122,15 @@ impl Mlp {
             let d_y = &d_output[..samples * outputs];
             let weight_range = self.offsets[layer]..self.offsets[layer + 1];
             let (d_weights, d_biases) = d_parameters[weight_range].split_at_mut(inputs * outputs);
-            multiply_add(inputs, outputs, samples, Left::Transposed(x), d_y, d_weights);
-            for row in d_y.chunks_exact(outputs) {
-                d_biases.iter_mut().zip(row).for_each(|(sum, d)| *sum += d);
+            for (m, a, c) in [(inputs, Left::Transposed(x), d_weights), (1, Left::Ones, d_biases)] {
+                let (start, finish) = (Start::Held, Finish::Plain);
+                Product { m, n: outputs, k: samples, a, b: d_y, start, finish, c }.run();
             }
-            d_input.clear();
             d_input.resize(samples * inputs, 0.0);
-            let weights = &transposed[self.offsets[layer]..][..inputs * outputs];
-            multiply_add(samples, inputs, outputs, Left::Rows(d_y), weights, d_input);
+            let (a, b) = (Left::Rows(d_y), &transposed[self.offsets[layer]..][..inputs * outputs]);
+            let (start, finish) = (Start::Zero, if layer > 0 { Finish::Gate(x) } else { Finish::Plain });
+            Product { m: samples, n: inputs, k: outputs, a, b, start, finish, c: d_input }.run();
             if layer > 0 {
-                d_input.iter_mut().zip(x).for_each(|(d, &x)| {
-                    if x <= 0.0 {
-                        *d = 0.0;
-                    }
-                });
                 std::mem::swap(d_output, d_input);
             }
         }

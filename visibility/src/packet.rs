@@ -32,6 +32,15 @@ impl pulp::WithSimd for Walk<'_> {
     }
 }
 
+/// AVX2 on x86-64, also where `pulp` is built with AVX-512 and the machine has it: packets are eight wide.
+fn arch() -> pulp::Arch {
+    #[cfg(target_arch = "x86_64")]
+    if let Some(simd) = pulp::x86::V3::try_new() {
+        return pulp::Arch::V3(simd);
+    }
+    pulp::Arch::new()
+}
+
 impl RayMesh {
     /// [`RayMesh::first_hit`] of many `rays` (R), each an origin and a direction, into `hits` (R), overwritten.
     ///
@@ -46,7 +55,7 @@ impl RayMesh {
         rays.par_chunks(TASK).zip(hits.par_chunks_mut(TASK)).for_each(|(rays, hits)| {
             let mut stack = Vec::with_capacity(self.tree.depth);
             for (rays, hits) in rays.chunks(WIDTH).zip(hits.chunks_mut(WIDTH)) {
-                pulp::Arch::new().dispatch(Walk { mesh: self, rays, hits, stack: &mut stack });
+                arch().dispatch(Walk { mesh: self, rays, hits, stack: &mut stack });
             }
         });
     }
