@@ -25,6 +25,7 @@ pub(crate) enum Start<'a> {
 #[derive(Clone, Copy)]
 pub(crate) enum Finish<'a> {
     Plain,
+    /// NaN becomes 0, on every instruction set.
     Relu,
     /// They pass where this (m × n) is above zero: the derivative of [`Finish::Relu`], given its result.
     Gate(&'a [f32]),
@@ -168,7 +169,7 @@ impl Product<'_> {
             Finish::Relu => {
                 for sum in &mut sum {
                     for v in 0..V {
-                        sum[v] = simd.max_f32s(sum[v], zero);
+                        sum[v] = simd.select_f32s(simd.greater_than_f32s(sum[v], zero), sum[v], zero);
                     }
                 }
             }
@@ -229,6 +230,30 @@ mod tests {
                             }
                         }
                     }
+                }
+            }
+        }
+
+        #[test]
+        fn results_have_the_same_bits_with_every_instruction_set(
+            m in 1usize..19, lanes in 1usize..6, k in 1usize..20, nan in any::<prop::sample::Index>(), seed in any::<u64>()
+        ) {
+            let n = lanes * LANES;
+            let mut random = crate::random::Stream::new(&[seed]);
+            let mut fill = |count: usize| (0..count).map(|_| random.normal()).collect::<Vec<f32>>();
+            let (mut a, b, row) = (fill(m * k), fill(k * n), fill(n));
+            a[nan.index(m * k)] = f32::NAN;
+            let bits = |arch: pulp::Arch, left| {
+                let mut out = vec![0.0; m * n];
+                arch.dispatch(Product { m, n, k, a: left, b: &b, start: Start::Row(&row), finish: Finish::Relu, c: &mut out });
+                out.into_iter().map(f32::to_bits).collect::<Vec<_>>()
+            };
+            for left in [Left::Rows(&a), Left::Transposed(&a), Left::Ones] {
+                let expected = bits(pulp::Arch::Scalar, left);
+                prop_assert!(bits(pulp::Arch::new(), left) == expected);
+                #[cfg(target_arch = "x86_64")]
+                if let Some(simd) = pulp::x86::V3::try_new() {
+                    prop_assert!(bits(pulp::Arch::V3(simd), left) == expected);
                 }
             }
         }
