@@ -5,7 +5,7 @@ use std::error::Error;
 use std::path::PathBuf;
 
 use glam::Vec3;
-use occnerf::data::{DemoConfig, Image, demo};
+use occnerf::capture::{DemoConfig, Image, demo};
 use occnerf::{Config, FieldRenderer, Method, PreparedFrame, Preset, Renderer, Scene, Trainer, evaluate};
 
 const STEPS: u64 = 100;

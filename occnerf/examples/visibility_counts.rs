@@ -9,7 +9,7 @@ use std::error::Error;
 use std::path::Path;
 
 use glam::{Affine3A, Mat3, Vec3};
-use occnerf::data::{DemoConfig, Image, LoadOptions, demo, load_capture};
+use occnerf::capture::{DemoConfig, Image, LoadOptions, demo, load_capture};
 use occnerf::{Config, Method, Preset, PriorRenderer, Renderer, Scene, Trainer, VertexColors, view_of};
 use smpl::{BodyModel, Placement};
 use testkit::statistics::{ranks, spearman};

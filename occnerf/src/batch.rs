@@ -1,7 +1,7 @@
 //! The rays of a training step: one frame, several square patches.
 
+use crate::capture::Pixels;
 use crate::config::Config;
-use crate::data::Pixels;
 use crate::pixels::{Label, Labels};
 use crate::random::Stream;
 use crate::scene::{PreparedFrame, Scene, bounds};

@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use crate::data::DataError;
+use crate::capture::CaptureError;
 use crate::validate::ConfigError;
 
 /// Any failure of preparing, training, saving or evaluating.
@@ -13,7 +13,7 @@ pub enum Error {
     Config(#[from] ConfigError),
     /// A capture.
     #[error(transparent)]
-    Data(#[from] DataError),
+    Data(#[from] CaptureError),
     /// The body model.
     #[error(transparent)]
     Body(#[from] smpl::Error),

@@ -9,7 +9,7 @@ use visibility::RayMesh;
 use volrender::metrics;
 
 use crate::Error;
-use crate::data::Pixels;
+use crate::capture::Pixels;
 use crate::lpips::Lpips;
 use crate::pixels::Label;
 use crate::render::{Renderer, Rendering};

@@ -4,12 +4,12 @@
 //! of density and colour in the body's rest pose that renders from any side.
 //!
 //! ```
-//! use occnerf::{Config, Method, Preset, Scene, Trainer, data};
+//! use occnerf::{Config, Method, Preset, Scene, Trainer, capture};
 //!
 //! # fn main() -> Result<(), Box<dyn std::error::Error>> {
 //! let body = smpl::BodyModel::embedded();
-//! let demo = data::DemoConfig { size: 48, frames: 4, eval_cameras: 1, ..data::DemoConfig::default() };
-//! let capture = data::demo(&demo, &body)?;
+//! let demo = capture::DemoConfig { size: 48, frames: 4, eval_cameras: 1, ..capture::DemoConfig::default() };
+//! let capture = capture::demo(&demo, &body)?;
 //! let mut config = Config::preset(Preset::Fast, Method::Occnerf);
 //! config.steps = 2;
 //! let scene = Scene::new(&capture, &body, &config)?;
@@ -29,10 +29,10 @@ mod adam;
 mod arena;
 mod batch;
 mod capacity;
+pub mod capture;
 mod checkpoint;
 mod config;
 mod correction;
-pub mod data;
 mod encoder;
 mod error;
 mod evaluate;

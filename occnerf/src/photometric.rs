@@ -5,8 +5,8 @@ use rayon::prelude::*;
 
 use crate::Error;
 use crate::batch::{Batch, target};
+use crate::capture::Pixels;
 use crate::config::LossConfig;
-use crate::data::Pixels;
 use crate::loss::Dissimilarity;
 use crate::lpips::Lpips;
 use crate::pixels::Labels;

@@ -146,8 +146,8 @@ fn a_step_agrees_with_one_written_straight_from_the_definitions() {
     ];
     for (seed, (method, motion)) in (1u64..).zip(cases) {
         let demo =
-            crate::data::DemoConfig { size: 48, frames: 3, eval_cameras: 1, eval_every: 3, ..Default::default() };
-        let capture = crate::data::demo(&demo, &body).unwrap();
+            crate::capture::DemoConfig { size: 48, frames: 3, eval_cameras: 1, eval_every: 3, ..Default::default() };
+        let capture = crate::capture::demo(&demo, &body).unwrap();
         let config = tiny(method, motion, seed);
         let scene = Scene::new(&capture, &body, &config).unwrap();
         let mut trainer = Trainer::new(&scene, config).unwrap();

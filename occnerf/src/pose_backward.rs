@@ -106,8 +106,8 @@ mod tests {
     #[test]
     fn gradient_of_the_pose_agrees_with_finite_differences() {
         let body = BodyModel::embedded();
-        let demo = crate::data::DemoConfig { size: 32, frames: 2, eval_cameras: 1, ..Default::default() };
-        let capture = crate::data::demo(&demo, &body).unwrap();
+        let demo = crate::capture::DemoConfig { size: 32, frames: 2, eval_cameras: 1, ..Default::default() };
+        let capture = crate::capture::demo(&demo, &body).unwrap();
         for method in [Method::Occnerf, Method::HashPoint] {
             let mut config = Config::preset(Preset::Fast, method);
             (config.encoding.levels, config.encoding.n_min, config.encoding.n_max) = (2, 3, 5);

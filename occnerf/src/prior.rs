@@ -113,8 +113,8 @@ mod tests {
     #[test]
     fn colours_start_from_those_of_the_prior_and_stay_with_them_where_no_frame_saw_it() {
         let body = smpl::BodyModel::embedded();
-        let demo = crate::data::DemoConfig { size: 48, frames: 4, eval_cameras: 1, ..Default::default() };
-        let capture = crate::data::demo(&demo, &body).unwrap();
+        let demo = crate::capture::DemoConfig { size: 48, frames: 4, eval_cameras: 1, ..Default::default() };
+        let capture = crate::capture::demo(&demo, &body).unwrap();
         let config = Config::preset(Preset::Fast, Method::Occnerf);
         let scene = Scene::new(&capture, &body, &config).unwrap();
         let shown = VertexColors::measure(&scene).unwrap();

@@ -242,8 +242,8 @@ impl Rays<'_> {
 
 #[cfg(test)]
 mod tests {
+    use crate::capture::{DemoConfig, demo};
     use crate::config::{Config, Method, Preset};
-    use crate::data::{DemoConfig, demo};
     use crate::parameters::Part;
     use crate::scene::Scene;
     use crate::trainer::Trainer;

@@ -315,8 +315,8 @@ impl Samples {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::capture::{DemoConfig, demo};
     use crate::config::{Method, Preset};
-    use crate::data::{DemoConfig, demo};
     use crate::trainer::Trainer;
 
     #[test]

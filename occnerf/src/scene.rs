@@ -10,8 +10,8 @@ use visibility::{RayMesh, View};
 use volrender::{Aabb, Camera};
 
 use crate::Error;
+use crate::capture::{Capture, Frame, PixelSource, Pixels};
 use crate::config::Config;
-use crate::data::{Capture, Frame, PixelSource, Pixels};
 use crate::pixels::{Label, Labels, label_pixels};
 
 /// Canonical height that every capture is scaled to, so that constants in metres mean the same for all.

@@ -97,8 +97,8 @@ fn highest(face: &[u32; 3], vertices: &[f32]) -> f32 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::capture::{DemoConfig, demo};
     use crate::config::{Method, Preset};
-    use crate::data::{DemoConfig, demo};
     use crate::vertices::VertexCode;
 
     fn scene(config: &Config) -> Scene {

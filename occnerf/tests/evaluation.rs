@@ -5,7 +5,7 @@ mod common;
 
 use common::{SIZE, body, capture, config, scene};
 use glam::Vec3;
-use occnerf::data::Image;
+use occnerf::capture::Image;
 use occnerf::{
     Error, Label, Method, PreparedFrame, Renderer, Rendering, Scene, SplitMetrics, evaluate, least_seen_quartile,
 };

@@ -5,7 +5,7 @@ mod common;
 
 use common::{SIZE, body, capture, config, scene};
 use glam::{Affine3A, Mat3, Vec3};
-use occnerf::data::{Frame, Pixels};
+use occnerf::capture::{Frame, Pixels};
 use occnerf::{FieldRenderer, Label, Method, PriorRenderer, Renderer, Scene, Trainer, VertexColors, view_of};
 use volrender::Camera;
 

@@ -4,7 +4,7 @@
 mod common;
 
 use common::{TempDir, config};
-use occnerf::data::{Capture, Layout, LoadOptions, SynthConfig, load_capture, synthesise};
+use occnerf::capture::{Capture, Layout, LoadOptions, SynthConfig, load_capture, synthesise};
 use occnerf::{FieldRenderer, Method, Scene, Trainer, VertexColors, evaluate};
 use smpl::BodyModel;
 

@@ -5,7 +5,7 @@ mod common;
 
 use common::{TempDir, bits, body, checkpoint, demo_config, on_threads, scene, tiny, train};
 use glam::Vec3;
-use occnerf::data::demo;
+use occnerf::capture::demo;
 use occnerf::{
     Config, DistanceKind, FieldRenderer, Method, MotionKind, PriorRenderer, Renderer, Scene, Trainer, VertexColors,
     checkpoint_config,

@@ -7,7 +7,7 @@ mod common;
 
 use common::{TempDir, body, capture, scene, tiny, train};
 use glam::Vec3;
-use occnerf::data::{Capture, DemoConfig, LoadOptions, Pixels, demo, load_capture};
+use occnerf::capture::{Capture, DemoConfig, LoadOptions, Pixels, demo, load_capture};
 use occnerf::{Label, Method, MotionKind, OccludedRule, Scene, VertexColors};
 
 const NO_DISTORTION: [f64; 5] = [0.0; 5];

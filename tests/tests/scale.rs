@@ -6,7 +6,7 @@ mod common;
 use approx::assert_abs_diff_eq;
 use common::{bits, body, capture, tiny, train};
 use glam::Vec3;
-use occnerf::data::{Capture, Frame};
+use occnerf::capture::{Capture, Frame};
 use occnerf::{Config, Method, MotionKind, Scene};
 use smpl::{BodyModel, Placement, SparseRows};
 

@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, anyhow, bail};
-use occnerf::data::LoadOptions;
+use occnerf::capture::LoadOptions;
 use occnerf::{Config, SplitMetrics};
 use serde::{Deserialize, Serialize};
 

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
 use clap::{Args, ValueEnum};
-use occnerf::data::{
+use occnerf::capture::{
     Capture, DemoConfig, LoadOptions, SynthConfig, Synthetic, Wrong, demo, find_body, load_capture, own_body,
 };
 use smpl::BodyModel;

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, Result, bail, ensure};
 use clap::{Args, ValueEnum};
 use indicatif::{ProgressBar, ProgressStyle};
-use occnerf::data::{Layout, Obstacle, Occlusion, SynthConfig, Synthetic, synthesise};
+use occnerf::capture::{Layout, Obstacle, Occlusion, SynthConfig, Synthetic, synthesise};
 use smpl::{Character, MotionClip};
 
 use crate::obstacle::ObstacleArguments;

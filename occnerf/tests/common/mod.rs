@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 
 use glam::{Affine3A, Mat3, Vec3};
-use occnerf::data::{Capture, EvalFrame, Frame, Image, Pixels};
+use occnerf::capture::{Capture, EvalFrame, Frame, Image, Pixels};
 use occnerf::{Config, Method, MotionKind, Preset, Scene};
 use smpl::{BodyModel, Placement, SparseRows};
 use visibility::RayMesh;

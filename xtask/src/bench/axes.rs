@@ -1,6 +1,6 @@
 //! The ways in which `bench stability` makes it hard.
 
-use occnerf::data::{DemoConfig, LoadOptions, Obstacle};
+use occnerf::capture::{DemoConfig, LoadOptions, Obstacle};
 use occnerf::{Config, Method, Preset};
 
 use super::difficulty::Difficulty;

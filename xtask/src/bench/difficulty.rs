@@ -5,7 +5,7 @@ use std::ops::{Add, Mul};
 
 use anyhow::{Result, ensure};
 use glam::{Quat, Vec3};
-use occnerf::data::{Capture, DemoConfig, Frame, Pixels, Wrong, demo};
+use occnerf::capture::{Capture, DemoConfig, Frame, Pixels, Wrong, demo};
 use serde::{Deserialize, Serialize};
 use smpl::{BodyModel, Placement, SparseRows};
 

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, bail};
 use glam::Vec3;
-use occnerf::data::{Capture, LoadOptions};
+use occnerf::capture::{Capture, LoadOptions};
 use occnerf::{
     Config, FieldRenderer, Method, PreparedFrame, PriorRenderer, Renderer, Scene, StepTimes, Trainer, VertexColors,
     evaluate,

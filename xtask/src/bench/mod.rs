@@ -19,7 +19,7 @@ use std::time::Duration;
 
 use anyhow::Result;
 use clap::{Args, Subcommand};
-use occnerf::data::Layout;
+use occnerf::capture::Layout;
 
 use self::job::Place;
 use self::runner::Bench;

@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Result, ensure};
 use clap::Args;
-use occnerf::data::{LoadOptions, Wrong};
+use occnerf::capture::{LoadOptions, Wrong};
 use occnerf::{Lpips, Preset};
 
 use crate::eval::{load_lpips, network_name};

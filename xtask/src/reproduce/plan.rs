@@ -6,7 +6,7 @@ use std::path::Path;
 use std::time::Instant;
 
 use anyhow::{Context, Result};
-use occnerf::data::LoadOptions;
+use occnerf::capture::LoadOptions;
 use occnerf::{Config, FieldRenderer, Lpips, Method, PreparedFrame, Preset, Scene, Trainer, evaluate_with};
 use serde::{Deserialize, Serialize};
 

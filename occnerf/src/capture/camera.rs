@@ -1,0 +1,69 @@
+//! Cameras from the matrices that captures hold.
+
+use glam::{Affine3A, Mat3, Vec3};
+use volrender::{Camera, Distortion};
+
+use super::records::Record;
+use super::{CaptureError, LoadOptions};
+
+/// Largest |R Rᵀ − I| of an extrinsic rotation; files written in `f32` or with a few decimals stay far below.
+const ORTHONORMAL: f32 = 1e-3;
+
+/// A lens and where it stands. The camera's image is 1 × 1 until the picture has been read.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Lens {
+    pub camera: Camera,
+    pub distortion: Distortion,
+}
+
+/// The three numbers of row `i` of a matrix with `columns` columns.
+fn row(values: &[f32], columns: usize, i: usize) -> Vec3 {
+    Vec3::from_slice(&values[columns * i..])
+}
+
+/// A rotation from 3 rows of `columns` values each; `None` unless it is one.
+pub(super) fn rotation(values: &[f32], columns: usize) -> Option<Mat3> {
+    let row = |i| row(values, columns, i);
+    let rotation = Mat3::from_cols(row(0), row(1), row(2)).transpose();
+    let product = (rotation * rotation.transpose() - Mat3::IDENTITY).to_cols_array();
+    let skewed = product.iter().any(|x| x.abs() > ORTHONORMAL) || rotation.determinant() < 0.0;
+    (!skewed).then_some(rotation)
+}
+
+/// A camera from a row-major calibration matrix (9); the error says what is wrong with it.
+pub(super) fn pinhole(k: &[f32], extrinsics: Affine3A, options: &LoadOptions) -> Result<Camera, String> {
+    let mut intrinsics = Mat3::from_cols_slice(k).transpose();
+    // The camera's own convention has the first pixel's centre at 0.5.
+    intrinsics.z_axis += Vec3::new(1.0, 1.0, 0.0) * (0.5 - options.pixel_centre);
+    Camera::new(intrinsics, extrinsics, 1, 1).map_err(|error| error.to_string())
+}
+
+impl Lens {
+    /// From a 3×3 matrix under `k`, a 3×4 or 4×4 one under `e`, and five numbers under `distortions` if there are any.
+    pub fn read(record: &Record<'_>, k: &str, e: &str, options: &LoadOptions) -> Result<Self, CaptureError> {
+        let intrinsics = record.shaped(k, &[3, 3], "")?;
+        let (shape, values) = record.array(e)?;
+        if shape != [4, 4] && shape != [3, 4] {
+            return Err(record.invalid(e, "shape [4, 4]", format!("shape {shape:?}")));
+        }
+        let last = values.get(12..).unwrap_or_default();
+        let rotation = rotation(&values, 4).filter(|_| last.is_empty() || last == [0.0, 0.0, 0.0, 1.0]);
+        let rotation = rotation.ok_or_else(|| {
+            let expected = "a rotation and a translation, with a last row of 0 0 0 1";
+            record.invalid(e, expected, format!("{values:?}"))
+        })?;
+        let translation = Vec3::new(values[3], values[7], values[11]);
+        let camera = pinhole(&intrinsics, Affine3A::from_mat3_translation(rotation, translation), options)
+            .map_err(|error| record.invalid(k, "a pinhole camera", error))?;
+
+        let mut distortion = Distortion::default();
+        if record.has("distortions") {
+            let (shape, d) = record.array("distortions")?;
+            let five: [f32; 5] = d
+                .try_into()
+                .map_err(|_| record.invalid("distortions", "5 numbers (k1 k2 p1 p2 k3)", format!("shape {shape:?}")))?;
+            distortion = Distortion::from_opencv(five);
+        }
+        Ok(Self { camera, distortion })
+    }
+}

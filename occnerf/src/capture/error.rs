@@ -1,0 +1,80 @@
+use std::path::{Path, PathBuf};
+
+/// What is wrong with a capture, in one line that names the file, the key within it, what was expected and
+/// what was found.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum CaptureError {
+    /// A file or directory cannot be read or written.
+    #[error("{}: {source}", path.display())]
+    Io {
+        /// The file or directory.
+        path: PathBuf,
+        /// The system's reason.
+        source: std::io::Error,
+    },
+    /// A picture cannot be decoded or encoded.
+    #[error("{}: not a readable picture: {source}", path.display())]
+    Picture {
+        /// The picture.
+        path: PathBuf,
+        /// The codec's reason.
+        source: image::ImageError,
+    },
+    /// A pickle or array file is truncated or malformed, or an array in it has the wrong type or shape.
+    #[error(transparent)]
+    Array(#[from] smpl::Error),
+    /// A file that the layout demands is absent.
+    #[error("{}: missing {what}", path.display())]
+    Missing {
+        /// Where it should be.
+        path: PathBuf,
+        /// What is absent, and who refers to it.
+        what: String,
+    },
+    /// A value has the wrong type, shape or size, or makes no sense.
+    #[error("{}: {key}: expected {expected}, found {actual}", path.display())]
+    Invalid {
+        /// The file.
+        path: PathBuf,
+        /// The value within the file.
+        key: String,
+        /// What would have been right.
+        expected: String,
+        /// What is there.
+        actual: String,
+    },
+    /// A setting that no capture can be made with.
+    #[error("{name}: expected {expected}, found {actual}")]
+    Setting {
+        /// The setting.
+        name: &'static str,
+        /// What would have been right.
+        expected: String,
+        /// What was given.
+        actual: String,
+    },
+}
+
+impl CaptureError {
+    pub(super) fn invalid(
+        path: &Path,
+        key: impl Into<String>,
+        expected: impl Into<String>,
+        actual: impl Into<String>,
+    ) -> Self {
+        Self::Invalid { path: path.to_owned(), key: key.into(), expected: expected.into(), actual: actual.into() }
+    }
+
+    pub(super) fn missing(path: &Path, what: impl Into<String>) -> Self {
+        Self::Missing { path: path.to_owned(), what: what.into() }
+    }
+
+    pub(super) fn setting(name: &'static str, expected: impl Into<String>, actual: impl ToString) -> Self {
+        Self::Setting { name, expected: expected.into(), actual: actual.to_string() }
+    }
+
+    pub(super) fn io(path: &Path) -> impl FnOnce(std::io::Error) -> Self + '_ {
+        move |source| Self::Io { path: path.to_owned(), source }
+    }
+}

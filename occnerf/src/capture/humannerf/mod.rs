@@ -1,0 +1,165 @@
+//! HumanNeRF's prepared layout (Weng et al. 2022), with OccNeRF's `eval` cameras.
+//!
+//! ```text
+//! images/frame_000000.png …   masks/frame_000000.png …   (PNG or JPEG)
+//! cameras.pkl                 {frame: {intrinsics (3,3), extrinsics (4,4), distortions (5)?}}
+//! mesh_infos.pkl              {frame: {Rh (3), Th (3), poses (3J), betas (≤ B), tpose_joints (J,3), …}}
+//! canonical_joints.pkl        {joints (J,3), avg_betas (≤ B)}
+//! eval/Camera_…/              images, masks, cameras.pkl and mesh_infos.pkl again, nothing occluded
+//! ```
+//!
+//! Frames are the entries of `cameras.pkl` in the order of their names, `10` after `9`.
+
+#[cfg(test)]
+mod tests;
+
+use std::path::{Path, PathBuf};
+
+use rayon::prelude::*;
+use smpl::BodyModel;
+
+use super::camera::Lens;
+use super::decode::{Planned, View, budget};
+use super::names::FrameName;
+use super::pictures::{Pictures, file_name};
+use super::records::{Record, Records};
+use super::{Capture, CaptureError, EvalFrame, LoadOptions, checks};
+
+/// Reads a capture in this layout.
+pub(super) fn load(dir: &Path, body: &BodyModel, options: &LoadOptions) -> Result<Capture, CaptureError> {
+    options.only_zju("HumanNeRF's prepared layout")?;
+    let mut all = Vec::new();
+    let train = plan(dir, body, options, |names| {
+        all = names.iter().map(|n| (*n).to_owned()).collect();
+        Ok(options.select(names))
+    })?;
+    let names = options.select(all.iter());
+    let mean_betas = mean_betas(dir, body)?;
+
+    let (mut cameras, mut eval) = (Vec::new(), Vec::new());
+    for camera in eval_directories(dir)? {
+        let view = plan(&camera, body, options, |mut seen| {
+            if let Some(odd) = seen.iter().find(|name| index(&all, name).is_none()) {
+                let expected = format!("the name of a frame of {}", dir.join("cameras.pkl").display());
+                let file = camera.join("cameras.pkl");
+                return Err(CaptureError::invalid(&file, *odd, expected, "no such training frame"));
+            }
+            seen.retain(|name| index(&names, name).is_some_and(|i| i % options.eval_stride == 0));
+            Ok(seen)
+        })?;
+        if let Some(view) = view {
+            cameras.push(file_name(&camera));
+            eval.push(view);
+        }
+    }
+
+    let train = train.ok_or_else(|| CaptureError::missing(&dir.join("cameras.pkl"), "frame"))?;
+    let mut budget = budget(&train, &eval, body, options)?;
+    let train = train.frames(body, options, &mut budget)?;
+    let mut frames = Vec::new();
+    for (camera_name, view) in cameras.into_iter().zip(eval) {
+        for frame in view.frames(body, options, &mut budget)? {
+            let train_index = index(&names, &frame.name).unwrap_or_default();
+            frames.push(EvalFrame { camera_name: camera_name.clone(), train_index, frame });
+        }
+    }
+    Ok(Capture { name: file_name(dir), train, eval: frames, mean_betas })
+}
+
+fn index(names: &[impl AsRef<str>], name: &str) -> Option<usize> {
+    names.binary_search_by(|n| FrameName(n.as_ref()).cmp(&FrameName(name))).ok()
+}
+
+/// The frames of a directory that `choose` keeps of their sorted names; `None` where it keeps none.
+fn plan(
+    dir: &Path,
+    body: &BodyModel,
+    options: &LoadOptions,
+    choose: impl FnOnce(Vec<&str>) -> Result<Vec<&str>, CaptureError>,
+) -> Result<Option<View>, CaptureError> {
+    if !dir.is_dir() {
+        return Err(CaptureError::missing(dir, "directory"));
+    }
+    let cameras = Records::load(&dir.join("cameras.pkl"))?;
+    let bodies = Records::load(&dir.join("mesh_infos.pkl"))?;
+    let (lenses, infos) = (cameras.frames()?, bodies.frames()?);
+    for (has, lacks, has_path, lacks_path) in
+        [(&lenses, &infos, cameras.path(), bodies.path()), (&infos, &lenses, bodies.path(), cameras.path())]
+    {
+        if let Some(name) = has.keys().find(|name| !lacks.contains_key(*name)) {
+            let expected = format!("an entry, as in {}", has_path.display());
+            return Err(CaptureError::invalid(lacks_path, name.0, expected, "no such key"));
+        }
+    }
+    let images = Pictures::list(&dir.join("images"))?;
+    let masks = Pictures::list(&dir.join("masks"))?;
+    if let Some((name, path)) = images.iter().find(|(name, _)| !lenses.contains_key(&FrameName(name))) {
+        let expected = format!("an entry `{name}` in {}", cameras.path().display());
+        return Err(CaptureError::invalid(path, "camera of the image", expected, "none"));
+    }
+    let chosen = choose(lenses.keys().map(|name| name.0).collect())?;
+    // Collected as results first, so that the error reported is the first in order whatever finishes first.
+    let frames: Vec<Result<Planned, CaptureError>> = chosen
+        .par_iter()
+        .map(|&name| {
+            let (image, mask) = (images.demand(name, cameras.path())?, masks.demand(name, cameras.path())?);
+            plan_frame(name, image, mask, &lenses[&FrameName(name)], &infos[&FrameName(name)], body, options)
+        })
+        .collect();
+    let frames: Vec<Planned> = frames.into_iter().collect::<Result<_, _>>()?;
+    if frames.is_empty() {
+        return Ok(None);
+    }
+    View::new(frames, &dir.join("masks"), cameras.path()).map(Some)
+}
+
+fn plan_frame(
+    name: &str,
+    image: PathBuf,
+    mask: PathBuf,
+    lens: &Record<'_>,
+    parameters: &Record<'_>,
+    body: &BodyModel,
+    options: &LoadOptions,
+) -> Result<Planned, CaptureError> {
+    let betas = checks::betas(parameters, "betas", body)?;
+    checks::joints(parameters, "tpose_joints", &betas, body)?;
+    Ok(Planned {
+        name: name.to_owned(),
+        image,
+        masks: vec![mask],
+        labels: false,
+        occluder: None,
+        hidden: None,
+        lens: Lens::read(lens, "intrinsics", "extrinsics", options)?,
+        pose: checks::rootless_pose(parameters, body)?,
+        placement: checks::origin(parameters)?,
+        betas,
+    })
+}
+
+/// The shape of the canonical body, `avg_betas` of `canonical_joints.pkl`, its joints checked against the model's.
+fn mean_betas(dir: &Path, body: &BodyModel) -> Result<Vec<f32>, CaptureError> {
+    let records = Records::load(&dir.join("canonical_joints.pkl"))?;
+    let canonical = records.whole();
+    let betas = checks::betas(&canonical, "avg_betas", body)?;
+    checks::joints(&canonical, "joints", &betas, body)?;
+    Ok(betas)
+}
+
+/// `eval/*/` in the order of their names; none where there is no `eval`.
+fn eval_directories(dir: &Path) -> Result<Vec<PathBuf>, CaptureError> {
+    let root = dir.join("eval");
+    if !root.exists() {
+        return Ok(Vec::new());
+    }
+    let mut found = Vec::new();
+    for entry in std::fs::read_dir(&root).map_err(CaptureError::io(&root))? {
+        let path = entry.map_err(CaptureError::io(&root))?.path();
+        if path.is_dir() {
+            found.push(path);
+        }
+    }
+    found.sort();
+    Ok(found)
+}

@@ -1,0 +1,162 @@
+//! The pixels of frames: in memory, or in files that are decoded when asked for.
+
+use std::sync::{Arc, OnceLock};
+
+use super::decode::Files;
+use super::obstacle::Area;
+use super::{CaptureError, Image};
+
+/// What a frame shows.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Pixels {
+    /// Picture multiplied by `mask`: colours are premultiplied by coverage, and 0 where the mask is 0. Over a
+    /// background B the picture is `image + (1 − mask) · B`.
+    pub image: Image,
+    /// Coverage of each pixel by the *visible* subject, 0 to 1, (H, W); above 0.5 the pixel counts as subject.
+    pub mask: Vec<f32>,
+    /// Pixels known to be covered by something in front of the subject, (H, W); `None` where nobody marked them.
+    pub occluder: Option<Vec<bool>>,
+}
+
+impl Pixels {
+    /// Lets nothing be seen in an area.
+    fn hide(&mut self, area: &Area) {
+        let width = self.image.width;
+        let visible: Vec<f32> = (0..self.mask.len()).map(|p| if area.contains(p, width) { 0.0 } else { 1.0 }).collect();
+        self.mask.iter_mut().zip(&visible).for_each(|(mask, seen)| *mask *= seen);
+        self.image.multiply(&visible);
+    }
+
+    /// Grows or shrinks the mask by so many pixels along the axes, and the picture with it.
+    fn grow(&mut self, pixels: i32) {
+        let (width, height) = (self.image.width as usize, self.image.height as usize);
+        for _ in 0..pixels.unsigned_abs() {
+            let old = self.mask.clone();
+            for i in 0..old.len() {
+                let (x, y) = (i % width, i / width);
+                let around = [
+                    (x > 0).then(|| i - 1),
+                    (x + 1 < width).then(|| i + 1),
+                    (y > 0).then(|| i - width),
+                    (y + 1 < height).then(|| i + width),
+                ];
+                let values = around.into_iter().flatten().map(|j| old[j]);
+                let new = if pixels > 0 { values.fold(old[i], f32::max) } else { values.fold(old[i], f32::min) };
+                if new < old[i] {
+                    // The picture is premultiplied by the mask.
+                    let share = new / old[i];
+                    self.image.pixels[3 * i..3 * i + 3].iter_mut().for_each(|c| *c *= share);
+                }
+                self.mask[i] = new;
+            }
+        }
+    }
+}
+
+/// A change of pixels that can be made whenever they are decoded.
+#[derive(Clone, Debug)]
+pub(super) enum Edit {
+    /// Something stands before these pixels.
+    Hide(Area),
+    /// The mask is larger, or smaller, by so many pixels.
+    Grow(i32),
+}
+
+impl Edit {
+    fn apply(&self, pixels: &mut Pixels) {
+        match self {
+            Self::Hide(area) => pixels.hide(area),
+            Self::Grow(by) => pixels.grow(*by),
+        }
+    }
+}
+
+/// Where the pixels of a frame are. Copies share what is decoded.
+#[derive(Clone, Debug)]
+pub struct PixelSource(Place);
+
+#[derive(Clone, Debug)]
+enum Place {
+    Memory(Arc<Pixels>),
+    Disk(Arc<OnDisk>),
+}
+
+#[derive(Debug)]
+struct OnDisk {
+    files: Arc<Files>,
+    edits: Vec<Edit>,
+    /// Whether the pixels stay in memory once they are decoded.
+    keep: bool,
+    kept: OnceLock<Arc<Pixels>>,
+}
+
+impl From<Pixels> for PixelSource {
+    fn from(pixels: Pixels) -> Self {
+        Self(Place::Memory(Arc::new(pixels)))
+    }
+}
+
+impl PixelSource {
+    /// Pixels that are decoded when asked for, the first time only if `keep`.
+    pub(super) fn on_disk(files: Files, keep: bool) -> Self {
+        let on_disk = OnDisk { files: Arc::new(files), edits: Vec::new(), keep, kept: OnceLock::new() };
+        Self(Place::Disk(Arc::new(on_disk)))
+    }
+
+    /// The pixels.
+    ///
+    /// # Errors
+    /// For files that cannot be read any more, or never were readable; none for pixels in memory.
+    pub fn pixels(&self) -> Result<Arc<Pixels>, CaptureError> {
+        match &self.0 {
+            Place::Memory(pixels) => Ok(Arc::clone(pixels)),
+            Place::Disk(disk) => {
+                if let Some(kept) = disk.kept.get() {
+                    return Ok(Arc::clone(kept));
+                }
+                let mut pixels = disk.files.decode()?;
+                disk.edits.iter().for_each(|edit| edit.apply(&mut pixels));
+                let pixels = Arc::new(pixels);
+                Ok(if disk.keep { Arc::clone(disk.kept.get_or_init(|| pixels)) } else { pixels })
+            }
+        }
+    }
+
+    /// Changes the pixels; they stay in memory from then on.
+    ///
+    /// # Errors
+    /// As of [`PixelSource::pixels`].
+    pub fn change(&mut self, change: impl FnOnce(&mut Pixels)) -> Result<(), CaptureError> {
+        let mut pixels = Arc::unwrap_or_clone(self.pixels()?);
+        change(&mut pixels);
+        *self = pixels.into();
+        Ok(())
+    }
+
+    /// Decodes what is to be kept, and looks at the headers of the rest.
+    pub(super) fn check(&self) -> Result<(), CaptureError> {
+        match &self.0 {
+            Place::Disk(disk) if !disk.keep => disk.files.check(),
+            _ => self.pixels().map(drop),
+        }
+    }
+
+    /// Makes a change, now or whenever the pixels are decoded.
+    pub(super) fn edit(&mut self, edit: Edit) {
+        match &mut self.0 {
+            Place::Memory(pixels) => edit.apply(Arc::make_mut(pixels)),
+            Place::Disk(disk) => {
+                let mut kept = match Arc::get_mut(disk) {
+                    Some(own) => own.kept.take(),
+                    None => disk.kept.get().cloned(),
+                };
+                if let Some(pixels) = &mut kept {
+                    edit.apply(Arc::make_mut(pixels));
+                }
+                let edits = disk.edits.iter().cloned().chain([edit]).collect();
+                let kept = kept.map_or_else(OnceLock::new, OnceLock::from);
+                *disk = Arc::new(OnDisk { files: Arc::clone(&disk.files), edits, keep: disk.keep, kept });
+            }
+        }
+    }
+}

@@ -1,0 +1,116 @@
+//! Pictures of a mesh by ray casting.
+
+use glam::{Affine3A, Mat3, Vec2, Vec3};
+use visibility::RayMesh;
+use volrender::Camera;
+
+use crate::capture::{CaptureError, Image};
+
+/// Rays a pixel, along each axis.
+const SAMPLES: u32 = 2;
+/// Toward the lamp: from the training camera's upper left.
+const LAMP: Vec3 = Vec3::new(-0.42, 0.68, 0.60);
+/// Light from everywhere, light from above, light of the lamp.
+const AMBIENT: f32 = 0.58;
+const SKY: f32 = 0.07;
+const DIRECT: f32 = 0.42;
+
+/// A camera at `eye` that looks at `target`, upright, square, with the focal length in picture sides.
+pub(in crate::capture) fn look_at(eye: Vec3, target: Vec3, size: u32, focal: f32) -> Result<Camera, CaptureError> {
+    let forward = (target - eye).normalize_or(Vec3::NEG_Z);
+    let right = forward.cross(Vec3::Y).normalize_or(Vec3::X);
+    let down = forward.cross(right);
+    let rotation = Mat3::from_cols(right, down, forward).transpose();
+    let extrinsics = Affine3A::from_mat3_translation(rotation, -(rotation * eye));
+    let side = size as f32;
+    let intrinsics =
+        Mat3::from_cols(Vec3::X * (focal * side), Vec3::Y * (focal * side), Vec3::new(side / 2.0, side / 2.0, 1.0));
+    Camera::new(intrinsics, extrinsics, size, size)
+        .map_err(|error| CaptureError::setting("camera", "a pinhole camera", error))
+}
+
+/// A picture, colours premultiplied, and its coverage.
+pub(in crate::capture) type Picture = (Image, Vec<f32>);
+
+/// The unlit colour of a face at a point given by barycentric weights.
+pub(in crate::capture) type Albedo<'a> = dyn Fn(u32, [f32; 3]) -> Vec3 + Sync + 'a;
+
+/// A mesh in one pose, ready to be looked at.
+pub(in crate::capture) struct Posture<'a> {
+    vertices: Vec<Vec3>,
+    normals: Vec<Vec3>,
+    faces: &'a [[u32; 3]],
+    albedo: &'a Albedo<'a>,
+    mesh: RayMesh,
+}
+
+impl<'a> Posture<'a> {
+    /// `vertices` and their `normals`, which need not be of unit length.
+    pub fn new(
+        vertices: Vec<Vec3>,
+        normals: Vec<Vec3>,
+        faces: &'a [[u32; 3]],
+        albedo: &'a Albedo<'a>,
+    ) -> Result<Self, CaptureError> {
+        let mesh = RayMesh::new(&vertices, faces)
+            .map_err(|error| CaptureError::setting("body", "a mesh that rays can hit", error))?;
+        Ok(Self { vertices, normals, faces, albedo, mesh })
+    }
+
+    /// Colour on black, and the share of each pixel that the mesh covers.
+    pub fn render(&self, camera: &Camera) -> Picture {
+        let (width, height) = (camera.width, camera.height);
+        let mut image = Image::new(width, height);
+        let mut mask = vec![0.0; (width * height) as usize];
+        let eye = camera.centre_of_projection();
+        let step = 1.0 / SAMPLES as f32;
+        let (low, high) = self.bounds(camera);
+        for row in low.y as u32..high.y as u32 {
+            for column in low.x as u32..high.x as u32 {
+                let mut sum = Vec3::ZERO;
+                let mut hits = 0;
+                for sample in 0..SAMPLES * SAMPLES {
+                    let u = column as f32 + ((sample % SAMPLES) as f32 + 0.5) * step;
+                    let v = row as f32 + ((sample / SAMPLES) as f32 + 0.5) * step;
+                    if let Some(color) = self.color(eye, camera.ray(u, v).direction) {
+                        sum += color;
+                        hits += 1;
+                    }
+                }
+                let pixel = (row * width + column) as usize;
+                let share = step * step;
+                mask[pixel] = hits as f32 * share;
+                image.pixels[3 * pixel..3 * pixel + 3].copy_from_slice(&(sum * share).to_array());
+            }
+        }
+        (image, mask)
+    }
+
+    /// Whole pixels around everything that projects, clipped to the picture.
+    fn bounds(&self, camera: &Camera) -> (Vec2, Vec2) {
+        let size = Vec2::new(camera.width as f32, camera.height as f32);
+        let (mut low, mut high) = (size, Vec2::ZERO);
+        for &vertex in &self.vertices {
+            let Some(p) = camera.project(vertex) else {
+                // A vertex behind the camera bounds nothing.
+                return (Vec2::ZERO, size);
+            };
+            low = low.min(p.truncate().floor());
+            high = high.max(p.truncate().ceil());
+        }
+        (low.clamp(Vec2::ZERO, size), high.clamp(Vec2::ZERO, size))
+    }
+
+    fn color(&self, origin: Vec3, direction: Vec3) -> Option<Vec3> {
+        let hit = self.mesh.first_hit(origin, direction)?;
+        let corners = self.faces[hit.face as usize];
+        let mix = |of: &[Vec3]| -> Vec3 { corners.iter().zip(hit.barycentric).map(|(&v, w)| of[v as usize] * w).sum() };
+        let normal = mix(&self.normals).normalize_or(-direction);
+        let lamp = normal.dot(LAMP.normalize_or(Vec3::Y));
+        // Half-Lambert: the terminator is soft and nothing is black.
+        let direct = (0.5 + 0.5 * lamp).powi(2);
+        let light = AMBIENT + SKY * normal.y + DIRECT * direct;
+        let color = (self.albedo)(hit.face, hit.barycentric) * light;
+        Some(color.clamp(Vec3::ZERO, Vec3::ONE))
+    }
+}

@@ -1,0 +1,102 @@
+//! HumanNeRF's layout for videos from anywhere.
+//!
+//! ```text
+//! images/NAME.png …       masks/NAME.png …      (PNG or JPEG; masks 0 to 255, the visible person)
+//! metadata.json           {NAME: {poses (3J), betas (≤ B), cam_intrinsics (3,3), cam_extrinsics (4,4), distortions (5)?}}
+//! occluders/NAME.png …    where known: 255 where something stands in front of the person
+//! clean/images, masks/    some of the frames again without occluders, kept back
+//! ```
+//!
+//! The pose's first joint turns the body about its pelvis; the extrinsics hold the body's translation. Frames are the
+//! entries of `metadata.json` in the order of their names, `10` after `9`; pictures that it does not mention are left out.
+
+mod metadata;
+#[cfg(test)]
+mod tests;
+
+use std::path::Path;
+
+use smpl::{BodyModel, Placement};
+
+use super::camera::Lens;
+use super::decode::{Planned, View, budget};
+use super::names::FrameName;
+use super::pictures::{Pictures, file_name};
+use super::records::Record;
+use super::{Capture, CaptureError, EvalFrame, LoadOptions, checks};
+
+/// Camera name of the frames under `clean`.
+const CLEAN: &str = "clean";
+
+/// Reads a capture in this layout.
+pub(super) fn load(dir: &Path, body: &BodyModel, options: &LoadOptions) -> Result<Capture, CaptureError> {
+    options.only_zju("HumanNeRF's wild layout")?;
+    let path = dir.join("metadata.json");
+    let records = metadata::read(&path)?;
+    let frames = options.select(records.frames()?);
+
+    let (images, masks) = (Pictures::list(&dir.join("images"))?, Pictures::list(&dir.join("masks"))?);
+    let occluders = optional(&dir.join("occluders"))?;
+    let train: Result<Vec<Planned>, CaptureError> = frames
+        .iter()
+        .map(|(FrameName(name), record)| {
+            let mut frame = plan(name, record, [&images, &masks], &path, body, options)?;
+            frame.occluder = occluders.as_ref().and_then(|o| o.get(name));
+            Ok(frame)
+        })
+        .collect();
+    let train = View::new(train?, &dir.join("masks"), &path)?;
+
+    let clean = dir.join(CLEAN);
+    let (mut indices, mut kept) = (Vec::new(), Vec::new());
+    if let Some(images) = optional(&clean.join("images"))? {
+        let masks = Pictures::list(&clean.join("masks"))?;
+        for (index, (FrameName(name), record)) in frames.iter().enumerate().step_by(options.eval_stride) {
+            if images.get(name).is_some() {
+                indices.push(index);
+                kept.push(plan(name, record, [&images, &masks], &path, body, options)?);
+            }
+        }
+    }
+    let eval: Vec<View> = match kept.is_empty() {
+        true => Vec::new(),
+        false => vec![View::new(kept, &clean.join("masks"), &path)?],
+    };
+
+    let mut budget = budget(&train, &eval, body, options)?;
+    let train = train.frames(body, options, &mut budget)?;
+    let mut kept = Vec::new();
+    for view in eval {
+        for (train_index, frame) in indices.iter().copied().zip(view.frames(body, options, &mut budget)?) {
+            kept.push(EvalFrame { camera_name: CLEAN.to_owned(), train_index, frame });
+        }
+    }
+    let mean_betas = checks::mean_betas(train.iter().map(|f| f.betas.as_slice()));
+    Ok(Capture { name: file_name(dir), train, eval: kept, mean_betas })
+}
+
+fn optional(dir: &Path) -> Result<Option<Pictures>, CaptureError> {
+    if dir.is_dir() { Pictures::list(dir).map(Some) } else { Ok(None) }
+}
+
+fn plan(
+    name: &str,
+    record: &Record<'_>,
+    [images, masks]: [&Pictures; 2],
+    metadata: &Path,
+    body: &BodyModel,
+    options: &LoadOptions,
+) -> Result<Planned, CaptureError> {
+    Ok(Planned {
+        name: name.to_owned(),
+        image: images.demand(name, metadata)?,
+        masks: vec![masks.demand(name, metadata)?],
+        labels: false,
+        occluder: None,
+        hidden: None,
+        lens: Lens::read(record, "cam_intrinsics", "cam_extrinsics", options)?,
+        pose: checks::pose(record, body)?,
+        placement: Placement::default(),
+        betas: checks::betas(record, "betas", body)?,
+    })
+}
