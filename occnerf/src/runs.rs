@@ -1,7 +1,7 @@
 //! The samples of a step's rays, evaluated front to back in runs, so that those behind an opaque surface need not be.
 
 use glam::Vec3;
-use volrender::{Composite, composite, composite_backward};
+use volrender::{Composite, RaySamples, SampleGradients, composite, composite_backward};
 
 use crate::field::Group;
 use crate::samples::{March, Samples, Tracer};
@@ -150,7 +150,8 @@ impl Along {
     /// Composites every ray.
     pub fn composite(&mut self, background: Vec3, composites: &mut Vec<Composite>) {
         let Self { starts, sigma, likelihood, delta, t, rgb, weights, .. } = self;
-        Rays { starts, sigma, likelihood, delta, t, rgb }.composite(background, weights, composites);
+        let samples = RaySamples { sigma, likelihood, delta, t, rgb };
+        composite_rays(starts, samples, background, weights, composites);
     }
 
     /// Backward of [`Along::composite`], into the runs' groups; `d_colors` of each ray.
@@ -159,21 +160,22 @@ impl Along {
         self.d_sigma.resize(n, 0.0);
         self.d_rgb.resize(n, Vec3::ZERO);
         self.d_likelihood.resize(n, 0.0);
+        let samples = RaySamples {
+            sigma: &self.sigma,
+            likelihood: &self.likelihood,
+            delta: &self.delta,
+            t: &self.t,
+            rgb: &self.rgb,
+        };
         for (ends, d_color) in self.starts.windows(2).zip(d_colors) {
             let range = ends[0]..ends[1];
-            composite_backward(
-                &self.sigma[range.clone()],
-                &self.likelihood[range.clone()],
-                &self.delta[range.clone()],
-                &self.rgb[range.clone()],
-                background,
-                &self.weights[range.clone()],
-                d_color,
-                0.0,
-                &mut self.d_sigma[range.clone()],
-                &mut self.d_rgb[range.clone()],
-                &mut self.d_likelihood[range],
-            );
+            let gradients = SampleGradients {
+                d_sigma: &mut self.d_sigma[range.clone()],
+                d_rgb: &mut self.d_rgb[range.clone()],
+                d_likelihood: &mut self.d_likelihood[range.clone()],
+            };
+            let weights = &self.weights[range.clone()];
+            composite_backward(samples.slice(range), background, weights, d_color, 0.0, gradients);
         }
         for group in runs.groups_mut() {
             let n = group.samples.len();
@@ -206,37 +208,24 @@ pub(crate) fn composite_group(
     composites: &mut Vec<Composite>,
 ) {
     let Samples { starts, likelihood, delta, t, .. } = &group.samples;
-    Rays { starts, sigma: &group.sigma, likelihood, delta, t, rgb: &group.rgb }
-        .composite(background, weights, composites);
+    let samples = RaySamples { sigma: &group.sigma, likelihood, delta, t, rgb: &group.rgb };
+    composite_rays(starts, samples, background, weights, composites);
 }
 
-/// The samples of rays, ray by ray, as far as compositing reads them.
-struct Rays<'a> {
-    /// First sample of each ray, and the end of the last.
-    starts: &'a [usize],
-    sigma: &'a [f32],
-    likelihood: &'a [f32],
-    delta: &'a [f32],
-    t: &'a [f32],
-    rgb: &'a [Vec3],
-}
-
-impl Rays<'_> {
-    fn composite(&self, background: Vec3, weights: &mut Vec<f32>, composites: &mut Vec<Composite>) {
-        weights.resize(self.t.len(), 0.0);
-        composites.clear();
-        for ends in self.starts.windows(2) {
-            let range = ends[0]..ends[1];
-            composites.push(composite(
-                &self.sigma[range.clone()],
-                &self.likelihood[range.clone()],
-                &self.delta[range.clone()],
-                &self.t[range.clone()],
-                &self.rgb[range.clone()],
-                background,
-                &mut weights[range],
-            ));
-        }
+/// Composites rays whose samples stand ray by ray; `starts` has the first sample of each ray, and
+/// the end of the last.
+fn composite_rays(
+    starts: &[usize],
+    samples: RaySamples<'_>,
+    background: Vec3,
+    weights: &mut Vec<f32>,
+    composites: &mut Vec<Composite>,
+) {
+    weights.resize(samples.t.len(), 0.0);
+    composites.clear();
+    for ends in starts.windows(2) {
+        let range = ends[0]..ends[1];
+        composites.push(composite(samples.slice(range.clone()), background, &mut weights[range]));
     }
 }
 

@@ -3,7 +3,7 @@
 use glam::{Affine3A, Vec3, Vec4};
 use smpl::{Posed, SurfaceMotion, WeightVolume};
 use surface_query::MeshDistance;
-use volrender::{Occupancy, Ray};
+use volrender::{Occupancy, OccupancyConfig, Ray};
 
 use crate::Error;
 use crate::config::{Config, DistanceKind};
@@ -35,9 +35,10 @@ impl Stage {
     pub fn set(&mut self, scene: &Scene, posed: &Posed, shell: &Shell, config: &Config) {
         let (margin, depth) = (config.motion.margin + config.motion.falloff, config.motion.depth);
         let Self { mesh, occupancy, cell } = self;
+        let size = OccupancyConfig { margin, depth, cell: *cell };
         rayon::join(
             || mesh.refit(&posed.vertices),
-            || occupancy.rebuild(&posed.vertices, &scene.model.faces, &shell.faces, margin, depth, *cell),
+            || occupancy.rebuild(&posed.vertices, &scene.model.faces, &shell.faces, size),
         );
     }
 }
@@ -46,7 +47,8 @@ impl Stage {
 pub(crate) fn near_canonical(scene: &Scene, config: &Config) -> Occupancy {
     let (mut occupancy, whole) = (Occupancy::default(), Shell::whole(scene, config));
     let (vertices, faces, motion) = (&scene.canonical.vertices, &scene.model.faces, &config.motion);
-    occupancy.rebuild(vertices, faces, &whole.faces, whole.farthest, motion.depth, FINE_CELL);
+    let size = OccupancyConfig { margin: whole.farthest, depth: motion.depth, cell: FINE_CELL };
+    occupancy.rebuild(vertices, faces, &whole.faces, size);
     occupancy
 }
 
