@@ -2,7 +2,6 @@
 
 use glam::Vec3;
 
-use super::ramp;
 use crate::model::{BodyModel, TERMS_PER_JOINT};
 use crate::sparse::SparseRows;
 
@@ -152,4 +151,10 @@ fn normals(vertices: &[Vec3], faces: &[[u32; 3]]) -> Vec<Vec3> {
             .collect();
     }
     out
+}
+
+/// 0 below `low`, 1 above `high`, smooth between.
+fn ramp(low: f32, high: f32, x: f32) -> f32 {
+    let s = ((x - low) / (high - low)).clamp(0.0, 1.0);
+    s * s * (3.0 - 2.0 * s)
 }
