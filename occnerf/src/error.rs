@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use crate::capture::CaptureError;
-use crate::validate::ConfigError;
+use crate::config::ConfigError;
 
 /// Any failure of preparing, training, saving or evaluating.
 #[derive(Debug, thiserror::Error)]

@@ -11,9 +11,9 @@ use volrender::metrics;
 use crate::Error;
 use crate::capture::Pixels;
 use crate::lpips::Lpips;
-use crate::pixels::Label;
-use crate::render::{Renderer, Rendering};
-use crate::scene::{PreparedFrame, Scene};
+use crate::render::field::{Renderer, Rendering};
+use crate::scene::labels::Label;
+use crate::scene::prepared::{PreparedFrame, Scene};
 
 /// Opacity above which the paper counts a pixel as rendered.
 const VISIBLE: f32 = 0.001;

@@ -8,8 +8,8 @@ use volrender::Aabb;
 
 use crate::Error;
 use crate::config::Config;
-use crate::scene::{PreparedFrame, Scene, bounds};
-use crate::trainer::pixel_ray;
+use crate::scene::prepared::{PreparedFrame, Scene, bounds};
+use crate::train::trainer::pixel_ray;
 
 /// Pixels of the subject that are looked at, at most: every n-th, all frames alike. A million keys take 8 MB.
 const MAX_PIXELS: usize = 1 << 20;

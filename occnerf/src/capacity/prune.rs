@@ -2,8 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::parameters::Part;
-use crate::trainer::Trainer;
+use crate::model::parameters::Part;
+use crate::train::trainer::Trainer;
 
 /// What pruning took away.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]

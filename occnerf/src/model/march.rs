@@ -3,9 +3,9 @@
 use glam::Vec3;
 use volrender::{Composite, composite, composite_backward};
 
-use crate::field::Group;
-use crate::samples::{March, Samples, Tracer};
-use crate::times::Stopwatch;
+use crate::model::field::Group;
+use crate::model::samples::{March, Samples, Tracer};
+use crate::model::times::Stopwatch;
 
 /// Live samples of a ray that are evaluated before it is asked whether it goes on: about as many as there are from one side of a
 /// surface to the other. Where next to nothing may be left out more of them make larger batches, which read a table that is larger
@@ -244,9 +244,9 @@ impl Rays<'_> {
 mod tests {
     use crate::capture::{DemoConfig, demo};
     use crate::config::{Config, Method, Preset};
-    use crate::parameters::Part;
-    use crate::scene::Scene;
-    use crate::trainer::Trainer;
+    use crate::model::parameters::Part;
+    use crate::scene::prepared::Scene;
+    use crate::train::trainer::Trainer;
 
     /// Some steps with all samples, to make the surface opaque, and one more as `config` has it: its report, the colours of its
     /// rays and the gradients.

@@ -1,6 +1,6 @@
 //! What a configuration may ask for.
 
-use crate::config::{Config, MotionKind};
+use crate::config::settings::{Config, MotionKind};
 
 /// A configuration that cannot be run: the key and why.
 #[derive(Debug, thiserror::Error, PartialEq)]
@@ -107,7 +107,7 @@ impl Config {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::{Method, Preset};
+    use crate::config::settings::{Method, Preset};
 
     #[test]
     fn a_bad_value_is_named_with_its_key() {

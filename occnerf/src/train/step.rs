@@ -4,20 +4,20 @@ use glam::Vec3;
 use rayon::prelude::*;
 use smpl::{Posed, WeightVolume};
 
-use crate::arena::Arena;
-use crate::batch::Batch;
 use crate::config::DistanceKind;
-use crate::correction::{Wrench, correct_backward};
-use crate::encoder::Slopes;
-use crate::field::Group;
-use crate::loss::completeness;
-use crate::parameters::Part;
-use crate::pixels::Label;
+use crate::model::arena::Arena;
+use crate::model::correction::{Wrench, correct_backward};
+use crate::model::encoder::Slopes;
+use crate::model::field::Group;
+use crate::model::parameters::Part;
+use crate::model::samples::March;
+use crate::model::times::{StepTimes, Stopwatch};
 use crate::random::Stream;
-use crate::samples::March;
-use crate::scene::PreparedFrame;
-use crate::times::{StepTimes, Stopwatch};
-use crate::trainer::{GroupState, Trainer, pixel_ray};
+use crate::scene::labels::Label;
+use crate::scene::prepared::PreparedFrame;
+use crate::train::batch::Batch;
+use crate::train::loss::completeness;
+use crate::train::trainer::{GroupState, Trainer, pixel_ray};
 
 const JITTER: u64 = 0x4A49_5454;
 

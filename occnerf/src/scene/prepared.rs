@@ -12,7 +12,7 @@ use volrender::{Aabb, Camera};
 use crate::Error;
 use crate::capture::{Capture, Frame, PixelSource, Pixels};
 use crate::config::Config;
-use crate::pixels::{Label, Labels, label_pixels};
+use crate::scene::labels::{Label, Labels, label_pixels};
 
 /// Canonical height that every capture is scaled to, so that constants in metres mean the same for all.
 const NORMALISED_HEIGHT: f32 = 1.7;

@@ -2,9 +2,9 @@
 
 use rayon::prelude::*;
 
-use crate::adam::Adam;
 use crate::config::{Config, RateConfig};
-use crate::field::Field;
+use crate::model::field::Field;
+use crate::train::adam::Adam;
 
 /// A parameter group.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -1,15 +1,48 @@
 //! The named settings, every value in one place.
 
-use crate::config::{
+use crate::config::settings::{
     AttentionKind, Config, DistanceKind, EncodingConfig, FieldConfig, LossConfig, Method, MotionConfig, MotionKind,
     OccludedRule, Preset, RateConfig, SurfaceConfig, VisibilityKind,
 };
+
+impl Config {
+    /// The defaults of a preset for a method.
+    pub fn preset(preset: Preset, method: Method) -> Self {
+        let mut config = match preset {
+            Preset::Paper => paper(),
+            Preset::PublishedCode => published_code(),
+            Preset::Balanced => balanced(),
+            Preset::Fast => fast(),
+        };
+        config.method = method;
+        if method != Method::Occnerf {
+            config.surface.surface_term = false;
+            config.surface.attention = false;
+            config.loss.completeness = 0.0;
+            // A field of x̂ alone does not know how far the prior's surface is.
+            config.field.density_bias_outside = config.field.density_bias;
+            config.field.prior_colors = false;
+        }
+        if method == Method::Humannerf {
+            // Without a hash grid the perceptron has to hold the whole person.
+            (config.field.width, config.field.depth) = match preset {
+                Preset::Paper | Preset::PublishedCode => (256, 8),
+                Preset::Fast | Preset::Balanced => (128, 4),
+            };
+            if matches!(preset, Preset::Fast | Preset::Balanced) {
+                // The higher rate was chosen for a small F behind a hash grid.
+                config.rates.field = 2e-3;
+            }
+        }
+        config
+    }
+}
 
 /// 2⁻²⁵: what remains behind it is lost when it is added to an f32 near 1.
 const NOTHING: f32 = 1.0 / (1 << 25) as f32;
 
 /// The paper's setting; what it leaves open is named in ARCHITECTURE.
-pub(crate) fn paper() -> Config {
+fn paper() -> Config {
     Config {
         preset: Preset::Paper,
         method: Method::Occnerf,
@@ -74,14 +107,14 @@ pub(crate) fn paper() -> Config {
 }
 
 /// The paper's setting as the published code has it.
-pub(crate) fn published_code() -> Config {
+fn published_code() -> Config {
     let mut config = Config { preset: Preset::PublishedCode, ..paper() };
     config.depart_as_published();
     config
 }
 
 /// The default.
-pub(crate) fn balanced() -> Config {
+fn balanced() -> Config {
     Config {
         preset: Preset::Balanced,
         steps: 800,
@@ -122,6 +155,23 @@ pub(crate) fn balanced() -> Config {
 }
 
 /// A first look: half as long.
-pub(crate) fn fast() -> Config {
+fn fast() -> Config {
     Config { preset: Preset::Fast, steps: 400, ..balanced() }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_preset_of_every_method_is_valid_and_survives_toml() {
+        for preset in [Preset::Fast, Preset::Balanced, Preset::Paper, Preset::PublishedCode] {
+            for method in [Method::Prior, Method::Humannerf, Method::HashPoint, Method::Occnerf] {
+                let config = Config::preset(preset, method);
+                config.validate().unwrap();
+                let text = toml::to_string(&config).unwrap();
+                assert_eq!(toml::from_str::<Config>(&text).unwrap(), config);
+            }
+        }
+    }
 }

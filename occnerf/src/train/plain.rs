@@ -8,14 +8,14 @@ use hashgrid::HashGrid;
 use testkit::oracle;
 use visibility::VisibilityCounts;
 
-use crate::batch::target;
 use crate::config::{Config, Method, MotionKind, Preset};
-use crate::encoder::Encoder;
-use crate::field::Group;
-use crate::parameters::Part;
+use crate::model::encoder::Encoder;
+use crate::model::field::Group;
+use crate::model::parameters::Part;
 use crate::random::Stream;
-use crate::scene::Scene;
-use crate::trainer::Trainer;
+use crate::scene::prepared::Scene;
+use crate::train::batch::target;
+use crate::train::trainer::Trainer;
 
 /// What the plain step reads besides the parameters under test: the samples of a step that was taken.
 struct Plain<'a, 'b> {

@@ -2,8 +2,6 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::presets;
-
 /// Which model is trained; every method shares data, sampler, renderer, losses and budget.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
@@ -294,37 +292,6 @@ pub struct Config {
 }
 
 impl Config {
-    /// The defaults of a preset for a method.
-    pub fn preset(preset: Preset, method: Method) -> Self {
-        let mut config = match preset {
-            Preset::Paper => presets::paper(),
-            Preset::PublishedCode => presets::published_code(),
-            Preset::Balanced => presets::balanced(),
-            Preset::Fast => presets::fast(),
-        };
-        config.method = method;
-        if method != Method::Occnerf {
-            config.surface.surface_term = false;
-            config.surface.attention = false;
-            config.loss.completeness = 0.0;
-            // A field of x̂ alone does not know how far the prior's surface is.
-            config.field.density_bias_outside = config.field.density_bias;
-            config.field.prior_colors = false;
-        }
-        if method == Method::Humannerf {
-            // Without a hash grid the perceptron has to hold the whole person.
-            (config.field.width, config.field.depth) = match preset {
-                Preset::Paper | Preset::PublishedCode => (256, 8),
-                Preset::Fast | Preset::Balanced => (128, 4),
-            };
-            if matches!(preset, Preset::Fast | Preset::Balanced) {
-                // The higher rate was chosen for a small F behind a hash grid.
-                config.rates.field = 2e-3;
-            }
-        }
-        config
-    }
-
     /// Departs from the paper as the code published with it does, as far as that is more than a defect: attention
     /// through a softmax, ten neighbours a level, mean distances with the sign of the majority, hidden pixels taught as background.
     pub fn depart_as_published(&mut self) {
@@ -341,23 +308,6 @@ impl Config {
             Component::Attention => self.surface.attention = false,
             Component::Completeness => self.loss.completeness = 0.0,
             Component::Perceptual => self.loss.perceptual = 0.0,
-        }
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn every_preset_of_every_method_is_valid_and_survives_toml() {
-        for preset in [Preset::Fast, Preset::Balanced, Preset::Paper, Preset::PublishedCode] {
-            for method in [Method::Prior, Method::Humannerf, Method::HashPoint, Method::Occnerf] {
-                let config = Config::preset(preset, method);
-                config.validate().unwrap();
-                let text = toml::to_string(&config).unwrap();
-                assert_eq!(toml::from_str::<Config>(&text).unwrap(), config);
-            }
         }
     }
 }

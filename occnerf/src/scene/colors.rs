@@ -4,7 +4,7 @@ use glam::{DVec3, Vec3, Vec4};
 use rayon::prelude::*;
 
 use crate::Error;
-use crate::scene::{Scene, view};
+use crate::scene::prepared::{Scene, view};
 
 /// A colour for each vertex of the prior.
 #[derive(Clone, Debug, PartialEq)]
@@ -84,8 +84,8 @@ impl VertexColors {
 mod tests {
     use super::*;
     use crate::config::{Config, Method, Preset};
-    use crate::trainer::Trainer;
-    use crate::vertices::VertexCode;
+    use crate::model::vertices::VertexCode;
+    use crate::train::trainer::Trainer;
 
     /// Face, barycentrics and colour of every sample of the first training frame.
     fn colours_of_samples(trainer: &mut Trainer<'_>) -> Vec<((u32, [f32; 3]), Vec3)> {
@@ -94,17 +94,20 @@ mod tests {
         trainer.encode_vertices(&mut code);
         let frame = &scene.train[0];
         let posed = trainer.corrected(frame);
-        let mut stage =
-            std::mem::replace(&mut trainer.stage, crate::samples::Stage::new(scene, crate::samples::CELL).unwrap());
+        let mut stage = std::mem::replace(
+            &mut trainer.stage,
+            crate::model::samples::Stage::new(scene, crate::model::samples::CELL).unwrap(),
+        );
         stage.set(scene, &posed, &trainer.shell, &trainer.config);
-        let mut group = crate::field::Group::default();
+        let mut group = crate::model::field::Group::default();
         group.samples.clear();
         let tracer = trainer.tracer(&stage, &trainer.shell, frame, &posed);
         for pixel in 0..48 * 48 {
-            group.samples.trace(&tracer, &crate::trainer::pixel_ray(frame, pixel));
+            group.samples.trace(&tracer, &crate::train::trainer::pixel_ray(frame, pixel));
         }
         let parameter = |part| trainer.parameters.get(part);
-        let (field, table) = (parameter(crate::parameters::Part::Field), parameter(crate::parameters::Part::Table));
+        let (field, table) =
+            (parameter(crate::model::parameters::Part::Field), parameter(crate::model::parameters::Part::Table));
         trainer.field.forward(field, table, &code.rows, &trainer.counts, &mut group, None);
         assert!(group.samples.len() > 500);
         group.samples.faces.into_iter().zip(group.rgb).collect()

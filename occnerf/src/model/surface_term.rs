@@ -2,7 +2,7 @@
 
 use std::ops::Range;
 
-use crate::samples::Samples;
+use crate::model::samples::Samples;
 
 /// Which rows each sample mixes, and where the mix stands in its input row: after the point term.
 pub(crate) struct Mix<'a> {

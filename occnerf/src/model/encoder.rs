@@ -8,7 +8,7 @@ use volrender::Aabb;
 
 use crate::Error;
 use crate::config::{Config, EncodingConfig, Method};
-use crate::samples::Samples;
+use crate::model::samples::Samples;
 
 /// Bands of the frequency encoding (Weng et al. 2022).
 const BANDS: usize = 10;

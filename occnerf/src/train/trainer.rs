@@ -9,23 +9,23 @@ use visibility::VisibilityCounts;
 use volrender::{Composite, Occupancy};
 
 use crate::Error;
-use crate::arena::Arena;
-use crate::batch::Batch;
 use crate::config::{Config, DistanceKind, MotionKind, VisibilityKind};
-use crate::correction::{Corrections, Wrench, correct, corrected};
-use crate::field::Field;
 use crate::lpips::Lpips;
-use crate::parameters::{PARTS, Parameters, Part};
-use crate::photometric::Photometric;
-use crate::pixels::Label;
-use crate::prior::VertexColors;
-use crate::restarts::Restarts;
-use crate::runs::{Along, Runs, run_length};
-use crate::samples::{CELL, Stage, Tracer, near_canonical};
-use crate::scene::{PreparedFrame, Scene};
-use crate::shell::Shell;
-use crate::times::{StepTimes, Stopwatch};
-use crate::vertices::VertexCode;
+use crate::model::arena::Arena;
+use crate::model::correction::{Corrections, Wrench, correct, corrected};
+use crate::model::extent::Shell;
+use crate::model::field::Field;
+use crate::model::march::{Along, Runs, run_length};
+use crate::model::parameters::{PARTS, Parameters, Part};
+use crate::model::samples::{CELL, Stage, Tracer, near_canonical};
+use crate::model::times::{StepTimes, Stopwatch};
+use crate::model::vertices::VertexCode;
+use crate::scene::colors::VertexColors;
+use crate::scene::labels::Label;
+use crate::scene::prepared::{PreparedFrame, Scene};
+use crate::train::batch::Batch;
+use crate::train::photometric::Photometric;
+use crate::train::restarts::Restarts;
 
 /// Rays are dealt row by row to this many groups, each with its own gradient buffers, summed in order: the result
 /// does not depend on who computes a group. Eight keep two to eight threads busy.

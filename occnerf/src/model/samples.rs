@@ -7,9 +7,9 @@ use volrender::{Occupancy, Ray};
 
 use crate::Error;
 use crate::config::{Config, DistanceKind};
+use crate::model::extent::Shell;
 use crate::random::Stream;
-use crate::scene::Scene;
-use crate::shell::Shell;
+use crate::scene::prepared::Scene;
 
 /// Side of a cell of the occupancy for the rays of a step, of which too few pass through one for a finer grid to pay.
 pub(crate) const CELL: f32 = 0.02;
@@ -317,7 +317,7 @@ mod tests {
     use super::*;
     use crate::capture::{DemoConfig, demo};
     use crate::config::{Method, Preset};
-    use crate::trainer::Trainer;
+    use crate::train::trainer::Trainer;
 
     #[test]
     fn with_a_volume_a_sample_lives_where_the_canonical_prior_is_near() {

@@ -10,10 +10,10 @@ use safetensors::tensor::{Dtype, SafeTensors};
 
 use crate::Error;
 use crate::config::Config;
-use crate::parameters::{PARTS, Part};
-use crate::scene::Scene;
-use crate::shell::Shell;
-use crate::trainer::Trainer;
+use crate::model::extent::Shell;
+use crate::model::parameters::{PARTS, Part};
+use crate::scene::prepared::Scene;
+use crate::train::trainer::Trainer;
 
 const FORMAT: &str = "occnerf-checkpoint";
 const VERSION: &str = "1";

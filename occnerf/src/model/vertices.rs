@@ -4,8 +4,8 @@ use glam::Vec3;
 use rayon::prelude::*;
 
 use crate::config::{Config, DistanceKind};
-use crate::encoder::{At, Coordinates, Encoder, Slopes};
-use crate::scene::Scene;
+use crate::model::encoder::{At, Coordinates, Encoder, Slopes};
+use crate::scene::prepared::Scene;
 
 const CHUNK: usize = 512;
 /// Farthest that a vertex's distance to its initial mesh is looked up; the encoding clamps earlier.

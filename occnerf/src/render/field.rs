@@ -6,17 +6,17 @@ use smpl::Posed;
 use volrender::{Camera, Composite};
 
 use crate::Error;
-use crate::batch::body_box;
 use crate::capture::Image;
-use crate::field::Group;
-use crate::parameters::Part;
-use crate::prior::VertexColors;
-use crate::runs::composite_group;
-use crate::samples::{FINE_CELL, March, Stage};
-use crate::scene::{PreparedFrame, Scene};
-use crate::shell::Shell;
-use crate::trainer::{Trainer, pixel_ray};
-use crate::vertices::VertexCode;
+use crate::model::extent::Shell;
+use crate::model::field::Group;
+use crate::model::march::composite_group;
+use crate::model::parameters::Part;
+use crate::model::samples::{FINE_CELL, March, Stage};
+use crate::model::vertices::VertexCode;
+use crate::scene::colors::VertexColors;
+use crate::scene::prepared::{PreparedFrame, Scene};
+use crate::train::batch::body_box;
+use crate::train::trainer::{Trainer, pixel_ray};
 
 /// A picture with the opacity of each of its pixels.
 #[derive(Clone, Debug)]

@@ -4,13 +4,13 @@ use glam::Vec3;
 use rayon::prelude::*;
 
 use crate::Error;
-use crate::batch::{Batch, target};
 use crate::capture::Pixels;
 use crate::config::LossConfig;
-use crate::loss::Dissimilarity;
 use crate::lpips::Lpips;
-use crate::pixels::Labels;
-use crate::trainer::{GroupState, StepReport};
+use crate::scene::labels::Labels;
+use crate::train::batch::{Batch, target};
+use crate::train::loss::Dissimilarity;
+use crate::train::trainer::{GroupState, StepReport};
 
 /// What the losses of a step read and write, kept from step to step; of each ray of the batch.
 #[derive(Default)]

@@ -7,10 +7,10 @@
 use rayon::prelude::*;
 
 use crate::config::{Config, MotionKind};
-use crate::field::Group;
-use crate::parameters::Part;
-use crate::scene::Scene;
-use crate::trainer::Trainer;
+use crate::model::field::Group;
+use crate::model::parameters::Part;
+use crate::scene::prepared::Scene;
+use crate::train::trainer::Trainer;
 
 /// From one looked at distance to the next, normalised metres.
 const LAYER: f32 = 0.005;
@@ -99,7 +99,7 @@ mod tests {
     use super::*;
     use crate::capture::{DemoConfig, demo};
     use crate::config::{Method, Preset};
-    use crate::vertices::VertexCode;
+    use crate::model::vertices::VertexCode;
 
     fn scene(config: &Config) -> Scene {
         let body = smpl::BodyModel::embedded();

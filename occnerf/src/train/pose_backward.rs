@@ -3,10 +3,10 @@
 use glam::{Affine3A, Mat3A, Vec3, Vec3A};
 use smpl::{BodyModel, Posed, SurfaceMotion};
 
-use crate::arena::Arena;
-use crate::correction::Wrench;
-use crate::field::Group;
-use crate::trainer::Trainer;
+use crate::model::arena::Arena;
+use crate::model::correction::Wrench;
+use crate::model::field::Group;
+use crate::train::trainer::Trainer;
 
 impl Trainer<'_> {
     /// Adds the gradients of the encoding's coordinates, of d and of f to those of the bones that the samples hang on. The
@@ -96,11 +96,11 @@ fn weights(model: &BodyModel, corners: [u32; 3], barycentric: [f32; 3]) -> impl 
 mod tests {
     use super::*;
     use crate::config::{Config, Method, Preset};
-    use crate::correction::{correct_backward, corrected};
-    use crate::parameters::Part;
+    use crate::model::correction::{correct_backward, corrected};
+    use crate::model::parameters::Part;
+    use crate::model::samples::{CELL, Stage};
     use crate::random::Stream;
-    use crate::samples::{CELL, Stage};
-    use crate::scene::Scene;
+    use crate::scene::prepared::Scene;
 
     /// Value = Σ c · features(x) + e · d(x) + p · f(x) of points x that keep still while the pose is corrected.
     #[test]

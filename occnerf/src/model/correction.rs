@@ -240,7 +240,7 @@ mod tests {
         };
         let mut wrenches = vec![Wrench::default(); model.num_joints()];
         for (face, bary, x, a) in &points {
-            let at = crate::pose_backward::Anchor::new(&model, &after, *face, *bary, *x).unwrap();
+            let at = crate::train::pose_backward::Anchor::new(&model, &after, *face, *bary, *x).unwrap();
             at.push(at.to_world(*a), &mut wrenches);
         }
         let gradient = correct_backward(&model, &posed, &correction, &after, &wrenches);

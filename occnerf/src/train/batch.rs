@@ -2,9 +2,9 @@
 
 use crate::capture::Pixels;
 use crate::config::Config;
-use crate::pixels::{Label, Labels};
 use crate::random::Stream;
-use crate::scene::{PreparedFrame, Scene, bounds};
+use crate::scene::labels::{Label, Labels};
+use crate::scene::prepared::{PreparedFrame, Scene, bounds};
 
 /// Share of patches centred on a pixel of the subject; the rest fall anywhere in the body's box.
 const ON_SUBJECT: f32 = 0.8;

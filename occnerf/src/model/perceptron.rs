@@ -1,6 +1,6 @@
 //! The field's multilayer perceptron: ReLU hidden layers, a linear head, both directions by hand.
 
-use crate::gemm::{Finish, LANES, Left, Product, Start};
+use crate::model::gemm::{Finish, LANES, Left, Product, Start};
 use crate::random::Stream;
 
 /// Shape of a perceptron and where its weights lie in one flat slice.
@@ -213,7 +213,7 @@ mod tests {
                 p
             };
             let input: Vec<f32> = (0..inputs * samples).map(|_| random.normal()).collect();
-            let cotangent: Vec<f32> = (0..samples * crate::gemm::LANES).map(|_| random.normal()).collect();
+            let cotangent: Vec<f32> = (0..samples * crate::model::gemm::LANES).map(|_| random.normal()).collect();
             let value = |parameters: &[f32], input: &[f32]| -> f64 {
                 let out = run(&mlp, parameters, input, samples);
                 out.layers[3].iter().zip(&cotangent).map(|(y, c)| f64::from(*y) * f64::from(*c)).sum()

@@ -7,14 +7,14 @@ use visibility::VisibilityCounts;
 use volrender::Aabb;
 
 use crate::Error;
-use crate::arena::Arena;
 use crate::config::{AttentionKind, Config, Method};
-use crate::encoder::{Coordinates, Encoder, fit};
-use crate::gemm::LANES;
-use crate::mix::{Gather, Mix, Scatter};
-use crate::mlp::{Activations, Mlp};
-use crate::samples::Samples;
-use crate::times::{StepTimes, Stopwatch};
+use crate::model::arena::Arena;
+use crate::model::encoder::{Coordinates, Encoder, fit};
+use crate::model::gemm::LANES;
+use crate::model::perceptron::{Activations, Mlp};
+use crate::model::samples::Samples;
+use crate::model::surface_term::{Gather, Mix, Scatter};
+use crate::model::times::{StepTimes, Stopwatch};
 
 /// Samples that pass through the perceptron together; their activations fit a second-level cache.
 const BLOCK: usize = 256;

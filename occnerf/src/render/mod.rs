@@ -1,0 +1,3 @@
+//! Pictures of a trained person, or of the prior.
+
+pub(crate) mod field;
