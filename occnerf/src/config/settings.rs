@@ -216,6 +216,13 @@ pub struct MotionConfig {
     pub shell_interval: usize,
 }
 
+impl MotionConfig {
+    /// Distance from the prior's surface beyond which nothing belongs to the subject, normalised metres.
+    pub fn reach(&self) -> f32 {
+        self.margin + self.falloff
+    }
+}
+
 /// Weights of the losses.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]

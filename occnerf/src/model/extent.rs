@@ -1,16 +1,14 @@
-//! How far from the prior's surface the field has anything to show: samples farther out are skipped, in training once
-//! that has emptied the space there, and in pictures.
+//! How far from the prior's surface the field has anything to show: samples farther out are skipped,
+//! in training once that has emptied the space there, and in pictures.
 //!
-//! An occupancy grid (Müller et al. 2022, section 5.1) in the coordinates that the field has anyway: place on the surface
-//! and distance from it.
+//! An occupancy grid (Müller et al. 2022, section 5.1) in the coordinates that the field has anyway:
+//! place on the surface and distance from it.
 
 use rayon::prelude::*;
 
-use crate::config::{Config, MotionKind};
-use crate::model::field::Group;
-use crate::model::parameters::Part;
-use crate::scene::prepared::Scene;
-use crate::train::trainer::Trainer;
+use crate::config::Config;
+use crate::model::body::Body;
+use crate::model::field::SampleBatch;
 
 /// From one looked at distance to the next, normalised metres.
 const LAYER: f32 = 0.005;
@@ -23,7 +21,7 @@ const CHUNK: usize = 256;
 
 /// The outer end of the field over each part of the prior's surface, normalised metres.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub(crate) struct Shell {
+pub(crate) struct Extent {
     /// V, what training goes on from.
     pub vertices: Vec<f32>,
     /// F, the farthest of the corners.
@@ -32,61 +30,59 @@ pub(crate) struct Shell {
     pub farthest: f32,
 }
 
-impl Shell {
+impl Extent {
     /// Everything out to the margin.
-    pub fn whole(scene: &Scene, config: &Config) -> Self {
-        Self::new(scene, vec![config.motion.margin + config.motion.falloff; scene.canonical.vertices.len()])
+    pub fn whole(body: &Body, config: &Config) -> Self {
+        Self::new(body, vec![config.motion.reach(); body.canonical.vertices.len()])
     }
 
     /// From the ends over the vertices (V).
-    pub fn new(scene: &Scene, vertices: Vec<f32>) -> Self {
-        let faces = scene.model.faces.iter().map(|face| highest(face, &vertices)).collect();
+    pub fn new(body: &Body, vertices: Vec<f32>) -> Self {
+        let faces = body.model.faces.iter().map(|face| highest(face, &vertices)).collect();
         let farthest = vertices.iter().copied().fold(0.0, f32::max);
         Self { vertices, faces, farthest }
     }
-}
 
-impl Trainer<'_> {
-    /// Looks at the field over every vertex. One layer beyond the last one that shows something is kept, and as much as
-    /// over any vertex that shares a face: the field can grow back there.
-    pub(crate) fn measure_shell(&self, vertex_features: &[f32]) -> Shell {
-        let (scene, motion) = (self.scene, &self.config.motion);
-        if motion.kind != MotionKind::Surface {
-            return Shell::whole(scene, &self.config);
-        }
-        let whole = motion.margin + motion.falloff;
+    /// Looks at the field over every vertex; `evaluate` gives samples their density. One layer
+    /// beyond the last one that shows something is kept, and as much as over any vertex that shares
+    /// a face: the field can grow back there.
+    pub fn measure(
+        body: &Body,
+        config: &Config,
+        neighbours: bool,
+        evaluate: impl Fn(&mut SampleBatch) + Sync,
+    ) -> Self {
+        let whole = config.motion.reach();
         let layers = (whole / LAYER).ceil() as usize;
-        let (normals, positions) = (scene.query.normals(), &scene.canonical.vertices);
-        let (field, table) = (self.parameters.get(Part::Field), self.parameters.get(Part::Table));
-        let needs_neighbours = self.needs_neighbours();
+        let (normals, positions) = (body.query.normals(), &body.canonical.vertices);
         let chunks: Vec<Vec<f32>> = (0..positions.len().div_ceil(CHUNK))
             .into_par_iter()
-            .map_init(Group::default, |group, chunk| {
-                group.samples.clear();
+            .map_init(SampleBatch::default, |batch, chunk| {
+                batch.samples.clear();
                 let range = chunk * CHUNK..((chunk + 1) * CHUNK).min(positions.len());
                 for v in range {
                     for layer in 0..layers {
                         let distance = layer as f32 * LAYER;
                         let at = positions[v] + distance * normals[v];
-                        group.samples.push_canonical(scene, at, positions[v], distance, needs_neighbours);
+                        batch.samples.push_canonical(body, at, positions[v], distance, neighbours);
                     }
                 }
-                self.field.forward(field, table, vertex_features, &self.counts, group, None);
+                evaluate(batch);
                 let shows = |sigma: &f32| 1.0 - (-sigma * LENGTH).exp() >= EMPTY;
                 // Of nothing at all the skin is kept.
                 let last = |sigmas: &[f32]| sigmas.iter().rposition(shows).unwrap_or(0);
-                group.sigma.chunks(layers).map(|sigmas| ((last(sigmas) + 1) as f32 * LAYER).min(whole)).collect()
+                batch.sigma.chunks(layers).map(|sigmas| ((last(sigmas) + 1) as f32 * LAYER).min(whole)).collect()
             })
             .collect();
         let own = chunks.concat();
         let mut ends = own.clone();
-        for face in &scene.model.faces {
+        for face in &body.model.faces {
             let highest = highest(face, &own);
             for &v in face {
                 ends[v as usize] = ends[v as usize].max(highest);
             }
         }
-        Shell::new(scene, ends)
+        Self::new(body, ends)
     }
 }
 

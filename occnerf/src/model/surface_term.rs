@@ -1,4 +1,4 @@
-//! The surface term of a block of samples: rows of vertices, mixed by attention, and the way back.
+//! The surface term of a block of samples: rows of vertices, mixed by attention.
 
 use std::ops::Range;
 
@@ -6,11 +6,11 @@ use crate::model::samples::Samples;
 
 /// Which rows each sample mixes, and where the mix stands in its input row: after the point term.
 pub(crate) struct Mix<'a> {
-    width: usize,
-    per_sample: usize,
-    neighbours: &'a [u32],
-    attention: &'a [f32],
-    row: usize,
+    pub width: usize,
+    pub per_sample: usize,
+    pub neighbours: &'a [u32],
+    pub attention: &'a [f32],
+    pub row: usize,
 }
 
 impl<'a> Mix<'a> {
@@ -41,32 +41,6 @@ impl pulp::WithSimd for Gather<'_> {
                 let from = &self.rows[v as usize * width..][..width];
                 for (out, &x) in out.iter_mut().zip(from) {
                     *out = a.mul_add(x, *out);
-                }
-            }
-        }
-    }
-}
-
-/// Transpose of [`Gather`].
-pub(crate) struct Scatter<'a> {
-    pub mix: Mix<'a>,
-    pub d_rows: &'a mut [f32],
-    pub d_input: &'a [f32],
-}
-
-impl pulp::WithSimd for Scatter<'_> {
-    type Output = ();
-
-    #[inline(always)]
-    fn with_simd<S: pulp::Simd>(self, _: S) {
-        let Mix { width, per_sample, neighbours, attention, row } = self.mix;
-        let each = neighbours.chunks_exact(per_sample).zip(attention.chunks_exact(per_sample));
-        for ((neighbours, attention), d_input) in each.zip(self.d_input.chunks_exact(row)) {
-            let from = &d_input[width..2 * width];
-            for (&v, &a) in neighbours.iter().zip(attention) {
-                let d_row = &mut self.d_rows[v as usize * width..][..width];
-                for (d, &x) in d_row.iter_mut().zip(from) {
-                    *d = a.mul_add(x, *d);
                 }
             }
         }

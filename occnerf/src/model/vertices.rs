@@ -3,9 +3,11 @@
 use glam::Vec3;
 use rayon::prelude::*;
 
-use crate::config::{Config, DistanceKind};
+use crate::config::SurfaceConfig;
+use crate::model::body::Body;
+use crate::model::distance::{SurfacePoint, needs_neighbours, surface_point, surface_point_backward};
 use crate::model::encoder::{At, Coordinates, Encoder, Slopes};
-use crate::scene::prepared::Scene;
+
 
 const CHUNK: usize = 512;
 /// Farthest that a vertex's distance to its initial mesh is looked up; the encoding clamps earlier.
@@ -36,20 +38,20 @@ struct Chunk {
 
 impl VertexCode {
     /// Encodes v_i = initial vertex + offset with its signed distance to the initial mesh.
-    pub fn encode(&mut self, scene: &Scene, config: &Config, encoder: &Encoder, table: &[f32], offsets: &[f32]) {
-        let vertices = &scene.canonical.vertices;
+    pub fn encode(&mut self, body: &Body, config: &SurfaceConfig, encoder: &Encoder, table: &[f32], offsets: &[f32]) {
+        let vertices = &body.canonical.vertices;
         (0..vertices.len())
             .into_par_iter()
             .with_min_len(CHUNK)
             .map_init(Vec::new, |neighbours, i| {
                 let position = vertices[i] + Vec3::from_slice(&offsets[3 * i..]);
-                let (distance, gradient) = distance_with_gradient(scene, config, i, position, neighbours);
+                let (distance, gradient) = distance_with_gradient(body, config, i, position, neighbours);
                 (position, distance, gradient)
             })
             .collect_into_vec(&mut self.state);
         self.at.clear();
         for &(v, d, _) in &self.state {
-            encoder.push_vertex(v, d, &scene.canonical_box, &mut self.at);
+            encoder.push_vertex(v, d, &body.canonical_box, &mut self.at);
         }
         let width = encoder.num_features();
         self.rows.resize(vertices.len() * width, 0.0);
@@ -72,7 +74,7 @@ impl VertexCode {
     }
 
     /// Gradient of the offsets (V × 3) from that of the features; overwrites.
-    pub fn backward(&mut self, scene: &Scene, encoder: &Encoder, table: &[f32], d_offsets: &mut [f32]) {
+    pub fn backward(&mut self, body: &Body, encoder: &Encoder, table: &[f32], d_offsets: &mut [f32]) {
         let Self { at, d_rows, state, chunks, .. } = self;
         let width = encoder.num_features();
         let d_rows = d_rows.par_chunks(CHUNK * width);
@@ -83,7 +85,7 @@ impl VertexCode {
             encoder.layout(n).from_rows(d_rows, width, 0..n, features);
             encoder.encode_backward_points(Slopes::Table(table), at.vertices(range.clone()), features, d_at);
             for (v, (state, d_offset)) in state[range].iter().zip(d_offsets.chunks_exact_mut(3)).enumerate() {
-                let (d_v, d_d) = encoder.d_metres(d_at, v, &scene.canonical_box);
+                let (d_v, d_d) = encoder.d_metres(d_at, v, &body.canonical_box);
                 let through_distance = if encoder.distance_is_inside(state.1) { d_d * state.2 } else { Vec3::ZERO };
                 (d_v + through_distance).write_to_slice(d_offset);
             }
@@ -91,31 +93,22 @@ impl VertexCode {
     }
 }
 
-/// Signed distance of a point to the initial mesh and its gradient, by the query that samples use; `neighbours` is scratch.
+/// Signed distance of a point to the initial mesh and its gradient, by the query that samples use;
+/// `neighbours` is scratch.
 fn distance_with_gradient(
-    scene: &Scene,
-    config: &Config,
+    body: &Body,
+    config: &SurfaceConfig,
     vertex: usize,
     position: Vec3,
     neighbours: &mut Vec<u32>,
 ) -> (f32, Vec3) {
-    match config.surface.distance {
-        kind @ (DistanceKind::Blended | DistanceKind::Mean) => {
-            neighbours.resize(scene.query.neighbours_per_query(), 0);
-            scene.query.neighbours(position, neighbours);
-            let finest = &neighbours[..config.surface.k];
-            if kind == DistanceKind::Mean {
-                return scene.query.mean_distance(position, finest);
-            }
-            let blended = scene.query.blend(position, finest);
-            (blended.signed_distance, scene.query.blend_backward(position, finest, Vec3::ZERO, 1.0))
-        }
-        DistanceKind::Exact => match scene.surface.closest(position, FARTHEST) {
-            Some(closest) => {
-                let away = (position - closest.point) * closest.signed_distance.signum();
-                (closest.signed_distance, away.normalize_or(scene.query.normals()[vertex]))
-            }
-            None => (FARTHEST, Vec3::ZERO),
-        },
+    if needs_neighbours(config.distance) {
+        neighbours.resize(body.query.neighbours_per_query(), 0);
+        body.query.neighbours(position, neighbours);
     }
+    let Some(at) = surface_point(body, config, position, neighbours, FARTHEST) else {
+        return (FARTHEST, Vec3::ZERO);
+    };
+    let (d_at, normal) = (SurfacePoint { closest: Vec3::ZERO, distance: 1.0 }, body.query.normals()[vertex]);
+    (at.distance, surface_point_backward(body, config, (position, neighbours), at, d_at, normal))
 }

@@ -4,7 +4,7 @@ use crate::capture::Pixels;
 use crate::config::Config;
 use crate::random::Stream;
 use crate::scene::labels::{Label, Labels};
-use crate::scene::prepared::{PreparedFrame, Scene, bounds};
+use crate::scene::prepared::Scene;
 
 /// Share of patches centred on a pixel of the subject; the rest fall anywhere in the body's box.
 const ON_SUBJECT: f32 = 0.8;
@@ -31,12 +31,12 @@ impl Batch {
         let mut random = Stream::new(&[config.seed, DRAW, step]);
         self.frame = frame_of(scene.train.len(), config.seed, step, &mut self.order);
         let frame = &scene.train[self.frame];
-        let (width, height) = (frame.camera.width, frame.camera.height);
+        let (width, height) = (frame.view.camera.width, frame.view.camera.height);
         let size = config.patch_size.min(width).min(height);
         self.size = size as usize;
         self.pixels.clear();
         self.background = glam::Vec3::new(random.uniform(), random.uniform(), random.uniform());
-        let body = body_box(frame);
+        let body = frame.view.body_box();
         for _ in 0..config.patches {
             let on_subject = random.uniform() < ON_SUBJECT && frame.labels.num_subject() > 0;
             let (x, y) = if on_subject {
@@ -61,28 +61,6 @@ fn frame_of(frames: usize, seed: u64, step: u64, order: &mut Vec<usize>) -> usiz
         order.swap(i, random.below(i + 1));
     }
     order[place]
-}
-
-/// The image-space box [x0, y0, x1, y1) of the body's corners, at least one pixel, inside the image.
-pub(crate) fn body_box(frame: &PreparedFrame) -> [u32; 4] {
-    let (low, high) = bounds(&frame.posed.vertices);
-    let (width, height) = (frame.camera.width as f32, frame.camera.height as f32);
-    let mut found = [width, height, 0.0f32, 0.0f32];
-    for corner in 0..8 {
-        let pick = |axis: usize| if corner >> axis & 1 == 0 { low[axis] } else { high[axis] };
-        match frame.camera.project(glam::Vec3::new(pick(0), pick(1), pick(2))) {
-            Some(p) => {
-                found = [found[0].min(p.x), found[1].min(p.y), found[2].max(p.x), found[3].max(p.y)];
-            }
-            // A corner behind the camera: the box may reach anywhere.
-            None => found = [0.0, 0.0, width, height],
-        }
-    }
-    let x0 = found[0].clamp(0.0, width - 1.0).floor();
-    let y0 = found[1].clamp(0.0, height - 1.0).floor();
-    let x1 = found[2].clamp(x0 + 1.0, width).ceil();
-    let y1 = found[3].clamp(y0 + 1.0, height).ceil();
-    [x0 as u32, y0 as u32, x1 as u32, y1 as u32]
 }
 
 /// What a ray should show: premultiplied colour over `background`; `None` where nothing is known.

@@ -10,7 +10,8 @@ use crate::lpips::Lpips;
 use crate::scene::labels::Labels;
 use crate::train::batch::{Batch, target};
 use crate::train::loss::Dissimilarity;
-use crate::train::trainer::{GroupState, StepReport};
+use crate::train::report::StepReport;
+use crate::train::step::RayGroup;
 
 /// What the losses of a step read and write, kept from step to step; of each ray of the batch.
 #[derive(Default)]
@@ -34,15 +35,15 @@ impl Photometric {
         &mut self,
         loss: &LossConfig,
         lpips: Option<&Lpips>,
-        groups: &[GroupState],
+        groups: &[RayGroup],
         batch: &Batch,
         (labels, pixels): (&Labels, &Pixels),
         report: &mut StepReport,
     ) -> Result<(), Error> {
         let Self { targets, d_colors, prediction, .. } = self;
         prediction.resize(3 * batch.pixels.len(), 0.0);
-        for state in groups {
-            for (&ray, composite) in state.rays.iter().zip(&state.composites) {
+        for group in groups {
+            for (&ray, composite) in group.rays.iter().zip(&group.composites) {
                 composite.color.write_to_slice(&mut prediction[3 * ray..]);
             }
         }

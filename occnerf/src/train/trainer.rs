@@ -1,391 +1,307 @@
-//! Training: the step from rays to gradients, deterministic whatever the number of threads.
+//! Training: a model, an optimiser and the buffers of a step, deterministic whatever the number of
+//! threads.
 
-use std::borrow::Cow;
-
-use glam::{Vec3, Vec4};
 use rayon::prelude::*;
-use smpl::{Posed, WeightVolume};
+use smpl::{MotionFrame, Posed};
 use visibility::VisibilityCounts;
-use volrender::{Composite, Occupancy};
 
 use crate::Error;
-use crate::config::{Config, DistanceKind, MotionKind, VisibilityKind};
+use crate::config::{Config, VisibilityKind};
 use crate::lpips::Lpips;
-use crate::model::arena::Arena;
-use crate::model::correction::{Corrections, Wrench, correct, corrected};
-use crate::model::extent::Shell;
-use crate::model::field::Field;
-use crate::model::march::{Along, Runs, run_length};
-use crate::model::parameters::{PARTS, Parameters, Part};
-use crate::model::samples::{CELL, Stage, Tracer, near_canonical};
+use crate::model::colors::VertexColors;
+use crate::model::correction::correct;
+use crate::model::march::MarchOptions;
+use crate::model::parameters::Part;
 use crate::model::times::{StepTimes, Stopwatch};
+use crate::model::trace::{CELL, PosedSurface};
+use crate::model::trained::Model;
 use crate::model::vertices::VertexCode;
-use crate::scene::colors::VertexColors;
 use crate::scene::labels::Label;
 use crate::scene::prepared::{PreparedFrame, Scene};
+use crate::train::backward::correction::{Wrench, correct_backward};
 use crate::train::batch::Batch;
+use crate::train::optimiser::Optimiser;
 use crate::train::photometric::Photometric;
+use crate::train::report::StepReport;
 use crate::train::restarts::Restarts;
+use crate::train::step::{RayGroup, Step, StepOptions, zero};
 
-/// Rays are dealt row by row to this many groups, each with its own gradient buffers, summed in order: the result
-/// does not depend on who computes a group. Eight keep two to eight threads busy.
+/// Rays are dealt row by row to this many groups, each with its own gradient buffers, summed in
+/// order: the result does not depend on who computes a group. Eight keep two to eight threads busy.
 const GROUPS: usize = 8;
-/// Part of a run after which poses are corrected.
+/// Share of the steps after which poses are corrected.
 const SETTLED: f32 = 0.1;
 
-/// What a step did.
-#[derive(Clone, Copy, Debug, Default, serde::Serialize)]
-pub struct StepReport {
-    /// Number of the step, from 1.
-    pub step: u64,
-    /// Weighted sum of the losses.
-    pub loss: f64,
-    /// Mean squared error over known pixels.
-    pub mse: f64,
-    /// Perceptual term.
-    pub perceptual: f64,
-    /// Completeness term.
-    pub completeness: f64,
-    /// Of the known pixels of the step, decibels.
-    pub psnr: f64,
-    /// Live samples that were evaluated.
-    pub live_samples: usize,
-    /// Rays traced.
-    pub rays: usize,
-    /// Gradients that were not finite and were left out.
-    pub bad_gradients: usize,
-    /// How often training has begun anew so far, each time at a tenth of the rates, because the field had become empty.
-    pub restarts: u32,
-    /// Where the time went.
-    pub times: StepTimes,
-}
-
-/// A model in training, or trained.
+/// A model in training.
 pub struct Trainer<'a> {
-    pub(crate) config: Config,
     pub(crate) scene: &'a Scene,
-    pub(crate) field: Field,
-    pub(crate) parameters: Parameters,
-    pub(crate) counts: VisibilityCounts,
-    pub(crate) volume: Option<WeightVolume>,
-    /// [`near_canonical`] where there is a volume, else empty.
-    near_canonical: Occupancy,
-    pub(crate) corrections: Corrections,
-    /// The perceptual term, where it is not the embedded one.
-    pub(crate) lpips: Option<Lpips>,
-    pub(crate) steps_done: u64,
+    pub(crate) model: Model,
+    pub(crate) optimiser: Optimiser,
     pub(crate) restarts: Restarts,
-    /// [`run_length`], but in tests.
-    pub(crate) run: usize,
-    /// Whether rays at unknown pixels have all their samples evaluated; for tests.
-    pub(crate) evaluates_all: bool,
-    pub(crate) stage: Stage,
-    /// Where the field ended when it was last looked at.
-    pub(crate) shell: Shell,
-    /// What colours start from, V; empty where they start from nothing.
-    pub(crate) base: Vec<Vec4>,
-    pub(crate) batch: Batch,
-    pub(crate) groups: Vec<GroupState>,
-    pub(crate) vertex_code: VertexCode,
-    pub(crate) transposed: Vec<f32>,
-    pub(crate) d_volume: Vec<f32>,
-    photometric: Photometric,
-    /// The corrected prior of a step.
-    posed: Posed,
+    /// The perceptual term, where it is not the embedded one.
+    lpips: Option<Lpips>,
+    pub(crate) buffers: Buffers,
 }
 
-#[derive(Default)]
-pub(crate) struct GroupState {
-    /// Indices into the batch of this group's rays.
-    pub rays: Vec<usize>,
-    /// Samples evaluated together, front to back.
-    pub runs: Runs,
-    /// The same ray by ray.
-    pub along: Along,
-    pub composites: Vec<Composite>,
-    /// Derivatives of the encoding of all runs.
-    pub jacobians: Arena,
-    pub times: StepTimes,
-    pub d_mlp: Vec<f32>,
-    pub d_vertices: Vec<f32>,
-    pub d_volume: Vec<f32>,
-    /// What the samples ask of each bone.
-    pub wrenches: Vec<Wrench>,
-    /// Sum of the completeness terms.
-    pub completeness: f64,
-    /// Finest neighbours of the termination points.
-    pub terminations: Vec<u32>,
+/// What a step fills, kept for the next one.
+pub(crate) struct Buffers {
+    pub batch: Batch,
+    pub groups: Vec<RayGroup>,
+    pub vertex_code: VertexCode,
+    pub surface: PosedSurface,
+    /// The corrected prior.
+    posed: Posed,
+    photometric: Photometric,
+    /// Weights of the perceptron, transposed.
+    transposed: Vec<f32>,
+    d_volume: Vec<f32>,
 }
 
 impl<'a> Trainer<'a> {
     /// A model at step 0.
+    ///
+    /// # Errors
+    /// A configuration that is not valid or not the one that `scene` was prepared for.
     pub fn new(scene: &'a Scene, config: Config) -> Result<Self, Error> {
-        config.validate()?;
-        let (levels, lists) = (scene.query.pyramid().levels.len(), scene.query.neighbours_per_query());
-        let (wanted, k) = (config.surface.coarse_levels + 1, config.surface.k);
-        if levels != wanted || lists != levels * k {
-            let k_of_scene = lists / levels.max(1);
-            let found = format!("was prepared for {k_of_scene} neighbours in each of {levels} levels");
-            return Err(Error::Scene(format!("{found}, the configuration asks for {k} in each of {wanted}")));
+        let colors = config.field.prior_colors.then(|| VertexColors::measure(scene)).transpose()?;
+        let base = colors.map_or_else(Vec::new, |colors| colors.before_sigmoid());
+        let frames = scene.train.iter().map(|frame| frame.view.clone()).collect();
+        let mut model = Model::new(config, scene.body.clone(), frames, base)?;
+        let surface = &model.config.surface;
+        if surface.attention && surface.visibility == VisibilityKind::Exact {
+            model.counts = VisibilityCounts::from_counts(scene.vertex_frequencies()?);
         }
-        let field = Field::new(&config, scene.canonical_box)?;
-        let volume = match config.motion.kind {
-            MotionKind::Surface => None,
-            MotionKind::Volume => Some(WeightVolume::diffused(&scene.model, &scene.canonical, &Default::default())),
-            MotionKind::Gaussian => Some(WeightVolume::gaussian(&scene.model, &scene.canonical, &Default::default())),
-        };
-        let vertices = scene.canonical.vertices.len();
-        let exact = config.surface.attention && config.surface.visibility == VisibilityKind::Exact;
-        let counts = if exact { scene.vertex_frequencies()? } else { vec![0; vertices] };
-        let motion = volume.as_ref().map_or(0, |v| v.delta.len());
-        let spacing = config.motion.correction_spacing;
-        let corrections = Corrections::new(scene.train.len(), spacing, scene.model.num_joints());
-        Ok(Self {
-            parameters: Parameters::new(&config, &field, vertices, motion, corrections.len()),
-            counts: VisibilityCounts::from_counts(counts),
-            stage: Stage::new(scene, CELL)?,
-            shell: Shell::whole(scene, &config),
-            base: if config.field.prior_colors { VertexColors::measure(scene)?.before_sigmoid() } else { Vec::new() },
+        let buffers = Buffers {
             batch: Batch::default(),
-            groups: (0..GROUPS).map(|_| GroupState::default()).collect(),
+            groups: (0..GROUPS).map(|_| RayGroup::default()).collect(),
             vertex_code: VertexCode::default(),
+            surface: PosedSurface::new(&scene.body, CELL)?,
+            posed: Posed::default(),
+            photometric: Photometric::default(),
             transposed: Vec::new(),
             d_volume: Vec::new(),
-            photometric: Photometric::default(),
-            posed: Posed::default(),
-            steps_done: 0,
-            restarts: Restarts::default(),
-            run: run_length(config.min_transmittance),
-            evaluates_all: false,
-            near_canonical: if volume.is_some() { near_canonical(scene, &config) } else { Occupancy::default() },
-            config,
-            scene,
-            field,
-            volume,
-            corrections,
-            lpips: None,
-        })
+        };
+        let optimiser = Optimiser::new(&model.parameters);
+        Ok(Self { scene, model, optimiser, restarts: Restarts::default(), lpips: None, buffers })
     }
 
-    /// Loads the weights that `loss.perceptual_weights` names, if it names any: before the first [`Trainer::step`], also of a
-    /// resumed run. Drawing and scoring do not need them.
+    /// The model as it is now.
+    pub fn model(&self) -> &Model {
+        &self.model
+    }
+
+    /// The model without what training it further takes.
+    pub fn into_model(self) -> Model {
+        self.model
+    }
+
+    /// Loads the weights that `loss.perceptual_weights` names, if it names any: before the first
+    /// [`Trainer::step`], also of a resumed run.
     ///
     /// # Errors
     /// Those of [`Lpips::load`]; [`Error::Lpips`] for patches too small for the network.
     pub fn load_perceptual(&mut self) -> Result<(), Error> {
-        if self.config.loss.perceptual > 0.0 && !self.config.loss.perceptual_weights.is_empty() {
-            let lpips = Lpips::load(self.config.loss.perceptual_weights.as_ref())?;
-            let sides = self.scene.train.iter().map(|f| f.camera.width.min(f.camera.height));
-            let side = sides.min().unwrap_or(0).min(self.config.patch_size) as usize;
+        let config = &self.model.config;
+        if config.loss.perceptual > 0.0 && !config.loss.perceptual_weights.is_empty() {
+            let lpips = Lpips::load(config.loss.perceptual_weights.as_ref())?;
+            let sides = self.scene.train.iter().map(|f| f.view.camera.width.min(f.view.camera.height));
+            let side = sides.min().unwrap_or(0).min(config.patch_size) as usize;
             lpips.check_size(side, side)?;
             self.lpips = Some(lpips);
         }
         Ok(())
     }
 
-    /// Which perceptual term the run is trained with: `ms-ssim`, `lpips` with the network's name, or `none`.
+    /// Which perceptual term the run is trained with: `ms-ssim`, `lpips` with the network's name, or
+    /// `none`.
     pub fn perceptual(&self) -> String {
         match &self.lpips {
             Some(lpips) => format!("lpips {}", lpips.trunk().name()),
-            None if self.config.loss.perceptual == 0.0 => "none".to_owned(),
+            None if self.model.config.loss.perceptual == 0.0 => "none".to_owned(),
             None => "ms-ssim".to_owned(),
         }
     }
 
-    /// The run's configuration.
-    pub fn config(&self) -> &Config {
-        &self.config
-    }
-
     /// Steps taken so far.
     pub fn steps_done(&self) -> u64 {
-        self.steps_done
+        self.model.steps_done
     }
 
-    /// Changes the length of the run, and with it the fall of the learning rates.
+    /// Changes how many steps there are to be, and with it the fall of the learning rates.
     pub fn set_steps(&mut self, steps: u64) {
-        self.config.steps = steps;
+        self.model.config.steps = steps;
     }
 
-    /// Learnable numbers, padding not counted.
-    pub fn num_parameters(&self) -> usize {
-        PARTS[1..].iter().map(|&(part, _)| self.parameters.count(part)).sum::<usize>()
-            + self.field.mlp.num_true_parameters()
-    }
-
-    /// How often each vertex was near a termination point, or in how many frames it is seen: see [`VisibilityKind`].
-    pub fn visibility_counts(&self) -> &[u64] {
-        self.counts.counts()
-    }
-
-    /// Encodes the vertices with the current parameters, as rendering needs them.
-    pub(crate) fn encode_vertices(&self, code: &mut VertexCode) {
-        if self.field.surface_term {
-            let (table, offsets) = (self.parameters.get(Part::Table), self.parameters.get(Part::Vertices));
-            code.encode(self.scene, &self.config, &self.field.encoder, table, offsets);
-        }
-    }
-
-    /// Takes the volume's log-weights from the parameters.
-    pub(crate) fn refresh_volume(&mut self) {
-        if let Some(volume) = &mut self.volume {
-            volume.delta.copy_from_slice(self.parameters.get(Part::Motion));
-            volume.update();
-        }
-    }
-
-    /// Shift and turns that training has found for the moment of a frame.
-    pub(crate) fn correction(&self, frame: &PreparedFrame) -> Option<Vec<Vec3>> {
-        let pose = self.parameters.get(Part::Pose);
-        frame.instant.filter(|_| !pose.is_empty()).map(|instant| self.corrections.at(pose, instant))
-    }
-
-    /// The posed prior of a frame as training has corrected it; as handed in where nothing is corrected.
-    pub fn corrected<'b>(&self, frame: &'b PreparedFrame) -> Cow<'b, Posed> {
-        match self.correction(frame) {
-            Some(correction) => Cow::Owned(corrected(&self.scene.model, &frame.shape, &frame.posed, &correction)),
-            None => Cow::Borrowed(&frame.posed),
-        }
-    }
-
-    /// Whether samples are to have their neighbours.
-    pub(crate) fn needs_neighbours(&self) -> bool {
-        self.field.surface_term || self.config.surface.distance != DistanceKind::Exact
-    }
-
-    pub(crate) fn tracer<'b>(
-        &'b self,
-        stage: &'b Stage,
-        shell: &'b Shell,
-        frame: &'b PreparedFrame,
-        posed: &'b Posed,
-    ) -> Tracer<'b> {
-        Tracer {
-            scene: self.scene,
-            config: &self.config,
-            stage,
-            posed,
-            to_canonical: &frame.to_canonical,
-            volume: self.volume.as_ref(),
-            near_canonical: &self.near_canonical,
-            shell,
-            base: &self.base,
-            faces: !self.parameters.get(Part::Pose).is_empty(),
-            neighbours: self.needs_neighbours(),
-        }
-    }
-
-    /// Whether this step teaches the poses: what a field says of them before it has taken shape would lead them astray.
-    pub(crate) fn teaches_poses(&self) -> bool {
-        let settled = (self.steps_done - self.restarts.begun) as f32 >= SETTLED * self.config.steps as f32;
-        settled && !self.parameters.get(Part::Pose).is_empty()
+    /// Whether the next step teaches the poses: what a field says of them before it has taken shape
+    /// would lead them astray.
+    fn teaches_poses(&self) -> bool {
+        let since = self.model.steps_done - self.restarts.begun;
+        let settled = since as f32 >= SETTLED * self.model.config.steps as f32;
+        settled && !self.model.parameters.get(Part::Pose).is_empty()
     }
 
     /// Forgets what was learnt.
     fn begin_anew(&mut self) {
-        let (motion, pose) = (self.parameters.get(Part::Motion).len(), self.parameters.get(Part::Pose).len());
-        let vertices = self.scene.canonical.vertices.len();
-        self.parameters = Parameters::new(&self.config, &self.field, vertices, motion, pose);
-        self.shell = Shell::whole(self.scene, &self.config);
-        if self.config.surface.visibility == VisibilityKind::Counted {
-            self.counts = VisibilityCounts::from_counts(vec![0; vertices]);
+        self.model.forget();
+        self.optimiser = Optimiser::new(&self.model.parameters);
+        if self.model.config.surface.visibility == VisibilityKind::Counted {
+            self.model.counts = VisibilityCounts::new(self.model.body.canonical.vertices.len());
         }
     }
 
     /// One optimisation step.
     ///
     /// # Errors
-    /// [`Error::Data`] where the step's picture cannot be decoded (any more); [`Error::Lpips`] where the configuration names
-    /// weights of the perceptual term and [`Trainer::load_perceptual`] was not called. The trainer is then as it was before.
+    /// [`Error::Data`] where the step's picture cannot be decoded (any more); [`Error::Lpips`] where
+    /// the configuration names weights of the perceptual term and [`Trainer::load_perceptual`] was
+    /// not called. The model is then as it was before.
     pub fn step(&mut self) -> Result<StepReport, Error> {
-        let loss = &self.config.loss;
-        let loaded = self.lpips.is_some() || loss.perceptual_weights.is_empty() || loss.perceptual == 0.0;
-        if !loaded {
+        let march = MarchOptions::training(self.model.config.min_transmittance);
+        self.step_with(StepOptions { march, skips_unknown: true })
+    }
+
+    pub(crate) fn step_with(&mut self, options: StepOptions) -> Result<StepReport, Error> {
+        let teaches_poses = self.teaches_poses();
+        let Self { scene, model, optimiser, restarts, lpips, buffers } = self;
+        let Buffers { batch, groups, vertex_code, surface, posed, photometric, transposed, d_volume } = buffers;
+        let loss = &model.config.loss;
+        if lpips.is_none() && !loss.perceptual_weights.is_empty() && loss.perceptual > 0.0 {
             return Err(Error::Lpips("the weights of the perceptual term were not loaded".to_owned()));
         }
-        let step = self.steps_done;
+        let step = model.steps_done;
         let (mut times, mut watch) = (StepTimes::default(), Stopwatch::start());
-        self.batch.draw(self.scene, &self.config, step);
-        let frame = &self.scene.train[self.batch.frame];
+        batch.draw(scene, &model.config, step);
+        let frame = &scene.train[batch.frame];
         let shown = frame.pixels()?;
-        let batch = std::mem::take(&mut self.batch);
-        let mut stage_code = std::mem::take(&mut self.vertex_code);
-        let mut own_posed = std::mem::take(&mut self.posed);
-        let posed = match self.correction(frame) {
+        let view = &*frame.view;
+        let correction = model.correction(view);
+        let posed = match &correction {
             Some(correction) => {
-                correct(&self.scene.model, &frame.shape, &frame.posed, &correction, &mut own_posed);
-                &own_posed
+                correct(&model.body.model, &view.shape, &view.posed, correction, posed);
+                &*posed
             }
-            None => &frame.posed,
+            None => &view.posed,
         };
-        self.encode_vertices(&mut stage_code);
-        self.vertex_code = stage_code;
-        let interval = self.config.motion.shell_interval as u64;
+        model.encode_vertices(vertex_code);
+        let interval = model.config.motion.shell_interval as u64;
         if interval > 0 && step > 0 && step.is_multiple_of(interval) {
-            self.shell = self.measure_shell(&self.vertex_code.rows);
+            model.extent = model.measure_extent(vertex_code);
         }
-        self.stage.set(self.scene, posed, &self.shell, &self.config);
-        let mut groups = std::mem::take(&mut self.groups);
-        for (index, state) in groups.iter_mut().enumerate() {
-            state.rays.clear();
-            // Those at unknown pixels come last, so that samples without a gradient are next to each other.
-            for unknown in [false, true] {
-                let is_due = |&ray: &usize| (frame.labels.at(batch.pixels[ray]) == Label::Unknown) == unknown;
-                let rays = (0..batch.pixels.len()).filter(|ray| ray / batch.size % GROUPS == index);
-                state.rays.extend(rays.filter(is_due));
-            }
-        }
+        surface.refit(&model.body, posed, &model.extent, &model.config);
+        deal(batch, frame, groups);
+        let motion = MotionFrame::new(&scene.body.model, posed);
+        let pass = Step {
+            model: &*model,
+            surface,
+            motion: &motion,
+            posed,
+            frame,
+            batch,
+            vertex_code,
+            teaches_poses,
+            options,
+        };
         watch.lap(&mut times.prepare);
-        groups.par_iter_mut().with_max_len(1).for_each(|state| self.forward(state, &batch, frame, posed));
+        groups.par_iter_mut().with_max_len(1).for_each(|group| pass.forward(group));
         let mut watch = Stopwatch::start();
         let mut report = StepReport { step: step + 1, rays: batch.pixels.len(), ..StepReport::default() };
-        let mut photometric = std::mem::take(&mut self.photometric);
-        let measured =
-            photometric.measure(loss, self.lpips.as_ref(), &groups, &batch, (&frame.labels, &shown), &mut report);
-        if let Err(error) = measured {
-            (self.groups, self.batch, self.photometric, self.posed) = (groups, batch, photometric, own_posed);
-            return Err(error);
-        }
-        let d_colors = &photometric.d_colors;
-        self.field.mlp.transposed_weights(self.parameters.get(Part::Field), &mut self.transposed);
+        photometric.measure(loss, lpips.as_ref(), groups, batch, (&frame.labels, &shown), &mut report)?;
+        model.field.mlp.transposed_weights(model.parameters.get(Part::Field), transposed);
         watch.lap(&mut times.losses);
-        let each = groups.par_iter_mut().with_max_len(1);
-        each.for_each(|state| self.backward(state, &batch, frame, posed, d_colors));
-        groups.iter().for_each(|state| times += state.times);
-        let nominal = (batch.pixels.len() * self.config.samples) as f64;
+        let d_colors = &photometric.d_colors;
+        groups.par_iter_mut().with_max_len(1).for_each(|group| pass.backward(group, transposed, d_colors));
+        groups.iter().for_each(|group| times += group.times);
+        let nominal = (batch.pixels.len() * model.config.samples) as f64;
         report.completeness = groups.iter().map(|g| g.completeness).sum::<f64>() / nominal;
-        report.live_samples = groups.iter().map(|g| g.along.len()).sum();
-        let loss = &self.config.loss;
+        report.live_samples = groups.iter().map(|g| g.ordered.len()).sum();
         report.loss = f64::from(loss.mse) * report.mse
             + f64::from(loss.perceptual) * report.perceptual
             + f64::from(loss.completeness) * report.completeness;
-        self.reduce(&groups, frame, posed, &mut times);
+        reduce(model, optimiser, groups, vertex_code, d_volume, &mut times);
         let mut watch = Stopwatch::start();
-        if self.config.surface.visibility == VisibilityKind::Counted {
-            groups.iter().for_each(|state| self.counts.add(&state.terminations));
+        if let (true, Some(correction), Some(instant)) = (teaches_poses, &correction, view.instant) {
+            let mut wrenches = vec![Wrench::default(); posed.bones.len()];
+            for group in &*groups {
+                wrenches.iter_mut().zip(&group.wrenches).for_each(|(to, from)| to.add(from));
+            }
+            let d_correction = correct_backward(&model.body.model, &view.posed, correction, posed, &wrenches);
+            model.corrections.at_backward(instant, &d_correction, optimiser.gradients.get_mut(Part::Pose));
         }
-        let decay = self.config.rates.final_fraction.powf(step as f32 / self.config.steps.max(1) as f32);
-        report.bad_gradients = self.parameters.step(&self.config.rates, decay * self.restarts.rates());
-        for state in &groups {
+        if model.config.surface.visibility == VisibilityKind::Counted {
+            groups.iter().for_each(|group| model.counts.add(&group.terminations));
+        }
+        let decay = model.config.rates.final_fraction.powf(step as f32 / model.config.steps.max(1) as f32);
+        let rates = &model.config.rates;
+        report.bad_gradients = optimiser.step(&mut model.parameters, rates, decay * restarts.rates());
+        for group in &*groups {
             let subject = |ray: &&usize| frame.labels.at(batch.pixels[**ray]) == Label::Subject;
-            let composites = state.rays.iter().zip(&state.composites).filter(|(ray, _)| subject(ray));
-            composites.for_each(|(_, composite)| self.restarts.note(composite.opacity));
+            let composites = group.rays.iter().zip(&group.composites).filter(|(ray, _)| subject(ray));
+            composites.for_each(|(_, composite)| restarts.note(composite.opacity));
         }
         if self.restarts.due(step + 1) {
             self.begin_anew();
         }
         report.restarts = self.restarts.count;
-        self.refresh_volume();
+        self.model.refresh_volume();
         watch.lap(&mut times.update);
         report.times = times;
-        (self.groups, self.batch, self.photometric, self.posed) = (groups, batch, photometric, own_posed);
-        self.steps_done += 1;
+        self.model.steps_done += 1;
         Ok(report)
     }
 }
 
-/// The ray through a pixel's centre.
-pub(crate) fn pixel_ray(frame: &PreparedFrame, pixel: u32) -> volrender::Ray {
-    let width = frame.camera.width;
-    frame.camera.ray((pixel % width) as f32 + 0.5, (pixel / width) as f32 + 0.5)
+/// Deals the rays of a batch to the groups, row by row. Those at unknown pixels come last in each,
+/// so that samples without a gradient are next to each other.
+fn deal(batch: &Batch, frame: &PreparedFrame, groups: &mut [RayGroup]) {
+    for (index, group) in groups.iter_mut().enumerate() {
+        group.rays.clear();
+        for unknown in [false, true] {
+            let is_due = |&ray: &usize| (frame.labels.at(batch.pixels[ray]) == Label::Unknown) == unknown;
+            let rays = (0..batch.pixels.len()).filter(|ray| ray / batch.size % GROUPS == index);
+            group.rays.extend(rays.filter(is_due));
+        }
+    }
+}
+
+/// Sums the groups' gradients in order and runs the parts of the backward pass that all samples
+/// share.
+fn reduce(
+    model: &Model,
+    optimiser: &mut Optimiser,
+    groups: &[RayGroup],
+    vertex_code: &mut VertexCode,
+    d_volume: &mut Vec<f32>,
+    times: &mut StepTimes,
+) {
+    let mut watch = Stopwatch::start();
+    optimiser.clear_gradients();
+    let gradients = &mut optimiser.gradients;
+    let sum = |to: &mut [f32], from: &(dyn Fn(&RayGroup) -> &[f32] + Sync)| {
+        to.par_chunks_mut(1 << 12).enumerate().for_each(|(chunk, to)| {
+            for group in groups {
+                let from = &from(group)[chunk << 12..][..to.len()];
+                to.iter_mut().zip(from).for_each(|(to, from)| *to += from);
+            }
+        });
+    };
+    let d_mlp = gradients.get_mut(Part::Field);
+    sum(d_mlp, &|g| &g.d_mlp);
+    model.field.mlp.clear_padding(d_mlp);
+    watch.lap(&mut times.update);
+    if model.field.surface_term {
+        zero(&mut vertex_code.d_rows, vertex_code.rows.len());
+        sum(&mut vertex_code.d_rows, &|g| &g.d_vertices);
+        let (table, d_offsets) = (model.parameters.get(Part::Table), gradients.get_mut(Part::Vertices));
+        vertex_code.backward(&model.body, &model.field.encoder, table, d_offsets);
+    }
+    let samples = groups.iter().flat_map(|group| group.segments.all()).map(|segment| &segment.batch);
+    let parts = samples.map(|batch| (batch.at.all(), &batch.features[..])).chain(vertex_code.parts());
+    model.field.encoder.encode_backward(parts, gradients.get_mut(Part::Table));
+    watch.lap(&mut times.encode_backward);
+    if let Some(volume) = model.volume() {
+        zero(d_volume, volume.weights.len());
+        sum(d_volume, &|g| &g.d_volume);
+        volume.softmax_backward(d_volume, gradients.get_mut(Part::Motion));
+    }
+    watch.lap(&mut times.update);
 }
