@@ -2,13 +2,13 @@
 
 use std::borrow::Cow;
 use std::collections::{BTreeMap, HashMap};
-use std::fs::File;
-use std::io::{BufWriter, Write};
+use std::io::Write;
 use std::path::Path;
 
 use safetensors::tensor::{Dtype, SafeTensors};
 
 use crate::Error;
+use crate::atomic::replace_file;
 use crate::config::Config;
 use crate::parameters::{PARTS, Part};
 use crate::scene::Scene;
@@ -30,8 +30,13 @@ const MAX_BYTES: u64 = 4 << 30;
 const MAX_STEPS: u64 = 1 << 40;
 
 impl Trainer<'_> {
-    /// Writes everything that training goes on from. An old file survives until the new one is complete.
+    /// Writes everything that training goes on from. An old file survives until the new one is complete and on the disk.
+    ///
+    /// # Errors
+    /// [`Error::Diverged`] where a number is not finite, so that what could be gone on from is not replaced by what cannot;
+    /// [`Error::Io`].
     pub fn save(&self, path: &Path) -> Result<(), Error> {
+        self.check_finite()?;
         let config = toml::to_string(&self.config).map_err(|e| file(path, format!("configuration: {e}")))?;
         let kept = self.parameters.kept_rows.as_deref();
         let restarts = serde_json::to_string(&self.restarts).map_err(|e| file(path, format!("{RESTARTS}: {e}")))?;
@@ -63,9 +68,23 @@ impl Trainer<'_> {
             tensors.push((SHELL.to_owned(), Array::Floats(Cow::Borrowed(&self.shell.vertices))));
         }
         tensors.push(("visibility_counts".to_owned(), Array::Counts(self.counts.counts())));
-        let partial = path.with_extension("safetensors.partial");
-        write(&partial, &header, tensors).map_err(|source| Error::Io { path: partial.clone(), source })?;
-        std::fs::rename(&partial, path).map_err(|source| Error::Io { path: path.to_owned(), source })
+        replace_file(path, |to| write(to, &header, tensors))
+            .map_err(|source| Error::Io { path: path.to_owned(), source })
+    }
+
+    fn check_finite(&self) -> Result<(), Error> {
+        for (part, name) in PARTS {
+            let adam = &self.parameters.optimisers[part as usize];
+            for (suffix, array) in
+                [("", self.parameters.get(part)), (".first_moment", &adam.first), (".second_moment", &adam.second)]
+            {
+                if let Some(at) = array.iter().position(|v| !v.is_finite()) {
+                    let key = format!("{name}{suffix}");
+                    return Err(Error::Diverged { step: self.steps_done, key, value: array[at] });
+                }
+            }
+        }
+        Ok(())
     }
 }
 
@@ -112,7 +131,11 @@ struct Entry {
 
 /// Writes a safetensors file array by array (the crate's own writers want all of them as bytes, or make a file that nobody else may
 /// read). Equal models are equal files: keys are in order.
-fn write(path: &Path, header: &BTreeMap<&str, String>, mut tensors: Vec<(String, Array<'_>)>) -> std::io::Result<()> {
+fn write(
+    to: &mut impl Write,
+    header: &BTreeMap<&str, String>,
+    mut tensors: Vec<(String, Array<'_>)>,
+) -> std::io::Result<()> {
     // The widest first: all are aligned.
     tensors.sort_by(|(a_name, a), (b_name, b)| b.dtype().cmp(&a.dtype()).then(a_name.cmp(b_name)));
     let mut keys = BTreeMap::from([("__metadata__", serde_json::to_value(header)?)]);
@@ -125,11 +148,9 @@ fn write(path: &Path, header: &BTreeMap<&str, String>, mut tensors: Vec<(String,
     }
     let mut text = serde_json::to_vec(&keys)?;
     text.resize(text.len().next_multiple_of(8), b' ');
-    let mut to = BufWriter::with_capacity(1 << 20, File::create(path)?);
     to.write_all(&(text.len() as u64).to_le_bytes())?;
     to.write_all(&text)?;
-    tensors.iter().try_for_each(|(_, array)| array.write(&mut to))?;
-    to.flush()
+    tensors.iter().try_for_each(|(_, array)| array.write(to))
 }
 
 impl<'a> Trainer<'a> {

@@ -27,6 +27,7 @@
 
 mod adam;
 mod arena;
+mod atomic;
 mod batch;
 mod capacity;
 pub mod capture;
@@ -64,6 +65,7 @@ mod trainer;
 mod validate;
 mod vertices;
 
+pub use atomic::replace_file;
 pub use capacity::{Capacity, Choice, Measured, Pruned};
 pub use checkpoint::checkpoint_config;
 pub use config::{
