@@ -25,6 +25,7 @@
 //! canonical body's height / 1.7 m, so that a capture in centimetres trains the same. The same seed and inputs give
 //! the same bits on one instruction set, whatever the number of threads, and so does resuming from a checkpoint.
 
+mod atomic;
 mod capacity;
 pub mod capture;
 mod config;
@@ -38,6 +39,7 @@ mod render;
 mod scene;
 mod train;
 
+pub use atomic::replace_file;
 pub use capacity::{Capacity, Choice, Measured, Pruned};
 pub use config::{
     AttentionKind, Component, Config, ConfigError, DistanceKind, EncodingConfig, FieldConfig, LossConfig, Method,
