@@ -2,8 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::parameters::Part;
-use crate::trainer::Trainer;
+use crate::model::parameters::Part;
+use crate::model::trained::Model;
 
 /// What pruning took away.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -16,7 +16,7 @@ pub struct Pruned {
     pub parameters: u64,
 }
 
-impl Trainer<'_> {
+impl Model {
     /// Empties the rows of the hash table that training never moved: they are no longer counted and no longer stored in a
     /// checkpoint. What a training ray can meet stays the same to the bit; elsewhere a feature changes by the 1e-4 that such a
     /// row was filled with at the start.
