@@ -46,12 +46,7 @@ impl Extent {
     /// Looks at the field over every vertex; `evaluate` gives samples their density. One layer
     /// beyond the last one that shows something is kept, and as much as over any vertex that shares
     /// a face: the field can grow back there.
-    pub fn measure(
-        body: &Body,
-        config: &Config,
-        neighbours: bool,
-        evaluate: impl Fn(&mut SampleBatch) + Sync,
-    ) -> Self {
+    pub fn measure(body: &Body, config: &Config, neighbours: bool, evaluate: impl Fn(&mut SampleBatch) + Sync) -> Self {
         let whole = config.motion.reach();
         let layers = (whole / LAYER).ceil() as usize;
         let (normals, positions) = (body.query.normals(), &body.canonical.vertices);

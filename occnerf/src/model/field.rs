@@ -141,7 +141,14 @@ impl Field {
     }
 
     /// Fills the activations `block` with those of the samples in `range`.
-    pub fn activate(&self, mlp: &[f32], vertex_features: &[f32], range: Range<usize>, batch: &mut SampleBatch, block: usize) {
+    pub fn activate(
+        &self,
+        mlp: &[f32],
+        vertex_features: &[f32],
+        range: Range<usize>,
+        batch: &mut SampleBatch,
+        block: usize,
+    ) {
         let (n, width) = (batch.samples.len(), self.encoder.num_features());
         let (row, activations) = (self.mlp.input_width(), &mut batch.blocks[block]);
         self.mlp.resize(activations, range.len());

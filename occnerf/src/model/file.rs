@@ -103,9 +103,7 @@ pub(crate) struct Contents<'a> {
 impl<'a> Contents<'a> {
     /// Takes `bytes` of `path` apart, whose header is to name `format` in one of `versions`.
     pub fn parse(path: &Path, bytes: &'a [u8], format: &str, versions: &[&str]) -> Result<Self, Error> {
-        let not_ours = |e: safetensors::SafeTensorError| {
-            wrong(path, format!("is not a whole safetensors file: {e}"))
-        };
+        let not_ours = |e: safetensors::SafeTensorError| wrong(path, format!("is not a whole safetensors file: {e}"));
         let (_, metadata) = SafeTensors::read_metadata(bytes).map_err(not_ours)?;
         let tensors = SafeTensors::deserialize(bytes).map_err(not_ours)?;
         let header = metadata.metadata().clone().unwrap_or_default();

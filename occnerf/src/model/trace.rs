@@ -205,9 +205,8 @@ impl Tracer<'_> {
             samples.neighbours.resize(first + self.body.query.neighbours_per_query(), 0);
             self.body.query.neighbours(mapped.canonical, &mut samples.neighbours[first..]);
         }
-        let within = |at: &SurfacePoint| {
-            at.distance <= reach && at.distance >= -depth && !(inside && at.distance >= 0.0)
-        };
+        let within =
+            |at: &SurfacePoint| at.distance <= reach && at.distance >= -depth && !(inside && at.distance >= 0.0);
         let at = at.or_else(|| look(&samples.neighbours[first..])).filter(within);
         let Some(at) = at.filter(|_| mapped.likelihood > 0.0) else {
             samples.neighbours.truncate(first);

@@ -71,7 +71,12 @@ impl OrderedSamples {
     }
 
     /// Backward of [`OrderedSamples::composite`], into the segments' batches; `d_colors` of each ray.
-    pub fn composite_backward(&mut self, background: Vec3, d_colors: impl Iterator<Item = Vec3>, segments: &mut Segments) {
+    pub fn composite_backward(
+        &mut self,
+        background: Vec3,
+        d_colors: impl Iterator<Item = Vec3>,
+        segments: &mut Segments,
+    ) {
         let n = self.places.len();
         self.d_sigma.resize(n, 0.0);
         self.d_rgb.resize(n, Vec3::ZERO);

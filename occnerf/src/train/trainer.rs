@@ -190,17 +190,8 @@ impl<'a> Trainer<'a> {
         surface.refit(&model.body, posed, &model.extent, &model.config);
         deal(batch, frame, groups);
         let motion = MotionFrame::new(&scene.body.model, posed);
-        let pass = Step {
-            model: &*model,
-            surface,
-            motion: &motion,
-            posed,
-            frame,
-            batch,
-            vertex_code,
-            teaches_poses,
-            options,
-        };
+        let pass =
+            Step { model: &*model, surface, motion: &motion, posed, frame, batch, vertex_code, teaches_poses, options };
         watch.lap(&mut times.prepare);
         groups.par_iter_mut().with_max_len(1).for_each(|group| pass.forward(group));
         let mut watch = Stopwatch::start();

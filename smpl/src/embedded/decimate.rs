@@ -10,7 +10,7 @@ use super::half::Half;
 /// Cost of an edge's length beside the distance to the planes: keeps triangles of about one size.
 const LENGTH_COST: f64 = 0.01;
 
-/// Above this height, metres, in front, the face is kept finer by this factor of the cost.
+/// Height in metres above which, in front, the face is kept finer, and the factor of its cost.
 const FACE: f64 = 1.49;
 const FACE_COST: f64 = 12.0;
 

@@ -1,4 +1,5 @@
-//! Meshing the implicit surface: naive surface nets (Gibson 1998) on half the body, projected onto the surface.
+//! Meshing the implicit surface: naive surface nets (Gibson 1998) on half the body, projected onto
+//! the surface.
 
 use std::collections::HashMap;
 
@@ -162,7 +163,8 @@ fn gradient(v: Vec3) -> Vec3 {
     Vec3::new(slope(Vec3::X), slope(Vec3::Y), slope(Vec3::Z))
 }
 
-/// Evens out the triangles: moves every vertex towards the mean of its neighbours along the surface.
+/// Evens out the triangles: moves every vertex towards the mean of its neighbours along the
+/// surface.
 pub(super) fn relax(mut mesh: Half) -> Half {
     let neighbours = super::rig::neighbours(mesh.vertices.len(), &mesh.faces);
     for _ in 0..6 {

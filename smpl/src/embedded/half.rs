@@ -8,7 +8,7 @@ pub(super) struct Half {
     pub(super) faces: Vec<[u32; 3]>,
 }
 
-/// Both halves of a body from the one with x ≥ 0. Vertices with x = 0 are shared.
+/// Builds both halves of a body from the one with x ≥ 0. Vertices with x = 0 are shared.
 pub(super) fn mirror(half: &Half) -> (Vec<Vec3>, Vec<[u32; 3]>) {
     let mut vertices = half.vertices.clone();
     let mut twin: Vec<u32> = Vec::with_capacity(vertices.len());

@@ -19,15 +19,16 @@ const ORIGIN: f32 = 1.15;
 const HALF_VERTICES: usize = 2450;
 
 impl BodyModel {
-    /// A body that needs no file: SMPL's 24 joints in SMPL's order, T-pose, about 1.7 m tall, some 4,800 vertices of one
-    /// closed surface without handles, mirror-symmetric in x.
+    /// A body that needs no file: SMPL's 24 joints in SMPL's order, T-pose, about 1.7 m tall, some
+    /// 4,800 vertices of one closed surface without handles, mirror-symmetric in x.
     ///
-    /// It is made by a program, not measured: proportions are those of an average adult, hands are mittens. Betas (plausible
-    /// within ±2): 0 height, 1 weight, 2 feminine to masculine, 3 muscle, 4 head size, 5 belly, 6 chest, 7 torso width,
-    /// 8 leg length, 9 arm length. Pose blend shapes restore the volume that linear blending loses at bent joints, to
-    /// second order in the angle.
+    /// It is made by a program, not measured: proportions are those of an average adult, hands are
+    /// mittens. Betas (plausible within ±2): 0 height, 1 weight, 2 feminine to masculine, 3 muscle,
+    /// 4 head size, 5 belly, 6 chest, 7 torso width, 8 leg length, 9 arm length. Pose blend shapes
+    /// restore the volume that linear blending loses at bent joints, to second order in the angle.
     ///
-    /// The result is the same at every call. Each call builds it anew, a fraction of a second: keep it.
+    /// The result is the same at every call. Each call builds it anew, a fraction of a second: keep
+    /// it.
     #[must_use]
     pub fn embedded() -> Self {
         let half = extract::half_surface();
