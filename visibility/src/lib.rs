@@ -42,6 +42,11 @@ mod tree;
 mod triangle;
 mod view;
 
+/// The README's examples, compiled as tests.
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+struct Readme;
+
 pub use counts::VisibilityCounts;
 pub use error::Error;
 pub use ray_mesh::{Hit, RayMesh};
