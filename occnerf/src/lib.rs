@@ -50,6 +50,8 @@ pub use evaluate::{FrameMetrics, SplitMetrics, evaluate, evaluate_with, least_se
 pub use lpips::{Lpips, Trunk};
 pub use model::body::{Body, Moment};
 pub use model::colors::VertexColors;
+pub use model::person::Person;
+pub use model::saved::checkpoint_config;
 pub use model::times::StepTimes;
 pub use model::trained::{Model, upright};
 pub use model::view::PosedView;
@@ -58,6 +60,5 @@ pub use render::picture::{Renderer, Rendering};
 pub use render::prior::PriorRenderer;
 pub use scene::labels::{Label, Labels, label_pixels};
 pub use scene::prepared::{PreparedFrame, Scene};
-pub use model::saved::checkpoint_config;
 pub use train::report::StepReport;
 pub use train::trainer::Trainer;

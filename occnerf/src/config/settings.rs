@@ -241,6 +241,21 @@ pub struct LossConfig {
     pub beta: f32,
 }
 
+impl LossConfig {
+    /// The perceptual term: `ms-ssim`, `lpips` or `none`.
+    pub fn perceptual_name(&self) -> String {
+        let embedded = self.perceptual_weights.is_empty();
+        if self.perceptual == 0.0 {
+            "none"
+        } else if embedded {
+            "ms-ssim"
+        } else {
+            "lpips"
+        }
+        .to_owned()
+    }
+}
+
 /// Adam's learning rates.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]

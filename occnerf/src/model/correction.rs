@@ -92,4 +92,3 @@ pub(crate) fn correct(model: &BodyModel, shape: &Shaped, posed: &Posed, correcti
         Vec3::from(model.weights.row(v).map(|(j, w)| w * bones[j].transform_point3a(rest)).sum::<Vec3A>())
     }));
 }
-

@@ -103,9 +103,7 @@ pub(crate) struct Contents<'a> {
 impl<'a> Contents<'a> {
     /// Takes `bytes` of `path` apart, whose header is to name `format` in one of `versions`.
     pub fn parse(path: &Path, bytes: &'a [u8], format: &str, versions: &[&str]) -> Result<Self, Error> {
-        let not_ours = |e: safetensors::SafeTensorError| {
-            wrong(path, format!("is not a whole safetensors file: {e}"))
-        };
+        let not_ours = |e: safetensors::SafeTensorError| wrong(path, format!("is not a whole safetensors file: {e}"));
         let (_, metadata) = SafeTensors::read_metadata(bytes).map_err(not_ours)?;
         let tensors = SafeTensors::deserialize(bytes).map_err(not_ours)?;
         let header = metadata.metadata().clone().unwrap_or_default();
@@ -130,12 +128,6 @@ impl<'a> Contents<'a> {
     /// A key of the header that has to be there.
     pub fn require(&self, key: &str) -> Result<&str, Error> {
         self.header(key).ok_or_else(|| self.wrong(format!("header lacks `{key}`")))
-    }
-
-    /// The length of an array of the given type.
-    pub fn len(&self, key: &str) -> Result<usize, Error> {
-        let view = self.tensors.tensor(key).map_err(|_| self.wrong(format!("lacks `{key}`")))?;
-        Ok(view.shape().iter().product())
     }
 
     fn bytes_of(&self, key: &str, dtype: Dtype, len: usize) -> Result<&[u8], Error> {

@@ -88,9 +88,7 @@ impl Parameters {
     pub fn count(&self, part: Part) -> usize {
         let all = self.get(part).len();
         match &self.kept_rows {
-            Some(kept) if part == Part::Table => {
-                all / kept.len().max(1) * kept.iter().filter(|kept| **kept).count()
-            }
+            Some(kept) if part == Part::Table => all / kept.len().max(1) * kept.iter().filter(|kept| **kept).count(),
             _ => all,
         }
     }

@@ -170,9 +170,7 @@ impl Model {
     /// corrected.
     pub fn corrected<'b>(&self, view: &'b PosedView) -> Cow<'b, Posed> {
         match self.correction(view) {
-            Some(correction) => {
-                Cow::Owned(corrected(&self.body.model, &view.shape, &view.posed, &correction))
-            }
+            Some(correction) => Cow::Owned(corrected(&self.body.model, &view.shape, &view.posed, &correction)),
             None => Cow::Borrowed(&view.posed),
         }
     }

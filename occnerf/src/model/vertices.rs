@@ -8,7 +8,6 @@ use crate::model::body::Body;
 use crate::model::distance::{SurfacePoint, needs_neighbours, surface_point, surface_point_backward};
 use crate::model::encoder::{At, Coordinates, Encoder, Slopes};
 
-
 const CHUNK: usize = 512;
 /// Farthest that a vertex's distance to its initial mesh is looked up; the encoding clamps earlier.
 const FARTHEST: f32 = 0.5;

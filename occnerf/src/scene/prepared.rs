@@ -84,7 +84,12 @@ impl Scene {
             .map(|frame| {
                 let mesh = RayMesh::new(&frame.view.posed.vertices, &self.body.model.faces)?;
                 let usable: Vec<bool> = frame.labels.iter().map(|label| label == Label::Subject).collect();
-                Ok(visibility::visible_vertices(&mesh, &frame.view.posed.vertices, &pinhole(&frame.view.camera), Some(&usable)))
+                Ok(visibility::visible_vertices(
+                    &mesh,
+                    &frame.view.posed.vertices,
+                    &pinhole(&frame.view.camera),
+                    Some(&usable),
+                ))
             })
             .collect();
         let mut counts = vec![0; self.body.canonical.vertices.len()];

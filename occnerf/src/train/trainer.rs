@@ -6,6 +6,7 @@ use smpl::{MotionFrame, Posed};
 use visibility::VisibilityCounts;
 
 use crate::Error;
+use crate::capacity::Pruned;
 use crate::config::{Config, VisibilityKind};
 use crate::lpips::Lpips;
 use crate::model::colors::VertexColors;
@@ -112,13 +113,17 @@ impl<'a> Trainer<'a> {
         Ok(())
     }
 
+    /// [`Model::prune`]; a step taken afterwards makes all rows learnable again.
+    pub fn prune(&mut self) -> Pruned {
+        self.model.prune()
+    }
+
     /// Which perceptual term the run is trained with: `ms-ssim`, `lpips` with the network's name, or
     /// `none`.
     pub fn perceptual(&self) -> String {
         match &self.lpips {
             Some(lpips) => format!("lpips {}", lpips.trunk().name()),
-            None if self.model.config.loss.perceptual == 0.0 => "none".to_owned(),
-            None => "ms-ssim".to_owned(),
+            None => self.model.config.loss.perceptual_name(),
         }
     }
 
@@ -190,17 +195,8 @@ impl<'a> Trainer<'a> {
         surface.refit(&model.body, posed, &model.extent, &model.config);
         deal(batch, frame, groups);
         let motion = MotionFrame::new(&scene.body.model, posed);
-        let pass = Step {
-            model: &*model,
-            surface,
-            motion: &motion,
-            posed,
-            frame,
-            batch,
-            vertex_code,
-            teaches_poses,
-            options,
-        };
+        let pass =
+            Step { model: &*model, surface, motion: &motion, posed, frame, batch, vertex_code, teaches_poses, options };
         watch.lap(&mut times.prepare);
         groups.par_iter_mut().with_max_len(1).for_each(|group| pass.forward(group));
         let mut watch = Stopwatch::start();
