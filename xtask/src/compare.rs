@@ -1,9 +1,10 @@
 //! `train --compare`: every method on one scene, both pixel rules, one table.
 
 use anyhow::Result;
-use occnerf::{Config, Lpips, Method, OccludedRule};
+use occnerf::{Config, Method, OccludedRule};
 
-use crate::run::{Metrics, RunConfig};
+use crate::eval::load_lpips;
+use crate::run::{Metrics, RunConfig, use_threads};
 use crate::settings::MethodName;
 use crate::train::{TrainArguments, run_unless_finished, scene_name};
 use crate::{run, source, table};
@@ -19,7 +20,9 @@ const RUNS: [(MethodName, OccludedRule); 7] = [
 ];
 
 /// Trains what is missing under OUT/METHOD-RULE and prints all; a finished run is not trained again.
-pub fn compare(arguments: &TrainArguments, lpips: Option<&Lpips>) -> Result<()> {
+pub fn compare(arguments: &TrainArguments) -> Result<()> {
+    use_threads(arguments.threads)?;
+    let lpips = load_lpips(arguments.lpips.as_deref())?;
     anyhow::ensure!(arguments.settings.method.is_none(), "--compare trains every method: leave --method out");
     let default = format!("runs/{}-compare", scene_name(arguments.scene.as_deref()));
     let out = arguments.out.clone().unwrap_or_else(|| default.into());
@@ -40,7 +43,10 @@ pub fn compare(arguments: &TrainArguments, lpips: Option<&Lpips>) -> Result<()> 
             load: source.load.clone(),
             train: config,
         };
-        rows.push((run.train.method.name().to_owned(), run_unless_finished(&directory, &name, &run, &source, lpips)?));
+        rows.push((
+            run.train.method.name().to_owned(),
+            run_unless_finished(&directory, &name, &run, &source, lpips.as_ref())?,
+        ));
     }
     let rows: Vec<(String, &Metrics)> = rows.iter().map(|(name, metrics)| (name.clone(), metrics)).collect();
     let text = table::markdown(&rows);

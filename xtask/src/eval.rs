@@ -12,8 +12,8 @@ use occnerf::{
 };
 use rayon::prelude::*;
 
+use crate::log::logged_seconds;
 use crate::run::{METRICS, Metrics, NOVEL_VIEWS, RunConfig, Splits, TRAINING_VIEWS, peak_rss_bytes, use_threads};
-use crate::train::logged_seconds;
 use crate::{pictures, report, table};
 
 /// Training frames are many and alike: every tenth is scored.

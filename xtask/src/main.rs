@@ -5,6 +5,9 @@ mod capacity;
 mod compare;
 mod convert;
 mod eval;
+mod film;
+mod font;
+mod log;
 mod obstacle;
 mod pictures;
 mod probe;
@@ -52,6 +55,7 @@ enum Command {
 
 fn main() -> std::process::ExitCode {
     let outcome = match Arguments::parse().command {
+        Command::Train(arguments) if arguments.compare => compare::compare(&arguments),
         Command::Train(arguments) => train::train(&arguments),
         Command::Eval(arguments) => eval::eval(&arguments),
         Command::Render(arguments) => render::render(&arguments),

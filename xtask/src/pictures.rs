@@ -9,7 +9,7 @@ use occnerf::capture::Image;
 use plotters::prelude::*;
 use plotters::style::text_anchor::{HPos, Pos, VPos};
 
-use crate::bench::chart;
+use crate::font::{FONT, LETTER, register_font};
 
 /// Gap between the cells of a sheet in pixels.
 const GAP: u32 = 4;
@@ -49,13 +49,13 @@ pub fn captioned(sheet: &RgbImage, names: &[&str]) -> Result<RgbImage> {
     const STRIP: u32 = 20;
     /// Largest height of a letter in pixels.
     const LARGEST: f64 = 14.0;
-    chart::register_font()?;
+    register_font()?;
     let (width, column) = (sheet.width(), (sheet.width() - GAP) as f64 / names.len().max(1) as f64);
     let longest = names.iter().map(|name| name.chars().count()).max().unwrap_or(0).max(1);
-    let letter = LARGEST.min((column - f64::from(GAP)) / (chart::LETTER * longest as f64));
+    let letter = LARGEST.min((column - f64::from(GAP)) / (LETTER * longest as f64));
     let mut strip = vec![255; 3 * (width * STRIP) as usize];
     let area = BitMapBackend::with_buffer(&mut strip, (width, STRIP)).into_drawing_area();
-    let style = (chart::FONT, letter).into_font().color(&BLACK).pos(Pos::new(HPos::Center, VPos::Center));
+    let style = (FONT, letter).into_font().color(&BLACK).pos(Pos::new(HPos::Center, VPos::Center));
     for (c, name) in names.iter().enumerate() {
         let middle = f64::from(GAP) / 2.0 + (c as f64 + 0.5) * column;
         area.draw_text(name, &style, (middle as i32, STRIP as i32 / 2))?;

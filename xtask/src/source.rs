@@ -9,8 +9,8 @@ use occnerf::capture::{
 };
 use smpl::BodyModel;
 
+use crate::film::{film, is_character};
 use crate::obstacle::ObstacleArguments;
-use crate::synth;
 
 /// Name of the scene that needs no files.
 pub const DEMO: &str = "demo";
@@ -151,11 +151,11 @@ pub fn load(scene: Option<&str>, body: Option<&Path>, options: &LoadOptions) -> 
         return Ok(Source { scene: name, body: None, load: options.clone(), capture, model });
     }
     let directory = Path::new(scene);
-    if directory.is_file() && synth::is_character(directory) {
+    if directory.is_file() && is_character(directory) {
         if *options != (LoadOptions { wrong: options.wrong, ..LoadOptions::default() }) || body.is_some() {
             bail!("{scene}: a character takes none of the options of a capture; use synth to choose how it is filmed");
         }
-        let Synthetic { mut capture, body, .. } = synth::film(Some(directory), None, &SynthConfig::default())?;
+        let Synthetic { mut capture, body, .. } = film(Some(directory), None, &SynthConfig::default())?;
         options.wrong.apply(&mut capture, &body)?;
         return Ok(Source { scene: name, body: None, load: options.clone(), capture, model: body });
     }

@@ -4,10 +4,9 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail, ensure};
 use clap::{Args, ValueEnum};
-use indicatif::{ProgressBar, ProgressStyle};
-use occnerf::capture::{Layout, Obstacle, Occlusion, SynthConfig, Synthetic, synthesise};
-use smpl::{Character, MotionClip};
+use occnerf::capture::{Layout, Obstacle, Occlusion, SynthConfig, Synthetic};
 
+use crate::film::{bar, film, is_character};
 use crate::obstacle::ObstacleArguments;
 
 /// What a finished directory holds, and nothing else does.
@@ -112,34 +111,6 @@ impl SynthArguments {
             occlusion,
         })
     }
-}
-
-/// Whether `path` is named like a rigged character.
-pub fn is_character(path: &Path) -> bool {
-    let extension = path.extension().and_then(|e| e.to_str()).unwrap_or("");
-    ["glb", "gltf"].iter().any(|known| extension.eq_ignore_ascii_case(known))
-}
-
-/// Films `character`, or the embedded person, with a bar.
-pub fn film(character: Option<&Path>, motion: Option<&Path>, config: &SynthConfig) -> Result<Synthetic> {
-    let named = |path: &Path| path.display().to_string();
-    let character = character.map(|path| Character::load(path).map(|c| (c, named(path)))).transpose()?;
-    let motion = motion.map(MotionClip::load).transpose()?;
-    let bar = bar("filming", config.frames);
-    let synthetic = synthesise(character.as_ref().map(|(c, _)| c), motion.as_ref(), config, &|_| bar.inc(1));
-    bar.finish_and_clear();
-    match character {
-        Some((_, name)) => synthetic.context(name),
-        None => Ok(synthetic?),
-    }
-}
-
-fn bar(what: &'static str, length: usize) -> ProgressBar {
-    let bar = ProgressBar::new(length as u64);
-    if let Ok(style) = ProgressStyle::with_template("{bar:28} {pos}/{len} {msg}  {elapsed}") {
-        bar.set_style(style);
-    }
-    bar.with_message(what)
 }
 
 /// Runs the command: everything is written beside --out and takes its place when it is complete.

@@ -10,8 +10,8 @@ use indicatif::{ProgressBar, ProgressStyle};
 use occnerf::{Lpips, Method, Person, Scene, StepReport, Trainer, VertexColors, checkpoint_config};
 
 use crate::capacity::{self, CapacityName};
-use crate::compare::compare;
 use crate::eval::{Drawn, Split, check_pictures, load_lpips, network_name, score_run, scored_frames, unscored};
+use crate::log::earlier_log;
 use crate::run::{CHECKPOINT, LOG, METRICS, Metrics, RunConfig, existing_directory, new_directory, use_threads};
 use crate::settings::SettingArguments;
 use crate::source::{self, LoadArguments, Source};
@@ -63,9 +63,6 @@ pub struct TrainArguments {
 pub fn train(arguments: &TrainArguments) -> Result<()> {
     use_threads(arguments.threads)?;
     let lpips = load_lpips(arguments.lpips.as_deref())?;
-    if arguments.compare {
-        return compare(arguments, lpips.as_ref());
-    }
     let method = arguments.settings.config()?.method;
     let name = format!("{}-{}", scene_name(arguments.scene.as_deref()), method.name());
     let out = arguments.out.as_deref();
@@ -291,34 +288,6 @@ fn optimise(directory: &Path, trainer: &mut Trainer<'_>, stop_after: Option<u64>
         eprintln!("warning: {bad} gradients were not finite and were left out");
     }
     Ok(earlier.seconds + start.elapsed().as_secs_f64())
-}
-
-/// Seconds of training that the first `steps` steps of the run in `directory` took, as far as its log knows.
-pub fn logged_seconds(directory: &Path, steps: u64) -> Result<f64> {
-    Ok(earlier_log(&directory.join(LOG), steps)?.seconds)
-}
-
-struct EarlierLog {
-    text: String,
-    seconds: f64,
-    steps: u64,
-}
-
-/// The log up to the checkpoint; lines of steps that the checkpoint does not hold are dropped.
-fn earlier_log(path: &Path, steps: u64) -> Result<EarlierLog> {
-    let mut log = EarlierLog { text: String::new(), seconds: 0.0, steps };
-    if steps == 0 || !path.exists() {
-        return Ok(log);
-    }
-    for line in std::fs::read_to_string(path).with_context(|| path.display().to_string())?.lines() {
-        let Ok(value) = serde_json::from_str::<serde_json::Value>(line) else { continue };
-        if value["step"].as_u64().is_some_and(|s| s <= steps) {
-            log.text.push_str(line);
-            log.text.push('\n');
-            log.seconds = value["seconds"].as_f64().unwrap_or(log.seconds);
-        }
-    }
-    Ok(log)
 }
 
 /// A running mean over about fifty steps.

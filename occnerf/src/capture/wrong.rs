@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 use smpl::{BodyModel, Placement};
 
 use super::demo::motion::{Pose, TrackerError, track};
-use super::source::Edit;
+use super::pixels::Edit;
 use super::synth::noise::normal;
 use super::{Capture, CaptureError, Frame};
 use crate::random::Stream;

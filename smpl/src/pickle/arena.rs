@@ -7,7 +7,8 @@ use super::reader::Step;
 use super::value::{MAX_DEPTH, Value};
 use crate::array::NdArray;
 
-/// Index of a node. Nodes live in one arena, because a container can be referred to before it is filled.
+/// Index of a node. Nodes live in one arena, because a container can be referred to before it is
+/// filled.
 pub(super) type Id = usize;
 
 /// A value under construction.
@@ -36,8 +37,8 @@ pub(super) enum Node<'a> {
 /// All nodes, and what may still be spent on them.
 pub(super) struct Arena<'a> {
     pub(super) nodes: Vec<Node<'a>>,
-    /// Bytes that may still be spent on arrays and results, so that a short file cannot ask for much memory by
-    /// referring to one thing many times.
+    /// Bytes that may still be spent on arrays and results, so that a short file cannot ask for
+    /// much memory by referring to one thing many times.
     budget: usize,
 }
 

@@ -13,7 +13,7 @@ const MAX_ARGUMENTS: usize = 8;
 
 pub(super) struct Machine<'a> {
     reader: Reader<'a>,
-    /// Where the current opcode starts.
+    /// Offset of the current opcode.
     opcode_at: usize,
     arena: Arena<'a>,
     stack: Vec<Id>,

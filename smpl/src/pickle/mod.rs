@@ -1,10 +1,10 @@
 //! Python pickles as plain data.
 //!
 //! A small stack machine reads protocols 0 to 5 and understands the few constructors that numpy
-//! arrays, chumpy arrays, scipy's `csc_matrix` and descriptions of PyTorch tensors need. Every other
-//! global is refused by name and nothing is ever executed. Memory is bounded by a multiple of the
-//! input's size, nesting by [`MAX_DEPTH`]; malformed input gives [`Error::Pickle`] with the offset of
-//! the opcode.
+//! arrays, chumpy arrays, scipy's `csc_matrix` and descriptions of PyTorch tensors need. Every
+//! other global is refused by name and nothing is ever executed. Memory is bounded by a multiple of
+//! the input's size, nesting by [`MAX_DEPTH`]; malformed input gives [`Error::Pickle`] with the
+//! offset of the opcode.
 
 mod arena;
 mod globals;
@@ -48,7 +48,8 @@ pub fn parse(file: &str, bytes: &[u8]) -> Result<Value, Error> {
     parse_at(file, bytes, 0)
 }
 
-/// Reads the pickle that starts at byte `start` and says where it ends, for files of several; `file` names them in errors.
+/// Reads the pickle that starts at byte `start` and says where it ends, for files of several;
+/// `file` names them in errors.
 ///
 /// # Errors
 /// [`Error::Pickle`].

@@ -1,4 +1,4 @@
-//! What the allowed globals construct, and how their state is set.
+//! Constructors of the allowed globals, and the state that BUILD sets.
 
 use std::borrow::Cow;
 
@@ -113,7 +113,8 @@ impl<'a> Arena<'a> {
             (Node::Object(class, _), Node::Dict(_)) => {
                 self.nodes[target] = Node::Object(class, Some(state));
             }
-            // Attributes of an `OrderedDict`, such as a state dictionary's versions, are no part of what it holds.
+            // Attributes of an `OrderedDict`, such as a state dictionary's versions, are no part of
+            // what it holds.
             (Node::Dict(_), Node::Dict(_)) => {}
             _ => return Err("state of something that has none".to_owned()),
         }

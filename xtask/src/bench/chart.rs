@@ -10,16 +10,14 @@ use plotters::prelude::*;
 use plotters::style::text_anchor::{HPos, Pos, VPos};
 
 use super::scale::Scale;
+use crate::font::{FONT, LETTER, register_font};
 
 /// PNGs are drawn so much larger and reduced, for smooth edges.
 const OVERSAMPLING: i32 = 2;
-pub const FONT: &str = "sans-serif";
 /// Height of the title and of each legend row, and sizes of text, in pixels.
 const TITLE: i32 = 34;
 const ROW: i32 = 20;
 const SMALL: i32 = 11;
-/// Mean width of a letter as a share of its height.
-pub const LETTER: f64 = 0.56;
 
 /// Colours that are told apart by colour-blind people too (Okabe and Ito 2008).
 pub const COLORS: [RGBColor; 7] = [
@@ -77,12 +75,6 @@ pub struct Picture {
     /// Of a panel, in pixels.
     pub size: (u32, u32),
     pub panels: Vec<Panel>,
-}
-
-/// SVG text is measured, and PNG text drawn, with a font that comes along: systems may have none.
-pub fn register_font() -> Result<()> {
-    plotters::style::register_font(FONT, FontStyle::Normal, dejavu::sans::regular())
-        .map_err(|_| anyhow!("the font cannot be read"))
 }
 
 impl Picture {

@@ -192,7 +192,7 @@ impl Experiment<'_> {
                     scene: source.scene.clone(),
                     body: source.body.clone(),
                     load: source.load.clone(),
-                    train: row.config(self.arguments.preset.into(), seed, plan),
+                    train: plan.config(row, self.arguments.preset.into(), seed),
                 };
                 if let Some(path) = &self.arguments.perceptual_weights {
                     run.train.loss.perceptual_weights.clone_from(path);

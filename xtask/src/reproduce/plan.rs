@@ -116,6 +116,11 @@ impl Plan {
         }
     }
 
+    /// The configuration of a run of `row`.
+    pub fn config(&self, row: &Row, preset: Preset, seed: u64) -> Config {
+        Config { seed, steps: self.steps_of(row), ..row.settings(preset) }
+    }
+
     /// Steps of a row.
     pub fn steps_of(&self, row: &Row) -> u64 {
         ((self.steps as f64 * self.factor(row)).round() as u64).max(1)

@@ -4,7 +4,7 @@ use std::sync::OnceLock;
 use glam::Vec3;
 use smpl::BodyModel;
 
-use super::byte;
+use super::folder::byte;
 use crate::capture::testing::Directory;
 use crate::capture::{
     Capture, Frame, Layout, LoadOptions, Obstacle, Occlusion, Pixels, SynthConfig, Synthetic, Wrong, find_body,
