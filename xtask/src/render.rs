@@ -11,7 +11,8 @@ use volrender::Camera;
 
 use crate::eval::Model;
 use crate::pictures;
-use crate::run::{CHECKPOINT, RunConfig, use_threads};
+use crate::process::say;
+use crate::run::{CHECKPOINT, RunConfig, make_directory, use_threads};
 
 /// Views of a full turn.
 const TURN: usize = 36;
@@ -68,7 +69,7 @@ pub fn render(arguments: &RenderArguments) -> Result<()> {
     };
     let name = format!("{:?}", arguments.what).to_lowercase();
     let out = arguments.out.clone().unwrap_or_else(|| directory.join("renders").join(&name));
-    std::fs::create_dir_all(&out).with_context(|| out.display().to_string())?;
+    make_directory(&out)?;
     let mut renderer = model.renderer(&scene)?;
     let bar = ProgressBar::new(views.len() as u64);
     let mut film = Vec::new();
@@ -82,7 +83,7 @@ pub fn render(arguments: &RenderArguments) -> Result<()> {
     bar.finish_and_clear();
     let path = out.join(format!("{name}.gif"));
     pictures::film(&film, FPS, &path)?;
-    println!("{} pictures and {}", film.len(), path.display());
+    say!("{} pictures and {}", film.len(), path.display());
     Ok(())
 }
 
