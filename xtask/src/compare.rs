@@ -4,6 +4,7 @@ use anyhow::Result;
 use occnerf::{Config, Method, OccludedRule};
 
 use crate::eval::load_lpips;
+use crate::process::say;
 use crate::run::{Metrics, RunConfig, use_threads};
 use crate::settings::MethodName;
 use crate::train::{TrainArguments, run_unless_finished, scene_name};
@@ -27,6 +28,7 @@ pub fn compare(arguments: &TrainArguments) -> Result<()> {
     let default = format!("runs/{}-compare", scene_name(arguments.scene.as_deref()));
     let out = arguments.out.clone().unwrap_or_else(|| default.into());
     let source = source::load(arguments.scene.as_deref(), arguments.body.as_deref(), &arguments.load.options()?)?;
+    let interval = arguments.saving.interval()?;
     let mut rows: Vec<(String, Metrics)> = Vec::new();
     for (method, occluded) in RUNS {
         let mut settings = arguments.settings.clone();
@@ -45,14 +47,14 @@ pub fn compare(arguments: &TrainArguments) -> Result<()> {
         };
         rows.push((
             run.train.method.name().to_owned(),
-            run_unless_finished(&directory, &name, &run, &source, lpips.as_ref())?,
+            run_unless_finished(&directory, &name, &run, &source, lpips.as_ref(), interval)?,
         ));
     }
     let rows: Vec<(String, &Metrics)> = rows.iter().map(|(name, metrics)| (name.clone(), metrics)).collect();
     let text = table::markdown(&rows);
     run::write(&out.join("comparison.md"), &text)?;
     let title = rows.first().map_or("scores", |(_, metrics)| metrics.splits.title());
-    println!("\n{}, {title}:\n{text}", source.scene);
-    println!("written: {}", out.join("comparison.md").display());
+    say!("\n{}, {title}:\n{text}", source.scene);
+    say!("written: {}", out.join("comparison.md").display());
     Ok(())
 }

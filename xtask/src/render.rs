@@ -11,7 +11,8 @@ use occnerf::{Body, FieldRenderer, Method, Model, Person, PosedView, PriorRender
 use volrender::Camera;
 
 use crate::pictures;
-use crate::run::{RunConfig, use_threads};
+use crate::process::say;
+use crate::run::{RunConfig, make_directory, use_threads};
 
 /// Views of a full turn.
 const TURN: usize = 36;
@@ -66,7 +67,7 @@ pub fn render(arguments: &RenderArguments) -> Result<()> {
     let views = views(body, frames, arguments, size);
     let name = format!("{:?}", arguments.what).to_lowercase();
     let out = arguments.out.clone().unwrap_or_else(|| directory.join("renders").join(&name));
-    std::fs::create_dir_all(&out).with_context(|| out.display().to_string())?;
+    make_directory(&out)?;
     let bar = ProgressBar::new(views.len() as u64);
     let mut film = Vec::new();
     for (i, view) in views.iter().enumerate() {
@@ -79,7 +80,7 @@ pub fn render(arguments: &RenderArguments) -> Result<()> {
     bar.finish_and_clear();
     let path = out.join(format!("{name}.gif"));
     pictures::film(&film, FPS, &path)?;
-    println!("{} pictures and {}", film.len(), path.display());
+    say!("{} pictures and {}", film.len(), path.display());
     Ok(())
 }
 

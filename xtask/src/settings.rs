@@ -86,7 +86,7 @@ pub struct SettingArguments {
     #[arg(long)]
     pub steps: Option<u64>,
     /// Seed of every random choice [default: 1]
-    #[arg(long)]
+    #[arg(long, value_parser = clap::value_parser!(u64).range(..=i64::MAX as u64))]
     pub seed: Option<u64>,
     /// Weights that make the perceptual term LPIPS: SqueezeNet 1.1, VGG16 or AlexNet with LPIPS's linear layers, .safetensors
     /// or .pth, a file or a directory [default: multi-scale SSIM]

@@ -23,7 +23,9 @@ use occnerf::capture::Layout;
 
 use self::job::Place;
 use self::runner::Bench;
-use crate::run::{use_threads, write};
+use crate::process::say;
+use crate::run::{check_threads, use_threads, write};
+use crate::shard::ShardArguments;
 use crate::source::{LoadArguments, Source};
 use crate::{source, train};
 
@@ -155,6 +157,8 @@ struct SittingArguments {
     /// Only draw what has been run
     #[arg(long)]
     draw: bool,
+    #[command(flatten)]
+    part: ShardArguments,
 }
 
 #[derive(Args)]
@@ -185,6 +189,8 @@ pub fn bench(arguments: &BenchArguments) -> Result<()> {
         What::Kernels(arguments) => kernels::run(&arguments.out, arguments.quick),
         What::Cost(arguments) => {
             use_threads(arguments.sitting.threads)?;
+            let alone = arguments.sitting.part.shard.is_none();
+            anyhow::ensure!(alone, "bench cost measures one machine: it has no parts");
             let mut bench = arguments.sitting.open(&arguments.out)?;
             let text = cost::run(&mut bench, &arguments.out)?;
             finish(&bench, &text, "cost.md")
@@ -198,9 +204,10 @@ pub fn bench(arguments: &BenchArguments) -> Result<()> {
 
 impl SittingArguments {
     fn open(&self, out: &Path) -> Result<Bench> {
-        let minutes = if self.draw { 0.0 } else { self.minutes.unwrap_or(1e6) };
+        let minutes = if self.draw || self.part.merge { 0.0 } else { self.minutes.unwrap_or(1e6) };
         anyhow::ensure!((0.0..=1e6).contains(&minutes), "--minutes {minutes}: expected 0 to 1000000");
-        Bench::open(out, self.threads, Duration::from_secs_f64(60.0 * minutes))
+        check_threads(self.threads)?;
+        Bench::open(out, self.threads, Duration::from_secs_f64(60.0 * minutes), self.part.shard)
     }
 }
 
@@ -275,12 +282,15 @@ fn pareto(arguments: &ParetoArguments) -> Result<()> {
     let mut text = String::new();
     for scene in &scenes {
         let lines = pareto::run(&on.sweep(scene, steps, *seed, *quick)?, &mut bench)?;
+        if !arguments.sitting.part.writes_tables() {
+            continue;
+        }
         let name = train::scene_name(Some(scene));
         pareto::charts(&name, &lines, &out.join(format!("pareto-{name}")))?;
         text.push_str(&format!("## {scene}\n\n{}\n", pareto::table(&lines)));
     }
     finish(&bench, &text, "pareto.md")?;
-    if !arguments.sitting.draw {
+    if !arguments.sitting.draw && arguments.sitting.part.writes_tables() {
         kernels::run(out, *quick)?;
     }
     Ok(())
@@ -295,6 +305,9 @@ fn capacity_bench(arguments: &CapacityArguments) -> Result<()> {
     for scene in &scenes {
         let points = capacity::points(&on.sweep(scene, steps, *seed, *quick)?, &on.read(scene)?, *paper)?;
         let lines = capacity::run(points, &mut bench)?;
+        if !arguments.sitting.part.writes_tables() {
+            continue;
+        }
         let name = train::scene_name(Some(scene));
         capacity::chart(&name, &lines, &out.join(format!("capacity-{name}")))?;
         text.push_str(&format!("## {scene}\n\n{}\n", capacity::table(&lines)));
@@ -324,6 +337,9 @@ fn stability(arguments: &StabilityArguments) -> Result<()> {
     for (scene, axes) in of_scenes {
         let sweep = stability::Sweep { axes, steps, quick: *quick, max_runs: *max_runs };
         let lines = sweep.run(&mut bench)?;
+        if !arguments.sitting.part.writes_tables() {
+            continue;
+        }
         let name = train::scene_name(Some(&scene));
         stability::charts(&name, &sweep.axes, &lines, &out.join(format!("stability-{name}")))?;
         let (table, finite) = (stability::table(&sweep.axes, &lines), stability::finite(&lines));
@@ -334,14 +350,21 @@ fn stability(arguments: &StabilityArguments) -> Result<()> {
 
 /// Prints and writes the table, and says what there is.
 fn finish(bench: &Bench, text: &str, name: &str) -> Result<()> {
+    let (begun, left) = bench.counts();
+    if bench.is_part() {
+        say!(
+            "{begun} runs in {:.1} minutes; {left} are of other parts, or left; --merge draws",
+            bench.seconds() / 60.0
+        );
+        return Ok(());
+    }
     let path = bench.path().with_file_name(name);
     write(&path, text)?;
-    println!("\n{text}");
-    println!("written: {}\nwritten: {}", bench.path().display(), path.display());
-    let (begun, left) = bench.counts();
-    println!("{begun} runs in {:.1} minutes", bench.seconds() / 60.0);
+    say!("\n{text}");
+    say!("written: {}\nwritten: {}", bench.path().display(), path.display());
+    say!("{begun} runs in {:.1} minutes", bench.seconds() / 60.0);
     if left > 0 {
-        println!("{left} points are left: the same command goes on with them");
+        say!("{left} points are left: the same command goes on with them");
     }
     Ok(())
 }

@@ -10,12 +10,13 @@ use anyhow::Result;
 use self::figure::{Figure, Sample};
 use super::chart::{Mark, Panel, Picture, Shape, Style};
 use super::scale::Scale;
+use crate::process::say;
 
 /// Name of the results.
 pub const RESULTS: &str = "kernels.json";
 /// Measures everything and draws it.
 pub fn run(directory: &Path, quick: bool) -> Result<()> {
-    std::fs::create_dir_all(directory)?;
+    crate::run::make_directory(directory)?;
     let figure = Figure::new(if quick { 4_000 } else { 20_000 });
     let kernels = [
         measure::distance(&figure)?,
@@ -28,12 +29,12 @@ pub fn run(directory: &Path, quick: bool) -> Result<()> {
     let path = directory.join(RESULTS);
     crate::run::write(&path, &serde_json::to_string_pretty(&results)?)?;
     for kernel in &kernels {
-        println!("{} ({}; {})", kernel.name, kernel.cost, kernel.error);
+        say!("{} ({}; {})", kernel.name, kernel.cost, kernel.error);
         for s in &kernel.samples {
-            println!("  {:<26} {:10.1} {:10.3}", s.name, s.nanoseconds, s.error);
+            say!("  {:<26} {:10.1} {:10.3}", s.name, s.nanoseconds, s.error);
         }
     }
-    println!("written: {}", path.display());
+    say!("written: {}", path.display());
     let panels = kernels.iter().map(|kernel| {
         let of = |pick: fn(&Sample) -> f64| kernel.samples.iter().map(pick);
         Panel {
