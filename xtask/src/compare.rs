@@ -6,18 +6,17 @@ use occnerf::{Config, Method, OccludedRule};
 use crate::eval::load_lpips;
 use crate::process::say;
 use crate::run::{Metrics, RunConfig, use_threads};
-use crate::settings::MethodName;
 use crate::train::{TrainArguments, run_unless_finished, scene_name};
 use crate::{run, source, table};
 
-const RUNS: [(MethodName, OccludedRule); 7] = [
-    (MethodName::Prior, OccludedRule::Unknown),
-    (MethodName::Humannerf, OccludedRule::Background),
-    (MethodName::Humannerf, OccludedRule::Unknown),
-    (MethodName::HashPoint, OccludedRule::Background),
-    (MethodName::HashPoint, OccludedRule::Unknown),
-    (MethodName::Occnerf, OccludedRule::Background),
-    (MethodName::Occnerf, OccludedRule::Unknown),
+const RUNS: [(Method, OccludedRule); 7] = [
+    (Method::Prior, OccludedRule::Unknown),
+    (Method::Humannerf, OccludedRule::Background),
+    (Method::Humannerf, OccludedRule::Unknown),
+    (Method::HashPoint, OccludedRule::Background),
+    (Method::HashPoint, OccludedRule::Unknown),
+    (Method::Occnerf, OccludedRule::Background),
+    (Method::Occnerf, OccludedRule::Unknown),
 ];
 
 /// Trains what is missing under OUT/METHOD-RULE and prints all; a finished run is not trained again.

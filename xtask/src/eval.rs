@@ -15,9 +15,7 @@ use rayon::prelude::*;
 
 use crate::optimise::logged_seconds;
 use crate::process::{Ending, Lock, note, say};
-use crate::run::{
-    METRICS, Metrics, NOVEL_VIEWS, RunConfig, Splits, TRAINING_VIEWS, peak_rss_bytes, use_threads,
-};
+use crate::run::{METRICS, Metrics, NOVEL_VIEWS, RunConfig, Splits, TRAINING_VIEWS, peak_rss_bytes, use_threads};
 use crate::{pictures, report, table};
 
 /// Training frames are many and alike: every tenth is scored.

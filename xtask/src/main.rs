@@ -8,6 +8,7 @@ mod convert;
 mod eval;
 mod film;
 mod font;
+mod front;
 mod list;
 mod obstacle;
 mod optimise;
@@ -17,6 +18,7 @@ mod process;
 mod render;
 mod report;
 mod reproduce;
+mod results;
 mod run;
 mod settings;
 mod shard;
@@ -45,6 +47,8 @@ enum Command {
     Eval(eval::EvalArguments),
     /// Draws a run's person: its movement, from all around, or in the rest pose.
     Render(render::RenderArguments),
+    /// Draws what the camera saw beside the person from unseen sides: README's picture.
+    Front(front::FrontArguments),
     /// The paper's table on captures: every baseline and ablation, several seeds, one budget.
     Reproduce(reproduce::ReproduceArguments),
     /// Writes an occluded capture of a synthetic person to disk, in a published dataset format.
@@ -83,6 +87,7 @@ fn main() -> std::process::ExitCode {
         Command::Train(arguments) => train::train(&arguments),
         Command::Eval(arguments) => eval::eval(&arguments),
         Command::Render(arguments) => render::render(&arguments),
+        Command::Front(arguments) => front::front(&arguments),
         Command::Reproduce(arguments) => reproduce::reproduce(&arguments),
         Command::Synth(arguments) => synth::synth(&arguments),
         Command::Probe(arguments) => probe::probe(&arguments),

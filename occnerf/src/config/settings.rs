@@ -132,6 +132,18 @@ pub enum Component {
     Perceptual,
 }
 
+impl Component {
+    /// The name used on the command line.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Surface => "surface",
+            Self::Attention => "attention",
+            Self::Completeness => "completeness",
+            Self::Perceptual => "perceptual",
+        }
+    }
+}
+
 /// The perceptron F.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]

@@ -24,6 +24,7 @@ use occnerf::capture::Layout;
 use self::job::Place;
 use self::runner::Bench;
 use crate::process::say;
+use crate::results::{self, Section};
 use crate::run::{check_threads, use_threads, write};
 use crate::shard::ShardArguments;
 use crate::source::{LoadArguments, Source};
@@ -159,6 +160,9 @@ struct SittingArguments {
     draw: bool,
     #[command(flatten)]
     part: ShardArguments,
+    /// Make what is found a section of xtask/RESULTS.md
+    #[arg(long)]
+    publish: bool,
 }
 
 #[derive(Args)]
@@ -178,6 +182,9 @@ struct KernelArguments {
     /// Fewer queries
     #[arg(long)]
     quick: bool,
+    /// Make what is found a section of xtask/RESULTS.md
+    #[arg(long)]
+    publish: bool,
 }
 
 /// Runs the command.
@@ -186,14 +193,14 @@ pub fn bench(arguments: &BenchArguments) -> Result<()> {
         What::Pareto(arguments) => pareto(arguments),
         What::Capacity(arguments) => capacity_bench(arguments),
         What::Stability(arguments) => stability(arguments),
-        What::Kernels(arguments) => kernels::run(&arguments.out, arguments.quick),
+        What::Kernels(arguments) => kernels::run(&arguments.out, arguments.quick, arguments.publish),
         What::Cost(arguments) => {
             use_threads(arguments.sitting.threads)?;
             let alone = arguments.sitting.part.shard.is_none();
             anyhow::ensure!(alone, "bench cost measures one machine: it has no parts");
             let mut bench = arguments.sitting.open(&arguments.out)?;
             let text = cost::run(&mut bench, &arguments.out)?;
-            finish(&bench, &text, "cost.md")
+            finish(&bench, &arguments.sitting, &text, "cost")
         }
         What::Point { threads } => {
             use_threads(*threads)?;
@@ -289,9 +296,9 @@ fn pareto(arguments: &ParetoArguments) -> Result<()> {
         pareto::charts(&name, &lines, &out.join(format!("pareto-{name}")))?;
         text.push_str(&format!("## {scene}\n\n{}\n", pareto::table(&lines)));
     }
-    finish(&bench, &text, "pareto.md")?;
+    finish(&bench, &arguments.sitting, &text, "pareto")?;
     if !arguments.sitting.draw && arguments.sitting.part.writes_tables() {
-        kernels::run(out, *quick)?;
+        kernels::run(out, *quick, arguments.sitting.publish)?;
     }
     Ok(())
 }
@@ -312,7 +319,7 @@ fn capacity_bench(arguments: &CapacityArguments) -> Result<()> {
         capacity::chart(&name, &lines, &out.join(format!("capacity-{name}")))?;
         text.push_str(&format!("## {scene}\n\n{}\n", capacity::table(&lines)));
     }
-    finish(&bench, &text, "capacity.md")
+    finish(&bench, &arguments.sitting, &text, "capacity")
 }
 
 fn stability(arguments: &StabilityArguments) -> Result<()> {
@@ -345,11 +352,11 @@ fn stability(arguments: &StabilityArguments) -> Result<()> {
         let (table, finite) = (stability::table(&sweep.axes, &lines), stability::finite(&lines));
         text.push_str(&format!("## {scene}\n\n{table}\n{finite}\n\n"));
     }
-    finish(&bench, &text, "stability.md")
+    finish(&bench, &arguments.sitting, &text, "stability")
 }
 
 /// Prints and writes the table, and says what there is.
-fn finish(bench: &Bench, text: &str, name: &str) -> Result<()> {
+fn finish(bench: &Bench, sitting: &SittingArguments, text: &str, name: &str) -> Result<()> {
     let (begun, left) = bench.counts();
     if bench.is_part() {
         say!(
@@ -358,13 +365,24 @@ fn finish(bench: &Bench, text: &str, name: &str) -> Result<()> {
         );
         return Ok(());
     }
-    let path = bench.path().with_file_name(name);
+    let path = bench.path().with_file_name(format!("{name}.md"));
     write(&path, text)?;
     say!("\n{text}");
     say!("written: {}\nwritten: {}", bench.path().display(), path.display());
     say!("{begun} runs in {:.1} minutes", bench.seconds() / 60.0);
     if left > 0 {
         say!("{left} points are left: the same command goes on with them");
+    }
+    if sitting.publish {
+        let title = match name {
+            "pareto" => "Speed against accuracy",
+            "capacity" => "Parameters against accuracy",
+            "stability" => "Where methods break",
+            _ => "What a step costs",
+        };
+        let stem = if name == "cost" { "growth" } else { name };
+        let charts = results::charts(bench.path().parent().unwrap_or(Path::new(".")), stem)?;
+        results::publish(&Section { name, title, body: text, charts: &charts })?;
     }
     Ok(())
 }

@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Result, bail, ensure};
 use clap::Args;
-use occnerf::capture::{LoadOptions, Wrong};
+use occnerf::capture::{LoadOptions, Perturbation};
 use occnerf::{Lpips, Preset};
 
 use crate::eval::{load_lpips, network_name};
@@ -17,8 +17,9 @@ use crate::list::unique_name;
 use crate::optimise::SavingArguments;
 use crate::process::say;
 use crate::process::{Ending, Lock};
+use crate::results::{self, Section};
 use crate::run::{self, Metrics, RunConfig, make_directory};
-use crate::settings::PresetName;
+use crate::settings;
 use crate::shard::ShardArguments;
 use crate::source::{self, LoadArguments, Source};
 use crate::train::{finished, run_unless_finished};
@@ -45,8 +46,8 @@ pub struct ReproduceArguments {
     #[arg(long, default_value_t = 3, value_name = "N", value_parser = clap::value_parser!(u64).range(1..=100))]
     seeds: u64,
     /// Settings that every row starts from
-    #[arg(long, default_value = "fast")]
-    preset: PresetName,
+    #[arg(long, default_value = "fast", value_parser = settings::preset())]
+    preset: Preset,
     /// Steps of a row, in place of a budget
     #[arg(long)]
     steps: Option<u64>,
@@ -66,21 +67,24 @@ pub struct ReproduceArguments {
     /// How much wrong poses, shapes and masks cost: the main methods at each, one table
     #[arg(long)]
     robustness: bool,
+    /// Make the tables a section of xtask/RESULTS.md, and of the first scene the table of README
+    #[arg(long)]
+    publish: bool,
 }
 
 /// A prior made wrong, and its directory.
-const LEVELS: [(&str, Wrong); 9] = {
-    let none = Wrong { pose_degrees: 0.0, shape: 0.0, mask_pixels: 0 };
+const LEVELS: [(&str, Perturbation); 9] = {
+    let none = Perturbation { pose_degrees: 0.0, shape: 0.0, mask_pixels: 0 };
     [
         ("as-it-is", none),
-        ("pose-2", Wrong { pose_degrees: 2.0, ..none }),
-        ("pose-5", Wrong { pose_degrees: 5.0, ..none }),
-        ("pose-10", Wrong { pose_degrees: 10.0, ..none }),
-        ("shape-1", Wrong { shape: 1.0, ..none }),
-        ("shape-2", Wrong { shape: 2.0, ..none }),
-        ("mask-minus-3", Wrong { mask_pixels: -3, ..none }),
-        ("mask-minus-1", Wrong { mask_pixels: -1, ..none }),
-        ("mask-plus-3", Wrong { mask_pixels: 3, ..none }),
+        ("pose-2", Perturbation { pose_degrees: 2.0, ..none }),
+        ("pose-5", Perturbation { pose_degrees: 5.0, ..none }),
+        ("pose-10", Perturbation { pose_degrees: 10.0, ..none }),
+        ("shape-1", Perturbation { shape: 1.0, ..none }),
+        ("shape-2", Perturbation { shape: 2.0, ..none }),
+        ("mask-minus-3", Perturbation { mask_pixels: -3, ..none }),
+        ("mask-minus-1", Perturbation { mask_pixels: -1, ..none }),
+        ("mask-plus-3", Perturbation { mask_pixels: 3, ..none }),
     ]
 };
 /// The methods themselves, each by its best pixel rule, and the published baseline.
@@ -141,7 +145,7 @@ struct Experiment<'a> {
 
 impl Experiment<'_> {
     fn plan(&self, directory: &Path, source: &Source, rows: &[&Row], minutes: f64) -> Result<Plan> {
-        let preset: Preset = self.arguments.preset.into();
+        let preset: Preset = self.arguments.preset;
         let request = Request {
             preset: preset.name().to_owned(),
             seeds: self.arguments.seeds,
@@ -183,13 +187,25 @@ impl Experiment<'_> {
                 say!("written: {}", name.display());
             }
         }
+        if self.arguments.publish {
+            let (name, title) = (format!("reproduce-{}", summary.name()), format!("Methods on {}", summary.name()));
+            let chart = [summary.chart(directory, &name)?];
+            let body = summary.markdown();
+            results::publish(&Section { name: &name, title: &title, body: &body, charts: &chart })?;
+            if self.arguments.scenes.first().is_none_or(|first| first == self.scene) {
+                results::publish_table(&summary.front())?;
+            }
+        }
         Ok(())
     }
 
     /// The main rows at each level of wrongness.
     fn robustness(&self, directory: &Path) -> Result<()> {
         let options = self.arguments.load.options()?;
-        ensure!(options.wrong == Wrong::default(), "--robustness goes through its own errors: leave --wrong-… out");
+        ensure!(
+            options.wrong == Perturbation::default(),
+            "--robustness goes through its own errors: leave --wrong-… out"
+        );
         let rows = self.arguments.rows(|row| MAIN.contains(&row.name));
         make_directory(directory)?;
         let mut plan = None;
@@ -217,6 +233,12 @@ impl Experiment<'_> {
         }
         say!("\n{}", summary::by_level(self.scene, &levels));
         say!("written: {}", directory.join("robustness.md").display());
+        if self.arguments.publish {
+            let scene = crate::train::scene_name(Some(self.scene));
+            let (name, title) = (format!("robustness-{scene}"), format!("A wrong prior on {scene}"));
+            let body = summary::by_level(&scene, &levels);
+            results::publish(&Section { name: &name, title: &title, body: &body, charts: &[] })?;
+        }
         Ok(())
     }
 
@@ -230,7 +252,7 @@ impl Experiment<'_> {
                     scene: source.scene.clone(),
                     body: source.body.clone(),
                     load: source.load.clone(),
-                    train: plan.config(row, self.arguments.preset.into(), seed),
+                    train: plan.config(row, self.arguments.preset, seed),
                 };
                 if let Some(path) = &self.arguments.perceptual_weights {
                     run.train.loss.perceptual_weights.clone_from(path);
