@@ -50,6 +50,7 @@ pub use evaluate::{FrameMetrics, SplitMetrics, evaluate, evaluate_with, least_se
 pub use lpips::{Lpips, Trunk};
 pub use model::body::{Body, Moment};
 pub use model::colors::VertexColors;
+pub use model::person::Person;
 pub use model::saved::checkpoint_config;
 pub use model::times::StepTimes;
 pub use model::trained::{Model, upright};

@@ -8,6 +8,7 @@ use occnerf::capture::{Layout, Obstacle, Occlusion, SynthConfig, Synthetic};
 
 use crate::film::{bar, film, is_character};
 use crate::obstacle::ObstacleArguments;
+use crate::process::say;
 
 /// What a finished directory holds, and nothing else does.
 const MARK: &str = "synth.json";
@@ -140,7 +141,7 @@ pub fn synth(arguments: &SynthArguments) -> Result<()> {
         return Err(error);
     }
     let capture = &synthetic.capture;
-    println!(
+    say!(
         "{}: {} frames, {} views kept back, {:.1} % of the person hidden where anything is, {} joints, {} vertices",
         out.display(),
         capture.train.len(),
@@ -149,12 +150,12 @@ pub fn synth(arguments: &SynthArguments) -> Result<()> {
         synthetic.body.num_joints(),
         synthetic.body.num_vertices(),
     );
-    println!("train on it: cargo xtask train {}", out.display());
+    say!("train on it: cargo xtask train {}", out.display());
     Ok(())
 }
 
 fn write(synthetic: &Synthetic, directory: &Path, layout: Layout) -> Result<()> {
-    std::fs::create_dir_all(directory).with_context(|| directory.display().to_string())?;
+    crate::run::make_directory(directory)?;
     let bar = bar("writing", synthetic.num_pictures(layout));
     synthetic.write(directory, layout, &|_| bar.inc(1))?;
     bar.finish_and_clear();

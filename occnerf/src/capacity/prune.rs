@@ -20,8 +20,6 @@ impl Model {
     /// Empties the rows of the hash table that training never moved: they are no longer counted and no longer stored in a
     /// checkpoint. What a training ray can meet stays the same to the bit; elsewhere a feature changes by the 1e-4 that such a
     /// row was filled with at the start.
-    ///
-    /// A step taken afterwards makes all rows learnable again.
     pub fn prune(&mut self) -> Pruned {
         let features = self.config.encoding.features.max(1);
         let initial = self.field.encoder.initial_table(self.config.seed);

@@ -16,6 +16,7 @@ mod image;
 mod names;
 mod obstacle;
 mod options;
+mod perturbation;
 mod pictures;
 mod pixels;
 mod records;
@@ -26,7 +27,6 @@ mod testing;
 mod undistort;
 mod wild;
 mod write;
-mod wrong;
 mod zju;
 
 pub use self::demo::{DemoConfig, demo};
@@ -36,10 +36,10 @@ pub use self::frame::{Capture, EvalFrame, Frame};
 pub use self::image::Image;
 pub use self::obstacle::Obstacle;
 pub use self::options::LoadOptions;
+pub use self::perturbation::Perturbation;
 pub use self::pixels::Pixels;
 pub use self::source::PixelSource;
 pub use self::synth::{Occlusion, SynthConfig, Synthetic, synthesise};
-pub use self::wrong::Wrong;
 
 use std::path::Path;
 

@@ -132,6 +132,18 @@ pub enum Component {
     Perceptual,
 }
 
+impl Component {
+    /// The name used on the command line.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Surface => "surface",
+            Self::Attention => "attention",
+            Self::Completeness => "completeness",
+            Self::Perceptual => "perceptual",
+        }
+    }
+}
+
 /// The perceptron F.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -239,6 +251,21 @@ pub struct LossConfig {
     pub completeness: f32,
     /// β of the completeness term, in units of the density.
     pub beta: f32,
+}
+
+impl LossConfig {
+    /// The perceptual term: `ms-ssim`, `lpips` or `none`.
+    pub fn perceptual_name(&self) -> String {
+        let embedded = self.perceptual_weights.is_empty();
+        if self.perceptual == 0.0 {
+            "none"
+        } else if embedded {
+            "ms-ssim"
+        } else {
+            "lpips"
+        }
+        .to_owned()
+    }
 }
 
 /// Adam's learning rates.

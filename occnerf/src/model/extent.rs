@@ -91,6 +91,8 @@ mod tests {
     use crate::capture::{DemoConfig, demo};
     use crate::config::{Method, Preset};
     use crate::model::vertices::VertexCode;
+    use crate::scene::prepared::Scene;
+    use crate::train::trainer::Trainer;
 
     fn scene(config: &Config) -> Scene {
         let body = smpl::BodyModel::embedded();
@@ -98,11 +100,11 @@ mod tests {
         Scene::new(&demo(&demo_config, &body).unwrap(), &body, config).unwrap()
     }
 
-    fn shell(scene: &Scene, config: &Config) -> Shell {
+    fn extent(scene: &Scene, config: &Config) -> Extent {
         let trainer = Trainer::new(scene, config.clone()).unwrap();
         let mut code = VertexCode::default();
-        trainer.encode_vertices(&mut code);
-        trainer.measure_shell(&code.rows)
+        trainer.model().encode_vertices(&mut code);
+        trainer.model().measure_extent(&code)
     }
 
     #[test]
@@ -116,8 +118,8 @@ mod tests {
         let raw = (end(EMPTY).exp() - 1.0).ln();
         let slope = (config.field.density_bias_outside - config.field.density_bias) / 0.06;
         let expected = (raw - config.field.density_bias) / slope;
-        let found = shell(&scene, &config);
-        assert_eq!(found.faces.len(), scene.model.faces.len());
+        let found = extent(&scene, &config);
+        assert_eq!(found.faces.len(), scene.body.model.faces.len());
         for end in &found.vertices {
             assert!((expected..expected + 2.0 * LAYER).contains(end), "{end}, density ends at {expected}");
         }
@@ -129,7 +131,7 @@ mod tests {
             let mut config = Config::preset(Preset::Fast, Method::HashPoint);
             (config.field.density_bias, config.field.density_bias_outside) = (bias, bias);
             let scene = scene(&config);
-            let found = shell(&scene, &config);
+            let found = extent(&scene, &config);
             assert!(found.vertices.iter().chain(&found.faces).all(|&end| end == expected), "{bias}: {found:?}");
             assert_eq!(found.farthest, expected);
         }

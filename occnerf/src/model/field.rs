@@ -16,7 +16,7 @@ use crate::model::surface_term::{Gather, Mix};
 use crate::model::times::{StepTimes, Stopwatch};
 
 /// Samples that pass through the perceptron together; their activations fit a second-level cache.
-const BLOCK: usize = 256;
+pub(crate) const BLOCK: usize = 256;
 /// Widest layers whose activations are worked out anew for the backward pass: to write them to memory and to read them again
 /// takes as long, and as much memory as all else that is known of a sample. Of wider ones it takes less time.
 const NARROW: usize = 64;

@@ -130,12 +130,6 @@ impl<'a> Contents<'a> {
         self.header(key).ok_or_else(|| self.wrong(format!("header lacks `{key}`")))
     }
 
-    /// The length of an array of the given type.
-    pub fn len(&self, key: &str) -> Result<usize, Error> {
-        let view = self.tensors.tensor(key).map_err(|_| self.wrong(format!("lacks `{key}`")))?;
-        Ok(view.shape().iter().product())
-    }
-
     fn bytes_of(&self, key: &str, dtype: Dtype, len: usize) -> Result<&[u8], Error> {
         let view = self.tensors.tensor(key).map_err(|_| self.wrong(format!("lacks `{key}`")))?;
         if view.dtype() != dtype || view.shape() != [len] {

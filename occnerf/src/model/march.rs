@@ -2,7 +2,7 @@
 //! time, so that those behind an opaque surface need not be.
 
 use glam::Vec3;
-use volrender::{Composite, composite};
+use volrender::{Composite, RaySamples, composite};
 
 use crate::model::field::SampleBatch;
 use crate::model::samples::Samples;
@@ -130,36 +130,23 @@ pub(crate) fn composite_batch(
     composites: &mut Vec<Composite>,
 ) {
     let Samples { starts, likelihood, delta, t, .. } = &batch.samples;
-    RaysOfSamples { starts, sigma: &batch.sigma, likelihood, delta, t, rgb: &batch.rgb }
-        .composite(background, weights, composites);
+    let samples = RaySamples { sigma: &batch.sigma, likelihood, delta, t, rgb: &batch.rgb };
+    composite_rays(starts, samples, background, weights, composites);
 }
 
-/// The samples of rays, ray by ray, as far as compositing reads them.
-pub(crate) struct RaysOfSamples<'a> {
-    /// First sample of each ray, and the end of the last.
-    pub starts: &'a [usize],
-    pub sigma: &'a [f32],
-    pub likelihood: &'a [f32],
-    pub delta: &'a [f32],
-    pub t: &'a [f32],
-    pub rgb: &'a [Vec3],
-}
-
-impl RaysOfSamples<'_> {
-    pub fn composite(&self, background: Vec3, weights: &mut Vec<f32>, composites: &mut Vec<Composite>) {
-        weights.resize(self.t.len(), 0.0);
-        composites.clear();
-        for ends in self.starts.windows(2) {
-            let range = ends[0]..ends[1];
-            composites.push(composite(
-                &self.sigma[range.clone()],
-                &self.likelihood[range.clone()],
-                &self.delta[range.clone()],
-                &self.t[range.clone()],
-                &self.rgb[range.clone()],
-                background,
-                &mut weights[range],
-            ));
-        }
+/// Composites rays whose samples stand ray by ray; `starts` has the first sample of each ray, and
+/// the end of the last.
+pub(crate) fn composite_rays(
+    starts: &[usize],
+    samples: RaySamples<'_>,
+    background: Vec3,
+    weights: &mut Vec<f32>,
+    composites: &mut Vec<Composite>,
+) {
+    weights.resize(samples.t.len(), 0.0);
+    composites.clear();
+    for ends in starts.windows(2) {
+        let range = ends[0]..ends[1];
+        composites.push(composite(samples.slice(range.clone()), background, &mut weights[range]));
     }
 }

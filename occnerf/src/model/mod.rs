@@ -13,6 +13,7 @@ pub(crate) mod gemm;
 pub(crate) mod march;
 pub(crate) mod parameters;
 pub(crate) mod perceptron;
+pub(crate) mod person;
 pub(crate) mod samples;
 pub(crate) mod saved;
 pub(crate) mod surface_term;

@@ -3,7 +3,7 @@
 use glam::{Vec3, Vec4};
 use smpl::{MotionField, MotionFrame, Posed};
 use surface_query::MeshDistance;
-use volrender::{Composite, Occupancy, Ray};
+use volrender::{Composite, Occupancy, OccupancyConfig, Ray};
 
 use crate::Error;
 use crate::config::Config;
@@ -35,11 +35,11 @@ impl PosedSurface {
 
     /// Moves it to another pose, out to `extent`.
     pub fn refit(&mut self, body: &Body, posed: &Posed, extent: &Extent, config: &Config) {
-        let (reach, depth) = (config.motion.reach(), config.motion.depth);
         let Self { mesh, occupancy, cell } = self;
+        let size = OccupancyConfig { margin: config.motion.reach(), depth: config.motion.depth, cell: *cell };
         rayon::join(
             || mesh.refit(&posed.vertices),
-            || occupancy.rebuild(&posed.vertices, &body.model.faces, &extent.faces, reach, depth, *cell),
+            || occupancy.rebuild(&posed.vertices, &body.model.faces, &extent.faces, size),
         );
     }
 }
@@ -47,8 +47,8 @@ impl PosedSurface {
 /// Cells near the canonical prior, which are marked once and for all.
 pub(crate) fn near_canonical(body: &Body, config: &Config) -> Occupancy {
     let (mut occupancy, whole) = (Occupancy::default(), Extent::whole(body, config));
-    let (vertices, faces, motion) = (&body.canonical.vertices, &body.model.faces, &config.motion);
-    occupancy.rebuild(vertices, faces, &whole.faces, whole.farthest, motion.depth, FINE_CELL);
+    let size = OccupancyConfig { margin: whole.farthest, depth: config.motion.depth, cell: FINE_CELL };
+    occupancy.rebuild(&body.canonical.vertices, &body.model.faces, &whole.faces, size);
     occupancy
 }
 
@@ -243,5 +243,59 @@ impl Tracer<'_> {
             samples.world.push(point);
         }
         live
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::capture::{DemoConfig, demo};
+    use crate::config::{DistanceKind, Method, Preset};
+    use crate::model::view::PosedView;
+    use crate::scene::prepared::Scene;
+    use crate::train::trainer::Trainer;
+
+    #[test]
+    fn with_a_volume_a_sample_lives_where_the_canonical_prior_is_near() {
+        let body = smpl::BodyModel::embedded();
+        let capture = demo(&DemoConfig { size: 32, frames: 2, eval_cameras: 1, ..Default::default() }, &body).unwrap();
+        for distance in [DistanceKind::Blended, DistanceKind::Exact] {
+            let mut config = Config::preset(Preset::Paper, Method::Occnerf);
+            (config.surface.distance, config.encoding.log2_table_size) = (distance, 8);
+            let scene = Scene::new(&capture, &body, &config).unwrap();
+            let trainer = Trainer::new(&scene, config.clone()).unwrap();
+            let frame: &PosedView = &scene.train[1].view;
+            let motion = MotionFrame::new(&body, &frame.posed);
+            let tracer = trainer.model().tracer(&trainer.buffers.surface, &trainer.model().extent, &motion);
+            let MotionField::Volume { weights, threshold } = tracer.motion else { panic!("a volume was asked for") };
+            let (reach, k) = (config.motion.reach(), config.surface.k);
+            let low = frame.posed.vertices.iter().copied().reduce(Vec3::min).unwrap() - 2.0 * reach;
+            let size = frame.posed.vertices.iter().copied().reduce(Vec3::max).unwrap() + 2.0 * reach - low;
+            let mut random = Stream::new(&[5]);
+            let (mut counts, mut samples) = ([0; 3], Samples::default());
+            for _ in 0..20_000 {
+                let point = low + size * Vec3::new(random.uniform(), random.uniform(), random.uniform());
+                let Some(mapped) = weights.map(&motion.to_canonical, point, *threshold) else {
+                    assert!(!tracer.push_point(&mut samples, point));
+                    continue;
+                };
+                let exact = scene.body.surface.closest(mapped.canonical, f32::INFINITY).unwrap().signed_distance;
+                let mut neighbours = vec![0; scene.body.query.neighbours_per_query()];
+                scene.body.query.neighbours(mapped.canonical, &mut neighbours);
+                let blended = scene.body.query.blend(mapped.canonical, &neighbours[..k]).signed_distance;
+                let used = if distance == DistanceKind::Exact { exact } else { blended };
+                let within = |d: f32| d <= reach && d >= -config.motion.depth;
+                let live = tracer.push_point(&mut samples, point);
+                // A little beyond the margin, as far as a cell or the corner of a box, either is right; nobody is as deep as `depth`.
+                if within(exact) {
+                    assert_eq!(live, within(used), "{point}: {exact}, {used}");
+                    counts[usize::from(live)] += 1;
+                } else if exact > 2.0 * reach {
+                    assert!(!live, "{point}: {exact}, {used}");
+                    counts[2] += 1;
+                }
+            }
+            assert!(counts[1] > 500 && counts[2] > 100, "{counts:?}");
+        }
     }
 }

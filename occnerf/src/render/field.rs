@@ -62,3 +62,54 @@ impl Renderer for FieldRenderer<'_> {
         })
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::{Config, Method, Preset};
+    use crate::model::field::SampleBatch;
+    use crate::model::march::composite_batch;
+    use crate::scene::prepared::Scene;
+    use crate::train::trainer::Trainer;
+
+    #[test]
+    fn a_picture_drawn_front_to_back_is_that_of_all_samples_at_once() {
+        let body = smpl::BodyModel::embedded();
+        let demo = crate::capture::DemoConfig { size: 32, frames: 3, eval_cameras: 1, ..Default::default() };
+        let capture = crate::capture::demo(&demo, &body).unwrap();
+        let mut config = Config { steps: 40, ..Config::preset(Preset::Fast, Method::Occnerf) };
+        // Dense enough for rays to end, however little was learnt.
+        config.field.density_scale *= 4.0;
+        let scene = Scene::new(&capture, &body, &config).unwrap();
+        let mut trainer = Trainer::new(&scene, config).unwrap();
+        for _ in 0..40 {
+            trainer.step().unwrap();
+        }
+        let (view, background) = (&*scene.eval[0].view, Vec3::new(0.3, 0.6, 0.9));
+        let model = trainer.model();
+        let mut renderer = FieldRenderer::new(model).unwrap();
+        let picture = renderer.render(view, background).unwrap();
+        let posed = model.corrected(view);
+        let whole = Extent::whole(&scene.body, model.config());
+        renderer.surface.refit(&scene.body, &posed, &whole, model.config());
+        let motion = MotionFrame::new(&body, &posed);
+        let tracer = model.tracer(&renderer.surface, &whole, &motion);
+        let mut all = SampleBatch::default();
+        all.samples.clear();
+        for pixel in 0..32 * 32 {
+            tracer.trace_all(&mut all.samples, &view.pixel_ray(pixel));
+        }
+        model.evaluate(&renderer.code, &mut all, None);
+        let (mut weights, mut composites) = (Vec::new(), Vec::new());
+        composite_batch(&all, background, &mut weights, &mut composites);
+        let (mut worst, mut solid) = (0.0f32, 0);
+        for (pixel, expected) in composites.iter().enumerate() {
+            let found = Vec3::from_slice(&picture.image.pixels[3 * pixel..]);
+            worst = worst.max((found - expected.color).abs().max_element());
+            worst = worst.max((picture.opacity[pixel] - expected.opacity).abs());
+            solid += usize::from(expected.opacity > 1.0 - MARCH.min_transmittance);
+        }
+        assert!(solid > 50, "{solid} rays end early");
+        assert!(worst < MARCH.min_transmittance + 1e-5, "{worst}");
+    }
+}

@@ -1,10 +1,10 @@
 //! The samples of a march put back into the order of their rays, for compositing and its backward.
 
 use glam::Vec3;
-use volrender::{Composite, composite_backward};
+use volrender::{Composite, RaySamples, SampleGradients, composite_backward};
 
 use crate::model::field::SampleBatch;
-use crate::model::march::{RaysOfSamples, Segment, Segments};
+use crate::model::march::{Segment, Segments, composite_rays};
 
 /// The samples of segments, ray by ray, and their gradients.
 #[derive(Default)]
@@ -67,7 +67,8 @@ impl OrderedSamples {
     /// Composites every ray.
     pub fn composite(&mut self, background: Vec3, composites: &mut Vec<Composite>) {
         let Self { starts, sigma, likelihood, delta, t, rgb, weights, .. } = self;
-        RaysOfSamples { starts, sigma, likelihood, delta, t, rgb }.composite(background, weights, composites);
+        let samples = RaySamples { sigma, likelihood, delta, t, rgb };
+        composite_rays(starts, samples, background, weights, composites);
     }
 
     /// Backward of [`OrderedSamples::composite`], into the segments' batches; `d_colors` of each ray.
@@ -81,21 +82,17 @@ impl OrderedSamples {
         self.d_sigma.resize(n, 0.0);
         self.d_rgb.resize(n, Vec3::ZERO);
         self.d_likelihood.resize(n, 0.0);
-        for (ends, d_color) in self.starts.windows(2).zip(d_colors) {
+        let Self { starts, sigma, likelihood, delta, t, rgb, weights, d_sigma, d_rgb, d_likelihood, .. } = self;
+        let samples = RaySamples { sigma, likelihood, delta, t, rgb };
+        for (ends, d_color) in starts.windows(2).zip(d_colors) {
             let range = ends[0]..ends[1];
-            composite_backward(
-                &self.sigma[range.clone()],
-                &self.likelihood[range.clone()],
-                &self.delta[range.clone()],
-                &self.rgb[range.clone()],
-                background,
-                &self.weights[range.clone()],
-                d_color,
-                0.0,
-                &mut self.d_sigma[range.clone()],
-                &mut self.d_rgb[range.clone()],
-                &mut self.d_likelihood[range],
-            );
+            let gradients = SampleGradients {
+                d_sigma: &mut d_sigma[range.clone()],
+                d_rgb: &mut d_rgb[range.clone()],
+                d_likelihood: &mut d_likelihood[range.clone()],
+            };
+            let weights = &weights[range.clone()];
+            composite_backward(samples.slice(range), background, weights, d_color, 0.0, gradients);
         }
         for Segment { batch, .. } in segments.all_mut() {
             let n = batch.samples.len();

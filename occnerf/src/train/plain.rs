@@ -10,7 +10,7 @@ use visibility::VisibilityCounts;
 
 use crate::config::{Config, Method, MotionKind, Preset};
 use crate::model::encoder::Encoder;
-use crate::model::field::Group;
+use crate::model::field::SampleBatch;
 use crate::model::parameters::Part;
 use crate::random::Stream;
 use crate::scene::prepared::Scene;
@@ -26,9 +26,9 @@ struct Plain<'a, 'b> {
 impl Plain<'_, '_> {
     /// Rows of features at points of the unit cube, or of space.
     fn encode<const D: usize>(&self, table: &[f32], points: &[[f32; D]]) -> Vec<Vec<f64>> {
-        let encoding = &self.trainer.config.encoding;
+        let encoding = &self.trainer.model.config.encoding;
         let flat: Vec<f64> = points.iter().flatten().map(|&x| f64::from(x)).collect();
-        let (ranges, resolutions) = match &self.trainer.field.encoder {
+        let (ranges, resolutions) = match &self.trainer.model.field.encoder {
             Encoder::Frequency => {
                 let row = |x: &[f64]| {
                     let bands = (0..10).flat_map(|band| {
@@ -55,15 +55,18 @@ impl Plain<'_, '_> {
     /// The loss and the colours of the rays, in the order of the batch.
     fn step(&self, field: &[f32], table: &[f32]) -> (f64, Vec<DVec3>) {
         let trainer = self.trainer;
-        let (config, batch) = (&trainer.config, &trainer.batch);
+        let (config, batch) = (&trainer.model.config, &trainer.buffers.batch);
         let frame = &trainer.scene.train[batch.frame];
-        let vertices = self.encode(table, &trainer.vertex_code.at.surface);
+        let vertices = self.encode(table, &trainer.buffers.vertex_code.at.surface);
         let background = batch.background.as_dvec3();
         let mut colors = vec![DVec3::ZERO; batch.pixels.len()];
         let mut completeness = 0.0;
-        for state in &trainer.groups {
-            // All samples are one run.
-            let Some(Group { samples, at, .. }) = state.runs.groups().next() else { continue };
+        for state in &trainer.buffers.groups {
+            // All samples are one segment.
+            let Some(SampleBatch { samples, at, .. }) = state.segments.all().first().map(|segment| &segment.batch)
+            else {
+                continue;
+            };
             let points =
                 if at.surface.is_empty() { self.encode(table, &at.point) } else { self.encode(table, &at.surface) };
             let per_sample = samples.neighbours.len().checked_div(samples.len()).unwrap_or(0);
@@ -71,7 +74,7 @@ impl Plain<'_, '_> {
                 let (mut transmittance, mut color) = (1.0, DVec3::ZERO);
                 for s in ends[0]..ends[1] {
                     let mut input = points[s].clone();
-                    if trainer.field.surface_term {
+                    if trainer.model.field.surface_term {
                         let neighbours = &samples.neighbours[s * per_sample..][..per_sample];
                         let count = |v: u32| 1.0 + self.counts.counts()[v as usize] as f64;
                         let total: f64 = neighbours.iter().map(|&v| count(v)).sum();
@@ -82,9 +85,9 @@ impl Plain<'_, '_> {
                         }
                         input.extend(mixed);
                     }
-                    let raw = trainer.field.mlp.plain(field, &input);
+                    let raw = trainer.model.field.mlp.plain(field, &input);
                     let d = f64::from(samples.distance[s]);
-                    let (f, reach) = (&config.field, f64::from(config.motion.margin + config.motion.falloff));
+                    let (f, reach) = (&config.field, f64::from(config.motion.reach()));
                     let (inside, outside) = (f64::from(f.density_bias), f64::from(f.density_bias_outside));
                     let bias = inside + (outside - inside) * d.clamp(0.0, reach) / reach;
                     let sigma = f64::from(f.density_scale) * (raw[0] + bias).exp().ln_1p();
@@ -155,16 +158,16 @@ fn a_step_agrees_with_one_written_straight_from_the_definitions() {
             trainer.step().unwrap();
         }
         let mut random = Stream::new(&[seed, 21]);
-        trainer.parameters.get_mut(Part::Table).iter_mut().for_each(|x| *x += 0.3 * random.normal());
-        let before = trainer.parameters.clone();
-        let counts = trainer.counts.clone();
+        trainer.model.parameters.get_mut(Part::Table).iter_mut().for_each(|x| *x += 0.3 * random.normal());
+        let before = trainer.model.parameters.clone();
+        let counts = trainer.model.counts.clone();
         let report = trainer.step().unwrap();
-        let gradients = [Part::Field, Part::Table].map(|part| trainer.parameters.gradient(part).to_vec());
+        let gradients = [Part::Field, Part::Table].map(|part| trainer.optimiser.gradients.get(part).to_vec());
         let plain = Plain { trainer: &trainer, counts: &counts };
         let (field, table) = (before.get(Part::Field), before.get(Part::Table));
         let (loss, colors) = plain.step(field, table);
         assert!((loss - report.loss).abs() < 1e-4 * loss, "{method:?}: loss {} plain {loss}", report.loss);
-        let rays: Vec<(DVec3, DVec3)> = (trainer.groups.iter())
+        let rays: Vec<(DVec3, DVec3)> = (trainer.buffers.groups.iter())
             .flat_map(|g| g.rays.iter().zip(&g.composites).map(|(&ray, c)| (c.color.as_dvec3(), colors[ray])))
             .collect();
         assert!(rays.len() == 288 && report.live_samples > 500, "{} {}", rays.len(), report.live_samples);
@@ -177,7 +180,7 @@ fn a_step_agrees_with_one_written_straight_from_the_definitions() {
                 let from = [field, table][part];
                 let mut step: Vec<f32> = from.iter().map(|_| 1e-5 * random.normal()).collect();
                 if part == 0 {
-                    trainer.field.mlp.clear_padding(&mut step);
+                    trainer.model.field.mlp.clear_padding(&mut step);
                 }
                 let moved = |sign: f32| from.iter().zip(&step).map(|(x, s)| x + sign * s).collect::<Vec<f32>>();
                 let (high, low) = (moved(1.0), moved(-1.0));

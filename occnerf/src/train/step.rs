@@ -156,3 +156,105 @@ pub(crate) fn zero(buffer: &mut Vec<f32>, len: usize) {
     buffer.clear();
     buffer.resize(len, 0.0);
 }
+
+#[cfg(test)]
+mod tests {
+    use crate::capture::{DemoConfig, demo};
+    use crate::config::{Config, Method, Preset};
+    use crate::model::march::MarchOptions;
+    use crate::model::parameters::Part;
+    use crate::scene::prepared::Scene;
+    use crate::train::report::StepReport;
+    use crate::train::step::StepOptions;
+    use crate::train::trainer::Trainer;
+
+    /// Some steps with all samples, to make the surface opaque, and one more as `config` has it: its report, the colours of its
+    /// rays and the gradients.
+    fn step(scene: &Scene, config: &Config) -> (StepReport, Vec<glam::Vec3>, [Vec<f32>; 3]) {
+        let mut trainer = Trainer::new(scene, Config { min_transmittance: 0.0, ..config.clone() }).unwrap();
+        for _ in 0..60 {
+            trainer.step().unwrap();
+        }
+        let march = MarchOptions { segment: 6, min_transmittance: config.min_transmittance };
+        let report = trainer.step_with(StepOptions { march, skips_unknown: true }).unwrap();
+        let colors = trainer.buffers.groups.iter().flat_map(|g| g.composites.iter().map(|c| c.color)).collect();
+        let gradients =
+            [Part::Field, Part::Table, Part::Pose].map(|part| trainer.optimiser.gradients.get(part).to_vec());
+        (report, colors, gradients)
+    }
+
+    /// One step of the volume motion, whose gradients pass through everything, and of the surface motion.
+    #[test]
+    fn what_lies_outside_the_prior_at_unknown_pixels_has_no_gradient() {
+        let body = smpl::BodyModel::embedded();
+        let capture = demo(&DemoConfig { size: 40, frames: 4, eval_cameras: 1, ..Default::default() }, &body).unwrap();
+        for (preset, density_scale) in [(Preset::Fast, 25.0), (Preset::Paper, 25.0), (Preset::Paper, 4.0)] {
+            let mut config = Config::preset(preset, Method::Occnerf);
+            (config.patches, config.patch_size, config.samples, config.seed) = (4, 24, 48, 2);
+            (config.loss.perceptual, config.min_transmittance) = (0.0, 0.0);
+            config.encoding.log2_table_size = 12;
+            // The smaller one has densities below β inside, which completeness pushes up.
+            config.field.density_scale = density_scale;
+            let scene = Scene::new(&capture, &body, &config).unwrap();
+            let [all, few] = [false, true].map(|skips_unknown| {
+                let mut trainer = Trainer::new(&scene, config.clone()).unwrap();
+                let march = MarchOptions::training(config.min_transmittance);
+                let report = trainer.step_with(StepOptions { march, skips_unknown }).unwrap();
+                let parts = [Part::Field, Part::Table, Part::Vertices, Part::Motion];
+                (
+                    report,
+                    parts.map(|part| trainer.optimiser.gradients.get(part).to_vec()),
+                    trainer.model().visibility_counts().to_vec(),
+                )
+            });
+            let (live, less) = (all.0.live_samples, few.0.live_samples);
+            assert!(live > 1000 && 20 * less < 19 * live, "{preset:?}: {less} of {live} samples");
+            assert!((all.0.loss - few.0.loss).abs() < 1e-6 * all.0.loss, "{} {}", all.0.loss, few.0.loss);
+            assert_eq!(all.2, few.2);
+            for (all, few) in all.1.iter().zip(&few.1).filter(|(all, _)| !all.is_empty()) {
+                let difference = largest_difference(all, few);
+                assert!(difference < 1e-5, "{preset:?}: {difference}");
+            }
+        }
+    }
+
+    fn largest_difference(a: &[f32], b: &[f32]) -> f32 {
+        assert_eq!(a.len(), b.len());
+        let largest = a.iter().map(|x| x.abs()).fold(0.0, f32::max);
+        a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max) / largest
+    }
+
+    #[test]
+    fn segments_change_nothing_and_samples_behind_an_opaque_surface_next_to_nothing() {
+        let body = smpl::BodyModel::embedded();
+        let capture = demo(&DemoConfig { size: 40, frames: 4, eval_cameras: 1, ..Default::default() }, &body).unwrap();
+        let mut config = Config::preset(Preset::Fast, Method::Occnerf);
+        (config.patches, config.patch_size, config.steps) = (2, 24, 100);
+        config.field.density_scale *= 30.0;
+        let scene = Scene::new(&capture, &body, &config).unwrap();
+        let at = |min_transmittance| step(&scene, &Config { min_transmittance, ..config.clone() });
+        let (all, all_colors, all_gradients) = at(0.0);
+        // In many segments, until nothing at all shines through.
+        let (same, same_colors, same_gradients) = at(f32::MIN_POSITIVE);
+        assert!(same.live_samples <= all.live_samples && all.live_samples > 1000, "{}", same.live_samples);
+        for (a, b) in all_colors.iter().zip(&same_colors) {
+            assert!((*a - *b).abs().max_element() < 1e-6, "{a} {b}");
+        }
+        // Completeness is that of the samples that are evaluated.
+        assert!((same.loss - all.loss).abs() < 1e-4 * all.loss, "{} {}", same.loss, all.loss);
+        for (all, same) in all_gradients.iter().zip(&same_gradients) {
+            let difference = largest_difference(all, same);
+            assert!(difference < 1e-4, "{difference}");
+        }
+        let (less, less_colors, less_gradients) = at(1e-3);
+        let share = less.live_samples as f64 / all.live_samples as f64;
+        assert!(share < 0.9, "{share} of the samples");
+        for (a, b) in all_colors.iter().zip(&less_colors) {
+            assert!((*a - *b).abs().max_element() < 1.1e-3, "{a} {b}");
+        }
+        for (all, less) in all_gradients.iter().zip(&less_gradients) {
+            let difference = largest_difference(all, less);
+            assert!(difference < 0.02, "{difference}");
+        }
+    }
+}

@@ -6,6 +6,7 @@ use smpl::{MotionFrame, Posed};
 use visibility::VisibilityCounts;
 
 use crate::Error;
+use crate::capacity::Pruned;
 use crate::config::{Config, VisibilityKind};
 use crate::lpips::Lpips;
 use crate::model::colors::VertexColors;
@@ -112,13 +113,17 @@ impl<'a> Trainer<'a> {
         Ok(())
     }
 
+    /// [`Model::prune`]; a step taken afterwards makes all rows learnable again.
+    pub fn prune(&mut self) -> Pruned {
+        self.model.prune()
+    }
+
     /// Which perceptual term the run is trained with: `ms-ssim`, `lpips` with the network's name, or
     /// `none`.
     pub fn perceptual(&self) -> String {
         match &self.lpips {
             Some(lpips) => format!("lpips {}", lpips.trunk().name()),
-            None if self.model.config.loss.perceptual == 0.0 => "none".to_owned(),
-            None => "ms-ssim".to_owned(),
+            None => self.model.config.loss.perceptual_name(),
         }
     }
 

@@ -11,6 +11,7 @@ use plotters::style::text_anchor::{HPos, Pos, VPos};
 
 use super::scale::Scale;
 use crate::font::{FONT, LETTER, register_font};
+use crate::process::say;
 
 /// PNGs are drawn so much larger and reduced, for smooth edges.
 const OVERSAMPLING: i32 = 2;
@@ -101,7 +102,7 @@ impl Picture {
         self.draw(&BitMapBackend::with_buffer(&mut pixels, large).into_drawing_area(), OVERSAMPLING)?;
         let picture = RgbImage::from_raw(large.0, large.1, pixels).ok_or_else(|| anyhow!("picture of no size"))?;
         crate::pictures::save(&imageops::resize(&picture, size.0, size.1, FilterType::Triangle), &png)?;
-        println!("written: {}\nwritten: {}", svg.display(), png.display());
+        say!("written: {}\nwritten: {}", svg.display(), png.display());
         Ok([svg, png])
     }
 

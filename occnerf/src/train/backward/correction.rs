@@ -76,8 +76,10 @@ fn left_jacobian_transposed(delta: Vec3, v: Vec3) -> Vec3 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::model::correction::corrected;
     use crate::random::Stream;
-    use smpl::SurfaceMotion;
+    use glam::Quat;
+    use smpl::{Shaped, SurfaceMotion};
 
     fn random(stream: &mut Stream, size: f32) -> Vec3 {
         size * Vec3::new(stream.normal(), stream.normal(), stream.normal())
@@ -154,7 +156,7 @@ mod tests {
         };
         let mut wrenches = vec![Wrench::default(); model.num_joints()];
         for (face, bary, x, a) in &points {
-            let at = crate::train::pose_backward::Anchor::new(&model, &after, *face, *bary, *x).unwrap();
+            let at = crate::train::backward::pose::Anchor::new(&model, &after, *face, *bary, *x).unwrap();
             at.push(at.to_world(*a), &mut wrenches);
         }
         let gradient = correct_backward(&model, &posed, &correction, &after, &wrenches);

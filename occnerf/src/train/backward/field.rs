@@ -85,9 +85,11 @@ impl pulp::WithSimd for Scatter<'_> {
 #[cfg(test)]
 mod tests {
     use glam::Vec4;
+    use visibility::VisibilityCounts;
+    use volrender::Aabb;
 
     use super::*;
-    use crate::config::Preset;
+    use crate::config::{Config, Method, Preset};
     use crate::random::Stream;
 
     fn group(n: usize, vertices: usize, per_sample: usize, random: &mut Stream) -> SampleBatch {
@@ -108,7 +110,7 @@ mod tests {
     fn activations_that_are_kept_and_those_worked_out_anew_give_the_same_bits() {
         let config = Config::preset(Preset::Fast, Method::Occnerf);
         let mut field = Field::new(&config, Aabb { min: Vec3::splat(-0.1), max: Vec3::splat(1.1) }).unwrap();
-        let (n, vertices) = (3 * BLOCK - 100, 12);
+        let (n, vertices) = (3 * crate::model::field::BLOCK - 100, 12);
         let mut random = Stream::new(&[4]);
         let mut normal = |n: usize| (0..n).map(|_| random.normal()).collect::<Vec<f32>>();
         let (mlp, table) = (field.mlp.initial(1), normal(field.encoder.num_parameters()));
@@ -119,11 +121,13 @@ mod tests {
         let [anew, kept] = [true, false].map(|narrow| {
             field.narrow = narrow;
             let mut group = group(n, vertices, 20, &mut Stream::new(&[5]));
-            field.forward(&mlp, &table, &features, &VisibilityCounts::new(vertices), &mut group, None);
+            let counts = VisibilityCounts::new(vertices);
+            let learnt = Learnt { perceptron: &mlp, table: &table, vertices: &features, counts: &counts };
+            field.forward(&learnt, &mut group, None);
             group.d_sigma.clone_from(&d_sigma);
             group.d_rgb = d_rgb.chunks(3).map(Vec3::from_slice).collect();
             let (mut d_mlp, mut d_features) = (vec![0.0; mlp.len()], vec![0.0; features.len()]);
-            field.backward(&mlp, &transposed, &features, &mut group, &mut d_mlp, &mut d_features);
+            field.backward(&learnt, &transposed, &mut group, &mut d_mlp, &mut d_features);
             assert_eq!(group.blocks.len(), if narrow { 1 } else { 3 });
             (group.features, d_mlp, d_features)
         });
@@ -151,7 +155,8 @@ mod tests {
             let features = normal(vertices * width, &mut random);
             let (c_sigma, c_rgb) = (normal(n, &mut random), normal(3 * n, &mut random));
             let value = |group: &mut SampleBatch, mlp: &[f32], table: &[f32], features: &[f32]| -> f64 {
-                field.forward(mlp, table, features, &counts, group, None);
+                let learnt = Learnt { perceptron: mlp, table, vertices: features, counts: &counts };
+                field.forward(&learnt, group, None);
                 let sigma = group.sigma.iter().zip(&c_sigma).map(|(s, c)| f64::from(s * c) * 0.04);
                 let rgb = group.rgb.iter().zip(c_rgb.chunks(3)).map(|(s, c)| f64::from(s.dot(Vec3::from_slice(c))));
                 sigma.chain(rgb).sum()
@@ -162,7 +167,8 @@ mod tests {
             let (mut transposed, mut d_mlp) = (Vec::new(), vec![0.0; mlp.len()]);
             field.mlp.transposed_weights(&mlp, &mut transposed);
             let mut d_features = vec![0.0; features.len()];
-            field.backward(&mlp, &transposed, &features, &mut group, &mut d_mlp, &mut d_features);
+            let learnt = Learnt { perceptron: &mlp, table: &table, vertices: &features, counts: &counts };
+            field.backward(&learnt, &transposed, &mut group, &mut d_mlp, &mut d_features);
             field.mlp.clear_padding(&mut d_mlp);
             let mut d_table = vec![0.0; table.len()];
             field.encoder.encode_backward(std::iter::once((group.at.all(), &group.features[..])), &mut d_table);

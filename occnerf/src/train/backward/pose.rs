@@ -95,3 +95,111 @@ fn weights(model: &BodyModel, corners: [u32; 3], barycentric: [f32; 3]) -> impl 
     let each = corners.into_iter().zip(barycentric);
     each.flat_map(|(v, b)| model.weights.row(v as usize).map(move |(joint, w)| (joint, b * w)))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::{Config, Method, Preset};
+    use crate::model::correction::corrected;
+    use crate::model::parameters::Part;
+    use crate::model::trace::{CELL, PosedSurface};
+    use crate::random::Stream;
+    use crate::scene::prepared::Scene;
+    use crate::train::backward::correction::correct_backward;
+    use crate::train::trainer::Trainer;
+    use smpl::MotionFrame;
+
+    /// Value = Σ c · features(x) + e · d(x) + p · f(x) of points x that keep still while the pose is corrected.
+    #[test]
+    fn gradient_of_the_pose_agrees_with_finite_differences() {
+        let body = BodyModel::embedded();
+        let demo = crate::capture::DemoConfig { size: 32, frames: 2, eval_cameras: 1, ..Default::default() };
+        let capture = crate::capture::demo(&demo, &body).unwrap();
+        for method in [Method::Occnerf, Method::HashPoint] {
+            let mut config = Config::preset(Preset::Fast, method);
+            (config.encoding.levels, config.encoding.n_min, config.encoding.n_max) = (2, 3, 5);
+            let scene = Scene::new(&capture, &body, &config).unwrap();
+            let mut trainer = Trainer::new(&scene, config.clone()).unwrap();
+            trainer.model.parameters.get_mut(Part::Table).iter_mut().for_each(|v| *v *= 1e4);
+            let (frame, model) = (&*scene.train[1].view, &trainer.model);
+            let mut stream = Stream::new(&[11, method as u64]);
+            let mut random = |size: f32| size * Vec3::new(stream.normal(), stream.normal(), stream.normal());
+            let correction: Vec<Vec3> = (0..=body.num_joints()).map(|_| random(0.03)).collect();
+            let after = corrected(&body, &frame.shape, &frame.posed, &correction);
+            let mut points = Vec::new();
+            for (f, corners) in body.faces.iter().enumerate().step_by(7) {
+                let [a, b, c] = corners.map(|v| after.vertices[v as usize]);
+                let normal = (b - a).cross(c - a).normalize_or_zero();
+                points.push((a + b + c) / 3.0 + ((f % 9) as f32 / 8.0 * 0.024 - 0.012) * normal);
+            }
+            // Which points live, and on which face, is decided once: the value jumps where that changes.
+            let mut surface = PosedSurface::new(&scene.body, CELL).unwrap();
+            let mut trace = |posed: &Posed, batch: &mut SampleBatch| -> Vec<usize> {
+                surface.refit(&scene.body, posed, &model.extent, &config);
+                let motion = MotionFrame::new(&body, posed);
+                let tracer = model.tracer(&surface, &model.extent, &motion);
+                batch.samples.clear();
+                let live = (0..points.len()).filter(|&i| tracer.push_point(&mut batch.samples, points[i]));
+                let live = live.collect();
+                model.field.encoder.coordinates(&batch.samples, &scene.body.canonical_box, &mut batch.at);
+                live
+            };
+            let mut group = SampleBatch::default();
+            let live = trace(&after, &mut group);
+            assert!(live.len() > 500, "{}", live.len());
+            let width = model.field.encoder.num_features();
+            let (table, mut features) = (model.parameters.get(Part::Table), vec![0.0; live.len() * width]);
+            let mut jacobians = Arena::default();
+            group.jacobian = jacobians.take(live.len() * model.field.encoder.jacobian_width());
+            let jacobian = jacobians.piece_mut(&group.jacobian);
+            model.field.encoder.encode_jacobian(table, group.at.all(), &mut features, jacobian);
+            let d_rows: Vec<f32> = (0..live.len() * width).map(|_| random(1.0).x).collect();
+            group.features = vec![0.0; d_rows.len()];
+            let layout = model.field.encoder.layout(live.len());
+            layout.from_rows(&d_rows, width, 0..live.len(), &mut group.features);
+            group.d_distance = live.iter().map(|_| random(3.0).x).collect();
+            group.d_likelihood = live.iter().map(|_| random(0.3).x).collect();
+            let mut wrenches = vec![Wrench::default(); after.bones.len()];
+            pose_backward(model, &mut group, &jacobians, &after, &mut wrenches);
+            let gradient = correct_backward(&body, &frame.posed, &correction, &after, &wrenches);
+
+            let mut value = |correction: &[Vec3]| -> f64 {
+                let mut moved = SampleBatch::default();
+                let found = trace(&corrected(&body, &frame.shape, &frame.posed, correction), &mut moved);
+                let mut features = vec![0.0; found.len() * width];
+                model.field.encoder.encode(model.parameters.get(Part::Table), moved.at.all(), &mut features);
+                let mut rows = vec![0.0; features.len()];
+                let layout = model.field.encoder.layout(found.len());
+                layout.to_rows(&features, 0..found.len(), &mut rows, width);
+                let at = |i: usize| live.binary_search(&i).ok();
+                let terms = found.iter().enumerate().filter_map(|(s, &i)| {
+                    let l = at(i)?;
+                    let (cotangent, row) = (&d_rows[l * width..][..width], &rows[s * width..][..width]);
+                    let dot: f64 = cotangent.iter().zip(row).map(|(c, v)| f64::from(c * v)).sum();
+                    let d = f64::from(group.d_distance[l] * moved.samples.distance[s]);
+                    Some(dot + d + f64::from(group.d_likelihood[l] * moved.samples.likelihood[s]))
+                });
+                terms.sum()
+            };
+            let (mut numeric_all, mut analytic_all) = (Vec::new(), Vec::new());
+            for j in 0..correction.len() {
+                for axis in 0..3 {
+                    let mut at = |h: f32| {
+                        let mut moved = correction.clone();
+                        moved[j][axis] += h;
+                        value(&moved)
+                    };
+                    let h = 1.0 / 1024.0;
+                    numeric_all.push((at(h) - at(-h)) / (2.0 * f64::from(h)));
+                    analytic_all.push(f64::from(gradient[j][axis]));
+                }
+            }
+            let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
+            let (nn, aa, na) =
+                (dot(&numeric_all, &numeric_all), dot(&analytic_all, &analytic_all), dot(&numeric_all, &analytic_all));
+            let (cosine, ratio) = (na / (nn * aa).sqrt(), (aa / nn).sqrt());
+            // The surface is not flat: what slides along a tangent plane there is a tenth or two off here.
+            assert!(cosine > 0.9 && (0.85..1.2).contains(&ratio), "{method:?}: cosine {cosine}, ratio {ratio}");
+        }
+    }
+}

@@ -10,12 +10,15 @@ use anyhow::Result;
 use self::figure::{Figure, Sample};
 use super::chart::{Mark, Panel, Picture, Shape, Style};
 use super::scale::Scale;
+use crate::process::say;
+use crate::results::{self, Section};
+use crate::table;
 
 /// Name of the results.
 pub const RESULTS: &str = "kernels.json";
 /// Measures everything and draws it.
-pub fn run(directory: &Path, quick: bool) -> Result<()> {
-    std::fs::create_dir_all(directory)?;
+pub fn run(directory: &Path, quick: bool, publish: bool) -> Result<()> {
+    crate::run::make_directory(directory)?;
     let figure = Figure::new(if quick { 4_000 } else { 20_000 });
     let kernels = [
         measure::distance(&figure)?,
@@ -27,13 +30,15 @@ pub fn run(directory: &Path, quick: bool) -> Result<()> {
     let results: Vec<&Sample> = kernels.iter().flat_map(|k| &k.samples).collect();
     let path = directory.join(RESULTS);
     crate::run::write(&path, &serde_json::to_string_pretty(&results)?)?;
+    let mut text = String::new();
     for kernel in &kernels {
-        println!("{} ({}; {})", kernel.name, kernel.cost, kernel.error);
-        for s in &kernel.samples {
-            println!("  {:<26} {:10.1} {:10.3}", s.name, s.nanoseconds, s.error);
-        }
+        let mut lines = vec![[kernel.name, kernel.cost, kernel.error].map(str::to_owned).to_vec()];
+        let line = |s: &Sample| vec![s.name.clone(), format!("{:.1}", s.nanoseconds), format!("{:.3}", s.error)];
+        lines.extend(kernel.samples.iter().map(line));
+        text.push_str(&format!("{}\n", table::aligned(&lines, 1)));
     }
-    println!("written: {}", path.display());
+    say!("{text}");
+    say!("written: {}", path.display());
     let panels = kernels.iter().map(|kernel| {
         let of = |pick: fn(&Sample) -> f64| kernel.samples.iter().map(pick);
         Panel {
@@ -59,6 +64,11 @@ pub fn run(directory: &Path, quick: bool) -> Result<()> {
     ];
     let title = "Cost against error of each approximation (embedded body, one thread, medians)".to_owned();
     Picture { title, legend, columns: 2, size: (520, 380), panels: panels.collect() }
-        .write(&directory.join("kernels"))
-        .map(|_| ())
+        .write(&directory.join("kernels"))?;
+    if publish {
+        let charts = results::charts(directory, "kernels")?;
+        let (name, title) = ("kernels", "Cost against error of the geometric kernels");
+        results::publish(&Section { name, title, body: &text, charts: &charts })?;
+    }
+    Ok(())
 }

@@ -17,7 +17,7 @@ const SHAPE: u64 = 0x5348_4150;
 /// Errors added to what a capture says of the body and of its pixels. None by default.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
-pub struct Wrong {
+pub struct Perturbation {
     /// Root mean square error of each bone's global orientation, degrees, smooth in time, 0 to 90.
     pub pose_degrees: f32,
     /// Standard deviation of the error of each shape coefficient, the same in all frames, 0 to 5.
@@ -27,7 +27,7 @@ pub struct Wrong {
     pub mask_pixels: i32,
 }
 
-impl Wrong {
+impl Perturbation {
     pub(super) fn check(&self) -> Result<(), CaptureError> {
         let real = [("wrong.pose_degrees", self.pose_degrees, 90.0), ("wrong.shape", self.shape, 5.0)];
         for (name, value, most) in real {
@@ -124,7 +124,7 @@ mod tests {
     fn nothing_changes_by_default() {
         let body = BodyModel::embedded();
         let (before, mut after) = (capture(&body), capture(&body));
-        Wrong::default().apply(&mut after, &body).unwrap();
+        Perturbation::default().apply(&mut after, &body).unwrap();
         for (a, b) in before.train.iter().zip(&after.train) {
             assert!(
                 a.pose == b.pose
@@ -139,7 +139,7 @@ mod tests {
     fn bones_turn_by_the_angle_asked_for_about_the_pelvis_in_both_placements() {
         let body = BodyModel::embedded();
         let before = capture(&body);
-        let wrong = Wrong { pose_degrees: 6.0, ..Wrong::default() };
+        let wrong = Perturbation { pose_degrees: 6.0, ..Perturbation::default() };
         let mut about_pelvis = before.clone();
         for frame in &mut about_pelvis.train {
             let pelvis = body.shaped(&frame.betas).joints[0];
@@ -175,7 +175,7 @@ mod tests {
         let area = |c: &Capture| c.train.iter().map(|f| f.shown().mask.iter().sum::<f32>()).sum::<f32>();
         for (mask_pixels, grows) in [(2, true), (-2, false)] {
             let mut after = before.clone();
-            Wrong { mask_pixels, ..Wrong::default() }.apply(&mut after, &body).unwrap();
+            Perturbation { mask_pixels, ..Perturbation::default() }.apply(&mut after, &body).unwrap();
             assert_eq!(area(&after) > 1.1 * area(&before), grows);
             assert_eq!(area(&after) < 0.9 * area(&before), !grows);
             for frame in &after.train {
@@ -189,9 +189,9 @@ mod tests {
     #[test]
     fn errors_out_of_range_are_named() {
         for (wrong, name) in [
-            (Wrong { pose_degrees: f32::NAN, ..Wrong::default() }, "pose_degrees"),
-            (Wrong { shape: -1.0, ..Wrong::default() }, "shape"),
-            (Wrong { mask_pixels: 65, ..Wrong::default() }, "mask_pixels"),
+            (Perturbation { pose_degrees: f32::NAN, ..Perturbation::default() }, "pose_degrees"),
+            (Perturbation { shape: -1.0, ..Perturbation::default() }, "shape"),
+            (Perturbation { mask_pixels: 65, ..Perturbation::default() }, "mask_pixels"),
         ] {
             assert!(wrong.check().unwrap_err().to_string().contains(name));
         }
