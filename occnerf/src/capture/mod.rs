@@ -9,6 +9,7 @@ mod decode;
 mod demo;
 mod error;
 mod find;
+mod gate;
 mod humannerf;
 mod image;
 mod names;
