@@ -9,6 +9,7 @@ mod common;
 mod mutate;
 mod seeds;
 
+use std::hint::black_box;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
@@ -120,7 +121,7 @@ fn bodies() {
         std::fs::write(&path, bytes).unwrap();
         let Ok(body) = BodyModel::load(&path) else { return false };
         let pose = vec![glam::Vec3::splat(0.1); body.num_joints()];
-        body.pose(&body.shaped(&[]), &pose, smpl::Placement::default());
+        black_box(body.pose(&body.shaped(&[]), &pose, smpl::Placement::default()));
         true
     };
     Attack { name: "body npz", form: Form::Zip, seeds: seeds::body_archives(), share: 60, most: 64 * MIB }.run(read);
@@ -140,7 +141,7 @@ fn clips() {
     Attack { name: "motion clip", form: Form::Zip, seeds: seeds::clips(), share: 50, most: 64 * MIB }.run(|bytes| {
         std::fs::write(&path, bytes).unwrap();
         let Ok(clip) = MotionClip::load(&path) else { return false };
-        clip.at(clip.duration() * 0.4, 24);
+        black_box(clip.at(clip.duration() * 0.4, 24));
         true
     });
 }
@@ -149,11 +150,11 @@ fn clips() {
 fn characters() {
     Attack { name: "glTF", form: Form::Glb, seeds: seeds::characters(), share: 120, most: 64 * MIB }.run(|bytes| {
         let Ok(character) = Character::from_bytes("a.glb", bytes) else { return false };
-        character.rest();
+        black_box(character.rest());
         for animation in 0..character.animations.len().min(4) {
-            character.pose(animation, 0.3);
+            black_box(character.pose(animation, 0.3));
         }
-        character.joint_parents();
+        black_box(character.joint_parents());
         true
     });
 }
@@ -207,7 +208,7 @@ fn checkpoints() {
     attack.run(|bytes| {
         std::fs::write(&path, bytes).unwrap();
         match checkpoint_config(&path) {
-            Ok(found) if found == config => Trainer::resume(&scene, &path).is_ok(),
+            Ok(found) if found == config => Trainer::resume(scene, &path).is_ok(),
             other => other.is_ok(),
         }
     });
@@ -218,9 +219,9 @@ fn weights_of_networks() {
     let path = place("weights.pth");
     // The network that is wanted is not there: everything up to the names of the tensors is read.
     let attack = Attack { name: "torch", form: Form::Zip, seeds: seeds::weights(), share: 10, most: 64 * MIB };
-    let seed = attack.seeds[0].clone();
     attack.run(|bytes| {
         std::fs::write(&path, bytes).unwrap();
-        Lpips::load(&path).is_ok() || bytes == seed || bytes.len() % 64 == 0
+        let refused = Lpips::load(&path).err().map(|error| error.to_string()).unwrap_or_default();
+        refused.contains("trunk") || refused.contains("expected floats") || refused.contains("lacks")
     });
 }

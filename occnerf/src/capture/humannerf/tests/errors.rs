@@ -201,7 +201,7 @@ fn numbers_that_nothing_in_the_world_has() {
     fails("wild-shape", &["frame_000001.betas", "1000"], infos(&[FRAME, "betas"], array(&[1], &[1e30])));
     let lens = |f: f64, c: f64| array(&[3, 3], &[f, 0.0, c, 0.0, f, 2.0, 0.0, 0.0, 1.0]);
     for (f, c) in [(1e-30, 3.0), (1e30, 3.0), (8.0, -1e30)] {
-        fails("wild-lens", &["frame_000001.intrinsics", "pinhole", "pixels"], |fixture| {
+        fails("wild-lens", &["frame_000001.intrinsics", "pinhole", "10000000"], |fixture| {
             fixture.cameras.set(&[FRAME, "intrinsics"], lens(f, c));
             fixture.write();
         });
