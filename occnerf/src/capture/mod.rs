@@ -11,6 +11,7 @@ mod error;
 mod files;
 mod find;
 mod frame;
+mod gate;
 mod humannerf;
 mod image;
 mod names;
