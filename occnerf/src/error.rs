@@ -32,6 +32,9 @@ pub enum Error {
     /// Pictures or weights that LPIPS cannot take.
     #[error("LPIPS: {0}")]
     Lpips(String),
+    /// An avatar that cannot be made, or not in the form that is asked for.
+    #[error("{0}")]
+    Bake(String),
     /// A file that cannot be read or written.
     #[error("{}: {source}", path.display())]
     Io {

@@ -1,10 +1,13 @@
 //! `cargo xtask`: train, evaluate and render people from occluded videos.
 
+mod avatar;
 mod bench;
 mod capacity;
 mod compare;
 mod convert;
 mod eval;
+mod export;
+mod film;
 mod obstacle;
 mod pictures;
 mod probe;
@@ -17,6 +20,7 @@ mod source;
 mod synth;
 mod table;
 mod train;
+mod view;
 
 use clap::{Parser, Subcommand};
 
@@ -36,6 +40,10 @@ enum Command {
     Eval(eval::EvalArguments),
     /// Draws a run's person: its movement, from all around, or in the rest pose.
     Render(render::RenderArguments),
+    /// Writes a run's person in a form that other programs open: skinned avatar, splats, mesh, motion.
+    Export(export::ExportArguments),
+    /// Writes a run's person as one HTML page, to turn around and play.
+    View(view::ViewArguments),
     /// The paper's table on captures: every baseline and ablation, several seeds, one budget.
     Reproduce(reproduce::ReproduceArguments),
     /// Writes an occluded capture of a synthetic person to disk, in a published dataset format.
@@ -55,6 +63,8 @@ fn main() -> std::process::ExitCode {
         Command::Train(arguments) => train::train(&arguments),
         Command::Eval(arguments) => eval::eval(&arguments),
         Command::Render(arguments) => render::render(&arguments),
+        Command::Export(arguments) => export::export(&arguments),
+        Command::View(arguments) => view::view(&arguments),
         Command::Reproduce(arguments) => reproduce::reproduce(&arguments),
         Command::Synth(arguments) => synth::synth(&arguments),
         Command::Probe(arguments) => probe::probe(&arguments),

@@ -1,10 +1,9 @@
-//! Contact sheets and short films.
+//! Contact sheets.
 
 use std::path::Path;
 
 use anyhow::{Context, Result};
-use image::codecs::gif::{GifEncoder, Repeat};
-use image::{Delay, Frame, Rgb, RgbImage, imageops};
+use image::{Rgb, RgbImage, imageops};
 use occnerf::capture::Image;
 use plotters::prelude::*;
 use plotters::style::text_anchor::{HPos, Pos, VPos};
@@ -94,18 +93,6 @@ pub fn cells(sheet: &RgbImage) -> Vec<Vec<RgbImage>> {
 /// Writes a PNG.
 pub fn save(picture: &RgbImage, path: &Path) -> Result<()> {
     picture.save(path).with_context(|| path.display().to_string())
-}
-
-/// Writes an endless GIF at `fps` frames a second.
-pub fn film(pictures: &[RgbImage], fps: u32, path: &Path) -> Result<()> {
-    let file = std::fs::File::create(path).with_context(|| path.display().to_string())?;
-    let mut encoder = GifEncoder::new_with_speed(std::io::BufWriter::new(file), 10);
-    encoder.set_repeat(Repeat::Infinite)?;
-    for picture in pictures {
-        let rgba = image::DynamicImage::ImageRgb8(picture.clone()).into_rgba8();
-        encoder.encode_frame(Frame::from_parts(rgba, 0, 0, Delay::from_numer_denom_ms(1000, fps)))?;
-    }
-    Ok(())
 }
 
 #[cfg(test)]

@@ -10,6 +10,7 @@ use occnerf::{Method, PreparedFrame, Scene, Trainer, VertexColors, view_of};
 use volrender::Camera;
 
 use crate::eval::Model;
+use crate::film::{Film, FilmFormat};
 use crate::pictures;
 use crate::run::{CHECKPOINT, RunConfig, use_threads};
 
@@ -41,6 +42,9 @@ pub struct RenderArguments {
     /// Where to [default: RUN/renders/WHAT]
     #[arg(long)]
     out: Option<PathBuf>,
+    /// What besides the pictures
+    #[arg(long, default_value = "gif")]
+    format: FilmFormat,
     /// Threads [default: all cores]
     #[arg(long)]
     threads: Option<usize>,
@@ -71,18 +75,22 @@ pub fn render(arguments: &RenderArguments) -> Result<()> {
     std::fs::create_dir_all(&out).with_context(|| out.display().to_string())?;
     let mut renderer = model.renderer(&scene)?;
     let bar = ProgressBar::new(views.len() as u64);
-    let mut film = Vec::new();
+    let path = arguments.format.extension().map(|extension| out.join(format!("{name}.{extension}")));
+    let camera = views.first().map_or(scene.train[0].camera, |view| view.camera);
+    let mut film = match &path {
+        Some(path) => Film::create(path, arguments.format, (camera.width, camera.height), FPS)?,
+        None => Film::None,
+    };
     for (i, view) in views.iter().enumerate() {
         let rendering = renderer.render(view, Vec3::splat(1.0))?;
         let picture = pictures::to_rgb(&rendering.image);
         pictures::save(&picture, &out.join(format!("{i:04}.png")))?;
-        film.push(picture);
+        film.push(&picture)?;
         bar.inc(1);
     }
     bar.finish_and_clear();
-    let path = out.join(format!("{name}.gif"));
-    pictures::film(&film, FPS, &path)?;
-    println!("{} pictures and {}", film.len(), path.display());
+    film.finish()?;
+    println!("{} pictures and {}", views.len(), path.as_ref().unwrap_or(&out).display());
     Ok(())
 }
 

@@ -1,6 +1,7 @@
 //! A trained person as a skinned, textured surface, which anything that draws triangles can show.
 
 mod avatar;
+pub mod export;
 mod motion;
 mod saved;
 mod skeleton;
