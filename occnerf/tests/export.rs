@@ -195,7 +195,7 @@ fn drawn(splats: &Splats, to_view: Mat3, middle: Vec3, scale: f32, side: usize) 
 fn splats_cover_the_surface_without_holes_and_show_its_colours() {
     let avatar = avatar();
     let vertices = avatar.skin(&avatar.bones_at(0, 0.0));
-    let splats = splats(avatar, &vertices, 0.006).unwrap();
+    let splats = splats(avatar, &vertices, 0.009).unwrap();
     assert!(splats.centres.len() > 20_000, "{}", splats.centres.len());
     let mesh = visibility::RayMesh::new(&vertices, &avatar.faces).unwrap();
     let middle = vertices.iter().sum::<Vec3>() / vertices.len() as f32;
@@ -226,7 +226,7 @@ fn splats_cover_the_surface_without_holes_and_show_its_colours() {
             assert!(least > 0.95, "turn {turn}, {scale} m a pixel: {least}");
             let error: f32 = core.iter().map(|&i| (found[i].0 - hits[i].unwrap()).length_squared() / 3.0).sum();
             let psnr = -10.0 * (error / core.len() as f32).log10();
-            assert!(core.len() > 2000 && psnr > 28.0, "turn {turn}, {scale} m a pixel: {psnr} dB");
+            assert!(core.len() > 2000 && psnr > 25.0, "turn {turn}, {scale} m a pixel: {psnr} dB");
         }
     }
 }

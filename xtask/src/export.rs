@@ -9,7 +9,7 @@ use occnerf::bake::{Avatar, export};
 use crate::avatar;
 
 /// Largest edge of the triangles that a splat stands for, in metres.
-const PATCH: f32 = 0.006;
+const PATCH: f32 = 0.009;
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 enum Format {

@@ -53,6 +53,7 @@ pub struct RenderArguments {
 /// Runs the command.
 pub fn render(arguments: &RenderArguments) -> Result<()> {
     use_threads(arguments.threads)?;
+    let size = arguments.size.as_deref().map(parse_size).transpose()?;
     let directory = &arguments.run;
     let run = RunConfig::read(directory)?;
     let source = run.source()?;
@@ -61,7 +62,6 @@ pub fn render(arguments: &RenderArguments) -> Result<()> {
     if arguments.frame >= frames {
         bail!("--frame {}: {} has frames 0 to {}", arguments.frame, run.scene, frames - 1);
     }
-    let size = arguments.size.as_deref().map(parse_size).transpose()?;
     let views = views(&scene, arguments, size);
     let trainer;
     let model = if run.train.method == Method::Prior {

@@ -16,9 +16,14 @@ class Page {
     this.playing = false;
     this.stale = true;
     this.before = 0;
+    // Pixels for each of the window's, while it moves: fewer where the machine is too slow.
+    this.detail = 1;
+    this.pace = 16;
+    this.late = 0;
     const [low, high] = person.heights(1);
     this.height = Math.max(high - low, 1e-3);
     this.floor = low;
+    this.hips = person.rest[0][1] - low;
     this.yaw = 0.5;
     this.pitch = 0.12;
     this.zoom = 1;
@@ -183,14 +188,26 @@ class Page {
       const next = this.frame + Math.min((now - this.before) / 1000, 0.25) * rate;
       this.seek(next > last ? 0 : next);
     }
+    this.adapt(Math.min(now - this.before, 100));
     this.before = now;
     if (this.stale) this.draw();
     requestAnimationFrame((later) => this.tick(later));
   }
 
+  adapt(elapsed) {
+    if (!this.playing) return;
+    this.pace += 0.1 * (elapsed - this.pace);
+    this.late = this.pace > 25 ? this.late + 1 : 0;
+    if (this.late > 12 && this.detail > 0.4) {
+      this.detail *= 0.75;
+      this.late = 0;
+      this.pace = 16;
+    }
+  }
+
   draw() {
     this.stale = false;
-    const dense = Math.min(devicePixelRatio || 1, 2);
+    const dense = Math.min(devicePixelRatio || 1, 2) * (this.playing ? this.detail : 1);
     const [width, height] = [this.canvas.clientWidth, this.canvas.clientHeight].map((n) => Math.max(Math.round(n * dense), 1));
     if (this.canvas.width !== width || this.canvas.height !== height) {
       this.canvas.width = width;
@@ -210,9 +227,15 @@ class Page {
     const root = this.person.root();
     // In the middle of what the panel leaves free.
     const covered = document.querySelector("footer").offsetHeight / Math.max(this.canvas.clientHeight, 1);
-    const target = [root[0], this.floor + 0.5 * this.height, root[2]];
+    // Half of a jump is followed, so that both the floor and the head stay in the picture.
+    const rise = 0.5 * (root[1] - this.floor - this.hips);
+    const target = [root[0], this.floor + 0.5 * this.height + rise, root[2]];
     const aspect = width / height;
-    const reach = Math.max((0.56 * this.height) / Math.max(1 - covered, 0.3), (0.5 * this.height) / aspect);
+    let reach = Math.max((0.56 * this.height) / Math.max(1 - covered, 0.3), ((this.clip ? 0.4 : 0.56) * this.height) / aspect);
+    if (element("cameras").checked) {
+      const away = this.shownCameras().map((camera) => Math.hypot(...eyeOf(camera).map((x, i) => x - target[i])));
+      reach = Math.max(reach, (0.65 * Math.max(...away, 0)) / Math.min(aspect, 1));
+    }
     const distance = reach / Math.tan(FIELD / 2) / this.zoom;
     const [sy, cy, sp, cp] = [Math.sin(this.yaw), Math.cos(this.yaw), Math.sin(this.pitch), Math.cos(this.pitch)];
     const back = [sy * cp, sp, cy * cp];
@@ -262,23 +285,24 @@ class Page {
     return lines;
   }
 
+  // A hundred cameras are enough to see the path of one that moves.
+  shownCameras() {
+    const stride = Math.ceil(this.frusta.length / 100);
+    return this.frusta.filter((_, at) => at % stride === 0);
+  }
+
   // Each camera as a pyramid, that of the shown frame in the accent's colour.
   cameraLines(faint, accent) {
     const current = this.cameras[Math.min(Math.round(this.frame), this.cameras.length - 1)];
     const lines = [];
-    // Those of a moving camera are told apart by the current one; a hundred are enough to see its path.
-    const stride = Math.ceil(this.frusta.length / 100);
-    const shown = this.frusta.filter((_, at) => at % stride === 0);
+    const shown = this.shownCameras();
     if (this.clip === this.person.clips[0]) shown.push(current);
     for (const camera of shown) {
-      const { k, size, e } = camera;
-      const world = (x, y, z) => {
-        const d = [x - e[3], y - e[7], z - e[11]];
-        return [0, 1, 2].map((i) => e[i] * d[0] + e[4 + i] * d[1] + e[8 + i] * d[2]);
-      };
+      const { k, size } = camera;
+      const world = (x, y, z) => toWorld(camera, x, y, z);
       const far = 0.3;
       const corner = (u, v) => world(((u - k[2]) / k[0]) * far, ((v - k[3]) / k[1]) * far, far);
-      const eye = world(0, 0, 0);
+      const eye = eyeOf(camera);
       const corners = [corner(0, 0), corner(size[0], 0), corner(size[0], size[1]), corner(0, size[1])];
       const color = camera === current && this.clip === this.person.clips[0] ? accent : faint;
       corners.forEach((at, i) => {
@@ -288,6 +312,14 @@ class Page {
     return lines;
   }
 }
+
+// A point of a camera's own axes in the world.
+function toWorld({ e }, x, y, z) {
+  const d = [x - e[3], y - e[7], z - e[11]];
+  return [0, 1, 2].map((i) => e[i] * d[0] + e[4 + i] * d[1] + e[8 + i] * d[2]);
+}
+
+const eyeOf = (camera) => toWorld(camera, 0, 0, 0);
 
 function rgb(hex) {
   const part = (at) => parseInt(hex.slice(at, at + 2), 16) / 255;
