@@ -1,7 +1,8 @@
-//! Fits a picture with a 2-D hash grid: `cargo run --release -p hashgrid --example fit_image [OUT.png]`.
+//! Fits a picture with a 2-D hash grid: `cargo run --release -p hashgrid --example fit_image
+//! [OUT.png]`.
 //!
-//! Three features a level are summed over the levels and are the colour: no network, so that all the detail comes
-//! from the grid. Writes the picture beside its fit.
+//! Three features a level are summed over the levels and are the colour: no network, so that all
+//! the detail comes from the grid. Writes the picture beside its fit.
 
 use hashgrid::{HashGrid, HashGridConfig};
 

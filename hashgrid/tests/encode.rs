@@ -7,7 +7,8 @@ use common::{encode, encode_rows, oracle, points, table};
 use hashgrid::HashGrid;
 use proptest::prelude::*;
 
-/// Each weight is a product of D factors rounded once, each sum has 2^D ≤ 16 terms of magnitude ≤ 1.
+/// Each weight is a product of D factors rounded once, each sum has 2^D ≤ 16 terms of magnitude ≤
+/// 1.
 const TOLERANCE: f64 = 20.0 * f32::EPSILON as f64;
 
 fn compare<const D: usize>(

@@ -19,8 +19,9 @@ fn off_faces<const D: usize>(count: usize) -> impl Strategy<Value = Vec<[f32; D]
     prop::collection::vec(point, count)
 }
 
-/// Within a cell the encoding is linear in each coordinate, so the step may be large and only rounding is left:
-/// `terms` values of magnitude ≤ 1, each with an error of some ulps, over twice the step.
+/// Within a cell the encoding is linear in each coordinate, so the step may be large and only
+/// rounding is left: `terms` values of magnitude ≤ 1, each with an error of some ulps, over twice
+/// the step.
 fn check_points<const D: usize>(points: &[[f32; D]], log2: u32, features: usize, seed: u64) {
     let grid = HashGrid::<D>::with_resolutions(&NESTED, features, log2).expect("a grid");
     let table = table(&grid, seed);

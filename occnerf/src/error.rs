@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use crate::capture::CaptureError;
-use crate::validate::ConfigError;
+use crate::config::ConfigError;
 
 /// Any failure of preparing, training, saving or evaluating.
 #[derive(Debug, thiserror::Error)]
@@ -35,6 +35,18 @@ pub enum Error {
     /// An avatar that cannot be made, or not in the form that is asked for.
     #[error("{0}")]
     Bake(String),
+    /// A training whose numbers have grown beyond all bounds.
+    #[error(
+        "training has diverged: after step {step} `{key}` holds {value}; smaller learning rates (`rates`) would do"
+    )]
+    Diverged {
+        /// Steps taken.
+        step: u64,
+        /// Parameters or moments of the optimiser, as in a checkpoint.
+        key: String,
+        /// The first such number.
+        value: f32,
+    },
     /// A file that cannot be read or written.
     #[error("{}: {source}", path.display())]
     Io {

@@ -62,7 +62,7 @@ fn a_good_checkpoint_is_accepted_and_saved_again_byte_for_byte() {
     let bytes = good(&dir);
     let path = dir.path("copy.safetensors");
     let trainer = resume(scene(), &path, &bytes).unwrap();
-    assert_eq!((trainer.steps_done(), trainer.config()), (2, &config(Method::Occnerf)));
+    assert_eq!((trainer.steps_done(), trainer.model().config()), (2, &config(Method::Occnerf)));
     assert_eq!(checkpoint_config(&path).unwrap(), config(Method::Occnerf));
     trainer.save(&path).unwrap();
     assert!(std::fs::read(&path).unwrap() == bytes);
@@ -298,6 +298,32 @@ fn an_old_checkpoint_survives_a_save_that_fails() {
     std::fs::create_dir(dir.path("good.safetensors.partial")).unwrap();
     let trainer = Trainer::new(scene(), config(Method::Occnerf)).unwrap();
     assert!(trainer.save(&path).is_err());
+    assert!(std::fs::read(&path).unwrap() == bytes);
+}
+
+#[test]
+fn a_training_that_has_diverged_leaves_the_good_checkpoint_alone() {
+    let dir = TempDir::new("diverged");
+    let mut config = config(Method::HashPoint);
+    let path = dir.path("good.safetensors");
+    let mut trainer = Trainer::new(scene(), config.clone()).unwrap();
+    trainer.step().unwrap();
+    trainer.save(&path).unwrap();
+    let bytes = std::fs::read(&path).unwrap();
+    (config.rates.field, config.rates.table) = (f32::MAX, f32::MAX);
+    let mut wild = Trainer::new(scene(), config).unwrap();
+    let mut outcome = wild.save(&path);
+    for _ in 0..20 {
+        std::fs::write(&path, &bytes).unwrap();
+        wild.step().unwrap();
+        outcome = wild.save(&path);
+        if outcome.is_err() {
+            break;
+        }
+    }
+    let error = outcome.unwrap_err();
+    assert!(matches!(error, Error::Diverged { .. }), "{error}");
+    assert!(error.to_string().contains("rates"), "{error}");
     assert!(std::fs::read(&path).unwrap() == bytes);
 }
 

@@ -18,11 +18,11 @@ pub struct Mesh {
     pub faces: Vec<[u32; 3]>,
 }
 
-/// Reads a mesh, by its extension: Wavefront `.obj`; `.glb` and `.gltf`, every triangle mesh of the scene at rest in the
-/// world; a body model (see [`BodyModel::load`]), its template.
+/// Reads a mesh, by its extension: Wavefront `.obj`; `.glb` and `.gltf`, every triangle mesh of the
+/// scene at rest in the world; a body model (see [`BodyModel::load`]), its template.
 ///
-/// Of an OBJ file the statements `v` and `f` count; polygons become fans. Vertices keep the file's order, so that
-/// results by vertex index compare with those of other programs.
+/// Of an OBJ file the statements `v` and `f` count; polygons become fans. Vertices keep the file's
+/// order, so that results by vertex index compare with those of other programs.
 ///
 /// # Errors
 /// Any [`Error`]; those about an OBJ file name the line.

@@ -10,8 +10,8 @@ pub(crate) const TERMS_PER_JOINT: usize = 9;
 
 /// A body in SMPL's form: V vertices, J joints, B shape and P pose blend shapes.
 ///
-/// Lengths are in the model's own unit. Everything is public so that bodies can be put together from other
-/// sources; [`BodyModel::validate`] tells whether the parts fit.
+/// Lengths are in the model's own unit. Everything is public so that bodies can be put together
+/// from other sources; [`BodyModel::validate`] tells whether the parts fit.
 #[derive(Clone, Debug, PartialEq)]
 pub struct BodyModel {
     /// Template, (V).
@@ -20,8 +20,8 @@ pub struct BodyModel {
     pub faces: Vec<[u32; 3]>,
     /// Shape blend shapes, (B·V): those of β_0 first, V each.
     pub shapedirs: Vec<Vec3>,
-    /// Pose blend shapes, (V, P): row v holds the terms that move vertex v. Term 9(j−1) + 3r + c belongs to entry
-    /// (r, c) of R(θ_j) − I. P is 9(J−1), or no row has any entry.
+    /// Pose blend shapes, (V, P): row v holds the terms that move vertex v. Term 9(j−1) + 3r + c
+    /// belongs to entry (r, c) of R(θ_j) − I. P is 9(J−1), or no row has any entry.
     pub posedirs: SparseRows<Vec3>,
     /// Skinning weights, (V, J), rows non-negative and summing to 1.
     pub weights: SkinningWeights,
@@ -59,12 +59,14 @@ impl BodyModel {
         self.shapedirs.len() / self.num_vertices().max(1)
     }
 
-    /// Applies the shape blend shapes and regresses the joints: template + B_S(β), J = regressor · that.
+    /// Applies the shape blend shapes and regresses the joints: template + B_S(β), J = regressor ·
+    /// that.
     ///
     /// Betas beyond those given are 0.
     ///
     /// # Panics
-    /// With more betas than the model has: compare with [`BodyModel::num_betas`] first where they come from a file.
+    /// With more betas than the model has: compare with [`BodyModel::num_betas`] first where they
+    /// come from a file.
     #[must_use]
     pub fn shaped(&self, betas: &[f32]) -> Shaped {
         assert!(betas.len() <= self.num_betas(), "shaped: {} betas, the model has {}", betas.len(), self.num_betas());
@@ -88,8 +90,8 @@ impl BodyModel {
         Shaped { vertices, joints }
     }
 
-    /// Checks that the parts fit together and every value is finite. `file` names the model in errors; keys are
-    /// those of SMPL's files.
+    /// Checks that the parts fit together and every value is finite. `file` names the model in
+    /// errors; keys are those of SMPL's files.
     ///
     /// # Errors
     /// [`Error::Invalid`], [`Error::NotFinite`].

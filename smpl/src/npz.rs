@@ -1,4 +1,5 @@
-//! Numpy's `.npy` and `.npz`: reading, with limits and errors that name the file and the array, and writing.
+//! Numpy's `.npy` and `.npz`: reading, with limits and errors that name the file and the array, and
+//! writing.
 //!
 //! Headers are not believed: memory grows with the bytes that really arrive, and never beyond
 //! [`MAX_ARRAY_BYTES`] for one array.
@@ -37,7 +38,7 @@ impl Npz {
         Self::from_bytes(&path.display().to_string(), read_file(path)?)
     }
 
-    /// The same for bytes in memory; `file` names them in errors.
+    /// Opens an archive in memory; `file` names them in errors.
     ///
     /// # Errors
     /// [`Error::Npy`] if they are no zip archive.
@@ -67,8 +68,8 @@ impl Npz {
     /// Reads the array `key`.
     ///
     /// # Errors
-    /// [`Error::MissingKey`], [`Error::TooLarge`], [`Error::Type`] for element types other than booleans,
-    /// integers and floats, and [`Error::Npy`] for anything malformed.
+    /// [`Error::MissingKey`], [`Error::TooLarge`], [`Error::Type`] for element types other than
+    /// booleans, integers and floats, and [`Error::Npy`] for anything malformed.
     pub fn array(&mut self, key: &str) -> Result<NdArray, Error> {
         let Some(index) = self.keys.iter().position(|k| k == key) else {
             return Err(Error::MissingKey {
@@ -85,8 +86,8 @@ impl Npz {
         read_array(&self.file, key, entry)
     }
 
-    /// Reads the array `key` as finite `f32` of shape `pattern` (`None`: any size): its shape and its values,
-    /// row-major.
+    /// Reads the array `key` as finite `f32` of shape `pattern` (`None`: any size): its shape and
+    /// its values, row-major.
     ///
     /// # Errors
     /// Those of [`Npz::array`] and [`NdArray::to_f32`].
@@ -96,8 +97,8 @@ impl Npz {
         Ok((array.shape, values))
     }
 
-    /// Reads the array `key` as integers of shape `pattern` (`None`: any size): its shape and its values,
-    /// row-major.
+    /// Reads the array `key` as integers of shape `pattern` (`None`: any size): its shape and its
+    /// values, row-major.
     ///
     /// # Errors
     /// Those of [`Npz::array`] and [`NdArray::to_i64`].
@@ -111,13 +112,15 @@ impl Npz {
 /// Reads a `.npy` file of plain values. For arrays of Python objects see [`crate::pickle::read`].
 ///
 /// # Errors
-/// [`Error::Io`], [`Error::TooLarge`], [`Error::Type`] and [`Error::Npy`]; the key in them is empty.
+/// [`Error::Io`], [`Error::TooLarge`], [`Error::Type`] and [`Error::Npy`]; the key in them is
+/// empty.
 pub fn read_npy(path: &Path) -> Result<NdArray, Error> {
     let bytes = read_file(path)?;
     read_array(&path.display().to_string(), "", bytes.as_slice())
 }
 
-/// The whole file, if it is not too large. Devices and pipes, which have no length, are read up to the limit.
+/// The whole file, if it is not too large. Devices and pipes, which have no length, are read up to
+/// the limit.
 pub(crate) fn read_file(path: &Path) -> Result<Vec<u8>, Error> {
     let io = |source| Error::Io { path: path.to_owned(), source };
     let file = std::fs::File::open(path).map_err(io)?;
@@ -138,10 +141,12 @@ pub(crate) fn read_file(path: &Path) -> Result<Vec<u8>, Error> {
     Ok(bytes)
 }
 
-/// Writes an uncompressed `.npz` of named arrays, as numpy's `savez` does. The same arrays give the same bytes.
+/// Writes an uncompressed `.npz` of named arrays, as numpy's `savez` does. The same arrays give the
+/// same bytes.
 ///
 /// # Errors
-/// [`Error::Io`]; [`Error::Invalid`] for an array whose shape does not fit its values; [`Error::Npy`] for two of one name.
+/// [`Error::Io`]; [`Error::Invalid`] for an array whose shape does not fit its values;
+/// [`Error::Npy`] for two of one name.
 pub fn write<K: AsRef<str>>(path: &Path, arrays: &[(K, NdArray)]) -> Result<(), Error> {
     write_with_text(path, arrays, &[])
 }
@@ -184,7 +189,8 @@ pub fn write_with_text<K: AsRef<str>>(
     std::fs::write(path, bytes).map_err(|source| Error::Io { path: path.to_owned(), source })
 }
 
-/// Magic, version 1.0 and the dict literal, padded so that the data begin at a multiple of 64 bytes.
+/// Magic, version 1.0 and the dict literal, padded so that the data begin at a multiple of 64
+/// bytes.
 fn header(descr: &str, shape: &[usize]) -> Vec<u8> {
     let extents: Vec<String> = shape.iter().map(usize::to_string).collect();
     // A tuple of one needs its comma.
@@ -197,7 +203,7 @@ fn header(descr: &str, shape: &[usize]) -> Vec<u8> {
     out
 }
 
-/// What precedes the data of a `.npy` file.
+/// Type, order and shape that precede the data of a `.npy` file.
 pub(crate) struct NpyHeader {
     /// numpy's type string, `|O` for pickled objects.
     pub(crate) descr: String,
@@ -234,7 +240,8 @@ pub(crate) fn read_header(file: &str, key: &str, reader: &mut impl Read) -> Resu
     parse_header(&text).ok_or_else(|| malformed(format!("header {:?}", text.trim_end())))
 }
 
-/// The dict literal `{'descr': '<f4', 'fortran_order': False, 'shape': (3, 4), }`, keys in any order.
+/// The dict literal `{'descr': '<f4', 'fortran_order': False, 'shape': (3, 4), }`, keys in any
+/// order.
 fn parse_header(text: &str) -> Option<NpyHeader> {
     let body = text.trim().strip_prefix('{')?.strip_suffix('}')?;
     let (mut descr, mut fortran, mut shape) = (None, None, None);
@@ -294,7 +301,8 @@ pub(crate) fn read_array(file: &str, key: &str, mut reader: impl Read) -> Result
         let (file, key) = (file.to_owned(), key.to_owned());
         return Err(Error::TooLarge { file, key, claimed: in_memory, limit: MAX_ARRAY_BYTES });
     }
-    // One byte more than claimed, so that trailing bytes are noticed and a zip entry's checksum is verified.
+    // One byte more than claimed, so that trailing bytes are noticed and a zip entry's checksum is
+    // verified.
     let mut bytes = Vec::new();
     (reader.take(claimed as u64 + 1).read_to_end(&mut bytes)).map_err(|e| malformed(e.to_string()))?;
     element.decode(&bytes, &header.shape, header.fortran).ok_or_else(|| {

@@ -1,6 +1,7 @@
 //! Bodies as safetensors: this crate's own form, bit-exact and quick to read.
 
 use std::collections::HashMap;
+use std::io::Write;
 use std::path::Path;
 
 use glam::Vec3;
@@ -14,12 +15,13 @@ use crate::sparse::SparseRows;
 const FORMAT: (&str, &str) = ("format", "smpl-body 1");
 
 impl BodyModel {
-    /// Writes the model as `.safetensors`, which [`BodyModel::load`] reads back bit for bit. An old file at `path` is
-    /// there until the new one is complete.
+    /// Writes the model as `.safetensors`, which [`BodyModel::load`] reads back bit for bit. An old
+    /// file at `path` is there until the new one is complete.
     ///
-    /// The header says `format: smpl-body 1`. Tensors: `v_template` (V,3), `f` (F,3), `shapedirs` (B,V,3), `parents` (J)
-    /// with −1 for the root; `posedirs`, `weights` and `J_regressor` as compressed sparse rows, each in three parts
-    /// `.offsets`, `.columns` and `.values`. Equal models give equal files.
+    /// The header says `format: smpl-body 1`. Tensors: `v_template` (V,3), `f` (F,3), `shapedirs`
+    /// (B,V,3), `parents` (J) with −1 for the root; `posedirs`, `weights` and `J_regressor` as
+    /// compressed sparse rows, each in three parts `.offsets`, `.columns` and `.values`. Equal
+    /// models give equal files.
     ///
     /// # Errors
     /// What [`BodyModel::validate`] finds; [`Error::Io`].
@@ -56,7 +58,12 @@ impl BodyModel {
         let header = HashMap::from([(FORMAT.0.to_owned(), FORMAT.1.to_owned())]);
         let bytes = safetensors::serialize(views, Some(header)).map_err(fault)?;
         let partial = path.with_extension("safetensors.partial");
-        std::fs::write(&partial, bytes).map_err(|source| Error::Io { path: partial.clone(), source })?;
+        // On the disk before the old file is gone, so that a power cut leaves one of the two.
+        let written = std::fs::File::create(&partial).and_then(|mut file| {
+            file.write_all(&bytes)?;
+            file.sync_all()
+        });
+        written.map_err(|source| Error::Io { path: partial.clone(), source })?;
         std::fs::rename(&partial, path).map_err(|source| Error::Io { path: path.to_owned(), source })
     }
 }

@@ -39,7 +39,8 @@ enum Root {
     MinusOne,
 }
 
-/// A body of `joints` joints and 3 vertices each, in a chain, with the further arrays of a SMPL-X archive.
+/// A body of `joints` joints and 3 vertices each, in a chain, with the further arrays of a SMPL-X
+/// archive.
 fn archive(name: &str, joints: usize, betas: usize, root: Root) -> PathBuf {
     let v = 3 * joints;
     let wave = |i: usize| (i as f32 * 0.71).sin();
@@ -138,7 +139,8 @@ fn models_that_are_none_are_not_saved() {
     assert!(BodyModel::embedded().save(Path::new("/no/such/folder/a.safetensors")).is_err());
 }
 
-/// The saved form of a body of three joints: written once, as tests run at once and would read what another is writing.
+/// The saved form of a body of three joints: written once, as tests run at once and would read what
+/// another is writing.
 static SMALL: LazyLock<Vec<u8>> = LazyLock::new(|| {
     let body = BodyModel::load(&archive("small.npz", 3, 2, Root::U32)).unwrap();
     let path = temporary("small.safetensors");

@@ -1,4 +1,5 @@
-//! Rigged characters: the shared ones where they are there, and small ones made here, right and wrong.
+//! Rigged characters: the shared ones where they are there, and small ones made here, right and
+//! wrong.
 #![allow(clippy::unwrap_used, reason = "helpers of tests")]
 
 mod common;
@@ -87,7 +88,8 @@ fn a_small_character_moves_as_worked_out_by_hand() {
     assert_eq!(arm.faces, [[0, 1, 2], [2, 1, 3]]);
     assert_eq!(arm.rest().vertices, arm.vertices);
     assert_eq!((arm.animations[0].name.as_str(), arm.animations[0].duration), ("bend", 3.0));
-    // A quarter turn about (0, 1, 0) takes (0, 2, 0) to (−1, 1, 0); vertex 3 is halfway between (1, 2, 0) and (−1, 2, 0).
+    // A quarter turn about (0, 1, 0) takes (0, 2, 0) to (−1, 1, 0); vertex 3 is halfway between (1,
+    // 2, 0) and (−1, 2, 0).
     let bent = arm.pose(0, 3.0);
     close(bent.vertices[0], Vec3::ZERO);
     close(bent.vertices[2], Vec3::new(-1.0, 1.0, 0.0));

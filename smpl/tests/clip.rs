@@ -31,7 +31,8 @@ fn archive(name: &str, arrays: &[(&str, Vec<u8>)]) -> PathBuf {
     path
 }
 
-/// Two frames in which joint j has the rotation (j, 0, 0) / 100, then twice that. Tests run at once: each has files of its own.
+/// Two frames in which joint j has the rotation (j, 0, 0) / 100, then twice that. Tests run at
+/// once: each has files of its own.
 fn clip(test: &str, joints: usize, rate: &str) -> PathBuf {
     let mut poses = vec![0.0; 6 * joints];
     for j in 0..joints {

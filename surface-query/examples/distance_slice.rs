@@ -1,6 +1,6 @@
-//! A slice through the signed distance of a body: exact on the left, blended in the middle, and on the right where
-//! the two disagree, red where they differ in sign. Writes a PNG (first argument, default `distance_slice.png`) and
-//! prints how far apart they are.
+//! A slice through the signed distance of a body: exact on the left, blended in the middle, and on
+//! the right where the two disagree, red where they differ in sign. Writes a PNG (first argument,
+//! default `distance_slice.png`) and prints how far apart they are.
 
 #[path = "../tests/body/mod.rs"]
 mod body;

@@ -1,5 +1,5 @@
-//! Which vertices of a mesh were seen, and how often: ray casts against a mesh, the vertices a camera sees, running
-//! counts, and the attention weights made of them.
+//! Which vertices of a mesh were seen, and how often: ray casts against a mesh, the vertices a
+//! camera sees, running counts, and the attention weights made of them.
 //!
 //! ```
 //! use glam::{Affine3A, Mat3, Vec3};
@@ -29,8 +29,9 @@
 //! # Ok::<(), visibility::Error>(())
 //! ```
 //!
-//! Conventions: cameras are OpenCV (x right, y down, z forward), extrinsics map world to camera, the first pixel's
-//! centre is (0.5, 0.5). Lengths are in the units of the vertices. Nothing depends on the number of threads.
+//! Conventions: cameras are OpenCV (x right, y down, z forward), extrinsics map world to camera,
+//! the first pixel's centre is (0.5, 0.5). Lengths are in the units of the vertices. Nothing
+//! depends on the number of threads.
 #![forbid(unsafe_code)]
 
 mod counts;

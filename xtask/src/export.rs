@@ -1,12 +1,15 @@
 //! `export`: a trained person in the forms that other programs open.
 
+use std::io::Write;
 use std::path::PathBuf;
 
 use anyhow::{Context, Result, bail};
 use clap::{Args, ValueEnum};
 use occnerf::bake::{Avatar, export};
+use occnerf::replace_file;
 
 use crate::avatar;
+use crate::process::{say, unwritten};
 
 /// Largest edge of the triangles that a splat stands for, in metres.
 const PATCH: f32 = 0.009;
@@ -56,30 +59,25 @@ pub fn export(arguments: &ExportArguments) -> Result<()> {
     match arguments.format {
         Format::Glb => {
             let bytes = person.to_glb()?;
-            std::fs::write(out, &bytes).with_context(|| out.display().to_string())?;
+            replace_file(out, |to| to.write_all(&bytes)).map_err(unwritten(out))?;
             let names: Vec<&str> = person.clips.iter().map(|clip| clip.name.as_str()).collect();
             let size = bytes.len() as f64 * 1e-6;
-            println!(
-                "{}: {size:.1} MB, {} triangles, motions: {}",
-                out.display(),
-                person.faces.len(),
-                names.join(", ")
-            );
+            say!("{}: {size:.1} MB, {} triangles, motions: {}", out.display(), person.faces.len(), names.join(", "));
         }
         Format::Ply => {
             let Posed { vertices, .. } = posed(&person, clip, arguments)?;
             let splats = export::splats(&person, &vertices, PATCH)?;
             splats.write(out)?;
-            println!("{}: {} splats", out.display(), splats.centres.len());
+            say!("{}: {} splats", out.display(), splats.centres.len());
         }
         Format::Obj => {
             let Posed { vertices, normals } = posed(&person, clip, arguments)?;
             export::write_obj(&person, &vertices, &normals, out)?;
-            println!("{}: {} triangles", out.display(), person.faces.len());
+            say!("{}: {} triangles", out.display(), person.faces.len());
         }
         Format::Npz => {
             export::write_amass(&person, clip, out)?;
-            println!("{}: {} frames", out.display(), person.clips[clip].motion.num_frames());
+            say!("{}: {} frames", out.display(), person.clips[clip].motion.num_frames());
         }
     }
     Ok(())

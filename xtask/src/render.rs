@@ -1,18 +1,19 @@
 //! `render`: pictures and a film of a trained person.
 
 use std::path::PathBuf;
+use std::sync::Arc;
 
 use anyhow::{Context, Result, bail};
 use clap::{Args, ValueEnum};
 use glam::{Affine3A, Mat3, Vec3};
 use indicatif::ProgressBar;
-use occnerf::{Method, PreparedFrame, Scene, Trainer, VertexColors, view_of};
+use occnerf::{Body, FieldRenderer, Method, Model, Person, PosedView, PriorRenderer, Renderer, upright};
 use volrender::Camera;
 
-use crate::eval::Model;
-use crate::film::{Film, FilmFormat};
 use crate::pictures;
-use crate::run::{CHECKPOINT, RunConfig, use_threads};
+use crate::process::say;
+use crate::run::{RunConfig, make_directory, use_threads};
+use crate::video::{self, FilmFormat};
 
 /// Views of a full turn.
 const TURN: usize = 36;
@@ -42,7 +43,7 @@ pub struct RenderArguments {
     /// Where to [default: RUN/renders/WHAT]
     #[arg(long)]
     out: Option<PathBuf>,
-    /// What besides the pictures
+    /// What to write besides the pictures
     #[arg(long, default_value = "gif")]
     format: FilmFormat,
     /// Threads [default: all cores]
@@ -56,41 +57,32 @@ pub fn render(arguments: &RenderArguments) -> Result<()> {
     let size = arguments.size.as_deref().map(parse_size).transpose()?;
     let directory = &arguments.run;
     let run = RunConfig::read(directory)?;
-    let source = run.source()?;
-    let scene = Scene::new(&source.capture, &source.model, &run.train)?;
-    let frames = scene.train.len();
-    if arguments.frame >= frames {
-        bail!("--frame {}: {} has frames 0 to {}", arguments.frame, run.scene, frames - 1);
-    }
-    let views = views(&scene, arguments, size);
-    let trainer;
-    let model = if run.train.method == Method::Prior {
-        Model::Prior(VertexColors::measure(&scene)?)
+    let (model, person);
+    let (body, frames, mut renderer): (_, _, Box<dyn Renderer + '_>) = if run.train.method == Method::Prior {
+        person = Person::load(directory, &run.train)?;
+        (&*person.body, &person.frames[..], Box::new(PriorRenderer::new(&person.body, &person.colors)))
     } else {
-        trainer = Trainer::resume(&scene, &directory.join(CHECKPOINT))?;
-        Model::Field(&trainer)
+        model = Model::load(directory)?;
+        (&**model.body(), model.frames(), Box::new(FieldRenderer::new(&model)?))
     };
+    if arguments.frame >= frames.len() {
+        bail!("--frame {}: {} has frames 0 to {}", arguments.frame, run.scene, frames.len() - 1);
+    }
+    let views = views(body, frames, arguments, size);
     let name = format!("{:?}", arguments.what).to_lowercase();
     let out = arguments.out.clone().unwrap_or_else(|| directory.join("renders").join(&name));
-    std::fs::create_dir_all(&out).with_context(|| out.display().to_string())?;
-    let mut renderer = model.renderer(&scene)?;
+    make_directory(&out)?;
     let bar = ProgressBar::new(views.len() as u64);
-    let path = arguments.format.extension().map(|extension| out.join(format!("{name}.{extension}")));
-    let camera = views.first().map_or(scene.train[0].camera, |view| view.camera);
-    let mut film = match &path {
-        Some(path) => Film::create(path, arguments.format, (camera.width, camera.height), FPS)?,
-        None => Film::None,
-    };
-    for (i, view) in views.iter().enumerate() {
+    let drawn = views.iter().enumerate().map(|(i, view)| {
         let rendering = renderer.render(view, Vec3::splat(1.0))?;
         let picture = pictures::to_rgb(&rendering.image);
         pictures::save(&picture, &out.join(format!("{i:04}.png")))?;
-        film.push(&picture)?;
         bar.inc(1);
-    }
+        Ok(picture)
+    });
+    let path = video::film(drawn, arguments.format, FPS, &out.join(&name))?;
     bar.finish_and_clear();
-    film.finish()?;
-    println!("{} pictures and {}", views.len(), path.as_ref().unwrap_or(&out).display());
+    say!("{} pictures and {}", views.len(), path.as_ref().unwrap_or(&out).display());
     Ok(())
 }
 
@@ -104,46 +96,41 @@ fn parse_size(text: &str) -> Result<(u32, u32)> {
     Ok((side(width)?, side(height)?))
 }
 
-fn views(scene: &Scene, arguments: &RenderArguments, size: Option<(u32, u32)>) -> Vec<PreparedFrame> {
+fn views(
+    body: &Body,
+    frames: &[Arc<PosedView>],
+    arguments: &RenderArguments,
+    size: Option<(u32, u32)>,
+) -> Vec<PosedView> {
     let resized = |camera: &Camera| size.map_or(*camera, |(w, h)| camera.resized(w, h));
-    let frame = &scene.train[arguments.frame];
+    let frame = &frames[arguments.frame];
+    let angles = (0..TURN).map(|i| i as f32 / TURN as f32 * std::f32::consts::TAU);
     match arguments.what {
-        What::Movement => {
-            let view = |f: &PreparedFrame| f.seen_by(&resized(&f.camera));
-            scene.train.iter().map(view).collect()
-        }
-        What::Freeview => (0..TURN)
-            .map(|i| {
-                let up = scene.up();
-                let turn = Mat3::from_axis_angle(up, i as f32 / TURN as f32 * std::f32::consts::TAU);
-                let centre = frame.posed.vertices.iter().sum::<Vec3>() / frame.posed.vertices.len() as f32;
+        What::Movement => frames.iter().map(|f| f.seen_by(&resized(&f.camera))).collect(),
+        What::Freeview => {
+            let up = upright(body, frames.iter().map(Arc::as_ref));
+            let view = |angle| {
+                let (turn, centre) = (Mat3::from_axis_angle(up, angle), frame.centre());
                 let about = Affine3A::from_mat3_translation(turn, centre - turn * centre);
                 let mut camera = frame.camera;
                 camera.world_to_camera *= about;
                 frame.seen_by(&resized(&camera))
-            })
-            .collect(),
+            };
+            angles.map(view).collect()
+        }
         What::Tpose => {
-            let joints = vec![Vec3::ZERO; scene.model.num_joints()];
-            let placement = smpl::Placement::Pelvis { translation: Vec3::ZERO };
-            let posed = scene.pose(&scene.mean_betas, &joints, placement);
-            let centre = posed.vertices.iter().sum::<Vec3>() / posed.vertices.len() as f32;
-            (0..TURN)
-                .map(|i| {
-                    let angle = i as f32 / TURN as f32 * std::f32::consts::TAU;
-                    let camera = camera_at(frame, centre, angle);
-                    view_of(scene, &resized(&camera), posed.clone())
-                })
-                .collect()
+            let rest = PosedView::new(&frame.camera, body.rest());
+            let centre = rest.centre();
+            angles.map(|angle| rest.seen_by(&resized(&camera_at(frame, centre, angle)))).collect()
         }
     }
 }
 
-/// A camera like the training camera's, at the same distance as the subject was, that looks level at `centre`.
-fn camera_at(frame: &PreparedFrame, centre: Vec3, angle: f32) -> Camera {
-    let body = frame.posed.vertices.iter().sum::<Vec3>() / frame.posed.vertices.len() as f32;
+/// A camera like the training camera's, at the same distance as the subject was, that looks level at
+/// `centre`.
+fn camera_at(frame: &PosedView, centre: Vec3, angle: f32) -> Camera {
     // Outstretched arms are as wide as the body is high.
-    let distance = 1.15 * frame.camera.world_to_camera.transform_point3(body).length();
+    let distance = 1.15 * frame.camera.world_to_camera.transform_point3(frame.centre()).length();
     let back = Vec3::new(angle.sin(), 0.0, angle.cos());
     let eye = centre + distance * back;
     let (right, down, forward) = (Vec3::Y.cross(back), -Vec3::Y, -back);

@@ -4,11 +4,11 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail, ensure};
 use clap::{Args, ValueEnum};
-use indicatif::{ProgressBar, ProgressStyle};
-use occnerf::capture::{Layout, Obstacle, Occlusion, SynthConfig, Synthetic, synthesise};
-use smpl::{Character, MotionClip};
+use occnerf::capture::{Layout, Obstacle, Occlusion, SynthConfig, Synthetic};
 
+use crate::film::{bar, film, is_character};
 use crate::obstacle::ObstacleArguments;
+use crate::process::say;
 
 /// What a finished directory holds, and nothing else does.
 const MARK: &str = "synth.json";
@@ -114,34 +114,6 @@ impl SynthArguments {
     }
 }
 
-/// Whether `path` is named like a rigged character.
-pub fn is_character(path: &Path) -> bool {
-    let extension = path.extension().and_then(|e| e.to_str()).unwrap_or("");
-    ["glb", "gltf"].iter().any(|known| extension.eq_ignore_ascii_case(known))
-}
-
-/// Films `character`, or the embedded person, with a bar.
-pub fn film(character: Option<&Path>, motion: Option<&Path>, config: &SynthConfig) -> Result<Synthetic> {
-    let named = |path: &Path| path.display().to_string();
-    let character = character.map(|path| Character::load(path).map(|c| (c, named(path)))).transpose()?;
-    let motion = motion.map(MotionClip::load).transpose()?;
-    let bar = bar("filming", config.frames);
-    let synthetic = synthesise(character.as_ref().map(|(c, _)| c), motion.as_ref(), config, &|_| bar.inc(1));
-    bar.finish_and_clear();
-    match character {
-        Some((_, name)) => synthetic.context(name),
-        None => Ok(synthetic?),
-    }
-}
-
-fn bar(what: &'static str, length: usize) -> ProgressBar {
-    let bar = ProgressBar::new(length as u64);
-    if let Ok(style) = ProgressStyle::with_template("{bar:28} {pos}/{len} {msg}  {elapsed}") {
-        bar.set_style(style);
-    }
-    bar.with_message(what)
-}
-
 /// Runs the command: everything is written beside --out and takes its place when it is complete.
 pub fn synth(arguments: &SynthArguments) -> Result<()> {
     let config = arguments.config()?;
@@ -169,7 +141,7 @@ pub fn synth(arguments: &SynthArguments) -> Result<()> {
         return Err(error);
     }
     let capture = &synthetic.capture;
-    println!(
+    say!(
         "{}: {} frames, {} views kept back, {:.1} % of the person hidden where anything is, {} joints, {} vertices",
         out.display(),
         capture.train.len(),
@@ -178,12 +150,12 @@ pub fn synth(arguments: &SynthArguments) -> Result<()> {
         synthetic.body.num_joints(),
         synthetic.body.num_vertices(),
     );
-    println!("train on it: cargo xtask train {}", out.display());
+    say!("train on it: cargo xtask train {}", out.display());
     Ok(())
 }
 
 fn write(synthetic: &Synthetic, directory: &Path, layout: Layout) -> Result<()> {
-    std::fs::create_dir_all(directory).with_context(|| directory.display().to_string())?;
+    crate::run::make_directory(directory)?;
     let bar = bar("writing", synthetic.num_pictures(layout));
     synthetic.write(directory, layout, &|_| bar.inc(1))?;
     bar.finish_and_clear();

@@ -6,6 +6,7 @@ mod motion;
 mod saved;
 mod skeleton;
 
+use std::io::Write;
 use std::path::Path;
 
 use crate::Error;
@@ -16,9 +17,5 @@ pub use skeleton::skeleton;
 
 /// Writes a file that is either the old one or complete.
 fn write_whole(path: &Path, bytes: &[u8]) -> Result<(), Error> {
-    let mut name = path.file_name().unwrap_or_default().to_owned();
-    name.push(".partial");
-    let partial = path.with_file_name(name);
-    std::fs::write(&partial, bytes).map_err(|source| Error::Io { path: path.to_owned(), source })?;
-    std::fs::rename(&partial, path).map_err(|source| Error::Io { path: path.to_owned(), source })
+    crate::replace_file(path, |to| to.write_all(bytes)).map_err(|source| Error::Io { path: path.to_owned(), source })
 }

@@ -8,13 +8,17 @@ mod checks;
 mod decode;
 mod demo;
 mod error;
+mod files;
 mod find;
+mod frame;
 mod humannerf;
 mod image;
 mod names;
 mod obstacle;
 mod options;
+mod perturbation;
 mod pictures;
+mod pixels;
 mod records;
 mod source;
 mod synth;
@@ -23,74 +27,21 @@ mod testing;
 mod undistort;
 mod wild;
 mod write;
-mod wrong;
 mod zju;
 
 pub use self::demo::{DemoConfig, demo};
 pub use self::error::CaptureError;
 pub use self::find::{Layout, find_body, own_body};
+pub use self::frame::{Capture, EvalFrame, Frame};
 pub use self::image::Image;
 pub use self::obstacle::Obstacle;
 pub use self::options::LoadOptions;
-pub use self::source::{PixelSource, Pixels};
+pub use self::perturbation::Perturbation;
+pub use self::pixels::Pixels;
+pub use self::source::PixelSource;
 pub use self::synth::{Occlusion, SynthConfig, Synthetic, synthesise};
-pub use self::wrong::Wrong;
 
 use std::path::Path;
-use std::sync::Arc;
-
-use glam::Vec3;
-
-/// One picture of the subject with everything that is known about it.
-#[derive(Clone, Debug)]
-pub struct Frame {
-    /// Name within its camera, such as `frame_000012`.
-    pub name: String,
-    /// Picture, mask and occluder, each as large as the camera's image.
-    pub source: PixelSource,
-    /// The camera, OpenCV convention, pixel centres at integer + 0.5.
-    pub camera: volrender::Camera,
-    /// Axis-angle rotation of each joint, (J). Joint 0 is zero where `placement` carries the global rotation.
-    pub pose: Vec<Vec3>,
-    /// How the posed body stands in the world.
-    pub placement: smpl::Placement,
-    /// Shape coefficients, at most as many as the body model has.
-    pub betas: Vec<f32>,
-}
-
-impl Frame {
-    /// What it shows; see [`PixelSource::pixels`].
-    ///
-    /// # Errors
-    /// For files that cannot be read; none for pixels in memory.
-    pub fn pixels(&self) -> Result<Arc<Pixels>, CaptureError> {
-        self.source.pixels()
-    }
-}
-
-/// A picture kept back for evaluation: nothing occluded, black background.
-#[derive(Clone, Debug)]
-pub struct EvalFrame {
-    /// Directory or given name of its camera.
-    pub camera_name: String,
-    /// The training frame of the same instant: same pose, and the occlusion that training saw then.
-    pub train_index: usize,
-    /// The picture, its camera and body parameters.
-    pub frame: Frame,
-}
-
-/// A monocular video of one person, and views of the same instants from elsewhere.
-#[derive(Clone, Debug)]
-pub struct Capture {
-    /// Where it comes from: a directory's name, or `demo`.
-    pub name: String,
-    /// The training video in time order; never empty.
-    pub train: Vec<Frame>,
-    /// Views kept back, by camera and then time; may be empty.
-    pub eval: Vec<EvalFrame>,
-    /// Shape of the canonical body (T-pose).
-    pub mean_betas: Vec<f32>,
-}
 
 /// Reads a capture from a directory in one of three published layouts, told apart by the files in it:
 ///

@@ -5,7 +5,7 @@ use std::ops::Range;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use super::source::Edit;
+use super::pixels::{Area, Edit};
 use super::{CaptureError, Frame};
 
 /// A simulated obstacle in front of the training camera. The default is the paper's: fixed, central, hiding half of
@@ -25,25 +25,6 @@ pub struct Obstacle {
     pub travel: f32,
     /// Its height in picture heights, above 0 to 1; its middle is at the subject's mean row, or as near as the picture allows.
     pub height: f32,
-}
-
-/// A rectangle of pixels.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub(super) struct Area {
-    pub columns: Range<u32>,
-    pub rows: Range<u32>,
-}
-
-impl Area {
-    pub fn is_empty(&self) -> bool {
-        self.columns.is_empty() || self.rows.is_empty()
-    }
-
-    /// Whether the pixel of this index is inside, in a picture of this width.
-    pub fn contains(&self, pixel: usize, width: u32) -> bool {
-        let pixel = pixel as u32;
-        self.columns.contains(&(pixel % width)) && self.rows.contains(&(pixel / width))
-    }
 }
 
 /// Where a frame's subject is.

@@ -3,7 +3,7 @@ use serde::{Deserialize, Serialize};
 use super::CaptureError;
 use super::image::MAX_SIDE;
 use super::obstacle::Obstacle;
-use super::wrong::Wrong;
+use super::perturbation::Perturbation;
 
 /// What a capture's files leave open, and how much of them is read. Every layout obeys all of it, but `camera` and
 /// `occlusion`, which only raw ZJU-MoCap leaves open. Two are equal where they read the same: `max_bytes` is not compared.
@@ -31,7 +31,7 @@ pub struct LoadOptions {
     /// default [`Obstacle`] where there is none.
     pub occlusion: Option<Obstacle>,
     /// Errors added on purpose.
-    pub wrong: Wrong,
+    pub wrong: Perturbation,
 }
 
 impl Default for LoadOptions {
@@ -45,7 +45,7 @@ impl Default for LoadOptions {
             max_bytes: 1 << 30,
             camera: None,
             occlusion: None,
-            wrong: Wrong::default(),
+            wrong: Perturbation::default(),
         }
     }
 }

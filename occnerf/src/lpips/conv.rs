@@ -4,7 +4,7 @@ use ndarray::linalg::general_mat_mul;
 use ndarray::{Array2, ArrayView2, ArrayViewMut2, Axis, Slice};
 use rayon::prelude::*;
 
-use super::maps::{Maps, Window};
+use super::maps::{Maps, Window, view};
 use super::winograd::Winograd;
 
 /// Pixels of one product.
@@ -173,12 +173,6 @@ impl Conv {
         let column = start.saturating_sub(self.window.padding).min(width);
         (skip, column, (self.window.size - skip).min(width - column))
     }
-}
-
-pub(super) fn view(data: &[f32], columns: usize) -> ArrayView2<'_, f32> {
-    // Every caller hands whole rows; were it not so, the product's own check of shapes would speak up.
-    let rows = data.len() / columns;
-    ArrayView2::from_shape((rows, columns), &data[..rows * columns]).unwrap_or(ArrayView2::from(&[[0.0; 0]; 0]))
 }
 
 /// Parts of a product, with first row and column each; the cut depends on the shape alone, and no element on the cut.

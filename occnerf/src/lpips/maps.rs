@@ -1,5 +1,6 @@
 //! Feature maps, and what happens to them between the convolutions.
 
+use ndarray::ArrayView2;
 use rayon::prelude::*;
 
 /// Images or feature maps: image after image, row-major, channels last.
@@ -109,4 +110,11 @@ pub(super) fn rectify_backward(out: &Maps, d_out: &mut Maps) {
     d_out.data.par_chunks_mut(1 << 12).zip(out.data[..len].par_chunks(1 << 12)).for_each(|(d, out)| {
         d.iter_mut().zip(out).for_each(|(d, &v)| *d = if v > 0.0 { *d } else { 0.0 });
     });
+}
+
+/// `data` as rows of `columns`.
+pub(super) fn view(data: &[f32], columns: usize) -> ArrayView2<'_, f32> {
+    // Every caller hands whole rows; were it not so, the product's own check of shapes would speak up.
+    let rows = data.len() / columns;
+    ArrayView2::from_shape((rows, columns), &data[..rows * columns]).unwrap_or(ArrayView2::from(&[[0.0; 0]; 0]))
 }

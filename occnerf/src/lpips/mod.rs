@@ -2,6 +2,7 @@
 
 mod conv;
 mod maps;
+mod tensor;
 mod torch;
 mod trunk;
 mod unit;
@@ -14,8 +15,7 @@ use crate::Error;
 use maps::Maps;
 use trunk::Network;
 
-/// Gives the tensor of a name, of exactly a shape.
-type Reader<'a> = dyn FnMut(&str, &[usize]) -> Result<Vec<f32>, Error> + 'a;
+pub use trunk::Trunk;
 
 /// What is taken off x ∈ [−1, 1] and what divides the rest, a channel each.
 const SHIFT: [f32; 3] = [-0.030, -0.088, -0.188];
@@ -24,28 +24,6 @@ const SCALE: [f32; 3] = [0.458, 0.448, 0.450];
 const MAX_PIXELS: usize = 1 << 21;
 /// Pixels of the pictures that go through the network together.
 const PIXELS_AT_ONCE: usize = 1 << 13;
-
-/// Which network's features are compared.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Trunk {
-    /// VGG16, of 59 MB.
-    Vgg16,
-    /// AlexNet, of 10 MB.
-    AlexNet,
-    /// SqueezeNet 1.1, of 3 MB.
-    SqueezeNet,
-}
-
-impl Trunk {
-    /// The name used in results.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Vgg16 => "vgg16",
-            Self::AlexNet => "alexnet",
-            Self::SqueezeNet => "squeezenet",
-        }
-    }
-}
 
 /// A network with its weights, ready to compare pictures.
 pub struct Lpips {
@@ -66,7 +44,9 @@ impl Lpips {
     /// # Errors
     /// [`Error::Io`] and [`Error::File`], naming file, tensor, expected and actual type and shape.
     pub fn load(path: &Path) -> Result<Self, Error> {
-        weights::load(path)
+        let mut found = weights::find(path)?;
+        let built = Self::new(found.trunk, |name, shape| found.read(name, shape));
+        built.map_err(|error| found.blame(error))
     }
 
     /// Builds `trunk` from what `read` gives for a name (`features.0.weight`, `lin0.weight`) and its shape (outputs,

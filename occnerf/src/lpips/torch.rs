@@ -9,7 +9,7 @@ use safetensors::tensor::Dtype;
 use smpl::pickle::{self, Value};
 use zip::{CompressionMethod, ZipArchive};
 
-use super::weights::{Tensor, fault, io};
+use super::tensor::{Tensor, fault, io};
 use crate::Error;
 
 /// How the older form starts: a pickled number of ten bytes.

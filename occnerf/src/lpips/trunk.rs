@@ -4,8 +4,32 @@ use ndarray::{ArrayViewMut2, Axis};
 
 use super::conv::Conv;
 use super::maps::{Maps, Window, max_pool, max_pool_backward, rectify_backward};
-use super::{Reader, Trunk};
 use crate::Error;
+
+/// Gives the tensor of a name, of exactly a shape.
+pub(super) type Reader<'a> = dyn FnMut(&str, &[usize]) -> Result<Vec<f32>, Error> + 'a;
+
+/// Which network's features are compared.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Trunk {
+    /// VGG16, of 59 MB.
+    Vgg16,
+    /// AlexNet, of 10 MB.
+    AlexNet,
+    /// SqueezeNet 1.1, of 3 MB.
+    SqueezeNet,
+}
+
+impl Trunk {
+    /// The name used in results.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Vgg16 => "vgg16",
+            Self::AlexNet => "alexnet",
+            Self::SqueezeNet => "squeezenet",
+        }
+    }
+}
 
 /// A layer of torchvision's `features`, under its number there.
 enum Plan {

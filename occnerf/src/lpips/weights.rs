@@ -7,23 +7,15 @@ use std::path::{Path, PathBuf};
 
 use safetensors::tensor::{Dtype, Metadata};
 
-use super::{Lpips, Trunk, torch};
+use super::tensor::{Tensor, fault, io};
+use super::torch;
+use super::trunk::Trunk;
 use crate::Error;
 
 /// Longest header of a safetensors file, as in the format's own library.
 const MAX_HEADER: u64 = 100_000_000;
 /// Files of a directory that are looked into.
 const MAX_FILES: usize = 256;
-
-/// A tensor of a file.
-#[derive(Clone, Debug)]
-pub(super) struct Tensor {
-    pub dtype: Dtype,
-    pub shape: Vec<usize>,
-    /// Where its bytes start: in the file, or in an entry of the zip archive that the file is.
-    pub at: u64,
-    pub entry: Option<String>,
-}
 
 /// An open file and what it holds.
 pub(super) struct Weights {
@@ -32,44 +24,61 @@ pub(super) struct Weights {
     tensors: BTreeMap<String, Tensor>,
 }
 
-pub(super) fn fault(path: &Path, what: impl Into<String>) -> Error {
-    Error::File { path: path.to_owned(), what: what.into() }
+/// A trunk with its linear layers, in one file or two.
+pub(super) struct Found {
+    pub trunk: Trunk,
+    weights: Weights,
+    lin: Option<Weights>,
 }
 
-pub(super) fn io(path: &Path) -> impl Fn(std::io::Error) -> Error {
-    move |source| Error::Io { path: path.to_owned(), source }
+impl Found {
+    /// Reads a tensor of exactly `shape`, axes of one beside.
+    pub fn read(&mut self, name: &str, shape: &[usize]) -> Result<Vec<f32>, Error> {
+        match &mut self.lin {
+            Some(lin) if name.starts_with("lin") => lin.read(name, shape),
+            _ => self.weights.read(name, shape),
+        }
+    }
+
+    /// `error` with the file's name.
+    pub fn blame(&self, error: Error) -> Error {
+        match error {
+            Error::Lpips(what) => fault(&self.weights.path, what),
+            other => other,
+        }
+    }
 }
 
-/// [`Lpips::load`].
-pub(super) fn load(path: &Path) -> Result<Lpips, Error> {
+/// The weights at `path`, as [`Lpips::load`](super::Lpips::load) looks for them.
+pub(super) fn find(path: &Path) -> Result<Found, Error> {
     if !std::fs::metadata(path).map_err(io(path))?.is_dir() {
-        let mut trunk_file = Weights::open(path)?;
-        let trunk = trunk_file.trunk().ok_or_else(|| {
-            let names: Vec<&str> = trunk_file.tensors.keys().take(4).map(String::as_str).collect();
+        let weights = Weights::open(path)?;
+        let trunk = weights.trunk().ok_or_else(|| {
+            let names: Vec<&str> = weights.tensors.keys().take(4).map(String::as_str).collect();
             let expected = "expected `features.0.weight` and the other layers of SqueezeNet 1.1, VGG16 or AlexNet";
             fault(path, format!("holds no trunk: {expected}; it starts with {}", names.join(", ")))
         })?;
-        if trunk_file.has_lin(trunk) {
-            return build(trunk, &mut trunk_file, None);
+        if weights.has_lin(trunk) {
+            return Ok(Found { trunk, weights, lin: None });
         }
         let beside = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
         let (others, damaged) = open_all(&files(beside)?);
         let lin = others.into_iter().find(|other| other.has_lin(trunk));
-        let mut lin = lin.ok_or_else(|| damaged.unwrap_or_else(|| no_lin(path, trunk)))?;
-        return build(trunk, &mut trunk_file, Some(&mut lin));
+        let lin = lin.ok_or_else(|| damaged.unwrap_or_else(|| no_lin(path, trunk)))?;
+        return Ok(Found { trunk, weights, lin: Some(lin) });
     }
     let (mut open, damaged) = open_all(&files(path)?);
     let mut lonely = None;
     for i in 0..open.len() {
         let Some(trunk) = open[i].trunk() else { continue };
         if open[i].has_lin(trunk) {
-            return build(trunk, &mut open[i], None);
+            return Ok(Found { trunk, weights: open.swap_remove(i), lin: None });
         }
         if let Some(other) = (0..open.len()).find(|&other| open[other].has_lin(trunk)) {
-            let mut trunk_file = open.swap_remove(i);
+            let weights = open.swap_remove(i);
             // The last file has moved to the place that became free.
             let other = if other == open.len() { i } else { other };
-            return build(trunk, &mut trunk_file, open.get_mut(other));
+            return Ok(Found { trunk, weights, lin: Some(open.swap_remove(other)) });
         }
         lonely = lonely.or_else(|| Some(no_lin(&open[i].path, trunk)));
     }
@@ -95,18 +104,6 @@ fn no_lin(path: &Path, trunk: Trunk) -> Error {
         path,
         format!("is {name} without LPIPS's linear layers: no `lin0.weight` of {name} in it or in a file beside it"),
     )
-}
-
-fn build(trunk: Trunk, trunk_file: &mut Weights, mut lin: Option<&mut Weights>) -> Result<Lpips, Error> {
-    let path = trunk_file.path.clone();
-    let built = Lpips::new(trunk, |name, shape| match &mut lin {
-        Some(lin) if name.starts_with("lin") => lin.read(name, shape),
-        _ => trunk_file.read(name, shape),
-    });
-    built.map_err(|error| match error {
-        Error::Lpips(what) => fault(&path, what),
-        other => other,
-    })
 }
 
 /// Files of weights in a directory, by name.

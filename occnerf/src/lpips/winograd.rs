@@ -5,8 +5,7 @@ use ndarray::linalg::general_mat_mul;
 use ndarray::{Array2, ArrayView2, ArrayViewMut2, Axis, Slice};
 use rayon::prelude::*;
 
-use super::conv::view;
-use super::maps::Maps;
+use super::maps::{Maps, view};
 
 /// Products of a tile: 4 × 4.
 const PRODUCTS: usize = 16;

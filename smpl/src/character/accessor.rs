@@ -12,15 +12,15 @@ use gltf::json::{Index, Root};
 use crate::Error;
 use crate::npz::read_file;
 
-/// What all accessors together may decode to, in bytes: 256 MiB.
+/// Bytes that all accessors together may decode to: 256 MiB.
 const MAX_DECODED_BYTES: u64 = 1 << 28;
 
-/// A document and the bytes that its accessors and images point into. Nothing in it is taken on trust: every index and
-/// range is checked where it is used.
+/// A document and the bytes that its accessors and images point into. Nothing in it is taken on
+/// trust: every index and range is checked where it is used.
 pub(super) struct Source<'a> {
     pub(super) file: &'a str,
     pub(super) root: &'a Root,
-    /// Where other files may lie; `None` admits none.
+    /// Directory where other files may lie; `None` admits none.
     folder: Option<&'a Path>,
     data: Vec<Vec<u8>>,
     /// Bytes that may still be decoded: many accessors may share one range.
@@ -70,7 +70,8 @@ impl<'a> Source<'a> {
         Ok((view, bytes.ok_or_else(outside)?))
     }
 
-    /// Elements of N components, decoded by `component` from the bytes of one; `None` from it is an error.
+    /// Elements of N components, decoded by `component` from the bytes of one; `None` from it is an
+    /// error.
     fn elements<const N: usize, T: Copy + Default>(
         &self,
         index: Index<Accessor>,
@@ -157,7 +158,8 @@ impl<'a> Source<'a> {
         })
     }
 
-    /// Media type and bytes of a data URI, or of a file in the folder. Addresses that leave the folder are refused.
+    /// Media type and bytes of a data URI, or of a file in the folder. Addresses that leave the
+    /// folder are refused.
     pub(super) fn resolve(&self, place: &str, uri: &str) -> Result<(String, Vec<u8>), Error> {
         if let Some(rest) = uri.strip_prefix("data:") {
             let Some((mime, text)) = rest.split_once(";base64,") else {

@@ -12,8 +12,8 @@ use super::{Character, Texture};
 use crate::Error;
 
 impl Character {
-    /// Appends a primitive's vertices and triangles. `skinned`: its own joints and weights count, within `joints`; else
-    /// it follows the first of those.
+    /// Appends a primitive's vertices and triangles. `skinned`: its own joints and weights count,
+    /// within `joints`; else it follows the first of those.
     pub(super) fn add_primitive(
         &mut self,
         source: &Source<'_>,
@@ -85,8 +85,8 @@ impl Character {
         Ok(())
     }
 
-    /// Appends a vertex's weights, normalised, one entry a joint. Without any weight, where glTF leaves it open, `default`
-    /// keeps the vertex with the body.
+    /// Appends a vertex's weights, normalised, one entry a joint. Without any weight, where glTF
+    /// leaves it open, `default` keeps the vertex with the body.
     fn push_weights(&mut self, mut row: Vec<(u32, f32)>, default: u32) {
         if row.is_empty() {
             row.push((default, 1.0));

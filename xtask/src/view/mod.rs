@@ -12,6 +12,7 @@ use serde_json::{Value, json};
 use volrender::Camera;
 
 use crate::avatar;
+use crate::process::say;
 use crate::report::escape;
 
 const PAGE: &str = include_str!("page.html");
@@ -40,7 +41,7 @@ pub fn view(arguments: &ViewArguments) -> Result<()> {
     avatar::check_folder(&out)?;
     let page = page(&person)?;
     crate::run::write(&out, &page)?;
-    println!("{}: {:.1} MB, opens in any browser with WebGL 2", out.display(), page.len() as f64 * 1e-6);
+    say!("{}: {:.1} MB, opens in any browser with WebGL 2", out.display(), page.len() as f64 * 1e-6);
     Ok(())
 }
 

@@ -2,6 +2,7 @@
 
 use glam::{Quat, Vec3};
 use serde_json::{Value, json};
+use volrender::Aabb;
 
 use crate::Error;
 use crate::bake::{Avatar, Clip};
@@ -246,7 +247,7 @@ impl File {
 
     /// Says between which corners an accessor's points lie.
     fn bound(&mut self, accessor: usize, points: &[Vec3]) {
-        let (low, high) = crate::scene::bounds(points);
+        let Aabb { min: low, max: high } = Aabb::from_points(points);
         self.accessors[accessor]["min"] = json!(low.to_array());
         self.accessors[accessor]["max"] = json!(high.to_array());
     }

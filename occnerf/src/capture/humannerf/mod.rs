@@ -131,7 +131,7 @@ fn plan_frame(
         labels: false,
         occluder: None,
         hidden: None,
-        lens: Lens::read(lens, "intrinsics", "extrinsics", options)?,
+        lens: Lens::read(lens, "intrinsics", "extrinsics", options.pixel_centre)?,
         pose: checks::rootless_pose(parameters, body)?,
         placement: checks::origin(parameters)?,
         betas,

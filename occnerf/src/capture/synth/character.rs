@@ -7,12 +7,13 @@ use rayon::prelude::*;
 use smpl::{BodyModel, Character, MotionClip, SparseRows};
 use visibility::RayMesh;
 
+use super::config::SynthConfig;
 use super::noise::smooth_noise;
 use super::perform::{Extent, Skeleton, brought, seconds};
 use super::render::Posture;
 use super::stage::{Progress, Stage, ring};
 use super::texture::{decode, pattern, sample};
-use super::{DemoConfig, SynthConfig};
+use crate::capture::demo::DemoConfig;
 use crate::capture::demo::motion::{Pose, TrackerError, track};
 use crate::capture::{Capture, CaptureError};
 

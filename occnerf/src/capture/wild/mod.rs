@@ -94,7 +94,7 @@ fn plan(
         labels: false,
         occluder: None,
         hidden: None,
-        lens: Lens::read(record, "cam_intrinsics", "cam_extrinsics", options)?,
+        lens: Lens::read(record, "cam_intrinsics", "cam_extrinsics", options.pixel_centre)?,
         pose: checks::pose(record, body)?,
         placement: Placement::default(),
         betas: checks::betas(record, "betas", body)?,

@@ -4,10 +4,10 @@ use std::sync::OnceLock;
 use glam::Vec3;
 use smpl::BodyModel;
 
-use super::byte;
+use super::folder::byte;
 use crate::capture::testing::Directory;
 use crate::capture::{
-    Capture, Frame, Layout, LoadOptions, Obstacle, Occlusion, Pixels, SynthConfig, Synthetic, Wrong, find_body,
+    Capture, Frame, Layout, LoadOptions, Obstacle, Occlusion, Perturbation, Pixels, SynthConfig, Synthetic, find_body,
     load_capture, synthesise,
 };
 
@@ -214,7 +214,7 @@ fn pictures_decoded_on_demand_are_those_decoded_at_once() {
             let at_once = LoadOptions {
                 resize: Some(40),
                 occlusion: (layout == Layout::ZjuMocap).then_some(moving),
-                wrong: Wrong { mask_pixels, ..Wrong::default() },
+                wrong: Perturbation { mask_pixels, ..Perturbation::default() },
                 ..LoadOptions::default()
             };
             let read = |options: &LoadOptions| load_capture(dir.path(), &body, options).unwrap();

@@ -4,7 +4,7 @@ use glam::{Affine3A, Vec3};
 use serde_json::{Map, Value, json};
 use smpl::{BodyModel, rodrigues};
 
-use super::{Folder, extrinsics, frame_mask, grey, mask_rgb, origin, rows};
+use super::folder::{Folder, extrinsics, frame_mask, grey, mask_rgb, origin, rows};
 use crate::capture::synth::Synthetic;
 use crate::capture::{CaptureError, Frame};
 
