@@ -36,6 +36,7 @@
 mod counts;
 mod error;
 mod packet;
+mod raster;
 mod ray_mesh;
 mod tree;
 mod triangle;
@@ -43,5 +44,6 @@ mod view;
 
 pub use counts::VisibilityCounts;
 pub use error::Error;
+pub use raster::{Fragment, Pixel, RasterOptions, Rasterizer, Samples};
 pub use ray_mesh::{Hit, RayMesh};
 pub use view::{View, visible_vertices};
