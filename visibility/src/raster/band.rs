@@ -106,8 +106,11 @@ impl Band<'_> {
             let face = layer.face[y * layer.stride + x];
             if face != NONE {
                 let fragment = self.fragment(face, faces[(face - first) as usize], centre);
-                let at = out[..count].partition_point(|f| f.depth <= fragment.depth);
-                out[at..=count].rotate_right(1);
+                let mut at = count;
+                while at > 0 && out[at - 1].depth > fragment.depth {
+                    out[at] = out[at - 1];
+                    at -= 1;
+                }
                 out[at] = fragment;
                 count += 1;
             }
@@ -126,13 +129,13 @@ impl Band<'_> {
         let [a, b, c] = projected.map(|v| v.clip);
         let [p, q, r] = [a, b, c].map(|v| v.truncate() - centre.truncate() * v.z);
         let weights = Vec3::new(q.perp_dot(r), r.perp_dot(p), p.perp_dot(q));
-        let weights = weights / (weights.x + weights.y + weights.z);
-        if !weights.is_finite() {
+        // Rounding of the corners draws samples that are a little outside.
+        let inside = (weights * (weights.x + weights.y + weights.z).signum()).max(Vec3::ZERO);
+        let scale = 1.0 / (inside.x + inside.y + inside.z);
+        if !scale.is_finite() || scale == 0.0 {
             return self.large_fragment(face, corners, centre.as_dvec3());
         }
-        // Rounding of the corners draws samples that are a little outside.
-        let inside = weights.max(Vec3::ZERO);
-        let inside = inside / (inside.x + inside.y + inside.z);
+        let inside = inside * scale;
         Fragment { face, depth: inside.dot(Vec3::new(a.z, b.z, c.z)), barycentric: inside.to_array() }
     }
 
