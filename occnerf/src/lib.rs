@@ -27,6 +27,7 @@
 
 mod adam;
 mod arena;
+pub mod bake;
 mod batch;
 mod capacity;
 pub mod capture;

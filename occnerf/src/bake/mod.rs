@@ -1,0 +1,23 @@
+//! A trained person as a skinned, textured surface, which anything that draws triangles can show.
+
+mod avatar;
+mod motion;
+mod saved;
+mod skeleton;
+
+use std::path::Path;
+
+use crate::Error;
+
+pub use avatar::{Atlas, Avatar, Clip, Joint, MAX_ATLAS_SIDE, MAX_JOINTS, MAX_SHELLS};
+pub use motion::{motion_of_bones, upright};
+pub use skeleton::skeleton;
+
+/// Writes a file that is either the old one or complete.
+fn write_whole(path: &Path, bytes: &[u8]) -> Result<(), Error> {
+    let mut name = path.file_name().unwrap_or_default().to_owned();
+    name.push(".partial");
+    let partial = path.with_file_name(name);
+    std::fs::write(&partial, bytes).map_err(|source| Error::Io { path: path.to_owned(), source })?;
+    std::fs::rename(&partial, path).map_err(|source| Error::Io { path: path.to_owned(), source })
+}
