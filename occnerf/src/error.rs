@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use crate::capture::CaptureError;
-use crate::validate::ConfigError;
+use crate::config::ConfigError;
 
 /// Any failure of preparing, training, saving or evaluating.
 #[derive(Debug, thiserror::Error)]
@@ -32,6 +32,18 @@ pub enum Error {
     /// Pictures or weights that LPIPS cannot take.
     #[error("LPIPS: {0}")]
     Lpips(String),
+    /// A training whose numbers have grown beyond all bounds.
+    #[error(
+        "training has diverged: after step {step} `{key}` holds {value}; smaller learning rates (`rates`) would do"
+    )]
+    Diverged {
+        /// Steps taken.
+        step: u64,
+        /// Parameters or moments of the optimiser, as in a checkpoint.
+        key: String,
+        /// The first such number.
+        value: f32,
+    },
     /// A file that cannot be read or written.
     #[error("{}: {source}", path.display())]
     Io {

@@ -11,9 +11,9 @@ use volrender::metrics;
 use crate::Error;
 use crate::capture::Pixels;
 use crate::lpips::Lpips;
-use crate::pixels::Label;
-use crate::render::{Renderer, Rendering};
-use crate::scene::{PreparedFrame, Scene};
+use crate::render::picture::{Renderer, Rendering};
+use crate::scene::labels::Label;
+use crate::scene::prepared::{PreparedFrame, Scene};
 
 /// Opacity above which the paper counts a pixel as rendered.
 const VISIBLE: f32 = 0.001;
@@ -107,7 +107,7 @@ pub fn evaluate_with(
     let (mut scores, mut seconds) = (Vec::new(), 0.0);
     for frame in frames {
         let start = Instant::now();
-        let mut rendering = renderer.render(frame, Vec3::ZERO)?;
+        let mut rendering = renderer.render(&frame.view, Vec3::ZERO)?;
         seconds += start.elapsed().as_secs_f64();
         progress(frame, &rendering);
         let truth = frame.pixels()?;
@@ -149,7 +149,7 @@ fn score(
     lpips: Option<&Lpips>,
 ) -> Result<FrameMetrics, Error> {
     let (a, b) = (&rendering.image.pixels[..], &truth.image.pixels[..]);
-    let (width, height) = (frame.camera.width as usize, frame.camera.height as usize);
+    let (width, height) = (frame.view.camera.width as usize, frame.view.camera.height as usize);
     let visible: Vec<bool> = rendering.opacity.iter().map(|&o| o > VISIBLE).collect();
     let mask: Vec<bool> = truth.mask.iter().map(|&m| m > 0.5).collect();
     let solid: Vec<bool> = rendering.opacity.iter().map(|&o| o > 0.5).collect();
@@ -175,15 +175,15 @@ fn score(
 
 /// Pixels (H × W) whose first hit on the posed prior is nearest to a vertex of `least`.
 fn hidden_pixels(scene: &Scene, frame: &PreparedFrame, mask: &[f32], least: &[bool]) -> Result<Vec<bool>, Error> {
-    let mesh = RayMesh::new(&frame.posed.vertices, &scene.model.faces)?;
-    let width = frame.camera.width as usize;
+    let mesh = RayMesh::new(&frame.view.posed.vertices, &scene.body.model.faces)?;
+    let width = frame.view.camera.width as usize;
     let nearest = |i: usize| {
         if mask[i] <= 0.5 {
             return false;
         }
-        let ray = frame.camera.ray((i % width) as f32 + 0.5, (i / width) as f32 + 0.5);
+        let ray = frame.view.camera.ray((i % width) as f32 + 0.5, (i / width) as f32 + 0.5);
         mesh.first_hit(ray.origin, ray.direction).is_some_and(|hit| {
-            let corners = scene.model.faces[hit.face as usize];
+            let corners = scene.body.model.faces[hit.face as usize];
             let [a, b, c] = hit.barycentric;
             let corner = if a >= b && a >= c {
                 0
@@ -195,5 +195,5 @@ fn hidden_pixels(scene: &Scene, frame: &PreparedFrame, mask: &[f32], least: &[bo
             least[corners[corner] as usize]
         })
     };
-    Ok((0..width * frame.camera.height as usize).into_par_iter().map(nearest).collect())
+    Ok((0..width * frame.view.camera.height as usize).into_par_iter().map(nearest).collect())
 }

@@ -25,59 +25,41 @@
 //! canonical body's height / 1.7 m, so that a capture in centimetres trains the same. The same seed and inputs give
 //! the same bits on one instruction set, whatever the number of threads, and so does resuming from a checkpoint.
 
-mod adam;
-mod arena;
+mod atomic;
 pub mod bake;
-mod batch;
 mod capacity;
 pub mod capture;
-mod checkpoint;
 mod config;
-mod correction;
-mod encoder;
 mod error;
 mod evaluate;
-mod field;
-mod gemm;
-mod loss;
 #[cfg_attr(not(feature = "lpips"), path = "lpips/absent.rs")]
 mod lpips;
-mod mix;
-mod mlp;
-mod parameters;
-mod photometric;
-mod pixels;
-#[cfg(test)]
-mod plain;
-mod pose_backward;
-mod presets;
-mod prior;
+mod model;
 mod random;
 mod render;
-mod restarts;
-mod runs;
-mod samples;
 mod scene;
-mod shell;
-mod step;
-mod times;
-mod trainer;
-mod validate;
-mod vertices;
+mod train;
 
+pub use atomic::replace_file;
 pub use capacity::{Capacity, Choice, Measured, Pruned};
-pub use checkpoint::checkpoint_config;
 pub use config::{
-    AttentionKind, Component, Config, DistanceKind, EncodingConfig, FieldConfig, LossConfig, Method, MotionConfig,
-    MotionKind, OccludedRule, Preset, RateConfig, SurfaceConfig, VisibilityKind,
+    AttentionKind, Component, Config, ConfigError, DistanceKind, EncodingConfig, FieldConfig, LossConfig, Method,
+    MotionConfig, MotionKind, OccludedRule, Preset, RateConfig, SurfaceConfig, VisibilityKind,
 };
 pub use error::Error;
 pub use evaluate::{FrameMetrics, SplitMetrics, evaluate, evaluate_with, least_seen_quartile};
 pub use lpips::{Lpips, Trunk};
-pub use pixels::{Label, Labels, label_pixels};
-pub use prior::VertexColors;
-pub use render::{FieldRenderer, PriorRenderer, Renderer, Rendering, view_of};
-pub use scene::{PreparedFrame, Scene};
-pub use times::StepTimes;
-pub use trainer::{StepReport, Trainer};
-pub use validate::ConfigError;
+pub use model::body::{Body, Moment};
+pub use model::colors::VertexColors;
+pub use model::person::Person;
+pub use model::saved::checkpoint_config;
+pub use model::times::StepTimes;
+pub use model::trained::{Model, upright};
+pub use model::view::PosedView;
+pub use render::field::FieldRenderer;
+pub use render::picture::{Renderer, Rendering};
+pub use render::prior::PriorRenderer;
+pub use scene::labels::{Label, Labels, label_pixels};
+pub use scene::prepared::{PreparedFrame, Scene};
+pub use train::report::StepReport;
+pub use train::trainer::Trainer;

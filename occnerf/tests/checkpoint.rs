@@ -302,6 +302,32 @@ fn an_old_checkpoint_survives_a_save_that_fails() {
 }
 
 #[test]
+fn a_training_that_has_diverged_leaves_the_good_checkpoint_alone() {
+    let dir = TempDir::new("diverged");
+    let mut config = config(Method::HashPoint);
+    let path = dir.path("good.safetensors");
+    let mut trainer = Trainer::new(scene(), config.clone()).unwrap();
+    trainer.step().unwrap();
+    trainer.save(&path).unwrap();
+    let bytes = std::fs::read(&path).unwrap();
+    (config.rates.field, config.rates.table) = (f32::MAX, f32::MAX);
+    let mut wild = Trainer::new(scene(), config).unwrap();
+    let mut outcome = wild.save(&path);
+    for _ in 0..20 {
+        std::fs::write(&path, &bytes).unwrap();
+        wild.step().unwrap();
+        outcome = wild.save(&path);
+        if outcome.is_err() {
+            break;
+        }
+    }
+    let error = outcome.unwrap_err();
+    assert!(matches!(error, Error::Diverged { .. }), "{error}");
+    assert!(error.to_string().contains("rates"), "{error}");
+    assert!(std::fs::read(&path).unwrap() == bytes);
+}
+
+#[test]
 fn a_checkpoint_must_say_how_far_its_field_reaches() {
     let dir = TempDir::new("shell");
     let path = dir.path("shell.safetensors");

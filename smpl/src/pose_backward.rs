@@ -27,6 +27,16 @@ struct Partial {
     features: Vec<f32>,
 }
 
+/// Derivatives by what the kinematic tree gives to skinning.
+struct JointGradients<'a> {
+    /// ∂/∂ linear part and translation of every bone, (J).
+    bones: Vec<(DMat3, DVec3)>,
+    /// ∂/∂ R − I of the non-root joints, (P).
+    features: Vec<f64>,
+    /// ∂/∂ posed joints, (J) or empty.
+    joints: &'a [Vec3],
+}
+
 impl BodyModel {
     /// Backward of [`BodyModel::pose`]: from `d_vertices`, (V), and `d_joints`, (J) or empty for none, to the rotations,
     /// the rest body and the placement. `posed` is the forward's result for the same inputs.
@@ -101,7 +111,9 @@ impl BodyModel {
                 *sum += f64::from(*d);
             }
         }
-        self.kinematics_backward(shaped, pose, placement, posed, d_bones, d_joints, &d_features, d_rest)
+        let d = JointGradients { bones: d_bones, features: d_features, joints: d_joints };
+        let (d_pose, d_rest_joints, placement) = self.kinematics_backward(shaped, pose, placement, posed, d);
+        PoseGradient { pose: d_pose, shaped: Shaped { vertices: d_rest, joints: d_rest_joints }, placement }
     }
 
     /// Backward of x = Σ w_i bones_i (rest + offset) and of the pose blend shapes, for a run of vertices from `start`.
@@ -141,19 +153,17 @@ impl BodyModel {
         out
     }
 
-    /// Backward of the kinematic tree. With G_i the joint frames (R_i, t_i): bone_i = (R_i, t_i − R_i J_i), and
-    /// R_i = R_p L_i, t_i = R_p (J_i − J_p) + t_p.
+    /// Backward of the kinematic tree, to the rotations, the rest joints and the placement. With G_i
+    /// the joint frames (R_i, t_i): bone_i = (R_i, t_i − R_i J_i), and R_i = R_p L_i,
+    /// t_i = R_p (J_i − J_p) + t_p.
     fn kinematics_backward(
         &self,
         shaped: &Shaped,
         pose: &[Vec3],
         placement: Placement,
         posed: &Posed,
-        d_bones: Vec<(DMat3, DVec3)>,
-        d_joints: &[Vec3],
-        d_features: &[f64],
-        d_rest: Vec<Vec3>,
-    ) -> PoseGradient {
+        d: JointGradients<'_>,
+    ) -> (Vec<Vec3>, Vec<Vec3>, Placement) {
         let rest: Vec<DVec3> = shaped.joints.iter().map(|j| j.as_dvec3()).collect();
         let linear: Vec<DMat3> = posed.bones.iter().map(|b| glam::Mat3::from(b.matrix3).as_dmat3()).collect();
         let mut d_pose = vec![Vec3::ZERO; rest.len()];
@@ -161,9 +171,9 @@ impl BodyModel {
         // ∂/∂R_i and ∂/∂t_i, from the bones first, then from the children.
         let mut d_linear = vec![DMat3::ZERO; rest.len()];
         let mut d_origin = vec![DVec3::ZERO; rest.len()];
-        for (i, (d_matrix, d_translation)) in d_bones.into_iter().enumerate() {
+        for (i, (d_matrix, d_translation)) in d.bones.into_iter().enumerate() {
             d_linear[i] = d_matrix - outer(d_translation, rest[i]);
-            d_origin[i] = d_translation + d_joints.get(i).map_or(DVec3::ZERO, |d| d.as_dvec3());
+            d_origin[i] = d_translation + d.joints.get(i).map_or(DVec3::ZERO, |d| d.as_dvec3());
             d_rest_joints[i] -= linear[i].transpose() * d_translation;
         }
         for i in (1..rest.len()).rev() {
@@ -177,7 +187,7 @@ impl BodyModel {
             d_rest_joints[i] += d_bone;
             d_rest_joints[parent] -= d_bone;
             let mut row_major = [0.0; TERMS_PER_JOINT];
-            row_major.copy_from_slice(&d_features[TERMS_PER_JOINT * (i - 1)..TERMS_PER_JOINT * i]);
+            row_major.copy_from_slice(&d.features[TERMS_PER_JOINT * (i - 1)..TERMS_PER_JOINT * i]);
             let d_local = to_parent * d_r + DMat3::from_cols_array(&row_major).transpose();
             d_pose[i] = rodrigues_backward(pose[i], d_local);
         }
@@ -194,8 +204,7 @@ impl BodyModel {
                 Placement::Origin { rotation: rodrigues_backward(rotation, d_rotation), translation: d_translation }
             }
         };
-        let joints = d_rest_joints.iter().map(|d| d.as_vec3()).collect();
-        PoseGradient { pose: d_pose, shaped: Shaped { vertices: d_rest, joints }, placement }
+        (d_pose, d_rest_joints.iter().map(|d| d.as_vec3()).collect(), placement)
     }
 
     /// Backward of [`BodyModel::shaped`]: from `d_shaped`, derivatives with respect to rest vertices and rest joints, to

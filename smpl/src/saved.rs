@@ -1,6 +1,7 @@
 //! Bodies as safetensors: this crate's own form, bit-exact and quick to read.
 
 use std::collections::HashMap;
+use std::io::Write;
 use std::path::Path;
 
 use glam::Vec3;
@@ -56,7 +57,12 @@ impl BodyModel {
         let header = HashMap::from([(FORMAT.0.to_owned(), FORMAT.1.to_owned())]);
         let bytes = safetensors::serialize(views, Some(header)).map_err(fault)?;
         let partial = path.with_extension("safetensors.partial");
-        std::fs::write(&partial, bytes).map_err(|source| Error::Io { path: partial.clone(), source })?;
+        // On the disk before the old file is gone, so that a power cut leaves one of the two.
+        let written = std::fs::File::create(&partial).and_then(|mut file| {
+            file.write_all(&bytes)?;
+            file.sync_all()
+        });
+        written.map_err(|source| Error::Io { path: partial.clone(), source })?;
         std::fs::rename(&partial, path).map_err(|source| Error::Io { path: path.to_owned(), source })
     }
 }

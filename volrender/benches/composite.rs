@@ -5,7 +5,7 @@ use divan::counter::ItemsCount;
 use divan::{Bencher, black_box};
 use glam::Vec3;
 use rayon::prelude::*;
-use volrender::{composite, composite_backward};
+use volrender::{RaySamples, SampleGradients, composite, composite_backward};
 
 const RAYS: usize = 6 * 32 * 32;
 const SAMPLES: usize = 128;
@@ -62,8 +62,14 @@ impl Outputs {
     }
 }
 
-type Run<'a> =
-    dyn Fn(&[f32], &[f32], &[f32], &[f32], &[Vec3], &mut [f32], &mut [f32], &mut [Vec3], &mut [f32]) + Sync + 'a;
+impl Rays {
+    fn samples(&self, ray: std::ops::Range<usize>) -> RaySamples<'_> {
+        let Self { sigma, likelihood, delta, t, rgb } = self;
+        RaySamples { sigma, likelihood, delta, t, rgb }.slice(ray)
+    }
+}
+
+type Run<'a> = dyn Fn(RaySamples<'_>, &mut [f32], SampleGradients<'_>) + Sync + 'a;
 
 /// One ray's inputs and outputs at a time, on the pool.
 fn each_ray(rays: &Rays, out: &mut Outputs, run: &Run<'_>) {
@@ -77,17 +83,7 @@ fn each_ray(rays: &Rays, out: &mut Outputs, run: &Run<'_>) {
         .with_min_len(64)
         .for_each(|(i, (((weights, d_sigma), d_rgb), d_likelihood))| {
             let ray = i * SAMPLES..(i + 1) * SAMPLES;
-            run(
-                &rays.sigma[ray.clone()],
-                &rays.likelihood[ray.clone()],
-                &rays.delta[ray.clone()],
-                &rays.t[ray.clone()],
-                &rays.rgb[ray],
-                weights,
-                d_sigma,
-                d_rgb,
-                d_likelihood,
-            );
+            run(rays.samples(ray), weights, SampleGradients { d_sigma, d_rgb, d_likelihood });
         });
 }
 
@@ -95,8 +91,8 @@ fn each_ray(rays: &Rays, out: &mut Outputs, run: &Run<'_>) {
 fn forward(bencher: Bencher<'_, '_>) {
     let (rays, mut out) = (Rays::new(), Outputs::new());
     bencher.counter(ItemsCount::new(TOTAL)).bench_local(|| {
-        each_ray(&rays, &mut out, &|sigma, likelihood, delta, t, rgb, weights, _, _, _| {
-            black_box(composite(sigma, likelihood, delta, t, rgb, Vec3::ONE, weights));
+        each_ray(&rays, &mut out, &|samples, weights, _| {
+            black_box(composite(samples, Vec3::ONE, weights));
         });
     });
 }
@@ -105,22 +101,10 @@ fn forward(bencher: Bencher<'_, '_>) {
 fn forward_and_backward(bencher: Bencher<'_, '_>) {
     let (rays, mut out) = (Rays::new(), Outputs::new());
     bencher.counter(ItemsCount::new(TOTAL)).bench_local(|| {
-        each_ray(&rays, &mut out, &|sigma, likelihood, delta, t, rgb, weights, d_sigma, d_rgb, d_likelihood| {
-            let pixel = composite(sigma, likelihood, delta, t, rgb, Vec3::ONE, weights);
+        each_ray(&rays, &mut out, &|samples, weights, gradients| {
+            let pixel = composite(samples, Vec3::ONE, weights);
             let d_color = 2.0 * (pixel.color - 0.5);
-            composite_backward(
-                sigma,
-                likelihood,
-                delta,
-                rgb,
-                Vec3::ONE,
-                weights,
-                d_color,
-                0.1,
-                d_sigma,
-                d_rgb,
-                d_likelihood,
-            );
+            composite_backward(samples, Vec3::ONE, weights, d_color, 0.1, gradients);
         });
     });
 }
@@ -130,7 +114,9 @@ fn forward_and_backward(bencher: Bencher<'_, '_>) {
 fn forward_and_backward_plain(bencher: Bencher<'_, '_>) {
     let (rays, mut out) = (Rays::new(), Outputs::new());
     bencher.counter(ItemsCount::new(TOTAL)).bench_local(|| {
-        each_ray(&rays, &mut out, &|sigma, likelihood, delta, _, rgb, weights, d_sigma, d_rgb, d_likelihood| {
+        each_ray(&rays, &mut out, &|samples, weights, gradients| {
+            let RaySamples { sigma, likelihood, delta, rgb, .. } = samples;
+            let SampleGradients { d_sigma, d_rgb, d_likelihood } = gradients;
             let (mut color, mut transmittance) = (Vec3::ZERO, 1.0);
             for i in 0..SAMPLES {
                 let alpha = likelihood[i] * (1.0 - (-sigma[i] * delta[i]).exp());
@@ -161,22 +147,14 @@ fn forward_and_backward_in_cache(bencher: Bencher<'_, '_>) {
     let (rays, mut out) = (Rays::new(), Outputs::new());
     let ray = 0..SAMPLES;
     bencher.counter(ItemsCount::new(SAMPLES)).bench_local(|| {
-        let (sigma, likelihood) = (black_box(&rays.sigma[ray.clone()]), &rays.likelihood[ray.clone()]);
-        let (delta, t, rgb) = (&rays.delta[ray.clone()], &rays.t[ray.clone()], &rays.rgb[ray.clone()]);
+        let samples = black_box(rays.samples(ray.clone()));
         let weights = &mut out.weights[ray.clone()];
-        let pixel = composite(sigma, likelihood, delta, t, rgb, Vec3::ONE, weights);
-        composite_backward(
-            sigma,
-            likelihood,
-            delta,
-            rgb,
-            Vec3::ONE,
-            weights,
-            pixel.color,
-            0.1,
-            &mut out.d_sigma[ray.clone()],
-            &mut out.d_rgb[ray.clone()],
-            &mut out.d_likelihood[ray.clone()],
-        );
+        let pixel = composite(samples, Vec3::ONE, weights);
+        let gradients = SampleGradients {
+            d_sigma: &mut out.d_sigma[ray.clone()],
+            d_rgb: &mut out.d_rgb[ray.clone()],
+            d_likelihood: &mut out.d_likelihood[ray.clone()],
+        };
+        composite_backward(samples, Vec3::ONE, weights, pixel.color, 0.1, gradients);
     });
 }

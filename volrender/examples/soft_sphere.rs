@@ -3,7 +3,7 @@
 //! Left the colours, right the depth of what was hit (near is bright).
 
 use glam::{Affine3A, Mat3, Vec3};
-use volrender::{Aabb, Camera, bin_edges, bin_widths, composite, sample};
+use volrender::{Aabb, Camera, RaySamples, bin_edges, bin_widths, composite, sample};
 
 const SIDE: u32 = 256;
 const SAMPLES: usize = 96;
@@ -39,7 +39,9 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
                 sample(&edges, jitter, &mut t);
                 let sigma = t.map(|t| 60.0 * ((0.9 - ray.at(t).length()) / 0.3).clamp(0.0, 1.0).powi(2));
                 let rgb = t.map(|t| shade(ray.at(t)));
-                let pixel = composite(&sigma, &[1.0; SAMPLES], &delta, &t, &rgb, sky, &mut weights);
+                let samples =
+                    RaySamples { sigma: &sigma, likelihood: &[1.0; SAMPLES], delta: &delta, t: &t, rgb: &rgb };
+                let pixel = composite(samples, sky, &mut weights);
                 color = pixel.color;
                 if pixel.opacity > 0.5 {
                     depth = 1.0 - (pixel.depth / pixel.opacity - 2.2) / 1.2;

@@ -1,13 +1,61 @@
-use crate::simd::Kernel;
+use std::ops::Range;
+
 use glam::{Vec3, Vec4};
 
 use crate::exponential::one_minus_exp;
+use crate::simd::Kernel;
 
 /// Samples whose exponentials are computed together in SIMD lanes.
 pub(crate) const BLOCK: usize = 32;
 
 /// Alphas compared together.
 const LANES: usize = 8;
+
+/// The samples of one ray, nearest first. All slices are (S).
+#[derive(Clone, Copy, Debug, Default)]
+pub struct RaySamples<'a> {
+    /// Density σ in 1/length, at least 0, however large.
+    pub sigma: &'a [f32],
+    /// Likelihood f in [0, 1] that anything is there, which scales α; 1 for an ordinary renderer.
+    pub likelihood: &'a [f32],
+    /// Width δ of the sample's own bin.
+    pub delta: &'a [f32],
+    /// Depth.
+    pub t: &'a [f32],
+    /// Colour c.
+    pub rgb: &'a [Vec3],
+}
+
+impl RaySamples<'_> {
+    /// The samples in `range`: one ray of many whose samples stand one after the other.
+    ///
+    /// # Panics
+    /// Where a slice ends before the range.
+    #[must_use]
+    pub fn slice(&self, range: Range<usize>) -> Self {
+        Self {
+            sigma: &self.sigma[range.clone()],
+            likelihood: &self.likelihood[range.clone()],
+            delta: &self.delta[range.clone()],
+            t: &self.t[range.clone()],
+            rgb: &self.rgb[range],
+        }
+    }
+
+    /// Panics where the lengths of the slices, or those of the results, differ.
+    pub(crate) fn assert_lengths<const N: usize>(&self, results: [usize; N]) {
+        let Self { sigma, likelihood, delta, t, rgb } = self;
+        let n = sigma.len();
+        assert!(
+            [likelihood.len(), delta.len(), t.len(), rgb.len()] == [n; 4] && results == [n; N],
+            "{n} sigma, {} likelihood, {} delta, {} t, {} rgb, results of {results:?}: expected equal lengths",
+            likelihood.len(),
+            delta.len(),
+            t.len(),
+            rgb.len(),
+        );
+    }
+}
 
 /// One composited ray.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -22,52 +70,27 @@ pub struct Composite {
     pub termination: Option<u32>,
 }
 
-/// Composites the samples of one ray, nearest first, and writes their weights w_i = α_i Π_{j<i} (1 − α_j) with
-/// α_i = f_i (1 − exp(−σ_i δ_i)) (Max 1995; the likelihood f as in HumanNeRF, 2022). All slices are (S).
+/// Composites the samples of one ray and writes their weights (S), w_i = α_i Π_{j<i} (1 − α_j) with
+/// α_i = f_i (1 − exp(−σ_i δ_i)) (Max 1995; the likelihood f as in HumanNeRF, 2022).
 ///
-/// `sigma` is density in 1/length, at least 0, however large; `likelihood` f is in [0, 1]; `delta` is the width of
-/// the sample's own bin; `t` its depth. Samples that are known to have α = 0 may be left out: the result is the
-/// same. A NaN in the inputs makes the colour NaN and never wins the termination.
+/// Samples that are known to have α = 0 may be left out: the result is the same. A NaN in the
+/// inputs makes the colour NaN and never wins the termination.
 ///
 /// Transmittance below 1e-38 counts as 0.
 ///
 /// # Panics
 /// Where the slices differ in length.
-pub fn composite(
-    sigma: &[f32],
-    likelihood: &[f32],
-    delta: &[f32],
-    t: &[f32],
-    rgb: &[Vec3],
-    background: Vec3,
-    weights: &mut [f32],
-) -> Composite {
-    let n = sigma.len();
-    assert!(
-        [likelihood.len(), delta.len(), t.len(), rgb.len(), weights.len()] == [n; 5],
-        "{n} sigma, {} likelihood, {} delta, {} t, {} rgb, {} weights: expected equal lengths",
-        likelihood.len(),
-        delta.len(),
-        t.len(),
-        rgb.len(),
-        weights.len()
-    );
+pub fn composite(samples: RaySamples<'_>, background: Vec3, weights: &mut [f32]) -> Composite {
+    samples.assert_lengths([weights.len()]);
     pulp::Arch::new().dispatch(Kernel(
         #[inline(always)]
-        || forward(sigma, likelihood, delta, t, rgb, background, weights),
+        || forward(samples, background, weights),
     ))
 }
 
 #[inline(always)]
-fn forward(
-    sigma: &[f32],
-    likelihood: &[f32],
-    delta: &[f32],
-    t: &[f32],
-    rgb: &[Vec3],
-    background: Vec3,
-    weights: &mut [f32],
-) -> Composite {
+fn forward(samples: RaySamples<'_>, background: Vec3, weights: &mut [f32]) -> Composite {
+    let RaySamples { sigma, likelihood, delta, t, rgb } = samples;
     let mut transmittance = 1.0;
     let mut sum = Vec4::ZERO; // colour and depth
     let mut opacity = 0.0;

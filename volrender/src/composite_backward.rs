@@ -1,11 +1,22 @@
-use crate::simd::Kernel;
 use glam::Vec3;
 
-use crate::composite::{BLOCK, flushed};
+use crate::composite::{BLOCK, RaySamples, flushed};
 use crate::exponential::one_minus_exp;
+use crate::simd::Kernel;
 
-/// Gradients of [`composite`](crate::composite) of one ray, given those of its colour and its opacity, and the
-/// `weights` that it wrote. All slices are (S); `d_sigma`, `d_rgb` and `d_likelihood` are overwritten.
+/// Where the gradients of one ray's samples go, each (S); overwritten.
+#[derive(Debug)]
+pub struct SampleGradients<'a> {
+    /// By density.
+    pub d_sigma: &'a mut [f32],
+    /// By colour.
+    pub d_rgb: &'a mut [Vec3],
+    /// By likelihood.
+    pub d_likelihood: &'a mut [f32],
+}
+
+/// Writes the gradients of [`composite`](crate::composite) by the samples of one ray, given those of
+/// its colour and its opacity, and the `weights` (S) that it wrote.
 ///
 /// With V_i = c_i · d_color + d_opacity the value of stopping at sample i, and R_i the value of everything behind it
 /// (R_S = background · d_color, R_{i−1} = α_i V_i + (1 − α_i) R_i), the derivative by α_i is T_i (V_i − R_i). Nothing is
@@ -14,66 +25,35 @@ use crate::exponential::one_minus_exp;
 /// # Panics
 /// Where the slices differ in length.
 pub fn composite_backward(
-    sigma: &[f32],
-    likelihood: &[f32],
-    delta: &[f32],
-    rgb: &[Vec3],
+    samples: RaySamples<'_>,
     background: Vec3,
     weights: &[f32],
     d_color: Vec3,
     d_opacity: f32,
-    d_sigma: &mut [f32],
-    d_rgb: &mut [Vec3],
-    d_likelihood: &mut [f32],
+    gradients: SampleGradients<'_>,
 ) {
-    let n = sigma.len();
-    assert!(
-        [likelihood.len(), delta.len(), rgb.len(), weights.len()] == [n; 4]
-            && [d_sigma.len(), d_rgb.len(), d_likelihood.len()] == [n; 3],
-        "{n} sigma, {} likelihood, {} delta, {} rgb, {} weights, {} d_sigma, {} d_rgb, {} d_likelihood: expected \
-         equal lengths",
-        likelihood.len(),
-        delta.len(),
-        rgb.len(),
-        weights.len(),
-        d_sigma.len(),
-        d_rgb.len(),
-        d_likelihood.len()
-    );
+    let SampleGradients { d_sigma, d_rgb, d_likelihood } = gradients;
+    samples.assert_lengths([weights.len(), d_sigma.len(), d_rgb.len(), d_likelihood.len()]);
     pulp::Arch::new().dispatch(Kernel(
         #[inline(always)]
         || {
-            backward(
-                sigma,
-                likelihood,
-                delta,
-                rgb,
-                background,
-                weights,
-                d_color,
-                d_opacity,
-                d_sigma,
-                d_rgb,
-                d_likelihood,
-            )
+            let gradients = SampleGradients { d_sigma, d_rgb, d_likelihood };
+            backward(samples, background, weights, d_color, d_opacity, gradients)
         },
     ))
 }
 
 #[inline(always)]
 fn backward(
-    sigma: &[f32],
-    likelihood: &[f32],
-    delta: &[f32],
-    rgb: &[Vec3],
+    samples: RaySamples<'_>,
     background: Vec3,
     weights: &[f32],
     d_color: Vec3,
     d_opacity: f32,
-    d_sigma: &mut [f32],
-    d_rgb: &mut [Vec3],
-    d_likelihood: &mut [f32],
+    gradients: SampleGradients<'_>,
 ) {
+    let RaySamples { sigma, likelihood, delta, rgb, .. } = samples;
+    let SampleGradients { d_sigma, d_rgb, d_likelihood } = gradients;
     // The outputs serve as scratch: dα/dσ, dα/df, and in d_rgb the transmittance in front of each sample.
     let mut transmittance = 1.0;
     let inputs = sigma.chunks(BLOCK).zip(likelihood.chunks(BLOCK)).zip(delta.chunks(BLOCK));

@@ -1,9 +1,8 @@
-//! The outer parts of a volume renderer: cameras and rays, patches of pixels, bounds, the cells worth sampling, samples along
-//! a ray, alpha compositing with
-//! its backward pass, and image metrics.
+//! The outer parts of a volume renderer: cameras and rays, patches of pixels, bounds, the cells
+//! worth sampling, samples along a ray, alpha compositing with its backward pass, and image metrics.
 //!
 //! ```
-//! use volrender::{Aabb, Camera, bin_edges, bin_midpoints, bin_widths, composite};
+//! use volrender::{Aabb, Camera, RaySamples, bin_edges, bin_midpoints, bin_widths, composite};
 //! use glam::{Affine3A, Mat3, Vec3};
 //!
 //! // 64×64 pixels, looking along +z from two metres before the origin.
@@ -20,7 +19,9 @@
 //!     // A ball of fog.
 //!     let sigma = t.map(|t| if ray.at(t).length() < 0.8 { 3.0 } else { 0.0 });
 //!     let mut weights = [0.0; 16];
-//!     let pixel = composite(&sigma, &[1.0; 16], &delta, &t, &[Vec3::X; 16], Vec3::ZERO, &mut weights);
+//!     let (likelihood, rgb) = ([1.0; 16], [Vec3::X; 16]);
+//!     let samples = RaySamples { sigma: &sigma, likelihood: &likelihood, delta: &delta, t: &t, rgb: &rgb };
+//!     let pixel = composite(samples, Vec3::ZERO, &mut weights);
 //!     assert!(pixel.opacity > 0.9);
 //! }
 //! # Ok::<(), volrender::Error>(())
@@ -46,9 +47,9 @@ mod sampling;
 mod simd;
 
 pub use camera::{Camera, Error};
-pub use composite::{Composite, composite};
-pub use composite_backward::composite_backward;
+pub use composite::{Composite, RaySamples, composite};
+pub use composite_backward::{SampleGradients, composite_backward};
 pub use distortion::Distortion;
-pub use occupancy::Occupancy;
+pub use occupancy::{Occupancy, OccupancyConfig};
 pub use ray::{Aabb, Ray};
 pub use sampling::{bin_edges, bin_midpoints, bin_widths, patch, sample};

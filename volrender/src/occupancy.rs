@@ -8,11 +8,11 @@ const MAX_CELLS: f32 = 256.0;
 /// Layers of cells that are marked together.
 const LAYERS: usize = 8;
 
-/// A coarse grid of the cells in which a body can be, so that samples in empty space cost nothing (Müller et al. 2022,
-/// section 5.1, made from a mesh rather than from a field).
+/// A coarse grid of the cells in which a body can be, so that samples in empty space cost nothing
+/// (Müller et al. 2022, section 5.1, made from a mesh rather than from a field).
 ///
-/// It marks a superset of the points within a margin of a triangle mesh that turns by no more than 120° at its edges, or
-/// enclosed by it and not too deep.
+/// It marks a superset of the points within a margin of a triangle mesh that turns by no more than
+/// 120° at its edges, or enclosed by it and not too deep.
 #[derive(Clone, Debug, Default)]
 pub struct Occupancy {
     min: Vec3,
@@ -27,34 +27,39 @@ pub struct Occupancy {
     region: Option<Aabb>,
 }
 
+/// How far from a mesh cells are marked, and how large they are, in the unit of its vertices.
+#[derive(Clone, Copy, Debug)]
+pub struct OccupancyConfig {
+    /// Upper bound of the margins of the faces, outside.
+    pub margin: f32,
+    /// Depth down to which the inside is marked; all of it where this is above `margin`.
+    pub depth: f32,
+    /// Side of a cell; longer where an axis would have more than about 256.
+    pub cell: f32,
+}
+
 impl Occupancy {
-    /// Rebuilds in place for `vertices` (V) and `faces` (F), which may be open: the cells at a triangle seal the inside off
-    /// from the outside. Wanted are points outside within the `margins` (F) of the triangles they are closest to (where they
-    /// are closest to an edge or a corner, of all triangles there), none above `margin`, and inside down to `depth`. Cells
-    /// have sides of `cell`, or so long that no axis has more than about 256. All lengths are in the unit of the vertices.
+    /// Rebuilds in place for `vertices` (V) and `faces` (F), which may be open: the cells at a
+    /// triangle seal the inside off from the outside. Wanted are points outside within the
+    /// `margins` (F) of the triangles they are closest to (where they are closest to an edge or a
+    /// corner, of all triangles there), none above `config.margin`, and inside down to
+    /// `config.depth`.
     ///
-    /// A mesh without vertices, or with one that is not finite, is nowhere, and so is one so large that lengths overflow.
+    /// A mesh without vertices, or with one that is not finite, is nowhere, and so is one so large
+    /// that lengths overflow. Lengths of `config` that are negative or NaN count as 0.
     ///
     /// # Panics
     /// Where `margins` has not one entry a face, or a face names a vertex that is not there.
-    pub fn rebuild(
-        &mut self,
-        vertices: &[Vec3],
-        faces: &[[u32; 3]],
-        margins: &[f32],
-        margin: f32,
-        depth: f32,
-        cell: f32,
-    ) {
+    pub fn rebuild(&mut self, vertices: &[Vec3], faces: &[[u32; 3]], margins: &[f32], config: OccupancyConfig) {
         assert_eq!(margins.len(), faces.len(), "{} margins for {} faces", margins.len(), faces.len());
         let low = vertices.iter().copied().fold(Vec3::INFINITY, Vec3::min);
         let high = vertices.iter().copied().fold(Vec3::NEG_INFINITY, Vec3::max);
         self.live.clear();
         self.region = None;
         self.size = IVec3::ZERO;
-        let (margin, depth) = (margin.max(0.0), depth.max(0.0));
+        let (margin, depth) = (config.margin.max(0.0), config.depth.max(0.0));
         let extent = (high - low).max_element() + 2.0 * margin;
-        let cell = cell.max(extent / MAX_CELLS).max(f32::MIN_POSITIVE);
+        let cell = config.cell.max(extent / MAX_CELLS).max(f32::MIN_POSITIVE);
         let border = Vec3::splat(margin + 1.5 * cell);
         let per_cell = 1.0 / cell;
         let size = (high - low + 2.0 * border) * per_cell;

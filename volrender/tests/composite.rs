@@ -5,7 +5,7 @@ use glam::Vec3;
 use proptest::prelude::*;
 use testkit::gradient::{Tolerance, assert_gradient};
 use testkit::oracle;
-use volrender::{Composite, composite, composite_backward};
+use volrender::{Composite, RaySamples, SampleGradients, composite, composite_backward};
 
 #[derive(Clone, Debug, Default)]
 struct Samples {
@@ -28,9 +28,13 @@ impl Samples {
 
     fn composite(&self, background: Vec3) -> (Composite, Vec<f32>) {
         let mut weights = vec![f32::NAN; self.sigma.len()];
-        let Self { sigma, likelihood, delta, t, rgb } = self;
-        let composite = composite(sigma, likelihood, delta, t, rgb, background, &mut weights);
+        let composite = composite(self.as_ray(), background, &mut weights);
         (composite, weights)
+    }
+
+    fn as_ray(&self) -> RaySamples<'_> {
+        let Self { sigma, likelihood, delta, t, rgb } = self;
+        RaySamples { sigma, likelihood, delta, t, rgb }
     }
 
     fn backward(&self, background: Vec3, d_color: Vec3, d_opacity: f32) -> Gradients {
@@ -38,19 +42,8 @@ impl Samples {
         let (_, weights) = self.composite(background);
         // Outputs are overwritten, whatever stood in them.
         let mut d = Gradients { sigma: vec![f32::NAN; n], rgb: vec![Vec3::NAN; n], likelihood: vec![f32::NAN; n] };
-        composite_backward(
-            &self.sigma,
-            &self.likelihood,
-            &self.delta,
-            &self.rgb,
-            background,
-            &weights,
-            d_color,
-            d_opacity,
-            &mut d.sigma,
-            &mut d.rgb,
-            &mut d.likelihood,
-        );
+        let gradients = SampleGradients { d_sigma: &mut d.sigma, d_rgb: &mut d.rgb, d_likelihood: &mut d.likelihood };
+        composite_backward(self.as_ray(), background, &weights, d_color, d_opacity, gradients);
         d
     }
 
@@ -264,5 +257,6 @@ fn nan_is_passed_on_and_never_terminates_a_ray() {
 #[test]
 #[should_panic(expected = "2 sigma, 1 likelihood")]
 fn slices_of_different_lengths_are_the_callers_bug() {
-    composite(&[1.0; 2], &[1.0], &[1.0; 2], &[1.0; 2], &[Vec3::ONE; 2], Vec3::ZERO, &mut [0.0; 2]);
+    let samples = RaySamples { sigma: &[1.0; 2], likelihood: &[1.0], ..RaySamples::default() };
+    composite(samples, Vec3::ZERO, &mut [0.0; 2]);
 }

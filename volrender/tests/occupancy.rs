@@ -3,7 +3,7 @@
 use glam::Vec3;
 use proptest::prelude::*;
 use testkit::oracle;
-use volrender::Occupancy;
+use volrender::{Occupancy, OccupancyConfig};
 
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(24))]
@@ -14,7 +14,7 @@ proptest! {
         queries in prop::collection::vec(testkit::strategy::vec3(1.6), 60)
     ) {
         let mut occupancy = Occupancy::default();
-        occupancy.rebuild(&mesh.vertices, &mesh.faces, &vec![margin; mesh.faces.len()], margin, 10.0, cell);
+        occupancy.rebuild(&mesh.vertices, &mesh.faces, &vec![margin; mesh.faces.len()], OccupancyConfig { margin, depth: 10.0, cell });
         for q in queries {
             let (_, _, distance) = oracle::closest_point(&mesh.vertices, &mesh.faces, q);
             if distance < f64::from(margin) || oracle::inside(&mesh.vertices, &mesh.faces, q) {
@@ -39,7 +39,7 @@ proptest! {
         let above = |face: &[u32; 3]| face.iter().map(|&v| mesh.vertices[v as usize].z).sum::<f32>() > 0.0;
         let margins: Vec<f32> = mesh.faces.iter().map(|f| if above(f) { near } else { far }).collect();
         let mut occupancy = Occupancy::default();
-        occupancy.rebuild(&mesh.vertices, &mesh.faces, &margins, 0.3, depth, cell);
+        occupancy.rebuild(&mesh.vertices, &mesh.faces, &margins, OccupancyConfig { margin: 0.3, depth, cell });
         for (face, along, shift) in places {
             let [a, b, c] = mesh.faces[face.index(mesh.faces.len())].map(|v| mesh.vertices[v as usize]);
             let q = (a + b + c) / 3.0 + along * (b - a).cross(c - a).normalize_or_zero() + shift;
@@ -64,7 +64,12 @@ fn space_away_from_the_surface_is_dead_on_both_sides() {
     // The plane leaves the sphere.
     let far = margin + 2.0 * cell + 0.5 * beside * beside;
     let mut occupancy = Occupancy::default();
-    occupancy.rebuild(&mesh.vertices, &mesh.faces, &vec![margin; mesh.faces.len()], margin, 0.04, cell);
+    occupancy.rebuild(
+        &mesh.vertices,
+        &mesh.faces,
+        &vec![margin; mesh.faces.len()],
+        OccupancyConfig { margin, depth: 0.04, cell },
+    );
     let (mut dead, mut total) = (0, 0);
     for i in 0..24 * 24 * 24 {
         let q = (Vec3::new((i % 24) as f32, (i / 24 % 24) as f32, (i / 576) as f32) + 0.5) / 12.0 - 1.0;
@@ -85,10 +90,15 @@ fn space_away_from_the_surface_is_dead_on_both_sides() {
 fn far_points_and_empty_meshes_are_dead() {
     let mut occupancy = Occupancy::default();
     assert!(!occupancy.is_live(Vec3::ZERO));
-    occupancy.rebuild(&[], &[], &[], 0.1, 1.0, 0.1);
+    occupancy.rebuild(&[], &[], &[], OccupancyConfig { margin: 0.1, depth: 1.0, cell: 0.1 });
     assert!(!occupancy.is_live(Vec3::ZERO) && occupancy.region().is_none());
     let mesh = testkit::mesh::icosphere(1);
-    occupancy.rebuild(&mesh.vertices, &mesh.faces, &vec![0.1; mesh.faces.len()], 0.1, 2.0, 0.1);
+    occupancy.rebuild(
+        &mesh.vertices,
+        &mesh.faces,
+        &vec![0.1; mesh.faces.len()],
+        OccupancyConfig { margin: 0.1, depth: 2.0, cell: 0.1 },
+    );
     assert!(occupancy.is_live(Vec3::ZERO) && !occupancy.is_live(Vec3::splat(1.4)));
     assert!(!occupancy.is_live(Vec3::splat(f32::NAN)) && !occupancy.is_live(Vec3::splat(1e30)));
 }
@@ -99,18 +109,23 @@ fn lengths_and_vertices_that_are_none_mark_nothing_or_the_mesh_alone() {
     let margins = vec![f32::NAN; mesh.faces.len()];
     let mut occupancy = Occupancy::default();
     for [margin, depth, cell] in [[f32::NAN, -1.0, -1.0], [0.0, f32::NAN, f32::NAN], [-1.0, 0.0, 0.0]] {
-        occupancy.rebuild(&mesh.vertices, &mesh.faces, &margins, margin, depth, cell);
+        occupancy.rebuild(&mesh.vertices, &mesh.faces, &margins, OccupancyConfig { margin, depth, cell });
         assert!(occupancy.is_live(mesh.vertices[0]) && !occupancy.is_live(2.0 * mesh.vertices[0]));
     }
-    occupancy.rebuild(&[Vec3::ONE; 3], &[[0, 1, 2]], &[0.0], 0.0, 0.0, 0.0);
+    occupancy.rebuild(&[Vec3::ONE; 3], &[[0, 1, 2]], &[0.0], OccupancyConfig { margin: 0.0, depth: 0.0, cell: 0.0 });
     assert!(occupancy.is_live(Vec3::ONE) && !occupancy.is_live(Vec3::ZERO));
-    occupancy.rebuild(&mesh.vertices, &mesh.faces, &margins, f32::INFINITY, 0.1, 0.1);
+    occupancy.rebuild(
+        &mesh.vertices,
+        &mesh.faces,
+        &margins,
+        OccupancyConfig { margin: f32::INFINITY, depth: 0.1, cell: 0.1 },
+    );
     assert!(occupancy.region().is_none() && !occupancy.is_live(Vec3::ZERO));
     let huge: Vec<Vec3> = mesh.vertices.iter().map(|v| 1.69e38 * *v).collect();
-    occupancy.rebuild(&huge, &mesh.faces, &margins, 0.1, 0.1, 0.1);
+    occupancy.rebuild(&huge, &mesh.faces, &margins, OccupancyConfig { margin: 0.1, depth: 0.1, cell: 0.1 });
     assert!(occupancy.region().is_none() && !occupancy.is_live(Vec3::ZERO));
     let mut broken = mesh.vertices.clone();
     broken[3].y = f32::NAN;
-    occupancy.rebuild(&broken, &mesh.faces, &margins, 0.1, 0.1, 0.1);
+    occupancy.rebuild(&broken, &mesh.faces, &margins, OccupancyConfig { margin: 0.1, depth: 0.1, cell: 0.1 });
     assert!(occupancy.region().is_none() && !occupancy.is_live(mesh.vertices[0]));
 }

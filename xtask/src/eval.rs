@@ -7,14 +7,12 @@ use clap::{Args, ValueEnum};
 use image::RgbImage;
 use indicatif::ProgressBar;
 use occnerf::{
-    FieldRenderer, Lpips, Method, PreparedFrame, PriorRenderer, Renderer, Rendering, Scene, SplitMetrics, Trainer,
+    FieldRenderer, Lpips, Method, Model, PreparedFrame, PriorRenderer, Renderer, Rendering, Scene, SplitMetrics,
     VertexColors, evaluate_with,
 };
 use rayon::prelude::*;
 
-use crate::run::{
-    CHECKPOINT, METRICS, Metrics, NOVEL_VIEWS, RunConfig, Splits, TRAINING_VIEWS, peak_rss_bytes, use_threads,
-};
+use crate::run::{METRICS, Metrics, NOVEL_VIEWS, RunConfig, Splits, TRAINING_VIEWS, peak_rss_bytes, use_threads};
 use crate::train::logged_seconds;
 use crate::{pictures, report, table};
 
@@ -57,11 +55,11 @@ pub struct EvalArguments {
 }
 
 /// What is known of a run before it is scored.
-pub fn unscored(run: &RunConfig, model: &Model<'_>, train_seconds: f64) -> Metrics {
+pub fn unscored(run: &RunConfig, drawn: &Drawn<'_>, train_seconds: f64) -> Metrics {
     let config = &run.train;
-    let (steps, parameters, perceptual) = match model {
-        Model::Prior(colors) => (0, 3 * colors.colors.len(), String::new()),
-        Model::Field(trainer) => (trainer.steps_done(), trainer.num_parameters(), trainer.perceptual()),
+    let (steps, parameters, perceptual) = match drawn {
+        Drawn::Prior(colors) => (0, 3 * colors.colors.len(), String::new()),
+        Drawn::Field { model, perceptual } => (model.steps_done(), model.num_parameters(), perceptual.clone()),
     };
     Metrics {
         method: config.method.name().to_owned(),
@@ -87,15 +85,15 @@ pub fn eval(arguments: &EvalArguments) -> Result<()> {
     let run = RunConfig::read(directory)?;
     let source = run.source()?;
     let scene = Scene::new(&source.capture, &source.model, &run.train)?;
-    let trainer;
-    let model = if run.train.method == Method::Prior {
-        Model::Prior(VertexColors::measure(&scene)?)
+    let loaded;
+    let drawn = if run.train.method == Method::Prior {
+        Drawn::Prior(VertexColors::measure(&scene)?)
     } else {
-        trainer = Trainer::resume(&scene, &directory.join(CHECKPOINT))?;
-        Model::Field(&trainer)
+        loaded = Model::load(directory)?;
+        Drawn::Field { model: &loaded, perceptual: loaded.config().loss.perceptual_name() }
     };
     let mut network = network_name(lpips.as_ref());
-    let mut metrics = unscored(&run, &model, 0.0);
+    let mut metrics = unscored(&run, &drawn, 0.0);
     metrics.train_seconds = logged_seconds(directory, metrics.steps)?;
     if directory.join(METRICS).is_file() {
         let Metrics { steps, train_seconds, .. } = metrics;
@@ -113,7 +111,7 @@ pub fn eval(arguments: &EvalArguments) -> Result<()> {
     for split in [Split::NovelView, Split::TrainView] {
         let empty = split == Split::NovelView && scene.eval.is_empty();
         if arguments.split.is_none_or(|only| only == split) {
-            let scores = model.score_with_bar(&scene, split, lpips.as_ref(), |_, _| {})?;
+            let scores = drawn.score_with_bar(&scene, split, lpips.as_ref(), |_, _| {})?;
             *split.of(&mut metrics.splits) = (!empty).then_some(scores);
         } else if let Some(scores) = split.of(&mut metrics.splits).as_mut().filter(|s| s.lpips_full.is_some()) {
             // One name stands for both splits: what another network measured goes.
@@ -163,17 +161,21 @@ pub fn network_name(lpips: Option<&Lpips>) -> Option<String> {
 }
 
 /// What can be scored and drawn.
-pub enum Model<'a> {
-    Field(&'a Trainer<'a>),
+pub enum Drawn<'a> {
+    Field {
+        model: &'a Model,
+        /// Name of the perceptual term that it was trained with.
+        perceptual: String,
+    },
     Prior(VertexColors),
 }
 
-impl Model<'_> {
+impl Drawn<'_> {
     /// Something that draws it.
     pub fn renderer<'s>(&'s self, scene: &'s Scene) -> Result<Box<dyn Renderer + 's>> {
         Ok(match self {
-            Self::Field(trainer) => Box::new(FieldRenderer::new(trainer)?),
-            Self::Prior(colors) => Box::new(PriorRenderer::new(scene, colors)),
+            Self::Field { model, .. } => Box::new(FieldRenderer::new(model)?),
+            Self::Prior(colors) => Box::new(PriorRenderer::new(&scene.body, colors)),
         })
     }
 
@@ -218,7 +220,7 @@ pub fn score_run(
     directory: &Path,
     run: &RunConfig,
     scene: &Scene,
-    model: &Model<'_>,
+    drawn: &Drawn<'_>,
     lpips: Option<&Lpips>,
     mut metrics: Metrics,
 ) -> Result<Metrics> {
@@ -226,7 +228,7 @@ pub fn score_run(
     let per_camera = scene.eval.iter().filter(|f| f.camera_name == scene.eval[0].camera_name).count().max(1);
     let stride = per_camera.div_ceil(SHEET_INSTANTS).max(1);
     let mut index = 0;
-    let novel = model.score_with_bar(scene, Split::NovelView, lpips, |frame, rendering| {
+    let novel = drawn.score_with_bar(scene, Split::NovelView, lpips, |frame, rendering| {
         if cameras.last().is_none_or(|(name, _)| *name != frame.camera_name) {
             cameras.push((frame.camera_name.clone(), Vec::new()));
             index = 0;
@@ -241,7 +243,7 @@ pub fn score_run(
     let rows = cameras.into_iter().map(|(_, row)| pairs(row)).collect::<Result<Vec<_>>>()?;
     pictures::save(&pictures::sheet(&rows), &directory.join("renders/novel_views.png"))?;
     let mut row = Vec::new();
-    let train = model.score_with_bar(scene, Split::TrainView, lpips, |frame, rendering| {
+    let train = drawn.score_with_bar(scene, Split::TrainView, lpips, |frame, rendering| {
         if row.len() < 5 {
             row.push(beside_truth(frame, rendering));
         }
@@ -258,7 +260,7 @@ pub fn score_run(
 
 /// Truth and rendering over grey.
 fn beside_truth(frame: &PreparedFrame, rendering: &Rendering) -> Result<[RgbImage; 2]> {
-    let (width, height) = (frame.camera.width, frame.camera.height);
+    let (width, height) = (frame.view.camera.width, frame.view.camera.height);
     let truth = frame.pixels()?;
     Ok([
         pictures::over_grey(&truth.image.pixels, &truth.mask, width, height),

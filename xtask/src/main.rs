@@ -1,5 +1,6 @@
 //! `cargo xtask`: train, evaluate and render people from occluded videos.
 
+mod baked;
 mod bench;
 mod capacity;
 mod compare;

@@ -1,17 +1,19 @@
 //! `render`: pictures and a film of a trained person.
 
 use std::path::PathBuf;
+use std::sync::Arc;
 
 use anyhow::{Context, Result, bail};
 use clap::{Args, ValueEnum};
 use glam::{Affine3A, Mat3, Vec3};
 use indicatif::ProgressBar;
-use occnerf::{Method, PreparedFrame, Scene, Trainer, VertexColors, view_of};
+use occnerf::bake::BakedRenderer;
+use occnerf::{Body, FieldRenderer, Method, Model, Person, PosedView, PriorRenderer, Renderer, upright};
+use visibility::Samples;
 use volrender::Camera;
 
-use crate::eval::Model;
-use crate::pictures;
-use crate::run::{CHECKPOINT, RunConfig, use_threads};
+use crate::run::{RunConfig, use_threads};
+use crate::{baked, pictures};
 
 /// Views of a full turn.
 const TURN: usize = 36;
@@ -41,6 +43,9 @@ pub struct RenderArguments {
     /// Where to [default: RUN/renders/WHAT]
     #[arg(long)]
     out: Option<PathBuf>,
+    /// Draw the baked person, by rasterising, instead of the field; bakes it first where RUN has none
+    #[arg(long)]
+    baked: bool,
     /// Threads [default: all cores]
     #[arg(long)]
     threads: Option<usize>,
@@ -51,25 +56,31 @@ pub fn render(arguments: &RenderArguments) -> Result<()> {
     use_threads(arguments.threads)?;
     let directory = &arguments.run;
     let run = RunConfig::read(directory)?;
-    let source = run.source()?;
-    let scene = Scene::new(&source.capture, &source.model, &run.train)?;
-    let frames = scene.train.len();
-    if arguments.frame >= frames {
-        bail!("--frame {}: {} has frames 0 to {}", arguments.frame, run.scene, frames - 1);
+    if arguments.baked && run.train.method == Method::Prior {
+        bail!("--baked: {} has no field to bake", directory.display());
+    }
+    let (model, person, avatar);
+    let (body, frames, mut renderer): (_, _, Box<dyn Renderer + '_>) = if run.train.method == Method::Prior {
+        person = Person::load(directory, &run.train)?;
+        (&*person.body, &person.frames[..], Box::new(PriorRenderer::new(&person.body, &person.colors)))
+    } else {
+        model = Model::load(directory)?;
+        let renderer: Box<dyn Renderer + '_> = if arguments.baked {
+            avatar = baked::avatar(directory, &model)?;
+            Box::new(BakedRenderer::new(&model, &avatar, Samples::Four)?)
+        } else {
+            Box::new(FieldRenderer::new(&model)?)
+        };
+        (&**model.body(), model.frames(), renderer)
+    };
+    if arguments.frame >= frames.len() {
+        bail!("--frame {}: {} has frames 0 to {}", arguments.frame, run.scene, frames.len() - 1);
     }
     let size = arguments.size.as_deref().map(parse_size).transpose()?;
-    let views = views(&scene, arguments, size);
-    let trainer;
-    let model = if run.train.method == Method::Prior {
-        Model::Prior(VertexColors::measure(&scene)?)
-    } else {
-        trainer = Trainer::resume(&scene, &directory.join(CHECKPOINT))?;
-        Model::Field(&trainer)
-    };
+    let views = views(body, frames, arguments, size);
     let name = format!("{:?}", arguments.what).to_lowercase();
     let out = arguments.out.clone().unwrap_or_else(|| directory.join("renders").join(&name));
     std::fs::create_dir_all(&out).with_context(|| out.display().to_string())?;
-    let mut renderer = model.renderer(&scene)?;
     let bar = ProgressBar::new(views.len() as u64);
     let mut film = Vec::new();
     for (i, view) in views.iter().enumerate() {
@@ -96,46 +107,41 @@ fn parse_size(text: &str) -> Result<(u32, u32)> {
     Ok((side(width)?, side(height)?))
 }
 
-fn views(scene: &Scene, arguments: &RenderArguments, size: Option<(u32, u32)>) -> Vec<PreparedFrame> {
+fn views(
+    body: &Body,
+    frames: &[Arc<PosedView>],
+    arguments: &RenderArguments,
+    size: Option<(u32, u32)>,
+) -> Vec<PosedView> {
     let resized = |camera: &Camera| size.map_or(*camera, |(w, h)| camera.resized(w, h));
-    let frame = &scene.train[arguments.frame];
+    let frame = &frames[arguments.frame];
+    let angles = (0..TURN).map(|i| i as f32 / TURN as f32 * std::f32::consts::TAU);
     match arguments.what {
-        What::Movement => {
-            let view = |f: &PreparedFrame| f.seen_by(&resized(&f.camera));
-            scene.train.iter().map(view).collect()
-        }
-        What::Freeview => (0..TURN)
-            .map(|i| {
-                let up = scene.up();
-                let turn = Mat3::from_axis_angle(up, i as f32 / TURN as f32 * std::f32::consts::TAU);
-                let centre = frame.posed.vertices.iter().sum::<Vec3>() / frame.posed.vertices.len() as f32;
+        What::Movement => frames.iter().map(|f| f.seen_by(&resized(&f.camera))).collect(),
+        What::Freeview => {
+            let up = upright(body, frames.iter().map(Arc::as_ref));
+            let view = |angle| {
+                let (turn, centre) = (Mat3::from_axis_angle(up, angle), frame.centre());
                 let about = Affine3A::from_mat3_translation(turn, centre - turn * centre);
                 let mut camera = frame.camera;
                 camera.world_to_camera *= about;
                 frame.seen_by(&resized(&camera))
-            })
-            .collect(),
+            };
+            angles.map(view).collect()
+        }
         What::Tpose => {
-            let joints = vec![Vec3::ZERO; scene.model.num_joints()];
-            let placement = smpl::Placement::Pelvis { translation: Vec3::ZERO };
-            let posed = scene.pose(&scene.mean_betas, &joints, placement);
-            let centre = posed.vertices.iter().sum::<Vec3>() / posed.vertices.len() as f32;
-            (0..TURN)
-                .map(|i| {
-                    let angle = i as f32 / TURN as f32 * std::f32::consts::TAU;
-                    let camera = camera_at(frame, centre, angle);
-                    view_of(scene, &resized(&camera), posed.clone())
-                })
-                .collect()
+            let rest = PosedView::new(&frame.camera, body.rest());
+            let centre = rest.centre();
+            angles.map(|angle| rest.seen_by(&resized(&camera_at(frame, centre, angle)))).collect()
         }
     }
 }
 
-/// A camera like the training camera's, at the same distance as the subject was, that looks level at `centre`.
-fn camera_at(frame: &PreparedFrame, centre: Vec3, angle: f32) -> Camera {
-    let body = frame.posed.vertices.iter().sum::<Vec3>() / frame.posed.vertices.len() as f32;
+/// A camera like the training camera's, at the same distance as the subject was, that looks level at
+/// `centre`.
+fn camera_at(frame: &PosedView, centre: Vec3, angle: f32) -> Camera {
     // Outstretched arms are as wide as the body is high.
-    let distance = 1.15 * frame.camera.world_to_camera.transform_point3(body).length();
+    let distance = 1.15 * frame.camera.world_to_camera.transform_point3(frame.centre()).length();
     let back = Vec3::new(angle.sin(), 0.0, angle.cos());
     let eye = centre + distance * back;
     let (right, down, forward) = (Vec3::Y.cross(back), -Vec3::Y, -back);

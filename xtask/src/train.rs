@@ -7,11 +7,11 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, Result, bail};
 use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
-use occnerf::{Lpips, Method, Scene, StepReport, Trainer, VertexColors, checkpoint_config};
+use occnerf::{Lpips, Method, Person, Scene, StepReport, Trainer, VertexColors, checkpoint_config};
 
 use crate::capacity::{self, CapacityName};
 use crate::compare::compare;
-use crate::eval::{Model, Split, check_pictures, load_lpips, network_name, score_run, scored_frames, unscored};
+use crate::eval::{Drawn, Split, check_pictures, load_lpips, network_name, score_run, scored_frames, unscored};
 use crate::run::{CHECKPOINT, LOG, METRICS, Metrics, RunConfig, existing_directory, new_directory, use_threads};
 use crate::settings::SettingArguments;
 use crate::source::{self, LoadArguments, Source};
@@ -140,15 +140,17 @@ pub fn run_one(
     check_pictures(&scene)?;
     if let Some(lpips) = lpips {
         for frame in scored_frames(&scene) {
-            lpips.check_size(frame.camera.width as usize, frame.camera.height as usize)?;
+            lpips.check_size(frame.view.camera.width as usize, frame.view.camera.height as usize)?;
         }
     }
+    let start = Instant::now();
+    let colors = VertexColors::measure(&scene)?;
+    let prior_seconds = start.elapsed().as_secs_f64();
+    Person::save(directory, &source.capture, &source.model, &colors)?;
     if run.train.method == Method::Prior {
-        let start = Instant::now();
-        let colors = VertexColors::measure(&scene)?;
-        let model = Model::Prior(colors);
-        let metrics = unscored(run, &model, start.elapsed().as_secs_f64());
-        return score_run(directory, run, &scene, &model, lpips, metrics).map(Some);
+        let prior = Drawn::Prior(colors);
+        let metrics = unscored(run, &prior, prior_seconds);
+        return score_run(directory, run, &scene, &prior, lpips, metrics).map(Some);
     }
     let checkpoint = directory.join(CHECKPOINT);
     let mut trainer =
@@ -160,9 +162,11 @@ pub fn run_one(
         return Ok(None);
     }
     capacity::prune(directory, &mut trainer, &checkpoint)?;
-    let model = Model::Field(&trainer);
-    let metrics = unscored(run, &model, seconds);
-    score_run(directory, run, &scene, &model, lpips, metrics).map(Some)
+    let perceptual = trainer.perceptual();
+    let model = trainer.into_model();
+    let trained = Drawn::Field { model: &model, perceptual };
+    let metrics = unscored(run, &trained, seconds);
+    score_run(directory, run, &scene, &trained, lpips, metrics).map(Some)
 }
 
 /// The scores of a run under `directory`: those it has if it finished earlier with the same settings; else it goes on from its
@@ -210,18 +214,18 @@ fn prior_metrics(run: &RunConfig, source: &Source, lpips: Option<&Lpips>) -> Res
     let scene = Scene::new(&source.capture, &source.model, &prior.train)?;
     let start = Instant::now();
     let colors = VertexColors::measure(&scene)?;
-    let model = Model::Prior(colors);
-    let mut metrics = unscored(&prior, &model, start.elapsed().as_secs_f64());
+    let drawn = Drawn::Prior(colors);
+    let mut metrics = unscored(&prior, &drawn, start.elapsed().as_secs_f64());
     metrics.lpips = network_name(lpips);
     let split = if scene.eval.is_empty() { Split::TrainView } else { Split::NovelView };
-    *split.of(&mut metrics.splits) = Some(model.score(&scene, split, lpips, |_, _| {})?);
+    *split.of(&mut metrics.splits) = Some(drawn.score(&scene, split, lpips, |_, _| {})?);
     Ok(metrics)
 }
 
 /// Takes steps until the end or `stop_after`, with a log, a bar and checkpoints; returns seconds of training, those
 /// of earlier sittings included.
 fn optimise(directory: &Path, trainer: &mut Trainer<'_>, stop_after: Option<u64>) -> Result<f64> {
-    let total = trainer.config().steps;
+    let total = trainer.model().config().steps;
     let end = stop_after.unwrap_or(total).min(total);
     let log_path = directory.join(LOG);
     let earlier = earlier_log(&log_path, trainer.steps_done())?;

@@ -2,11 +2,12 @@
 
 use glam::{Affine3A, Mat3, Mat3A, Vec2, Vec3, Vec3A, Vec4};
 use rayon::prelude::*;
-use visibility::{Fragment, Pixel, RasterOptions, Rasterizer, Samples, View};
+use visibility::{Fragment, Pixel, RasterOptions, Rasterizer, Samples};
 use volrender::Camera;
 
 use super::avatar::Avatar;
 use crate::Error;
+use crate::scene::prepared::pinhole;
 
 /// Vertices that are skinned together.
 const CHUNK: usize = 1024;
@@ -102,18 +103,8 @@ impl<'a> BakedPerson<'a> {
             }
             samples.map(|sample| paint.composite(sample)).sum::<Vec4>() / count as f32
         };
-        rasterizer.draw(skinned, &shells, &view(camera), &options, out, shade)?;
+        rasterizer.draw(skinned, &shells, &pinhole(camera), &options, out, shade)?;
         Ok(())
-    }
-}
-
-/// The camera as the rasteriser has it.
-pub(super) fn view(camera: &Camera) -> View {
-    View {
-        intrinsics: camera.intrinsics(),
-        extrinsics: camera.world_to_camera,
-        width: camera.width,
-        height: camera.height,
     }
 }
 

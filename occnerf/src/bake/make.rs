@@ -1,9 +1,11 @@
 //! From a trained person to an avatar.
 
+use std::sync::Arc;
 use std::time::Instant;
 
-use glam::{Affine3A, Mat3, Vec2, Vec3};
+use glam::{Affine3A, Vec2, Vec3};
 use smpl::{MotionClip, SparseRows};
+use volrender::Camera;
 
 use super::avatar::{Atlas, Avatar, Clip, MAX_SHELLS};
 use super::charts::Layout;
@@ -16,9 +18,10 @@ use super::skeleton::skeleton;
 use super::subdivide::{Anchor, Subdivided, normals};
 use super::surface::{Normal, SurfaceReport, heights, normals_of};
 use crate::Error;
-use crate::capacity::Measured;
-use crate::scene::Scene;
-use crate::trainer::Trainer;
+use crate::model::body::Body;
+use crate::model::trained::Model;
+use crate::model::view::PosedView;
+use crate::scene::prepared::Scene;
 
 /// Pixels of the training pictures that an edge of the surface may be long, where two subdivisions are enough for it.
 const EDGE: f32 = 1.5;
@@ -69,46 +72,73 @@ pub struct BakeReport {
     pub seconds: f64,
 }
 
-/// Bakes what `trainer` has learnt.
+/// Bakes a trained person. The scene that it was trained on says how well each place was seen, and what the texture is
+/// refined by; without it every place counts as seen, and the texture is the field's.
 ///
 /// # Errors
-/// [`Error::Scene`] for options outside their ranges, or a prior that needs more charts than the atlas has room for;
-/// those of [`Measured::of`] and of frames that cannot be decoded.
-pub fn bake(trainer: &Trainer<'_>, options: &BakeOptions) -> Result<(Avatar, BakeReport), Error> {
+/// [`Error::Scene`] for options outside their ranges, a body that no camera sees, or one that needs more charts than the atlas
+/// has room for; those of frames that cannot be decoded.
+pub fn bake(model: &Model, scene: Option<&Scene>, options: &BakeOptions) -> Result<(Avatar, BakeReport), Error> {
     let start = Instant::now();
+    let refuse = |what: String| Err(Error::Scene(format!("bake: {what}")));
     if !(1..=MAX_SHELLS).contains(&options.shells) {
-        return Err(Error::Scene(format!("bake: {} shells, expected 1 to {MAX_SHELLS}", options.shells)));
+        return refuse(format!("{} shells, expected 1 to {MAX_SHELLS}", options.shells));
     }
     if !(64..=2048).contains(&options.atlas) {
-        return Err(Error::Scene(format!("bake: an atlas of {} texels, expected 64 to 2048", options.atlas)));
+        return refuse(format!("an atlas of {} texels, expected 64 to 2048", options.atlas));
     }
     if !(options.fps > 0.0 && options.fps <= 1e6) {
-        return Err(Error::Scene(format!("bake: {} frames a second", options.fps)));
+        return refuse(format!("{} frames a second", options.fps));
     }
-    let scene = trainer.scene;
-    let pixel = Measured::of(scene, trainer.config())?.metres_a_pixel;
-    let (mut avatar, mut report) = surface(scene, &TrainedField::new(trainer), pixel, options)?;
-    (avatar.clips, avatar.cameras) = motion(trainer, &avatar, options.fps);
-    if options.refinements > 0 {
-        report.errors = refine(trainer, &mut avatar, options.refinements)?;
+    let Some(pixel) = pixel_width(model) else {
+        return refuse("no training frame has the body before its camera".to_owned());
+    };
+    let vertices = model.body.canonical.vertices.len();
+    let seen = scene.map_or_else(|| Ok(vec![1.0; vertices]), seen)?;
+    let (mut avatar, mut report) = surface(&model.body, &TrainedField::new(model), &seen, pixel, options)?;
+    (avatar.clips, avatar.cameras) = motion(model, &avatar, options.fps);
+    if let Some(scene) = scene {
+        avatar.name.clone_from(&scene.name);
+        if options.refinements > 0 {
+            report.errors = refine(model, scene, &mut avatar, options.refinements)?;
+        }
     }
     report.seconds = start.elapsed().as_secs_f64();
     Ok((avatar, report))
 }
 
-/// The avatar without its motion, for pictures whose pixels are `pixel` normalised metres wide.
+/// Width of a pixel of the training pictures at the depth of the body, normalised metres: the median over the frames.
+fn pixel_width(model: &Model) -> Option<f32> {
+    let width = |view: &Arc<PosedView>| {
+        let depth = view.camera.world_to_camera.transform_point3(view.centre()).z;
+        Some(depth / view.camera.focal.max_element()).filter(|width| width.is_finite() && *width > 0.0)
+    };
+    let mut widths: Vec<f32> = model.frames().iter().filter_map(width).collect();
+    widths.sort_by(f32::total_cmp);
+    widths.get(widths.len() / 2).copied()
+}
+
+/// How well the video showed each vertex of the prior, 0 to 1.
+fn seen(scene: &Scene) -> Result<Vec<f32>, Error> {
+    let enough = (FULL_CONFIDENCE * scene.train.len() as f32).max(1.0);
+    Ok(scene.vertex_frequencies()?.iter().map(|&n| (n as f32 / enough).min(1.0)).collect())
+}
+
+/// The avatar without name and motion, from pictures whose pixels are `pixel` normalised metres wide, and which have `seen` each
+/// vertex of the prior so well, (V).
 pub(super) fn surface(
-    scene: &Scene,
+    body: &Body,
     field: &impl CanonicalField,
+    seen: &[f32],
     pixel: f32,
     options: &BakeOptions,
 ) -> Result<(Avatar, BakeReport), Error> {
-    let (prior, faces) = (&scene.canonical.vertices, &scene.model.faces);
+    let (prior, faces) = (&body.canonical.vertices, &body.model.faces);
     let mesh = Subdivided::new(prior.len(), faces, subdivisions(prior, faces, pixel));
     let feet = normals_of(&mesh, prior, faces);
-    let (heights, found) = heights(field, &scene.surface, &feet, &mesh, options.shells);
+    let (heights, found) = heights(field, &body.surface, &feet, &mesh, options.shells);
     let layout = Layout::new(prior, faces, options.shells, pixel / TEXELS_A_PIXEL, options.atlas);
-    let layout = layout.ok_or_else(|| Error::Scene(format!("{}: bake: too many charts", scene.name)))?;
+    let layout = layout.ok_or_else(|| Error::Scene("bake: too many charts".to_owned()))?;
     let split = Split::new(&mesh, &layout, options.shells);
     let places = split.places(&layout, &feet);
     let describe = |face: u32| {
@@ -116,8 +146,9 @@ pub(super) fn surface(
         (face as usize / per_shell, mesh.faces[face as usize % per_shell])
     };
     let texels = texels(layout.side, &places, &split.faces, describe)?;
-    let colours = paint(field, &scene.surface, &feet, &heights, &texels);
-    let confidence = confidence(scene, &mesh)?;
+    let colours = paint(field, &body.surface, &feet, &heights, &texels);
+    let interpolated = |anchor: &Anchor| anchor.terms().map(|(v, w)| w * seen[v as usize]).sum();
+    let confidence: Vec<f32> = mesh.anchors.iter().map(interpolated).collect();
     let report = BakeReport {
         surface: found,
         vertices: split.vertices.len(),
@@ -129,12 +160,12 @@ pub(super) fn surface(
     let atlas = atlas(layout.side, &texels, &colours, &confidence);
     let (vertices, normals) = split.positions(&mesh, &feet, &heights);
     let rows = |of: &SparseRows<f32>| split.rows(&mesh, of, |w, value| w * value, |a, b| a + b);
-    let (joints, weights) = four_joints(&rows(&scene.model.weights));
-    let posedirs = split.rows(&mesh, &scene.model.posedirs, |w, value| w * value, |a, b| a + b);
-    let rest: Vec<Vec3> = scene.canonical.joints.iter().map(|joint| joint / scene.scale).collect();
+    let (joints, weights) = four_joints(&rows(&body.model.weights));
+    let posedirs = split.rows(&mesh, &body.model.posedirs, |w, value| w * value, |a, b| a + b);
+    let rest: Vec<Vec3> = body.canonical.joints.iter().map(|joint| joint / body.scale).collect();
     let avatar = Avatar {
-        name: scene.name.clone(),
-        vertices: vertices.into_iter().map(|v| v / scene.scale).collect(),
+        name: "person".to_owned(),
+        vertices: vertices.into_iter().map(|v| v / body.scale).collect(),
         normals,
         uvs: places.iter().map(|place| (place / layout.side as f32).clamp(Vec2::ZERO, Vec2::ONE)).collect(),
         shell_ends: (1..=options.shells).map(|shell| (shell * mesh.faces.len()) as u32).collect(),
@@ -143,8 +174,8 @@ pub(super) fn surface(
         weights,
         posedirs: SparseRows::from_rows(posedirs),
         atlas,
-        skeleton: skeleton(&scene.model.parents, &rest),
-        betas: scene.mean_betas.clone(),
+        skeleton: skeleton(&body.model.parents, &rest),
+        betas: body.mean_betas.clone(),
         clips: Vec::new(),
         cameras: Vec::new(),
     };
@@ -259,13 +290,6 @@ fn four_joints(rows: &[Vec<(u32, f32)>]) -> (Vec<[u16; 4]>, Vec<[f32; 4]>) {
     rows.iter().map(heaviest).unzip()
 }
 
-/// How well the video showed each vertex of the subdivided prior, 0 to 1.
-fn confidence(scene: &Scene, mesh: &Subdivided) -> Result<Vec<f32>, Error> {
-    let enough = (FULL_CONFIDENCE * scene.train.len() as f32).max(1.0);
-    let seen: Vec<f32> = scene.vertex_frequencies()?.iter().map(|&n| (n as f32 / enough).min(1.0)).collect();
-    Ok(mesh.anchors.iter().map(|anchor| anchor.terms().map(|(v, w)| w * seen[v as usize]).sum()).collect())
-}
-
 /// The atlas of painted texels, with their colours spread to what is between the charts.
 fn atlas(side: u32, texels: &[Texel], colours: &[(Vec3, f32)], confidence: &[f32]) -> Atlas {
     let count = (side * side) as usize;
@@ -287,24 +311,23 @@ fn atlas(side: u32, texels: &[Texel], colours: &[(Vec3, f32)], confidence: &[f32
 }
 
 /// The video's motion, as training has corrected it, and the cameras, in the avatar's world.
-fn motion(trainer: &Trainer<'_>, avatar: &Avatar, fps: f32) -> (Vec<Clip>, Vec<volrender::Camera>) {
-    let scene = trainer.scene;
-    let turn = upright(scene.up());
-    let bones = |frame| {
-        let mut bones = trainer.corrected(frame).bones.clone();
-        for bone in &mut bones {
-            bone.translation /= scene.scale;
-            *bone = Affine3A::from_mat3(turn) * *bone;
-        }
-        bones
+fn motion(model: &Model, avatar: &Avatar, fps: f32) -> (Vec<Clip>, Vec<Camera>) {
+    let turn = upright(model.up());
+    let scale = model.body.scale;
+    let bones = |view: &Arc<PosedView>| {
+        let placed = |bone: &Affine3A| {
+            let bone = Affine3A { translation: bone.translation / scale, ..*bone };
+            Affine3A::from_mat3(turn) * bone
+        };
+        model.corrected(view).bones.iter().map(placed).collect()
     };
-    let frames: Vec<Vec<Affine3A>> = scene.train.iter().map(bones).collect();
+    let frames: Vec<Vec<Affine3A>> = model.frames().iter().map(bones).collect();
     let motion: MotionClip = motion_of_bones(&avatar.skeleton, &frames, fps);
-    let camera = |frame: &crate::scene::PreparedFrame| {
-        let mut camera = frame.camera;
-        camera.world_to_camera.translation /= scene.scale;
-        camera.world_to_camera *= Affine3A::from_mat3(Mat3::transpose(&turn));
+    let camera = |view: &Arc<PosedView>| {
+        let mut camera = view.camera;
+        camera.world_to_camera.translation /= scale;
+        camera.world_to_camera *= Affine3A::from_mat3(turn.transpose());
         camera
     };
-    (vec![Clip { name: "video".to_owned(), motion }], scene.train.iter().map(camera).collect())
+    (vec![Clip { name: "video".to_owned(), motion }], model.frames().iter().map(camera).collect())
 }

@@ -5,11 +5,11 @@ use rayon::prelude::*;
 use visibility::{Fragment, RasterOptions, Rasterizer};
 
 use super::avatar::{Atlas, Avatar};
-use super::draw::{BakedPerson, BilinearCorner, atlas_place, view};
+use super::draw::{BakedPerson, BilinearCorner, atlas_place};
 use crate::Error;
-use crate::pixels::Label;
-use crate::scene::PreparedFrame;
-use crate::trainer::Trainer;
+use crate::model::trained::Model;
+use crate::scene::labels::Label;
+use crate::scene::prepared::{PreparedFrame, Scene, pinhole};
 
 /// Weight of the field's own colour in that of a texel, in pixels that show it.
 const PRIOR: f32 = 2.0;
@@ -28,11 +28,11 @@ struct Sight {
 /// Moves the colours of the middle shell's texels towards the known pixels of the training frames, `passes` times, each by a Jacobi
 /// step of the least squares problem that keeps unseen texels as they are. Returns the mean squared error before the first
 /// pass and before the last.
-pub(super) fn refine(trainer: &Trainer<'_>, avatar: &mut Avatar, passes: u32) -> Result<[f64; 2], Error> {
-    let frames = &trainer.scene.train;
+pub(super) fn refine(model: &Model, scene: &Scene, avatar: &mut Avatar, passes: u32) -> Result<[f64; 2], Error> {
+    let frames = &scene.train;
     let stride = frames.iter().map(|f| f.labels.num_subject()).sum::<usize>().div_ceil(MAX_PIXELS).max(1);
     let sights: Result<Vec<Vec<Sight>>, Error> =
-        frames.iter().map(|frame| sights(trainer, avatar, frame, stride)).collect();
+        frames.iter().map(|frame| sights(model, avatar, frame, stride)).collect();
     let sights = sights?.concat();
     let Atlas { rgba, .. } = &mut avatar.atlas;
     let start: Vec<Vec3> = rgba.as_chunks::<4>().0.iter().map(|&[r, g, b, _]| colour([r, g, b])).collect();
@@ -68,14 +68,14 @@ fn colour(bytes: [u8; 3]) -> Vec3 {
 }
 
 /// The subject's pixels of a frame that look at the surface well away from its outline.
-fn sights(trainer: &Trainer<'_>, avatar: &Avatar, frame: &crate::scene::PreparedFrame) -> Result<Vec<Sight>, Error> {
+fn sights(model: &Model, avatar: &Avatar, frame: &PreparedFrame, stride: usize) -> Result<Vec<Sight>, Error> {
     let pixels = frame.pixels()?;
-    let mut person = BakedPerson::new(avatar, trainer.scene.scale);
-    let vertices = person.skin(&trainer.corrected(frame).bones);
+    let mut person = BakedPerson::new(avatar, model.body.scale);
+    let vertices = person.skin(&model.corrected(&frame.view).bones);
     let options = RasterOptions { cull_back: true, near: 1e-3, ..RasterOptions::default() };
     let middle = avatar.shell_ends.len() / 2;
     let first = middle.checked_sub(1).map_or(0, |before| avatar.shell_ends[before]);
-    let drawn = Rasterizer::default().faces(vertices, avatar.shell(middle), &view(&frame.camera), &options)?;
+    let drawn = Rasterizer::default().faces(vertices, avatar.shell(middle), &pinhole(&frame.view.camera), &options)?;
     let size = Vec2::new(avatar.atlas.width as f32, avatar.atlas.height as f32);
     let sight = |i: usize| {
         let fragment = drawn[i]?;

@@ -1,8 +1,8 @@
-//! Where a bake meets a trained person: the field in the canonical space, and pictures of frames.
+//! Where a bake meets a trained person: the field in the canonical space, and pictures of views.
 
 use glam::{Vec3, Vec4};
 use rayon::prelude::*;
-use smpl::SurfaceMotion;
+use smpl::{MotionField, SurfaceMotion};
 use visibility::Samples;
 
 use super::avatar::Avatar;
@@ -10,94 +10,98 @@ use super::draw::BakedPerson;
 use super::field::{CanonicalField, Place};
 use crate::Error;
 use crate::capture::Image;
-use crate::config::DistanceKind;
-use crate::field::Group;
-use crate::parameters::Part;
-use crate::render::{Renderer, Rendering};
-use crate::scene::PreparedFrame;
-use crate::shell::Shell;
-use crate::trainer::Trainer;
-use crate::vertices::VertexCode;
+use crate::model::distance::{needs_neighbours, surface_point};
+use crate::model::extent::Extent;
+use crate::model::field::SampleBatch;
+use crate::model::trained::Model;
+use crate::model::vertices::VertexCode;
+use crate::model::view::PosedView;
+use crate::render::picture::{Renderer, Rendering};
 
 /// A trained field, its vertices encoded.
 pub(super) struct TrainedField<'a> {
-    trainer: &'a Trainer<'a>,
+    model: &'a Model,
     code: VertexCode,
-    shell: Shell,
+    extent: Extent,
 }
 
 impl<'a> TrainedField<'a> {
-    pub fn new(trainer: &'a Trainer<'a>) -> Self {
+    pub fn new(model: &'a Model) -> Self {
         let mut code = VertexCode::default();
-        trainer.encode_vertices(&mut code);
-        let shell = trainer.measure_shell(&code.rows);
-        Self { trainer, code, shell }
+        model.encode_vertices(&mut code);
+        let extent = model.measure_extent(&code);
+        Self { model, code, extent }
     }
 }
 
 impl CanonicalField for TrainedField<'_> {
     fn evaluate(&self, places: &[Place], out: &mut Vec<(f32, Vec3)>) {
-        let trainer = self.trainer;
-        let (scene, config) = (trainer.scene, &trainer.config);
-        let mut group = Group::default();
-        group.samples.clear();
-        let mut neighbours = vec![0; scene.query.neighbours_per_query()];
+        let Model { body, config, base, motion, .. } = self.model;
+        let blended = needs_neighbours(config.surface.distance);
+        let neighbours = blended || self.model.field.surface_term;
+        let based = !base.is_empty() && matches!(motion, MotionField::Surface(_));
+        let mut batch = SampleBatch::default();
+        batch.samples.clear();
         for place in places {
-            let (mut closest, mut distance) = (place.closest, place.distance);
-            if config.surface.distance != DistanceKind::Exact {
-                scene.query.neighbours(place.at, &mut neighbours);
-                let finest = &neighbours[..config.surface.k];
-                let blended = scene.query.blend(place.at, finest);
-                (closest, distance) = (blended.point, blended.signed_distance);
-                if config.surface.distance == DistanceKind::Mean {
-                    distance = scene.query.mean_distance(place.at, finest).0;
+            let samples = &mut batch.samples;
+            samples.push_canonical(body, place.at, place.closest, place.distance, neighbours);
+            if blended {
+                let own = &samples.neighbours[samples.neighbours.len() - body.query.neighbours_per_query()..];
+                if let Some(point) = surface_point(body, &config.surface, place.at, own, f32::INFINITY)
+                    && let (Some(closest), Some(distance)) = (samples.closest.last_mut(), samples.distance.last_mut())
+                {
+                    (*closest, *distance) = (point.closest, point.distance);
                 }
             }
-            group.samples.push_canonical(scene, place.at, closest, distance, trainer.needs_neighbours());
-            if !trainer.base.is_empty() {
-                let corners = scene.model.faces[place.face as usize].iter().zip(place.barycentric);
-                group.samples.base.push(corners.map(|(&v, b)| b * trainer.base[v as usize]).sum());
+            if based {
+                let corners = body.model.faces[place.face as usize].into_iter().zip(place.barycentric);
+                samples.base.push(corners.map(|(v, b)| b * base[v as usize]).sum());
             }
         }
-        let (field, table) = (trainer.parameters.get(Part::Field), trainer.parameters.get(Part::Table));
-        trainer.field.forward(field, table, &self.code.rows, &trainer.counts, &mut group, None);
-        let motion = SurfaceMotion { margin: config.motion.margin, falloff: config.motion.falloff };
+        self.model.evaluate(&self.code, &mut batch, None);
+        let likelihood = SurfaceMotion { margin: config.motion.margin, falloff: config.motion.falloff };
         let value = |((place, sigma), rgb): ((&Place, &f32), &Vec3)| {
-            let lives = place.distance <= self.shell.faces[place.face as usize];
-            (if lives { motion.likelihood(place.distance) * sigma } else { 0.0 }, *rgb)
+            let lives = place.distance <= self.extent.faces[place.face as usize];
+            (if lives { likelihood.likelihood(place.distance) * sigma } else { 0.0 }, *rgb)
         };
         out.clear();
-        out.extend(places.iter().zip(&group.sigma).zip(&group.rgb).map(value));
+        out.extend(places.iter().zip(&batch.sigma).zip(&batch.rgb).map(value));
     }
 
     fn reach(&self) -> f32 {
-        self.shell.farthest
+        self.extent.farthest
     }
 }
 
-/// Draws the frames of a scene with the avatar that was baked of it.
+/// Draws views with the avatar that was baked of a model, in the poses that the model's training found.
 pub struct BakedRenderer<'a> {
-    trainer: &'a Trainer<'a>,
+    model: &'a Model,
     person: BakedPerson<'a>,
     samples: Samples,
     pixels: Vec<Vec4>,
 }
 
 impl<'a> BakedRenderer<'a> {
-    /// In the poses that `trainer` has found.
-    #[must_use]
-    pub fn new(trainer: &'a Trainer<'a>, avatar: &'a Avatar, samples: Samples) -> Self {
-        let person = BakedPerson::new(avatar, trainer.scene.scale);
-        Self { trainer, person, samples, pixels: Vec::new() }
+    /// Takes the avatar of `model`.
+    ///
+    /// # Errors
+    /// [`Error::Scene`] for the avatar of another skeleton.
+    pub fn new(model: &'a Model, avatar: &'a Avatar, samples: Samples) -> Result<Self, Error> {
+        let (found, expected) = (avatar.num_joints(), model.body.model.num_joints());
+        if found != expected {
+            return Err(Error::Scene(format!("the avatar has {found} joints, the model {expected}")));
+        }
+        let person = BakedPerson::new(avatar, model.body.scale);
+        Ok(Self { model, person, samples, pixels: Vec::new() })
     }
 }
 
 impl Renderer for BakedRenderer<'_> {
-    fn render(&mut self, frame: &PreparedFrame, background: Vec3) -> Result<Rendering, Error> {
-        let posed = self.trainer.corrected(frame);
-        let (width, height) = (frame.camera.width, frame.camera.height);
-        self.pixels.resize((width * height) as usize, Vec4::ZERO);
-        self.person.draw(&posed.bones, &frame.camera, self.samples, &mut self.pixels)?;
+    fn render(&mut self, view: &PosedView, background: Vec3) -> Result<Rendering, Error> {
+        let posed = self.model.corrected(view);
+        let (width, height) = (view.camera.width, view.camera.height);
+        self.pixels.resize(width as usize * height as usize, Vec4::ZERO);
+        self.person.draw(&posed.bones, &view.camera, self.samples, &mut self.pixels)?;
         let over = |p: &Vec4| (p.truncate() + (1.0 - p.w) * background).to_array();
         let pixels: Vec<f32> = self.pixels.par_iter().flat_map_iter(over).collect();
         let opacity = self.pixels.iter().map(|p| p.w).collect();

@@ -11,9 +11,9 @@ use super::renderer::BakedRenderer;
 use super::{Avatar, BakeReport, skeleton};
 use crate::capture::{DemoConfig, demo};
 use crate::config::{Config, Method, Preset};
-use crate::render::Renderer;
-use crate::scene::Scene;
-use crate::trainer::Trainer;
+use crate::render::picture::Renderer;
+use crate::scene::prepared::Scene;
+use crate::train::trainer::Trainer;
 
 /// Height of the known field over the prior.
 const HEIGHT: f32 = 0.0123;
@@ -46,7 +46,10 @@ fn scene(config: &Config) -> Scene {
 
 fn baked(field: &Known, options: &BakeOptions) -> (Scene, Avatar, BakeReport) {
     let scene = scene(&Config::preset(Preset::Fast, Method::Occnerf));
-    let (avatar, report) = surface(&scene, field, 0.012, options).unwrap();
+    let (avatar, report) = {
+        let seen = vec![1.0; scene.body.canonical.vertices.len()];
+        surface(&scene.body, field, &seen, 0.012, options).unwrap()
+    };
     avatar.validate().unwrap();
     (scene, avatar, report)
 }
@@ -55,7 +58,7 @@ const SOLID: Known = Known { density: |_, d| if d < HEIGHT { 5000.0 } else { 0.0
 
 /// Canonical distances of an avatar's vertices from the prior, normalised metres.
 fn distances(scene: &Scene, avatar: &Avatar) -> Vec<f32> {
-    let distance = |v: &Vec3| scene.surface.closest(scene.scale * v, 1.0).unwrap().signed_distance;
+    let distance = |v: &Vec3| scene.body.surface.closest(scene.body.scale * v, 1.0).unwrap().signed_distance;
     avatar.vertices.iter().map(distance).collect()
 }
 
@@ -74,7 +77,7 @@ fn the_surface_is_where_a_known_field_becomes_opaque_and_has_its_colours() {
             let [x, y] = (*uv * size).to_array().map(|x| (x as usize).min(size as usize - 1));
             let texel = 4 * (y * size as usize + x);
             let found = Vec3::from([0, 1, 2].map(|c| f32::from(avatar.atlas.rgba[texel + c]) / 255.0));
-            let below = scene.surface.closest(scene.scale * v, 1.0).unwrap().point;
+            let below = scene.body.surface.closest(scene.body.scale * v, 1.0).unwrap().point;
             (found - known_colour(below)).abs().max_element()
         })
         .collect();
@@ -100,7 +103,17 @@ fn holes_take_the_height_of_what_is_about_them_and_gaps_are_counted() {
 #[test]
 fn shells_lie_over_each_other_and_their_opacities_make_up_that_of_the_field() {
     // Opacity 1 − e^−3 from 3 cm down to the prior, solid below.
-    let fog = Known { density: |_, d| if d < 0.0 { 5000.0 } else if d < 0.03 { 100.0 } else { 0.0 } };
+    let fog = Known {
+        density: |_, d| {
+            if d < 0.0 {
+                5000.0
+            } else if d < 0.03 {
+                100.0
+            } else {
+                0.0
+            }
+        },
+    };
     let (_, avatar, _) = baked(&fog, &BakeOptions { shells: 3, ..BakeOptions::default() });
     assert_eq!(avatar.shell_ends.len(), 3);
     let n = avatar.num_vertices() / 3;
@@ -126,7 +139,7 @@ fn shells_lie_over_each_other_and_their_opacities_make_up_that_of_the_field() {
 #[test]
 fn no_two_faces_share_a_texel_and_charts_keep_their_distance() {
     let scene = scene(&Config::preset(Preset::Fast, Method::Occnerf));
-    let (vertices, faces) = (&scene.canonical.vertices, &scene.model.faces);
+    let (vertices, faces) = (&scene.body.canonical.vertices, &scene.body.model.faces);
     let layout = Layout::new(vertices, faces, 2, 0.006, 1024).unwrap();
     let side = layout.side;
     let view = View { intrinsics: Mat3::IDENTITY, extrinsics: Affine3A::IDENTITY, width: side, height: side };
@@ -137,8 +150,7 @@ fn no_two_faces_share_a_texel_and_charts_keep_their_distance() {
             let corners = face.map(|v| layout.place(shell, chart, vertices[v as usize]).extend(1.0));
             let inside = |c: &Vec3| c.min_element() >= 0.0 && c.truncate().max_element() <= side as f32;
             assert!(corners.iter().all(inside), "{corners:?} in {side}");
-            let drawn =
-                Rasterizer::default().faces(&corners, &[[0, 1, 2]], &view, &RasterOptions::default()).unwrap();
+            let drawn = Rasterizer::default().faces(&corners, &[[0, 1, 2]], &view, &RasterOptions::default()).unwrap();
             for i in (0..drawn.len()).filter(|&i| drawn[i].is_some()) {
                 doubles += usize::from(owner[i].is_some_and(|of| of == (shell, chart)));
                 assert!(owner[i].is_none_or(|of| of == (shell, chart)), "two charts at {i}");
@@ -161,7 +173,7 @@ fn no_two_faces_share_a_texel_and_charts_keep_their_distance() {
 #[test]
 fn an_atlas_that_is_too_small_has_wider_texels_and_degenerate_meshes_have_one_too() {
     let scene = scene(&Config::preset(Preset::Fast, Method::Occnerf));
-    let layout = Layout::new(&scene.canonical.vertices, &scene.model.faces, 1, 1e-3, 512).unwrap();
+    let layout = Layout::new(&scene.body.canonical.vertices, &scene.body.model.faces, 1, 1e-3, 512).unwrap();
     assert!(layout.side <= 512);
     for (name, points) in testkit::strategy::degenerate_clouds() {
         if points.iter().all(|p| p.is_finite() && p.abs().max_element() < 1e6) {
@@ -275,9 +287,10 @@ fn a_person_in_training_is_baked_refined_and_drawn_alike_on_any_number_of_thread
         trainer.step().unwrap();
     }
     let make = || {
-        let (avatar, report) = bake(&trainer, &BakeOptions { refinements: 3, ..BakeOptions::default() }).unwrap();
-        let mut renderer = BakedRenderer::new(&trainer, &avatar, Samples::Four);
-        let rendering = renderer.render(&scene.train[1], Vec3::ZERO).unwrap();
+        let options = BakeOptions { refinements: 3, ..BakeOptions::default() };
+        let (avatar, report) = bake(trainer.model(), Some(&scene), &options).unwrap();
+        let mut renderer = BakedRenderer::new(trainer.model(), &avatar, Samples::Four).unwrap();
+        let rendering = renderer.render(&scene.train[1].view, Vec3::ZERO).unwrap();
         (avatar, report, rendering)
     };
     let [one, three] = [1, 3].map(|n| rayon::ThreadPoolBuilder::new().num_threads(n).build().unwrap().install(make));
@@ -307,6 +320,6 @@ fn a_person_in_training_is_baked_refined_and_drawn_alike_on_any_number_of_thread
         BakeOptions { atlas: 1, ..BakeOptions::default() },
         BakeOptions { fps: f32::NAN, ..BakeOptions::default() },
     ] {
-        assert!(bake(&trainer, &options).unwrap_err().to_string().starts_with("scene: bake: "));
+        assert!(bake(trainer.model(), None, &options).unwrap_err().to_string().starts_with("scene: bake: "));
     }
 }

@@ -8,8 +8,7 @@ use volrender::Aabb;
 
 use crate::Error;
 use crate::config::Config;
-use crate::scene::{PreparedFrame, Scene, bounds};
-use crate::trainer::pixel_ray;
+use crate::scene::prepared::{PreparedFrame, Scene};
 
 /// Pixels of the subject that are looked at, at most: every n-th, all frames alike. A million keys take 8 MB.
 const MAX_PIXELS: usize = 1 << 20;
@@ -45,10 +44,10 @@ impl Measured {
             return Err(none("no training frame has the body before its camera"));
         };
         let subject_pixels: usize = scene.train.iter().map(|f| f.labels.num_subject()).sum();
-        let extent = (scene.canonical_box.max - scene.canonical_box.min).max_element();
+        let extent = (scene.body.canonical_box.max - scene.body.canonical_box.min).max_element();
         let cell = width.max(extent / MAX_CELLS);
         let stride = subject_pixels.div_ceil(MAX_PIXELS).max(1);
-        let reach = config.motion.margin + config.motion.falloff;
+        let reach = config.motion.reach();
         let seen: Result<Vec<Seen>, Error> =
             scene.train.par_iter().map(|frame| Seen::of(scene, frame, cell, stride, reach)).collect();
         let (mut keys, mut span, mut rays) = (Vec::new(), 0.0, 0);
@@ -74,9 +73,9 @@ impl Measured {
 
 /// Width of a pixel at the depth of the body's middle; `None` for a body that is not before the camera.
 fn pixel_width(frame: &PreparedFrame) -> Option<f32> {
-    let centre = frame.posed.vertices.iter().sum::<Vec3>() / frame.posed.vertices.len().max(1) as f32;
-    let depth = frame.camera.world_to_camera.transform_point3(centre).z;
-    let width = depth / frame.camera.focal.max_element();
+    let centre = frame.view.posed.vertices.iter().sum::<Vec3>() / frame.view.posed.vertices.len().max(1) as f32;
+    let depth = frame.view.camera.world_to_camera.transform_point3(centre).z;
+    let width = depth / frame.view.camera.focal.max_element();
     (width.is_finite() && width > 0.0).then_some(width)
 }
 
@@ -96,19 +95,19 @@ impl Seen {
         if frame.labels.num_subject() == 0 {
             return Ok(seen);
         }
-        let mesh = RayMesh::new(&frame.posed.vertices, &scene.model.faces)?;
-        let (low, high) = bounds(&frame.posed.vertices);
+        let mesh = RayMesh::new(&frame.view.posed.vertices, &scene.body.model.faces)?;
+        let Aabb { min: low, max: high } = Aabb::from_points(&frame.view.posed.vertices);
         let region = Aabb { min: low - reach, max: high + reach };
         for n in (0..frame.labels.num_subject()).step_by(stride) {
-            let ray = pixel_ray(frame, frame.labels.subject(n));
+            let ray = frame.view.pixel_ray(frame.labels.subject(n));
             if let Some((near, far)) = region.intersect(&ray).filter(|(near, far)| far > near) {
                 seen.span += f64::from(far - near);
                 seen.rays += 1;
             }
             let Some(hit) = mesh.first_hit(ray.origin, ray.direction) else { continue };
-            let corners = scene.model.faces[hit.face as usize].map(|v| scene.canonical.vertices[v as usize]);
+            let corners = scene.body.model.faces[hit.face as usize].map(|v| scene.body.canonical.vertices[v as usize]);
             let point: Vec3 = corners.iter().zip(hit.barycentric).map(|(&v, b)| b * v).sum();
-            let place = ((point - scene.canonical_box.min) / cell).max(Vec3::ZERO).as_uvec3();
+            let place = ((point - scene.body.canonical_box.min) / cell).max(Vec3::ZERO).as_uvec3();
             seen.cells.push(u64::from(place.x) << 42 | u64::from(place.y) << 21 | u64::from(place.z));
         }
         seen.cells.sort_unstable();

@@ -11,7 +11,7 @@ pub use self::measure::Measured;
 pub use self::prune::Pruned;
 use crate::Error;
 use crate::config::{Config, Method};
-use crate::scene::Scene;
+use crate::scene::prepared::Scene;
 
 /// Longest side of the finest cell, in pixels of the video at the subject.
 const PIXELS_A_CELL: f32 = 0.75;

@@ -2,8 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::parameters::Part;
-use crate::trainer::Trainer;
+use crate::model::parameters::Part;
+use crate::model::trained::Model;
 
 /// What pruning took away.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -16,12 +16,10 @@ pub struct Pruned {
     pub parameters: u64,
 }
 
-impl Trainer<'_> {
+impl Model {
     /// Empties the rows of the hash table that training never moved: they are no longer counted and no longer stored in a
     /// checkpoint. What a training ray can meet stays the same to the bit; elsewhere a feature changes by the 1e-4 that such a
     /// row was filled with at the start.
-    ///
-    /// A step taken afterwards makes all rows learnable again.
     pub fn prune(&mut self) -> Pruned {
         let features = self.config.encoding.features.max(1);
         let initial = self.field.encoder.initial_table(self.config.seed);

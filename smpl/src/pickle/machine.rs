@@ -3,36 +3,10 @@
 use std::borrow::Cow;
 use std::collections::HashMap;
 
-use super::numpy::{Dtype, Global};
+use super::arena::{Arena, Id, Node};
+use super::globals::Global;
 use super::reader::{Reader, Step, long, unescape, unquote};
-use super::{PERSISTENT, Value};
-use crate::array::NdArray;
-
-/// Index of a node. Nodes live in one arena, because a container can be referred to before it is filled.
-pub(super) type Id = usize;
-
-/// A value under construction.
-pub(super) enum Node<'a> {
-    None,
-    Bool(bool),
-    Int(i64),
-    Float(f64),
-    Text(Cow<'a, str>),
-    Bytes(Cow<'a, [u8]>),
-    /// Python 2's `str`: text or data, the use decides.
-    ByteString(Cow<'a, [u8]>),
-    List(Vec<Id>),
-    Tuple(Vec<Id>),
-    Set(Vec<Id>),
-    Dict(Vec<(Id, Id)>),
-    Global(Global),
-    Dtype(Dtype),
-    /// `numpy.ndarray` before its state is set.
-    BlankArray,
-    Array(NdArray),
-    Objects(Vec<usize>, Vec<Id>),
-    Object(&'static str, Option<Id>),
-}
+use super::value::{PERSISTENT, Value};
 
 /// No allowed constructor takes more.
 const MAX_ARGUMENTS: usize = 8;
@@ -41,13 +15,10 @@ pub(super) struct Machine<'a> {
     reader: Reader<'a>,
     /// Where the current opcode starts.
     opcode_at: usize,
-    pub(super) nodes: Vec<Node<'a>>,
+    arena: Arena<'a>,
     stack: Vec<Id>,
     marks: Vec<usize>,
     memo: HashMap<u64, Id>,
-    /// Bytes that may still be spent on arrays and results, so that a short file cannot ask for much memory by
-    /// referring to one thing many times.
-    budget: usize,
 }
 
 impl<'a> Machine<'a> {
@@ -55,11 +26,10 @@ impl<'a> Machine<'a> {
         Self {
             reader: Reader::new(bytes, start),
             opcode_at: start,
-            nodes: Vec::new(),
+            arena: Arena::new(bytes.len()),
             stack: Vec::new(),
             marks: Vec::new(),
             memo: HashMap::new(),
-            budget: bytes.len().saturating_mul(64).saturating_add(1 << 20),
         }
     }
 
@@ -74,22 +44,15 @@ impl<'a> Machine<'a> {
             let opcode = self.reader.u8()?;
             if opcode == b'.' {
                 let top = self.pop()?;
-                return self.value(top, 0);
+                return self.arena.value(top, 0);
             }
             self.execute(opcode)?;
         }
     }
 
-    /// Takes `bytes` from the budget.
-    pub(super) fn spend(&mut self, bytes: usize) -> Step<()> {
-        let rest = self.budget.checked_sub(bytes);
-        self.budget = rest.ok_or("takes far more memory than the file's size")?;
-        Ok(())
-    }
-
     fn push(&mut self, node: Node<'a>) {
-        self.stack.push(self.nodes.len());
-        self.nodes.push(node);
+        self.stack.push(self.arena.nodes.len());
+        self.arena.nodes.push(node);
     }
 
     /// Pops one value; never across a mark.
@@ -135,7 +98,7 @@ impl<'a> Machine<'a> {
 
     fn append(&mut self, items: Vec<Id>) -> Step<()> {
         let top = self.top()?;
-        match &mut self.nodes[top] {
+        match &mut self.arena.nodes[top] {
             Node::List(list) | Node::Set(list) => list.extend(items),
             _ => return Err("append to something other than a list or set".to_owned()),
         }
@@ -147,7 +110,7 @@ impl<'a> Machine<'a> {
         if !items.len().is_multiple_of(2) {
             return Err("key without a value".to_owned());
         }
-        match &mut self.nodes[top] {
+        match &mut self.arena.nodes[top] {
             Node::Dict(dict) => dict.extend(items.chunks_exact(2).map(|kv| (kv[0], kv[1]))),
             _ => return Err("set an item of something other than a dict".to_owned()),
         }
@@ -322,7 +285,7 @@ impl<'a> Machine<'a> {
             0x93 => {
                 let name = self.pop()?;
                 let module = self.pop()?;
-                let global = match (&self.nodes[module], &self.nodes[name]) {
+                let global = match (&self.arena.nodes[module], &self.arena.nodes[name]) {
                     (Node::Text(module), Node::Text(name)) => Global::find(module, name)?,
                     _ => return Err("global without a name".to_owned()),
                 };
@@ -335,10 +298,10 @@ impl<'a> Machine<'a> {
             b'R' | 0x81 => {
                 let arguments = self.pop()?;
                 let callable = self.pop()?;
-                let node = match (&self.nodes[callable], &self.nodes[arguments]) {
+                let node = match (&self.arena.nodes[callable], &self.arena.nodes[arguments]) {
                     (Node::Global(global), Node::Tuple(items)) if items.len() <= MAX_ARGUMENTS => {
                         let (global, items) = (*global, items.clone());
-                        self.construct(global, &items)?
+                        self.arena.construct(global, &items)?
                     }
                     _ => {
                         return Err("call of something other than a global with a few arguments".to_owned());
@@ -349,7 +312,7 @@ impl<'a> Machine<'a> {
             b'b' => {
                 let state = self.pop()?;
                 let target = self.top()?;
-                self.build(target, state)?;
+                self.arena.build(target, state)?;
             }
             _ => return Err(format!("opcode {opcode:#04x} is not supported")),
         }

@@ -1,10 +1,13 @@
 //! Python pickles as plain data.
 //!
-//! A small stack machine reads protocols 0 to 5 and understands the few constructors that numpy arrays, chumpy
-//! arrays, scipy's `csc_matrix` and descriptions of PyTorch tensors need. Every other global is refused by name and nothing is ever executed.
-//! Memory is bounded by a multiple of the input's size, nesting by [`MAX_DEPTH`]; malformed input gives
-//! [`Error::Pickle`] with the offset of the opcode.
+//! A small stack machine reads protocols 0 to 5 and understands the few constructors that numpy
+//! arrays, chumpy arrays, scipy's `csc_matrix` and descriptions of PyTorch tensors need. Every other
+//! global is refused by name and nothing is ever executed. Memory is bounded by a multiple of the
+//! input's size, nesting by [`MAX_DEPTH`]; malformed input gives [`Error::Pickle`] with the offset of
+//! the opcode.
 
+mod arena;
+mod globals;
 mod machine;
 mod numpy;
 mod reader;
@@ -13,58 +16,10 @@ mod value;
 use std::path::Path;
 
 use crate::Error;
-use crate::array::NdArray;
 use crate::npz::{read_array, read_file, read_header};
 use machine::Machine;
 
-/// Deepest nesting of containers in a [`Value`].
-pub const MAX_DEPTH: usize = 100;
-
-/// Class of a [`Value::Object`] that stands for something outside the pickle; its state is what names it.
-pub const PERSISTENT: &str = "persistent id";
-
-/// A Python value.
-#[derive(Clone, Debug, PartialEq)]
-#[non_exhaustive]
-pub enum Value {
-    /// `None`.
-    None,
-    /// `bool`.
-    Bool(bool),
-    /// `int` that fits 64 bits.
-    Int(i64),
-    /// `float`.
-    Float(f64),
-    /// `str`; Python 2's byte strings are read as Latin-1.
-    Str(String),
-    /// `bytes` or `bytearray`.
-    Bytes(Vec<u8>),
-    /// `list`.
-    List(Vec<Value>),
-    /// `tuple`.
-    Tuple(Vec<Value>),
-    /// `set` or `frozenset`, in the file's order.
-    Set(Vec<Value>),
-    /// `dict` or `OrderedDict`, in the file's order; of equal keys the last counts.
-    Dict(Vec<(Value, Value)>),
-    /// numpy array of booleans, integers or floats. A numpy scalar has an empty shape.
-    Array(NdArray),
-    /// numpy array of objects or strings, row-major. One of no axes is replaced by its only item.
-    Objects {
-        /// Extent of every axis.
-        shape: Vec<usize>,
-        /// The items, last axis fastest.
-        items: Vec<Value>,
-    },
-    /// Instance of one of the allowed classes: `chumpy.ch.Ch`, `scipy.sparse.csc_matrix`, `torch.Tensor`, [`PERSISTENT`]; or
-    /// such a class itself, or one of PyTorch's storage classes, without attributes.
-    Object {
-        /// Full name of the class.
-        class: &'static str,
-        /// Its attributes, a [`Value::Dict`]; the arguments that a `torch.Tensor` is made from.
-        state: Box<Value>,
-    },
-}
+pub use value::{MAX_DEPTH, PERSISTENT, Value};
 
 /// Reads a pickle file, or a `.npy` file of either objects or plain values.
 ///

@@ -1,86 +1,59 @@
-//! From the machine's arena to an owned value, and what can be asked of one.
+//! Python's values as owned data, and what can be asked of one.
 
-use super::machine::{Id, Machine, Node};
-use super::numpy::Global;
-use super::reader::Step;
-use super::{MAX_DEPTH, Value};
 use crate::Error;
 use crate::array::{Data, NdArray};
 
+/// Deepest nesting of containers in a [`Value`].
+pub const MAX_DEPTH: usize = 100;
+
+/// Class of a [`Value::Object`] that stands for something outside the pickle; its state is what names it.
+pub const PERSISTENT: &str = "persistent id";
+
+/// A Python value.
+#[derive(Clone, Debug, PartialEq)]
+#[non_exhaustive]
+pub enum Value {
+    /// `None`.
+    None,
+    /// `bool`.
+    Bool(bool),
+    /// `int` that fits 64 bits.
+    Int(i64),
+    /// `float`.
+    Float(f64),
+    /// `str`; Python 2's byte strings are read as Latin-1.
+    Str(String),
+    /// `bytes` or `bytearray`.
+    Bytes(Vec<u8>),
+    /// `list`.
+    List(Vec<Value>),
+    /// `tuple`.
+    Tuple(Vec<Value>),
+    /// `set` or `frozenset`, in the file's order.
+    Set(Vec<Value>),
+    /// `dict` or `OrderedDict`, in the file's order; of equal keys the last counts.
+    Dict(Vec<(Value, Value)>),
+    /// numpy array of booleans, integers or floats. A numpy scalar has an empty shape.
+    Array(NdArray),
+    /// numpy array of objects or strings, row-major. One of no axes is replaced by its only item.
+    Objects {
+        /// Extent of every axis.
+        shape: Vec<usize>,
+        /// The items, last axis fastest.
+        items: Vec<Value>,
+    },
+    /// Instance of one of the allowed classes: `chumpy.ch.Ch`, `scipy.sparse.csc_matrix`, `torch.Tensor`, [`PERSISTENT`]; or
+    /// such a class itself, or one of PyTorch's storage classes, without attributes.
+    Object {
+        /// Full name of the class.
+        class: &'static str,
+        /// Its attributes, a [`Value::Dict`]; the arguments that a `torch.Tensor` is made from.
+        state: Box<Value>,
+    },
+}
+
 /// Most values of a sparse matrix made dense.
 const MAX_DENSE: usize = 1 << 25;
-
-impl Machine<'_> {
-    /// The owned tree below a node. Shared nodes are copied, against the budget.
-    pub(super) fn value(&mut self, id: Id, depth: usize) -> Step<Value> {
-        if depth > MAX_DEPTH {
-            return Err(format!("nested deeper than {MAX_DEPTH}"));
-        }
-        self.spend(size_of::<Value>())?;
-        let depth = depth + 1;
-        Ok(match &self.nodes[id] {
-            Node::None => Value::None,
-            Node::Bool(value) => Value::Bool(*value),
-            Node::Int(value) => Value::Int(*value),
-            Node::Float(value) => Value::Float(*value),
-            Node::Text(text) => {
-                let text = text.to_string();
-                self.spend(text.len())?;
-                Value::Str(text)
-            }
-            Node::ByteString(bytes) => {
-                // Latin-1 beyond ASCII takes two bytes in UTF-8.
-                let length = 2 * bytes.len();
-                let text = bytes.iter().map(|&b| char::from(b)).collect();
-                self.spend(length)?;
-                Value::Str(text)
-            }
-            Node::Bytes(bytes) => {
-                let bytes = bytes.to_vec();
-                self.spend(bytes.len())?;
-                Value::Bytes(bytes)
-            }
-            Node::Array(array) => {
-                let array = array.clone();
-                self.spend(8 * array.len())?;
-                Value::Array(array)
-            }
-            Node::List(items) => Value::List(self.values(items.clone(), depth)?),
-            Node::Tuple(items) => Value::Tuple(self.values(items.clone(), depth)?),
-            Node::Set(items) => Value::Set(self.values(items.clone(), depth)?),
-            Node::Objects(shape, items) => {
-                let (shape, items) = (shape.clone(), items.clone());
-                match items.as_slice() {
-                    &[only] if shape.is_empty() => self.value(only, depth)?,
-                    _ => Value::Objects { items: self.values(items, depth)?, shape },
-                }
-            }
-            Node::Dict(items) => {
-                let mut out = Vec::new();
-                for (key, value) in items.clone() {
-                    out.push((self.value(key, depth)?, self.value(value, depth)?));
-                }
-                Value::Dict(out)
-            }
-            &Node::Object(class, state) => Value::Object {
-                class,
-                state: Box::new(match state {
-                    Some(state) => self.value(state, depth)?,
-                    None => Value::Dict(Vec::new()),
-                }),
-            },
-            &Node::Global(Global::Class(class)) => Value::Object { class, state: Box::new(Value::Dict(Vec::new())) },
-            Node::Global(_) => return Err("a class or function as a value".to_owned()),
-            Node::Dtype(_) => return Err("a dtype as a value".to_owned()),
-            Node::BlankArray => return Err("array without data".to_owned()),
-        })
-    }
-
-    fn values(&mut self, ids: Vec<Id>, depth: usize) -> Step<Vec<Value>> {
-        self.spend(8 * ids.len())?;
-        ids.into_iter().map(|id| self.value(id, depth)).collect()
-    }
-}
 
 impl Value {
     /// Python's name of the type.

@@ -7,12 +7,12 @@ use anyhow::{Context, Result};
 use clap::Args;
 use glam::{Affine3A, Vec4};
 use occnerf::bake::{Avatar, BakeOptions, BakedPerson, BakedRenderer, bake};
-use occnerf::{FieldRenderer, PreparedFrame, Renderer, Scene, SplitMetrics, Trainer, evaluate};
+use occnerf::{FieldRenderer, Model, PosedView, PreparedFrame, Renderer, Scene, SplitMetrics, evaluate};
 use visibility::Samples;
 use volrender::Camera;
 
 use crate::pictures;
-use crate::run::{CHECKPOINT, RunConfig, use_threads};
+use crate::run::{RunConfig, use_threads};
 
 #[derive(Args)]
 pub struct BakedArguments {
@@ -41,7 +41,7 @@ pub fn baked(arguments: &BakedArguments) -> Result<()> {
     let run = RunConfig::read(&arguments.run)?;
     let source = run.source()?;
     let scene = Scene::new(&source.capture, &source.model, &run.train)?;
-    let trainer = Trainer::resume(&scene, &arguments.run.join(CHECKPOINT))?;
+    let model = Model::load(&arguments.run)?;
     std::fs::create_dir_all(&arguments.out).with_context(|| arguments.out.display().to_string())?;
     let frames: Vec<&PreparedFrame> = scene.eval.iter().collect();
     let mut rows = Vec::new();
@@ -51,7 +51,7 @@ pub fn baked(arguments: &BakedArguments) -> Result<()> {
         let mut index = 0;
         let scores = evaluate(&scene, renderer, &frames, |frame, rendering| {
             if index % stride == 0 {
-                let (width, height) = (frame.camera.width, frame.camera.height);
+                let (width, height) = (frame.view.camera.width, frame.view.camera.height);
                 row.push(pictures::over_grey(&rendering.image.pixels, &rendering.opacity, width, height));
             }
             index += 1;
@@ -71,17 +71,17 @@ pub fn baked(arguments: &BakedArguments) -> Result<()> {
     println!(
         "| | psnr_mask | psnr_hidden | ssim_mask | iou | s a picture |\n| --- | ---: | ---: | ---: | ---: | ---: |"
     );
-    scored("field", &mut FieldRenderer::new(&trainer)?)?;
+    scored("field", &mut FieldRenderer::new(&model)?)?;
     let mut notes = Vec::new();
     for &shells in &arguments.shells {
         for &refinements in &arguments.refinements {
             let options = BakeOptions { shells, refinements, atlas: arguments.atlas, ..BakeOptions::default() };
-            let (avatar, report) = bake(&trainer, &options)?;
+            let (avatar, report) = bake(&model, Some(&scene), &options)?;
             notes.push(format!("{shells} shells, {refinements} refinements: {report:?}"));
             for (name, samples) in [("1 sample", Samples::One), ("4 samples", Samples::Four)] {
                 let name = format!("{shells} shells, {refinements} refinements, {name}");
-                scored(&name, &mut BakedRenderer::new(&trainer, &avatar, samples))?;
-                let seconds = speed(&trainer, &scene, &avatar, &scene.train[0], samples)?;
+                scored(&name, &mut BakedRenderer::new(&model, &avatar, samples)?)?;
+                let seconds = speed(&model, &avatar, &scene.train[0].view, samples)?;
                 notes.push(format!("{name}: {:.1} pictures a second", 1.0 / seconds));
             }
             if shells == 1 {
@@ -99,16 +99,10 @@ pub fn baked(arguments: &BakedArguments) -> Result<()> {
 }
 
 /// Seconds of a picture of 512 × 512 of the video's motion, skinning included; the fastest of three rounds.
-fn speed(
-    trainer: &Trainer<'_>,
-    scene: &Scene,
-    avatar: &Avatar,
-    frame: &PreparedFrame,
-    samples: Samples,
-) -> Result<f64> {
-    let camera: Camera = frame.camera.resized(512, 512);
-    let mut person = BakedPerson::new(avatar, scene.scale);
-    let bones: Vec<Affine3A> = trainer.corrected(frame).bones.clone();
+fn speed(model: &Model, avatar: &Avatar, view: &PosedView, samples: Samples) -> Result<f64> {
+    let camera: Camera = view.camera.resized(512, 512);
+    let mut person = BakedPerson::new(avatar, model.body().scale);
+    let bones: Vec<Affine3A> = model.corrected(view).bones.clone();
     let mut out = vec![Vec4::ZERO; 512 * 512];
     let mut best = f64::INFINITY;
     for _ in 0..3 {

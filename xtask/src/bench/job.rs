@@ -108,7 +108,7 @@ pub fn measure(job: &Job) -> Result<Outcome> {
         let colors = VertexColors::measure(&scene)?;
         outcome.train_seconds = start.elapsed().as_secs_f64();
         outcome.parameters = 3 * colors.colors.len();
-        score(&scene, &mut PriorRenderer::new(&scene, &colors), &mut outcome)?;
+        score(&scene, &mut PriorRenderer::new(&scene.body, &colors), &mut outcome)?;
     } else {
         let mut trainer = Trainer::new(&scene, job.config.clone())?;
         let (mut seconds, mut times) = (Vec::new(), StepTimes::default());
@@ -131,8 +131,8 @@ pub fn measure(job: &Job) -> Result<Outcome> {
         outcome.step_seconds = seconds.get(seconds.len() / 2).copied().unwrap_or(0.0);
         let mean = |total: f64| total / seconds.len().max(1) as f64;
         outcome.stages = times.stages().map(|(name, total)| (name.to_owned(), mean(total))).to_vec();
-        outcome.parameters = trainer.num_parameters();
-        score(&scene, &mut FieldRenderer::new(&trainer)?, &mut outcome)?;
+        outcome.parameters = trainer.model().num_parameters();
+        score(&scene, &mut FieldRenderer::new(trainer.model())?, &mut outcome)?;
     }
     outcome.peak_rss_bytes = peak_rss_bytes();
     Ok(outcome)
@@ -143,7 +143,7 @@ fn score(scene: &Scene, renderer: &mut dyn Renderer, outcome: &mut Outcome) -> R
     let mut bad = 0;
     // The first picture pays for what later ones find ready.
     if let Some(first) = frames.first() {
-        renderer.render(first, Vec3::ZERO)?;
+        renderer.render(&first.view, Vec3::ZERO)?;
     }
     let metrics = evaluate(scene, renderer, &frames, |_, rendering| {
         let numbers = rendering.image.pixels.iter().chain(&rendering.opacity);

@@ -6,7 +6,7 @@ use occnerf::Lpips;
 use smpl::Mesh;
 use visibility::{RayMesh, View, visible_vertices};
 use volrender::metrics;
-use volrender::{bin_midpoints, bin_widths, composite_backward};
+use volrender::{RaySamples, SampleGradients, bin_midpoints, bin_widths, composite_backward};
 
 use super::input::{Input, vec3s};
 use super::output::{Output, count};
@@ -62,21 +62,12 @@ pub fn composite(mut input: Input, output: &mut Output) -> Result<()> {
         bin_midpoints(edges, &mut t);
         bin_widths(edges, &mut delta);
         let (sigma, rgb, weights) = (&sigma[row.clone()], &rgb[row.clone()], &mut weights[row.clone()]);
-        pixels.push(volrender::composite(sigma, &likelihood, &delta, &t, rgb, background, weights));
+        let samples = RaySamples { sigma, likelihood: &likelihood, delta: &delta, t: &t, rgb };
+        pixels.push(volrender::composite(samples, background, weights));
         if let Some(d_color) = &d_color {
-            composite_backward(
-                sigma,
-                &likelihood,
-                &delta,
-                rgb,
-                background,
-                weights,
-                d_color[ray],
-                0.0,
-                &mut d_sigma[row.clone()],
-                &mut d_rgb[row],
-                &mut d_likelihood,
-            );
+            let (d_sigma, d_rgb) = (&mut d_sigma[row.clone()], &mut d_rgb[row]);
+            let gradients = SampleGradients { d_sigma, d_rgb, d_likelihood: &mut d_likelihood };
+            composite_backward(samples, background, weights, d_color[ray], 0.0, gradients);
         }
     }
     output.vectors("color", &[rays, 3], &pixels.iter().map(|p| p.color).collect::<Vec<_>>())?;

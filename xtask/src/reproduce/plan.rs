@@ -151,7 +151,7 @@ fn measure(source: &Source, config: Config, lpips: Option<&Lpips>) -> Result<((f
     let step = start.elapsed().as_secs_f64() / TIMED as f64;
     let scored: Vec<&PreparedFrame> = crate::eval::scored_frames(&scene).collect();
     let first = &scored[..scored.len().min(1)];
-    let mut renderer = FieldRenderer::new(&trainer)?;
+    let mut renderer = FieldRenderer::new(trainer.model())?;
     let start = Instant::now();
     evaluate_with(&scene, &mut renderer, first, lpips, |_, _| {})?;
     Ok(((step, start.elapsed().as_secs_f64()), scored.len()))

@@ -8,7 +8,7 @@ use hashgrid::{HashGrid, HashGridConfig};
 use occnerf::{Config, Method, Preset};
 use smpl::{MotionField, MotionFrame, SurfaceMotion, SurfacePoint, WeightVolume, WeightVolumeConfig};
 use surface_query::{MeshDistance, SurfaceQuery, SurfaceQueryConfig};
-use volrender::{Aabb, Ray, bin_edges, bin_midpoints, bin_widths, composite};
+use volrender::{Aabb, Ray, RaySamples, bin_edges, bin_midpoints, bin_widths, composite};
 
 use super::{Figure, Kernel, REACH, Random, mean, median};
 
@@ -171,8 +171,9 @@ pub fn samples(figure: &Figure, rays: usize) -> Result<Kernel> {
             sigma[i] = if closest.is_some() { 150.0 * (0.5 - 25.0 * depth).clamp(0.0, 1.0) } else { 0.0 };
             rgb[i] = closest.map_or(Vec3::ZERO, |c| (40.0 * c.point).map(|x| 0.5 + 0.5 * x.sin()));
         }
-        let ones = vec![1.0; n];
-        composite(&sigma[..n], &ones, &delta[..n], &t[..n], &rgb[..n], Vec3::ZERO, &mut weights[..n]).color
+        let likelihood = &vec![1.0; n];
+        let samples = RaySamples { sigma: &sigma[..n], likelihood, delta: &delta[..n], t: &t[..n], rgb: &rgb[..n] };
+        composite(samples, Vec3::ZERO, &mut weights[..n]).color
     };
     let truth: Vec<Vec3> = rays.iter().map(|r| color(r, MOST)).collect();
     let ours = [Preset::Balanced, Preset::Paper].map(|preset| Config::preset(preset, Method::Occnerf).samples);

@@ -1,0 +1,11 @@
+//! Every setting of a run, the named presets, and what makes a configuration valid.
+
+mod presets;
+mod settings;
+mod validate;
+
+pub use self::settings::{
+    AttentionKind, Component, Config, DistanceKind, EncodingConfig, FieldConfig, LossConfig, Method, MotionConfig,
+    MotionKind, OccludedRule, Preset, RateConfig, SurfaceConfig, VisibilityKind,
+};
+pub use self::validate::ConfigError;

@@ -1,0 +1,335 @@
+//! Everything a run depends on, as one value that is written into its directory.
+
+use serde::{Deserialize, Serialize};
+
+/// Which model is trained; every method shares data, sampler, renderer, losses and budget.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Method {
+    /// No field: the posed prior mesh, each vertex the mean colour of the visible training pixels that saw it.
+    Prior,
+    /// Point-based: frequency encoding of x̂ with 10 bands and a perceptron (after Weng et al. 2022).
+    Humannerf,
+    /// Point-based: hash encoding of x̂ alone.
+    HashPoint,
+    /// The paper: point term and attended surface term.
+    Occnerf,
+}
+
+impl Method {
+    /// The name used on the command line and in results.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Prior => "prior",
+            Self::Humannerf => "humannerf",
+            Self::HashPoint => "hash-point",
+            Self::Occnerf => "occnerf",
+        }
+    }
+}
+
+/// What a pixel of the body's silhouette outside the mask is taken for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum OccludedRule {
+    /// Nothing is known of it: it enters no photometric term.
+    Unknown,
+    /// It is background, as the published code has it.
+    Background,
+}
+
+impl OccludedRule {
+    /// The name used on the command line and in results.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Unknown => "unknown",
+            Self::Background => "background",
+        }
+    }
+}
+
+/// How an observed point is mapped to the canonical pose.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum MotionKind {
+    /// Weight volume whose prior is the skinning weights diffused into space; learnable.
+    Volume,
+    /// Weight volume with the published oriented Gaussians, which has holes at the joints; learnable.
+    Gaussian,
+    /// Skinning weights of the nearest point of the posed surface.
+    Surface,
+}
+
+/// Where [v̂, d] comes from.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum DistanceKind {
+    /// The paper's blend of the k nearest vertices by normal similarity.
+    Blended,
+    /// The blended vertex, and the mean distance to the k nearest with the sign of the majority, as the published code has it.
+    Mean,
+    /// The closest point of the triangle mesh and its signed distance.
+    Exact,
+}
+
+/// How counts become weights of the surface term.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum AttentionKind {
+    /// The paper's: each vertex its share in the counts of all neighbours.
+    Share,
+    /// The published code's: a softmax of the counts scaled to [0, 1], nearly uniform.
+    Softmax,
+}
+
+/// Where the attention's counts come from.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum VisibilityKind {
+    /// The paper's running counts: neighbours of the samples in which training rays end.
+    Counted,
+    /// The number of training frames that show a vertex, by ray casting, from the first step on.
+    Exact,
+}
+
+/// A named set of defaults.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Preset {
+    /// For a first look.
+    Fast,
+    /// The default.
+    Balanced,
+    /// The paper's setting.
+    Paper,
+    /// The same with the departures of the code that was published with it.
+    PublishedCode,
+}
+
+impl Preset {
+    /// The name used on the command line and in results.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Fast => "fast",
+            Self::Balanced => "balanced",
+            Self::Paper => "paper",
+            Self::PublishedCode => "published-code",
+        }
+    }
+}
+
+/// The paper's components that can be switched off one by one.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Component {
+    /// The surface term: F sees the point term alone.
+    Surface,
+    /// The attention: the surface term is the plain mean.
+    Attention,
+    /// The completeness loss.
+    Completeness,
+    /// The perceptual loss.
+    Perceptual,
+}
+
+/// The perceptron F.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct FieldConfig {
+    /// Units of each hidden layer.
+    pub width: usize,
+    /// Hidden layers.
+    pub depth: usize,
+    /// Density σ = `density_scale` · softplus(raw + bias), per normalised metre.
+    pub density_scale: f32,
+    /// Bias at and inside the prior's surface. Positive, or an image that starts empty stays empty.
+    pub density_bias: f32,
+    /// Bias at the outer end of the margin; linear in between.
+    pub density_bias_outside: f32,
+    /// Whether colours start from those that the video showed of the prior's nearest surface point (see
+    /// [`crate::VertexColors`]): the perceptron adds to them before the sigmoid, where some frame saw them. Asks for
+    /// `motion.kind = surface`.
+    #[serde(default)]
+    pub prior_colors: bool,
+}
+
+/// The encoding γ.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct EncodingConfig {
+    /// Levels of the hash grid.
+    pub levels: usize,
+    /// Features a level.
+    pub features: usize,
+    /// log₂ of a level's largest table.
+    pub log2_table_size: u32,
+    /// Cells an axis of the coarsest level.
+    pub n_min: u32,
+    /// Cells an axis of the finest level.
+    pub n_max: u32,
+    /// Least d that is told from smaller ones, normalised metres. A wide interval makes cells long in d, along which
+    /// appearance hardly changes, and leaves more of the table to the surface.
+    pub distance_min: f32,
+    /// Largest d that is told from greater ones, normalised metres.
+    pub distance_max: f32,
+}
+
+/// Surface queries and the surface term.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct SurfaceConfig {
+    /// Nearest vertices a level.
+    pub k: usize,
+    /// Levels beyond the finest.
+    pub coarse_levels: usize,
+    /// Where [v̂, d] comes from.
+    pub distance: DistanceKind,
+    /// Whether F sees the surface term.
+    pub surface_term: bool,
+    /// Whether the surface term is weighted by the visibility counts.
+    pub attention: bool,
+    /// How.
+    pub attention_kind: AttentionKind,
+    /// Where those counts come from.
+    pub visibility: VisibilityKind,
+}
+
+/// The motion field.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct MotionConfig {
+    /// Volume or surface.
+    pub kind: MotionKind,
+    /// Distance from the prior's surface up to which a point can belong to the subject, normalised metres.
+    pub margin: f32,
+    /// Width of the fall to zero beyond the margin, normalised metres.
+    pub falloff: f32,
+    /// Depth below the prior's surface down to which there are samples, normalised metres. What lies deeper is hidden
+    /// behind that much body; a body is nowhere 0.3 deep, so 0.3 keeps every sample.
+    pub depth: f32,
+    /// Frames from one knot of the learnt pose corrections to the next; 0 leaves the prior's poses as they are, and the
+    /// volume kinds ask for that.
+    pub correction_spacing: usize,
+    /// Steps from one look at how far from the prior's surface the field has any density to the next: what lies farther out
+    /// is skipped until then. 0 never looks and keeps every sample, and the volume kinds ask for that.
+    #[serde(default)]
+    pub shell_interval: usize,
+}
+
+impl MotionConfig {
+    /// Distance from the prior's surface beyond which nothing belongs to the subject, normalised metres.
+    pub fn reach(&self) -> f32 {
+        self.margin + self.falloff
+    }
+}
+
+/// Weights of the losses.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct LossConfig {
+    /// λ₁, mean squared error.
+    pub mse: f32,
+    /// λ₂, perceptual term.
+    pub perceptual: f32,
+    /// File or directory of weights that makes the perceptual term LPIPS (see [`crate::Lpips::load`]); empty: multi-scale
+    /// SSIM, which needs none.
+    #[serde(default)]
+    pub perceptual_weights: String,
+    /// λ₃, completeness.
+    pub completeness: f32,
+    /// β of the completeness term, in units of the density.
+    pub beta: f32,
+}
+
+impl LossConfig {
+    /// The perceptual term: `ms-ssim`, `lpips` or `none`.
+    pub fn perceptual_name(&self) -> String {
+        let embedded = self.perceptual_weights.is_empty();
+        if self.perceptual == 0.0 {
+            "none"
+        } else if embedded {
+            "ms-ssim"
+        } else {
+            "lpips"
+        }
+        .to_owned()
+    }
+}
+
+/// Adam's learning rates.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RateConfig {
+    /// The perceptron F.
+    pub field: f32,
+    /// The vertices of the surface term.
+    pub vertices: f32,
+    /// The hash table.
+    pub table: f32,
+    /// The motion volume's log-weights.
+    pub motion: f32,
+    /// The pose corrections, radians and normalised metres.
+    pub pose: f32,
+    /// Every rate falls exponentially to this fraction over the run.
+    pub final_fraction: f32,
+    /// Decay of the second moment.
+    pub beta_2: f32,
+}
+
+/// A run.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Config {
+    /// Named defaults that this started from.
+    pub preset: Preset,
+    /// Which model.
+    pub method: Method,
+    /// The pixel rule.
+    pub occluded: OccludedRule,
+    /// Of every random choice.
+    pub seed: u64,
+    /// Optimisation steps.
+    pub steps: u64,
+    /// Patches a step, all from one frame.
+    pub patches: usize,
+    /// Side of a patch in pixels.
+    pub patch_size: u32,
+    /// Samples a ray across the body's box.
+    pub samples: usize,
+    /// Transmittance of a ray behind which training leaves samples out, below 1; 0 leaves out none.
+    #[serde(default)]
+    pub min_transmittance: f32,
+    /// The perceptron.
+    pub field: FieldConfig,
+    /// The hash grid.
+    pub encoding: EncodingConfig,
+    /// Surface queries.
+    pub surface: SurfaceConfig,
+    /// Motion field.
+    pub motion: MotionConfig,
+    /// Losses.
+    pub loss: LossConfig,
+    /// Learning rates.
+    pub rates: RateConfig,
+}
+
+impl Config {
+    /// Departs from the paper as the code published with it does, as far as that is more than a defect: attention
+    /// through a softmax, ten neighbours a level, mean distances with the sign of the majority, hidden pixels taught as background.
+    pub fn depart_as_published(&mut self) {
+        self.surface.attention_kind = AttentionKind::Softmax;
+        self.surface.k = 10;
+        self.surface.distance = DistanceKind::Mean;
+        self.occluded = OccludedRule::Background;
+    }
+
+    /// Switches a component of the method off.
+    pub fn ablate(&mut self, component: Component) {
+        match component {
+            Component::Surface => self.surface.surface_term = false,
+            Component::Attention => self.surface.attention = false,
+            Component::Completeness => self.loss.completeness = 0.0,
+            Component::Perceptual => self.loss.perceptual = 0.0,
+        }
+    }
+}

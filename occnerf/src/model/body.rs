@@ -1,0 +1,119 @@
+//! The shaped body that everything hangs on: its canonical surface with the searches over it, and
+//! the prior in any pose.
+
+use std::sync::Arc;
+
+use glam::Vec3;
+use smpl::{BodyModel, Posed, Shaped};
+use surface_query::{MeshDistance, SurfaceQuery, SurfaceQueryConfig};
+use volrender::{Aabb, Camera};
+
+use crate::Error;
+use crate::config::Config;
+use crate::model::view::PosedView;
+
+/// Canonical height that every body is scaled to, so that constants in metres mean the same for all.
+const NORMALISED_HEIGHT: f32 = 1.7;
+/// Share of its size by which the canonical box is inflated on each side.
+const BOX_INFLATION: f32 = 0.05;
+
+/// A body model in the shape of one person, lengths normalised.
+pub struct Body {
+    /// The prior as handed in (lengths not normalised).
+    pub model: BodyModel,
+    /// Normalised metres in one unit of the capture.
+    pub scale: f32,
+    /// Shape of the canonical body.
+    pub mean_betas: Vec<f32>,
+    /// Canonical (T-pose, mean betas) vertices, normalised.
+    pub canonical: Shaped,
+    /// The canonical box that encodings are relative to, inflated by 5 %.
+    pub canonical_box: Aabb,
+    /// Nearest vertices of the canonical mesh.
+    pub query: SurfaceQuery,
+    /// Exact distances to the canonical mesh.
+    pub surface: MeshDistance,
+}
+
+/// A person's pose at one moment, in the units of the capture.
+#[derive(Clone, Copy, Debug)]
+pub struct Moment<'a> {
+    /// Shape coefficients.
+    pub betas: &'a [f32],
+    /// Axis-angle rotation of each joint, (J).
+    pub pose: &'a [Vec3],
+    /// How the posed body stands in the world.
+    pub placement: smpl::Placement,
+}
+
+impl Body {
+    /// Shapes `model` by `mean_betas` and builds the searches that `config` asks for.
+    ///
+    /// # Errors
+    /// [`Error::Scene`] for a body without height; those of the searches.
+    pub fn new(model: &BodyModel, mean_betas: &[f32], config: &Config) -> Result<Self, Error> {
+        let mut canonical = model.shaped(mean_betas);
+        let Aabb { min: low, max: high } = Aabb::from_points(&canonical.vertices);
+        let height = high.y - low.y;
+        if !(height.is_finite() && height > 0.0) {
+            let what = format!("canonical body is {height} high: expected a finite height above 0");
+            return Err(Error::Scene(what));
+        }
+        let scale = NORMALISED_HEIGHT / height;
+        canonical.vertices.iter_mut().chain(&mut canonical.joints).for_each(|v| *v *= scale);
+        let (low, high) = (low * scale, high * scale);
+        let inflation = BOX_INFLATION * (high - low);
+        let query = SurfaceQueryConfig {
+            k: config.surface.k,
+            coarse_levels: config.surface.coarse_levels,
+            cell: 0.02,
+            margin: config.motion.reach() + 0.03,
+            ratio: 0.25,
+        };
+        Ok(Self {
+            query: SurfaceQuery::new(&canonical.vertices, &model.faces, &query)?,
+            surface: MeshDistance::new(&canonical.vertices, &model.faces)?,
+            mean_betas: mean_betas.to_owned(),
+            model: model.clone(),
+            scale,
+            canonical_box: Aabb { min: low - inflation, max: high + inflation },
+            canonical,
+        })
+    }
+
+    /// The prior at a moment, normalised.
+    pub fn pose(&self, moment: Moment<'_>) -> Posed {
+        self.shape_and_pose(moment).1
+    }
+
+    fn shape_and_pose(&self, moment: Moment<'_>) -> (Shaped, Posed) {
+        let mut shape = self.model.shaped(moment.betas);
+        let mut posed = self.model.pose(&shape, moment.pose, moment.placement);
+        shape.vertices.iter_mut().chain(&mut shape.joints).for_each(|v| *v *= self.scale);
+        let Posed { vertices, joints, pose_offsets, .. } = &mut posed;
+        vertices.iter_mut().chain(joints).chain(pose_offsets).for_each(|v| *v *= self.scale);
+        posed.bones.iter_mut().for_each(|b| b.translation *= self.scale);
+        (shape, posed)
+    }
+
+    /// The training frame `instant` as `camera` (of the capture) sees it.
+    pub(crate) fn view(&self, camera: &Camera, instant: usize, moment: Moment<'_>) -> PosedView {
+        let (shape, posed) = self.shape_and_pose(moment);
+        let camera = normalised_camera(camera, self.scale);
+        PosedView { camera, instant: Some(instant), posed, shape: Arc::new(shape) }
+    }
+
+    /// The canonical rest pose: no joint turned, the pelvis where the body model has it.
+    pub fn rest(&self) -> Posed {
+        let joints = vec![Vec3::ZERO; self.model.num_joints()];
+        let placement = smpl::Placement::Pelvis { translation: Vec3::ZERO };
+        self.pose(Moment { betas: &self.mean_betas, pose: &joints, placement })
+    }
+}
+
+/// A camera with its lengths multiplied by `scale`.
+pub(crate) fn normalised_camera(camera: &Camera, scale: f32) -> Camera {
+    let mut camera = *camera;
+    camera.world_to_camera.translation *= scale;
+    camera
+}

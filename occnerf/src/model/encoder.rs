@@ -1,0 +1,249 @@
+//! The encoding γ of each method.
+
+use std::ops::Range;
+
+use glam::Vec3;
+use hashgrid::{HashGrid, HashGridConfig, Layout};
+use volrender::Aabb;
+
+use crate::Error;
+use crate::config::{Config, EncodingConfig, Method};
+use crate::model::samples::Samples;
+
+/// Bands of the frequency encoding (Weng et al. 2022).
+const BANDS: usize = 10;
+
+/// What F is fed with at a point.
+#[derive(Clone, Debug)]
+pub(crate) enum Encoder {
+    /// sin and cos of 2^b · x̂, and x̂ itself.
+    Frequency,
+    /// Hash grid on x̂.
+    Point(HashGrid<3>),
+    /// Hash grid on [v̂, d], and the interval that d is clamped to, normalised metres.
+    Surface(HashGrid<4>, (f32, f32)),
+}
+
+impl Encoder {
+    pub fn new(config: &Config) -> Result<Self, Error> {
+        let EncodingConfig { levels, features, log2_table_size, n_min, n_max, distance_min, distance_max } =
+            config.encoding;
+        let grid = HashGridConfig { levels, features, log2_table_size, n_min, n_max };
+        Ok(match config.method {
+            Method::Prior | Method::Humannerf => Self::Frequency,
+            Method::HashPoint => Self::Point(HashGrid::new(&grid)?),
+            Method::Occnerf => Self::Surface(HashGrid::new(&grid)?, (distance_min, distance_max)),
+        })
+    }
+
+    #[cfg(test)]
+    pub fn num_parameters(&self) -> usize {
+        match self {
+            Self::Frequency => 0,
+            Self::Point(grid) => grid.num_parameters(),
+            Self::Surface(grid, _) => grid.num_parameters(),
+        }
+    }
+
+    pub fn num_features(&self) -> usize {
+        match self {
+            Self::Frequency => 3 + 6 * BANDS,
+            Self::Point(grid) => grid.num_features(),
+            Self::Surface(grid, _) => grid.num_features(),
+        }
+    }
+
+    pub fn initial_table(&self, seed: u64) -> Vec<f32> {
+        match self {
+            Self::Frequency => Vec::new(),
+            Self::Point(grid) => grid.init_table(seed),
+            Self::Surface(grid, _) => grid.init_table(seed),
+        }
+    }
+
+    /// The coordinates that samples are encoded at: x̂ for the frequencies, in the unit box for a grid.
+    pub fn coordinates(&self, samples: &Samples, region: &Aabb, out: &mut Coordinates) {
+        out.point.clear();
+        out.surface.clear();
+        match self {
+            Self::Frequency => out.point.extend(samples.canonical.iter().map(Vec3::to_array)),
+            Self::Point(_) => out.point.extend(samples.canonical.iter().map(|&x| in_box(x, region).to_array())),
+            Self::Surface(_, range) => out.surface.extend(
+                samples.closest.iter().zip(&samples.distance).map(|(&v, &d)| surface_coordinates(v, d, region, *range)),
+            ),
+        }
+    }
+
+    /// Adds a vertex with its signed distance; for the encoding of [v̂, d] alone.
+    pub fn push_vertex(&self, v: Vec3, d: f32, region: &Aabb, out: &mut Coordinates) {
+        if let Self::Surface(_, range) = self {
+            out.surface.push(surface_coordinates(v, d, region, *range));
+        }
+    }
+
+    /// Whether d takes part: beyond the clamp its gradient is zero.
+    pub fn distance_is_inside(&self, d: f32) -> bool {
+        matches!(self, Self::Surface(_, (low, high)) if d > *low && d < *high)
+    }
+
+    /// How the features of `points` points lie; a frequency encoding is one level.
+    pub fn layout(&self, points: usize) -> Layout {
+        match self {
+            Self::Frequency => Layout { levels: 1, points, features: self.num_features() },
+            Self::Point(grid) => grid.layout(points),
+            Self::Surface(grid, _) => grid.layout(points),
+        }
+    }
+
+    /// Features ([`Encoder::layout`]) of the coordinates.
+    pub fn encode(&self, table: &[f32], at: At<'_>, features: &mut [f32]) {
+        match self {
+            Self::Frequency => {
+                for (x, row) in at.point.iter().zip(features.chunks_exact_mut(self.num_features())) {
+                    row[..3].copy_from_slice(x);
+                    for (band, pair) in row[3..].chunks_exact_mut(6).enumerate() {
+                        let frequency = (1u32 << band) as f32;
+                        for axis in 0..3 {
+                            (pair[axis], pair[3 + axis]) = (x[axis] * frequency).sin_cos();
+                        }
+                    }
+                }
+            }
+            Self::Point(grid) => grid.encode(table, at.point, features),
+            Self::Surface(grid, _) => grid.encode(table, at.surface, features),
+        }
+    }
+
+    /// Derivatives that [`Encoder::encode_jacobian`] writes for each point; none where there is no table.
+    pub fn jacobian_width(&self) -> usize {
+        match self {
+            Self::Frequency => 0,
+            Self::Point(grid) => grid.jacobian_len(1),
+            Self::Surface(grid, _) => grid.jacobian_len(1),
+        }
+    }
+
+    /// [`Encoder::encode`] with what [`Encoder::encode_backward_points`] needs to leave the table alone.
+    pub fn encode_jacobian(&self, table: &[f32], at: At<'_>, features: &mut [f32], jacobian: &mut [f32]) {
+        match self {
+            Self::Frequency => self.encode(table, at, features),
+            Self::Point(grid) => grid.encode_jacobian(table, at.point, features, jacobian),
+            Self::Surface(grid, _) => grid.encode_jacobian(table, at.surface, features, jacobian),
+        }
+    }
+
+    /// Adds the gradient of the table from all parts, in their order.
+    pub fn encode_backward<'a>(
+        &self,
+        parts: impl Iterator<Item = (At<'a>, &'a [f32])> + Clone + Sync,
+        d_table: &mut [f32],
+    ) {
+        match self {
+            Self::Frequency => {}
+            Self::Point(grid) => grid.encode_backward_parts(parts.map(|(at, d)| (at.point, d)), d_table),
+            Self::Surface(grid, _) => grid.encode_backward_parts(parts.map(|(at, d)| (at.surface, d)), d_table),
+        }
+    }
+
+    /// Gradients of the coordinates; overwrites `d_at`.
+    pub fn encode_backward_points(&self, slopes: Slopes<'_>, at: At<'_>, d_features: &[f32], d_at: &mut Coordinates) {
+        d_at.clear();
+        d_at.point.resize(at.point.len(), [0.0; 3]);
+        d_at.surface.resize(at.surface.len(), [0.0; 4]);
+        match self {
+            Self::Frequency => {
+                let rows = d_features.chunks_exact(self.num_features());
+                for ((d, x), d_row) in d_at.point.iter_mut().zip(at.point).zip(rows) {
+                    d.copy_from_slice(&d_row[..3]);
+                    for (band, pair) in d_row[3..].chunks_exact(6).enumerate() {
+                        let frequency = (1u32 << band) as f32;
+                        for axis in 0..3 {
+                            let (sin, cos) = (x[axis] * frequency).sin_cos();
+                            d[axis] += frequency * (cos * pair[axis] - sin * pair[3 + axis]);
+                        }
+                    }
+                }
+            }
+            Self::Point(grid) => match slopes {
+                Slopes::Table(table) => grid.encode_backward_points(table, at.point, d_features, &mut d_at.point),
+                Slopes::Jacobian(jacobian) => grid.jacobian_backward(jacobian, d_features, &mut d_at.point),
+            },
+            Self::Surface(grid, _) => match slopes {
+                Slopes::Table(table) => grid.encode_backward_points(table, at.surface, d_features, &mut d_at.surface),
+                Slopes::Jacobian(jacobian) => grid.jacobian_backward(jacobian, d_features, &mut d_at.surface),
+            },
+        }
+    }
+
+    /// Gradient `index` of coordinates as that of x̂, or of v̂ and d, in normalised metres.
+    pub fn d_metres(&self, d_at: &Coordinates, index: usize, region: &Aabb) -> (Vec3, f32) {
+        let per_metre = (region.max - region.min).recip();
+        match self {
+            Self::Frequency => (Vec3::from_array(d_at.point[index]), 0.0),
+            Self::Point(_) => (Vec3::from_array(d_at.point[index]) * per_metre, 0.0),
+            Self::Surface(_, (low, high)) => {
+                let [x, y, z, w] = d_at.surface[index];
+                (Vec3::new(x, y, z) * per_metre, w * (1.0 / (high - low)))
+            }
+        }
+    }
+}
+
+/// Where the derivatives of a grid's features by the coordinates come from.
+#[derive(Clone, Copy)]
+pub(crate) enum Slopes<'a> {
+    /// They are worked out from the table.
+    Table(&'a [f32]),
+    /// [`Encoder::encode_jacobian`] has written them.
+    Jacobian(&'a [f32]),
+}
+
+/// Where samples are encoded; one of the two is filled.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Coordinates {
+    pub point: Vec<[f32; 3]>,
+    pub surface: Vec<[f32; 4]>,
+}
+
+/// Some of [`Coordinates`].
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct At<'a> {
+    pub point: &'a [[f32; 3]],
+    pub surface: &'a [[f32; 4]],
+}
+
+impl Coordinates {
+    pub fn all(&self) -> At<'_> {
+        At { point: &self.point, surface: &self.surface }
+    }
+
+    /// Those of vertices `range`, which are encoded on the surface.
+    pub fn vertices(&self, range: Range<usize>) -> At<'_> {
+        At { point: &[], surface: &self.surface[range] }
+    }
+
+    pub fn clear(&mut self) {
+        self.point.clear();
+        self.surface.clear();
+    }
+}
+
+fn in_box(x: Vec3, region: &Aabb) -> Vec3 {
+    (x - region.min) / (region.max - region.min)
+}
+
+/// [v̂, d] in the unit box.
+fn surface_coordinates(v: Vec3, d: f32, region: &Aabb, (low, high): (f32, f32)) -> [f32; 4] {
+    let p = in_box(v, region);
+    [p.x, p.y, p.z, (d.clamp(low, high) - low) / (high - low)]
+}
+
+/// Makes a buffer of `len` values that the caller writes all of. One that grows makes room for an eighth more, where a vector
+/// would for twice as many: of what each run of samples keeps for itself, features are the most.
+pub(crate) fn fit(buffer: &mut Vec<f32>, len: usize) {
+    if buffer.capacity() < len {
+        *buffer = Vec::new();
+        buffer.reserve_exact(len + len / 8);
+    }
+    buffer.resize(len, 0.0);
+}

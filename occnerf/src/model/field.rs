@@ -1,0 +1,212 @@
+//! The field F: [point term ‖ surface term] → density and colour of a batch of samples.
+
+use std::ops::Range;
+
+use glam::Vec3;
+use visibility::VisibilityCounts;
+use volrender::Aabb;
+
+use crate::Error;
+use crate::config::{AttentionKind, Config, Method};
+use crate::model::arena::Arena;
+use crate::model::encoder::{Coordinates, Encoder, fit};
+use crate::model::perceptron::{Activations, Mlp};
+use crate::model::samples::Samples;
+use crate::model::surface_term::{Gather, Mix};
+use crate::model::times::{StepTimes, Stopwatch};
+
+/// Samples that pass through the perceptron together; their activations fit a second-level cache.
+pub(crate) const BLOCK: usize = 256;
+/// Widest layers whose activations are worked out anew for the backward pass: to write them to memory and to read them again
+/// takes as long, and as much memory as all else that is known of a sample. Of wider ones it takes less time.
+const NARROW: usize = 64;
+/// Outputs of the head: raw density, raw red, green, blue.
+const OUTPUTS: usize = 4;
+
+/// Shape of the field; its parameters are the caller's.
+#[derive(Clone, Debug)]
+pub(crate) struct Field {
+    pub encoder: Encoder,
+    pub mlp: Mlp,
+    /// Whether the backward pass works out the activations anew.
+    pub narrow: bool,
+    /// Whether the input has a surface term.
+    pub surface_term: bool,
+    attention: Option<AttentionKind>,
+    pub density_scale: f32,
+    /// Bias at d ≤ 0 and its change per metre up to the reach.
+    pub density_bias: (f32, f32),
+    pub reach: f32,
+    region: Aabb,
+}
+
+/// Samples with what the field says of them, and everything that its backward pass needs.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct SampleBatch {
+    pub samples: Samples,
+    pub at: Coordinates,
+    /// Attention of each neighbour of each sample.
+    pub attention: Vec<f32>,
+    /// The point term, as it lies ([`Encoder::layout`]); after the backward pass its gradient.
+    pub features: Vec<f32>,
+    /// Where the derivatives of the features by the coordinates are in the arena that [`Field::forward`] was given.
+    pub jacobian: Range<usize>,
+    /// Of each block, or of the last one where they are worked out anew.
+    pub blocks: Vec<Activations>,
+    /// Activated density and colour of each sample.
+    pub sigma: Vec<f32>,
+    pub rgb: Vec<Vec3>,
+    /// Cotangents, filled by the caller.
+    pub d_sigma: Vec<f32>,
+    pub d_rgb: Vec<Vec3>,
+    pub d_likelihood: Vec<f32>,
+    /// Gradient of d through the density's bias.
+    pub d_distance: Vec<f32>,
+    /// Gradient of `at`, where it is asked for.
+    pub d_at: Coordinates,
+    pub d_output: Vec<f32>,
+    pub d_input: Vec<f32>,
+    /// Where the time of this step went.
+    pub times: StepTimes,
+}
+
+/// What a field has learnt, as evaluating it reads it.
+#[derive(Clone, Copy)]
+pub(crate) struct Learnt<'a> {
+    /// Weights of the perceptron.
+    pub perceptron: &'a [f32],
+    /// The hash table.
+    pub table: &'a [f32],
+    /// Features of the vertices, V × F; empty without a surface term.
+    pub vertices: &'a [f32],
+    /// How often each vertex was seen.
+    pub counts: &'a VisibilityCounts,
+}
+
+impl Field {
+    pub fn new(config: &Config, region: Aabb) -> Result<Self, Error> {
+        let encoder = Encoder::new(config)?;
+        let surface_term = config.method == Method::Occnerf && config.surface.surface_term;
+        let inputs = encoder.num_features() * (1 + usize::from(surface_term));
+        let reach = config.motion.reach();
+        let slope = (config.field.density_bias_outside - config.field.density_bias) / reach;
+        Ok(Self {
+            mlp: Mlp::new(inputs, &vec![config.field.width; config.field.depth], OUTPUTS),
+            narrow: config.field.width <= NARROW,
+            encoder,
+            surface_term,
+            attention: config.surface.attention.then_some(config.surface.attention_kind),
+            density_scale: config.field.density_scale,
+            density_bias: (config.field.density_bias, slope),
+            reach,
+            region,
+        })
+    }
+
+    /// Evaluates density and colour of every sample of the batch. Where gradients of the
+    /// coordinates will be asked for, the derivatives that they take are left in `jacobians`.
+    pub fn forward(&self, learnt: &Learnt<'_>, batch: &mut SampleBatch, jacobians: Option<&mut Arena>) {
+        let (n, width) = (batch.samples.len(), self.encoder.num_features());
+        let mut watch = Stopwatch::start();
+        self.encoder.coordinates(&batch.samples, &self.region, &mut batch.at);
+        fit(&mut batch.features, n * width);
+        if let Some(arena) = jacobians {
+            batch.jacobian = arena.take(n * self.encoder.jacobian_width());
+            let jacobian = arena.piece_mut(&batch.jacobian);
+            self.encoder.encode_jacobian(learnt.table, batch.at.all(), &mut batch.features, jacobian);
+        } else {
+            self.encoder.encode(learnt.table, batch.at.all(), &mut batch.features);
+        }
+        watch.lap(&mut batch.times.encode);
+        self.attend(learnt.counts, batch);
+        batch.sigma.resize(n, 0.0);
+        batch.rgb.resize(n, Vec3::ZERO);
+        let kept = if self.narrow { 1 } else { n.div_ceil(BLOCK) };
+        batch.blocks.resize_with(kept.max(batch.blocks.len()), Activations::default);
+        for (block, range) in self.blocks(n) {
+            self.activate(learnt.perceptron, learnt.vertices, range.clone(), batch, block);
+            for (s, raw) in range.zip(batch.blocks[block].outputs()) {
+                batch.sigma[s] = self.density_scale * softplus(raw[0] + self.bias(batch.samples.distance[s]));
+                let base = batch.samples.base(s);
+                batch.rgb[s] = (base.truncate() + base.w * Vec3::from_slice(&raw[1..4])).map(sigmoid);
+            }
+        }
+        watch.lap(&mut batch.times.perceptron);
+    }
+
+    /// Samples that pass through the perceptron together, and which of [`SampleBatch::blocks`] is theirs.
+    pub fn blocks(&self, samples: usize) -> impl Iterator<Item = (usize, Range<usize>)> {
+        let kept = usize::from(!self.narrow);
+        (0..samples).step_by(BLOCK).map(move |start| (kept * start / BLOCK, start..(start + BLOCK).min(samples)))
+    }
+
+    /// Fills the activations `block` with those of the samples in `range`.
+    pub fn activate(
+        &self,
+        mlp: &[f32],
+        vertex_features: &[f32],
+        range: Range<usize>,
+        batch: &mut SampleBatch,
+        block: usize,
+    ) {
+        let (n, width) = (batch.samples.len(), self.encoder.num_features());
+        let (row, activations) = (self.mlp.input_width(), &mut batch.blocks[block]);
+        self.mlp.resize(activations, range.len());
+        let input = &mut activations.layers[0];
+        self.encoder.layout(n).to_rows(&batch.features, range.clone(), input, row);
+        input.chunks_exact_mut(row).for_each(|input| input[width..].fill(0.0));
+        if self.surface_term {
+            let mix = Mix::new(width, row, range.clone(), &batch.samples, &batch.attention);
+            pulp::Arch::new().dispatch(Gather { mix, rows: vertex_features, input });
+        }
+        self.mlp.forward(mlp, activations, range.len());
+    }
+
+    /// a_i / Σ a over the neighbours of each sample.
+    fn attend(&self, counts: &VisibilityCounts, batch: &mut SampleBatch) {
+        batch.attention.clear();
+        if !self.surface_term {
+            return;
+        }
+        let total = batch.samples.neighbours.len();
+        let per_sample = total.checked_div(batch.samples.len()).unwrap_or(1).max(1);
+        batch.attention.resize(total, 1.0 / per_sample as f32);
+        let Some(kind) = self.attention else { return };
+        let rows = batch.samples.neighbours.chunks_exact(per_sample);
+        for (neighbours, out) in rows.zip(batch.attention.chunks_exact_mut(per_sample)) {
+            match kind {
+                AttentionKind::Share => counts.attention(neighbours, out),
+                AttentionKind::Softmax => counts.softmax_attention(neighbours, out),
+            }
+        }
+    }
+
+    pub fn bias(&self, distance: f32) -> f32 {
+        self.density_bias.0 + self.density_bias.1 * distance.clamp(0.0, self.reach)
+    }
+}
+
+/// ln(1 + eˣ) without overflow.
+pub(crate) fn softplus(x: f32) -> f32 {
+    x.max(0.0) + (-x.abs()).exp().ln_1p()
+}
+
+pub(crate) fn sigmoid(x: f32) -> f32 {
+    1.0 / (1.0 + (-x).exp())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn softplus_and_sigmoid_stay_finite_and_agree_with_each_other() {
+        for x in [-1e30, -200.0, -3.0f32, -0.1, 0.0, 0.1, 3.0, 200.0] {
+            assert!(softplus(x).is_finite() && sigmoid(x).is_finite());
+            let (x, h) = (f64::from(x), 1e-4);
+            let exact = |x: f64| x.max(0.0) + (-x.abs()).exp().ln_1p();
+            let slope = (exact(x + h) - exact(x - h)) / (2.0 * h);
+            assert!((slope - f64::from(sigmoid(x as f32))).abs() < 1e-5);
+        }
+    }
+}

@@ -1,0 +1,24 @@
+//! What a trained person is, and how a ray meets it.
+
+pub(crate) mod arena;
+pub(crate) mod body;
+pub(crate) mod colors;
+pub(crate) mod correction;
+pub(crate) mod distance;
+pub(crate) mod encoder;
+pub(crate) mod extent;
+pub(crate) mod field;
+pub(crate) mod file;
+pub(crate) mod gemm;
+pub(crate) mod march;
+pub(crate) mod parameters;
+pub(crate) mod perceptron;
+pub(crate) mod person;
+pub(crate) mod samples;
+pub(crate) mod saved;
+pub(crate) mod surface_term;
+pub(crate) mod times;
+pub(crate) mod trace;
+pub(crate) mod trained;
+pub(crate) mod vertices;
+pub(crate) mod view;

@@ -1,0 +1,95 @@
+//! The learnable arrays, in the paper's groups.
+
+use crate::config::Config;
+use crate::model::field::Field;
+
+/// A part of the parameters.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Part {
+    /// The perceptron F.
+    Field,
+    /// The hash table.
+    Table,
+    /// Offsets of the vertices, V × 3.
+    Vertices,
+    /// Log-weights of the motion volume.
+    Motion,
+    /// Corrections of the poses.
+    Pose,
+}
+
+/// Every part with its name in checkpoints.
+pub(crate) const PARTS: [(Part, &str); 5] = [
+    (Part::Field, "field"),
+    (Part::Table, "table"),
+    (Part::Vertices, "vertices"),
+    (Part::Motion, "motion"),
+    (Part::Pose, "pose"),
+];
+
+/// An array for each part: values, or their gradients.
+#[derive(Clone, Debug)]
+pub(crate) struct Arrays(pub [Vec<f32>; 5]);
+
+impl Arrays {
+    pub fn get(&self, part: Part) -> &[f32] {
+        &self.0[part as usize]
+    }
+
+    pub fn get_mut(&mut self, part: Part) -> &mut Vec<f32> {
+        &mut self.0[part as usize]
+    }
+
+    /// Zeros of the same lengths.
+    pub fn zeros(&self) -> Self {
+        Self(self.0.each_ref().map(|values| vec![0.0; values.len()]))
+    }
+}
+
+/// Values of every part.
+#[derive(Clone, Debug)]
+pub(crate) struct Parameters {
+    pub values: Arrays,
+    /// Rows of the table that pruning has left, if it took any; the others are zero.
+    pub kept_rows: Option<Vec<bool>>,
+}
+
+/// Lengths of the parts that the field does not know.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Lengths {
+    pub vertices: usize,
+    pub motion: usize,
+    pub pose: usize,
+}
+
+impl Parameters {
+    /// The values that training starts from.
+    pub fn new(config: &Config, field: &Field, lengths: Lengths) -> Self {
+        let vertices = if field.surface_term { 3 * lengths.vertices } else { 0 };
+        let values = Arrays([
+            field.mlp.initial(config.seed),
+            field.encoder.initial_table(config.seed),
+            vec![0.0; vertices],
+            vec![0.0; lengths.motion],
+            vec![0.0; lengths.pose],
+        ]);
+        Self { values, kept_rows: None }
+    }
+
+    pub fn get(&self, part: Part) -> &[f32] {
+        self.values.get(part)
+    }
+
+    pub fn get_mut(&mut self, part: Part) -> &mut Vec<f32> {
+        self.values.get_mut(part)
+    }
+
+    /// Numbers of a part that carry something.
+    pub fn count(&self, part: Part) -> usize {
+        let all = self.get(part).len();
+        match &self.kept_rows {
+            Some(kept) if part == Part::Table => all / kept.len().max(1) * kept.iter().filter(|kept| **kept).count(),
+            _ => all,
+        }
+    }
+}

@@ -1,0 +1,172 @@
+//! What a run directory keeps of the person beside what is learnt, so that a model can be drawn with
+//! the capture gone: the body, the moments and cameras of the video, the prior's colours.
+
+use std::borrow::Cow;
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::sync::Arc;
+
+use glam::{Affine3A, Vec2, Vec3};
+use smpl::{BodyModel, Placement};
+use volrender::Camera;
+
+use crate::Error;
+use crate::capture::Capture;
+use crate::config::Config;
+use crate::model::body::{Body, Moment};
+use crate::model::colors::VertexColors;
+use crate::model::file::{Array, Contents, read, write};
+use crate::model::saved::{CHECKPOINT, config_of, parse};
+use crate::model::trained::Model;
+use crate::model::view::PosedView;
+
+const BODY: &str = "body.safetensors";
+const PERSON: &str = "person.safetensors";
+const FORMAT: &str = "occnerf-person";
+const VERSION: &str = "1";
+/// Numbers of a camera: focal lengths, principal point, the columns of the extrinsics.
+const CAMERA: usize = 16;
+/// Numbers of a placement: whether it is about the origin, rotation, translation.
+const PLACEMENT: usize = 7;
+
+/// A person before anything is learnt.
+pub struct Person {
+    /// Name of the scene.
+    pub scene: String,
+    /// The shaped body.
+    pub body: Arc<Body>,
+    /// The training frames' poses and cameras.
+    pub frames: Vec<Arc<PosedView>>,
+    /// The colours that the video shows of the prior.
+    pub colors: VertexColors,
+}
+
+impl Person {
+    /// Writes `body.safetensors` and `person.safetensors` into the directory `run`.
+    ///
+    /// # Errors
+    /// Files that cannot be written.
+    pub fn save(run: &Path, capture: &Capture, model: &BodyModel, colors: &VertexColors) -> Result<(), Error> {
+        model.save(&run.join(BODY))?;
+        let (joints, betas) = (model.num_joints(), model.num_betas());
+        let vectors = |values: &[Vec3]| values.iter().flat_map(|v| v.to_array()).collect::<Vec<f32>>();
+        let mut frames: [Vec<f32>; 4] = Default::default();
+        let mut sizes = Vec::new();
+        for frame in &capture.train {
+            let [cameras, poses, shapes, placements] = &mut frames;
+            let Camera { focal, centre, world_to_camera, width, height } = frame.camera;
+            cameras.extend([focal.x, focal.y, centre.x, centre.y]);
+            cameras.extend(world_to_camera.to_cols_array());
+            sizes.extend([u64::from(width), u64::from(height)]);
+            poses.extend((0..joints).flat_map(|j| frame.pose.get(j).copied().unwrap_or_default().to_array()));
+            shapes.extend((0..betas).map(|b| frame.betas.get(b).copied().unwrap_or_default()));
+            placements.extend(match frame.placement {
+                Placement::Pelvis { translation } => [&[0.0; 4][..], &translation.to_array()].concat(),
+                Placement::Origin { rotation, translation } => {
+                    [&[1.0][..], &rotation.to_array(), &translation.to_array()].concat()
+                }
+            });
+        }
+        let floats = |values| Array::Floats(Cow::Owned(values));
+        let [cameras, poses, shapes, placements] = frames;
+        let arrays = [
+            ("cameras", floats(cameras)),
+            ("poses", floats(poses)),
+            ("betas", floats(shapes)),
+            ("placements", floats(placements)),
+            ("mean_betas", floats(padded(&capture.mean_betas, betas))),
+            ("colors", floats(vectors(&colors.colors))),
+            ("seen", Array::Bytes(colors.seen.iter().map(|&seen| u8::from(seen)).collect())),
+            ("sizes", Array::Counts(&sizes)),
+        ];
+        let header = BTreeMap::from([
+            ("format", FORMAT.to_owned()),
+            ("version", VERSION.to_owned()),
+            ("scene", capture.name.clone()),
+            ("frames", capture.train.len().to_string()),
+        ]);
+        write(&run.join(PERSON), &header, arrays.map(|(name, array)| (name.to_owned(), array)).into())
+    }
+
+    /// Reads what [`Person::save`] wrote into the directory `run`, as `config` prepares it.
+    ///
+    /// # Errors
+    /// [`Error::Io`], [`Error::Body`] and [`Error::File`] for files that are missing or damaged.
+    pub fn load(run: &Path, config: &Config) -> Result<Self, Error> {
+        let path = run.join(PERSON);
+        if !path.is_file() {
+            let what = "is missing; `train --resume` writes it, if the capture is still there".to_owned();
+            return Err(Error::File { path, what });
+        }
+        let model = BodyModel::load(&run.join(BODY))?;
+        let bytes = read(&path)?;
+        let contents = Contents::parse(&path, &bytes, FORMAT, &[VERSION])?;
+        let count = contents.require("frames")?;
+        // As many as there can be bytes for.
+        let frames: usize = count.parse().ok().filter(|n| (1..=bytes.len()).contains(n)).ok_or_else(|| {
+            contents.wrong(format!("header `frames` is {count:?}, expected a number of frames that fits the file"))
+        })?;
+        let (joints, betas, vertices) = (model.num_joints(), model.num_betas(), model.num_vertices());
+        let body = Arc::new(Body::new(&model, &contents.floats("mean_betas", betas)?, config)?);
+        let cameras = contents.floats("cameras", frames * CAMERA)?;
+        let sizes = contents.counts("sizes", frames * 2)?;
+        let poses = triples(&contents.floats("poses", frames * joints * 3)?);
+        let shapes = contents.floats("betas", frames * betas)?;
+        let placements = contents.floats("placements", frames * PLACEMENT)?;
+        let view = |frame: usize| {
+            let camera = camera(&cameras[frame * CAMERA..][..CAMERA], &sizes[2 * frame..][..2])
+                .ok_or_else(|| contents.wrong(format!("`cameras` {frame} is no pinhole camera")))?;
+            let placement = &placements[frame * PLACEMENT..][..PLACEMENT];
+            let (rotation, translation) = (Vec3::from_slice(&placement[1..]), Vec3::from_slice(&placement[4..]));
+            let placement = match placement[0] {
+                0.0 => Placement::Pelvis { translation },
+                _ => Placement::Origin { rotation, translation },
+            };
+            let (pose, betas) = (&poses[frame * joints..][..joints], &shapes[frame * betas..][..betas]);
+            Ok(Arc::new(body.view(&camera, frame, Moment { betas, pose, placement })))
+        };
+        let frames = (0..frames).map(view).collect::<Result<Vec<_>, Error>>()?;
+        let colors = triples(&contents.floats("colors", vertices * 3)?);
+        let seen = contents.bytes("seen", vertices)?.iter().map(|&seen| seen != 0).collect();
+        let scene = contents.require("scene")?.to_owned();
+        Ok(Self { scene, body, frames, colors: VertexColors { colors, seen } })
+    }
+}
+
+impl Model {
+    /// Reads the model of the run directory `run`, without what only training needs: neither the
+    /// capture nor the moments of the optimiser.
+    ///
+    /// # Errors
+    /// [`Error::Io`], [`Error::Body`] and [`Error::File`] for files that are missing or damaged.
+    pub fn load(run: &Path) -> Result<Self, Error> {
+        let path = run.join(CHECKPOINT);
+        let bytes = read(&path)?;
+        let contents = parse(&path, &bytes)?;
+        let config = config_of(&contents)?;
+        let Person { body, frames, colors, .. } = Person::load(run, &config)?;
+        let base = if config.field.prior_colors { colors.before_sigmoid() } else { Vec::new() };
+        let mut model = Self::new(config, body, frames, base)?;
+        model.restore(&contents)?;
+        Ok(model)
+    }
+}
+
+fn padded(values: &[f32], len: usize) -> Vec<f32> {
+    (0..len).map(|i| values.get(i).copied().unwrap_or_default()).collect()
+}
+
+fn triples(values: &[f32]) -> Vec<Vec3> {
+    values.chunks_exact(3).map(Vec3::from_slice).collect()
+}
+
+/// A camera from its numbers, `None` where they are none of a camera.
+fn camera(numbers: &[f32], size: &[u64]) -> Option<Camera> {
+    let mut columns = [0.0; 12];
+    columns.copy_from_slice(&numbers[4..]);
+    let side = |side: u64| u32::try_from(side).ok().filter(|side| (1..=1 << 14).contains(side));
+    let (focal, centre) = (Vec2::from_slice(numbers), Vec2::from_slice(&numbers[2..]));
+    let world_to_camera = Affine3A::from_cols_array(&columns);
+    let usual = focal.min_element() > 0.0 && world_to_camera.matrix3.determinant() != 0.0;
+    Some(Camera { focal, centre, world_to_camera, width: side(size[0])?, height: side(size[1])? }).filter(|_| usual)
+}

@@ -1,0 +1,301 @@
+//! Tracing: where a ray can meet the subject, and what the surface says of each point there.
+
+use glam::{Vec3, Vec4};
+use smpl::{MotionField, MotionFrame, Posed};
+use surface_query::MeshDistance;
+use volrender::{Composite, Occupancy, OccupancyConfig, Ray};
+
+use crate::Error;
+use crate::config::Config;
+use crate::model::body::Body;
+use crate::model::distance::{SurfacePoint, needs_neighbours, surface_point};
+use crate::model::extent::Extent;
+use crate::model::samples::Samples;
+use crate::random::Stream;
+
+/// Side of a cell of the occupancy for the rays of a step, of which too few pass through one for a
+/// finer grid to pay, normalised metres.
+pub(crate) const CELL: f32 = 0.02;
+/// The same for those of a picture, a tenth of whose time it saves.
+pub(crate) const FINE_CELL: f32 = 0.01;
+
+/// A posed prior ready to be sampled; refitted in place for each frame.
+pub(crate) struct PosedSurface {
+    mesh: MeshDistance,
+    pub occupancy: Occupancy,
+    cell: f32,
+}
+
+impl PosedSurface {
+    /// The canonical body, with an occupancy of cells of side `cell`, normalised metres.
+    pub fn new(body: &Body, cell: f32) -> Result<Self, Error> {
+        let mesh = MeshDistance::new(&body.canonical.vertices, &body.model.faces)?;
+        Ok(Self { mesh, occupancy: Occupancy::default(), cell })
+    }
+
+    /// Moves it to another pose, out to `extent`.
+    pub fn refit(&mut self, body: &Body, posed: &Posed, extent: &Extent, config: &Config) {
+        let Self { mesh, occupancy, cell } = self;
+        let size = OccupancyConfig { margin: config.motion.reach(), depth: config.motion.depth, cell: *cell };
+        rayon::join(
+            || mesh.refit(&posed.vertices),
+            || occupancy.rebuild(&posed.vertices, &body.model.faces, &extent.faces, size),
+        );
+    }
+}
+
+/// Cells near the canonical prior, which are marked once and for all.
+pub(crate) fn near_canonical(body: &Body, config: &Config) -> Occupancy {
+    let (mut occupancy, whole) = (Occupancy::default(), Extent::whole(body, config));
+    let size = OccupancyConfig { margin: whole.farthest, depth: config.motion.depth, cell: FINE_CELL };
+    occupancy.rebuild(&body.canonical.vertices, &body.model.faces, &whole.faces, size);
+    occupancy
+}
+
+/// Everything that tracing a ray reads.
+#[derive(Clone, Copy)]
+pub(crate) struct Tracer<'a> {
+    pub body: &'a Body,
+    pub config: &'a Config,
+    pub surface: &'a PosedSurface,
+    pub motion: &'a MotionField,
+    pub frame: &'a MotionFrame<'a>,
+    /// Where the canonical prior is near; read for volumes, of which it is not known from the point
+    /// in space.
+    pub near_canonical: &'a Occupancy,
+    pub extent: &'a Extent,
+    /// What colours start from at each vertex, see [`Samples::base`]; may be empty.
+    pub base: &'a [Vec4],
+    /// Whether neighbours are wanted at all.
+    pub neighbours: bool,
+    /// Whether [`Samples::faces`] are wanted; the surface motion alone has them.
+    pub faces: bool,
+}
+
+/// A ray on its way through the scene, front to back.
+#[derive(Clone, Debug)]
+pub(crate) struct March {
+    ray: Ray,
+    /// The first bin that is not traced yet.
+    bin: usize,
+    /// The face that was closest to the last sample bounds the search for the next.
+    known: Option<u32>,
+    /// Places each sample in its bin, the middle without.
+    jitter: Option<Stream>,
+    /// Whether samples outside the prior are dead.
+    inside: bool,
+    /// Whether all bins are traced.
+    ended: bool,
+    /// Colour, over black, and transmittance of what was traced and evaluated.
+    pub color: Vec3,
+    pub transmittance: f32,
+}
+
+impl March {
+    /// A ray of which nothing is traced yet; `jitter` places each sample in its bin, the middle
+    /// without.
+    pub fn new(ray: Ray, jitter: Option<Stream>) -> Self {
+        let (color, transmittance) = (Vec3::ZERO, 1.0);
+        Self { ray, bin: 0, known: None, jitter, inside: false, ended: false, color, transmittance }
+    }
+
+    /// With samples inside the prior alone, d < 0, if `inside`.
+    pub fn only_inside(self, inside: bool) -> Self {
+        Self { inside, ..self }
+    }
+
+    /// Whether there are bins left that can be seen through what is before them.
+    pub fn goes_on(&self, min_transmittance: f32) -> bool {
+        !self.ended && self.transmittance > min_transmittance
+    }
+
+    /// Takes in the samples that were traced last, composited over black.
+    pub fn pass(&mut self, composite: &Composite) {
+        self.color += self.transmittance * composite.color;
+        self.transmittance *= (1.0 - composite.opacity).max(0.0);
+    }
+}
+
+/// The closest point of the posed prior.
+type Nearest = smpl::SurfacePoint;
+
+impl Tracer<'_> {
+    /// Appends the next live samples of a ray to `samples`, at most `most`, and takes the march to
+    /// where they end.
+    pub fn trace(&self, samples: &mut Samples, most: usize, march: &mut March) {
+        let ray = march.ray;
+        let bins = self.config.samples;
+        let first = samples.len();
+        let span = self.surface.occupancy.region().and_then(|region| region.intersect(&ray));
+        if let Some((near, far)) = span.filter(|(near, far)| far > near) {
+            let width = (far - near) / bins as f32;
+            while march.bin < bins && samples.len() - first < most {
+                let bin = march.bin;
+                march.bin += 1;
+                let place = march.jitter.as_mut().map_or(0.5, Stream::uniform);
+                let t = near + (bin as f32 + place) * width;
+                let point = ray.origin + t * ray.direction;
+                if !self.surface.occupancy.is_live(point) {
+                    continue;
+                }
+                let live;
+                (live, march.known) = self.push(samples, point, march.known, march.inside);
+                if live {
+                    samples.t.push(t);
+                    samples.delta.push(width);
+                    samples.world.push(point);
+                }
+            }
+            march.ended = march.bin == bins;
+        } else {
+            march.ended = true;
+        }
+        samples.starts.push(samples.t.len());
+    }
+
+    /// The closest point of the posed prior, as far as anything there can live; `near` is a face
+    /// that is probably close.
+    fn nearest(&self, point: Vec3, near: Option<u32>) -> Option<Nearest> {
+        let mesh = &self.surface.mesh;
+        // Rounding may put the face itself a hair beyond its own distance.
+        let bound = near.map_or(f32::INFINITY, |face| 1.000_01 * mesh.distance_to_face(point, face) + 1e-6);
+        let farthest = self.extent.farthest.max(self.config.motion.depth);
+        let found = mesh.closest(point, farthest.min(bound))?;
+        let (face, barycentric, signed_distance) = (found.face, found.barycentric, found.signed_distance);
+        Some(Nearest { face, barycentric, signed_distance })
+    }
+
+    /// Maps a point, looks up its surface and appends it; false, with nothing appended, if it is
+    /// dead. `near` is a posed face that is probably close; returns the closest one where it was
+    /// looked up. `inside`: only d < 0 lives.
+    fn push(&self, samples: &mut Samples, point: Vec3, near: Option<u32>, inside: bool) -> (bool, Option<u32>) {
+        let (reach, depth) = (self.config.motion.reach(), self.config.motion.depth);
+        let mut nearest = None;
+        if let MotionField::Surface(_) = self.motion {
+            let Some(found) = self.nearest(point, near) else { return (false, None) };
+            if found.signed_distance > self.extent.faces[found.face as usize] || found.signed_distance < -depth {
+                return (false, Some(found.face));
+            }
+            nearest = Some(found);
+        }
+        let looked_up = nearest.map(|found| found.face);
+        let Some(mapped) = self.motion.map(self.frame, point, || nearest) else { return (false, looked_up) };
+        if nearest.is_none() && !self.near_canonical.is_live(mapped.canonical) {
+            return (false, None);
+        }
+        let corner = |v: u32| self.body.canonical.vertices[v as usize];
+        let exact = !needs_neighbours(self.config.surface.distance);
+        // The closest point keeps its face and barycentrics in the canonical pose.
+        let mut at = nearest.filter(|_| exact).map(|found| {
+            let weighted = self.body.model.faces[found.face as usize].into_iter().zip(found.barycentric);
+            let closest = weighted.map(|(v, b)| b * corner(v)).sum();
+            SurfacePoint { closest, distance: found.signed_distance }
+        });
+        let look = |neighbours: &[u32]| {
+            surface_point(self.body, &self.config.surface, mapped.canonical, neighbours, reach.max(depth))
+        };
+        if exact && at.is_none() {
+            at = look(&[]);
+            if at.is_none() {
+                return (false, looked_up);
+            }
+        }
+        let first = samples.neighbours.len();
+        if self.neighbours {
+            samples.neighbours.resize(first + self.body.query.neighbours_per_query(), 0);
+            self.body.query.neighbours(mapped.canonical, &mut samples.neighbours[first..]);
+        }
+        let within =
+            |at: &SurfacePoint| at.distance <= reach && at.distance >= -depth && !(inside && at.distance >= 0.0);
+        let at = at.or_else(|| look(&samples.neighbours[first..])).filter(within);
+        let Some(at) = at.filter(|_| mapped.likelihood > 0.0) else {
+            samples.neighbours.truncate(first);
+            return (false, looked_up);
+        };
+        samples.likelihood.push(mapped.likelihood);
+        samples.canonical.push(mapped.canonical);
+        samples.closest.push(at.closest);
+        samples.distance.push(at.distance);
+        if let Some(found) = nearest {
+            if !self.base.is_empty() {
+                let corners = self.body.model.faces[found.face as usize].into_iter();
+                let weighted = corners.zip(found.barycentric).map(|(v, b)| b * self.base[v as usize]);
+                samples.base.push(weighted.sum());
+            }
+            if self.faces {
+                samples.faces.push((found.face, found.barycentric));
+            }
+        }
+        (true, looked_up)
+    }
+
+    /// Appends all live samples of a ray, in the middle of their bins.
+    #[cfg(test)]
+    pub fn trace_all(&self, samples: &mut Samples, ray: &Ray) {
+        self.trace(samples, usize::MAX, &mut March::new(*ray, None));
+    }
+
+    /// Appends one point of space, if it lives.
+    #[cfg(test)]
+    pub fn push_point(&self, samples: &mut Samples, point: Vec3) -> bool {
+        let live = self.push(samples, point, None, false).0;
+        if live {
+            samples.world.push(point);
+        }
+        live
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::capture::{DemoConfig, demo};
+    use crate::config::{DistanceKind, Method, Preset};
+    use crate::model::view::PosedView;
+    use crate::scene::prepared::Scene;
+    use crate::train::trainer::Trainer;
+
+    #[test]
+    fn with_a_volume_a_sample_lives_where_the_canonical_prior_is_near() {
+        let body = smpl::BodyModel::embedded();
+        let capture = demo(&DemoConfig { size: 32, frames: 2, eval_cameras: 1, ..Default::default() }, &body).unwrap();
+        for distance in [DistanceKind::Blended, DistanceKind::Exact] {
+            let mut config = Config::preset(Preset::Paper, Method::Occnerf);
+            (config.surface.distance, config.encoding.log2_table_size) = (distance, 8);
+            let scene = Scene::new(&capture, &body, &config).unwrap();
+            let trainer = Trainer::new(&scene, config.clone()).unwrap();
+            let frame: &PosedView = &scene.train[1].view;
+            let motion = MotionFrame::new(&body, &frame.posed);
+            let tracer = trainer.model().tracer(&trainer.buffers.surface, &trainer.model().extent, &motion);
+            let MotionField::Volume { weights, threshold } = tracer.motion else { panic!("a volume was asked for") };
+            let (reach, k) = (config.motion.reach(), config.surface.k);
+            let low = frame.posed.vertices.iter().copied().reduce(Vec3::min).unwrap() - 2.0 * reach;
+            let size = frame.posed.vertices.iter().copied().reduce(Vec3::max).unwrap() + 2.0 * reach - low;
+            let mut random = Stream::new(&[5]);
+            let (mut counts, mut samples) = ([0; 3], Samples::default());
+            for _ in 0..20_000 {
+                let point = low + size * Vec3::new(random.uniform(), random.uniform(), random.uniform());
+                let Some(mapped) = weights.map(&motion.to_canonical, point, *threshold) else {
+                    assert!(!tracer.push_point(&mut samples, point));
+                    continue;
+                };
+                let exact = scene.body.surface.closest(mapped.canonical, f32::INFINITY).unwrap().signed_distance;
+                let mut neighbours = vec![0; scene.body.query.neighbours_per_query()];
+                scene.body.query.neighbours(mapped.canonical, &mut neighbours);
+                let blended = scene.body.query.blend(mapped.canonical, &neighbours[..k]).signed_distance;
+                let used = if distance == DistanceKind::Exact { exact } else { blended };
+                let within = |d: f32| d <= reach && d >= -config.motion.depth;
+                let live = tracer.push_point(&mut samples, point);
+                // A little beyond the margin, as far as a cell or the corner of a box, either is right; nobody is as deep as `depth`.
+                if within(exact) {
+                    assert_eq!(live, within(used), "{point}: {exact}, {used}");
+                    counts[usize::from(live)] += 1;
+                } else if exact > 2.0 * reach {
+                    assert!(!live, "{point}: {exact}, {used}");
+                    counts[2] += 1;
+                }
+            }
+            assert!(counts[1] > 500 && counts[2] > 100, "{counts:?}");
+        }
+    }
+}

@@ -1,0 +1,247 @@
+//! A trained person, or one in training: what it is, and all that drawing it reads.
+
+use std::borrow::Cow;
+use std::sync::Arc;
+
+use glam::{Vec3, Vec4};
+use smpl::{MotionField, MotionFrame, Posed, SurfaceMotion, WeightVolume};
+use visibility::VisibilityCounts;
+use volrender::Occupancy;
+
+use crate::Error;
+use crate::config::{Config, MotionKind};
+use crate::model::arena::Arena;
+use crate::model::body::Body;
+use crate::model::correction::{Corrections, corrected};
+use crate::model::distance::needs_neighbours;
+use crate::model::extent::Extent;
+use crate::model::field::{Field, Learnt, SampleBatch};
+use crate::model::parameters::{Lengths, PARTS, Parameters, Part};
+use crate::model::trace::{PosedSurface, Tracer, near_canonical};
+use crate::model::vertices::VertexCode;
+use crate::model::view::PosedView;
+
+/// Σ w below which the weight volume says nothing.
+const VOLUME_THRESHOLD: f32 = 1e-3;
+
+/// The field of one person on its body, with the moments that it was learnt from.
+#[derive(Clone)]
+pub struct Model {
+    pub(crate) config: Config,
+    pub(crate) body: Arc<Body>,
+    /// The training frames' poses, not corrected, and cameras.
+    pub(crate) frames: Vec<Arc<PosedView>>,
+    pub(crate) field: Field,
+    pub(crate) parameters: Parameters,
+    pub(crate) counts: VisibilityCounts,
+    pub(crate) motion: MotionField,
+    /// Where the canonical prior is near; empty for the surface motion.
+    near_canonical: Occupancy,
+    pub(crate) corrections: Corrections,
+    /// Where the field ended when it was last looked at.
+    pub(crate) extent: Extent,
+    /// What colours start from, V; empty where they start from nothing.
+    pub(crate) base: Vec<Vec4>,
+    pub(crate) steps_done: u64,
+}
+
+impl Model {
+    /// A model at step 0; `base` is what colours start from at each vertex (V), or empty.
+    pub(crate) fn new(
+        config: Config,
+        body: Arc<Body>,
+        frames: Vec<Arc<PosedView>>,
+        base: Vec<Vec4>,
+    ) -> Result<Self, Error> {
+        config.validate()?;
+        let (levels, lists) = (body.query.pyramid().levels.len(), body.query.neighbours_per_query());
+        let (wanted, k) = (config.surface.coarse_levels + 1, config.surface.k);
+        if levels != wanted || lists != levels * k {
+            let k_of_body = lists / levels.max(1);
+            let found = format!("was prepared for {k_of_body} neighbours in each of {levels} levels");
+            return Err(Error::Scene(format!("{found}, the configuration asks for {k} in each of {wanted}")));
+        }
+        let field = Field::new(&config, body.canonical_box)?;
+        let volume = |weights: WeightVolume| MotionField::Volume { weights, threshold: VOLUME_THRESHOLD };
+        let (prior, shaped) = (&body.model, &body.canonical);
+        let motion = match config.motion.kind {
+            MotionKind::Surface => {
+                let (margin, falloff) = (config.motion.margin, config.motion.falloff);
+                MotionField::Surface(SurfaceMotion { margin, falloff })
+            }
+            MotionKind::Volume => volume(WeightVolume::diffused(prior, shaped, &Default::default())),
+            MotionKind::Gaussian => volume(WeightVolume::gaussian(prior, shaped, &Default::default())),
+        };
+        let corrections = Corrections::new(frames.len(), config.motion.correction_spacing, prior.num_joints());
+        let (near_canonical, log_weights) = match &motion {
+            MotionField::Surface(_) => (Occupancy::default(), 0),
+            MotionField::Volume { weights, .. } => (near_canonical(&body, &config), weights.delta.len()),
+        };
+        let vertices = body.canonical.vertices.len();
+        let lengths = Lengths { vertices, motion: log_weights, pose: corrections.len() };
+        Ok(Self {
+            parameters: Parameters::new(&config, &field, lengths),
+            counts: VisibilityCounts::new(vertices),
+            extent: Extent::whole(&body, &config),
+            config,
+            body,
+            frames,
+            field,
+            motion,
+            near_canonical,
+            corrections,
+            base,
+            steps_done: 0,
+        })
+    }
+
+    /// The configuration that it is trained with.
+    pub fn config(&self) -> &Config {
+        &self.config
+    }
+
+    /// The shaped body.
+    pub fn body(&self) -> &Arc<Body> {
+        &self.body
+    }
+
+    /// The training frames' poses as handed in (see [`Model::corrected`]) and cameras.
+    pub fn frames(&self) -> &[Arc<PosedView>] {
+        &self.frames
+    }
+
+    /// Steps taken so far.
+    pub fn steps_done(&self) -> u64 {
+        self.steps_done
+    }
+
+    /// Learnable numbers, padding not counted.
+    pub fn num_parameters(&self) -> usize {
+        PARTS[1..].iter().map(|&(part, _)| self.parameters.count(part)).sum::<usize>()
+            + self.field.mlp.num_true_parameters()
+    }
+
+    /// How often each vertex was near a termination point, or in how many frames it is seen: see
+    /// [`VisibilityKind`](crate::VisibilityKind).
+    pub fn visibility_counts(&self) -> &[u64] {
+        self.counts.counts()
+    }
+
+    /// The parameters as before the first step.
+    pub(crate) fn forget(&mut self) {
+        let length = |part| self.parameters.get(part).len();
+        let (motion, pose) = (length(Part::Motion), length(Part::Pose));
+        let lengths = Lengths { vertices: self.body.canonical.vertices.len(), motion, pose };
+        self.parameters = Parameters::new(&self.config, &self.field, lengths);
+        self.extent = Extent::whole(&self.body, &self.config);
+    }
+
+    /// Encodes the vertices with the current parameters; nothing without a surface term.
+    pub(crate) fn encode_vertices(&self, code: &mut VertexCode) {
+        if self.field.surface_term {
+            let (table, offsets) = (self.parameters.get(Part::Table), self.parameters.get(Part::Vertices));
+            code.encode(&self.body, &self.config.surface, &self.field.encoder, table, offsets);
+        }
+    }
+
+    /// Takes the volume's log-weights from the parameters.
+    pub(crate) fn refresh_volume(&mut self) {
+        if let MotionField::Volume { weights, .. } = &mut self.motion {
+            weights.delta.copy_from_slice(self.parameters.get(Part::Motion));
+            weights.update();
+        }
+    }
+
+    /// The weight volume, if that is the kind of motion.
+    pub(crate) fn volume(&self) -> Option<&WeightVolume> {
+        match &self.motion {
+            MotionField::Volume { weights, .. } => Some(weights),
+            MotionField::Surface(_) => None,
+        }
+    }
+
+    /// Shift and turns that training has found for the moment of a view.
+    pub(crate) fn correction(&self, view: &PosedView) -> Option<Vec<Vec3>> {
+        let pose = self.parameters.get(Part::Pose);
+        view.instant.filter(|_| !pose.is_empty()).map(|instant| self.corrections.at(pose, instant))
+    }
+
+    /// The posed prior of a view as training has corrected it; as handed in where nothing is
+    /// corrected.
+    pub fn corrected<'b>(&self, view: &'b PosedView) -> Cow<'b, Posed> {
+        match self.correction(view) {
+            Some(correction) => Cow::Owned(corrected(&self.body.model, &view.shape, &view.posed, &correction)),
+            None => Cow::Borrowed(&view.posed),
+        }
+    }
+
+    /// Whether samples are to have their neighbours.
+    fn needs_neighbours(&self) -> bool {
+        self.field.surface_term || needs_neighbours(self.config.surface.distance)
+    }
+
+    /// What traces rays at the body that `surface` and `frame` are posed as.
+    pub(crate) fn tracer<'b>(
+        &'b self,
+        surface: &'b PosedSurface,
+        extent: &'b Extent,
+        frame: &'b MotionFrame<'b>,
+    ) -> Tracer<'b> {
+        Tracer {
+            body: &self.body,
+            config: &self.config,
+            surface,
+            motion: &self.motion,
+            frame,
+            near_canonical: &self.near_canonical,
+            extent,
+            base: &self.base,
+            neighbours: self.needs_neighbours(),
+            faces: !self.parameters.get(Part::Pose).is_empty(),
+        }
+    }
+
+    /// What the field has learnt, with the vertices as [`Model::encode_vertices`] encodes them.
+    pub(crate) fn learnt<'b>(&'b self, code: &'b VertexCode) -> Learnt<'b> {
+        Learnt {
+            perceptron: self.parameters.get(Part::Field),
+            table: self.parameters.get(Part::Table),
+            vertices: &code.rows,
+            counts: &self.counts,
+        }
+    }
+
+    /// Gives every sample of a batch its density and colour; see [`Field::forward`].
+    pub(crate) fn evaluate(&self, code: &VertexCode, batch: &mut SampleBatch, jacobians: Option<&mut Arena>) {
+        self.field.forward(&self.learnt(code), batch, jacobians);
+    }
+
+    /// Looks where the field ends; everything out to the margin where the motion is a volume.
+    pub(crate) fn measure_extent(&self, code: &VertexCode) -> Extent {
+        match self.motion {
+            MotionField::Volume { .. } => Extent::whole(&self.body, &self.config),
+            MotionField::Surface(_) => Extent::measure(&self.body, &self.config, self.needs_neighbours(), |batch| {
+                self.evaluate(code, batch, None);
+            }),
+        }
+    }
+
+    /// The world's upward direction: the mean direction from the pelvis to the head over the
+    /// training frames.
+    pub fn up(&self) -> Vec3 {
+        upright(&self.body, self.frames.iter().map(Arc::as_ref))
+    }
+}
+
+/// The axis of the world that the bodies of `views` stand along, upwards: the mean direction from
+/// the pelvis to the head.
+pub fn upright<'a>(body: &Body, views: impl Iterator<Item = &'a PosedView>) -> Vec3 {
+    let joints = &body.canonical.joints;
+    let head = (0..joints.len()).max_by(|&a, &b| joints[a].y.total_cmp(&joints[b].y)).unwrap_or(0);
+    let upward = |view: &PosedView| (view.posed.joints[head] - view.posed.joints[0]).normalize_or_zero();
+    let sum: Vec3 = views.map(upward).sum();
+    // Leaning averages out in the plane; the world's axes are upright in every known layout.
+    let axes = [Vec3::X, Vec3::Y, Vec3::Z].into_iter();
+    let axis = axes.max_by(|a, b| sum.dot(*a).abs().total_cmp(&sum.dot(*b).abs()));
+    axis.map_or(Vec3::Y, |a| a * sum.dot(a).signum())
+}

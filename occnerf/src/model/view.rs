@@ -1,0 +1,69 @@
+//! A posed body before a camera: all that a picture of a model needs to know of its moment.
+
+use std::sync::Arc;
+
+use glam::Vec3;
+use smpl::{Posed, Shaped};
+use volrender::{Aabb, Camera, Ray};
+
+/// A pose and a camera, lengths normalised.
+#[derive(Clone, Debug)]
+pub struct PosedView {
+    /// The camera.
+    pub camera: Camera,
+    /// Index of the training frame of the same instant, whose learnt pose correction holds for
+    /// this view too; `None` for poses that no training frame has.
+    pub instant: Option<usize>,
+    /// The posed prior as handed in.
+    pub posed: Posed,
+    /// Its body at rest; empty where `instant` is `None`.
+    pub shape: Arc<Shaped>,
+}
+
+impl PosedView {
+    /// A pose that no training frame has, before `camera`.
+    pub fn new(camera: &Camera, posed: Posed) -> Self {
+        let shape = Arc::new(Shaped { vertices: Vec::new(), joints: Vec::new() });
+        Self { camera: *camera, instant: None, posed, shape }
+    }
+
+    /// The same moment before another camera.
+    #[must_use]
+    pub fn seen_by(&self, camera: &Camera) -> Self {
+        Self { camera: *camera, ..self.clone() }
+    }
+
+    /// The ray through the centre of the pixel with a row-major index.
+    pub fn pixel_ray(&self, pixel: u32) -> Ray {
+        let width = self.camera.width;
+        self.camera.ray((pixel % width) as f32 + 0.5, (pixel / width) as f32 + 0.5)
+    }
+
+    /// The mean of the posed vertices.
+    pub fn centre(&self) -> Vec3 {
+        self.posed.vertices.iter().sum::<Vec3>() / self.posed.vertices.len().max(1) as f32
+    }
+
+    /// The image-space box [x0, y0, x1, y1) of the body's corners, at least one pixel, inside the
+    /// image.
+    pub(crate) fn body_box(&self) -> [u32; 4] {
+        let Aabb { min: low, max: high } = Aabb::from_points(&self.posed.vertices);
+        let (width, height) = (self.camera.width as f32, self.camera.height as f32);
+        let mut found = [width, height, 0.0f32, 0.0f32];
+        for corner in 0..8 {
+            let pick = |axis: usize| if corner >> axis & 1 == 0 { low[axis] } else { high[axis] };
+            match self.camera.project(Vec3::new(pick(0), pick(1), pick(2))) {
+                Some(p) => {
+                    found = [found[0].min(p.x), found[1].min(p.y), found[2].max(p.x), found[3].max(p.y)];
+                }
+                // A corner behind the camera: the box may reach anywhere.
+                None => found = [0.0, 0.0, width, height],
+            }
+        }
+        let x0 = found[0].clamp(0.0, width - 1.0).floor();
+        let y0 = found[1].clamp(0.0, height - 1.0).floor();
+        let x1 = found[2].clamp(x0 + 1.0, width).ceil();
+        let y1 = found[3].clamp(y0 + 1.0, height).ceil();
+        [x0 as u32, y0 as u32, x1 as u32, y1 as u32]
+    }
+}

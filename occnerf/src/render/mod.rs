@@ -1,0 +1,5 @@
+//! Pictures of a trained person, or of the prior.
+
+pub(crate) mod field;
+pub(crate) mod picture;
+pub(crate) mod prior;

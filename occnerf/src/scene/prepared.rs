@@ -1,0 +1,156 @@
+//! A capture made ready for training: posed bodies and pixel labels.
+
+use std::sync::Arc;
+
+use rayon::prelude::*;
+use smpl::BodyModel;
+use visibility::{RayMesh, View};
+use volrender::{Aabb, Camera};
+
+use crate::Error;
+use crate::capture::{Capture, Frame, PixelSource, Pixels};
+use crate::config::Config;
+use crate::model::body::{Body, Moment};
+use crate::model::view::PosedView;
+use crate::scene::labels::{Label, Labels, label_pixels};
+
+/// A frame with its posed prior.
+pub struct PreparedFrame {
+    /// As in the capture.
+    pub name: String,
+    /// As in the capture; evaluation cameras only.
+    pub camera_name: String,
+    /// Pose and camera, lengths normalised.
+    pub view: Arc<PosedView>,
+    /// Picture and mask, as in the capture; `None` where nothing was photographed.
+    pub source: Option<PixelSource>,
+    /// H × W; only training frames are labelled.
+    pub labels: Labels,
+}
+
+impl PreparedFrame {
+    /// What was photographed.
+    ///
+    /// # Errors
+    /// [`Error::Data`] for files that cannot be read; [`Error::Scene`] where nothing was photographed.
+    pub fn pixels(&self) -> Result<Arc<Pixels>, Error> {
+        let source = self.source.as_ref().ok_or_else(|| Error::Scene("a view without a picture".to_owned()))?;
+        Ok(source.pixels()?)
+    }
+}
+
+/// Everything that training and scoring read and never change.
+pub struct Scene {
+    /// Of the capture.
+    pub name: String,
+    /// The shaped body.
+    pub body: Arc<Body>,
+    /// Training frames.
+    pub train: Vec<PreparedFrame>,
+    /// Evaluation frames, never seen in training.
+    pub eval: Vec<PreparedFrame>,
+}
+
+impl Scene {
+    /// Prepares a capture with its prior.
+    ///
+    /// # Errors
+    /// A configuration that is not valid; [`Error::Scene`] for a capture that cannot be trained on;
+    /// pictures that cannot be read.
+    pub fn new(capture: &Capture, model: &BodyModel, config: &Config) -> Result<Self, Error> {
+        config.validate()?;
+        if let Some(lost) = capture.eval.iter().find(|e| e.train_index >= capture.train.len()) {
+            let (name, at, frames) = (&lost.frame.name, lost.train_index, capture.train.len());
+            return Err(Error::Scene(format!("view {name} is of training frame {at}, expected one of {frames}")));
+        }
+        let body = Arc::new(Body::new(model, &capture.mean_betas, config)?);
+        let train: Result<Vec<_>, Error> = (capture.train.par_iter().enumerate())
+            .map(|(i, frame)| prepare(&body, frame, i, "", Some(config)))
+            .collect();
+        let eval: Result<Vec<_>, Error> =
+            capture.eval.par_iter().map(|e| prepare(&body, &e.frame, e.train_index, &e.camera_name, None)).collect();
+        let scene = Self { name: capture.name.clone(), train: train?, eval: eval?, body };
+        if scene.train.iter().all(|f| f.labels.num_subject() == 0) {
+            return Err(Error::Scene(format!("{}: no training mask shows the subject", scene.name)));
+        }
+        Ok(scene)
+    }
+
+    /// How many training frames show each vertex of the prior to the camera at a pixel of the subject, by ray casting.
+    pub fn vertex_frequencies(&self) -> Result<Vec<u64>, Error> {
+        let seen: Result<Vec<Vec<bool>>, Error> = self
+            .train
+            .par_iter()
+            .map(|frame| {
+                let mesh = RayMesh::new(&frame.view.posed.vertices, &self.body.model.faces)?;
+                let usable: Vec<bool> = frame.labels.iter().map(|label| label == Label::Subject).collect();
+                Ok(visibility::visible_vertices(
+                    &mesh,
+                    &frame.view.posed.vertices,
+                    &pinhole(&frame.view.camera),
+                    Some(&usable),
+                ))
+            })
+            .collect();
+        let mut counts = vec![0; self.body.canonical.vertices.len()];
+        for frame in seen? {
+            counts.iter_mut().zip(frame).for_each(|(count, seen)| *count += u64::from(seen));
+        }
+        Ok(counts)
+    }
+}
+
+/// Poses the prior for `frame`, and labels its pixels if it is for training with `config`.
+fn prepare(
+    body: &Body,
+    frame: &Frame,
+    instant: usize,
+    camera_name: &str,
+    config: Option<&Config>,
+) -> Result<PreparedFrame, Error> {
+    let moment = Moment { betas: &frame.betas, pose: &frame.pose, placement: frame.placement };
+    let view = body.view(&frame.camera, instant, moment);
+    let mut labels = Labels::default();
+    if let Some(config) = config {
+        let camera = &view.camera;
+        let silhouette = silhouette(body, &view)?;
+        let depth = camera.world_to_camera.transform_point3(view.centre()).z.max(1e-3);
+        let pixels = frame.pixels()?;
+        labels = Labels::new(&label_pixels(
+            config.occluded,
+            &pixels.mask,
+            &silhouette,
+            pixels.occluder.as_deref(),
+            camera.width as usize,
+            camera.focal.x / depth,
+        ));
+    }
+    Ok(PreparedFrame {
+        name: frame.name.clone(),
+        camera_name: camera_name.to_owned(),
+        view: Arc::new(view),
+        source: Some(frame.source.clone()),
+        labels,
+    })
+}
+
+/// Pixels (H × W) whose ray hits the posed prior.
+fn silhouette(body: &Body, view: &PosedView) -> Result<Vec<bool>, Error> {
+    let mesh = RayMesh::new(&view.posed.vertices, &body.model.faces)?;
+    let region = Aabb::from_points(&view.posed.vertices);
+    let hits = |pixel| {
+        let ray = view.pixel_ray(pixel);
+        region.intersect(&ray).is_some() && mesh.first_hit(ray.origin, ray.direction).is_some()
+    };
+    Ok((0..view.camera.width * view.camera.height).map(hits).collect())
+}
+
+/// The pinhole view that the visibility crate asks for.
+pub(crate) fn pinhole(camera: &Camera) -> View {
+    View {
+        intrinsics: camera.intrinsics(),
+        extrinsics: camera.world_to_camera,
+        width: camera.width,
+        height: camera.height,
+    }
+}

@@ -1,0 +1,199 @@
+//! Backward of the field over a batch of samples.
+
+use glam::Vec3;
+
+use crate::model::field::{Field, Learnt, SampleBatch, sigmoid};
+use crate::model::gemm::LANES;
+use crate::model::surface_term::Mix;
+
+impl Field {
+    /// Backward of [`Field::forward`], with the same parameters, from `d_sigma` and `d_rgb`:
+    /// accumulates into `d_mlp` and `d_vertices` (V × F), overwrites `features` by their gradient,
+    /// and `d_distance`. Samples at the end that have no gradient are passed over.
+    ///
+    /// `transposed` are the perceptron's weights as [`Mlp::transposed_weights`] has them.
+    ///
+    /// [`Mlp::transposed_weights`]: crate::model::perceptron::Mlp::transposed_weights
+    pub fn backward(
+        &self,
+        learnt: &Learnt<'_>,
+        transposed: &[f32],
+        batch: &mut SampleBatch,
+        d_mlp: &mut [f32],
+        d_vertices: &mut [f32],
+    ) {
+        let (n, width) = (batch.samples.len(), self.encoder.num_features());
+        let (row, layout) = (self.mlp.input_width(), self.encoder.layout(n));
+        batch.d_distance.resize(n, 0.0);
+        let reached = |s: &usize| batch.d_sigma[*s] != 0.0 || batch.d_rgb[*s] != Vec3::ZERO;
+        let ends = (0..n).rev().find(reached).map_or(0, |s| s + 1);
+        batch.d_distance[ends..n].fill(0.0);
+        layout.clear(ends..n, &mut batch.features);
+        for (block, range) in self.blocks(ends) {
+            if self.narrow {
+                self.activate(learnt.perceptron, learnt.vertices, range.clone(), batch, block);
+            }
+            batch.d_output.clear();
+            batch.d_output.resize(range.len() * LANES, 0.0);
+            let outputs = batch.blocks[block].outputs();
+            for ((s, raw), d_raw) in range.clone().zip(outputs).zip(batch.d_output.chunks_exact_mut(LANES)) {
+                let distance = batch.samples.distance[s];
+                d_raw[0] = batch.d_sigma[s] * self.density_scale * sigmoid(raw[0] + self.bias(distance));
+                let slopes = distance > 0.0 && distance < self.reach;
+                batch.d_distance[s] = if slopes { d_raw[0] * self.density_bias.1 } else { 0.0 };
+                let (rgb, d_rgb) = (batch.rgb[s], batch.d_rgb[s]);
+                let share = batch.samples.base(s).w;
+                (share * d_rgb * rgb * (Vec3::ONE - rgb)).write_to_slice(&mut d_raw[1..4]);
+            }
+            let (d_output, d_input) = (&mut batch.d_output, &mut batch.d_input);
+            self.mlp.backward(transposed, &batch.blocks[block], range.len(), d_output, d_input, d_mlp);
+            layout.from_rows(d_input, row, range.clone(), &mut batch.features);
+            if self.surface_term {
+                let mix = Mix::new(width, row, range, &batch.samples, &batch.attention);
+                pulp::Arch::new().dispatch(Scatter { mix, d_rows: d_vertices, d_input });
+            }
+        }
+    }
+}
+
+/// Transpose of [`Gather`].
+pub(crate) struct Scatter<'a> {
+    pub mix: Mix<'a>,
+    pub d_rows: &'a mut [f32],
+    pub d_input: &'a [f32],
+}
+
+impl pulp::WithSimd for Scatter<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: pulp::Simd>(self, _: S) {
+        let Mix { width, per_sample, neighbours, attention, row } = self.mix;
+        let each = neighbours.chunks_exact(per_sample).zip(attention.chunks_exact(per_sample));
+        for ((neighbours, attention), d_input) in each.zip(self.d_input.chunks_exact(row)) {
+            let from = &d_input[width..2 * width];
+            for (&v, &a) in neighbours.iter().zip(attention) {
+                let d_row = &mut self.d_rows[v as usize * width..][..width];
+                for (d, &x) in d_row.iter_mut().zip(from) {
+                    *d = a.mul_add(x, *d);
+                }
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::Vec4;
+    use visibility::VisibilityCounts;
+    use volrender::Aabb;
+
+    use super::*;
+    use crate::config::{Config, Method, Preset};
+    use crate::random::Stream;
+
+    fn group(n: usize, vertices: usize, per_sample: usize, random: &mut Stream) -> SampleBatch {
+        let mut group = SampleBatch::default();
+        let s = &mut group.samples;
+        for _ in 0..n {
+            s.t.push(1.0);
+            s.canonical.push(Vec3::new(random.uniform(), random.uniform(), random.uniform()));
+            s.closest.push(Vec3::new(random.uniform(), random.uniform(), random.uniform()));
+            s.distance.push(random.uniform() * 0.06 + 0.005);
+            s.neighbours.extend((0..per_sample).map(|_| random.below(vertices) as u32));
+            s.base.push(Vec4::new(random.normal(), random.normal(), random.normal(), random.uniform()));
+        }
+        group
+    }
+
+    #[test]
+    fn activations_that_are_kept_and_those_worked_out_anew_give_the_same_bits() {
+        let config = Config::preset(Preset::Fast, Method::Occnerf);
+        let mut field = Field::new(&config, Aabb { min: Vec3::splat(-0.1), max: Vec3::splat(1.1) }).unwrap();
+        let (n, vertices) = (3 * crate::model::field::BLOCK - 100, 12);
+        let mut random = Stream::new(&[4]);
+        let mut normal = |n: usize| (0..n).map(|_| random.normal()).collect::<Vec<f32>>();
+        let (mlp, table) = (field.mlp.initial(1), normal(field.encoder.num_parameters()));
+        let features = normal(vertices * field.encoder.num_features());
+        let (d_sigma, d_rgb) = (normal(n), normal(3 * n));
+        let mut transposed = Vec::new();
+        field.mlp.transposed_weights(&mlp, &mut transposed);
+        let [anew, kept] = [true, false].map(|narrow| {
+            field.narrow = narrow;
+            let mut group = group(n, vertices, 20, &mut Stream::new(&[5]));
+            let counts = VisibilityCounts::new(vertices);
+            let learnt = Learnt { perceptron: &mlp, table: &table, vertices: &features, counts: &counts };
+            field.forward(&learnt, &mut group, None);
+            group.d_sigma.clone_from(&d_sigma);
+            group.d_rgb = d_rgb.chunks(3).map(Vec3::from_slice).collect();
+            let (mut d_mlp, mut d_features) = (vec![0.0; mlp.len()], vec![0.0; features.len()]);
+            field.backward(&learnt, &transposed, &mut group, &mut d_mlp, &mut d_features);
+            assert_eq!(group.blocks.len(), if narrow { 1 } else { 3 });
+            (group.features, d_mlp, d_features)
+        });
+        assert!(anew == kept && anew.1.iter().any(|&d| d != 0.0));
+    }
+
+    /// Every parameter group of every method at once, along random directions.
+    #[test]
+    fn gradients_of_weights_table_vertices_and_bias_agree_with_central_differences() {
+        let region = Aabb { min: Vec3::splat(-0.1), max: Vec3::splat(1.1) };
+        for method in [Method::Occnerf, Method::HashPoint, Method::Humannerf] {
+            let mut config = Config::preset(Preset::Fast, method);
+            (config.field.width, config.field.depth) = (20, 2);
+            (config.encoding.levels, config.encoding.n_max, config.encoding.log2_table_size) = (3, 20, 10);
+            let field = Field::new(&config, region).unwrap();
+            let mut random = Stream::new(&[3, method as u64]);
+            let (n, vertices) = (40, 12);
+            let mut group = group(n, vertices, 20, &mut random);
+            let mut counts = VisibilityCounts::new(vertices);
+            counts.add(&[1, 1, 1, 5, 7, 7]);
+            let width = field.encoder.num_features();
+            let mlp = field.mlp.initial(1);
+            let normal = |n: usize, random: &mut Stream| (0..n).map(|_| random.normal()).collect::<Vec<f32>>();
+            let table: Vec<f32> = normal(field.encoder.num_parameters(), &mut random);
+            let features = normal(vertices * width, &mut random);
+            let (c_sigma, c_rgb) = (normal(n, &mut random), normal(3 * n, &mut random));
+            let value = |group: &mut SampleBatch, mlp: &[f32], table: &[f32], features: &[f32]| -> f64 {
+                let learnt = Learnt { perceptron: mlp, table, vertices: features, counts: &counts };
+                field.forward(&learnt, group, None);
+                let sigma = group.sigma.iter().zip(&c_sigma).map(|(s, c)| f64::from(s * c) * 0.04);
+                let rgb = group.rgb.iter().zip(c_rgb.chunks(3)).map(|(s, c)| f64::from(s.dot(Vec3::from_slice(c))));
+                sigma.chain(rgb).sum()
+            };
+            value(&mut group, &mlp, &table, &features);
+            group.d_sigma = c_sigma.iter().map(|c| c * 0.04).collect();
+            group.d_rgb = c_rgb.chunks(3).map(Vec3::from_slice).collect();
+            let (mut transposed, mut d_mlp) = (Vec::new(), vec![0.0; mlp.len()]);
+            field.mlp.transposed_weights(&mlp, &mut transposed);
+            let mut d_features = vec![0.0; features.len()];
+            let learnt = Learnt { perceptron: &mlp, table: &table, vertices: &features, counts: &counts };
+            field.backward(&learnt, &transposed, &mut group, &mut d_mlp, &mut d_features);
+            field.mlp.clear_padding(&mut d_mlp);
+            let mut d_table = vec![0.0; table.len()];
+            field.encoder.encode_backward(std::iter::once((group.at.all(), &group.features[..])), &mut d_table);
+            for direction in 0..6 {
+                let mut random = Stream::new(&[17, direction]);
+                let mut u_mlp = normal(mlp.len(), &mut random);
+                field.mlp.clear_padding(&mut u_mlp);
+                let (u_table, u_features) = (normal(table.len(), &mut random), normal(features.len(), &mut random));
+                let parts: [(&[f32], &[f32]); 3] = [(&d_mlp, &u_mlp), (&d_table, &u_table), (&d_features, &u_features)];
+                for part in 0..3 {
+                    let dot = parts[part].0.iter().zip(parts[part].1).map(|(a, b)| f64::from(a * b)).sum::<f64>();
+                    let mut at = |h: f32| {
+                        let moved = |which: usize, x: &[f32], u: &[f32]| -> Vec<f32> {
+                            x.iter().zip(u).map(|(x, u)| x + if which == part { h * u } else { 0.0 }).collect()
+                        };
+                        let (m, t) = (moved(0, &mlp, &u_mlp), moved(1, &table, &u_table));
+                        value(&mut group, &m, &t, &moved(2, &features, &u_features))
+                    };
+                    let h = 2e-4;
+                    let numeric = (at(h) - at(-h)) / (2.0 * f64::from(h));
+                    // Some ReLU of some sample switches within any step; their share of the derivative is small.
+                    let scale = 0.03 * dot.abs().max(1.0);
+                    assert!((numeric - dot).abs() < scale, "{method:?} part {part}: {numeric} {dot}");
+                }
+            }
+        }
+    }
+}

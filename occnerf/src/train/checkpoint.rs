@@ -1,0 +1,83 @@
+//! Checkpoints: the model with everything that training goes on from, replaced atomically.
+
+use std::path::Path;
+
+use crate::Error;
+use crate::model::file::{read, write};
+use crate::model::parameters::PARTS;
+use crate::model::saved::{config_of, parse};
+use crate::scene::prepared::Scene;
+use crate::train::trainer::Trainer;
+
+/// What is known of restarts, in the header as JSON; files from before there were any have none.
+const RESTARTS: &str = "restarts";
+
+impl<'a> Trainer<'a> {
+    /// Writes everything that training goes on from. An old file survives until the new one is
+    /// complete and on the disk.
+    ///
+    /// # Errors
+    /// [`Error::Diverged`] where a number is not finite, so that what could be gone on from is not
+    /// replaced by what cannot; [`Error::Io`].
+    pub fn save(&self, path: &Path) -> Result<(), Error> {
+        self.check_finite()?;
+        let unwritable = |what: String| Error::File { path: path.to_owned(), what };
+        let mut header = self.model.header(&self.scene.name)?;
+        let restarts = serde_json::to_string(&self.restarts);
+        header.insert(RESTARTS, restarts.map_err(|e| unwritable(format!("{RESTARTS}: {e}")))?);
+        let mut arrays = self.model.arrays();
+        for ((part, name), adam) in PARTS.into_iter().zip(&self.optimiser.moments) {
+            for (order, moment) in [("first", &adam.first), ("second", &adam.second)] {
+                arrays.push((format!("{name}.{order}_moment"), self.model.stored(part, moment)));
+            }
+        }
+        write(path, &header, arrays)
+    }
+
+    fn check_finite(&self) -> Result<(), Error> {
+        for ((part, name), adam) in PARTS.into_iter().zip(&self.optimiser.moments) {
+            let values = self.model.parameters.get(part);
+            for (suffix, array) in [("", values), (".first_moment", &adam.first), (".second_moment", &adam.second)] {
+                if let Some(at) = array.iter().position(|v| !v.is_finite()) {
+                    let (step, key) = (self.model.steps_done, format!("{name}{suffix}"));
+                    return Err(Error::Diverged { step, key, value: array[at] });
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// Goes on from a checkpoint of the same scene and configuration; the number of steps may
+    /// differ.
+    ///
+    /// # Errors
+    /// [`Error::Io`]; [`Error::File`] for a damaged checkpoint, or one of another scene.
+    pub fn resume(scene: &'a Scene, path: &Path) -> Result<Self, Error> {
+        let bytes = read(path)?;
+        let contents = parse(path, &bytes)?;
+        let trained_on = contents.require("scene")?;
+        if trained_on != scene.name {
+            let what = format!("was trained on scene {trained_on:?}, expected {:?}", scene.name);
+            return Err(contents.wrong(what));
+        }
+        let config = config_of(&contents)?;
+        let mut trainer = Self::new(scene, config).map_err(|e| contents.wrong(e.to_string()))?;
+        trainer.model.restore(&contents)?;
+        let steps_done = trainer.model.steps_done;
+        if let Some(text) = contents.header(RESTARTS) {
+            let wrong = |what: String| contents.wrong(format!("header `{RESTARTS}`: {what}"));
+            trainer.restarts = serde_json::from_str(text).map_err(|e| wrong(e.to_string()))?;
+            trainer.restarts.check(steps_done).map_err(wrong)?;
+        }
+        for ((part, name), adam) in PARTS.into_iter().zip(&mut trainer.optimiser.moments) {
+            adam.first = trainer.model.restored(&contents, part, &format!("{name}.first_moment"))?;
+            adam.second = trainer.model.restored(&contents, part, &format!("{name}.second_moment"))?;
+            if let Some(at) = adam.second.iter().position(|&v| v < 0.0) {
+                let what = format!("`{name}.second_moment` is {} at {at}, expected at least 0", adam.second[at]);
+                return Err(contents.wrong(what));
+            }
+            adam.steps = steps_done - trainer.restarts.begun;
+        }
+        Ok(trainer)
+    }
+}

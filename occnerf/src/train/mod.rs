@@ -1,0 +1,16 @@
+//! Training: a model, an optimiser and a batch, stepped from rays to gradients.
+
+pub(crate) mod adam;
+pub(crate) mod backward;
+pub(crate) mod batch;
+pub(crate) mod checkpoint;
+pub(crate) mod loss;
+pub(crate) mod optimiser;
+pub(crate) mod ordered;
+pub(crate) mod photometric;
+#[cfg(test)]
+mod plain;
+pub(crate) mod report;
+pub(crate) mod restarts;
+pub(crate) mod step;
+pub(crate) mod trainer;

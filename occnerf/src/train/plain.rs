@@ -1,0 +1,197 @@
+//! A training step written straight from the definitions, in f64 and sample by sample, to test the fast one against: from where
+//! samples lie to the loss, with the gradients taken by central differences.
+
+use std::ops::Range;
+
+use glam::{DVec3, Vec3};
+use hashgrid::HashGrid;
+use testkit::oracle;
+use visibility::VisibilityCounts;
+
+use crate::config::{Config, Method, MotionKind, Preset};
+use crate::model::encoder::Encoder;
+use crate::model::field::SampleBatch;
+use crate::model::parameters::Part;
+use crate::random::Stream;
+use crate::scene::prepared::Scene;
+use crate::train::batch::target;
+use crate::train::trainer::Trainer;
+
+/// What the plain step reads besides the parameters under test: the samples of a step that was taken.
+struct Plain<'a, 'b> {
+    trainer: &'a Trainer<'b>,
+    counts: &'a VisibilityCounts,
+}
+
+impl Plain<'_, '_> {
+    /// Rows of features at points of the unit cube, or of space.
+    fn encode<const D: usize>(&self, table: &[f32], points: &[[f32; D]]) -> Vec<Vec<f64>> {
+        let encoding = &self.trainer.model.config.encoding;
+        let flat: Vec<f64> = points.iter().flatten().map(|&x| f64::from(x)).collect();
+        let (ranges, resolutions) = match &self.trainer.model.field.encoder {
+            Encoder::Frequency => {
+                let row = |x: &[f64]| {
+                    let bands = (0..10).flat_map(|band| {
+                        let angle = |x: &f64| x * f64::from(1u32 << band);
+                        let sines = x.iter().map(move |x| angle(x).sin());
+                        sines.chain(x.iter().map(move |x| angle(x).cos())).collect::<Vec<f64>>()
+                    });
+                    x.iter().copied().chain(bands).collect()
+                };
+                return flat.chunks(3).map(row).collect();
+            }
+            Encoder::Point(grid) => levels(grid),
+            Encoder::Surface(grid, _) => levels(grid),
+        };
+        let (log2, features) = (encoding.log2_table_size, encoding.features);
+        let mut padded = vec![0.0; (resolutions.len() << log2) * features];
+        for (range, level) in ranges.into_iter().zip(padded.chunks_mut(features << log2)) {
+            level[..range.len()].copy_from_slice(&table[range]);
+        }
+        let rows = oracle::hash_encode(&flat, D, &resolutions, &padded, log2, features);
+        rows.chunks(resolutions.len() * features).map(<[f64]>::to_vec).collect()
+    }
+
+    /// The loss and the colours of the rays, in the order of the batch.
+    fn step(&self, field: &[f32], table: &[f32]) -> (f64, Vec<DVec3>) {
+        let trainer = self.trainer;
+        let (config, batch) = (&trainer.model.config, &trainer.buffers.batch);
+        let frame = &trainer.scene.train[batch.frame];
+        let vertices = self.encode(table, &trainer.buffers.vertex_code.at.surface);
+        let background = batch.background.as_dvec3();
+        let mut colors = vec![DVec3::ZERO; batch.pixels.len()];
+        let mut completeness = 0.0;
+        for state in &trainer.buffers.groups {
+            // All samples are one segment.
+            let Some(SampleBatch { samples, at, .. }) = state.segments.all().first().map(|segment| &segment.batch)
+            else {
+                continue;
+            };
+            let points =
+                if at.surface.is_empty() { self.encode(table, &at.point) } else { self.encode(table, &at.surface) };
+            let per_sample = samples.neighbours.len().checked_div(samples.len()).unwrap_or(0);
+            for (ends, &ray) in samples.starts.windows(2).zip(&state.rays) {
+                let (mut transmittance, mut color) = (1.0, DVec3::ZERO);
+                for s in ends[0]..ends[1] {
+                    let mut input = points[s].clone();
+                    if trainer.model.field.surface_term {
+                        let neighbours = &samples.neighbours[s * per_sample..][..per_sample];
+                        let count = |v: u32| 1.0 + self.counts.counts()[v as usize] as f64;
+                        let total: f64 = neighbours.iter().map(|&v| count(v)).sum();
+                        let mut mixed = vec![0.0; input.len()];
+                        for &v in neighbours {
+                            let share = count(v) / total;
+                            mixed.iter_mut().zip(&vertices[v as usize]).for_each(|(sum, x)| *sum += share * x);
+                        }
+                        input.extend(mixed);
+                    }
+                    let raw = trainer.model.field.mlp.plain(field, &input);
+                    let d = f64::from(samples.distance[s]);
+                    let (f, reach) = (&config.field, f64::from(config.motion.reach()));
+                    let (inside, outside) = (f64::from(f.density_bias), f64::from(f.density_bias_outside));
+                    let bias = inside + (outside - inside) * d.clamp(0.0, reach) / reach;
+                    let sigma = f64::from(f.density_scale) * (raw[0] + bias).exp().ln_1p();
+                    let alpha = f64::from(samples.likelihood[s]) * (1.0 - (-sigma * f64::from(samples.delta[s])).exp());
+                    let base = samples.base(s).as_dvec4();
+                    let rgb = base.truncate() + base.w * DVec3::new(raw[1], raw[2], raw[3]);
+                    color += transmittance * alpha * rgb.map(|x| 1.0 / (1.0 + (-x).exp()));
+                    transmittance *= 1.0 - alpha;
+                    if d < 0.0 {
+                        let beta = f64::from(config.loss.beta);
+                        completeness += ((beta - sigma).max(0.0) - beta).exp();
+                    }
+                }
+                colors[ray] = color + transmittance * background;
+            }
+        }
+        let shown = frame.pixels().unwrap();
+        let known = |&(pixel, _): &(&u32, &DVec3)| target(&frame.labels, &shown, *pixel, batch.background).is_some();
+        let rays: Vec<(&u32, &DVec3)> = batch.pixels.iter().zip(&colors).filter(known).collect();
+        let error = |&(&pixel, color): &(&u32, &DVec3)| {
+            let target: Vec3 = target(&frame.labels, &shown, pixel, batch.background).unwrap_or_default();
+            (color - target.as_dvec3()).length_squared()
+        };
+        let mse = rays.iter().map(error).sum::<f64>() / (3 * rays.len()) as f64;
+        let nominal = (batch.pixels.len() * config.samples) as f64;
+        let loss = f64::from(config.loss.mse) * mse + f64::from(config.loss.completeness) * completeness / nominal;
+        (loss, colors)
+    }
+}
+
+/// Where each level lies in the table, and its cells an axis.
+fn levels<const D: usize>(grid: &HashGrid<D>) -> (Vec<Range<usize>>, Vec<u32>) {
+    grid.resolutions().iter().enumerate().map(|(l, &n)| (grid.level_range(l), n)).unzip()
+}
+
+fn tiny(method: Method, motion: MotionKind, seed: u64) -> Config {
+    let mut config = Config::preset(Preset::Fast, method);
+    (config.seed, config.patches, config.patch_size, config.samples) = (seed, 2, 12, 20);
+    (config.field.width, config.field.depth) = (24, 2);
+    (config.encoding.levels, config.encoding.log2_table_size, config.encoding.n_max) = (5, 11, 96);
+    (config.motion.kind, config.motion.correction_spacing, config.motion.shell_interval) = (motion, 0, 0);
+    config.min_transmittance = 0.0;
+    config.field.prior_colors &= motion == MotionKind::Surface;
+    // The perceptual term has an oracle of its own.
+    (config.loss.perceptual, config.loss.beta) = (0.0, 60.0);
+    config
+}
+
+/// The fast step and the plain one on the same samples: colours to 1e-4, losses to 1e-4 of themselves, derivatives
+/// along random directions to 1e-2 of themselves.
+#[test]
+fn a_step_agrees_with_one_written_straight_from_the_definitions() {
+    let body = smpl::BodyModel::embedded();
+    let cases = [
+        (Method::Occnerf, MotionKind::Surface),
+        (Method::Occnerf, MotionKind::Volume),
+        (Method::HashPoint, MotionKind::Surface),
+        (Method::Humannerf, MotionKind::Surface),
+    ];
+    for (seed, (method, motion)) in (1u64..).zip(cases) {
+        let demo =
+            crate::capture::DemoConfig { size: 48, frames: 3, eval_cameras: 1, eval_every: 3, ..Default::default() };
+        let capture = crate::capture::demo(&demo, &body).unwrap();
+        let config = tiny(method, motion, seed);
+        let scene = Scene::new(&capture, &body, &config).unwrap();
+        let mut trainer = Trainer::new(&scene, config).unwrap();
+        for _ in 0..3 {
+            trainer.step().unwrap();
+        }
+        let mut random = Stream::new(&[seed, 21]);
+        trainer.model.parameters.get_mut(Part::Table).iter_mut().for_each(|x| *x += 0.3 * random.normal());
+        let before = trainer.model.parameters.clone();
+        let counts = trainer.model.counts.clone();
+        let report = trainer.step().unwrap();
+        let gradients = [Part::Field, Part::Table].map(|part| trainer.optimiser.gradients.get(part).to_vec());
+        let plain = Plain { trainer: &trainer, counts: &counts };
+        let (field, table) = (before.get(Part::Field), before.get(Part::Table));
+        let (loss, colors) = plain.step(field, table);
+        assert!((loss - report.loss).abs() < 1e-4 * loss, "{method:?}: loss {} plain {loss}", report.loss);
+        let rays: Vec<(DVec3, DVec3)> = (trainer.buffers.groups.iter())
+            .flat_map(|g| g.rays.iter().zip(&g.composites).map(|(&ray, c)| (c.color.as_dvec3(), colors[ray])))
+            .collect();
+        assert!(rays.len() == 288 && report.live_samples > 500, "{} {}", rays.len(), report.live_samples);
+        for (fast, plain) in rays {
+            assert!((fast - plain).abs().max_element() < 1e-4, "{method:?}: {fast} {plain}");
+        }
+        for direction in 0..3 {
+            let mut random = Stream::new(&[seed, 22, direction]);
+            for part in [0, 1].into_iter().filter(|&part| ![field, table][part].is_empty()) {
+                let from = [field, table][part];
+                let mut step: Vec<f32> = from.iter().map(|_| 1e-5 * random.normal()).collect();
+                if part == 0 {
+                    trainer.model.field.mlp.clear_padding(&mut step);
+                }
+                let moved = |sign: f32| from.iter().zip(&step).map(|(x, s)| x + sign * s).collect::<Vec<f32>>();
+                let (high, low) = (moved(1.0), moved(-1.0));
+                let loss =
+                    |moved: &[f32]| if part == 0 { plain.step(moved, table).0 } else { plain.step(field, moved).0 };
+                let numeric = loss(&high) - loss(&low);
+                let each = gradients[part].iter().zip(high.iter().zip(&low));
+                let analytic: f64 = each.map(|(g, (h, l))| f64::from(*g) * (f64::from(*h) - f64::from(*l))).sum();
+                let scale = 1e-2 * numeric.abs().max(1e-7);
+                assert!((numeric - analytic).abs() < scale, "{method:?} {motion:?} part {part}: {numeric} {analytic}");
+            }
+        }
+    }
+}

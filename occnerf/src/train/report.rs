@@ -1,0 +1,30 @@
+//! What a step says of itself.
+
+use crate::model::times::StepTimes;
+
+/// What a step did.
+#[derive(Clone, Copy, Debug, Default, serde::Serialize)]
+pub struct StepReport {
+    /// Number of the step, from 1.
+    pub step: u64,
+    /// Weighted sum of the losses.
+    pub loss: f64,
+    /// Mean squared error over known pixels.
+    pub mse: f64,
+    /// Perceptual term.
+    pub perceptual: f64,
+    /// Completeness term.
+    pub completeness: f64,
+    /// Of the known pixels of the step, decibels.
+    pub psnr: f64,
+    /// Live samples that were evaluated.
+    pub live_samples: usize,
+    /// Rays traced.
+    pub rays: usize,
+    /// Gradients that were not finite and were left out.
+    pub bad_gradients: usize,
+    /// How often training has begun anew so far, each time at a tenth of the rates, because the field had become empty.
+    pub restarts: u32,
+    /// Where the time went.
+    pub times: StepTimes,
+}

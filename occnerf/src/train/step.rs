@@ -1,0 +1,260 @@
+//! The two halves of a training step that rays go through, group by group.
+
+use glam::Vec3;
+use smpl::{MotionFrame, Posed};
+use volrender::Composite;
+
+use crate::model::arena::Arena;
+use crate::model::march::{MarchOptions, Segment, Segments};
+use crate::model::times::{StepTimes, Stopwatch};
+use crate::model::trace::{March, PosedSurface};
+use crate::model::trained::Model;
+use crate::model::vertices::VertexCode;
+use crate::random::Stream;
+use crate::scene::labels::Label;
+use crate::scene::prepared::PreparedFrame;
+use crate::train::backward::correction::Wrench;
+use crate::train::backward::motion::volume_backward;
+use crate::train::backward::pose::pose_backward;
+use crate::train::batch::Batch;
+use crate::train::loss::completeness;
+use crate::train::ordered::OrderedSamples;
+
+const JITTER: u64 = 0x4A49_5454;
+
+/// Rays that one thread takes through a step, with gradient buffers of their own.
+#[derive(Default)]
+pub(crate) struct RayGroup {
+    /// Indices into the batch of this group's rays.
+    pub rays: Vec<usize>,
+    /// Samples evaluated together, front to back.
+    pub segments: Segments,
+    /// The same ray by ray.
+    pub ordered: OrderedSamples,
+    pub composites: Vec<Composite>,
+    /// Derivatives of the encoding of all segments.
+    pub jacobians: Arena,
+    pub times: StepTimes,
+    pub d_mlp: Vec<f32>,
+    pub d_vertices: Vec<f32>,
+    pub d_volume: Vec<f32>,
+    /// What the samples ask of each bone.
+    pub wrenches: Vec<Wrench>,
+    /// Sum of the completeness terms.
+    pub completeness: f64,
+    /// Finest neighbours of the termination points.
+    pub terminations: Vec<u32>,
+}
+
+/// What a step may do otherwise than its configuration says, so that tests can tell that it does
+/// not matter.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct StepOptions {
+    pub march: MarchOptions,
+    /// Whether rays at unknown pixels have only their samples inside the prior evaluated: the others
+    /// have no gradient.
+    pub skips_unknown: bool,
+}
+
+/// What every group of a step reads.
+pub(crate) struct Step<'a> {
+    pub model: &'a Model,
+    pub surface: &'a PosedSurface,
+    pub motion: &'a MotionFrame<'a>,
+    pub posed: &'a Posed,
+    pub frame: &'a PreparedFrame,
+    pub batch: &'a Batch,
+    pub vertex_code: &'a VertexCode,
+    /// Whether this step teaches the poses.
+    pub teaches_poses: bool,
+    pub options: StepOptions,
+}
+
+impl Step<'_> {
+    /// Traces, encodes, evaluates and composites the rays of a group. What lies outside the prior on
+    /// a ray at an unknown pixel is dead: no photometric term asks for the ray's colour, and
+    /// completeness for the inside alone.
+    pub fn forward(&self, group: &mut RayGroup) {
+        let Self { model, frame, batch, .. } = *self;
+        let config = &model.config;
+        let tracer = model.tracer(self.surface, &model.extent, self.motion);
+        let RayGroup { rays, segments, ordered, composites, terminations, times, jacobians, .. } = group;
+        let label = |ray: usize| frame.labels.at(batch.pixels[ray]);
+        let marches = rays.iter().map(|&ray| {
+            let jitter = Stream::new(&[config.seed, JITTER, model.steps_done, ray as u64]);
+            let hidden = label(ray) == Label::Unknown && self.options.skips_unknown;
+            March::new(frame.view.pixel_ray(batch.pixels[ray]), Some(jitter)).only_inside(hidden)
+        });
+        let mut jacobians = (model.volume().is_some() || self.teaches_poses).then_some(jacobians);
+        if let Some(arena) = &mut jacobians {
+            arena.clear(rays.len() * config.samples * model.field.encoder.jacobian_width());
+        }
+        segments.march(&tracer, marches, self.options.march, |samples| {
+            model.evaluate(self.vertex_code, samples, jacobians.as_deref_mut());
+        });
+        *times = StepTimes::default();
+        for Segment { batch, .. } in segments.all_mut() {
+            *times += std::mem::take(&mut batch.times);
+        }
+        let mut watch = Stopwatch::start();
+        ordered.gather(segments);
+        ordered.composite(batch.background, composites);
+        watch.lap(&mut times.losses);
+        terminations.clear();
+        for (index, &ray) in rays.iter().enumerate() {
+            let composite = &composites[index];
+            let visible = label(ray) == Label::Subject && composite.opacity > 0.5;
+            if let Some(t) = composite.termination.filter(|_| visible) {
+                let nearest = ordered.neighbours(segments, index, t as usize, config.surface.k);
+                terminations.extend_from_slice(nearest);
+            }
+        }
+    }
+
+    /// Backward of [`Step::forward`] with the completeness term added. `transposed` are the
+    /// perceptron's weights, `d_colors` the gradients of the batch's rays.
+    pub fn backward(&self, group: &mut RayGroup, transposed: &[f32], d_colors: &[Vec3]) {
+        let mut watch = Stopwatch::start();
+        let Self { model, batch, .. } = *self;
+        let RayGroup { rays, segments, ordered, times, jacobians, .. } = group;
+        ordered.composite_backward(batch.background, rays.iter().map(|&ray| d_colors[ray]), segments);
+        let learnt = model.learnt(self.vertex_code);
+        zero(&mut group.d_mlp, learnt.perceptron.len());
+        zero(&mut group.d_vertices, learnt.vertices.len());
+        if let Some(volume) = model.volume() {
+            zero(&mut group.d_volume, volume.weights.len());
+        }
+        group.wrenches.clear();
+        group.wrenches.resize(self.posed.bones.len(), Wrench::default());
+        group.completeness = 0.0;
+        let loss = &model.config.loss;
+        let scale = loss.completeness / (batch.pixels.len() * model.config.samples) as f32;
+        for Segment { batch, .. } in segments.all_mut() {
+            if loss.completeness > 0.0 {
+                for s in (0..batch.samples.len()).filter(|&s| batch.samples.distance[s] < 0.0) {
+                    let (value, slope) = completeness(batch.sigma[s], loss.beta);
+                    group.completeness += f64::from(value);
+                    batch.d_sigma[s] += scale * slope;
+                }
+            }
+            watch.lap(&mut times.losses);
+            model.field.backward(&learnt, transposed, batch, &mut group.d_mlp, &mut group.d_vertices);
+            watch.lap(&mut times.perceptron_backward);
+            if let Some(volume) = model.volume() {
+                volume_backward(model, volume, self.motion, batch, jacobians, &mut group.d_volume);
+            }
+            if self.teaches_poses {
+                pose_backward(model, batch, jacobians, self.posed, &mut group.wrenches);
+            }
+            watch.lap(&mut times.motion_backward);
+        }
+    }
+}
+
+/// Makes `buffer` `len` zeros.
+pub(crate) fn zero(buffer: &mut Vec<f32>, len: usize) {
+    buffer.clear();
+    buffer.resize(len, 0.0);
+}
+
+#[cfg(test)]
+mod tests {
+    use crate::capture::{DemoConfig, demo};
+    use crate::config::{Config, Method, Preset};
+    use crate::model::march::MarchOptions;
+    use crate::model::parameters::Part;
+    use crate::scene::prepared::Scene;
+    use crate::train::report::StepReport;
+    use crate::train::step::StepOptions;
+    use crate::train::trainer::Trainer;
+
+    /// Some steps with all samples, to make the surface opaque, and one more as `config` has it: its report, the colours of its
+    /// rays and the gradients.
+    fn step(scene: &Scene, config: &Config) -> (StepReport, Vec<glam::Vec3>, [Vec<f32>; 3]) {
+        let mut trainer = Trainer::new(scene, Config { min_transmittance: 0.0, ..config.clone() }).unwrap();
+        for _ in 0..60 {
+            trainer.step().unwrap();
+        }
+        let march = MarchOptions { segment: 6, min_transmittance: config.min_transmittance };
+        let report = trainer.step_with(StepOptions { march, skips_unknown: true }).unwrap();
+        let colors = trainer.buffers.groups.iter().flat_map(|g| g.composites.iter().map(|c| c.color)).collect();
+        let gradients =
+            [Part::Field, Part::Table, Part::Pose].map(|part| trainer.optimiser.gradients.get(part).to_vec());
+        (report, colors, gradients)
+    }
+
+    /// One step of the volume motion, whose gradients pass through everything, and of the surface motion.
+    #[test]
+    fn what_lies_outside_the_prior_at_unknown_pixels_has_no_gradient() {
+        let body = smpl::BodyModel::embedded();
+        let capture = demo(&DemoConfig { size: 40, frames: 4, eval_cameras: 1, ..Default::default() }, &body).unwrap();
+        for (preset, density_scale) in [(Preset::Fast, 25.0), (Preset::Paper, 25.0), (Preset::Paper, 4.0)] {
+            let mut config = Config::preset(preset, Method::Occnerf);
+            (config.patches, config.patch_size, config.samples, config.seed) = (4, 24, 48, 2);
+            (config.loss.perceptual, config.min_transmittance) = (0.0, 0.0);
+            config.encoding.log2_table_size = 12;
+            // The smaller one has densities below β inside, which completeness pushes up.
+            config.field.density_scale = density_scale;
+            let scene = Scene::new(&capture, &body, &config).unwrap();
+            let [all, few] = [false, true].map(|skips_unknown| {
+                let mut trainer = Trainer::new(&scene, config.clone()).unwrap();
+                let march = MarchOptions::training(config.min_transmittance);
+                let report = trainer.step_with(StepOptions { march, skips_unknown }).unwrap();
+                let parts = [Part::Field, Part::Table, Part::Vertices, Part::Motion];
+                (
+                    report,
+                    parts.map(|part| trainer.optimiser.gradients.get(part).to_vec()),
+                    trainer.model().visibility_counts().to_vec(),
+                )
+            });
+            let (live, less) = (all.0.live_samples, few.0.live_samples);
+            assert!(live > 1000 && 20 * less < 19 * live, "{preset:?}: {less} of {live} samples");
+            assert!((all.0.loss - few.0.loss).abs() < 1e-6 * all.0.loss, "{} {}", all.0.loss, few.0.loss);
+            assert_eq!(all.2, few.2);
+            for (all, few) in all.1.iter().zip(&few.1).filter(|(all, _)| !all.is_empty()) {
+                let difference = largest_difference(all, few);
+                assert!(difference < 1e-5, "{preset:?}: {difference}");
+            }
+        }
+    }
+
+    fn largest_difference(a: &[f32], b: &[f32]) -> f32 {
+        assert_eq!(a.len(), b.len());
+        let largest = a.iter().map(|x| x.abs()).fold(0.0, f32::max);
+        a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max) / largest
+    }
+
+    #[test]
+    fn segments_change_nothing_and_samples_behind_an_opaque_surface_next_to_nothing() {
+        let body = smpl::BodyModel::embedded();
+        let capture = demo(&DemoConfig { size: 40, frames: 4, eval_cameras: 1, ..Default::default() }, &body).unwrap();
+        let mut config = Config::preset(Preset::Fast, Method::Occnerf);
+        (config.patches, config.patch_size, config.steps) = (2, 24, 100);
+        config.field.density_scale *= 30.0;
+        let scene = Scene::new(&capture, &body, &config).unwrap();
+        let at = |min_transmittance| step(&scene, &Config { min_transmittance, ..config.clone() });
+        let (all, all_colors, all_gradients) = at(0.0);
+        // In many segments, until nothing at all shines through.
+        let (same, same_colors, same_gradients) = at(f32::MIN_POSITIVE);
+        assert!(same.live_samples <= all.live_samples && all.live_samples > 1000, "{}", same.live_samples);
+        for (a, b) in all_colors.iter().zip(&same_colors) {
+            assert!((*a - *b).abs().max_element() < 1e-6, "{a} {b}");
+        }
+        // Completeness is that of the samples that are evaluated.
+        assert!((same.loss - all.loss).abs() < 1e-4 * all.loss, "{} {}", same.loss, all.loss);
+        for (all, same) in all_gradients.iter().zip(&same_gradients) {
+            let difference = largest_difference(all, same);
+            assert!(difference < 1e-4, "{difference}");
+        }
+        let (less, less_colors, less_gradients) = at(1e-3);
+        let share = less.live_samples as f64 / all.live_samples as f64;
+        assert!(share < 0.9, "{share} of the samples");
+        for (a, b) in all_colors.iter().zip(&less_colors) {
+            assert!((*a - *b).abs().max_element() < 1.1e-3, "{a} {b}");
+        }
+        for (all, less) in all_gradients.iter().zip(&less_gradients) {
+            let difference = largest_difference(all, less);
+            assert!(difference < 0.02, "{difference}");
+        }
+    }
+}

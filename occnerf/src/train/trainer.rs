@@ -1,0 +1,303 @@
+//! Training: a model, an optimiser and the buffers of a step, deterministic whatever the number of
+//! threads.
+
+use rayon::prelude::*;
+use smpl::{MotionFrame, Posed};
+use visibility::VisibilityCounts;
+
+use crate::Error;
+use crate::capacity::Pruned;
+use crate::config::{Config, VisibilityKind};
+use crate::lpips::Lpips;
+use crate::model::colors::VertexColors;
+use crate::model::correction::correct;
+use crate::model::march::MarchOptions;
+use crate::model::parameters::Part;
+use crate::model::times::{StepTimes, Stopwatch};
+use crate::model::trace::{CELL, PosedSurface};
+use crate::model::trained::Model;
+use crate::model::vertices::VertexCode;
+use crate::scene::labels::Label;
+use crate::scene::prepared::{PreparedFrame, Scene};
+use crate::train::backward::correction::{Wrench, correct_backward};
+use crate::train::batch::Batch;
+use crate::train::optimiser::Optimiser;
+use crate::train::photometric::Photometric;
+use crate::train::report::StepReport;
+use crate::train::restarts::Restarts;
+use crate::train::step::{RayGroup, Step, StepOptions, zero};
+
+/// Rays are dealt row by row to this many groups, each with its own gradient buffers, summed in
+/// order: the result does not depend on who computes a group. Eight keep two to eight threads busy.
+const GROUPS: usize = 8;
+/// Share of the steps after which poses are corrected.
+const SETTLED: f32 = 0.1;
+
+/// A model in training.
+pub struct Trainer<'a> {
+    pub(crate) scene: &'a Scene,
+    pub(crate) model: Model,
+    pub(crate) optimiser: Optimiser,
+    pub(crate) restarts: Restarts,
+    /// The perceptual term, where it is not the embedded one.
+    lpips: Option<Lpips>,
+    pub(crate) buffers: Buffers,
+}
+
+/// What a step fills, kept for the next one.
+pub(crate) struct Buffers {
+    pub batch: Batch,
+    pub groups: Vec<RayGroup>,
+    pub vertex_code: VertexCode,
+    pub surface: PosedSurface,
+    /// The corrected prior.
+    posed: Posed,
+    photometric: Photometric,
+    /// Weights of the perceptron, transposed.
+    transposed: Vec<f32>,
+    d_volume: Vec<f32>,
+}
+
+impl<'a> Trainer<'a> {
+    /// A model at step 0.
+    ///
+    /// # Errors
+    /// A configuration that is not valid or not the one that `scene` was prepared for.
+    pub fn new(scene: &'a Scene, config: Config) -> Result<Self, Error> {
+        let colors = config.field.prior_colors.then(|| VertexColors::measure(scene)).transpose()?;
+        let base = colors.map_or_else(Vec::new, |colors| colors.before_sigmoid());
+        let frames = scene.train.iter().map(|frame| frame.view.clone()).collect();
+        let mut model = Model::new(config, scene.body.clone(), frames, base)?;
+        let surface = &model.config.surface;
+        if surface.attention && surface.visibility == VisibilityKind::Exact {
+            model.counts = VisibilityCounts::from_counts(scene.vertex_frequencies()?);
+        }
+        let buffers = Buffers {
+            batch: Batch::default(),
+            groups: (0..GROUPS).map(|_| RayGroup::default()).collect(),
+            vertex_code: VertexCode::default(),
+            surface: PosedSurface::new(&scene.body, CELL)?,
+            posed: Posed::default(),
+            photometric: Photometric::default(),
+            transposed: Vec::new(),
+            d_volume: Vec::new(),
+        };
+        let optimiser = Optimiser::new(&model.parameters);
+        Ok(Self { scene, model, optimiser, restarts: Restarts::default(), lpips: None, buffers })
+    }
+
+    /// The model as it is now.
+    pub fn model(&self) -> &Model {
+        &self.model
+    }
+
+    /// The model without what training it further takes.
+    pub fn into_model(self) -> Model {
+        self.model
+    }
+
+    /// Loads the weights that `loss.perceptual_weights` names, if it names any: before the first
+    /// [`Trainer::step`], also of a resumed run.
+    ///
+    /// # Errors
+    /// Those of [`Lpips::load`]; [`Error::Lpips`] for patches too small for the network.
+    pub fn load_perceptual(&mut self) -> Result<(), Error> {
+        let config = &self.model.config;
+        if config.loss.perceptual > 0.0 && !config.loss.perceptual_weights.is_empty() {
+            let lpips = Lpips::load(config.loss.perceptual_weights.as_ref())?;
+            let sides = self.scene.train.iter().map(|f| f.view.camera.width.min(f.view.camera.height));
+            let side = sides.min().unwrap_or(0).min(config.patch_size) as usize;
+            lpips.check_size(side, side)?;
+            self.lpips = Some(lpips);
+        }
+        Ok(())
+    }
+
+    /// [`Model::prune`]; a step taken afterwards makes all rows learnable again.
+    pub fn prune(&mut self) -> Pruned {
+        self.model.prune()
+    }
+
+    /// Which perceptual term the run is trained with: `ms-ssim`, `lpips` with the network's name, or
+    /// `none`.
+    pub fn perceptual(&self) -> String {
+        match &self.lpips {
+            Some(lpips) => format!("lpips {}", lpips.trunk().name()),
+            None => self.model.config.loss.perceptual_name(),
+        }
+    }
+
+    /// Steps taken so far.
+    pub fn steps_done(&self) -> u64 {
+        self.model.steps_done
+    }
+
+    /// Changes how many steps there are to be, and with it the fall of the learning rates.
+    pub fn set_steps(&mut self, steps: u64) {
+        self.model.config.steps = steps;
+    }
+
+    /// Whether the next step teaches the poses: what a field says of them before it has taken shape
+    /// would lead them astray.
+    fn teaches_poses(&self) -> bool {
+        let since = self.model.steps_done - self.restarts.begun;
+        let settled = since as f32 >= SETTLED * self.model.config.steps as f32;
+        settled && !self.model.parameters.get(Part::Pose).is_empty()
+    }
+
+    /// Forgets what was learnt.
+    fn begin_anew(&mut self) {
+        self.model.forget();
+        self.optimiser = Optimiser::new(&self.model.parameters);
+        if self.model.config.surface.visibility == VisibilityKind::Counted {
+            self.model.counts = VisibilityCounts::new(self.model.body.canonical.vertices.len());
+        }
+    }
+
+    /// One optimisation step.
+    ///
+    /// # Errors
+    /// [`Error::Data`] where the step's picture cannot be decoded (any more); [`Error::Lpips`] where
+    /// the configuration names weights of the perceptual term and [`Trainer::load_perceptual`] was
+    /// not called. The model is then as it was before.
+    pub fn step(&mut self) -> Result<StepReport, Error> {
+        let march = MarchOptions::training(self.model.config.min_transmittance);
+        self.step_with(StepOptions { march, skips_unknown: true })
+    }
+
+    pub(crate) fn step_with(&mut self, options: StepOptions) -> Result<StepReport, Error> {
+        let teaches_poses = self.teaches_poses();
+        let Self { scene, model, optimiser, restarts, lpips, buffers } = self;
+        let Buffers { batch, groups, vertex_code, surface, posed, photometric, transposed, d_volume } = buffers;
+        let loss = &model.config.loss;
+        if lpips.is_none() && !loss.perceptual_weights.is_empty() && loss.perceptual > 0.0 {
+            return Err(Error::Lpips("the weights of the perceptual term were not loaded".to_owned()));
+        }
+        let step = model.steps_done;
+        let (mut times, mut watch) = (StepTimes::default(), Stopwatch::start());
+        batch.draw(scene, &model.config, step);
+        let frame = &scene.train[batch.frame];
+        let shown = frame.pixels()?;
+        let view = &*frame.view;
+        let correction = model.correction(view);
+        let posed = match &correction {
+            Some(correction) => {
+                correct(&model.body.model, &view.shape, &view.posed, correction, posed);
+                &*posed
+            }
+            None => &view.posed,
+        };
+        model.encode_vertices(vertex_code);
+        let interval = model.config.motion.shell_interval as u64;
+        if interval > 0 && step > 0 && step.is_multiple_of(interval) {
+            model.extent = model.measure_extent(vertex_code);
+        }
+        surface.refit(&model.body, posed, &model.extent, &model.config);
+        deal(batch, frame, groups);
+        let motion = MotionFrame::new(&scene.body.model, posed);
+        let pass =
+            Step { model: &*model, surface, motion: &motion, posed, frame, batch, vertex_code, teaches_poses, options };
+        watch.lap(&mut times.prepare);
+        groups.par_iter_mut().with_max_len(1).for_each(|group| pass.forward(group));
+        let mut watch = Stopwatch::start();
+        let mut report = StepReport { step: step + 1, rays: batch.pixels.len(), ..StepReport::default() };
+        photometric.measure(loss, lpips.as_ref(), groups, batch, (&frame.labels, &shown), &mut report)?;
+        model.field.mlp.transposed_weights(model.parameters.get(Part::Field), transposed);
+        watch.lap(&mut times.losses);
+        let d_colors = &photometric.d_colors;
+        groups.par_iter_mut().with_max_len(1).for_each(|group| pass.backward(group, transposed, d_colors));
+        groups.iter().for_each(|group| times += group.times);
+        let nominal = (batch.pixels.len() * model.config.samples) as f64;
+        report.completeness = groups.iter().map(|g| g.completeness).sum::<f64>() / nominal;
+        report.live_samples = groups.iter().map(|g| g.ordered.len()).sum();
+        report.loss = f64::from(loss.mse) * report.mse
+            + f64::from(loss.perceptual) * report.perceptual
+            + f64::from(loss.completeness) * report.completeness;
+        reduce(model, optimiser, groups, vertex_code, d_volume, &mut times);
+        let mut watch = Stopwatch::start();
+        if let (true, Some(correction), Some(instant)) = (teaches_poses, &correction, view.instant) {
+            let mut wrenches = vec![Wrench::default(); posed.bones.len()];
+            for group in &*groups {
+                wrenches.iter_mut().zip(&group.wrenches).for_each(|(to, from)| to.add(from));
+            }
+            let d_correction = correct_backward(&model.body.model, &view.posed, correction, posed, &wrenches);
+            model.corrections.at_backward(instant, &d_correction, optimiser.gradients.get_mut(Part::Pose));
+        }
+        if model.config.surface.visibility == VisibilityKind::Counted {
+            groups.iter().for_each(|group| model.counts.add(&group.terminations));
+        }
+        let decay = model.config.rates.final_fraction.powf(step as f32 / model.config.steps.max(1) as f32);
+        let rates = &model.config.rates;
+        report.bad_gradients = optimiser.step(&mut model.parameters, rates, decay * restarts.rates());
+        for group in &*groups {
+            let subject = |ray: &&usize| frame.labels.at(batch.pixels[**ray]) == Label::Subject;
+            let composites = group.rays.iter().zip(&group.composites).filter(|(ray, _)| subject(ray));
+            composites.for_each(|(_, composite)| restarts.note(composite.opacity));
+        }
+        if self.restarts.due(step + 1) {
+            self.begin_anew();
+        }
+        report.restarts = self.restarts.count;
+        self.model.refresh_volume();
+        watch.lap(&mut times.update);
+        report.times = times;
+        self.model.steps_done += 1;
+        Ok(report)
+    }
+}
+
+/// Deals the rays of a batch to the groups, row by row. Those at unknown pixels come last in each,
+/// so that samples without a gradient are next to each other.
+fn deal(batch: &Batch, frame: &PreparedFrame, groups: &mut [RayGroup]) {
+    for (index, group) in groups.iter_mut().enumerate() {
+        group.rays.clear();
+        for unknown in [false, true] {
+            let is_due = |&ray: &usize| (frame.labels.at(batch.pixels[ray]) == Label::Unknown) == unknown;
+            let rays = (0..batch.pixels.len()).filter(|ray| ray / batch.size % GROUPS == index);
+            group.rays.extend(rays.filter(is_due));
+        }
+    }
+}
+
+/// Sums the groups' gradients in order and runs the parts of the backward pass that all samples
+/// share.
+fn reduce(
+    model: &Model,
+    optimiser: &mut Optimiser,
+    groups: &[RayGroup],
+    vertex_code: &mut VertexCode,
+    d_volume: &mut Vec<f32>,
+    times: &mut StepTimes,
+) {
+    let mut watch = Stopwatch::start();
+    optimiser.clear_gradients();
+    let gradients = &mut optimiser.gradients;
+    let sum = |to: &mut [f32], from: &(dyn Fn(&RayGroup) -> &[f32] + Sync)| {
+        to.par_chunks_mut(1 << 12).enumerate().for_each(|(chunk, to)| {
+            for group in groups {
+                let from = &from(group)[chunk << 12..][..to.len()];
+                to.iter_mut().zip(from).for_each(|(to, from)| *to += from);
+            }
+        });
+    };
+    let d_mlp = gradients.get_mut(Part::Field);
+    sum(d_mlp, &|g| &g.d_mlp);
+    model.field.mlp.clear_padding(d_mlp);
+    watch.lap(&mut times.update);
+    if model.field.surface_term {
+        zero(&mut vertex_code.d_rows, vertex_code.rows.len());
+        sum(&mut vertex_code.d_rows, &|g| &g.d_vertices);
+        let (table, d_offsets) = (model.parameters.get(Part::Table), gradients.get_mut(Part::Vertices));
+        vertex_code.backward(&model.body, &model.field.encoder, table, d_offsets);
+    }
+    let samples = groups.iter().flat_map(|group| group.segments.all()).map(|segment| &segment.batch);
+    let parts = samples.map(|batch| (batch.at.all(), &batch.features[..])).chain(vertex_code.parts());
+    model.field.encoder.encode_backward(parts, gradients.get_mut(Part::Table));
+    watch.lap(&mut times.encode_backward);
+    if let Some(volume) = model.volume() {
+        zero(d_volume, volume.weights.len());
+        sum(d_volume, &|g| &g.d_volume);
+        volume.softmax_backward(d_volume, gradients.get_mut(Part::Motion));
+    }
+    watch.lap(&mut times.update);
+}
