@@ -3,23 +3,19 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, ensure};
+use occnerf::Model;
 use occnerf::bake::{Avatar, Clip, export};
 use smpl::MotionClip;
 
-use crate::run::CHECKPOINT;
+use crate::baked;
 
-pub const AVATAR: &str = "avatar.safetensors";
-
-/// Reads the baked person of a run.
+/// The baked person of a run: see [`baked::avatar`].
 pub fn of_run(run: &Path) -> Result<Avatar> {
-    let path = run.join(AVATAR);
-    if !path.exists() {
-        ensure!(run.is_dir(), "{}: no such run", run.display());
-        let checkpoint = run.join(CHECKPOINT);
-        ensure!(checkpoint.exists(), "{}: no such file; is {} a run?", checkpoint.display(), run.display());
-        ensure!(path.exists(), "{}: no such file; bake the run first", path.display());
+    ensure!(run.is_dir(), "{}: no such run", run.display());
+    match baked::fresh(run)? {
+        Some(avatar) => Ok(avatar),
+        None => baked::avatar(run, &Model::load(run)?),
     }
-    Ok(Avatar::load(&path)?)
 }
 
 /// Adds a motion from a file, named after it.
