@@ -26,6 +26,7 @@
 //! the same bits on one instruction set, whatever the number of threads, and so does resuming from a checkpoint.
 
 mod atomic;
+pub mod bake;
 mod capacity;
 pub mod capture;
 mod config;

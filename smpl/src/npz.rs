@@ -148,6 +148,18 @@ pub(crate) fn read_file(path: &Path) -> Result<Vec<u8>, Error> {
 /// [`Error::Io`]; [`Error::Invalid`] for an array whose shape does not fit its values;
 /// [`Error::Npy`] for two of one name.
 pub fn write<K: AsRef<str>>(path: &Path, arrays: &[(K, NdArray)]) -> Result<(), Error> {
+    write_with_text(path, arrays, &[])
+}
+
+/// [`write`] with scalar strings besides, as numpy's `str_`.
+///
+/// # Errors
+/// As [`write`].
+pub fn write_with_text<K: AsRef<str>>(
+    path: &Path,
+    arrays: &[(K, NdArray)],
+    texts: &[(&str, &str)],
+) -> Result<(), Error> {
     let file = path.display().to_string();
     let mut archive = ZipWriter::new(Cursor::new(Vec::new()));
     let options = SimpleFileOptions::default().compression_method(CompressionMethod::Stored);
@@ -160,7 +172,16 @@ pub fn write<K: AsRef<str>>(path: &Path, arrays: &[(K, NdArray)]) -> Result<(), 
         let malformed = |message: String| Error::Npy { file: file.clone(), key: key.to_owned(), message };
         archive.start_file(format!("{key}.npy"), options).map_err(|e| malformed(e.to_string()))?;
         let io = |source| Error::Io { path: path.to_owned(), source };
-        archive.write_all(&header(array)).and_then(|()| array.data.write(&mut archive)).map_err(io)?;
+        let head = header(array.data.descr(), &array.shape);
+        archive.write_all(&head).and_then(|()| array.data.write(&mut archive)).map_err(io)?;
+    }
+    for &(key, text) in texts {
+        let malformed = |message: String| Error::Npy { file: file.clone(), key: key.to_owned(), message };
+        archive.start_file(format!("{key}.npy"), options).map_err(|e| malformed(e.to_string()))?;
+        let letters: Vec<u8> = text.chars().flat_map(|c| u32::from(c).to_le_bytes()).collect();
+        let head = header(&format!("<U{}", letters.len() / 4), &[]);
+        let io = |source| Error::Io { path: path.to_owned(), source };
+        archive.write_all(&head).and_then(|()| archive.write_all(&letters)).map_err(io)?;
     }
     let whole =
         |e: zip::result::ZipError| Error::Npy { file: file.clone(), key: String::new(), message: e.to_string() };
@@ -170,15 +191,11 @@ pub fn write<K: AsRef<str>>(path: &Path, arrays: &[(K, NdArray)]) -> Result<(), 
 
 /// Magic, version 1.0 and the dict literal, padded so that the data begin at a multiple of 64
 /// bytes.
-fn header(array: &NdArray) -> Vec<u8> {
-    let extents: Vec<String> = array.shape.iter().map(usize::to_string).collect();
+fn header(descr: &str, shape: &[usize]) -> Vec<u8> {
+    let extents: Vec<String> = shape.iter().map(usize::to_string).collect();
     // A tuple of one needs its comma.
     let comma = if extents.len() == 1 { "," } else { "" };
-    let text = format!(
-        "{{'descr': '{}', 'fortran_order': False, 'shape': ({}{comma}), }}",
-        array.data.descr(),
-        extents.join(", ")
-    );
+    let text = format!("{{'descr': '{descr}', 'fortran_order': False, 'shape': ({}{comma}), }}", extents.join(", "));
     let length = (10 + text.len() + 1).next_multiple_of(64) - 10;
     let mut out = b"\x93NUMPY\x01\x00".to_vec();
     out.extend((length as u16).to_le_bytes());

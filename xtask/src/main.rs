@@ -1,11 +1,14 @@
 //! `cargo xtask`: train, evaluate and render people from occluded videos.
 #![warn(clippy::print_stdout, clippy::print_stderr, reason = "printing must never stop work: see process::print")]
 
+mod avatar;
+mod baked;
 mod bench;
 mod capacity;
 mod compare;
 mod convert;
 mod eval;
+mod export;
 mod film;
 mod font;
 mod front;
@@ -26,6 +29,8 @@ mod source;
 mod synth;
 mod table;
 mod train;
+mod video;
+mod view;
 
 use clap::{Parser, Subcommand};
 
@@ -49,6 +54,10 @@ enum Command {
     Render(render::RenderArguments),
     /// Draws what the camera saw beside the person from unseen sides: README's picture.
     Front(front::FrontArguments),
+    /// Writes a run's person in a form that other programs open: skinned avatar, splats, mesh, motion.
+    Export(export::ExportArguments),
+    /// Writes a run's person as one HTML page, to turn around and play.
+    View(view::ViewArguments),
     /// The paper's table on captures: every baseline and ablation, several seeds, one budget.
     Reproduce(reproduce::ReproduceArguments),
     /// Writes an occluded capture of a synthetic person to disk, in a published dataset format.
@@ -88,6 +97,8 @@ fn main() -> std::process::ExitCode {
         Command::Eval(arguments) => eval::eval(&arguments),
         Command::Render(arguments) => render::render(&arguments),
         Command::Front(arguments) => front::front(&arguments),
+        Command::Export(arguments) => export::export(&arguments),
+        Command::View(arguments) => view::view(&arguments),
         Command::Reproduce(arguments) => reproduce::reproduce(&arguments),
         Command::Synth(arguments) => synth::synth(&arguments),
         Command::Probe(arguments) => probe::probe(&arguments),
