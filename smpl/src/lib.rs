@@ -37,6 +37,7 @@ mod pose_backward;
 mod rotation;
 mod saved;
 mod sparse;
+pub mod torch;
 
 /// The README's example, compiled as a test.
 #[cfg(doctest)]

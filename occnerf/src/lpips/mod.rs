@@ -2,7 +2,6 @@
 
 mod conv;
 mod maps;
-mod torch;
 mod trunk;
 mod unit;
 mod weights;

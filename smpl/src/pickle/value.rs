@@ -1,5 +1,6 @@
 //! From the machine's arena to an owned value, and what can be asked of one.
 
+use super::joblib::WRAPPER;
 use super::machine::{Id, Machine, Node};
 use super::numpy::Global;
 use super::reader::Step;
@@ -11,13 +12,37 @@ use crate::array::{Data, NdArray};
 const MAX_DENSE: usize = 1 << 25;
 
 impl Machine<'_> {
-    /// The owned tree below a node. Shared nodes are copied, against the budget.
-    pub(super) fn value(&mut self, id: Id, depth: usize) -> Step<Value> {
+    /// The owned tree below `top`, once the machine has stopped.
+    pub(super) fn value_of(&mut self, top: Id) -> Step<Value> {
+        let uses = self.uses();
+        self.value(top, &uses, true, 0)
+    }
+
+    /// How often each node is referred to, counted up to 2. What is used once can be moved rather than copied.
+    fn uses(&self) -> Vec<u8> {
+        let mut uses = vec![0u8; self.nodes.len()];
+        let mut count = |id: Id| uses[id] = (uses[id] + 1).min(2);
+        for node in &self.nodes {
+            match node {
+                Node::List(items) | Node::Tuple(items) | Node::Set(items) => items.iter().copied().for_each(&mut count),
+                Node::Dict(items) => items.iter().flat_map(|&(k, v)| [k, v]).for_each(&mut count),
+                Node::Objects(objects) => objects.1.iter().copied().for_each(&mut count),
+                Node::Object(_, Some(state)) => count(*state),
+                _ => {}
+            }
+        }
+        uses
+    }
+
+    /// The owned tree below a node. Shared nodes are copied, against the budget; `owned` says that no other node leads
+    /// here.
+    fn value(&mut self, id: Id, uses: &[u8], owned: bool, depth: usize) -> Step<Value> {
         if depth > MAX_DEPTH {
             return Err(format!("nested deeper than {MAX_DEPTH}"));
         }
         self.spend(size_of::<Value>())?;
-        let depth = depth + 1;
+        let owned = owned && uses[id] < 2;
+        let below = |machine: &mut Self, id: Id| machine.value(id, uses, owned, depth + 1);
         Ok(match &self.nodes[id] {
             Node::None => Value::None,
             Node::Bool(value) => Value::Bool(*value),
@@ -40,32 +65,43 @@ impl Machine<'_> {
                 self.spend(bytes.len())?;
                 Value::Bytes(bytes)
             }
+            Node::Array(_) if owned => match std::mem::replace(&mut self.nodes[id], Node::None) {
+                Node::Array(array) => Value::Array(*array),
+                _ => Value::None,
+            },
             Node::Array(array) => {
-                let array = array.clone();
                 self.spend(8 * array.len())?;
-                Value::Array(array)
+                match &self.nodes[id] {
+                    Node::Array(array) => Value::Array(array.as_ref().clone()),
+                    _ => Value::None,
+                }
             }
-            Node::List(items) => Value::List(self.values(items.clone(), depth)?),
-            Node::Tuple(items) => Value::Tuple(self.values(items.clone(), depth)?),
-            Node::Set(items) => Value::Set(self.values(items.clone(), depth)?),
-            Node::Objects(shape, items) => {
-                let (shape, items) = (shape.clone(), items.clone());
+            Node::List(items) => Value::List(self.values(items.clone(), below)?),
+            Node::Tuple(items) => Value::Tuple(self.values(items.clone(), below)?),
+            Node::Set(items) => Value::Set(self.values(items.clone(), below)?),
+            Node::Objects(objects) => {
+                let (shape, items) = objects.as_ref().clone();
                 match items.as_slice() {
-                    &[only] if shape.is_empty() => self.value(only, depth)?,
-                    _ => Value::Objects { items: self.values(items, depth)?, shape },
+                    &[only] if shape.is_empty() => below(self, only)?,
+                    _ => Value::Objects { items: self.values(items, below)?, shape },
                 }
             }
             Node::Dict(items) => {
-                let mut out = Vec::new();
-                for (key, value) in items.clone() {
-                    out.push((self.value(key, depth)?, self.value(value, depth)?));
+                let items = items.clone();
+                self.spend(items.len() * (size_of::<(Id, Id)>() + size_of::<(Value, Value)>()))?;
+                let mut out = Vec::with_capacity(items.len());
+                for (key, value) in items {
+                    out.push((below(self, key)?, below(self, value)?));
                 }
                 Value::Dict(out)
+            }
+            Node::Object(WRAPPER, _) | Node::Global(Global::Class(WRAPPER)) => {
+                return Err("joblib array without its state".to_owned());
             }
             &Node::Object(class, state) => Value::Object {
                 class,
                 state: Box::new(match state {
-                    Some(state) => self.value(state, depth)?,
+                    Some(state) => below(self, state)?,
                     None => Value::Dict(Vec::new()),
                 }),
             },
@@ -76,9 +112,13 @@ impl Machine<'_> {
         })
     }
 
-    fn values(&mut self, ids: Vec<Id>, depth: usize) -> Step<Vec<Value>> {
-        self.spend(8 * ids.len())?;
-        ids.into_iter().map(|id| self.value(id, depth)).collect()
+    fn values(&mut self, ids: Vec<Id>, mut below: impl FnMut(&mut Self, Id) -> Step<Value>) -> Step<Vec<Value>> {
+        self.spend(ids.len() * (size_of::<Id>() + size_of::<Value>()))?;
+        let mut out = Vec::with_capacity(ids.len());
+        for id in ids {
+            out.push(below(self, id)?);
+        }
+        Ok(out)
     }
 }
 
