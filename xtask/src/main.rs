@@ -2,9 +2,11 @@
 
 mod bench;
 mod capacity;
+mod check;
 mod compare;
 mod convert;
 mod eval;
+mod import;
 mod obstacle;
 mod pictures;
 mod probe;
@@ -38,6 +40,10 @@ enum Command {
     Render(render::RenderArguments),
     /// The paper's table on captures: every baseline and ablation, several seeds, one budget.
     Reproduce(reproduce::ReproduceArguments),
+    /// Makes a capture of a video from what a body estimator and a segmenter wrote.
+    Import(import::ImportArguments),
+    /// Tells whether a capture's body lies on its person: a picture, a table, and the mistakes that are likely.
+    Check(check::CheckArguments),
     /// Writes an occluded capture of a synthetic person to disk, in a published dataset format.
     Synth(synth::SynthArguments),
     /// Runs one function of one crate on numpy arrays.
@@ -56,6 +62,8 @@ fn main() -> std::process::ExitCode {
         Command::Eval(arguments) => eval::eval(&arguments),
         Command::Render(arguments) => render::render(&arguments),
         Command::Reproduce(arguments) => reproduce::reproduce(&arguments),
+        Command::Import(arguments) => import::import(&arguments),
+        Command::Check(arguments) => check::check(&arguments),
         Command::Synth(arguments) => synth::synth(&arguments),
         Command::Probe(arguments) => probe::probe(&arguments),
         Command::Bench(arguments) => bench::bench(&arguments),
