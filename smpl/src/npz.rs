@@ -7,11 +7,14 @@
 use std::io::{Cursor, Read, Write};
 use std::path::Path;
 
+use zip::read::ZipFile;
+use zip::result::ZipError;
 use zip::write::SimpleFileOptions;
 use zip::{CompressionMethod, ZipArchive, ZipWriter};
 
 use crate::Error;
 use crate::array::{ElementType, NdArray, element_count};
+use crate::pickle::{self, Value, unpacked_limit};
 
 /// Largest array that is read, in bytes of the file and of memory: 1 GiB.
 pub const MAX_ARRAY_BYTES: u64 = 1 << 30;
@@ -71,6 +74,30 @@ impl Npz {
     /// [`Error::MissingKey`], [`Error::TooLarge`], [`Error::Type`] for element types other than
     /// booleans, integers and floats, and [`Error::Npy`] for anything malformed.
     pub fn array(&mut self, key: &str) -> Result<NdArray, Error> {
+        let file = self.file.clone();
+        read_array(&file, key, self.entry(key)?)
+    }
+
+    /// Reads `key` whatever its elements are: numbers, text, or pickled Python objects ([`crate::pickle`]).
+    ///
+    /// # Errors
+    /// Those of [`Npz::array`]; [`Error::Pickle`]; [`Error::TooLarge`] for what compression makes more than 256 times as
+    /// large and 64 MiB.
+    pub fn value(&mut self, key: &str) -> Result<Value, Error> {
+        let file = format!("{}: `{key}`", self.file);
+        let entry = self.entry(key)?;
+        let limit = unpacked_limit(entry.compressed_size());
+        let malformed =
+            |e: std::io::Error| Error::Npy { file: file.clone(), key: String::new(), message: e.to_string() };
+        let mut bytes = Vec::new();
+        entry.take(limit + 1).read_to_end(&mut bytes).map_err(malformed)?;
+        if bytes.len() as u64 > limit {
+            return Err(Error::TooLarge { file, key: key.to_owned(), claimed: bytes.len() as u128, limit });
+        }
+        pickle::from_bytes(&file, bytes)
+    }
+
+    fn entry(&mut self, key: &str) -> Result<ZipFile<'_, Cursor<Vec<u8>>>, Error> {
         let Some(index) = self.keys.iter().position(|k| k == key) else {
             return Err(Error::MissingKey {
                 file: self.file.clone(),
@@ -78,12 +105,9 @@ impl Npz {
                 available: self.keys.clone(),
             });
         };
-        let entry = self.archive.by_index(index).map_err(|e| Error::Npy {
-            file: self.file.clone(),
-            key: key.to_owned(),
-            message: e.to_string(),
-        })?;
-        read_array(&self.file, key, entry)
+        let malformed =
+            |e: ZipError| Error::Npy { file: self.file.clone(), key: key.to_owned(), message: e.to_string() };
+        self.archive.by_index(index).map_err(malformed)
     }
 
     /// Reads the array `key` as finite `f32` of shape `pattern` (`None`: any size): its shape and
@@ -183,8 +207,7 @@ pub fn write_with_text<K: AsRef<str>>(
         let io = |source| Error::Io { path: path.to_owned(), source };
         archive.write_all(&head).and_then(|()| archive.write_all(&letters)).map_err(io)?;
     }
-    let whole =
-        |e: zip::result::ZipError| Error::Npy { file: file.clone(), key: String::new(), message: e.to_string() };
+    let whole = |e: ZipError| Error::Npy { file: file.clone(), key: String::new(), message: e.to_string() };
     let bytes = archive.finish().map_err(whole)?.into_inner();
     std::fs::write(path, bytes).map_err(|source| Error::Io { path: path.to_owned(), source })
 }

@@ -5,6 +5,7 @@ mod avatar;
 mod baked;
 mod bench;
 mod capacity;
+mod check;
 mod compare;
 mod convert;
 mod eval;
@@ -12,6 +13,7 @@ mod export;
 mod film;
 mod font;
 mod front;
+mod import;
 mod list;
 mod obstacle;
 mod optimise;
@@ -60,6 +62,10 @@ enum Command {
     View(view::ViewArguments),
     /// The paper's table on captures: every baseline and ablation, several seeds, one budget.
     Reproduce(reproduce::ReproduceArguments),
+    /// Makes a capture of a video from what a body estimator and a segmenter wrote.
+    Import(import::ImportArguments),
+    /// Tells whether a capture's body lies on its person: a picture, a table, and the mistakes that are likely.
+    Check(check::CheckArguments),
     /// Writes an occluded capture of a synthetic person to disk, in a published dataset format.
     Synth(synth::SynthArguments),
     /// Runs one function of one crate on numpy arrays.
@@ -100,6 +106,8 @@ fn main() -> std::process::ExitCode {
         Command::Export(arguments) => export::export(&arguments),
         Command::View(arguments) => view::view(&arguments),
         Command::Reproduce(arguments) => reproduce::reproduce(&arguments),
+        Command::Import(arguments) => import::import(&arguments),
+        Command::Check(arguments) => check::check(&arguments),
         Command::Synth(arguments) => synth::synth(&arguments),
         Command::Probe(arguments) => probe::probe(&arguments),
         Command::Bench(arguments) => bench::bench(&arguments),

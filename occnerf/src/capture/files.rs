@@ -62,6 +62,17 @@ impl Files {
         self.same_size(path, (width, height)).map(|()| levels)
     }
 
+    /// The picture without its mask, as large as the pixels are.
+    pub fn photograph(&self) -> Result<Image, CaptureError> {
+        self.gate.pass(decoding_bytes(self.size), || {
+            let image = Image::load(&self.image)?;
+            self.same_size(&self.image, (image.width, image.height))?;
+            let camera = volrender::Camera { width: self.size.0, height: self.size.1, ..self.lens.camera };
+            let whole = undistort(image.pixels, 3, &camera, &self.lens.distortion);
+            Ok(Image { width: self.to.0, height: self.to.1, pixels: resize(whole, 3, self.size, self.to) })
+        })
+    }
+
     /// Reads the pictures, when there is room for it.
     pub fn decode(&self) -> Result<Pixels, CaptureError> {
         self.check()?;

@@ -2,8 +2,7 @@
 
 mod conv;
 mod maps;
-mod tensor;
-mod torch;
+
 mod trunk;
 mod unit;
 mod weights;
