@@ -6,7 +6,8 @@ use volrender::{Camera, Distortion};
 use super::CaptureError;
 use super::records::Record;
 
-/// Largest |R Rᵀ − I| of an extrinsic rotation; files written in `f32` or with a few decimals stay far below.
+/// Largest |R Rᵀ − I| of an extrinsic rotation; files written in `f32` or with a few decimals stay
+/// far below.
 const ORTHONORMAL: f32 = 1e-3;
 
 /// A lens and where it stands. The camera's image is 1 × 1 until the picture has been read.
@@ -40,7 +41,8 @@ pub(super) fn pinhole(k: &[f32], extrinsics: Affine3A, pixel_centre: f32) -> Res
 }
 
 impl Lens {
-    /// From a 3×3 matrix under `k`, a 3×4 or 4×4 one under `e`, and five numbers under `distortions` if there are any.
+    /// From a 3×3 matrix under `k`, a 3×4 or 4×4 one under `e`, and five numbers under
+    /// `distortions` if there are any.
     pub fn read(record: &Record<'_>, k: &str, e: &str, pixel_centre: f32) -> Result<Self, CaptureError> {
         let intrinsics = record.shaped(k, &[3, 3], "")?;
         let (shape, values) = record.array(e)?;
