@@ -32,6 +32,9 @@ pub enum Error {
     /// Pictures or weights that LPIPS cannot take.
     #[error("LPIPS: {0}")]
     Lpips(String),
+    /// An avatar that cannot be made, or not in the form that is asked for.
+    #[error("{0}")]
+    Bake(String),
     /// A training whose numbers have grown beyond all bounds.
     #[error(
         "training has diverged: after step {step} `{key}` holds {value}; smaller learning rates (`rates`) would do"

@@ -27,6 +27,7 @@
 //! threads, and so does resuming from a checkpoint.
 
 mod atomic;
+pub mod bake;
 mod capacity;
 pub mod capture;
 mod config;

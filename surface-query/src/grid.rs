@@ -142,13 +142,6 @@ impl CandidateGrid {
         }
         true
     }
-
-    /// Number of cells with lists, and of list entries in all of them.
-    pub fn size(&self, levels: usize) -> (usize, usize) {
-        let rows = self.offsets.len() / levels;
-        let filled = (0..rows).filter(|r| self.offsets[r * levels] != self.offsets[r * levels + 1]).count();
-        (filled, self.offsets.last().map_or(0, |&n| n as usize))
-    }
 }
 
 #[inline(always)]

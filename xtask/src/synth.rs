@@ -121,7 +121,7 @@ pub fn synth(arguments: &SynthArguments) -> Result<()> {
     if let Some(path) = arguments.character.as_deref().filter(|path| !is_character(path)) {
         bail!("{}: not a character; expected a .glb or .gltf", path.display());
     }
-    vacant(out, arguments.force)?;
+    vacant(out, arguments.force, MARK)?;
     let layout = match arguments.format {
         FormatName::Humannerf => Layout::HumanNerf,
         FormatName::ZjuMocap => Layout::ZjuMocap,
@@ -131,7 +131,7 @@ pub fn synth(arguments: &SynthArguments) -> Result<()> {
     let partial = beside(out)?;
     let written = write(&synthetic, &partial, layout).and_then(|()| {
         if out.exists() {
-            vacant(out, arguments.force)?;
+            vacant(out, arguments.force, MARK)?;
             std::fs::remove_dir_all(out).with_context(|| out.display().to_string())?;
         }
         std::fs::rename(&partial, out).with_context(|| out.display().to_string())
@@ -163,8 +163,9 @@ fn write(synthetic: &Synthetic, directory: &Path, layout: Layout) -> Result<()> 
     crate::run::write(&directory.join(MARK), &serde_json::to_string_pretty(&mark)?)
 }
 
-/// Errors unless `out` may be written: absent, empty, or an earlier result that is to be replaced.
-fn vacant(out: &Path, force: bool) -> Result<()> {
+/// Errors unless `out` may be written: absent, empty, or an earlier result of the command that leaves `mark`, to be
+/// replaced.
+pub fn vacant(out: &Path, force: bool, mark: &str) -> Result<()> {
     let Ok(entries) = std::fs::read_dir(out) else {
         ensure!(!out.exists(), "{}: not a directory", out.display());
         return Ok(());
@@ -172,13 +173,14 @@ fn vacant(out: &Path, force: bool) -> Result<()> {
     if entries.count() == 0 {
         return Ok(());
     }
-    ensure!(out.join(MARK).is_file(), "{}: not empty, and not written by synth (no {MARK})", out.display());
+    let command = mark.trim_end_matches(".json");
+    ensure!(out.join(mark).is_file(), "{}: not empty, and not written by {command} (no {mark})", out.display());
     ensure!(force, "{}: already holds a capture (--force replaces it)", out.display());
     Ok(())
 }
 
 /// A free name in the same folder.
-fn beside(out: &Path) -> Result<PathBuf> {
+pub fn beside(out: &Path) -> Result<PathBuf> {
     let Some(name) = out.file_name() else { bail!("{}: not a name for a directory", out.display()) };
     let partial = out.with_file_name(format!("{}.partial-{}", name.to_string_lossy(), std::process::id()));
     ensure!(!partial.exists(), "{}: in the way", partial.display());

@@ -8,7 +8,8 @@ use rayon::prelude::*;
 use smpl::{BodyModel, Placement};
 
 use super::camera::Lens;
-use super::files::Files;
+use super::files::{Files, decoding_bytes};
+use super::gate::Gate;
 use super::image::dimensions;
 use super::source::PixelSource;
 use super::{CaptureError, Frame, LoadOptions, checks};
@@ -38,13 +39,24 @@ pub(super) struct Planned {
     pub betas: Vec<f32>,
 }
 
-/// Bytes of memory, shared out first come, first served.
-pub(super) struct Budget(u64);
+/// Bytes of memory for pictures that are kept, shared out first come, first served, and the way to those for decoding.
+pub(super) struct Budget {
+    left: u64,
+    gate: Arc<Gate>,
+}
 
 impl Budget {
+    /// `left` bytes of which those for decoding are put aside: `picture` for every thread, but at most a quarter unless
+    /// one picture takes more.
+    fn new(left: u64, picture: u64) -> Self {
+        let threads = rayon::current_num_threads() as u64;
+        let aside = (picture.saturating_mul(threads)).min(left / 4).max(picture);
+        Self { left: left.saturating_sub(aside), gate: Arc::new(Gate::new(aside)) }
+    }
+
     fn take(&mut self, bytes: u64) -> bool {
-        let left = self.0.checked_sub(bytes);
-        self.0 = left.unwrap_or(self.0);
+        let left = self.left.checked_sub(bytes);
+        self.left = left.unwrap_or(self.left);
         left.is_some()
     }
 }
@@ -72,6 +84,11 @@ impl View {
         u64::from(width) * u64::from(height) * PIXEL_BYTES
     }
 
+    /// Bytes that decoding a frame takes.
+    fn decoding_bytes(&self) -> u64 {
+        decoding_bytes(self.size)
+    }
+
     /// The frames, checked together. Pictures that `budget` has room for are decoded; headers are read of all.
     pub fn frames(
         self,
@@ -86,7 +103,8 @@ impl View {
             let Planned { name, image, masks, labels, occluder, hidden, lens, pose, placement, betas } = plan;
             let camera = volrender::Camera { width: size.0, height: size.1, ..lens.camera };
             let first = Arc::clone(&first);
-            let files = Files { image, masks, labels, occluder, hidden, lens, size, to, first };
+            let gate = Arc::clone(&budget.gate);
+            let files = Files { image, masks, labels, occluder, hidden, lens, size, to, first, gate };
             let source = PixelSource::on_disk(files, budget.take(bytes));
             Frame { name, source, camera: camera.resized(to.0, to.1), pose, placement, betas }
         };
@@ -101,8 +119,8 @@ impl View {
     }
 }
 
-/// Bytes for pixels that [`LoadOptions::max_bytes`] leaves beside the bodies of all views. Errors where that is not one picture,
-/// naming values that fit.
+/// Bytes for pixels that [`LoadOptions::max_bytes`] leaves beside the bodies of all views. Errors where no picture can be
+/// decoded in that, naming values that fit.
 pub(super) fn budget(
     train: &View,
     eval: &[View],
@@ -120,18 +138,11 @@ pub(super) fn budget(
         (frames + views) as u64 * body_bytes + frames as u64 * train.picture_bytes(options).div_ceil(LABELS_SHARE)
     };
     let bodies = kept(1, 1);
-    let picture = views().map(|view| view.picture_bytes(options)).max().unwrap_or(0);
+    let picture = views().map(View::decoding_bytes).max().unwrap_or(0);
     if bodies + picture <= limit {
-        return Ok(Budget(limit - bodies));
+        return Ok(Budget::new(limit - bodies, picture));
     }
     let mut ways = Vec::new();
-    if bodies < limit {
-        let side = views().map(|view| options.resized(view.size)).map(|(w, h)| w.max(h)).max().unwrap_or(1);
-        let resize = (f64::from(side) * ((limit - bodies) as f64 / picture as f64).sqrt()).floor();
-        if resize >= 1.0 {
-            ways.push(format!("resize {resize}"));
-        }
-    }
     let longest = views().map(|view| view.frames.len()).max().unwrap_or(1);
     let fits = |n: usize, m: usize| kept(n, m) + picture <= limit;
     if let Some(n) = (2..=longest).find(|&n| fits(n, n)) {
@@ -148,6 +159,6 @@ pub(super) fn budget(
     let frames: usize = views().map(|view| view.frames.len()).sum();
     let expected =
         format!("all bodies and a picture within {} MiB (would fit: {})", mebibytes(limit), ways.join(", or "));
-    let actual = format!("{frames} bodies of {} vertices and {picture} bytes a picture", body.num_vertices());
+    let actual = format!("{frames} bodies of {} vertices and {picture} bytes to decode a picture", body.num_vertices());
     Err(CaptureError::setting("max_bytes", expected, actual))
 }

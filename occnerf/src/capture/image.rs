@@ -113,7 +113,7 @@ pub(super) fn dimensions(path: &Path) -> Result<(u32, u32), CaptureError> {
     Ok((width, height))
 }
 
-fn decode(path: &Path) -> Result<DynamicImage, CaptureError> {
+pub(super) fn decode(path: &Path) -> Result<DynamicImage, CaptureError> {
     dimensions(path)?;
     open(path)?.decode().map_err(|source| picture_error(path, source))
 }

@@ -5,6 +5,7 @@
 //! training.
 
 mod camera;
+mod check;
 mod checks;
 mod decode;
 mod demo;
@@ -12,8 +13,10 @@ mod error;
 mod files;
 mod find;
 mod frame;
+mod gate;
 mod humannerf;
 mod image;
+mod import;
 mod names;
 mod obstacle;
 mod options;
@@ -30,11 +33,13 @@ mod wild;
 mod write;
 mod zju;
 
+pub use self::check::{Check, Fault, FrameCheck, Mistake, body_silhouette, check, photograph, unknown_pixels};
 pub use self::demo::{DemoConfig, demo};
 pub use self::error::CaptureError;
 pub use self::find::{Layout, find_body, own_body};
 pub use self::frame::{Capture, EvalFrame, Frame};
 pub use self::image::Image;
+pub use self::import::{ImportOptions, Imported, Tool, import};
 pub use self::obstacle::Obstacle;
 pub use self::options::LoadOptions;
 pub use self::perturbation::Perturbation;

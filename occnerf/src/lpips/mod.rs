@@ -3,8 +3,7 @@
 
 mod conv;
 mod maps;
-mod tensor;
-mod torch;
+
 mod trunk;
 mod unit;
 mod weights;

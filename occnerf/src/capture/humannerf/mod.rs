@@ -22,7 +22,7 @@ use smpl::BodyModel;
 use super::camera::Lens;
 use super::decode::{Planned, View, budget};
 use super::names::FrameName;
-use super::pictures::{Pictures, file_name};
+use super::pictures::{Pictures, file_name, is_directory};
 use super::records::{Record, Records};
 use super::{Capture, CaptureError, EvalFrame, LoadOptions, checks};
 
@@ -153,13 +153,13 @@ fn mean_betas(dir: &Path, body: &BodyModel) -> Result<Vec<f32>, CaptureError> {
 /// `eval/*/` in the order of their names; none where there is no `eval`.
 fn eval_directories(dir: &Path) -> Result<Vec<PathBuf>, CaptureError> {
     let root = dir.join("eval");
-    if !root.exists() {
+    if !is_directory(&root)? {
         return Ok(Vec::new());
     }
     let mut found = Vec::new();
     for entry in std::fs::read_dir(&root).map_err(CaptureError::io(&root))? {
         let path = entry.map_err(CaptureError::io(&root))?.path();
-        if path.is_dir() {
+        if is_directory(&path)? {
             found.push(path);
         }
     }

@@ -23,7 +23,7 @@ use smpl::{BodyModel, Placement};
 use super::camera::Lens;
 use super::decode::{Planned, View, budget};
 use super::names::FrameName;
-use super::pictures::{Pictures, file_name};
+use super::pictures::{Pictures, file_name, is_directory};
 use super::records::Record;
 use super::{Capture, CaptureError, EvalFrame, LoadOptions, checks};
 
@@ -51,6 +51,7 @@ pub(super) fn load(dir: &Path, body: &BodyModel, options: &LoadOptions) -> Resul
 
     let clean = dir.join(CLEAN);
     let (mut indices, mut kept) = (Vec::new(), Vec::new());
+    is_directory(&clean)?;
     if let Some(images) = optional(&clean.join("images"))? {
         let masks = Pictures::list(&clean.join("masks"))?;
         for (index, (FrameName(name), record)) in frames.iter().enumerate().step_by(options.eval_stride) {
@@ -78,7 +79,7 @@ pub(super) fn load(dir: &Path, body: &BodyModel, options: &LoadOptions) -> Resul
 }
 
 fn optional(dir: &Path) -> Result<Option<Pictures>, CaptureError> {
-    if dir.is_dir() { Pictures::list(dir).map(Some) } else { Ok(None) }
+    if is_directory(dir)? { Pictures::list(dir).map(Some) } else { Ok(None) }
 }
 
 fn plan(

@@ -223,8 +223,8 @@ fn pictures_decoded_on_demand_are_those_decoded_at_once() {
             let bodies = (all.train.len() + all.eval.len()) * body.num_vertices() * 36;
             let picture = 40 * 40 * 16usize;
             let labels = all.train.len() * picture.div_ceil(42);
-            // Room for the pictures of two frames.
-            let on_demand = LoadOptions { max_bytes: (bodies + labels + 2 * picture) as u64, ..at_once };
+            // Room for the pictures of two frames, and to decode another.
+            let on_demand = LoadOptions { max_bytes: (bodies + labels + 2 * picture + 48 * 48 * 48) as u64, ..at_once };
             let few = read(&on_demand);
             let frames = |capture: &Capture| -> Vec<Frame> {
                 capture.train.iter().chain(capture.eval.iter().map(|e| &e.frame)).cloned().collect()

@@ -27,7 +27,7 @@ use smpl::{BodyModel, Placement};
 use self::annots::Annots;
 use super::decode::{Planned, View, budget};
 use super::image::dimensions;
-use super::pictures::file_name;
+use super::pictures::{file_name, is_directory};
 use super::records::{Record, Records, triples};
 use super::{Capture, CaptureError, EvalFrame, LoadOptions, checks};
 
@@ -81,7 +81,10 @@ pub(super) fn load(dir: &Path, body: &BodyModel, options: &LoadOptions) -> Resul
     for other in (0..annots.lenses.len()).filter(|&c| c != camera) {
         let mut kept = Vec::new();
         for index in (0..instants.len()).step_by(options.eval_stride) {
-            let there = annots.picture(instants[index], other).is_some_and(|path| dir.join(path).is_file());
+            let there = match annots.picture(instants[index], other).map(|path| dir.join(path)) {
+                Some(path) => !is_directory(&path)? && path.is_file(),
+                None => false,
+            };
             if let Some(frame) = if there { plan(other, index)? } else { None } {
                 kept.push(frame);
                 indices.push((other, index));
