@@ -7,7 +7,8 @@ use super::CaptureError;
 use super::checks::MAX_DISTANCE;
 use super::records::Record;
 
-/// Largest |R Rᵀ − I| of an extrinsic rotation; files written in `f32` or with a few decimals stay far below.
+/// Largest |R Rᵀ − I| of an extrinsic rotation; files written in `f32` or with a few decimals stay
+/// far below.
 const ORTHONORMAL: f32 = 1e-3;
 /// Focal lengths, in pixels, from a fisheye's on a picture of a few pixels to a telescope's.
 const FOCAL: (f32, f32) = (0.01, 1e7);
@@ -54,7 +55,8 @@ pub(super) fn pinhole(k: &[f32], extrinsics: Affine3A, pixel_centre: f32) -> Res
 }
 
 impl Lens {
-    /// From a 3×3 matrix under `k`, a 3×4 or 4×4 one under `e`, and five numbers under `distortions` if there are any.
+    /// From a 3×3 matrix under `k`, a 3×4 or 4×4 one under `e`, and five numbers under
+    /// `distortions` if there are any.
     pub fn read(record: &Record<'_>, k: &str, e: &str, pixel_centre: f32) -> Result<Self, CaptureError> {
         let intrinsics = record.shaped(k, &[3, 3], "")?;
         let (shape, values) = record.array(e)?;

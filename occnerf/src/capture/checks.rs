@@ -8,8 +8,9 @@ use smpl::{BodyModel, Placement};
 use super::records::{Record, triples};
 use super::{CaptureError, Frame};
 
-/// How far a joint may be from where the file has it, as a fraction of the body's largest extent: 4 cm at 1.7 m.
-/// The same model agrees to rounding, another model of a person is several times as far off.
+/// How far a joint may be from where the file has it, as a fraction of the body's largest extent: 4
+/// cm at 1.7 m. The same model agrees to rounding, another model of a person is several times as
+/// far off.
 const JOINT_TOLERANCE: f32 = 0.04 / 1.7;
 
 /// Largest component of a rotation that is taken for one, in radians: more turns than anybody takes in a video.

@@ -16,7 +16,8 @@ use super::{CaptureError, Frame, LoadOptions, checks};
 
 /// Bytes that a pixel of a frame takes: three colours and coverage.
 const PIXEL_BYTES: u64 = 16;
-/// Bytes that a vertex of a frame's body takes once it is prepared: at rest, its pose offset, and posed.
+/// Bytes that a vertex of a frame's body takes once it is prepared: at rest, its pose offset, and
+/// posed.
 const VERTEX_BYTES: u64 = 36;
 /// A training frame's labels take this part of the bytes of its pixels: see [`crate::Labels`].
 const LABELS_SHARE: u64 = 42;
@@ -108,7 +109,8 @@ impl View {
             Frame { name, source, camera: camera.resized(to.0, to.1), pose, placement, betas }
         };
         let frames: Vec<Frame> = self.frames.into_iter().map(frame).collect();
-        // Collected as results first, so that the error reported is the first in order whatever finishes first.
+        // Collected as results first, so that the error reported is the first in order whatever
+        // finishes first.
         let checked: Vec<Result<(), CaptureError>> = frames.par_iter().map(|f| f.source.check()).collect();
         checked.into_iter().collect::<Result<(), CaptureError>>()?;
         checks::subject_is_seen(&self.masks, &frames)?;
@@ -128,7 +130,8 @@ pub(super) fn budget(
     let limit = options.max_bytes;
     let body_bytes = body.num_vertices() as u64 * VERTEX_BYTES;
     let views = || std::iter::once(train).chain(eval);
-    // Bytes of what is kept of every frame: of every n-th in training, and of every m-th view kept back.
+    // Bytes of what is kept of every frame: of every n-th in training, and of every m-th view kept
+    // back.
     let kept = |n: usize, m: usize| {
         let (frames, views) =
             (train.frames.len().div_ceil(n), eval.iter().map(|v| v.frames.len().div_ceil(m)).sum::<usize>());

@@ -41,7 +41,8 @@ pub(super) fn decoding_bytes((width, height): (u32, u32)) -> u64 {
 }
 
 impl Files {
-    /// Whether the headers say what they should; nothing is decoded that the memory check did not count.
+    /// Whether the headers say what they should; nothing is decoded that the memory check did not
+    /// count.
     pub fn check(&self) -> Result<(), CaptureError> {
         self.same_size(&self.image, dimensions(&self.image)?)?;
         self.masks.iter().chain(&self.occluder).try_for_each(|path| self.same_size(path, dimensions(path)?))

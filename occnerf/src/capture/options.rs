@@ -5,15 +5,18 @@ use super::image::MAX_SIDE;
 use super::obstacle::Obstacle;
 use super::perturbation::Perturbation;
 
-/// What a capture's files leave open, and how much of them is read. Every layout obeys all of it, but `camera` and
-/// `occlusion`, which only raw ZJU-MoCap leaves open. Two are equal where they read the same: `max_bytes` is not compared.
+/// Settings that a capture's files leave open, and how much of them is read. Every layout obeys all
+/// of it, but `camera` and `occlusion`, which only raw ZJU-MoCap leaves open. Two are equal where
+/// they read the same: `max_bytes` is not compared.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct LoadOptions {
-    /// Where the intrinsics put the centre of the first pixel: 0.5 where they count from the image's corner, 0
-    /// where they count from the first pixel's centre, as HumanNeRF's own rays do.
+    /// Where the intrinsics put the centre of the first pixel: 0.5 where they count from the
+    /// image's corner, 0 where they count from the first pixel's centre, as HumanNeRF's own rays
+    /// do.
     pub pixel_centre: f32,
-    /// Longest side in pixels that pictures are reduced to; smaller ones, and all if `None`, stay as they are.
+    /// Longest side in pixels that pictures are reduced to; smaller ones, and all if `None`, stay
+    /// as they are.
     pub resize: Option<u32>,
     /// Training frames are every n-th, beginning with the first.
     pub stride: usize,
@@ -27,8 +30,8 @@ pub struct LoadOptions {
     pub max_bytes: u64,
     /// The training camera: its folder's name, or its number counted from 1. The first if `None`.
     pub camera: Option<String>,
-    /// The simulated obstacle before the training camera. `None`: what the capture's `occlusion.json` says, or the
-    /// default [`Obstacle`] where there is none.
+    /// The simulated obstacle before the training camera. `None`: what the capture's
+    /// `occlusion.json` says, or the default [`Obstacle`] where there is none.
     pub occlusion: Option<Obstacle>,
     /// Errors added on purpose.
     pub wrong: Perturbation,

@@ -113,8 +113,8 @@ pub(super) fn find(path: &Path) -> Result<Found, Error> {
     Err(damaged.or(lonely).unwrap_or_else(|| fault(path, "has no .safetensors, .pth or .pt file with a trunk in it")))
 }
 
-/// The files that can be read, and what is wrong with the first that cannot: it matters where what is needed is in none of the
-/// others.
+/// The files that can be read, and what is wrong with the first that cannot: it matters where what
+/// is needed is in none of the others.
 fn open_all(paths: &[PathBuf]) -> (Vec<Weights>, Option<Error>) {
     let (mut open, mut damaged) = (Vec::new(), None);
     for path in paths {
@@ -288,7 +288,8 @@ fn safetensors(path: &Path, file: &mut File) -> Result<BTreeMap<String, Tensor>,
     let found = length - 8 - header;
     let mut tensors = BTreeMap::new();
     for (name, info) in metadata.tensors() {
-        // Types and shapes fit the offsets: safetensors has looked. Whether the bytes are there it cannot know.
+        // Types and shapes fit the offsets: safetensors has looked. Whether the bytes are there it
+        // cannot know.
         let (start, end) = (info.data_offsets.0 as u64, info.data_offsets.1 as u64);
         if end > found {
             let (dtype, shape) = (info.dtype, &info.shape);

@@ -2,13 +2,15 @@
 //!
 //! ```text
 //! images/NAME.png …       masks/NAME.png …      (PNG or JPEG; masks 0 to 255, the visible person)
-//! metadata.json           {NAME: {poses (3J), betas (≤ B), cam_intrinsics (3,3), cam_extrinsics (4,4), distortions (5)?}}
+//! metadata.json           {NAME: {poses (3J), betas (≤ B), cam_intrinsics (3,3),
+//!                          cam_extrinsics (4,4), distortions (5)?}}
 //! occluders/NAME.png …    where known: 255 where something stands in front of the person
 //! clean/images, masks/    some of the frames again without occluders, kept back
 //! ```
 //!
-//! The pose's first joint turns the body about its pelvis; the extrinsics hold the body's translation. Frames are the
-//! entries of `metadata.json` in the order of their names, `10` after `9`; pictures that it does not mention are left out.
+//! The pose's first joint turns the body about its pelvis; the extrinsics hold the body's
+//! translation. Frames are the entries of `metadata.json` in the order of their names, `10` after
+//! `9`; pictures that it does not mention are left out.
 
 mod metadata;
 #[cfg(test)]

@@ -283,7 +283,8 @@ fn the_shared_captures_are_read_and_the_body_covers_the_subject() {
             assert_eq!(capture.train[eval.train_index].name, eval.frame.name);
             assert!(overlap(&eval.frame, &body) > 0.6, "{} {}", eval.frame.name, overlap(&eval.frame, &body));
         }
-        // The published person also where the occluders are known, which are never on the subject's mask.
+        // The published person also where the occluders are known, which are never on the subject's
+        // mask.
         for frame in capture.train.iter().step_by(13) {
             let pixels = frame.shown();
             let occluder = pixels.occluder.as_ref().unwrap();

@@ -204,7 +204,8 @@ fn half_covered_pixels_stay_on_their_side() {
     assert_eq!([0.0, 0.25, 0.5, 0.75, 1.0, -1.0, 7.0, f32::NAN].map(byte), [0, 64, 127, 191, 255, 0, 255, 0]);
 }
 
-/// Whatever is done to them: resized, behind an obstacle that moves, with masks too large or too small.
+/// Whatever is done to them: resized, behind an obstacle that moves, with masks too large or too
+/// small.
 #[test]
 fn pictures_decoded_on_demand_are_those_decoded_at_once() {
     for (layout, made) in LAYOUTS.map(|layout| (layout, central())) {

@@ -1,4 +1,5 @@
-//! Every fault of a capture is one line that names the file, the key, what was expected and what was found.
+//! Every fault of a capture is one line that names the file, the key, what was expected and what
+//! was found.
 
 use super::fixture::Fixture;
 use crate::capture::testing::{Py, array, body};
