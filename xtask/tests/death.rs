@@ -169,7 +169,11 @@ fn a_training_killed_at_any_moment_ends_the_same_to_the_bit() {
             lives += 1;
             let arguments = |out: &Path| {
                 let resume = out.join("config.toml").is_file();
-                of(out, "240", &[&["--checkpoint-every", interval][..], if resume { &["--resume"] } else { &[] }].concat())
+                of(
+                    out,
+                    "240",
+                    &[&["--checkpoint-every", interval][..], if resume { &["--resume"] } else { &[] }].concat(),
+                )
             };
             let work = Work { name: "train", out: out.clone(), arguments: &arguments };
             until_it_ends(&work, 1500, &mut random, 12, &mut toll);

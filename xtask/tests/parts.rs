@@ -25,7 +25,8 @@ fn parts_of_a_reproduction_make_the_table_that_one_job_makes() {
     let without = "humannerf-bg,humannerf-bg-4x,humannerf-bg-time,humannerf,humannerf-4x,humannerf-time,hash-point-bg,\
                    occnerf-bg,occnerf-published,no-surface,no-attention,no-completeness,no-perceptual";
     let command = |out: &Path, more: &[&str]| -> Vec<String> {
-        let all = ["reproduce", text(&capture), "--out", text(out), "--steps", "2", "--seeds", "2", "--without", without];
+        let all =
+            ["reproduce", text(&capture), "--out", text(out), "--steps", "2", "--seeds", "2", "--without", without];
         all.iter().chain(more).map(|word| (*word).to_owned()).collect()
     };
     let run = |words: &[String]| done(&words.iter().map(String::as_str).collect::<Vec<_>>());

@@ -192,10 +192,12 @@ fn metadata_of_captures() {
 
 #[test]
 fn configurations() {
-    Attack { name: "TOML", form: Form::Plain, seeds: seeds::configurations(), share: 30, most: 64 * MIB }.run(|bytes| {
-        let Ok(text) = std::str::from_utf8(bytes) else { return false };
-        toml::from_str::<Config>(text).is_ok_and(|config| config.validate().is_ok())
-    });
+    Attack { name: "TOML", form: Form::Plain, seeds: seeds::configurations(), share: 30, most: 64 * MIB }.run(
+        |bytes| {
+            let Ok(text) = std::str::from_utf8(bytes) else { return false };
+            toml::from_str::<Config>(text).is_ok_and(|config| config.validate().is_ok())
+        },
+    );
 }
 
 /// Sizes are those of the configuration in the file, which is bounded by itself: only the sizes of the seed are opened.
@@ -203,8 +205,7 @@ fn configurations() {
 fn checkpoints() {
     let path = place("checkpoint.safetensors");
     let (scene, seed, config) = seeds::checkpoint();
-    let attack =
-        Attack { name: "checkpoint", form: Form::Safetensors, seeds: vec![seed], share: 30, most: 64 * MIB };
+    let attack = Attack { name: "checkpoint", form: Form::Safetensors, seeds: vec![seed], share: 30, most: 64 * MIB };
     attack.run(|bytes| {
         std::fs::write(&path, bytes).unwrap();
         match checkpoint_config(&path) {

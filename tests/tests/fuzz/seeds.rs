@@ -161,7 +161,8 @@ fn encoded(picture: &image::DynamicImage, format: image::ImageFormat) -> Vec<u8>
 
 pub fn pngs() -> Vec<Vec<u8>> {
     let rgb = image::RgbImage::from_fn(9, 7, |x, y| image::Rgb([x as u8 * 20, y as u8 * 30, 9]));
-    let deep = image::ImageBuffer::<image::Rgba<u16>, _>::from_fn(5, 4, |x, y| image::Rgba([x as u16, y as u16, 9, 65535]));
+    let deep =
+        image::ImageBuffer::<image::Rgba<u16>, _>::from_fn(5, 4, |x, y| image::Rgba([x as u16, y as u16, 9, 65535]));
     let grey = image::GrayImage::from_fn(16, 3, |x, _| image::Luma([x as u8]));
     [rgb.into(), image::DynamicImage::ImageRgba16(deep), grey.into()]
         .map(|picture| encoded(&picture, image::ImageFormat::Png))
