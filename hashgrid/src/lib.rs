@@ -47,6 +47,11 @@ mod jacobian;
 mod layout;
 mod simd;
 
+/// The README's examples, compiled as tests.
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+struct Readme;
+
 pub use config::{Error, HashGridConfig, MAX_LOG2_TABLE_SIZE, MAX_PARAMETERS, MAX_RESOLUTION};
 pub use grid::HashGrid;
 pub use layout::Layout;

@@ -49,6 +49,11 @@ mod search;
 mod tree;
 mod triangle;
 
+/// The README's examples, compiled as tests.
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+struct Readme;
+
 pub use blend::Blended;
 pub use distance::{Closest, MeshDistance};
 pub use error::Error;

@@ -47,6 +47,11 @@ mod tree;
 mod triangle;
 mod view;
 
+/// The README's examples, compiled as tests.
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+struct Readme;
+
 pub use counts::VisibilityCounts;
 pub use error::Error;
 pub use raster::{Fragment, Pixel, RasterOptions, Rasterizer, Samples};

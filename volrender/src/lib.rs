@@ -48,6 +48,11 @@ mod ray;
 mod sampling;
 mod simd;
 
+/// The README's examples, compiled as tests.
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+struct Readme;
+
 pub use camera::{Camera, Error};
 pub use composite::{Composite, RaySamples, composite};
 pub use composite_backward::{SampleGradients, composite_backward};

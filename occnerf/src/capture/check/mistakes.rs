@@ -75,6 +75,8 @@ const DEGREES_SHARE: f32 = 0.05;
 const BETTER: f32 = 1.3;
 const BETTER_BY: f32 = 0.12;
 const COVERS: f32 = 0.75;
+/// Share of the picture's border that masks may have.
+const BORDER: f32 = 0.5;
 /// A fit that covers less of the mask than this is wrong.
 const BESIDE: f32 = 0.5;
 /// A frame shift must be this many standard errors better than none, and by this much.
@@ -140,8 +142,13 @@ pub(super) fn find(capture: &Capture, body: &BodyModel, views: &[View]) -> Vec<M
         Mistake::Unit(1000.0),
         Mistake::Unit(100.0),
         Mistake::Unit(0.001),
-        Mistake::MaskInverted,
     ];
+    // Masks of nearly everything look best with a body that fills the picture: they are judged first.
+    let around = views.iter().map(View::border).sum::<f32>() / views.len().max(1) as f32;
+    let (iou, covers) = mean(&overlaps(&posed, body, Some(Mistake::MaskInverted)));
+    if around > BORDER && iou > given && covers > given {
+        return vec![Mistake::MaskInverted];
+    }
     let undone = others.into_iter().chain(focal).filter_map(|mistake| {
         let (iou, covers) = mean(&overlaps(&posed, body, Some(mistake)));
         let better = iou > BETTER * given && iou > given + BETTER_BY && covers > COVERS;

@@ -109,19 +109,28 @@ struct View {
 /// # Errors
 /// Pictures that cannot be read.
 pub fn check(capture: &Capture, body: &BodyModel) -> Result<Check, CaptureError> {
-    let small: Vec<Result<View, CaptureError>> =
-        capture.train.par_iter().enumerate().map(|(i, frame)| View::new(i, frame)).collect();
-    let small: Vec<View> = small.into_iter().collect::<Result<_, _>>()?;
+    let small = small_views(capture)?;
     let mut frames: Vec<FrameCheck> =
         small.par_iter().map(|view| one(&capture.train[view.index], view, body)).collect();
     for (frame, faults) in frames.iter_mut().zip(jumps::find(capture, body)) {
         frame.faults.extend(faults);
     }
+    let mistakes = likely(capture, body, small);
+    Ok(Check { frames, surface_seen: surface_seen(capture, body)?, mistakes })
+}
+
+/// The mistakes that some of the frames with a mask tell of.
+fn likely(capture: &Capture, body: &BodyModel, small: Vec<View>) -> Vec<Mistake> {
     let shown: Vec<View> = small.into_iter().filter(|view| view.mask.contains(&true)).collect();
     let every = shown.len().div_ceil(VIEWS).max(1);
     let views: Vec<View> = shown.into_iter().step_by(every).collect();
-    let mistakes = if views.is_empty() { Vec::new() } else { mistakes::find(capture, body, &views) };
-    Ok(Check { frames, surface_seen: surface_seen(capture, body)?, mistakes })
+    if views.is_empty() { Vec::new() } else { mistakes::find(capture, body, &views) }
+}
+
+fn small_views(capture: &Capture) -> Result<Vec<View>, CaptureError> {
+    let small: Vec<Result<View, CaptureError>> =
+        capture.train.par_iter().enumerate().map(|(i, frame)| View::new(i, frame)).collect();
+    small.into_iter().collect()
 }
 
 /// Pixels (H × W) of a frame's picture that the posed body covers.
@@ -181,6 +190,16 @@ impl View {
         let mask = (0..count).map(|i| pixels.mask[source(i)] > 0.5).collect();
         let occluder = pixels.occluder.as_ref().map(|o| (0..count).map(|i| o[source(i)]).collect());
         Ok(Self { index, camera, mask, occluder })
+    }
+}
+
+impl View {
+    /// Share of the picture's border that the mask has.
+    fn border(&self) -> f32 {
+        let (width, height) = (self.camera.width as usize, self.camera.height as usize);
+        let outer = |i: usize| i < width || i >= width * (height - 1) || i % width == 0 || i % width == width - 1;
+        let border: Vec<bool> = (0..self.mask.len()).filter(|&i| outer(i)).map(|i| self.mask[i]).collect();
+        border.iter().filter(|mask| **mask).count() as f32 / border.len().max(1) as f32
     }
 }
 

@@ -118,9 +118,9 @@ fn good_captures_raise_no_alarm() {
             alarms.push(format!("{name}: {:?}, {} faults", whole.mistakes, faults(&whole)));
         }
         for window in windows(&capture, 20, 20) {
-            let part = check(&window, &body).unwrap();
-            if !part.mistakes.is_empty() {
-                alarms.push(format!("{name} from {}: {:?}", window.train[0].name, part.mistakes));
+            let mistakes = likely(&window, &body, small_views(&window).unwrap());
+            if !mistakes.is_empty() {
+                alarms.push(format!("{name} from {}: {mistakes:?}", window.train[0].name));
             }
         }
     }
@@ -150,7 +150,8 @@ fn each_mistake_is_found() {
         let (mut trials, mut found, mut others) = (0, 0, Vec::new());
         for (name, capture, body) in &captures {
             for window in windows(capture, 30, 30) {
-                let mistakes = check(&made(mistake, &window, body), body).unwrap().mistakes;
+                let wrong = made(mistake, &window, body);
+                let mistakes = likely(&wrong, body, small_views(&wrong).unwrap());
                 trials += 1;
                 if mistakes.first().is_some_and(|first| same(*first, mistake)) {
                     found += 1;

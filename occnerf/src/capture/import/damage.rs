@@ -90,13 +90,14 @@ fn mutated(whole: &[u8], places: &[usize], stream: &mut Stream) -> Vec<u8> {
 /// Entries of an archive, and an archive of entries: checksums are right, so that damage within is met.
 fn unzipped(bytes: &[u8]) -> Vec<(String, Vec<u8>)> {
     let mut zip = ZipArchive::new(Cursor::new(bytes)).unwrap();
-    let entry = |i: usize| {
+    let mut entries = Vec::new();
+    for i in 0..zip.len() {
         let mut entry = zip.by_index(i).unwrap();
         let mut bytes = Vec::new();
         entry.read_to_end(&mut bytes).unwrap();
-        (entry.name().unwrap().to_string(), bytes)
-    };
-    (0..zip.len()).map(entry).collect()
+        entries.push((entry.name().unwrap().to_string(), bytes));
+    }
+    entries
 }
 
 fn zipped(entries: &[(String, Vec<u8>)]) -> Vec<u8> {

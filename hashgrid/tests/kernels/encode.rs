@@ -1,9 +1,7 @@
 //! The encoding against the plain one of the test kit.
 
-mod common;
-
+use crate::common::{encode, encode_rows, oracle, points, table};
 use approx::{abs_diff_eq, assert_abs_diff_eq};
-use common::{encode, encode_rows, oracle, points, table};
 use hashgrid::HashGrid;
 use proptest::prelude::*;
 
@@ -110,7 +108,7 @@ fn splitting_the_points_changes_no_bit() {
     let grid = HashGrid::<4>::with_resolutions(&[3, 20, 50], 2, 10).unwrap();
     let table = table(&grid, 1);
     let points: Vec<[f32; 4]> =
-        common::noise(4 * 40_000, 2).as_chunks::<4>().0.iter().map(|p| p.map(|x| 0.5 + 0.5 * x)).collect();
+        crate::common::noise(4 * 40_000, 2).as_chunks::<4>().0.iter().map(|p| p.map(|x| 0.5 + 0.5 * x)).collect();
     let together = encode_rows(&grid, &table, &points);
     for size in [1, 7, 16, 17, 5000] {
         let apart: Vec<f32> = points.chunks(size).flat_map(|p| encode_rows(&grid, &table, p)).collect();

@@ -1,9 +1,7 @@
 //! The backward passes against finite differences, and as adjoints of the forward.
 
-mod common;
-
+use crate::common::{dot, encode, noise, points, table};
 use approx::abs_diff_eq;
-use common::{dot, encode, noise, points, table};
 use hashgrid::HashGrid;
 use proptest::prelude::*;
 use testkit::gradient::{Tolerance, assert_gradient};
