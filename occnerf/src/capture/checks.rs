@@ -13,7 +13,8 @@ use super::{CaptureError, Frame};
 /// far off.
 const JOINT_TOLERANCE: f32 = 0.04 / 1.7;
 
-/// Largest component of a rotation that is taken for one, in radians: more turns than anybody takes in a video.
+/// Largest component of a rotation that is taken for one, in radians: more turns than anybody takes
+/// in a video.
 const MAX_ANGLE: f32 = 1e3;
 /// Largest shape coefficient, in standard deviations.
 const MAX_BETA: f32 = 1e3;

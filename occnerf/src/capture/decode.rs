@@ -39,15 +39,16 @@ pub(super) struct Planned {
     pub betas: Vec<f32>,
 }
 
-/// Bytes of memory for pictures that are kept, shared out first come, first served, and the way to those for decoding.
+/// Bytes of memory for pictures that are kept, shared out first come, first served, and the way to
+/// those for decoding.
 pub(super) struct Budget {
     left: u64,
     gate: Arc<Gate>,
 }
 
 impl Budget {
-    /// `left` bytes of which those for decoding are put aside: `picture` for every thread, but at most a quarter unless
-    /// one picture takes more.
+    /// `left` bytes of which those for decoding are put aside: `picture` for every thread, but at
+    /// most a quarter unless one picture takes more.
     fn new(left: u64, picture: u64) -> Self {
         let threads = rayon::current_num_threads() as u64;
         let aside = (picture.saturating_mul(threads)).min(left / 4).max(picture);
@@ -89,7 +90,8 @@ impl View {
         decoding_bytes(self.size)
     }
 
-    /// The frames, checked together. Pictures that `budget` has room for are decoded; headers are read of all.
+    /// The frames, checked together. Pictures that `budget` has room for are decoded; headers are
+    /// read of all.
     pub fn frames(
         self,
         body: &BodyModel,
@@ -119,8 +121,8 @@ impl View {
     }
 }
 
-/// Bytes for pixels that [`LoadOptions::max_bytes`] leaves beside the bodies of all views. Errors where no picture can be
-/// decoded in that, naming values that fit.
+/// Bytes for pixels that [`LoadOptions::max_bytes`] leaves beside the bodies of all views. Errors
+/// where no picture can be decoded in that, naming values that fit.
 pub(super) fn budget(
     train: &View,
     eval: &[View],

@@ -16,8 +16,9 @@ impl Gate {
         Self { limit, taken: Mutex::new(0), freed: Condvar::new() }
     }
 
-    /// Runs `work`, which takes so many bytes and no thread but this one: who waits here must not keep who is inside from
-    /// ending. What is larger than all that was put aside has the gate to itself.
+    /// Runs `work`, which takes so many bytes and no thread but this one: who waits here must not
+    /// keep who is inside from ending. What is larger than all that was put aside has the gate to
+    /// itself.
     pub fn pass<T>(&self, bytes: u64, work: impl FnOnce() -> T) -> T {
         let fits = |taken: &mut u64| *taken > 0 && taken.saturating_add(bytes) > self.limit;
         // A decoder that panics poisons the count, not the memory.

@@ -136,7 +136,8 @@ fn stride_and_limit_keep_frames_and_their_views_together() {
 #[test]
 fn memory_beyond_the_bound_names_options_that_fit() {
     let (dir, _) = fixture("wild-memory");
-    // 4 + 2 frames whose bodies have 8 vertices of 36 bytes, labels of 4 frames, and 24 pixels of 48 bytes to decode.
+    // 4 + 2 frames whose bodies have 8 vertices of 36 bytes, labels of 4 frames, and 24 pixels of
+    // 48 bytes to decode.
     let fits = LoadOptions { max_bytes: 6 * 8 * 36 + 4 * 10 + 24 * 48, ..LoadOptions::default() };
     assert!(load_capture(dir.path(), &body(), &fits).is_ok());
     let tight = LoadOptions { max_bytes: fits.max_bytes - 1, ..fits };
