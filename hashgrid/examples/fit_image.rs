@@ -6,7 +6,7 @@
 
 use hashgrid::{HashGrid, HashGridConfig};
 
-const SIDE: usize = 256;
+const SIDE: usize = 112;
 const BATCH: usize = 4096;
 const STEPS: usize = 400;
 

@@ -11,7 +11,7 @@ use image::{Rgb, RgbImage};
 use surface_query::{MeshDistance, SurfaceQuery, SurfaceQueryConfig};
 use testkit::TriMesh;
 
-const SIZE: u32 = 280;
+const SIZE: u32 = 256;
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let path = std::env::args().nth(1).unwrap_or("distance_slice.png".into());
