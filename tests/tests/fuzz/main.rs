@@ -162,7 +162,7 @@ fn characters() {
 #[test]
 fn meshes() {
     let path = place("a.obj");
-    Attack { name: "OBJ", form: Form::Plain, seeds: seeds::meshes(), share: 80, most: 128 * MIB }.run(|bytes| {
+    Attack { name: "OBJ", form: Form::Plain, seeds: seeds::meshes(), share: 100, most: 128 * MIB }.run(|bytes| {
         std::fs::write(&path, bytes).unwrap();
         load_mesh(&path).is_ok()
     });
@@ -205,7 +205,7 @@ fn configurations() {
 fn checkpoints() {
     let path = place("checkpoint.safetensors");
     let (scene, seed, config) = seeds::checkpoint();
-    let attack = Attack { name: "checkpoint", form: Form::Safetensors, seeds: vec![seed], share: 30, most: 64 * MIB };
+    let attack = Attack { name: "checkpoint", form: Form::Safetensors, seeds: vec![seed], share: 10, most: 64 * MIB };
     attack.run(|bytes| {
         std::fs::write(&path, bytes).unwrap();
         match checkpoint_config(&path) {
