@@ -98,7 +98,7 @@ pub fn import(arguments: &ImportArguments) -> Result<()> {
             bail!("{}: no such file or directory ({what})", path.display());
         }
     }
-    let partial = beside(out)?;
+    let partial = beside(out, "partial")?;
     let written = capture::import(&options, &partial).map_err(anyhow::Error::from).and_then(|imported| {
         let mark =
             serde_json::json!({ "tool": imported.tool.name(), "person": imported.person, "frames": imported.frames });

@@ -10,7 +10,7 @@ use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
 use occnerf::{StepReport, Trainer};
 
-use crate::process::{Ending, Guard, note, unwritten};
+use crate::process::{Ending, Guard, note, one_line, unwritten};
 use crate::run::{self, CHECKPOINT, LOG};
 
 const LOG_EVERY: u64 = 10;
@@ -112,7 +112,7 @@ pub fn optimise(directory: &Path, trainer: &mut Trainer<'_>, sitting: &Sitting) 
                     bar.abandon();
                     return Err(error);
                 }
-                bar.suspend(|| note!("warning: {error:#}; training goes on and tries again"));
+                bar.suspend(|| note!("warning: {}; training goes on and tries again", one_line(&error)));
             }
             saved = Instant::now();
         }

@@ -8,7 +8,7 @@ use occnerf::capture::{Layout, Obstacle, Occlusion, SynthConfig, Synthetic};
 
 use crate::film::{bar, film, is_character};
 use crate::obstacle::ObstacleArguments;
-use crate::process::say;
+use crate::process::{say, unwritten};
 
 /// What a finished directory holds, and nothing else does.
 const MARK: &str = "synth.json";
@@ -128,13 +128,16 @@ pub fn synth(arguments: &SynthArguments) -> Result<()> {
         FormatName::Ocmotion => Layout::Wild,
     };
     let synthetic = film(arguments.character.as_deref(), arguments.motion.as_deref(), &config)?;
-    let partial = beside(out)?;
+    let partial = beside(out, "partial")?;
     let written = write(&synthetic, &partial, layout).and_then(|()| {
+        let old = beside(out, "old")?;
         if out.exists() {
             vacant(out, arguments.force, MARK)?;
-            std::fs::remove_dir_all(out).with_context(|| out.display().to_string())?;
+            // Aside, whole: what is killed while it removes a capture leaves something that nobody dares to replace.
+            std::fs::rename(out, &old).map_err(unwritten(out))?;
         }
-        std::fs::rename(&partial, out).with_context(|| out.display().to_string())
+        std::fs::rename(&partial, out).map_err(unwritten(out))?;
+        if old.exists() { std::fs::remove_dir_all(&old).map_err(unwritten(&old)) } else { Ok(()) }
     });
     if let Err(error) = written {
         let _ = std::fs::remove_dir_all(&partial);
@@ -180,9 +183,9 @@ pub fn vacant(out: &Path, force: bool, mark: &str) -> Result<()> {
 }
 
 /// A free name in the same folder.
-pub fn beside(out: &Path) -> Result<PathBuf> {
+pub fn beside(out: &Path, what: &str) -> Result<PathBuf> {
     let Some(name) = out.file_name() else { bail!("{}: not a name for a directory", out.display()) };
-    let partial = out.with_file_name(format!("{}.partial-{}", name.to_string_lossy(), std::process::id()));
-    ensure!(!partial.exists(), "{}: in the way", partial.display());
-    Ok(partial)
+    let free = out.with_file_name(format!("{}.{what}-{}", name.to_string_lossy(), std::process::id()));
+    ensure!(!free.exists(), "{}: in the way", free.display());
+    Ok(free)
 }

@@ -46,6 +46,13 @@ fn wait_for(path: &Path) {
     }
 }
 
+/// Whether this process was started to ignore a signal, as in the background of a script: what it starts does so too.
+fn ignored(signal: u32) -> bool {
+    let status = std::fs::read_to_string("/proc/self/status").unwrap();
+    let mask = status.lines().find_map(|line| line.strip_prefix("SigIgn:")).unwrap();
+    u64::from_str_radix(mask.trim(), 16).unwrap() >> (signal - 1) & 1 == 1
+}
+
 /// Sends a signal, and returns the exit code and what was said.
 fn stopped(child: Child, signal: &str) -> (i32, String) {
     let sent = Command::new("kill").args([signal, &child.id().to_string()]).status().unwrap();
@@ -101,6 +108,10 @@ fn signals_save_first_and_the_end_is_the_same_to_the_bit() {
     let whole = folder.join("whole");
     done(&training(&whole, "400"));
     for (signal, code) in [("-INT", 130), ("-TERM", 143), ("-HUP", 129)] {
+        if ignored(code as u32 - 128) {
+            println!("skipped: {signal} is ignored here");
+            continue;
+        }
         let run = folder.join(code.to_string());
         let child = start(&training(&run, "400"));
         wait_for(&run.join("train.jsonl"));
@@ -167,9 +178,12 @@ fn a_result_that_cannot_be_written_has_an_exit_code_and_leaves_the_old_one() {
 #[test]
 fn a_training_whose_folder_vanishes_says_so_at_its_end() {
     let run = folder("vanishing").join("run");
-    let child = start(&[training(&run, "60"), vec!["--checkpoint-every", "0.05"]].concat());
+    let child = start(&[training(&run, "300"), vec!["--checkpoint-every", "0.2"]].concat());
     wait_for(&run.join("checkpoint.safetensors"));
-    std::fs::remove_dir_all(&run).unwrap();
+    while run.exists() {
+        // What is written meanwhile is in the way.
+        let _ = std::fs::remove_dir_all(&run);
+    }
     let output = child.wait_with_output().unwrap();
     let said = String::from_utf8(output.stderr).unwrap();
     assert_eq!(output.status.code(), Some(3), "{said}");
@@ -214,6 +228,6 @@ fn names_do_not_steer_the_terminal() {
         let said = String::from_utf8(output.stderr).unwrap();
         assert!(!said.trim_end().chars().any(|c| c.is_control() || c == '\u{202e}'), "{said:?}");
     }
-    let long = "x".repeat(1 << 17);
+    let long = "x".repeat(100_000);
     assert!(xtask(&["train", &long]).stderr.len() < 10_000);
 }
