@@ -1,5 +1,7 @@
-//! Trains a person for a hundred steps on a small demo capture and draws them from a side that no training frame
-//! shows: on the left the truth, on the right the model. Usage: `train_demo [OUT.png]`.
+//! Trains a person for a hundred steps on a small demo capture and draws them from a side that no
+//! training frame shows: on the left the truth, on the right the model.
+//!
+//! Usage: `train_demo [OUT.png]`.
 
 use std::error::Error;
 use std::path::PathBuf;

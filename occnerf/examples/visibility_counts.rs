@@ -1,7 +1,8 @@
-//! The paper's running counts against exact visibility on a real training: trains for some steps, then compares how often
-//! each vertex was near a termination point with the number of training frames that show it, by ray casting. Prints
-//! Spearman's rank correlation of the two as training goes on and draws the body in both orders, red the least seen vertex and
-//! green the most: exact from four sides above, counted below.
+//! The paper's running counts against exact visibility on a real training: trains for some steps,
+//! then compares how often each vertex was near a termination point with the number of training
+//! frames that show it, by ray casting. Prints Spearman's rank correlation of the two as training
+//! goes on and draws the body in both orders, red the least seen vertex and green the most: exact
+//! from four sides above, counted below.
 //!
 //! Usage: `visibility_counts [OUT.png] [STEPS] [CAPTURE BODY]`; without a capture a small demo.
 

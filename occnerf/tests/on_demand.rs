@@ -15,7 +15,7 @@ const STEPS: u64 = 8;
 fn read(dir: &TempDir, body: &BodyModel, pictures: u64) -> Capture {
     let bodies = 8 * body.num_vertices() as u64 * 36;
     let picture = u64::from(SIZE * SIZE) * 16;
-    let max_bytes = bodies + 4 * picture.div_ceil(42) + pictures * picture;
+    let max_bytes = bodies + 4 * picture.div_ceil(42) + (pictures + 3) * picture;
     load_capture(&dir.path("capture"), body, &LoadOptions { max_bytes, ..LoadOptions::default() }).unwrap()
 }
 

@@ -5,6 +5,7 @@ use std::path::Path;
 use glam::{Quat, Vec3};
 
 use crate::Error;
+use crate::model::MAX_COORDINATE;
 use crate::npz::Npz;
 use crate::pose::Placement;
 
@@ -35,7 +36,7 @@ impl MotionClip {
     ///
     /// # Errors
     /// Any [`Error`] of arrays; [`Error::Invalid`] without frames, for a rate that is not positive,
-    /// and for rotations beyond 1000 rad.
+    /// and for rotations beyond 1000 rad or translations beyond 10⁶.
     pub fn load(path: &Path) -> Result<Self, Error> {
         let mut npz = Npz::open(path)?;
         let file = npz.file().to_owned();
@@ -53,6 +54,10 @@ impl MotionClip {
         };
         let vectors = |values: Vec<f32>| values.chunks_exact(3).map(Vec3::from_slice).collect::<Vec<_>>();
         let clip = Self { poses: vectors(poses), num_joints: shape[1] / 3, trans: vectors(trans), fps };
+        if let Some(i) = clip.trans.iter().position(|t| t.abs().max_element() > MAX_COORDINATE) {
+            let message = format!("{} at frame {i}, expected at most {MAX_COORDINATE} either way", clip.trans[i]);
+            return Err(Error::invalid(&file, "trans", message));
+        }
         match clip.poses.iter().position(|r| r.length() > MAX_ANGLE) {
             Some(i) => Err(Error::invalid(&file, "poses", format!("a rotation of {} rad", clip.poses[i].length()))),
             None => Ok(clip),

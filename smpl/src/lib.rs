@@ -39,6 +39,7 @@ mod pose_backward;
 mod rotation;
 mod saved;
 mod sparse;
+pub mod torch;
 
 /// The README's example, compiled as a test.
 #[cfg(doctest)]

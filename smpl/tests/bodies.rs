@@ -192,3 +192,19 @@ proptest! {
         }
     }
 }
+
+#[test]
+fn bodies_without_a_surface_or_larger_than_anything_are_refused() {
+    let refused = |change: fn(&mut BodyModel), words: [&str; 2]| {
+        let mut body = BodyModel::embedded();
+        change(&mut body);
+        let message = body.validate("a.npz").unwrap_err().to_string();
+        assert!(words.iter().all(|word| message.contains(word)), "{words:?}: {message}");
+    };
+    refused(|body| body.faces.clear(), ["`f`", "no faces"]);
+    refused(|body| body.faces.iter_mut().for_each(|f| f[1] = f[0]), ["`f`", "degenerate"]);
+    refused(|body| body.v_template.fill(Vec3::ONE), ["`f`", "degenerate"]);
+    refused(|body| body.v_template[7].y = 1e30, ["`v_template`", "row 7"]);
+    refused(|body| body.shapedirs[3] = Vec3::splat(-2e6), ["`shapedirs`", "row 3"]);
+    refused(|body| body.posedirs.values[5].z = 1e30, ["`posedirs`", "row 5"]);
+}

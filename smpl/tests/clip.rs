@@ -109,6 +109,7 @@ fn wrong_clips_are_refused() {
         ("poses", floats(&[2, 72], &[f32::NAN; 144])),
         ("poses", floats(&[2, 72], &[1e30; 144])),
         ("trans", floats(&[2, 2], &[0.0; 4])),
+        ("trans", floats(&[2, 3], &[-1e38; 6])),
         ("fps", floats(&[], &[0.0])),
         ("fps", floats(&[], &[-30.0])),
         ("fps", floats(&[], &[f32::NAN])),

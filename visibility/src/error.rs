@@ -24,6 +24,16 @@ pub enum Error {
         /// Their number.
         count: usize,
     },
+    /// A picture that is too large to rasterise.
+    #[error("a picture of {width} × {height} pixels, at most {most} × {most} can be rasterised")]
+    ImageSize {
+        /// Pixels a row.
+        width: u32,
+        /// Rows.
+        height: u32,
+        /// Most pixels a row or column, with the samples a pixel asked for.
+        most: u32,
+    },
 }
 
 pub(crate) fn check_mesh(vertices: &[glam::Vec3], faces: &[[u32; 3]]) -> Result<(), Error> {

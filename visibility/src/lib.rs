@@ -1,9 +1,10 @@
 //! Which vertices of a mesh were seen, and how often: ray casts against a mesh, the vertices a
-//! camera sees, running counts, and the attention weights made of them.
+//! camera sees, a rasteriser that says which triangle every pixel sees, running counts, and the
+//! attention weights made of them.
 //!
 //! ```
 //! use glam::{Affine3A, Mat3, Vec3};
-//! use visibility::{RayMesh, View, VisibilityCounts, visible_vertices};
+//! use visibility::{RasterOptions, Rasterizer, RayMesh, View, VisibilityCounts, visible_vertices};
 //!
 //! // A triangle at depth 2 and one behind it.
 //! let front = [Vec3::new(-1.0, -1.0, 2.0), Vec3::new(1.0, -1.0, 2.0), Vec3::new(0.0, 1.0, 2.0)];
@@ -21,6 +22,9 @@
 //! let seen = visible_vertices(&mesh, &vertices, &view, None);
 //! assert_eq!(seen, [true, true, true, false, true, true]);
 //!
+//! let fragments = Rasterizer::default().faces(&vertices, &[[0, 1, 2], [3, 4, 5]], &view, &RasterOptions::default())?;
+//! assert_eq!(fragments[10 * 20 + 10].map(|f| (f.face, f.depth)), Some((0, 2.0)));
+//!
 //! let mut counts = VisibilityCounts::new(vertices.len());
 //! counts.add_visible(&seen);
 //! let mut attention = [0.0; 2];
@@ -37,6 +41,7 @@
 mod counts;
 mod error;
 mod packet;
+mod raster;
 mod ray_mesh;
 mod tree;
 mod triangle;
@@ -49,5 +54,6 @@ struct Readme;
 
 pub use counts::VisibilityCounts;
 pub use error::Error;
+pub use raster::{Fragment, Pixel, RasterOptions, Rasterizer, Samples};
 pub use ray_mesh::{Hit, RayMesh};
 pub use view::{View, visible_vertices};

@@ -34,7 +34,7 @@ impl pulp::WithSimd for Walk<'_> {
 
 /// AVX2 on x86-64, also where `pulp` is built with AVX-512 and the machine has it: packets are
 /// eight wide.
-fn arch() -> pulp::Arch {
+pub(crate) fn arch() -> pulp::Arch {
     #[cfg(target_arch = "x86_64")]
     if let Some(simd) = pulp::x86::V3::try_new() {
         return pulp::Arch::V3(simd);

@@ -14,7 +14,7 @@ use occnerf::{
 use rayon::prelude::*;
 
 use crate::optimise::logged_seconds;
-use crate::process::{Ending, Lock, note, say};
+use crate::process::{Ending, Lock, note, one_line, say};
 use crate::run::{METRICS, Metrics, NOVEL_VIEWS, RunConfig, Splits, TRAINING_VIEWS, peak_rss_bytes, use_threads};
 use crate::{pictures, report, table};
 
@@ -265,7 +265,7 @@ pub fn score_run(
             Some(_) => Err(error),
             // The scores are there: what cannot be drawn is no reason to end in an error.
             None => {
-                note!("warning: not all was drawn: {error:#}");
+                note!("warning: not all was drawn: {}", one_line(&error));
                 Ok(())
             }
         }

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use anyhow::{Result, ensure};
 use clap::Args;
 use glam::Vec3;
-use image::{Rgb, RgbImage};
+use image::{Rgb, RgbImage, imageops};
 use occnerf::{FieldRenderer, Label, Model, PreparedFrame, Renderer, Scene};
 
 use crate::pictures;
@@ -57,12 +57,33 @@ pub fn front(arguments: &FrontArguments) -> Result<()> {
         }
         rows.push(cells);
     }
+    crop(&mut rows);
     let names = ["the camera sees", "its mask", "truth, unseen side", "ours", "truth, other side", "ours"];
     let sheet = pictures::captioned(&pictures::sheet(&rows), &names)?;
     let out = arguments.out.clone().unwrap_or_else(|| arguments.run.join("renders/front.png"));
     pictures::save(&sheet, &out)?;
     say!("written: {}", out.display());
     Ok(())
+}
+
+/// Cuts all pictures, equally large, to what differs from their corners in any of them.
+fn crop(rows: &mut [Vec<RgbImage>]) {
+    const ROOM: u32 = 8;
+    let (mut low, mut high) = ((u32::MAX, u32::MAX), (0, 0));
+    for picture in rows.iter().flatten() {
+        let empty = picture.get_pixel(0, 0);
+        for (x, y, _) in picture.enumerate_pixels().filter(|(_, _, pixel)| *pixel != empty) {
+            low = (low.0.min(x), low.1.min(y));
+            high = (high.0.max(x), high.1.max(y));
+        }
+    }
+    for picture in rows.iter_mut().flatten() {
+        let (x, y) = (low.0.saturating_sub(ROOM), low.1.saturating_sub(ROOM));
+        let (right, bottom) = ((high.0 + ROOM).min(picture.width() - 1), (high.1 + ROOM).min(picture.height() - 1));
+        if x < right && y < bottom {
+            *picture = imageops::crop_imm(picture, x, y, right - x + 1, bottom - y + 1).to_image();
+        }
+    }
 }
 
 /// What the camera saw of a training frame, the obstacle painted where it stands, and the mask.

@@ -5,7 +5,7 @@ use std::path::Path;
 use anyhow::{Context, Result, bail, ensure};
 
 use crate::eval::load_lpips;
-use crate::process::{Ending, say};
+use crate::process::{Ending, one_line, say};
 use crate::run::{self, Metrics, RunConfig, use_threads};
 use crate::train::{TrainArguments, finished, run_unless_finished, scene_name};
 use crate::{source, table};
@@ -46,7 +46,7 @@ pub fn train_list(arguments: &TrainArguments) -> Result<()> {
             Err(error) if matches!(error.downcast_ref(), Some(Ending::Busy(_))) => say!("{name}: in another job"),
             Err(error) if error.chain().any(|cause| cause.is::<Ending>()) => return Err(error),
             Err(error) => {
-                say!("{name}: failed: {error:#}");
+                say!("{name}: failed: {}", one_line(&error));
                 failed.push(name);
             }
         }

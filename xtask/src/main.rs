@@ -1,14 +1,19 @@
 //! `cargo xtask`: train, evaluate and render people from occluded videos.
 #![warn(clippy::print_stdout, clippy::print_stderr, reason = "printing must never stop work: see process::print")]
 
+mod avatar;
+mod baked;
 mod bench;
 mod capacity;
+mod check;
 mod compare;
 mod convert;
 mod eval;
+mod export;
 mod film;
 mod font;
 mod front;
+mod import;
 mod list;
 mod obstacle;
 mod optimise;
@@ -26,6 +31,8 @@ mod source;
 mod synth;
 mod table;
 mod train;
+mod video;
+mod view;
 
 use clap::{Parser, Subcommand};
 
@@ -49,8 +56,16 @@ enum Command {
     Render(render::RenderArguments),
     /// Draws what the camera saw beside the person from unseen sides: README's picture.
     Front(front::FrontArguments),
+    /// Writes a run's person in a form that other programs open: skinned avatar, splats, mesh, motion.
+    Export(export::ExportArguments),
+    /// Writes a run's person as one HTML page, to turn around and play.
+    View(view::ViewArguments),
     /// The paper's table on captures: every baseline and ablation, several seeds, one budget.
     Reproduce(reproduce::ReproduceArguments),
+    /// Makes a capture of a video from what a body estimator and a segmenter wrote.
+    Import(import::ImportArguments),
+    /// Tells whether a capture's body lies on its person: a picture, a table, and the mistakes that are likely.
+    Check(check::CheckArguments),
     /// Writes an occluded capture of a synthetic person to disk, in a published dataset format.
     Synth(synth::SynthArguments),
     /// Runs one function of one crate on numpy arrays.
@@ -88,7 +103,11 @@ fn main() -> std::process::ExitCode {
         Command::Eval(arguments) => eval::eval(&arguments),
         Command::Render(arguments) => render::render(&arguments),
         Command::Front(arguments) => front::front(&arguments),
+        Command::Export(arguments) => export::export(&arguments),
+        Command::View(arguments) => view::view(&arguments),
         Command::Reproduce(arguments) => reproduce::reproduce(&arguments),
+        Command::Import(arguments) => import::import(&arguments),
+        Command::Check(arguments) => check::check(&arguments),
         Command::Synth(arguments) => synth::synth(&arguments),
         Command::Probe(arguments) => probe::probe(&arguments),
         Command::Bench(arguments) => bench::bench(&arguments),

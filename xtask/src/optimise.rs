@@ -10,7 +10,7 @@ use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
 use occnerf::{StepReport, Trainer};
 
-use crate::process::{Ending, Guard, note, unwritten};
+use crate::process::{Ending, Guard, note, one_line, unwritten};
 use crate::run::{self, CHECKPOINT, LOG};
 
 const LOG_EVERY: u64 = 10;
@@ -112,7 +112,7 @@ pub fn optimise(directory: &Path, trainer: &mut Trainer<'_>, sitting: &Sitting) 
                     bar.abandon();
                     return Err(error);
                 }
-                bar.suspend(|| note!("warning: {error:#}; training goes on and tries again"));
+                bar.suspend(|| note!("warning: {}; training goes on and tries again", one_line(&error)));
             }
             saved = Instant::now();
         }
@@ -241,5 +241,38 @@ fn blend(mean: Option<StepReport>, new: StepReport) -> StepReport {
         completeness: mix(old.completeness, new.completeness),
         psnr: mix(old.psnr, new.psnr),
         ..new
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_log_cut_off_or_damaged_anywhere_gives_its_whole_lines() {
+        let folder = std::env::temp_dir().join(format!("xtask-log-{}", std::process::id()));
+        std::fs::create_dir_all(&folder).unwrap();
+        let path = folder.join(LOG);
+        let line = |step: u64| format!("{{\"step\":{step},\"seconds\":{}.5,\"loss\":null}}\n", step);
+        let text: String = (1..=4).map(|i| line(10 * i)).collect();
+        for length in 0..=text.len() {
+            std::fs::write(&path, &text[..length]).unwrap();
+            let log = earlier_log(&path, 30).unwrap();
+            let whole = text[..length].matches('\n').count().min(3) as u64;
+            // A last line may be whole without its end.
+            let least = 10.0 * whole as f64 + if whole > 0 { 0.5 } else { 0.0 };
+            assert!(log.seconds == least || log.seconds == least + 10.0 || whole == 0, "{length}: {}", log.seconds);
+            assert!(log.text.lines().count() as u64 - whole <= 1);
+        }
+        for hostile in [
+            &b"\xff\xfe{\"step\":1,\"seconds\":1e308}\n"[..],
+            b"{\"step\":18446744073709551616,\"seconds\":[[[[[]]]]]}\n",
+            b"[1]\nnull\n\"x\"\n{\"step\":-1}\n{}\n",
+            &[b'['; 100_000],
+        ] {
+            std::fs::write(&path, hostile).unwrap();
+            assert!(earlier_log(&path, 30).unwrap().text.lines().count() <= 1);
+        }
+        std::fs::remove_dir_all(&folder).unwrap();
     }
 }

@@ -1,12 +1,11 @@
-//! Contact sheets and short films.
+//! Contact sheets.
 
 use std::fs::File;
 use std::io::BufWriter;
 use std::path::Path;
 
 use anyhow::{Context, Result};
-use image::codecs::gif::{GifEncoder, Repeat};
-use image::{Delay, Frame, ImageError, ImageFormat, ImageResult, Rgb, RgbImage, imageops};
+use image::{ImageError, ImageFormat, ImageResult, Rgb, RgbImage, imageops};
 use occnerf::capture::Image;
 use plotters::prelude::*;
 use plotters::style::text_anchor::{HPos, Pos, VPos};
@@ -127,19 +126,6 @@ fn replace(path: &Path, encode: impl FnOnce(&mut BufWriter<File>) -> ImageResult
         Some(error) => Err(error).with_context(|| path.display().to_string()),
         None => written.map_err(unwritten(path)),
     }
-}
-
-/// Writes an endless GIF at `fps` frames a second.
-pub fn film(pictures: &[RgbImage], fps: u32, path: &Path) -> Result<()> {
-    replace(path, |to| {
-        let mut encoder = GifEncoder::new_with_speed(to, 10);
-        encoder.set_repeat(Repeat::Infinite)?;
-        for picture in pictures {
-            let rgba = image::DynamicImage::ImageRgb8(picture.clone()).into_rgba8();
-            encoder.encode_frame(Frame::from_parts(rgba, 0, 0, Delay::from_numer_denom_ms(1000, fps)))?;
-        }
-        Ok(())
-    })
 }
 
 #[cfg(test)]

@@ -7,12 +7,15 @@ use anyhow::{Context, Result, bail};
 use clap::{Args, ValueEnum};
 use glam::{Affine3A, Mat3, Vec3};
 use indicatif::ProgressBar;
+use occnerf::bake::BakedRenderer;
 use occnerf::{Body, FieldRenderer, Method, Model, Person, PosedView, PriorRenderer, Renderer, upright};
+use visibility::Samples;
 use volrender::Camera;
 
-use crate::pictures;
 use crate::process::say;
 use crate::run::{RunConfig, make_directory, use_threads};
+use crate::video::{self, FilmFormat};
+use crate::{baked, pictures};
 
 /// Views of a full turn.
 const TURN: usize = 36;
@@ -42,6 +45,12 @@ pub struct RenderArguments {
     /// Where to [default: RUN/renders/WHAT]
     #[arg(long)]
     out: Option<PathBuf>,
+    /// What to write besides the pictures
+    #[arg(long, default_value = "gif")]
+    format: FilmFormat,
+    /// Draw the baked person, by rasterising, instead of the field; bakes it first where RUN has none
+    #[arg(long)]
+    baked: bool,
     /// Threads [default: all cores]
     #[arg(long)]
     threads: Option<usize>,
@@ -50,37 +59,44 @@ pub struct RenderArguments {
 /// Runs the command.
 pub fn render(arguments: &RenderArguments) -> Result<()> {
     use_threads(arguments.threads)?;
+    let size = arguments.size.as_deref().map(parse_size).transpose()?;
     let directory = &arguments.run;
     let run = RunConfig::read(directory)?;
-    let (model, person);
+    if arguments.baked && run.train.method == Method::Prior {
+        bail!("--baked: {} has no field to bake", directory.display());
+    }
+    let (model, person, avatar);
     let (body, frames, mut renderer): (_, _, Box<dyn Renderer + '_>) = if run.train.method == Method::Prior {
         person = Person::load(directory, &run.train)?;
         (&*person.body, &person.frames[..], Box::new(PriorRenderer::new(&person.body, &person.colors)))
     } else {
         model = Model::load(directory)?;
-        (&**model.body(), model.frames(), Box::new(FieldRenderer::new(&model)?))
+        let renderer: Box<dyn Renderer + '_> = if arguments.baked {
+            avatar = baked::avatar(directory, &model)?;
+            Box::new(BakedRenderer::new(&model, &avatar, Samples::Four)?)
+        } else {
+            Box::new(FieldRenderer::new(&model)?)
+        };
+        (&**model.body(), model.frames(), renderer)
     };
     if arguments.frame >= frames.len() {
         bail!("--frame {}: {} has frames 0 to {}", arguments.frame, run.scene, frames.len() - 1);
     }
-    let size = arguments.size.as_deref().map(parse_size).transpose()?;
     let views = views(body, frames, arguments, size);
     let name = format!("{:?}", arguments.what).to_lowercase();
     let out = arguments.out.clone().unwrap_or_else(|| directory.join("renders").join(&name));
     make_directory(&out)?;
     let bar = ProgressBar::new(views.len() as u64);
-    let mut film = Vec::new();
-    for (i, view) in views.iter().enumerate() {
+    let drawn = views.iter().enumerate().map(|(i, view)| {
         let rendering = renderer.render(view, Vec3::splat(1.0))?;
         let picture = pictures::to_rgb(&rendering.image);
         pictures::save(&picture, &out.join(format!("{i:04}.png")))?;
-        film.push(picture);
         bar.inc(1);
-    }
+        Ok(picture)
+    });
+    let path = video::film(drawn, arguments.format, FPS, &out.join(&name))?;
     bar.finish_and_clear();
-    let path = out.join(format!("{name}.gif"));
-    pictures::film(&film, FPS, &path)?;
-    say!("{} pictures and {}", film.len(), path.display());
+    say!("{} pictures and {}", views.len(), path.as_ref().unwrap_or(&out).display());
     Ok(())
 }
 

@@ -82,6 +82,17 @@ enum ObstacleName {
 }
 
 impl LoadArguments {
+    /// A capture as it is.
+    pub fn none() -> Self {
+        /// The options alone.
+        #[derive(clap::Parser)]
+        struct Line {
+            #[command(flatten)]
+            load: LoadArguments,
+        }
+        <Line as clap::Parser>::parse_from([""]).load
+    }
+
     /// The same for the library.
     pub fn options(&self) -> Result<LoadOptions> {
         let occlusion = match self.occlusion {

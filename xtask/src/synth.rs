@@ -8,7 +8,7 @@ use occnerf::capture::{Layout, Obstacle, Occlusion, SynthConfig, Synthetic};
 
 use crate::film::{bar, film, is_character};
 use crate::obstacle::ObstacleArguments;
-use crate::process::say;
+use crate::process::{say, unwritten};
 
 /// What a finished directory holds, and nothing else does.
 const MARK: &str = "synth.json";
@@ -121,20 +121,23 @@ pub fn synth(arguments: &SynthArguments) -> Result<()> {
     if let Some(path) = arguments.character.as_deref().filter(|path| !is_character(path)) {
         bail!("{}: not a character; expected a .glb or .gltf", path.display());
     }
-    vacant(out, arguments.force)?;
+    vacant(out, arguments.force, MARK)?;
     let layout = match arguments.format {
         FormatName::Humannerf => Layout::HumanNerf,
         FormatName::ZjuMocap => Layout::ZjuMocap,
         FormatName::Ocmotion => Layout::Wild,
     };
     let synthetic = film(arguments.character.as_deref(), arguments.motion.as_deref(), &config)?;
-    let partial = beside(out)?;
+    let partial = beside(out, "partial")?;
     let written = write(&synthetic, &partial, layout).and_then(|()| {
+        let old = beside(out, "old")?;
         if out.exists() {
-            vacant(out, arguments.force)?;
-            std::fs::remove_dir_all(out).with_context(|| out.display().to_string())?;
+            vacant(out, arguments.force, MARK)?;
+            // Aside, whole: what is killed while it removes a capture leaves something that nobody dares to replace.
+            std::fs::rename(out, &old).map_err(unwritten(out))?;
         }
-        std::fs::rename(&partial, out).with_context(|| out.display().to_string())
+        std::fs::rename(&partial, out).map_err(unwritten(out))?;
+        if old.exists() { std::fs::remove_dir_all(&old).map_err(unwritten(&old)) } else { Ok(()) }
     });
     if let Err(error) = written {
         let _ = std::fs::remove_dir_all(&partial);
@@ -163,8 +166,9 @@ fn write(synthetic: &Synthetic, directory: &Path, layout: Layout) -> Result<()> 
     crate::run::write(&directory.join(MARK), &serde_json::to_string_pretty(&mark)?)
 }
 
-/// Errors unless `out` may be written: absent, empty, or an earlier result that is to be replaced.
-fn vacant(out: &Path, force: bool) -> Result<()> {
+/// Errors unless `out` may be written: absent, empty, or an earlier result of the command that leaves `mark`, to be
+/// replaced.
+pub fn vacant(out: &Path, force: bool, mark: &str) -> Result<()> {
     let Ok(entries) = std::fs::read_dir(out) else {
         ensure!(!out.exists(), "{}: not a directory", out.display());
         return Ok(());
@@ -172,15 +176,16 @@ fn vacant(out: &Path, force: bool) -> Result<()> {
     if entries.count() == 0 {
         return Ok(());
     }
-    ensure!(out.join(MARK).is_file(), "{}: not empty, and not written by synth (no {MARK})", out.display());
+    let command = mark.trim_end_matches(".json");
+    ensure!(out.join(mark).is_file(), "{}: not empty, and not written by {command} (no {mark})", out.display());
     ensure!(force, "{}: already holds a capture (--force replaces it)", out.display());
     Ok(())
 }
 
 /// A free name in the same folder.
-fn beside(out: &Path) -> Result<PathBuf> {
+pub fn beside(out: &Path, what: &str) -> Result<PathBuf> {
     let Some(name) = out.file_name() else { bail!("{}: not a name for a directory", out.display()) };
-    let partial = out.with_file_name(format!("{}.partial-{}", name.to_string_lossy(), std::process::id()));
-    ensure!(!partial.exists(), "{}: in the way", partial.display());
-    Ok(partial)
+    let free = out.with_file_name(format!("{}.{what}-{}", name.to_string_lossy(), std::process::id()));
+    ensure!(!free.exists(), "{}: in the way", free.display());
+    Ok(free)
 }

@@ -4,10 +4,14 @@ use glam::{Affine3A, Mat3, Vec3};
 use volrender::{Camera, Distortion};
 
 use super::CaptureError;
+use super::checks::MAX_DISTANCE;
 use super::records::Record;
 
-/// Largest |R Rᵀ − I| of an extrinsic rotation; files written in `f32` or with a few decimals stay far below.
+/// Largest |R Rᵀ − I| of an extrinsic rotation; files written in `f32` or with a few decimals stay
+/// far below.
 const ORTHONORMAL: f32 = 1e-3;
+/// Focal lengths, in pixels, from a fisheye's on a picture of a few pixels to a telescope's.
+const FOCAL: (f32, f32) = (0.01, 1e7);
 
 /// A lens and where it stands. The camera's image is 1 × 1 until the picture has been read.
 #[derive(Clone, Copy, Debug)]
@@ -34,13 +38,25 @@ pub(super) fn rotation(values: &[f32], columns: usize) -> Option<Mat3> {
 /// `pixel_centre`; the error says what is wrong with it.
 pub(super) fn pinhole(k: &[f32], extrinsics: Affine3A, pixel_centre: f32) -> Result<Camera, String> {
     let mut intrinsics = Mat3::from_cols_slice(k).transpose();
+    let focal = k[0].min(k[4])..=k[0].max(k[4]);
+    if *focal.start() < FOCAL.0 || *focal.end() > FOCAL.1 {
+        return Err(format!("focal lengths of {} and {} pixels, expected {} to {}", k[0], k[4], FOCAL.0, FOCAL.1));
+    }
+    if k[2].abs().max(k[5].abs()) > FOCAL.1 {
+        return Err(format!("a principal point at {} {}, expected at most {} either way", k[2], k[5], FOCAL.1));
+    }
+    if extrinsics.translation.abs().max_element() > MAX_DISTANCE {
+        let expected = format!("expected at most {MAX_DISTANCE} either way");
+        return Err(format!("a translation of {}, {expected}", extrinsics.translation));
+    }
     // The camera's own convention has the first pixel's centre at 0.5.
     intrinsics.z_axis += Vec3::new(1.0, 1.0, 0.0) * (0.5 - pixel_centre);
     Camera::new(intrinsics, extrinsics, 1, 1).map_err(|error| error.to_string())
 }
 
 impl Lens {
-    /// From a 3×3 matrix under `k`, a 3×4 or 4×4 one under `e`, and five numbers under `distortions` if there are any.
+    /// From a 3×3 matrix under `k`, a 3×4 or 4×4 one under `e`, and five numbers under
+    /// `distortions` if there are any.
     pub fn read(record: &Record<'_>, k: &str, e: &str, pixel_centre: f32) -> Result<Self, CaptureError> {
         let intrinsics = record.shaped(k, &[3, 3], "")?;
         let (shape, values) = record.array(e)?;

@@ -8,14 +8,16 @@ use rayon::prelude::*;
 use smpl::{BodyModel, Placement};
 
 use super::camera::Lens;
-use super::files::Files;
+use super::files::{Files, decoding_bytes};
+use super::gate::Gate;
 use super::image::dimensions;
 use super::source::PixelSource;
 use super::{CaptureError, Frame, LoadOptions, checks};
 
 /// Bytes that a pixel of a frame takes: three colours and coverage.
 const PIXEL_BYTES: u64 = 16;
-/// Bytes that a vertex of a frame's body takes once it is prepared: at rest, its pose offset, and posed.
+/// Bytes that a vertex of a frame's body takes once it is prepared: at rest, its pose offset, and
+/// posed.
 const VERTEX_BYTES: u64 = 36;
 /// A training frame's labels take this part of the bytes of its pixels: see [`crate::Labels`].
 const LABELS_SHARE: u64 = 42;
@@ -37,13 +39,25 @@ pub(super) struct Planned {
     pub betas: Vec<f32>,
 }
 
-/// Bytes of memory, shared out first come, first served.
-pub(super) struct Budget(u64);
+/// Bytes of memory for pictures that are kept, shared out first come, first served, and the way to
+/// those for decoding.
+pub(super) struct Budget {
+    left: u64,
+    gate: Arc<Gate>,
+}
 
 impl Budget {
+    /// `left` bytes of which those for decoding are put aside: `picture` for every thread, but at
+    /// most a quarter unless one picture takes more.
+    fn new(left: u64, picture: u64) -> Self {
+        let threads = rayon::current_num_threads() as u64;
+        let aside = (picture.saturating_mul(threads)).min(left / 4).max(picture);
+        Self { left: left.saturating_sub(aside), gate: Arc::new(Gate::new(aside)) }
+    }
+
     fn take(&mut self, bytes: u64) -> bool {
-        let left = self.0.checked_sub(bytes);
-        self.0 = left.unwrap_or(self.0);
+        let left = self.left.checked_sub(bytes);
+        self.left = left.unwrap_or(self.left);
         left.is_some()
     }
 }
@@ -71,7 +85,13 @@ impl View {
         u64::from(width) * u64::from(height) * PIXEL_BYTES
     }
 
-    /// The frames, checked together. Pictures that `budget` has room for are decoded; headers are read of all.
+    /// Bytes that decoding a frame takes.
+    fn decoding_bytes(&self) -> u64 {
+        decoding_bytes(self.size)
+    }
+
+    /// The frames, checked together. Pictures that `budget` has room for are decoded; headers are
+    /// read of all.
     pub fn frames(
         self,
         body: &BodyModel,
@@ -85,12 +105,14 @@ impl View {
             let Planned { name, image, masks, labels, occluder, hidden, lens, pose, placement, betas } = plan;
             let camera = volrender::Camera { width: size.0, height: size.1, ..lens.camera };
             let first = Arc::clone(&first);
-            let files = Files { image, masks, labels, occluder, hidden, lens, size, to, first };
+            let gate = Arc::clone(&budget.gate);
+            let files = Files { image, masks, labels, occluder, hidden, lens, size, to, first, gate };
             let source = PixelSource::on_disk(files, budget.take(bytes));
             Frame { name, source, camera: camera.resized(to.0, to.1), pose, placement, betas }
         };
         let frames: Vec<Frame> = self.frames.into_iter().map(frame).collect();
-        // Collected as results first, so that the error reported is the first in order whatever finishes first.
+        // Collected as results first, so that the error reported is the first in order whatever
+        // finishes first.
         let checked: Vec<Result<(), CaptureError>> = frames.par_iter().map(|f| f.source.check()).collect();
         checked.into_iter().collect::<Result<(), CaptureError>>()?;
         checks::subject_is_seen(&self.masks, &frames)?;
@@ -99,8 +121,8 @@ impl View {
     }
 }
 
-/// Bytes for pixels that [`LoadOptions::max_bytes`] leaves beside the bodies of all views. Errors where that is not one picture,
-/// naming values that fit.
+/// Bytes for pixels that [`LoadOptions::max_bytes`] leaves beside the bodies of all views. Errors
+/// where no picture can be decoded in that, naming values that fit.
 pub(super) fn budget(
     train: &View,
     eval: &[View],
@@ -110,25 +132,19 @@ pub(super) fn budget(
     let limit = options.max_bytes;
     let body_bytes = body.num_vertices() as u64 * VERTEX_BYTES;
     let views = || std::iter::once(train).chain(eval);
-    // Bytes of what is kept of every frame: of every n-th in training, and of every m-th view kept back.
+    // Bytes of what is kept of every frame: of every n-th in training, and of every m-th view kept
+    // back.
     let kept = |n: usize, m: usize| {
         let (frames, views) =
             (train.frames.len().div_ceil(n), eval.iter().map(|v| v.frames.len().div_ceil(m)).sum::<usize>());
         (frames + views) as u64 * body_bytes + frames as u64 * train.picture_bytes(options).div_ceil(LABELS_SHARE)
     };
     let bodies = kept(1, 1);
-    let picture = views().map(|view| view.picture_bytes(options)).max().unwrap_or(0);
+    let picture = views().map(View::decoding_bytes).max().unwrap_or(0);
     if bodies + picture <= limit {
-        return Ok(Budget(limit - bodies));
+        return Ok(Budget::new(limit - bodies, picture));
     }
     let mut ways = Vec::new();
-    if bodies < limit {
-        let side = views().map(|view| options.resized(view.size)).map(|(w, h)| w.max(h)).max().unwrap_or(1);
-        let resize = (f64::from(side) * ((limit - bodies) as f64 / picture as f64).sqrt()).floor();
-        if resize >= 1.0 {
-            ways.push(format!("resize {resize}"));
-        }
-    }
     let longest = views().map(|view| view.frames.len()).max().unwrap_or(1);
     let fits = |n: usize, m: usize| kept(n, m) + picture <= limit;
     if let Some(n) = (2..=longest).find(|&n| fits(n, n)) {
@@ -145,6 +161,6 @@ pub(super) fn budget(
     let frames: usize = views().map(|view| view.frames.len()).sum();
     let expected =
         format!("all bodies and a picture within {} MiB (would fit: {})", mebibytes(limit), ways.join(", or "));
-    let actual = format!("{frames} bodies of {} vertices and {picture} bytes a picture", body.num_vertices());
+    let actual = format!("{frames} bodies of {} vertices and {picture} bytes to decode a picture", body.num_vertices());
     Err(CaptureError::setting("max_bytes", expected, actual))
 }

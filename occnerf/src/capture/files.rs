@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use super::camera::Lens;
+use super::gate::Gate;
 use super::image::{dimensions, load_mask, resize};
 use super::pixels::Pixels;
 use super::undistort::undistort;
@@ -26,10 +27,22 @@ pub(super) struct Files {
     pub to: (u32, u32),
     /// Name of the frame that `size` was read from.
     pub first: Arc<str>,
+    /// Lets as many decode at once as there is memory for.
+    pub gate: Arc<Gate>,
+}
+
+/// Bytes that a pixel of a file takes while it is decoded, at the worst: picture and masks as they
+/// come out of the file and in floats, rectified and reduced.
+const DECODED_BYTES: u64 = 48;
+
+/// Bytes that decoding a picture of so many columns and rows takes.
+pub(super) fn decoding_bytes((width, height): (u32, u32)) -> u64 {
+    u64::from(width) * u64::from(height) * DECODED_BYTES
 }
 
 impl Files {
-    /// Whether the headers say what they should; nothing is decoded that the memory check did not count.
+    /// Whether the headers say what they should; nothing is decoded that the memory check did not
+    /// count.
     pub fn check(&self) -> Result<(), CaptureError> {
         self.same_size(&self.image, dimensions(&self.image)?)?;
         self.masks.iter().chain(&self.occluder).try_for_each(|path| self.same_size(path, dimensions(path)?))
@@ -50,9 +63,24 @@ impl Files {
         self.same_size(path, (width, height)).map(|()| levels)
     }
 
-    /// Reads the pictures.
+    /// The picture without its mask, as large as the pixels are.
+    pub fn photograph(&self) -> Result<Image, CaptureError> {
+        self.gate.pass(decoding_bytes(self.size), || {
+            let image = Image::load(&self.image)?;
+            self.same_size(&self.image, (image.width, image.height))?;
+            let camera = volrender::Camera { width: self.size.0, height: self.size.1, ..self.lens.camera };
+            let whole = undistort(image.pixels, 3, &camera, &self.lens.distortion);
+            Ok(Image { width: self.to.0, height: self.to.1, pixels: resize(whole, 3, self.size, self.to) })
+        })
+    }
+
+    /// Reads the pictures, when there is room for it.
     pub fn decode(&self) -> Result<Pixels, CaptureError> {
         self.check()?;
+        self.gate.pass(decoding_bytes(self.size), || self.decode_now())
+    }
+
+    fn decode_now(&self) -> Result<Pixels, CaptureError> {
         let size = self.size;
         let mut image = Image::load(&self.image)?;
         self.same_size(&self.image, (image.width, image.height))?;

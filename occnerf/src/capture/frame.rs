@@ -17,7 +17,8 @@ pub struct Frame {
     pub source: PixelSource,
     /// The camera, OpenCV convention, pixel centres at integer + 0.5.
     pub camera: volrender::Camera,
-    /// Axis-angle rotation of each joint, (J). Joint 0 is zero where `placement` carries the global rotation.
+    /// Axis-angle rotation of each joint, (J). Joint 0 is zero where `placement` carries the global
+    /// rotation.
     pub pose: Vec<Vec3>,
     /// How the posed body stands in the world.
     pub placement: smpl::Placement,
@@ -26,7 +27,7 @@ pub struct Frame {
 }
 
 impl Frame {
-    /// What it shows; see [`PixelSource::pixels`].
+    /// The pixels; see [`PixelSource::pixels`].
     ///
     /// # Errors
     /// For files that cannot be read; none for pixels in memory.
@@ -49,7 +50,7 @@ pub struct EvalFrame {
 /// A monocular video of one person, and views of the same instants from elsewhere.
 #[derive(Clone, Debug)]
 pub struct Capture {
-    /// Where it comes from: a directory's name, or `demo`.
+    /// Name of the directory it comes from, or `demo`.
     pub name: String,
     /// The training video in time order; never empty.
     pub train: Vec<Frame>,

@@ -22,8 +22,8 @@ pub struct Perturbation {
     pub pose_degrees: f32,
     /// Standard deviation of the error of each shape coefficient, the same in all frames, 0 to 5.
     pub shape: f32,
-    /// Pixels by which the training masks are larger (smaller if negative) than they should be, −64 to 64. What is
-    /// added shows black.
+    /// Pixels by which the training masks are larger (smaller if negative) than they should be, −64
+    /// to 64. What is added shows black.
     pub mask_pixels: i32,
 }
 
@@ -41,7 +41,8 @@ impl Perturbation {
         Ok(())
     }
 
-    /// Makes a capture wrong. Views kept back get the wrong bodies of their instants, but keep their pixels.
+    /// Makes a capture wrong. Views kept back get the wrong bodies of their instants, but keep
+    /// their pixels.
     ///
     /// # Errors
     /// A value out of its range.

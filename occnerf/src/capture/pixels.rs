@@ -23,15 +23,17 @@ impl Area {
     }
 }
 
-/// What a frame shows.
+/// A frame's picture, mask and occluder.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Pixels {
-    /// Picture multiplied by `mask`: colours are premultiplied by coverage, and 0 where the mask is 0. Over a
-    /// background B the picture is `image + (1 − mask) · B`.
+    /// Picture multiplied by `mask`: colours are premultiplied by coverage, and 0 where the mask is
+    /// 0. Over a background B the picture is `image + (1 − mask) · B`.
     pub image: Image,
-    /// Coverage of each pixel by the *visible* subject, 0 to 1, (H, W); above 0.5 the pixel counts as subject.
+    /// Coverage of each pixel by the *visible* subject, 0 to 1, (H, W); above 0.5 the pixel counts
+    /// as subject.
     pub mask: Vec<f32>,
-    /// Pixels known to be covered by something in front of the subject, (H, W); `None` where nobody marked them.
+    /// Pixels known to be covered by something in front of the subject, (H, W); `None` where nobody
+    /// marked them.
     pub occluder: Option<Vec<bool>>,
 }
 

@@ -2,9 +2,9 @@
 
 use std::sync::{Arc, OnceLock};
 
-use super::CaptureError;
 use super::files::Files;
 use super::pixels::{Edit, Pixels};
+use super::{CaptureError, Image};
 
 /// Where the pixels of a frame are. Copies share what is decoded.
 #[derive(Clone, Debug)]
@@ -54,6 +54,14 @@ impl PixelSource {
                 let pixels = Arc::new(pixels);
                 Ok(if disk.keep { Arc::clone(disk.kept.get_or_init(|| pixels)) } else { pixels })
             }
+        }
+    }
+
+    /// The picture with what its mask hides; `None` for pixels in memory, which lack that.
+    pub(super) fn photograph(&self) -> Option<Result<Image, CaptureError>> {
+        match &self.0 {
+            Place::Memory(_) => None,
+            Place::Disk(disk) => Some(disk.files.photograph()),
         }
     }
 

@@ -1,9 +1,9 @@
-//! LPIPS (Zhang et al. 2018): the distance of two pictures in the features of a trained network, and its gradient.
+//! LPIPS (Zhang et al. 2018): the distance of two pictures in the features of a trained network,
+//! and its gradient.
 
 mod conv;
 mod maps;
-mod tensor;
-mod torch;
+
 mod trunk;
 mod unit;
 mod weights;
@@ -34,12 +34,14 @@ pub struct Lpips {
 }
 
 impl Lpips {
-    /// Reads weights: a trunk with torchvision's names (`features.0.weight`, …) and LPIPS's linear layers (`lin0.weight`
-    /// or `lin0.model.1.weight`, …), in `.safetensors`, or in `.pth` or `.pt` as `torch.save` writes it.
+    /// Reads weights: a trunk with torchvision's names (`features.0.weight`, …) and LPIPS's linear
+    /// layers (`lin0.weight` or `lin0.model.1.weight`, …), in `.safetensors`, or in `.pth` or `.pt`
+    /// as `torch.save` writes it.
     ///
-    /// `path` is one file, with the linear layers inside or in another file beside it, or a directory of such files. In a
-    /// directory the first trunk counts, by file name, that has its linear layers. Pickles are parsed, never executed, and
-    /// only the tensors that are needed are read: a classifier in the file costs nothing.
+    /// `path` is one file, with the linear layers inside or in another file beside it, or a
+    /// directory of such files. In a directory the first trunk counts, by file name, that has its
+    /// linear layers. Pickles are parsed, never executed, and only the tensors that are needed are
+    /// read: a classifier in the file costs nothing.
     ///
     /// # Errors
     /// [`Error::Io`] and [`Error::File`], naming file, tensor, expected and actual type and shape.
@@ -49,11 +51,12 @@ impl Lpips {
         built.map_err(|error| found.blame(error))
     }
 
-    /// Builds `trunk` from what `read` gives for a name (`features.0.weight`, `lin0.weight`) and its shape (outputs,
-    /// inputs, rows, columns; channels), row-major.
+    /// Builds `trunk` from what `read` gives for a name (`features.0.weight`, `lin0.weight`) and
+    /// its shape (outputs, inputs, rows, columns; channels), row-major.
     ///
     /// # Errors
-    /// Those of `read`; [`Error::Lpips`] for a tensor of another length or with numbers that are not finite.
+    /// Those of `read`; [`Error::Lpips`] for a tensor of another length or with numbers that are
+    /// not finite.
     pub fn new(trunk: Trunk, mut read: impl FnMut(&str, &[usize]) -> Result<Vec<f32>, Error>) -> Result<Self, Error> {
         let mut checked = |name: &str, shape: &[usize]| {
             let values = read(name, shape)?;
@@ -72,7 +75,7 @@ impl Lpips {
         Ok(Self { trunk, network, lin })
     }
 
-    /// Which network this is.
+    /// The network.
     pub fn trunk(&self) -> Trunk {
         self.trunk
     }
@@ -80,7 +83,8 @@ impl Lpips {
     /// Whether pictures of a size can be compared.
     ///
     /// # Errors
-    /// [`Error::Lpips`] for those too small to have an output at every layer, and those of more than 2²¹ pixels.
+    /// [`Error::Lpips`] for those too small to have an output at every layer, and those of more
+    /// than 2²¹ pixels.
     pub fn check_size(&self, width: usize, height: usize) -> Result<(), Error> {
         let name = self.trunk.name();
         let refused = |expected: String| {
@@ -96,8 +100,9 @@ impl Lpips {
         Ok(())
     }
 
-    /// Distances of the pictures in `a` from those in `b`: (N, `height`, `width`, 3), row-major, sRGB in [0, 1]. 0 for
-    /// equal pictures; about 0.1 for a slight blur and 0.7 for unrelated ones. The same bits on any number of threads.
+    /// Distances of the pictures in `a` from those in `b`: (N, `height`, `width`, 3), row-major,
+    /// sRGB in [0, 1]. 0 for equal pictures; about 0.1 for a slight blur and 0.7 for unrelated
+    /// ones. The same bits on any number of threads.
     ///
     /// # Errors
     /// Those of [`Lpips::check_size`].
@@ -108,8 +113,9 @@ impl Lpips {
         self.compare(a, b, [width, height], None)
     }
 
-    /// [`Lpips::distance`], and adds `d_distance` × the gradient of each picture's distance by that picture to `d_a` (like
-    /// `a`). Where a channel's maximum in a window is shared, the first pixel gets the gradient; a distance of 0 has none.
+    /// Computes [`Lpips::distance`] and adds `d_distance` × the gradient of each picture's distance
+    /// by that picture to `d_a` (like `a`). Where a channel's maximum in a window is shared, the
+    /// first pixel gets the gradient; a distance of 0 has none.
     ///
     /// # Errors
     /// Those of [`Lpips::check_size`].

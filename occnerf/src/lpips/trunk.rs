@@ -1,4 +1,5 @@
-//! The networks: SqueezeNet 1.1, VGG16 and AlexNet as far as their last tap, with torchvision's names.
+//! The networks: SqueezeNet 1.1, VGG16 and AlexNet as far as their last tap, with torchvision's
+//! names.
 
 use ndarray::{ArrayViewMut2, Axis};
 
@@ -161,8 +162,8 @@ impl Network {
         self.layers.iter().fold(Some([height, width]), step).is_some()
     }
 
-    /// Runs the layers up to the last tap; `seen` gets the number and the output of each. Returns the outputs, of the last
-    /// layer alone unless `all` are to be kept.
+    /// Runs the layers up to the last tap; `seen` gets the number and the output of each. Returns
+    /// the outputs, of the last layer alone unless `all` are to be kept.
     pub fn forward(&self, input: &Maps, mut seen: impl FnMut(usize, &Maps), all: bool) -> Vec<Maps> {
         let mut outputs: Vec<Maps> = Vec::new();
         for (number, layer) in self.layers.iter().enumerate() {
@@ -176,8 +177,8 @@ impl Network {
         outputs
     }
 
-    /// The gradient by the first images of `input`, as many as the tap gradients are for. `outputs` are those of every
-    /// layer; `at_tap` adds the gradient by the output of layer `taps[i].0`.
+    /// The gradient by the first images of `input`, as many as the tap gradients are for. `outputs`
+    /// are those of every layer; `at_tap` adds the gradient by the output of layer `taps[i].0`.
     pub fn backward(
         &self,
         input: &Maps,

@@ -2,13 +2,14 @@
 
 use std::collections::BTreeMap;
 use std::fs::File;
-use std::io::{Read, Seek, SeekFrom};
+use std::io::{BufReader, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
 use safetensors::tensor::{Dtype, Metadata};
+use smpl::Data;
+use smpl::pickle::Value;
+use smpl::torch::{self, TorchFile};
 
-use super::tensor::{Tensor, fault, io};
-use super::torch;
 use super::trunk::Trunk;
 use crate::Error;
 
@@ -17,11 +18,38 @@ const MAX_HEADER: u64 = 100_000_000;
 /// Files of a directory that are looked into.
 const MAX_FILES: usize = 256;
 
+/// A tensor of a file.
+#[derive(Clone, Debug)]
+struct Tensor {
+    shape: Vec<usize>,
+    place: Place,
+}
+
+#[derive(Clone, Debug)]
+enum Place {
+    /// Type, and where the bytes start in a safetensors file.
+    Bytes(Dtype, u64),
+    Torch(torch::Tensor),
+}
+
 /// An open file and what it holds.
 pub(super) struct Weights {
     path: PathBuf,
-    file: File,
+    source: Source,
     tensors: BTreeMap<String, Tensor>,
+}
+
+enum Source {
+    Safetensors(File),
+    Torch(TorchFile<BufReader<File>>),
+}
+
+pub(super) fn fault(path: &Path, what: impl Into<String>) -> Error {
+    Error::File { path: path.to_owned(), what: what.into() }
+}
+
+pub(super) fn io(path: &Path) -> impl Fn(std::io::Error) -> Error {
+    move |source| Error::Io { path: path.to_owned(), source }
 }
 
 /// A trunk with its linear layers, in one file or two.
@@ -85,8 +113,8 @@ pub(super) fn find(path: &Path) -> Result<Found, Error> {
     Err(damaged.or(lonely).unwrap_or_else(|| fault(path, "has no .safetensors, .pth or .pt file with a trunk in it")))
 }
 
-/// The files that can be read, and what is wrong with the first that cannot: it matters where what is needed is in none of the
-/// others.
+/// The files that can be read, and what is wrong with the first that cannot: it matters where what
+/// is needed is in none of the others.
 fn open_all(paths: &[PathBuf]) -> (Vec<Weights>, Option<Error>) {
     let (mut open, mut damaged) = (Vec::new(), None);
     for path in paths {
@@ -125,15 +153,16 @@ impl Weights {
     pub fn open(path: &Path) -> Result<Self, Error> {
         let mut file = File::open(path).map_err(io(path))?;
         let mut start = Vec::new();
-        (&mut file).take(torch::LEGACY.len() as u64).read_to_end(&mut start).map_err(io(path))?;
-        let tensors = if start.starts_with(b"PK") {
-            torch::archive(path, &file)?
-        } else if start == torch::LEGACY {
-            torch::legacy(path, &mut file)?
+        (&mut file).take(64).read_to_end(&mut start).map_err(io(path))?;
+        let (source, tensors) = if torch::is_torch(&start) {
+            let file = TorchFile::open(&path.display().to_string(), BufReader::new(file))?;
+            let tensors = torch_tensors(&file)?;
+            (Source::Torch(file), tensors)
         } else {
-            safetensors(path, &mut file)?
+            let tensors = safetensors(path, &mut file)?;
+            (Source::Safetensors(file), tensors)
         };
-        Ok(Self { path: path.to_owned(), file, tensors })
+        Ok(Self { path: path.to_owned(), source, tensors })
     }
 
     /// Which trunk this is: all of its first and last layers' names tell it from its relatives.
@@ -174,25 +203,51 @@ impl Weights {
         let found = self.find(name).map(|(name, tensor)| (name.clone(), tensor.clone()));
         let (name, tensor) = found.ok_or_else(|| fault(path, format!("lacks `{name}`, of shape {shape:?}")))?;
         let bare = |shape: &[usize]| shape.iter().copied().filter(|&n| n != 1).collect::<Vec<_>>();
-        let known = matches!(tensor.dtype, Dtype::F16 | Dtype::BF16 | Dtype::F32 | Dtype::F64);
+        let (known, dtype) = match &tensor.place {
+            Place::Bytes(dtype, _) => {
+                (matches!(dtype, Dtype::F16 | Dtype::BF16 | Dtype::F32 | Dtype::F64), format!("{dtype:?}"))
+            }
+            Place::Torch(tensor) => (tensor.is_float(), tensor.dtype.to_owned()),
+        };
         let flat = shape.len() == 1 && bare(&tensor.shape) == bare(shape);
         if !known || (tensor.shape != shape && !flat) {
-            let (dtype, found) = (tensor.dtype, &tensor.shape);
-            return Err(fault(path, format!("`{name}` is {dtype:?} {found:?}, expected floats {shape:?}")));
+            let found = &tensor.shape;
+            return Err(fault(path, format!("`{name}` is {dtype} {found:?}, expected floats {shape:?}")));
         }
         // The shape is one of ours, so this is at most a few megabytes.
-        let size = tensor.dtype.bitsize() / 8;
-        let mut bytes = vec![0; size * shape.iter().product::<usize>()];
-        let cut = |e: std::io::Error| fault(path, format!("`{name}`, {dtype:?} {shape:?}: {e}", dtype = tensor.dtype));
-        match &tensor.entry {
-            Some(entry) => torch::read_entry(path, &self.file, entry, tensor.at, &mut bytes)?,
-            None => {
-                self.file.seek(SeekFrom::Start(tensor.at)).map_err(cut)?;
-                self.file.read_exact(&mut bytes).map_err(cut)?;
+        match (&mut self.source, &tensor.place) {
+            (Source::Safetensors(file), Place::Bytes(dtype, at)) => {
+                let size = dtype.bitsize() / 8;
+                let mut bytes = vec![0; size * shape.iter().product::<usize>()];
+                let cut = |e: std::io::Error| fault(path, format!("`{name}`, {dtype:?} {shape:?}: {e}"));
+                file.seek(SeekFrom::Start(*at)).map_err(cut)?;
+                file.read_exact(&mut bytes).map_err(cut)?;
+                Ok(bytes.chunks_exact(size).map(|word| number(*dtype, word)).collect())
+            }
+            (Source::Torch(file), Place::Torch(tensor)) => Ok(match file.read(&name, tensor)?.data {
+                Data::F32(values) => values,
+                Data::F64(values) => values.into_iter().map(|value| value as f32).collect(),
+                Data::I64(_) | Data::Bool(_) => Vec::new(),
+            }),
+            _ => Err(fault(path, format!("`{name}` is in no open file"))),
+        }
+    }
+}
+
+/// The tensors of a state dictionary, alone or as `state_dict` of a training checkpoint.
+fn torch_tensors(file: &TorchFile<BufReader<File>>) -> Result<BTreeMap<String, Tensor>, Error> {
+    let root = file.root();
+    let mut tensors = BTreeMap::new();
+    if let Value::Dict(items) = root.get("state_dict").unwrap_or(root) {
+        for (name, value) in items {
+            let Some(name) = name.as_str() else { continue };
+            if let Some(tensor) = file.tensor(name, value)? {
+                let shape = tensor.shape.clone();
+                tensors.insert(name.to_owned(), Tensor { shape, place: Place::Torch(tensor) });
             }
         }
-        Ok(bytes.chunks_exact(size).map(|word| number(tensor.dtype, word)).collect())
     }
+    Ok(tensors)
 }
 
 /// A little-endian float.
@@ -233,14 +288,15 @@ fn safetensors(path: &Path, file: &mut File) -> Result<BTreeMap<String, Tensor>,
     let found = length - 8 - header;
     let mut tensors = BTreeMap::new();
     for (name, info) in metadata.tensors() {
-        // Types and shapes fit the offsets: safetensors has looked. Whether the bytes are there it cannot know.
+        // Types and shapes fit the offsets: safetensors has looked. Whether the bytes are there it
+        // cannot know.
         let (start, end) = (info.data_offsets.0 as u64, info.data_offsets.1 as u64);
         if end > found {
             let (dtype, shape) = (info.dtype, &info.shape);
             return Err(fault(path, format!("is cut: `{name}`, {dtype:?} {shape:?}, ends at byte {end} of {found}")));
         }
-        let (dtype, shape, at) = (info.dtype, info.shape.clone(), 8 + header + start);
-        tensors.insert(name, Tensor { dtype, shape, at, entry: None });
+        let place = Place::Bytes(info.dtype, 8 + header + start);
+        tensors.insert(name, Tensor { shape: info.shape.clone(), place });
     }
     Ok(tensors)
 }

@@ -14,6 +14,8 @@ use crate::npz::read_file;
 
 /// Bytes that all accessors together may decode to: 256 MiB.
 const MAX_DECODED_BYTES: u64 = 1 << 28;
+/// What the buffers and the pictures of a document may come to, in bytes: 512 MiB. A document may name one file many times.
+const MAX_RESOLVED_BYTES: u64 = 1 << 29;
 
 /// A document and the bytes that its accessors and images point into. Nothing in it is taken on
 /// trust: every index and range is checked where it is used.
@@ -25,6 +27,8 @@ pub(super) struct Source<'a> {
     data: Vec<Vec<u8>>,
     /// Bytes that may still be decoded: many accessors may share one range.
     left: Cell<u64>,
+    /// Bytes that addresses may still lead to.
+    resolvable: Cell<u64>,
 }
 
 impl<'a> Source<'a> {
@@ -35,7 +39,14 @@ impl<'a> Source<'a> {
         mut blob: Option<Vec<u8>>,
         folder: Option<&'a Path>,
     ) -> Result<Self, Error> {
-        let mut source = Self { file, root, folder, data: Vec::new(), left: Cell::new(MAX_DECODED_BYTES) };
+        let mut source = Self {
+            file,
+            root,
+            folder,
+            data: Vec::new(),
+            left: Cell::new(MAX_DECODED_BYTES),
+            resolvable: Cell::new(MAX_RESOLVED_BYTES),
+        };
         for (i, buffer) in root.buffers.iter().enumerate() {
             let place = format!("buffer {i}");
             let bytes = match &buffer.uri {
@@ -165,15 +176,33 @@ impl<'a> Source<'a> {
             let Some((mime, text)) = rest.split_once(";base64,") else {
                 return Err(self.invalid(place, "a data address that is not base64"));
             };
+            self.spend(place, text.len() as u64 / 4 * 3)?;
             let bytes = base64::engine::general_purpose::STANDARD.decode(text);
             return Ok((mime.to_owned(), bytes.map_err(|e| self.invalid(place, e.to_string()))?));
         }
         let path = Path::new(uri);
         let inside = path.components().all(|c| matches!(c, Component::Normal(_) | Component::CurDir));
         match self.folder {
-            Some(folder) if inside => Ok((String::new(), read_file(&folder.join(path))?)),
+            Some(folder) if inside => {
+                let path = folder.join(path);
+                // Before it is read.
+                self.spend(place, std::fs::metadata(&path).map_or(0, |file| file.len()))?;
+                Ok((String::new(), read_file(&path)?))
+            }
             _ => Err(self.invalid(place, format!("the address {uri:?} does not lead to a file beside it"))),
         }
+    }
+
+    /// Takes what an address leads to off what the document may still ask for.
+    fn spend(&self, place: &str, bytes: u64) -> Result<(), Error> {
+        let left = self.resolvable.get().checked_sub(bytes).ok_or_else(|| Error::TooLarge {
+            file: self.file.to_owned(),
+            key: place.to_owned(),
+            claimed: u128::from(MAX_RESOLVED_BYTES - self.resolvable.get()) + u128::from(bytes),
+            limit: MAX_RESOLVED_BYTES,
+        })?;
+        self.resolvable.set(left);
+        Ok(())
     }
 
     pub(super) fn invalid(&self, place: &str, message: impl Into<String>) -> Error {

@@ -1,6 +1,7 @@
 //! `bench`: what every approximation costs and is worth, and where methods break.
 
 mod axes;
+mod baked;
 mod capacity;
 pub mod chart;
 mod cost;
@@ -57,6 +58,8 @@ enum What {
     Kernels(KernelArguments),
     /// Where the time of a step goes, and how time and memory grow with rays, samples, table, vertices, frames and pixels.
     Cost(CostArguments),
+    /// A run's baked person against its field: a table of scores and speeds, and pictures.
+    Baked(baked::BakedArguments),
     /// One run, handed over on standard input.
     #[command(hide = true)]
     Point {
@@ -190,6 +193,7 @@ struct KernelArguments {
 /// Runs the command.
 pub fn bench(arguments: &BenchArguments) -> Result<()> {
     match &arguments.what {
+        What::Baked(arguments) => baked::baked(arguments),
         What::Pareto(arguments) => pareto(arguments),
         What::Capacity(arguments) => capacity_bench(arguments),
         What::Stability(arguments) => stability(arguments),

@@ -49,8 +49,18 @@ fn name(signal: i32) -> String {
     }
 }
 
-/// The one line that is printed of an error, and the exit code.
+/// The one line that is printed of an error that ends the program, and the exit code.
 pub fn described(error: &Error) -> (String, u8) {
+    let ending = error.chain().find_map(|cause| cause.downcast_ref::<Ending>());
+    let line = one_line(error);
+    match ending {
+        Some(Ending::Stopped { .. }) => (line, ending.map_or(1, Ending::code)),
+        _ => (format!("error: {line}"), ending.map_or(1, Ending::code)),
+    }
+}
+
+/// An error and its causes on one line, each said once, not longer than anybody reads.
+pub fn one_line(error: &Error) -> String {
     let mut text = String::new();
     for cause in error.chain() {
         let cause = cause.to_string();
@@ -63,13 +73,8 @@ pub fn described(error: &Error) -> (String, u8) {
         }
         text.push_str(&cause);
     }
-    let ending = error.chain().find_map(|cause| cause.downcast_ref::<Ending>());
-    let line: Vec<&str> = text.lines().map(str::trim).filter(|line| !line.is_empty()).collect();
-    let line = cut(&shown(&line.join(" ")));
-    match ending {
-        Some(Ending::Stopped { .. }) => (line, ending.map_or(1, Ending::code)),
-        _ => (format!("error: {line}"), ending.map_or(1, Ending::code)),
-    }
+    let lines: Vec<&str> = text.lines().map(str::trim).filter(|line| !line.is_empty()).collect();
+    cut(&shown(&lines.join(" ")))
 }
 
 /// The beginning and the end of what is too long.

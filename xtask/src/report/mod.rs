@@ -12,6 +12,7 @@ use occnerf::{Capacity, Choice, Pruned};
 
 use self::curves::{Log, curves};
 use self::page::Page;
+pub use self::page::escape;
 use self::viewer::{Views, viewers};
 use crate::bench;
 use crate::capacity;

@@ -102,7 +102,16 @@ pub fn reproduce(arguments: &ReproduceArguments) -> Result<()> {
     let scenes = if arguments.scenes.is_empty() { &demo[..] } else { &arguments.scenes };
     let minutes = arguments.budget / scenes.len() as f64;
     let runs = Runs::default();
+    let rows = arguments.rows(|row| !arguments.robustness || MAIN.contains(&row.name));
+    let levels = if arguments.robustness { LEVELS.len() } else { 1 };
+    let each = levels * rows.iter().map(|row| row.runs(arguments.seeds) as usize).sum::<usize>();
     for (index, scene) in scenes.iter().enumerate() {
+        // Of many jobs most have nothing to do with a scene, and need not load it.
+        let first = runs.count.get();
+        if arguments.part.shard.is_some_and(|shard| !(first..first + each).any(|run| shard.has(run))) {
+            runs.count.set(first + each);
+            continue;
+        }
         say!("scene {} of {}: {scene}", index + 1, scenes.len());
         let directory = arguments.out.join(unique_name(scenes, index));
         let experiment = Experiment { arguments, lpips: lpips.as_ref(), scene, minutes, runs: &runs };

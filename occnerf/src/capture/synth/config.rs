@@ -1,4 +1,4 @@
-//! What a synthetic capture is made of.
+//! Settings of a synthetic capture.
 
 use serde::{Deserialize, Serialize};
 
@@ -13,14 +13,15 @@ pub enum Occlusion {
     Rectangle(Obstacle),
     /// A desk and two pillars of 3-D geometry, lit as the person is, before a room; in every frame.
     Objects {
-        /// Part of the person's pixels that is hidden, 0 to 0.95: the objects are as wide as that takes.
+        /// Part of the person's pixels that is hidden, 0 to 0.95: the objects are as wide as that
+        /// takes.
         fraction: f32,
         /// How far they stand to the right of the person, in picture widths, −1 to 1.
         position: f32,
     },
 }
 
-/// What a synthetic capture is made of. The default gives the demo's.
+/// Settings of a synthetic capture. The default gives the demo's.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct SynthConfig {
@@ -36,10 +37,12 @@ pub struct SynthConfig {
     pub seed: u64,
     /// Root mean square error of each bone's orientation in the prior, degrees, 0 to 45.
     pub pose_noise_degrees: f32,
-    /// Error of the prior's shape relative to the usual one, 0 to 3. At 1 the embedded person's coefficients are off by
-    /// 0.15 (standard deviation), beside the clothes; the prior of a character lies 1 to 3 cm inside it.
+    /// Error of the prior's shape relative to the usual one, 0 to 3. At 1 the embedded person's
+    /// coefficients are off by 0.15 (standard deviation), beside the clothes; the prior of a
+    /// character lies 1 to 3 cm inside it.
     pub shape_noise: f32,
-    /// Full turns added over the video to the motion of a clip or a character, −10 to 10, so that all sides are seen.
+    /// Full turns added over the video to the motion of a clip or a character, −10 to 10, so that
+    /// all sides are seen.
     pub turns: f32,
     /// What hides the person.
     pub occlusion: Occlusion,

@@ -1,4 +1,5 @@
-//! Captures made to order: a person or a character filmed, then hidden in part, ready to be written to disk.
+//! Captures made to order: a person or a character filmed, then hidden in part, ready to be written
+//! to disk.
 
 mod character;
 mod config;
@@ -25,11 +26,11 @@ use super::{Capture, CaptureError, Frame};
 
 /// A capture made by [`synthesise`], with what only its maker knows.
 pub struct Synthetic {
-    /// What training sees: the occlusion applied.
+    /// The capture that training sees, the occlusion applied.
     pub capture: Capture,
     /// The body model that the capture's poses and betas are for.
     pub body: BodyModel,
-    /// What it was made of.
+    /// The configuration it was made of.
     pub config: SynthConfig,
     /// Part of the subject's pixels that is hidden, over the frames in which anything is.
     pub hidden_fraction: f32,
@@ -41,17 +42,19 @@ pub struct Synthetic {
     pub(super) objects: Option<Objects>,
 }
 
-/// Films the embedded person, or `character`, moving as in `motion` (SMPL's joints), else in its own way: the embedded
-/// person walks and turns, a character plays its first animation, or stands where it has none. `progress` is called
-/// with the number of instants filmed.
+/// Films the embedded person, or `character`, moving as in `motion` (SMPL's joints), else in its
+/// own way: the embedded person walks and turns, a character plays its first animation, or stands
+/// where it has none. `progress` is called with the number of instants filmed.
 ///
-/// The tracker's poses and betas are off by the configured errors. A character's body model is its own mesh at rest
-/// with its skin and joints, and one coefficient that moves the surface inward. Cameras stand still around the origin, so motions
-/// are brought there. The result depends on the arguments alone, not on the number of threads.
+/// The tracker's poses and betas are off by the configured errors. A character's body model is its
+/// own mesh at rest with its skin and joints, and one coefficient that moves the surface inward.
+/// Cameras stand still around the origin, so motions are brought there. The result depends on the
+/// arguments alone, not on the number of threads.
 ///
 /// # Errors
-/// [`CaptureError::Setting`] for values outside their ranges, for more pixels than [`LoadOptions::max_bytes`] admits by
-/// default, and for characters that no body can be made of, or that `motion` cannot drive.
+/// [`CaptureError::Setting`] for values outside their ranges, for more pixels than
+/// [`LoadOptions::max_bytes`] admits by default, and for characters that no body can be made of, or
+/// that `motion` cannot drive.
 pub fn synthesise(
     character: Option<&Character>,
     motion: Option<&MotionClip>,

@@ -44,7 +44,8 @@ impl Folder<'_> {
             (self.progress)(self.written.fetch_add(1, std::sync::atomic::Ordering::Relaxed) + 1);
             Ok(())
         };
-        // Collected as results first, so that the error reported is the first in order whatever finishes first.
+        // Collected as results first, so that the error reported is the first in order whatever
+        // finishes first.
         let saved: Vec<Result<(), CaptureError>> = names.par_iter().enumerate().map(save).collect();
         saved.into_iter().collect()
     }
@@ -54,7 +55,8 @@ pub(super) fn rgb(image: &Image) -> RgbImage {
     RgbImage::from_fn(image.width, image.height, |x, y| image::Rgb(image.rgb(x, y).map(byte)))
 }
 
-/// Colours as they are without what they were mixed with at edges, for readers that multiply by the mask.
+/// Colours as they are without what they were mixed with at edges, for readers that multiply by the
+/// mask.
 pub(super) fn unmixed(image: &Image, mask: &[f32]) -> RgbImage {
     let mut whole = image.clone();
     for (pixel, &coverage) in whole.pixels.chunks_exact_mut(3).zip(mask).filter(|(_, m)| **m > 0.0) {
@@ -63,7 +65,8 @@ pub(super) fn unmixed(image: &Image, mask: &[f32]) -> RgbImage {
     rgb(&whole)
 }
 
-/// Nearest of 256 levels, the lower of two: one half stays below the middle, as readers tell subject from background.
+/// Nearest of 256 levels, the lower of two: one half stays below the middle, as readers tell
+/// subject from background.
 pub(super) fn byte(value: f32) -> u8 {
     (value * 255.0 - 0.5).ceil().clamp(0.0, 255.0) as u8
 }
@@ -96,7 +99,8 @@ pub(super) fn flat(points: &[Vec3]) -> Vec<f32> {
     points.iter().flat_map(|p| p.to_array()).collect()
 }
 
-/// Rotation and translation about the origin, as ZJU-MoCap has them. Synthetic frames are placed so.
+/// Rotation and translation about the origin, as ZJU-MoCap has them. Synthetic frames are placed
+/// so.
 pub(super) fn origin(frame: &Frame) -> (Vec3, Vec3) {
     match frame.placement {
         Placement::Origin { rotation, translation } => (rotation, translation),

@@ -20,16 +20,18 @@ use super::{CaptureError, Layout};
 const BODY: &str = "body.safetensors";
 
 impl Synthetic {
-    /// Writes the capture into `dir`, which is made if it is not there, for [`super::load_capture`] to read, with the body model
-    /// as `body.safetensors`.
+    /// Writes the capture into `dir`, which is made if it is not there, for [`super::load_capture`]
+    /// to read, with the body model as `body.safetensors`.
     ///
-    /// What a rectangle hides is black in HumanNeRF's layouts and 0 in their masks; raw ZJU-MoCap gets clean pictures and
-    /// an `occlusion.json`, as its occlusion is simulated by those who read it. Objects are in the pictures, before a
-    /// room; the wild layout says where, in `occluders`. It holds back clean pictures by the training camera, every
-    /// `eval_every`-th; the others hold back the other cameras. `progress` is called with the number of pictures written.
+    /// What a rectangle hides is black in HumanNeRF's layouts and 0 in their masks; raw ZJU-MoCap
+    /// gets clean pictures and an `occlusion.json`, as its occlusion is simulated by those who read
+    /// it. Objects are in the pictures, before a room; the wild layout says where, in `occluders`.
+    /// It holds back clean pictures by the training camera, every `eval_every`-th; the others hold
+    /// back the other cameras. `progress` is called with the number of pictures written.
     ///
     /// # Errors
-    /// [`CaptureError::Io`], [`CaptureError::Picture`], [`CaptureError::Array`]. What has been written by then stays.
+    /// [`CaptureError::Io`], [`CaptureError::Picture`], [`CaptureError::Array`]. What has been
+    /// written by then stays.
     pub fn write(&self, dir: &Path, layout: Layout, progress: &(dyn Fn(usize) + Sync)) -> Result<(), CaptureError> {
         let folder = Folder { dir, progress, written: std::sync::atomic::AtomicUsize::new(0) };
         folder.make("")?;

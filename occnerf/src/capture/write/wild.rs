@@ -40,7 +40,8 @@ pub(super) fn write(synthetic: &Synthetic, folder: &Folder<'_>) -> Result<(), Ca
     })
 }
 
-/// Body and camera of a frame. The layout has no translation of the body, so the camera moves instead.
+/// Body and camera of a frame. The layout has no translation of the body, so the camera moves
+/// instead.
 fn record(body: &BodyModel, frame: &Frame) -> Value {
     let (rotation, translation) = origin(frame);
     // A turn about the pelvis in place of one about the origin.

@@ -1,0 +1,328 @@
+//! The plain types of a baked person, their checks, and how it moves.
+
+use glam::{Affine3A, Mat3, Mat3A, Vec2, Vec3, Vec3A};
+use rayon::prelude::*;
+use smpl::{MotionClip, Placement, SparseRows};
+use volrender::Camera;
+
+/// Most shells of an avatar.
+pub const MAX_SHELLS: usize = 5;
+/// Most joints of an avatar.
+pub const MAX_JOINTS: usize = 256;
+/// Longest side of an atlas in texels.
+pub const MAX_ATLAS_SIDE: u32 = 4096;
+/// Largest coordinate that is taken for one, in metres.
+const MAX_LENGTH: f32 = 1e6;
+/// Pose blend-shape terms of a joint other than the root: the entries of R − I.
+const TERMS_PER_JOINT: usize = 9;
+
+/// A person as one to five textured shells of triangles, skinned to a skeleton, with the motions they make.
+///
+/// Everything is in metres in a world that is right-handed and y up. The surface stands in the canonical pose (the
+/// T-pose, all rotations zero), facing +z. V vertices, F triangles, J joints, T frames of a clip.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Avatar {
+    /// Name of the scene, as the capture gives it.
+    pub name: String,
+    /// Canonical positions of all shells, (V); vertices on a seam of the atlas stand once for each chart.
+    pub vertices: Vec<Vec3>,
+    /// Canonical unit normals, (V).
+    pub normals: Vec<Vec3>,
+    /// Place in the atlas, (V): u to the right and v downward, both from 0 to 1 over the whole atlas.
+    pub uvs: Vec<Vec2>,
+    /// Triangles of all shells, the innermost shell's first, (F), counter-clockwise seen from outside.
+    pub faces: Vec<[u32; 3]>,
+    /// One past the last triangle of each shell, from the innermost to the outermost; ascending, the last is F.
+    pub shell_ends: Vec<u32>,
+    /// Joints that move each vertex, (V); those that do not count are repeated or 0.
+    pub joints: Vec<[u16; 4]>,
+    /// Their weights, (V): not negative, summing to 1.
+    pub weights: Vec<[f32; 4]>,
+    /// Pose blend shapes, (V, 9(J−1)), in the order of [`smpl::BodyModel::posedirs`]; no row has any entry where
+    /// skinning alone moves the surface. Formats that have none leave them out.
+    pub posedirs: SparseRows<Vec3>,
+    /// Colours and confidence.
+    pub atlas: Atlas,
+    /// The skeleton at rest, (J); parents come before their children, joint 0 is the only root.
+    pub skeleton: Vec<Joint>,
+    /// Shape coefficients of the body model that the surface came from; may be empty.
+    pub betas: Vec<f32>,
+    /// Motions; the first is the video's.
+    pub clips: Vec<Clip>,
+    /// The training camera of each frame of the first clip, (T), or none.
+    pub cameras: Vec<Camera>,
+}
+
+/// The picture that the surface is painted with.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Atlas {
+    /// Texels a row.
+    pub width: u32,
+    /// Rows.
+    pub height: u32,
+    /// 8-bit sRGB and linear alpha, not premultiplied, (H, W, 4), row-major from the top left.
+    pub rgba: Vec<u8>,
+    /// How well the video showed each texel, (H, W): 0 never, 255 often.
+    pub confidence: Vec<u8>,
+}
+
+/// A joint of the skeleton.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Joint {
+    /// Such as `left_knee`; unique.
+    pub name: String,
+    /// The joint it hangs from; `None` for the root alone.
+    pub parent: Option<u16>,
+    /// Canonical position.
+    pub rest: Vec3,
+}
+
+/// A named motion: axis-angle rotations (T·J) of each joint relative to its parent, and translations (T) of the root.
+///
+/// The root joint stands at its rest position + translation and turns about itself ([`Placement::Pelvis`]).
+#[derive(Clone, Debug, PartialEq)]
+pub struct Clip {
+    /// Such as `video`; unique.
+    pub name: String,
+    /// Rotations, translations and rate.
+    pub motion: MotionClip,
+}
+
+impl Avatar {
+    /// V.
+    #[must_use]
+    pub fn num_vertices(&self) -> usize {
+        self.vertices.len()
+    }
+
+    /// J.
+    #[must_use]
+    pub fn num_joints(&self) -> usize {
+        self.skeleton.len()
+    }
+
+    /// Triangles of shell `shell`, 0 being the innermost.
+    ///
+    /// # Panics
+    /// If there is no such shell.
+    #[must_use]
+    pub fn shell(&self, shell: usize) -> &[[u32; 3]] {
+        let start = shell.checked_sub(1).map_or(0, |before| self.shell_ends[before] as usize);
+        &self.faces[start..self.shell_ends[shell] as usize]
+    }
+
+    /// Canonical to world transform of each joint, (J), for rotations `pose` (J).
+    ///
+    /// # Panics
+    /// If `pose` is not J long.
+    #[must_use]
+    pub fn bones(&self, pose: &[Vec3], translation: Vec3) -> Vec<Affine3A> {
+        assert_eq!(pose.len(), self.num_joints(), "bones: rotations of joints");
+        let mut frames: Vec<Affine3A> = Vec::with_capacity(pose.len());
+        for (joint, &turn) in self.skeleton.iter().zip(pose) {
+            let parent = joint.parent.map(usize::from);
+            let origin = parent.map_or(-translation, |parent| self.skeleton[parent].rest);
+            let local = Affine3A::from_mat3_translation(smpl::rodrigues(turn), joint.rest - origin);
+            frames.push(parent.map_or(local, |parent| frames[parent] * local));
+        }
+        let about = |(frame, joint): (Affine3A, &Joint)| frame * Affine3A::from_translation(-joint.rest);
+        frames.into_iter().zip(&self.skeleton).map(about).collect()
+    }
+
+    /// Canonical to world transform of each joint, (J), at `seconds` of clip `clip`.
+    ///
+    /// # Panics
+    /// If there is no such clip.
+    #[must_use]
+    pub fn bones_at(&self, clip: usize, seconds: f32) -> Vec<Affine3A> {
+        let (pose, placement) = self.clips[clip].motion.at(seconds, self.num_joints());
+        let (Placement::Pelvis { translation } | Placement::Origin { translation, .. }) = placement;
+        self.bones(&pose, translation)
+    }
+
+    /// Linear blend skinning without pose blend shapes, as glTF has it: Σ w_vi · bones_i · vertices_v, (V).
+    ///
+    /// # Panics
+    /// Unless there are J bones.
+    #[must_use]
+    pub fn skin(&self, bones: &[Affine3A]) -> Vec<Vec3> {
+        self.skinned(bones, &|v| self.vertices[v])
+    }
+
+    /// [`Avatar::skin`] after the pose blend shapes of rotations `pose`, (J).
+    ///
+    /// # Panics
+    /// Unless `bones` and `pose` are J long.
+    #[must_use]
+    pub fn skin_with_blend_shapes(&self, bones: &[Affine3A], pose: &[Vec3]) -> Vec<Vec3> {
+        assert_eq!(pose.len(), self.num_joints(), "skin_with_blend_shapes: rotations of joints");
+        let features: Vec<f32> = (pose.iter().skip(1))
+            .flat_map(|&turn| (smpl::rodrigues(turn) - Mat3::IDENTITY).transpose().to_cols_array())
+            .collect();
+        self.skinned(bones, &|v| {
+            self.vertices[v] + self.posedirs.row(v).map(|(term, d)| features[term] * d).sum::<Vec3>()
+        })
+    }
+
+    fn skinned(&self, bones: &[Affine3A], rest: &(dyn Fn(usize) -> Vec3 + Sync)) -> Vec<Vec3> {
+        assert_eq!(bones.len(), self.num_joints(), "skin: bones");
+        (0..self.num_vertices())
+            .into_par_iter()
+            .map(|v| blend(bones, self.joints[v], self.weights[v]).transform_point3(rest(v)))
+            .collect()
+    }
+
+    /// World normals of each vertex, (V): the canonical ones turned with the bones.
+    ///
+    /// # Panics
+    /// Unless there are J bones.
+    #[must_use]
+    pub fn turned_normals(&self, bones: &[Affine3A]) -> Vec<Vec3> {
+        assert_eq!(bones.len(), self.num_joints(), "turned_normals: bones");
+        let turned = |(v, &normal): (usize, &Vec3)| {
+            blend(bones, self.joints[v], self.weights[v]).transform_vector3(normal).normalize_or(normal)
+        };
+        self.normals.par_iter().enumerate().map(turned).collect()
+    }
+
+    /// Says what does not fit together, names the part, and what is expected and found.
+    ///
+    /// # Errors
+    /// The first fault in the order of the fields.
+    pub fn validate(&self) -> Result<(), String> {
+        let (v, j) = (self.num_vertices(), self.num_joints());
+        let each = [
+            ("normals", self.normals.len()),
+            ("uvs", self.uvs.len()),
+            ("joints", self.joints.len()),
+            ("weights", self.weights.len()),
+            ("posedirs", self.posedirs.num_rows()),
+        ];
+        expect(v > 0, || "`vertices`: expected some, found none".to_owned())?;
+        for (key, found) in each {
+            expect(found == v, || format!("`{key}`: expected {v} rows, one a vertex, found {found}"))?;
+        }
+        vectors("vertices", &self.vertices, MAX_LENGTH)?;
+        vectors("normals", &self.normals, 1.01)?;
+        let inside = |uv: &Vec2| (0.0..=1.0).contains(&uv.x) && (0.0..=1.0).contains(&uv.y);
+        all("uvs", &self.uvs, inside, "numbers from 0 to 1")?;
+        let known = |face: &[u32; 3]| face.iter().all(|&i| (i as usize) < v);
+        all("faces", &self.faces, known, &format!("vertices below {v}"))?;
+        let ends = &self.shell_ends;
+        let ordered = ends.windows(2).all(|w| w[0] < w[1]) && ends.first().is_some_and(|&end| end > 0);
+        let whole = ends.last().is_some_and(|&last| last as usize == self.faces.len());
+        expect(ordered && whole && ends.len() <= MAX_SHELLS, || {
+            let f = self.faces.len();
+            format!("`shell_ends`: expected 1 to {MAX_SHELLS} ascending numbers above 0 up to {f}, found {ends:?}")
+        })?;
+        expect((1..=MAX_JOINTS).contains(&j), || format!("`skeleton`: expected 1 to {MAX_JOINTS} joints, found {j}"))?;
+        all("joints", &self.joints, |row| row.iter().all(|&i| usize::from(i) < j), &format!("joints below {j}"))?;
+        let sums = |row: &[f32; 4]| {
+            row.iter().all(|w| (0.0..=1.001).contains(w)) && (row.iter().sum::<f32>() - 1.0).abs() <= 1e-3
+        };
+        all("weights", &self.weights, sums, "numbers of at least 0 that sum to 1")?;
+        self.validate_posedirs(TERMS_PER_JOINT * (j - 1))?;
+        self.atlas.validate()?;
+        self.validate_skeleton()?;
+        all("betas", &self.betas, |beta| beta.abs() <= MAX_LENGTH, "finite numbers")?;
+        self.validate_motion()
+    }
+
+    fn validate_posedirs(&self, terms: usize) -> Result<(), String> {
+        let SparseRows { offsets, columns, values } = &self.posedirs;
+        let parted = offsets.first() == Some(&0)
+            && offsets.windows(2).all(|w| w[0] <= w[1])
+            && offsets.last().is_some_and(|&end| end as usize == columns.len())
+            && columns.len() == values.len();
+        expect(parted, || "`posedirs`: expected row offsets that part the entries".to_owned())?;
+        all("posedirs columns", columns, |&c| (c as usize) < terms, &format!("terms below {terms}"))?;
+        vectors("posedirs", values, MAX_LENGTH)
+    }
+
+    fn validate_skeleton(&self) -> Result<(), String> {
+        for (j, joint) in self.skeleton.iter().enumerate() {
+            let placed = joint.parent.map_or(j == 0, |parent| usize::from(parent) < j);
+            expect(placed, || {
+                let expected = "none for joint 0 and a joint before it for all others";
+                format!("`skeleton`: parent of joint {j}: expected {expected}, found {:?}", joint.parent)
+            })?;
+            let twice = self.skeleton[..j].iter().any(|other| other.name == joint.name);
+            expect(!twice, || format!("`skeleton`: two joints are named {:?}", joint.name))?;
+        }
+        vectors("skeleton", &self.skeleton.iter().map(|joint| joint.rest).collect::<Vec<_>>(), MAX_LENGTH)
+    }
+
+    fn validate_motion(&self) -> Result<(), String> {
+        let j = self.num_joints();
+        for (c, Clip { name, motion }) in self.clips.iter().enumerate() {
+            let twice = self.clips[..c].iter().any(|other| other.name == *name);
+            expect(!twice, || format!("`clips`: two are named {name:?}"))?;
+            expect(motion.num_joints == j, || {
+                format!("clip {name:?}: expected {j} joints, found {}", motion.num_joints)
+            })?;
+            let (frames, turns) = (motion.num_frames(), motion.poses.len());
+            expect(frames > 0 && frames.checked_mul(j) == Some(turns), || {
+                format!("clip {name:?}: expected some frames of {j} rotations, found {frames} of {turns} in all")
+            })?;
+            let rate = motion.fps;
+            expect(rate > 0.0 && rate <= 1e6, || format!("clip {name:?}: {rate} frames a second"))?;
+            vectors(&format!("poses of {name:?}"), &motion.poses, 1e3)?;
+            vectors(&format!("trans of {name:?}"), &motion.trans, MAX_LENGTH)?;
+        }
+        let frames = self.clips.first().map_or(0, |clip| clip.motion.num_frames());
+        let cameras = self.cameras.len();
+        expect(cameras == 0 || cameras == frames, || {
+            format!("`cameras`: expected {frames}, one a frame of the first clip, or none; found {cameras}")
+        })?;
+        for (i, camera) in self.cameras.iter().enumerate() {
+            let Camera { world_to_camera, width, height, .. } = *camera;
+            Camera::new(camera.intrinsics(), world_to_camera, width, height)
+                .map_err(|error| format!("camera {i}: {error}"))?;
+        }
+        Ok(())
+    }
+}
+
+impl Atlas {
+    fn validate(&self) -> Result<(), String> {
+        let sides = 1..=MAX_ATLAS_SIDE;
+        expect(sides.contains(&self.width) && sides.contains(&self.height), || {
+            let (w, h) = (self.width, self.height);
+            format!("`atlas`: expected sides of 1 to {MAX_ATLAS_SIDE} texels, found {w}×{h}")
+        })?;
+        let texels = self.width as usize * self.height as usize;
+        for (key, expected, found) in
+            [("rgba", 4 * texels, self.rgba.len()), ("confidence", texels, self.confidence.len())]
+        {
+            expect(found == expected, || format!("`atlas` {key}: expected {expected} bytes, found {found}"))?;
+        }
+        Ok(())
+    }
+}
+
+/// Σ w_i · bones_i.
+fn blend(bones: &[Affine3A], joints: [u16; 4], weights: [f32; 4]) -> Affine3A {
+    let mut sum = Affine3A { matrix3: Mat3A::ZERO, translation: Vec3A::ZERO };
+    for (joint, weight) in joints.into_iter().zip(weights) {
+        let bone = &bones[usize::from(joint)];
+        sum.matrix3 += bone.matrix3 * weight;
+        sum.translation += bone.translation * weight;
+    }
+    sum
+}
+
+fn expect(holds: bool, message: impl FnOnce() -> String) -> Result<(), String> {
+    if holds { Ok(()) } else { Err(message()) }
+}
+
+/// Every entry must do; NaN does not pass comparisons.
+fn all<T: std::fmt::Debug>(key: &str, values: &[T], does: impl Fn(&T) -> bool, expected: &str) -> Result<(), String> {
+    match values.iter().position(|value| !does(value)) {
+        Some(at) => Err(format!("`{key}`: expected {expected}, found {:?} at {at}", values[at])),
+        None => Ok(()),
+    }
+}
+
+fn vectors(key: &str, values: &[Vec3], longest: f32) -> Result<(), String> {
+    all(key, values, |v| v.length() <= longest, &format!("finite vectors no longer than {longest}"))
+}

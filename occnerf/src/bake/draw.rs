@@ -1,0 +1,183 @@
+//! Pictures of a baked person: skinned, rasterised, painted from the atlas.
+
+use glam::{Affine3A, Mat3, Mat3A, Vec2, Vec3, Vec3A, Vec4};
+use rayon::prelude::*;
+use visibility::{Fragment, Pixel, RasterOptions, Rasterizer, Samples};
+use volrender::Camera;
+
+use super::avatar::Avatar;
+use crate::Error;
+use crate::scene::prepared::pinhole;
+
+/// Vertices that are skinned together.
+const CHUNK: usize = 1024;
+/// Pose blend-shape terms of a joint other than the root.
+const TERMS: usize = 9;
+
+/// An avatar made ready to be drawn; keeps its buffers from picture to picture.
+pub struct BakedPerson<'a> {
+    avatar: &'a Avatar,
+    /// Canonical positions in the unit of the bones, (V).
+    vertices: Vec<Vec3>,
+    /// What one unit of the avatar is in that of the bones.
+    scale: f32,
+    /// Premultiplied colours, (H, W).
+    texels: Vec<Vec4>,
+    features: Vec<f32>,
+    skinned: Vec<Vec3>,
+    rasterizer: Rasterizer,
+}
+
+impl<'a> BakedPerson<'a> {
+    /// For bones and cameras in which an avatar's metre is `scale` long.
+    #[must_use]
+    pub fn new(avatar: &'a Avatar, scale: f32) -> Self {
+        let texel = |rgba: &[u8; 4]| {
+            let [r, g, b, a] = rgba.map(|byte| f32::from(byte) / 255.0);
+            Vec4::new(r * a, g * a, b * a, a)
+        };
+        Self {
+            avatar,
+            vertices: avatar.vertices.iter().map(|v| scale * v).collect(),
+            scale,
+            texels: avatar.atlas.rgba.as_chunks().0.iter().map(texel).collect(),
+            features: Vec::new(),
+            skinned: Vec::new(),
+            rasterizer: Rasterizer::default(),
+        }
+    }
+
+    /// World positions of the vertices, (V): pose blend shapes, then linear blend skinning by `bones` (J), canonical to world.
+    ///
+    /// # Panics
+    /// Unless there are J bones.
+    pub fn skin(&mut self, bones: &[Affine3A]) -> &[Vec3] {
+        let Self { avatar, vertices, scale, features, skinned, .. } = self;
+        assert_eq!(bones.len(), avatar.num_joints(), "skin: bones");
+        blend_shape_features(avatar, bones, *scale, features);
+        skinned.resize(vertices.len(), Vec3::ZERO);
+        let rows = skinned.par_chunks_mut(CHUNK).enumerate();
+        rows.for_each(|(chunk, out)| {
+            for (v, out) in (chunk * CHUNK..).zip(out) {
+                let (mut matrix, mut translation) = (Mat3A::ZERO, Vec3A::ZERO);
+                for (joint, weight) in avatar.joints[v].into_iter().zip(avatar.weights[v]) {
+                    let bone = &bones[usize::from(joint)];
+                    matrix += bone.matrix3 * weight;
+                    translation += bone.translation * weight;
+                }
+                let mut rest = Vec3A::from(vertices[v]);
+                for (term, direction) in avatar.posedirs.row(v) {
+                    rest += features[term] * Vec3A::from(direction);
+                }
+                *out = Vec3::from(matrix * rest + translation);
+            }
+        });
+        skinned
+    }
+
+    /// The person in the pose of `bones` (J) as `camera` sees them: premultiplied colour and opacity of each pixel into
+    /// `out` (H·W, row-major).
+    ///
+    /// # Errors
+    /// [`Error::Visibility`] for pictures that are too large.
+    ///
+    /// # Panics
+    /// Unless there are J bones and H·W pixels.
+    pub fn draw(
+        &mut self,
+        bones: &[Affine3A],
+        camera: &Camera,
+        samples: Samples,
+        out: &mut [Vec4],
+    ) -> Result<(), Error> {
+        self.skin(bones);
+        let Self { avatar, texels, skinned, rasterizer, scale, .. } = self;
+        let options = RasterOptions { samples, cull_back: true, near: 1e-3 * *scale };
+        let shells: Vec<&[[u32; 3]]> = (0..avatar.shell_ends.len()).map(|shell| avatar.shell(shell)).collect();
+        let paint = Paint { avatar, texels, size: Vec2::new(avatar.atlas.width as f32, avatar.atlas.height as f32) };
+        let shade = |pixel: Pixel<'_>| {
+            let samples = pixel.samples();
+            let count = samples.len();
+            if count == 0 {
+                return Vec4::ZERO;
+            }
+            samples.map(|sample| paint.composite(sample)).sum::<Vec4>() / count as f32
+        };
+        rasterizer.draw(skinned, &shells, &pinhole(camera), &options, out, shade)?;
+        Ok(())
+    }
+}
+
+/// R − I of each joint but the root relative to its parent, in units of `scale`.
+fn blend_shape_features(avatar: &Avatar, bones: &[Affine3A], scale: f32, out: &mut Vec<f32>) {
+    out.clear();
+    out.reserve(TERMS * bones.len());
+    for (joint, bone) in avatar.skeleton.iter().zip(bones).skip(1) {
+        let parent = joint.parent.map_or(Mat3A::IDENTITY, |parent| bones[usize::from(parent)].matrix3);
+        let local = Mat3::from(parent.transpose() * bone.matrix3) - Mat3::IDENTITY;
+        out.extend((local.transpose() * scale).to_cols_array());
+    }
+}
+
+/// What the faces are painted with.
+struct Paint<'a> {
+    avatar: &'a Avatar,
+    texels: &'a [Vec4],
+    /// Of the atlas.
+    size: Vec2,
+}
+
+impl Paint<'_> {
+    /// Fragments over each other, the nearest on top.
+    #[inline]
+    fn composite(&self, sample: &[Fragment]) -> Vec4 {
+        let mut sum = Vec4::ZERO;
+        for fragment in sample {
+            let colour = self.lookup(atlas_place(self.avatar, fragment) * self.size);
+            sum += (1.0 - sum.w) * colour;
+        }
+        sum
+    }
+
+    /// Between the middles of four texels.
+    #[inline]
+    fn lookup(&self, place: Vec2) -> Vec4 {
+        let corner = BilinearCorner::new(place, self.size);
+        let [a, b, c, d] = corner.texels(self.avatar.atlas.width, self.avatar.atlas.height).map(|i| self.texels[i]);
+        let (top, bottom) = (a + (b - a) * corner.share.x, c + (d - c) * corner.share.x);
+        top + (bottom - top) * corner.share.y
+    }
+}
+
+/// Where a fragment is in the atlas, 0 to 1.
+#[inline]
+pub(super) fn atlas_place(avatar: &Avatar, fragment: &Fragment) -> Vec2 {
+    let corners = avatar.faces[fragment.face as usize];
+    corners.iter().zip(fragment.barycentric).map(|(&v, b)| b * avatar.uvs[v as usize]).sum()
+}
+
+/// The first of the four texels about a place, and how far towards the others it is.
+pub(super) struct BilinearCorner {
+    x: usize,
+    y: usize,
+    pub share: Vec2,
+}
+
+impl BilinearCorner {
+    /// At `place`, in texels of an atlas of `size`.
+    #[inline]
+    pub fn new(place: Vec2, size: Vec2) -> Self {
+        // Texels at the border go on beyond it.
+        let at = (place - 0.5).clamp(Vec2::ZERO, (size - 1.0).max(Vec2::ZERO));
+        let corner = at.floor().min((size - 2.0).max(Vec2::ZERO));
+        Self { x: corner.x as usize, y: corner.y as usize, share: at - corner }
+    }
+
+    /// Row by row; an atlas of one row or column has its only one twice.
+    #[inline]
+    pub fn texels(&self, width: u32, height: u32) -> [usize; 4] {
+        let first = self.y * width as usize + self.x;
+        let (right, down) = (usize::from(width > 1), if height > 1 { width as usize } else { 0 });
+        [first, first + right, first + down, first + right + down]
+    }
+}

@@ -1,0 +1,333 @@
+//! From a trained person to an avatar.
+
+use std::sync::Arc;
+use std::time::Instant;
+
+use glam::{Affine3A, Vec2, Vec3};
+use smpl::{MotionClip, SparseRows};
+use volrender::Camera;
+
+use super::avatar::{Atlas, Avatar, Clip, MAX_SHELLS};
+use super::charts::Layout;
+use super::field::CanonicalField;
+use super::motion::{motion_of_bones, upright};
+use super::paint::{Texel, dilate, paint, texels};
+use super::refine::refine;
+use super::renderer::TrainedField;
+use super::skeleton::skeleton;
+use super::subdivide::{Anchor, Subdivided, normals};
+use super::surface::{Normal, SurfaceReport, heights, normals_of};
+use crate::Error;
+use crate::model::body::Body;
+use crate::model::trained::Model;
+use crate::model::view::PosedView;
+use crate::scene::prepared::Scene;
+
+/// Pixels of the training pictures that an edge of the surface may be long, where two subdivisions are enough for it.
+const EDGE: f32 = 1.5;
+/// Most subdivisions: each makes four times the faces.
+const MOST_SUBDIVISIONS: u32 = 2;
+/// Texels across a pixel of the training pictures.
+const TEXELS_A_PIXEL: f32 = 2.0;
+/// Share of the training frames that must have seen a place for full confidence.
+const FULL_CONFIDENCE: f32 = 0.1;
+
+/// How a person is baked.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct BakeOptions {
+    /// Surfaces over each other, 1 to 5: one is opaque, the others have alpha.
+    pub shells: usize,
+    /// Longest side of the atlas, texels; it is as large as the training pictures ask for, up to this.
+    pub atlas: u32,
+    /// Passes over the training pictures in which the texture is drawn towards them; 0 leaves it as the field has it.
+    pub refinements: u32,
+    /// Frames a second of the video's motion.
+    pub fps: f32,
+}
+
+impl Default for BakeOptions {
+    /// One surface, at most 2048 × 2048 texels.
+    fn default() -> Self {
+        Self { shells: 1, atlas: 2048, refinements: 4, fps: 30.0 }
+    }
+}
+
+/// What baking did.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct BakeReport {
+    /// What was found of the surface; of several shells, of the middle one.
+    pub surface: SurfaceReport,
+    /// Vertices of all shells, those on seams once for each chart.
+    pub vertices: usize,
+    /// Triangles of all shells.
+    pub faces: usize,
+    /// Side of the atlas.
+    pub side: u32,
+    /// Texels on the surface.
+    pub texels: usize,
+    /// Mean squared error over the known pixels of the training frames that show the surface, before the first pass of
+    /// refinement and before the last.
+    pub errors: [f64; 2],
+    /// Wall clock, seconds.
+    pub seconds: f64,
+}
+
+/// Bakes a trained person. The scene that it was trained on says how well each place was seen, and what the texture is
+/// refined by; without it every place counts as seen, and the texture is the field's.
+///
+/// # Errors
+/// [`Error::Scene`] for options outside their ranges, a body that no camera sees, or one that needs more charts than the atlas
+/// has room for; those of frames that cannot be decoded.
+pub fn bake(model: &Model, scene: Option<&Scene>, options: &BakeOptions) -> Result<(Avatar, BakeReport), Error> {
+    let start = Instant::now();
+    let refuse = |what: String| Err(Error::Scene(format!("bake: {what}")));
+    if !(1..=MAX_SHELLS).contains(&options.shells) {
+        return refuse(format!("{} shells, expected 1 to {MAX_SHELLS}", options.shells));
+    }
+    if !(64..=2048).contains(&options.atlas) {
+        return refuse(format!("an atlas of {} texels, expected 64 to 2048", options.atlas));
+    }
+    if !(options.fps > 0.0 && options.fps <= 1e6) {
+        return refuse(format!("{} frames a second", options.fps));
+    }
+    let Some(pixel) = pixel_width(model) else {
+        return refuse("no training frame has the body before its camera".to_owned());
+    };
+    let vertices = model.body.canonical.vertices.len();
+    let seen = scene.map_or_else(|| Ok(vec![1.0; vertices]), seen)?;
+    let (mut avatar, mut report) = surface(&model.body, &TrainedField::new(model), &seen, pixel, options)?;
+    (avatar.clips, avatar.cameras) = motion(model, &avatar, options.fps);
+    if let Some(scene) = scene {
+        avatar.name.clone_from(&scene.name);
+        if options.refinements > 0 {
+            report.errors = refine(model, scene, &mut avatar, options.refinements)?;
+        }
+    }
+    report.seconds = start.elapsed().as_secs_f64();
+    Ok((avatar, report))
+}
+
+/// Width of a pixel of the training pictures at the depth of the body, normalised metres: the median over the frames.
+fn pixel_width(model: &Model) -> Option<f32> {
+    let width = |view: &Arc<PosedView>| {
+        let depth = view.camera.world_to_camera.transform_point3(view.centre()).z;
+        Some(depth / view.camera.focal.max_element()).filter(|width| width.is_finite() && *width > 0.0)
+    };
+    let mut widths: Vec<f32> = model.frames().iter().filter_map(width).collect();
+    widths.sort_by(f32::total_cmp);
+    widths.get(widths.len() / 2).copied()
+}
+
+/// How well the video showed each vertex of the prior, 0 to 1.
+fn seen(scene: &Scene) -> Result<Vec<f32>, Error> {
+    let enough = (FULL_CONFIDENCE * scene.train.len() as f32).max(1.0);
+    Ok(scene.vertex_frequencies()?.iter().map(|&n| (n as f32 / enough).min(1.0)).collect())
+}
+
+/// The avatar without name and motion, from pictures whose pixels are `pixel` normalised metres wide, and which have `seen` each
+/// vertex of the prior so well, (V).
+pub(super) fn surface(
+    body: &Body,
+    field: &impl CanonicalField,
+    seen: &[f32],
+    pixel: f32,
+    options: &BakeOptions,
+) -> Result<(Avatar, BakeReport), Error> {
+    let (prior, faces) = (&body.canonical.vertices, &body.model.faces);
+    let mesh = Subdivided::new(prior.len(), faces, subdivisions(prior, faces, pixel));
+    let feet = normals_of(&mesh, prior, faces);
+    let (heights, found) = heights(field, &body.surface, &feet, &mesh, options.shells);
+    let layout = Layout::new(prior, faces, options.shells, pixel / TEXELS_A_PIXEL, options.atlas);
+    let layout = layout.ok_or_else(|| Error::Scene("bake: too many charts".to_owned()))?;
+    let split = Split::new(&mesh, &layout, options.shells);
+    let places = split.places(&layout, &feet);
+    let describe = |face: u32| {
+        let per_shell = mesh.faces.len();
+        (face as usize / per_shell, mesh.faces[face as usize % per_shell])
+    };
+    let texels = texels(layout.side, &places, &split.faces, describe)?;
+    let colours = paint(field, &body.surface, &feet, &heights, &texels);
+    let interpolated = |anchor: &Anchor| anchor.terms().map(|(v, w)| w * seen[v as usize]).sum();
+    let confidence: Vec<f32> = mesh.anchors.iter().map(interpolated).collect();
+    let report = BakeReport {
+        surface: found,
+        vertices: split.vertices.len(),
+        faces: split.faces.len(),
+        side: layout.side,
+        texels: texels.len(),
+        ..BakeReport::default()
+    };
+    let atlas = atlas(layout.side, &texels, &colours, &confidence);
+    let (vertices, normals) = split.positions(&mesh, &feet, &heights);
+    let rows = |of: &SparseRows<f32>| split.rows(&mesh, of, |w, value| w * value, |a, b| a + b);
+    let (joints, weights) = four_joints(&rows(&body.model.weights));
+    let posedirs = split.rows(&mesh, &body.model.posedirs, |w, value| w * value, |a, b| a + b);
+    let rest: Vec<Vec3> = body.canonical.joints.iter().map(|joint| joint / body.scale).collect();
+    let avatar = Avatar {
+        name: "person".to_owned(),
+        vertices: vertices.into_iter().map(|v| v / body.scale).collect(),
+        normals,
+        uvs: places.iter().map(|place| (place / layout.side as f32).clamp(Vec2::ZERO, Vec2::ONE)).collect(),
+        shell_ends: (1..=options.shells).map(|shell| (shell * mesh.faces.len()) as u32).collect(),
+        faces: split.faces,
+        joints,
+        weights,
+        posedirs: SparseRows::from_rows(posedirs),
+        atlas,
+        skeleton: skeleton(&body.model.parents, &rest),
+        betas: body.mean_betas.clone(),
+        clips: Vec::new(),
+        cameras: Vec::new(),
+    };
+    Ok((avatar, report))
+}
+
+/// How often the prior must be subdivided for its mean edge to be short enough.
+fn subdivisions(prior: &[Vec3], faces: &[[u32; 3]], pixel: f32) -> u32 {
+    let edges = faces.iter().map(|face| {
+        let [a, b, c] = face.map(|v| prior[v as usize]);
+        f64::from(a.distance(b) + b.distance(c) + c.distance(a)) / 3.0
+    });
+    let mean = edges.sum::<f64>() as f32 / faces.len().max(1) as f32;
+    (0..MOST_SUBDIVISIONS).find(|&times| mean / 2f32.powi(times as i32) <= EDGE * pixel).unwrap_or(MOST_SUBDIVISIONS)
+}
+
+/// Vertices of all shells, one for each chart that a vertex of the subdivided prior is in.
+struct Split {
+    /// Shell, chart and vertex of the subdivided prior.
+    vertices: Vec<(usize, u32, u32)>,
+    faces: Vec<[u32; 3]>,
+}
+
+impl Split {
+    fn new(mesh: &Subdivided, layout: &Layout, shells: usize) -> Self {
+        let mut split = Self { vertices: Vec::new(), faces: Vec::with_capacity(shells * mesh.faces.len()) };
+        for shell in 0..shells {
+            let mut copies: Vec<Vec<(u32, u32)>> = vec![Vec::new(); mesh.anchors.len()];
+            for (face, &parent) in mesh.faces.iter().zip(&mesh.parents) {
+                let chart = layout.charts[parent as usize];
+                split.faces.push(face.map(|v| {
+                    let copies = &mut copies[v as usize];
+                    if let Some(&(_, copy)) = copies.iter().find(|(of, _)| *of == chart) {
+                        return copy;
+                    }
+                    let copy = split.vertices.len() as u32;
+                    split.vertices.push((shell, chart, v));
+                    copies.push((chart, copy));
+                    copy
+                }));
+            }
+        }
+        split
+    }
+
+    /// In the atlas, texels.
+    fn places(&self, layout: &Layout, feet: &[Normal]) -> Vec<Vec2> {
+        self.vertices.iter().map(|&(shell, chart, v)| layout.place(shell, chart, feet[v as usize].foot)).collect()
+    }
+
+    /// Canonical positions and unit normals, normalised metres.
+    fn positions(&self, mesh: &Subdivided, feet: &[Normal], heights: &[Vec<f32>]) -> (Vec<Vec3>, Vec<Vec3>) {
+        let shells: Vec<(Vec<Vec3>, Vec<Vec3>)> = heights
+            .iter()
+            .map(|heights| {
+                let raised = |(normal, height): (&Normal, &f32)| normal.foot + height * normal.direction;
+                let vertices: Vec<Vec3> = feet.iter().zip(heights).map(raised).collect();
+                let normals = normals(&vertices, &mesh.faces);
+                let usable = |(normal, foot): (Vec3, &Normal)| normal.try_normalize().unwrap_or(foot.direction);
+                let normals = normals.into_iter().zip(feet).map(usable).collect();
+                (vertices, normals)
+            })
+            .collect();
+        let each = self.vertices.iter().map(|&(shell, _, v)| {
+            let (vertices, normals) = &shells[shell];
+            (vertices[v as usize], normals[v as usize])
+        });
+        each.unzip()
+    }
+
+    /// Rows of the prior's vertices, interpolated; columns ascending.
+    fn rows<T: Copy>(
+        &self,
+        mesh: &Subdivided,
+        of: &SparseRows<T>,
+        times: impl Fn(f32, T) -> T,
+        plus: impl Fn(T, T) -> T,
+    ) -> Vec<Vec<(u32, T)>> {
+        let row = |anchor: &Anchor| {
+            let mut row: Vec<(u32, T)> = Vec::new();
+            for (v, w) in anchor.terms() {
+                for (column, value) in of.row(v as usize) {
+                    let (column, value) = (column as u32, times(w, value));
+                    match row.binary_search_by_key(&column, |entry| entry.0) {
+                        Ok(at) => row[at].1 = plus(row[at].1, value),
+                        Err(at) => row.insert(at, (column, value)),
+                    }
+                }
+            }
+            row
+        };
+        self.vertices.iter().map(|&(_, _, v)| row(&mesh.anchors[v as usize])).collect()
+    }
+}
+
+/// The four heaviest joints of each row with their weights, which are made to sum to 1.
+fn four_joints(rows: &[Vec<(u32, f32)>]) -> (Vec<[u16; 4]>, Vec<[f32; 4]>) {
+    let heaviest = |row: &Vec<(u32, f32)>| {
+        let mut row = row.clone();
+        row.sort_by(|a, b| b.1.total_cmp(&a.1).then(a.0.cmp(&b.0)));
+        row.truncate(4);
+        let total: f32 = row.iter().map(|entry| entry.1).sum();
+        let (mut joints, mut weights) = ([0; 4], [0.0; 4]);
+        for (i, (joint, weight)) in row.into_iter().enumerate() {
+            (joints[i], weights[i]) = (joint as u16, weight / total);
+        }
+        if total.is_nan() || total <= 0.0 {
+            (joints, weights) = ([0; 4], [1.0, 0.0, 0.0, 0.0]);
+        }
+        (joints, weights)
+    };
+    rows.iter().map(heaviest).unzip()
+}
+
+/// The atlas of painted texels, with their colours spread to what is between the charts.
+fn atlas(side: u32, texels: &[Texel], colours: &[(Vec3, f32)], confidence: &[f32]) -> Atlas {
+    let count = (side * side) as usize;
+    let (mut values, mut known) = (vec![[0.0f32; 5]; count], vec![false; count]);
+    for (texel, (colour, alpha)) in texels.iter().zip(colours) {
+        let seen: f32 = texel.corners.iter().zip(texel.weights).map(|(&v, w)| w * confidence[v as usize]).sum();
+        values[texel.index as usize] = [colour.x, colour.y, colour.z, *alpha, seen];
+        known[texel.index as usize] = true;
+    }
+    dilate(side as usize, &mut values, &mut known);
+    let byte = |x: f32| (x.clamp(0.0, 1.0) * 255.0 + 0.5) as u8;
+    Atlas {
+        width: side,
+        height: side,
+        rgba: values.iter().flat_map(|v| [v[0], v[1], v[2], v[3]].map(byte)).collect(),
+        // What no frame ever saw stays 0; what any saw does not become it.
+        confidence: values.iter().map(|v| if v[4] > 0.0 { byte(v[4]).max(1) } else { 0 }).collect(),
+    }
+}
+
+/// The video's motion, as training has corrected it, and the cameras, in the avatar's world.
+fn motion(model: &Model, avatar: &Avatar, fps: f32) -> (Vec<Clip>, Vec<Camera>) {
+    let turn = upright(model.up());
+    let scale = model.body.scale;
+    let bones = |view: &Arc<PosedView>| {
+        let placed = |bone: &Affine3A| {
+            let bone = Affine3A { translation: bone.translation / scale, ..*bone };
+            Affine3A::from_mat3(turn) * bone
+        };
+        model.corrected(view).bones.iter().map(placed).collect()
+    };
+    let frames: Vec<Vec<Affine3A>> = model.frames().iter().map(bones).collect();
+    let motion: MotionClip = motion_of_bones(&avatar.skeleton, &frames, fps);
+    let camera = |view: &Arc<PosedView>| {
+        let mut camera = view.camera;
+        camera.world_to_camera.translation /= scale;
+        camera.world_to_camera *= Affine3A::from_mat3(turn.transpose());
+        camera
+    };
+    (vec![Clip { name: "video".to_owned(), motion }], model.frames().iter().map(camera).collect())
+}

@@ -1,0 +1,36 @@
+//! A trained person as a skinned, textured surface, which anything that draws triangles can show.
+
+mod avatar;
+mod charts;
+mod draw;
+pub mod export;
+mod field;
+mod make;
+mod motion;
+mod paint;
+mod refine;
+mod renderer;
+mod saved;
+mod skeleton;
+mod subdivide;
+mod surface;
+#[cfg(test)]
+mod tests;
+
+use std::io::Write;
+use std::path::Path;
+
+use crate::Error;
+
+pub use avatar::{Atlas, Avatar, Clip, Joint, MAX_ATLAS_SIDE, MAX_JOINTS, MAX_SHELLS};
+pub use draw::BakedPerson;
+pub use make::{BakeOptions, BakeReport, bake};
+pub use motion::{motion_of_bones, upright};
+pub use renderer::BakedRenderer;
+pub use skeleton::skeleton;
+pub use surface::SurfaceReport;
+
+/// Writes a file that is either the old one or complete.
+fn write_whole(path: &Path, bytes: &[u8]) -> Result<(), Error> {
+    crate::replace_file(path, |to| to.write_all(bytes)).map_err(|source| Error::Io { path: path.to_owned(), source })
+}

@@ -1,0 +1,153 @@
+//! The atlas's colours: the field integrated through each shell.
+
+use glam::{Vec2, Vec3};
+use rayon::prelude::*;
+use surface_query::MeshDistance;
+
+use super::field::CanonicalField;
+use super::surface::{Normal, STEP};
+use crate::Error;
+use visibility::{RasterOptions, Rasterizer, View};
+
+/// How far beyond the outermost shell, and below the innermost, the field is integrated, normalised metres.
+const BEYOND: f32 = 0.02;
+const BELOW: f32 = 0.0125;
+/// Texels that are evaluated together.
+const CHUNK: usize = 128;
+
+/// A texel on the surface.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Texel {
+    /// In the atlas, row-major.
+    pub index: u32,
+    /// Vertices of the subdivided prior, and how much of each.
+    pub corners: [u32; 3],
+    pub weights: [f32; 3],
+    pub shell: usize,
+}
+
+impl Texel {
+    fn mix(&self, values: &[f32]) -> f32 {
+        self.corners.iter().zip(self.weights).map(|(&v, w)| w * values[v as usize]).sum()
+    }
+
+    fn normal(&self, normals: &[Normal]) -> Normal {
+        let sum = |part: fn(&Normal) -> Vec3| {
+            self.corners.iter().zip(self.weights).map(|(&v, w)| w * part(&normals[v as usize])).sum::<Vec3>()
+        };
+        Normal { foot: sum(|n| n.foot), direction: sum(|n| n.direction).normalize_or(Vec3::Y) }
+    }
+}
+
+/// The texels whose middles lie on a face: `places` (V) of the vertices of `faces`, in texels of a square of `side`.
+/// `describe` says of a face which shell it is of and which vertices of the subdivided prior it has.
+pub(super) fn texels(
+    side: u32,
+    places: &[Vec2],
+    faces: &[[u32; 3]],
+    describe: impl Fn(u32) -> (usize, [u32; 3]),
+) -> Result<Vec<Texel>, Error> {
+    let flat: Vec<Vec3> = places.iter().map(|place| place.extend(1.0)).collect();
+    let view =
+        View { intrinsics: glam::Mat3::IDENTITY, extrinsics: glam::Affine3A::IDENTITY, width: side, height: side };
+    let drawn = Rasterizer::default().faces(&flat, faces, &view, &RasterOptions::default())?;
+    let texel = |(index, fragment): (u32, Option<visibility::Fragment>)| {
+        let fragment = fragment?;
+        let (shell, corners) = describe(fragment.face);
+        Some(Texel { index, corners, weights: fragment.barycentric, shell })
+    };
+    Ok((0..).zip(drawn).filter_map(texel).collect())
+}
+
+/// Colour and alpha of each of `texels`, with shells at `heights` (shells, V) over the prior's `normals` (V).
+///
+/// A shell stands for the part of the field between the middles of the gaps to its neighbours. A single one is opaque.
+pub(super) fn paint(
+    field: &impl CanonicalField,
+    prior: &MeshDistance,
+    normals: &[Normal],
+    heights: &[Vec<f32>],
+    texels: &[Texel],
+) -> Vec<(Vec3, f32)> {
+    let chunks: Vec<Vec<(Vec3, f32)>> = texels
+        .par_chunks(CHUNK)
+        .map_init(Default::default, |(along, places, values): &mut (Vec<_>, Vec<_>, Vec<_>), texels| {
+            places.clear();
+            let mut counts = Vec::with_capacity(texels.len());
+            for texel in texels {
+                let [low, high] = slab(heights, texel, field.reach());
+                texel.normal(normals).places(prior, high, low, field.reach() + high - low, along);
+                counts.push(along.len());
+                places.extend(along.iter().map(|(_, place)| *place));
+            }
+            field.evaluate(places, values);
+            let mut rest = &values[..];
+            let colour = |count: usize| {
+                let (own, others) = rest.split_at(count);
+                rest = others;
+                integrate(own)
+            };
+            let colours: Vec<(Vec3, f32)> = counts.into_iter().map(colour).collect();
+            let single = heights.len() == 1;
+            colours.into_iter().map(|(c, a)| (c, if single { 1.0 } else { a })).collect()
+        })
+        .collect();
+    chunks.concat()
+}
+
+/// Heights between which a texel's shell stands for the field.
+fn slab(heights: &[Vec<f32>], texel: &Texel, reach: f32) -> [f32; 2] {
+    let own = texel.mix(&heights[texel.shell]);
+    let to = |shell: Option<&Vec<f32>>| shell.map(|heights| 0.5 * (own + texel.mix(heights)));
+    let inner = to(texel.shell.checked_sub(1).and_then(|shell| heights.get(shell)));
+    let outer = to(heights.get(texel.shell + 1));
+    let high = outer.unwrap_or((own + BEYOND).min(reach));
+    [inner.unwrap_or(own - BELOW), high.max(own + STEP)]
+}
+
+/// Colour and opacity of points one step from each other, outside in.
+fn integrate(points: &[(f32, Vec3)]) -> (Vec3, f32) {
+    let (mut transmittance, mut sum) = (1.0, Vec3::ZERO);
+    for &(density, colour) in points {
+        let alpha = 1.0 - (-density * STEP).exp();
+        sum += transmittance * alpha * colour;
+        transmittance *= 1.0 - alpha;
+    }
+    let opacity = 1.0 - transmittance;
+    if opacity > 1e-3 {
+        return (sum / opacity, opacity);
+    }
+    // Of next to nothing, the colour of what is there.
+    let mean = points.iter().map(|p| p.1).sum::<Vec3>() / points.len().max(1) as f32;
+    (mean, opacity)
+}
+
+/// Spreads the values of the texels that `known` marks to all others, ring by ring, so that lookups between texels at the rim of a
+/// chart find its colours.
+pub(super) fn dilate<const N: usize>(side: usize, values: &mut [[f32; N]], known: &mut [bool]) {
+    let mut rim: Vec<usize> = (0..known.len()).filter(|&i| !known[i]).collect();
+    while !rim.is_empty() {
+        let mean = |&i: &usize| {
+            let (x, y) = (i % side, i / side);
+            let (mut sum, mut count) = ([0.0; N], 0.0f32);
+            for ny in y.saturating_sub(1)..(y + 2).min(side) {
+                for nx in x.saturating_sub(1)..(x + 2).min(side) {
+                    let n = ny * side + nx;
+                    if known[n] {
+                        (0..N).for_each(|k| sum[k] += values[n][k]);
+                        count += 1.0;
+                    }
+                }
+            }
+            (count > 0.0).then(|| (i, sum.map(|s| s / count)))
+        };
+        let found: Vec<(usize, [f32; N])> = rim.par_iter().filter_map(mean).collect();
+        if found.is_empty() {
+            return;
+        }
+        for (i, value) in found {
+            (values[i], known[i]) = (value, true);
+        }
+        rim.retain(|&i| !known[i]);
+    }
+}

@@ -1,0 +1,110 @@
+//! Where a bake meets a trained person: the field in the canonical space, and pictures of views.
+
+use glam::{Vec3, Vec4};
+use rayon::prelude::*;
+use smpl::{MotionField, SurfaceMotion};
+use visibility::Samples;
+
+use super::avatar::Avatar;
+use super::draw::BakedPerson;
+use super::field::{CanonicalField, Place};
+use crate::Error;
+use crate::capture::Image;
+use crate::model::distance::{needs_neighbours, surface_point};
+use crate::model::extent::Extent;
+use crate::model::field::SampleBatch;
+use crate::model::trained::Model;
+use crate::model::vertices::VertexCode;
+use crate::model::view::PosedView;
+use crate::render::picture::{Renderer, Rendering};
+
+/// A trained field, its vertices encoded.
+pub(super) struct TrainedField<'a> {
+    model: &'a Model,
+    code: VertexCode,
+    extent: Extent,
+}
+
+impl<'a> TrainedField<'a> {
+    pub fn new(model: &'a Model) -> Self {
+        let mut code = VertexCode::default();
+        model.encode_vertices(&mut code);
+        let extent = model.measure_extent(&code);
+        Self { model, code, extent }
+    }
+}
+
+impl CanonicalField for TrainedField<'_> {
+    fn evaluate(&self, places: &[Place], out: &mut Vec<(f32, Vec3)>) {
+        let Model { body, config, base, motion, .. } = self.model;
+        let blended = needs_neighbours(config.surface.distance);
+        let neighbours = blended || self.model.field.surface_term;
+        let based = !base.is_empty() && matches!(motion, MotionField::Surface(_));
+        let mut batch = SampleBatch::default();
+        batch.samples.clear();
+        for place in places {
+            let samples = &mut batch.samples;
+            samples.push_canonical(body, place.at, place.closest, place.distance, neighbours);
+            if blended {
+                let own = &samples.neighbours[samples.neighbours.len() - body.query.neighbours_per_query()..];
+                if let Some(point) = surface_point(body, &config.surface, place.at, own, f32::INFINITY)
+                    && let (Some(closest), Some(distance)) = (samples.closest.last_mut(), samples.distance.last_mut())
+                {
+                    (*closest, *distance) = (point.closest, point.distance);
+                }
+            }
+            if based {
+                let corners = body.model.faces[place.face as usize].into_iter().zip(place.barycentric);
+                samples.base.push(corners.map(|(v, b)| b * base[v as usize]).sum());
+            }
+        }
+        self.model.evaluate(&self.code, &mut batch, None);
+        let likelihood = SurfaceMotion { margin: config.motion.margin, falloff: config.motion.falloff };
+        let value = |((place, sigma), rgb): ((&Place, &f32), &Vec3)| {
+            let lives = place.distance <= self.extent.faces[place.face as usize];
+            (if lives { likelihood.likelihood(place.distance) * sigma } else { 0.0 }, *rgb)
+        };
+        out.clear();
+        out.extend(places.iter().zip(&batch.sigma).zip(&batch.rgb).map(value));
+    }
+
+    fn reach(&self) -> f32 {
+        self.extent.farthest
+    }
+}
+
+/// Draws views with the avatar that was baked of a model, in the poses that the model's training found.
+pub struct BakedRenderer<'a> {
+    model: &'a Model,
+    person: BakedPerson<'a>,
+    samples: Samples,
+    pixels: Vec<Vec4>,
+}
+
+impl<'a> BakedRenderer<'a> {
+    /// Takes the avatar of `model`.
+    ///
+    /// # Errors
+    /// [`Error::Scene`] for the avatar of another skeleton.
+    pub fn new(model: &'a Model, avatar: &'a Avatar, samples: Samples) -> Result<Self, Error> {
+        let (found, expected) = (avatar.num_joints(), model.body.model.num_joints());
+        if found != expected {
+            return Err(Error::Scene(format!("the avatar has {found} joints, the model {expected}")));
+        }
+        let person = BakedPerson::new(avatar, model.body.scale);
+        Ok(Self { model, person, samples, pixels: Vec::new() })
+    }
+}
+
+impl Renderer for BakedRenderer<'_> {
+    fn render(&mut self, view: &PosedView, background: Vec3) -> Result<Rendering, Error> {
+        let posed = self.model.corrected(view);
+        let (width, height) = (view.camera.width, view.camera.height);
+        self.pixels.resize(width as usize * height as usize, Vec4::ZERO);
+        self.person.draw(&posed.bones, &view.camera, self.samples, &mut self.pixels)?;
+        let over = |p: &Vec4| (p.truncate() + (1.0 - p.w) * background).to_array();
+        let pixels: Vec<f32> = self.pixels.par_iter().flat_map_iter(over).collect();
+        let opacity = self.pixels.iter().map(|p| p.w).collect();
+        Ok(Rendering { image: Image { width, height, pixels }, opacity })
+    }
+}

@@ -1,0 +1,136 @@
+//! The canonical prior with its triangles in four, as often as a picture can tell.
+
+use std::collections::HashMap;
+
+use glam::Vec3;
+
+/// A point of the prior: vertices of one face, ascending, and how much of each.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Anchor {
+    pub corners: [u32; 3],
+    pub weights: [f32; 3],
+}
+
+impl Anchor {
+    pub fn vertex(v: u32) -> Self {
+        Self { corners: [v; 3], weights: [1.0, 0.0, 0.0] }
+    }
+
+    /// Halfway between two points of one face.
+    fn middle(a: &Self, b: &Self) -> Self {
+        let mut terms: Vec<(u32, f32)> = Vec::with_capacity(6);
+        for anchor in [a, b] {
+            for (v, w) in anchor.terms() {
+                match terms.iter_mut().find(|(other, _)| *other == v) {
+                    Some((_, sum)) => *sum += 0.5 * w,
+                    None => terms.push((v, 0.5 * w)),
+                }
+            }
+        }
+        terms.sort_by_key(|&(v, _)| v);
+        let mut middle = Self::vertex(terms.first().map_or(0, |t| t.0));
+        for (i, &(v, w)) in terms.iter().take(3).enumerate() {
+            (middle.corners[i], middle.weights[i]) = (v, w);
+        }
+        middle
+    }
+
+    /// Vertices that count, with their weights.
+    pub fn terms(&self) -> impl Iterator<Item = (u32, f32)> + use<> {
+        self.corners.into_iter().zip(self.weights).filter(|&(_, w)| w > 0.0)
+    }
+
+    /// A quantity of the vertices, interpolated.
+    pub fn mix(&self, values: &[Vec3]) -> Vec3 {
+        self.terms().map(|(v, w)| w * values[v as usize]).sum()
+    }
+}
+
+/// A subdivided mesh.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Subdivided {
+    /// (V)
+    pub anchors: Vec<Anchor>,
+    /// (F)
+    pub faces: Vec<[u32; 3]>,
+    /// The face of the prior that each face is part of, (F).
+    pub parents: Vec<u32>,
+}
+
+impl Subdivided {
+    /// Puts four faces, of equal area, in the place of each, `times` over. Vertices of the prior keep their indices.
+    pub fn new(vertices: usize, faces: &[[u32; 3]], times: u32) -> Self {
+        let mut mesh = Self {
+            anchors: (0..vertices as u32).map(Anchor::vertex).collect(),
+            faces: faces.to_vec(),
+            parents: (0..faces.len() as u32).collect(),
+        };
+        for _ in 0..times {
+            let mut middles: HashMap<(u32, u32), u32> = HashMap::with_capacity(mesh.faces.len() * 3 / 2);
+            let mut finer = Vec::with_capacity(4 * mesh.faces.len());
+            for &[a, b, c] in &mesh.faces {
+                let anchors = &mut mesh.anchors;
+                let mut middle = |a: u32, b: u32| {
+                    *middles.entry((a.min(b), a.max(b))).or_insert_with(|| {
+                        anchors.push(Anchor::middle(&anchors[a as usize], &anchors[b as usize]));
+                        anchors.len() as u32 - 1
+                    })
+                };
+                let (ab, bc, ca) = (middle(a, b), middle(b, c), middle(c, a));
+                finer.extend([[a, ab, ca], [ab, b, bc], [ca, bc, c], [ab, bc, ca]]);
+            }
+            mesh.faces = finer;
+            mesh.parents = mesh.parents.iter().flat_map(|&parent| [parent; 4]).collect();
+        }
+        mesh
+    }
+}
+
+/// Unit normals of vertices: the area-weighted sum of those of the faces about them, zero where there are none.
+pub(super) fn normals(vertices: &[Vec3], faces: &[[u32; 3]]) -> Vec<Vec3> {
+    let mut sums = vec![Vec3::ZERO; vertices.len()];
+    for face in faces {
+        let [a, b, c] = face.map(|v| vertices[v as usize]);
+        let normal = (b - a).cross(c - a);
+        face.iter().for_each(|&v| sums[v as usize] += normal);
+    }
+    sums.into_iter().map(Vec3::normalize_or_zero).collect()
+}
+
+/// Vertices that share an edge with each, ascending.
+pub(super) fn neighbours(vertices: usize, faces: &[[u32; 3]]) -> Vec<Vec<u32>> {
+    let mut lists: Vec<Vec<u32>> = vec![Vec::with_capacity(8); vertices];
+    for &[a, b, c] in faces {
+        for (from, to) in [(a, b), (b, c), (c, a), (b, a), (c, b), (a, c)] {
+            lists[from as usize].push(to);
+        }
+    }
+    for list in &mut lists {
+        list.sort_unstable();
+        list.dedup();
+    }
+    lists
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_subdivided_sphere_has_four_times_the_faces_and_the_same_shape() {
+        let ball = testkit::mesh::icosphere(1);
+        let fine = Subdivided::new(ball.vertices.len(), &ball.faces, 2);
+        assert_eq!((fine.faces.len(), fine.anchors.len()), (16 * ball.faces.len(), 8 * ball.faces.len() + 2));
+        let vertices: Vec<Vec3> = fine.anchors.iter().map(|anchor| anchor.mix(&ball.vertices)).collect();
+        let mesh = testkit::TriMesh { vertices, faces: fine.faces.clone() };
+        assert!(mesh.is_closed() && (mesh.volume() - ball.volume()).abs() < 1e-5);
+        for (face, &parent) in fine.faces.iter().zip(&fine.parents) {
+            let corners = ball.faces[parent as usize];
+            for &v in face {
+                let anchor = &fine.anchors[v as usize];
+                assert!(anchor.terms().all(|(v, _)| corners.contains(&v)));
+                assert!((anchor.weights.iter().sum::<f32>() - 1.0).abs() < 1e-6);
+            }
+        }
+    }
+}

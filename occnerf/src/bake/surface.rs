@@ -1,0 +1,214 @@
+//! Where the person's surface is: along the prior's normals, where the field becomes opaque.
+
+use glam::Vec3;
+use rayon::prelude::*;
+use surface_query::MeshDistance;
+
+use super::field::{CanonicalField, Place};
+use super::subdivide::{Subdivided, neighbours, normals};
+
+/// From one point of a profile to the next, normalised metres.
+pub(super) const STEP: f32 = 0.0025;
+/// How deep below the prior the surface may be.
+const DEPTH: f32 = 0.03;
+/// Share of its height above the prior that a point's distance from it must have: nearer ones belong to another part.
+const OWN: f32 = 0.7;
+/// Farther from the median of its neighbours than this a surface point is taken for noise.
+const OUTLIER: f32 = 0.01;
+/// Optical depth of opacity ½.
+const HALF: f32 = std::f32::consts::LN_2;
+/// Vertices whose profiles are evaluated together.
+const CHUNK: usize = 64;
+/// Least height of a shell over the next one inside.
+const APART: f32 = 0.001;
+/// Passes of smoothing, each halfway to the mean of the neighbours.
+const SMOOTHING: usize = 2;
+
+/// What was found of the surface.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct SurfaceReport {
+    /// Vertices over which the field never becomes opaque; they take the height of their neighbours.
+    pub holes: usize,
+    /// Vertices with a gap behind the surface found, and something opaque behind that.
+    pub double: usize,
+    /// Vertices so far from their neighbours that they were put between them.
+    pub outliers: usize,
+}
+
+/// A normal of the prior.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Normal {
+    pub foot: Vec3,
+    pub direction: Vec3,
+}
+
+impl Normal {
+    /// The points at heights `high`, `high` − STEP, … down to `low`, outside in, that belong to this part of the prior, with their
+    /// heights.
+    pub fn places(&self, prior: &MeshDistance, high: f32, low: f32, farthest: f32, out: &mut Vec<(f32, Place)>) {
+        out.clear();
+        let steps = ((high - low) / STEP).ceil().max(0.0) as usize;
+        // Inside out, so that the first point of another part ends it.
+        for step in (0..=steps).rev() {
+            let height = high - step as f32 * STEP;
+            let at = self.foot + height * self.direction;
+            let Some(closest) = prior.closest(at, farthest) else { break };
+            if height > 0.0 && closest.signed_distance < OWN * height {
+                break;
+            }
+            let (face, barycentric, distance) = (closest.face, closest.barycentric, closest.signed_distance);
+            out.push((height, Place { at, closest: closest.point, face, barycentric, distance }));
+        }
+        out.reverse();
+    }
+}
+
+/// The normals of a subdivided prior.
+pub(super) fn normals_of(mesh: &Subdivided, prior: &[Vec3], prior_faces: &[[u32; 3]]) -> Vec<Normal> {
+    let directions = normals(prior, prior_faces);
+    let normal = |anchor: &super::subdivide::Anchor| Normal {
+        foot: anchor.mix(prior),
+        direction: anchor.mix(&directions).normalize_or(Vec3::Y),
+    };
+    mesh.anchors.iter().map(normal).collect()
+}
+
+/// Height over the prior, along each normal (V), at which the optical depth from outside passes each of `depths`, which
+/// ascend: (V · depths), with NaN for none. And how many have something opaque behind a gap.
+fn crossings(
+    field: &impl CanonicalField,
+    prior: &MeshDistance,
+    normals: &[Normal],
+    depths: &[f32],
+) -> (Vec<f32>, usize) {
+    let reach = field.reach();
+    let chunks: Vec<(Vec<f32>, usize)> = normals
+        .par_chunks(CHUNK)
+        .map_init(Default::default, |(along, places, values): &mut Scratch, normals| {
+            places.clear();
+            let mut profiles = Vec::with_capacity(normals.len());
+            for normal in normals {
+                normal.places(prior, reach, -DEPTH, reach + DEPTH, along);
+                profiles.push(along.iter().map(|(height, _)| *height).collect::<Vec<f32>>());
+                places.extend(along.iter().map(|(_, place)| *place));
+            }
+            field.evaluate(places, values);
+            let (mut out, mut double, mut start) = (Vec::new(), 0, 0);
+            for heights in &profiles {
+                let densities = &values[start..start + heights.len()];
+                start += heights.len();
+                double += usize::from(profile(heights, densities, depths, &mut out));
+            }
+            (out, double)
+        })
+        .collect();
+    let double = chunks.iter().map(|chunk| chunk.1).sum();
+    (chunks.into_iter().flat_map(|chunk| chunk.0).collect(), double)
+}
+
+type Scratch = (Vec<(f32, Place)>, Vec<Place>, Vec<(f32, Vec3)>);
+
+/// Appends the heights at which the optical depth from outside passes each of `depths`; whether a gap, of no more than
+/// a tenth of the density before it, lies between something opaque outside and something opaque inside.
+fn profile(heights: &[f32], densities: &[(f32, Vec3)], depths: &[f32], out: &mut Vec<f32>) -> bool {
+    let first = out.len();
+    out.resize(first + depths.len(), f32::NAN);
+    let (mut depth, mut next) = (0.0, 0);
+    // Greatest density and optical depth since the last gap.
+    let (mut peak, mut since, mut gap, mut double) = (0.0f32, 0.0, false, false);
+    for (&height, &(density, _)) in heights.iter().zip(densities) {
+        let added = density * STEP;
+        while next < depths.len() && depth + added >= depths[next] {
+            out[first + next] = height + STEP * (0.5 - (depths[next] - depth) / added);
+            next += 1;
+        }
+        depth += added;
+        if since >= HALF && density < 0.1 * peak {
+            gap = true;
+            (peak, since) = (0.0, 0.0);
+        }
+        peak = peak.max(density);
+        since += added;
+        double |= gap && since >= HALF;
+    }
+    double
+}
+
+/// Heights of shells over each normal (V), from the innermost to the outermost: where the opacity from outside passes
+/// ½, or for `shells` of them the middle of each of as many equal parts. Holes are filled, outliers put between their
+/// neighbours, all smoothed.
+pub(super) fn heights(
+    field: &impl CanonicalField,
+    prior: &MeshDistance,
+    normals: &[Normal],
+    mesh: &Subdivided,
+    shells: usize,
+) -> (Vec<Vec<f32>>, SurfaceReport) {
+    let opacity = |shell: usize| (shell as f32 + 0.5) / shells as f32;
+    let depths: Vec<f32> = (0..shells).map(|shell| -(1.0 - opacity(shell)).ln()).collect();
+    let (found, double) = crossings(field, prior, normals, &depths);
+    let near = neighbours(normals.len(), &mesh.faces);
+    let mut report = SurfaceReport { double, ..SurfaceReport::default() };
+    let mut out: Vec<Vec<f32>> = Vec::with_capacity(shells);
+    for shell in (0..shells).rev() {
+        let mut heights: Vec<f32> = found.iter().skip(shell).step_by(shells).copied().collect();
+        let holes = heights.iter().filter(|h| h.is_nan()).count();
+        fill(&mut heights, &near);
+        let outliers = tame(&mut heights, &near);
+        for _ in 0..SMOOTHING {
+            heights = smoothed(&heights, &near);
+        }
+        if let Some(inner) = out.last() {
+            let above = |(height, inner): (&mut f32, &f32)| *height = height.max(inner + APART);
+            heights.iter_mut().zip(inner).for_each(above);
+        }
+        if shell == shells / 2 {
+            (report.holes, report.outliers) = (holes, outliers);
+        }
+        out.push(heights);
+    }
+    (out, report)
+}
+
+/// Puts heights that are far from the median of their neighbours there; returns how many.
+fn tame(heights: &mut [f32], near: &[Vec<u32>]) -> usize {
+    let median = |(near, &own): (&Vec<u32>, &f32)| {
+        let mut about: Vec<f32> = near.iter().map(|&v| heights[v as usize]).collect();
+        about.sort_by(f32::total_cmp);
+        about.get(about.len() / 2).copied().unwrap_or(own)
+    };
+    let medians: Vec<f32> = near.iter().zip(&*heights).map(median).collect();
+    let mut outliers = 0;
+    for (height, median) in heights.iter_mut().zip(medians) {
+        if (*height - median).abs() > OUTLIER {
+            *height = median;
+            outliers += 1;
+        }
+    }
+    outliers
+}
+
+fn smoothed(heights: &[f32], near: &[Vec<u32>]) -> Vec<f32> {
+    let mean = |near: &[u32]| near.iter().map(|&v| heights[v as usize]).sum::<f32>() / near.len() as f32;
+    let halfway = |(near, &own): (&Vec<u32>, &f32)| if near.is_empty() { own } else { 0.5 * (own + mean(near)) };
+    near.iter().zip(heights).map(halfway).collect()
+}
+
+/// Gives what is NaN the mean of its neighbours, from the rim inwards; 0, the prior itself, where nothing is known.
+fn fill(heights: &mut [f32], near: &[Vec<u32>]) {
+    let mut missing: Vec<usize> = (0..heights.len()).filter(|&v| heights[v].is_nan()).collect();
+    while !missing.is_empty() {
+        let known = |v: usize| {
+            let about = near[v].iter().map(|&n| heights[n as usize]).filter(|h| !h.is_nan());
+            let (sum, count) = about.fold((0.0, 0), |(sum, count), h| (sum + h, count + 1));
+            (count > 0).then(|| sum / count as f32)
+        };
+        let found: Vec<(usize, f32)> = missing.iter().filter_map(|&v| Some((v, known(v)?))).collect();
+        if found.is_empty() {
+            missing.iter().for_each(|&v| heights[v] = 0.0);
+            return;
+        }
+        found.iter().for_each(|&(v, height)| heights[v] = height);
+        missing.retain(|&v| heights[v].is_nan());
+    }
+}

@@ -1,0 +1,325 @@
+//! A bake of fields that are known, and of a person in training.
+
+use glam::{Affine3A, Mat3, Vec2, Vec3, Vec4};
+use visibility::{RasterOptions, Rasterizer, Samples, View};
+
+use super::charts::{Layout, PADDING};
+use super::draw::BakedPerson;
+use super::field::{CanonicalField, Place};
+use super::make::{BakeOptions, bake, surface};
+use super::renderer::BakedRenderer;
+use super::{Avatar, BakeReport, skeleton};
+use crate::capture::{DemoConfig, demo};
+use crate::config::{Config, Method, Preset};
+use crate::render::picture::Renderer;
+use crate::scene::prepared::Scene;
+use crate::train::trainer::Trainer;
+
+/// Height of the known field over the prior.
+const HEIGHT: f32 = 0.0123;
+
+/// Opaque up to a height over the prior, in a colour that changes from place to place.
+struct Known {
+    density: fn(Vec3, f32) -> f32,
+}
+
+fn known_colour(at: Vec3) -> Vec3 {
+    Vec3::new((3.0 * at.y).sin(), (4.0 * at.x).cos(), (5.0 * at.z).sin()) * 0.4 + 0.5
+}
+
+impl CanonicalField for Known {
+    fn evaluate(&self, places: &[Place], out: &mut Vec<(f32, Vec3)>) {
+        out.clear();
+        out.extend(places.iter().map(|p| ((self.density)(p.closest, p.distance), known_colour(p.closest))));
+    }
+
+    fn reach(&self) -> f32 {
+        0.06
+    }
+}
+
+fn scene(config: &Config) -> Scene {
+    let body = smpl::BodyModel::embedded();
+    let demo_config = DemoConfig { size: 48, frames: 4, eval_cameras: 1, ..DemoConfig::default() };
+    Scene::new(&demo(&demo_config, &body).unwrap(), &body, config).unwrap()
+}
+
+fn baked(field: &Known, options: &BakeOptions) -> (Scene, Avatar, BakeReport) {
+    let scene = scene(&Config::preset(Preset::Fast, Method::Occnerf));
+    let (avatar, report) = {
+        let seen = vec![1.0; scene.body.canonical.vertices.len()];
+        surface(&scene.body, field, &seen, 0.012, options).unwrap()
+    };
+    avatar.validate().unwrap();
+    (scene, avatar, report)
+}
+
+const SOLID: Known = Known { density: |_, d| if d < HEIGHT { 5000.0 } else { 0.0 } };
+
+/// Canonical distances of an avatar's vertices from the prior, normalised metres.
+fn distances(scene: &Scene, avatar: &Avatar) -> Vec<f32> {
+    let distance = |v: &Vec3| scene.body.surface.closest(scene.body.scale * v, 1.0).unwrap().signed_distance;
+    avatar.vertices.iter().map(distance).collect()
+}
+
+#[test]
+fn the_surface_is_where_a_known_field_becomes_opaque_and_has_its_colours() {
+    let (scene, avatar, report) = baked(&SOLID, &BakeOptions::default());
+    let mut off: Vec<f32> = distances(&scene, &avatar).iter().map(|d| (d - HEIGHT).abs()).collect();
+    off.sort_by(f32::total_cmp);
+    // Folds, where two parts of the prior are equally near, are smoothed.
+    assert!(off[off.len() * 9 / 10] < 0.002, "{:?}", &off[off.len() * 9 / 10..][..5]);
+    assert_eq!(report.surface.holes, 0);
+    // Texels at the vertices show the colours of the points of the prior below.
+    let size = avatar.atlas.width as f32;
+    let mut errors: Vec<f32> = (avatar.vertices.iter().zip(&avatar.uvs))
+        .map(|(v, uv)| {
+            let [x, y] = (*uv * size).to_array().map(|x| (x as usize).min(size as usize - 1));
+            let texel = 4 * (y * size as usize + x);
+            let found = Vec3::from([0, 1, 2].map(|c| f32::from(avatar.atlas.rgba[texel + c]) / 255.0));
+            let below = scene.body.surface.closest(scene.body.scale * v, 1.0).unwrap().point;
+            (found - known_colour(below)).abs().max_element()
+        })
+        .collect();
+    errors.sort_by(f32::total_cmp);
+    assert!(errors[errors.len() * 9 / 10] < 0.03, "{}", errors[errors.len() * 9 / 10]);
+}
+
+#[test]
+fn holes_take_the_height_of_what_is_about_them_and_gaps_are_counted() {
+    // Nothing over the left half of the head.
+    let holed = Known { density: |p, d| if d < HEIGHT && !(p.y > 0.5 && p.x > 0.02) { 5000.0 } else { 0.0 } };
+    let (scene, avatar, report) = baked(&holed, &BakeOptions::default());
+    assert!(report.surface.holes > 10, "{report:?}");
+    assert!(distances(&scene, &avatar).iter().all(|d| (-0.031..0.061).contains(d)));
+    let hull = Known { density: |_, d| if d < 0.0 || (0.02..0.03).contains(&d) { 5000.0 } else { 0.0 } };
+    let (_, _, report) = baked(&hull, &BakeOptions::default());
+    assert!(report.surface.double > report.vertices / 2, "{report:?}");
+    let empty = Known { density: |_, _| 0.0 };
+    let (scene, avatar, report) = baked(&empty, &BakeOptions::default());
+    assert!(report.surface.holes > 0 && distances(&scene, &avatar).iter().all(|d| d.abs() < 1e-3));
+}
+
+#[test]
+fn shells_lie_over_each_other_and_their_opacities_make_up_that_of_the_field() {
+    // Opacity 1 − e^−3 from 3 cm down to the prior, solid below.
+    let fog = Known {
+        density: |_, d| {
+            if d < 0.0 {
+                5000.0
+            } else if d < 0.03 {
+                100.0
+            } else {
+                0.0
+            }
+        },
+    };
+    let (_, avatar, _) = baked(&fog, &BakeOptions { shells: 3, ..BakeOptions::default() });
+    assert_eq!(avatar.shell_ends.len(), 3);
+    let n = avatar.num_vertices() / 3;
+    for i in 0..n {
+        let [a, b, c] = [0, 1, 2].map(|shell| avatar.vertices[shell * n + i]);
+        let up = avatar.normals[i];
+        assert!(up.dot(b - a) > -1e-3 && up.dot(c - b) > -1e-3);
+    }
+    let alphas: Vec<f32> = (0..3)
+        .map(|shell| {
+            let alpha = |v: usize| {
+                let place = avatar.uvs[v] * avatar.atlas.width as f32;
+                avatar.atlas.rgba[4 * (place.y as usize * avatar.atlas.width as usize + place.x as usize) + 3]
+            };
+            let mut all: Vec<u8> = (shell * n..(shell + 1) * n).map(alpha).collect();
+            all.sort_unstable();
+            f32::from(all[n / 2]) / 255.0
+        })
+        .collect();
+    assert!(alphas[0] > 0.7 && (0.2..0.7).contains(&alphas[1]) && (0.1..0.6).contains(&alphas[2]), "{alphas:?}");
+}
+
+#[test]
+fn no_two_faces_share_a_texel_and_charts_keep_their_distance() {
+    let scene = scene(&Config::preset(Preset::Fast, Method::Occnerf));
+    let (vertices, faces) = (&scene.body.canonical.vertices, &scene.body.model.faces);
+    let layout = Layout::new(vertices, faces, 2, 0.006, 1024).unwrap();
+    let side = layout.side;
+    let view = View { intrinsics: Mat3::IDENTITY, extrinsics: Affine3A::IDENTITY, width: side, height: side };
+    let mut owner = vec![None; (side * side) as usize];
+    let mut doubles = 0;
+    for shell in 0..2 {
+        for (face, &chart) in faces.iter().zip(&layout.charts) {
+            let corners = face.map(|v| layout.place(shell, chart, vertices[v as usize]).extend(1.0));
+            let inside = |c: &Vec3| c.min_element() >= 0.0 && c.truncate().max_element() <= side as f32;
+            assert!(corners.iter().all(inside), "{corners:?} in {side}");
+            let drawn = Rasterizer::default().faces(&corners, &[[0, 1, 2]], &view, &RasterOptions::default()).unwrap();
+            for i in (0..drawn.len()).filter(|&i| drawn[i].is_some()) {
+                doubles += usize::from(owner[i].is_some_and(|of| of == (shell, chart)));
+                assert!(owner[i].is_none_or(|of| of == (shell, chart)), "two charts at {i}");
+                owner[i] = Some((shell, chart));
+            }
+        }
+    }
+    let used = owner.iter().flatten().count();
+    assert!(doubles * 1000 <= used && used * 5 > owner.len(), "{doubles} of {used} in {}", owner.len());
+    // Within the padding of a texel there is none of another chart.
+    let side = side as usize;
+    for i in (0..owner.len()).filter(|&i| owner[i].is_some()) {
+        let ahead = (1..PADDING as usize).filter(|k| i % side + k < side).map(|k| i + k);
+        for j in ahead {
+            assert!(owner[j].is_none_or(|of| Some(of) == owner[i]), "charts {:?} {:?}", owner[i], owner[j]);
+        }
+    }
+}
+
+#[test]
+fn an_atlas_that_is_too_small_has_wider_texels_and_degenerate_meshes_have_one_too() {
+    let scene = scene(&Config::preset(Preset::Fast, Method::Occnerf));
+    let layout = Layout::new(&scene.body.canonical.vertices, &scene.body.model.faces, 1, 1e-3, 512).unwrap();
+    assert!(layout.side <= 512);
+    for (name, points) in testkit::strategy::degenerate_clouds() {
+        if points.iter().all(|p| p.is_finite() && p.abs().max_element() < 1e6) {
+            let n = points.len() as u32;
+            let faces: Vec<[u32; 3]> = (0..n.saturating_sub(2)).map(|i| [i, i + 1, i + 2]).collect();
+            assert!(Layout::new(&points, &faces, 1, 0.01, 512).is_some_and(|l| l.side <= 512), "{name}");
+        }
+    }
+}
+
+/// A square of two triangles, 2 wide, at z = 0, seen from +z, with a joint.
+fn square(rgba: &[[u8; 4]], width: u32) -> Avatar {
+    let corners = [(-1.0, 1.0), (1.0, 1.0), (-1.0, -1.0), (1.0, -1.0)];
+    Avatar {
+        name: "square".to_owned(),
+        vertices: corners.map(|(x, y)| Vec3::new(x, y, 0.0)).to_vec(),
+        normals: vec![Vec3::Z; 4],
+        uvs: corners.map(|(x, y)| Vec2::new(0.5 + 0.5 * x, 0.5 - 0.5 * y)).to_vec(),
+        faces: vec![[0, 2, 1], [1, 2, 3]],
+        shell_ends: vec![2],
+        joints: vec![[0; 4]; 4],
+        weights: vec![[1.0, 0.0, 0.0, 0.0]; 4],
+        posedirs: smpl::SparseRows::from_rows(vec![Vec::<(u32, Vec3)>::new(); 4]),
+        atlas: super::Atlas {
+            width,
+            height: rgba.len() as u32 / width,
+            rgba: rgba.as_flattened().to_vec(),
+            confidence: vec![255; rgba.len()],
+        },
+        skeleton: skeleton(&[None], &[Vec3::ZERO]),
+        betas: Vec::new(),
+        clips: Vec::new(),
+        cameras: Vec::new(),
+    }
+}
+
+/// From 4 in front of the origin, in which the square fills the picture.
+fn in_front(size: u32) -> volrender::Camera {
+    let (focal, middle) = (2.0 * size as f32, 0.5 * size as f32);
+    let intrinsics = Mat3::from_cols(Vec3::X * focal, Vec3::Y * focal, Vec3::new(middle, middle, 1.0));
+    let flip = Mat3::from_cols(Vec3::X, -Vec3::Y, -Vec3::Z);
+    volrender::Camera::new(intrinsics, Affine3A::from_mat3_translation(flip, Vec3::Z * 4.0), size, size).unwrap()
+}
+
+fn picture(avatar: &Avatar, bones: &[Affine3A], size: u32, samples: Samples) -> Vec<Vec4> {
+    let mut out = vec![Vec4::ZERO; (size * size) as usize];
+    BakedPerson::new(avatar, 1.0).draw(bones, &in_front(size), samples, &mut out).unwrap();
+    out
+}
+
+#[test]
+fn a_square_shows_its_texels_interpolated_between_their_middles() {
+    let texels: Vec<[u8; 4]> = (0..16).map(|i| [i * 16, 255 - i * 7, i * 3, 255]).collect();
+    let value = |x: usize, y: usize| Vec4::from(texels[4 * y + x].map(|byte| f32::from(byte) / 255.0));
+    let avatar = square(&texels, 4);
+    // A texel a pixel: their middles coincide.
+    for (i, pixel) in picture(&avatar, &[Affine3A::IDENTITY], 4, Samples::One).into_iter().enumerate() {
+        assert!((pixel - value(i % 4, i / 4)).abs().max_element() < 1e-3, "{i}: {pixel}");
+    }
+    // Against interpolation written out.
+    for (i, pixel) in picture(&avatar, &[Affine3A::IDENTITY], 32, Samples::One).into_iter().enumerate() {
+        let at = |p: usize| ((p as f32 + 0.5) / 8.0 - 0.5).clamp(0.0, 3.0);
+        let (x, y) = (at(i % 32), at(i / 32));
+        let mut expected = Vec4::ZERO;
+        for (ty, tx) in (0..4).flat_map(|ty| (0..4).map(move |tx| (ty, tx))) {
+            let share = (1.0 - (x - tx as f32).abs()).max(0.0) * (1.0 - (y - ty as f32).abs()).max(0.0);
+            expected += share * value(tx, ty);
+        }
+        assert!((pixel - expected).abs().max_element() < 2e-3, "{i}: {pixel} {expected}");
+    }
+}
+
+#[test]
+fn an_atlas_of_one_texel_and_a_back_that_is_not_drawn() {
+    let avatar = square(&[[51, 102, 204, 128]], 1);
+    let expected = Vec4::new(0.2, 0.4, 0.8, 1.0) * (128.0 / 255.0);
+    for pixel in picture(&avatar, &[Affine3A::IDENTITY], 8, Samples::Four) {
+        let expected = expected.truncate().extend(128.0 / 255.0);
+        assert!((pixel - expected).abs().max_element() < 1e-4, "{pixel}");
+    }
+    let turned = Affine3A::from_rotation_y(std::f32::consts::PI);
+    assert!(picture(&avatar, &[turned], 8, Samples::One).iter().all(|p| *p == Vec4::ZERO));
+}
+
+#[test]
+fn shells_are_composited_the_outermost_on_top() {
+    let mut avatar = square(&[[255, 0, 0, 255], [0, 255, 0, 128]], 2);
+    // The first is red and behind, the second green and in front.
+    let front: Vec<Vec3> = avatar.vertices.iter().map(|v| v + Vec3::Z * 0.1).collect();
+    avatar.vertices.extend(front);
+    avatar.uvs = [[Vec2::new(0.1, 0.5); 4], [Vec2::new(0.9, 0.5); 4]].concat();
+    avatar.faces.extend([[4, 6, 5], [5, 6, 7]]);
+    avatar.shell_ends = vec![2, 4];
+    let twice = |rows: &mut Vec<_>| rows.extend_from_within(..);
+    twice(&mut avatar.normals);
+    avatar.joints.extend_from_within(..);
+    avatar.weights.extend_from_within(..);
+    avatar.posedirs = smpl::SparseRows::from_rows(vec![Vec::<(u32, Vec3)>::new(); 8]);
+    avatar.validate().unwrap();
+    let middle = picture(&avatar, &[Affine3A::IDENTITY], 9, Samples::One)[40];
+    let alpha = 128.0 / 255.0;
+    assert!((middle - Vec4::new(1.0 - alpha, alpha, 0.0, 1.0)).abs().max_element() < 1e-4, "{middle}");
+}
+
+#[test]
+fn a_person_in_training_is_baked_refined_and_drawn_alike_on_any_number_of_threads() {
+    let config = Config { steps: 60, ..Config::preset(Preset::Fast, Method::Occnerf) };
+    let scene = scene(&config);
+    let mut trainer = Trainer::new(&scene, config).unwrap();
+    for _ in 0..60 {
+        trainer.step().unwrap();
+    }
+    let make = || {
+        let options = BakeOptions { refinements: 3, ..BakeOptions::default() };
+        let (avatar, report) = bake(trainer.model(), Some(&scene), &options).unwrap();
+        let mut renderer = BakedRenderer::new(trainer.model(), &avatar, Samples::Four).unwrap();
+        let rendering = renderer.render(&scene.train[1].view, Vec3::ZERO).unwrap();
+        (avatar, report, rendering)
+    };
+    let [one, three] = [1, 3].map(|n| rayon::ThreadPoolBuilder::new().num_threads(n).build().unwrap().install(make));
+    assert!(one.0 == three.0 && one.2.image == three.2.image);
+    let (avatar, report, rendering) = one;
+    avatar.validate().unwrap();
+    assert!(report.errors[1] < report.errors[0], "{report:?}");
+    // What is drawn covers the subject.
+    let truth = scene.train[1].pixels().unwrap();
+    let (mut both, mut either) = (0, 0);
+    for (opacity, mask) in rendering.opacity.iter().zip(&truth.mask) {
+        both += usize::from(*opacity > 0.5 && *mask > 0.5);
+        either += usize::from(*opacity > 0.5);
+    }
+    assert!(both * 10 > either * 5 && either > 50, "{both} of {either}");
+    // Skinned as the avatar's own types say.
+    let clip = &avatar.clips[0].motion;
+    let pose = &clip.poses[..avatar.num_joints()];
+    let bones = avatar.bones(pose, clip.trans[0]);
+    let expected = avatar.skin_with_blend_shapes(&bones, pose);
+    for (found, expected) in BakedPerson::new(&avatar, 1.0).skin(&bones).iter().zip(expected) {
+        assert!(found.distance(expected) < 1e-4);
+    }
+    for options in [
+        BakeOptions { shells: 0, ..BakeOptions::default() },
+        BakeOptions { shells: 6, ..BakeOptions::default() },
+        BakeOptions { atlas: 1, ..BakeOptions::default() },
+        BakeOptions { fps: f32::NAN, ..BakeOptions::default() },
+    ] {
+        assert!(bake(trainer.model(), None, &options).unwrap_err().to_string().starts_with("scene: bake: "));
+    }
+}

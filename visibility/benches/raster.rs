@@ -1,0 +1,126 @@
+//! Cost of rasterising a body of 13776 triangles (a ball of 20480 where that is not at hand), and of casting the rays
+//! of the same pictures at it.
+#![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
+
+#[path = "../tests/body/mod.rs"]
+mod body;
+
+use std::collections::HashMap;
+
+use divan::Bencher;
+use divan::counter::ItemsCount;
+use glam::{Affine3A, Mat3, Quat, Vec3};
+use testkit::TriMesh;
+use visibility::{RasterOptions, Rasterizer, RayMesh, Samples, View};
+
+fn main() {
+    divan::main();
+}
+
+/// The whole body from 3 m in front, four fifths of the picture high.
+fn view(width: u32, height: u32) -> View {
+    let focal = height as f32 * 1.4;
+    View {
+        intrinsics: Mat3::from_cols(
+            Vec3::X * focal,
+            Vec3::Y * focal,
+            Vec3::new(width as f32 / 2.0, height as f32 / 2.0, 1.0),
+        ),
+        extrinsics: Affine3A::from_rotation_translation(
+            Quat::from_rotation_x(std::f32::consts::PI),
+            Vec3::new(0.0, -0.2, 3.0),
+        ),
+        width,
+        height,
+    }
+}
+
+/// Every triangle in four, `times` over.
+fn subdivided(times: u32) -> TriMesh {
+    let mut mesh = body::body_or_ball();
+    for _ in 0..times {
+        let TriMesh { vertices, faces } = &mut mesh;
+        let mut middles = HashMap::new();
+        let mut middle = |a: u32, b: u32| {
+            *middles.entry((a.min(b), a.max(b))).or_insert_with(|| {
+                vertices.push((vertices[a as usize] + vertices[b as usize]) / 2.0);
+                vertices.len() as u32 - 1
+            })
+        };
+        *faces = (faces.iter())
+            .flat_map(|&[a, b, c]| {
+                let (ab, bc, ca) = (middle(a, b), middle(b, c), middle(c, a));
+                [[a, ab, ca], [ab, b, bc], [ca, bc, c], [ab, bc, ca]]
+            })
+            .collect();
+    }
+    mesh
+}
+
+fn pool(threads: usize) -> rayon::ThreadPool {
+    rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap()
+}
+
+fn draw(bencher: Bencher<'_, '_>, mesh: &TriMesh, view: &View, threads: usize, layers: usize, samples: Samples) {
+    let options = RasterOptions { samples, cull_back: true, ..RasterOptions::default() };
+    let mut out = vec![0u32; (view.width * view.height) as usize];
+    let mut rasterizer = Rasterizer::default();
+    let layers = vec![&mesh.faces[..]; layers];
+    let pool = pool(threads);
+    bencher.counter(ItemsCount::new(out.len())).bench_local(|| {
+        pool.install(|| {
+            rasterizer.draw(&mesh.vertices, &layers, view, &options, &mut out, |pixel| {
+                pixel.samples().next().and_then(|sample| sample.first()).map_or(0, |f| f.face)
+            })
+        })
+    });
+}
+
+/// A picture of 512 × 512, of meshes subdivided so many times, on two threads.
+#[divan::bench(args = [0, 1, 2])]
+fn faces_512(bencher: Bencher<'_, '_>, times: u32) {
+    draw(bencher, &subdivided(times), &view(512, 512), 2, 1, Samples::One);
+}
+
+/// The same on one.
+#[divan::bench(args = [0, 1, 2])]
+fn faces_512_one_thread(bencher: Bencher<'_, '_>, times: u32) {
+    draw(bencher, &subdivided(times), &view(512, 512), 1, 1, Samples::One);
+}
+
+/// Four samples a pixel.
+#[divan::bench]
+fn four_samples_512(bencher: Bencher<'_, '_>) {
+    draw(bencher, &subdivided(1), &view(512, 512), 2, 1, Samples::Four);
+}
+
+/// Three layers.
+#[divan::bench]
+fn three_layers_512(bencher: Bencher<'_, '_>) {
+    draw(bencher, &subdivided(1), &view(512, 512), 2, 3, Samples::One);
+}
+
+/// Pictures of other sizes.
+#[divan::bench(args = [(256, 256), (1920, 1080)])]
+fn faces(bencher: Bencher<'_, '_>, (width, height): (u32, u32)) {
+    draw(bencher, &subdivided(1), &view(width, height), 2, 1, Samples::One);
+}
+
+/// What the ray caster needs for the picture of 512 × 512, on two threads, its tree at hand.
+#[divan::bench(args = [0, 1])]
+fn rays_512(bencher: Bencher<'_, '_>, times: u32) {
+    let mesh = subdivided(times);
+    let rays = RayMesh::new(&mesh.vertices, &mesh.faces).unwrap();
+    let view = view(512, 512);
+    let (origin, to_world) = (view.centre().unwrap(), view.extrinsics.inverse());
+    let inverse = view.intrinsics.inverse();
+    let all: Vec<(Vec3, Vec3)> = (0..512 * 512)
+        .map(|i| {
+            let pixel = Vec3::new((i % 512) as f32 + 0.5, (i / 512) as f32 + 0.5, 1.0);
+            (origin, to_world.transform_vector3(inverse * pixel))
+        })
+        .collect();
+    let mut hits = vec![None; all.len()];
+    let pool = pool(2);
+    bencher.counter(ItemsCount::new(all.len())).bench_local(|| pool.install(|| rays.first_hits(&all, &mut hits)));
+}

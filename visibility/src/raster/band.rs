@@ -1,0 +1,236 @@
+//! Drawing of a band of rows: depth and face of every sample, then barycentrics.
+
+use glam::{DVec3, Vec3};
+
+use super::project::{Projected, Projection, STEP};
+use super::triangle::{Chunk, Triangle};
+use super::{Fragment, Pixel};
+
+/// Rows of samples of a band.
+pub(super) const BAND: usize = 16;
+/// Samples of a row that are tested together.
+const LANES: usize = 8;
+/// Columns over which edge functions are stepped in 32 bits.
+const BLOCK: i32 = 32;
+/// Edge functions beyond this keep their sign throughout a block: a step is at most 2²⁴, and there are fewer than 64.
+const CERTAIN: i64 = 1 << 30;
+/// No face.
+const NONE: u32 = u32::MAX;
+
+/// What a picture is drawn from.
+pub(super) struct Band<'a> {
+    pub projection: &'a Projection,
+    pub projected: &'a [Projected],
+    pub vertices: &'a [Vec3],
+    pub layers: &'a [&'a [[u32; 3]]],
+    pub chunks: &'a [Chunk],
+}
+
+/// The samples of a band, layer by layer.
+#[derive(Default)]
+pub(super) struct Strip {
+    layers: Vec<Layer>,
+    fragments: Vec<Fragment>,
+    counts: Vec<usize>,
+}
+
+#[derive(Default)]
+struct Layer {
+    /// Reciprocal of the depth, 0 for nothing.
+    inverse: Vec<f32>,
+    face: Vec<u32>,
+    stride: usize,
+    /// Columns that something was drawn in.
+    columns: [usize; 2],
+}
+
+impl Band<'_> {
+    pub fn draw<T>(&self, band: usize, strip: &mut Strip, out: &mut [T], shade: &impl Fn(Pixel<'_>) -> T) {
+        let side = self.projection.side;
+        let [low, high] = self.fill(band, strip);
+        let columns = [low / side, high.div_ceil(side)];
+        let Strip { layers, fragments, counts } = strip;
+        let nothing = Fragment { face: NONE, depth: f32::INFINITY, barycentric: [0.0; 3] };
+        fragments.clear();
+        fragments.resize(side * side * self.layers.len(), nothing);
+        counts.clear();
+        counts.resize(side * side, 0);
+        let width = self.projection.width / side;
+        let first = band * BAND / side * width;
+        for (row, out) in out.chunks_mut(width).enumerate() {
+            for (column, out) in out.iter_mut().enumerate() {
+                let mut any = false;
+                if (columns[0]..columns[1]).contains(&column) {
+                    for (sample, count) in counts.iter_mut().enumerate() {
+                        let at = [column * side + sample % side, row * side + sample / side];
+                        let fragments = &mut fragments[sample * self.layers.len()..][..self.layers.len()];
+                        *count = self.resolve(layers, at, band, fragments);
+                        any |= *count > 0;
+                    }
+                }
+                let counts = if any { &counts[..] } else { &[] };
+                let index = first + row * width + column;
+                *out = shade(Pixel { index, fragments, counts, layers: self.layers.len() });
+            }
+        }
+    }
+
+    /// Depth and face of every sample; the first column that is drawn in, and the one after the last.
+    fn fill(&self, band: usize, strip: &mut Strip) -> [usize; 2] {
+        let stride = self.projection.width.next_multiple_of(LANES) + LANES;
+        strip.layers.resize_with(self.layers.len(), Layer::default);
+        for layer in &mut strip.layers {
+            layer.stride = stride;
+            layer.columns = [usize::MAX, 0];
+            layer.inverse.clear();
+            layer.inverse.resize(stride * BAND, 0.0);
+            layer.face.clear();
+            layer.face.resize(stride * BAND, NONE);
+        }
+        let first_row = (band * BAND) as i32;
+        for chunk in self.chunks.iter().filter(|chunk| !chunk.bins[band].is_empty()) {
+            let layer = &mut strip.layers[chunk.layer];
+            crate::packet::arch().dispatch(Fill { layer, first_row, chunk, bin: &chunk.bins[band] });
+        }
+        strip
+            .layers
+            .iter()
+            .fold([usize::MAX, 0], |[low, high], layer| [low.min(layer.columns[0]), high.max(layer.columns[1])])
+    }
+
+    /// What a sample sees, nearest first; returns how much.
+    fn resolve(&self, layers: &[Layer], [x, y]: [usize; 2], band: usize, out: &mut [Fragment]) -> usize {
+        let mut count = 0;
+        let (mut first, centre) = (0, Vec3::new(x as f32 + 0.5, (band * BAND + y) as f32 + 0.5, 0.0));
+        for (layer, faces) in layers.iter().zip(self.layers) {
+            let face = layer.face[y * layer.stride + x];
+            if face != NONE {
+                let fragment = self.fragment(face, faces[(face - first) as usize], centre);
+                let mut at = count;
+                while at > 0 && out[at - 1].depth > fragment.depth {
+                    out[at] = out[at - 1];
+                    at -= 1;
+                }
+                out[at] = fragment;
+                count += 1;
+            }
+            first += faces.len() as u32;
+        }
+        count
+    }
+
+    /// The triangle's plane where the ray through the `centre` of a sample meets it (Olano and Greer 1997: edge
+    /// functions of homogeneous coordinates, right also for corners behind the camera).
+    fn fragment(&self, face: u32, corners: [u32; 3], centre: Vec3) -> Fragment {
+        let projected = corners.map(|v| &self.projected[v as usize]);
+        if projected.iter().any(|v| v.inverse == 0.0) {
+            return self.large_fragment(face, corners, centre.as_dvec3());
+        }
+        let [a, b, c] = projected.map(|v| v.clip);
+        let [p, q, r] = [a, b, c].map(|v| v.truncate() - centre.truncate() * v.z);
+        let weights = Vec3::new(q.perp_dot(r), r.perp_dot(p), p.perp_dot(q));
+        // Rounding of the corners draws samples that are a little outside.
+        let inside = (weights * (weights.x + weights.y + weights.z).signum()).max(Vec3::ZERO);
+        let scale = 1.0 / (inside.x + inside.y + inside.z);
+        if !scale.is_finite() || scale == 0.0 {
+            return self.large_fragment(face, corners, centre.as_dvec3());
+        }
+        let inside = inside * scale;
+        Fragment { face, depth: inside.dot(Vec3::new(a.z, b.z, c.z)), barycentric: inside.to_array() }
+    }
+
+    /// The same for triangles that reach behind the camera or so far that an f32 is not enough.
+    #[cold]
+    fn large_fragment(&self, face: u32, corners: [u32; 3], centre: DVec3) -> Fragment {
+        let [a, b, c] = corners.map(|v| self.projection.exact(self.vertices[v as usize]));
+        let [p, q, r] = [a, b, c].map(|v| v.truncate() - centre.truncate() * v.z);
+        let weights = DVec3::new(q.perp_dot(r), r.perp_dot(p), p.perp_dot(q));
+        let weights = weights / (weights.x + weights.y + weights.z);
+        let weights = if weights.is_finite() { weights.max(DVec3::ZERO) } else { DVec3::ONE };
+        let weights = weights / (weights.x + weights.y + weights.z);
+        let depth = weights.dot(DVec3::new(a.z, b.z, c.z)).max(f64::from(self.projection.near));
+        Fragment { face, depth: depth.min(f64::from(f32::MAX)) as f32, barycentric: weights.as_vec3().to_array() }
+    }
+}
+
+/// The triangles of a bin, compiled for the widest instructions of the machine.
+struct Fill<'a> {
+    layer: &'a mut Layer,
+    first_row: i32,
+    chunk: &'a Chunk,
+    bin: &'a [u32],
+}
+
+impl pulp::WithSimd for Fill<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: pulp::Simd>(self, _: S) {
+        for &index in self.bin {
+            let triangle = &self.chunk.triangles[index as usize];
+            let [low, high] = &mut self.layer.columns;
+            *low = (*low).min(triangle.columns[0] as usize);
+            *high = (*high).max(triangle.columns[1] as usize + 1);
+            for start in (triangle.columns[0]..=triangle.columns[1]).step_by(BLOCK as usize) {
+                self.layer.fill(triangle, start, self.first_row);
+            }
+        }
+    }
+}
+
+impl Layer {
+    /// Draws the columns of a triangle from `start` on, a block of them.
+    #[inline(always)]
+    fn fill(&mut self, triangle: &Triangle, start: i32, first_row: i32) {
+        let end = (triangle.columns[1] + 1).min(start + BLOCK);
+        let rows = [triangle.rows[0].max(first_row), triangle.rows[1].min(first_row + BAND as i32 - 1)];
+        let (px, py) = (start * STEP + STEP / 2, rows[0] * STEP + STEP / 2);
+        let (x, y) = (triangle.x, triangle.y);
+        let (mut edges, mut across, mut down) = ([0i32; 3], [0i32; 3], [0i32; 3]);
+        for i in 0..3 {
+            let j = (i + 1) % 3;
+            let (dx, dy) = (x[j] - x[i], y[j] - y[i]);
+            let edge = i64::from(dx) * i64::from(py - y[i]) - i64::from(dy) * i64::from(px - x[i]);
+            // Samples on an edge belong to the triangle whose top or left edge it is.
+            let owned = dy < 0 || (dy == 0 && dx > 0);
+            // Steps are whole multiples of STEP, so that what is below one decides no sign.
+            edges[i] = ((edge - i64::from(!owned)) >> STEP.trailing_zeros()).clamp(-CERTAIN, CERTAIN) as i32;
+            (across[i], down[i]) = (-dy, dx);
+        }
+        let [inverse, least, most] = triangle.inverse;
+        let slope = triangle.slope.map(|s| (s * f64::from(STEP)) as f32);
+        let at_start =
+            f64::from(inverse) + triangle.slope[0] * f64::from(px - x[0]) + triangle.slope[1] * f64::from(py - y[0]);
+        let mut inverse = at_start as f32;
+        for row in rows[0]..=rows[1] {
+            let at = (row - first_row) as usize * self.stride + start as usize;
+            let span = at..at + ((end - start) as usize).next_multiple_of(LANES);
+            let depths = self.inverse[span.clone()].as_chunks_mut::<LANES>().0;
+            let faces = self.face[span].as_chunks_mut::<LANES>().0;
+            let (mut first, mut edge) = (0.0f32, edges);
+            for (depths, faces) in depths.iter_mut().zip(faces) {
+                for i in 0..LANES {
+                    let lane = i as i32;
+                    let outside = edge[0].wrapping_add(across[0].wrapping_mul(lane))
+                        | edge[1].wrapping_add(across[1].wrapping_mul(lane))
+                        | edge[2].wrapping_add(across[2].wrapping_mul(lane));
+                    let depth = inverse + slope[0] * (first + i as f32);
+                    let depth = if depth > least { depth } else { least };
+                    let depth = if depth < most { depth } else { most };
+                    let nearer = (depth > depths[i]) | ((depth == depths[i]) & (triangle.face < faces[i]));
+                    let seen = (outside >= 0) & nearer;
+                    depths[i] = if seen { depth } else { depths[i] };
+                    faces[i] = if seen { triangle.face } else { faces[i] };
+                }
+                first += LANES as f32;
+                for e in 0..3 {
+                    edge[e] = edge[e].wrapping_add(across[e].wrapping_mul(LANES as i32));
+                }
+            }
+            for e in 0..3 {
+                edges[e] = edges[e].wrapping_add(down[e]);
+            }
+            inverse += slope[1];
+        }
+    }
+}

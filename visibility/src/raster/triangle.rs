@@ -1,0 +1,123 @@
+//! Triangles in fixed point, sorted into the bands of rows that they reach.
+
+use std::ops::Range;
+
+use glam::Vec3;
+
+use super::band::BAND;
+use super::clip::clip;
+use super::project::{Projected, Projection, STEP};
+use crate::Error;
+
+/// Faces that are set up together.
+pub(super) const CHUNK: usize = 2048;
+
+/// A triangle on the screen, wound so that its area is positive.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Triangle {
+    /// Fixed-point corners.
+    pub x: [i32; 3],
+    pub y: [i32; 3],
+    /// Samples that its bounding box holds: first and last column, first and last row.
+    pub columns: [i32; 2],
+    pub rows: [i32; 2],
+    /// Counted through all layers.
+    pub face: u32,
+    /// Reciprocal of the depth: at the first corner, least and most.
+    pub inverse: [f32; 3],
+    /// How the reciprocal grows per step of fixed point.
+    pub slope: [f64; 2],
+}
+
+/// Some faces of a layer, set up.
+#[derive(Debug, Default)]
+pub(super) struct Chunk {
+    pub layer: usize,
+    /// Faces of the layer.
+    pub range: Range<usize>,
+    /// The first of them, counted through all layers.
+    first: usize,
+    pub triangles: Vec<Triangle>,
+    /// Triangles that reach into each band.
+    pub bins: Vec<Vec<u32>>,
+}
+
+impl Chunk {
+    pub fn begin(&mut self, layer: usize, first: usize, range: Range<usize>, bands: usize) {
+        (self.layer, self.first, self.range) = (layer, first, range);
+        self.triangles.clear();
+        self.bins.iter_mut().for_each(Vec::clear);
+        self.bins.resize_with(bands, Vec::new);
+    }
+
+    pub fn set_up(
+        &mut self,
+        faces: &[[u32; 3]],
+        projected: &[Projected],
+        vertices: &[Vec3],
+        projection: &Projection,
+    ) -> Result<(), Error> {
+        for (i, face) in faces.iter().enumerate() {
+            let mut corners = [&projected[..0]; 3];
+            for (corner, &vertex) in corners.iter_mut().zip(face) {
+                let at = vertex as usize;
+                *corner = projected.get(at..=at).ok_or(Error::FaceIndex {
+                    face: self.range.start + i,
+                    vertex,
+                    vertices: projected.len(),
+                })?;
+            }
+            let [a, b, c] = corners.map(|corner| &corner[0]);
+            let index = (self.first + i) as u32;
+            if a.inverse > 0.0 && b.inverse > 0.0 && c.inverse > 0.0 {
+                self.push(projection, index, [a, b, c].map(|v| ([v.x, v.y], v.inverse)));
+            } else if !(a.inverse.is_nan() || b.inverse.is_nan() || c.inverse.is_nan()) {
+                let v = face.map(|v| vertices[v as usize]);
+                clip(projection, [(v[0], a), (v[1], b), (v[2], c)], |part| self.push(projection, index, part));
+            }
+        }
+        Ok(())
+    }
+
+    #[inline]
+    fn push(&mut self, projection: &Projection, face: u32, corners: [([i32; 2], f32); 3]) {
+        let [mut a, b, mut c] = corners;
+        let columns = samples(a.0[0], b.0[0], c.0[0], projection.width);
+        let rows = samples(a.0[1], b.0[1], c.0[1], projection.height);
+        if columns[0] > columns[1] || rows[0] > rows[1] {
+            return;
+        }
+        let [bx, by, cx, cy] = [b.0[0] - a.0[0], b.0[1] - a.0[1], c.0[0] - a.0[0], c.0[1] - a.0[1]];
+        let area = i64::from(bx) * i64::from(cy) - i64::from(cx) * i64::from(by);
+        // Rows grow downwards: what is counter-clockwise to the eye has a negative area.
+        if area == 0 || (projection.cull_back && area > 0) {
+            return;
+        }
+        if area < 0 {
+            (a, c) = (c, a);
+        }
+        let [bx, by, cx, cy] = [b.0[0] - a.0[0], b.0[1] - a.0[1], c.0[0] - a.0[0], c.0[1] - a.0[1]].map(f64::from);
+        let (bz, cz) = (f64::from(b.1) - f64::from(a.1), f64::from(c.1) - f64::from(a.1));
+        let scale = 1.0 / area.abs() as f64;
+        let index = self.triangles.len() as u32;
+        self.triangles.push(Triangle {
+            x: [a.0[0], b.0[0], c.0[0]],
+            y: [a.0[1], b.0[1], c.0[1]],
+            columns,
+            rows,
+            face,
+            inverse: [a.1, a.1.min(b.1).min(c.1), a.1.max(b.1).max(c.1)],
+            slope: [(bz * cy - cz * by) * scale, (cz * bx - bz * cx) * scale],
+        });
+        for band in rows[0] as usize / BAND..=rows[1] as usize / BAND {
+            self.bins[band].push(index);
+        }
+    }
+}
+
+/// The first and last of `count` samples, at their middles, between three fixed-point coordinates.
+fn samples(a: i32, b: i32, c: i32, count: usize) -> [i32; 2] {
+    let (low, high) = (a.min(b).min(c), a.max(b).max(c));
+    let half = STEP / 2;
+    [(low + half - 1).div_euclid(STEP).max(0), (high - half).div_euclid(STEP).min(count as i32 - 1)]
+}

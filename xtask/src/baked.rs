@@ -1,0 +1,48 @@
+//! A run's person as an avatar, baked when it is first asked for.
+
+use std::path::{Path, PathBuf};
+use std::time::SystemTime;
+
+use anyhow::{Context, Result};
+use occnerf::bake::{Avatar, BakeOptions, bake};
+use occnerf::{Model, Scene};
+
+use crate::process::{note, say};
+use crate::run::{CHECKPOINT, RunConfig};
+
+/// The avatar's file in a run directory.
+pub const AVATAR: &str = "avatar.safetensors";
+
+/// Where the avatar of a run lies.
+pub fn path(run: &Path) -> PathBuf {
+    run.join(AVATAR)
+}
+
+/// The avatar in a run's directory, unless there is none or the checkpoint is newer.
+pub fn fresh(run: &Path) -> Result<Option<Avatar>> {
+    let written = |path: PathBuf| -> Option<SystemTime> { path.metadata().ok()?.modified().ok() };
+    let (avatar, checkpoint) = (written(path(run)), written(run.join(CHECKPOINT)));
+    let fresh = avatar.is_some() && avatar >= checkpoint;
+    Ok(if fresh { Some(Avatar::load(&path(run))?) } else { None })
+}
+
+/// The avatar of a run: that in its directory where it is not older than the checkpoint, else baked, and written there.
+/// Baking looks at the capture again, where it is still to be had.
+pub fn avatar(run: &Path, model: &Model) -> Result<Avatar> {
+    if let Some(avatar) = fresh(run)? {
+        return Ok(avatar);
+    }
+    let path = path(run);
+    let scene = scene(run).map_err(|error| note!("baking without the capture: {error:#}")).ok();
+    let (avatar, report) = bake(model, scene.as_ref(), &BakeOptions::default())?;
+    avatar.save(&path).with_context(|| path.display().to_string())?;
+    let (side, faces, seconds) = (report.side, report.faces, report.seconds);
+    say!("baked {faces} triangles and an atlas of {side} × {side} in {seconds:.1} s: {}", path.display());
+    Ok(avatar)
+}
+
+fn scene(run: &Path) -> Result<Scene> {
+    let config = RunConfig::read(run)?;
+    let source = config.source()?;
+    Ok(Scene::new(&source.capture, &source.model, &config.train)?)
+}
