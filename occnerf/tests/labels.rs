@@ -101,14 +101,16 @@ proptest! {
     }
 
     #[test]
-    fn a_known_occluder_overrules_the_silhouette_and_the_background_rule_overrules_both(
+    fn a_known_occluder_joins_what_is_inferred_and_the_background_rule_overrules_both(
         subject in blobs(), silhouette in blobs(), occluder in blobs(), scale in 20.0f32..200.0,
     ) {
         let mask = mask(&subject);
         let known = label_pixels(OccludedRule::Unknown, &mask, &silhouette, Some(&occluder), WIDTH, scale);
+        let inferred = label_pixels(OccludedRule::Unknown, &mask, &silhouette, None, WIDTH, scale);
         let background = label_pixels(OccludedRule::Background, &mask, &silhouette, Some(&occluder), WIDTH, scale);
         for i in 0..mask.len() {
-            prop_assert_eq!(known[i] == Label::Unknown, occluder[i] && !subject[i]);
+            let hidden = (occluder[i] && !subject[i]) || inferred[i] == Label::Unknown;
+            prop_assert_eq!(known[i] == Label::Unknown, hidden);
             prop_assert_eq!(background[i] == Label::Background, !subject[i]);
         }
     }

@@ -110,9 +110,9 @@ const CLOTHES: f32 = 0.04;
 /// Labels the pixels of a frame of `width` × H pixels.
 ///
 /// `mask`: subject coverage; `silhouette`: pixels that the posed prior covers; `occluder`: known
-/// occluder pixels; `pixels_per_metre`: image scale at the subject's depth. With a known occluder
-/// its pixels are unknown; else the silhouette outside the mask, opened by 3 cm and dilated by 4
-/// cm.
+/// occluder pixels; `pixels_per_metre`: image scale at the subject's depth. Unknown are the
+/// occluder's pixels, which may be some of many, and the silhouette outside the mask, opened by 3 cm
+/// and dilated by 4 cm.
 pub fn label_pixels(
     rule: OccludedRule,
     mask: &[f32],
@@ -123,16 +123,14 @@ pub fn label_pixels(
 ) -> Vec<Label> {
     assert_eq!(mask.len(), silhouette.len());
     let subject: Vec<bool> = mask.iter().map(|&m| m > 0.5).collect();
-    let unknown: Vec<bool> = match (rule, occluder) {
-        (OccludedRule::Background, _) => vec![false; mask.len()],
-        (OccludedRule::Unknown, Some(occluder)) => occluder.to_vec(),
-        (OccludedRule::Unknown, None) => {
-            let missing: Vec<bool> = silhouette.iter().zip(&subject).map(|(&s, &m)| s && !m).collect();
-            let radius = 0.5 * SLIVER * pixels_per_metre;
-            let opened = dilate(&erode(&missing, width, radius), width, radius);
-            dilate(&opened, width, CLOTHES * pixels_per_metre)
-        }
-    };
+    let mut unknown = vec![false; mask.len()];
+    if rule == OccludedRule::Unknown {
+        let missing: Vec<bool> = silhouette.iter().zip(&subject).map(|(&s, &m)| s && !m).collect();
+        let radius = 0.5 * SLIVER * pixels_per_metre;
+        let opened = dilate(&erode(&missing, width, radius), width, radius);
+        unknown = dilate(&opened, width, CLOTHES * pixels_per_metre);
+        unknown.iter_mut().zip(occluder.into_iter().flatten()).for_each(|(unknown, &known)| *unknown |= known);
+    }
     subject
         .iter()
         .zip(unknown)
@@ -257,9 +255,12 @@ mod tests {
     }
 
     #[test]
-    fn a_known_occluder_is_taken_as_it_is() {
-        let occluder = [true, false, true, false];
-        let labels = label_pixels(OccludedRule::Unknown, &[1.0, 0.0, 0.0, 0.0], &[true; 4], Some(&occluder), 4, 1.0);
-        assert_eq!(labels, [Label::Subject, Label::Background, Label::Unknown, Label::Background]);
+    fn a_known_occluder_joins_what_is_inferred() {
+        let (mask, occluder) = ([1.0, 0.0, 0.0, 0.0, 0.0], [true, false, true, false, false]);
+        let of = |silhouette: &[bool], rule| label_pixels(rule, &mask, silhouette, Some(&occluder), 5, 1.0);
+        use Label::{Background, Subject, Unknown};
+        assert_eq!(of(&[false; 5], OccludedRule::Unknown), [Subject, Background, Unknown, Background, Background]);
+        assert_eq!(of(&[true; 5], OccludedRule::Unknown), [Subject, Unknown, Unknown, Unknown, Unknown]);
+        assert_eq!(of(&[true; 5], OccludedRule::Background)[1..], [Background; 4]);
     }
 }
