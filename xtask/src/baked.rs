@@ -17,8 +17,8 @@ pub fn path(run: &Path) -> PathBuf {
     run.join(AVATAR)
 }
 
-/// The avatar of a run: that in its directory where it is not older than the checkpoint, else baked, and written there. Baking
-/// looks at the capture again, where it is still to be had.
+/// The avatar of a run: that in its directory where it is not older than the checkpoint, else
+/// baked, and written there. Baking looks at the capture again, where it is still to be had.
 pub fn avatar(run: &Path, model: &Model) -> Result<Avatar> {
     let path = path(run);
     let written = |path: &Path| -> Option<SystemTime> { path.metadata().ok()?.modified().ok() };
