@@ -1,5 +1,6 @@
-//! The paper's encoding (D 4, L 16, F 2, T 2^19), forward and backward, against a plain implementation; the target's
-//! points are uniform in the unit cube, those of a trained scene lie on a surface and share more corners.
+//! The paper's encoding (D 4, L 16, F 2, T 2^19), forward and backward, against a plain
+//! implementation; the target's points are uniform in the unit cube, those of a trained scene lie
+//! on a surface and share more corners.
 //!
 //! `cargo bench -p hashgrid`: times are a call of [`POINTS`] points; items/s are points.
 

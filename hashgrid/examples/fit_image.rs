@@ -1,11 +1,12 @@
-//! Fits a picture with a 2-D hash grid: `cargo run --release -p hashgrid --example fit_image [OUT.png]`.
+//! Fits a picture with a 2-D hash grid: `cargo run --release -p hashgrid --example fit_image
+//! [OUT.png]`.
 //!
-//! Three features a level are summed over the levels and are the colour: no network, so that all the detail comes
-//! from the grid. Writes the picture beside its fit.
+//! Three features a level are summed over the levels and are the colour: no network, so that all
+//! the detail comes from the grid. Writes the picture beside its fit.
 
 use hashgrid::{HashGrid, HashGridConfig};
 
-const SIDE: usize = 256;
+const SIDE: usize = 112;
 const BATCH: usize = 4096;
 const STEPS: usize = 400;
 

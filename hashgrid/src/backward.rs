@@ -5,11 +5,12 @@ use crate::grid::{HashGrid, Level};
 use crate::simd::{Kernel, arch};
 
 impl<const D: usize> HashGrid<D> {
-    /// Adds the gradient of the table to `d_table` ([`HashGrid::num_parameters`]), given `points` (Q, D) and the
-    /// gradient of their features `d_features` (L, Q, F).
+    /// Adds the gradient of the table to `d_table` ([`HashGrid::num_parameters`]), given `points`
+    /// (Q, D) and the gradient of their features `d_features` (L, Q, F).
     ///
-    /// Levels run in parallel on the current rayon pool; each adds its points in their order, so that the result
-    /// does not depend on the number of threads. The encoding is linear in the table: no table is needed.
+    /// Levels run in parallel on the current rayon pool; each adds its points in their order, so
+    /// that the result does not depend on the number of threads. The encoding is linear in the
+    /// table: no table is needed.
     ///
     /// # Panics
     /// Where a slice has another length.
@@ -17,8 +18,8 @@ impl<const D: usize> HashGrid<D> {
         self.encode_backward_parts(std::iter::once((points, d_features)), d_table);
     }
 
-    /// [`HashGrid::encode_backward`] of points that lie in several places, one part after the other: a level's part of the
-    /// table comes to the cache once for all of them.
+    /// [`HashGrid::encode_backward`] of points that lie in several places, one part after the
+    /// other: a level's part of the table comes to the cache once for all of them.
     ///
     /// # Panics
     /// As [`HashGrid::encode_backward`].

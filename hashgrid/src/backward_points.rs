@@ -4,11 +4,12 @@ use crate::grid::{HashGrid, Level};
 use crate::simd::{Kernel, arch};
 
 impl<const D: usize> HashGrid<D> {
-    /// Adds the gradient of the coordinates to `d_points` (Q, D), given `table`, `points` (Q, D) and the gradient
-    /// of their features `d_features` (L, Q, F). Runs on the calling thread.
+    /// Adds the gradient of the coordinates to `d_points` (Q, D), given `table`, `points` (Q, D)
+    /// and the gradient of their features `d_features` (L, Q, F). Runs on the calling thread.
     ///
-    /// The encoding is d-linear within a cell and only continuous across cells: on a face the derivative is that
-    /// of the upper cell (at x = 1, of the last cell). Coordinates outside \[0, 1\] and NaN get no gradient.
+    /// The encoding is d-linear within a cell and only continuous across cells: on a face the
+    /// derivative is that of the upper cell (at x = 1, of the last cell). Coordinates outside \[0,
+    /// 1\] and NaN get no gradient.
     ///
     /// # Panics
     /// Where a slice has another length.
@@ -75,7 +76,8 @@ fn level_backward_points<const D: usize, const W: usize>(
     }
 }
 
-/// Derivative along axis `j` of the d-linear interpolation of corner `values`, a cell's side being 1.
+/// Derivative along axis `j` of the d-linear interpolation of corner `values`, a cell's side being
+/// 1.
 #[inline(always)]
 fn slope<const D: usize>(values: &[Lanes<f32>; MAX_CORNERS], fraction: &[Lanes<f32>; 4], j: usize) -> Lanes<f32> {
     let mut folded = *values;

@@ -11,8 +11,9 @@ pub const MAX_PARAMETERS: usize = 1 << 31;
 
 /// Shape of an encoding whose resolutions grow geometrically from `n_min` to `n_max`.
 ///
-/// N_l = ⌊n_min · b^l⌋ with b = (n_max / n_min)^(1 / (levels − 1)) (Müller et al. 2022, eq. 2 and 3); the first
-/// and the last level are exactly `n_min` and `n_max`. With one level, only `n_min` is used.
+/// N_l = ⌊n_min · b^l⌋ with b = (n_max / n_min)^(1 / (levels − 1)) (Müller et al. 2022, eq. 2 and
+/// 3); the first and the last level are exactly `n_min` and `n_max`. With one level, only `n_min`
+/// is used.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct HashGridConfig {
     /// L, at least 1.
@@ -94,7 +95,7 @@ pub enum Error {
     /// `levels` is 0, or there are no resolutions.
     #[error("a hash grid needs at least one level")]
     NoLevels,
-    /// More levels than anybody means.
+    /// Most levels.
     #[error("{levels} levels, at most {most}")]
     TooManyLevels {
         /// The levels asked for.

@@ -26,7 +26,8 @@ impl Corners {
         Self { row: [[0; BLOCK]; MAX_CORNERS], fraction: [[0.0; BLOCK]; 4] }
     }
 
-    /// Fills the block from up to [`BLOCK`] `points`; lanes beyond them hold the corners of the origin.
+    /// Fills the block from up to [`BLOCK`] `points`; lanes beyond them hold the corners of the
+    /// origin.
     #[inline(always)]
     pub fn fill<const D: usize>(&mut self, level: &Level, points: &[[f32; D]]) {
         if level.hashed {
@@ -108,8 +109,8 @@ impl Corners {
         weight
     }
 
-    /// Reads the rows of all corners before anything is done with them: more of them are on their way at a time where the
-    /// table is larger than the cache.
+    /// Reads the rows of all corners before anything is done with them: more of them are on their
+    /// way at a time where the table is larger than the cache.
     #[inline(always)]
     pub fn gather<const D: usize, const W: usize>(
         &self,
@@ -164,8 +165,8 @@ pub(crate) fn row_mut<const W: usize>(table: &mut [f32], stride: usize, offset: 
     &mut table[start..].as_chunks_mut::<W>().0[0]
 }
 
-/// Runs `$kernel::<D, W>(.., stride, offset)` in passes that cover all F features: one pass for F of 1, 2, 4 or
-/// 8, else passes of 8, 4, 2 and 1.
+/// Runs `$kernel::<D, W>(.., stride, offset)` in passes that cover all F features: one pass for F
+/// of 1, 2, 4 or 8, else passes of 8, 4, 2 and 1.
 macro_rules! for_widths {
     ($features:expr, $kernel:ident::<$d:ident>($($argument:expr),*)) => {
         match $features {

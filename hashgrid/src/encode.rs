@@ -2,16 +2,19 @@ use crate::corners::{BLOCK, Corners, MAX_CORNERS, for_widths, spread};
 use crate::grid::{HashGrid, Level};
 use crate::simd::{Kernel, arch};
 
-/// Points that go through one level before the next level starts: enough to share what it takes to bring a level's
-/// table to the cache, few enough for their coordinates to stay there from level to level.
+/// Points that go through one level before the next level starts: enough to share what it takes to
+/// bring a level's table to the cache, few enough for their coordinates to stay there from level to
+/// level.
 pub(crate) const CHUNK: usize = 1 << 15;
 
 impl<const D: usize> HashGrid<D> {
-    /// Encodes `points` (Q, D) with `table` ([`HashGrid::num_parameters`]) into `features` (L, Q, F), overwritten.
+    /// Encodes `points` (Q, D) with `table` ([`HashGrid::num_parameters`]) into `features` (L, Q,
+    /// F), overwritten.
     ///
-    /// Runs on the calling thread; split the points to use more. Thousands of points a call are faster a point
-    /// than a few, because a level's part of the table then stays in the cache (a third faster with 16 k than with 4 k
-    /// where the table is far larger than the cache), and is brought there once for all of them.
+    /// Runs on the calling thread; split the points to use more. Thousands of points a call are
+    /// faster a point than a few, because a level's part of the table then stays in the cache (a
+    /// third faster with 16 k than with 4 k where the table is far larger than the cache), and is
+    /// brought there once for all of them.
     ///
     /// # Panics
     /// Where a slice has another length.

@@ -7,8 +7,8 @@ use crate::layout::Layout;
 
 /// A multiresolution hash encoding of D-dimensional points, D = 2, 3 or 4 (others do not compile).
 ///
-/// Holds the shape only; the table of parameters belongs to the caller, so that optimisers and checkpoints see
-/// one flat slice.
+/// Holds the shape only; the table of parameters belongs to the caller, so that optimisers and
+/// checkpoints see one flat slice.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct HashGrid<const D: usize> {
     pub(crate) levels: Vec<Level>,
@@ -30,8 +30,8 @@ impl<const D: usize> HashGrid<D> {
     /// A grid with geometrically growing resolutions.
     ///
     /// # Errors
-    /// A configuration that has no meaning (no levels, no features, `n_max` < `n_min`, a resolution of 0) or no
-    /// sensible size (see the limits of this crate).
+    /// A configuration that has no meaning (no levels, no features, `n_max` < `n_min`, a resolution
+    /// of 0) or no sensible size (see the limits of this crate).
     pub fn new(config: &HashGridConfig) -> Result<Self, Error> {
         let resolutions = config.resolutions()?;
         Self::with_resolutions(&resolutions, config.features, config.log2_table_size)
@@ -76,7 +76,7 @@ impl<const D: usize> HashGrid<D> {
         self.levels.len() * self.features
     }
 
-    /// Where level `level` lies in the flat table: min((N + 1)^D, 2^T) rows of F numbers.
+    /// Range of level `level` in the flat table: min((N + 1)^D, 2^T) rows of F numbers.
     ///
     /// # Panics
     /// Where there is no such level.
@@ -87,7 +87,7 @@ impl<const D: usize> HashGrid<D> {
         start..start + rows * self.features
     }
 
-    /// How the features of `points` points lie.
+    /// Layout of the features of `points` points.
     #[must_use]
     pub fn layout(&self, points: usize) -> Layout {
         Layout { levels: self.levels.len(), points, features: self.features }
@@ -99,7 +99,8 @@ impl<const D: usize> HashGrid<D> {
         &self.resolutions
     }
 
-    /// A table to start from: uniform in ±1e-4 (Müller et al. 2022, section 3), the same for the same seed.
+    /// A table to start from: uniform in ±1e-4 (Müller et al. 2022, section 3), the same for the
+    /// same seed.
     #[must_use]
     pub fn init_table(&self, seed: u64) -> Vec<f32> {
         const AMPLITUDE: f32 = 1e-4;
@@ -122,7 +123,7 @@ impl<const D: usize> HashGrid<D> {
         );
     }
 
-    /// Where level `level` of the features of `points` points lies, from point `first` on.
+    /// Range of level `level` of the features of `points` points, from point `first` on.
     pub(crate) fn features_range(&self, level: usize, points: usize, first: usize, count: usize) -> Range<usize> {
         let start = (level * points + first) * self.features;
         start..start + count * self.features

@@ -10,11 +10,13 @@ impl<const D: usize> HashGrid<D> {
         self.num_features() * D * points
     }
 
-    /// [`HashGrid::encode`], up to rounding, that also writes the derivatives of the features by the coordinates, (L, Q, D, F),
-    /// overwritten: where a backward pass to the points follows, [`HashGrid::jacobian_backward`] need not read the table
-    /// again, which costs most where it is larger than the cache. Runs on the calling thread.
+    /// [`HashGrid::encode`], up to rounding, that also writes the derivatives of the features by
+    /// the coordinates, (L, Q, D, F), overwritten: where a backward pass to the points follows,
+    /// [`HashGrid::jacobian_backward`] need not read the table again, which costs most where it is
+    /// larger than the cache. Runs on the calling thread.
     ///
-    /// On the faces of cells and outside \[0, 1\] the derivatives are those of [`HashGrid::encode_backward_points`].
+    /// On the faces of cells and outside \[0, 1\] the derivatives are those of
+    /// [`HashGrid::encode_backward_points`].
     ///
     /// # Panics
     /// Where a slice has another length.
@@ -37,8 +39,9 @@ impl<const D: usize> HashGrid<D> {
         }
     }
 
-    /// Adds the gradient of the coordinates to `d_points` (Q, D), given what [`HashGrid::encode_jacobian`] wrote and the gradient
-    /// of the features `d_features` (L, Q, F). Runs on the calling thread.
+    /// Adds the gradient of the coordinates to `d_points` (Q, D), given what
+    /// [`HashGrid::encode_jacobian`] wrote and the gradient of the features `d_features` (L, Q, F).
+    /// Runs on the calling thread.
     ///
     /// # Panics
     /// Where a slice has another length.
@@ -115,7 +118,8 @@ fn project<const D: usize, const W: usize>(
     }
 }
 
-/// Interpolates the corners' values into `values[0]`; returns its derivatives along the axes, a cell's side being 1.
+/// Interpolates the corners' values into `values[0]`; returns its derivatives along the axes, a
+/// cell's side being 1.
 #[inline(always)]
 fn fold<const D: usize, const W: usize>(values: &mut Values<W>, fraction: &[Lanes<f32>; 4]) -> [Lanes<[f32; W]>; D] {
     let mut slopes = [[[[0.0f32; W]; BLOCK]; MAX_CORNERS / 2]; D];

@@ -2,8 +2,9 @@ use std::ops::Range;
 
 /// Shape of encoded points, (L, Q, F): levels, points, features of a level.
 ///
-/// A pass over one level reads and writes what belongs together; perceptrons want a row for each point, Q × (L·F). The two
-/// functions here go from one to the other, a range of points at a time, so that rows need never be more than fit a cache.
+/// A pass over one level reads and writes what belongs together; perceptrons want a row for each
+/// point, Q × (L·F). The two functions here go from one to the other, a range of points at a time,
+/// so that rows need never be more than fit a cache.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Layout {
     /// L.
@@ -27,10 +28,12 @@ impl Layout {
         self.len() == 0
     }
 
-    /// Copies the features of the points in `range` to the starts of `rows`, `stride` numbers apart.
+    /// Copies the features of the points in `range` to the starts of `rows`, `stride` numbers
+    /// apart.
     ///
     /// # Panics
-    /// Where a slice has another length or is too short, a point is not there, `stride` is less than L·F, or that is 0.
+    /// Where a slice has another length or is too short, a point is not there, `stride` is less
+    /// than L·F, or that is 0.
     pub fn to_rows(&self, features: &[f32], range: Range<usize>, rows: &mut [f32], stride: usize) {
         self.check(features.len(), &range, rows.len(), stride);
         for l in 0..self.levels {
@@ -44,7 +47,8 @@ impl Layout {
         }
     }
 
-    /// The way back: `features` of the points in `range` from the starts of `rows`, `stride` numbers apart.
+    /// The way back: `features` of the points in `range` from the starts of `rows`, `stride`
+    /// numbers apart.
     ///
     /// # Panics
     /// As [`Layout::to_rows`].

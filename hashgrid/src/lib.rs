@@ -1,8 +1,10 @@
-//! Multiresolution hash encoding (Müller, Evans, Schied, Keller: *Instant Neural Graphics Primitives with a
-//! Multiresolution Hash Encoding*, 2022) in 2, 3 or 4 dimensions, with its backward passes written by hand.
+//! Multiresolution hash encoding (Müller, Evans, Schied, Keller: *Instant Neural Graphics
+//! Primitives with a Multiresolution Hash Encoding*, 2022) in 2, 3 or 4 dimensions, with its
+//! backward passes written by hand.
 //!
-//! A point of the unit cube is looked up in L grids of growing resolution; every grid corner owns F learnable
-//! numbers, which are interpolated d-linearly. Grids too fine for their share of the table index it by a hash.
+//! A point of the unit cube is looked up in L grids of growing resolution; every grid corner owns F
+//! learnable numbers, which are interpolated d-linearly. Grids too fine for their share of the
+//! table index it by a hash.
 //!
 //! ```
 //! use hashgrid::{HashGrid, HashGridConfig};
@@ -23,14 +25,16 @@
 //!
 //! # Conventions
 //!
-//! * Level l has N_l cells an axis; p = x · N_l, cell c = min(⌊p⌋, N_l − 1), corners c and c + 1, so x = 1 is
-//!   inside the last cell.
-//! * Where (N_l + 1)^D corners fit the 2^T rows, corner c has row Σ_j c_j (N_l + 1)^j (*dense*); else
-//!   (⊕_j c_j · π_j) mod 2^T in wrapping `u32`, π = 1, 2654435761, 805459861, 3674653429 (*hashed*).
+//! * Level l has N_l cells an axis; p = x · N_l, cell c = min(⌊p⌋, N_l − 1), corners c and c + 1,
+//!   so x = 1 is inside the last cell.
+//! * Where (N_l + 1)^D corners fit the 2^T rows, corner c has row Σ_j c_j (N_l + 1)^j (*dense*);
+//!   else (⊕_j c_j · π_j) mod 2^T in wrapping `u32`, π = 1, 2654435761, 805459861, 3674653429
+//!   (*hashed*).
 //! * Coordinates are clamped to \[0, 1\]; NaN counts as 0. Neither gets a gradient.
-//! * The table is one flat slice owned by the caller, level after level, a dense level holding only the rows it
-//!   has: [`HashGrid::level_range`] says where. Features are (L, Q, F), a level's features of all points after each other;
-//!   [`Layout`] copies them to rows of a point each, and back.
+//! * The table is one flat slice owned by the caller, level after level, a dense level holding only
+//!   the rows it has: [`HashGrid::level_range`] says where. Features are (L, Q, F), a level's
+//!   features of all points after each other; [`Layout`] copies them to rows of a point each, and
+//!   back.
 //! * Results do not depend on the number of threads, bit for bit.
 
 mod backward;
@@ -42,6 +46,11 @@ mod grid;
 mod jacobian;
 mod layout;
 mod simd;
+
+/// The README's examples, compiled as tests.
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+struct Readme;
 
 pub use config::{Error, HashGridConfig, MAX_LOG2_TABLE_SIZE, MAX_PARAMETERS, MAX_RESOLUTION};
 pub use grid::HashGrid;

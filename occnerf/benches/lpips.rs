@@ -1,5 +1,6 @@
-//! The perceptual term of a training step: six patches of 32 × 32, features of prediction and target and the gradient by
-//! the prediction. VGG16 and the others with random weights, two threads.
+//! The perceptual term of a training step: six patches of 32 × 32, features of prediction and
+//! target and the gradient by the prediction. VGG16 and the others with random weights, two
+//! threads.
 //!
 //! `cargo bench -p occnerf --bench lpips`: items/s are pixels of the prediction.
 #![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]

@@ -43,7 +43,7 @@ mod occnerf_demo {
     #[divan::bench(args = [Preset::Fast, Preset::Balanced])]
     fn training_step(bencher: Bencher<'_, '_>, preset: Preset) {
         let mut trainer = trainer(preset, Method::Occnerf);
-        let config = trainer.config();
+        let config = trainer.model().config();
         let rays = config.patches * (config.patch_size * config.patch_size) as usize;
         bencher.counter(ItemsCount::new(rays)).bench_local(|| trainer.step().unwrap());
     }
@@ -58,9 +58,9 @@ mod occnerf_demo {
     #[divan::bench(args = [Preset::Fast, Preset::Balanced])]
     fn rendered_frame(bencher: Bencher<'_, '_>, preset: Preset) {
         let trainer = trainer(preset, Method::Occnerf);
-        let mut renderer = FieldRenderer::new(&trainer).unwrap();
+        let mut renderer = FieldRenderer::new(trainer.model()).unwrap();
         let frame = &scene().eval[0];
-        let pixels = (frame.camera.width * frame.camera.height) as usize;
-        bencher.counter(ItemsCount::new(pixels)).bench_local(|| renderer.render(frame, Vec3::ZERO).unwrap());
+        let pixels = (frame.view.camera.width * frame.view.camera.height) as usize;
+        bencher.counter(ItemsCount::new(pixels)).bench_local(|| renderer.render(&frame.view, Vec3::ZERO).unwrap());
     }
 }

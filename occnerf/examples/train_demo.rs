@@ -1,5 +1,7 @@
-//! Trains a person for a hundred steps on a small demo capture and draws them from a side that no training frame
-//! shows: on the left the truth, on the right the model. Usage: `train_demo [OUT.png]`.
+//! Trains a person for a hundred steps on a small demo capture and draws them from a side that no
+//! training frame shows: on the left the truth, on the right the model.
+//!
+//! Usage: `train_demo [OUT.png]`.
 
 use std::error::Error;
 use std::path::PathBuf;
@@ -20,7 +22,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     config.steps = STEPS;
     let scene = Scene::new(&capture, &body, &config)?;
     let mut trainer = Trainer::new(&scene, config)?;
-    println!("{} parameters, {} frames", trainer.num_parameters(), scene.train.len());
+    println!("{} parameters, {} frames", trainer.model().num_parameters(), scene.train.len());
     for _ in 0..STEPS {
         let report = trainer.step()?;
         if report.step % 20 == 0 {
@@ -29,12 +31,12 @@ fn main() -> Result<(), Box<dyn Error>> {
     }
 
     let view = &scene.eval[0];
-    let mut renderer = FieldRenderer::new(&trainer)?;
+    let mut renderer = FieldRenderer::new(trainer.model())?;
     let scores = evaluate(&scene, &mut renderer, &[view], |_, _| {})?;
     if let Some(psnr) = scores.psnr_mask {
         println!("{} {}: {psnr:.1} dB over the subject", view.camera_name, view.name);
     }
-    let rendering = renderer.render(view, Vec3::splat(GREY))?;
+    let rendering = renderer.render(&view.view, Vec3::splat(GREY))?;
     side_by_side(&truth(view)?, &rendering.image).save_png(&out)?;
     println!("{}", out.display());
     Ok(())
@@ -45,7 +47,7 @@ fn truth(frame: &PreparedFrame) -> Result<Image, occnerf::Error> {
     let shown = frame.pixels()?;
     let each = shown.image.pixels.chunks_exact(3).zip(&shown.mask);
     let pixels = each.flat_map(|(p, m)| p.iter().map(move |c| c + (1.0 - m) * GREY)).collect();
-    Ok(Image { width: frame.camera.width, height: frame.camera.height, pixels })
+    Ok(Image { width: frame.view.camera.width, height: frame.view.camera.height, pixels })
 }
 
 fn side_by_side(left: &Image, right: &Image) -> Image {

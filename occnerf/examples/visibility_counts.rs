@@ -1,7 +1,8 @@
-//! The paper's running counts against exact visibility on a real training: trains for some steps, then compares how often
-//! each vertex was near a termination point with the number of training frames that show it, by ray casting. Prints
-//! Spearman's rank correlation of the two as training goes on and draws the body in both orders, red the least seen vertex and
-//! green the most: exact from four sides above, counted below.
+//! The paper's running counts against exact visibility on a real training: trains for some steps,
+//! then compares how often each vertex was near a termination point with the number of training
+//! frames that show it, by ray casting. Prints Spearman's rank correlation of the two as training
+//! goes on and draws the body in both orders, red the least seen vertex and green the most: exact
+//! from four sides above, counted below.
 //!
 //! Usage: `visibility_counts [OUT.png] [STEPS] [CAPTURE BODY]`; without a capture a small demo.
 
@@ -10,8 +11,8 @@ use std::path::Path;
 
 use glam::{Affine3A, Mat3, Vec3};
 use occnerf::capture::{DemoConfig, Image, LoadOptions, demo, load_capture};
-use occnerf::{Config, Method, Preset, PriorRenderer, Renderer, Scene, Trainer, VertexColors, view_of};
-use smpl::{BodyModel, Placement};
+use occnerf::{Config, Method, PosedView, Preset, PriorRenderer, Renderer, Scene, Trainer, VertexColors};
+use smpl::BodyModel;
 use testkit::statistics::{ranks, spearman};
 use volrender::Camera;
 
@@ -37,7 +38,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     for step in 1..=steps {
         trainer.step()?;
         if step == steps || (step % 50 == 0 && (step / 50).is_power_of_two()) {
-            let counts = trainer.visibility_counts();
+            let counts = trainer.model().visibility_counts();
             let never = counts.iter().zip(&exact).filter(|(c, e)| **c > 0 && **e == 0).count();
             let missed = counts.iter().zip(&exact).filter(|(c, e)| **c == 0 && **e > 0).count();
             let agreement = spearman(&exact, counts);
@@ -46,8 +47,10 @@ fn main() -> Result<(), Box<dyn Error>> {
             );
         }
     }
-    let rows: Result<Vec<Image>, Box<dyn Error>> =
-        [&exact[..], trainer.visibility_counts()].into_iter().map(|counts| turnaround(&scene, counts)).collect();
+    let rows: Result<Vec<Image>, Box<dyn Error>> = [&exact[..], trainer.model().visibility_counts()]
+        .into_iter()
+        .map(|counts| turnaround(&scene, counts))
+        .collect();
     let rows = rows?;
     let pixels = rows.iter().flat_map(|row| row.pixels.iter().copied()).collect();
     Image { width: 4 * SIZE, height: 2 * SIZE, pixels }.save_png(Path::new(out))?;
@@ -61,9 +64,8 @@ fn turnaround(scene: &Scene, counts: &[u64]) -> Result<Image, Box<dyn Error>> {
     let colour = |share: f32| Vec3::new((2.0 - 2.0 * share).min(1.0), (1.7 * share).min(0.85), 0.15);
     let colors = ranks(counts).into_iter().map(|r| colour(share(r))).collect();
     let colors = VertexColors { colors, seen: vec![true; counts.len()] };
-    let mut renderer = PriorRenderer::new(scene, &colors);
-    let pose = vec![Vec3::ZERO; scene.model.num_joints()];
-    let body = scene.pose(&scene.mean_betas, &pose, Placement::default());
+    let mut renderer = PriorRenderer::new(&scene.body, &colors);
+    let body = scene.body.rest();
     let middle = body.joints.iter().sum::<Vec3>() / body.joints.len() as f32;
     let (focal, centre) = (SIZE as f32 * 1.15, SIZE as f32 / 2.0);
     let intrinsics = Mat3::from_cols(Vec3::X * focal, Vec3::Y * focal, Vec3::new(centre, centre, 1.0));
@@ -76,7 +78,7 @@ fn turnaround(scene: &Scene, counts: &[u64]) -> Result<Image, Box<dyn Error>> {
         let rotation = Mat3::from_cols(right, forward.cross(right), forward).transpose();
         let extrinsics = Affine3A::from_mat3_translation(rotation, rotation * -eye);
         let camera = Camera::new(intrinsics, extrinsics, SIZE, SIZE)?;
-        let picture = renderer.render(&view_of(scene, &camera, body.clone()), Vec3::ONE)?.image.pixels;
+        let picture = renderer.render(&PosedView::new(&camera, body.clone()), Vec3::ONE)?.image.pixels;
         for (y, row) in picture.chunks_exact(3 * SIZE as usize).enumerate() {
             pixels[3 * SIZE as usize * (4 * y + usize::from(side))..][..row.len()].copy_from_slice(row);
         }

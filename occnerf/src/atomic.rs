@@ -1,4 +1,5 @@
-//! Files that are whole at every moment: replaced in one go, and on the disk before the old one is gone.
+//! Files that are whole at every moment: replaced in one go, and on the disk before the old one is
+//! gone.
 
 use std::ffi::OsString;
 use std::fs::File;
@@ -7,9 +8,10 @@ use std::path::{Path, PathBuf};
 
 /// Replaces the file at `path` by what `write` writes.
 ///
-/// Whoever reads `path`, at any moment and after a power cut, finds the old content or the new one, whole. The new
-/// content stands in `path` with `.partial` behind it until it is complete and on the disk; one process at a time may
-/// write a path. Where anything fails the old file stays as it was, and the partial one is removed.
+/// Whoever reads `path`, at any moment and after a power cut, finds the old content or the new one,
+/// whole. The new content stands in `path` with `.partial` behind it until it is complete and on
+/// the disk; one process at a time may write a path. Where anything fails the old file stays as it
+/// was, and the partial one is removed.
 ///
 /// # Errors
 /// Those of the system, and of `write`.
@@ -25,8 +27,8 @@ pub fn replace_file(path: &Path, write: impl FnOnce(&mut BufWriter<File>) -> Res
         let _ = std::fs::remove_file(&partial);
         return written;
     }
-    // The new name is an entry of the directory. Not every file system can be asked to keep one: the file is whole
-    // either way.
+    // The new name is an entry of the directory. Not every file system can be asked to keep one:
+    // the file is whole either way.
     let parent = path.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or(Path::new("."));
     let _ = File::open(parent).and_then(|directory| directory.sync_all());
     Ok(())

@@ -1,4 +1,4 @@
-//! What can go wrong outside the caller's control.
+//! Errors: what can go wrong outside the caller's control.
 
 use std::path::PathBuf;
 
@@ -8,13 +8,13 @@ use crate::config::ConfigError;
 /// Any failure of preparing, training, saving or evaluating.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// A value of the configuration.
+    /// A value of the configuration that cannot be.
     #[error(transparent)]
     Config(#[from] ConfigError),
-    /// A capture.
+    /// A capture that cannot be read.
     #[error(transparent)]
     Data(#[from] CaptureError),
-    /// The body model.
+    /// A body model that cannot be read.
     #[error(transparent)]
     Body(#[from] smpl::Error),
     /// The canonical or a posed mesh, as a set of points.
@@ -32,6 +32,9 @@ pub enum Error {
     /// Pictures or weights that LPIPS cannot take.
     #[error("LPIPS: {0}")]
     Lpips(String),
+    /// An avatar that cannot be made, or not in the form that is asked for.
+    #[error("{0}")]
+    Bake(String),
     /// A training whose numbers have grown beyond all bounds.
     #[error(
         "training has diverged: after step {step} `{key}` holds {value}; smaller learning rates (`rates`) would do"
@@ -47,15 +50,15 @@ pub enum Error {
     /// A file that cannot be read or written.
     #[error("{}: {source}", path.display())]
     Io {
-        /// Which file.
+        /// Path of the file.
         path: PathBuf,
-        /// Why not.
+        /// The system's reason.
         source: std::io::Error,
     },
     /// A file that does not hold what it should.
     #[error("{}: {what}", path.display())]
     File {
-        /// Which file.
+        /// Path of the file.
         path: PathBuf,
         /// Key, expected and actual.
         what: String,

@@ -17,61 +17,64 @@ use crate::scene::prepared::{PreparedFrame, Scene};
 
 /// Opacity above which the paper counts a pixel as rendered.
 const VISIBLE: f32 = 0.001;
-/// Fewer hidden pixels than this in a frame give no figure for it: one pixel would weigh as much as a whole side.
+/// Fewer hidden pixels than this in a frame give no figure for it: one pixel would weigh as much as
+/// a whole side.
 const MIN_HIDDEN_PIXELS: usize = 16;
 
 /// Scores of one picture; `None` where the set of pixels is empty.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct FrameMetrics {
-    /// Of the frame.
+    /// Name of the frame.
     pub name: String,
-    /// Of the camera.
+    /// Name of the camera.
     pub camera: String,
-    /// Over pixels whose predicted opacity is above 0.001, the paper's definition.
+    /// PSNR (dB) over pixels whose predicted opacity is above 0.001, the paper's definition.
     pub psnr_vis: Option<f64>,
-    /// The same pixels.
+    /// SSIM over the pixels of `psnr_vis`.
     pub ssim_vis: Option<f64>,
-    /// Over the true subject's pixels.
+    /// PSNR (dB) over the true subject's pixels.
     pub psnr_mask: Option<f64>,
-    /// The same pixels.
+    /// SSIM over the pixels of `psnr_mask`.
     pub ssim_mask: Option<f64>,
-    /// Over the subject's pixels on the quartile of vertices that the training video showed least.
+    /// PSNR (dB) over the subject's pixels on the quartile of vertices that the training video
+    /// showed least.
     pub psnr_hidden: Option<f64>,
-    /// The whole image. Like the others above it is `null` in JSON where there is no error at all.
+    /// PSNR (dB) over the whole image. Like those above it is `null` in JSON where there is no
+    /// error.
     pub psnr_full: Option<f64>,
-    /// The whole image.
+    /// SSIM over the whole image.
     pub ssim_full: Option<f64>,
     /// LPIPS over the whole image; not measured without weights.
     #[serde(default)]
     pub lpips_full: Option<f64>,
-    /// Opacity above one half against the true mask.
+    /// Intersection over union of the pixels with opacity above one half and the true mask.
     pub mask_iou: f64,
 }
 
-/// Means over the pictures of a split.
+/// Means over the pictures of a split, of those pictures that have the score.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct SplitMetrics {
-    /// Mean of the frames that have it, as all below.
+    /// Mean of [`FrameMetrics::psnr_vis`].
     pub psnr_vis: Option<f64>,
-    /// Mean.
+    /// Mean of [`FrameMetrics::ssim_vis`].
     pub ssim_vis: Option<f64>,
-    /// Mean.
+    /// Mean of [`FrameMetrics::psnr_mask`].
     pub psnr_mask: Option<f64>,
-    /// Mean.
+    /// Mean of [`FrameMetrics::ssim_mask`].
     pub ssim_mask: Option<f64>,
-    /// Mean.
+    /// Mean of [`FrameMetrics::psnr_hidden`].
     pub psnr_hidden: Option<f64>,
-    /// Mean.
+    /// Mean of [`FrameMetrics::psnr_full`].
     pub psnr_full: Option<f64>,
-    /// Mean.
+    /// Mean of [`FrameMetrics::ssim_full`].
     pub ssim_full: Option<f64>,
-    /// Not measured without weights.
+    /// Mean of [`FrameMetrics::lpips_full`]; not measured without weights.
     pub lpips_full: Option<f64>,
-    /// Mean.
+    /// Mean of [`FrameMetrics::mask_iou`].
     pub mask_iou: Option<f64>,
-    /// Wall clock.
+    /// Seconds of wall clock to draw a picture.
     pub render_seconds_per_frame: f64,
-    /// Each picture.
+    /// Scores of each picture.
     pub frames: Vec<FrameMetrics>,
 }
 
@@ -95,7 +98,7 @@ pub fn evaluate(
     evaluate_with(scene, renderer, frames, None, progress)
 }
 
-/// [`evaluate`], with LPIPS over the whole image where `lpips` is given.
+/// Does what [`evaluate`] does, with LPIPS over the whole image where `lpips` is given.
 pub fn evaluate_with(
     scene: &Scene,
     renderer: &mut dyn Renderer,

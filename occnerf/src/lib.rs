@@ -1,14 +1,14 @@
 //! Rendering humans from object-occluded monocular videos (OccNeRF, ICCV 2023), on a CPU.
 //!
-//! A video of a moving person, partly hidden behind objects, with a body model fitted to each frame, becomes a field
-//! of density and colour in the body's rest pose that renders from any side.
+//! A video of a moving person, partly hidden behind objects, with a body model fitted to each
+//! frame, becomes a field of density and colour in the body's rest pose that renders from any side.
 //!
 //! ```
 //! use occnerf::{Config, Method, Preset, Scene, Trainer, capture};
 //!
 //! # fn main() -> Result<(), Box<dyn std::error::Error>> {
 //! let body = smpl::BodyModel::embedded();
-//! let demo = capture::DemoConfig { size: 48, frames: 4, eval_cameras: 1, ..capture::DemoConfig::default() };
+//! let demo = capture::DemoConfig { size: 48, frames: 4, eval_cameras: 1, ..Default::default() };
 //! let capture = capture::demo(&demo, &body)?;
 //! let mut config = Config::preset(Preset::Fast, Method::Occnerf);
 //! config.steps = 2;
@@ -21,9 +21,10 @@
 //! ```
 //!
 //! # Conventions
-//! Right-handed, OpenCV cameras, pixel centres at integer + 0.5, sRGB in [0, 1]. Inside, lengths are divided by the
-//! canonical body's height / 1.7 m, so that a capture in centimetres trains the same. The same seed and inputs give
-//! the same bits on one instruction set, whatever the number of threads, and so does resuming from a checkpoint.
+//! Right-handed, OpenCV cameras, pixel centres at integer + 0.5, sRGB in [0, 1]. Inside, lengths
+//! are divided by the canonical body's height / 1.7 m, so that a capture in centimetres trains the
+//! same. The same seed and inputs give the same bits on one instruction set, whatever the number of
+//! threads, and so does resuming from a checkpoint.
 
 mod atomic;
 pub mod bake;

@@ -1,4 +1,5 @@
-//! Counter-based random numbers: a value depends on its address (seed, step, ray, …) alone, never on who asks first.
+//! Counter-based random numbers: a value depends on its address (seed, step, ray, …) alone, never
+//! on who asks first.
 
 /// SplitMix64's finaliser (Steele, Lea and Flood 2014).
 fn mix(mut x: u64) -> u64 {

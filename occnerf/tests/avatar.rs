@@ -34,22 +34,24 @@ fn an_avatar_moves_as_the_prior_that_it_came_from() {
     let scene = scene();
     let avatar = avatar(&scene);
     avatar.validate().unwrap();
-    let world = upright(scene.up()) * (1.0 / scene.scale);
+    let body = &scene.body;
+    let up = occnerf::upright(body, scene.train.iter().map(|frame| &*frame.view));
+    let world = upright(up) * (1.0 / body.scale);
     let motion = &avatar.clips[0].motion;
     for (t, frame) in scene.train.iter().enumerate() {
         let pose = &motion.poses[t * motion.num_joints..][..motion.num_joints];
         let bones = avatar.bones(pose, motion.trans[t]);
         let moved = avatar.skin_with_blend_shapes(&bones, pose);
-        let expected = scene.model.faces.iter().flatten().map(|&v| world * frame.posed.vertices[v as usize]);
+        let expected = body.model.faces.iter().flatten().map(|&v| world * frame.view.posed.vertices[v as usize]);
         let worst = moved.iter().zip(expected).map(|(a, b)| a.distance(b)).fold(0.0, f32::max);
         // The betas of the demo's frames are the mean ones; four weights a vertex of at most four.
         assert!(worst < 2e-4, "frame {t}: {worst} m");
         // The camera sees a vertex where the capture's camera saw it.
         let (here, there) =
-            (avatar.cameras[t].project(moved[0]), frame.posed.vertices[scene.model.faces[0][0] as usize]);
-        let (here, there) = (here.unwrap(), frame.camera.project(there).unwrap());
+            (avatar.cameras[t].project(moved[0]), frame.view.posed.vertices[body.model.faces[0][0] as usize]);
+        let (here, there) = (here.unwrap(), frame.view.camera.project(there).unwrap());
         assert!((here - there).truncate().length() < 0.05, "{here} {there}");
-        assert!((here.z * scene.scale - there.z).abs() < 1e-3);
+        assert!((here.z * body.scale - there.z).abs() < 1e-3);
         // At a frame's own second the clip is that frame.
         let seconds = t as f32 / motion.fps;
         let again = avatar.skin(&avatar.bones_at(0, seconds));

@@ -137,9 +137,9 @@ fn trained() -> Trainer<'static> {
 }
 
 fn pictures(trainer: &Trainer<'_>) -> Vec<f32> {
-    let mut renderer = FieldRenderer::new(trainer).unwrap();
+    let mut renderer = FieldRenderer::new(trainer.model()).unwrap();
     let frames = scene().eval.iter().chain(&scene().train);
-    frames.flat_map(|frame| renderer.render(frame, Vec3::ONE).unwrap().image.pixels).collect()
+    frames.flat_map(|frame| renderer.render(&frame.view, Vec3::ONE).unwrap().image.pixels).collect()
 }
 
 #[test]
@@ -148,11 +148,11 @@ fn a_pruned_model_draws_the_same_pictures_with_fewer_parameters_also_from_its_fi
     let (whole_file, file) = (dir.path("whole.safetensors"), dir.path("pruned.safetensors"));
     let mut trainer = trained();
     trainer.save(&whole_file).unwrap();
-    let (whole, before) = (trainer.num_parameters(), pictures(&trainer));
+    let (whole, before) = (trainer.model().num_parameters(), pictures(&trainer));
     let pruned = trainer.prune();
     assert!(pruned.dropped > pruned.rows / 2 && pruned.dropped < pruned.rows, "{pruned:?}");
-    assert_eq!(pruned.parameters as usize, trainer.num_parameters());
-    assert_eq!(whole - trainer.num_parameters(), 2 * pruned.dropped as usize);
+    assert_eq!(pruned.parameters as usize, trainer.model().num_parameters());
+    assert_eq!(whole - trainer.model().num_parameters(), 2 * pruned.dropped as usize);
     let after = pictures(&trainer);
     let worst = before.iter().zip(&after).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
     // An emptied feature was at most 1e-4; the field's slope is of the order of 1.
@@ -163,20 +163,20 @@ fn a_pruned_model_draws_the_same_pictures_with_fewer_parameters_also_from_its_fi
     let [large, small] = [&whole_file, &file].map(|path| std::fs::metadata(path).unwrap().len());
     assert!(small < large / 2, "{small} of {large} bytes");
     let mut resumed = Trainer::resume(scene(), &file).unwrap();
-    assert_eq!((resumed.num_parameters(), pictures(&resumed)), (trainer.num_parameters(), after));
+    assert_eq!((resumed.model().num_parameters(), pictures(&resumed)), (trainer.model().num_parameters(), after));
     let again = dir.path("again.safetensors");
     resumed.save(&again).unwrap();
     assert!(std::fs::read(&again).unwrap() == std::fs::read(&file).unwrap());
     // Training on, all rows can be learnt again, and both go the same way.
     assert_eq!(resumed.step().unwrap().loss.to_bits(), trainer.step().unwrap().loss.to_bits());
-    assert_eq!(resumed.num_parameters(), whole);
+    assert_eq!(resumed.model().num_parameters(), whole);
 }
 
 #[test]
 fn methods_without_a_table_have_nothing_to_prune() {
     let mut trainer = Trainer::new(scene(), config(Method::Humannerf)).unwrap();
     trainer.step().unwrap();
-    let whole = trainer.num_parameters();
+    let whole = trainer.model().num_parameters();
     let pruned = trainer.prune();
     assert_eq!((pruned.rows, pruned.dropped, pruned.parameters as usize), (0, 0, whole));
 }

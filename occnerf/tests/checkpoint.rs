@@ -62,7 +62,7 @@ fn a_good_checkpoint_is_accepted_and_saved_again_byte_for_byte() {
     let bytes = good(&dir);
     let path = dir.path("copy.safetensors");
     let trainer = resume(scene(), &path, &bytes).unwrap();
-    assert_eq!((trainer.steps_done(), trainer.config()), (2, &config(Method::Occnerf)));
+    assert_eq!((trainer.steps_done(), trainer.model().config()), (2, &config(Method::Occnerf)));
     assert_eq!(checkpoint_config(&path).unwrap(), config(Method::Occnerf));
     trainer.save(&path).unwrap();
     assert!(std::fs::read(&path).unwrap() == bytes);

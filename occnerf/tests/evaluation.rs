@@ -7,21 +7,24 @@ use common::{SIZE, body, capture, config, scene};
 use glam::Vec3;
 use occnerf::capture::Image;
 use occnerf::{
-    Error, Label, Method, PreparedFrame, Renderer, Rendering, Scene, SplitMetrics, evaluate, least_seen_quartile,
+    Error, Label, Method, PosedView, PreparedFrame, Renderer, Rendering, Scene, SplitMetrics, evaluate,
+    least_seen_quartile,
 };
 
-/// Returns the truth after `change` has been at the pixels and opacities of (frame, index).
+/// Returns the truth of the frame with a view after `change` has been at the pixels and opacities of
+/// (frame, index).
 struct Truth<F: Fn(&PreparedFrame, usize, &mut [f32], &mut f32) + Sync>(F);
 
 impl<F: Fn(&PreparedFrame, usize, &mut [f32], &mut f32) + Sync> Renderer for Truth<F> {
-    fn render(&mut self, frame: &PreparedFrame, background: Vec3) -> Result<Rendering, Error> {
+    fn render(&mut self, view: &PosedView, background: Vec3) -> Result<Rendering, Error> {
+        let frame = scene().eval.iter().chain(&scene().train).find(|frame| std::ptr::eq(&*frame.view, view)).unwrap();
         assert_eq!(background, Vec3::ZERO, "pictures are compared on black");
         let truth = frame.pixels()?;
         let (mut pixels, mut opacity) = (truth.image.pixels.clone(), truth.mask.clone());
         for (i, (pixel, opacity)) in pixels.chunks_exact_mut(3).zip(&mut opacity).enumerate() {
             self.0(frame, i, pixel, opacity);
         }
-        let image = Image { width: frame.camera.width, height: frame.camera.height, pixels };
+        let image = Image { width: frame.view.camera.width, height: frame.view.camera.height, pixels };
         Ok(Rendering { image, opacity })
     }
 }
@@ -143,12 +146,12 @@ fn hidden_pixels_are_those_of_the_least_seen_quarter() {
     assert!(bound(true).max() <= bound(false).min());
     // An error on all of the subject but its never-seen side leaves the hidden pixels perfect.
     let view = &scene().eval[1];
-    let mesh = visibility::RayMesh::new(&view.posed.vertices, &scene().model.faces).unwrap();
+    let mesh = visibility::RayMesh::new(&view.view.posed.vertices, &scene().body.model.faces).unwrap();
     let split = scores(std::slice::from_ref(view), |frame, i, pixel, _| {
         let (column, row) = ((i % SIZE as usize) as f32, (i / SIZE as usize) as f32);
-        let ray = frame.camera.ray(column + 0.5, row + 0.5);
+        let ray = frame.view.camera.ray(column + 0.5, row + 0.5);
         let hidden = mesh.first_hit(ray.origin, ray.direction).is_some_and(|hit| {
-            let corners = scene().model.faces[hit.face as usize];
+            let corners = scene().body.model.faces[hit.face as usize];
             let largest = (0..3).rev().max_by(|&a, &b| hit.barycentric[a].total_cmp(&hit.barycentric[b]));
             least[corners[largest.unwrap()] as usize]
         });
@@ -178,7 +181,7 @@ fn no_frames_give_no_scores_and_progress_hears_of_every_frame() {
 struct Broken;
 
 impl Renderer for Broken {
-    fn render(&mut self, _: &PreparedFrame, _: Vec3) -> Result<Rendering, Error> {
+    fn render(&mut self, _: &PosedView, _: Vec3) -> Result<Rendering, Error> {
         Err(Error::Scene("the paint has run out".to_owned()))
     }
 }

@@ -6,7 +6,7 @@ mod common;
 use common::{SIZE, body, capture, config, scene};
 use glam::{Affine3A, Mat3, Vec3};
 use occnerf::capture::{Frame, Pixels};
-use occnerf::{FieldRenderer, Label, Method, PriorRenderer, Renderer, Scene, Trainer, VertexColors, view_of};
+use occnerf::{FieldRenderer, Label, Method, PosedView, PriorRenderer, Renderer, Scene, Trainer, VertexColors};
 use volrender::Camera;
 
 /// The person wholly hidden, behind the camera, far beside the picture, and around the camera.
@@ -76,13 +76,12 @@ fn a_capture_that_is_nearly_all_unknown_still_trains() {
 fn pictures_from_anywhere_are_finite_and_empty_where_nobody_is() {
     let trainer = Trainer::new(scene(), config(Method::Occnerf)).unwrap();
     let colors = VertexColors::measure(scene()).unwrap();
-    let posed = || scene().pose(&[0.0], &[Vec3::ZERO; 2], smpl::Placement::default());
     let background = Vec3::new(0.2, 0.4, 0.6);
     for kind in ["behind", "beside", "around"] {
-        let view = view_of(scene(), &odd(kind).camera, posed());
+        let view = PosedView::new(&odd(kind).camera, scene().body.rest());
         let pictures = [
-            FieldRenderer::new(&trainer).unwrap().render(&view, background).unwrap(),
-            PriorRenderer::new(scene(), &colors).render(&view, background).unwrap(),
+            FieldRenderer::new(trainer.model()).unwrap().render(&view, background).unwrap(),
+            PriorRenderer::new(&scene().body, &colors).render(&view, background).unwrap(),
         ];
         for picture in pictures {
             assert!(picture.image.pixels.iter().all(|p| (0.0..=1.0).contains(p)), "{kind}");
@@ -104,9 +103,8 @@ fn pictures_of_a_single_pixel_and_long_thin_ones_are_drawn() {
         let intrinsics = Mat3::from_cols(Vec3::X * focal, Vec3::Y * focal, centre);
         let extrinsics = Affine3A::from_mat3_translation(Mat3::from_cols(Vec3::X, -Vec3::Y, -Vec3::Z), Vec3::Z * 3.0);
         let camera = Camera::new(intrinsics, extrinsics, width, height).unwrap();
-        let posed = scene().pose(&[0.0], &[Vec3::ZERO; 2], smpl::Placement::default());
-        let view = view_of(scene(), &camera, posed);
-        let picture = FieldRenderer::new(&trainer).unwrap().render(&view, Vec3::ZERO).unwrap();
+        let view = PosedView::new(&camera, scene().body.rest());
+        let picture = FieldRenderer::new(trainer.model()).unwrap().render(&view, Vec3::ZERO).unwrap();
         assert_eq!(picture.opacity.len(), (width * height) as usize);
         // The middle of the picture is the middle of the person.
         let middle = (height / 2 * width + width / 2) as usize;

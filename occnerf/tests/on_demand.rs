@@ -15,7 +15,7 @@ const STEPS: u64 = 8;
 fn read(dir: &TempDir, body: &BodyModel, pictures: u64) -> Capture {
     let bodies = 8 * body.num_vertices() as u64 * 36;
     let picture = u64::from(SIZE * SIZE) * 16;
-    let max_bytes = bodies + 4 * picture.div_ceil(42) + pictures * picture;
+    let max_bytes = bodies + 4 * picture.div_ceil(42) + (pictures + 3) * picture;
     load_capture(&dir.path("capture"), body, &LoadOptions { max_bytes, ..LoadOptions::default() }).unwrap()
 }
 
@@ -23,7 +23,7 @@ fn read(dir: &TempDir, body: &BodyModel, pictures: u64) -> Capture {
 fn trained(dir: &TempDir, trainer: &Trainer<'_>, scene: &Scene) -> (Vec<u8>, Option<f64>) {
     trainer.save(&dir.path("checkpoint")).unwrap();
     let frames: Vec<_> = scene.eval.iter().collect();
-    let scores = evaluate(scene, &mut FieldRenderer::new(trainer).unwrap(), &frames, |_, _| {}).unwrap();
+    let scores = evaluate(scene, &mut FieldRenderer::new(trainer.model()).unwrap(), &frames, |_, _| {}).unwrap();
     (std::fs::read(dir.path("checkpoint")).unwrap(), scores.psnr_mask)
 }
 

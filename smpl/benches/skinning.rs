@@ -1,13 +1,14 @@
-//! Skinning, motion fields and construction. The shared SMPL-sized body (6890 vertices, 207 sparse pose terms) is used
-//! where it is there, else the embedded one; `dense` fills every pose term, as in SMPL itself.
+//! Skinning, motion fields and construction. The shared SMPL-sized body (6890 vertices, 207 sparse
+//! pose terms) is used where it is there, else the embedded one; `dense` fills every pose term, as
+//! in SMPL itself.
 
 use std::path::Path;
 
 use divan::counter::ItemsCount;
 use divan::{Bencher, black_box};
-use glam::Vec3;
+use glam::{Mat3, Vec3};
 use rayon::prelude::*;
-use smpl::{BodyModel, Placement, Shaped, SparseRows, SurfaceMotion, WeightVolume, WeightVolumeConfig};
+use smpl::{BodyModel, Placement, Shaped, SparseRows, SurfaceMotion, WeightVolume, WeightVolumeConfig, rodrigues};
 
 fn main() {
     divan::main();
@@ -50,6 +51,32 @@ mod one_frame {
     #[divan::bench]
     fn dense(bencher: Bencher<'_, '_>) {
         run(bencher, &super::dense());
+    }
+
+    /// The vertices of `dense` from the definition, the bones given: every term and every weight of
+    /// each vertex.
+    #[divan::bench]
+    fn dense_plain(bencher: Bencher<'_, '_>) {
+        let (body, pose) = (super::dense(), pose(0));
+        let bones = body.pose(&body.shaped(&BETAS), &pose, Placement::default()).bones;
+        let turns = pose[1..].iter().map(|&r| rodrigues(r) - Mat3::IDENTITY);
+        let terms: Vec<f32> = turns.flat_map(|r| r.transpose().to_cols_array()).collect();
+        let n = body.num_vertices();
+        let mut weights = vec![0.0; n * bones.len()];
+        for (v, weights) in weights.chunks_exact_mut(bones.len()).enumerate() {
+            body.weights.row(v).for_each(|(joint, w)| weights[joint] = w);
+        }
+        let posedirs: Vec<Vec3> = body.posedirs.values.clone();
+        bencher.bench(|| {
+            let vertex = |v: usize| {
+                let shape = BETAS.iter().zip(body.shapedirs.chunks_exact(n)).map(|(&beta, s)| beta * s[v]);
+                let pose = terms.iter().zip(&posedirs[terms.len() * v..]).map(|(&term, &d)| term * d);
+                let rest = body.v_template[v] + shape.sum::<Vec3>() + pose.sum::<Vec3>();
+                let weights = &weights[bones.len() * v..];
+                bones.iter().zip(weights).map(|(bone, &w)| w * bone.transform_point3(rest)).sum::<Vec3>()
+            };
+            (0..n).map(vertex).collect::<Vec<_>>()
+        });
     }
 
     /// Backward of shape and pose, all inputs; the forward is not timed.

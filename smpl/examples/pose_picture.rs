@@ -1,4 +1,5 @@
-//! Draws the embedded body at rest, walking, sitting, and in its shapes. Usage: `pose_picture [OUT.png [BODY.npz]]`.
+//! Draws the embedded body at rest, walking, sitting, and in its shapes. Usage: `pose_picture
+//! [OUT.png [BODY.npz]]`.
 
 use std::error::Error;
 use std::f32::consts::FRAC_PI_2;

@@ -90,7 +90,8 @@ impl NdArray {
         }
     }
 
-    /// Every value as `f32`, row-major, after checking the shape against `pattern` (`None`: any size).
+    /// Every value as `f32`, row-major, after checking the shape against `pattern` (`None`: any
+    /// size).
     ///
     /// `file` and `key` only name the array in errors.
     ///
@@ -110,7 +111,8 @@ impl NdArray {
         }
     }
 
-    /// Every value as `i64`, row-major, after checking the shape against `pattern` (`None`: any size).
+    /// Every value as `i64`, row-major, after checking the shape against `pattern` (`None`: any
+    /// size).
     ///
     /// # Errors
     /// [`Error::Shape`]; [`Error::Type`] for floats.
@@ -200,7 +202,7 @@ impl ElementType {
         }
     }
 
-    /// The same type in the named byte order (`<`, `>`, `|` or `=`).
+    /// This type in the named byte order (`<`, `>`, `|` or `=`).
     pub(crate) fn with_order(self, order: &str) -> Self {
         Self { big_endian: order == ">", ..self }
     }

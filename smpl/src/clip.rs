@@ -5,6 +5,7 @@ use std::path::Path;
 use glam::{Quat, Vec3};
 
 use crate::Error;
+use crate::model::MAX_COORDINATE;
 use crate::npz::Npz;
 use crate::pose::Placement;
 
@@ -29,12 +30,13 @@ pub struct MotionClip {
 }
 
 impl MotionClip {
-    /// Reads an `.npz` with `poses` (T, 3J), `trans` (T, 3) and one of `fps`, `mocap_framerate` and `mocap_frame_rate`, as
-    /// AMASS has them (156 columns for SMPL-H, 165 for SMPL-X). Other arrays are left alone. AMASS has z up.
+    /// Reads an `.npz` with `poses` (T, 3J), `trans` (T, 3) and one of `fps`, `mocap_framerate` and
+    /// `mocap_frame_rate`, as AMASS has them (156 columns for SMPL-H, 165 for SMPL-X). Other arrays
+    /// are left alone. AMASS has z up.
     ///
     /// # Errors
-    /// Any [`Error`] of arrays; [`Error::Invalid`] without frames, for a rate that is not positive, and for rotations
-    /// beyond 1000 rad.
+    /// Any [`Error`] of arrays; [`Error::Invalid`] without frames, for a rate that is not positive,
+    /// and for rotations beyond 1000 rad or translations beyond 10⁶.
     pub fn load(path: &Path) -> Result<Self, Error> {
         let mut npz = Npz::open(path)?;
         let file = npz.file().to_owned();
@@ -52,6 +54,10 @@ impl MotionClip {
         };
         let vectors = |values: Vec<f32>| values.chunks_exact(3).map(Vec3::from_slice).collect::<Vec<_>>();
         let clip = Self { poses: vectors(poses), num_joints: shape[1] / 3, trans: vectors(trans), fps };
+        if let Some(i) = clip.trans.iter().position(|t| t.abs().max_element() > MAX_COORDINATE) {
+            let message = format!("{} at frame {i}, expected at most {MAX_COORDINATE} either way", clip.trans[i]);
+            return Err(Error::invalid(&file, "trans", message));
+        }
         match clip.poses.iter().position(|r| r.length() > MAX_ANGLE) {
             Some(i) => Err(Error::invalid(&file, "poses", format!("a rotation of {} rad", clip.poses[i].length()))),
             None => Ok(clip),
@@ -64,18 +70,20 @@ impl MotionClip {
         self.trans.len()
     }
 
-    /// From the first frame to the last, in seconds.
+    /// Time from the first frame to the last, in seconds.
     #[must_use]
     pub fn duration(&self) -> f32 {
         self.num_frames().saturating_sub(1) as f32 / self.fps
     }
 
-    /// The pose at `seconds` for a body of `joints` joints, and where it stands: the root turns about the pelvis.
+    /// The pose at `seconds` for a body of `joints` joints, and where it stands: the root turns
+    /// about the pelvis.
     ///
-    /// Between frames, rotations are interpolated along the shorter great arc and translations linearly; the clip is
-    /// held before its first and after its last frame. A body with as many joints as the clip gets all of them. Otherwise the
-    /// first 22 are the body's and the same in SMPL, SMPL-H and SMPL-X; fingers go from SMPL-H (52 joints) to SMPL-X (55) and
-    /// back; every other joint (SMPL's two hands, jaw and eyes) stays at rest.
+    /// Between frames, rotations are interpolated along the shorter great arc and translations
+    /// linearly; the clip is held before its first and after its last frame. A body with as many
+    /// joints as the clip gets all of them. Otherwise the first 22 are the body's and the same in
+    /// SMPL, SMPL-H and SMPL-X; fingers go from SMPL-H (52 joints) to SMPL-X (55) and back; every
+    /// other joint (SMPL's two hands, jaw and eyes) stays at rest.
     ///
     /// # Panics
     /// If the clip has no frame, or `poses` is not T·J long.

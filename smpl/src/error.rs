@@ -1,10 +1,11 @@
-//! What can be wrong with a file.
+//! Errors of files.
 
 use std::path::PathBuf;
 
 /// A file that cannot be read or does not hold what it should.
 ///
-/// `file` is the path as given, or the name passed with bytes already in memory; `key` is the array's name.
+/// `file` is the path as given, or the name passed with bytes already in memory; `key` is the
+/// array's name.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
@@ -27,88 +28,90 @@ pub enum Error {
     /// An array that must be there is not.
     #[error("{file}: no `{key}` (it holds {})", available.join(", "))]
     MissingKey {
-        /// Which file.
+        /// The file.
         file: String,
-        /// What was looked for.
+        /// The name that was looked for.
         key: String,
-        /// What there is instead.
+        /// The names that are there instead.
         available: Vec<String>,
     },
     /// An array of another shape than its use demands.
     #[error("{file}: `{key}` has shape {actual:?}, expected {expected}")]
     Shape {
-        /// Which file.
+        /// The file.
         file: String,
-        /// Which array.
+        /// The array.
         key: String,
         /// Pattern, `_` standing for any size.
         expected: String,
-        /// What the file says.
+        /// The shape in the file.
         actual: Vec<usize>,
     },
     /// An array or object of another type than its use demands.
     #[error("{file}: `{key}` is {actual}, expected {expected}")]
     Type {
-        /// Which file.
+        /// The file.
         file: String,
-        /// Which array.
+        /// The array.
         key: String,
-        /// What would do.
+        /// The type that is expected.
         expected: &'static str,
-        /// What it is.
+        /// The type found.
         actual: String,
     },
     /// NaN, an infinity, or a value too large for `f32`.
     #[error("{file}: `{key}` is not finite at flat index {index}")]
     NotFinite {
-        /// Which file.
+        /// The file.
         file: String,
-        /// Which array.
+        /// The array.
         key: String,
         /// Position of the first such value, row-major.
         index: usize,
     },
-    /// Readable, but impossible: an index out of range, weights that do not sum to one, a tree with a cycle. Also what
-    /// cannot be read of a glTF, OBJ or safetensors file; `key` is then the part or the line.
+    /// Readable, but impossible: an index out of range, weights that do not sum to one, a tree with
+    /// a cycle. Also what cannot be read of a glTF, OBJ or safetensors file; `key` is then the part
+    /// or the line.
     #[error("{file}: `{key}`: {message}")]
     Invalid {
-        /// Which file.
+        /// The file.
         file: String,
-        /// Which array.
+        /// The array.
         key: String,
-        /// What is wrong with it.
+        /// The fault.
         message: String,
     },
-    /// More memory than the reader's limit would be needed. Raised before the memory is asked for.
+    /// The file asks for more memory than the reader's limit. Raised before the memory is
+    /// allocated.
     #[error("{file}: `{key}` claims {claimed} bytes, more than the limit of {limit}")]
     TooLarge {
-        /// Which file.
+        /// The file.
         file: String,
-        /// Which array; empty for the file as a whole.
+        /// The array; empty for the file as a whole.
         key: String,
-        /// What the header claims.
+        /// Bytes that the header claims.
         claimed: u128,
-        /// What is allowed.
+        /// Bytes that are allowed.
         limit: u64,
     },
     /// Malformed or truncated `.npy` or `.npz` structure.
     #[error("{file}: `{key}`: malformed array file: {message}")]
     Npy {
-        /// Which file.
+        /// The file.
         file: String,
-        /// Which array; empty for the archive as a whole.
+        /// The array; empty for the archive as a whole.
         key: String,
-        /// What was found.
+        /// The fault found.
         message: String,
     },
     /// Malformed, truncated or disallowed pickle.
     #[error("{file}: malformed pickle at byte {offset}: {message}")]
     Pickle {
-        /// Which file.
+        /// The file.
         file: String,
         /// Offset of the opcode at fault from the start of the file.
         offset: usize,
-        /// What was found.
+        /// The fault found.
         message: String,
     },
 }

@@ -1,8 +1,9 @@
 //! Parametric bodies in SMPL's form.
 //!
-//! Load one (or take the embedded one), shape it, pose it, skin it, and carry points of the posed world back to the
-//! canonical pose; or go backward from vertices to pose and shape. Beside them: rigged glTF characters ([`Character`]),
-//! motion capture ([`MotionClip`]) and plain meshes ([`load_mesh`]).
+//! Load one (or take the embedded one), shape it, pose it, skin it, and carry points of the posed
+//! world back to the canonical pose; or go backward from vertices to pose and shape. Beside them:
+//! rigged glTF characters ([`Character`]), motion capture ([`MotionClip`]) and plain meshes
+//! ([`load_mesh`]).
 //!
 //! ```
 //! use glam::Vec3;
@@ -17,9 +18,10 @@
 //! ```
 //!
 //! # Conventions
-//! Right-handed, y up, facing +z, the person's left at +x; angles in radians, rotations as axis-angle vectors. Lengths
-//! are in the model's unit: only the defaults of [`SurfaceMotion`] and [`WeightVolumeConfig`] assume metres. The canonical
-//! space is the rest pose of a [`Shaped`] body. Arithmetic is `f32` and independent of the number of threads.
+//! Right-handed, y up, facing +z, the person's left at +x; angles in radians, rotations as
+//! axis-angle vectors. Lengths are in the model's unit: only the defaults of [`SurfaceMotion`] and
+//! [`WeightVolumeConfig`] assume metres. The canonical space is the rest pose of a [`Shaped`] body.
+//! Arithmetic is `f32` and independent of the number of threads.
 
 mod array;
 mod character;
@@ -37,6 +39,7 @@ mod pose_backward;
 mod rotation;
 mod saved;
 mod sparse;
+pub mod torch;
 
 /// The README's example, compiled as a test.
 #[cfg(doctest)]

@@ -13,13 +13,15 @@ use crate::saved;
 use crate::sparse::SparseRows;
 
 impl BodyModel {
-    /// Reads a body in SMPL's form: an `.npz`, a `.pkl` in the style of the original release (chumpy arrays, sparse
-    /// regressor), or this crate's own `.safetensors` ([`BodyModel::save`]). The first bytes tell which; where they do
-    /// not, the extension. Nothing in a pickle is executed.
+    /// Reads a body in SMPL's form: an `.npz`, a `.pkl` in the style of the original release
+    /// (chumpy arrays, sparse regressor), or this crate's own `.safetensors` ([`BodyModel::save`]).
+    /// The first bytes tell which; where they do not, the extension. Nothing in a pickle is
+    /// executed.
     ///
-    /// An npz or pickle needs `v_template` (V,3), `f` (F,3), `weights` (V,J), `J_regressor` (J,V), `kintree_table` (2,J),
-    /// `shapedirs` (V,3,B) and `posedirs` (V,3,9(J−1)), for any J and B: SMPL (24), SMPL-H (52) and SMPL-X (55, its
-    /// expressions among the B) alike. Other arrays are left alone. Whatever stands for the root's parent will do.
+    /// An npz or pickle needs `v_template` (V,3), `f` (F,3), `weights` (V,J), `J_regressor` (J,V),
+    /// `kintree_table` (2,J), `shapedirs` (V,3,B) and `posedirs` (V,3,9(J−1)), for any J and B:
+    /// SMPL (24), SMPL-H (52) and SMPL-X (55, its expressions among the B) alike. Other arrays are
+    /// left alone. Whatever stands for the root's parent will do.
     ///
     /// # Errors
     /// Any [`Error`]; those about the content name the array.
@@ -43,8 +45,8 @@ impl BodyModel {
     }
 }
 
-/// The usual extension for what the bytes begin like: a zip archive, a pickle of protocol 2 or later, or the length and
-/// the opening brace of a safetensors header.
+/// The usual extension for what the bytes begin like: a zip archive, a pickle of protocol 2 or
+/// later, or the length and the opening brace of a safetensors header.
 fn kind(bytes: &[u8]) -> Option<&'static str> {
     match bytes {
         [b'P', b'K', 3 | 5, 4 | 6, ..] => Some("npz"),

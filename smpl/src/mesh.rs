@@ -6,7 +6,7 @@ use glam::Vec3;
 
 use crate::Error;
 use crate::character::Character;
-use crate::model::BodyModel;
+use crate::model::{BodyModel, MAX_COORDINATE};
 use crate::npz::read_file;
 
 /// A triangle mesh.
@@ -18,11 +18,11 @@ pub struct Mesh {
     pub faces: Vec<[u32; 3]>,
 }
 
-/// Reads a mesh, by its extension: Wavefront `.obj`; `.glb` and `.gltf`, every triangle mesh of the scene at rest in the
-/// world; a body model (see [`BodyModel::load`]), its template.
+/// Reads a mesh, by its extension: Wavefront `.obj`; `.glb` and `.gltf`, every triangle mesh of the
+/// scene at rest in the world; a body model (see [`BodyModel::load`]), its template.
 ///
-/// Of an OBJ file the statements `v` and `f` count; polygons become fans. Vertices keep the file's order, so that
-/// results by vertex index compare with those of other programs.
+/// Of an OBJ file the statements `v` and `f` count; polygons become fans. Vertices keep the file's
+/// order, so that results by vertex index compare with those of other programs.
 ///
 /// # Errors
 /// Any [`Error`]; those about an OBJ file name the line.
@@ -33,7 +33,7 @@ pub fn load_mesh(path: &Path) -> Result<Mesh, Error> {
         "glb" | "gltf" => {
             let character = Character::load(path)?;
             let mesh = Mesh { vertices: character.rest().vertices, faces: character.faces };
-            match mesh.vertices.iter().position(|v| !v.is_finite()) {
+            match mesh.vertices.iter().position(|v| !v.is_finite() || v.abs().max_element() > MAX_COORDINATE) {
                 Some(v) => {
                     Err(Error::NotFinite { file: path.display().to_string(), key: "vertices".to_owned(), index: 3 * v })
                 }
@@ -74,6 +74,9 @@ fn parse_obj(file: &str, bytes: &[u8]) -> Result<Mesh, Error> {
                     *value = word.parse().map_err(|_| invalid(format!("{word:?} is no number")))?;
                     if !value.is_finite() {
                         return Err(invalid(format!("{word:?} is not finite")));
+                    }
+                    if value.abs() > MAX_COORDINATE {
+                        return Err(invalid(format!("{word:?}: expected at most {MAX_COORDINATE} either way")));
                     }
                 }
                 mesh.vertices.push(position.into());

@@ -7,11 +7,13 @@ use crate::sparse::{SkinningWeights, SparseRows};
 
 /// Pose blend-shape terms a non-root joint: the entries of R − I.
 pub(crate) const TERMS_PER_JOINT: usize = 9;
+/// Largest coordinate of a body or mesh, in its own unit: a kilometre in millimetres.
+pub(crate) const MAX_COORDINATE: f32 = 1e6;
 
 /// A body in SMPL's form: V vertices, J joints, B shape and P pose blend shapes.
 ///
-/// Lengths are in the model's own unit. Everything is public so that bodies can be put together from other
-/// sources; [`BodyModel::validate`] tells whether the parts fit.
+/// Lengths are in the model's own unit. Everything is public so that bodies can be put together
+/// from other sources; [`BodyModel::validate`] tells whether the parts fit.
 #[derive(Clone, Debug, PartialEq)]
 pub struct BodyModel {
     /// Template, (V).
@@ -20,8 +22,8 @@ pub struct BodyModel {
     pub faces: Vec<[u32; 3]>,
     /// Shape blend shapes, (B·V): those of β_0 first, V each.
     pub shapedirs: Vec<Vec3>,
-    /// Pose blend shapes, (V, P): row v holds the terms that move vertex v. Term 9(j−1) + 3r + c belongs to entry
-    /// (r, c) of R(θ_j) − I. P is 9(J−1), or no row has any entry.
+    /// Pose blend shapes, (V, P): row v holds the terms that move vertex v. Term 9(j−1) + 3r + c
+    /// belongs to entry (r, c) of R(θ_j) − I. P is 9(J−1), or no row has any entry.
     pub posedirs: SparseRows<Vec3>,
     /// Skinning weights, (V, J), rows non-negative and summing to 1.
     pub weights: SkinningWeights,
@@ -59,12 +61,14 @@ impl BodyModel {
         self.shapedirs.len() / self.num_vertices().max(1)
     }
 
-    /// Applies the shape blend shapes and regresses the joints: template + B_S(β), J = regressor · that.
+    /// Applies the shape blend shapes and regresses the joints: template + B_S(β), J = regressor ·
+    /// that.
     ///
     /// Betas beyond those given are 0.
     ///
     /// # Panics
-    /// With more betas than the model has: compare with [`BodyModel::num_betas`] first where they come from a file.
+    /// With more betas than the model has: compare with [`BodyModel::num_betas`] first where they
+    /// come from a file.
     #[must_use]
     pub fn shaped(&self, betas: &[f32]) -> Shaped {
         assert!(betas.len() <= self.num_betas(), "shaped: {} betas, the model has {}", betas.len(), self.num_betas());
@@ -88,8 +92,8 @@ impl BodyModel {
         Shaped { vertices, joints }
     }
 
-    /// Checks that the parts fit together and every value is finite. `file` names the model in errors; keys are
-    /// those of SMPL's files.
+    /// Checks that the parts fit together, that there is a surface, and that every value is finite and
+    /// below 10⁶ units. `file` names the model in errors; keys are those of SMPL's files.
     ///
     /// # Errors
     /// [`Error::Invalid`], [`Error::NotFinite`].
@@ -100,6 +104,7 @@ impl BodyModel {
             return invalid("v_template", "no vertices".to_owned());
         }
         finite(file, "v_template", &self.v_template)?;
+        near(file, "v_template", &self.v_template)?;
         for (i, face) in self.faces.iter().enumerate() {
             if let Some(bad) = face.iter().find(|&&index| index as usize >= v) {
                 return invalid("f", format!("face {i} names vertex {bad} of {v}"));
@@ -109,7 +114,14 @@ impl BodyModel {
             let n = self.shapedirs.len();
             return invalid("shapedirs", format!("{n} directions for {v} vertices"));
         }
+        let vertex = |i: u32| self.v_template[i as usize].as_dvec3();
+        let area = |f: &[u32; 3]| (vertex(f[1]) - vertex(f[0])).cross(vertex(f[2]) - vertex(f[0])).length();
+        if !self.faces.iter().any(|face| area(face) > 0.0) {
+            let what = if self.faces.is_empty() { "no faces" } else { "all faces are degenerate" };
+            return invalid("f", what.to_owned());
+        }
         finite(file, "shapedirs", &self.shapedirs)?;
+        near(file, "shapedirs", &self.shapedirs)?;
         if self.parents.first() != Some(&None) {
             return invalid("kintree_table", "joint 0 is not the root".to_owned());
         }
@@ -135,6 +147,7 @@ impl BodyModel {
             return invalid("posedirs", format!("columns of row {row} do not ascend"));
         }
         finite(file, "posedirs", &self.posedirs.values)?;
+        near(file, "posedirs", &self.posedirs.values)?;
         for i in 0..v {
             let mut sum = 0.0;
             for (_, w) in self.weights.row(i) {
@@ -155,6 +168,17 @@ impl BodyModel {
             }
         }
         Ok(())
+    }
+}
+
+/// Within what single precision can place to a tenth of a unit: no body, in whatever unit, reaches farther.
+fn near(file: &str, key: &str, values: &[Vec3]) -> Result<(), Error> {
+    match values.iter().position(|v| v.abs().max_element() > MAX_COORDINATE) {
+        Some(index) => {
+            let message = format!("{} at row {index}, expected at most {MAX_COORDINATE} either way", values[index]);
+            Err(Error::invalid(file, key, message))
+        }
+        None => Ok(()),
     }
 }
 

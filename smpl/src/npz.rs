@@ -1,4 +1,5 @@
-//! Numpy's `.npy` and `.npz`: reading, with limits and errors that name the file and the array, and writing.
+//! Numpy's `.npy` and `.npz`: reading, with limits and errors that name the file and the array, and
+//! writing.
 //!
 //! Headers are not believed: memory grows with the bytes that really arrive, and never beyond
 //! [`MAX_ARRAY_BYTES`] for one array.
@@ -6,11 +7,14 @@
 use std::io::{Cursor, Read, Write};
 use std::path::Path;
 
+use zip::read::ZipFile;
+use zip::result::ZipError;
 use zip::write::SimpleFileOptions;
 use zip::{CompressionMethod, ZipArchive, ZipWriter};
 
 use crate::Error;
 use crate::array::{ElementType, NdArray, element_count};
+use crate::pickle::{self, Value, unpacked_limit};
 
 /// Largest array that is read, in bytes of the file and of memory: 1 GiB.
 pub const MAX_ARRAY_BYTES: u64 = 1 << 30;
@@ -37,7 +41,7 @@ impl Npz {
         Self::from_bytes(&path.display().to_string(), read_file(path)?)
     }
 
-    /// The same for bytes in memory; `file` names them in errors.
+    /// Opens an archive in memory; `file` names them in errors.
     ///
     /// # Errors
     /// [`Error::Npy`] if they are no zip archive.
@@ -67,9 +71,33 @@ impl Npz {
     /// Reads the array `key`.
     ///
     /// # Errors
-    /// [`Error::MissingKey`], [`Error::TooLarge`], [`Error::Type`] for element types other than booleans,
-    /// integers and floats, and [`Error::Npy`] for anything malformed.
+    /// [`Error::MissingKey`], [`Error::TooLarge`], [`Error::Type`] for element types other than
+    /// booleans, integers and floats, and [`Error::Npy`] for anything malformed.
     pub fn array(&mut self, key: &str) -> Result<NdArray, Error> {
+        let file = self.file.clone();
+        read_array(&file, key, self.entry(key)?)
+    }
+
+    /// Reads `key` whatever its elements are: numbers, text, or pickled Python objects ([`crate::pickle`]).
+    ///
+    /// # Errors
+    /// Those of [`Npz::array`]; [`Error::Pickle`]; [`Error::TooLarge`] for what compression makes more than 256 times as
+    /// large and 64 MiB.
+    pub fn value(&mut self, key: &str) -> Result<Value, Error> {
+        let file = format!("{}: `{key}`", self.file);
+        let entry = self.entry(key)?;
+        let limit = unpacked_limit(entry.compressed_size());
+        let malformed =
+            |e: std::io::Error| Error::Npy { file: file.clone(), key: String::new(), message: e.to_string() };
+        let mut bytes = Vec::new();
+        entry.take(limit + 1).read_to_end(&mut bytes).map_err(malformed)?;
+        if bytes.len() as u64 > limit {
+            return Err(Error::TooLarge { file, key: key.to_owned(), claimed: bytes.len() as u128, limit });
+        }
+        pickle::from_bytes(&file, bytes)
+    }
+
+    fn entry(&mut self, key: &str) -> Result<ZipFile<'_, Cursor<Vec<u8>>>, Error> {
         let Some(index) = self.keys.iter().position(|k| k == key) else {
             return Err(Error::MissingKey {
                 file: self.file.clone(),
@@ -77,16 +105,13 @@ impl Npz {
                 available: self.keys.clone(),
             });
         };
-        let entry = self.archive.by_index(index).map_err(|e| Error::Npy {
-            file: self.file.clone(),
-            key: key.to_owned(),
-            message: e.to_string(),
-        })?;
-        read_array(&self.file, key, entry)
+        let malformed =
+            |e: ZipError| Error::Npy { file: self.file.clone(), key: key.to_owned(), message: e.to_string() };
+        self.archive.by_index(index).map_err(malformed)
     }
 
-    /// Reads the array `key` as finite `f32` of shape `pattern` (`None`: any size): its shape and its values,
-    /// row-major.
+    /// Reads the array `key` as finite `f32` of shape `pattern` (`None`: any size): its shape and
+    /// its values, row-major.
     ///
     /// # Errors
     /// Those of [`Npz::array`] and [`NdArray::to_f32`].
@@ -96,8 +121,8 @@ impl Npz {
         Ok((array.shape, values))
     }
 
-    /// Reads the array `key` as integers of shape `pattern` (`None`: any size): its shape and its values,
-    /// row-major.
+    /// Reads the array `key` as integers of shape `pattern` (`None`: any size): its shape and its
+    /// values, row-major.
     ///
     /// # Errors
     /// Those of [`Npz::array`] and [`NdArray::to_i64`].
@@ -111,13 +136,15 @@ impl Npz {
 /// Reads a `.npy` file of plain values. For arrays of Python objects see [`crate::pickle::read`].
 ///
 /// # Errors
-/// [`Error::Io`], [`Error::TooLarge`], [`Error::Type`] and [`Error::Npy`]; the key in them is empty.
+/// [`Error::Io`], [`Error::TooLarge`], [`Error::Type`] and [`Error::Npy`]; the key in them is
+/// empty.
 pub fn read_npy(path: &Path) -> Result<NdArray, Error> {
     let bytes = read_file(path)?;
     read_array(&path.display().to_string(), "", bytes.as_slice())
 }
 
-/// The whole file, if it is not too large. Devices and pipes, which have no length, are read up to the limit.
+/// The whole file, if it is not too large. Devices and pipes, which have no length, are read up to
+/// the limit.
 pub(crate) fn read_file(path: &Path) -> Result<Vec<u8>, Error> {
     let io = |source| Error::Io { path: path.to_owned(), source };
     let file = std::fs::File::open(path).map_err(io)?;
@@ -138,11 +165,25 @@ pub(crate) fn read_file(path: &Path) -> Result<Vec<u8>, Error> {
     Ok(bytes)
 }
 
-/// Writes an uncompressed `.npz` of named arrays, as numpy's `savez` does. The same arrays give the same bytes.
+/// Writes an uncompressed `.npz` of named arrays, as numpy's `savez` does. The same arrays give the
+/// same bytes.
 ///
 /// # Errors
-/// [`Error::Io`]; [`Error::Invalid`] for an array whose shape does not fit its values; [`Error::Npy`] for two of one name.
+/// [`Error::Io`]; [`Error::Invalid`] for an array whose shape does not fit its values;
+/// [`Error::Npy`] for two of one name.
 pub fn write<K: AsRef<str>>(path: &Path, arrays: &[(K, NdArray)]) -> Result<(), Error> {
+    write_with_text(path, arrays, &[])
+}
+
+/// [`write`] with scalar strings besides, as numpy's `str_`.
+///
+/// # Errors
+/// As [`write`].
+pub fn write_with_text<K: AsRef<str>>(
+    path: &Path,
+    arrays: &[(K, NdArray)],
+    texts: &[(&str, &str)],
+) -> Result<(), Error> {
     let file = path.display().to_string();
     let mut archive = ZipWriter::new(Cursor::new(Vec::new()));
     let options = SimpleFileOptions::default().compression_method(CompressionMethod::Stored);
@@ -155,24 +196,29 @@ pub fn write<K: AsRef<str>>(path: &Path, arrays: &[(K, NdArray)]) -> Result<(), 
         let malformed = |message: String| Error::Npy { file: file.clone(), key: key.to_owned(), message };
         archive.start_file(format!("{key}.npy"), options).map_err(|e| malformed(e.to_string()))?;
         let io = |source| Error::Io { path: path.to_owned(), source };
-        archive.write_all(&header(array)).and_then(|()| array.data.write(&mut archive)).map_err(io)?;
+        let head = header(array.data.descr(), &array.shape);
+        archive.write_all(&head).and_then(|()| array.data.write(&mut archive)).map_err(io)?;
     }
-    let whole =
-        |e: zip::result::ZipError| Error::Npy { file: file.clone(), key: String::new(), message: e.to_string() };
+    for &(key, text) in texts {
+        let malformed = |message: String| Error::Npy { file: file.clone(), key: key.to_owned(), message };
+        archive.start_file(format!("{key}.npy"), options).map_err(|e| malformed(e.to_string()))?;
+        let letters: Vec<u8> = text.chars().flat_map(|c| u32::from(c).to_le_bytes()).collect();
+        let head = header(&format!("<U{}", letters.len() / 4), &[]);
+        let io = |source| Error::Io { path: path.to_owned(), source };
+        archive.write_all(&head).and_then(|()| archive.write_all(&letters)).map_err(io)?;
+    }
+    let whole = |e: ZipError| Error::Npy { file: file.clone(), key: String::new(), message: e.to_string() };
     let bytes = archive.finish().map_err(whole)?.into_inner();
     std::fs::write(path, bytes).map_err(|source| Error::Io { path: path.to_owned(), source })
 }
 
-/// Magic, version 1.0 and the dict literal, padded so that the data begin at a multiple of 64 bytes.
-fn header(array: &NdArray) -> Vec<u8> {
-    let extents: Vec<String> = array.shape.iter().map(usize::to_string).collect();
+/// Magic, version 1.0 and the dict literal, padded so that the data begin at a multiple of 64
+/// bytes.
+fn header(descr: &str, shape: &[usize]) -> Vec<u8> {
+    let extents: Vec<String> = shape.iter().map(usize::to_string).collect();
     // A tuple of one needs its comma.
     let comma = if extents.len() == 1 { "," } else { "" };
-    let text = format!(
-        "{{'descr': '{}', 'fortran_order': False, 'shape': ({}{comma}), }}",
-        array.data.descr(),
-        extents.join(", ")
-    );
+    let text = format!("{{'descr': '{descr}', 'fortran_order': False, 'shape': ({}{comma}), }}", extents.join(", "));
     let length = (10 + text.len() + 1).next_multiple_of(64) - 10;
     let mut out = b"\x93NUMPY\x01\x00".to_vec();
     out.extend((length as u16).to_le_bytes());
@@ -180,7 +226,7 @@ fn header(array: &NdArray) -> Vec<u8> {
     out
 }
 
-/// What precedes the data of a `.npy` file.
+/// Type, order and shape that precede the data of a `.npy` file.
 pub(crate) struct NpyHeader {
     /// numpy's type string, `|O` for pickled objects.
     pub(crate) descr: String,
@@ -217,7 +263,8 @@ pub(crate) fn read_header(file: &str, key: &str, reader: &mut impl Read) -> Resu
     parse_header(&text).ok_or_else(|| malformed(format!("header {:?}", text.trim_end())))
 }
 
-/// The dict literal `{'descr': '<f4', 'fortran_order': False, 'shape': (3, 4), }`, keys in any order.
+/// The dict literal `{'descr': '<f4', 'fortran_order': False, 'shape': (3, 4), }`, keys in any
+/// order.
 fn parse_header(text: &str) -> Option<NpyHeader> {
     let body = text.trim().strip_prefix('{')?.strip_suffix('}')?;
     let (mut descr, mut fortran, mut shape) = (None, None, None);
@@ -277,7 +324,8 @@ pub(crate) fn read_array(file: &str, key: &str, mut reader: impl Read) -> Result
         let (file, key) = (file.to_owned(), key.to_owned());
         return Err(Error::TooLarge { file, key, claimed: in_memory, limit: MAX_ARRAY_BYTES });
     }
-    // One byte more than claimed, so that trailing bytes are noticed and a zip entry's checksum is verified.
+    // One byte more than claimed, so that trailing bytes are noticed and a zip entry's checksum is
+    // verified.
     let mut bytes = Vec::new();
     (reader.take(claimed as u64 + 1).read_to_end(&mut bytes)).map_err(|e| malformed(e.to_string()))?;
     element.decode(&bytes, &header.shape, header.fortran).ok_or_else(|| {

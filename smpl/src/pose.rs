@@ -12,23 +12,26 @@ pub(crate) const CHUNK: usize = 1024;
 /// Frames that share one pass over the pose blend shapes: a cache line of coefficients.
 const LANES: usize = 16;
 
-/// Vertices a parallel task of a batch. Their blend shapes stay in the second-level cache from one block of frames to the
-/// next, their offsets for all lanes in the first between the two passes.
+/// Vertices a parallel task of a batch. Their blend shapes stay in the second-level cache from one
+/// block of frames to the next, their offsets for all lanes in the first between the two passes.
 const TILE: usize = 64;
 
-/// Dense rows of blend shapes that are summed side by side, so that additions do not wait for each other.
+/// Dense rows of blend shapes that are summed side by side, so that additions do not wait for each
+/// other.
 const GROUP: usize = 4;
 
-/// Where a posed body stands in the world. The two differ in the point that the global rotation turns about.
+/// Place of a posed body in the world. The two differ in the point that the global rotation turns
+/// about.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Placement {
-    /// SMPL's own: the root joint (pelvis) turns by `pose[0]` about itself, then everything moves by `translation`.
+    /// SMPL's own: the root joint (pelvis) turns by `pose[0]` about itself, then everything moves
+    /// by `translation`.
     Pelvis {
-        /// In the model's unit.
+        /// Shift in the model's unit.
         translation: Vec3,
     },
-    /// ZJU-MoCap's: x = R(Rh) · lbs(pose with a zero root) + Th, a rotation about the **origin**. `pose[0]` is not
-    /// used.
+    /// ZJU-MoCap's: x = R(Rh) · lbs(pose with a zero root) + Th, a rotation about the **origin**.
+    /// `pose[0]` is not used.
     Origin {
         /// Rh, axis-angle.
         rotation: Vec3,
@@ -51,7 +54,8 @@ pub struct Posed {
     pub vertices: Vec<Vec3>,
     /// Joints, (J).
     pub joints: Vec<Vec3>,
-    /// Rest (shaped T-pose) to world, (J): vertex v is at Σ w_vi · bones_i · (rest_v + pose_offsets_v).
+    /// Rest (shaped T-pose) to world, (J): vertex v is at Σ w_vi · bones_i · (rest_v +
+    /// pose_offsets_v).
     pub bones: Vec<Affine3A>,
     /// Pose blend shapes B_P in rest space, (V).
     pub pose_offsets: Vec<Vec3>,
@@ -66,11 +70,11 @@ impl Posed {
 }
 
 impl BodyModel {
-    /// Poses `shaped` (from [`BodyModel::shaped`] of this model) by the axis-angle rotations `pose`, (J), of each
-    /// joint relative to its parent.
+    /// Poses `shaped` (from [`BodyModel::shaped`] of this model) by the axis-angle rotations
+    /// `pose`, (J), of each joint relative to its parent.
     ///
-    /// Work is spread over the current rayon pool; the result does not depend on its size, and equals that of
-    /// [`BodyModel::pose_batch`] bit for bit.
+    /// Work is spread over the current rayon pool; the result does not depend on its size, and
+    /// equals that of [`BodyModel::pose_batch`] bit for bit.
     ///
     /// # Panics
     /// If a length is not the model's.
@@ -88,7 +92,8 @@ impl BodyModel {
         Posed { vertices, joints: frame.joints, bones: frame.bones, pose_offsets }
     }
 
-    /// [`BodyModel::pose`] for many frames at once, which reads the pose blend shapes from memory once for all of them.
+    /// [`BodyModel::pose`] for many frames at once, which reads the pose blend shapes from memory
+    /// once for all of them.
     ///
     /// # Panics
     /// If a length is not the model's.
@@ -197,8 +202,8 @@ struct Kinematics {
     bones: Vec<Affine3A>,
 }
 
-// What runs under pulp's dispatch is a type of its own: a closure would not be inlined into the function that carries the
-// wide instructions, and be compiled without them.
+// What runs under pulp's dispatch is a type of its own: a closure would not be inlined into the
+// function that carries the wide instructions, and be compiled without them.
 
 /// A run of vertices in one frame.
 struct OneFrame<'a> {

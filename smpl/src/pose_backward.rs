@@ -10,16 +10,16 @@ use crate::rotation::{rodrigues, rodrigues_backward};
 /// Derivatives of a scalar with respect to the inputs of [`BodyModel::pose`].
 #[derive(Clone, Debug, PartialEq)]
 pub struct PoseGradient {
-    /// With respect to the axis-angle rotations, (J). The root's is 0 under [`Placement::Origin`].
+    /// Derivatives by the axis-angle rotations, (J). The root's is 0 under [`Placement::Origin`].
     pub pose: Vec<Vec3>,
-    /// With respect to the rest vertices, (V), and the rest joints, (J), each taken as an input of its own: pass it to
-    /// [`BodyModel::shaped_backward`].
+    /// Derivatives by the rest vertices, (V), and the rest joints, (J), each taken as an input of
+    /// its own: pass it to [`BodyModel::shaped_backward`].
     pub shaped: Shaped,
-    /// With respect to the fields of the placement; the variant is that of the pose.
+    /// Derivatives by the fields of the placement; the variant is that of the pose.
     pub placement: Placement,
 }
 
-/// What one run of vertices adds.
+/// Sums over one run of vertices.
 struct Partial {
     /// ∂/∂ linear part and translation of every bone.
     bones: Vec<(Mat3A, Vec3A)>,
@@ -38,11 +38,13 @@ struct JointGradients<'a> {
 }
 
 impl BodyModel {
-    /// Backward of [`BodyModel::pose`]: from `d_vertices`, (V), and `d_joints`, (J) or empty for none, to the rotations,
-    /// the rest body and the placement. `posed` is the forward's result for the same inputs.
+    /// Propagates the gradient of [`BodyModel::pose`] from `d_vertices`, (V), and `d_joints`, (J)
+    /// or empty for none, to the rotations, the rest body and the placement. `posed` is the
+    /// forward's result for the same inputs.
     ///
-    /// Derivatives with respect to `Posed::bones` and `Posed::pose_offsets` are not taken. The result does not depend on
-    /// the number of threads. The rotations' part is smooth everywhere, zero and π included.
+    /// Derivatives with respect to `Posed::bones` and `Posed::pose_offsets` are not taken. The
+    /// result does not depend on the number of threads. The rotations' part is smooth everywhere,
+    /// zero and π included.
     ///
     /// A pose from vertices, by gradient descent:
     ///
@@ -116,7 +118,8 @@ impl BodyModel {
         PoseGradient { pose: d_pose, shaped: Shaped { vertices: d_rest, joints: d_rest_joints }, placement }
     }
 
-    /// Backward of x = Σ w_i bones_i (rest + offset) and of the pose blend shapes, for a run of vertices from `start`.
+    /// Backward of x = Σ w_i bones_i (rest + offset) and of the pose blend shapes, for a run of
+    /// vertices from `start`.
     #[inline(always)]
     fn skin_backward(
         &self,
@@ -153,9 +156,9 @@ impl BodyModel {
         out
     }
 
-    /// Backward of the kinematic tree, to the rotations, the rest joints and the placement. With G_i
-    /// the joint frames (R_i, t_i): bone_i = (R_i, t_i − R_i J_i), and R_i = R_p L_i,
-    /// t_i = R_p (J_i − J_p) + t_p.
+    /// Backward of the kinematic tree, to the rotations, the rest joints and the placement. With
+    /// G_i the joint frames (R_i, t_i): bone_i = (R_i, t_i − R_i J_i), and R_i = R_p L_i, t_i = R_p
+    /// (J_i − J_p) + t_p.
     fn kinematics_backward(
         &self,
         shaped: &Shaped,
@@ -207,8 +210,9 @@ impl BodyModel {
         (d_pose, d_rest_joints.iter().map(|d| d.as_vec3()).collect(), placement)
     }
 
-    /// Backward of [`BodyModel::shaped`]: from `d_shaped`, derivatives with respect to rest vertices and rest joints, to
-    /// all B betas. The joints' part goes through the regressor.
+    /// Propagates the gradient of [`BodyModel::shaped`] from `d_shaped`, derivatives with respect
+    /// to rest vertices and rest joints, to all B betas. The joints' part goes through the
+    /// regressor.
     ///
     /// # Panics
     /// If a length is not the model's.

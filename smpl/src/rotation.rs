@@ -2,11 +2,11 @@
 
 use glam::{DMat3, Mat3, Vec3};
 
-/// Rotation matrix of the axis-angle vector `axis_angle` (direction: axis; length: radians), by Rodrigues'
-/// formula R = I + a·K + b·K² with a = sin θ/θ and b = (1 − cos θ)/θ².
+/// Rotation matrix of the axis-angle vector `axis_angle` (direction: axis; length: radians), by
+/// Rodrigues' formula R = I + a·K + b·K² with a = sin θ/θ and b = (1 − cos θ)/θ².
 ///
-/// Both coefficients are evaluated without cancellation, so that rotations of any size, zero included, are exact
-/// to rounding. A vector that is not finite gives a matrix of NaN.
+/// Both coefficients are evaluated without cancellation, so that rotations of any size, zero
+/// included, are exact to rounding. A vector that is not finite gives a matrix of NaN.
 #[must_use]
 pub fn rodrigues(axis_angle: Vec3) -> Mat3 {
     // f64, because a product of a dozen of these is held against references in f64.
@@ -27,7 +27,8 @@ pub fn rodrigues(axis_angle: Vec3) -> Mat3 {
     Mat3::from_cols_array_2d(&columns.map(|c| c.map(|x| x as f32)))
 }
 
-/// Backward of [`rodrigues`], (R) → axis-angle, in closed form and without cancellation at any angle.
+/// Propagates the gradient of [`rodrigues`] from R to the axis-angle vector, in closed form and
+/// without cancellation at any angle.
 ///
 /// With k the vector of the skew part of D, S = D + Dᵀ and R = I + a K + b (v vᵀ − θ² I):
 /// ∂/∂v = a k + (a'/θ)(k·v) v + b (S v − 2 tr(D) v) + (b'/θ)(vᵀ D v − θ² tr(D)) v.

@@ -15,12 +15,13 @@ use crate::sparse::SparseRows;
 const FORMAT: (&str, &str) = ("format", "smpl-body 1");
 
 impl BodyModel {
-    /// Writes the model as `.safetensors`, which [`BodyModel::load`] reads back bit for bit. An old file at `path` is
-    /// there until the new one is complete.
+    /// Writes the model as `.safetensors`, which [`BodyModel::load`] reads back bit for bit. An old
+    /// file at `path` is there until the new one is complete.
     ///
-    /// The header says `format: smpl-body 1`. Tensors: `v_template` (V,3), `f` (F,3), `shapedirs` (B,V,3), `parents` (J)
-    /// with −1 for the root; `posedirs`, `weights` and `J_regressor` as compressed sparse rows, each in three parts
-    /// `.offsets`, `.columns` and `.values`. Equal models give equal files.
+    /// The header says `format: smpl-body 1`. Tensors: `v_template` (V,3), `f` (F,3), `shapedirs`
+    /// (B,V,3), `parents` (J) with −1 for the root; `posedirs`, `weights` and `J_regressor` as
+    /// compressed sparse rows, each in three parts `.offsets`, `.columns` and `.values`. Equal
+    /// models give equal files.
     ///
     /// # Errors
     /// What [`BodyModel::validate`] finds; [`Error::Io`].

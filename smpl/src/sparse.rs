@@ -1,7 +1,7 @@
 //! Sparse rows.
 
-/// Compressed sparse rows: the non-zero entries of row i are `columns[offsets[i]..offsets[i + 1]]`, columns
-/// ascending, with their `values`.
+/// Compressed sparse rows: the non-zero entries of row i are `columns[offsets[i]..offsets[i + 1]]`,
+/// columns ascending, with their `values`.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SparseRows<T> {
     /// Start of each row, and the end of the last: (rows + 1), from 0, not decreasing.
@@ -16,7 +16,7 @@ pub struct SparseRows<T> {
 pub type SkinningWeights = SparseRows<f32>;
 
 impl<T: Copy> SparseRows<T> {
-    /// From the entries of each row in turn.
+    /// Collects the entries of each row in turn.
     pub fn from_rows(rows: impl IntoIterator<Item = impl IntoIterator<Item = (u32, T)>>) -> Self {
         let mut out = Self { offsets: vec![0], columns: Vec::new(), values: Vec::new() };
         for row in rows {
@@ -45,7 +45,7 @@ impl<T: Copy> SparseRows<T> {
         self.columns[range.clone()].iter().zip(&self.values[range]).map(|(&column, &value)| (column as usize, value))
     }
 
-    /// What is wrong with the structure, if anything.
+    /// The fault of the structure, if there is any.
     pub(crate) fn fault(&self, rows: usize, columns: usize) -> Option<String> {
         if self.offsets.len() != rows + 1 {
             return Some(format!("{} rows, expected {rows}", self.num_rows()));

@@ -39,7 +39,8 @@ enum Root {
     MinusOne,
 }
 
-/// A body of `joints` joints and 3 vertices each, in a chain, with the further arrays of a SMPL-X archive.
+/// A body of `joints` joints and 3 vertices each, in a chain, with the further arrays of a SMPL-X
+/// archive.
 fn archive(name: &str, joints: usize, betas: usize, root: Root) -> PathBuf {
     let v = 3 * joints;
     let wave = |i: usize| (i as f32 * 0.71).sin();
@@ -138,7 +139,8 @@ fn models_that_are_none_are_not_saved() {
     assert!(BodyModel::embedded().save(Path::new("/no/such/folder/a.safetensors")).is_err());
 }
 
-/// The saved form of a body of three joints: written once, as tests run at once and would read what another is writing.
+/// The saved form of a body of three joints: written once, as tests run at once and would read what
+/// another is writing.
 static SMALL: LazyLock<Vec<u8>> = LazyLock::new(|| {
     let body = BodyModel::load(&archive("small.npz", 3, 2, Root::U32)).unwrap();
     let path = temporary("small.safetensors");
@@ -189,4 +191,20 @@ proptest! {
             prop_assert_eq!(body.pose(&body.shaped(&[]), &pose, Placement::default()).vertices.len(), body.num_vertices());
         }
     }
+}
+
+#[test]
+fn bodies_without_a_surface_or_larger_than_anything_are_refused() {
+    let refused = |change: fn(&mut BodyModel), words: [&str; 2]| {
+        let mut body = BodyModel::embedded();
+        change(&mut body);
+        let message = body.validate("a.npz").unwrap_err().to_string();
+        assert!(words.iter().all(|word| message.contains(word)), "{words:?}: {message}");
+    };
+    refused(|body| body.faces.clear(), ["`f`", "no faces"]);
+    refused(|body| body.faces.iter_mut().for_each(|f| f[1] = f[0]), ["`f`", "degenerate"]);
+    refused(|body| body.v_template.fill(Vec3::ONE), ["`f`", "degenerate"]);
+    refused(|body| body.v_template[7].y = 1e30, ["`v_template`", "row 7"]);
+    refused(|body| body.shapedirs[3] = Vec3::splat(-2e6), ["`shapedirs`", "row 3"]);
+    refused(|body| body.posedirs.values[5].z = 1e30, ["`posedirs`", "row 5"]);
 }

@@ -1,4 +1,5 @@
-//! Rigged characters: the shared ones where they are there, and small ones made here, right and wrong.
+//! Rigged characters: the shared ones where they are there, and small ones made here, right and
+//! wrong.
 #![allow(clippy::unwrap_used, reason = "helpers of tests")]
 
 mod common;
@@ -87,7 +88,8 @@ fn a_small_character_moves_as_worked_out_by_hand() {
     assert_eq!(arm.faces, [[0, 1, 2], [2, 1, 3]]);
     assert_eq!(arm.rest().vertices, arm.vertices);
     assert_eq!((arm.animations[0].name.as_str(), arm.animations[0].duration), ("bend", 3.0));
-    // A quarter turn about (0, 1, 0) takes (0, 2, 0) to (−1, 1, 0); vertex 3 is halfway between (1, 2, 0) and (−1, 2, 0).
+    // A quarter turn about (0, 1, 0) takes (0, 2, 0) to (−1, 1, 0); vertex 3 is halfway between (1,
+    // 2, 0) and (−1, 2, 0).
     let bent = arm.pose(0, 3.0);
     close(bent.vertices[0], Vec3::ZERO);
     close(bent.vertices[2], Vec3::new(-1.0, 1.0, 0.0));
@@ -304,4 +306,27 @@ fn joints_hang_on_the_nearest_joint_above() {
     assert_eq!(above("LeftForeArm"), Some("LeftArm"));
     assert_eq!(above("RightUpLeg"), Some("RHipJoint"));
     assert_eq!(parents.iter().filter(|p| p.is_none()).count(), 1);
+}
+
+/// A few bytes of text asked for gigabytes.
+#[test]
+fn one_file_named_many_times_is_refused_before_it_fills_the_memory() {
+    let folder = std::path::Path::new(env!("CARGO_TARGET_TMPDIR")).join("named-often");
+    std::fs::create_dir_all(&folder).unwrap();
+    let size = 32 << 20;
+    // Sparse: it takes no room on the disk.
+    std::fs::File::create(folder.join("big.bin")).unwrap().set_len(size).unwrap();
+    let buffers = vec![format!(r#"{{"byteLength":{size},"uri":"big.bin"}}"#); 400].join(",");
+    let path = folder.join("often.gltf");
+    std::fs::write(&path, format!(r#"{{"asset":{{"version":"2.0"}},"buffers":[{buffers}]}}"#)).unwrap();
+    let message = Character::load(&path).unwrap_err().to_string();
+    assert!(message.contains("buffer 16") && message.contains("more than the limit"), "{message}");
+}
+
+#[test]
+fn vertices_beyond_anything_are_refused() {
+    let (json, mut bytes) = arm();
+    bytes[..4].copy_from_slice(&1e30f32.to_le_bytes());
+    let message = Character::from_bytes("arm.glb", &glb(&json, &bytes)).unwrap_err().to_string();
+    assert!(message.contains("POSITION") && message.contains("1000000"), "{message}");
 }

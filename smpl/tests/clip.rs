@@ -31,7 +31,8 @@ fn archive(name: &str, arrays: &[(&str, Vec<u8>)]) -> PathBuf {
     path
 }
 
-/// Two frames in which joint j has the rotation (j, 0, 0) / 100, then twice that. Tests run at once: each has files of its own.
+/// Two frames in which joint j has the rotation (j, 0, 0) / 100, then twice that. Tests run at
+/// once: each has files of its own.
 fn clip(test: &str, joints: usize, rate: &str) -> PathBuf {
     let mut poses = vec![0.0; 6 * joints];
     for j in 0..joints {
@@ -108,6 +109,7 @@ fn wrong_clips_are_refused() {
         ("poses", floats(&[2, 72], &[f32::NAN; 144])),
         ("poses", floats(&[2, 72], &[1e30; 144])),
         ("trans", floats(&[2, 2], &[0.0; 4])),
+        ("trans", floats(&[2, 3], &[-1e38; 6])),
         ("fps", floats(&[], &[0.0])),
         ("fps", floats(&[], &[-30.0])),
         ("fps", floats(&[], &[f32::NAN])),

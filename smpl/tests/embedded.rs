@@ -29,7 +29,8 @@ fn it_is_closed_and_has_no_handles() {
     let f = BODY.faces.len() as i64;
     assert_eq!(v - f * 3 / 2 + f, 2, "Euler characteristic of a sphere");
     assert_eq!(BODY.faces.iter().flatten().collect::<HashSet<_>>().len() as i64, v, "a stray vertex");
-    // The faces around every vertex form one fan: walking over them from edge to edge meets them all.
+    // The faces around every vertex form one fan: walking over them from edge to edge meets them
+    // all.
     let mut next: HashMap<(u32, u32), u32> = HashMap::new();
     let mut count = vec![0; v as usize];
     for face in &BODY.faces {

@@ -81,8 +81,8 @@ fn posed_vertices_map_back_to_their_rest_positions() {
 
 const STEP: f32 = 1e-3;
 
-/// Whether no bone's weight has a cell face within the step of `x` in a cell that holds any weight, and f keeps on one
-/// side of 1.
+/// Whether no bone's weight has a cell face within the step of `x` in a cell that holds any weight,
+/// and f keeps on one side of 1.
 fn smooth(scene: &Scene, frame: &MotionFrame<'_>, x: Vec3) -> bool {
     let MotionField::Volume { weights: volume, .. } = &scene.volume else { return false };
     let n = volume.resolution;
@@ -109,7 +109,8 @@ fn smooth(scene: &Scene, frame: &MotionFrame<'_>, x: Vec3) -> bool {
     cells_agree && (values.iter().all(|&f| f == 1.0) || values.iter().all(|&f| (0.02..0.999).contains(&f)))
 }
 
-/// Differences of f32 positions of size one, 1e-7 over twice the step; curvature within a cell is mild.
+/// Differences of f32 positions of size one, 1e-7 over twice the step; curvature within a cell is
+/// mild.
 const TOLERANCE: Tolerance = Tolerance { abs: 2e-3, rel: 1e-2 };
 
 #[test]
@@ -151,7 +152,8 @@ fn the_volume_kinds_gradients_agree_with_differences() {
                 moved.update();
                 value(&MotionField::Volume { weights: moved.clone(), threshold: 1e-3 }, x)
             };
-            // f is 1 at its most, a kink in the weights too; steps of 0.05 in the logarithm stay off it where f < 0.9.
+            // f is 1 at its most, a kink in the weights too; steps of 0.05 in the logarithm stay
+            // off it where f < 0.9.
             if scene.volume.map(&frame, x, unused).unwrap().likelihood < 0.9 {
                 let tolerance = Tolerance { abs: 2e-4, rel: 2e-2 };
                 check("log-weights", &vec![0.0; entries.len()], &analytic, 5e-2, tolerance, at).unwrap();
@@ -170,7 +172,8 @@ fn foot(scene: &Scene, face: usize, barycentric: [f32; 3]) -> (Vec3, Vec3) {
     ((0..3).map(|k| barycentric[k] * p[k]).sum(), normal)
 }
 
-/// The nearest point to `x` on the part of the face that `within` names: 3 corners the plane, 2 the edge, 1 the corner.
+/// The nearest point to `x` on the part of the face that `within` names: 3 corners the plane, 2 the
+/// edge, 1 the corner.
 fn nearest(scene: &Scene, face: usize, within: &[usize], x: Vec3) -> SurfacePoint {
     let p = scene.body.faces[face].map(|v| scene.posed.vertices[v as usize].as_dvec3());
     let q = x.as_dvec3();
@@ -217,7 +220,8 @@ proptest! {
         };
         let found = || Some(nearest(scene, face, within, x));
         let d_point = field.map_backward(&frame, x, found, d_canonical, 0.1, &mut []);
-        // The way of the nearest point over a face of a few millimetres is steep: a short step, and rounding to match.
+        // The way of the nearest point over a face of a few millimetres is steep: a short step, and
+        // rounding to match.
         let tolerance = Tolerance { abs: 8e-3, rel: 2e-2 };
         check("point", &x.to_array(), &d_point.to_array(), 2e-4, tolerance, value).map_err(TestCaseError::fail)?;
     }

@@ -9,7 +9,8 @@ use smpl::{BodyModel, Placement, SparseRows};
 use testkit::gradient::{Tolerance, check};
 use testkit::strategy::vec3;
 
-/// Every tenth vertex of the embedded body, with a pose blend shape for every term and a regressor of its own.
+/// Every tenth vertex of the embedded body, with a pose blend shape for every term and a regressor
+/// of its own.
 static BODY: LazyLock<BodyModel> = LazyLock::new(|| {
     let full = BodyModel::embedded();
     let kept: Vec<usize> = (0..full.num_vertices()).step_by(10).collect();
@@ -44,7 +45,8 @@ fn dot(a: &[Vec3], b: &[Vec3]) -> f64 {
     a.iter().zip(b).map(|(a, b)| a.as_dvec3().dot(b.as_dvec3())).sum()
 }
 
-/// Rotation of every joint but the root, then rotation and translation of the placement, then betas: 81 + 10 numbers.
+/// Rotation of every joint but the root, then rotation and translation of the placement, then
+/// betas: 81 + 10 numbers.
 fn unpack(x: &[f32], origin: bool) -> (Vec<Vec3>, Placement, &[f32]) {
     let vectors: Vec<Vec3> = x[..75].chunks_exact(3).map(Vec3::from_slice).collect();
     let (rotation, translation) = (vectors[0], vectors[24]);
@@ -77,7 +79,8 @@ fn compare(pose: &[Vec3], translation: Vec3, betas: &[f32], origin: bool) -> Res
     }
     let d_betas = BODY.shaped_backward(&gradient.shaped);
     let analytic: Vec<f32> = vectors.iter().flat_map(|v| v.to_array()).chain(d_betas).collect();
-    // Values are sums of a few units in f32 positions: rounding 1e-6 over the step, and a third derivative of a few units.
+    // Values are sums of a few units in f32 positions: rounding 1e-6 over the step, and a third
+    // derivative of a few units.
     check("pose", &x, &analytic, 1e-2, Tolerance { abs: 2e-3, rel: 5e-3 }, value)
 }
 

@@ -34,7 +34,8 @@ fn bodies() -> Vec<(&'static str, BodyModel)> {
     out
 }
 
-/// Points inside the body: between the joints, and halfway from each of some vertices to the nearest of those.
+/// Points inside the body: between the joints, and halfway from each of some vertices to the
+/// nearest of those.
 fn inside_points(body: &BodyModel, shaped: &Shaped) -> Vec<Vec3> {
     let mut axes = Vec::new();
     for (joint, parent) in body.parents.iter().enumerate() {
@@ -72,7 +73,8 @@ fn the_diffused_prior_leaves_the_surroundings_to_the_background() {
     let (body, shaped) = &*BODY;
     let config = WeightVolumeConfig::default();
     let volume = WeightVolume::diffused(body, shaped, &config);
-    // A cell's diagonal beyond margin and falloff, no sample that a point is mixed from sees the body.
+    // A cell's diagonal beyond margin and falloff, no sample that a point is mixed from sees the
+    // body.
     let cell = (volume.max - volume.min).length() / 31.0;
     let far = config.margin.max(cell) + config.falloff + cell;
     let (mut checked, mut least) = (0, f32::INFINITY);

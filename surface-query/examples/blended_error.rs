@@ -1,9 +1,9 @@
-//! How far the paper's blended distance is from the exact one, by region of a body in T-pose: a table of points spread
-//! evenly within 5 cm of the skin, and two pictures: the body coloured by the mean error around it, front and back, and
-//! a slice through armpits and crotch.
+//! How far the paper's blended distance is from the exact one, by region of a body in T-pose: a
+//! table of points spread evenly within 5 cm of the skin, and two pictures: the body coloured by
+//! the mean error around it, front and back, and a slice through armpits and crotch.
 //!
-//! `blended_error [FOLDER] [BODY.npz]`: writes `blended_error.png` and `blended_slice.png` into FOLDER (default `.`).
-//! Without BODY, the embedded body of `smpl`, whose hands are mittens.
+//! `blended_error [FOLDER] [BODY.npz]`: writes `blended_error.png` and `blended_slice.png` into
+//! FOLDER (default `.`). Without BODY, the embedded body of `smpl`, whose hands are mittens.
 
 use std::path::{Path, PathBuf};
 
@@ -149,7 +149,8 @@ fn portraits(mesh: &MeshDistance, faces: &[[u32; 3]], errors: &[f32], low: Vec3,
     })
 }
 
-/// The error at depth `z` within 10 cm of the skin, from the head to below the crotch; inside is darker.
+/// The error at depth `z` within 10 cm of the skin, from the head to below the crotch; inside is
+/// darker.
 fn slice(mesh: &MeshDistance, mut blended: impl FnMut(Vec3) -> f32, z: f32, low: Vec3, high: Vec3) -> RgbImage {
     let (width, scale) = (480, (high.x - low.x) / 480.0);
     let height = (1.15 / scale) as u32;

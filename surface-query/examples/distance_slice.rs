@@ -1,6 +1,6 @@
-//! A slice through the signed distance of a body: exact on the left, blended in the middle, and on the right where
-//! the two disagree, red where they differ in sign. Writes a PNG (first argument, default `distance_slice.png`) and
-//! prints how far apart they are.
+//! A slice through the signed distance of a body: exact on the left, blended in the middle, and on
+//! the right where the two disagree, red where they differ in sign. Writes a PNG (first argument,
+//! default `distance_slice.png`) and prints how far apart they are.
 
 #[path = "../tests/body/mod.rs"]
 mod body;
@@ -11,7 +11,7 @@ use image::{Rgb, RgbImage};
 use surface_query::{MeshDistance, SurfaceQuery, SurfaceQueryConfig};
 use testkit::TriMesh;
 
-const SIZE: u32 = 480;
+const SIZE: u32 = 256;
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let path = std::env::args().nth(1).unwrap_or("distance_slice.png".into());
@@ -41,7 +41,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         picture.put_pixel(column, row, colour(d));
         picture.put_pixel(column + SIZE, row, colour(blended));
         let off = ((d - blended).abs() / 0.02).min(1.0);
-        let grey = (255.0 * (1.0 - off)) as u8;
+        let grey = (255.0 * (1.0 - (8.0 * off).round() / 8.0)) as u8;
         let difference = if wrong { [220, 30, 30] } else { [grey; 3] };
         picture.put_pixel(column + 2 * SIZE, row, Rgb(difference));
     }
@@ -93,11 +93,13 @@ fn compare(mesh: &TriMesh, exact: &MeshDistance, surface: &SurfaceQuery) {
     }
 }
 
-/// Blue inside, orange outside, a line every 2 cm, white at the surface.
+/// Blue inside, orange outside, in bands of 2 cm, white at the surface.
 fn colour(d: f32) -> Rgb<u8> {
-    let fade = (-4.0 * d.abs()).exp();
-    let line = 0.75 + 0.25 * ((d / 0.02 * std::f32::consts::TAU).cos() * 0.5 + 0.5).powf(0.3);
+    if d.abs() < 0.003 {
+        return Rgb([255; 3]);
+    }
+    let band = (d.abs() / 0.02).floor();
+    let fade = (-0.08 * band).exp() * if band % 2.0 == 0.0 { 1.0 } else { 0.88 };
     let base = if d < 0.0 { [0.3, 0.55, 1.0] } else { [1.0, 0.7, 0.3] };
-    let near = (1.0 - d.abs() / 0.003).max(0.0);
-    Rgb(base.map(|c| ((c * fade * line * (1.0 - near) + near) * 255.0) as u8))
+    Rgb(base.map(|c| (c * fade * 255.0) as u8))
 }

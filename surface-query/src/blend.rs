@@ -1,7 +1,7 @@
 use glam::Vec3;
 
-/// Below this sum of weights all normals are perpendicular to the query's directions, and what is left of the
-/// cosines is rounding.
+/// Sum of weights below which all normals are perpendicular to the query's directions, and what is
+/// left of the cosines is rounding.
 const MIN_WEIGHT: f32 = 1e-5;
 
 /// Blend of the nearest vertices, OccNeRF §3.2 (surface-based rendering).
@@ -43,8 +43,8 @@ pub(crate) fn sums(vertices: &[Vec3], normals: &[Vec3], query: Vec3, finest: &[u
     Sums { inverse_distance: true, ..accumulate(vertices, normals, query, finest, inverse) }
 }
 
-/// Σ w, Σ w v / Σ w and Σ w n. The points are averaged as offsets from the query, which keeps the digits of a
-/// small distance far from the origin.
+/// Σ w, Σ w v / Σ w and Σ w n. The points are averaged as offsets from the query, which keeps the
+/// digits of a small distance far from the origin.
 #[inline(always)]
 fn accumulate(
     vertices: &[Vec3],

@@ -7,8 +7,8 @@ use crate::search::Search;
 use crate::tree::{Child, STACK, Tree, WIDTH};
 use crate::triangle::{Foot, Pack, closest_on_triangle};
 
-/// Queries farther than this many sizes of the mesh are answered in `f64`: from there `f32` would take faces for
-/// equally near of which one looks at the query and the other away.
+/// Queries farther than this many sizes of the mesh are answered in `f64`: from there `f32` would
+/// take faces for equally near of which one looks at the query and the other away.
 const FAR: f32 = 32.0;
 
 /// The nearest point of a mesh.
@@ -24,27 +24,30 @@ pub struct Closest {
     pub signed_distance: f32,
 }
 
-/// Exact signed distance to a triangle mesh: a bounding volume hierarchy finds the closest point, the
-/// angle-weighted pseudonormal of the face, edge or vertex it lies on gives the sign (Bærentzen and Aanæs 2005).
+/// Exact signed distance to a triangle mesh: a bounding volume hierarchy finds the closest point,
+/// the angle-weighted pseudonormal of the face, edge or vertex it lies on gives the sign (Bærentzen
+/// and Aanæs 2005).
 ///
-/// The faces keep their connectivity for life; [`MeshDistance::refit`] moves the vertices. Queries take `&self`
-/// and may run on any number of threads.
+/// The faces keep their connectivity for life; [`MeshDistance::refit`] moves the vertices. Queries
+/// take `&self` and may run on any number of threads.
 ///
-/// **Accuracy.** The tree is searched in `f32` with an allowance for rounding, and all faces it leaves are compared
-/// in `f64`: the distance is the true one rounded to `f32`. Only slivers, triangles several hundred times
-/// as long as high, may lose to a face that is farther by up to 10⁻⁶ of their length.
+/// **Accuracy.** The tree is searched in `f32` with an allowance for rounding, and all faces it
+/// leaves are compared in `f64`: the distance is the true one rounded to `f32`. Only slivers,
+/// triangles several hundred times as long as high, may lose to a face that is farther by up to
+/// 10⁻⁶ of their length.
 ///
-/// **The sign** is that of inside and outside for a closed mesh without self-intersections. See the crate's
-/// README for what it means on others.
+/// **The sign** is that of inside and outside for a closed mesh without self-intersections. See the
+/// crate's README for what it means on others.
 pub struct MeshDistance {
     faces: Vec<[u32; 3]>,
-    /// Multiplied by `scale`, a power of two, which is exact and brings products of four lengths into range.
+    /// Multiplied by `scale`, a power of two, which is exact and brings products of four lengths
+    /// into range.
     vertices: Vec<Vec3>,
     scale: f32,
-    /// Of the box of all faces, scaled.
+    /// Centre and radius of the box of all faces, scaled.
     centre: Vec3,
     radius: f32,
-    /// What rounding may add to a distance measured in `f32`, scaled.
+    /// Error that rounding may add to a distance measured in `f32`, scaled.
     error: f32,
     tree: Tree,
     /// The triangles of each leaf of the tree.
@@ -53,8 +56,9 @@ pub struct MeshDistance {
 }
 
 impl MeshDistance {
-    /// Takes a mesh of `vertices` (V) and `faces` (F), counter-clockwise seen from outside. Vertices at exactly
-    /// the same position are treated as one when the sign is decided, now and after every refit.
+    /// Takes a mesh of `vertices` (V) and `faces` (F), counter-clockwise seen from outside.
+    /// Vertices at exactly the same position are treated as one when the sign is decided, now and
+    /// after every refit.
     ///
     /// # Errors
     /// A vertex that is not finite, or a face that names no vertex.
@@ -79,8 +83,9 @@ impl MeshDistance {
 
     /// Moves the vertices (V); the faces stay. Linear in the size of the mesh.
     ///
-    /// The tree keeps the shape it was built with: after a change that is no deformation queries stay exact but
-    /// become slow. Faces with a vertex that is not finite are nowhere until the next refit.
+    /// The tree keeps the shape it was built with: after a change that is no deformation queries
+    /// stay exact but become slow. Faces with a vertex that is not finite are nowhere until the
+    /// next refit.
     ///
     /// # Panics
     /// If the number of vertices is another than at the start.
@@ -135,15 +140,18 @@ impl MeshDistance {
         if let Some([min, max]) = self.tree.bounds() {
             self.centre = (min + max) / 2.0;
             self.radius = ((max - min) / 2.0).max_element();
-            // A point of a triangle is built from the query's offset and two edges, each rounded a few times.
+            // A point of a triangle is built from the query's offset and two edges, each rounded a
+            // few times.
             self.error = 16.0 * f32::EPSILON * longest;
         }
     }
 
-    /// The point of the mesh closest to `query`, if it is at most `max_distance` away (infinity: any).
+    /// The point of the mesh closest to `query`, if it is at most `max_distance` away (infinity:
+    /// any).
     ///
-    /// `None` for a mesh without faces, a query that is not finite, and a `max_distance` that is negative or NaN.
-    /// A tight `max_distance` makes queries that fail, and those that succeed, faster.
+    /// `None` for a mesh without faces, a query that is not finite, and a `max_distance` that is
+    /// negative or NaN. A tight `max_distance` makes queries that fail, and those that succeed,
+    /// faster.
     #[must_use]
     pub fn closest(&self, query: Vec3, max_distance: f32) -> Option<Closest> {
         let q = query * self.scale;
@@ -173,8 +181,8 @@ impl MeshDistance {
         })
     }
 
-    /// Unsigned distance from `query` to one face. As a `max_distance` it makes the query of a point near the one
-    /// whose closest face this was several times faster.
+    /// Unsigned distance from `query` to one face. As a `max_distance` it makes the query of a
+    /// point near the one whose closest face this was several times faster.
     ///
     /// # Panics
     /// Where there is no such face.
@@ -184,8 +192,8 @@ impl MeshDistance {
         (self.foot(face, query.as_dvec3() * scale).offset.length() / scale) as f32
     }
 
-    /// Nearest face and its closest point, scaled, if that is about as near as `reach`; `q` and `exact` are the
-    /// scaled query.
+    /// Nearest face and its closest point, scaled, if that is about as near as `reach`; `q` and
+    /// `exact` are the scaled query.
     #[inline(always)]
     fn nearest(&self, q: Vec3, exact: DVec3, reach: f32) -> Option<(u32, Foot)> {
         let q = [q.x, q.y, q.z].map(Vec4::splat);
@@ -237,9 +245,10 @@ impl MeshDistance {
         closest_on_triangle(corners, q)
     }
 
-    /// The same as [`MeshDistance::nearest`] for a query far outside, and for a tree too deep for that.
+    /// [`MeshDistance::nearest`] for a query far outside, and for a tree too deep for that.
     fn nearest_to_far(&self, q: DVec3) -> Option<(u32, Foot)> {
-        // From here on the nearest point depends on the direction alone, and f64 still tells faces apart.
+        // From here on the nearest point depends on the direction alone, and f64 still tells faces
+        // apart.
         let (centre, horizon) = (self.centre.as_dvec3(), 1e7 * f64::from(self.radius));
         let (face, foot) = self.nearest_foot(centre + (q - centre).clamp_length_max(horizon), f64::INFINITY)?;
         let moved = q - centre - (q - centre).clamp_length_max(horizon);
@@ -247,7 +256,8 @@ impl MeshDistance {
         Some((face, Foot { offset, ..foot }))
     }
 
-    /// Nearest face and its closest point if its squared distance is at most `best`: the tree in `f64`.
+    /// Nearest face and its closest point if its squared distance is at most `best`: the tree in
+    /// `f64`.
     fn nearest_foot(&self, q: DVec3, mut best: f64) -> Option<(u32, Foot)> {
         let mut found = None;
         let mut stack = vec![(0.0, 0u32)];
@@ -294,8 +304,8 @@ fn pop(stack: &[(f32, u32)], height: &mut usize, bound: f32) -> Option<u32> {
     None
 }
 
-/// The power of two that brings the largest finite coordinate to about 1, within the exponents whose inverse
-/// and whose product with any coordinate are normal.
+/// The power of two that brings the largest finite coordinate to about 1, within the exponents
+/// whose inverse and whose product with any coordinate are normal.
 fn power_of_two_scale(vertices: &[Vec3]) -> f32 {
     let largest = vertices.iter().filter(|v| v.is_finite()).fold(0.0, |m: f32, v| m.max(v.abs().max_element()));
     if largest == 0.0 {

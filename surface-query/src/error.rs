@@ -1,4 +1,4 @@
-/// What is wrong with the mesh or the configuration a structure was asked to hold.
+/// Errors of meshes and configurations.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
@@ -21,10 +21,10 @@ pub enum Error {
     /// A nearest-vertex structure needs at least one vertex.
     #[error("no vertices")]
     NoVertices,
-    /// More vertices or faces than a `u32` counts.
+    /// The mesh has more vertices or faces than a `u32` counts.
     #[error("{count} elements, at most 2^31 are supported")]
     TooMany {
-        /// How many there are.
+        /// Their number.
         count: usize,
     },
     /// A configuration value out of its range.
@@ -34,10 +34,11 @@ pub enum Error {
         name: &'static str,
         /// Its value.
         value: f64,
-        /// What is allowed.
+        /// The range allowed.
         expected: &'static str,
     },
-    /// The candidate grid would need too many cells: the cell is too small for the extent of the vertices.
+    /// The candidate grid would need too many cells: the cell is too small for the extent of the
+    /// vertices.
     #[error("candidate grid of {cells:.3e} cells, at most {limit:.3e}: choose larger cells")]
     GridTooLarge {
         /// Cells of the bounding box.

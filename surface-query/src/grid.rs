@@ -1,5 +1,5 @@
-//! A grid of cells around the vertices, each with a list per level of every point that can be among the k
-//! nearest of any query in the cell.
+//! A grid of cells around the vertices, each with a list per level of every point that can be among
+//! the k nearest of any query in the cell.
 
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
@@ -15,10 +15,12 @@ const MAX_BLOCKS: f64 = (1 << 24) as f64;
 const EMPTY: u32 = u32::MAX;
 /// Levels of at most this many points are searched whole when the lists are built.
 const SMALL_LEVEL: usize = 128;
-/// Beyond this magnitude squared distances come near the end of `f32`, and the margins below mean nothing.
+/// Magnitude beyond which squared distances come near the end of `f32`, and the margins below mean
+/// nothing.
 const MAX_COORDINATE: f32 = 1e18;
 
-/// Candidate lists, in the narrowest integer that holds the indices: they are most of the memory traffic.
+/// Candidate lists, in the narrowest integer that holds the indices: they are most of the memory
+/// traffic.
 enum Lists {
     Narrow(Vec<u16>),
     Wide(Vec<u32>),
@@ -32,8 +34,8 @@ pub(crate) struct CandidateGrid {
     blocks: [usize; 2],
     /// Slot of each block or `EMPTY`.
     table: Vec<u32>,
-    /// Where the list of (slot, cell, level) begins; it ends where the next begins. Cells outside the margin
-    /// have empty lists.
+    /// Start of the list of (slot, cell, level) begins; it ends where the next begins. Cells
+    /// outside the margin have empty lists.
     offsets: Vec<u32>,
     lists: Lists,
 }
@@ -63,8 +65,8 @@ impl CandidateGrid {
             origin: origin.as_dvec3(),
             // The cell that the lookup really uses, after the rounding of its reciprocal.
             cell: 1.0 / f64::from(per_cell),
-            // The lookup rounds the offset from the origin three times; its cells reach that much further.
-            // Half an ulp each, so four whole ulps are ample.
+            // The lookup rounds the offset from the origin three times; its cells reach that much
+            // further. Half an ulp each, so four whole ulps are ample.
             rounding: 4.0 * f64::from(f32::EPSILON) * (blocks.max_element() * block_size + f64::from(reach)),
             margin: f64::from(margin),
             k,
@@ -122,7 +124,8 @@ impl CandidateGrid {
         (slot != EMPTY).then_some(slot as usize * BLOCK_CELLS + cell)
     }
 
-    /// k nearest of every level, level after level into `out`; false where the query's cell has no lists.
+    /// k nearest of every level, level after level into `out`; false where the query's cell has no
+    /// lists.
     #[inline(always)]
     pub fn nearest(&self, levels: &[Level], k: usize, q: Vec3, out: &mut [u32]) -> bool {
         let Some(row) = self.row(q) else {
@@ -138,13 +141,6 @@ impl CandidateGrid {
             Lists::Wide(lists) => nearest_of_lists(levels, offsets, lists, k, q, out),
         }
         true
-    }
-
-    /// Number of cells with lists, and of list entries in all of them.
-    pub fn size(&self, levels: usize) -> (usize, usize) {
-        let rows = self.offsets.len() / levels;
-        let filled = (0..rows).filter(|r| self.offsets[r * levels] != self.offsets[r * levels + 1]).count();
-        (filled, self.offsets.last().map_or(0, |&n| n as usize))
     }
 }
 
@@ -193,8 +189,8 @@ impl Shape {
                 if n <= SMALL_LEVEL {
                     return (0..n as u32).collect();
                 }
-                // The k-th nearest distance changes by at most the way the query moves, and a candidate is
-                // at most that far from the query.
+                // The k-th nearest distance changes by at most the way the query moves, and a
+                // candidate is at most that far from the query.
                 let kth = f64::from(level.kth_distance(centre, self.k.min(n)));
                 level.within(centre, ((kth + 2.0 * radius) * (1.0 + 1e-6)) as f32)
             })
@@ -230,11 +226,12 @@ impl Shape {
         })
     }
 
-    /// Appends every point of `near` that can be among the k nearest of a query in the cell. `near` holds them.
+    /// Appends every point of `near` that can be among the k nearest of a query in the cell. `near`
+    /// holds them.
     ///
-    /// A point is left out only where k others are closer for certain. Queries compare squared distances in
-    /// `f32`, off by at most 4 ulp relative (2.4e-7) and, near underflow, by a few denormals: the margins
-    /// `RELATIVE` and `ABSOLUTE` are far above that.
+    /// A point is left out only where k others are closer for certain. Queries compare squared
+    /// distances in `f32`, off by at most 4 ulp relative (2.4e-7) and, near underflow, by a few
+    /// denormals: the margins `RELATIVE` and `ABSOLUTE` are far above that.
     fn candidates(
         &self,
         level: &Level,
@@ -259,16 +256,19 @@ impl Shape {
                 max: far.length_squared(),
             }
         }));
-        // First sieve: k points are certainly within `bound`, so whatever is certainly beyond it is out.
+        // First sieve: k points are certainly within `bound`, so whatever is certainly beyond it is
+        // out.
         if scratch.len() > self.k {
             scratch.select_nth_unstable_by(self.k - 1, |a, b| a.max.total_cmp(&b.max));
             let bound = scratch[self.k - 1].max * (1.0 + RELATIVE) + ABSOLUTE;
             scratch.retain(|c| c.min <= bound);
         }
-        // Nearest to the centre first: the strongest rivals here, and well predicted branches in the query.
+        // Nearest to the centre first: the strongest rivals here, and well predicted branches in
+        // the query.
         scratch.sort_unstable_by(|a, b| (a.length_squared.total_cmp(&b.length_squared)).then(a.local.cmp(&b.local)));
-        // Second sieve: j is closer than p everywhere in the cell if |q−p|² − |q−j|², which is linear in q,
-        // is positive at its lowest corner. Of equal points the lower index wins every tie.
+        // Second sieve: j is closer than p everywhere in the cell if |q−p|² − |q−j|², which is
+        // linear in q, is positive at its lowest corner. Of equal points the lower index wins every
+        // tie.
         for c in scratch.iter() {
             let certain = c.max * RELATIVE + ABSOLUTE;
             let mut closer = 0;

@@ -13,8 +13,8 @@ pub(crate) const MAX_K: usize = 1 << 16;
 /// Largest k whose list is kept on the stack.
 const SMALL_K: usize = 64;
 
-/// Squared distance of a query to a point. Everything that ranks points goes through this one expression, so
-/// that the grid, the tree and brute force agree to the last bit.
+/// Squared distance of a query to a point. Everything that ranks points goes through this one
+/// expression, so that the grid, the tree and brute force agree to the last bit.
 #[inline(always)]
 pub(crate) fn distance_squared(p: Vec3, q: Vec3) -> f32 {
     let d = q - p;
@@ -45,8 +45,8 @@ impl Level {
         Ok(Self { ids, points, tree })
     }
 
-    /// An upper bound of the distance from `centre` to the k-th nearest point; infinite where there are not
-    /// k points or the distance overflows.
+    /// An upper bound of the distance from `centre` to the k-th nearest point; infinite where there
+    /// are not k points or the distance overflows.
     pub fn kth_distance(&self, centre: Vec3, k: usize) -> f32 {
         let Some(k_nonzero) = NonZero::new(k) else {
             return 0.0;
@@ -90,7 +90,8 @@ impl Level {
         self.nearest_of(&near, q, out);
     }
 
-    /// The k nearest of the candidates `list`, which must hold them: original indices into `out` (k).
+    /// The k nearest of the candidates `list`, which must hold them: original indices into `out`
+    /// (k).
     #[inline(always)]
     pub fn nearest_of<I: Copy + Into<u32>>(&self, list: &[I], q: Vec3, out: &mut [u32]) {
         // The usual k's get a buffer that stays in registers.
@@ -137,8 +138,8 @@ impl Level {
     }
 }
 
-/// Relative allowance for everything the tree may round differently: its incremental box distances are off by
-/// a few ulp per level of the tree, so 1e-4 holds with three decimal digits to spare.
+/// Relative allowance for everything the tree may round differently: its incremental box distances
+/// are off by a few ulp per level of the tree, so 1e-4 holds with three decimal digits to spare.
 const SLACK: f32 = 1e-4;
 
 /// Sorts the smallest keys of the list into `best`.

@@ -1,5 +1,6 @@
-//! Queries about a triangle mesh from points around it: nearest vertices at several scales, a normal-weighted blend
-//! of them with a signed distance, and the exact closest point with the exact sign.
+//! Queries about a triangle mesh from points around it: nearest vertices at several scales, a
+//! normal-weighted blend of them with a signed distance, and the exact closest point with the exact
+//! sign.
 //!
 //! ```
 //! use glam::Vec3;
@@ -29,9 +30,9 @@
 //! # Ok::<(), surface_query::Error>(())
 //! ```
 //!
-//! Conventions: lengths are in the units of the vertices; faces are wound counter-clockwise seen from outside;
-//! distances are positive outside. Ties between equally near vertices go to the lower index. Nothing depends on the
-//! number of threads.
+//! Conventions: lengths are in the units of the vertices; faces are wound counter-clockwise seen
+//! from outside; distances are positive outside. Ties between equally near vertices go to the lower
+//! index. Nothing depends on the number of threads.
 #![forbid(unsafe_code)]
 
 mod blend;
@@ -47,6 +48,11 @@ mod query;
 mod search;
 mod tree;
 mod triangle;
+
+/// The README's examples, compiled as tests.
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+struct Readme;
 
 pub use blend::Blended;
 pub use distance::{Closest, MeshDistance};

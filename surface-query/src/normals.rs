@@ -1,10 +1,12 @@
 use glam::{DVec3, Vec3};
 
-/// Unit normal of each vertex, (V): the normals of its faces weighted by the angle the face spans at the vertex
-/// (Thürmer and Wüthrich 1998; Bærentzen and Aanæs 2005). Faces are wound counter-clockwise seen from outside.
+/// Unit normal of each vertex, (V): the normals of its faces weighted by the angle the face spans
+/// at the vertex (Thürmer and Wüthrich 1998; Bærentzen and Aanæs 2005). Faces are wound
+/// counter-clockwise seen from outside.
 ///
-/// A vertex without a face, or whose faces have no area or cancel, gets +Y, so that every normal is unit.
-/// Vertices are told apart by index: a seam of duplicated vertices gets the normals of either side.
+/// A vertex without a face, or whose faces have no area or cancel, gets +Y, so that every normal is
+/// unit. Vertices are told apart by index: a seam of duplicated vertices gets the normals of either
+/// side.
 ///
 /// # Panics
 /// If a face names a vertex that does not exist.

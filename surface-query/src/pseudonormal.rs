@@ -1,5 +1,5 @@
-//! Angle-weighted pseudonormals of faces, edges and vertices (Bærentzen and Aanæs 2005): the side of the
-//! nearest feature's pseudonormal a point is on is the side of the surface.
+//! Angle-weighted pseudonormals of faces, edges and vertices (Bærentzen and Aanæs 2005): the side
+//! of the nearest feature's pseudonormal a point is on is the side of the surface.
 
 use std::collections::HashMap;
 
@@ -8,8 +8,8 @@ use glam::{DVec3, Vec3};
 use crate::normals::{corner_angles, face_normal};
 use crate::triangle::Feature;
 
-/// What of the mesh's connectivity the normals need. Vertices at the same position count as one, so that the
-/// seams of textured meshes do not look like holes.
+/// The part of the mesh's connectivity that the normals need. Vertices at the same position count
+/// as one, so that the seams of textured meshes do not look like holes.
 struct Topology {
     /// Edge i of a face goes from corner i to corner i+1.
     edges: Vec<[u32; 3]>,
@@ -54,8 +54,8 @@ impl Pseudonormals {
         }
     }
 
-    /// Normals of the same faces at new positions. None is normalised but those of the faces: only their side
-    /// matters.
+    /// Normals of the same faces at new positions. None is normalised but those of the faces: only
+    /// their side matters.
     pub fn update(&mut self, vertices: &[Vec3], faces: &[[u32; 3]]) {
         self.edges.fill(Vec3::ZERO);
         self.vertices.fill(Vec3::ZERO);

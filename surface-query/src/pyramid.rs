@@ -1,27 +1,30 @@
 use glam::{DVec3, Vec3};
 
-/// Points of one leaf of the sampling tree. Smaller leaves skip more distances but cost more box tests.
+/// Points of one leaf of the sampling tree. Smaller leaves skip more distances but cost more box
+/// tests.
 const BUCKET: usize = 32;
 
-/// Nested subsets of a point set: level 0 holds every point, each further level a farthest point sampling of
-/// the level above it.
+/// Nested subsets of a point set: level 0 holds every point, each further level a farthest point
+/// sampling of the level above it.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Pyramid {
-    /// `levels[0]` is 0, 1, …, N−1; further levels are in the order of sampling and hold indices into the
-    /// original points. Each level is a prefix of the one above it from level 1 on: farthest point sampling
-    /// is greedy, so sampling a sampled set again repeats its beginning.
+    /// `levels[0]` is 0, 1, …, N−1; further levels are in the order of sampling and hold indices
+    /// into the original points. Each level is a prefix of the one above it from level 1 on:
+    /// farthest point sampling is greedy, so sampling a sampled set again repeats its beginning.
     pub levels: Vec<Vec<u32>>,
 }
 
 impl Pyramid {
-    /// Samples `levels` levels beyond the finest. Level l+1 holds ⌊`ratio` · size of level l⌋ points, at least
-    /// one while there are any; the first is index 0. 6890 points at ratio 0.25: 6890, 1722, 430, 107.
+    /// Samples `levels` levels beyond the finest. Level l+1 holds ⌊`ratio` · size of level l⌋
+    /// points, at least one while there are any; the first is index 0. 6890 points at ratio 0.25:
+    /// 6890, 1722, 430, 107.
     ///
     /// A `ratio` outside (0, 1] is clamped into it; NaN counts as 1.
     #[must_use]
     pub fn new(points: &[Vec3], ratio: f32, levels: usize) -> Self {
         let ratio = if ratio.is_nan() { 1.0 } else { ratio.clamp(0.0, 1.0) };
-        // The factor undoes the rounding of a decimal ratio to f32: 10 · 0.7f32 is 6.9999998 in f64.
+        // The factor undoes the rounding of a decimal ratio to f32: 10 · 0.7f32 is 6.9999998 in
+        // f64.
         let smaller = |n: usize| ((n as f64 * f64::from(ratio) * (1.0 + 1e-7)) as usize).max(1);
         let n = points.len();
         let mut pyramid = vec![(0..n as u32).collect::<Vec<u32>>()];
@@ -37,15 +40,15 @@ impl Pyramid {
     }
 }
 
-/// Exact farthest point sampling (Gonzalez 1985): `count` distinct indices, first index 0, then again and again
-/// the point whose distance to the nearest chosen point is largest; ties go to the lower index. At most N are
-/// returned.
+/// Exact farthest point sampling (Gonzalez 1985): `count` distinct indices, first index 0, then
+/// again and again the point whose distance to the nearest chosen point is largest; ties go to the
+/// lower index. At most N are returned.
 ///
-/// Distances are compared in `f64`, in which the squared distance of two `f32` points is exact or nearly so.
-/// Points that are not finite are chosen last, in the order of their indices.
+/// Distances are compared in `f64`, in which the squared distance of two `f32` points is exact or
+/// nearly so. Points that are not finite are chosen last, in the order of their indices.
 ///
-/// The work is that of a k-d tree of buckets (Han et al., *QuickFPS*, 2023): whatever lies in a box that is farther
-/// from the new sample than any point in it is from the chosen ones is skipped.
+/// The work is that of a k-d tree of buckets (Han et al., *QuickFPS*, 2023): whatever lies in a box
+/// that is farther from the new sample than any point in it is from the chosen ones is skipped.
 #[must_use]
 pub fn farthest_points(points: &[Vec3], count: usize) -> Vec<u32> {
     let count = count.min(points.len());
@@ -69,8 +72,8 @@ pub fn farthest_points(points: &[Vec3], count: usize) -> Vec<u32> {
 struct Node {
     min: DVec3,
     max: DVec3,
-    /// Largest squared distance of a point to the nearest chosen one, infinite before the first; −1 where all are
-    /// chosen themselves.
+    /// Largest squared distance of a point to the nearest chosen one, infinite before the first; −1
+    /// where all are chosen themselves.
     gap: f64,
     /// The lowest index of the points that have it.
     farthest: u32,
@@ -120,8 +123,9 @@ impl Node {
         node
     }
 
-    /// Squared distance to the box. Rounding is monotone and the terms are summed in the same order as in
-    /// [`Node::update`], so this is never above the computed distance of any point in the box.
+    /// Squared distance to the box. Rounding is monotone and the terms are summed in the same order
+    /// as in [`Node::update`], so this is never above the computed distance of any point in the
+    /// box.
     #[inline]
     fn distance_squared(&self, p: DVec3) -> f64 {
         let d = p - p.clamp(self.min, self.max);

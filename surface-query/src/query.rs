@@ -7,7 +7,7 @@ use crate::grid::CandidateGrid;
 use crate::knn::{Level, MAX_K};
 use crate::{Error, Pyramid, vertex_normals};
 
-/// How a [`SurfaceQuery`] searches.
+/// Settings of a [`SurfaceQuery`].
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SurfaceQueryConfig {
     /// Neighbours a level, 1 to 65536.
@@ -19,14 +19,14 @@ pub struct SurfaceQueryConfig {
     /// Side of the cells of the candidate grid, in the units of the vertices. About the distance of
     /// neighbouring vertices is fast; halving it costs eight times the memory. 0: no grid.
     pub cell: f32,
-    /// How far around the vertices the grid reaches, in the units of the vertices. Queries farther out go
-    /// through the trees: the same answer, several times slower. 0: no grid.
+    /// Distance around the vertices that the grid covers, in the units of the vertices. Queries
+    /// farther out go through the trees: the same answer, several times slower. 0: no grid.
     pub margin: f32,
 }
 
 impl SurfaceQueryConfig {
-    /// The paper's neighbourhoods (5 neighbours at 4 scales, ratio 0.25) with a grid for a body of 6890
-    /// vertices in metres: cells of 2 cm to 12 cm from the skin.
+    /// The paper's neighbourhoods (5 neighbours at 4 scales, ratio 0.25) with a grid for a body of
+    /// 6890 vertices in metres: cells of 2 cm to 12 cm from the skin.
     pub const BODY: Self = Self { k: 5, coarse_levels: 3, ratio: 0.25, cell: 0.02, margin: 0.12 };
 
     /// The paper's neighbourhoods without a grid: right for any unit and size.
@@ -54,8 +54,8 @@ impl SurfaceQueryConfig {
 
 /// Nearest vertices at several scales, their blend, and its signed distance.
 ///
-/// Built once for a mesh at rest; the mesh does not change afterwards. All queries take `&self` and may run on
-/// any number of threads.
+/// Built once for a mesh at rest; the mesh does not change afterwards. All queries take `&self` and
+/// may run on any number of threads.
 pub struct SurfaceQuery {
     vertices: Vec<Vec3>,
     normals: Vec<Vec3>,
@@ -66,12 +66,12 @@ pub struct SurfaceQuery {
 }
 
 impl SurfaceQuery {
-    /// Takes a mesh of `vertices` (V) and `faces` (F), counter-clockwise seen from outside. Without faces it is a
-    /// point cloud whose normals are all +Y.
+    /// Takes a mesh of `vertices` (V) and `faces` (F), counter-clockwise seen from outside. Without
+    /// faces it is a point cloud whose normals are all +Y.
     ///
     /// # Errors
-    /// No vertices, a vertex that is not finite, a face that names no vertex, a configuration out of range, or
-    /// a cell too small for the extent of the vertices.
+    /// No vertices, a vertex that is not finite, a face that names no vertex, a configuration out
+    /// of range, or a cell too small for the extent of the vertices.
     pub fn new(vertices: &[Vec3], faces: &[[u32; 3]], config: &SurfaceQueryConfig) -> Result<Self, Error> {
         config.check()?;
         check_mesh(vertices, faces)?;
@@ -101,11 +101,13 @@ impl SurfaceQuery {
         self.levels.len() * self.k
     }
 
-    /// The k nearest vertices of every level into `out` ((coarse levels + 1) · k): finest level first, nearest
-    /// first in each, equal distances by lower index. A level of fewer than k points repeats its list.
+    /// The k nearest vertices of every level into `out` ((coarse levels + 1) · k): finest level
+    /// first, nearest first in each, equal distances by lower index. A level of fewer than k points
+    /// repeats its list.
     ///
-    /// Exact with respect to squared distances computed in `f32` as x² + y² + z². A query that is not finite,
-    /// or whose squared distances overflow, is infinitely far from everything: it gets the lowest indices.
+    /// Exact with respect to squared distances computed in `f32` as x² + y² + z². A query that is
+    /// not finite, or whose squared distances overflow, is infinitely far from everything: it gets
+    /// the lowest indices.
     ///
     /// # Panics
     /// If `out` has another length.
@@ -129,12 +131,13 @@ impl SurfaceQuery {
         }
     }
 
-    /// Blend of the vertices `finest`, usually the first k of [`SurfaceQuery::neighbours`]:
-    /// w_i = |cos(x − v_i, n_i)|, v̂ = Σ w_i v_i / Σ w_i, n̂ = normalise(Σ w_i n_i), d = (x − v̂) · n̂.
+    /// Blend of the vertices `finest`, usually the first k of [`SurfaceQuery::neighbours`]: w_i =
+    /// |cos(x − v_i, n_i)|, v̂ = Σ w_i v_i / Σ w_i, n̂ = normalise(Σ w_i n_i), d = (x − v̂) · n̂.
     ///
-    /// The cosine of a zero vector is 1, so a query on a vertex is defined. Where Σ w < 1e-5 (the query lies
-    /// in all tangent planes) the weights are inverse distances. Where the normals cancel, n̂ is that of the
-    /// first vertex. A query that is not finite gives values that are not.
+    /// The cosine of a zero vector is 1, so a query on a vertex is defined. Where Σ w < 1e-5 (the
+    /// query lies in all tangent planes) the weights are inverse distances. Where the normals
+    /// cancel, n̂ is that of the first vertex. A query that is not finite gives values that are
+    /// not.
     ///
     /// # Panics
     /// If `finest` is empty or names no vertex.
@@ -145,8 +148,9 @@ impl SurfaceQuery {
         blend::blend(&self.vertices, &self.normals, query, finest)
     }
 
-    /// Gradient with respect to the query of a loss of [`SurfaceQuery::blend`]'s point and signed distance,
-    /// given the loss's gradient with respect to those. The set of neighbours is a constant.
+    /// Gradient with respect to the query of a loss of [`SurfaceQuery::blend`]'s point and signed
+    /// distance, given the loss's gradient with respect to those. The set of neighbours is a
+    /// constant.
     ///
     /// At its kinks (a cosine of 0, the query on a vertex) the weight's derivative counts as 0.
     ///
@@ -158,9 +162,10 @@ impl SurfaceQuery {
         blend_backward::blend_backward(&self.vertices, &self.normals, query, finest, d_point, d_signed_distance)
     }
 
-    /// The distance of the code that was published with the paper, for comparisons: the mean distance from the query to the
-    /// vertices `finest`, with the sign of the side on which most of them have it (a tie is outside). It is nowhere
-    /// near 0 on the surface. Also returns its gradient with respect to the query; the sign is a constant.
+    /// The distance of the code that was published with the paper, for comparisons: the mean
+    /// distance from the query to the vertices `finest`, with the sign of the side on which most of
+    /// them have it (a tie is outside). It is nowhere near 0 on the surface. Also returns its
+    /// gradient with respect to the query; the sign is a constant.
     ///
     /// # Panics
     /// If `finest` is empty or names no vertex.
@@ -194,11 +199,5 @@ impl SurfaceQuery {
     #[must_use]
     pub fn pyramid(&self) -> &Pyramid {
         &self.pyramid
-    }
-
-    /// Cells of the candidate grid and entries of its lists; zeros without one. For judging `cell` and `margin`.
-    #[must_use]
-    pub fn grid_size(&self) -> (usize, usize) {
-        self.grid.as_ref().map_or((0, 0), |grid| grid.size(self.levels.len()))
     }
 }

@@ -1,9 +1,9 @@
-//! What a closest-point search knows while it walks the tree.
+//! State of a closest-point search while it walks the tree.
 
 use crate::tree::LANES;
 
-/// Faces kept for the exact comparison. Six meet at a usual vertex; more than this are compared in `f64` from the
-/// start.
+/// Faces kept for the exact comparison. Six meet at a usual vertex; more than this are compared in
+/// `f64` from the start.
 const MAX_CANDIDATES: usize = 32;
 
 /// Faces that may be the nearest, given that `f32` distances are off by up to `error`.
@@ -20,7 +20,7 @@ pub(crate) struct Search {
 }
 
 impl Search {
-    /// Of faces about as near as `reach`.
+    /// Faces about as near as `reach`.
     #[inline(always)]
     pub fn new(reach: f32, error: f32) -> Self {
         Self {

@@ -1,5 +1,5 @@
-//! Tree of boxes over triangles, built by obvhs and laid out for this crate's traversal: eight children a node, whose
-//! boxes are tested together, four triangles a leaf.
+//! Tree of boxes over triangles, built by obvhs and laid out for this crate's traversal: eight
+//! children a node, whose boxes are tested together, four triangles a leaf.
 
 use std::time::Duration;
 
@@ -15,7 +15,8 @@ pub(crate) const LANES: usize = 4;
 pub(crate) const WIDTH: usize = 8;
 /// Marks a child that is a leaf; the other bits are its number.
 const LEAF: u32 = 1 << 31;
-/// Places of a stack of fixed size: of a tree 18 nodes deep, which not even triangles over all scales of `f32` make.
+/// Places of a stack of fixed size: of a tree 18 nodes deep, which not even triangles over all
+/// scales of `f32` make.
 pub(crate) const STACK: usize = 128;
 
 /// Bounds of the children: lowest and highest corner along each axis, a lane for each child.
@@ -43,7 +44,7 @@ impl Child {
 }
 
 impl Node {
-    /// Without children: all are nowhere.
+    /// A node without children: all are nowhere.
     const EMPTY: Self = Self { low: [[Vec4::MAX; 2]; 3], high: [[Vec4::MIN; 2]; 3], children: [0; WIDTH], count: 0 };
 
     /// [`Child::new`]'s argument for one of the children.
@@ -52,8 +53,8 @@ impl Node {
         self.children[place]
     }
 
-    /// Squared distance of a point to the box of each child; rounding never makes it more than the computed
-    /// distance of a point inside.
+    /// Squared distance of a point to the box of each child; rounding never makes it more than the
+    /// computed distance of a point inside.
     #[inline(always)]
     pub fn distance_squared(&self, q: [Vec4; 3]) -> [Vec4; WIDTH / 4] {
         let mut sum = [Vec4::ZERO; WIDTH / 4];
@@ -96,8 +97,8 @@ pub(crate) struct Tree {
 }
 
 impl Tree {
-    /// Builds over the faces at the positions `vertices`, which must be finite and not near overflow. Call
-    /// [`Tree::refit`] afterwards.
+    /// Builds over the faces at the positions `vertices`, which must be finite and not near
+    /// overflow. Call [`Tree::refit`] afterwards.
     pub fn new(vertices: &[Vec3], faces: &[[u32; 3]]) -> Self {
         let boxes: Vec<Aabb> = faces
             .iter()
@@ -175,8 +176,8 @@ impl Tree {
         (min.x <= max.x).then_some([min, max])
     }
 
-    /// Recomputes every box. `leaf_box` gives the lowest and highest corner of the faces of a leaf; `None` if
-    /// all of them are nowhere.
+    /// Recomputes every box. `leaf_box` gives the lowest and highest corner of the faces of a leaf;
+    /// `None` if all of them are nowhere.
     pub fn refit(&mut self, leaf_box: impl Fn(&[u32; LANES]) -> Option<[Vec3; 2]>) {
         for n in (0..self.nodes.len()).rev() {
             for place in 0..self.nodes[n].count {

@@ -1,4 +1,5 @@
-//! Distance from a point to triangles: four at a time in `f32` to find the nearest, one in `f64` to measure it.
+//! Distance from a point to triangles: four at a time in `f32` to find the nearest, one in `f64` to
+//! measure it.
 
 use glam::{DVec3, Vec3, Vec4};
 
@@ -17,7 +18,8 @@ fn dot(u: [Vec4; 3], v: [Vec4; 3]) -> Vec4 {
     u[0] * v[0] + u[1] * v[1] + u[2] * v[2]
 }
 
-/// |p − s·ab − t·ac|², the residual formed before it is squared so that small distances keep their digits.
+/// |p − s·ab − t·ac|², the residual formed before it is squared so that small distances keep their
+/// digits.
 #[inline(always)]
 fn residual(p: [Vec4; 3], ab: [Vec4; 3], ac: [Vec4; 3], s: Vec4, t: Vec4) -> Vec4 {
     let r = [0, 1, 2].map(|i| p[i] - s * ab[i] - t * ac[i]);
@@ -48,9 +50,9 @@ impl Pack {
     /// Squared distance of `q` to each triangle.
     ///
     /// The least of the distances to the three edges and, where it falls inside, to the foot of the
-    /// perpendicular. Each is the distance to a real point of the triangle, so a sliver whose foot is badly
-    /// conditioned is never reported too close, and its edges bound the error by its width. A lane with a
-    /// corner that is not finite gives NaN, which is below no bound.
+    /// perpendicular. Each is the distance to a real point of the triangle, so a sliver whose foot
+    /// is badly conditioned is never reported too close, and its edges bound the error by its
+    /// width. A lane with a corner that is not finite gives NaN, which is below no bound.
     #[inline(always)]
     pub fn distance_squared(&self, q: [Vec4; 3]) -> Vec4 {
         let (ab, ac) = (self.ab, self.ac);
@@ -81,7 +83,7 @@ impl Pack {
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) enum Feature {
     Face,
-    /// From corner i to corner i+1.
+    /// Edge from corner i to corner i+1.
     Edge(usize),
     Vertex(usize),
 }
@@ -92,14 +94,15 @@ pub(crate) struct Foot {
     pub distance_squared: f64,
     pub barycentric: [f64; 3],
     pub feature: Feature,
-    /// From the closest point to the query.
+    /// Vector from the closest point to the query.
     pub offset: DVec3,
 }
 
 /// Squared sine of the angle at the first corner from which on a triangle is no sliver.
 const WELL_SHAPED: f64 = 1e-4;
 
-/// Closest point of the triangle to `q`, in `f64`; the same case distinction as [`Pack::distance_squared`].
+/// Closest point of the triangle to `q`, in `f64`; the same case distinction as
+/// [`Pack::distance_squared`].
 pub(crate) fn closest_on_triangle(corners: [DVec3; 3], q: DVec3) -> Foot {
     let foot = |barycentric: [f64; 3], feature| {
         // Relative to the nearest corner in weight: no cancellation against the origin's distance.

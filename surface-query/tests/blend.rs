@@ -134,7 +134,8 @@ proptest! {
 
 #[test]
 fn the_gradient_of_inverse_distance_weights_is_that_of_finite_differences() {
-    // In the plane of a flat sheet every cosine is 0, and stays 0 while the query moves in the plane.
+    // In the plane of a flat sheet every cosine is 0, and stays 0 while the query moves in the
+    // plane.
     let query = build(&mesh::open_grid(6));
     let q = Vec3::new(0.13, -0.22, 0.0);
     let list = finest(&query, q);

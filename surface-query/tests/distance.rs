@@ -20,7 +20,8 @@ fn check(mesh: &TriMesh, q: Vec3, found: &Closest) -> Result<(), TestCaseError> 
     let eps = tolerance(mesh, q);
     let (_, _, distance) = oracle::closest_point(&mesh.vertices, &mesh.faces, q);
     let unsigned = f64::from(found.signed_distance.abs());
-    // A distance may be longer than any coordinate: its own rounding is half a unit in its last place.
+    // A distance may be longer than any coordinate: its own rounding is half a unit in its last
+    // place.
     let rounding = eps.max(distance * f64::from(f32::EPSILON) * 0.501);
     prop_assert!((unsigned - distance).abs() <= rounding, "{q}: {unsigned} instead of {distance}");
     // The point is rounded along each axis.

@@ -119,7 +119,6 @@ fn neighbours_on_cell_faces_of_a_grid_far_from_the_origin_equal_brute_force() {
     let mut random = Random(7);
     let points: Vec<Vec3> = (0..600).map(|_| random.vec3(0.5) + 4096.0).collect();
     let query = SurfaceQuery::new(&points, &[], &config(5, 0.1, 0.2)).unwrap();
-    assert!(query.grid_size().0 > 100);
     let corner = points.iter().fold(Vec3::MAX, |m, p| m.min(*p)) - 0.3;
     for i in 0..3000 {
         let cells = Vec3::new((i % 15) as f32, (i / 15 % 15) as f32, (i / 225) as f32);
@@ -135,7 +134,6 @@ fn a_grid_answers_every_query_within_the_margin_like_the_trees_do() {
     };
     let grid = SurfaceQuery::new(&body.vertices, &body.faces, &SurfaceQueryConfig::BODY).unwrap();
     let trees = SurfaceQuery::new(&body.vertices, &body.faces, &SurfaceQueryConfig::TREES).unwrap();
-    assert_eq!(trees.grid_size(), (0, 0));
     let (mut a, mut b) = ([0; 20], [0; 20]);
     let mut random = Random(3);
     let mut queries = random.near_surface(&body, 20_000, 0.2);
@@ -218,7 +216,8 @@ fn neighbour_sets_overlap_less_with_distance_and_more_with_scales() {
         assert!(fine[i] < fine[i - 1] && scaled[i] < scaled[i - 1], "{fine:?} {scaled:?}");
         assert!(scaled[i] > fine[i], "{fine:?} {scaled:?}");
     }
-    // At a third of the way to the next but one vertex most of the coarse neighbours are still the same.
+    // At a third of the way to the next but one vertex most of the coarse neighbours are still the
+    // same.
     assert!(scaled[3] > 1.5 * fine[3], "{fine:?} {scaled:?}");
 }
 

@@ -2,13 +2,14 @@
 
 use std::fmt::Write as _;
 
-/// How far analytic and numeric derivative may differ: `|a − n| ≤ abs + rel · max(|a|, |n|)`.
+/// Largest difference of analytic and numeric derivative: `|a − n| ≤ abs + rel · max(|a|, |n|)`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Tolerance {
-    /// Allowed difference whatever the magnitude; covers the rounding of the function under test, which a
-    /// central difference magnifies by 1 / (2 · step).
+    /// Allowed difference whatever the magnitude; covers the rounding of the function under test,
+    /// which a central difference magnifies by 1 / (2 · step).
     pub abs: f64,
-    /// Allowed difference as a fraction of the larger derivative; covers the third-order term step² / 6 · f‴.
+    /// Allowed difference as a fraction of the larger derivative; covers the third-order term step²
+    /// / 6 · f‴.
     pub rel: f64,
 }
 
@@ -32,12 +33,12 @@ impl Tolerance {
 
 /// Compares `analytic` (N) with central differences of `f` at `x` (N), one coordinate at a time.
 ///
-/// The difference is divided by the step that `f32` really represents, `(x + h) − (x − h)`. `f` must be
-/// smooth within `step` of `x`: keep off kinks, grid faces and ties.
+/// The difference is divided by the step that `f32` really represents, `(x + h) − (x − h)`. `f`
+/// must be smooth within `step` of `x`: keep off kinks, grid faces and ties.
 ///
 /// # Errors
-/// Every disagreeing coordinate together, each with its index, value and both derivatives; also different
-/// lengths, and a step lost to rounding.
+/// Every disagreeing coordinate together, each with its index, value and both derivatives; also
+/// different lengths, and a step lost to rounding.
 pub fn check(
     name: &str,
     x: &[f32],

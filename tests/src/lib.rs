@@ -1,8 +1,8 @@
-//! Test kit of the workspace: meshes, proptest strategies, a finite-difference gradient checker, rank statistics and
-//! brute-force oracles.
+//! Test kit of the workspace: meshes, proptest strategies, a finite-difference gradient checker,
+//! rank statistics and brute-force oracles.
 //!
-//! Everything here is written to be obviously right rather than fast. The oracles take slices and glam values
-//! only, compute in `f64`, and share no code with the crates they check.
+//! Everything here is written to be obviously right rather than fast. The oracles take slices and
+//! glam values only, compute in `f64`, and share no code with the crates they check.
 //!
 //! ```
 //! use testkit::{gradient::{assert_gradient, Tolerance}, mesh, oracle};
@@ -15,8 +15,8 @@
 //! assert_gradient("square", &[3.0], &[6.0], 1e-2, Tolerance::default(), |x| f64::from(x[0]).powi(2));
 //! ```
 //!
-//! Conventions: closed meshes are wound counter-clockwise seen from outside; ties between equally good
-//! answers go to the lower index.
+//! Conventions: closed meshes are wound counter-clockwise seen from outside; ties between equally
+//! good answers go to the lower index.
 
 pub mod gradient;
 pub mod mesh;

@@ -9,12 +9,13 @@ use glam::Vec3;
 pub struct TriMesh {
     /// Positions, (V).
     pub vertices: Vec<Vec3>,
-    /// Vertex indices of each triangle, (F); counter-clockwise seen from outside where the mesh is closed.
+    /// Vertex indices of each triangle, (F); counter-clockwise seen from outside where the mesh is
+    /// closed.
     pub faces: Vec<[u32; 3]>,
 }
 
 impl TriMesh {
-    /// The same faces with every vertex passed through `f`.
+    /// A mesh of the same faces with every vertex passed through `f`.
     #[must_use]
     pub fn map(mut self, f: impl FnMut(Vec3) -> Vec3) -> Self {
         self.vertices = self.vertices.into_iter().map(f).collect();
@@ -33,8 +34,8 @@ impl TriMesh {
             .sum()
     }
 
-    /// Whether every directed edge is met by exactly one opposite one: closed, manifold at edges, and
-    /// consistently wound.
+    /// Whether every directed edge is met by exactly one opposite one: closed, manifold at edges,
+    /// and consistently wound.
     #[must_use]
     pub fn is_closed(&self) -> bool {
         let mut edges: HashMap<(u32, u32), u32> = HashMap::new();
@@ -47,8 +48,8 @@ impl TriMesh {
     }
 }
 
-/// Unit sphere about the origin: an icosahedron whose faces are split in four `subdivisions` times, so
-/// 10 · 4ⁿ + 2 vertices and 20 · 4ⁿ faces.
+/// Unit sphere about the origin: an icosahedron whose faces are split in four `subdivisions` times,
+/// so 10 · 4ⁿ + 2 vertices and 20 · 4ⁿ faces.
 #[must_use]
 pub fn icosphere(subdivisions: u32) -> TriMesh {
     let phi = (1.0 + 5.0_f32.sqrt()) / 2.0;
@@ -110,8 +111,8 @@ pub fn icosphere(subdivisions: u32) -> TriMesh {
     TriMesh { vertices, faces }
 }
 
-/// Box about the origin with half extents `half`: 8 vertices, 12 faces. Vertex i has the sign of axis j
-/// positive where bit j of i is set.
+/// Box about the origin with half extents `half`: 8 vertices, 12 faces. Vertex i has the sign of
+/// axis j positive where bit j of i is set.
 #[must_use]
 pub fn cuboid(half: Vec3) -> TriMesh {
     let vertices = (0..8)

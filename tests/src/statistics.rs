@@ -1,7 +1,7 @@
 //! Rank statistics.
 
-/// Spearman's rank correlation of two samples of the same length (Spearman 1904): 1 where they agree on the order, −1 where
-/// one is the other's reverse; NaN where one of them is constant.
+/// Spearman's rank correlation of two samples of the same length (Spearman 1904): 1 where they
+/// agree on the order, −1 where one is the other's reverse; NaN where one of them is constant.
 #[must_use]
 pub fn spearman(a: &[u64], b: &[u64]) -> f64 {
     assert_eq!(a.len(), b.len(), "spearman: samples of different length");

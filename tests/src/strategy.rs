@@ -1,4 +1,5 @@
-//! Proptest strategies, one per type, with bounded ranges; and the degenerate inputs every crate is swept over.
+//! Proptest strategies, one per type, with bounded ranges; and the degenerate inputs every crate is
+//! swept over.
 
 use glam::{Quat, Vec3};
 use proptest::prelude::*;
@@ -25,8 +26,8 @@ pub fn rotation() -> impl Strategy<Value = Quat> {
         .prop_map(|(axis, angle)| Quat::from_axis_angle(axis, angle))
 }
 
-/// Closed star-shaped mesh of 162 vertices about the origin, radii between 0.55 and 1.45: a sphere with three
-/// smooth waves on it.
+/// Closed star-shaped mesh of 162 vertices about the origin, radii between 0.55 and 1.45: a sphere
+/// with three smooth waves on it.
 pub fn bumpy_sphere() -> impl Strategy<Value = TriMesh> {
     let wave = (vec3(4.0), 0.0..std::f32::consts::TAU, 0.0f32..0.15);
     prop::collection::vec(wave, 3).prop_map(|waves| {
@@ -42,8 +43,8 @@ pub fn cloud(n: std::ops::Range<usize>, range: f32) -> impl Strategy<Value = Vec
     prop::collection::vec(vec3(range), n)
 }
 
-/// Named point sets on which searches, trees and normalisations go wrong: too few points, coincident,
-/// collinear and coplanar ones, extreme magnitudes, and values that are not finite.
+/// Named point sets on which searches, trees and normalisations go wrong: too few points,
+/// coincident, collinear and coplanar ones, extreme magnitudes, and values that are not finite.
 #[must_use]
 pub fn degenerate_clouds() -> Vec<(&'static str, Vec<Vec3>)> {
     let line = |scale: f32| (0..40).map(move |i| Vec3::X * (i as f32 * scale));

@@ -44,9 +44,9 @@ fn captures_scenes_colours_and_pictures_are_the_same_on_one_and_on_three_threads
             let scene = Scene::new(&capture, body(), &config).unwrap();
             let trained = train(&scene, &config, 2);
             let trainer = Trainer::new(&scene, config.clone()).unwrap();
-            let field = FieldRenderer::new(&trainer).unwrap().render(&scene.eval[0], Vec3::ONE).unwrap();
+            let field = FieldRenderer::new(trainer.model()).unwrap().render(&scene.eval[0].view, Vec3::ONE).unwrap();
             let colors = VertexColors::measure(&scene).unwrap();
-            let prior = PriorRenderer::new(&scene, &colors).render(&scene.eval[0], Vec3::X).unwrap();
+            let prior = PriorRenderer::new(&scene.body, &colors).render(&scene.eval[0].view, Vec3::X).unwrap();
             let counts = scene.vertex_frequencies().unwrap();
             let frames: Vec<_> = capture.train.into_iter().map(|f| (f.pixels().unwrap(), f.pose)).collect();
             (frames, colors, counts, [field, prior].map(|r| (r.image, r.opacity)), bits(&trained.0), trained.1)
@@ -69,7 +69,7 @@ fn stopping_and_going_on_equals_never_having_stopped() {
         assert_eq!(checkpoint_config(&path).unwrap(), config);
         let mut second = Trainer::resume(scene(), &path).unwrap();
         assert_eq!(second.steps_done(), 3);
-        assert_eq!(second.visibility_counts(), first.visibility_counts());
+        assert_eq!(second.model().visibility_counts(), first.model().visibility_counts());
         let rest: Vec<_> = (0..3).map(|_| second.step().unwrap()).collect();
         assert_eq!(bits(&rest), bits(&reports[3..]), "{}: losses", name(&config));
         assert!(checkpoint(&second) == whole, "{}: checkpoints differ", name(&config));
@@ -88,7 +88,7 @@ fn a_resumed_model_draws_the_same_picture() {
     trainer.save(&path).unwrap();
     let resumed = Trainer::resume(scene(), &path).unwrap();
     let draw = |trainer: &Trainer<'_>| {
-        let rendering = FieldRenderer::new(trainer).unwrap().render(&scene().eval[1], Vec3::ZERO).unwrap();
+        let rendering = FieldRenderer::new(trainer.model()).unwrap().render(&scene().eval[1].view, Vec3::ZERO).unwrap();
         (rendering.image, rendering.opacity)
     };
     assert!(draw(&trainer) == draw(&resumed));

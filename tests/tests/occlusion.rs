@@ -8,7 +8,7 @@ mod common;
 use common::{TempDir, body, capture, scene, tiny, train};
 use glam::Vec3;
 use occnerf::capture::{Capture, DemoConfig, LoadOptions, Pixels, demo, load_capture};
-use occnerf::{Label, Method, MotionKind, OccludedRule, Scene, VertexColors};
+use occnerf::{Label, Method, MotionKind, OccludedRule, Scene, VertexColors, upright};
 
 const NO_DISTORTION: [f64; 5] = [0.0; 5];
 const BARREL: [f64; 5] = [-0.2, 0.05, 0.001, -0.002, 0.0];
@@ -156,6 +156,6 @@ fn a_known_occluder_is_what_is_unknown() {
             assert_eq!(label, expected);
         }
     }
-    let up = scene.up();
+    let up = upright(&scene.body, scene.train.iter().map(|frame| &*frame.view));
     assert!(up.distance(Vec3::Y) < 1e-6, "{up}");
 }

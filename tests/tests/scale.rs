@@ -37,7 +37,7 @@ fn scaled_capture(scale: f32) -> Capture {
 /// The scene in another unit; it does not depend on method or motion.
 fn scaled_scene(scale: f32) -> Scene {
     let scene = Scene::new(&scaled_capture(scale), &scaled_body(scale), &configs()[0]).unwrap();
-    assert_abs_diff_eq!(scene.scale * scale, common::scene().scale, epsilon = 1e-6);
+    assert_abs_diff_eq!(scene.body.scale * scale, common::scene().body.scale, epsilon = 1e-6);
     scene
 }
 
@@ -84,8 +84,8 @@ fn vertices_and_joints_of_a_frame_are_the_same_in_any_unit() {
     for (ours, theirs) in common::scene().train.iter().zip(&scene.train) {
         let far = |a: &[Vec3], b: &[Vec3]| a.iter().zip(b).map(|(a, b)| a.distance(*b)).fold(0.0, f32::max);
         // A few units in the last place of coordinates of at most 2.
-        assert!(far(&ours.posed.vertices, &theirs.posed.vertices) < 3e-6);
-        assert!(far(&ours.posed.joints, &theirs.posed.joints) < 3e-6);
+        assert!(far(&ours.view.posed.vertices, &theirs.view.posed.vertices) < 3e-6);
+        assert!(far(&ours.view.posed.joints, &theirs.view.posed.joints) < 3e-6);
         assert_eq!(ours.labels, theirs.labels);
     }
 }

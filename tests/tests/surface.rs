@@ -121,18 +121,18 @@ fn distance_structure_and_ray_structure_agree_on_a_walking_body_after_a_refit() 
 #[test]
 fn the_prior_renderers_silhouette_is_that_of_the_ray_casts() {
     let scene = scene();
-    let vertices = scene.canonical.vertices.len();
+    let vertices = scene.body.canonical.vertices.len();
     let colors = VertexColors { colors: vec![Vec3::ONE; vertices], seen: vec![true; vertices] };
     for frame in [&scene.eval[0], &scene.train[5]] {
-        let (vertices, faces) = (&frame.posed.vertices, &scene.model.faces);
-        let rendering = PriorRenderer::new(scene, &colors).render(frame, Vec3::ZERO).unwrap();
+        let (vertices, faces) = (&frame.view.posed.vertices, &scene.body.model.faces);
+        let rendering = PriorRenderer::new(&scene.body, &colors).render(&frame.view, Vec3::ZERO).unwrap();
         let (mut inside, mut wrong) = (0, 0);
-        let width = frame.camera.width as usize;
+        let width = frame.view.camera.width as usize;
         // Every third column, to spare time.
         for i in (0..rendering.opacity.len()).filter(|i| i % width % 3 == 1) {
             let (column, row) = ((i % width) as f32, (i / width) as f32);
             let cast = |(u, v): (f32, f32)| {
-                let ray = frame.camera.ray(column + u, row + v);
+                let ray = frame.view.camera.ray(column + u, row + v);
                 u8::from(oracle::first_hit(vertices, faces, ray.origin, ray.direction).is_some())
             };
             let hits: u8 = [(0.25, 0.25), (0.75, 0.25), (0.25, 0.75), (0.75, 0.75)].map(cast).iter().sum();
@@ -154,17 +154,17 @@ fn the_prior_renderers_silhouette_is_that_of_the_ray_casts() {
 fn cameras_and_views_put_vertices_into_the_same_pixels_and_rays_lead_back_to_them() {
     let scene = scene();
     let frame = &scene.train[0];
-    let camera = &frame.camera;
+    let camera = &frame.view.camera;
     let view = View {
         intrinsics: camera.intrinsics(),
         extrinsics: camera.world_to_camera,
         width: camera.width,
         height: camera.height,
     };
-    let mesh = RayMesh::new(&frame.posed.vertices, &scene.model.faces).unwrap();
-    let visible = visibility::visible_vertices(&mesh, &frame.posed.vertices, &view, None);
+    let mesh = RayMesh::new(&frame.view.posed.vertices, &scene.body.model.faces).unwrap();
+    let visible = visibility::visible_vertices(&mesh, &frame.view.posed.vertices, &view, None);
     let mut seen = 0;
-    for (&v, visible) in frame.posed.vertices.iter().zip(visible) {
+    for (&v, visible) in frame.view.posed.vertices.iter().zip(visible) {
         let projected = camera.project(v).unwrap();
         let pixel = view.pixel(v).unwrap();
         let edge = (projected.fract() - 0.5).abs();

@@ -16,7 +16,7 @@ const SMALL_TABLE: u32 = 12;
 /// The least and the mean opacity over the prior's silhouette in a picture of an untrained field.
 fn initial_opacity(scene: &Scene, config: Config, frame: &PreparedFrame) -> (f32, f32) {
     let trainer = Trainer::new(scene, config).unwrap();
-    let rendering = FieldRenderer::new(&trainer).unwrap().render(frame, Vec3::ZERO).unwrap();
+    let rendering = FieldRenderer::new(trainer.model()).unwrap().render(&frame.view, Vec3::ZERO).unwrap();
     let inside: Vec<f32> =
         rendering.opacity.iter().zip(silhouette(scene, frame)).filter(|(_, s)| *s).map(|(o, _)| *o).collect();
     assert!(inside.len() > 100);
@@ -68,7 +68,7 @@ fn a_short_training_lowers_the_loss_and_beats_its_own_start() {
         let mut trainer = Trainer::new(scene(), config).unwrap();
         let psnr = |trainer: &Trainer<'_>| {
             let frames: Vec<&PreparedFrame> = scene().eval.iter().collect();
-            let mut renderer = FieldRenderer::new(trainer).unwrap();
+            let mut renderer = FieldRenderer::new(trainer.model()).unwrap();
             evaluate(scene(), &mut renderer, &frames, |_, _| {}).unwrap().psnr_mask.unwrap()
         };
         let start = psnr(&trainer);
@@ -111,10 +111,10 @@ fn every_motion_and_distance_trains_without_bad_gradients() {
 #[test]
 fn vertices_near_visible_pixels_are_counted_and_the_rest_stay_behind() {
     let mut trainer = Trainer::new(scene(), tiny(Method::Occnerf, MotionKind::Surface)).unwrap();
-    assert!(trainer.visibility_counts().iter().all(|&c| c == 0));
+    assert!(trainer.model().visibility_counts().iter().all(|&c| c == 0));
     let mut rays = 0;
     (0..24).for_each(|_| rays += trainer.step().unwrap().rays as u64);
-    let counts = trainer.visibility_counts();
+    let counts = trainer.model().visibility_counts();
     let total: u64 = counts.iter().sum();
     assert!(total > 0 && total.is_multiple_of(5) && total <= 5 * rays, "{total} of {rays} rays");
     // Vertices that ray casting never sees are hit by far fewer terminations than those it sees in many frames.
@@ -131,8 +131,8 @@ fn vertices_near_visible_pixels_are_counted_and_the_rest_stay_behind() {
 fn the_scene_keeps_capture_and_labels_in_step() {
     assert_eq!(scene().train.len(), capture().train.len());
     assert_eq!(scene().eval.len(), capture().eval.len());
-    assert_eq!(scene().canonical.vertices.len(), body().num_vertices());
+    assert_eq!(scene().body.canonical.vertices.len(), body().num_vertices());
     let (low, high) =
-        scene().canonical.vertices.iter().fold((f32::MAX, f32::MIN), |(l, h), v| (l.min(v.y), h.max(v.y)));
+        scene().body.canonical.vertices.iter().fold((f32::MAX, f32::MIN), |(l, h), v| (l.min(v.y), h.max(v.y)));
     assert!((high - low - 1.7).abs() < 1e-5);
 }

@@ -1,16 +1,21 @@
-//! Cost of casting rays at a body of 13776 triangles (a ball of 20480 where that is not at hand), and at the same
-//! with every triangle split in two.
+//! Cost of casting rays at a body of 13776 triangles (a ball of 20480 where that is not at hand),
+//! and at the same with every triangle split in two.
 #![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
 
 #[path = "../tests/body/mod.rs"]
 mod body;
 
 use std::hint::black_box;
+use std::time::Duration;
 
 use body::Random;
 use divan::Bencher;
 use divan::counter::ItemsCount;
-use glam::{Affine3A, Mat3, Quat, Vec3};
+use glam::{Affine3A, Mat3, Quat, Vec3, Vec3A};
+use obvhs::BvhBuildParams;
+use obvhs::cwbvh::builder::build_cwbvh_from_tris;
+use obvhs::ray::{Ray, RayHit};
+use obvhs::triangle::Triangle;
 use testkit::TriMesh;
 use visibility::{RayMesh, View, VisibilityCounts, visible_vertices};
 
@@ -60,7 +65,8 @@ fn image_rays(focal: f32) -> Vec<(Vec3, Vec3)> {
         .collect()
 }
 
-/// The whole body in view, of which most rays miss, and the chest filling the image, every ray a hit.
+/// The whole body in view, of which most rays miss, and the chest filling the image, every ray a
+/// hit.
 const FOCALS: [f32; 2] = [1.2, 12.0];
 
 /// One ray at a time, one thread.
@@ -81,6 +87,23 @@ fn single(bencher: Bencher<'_, '_>, mesh: &TriMesh, focal: f32) {
     bencher.counter(ItemsCount::new(rays.len())).bench_local(|| {
         for &(origin, direction) in &rays {
             black_box(mesh.first_hit(origin, direction));
+        }
+    });
+}
+
+/// The same by obvhs as it comes: its widest tree, its traversal, its triangles.
+#[divan::bench(args = FOCALS)]
+fn first_hit_split_obvhs(bencher: Bencher<'_, '_>, focal: f32) {
+    let mesh = split(&body::body_or_ball());
+    let corners = |face: &[u32; 3]| face.map(|v| Vec3A::from(mesh.vertices[v as usize]));
+    let triangles: Vec<Triangle> = mesh.faces.iter().map(corners).map(|[v0, v1, v2]| Triangle { v0, v1, v2 }).collect();
+    let tree = build_cwbvh_from_tris(&triangles, BvhBuildParams::medium_build(), &mut Duration::default());
+    let rays = image_rays(focal);
+    bencher.counter(ItemsCount::new(rays.len())).bench_local(|| {
+        for &(origin, direction) in &rays {
+            let (ray, mut hit) = (Ray::new_inf(origin.into(), direction.into()), RayHit::none());
+            tree.ray_traverse(ray, &mut hit, |ray, i| triangles[tree.primitive_indices[i] as usize].intersect(ray));
+            black_box(hit);
         }
     });
 }

@@ -1,8 +1,9 @@
-//! Exact visibility against the paper's running counts: a camera circles a body once while a fixed rectangle hides half
-//! of the picture. Exact: in how many frames was each vertex seen. Counted: random pixels of the visible subject are
-//! traced to the skin, as training does with the termination points of its rays, and each adds 1 to its five nearest
-//! vertices. Prints Spearman's rank correlation of the two and writes a PNG (first argument, default
-//! `visibility_map.png`): exact from the front and the back, then counted.
+//! Exact visibility against the paper's running counts: a camera circles a body once while a fixed
+//! rectangle hides half of the picture. Exact: in how many frames was each vertex seen. Counted:
+//! random pixels of the visible subject are traced to the skin, as training does with the
+//! termination points of its rays, and each adds 1 to its five nearest vertices. Prints Spearman's
+//! rank correlation of the two and writes a PNG (first argument, default `visibility_map.png`):
+//! exact from the front and the back, then counted.
 //!
 //! A second argument names a body model to use in place of the embedded one.
 
@@ -20,7 +21,8 @@ use visibility::{RayMesh, View, VisibilityCounts, visible_vertices};
 
 const SIZE: u32 = 240;
 const FRAMES: usize = 100;
-/// Rays of a frame that land on the subject, in training: six patches of 32×32 pixels, about a sixth of them subject.
+/// Rays of a frame that land on the subject, in training: six patches of 32×32 pixels, about a
+/// sixth of them subject.
 const RAYS: usize = 1000;
 /// Vertices that a termination point counts for.
 const K: usize = 5;

@@ -1,7 +1,7 @@
-/// How often each vertex of a mesh was seen.
+/// Counts of how often each vertex of a mesh was seen.
 ///
-/// Counts are whole numbers in 64 bits, so they go on growing where `f32` would stop at 2²⁴, and they do not
-/// depend on the order in which they were added.
+/// Counts are whole numbers in 64 bits, so they go on growing where `f32` would stop at 2²⁴, and
+/// they do not depend on the order in which they were added.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct VisibilityCounts {
     counts: Vec<u64>,
@@ -70,8 +70,8 @@ impl VisibilityCounts {
         }
     }
 
-    /// Attention of a list of vertices, OccNeRF §3.3: (1 + c_i) / Σ_j (1 + c_j) into `out` (as many). Positive,
-    /// sums to 1, and uniform before anything was seen.
+    /// Attention of a list of vertices, OccNeRF §3.3: (1 + c_i) / Σ_j (1 + c_j) into `out` (as
+    /// many). Positive, sums to 1, and uniform before anything was seen.
     ///
     /// # Panics
     /// If the lengths differ or a vertex does not exist.
@@ -86,8 +86,9 @@ impl VisibilityCounts {
         }
     }
 
-    /// The attention of the code that was published with the paper, for comparisons: the counts of the list, less their
-    /// smallest, divided by what is then their largest, through a softmax. Within a factor of e of uniform, whatever the counts.
+    /// The attention of the code that was published with the paper, for comparisons: the counts of
+    /// the list, less their smallest, divided by what is then their largest, through a softmax.
+    /// Within a factor of e of uniform, whatever the counts.
     ///
     /// # Panics
     /// If the lengths differ or a vertex does not exist.

@@ -1,4 +1,4 @@
-/// What is wrong with a mesh.
+/// Errors of meshes.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
@@ -18,10 +18,10 @@ pub enum Error {
         /// The vertex.
         vertex: usize,
     },
-    /// More vertices or faces than are supported.
+    /// The mesh has more vertices or faces than are supported.
     #[error("{count} elements, at most 2^31 are supported")]
     TooMany {
-        /// How many there are.
+        /// Their number.
         count: usize,
     },
     /// A picture that is too large to rasterise.

@@ -1,5 +1,6 @@
-//! Which vertices of a mesh were seen, and how often: ray casts against a mesh, the vertices a camera sees, a rasteriser
-//! that says which triangle every pixel sees, running counts, and the attention weights made of them.
+//! Which vertices of a mesh were seen, and how often: ray casts against a mesh, the vertices a
+//! camera sees, a rasteriser that says which triangle every pixel sees, running counts, and the
+//! attention weights made of them.
 //!
 //! ```
 //! use glam::{Affine3A, Mat3, Vec3};
@@ -32,8 +33,9 @@
 //! # Ok::<(), visibility::Error>(())
 //! ```
 //!
-//! Conventions: cameras are OpenCV (x right, y down, z forward), extrinsics map world to camera, the first pixel's
-//! centre is (0.5, 0.5). Lengths are in the units of the vertices. Nothing depends on the number of threads.
+//! Conventions: cameras are OpenCV (x right, y down, z forward), extrinsics map world to camera,
+//! the first pixel's centre is (0.5, 0.5). Lengths are in the units of the vertices. Nothing
+//! depends on the number of threads.
 #![forbid(unsafe_code)]
 
 mod counts;
@@ -44,6 +46,11 @@ mod ray_mesh;
 mod tree;
 mod triangle;
 mod view;
+
+/// The README's examples, compiled as tests.
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+struct Readme;
 
 pub use counts::VisibilityCounts;
 pub use error::Error;

@@ -14,8 +14,8 @@ const TASK: usize = 64 * WIDTH;
 
 type Lanes = [f32; WIDTH];
 
-/// A packet, compiled for the widest instructions of the machine. A struct, since the shim through which pulp calls a
-/// closure is compiled for the baseline.
+/// A packet, compiled for the widest instructions of the machine. A struct, since the shim through
+/// which pulp calls a closure is compiled for the baseline.
 struct Walk<'a> {
     mesh: &'a RayMesh,
     rays: &'a [(Vec3, Vec3)],
@@ -32,7 +32,8 @@ impl pulp::WithSimd for Walk<'_> {
     }
 }
 
-/// AVX2 on x86-64, also where `pulp` is built with AVX-512 and the machine has it: packets are eight wide.
+/// AVX2 on x86-64, also where `pulp` is built with AVX-512 and the machine has it: packets are
+/// eight wide.
 pub(crate) fn arch() -> pulp::Arch {
     #[cfg(target_arch = "x86_64")]
     if let Some(simd) = pulp::x86::V3::try_new() {
@@ -42,11 +43,13 @@ pub(crate) fn arch() -> pulp::Arch {
 }
 
 impl RayMesh {
-    /// [`RayMesh::first_hit`] of many `rays` (R), each an origin and a direction, into `hits` (R), overwritten.
+    /// [`RayMesh::first_hit`] of many `rays` (R), each an origin and a direction, into `hits` (R),
+    /// overwritten.
     ///
-    /// Work is spread over the current rayon pool; the result does not depend on its size. Eight consecutive rays
-    /// share one walk through the tree, so put rays that are near each other side by side: the pixels of a row, or better
-    /// of a tile. Where faces are hit within rounding of the same depth another one may be found than for a single ray.
+    /// Work is spread over the current rayon pool; the result does not depend on its size. Eight
+    /// consecutive rays share one walk through the tree, so put rays that are near each other side
+    /// by side: the pixels of a row, or better of a tile. Where faces are hit within rounding of
+    /// the same depth another one may be found than for a single ray.
     ///
     /// # Panics
     /// If the lengths differ.
@@ -164,8 +167,8 @@ impl Packet {
         }
     }
 
-    /// The nearest depth at which a ray meets a child's box, as [`Node::entry`] has it; infinity where none does before
-    /// its end.
+    /// The nearest depth at which a ray meets a child's box, as [`Node::entry`] has it; infinity
+    /// where none does before its end.
     #[inline(always)]
     fn entry(&self, node: &Node, side: usize) -> f32 {
         let mut enter = [0.0; WIDTH];

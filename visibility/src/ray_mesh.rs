@@ -5,14 +5,14 @@ use crate::error::check_mesh;
 use crate::tree::{Child, LANES, MAX_DEPTH, Tree};
 use crate::triangle::{Pack, Ray};
 
-/// Beyond this many sizes of the mesh an origin's own rounding is larger than the mesh.
+/// Sizes of the mesh beyond which an origin's own rounding is larger than the mesh.
 const FAR: f32 = 1e15;
 
-/// How much larger the boxes are than their faces, in units of the tree, where coordinates are at most 2: two ulp.
-/// A ray within a side of a box is then inside whatever the sign of its zeros.
+/// Margin of the boxes around their faces, in units of the tree, where coordinates are at most 2:
+/// two ulp. A ray within a side of a box is then inside whatever the sign of its zeros.
 const PADDING: f32 = 2.0 * f32::EPSILON;
 
-/// Where a ray meets a mesh.
+/// The point where a ray meets a mesh.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Hit {
     /// Position along the ray, in units of its direction: the point is origin + t · direction.
@@ -23,11 +23,11 @@ pub struct Hit {
     pub barycentric: [f32; 3],
 }
 
-/// A triangle mesh to cast rays at. Both sides of a triangle are hit, and the intersection is watertight: no
-/// ray slips through an edge or a vertex that triangles share.
+/// A triangle mesh to cast rays at. Both sides of a triangle are hit, and the intersection is
+/// watertight: no ray slips through an edge or a vertex that triangles share.
 ///
-/// The faces keep their connectivity for life; [`RayMesh::refit`] moves the vertices. Queries take `&self` and
-/// may run on any number of threads.
+/// The faces keep their connectivity for life; [`RayMesh::refit`] moves the vertices. Queries take
+/// `&self` and may run on any number of threads.
 pub struct RayMesh {
     faces: Vec<[u32; 3]>,
     /// Multiplied by `scale`, a power of two, so that products neither overflow nor vanish.
@@ -54,8 +54,9 @@ impl RayMesh {
 
     /// Moves the vertices (V); the faces stay. Linear in the size of the mesh.
     ///
-    /// The tree keeps the shape it was built with: after a change that is no deformation queries stay exact but
-    /// become slow. Faces with a vertex that is not finite are nowhere until the next refit.
+    /// The tree keeps the shape it was built with: after a change that is no deformation queries
+    /// stay exact but become slow. Faces with a vertex that is not finite are nowhere until the
+    /// next refit.
     ///
     /// # Panics
     /// If the number of vertices is another than at the start.
@@ -93,11 +94,12 @@ impl RayMesh {
         });
     }
 
-    /// The first face the ray from `origin` along `direction` (of any length but zero) meets, at t ≥ 0.
+    /// The first face the ray from `origin` along `direction` (of any length but zero) meets, at t
+    /// ≥ 0.
     ///
-    /// `None` where it meets none; a ray in the plane of a triangle does not meet it. Also `None` for a
-    /// direction of zero, an origin or direction that is not finite, and an origin farther than 10¹⁵ times the
-    /// size of the mesh. Of faces hit at the same t it is the lowest.
+    /// `None` where it meets none; a ray in the plane of a triangle does not meet it. Also `None`
+    /// for a direction of zero, an origin or direction that is not finite, and an origin farther
+    /// than 10¹⁵ times the size of the mesh. Of faces hit at the same t it is the lowest.
     #[must_use]
     pub fn first_hit(&self, origin: Vec3, direction: Vec3) -> Option<Hit> {
         let (ray, to_t) = self.ray(origin, direction)?;
@@ -123,14 +125,14 @@ impl RayMesh {
         first
     }
 
-    /// Whether the ray meets any face at 0 ≤ t < `t_max`, t in units of `direction`. False for the rays for
-    /// which [`RayMesh::first_hit`] is `None`, and for a `t_max` of NaN.
+    /// Whether the ray meets any face at 0 ≤ t < `t_max`, t in units of `direction`. False for the
+    /// rays for which [`RayMesh::first_hit`] is `None`, and for a `t_max` of NaN.
     #[must_use]
     pub fn is_blocked(&self, origin: Vec3, direction: Vec3, t_max: f32) -> bool {
         self.is_blocked_by(origin, direction, t_max, |_| true)
     }
 
-    /// The same counting only faces that `counts` accepts.
+    /// [`RayMesh::is_blocked`] counting only faces that `counts` accepts.
     pub(crate) fn is_blocked_by(
         &self,
         origin: Vec3,
@@ -162,8 +164,8 @@ impl RayMesh {
         self.vertices.get(index) == Some(&(position * self.scale))
     }
 
-    /// The ray in the units of the tree, its direction multiplied by a power of two; and the factor that turns a
-    /// depth along it into one in units of `direction`.
+    /// The ray in the units of the tree, its direction multiplied by a power of two; and the factor
+    /// that turns a depth along it into one in units of `direction`.
     #[inline(always)]
     pub(crate) fn ray(&self, origin: Vec3, direction: Vec3) -> Option<(Ray, f64)> {
         let longest = direction.abs().max_element();
@@ -186,8 +188,8 @@ impl RayMesh {
         Some((Ray::new(o, d), to_t))
     }
 
-    /// Visits the leaves the ray meets before `end`, nearest box first. `visit` returns the new end, or `None`
-    /// to stop.
+    /// Visits the leaves the ray meets before `end`, nearest box first. `visit` returns the new
+    /// end, or `None` to stop.
     #[inline(always)]
     fn walk(&self, ray: &Ray, mut end: f32, mut visit: impl FnMut(usize) -> Option<f32>) {
         if self.tree.nodes.is_empty() {

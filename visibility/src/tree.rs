@@ -1,5 +1,5 @@
-//! Binary tree of boxes over triangles, built by obvhs and laid out for this crate's traversal: one cache line
-//! a node with the boxes of both children, four triangles a leaf.
+//! Binary tree of boxes over triangles, built by obvhs and laid out for this crate's traversal: one
+//! cache line a node with the boxes of both children, four triangles a leaf.
 
 use std::time::Duration;
 
@@ -16,7 +16,8 @@ const LEAF: u32 = 1 << 31;
 /// Deepest tree that is walked with a stack of fixed size.
 pub(crate) const MAX_DEPTH: usize = 96;
 
-/// Bounds of two children: `axes[a]` = (lowest of left, of right, highest of left, of right) along axis a.
+/// Bounds of two children: `axes[a]` = (lowest of left, of right, highest of left, of right) along
+/// axis a.
 #[derive(Clone, Copy)]
 pub(crate) struct Node {
     pub axes: [Vec4; 3],
@@ -37,9 +38,9 @@ impl Node {
         if child & LEAF == 0 { Child::Node(child) } else { Child::Leaf(child & !LEAF) }
     }
 
-    /// Where along the ray each child's box begins, not before its origin; infinity where it is missed or lies
-    /// beyond `end`. Widened at both ends by more than rounding can take away, so no box that holds a hit is missed, nor
-    /// seems to begin behind it.
+    /// Distances along the ray at which each child's box begins, not before its origin; infinity
+    /// where it is missed or lies beyond `end`. Widened at both ends by more than rounding can take
+    /// away, so no box that holds a hit is missed, nor seems to begin behind it.
     #[inline(always)]
     pub fn entry(&self, origin: [Vec4; 3], inverse: [Vec4; 3], end: f32) -> [f32; 2] {
         let mut enter = Vec4::ZERO;
@@ -75,8 +76,8 @@ pub(crate) struct Tree {
 }
 
 impl Tree {
-    /// Builds over the faces at the positions `vertices`, which must be finite and not near overflow. Call
-    /// [`Tree::refit`] afterwards.
+    /// Builds over the faces at the positions `vertices`, which must be finite and not near
+    /// overflow. Call [`Tree::refit`] afterwards.
     pub fn new(vertices: &[Vec3], faces: &[[u32; 3]]) -> Self {
         let boxes: Vec<Aabb> = faces
             .iter()
@@ -135,8 +136,8 @@ impl Tree {
         (self.leaves.len() as u32 - 1) | LEAF
     }
 
-    /// Recomputes every box. `leaf_box` gives the lowest and highest corner of the faces of a leaf; `None` if
-    /// all of them are nowhere.
+    /// Recomputes every box. `leaf_box` gives the lowest and highest corner of the faces of a leaf;
+    /// `None` if all of them are nowhere.
     pub fn refit(&mut self, leaf_box: impl Fn(&[u32; LANES]) -> Option<[Vec3; 2]>) {
         for n in (0..self.nodes.len()).rev() {
             let [left, right] = [0, 1].map(|side| match self.nodes[n].child(side) {

@@ -1,5 +1,5 @@
-//! Watertight intersection of a ray with four triangles (Woop, Benthin and Wald 2013): a ray through an edge
-//! shared by two triangles hits at least one of them.
+//! Watertight intersection of a ray with four triangles (Woop, Benthin and Wald 2013): a ray
+//! through an edge shared by two triangles hits at least one of them.
 
 use glam::{Vec3, Vec4};
 
@@ -81,8 +81,8 @@ impl Pack {
         let mut w = b[0] * a[1] - b[1] * a[0];
         let zero = Vec4::ZERO;
         if (u.cmpeq(zero) | v.cmpeq(zero) | w.cmpeq(zero)).any() {
-            // Products of two f32 are exact in f64: the sign of an edge function is then right, and the same
-            // for both triangles of the edge.
+            // Products of two f32 are exact in f64: the sign of an edge function is then right, and
+            // the same for both triangles of the edge.
             u = exact(u, c, b);
             v = exact(v, a, c);
             w = exact(w, b, a);

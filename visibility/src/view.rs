@@ -3,12 +3,12 @@ use rayon::prelude::*;
 
 use crate::RayMesh;
 
-/// How much closer than the vertex, as a share of its distance, something must be to hide it. Far above the
+/// Share of a vertex's distance by which something must be closer to hide it. Far above the
 /// rounding of the intersection (1e-6) and below any gap that matters (0.03 mm at 3 m).
 const MARGIN: f32 = 1e-5;
 
-/// A pinhole camera of the OpenCV convention: x right, y down, z forward; the centre of the first pixel is at
-/// (0.5, 0.5).
+/// A pinhole camera of the OpenCV convention: x right, y down, z forward; the centre of the first
+/// pixel is at (0.5, 0.5).
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct View {
     /// Pixels from normalised camera coordinates.
@@ -35,8 +35,8 @@ impl View {
         centre.is_finite().then_some(centre)
     }
 
-    /// Row-major index of the pixel that a point of the world falls into; `None` behind the camera, outside the
-    /// image, or for a point that is not finite.
+    /// Row-major index of the pixel that a point of the world falls into; `None` behind the camera,
+    /// outside the image, or for a point that is not finite.
     #[must_use]
     pub fn pixel(&self, point: Vec3) -> Option<usize> {
         let p = self.extrinsics.transform_point3(point);
@@ -48,13 +48,13 @@ impl View {
     }
 }
 
-/// Which of `vertices` (V) the view sees: those in front of the camera that fall into a pixel of the image, and
-/// into one that is `usable` (H·W row-major, `true` = nothing but the mesh is in front; `None`: all are), to which
-/// nothing of `mesh` blocks the way from the camera.
+/// Marks those of `vertices` (V) that the view sees: those in front of the camera that fall into a
+/// pixel of the image, and into one that is `usable` (H·W row-major, `true` = nothing but the mesh
+/// is in front; `None`: all are), to which nothing of `mesh` blocks the way from the camera.
 ///
-/// The vertices are usually those of the mesh, in its order. Such a vertex is not hidden by its own faces,
-/// however obliquely they are seen; other points are, unless they lie within a relative 1e-5 of the surface.
-/// Nothing is visible where the extrinsics have no inverse.
+/// The vertices are usually those of the mesh, in its order. Such a vertex is not hidden by its own
+/// faces, however obliquely they are seen; other points are, unless they lie within a relative 1e-5
+/// of the surface. Nothing is visible where the extrinsics have no inverse.
 ///
 /// # Panics
 /// If `usable` has not `width · height` entries.

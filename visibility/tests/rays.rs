@@ -13,8 +13,8 @@ fn build(mesh: &TriMesh) -> RayMesh {
     RayMesh::new(&mesh.vertices, &mesh.faces).unwrap()
 }
 
-/// Whether the mesh moved by a hair either way along x, y and z would give the oracle another answer: such rays
-/// graze an edge, and rounding decides.
+/// Whether the mesh moved by a hair either way along x, y and z would give the oracle another
+/// answer: such rays graze an edge, and rounding decides.
 fn is_clear(mesh: &TriMesh, o: Vec3, d: Vec3) -> Option<Option<(u32, f64)>> {
     let answer = oracle::first_hit(&mesh.vertices, &mesh.faces, o, d);
     let size = mesh.vertices.iter().fold(0.0, |m: f32, v| m.max(v.abs().max_element()));

@@ -28,7 +28,8 @@ fn visible(mesh: &TriMesh, view: &View) -> Vec<bool> {
     visible_vertices(&rays, &mesh.vertices, view, None)
 }
 
-/// Whether anything but the vertex's own faces is in front of it; `None` within rounding of an edge.
+/// Whether anything but the vertex's own faces is in front of it; `None` within rounding of an
+/// edge.
 fn plain(mesh: &TriMesh, view: &View, vertex: usize) -> Option<bool> {
     let v = mesh.vertices[vertex];
     let eye = view.centre().unwrap();

@@ -1,5 +1,5 @@
-//! Compositing 6144 rays (six patches of 32×32) of 128 samples, forward and backward, on two threads, against a plain
-//! implementation. items/s are samples.
+//! Compositing 6144 rays (six patches of 32×32) of 128 samples, forward and backward, on two
+//! threads, against a plain implementation. items/s are samples.
 
 use divan::counter::ItemsCount;
 use divan::{Bencher, black_box};

@@ -1,4 +1,5 @@
-//! Renders a soft, striped sphere over a sky: `cargo run --release -p volrender --example soft_sphere [OUT.png]`.
+//! Renders a soft, striped sphere over a sky: `cargo run --release -p volrender --example
+//! soft_sphere [OUT.png]`.
 //!
 //! Left the colours, right the depth of what was hit (near is bright).
 

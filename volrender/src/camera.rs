@@ -22,7 +22,8 @@ pub struct Camera {
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
-    /// Not a matrix of the form \[fx 0 cx; 0 fy cy; 0 0 1\] with positive, finite focal lengths.
+    /// The intrinsics are not a matrix of the form \[fx 0 cx; 0 fy cy; 0 0 1\] with positive,
+    /// finite focal lengths.
     #[error("intrinsics {0} are not [fx 0 cx; 0 fy cy; 0 0 1] with positive focal lengths")]
     Intrinsics(Mat3),
     /// Values that are not finite, or a linear part that cannot be inverted.
@@ -47,9 +48,9 @@ impl Camera {
     /// A camera from a 3×3 calibration matrix and extrinsics that map world to camera.
     ///
     /// # Errors
-    /// Skewed or otherwise unusual intrinsics, extrinsics that are not finite or not invertible, no pixels. A
-    /// rotation that is not quite orthonormal, or scaled, is accepted: rays stay exact and of unit length, the
-    /// depth of [`Camera::project`] is then in the camera's unit.
+    /// Skewed or otherwise unusual intrinsics, extrinsics that are not finite or not invertible, no
+    /// pixels. A rotation that is not quite orthonormal, or scaled, is accepted: rays stay exact
+    /// and of unit length, the depth of [`Camera::project`] is then in the camera's unit.
     pub fn new(intrinsics: Mat3, world_to_camera: Affine3A, width: u32, height: u32) -> Result<Self, Error> {
         let k = intrinsics;
         let focal = Vec2::new(k.x_axis.x, k.y_axis.y);
@@ -79,7 +80,7 @@ impl Camera {
         Mat3::from_cols(Vec3::new(self.focal.x, 0.0, 0.0), Vec3::new(0.0, self.focal.y, 0.0), self.centre.extend(1.0))
     }
 
-    /// Where the camera stands, in the world.
+    /// Position of the camera in the world.
     #[must_use]
     pub fn centre_of_projection(&self) -> Vec3 {
         self.world_to_camera.inverse().translation.into()
@@ -95,8 +96,8 @@ impl Camera {
         Ray { origin: camera_to_world.translation.into(), direction: direction.normalize_or_zero() }
     }
 
-    /// Image position and depth (u, v, z) of a point of the world, whether inside the image or not. `None` where
-    /// it is not in front of the camera, or the result is not finite.
+    /// Image position and depth (u, v, z) of a point of the world, whether inside the image or not.
+    /// `None` where it is not in front of the camera, or the result is not finite.
     #[must_use]
     pub fn project(&self, x: Vec3) -> Option<Vec3> {
         let p = self.world_to_camera.transform_point3(x);
@@ -116,8 +117,8 @@ impl Camera {
         Self { focal: self.focal * scale, centre: self.centre * scale, width, height, ..*self }
     }
 
-    /// Where a lens with `distortion` puts what a perfect lens puts at `pixel`: read a distorted photograph here
-    /// to fill `pixel` of the undistorted one.
+    /// The pixel where a lens with `distortion` puts what a perfect lens puts at `pixel`: read a
+    /// distorted photograph here to fill `pixel` of the undistorted one.
     #[must_use]
     pub fn distort_pixel(&self, distortion: &Distortion, pixel: Vec2) -> Vec2 {
         let p = (pixel - self.centre) / self.focal;

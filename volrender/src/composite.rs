@@ -109,7 +109,8 @@ fn forward(samples: RaySamples<'_>, background: Vec3, weights: &mut [f32]) -> Co
         if let Some(i) = first_largest(alpha, &mut largest) {
             termination = Some((block * BLOCK + i) as u32);
         }
-        // One sum each, in the order of the samples: leaving out those with α = 0 then changes no bit.
+        // One sum each, in the order of the samples: leaving out those with α = 0 then changes no
+        // bit.
         let outputs = weights.iter_mut().zip(t).zip(rgb);
         for (&alpha, ((weight, &t), &rgb)) in alpha.iter().zip(outputs) {
             *weight = transmittance * alpha;
@@ -124,8 +125,8 @@ fn forward(samples: RaySamples<'_>, background: Vec3, weights: &mut [f32]) -> Co
     Composite { color: sum.truncate() + (1.0 - opacity) * background, opacity, depth: sum.w, termination }
 }
 
-/// The first index of the largest of `alpha` (at most [`BLOCK`]) that is larger than `largest`, which it then
-/// becomes; `None` where there is none. NaN is not larger than anything.
+/// The first index of the largest of `alpha` (at most [`BLOCK`]) that is larger than `largest`,
+/// which it then becomes; `None` where there is none. NaN is not larger than anything.
 #[inline(always)]
 fn first_largest(alpha: &[f32], largest: &mut f32) -> Option<usize> {
     let mut lanes = [0.0f32; LANES];

@@ -4,23 +4,24 @@ use crate::composite::{BLOCK, RaySamples, flushed};
 use crate::exponential::one_minus_exp;
 use crate::simd::Kernel;
 
-/// Where the gradients of one ray's samples go, each (S); overwritten.
+/// Outputs for the gradients of one ray's samples, each (S); overwritten.
 #[derive(Debug)]
 pub struct SampleGradients<'a> {
-    /// By density.
+    /// Gradient by density.
     pub d_sigma: &'a mut [f32],
-    /// By colour.
+    /// Gradient by colour.
     pub d_rgb: &'a mut [Vec3],
-    /// By likelihood.
+    /// Gradient by likelihood.
     pub d_likelihood: &'a mut [f32],
 }
 
-/// Writes the gradients of [`composite`](crate::composite) by the samples of one ray, given those of
-/// its colour and its opacity, and the `weights` (S) that it wrote.
+/// Writes the gradients of [`composite`](crate::composite) by the samples of one ray, given those
+/// of its colour and its opacity, and the `weights` (S) that it wrote.
 ///
-/// With V_i = c_i · d_color + d_opacity the value of stopping at sample i, and R_i the value of everything behind it
-/// (R_S = background · d_color, R_{i−1} = α_i V_i + (1 − α_i) R_i), the derivative by α_i is T_i (V_i − R_i). Nothing is
-/// divided by 1 − α, so that an opaque sample, and every sample behind it, has its exact gradient.
+/// With V_i = c_i · d_color + d_opacity the value of stopping at sample i, and R_i the value of
+/// everything behind it (R_S = background · d_color, R_{i−1} = α_i V_i + (1 − α_i) R_i), the
+/// derivative by α_i is T_i (V_i − R_i). Nothing is divided by 1 − α, so that an opaque sample, and
+/// every sample behind it, has its exact gradient.
 ///
 /// # Panics
 /// Where the slices differ in length.
@@ -54,7 +55,8 @@ fn backward(
 ) {
     let RaySamples { sigma, likelihood, delta, rgb, .. } = samples;
     let SampleGradients { d_sigma, d_rgb, d_likelihood } = gradients;
-    // The outputs serve as scratch: dα/dσ, dα/df, and in d_rgb the transmittance in front of each sample.
+    // The outputs serve as scratch: dα/dσ, dα/df, and in d_rgb the transmittance in front of each
+    // sample.
     let mut transmittance = 1.0;
     let inputs = sigma.chunks(BLOCK).zip(likelihood.chunks(BLOCK)).zip(delta.chunks(BLOCK));
     let outputs = d_sigma.chunks_mut(BLOCK).zip(d_likelihood.chunks_mut(BLOCK)).zip(d_rgb.chunks_mut(BLOCK));

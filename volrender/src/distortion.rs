@@ -22,7 +22,7 @@ pub struct Distortion {
 const MAX_STEPS: usize = 50;
 
 impl Distortion {
-    /// From OpenCV's order (k1, k2, p1, p2, k3).
+    /// Takes OpenCV's order (k1, k2, p1, p2, k3).
     #[must_use]
     pub fn from_opencv([k1, k2, p1, p2, k3]: [f32; 5]) -> Self {
         Self { k1, k2, p1, p2, k3 }
@@ -34,8 +34,9 @@ impl Distortion {
         *self == Self::default()
     }
 
-    /// Ideal distance from the axis from which on the radial part folds back, so that a picture would show the same twice:
-    /// the first at which r · (1 + k1 r² + k2 r⁴ + k3 r⁶) no longer grows; infinite where it always does.
+    /// Ideal distance from the axis from which on the radial part folds back, so that a picture
+    /// would show the same twice: the first at which r · (1 + k1 r² + k2 r⁴ + k3 r⁶) no longer
+    /// grows; infinite where it always does.
     #[must_use]
     pub fn fold_radius(&self) -> f32 {
         let [a, b, c] = [3.0 * f64::from(self.k1), 5.0 * f64::from(self.k2), 7.0 * f64::from(self.k3)];
@@ -75,8 +76,8 @@ impl Distortion {
 
     /// Distorted to ideal coordinates, by Newton's method from `p`.
     ///
-    /// `None` where it does not converge: beyond the radius where the model folds back nothing maps to `p`, and
-    /// the point it finds may then lie on another branch of the fold.
+    /// `None` where it does not converge: beyond the radius where the model folds back nothing maps
+    /// to `p`, and the point it finds may then lie on another branch of the fold.
     #[must_use]
     pub fn undistort(&self, p: Vec2) -> Option<Vec2> {
         if self.is_none() {

@@ -1,8 +1,9 @@
-/// (1 − exp(−x), exp(−x)), both to a few units in the last place, without branches so that loops vectorise.
+/// (1 − exp(−x), exp(−x)), both to a few units in the last place, without branches so that loops
+/// vectorise.
 ///
-/// exp(−x) = 2ⁿ (1 + q) with |r| ≤ ln 2 / 2 and q = expm1(r): the first result is (1 − 2ⁿ) − 2ⁿ q, which for small x
-/// (n = 0) is −q, free of the cancellation of 1 − exp. x ≥ 87 gives exactly 1 and about 1e-38, x ≤ −88 is treated as
-/// −88, NaN stays NaN.
+/// exp(−x) = 2ⁿ (1 + q) with |r| ≤ ln 2 / 2 and q = expm1(r): the first result is (1 − 2ⁿ) − 2ⁿ q,
+/// which for small x (n = 0) is −q, free of the cancellation of 1 − exp. x ≥ 87 gives exactly 1 and
+/// about 1e-38, x ≤ −88 is treated as −88, NaN stays NaN.
 #[inline(always)]
 pub(crate) fn one_minus_exp(x: f32) -> (f32, f32) {
     const LN_2_HIGH: f32 = 0.693_359_4; // 9 bits, so that n · LN_2_HIGH is exact

@@ -1,5 +1,6 @@
 //! The outer parts of a volume renderer: cameras and rays, patches of pixels, bounds, the cells
-//! worth sampling, samples along a ray, alpha compositing with its backward pass, and image metrics.
+//! worth sampling, samples along a ray, alpha compositing with its backward pass, and image
+//! metrics.
 //!
 //! ```
 //! use volrender::{Aabb, Camera, RaySamples, bin_edges, bin_midpoints, bin_widths, composite};
@@ -29,10 +30,11 @@
 //!
 //! # Conventions
 //!
-//! * Cameras are OpenCV: x right, y down, z forward, extrinsics map world to camera. Pixel (column, row) has its
-//!   centre at (column + 0.5, row + 0.5).
+//! * Cameras are OpenCV: x right, y down, z forward, extrinsics map world to camera. Pixel (column,
+//!   row) has its centre at (column + 0.5, row + 0.5).
 //! * Ray directions have unit length, so t, δ and depth are lengths in the unit of the world.
-//! * α_i = f_i (1 − exp(−σ_i δ_i)), w_i = α_i Π_{j<i} (1 − α_j), C = Σ w_i c_i + (1 − Σ w_i) · background.
+//! * α_i = f_i (1 − exp(−σ_i δ_i)), w_i = α_i Π_{j<i} (1 − α_j), C = Σ w_i c_i + (1 − Σ w_i) ·
+//!   background.
 //! * Images are row-major H × W × 3, values in \[0, 1\].
 
 mod camera;
@@ -45,6 +47,11 @@ mod occupancy;
 mod ray;
 mod sampling;
 mod simd;
+
+/// The README's examples, compiled as tests.
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+struct Readme;
 
 pub use camera::{Camera, Error};
 pub use composite::{Composite, RaySamples, composite};

@@ -4,8 +4,8 @@ use rayon::prelude::*;
 
 use crate::camera::Error;
 
-/// Peak signal-to-noise ratio in dB, −10 log10 of the mean squared difference of all values (any shape). Infinite
-/// for equal images, NaN for empty ones.
+/// Peak signal-to-noise ratio in dB, −10 log10 of the mean squared difference of all values (any
+/// shape). Infinite for equal images, NaN for empty ones.
 ///
 /// # Panics
 /// Where the lengths differ.
@@ -16,7 +16,8 @@ pub fn psnr(a: &[f32], b: &[f32]) -> f64 {
     decibels(sum / a.len() as f64)
 }
 
-/// [`psnr`] of the pixels where `mask` (H·W) is true, all three channels of each. `None` where it never is.
+/// [`psnr`] of the pixels where `mask` (H·W) is true, all three channels of each. `None` where it
+/// never is.
 ///
 /// # Panics
 /// Where the lengths are not 3·H·W, 3·H·W and H·W.
@@ -46,9 +47,10 @@ fn decibels(mean_squared: f64) -> f64 {
 const WINDOW: usize = 7;
 const BORDER: usize = WINDOW / 2;
 
-/// Structural similarity (Wang et al. 2004), the mean over the three channels and the pixels whose window lies
-/// within the image. It equals scikit-image's `structural_similarity(a, b, data_range=1, channel_axis=-1)`: 7×7 uniform
-/// window, sample covariance (n / (n − 1)), K1 0.01, K2 0.03, data range 1.
+/// Structural similarity (Wang et al. 2004), the mean over the three channels and the pixels whose
+/// window lies within the image. It equals scikit-image's `structural_similarity(a, b,
+/// data_range=1, channel_axis=-1)`: 7×7 uniform window, sample covariance (n / (n − 1)), K1 0.01,
+/// K2 0.03, data range 1.
 ///
 /// # Errors
 /// [`Error::ImageSize`] for an image smaller than the window.
@@ -65,8 +67,9 @@ pub fn ssim(a: &[f32], b: &[f32], width: usize, height: usize) -> Result<f64, Er
     Ok(sum / ((width - 2 * BORDER) * (height - 2 * BORDER)) as f64)
 }
 
-/// Structural similarity around every pixel (H·W), channels averaged, with the constants of [`ssim`]. Beyond the
-/// border the image is mirrored with the edge sample repeated (scipy's `reflect`), so any size but 0 has a map.
+/// Structural similarity around every pixel (H·W), channels averaged, with the constants of
+/// [`ssim`]. Beyond the border the image is mirrored with the edge sample repeated (scipy's
+/// `reflect`), so any size but 0 has a map.
 ///
 /// # Panics
 /// Where the lengths are not 3·H·W.

@@ -18,7 +18,8 @@ pub struct Occupancy {
     min: Vec3,
     per_cell: f32,
     size: IVec3,
-    /// A bit a cell, z by z, y by y: `words` for the cells of a row. All of them together fit a second-level cache.
+    /// A bit a cell, z by z, y by y: `words` for the cells of a row. All of them together fit a
+    /// second-level cache.
     live: Vec<u64>,
     words: usize,
     reaches: Vec<Reach>,
@@ -27,7 +28,7 @@ pub struct Occupancy {
     region: Option<Aabb>,
 }
 
-/// How far from a mesh cells are marked, and how large they are, in the unit of its vertices.
+/// Distance from a mesh within which cells are marked, and their size, in the unit of its vertices.
 #[derive(Clone, Copy, Debug)]
 pub struct OccupancyConfig {
     /// Upper bound of the margins of the faces, outside.
@@ -101,7 +102,8 @@ impl Occupancy {
         outside.clear();
         outside.resize((size.x * size.y * size.z) as usize, false);
         self.queue.clear();
-        // The border is wider than a cell, so the outermost layer is empty and the first cell reaches all of it.
+        // The border is wider than a cell, so the outermost layer is empty and the first cell
+        // reaches all of it.
         self.queue.push(0);
         outside[0] = true;
         while let Some(index) = self.queue.pop() {
@@ -132,7 +134,8 @@ impl Occupancy {
         self.outside = outside;
     }
 
-    /// The box of everything within the margin of the mesh, where rays can meet anything; `None` for a mesh that is nowhere.
+    /// The box of everything within the margin of the mesh, where rays can meet anything; `None`
+    /// for a mesh that is nowhere.
     #[must_use]
     pub fn region(&self) -> Option<Aabb> {
         self.region
@@ -142,7 +145,8 @@ impl Occupancy {
     #[inline]
     #[must_use]
     pub fn is_live(&self, point: Vec3) -> bool {
-        // Truncation is the floor of what is not negative; NaN fails the comparison, and huge values saturate.
+        // Truncation is the floor of what is not negative; NaN fails the comparison, and huge
+        // values saturate.
         let place = (point - self.min) * self.per_cell;
         if !place.cmpge(Vec3::ZERO).all() {
             return false;
@@ -158,15 +162,17 @@ impl Occupancy {
     }
 }
 
-/// The cells that are within a triangle's margins, in units of cells: those that three bodies have in common.
+/// The cells that are within a triangle's margins, in units of cells: those that three bodies have
+/// in common.
 ///
-/// - A box: what is closest to the triangle lies in the direction of its normal, or within 60° of it.
-/// - What lies between two planes parallel to the triangle: what is closest to it, or to one of its edges or corners, is no
-///   farther from its plane than from itself.
+/// - A box: what is closest to the triangle lies in the direction of its normal, or within 60° of
+///   it.
+/// - What lies between two planes parallel to the triangle: what is closest to it, or to one of its
+///   edges or corners, is no farther from its plane than from itself.
 /// - What is no farther than the larger margin from the triangle's box.
 #[derive(Clone, Copy, Debug)]
 struct Reach {
-    /// Of the first body, cut off where the grid ends.
+    /// First and last cell of the first body, cut off where the grid ends.
     first: IVec3,
     last: IVec3,
     /// Bounds of normal · (centre of a cell).
@@ -175,15 +181,15 @@ struct Reach {
     high: f32,
     /// One over the first coordinate of the normal, finite.
     per_x: f32,
-    /// Corners of the triangle's box, and the square of the larger margin; infinite where the inside is to be sealed off,
-    /// which whole boxes do.
+    /// Corners of the triangle's box, and the square of the larger margin; infinite where the
+    /// inside is to be sealed off, which whole boxes do.
     box_low: Vec3,
     box_high: Vec3,
     farthest: f32,
 }
 
 impl Reach {
-    /// More than rounding takes, cells.
+    /// Margin for rounding, cells.
     const ROUNDING: f32 = 0.01;
 
     fn new(corners: [Vec3; 3], margin: f32, depth: f32, fills: bool, size: IVec3) -> Self {
@@ -231,7 +237,8 @@ impl Reach {
         }
     }
 
-    /// First and last cell of row (y, z) that are no farther than `left` along x; none where the first lies after the last.
+    /// First and last cell of row (y, z) that are no farther than `left` along x; none where the
+    /// first lies after the last.
     #[inline]
     fn row(&self, y: i32, z: i32, left: f32) -> (i32, i32) {
         let rest = self.normal.y * (y as f32 + 0.5) + self.normal.z * (z as f32 + 0.5);
@@ -256,9 +263,10 @@ fn set_bits(words: &mut [u64], from: usize, to: usize) {
     }
 }
 
-/// How far the unit vectors within 60° of `normal` reach along each axis, at least 0. A point lies in the direction of the
-/// normal from a closest point inside a face, and between the normals around from one on an edge or a corner: within 60° of
-/// one of them unless the surface turns by more than 120° there.
+/// Extent along each axis of the unit vectors within 60° of `normal`, at least 0. A point lies in
+/// the direction of the normal from a closest point inside a face, and between the normals around
+/// from one on an edge or a corner: within 60° of one of them unless the surface turns by more than
+/// 120° there.
 fn support(normal: Vec3) -> Vec3 {
     const COS: f32 = 0.5;
     const SIN: f32 = 0.866_025_4;

@@ -3,7 +3,7 @@ use glam::Vec3;
 /// A half-line.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Ray {
-    /// Where t is 0.
+    /// The point at t = 0.
     pub origin: Vec3,
     /// Unit length.
     pub direction: Vec3,
@@ -30,8 +30,8 @@ impl Aabb {
     /// The box without any point.
     pub const EMPTY: Self = Self { min: Vec3::INFINITY, max: Vec3::NEG_INFINITY };
 
-    /// The smallest box around `points`. Points that are not finite do not count; without any point it is
-    /// [`Aabb::EMPTY`].
+    /// The smallest box around `points`. Points that are not finite do not count; without any point
+    /// it is [`Aabb::EMPTY`].
     #[must_use]
     pub fn from_points(points: &[Vec3]) -> Self {
         points
@@ -40,7 +40,8 @@ impl Aabb {
             .fold(Self::EMPTY, |bounds, &p| Self { min: bounds.min.min(p), max: bounds.max.max(p) })
     }
 
-    /// The box with every face moved outwards by `margin`. A negative margin shrinks it, an empty box stays empty.
+    /// The box with every face moved outwards by `margin`. A negative margin shrinks it, an empty
+    /// box stays empty.
     #[must_use]
     pub fn inflated(&self, margin: f32) -> Self {
         if self.is_empty() {
@@ -63,10 +64,12 @@ impl Aabb {
 
     /// The range of t ≥ 0 for which the ray is in the box, as (near, far) with near < far.
     ///
-    /// `None` where the ray misses, where it touches in a single point (a flat box seen from its side is touched
-    /// by no ray for longer), where the direction is zero, the box empty, or anything is NaN or infinite.
+    /// `None` where the ray misses, where it touches in a single point (a flat box seen from its
+    /// side is touched by no ray for longer), where the direction is zero, the box empty, or
+    /// anything is NaN or infinite.
     ///
-    /// A direction parallel to a face is handled exactly: such an axis either excludes the ray or does not bound it.
+    /// A direction parallel to a face is handled exactly: such an axis either excludes the ray or
+    /// does not bound it.
     #[must_use]
     pub fn intersect(&self, ray: &Ray) -> Option<(f32, f32)> {
         if self.is_empty() || !ray.origin.is_finite() || !ray.direction.is_finite() {

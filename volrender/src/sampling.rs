@@ -1,6 +1,6 @@
-/// The pixels of a square of side `size` around the pixel (column, row) `around`, moved and cut as much as it takes to be
-/// inside an image of (W, H), of at most 2^32 pixels: row-major indices into (H, W), row by row. What the square is around may be
-/// outside.
+/// The pixels of a square of side `size` around the pixel (column, row) `around`, moved and cut as
+/// much as it takes to be inside an image of (W, H), of at most 2^32 pixels: row-major indices into
+/// (H, W), row by row. What the square is around may be outside.
 ///
 /// ```
 /// let corner = volrender::patch((0, 1), 2, (4, 3));
@@ -13,8 +13,8 @@ pub fn patch(around: (u32, u32), size: u32, (width, height): (u32, u32)) -> impl
     (top..top + size).flat_map(move |row| (left..left + size).map(move |column| row * width + column))
 }
 
-/// Writes the n + 1 edges of `n` equal bins between `near` and `far` into `edges`. The first is `near` and the
-/// last `far`, exactly; with `n` 0 there is one edge, `near`.
+/// Writes the n + 1 edges of `n` equal bins between `near` and `far` into `edges`. The first is
+/// `near` and the last `far`, exactly; with `n` 0 there is one edge, `near`.
 ///
 /// # Panics
 /// Where `edges` does not have n + 1 places.
@@ -53,8 +53,8 @@ pub fn bin_widths(edges: &[f32], delta: &mut [f32]) {
 
 /// Writes one sample of each bin into `t` (S), for ascending `edges` (S + 1): stratified sampling.
 ///
-/// `jitter` is called once a bin, in order, for a number in [0, 1) that says where in the bin; values outside are
-/// clamped and NaN is 0, so that a sample never leaves its bin.
+/// `jitter` is called once a bin, in order, for a number in [0, 1) that says where in the bin;
+/// values outside are clamped and NaN is 0, so that a sample never leaves its bin.
 ///
 /// # Panics
 /// Where the lengths do not fit.

@@ -1,4 +1,5 @@
-//! Compositing against the plain one of the test kit, its gradients against finite differences of that.
+//! Compositing against the plain one of the test kit, its gradients against finite differences of
+//! that.
 
 use approx::{abs_diff_eq, assert_abs_diff_eq};
 use glam::Vec3;
@@ -56,8 +57,8 @@ impl Samples {
 
     fn check_gradients(&self, background: Vec3, d_color: Vec3, d_opacity: f32) {
         let d = self.backward(background, d_color, d_opacity);
-        // The oracle is exact, so what is left is the backward's f32 rounding (a few ulps a sample, values up to
-        // about 4) and the third derivative of exp, δ³ step² / 6.
+        // The oracle is exact, so what is left is the backward's f32 rounding (a few ulps a sample,
+        // values up to about 4) and the third derivative of exp, δ³ step² / 6.
         let ulps = 8.0 * f64::from(f32::EPSILON) * (4 + self.sigma.len()) as f64;
         let tolerance = Tolerance { abs: ulps, rel: 1e-3 };
         assert_gradient("likelihood", &self.likelihood, &d.likelihood, 1e-3, tolerance, |x| {

@@ -243,7 +243,8 @@ fn no_bins_and_odd_jitter_are_fine() {
 
 #[test]
 fn a_lens_agrees_with_opencvs_formula() {
-    // x' = x (1 + k1 r² + k2 r⁴ + k3 r⁶) + 2 p1 x y + p2 (r² + 2 x²), by hand at (0.5, 0.25), r² = 0.3125.
+    // x' = x (1 + k1 r² + k2 r⁴ + k3 r⁶) + 2 p1 x y + p2 (r² + 2 x²), by hand at (0.5, 0.25), r² =
+    // 0.3125.
     let lens = Distortion::from_opencv([0.1, -0.2, 0.01, 0.02, 0.3]);
     let s = 1.0 + 0.1 * 0.3125 - 0.2 * 0.097_656_25 + 0.3 * 0.030_517_578;
     let expected = Vec2::new(

@@ -7,6 +7,7 @@ use anyhow::{Context, Result};
 use occnerf::bake::{Avatar, BakeOptions, bake};
 use occnerf::{Model, Scene};
 
+use crate::process::{note, say};
 use crate::run::{CHECKPOINT, RunConfig};
 
 /// The avatar's file in a run directory.
@@ -17,21 +18,26 @@ pub fn path(run: &Path) -> PathBuf {
     run.join(AVATAR)
 }
 
+/// The avatar in a run's directory, unless there is none or the checkpoint is newer.
+pub fn fresh(run: &Path) -> Result<Option<Avatar>> {
+    let written = |path: PathBuf| -> Option<SystemTime> { path.metadata().ok()?.modified().ok() };
+    let (avatar, checkpoint) = (written(path(run)), written(run.join(CHECKPOINT)));
+    let fresh = avatar.is_some() && avatar >= checkpoint;
+    Ok(if fresh { Some(Avatar::load(&path(run))?) } else { None })
+}
+
 /// The avatar of a run: that in its directory where it is not older than the checkpoint, else
 /// baked, and written there. Baking looks at the capture again, where it is still to be had.
 pub fn avatar(run: &Path, model: &Model) -> Result<Avatar> {
-    let path = path(run);
-    let written = |path: &Path| -> Option<SystemTime> { path.metadata().ok()?.modified().ok() };
-    if let (Some(avatar), Some(checkpoint)) = (written(&path), written(&run.join(CHECKPOINT)))
-        && avatar >= checkpoint
-    {
-        return Ok(Avatar::load(&path)?);
+    if let Some(avatar) = fresh(run)? {
+        return Ok(avatar);
     }
-    let scene = scene(run).map_err(|error| eprintln!("baking without the capture: {error:#}")).ok();
+    let path = path(run);
+    let scene = scene(run).map_err(|error| note!("baking without the capture: {error:#}")).ok();
     let (avatar, report) = bake(model, scene.as_ref(), &BakeOptions::default())?;
     avatar.save(&path).with_context(|| path.display().to_string())?;
     let (side, faces, seconds) = (report.side, report.faces, report.seconds);
-    println!("baked {faces} triangles and an atlas of {side} × {side} in {seconds:.1} s: {}", path.display());
+    say!("baked {faces} triangles and an atlas of {side} × {side} in {seconds:.1} s: {}", path.display());
     Ok(avatar)
 }
 

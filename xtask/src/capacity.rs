@@ -6,6 +6,8 @@ use anyhow::{Context, Result, bail};
 use clap::ValueEnum;
 use occnerf::{Capacity, Config, Method, Scene, Trainer};
 
+use crate::optimise;
+use crate::process::{say, unwritten};
 use crate::run::write;
 use crate::source::Source;
 
@@ -41,6 +43,16 @@ pub fn read(directory: &Path) -> Result<Option<Capacity>> {
     serde_json::from_str(&text).map(Some).with_context(|| path.display().to_string())
 }
 
+/// Writes what was chosen into the directory of a new run, or sees to it that nothing is said to have been.
+pub fn begin(directory: &Path, chosen: Option<&Capacity>) -> Result<()> {
+    let path = directory.join(FILE);
+    match chosen {
+        Some(capacity) => save(directory, capacity),
+        None if path.exists() => std::fs::remove_file(&path).map_err(unwritten(&path)),
+        None => Ok(()),
+    }
+}
+
 /// Writes it into a run directory.
 pub fn save(directory: &Path, capacity: &Capacity) -> Result<()> {
     write(&directory.join(FILE), &serde_json::to_string_pretty(capacity)?)
@@ -60,8 +72,8 @@ pub fn resumed(directory: &Path, asked: Option<CapacityName>) -> Result<Option<C
 pub fn prune(directory: &Path, trainer: &mut Trainer<'_>, checkpoint: &Path) -> Result<()> {
     let Some(mut capacity) = read(directory)? else { return Ok(()) };
     let pruned = trainer.prune();
-    trainer.save(checkpoint)?;
-    println!("pruned: {} of {} rows of the table; {} parameters", pruned.dropped, pruned.rows, pruned.parameters);
+    optimise::save(trainer, checkpoint)?;
+    say!("pruned: {} of {} rows of the table; {} parameters", pruned.dropped, pruned.rows, pruned.parameters);
     capacity.pruned = Some(pruned);
     save(directory, &capacity)
 }

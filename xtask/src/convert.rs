@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use crate::process::say;
 use anyhow::{Context, Result, ensure};
 use clap::Args;
 use smpl::BodyModel;
@@ -37,7 +38,7 @@ pub fn convert(arguments: &ConvertArguments) -> Result<()> {
     let back = BodyModel::load(output)?;
     ensure!(back == model, "{}: reads back differently", output.display());
     let size = std::fs::metadata(output).with_context(|| output.display().to_string())?.len();
-    println!(
+    say!(
         "{}: {} vertices, {} faces, {} joints, {} betas, {:.1} MB",
         output.display(),
         model.num_vertices(),

@@ -1,5 +1,6 @@
 //! `eval`: scores a run on frames that training did not see, or on those it saw.
 
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Result, ensure};
@@ -12,14 +13,17 @@ use occnerf::{
 };
 use rayon::prelude::*;
 
+use crate::optimise::logged_seconds;
+use crate::process::{Ending, Lock, note, one_line, say};
 use crate::run::{METRICS, Metrics, NOVEL_VIEWS, RunConfig, Splits, TRAINING_VIEWS, peak_rss_bytes, use_threads};
-use crate::train::logged_seconds;
 use crate::{pictures, report, table};
 
 /// Training frames are many and alike: every tenth is scored.
 const TRAIN_STRIDE: usize = 10;
 /// Pictures of a sheet: one row a camera, so many instants.
 const SHEET_INSTANTS: usize = 3;
+/// Training frames on their sheet.
+const TRAIN_PICTURES: usize = 5;
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum Split {
@@ -83,6 +87,7 @@ pub fn eval(arguments: &EvalArguments) -> Result<()> {
     let lpips = load_lpips(arguments.lpips.as_deref())?;
     let directory = &arguments.run;
     let run = RunConfig::read(directory)?;
+    let _lock = Lock::take(directory)?;
     let source = run.source()?;
     let scene = Scene::new(&source.capture, &source.model, &run.train)?;
     let loaded;
@@ -128,7 +133,7 @@ pub fn eval(arguments: &EvalArguments) -> Result<()> {
     for (name, split) in [(NOVEL_VIEWS, &metrics.splits.novel_view), (TRAINING_VIEWS, &metrics.splits.train_view)] {
         if let Some(split) = split {
             one.splits = Splits { novel_view: Some(split.clone()), train_view: None };
-            println!("{name}:\n{}", table::markdown(&[(one.method.clone(), &one)]));
+            say!("{name}:\n{}", table::markdown(&[(one.method.clone(), &one)]));
         }
     }
     Ok(())
@@ -227,6 +232,8 @@ pub fn score_run(
     let mut cameras: Vec<(String, Vec<Result<[RgbImage; 2]>>)> = Vec::new();
     let per_camera = scene.eval.iter().filter(|f| f.camera_name == scene.eval[0].camera_name).count().max(1);
     let stride = per_camera.div_ceil(SHEET_INSTANTS).max(1);
+    let names: BTreeSet<&str> = scene.eval.iter().map(|f| f.camera_name.as_str()).collect();
+    let most = pictures::MAX_SHEET_PIXELS / (2 * SHEET_INSTANTS * names.len().max(1)) as u64;
     let mut index = 0;
     let novel = drawn.score_with_bar(scene, Split::NovelView, lpips, |frame, rendering| {
         if cameras.last().is_none_or(|(name, _)| *name != frame.camera_name) {
@@ -236,36 +243,52 @@ pub fn score_run(
         if index % stride == 0
             && let Some((_, row)) = cameras.last_mut()
         {
-            row.push(beside_truth(frame, rendering));
+            row.push(beside_truth(frame, rendering, most));
         }
         index += 1;
     })?;
-    let rows = cameras.into_iter().map(|(_, row)| pairs(row)).collect::<Result<Vec<_>>>()?;
-    pictures::save(&pictures::sheet(&rows), &directory.join("renders/novel_views.png"))?;
     let mut row = Vec::new();
+    let most = pictures::MAX_SHEET_PIXELS / (2 * TRAIN_PICTURES) as u64;
     let train = drawn.score_with_bar(scene, Split::TrainView, lpips, |frame, rendering| {
-        if row.len() < 5 {
-            row.push(beside_truth(frame, rendering));
+        if row.len() < TRAIN_PICTURES {
+            row.push(beside_truth(frame, rendering, most));
         }
     })?;
-    pictures::save(&pictures::sheet(&[pairs(row)?]), &directory.join("renders/train_views.png"))?;
     metrics.peak_rss_bytes = peak_rss_bytes();
     metrics.lpips = network_name(lpips);
     metrics.splits = Splits { novel_view: (!scene.eval.is_empty()).then_some(novel), train_view: Some(train) };
     metrics.scene.clone_from(&run.scene);
     metrics.write(directory)?;
-    report::write(directory, &metrics)?;
+    let cameras = cameras.into_iter().map(|(_, row)| row).collect();
+    draw(directory, cameras, row).and_then(|()| report::write(directory, &metrics)).or_else(|error| {
+        match error.downcast_ref::<Ending>() {
+            Some(_) => Err(error),
+            // The scores are there: what cannot be drawn is no reason to end in an error.
+            None => {
+                note!("warning: not all was drawn: {}", one_line(&error));
+                Ok(())
+            }
+        }
+    })?;
     Ok(metrics)
 }
 
-/// Truth and rendering over grey.
-fn beside_truth(frame: &PreparedFrame, rendering: &Rendering) -> Result<[RgbImage; 2]> {
+/// Writes the contact sheets of both splits.
+fn draw(directory: &Path, novel: Vec<Vec<Result<[RgbImage; 2]>>>, train: Vec<Result<[RgbImage; 2]>>) -> Result<()> {
+    let rows = novel.into_iter().map(pairs).collect::<Result<Vec<_>>>()?;
+    pictures::save(&pictures::sheet(&rows), &directory.join("renders/novel_views.png"))?;
+    pictures::save(&pictures::sheet(&[pairs(train)?]), &directory.join("renders/train_views.png"))
+}
+
+/// Truth and rendering over grey, each reduced to at most `most` pixels.
+fn beside_truth(frame: &PreparedFrame, rendering: &Rendering, most: u64) -> Result<[RgbImage; 2]> {
     let (width, height) = (frame.view.camera.width, frame.view.camera.height);
     let truth = frame.pixels()?;
     Ok([
         pictures::over_grey(&truth.image.pixels, &truth.mask, width, height),
         pictures::over_grey(&rendering.image.pixels, &rendering.opacity, width, height),
-    ])
+    ]
+    .map(|picture| pictures::reduced(picture, most)))
 }
 
 /// Pictures one after the other.

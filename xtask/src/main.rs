@@ -1,25 +1,42 @@
 //! `cargo xtask`: train, evaluate and render people from occluded videos.
+#![warn(clippy::print_stdout, clippy::print_stderr, reason = "printing must never stop work: see process::print")]
 
+mod avatar;
 mod baked;
 mod bench;
 mod capacity;
+mod check;
 mod compare;
 mod convert;
 mod eval;
+mod export;
+mod film;
+mod font;
+mod front;
+mod import;
+mod list;
 mod obstacle;
+mod optimise;
 mod pictures;
 mod probe;
+mod process;
 mod render;
 mod report;
 mod reproduce;
+mod results;
 mod run;
 mod settings;
+mod shard;
 mod source;
 mod synth;
 mod table;
 mod train;
+mod video;
+mod view;
 
 use clap::{Parser, Subcommand};
+
+use crate::process::note;
 
 /// Turns a video of a moving person, partly hidden behind objects, into a 3-D person that renders from any side.
 #[derive(Parser)]
@@ -37,8 +54,18 @@ enum Command {
     Eval(eval::EvalArguments),
     /// Draws a run's person: its movement, from all around, or in the rest pose.
     Render(render::RenderArguments),
+    /// Draws what the camera saw beside the person from unseen sides: README's picture.
+    Front(front::FrontArguments),
+    /// Writes a run's person in a form that other programs open: skinned avatar, splats, mesh, motion.
+    Export(export::ExportArguments),
+    /// Writes a run's person as one HTML page, to turn around and play.
+    View(view::ViewArguments),
     /// The paper's table on captures: every baseline and ablation, several seeds, one budget.
     Reproduce(reproduce::ReproduceArguments),
+    /// Makes a capture of a video from what a body estimator and a segmenter wrote.
+    Import(import::ImportArguments),
+    /// Tells whether a capture's body lies on its person: a picture, a table, and the mistakes that are likely.
+    Check(check::CheckArguments),
     /// Writes an occluded capture of a synthetic person to disk, in a published dataset format.
     Synth(synth::SynthArguments),
     /// Runs one function of one crate on numpy arrays.
@@ -51,12 +78,36 @@ enum Command {
     Convert(convert::ConvertArguments),
 }
 
+/// Exit codes: 0 done; 1 something given is wrong; 2 the command line cannot be read; 3 a result cannot be written; 4 another
+/// process has the folder; 128 + n ended by signal n, with everything saved.
 fn main() -> std::process::ExitCode {
-    let outcome = match Arguments::parse().command {
+    let command = match Arguments::try_parse() {
+        Ok(arguments) => arguments.command,
+        // Help is ours; an error quotes what was given.
+        Err(error) if !error.use_stderr() => {
+            let _ = error.print();
+            return std::process::ExitCode::SUCCESS;
+        }
+        Err(error) => {
+            note!("{}", error.to_string().trim_end());
+            return std::process::ExitCode::from(2);
+        }
+    };
+    if let Err(error) = process::watch() {
+        note!("warning: signals end the program unsaved: {error}");
+    }
+    let outcome = match command {
+        Command::Train(arguments) if arguments.compare => compare::compare(&arguments),
+        Command::Train(arguments) if arguments.list.is_some() => list::train_list(&arguments),
         Command::Train(arguments) => train::train(&arguments),
         Command::Eval(arguments) => eval::eval(&arguments),
         Command::Render(arguments) => render::render(&arguments),
+        Command::Front(arguments) => front::front(&arguments),
+        Command::Export(arguments) => export::export(&arguments),
+        Command::View(arguments) => view::view(&arguments),
         Command::Reproduce(arguments) => reproduce::reproduce(&arguments),
+        Command::Import(arguments) => import::import(&arguments),
+        Command::Check(arguments) => check::check(&arguments),
         Command::Synth(arguments) => synth::synth(&arguments),
         Command::Probe(arguments) => probe::probe(&arguments),
         Command::Bench(arguments) => bench::bench(&arguments),
@@ -66,8 +117,9 @@ fn main() -> std::process::ExitCode {
     match outcome {
         Ok(()) => std::process::ExitCode::SUCCESS,
         Err(error) => {
-            eprintln!("error: {error:#}");
-            std::process::ExitCode::FAILURE
+            let (text, code) = process::described(&error);
+            note!("{text}");
+            std::process::ExitCode::from(code)
         }
     }
 }

@@ -1,16 +1,20 @@
-//! Contact sheets and short films.
+//! Contact sheets.
 
+use std::fs::File;
+use std::io::BufWriter;
 use std::path::Path;
 
 use anyhow::{Context, Result};
-use image::codecs::gif::{GifEncoder, Repeat};
-use image::{Delay, Frame, Rgb, RgbImage, imageops};
+use image::{ImageError, ImageFormat, ImageResult, Rgb, RgbImage, imageops};
 use occnerf::capture::Image;
 use plotters::prelude::*;
 use plotters::style::text_anchor::{HPos, Pos, VPos};
 
-use crate::bench::chart;
+use crate::font::{FONT, LETTER, register_font};
+use crate::process::unwritten;
 
+/// Pixels of a sheet: 96 MiB in memory, and less than what a reader of pictures takes for a bomb.
+pub const MAX_SHEET_PIXELS: u64 = 1 << 25;
 /// Gap between the cells of a sheet in pixels.
 const GAP: u32 = 4;
 
@@ -26,6 +30,17 @@ pub fn to_rgb(image: &Image) -> RgbImage {
 pub fn over_grey(pixels: &[f32], coverage: &[f32], width: u32, height: u32) -> RgbImage {
     let over = pixels.chunks_exact(3).zip(coverage).flat_map(|(p, &m)| p.iter().map(move |c| c + (1.0 - m) * 0.35));
     to_rgb(&Image { width, height, pixels: over.collect() })
+}
+
+/// The picture with at most `most` pixels, of the same shape.
+pub fn reduced(picture: RgbImage, most: u64) -> RgbImage {
+    let (width, height) = picture.dimensions();
+    let scale = (most as f64 / (f64::from(width) * f64::from(height))).sqrt();
+    if scale >= 1.0 {
+        return picture;
+    }
+    let side = |n: u32| ((f64::from(n) * scale) as u32).max(1);
+    imageops::resize(&picture, side(width), side(height), imageops::FilterType::Triangle)
 }
 
 /// Rows of equally large pictures on white.
@@ -49,13 +64,13 @@ pub fn captioned(sheet: &RgbImage, names: &[&str]) -> Result<RgbImage> {
     const STRIP: u32 = 20;
     /// Largest height of a letter in pixels.
     const LARGEST: f64 = 14.0;
-    chart::register_font()?;
+    register_font()?;
     let (width, column) = (sheet.width(), (sheet.width() - GAP) as f64 / names.len().max(1) as f64);
     let longest = names.iter().map(|name| name.chars().count()).max().unwrap_or(0).max(1);
-    let letter = LARGEST.min((column - f64::from(GAP)) / (chart::LETTER * longest as f64));
+    let letter = LARGEST.min((column - f64::from(GAP)) / (LETTER * longest as f64));
     let mut strip = vec![255; 3 * (width * STRIP) as usize];
     let area = BitMapBackend::with_buffer(&mut strip, (width, STRIP)).into_drawing_area();
-    let style = (chart::FONT, letter).into_font().color(&BLACK).pos(Pos::new(HPos::Center, VPos::Center));
+    let style = (FONT, letter).into_font().color(&BLACK).pos(Pos::new(HPos::Center, VPos::Center));
     for (c, name) in names.iter().enumerate() {
         let middle = f64::from(GAP) / 2.0 + (c as f64 + 0.5) * column;
         area.draw_text(name, &style, (middle as i32, STRIP as i32 / 2))?;
@@ -93,19 +108,24 @@ pub fn cells(sheet: &RgbImage) -> Vec<Vec<RgbImage>> {
 
 /// Writes a PNG.
 pub fn save(picture: &RgbImage, path: &Path) -> Result<()> {
-    picture.save(path).with_context(|| path.display().to_string())
+    replace(path, |to| picture.write_to(to, ImageFormat::Png))
 }
 
-/// Writes an endless GIF at `fps` frames a second.
-pub fn film(pictures: &[RgbImage], fps: u32, path: &Path) -> Result<()> {
-    let file = std::fs::File::create(path).with_context(|| path.display().to_string())?;
-    let mut encoder = GifEncoder::new_with_speed(std::io::BufWriter::new(file), 10);
-    encoder.set_repeat(Repeat::Infinite)?;
-    for picture in pictures {
-        let rgba = image::DynamicImage::ImageRgb8(picture.clone()).into_rgba8();
-        encoder.encode_frame(Frame::from_parts(rgba, 0, 0, Delay::from_numer_denom_ms(1000, fps)))?;
+/// Replaces a file by what `encode` writes.
+fn replace(path: &Path, encode: impl FnOnce(&mut BufWriter<File>) -> ImageResult<()>) -> Result<()> {
+    let mut failed = None;
+    let written = occnerf::replace_file(path, |to| match encode(to) {
+        Err(ImageError::IoError(error)) => Err(error),
+        Err(error) => {
+            failed = Some(error);
+            Err(std::io::Error::other("not encoded"))
+        }
+        Ok(()) => Ok(()),
+    });
+    match failed {
+        Some(error) => Err(error).with_context(|| path.display().to_string()),
+        None => written.map_err(unwritten(path)),
     }
-    Ok(())
 }
 
 #[cfg(test)]
@@ -123,6 +143,16 @@ mod tests {
             let ink = |c| third(c).iter().any(|&x| (0..strip).any(|y| whole.get_pixel(x, y).0[0] < 128));
             assert!((0..3).all(|c| ink(c) != names.is_empty()));
         }
+    }
+
+    #[test]
+    fn a_sheet_of_large_pictures_stays_small_enough_to_be_read() {
+        let large = || RgbImage::from_pixel(3300, 3300, Rgb([9; 3]));
+        let row = || (0..6).map(|_| reduced(large(), MAX_SHEET_PIXELS / 18)).collect::<Vec<_>>();
+        let sheet = sheet(&[row(), row(), row()]);
+        assert!(u64::from(sheet.width()) * u64::from(sheet.height()) < MAX_SHEET_PIXELS + MAX_SHEET_PIXELS / 50);
+        assert_eq!(reduced(large(), 1 << 40).dimensions(), (3300, 3300));
+        assert_eq!(reduced(RgbImage::new(1, 9), 3).dimensions(), (1, 5));
     }
 
     #[test]

@@ -12,7 +12,9 @@ use occnerf::{Body, FieldRenderer, Method, Model, Person, PosedView, PriorRender
 use visibility::Samples;
 use volrender::Camera;
 
-use crate::run::{RunConfig, use_threads};
+use crate::process::say;
+use crate::run::{RunConfig, make_directory, use_threads};
+use crate::video::{self, FilmFormat};
 use crate::{baked, pictures};
 
 /// Views of a full turn.
@@ -43,6 +45,9 @@ pub struct RenderArguments {
     /// Where to [default: RUN/renders/WHAT]
     #[arg(long)]
     out: Option<PathBuf>,
+    /// What to write besides the pictures
+    #[arg(long, default_value = "gif")]
+    format: FilmFormat,
     /// Draw the baked person, by rasterising, instead of the field; bakes it first where RUN has none
     #[arg(long)]
     baked: bool,
@@ -54,6 +59,7 @@ pub struct RenderArguments {
 /// Runs the command.
 pub fn render(arguments: &RenderArguments) -> Result<()> {
     use_threads(arguments.threads)?;
+    let size = arguments.size.as_deref().map(parse_size).transpose()?;
     let directory = &arguments.run;
     let run = RunConfig::read(directory)?;
     if arguments.baked && run.train.method == Method::Prior {
@@ -76,24 +82,21 @@ pub fn render(arguments: &RenderArguments) -> Result<()> {
     if arguments.frame >= frames.len() {
         bail!("--frame {}: {} has frames 0 to {}", arguments.frame, run.scene, frames.len() - 1);
     }
-    let size = arguments.size.as_deref().map(parse_size).transpose()?;
     let views = views(body, frames, arguments, size);
     let name = format!("{:?}", arguments.what).to_lowercase();
     let out = arguments.out.clone().unwrap_or_else(|| directory.join("renders").join(&name));
-    std::fs::create_dir_all(&out).with_context(|| out.display().to_string())?;
+    make_directory(&out)?;
     let bar = ProgressBar::new(views.len() as u64);
-    let mut film = Vec::new();
-    for (i, view) in views.iter().enumerate() {
+    let drawn = views.iter().enumerate().map(|(i, view)| {
         let rendering = renderer.render(view, Vec3::splat(1.0))?;
         let picture = pictures::to_rgb(&rendering.image);
         pictures::save(&picture, &out.join(format!("{i:04}.png")))?;
-        film.push(picture);
         bar.inc(1);
-    }
+        Ok(picture)
+    });
+    let path = video::film(drawn, arguments.format, FPS, &out.join(&name))?;
     bar.finish_and_clear();
-    let path = out.join(format!("{name}.gif"));
-    pictures::film(&film, FPS, &path)?;
-    println!("{} pictures and {}", film.len(), path.display());
+    say!("{} pictures and {}", views.len(), path.as_ref().unwrap_or(&out).display());
     Ok(())
 }
 

@@ -1,15 +1,18 @@
 //! The run directory: what a run was trained with, its log, checkpoint, scores and pictures.
 
+use std::io::{ErrorKind, Write};
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context, Result, anyhow, bail};
+use anyhow::{Context, Result, anyhow, bail, ensure};
 use occnerf::capture::LoadOptions;
-use occnerf::{Config, SplitMetrics};
+use occnerf::{Config, SplitMetrics, replace_file};
 use serde::{Deserialize, Serialize};
 
+use crate::process::{Lock, unwritten};
 use crate::source::{self, Source};
 
 pub const CHECKPOINT: &str = "checkpoint.safetensors";
+const CONFIG: &str = "config.toml";
 pub const METRICS: &str = "metrics.json";
 pub const LOG: &str = "train.jsonl";
 
@@ -31,7 +34,7 @@ pub struct RunConfig {
 impl RunConfig {
     /// Reads a run's config.toml.
     pub fn read(run: &Path) -> Result<Self> {
-        let path = run.join("config.toml");
+        let path = run.join(CONFIG);
         let text = std::fs::read_to_string(&path).with_context(|| format!("{} is not a run", path.display()))?;
         let config = toml::from_str(&text).map_err(|error| anyhow!("{}: {}", path.display(), error.message()));
         let config: Self = config?;
@@ -41,7 +44,7 @@ impl RunConfig {
 
     /// Writes it.
     pub fn write(&self, run: &Path) -> Result<()> {
-        write(&run.join("config.toml"), &toml::to_string(self)?)
+        write(&run.join(CONFIG), &toml::to_string(self)?)
     }
 
     /// Whether two runs are of the same files.
@@ -121,17 +124,33 @@ impl Metrics {
     }
 }
 
-/// A directory for a new run: `out`, or the first free `runs/NAME`, `runs/NAME-2`, …
-pub fn new_directory(out: Option<&Path>, name: &str) -> Result<PathBuf> {
+/// A directory for a new run, which is this process's alone: `out`, or the first free `runs/NAME`, `runs/NAME-2`, …
+pub fn new_directory(out: Option<&Path>, name: &str) -> Result<(PathBuf, Lock)> {
     let directory = match out {
-        Some(out) if out.join(CHECKPOINT).exists() => {
-            bail!("{} already holds a run: go on with --resume, or give another --out", out.display())
+        Some(out) => {
+            make_directory(out)?;
+            out.to_owned()
         }
-        Some(out) => out.to_owned(),
-        None => candidates(name).find(|d| !d.exists()).context("no free directory under runs/")?,
+        None => free_directory(name)?,
     };
-    std::fs::create_dir_all(directory.join("renders")).with_context(|| directory.display().to_string())?;
-    Ok(directory)
+    let lock = Lock::take(&directory)?;
+    if directory.join(CHECKPOINT).exists() {
+        bail!("{} already holds a run: go on with --resume, or give another --out", directory.display());
+    }
+    make_directory(&directory.join("renders"))?;
+    Ok((directory, lock))
+}
+
+/// Makes the first of the default names that nobody has made, whoever else is looking for one.
+fn free_directory(name: &str) -> Result<PathBuf> {
+    for directory in candidates(name) {
+        make_directory(directory.parent().unwrap_or(Path::new(".")))?;
+        match std::fs::create_dir(&directory) {
+            Err(error) if error.kind() == ErrorKind::AlreadyExists => {}
+            made => return made.map_err(unwritten(&directory)).map(|()| directory),
+        }
+    }
+    bail!("no free directory under runs/")
 }
 
 /// The run to go on with: `out`, or the latest of the default names.
@@ -140,8 +159,8 @@ pub fn existing_directory(out: Option<&Path>, name: &str) -> Result<PathBuf> {
         Some(out) => out.to_owned(),
         None => candidates(name).take_while(|d| d.exists()).last().context("no run to resume under runs/")?,
     };
-    if !directory.join(CHECKPOINT).is_file() {
-        bail!("{} has no {CHECKPOINT} to resume from", directory.display());
+    if ![CHECKPOINT, CONFIG].iter().any(|name| directory.join(name).is_file()) {
+        bail!("{} has no {CHECKPOINT} to resume from, and no {CONFIG} to begin with", directory.display());
     }
     Ok(directory)
 }
@@ -158,12 +177,35 @@ pub fn peak_rss_bytes() -> u64 {
     line.and_then(|l| l.trim().trim_end_matches(" kB").parse::<u64>().ok()).unwrap_or(0) * 1024
 }
 
+/// Makes a directory, and those above it, where there is none.
+///
+/// # Errors
+/// [`Ending::Unwritten`](crate::process::Ending::Unwritten).
+pub fn make_directory(path: &Path) -> Result<()> {
+    std::fs::create_dir_all(path).map_err(unwritten(path))
+}
+
+/// Replaces a file by a text; whoever reads it finds the old one or the new one, whole.
+///
+/// # Errors
+/// [`Ending::Unwritten`](crate::process::Ending::Unwritten).
 pub fn write(path: &Path, text: &str) -> Result<()> {
-    std::fs::write(path, text).with_context(|| path.display().to_string())
+    replace_file(path, |to| to.write_all(text.as_bytes())).map_err(unwritten(path))
+}
+
+/// More than any machine has cores; a thousand times as many would keep the system busy for minutes.
+const MAX_THREADS: usize = 1024;
+
+/// Errors for a number of threads that no machine has.
+pub fn check_threads(threads: Option<usize>) -> Result<()> {
+    let fits = threads.is_none_or(|threads| (1..=MAX_THREADS).contains(&threads));
+    ensure!(fits, "--threads {}: expected 1 to {MAX_THREADS}", threads.unwrap_or_default());
+    Ok(())
 }
 
 /// Sets the number of threads of everything that follows.
 pub fn use_threads(threads: Option<usize>) -> Result<()> {
+    check_threads(threads)?;
     if let Some(threads) = threads {
         rayon::ThreadPoolBuilder::new().num_threads(threads).build_global()?;
     }

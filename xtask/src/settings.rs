@@ -1,92 +1,70 @@
 //! From the command line to a configuration.
 
 use anyhow::{Context, Result, bail};
-use clap::{Args, ValueEnum};
+use clap::Args;
+use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 use occnerf::{Capacity, Component, Config, Method, OccludedRule, Preset};
 
-/// Which model is trained.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-pub enum MethodName {
-    /// The posed prior in mean vertex colours; nothing is trained.
-    Prior,
-    /// Point-based, frequency encoding.
-    Humannerf,
-    /// Point-based, hash encoding.
-    HashPoint,
-    /// Point term and attended surface term.
-    Occnerf,
+const METHODS: &[(Method, &str)] = &[
+    (Method::Prior, "The posed prior in mean vertex colours; nothing is trained"),
+    (Method::Humannerf, "Point-based, frequency encoding"),
+    (Method::HashPoint, "Point-based, hash encoding"),
+    (Method::Occnerf, "Point term and attended surface term"),
+];
+const PRESETS: &[(Preset, &str)] = &[
+    (Preset::Fast, "A first look: about a minute"),
+    (Preset::Balanced, "The default: about two minutes"),
+    (Preset::Paper, "The paper's setting: about two hours"),
+    (Preset::PublishedCode, "The same with choices of the code that was published with the paper"),
+];
+const COMPONENTS: &[(Component, &str)] = &[
+    (Component::Surface, "The surface term: F sees the point term alone"),
+    (Component::Attention, "Its weights: the surface term is a plain mean"),
+    (Component::Completeness, "The completeness loss"),
+    (Component::Perceptual, "The perceptual loss"),
+];
+const RULES: &[(OccludedRule, &str)] = &[
+    (OccludedRule::Unknown, "Pixels behind an occluder enter no photometric term"),
+    (OccludedRule::Background, "They are taught to be background, as the published code has it"),
+];
+
+/// Parses the name of one of `values`, each with its help.
+fn named<T: Copy + Send + Sync + 'static>(
+    values: &'static [(T, &'static str)],
+    name: fn(T) -> &'static str,
+) -> impl TypedValueParser<Value = T> {
+    let possible = values.iter().map(move |&(value, help)| PossibleValue::new(name(value)).help(help));
+    PossibleValuesParser::new(possible.collect::<Vec<_>>()).try_map(move |given| {
+        let found = values.iter().find(|(value, _)| name(*value) == given);
+        found.map(|(value, _)| *value).ok_or("no such name")
+    })
 }
 
-impl From<MethodName> for Method {
-    fn from(name: MethodName) -> Self {
-        match name {
-            MethodName::Prior => Self::Prior,
-            MethodName::Humannerf => Self::Humannerf,
-            MethodName::HashPoint => Self::HashPoint,
-            MethodName::Occnerf => Self::Occnerf,
-        }
-    }
-}
-
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-pub enum PresetName {
-    /// A first look: about a minute.
-    Fast,
-    /// The default: about two minutes.
-    Balanced,
-    /// The paper's setting: over two hours.
-    Paper,
-    /// The same with the choices of the code that was published with the paper.
-    PublishedCode,
-}
-
-impl From<PresetName> for Preset {
-    fn from(name: PresetName) -> Self {
-        match name {
-            PresetName::Fast => Self::Fast,
-            PresetName::Balanced => Self::Balanced,
-            PresetName::Paper => Self::Paper,
-            PresetName::PublishedCode => Self::PublishedCode,
-        }
-    }
-}
-
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-pub enum ComponentName {
-    Surface,
-    Attention,
-    Completeness,
-    Perceptual,
-}
-
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-pub enum OccludedName {
-    /// Pixels behind an occluder enter no photometric term.
-    Unknown,
-    /// They are taught to be background, as the published code has it.
-    Background,
+/// Parses the name of a preset.
+pub fn preset() -> impl TypedValueParser<Value = Preset> {
+    named(PRESETS, Preset::name)
 }
 
 /// What a run is trained with.
 #[derive(Args, Clone, Debug, Default)]
 pub struct SettingArguments {
     /// Named settings [default: balanced]
-    #[arg(long)]
-    pub preset: Option<PresetName>,
+    #[arg(long, value_parser = preset())]
+    pub preset: Option<Preset>,
     /// Which model [default: occnerf]
-    #[arg(long)]
-    pub method: Option<MethodName>,
+    #[arg(long, value_parser = named(METHODS, Method::name))]
+    pub method: Option<Method>,
     /// Components of the method to switch off, comma separated
-    #[arg(long, value_delimiter = ',')]
-    pub ablate: Vec<ComponentName>,
+    #[arg(long, value_delimiter = ',', value_parser = named(COMPONENTS, Component::name))]
+    pub ablate: Vec<Component>,
     /// What a hidden pixel of the body's silhouette is taken for [default: unknown]
-    #[arg(long)]
-    pub occluded: Option<OccludedName>,
+    #[arg(long, value_parser = named(RULES, OccludedRule::name))]
+    pub occluded: Option<OccludedRule>,
     /// Optimisation steps [default: the preset's]
     #[arg(long)]
     pub steps: Option<u64>,
     /// Seed of every random choice [default: 1]
-    #[arg(long)]
+    #[arg(long, value_parser = clap::value_parser!(u64).range(..=i64::MAX as u64))]
     pub seed: Option<u64>,
     /// Weights that make the perceptual term LPIPS: SqueezeNet 1.1, VGG16 or AlexNet with LPIPS's linear layers, .safetensors
     /// or .pth, a file or a directory [default: multi-scale SSIM]
@@ -100,26 +78,14 @@ pub struct SettingArguments {
 impl SettingArguments {
     /// The preset with everything given on the command line applied.
     pub fn config(&self) -> Result<Config> {
-        let preset = self.preset.unwrap_or(PresetName::Balanced).into();
-        let method = self.method.map_or(Method::Occnerf, Method::from);
+        let (preset, method) = (self.preset.unwrap_or(Preset::Balanced), self.method.unwrap_or(Method::Occnerf));
         self.apply(Config::preset(preset, method))
     }
 
     /// `config` with everything but preset and method applied.
     pub fn apply(&self, mut config: Config) -> Result<Config> {
-        for component in &self.ablate {
-            config.ablate(match component {
-                ComponentName::Surface => Component::Surface,
-                ComponentName::Attention => Component::Attention,
-                ComponentName::Completeness => Component::Completeness,
-                ComponentName::Perceptual => Component::Perceptual,
-            });
-        }
-        match self.occluded {
-            Some(OccludedName::Unknown) => config.occluded = OccludedRule::Unknown,
-            Some(OccludedName::Background) => config.occluded = OccludedRule::Background,
-            None => {}
-        }
+        self.ablate.iter().for_each(|component| config.ablate(*component));
+        config.occluded = self.occluded.unwrap_or(config.occluded);
         config.steps = self.steps.unwrap_or(config.steps);
         config.seed = self.seed.unwrap_or(config.seed);
         if let Some(path) = &self.perceptual_weights {

@@ -1,16 +1,19 @@
 //! Where the frames come from: the embedded demo, a character filmed on the spot, or a capture on disk with its body model.
 
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
 use clap::{Args, ValueEnum};
 use occnerf::capture::{
-    Capture, DemoConfig, LoadOptions, SynthConfig, Synthetic, Wrong, demo, find_body, load_capture, own_body,
+    Capture, DemoConfig, LoadOptions, Perturbation, SynthConfig, Synthetic, demo, find_body, load_capture, own_body,
 };
+use serde::Serialize;
+use serde_json::Value;
 use smpl::BodyModel;
 
+use crate::film::{film, is_character};
 use crate::obstacle::ObstacleArguments;
-use crate::synth;
 
 /// Name of the scene that needs no files.
 pub const DEMO: &str = "demo";
@@ -27,20 +30,21 @@ pub struct Source {
 }
 
 /// What a capture's files leave open.
-#[derive(Args, Clone, Debug)]
+#[derive(Args, Clone, Debug, Serialize)]
+#[serde(rename_all = "kebab-case")]
 pub struct LoadArguments {
     /// Longest side in pixels that pictures are reduced to [default: as they are]
     #[arg(long, value_name = "PIXELS")]
     resize: Option<u32>,
-    /// Train on every n-th frame
-    #[arg(long, value_name = "N", default_value_t = 1)]
-    stride: usize,
+    /// Train on every n-th frame [default: 1]
+    #[arg(long, value_name = "N")]
+    stride: Option<usize>,
     /// Train on at most this many frames [default: all]
     #[arg(long, value_name = "N")]
     max_frames: Option<usize>,
-    /// Keep back views of every n-th training frame
-    #[arg(long, value_name = "N", default_value_t = 1)]
-    eval_stride: usize,
+    /// Keep back views of every n-th training frame [default: 1]
+    #[arg(long, value_name = "N")]
+    eval_stride: Option<usize>,
     /// Training camera of a ZJU-MoCap capture, by folder or by number from 1 [default: the first]
     #[arg(long, value_name = "NAME")]
     camera: Option<String>,
@@ -48,23 +52,26 @@ pub struct LoadArguments {
     #[arg(long)]
     occlusion: Option<ObstacleName>,
     #[command(flatten)]
+    #[serde(flatten)]
     obstacle: ObstacleArguments,
     /// Most memory that a capture's bodies and decoded pictures may take, in MiB; pictures beyond it are decoded whenever
     /// they are needed [default: 1024]
     #[arg(long, value_name = "MIB", value_parser = clap::value_parser!(u64).range(1..=1 << 24))]
     memory: Option<u64>,
     /// Turn every bone of the prior by so many degrees (root mean square), to see what a method bears
-    #[arg(long, value_name = "DEGREES", default_value_t = 0.0)]
-    wrong_pose: f32,
-    /// Change every shape coefficient of the prior by so many standard deviations
-    #[arg(long, value_name = "N", default_value_t = 0.0)]
-    wrong_shape: f32,
-    /// Grow the training masks by so many pixels, or shrink them
-    #[arg(long, value_name = "PIXELS", default_value_t = 0, allow_negative_numbers = true)]
-    wrong_mask: i32,
+    /// [default: 0]
+    #[arg(long, value_name = "DEGREES")]
+    wrong_pose: Option<f32>,
+    /// Change every shape coefficient of the prior by so many standard deviations [default: 0]
+    #[arg(long, value_name = "N")]
+    wrong_shape: Option<f32>,
+    /// Grow the training masks by so many pixels, or shrink them [default: 0]
+    #[arg(long, value_name = "PIXELS", allow_negative_numbers = true)]
+    wrong_mask: Option<i32>,
 }
 
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, ValueEnum)]
+#[serde(rename_all = "kebab-case")]
 enum ObstacleName {
     /// No obstacle.
     None,
@@ -75,6 +82,17 @@ enum ObstacleName {
 }
 
 impl LoadArguments {
+    /// A capture as it is.
+    pub fn none() -> Self {
+        /// The options alone.
+        #[derive(clap::Parser)]
+        struct Line {
+            #[command(flatten)]
+            load: LoadArguments,
+        }
+        <Line as clap::Parser>::parse_from([""]).load
+    }
+
     /// The same for the library.
     pub fn options(&self) -> Result<LoadOptions> {
         let occlusion = match self.occlusion {
@@ -83,44 +101,29 @@ impl LoadArguments {
             Some(ObstacleName::Central) => Some(self.obstacle.central()),
             None => self.obstacle.given().then(|| self.obstacle.central()),
         };
+        let wrong = Perturbation {
+            pose_degrees: self.wrong_pose.unwrap_or_default(),
+            shape: self.wrong_shape.unwrap_or_default(),
+            mask_pixels: self.wrong_mask.unwrap_or_default(),
+        };
         Ok(LoadOptions {
             resize: self.resize,
-            stride: self.stride,
+            stride: self.stride.unwrap_or(1),
             max_frames: self.max_frames,
-            eval_stride: self.eval_stride,
+            eval_stride: self.eval_stride.unwrap_or(1),
             camera: self.camera.clone(),
             occlusion,
-            wrong: Wrong { pose_degrees: self.wrong_pose, shape: self.wrong_shape, mask_pixels: self.wrong_mask },
+            wrong,
             max_bytes: self.memory.map_or(LoadOptions::default().max_bytes, |mib| mib << 20),
             ..LoadOptions::default()
         })
     }
 
-    /// The same as on the command line.
+    /// The same as on the command line: every flag that was given.
     pub fn command_line(&self) -> String {
-        let mut text = String::new();
-        let mut add = |name: &str, value: Option<String>| {
-            text.extend(value.map(|value| format!(" --{name} {value}")));
-        };
-        let not_one = |n: usize| (n != 1).then(|| n.to_string());
-        add("resize", self.resize.map(|n| n.to_string()));
-        add("stride", not_one(self.stride));
-        add("max-frames", self.max_frames.map(|n| n.to_string()));
-        add("eval-stride", not_one(self.eval_stride));
-        add("camera", self.camera.clone());
-        let name = self.occlusion.and_then(|o| o.to_possible_value());
-        add("occlusion", name.map(|n| n.get_name().to_owned()));
-        add("memory", self.memory.map(|n| n.to_string()));
-        let number = |x: Option<f32>| x.map(|x| x.to_string());
-        add("fraction", number(self.obstacle.fraction));
-        add("share", number(self.obstacle.share));
-        add("position", number(self.obstacle.position));
-        add("height", number(self.obstacle.height));
-        let not_zero = |x: f32| (x != 0.0).then(|| x.to_string());
-        add("wrong-pose", not_zero(self.wrong_pose));
-        add("wrong-shape", not_zero(self.wrong_shape));
-        add("wrong-mask", (self.wrong_mask != 0).then(|| self.wrong_mask.to_string()));
-        text
+        let flags = serde_json::to_string(self).and_then(|text| serde_json::from_str::<BTreeMap<String, Value>>(&text));
+        let given = flags.unwrap_or_default().into_iter().filter(|(_, value)| !value.is_null());
+        given.map(|(flag, value)| format!(" --{flag} {}", value.to_string().trim_matches('"'))).collect()
     }
 
     /// How a run to be resumed read its capture, checked against what is asked for.
@@ -151,11 +154,11 @@ pub fn load(scene: Option<&str>, body: Option<&Path>, options: &LoadOptions) -> 
         return Ok(Source { scene: name, body: None, load: options.clone(), capture, model });
     }
     let directory = Path::new(scene);
-    if directory.is_file() && synth::is_character(directory) {
+    if directory.is_file() && is_character(directory) {
         if *options != (LoadOptions { wrong: options.wrong, ..LoadOptions::default() }) || body.is_some() {
             bail!("{scene}: a character takes none of the options of a capture; use synth to choose how it is filmed");
         }
-        let Synthetic { mut capture, body, .. } = synth::film(Some(directory), None, &SynthConfig::default())?;
+        let Synthetic { mut capture, body, .. } = film(Some(directory), None, &SynthConfig::default())?;
         options.wrong.apply(&mut capture, &body)?;
         return Ok(Source { scene: name, body: None, load: options.clone(), capture, model: body });
     }

@@ -4,11 +4,11 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail, ensure};
 use clap::{Args, ValueEnum};
-use indicatif::{ProgressBar, ProgressStyle};
-use occnerf::capture::{Layout, Obstacle, Occlusion, SynthConfig, Synthetic, synthesise};
-use smpl::{Character, MotionClip};
+use occnerf::capture::{Layout, Obstacle, Occlusion, SynthConfig, Synthetic};
 
+use crate::film::{bar, film, is_character};
 use crate::obstacle::ObstacleArguments;
+use crate::process::{say, unwritten};
 
 /// What a finished directory holds, and nothing else does.
 const MARK: &str = "synth.json";
@@ -114,34 +114,6 @@ impl SynthArguments {
     }
 }
 
-/// Whether `path` is named like a rigged character.
-pub fn is_character(path: &Path) -> bool {
-    let extension = path.extension().and_then(|e| e.to_str()).unwrap_or("");
-    ["glb", "gltf"].iter().any(|known| extension.eq_ignore_ascii_case(known))
-}
-
-/// Films `character`, or the embedded person, with a bar.
-pub fn film(character: Option<&Path>, motion: Option<&Path>, config: &SynthConfig) -> Result<Synthetic> {
-    let named = |path: &Path| path.display().to_string();
-    let character = character.map(|path| Character::load(path).map(|c| (c, named(path)))).transpose()?;
-    let motion = motion.map(MotionClip::load).transpose()?;
-    let bar = bar("filming", config.frames);
-    let synthetic = synthesise(character.as_ref().map(|(c, _)| c), motion.as_ref(), config, &|_| bar.inc(1));
-    bar.finish_and_clear();
-    match character {
-        Some((_, name)) => synthetic.context(name),
-        None => Ok(synthetic?),
-    }
-}
-
-fn bar(what: &'static str, length: usize) -> ProgressBar {
-    let bar = ProgressBar::new(length as u64);
-    if let Ok(style) = ProgressStyle::with_template("{bar:28} {pos}/{len} {msg}  {elapsed}") {
-        bar.set_style(style);
-    }
-    bar.with_message(what)
-}
-
 /// Runs the command: everything is written beside --out and takes its place when it is complete.
 pub fn synth(arguments: &SynthArguments) -> Result<()> {
     let config = arguments.config()?;
@@ -149,27 +121,30 @@ pub fn synth(arguments: &SynthArguments) -> Result<()> {
     if let Some(path) = arguments.character.as_deref().filter(|path| !is_character(path)) {
         bail!("{}: not a character; expected a .glb or .gltf", path.display());
     }
-    vacant(out, arguments.force)?;
+    vacant(out, arguments.force, MARK)?;
     let layout = match arguments.format {
         FormatName::Humannerf => Layout::HumanNerf,
         FormatName::ZjuMocap => Layout::ZjuMocap,
         FormatName::Ocmotion => Layout::Wild,
     };
     let synthetic = film(arguments.character.as_deref(), arguments.motion.as_deref(), &config)?;
-    let partial = beside(out)?;
+    let partial = beside(out, "partial")?;
     let written = write(&synthetic, &partial, layout).and_then(|()| {
+        let old = beside(out, "old")?;
         if out.exists() {
-            vacant(out, arguments.force)?;
-            std::fs::remove_dir_all(out).with_context(|| out.display().to_string())?;
+            vacant(out, arguments.force, MARK)?;
+            // Aside, whole: what is killed while it removes a capture leaves something that nobody dares to replace.
+            std::fs::rename(out, &old).map_err(unwritten(out))?;
         }
-        std::fs::rename(&partial, out).with_context(|| out.display().to_string())
+        std::fs::rename(&partial, out).map_err(unwritten(out))?;
+        if old.exists() { std::fs::remove_dir_all(&old).map_err(unwritten(&old)) } else { Ok(()) }
     });
     if let Err(error) = written {
         let _ = std::fs::remove_dir_all(&partial);
         return Err(error);
     }
     let capture = &synthetic.capture;
-    println!(
+    say!(
         "{}: {} frames, {} views kept back, {:.1} % of the person hidden where anything is, {} joints, {} vertices",
         out.display(),
         capture.train.len(),
@@ -178,12 +153,12 @@ pub fn synth(arguments: &SynthArguments) -> Result<()> {
         synthetic.body.num_joints(),
         synthetic.body.num_vertices(),
     );
-    println!("train on it: cargo xtask train {}", out.display());
+    say!("train on it: cargo xtask train {}", out.display());
     Ok(())
 }
 
 fn write(synthetic: &Synthetic, directory: &Path, layout: Layout) -> Result<()> {
-    std::fs::create_dir_all(directory).with_context(|| directory.display().to_string())?;
+    crate::run::make_directory(directory)?;
     let bar = bar("writing", synthetic.num_pictures(layout));
     synthetic.write(directory, layout, &|_| bar.inc(1))?;
     bar.finish_and_clear();
@@ -191,8 +166,9 @@ fn write(synthetic: &Synthetic, directory: &Path, layout: Layout) -> Result<()> 
     crate::run::write(&directory.join(MARK), &serde_json::to_string_pretty(&mark)?)
 }
 
-/// Errors unless `out` may be written: absent, empty, or an earlier result that is to be replaced.
-fn vacant(out: &Path, force: bool) -> Result<()> {
+/// Errors unless `out` may be written: absent, empty, or an earlier result of the command that leaves `mark`, to be
+/// replaced.
+pub fn vacant(out: &Path, force: bool, mark: &str) -> Result<()> {
     let Ok(entries) = std::fs::read_dir(out) else {
         ensure!(!out.exists(), "{}: not a directory", out.display());
         return Ok(());
@@ -200,15 +176,16 @@ fn vacant(out: &Path, force: bool) -> Result<()> {
     if entries.count() == 0 {
         return Ok(());
     }
-    ensure!(out.join(MARK).is_file(), "{}: not empty, and not written by synth (no {MARK})", out.display());
+    let command = mark.trim_end_matches(".json");
+    ensure!(out.join(mark).is_file(), "{}: not empty, and not written by {command} (no {mark})", out.display());
     ensure!(force, "{}: already holds a capture (--force replaces it)", out.display());
     Ok(())
 }
 
 /// A free name in the same folder.
-fn beside(out: &Path) -> Result<PathBuf> {
+pub fn beside(out: &Path, what: &str) -> Result<PathBuf> {
     let Some(name) = out.file_name() else { bail!("{}: not a name for a directory", out.display()) };
-    let partial = out.with_file_name(format!("{}.partial-{}", name.to_string_lossy(), std::process::id()));
-    ensure!(!partial.exists(), "{}: in the way", partial.display());
-    Ok(partial)
+    let free = out.with_file_name(format!("{}.{what}-{}", name.to_string_lossy(), std::process::id()));
+    ensure!(!free.exists(), "{}: in the way", free.display());
+    Ok(free)
 }

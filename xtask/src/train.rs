@@ -1,27 +1,23 @@
 //! `train`: from frames to a scored and drawn person.
 
-use std::io::{IsTerminal, Write};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-use anyhow::{Context, Result, bail};
+use anyhow::{Context, Result, bail, ensure};
 use clap::Args;
-use indicatif::{ProgressBar, ProgressStyle};
-use occnerf::{Lpips, Method, Person, Scene, StepReport, Trainer, VertexColors, checkpoint_config};
+use occnerf::{Config, Lpips, Method, Person, Scene, Trainer, VertexColors, checkpoint_config};
 
 use crate::capacity::{self, CapacityName};
-use crate::compare::compare;
 use crate::eval::{Drawn, Split, check_pictures, load_lpips, network_name, score_run, scored_frames, unscored};
-use crate::run::{CHECKPOINT, LOG, METRICS, Metrics, RunConfig, existing_directory, new_directory, use_threads};
+use crate::optimise::{SavingArguments, Sitting, optimise};
+use crate::process::{Lock, say};
+use crate::run::{
+    CHECKPOINT, METRICS, Metrics, RunConfig, existing_directory, make_directory, new_directory, use_threads,
+};
 use crate::settings::SettingArguments;
+use crate::shard::ShardArguments;
 use crate::source::{self, LoadArguments, Source};
-use crate::{run, table};
-
-/// A checkpoint this often, so that a power cut costs little.
-const CHECKPOINT_EVERY: Duration = Duration::from_secs(30);
-const LOG_EVERY: u64 = 10;
-/// Without a terminal the progress is a line this often.
-const LINE_EVERY: Duration = Duration::from_secs(15);
+use crate::table;
 
 #[derive(Args)]
 pub struct TrainArguments {
@@ -51,9 +47,16 @@ pub struct TrainArguments {
     /// Go on with the run in --out from its checkpoint
     #[arg(long)]
     pub resume: bool,
+    #[command(flatten)]
+    pub saving: SavingArguments,
     /// Stop after this many steps in all, leaving a checkpoint to resume from
     #[arg(long)]
     pub stop_after: Option<u64>,
+    /// Train every scene of FILE, a path a line, each under OUT; finished ones are not trained again
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["scene", "resume", "stop_after", "compare", "capacity"])]
+    pub list: Option<PathBuf>,
+    #[command(flatten)]
+    pub part: ShardArguments,
     /// Train every method under both pixel rules and print one table
     #[arg(long, conflicts_with_all = ["resume", "stop_after"])]
     pub compare: bool,
@@ -63,49 +66,22 @@ pub struct TrainArguments {
 pub fn train(arguments: &TrainArguments) -> Result<()> {
     use_threads(arguments.threads)?;
     let lpips = load_lpips(arguments.lpips.as_deref())?;
-    if arguments.compare {
-        return compare(arguments, lpips.as_ref());
-    }
+    let alone = arguments.part.shard.is_none() && !arguments.part.merge;
+    ensure!(alone, "--shard and --merge: of one scene there are no parts; they go with --list");
     let method = arguments.settings.config()?.method;
     let name = format!("{}-{}", scene_name(arguments.scene.as_deref()), method.name());
     let out = arguments.out.as_deref();
-    let (directory, mut config) = if arguments.resume {
-        let directory = existing_directory(out, &name)?;
-        let capacity = capacity::resumed(&directory, arguments.capacity)?;
-        let saved = checkpoint_config(&directory.join(CHECKPOINT))?;
-        let config = arguments.settings.resumed(saved, capacity.as_ref())?;
-        (directory, config)
-    } else {
-        (PathBuf::new(), arguments.settings.config()?)
-    };
-    let source = if arguments.resume {
-        let saved = RunConfig::read(&directory)?;
-        let load = arguments.load.resumed(&saved.load)?;
-        let scene = arguments.scene.as_deref().unwrap_or(&saved.scene);
-        source::load(Some(scene), arguments.body.as_deref().or(saved.body.as_deref()), &load)?
-    } else {
-        source::load(arguments.scene.as_deref(), arguments.body.as_deref(), &arguments.load.options()?)?
-    };
-    let mut chosen = None;
-    if !arguments.resume && arguments.capacity == Some(CapacityName::Auto) {
-        let capacity = capacity::measure(&source, &config, &arguments.settings.set)?;
-        capacity.apply(&mut config);
-        config.validate()?;
-        chosen = Some(capacity);
-    }
-    // The directory of a new run is made only now, so that bad input leaves nothing behind.
-    let directory = if arguments.resume { directory } else { new_directory(out, &name)? };
+    let sitting =
+        Sitting { resume: arguments.resume, stop_after: arguments.stop_after, interval: arguments.saving.interval()? };
+    // The lock is held to the end.
+    let Begun { directory, source, config, _lock } =
+        if arguments.resume { resumed(arguments, &existing_directory(out, &name)?)? } else { begun(arguments, &name)? };
     let run =
         RunConfig { scene: source.scene.clone(), body: source.body.clone(), load: source.load.clone(), train: config };
     run.write(&directory)?;
-    println!("run: {}", directory.display());
-    if let Some(capacity) = &chosen {
-        capacity::save(&directory, capacity)?;
-        print!("capacity from the scene:\n{capacity}");
-    }
-    let Some(metrics) = run_one(&directory, &run, &source, lpips.as_ref(), arguments.resume, arguments.stop_after)?
-    else {
-        println!("stopped; go on with --resume --out {}", directory.display());
+    say!("run: {}", directory.display());
+    let Some(metrics) = run_one(&directory, &run, &source, lpips.as_ref(), &sitting)? else {
+        say!("stopped; go on with --resume --out {}", directory.display());
         return Ok(());
     };
     let mut rows = vec![(metrics.method.clone(), &metrics)];
@@ -114,9 +90,52 @@ pub fn train(arguments: &TrainArguments) -> Result<()> {
         prior = prior_metrics(&run, &source, lpips.as_ref())?;
         rows.insert(0, (prior.method.clone(), &prior));
     }
-    println!("\n{}:\n{}", metrics.splits.title(), table::markdown(&rows));
-    println!("pictures: {}", directory.join("renders").display());
+    say!("\n{}:\n{}", metrics.splits.title(), table::markdown(&rows));
+    say!("pictures: {}", directory.join("renders").display());
     Ok(())
+}
+
+/// A run that is about to be trained, and its directory, which nobody else writes.
+struct Begun {
+    directory: PathBuf,
+    source: Source,
+    config: Config,
+    _lock: Lock,
+}
+
+/// A new run.
+fn begun(arguments: &TrainArguments, name: &str) -> Result<Begun> {
+    let mut config = arguments.settings.config()?;
+    let source = source::load(arguments.scene.as_deref(), arguments.body.as_deref(), &arguments.load.options()?)?;
+    let mut chosen = None;
+    if arguments.capacity == Some(CapacityName::Auto) {
+        let capacity = capacity::measure(&source, &config, &arguments.settings.set)?;
+        capacity.apply(&mut config);
+        config.validate()?;
+        chosen = Some(capacity);
+    }
+    // The directory is made only now, so that bad input leaves nothing behind.
+    let (directory, lock) = new_directory(arguments.out.as_deref(), name)?;
+    capacity::begin(&directory, chosen.as_ref())?;
+    if let Some(capacity) = &chosen {
+        say!("capacity from the scene:\n{}", capacity.to_string().trim_end());
+    }
+    Ok(Begun { directory, source, config, _lock: lock })
+}
+
+/// A run that goes on.
+fn resumed(arguments: &TrainArguments, directory: &Path) -> Result<Begun> {
+    let lock = Lock::take(directory)?;
+    let capacity = capacity::resumed(directory, arguments.capacity)?;
+    let checkpoint = directory.join(CHECKPOINT);
+    // A run that ended before its first checkpoint begins anew.
+    let begun = if checkpoint.is_file() { Some(checkpoint_config(&checkpoint)?) } else { None };
+    let saved = RunConfig::read(directory)?;
+    let config = arguments.settings.resumed(begun.unwrap_or(saved.train), capacity.as_ref())?;
+    let load = arguments.load.resumed(&saved.load)?;
+    let scene = arguments.scene.as_deref().unwrap_or(&saved.scene);
+    let source = source::load(Some(scene), arguments.body.as_deref().or(saved.body.as_deref()), &load)?;
+    Ok(Begun { directory: directory.to_owned(), source, config, _lock: lock })
 }
 
 /// A short name for default directories.
@@ -132,8 +151,7 @@ pub fn run_one(
     run: &RunConfig,
     source: &Source,
     lpips: Option<&Lpips>,
-    resume: bool,
-    stop_after: Option<u64>,
+    sitting: &Sitting,
 ) -> Result<Option<Metrics>> {
     let scene = Scene::new(&source.capture, &source.model, &run.train)?;
     // Before the training, not after it.
@@ -153,11 +171,14 @@ pub fn run_one(
         return score_run(directory, run, &scene, &prior, lpips, metrics).map(Some);
     }
     let checkpoint = directory.join(CHECKPOINT);
-    let mut trainer =
-        if resume { Trainer::resume(&scene, &checkpoint)? } else { Trainer::new(&scene, run.train.clone())? };
+    let mut trainer = if sitting.resume && checkpoint.is_file() {
+        Trainer::resume(&scene, &checkpoint)?
+    } else {
+        Trainer::new(&scene, run.train.clone())?
+    };
     trainer.set_steps(run.train.steps);
     trainer.load_perceptual()?;
-    let seconds = optimise(directory, &mut trainer, stop_after)?;
+    let seconds = optimise(directory, &mut trainer, sitting)?;
     if trainer.steps_done() < run.train.steps {
         return Ok(None);
     }
@@ -177,7 +198,10 @@ pub fn run_unless_finished(
     run: &RunConfig,
     source: &Source,
     lpips: Option<&Lpips>,
+    interval: Duration,
 ) -> Result<Metrics> {
+    make_directory(&directory.join("renders"))?;
+    let _lock = Lock::take(directory)?;
     let old = if directory.join("config.toml").is_file() { Some(RunConfig::read(directory)?) } else { None };
     if let Some(old) = old.as_ref().filter(|old| !old.same_scene(run)) {
         let body = |run: &RunConfig| run.body.as_ref().map_or(String::new(), |b| format!(" with {}", b.display()));
@@ -193,18 +217,28 @@ pub fn run_unless_finished(
     let earlier = old.is_some_and(|old| old.train == run.train && old.load == run.load);
     if earlier && directory.join(METRICS).is_file() {
         let metrics = Metrics::read(directory)?;
-        // Scores that lack what is asked for now are made anew from the checkpoint.
-        if lpips.is_none() || metrics.lpips == network_name(lpips) {
-            println!("{name}: finished earlier");
+        // Scores that lack what is asked for now are made anew from the checkpoint, as are those of fewer steps.
+        let whole = run.train.method == Method::Prior || metrics.steps >= run.train.steps;
+        if whole && (lpips.is_none() || metrics.lpips == network_name(lpips)) {
+            say!("{name}: finished earlier");
             return Ok(metrics);
         }
     }
-    println!("{name}: training");
-    std::fs::create_dir_all(directory.join("renders"))?;
+    say!("{name}: training");
     run.write(directory)?;
-    let resume = earlier && directory.join(CHECKPOINT).is_file();
-    let metrics = run_one(directory, run, source, lpips, resume, None)?;
+    let sitting = Sitting { resume: earlier, stop_after: None, interval };
+    let metrics = run_one(directory, run, source, lpips, &sitting)?;
     metrics.with_context(|| format!("{name}: stopped before its end"))
+}
+
+/// The scores under `directory` of a run with the settings `config`; `None` where it has not come to them.
+pub fn finished(directory: &Path, config: &Config) -> Result<Option<Metrics>> {
+    if !directory.join("config.toml").is_file() || !directory.join(METRICS).is_file() {
+        return Ok(None);
+    }
+    let metrics = Metrics::read(directory)?;
+    let whole = config.method == Method::Prior || metrics.steps >= config.steps;
+    Ok(Some(metrics).filter(|_| whole && RunConfig::read(directory).is_ok_and(|run| run.train == *config)))
 }
 
 /// The scores of the prior baseline on the same frames.
@@ -220,117 +254,4 @@ fn prior_metrics(run: &RunConfig, source: &Source, lpips: Option<&Lpips>) -> Res
     let split = if scene.eval.is_empty() { Split::TrainView } else { Split::NovelView };
     *split.of(&mut metrics.splits) = Some(drawn.score(&scene, split, lpips, |_, _| {})?);
     Ok(metrics)
-}
-
-/// Takes steps until the end or `stop_after`, with a log, a bar and checkpoints; returns seconds of training, those
-/// of earlier sittings included.
-fn optimise(directory: &Path, trainer: &mut Trainer<'_>, stop_after: Option<u64>) -> Result<f64> {
-    let total = trainer.model().config().steps;
-    let end = stop_after.unwrap_or(total).min(total);
-    let log_path = directory.join(LOG);
-    let earlier = earlier_log(&log_path, trainer.steps_done())?;
-    run::write(&log_path, &earlier.text)?;
-    let mut log = std::fs::File::options().append(true).open(&log_path).context(LOG)?;
-    let bar = ProgressBar::new(total);
-    let style = "{bar:28} {pos}/{len} steps  {msg}  {elapsed} elapsed, {eta} left";
-    bar.set_style(ProgressStyle::with_template(style)?);
-    bar.set_position(trainer.steps_done());
-    bar.reset_eta();
-    let checkpoint = directory.join(CHECKPOINT);
-    let (start, mut saved, mut lined) = (Instant::now(), Instant::now(), Instant::now());
-    let (mut smooth, mut bad, mut restarts) = (None::<StepReport>, 0, None);
-    while trainer.steps_done() < end {
-        let report = match trainer.step() {
-            Ok(report) => report,
-            Err(error) => {
-                bar.abandon();
-                let learnt = match trainer.save(&checkpoint) {
-                    Ok(()) => format!("is in {}", checkpoint.display()),
-                    Err(error) => format!("could not be saved ({error})"),
-                };
-                let place = format!("step {}; what was learnt {learnt}", trainer.steps_done() + 1);
-                return Err(anyhow::Error::from(error).context(place));
-            }
-        };
-        bad += report.bad_gradients;
-        if restarts.replace(report.restarts).is_some_and(|before| before < report.restarts) {
-            let said = format!("step {}: nothing was left of the person", report.step);
-            bar.suspend(|| eprintln!("{said}; begun anew at a tenth of the learning rates"));
-        }
-        let mean = blend(smooth, report);
-        smooth = Some(mean);
-        let seconds = earlier.seconds + start.elapsed().as_secs_f64();
-        if report.step.is_multiple_of(LOG_EVERY) || report.step == end {
-            let mut line = serde_json::to_value(mean)?;
-            line["step"] = report.step.into();
-            line["seconds"] = seconds.into();
-            line["live_samples"] = report.live_samples.into();
-            line["bad_gradients"] = bad.into();
-            writeln!(log, "{line}").context(LOG)?;
-            let message = format!(
-                "loss {:.4} (mse {:.4}, perceptual {:.3}, completeness {:.4})  psnr {:.2}",
-                mean.loss, mean.mse, mean.perceptual, mean.completeness, mean.psnr
-            );
-            bar.set_position(report.step);
-            if !std::io::stderr().is_terminal() && lined.elapsed() >= LINE_EVERY {
-                lined = Instant::now();
-                let left = start.elapsed().as_secs_f64() / (bar.position() as f64 - earlier.steps as f64).max(1.0)
-                    * (total - report.step) as f64;
-                eprintln!("step {}/{total}  {message}  {seconds:.0} s, {left:.0} s left", report.step);
-            }
-            bar.set_message(message);
-        }
-        if saved.elapsed() >= CHECKPOINT_EVERY {
-            trainer.save(&checkpoint)?;
-            saved = Instant::now();
-        }
-    }
-    trainer.save(&checkpoint)?;
-    bar.finish();
-    if bad > 0 {
-        eprintln!("warning: {bad} gradients were not finite and were left out");
-    }
-    Ok(earlier.seconds + start.elapsed().as_secs_f64())
-}
-
-/// Seconds of training that the first `steps` steps of the run in `directory` took, as far as its log knows.
-pub fn logged_seconds(directory: &Path, steps: u64) -> Result<f64> {
-    Ok(earlier_log(&directory.join(LOG), steps)?.seconds)
-}
-
-struct EarlierLog {
-    text: String,
-    seconds: f64,
-    steps: u64,
-}
-
-/// The log up to the checkpoint; lines of steps that the checkpoint does not hold are dropped.
-fn earlier_log(path: &Path, steps: u64) -> Result<EarlierLog> {
-    let mut log = EarlierLog { text: String::new(), seconds: 0.0, steps };
-    if steps == 0 || !path.exists() {
-        return Ok(log);
-    }
-    for line in std::fs::read_to_string(path).with_context(|| path.display().to_string())?.lines() {
-        let Ok(value) = serde_json::from_str::<serde_json::Value>(line) else { continue };
-        if value["step"].as_u64().is_some_and(|s| s <= steps) {
-            log.text.push_str(line);
-            log.text.push('\n');
-            log.seconds = value["seconds"].as_f64().unwrap_or(log.seconds);
-        }
-    }
-    Ok(log)
-}
-
-/// A running mean over about fifty steps.
-fn blend(mean: Option<StepReport>, new: StepReport) -> StepReport {
-    let Some(old) = mean else { return new };
-    let mix = |old: f64, new: f64| old + 0.02 * (new - old);
-    StepReport {
-        loss: mix(old.loss, new.loss),
-        mse: mix(old.mse, new.mse),
-        perceptual: mix(old.perceptual, new.perceptual),
-        completeness: mix(old.completeness, new.completeness),
-        psnr: mix(old.psnr, new.psnr),
-        ..new
-    }
 }

@@ -3,6 +3,7 @@
 mod avatar;
 mod charts;
 mod draw;
+pub mod export;
 mod field;
 mod make;
 mod motion;
@@ -16,6 +17,7 @@ mod surface;
 #[cfg(test)]
 mod tests;
 
+use std::io::Write;
 use std::path::Path;
 
 use crate::Error;
@@ -30,9 +32,5 @@ pub use surface::SurfaceReport;
 
 /// Writes a file that is either the old one or complete.
 fn write_whole(path: &Path, bytes: &[u8]) -> Result<(), Error> {
-    let mut name = path.file_name().unwrap_or_default().to_owned();
-    name.push(".partial");
-    let partial = path.with_file_name(name);
-    std::fs::write(&partial, bytes).map_err(|source| Error::Io { path: path.to_owned(), source })?;
-    std::fs::rename(&partial, path).map_err(|source| Error::Io { path: path.to_owned(), source })
+    crate::replace_file(path, |to| to.write_all(bytes)).map_err(|source| Error::Io { path: path.to_owned(), source })
 }

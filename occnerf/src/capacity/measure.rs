@@ -10,7 +10,8 @@ use crate::Error;
 use crate::config::Config;
 use crate::scene::prepared::{PreparedFrame, Scene};
 
-/// Pixels of the subject that are looked at, at most: every n-th, all frames alike. A million keys take 8 MB.
+/// Pixels of the subject that are looked at, at most: every n-th, all frames alike. A million keys
+/// take 8 MB.
 const MAX_PIXELS: usize = 1 << 20;
 /// Cells an axis beyond which points are not told apart: three such numbers fit one key.
 const MAX_CELLS: f32 = (1 << 20) as f32;
@@ -24,9 +25,11 @@ pub struct Measured {
     pub extent: f32,
     /// Pixels labelled subject, over all training frames.
     pub subject_pixels: u64,
-    /// Distinct cells, as wide as a pixel, of the canonical surface in which a subject pixel's ray first meets the prior.
+    /// Distinct cells, as wide as a pixel, of the canonical surface in which a subject pixel's ray
+    /// first meets the prior.
     pub cells: u64,
-    /// Mean length of a subject pixel's ray within the box of the posed body, along which samples are spread.
+    /// Mean length of a subject pixel's ray within the box of the posed body, along which samples
+    /// are spread.
     pub span: f32,
 }
 
@@ -34,8 +37,8 @@ impl Measured {
     /// Measures the training frames of `scene` for a model with the margins of `config`.
     ///
     /// # Errors
-    /// [`Error::Scene`] where no frame has the body before its camera or no subject pixel's ray meets the posed prior;
-    /// [`Error::Visibility`] for a prior that cannot be cast at.
+    /// [`Error::Scene`] where no frame has the body before its camera or no subject pixel's ray
+    /// meets the posed prior; [`Error::Visibility`] for a prior that cannot be cast at.
     pub fn of(scene: &Scene, config: &Config) -> Result<Self, Error> {
         let mut widths: Vec<f32> = scene.train.iter().filter_map(pixel_width).collect();
         widths.sort_by(f32::total_cmp);
@@ -71,7 +74,8 @@ impl Measured {
     }
 }
 
-/// Width of a pixel at the depth of the body's middle; `None` for a body that is not before the camera.
+/// Width of a pixel at the depth of the body's middle; `None` for a body that is not before the
+/// camera.
 fn pixel_width(frame: &PreparedFrame) -> Option<f32> {
     let centre = frame.view.posed.vertices.iter().sum::<Vec3>() / frame.view.posed.vertices.len().max(1) as f32;
     let depth = frame.view.camera.world_to_camera.transform_point3(centre).z;

@@ -1,4 +1,5 @@
-//! How much model a scene needs: sizes of the encoding, the perceptron and the sampling from what its video shows.
+//! How much model a scene needs: sizes of the encoding, the perceptron and the sampling from what
+//! its video shows.
 
 mod measure;
 mod prune;
@@ -17,21 +18,23 @@ use crate::scene::prepared::Scene;
 const PIXELS_A_CELL: f32 = 0.75;
 /// Rows of a level's table for the shape that every body has, before any detail.
 const ROWS_OF_A_BODY: f64 = 4096.0;
-/// Pixel-wide places of the seen surface for each row on top of those. At 2.5 the demo loses 0.3 dB.
+/// Pixel-wide places of the seen surface for each row on top of those. At 2.5 the demo loses 0.3
+/// dB.
 const PLACES_A_ROW: f64 = 1.0;
 /// Pixel-wide places for each unit of a hidden layer.
 const PLACES_A_UNIT: f64 = 400.0;
-/// Least width of a hidden layer, whatever the scene: 32 loses 0.3 dB and saves a thirtieth of the parameters. Widths are
-/// multiples of `UNITS`, for the kernels fill up their lanes anyway.
+/// Least width of a hidden layer, whatever the scene: 32 loses 0.3 dB and saves a thirtieth of the
+/// parameters. Widths are multiples of `UNITS`, for the kernels fill up their lanes anyway.
 const MIN_WIDTH: usize = 64;
 const UNITS: usize = 16;
 /// Mean distance of samples along a ray, normalised metres: that of `fast` on a walking person.
 const STEP: f32 = 0.018;
 
-/// What was measured of a scene, and the sizes that follow from it, none above those it started from.
+/// What was measured of a scene, and the sizes that follow from it, none above those it started
+/// from.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Capacity {
-    /// What the video shows.
+    /// What the video shows of the person.
     pub measured: Measured,
     /// Sizes with their reasons.
     pub choices: Vec<Choice>,
@@ -40,23 +43,25 @@ pub struct Capacity {
     pub pruned: Option<Pruned>,
 }
 
-/// One size.
+/// A size of the model, with its reason.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Choice {
     /// Dotted name in [`Config`].
     pub key: String,
-    /// Value before.
+    /// Value in the preset.
     pub preset: f64,
-    /// Value from now on, at most `preset`.
+    /// Value chosen for the scene, at most `preset`.
     pub chosen: f64,
-    /// Why.
+    /// The reason, in words and figures.
     pub why: String,
 }
 
 impl Capacity {
-    /// Measures a scene and chooses sizes at most those of `config`; the same for the same scene, whatever the threads.
+    /// Measures a scene and chooses sizes at most those of `config`; the same for the same scene,
+    /// whatever the threads.
     ///
-    /// Of the encodings the hash grids have sizes to choose; `humannerf` keeps its perceptron, which holds the whole person.
+    /// Of the encodings the hash grids have sizes to choose; `humannerf` keeps its perceptron,
+    /// which holds the whole person.
     ///
     /// # Errors
     /// A configuration that is not valid, and those of [`Measured::of`].
@@ -116,7 +121,8 @@ impl Capacity {
     }
 }
 
-/// Levels up to `n_max` cells that keep the growth from level to level of `most` levels up to `preset_max` cells.
+/// Levels up to `n_max` cells that keep the growth from level to level of `most` levels up to
+/// `preset_max` cells.
 fn levels(most: usize, n_min: u32, preset_max: u32, n_max: u32) -> (usize, f64) {
     let octaves = |n: u32| (f64::from(n.max(1)) / f64::from(n_min.max(1))).ln();
     if most < 2 || preset_max <= n_min {

@@ -1,11 +1,11 @@
-//! What of a trained model carries nothing.
+//! Pruning: rows of the hash table that training never moved.
 
 use serde::{Deserialize, Serialize};
 
 use crate::model::parameters::Part;
 use crate::model::trained::Model;
 
-/// What pruning took away.
+/// Counts of what pruning took away.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Pruned {
     /// Rows of the hash table before.
@@ -17,9 +17,9 @@ pub struct Pruned {
 }
 
 impl Model {
-    /// Empties the rows of the hash table that training never moved: they are no longer counted and no longer stored in a
-    /// checkpoint. What a training ray can meet stays the same to the bit; elsewhere a feature changes by the 1e-4 that such a
-    /// row was filled with at the start.
+    /// Empties the rows of the hash table that training never moved: they are no longer counted and
+    /// no longer stored in a checkpoint. What a training ray can meet stays the same to the bit;
+    /// elsewhere a feature changes by the 1e-4 that such a row was filled with at the start.
     pub fn prune(&mut self) -> Pruned {
         let features = self.config.encoding.features.max(1);
         let initial = self.field.encoder.initial_table(self.config.seed);

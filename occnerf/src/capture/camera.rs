@@ -3,11 +3,15 @@
 use glam::{Affine3A, Mat3, Vec3};
 use volrender::{Camera, Distortion};
 
+use super::CaptureError;
+use super::checks::MAX_DISTANCE;
 use super::records::Record;
-use super::{CaptureError, LoadOptions};
 
-/// Largest |R Rᵀ − I| of an extrinsic rotation; files written in `f32` or with a few decimals stay far below.
+/// Largest |R Rᵀ − I| of an extrinsic rotation; files written in `f32` or with a few decimals stay
+/// far below.
 const ORTHONORMAL: f32 = 1e-3;
+/// Focal lengths, in pixels, from a fisheye's on a picture of a few pixels to a telescope's.
+const FOCAL: (f32, f32) = (0.01, 1e7);
 
 /// A lens and where it stands. The camera's image is 1 × 1 until the picture has been read.
 #[derive(Clone, Copy, Debug)]
@@ -30,17 +34,30 @@ pub(super) fn rotation(values: &[f32], columns: usize) -> Option<Mat3> {
     (!skewed).then_some(rotation)
 }
 
-/// A camera from a row-major calibration matrix (9); the error says what is wrong with it.
-pub(super) fn pinhole(k: &[f32], extrinsics: Affine3A, options: &LoadOptions) -> Result<Camera, String> {
+/// A camera from a row-major calibration matrix (9) that puts the first pixel's centre at
+/// `pixel_centre`; the error says what is wrong with it.
+pub(super) fn pinhole(k: &[f32], extrinsics: Affine3A, pixel_centre: f32) -> Result<Camera, String> {
     let mut intrinsics = Mat3::from_cols_slice(k).transpose();
+    let focal = k[0].min(k[4])..=k[0].max(k[4]);
+    if *focal.start() < FOCAL.0 || *focal.end() > FOCAL.1 {
+        return Err(format!("focal lengths of {} and {} pixels, expected {} to {}", k[0], k[4], FOCAL.0, FOCAL.1));
+    }
+    if k[2].abs().max(k[5].abs()) > FOCAL.1 {
+        return Err(format!("a principal point at {} {}, expected at most {} either way", k[2], k[5], FOCAL.1));
+    }
+    if extrinsics.translation.abs().max_element() > MAX_DISTANCE {
+        let expected = format!("expected at most {MAX_DISTANCE} either way");
+        return Err(format!("a translation of {}, {expected}", extrinsics.translation));
+    }
     // The camera's own convention has the first pixel's centre at 0.5.
-    intrinsics.z_axis += Vec3::new(1.0, 1.0, 0.0) * (0.5 - options.pixel_centre);
+    intrinsics.z_axis += Vec3::new(1.0, 1.0, 0.0) * (0.5 - pixel_centre);
     Camera::new(intrinsics, extrinsics, 1, 1).map_err(|error| error.to_string())
 }
 
 impl Lens {
-    /// From a 3×3 matrix under `k`, a 3×4 or 4×4 one under `e`, and five numbers under `distortions` if there are any.
-    pub fn read(record: &Record<'_>, k: &str, e: &str, options: &LoadOptions) -> Result<Self, CaptureError> {
+    /// From a 3×3 matrix under `k`, a 3×4 or 4×4 one under `e`, and five numbers under
+    /// `distortions` if there are any.
+    pub fn read(record: &Record<'_>, k: &str, e: &str, pixel_centre: f32) -> Result<Self, CaptureError> {
         let intrinsics = record.shaped(k, &[3, 3], "")?;
         let (shape, values) = record.array(e)?;
         if shape != [4, 4] && shape != [3, 4] {
@@ -53,7 +70,7 @@ impl Lens {
             record.invalid(e, expected, format!("{values:?}"))
         })?;
         let translation = Vec3::new(values[3], values[7], values[11]);
-        let camera = pinhole(&intrinsics, Affine3A::from_mat3_translation(rotation, translation), options)
+        let camera = pinhole(&intrinsics, Affine3A::from_mat3_translation(rotation, translation), pixel_centre)
             .map_err(|error| record.invalid(k, "a pinhole camera", error))?;
 
         let mut distortion = Distortion::default();

@@ -8,20 +8,38 @@ use smpl::{BodyModel, Placement};
 use super::records::{Record, triples};
 use super::{CaptureError, Frame};
 
-/// How far a joint may be from where the file has it, as a fraction of the body's largest extent: 4 cm at 1.7 m.
-/// The same model agrees to rounding, another model of a person is several times as far off.
+/// How far a joint may be from where the file has it, as a fraction of the body's largest extent: 4
+/// cm at 1.7 m. The same model agrees to rounding, another model of a person is several times as
+/// far off.
 const JOINT_TOLERANCE: f32 = 0.04 / 1.7;
+
+/// Largest component of a rotation that is taken for one, in radians: more turns than anybody takes
+/// in a video.
+const MAX_ANGLE: f32 = 1e3;
+/// Largest shape coefficient, in standard deviations.
+const MAX_BETA: f32 = 1e3;
+/// Farthest from the origin that a body or a camera may be, in whatever unit.
+pub(super) const MAX_DISTANCE: f32 = 1e7;
+
+/// Errors for a number that nothing in the world has.
+pub(super) fn below(record: &Record<'_>, key: &str, values: &[f32], most: f32) -> Result<(), CaptureError> {
+    match values.iter().find(|value| value.abs() > most) {
+        Some(value) => Err(record.invalid(key, format!("numbers up to {most} either way"), value.to_string())),
+        None => Ok(()),
+    }
+}
 
 /// Shape coefficients that the model can take.
 pub(super) fn betas(record: &Record<'_>, key: &str, body: &BodyModel) -> Result<Vec<f32>, CaptureError> {
     let (shape, values) = record.array(key)?;
-    if shape.len() != 1 || values.is_empty() || values.len() > body.num_betas() {
-        return Err(record.invalid(
-            key,
-            format!("1 to {} numbers, as the body model has", body.num_betas()),
-            format!("shape {shape:?}"),
-        ));
+    if shape.len() != 1 || values.len() > body.num_betas() || values.is_empty() && body.num_betas() > 0 {
+        let expected = match body.num_betas() {
+            0 => "no numbers: the body model has one shape only".to_owned(),
+            most => format!("1 to {most} numbers, as the body model has"),
+        };
+        return Err(record.invalid(key, expected, format!("shape {shape:?}")));
     }
+    below(record, key, &values, MAX_BETA)?;
     Ok(values)
 }
 
@@ -29,6 +47,7 @@ pub(super) fn betas(record: &Record<'_>, key: &str, body: &BodyModel) -> Result<
 pub(super) fn pose(record: &Record<'_>, body: &BodyModel) -> Result<Vec<Vec3>, CaptureError> {
     let joints = body.num_joints();
     let (shape, values) = record.array("poses")?;
+    below(record, "poses", &values, MAX_ANGLE)?;
     if shape != [3 * joints] && shape != [joints, 3] {
         let expected = format!("shape [{}], 3 for each of the body model's {joints} joints", 3 * joints);
         return Err(record.invalid("poses", expected, format!("shape {shape:?}")));
@@ -48,7 +67,10 @@ pub(super) fn rootless_pose(record: &Record<'_>, body: &BodyModel) -> Result<Vec
 
 /// ZJU-MoCap's way of placing a body: rotation `Rh` and translation `Th` about the origin.
 pub(super) fn origin(record: &Record<'_>) -> Result<Placement, CaptureError> {
-    Ok(Placement::Origin { rotation: record.vec3("Rh")?, translation: record.vec3("Th")? })
+    let (rotation, translation) = (record.vec3("Rh")?, record.vec3("Th")?);
+    below(record, "Rh", &rotation.to_array(), MAX_ANGLE)?;
+    below(record, "Th", &translation.to_array(), MAX_DISTANCE)?;
+    Ok(Placement::Origin { rotation, translation })
 }
 
 /// The mean of all frames' shape coefficients, those that a frame lacks being 0.

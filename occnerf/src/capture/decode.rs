@@ -8,14 +8,16 @@ use rayon::prelude::*;
 use smpl::{BodyModel, Placement};
 
 use super::camera::Lens;
-use super::image::{dimensions, load_mask, resize};
-use super::source::{PixelSource, Pixels};
-use super::undistort::undistort;
-use super::{CaptureError, Frame, Image, LoadOptions, checks};
+use super::files::{Files, decoding_bytes};
+use super::gate::Gate;
+use super::image::dimensions;
+use super::source::PixelSource;
+use super::{CaptureError, Frame, LoadOptions, checks};
 
 /// Bytes that a pixel of a frame takes: three colours and coverage.
 const PIXEL_BYTES: u64 = 16;
-/// Bytes that a vertex of a frame's body takes once it is prepared: at rest, its pose offset, and posed.
+/// Bytes that a vertex of a frame's body takes once it is prepared: at rest, its pose offset, and
+/// posed.
 const VERTEX_BYTES: u64 = 36;
 /// A training frame's labels take this part of the bytes of its pixels: see [`crate::Labels`].
 const LABELS_SHARE: u64 = 42;
@@ -37,29 +39,25 @@ pub(super) struct Planned {
     pub betas: Vec<f32>,
 }
 
-/// The files of a frame, and how they become its pixels.
-#[derive(Debug)]
-pub(super) struct Files {
-    image: PathBuf,
-    masks: Vec<PathBuf>,
-    labels: bool,
-    occluder: Option<PathBuf>,
-    hidden: Option<[(u32, u32); 2]>,
-    lens: Lens,
-    /// Columns and rows of every file, and what they are reduced to.
-    size: (u32, u32),
-    to: (u32, u32),
-    /// Name of the frame that `size` was read from.
-    first: Arc<str>,
+/// Bytes of memory for pictures that are kept, shared out first come, first served, and the way to
+/// those for decoding.
+pub(super) struct Budget {
+    left: u64,
+    gate: Arc<Gate>,
 }
 
-/// Bytes of memory, shared out first come, first served.
-pub(super) struct Budget(u64);
-
 impl Budget {
+    /// `left` bytes of which those for decoding are put aside: `picture` for every thread, but at
+    /// most a quarter unless one picture takes more.
+    fn new(left: u64, picture: u64) -> Self {
+        let threads = rayon::current_num_threads() as u64;
+        let aside = (picture.saturating_mul(threads)).min(left / 4).max(picture);
+        Self { left: left.saturating_sub(aside), gate: Arc::new(Gate::new(aside)) }
+    }
+
     fn take(&mut self, bytes: u64) -> bool {
-        let left = self.0.checked_sub(bytes);
-        self.0 = left.unwrap_or(self.0);
+        let left = self.left.checked_sub(bytes);
+        self.left = left.unwrap_or(self.left);
         left.is_some()
     }
 }
@@ -87,7 +85,13 @@ impl View {
         u64::from(width) * u64::from(height) * PIXEL_BYTES
     }
 
-    /// The frames, checked together. Pictures that `budget` has room for are decoded; headers are read of all.
+    /// Bytes that decoding a frame takes.
+    fn decoding_bytes(&self) -> u64 {
+        decoding_bytes(self.size)
+    }
+
+    /// The frames, checked together. Pictures that `budget` has room for are decoded; headers are
+    /// read of all.
     pub fn frames(
         self,
         body: &BodyModel,
@@ -101,12 +105,14 @@ impl View {
             let Planned { name, image, masks, labels, occluder, hidden, lens, pose, placement, betas } = plan;
             let camera = volrender::Camera { width: size.0, height: size.1, ..lens.camera };
             let first = Arc::clone(&first);
-            let files = Files { image, masks, labels, occluder, hidden, lens, size, to, first };
+            let gate = Arc::clone(&budget.gate);
+            let files = Files { image, masks, labels, occluder, hidden, lens, size, to, first, gate };
             let source = PixelSource::on_disk(files, budget.take(bytes));
             Frame { name, source, camera: camera.resized(to.0, to.1), pose, placement, betas }
         };
         let frames: Vec<Frame> = self.frames.into_iter().map(frame).collect();
-        // Collected as results first, so that the error reported is the first in order whatever finishes first.
+        // Collected as results first, so that the error reported is the first in order whatever
+        // finishes first.
         let checked: Vec<Result<(), CaptureError>> = frames.par_iter().map(|f| f.source.check()).collect();
         checked.into_iter().collect::<Result<(), CaptureError>>()?;
         checks::subject_is_seen(&self.masks, &frames)?;
@@ -115,8 +121,8 @@ impl View {
     }
 }
 
-/// Bytes for pixels that [`LoadOptions::max_bytes`] leaves beside the bodies of all views. Errors where that is not one picture,
-/// naming values that fit.
+/// Bytes for pixels that [`LoadOptions::max_bytes`] leaves beside the bodies of all views. Errors
+/// where no picture can be decoded in that, naming values that fit.
 pub(super) fn budget(
     train: &View,
     eval: &[View],
@@ -126,25 +132,19 @@ pub(super) fn budget(
     let limit = options.max_bytes;
     let body_bytes = body.num_vertices() as u64 * VERTEX_BYTES;
     let views = || std::iter::once(train).chain(eval);
-    // Bytes of what is kept of every frame: of every n-th in training, and of every m-th view kept back.
+    // Bytes of what is kept of every frame: of every n-th in training, and of every m-th view kept
+    // back.
     let kept = |n: usize, m: usize| {
         let (frames, views) =
             (train.frames.len().div_ceil(n), eval.iter().map(|v| v.frames.len().div_ceil(m)).sum::<usize>());
         (frames + views) as u64 * body_bytes + frames as u64 * train.picture_bytes(options).div_ceil(LABELS_SHARE)
     };
     let bodies = kept(1, 1);
-    let picture = views().map(|view| view.picture_bytes(options)).max().unwrap_or(0);
+    let picture = views().map(View::decoding_bytes).max().unwrap_or(0);
     if bodies + picture <= limit {
-        return Ok(Budget(limit - bodies));
+        return Ok(Budget::new(limit - bodies, picture));
     }
     let mut ways = Vec::new();
-    if bodies < limit {
-        let side = views().map(|view| options.resized(view.size)).map(|(w, h)| w.max(h)).max().unwrap_or(1);
-        let resize = (f64::from(side) * ((limit - bodies) as f64 / picture as f64).sqrt()).floor();
-        if resize >= 1.0 {
-            ways.push(format!("resize {resize}"));
-        }
-    }
     let longest = views().map(|view| view.frames.len()).max().unwrap_or(1);
     let fits = |n: usize, m: usize| kept(n, m) + picture <= limit;
     if let Some(n) = (2..=longest).find(|&n| fits(n, n)) {
@@ -161,76 +161,6 @@ pub(super) fn budget(
     let frames: usize = views().map(|view| view.frames.len()).sum();
     let expected =
         format!("all bodies and a picture within {} MiB (would fit: {})", mebibytes(limit), ways.join(", or "));
-    let actual = format!("{frames} bodies of {} vertices and {picture} bytes a picture", body.num_vertices());
+    let actual = format!("{frames} bodies of {} vertices and {picture} bytes to decode a picture", body.num_vertices());
     Err(CaptureError::setting("max_bytes", expected, actual))
-}
-
-impl Files {
-    /// Whether the headers say what they should; nothing is decoded that the memory check did not count.
-    pub fn check(&self) -> Result<(), CaptureError> {
-        self.same_size(&self.image, dimensions(&self.image)?)?;
-        self.masks.iter().chain(&self.occluder).try_for_each(|path| self.same_size(path, dimensions(path)?))
-    }
-
-    fn same_size(&self, path: &Path, found: (u32, u32)) -> Result<(), CaptureError> {
-        if found == self.size {
-            return Ok(());
-        }
-        let text = |(w, h): (u32, u32)| format!("{w}×{h}");
-        let of = if path == self.image { format!("`{}`", self.first) } else { "its image".to_owned() };
-        Err(CaptureError::invalid(path, "size", format!("{}, as of {of}", text(self.size)), text(found)))
-    }
-
-    /// A mask, which may have changed since its header was read.
-    fn mask(&self, path: &Path) -> Result<Vec<f32>, CaptureError> {
-        let (width, height, levels) = load_mask(path)?;
-        self.same_size(path, (width, height)).map(|()| levels)
-    }
-
-    /// Reads the pictures.
-    pub fn decode(&self) -> Result<Pixels, CaptureError> {
-        self.check()?;
-        let size = self.size;
-        let mut image = Image::load(&self.image)?;
-        self.same_size(&self.image, (image.width, image.height))?;
-        let mut mask = vec![0.0f32; size.0 as usize * size.1 as usize];
-        for path in &self.masks {
-            for (out, level) in mask.iter_mut().zip(self.mask(path)?) {
-                let level = if self.labels && level > 0.0 { 1.0 } else { level };
-                *out = out.max(level);
-            }
-        }
-        if let Some([(x0, y0), (x1, y1)]) = self.hidden {
-            let columns = x0.min(size.0) as usize..x1.min(size.0) as usize;
-            for row in mask.chunks_exact_mut(size.0 as usize).take(y1 as usize).skip(y0 as usize) {
-                row[columns.clone()].fill(0.0);
-            }
-        }
-        let occluder = match &self.occluder {
-            Some(path) => Some(self.mask(path)?.into_iter().map(|level| f32::from(level > 0.5)).collect()),
-            None => None,
-        };
-        // Masked first, or interpolation would draw hidden colours into the mask's edge.
-        image.multiply(&mask);
-
-        let Lens { camera, distortion } = self.lens;
-        let camera = volrender::Camera { width: size.0, height: size.1, ..camera };
-        let to = self.to;
-        let resample = |values: Vec<f32>, channels: usize| {
-            resize(undistort(values, channels, &camera, &distortion), channels, size, to)
-        };
-        // Without known occluders the silhouette tells what is unknown.
-        let occluder = occluder.map(|covered: Vec<f32>| {
-            let everything = (!distortion.is_none()).then(|| vec![1.0; covered.len()]);
-            // A pixel that an occluder touches is not known to show background.
-            let mut unknown: Vec<bool> = resample(covered, 1).into_iter().map(|covered| covered > 0.0).collect();
-            if let Some(everything) = everything {
-                // Nor is one that the lens never saw.
-                unknown.iter_mut().zip(resample(everything, 1)).for_each(|(unknown, seen)| *unknown |= seen < 0.5);
-            }
-            unknown
-        });
-        let image = Image { width: to.0, height: to.1, pixels: resample(image.pixels, 3) };
-        Ok(Pixels { image, mask: resample(mask, 1), occluder })
-    }
 }

@@ -1,7 +1,7 @@
 use std::path::{Path, PathBuf};
 
-/// What is wrong with a capture, in one line that names the file, the key within it, what was expected and
-/// what was found.
+/// What is wrong with a capture, in one line that names the file, the key within it, what was
+/// expected and what was found.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum CaptureError {
@@ -21,15 +21,16 @@ pub enum CaptureError {
         /// The codec's reason.
         source: image::ImageError,
     },
-    /// A pickle or array file is truncated or malformed, or an array in it has the wrong type or shape.
+    /// A pickle or array file is truncated or malformed, or an array in it has the wrong type or
+    /// shape.
     #[error(transparent)]
     Array(#[from] smpl::Error),
     /// A file that the layout demands is absent.
     #[error("{}: missing {what}", path.display())]
     Missing {
-        /// Where it should be.
+        /// Path where it should be.
         path: PathBuf,
-        /// What is absent, and who refers to it.
+        /// Name of what is absent, and who refers to it.
         what: String,
     },
     /// A value has the wrong type, shape or size, or makes no sense.
@@ -39,9 +40,9 @@ pub enum CaptureError {
         path: PathBuf,
         /// The value within the file.
         key: String,
-        /// What would have been right.
+        /// Values that would have been right.
         expected: String,
-        /// What is there.
+        /// Value that is there.
         actual: String,
     },
     /// A setting that no capture can be made with.
@@ -49,9 +50,9 @@ pub enum CaptureError {
     Setting {
         /// The setting.
         name: &'static str,
-        /// What would have been right.
+        /// Values that would have been right.
         expected: String,
-        /// What was given.
+        /// Value that was given.
         actual: String,
     },
 }

@@ -16,8 +16,8 @@ pub enum Layout {
 }
 
 impl Layout {
-    /// In the order in which they are looked for: HumanNeRF's tool puts its files beside the `metadata.json` that it
-    /// made them from.
+    /// In the order in which they are looked for: HumanNeRF's tool puts its files beside the
+    /// `metadata.json` that it made them from.
     const ALL: [(&'static [&'static str], &'static str, Self); 3] = [
         (&["annots.npy"], "raw ZJU-MoCap", Self::ZjuMocap),
         (&["metadata.json"], "HumanNeRF's wild layout", Self::Wild),
@@ -27,7 +27,8 @@ impl Layout {
     /// The layout of the capture in `dir`, by the files that are there.
     ///
     /// # Errors
-    /// [`CaptureError::Missing`] where there is no such directory, [`CaptureError::Invalid`] where it has no known layout.
+    /// [`CaptureError::Missing`] where there is no such directory, [`CaptureError::Invalid`] where
+    /// it has no known layout.
     pub fn detect(dir: &Path) -> Result<Self, CaptureError> {
         if !dir.is_dir() {
             return Err(CaptureError::missing(dir, "directory"));
@@ -40,12 +41,13 @@ impl Layout {
     }
 }
 
-/// The body model that belongs to the capture in `dir`: its own `body.npz` or `body.safetensors`, else the first `.npz` with a body in a
-/// directory `body` beside it or beside the nearest of the directories above it.
+/// The body model that belongs to the capture in `dir`: its own `body.npz` or `body.safetensors`,
+/// else the first `.npz` with a body in a directory `body` beside it or beside the nearest of the
+/// directories above it.
 ///
 /// # Errors
-/// [`CaptureError::Missing`] or [`CaptureError::Invalid`] where `dir` is no capture of a known layout, and
-/// [`CaptureError::Missing`] where no body is found.
+/// [`CaptureError::Missing`] or [`CaptureError::Invalid`] where `dir` is no capture of a known
+/// layout, and [`CaptureError::Missing`] where no body is found.
 pub fn find_body(dir: &Path) -> Result<PathBuf, CaptureError> {
     Layout::detect(dir)?;
     if let Some(found) = own_body(dir) {

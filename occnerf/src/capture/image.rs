@@ -47,8 +47,8 @@ impl Image {
     /// Reads a PNG or JPEG of 8 or 16 bits a channel; grey becomes RGB, transparency is dropped.
     ///
     /// # Errors
-    /// [`CaptureError::Io`], [`CaptureError::Picture`], and [`CaptureError::Invalid`] for a side of 0 or above 8192,
-    /// which is found before anything is decoded.
+    /// [`CaptureError::Io`], [`CaptureError::Picture`], and [`CaptureError::Invalid`] for a side of
+    /// 0 or above 8192, which is found before anything is decoded.
     pub fn load(path: &Path) -> Result<Self, CaptureError> {
         let decoded = decode(path)?.into_rgb32f();
         Ok(Self { width: decoded.width(), height: decoded.height(), pixels: decoded.into_raw() })
@@ -57,8 +57,8 @@ impl Image {
     /// Writes an 8-bit PNG; values are clamped to 0 to 1 and NaN becomes 0.
     ///
     /// # Errors
-    /// [`CaptureError::Io`] or [`CaptureError::Picture`] where the file cannot be written, [`CaptureError::Setting`]
-    /// where `pixels` is not (H, W, 3).
+    /// [`CaptureError::Io`] or [`CaptureError::Picture`] where the file cannot be written,
+    /// [`CaptureError::Setting`] where `pixels` is not (H, W, 3).
     pub fn save_png(&self, path: &Path) -> Result<(), CaptureError> {
         let bytes = self.pixels.iter().copied().map(to_byte).collect();
         let picture = image::RgbImage::from_raw(self.width, self.height, bytes);
@@ -113,21 +113,22 @@ pub(super) fn dimensions(path: &Path) -> Result<(u32, u32), CaptureError> {
     Ok((width, height))
 }
 
-fn decode(path: &Path) -> Result<DynamicImage, CaptureError> {
+pub(super) fn decode(path: &Path) -> Result<DynamicImage, CaptureError> {
     dimensions(path)?;
     open(path)?.decode().map_err(|source| picture_error(path, source))
 }
 
-/// Coverage in [0,1] from a mask picture, with its width and height: the largest of a pixel's colour channels,
-/// full scale (255) being 1.
+/// Coverage in [0,1] from a mask picture, with its width and height: the largest of a pixel's
+/// colour channels, full scale (255) being 1.
 pub(super) fn load_mask(path: &Path) -> Result<(u32, u32, Vec<f32>), CaptureError> {
     let picture = Image::load(path)?;
     let mask = picture.pixels.chunks_exact(3).map(|p| p[0].max(p[1]).max(p[2])).collect();
     Ok((picture.width, picture.height, mask))
 }
 
-/// Resamples values of `channels` (1 or 3) a pixel with a tent filter as wide as the reduction needs; the outer edges
-/// of both pictures coincide. Linear, so that what is premultiplied by its mask stays so.
+/// Resamples values of `channels` (1 or 3) a pixel with a tent filter as wide as the reduction
+/// needs; the outer edges of both pictures coincide. Linear, so that what is premultiplied by its
+/// mask stays so.
 pub(super) fn resize(values: Vec<f32>, channels: usize, from: (u32, u32), to: (u32, u32)) -> Vec<f32> {
     fn resample<P>(values: Vec<f32>, from: (u32, u32), to: (u32, u32)) -> Vec<f32>
     where

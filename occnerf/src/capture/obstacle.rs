@@ -1,49 +1,34 @@
-//! The paper's simulated obstacle (§4, Datasets): a box in front of the camera that hides a rectangle.
+//! The paper's simulated obstacle (§4, Datasets): a box in front of the camera that hides a
+//! rectangle.
 
 use std::ops::Range;
 
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use super::source::Edit;
+use super::pixels::{Area, Edit};
 use super::{CaptureError, Frame};
 
-/// A simulated obstacle in front of the training camera. The default is the paper's: fixed, central, hiding half of
-/// the subject's pixels in the first 80 % of the frames, and as high as the picture, as in the code published with it.
+/// A simulated obstacle in front of the training camera. The default is the paper's: fixed,
+/// central, hiding half of the subject's pixels in the first 80 % of the frames, and as high as the
+/// picture, as in the code published with it.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Obstacle {
-    /// Part of the subject's pixels in the occluded frames that is hidden, 0 (no obstacle) to 0.95; no more than the obstacle's rows
-    /// have.
+    /// Part of the subject's pixels in the occluded frames that is hidden, 0 (no obstacle) to 0.95;
+    /// no more than the obstacle's rows have.
     pub fraction: f32,
     /// Part of the video, from its start, that is occluded, 0 to 1.
     pub share: f32,
-    /// How far the obstacle's middle stands to the right of the subject's mean column in the obstacle's rows, in picture widths, −1 to 1.
+    /// How far the obstacle's middle stands to the right of the subject's mean column in the
+    /// obstacle's rows, in picture widths, −1 to 1.
     pub position: f32,
-    /// How far it moves to the right, evenly over the occluded frames, in picture widths, −2 to 2. It is at `position`
-    /// half-way through.
+    /// How far it moves to the right, evenly over the occluded frames, in picture widths, −2 to 2.
+    /// It is at `position` half-way through.
     pub travel: f32,
-    /// Its height in picture heights, above 0 to 1; its middle is at the subject's mean row, or as near as the picture allows.
+    /// Its height in picture heights, above 0 to 1; its middle is at the subject's mean row, or as
+    /// near as the picture allows.
     pub height: f32,
-}
-
-/// A rectangle of pixels.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub(super) struct Area {
-    pub columns: Range<u32>,
-    pub rows: Range<u32>,
-}
-
-impl Area {
-    pub fn is_empty(&self) -> bool {
-        self.columns.is_empty() || self.rows.is_empty()
-    }
-
-    /// Whether the pixel of this index is inside, in a picture of this width.
-    pub fn contains(&self, pixel: usize, width: u32) -> bool {
-        let pixel = pixel as u32;
-        self.columns.contains(&(pixel % width)) && self.rows.contains(&(pixel / width))
-    }
 }
 
 /// Where a frame's subject is.
@@ -121,8 +106,9 @@ impl Obstacle {
 
     /// The columns that are hidden in each of the occluded frames.
     ///
-    /// The obstacle has one width, such that the part of all subject pixels of the occluded frames that it hides is as
-    /// near to `fraction` as whole columns come. Ranges are empty where nothing is hidden.
+    /// The obstacle has one width, such that the part of all subject pixels of the occluded frames
+    /// that it hides is as near to `fraction` as whole columns come. Ranges are empty where nothing
+    /// is hidden.
     fn columns(&self, subject: &[Subject]) -> Result<Vec<Range<u32>>, CaptureError> {
         let affected = subject.len();
         let w = subject.first().map_or(0, |first| first.columns.len() as i64);
@@ -165,7 +151,8 @@ impl Obstacle {
         Ok(hidden)
     }
 
-    /// Hides what the obstacle covers in a video of equally large frames; returns what is hidden of each.
+    /// Hides what the obstacle covers in a video of equally large frames; returns what is hidden of
+    /// each.
     pub(super) fn hide(&self, frames: &mut [Frame]) -> Result<Vec<Area>, CaptureError> {
         let Some((width, height)) = frames.first().map(|f| (f.camera.width, f.camera.height)) else {
             return Ok(Vec::new());

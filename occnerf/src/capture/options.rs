@@ -3,17 +3,20 @@ use serde::{Deserialize, Serialize};
 use super::CaptureError;
 use super::image::MAX_SIDE;
 use super::obstacle::Obstacle;
-use super::wrong::Wrong;
+use super::perturbation::Perturbation;
 
-/// What a capture's files leave open, and how much of them is read. Every layout obeys all of it, but `camera` and
-/// `occlusion`, which only raw ZJU-MoCap leaves open. Two are equal where they read the same: `max_bytes` is not compared.
+/// Settings that a capture's files leave open, and how much of them is read. Every layout obeys all
+/// of it, but `camera` and `occlusion`, which only raw ZJU-MoCap leaves open. Two are equal where
+/// they read the same: `max_bytes` is not compared.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct LoadOptions {
-    /// Where the intrinsics put the centre of the first pixel: 0.5 where they count from the image's corner, 0
-    /// where they count from the first pixel's centre, as HumanNeRF's own rays do.
+    /// Where the intrinsics put the centre of the first pixel: 0.5 where they count from the
+    /// image's corner, 0 where they count from the first pixel's centre, as HumanNeRF's own rays
+    /// do.
     pub pixel_centre: f32,
-    /// Longest side in pixels that pictures are reduced to; smaller ones, and all if `None`, stay as they are.
+    /// Longest side in pixels that pictures are reduced to; smaller ones, and all if `None`, stay
+    /// as they are.
     pub resize: Option<u32>,
     /// Training frames are every n-th, beginning with the first.
     pub stride: usize,
@@ -21,17 +24,17 @@ pub struct LoadOptions {
     pub max_frames: Option<usize>,
     /// Views kept back are those of every n-th training frame, beginning with the first.
     pub eval_stride: usize,
-    /// Most bytes that the bodies of all frames (36 a vertex), the labels of the training frames (3 bits a pixel) and pictures
-    /// kept in memory (16 a pixel) may take. Pictures
-    /// beyond it are decoded whenever they are asked for.
+    /// Most bytes that the bodies of all frames (36 a vertex), the labels of the training frames (3
+    /// bits a pixel), pictures kept in memory (16 a pixel) and pictures being decoded (48 a pixel
+    /// of the file) may take. Pictures beyond it are decoded whenever they are asked for.
     pub max_bytes: u64,
     /// The training camera: its folder's name, or its number counted from 1. The first if `None`.
     pub camera: Option<String>,
-    /// The simulated obstacle before the training camera. `None`: what the capture's `occlusion.json` says, or the
-    /// default [`Obstacle`] where there is none.
+    /// The simulated obstacle before the training camera. `None`: what the capture's
+    /// `occlusion.json` says, or the default [`Obstacle`] where there is none.
     pub occlusion: Option<Obstacle>,
     /// Errors added on purpose.
-    pub wrong: Wrong,
+    pub wrong: Perturbation,
 }
 
 impl Default for LoadOptions {
@@ -45,7 +48,7 @@ impl Default for LoadOptions {
             max_bytes: 1 << 30,
             camera: None,
             occlusion: None,
-            wrong: Wrong::default(),
+            wrong: Perturbation::default(),
         }
     }
 }

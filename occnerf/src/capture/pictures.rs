@@ -1,6 +1,7 @@
 //! Finding pictures by name.
 
 use std::collections::BTreeMap;
+use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
 use super::CaptureError;
@@ -9,6 +10,19 @@ use super::CaptureError;
 pub(super) fn file_name(path: &Path) -> String {
     let name = path.file_name().unwrap_or(path.as_os_str());
     name.to_string_lossy().into_owned()
+}
+
+/// Whether there is a directory at `path`.
+///
+/// # Errors
+/// [`CaptureError::Io`] for a link that leads nowhere or in a circle, and whatever else cannot be
+/// looked at: what it should lead to would be passed over in silence.
+pub(super) fn is_directory(path: &Path) -> Result<bool, CaptureError> {
+    match std::fs::metadata(path) {
+        Ok(found) => Ok(found.is_dir()),
+        Err(_) if std::fs::symlink_metadata(path).is_err_and(|error| error.kind() == ErrorKind::NotFound) => Ok(false),
+        Err(error) => Err(CaptureError::io(path)(error)),
+    }
 }
 
 /// PNG and JPEG files of a directory by name without extension.

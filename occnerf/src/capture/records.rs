@@ -107,8 +107,8 @@ impl<'a> Record<'a> {
         !matches!(self.value.get(key), None | Some(Value::None))
     }
 
-    /// Finite values, row-major, and the shape, of an array or of nested lists. Axes of length 1 in front are dropped:
-    /// raw files store vectors as (1, N).
+    /// Finite values, row-major, and the shape, of an array or of nested lists. Axes of length 1 in
+    /// front are dropped: raw files store vectors as (1, N).
     pub fn array(&self, key: &str) -> Result<(Vec<usize>, Vec<f32>), CaptureError> {
         let (mut shape, values) = self.stacked(key)?;
         while shape.len() > 1 && shape[0] == 1 {
@@ -142,7 +142,8 @@ impl<'a> Record<'a> {
     }
 }
 
-/// An array, or lists of them stacked; the inner error says what is there instead. Pickles bound the depth.
+/// An array, or lists of them stacked; the inner error says what is there instead. Pickles bound
+/// the depth.
 fn stack(value: &Value, file: &str, key: &str) -> Result<Result<NdArray, String>, CaptureError> {
     if let Some(array) = value.to_dense(file, key)? {
         return Ok(Ok(array));

@@ -2,74 +2,9 @@
 
 use std::sync::{Arc, OnceLock};
 
-use super::decode::Files;
-use super::obstacle::Area;
+use super::files::Files;
+use super::pixels::{Edit, Pixels};
 use super::{CaptureError, Image};
-
-/// What a frame shows.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Pixels {
-    /// Picture multiplied by `mask`: colours are premultiplied by coverage, and 0 where the mask is 0. Over a
-    /// background B the picture is `image + (1 − mask) · B`.
-    pub image: Image,
-    /// Coverage of each pixel by the *visible* subject, 0 to 1, (H, W); above 0.5 the pixel counts as subject.
-    pub mask: Vec<f32>,
-    /// Pixels known to be covered by something in front of the subject, (H, W); `None` where nobody marked them.
-    pub occluder: Option<Vec<bool>>,
-}
-
-impl Pixels {
-    /// Lets nothing be seen in an area.
-    fn hide(&mut self, area: &Area) {
-        let width = self.image.width;
-        let visible: Vec<f32> = (0..self.mask.len()).map(|p| if area.contains(p, width) { 0.0 } else { 1.0 }).collect();
-        self.mask.iter_mut().zip(&visible).for_each(|(mask, seen)| *mask *= seen);
-        self.image.multiply(&visible);
-    }
-
-    /// Grows or shrinks the mask by so many pixels along the axes, and the picture with it.
-    fn grow(&mut self, pixels: i32) {
-        let (width, height) = (self.image.width as usize, self.image.height as usize);
-        for _ in 0..pixels.unsigned_abs() {
-            let old = self.mask.clone();
-            for i in 0..old.len() {
-                let (x, y) = (i % width, i / width);
-                let around = [
-                    (x > 0).then(|| i - 1),
-                    (x + 1 < width).then(|| i + 1),
-                    (y > 0).then(|| i - width),
-                    (y + 1 < height).then(|| i + width),
-                ];
-                let values = around.into_iter().flatten().map(|j| old[j]);
-                let new = if pixels > 0 { values.fold(old[i], f32::max) } else { values.fold(old[i], f32::min) };
-                if new < old[i] {
-                    // The picture is premultiplied by the mask.
-                    let share = new / old[i];
-                    self.image.pixels[3 * i..3 * i + 3].iter_mut().for_each(|c| *c *= share);
-                }
-                self.mask[i] = new;
-            }
-        }
-    }
-}
-
-/// A change of pixels that can be made whenever they are decoded.
-#[derive(Clone, Debug)]
-pub(super) enum Edit {
-    /// Something stands before these pixels.
-    Hide(Area),
-    /// The mask is larger, or smaller, by so many pixels.
-    Grow(i32),
-}
-
-impl Edit {
-    fn apply(&self, pixels: &mut Pixels) {
-        match self {
-            Self::Hide(area) => pixels.hide(area),
-            Self::Grow(by) => pixels.grow(*by),
-        }
-    }
-}
 
 /// Where the pixels of a frame are. Copies share what is decoded.
 #[derive(Clone, Debug)]
@@ -119,6 +54,14 @@ impl PixelSource {
                 let pixels = Arc::new(pixels);
                 Ok(if disk.keep { Arc::clone(disk.kept.get_or_init(|| pixels)) } else { pixels })
             }
+        }
+    }
+
+    /// The picture with what its mask hides; `None` for pixels in memory, which lack that.
+    pub(super) fn photograph(&self) -> Option<Result<Image, CaptureError>> {
+        match &self.0 {
+            Place::Memory(_) => None,
+            Place::Disk(disk) => Some(disk.files.photograph()),
         }
     }
 

@@ -3,8 +3,8 @@
 use glam::Vec2;
 use volrender::{Camera, Distortion};
 
-/// What a perfect lens would have shown in place of `source` (H, W, channels), which `camera` saw through
-/// `distortion`: bilinear, 0 beyond the border and where the model of the lens folds back.
+/// What a perfect lens would have shown in place of `source` (H, W, channels), which `camera` saw
+/// through `distortion`: bilinear, 0 beyond the border and where the model of the lens folds back.
 pub(super) fn undistort(source: Vec<f32>, channels: usize, camera: &Camera, distortion: &Distortion) -> Vec<f32> {
     if distortion.is_none() {
         return source;

@@ -41,7 +41,7 @@ impl Config {
 /// 2⁻²⁵: what remains behind it is lost when it is added to an f32 near 1.
 const NOTHING: f32 = 1.0 / (1 << 25) as f32;
 
-/// The paper's setting; what it leaves open is named in ARCHITECTURE.
+/// The paper's setting, which leaves the size of F open.
 fn paper() -> Config {
     Config {
         preset: Preset::Paper,

@@ -6,9 +6,11 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Method {
-    /// No field: the posed prior mesh, each vertex the mean colour of the visible training pixels that saw it.
+    /// No field: the posed prior mesh, each vertex the mean colour of the visible training pixels
+    /// that saw it.
     Prior,
-    /// Point-based: frequency encoding of x̂ with 10 bands and a perceptron (after Weng et al. 2022).
+    /// Point-based: frequency encoding of x̂ with 10 bands and a perceptron (after Weng et al.
+    /// 2022).
     Humannerf,
     /// Point-based: hash encoding of x̂ alone.
     HashPoint,
@@ -54,7 +56,8 @@ impl OccludedRule {
 pub enum MotionKind {
     /// Weight volume whose prior is the skinning weights diffused into space; learnable.
     Volume,
-    /// Weight volume with the published oriented Gaussians, which has holes at the joints; learnable.
+    /// Weight volume with the published oriented Gaussians, which has holes at the joints;
+    /// learnable.
     Gaussian,
     /// Skinning weights of the nearest point of the posed surface.
     Surface,
@@ -66,7 +69,8 @@ pub enum MotionKind {
 pub enum DistanceKind {
     /// The paper's blend of the k nearest vertices by normal similarity.
     Blended,
-    /// The blended vertex, and the mean distance to the k nearest with the sign of the majority, as the published code has it.
+    /// The blended vertex, and the mean distance to the k nearest with the sign of the majority, as
+    /// the published code has it.
     Mean,
     /// The closest point of the triangle mesh and its signed distance.
     Exact,
@@ -102,7 +106,7 @@ pub enum Preset {
     Balanced,
     /// The paper's setting.
     Paper,
-    /// The same with the departures of the code that was published with it.
+    /// The paper's setting with the departures of the code that was published with it.
     PublishedCode,
 }
 
@@ -132,6 +136,18 @@ pub enum Component {
     Perceptual,
 }
 
+impl Component {
+    /// The name used on the command line.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Surface => "surface",
+            Self::Attention => "attention",
+            Self::Completeness => "completeness",
+            Self::Perceptual => "perceptual",
+        }
+    }
+}
+
 /// The perceptron F.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -146,9 +162,9 @@ pub struct FieldConfig {
     pub density_bias: f32,
     /// Bias at the outer end of the margin; linear in between.
     pub density_bias_outside: f32,
-    /// Whether colours start from those that the video showed of the prior's nearest surface point (see
-    /// [`crate::VertexColors`]): the perceptron adds to them before the sigmoid, where some frame saw them. Asks for
-    /// `motion.kind = surface`.
+    /// Whether colours start from those that the video showed of the prior's nearest surface point
+    /// (see [`crate::VertexColors`]): the perceptron adds to them before the sigmoid, where some
+    /// frame saw them. Asks for `motion.kind = surface`.
     #[serde(default)]
     pub prior_colors: bool,
 }
@@ -167,8 +183,8 @@ pub struct EncodingConfig {
     pub n_min: u32,
     /// Cells an axis of the finest level.
     pub n_max: u32,
-    /// Least d that is told from smaller ones, normalised metres. A wide interval makes cells long in d, along which
-    /// appearance hardly changes, and leaves more of the table to the surface.
+    /// Least d that is told from smaller ones, normalised metres. A wide interval makes cells long
+    /// in d, along which appearance hardly changes, and leaves more of the table to the surface.
     pub distance_min: f32,
     /// Largest d that is told from greater ones, normalised metres.
     pub distance_max: f32,
@@ -188,9 +204,9 @@ pub struct SurfaceConfig {
     pub surface_term: bool,
     /// Whether the surface term is weighted by the visibility counts.
     pub attention: bool,
-    /// How.
+    /// How counts become weights.
     pub attention_kind: AttentionKind,
-    /// Where those counts come from.
+    /// Where the attention's counts come from.
     pub visibility: VisibilityKind,
 }
 
@@ -200,24 +216,28 @@ pub struct SurfaceConfig {
 pub struct MotionConfig {
     /// Volume or surface.
     pub kind: MotionKind,
-    /// Distance from the prior's surface up to which a point can belong to the subject, normalised metres.
+    /// Distance from the prior's surface up to which a point can belong to the subject, normalised
+    /// metres.
     pub margin: f32,
     /// Width of the fall to zero beyond the margin, normalised metres.
     pub falloff: f32,
-    /// Depth below the prior's surface down to which there are samples, normalised metres. What lies deeper is hidden
-    /// behind that much body; a body is nowhere 0.3 deep, so 0.3 keeps every sample.
+    /// Depth below the prior's surface down to which there are samples, normalised metres. What
+    /// lies deeper is hidden behind that much body; a body is nowhere 0.3 deep, so 0.3 keeps every
+    /// sample.
     pub depth: f32,
-    /// Frames from one knot of the learnt pose corrections to the next; 0 leaves the prior's poses as they are, and the
-    /// volume kinds ask for that.
+    /// Frames from one knot of the learnt pose corrections to the next; 0 leaves the prior's poses
+    /// as they are, and the volume kinds ask for that.
     pub correction_spacing: usize,
-    /// Steps from one look at how far from the prior's surface the field has any density to the next: what lies farther out
-    /// is skipped until then. 0 never looks and keeps every sample, and the volume kinds ask for that.
+    /// Steps from one look at how far from the prior's surface the field has any density to the
+    /// next: what lies farther out is skipped until then. 0 never looks and keeps every sample, and
+    /// the volume kinds ask for that.
     #[serde(default)]
     pub shell_interval: usize,
 }
 
 impl MotionConfig {
-    /// Distance from the prior's surface beyond which nothing belongs to the subject, normalised metres.
+    /// Distance from the prior's surface beyond which nothing belongs to the subject, normalised
+    /// metres.
     pub fn reach(&self) -> f32 {
         self.margin + self.falloff
     }
@@ -231,8 +251,8 @@ pub struct LossConfig {
     pub mse: f32,
     /// λ₂, perceptual term.
     pub perceptual: f32,
-    /// File or directory of weights that makes the perceptual term LPIPS (see [`crate::Lpips::load`]); empty: multi-scale
-    /// SSIM, which needs none.
+    /// File or directory of weights that makes the perceptual term LPIPS (see
+    /// [`crate::Lpips::load`]); empty: multi-scale SSIM, which needs none.
     #[serde(default)]
     pub perceptual_weights: String,
     /// λ₃, completeness.
@@ -276,17 +296,17 @@ pub struct RateConfig {
     pub beta_2: f32,
 }
 
-/// A run.
+/// The configuration of a run.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Config {
     /// Named defaults that this started from.
     pub preset: Preset,
-    /// Which model.
+    /// Model that is trained.
     pub method: Method,
     /// The pixel rule.
     pub occluded: OccludedRule,
-    /// Of every random choice.
+    /// Seeds every random choice.
     pub seed: u64,
     /// Optimisation steps.
     pub steps: u64,
@@ -303,7 +323,7 @@ pub struct Config {
     pub field: FieldConfig,
     /// The hash grid.
     pub encoding: EncodingConfig,
-    /// Surface queries.
+    /// Surface queries and the surface term.
     pub surface: SurfaceConfig,
     /// Motion field.
     pub motion: MotionConfig,
@@ -314,8 +334,9 @@ pub struct Config {
 }
 
 impl Config {
-    /// Departs from the paper as the code published with it does, as far as that is more than a defect: attention
-    /// through a softmax, ten neighbours a level, mean distances with the sign of the majority, hidden pixels taught as background.
+    /// Departs from the paper as the code published with it does, as far as that is more than a
+    /// defect: attention through a softmax, ten neighbours a level, mean distances with the sign of
+    /// the majority, hidden pixels taught as background.
     pub fn depart_as_published(&mut self) {
         self.surface.attention_kind = AttentionKind::Softmax;
         self.surface.k = 10;

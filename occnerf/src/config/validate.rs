@@ -8,9 +8,9 @@ use crate::config::settings::{Config, MotionKind};
 pub struct ConfigError {
     /// Dotted name of the field.
     pub key: &'static str,
-    /// What was given.
+    /// Value that was given.
     pub value: String,
-    /// What is allowed.
+    /// Values that are allowed.
     pub expected: &'static str,
 }
 
@@ -32,8 +32,8 @@ impl Config {
                 return Err(ConfigError { key, value: value.to_string(), expected });
             }
         }
-        // Products that decide about memory: 2²⁷ table entries are 2 GB with both moments; a live sample takes 2 to 4 kB,
-        // and about a third live, so 2²³ samples are 6 to 12 GB.
+        // Products that decide about memory: 2²⁷ table entries are 2 GB with both moments; a live
+        // sample takes 2 to 4 kB, and about a third live, so 2²³ samples are 6 to 12 GB.
         let table = (self.encoding.levels as u64).saturating_mul(self.encoding.features as u64);
         let table = table.saturating_mul(1u64.checked_shl(self.encoding.log2_table_size).unwrap_or(u64::MAX));
         if table > 1 << 27 {

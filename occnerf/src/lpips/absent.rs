@@ -1,4 +1,4 @@
-//! The same interface in a build without the feature `lpips`: nothing can be loaded.
+//! The interface of LPIPS in a build without the feature `lpips`: nothing can be loaded.
 
 use std::convert::Infallible;
 use std::path::Path;
@@ -29,7 +29,7 @@ impl Lpips {
         Err(Error::Lpips(format!("weights {path} given, but this build is without the feature `lpips`")))
     }
 
-    /// Which network this is.
+    /// The network.
     pub fn trunk(&self) -> Trunk {
         match self.0 {}
     }

@@ -1,15 +1,17 @@
-//! Convolutions as matrix products, which ndarray does: a row of the left operand is what the kernel sees at a pixel.
+//! Convolutions as matrix products, which ndarray does: a row of the left operand is what the
+//! kernel sees at a pixel.
 
 use ndarray::linalg::general_mat_mul;
 use ndarray::{Array2, ArrayView2, ArrayViewMut2, Axis, Slice};
 use rayon::prelude::*;
 
-use super::maps::{Maps, Window};
+use super::maps::{Maps, Window, view};
 use super::winograd::Winograd;
 
 /// Pixels of one product.
 const PIXELS: usize = 256;
-/// A product of fewer blocks of pixels is split along the other axis too, into about so many parts in all.
+/// A product of fewer blocks of pixels is split along the other axis too, into about so many parts
+/// in all.
 const PARTS: usize = 4;
 /// Input channels from which on minimal filtering pays.
 const MINIMAL: usize = 16;
@@ -96,8 +98,8 @@ impl Conv {
         }
     }
 
-    /// Adds the gradient by the input to `d_input`; `d_out` (pixels of `size` × outputs) is that by the convolution,
-    /// before rectification.
+    /// Adds the gradient by the input to `d_input`; `d_out` (pixels of `size` × outputs) is that by
+    /// the convolution, before rectification.
     pub fn backward(&self, d_out: ArrayView2<'_, f32>, size: [usize; 2], d_input: &mut Maps) {
         let weight = match &self.weight {
             Weight::Plain(weight) => weight.view(),
@@ -143,8 +145,8 @@ impl Conv {
         }
     }
 
-    /// The reverse of [`Self::gather`]: adds to each row of the input what the output pixels that saw it hand back, in
-    /// an order that does not depend on who does it.
+    /// The reverse of [`Self::gather`]: adds to each row of the input what the output pixels that
+    /// saw it hand back, in an order that does not depend on who does it.
     fn scatter(&self, d_seen: &[f32], size: [usize; 2], d_input: &mut Maps) {
         let (c, columns) = (self.inputs, self.columns());
         let (height, width) = (d_input.height, d_input.width);
@@ -166,7 +168,8 @@ impl Conv {
         });
     }
 
-    /// Along a row: kernel columns that hang over the left end at position `x`, first column seen, and how many are.
+    /// Along a row: kernel columns that hang over the left end at position `x`, first column seen,
+    /// and how many are.
     fn span(&self, x: usize, width: usize) -> (usize, usize, usize) {
         let start = x * self.window.stride;
         let skip = self.window.padding.saturating_sub(start);
@@ -175,13 +178,8 @@ impl Conv {
     }
 }
 
-pub(super) fn view(data: &[f32], columns: usize) -> ArrayView2<'_, f32> {
-    // Every caller hands whole rows; were it not so, the product's own check of shapes would speak up.
-    let rows = data.len() / columns;
-    ArrayView2::from_shape((rows, columns), &data[..rows * columns]).unwrap_or(ArrayView2::from(&[[0.0; 0]; 0]))
-}
-
-/// Parts of a product, with first row and column each; the cut depends on the shape alone, and no element on the cut.
+/// Parts of a product, with first row and column each; the cut depends on the shape alone, and no
+/// element on the cut.
 fn tiles(out: ArrayViewMut2<'_, f32>) -> Vec<(usize, usize, ArrayViewMut2<'_, f32>)> {
     let (rows, columns) = out.dim();
     let blocks = rows.div_ceil(PIXELS).max(1);

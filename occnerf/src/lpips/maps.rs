@@ -1,5 +1,6 @@
 //! Feature maps, and what happens to them between the convolutions.
 
+use ndarray::ArrayView2;
 use rayon::prelude::*;
 
 /// Images or feature maps: image after image, row-major, channels last.
@@ -28,7 +29,8 @@ impl Maps {
     }
 }
 
-/// Where a window of `size` every `stride` pixels stands along an axis that is padded with `padding` zeros at both ends.
+/// Where a window of `size` every `stride` pixels stands along an axis that is padded with
+/// `padding` zeros at both ends.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Window {
     pub size: usize,
@@ -68,8 +70,8 @@ pub(super) fn max_pool(input: &Maps, window: Window, size: [usize; 2]) -> Maps {
     out
 }
 
-/// Gradient by the input of [`max_pool`]: of equal values the first in reading order gets it. `d_out` and `out` may
-/// hold fewer images than `input`.
+/// Gradient by the input of [`max_pool`]: of equal values the first in reading order gets it.
+/// `d_out` and `out` may hold fewer images than `input`.
 pub(super) fn max_pool_backward(input: &Maps, out: &Maps, window: Window, d_out: &Maps) -> Maps {
     let mut d_input = Maps::zeros(d_out.count, [input.height, input.width], input.channels);
     let c = input.channels;
@@ -109,4 +111,12 @@ pub(super) fn rectify_backward(out: &Maps, d_out: &mut Maps) {
     d_out.data.par_chunks_mut(1 << 12).zip(out.data[..len].par_chunks(1 << 12)).for_each(|(d, out)| {
         d.iter_mut().zip(out).for_each(|(d, &v)| *d = if v > 0.0 { *d } else { 0.0 });
     });
+}
+
+/// `data` as rows of `columns`.
+pub(super) fn view(data: &[f32], columns: usize) -> ArrayView2<'_, f32> {
+    // Every caller hands whole rows; were it not so, the product's own check of shapes would speak
+    // up.
+    let rows = data.len() / columns;
+    ArrayView2::from_shape((rows, columns), &data[..rows * columns]).unwrap_or(ArrayView2::from(&[[0.0; 0]; 0]))
 }

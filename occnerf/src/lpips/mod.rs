@@ -1,8 +1,9 @@
-//! LPIPS (Zhang et al. 2018): the distance of two pictures in the features of a trained network, and its gradient.
+//! LPIPS (Zhang et al. 2018): the distance of two pictures in the features of a trained network,
+//! and its gradient.
 
 mod conv;
 mod maps;
-mod torch;
+
 mod trunk;
 mod unit;
 mod weights;
@@ -14,8 +15,7 @@ use crate::Error;
 use maps::Maps;
 use trunk::Network;
 
-/// Gives the tensor of a name, of exactly a shape.
-type Reader<'a> = dyn FnMut(&str, &[usize]) -> Result<Vec<f32>, Error> + 'a;
+pub use trunk::Trunk;
 
 /// What is taken off x ∈ [−1, 1] and what divides the rest, a channel each.
 const SHIFT: [f32; 3] = [-0.030, -0.088, -0.188];
@@ -24,28 +24,6 @@ const SCALE: [f32; 3] = [0.458, 0.448, 0.450];
 const MAX_PIXELS: usize = 1 << 21;
 /// Pixels of the pictures that go through the network together.
 const PIXELS_AT_ONCE: usize = 1 << 13;
-
-/// Which network's features are compared.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Trunk {
-    /// VGG16, of 59 MB.
-    Vgg16,
-    /// AlexNet, of 10 MB.
-    AlexNet,
-    /// SqueezeNet 1.1, of 3 MB.
-    SqueezeNet,
-}
-
-impl Trunk {
-    /// The name used in results.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Vgg16 => "vgg16",
-            Self::AlexNet => "alexnet",
-            Self::SqueezeNet => "squeezenet",
-        }
-    }
-}
 
 /// A network with its weights, ready to compare pictures.
 pub struct Lpips {
@@ -56,24 +34,29 @@ pub struct Lpips {
 }
 
 impl Lpips {
-    /// Reads weights: a trunk with torchvision's names (`features.0.weight`, …) and LPIPS's linear layers (`lin0.weight`
-    /// or `lin0.model.1.weight`, …), in `.safetensors`, or in `.pth` or `.pt` as `torch.save` writes it.
+    /// Reads weights: a trunk with torchvision's names (`features.0.weight`, …) and LPIPS's linear
+    /// layers (`lin0.weight` or `lin0.model.1.weight`, …), in `.safetensors`, or in `.pth` or `.pt`
+    /// as `torch.save` writes it.
     ///
-    /// `path` is one file, with the linear layers inside or in another file beside it, or a directory of such files. In a
-    /// directory the first trunk counts, by file name, that has its linear layers. Pickles are parsed, never executed, and
-    /// only the tensors that are needed are read: a classifier in the file costs nothing.
+    /// `path` is one file, with the linear layers inside or in another file beside it, or a
+    /// directory of such files. In a directory the first trunk counts, by file name, that has its
+    /// linear layers. Pickles are parsed, never executed, and only the tensors that are needed are
+    /// read: a classifier in the file costs nothing.
     ///
     /// # Errors
     /// [`Error::Io`] and [`Error::File`], naming file, tensor, expected and actual type and shape.
     pub fn load(path: &Path) -> Result<Self, Error> {
-        weights::load(path)
+        let mut found = weights::find(path)?;
+        let built = Self::new(found.trunk, |name, shape| found.read(name, shape));
+        built.map_err(|error| found.blame(error))
     }
 
-    /// Builds `trunk` from what `read` gives for a name (`features.0.weight`, `lin0.weight`) and its shape (outputs,
-    /// inputs, rows, columns; channels), row-major.
+    /// Builds `trunk` from what `read` gives for a name (`features.0.weight`, `lin0.weight`) and
+    /// its shape (outputs, inputs, rows, columns; channels), row-major.
     ///
     /// # Errors
-    /// Those of `read`; [`Error::Lpips`] for a tensor of another length or with numbers that are not finite.
+    /// Those of `read`; [`Error::Lpips`] for a tensor of another length or with numbers that are
+    /// not finite.
     pub fn new(trunk: Trunk, mut read: impl FnMut(&str, &[usize]) -> Result<Vec<f32>, Error>) -> Result<Self, Error> {
         let mut checked = |name: &str, shape: &[usize]| {
             let values = read(name, shape)?;
@@ -92,7 +75,7 @@ impl Lpips {
         Ok(Self { trunk, network, lin })
     }
 
-    /// Which network this is.
+    /// The network.
     pub fn trunk(&self) -> Trunk {
         self.trunk
     }
@@ -100,7 +83,8 @@ impl Lpips {
     /// Whether pictures of a size can be compared.
     ///
     /// # Errors
-    /// [`Error::Lpips`] for those too small to have an output at every layer, and those of more than 2²¹ pixels.
+    /// [`Error::Lpips`] for those too small to have an output at every layer, and those of more
+    /// than 2²¹ pixels.
     pub fn check_size(&self, width: usize, height: usize) -> Result<(), Error> {
         let name = self.trunk.name();
         let refused = |expected: String| {
@@ -116,8 +100,9 @@ impl Lpips {
         Ok(())
     }
 
-    /// Distances of the pictures in `a` from those in `b`: (N, `height`, `width`, 3), row-major, sRGB in [0, 1]. 0 for
-    /// equal pictures; about 0.1 for a slight blur and 0.7 for unrelated ones. The same bits on any number of threads.
+    /// Distances of the pictures in `a` from those in `b`: (N, `height`, `width`, 3), row-major,
+    /// sRGB in [0, 1]. 0 for equal pictures; about 0.1 for a slight blur and 0.7 for unrelated
+    /// ones. The same bits on any number of threads.
     ///
     /// # Errors
     /// Those of [`Lpips::check_size`].
@@ -128,8 +113,9 @@ impl Lpips {
         self.compare(a, b, [width, height], None)
     }
 
-    /// [`Lpips::distance`], and adds `d_distance` × the gradient of each picture's distance by that picture to `d_a` (like
-    /// `a`). Where a channel's maximum in a window is shared, the first pixel gets the gradient; a distance of 0 has none.
+    /// Computes [`Lpips::distance`] and adds `d_distance` × the gradient of each picture's distance
+    /// by that picture to `d_a` (like `a`). Where a channel's maximum in a window is shared, the
+    /// first pixel gets the gradient; a distance of 0 has none.
     ///
     /// # Errors
     /// Those of [`Lpips::check_size`].

@@ -1,11 +1,36 @@
-//! The networks: SqueezeNet 1.1, VGG16 and AlexNet as far as their last tap, with torchvision's names.
+//! The networks: SqueezeNet 1.1, VGG16 and AlexNet as far as their last tap, with torchvision's
+//! names.
 
 use ndarray::{ArrayViewMut2, Axis};
 
 use super::conv::Conv;
 use super::maps::{Maps, Window, max_pool, max_pool_backward, rectify_backward};
-use super::{Reader, Trunk};
 use crate::Error;
+
+/// Gives the tensor of a name, of exactly a shape.
+pub(super) type Reader<'a> = dyn FnMut(&str, &[usize]) -> Result<Vec<f32>, Error> + 'a;
+
+/// Which network's features are compared.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Trunk {
+    /// VGG16, of 59 MB.
+    Vgg16,
+    /// AlexNet, of 10 MB.
+    AlexNet,
+    /// SqueezeNet 1.1, of 3 MB.
+    SqueezeNet,
+}
+
+impl Trunk {
+    /// The name used in results.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Vgg16 => "vgg16",
+            Self::AlexNet => "alexnet",
+            Self::SqueezeNet => "squeezenet",
+        }
+    }
+}
 
 /// A layer of torchvision's `features`, under its number there.
 enum Plan {
@@ -137,8 +162,8 @@ impl Network {
         self.layers.iter().fold(Some([height, width]), step).is_some()
     }
 
-    /// Runs the layers up to the last tap; `seen` gets the number and the output of each. Returns the outputs, of the last
-    /// layer alone unless `all` are to be kept.
+    /// Runs the layers up to the last tap; `seen` gets the number and the output of each. Returns
+    /// the outputs, of the last layer alone unless `all` are to be kept.
     pub fn forward(&self, input: &Maps, mut seen: impl FnMut(usize, &Maps), all: bool) -> Vec<Maps> {
         let mut outputs: Vec<Maps> = Vec::new();
         for (number, layer) in self.layers.iter().enumerate() {
@@ -152,8 +177,8 @@ impl Network {
         outputs
     }
 
-    /// The gradient by the first images of `input`, as many as the tap gradients are for. `outputs` are those of every
-    /// layer; `at_tap` adds the gradient by the output of layer `taps[i].0`.
+    /// The gradient by the first images of `input`, as many as the tap gradients are for. `outputs`
+    /// are those of every layer; `at_tap` adds the gradient by the output of layer `taps[i].0`.
     pub fn backward(
         &self,
         input: &Maps,

@@ -1,4 +1,5 @@
-//! The distance of two sets of feature maps: channels scaled to unit length, squared differences, weighted.
+//! The distance of two sets of feature maps: channels scaled to unit length, squared differences,
+//! weighted.
 
 use rayon::prelude::*;
 
@@ -12,8 +13,8 @@ fn scale(features: &[f32]) -> (f32, f32) {
     (length, 1.0 / (length + EPSILON))
 }
 
-/// Mean over pixels of Σ_c w_c (â_c − b̂_c)², f̂ = f / (|f| + 1e-10), of image `i` and image `i` + half of `maps`, whose
-/// second half is b.
+/// Mean over pixels of Σ_c w_c (â_c − b̂_c)², f̂ = f / (|f| + 1e-10), of image `i` and image `i` +
+/// half of `maps`, whose second half is b.
 pub(super) fn distances(maps: &Maps, weights: &[f32]) -> Vec<f64> {
     let (c, half) = (maps.channels, maps.data.len() / 2);
     let (a, b) = maps.data.split_at(half);
@@ -27,8 +28,8 @@ pub(super) fn distances(maps: &Maps, weights: &[f32]) -> Vec<f64> {
     pixels.chunks_exact(area).map(|image| image.iter().sum::<f64>() / area as f64).collect()
 }
 
-/// Adds `d_distance` × the gradient of each distance by a to `d_a`. A pixel without any feature gets none: what reaches
-/// it is lost in the rectification before.
+/// Adds `d_distance` × the gradient of each distance by a to `d_a`. A pixel without any feature
+/// gets none: what reaches it is lost in the rectification before.
 pub(super) fn distances_backward(maps: &Maps, weights: &[f32], d_distance: f32, d_a: &mut Maps) {
     let (c, half) = (maps.channels, maps.data.len() / 2);
     let (a, b) = maps.data.split_at(half);

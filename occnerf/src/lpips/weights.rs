@@ -2,12 +2,15 @@
 
 use std::collections::BTreeMap;
 use std::fs::File;
-use std::io::{Read, Seek, SeekFrom};
+use std::io::{BufReader, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
 use safetensors::tensor::{Dtype, Metadata};
+use smpl::Data;
+use smpl::pickle::Value;
+use smpl::torch::{self, TorchFile};
 
-use super::{Lpips, Trunk, torch};
+use super::trunk::Trunk;
 use crate::Error;
 
 /// Longest header of a safetensors file, as in the format's own library.
@@ -17,19 +20,28 @@ const MAX_FILES: usize = 256;
 
 /// A tensor of a file.
 #[derive(Clone, Debug)]
-pub(super) struct Tensor {
-    pub dtype: Dtype,
-    pub shape: Vec<usize>,
-    /// Where its bytes start: in the file, or in an entry of the zip archive that the file is.
-    pub at: u64,
-    pub entry: Option<String>,
+struct Tensor {
+    shape: Vec<usize>,
+    place: Place,
+}
+
+#[derive(Clone, Debug)]
+enum Place {
+    /// Type, and where the bytes start in a safetensors file.
+    Bytes(Dtype, u64),
+    Torch(torch::Tensor),
 }
 
 /// An open file and what it holds.
 pub(super) struct Weights {
     path: PathBuf,
-    file: File,
+    source: Source,
     tensors: BTreeMap<String, Tensor>,
+}
+
+enum Source {
+    Safetensors(File),
+    Torch(TorchFile<BufReader<File>>),
 }
 
 pub(super) fn fault(path: &Path, what: impl Into<String>) -> Error {
@@ -40,44 +52,69 @@ pub(super) fn io(path: &Path) -> impl Fn(std::io::Error) -> Error {
     move |source| Error::Io { path: path.to_owned(), source }
 }
 
-/// [`Lpips::load`].
-pub(super) fn load(path: &Path) -> Result<Lpips, Error> {
+/// A trunk with its linear layers, in one file or two.
+pub(super) struct Found {
+    pub trunk: Trunk,
+    weights: Weights,
+    lin: Option<Weights>,
+}
+
+impl Found {
+    /// Reads a tensor of exactly `shape`, axes of one beside.
+    pub fn read(&mut self, name: &str, shape: &[usize]) -> Result<Vec<f32>, Error> {
+        match &mut self.lin {
+            Some(lin) if name.starts_with("lin") => lin.read(name, shape),
+            _ => self.weights.read(name, shape),
+        }
+    }
+
+    /// `error` with the file's name.
+    pub fn blame(&self, error: Error) -> Error {
+        match error {
+            Error::Lpips(what) => fault(&self.weights.path, what),
+            other => other,
+        }
+    }
+}
+
+/// The weights at `path`, as [`Lpips::load`](super::Lpips::load) looks for them.
+pub(super) fn find(path: &Path) -> Result<Found, Error> {
     if !std::fs::metadata(path).map_err(io(path))?.is_dir() {
-        let mut trunk_file = Weights::open(path)?;
-        let trunk = trunk_file.trunk().ok_or_else(|| {
-            let names: Vec<&str> = trunk_file.tensors.keys().take(4).map(String::as_str).collect();
+        let weights = Weights::open(path)?;
+        let trunk = weights.trunk().ok_or_else(|| {
+            let names: Vec<&str> = weights.tensors.keys().take(4).map(String::as_str).collect();
             let expected = "expected `features.0.weight` and the other layers of SqueezeNet 1.1, VGG16 or AlexNet";
             fault(path, format!("holds no trunk: {expected}; it starts with {}", names.join(", ")))
         })?;
-        if trunk_file.has_lin(trunk) {
-            return build(trunk, &mut trunk_file, None);
+        if weights.has_lin(trunk) {
+            return Ok(Found { trunk, weights, lin: None });
         }
         let beside = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
         let (others, damaged) = open_all(&files(beside)?);
         let lin = others.into_iter().find(|other| other.has_lin(trunk));
-        let mut lin = lin.ok_or_else(|| damaged.unwrap_or_else(|| no_lin(path, trunk)))?;
-        return build(trunk, &mut trunk_file, Some(&mut lin));
+        let lin = lin.ok_or_else(|| damaged.unwrap_or_else(|| no_lin(path, trunk)))?;
+        return Ok(Found { trunk, weights, lin: Some(lin) });
     }
     let (mut open, damaged) = open_all(&files(path)?);
     let mut lonely = None;
     for i in 0..open.len() {
         let Some(trunk) = open[i].trunk() else { continue };
         if open[i].has_lin(trunk) {
-            return build(trunk, &mut open[i], None);
+            return Ok(Found { trunk, weights: open.swap_remove(i), lin: None });
         }
         if let Some(other) = (0..open.len()).find(|&other| open[other].has_lin(trunk)) {
-            let mut trunk_file = open.swap_remove(i);
+            let weights = open.swap_remove(i);
             // The last file has moved to the place that became free.
             let other = if other == open.len() { i } else { other };
-            return build(trunk, &mut trunk_file, open.get_mut(other));
+            return Ok(Found { trunk, weights, lin: Some(open.swap_remove(other)) });
         }
         lonely = lonely.or_else(|| Some(no_lin(&open[i].path, trunk)));
     }
     Err(damaged.or(lonely).unwrap_or_else(|| fault(path, "has no .safetensors, .pth or .pt file with a trunk in it")))
 }
 
-/// The files that can be read, and what is wrong with the first that cannot: it matters where what is needed is in none of the
-/// others.
+/// The files that can be read, and what is wrong with the first that cannot: it matters where what
+/// is needed is in none of the others.
 fn open_all(paths: &[PathBuf]) -> (Vec<Weights>, Option<Error>) {
     let (mut open, mut damaged) = (Vec::new(), None);
     for path in paths {
@@ -95,18 +132,6 @@ fn no_lin(path: &Path, trunk: Trunk) -> Error {
         path,
         format!("is {name} without LPIPS's linear layers: no `lin0.weight` of {name} in it or in a file beside it"),
     )
-}
-
-fn build(trunk: Trunk, trunk_file: &mut Weights, mut lin: Option<&mut Weights>) -> Result<Lpips, Error> {
-    let path = trunk_file.path.clone();
-    let built = Lpips::new(trunk, |name, shape| match &mut lin {
-        Some(lin) if name.starts_with("lin") => lin.read(name, shape),
-        _ => trunk_file.read(name, shape),
-    });
-    built.map_err(|error| match error {
-        Error::Lpips(what) => fault(&path, what),
-        other => other,
-    })
 }
 
 /// Files of weights in a directory, by name.
@@ -128,15 +153,16 @@ impl Weights {
     pub fn open(path: &Path) -> Result<Self, Error> {
         let mut file = File::open(path).map_err(io(path))?;
         let mut start = Vec::new();
-        (&mut file).take(torch::LEGACY.len() as u64).read_to_end(&mut start).map_err(io(path))?;
-        let tensors = if start.starts_with(b"PK") {
-            torch::archive(path, &file)?
-        } else if start == torch::LEGACY {
-            torch::legacy(path, &mut file)?
+        (&mut file).take(64).read_to_end(&mut start).map_err(io(path))?;
+        let (source, tensors) = if torch::is_torch(&start) {
+            let file = TorchFile::open(&path.display().to_string(), BufReader::new(file))?;
+            let tensors = torch_tensors(&file)?;
+            (Source::Torch(file), tensors)
         } else {
-            safetensors(path, &mut file)?
+            let tensors = safetensors(path, &mut file)?;
+            (Source::Safetensors(file), tensors)
         };
-        Ok(Self { path: path.to_owned(), file, tensors })
+        Ok(Self { path: path.to_owned(), source, tensors })
     }
 
     /// Which trunk this is: all of its first and last layers' names tell it from its relatives.
@@ -177,25 +203,51 @@ impl Weights {
         let found = self.find(name).map(|(name, tensor)| (name.clone(), tensor.clone()));
         let (name, tensor) = found.ok_or_else(|| fault(path, format!("lacks `{name}`, of shape {shape:?}")))?;
         let bare = |shape: &[usize]| shape.iter().copied().filter(|&n| n != 1).collect::<Vec<_>>();
-        let known = matches!(tensor.dtype, Dtype::F16 | Dtype::BF16 | Dtype::F32 | Dtype::F64);
+        let (known, dtype) = match &tensor.place {
+            Place::Bytes(dtype, _) => {
+                (matches!(dtype, Dtype::F16 | Dtype::BF16 | Dtype::F32 | Dtype::F64), format!("{dtype:?}"))
+            }
+            Place::Torch(tensor) => (tensor.is_float(), tensor.dtype.to_owned()),
+        };
         let flat = shape.len() == 1 && bare(&tensor.shape) == bare(shape);
         if !known || (tensor.shape != shape && !flat) {
-            let (dtype, found) = (tensor.dtype, &tensor.shape);
-            return Err(fault(path, format!("`{name}` is {dtype:?} {found:?}, expected floats {shape:?}")));
+            let found = &tensor.shape;
+            return Err(fault(path, format!("`{name}` is {dtype} {found:?}, expected floats {shape:?}")));
         }
         // The shape is one of ours, so this is at most a few megabytes.
-        let size = tensor.dtype.bitsize() / 8;
-        let mut bytes = vec![0; size * shape.iter().product::<usize>()];
-        let cut = |e: std::io::Error| fault(path, format!("`{name}`, {dtype:?} {shape:?}: {e}", dtype = tensor.dtype));
-        match &tensor.entry {
-            Some(entry) => torch::read_entry(path, &self.file, entry, tensor.at, &mut bytes)?,
-            None => {
-                self.file.seek(SeekFrom::Start(tensor.at)).map_err(cut)?;
-                self.file.read_exact(&mut bytes).map_err(cut)?;
+        match (&mut self.source, &tensor.place) {
+            (Source::Safetensors(file), Place::Bytes(dtype, at)) => {
+                let size = dtype.bitsize() / 8;
+                let mut bytes = vec![0; size * shape.iter().product::<usize>()];
+                let cut = |e: std::io::Error| fault(path, format!("`{name}`, {dtype:?} {shape:?}: {e}"));
+                file.seek(SeekFrom::Start(*at)).map_err(cut)?;
+                file.read_exact(&mut bytes).map_err(cut)?;
+                Ok(bytes.chunks_exact(size).map(|word| number(*dtype, word)).collect())
+            }
+            (Source::Torch(file), Place::Torch(tensor)) => Ok(match file.read(&name, tensor)?.data {
+                Data::F32(values) => values,
+                Data::F64(values) => values.into_iter().map(|value| value as f32).collect(),
+                Data::I64(_) | Data::Bool(_) => Vec::new(),
+            }),
+            _ => Err(fault(path, format!("`{name}` is in no open file"))),
+        }
+    }
+}
+
+/// The tensors of a state dictionary, alone or as `state_dict` of a training checkpoint.
+fn torch_tensors(file: &TorchFile<BufReader<File>>) -> Result<BTreeMap<String, Tensor>, Error> {
+    let root = file.root();
+    let mut tensors = BTreeMap::new();
+    if let Value::Dict(items) = root.get("state_dict").unwrap_or(root) {
+        for (name, value) in items {
+            let Some(name) = name.as_str() else { continue };
+            if let Some(tensor) = file.tensor(name, value)? {
+                let shape = tensor.shape.clone();
+                tensors.insert(name.to_owned(), Tensor { shape, place: Place::Torch(tensor) });
             }
         }
-        Ok(bytes.chunks_exact(size).map(|word| number(tensor.dtype, word)).collect())
     }
+    Ok(tensors)
 }
 
 /// A little-endian float.
@@ -236,14 +288,15 @@ fn safetensors(path: &Path, file: &mut File) -> Result<BTreeMap<String, Tensor>,
     let found = length - 8 - header;
     let mut tensors = BTreeMap::new();
     for (name, info) in metadata.tensors() {
-        // Types and shapes fit the offsets: safetensors has looked. Whether the bytes are there it cannot know.
+        // Types and shapes fit the offsets: safetensors has looked. Whether the bytes are there it
+        // cannot know.
         let (start, end) = (info.data_offsets.0 as u64, info.data_offsets.1 as u64);
         if end > found {
             let (dtype, shape) = (info.dtype, &info.shape);
             return Err(fault(path, format!("is cut: `{name}`, {dtype:?} {shape:?}, ends at byte {end} of {found}")));
         }
-        let (dtype, shape, at) = (info.dtype, info.shape.clone(), 8 + header + start);
-        tensors.insert(name, Tensor { dtype, shape, at, entry: None });
+        let place = Place::Bytes(info.dtype, 8 + header + start);
+        tensors.insert(name, Tensor { shape: info.shape.clone(), place });
     }
     Ok(tensors)
 }

@@ -1,12 +1,12 @@
-//! Convolutions of 3 × 3 taps by minimal filtering (Winograd 1980; Lavin and Gray, "Fast Algorithms for Convolutional
-//! Neural Networks", 2016): four pixels of a channel from 16 products instead of 36.
+//! Convolutions of 3 × 3 taps by minimal filtering (Winograd 1980; Lavin and Gray, "Fast Algorithms
+//! for Convolutional Neural Networks", 2016): four pixels of a channel from 16 products instead of
+//! 36.
 
 use ndarray::linalg::general_mat_mul;
 use ndarray::{Array2, ArrayView2, ArrayViewMut2, Axis, Slice};
 use rayon::prelude::*;
 
-use super::conv::view;
-use super::maps::Maps;
+use super::maps::{Maps, view};
 
 /// Products of a tile: 4 × 4.
 const PRODUCTS: usize = 16;
@@ -19,14 +19,16 @@ const TAPS: [[f64; 3]; 4] = [[1.0, 0.0, 0.0], [0.5, 0.5, 0.5], [0.5, -0.5, 0.5],
 /// The products to two pixels of the output.
 const DROP: [[f32; 4]; 2] = [[1.0, 1.0, 1.0, 0.0], [0.0, 1.0, -1.0, -1.0]];
 
-/// A convolution of 3 × 3 taps, every pixel, with a border of one zero. Linear: neither bias nor rectification.
+/// A convolution of 3 × 3 taps, every pixel, with a border of one zero. Linear: neither bias nor
+/// rectification.
 #[derive(Clone, Debug)]
 pub(super) struct Winograd {
     /// Inputs by outputs, for each of the products.
     weights: Vec<Array2<f32>>,
 }
 
-/// Pictures in tiles of 2 × 2 pixels, the last of a row or column hanging over where there is an odd number.
+/// Pictures in tiles of 2 × 2 pixels, the last of a row or column hanging over where there is an
+/// odd number.
 #[derive(Clone, Copy)]
 struct Tiling {
     height: usize,
@@ -111,7 +113,8 @@ impl Winograd {
         }
     }
 
-    /// Adds the gradient by the input to `d_input`; `d_out` (pixels × outputs) is that by the output.
+    /// Adds the gradient by the input to `d_input`; `d_out` (pixels × outputs) is that by the
+    /// output.
     pub fn backward(&self, d_out: ArrayView2<'_, f32>, d_input: &mut Maps) {
         let (c, outputs) = (d_input.channels, d_out.ncols());
         let tiling = Tiling::new([d_input.height, d_input.width]);
@@ -154,7 +157,8 @@ impl Winograd {
     }
 }
 
-/// The tiles that see a pixel along an axis of so many `tiles`, and where they see it: tile t sees 2 t − 1 to 2 t + 2.
+/// The tiles that see a pixel along an axis of so many `tiles`, and where they see it: tile t sees
+/// 2 t − 1 to 2 t + 2.
 fn seen(at: usize, tiles: usize) -> impl Iterator<Item = (usize, usize)> {
     (at.saturating_sub(1) / 2..=at.div_ceil(2))
         .filter(move |&tile| tile < tiles)

@@ -1,9 +1,10 @@
-//! One buffer for what many runs of samples leave to the backward pass.
+//! One buffer for what many segments of samples leave to the backward pass.
 
 use std::ops::Range;
 
-/// Numbers handed out piece by piece. What all pieces of a step take together is known far better beforehand than what each
-/// takes, and a buffer for each would in the end be as long as its piece ever was.
+/// Numbers handed out piece by piece. What all pieces of a step take together is known far better
+/// beforehand than what each takes, and a buffer for each would in the end be as long as its piece
+/// ever was.
 #[derive(Debug, Default)]
 pub(crate) struct Arena {
     buffer: Vec<f32>,
@@ -11,9 +12,9 @@ pub(crate) struct Arena {
 }
 
 impl Arena {
-    /// Takes all pieces back and makes room for `most` numbers. That is address space: memory is taken as it is written to,
-    /// and there is no buffer to grow, with the copy that this takes and the holes that it leaves. Where so much is not to be
-    /// had, the buffer grows after all.
+    /// Takes all pieces back and makes room for `most` numbers. That is address space: memory is
+    /// taken as it is written to, and there is no buffer to grow, with the copy that this takes and
+    /// the holes that it leaves. Where so much is not to be had, the buffer grows after all.
     pub fn clear(&mut self, most: usize) {
         self.used = 0;
         if self.buffer.capacity() < most {

@@ -12,7 +12,8 @@ use crate::Error;
 use crate::config::Config;
 use crate::model::view::PosedView;
 
-/// Canonical height that every body is scaled to, so that constants in metres mean the same for all.
+/// Canonical height that every body is scaled to, so that constants in metres mean the same for
+/// all.
 const NORMALISED_HEIGHT: f32 = 1.7;
 /// Share of its size by which the canonical box is inflated on each side.
 const BOX_INFLATION: f32 = 0.05;

@@ -1,4 +1,5 @@
-//! Colours of the prior's vertices: a baseline of their own, and what the field's colours start from.
+//! Colours of the prior's vertices: a baseline of their own, and what the field's colours start
+//! from.
 
 use glam::{Vec3, Vec4};
 
@@ -12,8 +13,9 @@ pub struct VertexColors {
 }
 
 impl VertexColors {
-    /// What a sigmoid makes the colours of, black and white taken for nearly so, and as w how much of what a perceptron
-    /// says is to be added: nothing where no frame saw the vertex, for there nothing has taught it.
+    /// What a sigmoid makes the colours of, black and white taken for nearly so, and as w how much
+    /// of what a perceptron says is to be added: nothing where no frame saw the vertex, for there
+    /// nothing has taught it.
     pub(crate) fn before_sigmoid(&self) -> Vec<Vec4> {
         /// 5 levels of 255.
         const LEAST: f32 = 0.02;

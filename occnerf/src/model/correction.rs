@@ -1,14 +1,16 @@
 //! Corrections of the prior's poses, learnt with the field.
 //!
-//! A body model fitted to a video is off by a degree or two, and an image error says which way. A correction turns each
-//! joint about itself, in the joint's own axes, and shifts the whole; it moves the posed bones and leaves the pose blend
-//! shapes as they are. Corrections are linear in time between knots: fitting errors hardly change from one frame to the
-//! next, each step teaches its neighbours too, and a moment that is hidden follows those before and after it.
+//! A body model fitted to a video is off by a degree or two, and an image error says which way. A
+//! correction turns each joint about itself, in the joint's own axes, and shifts the whole; it
+//! moves the posed bones and leaves the pose blend shapes as they are. Corrections are linear in
+//! time between knots: fitting errors hardly change from one frame to the next, each step teaches
+//! its neighbours too, and a moment that is hidden follows those before and after it.
 
 use glam::{Affine3A, Mat3A, Quat, Vec3, Vec3A};
 use smpl::{BodyModel, Posed, Shaped};
 
-/// How the flat parameters (K knots × (J + 1) × 3: shift, then each joint's axis-angle turn) belong to frames.
+/// How the flat parameters (K knots × (J + 1) × 3: shift, then each joint's axis-angle turn) belong
+/// to frames.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Corrections {
     frames: usize,
@@ -51,8 +53,8 @@ impl Corrections {
     }
 }
 
-/// World-space change of each bone: C_j = C_parent · (turn by `correction[1 + j]`, in the joint's axes, about the joint),
-/// after the shift `correction[0]` in the root's axes.
+/// World-space change of each bone: C_j = C_parent · (turn by `correction[1 + j]`, in the joint's
+/// axes, about the joint), after the shift `correction[0]` in the root's axes.
 pub(crate) fn changes(model: &BodyModel, posed: &Posed, correction: &[Vec3]) -> Vec<Affine3A> {
     let mut out: Vec<Affine3A> = Vec::with_capacity(posed.bones.len());
     for (j, parent) in model.parents.iter().enumerate() {

@@ -61,7 +61,8 @@ impl Encoder {
         }
     }
 
-    /// The coordinates that samples are encoded at: x̂ for the frequencies, in the unit box for a grid.
+    /// The coordinates that samples are encoded at: x̂ for the frequencies, in the unit box for a
+    /// grid.
     pub fn coordinates(&self, samples: &Samples, region: &Aabb, out: &mut Coordinates) {
         out.point.clear();
         out.surface.clear();
@@ -114,7 +115,8 @@ impl Encoder {
         }
     }
 
-    /// Derivatives that [`Encoder::encode_jacobian`] writes for each point; none where there is no table.
+    /// Derivatives that [`Encoder::encode_jacobian`] writes for each point; none where there is no
+    /// table.
     pub fn jacobian_width(&self) -> usize {
         match self {
             Self::Frequency => 0,
@@ -123,7 +125,8 @@ impl Encoder {
         }
     }
 
-    /// [`Encoder::encode`] with what [`Encoder::encode_backward_points`] needs to leave the table alone.
+    /// [`Encoder::encode`] with what [`Encoder::encode_backward_points`] needs to leave the table
+    /// alone.
     pub fn encode_jacobian(&self, table: &[f32], at: At<'_>, features: &mut [f32], jacobian: &mut [f32]) {
         match self {
             Self::Frequency => self.encode(table, at, features),
@@ -192,7 +195,7 @@ impl Encoder {
 /// Where the derivatives of a grid's features by the coordinates come from.
 #[derive(Clone, Copy)]
 pub(crate) enum Slopes<'a> {
-    /// They are worked out from the table.
+    /// They are computed from the table.
     Table(&'a [f32]),
     /// [`Encoder::encode_jacobian`] has written them.
     Jacobian(&'a [f32]),
@@ -238,8 +241,9 @@ fn surface_coordinates(v: Vec3, d: f32, region: &Aabb, (low, high): (f32, f32)) 
     [p.x, p.y, p.z, (d.clamp(low, high) - low) / (high - low)]
 }
 
-/// Makes a buffer of `len` values that the caller writes all of. One that grows makes room for an eighth more, where a vector
-/// would for twice as many: of what each run of samples keeps for itself, features are the most.
+/// Makes a buffer of `len` values that the caller writes all of. One that grows makes room for an
+/// eighth more, where a vector would for twice as many: of what each segment of samples keeps for
+/// itself, features are the most.
 pub(crate) fn fit(buffer: &mut Vec<f32>, len: usize) {
     if buffer.capacity() < len {
         *buffer = Vec::new();

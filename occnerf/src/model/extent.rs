@@ -1,8 +1,8 @@
-//! How far from the prior's surface the field has anything to show: samples farther out are skipped,
-//! in training once that has emptied the space there, and in pictures.
+//! How far from the prior's surface the field has anything to show: samples farther out are
+//! skipped, in training once that has emptied the space there, and in pictures.
 //!
-//! An occupancy grid (Müller et al. 2022, section 5.1) in the coordinates that the field has anyway:
-//! place on the surface and distance from it.
+//! An occupancy grid (Müller et al. 2022, section 5.1) in the coordinates that the field has
+//! anyway: place on the surface and distance from it.
 
 use rayon::prelude::*;
 
@@ -111,8 +111,9 @@ mod tests {
     fn it_ends_a_layer_behind_the_last_one_that_shows_something() {
         let mut config = Config::preset(Preset::Fast, Method::Occnerf);
         let scene = scene(&config);
-        // The table is nearly zero and so are the features: the density falls with the distance alone, and crosses EMPTY where
-        // softplus(bias) · scale · LENGTH does, up to what the perceptron's first values add.
+        // The table is nearly zero and so are the features: the density falls with the distance
+        // alone, and crosses EMPTY where softplus(bias) · scale · LENGTH does, up to what the
+        // perceptron's first values add.
         config.field.density_bias_outside = -40.0;
         let end = |density: f32| -(1.0 - density).ln() / (config.field.density_scale * LENGTH);
         let raw = (end(EMPTY).exp() - 1.0).ln();

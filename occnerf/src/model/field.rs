@@ -17,8 +17,9 @@ use crate::model::times::{StepTimes, Stopwatch};
 
 /// Samples that pass through the perceptron together; their activations fit a second-level cache.
 pub(crate) const BLOCK: usize = 256;
-/// Widest layers whose activations are worked out anew for the backward pass: to write them to memory and to read them again
-/// takes as long, and as much memory as all else that is known of a sample. Of wider ones it takes less time.
+/// Widest layers whose activations are recomputed for the backward pass: writing them to memory and
+/// reading them again takes as long, and as much memory as all else that is known of a sample. With
+/// wider layers it takes less time.
 const NARROW: usize = 64;
 /// Outputs of the head: raw density, raw red, green, blue.
 const OUTPUTS: usize = 4;
@@ -28,7 +29,7 @@ const OUTPUTS: usize = 4;
 pub(crate) struct Field {
     pub encoder: Encoder,
     pub mlp: Mlp,
-    /// Whether the backward pass works out the activations anew.
+    /// Whether the backward pass recomputes activations.
     pub narrow: bool,
     /// Whether the input has a surface term.
     pub surface_term: bool,
@@ -49,9 +50,10 @@ pub(crate) struct SampleBatch {
     pub attention: Vec<f32>,
     /// The point term, as it lies ([`Encoder::layout`]); after the backward pass its gradient.
     pub features: Vec<f32>,
-    /// Where the derivatives of the features by the coordinates are in the arena that [`Field::forward`] was given.
+    /// Where the derivatives of the features by the coordinates are in the arena that
+    /// [`Field::forward`] was given.
     pub jacobian: Range<usize>,
-    /// Of each block, or of the last one where they are worked out anew.
+    /// Activations of each block, or of the last one where they are recomputed.
     pub blocks: Vec<Activations>,
     /// Activated density and colour of each sample.
     pub sigma: Vec<f32>,
@@ -134,7 +136,8 @@ impl Field {
         watch.lap(&mut batch.times.perceptron);
     }
 
-    /// Samples that pass through the perceptron together, and which of [`SampleBatch::blocks`] is theirs.
+    /// Samples that pass through the perceptron together, and which of [`SampleBatch::blocks`] is
+    /// theirs.
     pub fn blocks(&self, samples: usize) -> impl Iterator<Item = (usize, Range<usize>)> {
         let kept = usize::from(!self.narrow);
         (0..samples).step_by(BLOCK).map(move |start| (kept * start / BLOCK, start..(start + BLOCK).min(samples)))

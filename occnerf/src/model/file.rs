@@ -56,8 +56,8 @@ struct Entry {
 }
 
 /// Writes a file array by array (the crate's own writers want all of them as bytes, or make a file
-/// that nobody else may read). Equal contents are equal files: keys are in order. The old file stays
-/// until the new one is complete and on the disk.
+/// that nobody else may read). Equal contents are equal files: keys are in order. The old file
+/// stays until the new one is complete and on the disk.
 pub(crate) fn write(
     path: &Path,
     header: &BTreeMap<&str, String>,

@@ -3,7 +3,8 @@
 /// Widths are padded to this: two AVX2 registers, or one of AVX-512.
 pub(crate) const LANES: usize = 16;
 
-/// A left operand (m × k), the transpose of a matrix (k × m) that lies in memory row by row, or ones everywhere.
+/// A left operand (m × k), the transpose of a matrix (k × m) that lies in memory row by row, or
+/// ones everywhere.
 #[derive(Clone, Copy)]
 pub(crate) enum Left<'a> {
     Rows(&'a [f32]),
@@ -27,17 +28,19 @@ pub(crate) enum Finish<'a> {
     Plain,
     /// NaN becomes 0, on every instruction set.
     Relu,
-    /// They pass where this (m × n) is above zero: the derivative of [`Finish::Relu`], given its result.
+    /// They pass where this (m × n) is above zero: the derivative of [`Finish::Relu`], given its
+    /// result.
     Gate(&'a [f32]),
 }
 
-/// `c (m × n) = finish(start + a (m × k) · b (k × n))`, `b` and `c` row-major, `n` a multiple of 16.
+/// `c (m × n) = finish(start + a (m × k) · b (k × n))`, `b` and `c` row-major, `n` a multiple of
+/// 16.
 ///
-/// The order of the additions into an element depends on neither `m` nor the instruction set, so a block of rows gives the
-/// same bits wherever it is cut.
+/// The order of the additions into an element depends on neither `m` nor the instruction set, so a
+/// block of rows gives the same bits wherever it is cut.
 ///
-/// A struct and not a closure: the shim through which a closure is called is compiled without the wide
-/// instructions, and a fused multiply-add becomes a function call there.
+/// A struct and not a closure: the shim through which a closure is called is compiled without the
+/// wide instructions, and a fused multiply-add becomes a function call there.
 pub(crate) struct Product<'a> {
     pub m: usize,
     pub n: usize,
@@ -52,7 +55,8 @@ pub(crate) struct Product<'a> {
 impl pulp::WithSimd for Product<'_> {
     type Output = ();
 
-    /// Blocks as large as the registers hold: 16 sums of 16 lanes with AVX-512, 12 of 8 with AVX2, 16 of 4 with NEON.
+    /// Blocks as large as the registers hold: 16 sums of 16 lanes with AVX-512, 12 of 8 with AVX2,
+    /// 16 of 4 with NEON.
     #[inline(always)]
     fn with_simd<S: pulp::Simd>(mut self, simd: S) {
         match S::F32_LANES {

@@ -1,5 +1,5 @@
-//! The march along rays: samples are traced and evaluated front to back, a segment of every ray at a
-//! time, so that those behind an opaque surface need not be.
+//! The march along rays: samples are traced and evaluated front to back, a segment of every ray at
+//! a time, so that those behind an opaque surface need not be.
 
 use glam::Vec3;
 use volrender::{Composite, RaySamples, composite};

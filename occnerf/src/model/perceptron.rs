@@ -5,8 +5,8 @@ use crate::random::Stream;
 
 /// Shape of a perceptron and where its weights lie in one flat slice.
 ///
-/// Layer `l` holds a matrix (inputs × outputs, row-major) followed by its biases; widths are padded to 16 lanes and
-/// the padding stays zero.
+/// Layer `l` holds a matrix (inputs × outputs, row-major) followed by its biases; widths are padded
+/// to 16 lanes and the padding stays zero.
 #[derive(Clone, Debug)]
 pub(crate) struct Mlp {
     /// Padded widths: input, hidden …, output.
@@ -63,8 +63,8 @@ impl Mlp {
         self.widths.len() - 1
     }
 
-    /// He-uniform weights (He et al. 2015), zero biases; the head is a tenth of that, so that every seed starts near
-    /// its biases.
+    /// He-uniform weights (He et al. 2015), zero biases; the head is a tenth of that, so that every
+    /// seed starts near its biases.
     pub fn initial(&self, seed: u64) -> Vec<f32> {
         let mut parameters = vec![0.0; self.num_parameters()];
         for layer in 0..self.num_layers() {
@@ -90,7 +90,8 @@ impl Mlp {
         }
     }
 
-    /// Fills every layer of `activations` from its input rows; the last buffer is the linear output.
+    /// Fills every layer of `activations` from its input rows; the last buffer is the linear
+    /// output.
     pub fn forward(&self, parameters: &[f32], activations: &mut Activations, samples: usize) {
         assert_eq!(parameters.len(), self.num_parameters());
         for layer in 0..self.num_layers() {
@@ -104,9 +105,11 @@ impl Mlp {
         }
     }
 
-    /// Backward of [`Mlp::forward`]: accumulates into `d_parameters`, overwrites `d_input` (samples × padded width).
+    /// Backward of [`Mlp::forward`]: accumulates into `d_parameters`, overwrites `d_input` (samples
+    /// × padded width).
     ///
-    /// `transposed` is [`Mlp::transposed_weights`] of the same parameters; `d_output` is consumed as scratch.
+    /// `transposed` is [`Mlp::transposed_weights`] of the same parameters; `d_output` is consumed
+    /// as scratch.
     pub fn backward(
         &self,
         transposed: &[f32],
@@ -233,7 +236,8 @@ mod tests {
                 let h = 1e-3;
                 let moved = |h: f32| parameters.iter().zip(&d).map(|(p, d)| p + h * d).collect::<Vec<f32>>();
                 let (low, high) = (moved(-h), moved(h));
-                // A unit that switches within the step is a kink: the difference is no derivative there.
+                // A unit that switches within the step is a kink: the difference is no derivative
+                // there.
                 let (low_run, high_run) = (run(&mlp, &low, &input, samples), run(&mlp, &high, &input, samples));
                 if signs(&low_run) != signs(&high_run) {
                     continue;

@@ -1,5 +1,5 @@
-//! What a run directory keeps of the person beside what is learnt, so that a model can be drawn with
-//! the capture gone: the body, the moments and cameras of the video, the prior's colours.
+//! What a run directory keeps of the person beside what is learnt, so that a model can be drawn
+//! with the capture gone: the body, the moments and cameras of the video, the prior's colours.
 
 use std::borrow::Cow;
 use std::collections::BTreeMap;

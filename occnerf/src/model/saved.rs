@@ -16,8 +16,8 @@ use crate::model::trained::Model;
 pub(crate) const CHECKPOINT: &str = "checkpoint.safetensors";
 const FORMAT: &str = "occnerf-checkpoint";
 const VERSION: &str = "1";
-/// Of pruned models: a bit for each row of the table, lowest first in each byte, and the rows whose
-/// bit is set.
+/// Version of pruned models: they have a bit for each row of the table, lowest first in each byte,
+/// and the rows whose bit is set.
 const PRUNED: &str = "2";
 const KEPT: &str = "table.kept";
 /// Where `motion.shell_interval` is not 0: how far the field reaches over each vertex.

@@ -6,7 +6,8 @@ use std::time::Instant;
 /// Seconds of each stage of a step, summed over the threads that worked on it.
 #[derive(Clone, Copy, Debug, Default, PartialEq, serde::Serialize)]
 pub struct StepTimes {
-    /// Drawing rays, decoding the picture where it is not kept, posing the prior, encoding its vertices.
+    /// Drawing rays, decoding the picture where it is not kept, posing the prior, encoding its
+    /// vertices.
     pub prepare: f64,
     /// Samples, their motion, their surface queries.
     pub trace: f64,

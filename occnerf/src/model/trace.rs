@@ -16,7 +16,7 @@ use crate::random::Stream;
 /// Side of a cell of the occupancy for the rays of a step, of which too few pass through one for a
 /// finer grid to pay, normalised metres.
 pub(crate) const CELL: f32 = 0.02;
-/// The same for those of a picture, a tenth of whose time it saves.
+/// Side of a cell for the rays of a picture, a tenth of whose time it saves, normalised metres.
 pub(crate) const FINE_CELL: f32 = 0.01;
 
 /// A posed prior ready to be sampled; refitted in place for each frame.
@@ -286,7 +286,8 @@ mod tests {
                 let used = if distance == DistanceKind::Exact { exact } else { blended };
                 let within = |d: f32| d <= reach && d >= -config.motion.depth;
                 let live = tracer.push_point(&mut samples, point);
-                // A little beyond the margin, as far as a cell or the corner of a box, either is right; nobody is as deep as `depth`.
+                // A little beyond the margin, as far as a cell or the corner of a box, either is
+                // right; nobody is as deep as `depth`.
                 if within(exact) {
                     assert_eq!(live, within(used), "{point}: {exact}, {used}");
                     counts[usize::from(live)] += 1;

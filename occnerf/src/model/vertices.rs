@@ -64,7 +64,8 @@ impl VertexCode {
         });
     }
 
-    /// Where vertices are encoded, and after [`VertexCode::backward`] the gradients of their features, chunk by chunk.
+    /// Where vertices are encoded, and after [`VertexCode::backward`] the gradients of their
+    /// features, chunk by chunk.
     pub fn parts(&self) -> impl Iterator<Item = (At<'_>, &[f32])> + Clone + Sync {
         self.chunks.iter().enumerate().map(|(chunk, Chunk { features, .. })| {
             let end = ((chunk + 1) * CHUNK).min(self.at.surface.len());

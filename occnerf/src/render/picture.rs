@@ -1,4 +1,4 @@
-//! What a picture is, and how it is filled.
+//! Renderers, the pictures they draw, and how a picture is filled.
 
 use glam::Vec3;
 use rayon::prelude::*;

@@ -8,8 +8,9 @@ use crate::model::colors::VertexColors;
 use crate::scene::prepared::{Scene, pinhole};
 
 impl VertexColors {
-    /// The mean colour of the visible training pixels that saw each vertex, by ray casting; a vertex that none saw takes
-    /// the mean of those that some saw, weighted by their canonical distances to the power of −4 (Shepard 1968).
+    /// The mean colour of the visible training pixels that saw each vertex, by ray casting; a
+    /// vertex that none saw takes the mean of those that some saw, weighted by their canonical
+    /// distances to the power of −4 (Shepard 1968).
     pub fn measure(scene: &Scene) -> Result<Self, Error> {
         let per_frame: Result<Vec<Vec<(Vec3, u32)>>, Error> = scene
             .train
@@ -102,7 +103,8 @@ mod tests {
         assert!(shown.colors.iter().all(|c| (c.cmpge(Vec3::ZERO) & c.cmple(Vec3::ONE)).all()));
         let mut trainer = Trainer::new(&scene, config).unwrap();
         let between = |c: Vec3| c.clamp(Vec3::splat(0.02), Vec3::splat(0.98));
-        // How far each colour lies outside of those at the corners of its face, and whether none of them was seen.
+        // How far each colour lies outside of those at the corners of its face, and whether none of
+        // them was seen.
         let strays = |trainer: &Trainer<'_>| -> Vec<(f32, bool)> {
             let stray = |((face, _), rgb): ((u32, [f32; 3]), Vec3)| {
                 let corners = scene.body.model.faces[face as usize];

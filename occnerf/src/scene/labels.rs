@@ -1,4 +1,4 @@
-//! What is known of each pixel of a training image: subject, background, or nothing.
+//! Labels of a training image's pixels: subject, background, or unknown.
 
 use crate::config::OccludedRule;
 
@@ -30,7 +30,7 @@ struct Word {
 }
 
 impl Labels {
-    /// Of pixels in row-major order.
+    /// Packs the labels of pixels in row-major order.
     #[must_use]
     pub fn new(labels: &[Label]) -> Self {
         let mut subject = 0;
@@ -101,16 +101,18 @@ impl Labels {
     }
 }
 
-/// Width below which a piece of silhouette outside the mask is taken for misregistration of the prior, metres.
+/// Width below which a piece of silhouette outside the mask is taken for misregistration of the
+/// prior, metres.
 const SLIVER: f32 = 0.03;
 /// Thickness of clothes that an occluder may hide beyond the prior's silhouette, metres.
 const CLOTHES: f32 = 0.04;
 
 /// Labels the pixels of a frame of `width` × H pixels.
 ///
-/// `mask`: subject coverage; `silhouette`: pixels that the posed prior covers; `occluder`: known occluder pixels;
-/// `pixels_per_metre`: image scale at the subject's depth. With a known occluder its pixels are unknown; else the
-/// silhouette outside the mask, opened by 3 cm and dilated by 4 cm.
+/// `mask`: subject coverage; `silhouette`: pixels that the posed prior covers; `occluder`: known
+/// occluder pixels; `pixels_per_metre`: image scale at the subject's depth. With a known occluder
+/// its pixels are unknown; else the silhouette outside the mask, opened by 3 cm and dilated by 4
+/// cm.
 pub fn label_pixels(
     rule: OccludedRule,
     mask: &[f32],
@@ -152,8 +154,8 @@ fn erode(set: &[bool], width: usize, radius: f32) -> Vec<bool> {
     squared_distance(&unset, width).iter().map(|&d| d > radius * radius).collect()
 }
 
-/// Squared distance in pixels to the nearest set pixel, infinite where there is none (Felzenszwalb and
-/// Huttenlocher 2012: lower envelopes of parabolas, along columns, then rows).
+/// Squared distance in pixels to the nearest set pixel, infinite where there is none (Felzenszwalb
+/// and Huttenlocher 2012: lower envelopes of parabolas, along columns, then rows).
 fn squared_distance(set: &[bool], width: usize) -> Vec<f32> {
     let height = set.len().checked_div(width).unwrap_or(0);
     let mut field: Vec<f32> = set.iter().map(|&s| if s { 0.0 } else { f32::INFINITY }).collect();

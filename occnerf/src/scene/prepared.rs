@@ -16,23 +16,24 @@ use crate::scene::labels::{Label, Labels, label_pixels};
 
 /// A frame with its posed prior.
 pub struct PreparedFrame {
-    /// As in the capture.
+    /// Name in the capture.
     pub name: String,
-    /// As in the capture; evaluation cameras only.
+    /// Name of the camera in the capture; empty for training frames.
     pub camera_name: String,
     /// Pose and camera, lengths normalised.
     pub view: Arc<PosedView>,
     /// Picture and mask, as in the capture; `None` where nothing was photographed.
     pub source: Option<PixelSource>,
-    /// H × W; only training frames are labelled.
+    /// Labels of the pixels, H × W; only training frames are labelled.
     pub labels: Labels,
 }
 
 impl PreparedFrame {
-    /// What was photographed.
+    /// The picture and its mask.
     ///
     /// # Errors
-    /// [`Error::Data`] for files that cannot be read; [`Error::Scene`] where nothing was photographed.
+    /// [`Error::Data`] for files that cannot be read; [`Error::Scene`] where nothing was
+    /// photographed.
     pub fn pixels(&self) -> Result<Arc<Pixels>, Error> {
         let source = self.source.as_ref().ok_or_else(|| Error::Scene("a view without a picture".to_owned()))?;
         Ok(source.pixels()?)
@@ -41,7 +42,7 @@ impl PreparedFrame {
 
 /// Everything that training and scoring read and never change.
 pub struct Scene {
-    /// Of the capture.
+    /// Name of the capture.
     pub name: String,
     /// The shaped body.
     pub body: Arc<Body>,
@@ -76,7 +77,8 @@ impl Scene {
         Ok(scene)
     }
 
-    /// How many training frames show each vertex of the prior to the camera at a pixel of the subject, by ray casting.
+    /// How many training frames show each vertex of the prior to the camera at a pixel of the
+    /// subject, by ray casting.
     pub fn vertex_frequencies(&self) -> Result<Vec<u64>, Error> {
         let seen: Result<Vec<Vec<bool>>, Error> = self
             .train

@@ -1,10 +1,12 @@
-//! Adam (Kingma and Ba 2015), one instance for each parameter group. What no gradient has ever reached is passed over: there a step
-//! would change nothing, so the result is that of the dense one to the bit.
+//! Adam (Kingma and Ba 2015), one instance for each parameter group. What no gradient has ever
+//! reached is passed over: there a step would change nothing, so the result is that of the dense
+//! one to the bit.
 
 use rayon::prelude::*;
 
 const BETA_1: f32 = 0.9;
-/// Small beside any gradient that matters; hash-grid gradients are often below 1e-8 (Müller et al. 2022 use 1e-15).
+/// Small beside any gradient that matters; hash-grid gradients are often below 1e-8 (Müller et al.
+/// 2022 use 1e-15).
 const EPSILON: f32 = 1e-12;
 const CHUNK: usize = 1 << 14;
 /// Numbers that are passed over together.
@@ -16,7 +18,8 @@ pub(crate) struct Adam {
     pub first: Vec<f32>,
     pub second: Vec<f32>,
     pub steps: u64,
-    /// Blocks that a gradient has reached; empty before the first step, which finds out from the moments.
+    /// Blocks that a gradient has reached; empty before the first step, which finds out from the
+    /// moments.
     reached: Vec<bool>,
 }
 
@@ -25,7 +28,8 @@ impl Adam {
         Self { first: vec![0.0; parameters], second: vec![0.0; parameters], steps: 0, reached: Vec::new() }
     }
 
-    /// One step down `gradient`. Entries whose gradient is not finite are left alone; returns how many there were.
+    /// One step down `gradient`. Entries whose gradient is not finite are left alone; returns how
+    /// many there were.
     pub fn step(&mut self, rate: f32, beta_2: f32, parameters: &mut [f32], gradient: &[f32]) -> usize {
         assert_eq!(parameters.len(), self.first.len());
         assert_eq!(gradient.len(), self.first.len());
@@ -61,7 +65,7 @@ struct Update<'a> {
     reached: &'a mut [bool],
 }
 
-/// Of either sign.
+/// Whether all values are zero, of either sign.
 #[inline(always)]
 fn are_zero(values: &[f32]) -> bool {
     values.iter().fold(0, |bits, value| bits | value.to_bits() << 1) == 0
@@ -118,7 +122,8 @@ mod tests {
     }
 
     proptest! {
-        /// Gradients of some stretches in each step, none of most; in between the moments are read back, as from a checkpoint.
+        /// Gradients of some stretches in each step, none of most; in between the moments are read
+        /// back, as from a checkpoint.
         #[test]
         fn what_no_gradient_reaches_is_as_the_dense_step_leaves_it(
             n in 1usize..3 * CHUNK, resumed in 0usize..6,

@@ -9,7 +9,7 @@ use crate::model::saved::{config_of, parse};
 use crate::scene::prepared::Scene;
 use crate::train::trainer::Trainer;
 
-/// What is known of restarts, in the header as JSON; files from before there were any have none.
+/// Key of what is known of restarts, in the header as JSON; read as none where it is absent.
 const RESTARTS: &str = "restarts";
 
 impl<'a> Trainer<'a> {

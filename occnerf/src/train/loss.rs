@@ -7,9 +7,10 @@ const C2: f32 = 0.03 * 0.03;
 /// A 32-pixel patch has at most three scales: at a fourth, 4 pixels are smaller than the window.
 const MAX_SCALES: usize = 3;
 
-/// Multi-scale structural dissimilarity of two square patches: the mean over scales of 1 − SSIM, each scale the
-/// 2 × 2 mean of the one before (after Wang et al. 2003, with a sum in place of the product so that the gradient
-/// stays bounded where a scale's SSIM is near 0). Keeps the buffers that it takes.
+/// Multi-scale structural dissimilarity of two square patches: the mean over scales of 1 − SSIM,
+/// each scale the 2 × 2 mean of the one before (after Wang et al. 2003, with a sum in place of the
+/// product so that the gradient stays bounded where a scale's SSIM is near 0). Keeps the buffers
+/// that it takes.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Dissimilarity {
     scales: Vec<Scale>,
@@ -36,8 +37,8 @@ struct Windows {
 }
 
 impl Dissimilarity {
-    /// `a`, `b`: `size`·`size`·3 row-major in [0, 1]. Adds `scale` × the gradient with respect to `a` to `d_a` and
-    /// returns the value (unscaled). A patch smaller than the window gives 0.
+    /// `a`, `b`: `size`·`size`·3 row-major in [0, 1]. Adds `scale` × the gradient with respect to
+    /// `a` to `d_a` and returns the value (unscaled). A patch smaller than the window gives 0.
     pub fn backward(&mut self, a: &[f32], b: &[f32], size: usize, scale: f32, d_a: &mut [f32]) -> f64 {
         assert_eq!((a.len(), b.len(), d_a.len()), (size * size * 3, size * size * 3, size * size * 3));
         let count = (0..MAX_SCALES).take_while(|s| size >> s >= WINDOW).count();
@@ -93,16 +94,17 @@ fn half_size_backward(d_out: &[f32], half: usize, side: usize, d_x: &mut [f32]) 
 }
 
 impl Windows {
-    /// Mean SSIM over window positions and channels (uniform 7 × 7, sample covariance, data range 1); adds
-    /// `scale` × its gradient to `d_x`.
+    /// Mean SSIM over window positions and channels (uniform 7 × 7, sample covariance, data range
+    /// 1); adds `scale` × its gradient to `d_x`.
     fn ssim_backward(&mut self, x: &[f32], y: &[f32], side: usize, scale: f32, d_x: &mut [f32]) -> f64 {
         let positions = side - WINDOW + 1;
         let count = (WINDOW * WINDOW) as f32;
         let unbias = count / (count - 1.0);
         let weight = scale / (positions * positions * 3) as f32;
         let mut sum = 0.0;
-        // The SSIM of a window is a function of five window means, so its gradient is gathered through them: a pixel
-        // receives the box sum of the coefficients of the windows that hold it.
+        // The SSIM of a window is a function of five window means, so its gradient is gathered
+        // through them: a pixel receives the box sum of the coefficients of the windows that hold
+        // it.
         for channel in 0..3 {
             self.measure(x, y, side, channel);
             let Self { means, coefficients, .. } = self;
@@ -138,7 +140,8 @@ impl Windows {
         sum / (positions * positions * 3) as f64
     }
 
-    /// Means of x, y, x², y², xy over every window of one channel, by running sums along rows, then columns.
+    /// Means of x, y, x², y², xy over every window of one channel, by running sums along rows, then
+    /// columns.
     fn measure(&mut self, x: &[f32], y: &[f32], side: usize, channel: usize) {
         let Self { rows, means, .. } = self;
         let positions = side - WINDOW + 1;
@@ -170,8 +173,8 @@ impl Windows {
     }
 }
 
-/// Completeness of one sample inside the body, on the activated density (paper §3.4): e^(ReLU(β − σ) − β), which is
-/// 1 at σ = 0 and e^−β from σ = β on. Returns the value and its derivative by σ.
+/// Completeness of one sample inside the body, on the activated density (paper §3.4): e^(ReLU(β −
+/// σ) − β), which is 1 at σ = 0 and e^−β from σ = β on. Returns the value and its derivative by σ.
 pub(crate) fn completeness(sigma: f32, beta: f32) -> (f32, f32) {
     if sigma < beta {
         let value = (-sigma).exp();
@@ -222,7 +225,8 @@ mod tests {
             let (a, b) = (patch(size, 1), patch(size, 2));
             let mut d_a = vec![0.0; a.len()];
             Dissimilarity::default().backward(&a, &b, size, 1.0, &mut d_a);
-            // The oracle works in f64: a difference of f32 variances would drown the small derivatives.
+            // The oracle works in f64: a difference of f32 variances would drown the small
+            // derivatives.
             let tolerance = Tolerance { abs: 2e-6, rel: 0.01 };
             let picked: Vec<usize> = (0..a.len()).step_by(a.len().div_ceil(150)).collect();
             let point: Vec<f32> = picked.iter().map(|&i| a[i]).collect();

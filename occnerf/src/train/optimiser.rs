@@ -14,7 +14,7 @@ pub(crate) struct Optimiser {
 }
 
 impl Optimiser {
-    /// Nothing taken yet.
+    /// An optimiser that has taken no step.
     pub fn new(parameters: &Parameters) -> Self {
         let lengths = parameters.values.0.each_ref().map(Vec::len);
         Self { gradients: parameters.values.zeros(), moments: lengths.map(Adam::new) }

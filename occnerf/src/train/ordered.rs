@@ -71,7 +71,8 @@ impl OrderedSamples {
         composite_rays(starts, samples, background, weights, composites);
     }
 
-    /// Backward of [`OrderedSamples::composite`], into the segments' batches; `d_colors` of each ray.
+    /// Backward of [`OrderedSamples::composite`], into the segments' batches; `d_colors` of each
+    /// ray.
     pub fn composite_backward(
         &mut self,
         background: Vec3,

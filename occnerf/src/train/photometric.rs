@@ -1,4 +1,5 @@
-//! Photometric losses of a step: the error of its known pixels, and the perceptual term of its patches.
+//! Photometric losses of a step: the error of its known pixels, and the perceptual term of its
+//! patches.
 
 use glam::Vec3;
 use rayon::prelude::*;
@@ -24,7 +25,7 @@ pub(crate) struct Photometric {
     shown: Vec<f32>,
     /// Gradient of the perceptual term, rays × 3.
     d_prediction: Vec<f32>,
-    /// Of each patch.
+    /// Perceptual terms of the patches.
     dissimilarities: Vec<Dissimilarity>,
     values: Vec<f64>,
 }
@@ -66,7 +67,8 @@ impl Photometric {
         Ok(())
     }
 
-    /// Mean of the patches' perceptual terms; adds `weight` times its gradient to `d_colors` where the target is known.
+    /// Mean of the patches' perceptual terms; adds `weight` times its gradient to `d_colors` where
+    /// the target is known.
     fn perceptual(&mut self, weight: f32, lpips: Option<&Lpips>, size: usize) -> Result<f64, Error> {
         let Self { targets, d_colors, prediction, shown, d_prediction, dissimilarities, values } = self;
         shown.clear();

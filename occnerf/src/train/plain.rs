@@ -1,5 +1,6 @@
-//! A training step written straight from the definitions, in f64 and sample by sample, to test the fast one against: from where
-//! samples lie to the loss, with the gradients taken by central differences.
+//! A training step written straight from the definitions, in f64 and sample by sample, to test the
+//! fast one against: from where samples lie to the loss, with the gradients taken by central
+//! differences.
 
 use std::ops::Range;
 
@@ -17,7 +18,8 @@ use crate::scene::prepared::Scene;
 use crate::train::batch::target;
 use crate::train::trainer::Trainer;
 
-/// What the plain step reads besides the parameters under test: the samples of a step that was taken.
+/// What the plain step reads besides the parameters under test: the samples of a step that was
+/// taken.
 struct Plain<'a, 'b> {
     trainer: &'a Trainer<'b>,
     counts: &'a VisibilityCounts,
@@ -136,8 +138,8 @@ fn tiny(method: Method, motion: MotionKind, seed: u64) -> Config {
     config
 }
 
-/// The fast step and the plain one on the same samples: colours to 1e-4, losses to 1e-4 of themselves, derivatives
-/// along random directions to 1e-2 of themselves.
+/// The fast step and the plain one on the same samples: colours to 1e-4, losses to 1e-4 of
+/// themselves, derivatives along random directions to 1e-2 of themselves.
 #[test]
 fn a_step_agrees_with_one_written_straight_from_the_definitions() {
     let body = smpl::BodyModel::embedded();

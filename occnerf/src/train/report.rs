@@ -1,8 +1,8 @@
-//! What a step says of itself.
+//! The report of a training step.
 
 use crate::model::times::StepTimes;
 
-/// What a step did.
+/// Losses, counts and times of a training step.
 #[derive(Clone, Copy, Debug, Default, serde::Serialize)]
 pub struct StepReport {
     /// Number of the step, from 1.
@@ -15,7 +15,7 @@ pub struct StepReport {
     pub perceptual: f64,
     /// Completeness term.
     pub completeness: f64,
-    /// Of the known pixels of the step, decibels.
+    /// PSNR over the known pixels of the step, decibels.
     pub psnr: f64,
     /// Live samples that were evaluated.
     pub live_samples: usize,
@@ -23,8 +23,9 @@ pub struct StepReport {
     pub rays: usize,
     /// Gradients that were not finite and were left out.
     pub bad_gradients: usize,
-    /// How often training has begun anew so far, each time at a tenth of the rates, because the field had become empty.
+    /// How often training has begun anew, each time at a tenth of the rates, because the field had
+    /// become empty.
     pub restarts: u32,
-    /// Where the time went.
+    /// Time of each stage.
     pub times: StepTimes,
 }

@@ -1,4 +1,5 @@
-//! A field that has become empty starts again: nothing would teach it, since what has no density has no gradient either.
+//! A field that has become empty starts again: nothing would teach it, since what has no density
+//! has no gradient either.
 
 use serde::{Deserialize, Serialize};
 
@@ -15,11 +16,12 @@ const MOST: u32 = 3;
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct Restarts {
-    /// So far.
+    /// Restarts so far.
     pub count: u32,
     /// Steps that had been taken at the last one.
     pub begun: u64,
-    /// Rays at the subject's known pixels in this window, and those that met it: an opacity above a half.
+    /// Rays at the subject's known pixels in this window, and those that met it: an opacity above a
+    /// half.
     pub rays: u64,
     pub met: u64,
 }

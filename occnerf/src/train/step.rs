@@ -29,7 +29,7 @@ pub(crate) struct RayGroup {
     pub rays: Vec<usize>,
     /// Samples evaluated together, front to back.
     pub segments: Segments,
-    /// The same ray by ray.
+    /// The samples of all segments, ray by ray.
     pub ordered: OrderedSamples,
     pub composites: Vec<Composite>,
     /// Derivatives of the encoding of all segments.
@@ -51,8 +51,8 @@ pub(crate) struct RayGroup {
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct StepOptions {
     pub march: MarchOptions,
-    /// Whether rays at unknown pixels have only their samples inside the prior evaluated: the others
-    /// have no gradient.
+    /// Whether rays at unknown pixels have only their samples inside the prior evaluated: the
+    /// others have no gradient.
     pub skips_unknown: bool,
 }
 
@@ -71,8 +71,8 @@ pub(crate) struct Step<'a> {
 }
 
 impl Step<'_> {
-    /// Traces, encodes, evaluates and composites the rays of a group. What lies outside the prior on
-    /// a ray at an unknown pixel is dead: no photometric term asks for the ray's colour, and
+    /// Traces, encodes, evaluates and composites the rays of a group. What lies outside the prior
+    /// on a ray at an unknown pixel is dead: no photometric term asks for the ray's colour, and
     /// completeness for the inside alone.
     pub fn forward(&self, group: &mut RayGroup) {
         let Self { model, frame, batch, .. } = *self;
@@ -168,8 +168,8 @@ mod tests {
     use crate::train::step::StepOptions;
     use crate::train::trainer::Trainer;
 
-    /// Some steps with all samples, to make the surface opaque, and one more as `config` has it: its report, the colours of its
-    /// rays and the gradients.
+    /// Some steps with all samples, to make the surface opaque, and one more as `config` has it:
+    /// its report, the colours of its rays and the gradients.
     fn step(scene: &Scene, config: &Config) -> (StepReport, Vec<glam::Vec3>, [Vec<f32>; 3]) {
         let mut trainer = Trainer::new(scene, Config { min_transmittance: 0.0, ..config.clone() }).unwrap();
         for _ in 0..60 {
@@ -183,7 +183,8 @@ mod tests {
         (report, colors, gradients)
     }
 
-    /// One step of the volume motion, whose gradients pass through everything, and of the surface motion.
+    /// One step of the volume motion, whose gradients pass through everything, and of the surface
+    /// motion.
     #[test]
     fn what_lies_outside_the_prior_at_unknown_pixels_has_no_gradient() {
         let body = smpl::BodyModel::embedded();

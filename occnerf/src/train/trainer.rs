@@ -59,7 +59,7 @@ pub(crate) struct Buffers {
 }
 
 impl<'a> Trainer<'a> {
-    /// A model at step 0.
+    /// Begins training at step 0.
     ///
     /// # Errors
     /// A configuration that is not valid or not the one that `scene` was prepared for.
@@ -113,13 +113,13 @@ impl<'a> Trainer<'a> {
         Ok(())
     }
 
-    /// [`Model::prune`]; a step taken afterwards makes all rows learnable again.
+    /// Calls [`Model::prune`]; a step taken afterwards makes all rows learnable again.
     pub fn prune(&mut self) -> Pruned {
         self.model.prune()
     }
 
-    /// Which perceptual term the run is trained with: `ms-ssim`, `lpips` with the network's name, or
-    /// `none`.
+    /// Which perceptual term the run is trained with: `ms-ssim`, `lpips` with the network's name,
+    /// or `none`.
     pub fn perceptual(&self) -> String {
         match &self.lpips {
             Some(lpips) => format!("lpips {}", lpips.trunk().name()),
@@ -154,10 +154,10 @@ impl<'a> Trainer<'a> {
         }
     }
 
-    /// One optimisation step.
+    /// Takes one optimisation step.
     ///
     /// # Errors
-    /// [`Error::Data`] where the step's picture cannot be decoded (any more); [`Error::Lpips`] where
+    /// [`Error::Data`] where the step's picture cannot be decoded; [`Error::Lpips`] where
     /// the configuration names weights of the perceptual term and [`Trainer::load_perceptual`] was
     /// not called. The model is then as it was before.
     pub fn step(&mut self) -> Result<StepReport, Error> {

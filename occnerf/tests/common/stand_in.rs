@@ -2,7 +2,7 @@
 
 use glam::{Affine3A, Vec2, Vec3};
 use occnerf::bake::{Atlas, Avatar, Clip, motion_of_bones, skeleton, upright};
-use occnerf::{Scene, VertexColors};
+use occnerf::{Scene, VertexColors, upright as up_of};
 use volrender::Camera;
 
 /// Texels a side of the square that a face's colours stand in.
@@ -10,24 +10,26 @@ const CELL: usize = 8;
 
 /// The prior of a prepared scene as an avatar of one shell.
 pub fn stand_in(scene: &Scene, colors: &VertexColors) -> Avatar {
-    let metres = 1.0 / scene.scale;
-    let world = Affine3A::from_mat3(upright(scene.up()) * metres);
-    let model = &scene.model;
-    let rest: Vec<Vec3> = scene.canonical.joints.iter().map(|&joint| joint * metres).collect();
+    let body = &scene.body;
+    let metres = 1.0 / body.scale;
+    let up = up_of(body, scene.train.iter().map(|frame| &*frame.view));
+    let world = Affine3A::from_mat3(upright(up) * metres);
+    let model = &body.model;
+    let rest: Vec<Vec3> = body.canonical.joints.iter().map(|&joint| joint * metres).collect();
     let skeleton = skeleton(&model.parents, &rest);
     let frames: Vec<Vec<Affine3A>> = scene
         .train
         .iter()
         .map(|frame| {
-            let to_avatar = |bone: &Affine3A| world * *bone * Affine3A::from_scale(Vec3::splat(scene.scale));
-            frame.posed.bones.iter().map(to_avatar).collect()
+            let to_avatar = |bone: &Affine3A| world * *bone * Affine3A::from_scale(Vec3::splat(body.scale));
+            frame.view.posed.bones.iter().map(to_avatar).collect()
         })
         .collect();
     let cameras = scene
         .train
         .iter()
         .map(|frame| {
-            let mut camera = frame.camera;
+            let mut camera = frame.view.camera;
             let there = world.inverse();
             let mut placed = camera.world_to_camera * there;
             // Back to a rotation, and to depths in metres.
@@ -67,7 +69,7 @@ pub fn stand_in(scene: &Scene, colors: &VertexColors) -> Avatar {
         for (corner, &v) in face.iter().enumerate() {
             let place = Vec2::new(x0 as f32, y0 as f32) + places[corner];
             uvs.push(place / Vec2::new(width as f32, height as f32));
-            vertices.push(scene.canonical.vertices[v as usize] * metres);
+            vertices.push(body.canonical.vertices[v as usize] * metres);
             let mut row: Vec<(usize, f32)> = model.weights.row(v as usize).collect();
             row.sort_by(|a, b| b.1.total_cmp(&a.1));
             row.truncate(4);
@@ -77,9 +79,9 @@ pub fn stand_in(scene: &Scene, colors: &VertexColors) -> Avatar {
             weights.push(std::array::from_fn(|i| entry(i).1 / sum));
         }
     }
-    let mut sums = vec![Vec3::ZERO; scene.canonical.vertices.len()];
+    let mut sums = vec![Vec3::ZERO; body.canonical.vertices.len()];
     for face in &model.faces {
-        let [a, b, c] = face.map(|v| scene.canonical.vertices[v as usize]);
+        let [a, b, c] = face.map(|v| body.canonical.vertices[v as usize]);
         face.iter().for_each(|&v| sums[v as usize] += (b - a).cross(c - a));
     }
     let smooth = model.faces.iter().flatten().map(|&v| sums[v as usize].normalize_or(Vec3::Y)).collect();
@@ -102,7 +104,7 @@ pub fn stand_in(scene: &Scene, colors: &VertexColors) -> Avatar {
         posedirs,
         atlas,
         skeleton,
-        betas: scene.mean_betas.clone(),
+        betas: body.mean_betas.clone(),
         clips: vec![Clip { name: "video".to_owned(), motion }],
         cameras,
     }

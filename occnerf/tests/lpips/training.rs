@@ -75,9 +75,9 @@ fn scoring_reports_lpips_where_weights_are_given() {
     let trainer = Trainer::new(scene, common::config(Method::Occnerf)).unwrap();
     let frames: Vec<_> = scene.eval.iter().collect();
     let mut seen = Vec::new();
-    let mut renderer = FieldRenderer::new(&trainer).unwrap();
+    let mut renderer = FieldRenderer::new(trainer.model()).unwrap();
     let scores = evaluate_with(scene, &mut renderer, &frames, Some(&lpips), |frame, rendering| {
-        let size = (frame.camera.width as usize, frame.camera.height as usize);
+        let size = (frame.view.camera.width as usize, frame.view.camera.height as usize);
         let truth = frame.pixels().unwrap();
         seen.push(lpips.distance(&rendering.image.pixels, &truth.image.pixels, size.0, size.1).unwrap()[0]);
     });
@@ -85,7 +85,7 @@ fn scoring_reports_lpips_where_weights_are_given() {
     let found: Vec<f64> = scores.frames.iter().filter_map(|f| f.lpips_full).collect();
     assert_eq!(found, seen);
     assert!((scores.lpips_full.unwrap() - seen.iter().sum::<f64>() / seen.len() as f64).abs() < 1e-12);
-    let mut renderer = FieldRenderer::new(&trainer).unwrap();
+    let mut renderer = FieldRenderer::new(trainer.model()).unwrap();
     let without = evaluate_with(scene, &mut renderer, &frames, None, |_, _| {}).unwrap();
     assert_eq!(without.lpips_full, None);
 }

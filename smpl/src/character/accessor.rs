@@ -12,19 +12,23 @@ use gltf::json::{Index, Root};
 use crate::Error;
 use crate::npz::read_file;
 
-/// What all accessors together may decode to, in bytes: 256 MiB.
+/// Bytes that all accessors together may decode to: 256 MiB.
 const MAX_DECODED_BYTES: u64 = 1 << 28;
+/// What the buffers and the pictures of a document may come to, in bytes: 512 MiB. A document may name one file many times.
+const MAX_RESOLVED_BYTES: u64 = 1 << 29;
 
-/// A document and the bytes that its accessors and images point into. Nothing in it is taken on trust: every index and
-/// range is checked where it is used.
+/// A document and the bytes that its accessors and images point into. Nothing in it is taken on
+/// trust: every index and range is checked where it is used.
 pub(super) struct Source<'a> {
     pub(super) file: &'a str,
     pub(super) root: &'a Root,
-    /// Where other files may lie; `None` admits none.
+    /// Directory where other files may lie; `None` admits none.
     folder: Option<&'a Path>,
     data: Vec<Vec<u8>>,
     /// Bytes that may still be decoded: many accessors may share one range.
     left: Cell<u64>,
+    /// Bytes that addresses may still lead to.
+    resolvable: Cell<u64>,
 }
 
 impl<'a> Source<'a> {
@@ -35,7 +39,14 @@ impl<'a> Source<'a> {
         mut blob: Option<Vec<u8>>,
         folder: Option<&'a Path>,
     ) -> Result<Self, Error> {
-        let mut source = Self { file, root, folder, data: Vec::new(), left: Cell::new(MAX_DECODED_BYTES) };
+        let mut source = Self {
+            file,
+            root,
+            folder,
+            data: Vec::new(),
+            left: Cell::new(MAX_DECODED_BYTES),
+            resolvable: Cell::new(MAX_RESOLVED_BYTES),
+        };
         for (i, buffer) in root.buffers.iter().enumerate() {
             let place = format!("buffer {i}");
             let bytes = match &buffer.uri {
@@ -70,7 +81,8 @@ impl<'a> Source<'a> {
         Ok((view, bytes.ok_or_else(outside)?))
     }
 
-    /// Elements of N components, decoded by `component` from the bytes of one; `None` from it is an error.
+    /// Elements of N components, decoded by `component` from the bytes of one; `None` from it is an
+    /// error.
     fn elements<const N: usize, T: Copy + Default>(
         &self,
         index: Index<Accessor>,
@@ -157,21 +169,40 @@ impl<'a> Source<'a> {
         })
     }
 
-    /// Media type and bytes of a data URI, or of a file in the folder. Addresses that leave the folder are refused.
+    /// Media type and bytes of a data URI, or of a file in the folder. Addresses that leave the
+    /// folder are refused.
     pub(super) fn resolve(&self, place: &str, uri: &str) -> Result<(String, Vec<u8>), Error> {
         if let Some(rest) = uri.strip_prefix("data:") {
             let Some((mime, text)) = rest.split_once(";base64,") else {
                 return Err(self.invalid(place, "a data address that is not base64"));
             };
+            self.spend(place, text.len() as u64 / 4 * 3)?;
             let bytes = base64::engine::general_purpose::STANDARD.decode(text);
             return Ok((mime.to_owned(), bytes.map_err(|e| self.invalid(place, e.to_string()))?));
         }
         let path = Path::new(uri);
         let inside = path.components().all(|c| matches!(c, Component::Normal(_) | Component::CurDir));
         match self.folder {
-            Some(folder) if inside => Ok((String::new(), read_file(&folder.join(path))?)),
+            Some(folder) if inside => {
+                let path = folder.join(path);
+                // Before it is read.
+                self.spend(place, std::fs::metadata(&path).map_or(0, |file| file.len()))?;
+                Ok((String::new(), read_file(&path)?))
+            }
             _ => Err(self.invalid(place, format!("the address {uri:?} does not lead to a file beside it"))),
         }
+    }
+
+    /// Takes what an address leads to off what the document may still ask for.
+    fn spend(&self, place: &str, bytes: u64) -> Result<(), Error> {
+        let left = self.resolvable.get().checked_sub(bytes).ok_or_else(|| Error::TooLarge {
+            file: self.file.to_owned(),
+            key: place.to_owned(),
+            claimed: u128::from(MAX_RESOLVED_BYTES - self.resolvable.get()) + u128::from(bytes),
+            limit: MAX_RESOLVED_BYTES,
+        })?;
+        self.resolvable.set(left);
+        Ok(())
     }
 
     pub(super) fn invalid(&self, place: &str, message: impl Into<String>) -> Error {

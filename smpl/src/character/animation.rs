@@ -40,7 +40,8 @@ pub(super) enum Interpolation {
 }
 
 impl Animation {
-    /// Replaces what the channels drive. Nodes given as matrices are left alone; the reader admits none with a channel.
+    /// Replaces what the channels drive. Nodes given as matrices are left alone; the reader admits
+    /// none with a channel.
     pub(super) fn apply(&self, seconds: f32, locals: &mut [Local]) {
         for channel in &self.channels {
             let value = channel.at(seconds);

@@ -13,10 +13,12 @@ pub use animation::Animation;
 use crate::pose::{CHUNK, blend};
 use crate::sparse::SkinningWeights;
 
-/// A rigged character: every triangle mesh of a glTF scene merged into one, with V vertices and J joints.
+/// A rigged character: every triangle mesh of a glTF scene merged into one, with V vertices and J
+/// joints.
 ///
-/// Meshes without a skin are bound rigidly to a joint that stands for their node. Not read: morph targets, sparse
-/// accessors, materials other than the first base-colour texture. Lengths are metres, y up, as in glTF.
+/// Meshes without a skin are bound rigidly to a joint that stands for their node. Not read: morph
+/// targets, sparse accessors, materials other than the first base-colour texture. Lengths are
+/// metres, y up, as in glTF.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Character {
     /// Vertices as the file has them, in the space that the inverse bind matrices start from, (V).
@@ -89,8 +91,8 @@ impl Character {
         self.joint_nodes.len()
     }
 
-    /// The nearest joint above each, (J): that of the nearest node above which is a joint. Of joints that share a node the
-    /// first is above the others.
+    /// The nearest joint above each, (J): that of the nearest node above which is a joint. Of
+    /// joints that share a node the first is above the others.
     #[must_use]
     pub fn joint_parents(&self) -> Vec<Option<usize>> {
         let mut first = vec![None; self.nodes.len()];
@@ -119,8 +121,8 @@ impl Character {
         self.place(self.nodes.iter().map(|n| n.rest).collect())
     }
 
-    /// The character at `seconds` of animation `animation`, held before its first and after its last key. Nodes that
-    /// it does not move stand as in the file.
+    /// The character at `seconds` of animation `animation`, held before its first and after its
+    /// last key. Nodes that it does not move stand as in the file.
     ///
     /// # Panics
     /// If there is no such animation.

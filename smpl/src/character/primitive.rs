@@ -10,10 +10,11 @@ use super::accessor::Source;
 use super::read::Joints;
 use super::{Character, Texture};
 use crate::Error;
+use crate::model::MAX_COORDINATE;
 
 impl Character {
-    /// Appends a primitive's vertices and triangles. `skinned`: its own joints and weights count, within `joints`; else
-    /// it follows the first of those.
+    /// Appends a primitive's vertices and triangles. `skinned`: its own joints and weights count,
+    /// within `joints`; else it follows the first of those.
     pub(super) fn add_primitive(
         &mut self,
         source: &Source<'_>,
@@ -33,6 +34,9 @@ impl Character {
         let attribute = |semantic| primitive.attributes.get(&Checked::Valid(semantic)).copied();
         let positions = attribute(Semantic::Positions).ok_or_else(|| invalid("no positions".to_owned()))?;
         let positions = source.floats::<3>(positions, &format!("{place}, POSITION"))?;
+        if let Some(far) = positions.iter().find(|p| p.iter().any(|x| x.abs() > MAX_COORDINATE)) {
+            return Err(invalid(format!("POSITION {far:?}: expected at most {MAX_COORDINATE} either way")));
+        }
         let (first, count) = (self.vertices.len() as u32, positions.len());
         self.vertices.extend(positions.into_iter().map(Vec3::from));
         let fits = |n: usize, name: &str| {
@@ -85,8 +89,8 @@ impl Character {
         Ok(())
     }
 
-    /// Appends a vertex's weights, normalised, one entry a joint. Without any weight, where glTF leaves it open, `default`
-    /// keeps the vertex with the body.
+    /// Appends a vertex's weights, normalised, one entry a joint. Without any weight, where glTF
+    /// leaves it open, `default` keeps the vertex with the body.
     fn push_weights(&mut self, mut row: Vec<(u32, f32)>, default: u32) {
         if row.is_empty() {
             row.push((default, 1.0));

@@ -1,4 +1,4 @@
-//! From a glTF document to a [`Character`].
+//! Reads a [`Character`] from a glTF document.
 
 use std::collections::HashMap;
 use std::path::Path;
@@ -24,7 +24,8 @@ impl Character {
         read(&path.display().to_string(), &read_file(path)?, path.parent())
     }
 
-    /// The same for bytes in memory, which may not point to other files; `file` names them in errors.
+    /// Reads a character from bytes in memory, which may not point to other files; `file` names
+    /// them in errors.
     ///
     /// # Errors
     /// As for [`Character::load`].
@@ -135,7 +136,8 @@ fn nodes(source: &Source<'_>) -> Result<Vec<Node>, Error> {
     Ok(out)
 }
 
-/// Nodes with parents before children. A cycle has no root, so what is not reached is on one or below it.
+/// Nodes with parents before children. A cycle has no root, so what is not reached is on one or
+/// below it.
 fn order(source: &Source<'_>, nodes: &[Node]) -> Result<Vec<usize>, Error> {
     let mut children = vec![Vec::new(); nodes.len()];
     let mut order = Vec::with_capacity(nodes.len());

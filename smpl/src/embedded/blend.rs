@@ -2,11 +2,11 @@
 
 use glam::Vec3;
 
-use super::ramp;
 use crate::model::{BodyModel, TERMS_PER_JOINT};
 use crate::sparse::SparseRows;
 
-/// (10·V): displacement of every vertex for one unit of each beta. `vertices` stand on the floor y = 0.
+/// (10·V): displacement of every vertex for one unit of each beta. `vertices` stand on the floor y
+/// = 0.
 pub(super) fn shape_directions(vertices: &[Vec3], faces: &[[u32; 3]]) -> Vec<Vec3> {
     let normals = normals(vertices, faces);
     let directions: [fn(Vec3, Vec3) -> Vec3; 10] =
@@ -88,15 +88,15 @@ fn arm_length(p: Vec3, _: Vec3) -> Vec3 {
     Vec3::X * (0.022 * p.x.signum() * ((p.x.abs() - 0.2) / 0.48).clamp(0.0, 1.0))
 }
 
-/// How much of the correction is applied: all of it overshoots at turns beyond a radian.
+/// Share of the correction that is applied: all of it overshoots at turns beyond a radian.
 const PART: f32 = 0.7;
 
 /// (V, 207): corrects linear blending to second order in the angle.
 ///
-/// A vertex that follows joint j (and everything beyond it) with weight w, and its parent with the rest, should turn about
-/// j by the fraction w of the rotation, but is put at (1−w) r + w R r, which lies closer to the axis. To second order the
-/// difference is −w (1−w) ½(M + Mᵀ) r with M = R − I and r the vertex seen from the joint: linear in M, which is what pose
-/// blend shapes can say.
+/// A vertex that follows joint j (and everything beyond it) with weight w, and its parent with the
+/// rest, should turn about j by the fraction w of the rotation, but is put at (1−w) r + w R r,
+/// which lies closer to the axis. To second order the difference is −w (1−w) ½(M + Mᵀ) r with M = R
+/// − I and r the vertex seen from the joint: linear in M, which is what pose blend shapes can say.
 pub(super) fn pose_directions(model: &BodyModel) -> SparseRows<Vec3> {
     let joints = model.shaped(&[]).joints;
     SparseRows::from_rows((0..model.num_vertices()).map(|v| {
@@ -132,7 +132,8 @@ pub(super) fn pose_directions(model: &BodyModel) -> SparseRows<Vec3> {
     }))
 }
 
-/// Area-weighted, then evened out over the mesh, so that moving along them does not fold creases; shorter than 1 there.
+/// Area-weighted, then evened out over the mesh, so that moving along them does not fold creases;
+/// shorter than 1 there.
 fn normals(vertices: &[Vec3], faces: &[[u32; 3]]) -> Vec<Vec3> {
     let mut out = vec![Vec3::ZERO; vertices.len()];
     for face in faces {
@@ -152,4 +153,10 @@ fn normals(vertices: &[Vec3], faces: &[[u32; 3]]) -> Vec<Vec3> {
             .collect();
     }
     out
+}
+
+/// 0 below `low`, 1 above `high`, smooth between.
+fn ramp(low: f32, high: f32, x: f32) -> f32 {
+    let s = ((x - low) / (high - low)).clamp(0.0, 1.0);
+    s * s * (3.0 - 2.0 * s)
 }

@@ -5,12 +5,12 @@ use std::collections::BinaryHeap;
 
 use glam::{DMat3, DVec3};
 
-use super::Mesh;
+use super::half::Half;
 
 /// Cost of an edge's length beside the distance to the planes: keeps triangles of about one size.
 const LENGTH_COST: f64 = 0.01;
 
-/// Above this height, metres, in front, the face is kept finer by this factor of the cost.
+/// Height in metres above which, in front, the face is kept finer, and the factor of its cost.
 const FACE: f64 = 1.49;
 const FACE_COST: f64 = 12.0;
 
@@ -87,7 +87,7 @@ struct Collapser {
 }
 
 /// Collapses edges until `target` vertices are left.
-pub(super) fn decimate(mesh: Mesh, target: usize) -> Mesh {
+pub(super) fn decimate(mesh: Half, target: usize) -> Half {
     let mut state = Collapser::new(&mesh);
     let mut count = mesh.vertices.len();
     while count > target {
@@ -102,7 +102,7 @@ pub(super) fn decimate(mesh: Mesh, target: usize) -> Mesh {
 }
 
 impl Collapser {
-    fn new(mesh: &Mesh) -> Self {
+    fn new(mesh: &Half) -> Self {
         let n = mesh.vertices.len();
         let mut state = Self {
             positions: mesh.vertices.iter().map(|v| v.as_dvec3()).collect(),
@@ -247,7 +247,7 @@ impl Collapser {
         })
     }
 
-    fn finish(self) -> Mesh {
+    fn finish(self) -> Half {
         let mut index = vec![u32::MAX; self.positions.len()];
         let mut vertices = Vec::new();
         let mut faces = Vec::new();
@@ -261,6 +261,6 @@ impl Collapser {
                 *slot
             }));
         }
-        Mesh { vertices, faces }
+        Half { vertices, faces }
     }
 }

@@ -1,11 +1,12 @@
-//! Meshing the implicit surface: naive surface nets (Gibson 1998) on half the body, projected onto the surface.
+//! Meshing the implicit surface: naive surface nets (Gibson 1998) on half the body, projected onto
+//! the surface.
 
 use std::collections::HashMap;
 
 use glam::Vec3;
 use rayon::prelude::*;
 
-use super::Mesh;
+use super::half::Half;
 use super::shape::distance;
 
 /// Edge of a grid cell, metres.
@@ -24,7 +25,7 @@ const BLOCK: usize = 8;
 const SLOPE: f32 = 1.8;
 
 /// The half with x ≥ 0, open along x = 0.
-pub(super) fn half_surface() -> Mesh {
+pub(super) fn half_surface() -> Half {
     let corners = CELLS.map(|n| n + 1);
     let at = |i: [usize; 3]| (i[2] * corners[1] + i[1]) * corners[0] + i[0];
     let values = sample(corners);
@@ -70,7 +71,7 @@ pub(super) fn half_surface() -> Mesh {
             }
         }
     }
-    Mesh { vertices, faces }
+    Half { vertices, faces }
 }
 
 /// Values at the corners; only their sign is right far from the surface.
@@ -162,8 +163,9 @@ fn gradient(v: Vec3) -> Vec3 {
     Vec3::new(slope(Vec3::X), slope(Vec3::Y), slope(Vec3::Z))
 }
 
-/// Evens out the triangles: moves every vertex towards the mean of its neighbours along the surface.
-pub(super) fn relax(mut mesh: Mesh) -> Mesh {
+/// Evens out the triangles: moves every vertex towards the mean of its neighbours along the
+/// surface.
+pub(super) fn relax(mut mesh: Half) -> Half {
     let neighbours = super::rig::neighbours(mesh.vertices.len(), &mesh.faces);
     for _ in 0..6 {
         let old = &mesh.vertices;

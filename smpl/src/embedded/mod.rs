@@ -3,6 +3,7 @@
 mod blend;
 mod decimate;
 mod extract;
+mod half;
 mod rig;
 mod shape;
 mod tube;
@@ -18,21 +19,22 @@ const ORIGIN: f32 = 1.15;
 const HALF_VERTICES: usize = 2450;
 
 impl BodyModel {
-    /// A body that needs no file: SMPL's 24 joints in SMPL's order, T-pose, about 1.7 m tall, some 4,800 vertices of one
-    /// closed surface without handles, mirror-symmetric in x.
+    /// A body that needs no file: SMPL's 24 joints in SMPL's order, T-pose, about 1.7 m tall, some
+    /// 4,800 vertices of one closed surface without handles, mirror-symmetric in x.
     ///
-    /// It is made by a program, not measured: proportions are those of an average adult, hands are mittens. Betas (plausible
-    /// within ±2): 0 height, 1 weight, 2 feminine to masculine, 3 muscle, 4 head size, 5 belly, 6 chest, 7 torso width,
-    /// 8 leg length, 9 arm length. Pose blend shapes restore the volume that linear blending loses at bent joints, to
-    /// second order in the angle.
+    /// It is made by a program, not measured: proportions are those of an average adult, hands are
+    /// mittens. Betas (plausible within ±2): 0 height, 1 weight, 2 feminine to masculine, 3 muscle,
+    /// 4 head size, 5 belly, 6 chest, 7 torso width, 8 leg length, 9 arm length. Pose blend shapes
+    /// restore the volume that linear blending loses at bent joints, to second order in the angle.
     ///
-    /// The result is the same at every call. Each call builds it anew, a fraction of a second: keep it.
+    /// The result is the same at every call. Each call builds it anew, a fraction of a second: keep
+    /// it.
     #[must_use]
     pub fn embedded() -> Self {
         let half = extract::half_surface();
         let half = decimate::decimate(half, HALF_VERTICES);
         let half = extract::relax(half);
-        let (vertices, faces) = mirror(&half);
+        let (vertices, faces) = half::mirror(&half);
         let weights = rig::skinning_weights(&vertices, &faces);
         let shapedirs = blend::shape_directions(&vertices, &faces);
         let j_regressor = rig::joint_regressor(&vertices);
@@ -49,33 +51,4 @@ impl BodyModel {
         model.posedirs = blend::pose_directions(&model);
         model
     }
-}
-
-/// Triangles over points.
-pub(super) struct Mesh {
-    pub(super) vertices: Vec<Vec3>,
-    pub(super) faces: Vec<[u32; 3]>,
-}
-
-/// Both halves of a body from the one with x ≥ 0. Vertices with x = 0 are shared.
-fn mirror(half: &Mesh) -> (Vec<Vec3>, Vec<[u32; 3]>) {
-    let mut vertices = half.vertices.clone();
-    let mut twin: Vec<u32> = Vec::with_capacity(vertices.len());
-    for (i, v) in half.vertices.iter().enumerate() {
-        if v.x == 0.0 {
-            twin.push(i as u32);
-        } else {
-            twin.push(vertices.len() as u32);
-            vertices.push(Vec3::new(-v.x, v.y, v.z));
-        }
-    }
-    let mut faces = half.faces.clone();
-    faces.extend((half.faces.iter()).map(|&[a, b, c]| [a, c, b].map(|i| twin[i as usize])));
-    (vertices, faces)
-}
-
-/// 0 below `low`, 1 above `high`, smooth between.
-pub(super) fn ramp(low: f32, high: f32, x: f32) -> f32 {
-    let s = ((x - low) / (high - low)).clamp(0.0, 1.0);
-    s * s * (3.0 - 2.0 * s)
 }

@@ -4,7 +4,8 @@ use glam::{DMat4, DVec4, Vec3};
 
 use crate::sparse::SparseRows;
 
-/// SMPL's joints in its order: parent, position with the floor at y = 0, metres, and the axis of the limb through it.
+/// SMPL's joints in its order: parent, position with the floor at y = 0, metres, and the axis of
+/// the limb through it.
 pub(super) const JOINTS: [(usize, [f32; 3], Vec3); 24] = [
     (usize::MAX, [0.0, 0.93, 0.0], Vec3::Y),
     (0, [0.088, 0.885, 0.004], Vec3::Y),
@@ -91,7 +92,8 @@ fn owner(p: Vec3) -> usize {
     }
 }
 
-/// Joints by region, smoothed along the surface: neighbouring limbs do not mix however close they are.
+/// Joints by region, smoothed along the surface: neighbouring limbs do not mix however close they
+/// are.
 pub(super) fn skinning_weights(vertices: &[Vec3], faces: &[[u32; 3]]) -> SparseRows<f32> {
     let neighbours = neighbours(vertices.len(), faces);
     let mut weights = vec![[0.0f32; 24]; vertices.len()];

@@ -1,7 +1,8 @@
-//! The implicit surface: tubes of superelliptic cross-section along limbs and torso, joined by smooth minima.
+//! The implicit surface: tubes of superelliptic cross-section along limbs and torso, joined by
+//! smooth minima.
 //!
-//! Coordinates are metres with the floor at y = 0, facing +z. Dimensions are rounded from common tables of adult
-//! proportions (a body of 7½ heads, arm span equal to height).
+//! Coordinates are metres with the floor at y = 0, facing +z. Dimensions are rounded from common
+//! tables of adult proportions (a body of 7½ heads, arm span equal to height).
 
 use glam::Vec3;
 

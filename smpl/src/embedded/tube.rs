@@ -5,7 +5,8 @@ use glam::Vec3;
 /// A cross-section of a tube: position along the axis, centre across (2), radii across (2).
 pub(super) type Section = [f32; 5];
 
-/// A tube along a coordinate axis. Across y the coordinates are (x, z), across x (y, z), across z (x, y).
+/// A tube along a coordinate axis. Across y the coordinates are (x, z), across x (y, z), across z
+/// (x, y).
 pub(super) struct Tube {
     pub(super) axis: usize,
     /// Exponent of the cross-section: 2 is an ellipse, more is boxier.
@@ -41,7 +42,8 @@ impl Tube {
         out
     }
 
-    /// Distance to first order, negative inside: (k − 1)/|∇k| of the norm k whose unit level is the tube.
+    /// Distance to first order, negative inside: (k − 1)/|∇k| of the norm k whose unit level is the
+    /// tube.
     pub(super) fn distance(&self, p: Vec3) -> f32 {
         let (t, u, v) = match self.axis {
             0 => (p.x, p.y, p.z),

@@ -1,4 +1,4 @@
-//! Both kinds of motion field behind one interface.
+//! One interface for both kinds of motion field.
 
 use glam::{Affine3A, Mat3, Vec3};
 
@@ -28,15 +28,17 @@ impl<'a> MotionFrame<'a> {
 /// The point of a posed surface that is nearest to a query.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SurfacePoint {
-    /// Which face.
+    /// The face.
     pub face: u32,
-    /// Where on it; 0 for a corner that has no part in it, so that edges and corners are told from the inside.
+    /// Barycentric coordinates on it; 0 for a corner that has no part in it, so that edges and
+    /// corners are told from the inside.
     pub barycentric: [f32; 3],
-    /// From the surface to the query, outside positive.
+    /// Distance from the surface to the query, outside positive.
     pub signed_distance: f32,
 }
 
-/// Either kind of motion field: from a point x of the world to its canonical point x̂ and the likelihood f.
+/// Either kind of motion field: from a point x of the world to its canonical point x̂ and the
+/// likelihood f.
 ///
 /// ```
 /// use glam::Vec3;
@@ -70,8 +72,8 @@ pub enum MotionField {
 }
 
 impl MotionField {
-    /// Maps `point`; `nearest` is called by the surface kind only, at most once, and its `None` means too far away.
-    /// `None`: dead, see [`SurfaceMotion::map`] and [`WeightVolume::map`].
+    /// Maps `point`; `nearest` is called by the surface kind only, at most once, and its `None`
+    /// means too far away. `None`: dead, see [`SurfaceMotion::map`] and [`WeightVolume::map`].
     ///
     /// # Panics
     /// If the parts do not belong to one body.
@@ -91,16 +93,15 @@ impl MotionField {
         }
     }
 
-    /// [`MotionField::map`] with ∂x̂/∂x and ∂f/∂x. The surface kind's includes the way of the nearest point along its
-    /// face or edge.
+    /// [`MotionField::map`] with ∂x̂/∂x and ∂f/∂x. The surface kind's includes the way of the
+    /// nearest point along its face or edge.
     ///
-    /// Both kinds have kinks: cells of the volumes, and where the nearest point passes an edge or one bone takes over.
-    /// There the derivative is that of one side.
+    /// Both kinds have kinks: cells of the volumes, and where the nearest point passes an edge or
+    /// one bone takes over. There the derivative is that of one side.
     ///
     /// # Panics
     /// If the parts do not belong to one body.
-    #[must_use]
-    pub fn map_with_jacobian(
+    fn map_with_jacobian(
         &self,
         frame: &MotionFrame<'_>,
         point: Vec3,
@@ -112,9 +113,10 @@ impl MotionField {
         }
     }
 
-    /// Backward of [`MotionField::map`]: returns the derivative with respect to `point`, and for the volume kind adds to
-    /// `d_weights`, laid out like `WeightVolume::weights` ([`WeightVolume::softmax_backward`] takes them on to Δ). The surface
-    /// kind leaves `d_weights` alone; it may be empty. Dead points give 0 and add nothing.
+    /// Propagates the gradient of [`MotionField::map`]: returns the derivative with respect to
+    /// `point`, and for the volume kind adds to `d_weights`, laid out like `WeightVolume::weights`
+    /// ([`WeightVolume::softmax_backward`] takes them on to Δ). The surface kind leaves `d_weights`
+    /// alone; it may be empty. Dead points give 0 and add nothing.
     ///
     /// # Panics
     /// If a length does not fit.

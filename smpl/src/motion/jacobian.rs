@@ -1,4 +1,4 @@
-//! How x̂ and f change with the point.
+//! Derivatives of x̂ and f by the point.
 
 use glam::{Affine3A, Mat3, Mat3A, Vec3, Vec3A};
 
@@ -106,8 +106,9 @@ impl SurfaceMotion {
     }
 }
 
-/// Gradients of the barycentric coordinates of the nearest point with respect to the query: within a triangle those of
-/// the projection on its plane, on an edge those along it, at a corner 0. A triangle or edge without extent has none.
+/// Gradients of the barycentric coordinates of the nearest point with respect to the query: within
+/// a triangle those of the projection on its plane, on an edge those along it, at a corner 0. A
+/// triangle or edge without extent has none.
 fn barycentric_gradients(positions: [Vec3; 3], barycentric: [f32; 3]) -> [Vec3; 3] {
     let mut out = [Vec3::ZERO; 3];
     let within: Vec<usize> = (0..3).filter(|&k| barycentric[k] != 0.0).collect();

@@ -13,7 +13,7 @@ pub use field::{MotionField, MotionFrame, SurfacePoint};
 pub use surface::SurfaceMotion;
 pub use volume::{WeightVolume, WeightVolumeConfig};
 
-/// Where a point of the world lies in canonical space.
+/// A point of the world in canonical space.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct MotionSample {
     /// x̂, in the unshifted rest pose.

@@ -6,18 +6,19 @@ use rayon::prelude::*;
 use super::volume::{WeightVolume, WeightVolumeConfig};
 use crate::model::{BodyModel, Shaped};
 
-/// What the background keeps inside the body, so that learning can still raise it.
+/// Weight that the background keeps inside the body, so that learning can still raise it.
 const BACKGROUND_FLOOR: f32 = 1e-3;
 
 /// Bones with less than this at a sample of the diffused prior are switched off there.
 const DIFFUSED_CUT: f32 = 1e-3;
 
-/// The same for the Gaussian prior, whose tails matter at the joints.
+/// Weight that the background keeps of the Gaussian prior, whose tails matter at the joints.
 const GAUSSIAN_CUT: f32 = 1e-4;
 
-/// The margin is at least this part of a cell's diagonal. At 1 the surface would see no background at all, but limbs that
-/// hang beside the body would be within the body's margin: at 0.7, 32 samples and a walking pose the 90th percentile of
-/// |x̂ − rest| over the vertices is 27 mm instead of 57, for f ≥ 0.99 instead of 0.999 on the surface.
+/// The margin is at least this part of a cell's diagonal. At 1 the surface would see no background
+/// at all, but limbs that hang beside the body would be within the body's margin: at 0.7, 32
+/// samples and a walking pose the 90th percentile of |x̂ − rest| over the vertices is 27 mm instead
+/// of 57, for f ≥ 0.99 instead of 0.999 on the surface.
 const CELL_SHARE: f32 = 0.7;
 
 /// Sample positions of a volume.
@@ -37,8 +38,8 @@ impl Grid {
         assert!(!shaped.vertices.is_empty(), "weight volume: no vertices");
         let low = shaped.vertices.iter().copied().fold(Vec3::INFINITY, Vec3::min);
         let high = shaped.vertices.iter().copied().fold(Vec3::NEG_INFINITY, Vec3::max);
-        // The margin follows from the cell and the cell from the margin. At the coarsest resolutions they run away from
-        // each other, hence the fixed number of rounds.
+        // The margin follows from the cell and the cell from the margin. At the coarsest
+        // resolutions they run away from each other, hence the fixed number of rounds.
         let mut margin = config.margin;
         let mut pad = margin + config.falloff;
         for _ in 0..8 {
@@ -65,11 +66,12 @@ impl Grid {
 }
 
 impl WeightVolume {
-    /// The paper's prior: bone i, from joint i to each of its children (leaves: to twice the mean of their own vertices),
-    /// is an oriented Gaussian g_i; the background is 1 − min(Σ g, 1).
+    /// The paper's prior: bone i, from joint i to each of its children (leaves: to twice the mean
+    /// of their own vertices), is an oriented Gaussian g_i; the background is 1 − min(Σ g, 1).
     ///
-    /// Admitted weakness: with the default widths, Σ w falls to a few percent at knees and elbows, so that limbs come
-    /// apart there until Δ has filled the holes. [`WeightVolume::diffused`] has none.
+    /// Admitted weakness: with the default widths, Σ w falls to a few percent at knees and elbows,
+    /// so that limbs come apart there until Δ has filled the holes. [`WeightVolume::diffused`] has
+    /// none.
     ///
     /// # Panics
     /// If the resolution is below 2, or `shaped` is not of `model`.
@@ -109,9 +111,10 @@ impl WeightVolume {
         Self::from_prior(grid.n, grid.min, grid.max, &prior)
     }
 
-    /// The skinning weights of the canonical mesh, spread into the volume: every sample gets the mean of the weights of
-    /// the vertices about as near as the nearest one. Inside the body and up to the margin outside, f is 1 to within
-    /// 1 % in the canonical pose; beyond, the background takes over smoothly.
+    /// The skinning weights of the canonical mesh, spread into the volume: every sample gets the
+    /// mean of the weights of the vertices about as near as the nearest one. Inside the body and up
+    /// to the margin outside, f is 1 to within 1 % in the canonical pose; beyond, the background
+    /// takes over smoothly.
     ///
     /// Distances are to vertices, so edges should not be much longer than the margin.
     ///
@@ -186,7 +189,8 @@ impl Gaussian {
     }
 }
 
-/// Mean of the vertices, weighted by how much they belong to `joint`; the joint itself if none does.
+/// Mean of the vertices, weighted by how much they belong to `joint`; the joint itself if none
+/// does.
 fn own_centre(model: &BodyModel, shaped: &Shaped, joint: usize) -> Vec3 {
     let (mut sum, mut total) = (Vec3::ZERO, 0.0);
     for (v, &vertex) in shaped.vertices.iter().enumerate() {
@@ -238,7 +242,8 @@ impl Cloud {
     }
 }
 
-/// Adds the skinning weights of vertices near `x`, weighted by exp(−(d² − d_min²)/2h²) with h² = `width`.
+/// Adds the skinning weights of vertices near `x`, weighted by exp(−(d² − d_min²)/2h²) with h² =
+/// `width`.
 fn gather(model: &BodyModel, shaped: &Shaped, x: Vec3, nearest_squared: f32, width: f32, out: &mut [f32]) {
     for (v, vertex) in shaped.vertices.iter().enumerate() {
         let excess = (vertex.distance_squared(x) - nearest_squared) / (2.0 * width);
@@ -251,9 +256,9 @@ fn gather(model: &BodyModel, shaped: &Shaped, x: Vec3, nearest_squared: f32, wid
     }
 }
 
-/// Which samples are outside the body: those reached from the border without coming nearer to a vertex than the margin,
-/// and their surroundings. The shell that stops the flood is more than a cell thick, so it cannot leak through a mesh
-/// whose edges are shorter than that.
+/// Marks the samples outside the body: those reached from the border without coming nearer to a
+/// vertex than the margin, and their surroundings. The shell that stops the flood is more than a
+/// cell thick, so it cannot leak through a mesh whose edges are shorter than that.
 fn flood(grid: &Grid, nearest: &[f32]) -> Vec<bool> {
     let n = grid.n;
     let passable = |i: usize| nearest[i] > grid.margin * grid.margin;

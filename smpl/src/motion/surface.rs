@@ -8,13 +8,13 @@ use crate::pose::{Posed, blend};
 
 /// Motion field whose weights are those of the nearest point of the posed surface.
 ///
-/// The likelihood is 1 inside the body and outside up to `margin` from it, then falls with a continuous derivative to 0
-/// at `margin + falloff`.
+/// The likelihood is 1 inside the body and outside up to `margin` from it, then falls with a
+/// continuous derivative to 0 at `margin + falloff`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SurfaceMotion {
-    /// In the unit of the model.
+    /// Distance from the surface up to which f is 1, in the unit of the model.
     pub margin: f32,
-    /// In the unit of the model; 0 gives a step.
+    /// Length over which f falls to 0 beyond the margin, in the unit of the model; 0 gives a step.
     pub falloff: f32,
 }
 
@@ -26,17 +26,18 @@ impl Default for SurfaceMotion {
 }
 
 impl SurfaceMotion {
-    /// Blended bones with a determinant below this are replaced by the heaviest bone alone. Two rigid bones in equal parts
-    /// reach it at a relative turn of 154°.
+    /// Blended bones with a determinant below this are replaced by the heaviest bone alone. Two
+    /// rigid bones in equal parts reach it at a relative turn of 154°.
     pub const MIN_DETERMINANT: f32 = 0.05;
 
-    /// Maps `point`, whose nearest surface point lies on `face` at `barycentric` and is `signed_distance` away (outside
-    /// positive): x̂ = (Σ w_i A_i)⁻¹ x − B_P, with weights w and pose offset B_P interpolated on the face.
+    /// Maps `point`, whose nearest surface point lies on `face` at `barycentric` and is
+    /// `signed_distance` away (outside positive): x̂ = (Σ w_i A_i)⁻¹ x − B_P, with weights w and
+    /// pose offset B_P interpolated on the face.
     ///
     /// `None` (dead) where the likelihood is 0, and for anything not finite.
     ///
-    /// Weak spots: x̂ jumps where the nearest point does (the medial axis, so also between touching limbs), and where
-    /// a fold is so sharp that one bone takes over.
+    /// Weak spots: x̂ jumps where the nearest point does (the medial axis, so also between touching
+    /// limbs), and where a fold is so sharp that one bone takes over.
     ///
     /// # Panics
     /// If `face` is not a face of `model`, or `posed` is not of it.
@@ -82,7 +83,8 @@ impl SurfaceMotion {
         1.0 - s * s * (3.0 - 2.0 * s)
     }
 
-    /// Derivative of [`SurfaceMotion::likelihood`] with respect to the distance; 0 where that has none.
+    /// Derivative of [`SurfaceMotion::likelihood`] with respect to the distance; 0 where that has
+    /// none.
     #[must_use]
     pub fn likelihood_slope(&self, signed_distance: f32) -> f32 {
         let s = (signed_distance - self.margin) / self.falloff;

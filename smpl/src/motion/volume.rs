@@ -8,14 +8,16 @@ use super::MotionSample;
 /// Voxels a parallel task of the softmax.
 pub(super) const BLOCK: usize = 2048;
 
-/// How a [`WeightVolume`] is laid out and initialised. Lengths are in the unit of the model; defaults fit metres.
+/// Layout and initial values of a [`WeightVolume`]. Lengths are in the unit of the model; defaults
+/// fit metres.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct WeightVolumeConfig {
     /// Samples an axis, at least 2. 32 is the paper's.
     pub resolution: usize,
-    /// Diffused prior: the body takes everything up to this distance from the surface. It is raised to 0.7 of a cell's
-    /// diagonal where that is longer, so that interpolation at the surface sees hardly any background. The smaller, the
-    /// less do limbs close to each other disturb each other.
+    /// Diffused prior: the body takes everything up to this distance from the surface. It is raised
+    /// to 0.7 of a cell's diagonal where that is longer, so that interpolation at the surface sees
+    /// hardly any background. The smaller, the less do limbs close to each other disturb each
+    /// other.
     pub margin: f32,
     /// Diffused prior: the background takes over along this length beyond the margin.
     pub falloff: f32,
@@ -33,8 +35,9 @@ impl Default for WeightVolumeConfig {
 
 /// Motion field of learnable weights on a grid in canonical space.
 ///
-/// K + 1 channels, one a joint and the background last, on `resolution`³ samples that span `min` to `max` with samples on
-/// the faces of the box. Layout of every array: (K+1, n, n, n) for channel, z, y, x.
+/// K + 1 channels, one a joint and the background last, on `resolution`³ samples that span `min` to
+/// `max` with samples on the faces of the box. Layout of every array: (K+1, n, n, n) for channel,
+/// z, y, x.
 #[derive(Clone, Debug, PartialEq)]
 pub struct WeightVolume {
     /// Samples an axis, n.
@@ -55,8 +58,8 @@ pub struct WeightVolume {
     pub(super) support: Vec<Support>,
 }
 
-/// Box, in steps of the grid from its first sample and inclusive, outside which interpolated weights are 0. Empty where low is
-/// above high.
+/// Box, in steps of the grid from its first sample and inclusive, outside which interpolated
+/// weights are 0. Empty where low is above high.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Support {
     low: Vec3A,
@@ -74,7 +77,7 @@ pub(super) struct Cell {
 }
 
 impl WeightVolume {
-    /// From a prior, (K+1, n, n, n), whose channels sum to 1 at every sample.
+    /// Builds a volume from a prior, (K+1, n, n, n), whose channels sum to 1 at every sample.
     pub(super) fn from_prior(resolution: usize, min: Vec3, max: Vec3, prior: &[f32]) -> Self {
         let samples = resolution.pow(3);
         let channels = prior.len() / samples;
@@ -101,7 +104,8 @@ impl WeightVolume {
         let samples = self.resolution.pow(3);
         let (log_prior, delta) = (&self.log_prior, &self.delta);
         let logit = |i: usize| log_prior[i] + delta[i];
-        // Blocks of every channel, regrouped by block, so that a task owns one block of all channels.
+        // Blocks of every channel, regrouped by block, so that a task owns one block of all
+        // channels.
         let mut blocks: Vec<Vec<&mut [f32]>> = Vec::new();
         blocks.resize_with(samples.div_ceil(BLOCK), Vec::new);
         for channel in self.weights.chunks_exact_mut(samples) {
@@ -134,8 +138,9 @@ impl WeightVolume {
         });
     }
 
-    /// Maps `point` in the world: w_i = w^c_i(y_i) with y_i = `to_canonical`_i · x ([`crate::Posed::to_canonical`]),
-    /// x̂ = Σ w_i y_i / Σ w_i over the K bones, f = min(Σ w_i, 1). Trilinear; 0 outside the box.
+    /// Maps `point` in the world: w_i = w^c_i(y_i) with y_i = `to_canonical`_i · x
+    /// ([`crate::Posed::to_canonical`]), x̂ = Σ w_i y_i / Σ w_i over the K bones, f = min(Σ w_i,
+    /// 1). Trilinear; 0 outside the box.
     ///
     /// `None` (dead) where Σ w_i is below `threshold` or 0, and for anything not finite.
     ///
@@ -180,7 +185,8 @@ impl WeightVolume {
         [0, 1, row, row + 1, slice, slice + 1, slice + row, slice + row + 1].map(|o| first + o)
     }
 
-    /// The cell that holds `y`, if it is in the box and any of its corners in the support of `bone`.
+    /// The cell that holds `y`, if it is in the box and any of its corners in the support of
+    /// `bone`.
     #[inline(always)]
     pub(super) fn cell(&self, bone: usize, y: Vec3A) -> Option<Cell> {
         let n = self.resolution;

@@ -5,11 +5,12 @@ use glam::{Affine3A, Vec3, Vec3A};
 use super::volume::{Cell, WeightVolume};
 
 impl WeightVolume {
-    /// Backward of [`WeightVolume::map`] with respect to the softmaxed weights: ∂x̂/∂w_i = (y_i − x̂)/Σw, and
-    /// ∂f/∂w_i = 1 where Σ w < 1, else 0. Adds to `d_weights`, laid out like `weights`.
+    /// Propagates the gradient of [`WeightVolume::map`] to the softmaxed weights: ∂x̂/∂w_i = (y_i −
+    /// x̂)/Σw, and ∂f/∂w_i = 1 where Σ w < 1, else 0. Adds to `d_weights`, laid out like `weights`.
     ///
-    /// Nothing is added for a sample that is dead at any threshold. The gradient with respect to the point is that of
-    /// [`super::MotionField::map_backward`]; that with respect to the transforms is not computed.
+    /// Nothing is added for a sample that is dead at any threshold. The gradient with respect to
+    /// the point is that of [`super::MotionField::map_backward`]; that with respect to the
+    /// transforms is not computed.
     ///
     /// # Panics
     /// If a length does not fit.
@@ -67,7 +68,8 @@ impl WeightVolume {
         }
     }
 
-    /// Backward of [`WeightVolume::update`]: adds w_c (d_c − Σ_k w_k d_k) to `d_delta`. All three arrays share one layout.
+    /// Propagates the gradient of [`WeightVolume::update`]: adds w_c (d_c − Σ_k w_k d_k) to
+    /// `d_delta`. All three arrays share one layout.
     ///
     /// # Panics
     /// If a length does not fit.

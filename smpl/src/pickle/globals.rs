@@ -1,7 +1,8 @@
 //! The allowed globals and the types of arrays' elements, by their names.
 
+use super::joblib::WRAPPER;
 use super::reader::Step;
-use crate::array::ElementType;
+use crate::array::{ElementType, element_count};
 
 /// A global on the allow-list.
 #[derive(Clone, Copy)]
@@ -15,6 +16,10 @@ pub(super) enum Global {
     Object,
     Set,
     Bytes,
+    /// A dictionary, or what makes the entries that a `defaultdict` lacks.
+    Dict,
+    List,
+    DefaultDict,
     OrderedDict,
     Encode,
     /// `torch.Tensor` from storage, offset, extents and strides.
@@ -50,7 +55,11 @@ impl Global {
             ("__builtin__" | "builtins", "object") => Self::Object,
             ("__builtin__" | "builtins", "set" | "frozenset") => Self::Set,
             ("__builtin__" | "builtins", "bytes" | "bytearray") => Self::Bytes,
+            ("__builtin__" | "builtins", "dict") => Self::Dict,
+            ("__builtin__" | "builtins", "list") => Self::List,
+            ("collections", "defaultdict") => Self::DefaultDict,
             ("collections", "OrderedDict") => Self::OrderedDict,
+            ("joblib.numpy_pickle", "NumpyArrayWrapper") => Self::Class(WRAPPER),
             ("_codecs", "encode") => Self::Encode,
             ("chumpy.ch", "Ch") => Self::Class("chumpy.ch.Ch"),
             ("scipy.sparse.csc" | "scipy.sparse._csc", "csc_matrix") => Self::Class("scipy.sparse.csc_matrix"),
@@ -87,4 +96,22 @@ impl Dtype {
         };
         parsed.ok_or_else(|| format!("dtype {name:?} is not supported"))
     }
+
+    /// Bytes of an array as raw memory; `None` for objects, which have none.
+    pub(super) fn raw_bytes(self, shape: &[usize]) -> Step<Option<u64>> {
+        let size = match self {
+            Self::Number(element) => element.size(),
+            Self::ByteText(size) | Self::WideText { size, .. } => size,
+            Self::Object => return Ok(None),
+        };
+        let bytes = element_count(shape).and_then(|n| n.checked_mul(size as u128));
+        let bytes = bytes.and_then(|n| u64::try_from(n).ok());
+        bytes.map(Some).ok_or_else(|| format!("shape {shape:?}"))
+    }
+}
+
+/// How many elements an array has.
+pub(super) fn count(shape: &[usize]) -> Step<usize> {
+    let count = element_count(shape).and_then(|n| usize::try_from(n).ok());
+    count.ok_or_else(|| format!("shape {shape:?}"))
 }

@@ -1,13 +1,13 @@
-//! What the allowed globals construct, and how their state is set.
+//! The allowed globals: what they construct, and how their state is set.
 
 use std::borrow::Cow;
 
-use super::arena::{Arena, Id, Node};
-use super::globals::{Dtype, Global};
+use super::globals::{Dtype, Global, count};
+use super::joblib::WRAPPER;
+use super::machine::{Id, Machine, Node, grown};
 use super::reader::Step;
-use crate::array::element_count;
 
-impl<'a> Arena<'a> {
+impl<'a> Machine<'a> {
     /// Calls `global` with `arguments`.
     pub(super) fn construct(&mut self, global: Global, arguments: &[Id]) -> Step<Node<'a>> {
         let wrong = |what: &str| Err(format!("arguments of {what}"));
@@ -44,7 +44,10 @@ impl<'a> Arena<'a> {
             },
             (Global::Bytes, []) => Node::Bytes(Cow::Borrowed(&[])),
             (Global::Bytes, [raw]) => Node::Bytes(self.bytes(*raw)?),
-            (Global::OrderedDict, []) => Node::Dict(Vec::new()),
+            (Global::OrderedDict | Global::DefaultDict | Global::Dict, []) => Node::Dict(Vec::new()),
+            // What it makes entries from is not needed to read those that are there.
+            (Global::DefaultDict, [_]) => Node::Dict(Vec::new()),
+            (Global::List, []) => Node::List(Vec::new()),
             (Global::OrderedDict, [items]) => {
                 let Node::List(items) = &self.nodes[*items] else {
                     return wrong("OrderedDict");
@@ -70,9 +73,8 @@ impl<'a> Arena<'a> {
                 Node::Bytes(Cow::Owned(bytes))
             }
             (Global::RebuildTensor, [_, _, _, _, ..]) => {
-                let state = self.nodes.len();
                 self.spend(8 * arguments.len())?;
-                self.nodes.push(Node::Tuple(arguments.to_vec()));
+                let state = self.add(Node::Tuple(arguments.to_vec()))?;
                 Node::Object("torch.Tensor", Some(state))
             }
             (Global::RebuildParameter, [tensor, ..]) => match self.nodes[*tensor] {
@@ -110,6 +112,10 @@ impl<'a> Arena<'a> {
                 };
                 self.nodes[target] = Node::Dtype(dtype);
             }
+            (Node::Object(WRAPPER, _), Node::Dict(items)) => {
+                let items = items.clone();
+                self.nodes[target] = self.joblib_array(&items)?;
+            }
             (Node::Object(class, _), Node::Dict(_)) => {
                 self.nodes[target] = Node::Object(class, Some(state));
             }
@@ -121,64 +127,79 @@ impl<'a> Arena<'a> {
     }
 
     fn array(&mut self, dtype: Dtype, shape: Vec<usize>, fortran: bool, raw: Id) -> Step<Node<'a>> {
-        let count = element_count(&shape).and_then(|n| usize::try_from(n).ok());
-        let count = count.ok_or_else(|| format!("shape {shape:?}"))?;
-        let mismatch = |found: usize| format!("shape {shape:?} with {found} bytes or items of data");
+        let Dtype::Object = dtype else {
+            return match &self.nodes[raw] {
+                Node::Bytes(Cow::Borrowed(bytes)) | Node::ByteString(Cow::Borrowed(bytes)) => {
+                    let bytes = *bytes;
+                    self.raw_array(dtype, shape, fortran, bytes)
+                }
+                Node::Bytes(_) | Node::ByteString(_) => {
+                    let bytes = self.bytes(raw)?;
+                    self.raw_array(dtype, shape, fortran, &bytes)
+                }
+                _ => Err("data of an array".to_owned()),
+            };
+        };
+        if fortran && shape.len() > 1 {
+            // Objects in Fortran order do not occur in the formats this is for.
+            return Err("column-major array of objects".to_owned());
+        }
+        let count = count(&shape)?;
+        let items = match &self.nodes[raw] {
+            Node::List(items) if items.len() == count => items.clone(),
+            Node::List(items) => return Err(mismatch(&shape, items.len())),
+            // A scalar of object type holds the object itself.
+            _ if shape.is_empty() => vec![raw],
+            _ => return Err("data of an array".to_owned()),
+        };
+        self.spend(8 * items.len() + 8 * shape.len())?;
+        Ok(Node::Objects(Box::new((shape, items))))
+    }
+
+    /// An array from the bytes of its elements, which are not objects.
+    pub(super) fn raw_array(&mut self, dtype: Dtype, shape: Vec<usize>, fortran: bool, raw: &[u8]) -> Step<Node<'a>> {
+        let count = count(&shape)?;
+        self.spend(8 * shape.len())?;
         match dtype {
             Dtype::Number(element) => {
-                let length = match &self.nodes[raw] {
-                    Node::Bytes(b) | Node::ByteString(b) => b.len(),
-                    _ => return Err("data of an array".to_owned()),
-                };
-                self.spend(length / element.size() * 8)?;
-                let (Node::Bytes(bytes) | Node::ByteString(bytes)) = &self.nodes[raw] else {
-                    return Err("data of an array".to_owned());
-                };
-                let array = element.decode(bytes, &shape, fortran);
-                Ok(Node::Array(array.ok_or_else(|| mismatch(length))?))
+                // What is put in another order is there twice for a while.
+                let copies = if fortran { 2 } else { 1 };
+                let length = count.min(raw.len());
+                self.spend(length.saturating_mul(copies * element.size_in_memory()))?;
+                let array = element.decode(raw, &shape, fortran);
+                Ok(Node::Array(Box::new(array.ok_or_else(|| mismatch(&shape, raw.len()))?)))
             }
-            // Objects and text in Fortran order do not occur in the formats this is for.
-            _ if fortran && shape.len() > 1 => Err("column-major array of objects".to_owned()),
-            Dtype::Object => {
-                let items = match &self.nodes[raw] {
-                    Node::List(items) if items.len() == count => items.clone(),
-                    Node::List(items) => return Err(mismatch(items.len())),
-                    // A scalar of object type holds the object itself.
-                    _ if shape.is_empty() => vec![raw],
-                    _ => return Err("data of an array".to_owned()),
-                };
-                self.spend(8 * items.len())?;
-                Ok(Node::Objects(shape, items))
+            Dtype::Object => Err("data of an array".to_owned()),
+            Dtype::ByteText(_) | Dtype::WideText { .. } if fortran && shape.len() > 1 => {
+                Err("column-major array of text".to_owned())
             }
             Dtype::ByteText(size) | Dtype::WideText { size, .. } => {
-                let bytes = self.bytes(raw)?;
-                if count.checked_mul(size) != Some(bytes.len()) {
-                    return Err(mismatch(bytes.len()));
+                if count.checked_mul(size) != Some(raw.len()) {
+                    return Err(mismatch(&shape, raw.len()));
                 }
-                self.spend(bytes.len() + 64 * count)?;
+                self.spend(2 * raw.len() + count.saturating_mul(grown::<Id>()))?;
                 let mut items = Vec::with_capacity(count);
-                for item in bytes.chunks_exact(size) {
+                for item in raw.chunks_exact(size) {
                     let text = match dtype {
                         Dtype::WideText { big_endian, .. } => wide_text(item, big_endian)?,
                         _ => item.iter().copied().map(char::from).collect(),
                     };
-                    items.push(self.nodes.len());
                     let text = text.trim_end_matches('\0').to_owned();
-                    self.nodes.push(Node::Text(Cow::Owned(text)));
+                    items.push(self.add(Node::Text(Cow::Owned(text)))?);
                 }
-                Ok(Node::Objects(shape, items))
+                Ok(Node::Objects(Box::new((shape, items))))
             }
         }
     }
 
-    fn dtype(&self, id: Id) -> Step<Dtype> {
+    pub(super) fn dtype(&self, id: Id) -> Step<Dtype> {
         match &self.nodes[id] {
             Node::Dtype(dtype) => Ok(*dtype),
             _ => Err("array without a dtype".to_owned()),
         }
     }
 
-    fn shape(&self, id: Id) -> Step<Vec<usize>> {
+    pub(super) fn shape(&self, id: Id) -> Step<Vec<usize>> {
         let extent = |id: &Id| match self.nodes[*id] {
             Node::Int(n) => usize::try_from(n).ok(),
             _ => None,
@@ -192,7 +213,7 @@ impl<'a> Arena<'a> {
     }
 
     /// A short text: the name of a type or an order.
-    fn text(&self, id: Id) -> Step<Cow<'_, str>> {
+    pub(super) fn text(&self, id: Id) -> Step<Cow<'_, str>> {
         match &self.nodes[id] {
             Node::Text(text) if text.len() <= 64 => Ok(Cow::Borrowed(text)),
             Node::ByteString(bytes) | Node::Bytes(bytes) if bytes.len() <= 64 => {
@@ -212,6 +233,10 @@ impl<'a> Arena<'a> {
         self.spend(bytes.len())?;
         Ok(bytes)
     }
+}
+
+fn mismatch(shape: &[usize], found: usize) -> String {
+    format!("shape {shape:?} with {found} bytes or items of data")
 }
 
 fn wide_text(bytes: &[u8], big_endian: bool) -> Step<String> {

@@ -2,7 +2,8 @@
 
 use std::borrow::Cow;
 
-/// What an operation of the machine gives; the message is completed with file and offset at the outside.
+/// Result of an operation of the machine; the message is completed with file and offset at the
+/// outside.
 pub(super) type Step<T> = Result<T, String>;
 
 /// A cursor over the input.
@@ -61,7 +62,7 @@ impl<'a> Reader<'a> {
         Ok(&rest[..end])
     }
 
-    /// The same, as text.
+    /// The rest of the line as text.
     pub(super) fn line(&mut self) -> Step<&'a str> {
         std::str::from_utf8(self.line_bytes()?)
             .map(|line| line.trim_end_matches('\r'))

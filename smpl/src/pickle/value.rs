@@ -1,7 +1,10 @@
-//! Python's values as owned data, and what can be asked of one.
+//! Python values, as plain data.
 
 use crate::Error;
 use crate::array::{Data, NdArray};
+
+/// Most values of a sparse matrix made dense.
+const MAX_DENSE: usize = 1 << 25;
 
 /// Deepest nesting of containers in a [`Value`].
 pub const MAX_DEPTH: usize = 100;
@@ -51,9 +54,6 @@ pub enum Value {
         state: Box<Value>,
     },
 }
-
-/// Most values of a sparse matrix made dense.
-const MAX_DENSE: usize = 1 << 25;
 
 impl Value {
     /// Python's name of the type.

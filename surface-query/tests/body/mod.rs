@@ -1,4 +1,5 @@
-//! A mesh of realistic size for tests, benches and the example: the shared open body where it is at hand.
+//! A mesh of realistic size for tests, benches and the example: the shared open body where it is at
+//! hand.
 #![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
 
 use std::io::Read;
@@ -6,7 +7,8 @@ use std::io::Read;
 use glam::Vec3;
 use testkit::{TriMesh, mesh};
 
-/// The open body, 6890 vertices in metres; `None`, with the reason printed, where the file is not there.
+/// The open body, 6890 vertices in metres; `None`, with the reason printed, where the file is not
+/// there.
 pub fn open_body() -> Option<TriMesh> {
     let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../../shared/data/body/open_body.npz");
     let file = match std::fs::File::open(path) {

@@ -1,9 +1,10 @@
 const PRIMES: [u32; 4] = [1, 2_654_435_761, 805_459_861, 3_674_653_429];
 
-/// Row of a level's table that holds grid corner `corner` (D), for a level of `resolution` cells an axis.
+/// Row of a level's table that holds grid corner `corner` (D), for a level of `resolution` cells an
+/// axis.
 ///
-/// Dense, Σ c_j (N+1)^j, where the level's (N+1)^D corners fit 2^T rows; else the XOR of c_j · π_j in wrapping
-/// u32, modulo 2^T (Müller et al. 2022, eq. 4).
+/// Dense, Σ c_j (N+1)^j, where the level's (N+1)^D corners fit 2^T rows; else the XOR of c_j · π_j
+/// in wrapping u32, modulo 2^T (Müller et al. 2022, eq. 4).
 ///
 /// # Panics
 /// For more than 4 dimensions.
@@ -26,8 +27,8 @@ pub fn hash_index(corner: &[u32], resolution: u32, log2_table_size: u32) -> usiz
     (u128::from(hash) % rows) as usize
 }
 
-/// Multiresolution hash encoding: `points` (Q × `dims`, from 0 to 1; clamped, NaN as 0), `table` (L, 2^T, F)
-/// padded, one entry of `resolutions` a level; returns (Q, L·F), level by level.
+/// Multiresolution hash encoding: `points` (Q × `dims`, from 0 to 1; clamped, NaN as 0), `table`
+/// (L, 2^T, F) padded, one entry of `resolutions` a level; returns (Q, L·F), level by level.
 ///
 /// # Panics
 /// Where lengths do not fit each other.

@@ -14,7 +14,8 @@ fn closest_on_segment(a: DVec3, b: DVec3, q: DVec3) -> DVec3 {
     a + along * ((q - a).dot(along) / length_squared).clamp(0.0, 1.0)
 }
 
-/// Closest point of a triangle: the foot of the perpendicular if it falls inside, else the best of the edges.
+/// Closest point of a triangle: the foot of the perpendicular if it falls inside, else the best of
+/// the edges.
 fn closest_on_triangle([a, b, c]: [DVec3; 3], q: DVec3) -> DVec3 {
     let normal = (b - a).cross(c - a);
     if let Some(n) = normal.try_normalize() {
@@ -51,8 +52,8 @@ pub fn closest_point(vertices: &[Vec3], faces: &[[u32; 3]], q: Vec3) -> (u32, DV
     best.unwrap_or_else(|| panic!("closest_point: a mesh without faces"))
 }
 
-/// First face met by the ray `o + t d`, t ≥ 0, from either side, and its `t` (in units of `d`); ties by lower
-/// face. Rays in a triangle's plane miss it.
+/// First face met by the ray `o + t d`, t ≥ 0, from either side, and its `t` (in units of `d`);
+/// ties by lower face. Rays in a triangle's plane miss it.
 #[must_use]
 pub fn first_hit(vertices: &[Vec3], faces: &[[u32; 3]], o: Vec3, d: Vec3) -> Option<(u32, f64)> {
     let (o, d) = (o.as_dvec3(), d.as_dvec3());
@@ -75,8 +76,9 @@ pub fn first_hit(vertices: &[Vec3], faces: &[[u32; 3]], o: Vec3, d: Vec3) -> Opt
     first
 }
 
-/// Generalised winding number of the mesh about `q`: the sum of its faces' signed solid angles over 4π
-/// (van Oosterom and Strackee 1983). 1 inside a closed mesh wound outward, 0 outside, 0.5 on a smooth surface.
+/// Generalised winding number of the mesh about `q`: the sum of its faces' signed solid angles over
+/// 4π (van Oosterom and Strackee 1983). 1 inside a closed mesh wound outward, 0 outside, 0.5 on a
+/// smooth surface.
 #[must_use]
 pub fn winding_number(vertices: &[Vec3], faces: &[[u32; 3]], q: Vec3) -> f64 {
     let q = q.as_dvec3();

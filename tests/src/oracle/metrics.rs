@@ -1,4 +1,5 @@
-/// Peak signal-to-noise ratio in dB of values from 0 to 1, over all of them; infinite for equal inputs.
+/// Peak signal-to-noise ratio in dB of values from 0 to 1, over all of them; infinite for equal
+/// inputs.
 ///
 /// # Panics
 /// Where lengths differ.
@@ -11,9 +12,10 @@ pub fn psnr(a: &[f32], b: &[f32]) -> f64 {
 
 const WINDOW: isize = 7;
 
-/// SSIM of every pixel, channels averaged: `a`, `b` (H, W, 3) from 0 to 1, result (H, W). 7×7 uniform window,
-/// sample covariance, K1 0.01, K2 0.03, data range 1; beyond the border the image is mirrored with the edge
-/// sample repeated (Wang et al. 2004, as `skimage.metrics.structural_similarity` computes its full map).
+/// SSIM of every pixel, channels averaged: `a`, `b` (H, W, 3) from 0 to 1, result (H, W). 7×7
+/// uniform window, sample covariance, K1 0.01, K2 0.03, data range 1; beyond the border the image
+/// is mirrored with the edge sample repeated (Wang et al. 2004, as
+/// `skimage.metrics.structural_similarity` computes its full map).
 ///
 /// # Panics
 /// Where lengths are not 3·W·H.
@@ -98,8 +100,8 @@ mod tests {
     fn ssim_matches_scikit_image() {
         let (a, b) = (pattern(0), pattern(3));
         assert_abs_diff_eq!(ssim(&a, &a, 12, 10), 1.0, epsilon = 1e-12);
-        // scikit-image 0.26.0: structural_similarity(a, b, data_range=1, channel_axis=-1) of the same patterns,
-        // and the mean of its full map.
+        // scikit-image 0.26.0: structural_similarity(a, b, data_range=1, channel_axis=-1) of the
+        // same patterns, and the mean of its full map.
         assert!((ssim(&a, &b, 12, 10) + 0.434_589_531_787).abs() < 1e-6, "{}", ssim(&a, &b, 12, 10));
         let map = ssim_map(&a, &b, 12, 10);
         let mean = map.iter().sum::<f64>() / map.len() as f64;

@@ -1,7 +1,7 @@
 use glam::Vec3;
 
-/// The `k` points nearest to `q` with their distances: nearest first, ties by lower index; all points where
-/// there are fewer than `k`. A distance that is NaN sorts last.
+/// The `k` points nearest to `q` with their distances: nearest first, ties by lower index; all
+/// points where there are fewer than `k`. A distance that is NaN sorts last.
 #[must_use]
 pub fn knn(points: &[Vec3], q: Vec3, k: usize) -> Vec<(u32, f64)> {
     let mut all: Vec<(u32, f64)> =
@@ -11,8 +11,8 @@ pub fn knn(points: &[Vec3], q: Vec3, k: usize) -> Vec<(u32, f64)> {
     all
 }
 
-/// Farthest point sampling from point 0: `count` (at most N) distinct indices, each the point farthest from
-/// those before it, ties by lower index.
+/// Farthest point sampling from point 0: `count` (at most N) distinct indices, each the point
+/// farthest from those before it, ties by lower index.
 #[must_use]
 pub fn farthest_points(points: &[Vec3], count: usize) -> Vec<u32> {
     let mut chosen: Vec<u32> = Vec::new();
@@ -56,7 +56,8 @@ mod tests {
 
     #[test]
     fn farthest_points_on_a_line_halve_the_gaps() {
-        // 0, then 10, then 3 (gap 3), then 1 and 2 are both 1 from their neighbours: the lower index.
+        // 0, then 10, then 3 (gap 3), then 1 and 2 are both 1 from their neighbours: the lower
+        // index.
         assert_eq!(farthest_points(&line(), 4), [0, 4, 3, 1]);
     }
 

@@ -1,7 +1,8 @@
 use glam::{DVec3, Vec3};
 
-/// Alpha compositing of one ray, α_i = f_i (1 − exp(−σ_i δ_i)): colour over `background`, opacity, weights (S)
-/// and the lowest index of the largest α (`None` for no samples or all-zero α). All inputs are (S).
+/// Alpha compositing of one ray, α_i = f_i (1 − exp(−σ_i δ_i)): colour over `background`, opacity,
+/// weights (S) and the lowest index of the largest α (`None` for no samples or all-zero α). All
+/// inputs are (S).
 ///
 /// # Panics
 /// Where the slices differ in length.

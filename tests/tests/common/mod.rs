@@ -76,8 +76,8 @@ pub fn on_threads<T: Send>(threads: usize, work: impl FnOnce() -> T + Send) -> T
 
 /// Pixels whose centre's ray hits the posed prior.
 pub fn silhouette(scene: &Scene, frame: &PreparedFrame) -> Vec<bool> {
-    let mesh = RayMesh::new(&frame.posed.vertices, &scene.model.faces).unwrap();
-    let camera = &frame.camera;
+    let mesh = RayMesh::new(&frame.view.posed.vertices, &scene.body.model.faces).unwrap();
+    let camera = &frame.view.camera;
     let pixels = (0..camera.height).flat_map(|row| (0..camera.width).map(move |column| (row, column)));
     let rays = pixels.map(|(row, column)| camera.ray(column as f32 + 0.5, row as f32 + 0.5));
     rays.map(|ray| mesh.first_hit(ray.origin, ray.direction).is_some()).collect()

@@ -12,6 +12,7 @@ use visibility::Samples;
 use volrender::Camera;
 
 use crate::pictures;
+use crate::process::say;
 use crate::run::{RunConfig, use_threads};
 
 #[derive(Args)]
@@ -58,7 +59,7 @@ pub fn baked(arguments: &BakedArguments) -> Result<()> {
         })?;
         rows.push(row);
         let mean = |value: Option<f64>| value.map_or("–".to_owned(), |value| format!("{value:.3}"));
-        println!(
+        say!(
             "| {name} | {} | {} | {} | {} | {:.4} |",
             mean(scores.psnr_mask),
             mean(scores.psnr_hidden),
@@ -68,9 +69,7 @@ pub fn baked(arguments: &BakedArguments) -> Result<()> {
         );
         Ok(scores)
     };
-    println!(
-        "| | psnr_mask | psnr_hidden | ssim_mask | iou | s a picture |\n| --- | ---: | ---: | ---: | ---: | ---: |"
-    );
+    say!("| | psnr_mask | psnr_hidden | ssim_mask | iou | s a picture |\n| --- | ---: | ---: | ---: | ---: | ---: |");
     scored("field", &mut FieldRenderer::new(&model)?)?;
     let mut notes = Vec::new();
     for &shells in &arguments.shells {
@@ -94,7 +93,7 @@ pub fn baked(arguments: &BakedArguments) -> Result<()> {
         }
     }
     pictures::save(&pictures::sheet(&rows), &arguments.out.join("baked.png"))?;
-    println!("{}", notes.join("\n"));
+    say!("{}", notes.join("\n"));
     Ok(())
 }
 

@@ -10,16 +10,15 @@ use plotters::prelude::*;
 use plotters::style::text_anchor::{HPos, Pos, VPos};
 
 use super::scale::Scale;
+use crate::font::{FONT, LETTER, register_font};
+use crate::process::say;
 
 /// PNGs are drawn so much larger and reduced, for smooth edges.
 const OVERSAMPLING: i32 = 2;
-pub const FONT: &str = "sans-serif";
 /// Height of the title and of each legend row, and sizes of text, in pixels.
 const TITLE: i32 = 34;
 const ROW: i32 = 20;
 const SMALL: i32 = 11;
-/// Mean width of a letter as a share of its height.
-pub const LETTER: f64 = 0.56;
 
 /// Colours that are told apart by colour-blind people too (Okabe and Ito 2008).
 pub const COLORS: [RGBColor; 7] = [
@@ -79,12 +78,6 @@ pub struct Picture {
     pub panels: Vec<Panel>,
 }
 
-/// SVG text is measured, and PNG text drawn, with a font that comes along: systems may have none.
-pub fn register_font() -> Result<()> {
-    plotters::style::register_font(FONT, FontStyle::Normal, dejavu::sans::regular())
-        .map_err(|_| anyhow!("the font cannot be read"))
-}
-
 impl Picture {
     fn head(&self) -> i32 {
         TITLE + if self.legend.is_empty() { 0 } else { ROW }
@@ -109,7 +102,7 @@ impl Picture {
         self.draw(&BitMapBackend::with_buffer(&mut pixels, large).into_drawing_area(), OVERSAMPLING)?;
         let picture = RgbImage::from_raw(large.0, large.1, pixels).ok_or_else(|| anyhow!("picture of no size"))?;
         crate::pictures::save(&imageops::resize(&picture, size.0, size.1, FilterType::Triangle), &png)?;
-        println!("written: {}\nwritten: {}", svg.display(), png.display());
+        say!("written: {}\nwritten: {}", svg.display(), png.display());
         Ok([svg, png])
     }
 

@@ -5,7 +5,7 @@ use std::ops::{Add, Mul};
 
 use anyhow::{Result, ensure};
 use glam::{Quat, Vec3};
-use occnerf::capture::{Capture, DemoConfig, Frame, Pixels, Wrong, demo};
+use occnerf::capture::{Capture, DemoConfig, Frame, Perturbation, Pixels, demo};
 use serde::{Deserialize, Serialize};
 use smpl::{BodyModel, Placement, SparseRows};
 
@@ -50,7 +50,7 @@ impl Difficulty {
         }
         let mut capture = if self.shutter > 0.0 { self.exposed(&body)? } else { demo(&self.demo, &body)? };
         let mask_pixels = i32::try_from(self.erosion).map_or(i32::MIN, |pixels| -pixels);
-        Wrong { mask_pixels, ..Wrong::default() }.apply(&mut capture, &body)?;
+        Perturbation { mask_pixels, ..Perturbation::default() }.apply(&mut capture, &body)?;
         if self.facing_degrees < 180.0 {
             keep(&mut capture, |frame| facing(frame) <= self.facing_degrees);
             let degrees = self.facing_degrees;

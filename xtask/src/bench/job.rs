@@ -1,6 +1,6 @@
 //! One measured run: what it is, and what came of it.
 
-use std::io::{Read, Write};
+use std::io::{BufRead, Read, Write};
 use std::path::PathBuf;
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
@@ -16,6 +16,7 @@ use serde::{Deserialize, Serialize};
 use smpl::BodyModel;
 
 use super::difficulty::Difficulty;
+use crate::process::{Ending, Guard, say};
 use crate::run::peak_rss_bytes;
 use crate::source;
 
@@ -158,12 +159,17 @@ fn score(scene: &Scene, renderer: &mut dyn Renderer, outcome: &mut Outcome) -> R
     Ok(())
 }
 
-/// The child's part: a job on standard input, its outcome as one line on standard output.
+/// The child's part: a job as the first line of standard input, which stays open, its outcome as one line on standard output.
 pub fn serve() -> Result<()> {
     let mut text = String::new();
-    std::io::stdin().take(MAX_JOB_BYTES).read_to_string(&mut text).context("standard input")?;
+    std::io::stdin().lock().take(MAX_JOB_BYTES).read_line(&mut text).context("standard input")?;
     let job: Job = serde_json::from_str(&text).context("standard input is not a job")?;
-    println!("{}", serde_json::to_string(&measure(&job)?)?);
+    // Standard input ends when the sweep does, however that ends: nobody waits for the outcome then.
+    std::thread::spawn(|| {
+        let _ = std::io::copy(&mut std::io::stdin().lock(), &mut std::io::sink());
+        std::process::exit(1);
+    });
+    say!("{}", serde_json::to_string(&measure(&job)?)?);
     Ok(())
 }
 
@@ -171,7 +177,7 @@ pub fn serve() -> Result<()> {
 /// error, a panic, and a run longer than `limit` come back as [`Outcome::error`].
 ///
 /// # Errors
-/// Only where no process can be started.
+/// Where no process can be started; [`Ending::Stopped`] where a signal came.
 pub fn run(job: &Job, threads: Option<usize>, limit: Duration) -> Result<Outcome> {
     let program = std::env::current_exe().context("the path of this program")?;
     let mut command = Command::new(program);
@@ -181,16 +187,21 @@ pub fn run(job: &Job, threads: Option<usize>, limit: Duration) -> Result<Outcome
     }
     command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped());
     let mut child = command.spawn().context("cannot start a run")?;
-    let outcome = converse(&mut child, job, limit);
+    let guard = Guard::begin();
+    let outcome = converse(&mut child, job, limit, &guard);
     // Whatever happened, nothing is left running.
     if outcome.is_err() {
         let _ = child.kill();
         let _ = child.wait();
     }
+    if let Some(signal) = guard.signal() {
+        let after = "what has been run is in the log: the same command goes on".to_owned();
+        return Err(Ending::Stopped { signal, after }.into());
+    }
     Ok(outcome.unwrap_or_else(|error| Outcome { error: Some(format!("{error:#}")), ..Outcome::default() }))
 }
 
-fn converse(child: &mut Child, job: &Job, limit: Duration) -> Result<Outcome> {
+fn converse(child: &mut Child, job: &Job, limit: Duration, guard: &Guard) -> Result<Outcome> {
     let read = |mut pipe: Box<dyn Read + Send>| {
         std::thread::spawn(move || {
             let mut bytes = Vec::new();
@@ -201,12 +212,14 @@ fn converse(child: &mut Child, job: &Job, limit: Duration) -> Result<Outcome> {
     let (out, err) = (child.stdout.take().context("no output")?, child.stderr.take().context("no output")?);
     let (out, err) = (read(Box::new(out)), read(Box::new(err)));
     let mut input = child.stdin.take().context("no input")?;
-    input.write_all(serde_json::to_string(job)?.as_bytes()).context("handing over the job")?;
-    drop(input);
+    input.write_all((serde_json::to_string(job)? + "\n").as_bytes()).context("handing over the job")?;
     let start = Instant::now();
     let status = loop {
         if let Some(status) = child.try_wait()? {
             break status;
+        }
+        if guard.signal().is_some() {
+            bail!("stopped by a signal");
         }
         if start.elapsed() > limit {
             bail!("stopped after {:.0} s", limit.as_secs_f64());

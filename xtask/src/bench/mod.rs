@@ -24,7 +24,10 @@ use occnerf::capture::Layout;
 
 use self::job::Place;
 use self::runner::Bench;
-use crate::run::{use_threads, write};
+use crate::process::say;
+use crate::results::{self, Section};
+use crate::run::{check_threads, use_threads, write};
+use crate::shard::ShardArguments;
 use crate::source::{LoadArguments, Source};
 use crate::{source, train};
 
@@ -158,6 +161,11 @@ struct SittingArguments {
     /// Only draw what has been run
     #[arg(long)]
     draw: bool,
+    #[command(flatten)]
+    part: ShardArguments,
+    /// Make what is found a section of xtask/RESULTS.md
+    #[arg(long)]
+    publish: bool,
 }
 
 #[derive(Args)]
@@ -177,6 +185,9 @@ struct KernelArguments {
     /// Fewer queries
     #[arg(long)]
     quick: bool,
+    /// Make what is found a section of xtask/RESULTS.md
+    #[arg(long)]
+    publish: bool,
 }
 
 /// Runs the command.
@@ -186,12 +197,14 @@ pub fn bench(arguments: &BenchArguments) -> Result<()> {
         What::Pareto(arguments) => pareto(arguments),
         What::Capacity(arguments) => capacity_bench(arguments),
         What::Stability(arguments) => stability(arguments),
-        What::Kernels(arguments) => kernels::run(&arguments.out, arguments.quick),
+        What::Kernels(arguments) => kernels::run(&arguments.out, arguments.quick, arguments.publish),
         What::Cost(arguments) => {
             use_threads(arguments.sitting.threads)?;
+            let alone = arguments.sitting.part.shard.is_none();
+            anyhow::ensure!(alone, "bench cost measures one machine: it has no parts");
             let mut bench = arguments.sitting.open(&arguments.out)?;
             let text = cost::run(&mut bench, &arguments.out)?;
-            finish(&bench, &text, "cost.md")
+            finish(&bench, &arguments.sitting, &text, "cost")
         }
         What::Point { threads } => {
             use_threads(*threads)?;
@@ -202,9 +215,10 @@ pub fn bench(arguments: &BenchArguments) -> Result<()> {
 
 impl SittingArguments {
     fn open(&self, out: &Path) -> Result<Bench> {
-        let minutes = if self.draw { 0.0 } else { self.minutes.unwrap_or(1e6) };
+        let minutes = if self.draw || self.part.merge { 0.0 } else { self.minutes.unwrap_or(1e6) };
         anyhow::ensure!((0.0..=1e6).contains(&minutes), "--minutes {minutes}: expected 0 to 1000000");
-        Bench::open(out, self.threads, Duration::from_secs_f64(60.0 * minutes))
+        check_threads(self.threads)?;
+        Bench::open(out, self.threads, Duration::from_secs_f64(60.0 * minutes), self.part.shard)
     }
 }
 
@@ -279,13 +293,16 @@ fn pareto(arguments: &ParetoArguments) -> Result<()> {
     let mut text = String::new();
     for scene in &scenes {
         let lines = pareto::run(&on.sweep(scene, steps, *seed, *quick)?, &mut bench)?;
+        if !arguments.sitting.part.writes_tables() {
+            continue;
+        }
         let name = train::scene_name(Some(scene));
         pareto::charts(&name, &lines, &out.join(format!("pareto-{name}")))?;
         text.push_str(&format!("## {scene}\n\n{}\n", pareto::table(&lines)));
     }
-    finish(&bench, &text, "pareto.md")?;
-    if !arguments.sitting.draw {
-        kernels::run(out, *quick)?;
+    finish(&bench, &arguments.sitting, &text, "pareto")?;
+    if !arguments.sitting.draw && arguments.sitting.part.writes_tables() {
+        kernels::run(out, *quick, arguments.sitting.publish)?;
     }
     Ok(())
 }
@@ -299,11 +316,14 @@ fn capacity_bench(arguments: &CapacityArguments) -> Result<()> {
     for scene in &scenes {
         let points = capacity::points(&on.sweep(scene, steps, *seed, *quick)?, &on.read(scene)?, *paper)?;
         let lines = capacity::run(points, &mut bench)?;
+        if !arguments.sitting.part.writes_tables() {
+            continue;
+        }
         let name = train::scene_name(Some(scene));
         capacity::chart(&name, &lines, &out.join(format!("capacity-{name}")))?;
         text.push_str(&format!("## {scene}\n\n{}\n", capacity::table(&lines)));
     }
-    finish(&bench, &text, "capacity.md")
+    finish(&bench, &arguments.sitting, &text, "capacity")
 }
 
 fn stability(arguments: &StabilityArguments) -> Result<()> {
@@ -328,24 +348,45 @@ fn stability(arguments: &StabilityArguments) -> Result<()> {
     for (scene, axes) in of_scenes {
         let sweep = stability::Sweep { axes, steps, quick: *quick, max_runs: *max_runs };
         let lines = sweep.run(&mut bench)?;
+        if !arguments.sitting.part.writes_tables() {
+            continue;
+        }
         let name = train::scene_name(Some(&scene));
         stability::charts(&name, &sweep.axes, &lines, &out.join(format!("stability-{name}")))?;
         let (table, finite) = (stability::table(&sweep.axes, &lines), stability::finite(&lines));
         text.push_str(&format!("## {scene}\n\n{table}\n{finite}\n\n"));
     }
-    finish(&bench, &text, "stability.md")
+    finish(&bench, &arguments.sitting, &text, "stability")
 }
 
 /// Prints and writes the table, and says what there is.
-fn finish(bench: &Bench, text: &str, name: &str) -> Result<()> {
-    let path = bench.path().with_file_name(name);
-    write(&path, text)?;
-    println!("\n{text}");
-    println!("written: {}\nwritten: {}", bench.path().display(), path.display());
+fn finish(bench: &Bench, sitting: &SittingArguments, text: &str, name: &str) -> Result<()> {
     let (begun, left) = bench.counts();
-    println!("{begun} runs in {:.1} minutes", bench.seconds() / 60.0);
+    if bench.is_part() {
+        say!(
+            "{begun} runs in {:.1} minutes; {left} are of other parts, or left; --merge draws",
+            bench.seconds() / 60.0
+        );
+        return Ok(());
+    }
+    let path = bench.path().with_file_name(format!("{name}.md"));
+    write(&path, text)?;
+    say!("\n{text}");
+    say!("written: {}\nwritten: {}", bench.path().display(), path.display());
+    say!("{begun} runs in {:.1} minutes", bench.seconds() / 60.0);
     if left > 0 {
-        println!("{left} points are left: the same command goes on with them");
+        say!("{left} points are left: the same command goes on with them");
+    }
+    if sitting.publish {
+        let title = match name {
+            "pareto" => "Speed against accuracy",
+            "capacity" => "Parameters against accuracy",
+            "stability" => "Where methods break",
+            _ => "What a step costs",
+        };
+        let stem = if name == "cost" { "growth" } else { name };
+        let charts = results::charts(bench.path().parent().unwrap_or(Path::new(".")), stem)?;
+        results::publish(&Section { name, title, body: text, charts: &charts })?;
     }
     Ok(())
 }

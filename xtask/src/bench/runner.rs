@@ -1,5 +1,6 @@
 //! Runs points one after another and remembers them: one JSON line a point in bench.jsonl.
 
+use std::fs::File;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
@@ -8,6 +9,8 @@ use anyhow::{Context, Result, bail};
 use serde::{Deserialize, Serialize};
 
 use super::job::{self, Job, Outcome};
+use crate::process::{Lock, say, unwritten};
+use crate::shard::Shard;
 
 /// Name of the log.
 pub const LOG: &str = "bench.jsonl";
@@ -91,9 +94,41 @@ pub fn read(path: &Path) -> Result<Vec<Line>> {
     Ok(lines)
 }
 
+/// Reads the logs of a sweep: its own, and those of its parts.
+fn read_all(directory: &Path) -> Result<Vec<Line>> {
+    let entries = std::fs::read_dir(directory).with_context(|| directory.display().to_string())?;
+    let of_part = |name: &str| name.starts_with("bench-") && name.ends_with(".jsonl");
+    let mut paths: Vec<PathBuf> = entries
+        .filter_map(|entry| Some(entry.ok()?.path()))
+        .filter(|path| path.file_name().and_then(|n| n.to_str()).is_some_and(|name| name == LOG || of_part(name)))
+        .collect();
+    paths.sort();
+    let mut lines: Vec<Line> = Vec::new();
+    for path in paths {
+        for line in read(&path)? {
+            // A part that failed does not replace one that did not.
+            if line.outcome.error.is_none() || lines.iter().all(|old| !line.replaces(old)) {
+                lines.retain(|old| !line.replaces(old));
+                lines.push(line);
+            }
+        }
+    }
+    Ok(lines)
+}
+
+/// What tells a point from all others, the same in every part.
+fn name(point: &Point) -> String {
+    let config = &point.job.config;
+    let place = point.job.place.name();
+    format!("{} {place} {} {} {} {}", point.bench, point.factor, point.name, config.method.name(), config.seed)
+}
+
 /// A sweep in progress.
 pub struct Bench {
     path: PathBuf,
+    file: File,
+    _lock: Lock,
+    shard: Option<Shard>,
     lines: Vec<Line>,
     threads: Option<usize>,
     start: Instant,
@@ -104,15 +139,27 @@ pub struct Bench {
 }
 
 impl Bench {
-    /// Goes on in `directory`, which is made if need be.
-    pub fn open(directory: &Path, threads: Option<usize>, budget: Duration) -> Result<Self> {
-        std::fs::create_dir_all(directory).with_context(|| directory.display().to_string())?;
-        let path = directory.join(LOG);
-        let lines = if path.exists() { read(&path)? } else { Vec::new() };
+    /// Goes on in `directory`, which is made if need be. A part of a sweep has a log and a lock of its own, and reads
+    /// those of the others.
+    pub fn open(directory: &Path, threads: Option<usize>, budget: Duration, shard: Option<Shard>) -> Result<Self> {
+        crate::run::make_directory(directory)?;
+        let path = directory.join(shard.map_or(LOG.to_owned(), |shard| format!("bench-{}.jsonl", shard.name())));
+        let lock = Lock::take(&match shard {
+            None => directory.to_owned(),
+            Some(shard) => {
+                let own = directory.join("parts").join(shard.name());
+                crate::run::make_directory(&own)?;
+                own
+            }
+        })?;
+        let own = if path.exists() { read(&path)? } else { Vec::new() };
         // Written anew, so that a line that was cut off does not spoil the next.
-        let text: Vec<String> = lines.iter().map(serde_json::to_string).collect::<Result<_, _>>()?;
+        let text: Vec<String> = own.iter().map(serde_json::to_string).collect::<Result<_, _>>()?;
         crate::run::write(&path, &text.iter().map(|l| format!("{l}\n")).collect::<String>())?;
-        Ok(Self { path, lines, threads, start: Instant::now(), budget, begun: 0, left: 0 })
+        let file = File::options().append(true).open(&path).map_err(unwritten(&path))?;
+        let lines = read_all(directory)?;
+        let start = Instant::now();
+        Ok(Self { path, file, _lock: lock, shard, lines, threads, start, budget, begun: 0, left: 0 })
     }
 
     /// Runs a point, unless the log has it with the very same job and no error; `None` when time is up.
@@ -120,12 +167,13 @@ impl Bench {
         let done = self.lines.iter().find(|l| l.point.job == point.job && l.outcome.error.is_none());
         if let Some(done) = done {
             let line = Line { point, outcome: done.outcome.clone() };
-            if !self.lines.contains(&line) {
+            if !self.lines.contains(&line) && self.shard.is_none() {
                 self.add(line.clone())?;
             }
             return Ok(Some(line));
         }
-        if self.start.elapsed() >= self.budget {
+        let others = self.shard.is_some_and(|shard| !shard.has_name(&name(&point)));
+        if others || self.start.elapsed() >= self.budget {
             self.left += 1;
             return Ok(None);
         }
@@ -133,16 +181,27 @@ impl Bench {
         let outcome = job::run(&point.job, self.threads, LIMIT)?;
         let line = Line { point, outcome };
         self.add(line.clone())?;
-        println!("{}", summary(&line));
+        say!("{}", summary(&line));
         Ok(Some(line))
     }
 
     fn add(&mut self, line: Line) -> Result<()> {
-        let mut file = std::fs::File::options().create(true).append(true).open(&self.path)?;
-        writeln!(file, "{}", serde_json::to_string(&line)?).with_context(|| self.path.display().to_string())?;
+        let text = serde_json::to_string(&line)? + "\n";
+        let length = self.file.metadata().map(|m| m.len());
+        let written = self.file.write_all(text.as_bytes()).and_then(|()| self.file.sync_data());
+        if let (Err(_), Ok(length)) = (&written, length) {
+            // No half line stays for others to read.
+            let _ = self.file.set_len(length);
+        }
+        written.map_err(unwritten(&self.path))?;
         self.lines.retain(|old| !line.replaces(old));
         self.lines.push(line);
         Ok(())
+    }
+
+    /// Whether this is one of several parts, so that there is nothing to draw yet.
+    pub fn is_part(&self) -> bool {
+        self.shard.is_some()
     }
 
     /// The log's path.
@@ -228,9 +287,11 @@ pub mod tests {
         let (a, b) = (serde_json::to_string(&a).unwrap(), serde_json::to_string(&b).unwrap());
         std::fs::write(&path, format!("{a}\n{}", &b[..b.len() / 2])).unwrap();
         assert_eq!(read(&path).unwrap().len(), 1);
-        let bench = Bench::open(&folder, None, Duration::ZERO).unwrap();
+        let bench = Bench::open(&folder, None, Duration::ZERO, None).unwrap();
         assert_eq!(bench.lines.len(), 1);
+        assert!(Bench::open(&folder, None, Duration::ZERO, None).is_err(), "another process has it");
         assert_eq!(std::fs::read_to_string(bench.path()).unwrap(), format!("{a}\n"));
+        drop(bench);
         std::fs::write(&path, format!("{a}\nnot json\n{b}\n")).unwrap();
         let message = read(&path).unwrap_err().to_string();
         assert!(message.contains(LOG) && message.contains("line 2"), "{message}");
@@ -238,10 +299,30 @@ pub mod tests {
     }
 
     #[test]
+    fn parts_share_points_out_and_read_each_others_logs() {
+        let folder = folder("parts");
+        let shards = ["1/2", "2/2"].map(|text| text.parse::<Shard>().unwrap());
+        let lines: Vec<Line> = (0..9).map(|i| line(&format!("p{i}"), "k", Kind::Change, 20.0, 3.0)).collect();
+        for shard in shards {
+            let mut bench = Bench::open(&folder, None, Duration::ZERO, Some(shard)).unwrap();
+            let own: Vec<&Line> = lines.iter().filter(|l| shard.has_name(&name(&l.point))).collect();
+            assert!((1..9).contains(&own.len()));
+            own.into_iter().for_each(|line| bench.add(line.clone()).unwrap());
+            assert!(Bench::open(&folder, None, Duration::ZERO, Some(shard)).is_err(), "its twin runs");
+        }
+        let mut whole = Bench::open(&folder, None, Duration::ZERO, None).unwrap();
+        for line in &lines {
+            assert_eq!(whole.run(line.point.clone()).unwrap().as_ref(), Some(line));
+        }
+        assert_eq!(whole.counts(), (0, 0));
+        std::fs::remove_dir_all(&folder).unwrap();
+    }
+
+    #[test]
     fn a_finished_point_is_not_run_again_and_its_later_line_holds() {
         let folder = folder("again");
         let old = line("a", "k", Kind::Change, 20.0, 3.0);
-        let mut bench = Bench::open(&folder, None, Duration::ZERO).unwrap();
+        let mut bench = Bench::open(&folder, None, Duration::ZERO, None).unwrap();
         bench.add(old.clone()).unwrap();
         assert_eq!(bench.run(old.point.clone()).unwrap().unwrap(), old);
         // Other settings are another run, for which there is no time here.

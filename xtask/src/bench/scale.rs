@@ -6,6 +6,10 @@ use plotters::coord::ranged1d::{KeyPointHint, NoDefaultFormatting, Ranged, Value
 
 /// Share of its extent by which a linear or logarithmic axis reaches beyond its values.
 const ROOM: f64 = 0.06;
+/// Of values that have a place.
+const LARGEST: f64 = 1e100;
+/// Decades of an axis that all have a tick.
+const MOST_DECADES: f64 = 12.0;
 
 /// From values to places.
 #[derive(Clone, Debug, PartialEq)]
@@ -17,9 +21,9 @@ pub enum Scale {
 }
 
 impl Scale {
-    /// A scale that shows all of `values` that it can: finite ones, above 0 on a logarithmic scale.
+    /// A scale that shows all of `values` that it can: those up to 1e100 either way, above 1e-100 on a logarithmic scale.
     pub fn around(values: impl Iterator<Item = f64>, logarithmic: bool) -> Self {
-        let values = values.filter(|v| v.is_finite() && (!logarithmic || *v > 0.0));
+        let values = values.filter(|v| fits(*v, logarithmic));
         let place = |v: f64| if logarithmic { v.ln() } else { v };
         let (low, high) = values.map(place).fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), v| (a.min(v), b.max(v)));
         let (low, high) = if low <= high { (low, high) } else { (0.0, 1.0) };
@@ -31,7 +35,7 @@ impl Scale {
 
     /// Whether a value has a place on it.
     pub fn shows(&self, value: f64) -> bool {
-        value.is_finite() && (!matches!(self, Self::Logarithmic(_)) || value > 0.0)
+        fits(value, matches!(self, Self::Logarithmic(_)))
     }
 
     /// 0 at the low end, 1 at the high end.
@@ -64,11 +68,17 @@ impl Scale {
                     _ => &[1.0],
                 };
                 let powers = (r.start.log10().floor() as i32)..=(r.end.log10().ceil() as i32);
+                let powers = powers.step_by((decades / MOST_DECADES).ceil().max(1.0) as usize);
                 let all = powers.flat_map(|p| digits.iter().map(move |d| d * 10f64.powi(p)));
                 all.filter(|v| r.contains(v)).collect()
             }
         }
     }
+}
+
+/// Whether there is a place for a value: sums and powers of what has one stay finite.
+fn fits(value: f64, logarithmic: bool) -> bool {
+    value.abs() <= LARGEST && (!logarithmic || value >= 1.0 / LARGEST)
 }
 
 impl Ranged for Scale {
@@ -105,6 +115,9 @@ pub fn number(value: f64) -> String {
     if value == 0.0 || !value.is_finite() {
         return value.abs().to_string();
     }
+    if !(1e-9..1e15).contains(&value.abs()) {
+        return format!("{value:.3e}");
+    }
     let digits = (3 - value.abs().log10().floor() as i32).clamp(0, 12) as usize;
     let text = format!("{value:.digits$}");
     if text.contains('.') { text.trim_end_matches('0').trim_end_matches('.').to_owned() } else { text }
@@ -120,6 +133,22 @@ mod tests {
     fn numbers_are_short() {
         let written = [0.0, 0.1 + 0.2, 17.5, 1200.0, 1e-5, -2.25].map(number);
         assert_eq!(written, ["0", "0.3", "17.5", "1200", "0.00001", "-2.25"]);
+    }
+
+    #[test]
+    fn losses_of_a_training_that_blew_up_are_drawn_in_no_time() {
+        let start = std::time::Instant::now();
+        for values in [&[1e308, 1e-300, 1.0][..], &[1e99, 1e-99], &[f64::MAX, f64::MIN], &[5e-324], &[1e100, -1e100]] {
+            for logarithmic in [false, true] {
+                let scale = Scale::around(values.iter().copied(), logarithmic);
+                let ticks = scale.ticks();
+                assert!(ticks.len() <= 20, "{values:?}: {ticks:?}");
+                let places = values.iter().filter(|v| scale.shows(**v)).map(|v| scale.share(*v));
+                places.for_each(|place| assert!((0.0..=1.0).contains(&place), "{values:?}: {place}"));
+                assert!(ticks.iter().all(|tick| number(*tick).len() < 20));
+            }
+        }
+        assert!(start.elapsed().as_secs() < 1);
     }
 
     proptest! {

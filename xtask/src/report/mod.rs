@@ -12,9 +12,11 @@ use occnerf::{Capacity, Choice, Pruned};
 
 use self::curves::{Log, curves};
 use self::page::Page;
+pub use self::page::escape;
 use self::viewer::{Views, viewers};
 use crate::bench;
 use crate::capacity;
+use crate::process::say;
 use crate::run::{self, LOG, METRICS, Metrics, RunConfig};
 use crate::table;
 
@@ -62,7 +64,7 @@ pub fn report(arguments: &ReportArguments) -> Result<()> {
         (None, several) => several[0].parent().unwrap_or(Path::new("")).join("report.html"),
     };
     run::write(&out, &page.finish(&title))?;
-    println!("written: {}", out.display());
+    say!("written: {}", out.display());
     Ok(())
 }
 

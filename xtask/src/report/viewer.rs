@@ -9,9 +9,12 @@ use base64::engine::general_purpose::STANDARD;
 use image::{ImageFormat, RgbImage};
 
 use crate::pictures;
+use crate::process::note;
 
 /// Views of a viewer at most.
 const MOST: usize = 15;
+/// Pixels of a sheet that is taken apart; more than any that is written now.
+const MAX_PIXELS: u64 = pictures::MAX_SHEET_PIXELS + pictures::MAX_SHEET_PIXELS / 8;
 
 /// Truth and results of some unseen views, as `eval` draws them side by side.
 pub struct Views {
@@ -23,6 +26,11 @@ impl Views {
     /// Takes a sheet of pairs apart; none if there is no such file.
     pub fn read(path: &Path) -> Result<Option<Self>> {
         if !path.exists() {
+            return Ok(None);
+        }
+        let (width, height) = image::image_dimensions(path).with_context(|| path.display().to_string())?;
+        if u64::from(width) * u64::from(height) > MAX_PIXELS {
+            note!("warning: {}: {width}×{height} pixels are too many for the page", path.display());
             return Ok(None);
         }
         let sheet = image::open(path).with_context(|| path.display().to_string())?.into_rgb8();

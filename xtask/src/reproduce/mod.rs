@@ -4,18 +4,25 @@ mod plan;
 mod rows;
 mod summary;
 
+use std::cell::{Cell, RefCell};
 use std::path::{Path, PathBuf};
 
-use anyhow::{Result, ensure};
+use anyhow::{Result, bail, ensure};
 use clap::Args;
-use occnerf::capture::{LoadOptions, Wrong};
+use occnerf::capture::{LoadOptions, Perturbation};
 use occnerf::{Lpips, Preset};
 
 use crate::eval::{load_lpips, network_name};
-use crate::run::{self, RunConfig};
-use crate::settings::PresetName;
+use crate::list::unique_name;
+use crate::optimise::SavingArguments;
+use crate::process::say;
+use crate::process::{Ending, Lock};
+use crate::results::{self, Section};
+use crate::run::{self, Metrics, RunConfig, make_directory};
+use crate::settings;
+use crate::shard::ShardArguments;
 use crate::source::{self, LoadArguments, Source};
-use crate::train::{run_unless_finished, scene_name};
+use crate::train::{finished, run_unless_finished};
 use plan::{Plan, Request};
 use rows::{ROWS, Row};
 use summary::Summary;
@@ -39,8 +46,8 @@ pub struct ReproduceArguments {
     #[arg(long, default_value_t = 3, value_name = "N", value_parser = clap::value_parser!(u64).range(1..=100))]
     seeds: u64,
     /// Settings that every row starts from
-    #[arg(long, default_value = "fast")]
-    preset: PresetName,
+    #[arg(long, default_value = "fast", value_parser = settings::preset())]
+    preset: Preset,
     /// Steps of a row, in place of a budget
     #[arg(long)]
     steps: Option<u64>,
@@ -53,24 +60,31 @@ pub struct ReproduceArguments {
     /// Rows to leave out, comma separated, by the names of the table
     #[arg(long, value_delimiter = ',', value_name = "ROW")]
     without: Vec<String>,
+    #[command(flatten)]
+    saving: SavingArguments,
+    #[command(flatten)]
+    part: ShardArguments,
     /// How much wrong poses, shapes and masks cost: the main methods at each, one table
     #[arg(long)]
     robustness: bool,
+    /// Make the tables a section of xtask/RESULTS.md, and of the first scene the table of README
+    #[arg(long)]
+    publish: bool,
 }
 
 /// A prior made wrong, and its directory.
-const LEVELS: [(&str, Wrong); 9] = {
-    let none = Wrong { pose_degrees: 0.0, shape: 0.0, mask_pixels: 0 };
+const LEVELS: [(&str, Perturbation); 9] = {
+    let none = Perturbation { pose_degrees: 0.0, shape: 0.0, mask_pixels: 0 };
     [
         ("as-it-is", none),
-        ("pose-2", Wrong { pose_degrees: 2.0, ..none }),
-        ("pose-5", Wrong { pose_degrees: 5.0, ..none }),
-        ("pose-10", Wrong { pose_degrees: 10.0, ..none }),
-        ("shape-1", Wrong { shape: 1.0, ..none }),
-        ("shape-2", Wrong { shape: 2.0, ..none }),
-        ("mask-minus-3", Wrong { mask_pixels: -3, ..none }),
-        ("mask-minus-1", Wrong { mask_pixels: -1, ..none }),
-        ("mask-plus-3", Wrong { mask_pixels: 3, ..none }),
+        ("pose-2", Perturbation { pose_degrees: 2.0, ..none }),
+        ("pose-5", Perturbation { pose_degrees: 5.0, ..none }),
+        ("pose-10", Perturbation { pose_degrees: 10.0, ..none }),
+        ("shape-1", Perturbation { shape: 1.0, ..none }),
+        ("shape-2", Perturbation { shape: 2.0, ..none }),
+        ("mask-minus-3", Perturbation { mask_pixels: -3, ..none }),
+        ("mask-minus-1", Perturbation { mask_pixels: -1, ..none }),
+        ("mask-plus-3", Perturbation { mask_pixels: 3, ..none }),
     ]
 };
 /// The methods themselves, each by its best pixel rule, and the published baseline.
@@ -87,26 +101,45 @@ pub fn reproduce(arguments: &ReproduceArguments) -> Result<()> {
     let demo = [source::DEMO.to_owned()];
     let scenes = if arguments.scenes.is_empty() { &demo[..] } else { &arguments.scenes };
     let minutes = arguments.budget / scenes.len() as f64;
+    let runs = Runs::default();
+    let rows = arguments.rows(|row| !arguments.robustness || MAIN.contains(&row.name));
+    let levels = if arguments.robustness { LEVELS.len() } else { 1 };
+    let each = levels * rows.iter().map(|row| row.runs(arguments.seeds) as usize).sum::<usize>();
     for (index, scene) in scenes.iter().enumerate() {
-        println!("scene {} of {}: {scene}", index + 1, scenes.len());
-        let directory = arguments.out.join(directory_name(scenes, index));
-        let experiment = Experiment { arguments, lpips: lpips.as_ref(), scene, minutes };
+        // Of many jobs most have nothing to do with a scene, and need not load it.
+        let first = runs.count.get();
+        if arguments.part.shard.is_some_and(|shard| !(first..first + each).any(|run| shard.has(run))) {
+            runs.count.set(first + each);
+            continue;
+        }
+        say!("scene {} of {}: {scene}", index + 1, scenes.len());
+        let directory = arguments.out.join(unique_name(scenes, index));
+        let experiment = Experiment { arguments, lpips: lpips.as_ref(), scene, minutes, runs: &runs };
         if arguments.robustness {
             experiment.robustness(&directory.join("robustness"))?;
         } else {
             experiment.table(&directory)?;
         }
     }
-    Ok(())
+    let missing = runs.missing.into_inner();
+    match missing.first() {
+        Some(first) => {
+            bail!(
+                "{} of {} runs have no scores yet, such as {first}: run their parts again",
+                missing.len(),
+                runs.count.get()
+            )
+        }
+        None => Ok(()),
+    }
 }
 
-/// The scene's own name, numbered where another scene before it has the same.
-fn directory_name(scenes: &[String], index: usize) -> String {
-    let name = |i: usize| scene_name(Some(&scenes[i]));
-    match (0..index).filter(|&i| name(i) == name(index)).count() {
-        0 => name(index),
-        earlier => format!("{}-{}", name(index), earlier + 1),
-    }
+/// Runs met so far, over all scenes.
+#[derive(Default)]
+struct Runs {
+    count: Cell<usize>,
+    /// Those that a merge has found without scores.
+    missing: RefCell<Vec<String>>,
 }
 
 /// What is asked for one scene.
@@ -116,11 +149,12 @@ struct Experiment<'a> {
     scene: &'a str,
     /// That everything may take.
     minutes: f64,
+    runs: &'a Runs,
 }
 
 impl Experiment<'_> {
     fn plan(&self, directory: &Path, source: &Source, rows: &[&Row], minutes: f64) -> Result<Plan> {
-        let preset: Preset = self.arguments.preset.into();
+        let preset: Preset = self.arguments.preset;
         let request = Request {
             preset: preset.name().to_owned(),
             seeds: self.arguments.seeds,
@@ -130,7 +164,15 @@ impl Experiment<'_> {
             perceptual_weights: self.arguments.perceptual_weights.clone().unwrap_or_default(),
             lpips: network_name(self.lpips),
         };
-        Plan::read_or_make(directory, source, rows, request, preset, self.arguments.steps, self.lpips)
+        // The first of several jobs makes it, and the others wait.
+        let _lock = Lock::wait(directory)?;
+        match Plan::read(directory, &request, self.arguments.steps)? {
+            Some(plan) => Ok(plan),
+            None if self.arguments.part.merge => {
+                bail!("{}: no part has begun with these arguments", directory.display())
+            }
+            None => Plan::make(directory, source, rows, request, preset, self.arguments.steps, self.lpips),
+        }
     }
 
     fn load(&self, options: &LoadOptions) -> Result<Source> {
@@ -140,15 +182,27 @@ impl Experiment<'_> {
     /// The paper's table.
     fn table(&self, directory: &Path) -> Result<()> {
         let source = self.load(&self.arguments.load.options()?)?;
-        std::fs::create_dir_all(directory)?;
+        make_directory(directory)?;
         let rows = self.arguments.rows(|_| true);
         let plan = self.plan(directory, &source, &rows, self.minutes)?;
-        println!("{plan}");
+        say!("{plan}");
         let summary = self.run_rows(&rows, &plan, &source, directory)?;
-        println!("\n{}", summary.markdown());
+        if !self.arguments.part.writes_tables() {
+            return Ok(());
+        }
+        say!("\n{}", summary.markdown());
         for name in ["reproduce.md", "reproduce.json", "reproduce.png"].map(|name| directory.join(name)) {
             if name.is_file() {
-                println!("written: {}", name.display());
+                say!("written: {}", name.display());
+            }
+        }
+        if self.arguments.publish {
+            let (name, title) = (format!("reproduce-{}", summary.name()), format!("Methods on {}", summary.name()));
+            let chart = [summary.chart(directory, &name)?];
+            let body = summary.markdown();
+            results::publish(&Section { name: &name, title: &title, body: &body, charts: &chart })?;
+            if self.arguments.scenes.first().is_none_or(|first| first == self.scene) {
+                results::publish_table(&summary.front())?;
             }
         }
         Ok(())
@@ -157,28 +211,43 @@ impl Experiment<'_> {
     /// The main rows at each level of wrongness.
     fn robustness(&self, directory: &Path) -> Result<()> {
         let options = self.arguments.load.options()?;
-        ensure!(options.wrong == Wrong::default(), "--robustness goes through its own errors: leave --wrong-… out");
+        ensure!(
+            options.wrong == Perturbation::default(),
+            "--robustness goes through its own errors: leave --wrong-… out"
+        );
         let rows = self.arguments.rows(|row| MAIN.contains(&row.name));
-        std::fs::create_dir_all(directory)?;
+        make_directory(directory)?;
         let mut plan = None;
         let mut levels = Vec::new();
         for (name, wrong) in LEVELS {
-            println!("{name}");
+            say!("{name}");
             let source = self.load(&LoadOptions { wrong, ..options.clone() })?;
             let plan = match &mut plan {
                 Some(plan) => plan,
                 none => none.insert(self.plan(directory, &source, &rows, self.minutes / LEVELS.len() as f64)?),
             };
-            println!("{plan}");
+            say!("{plan}");
             let at = directory.join(name);
-            std::fs::create_dir_all(&at)?;
+            make_directory(&at)?;
             levels.push((name, self.run_rows(&rows, plan, &source, &at)?.scores()));
+            if !self.arguments.part.writes_tables() {
+                continue;
+            }
             let text = summary::by_level(self.scene, &levels);
             run::write(&directory.join("robustness.md"), &text)?;
             run::write(&directory.join("robustness.json"), &serde_json::to_string_pretty(&levels)?)?;
         }
-        println!("\n{}", summary::by_level(self.scene, &levels));
-        println!("written: {}", directory.join("robustness.md").display());
+        if !self.arguments.part.writes_tables() {
+            return Ok(());
+        }
+        say!("\n{}", summary::by_level(self.scene, &levels));
+        say!("written: {}", directory.join("robustness.md").display());
+        if self.arguments.publish {
+            let scene = crate::train::scene_name(Some(self.scene));
+            let (name, title) = (format!("robustness-{scene}"), format!("A wrong prior on {scene}"));
+            let body = summary::by_level(&scene, &levels);
+            results::publish(&Section { name: &name, title: &title, body: &body, charts: &[] })?;
+        }
         Ok(())
     }
 
@@ -192,18 +261,47 @@ impl Experiment<'_> {
                     scene: source.scene.clone(),
                     body: source.body.clone(),
                     load: source.load.clone(),
-                    train: row.config(self.arguments.preset.into(), seed, plan),
+                    train: plan.config(row, self.arguments.preset, seed),
                 };
                 if let Some(path) = &self.arguments.perceptual_weights {
                     run.train.loss.perceptual_weights.clone_from(path);
                 }
-                let metrics = run_unless_finished(&directory.join(&name), &name, &run, source, self.lpips)?;
-                summary.add(row, &directory.join(&name), metrics);
+                if let Some(metrics) = self.run(&directory.join(&name), &name, &run, source)? {
+                    summary.add(row, &directory.join(&name), metrics);
+                }
             }
             // After every row, so that an end before the last leaves a table.
-            summary.write(directory)?;
+            if self.arguments.part.writes_tables() {
+                summary.write(directory)?;
+            }
         }
         Ok(summary)
+    }
+}
+
+impl Experiment<'_> {
+    /// The scores of a run; `None` where it is not this job's, or a merge does not find it.
+    fn run(&self, directory: &Path, name: &str, run: &RunConfig, source: &Source) -> Result<Option<Metrics>> {
+        let part = self.arguments.part;
+        let index = self.runs.count.replace(self.runs.count.get() + 1);
+        if part.merge {
+            let metrics = finished(directory, &run.train)?;
+            if metrics.is_none() {
+                self.runs.missing.borrow_mut().push(directory.display().to_string());
+            }
+            return Ok(metrics);
+        }
+        if part.shard.is_some_and(|shard| !shard.has(index)) {
+            return Ok(None);
+        }
+        let interval = self.arguments.saving.interval()?;
+        match run_unless_finished(directory, name, run, source, self.lpips, interval) {
+            Err(error) if part.shard.is_some() && matches!(error.downcast_ref(), Some(Ending::Busy(_))) => {
+                say!("{name}: in another job");
+                Ok(None)
+            }
+            other => other.map(Some),
+        }
     }
 }
 

@@ -11,9 +11,11 @@ use occnerf::{Config, FieldRenderer, Lpips, Method, PreparedFrame, Preset, Scene
 use serde::{Deserialize, Serialize};
 
 use super::rows::{Length, Row};
+use crate::process::note;
 use crate::run;
 use crate::source::Source;
 
+const FILE: &str = "plan.json";
 /// Steps before and of a measurement.
 const WARM: u64 = 4;
 const TIMED: u64 = 10;
@@ -50,8 +52,20 @@ pub struct Plan {
 }
 
 impl Plan {
-    /// The plan that an earlier sitting left under `directory` for the same request, or a new one.
-    pub fn read_or_make(
+    /// The plan that an earlier sitting, or another job, left under `directory` for the same request.
+    pub fn read(directory: &Path, request: &Request, steps: Option<u64>) -> Result<Option<Self>> {
+        let path = directory.join(FILE);
+        if !path.is_file() {
+            return Ok(None);
+        }
+        let text = std::fs::read_to_string(&path).with_context(|| path.display().to_string())?;
+        // One that an older version wrote lacks what this one asks: it is made anew.
+        let old = serde_json::from_str::<Self>(&text).ok();
+        Ok(old.filter(|old| old.request == *request && steps.is_none_or(|s| s == old.steps)))
+    }
+
+    /// A new plan, which is left under `directory`.
+    pub fn make(
         directory: &Path,
         source: &Source,
         rows: &[&Row],
@@ -60,15 +74,6 @@ impl Plan {
         steps: Option<u64>,
         lpips: Option<&Lpips>,
     ) -> Result<Self> {
-        let path = directory.join("plan.json");
-        if path.is_file() {
-            let text = std::fs::read_to_string(&path).with_context(|| path.display().to_string())?;
-            // One that an older version wrote lacks what this one asks: it is made anew.
-            let old = serde_json::from_str::<Self>(&text).ok();
-            if let Some(old) = old.filter(|old| old.request == request && steps.is_none_or(|s| s == old.steps)) {
-                return Ok(old);
-            }
-        }
         let (mut cost, mut pictures) = (BTreeMap::new(), 0);
         for method in [Method::Humannerf, Method::HashPoint, Method::Occnerf] {
             if let Some(row) = rows.iter().find(|row| row.method == method) {
@@ -90,13 +95,13 @@ impl Plan {
         let affordable = (SPARE * 60.0 * minutes - fixed) / a_step.max(1e-9);
         plan.steps = steps.unwrap_or(affordable.clamp(FEWEST as f64, 1e6) as u64);
         if steps.is_none() && affordable < FEWEST as f64 {
-            eprintln!(
+            note!(
                 "warning: {minutes:.0} minutes do not pay for {FEWEST} steps a run beside {:.0} minutes of scoring; \
                  fewer --seeds, a larger --eval-stride or --without would",
                 fixed / 60.0
             );
         }
-        run::write(&path, &serde_json::to_string_pretty(&plan)?)?;
+        run::write(&directory.join(FILE), &serde_json::to_string_pretty(&plan)?)?;
         Ok(plan)
     }
 
@@ -114,6 +119,11 @@ impl Plan {
                 if reference > 0.0 && own > 0.0 { reference / own } else { 1.0 }
             }
         }
+    }
+
+    /// The configuration of a run of `row`.
+    pub fn config(&self, row: &Row, preset: Preset, seed: u64) -> Config {
+        Config { seed, steps: self.steps_of(row), ..row.settings(preset) }
     }
 
     /// Steps of a row.

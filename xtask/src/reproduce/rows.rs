@@ -2,8 +2,6 @@
 
 use occnerf::{Component, Config, Method, OccludedRule, Preset};
 
-use super::plan::Plan;
-
 /// How long a row trains.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Length {
@@ -85,10 +83,5 @@ impl Row {
             config.ablate(component);
         }
         config
-    }
-
-    /// The configuration of a run.
-    pub fn config(&self, preset: Preset, seed: u64, plan: &Plan) -> Config {
-        Config { seed, steps: plan.steps_of(self), ..self.settings(preset) }
     }
 }

@@ -11,6 +11,7 @@ use super::plan::Plan;
 use super::rows::Row;
 use crate::run::{self, Metrics};
 use crate::source::Source;
+use crate::train::scene_name;
 use crate::{pictures, table};
 
 /// Rows whose pictures stand beside the truth, as in the paper's figures.
@@ -118,6 +119,36 @@ impl<'a> Summary<'a> {
             }
         }
         text
+    }
+
+    /// The scene without the folders that lead to it.
+    pub fn name(&self) -> String {
+        scene_name(Some(self.scene))
+    }
+
+    /// The pictures of all methods under another name, for a folder with those of other scenes.
+    pub fn chart(&self, directory: &Path, name: &str) -> Result<PathBuf> {
+        let copy = directory.join(format!("{name}.png"));
+        std::fs::copy(directory.join("reproduce.png"), &copy).with_context(|| copy.display().to_string())?;
+        Ok(copy)
+    }
+
+    /// The table for README: few rows, few columns, novel views.
+    pub fn front(&self) -> String {
+        let heads = ["method", "hidden pixels", "steps", "seconds", "psnr_mask", "psnr_hidden", "ssim_mask"];
+        let mut lines = vec![heads.map(str::to_owned).to_vec()];
+        for entry in self.rows.iter().filter(|entry| SHOWN.contains(&entry.name)) {
+            let splits: Vec<&SplitMetrics> = entry.runs.iter().filter_map(|m| Some(m.splits.first()?.1)).collect();
+            let seconds = entry.runs.iter().map(|m| m.train_seconds).sum::<f64>() / entry.runs.len() as f64;
+            let mean = |pick: fn(&SplitMetrics) -> Option<f64>, digits: usize| {
+                cell(&splits.iter().filter_map(|s| pick(s)).collect::<Vec<_>>(), digits)
+            };
+            let name = entry.runs.first().map_or(entry.name, |m| &m.method).to_owned();
+            let (steps, seconds) = (entry.steps.to_string(), format!("{seconds:.0}"));
+            let scores = [mean(|s| s.psnr_mask, 2), mean(|s| s.psnr_hidden, 2), mean(|s| s.ssim_mask, 3)];
+            lines.push([vec![name, entry.occluded.clone(), steps, seconds], scores.to_vec()].concat());
+        }
+        table::aligned(&lines, 2)
     }
 
     /// What is ranked, row by row.

@@ -1,7 +1,7 @@
 //! What the person wears: how far each garment reaches, and how far it stands off the body.
 //!
-//! Every `…_inside` function tells how deep a point of the rest pose (figure metres) lies within a garment:
-//! positive inside, 0 at the hem, falling outward.
+//! Every `…_inside` function tells how deep a point of the rest pose (figure metres) lies within a
+//! garment: positive inside, 0 at the hem, falling outward.
 
 use glam::Vec3;
 
@@ -75,8 +75,8 @@ impl Landmarks {
         self.ankle.y - 0.045
     }
 
-    /// What is seen at a point of the rest pose, and how far below the next garment's hem it lies (large where
-    /// there is none near), for the shade that hems cast.
+    /// What is seen at a point of the rest pose, and how far below the next garment's hem it lies
+    /// (large where there is none near), for the shade that hems cast.
     pub fn garment(&self, q: Vec3) -> (Garment, f32) {
         let (hair, shirt) = (self.hair_inside(q), self.shirt_inside(q));
         let (belt, trousers, shoe) = (self.belt_inside(q), self.trousers_inside(q), self.shoe_inside(q));

@@ -26,7 +26,8 @@ pub(in crate::capture) mod joint {
     pub const COUNT: usize = 24;
 }
 
-/// Where the parts of a figure are, with its pelvis at the origin and 1.695 m tall. Left and right are alike.
+/// Where the parts of a figure are, with its pelvis at the origin and 1.695 m tall. Left and right
+/// are alike.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Landmarks {
     /// Length of one figure metre in the body model's unit.
@@ -36,7 +37,8 @@ pub(super) struct Landmarks {
     pub chest: Vec3,
     pub neck: Vec3,
     pub head: Vec3,
-    /// Distance from the head joint to the crown relative to that of the figure the face was drawn for.
+    /// Distance from the head joint to the crown relative to that of the figure the face was drawn
+    /// for.
     pub face: f32,
     /// Distances from the middle plane.
     pub shoulder_x: f32,

@@ -28,7 +28,7 @@ use crate::random::Stream;
 
 /// Shape coefficients of the person and of the tracker's guess that are not zero.
 const BETAS: usize = 6;
-/// What the demo is made of. The default is the one that figures are quoted for.
+/// Settings of the demo. The default is the one that figures are quoted for.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct DemoConfig {
@@ -36,8 +36,8 @@ pub struct DemoConfig {
     pub size: u32,
     /// Frames of the training video, 1 to 10 000. However many, they show the same walk.
     pub frames: usize,
-    /// Cameras kept back for evaluation, evenly around the person, with the training camera midway between the first
-    /// and the last of them: for five, 36° off it and 72° apart. At most 64.
+    /// Cameras kept back for evaluation, evenly around the person, with the training camera midway
+    /// between the first and the last of them: for five, 36° off it and 72° apart. At most 64.
     pub eval_cameras: usize,
     /// Evaluation cameras see one frame in this many, beginning with the first.
     pub eval_every: usize,
@@ -49,7 +49,8 @@ pub struct DemoConfig {
     pub translation_noise: f32,
     /// Standard deviation of the prior's error in each shape coefficient.
     pub beta_noise: f32,
-    /// Part of the subject's pixels in the occluded frames that are hidden, 0 (no obstacle) to below 1.
+    /// Part of the subject's pixels in the occluded frames that are hidden, 0 (no obstacle) to
+    /// below 1.
     pub occluded_fraction: f32,
     /// Part of the training video, from its start, that is occluded, 0 to 1.
     pub occluded_share: f32,
@@ -102,17 +103,20 @@ impl DemoConfig {
     }
 }
 
-/// Makes a video of a clothed person who walks and turns, occluded as in the paper's simulation, with views of the
-/// same instants from other sides.
+/// Makes a video of a clothed person who walks and turns, occluded as in the paper's simulation,
+/// with views of the same instants from other sides.
 ///
-/// The person is `body` with a shape of its own, in clothes that stand 1 to 3 cm off it and that the body model knows
-/// nothing of. The returned poses and betas are not the true ones but a tracker's, with the errors of `config`; training
-/// and evaluation frames of one instant share them. Pictures are anti-aliased: the mask is the share of 4 rays a pixel
-/// that meet the person, the colour is on black. An obstacle as high as the picture covers the middle of the training
-/// view in the first frames. The result depends on `config` and `body` alone, not on the number of threads.
+/// The person is `body` with a shape of its own, in clothes that stand 1 to 3 cm off it and that
+/// the body model knows nothing of. The returned poses and betas are not the true ones but a
+/// tracker's, with the errors of `config`; training and evaluation frames of one instant share
+/// them. Pictures are anti-aliased: the mask is the share of 4 rays a pixel that meet the person,
+/// the colour is on black. An obstacle as high as the picture covers the middle of the training
+/// view in the first frames. The result depends on `config` and `body` alone, not on the number of
+/// threads.
 ///
 /// # Errors
-/// [`CaptureError::Setting`] for values outside the stated ranges, and for a body without SMPL's 24 joints.
+/// [`CaptureError::Setting`] for values outside the stated ranges, and for a body without SMPL's 24
+/// joints.
 pub fn demo(config: &DemoConfig, body: &BodyModel) -> Result<Capture, CaptureError> {
     config.check()?;
     let joints = body.num_joints();
@@ -124,8 +128,8 @@ pub fn demo(config: &DemoConfig, body: &BodyModel) -> Result<Capture, CaptureErr
     Ok(capture)
 }
 
-/// The demo before anything stands in front of it, and the height that the cameras stand for. `perform` gives the
-/// poses for a body of that shape, and that height.
+/// The demo before anything stands in front of it, and the height that the cameras stand for.
+/// `perform` gives the poses for a body of that shape, and that height.
 pub(super) fn film(
     config: &DemoConfig,
     body: &BodyModel,

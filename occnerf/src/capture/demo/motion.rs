@@ -33,8 +33,9 @@ impl Pose {
 
 /// Walking on the spot while turning, at frame `frame` of `frames`. The translation is 0.
 ///
-/// The T-pose's left arm points along +x: turning about −z lowers it, about −x then swings it forward; a knee
-/// bends about +x, a left elbow about −y. `pressed` (0 to 1) brings the arms to the trunk and the thighs together.
+/// The T-pose's left arm points along +x: turning about −z lowers it, about −x then swings it
+/// forward; a knee bends about +x, a left elbow about −y. `pressed` (0 to 1) brings the arms to the
+/// trunk and the thighs together.
 pub(in crate::capture) fn walk(frame: usize, frames: usize, pressed: f32) -> Pose {
     let time = frame as f32 / frames as f32;
     let phase = TAU * time * 100.0 / STRIDE;
@@ -71,8 +72,8 @@ pub(in crate::capture) fn walk(frame: usize, frames: usize, pressed: f32) -> Pos
     Pose { joints, rotation, translation: Vec3::ZERO }
 }
 
-/// A smooth 3-vector of time with the given root mean square length over the video, (T). Periodic in twice the
-/// video's length, so that its ends are free.
+/// A smooth 3-vector of time with the given root mean square length over the video, (T). Periodic
+/// in twice the video's length, so that its ends are free.
 fn wander(stream: &mut Stream, frames: usize, rms: f32) -> Vec<Vec3> {
     let mut waves = Vec::new();
     for harmonic in 1..=HARMONICS {
@@ -107,8 +108,8 @@ pub(in crate::capture) struct TrackerError {
     pub translation: f32,
 }
 
-/// What a tracker would report for `poses`: the errors of bones are independent of each other and smooth in time.
-/// `pelvis` is the pelvis joint at rest, about which the global error turns.
+/// What a tracker would report for `poses`: the errors of bones are independent of each other and
+/// smooth in time. `pelvis` is the pelvis joint at rest, about which the global error turns.
 pub(in crate::capture) fn track(
     poses: &[Pose],
     parents: &[Option<usize>],

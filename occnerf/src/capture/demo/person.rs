@@ -1,4 +1,5 @@
-//! The clothed person: a finer mesh than the body's, stood off it by the clothes, that follows the body's bones.
+//! The clothed person: a finer mesh than the body's, stood off it by the clothes, that follows the
+//! body's bones.
 
 use std::collections::HashMap;
 
@@ -12,16 +13,19 @@ pub(super) struct Person {
     pub landmarks: Landmarks,
     /// Triangles of the finer mesh.
     pub faces: Vec<[u32; 3]>,
-    /// Places on the naked body at rest, one a vertex of the finer mesh: what colours are looked up by.
+    /// Places on the naked body at rest, one a vertex of the finer mesh: what colours are looked up
+    /// by.
     pub rest: Vec<Vec3>,
     /// `rest` with the clothes on.
     clothed: Vec<Vec3>,
-    /// The two vertices of the body's mesh that a vertex lies halfway between; the same twice for an old one.
+    /// The two vertices of the body's mesh that a vertex lies halfway between; the same twice for
+    /// an old one.
     ends: Vec<[u32; 2]>,
     weights: SparseRows<f32>,
 }
 
-/// Faces split in four at the midpoints of their edges, and the vertices that each new vertex lies between.
+/// Faces split in four at the midpoints of their edges, and the vertices that each new vertex lies
+/// between.
 fn subdivide(vertices: usize, faces: &[[u32; 3]]) -> (Vec<[u32; 3]>, Vec<[u32; 2]>) {
     let mut ends: Vec<[u32; 2]> = (0..vertices as u32).map(|v| [v, v]).collect();
     let mut middles: HashMap<[u32; 2], u32> = HashMap::new();

@@ -7,7 +7,8 @@ fn body() -> &'static BodyModel {
     BODY.get_or_init(BodyModel::embedded)
 }
 
-/// Full size, since whole columns are what the obstacle is made of; every fifth frame of the default.
+/// Full size, since whole columns are what the obstacle is made of; every fifth frame of the
+/// default.
 fn config() -> DemoConfig {
     DemoConfig { frames: 20, eval_cameras: 2, ..DemoConfig::default() }
 }

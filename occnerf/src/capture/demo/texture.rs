@@ -97,7 +97,8 @@ fn back_print(p: Vec2) -> Option<Vec3> {
     if edge.min_element() < border {
         return Some(CREAM);
     }
-    // Seven segments a digit: top, upper left, upper right, middle, lower left, lower right, bottom.
+    // Seven segments a digit: top, upper left, upper right, middle, lower left, lower right,
+    // bottom.
     let digit = |p: Vec2, segments: [bool; 7]| {
         let (w, h, thick) = (0.025, 0.056, 0.009);
         let horizontal = |y: f32| (p.y - y).abs() < thick && p.x.abs() < w + thick;

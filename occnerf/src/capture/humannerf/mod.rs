@@ -3,9 +3,10 @@
 //! ```text
 //! images/frame_000000.png …   masks/frame_000000.png …   (PNG or JPEG)
 //! cameras.pkl                 {frame: {intrinsics (3,3), extrinsics (4,4), distortions (5)?}}
-//! mesh_infos.pkl              {frame: {Rh (3), Th (3), poses (3J), betas (≤ B), tpose_joints (J,3), …}}
+//! mesh_infos.pkl              {frame: {Rh (3), Th (3), poses (3J), betas (≤ B),
+//!                              tpose_joints (J,3), …}}
 //! canonical_joints.pkl        {joints (J,3), avg_betas (≤ B)}
-//! eval/Camera_…/              images, masks, cameras.pkl and mesh_infos.pkl again, nothing occluded
+//! eval/Camera_…/              images, masks, cameras.pkl, mesh_infos.pkl again, nothing occluded
 //! ```
 //!
 //! Frames are the entries of `cameras.pkl` in the order of their names, `10` after `9`.
@@ -21,7 +22,7 @@ use smpl::BodyModel;
 use super::camera::Lens;
 use super::decode::{Planned, View, budget};
 use super::names::FrameName;
-use super::pictures::{Pictures, file_name};
+use super::pictures::{Pictures, file_name, is_directory};
 use super::records::{Record, Records};
 use super::{Capture, CaptureError, EvalFrame, LoadOptions, checks};
 
@@ -98,7 +99,8 @@ fn plan(
         return Err(CaptureError::invalid(path, "camera of the image", expected, "none"));
     }
     let chosen = choose(lenses.keys().map(|name| name.0).collect())?;
-    // Collected as results first, so that the error reported is the first in order whatever finishes first.
+    // Collected as results first, so that the error reported is the first in order whatever
+    // finishes first.
     let frames: Vec<Result<Planned, CaptureError>> = chosen
         .par_iter()
         .map(|&name| {
@@ -131,14 +133,15 @@ fn plan_frame(
         labels: false,
         occluder: None,
         hidden: None,
-        lens: Lens::read(lens, "intrinsics", "extrinsics", options)?,
+        lens: Lens::read(lens, "intrinsics", "extrinsics", options.pixel_centre)?,
         pose: checks::rootless_pose(parameters, body)?,
         placement: checks::origin(parameters)?,
         betas,
     })
 }
 
-/// The shape of the canonical body, `avg_betas` of `canonical_joints.pkl`, its joints checked against the model's.
+/// The shape of the canonical body, `avg_betas` of `canonical_joints.pkl`, its joints checked
+/// against the model's.
 fn mean_betas(dir: &Path, body: &BodyModel) -> Result<Vec<f32>, CaptureError> {
     let records = Records::load(&dir.join("canonical_joints.pkl"))?;
     let canonical = records.whole();
@@ -150,13 +153,13 @@ fn mean_betas(dir: &Path, body: &BodyModel) -> Result<Vec<f32>, CaptureError> {
 /// `eval/*/` in the order of their names; none where there is no `eval`.
 fn eval_directories(dir: &Path) -> Result<Vec<PathBuf>, CaptureError> {
     let root = dir.join("eval");
-    if !root.exists() {
+    if !is_directory(&root)? {
         return Ok(Vec::new());
     }
     let mut found = Vec::new();
     for entry in std::fs::read_dir(&root).map_err(CaptureError::io(&root))? {
         let path = entry.map_err(CaptureError::io(&root))?.path();
-        if path.is_dir() {
+        if is_directory(&path)? {
             found.push(path);
         }
     }

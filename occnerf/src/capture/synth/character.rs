@@ -7,20 +7,21 @@ use rayon::prelude::*;
 use smpl::{BodyModel, Character, MotionClip, SparseRows};
 use visibility::RayMesh;
 
+use super::config::SynthConfig;
 use super::noise::smooth_noise;
 use super::perform::{Extent, Skeleton, brought, seconds};
 use super::render::Posture;
 use super::stage::{Progress, Stage, ring};
 use super::texture::{decode, pattern, sample};
-use super::{DemoConfig, SynthConfig};
+use crate::capture::demo::DemoConfig;
 use crate::capture::demo::motion::{Pose, TrackerError, track};
 use crate::capture::{Capture, CaptureError};
 
 /// Most vertices, and joints, of a character: every training step encodes all vertices.
 const MAX_VERTICES: usize = 200_000;
 const MAX_JOINTS: usize = 512;
-/// How deep a coefficient of 1 sinks the surface, in metres of a person 1.7 m tall, and at most as a share of the body's
-/// thickness there.
+/// How deep a coefficient of 1 sinks the surface, in metres of a person 1.7 m tall, and at most as
+/// a share of the body's thickness there.
 const DEPTH: [f32; 2] = [0.01, 0.03];
 const DEPTH_SHARE: f32 = 0.3;
 /// Fewest vertices that a joint's place is told by.
@@ -42,7 +43,8 @@ struct Figure<'a> {
     unit: f32,
 }
 
-/// Films `character`; the body model comes with the video and the height that the cameras stand for.
+/// Films `character`; the body model comes with the video and the height that the cameras stand
+/// for.
 pub(super) fn film(
     character: &Character,
     motion: Option<&MotionClip>,
@@ -309,7 +311,8 @@ fn regressor(
     near.iter().zip(places).map(joint).collect()
 }
 
-/// Weights w of `near` with Σ w = 1 and Σ w v = `place`, of the least Σ w² / u, u being the weights that come with them.
+/// Weights w of `near` with Σ w = 1 and Σ w v = `place`, of the least Σ w² / u, u being the weights
+/// that come with them.
 fn affine(vertices: &[Vec3], near: &[(u32, f32)], place: Vec3, unit: f32) -> Option<Vec<(u32, f32)>> {
     let row = |v: u32| ((vertices[v as usize] - place) / unit).as_dvec3().extend(1.0);
     let mut normal = DMat4::ZERO;

@@ -1,6 +1,7 @@
 //! A desk and pillars between the training camera and the person, and the room behind.
 //!
-//! They stand wholly in front of the person and do not move, nor does the camera: one picture of them serves all frames.
+//! They stand wholly in front of the person and do not move, nor does the camera: one picture of
+//! them serves all frames.
 
 use glam::Vec3;
 use volrender::Camera;
@@ -9,8 +10,8 @@ use super::noise::smooth_noise;
 use super::render::{Picture, Posture};
 use crate::capture::{CaptureError, Frame, Image};
 
-/// Distance of the objects' far and near sides from the person's axis, in heights of the person: beyond a
-/// stretched arm, before the camera.
+/// Distance of the objects' far and near sides from the person's axis, in heights of the person:
+/// beyond a stretched arm, before the camera.
 const FAR: f32 = 0.72;
 const NEAR: f32 = 0.90;
 /// Between the pillars, behind, and the desk.
@@ -36,8 +37,9 @@ pub(in crate::capture) struct Objects {
 }
 
 impl Objects {
-    /// Objects so wide that they hide as nearly as pixels allow `fraction` of the subject in `frames`, `position` picture widths to
-    /// the right of the person; `height` is what the cameras stand for.
+    /// Objects so wide that they hide as nearly as pixels allow `fraction` of the subject in
+    /// `frames`, `position` picture widths to the right of the person; `height` is what the cameras
+    /// stand for.
     pub fn new(frames: &[Frame], height: f32, fraction: f32, position: f32) -> Result<Self, CaptureError> {
         let Some(camera) = frames.first().map(|frame| frame.camera) else {
             return Err(CaptureError::setting("frames", "at least 1", 0));
@@ -71,7 +73,8 @@ impl Objects {
         Ok(Self { front: if nearer { below } else { above }, room: room(&camera, height) })
     }
 
-    /// Hides what the objects cover, and marks it as covered where they take more than half of a pixel.
+    /// Hides what the objects cover, and marks it as covered where they take more than half of a
+    /// pixel.
     pub fn hide(&self, frames: &mut [Frame]) -> Result<(), CaptureError> {
         let visible: Vec<f32> = self.front.1.iter().map(|cover| 1.0 - cover).collect();
         frames.iter_mut().try_for_each(|frame| {
@@ -88,7 +91,8 @@ impl Objects {
         &self.front.1
     }
 
-    /// What a camera would take of a person (premultiplied, with its coverage) in the room, behind the objects if `occluded`.
+    /// What a camera would take of a person (premultiplied, with its coverage) in the room, behind
+    /// the objects if `occluded`.
     pub fn photograph(&self, (person, mask): &Picture, occluded: bool) -> Image {
         let mut photo = self.room.clone();
         for (i, pixel) in photo.pixels.chunks_exact_mut(3).enumerate() {

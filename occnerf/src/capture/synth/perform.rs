@@ -102,7 +102,8 @@ fn sample(clip: &MotionClip, seconds: f32, joints: usize) -> (Vec<Vec3>, Vec3) {
     }
 }
 
-/// SMPL's joint for each of a character's, told by their names; `None` for those that follow their parents.
+/// SMPL's joint for each of a character's, told by their names; `None` for those that follow their
+/// parents.
 fn assign(names: &[&str]) -> Vec<Option<usize>> {
     let read: Vec<(Option<usize>, String)> = names.iter().map(|name| side_and_base(name)).collect();
     let has_collars = read.iter().any(|(_, base)| matches!(base.as_str(), "collar" | "clavicle"));
@@ -131,7 +132,8 @@ fn assign(names: &[&str]) -> Vec<Option<usize>> {
     assigned
 }
 
-/// Left is 0 and right is 1, of the names of MakeHuman, Mixamo, Unreal and SMPL; and the rest in small letters.
+/// Left is 0 and right is 1, of the names of MakeHuman, Mixamo, Unreal and SMPL; and the rest in
+/// small letters.
 fn side_and_base(name: &str) -> (Option<usize>, String) {
     let name = name.rsplit(':').next().unwrap_or(name).to_ascii_lowercase();
     let name = name.strip_prefix("mixamorig").unwrap_or(&name);
@@ -152,7 +154,8 @@ fn side_and_base(name: &str) -> (Option<usize>, String) {
     (None, clean(name))
 }
 
-/// A skeleton to be driven: joints at rest, y up, facing +z, and their parents, each before its children.
+/// A skeleton to be driven: joints at rest, y up, facing +z, and their parents, each before its
+/// children.
 pub(super) struct Skeleton<'a> {
     pub names: &'a [&'a str],
     pub joints: &'a [Vec3],
@@ -164,7 +167,8 @@ pub(super) struct Skeleton<'a> {
 impl Skeleton<'_> {
     /// Rest to world, (J), at each frame of `clip`.
     ///
-    /// A bone takes the orientation in the world of its counterpart, with the limbs' directions at rest made up for.
+    /// A bone takes the orientation in the world of its counterpart, with the limbs' directions at
+    /// rest made up for.
     pub fn driven(&self, clip: &MotionClip, frames: usize) -> Result<Vec<Vec<Affine3A>>, CaptureError> {
         let assigned = assign(self.names);
         let place_of = |s: usize| assigned.iter().position(|a| *a == Some(s));

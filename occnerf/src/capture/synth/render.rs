@@ -15,7 +15,8 @@ const AMBIENT: f32 = 0.58;
 const SKY: f32 = 0.07;
 const DIRECT: f32 = 0.42;
 
-/// A camera at `eye` that looks at `target`, upright, square, with the focal length in picture sides.
+/// A camera at `eye` that looks at `target`, upright, square, with the focal length in picture
+/// sides.
 pub(in crate::capture) fn look_at(eye: Vec3, target: Vec3, size: u32, focal: f32) -> Result<Camera, CaptureError> {
     let forward = (target - eye).normalize_or(Vec3::NEG_Z);
     let right = forward.cross(Vec3::Y).normalize_or(Vec3::X);

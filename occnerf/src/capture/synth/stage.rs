@@ -12,7 +12,8 @@ use crate::capture::{Capture, CaptureError, EvalFrame, Frame, Pixels};
 
 /// Focal length in picture sides.
 const FOCAL: f32 = 1.45;
-/// Distance of the cameras from the person's axis in heights of the person: fills three quarters of the picture.
+/// Distance of the cameras from the person's axis in heights of the person: fills three quarters of
+/// the picture.
 const DISTANCE: f32 = 1.97;
 /// Height of the cameras and of the point they look at, in heights of the person.
 const CAMERA_HEIGHT: f32 = 0.60;
@@ -21,7 +22,8 @@ const TARGET_HEIGHT: f32 = 0.505;
 /// Called with the number of instants filmed so far, from any thread.
 pub(in crate::capture) type Progress<'a> = dyn Fn(usize) + Sync + 'a;
 
-/// The training camera, then `others` around the circle, for a person of `height` on the floor at the origin.
+/// The training camera, then `others` around the circle, for a person of `height` on the floor at
+/// the origin.
 pub(in crate::capture) fn ring(size: u32, others: usize, height: f32) -> Result<Vec<Camera>, CaptureError> {
     (0..=others)
         .map(|c| {

@@ -2,7 +2,7 @@ use smpl::{Character, MotionClip};
 
 use super::*;
 use crate::capture::testing::{overlap, shared};
-use crate::capture::{DemoConfig, demo};
+use crate::capture::{DemoConfig, Obstacle, demo};
 
 fn small() -> SynthConfig {
     SynthConfig { size: 64, frames: 6, eval_cameras: 1, eval_every: 3, ..SynthConfig::default() }

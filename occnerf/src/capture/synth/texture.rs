@@ -21,7 +21,8 @@ pub(super) fn decode(character: &Character) -> Result<Option<RgbImage>, CaptureE
     Ok(Some(decoded.into_rgb8()))
 }
 
-/// The colour at `uv`, bilinear, repeated beyond the edges. Coordinates that are not finite give the corner's.
+/// The colour at `uv`, bilinear, repeated beyond the edges. Coordinates that are not finite give
+/// the corner's.
 pub(super) fn sample(texture: &RgbImage, uv: Vec2) -> Vec3 {
     let size = Vec2::new(texture.width() as f32, texture.height() as f32);
     let uv = if uv.is_finite() { uv - uv.floor() } else { Vec2::ZERO };
@@ -36,8 +37,8 @@ pub(super) fn sample(texture: &RgbImage, uv: Vec2) -> Vec3 {
     row(0).lerp(row(1), t.y)
 }
 
-/// A pattern for characters without a texture: bands of colour that differ from bone to bone. `at` is the place at rest in
-/// metres of a person 1.7 m tall, `joint` the bone that moves it most.
+/// A pattern for characters without a texture: bands of colour that differ from bone to bone. `at`
+/// is the place at rest in metres of a person 1.7 m tall, `joint` the bone that moves it most.
 pub(super) fn pattern(at: Vec3, joint: usize) -> Vec3 {
     let hue = joint as f32 * 0.618_034;
     let wave = |shift: f32| 0.5 + 0.35 * (std::f32::consts::TAU * (hue + shift)).cos();

@@ -1,4 +1,5 @@
-//! A tiny body, a writer of the few pickle opcodes that captures take, and directories that go away.
+//! A tiny body, a writer of the few pickle opcodes that captures take, and directories that go
+//! away.
 
 use std::path::{Path, PathBuf};
 
@@ -163,7 +164,8 @@ impl super::Frame {
     }
 }
 
-/// Overlap of the posed body's silhouette with the mask, over the pixels that no known occluder covers.
+/// Overlap of the posed body's silhouette with the mask, over the pixels that no known occluder
+/// covers.
 pub fn overlap(frame: &super::Frame, body: &BodyModel) -> f32 {
     let posed = body.pose(&body.shaped(&frame.betas), &frame.pose, frame.placement);
     let mesh = visibility::RayMesh::new(&posed.vertices, &body.faces).unwrap();

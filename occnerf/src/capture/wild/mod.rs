@@ -2,13 +2,15 @@
 //!
 //! ```text
 //! images/NAME.png …       masks/NAME.png …      (PNG or JPEG; masks 0 to 255, the visible person)
-//! metadata.json           {NAME: {poses (3J), betas (≤ B), cam_intrinsics (3,3), cam_extrinsics (4,4), distortions (5)?}}
+//! metadata.json           {NAME: {poses (3J), betas (≤ B), cam_intrinsics (3,3),
+//!                          cam_extrinsics (4,4), distortions (5)?}}
 //! occluders/NAME.png …    where known: 255 where something stands in front of the person
 //! clean/images, masks/    some of the frames again without occluders, kept back
 //! ```
 //!
-//! The pose's first joint turns the body about its pelvis; the extrinsics hold the body's translation. Frames are the
-//! entries of `metadata.json` in the order of their names, `10` after `9`; pictures that it does not mention are left out.
+//! The pose's first joint turns the body about its pelvis; the extrinsics hold the body's
+//! translation. Frames are the entries of `metadata.json` in the order of their names, `10` after
+//! `9`; pictures that it does not mention are left out.
 
 mod metadata;
 #[cfg(test)]
@@ -21,7 +23,7 @@ use smpl::{BodyModel, Placement};
 use super::camera::Lens;
 use super::decode::{Planned, View, budget};
 use super::names::FrameName;
-use super::pictures::{Pictures, file_name};
+use super::pictures::{Pictures, file_name, is_directory};
 use super::records::Record;
 use super::{Capture, CaptureError, EvalFrame, LoadOptions, checks};
 
@@ -49,6 +51,7 @@ pub(super) fn load(dir: &Path, body: &BodyModel, options: &LoadOptions) -> Resul
 
     let clean = dir.join(CLEAN);
     let (mut indices, mut kept) = (Vec::new(), Vec::new());
+    is_directory(&clean)?;
     if let Some(images) = optional(&clean.join("images"))? {
         let masks = Pictures::list(&clean.join("masks"))?;
         for (index, (FrameName(name), record)) in frames.iter().enumerate().step_by(options.eval_stride) {
@@ -76,7 +79,7 @@ pub(super) fn load(dir: &Path, body: &BodyModel, options: &LoadOptions) -> Resul
 }
 
 fn optional(dir: &Path) -> Result<Option<Pictures>, CaptureError> {
-    if dir.is_dir() { Pictures::list(dir).map(Some) } else { Ok(None) }
+    if is_directory(dir)? { Pictures::list(dir).map(Some) } else { Ok(None) }
 }
 
 fn plan(
@@ -94,7 +97,7 @@ fn plan(
         labels: false,
         occluder: None,
         hidden: None,
-        lens: Lens::read(record, "cam_intrinsics", "cam_extrinsics", options)?,
+        lens: Lens::read(record, "cam_intrinsics", "cam_extrinsics", options.pixel_centre)?,
         pose: checks::pose(record, body)?,
         placement: Placement::default(),
         betas: checks::betas(record, "betas", body)?,

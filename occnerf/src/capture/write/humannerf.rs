@@ -1,6 +1,7 @@
 //! HumanNeRF's prepared layout.
 
-use super::{Folder, Py, extrinsics, flat, frame_mask, origin, rows, unmixed};
+use super::folder::{Folder, extrinsics, flat, frame_mask, origin, rows, unmixed};
+use super::pickle::Py;
 use crate::capture::synth::Synthetic;
 use crate::capture::{CaptureError, Frame};
 

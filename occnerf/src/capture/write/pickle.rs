@@ -1,6 +1,7 @@
 //! Python pickles of dictionaries, lists, texts and numpy arrays.
 
-/// _reconstruct(ndarray, (0,), b'b'), and the beginning of its state (1, shape, dtype, False, bytes or items).
+/// _reconstruct(ndarray, (0,), b'b'), and the beginning of its state (1, shape, dtype, False, bytes
+/// or items).
 const ARRAY: &[u8] = b"cnumpy.core.multiarray\n_reconstruct\ncnumpy\nndarray\nK\0\x85C\x01b\x87R(K\x01(";
 
 /// What a pickle is made of.
@@ -37,8 +38,8 @@ impl Py {
         out
     }
 
-    /// The same as `numpy.save` writes it for an object: a header, then the pickle of an array of no axes with the object
-    /// as its item.
+    /// The same as `numpy.save` writes it for an object: a header, then the pickle of an array of
+    /// no axes with the object as its item.
     pub fn npy(&self) -> Vec<u8> {
         let dictionary = "{'descr': '|O', 'fortran_order': False, 'shape': (), }";
         // The pickle starts at a multiple of 64.

@@ -4,10 +4,10 @@ use std::sync::OnceLock;
 use glam::Vec3;
 use smpl::BodyModel;
 
-use super::byte;
+use super::folder::byte;
 use crate::capture::testing::Directory;
 use crate::capture::{
-    Capture, Frame, Layout, LoadOptions, Obstacle, Occlusion, Pixels, SynthConfig, Synthetic, Wrong, find_body,
+    Capture, Frame, Layout, LoadOptions, Obstacle, Occlusion, Perturbation, Pixels, SynthConfig, Synthetic, find_body,
     load_capture, synthesise,
 };
 
@@ -204,7 +204,8 @@ fn half_covered_pixels_stay_on_their_side() {
     assert_eq!([0.0, 0.25, 0.5, 0.75, 1.0, -1.0, 7.0, f32::NAN].map(byte), [0, 64, 127, 191, 255, 0, 255, 0]);
 }
 
-/// Whatever is done to them: resized, behind an obstacle that moves, with masks too large or too small.
+/// Whatever is done to them: resized, behind an obstacle that moves, with masks too large or too
+/// small.
 #[test]
 fn pictures_decoded_on_demand_are_those_decoded_at_once() {
     for (layout, made) in LAYOUTS.map(|layout| (layout, central())) {
@@ -214,7 +215,7 @@ fn pictures_decoded_on_demand_are_those_decoded_at_once() {
             let at_once = LoadOptions {
                 resize: Some(40),
                 occlusion: (layout == Layout::ZjuMocap).then_some(moving),
-                wrong: Wrong { mask_pixels, ..Wrong::default() },
+                wrong: Perturbation { mask_pixels, ..Perturbation::default() },
                 ..LoadOptions::default()
             };
             let read = |options: &LoadOptions| load_capture(dir.path(), &body, options).unwrap();
@@ -222,8 +223,8 @@ fn pictures_decoded_on_demand_are_those_decoded_at_once() {
             let bodies = (all.train.len() + all.eval.len()) * body.num_vertices() * 36;
             let picture = 40 * 40 * 16usize;
             let labels = all.train.len() * picture.div_ceil(42);
-            // Room for the pictures of two frames.
-            let on_demand = LoadOptions { max_bytes: (bodies + labels + 2 * picture) as u64, ..at_once };
+            // Room for the pictures of two frames, and to decode another.
+            let on_demand = LoadOptions { max_bytes: (bodies + labels + 2 * picture + 48 * 48 * 48) as u64, ..at_once };
             let few = read(&on_demand);
             let frames = |capture: &Capture| -> Vec<Frame> {
                 capture.train.iter().chain(capture.eval.iter().map(|e| &e.frame)).cloned().collect()

@@ -4,7 +4,7 @@ use glam::{Affine3A, Vec3};
 use serde_json::{Map, Value, json};
 use smpl::{BodyModel, rodrigues};
 
-use super::{Folder, extrinsics, frame_mask, grey, mask_rgb, origin, rows};
+use super::folder::{Folder, extrinsics, frame_mask, grey, mask_rgb, origin, rows};
 use crate::capture::synth::Synthetic;
 use crate::capture::{CaptureError, Frame};
 
@@ -40,7 +40,8 @@ pub(super) fn write(synthetic: &Synthetic, folder: &Folder<'_>) -> Result<(), Ca
     })
 }
 
-/// Body and camera of a frame. The layout has no translation of the body, so the camera moves instead.
+/// Body and camera of a frame. The layout has no translation of the body, so the camera moves
+/// instead.
 fn record(body: &BodyModel, frame: &Frame) -> Value {
     let (rotation, translation) = origin(frame);
     // A turn about the pelvis in place of one about the origin.

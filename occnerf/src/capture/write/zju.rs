@@ -4,8 +4,9 @@ use glam::{Mat3, Vec3};
 use image::GrayImage;
 use serde_json::{Value, json};
 
-use super::{Folder, Py, flat, origin, rgb, rows};
-use crate::capture::obstacle::Area;
+use super::folder::{Folder, flat, origin, rgb, rows};
+use super::pickle::Py;
+use crate::capture::pixels::Area;
 use crate::capture::synth::Synthetic;
 use crate::capture::{CaptureError, Frame, Image};
 

@@ -107,7 +107,7 @@ fn lenses(cams: &Record<'_>, options: &LoadOptions) -> Result<Vec<Lens>, Capture
                 rotation(values, 3).ok_or_else(|| cams.invalid(&key("R"), "a rotation", format!("{values:?}")))?;
             let translation = Vec3::from_slice(&t[3 * camera..]) / MILLIMETRES;
             let extrinsics = Affine3A::from_mat3_translation(rotation, translation);
-            let camera_of = pinhole(&k[9 * camera..9 * camera + 9], extrinsics, options)
+            let camera_of = pinhole(&k[9 * camera..9 * camera + 9], extrinsics, options.pixel_centre)
                 .map_err(|error| cams.invalid(&key("K"), "a pinhole camera", error))?;
             let d = &d[5 * camera..5 * camera + 5];
             let distortion = Distortion::from_opencv([d[0], d[1], d[2], d[3], d[4]]);

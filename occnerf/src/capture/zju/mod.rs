@@ -1,13 +1,15 @@
 //! Raw ZJU-MoCap (Peng et al. 2021), many cameras around one person.
 //!
 //! ```text
-//! annots.npy                   {cams: {K (C,3,3), R (C,3,3), T (C,3) in millimetres, D (C,5)?}, ims: [{ims: [paths]}]}
-//! Camera_B1/000000.jpg …       the paths of `ims`: a frame's pictures, the folder telling the camera
-//! mask_cihp/Camera_B1/… .png   labels, 0 being background; or mask/, and where there are both, either
-//! new_params/0.npy …           {poses (1,3J), Rh (1,3), Th (1,3), shapes (1,≤B)}, counted from 0, or all from 1
+//! annots.npy                   {cams: {K (C,3,3), R (C,3,3), T (C,3) in millimetres, D (C,5)?},
+//!                               ims: [{ims: [paths]}]}
+//! Camera_B1/000000.jpg …       the paths of `ims`: a frame's pictures, a folder a camera
+//! mask_cihp/Camera_B1/… .png   labels, 0 being background; or mask/; where there are both, either
+//! new_params/0.npy …           {poses (1,3J), Rh (1,3), Th (1,3), shapes (1,≤B)}, counted from 0,
+//!                              or all from 1
 //! new_vertices/0.npy …         (V,3), where present compared with the model
-//! occlusion.json               {camera, image_size (w,h), rect {x0, y0, x1, y1}, frames}, where present; of one that
-//!                              moves, also rects, one for each of frames
+//! occlusion.json               {camera, image_size (w,h), rect {x0, y0, x1, y1}, frames}, where
+//!                              present; of one that moves, also rects, one for each of frames
 //! ```
 
 mod annots;
@@ -25,11 +27,12 @@ use smpl::{BodyModel, Placement};
 use self::annots::Annots;
 use super::decode::{Planned, View, budget};
 use super::image::dimensions;
-use super::pictures::file_name;
+use super::pictures::{file_name, is_directory};
 use super::records::{Record, Records, triples};
 use super::{Capture, CaptureError, EvalFrame, LoadOptions, checks};
 
-/// How far a vertex may be from where the file has it, as a fraction of the body's largest extent, 1 cm at 1.7 m.
+/// How far a vertex may be from where the file has it, as a fraction of the body's largest extent,
+/// 1 cm at 1.7 m.
 const VERTEX_TOLERANCE: f32 = 0.01 / 1.7;
 /// Longest `occlusion.json` that is read.
 const MAX_OCCLUSION_BYTES: u64 = 1 << 20;
@@ -78,7 +81,10 @@ pub(super) fn load(dir: &Path, body: &BodyModel, options: &LoadOptions) -> Resul
     for other in (0..annots.lenses.len()).filter(|&c| c != camera) {
         let mut kept = Vec::new();
         for index in (0..instants.len()).step_by(options.eval_stride) {
-            let there = annots.picture(instants[index], other).is_some_and(|path| dir.join(path).is_file());
+            let there = match annots.picture(instants[index], other).map(|path| dir.join(path)) {
+                Some(path) => !is_directory(&path)? && path.is_file(),
+                None => false,
+            };
             if let Some(frame) = if there { plan(other, index)? } else { None } {
                 kept.push(frame);
                 indices.push((other, index));
@@ -130,7 +136,8 @@ fn bodies(dir: &Path, annots: &Annots, instants: &[usize], body: &BodyModel) -> 
     // Some subjects count from 1; a folder that merely lacks 0.npy is not one of them.
     let last = annots.num_instants();
     let offset = usize::from(!file("new_params", 0).is_file() && file("new_params", last).is_file());
-    // Collected as results first, so that the error reported is the first in order whatever finishes first.
+    // Collected as results first, so that the error reported is the first in order whatever
+    // finishes first.
     let fitted: Vec<Result<Fitted, CaptureError>> = instants
         .par_iter()
         .map(|&instant| {

@@ -29,9 +29,9 @@ impl Corrections {
     }
 }
 
-/// Backward of [`corrected`] for points that keep still while the body moves: `wrenches` (J) gather, over all points, the
-/// gradients with respect to the points' place *relative to the body*, in world axes, shared out by skinning weight.
-/// `after` is the result of [`corrected`].
+/// Backward of [`corrected`] for points that keep still while the body moves: `wrenches` (J)
+/// gather, over all points, the gradients with respect to the points' place *relative to the body*,
+/// in world axes, shared out by skinning weight. `after` is the result of [`corrected`].
 pub(crate) fn correct_backward(
     model: &BodyModel,
     posed: &Posed,
@@ -44,7 +44,8 @@ pub(crate) fn correct_backward(
     let changes = changes(model, posed, correction);
     for j in (0..subtree.len()).rev() {
         let Wrench { force, moment } = subtree[j];
-        // A turn of the joint by ω carries the body along by ω × (x − J), and a still point the other way.
+        // A turn of the joint by ω carries the body along by ω × (x − J), and a still point the
+        // other way.
         let d_turn = Vec3A::from(after.joints[j]).cross(force) - moment;
         let axes = posed.bones[j].matrix3;
         let before = model.parents[j].map_or(axes, |parent| changes[parent].matrix3 * axes);

@@ -189,7 +189,8 @@ mod tests {
                     };
                     let h = 2e-4;
                     let numeric = (at(h) - at(-h)) / (2.0 * f64::from(h));
-                    // Some ReLU of some sample switches within any step; their share of the derivative is small.
+                    // Some ReLU of some sample switches within any step; their share of the
+                    // derivative is small.
                     let scale = 0.03 * dot.abs().max(1.0);
                     assert!((numeric - dot).abs() < scale, "{method:?} part {part}: {numeric} {dot}");
                 }

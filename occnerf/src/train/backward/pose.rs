@@ -55,8 +55,8 @@ pub(crate) struct Anchor<'a> {
 }
 
 impl<'a> Anchor<'a> {
-    /// Of the point `x` whose nearest surface point lies on `face` at `barycentric`; `None` where a fold is so sharp that the
-    /// map takes one bone for all.
+    /// Anchors the point `x` whose nearest surface point lies on `face` at `barycentric`; `None`
+    /// where a fold is so sharp that the map takes one bone for all.
     pub fn new(model: &'a BodyModel, posed: &'a Posed, face: u32, barycentric: [f32; 3], x: Vec3) -> Option<Self> {
         let (corners, bones) = (model.faces[face as usize], &posed.bones[..]);
         let mut to_world = Affine3A { matrix3: Mat3A::ZERO, translation: Vec3A::ZERO };
@@ -109,7 +109,8 @@ mod tests {
     use crate::train::trainer::Trainer;
     use smpl::MotionFrame;
 
-    /// Value = Σ c · features(x) + e · d(x) + p · f(x) of points x that keep still while the pose is corrected.
+    /// Value = Σ c · features(x) + e · d(x) + p · f(x) of points x that keep still while the pose
+    /// is corrected.
     #[test]
     fn gradient_of_the_pose_agrees_with_finite_differences() {
         let body = BodyModel::embedded();
@@ -132,7 +133,8 @@ mod tests {
                 let normal = (b - a).cross(c - a).normalize_or_zero();
                 points.push((a + b + c) / 3.0 + ((f % 9) as f32 / 8.0 * 0.024 - 0.012) * normal);
             }
-            // Which points live, and on which face, is decided once: the value jumps where that changes.
+            // Which points live, and on which face, is decided once: the value jumps where that
+            // changes.
             let mut surface = PosedSurface::new(&scene.body, CELL).unwrap();
             let mut trace = |posed: &Posed, batch: &mut SampleBatch| -> Vec<usize> {
                 surface.refit(&scene.body, posed, &model.extent, &config);
@@ -198,7 +200,8 @@ mod tests {
             let (nn, aa, na) =
                 (dot(&numeric_all, &numeric_all), dot(&analytic_all, &analytic_all), dot(&numeric_all, &analytic_all));
             let (cosine, ratio) = (na / (nn * aa).sqrt(), (aa / nn).sqrt());
-            // The surface is not flat: what slides along a tangent plane there is a tenth or two off here.
+            // The surface is not flat: what slides along a tangent plane there is a tenth or two
+            // off here.
             assert!(cosine > 0.9 && (0.85..1.2).contains(&ratio), "{method:?}: cosine {cosine}, ratio {ratio}");
         }
     }

@@ -10,7 +10,7 @@ use smpl::{MotionField, MotionFrame, SurfaceMotion, SurfacePoint, WeightVolume, 
 use surface_query::{MeshDistance, SurfaceQuery, SurfaceQueryConfig};
 use volrender::{Aabb, Ray, RaySamples, bin_edges, bin_midpoints, bin_widths, composite};
 
-use super::{Figure, Kernel, REACH, Random, mean, median};
+use super::figure::{Figure, Kernel, REACH, Random, mean, median};
 
 /// Signed distance: the blend of the k nearest vertices against the exact closest point.
 pub fn distance(figure: &Figure) -> Result<Kernel> {

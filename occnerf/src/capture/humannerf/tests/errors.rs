@@ -1,4 +1,5 @@
-//! Every fault of a capture is one line that names the file, the key, what was expected and what was found.
+//! Every fault of a capture is one line that names the file, the key, what was expected and what
+//! was found.
 
 use super::fixture::Fixture;
 use crate::capture::testing::{Py, array, body};
@@ -190,6 +191,37 @@ fn cameras_that_cannot_be() {
     fails("scaled", &["frame_000000.extrinsics", "rotation"], everywhere(matrix([1.1, -1.1, -1.1], 4.0)));
     let k = [-8.0, 0.0, 3.0, 0.0, 8.0, 2.0, 0.0, 0.0, 1.0];
     fails("focal", &["frame_000001.intrinsics", "pinhole"], cameras(&[FRAME, "intrinsics"], array(&[3, 3], &k)));
+}
+
+#[test]
+fn numbers_that_nothing_in_the_world_has() {
+    let pose = |x: f64| array(&[6], &[0.0, 0.0, 0.0, 0.0, x, 0.0]);
+    fails("wild-pose", &["frame_000001.poses", "1000"], infos(&[FRAME, "poses"], pose(1e30)));
+    fails("wild-turn", &["frame_000001.Rh", "1000"], infos(&[FRAME, "Rh"], array(&[3], &[0.0, -1e30, 0.0])));
+    fails("far", &["frame_000001.Th", "10000000"], infos(&[FRAME, "Th"], array(&[3], &[0.0, 0.0, -1e38])));
+    fails("wild-shape", &["frame_000001.betas", "1000"], infos(&[FRAME, "betas"], array(&[1], &[1e30])));
+    let lens = |f: f64, c: f64| array(&[3, 3], &[f, 0.0, c, 0.0, f, 2.0, 0.0, 0.0, 1.0]);
+    for (f, c) in [(1e-30, 3.0), (1e30, 3.0), (8.0, -1e30)] {
+        fails("wild-lens", &["frame_000001.intrinsics", "pinhole", "10000000"], |fixture| {
+            fixture.cameras.set(&[FRAME, "intrinsics"], lens(f, c));
+            fixture.write();
+        });
+    }
+}
+
+/// Its views would be passed over in silence.
+#[cfg(unix)]
+#[test]
+fn links_that_lead_nowhere_or_in_a_circle_are_named() {
+    for target in ["nowhere", "eval"] {
+        fails("link", &["eval"], |f| {
+            std::fs::remove_dir_all(f.dir.join("eval")).unwrap();
+            std::os::unix::fs::symlink(target, f.dir.join("eval")).unwrap();
+        });
+    }
+    fails("camera-link", &["eval/Camera_B9"], |f| {
+        std::os::unix::fs::symlink("nowhere", f.dir.join("eval/Camera_B9")).unwrap();
+    });
 }
 
 #[test]

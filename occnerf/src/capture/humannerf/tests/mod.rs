@@ -131,7 +131,8 @@ fn the_shared_capture_is_read() {
         assert_eq!(capture.train[eval.train_index].pose, eval.frame.pose);
         assert_eq!(capture.train[eval.train_index].placement, eval.frame.placement);
     }
-    // The posed prior covers the unoccluded subject: poses, placement and cameras are read the right way.
+    // The posed prior covers the unoccluded subject: poses, placement and cameras are read the
+    // right way.
     for eval in capture.eval.iter().step_by(9) {
         let overlap = overlap(&eval.frame, &body);
         assert!(overlap > 0.6, "{} {}: {overlap}", eval.camera_name, eval.frame.name);

@@ -1,10 +1,12 @@
-//! Every fault of a capture is one line that names the file, the key, what was expected and what was found.
+//! Every fault of a capture is one line that names the file, the key, what was expected and what
+//! was found.
 
 use super::fixture::{Fixture, SIZE, record};
 use crate::capture::testing::{Py, array, body, damaged};
 use crate::capture::{LoadOptions, load_capture};
 
-/// Breaks a fresh capture, writes its pickles, and checks that the message holds all of `words` and is one line.
+/// Breaks a fresh capture, writes its pickles, and checks that the message holds all of `words` and
+/// is one line.
 #[track_caller]
 fn fails(name: &str, words: &[&str], breakage: impl FnOnce(&mut Fixture)) {
     let mut fixture = Fixture::new(&format!("zju-{name}"));

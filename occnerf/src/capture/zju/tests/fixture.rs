@@ -56,7 +56,8 @@ impl Fixture {
         fixture
     }
 
-    /// Masks that show columns 4 to 7 between them: labels 1 and 2 on 4 to 6 in one, 1 on 7 in the other.
+    /// Masks that show columns 4 to 7 between them: labels 1 and 2 on 4 to 6 in one, 1 on 7 in the
+    /// other.
     pub fn masks(&self, picture: &str, shown: bool) {
         let shown = u8::from(shown);
         let labels = |x, _| shown * [0, 0, 0, 0, 1, 2, 1, 0, 0, 0, 0, 0][x as usize];
@@ -64,7 +65,8 @@ impl Fixture {
         self.dir.picture(&format!("mask/{picture}.png"), SIZE, |x, _| shown * u8::from(x == 7));
     }
 
-    /// Writes the pickles, after a test has changed what is in them, and the vertices of the last instant.
+    /// Writes the pickles, after a test has changed what is in them, and the vertices of the last
+    /// instant.
     pub fn write(&self) {
         self.dir.write("annots.npy", self.annots.npy());
         for i in 0..3 {

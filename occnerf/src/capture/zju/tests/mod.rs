@@ -139,7 +139,8 @@ fn hidden_pixels_never_reach_training_and_kept_back_views_are_whole() {
 #[test]
 fn a_lower_obstacle_hides_its_part_about_the_middle_row() {
     let fixture = Fixture::new("zju-low");
-    // The subject is four columns of eight rows; of the four rows in the middle two columns are a quarter of it.
+    // The subject is four columns of eight rows; of the four rows in the middle two columns are a
+    // quarter of it.
     let low = Obstacle { fraction: 0.25, share: 1.0, height: 0.5, ..Obstacle::default() };
     for (fraction, columns) in [(0.25, 5..7), (0.5, 4..8)] {
         let options = LoadOptions { occlusion: Some(Obstacle { fraction, ..low }), ..LoadOptions::default() };

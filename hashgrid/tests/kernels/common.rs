@@ -1,0 +1,75 @@
+//! What the tests of this crate share.
+
+use hashgrid::HashGrid;
+use proptest::prelude::*;
+
+/// The (L, 2^T, F) table of the oracle, holes 0, from the compact one.
+pub fn padded<const D: usize>(grid: &HashGrid<D>, table: &[f32], log2: u32, f: usize) -> Vec<f32> {
+    let rows = 1usize << log2;
+    let mut padded = vec![0.0; grid.resolutions().len() * rows * f];
+    for l in 0..grid.resolutions().len() {
+        let level = &table[grid.level_range(l)];
+        padded[l * rows * f..][..level.len()].copy_from_slice(level);
+    }
+    padded
+}
+
+pub fn oracle<const D: usize>(grid: &HashGrid<D>, table: &[f32], points: &[[f32; D]], log2: u32, f: usize) -> Vec<f64> {
+    let points: Vec<f64> = points.iter().flatten().map(|&x| f64::from(x)).collect();
+    let table = padded(grid, table, log2, f);
+    testkit::oracle::hash_encode(&points, D, grid.resolutions(), &table, log2, f)
+}
+
+pub fn encode<const D: usize>(grid: &HashGrid<D>, table: &[f32], points: &[[f32; D]]) -> Vec<f32> {
+    let mut features = vec![f32::NAN; points.len() * grid.num_features()];
+    grid.encode(table, points, &mut features);
+    features
+}
+
+/// [`encode`], a row for each point.
+pub fn encode_rows<const D: usize>(grid: &HashGrid<D>, table: &[f32], points: &[[f32; D]]) -> Vec<f32> {
+    let features = encode(grid, table, points);
+    let mut rows = vec![f32::NAN; features.len()];
+    grid.layout(points.len()).to_rows(&features, 0..points.len(), &mut rows, grid.num_features());
+    rows
+}
+
+/// A table with values of magnitude one: those of `init_table` are too small to show an error.
+pub fn table<const D: usize>(grid: &HashGrid<D>, seed: u64) -> Vec<f32> {
+    grid.init_table(seed).iter().map(|x| x * 1e4).collect()
+}
+
+/// Coordinates mostly inside, sometimes on or beyond the ends, on faces, or no number at all.
+pub fn coordinate() -> impl Strategy<Value = f32> {
+    prop_oneof![
+        12 => 0.0f32..=1.0,
+        1 => Just(0.0),
+        1 => Just(1.0),
+        1 => (0u32..=16).prop_map(|i| i as f32 / 16.0),
+        1 => -3.0f32..4.0,
+        1 => prop::sample::select(vec![
+            -0.0, f32::NAN, f32::INFINITY, f32::NEG_INFINITY, 1e-42, 1.0 - f32::EPSILON / 2.0, f32::MAX,
+        ]),
+    ]
+}
+
+pub fn points<const D: usize>(count: std::ops::Range<usize>) -> impl Strategy<Value = Vec<[f32; D]>> {
+    let point = prop::collection::vec(coordinate(), D).prop_map(|x| <[f32; D]>::try_from(x).expect("D coordinates"));
+    prop::collection::vec(point, count)
+}
+
+/// Numbers in ±1 that do not matter otherwise.
+pub fn noise(n: usize, seed: u64) -> Vec<f32> {
+    let mut state = seed.wrapping_mul(0x9E37_79B9_7F4A_7C15) | 1;
+    (0..n)
+        .map(|_| {
+            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            (state >> 40) as f32 / (1u32 << 23) as f32 - 1.0
+        })
+        .collect()
+}
+
+pub fn dot(a: &[f32], b: &[f32]) -> f64 {
+    assert_eq!(a.len(), b.len());
+    a.iter().zip(b).map(|(&a, &b)| f64::from(a) * f64::from(b)).sum()
+}

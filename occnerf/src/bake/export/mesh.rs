@@ -1,0 +1,83 @@
+//! One pose as a Wavefront OBJ with its material and picture.
+
+use std::fmt::Write as _;
+use std::path::Path;
+
+use glam::{Vec2, Vec3};
+
+use crate::Error;
+use crate::bake::{Atlas, Avatar, write_whole};
+
+/// Writes `path` (`.obj`) and beside it the same name with `.mtl` and `.png`: the avatar's outermost shell with
+/// `vertices` (V) and `normals` (V) in their places, colours at the vertices (`v x y z r g b`, sRGB from 0 to 1) and
+/// texture coordinates.
+///
+/// # Errors
+/// [`Error::Bake`] for other numbers of vertices or normals and for an avatar without shells; [`Error::Io`].
+pub fn write_obj(avatar: &Avatar, vertices: &[Vec3], normals: &[Vec3], path: &Path) -> Result<(), Error> {
+    let v = avatar.num_vertices();
+    if vertices.len() != v || normals.len() != v {
+        let found = (vertices.len(), normals.len());
+        return Err(Error::Bake(format!("mesh: expected {v} vertices and normals, found {found:?}")));
+    }
+    let Some(outermost) = avatar.shell_ends.len().checked_sub(1) else {
+        return Err(Error::Bake("mesh: the avatar has no shells".to_owned()));
+    };
+    // Only what the shell uses, in the order in which it is used.
+    let mut places = vec![0u32; v];
+    let mut used: Vec<usize> = Vec::new();
+    let faces: Vec<[u32; 3]> = (avatar.shell(outermost).iter())
+        .map(|face| {
+            face.map(|index| {
+                let place = &mut places[index as usize];
+                if *place == 0 {
+                    used.push(index as usize);
+                    *place = used.len() as u32;
+                }
+                *place
+            })
+        })
+        .collect();
+    let file_name = |extension: &str| {
+        // Names with blanks or line ends would not survive in an OBJ's statements.
+        let name = path.with_extension(extension).file_name().unwrap_or_default().to_string_lossy().into_owned();
+        name.chars().map(|c| if c.is_whitespace() || c.is_control() { '_' } else { c }).collect::<String>()
+    };
+    let (material, picture) = (file_name("mtl"), file_name("png"));
+    let mut text = format!("# metres, y up; colours of vertices in sRGB\nmtllib {material}\no person\nusemtl person\n");
+    for &i in &used {
+        let (at, color) = (vertices[i], avatar.atlas.color(avatar.uvs[i]));
+        let _ = writeln!(text, "v {:.6} {:.6} {:.6} {:.4} {:.4} {:.4}", at.x, at.y, at.z, color.x, color.y, color.z);
+    }
+    for &i in &used {
+        // OBJ counts v upward.
+        let _ = writeln!(text, "vt {:.6} {:.6}", avatar.uvs[i].x, 1.0 - avatar.uvs[i].y);
+    }
+    for &i in &used {
+        let n = normals[i];
+        let _ = writeln!(text, "vn {:.4} {:.4} {:.4}", n.x, n.y, n.z);
+    }
+    for [a, b, c] in faces {
+        let _ = writeln!(text, "f {a}/{a}/{a} {b}/{b}/{b} {c}/{c}/{c}");
+    }
+    let library = format!("newmtl person\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd {picture}\n");
+    write_whole(&path.with_file_name(picture), &avatar.atlas.to_png()?)?;
+    write_whole(&path.with_file_name(material), library.as_bytes())?;
+    write_whole(path, text.as_bytes())
+}
+
+impl Atlas {
+    /// The colour at a place in the atlas, sRGB in [0, 1], interpolated between the four nearest texels' centres.
+    pub(super) fn color(&self, uv: Vec2) -> Vec3 {
+        let (width, height) = (self.width as usize, self.height as usize);
+        let at = uv * Vec2::new(width as f32, height as f32) - 0.5;
+        let (low, share) = (at.floor(), at - at.floor());
+        let texel = |x: f32, y: f32| {
+            let (x, y) = ((x.max(0.0) as usize).min(width - 1), (y.max(0.0) as usize).min(height - 1));
+            let bytes = &self.rgba[4 * (y * width + x)..][..3];
+            Vec3::new(f32::from(bytes[0]), f32::from(bytes[1]), f32::from(bytes[2])) / 255.0
+        };
+        let row = |y: f32| texel(low.x, y).lerp(texel(low.x + 1.0, y), share.x);
+        row(low.y).lerp(row(low.y + 1.0), share.y)
+    }
+}

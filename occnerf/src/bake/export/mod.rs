@@ -1,0 +1,62 @@
+//! Avatars in the forms that other programs open.
+
+mod glb;
+mod mesh;
+mod motion;
+mod splats;
+
+pub use glb::to_glb;
+pub use mesh::write_obj;
+pub use motion::{adapt_motion, write_amass};
+pub use splats::{Splats, splats};
+
+use std::io::Cursor;
+
+use image::codecs::png::{CompressionType, FilterType, PngEncoder};
+use image::{ExtendedColorType, ImageEncoder};
+
+use super::Atlas;
+use crate::Error;
+
+impl Atlas {
+    /// The colours as a PNG, without alpha where every texel is opaque.
+    ///
+    /// # Errors
+    /// [`Error::Bake`] where the encoder refuses, as for a picture that is not (H, W, 4).
+    pub fn to_png(&self) -> Result<Vec<u8>, Error> {
+        if self.is_opaque() {
+            let rgb: Vec<u8> = self.rgba.chunks_exact(4).flat_map(|texel| [texel[0], texel[1], texel[2]]).collect();
+            return self.encode(&rgb, ExtendedColorType::Rgb8);
+        }
+        self.encode(&self.rgba, ExtendedColorType::Rgba8)
+    }
+
+    /// The confidence as a grey PNG.
+    ///
+    /// # Errors
+    /// As [`Atlas::to_png`].
+    pub fn confidence_to_png(&self) -> Result<Vec<u8>, Error> {
+        self.encode(&self.confidence, ExtendedColorType::L8)
+    }
+
+    /// Whether nothing shines through.
+    #[must_use]
+    pub fn is_opaque(&self) -> bool {
+        self.rgba.chunks_exact(4).all(|texel| texel[3] == 255)
+    }
+
+    fn encode(&self, values: &[u8], kind: ExtendedColorType) -> Result<Vec<u8>, Error> {
+        let mut bytes = Cursor::new(Vec::new());
+        let fault = |error: image::ImageError| Error::Bake(format!("atlas: {error}"));
+        // The encoder asserts what it is given.
+        let channels = usize::from(kind.channel_count());
+        if values.len() != self.width as usize * self.height as usize * channels {
+            let (w, h) = (self.width, self.height);
+            return Err(Error::Bake(format!("atlas: {} values for {w}×{h}×{channels}", values.len())));
+        }
+        PngEncoder::new_with_quality(&mut bytes, CompressionType::Best, FilterType::Adaptive)
+            .write_image(values, self.width, self.height, kind)
+            .map_err(fault)?;
+        Ok(bytes.into_inner())
+    }
+}

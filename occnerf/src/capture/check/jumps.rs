@@ -1,0 +1,66 @@
+//! Frames where a fit jumps.
+
+use glam::{Quat, Vec3};
+use smpl::BodyModel;
+
+use super::Fault;
+use crate::capture::{Capture, Frame};
+
+/// A step is a jump if it is this many times the median step, and at least this large.
+const TIMES: f32 = 8.0;
+/// Of the pelvis across the view, in multiples of its depth; and of its depth, as a logarithm.
+const PLACE: f32 = 0.08;
+const DEPTH: f32 = 0.25;
+/// Of the joint that turns most, radians.
+const TURN: f32 = 1.2;
+
+/// The jumps of each frame from the one before it.
+pub(super) fn find(capture: &Capture, body: &BodyModel) -> Vec<Vec<Fault>> {
+    let states: Vec<State> = capture.train.iter().map(|frame| State::of(frame, body)).collect();
+    let steps: Vec<[f32; 3]> = states.windows(2).map(|pair| pair[0].step(&pair[1])).collect();
+    let median = |i: usize| {
+        let mut values: Vec<f32> = steps.iter().map(|step| step[i]).collect();
+        values.sort_by(f32::total_cmp);
+        values.get(values.len() / 2).copied().unwrap_or(0.0)
+    };
+    let limits = [PLACE, DEPTH, TURN].iter().enumerate().map(|(i, least)| least.max(TIMES * median(i)));
+    let limits: Vec<f32> = limits.collect();
+    let faults = |step: &[f32; 3]| {
+        let mut faults = Vec::new();
+        // NaN, of a pelvis behind the camera, is no jump: it does not fit anyway.
+        if step[0] > limits[0] || step[1] > limits[1] {
+            faults.push(Fault::PlaceJump);
+        }
+        if step[2] > limits[2] {
+            faults.push(Fault::PoseJump);
+        }
+        faults
+    };
+    let first = if states.is_empty() { None } else { Some(Vec::new()) };
+    first.into_iter().chain(steps.iter().map(faults)).collect()
+}
+
+/// Where a body is in its camera, and how its joints are turned.
+struct State {
+    pelvis: Vec3,
+    bones: Vec<Quat>,
+}
+
+impl State {
+    fn of(frame: &Frame, body: &BodyModel) -> Self {
+        let posed = body.pose(&body.shaped(&frame.betas), &frame.pose, frame.placement);
+        let camera = frame.camera.world_to_camera;
+        let turn = |bone: &glam::Affine3A| Quat::from_mat3a(&(camera.matrix3 * bone.matrix3));
+        let pelvis = posed.joints.first().copied().unwrap_or(Vec3::ZERO);
+        Self { pelvis: camera.transform_point3(pelvis), bones: posed.bones.iter().map(turn).collect() }
+    }
+
+    /// How far the pelvis moves across the view and in depth, and the largest turn of a joint.
+    fn step(&self, next: &Self) -> [f32; 3] {
+        let direction = |p: Vec3| p.truncate() / p.z;
+        let across = direction(self.pelvis).distance(direction(next.pelvis));
+        let depth = (next.pelvis.z / self.pelvis.z).ln().abs();
+        let turn = self.bones.iter().zip(&next.bones).map(|(a, b)| a.angle_between(*b));
+        [across, depth, turn.fold(0.0, f32::max)]
+    }
+}

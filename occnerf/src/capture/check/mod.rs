@@ -1,0 +1,245 @@
+//! Whether a fit lies on the person, before anything is trained on it.
+//!
+//! [`check`] compares the posed body's silhouette with the mask of every frame, looks for sudden jumps, and names the
+//! usual mistakes ([`Mistake`]) when undoing them would make a poor fit good.
+
+mod jumps;
+mod mistakes;
+mod silhouette;
+#[cfg(test)]
+mod tests;
+
+pub use self::mistakes::Mistake;
+
+use glam::Vec3;
+use rayon::prelude::*;
+use smpl::BodyModel;
+use visibility::{RayMesh, View as Pinhole, visible_vertices};
+use volrender::Camera;
+
+use self::mistakes::{Overlap, outline};
+use super::{Capture, CaptureError, Frame, Image, Pixels};
+use crate::{Label, OccludedRule, label_pixels};
+
+/// Longest side in pixels of the pictures that silhouettes are compared at.
+const SIDE: u32 = 192;
+/// Frames that mistakes are looked for in, and that say what is seen of the surface.
+const VIEWS: usize = 48;
+const SURFACE_VIEWS: usize = 32;
+/// Overlap below which a frame does not fit.
+const LEAST_IOU: f32 = 0.6;
+
+/// Something wrong with one frame.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum Fault {
+    /// The mask shows nobody.
+    EmptyMask,
+    /// The silhouette and the mask do not overlap.
+    Overlap,
+    /// The body moves much further than between other frames.
+    PlaceJump,
+    /// Joints turn much further than between other frames.
+    PoseJump,
+}
+
+impl Fault {
+    /// A few words for tables.
+    #[must_use]
+    pub fn words(self) -> &'static str {
+        match self {
+            Self::EmptyMask => "mask empty",
+            Self::Overlap => "does not fit",
+            Self::PlaceJump => "jump of place or camera",
+            Self::PoseJump => "jump of pose",
+        }
+    }
+}
+
+/// One frame.
+#[derive(Clone, Debug, PartialEq)]
+pub struct FrameCheck {
+    /// As in the capture.
+    pub name: String,
+    /// Intersection over union of the silhouette with the mask and the unknown pixels within the silhouette; `None` where
+    /// there is neither mask nor silhouette.
+    pub iou: Option<f32>,
+    /// Share of the silhouette that is unknown.
+    pub hidden: f32,
+    /// What is wrong.
+    pub faults: Vec<Fault>,
+}
+
+/// A whole capture.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Check {
+    /// The training frames in order.
+    pub frames: Vec<FrameCheck>,
+    /// Share of the body's vertices that some frame shows at a pixel of the mask.
+    pub surface_seen: f32,
+    /// Likely mistakes; none for a good capture.
+    pub mistakes: Vec<Mistake>,
+}
+
+impl Check {
+    /// Mean overlap of the frames that have one.
+    #[must_use]
+    pub fn mean_iou(&self) -> f32 {
+        let ious: Vec<f32> = self.frames.iter().filter_map(|frame| frame.iou).collect();
+        ious.iter().sum::<f32>() / ious.len().max(1) as f32
+    }
+
+    /// Mean share of the silhouette that is unknown.
+    #[must_use]
+    pub fn mean_hidden(&self) -> f32 {
+        self.frames.iter().map(|frame| frame.hidden).sum::<f32>() / self.frames.len().max(1) as f32
+    }
+}
+
+/// A frame's mask, small.
+struct View {
+    index: usize,
+    camera: Camera,
+    mask: Vec<bool>,
+    occluder: Option<Vec<bool>>,
+}
+
+/// Checks the training frames.
+///
+/// # Errors
+/// Pictures that cannot be read.
+pub fn check(capture: &Capture, body: &BodyModel) -> Result<Check, CaptureError> {
+    let small = small_views(capture)?;
+    let mut frames: Vec<FrameCheck> =
+        small.par_iter().map(|view| one(&capture.train[view.index], view, body)).collect();
+    for (frame, faults) in frames.iter_mut().zip(jumps::find(capture, body)) {
+        frame.faults.extend(faults);
+    }
+    let mistakes = likely(capture, body, small);
+    Ok(Check { frames, surface_seen: surface_seen(capture, body)?, mistakes })
+}
+
+/// The mistakes that some of the frames with a mask tell of.
+fn likely(capture: &Capture, body: &BodyModel, small: Vec<View>) -> Vec<Mistake> {
+    let shown: Vec<View> = small.into_iter().filter(|view| view.mask.contains(&true)).collect();
+    let every = shown.len().div_ceil(VIEWS).max(1);
+    let views: Vec<View> = shown.into_iter().step_by(every).collect();
+    if views.is_empty() { Vec::new() } else { mistakes::find(capture, body, &views) }
+}
+
+fn small_views(capture: &Capture) -> Result<Vec<View>, CaptureError> {
+    let small: Vec<Result<View, CaptureError>> =
+        capture.train.par_iter().enumerate().map(|(i, frame)| View::new(i, frame)).collect();
+    small.into_iter().collect()
+}
+
+/// Pixels (H × W) of a frame's picture that the posed body covers.
+#[must_use]
+pub fn body_silhouette(frame: &Frame, body: &BodyModel) -> Vec<bool> {
+    outline(frame, &frame.camera, body)
+}
+
+/// The picture of a frame as it was taken, what its mask hides included, for people to look at; for pixels that are in
+/// memory alone, what the mask shows.
+///
+/// # Errors
+/// Pictures that cannot be read.
+pub fn photograph(frame: &Frame) -> Result<Image, CaptureError> {
+    match frame.source.photograph() {
+        Some(image) => image,
+        None => Ok(frame.pixels()?.image.clone()),
+    }
+}
+
+/// Pixels (H × W) of a frame of which nothing is known, where `silhouette` is the body's.
+#[must_use]
+pub fn unknown_pixels(frame: &Frame, pixels: &Pixels, silhouette: &[bool], body: &BodyModel) -> Vec<bool> {
+    unknown(&pixels.mask, silhouette, pixels.occluder.as_deref(), &frame.camera, frame, body)
+}
+
+fn unknown(
+    mask: &[f32],
+    silhouette: &[bool],
+    occluder: Option<&[bool]>,
+    camera: &Camera,
+    frame: &Frame,
+    body: &BodyModel,
+) -> Vec<bool> {
+    let posed = body.pose(&body.shaped(&frame.betas), &frame.pose, frame.placement);
+    let pelvis = posed.joints.first().copied().unwrap_or(Vec3::ZERO);
+    let depth = camera.world_to_camera.transform_point3(pelvis).z.max(1e-3);
+    let scale = camera.focal.x / depth;
+    let labels = label_pixels(OccludedRule::Unknown, mask, silhouette, occluder, camera.width as usize, scale);
+    labels.into_iter().map(|label| label == Label::Unknown).collect()
+}
+
+impl View {
+    fn new(index: usize, frame: &Frame) -> Result<Self, CaptureError> {
+        let pixels = frame.pixels()?;
+        let (width, height) = (frame.camera.width, frame.camera.height);
+        let scale = (f64::from(SIDE) / f64::from(width.max(height))).min(1.0);
+        let side = |n: u32| ((f64::from(n) * scale).round() as u32).max(1);
+        let camera = frame.camera.resized(side(width), side(height));
+        // The pixel that holds the small one's centre.
+        let source = |i: u32| {
+            let (x, y) = (i % camera.width, i / camera.width);
+            let at = |i: u32, small: u32, large: u32| (2 * i + 1) as usize * large as usize / (2 * small as usize);
+            at(y, camera.height, height) * width as usize + at(x, camera.width, width)
+        };
+        let count = camera.width * camera.height;
+        let mask = (0..count).map(|i| pixels.mask[source(i)] > 0.5).collect();
+        let occluder = pixels.occluder.as_ref().map(|o| (0..count).map(|i| o[source(i)]).collect());
+        Ok(Self { index, camera, mask, occluder })
+    }
+}
+
+impl View {
+    /// Share of the picture's border that the mask has.
+    fn border(&self) -> f32 {
+        let (width, height) = (self.camera.width as usize, self.camera.height as usize);
+        let outer = |i: usize| i < width || i >= width * (height - 1) || i % width == 0 || i % width == width - 1;
+        let border: Vec<bool> = (0..self.mask.len()).filter(|&i| outer(i)).map(|i| self.mask[i]).collect();
+        border.iter().filter(|mask| **mask).count() as f32 / border.len().max(1) as f32
+    }
+}
+
+fn one(frame: &Frame, view: &View, body: &BodyModel) -> FrameCheck {
+    let silhouette = outline(frame, &view.camera, body);
+    let mask: Vec<f32> = view.mask.iter().map(|&m| f32::from(m)).collect();
+    let unknown = unknown(&mask, &silhouette, view.occluder.as_deref(), &view.camera, frame, body);
+    let (mut known, mut either, mut hidden) = (0, 0, 0);
+    for ((&body, &mask), &unknown) in silhouette.iter().zip(&view.mask).zip(&unknown) {
+        known += usize::from(body && (mask || unknown));
+        either += usize::from(body || mask);
+        hidden += usize::from(body && unknown && !mask);
+    }
+    let covered = silhouette.iter().filter(|c| **c).count();
+    let iou = (either > 0).then(|| known as f32 / either as f32);
+    let empty = !view.mask.contains(&true);
+    // Half of a fit that misses the mask is unknown: what counts then is the mask.
+    let beside = !empty && Overlap::of(&silhouette, view, false).covered() < 0.5;
+    let mut faults = Vec::new();
+    if empty {
+        faults.push(Fault::EmptyMask);
+    } else if beside || iou.is_some_and(|iou| iou < LEAST_IOU) {
+        faults.push(Fault::Overlap);
+    }
+    FrameCheck { name: frame.name.clone(), iou, hidden: hidden as f32 / covered.max(1) as f32, faults }
+}
+
+/// Share of the body's vertices that are seen at a pixel of the mask in at least one of up to 32 frames.
+fn surface_seen(capture: &Capture, body: &BodyModel) -> Result<f32, CaptureError> {
+    let every = capture.train.len().div_ceil(SURFACE_VIEWS).max(1);
+    let mut seen = vec![false; body.num_vertices()];
+    for frame in capture.train.iter().step_by(every) {
+        let posed = body.pose(&body.shaped(&frame.betas), &frame.pose, frame.placement);
+        // A body that cannot be hit by rays is not seen.
+        let Ok(mesh) = RayMesh::new(&posed.vertices, &body.faces) else { continue };
+        let usable: Vec<bool> = frame.pixels()?.mask.iter().map(|&mask| mask > 0.5).collect();
+        let Camera { width, height, world_to_camera, .. } = frame.camera;
+        let view = Pinhole { intrinsics: frame.camera.intrinsics(), extrinsics: world_to_camera, width, height };
+        let now = visible_vertices(&mesh, &posed.vertices, &view, Some(&usable));
+        seen.iter_mut().zip(now).for_each(|(seen, now)| *seen |= now);
+    }
+    Ok(seen.iter().filter(|seen| **seen).count() as f32 / seen.len().max(1) as f32)
+}

@@ -1,0 +1,231 @@
+//! Every mistake made on good captures, and none found in them.
+
+use glam::{Affine3A, Mat3, Quat, Vec3};
+use smpl::{BodyModel, Placement};
+
+use super::silhouette::silhouette;
+use super::*;
+use crate::capture::testing::{Directory, shared};
+use crate::capture::{DemoConfig, ImportOptions, LoadOptions, demo, import, load_capture};
+
+fn small_demo(body: &BodyModel, seed: u64) -> Capture {
+    let config = DemoConfig { size: 128, frames: 60, eval_cameras: 1, seed, ..DemoConfig::default() };
+    demo(&config, body).unwrap()
+}
+
+/// Good captures, each with its body.
+fn good() -> Vec<(String, Capture, BodyModel)> {
+    let body = BodyModel::embedded();
+    let mut found: Vec<(String, Capture, BodyModel)> =
+        (0..2).map(|seed| (format!("demo {seed}"), small_demo(&body, seed), body.clone())).collect();
+    if let Some(dir) = shared("captures") {
+        let body = BodyModel::load(&dir.join("../body/open_body.npz")).unwrap();
+        for name in ["zju_demo", "humannerf_demo", "ocmotion_like/mild", "ocmotion_like/severe"] {
+            let options = LoadOptions { eval_stride: 20, ..LoadOptions::default() };
+            let capture = load_capture(&dir.join(name), &body, &options).unwrap();
+            found.push((name.to_owned(), capture, body.clone()));
+        }
+    }
+    found
+}
+
+/// Parts of a capture's video.
+fn windows(capture: &Capture, length: usize, step: usize) -> Vec<Capture> {
+    let starts = (0..capture.train.len().saturating_sub(length - 1)).step_by(step);
+    let window = |start: usize| Capture { train: capture.train[start..start + length].to_vec(), ..capture.clone() };
+    starts.map(window).collect()
+}
+
+/// Makes a mistake.
+fn made(mistake: Mistake, capture: &Capture, body: &BodyModel) -> Capture {
+    let mut wrong = capture.clone();
+    let count = capture.train.len();
+    for (i, frame) in wrong.train.iter_mut().enumerate() {
+        let camera = &mut frame.camera;
+        match mistake {
+            Mistake::CameraToWorld => camera.world_to_camera = camera.world_to_camera.inverse(),
+            Mistake::CameraYUp => {
+                let flip = Affine3A::from_mat3(Mat3::from_diagonal(Vec3::new(1.0, -1.0, -1.0)));
+                camera.world_to_camera = flip * camera.world_to_camera;
+            }
+            // The root turned about the camera's x axis, as a fit for another axis up would have it.
+            Mistake::BodyUp(degrees) => {
+                let axis = camera.world_to_camera.inverse().transform_vector3(Vec3::X);
+                let turn = Quat::from_axis_angle(axis, (degrees as f32).to_radians());
+                let shaped = body.shaped(&frame.betas);
+                let pelvis = body.pose(&shaped, &frame.pose, frame.placement).joints[0];
+                match &mut frame.placement {
+                    Placement::Pelvis { .. } => {
+                        frame.pose[0] = (turn * Quat::from_scaled_axis(frame.pose[0])).to_scaled_axis();
+                    }
+                    Placement::Origin { rotation, translation } => {
+                        *rotation = (turn * Quat::from_scaled_axis(*rotation)).to_scaled_axis();
+                        *translation = pelvis - Quat::from_scaled_axis(*rotation) * shaped.joints[0];
+                    }
+                }
+            }
+            Mistake::Unit(factor) => {
+                camera.world_to_camera.translation *= factor;
+                let (Placement::Pelvis { translation } | Placement::Origin { translation, .. }) = &mut frame.placement;
+                *translation *= factor;
+            }
+            Mistake::Degrees => frame.pose.iter_mut().for_each(|axis| *axis *= 180.0 / std::f32::consts::PI),
+            Mistake::Focal(factor) => camera.focal *= factor,
+            Mistake::MaskInverted => {
+                frame.source.change(|pixels| pixels.mask.iter_mut().for_each(|m| *m = 1.0 - *m)).unwrap();
+            }
+            Mistake::FrameShift(by) => {
+                let other = (i as i32 - by).clamp(0, count as i32 - 1) as usize;
+                frame.source = capture.train[other].source.clone();
+            }
+            // Somebody else's motion, one and a half steps aside.
+            Mistake::WrongPerson => {
+                let other = &capture.train[(i + count / 3) % count];
+                (frame.pose, frame.placement) = (other.pose.clone(), other.placement);
+                let aside = Affine3A::from_translation(Vec3::X * 0.9);
+                frame.camera.world_to_camera = aside * other.camera.world_to_camera;
+            }
+            _ => panic!("{mistake:?}"),
+        }
+    }
+    wrong
+}
+
+fn same(found: Mistake, made: Mistake) -> bool {
+    match (found, made) {
+        // To half an octave.
+        (Mistake::Focal(a), Mistake::Focal(b)) => (a / b).log2().abs() < 0.6,
+        (found, made) => found == made,
+    }
+}
+
+#[test]
+fn good_captures_raise_no_alarm() {
+    let mut alarms = Vec::new();
+    for (name, capture, body) in good() {
+        let whole = check(&capture, &body).unwrap();
+        println!(
+            "{name}: overlap {:.3}, hidden {:.3}, surface {:.3}, faults {}, {:?}",
+            whole.mean_iou(),
+            whole.mean_hidden(),
+            whole.surface_seen,
+            whole.frames.iter().filter(|frame| !frame.faults.is_empty()).count(),
+            whole.mistakes,
+        );
+        let faults =
+            |check: &Check| check.frames.iter().filter(|f| f.faults.iter().any(|f| *f != Fault::EmptyMask)).count();
+        if !whole.mistakes.is_empty() || faults(&whole) > 0 {
+            alarms.push(format!("{name}: {:?}, {} faults", whole.mistakes, faults(&whole)));
+        }
+        for window in windows(&capture, 20, 20) {
+            let mistakes = likely(&window, &body, small_views(&window).unwrap());
+            if !mistakes.is_empty() {
+                alarms.push(format!("{name} from {}: {mistakes:?}", window.train[0].name));
+            }
+        }
+    }
+    assert!(alarms.is_empty(), "{alarms:#?}");
+}
+
+#[test]
+fn each_mistake_is_found() {
+    let captures = good();
+    let mut lines = Vec::new();
+    for mistake in [
+        Mistake::CameraToWorld,
+        Mistake::CameraYUp,
+        Mistake::BodyUp(180),
+        Mistake::BodyUp(90),
+        Mistake::BodyUp(-90),
+        Mistake::Unit(1000.0),
+        Mistake::Degrees,
+        Mistake::Focal(2.0),
+        Mistake::Focal(0.5),
+        Mistake::Focal(8.0),
+        Mistake::MaskInverted,
+        Mistake::FrameShift(1),
+        Mistake::FrameShift(-1),
+        Mistake::WrongPerson,
+    ] {
+        let (mut trials, mut found, mut others) = (0, 0, Vec::new());
+        for (name, capture, body) in &captures {
+            for window in windows(capture, 30, 30) {
+                let wrong = made(mistake, &window, body);
+                let mistakes = likely(&wrong, body, small_views(&wrong).unwrap());
+                trials += 1;
+                if mistakes.first().is_some_and(|first| same(*first, mistake)) {
+                    found += 1;
+                } else {
+                    others.push(format!("{name} from {}: {mistakes:?}", window.train[0].name));
+                }
+            }
+        }
+        lines.push((format!("{mistake:?}: {found} of {trials}"), found * 100 >= 95 * trials, others));
+    }
+    for (line, ..) in &lines {
+        println!("{line}");
+    }
+    let missed: Vec<_> = lines.iter().filter(|(_, enough, _)| !enough).collect();
+    assert!(missed.is_empty(), "{missed:#?}");
+}
+
+#[test]
+fn fits_of_estimators_raise_no_alarm() {
+    let Some(dir) = shared("estimators") else { return };
+    let out = Directory::new("check-import");
+    for (fit, masks) in [
+        ("wham/wham_output.pkl", "sam2"),
+        ("phalp/demo_clip.pkl", "matanyone"),
+        ("gvhmr/hmr4d_results.pt", "sam2"),
+        ("prompthmr/results.pkl", "sam2"),
+        ("romp/video_results.npz", "sam2"),
+        ("easymocap", "sam2"),
+    ] {
+        let to = out.path().join(fit.split('/').next().unwrap());
+        let options = ImportOptions {
+            frames: dir.join("frames"),
+            fit: dir.join(fit),
+            masks: Some(dir.join(masks)),
+            ..ImportOptions::default()
+        };
+        import(&options, &to).unwrap();
+        let body = BodyModel::load(&to.join("body.safetensors")).unwrap();
+        let found = check(&load_capture(&to, &body, &LoadOptions::default()).unwrap(), &body).unwrap();
+        println!("{fit}: overlap {:.3}", found.mean_iou());
+        assert!(found.mistakes.is_empty() && found.frames.iter().all(|f| f.faults.is_empty()), "{fit}: {found:?}");
+    }
+}
+
+#[test]
+fn a_silhouette_is_where_rays_hit() {
+    let body = BodyModel::embedded();
+    let capture = small_demo(&body, 3);
+    for frame in capture.train.iter().step_by(20) {
+        let posed = body.pose(&body.shaped(&frame.betas), &frame.pose, frame.placement);
+        let mesh = RayMesh::new(&posed.vertices, &body.faces).unwrap();
+        let covered = silhouette(&posed.vertices, &body.faces, &frame.camera);
+        let wrong = covered.iter().enumerate().filter(|(i, covered)| {
+            let (x, y) = (*i as u32 % frame.camera.width, *i as u32 / frame.camera.width);
+            let ray = frame.camera.ray(x as f32 + 0.5, y as f32 + 0.5);
+            mesh.first_hit(ray.origin, ray.direction).is_some() != **covered
+        });
+        // Rounding at the outline.
+        assert!(covered.iter().filter(|c| **c).count() > 500 && wrong.count() <= 3);
+    }
+}
+
+#[test]
+fn jumps_empty_masks_and_frames_that_do_not_fit_are_marked() {
+    let body = BodyModel::embedded();
+    let mut capture = small_demo(&body, 1);
+    capture.train[10].source.change(|pixels| pixels.mask.fill(0.0)).unwrap();
+    capture.train[20].camera.world_to_camera.translation.x += 1.5;
+    capture.train[30].pose.iter_mut().skip(1).for_each(|axis| *axis += Vec3::splat(0.9));
+    let found = check(&capture, &body).unwrap();
+    let faults = |i: usize| &found.frames[i].faults;
+    assert_eq!(faults(10), &[Fault::EmptyMask]);
+    assert!(faults(20).contains(&Fault::Overlap) && faults(20).contains(&Fault::PlaceJump), "{:?}", faults(20));
+    assert!(faults(21).contains(&Fault::PlaceJump));
+    assert!(faults(30).contains(&Fault::PoseJump) && faults(31).contains(&Fault::PoseJump), "{:?}", faults(30));
+    assert!(faults(40).is_empty() && found.mistakes.is_empty());
+}

@@ -1,0 +1,222 @@
+//! What all estimators say: people, and for each of their frames a pose, a shape, a place and a camera.
+
+use std::fs::File;
+use std::io::{BufReader, Read};
+use std::path::Path;
+
+use glam::{DMat3, DQuat, DVec3};
+use smpl::npz::Npz;
+use smpl::pickle::{self, Value};
+use smpl::torch::{TorchFile, is_torch};
+
+use super::item::Item;
+use super::rle::Rle;
+use super::{Video, easymocap, gvhmr, phalp, prompthmr, romp, wham};
+use crate::capture::CaptureError;
+
+/// Joints of SMPL and of SMPL-X.
+pub(super) const SMPL: usize = 24;
+pub(super) const SMPLX: usize = 55;
+/// Shape coefficients that estimators fit.
+pub(super) const BETAS: usize = 10;
+
+/// An estimator.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Tool {
+    /// WHAM (Shin et al. 2024), `wham_output.pkl`.
+    Wham,
+    /// 4D-Humans or PHALP (Goel et al. 2023, Rajasegaran et al. 2022), `demo_NAME.pkl`.
+    Phalp,
+    /// GVHMR (Shen et al. 2024), `hmr4d_results.pt`.
+    Gvhmr,
+    /// PromptHMR (Wang et al. 2025), `results.pkl`.
+    PromptHmr,
+    /// ROMP (Sun et al. 2021), `video_results.npz`.
+    Romp,
+    /// EasyMocap, a folder with `smpl/`, `intri.yml` and `extri.yml`.
+    EasyMocap,
+}
+
+impl Tool {
+    /// Its name as its authors write it.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Wham => "WHAM",
+            Self::Phalp => "4D-Humans / PHALP",
+            Self::Gvhmr => "GVHMR",
+            Self::PromptHmr => "PromptHMR",
+            Self::Romp => "ROMP",
+            Self::EasyMocap => "EasyMocap",
+        }
+    }
+
+    /// Joints of the bodies that it fits.
+    #[must_use]
+    pub fn joints(self) -> usize {
+        if self.hands_at_mean().is_some() { SMPLX } else { SMPL }
+    }
+
+    /// For SMPL-X, whether the hands rest at the body model's mean rather than flat.
+    pub(super) fn hands_at_mean(self) -> Option<bool> {
+        match self {
+            Self::Gvhmr => Some(true),
+            Self::PromptHmr => Some(false),
+            _ => None,
+        }
+    }
+}
+
+/// What a file says.
+pub(super) struct Fit {
+    pub tool: Tool,
+    pub people: Vec<Person>,
+}
+
+/// One person.
+pub(super) struct Person {
+    pub id: String,
+    /// By index, each once.
+    pub frames: Vec<FitFrame>,
+    /// Frames in which what the file says is of another frame.
+    pub ghosts: usize,
+}
+
+/// A person in one frame. Lengths in metres, OpenCV axes.
+#[derive(Clone)]
+pub(super) struct FitFrame {
+    /// Counted from 0.
+    pub index: usize,
+    /// Axis-angle of each joint that the tool fits, the root's in the world.
+    pub pose: Vec<DVec3>,
+    pub betas: Vec<f64>,
+    /// The world's axes in the camera.
+    pub world_to_camera: DMat3,
+    /// What the root turns about, and where that leaves the body in the camera.
+    pub about: About,
+    pub offset: DVec3,
+    /// Focal lengths and principal point in pixels of the video.
+    pub focal: [f64; 2],
+    pub centre: [f64; 2],
+    pub mask: Option<OwnMask>,
+}
+
+/// Where the pelvis is in the camera, J being its place in the body at rest.
+#[derive(Clone, Copy)]
+pub(super) enum About {
+    /// At J + offset.
+    Pelvis,
+    /// At turn · J + offset.
+    Origin(DMat3),
+}
+
+/// A mask that the estimator's file holds.
+#[derive(Clone)]
+pub(super) enum OwnMask {
+    Runs(Rle),
+    /// Height, width, pixels row by row.
+    Pixels(usize, usize, Vec<bool>),
+}
+
+impl FitFrame {
+    /// The pelvis in the camera, for a body whose pelvis at rest is at `joint`.
+    pub fn pelvis(&self, joint: DVec3) -> DVec3 {
+        match self.about {
+            About::Pelvis => joint + self.offset,
+            About::Origin(turn) => turn * joint + self.offset,
+        }
+    }
+
+    /// The same picture by a camera of another focal length: everything is as many times as far away.
+    pub fn refocused(&mut self, focal: f64, joint: DVec3) {
+        let before = self.pelvis(joint);
+        let ratio = focal / self.focal[0];
+        self.offset.z += before.z * (ratio - 1.0);
+        self.focal = self.focal.map(|f| f * ratio);
+    }
+}
+
+/// Axis-angle of a rotation, at most half a turn.
+pub(super) fn axis_angle(rotation: DMat3) -> DVec3 {
+    let turn = DQuat::from_mat3(&rotation).normalize();
+    let turn = if turn.w < 0.0 { -turn } else { turn };
+    turn.to_scaled_axis()
+}
+
+/// The rotation of an axis-angle.
+pub(super) fn rotation(axis: DVec3) -> DMat3 {
+    DMat3::from_quat(DQuat::from_scaled_axis(axis))
+}
+
+/// Reads a fit, which is told by what the file holds, not by its name.
+pub(super) fn read(path: &Path, video: &Video) -> Result<Fit, CaptureError> {
+    let fit = if path.is_dir() { easymocap::read(path, video)? } else { read_file(path, video)? };
+    for person in &fit.people {
+        check(path, person, video)?;
+    }
+    Ok(Fit { people: fit.people.into_iter().filter(|person| !person.frames.is_empty()).collect(), ..fit })
+}
+
+fn read_file(path: &Path, video: &Video) -> Result<Fit, CaptureError> {
+    let mut file = File::open(path).map_err(CaptureError::io(path))?;
+    let mut start = Vec::new();
+    (&mut file).take(64).read_to_end(&mut start).map_err(CaptureError::io(path))?;
+    let name = path.display().to_string();
+    if is_torch(&start) {
+        // A zip archive of numpy's arrays starts alike.
+        if start.starts_with(b"PK")
+            && let Ok(mut npz) = Npz::open(path)
+            && npz.keys().iter().any(|key| key == "results")
+        {
+            return romp::read(path, &npz.value("results")?, video);
+        }
+        let mut file = TorchFile::open(&name, BufReader::new(file))?;
+        return gvhmr::read(path, &mut file, video);
+    }
+    parse(path, &pickle::read(path)?, video)
+}
+
+/// Reads a pickle's value.
+pub(super) fn parse(path: &Path, value: &Value, video: &Video) -> Result<Fit, CaptureError> {
+    let root = Item::new(path, value);
+    if value.get("people").is_some() && value.get("camera").is_some() {
+        return prompthmr::read(&root, video);
+    }
+    let entries = root.entries()?;
+    let has = |keys: &[&str]| entries.iter().any(|(_, item)| keys.iter().all(|key| item.value.get(key).is_some()));
+    if has(&["tid", "smpl", "camera"]) {
+        phalp::read(&entries, video)
+    } else if has(&["pose", "trans", "frame_ids"]) {
+        wham::read(&entries, video)
+    } else if has(&["smpl_thetas", "cam_trans"]) {
+        romp::read(path, value, video)
+    } else {
+        let held: Vec<&str> = entries.iter().map(|(name, _)| name.as_str()).take(8).collect();
+        let expected = "a result of WHAM, 4D-Humans / PHALP, GVHMR, PromptHMR or ROMP, or EasyMocap's folder";
+        Err(root.invalid(expected, format!("a dictionary of {}", held.join(", "))))
+    }
+}
+
+/// Indices within the video, each once; a body and a camera that can be.
+pub(super) fn check(path: &Path, person: &Person, video: &Video) -> Result<(), CaptureError> {
+    let mut seen = vec![false; video.names.len()];
+    for frame in &person.frames {
+        let key = format!("person {}, frame {}", person.id, frame.index);
+        let invalid = |expected: String, actual: String| CaptureError::invalid(path, key.as_str(), expected, actual);
+        match seen.get_mut(frame.index) {
+            Some(seen) if !*seen => *seen = true,
+            Some(_) => return Err(invalid("each frame once".to_owned(), "it twice".to_owned())),
+            None => {
+                let expected = format!("a frame of the video, which has {} (counted from 0)", video.names.len());
+                return Err(invalid(expected, format!("frame {}", frame.index)));
+            }
+        }
+        if frame.focal.iter().any(|f| !(*f >= 1.0 && *f <= 1e6)) {
+            return Err(invalid("a focal length of 1 to 1000000 pixels".to_owned(), format!("{:?}", frame.focal)));
+        }
+        if frame.offset.abs().max_element() > 1e5 {
+            return Err(invalid("a body within 100 km".to_owned(), format!("{}", frame.offset)));
+        }
+    }
+    Ok(())
+}

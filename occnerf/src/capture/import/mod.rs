@@ -1,0 +1,271 @@
+//! Captures from what body estimators and segmenters write.
+//!
+//! [`import`] reads the frames of a video, a fit and masks, and writes a capture in HumanNeRF's wild layout for
+//! [`super::load_capture`]. Formats are told by what is in the files:
+//!
+//! - fits: WHAM, 4D-Humans / PHALP, GVHMR, PromptHMR, ROMP, EasyMocap ([`Tool`]);
+//! - masks: ids of objects (SAM 2's palette PNGs by value, its folders an object, Grounded-SAM-2's `.npy`), coverage
+//!   (MatAnyone, plain 0/255 pictures), or the fit's own (4D-Humans / PHALP, PromptHMR).
+//!
+//! All estimators place the body in the camera, for a focal length of their own; the camera stands still in a world with
+//! its axes (with EasyMocap, in the calibrated world), and the body's place is in the extrinsics.
+
+mod body;
+#[cfg(test)]
+mod damage;
+mod easymocap;
+mod fit;
+mod gvhmr;
+mod item;
+mod levels;
+mod masks;
+mod phalp;
+mod prompthmr;
+mod rle;
+mod romp;
+#[cfg(test)]
+mod tests;
+mod wham;
+mod write;
+mod yaml;
+
+pub use self::fit::Tool;
+
+use std::path::{Path, PathBuf};
+
+use glam::DVec3;
+use smpl::BodyModel;
+
+use self::fit::{BETAS, FitFrame, Person, SMPLX};
+use self::masks::Masks;
+use super::CaptureError;
+use super::image::dimensions;
+use super::names::FrameName;
+use super::pictures::Pictures;
+
+/// What to import.
+#[derive(Clone, Debug, Default)]
+pub struct ImportOptions {
+    /// Folder of the video's frames, `.png` or `.jpg`, in the order of their names.
+    pub frames: PathBuf,
+    /// The estimator's file, or EasyMocap's folder.
+    pub fit: PathBuf,
+    /// The segmenter's folder, or one `.npy` file; `None`: the masks in the fit.
+    pub masks: Option<PathBuf>,
+    /// The estimator's id of the person; `None`: who is there in most frames.
+    pub person: Option<String>,
+    /// The person's value in masks of ids, 1 if `None`.
+    pub object: Option<u8>,
+    /// Values of what stands in front of the person.
+    pub occluder_objects: Vec<u8>,
+    /// Focal length in pixels in place of the one that the estimator assumed; the body moves so that the picture stays.
+    pub focal: Option<f64>,
+    /// The body model; `None`: one that fits, from a folder `body` near the fit or the frames.
+    pub body: Option<PathBuf>,
+    /// Whether pictures are copied rather than linked.
+    pub copy: bool,
+}
+
+/// What was imported, and what was not.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Imported {
+    /// Who wrote the fit.
+    pub tool: Tool,
+    /// The person's id, and frames of the capture.
+    pub person: String,
+    /// As many as there are in the capture.
+    pub frames: usize,
+    /// The other people: ids, and the frames that each is in.
+    pub others: Vec<(String, usize)>,
+    /// Frames of the video.
+    pub video_frames: usize,
+    /// Frames before the person's first, after the last, and between without a fit.
+    pub unfitted: [usize; 3],
+    /// Frames in which the fit is left over from an earlier one.
+    pub ghosts: usize,
+    /// Frames with a fit but without a mask.
+    pub unmasked: usize,
+    /// Largest standard deviation of a shape coefficient over the frames; the capture has their robust mean.
+    pub betas_spread: f64,
+    /// Focal length in pixels of the first frame.
+    pub focal: f64,
+    /// What the masks are.
+    pub masks: &'static str,
+    /// The body model's file.
+    pub body: PathBuf,
+}
+
+/// Frames of a video.
+struct Video {
+    names: Vec<String>,
+    paths: Vec<PathBuf>,
+    size: (u32, u32),
+}
+
+/// A person in one frame, as the capture has it.
+struct Placed {
+    index: usize,
+    /// Axis-angle of every joint of the body model.
+    pose: Vec<DVec3>,
+    frame: FitFrame,
+    /// The extrinsics' translation.
+    translation: DVec3,
+}
+
+/// Writes the capture that `options` describe into the folder `out`, which is made if it is not there.
+///
+/// # Errors
+/// Files that are missing, malformed or damaged, of formats that are not known, or that do not belong together: frames
+/// beyond the video, pictures or masks of unequal sizes, a body model of other joints than the fit's. The error names
+/// file and key, what was expected and what was found. What has been written by then stays.
+pub fn import(options: &ImportOptions, out: &Path) -> Result<Imported, CaptureError> {
+    let video = Video::list(&options.frames)?;
+    if let Some(focal) = options.focal.filter(|focal| !(*focal >= 1.0 && *focal <= 1e6)) {
+        return Err(CaptureError::setting("focal", "1 to 1000000 pixels", focal));
+    }
+    let fit = fit::read(&options.fit, &video)?;
+    let tool = fit.tool;
+    let (person, others) = choose(&options.fit, fit.people, options.person.as_deref())?;
+    let (body_path, model) = body::find(tool, options.body.as_deref(), &[&options.fit, &options.frames])?;
+    let hands = match tool.hands_at_mean() {
+        Some(true) => body::mean_hands(&body_path)?,
+        _ => Vec::new(),
+    };
+    let (betas, betas_spread) = robust_mean(person.frames.iter().map(|frame| frame.betas.as_slice()));
+    let unfitted = gaps(&person, video.names.len());
+    let masks = options.masks.as_ref().map(|path| Masks::open(path, options, &video)).transpose()?;
+    let has_mask = |frame: &FitFrame| masks.as_ref().map_or(frame.mask.is_some(), |masks| masks.has(frame.index));
+    let fitted = person.frames.len();
+    let frames: Vec<FitFrame> = person.frames.into_iter().filter(has_mask).collect();
+    if frames.is_empty() {
+        let (path, what) = match &options.masks {
+            Some(path) => (path, "a mask of a frame with a fit"),
+            None => (&options.fit, "masks in the fit (4D-Humans and PromptHMR have them), or --masks"),
+        };
+        return Err(CaptureError::invalid(path, "masks", what, format!("none, of {fitted} fitted frames")));
+    }
+    let unmasked = fitted - frames.len();
+    let place = |frame| placed(frame, &betas, &model, &hands, options.focal);
+    let placed: Vec<Placed> = frames.into_iter().map(place).collect();
+    let kind = masks.as_ref().map_or("those in the fit", |masks| masks.kind);
+    write::capture(
+        &write::Parts { options, video: &video, placed: &placed, betas: &betas, masks: masks.as_ref() },
+        out,
+    )?;
+    write::body(&model, out)?;
+    Ok(Imported {
+        tool,
+        person: person.id,
+        frames: placed.len(),
+        others,
+        video_frames: video.names.len(),
+        unfitted,
+        ghosts: person.ghosts,
+        unmasked,
+        betas_spread,
+        focal: placed.first().map_or(0.0, |placed| placed.frame.focal[0]),
+        masks: kind,
+        body: body_path,
+    })
+}
+
+impl Video {
+    /// The pictures of a folder, all of one size.
+    fn list(dir: &Path) -> Result<Self, CaptureError> {
+        let pictures = Pictures::list(dir)?;
+        let mut found: Vec<(&String, &PathBuf)> = pictures.iter().collect();
+        found.sort_by(|a, b| FrameName(a.0).cmp(&FrameName(b.0)));
+        let Some((_, first)) = found.first() else {
+            return Err(CaptureError::invalid(dir, "files", "the video's frames, .png or .jpg", "none"));
+        };
+        let size = dimensions(first)?;
+        for (_, path) in &found {
+            let other = dimensions(path)?;
+            if other != size {
+                let expected = format!("{}×{}, as the first frame", size.0, size.1);
+                return Err(CaptureError::invalid(path, "size", expected, format!("{}×{}", other.0, other.1)));
+            }
+        }
+        Ok(Self {
+            names: found.iter().map(|(name, _)| (*name).clone()).collect(),
+            paths: found.iter().map(|(_, path)| (*path).clone()).collect(),
+            size,
+        })
+    }
+}
+
+/// The person asked for, or who is there in most frames (of equals the first); and ids and frames of the others.
+fn choose(
+    path: &Path,
+    mut people: Vec<Person>,
+    asked: Option<&str>,
+) -> Result<(Person, Vec<(String, usize)>), CaptureError> {
+    let held = || {
+        let each = people.iter().map(|p| format!("{} ({} frames)", p.id, p.frames.len()));
+        each.collect::<Vec<_>>().join(", ")
+    };
+    let at = match asked {
+        Some(id) => people.iter().position(|person| person.id == id),
+        None => (0..people.len()).min_by_key(|&i| (usize::MAX - people[i].frames.len(), i)),
+    };
+    let Some(at) = at else {
+        let expected = asked.map_or("a person".to_owned(), |id| format!("person {id}"));
+        let found = if people.is_empty() { "nobody".to_owned() } else { held() };
+        return Err(CaptureError::invalid(path, "people", expected, found));
+    };
+    let mut person = people.remove(at);
+    person.frames.sort_by_key(|frame| frame.index);
+    Ok((person, people.into_iter().map(|other| (other.id, other.frames.len())).collect()))
+}
+
+/// Frames before the person's first, after the last, and between without a fit.
+fn gaps(person: &Person, total: usize) -> [usize; 3] {
+    let (Some(first), Some(last)) = (person.frames.first(), person.frames.last()) else { return [total, 0, 0] };
+    let between = last.index - first.index + 1 - person.frames.len();
+    [first.index, total - 1 - last.index, between]
+}
+
+/// The mean of each coefficient over the values within five (scaled) median deviations of the median, and the largest
+/// standard deviation of a coefficient over all values.
+fn robust_mean<'a>(frames: impl Iterator<Item = &'a [f64]> + Clone) -> (Vec<f64>, f64) {
+    /// Median absolute deviations in a standard deviation of a normal distribution.
+    const SCALE: f64 = 1.4826;
+    let mut spread = 0.0f64;
+    let median = |values: &mut [f64]| {
+        values.sort_by(f64::total_cmp);
+        values.get(values.len() / 2).copied().unwrap_or(0.0)
+    };
+    let mean = |i: usize| {
+        let mut values: Vec<f64> = frames.clone().map(|betas| betas.get(i).copied().unwrap_or(0.0)).collect();
+        let middle = median(&mut values);
+        let mut off: Vec<f64> = values.iter().map(|v| (v - middle).abs()).collect();
+        let limit = 5.0 * SCALE * median(&mut off);
+        let count = values.len().max(1) as f64;
+        let all = values.iter().sum::<f64>() / count;
+        spread = spread.max((values.iter().map(|v| (v - all).powi(2)).sum::<f64>() / count).sqrt());
+        let kept: Vec<f64> = values.into_iter().filter(|v| (v - middle).abs() <= limit).collect();
+        kept.iter().sum::<f64>() / kept.len().max(1) as f64
+    };
+    ((0..BETAS).map(mean).collect(), spread)
+}
+
+/// Puts a fitted frame into the capture's form: every joint of the body model posed, and the pelvis where the frame's own
+/// shape has it.
+fn placed(mut frame: FitFrame, betas: &[f64], model: &BodyModel, hands: &[DVec3], focal: Option<f64>) -> Placed {
+    let pelvis = |betas: &[f64]| {
+        let betas: Vec<f32> = betas.iter().take(model.num_betas()).map(|&beta| beta as f32).collect();
+        model.shaped(&betas).joints.first().map_or(DVec3::ZERO, |joint| joint.as_dvec3())
+    };
+    let own = pelvis(&frame.betas);
+    if let Some(focal) = focal {
+        frame.refocused(focal, own);
+    }
+    let mut pose = frame.pose.clone();
+    pose.resize(model.num_joints(), DVec3::ZERO);
+    if pose.len() == SMPLX && !hands.is_empty() {
+        let start = SMPLX - hands.len();
+        pose[start..].copy_from_slice(hands);
+    }
+    let translation = frame.pelvis(own) - frame.world_to_camera * pelvis(betas);
+    Placed { index: frame.index, pose, translation, frame }
+}

@@ -1,0 +1,101 @@
+//! A run's person, drawn with the capture gone.
+#![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
+
+mod common;
+
+use std::path::Path;
+
+use common::{TempDir, body, capture, config, scene};
+use glam::Vec3;
+use occnerf::{
+    Error, FieldRenderer, Method, Model, MotionKind, Person, PriorRenderer, Renderer, Trainer, VertexColors,
+};
+
+const CHECKPOINT: &str = "checkpoint.safetensors";
+const PERSON: &str = "person.safetensors";
+
+/// Leaves a run of a few steps in `run`; its model, without the trainer.
+fn trained(run: &Path, change: impl Fn(&mut occnerf::Config)) -> Model {
+    let mut config = config(Method::Occnerf);
+    change(&mut config);
+    let mut trainer = Trainer::new(scene(), config).unwrap();
+    for _ in 0..6 {
+        trainer.step().unwrap();
+    }
+    Person::save(run, &capture(), body(), &VertexColors::measure(scene()).unwrap()).unwrap();
+    trainer.save(&run.join(CHECKPOINT)).unwrap();
+    trainer.into_model()
+}
+
+fn pictures(model: &Model) -> Vec<f32> {
+    let mut renderer = FieldRenderer::new(model).unwrap();
+    let draw = |view: &std::sync::Arc<_>| renderer.render(view, Vec3::new(0.2, 0.4, 0.6)).unwrap().image.pixels;
+    model.frames().iter().flat_map(draw).collect()
+}
+
+#[test]
+fn a_model_read_from_its_run_draws_the_same_bits_as_the_trained_one() {
+    let kinds: [fn(&mut occnerf::Config); 3] = [
+        |_| {},
+        |c| c.field.prior_colors = false,
+        |c| {
+            (c.motion.kind, c.motion.correction_spacing, c.motion.shell_interval) = (MotionKind::Volume, 0, 0);
+            c.field.prior_colors = false;
+        },
+    ];
+    for (kind, change) in kinds.into_iter().enumerate() {
+        let dir = TempDir::new(&format!("person-{kind}"));
+        let model = trained(dir.path("").as_path(), change);
+        let loaded = Model::load(dir.path("").as_path()).unwrap();
+        assert_eq!(loaded.config(), model.config());
+        assert_eq!((loaded.steps_done(), loaded.num_parameters()), (6, model.num_parameters()));
+        assert_eq!(loaded.visibility_counts(), model.visibility_counts());
+        assert_eq!(loaded.up(), model.up());
+        assert!(pictures(&loaded) == pictures(&model), "kind {kind}");
+    }
+}
+
+#[test]
+fn the_prior_of_a_run_draws_the_same_bits_too() {
+    let dir = TempDir::new("person-prior");
+    let colors = VertexColors::measure(scene()).unwrap();
+    let run = dir.path("");
+    Person::save(&run, &capture(), body(), &colors).unwrap();
+    let person = Person::load(&run, &config(Method::Prior)).unwrap();
+    assert_eq!((person.scene.as_str(), &person.colors), (scene().name.as_str(), &colors));
+    let view = &scene().train[1].view;
+    let drawn = PriorRenderer::new(&scene().body, &colors).render(view, Vec3::ONE).unwrap();
+    let again = PriorRenderer::new(&person.body, &person.colors).render(&person.frames[1], Vec3::ONE).unwrap();
+    assert!(drawn.image.pixels == again.image.pixels);
+}
+
+#[test]
+fn what_is_missing_or_damaged_is_named() {
+    let dir = TempDir::new("person-damage");
+    let run = dir.path("");
+    let said = || Model::load(&run).err().map(|error| error.to_string()).unwrap_or_default();
+    assert!(matches!(Model::load(&run), Err(Error::Io { .. })) && said().contains(CHECKPOINT));
+    trained(&run, |_| {});
+    let whole = std::fs::read(run.join(PERSON)).unwrap();
+    std::fs::remove_file(run.join(PERSON)).unwrap();
+    assert!(said().contains(PERSON) && said().contains("--resume"), "{}", said());
+    for cut in [0, 7, 100, whole.len() / 2, whole.len() - 1] {
+        std::fs::write(run.join(PERSON), &whole[..cut]).unwrap();
+        assert!(said().contains(PERSON), "{cut}: {}", said());
+    }
+    // A NaN, a camera of no size, and a number of frames that the arrays do not have.
+    let start = 8 + u64::from_le_bytes(whole[..8].try_into().unwrap()) as usize;
+    for (bytes, at) in [([0, 0, 0xc0, 0x7f], start + 64), ([0xff, 0xff, 0xff, 0xff], start)] {
+        let mut damaged = whole.clone();
+        damaged[at..at + 4].copy_from_slice(&bytes);
+        std::fs::write(run.join(PERSON), damaged).unwrap();
+        assert!(said().contains(PERSON), "{}", said());
+    }
+    let claimed = String::from_utf8_lossy(&whole).find("\"frames\":\"2\"").unwrap();
+    let mut damaged = whole.clone();
+    damaged[claimed + 10] = b'9';
+    std::fs::write(run.join(PERSON), damaged).unwrap();
+    assert!(said().contains("expected F32 [144]"), "{}", said());
+    std::fs::write(run.join(PERSON), &whole).unwrap();
+    assert!(Model::load(&run).is_ok());
+}

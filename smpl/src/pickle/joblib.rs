@@ -1,0 +1,50 @@
+//! Arrays of `joblib.dump`: an object that describes the array, and behind its state the array's bytes.
+
+use super::machine::{Id, Machine, Node};
+use super::reader::Step;
+
+/// Class of the describing object, which never becomes a value.
+pub(super) const WRAPPER: &str = "joblib.numpy_pickle.NumpyArrayWrapper";
+/// Pickles within pickles: an array of objects is one.
+const MAX_NESTED: usize = 4;
+
+impl<'a> Machine<'a> {
+    /// The array that a wrapper with these attributes describes, read from behind it: one byte with the padding's
+    /// length, padding, and the elements (up to joblib 1.1 the elements alone; the attribute for the padding is then
+    /// absent); or, for elements that are objects, a pickle of the array.
+    pub(super) fn joblib_array(&mut self, attributes: &[(Id, Id)]) -> Step<Node<'a>> {
+        let find = |name: &str| {
+            let named = |id: Id| matches!(&self.nodes[id], Node::Text(text) if text == name);
+            attributes.iter().rev().find(|(key, _)| named(*key)).map(|(_, value)| *value)
+        };
+        let demand = |name: &str| find(name).ok_or_else(|| format!("joblib array without `{name}`"));
+        let (shape, order, dtype) = (demand("shape")?, demand("order")?, demand("dtype")?);
+        let aligned = find("numpy_array_alignment_bytes").filter(|&id| !matches!(self.nodes[id], Node::None));
+        let (dtype, shape) = (self.dtype(dtype)?, self.shape(shape)?);
+        let fortran = match self.text(order)?.as_ref() {
+            "C" => false,
+            "F" => true,
+            other => return Err(format!("order {other:?} of a joblib array, expected C or F")),
+        };
+        let Some(length) = dtype.raw_bytes(&shape)? else { return self.nested() };
+        if aligned.is_some() {
+            let padding = self.reader.u8()?;
+            self.reader.take(padding.into())?;
+        }
+        let bytes = self.reader.take(length)?;
+        self.raw_array(dtype, shape, fortran, bytes)
+    }
+
+    /// The value of the pickle that starts here. It has a stack and a memo of its own.
+    fn nested(&mut self) -> Step<Node<'a>> {
+        if self.nesting >= MAX_NESTED {
+            return Err(format!("pickles nested deeper than {MAX_NESTED}"));
+        }
+        let outer = (std::mem::take(&mut self.stack), std::mem::take(&mut self.marks), std::mem::take(&mut self.memo));
+        self.nesting += 1;
+        let top = self.run_to_stop();
+        self.nesting -= 1;
+        (self.stack, self.marks, self.memo) = outer;
+        Ok(std::mem::replace(&mut self.nodes[top?], Node::None))
+    }
+}

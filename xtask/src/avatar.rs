@@ -1,0 +1,42 @@
+//! The baked person of a run, and what else it can do.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, Result, ensure};
+use occnerf::Model;
+use occnerf::bake::{Avatar, Clip, export};
+use smpl::MotionClip;
+
+use crate::baked;
+
+/// The baked person of a run: see [`baked::avatar`].
+pub fn of_run(run: &Path) -> Result<Avatar> {
+    ensure!(run.is_dir(), "{}: no such run", run.display());
+    match baked::fresh(run)? {
+        Some(avatar) => Ok(avatar),
+        None => baked::avatar(run, &Model::load(run)?),
+    }
+}
+
+/// Adds a motion from a file, named after it.
+pub fn add_motion(avatar: &mut Avatar, path: &Path) -> Result<()> {
+    let motion = MotionClip::load(path)?;
+    let motion = export::adapt_motion(avatar, &motion).with_context(|| path.display().to_string())?;
+    let stem = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+    let taken = |name: &str| avatar.clips.iter().any(|clip| clip.name == name);
+    let others = (2..).map(|i| format!("{stem} {i}"));
+    let name = std::iter::once(stem.clone()).chain(others).find(|name| !taken(name)).unwrap_or(stem);
+    avatar.clips.push(Clip { name, motion });
+    Ok(())
+}
+
+/// Errors unless the folder that `out` is to lie in exists.
+pub fn check_folder(out: &Path) -> Result<()> {
+    let folder = match out.parent() {
+        Some(parent) if parent != Path::new("") => parent.to_owned(),
+        _ => PathBuf::from("."),
+    };
+    ensure!(folder.is_dir(), "--out {}: no such folder {}", out.display(), folder.display());
+    ensure!(!out.is_dir(), "--out {}: is a folder, expected a file", out.display());
+    Ok(())
+}

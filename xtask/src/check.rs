@@ -1,0 +1,174 @@
+//! `check`: whether a capture's body lies on its person, before anything is trained.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, Result};
+use clap::Args;
+use image::{Rgb, RgbImage, imageops};
+use occnerf::capture::{Check, Frame, body_silhouette, photograph, unknown_pixels};
+use smpl::BodyModel;
+
+use crate::pictures::{captioned, sheet, to_rgb};
+use crate::source::{self, LoadArguments, Source};
+use crate::table;
+
+/// Frames in the picture, and how many in a row.
+const FRAMES: usize = 8;
+const COLUMNS: usize = 4;
+/// Longest side of a frame in the picture, pixels.
+const SIDE: u32 = 480;
+/// Lines of the table of frames that do not fit.
+const LINES: usize = 20;
+
+/// What to check.
+#[derive(Args)]
+pub struct CheckArguments {
+    /// A capture, as of `train`; the embedded demo if left out
+    scene: Option<String>,
+    /// The picture to write [default: check.png in the capture, or demo-check.png]
+    #[arg(long, value_name = "FILE.png")]
+    out: Option<PathBuf>,
+    /// The body model, as of `train`
+    #[arg(long)]
+    body: Option<PathBuf>,
+    /// Print a line for every frame, not only for those that do not fit
+    #[arg(long)]
+    all: bool,
+    #[command(flatten)]
+    load: LoadArguments,
+}
+
+impl CheckArguments {
+    /// A capture as it is.
+    pub fn of(capture: &Path) -> Self {
+        let scene = Some(capture.display().to_string());
+        Self { scene, out: None, body: None, all: false, load: LoadArguments::none() }
+    }
+}
+
+/// Runs the command.
+pub fn check(arguments: &CheckArguments) -> Result<()> {
+    let source = source::load(arguments.scene.as_deref(), arguments.body.as_deref(), &arguments.load.options()?)?;
+    let found = occnerf::capture::check(&source.capture, &source.model)?;
+    let path = arguments.out.clone().unwrap_or_else(|| match Path::new(&source.scene) {
+        scene if scene.is_dir() => scene.join("check.png"),
+        _ => PathBuf::from(format!("{}-check.png", crate::train::scene_name(Some(&source.scene)))),
+    });
+    picture(&source, &found)?.save(&path).with_context(|| path.display().to_string())?;
+    say(&found, arguments.all);
+    println!("picture: {} (outline of the body; green: mask; orange: unknown)", path.display());
+    Ok(())
+}
+
+fn say(found: &Check, all: bool) {
+    let count = found.frames.len();
+    println!(
+        "{count} frames: body and mask overlap {:.2}, {:.0} % of the body hidden, {:.0} % of its surface seen at all",
+        found.mean_iou(),
+        100.0 * found.mean_hidden(),
+        100.0 * found.surface_seen
+    );
+    let bad = found.frames.iter().filter(|frame| !frame.faults.is_empty()).count();
+    if bad > 0 {
+        println!("{bad} frames do not fit");
+    }
+    let mut lines = vec![["frame", "overlap", "hidden", ""].map(str::to_owned).to_vec()];
+    for frame in found.frames.iter().filter(|frame| all || !frame.faults.is_empty()) {
+        let iou = frame.iou.map_or("-".to_owned(), |iou| format!("{iou:.2}"));
+        let faults: Vec<&str> = frame.faults.iter().map(|fault| fault.words()).collect();
+        lines.push(vec![frame.name.clone(), iou, format!("{:.0} %", 100.0 * frame.hidden), faults.join(", ")]);
+    }
+    let more = lines.len().saturating_sub(1 + if all { usize::MAX - 1 } else { LINES });
+    if lines.len() > 1 {
+        lines.truncate(lines.len() - more);
+        print!("{}", table::aligned(&lines, 1));
+    }
+    if more > 0 {
+        println!("… and {more} more (--all)");
+    }
+    match found.mistakes.as_slice() {
+        [] => println!("no usual mistake found"),
+        mistakes => mistakes.iter().for_each(|mistake| println!("likely mistake: {mistake}")),
+    }
+}
+
+/// Frames from all over the video.
+fn picture(source: &Source, found: &Check) -> Result<RgbImage> {
+    let frames = &source.capture.train;
+    let shown = FRAMES.min(frames.len());
+    let chosen: Vec<usize> = (0..shown).map(|i| (2 * i + 1) * frames.len() / (2 * shown)).collect();
+    let mut strips = Vec::new();
+    for row in chosen.chunks(COLUMNS) {
+        let mut cells = row.iter().map(|&i| cell(&frames[i], &source.model)).collect::<Result<Vec<_>>>()?;
+        let mut names: Vec<String> = row
+            .iter()
+            .map(|&i| {
+                let iou = found.frames[i].iou.map_or("-".to_owned(), |iou| format!("{iou:.2}"));
+                format!("{}  {iou}", found.frames[i].name)
+            })
+            .collect();
+        // Rows are equally wide.
+        let size = cells.first().map_or((1, 1), RgbImage::dimensions);
+        let missing = COLUMNS.min(shown) - cells.len();
+        cells.extend((0..missing).map(|_| RgbImage::from_pixel(size.0, size.1, Rgb([255; 3]))));
+        names.extend((0..missing).map(|_| String::new()));
+        let names: Vec<&str> = names.iter().map(String::as_str).collect();
+        strips.push(captioned(&sheet(&[cells]), &names)?);
+    }
+    let width = strips.iter().map(RgbImage::width).max().unwrap_or(1);
+    let height = strips.iter().map(RgbImage::height).sum::<u32>().max(1);
+    let mut whole = RgbImage::from_pixel(width, height, Rgb([255; 3]));
+    let mut top = 0;
+    for strip in &strips {
+        imageops::replace(&mut whole, strip, 0, i64::from(top));
+        top += strip.height();
+    }
+    Ok(whole)
+}
+
+/// A frame: mask tinted green, unknown pixels orange, the body's outline white on black.
+fn cell(frame: &Frame, model: &BodyModel) -> Result<RgbImage> {
+    let pixels = frame.pixels()?;
+    let silhouette = body_silhouette(frame, model);
+    let unknown = unknown_pixels(frame, &pixels, &silhouette, model);
+    let mut picture = to_rgb(&photograph(frame)?);
+    let (width, height) = picture.dimensions();
+    let at = |x: u32, y: u32| (y * width + x) as usize;
+    let blend = |pixel: &mut Rgb<u8>, tint: [u8; 3], share: f32| {
+        for (channel, tint) in pixel.0.iter_mut().zip(tint) {
+            *channel = (f32::from(*channel) * (1.0 - share) + f32::from(tint) * share) as u8;
+        }
+    };
+    for (x, y, pixel) in picture.enumerate_pixels_mut() {
+        if pixels.mask[at(x, y)] > 0.5 {
+            blend(pixel, [40, 220, 90], 0.35);
+        } else if unknown[at(x, y)] {
+            blend(pixel, [255, 140, 0], 0.45);
+        }
+    }
+    // A small picture is enlarged first, so that the line is thin.
+    let times = (SIDE / width.max(height)).max(1);
+    let mut picture = match width.max(height) {
+        longest if longest > SIDE => {
+            let side = |n: u32| (n * SIDE / longest).max(1);
+            imageops::thumbnail(&picture, side(width), side(height))
+        }
+        _ => imageops::resize(&picture, width * times, height * times, imageops::FilterType::Nearest),
+    };
+    let (to_width, to_height) = picture.dimensions();
+    let inside = |x: u32, y: u32| {
+        let (x, y) = (x * width / to_width, y * height / to_height);
+        silhouette[at(x, y)]
+    };
+    for y in 0..to_height {
+        for x in 0..to_width {
+            let here = inside(x, y);
+            let right = x + 1 < to_width && inside(x + 1, y) != here;
+            let below = y + 1 < to_height && inside(x, y + 1) != here;
+            if right || below {
+                picture.put_pixel(x, y, Rgb(if here { [255, 255, 255] } else { [255, 0, 200] }));
+            }
+        }
+    }
+    Ok(picture)
+}

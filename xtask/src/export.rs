@@ -1,0 +1,101 @@
+//! `export`: a trained person in the forms that other programs open.
+
+use std::io::Write;
+use std::path::PathBuf;
+
+use anyhow::{Context, Result, bail};
+use clap::{Args, ValueEnum};
+use occnerf::bake::{Avatar, export};
+use occnerf::replace_file;
+
+use crate::avatar;
+use crate::process::{say, unwritten};
+
+/// Largest edge of the triangles that a splat stands for, in metres.
+const PATCH: f32 = 0.009;
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+enum Format {
+    /// Skinned, textured avatar with its motions: glTF binary for Blender, three.js, Unity, Unreal, Godot.
+    Glb,
+    /// One pose as 3-D Gaussian splats, for viewers of such scenes.
+    Ply,
+    /// One pose as a mesh with colours at its vertices, and .mtl and .png beside it.
+    Obj,
+    /// The corrected poses as motion capture in AMASS's form.
+    Npz,
+}
+
+#[derive(Args)]
+pub struct ExportArguments {
+    /// Run directory
+    run: PathBuf,
+    #[arg(long)]
+    format: Format,
+    /// File to write
+    #[arg(long, value_name = "FILE")]
+    out: PathBuf,
+    /// Motion capture, an .npz with poses, trans and fps, as AMASS has them: added to a glb, in place of the video's motion
+    /// elsewhere
+    #[arg(long, value_name = "CLIP.npz")]
+    motion: Option<PathBuf>,
+    /// Frame of the motion whose pose a ply or an obj shows [default: the first]
+    #[arg(long, value_name = "N")]
+    frame: Option<usize>,
+}
+
+/// Runs the command.
+pub fn export(arguments: &ExportArguments) -> Result<()> {
+    let out = &arguments.out;
+    avatar::check_folder(out)?;
+    if arguments.frame.is_some() && !matches!(arguments.format, Format::Ply | Format::Obj) {
+        bail!("--frame is of one pose: --format ply or obj");
+    }
+    let mut person = avatar::of_run(&arguments.run)?;
+    if let Some(path) = &arguments.motion {
+        avatar::add_motion(&mut person, path)?;
+    }
+    let clip = if arguments.motion.is_some() { person.clips.len() - 1 } else { 0 };
+    match arguments.format {
+        Format::Glb => {
+            let bytes = person.to_glb()?;
+            replace_file(out, |to| to.write_all(&bytes)).map_err(unwritten(out))?;
+            let names: Vec<&str> = person.clips.iter().map(|clip| clip.name.as_str()).collect();
+            let size = bytes.len() as f64 * 1e-6;
+            say!("{}: {size:.1} MB, {} triangles, motions: {}", out.display(), person.faces.len(), names.join(", "));
+        }
+        Format::Ply => {
+            let Posed { vertices, .. } = posed(&person, clip, arguments)?;
+            let splats = export::splats(&person, &vertices, PATCH)?;
+            splats.write(out)?;
+            say!("{}: {} splats", out.display(), splats.centres.len());
+        }
+        Format::Obj => {
+            let Posed { vertices, normals } = posed(&person, clip, arguments)?;
+            export::write_obj(&person, &vertices, &normals, out)?;
+            say!("{}: {} triangles", out.display(), person.faces.len());
+        }
+        Format::Npz => {
+            export::write_amass(&person, clip, out)?;
+            say!("{}: {} frames", out.display(), person.clips[clip].motion.num_frames());
+        }
+    }
+    Ok(())
+}
+
+struct Posed {
+    vertices: Vec<glam::Vec3>,
+    normals: Vec<glam::Vec3>,
+}
+
+/// The person at the frame that is asked for.
+fn posed(person: &Avatar, clip: usize, arguments: &ExportArguments) -> Result<Posed> {
+    let motion = &person.clips.get(clip).context("the person has no motion")?.motion;
+    let (frame, frames) = (arguments.frame.unwrap_or(0), motion.num_frames());
+    if frame >= frames {
+        bail!("--frame {frame}: the motion has frames 0 to {}", frames - 1);
+    }
+    let pose = &motion.poses[frame * motion.num_joints..][..motion.num_joints];
+    let bones = person.bones(pose, motion.trans[frame]);
+    Ok(Posed { vertices: person.skin_with_blend_shapes(&bones, pose), normals: person.turned_normals(&bones) })
+}

@@ -1,0 +1,152 @@
+//! `import`: a capture from what a body estimator and a segmenter wrote.
+
+use std::path::PathBuf;
+
+use anyhow::{Context, Result, bail};
+use clap::Args;
+use occnerf::capture::{self, ImportOptions, Imported};
+
+use crate::check::{self, CheckArguments};
+use crate::synth::{beside, vacant};
+
+/// What a finished directory holds, and nothing else does.
+const MARK: &str = "import.json";
+/// Environment variable that names a body model.
+const BODY_VARIABLE: &str = "SMPL_MODEL";
+
+/// Where each tool leaves its file.
+const TOOLS: &str = "\
+Run one estimator and one segmenter as their own pages say, on the same frames (ffmpeg -i clip.mp4 frames/%06d.png).
+
+--fit, told by what is in the file:
+  WHAM              output/demo/CLIP/wham_output.pkl          (demo.py --save_pkl)
+  4D-Humans, PHALP  outputs/results/demo_CLIP.pkl             (track.py; its masks are used without --masks)
+  GVHMR             outputs/demo/CLIP/hmr4d_results.pt        (wants --body SMPLX_NEUTRAL.npz)
+  PromptHMR         results/CLIP/results.pkl                  (wants --body SMPLX_NEUTRAL.npz; its masks are used, too)
+  ROMP              OUTPUT/video_results.npz                  (romp --mode=video -t)
+  EasyMocap         OUTPUT, the folder with smpl/; intri.yml and extri.yml in it or above
+
+--masks, of the person as far as it is visible:
+  SAM 2             OUTPUT/CLIP of vos_inference.py: PNGs by value, or a folder an object (--object, --occluder-objects)
+  Grounded-SAM-2    OUTPUT with mask_data/mask_*.npy          (--object, --occluder-objects)
+  MatAnyone         OUTPUT/CLIP with pha/0000.png
+  any other         PNGs of 0 and 255, or one .npy (frames, height, width)
+
+--body: SMPL_NEUTRAL.pkl of SMPL_python_v.1.1.0 (smpl.is.tue.mpg.de), or SMPLX_NEUTRAL.npz (smpl-x.is.tue.mpg.de).
+
+Then: cargo xtask train CAPTURE";
+
+/// What to read, and where to write.
+#[derive(Args)]
+#[command(after_long_help = TOOLS, after_help = "--help says where each tool leaves its file")]
+pub struct ImportArguments {
+    /// Folder of the video's frames, PNG or JPEG, in the order of their names
+    #[arg(long, value_name = "DIR")]
+    frames: PathBuf,
+    /// What the estimator wrote: a file, or EasyMocap's folder
+    #[arg(long, value_name = "FILE")]
+    fit: PathBuf,
+    /// What the segmenter wrote: a folder, or a .npy file [default: the masks in the fit]
+    #[arg(long, value_name = "DIR|FILE")]
+    masks: Option<PathBuf>,
+    /// The estimator's id of the person [default: who is there in most frames]
+    #[arg(long, value_name = "ID")]
+    person: Option<String>,
+    /// The person's value in masks of ids [default: 1]
+    #[arg(long, value_name = "ID")]
+    object: Option<u8>,
+    /// Values, in masks of ids, of what stands in front of the person
+    #[arg(long, value_name = "IDS", value_delimiter = ',')]
+    occluder_objects: Vec<u8>,
+    /// Focal length in pixels [default: the one that the estimator assumed]
+    #[arg(long, value_name = "PX")]
+    focal: Option<f64>,
+    /// The body model that the estimator fitted, .npz or .pkl [default: the variable SMPL_MODEL, or one that fits in a folder
+    /// `body` near the fit or the frames]
+    #[arg(long, value_name = "FILE")]
+    body: Option<PathBuf>,
+    /// Copy the frames into the capture; else it has links to them
+    #[arg(long)]
+    copy: bool,
+    /// Directory to write, new or empty
+    #[arg(long, value_name = "CAPTURE")]
+    out: PathBuf,
+    /// Replace what an earlier import wrote to --out
+    #[arg(long)]
+    force: bool,
+}
+
+/// Runs the command: everything is written beside --out and takes its place when it is complete.
+pub fn import(arguments: &ImportArguments) -> Result<()> {
+    let out = &arguments.out;
+    vacant(out, arguments.force, MARK)?;
+    let options = ImportOptions {
+        frames: arguments.frames.clone(),
+        fit: arguments.fit.clone(),
+        masks: arguments.masks.clone(),
+        person: arguments.person.clone(),
+        object: arguments.object,
+        occluder_objects: arguments.occluder_objects.clone(),
+        focal: arguments.focal,
+        body: arguments.body.clone().or_else(|| std::env::var_os(BODY_VARIABLE).map(PathBuf::from)),
+        copy: arguments.copy,
+    };
+    for (what, path) in
+        [("--frames", Some(&options.frames)), ("--fit", Some(&options.fit)), ("--masks", options.masks.as_ref())]
+    {
+        if let Some(path) = path.filter(|path| !path.exists()) {
+            bail!("{}: no such file or directory ({what})", path.display());
+        }
+    }
+    let partial = beside(out, "partial")?;
+    let written = capture::import(&options, &partial).map_err(anyhow::Error::from).and_then(|imported| {
+        let mark =
+            serde_json::json!({ "tool": imported.tool.name(), "person": imported.person, "frames": imported.frames });
+        crate::run::write(&partial.join(MARK), &serde_json::to_string_pretty(&mark)?)?;
+        if out.exists() {
+            vacant(out, arguments.force, MARK)?;
+            std::fs::remove_dir_all(out).with_context(|| out.display().to_string())?;
+        }
+        std::fs::rename(&partial, out).with_context(|| out.display().to_string())?;
+        Ok(imported)
+    });
+    let imported = match written {
+        Ok(imported) => imported,
+        Err(error) => {
+            let _ = std::fs::remove_dir_all(&partial);
+            return Err(error);
+        }
+    };
+    say(&imported);
+    check::check(&CheckArguments::of(out))?;
+    println!("train on it: cargo xtask train {}", out.display());
+    Ok(())
+}
+
+/// What was imported, and what was left out.
+fn say(imported: &Imported) {
+    let Imported { tool, person, frames, video_frames, focal, masks, betas_spread, .. } = imported;
+    println!("{}: person {person}, {frames} of {video_frames} frames, focal length {focal:.1} px", tool.name());
+    println!("masks: {masks}; body: {}", imported.body.display());
+    if !imported.others.is_empty() {
+        let each: Vec<String> = imported.others.iter().map(|(id, n)| format!("{id} ({n} frames)")).collect();
+        println!("others there (--person ID): {}", each.join(", "));
+    }
+    let [before, after, between] = imported.unfitted;
+    for (count, what) in [
+        (before, "before the person's first"),
+        (after, "after the last"),
+        (between, "between, without a fit"),
+        (imported.ghosts, "of these with a fit left over from an earlier frame"),
+        (imported.unmasked, "with a fit but without a mask"),
+    ] {
+        if count > 0 {
+            println!("left out: {count} frames {what}");
+        }
+    }
+    if *betas_spread > 1e-6 {
+        println!(
+            "shape: the robust mean of all frames (standard deviation of a coefficient at most {betas_spread:.2})"
+        );
+    }
+}

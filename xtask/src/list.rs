@@ -1,0 +1,93 @@
+//! `train --list`: every scene of a plain list, one run each, alone or as one of many jobs.
+
+use std::path::Path;
+
+use anyhow::{Context, Result, bail, ensure};
+
+use crate::eval::load_lpips;
+use crate::process::{Ending, one_line, say};
+use crate::run::{self, Metrics, RunConfig, use_threads};
+use crate::train::{TrainArguments, finished, run_unless_finished, scene_name};
+use crate::{source, table};
+
+/// Longest list that is read.
+const MAX_BYTES: u64 = 16 << 20;
+
+/// Trains the scenes of the list that are this job's, under OUT/SCENE; `--merge` makes the table. What is wrong with a
+/// scene is said and the others go on; it is an error at the end.
+pub fn train_list(arguments: &TrainArguments) -> Result<()> {
+    use_threads(arguments.threads)?;
+    let lpips = load_lpips(arguments.lpips.as_deref())?;
+    let scenes = read(arguments.list.as_deref().context("--list: no file")?)?;
+    let out = arguments.out.as_deref().context("--list: give --out, the folder of all runs")?;
+    let (config, load) = (arguments.settings.config()?, arguments.load.options()?);
+    let interval = arguments.saving.interval()?;
+    let (mut rows, mut failed, mut missing): (Vec<(String, Metrics)>, Vec<String>, Vec<String>) = Default::default();
+    for (index, scene) in scenes.iter().enumerate() {
+        if arguments.part.shard.is_some_and(|shard| !shard.has(index)) {
+            continue;
+        }
+        let name = unique_name(&scenes, index);
+        let directory = out.join(&name);
+        if arguments.part.merge {
+            match finished(&directory, &config)? {
+                Some(metrics) => rows.push((name, metrics)),
+                None => missing.push(name),
+            }
+            continue;
+        }
+        let trained = source::load(Some(scene), arguments.body.as_deref(), &load).and_then(|source| {
+            let (body, load) = (source.body.clone(), source.load.clone());
+            let run = RunConfig { scene: source.scene.clone(), body, load, train: config.clone() };
+            run_unless_finished(&directory, &name, &run, &source, lpips.as_ref(), interval)
+        });
+        match trained {
+            Ok(metrics) => rows.push((name, metrics)),
+            Err(error) if matches!(error.downcast_ref(), Some(Ending::Busy(_))) => say!("{name}: in another job"),
+            Err(error) if error.chain().any(|cause| cause.is::<Ending>()) => return Err(error),
+            Err(error) => {
+                say!("{name}: failed: {}", one_line(&error));
+                failed.push(name);
+            }
+        }
+    }
+    if arguments.part.writes_tables() && !rows.is_empty() {
+        let rows: Vec<(String, &Metrics)> = rows.iter().map(|(name, metrics)| (name.clone(), metrics)).collect();
+        let text = table::markdown(&rows);
+        run::write(&out.join("list.md"), &text)?;
+        say!("\n{text}\nwritten: {}", out.join("list.md").display());
+    }
+    if let Some(first) = missing.first() {
+        bail!(
+            "{} of {} scenes have no scores yet, such as {first}: run their parts again",
+            missing.len(),
+            scenes.len()
+        );
+    }
+    match failed.first() {
+        Some(first) => bail!("{} of {} scenes failed, such as {first}", failed.len(), scenes.len()),
+        None => Ok(()),
+    }
+}
+
+/// A scene a line; empty lines and what follows `#` are left out.
+fn read(path: &Path) -> Result<Vec<String>> {
+    let name = || path.display().to_string();
+    let size = std::fs::metadata(path).with_context(name)?.len();
+    ensure!(size <= MAX_BYTES, "{}: {size} bytes, expected a list of at most {MAX_BYTES}", path.display());
+    let text = std::fs::read_to_string(path).with_context(name)?;
+    let lines = text.lines().map(|line| line.split('#').next().unwrap_or("").trim());
+    let scenes: Vec<String> = lines.filter(|line| !line.is_empty()).map(str::to_owned).collect();
+    ensure!(!scenes.is_empty(), "{}: no scene in it", path.display());
+    Ok(scenes)
+}
+
+/// The scene's own name, numbered where another before it has the same.
+pub fn unique_name(scenes: &[String], index: usize) -> String {
+    let name = |i: usize| scene_name(Some(&scenes[i]));
+    let own = name(index);
+    match (0..index).filter(|&i| name(i) == own).count() {
+        0 => own,
+        earlier => format!("{own}-{}", earlier + 1),
+    }
+}

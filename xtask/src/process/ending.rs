@@ -1,0 +1,122 @@
+//! How the program ends: a message of one line, and an exit code for scripts.
+
+use std::io;
+use std::path::{Path, PathBuf};
+
+use anyhow::Error;
+
+use super::print::shown;
+
+/// Longest message that is printed, in characters: some quote what they found in a file.
+const LONGEST: usize = 2000;
+
+/// Ends that scripts can tell apart; any other error exits with 1, a command line that cannot be read with 2.
+#[derive(Debug, thiserror::Error)]
+pub enum Ending {
+    /// A result cannot be written: a full disk, a folder that is read-only or gone. What stood there before is whole.
+    #[error("{}: cannot be written: {source}", path.display())]
+    Unwritten { path: PathBuf, source: io::Error },
+    /// Another process works in the folder.
+    #[error("{} is in use by another process: wait for its end, or give another --out", .0.display())]
+    Busy(PathBuf),
+    /// A signal came; everything is saved.
+    #[error("stopped by {}; {after}", name(*.signal))]
+    Stopped { signal: i32, after: String },
+}
+
+impl Ending {
+    fn code(&self) -> u8 {
+        match self {
+            Self::Unwritten { .. } => 3,
+            Self::Busy(_) => 4,
+            // As a shell has it.
+            Self::Stopped { signal, .. } => 128 + u8::try_from(*signal).unwrap_or(0) % 127,
+        }
+    }
+}
+
+/// What turns the system's error into one that says which result is missing.
+pub fn unwritten(path: &Path) -> impl FnOnce(io::Error) -> Error + '_ {
+    move |source| Ending::Unwritten { path: path.to_owned(), source }.into()
+}
+
+fn name(signal: i32) -> String {
+    match signal {
+        1 => "SIGHUP".to_owned(),
+        2 => "SIGINT".to_owned(),
+        15 => "SIGTERM".to_owned(),
+        other => format!("signal {other}"),
+    }
+}
+
+/// The one line that is printed of an error that ends the program, and the exit code.
+pub fn described(error: &Error) -> (String, u8) {
+    let ending = error.chain().find_map(|cause| cause.downcast_ref::<Ending>());
+    let line = one_line(error);
+    match ending {
+        Some(Ending::Stopped { .. }) => (line, ending.map_or(1, Ending::code)),
+        _ => (format!("error: {line}"), ending.map_or(1, Ending::code)),
+    }
+}
+
+/// An error and its causes on one line, each said once, not longer than anybody reads.
+pub fn one_line(error: &Error) -> String {
+    let mut text = String::new();
+    for cause in error.chain() {
+        let cause = cause.to_string();
+        // Errors of the crates below quote their cause and hand it on as well.
+        if text.ends_with(&cause) {
+            continue;
+        }
+        if !text.is_empty() {
+            text.push_str(": ");
+        }
+        text.push_str(&cause);
+    }
+    let lines: Vec<&str> = text.lines().map(str::trim).filter(|line| !line.is_empty()).collect();
+    cut(&shown(&lines.join(" ")))
+}
+
+/// The beginning and the end of what is too long.
+fn cut(text: &str) -> String {
+    let count = text.chars().count();
+    if count <= LONGEST {
+        return text.to_owned();
+    }
+    let start: String = text.chars().take(LONGEST / 2).collect();
+    let end: String = text.chars().skip(count - LONGEST / 4).collect();
+    format!("{start} … ({} characters left out) … {end}", count - LONGEST / 2 - LONGEST / 4)
+}
+
+#[cfg(test)]
+mod tests {
+    use anyhow::{Context, anyhow};
+
+    use super::*;
+
+    #[test]
+    fn a_cause_is_said_once_on_one_line_without_escapes() {
+        let gone = io::Error::from(io::ErrorKind::NotFound);
+        let path = PathBuf::from("a\u{1b}[31m\nb.npz");
+        let error = Error::from(smpl::Error::Io { path, source: gone }).context("the body");
+        let (text, code) = described(&error);
+        assert_eq!((text.as_str(), code), ("error: the body: a\\u{1b}[31m b.npz: entity not found", 1));
+    }
+
+    #[test]
+    fn megabytes_are_not_echoed() {
+        let (text, _) = described(&anyhow!("before {} after", "x".repeat(1 << 20)));
+        assert!(text.len() < 2 * LONGEST && text.starts_with("error: before x") && text.ends_with("x after"));
+    }
+
+    #[test]
+    fn ends_have_codes_of_their_own_under_any_context() {
+        let full = || io::Error::from_raw_os_error(28);
+        let unwritten = Err::<(), _>(full()).map_err(unwritten(Path::new("x"))).context("saving").unwrap_err();
+        assert_eq!(described(&unwritten).1, 3);
+        assert_eq!(described(&Ending::Busy("x".into()).into()).1, 4);
+        let (text, code) = described(&Ending::Stopped { signal: 15, after: "saved".to_owned() }.into());
+        assert_eq!((text.as_str(), code), ("stopped by SIGTERM; saved", 143));
+        assert_eq!(described(&anyhow!("x")).1, 1);
+    }
+}

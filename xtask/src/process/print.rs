@@ -1,0 +1,78 @@
+//! Everything that is printed. What cannot be written never stops work, and no text steers a terminal.
+
+use std::fmt::{Arguments, Write as _};
+use std::io::Write;
+
+/// Prints a line on standard output, as `println!` takes it.
+macro_rules! say {
+    ($($text:tt)*) => { $crate::process::out(format_args!($($text)*)) };
+}
+
+/// Prints a line on standard error.
+macro_rules! note {
+    ($($text:tt)*) => { $crate::process::err(format_args!($($text)*)) };
+}
+
+pub(crate) use {note, say};
+
+/// Prints a line on standard output.
+pub fn out(text: Arguments<'_>) {
+    line(&mut std::io::stdout().lock(), text);
+}
+
+/// Prints a line on standard error.
+pub fn err(text: Arguments<'_>) {
+    line(&mut std::io::stderr().lock(), text);
+}
+
+fn line(to: &mut impl Write, text: Arguments<'_>) {
+    let mut text = shown(&text.to_string());
+    text.push('\n');
+    // A closed pipe or a full disk: there is nobody to tell, and results do not depend on it.
+    let _ = to.write_all(text.as_bytes()).and_then(|()| to.flush());
+}
+
+/// Text with everything that a terminal would obey, or that turns the direction of writing, as `\u{…}`; line breaks and
+/// tabs are left.
+pub fn shown(text: &str) -> String {
+    let mut out = String::with_capacity(text.len());
+    for c in text.chars() {
+        let turns = matches!(c, '\u{200e}' | '\u{200f}' | '\u{2028}'..='\u{202e}' | '\u{2066}'..='\u{2069}');
+        if turns || c.is_control() && c != '\n' && c != '\t' {
+            let _ = write!(out, "{}", c.escape_unicode());
+        } else {
+            out.push(c);
+        }
+    }
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io::{Error, Result};
+
+    use super::*;
+
+    #[test]
+    fn nothing_that_steers_a_terminal_is_left() {
+        let hostile = "a\u{1b}[2J\u{1b}]0;title\u{7}b\r\u{9b}31m\u{202e}c\u{2066}\u{7f}\n\té 日";
+        let text = shown(hostile);
+        assert!(text.chars().all(|c| c == '\n' || c == '\t' || !c.is_control()), "{text:?}");
+        assert!(text.starts_with("a\\u{1b}[2J") && text.ends_with("\n\té 日"), "{text:?}");
+        assert!(!text.contains('\u{202e}') && !text.contains('\u{2066}'));
+    }
+
+    #[test]
+    fn a_place_that_takes_nothing_is_passed_over() {
+        struct Full;
+        impl Write for Full {
+            fn write(&mut self, _: &[u8]) -> Result<usize> {
+                Err(Error::from_raw_os_error(28))
+            }
+            fn flush(&mut self) -> Result<()> {
+                Err(Error::from_raw_os_error(28))
+            }
+        }
+        line(&mut Full, format_args!("lost"));
+    }
+}

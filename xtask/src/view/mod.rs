@@ -1,0 +1,103 @@
+//! `view`: one HTML file of a trained person, to turn around and play.
+
+use std::hash::{DefaultHasher, Hash, Hasher};
+use std::path::PathBuf;
+
+use anyhow::{Context, Result};
+use base64::Engine;
+use base64::engine::general_purpose::STANDARD;
+use clap::Args;
+use occnerf::bake::Avatar;
+use serde_json::{Value, json};
+use volrender::Camera;
+
+use crate::avatar;
+use crate::process::say;
+use crate::report::escape;
+
+const PAGE: &str = include_str!("page.html");
+const STYLE: &str = include_str!("page.css");
+const SCRIPTS: [&str; 3] = [include_str!("person.js"), include_str!("draw.js"), include_str!("page.js")];
+
+#[derive(Args)]
+pub struct ViewArguments {
+    /// Run directory
+    run: PathBuf,
+    /// Another motion to choose, besides the video's: an .npz with poses, trans and fps, as AMASS has them; repeatable
+    #[arg(long, value_name = "CLIP.npz")]
+    motion: Vec<PathBuf>,
+    /// Where to [default: RUN/person.html]
+    #[arg(long, value_name = "FILE")]
+    out: Option<PathBuf>,
+}
+
+/// Runs the command.
+pub fn view(arguments: &ViewArguments) -> Result<()> {
+    let mut person = avatar::of_run(&arguments.run)?;
+    for path in &arguments.motion {
+        avatar::add_motion(&mut person, path)?;
+    }
+    let out = arguments.out.clone().unwrap_or_else(|| arguments.run.join("person.html"));
+    avatar::check_folder(&out)?;
+    let page = page(&person)?;
+    crate::run::write(&out, &page)?;
+    say!("{}: {:.1} MB, opens in any browser with WebGL 2", out.display(), page.len() as f64 * 1e-6);
+    Ok(())
+}
+
+/// The whole page.
+pub fn page(person: &Avatar) -> Result<String> {
+    let name = if person.name.is_empty() { "person" } else { &person.name };
+    let shells = person.shell_ends.len();
+    let extra = json!({
+        "cameras": person.cameras.iter().map(camera).collect::<Vec<_>>(),
+        "confidence": STANDARD.encode(person.atlas.confidence_to_png()?),
+    });
+    let facts = format!(
+        "{} triangles{}, {} joints",
+        person.faces.len(),
+        if shells > 1 { format!(" in {shells} shells") } else { String::new() },
+        person.num_joints()
+    );
+    let glb = STANDARD.encode(person.to_glb()?);
+    let mut hasher = DefaultHasher::new();
+    (&glb, name).hash(&mut hasher);
+    let nonce = format!("{:016x}", hasher.finish());
+    let script = SCRIPTS.concat();
+    fill(
+        PAGE,
+        &[
+            ("nonce", &nonce),
+            ("title", &escape(name)),
+            ("facts", &escape(&facts)),
+            ("style", STYLE),
+            ("script", &script),
+            ("avatar", &glb),
+            // Nothing in a string may end the element that it stands in.
+            ("extra", &extra.to_string().replace('<', "\\u003c")),
+        ],
+    )
+}
+
+/// The template with its places filled; what fills one is not looked at again.
+fn fill(template: &str, parts: &[(&str, &str)]) -> Result<String> {
+    let mut out = String::with_capacity(template.len() + parts.iter().map(|part| part.1.len()).sum::<usize>());
+    let mut rest = template;
+    while let Some((before, after)) = rest.split_once('{') {
+        let (key, after) = after.split_once('}').context("the page's template has a place without an end")?;
+        let part = parts.iter().find(|part| part.0 == key);
+        out.push_str(before);
+        out.push_str(part.with_context(|| format!("the page's template has an unknown place {key:?}"))?.1);
+        rest = after;
+    }
+    out.push_str(rest);
+    Ok(out)
+}
+
+/// Intrinsics fx fy cx cy, size, and the rows of the extrinsics.
+fn camera(camera: &Camera) -> Value {
+    let columns = camera.world_to_camera.to_cols_array();
+    let rows: Vec<f32> = (0..12).map(|i| columns[3 * (i % 4) + i / 4]).collect();
+    let k = [camera.focal.x, camera.focal.y, camera.centre.x, camera.centre.y];
+    json!({ "k": k, "size": [camera.width, camera.height], "e": rows })
+}
