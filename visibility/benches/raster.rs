@@ -1,5 +1,5 @@
-//! Cost of rasterising a body of 13776 triangles (a ball of 20480 where that is not at hand), and of casting the rays
-//! of the same pictures at it.
+//! Cost of rasterising a body of 13776 triangles (a ball of 20480 where that is not at hand), and
+//! of casting the rays of the same pictures at it.
 #![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
 
 #[path = "../tests/body/mod.rs"]

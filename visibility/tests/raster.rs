@@ -55,7 +55,8 @@ fn from_edge(mesh: &TriMesh, view: &View, face: u32, pixel: usize) -> f64 {
         .fold(f64::INFINITY, f64::min)
 }
 
-/// Least and greatest depth of a face's plane within the rounding of its corners about the centre of a pixel.
+/// Least and greatest depth of a face's plane within the rounding of its corners about the centre
+/// of a pixel.
 fn depths(mesh: &TriMesh, view: &View, face: u32, pixel: usize) -> [f64; 2] {
     let eye = view.centre().unwrap().as_dvec3();
     let [a, b, c] = mesh.faces[face as usize].map(|v| mesh.vertices[v as usize].as_dvec3() - eye);
@@ -72,7 +73,8 @@ fn check_against_rays(mesh: &TriMesh, view: &View) -> Result<usize, TestCaseErro
     let rays = RayMesh::new(&mesh.vertices, &mesh.faces).unwrap();
     let eye = view.centre().unwrap();
     let drawn = draw(mesh, view);
-    // Corners are rounded to 1/256 of a pixel, twice 1/512 at worst, and rays to a part in 10⁶ of the picture.
+    // Corners are rounded to 1/256 of a pixel, twice 1/512 at worst, and rays to a part in 10⁶ of
+    // the picture.
     let close = |face: u32, pixel| from_edge(mesh, view, face, pixel) < 0.01;
     for (pixel, fragment) in drawn.iter().enumerate() {
         let hit = rays.first_hit(eye, direction(view, pixel));

@@ -26,8 +26,8 @@ pub fn fresh(run: &Path) -> Result<Option<Avatar>> {
     Ok(if fresh { Some(Avatar::load(&path(run))?) } else { None })
 }
 
-/// The avatar of a run: that in its directory where it is not older than the checkpoint, else baked, and written there.
-/// Baking looks at the capture again, where it is still to be had.
+/// The avatar of a run: that in its directory where it is not older than the checkpoint, else
+/// baked, and written there. Baking looks at the capture again, where it is still to be had.
 pub fn avatar(run: &Path, model: &Model) -> Result<Avatar> {
     if let Some(avatar) = fresh(run)? {
         return Ok(avatar);

@@ -10,7 +10,8 @@ pub(super) const PADDING: u32 = 4;
 const DIRECTIONS: [Vec3; 6] = [Vec3::Z, Vec3::NEG_Z, Vec3::X, Vec3::NEG_X, Vec3::Y, Vec3::NEG_Y];
 /// Passes in which faces join the chart that most of their neighbours are in.
 const VOTES: usize = 6;
-/// Least cosine between a face's normal and the direction of a chart that it joins for its neighbours' sake.
+/// Least cosine between a face's normal and the direction of a chart that it joins for its
+/// neighbours' sake.
 const LEAST_COSINE: f32 = 0.35;
 
 /// Charts over the faces of a mesh, laid out.
@@ -45,8 +46,9 @@ impl Projection {
 }
 
 impl Layout {
-    /// Charts for a mesh of `vertices` and `faces`, `texel` wide texels; wider ones where they need more than a square
-    /// of `most` × `most`. All of them `shells` times. `None` where even charts of a texel do not fit.
+    /// Charts for a mesh of `vertices` and `faces`, `texel` wide texels; wider ones where they need
+    /// more than a square of `most` × `most`. All of them `shells` times. `None` where even charts
+    /// of a texel do not fit.
     pub fn new(vertices: &[Vec3], faces: &[[u32; 3]], shells: usize, texel: f32, most: u32) -> Option<Self> {
         let directions = directions(vertices, faces);
         let charts = charts(vertices, faces, &directions, texel);
@@ -126,7 +128,8 @@ fn adjacent(faces: &[[u32; 3]]) -> Vec<Vec<u32>> {
     (0..).zip(faces).map(others).collect()
 }
 
-/// Connected faces of one direction that do not hide each other, none twice as many texels as its own.
+/// Connected faces of one direction that do not hide each other, none twice as many texels as its
+/// own.
 fn charts(vertices: &[Vec3], faces: &[[u32; 3]], directions: &[usize], texel: f32) -> Vec<u32> {
     const NONE: u32 = u32::MAX;
     let near = adjacent(faces);
@@ -178,7 +181,8 @@ fn inner_texels([a, b, c]: [Vec2; 3]) -> Vec<[i32; 2]> {
     texels
 }
 
-/// The side of a square, at most `most`, and the corners of boxes side by side in it, row by row, the highest first.
+/// The side of a square, at most `most`, and the corners of boxes side by side in it, row by row,
+/// the highest first.
 fn pack(sizes: &[[u32; 2]], most: u32) -> Option<(u32, Vec<[u32; 2]>)> {
     let mut order: Vec<usize> = (0..sizes.len()).collect();
     order.sort_by_key(|&i| (std::cmp::Reverse(sizes[i][1]), std::cmp::Reverse(sizes[i][0]), i));

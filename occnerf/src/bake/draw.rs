@@ -47,7 +47,8 @@ impl<'a> BakedPerson<'a> {
         }
     }
 
-    /// World positions of the vertices, (V): pose blend shapes, then linear blend skinning by `bones` (J), canonical to world.
+    /// World positions of the vertices, (V): pose blend shapes, then linear blend skinning by
+    /// `bones` (J), canonical to world.
     ///
     /// # Panics
     /// Unless there are J bones.
@@ -75,8 +76,8 @@ impl<'a> BakedPerson<'a> {
         skinned
     }
 
-    /// The person in the pose of `bones` (J) as `camera` sees them: premultiplied colour and opacity of each pixel into
-    /// `out` (H·W, row-major).
+    /// The person in the pose of `bones` (J) as `camera` sees them: premultiplied colour and
+    /// opacity of each pixel into `out` (H·W, row-major).
     ///
     /// # Errors
     /// [`Error::Visibility`] for pictures that are too large.

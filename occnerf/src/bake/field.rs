@@ -17,8 +17,12 @@ pub(super) struct Place {
 
 /// A trained person in the canonical space.
 pub(super) trait CanonicalField: Sync {
-    /// Density, in 1 / normalised metre and 0 where nothing can be, and colour at each of `places`; overwrites `out`.
+    /// Density, in 1 / normalised metre and 0 where nothing can be, and colour at each of `places`;
+    /// overwrites `out`.
     fn evaluate(&self, places: &[Place], out: &mut Vec<(f32, Vec3)>);
+
+    /// From one sample of a picture's ray to the next, normalised metres.
+    fn spacing(&self) -> f32;
 
     /// How far from the prior there can be anything.
     fn reach(&self) -> f32;

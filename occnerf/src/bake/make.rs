@@ -23,7 +23,8 @@ use crate::model::trained::Model;
 use crate::model::view::PosedView;
 use crate::scene::prepared::Scene;
 
-/// Pixels of the training pictures that an edge of the surface may be long, where two subdivisions are enough for it.
+/// Pixels of the training pictures that an edge of the surface may be long, where two subdivisions
+/// are enough for it.
 const EDGE: f32 = 1.5;
 /// Most subdivisions: each makes four times the faces.
 const MOST_SUBDIVISIONS: u32 = 2;
@@ -37,9 +38,11 @@ const FULL_CONFIDENCE: f32 = 0.1;
 pub struct BakeOptions {
     /// Surfaces over each other, 1 to 5: one is opaque, the others have alpha.
     pub shells: usize,
-    /// Longest side of the atlas, texels; it is as large as the training pictures ask for, up to this.
+    /// Longest side of the atlas, texels; it is as large as the training pictures ask for, up to
+    /// this.
     pub atlas: u32,
-    /// Passes over the training pictures in which the texture is drawn towards them; 0 leaves it as the field has it.
+    /// Passes over the training pictures in which the texture is drawn towards them; 0 leaves it as
+    /// the field has it.
     pub refinements: u32,
     /// Frames a second of the video's motion.
     pub fps: f32,
@@ -65,19 +68,20 @@ pub struct BakeReport {
     pub side: u32,
     /// Texels on the surface.
     pub texels: usize,
-    /// Mean squared error over the known pixels of the training frames that show the surface, before the first pass of
-    /// refinement and before the last.
+    /// Mean squared error over the known pixels of the training frames that show the surface,
+    /// before the first pass of refinement and before the last.
     pub errors: [f64; 2],
     /// Wall clock, seconds.
     pub seconds: f64,
 }
 
-/// Bakes a trained person. The scene that it was trained on says how well each place was seen, and what the texture is
-/// refined by; without it every place counts as seen, and the texture is the field's.
+/// Bakes a trained person. The scene that it was trained on says how well each place was seen, and
+/// what the texture is refined by; without it every place counts as seen, and the texture is the
+/// field's.
 ///
 /// # Errors
-/// [`Error::Scene`] for options outside their ranges, a body that no camera sees, or one that needs more charts than the atlas
-/// has room for; those of frames that cannot be decoded.
+/// [`Error::Scene`] for options outside their ranges, a body that no camera sees, or one that needs
+/// more charts than the atlas has room for; those of frames that cannot be decoded.
 pub fn bake(model: &Model, scene: Option<&Scene>, options: &BakeOptions) -> Result<(Avatar, BakeReport), Error> {
     let start = Instant::now();
     let refuse = |what: String| Err(Error::Scene(format!("bake: {what}")));
@@ -107,7 +111,8 @@ pub fn bake(model: &Model, scene: Option<&Scene>, options: &BakeOptions) -> Resu
     Ok((avatar, report))
 }
 
-/// Width of a pixel of the training pictures at the depth of the body, normalised metres: the median over the frames.
+/// Width of a pixel of the training pictures at the depth of the body, normalised metres: the
+/// median over the frames.
 fn pixel_width(model: &Model) -> Option<f32> {
     let width = |view: &Arc<PosedView>| {
         let depth = view.camera.world_to_camera.transform_point3(view.centre()).z;
@@ -124,8 +129,8 @@ fn seen(scene: &Scene) -> Result<Vec<f32>, Error> {
     Ok(scene.vertex_frequencies()?.iter().map(|&n| (n as f32 / enough).min(1.0)).collect())
 }
 
-/// The avatar without name and motion, from pictures whose pixels are `pixel` normalised metres wide, and which have `seen` each
-/// vertex of the prior so well, (V).
+/// The avatar without name and motion, from pictures whose pixels are `pixel` normalised metres
+/// wide, and which have `seen` each vertex of the prior so well, (V).
 pub(super) fn surface(
     body: &Body,
     field: &impl CanonicalField,

@@ -9,7 +9,8 @@ use super::surface::{Normal, STEP};
 use crate::Error;
 use visibility::{RasterOptions, Rasterizer, View};
 
-/// How far beyond the outermost shell, and below the innermost, the field is integrated, normalised metres.
+/// How far beyond the outermost shell, and below the innermost, the field is integrated, normalised
+/// metres.
 const BEYOND: f32 = 0.02;
 const BELOW: f32 = 0.0125;
 /// Texels that are evaluated together.
@@ -39,8 +40,9 @@ impl Texel {
     }
 }
 
-/// The texels whose middles lie on a face: `places` (V) of the vertices of `faces`, in texels of a square of `side`.
-/// `describe` says of a face which shell it is of and which vertices of the subdivided prior it has.
+/// The texels whose middles lie on a face: `places` (V) of the vertices of `faces`, in texels of a
+/// square of `side`. `describe` says of a face which shell it is of and which vertices of the
+/// subdivided prior it has.
 pub(super) fn texels(
     side: u32,
     places: &[Vec2],
@@ -59,9 +61,11 @@ pub(super) fn texels(
     Ok((0..).zip(drawn).filter_map(texel).collect())
 }
 
-/// Colour and alpha of each of `texels`, with shells at `heights` (shells, V) over the prior's `normals` (V).
+/// Colour and alpha of each of `texels`, with shells at `heights` (shells, V) over the prior's
+/// `normals` (V).
 ///
-/// A shell stands for the part of the field between the middles of the gaps to its neighbours. A single one is opaque.
+/// A shell stands for the part of the field between the middles of the gaps to its neighbours. A
+/// single one is opaque.
 pub(super) fn paint(
     field: &impl CanonicalField,
     prior: &MeshDistance,
@@ -75,7 +79,7 @@ pub(super) fn paint(
             places.clear();
             let mut counts = Vec::with_capacity(texels.len());
             for texel in texels {
-                let [low, high] = slab(heights, texel, field.reach());
+                let [low, high] = slab(heights, texel, field.reach(), field.spacing());
                 texel.normal(normals).places(prior, high, low, field.reach() + high - low, along);
                 counts.push(along.len());
                 places.extend(along.iter().map(|(_, place)| *place));
@@ -85,7 +89,7 @@ pub(super) fn paint(
             let colour = |count: usize| {
                 let (own, others) = rest.split_at(count);
                 rest = others;
-                integrate(own)
+                integrate(own, field.spacing())
             };
             let colours: Vec<(Vec3, f32)> = counts.into_iter().map(colour).collect();
             let single = heights.len() == 1;
@@ -95,35 +99,41 @@ pub(super) fn paint(
     chunks.concat()
 }
 
-/// Heights between which a texel's shell stands for the field.
-fn slab(heights: &[Vec<f32>], texel: &Texel, reach: f32) -> [f32; 2] {
+/// Heights between which a texel's shell stands for the field, of which pictures take samples
+/// `spacing` apart.
+fn slab(heights: &[Vec<f32>], texel: &Texel, reach: f32, spacing: f32) -> [f32; 2] {
     let own = texel.mix(&heights[texel.shell]);
     let to = |shell: Option<&Vec<f32>>| shell.map(|heights| 0.5 * (own + texel.mix(heights)));
     let inner = to(texel.shell.checked_sub(1).and_then(|shell| heights.get(shell)));
     let outer = to(heights.get(texel.shell + 1));
     let high = outer.unwrap_or((own + BEYOND).min(reach));
-    [inner.unwrap_or(own - BELOW), high.max(own + STEP)]
+    [inner.unwrap_or(own - BELOW.max(spacing)), high.max(own + STEP)]
 }
 
-/// Colour and opacity of points one step from each other, outside in.
-fn integrate(points: &[(f32, Vec3)]) -> (Vec3, f32) {
-    let (mut transmittance, mut sum) = (1.0, Vec3::ZERO);
-    for &(density, colour) in points {
-        let alpha = 1.0 - (-density * STEP).exp();
-        sum += transmittance * alpha * colour;
-        transmittance *= 1.0 - alpha;
+/// Colour and opacity of points one step from each other, outside in: the mean over all places that
+/// samples `spacing` apart can have, as of pixels next to each other.
+fn integrate(points: &[(f32, Vec3)], spacing: f32) -> (Vec3, f32) {
+    let stride = ((spacing / STEP).round() as usize).max(1);
+    let (mut sum, mut opacity) = (Vec3::ZERO, 0.0);
+    for phase in 0..stride.min(points.len()) {
+        let mut transmittance = 1.0;
+        for &(density, colour) in points[phase..].iter().step_by(stride) {
+            let alpha = 1.0 - (-density * STEP * stride as f32).exp();
+            sum += transmittance * alpha * colour;
+            transmittance *= 1.0 - alpha;
+        }
+        opacity += 1.0 - transmittance;
     }
-    let opacity = 1.0 - transmittance;
     if opacity > 1e-3 {
-        return (sum / opacity, opacity);
+        return (sum / opacity, opacity / stride as f32);
     }
     // Of next to nothing, the colour of what is there.
     let mean = points.iter().map(|p| p.1).sum::<Vec3>() / points.len().max(1) as f32;
-    (mean, opacity)
+    (mean, 0.0)
 }
 
-/// Spreads the values of the texels that `known` marks to all others, ring by ring, so that lookups between texels at the rim of a
-/// chart find its colours.
+/// Spreads the values of the texels that `known` marks to all others, ring by ring, so that lookups
+/// between texels at the rim of a chart find its colours.
 pub(super) fn dilate<const N: usize>(side: usize, values: &mut [[f32; N]], known: &mut [bool]) {
     let mut rim: Vec<usize> = (0..known.len()).filter(|&i| !known[i]).collect();
     while !rim.is_empty() {

@@ -25,9 +25,9 @@ struct Sight {
     colour: Vec3,
 }
 
-/// Moves the colours of the middle shell's texels towards the known pixels of the training frames, `passes` times, each by a Jacobi
-/// step of the least squares problem that keeps unseen texels as they are. Returns the mean squared error before the first
-/// pass and before the last.
+/// Moves the colours of the middle shell's texels towards the known pixels of the training frames,
+/// `passes` times, each by a Jacobi step of the least squares problem that keeps unseen texels as
+/// they are. Returns the mean squared error before the first pass and before the last.
 pub(super) fn refine(model: &Model, scene: &Scene, avatar: &mut Avatar, passes: u32) -> Result<[f64; 2], Error> {
     let frames = &scene.train;
     let stride = frames.iter().map(|f| f.labels.num_subject()).sum::<usize>().div_ceil(MAX_PIXELS).max(1);

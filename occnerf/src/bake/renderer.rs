@@ -4,6 +4,7 @@ use glam::{Vec3, Vec4};
 use rayon::prelude::*;
 use smpl::{MotionField, SurfaceMotion};
 use visibility::Samples;
+use volrender::{Aabb, Ray};
 
 use super::avatar::Avatar;
 use super::draw::BakedPerson;
@@ -23,6 +24,7 @@ pub(super) struct TrainedField<'a> {
     model: &'a Model,
     code: VertexCode,
     extent: Extent,
+    spacing: f32,
 }
 
 impl<'a> TrainedField<'a> {
@@ -30,8 +32,24 @@ impl<'a> TrainedField<'a> {
         let mut code = VertexCode::default();
         model.encode_vertices(&mut code);
         let extent = model.measure_extent(&code);
-        Self { model, code, extent }
+        let spacing = mean_span(model) / model.config.samples as f32;
+        Self { model, code, extent, spacing }
     }
+}
+
+/// Mean length of the rays through the middle of the body within its box, along which samples are
+/// spread, over the training frames.
+fn mean_span(model: &Model) -> f32 {
+    let reach = model.config.motion.reach();
+    let spans = model.frames.iter().filter_map(|view| {
+        let box_of = Aabb::from_points(&view.posed.vertices);
+        let region = Aabb { min: box_of.min - reach, max: box_of.max + reach };
+        let origin = view.camera.centre_of_projection();
+        let ray = Ray { origin, direction: (view.centre() - origin).normalize_or_zero() };
+        region.intersect(&ray).map(|(near, far)| far - near)
+    });
+    let (sum, count) = spans.fold((0.0, 0), |(sum, count), span| (sum + span, count + 1));
+    if count > 0 { sum / count as f32 } else { 0.0 }
 }
 
 impl CanonicalField for TrainedField<'_> {
@@ -68,12 +86,17 @@ impl CanonicalField for TrainedField<'_> {
         out.extend(places.iter().zip(&batch.sigma).zip(&batch.rgb).map(value));
     }
 
+    fn spacing(&self) -> f32 {
+        self.spacing
+    }
+
     fn reach(&self) -> f32 {
         self.extent.farthest
     }
 }
 
-/// Draws views with the avatar that was baked of a model, in the poses that the model's training found.
+/// Draws views with the avatar that was baked of a model, in the poses that the model's training
+/// found.
 pub struct BakedRenderer<'a> {
     model: &'a Model,
     person: BakedPerson<'a>,

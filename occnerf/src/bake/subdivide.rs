@@ -58,7 +58,8 @@ pub(super) struct Subdivided {
 }
 
 impl Subdivided {
-    /// Puts four faces, of equal area, in the place of each, `times` over. Vertices of the prior keep their indices.
+    /// Puts four faces, of equal area, in the place of each, `times` over. Vertices of the prior
+    /// keep their indices.
     pub fn new(vertices: usize, faces: &[[u32; 3]], times: u32) -> Self {
         let mut mesh = Self {
             anchors: (0..vertices as u32).map(Anchor::vertex).collect(),
@@ -86,7 +87,8 @@ impl Subdivided {
     }
 }
 
-/// Unit normals of vertices: the area-weighted sum of those of the faces about them, zero where there are none.
+/// Unit normals of vertices: the area-weighted sum of those of the faces about them, zero where
+/// there are none.
 pub(super) fn normals(vertices: &[Vec3], faces: &[[u32; 3]]) -> Vec<Vec3> {
     let mut sums = vec![Vec3::ZERO; vertices.len()];
     for face in faces {

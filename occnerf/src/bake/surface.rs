@@ -11,7 +11,8 @@ use super::subdivide::{Subdivided, neighbours, normals};
 pub(super) const STEP: f32 = 0.0025;
 /// How deep below the prior the surface may be.
 const DEPTH: f32 = 0.03;
-/// Share of its height above the prior that a point's distance from it must have: nearer ones belong to another part.
+/// Share of its height above the prior that a point's distance from it must have: nearer ones
+/// belong to another part.
 const OWN: f32 = 0.7;
 /// Farther from the median of its neighbours than this a surface point is taken for noise.
 const OUTLIER: f32 = 0.01;
@@ -27,7 +28,8 @@ const SMOOTHING: usize = 2;
 /// What was found of the surface.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct SurfaceReport {
-    /// Vertices over which the field never becomes opaque; they take the height of their neighbours.
+    /// Vertices over which the field never becomes opaque; they take the height of their
+    /// neighbours.
     pub holes: usize,
     /// Vertices with a gap behind the surface found, and something opaque behind that.
     pub double: usize,
@@ -43,8 +45,8 @@ pub(super) struct Normal {
 }
 
 impl Normal {
-    /// The points at heights `high`, `high` − STEP, … down to `low`, outside in, that belong to this part of the prior, with their
-    /// heights.
+    /// The points at heights `high`, `high` − STEP, … down to `low`, outside in, that belong to
+    /// this part of the prior, with their heights.
     pub fn places(&self, prior: &MeshDistance, high: f32, low: f32, farthest: f32, out: &mut Vec<(f32, Place)>) {
         out.clear();
         let steps = ((high - low) / STEP).ceil().max(0.0) as usize;
@@ -73,8 +75,9 @@ pub(super) fn normals_of(mesh: &Subdivided, prior: &[Vec3], prior_faces: &[[u32;
     mesh.anchors.iter().map(normal).collect()
 }
 
-/// Height over the prior, along each normal (V), at which the optical depth from outside passes each of `depths`, which
-/// ascend: (V · depths), with NaN for none. And how many have something opaque behind a gap.
+/// Height over the prior, along each normal (V), at which the optical depth from outside passes
+/// each of `depths`, which ascend: (V · depths), with NaN for none. And how many have something
+/// opaque behind a gap.
 fn crossings(
     field: &impl CanonicalField,
     prior: &MeshDistance,
@@ -97,7 +100,7 @@ fn crossings(
             for heights in &profiles {
                 let densities = &values[start..start + heights.len()];
                 start += heights.len();
-                double += usize::from(profile(heights, densities, depths, &mut out));
+                double += usize::from(profile(heights, densities, field.spacing(), depths, &mut out));
             }
             (out, double)
         })
@@ -108,21 +111,27 @@ fn crossings(
 
 type Scratch = (Vec<(f32, Place)>, Vec<Place>, Vec<(f32, Vec3)>);
 
-/// Appends the heights at which the optical depth from outside passes each of `depths`; whether a gap, of no more than
-/// a tenth of the density before it, lies between something opaque outside and something opaque inside.
-fn profile(heights: &[f32], densities: &[(f32, Vec3)], depths: &[f32], out: &mut Vec<f32>) -> bool {
+/// Appends the heights at which the optical depth passes each of `depths`: that from outside down
+/// to there, and that of `spacing` at the greatest density so far, which a sample of a picture
+/// stands for. Where the field is fog that is farther out than the middle of the fog, and where
+/// pictures show its outline. Returns whether a gap, of no more than a tenth of the density before
+/// it, lies between something opaque outside and something opaque inside.
+fn profile(heights: &[f32], densities: &[(f32, Vec3)], spacing: f32, depths: &[f32], out: &mut Vec<f32>) -> bool {
     let first = out.len();
     out.resize(first + depths.len(), f32::NAN);
     let (mut depth, mut next) = (0.0, 0);
     // Greatest density and optical depth since the last gap.
     let (mut peak, mut since, mut gap, mut double) = (0.0f32, 0.0, false, false);
+    let (mut thickest, mut before) = (0.0f32, 0.0);
     for (&height, &(density, _)) in heights.iter().zip(densities) {
         let added = density * STEP;
-        while next < depths.len() && depth + added >= depths[next] {
-            out[first + next] = height + STEP * (0.5 - (depths[next] - depth) / added);
+        thickest = thickest.max(density);
+        let here = depth + added + thickest * spacing;
+        while next < depths.len() && here >= depths[next] {
+            out[first + next] = height + STEP * (0.5 - (depths[next] - before) / (here - before));
             next += 1;
         }
-        depth += added;
+        (before, depth) = (here, depth + added);
         if since >= HALF && density < 0.1 * peak {
             gap = true;
             (peak, since) = (0.0, 0.0);
@@ -134,9 +143,9 @@ fn profile(heights: &[f32], densities: &[(f32, Vec3)], depths: &[f32], out: &mut
     double
 }
 
-/// Heights of shells over each normal (V), from the innermost to the outermost: where the opacity from outside passes
-/// ½, or for `shells` of them the middle of each of as many equal parts. Holes are filled, outliers put between their
-/// neighbours, all smoothed.
+/// Heights of shells over each normal (V), from the innermost to the outermost: where the opacity
+/// from outside passes ½, or for `shells` of them the middle of each of as many equal parts. Holes
+/// are filled, outliers put between their neighbours, all smoothed.
 pub(super) fn heights(
     field: &impl CanonicalField,
     prior: &MeshDistance,
@@ -194,7 +203,8 @@ fn smoothed(heights: &[f32], near: &[Vec<u32>]) -> Vec<f32> {
     near.iter().zip(heights).map(halfway).collect()
 }
 
-/// Gives what is NaN the mean of its neighbours, from the rim inwards; 0, the prior itself, where nothing is known.
+/// Gives what is NaN the mean of its neighbours, from the rim inwards; 0, the prior itself, where
+/// nothing is known.
 fn fill(heights: &mut [f32], near: &[Vec<u32>]) {
     let mut missing: Vec<usize> = (0..heights.len()).filter(|&v| heights[v].is_nan()).collect();
     while !missing.is_empty() {

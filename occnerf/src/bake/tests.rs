@@ -33,6 +33,10 @@ impl CanonicalField for Known {
         out.extend(places.iter().map(|p| ((self.density)(p.closest, p.distance), known_colour(p.closest))));
     }
 
+    fn spacing(&self) -> f32 {
+        0.0
+    }
+
     fn reach(&self) -> f32 {
         0.06
     }

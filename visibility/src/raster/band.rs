@@ -2,17 +2,16 @@
 
 use glam::{DVec3, Vec3};
 
+use super::fragment::{Fragment, Pixel};
 use super::project::{Projected, Projection, STEP};
-use super::triangle::{Chunk, Triangle};
-use super::{Fragment, Pixel};
+use super::triangle::{BAND, Chunk, Triangle};
 
-/// Rows of samples of a band.
-pub(super) const BAND: usize = 16;
 /// Samples of a row that are tested together.
 const LANES: usize = 8;
 /// Columns over which edge functions are stepped in 32 bits.
 const BLOCK: i32 = 32;
-/// Edge functions beyond this keep their sign throughout a block: a step is at most 2²⁴, and there are fewer than 64.
+/// Edge functions beyond this keep their sign throughout a block: a step is at most 2²⁴, and there
+/// are fewer than 64.
 const CERTAIN: i64 = 1 << 30;
 /// No face.
 const NONE: u32 = u32::MAX;
@@ -75,7 +74,8 @@ impl Band<'_> {
         }
     }
 
-    /// Depth and face of every sample; the first column that is drawn in, and the one after the last.
+    /// Depth and face of every sample; the first column that is drawn in, and the one after the
+    /// last.
     fn fill(&self, band: usize, strip: &mut Strip) -> [usize; 2] {
         let stride = self.projection.width.next_multiple_of(LANES) + LANES;
         strip.layers.resize_with(self.layers.len(), Layer::default);
@@ -119,8 +119,9 @@ impl Band<'_> {
         count
     }
 
-    /// The triangle's plane where the ray through the `centre` of a sample meets it (Olano and Greer 1997: edge
-    /// functions of homogeneous coordinates, right also for corners behind the camera).
+    /// The triangle's plane where the ray through the `centre` of a sample meets it (Olano and
+    /// Greer 1997: edge functions of homogeneous coordinates, right also for corners behind the
+    /// camera).
     fn fragment(&self, face: u32, corners: [u32; 3], centre: Vec3) -> Fragment {
         let projected = corners.map(|v| &self.projected[v as usize]);
         if projected.iter().any(|v| v.inverse == 0.0) {

@@ -15,10 +15,11 @@ struct Corner {
     vertex: Option<Projected>,
 }
 
-/// Clips the triangle to what is before the near plane and within the guard band, and passes its corners in fixed-point
-/// coordinates, three at a time, to `emit`.
+/// Clips the triangle to what is before the near plane and within the guard band, and passes its
+/// corners in fixed-point coordinates, three at a time, to `emit`.
 ///
-/// What is left of an edge depends on its two ends alone, so that triangles which share the edge still do.
+/// What is left of an edge depends on its two ends alone, so that triangles which share the edge
+/// still do.
 pub(super) fn clip(
     projection: &Projection,
     corners: [(Vec3, &Projected); 3],

@@ -3,8 +3,8 @@
 use glam::{Affine3A, DVec3, Mat3, Vec3};
 use rayon::prelude::*;
 
-use super::RasterOptions;
-use crate::View;
+use super::options::RasterOptions;
+use crate::view::View;
 
 /// Steps of fixed-point coordinates between samples.
 pub(super) const STEP: i32 = 256;
@@ -16,7 +16,8 @@ pub(super) const GUARD: f32 = (1 << 15) as f32;
 pub(super) struct Projected {
     /// Homogeneous coordinates in the image: samples times depth, and depth.
     pub clip: Vec3,
-    /// Reciprocal of the depth; 0 for a vertex whose triangles are clipped, NaN for one that is nowhere.
+    /// Reciprocal of the depth; 0 for a vertex whose triangles are clipped, NaN for one that is
+    /// nowhere.
     pub inverse: f32,
     /// Fixed-point position.
     pub x: i32,

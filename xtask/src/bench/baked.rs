@@ -97,7 +97,8 @@ pub fn baked(arguments: &BakedArguments) -> Result<()> {
     Ok(())
 }
 
-/// Seconds of a picture of 512 × 512 of the video's motion, skinning included; the fastest of three rounds.
+/// Seconds of a picture of 512 × 512 of the video's motion, skinning included; the fastest of three
+/// rounds.
 fn speed(model: &Model, avatar: &Avatar, view: &PosedView, samples: Samples) -> Result<f64> {
     let camera: Camera = view.camera.resized(512, 512);
     let mut person = BakedPerson::new(avatar, model.body().scale);

@@ -1,0 +1,111 @@
+//! Cost of drawing a baked person, skinning included, and of baking one: the demo's person after a
+//! few steps.
+#![allow(clippy::unwrap_used, reason = "a failure here is a failed bench")]
+
+use std::sync::OnceLock;
+
+use divan::Bencher;
+use glam::{Affine3A, Vec4};
+use occnerf::bake::{Avatar, BakeOptions, BakedPerson, bake};
+use occnerf::{Config, Method, Model, Preset, Scene, Trainer, capture};
+use visibility::Samples;
+use volrender::Camera;
+
+/// Enough for a surface near the prior; what is drawn does not depend on how good it is.
+const STEPS: u64 = 60;
+
+fn main() {
+    divan::main();
+}
+
+struct Trained {
+    scene: Scene,
+    model: Model,
+}
+
+fn trained() -> &'static Trained {
+    static TRAINED: OnceLock<Trained> = OnceLock::new();
+    TRAINED.get_or_init(|| {
+        let body = smpl::BodyModel::embedded();
+        let demo = capture::DemoConfig { eval_cameras: 1, frames: 12, ..capture::DemoConfig::default() };
+        let config = Config { steps: STEPS, ..Config::preset(Preset::Fast, Method::Occnerf) };
+        let scene = Scene::new(&capture::demo(&demo, &body).unwrap(), &body, &config).unwrap();
+        let mut trainer = Trainer::new(&scene, config).unwrap();
+        (0..STEPS).for_each(|_| drop(trainer.step().unwrap()));
+        let model = trainer.into_model();
+        Trained { scene, model }
+    })
+}
+
+fn avatar(shells: usize) -> &'static Avatar {
+    static ONE: OnceLock<Avatar> = OnceLock::new();
+    static THREE: OnceLock<Avatar> = OnceLock::new();
+    let of = if shells == 1 { &ONE } else { &THREE };
+    of.get_or_init(|| {
+        let options = BakeOptions { shells, ..BakeOptions::default() };
+        bake(&trained().model, Some(&trained().scene), &options).unwrap().0
+    })
+}
+
+fn draw(bencher: Bencher<'_, '_>, shells: usize, samples: Samples, size: (u32, u32), threads: usize) {
+    let model = &trained().model;
+    let mut person = BakedPerson::new(avatar(shells), model.body().scale);
+    let view = &model.frames()[0];
+    let bones: Vec<Affine3A> = model.corrected(view).bones.clone();
+    // As high as the square picture, in the middle of a wide one.
+    let mut camera: Camera = view.camera.resized(size.1, size.1);
+    camera.centre.x += (size.0 - size.1) as f32 / 2.0;
+    camera.width = size.0;
+    let mut out = vec![Vec4::ZERO; (size.0 * size.1) as usize];
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+    bencher.bench_local(|| pool.install(|| person.draw(&bones, &camera, samples, &mut out)).unwrap());
+}
+
+const SIZES: [(u32, u32); 4] = [(256, 256), (512, 512), (1024, 1024), (1920, 1080)];
+
+/// One surface, two threads.
+#[divan::bench(args = SIZES)]
+fn one_surface(bencher: Bencher<'_, '_>, size: (u32, u32)) {
+    draw(bencher, 1, Samples::One, size, 2);
+}
+
+/// One surface, one thread.
+#[divan::bench(args = SIZES)]
+fn one_surface_one_thread(bencher: Bencher<'_, '_>, size: (u32, u32)) {
+    draw(bencher, 1, Samples::One, size, 1);
+}
+
+/// One surface, four samples a pixel, two threads.
+#[divan::bench(args = SIZES)]
+fn one_surface_four_samples(bencher: Bencher<'_, '_>, size: (u32, u32)) {
+    draw(bencher, 1, Samples::Four, size, 2);
+}
+
+/// Three shells, two threads.
+#[divan::bench(args = SIZES)]
+fn three_shells(bencher: Bencher<'_, '_>, size: (u32, u32)) {
+    draw(bencher, 3, Samples::One, size, 2);
+}
+
+/// Three shells, one thread.
+#[divan::bench(args = SIZES)]
+fn three_shells_one_thread(bencher: Bencher<'_, '_>, size: (u32, u32)) {
+    draw(bencher, 3, Samples::One, size, 1);
+}
+
+/// Skinning alone, one thread.
+#[divan::bench]
+fn skin(bencher: Bencher<'_, '_>) {
+    let model = &trained().model;
+    let mut person = BakedPerson::new(avatar(1), model.body().scale);
+    let bones: Vec<Affine3A> = model.corrected(&model.frames()[0]).bones.clone();
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
+    bencher.bench_local(|| pool.install(|| drop(divan::black_box(person.skin(&bones)))));
+}
+
+/// Baking with a surface or three, all threads.
+#[divan::bench(args = [1, 3], sample_count = 3)]
+fn baking(bencher: Bencher<'_, '_>, shells: usize) {
+    let options = BakeOptions { shells, ..BakeOptions::default() };
+    bencher.bench_local(|| bake(&trained().model, Some(&trained().scene), &options).unwrap());
+}
