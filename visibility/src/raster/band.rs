@@ -2,12 +2,10 @@
 
 use glam::{DVec3, Vec3};
 
+use super::pixel::{Fragment, Pixel};
 use super::project::{Projected, Projection, STEP};
-use super::triangle::{Chunk, Triangle};
-use super::{Fragment, Pixel};
+use super::triangle::{BAND, Chunk, Triangle};
 
-/// Rows of samples of a band.
-pub(super) const BAND: usize = 16;
 /// Samples of a row that are tested together.
 const LANES: usize = 8;
 /// Columns over which edge functions are stepped in 32 bits.

@@ -5,6 +5,8 @@
 
 mod band;
 mod clip;
+mod options;
+mod pixel;
 mod project;
 mod triangle;
 
@@ -12,79 +14,15 @@ use glam::Vec3;
 use rayon::prelude::*;
 
 use crate::{Error, View};
-use band::{BAND, Band};
+use band::Band;
 use project::{Projected, Projection};
-use triangle::Chunk;
+use triangle::{BAND, Chunk};
+
+pub use options::{RasterOptions, Samples};
+pub use pixel::{Fragment, Pixel};
 
 /// Most samples a row or column of the image.
 const MOST_SAMPLES: u32 = 1 << 14;
-
-/// How triangles are drawn.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct RasterOptions {
-    /// Samples of a pixel.
-    pub samples: Samples,
-    /// Leaves out triangles that the camera sees clockwise: the inside of closed meshes.
-    pub cull_back: bool,
-    /// Nothing closer than this depth is drawn, in the units of the vertices; above 0.
-    pub near: f32,
-}
-
-impl Default for RasterOptions {
-    /// One sample a pixel, both sides, everything farther than 10⁻⁴ units.
-    fn default() -> Self {
-        Self { samples: Samples::One, cull_back: false, near: 1e-4 }
-    }
-}
-
-/// Where a pixel looks.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Samples {
-    /// At its centre.
-    One,
-    /// At the centres of its four quarters, row by row.
-    Four,
-}
-
-impl Samples {
-    fn per_side(self) -> u32 {
-        match self {
-            Self::One => 1,
-            Self::Four => 2,
-        }
-    }
-}
-
-/// What a sample sees of a layer.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Fragment {
-    /// The face, counted through all layers.
-    pub face: u32,
-    /// Third camera coordinate, where the last row of the intrinsics is (0, 0, 1).
-    pub depth: f32,
-    /// Perspective-correct weights of the corners: non-negative, sum 1.
-    pub barycentric: [f32; 3],
-}
-
-/// What the samples of a pixel see.
-#[derive(Clone, Copy, Debug)]
-pub struct Pixel<'a> {
-    /// Row-major index of the pixel.
-    pub index: usize,
-    fragments: &'a [Fragment],
-    /// Fragments of every sample; empty where none sees anything.
-    counts: &'a [usize],
-    layers: usize,
-}
-
-impl Pixel<'_> {
-    /// What every sample sees, nearest first: at most one fragment a layer. No sample at all where the whole pixel
-    /// sees nothing.
-    #[inline]
-    pub fn samples(&self) -> impl ExactSizeIterator<Item = &[Fragment]> {
-        self.counts.iter().zip(self.fragments.chunks_exact(self.layers.max(1))).map(|(&n, sample)| &sample[..n])
-    }
-}
 
 /// Draws triangle meshes; keeps its buffers from picture to picture.
 #[derive(Debug, Default)]

@@ -4,11 +4,12 @@ use std::ops::Range;
 
 use glam::Vec3;
 
-use super::band::BAND;
 use super::clip::clip;
 use super::project::{Projected, Projection, STEP};
 use crate::Error;
 
+/// Rows of samples of a band.
+pub(super) const BAND: usize = 16;
 /// Faces that are set up together.
 pub(super) const CHUNK: usize = 2048;
 
