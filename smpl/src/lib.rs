@@ -32,6 +32,7 @@ mod load;
 mod mesh;
 mod model;
 mod motion;
+mod npy;
 pub mod npz;
 pub mod pickle;
 mod pose;

@@ -7,7 +7,7 @@ use glam::Vec3;
 use crate::Error;
 use crate::character::Character;
 use crate::model::{BodyModel, MAX_COORDINATE};
-use crate::npz::read_file;
+use crate::npy::read_file;
 
 /// A triangle mesh.
 #[derive(Clone, Debug, PartialEq)]

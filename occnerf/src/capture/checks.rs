@@ -5,6 +5,7 @@ use std::path::Path;
 use glam::Vec3;
 use smpl::{BodyModel, Placement};
 
+use super::camera::MAX_DISTANCE;
 use super::records::{Record, triples};
 use super::{CaptureError, Frame};
 
@@ -18,8 +19,6 @@ const JOINT_TOLERANCE: f32 = 0.04 / 1.7;
 const MAX_ANGLE: f32 = 1e3;
 /// Largest shape coefficient, in standard deviations.
 const MAX_BETA: f32 = 1e3;
-/// Farthest from the origin that a body or a camera may be, in whatever unit.
-pub(super) const MAX_DISTANCE: f32 = 1e7;
 
 /// Errors for a number that nothing in the world has.
 pub(super) fn below(record: &Record<'_>, key: &str, values: &[f32], most: f32) -> Result<(), CaptureError> {

@@ -10,7 +10,7 @@ use gltf::json::validation::Checked;
 use gltf::json::{Index, Root};
 
 use crate::Error;
-use crate::npz::read_file;
+use crate::npy::read_file;
 
 /// Bytes that all accessors together may decode to: 256 MiB.
 const MAX_DECODED_BYTES: u64 = 1 << 28;

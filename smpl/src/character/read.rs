@@ -12,7 +12,7 @@ use super::accessor::Source;
 use super::animation::{Animation, Channel, Interpolation, Part, unit, widen};
 use super::{Character, Local, Node};
 use crate::Error;
-use crate::npz::read_file;
+use crate::npy::read_file;
 use crate::sparse::SparseRows;
 
 impl Character {

@@ -3,7 +3,7 @@
 use std::io::Read;
 
 use crate::Error;
-use crate::npz::MAX_FILE_BYTES;
+use crate::npy::MAX_FILE_BYTES;
 
 /// Dictionary of the LZMA decoders in KiB: that of `xz -9`, and as much again for the rest.
 const LZMA_KIBIBYTES: u32 = 128 << 10;

@@ -1,7 +1,6 @@
 //! What the machine has built, as values.
 
-use super::globals::Global;
-use super::joblib::WRAPPER;
+use super::globals::{Global, WRAPPER};
 use super::machine::{Id, Machine, Node};
 use super::reader::Step;
 use super::value::{MAX_DEPTH, Value};

@@ -1,8 +1,10 @@
 //! The allowed globals and the types of arrays' elements, by their names.
 
-use super::joblib::WRAPPER;
 use super::reader::Step;
 use crate::array::{ElementType, element_count};
+
+/// Class of the describing object, which never becomes a value.
+pub(super) const WRAPPER: &str = "joblib.numpy_pickle.NumpyArrayWrapper";
 
 /// A global on the allow-list.
 #[derive(Clone, Copy)]

@@ -3,8 +3,6 @@
 use super::machine::{Id, Machine, Node};
 use super::reader::Step;
 
-/// Class of the describing object, which never becomes a value.
-pub(super) const WRAPPER: &str = "joblib.numpy_pickle.NumpyArrayWrapper";
 /// Pickles within pickles: an array of objects is one.
 const MAX_NESTED: usize = 4;
 

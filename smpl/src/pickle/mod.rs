@@ -18,7 +18,7 @@ mod value;
 use std::path::Path;
 
 use crate::Error;
-use crate::npz::{read_array, read_file, read_header};
+use crate::npy::{read_array, read_file, read_header};
 use machine::Machine;
 
 pub(crate) use compressed::unpacked_limit;

@@ -2,8 +2,7 @@
 
 use std::borrow::Cow;
 
-use super::globals::{Dtype, Global, count};
-use super::joblib::WRAPPER;
+use super::globals::{Dtype, Global, WRAPPER, count};
 use super::machine::{Id, Machine, Node, grown};
 use super::reader::Step;
 

@@ -37,7 +37,7 @@ fn read_fit(name: &str, bytes: &[u8], video: &Video) -> Result<Fit, CaptureError
             let mut npz = Npz::from_bytes(name, bytes.to_vec())?;
             romp::read(path, &npz.value("results")?, video)
         }
-        _ => fit::parse(path, &pickle::from_bytes(name, bytes.to_vec())?, video),
+        _ => read::parse(path, &pickle::from_bytes(name, bytes.to_vec())?, video),
     }
 }
 
@@ -194,7 +194,7 @@ fn mutated_masks_and_easymocap_files_are_errors_or_read() {
         let places: Vec<usize> = (0..whole.len()).collect();
         for case in 0..each {
             out.write(file, mutated(&whole, &places, &mut Stream::new(&[4, case as u64])));
-            bounded(file, case, || fit::read(out.path(), &video).map(drop).map_err(|e| e.to_string()));
+            bounded(file, case, || read::read(out.path(), &video).map(drop).map_err(|e| e.to_string()));
         }
     }
 }
@@ -251,9 +251,9 @@ fn what_is_wrong_is_said_in_one_line_with_file_key_expected_and_found() {
         let path = dir.join(file);
         let mut root = pickle::read(&path).unwrap();
         set(&mut root, keys, value);
-        let result = fit::parse(&path, &root, &video).and_then(|fit| {
+        let result = read::parse(&path, &root, &video).and_then(|fit| {
             // What `read` checks of every person.
-            fit.people.iter().try_for_each(|person| fit::check(&path, person, &video))
+            fit.people.iter().try_for_each(|person| read::check(&path, person, &video))
         });
         let error = result.err().unwrap_or_else(|| panic!("{keys:?} was read")).to_string();
         let name = Path::new(file).file_name().unwrap().to_str().unwrap();
@@ -271,7 +271,7 @@ fn programs_bombs_and_foreign_files_are_refused_by_name() {
     let out = Directory::new("import-hostile");
     let refused = |name: &str, bytes: &[u8], words: &[&str]| {
         out.write(name, bytes);
-        let error = fit::read(&out.path().join(name), &video).err().unwrap().to_string();
+        let error = read::read(&out.path().join(name), &video).err().unwrap().to_string();
         for word in words.iter().chain(&[name]) {
             assert!(error.contains(word), "{word}: {error}");
         }

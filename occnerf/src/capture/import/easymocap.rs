@@ -8,8 +8,8 @@ use std::path::{Path, PathBuf};
 use glam::{DMat3, DVec3};
 use serde::Deserialize;
 
-use super::Video;
 use super::fit::{About, Fit, FitFrame, Person, SMPL, Tool, axis_angle, rotation};
+use super::video::Video;
 use super::yaml;
 use crate::capture::CaptureError;
 

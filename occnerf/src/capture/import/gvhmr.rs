@@ -7,9 +7,9 @@ use std::path::Path;
 use glam::{DMat3, DVec3};
 use smpl::torch::TorchFile;
 
-use super::Video;
 use super::fit::{About, BETAS, Fit, FitFrame, Person, Tool};
 use super::item::{Item, vectors};
+use super::video::Video;
 use crate::capture::CaptureError;
 
 /// Joints of the body in `body_pose`.

@@ -7,7 +7,8 @@ use smpl::npz::read_npy;
 use smpl::{Data, NdArray};
 
 use super::levels::Levels;
-use super::{ImportOptions, Video};
+use super::options::ImportOptions;
+use super::video::Video;
 use crate::capture::names::FrameName;
 use crate::capture::pictures::file_name;
 use crate::capture::{CaptureError, pictures::Pictures};

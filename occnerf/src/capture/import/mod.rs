@@ -19,17 +19,21 @@ mod gvhmr;
 mod item;
 mod levels;
 mod masks;
+mod options;
 mod phalp;
 mod prompthmr;
+mod read;
 mod rle;
 mod romp;
 #[cfg(test)]
 mod tests;
+mod video;
 mod wham;
 mod write;
 mod yaml;
 
 pub use self::fit::Tool;
+pub use self::options::ImportOptions;
 
 use std::path::{Path, PathBuf};
 
@@ -38,33 +42,9 @@ use smpl::BodyModel;
 
 use self::fit::{BETAS, FitFrame, Person, SMPLX};
 use self::masks::Masks;
+use self::video::Video;
+use self::write::Placed;
 use super::CaptureError;
-use super::image::dimensions;
-use super::names::FrameName;
-use super::pictures::Pictures;
-
-/// What to import.
-#[derive(Clone, Debug, Default)]
-pub struct ImportOptions {
-    /// Folder of the video's frames, `.png` or `.jpg`, in the order of their names.
-    pub frames: PathBuf,
-    /// The estimator's file, or EasyMocap's folder.
-    pub fit: PathBuf,
-    /// The segmenter's folder, or one `.npy` file; `None`: the masks in the fit.
-    pub masks: Option<PathBuf>,
-    /// The estimator's id of the person; `None`: who is there in most frames.
-    pub person: Option<String>,
-    /// The person's value in masks of ids, 1 if `None`.
-    pub object: Option<u8>,
-    /// Values of what stands in front of the person.
-    pub occluder_objects: Vec<u8>,
-    /// Focal length in pixels in place of the one that the estimator assumed; the body moves so that the picture stays.
-    pub focal: Option<f64>,
-    /// The body model; `None`: one that fits, from a folder `body` near the fit or the frames.
-    pub body: Option<PathBuf>,
-    /// Whether pictures are copied rather than linked.
-    pub copy: bool,
-}
 
 /// What was imported, and what was not.
 #[derive(Clone, Debug, PartialEq)]
@@ -95,23 +75,6 @@ pub struct Imported {
     pub body: PathBuf,
 }
 
-/// Frames of a video.
-struct Video {
-    names: Vec<String>,
-    paths: Vec<PathBuf>,
-    size: (u32, u32),
-}
-
-/// A person in one frame, as the capture has it.
-struct Placed {
-    index: usize,
-    /// Axis-angle of every joint of the body model.
-    pose: Vec<DVec3>,
-    frame: FitFrame,
-    /// The extrinsics' translation.
-    translation: DVec3,
-}
-
 /// Writes the capture that `options` describe into the folder `out`, which is made if it is not there.
 ///
 /// # Errors
@@ -123,7 +86,7 @@ pub fn import(options: &ImportOptions, out: &Path) -> Result<Imported, CaptureEr
     if let Some(focal) = options.focal.filter(|focal| !(*focal >= 1.0 && *focal <= 1e6)) {
         return Err(CaptureError::setting("focal", "1 to 1000000 pixels", focal));
     }
-    let fit = fit::read(&options.fit, &video)?;
+    let fit = read::read(&options.fit, &video)?;
     let tool = fit.tool;
     let (person, others) = choose(&options.fit, fit.people, options.person.as_deref())?;
     let (body_path, model) = body::find(tool, options.body.as_deref(), &[&options.fit, &options.frames])?;
@@ -167,31 +130,6 @@ pub fn import(options: &ImportOptions, out: &Path) -> Result<Imported, CaptureEr
         masks: kind,
         body: body_path,
     })
-}
-
-impl Video {
-    /// The pictures of a folder, all of one size.
-    fn list(dir: &Path) -> Result<Self, CaptureError> {
-        let pictures = Pictures::list(dir)?;
-        let mut found: Vec<(&String, &PathBuf)> = pictures.iter().collect();
-        found.sort_by(|a, b| FrameName(a.0).cmp(&FrameName(b.0)));
-        let Some((_, first)) = found.first() else {
-            return Err(CaptureError::invalid(dir, "files", "the video's frames, .png or .jpg", "none"));
-        };
-        let size = dimensions(first)?;
-        for (_, path) in &found {
-            let other = dimensions(path)?;
-            if other != size {
-                let expected = format!("{}×{}, as the first frame", size.0, size.1);
-                return Err(CaptureError::invalid(path, "size", expected, format!("{}×{}", other.0, other.1)));
-            }
-        }
-        Ok(Self {
-            names: found.iter().map(|(name, _)| (*name).clone()).collect(),
-            paths: found.iter().map(|(_, path)| (*path).clone()).collect(),
-            size,
-        })
-    }
 }
 
 /// The person asked for, or who is there in most frames (of equals the first); and ids and frames of the others.

@@ -7,10 +7,10 @@ use std::collections::BTreeMap;
 use glam::{DMat3, DVec3};
 use smpl::pickle::Value;
 
-use super::Video;
 use super::fit::{About, BETAS, Fit, FitFrame, OwnMask, Person, SMPL, Tool, axis_angle};
 use super::item::Item;
 use super::rle::Rle;
+use super::video::Video;
 use crate::capture::CaptureError;
 use crate::capture::names::FrameName;
 

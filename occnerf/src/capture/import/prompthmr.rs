@@ -5,9 +5,9 @@
 use glam::{DMat3, DVec3};
 use smpl::{Data, NdArray};
 
-use super::Video;
 use super::fit::{About, BETAS, Fit, FitFrame, OwnMask, Person, Tool};
 use super::item::{Item, vectors};
+use super::video::Video;
 use crate::capture::CaptureError;
 
 /// Joints in `pose`.

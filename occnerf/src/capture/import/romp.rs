@@ -8,9 +8,9 @@ use std::path::Path;
 use glam::{DMat3, DVec3};
 use smpl::pickle::Value;
 
-use super::Video;
 use super::fit::{About, BETAS, Fit, FitFrame, Person, SMPL, Tool};
 use super::item::{Item, vectors};
+use super::video::Video;
 use crate::capture::CaptureError;
 use crate::capture::names::FrameName;
 

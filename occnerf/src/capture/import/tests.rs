@@ -56,7 +56,7 @@ fn rows(m: DMat3) -> [f64; 9] {
 fn fit_of(dir: &Path, file: &str, person: Option<&str>) -> (Tool, Person, Vec<(String, usize)>) {
     let video = Video::list(&dir.join("frames")).unwrap();
     let path = dir.join(file);
-    let fit = fit::read(&path, &video).unwrap_or_else(|e| panic!("{e}"));
+    let fit = read::read(&path, &video).unwrap_or_else(|e| panic!("{e}"));
     let (person, others) = choose(&path, fit.people, person).unwrap();
     (fit.tool, person, others)
 }
@@ -273,12 +273,12 @@ fn fits_that_are_wrong_are_named() {
     let video = Video::list(&dir.join("frames")).unwrap();
     let few = Video { names: video.names[..7].to_vec(), paths: video.paths[..7].to_vec(), size: video.size };
     for (_, file, _) in FITS {
-        let error = fit::read(&dir.join(file), &few).err().unwrap().to_string();
+        let error = read::read(&dir.join(file), &few).err().unwrap().to_string();
         assert!(error.contains("7") || error.contains("000007"), "{file}: {error}");
     }
     let tall = Video { size: (256, 512), names: video.names, paths: video.paths };
     for file in ["phalp/demo_clip.pkl", "prompthmr/results.pkl", "easymocap", "gvhmr/hmr4d_results.pt"] {
-        let error = fit::read(&dir.join(file), &tall).err().unwrap().to_string();
+        let error = read::read(&dir.join(file), &tall).err().unwrap().to_string();
         assert!(error.contains("512"), "{file}: {error}");
     }
     let (_, person, _) = fit_of(&dir, "wham/wham_output.pkl", None);

@@ -3,9 +3,9 @@
 
 use glam::{DMat3, DVec3};
 
-use super::Video;
 use super::fit::{About, BETAS, Fit, FitFrame, Person, SMPL, Tool};
 use super::item::{Item, vectors};
+use super::video::Video;
 use crate::capture::CaptureError;
 
 pub(super) fn read(people: &[(String, Item<'_>)], video: &Video) -> Result<Fit, CaptureError> {

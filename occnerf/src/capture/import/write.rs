@@ -7,10 +7,21 @@ use rayon::prelude::*;
 use serde_json::{Map, Value, json};
 use smpl::BodyModel;
 
-use super::fit::OwnMask;
+use super::fit::{FitFrame, OwnMask};
 use super::masks::Masks;
-use super::{ImportOptions, Placed, Video};
+use super::options::ImportOptions;
+use super::video::Video;
 use crate::capture::CaptureError;
+
+/// A person in one frame, as the capture has it.
+pub(super) struct Placed {
+    pub index: usize,
+    /// Axis-angle of every joint of the body model.
+    pub pose: Vec<DVec3>,
+    pub frame: FitFrame,
+    /// The extrinsics' translation.
+    pub translation: DVec3,
+}
 
 /// What a capture is written from.
 pub(super) struct Parts<'a> {

@@ -1,0 +1,88 @@
+//! Reading a fit, whichever estimator wrote it.
+
+use std::fs::File;
+use std::io::{BufReader, Read};
+use std::path::Path;
+
+use smpl::npz::Npz;
+use smpl::pickle::{self, Value};
+use smpl::torch::{TorchFile, is_torch};
+
+use super::fit::{Fit, Person};
+use super::item::Item;
+use super::video::Video;
+use super::{easymocap, gvhmr, phalp, prompthmr, romp, wham};
+use crate::capture::CaptureError;
+
+/// Reads a fit, which is told by what the file holds, not by its name.
+pub(super) fn read(path: &Path, video: &Video) -> Result<Fit, CaptureError> {
+    let fit = if path.is_dir() { easymocap::read(path, video)? } else { read_file(path, video)? };
+    for person in &fit.people {
+        check(path, person, video)?;
+    }
+    Ok(Fit { people: fit.people.into_iter().filter(|person| !person.frames.is_empty()).collect(), ..fit })
+}
+
+fn read_file(path: &Path, video: &Video) -> Result<Fit, CaptureError> {
+    let mut file = File::open(path).map_err(CaptureError::io(path))?;
+    let mut start = Vec::new();
+    (&mut file).take(64).read_to_end(&mut start).map_err(CaptureError::io(path))?;
+    let name = path.display().to_string();
+    if is_torch(&start) {
+        // A zip archive of numpy's arrays starts alike.
+        if start.starts_with(b"PK")
+            && let Ok(mut npz) = Npz::open(path)
+            && npz.keys().iter().any(|key| key == "results")
+        {
+            return romp::read(path, &npz.value("results")?, video);
+        }
+        let mut file = TorchFile::open(&name, BufReader::new(file))?;
+        return gvhmr::read(path, &mut file, video);
+    }
+    parse(path, &pickle::read(path)?, video)
+}
+
+/// Reads a pickle's value.
+pub(super) fn parse(path: &Path, value: &Value, video: &Video) -> Result<Fit, CaptureError> {
+    let root = Item::new(path, value);
+    if value.get("people").is_some() && value.get("camera").is_some() {
+        return prompthmr::read(&root, video);
+    }
+    let entries = root.entries()?;
+    let has = |keys: &[&str]| entries.iter().any(|(_, item)| keys.iter().all(|key| item.value.get(key).is_some()));
+    if has(&["tid", "smpl", "camera"]) {
+        phalp::read(&entries, video)
+    } else if has(&["pose", "trans", "frame_ids"]) {
+        wham::read(&entries, video)
+    } else if has(&["smpl_thetas", "cam_trans"]) {
+        romp::read(path, value, video)
+    } else {
+        let held: Vec<&str> = entries.iter().map(|(name, _)| name.as_str()).take(8).collect();
+        let expected = "a result of WHAM, 4D-Humans / PHALP, GVHMR, PromptHMR or ROMP, or EasyMocap's folder";
+        Err(root.invalid(expected, format!("a dictionary of {}", held.join(", "))))
+    }
+}
+
+/// Indices within the video, each once; a body and a camera that can be.
+pub(super) fn check(path: &Path, person: &Person, video: &Video) -> Result<(), CaptureError> {
+    let mut seen = vec![false; video.names.len()];
+    for frame in &person.frames {
+        let key = format!("person {}, frame {}", person.id, frame.index);
+        let invalid = |expected: String, actual: String| CaptureError::invalid(path, key.as_str(), expected, actual);
+        match seen.get_mut(frame.index) {
+            Some(seen) if !*seen => *seen = true,
+            Some(_) => return Err(invalid("each frame once".to_owned(), "it twice".to_owned())),
+            None => {
+                let expected = format!("a frame of the video, which has {} (counted from 0)", video.names.len());
+                return Err(invalid(expected, format!("frame {}", frame.index)));
+            }
+        }
+        if frame.focal.iter().any(|f| !(*f >= 1.0 && *f <= 1e6)) {
+            return Err(invalid("a focal length of 1 to 1000000 pixels".to_owned(), format!("{:?}", frame.focal)));
+        }
+        if frame.offset.abs().max_element() > 1e5 {
+            return Err(invalid("a body within 100 km".to_owned(), format!("{}", frame.offset)));
+        }
+    }
+    Ok(())
+}
