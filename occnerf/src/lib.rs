@@ -30,6 +30,7 @@ mod atomic;
 pub mod bake;
 mod capacity;
 pub mod capture;
+mod check;
 mod config;
 mod error;
 mod evaluate;
@@ -43,6 +44,7 @@ mod train;
 
 pub use atomic::replace_file;
 pub use capacity::{Capacity, Choice, Measured, Pruned};
+pub use check::{Check, Fault, FrameCheck, Mistake, body_silhouette, check, photograph, unknown_pixels};
 pub use config::{
     AttentionKind, Component, Config, ConfigError, DistanceKind, EncodingConfig, FieldConfig, LossConfig, Method,
     MotionConfig, MotionKind, OccludedRule, Preset, RateConfig, SurfaceConfig, VisibilityKind,

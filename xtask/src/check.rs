@@ -5,7 +5,8 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, Result};
 use clap::Args;
 use image::{Rgb, RgbImage, imageops};
-use occnerf::capture::{Check, Frame, body_silhouette, photograph, unknown_pixels};
+use occnerf::capture::Frame;
+use occnerf::{Check, body_silhouette, photograph, unknown_pixels};
 use smpl::BodyModel;
 
 use crate::pictures::{captioned, sheet, to_rgb};
@@ -49,7 +50,7 @@ impl CheckArguments {
 /// Runs the command.
 pub fn check(arguments: &CheckArguments) -> Result<()> {
     let source = source::load(arguments.scene.as_deref(), arguments.body.as_deref(), &arguments.load.options()?)?;
-    let found = occnerf::capture::check(&source.capture, &source.model)?;
+    let found = occnerf::check(&source.capture, &source.model)?;
     let path = arguments.out.clone().unwrap_or_else(|| match Path::new(&source.scene) {
         scene if scene.is_dir() => scene.join("check.png"),
         _ => PathBuf::from(format!("{}-check.png", crate::train::scene_name(Some(&source.scene)))),

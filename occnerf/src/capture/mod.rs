@@ -5,7 +5,6 @@
 //! training.
 
 mod camera;
-mod check;
 mod checks;
 mod decode;
 mod demo;
@@ -27,13 +26,12 @@ mod records;
 mod source;
 mod synth;
 #[cfg(test)]
-mod testing;
+pub(crate) mod testing;
 mod undistort;
 mod wild;
 mod write;
 mod zju;
 
-pub use self::check::{Check, Fault, FrameCheck, Mistake, body_silhouette, check, photograph, unknown_pixels};
 pub use self::demo::{DemoConfig, demo};
 pub use self::error::CaptureError;
 pub use self::find::{Layout, find_body, own_body};

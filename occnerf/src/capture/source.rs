@@ -58,7 +58,7 @@ impl PixelSource {
     }
 
     /// The picture with what its mask hides; `None` for pixels in memory, which lack that.
-    pub(super) fn photograph(&self) -> Option<Result<Image, CaptureError>> {
+    pub(crate) fn photograph(&self) -> Option<Result<Image, CaptureError>> {
         match &self.0 {
             Place::Memory(_) => None,
             Place::Disk(disk) => Some(disk.files.photograph()),

@@ -2,6 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
+use glam::DVec3;
 use image::{GrayImage, ImageFormat};
 use rayon::prelude::*;
 use serde_json::{Map, Value, json};

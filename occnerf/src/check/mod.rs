@@ -18,8 +18,9 @@ use visibility::{RayMesh, View as Pinhole, visible_vertices};
 use volrender::Camera;
 
 use self::mistakes::{Overlap, outline};
-use super::{Capture, CaptureError, Frame, Image, Pixels};
-use crate::{Label, OccludedRule, label_pixels};
+use crate::capture::{Capture, CaptureError, Frame, Image, Pixels};
+use crate::config::OccludedRule;
+use crate::scene::labels::{Label, label_pixels};
 
 /// Longest side in pixels of the pictures that silhouettes are compared at.
 const SIDE: u32 = 192;
