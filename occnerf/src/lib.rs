@@ -46,8 +46,8 @@ pub use atomic::replace_file;
 pub use capacity::{Capacity, Choice, Measured, Pruned};
 pub use check::{Check, Fault, FrameCheck, Mistake, body_silhouette, check, photograph, unknown_pixels};
 pub use config::{
-    AttentionKind, Component, Config, ConfigError, DistanceKind, EncodingConfig, FieldConfig, LossConfig, Method,
-    MotionConfig, MotionKind, OccludedRule, Preset, RateConfig, SurfaceConfig, VisibilityKind,
+    Component, Config, ConfigError, DistanceKind, EncodingConfig, FieldConfig, LossConfig, Method, MotionConfig,
+    MotionKind, OccludedRule, Preset, RateConfig, SurfaceConfig, VisibilityKind,
 };
 pub use error::Error;
 pub use evaluate::{FrameMetrics, SplitMetrics, evaluate, evaluate_with, least_seen_quartile};

@@ -8,7 +8,7 @@ use glam::Vec3;
 use occnerf::{Capacity, Config, Error, FieldRenderer, Measured, Method, Preset, Renderer, Scene, Trainer};
 use proptest::prelude::*;
 
-const PRESETS: [Preset; 4] = [Preset::Fast, Preset::Balanced, Preset::Paper, Preset::PublishedCode];
+const PRESETS: [Preset; 3] = [Preset::Fast, Preset::Balanced, Preset::Paper];
 const METHODS: [Method; 3] = [Method::Occnerf, Method::HashPoint, Method::Humannerf];
 const SIZES: [&str; 5] = ["encoding.n_max", "encoding.levels", "encoding.log2_table_size", "field.width", "samples"];
 

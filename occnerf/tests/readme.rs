@@ -29,7 +29,6 @@ fn table() -> String {
         row("[v̂, d]", |c| {
             let name = match c.surface.distance {
                 DistanceKind::Blended => "blend of vertices",
-                DistanceKind::Mean => "blend of vertices, mean distance",
                 DistanceKind::Exact => "closest point",
             };
             name.to_owned()

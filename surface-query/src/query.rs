@@ -162,27 +162,6 @@ impl SurfaceQuery {
         blend_backward::blend_backward(&self.vertices, &self.normals, query, finest, d_point, d_signed_distance)
     }
 
-    /// The distance of the code that was published with the paper, for comparisons: the mean
-    /// distance from the query to the vertices `finest`, with the sign of the side on which most of
-    /// them have it (a tie is outside). It is nowhere near 0 on the surface. Also returns its
-    /// gradient with respect to the query; the sign is a constant.
-    ///
-    /// # Panics
-    /// If `finest` is empty or names no vertex.
-    #[must_use]
-    pub fn mean_distance(&self, query: Vec3, finest: &[u32]) -> (f32, Vec3) {
-        assert!(!finest.is_empty(), "mean_distance: no neighbours");
-        let (mut sum, mut gradient, mut inside) = (0.0, Vec3::ZERO, 0);
-        for &v in finest {
-            let offset = query - self.vertices[v as usize];
-            sum += offset.length();
-            gradient += offset.normalize_or_zero();
-            inside += usize::from(offset.dot(self.normals[v as usize]) < 0.0);
-        }
-        let share = if 2 * inside > finest.len() { -1.0 } else { 1.0 } / finest.len() as f32;
-        (share * sum, share * gradient)
-    }
-
     /// The vertices, (V).
     #[must_use]
     pub fn vertices(&self) -> &[Vec3] {

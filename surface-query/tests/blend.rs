@@ -87,30 +87,6 @@ proptest! {
     }
 
     #[test]
-    fn the_mean_distance_has_the_sign_of_the_majority_and_the_gradient_of_finite_differences(
-        mesh in strategy::bumpy_sphere(),
-        direction in strategy::unit_vec3(),
-        r in 0.25f32..2.0,
-    ) {
-        let query = build(&mesh);
-        let q = direction * r;
-        let list = finest(&query, q);
-        prop_assume!(off_the_kinks(&query, q, &list));
-        let (distance, gradient) = query.mean_distance(q, &list);
-        let sides = list.iter().map(|&i| {
-            let v = i as usize;
-            (q - query.vertices()[v]).dot(query.normals()[v]).signum()
-        });
-        let side = f64::from(sides.sum::<f32>().signum());
-        prop_assert_eq!(f64::from(distance.signum()), side);
-        let outcome = check("mean", &q.to_array(), &gradient.to_array(), 2e-3, Tolerance::default(), |x| {
-            let q = Vec3::from_slice(x).as_dvec3();
-            side * list.iter().map(|&i| q.distance(query.vertices()[i as usize].as_dvec3())).sum::<f64>() / 5.0
-        });
-        prop_assert!(outcome.is_ok(), "{}", outcome.unwrap_err());
-    }
-
-    #[test]
     fn blends_of_degenerate_meshes_are_finite(q in strategy::vec3(2.0)) {
         for (name, vertices) in strategy::degenerate_clouds() {
             let n = vertices.len() as u32;

@@ -86,25 +86,6 @@ impl VisibilityCounts {
         }
     }
 
-    /// The attention of the code that was published with the paper, for comparisons: the counts of
-    /// the list, less their smallest, divided by what is then their largest, through a softmax.
-    /// Within a factor of e of uniform, whatever the counts.
-    ///
-    /// # Panics
-    /// If the lengths differ or a vertex does not exist.
-    pub fn softmax_attention(&self, neighbours: &[u32], out: &mut [f32]) {
-        assert_eq!(neighbours.len(), out.len(), "attention: {} neighbours, {} outputs", neighbours.len(), out.len());
-        let count = |v: u32| self.counts[v as usize];
-        let counts = || neighbours.iter().map(|&v| count(v));
-        let (least, most) = (counts().min().unwrap_or(0), counts().max().unwrap_or(0));
-        let range = (most - least).max(1) as f64;
-        let weight = |v: u32| ((count(v) - least) as f64 / range).exp();
-        let sum: f64 = neighbours.iter().map(|&v| weight(v)).sum();
-        for (a, &v) in out.iter_mut().zip(neighbours) {
-            *a = (weight(v) / sum) as f32;
-        }
-    }
-
     /// Sum of all counts.
     #[must_use]
     pub fn total(&self) -> u128 {

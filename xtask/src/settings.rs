@@ -15,7 +15,6 @@ const PRESETS: &[(Preset, &str)] = &[
     (Preset::Fast, "A first look: about a minute"),
     (Preset::Balanced, "The default: about two minutes"),
     (Preset::Paper, "The paper's setting: about two hours"),
-    (Preset::PublishedCode, "The same with choices of the code that was published with the paper"),
 ];
 const COMPONENTS: &[(Component, &str)] = &[
     (Component::Surface, "The surface term: F sees the point term alone"),

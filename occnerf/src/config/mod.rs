@@ -5,7 +5,7 @@ mod settings;
 mod validate;
 
 pub use self::settings::{
-    AttentionKind, Component, Config, DistanceKind, EncodingConfig, FieldConfig, LossConfig, Method, MotionConfig,
-    MotionKind, OccludedRule, Preset, RateConfig, SurfaceConfig, VisibilityKind,
+    Component, Config, DistanceKind, EncodingConfig, FieldConfig, LossConfig, Method, MotionConfig, MotionKind,
+    OccludedRule, Preset, RateConfig, SurfaceConfig, VisibilityKind,
 };
 pub use self::validate::ConfigError;

@@ -1,8 +1,8 @@
 //! The named settings, every value in one place.
 
 use crate::config::settings::{
-    AttentionKind, Config, DistanceKind, EncodingConfig, FieldConfig, LossConfig, Method, MotionConfig, MotionKind,
-    OccludedRule, Preset, RateConfig, SurfaceConfig, VisibilityKind,
+    Config, DistanceKind, EncodingConfig, FieldConfig, LossConfig, Method, MotionConfig, MotionKind, OccludedRule,
+    Preset, RateConfig, SurfaceConfig, VisibilityKind,
 };
 
 impl Config {
@@ -10,7 +10,6 @@ impl Config {
     pub fn preset(preset: Preset, method: Method) -> Self {
         let mut config = match preset {
             Preset::Paper => paper(),
-            Preset::PublishedCode => published_code(),
             Preset::Balanced => balanced(),
             Preset::Fast => fast(),
         };
@@ -26,7 +25,7 @@ impl Config {
         if method == Method::Humannerf {
             // Without a hash grid the perceptron has to hold the whole person.
             (config.field.width, config.field.depth) = match preset {
-                Preset::Paper | Preset::PublishedCode => (256, 8),
+                Preset::Paper => (256, 8),
                 Preset::Fast | Preset::Balanced => (128, 4),
             };
             if matches!(preset, Preset::Fast | Preset::Balanced) {
@@ -76,7 +75,6 @@ fn paper() -> Config {
             distance: DistanceKind::Blended,
             surface_term: true,
             attention: true,
-            attention_kind: AttentionKind::Share,
             visibility: VisibilityKind::Counted,
         },
         motion: MotionConfig {
@@ -104,13 +102,6 @@ fn paper() -> Config {
             beta_2: 0.999,
         },
     }
-}
-
-/// The paper's setting as the published code has it.
-fn published_code() -> Config {
-    let mut config = Config { preset: Preset::PublishedCode, ..paper() };
-    config.depart_as_published();
-    config
 }
 
 /// The default.
@@ -165,7 +156,7 @@ mod tests {
 
     #[test]
     fn every_preset_of_every_method_is_valid_and_survives_toml() {
-        for preset in [Preset::Fast, Preset::Balanced, Preset::Paper, Preset::PublishedCode] {
+        for preset in [Preset::Fast, Preset::Balanced, Preset::Paper] {
             for method in [Method::Prior, Method::Humannerf, Method::HashPoint, Method::Occnerf] {
                 let config = Config::preset(preset, method);
                 config.validate().unwrap();

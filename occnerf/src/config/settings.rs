@@ -69,21 +69,8 @@ pub enum MotionKind {
 pub enum DistanceKind {
     /// The paper's blend of the k nearest vertices by normal similarity.
     Blended,
-    /// The blended vertex, and the mean distance to the k nearest with the sign of the majority, as
-    /// the published code has it.
-    Mean,
     /// The closest point of the triangle mesh and its signed distance.
     Exact,
-}
-
-/// How counts become weights of the surface term.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum AttentionKind {
-    /// The paper's: each vertex its share in the counts of all neighbours.
-    Share,
-    /// The published code's: a softmax of the counts scaled to [0, 1], nearly uniform.
-    Softmax,
 }
 
 /// Where the attention's counts come from.
@@ -106,8 +93,6 @@ pub enum Preset {
     Balanced,
     /// The paper's setting.
     Paper,
-    /// The paper's setting with the departures of the code that was published with it.
-    PublishedCode,
 }
 
 impl Preset {
@@ -117,7 +102,6 @@ impl Preset {
             Self::Fast => "fast",
             Self::Balanced => "balanced",
             Self::Paper => "paper",
-            Self::PublishedCode => "published-code",
         }
     }
 }
@@ -204,8 +188,6 @@ pub struct SurfaceConfig {
     pub surface_term: bool,
     /// Whether the surface term is weighted by the visibility counts.
     pub attention: bool,
-    /// How counts become weights.
-    pub attention_kind: AttentionKind,
     /// Where the attention's counts come from.
     pub visibility: VisibilityKind,
 }
@@ -334,16 +316,6 @@ pub struct Config {
 }
 
 impl Config {
-    /// Departs from the paper as the code published with it does, as far as that is more than a
-    /// defect: attention through a softmax, ten neighbours a level, mean distances with the sign of
-    /// the majority, hidden pixels taught as background.
-    pub fn depart_as_published(&mut self) {
-        self.surface.attention_kind = AttentionKind::Softmax;
-        self.surface.k = 10;
-        self.surface.distance = DistanceKind::Mean;
-        self.occluded = OccludedRule::Background;
-    }
-
     /// Switches a component of the method off.
     pub fn ablate(&mut self, component: Component) {
         match component {

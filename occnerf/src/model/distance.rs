@@ -19,7 +19,7 @@ pub(crate) fn needs_neighbours(kind: DistanceKind) -> bool {
     kind != DistanceKind::Exact
 }
 
-/// The place of `x`, whose `neighbours` (finest level first) are read by the blended kinds;
+/// The place of `x`, whose `neighbours` (finest level first) are read by the blended kind;
 /// `None` where the exact surface is farther than `farthest`.
 pub(crate) fn surface_point(
     body: &Body,
@@ -28,15 +28,10 @@ pub(crate) fn surface_point(
     neighbours: &[u32],
     farthest: f32,
 ) -> Option<SurfacePoint> {
-    let finest = || &neighbours[..config.k];
     match config.distance {
         DistanceKind::Blended => {
-            let blended = body.query.blend(x, finest());
+            let blended = body.query.blend(x, &neighbours[..config.k]);
             Some(SurfacePoint { closest: blended.point, distance: blended.signed_distance })
-        }
-        DistanceKind::Mean => {
-            let closest = body.query.blend(x, finest()).point;
-            Some(SurfacePoint { closest, distance: body.query.mean_distance(x, finest()).0 })
         }
         DistanceKind::Exact => {
             let found = body.surface.closest(x, farthest)?;
@@ -55,13 +50,8 @@ pub(crate) fn surface_point_backward(
     d_at: SurfacePoint,
     at_surface: Vec3,
 ) -> Vec3 {
-    let finest = || &neighbours[..config.k];
     match config.distance {
-        DistanceKind::Blended => body.query.blend_backward(x, finest(), d_at.closest, d_at.distance),
-        DistanceKind::Mean => {
-            d_at.distance * body.query.mean_distance(x, finest()).1
-                + body.query.blend_backward(x, finest(), d_at.closest, 0.0)
-        }
+        DistanceKind::Blended => body.query.blend_backward(x, &neighbours[..config.k], d_at.closest, d_at.distance),
         DistanceKind::Exact => {
             let normal = ((x - at.closest) * at.distance.signum()).normalize_or(at_surface);
             d_at.distance * normal + d_at.closest - normal.dot(d_at.closest) * normal

@@ -7,7 +7,7 @@ use visibility::VisibilityCounts;
 use volrender::Aabb;
 
 use crate::Error;
-use crate::config::{AttentionKind, Config, Method};
+use crate::config::{Config, Method};
 use crate::model::arena::Arena;
 use crate::model::encoder::{Coordinates, Encoder, fit};
 use crate::model::perceptron::{Activations, Mlp};
@@ -33,7 +33,7 @@ pub(crate) struct Field {
     pub narrow: bool,
     /// Whether the input has a surface term.
     pub surface_term: bool,
-    attention: Option<AttentionKind>,
+    attention: bool,
     pub density_scale: f32,
     /// Bias at d ≤ 0 and its change per metre up to the reach.
     pub density_bias: (f32, f32),
@@ -97,7 +97,7 @@ impl Field {
             narrow: config.field.width <= NARROW,
             encoder,
             surface_term,
-            attention: config.surface.attention.then_some(config.surface.attention_kind),
+            attention: config.surface.attention,
             density_scale: config.field.density_scale,
             density_bias: (config.field.density_bias, slope),
             reach,
@@ -174,13 +174,12 @@ impl Field {
         let total = batch.samples.neighbours.len();
         let per_sample = total.checked_div(batch.samples.len()).unwrap_or(1).max(1);
         batch.attention.resize(total, 1.0 / per_sample as f32);
-        let Some(kind) = self.attention else { return };
+        if !self.attention {
+            return;
+        }
         let rows = batch.samples.neighbours.chunks_exact(per_sample);
         for (neighbours, out) in rows.zip(batch.attention.chunks_exact_mut(per_sample)) {
-            match kind {
-                AttentionKind::Share => counts.attention(neighbours, out),
-                AttentionKind::Softmax => counts.softmax_attention(neighbours, out),
-            }
+            counts.attention(neighbours, out);
         }
     }
 

@@ -26,12 +26,10 @@ pub struct Row {
     pub length: Length,
     /// A component that is switched off.
     pub without: Option<Component>,
-    /// Whether it makes the choices of the published code.
-    pub as_published: bool,
 }
 
 const fn row(name: &'static str, method: Method, occluded: OccludedRule, length: Length) -> Row {
-    Row { name, method, occluded, length, without: None, as_published: false }
+    Row { name, method, occluded, length, without: None }
 }
 
 const fn ablation(name: &'static str, component: Component) -> Row {
@@ -43,7 +41,7 @@ use Method::{HashPoint, Humannerf, Occnerf, Prior};
 use OccludedRule::{Background, Unknown};
 
 /// Every row, baselines first. Row names say `bg` where hidden pixels are taught to be background.
-pub const ROWS: [Row; 16] = [
+pub const ROWS: [Row; 15] = [
     row("prior", Prior, Unknown, Steps),
     row("humannerf-bg", Humannerf, Background, Steps),
     row("humannerf-bg-4x", Humannerf, Background, FourTimes),
@@ -54,7 +52,6 @@ pub const ROWS: [Row; 16] = [
     row("hash-point-bg", HashPoint, Background, Steps),
     row("hash-point", HashPoint, Unknown, Steps),
     row("occnerf-bg", Occnerf, Background, Steps),
-    Row { as_published: true, ..row("occnerf-published", Occnerf, Background, Steps) },
     row("occnerf", Occnerf, Unknown, Steps),
     ablation("no-surface", Component::Surface),
     ablation("no-attention", Component::Attention),
@@ -76,9 +73,6 @@ impl Row {
     /// Everything but the number of steps.
     pub fn settings(&self, preset: Preset) -> Config {
         let mut config = Config { occluded: self.occluded, ..Config::preset(preset, self.method) };
-        if self.as_published {
-            config.depart_as_published();
-        }
         if let Some(component) = self.without {
             config.ablate(component);
         }
