@@ -49,7 +49,10 @@ impl CheckArguments {
 
 /// Runs the command.
 pub fn check(arguments: &CheckArguments) -> Result<()> {
-    let source = source::load(arguments.scene.as_deref(), arguments.body.as_deref(), &arguments.load.options()?)?;
+    let mut load = arguments.load.options()?;
+    // A camera that sees nothing of the body is what is to be explained.
+    load.unseen = true;
+    let source = source::load(arguments.scene.as_deref(), arguments.body.as_deref(), &load)?;
     let found = occnerf::check(&source.capture, &source.model)?;
     let path = arguments.out.clone().unwrap_or_else(|| match Path::new(&source.scene) {
         scene if scene.is_dir() => scene.join("check.png"),
@@ -127,7 +130,7 @@ fn picture(source: &Source, found: &Check) -> Result<RgbImage> {
     Ok(whole)
 }
 
-/// A frame: mask tinted green, unknown pixels orange, the body's outline white on black.
+/// A frame: mask tinted green, unknown pixels orange, the body's outline white within purple.
 fn cell(frame: &Frame, model: &BodyModel) -> Result<RgbImage> {
     let pixels = frame.pixels()?;
     let silhouette = body_silhouette(frame, model);
@@ -161,13 +164,16 @@ fn cell(frame: &Frame, model: &BodyModel) -> Result<RgbImage> {
         let (x, y) = (x * width / to_width, y * height / to_height);
         silhouette[at(x, y)]
     };
+    // Two pixels wide, so that it shows on light and on dark.
+    let next = |x: u32, y: u32| {
+        let (right, below) = ((x + 1).min(to_width - 1), (y + 1).min(to_height - 1));
+        [(x.saturating_sub(1), y), (right, y), (x, y.saturating_sub(1)), (x, below)]
+    };
     for y in 0..to_height {
         for x in 0..to_width {
             let here = inside(x, y);
-            let right = x + 1 < to_width && inside(x + 1, y) != here;
-            let below = y + 1 < to_height && inside(x, y + 1) != here;
-            if right || below {
-                picture.put_pixel(x, y, Rgb(if here { [255, 255, 255] } else { [255, 0, 200] }));
+            if next(x, y).into_iter().any(|(x, y)| inside(x, y) != here) {
+                picture.put_pixel(x, y, Rgb(if here { [255, 255, 255] } else { [200, 0, 160] }));
             }
         }
     }

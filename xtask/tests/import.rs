@@ -67,3 +67,50 @@ fn help_says_where_the_tools_leave_their_files() {
         assert!(help.contains(word), "{word}");
     }
 }
+
+/// Rewrites every frame of a capture's metadata.json.
+fn rewritten(capture: &Path, change: impl Fn(&mut serde_json::Value)) {
+    let path = capture.join("metadata.json");
+    let mut records: serde_json::Value = serde_json::from_str(&std::fs::read_to_string(&path).unwrap()).unwrap();
+    records.as_object_mut().unwrap().values_mut().for_each(change);
+    std::fs::write(&path, records.to_string()).unwrap();
+}
+
+fn each(list: &mut serde_json::Value, change: impl Fn(f64) -> f64) {
+    for number in list.as_array_mut().unwrap() {
+        *number = change(number.as_f64().unwrap()).into();
+    }
+}
+
+#[test]
+fn check_names_the_mistake_in_a_capture_on_disk() {
+    let Some(dir) = estimators() else { return };
+    let folder = folder("check-mistakes");
+    let capture = folder.join("capture");
+    let (frames, fit, masks) = (dir.join("frames"), dir.join("wham/wham_output.pkl"), dir.join("sam2"));
+    let line =
+        ["import", "--frames", text(&frames), "--fit", text(&fit), "--masks", text(&masks), "--out", text(&capture)];
+    done(&line);
+    let whole = std::fs::read_to_string(capture.join("metadata.json")).unwrap();
+    type Change = fn(&mut serde_json::Value);
+    // The extrinsics of an import are a translation alone.
+    let mistakes: [(&str, Change); 5] = [
+        ("camera to world", |record| {
+            (0..3).for_each(|row| each(&mut record["cam_extrinsics"][row], |x| if x == 1.0 { x } else { -x }));
+        }),
+        ("points up (OpenGL)", |record| (1..3).for_each(|row| each(&mut record["cam_extrinsics"][row], |x| -x))),
+        ("millimetres", |record| {
+            (0..3).for_each(|row| each(&mut record["cam_extrinsics"][row], |x| if x == 1.0 { x } else { 1000.0 * x }));
+        }),
+        ("in degrees", |record| each(&mut record["poses"], f64::to_degrees)),
+        ("times too long", |record| {
+            (0..2).for_each(|row| each(&mut record["cam_intrinsics"][row], |x| if x > 200.0 { 2.0 * x } else { x }));
+        }),
+    ];
+    for (words, change) in mistakes {
+        std::fs::write(capture.join("metadata.json"), &whole).unwrap();
+        rewritten(&capture, change);
+        let said = done(&["check", text(&capture)]);
+        assert!(said.contains("likely mistake") && said.contains(words), "{words}: {said}");
+    }
+}

@@ -7,7 +7,7 @@ use super::perturbation::Perturbation;
 
 /// Settings that a capture's files leave open, and how much of them is read. Every layout obeys all
 /// of it, but `camera` and `occlusion`, which only raw ZJU-MoCap leaves open. Two are equal where
-/// they read the same: `max_bytes` is not compared.
+/// they read the same: `max_bytes` and `unseen` are not compared.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct LoadOptions {
@@ -35,6 +35,10 @@ pub struct LoadOptions {
     pub occlusion: Option<Obstacle>,
     /// Errors added on purpose.
     pub wrong: Perturbation,
+    /// Whether a capture is read whose cameras see nothing of the body, for [`super::check`] to say
+    /// why.
+    #[serde(skip)]
+    pub unseen: bool,
 }
 
 impl Default for LoadOptions {
@@ -49,6 +53,7 @@ impl Default for LoadOptions {
             camera: None,
             occlusion: None,
             wrong: Perturbation::default(),
+            unseen: false,
         }
     }
 }
@@ -66,6 +71,7 @@ impl PartialEq for LoadOptions {
                 camera,
                 occlusion,
                 wrong,
+                unseen: _,
             } = options;
             (pixel_centre, resize, stride, max_frames, eval_stride, camera, occlusion, wrong)
         }
