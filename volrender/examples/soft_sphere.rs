@@ -4,7 +4,7 @@
 //! Left the colours, right the depth of what was hit (near is bright).
 
 use glam::{Affine3A, Mat3, Vec3};
-use volrender::{Aabb, Camera, RaySamples, bin_edges, bin_widths, composite, sample};
+use volrender::{Aabb, Bins, Camera, RaySamples, composite};
 
 const SIDE: u32 = 256;
 const SAMPLES: usize = 96;
@@ -21,7 +21,6 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let camera = Camera::new(intrinsics, camera_to_world.inverse(), SIDE, SIDE)?;
 
     let bounds = Aabb { min: Vec3::splat(-1.0), max: Vec3::splat(1.0) };
-    let (mut edges, mut t, mut delta) = ([0.0; SAMPLES + 1], [0.0; SAMPLES], [0.0; SAMPLES]);
     let mut weights = [0.0; SAMPLES];
     let mut state = 1u32;
     let mut image = image::RgbImage::new(2 * SIDE, SIDE);
@@ -31,13 +30,12 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
             let sky = Vec3::new(0.55, 0.7, 0.95).lerp(Vec3::ONE, (row as f32 + 0.5) / SIDE as f32);
             let (mut color, mut depth) = (sky, 0.0);
             if let Some((near, far)) = bounds.intersect(&ray) {
-                bin_edges(near, far, SAMPLES, &mut edges);
-                bin_widths(&edges, &mut delta);
-                let jitter = || {
+                let bins = Bins::new(near, far, SAMPLES);
+                let delta = [bins.width(); SAMPLES];
+                let t: [f32; SAMPLES] = std::array::from_fn(|i| {
                     state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
-                    (state >> 8) as f32 / (1u32 << 24) as f32
-                };
-                sample(&edges, jitter, &mut t);
+                    bins.at(i, (state >> 8) as f32 / (1u32 << 24) as f32)
+                });
                 let sigma = t.map(|t| 60.0 * ((0.9 - ray.at(t).length()) / 0.3).clamp(0.0, 1.0).powi(2));
                 let rgb = t.map(|t| shade(ray.at(t)));
                 let samples =

@@ -3,7 +3,7 @@
 //! metrics.
 //!
 //! ```
-//! use volrender::{Aabb, Camera, RaySamples, bin_edges, bin_midpoints, bin_widths, composite};
+//! use volrender::{Aabb, Bins, Camera, RaySamples, composite};
 //! use glam::{Affine3A, Mat3, Vec3};
 //!
 //! // 64×64 pixels, looking along +z from two metres before the origin.
@@ -13,10 +13,8 @@
 //!
 //! let bounds = Aabb { min: Vec3::splat(-1.0), max: Vec3::splat(1.0) };
 //! if let Some((near, far)) = bounds.intersect(&ray) {
-//!     let (mut edges, mut t, mut delta) = ([0.0; 17], [0.0; 16], [0.0; 16]);
-//!     bin_edges(near, far, 16, &mut edges);
-//!     bin_midpoints(&edges, &mut t);
-//!     bin_widths(&edges, &mut delta);
+//!     let bins = Bins::new(near, far, 16);
+//!     let (t, delta): ([f32; 16], _) = (std::array::from_fn(|i| bins.at(i, 0.5)), [bins.width(); 16]);
 //!     // A ball of fog.
 //!     let sigma = t.map(|t| if ray.at(t).length() < 0.8 { 3.0 } else { 0.0 });
 //!     let mut weights = [0.0; 16];
@@ -59,4 +57,4 @@ pub use composite_backward::{SampleGradients, composite_backward};
 pub use distortion::Distortion;
 pub use occupancy::{Occupancy, OccupancyConfig};
 pub use ray::{Aabb, Ray};
-pub use sampling::{bin_edges, bin_midpoints, bin_widths, patch, sample};
+pub use sampling::{Bins, bin_midpoints, bin_widths, patch};

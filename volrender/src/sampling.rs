@@ -13,19 +13,35 @@ pub fn patch(around: (u32, u32), size: u32, (width, height): (u32, u32)) -> impl
     (top..top + size).flat_map(move |row| (left..left + size).map(move |column| row * width + column))
 }
 
-/// Writes the n + 1 edges of `n` equal bins between `near` and `far` into `edges`. The first is
-/// `near` and the last `far`, exactly; with `n` 0 there is one edge, `near`.
+/// Equal bins along a ray, each with one sample: stratified sampling.
 ///
-/// # Panics
-/// Where `edges` does not have n + 1 places.
-pub fn bin_edges(near: f32, far: f32, n: usize, edges: &mut [f32]) {
-    assert_eq!(edges.len(), n + 1, "{} edges for {n} bins, expected {}", edges.len(), n + 1);
-    edges[0] = near;
-    for i in 1..n {
-        edges[i] = near + (far - near) * (i as f32 / n as f32);
+/// ```
+/// let bins = volrender::Bins::new(1.0, 3.0, 4);
+/// assert_eq!((bins.width(), bins.at(0, 0.5), bins.at(3, 0.0)), (0.5, 1.25, 2.5));
+/// ```
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Bins {
+    near: f32,
+    width: f32,
+}
+
+impl Bins {
+    /// `n` bins between the depths `near` and `far`. Without any, the width is 0.
+    #[must_use]
+    pub fn new(near: f32, far: f32, n: usize) -> Self {
+        Self { near, width: if n == 0 { 0.0 } else { (far - near) / n as f32 } }
     }
-    if n > 0 {
-        edges[n] = far;
+
+    /// The width δ of each.
+    #[must_use]
+    pub fn width(&self) -> f32 {
+        self.width
+    }
+
+    /// The depth in bin `i` at `place`, from 0 at its near end to 1 at its far end.
+    #[must_use]
+    pub fn at(&self, i: usize, place: f32) -> f32 {
+        self.near + (i as f32 + place) * self.width
     }
 }
 
@@ -48,22 +64,6 @@ pub fn bin_widths(edges: &[f32], delta: &mut [f32]) {
     assert_bins(edges, delta);
     for (delta, bin) in delta.iter_mut().zip(edges.windows(2)) {
         *delta = bin[1] - bin[0];
-    }
-}
-
-/// Writes one sample of each bin into `t` (S), for ascending `edges` (S + 1): stratified sampling.
-///
-/// `jitter` is called once a bin, in order, for a number in [0, 1) that says where in the bin;
-/// values outside are clamped and NaN is 0, so that a sample never leaves its bin.
-///
-/// # Panics
-/// Where the lengths do not fit.
-pub fn sample(edges: &[f32], mut jitter: impl FnMut() -> f32, t: &mut [f32]) {
-    assert_bins(edges, t);
-    for (t, bin) in t.iter_mut().zip(edges.windows(2)) {
-        let place = jitter();
-        let place = if place > 0.0 { place.min(1.0) } else { 0.0 };
-        *t = (bin[0] + (bin[1] - bin[0]) * place).min(bin[1]);
     }
 }
 

@@ -4,7 +4,7 @@ use approx::abs_diff_eq;
 use glam::{Affine3A, Mat3, Quat, Vec2, Vec3};
 use proptest::prelude::*;
 use testkit::strategy::{degenerate_clouds, rotation, unit_vec3, vec3};
-use volrender::{Aabb, Camera, Distortion, Error, Ray, bin_edges, bin_midpoints, bin_widths, patch, sample};
+use volrender::{Aabb, Bins, Camera, Distortion, Error, Ray, bin_midpoints, bin_widths, patch};
 
 fn intrinsics(fx: f32, fy: f32, cx: f32, cy: f32) -> Mat3 {
     Mat3::from_cols_array(&[fx, 0.0, 0.0, 0.0, fy, 0.0, cx, cy, 1.0])
@@ -98,33 +98,22 @@ proptest! {
     }
 
     #[test]
-    fn bins_tile_the_range(near in 0.0f32..10.0, length in 0.0f32..5.0, n in 1usize..300) {
-        let far = near + length;
-        let (mut edges, mut middle, mut delta) = (vec![0.0; n + 1], vec![0.0; n], vec![0.0; n]);
-        bin_edges(near, far, n, &mut edges);
+    fn bins_tile_the_range_and_a_sample_stays_in_its_bin(
+        near in 0.0f32..10.0, length in 0.0f32..5.0, n in 1usize..300, place in 0.0f32..1.0,
+    ) {
+        let bins = Bins::new(near, near + length, n);
+        let edges: Vec<f32> = (0..=n).map(|i| bins.at(i, 0.0)).collect();
+        let (mut middle, mut delta) = (vec![0.0; n], vec![0.0; n]);
         bin_midpoints(&edges, &mut middle);
         bin_widths(&edges, &mut delta);
-        prop_assert_eq!((edges[0], edges[n]), (near, far));
-        prop_assert!(edges.is_sorted());
-        prop_assert!(abs_diff_eq!(delta.iter().sum::<f32>(), length, epsilon = 1e-4));
+        prop_assert!(edges[0] == near && edges.is_sorted());
+        prop_assert!(abs_diff_eq!(edges[n], near + length, epsilon = 1e-5));
         for i in 0..n {
-            prop_assert!(edges[i] <= middle[i] && middle[i] <= edges[i + 1]);
+            let t = bins.at(i, place);
+            prop_assert!(edges[i] <= t && t <= edges[i + 1]);
             // An ulp of an edge is up to 1e-6.
-            prop_assert!(abs_diff_eq!(delta[i], length / n as f32, epsilon = 3e-6));
-        }
-    }
-
-    #[test]
-    fn a_sample_stays_in_its_bin(near in 0.0f32..10.0, length in 0.0f32..5.0, jitter in prop::collection::vec(-0.5f32..1.5, 1..100)) {
-        let n = jitter.len();
-        let (mut edges, mut t) = (vec![0.0; n + 1], vec![0.0; n]);
-        bin_edges(near, near + length, n, &mut edges);
-        let mut numbers = jitter.iter();
-        sample(&edges, || *numbers.next().unwrap(), &mut t);
-        for i in 0..n {
-            prop_assert!(edges[i] <= t[i] && t[i] <= edges[i + 1]);
-            let expected = edges[i] + (edges[i + 1] - edges[i]) * jitter[i].clamp(0.0, 1.0);
-            prop_assert!(abs_diff_eq!(t[i], expected, epsilon = 2e-6));
+            prop_assert!(abs_diff_eq!(delta[i], bins.width(), epsilon = 3e-6));
+            prop_assert!(abs_diff_eq!(middle[i], bins.at(i, 0.5), epsilon = 3e-6));
         }
     }
 
@@ -230,15 +219,10 @@ fn boxes_of_degenerate_clouds_hold_their_finite_points() {
 }
 
 #[test]
-fn no_bins_and_odd_jitter_are_fine() {
-    let mut edge = [0.0];
-    bin_edges(2.0, 5.0, 0, &mut edge);
-    assert_eq!(edge, [2.0]);
-    bin_midpoints(&edge, &mut []);
-    let mut t = [0.0; 3];
-    let mut jitter = [f32::NAN, f32::INFINITY, f32::NEG_INFINITY].into_iter();
-    sample(&[0.0, 1.0, 2.0, 3.0], || jitter.next().unwrap(), &mut t);
-    assert_eq!(t, [0.0, 2.0, 2.0]);
+fn no_bins_have_no_width() {
+    let bins = Bins::new(2.0, 5.0, 0);
+    assert_eq!((bins.width(), bins.at(0, 0.5)), (0.0, 2.0));
+    bin_midpoints(&[2.0], &mut []);
 }
 
 #[test]

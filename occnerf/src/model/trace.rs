@@ -3,7 +3,7 @@
 use glam::{Vec3, Vec4};
 use smpl::{MotionField, MotionFrame, Posed};
 use surface_query::MeshDistance;
-use volrender::{Composite, Occupancy, OccupancyConfig, Ray};
+use volrender::{Bins, Composite, Occupancy, OccupancyConfig, Ray};
 
 use crate::Error;
 use crate::config::Config;
@@ -124,16 +124,16 @@ impl Tracer<'_> {
     /// where they end.
     pub fn trace(&self, samples: &mut Samples, most: usize, march: &mut March) {
         let ray = march.ray;
-        let bins = self.config.samples;
+        let count = self.config.samples;
         let first = samples.len();
         let span = self.surface.occupancy.region().and_then(|region| region.intersect(&ray));
         if let Some((near, far)) = span.filter(|(near, far)| far > near) {
-            let width = (far - near) / bins as f32;
-            while march.bin < bins && samples.len() - first < most {
+            let bins = Bins::new(near, far, count);
+            while march.bin < count && samples.len() - first < most {
                 let bin = march.bin;
                 march.bin += 1;
                 let place = march.jitter.as_mut().map_or(0.5, Stream::uniform);
-                let t = near + (bin as f32 + place) * width;
+                let t = bins.at(bin, place);
                 let point = ray.origin + t * ray.direction;
                 if !self.surface.occupancy.is_live(point) {
                     continue;
@@ -142,11 +142,11 @@ impl Tracer<'_> {
                 (live, march.known) = self.push(samples, point, march.known, march.inside);
                 if live {
                     samples.t.push(t);
-                    samples.delta.push(width);
+                    samples.delta.push(bins.width());
                     samples.world.push(point);
                 }
             }
-            march.ended = march.bin == bins;
+            march.ended = march.bin == count;
         } else {
             march.ended = true;
         }

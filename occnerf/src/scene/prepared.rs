@@ -5,7 +5,7 @@ use std::sync::Arc;
 use rayon::prelude::*;
 use smpl::BodyModel;
 use visibility::{RayMesh, View};
-use volrender::{Aabb, Camera};
+use volrender::Camera;
 
 use crate::Error;
 use crate::capture::{Capture, Frame, PixelSource, Pixels};
@@ -139,12 +139,14 @@ fn prepare(
 /// Pixels (H × W) whose ray hits the posed prior.
 fn silhouette(body: &Body, view: &PosedView) -> Result<Vec<bool>, Error> {
     let mesh = RayMesh::new(&view.posed.vertices, &body.model.faces)?;
-    let region = Aabb::from_points(&view.posed.vertices);
-    let hits = |pixel| {
-        let ray = view.pixel_ray(pixel);
-        region.intersect(&ray).is_some() && mesh.first_hit(ray.origin, ray.direction).is_some()
-    };
-    Ok((0..view.camera.width * view.camera.height).map(hits).collect())
+    let (width, [x0, y0, x1, y1]) = (view.camera.width, view.body_box());
+    let pixels: Vec<u32> = (y0..y1).flat_map(|row| (x0..x1).map(move |column| row * width + column)).collect();
+    let ray = |&pixel: &u32| (view.pixel_ray(pixel).origin, view.pixel_ray(pixel).direction);
+    let mut hits = vec![None; pixels.len()];
+    mesh.first_hits(&pixels.iter().map(ray).collect::<Vec<_>>(), &mut hits);
+    let mut covered = vec![false; (width * view.camera.height) as usize];
+    pixels.iter().zip(&hits).for_each(|(&pixel, hit)| covered[pixel as usize] = hit.is_some());
+    Ok(covered)
 }
 
 /// The pinhole view that the visibility crate asks for.

@@ -8,7 +8,7 @@ use hashgrid::{HashGrid, HashGridConfig};
 use occnerf::{Config, Method, Preset};
 use smpl::{MotionField, MotionFrame, SurfaceMotion, SurfacePoint, WeightVolume, WeightVolumeConfig};
 use surface_query::{MeshDistance, SurfaceQuery, SurfaceQueryConfig};
-use volrender::{Aabb, Ray, RaySamples, bin_edges, bin_midpoints, bin_widths, composite};
+use volrender::{Aabb, Bins, Ray, RaySamples, composite};
 
 use super::figure::{Figure, Kernel, REACH, Random, mean, median};
 
@@ -156,14 +156,13 @@ pub fn samples(figure: &Figure, rays: usize) -> Result<Kernel> {
         figure.posed.vertices[vertex] + 0.01 * Vec3::new(random.next(), random.next(), random.next())
     };
     let rays: Vec<Ray> = (0..rays).map(|_| ray(target())).collect();
-    let [mut edges, mut t, mut delta, mut sigma, mut weights] = [(); 5].map(|()| vec![0.0; MOST + 1]);
+    let [mut t, mut delta, mut sigma, mut weights] = [(); 4].map(|()| vec![0.0; MOST]);
     let mut rgb = vec![Vec3::ZERO; MOST];
     let mut color = |ray: &Ray, n: usize| -> Vec3 {
         let Some((near, far)) = bounds.intersect(ray) else { return Vec3::ZERO };
-        bin_edges(near, far, n, &mut edges[..n + 1]);
-        bin_midpoints(&edges[..n + 1], &mut t[..n]);
-        bin_widths(&edges[..n + 1], &mut delta[..n]);
+        let bins = Bins::new(near, far, n);
         for i in 0..n {
+            (t[i], delta[i]) = (bins.at(i, 0.5), bins.width());
             let at = ray.at(t[i]);
             let closest = mesh.closest(at, 0.04);
             let depth = closest.as_ref().map_or(1.0, |c| c.signed_distance);
