@@ -117,8 +117,13 @@ import { GLTFLoader } from "three/addons/loaders/GLTFLoader.js";
 const gltf = await new GLTFLoader().loadAsync("/person.glb");
 scene.add(gltf.scene);
 const mixer = new THREE.AnimationMixer(gltf.scene);
-mixer.clipAction(gltf.animations[0]).play();
+const action = mixer.clipAction(gltf.animations[0]);
+// The last frame is not the first.
+action.setLoop(THREE.LoopOnce);
+action.clampWhenFinished = true;
+action.play();
 window.shot = (seconds, camera, side) => {
+  action.reset();
   mixer.setTime(seconds);
   gltf.scene.traverse((o) => (o.frustumCulled = false));
   renderer.render(scene, window.camera(camera, side));
@@ -136,9 +141,9 @@ splats.rotation.x = Math.PI;
 scene.add(splats);
 window.shot = async (camera, side) => {
   // Sorting is done beside drawing.
-  for (let i = 0; i < 12; i++) {
+  for (let i = 0; i < 4; i++) {
     renderer.render(scene, window.camera(camera, side));
-    await new Promise((done) => setTimeout(done, 150));
+    await new Promise((done) => setTimeout(done, 1000));
   }
   return window.png();
 };
@@ -167,7 +172,8 @@ async function shots(browser, cameras) {
   writeFileSync(at("splats.html"), THREE_PAGE(SPLAT_BODY));
   const splats = await open(browser, { viewport: { width: 700, height: 700 } }, "http://local/splats.html");
   await splats.page.waitForFunction(() => window.ready, null, { timeout: 60000 }).catch(() => {});
-  const drawn = await splats.page.evaluate((c) => window.shot?.(c, 512), cameras[0]);
+  const late = new Promise((done) => setTimeout(() => done(null), 240000));
+  const drawn = await Promise.race([splats.page.evaluate((c) => window.shot?.(c, 512), cameras[0]), late]);
   check(Boolean(drawn), `a splat viewer reads the PLY: ${await splats.page.evaluate(() => window.ready)} splats ${splats.problems.slice(0, 3).join("; ")}`);
   if (drawn) {
     const picture = Buffer.from(drawn, "base64");
@@ -187,12 +193,18 @@ async function video(browser) {
   check(stream.codec_name === "h264" && Number(stream.nb_read_frames) === pictures.length,
     `ffprobe: ${stream.codec_name} ${stream.width}x${stream.height} ${stream.pix_fmt}, ${stream.nb_read_frames} of ${pictures.length} frames`);
   const rate = Number(stream.r_frame_rate.split("/")[0]) / Number(stream.r_frame_rate.split("/")[1]);
-  writeFileSync(at("video.html"), `<!doctype html><link rel="icon" href="data:,"><video src="/movement/movement.mp4" muted preload="auto"></video>`);
+  writeFileSync(at("video.html"), `<!doctype html><link rel="icon" href="data:,"><video muted></video>`);
   const { page, problems, close } = await open(browser, {}, "http://local/video.html");
   const frame = Math.floor(pictures.length / 2);
   const shot = await page.evaluate(async (seconds) => {
     const video = document.querySelector("video");
-    if (video.readyState < 2) await new Promise((done, fail) => { video.onloadeddata = done; video.onerror = () => fail(video.error.message); });
+    // Whole in memory, so that it can be sought in.
+    const whole = await (await fetch("/movement/movement.mp4")).blob();
+    await new Promise((done, fail) => {
+      video.onloadeddata = done;
+      video.onerror = () => fail(new Error(video.error.message));
+      video.src = URL.createObjectURL(whole);
+    });
     await new Promise((done) => { video.onseeked = done; video.currentTime = seconds; });
     const canvas = document.createElement("canvas");
     [canvas.width, canvas.height] = [video.videoWidth, video.videoHeight];

@@ -8,7 +8,9 @@ use clap::{Args, ValueEnum};
 use glam::{Affine3A, Mat3, Vec3};
 use indicatif::ProgressBar;
 use occnerf::bake::BakedRenderer;
-use occnerf::{Body, FieldRenderer, Method, Model, Person, PosedView, PriorRenderer, Renderer, upright};
+use occnerf::bake::export::fit_motion;
+use occnerf::{Body, FieldRenderer, Method, Model, Moment, Person, PosedView, PriorRenderer, Renderer, upright};
+use smpl::{MotionClip, Placement};
 use visibility::Samples;
 use volrender::Camera;
 
@@ -29,6 +31,10 @@ pub enum What {
     Freeview,
     /// The rest pose from all around.
     Tpose,
+    /// Every frame of the video while the camera goes round once.
+    Allview,
+    /// The poses of --motion from the front.
+    Pose,
 }
 
 #[derive(Args)]
@@ -39,6 +45,9 @@ pub struct RenderArguments {
     /// Training frame of `freeview` [default: the first]
     #[arg(long, default_value_t = 0)]
     frame: usize,
+    /// Motion capture for `pose`, an .npz with poses, trans and fps, as AMASS has them
+    #[arg(long, value_name = "CLIP.npz", required_if_eq("what", "pose"))]
+    motion: Option<PathBuf>,
     /// Size of the pictures, WIDTHxHEIGHT [default: as in training]
     #[arg(long)]
     size: Option<String>,
@@ -82,7 +91,10 @@ pub fn render(arguments: &RenderArguments) -> Result<()> {
     if arguments.frame >= frames.len() {
         bail!("--frame {}: {} has frames 0 to {}", arguments.frame, run.scene, frames.len() - 1);
     }
-    let views = views(body, frames, arguments, size);
+    if arguments.motion.is_some() && arguments.what != What::Pose {
+        bail!("--motion is for `render RUN pose`");
+    }
+    let views = views(body, frames, arguments, size)?;
     let name = format!("{:?}", arguments.what).to_lowercase();
     let out = arguments.out.clone().unwrap_or_else(|| directory.join("renders").join(&name));
     make_directory(&out)?;
@@ -115,29 +127,43 @@ fn views(
     frames: &[Arc<PosedView>],
     arguments: &RenderArguments,
     size: Option<(u32, u32)>,
-) -> Vec<PosedView> {
+) -> Result<Vec<PosedView>> {
     let resized = |camera: &Camera| size.map_or(*camera, |(w, h)| camera.resized(w, h));
     let frame = &frames[arguments.frame];
-    let angles = (0..TURN).map(|i| i as f32 / TURN as f32 * std::f32::consts::TAU);
-    match arguments.what {
+    let turn = |count: usize| (0..count).map(move |i| i as f32 / count as f32 * std::f32::consts::TAU);
+    let angles = turn(TURN);
+    // The camera of a frame, gone about the vertical through the body.
+    let up = upright(body, frames.iter().map(Arc::as_ref));
+    let around = |frame: &PosedView, angle: f32| {
+        let (turn, centre) = (Mat3::from_axis_angle(up, angle), frame.centre());
+        let mut camera = frame.camera;
+        camera.world_to_camera *= Affine3A::from_mat3_translation(turn, centre - turn * centre);
+        frame.seen_by(&resized(&camera))
+    };
+    Ok(match arguments.what {
         What::Movement => frames.iter().map(|f| f.seen_by(&resized(&f.camera))).collect(),
-        What::Freeview => {
-            let up = upright(body, frames.iter().map(Arc::as_ref));
-            let view = |angle| {
-                let (turn, centre) = (Mat3::from_axis_angle(up, angle), frame.centre());
-                let about = Affine3A::from_mat3_translation(turn, centre - turn * centre);
-                let mut camera = frame.camera;
-                camera.world_to_camera *= about;
-                frame.seen_by(&resized(&camera))
-            };
-            angles.map(view).collect()
-        }
+        What::Freeview => angles.map(|angle| around(frame, angle)).collect(),
+        What::Allview => frames.iter().zip(turn(frames.len())).map(|(f, angle)| around(f, angle)).collect(),
         What::Tpose => {
             let rest = PosedView::new(&frame.camera, body.rest());
             let centre = rest.centre();
             angles.map(|angle| rest.seen_by(&resized(&camera_at(frame, centre, angle)))).collect()
         }
-    }
+        What::Pose => {
+            let path = arguments.motion.as_deref().context("pose: --motion CLIP.npz says which poses")?;
+            let joints = body.model.num_joints();
+            let root = body.canonical.joints.first().map_or(Vec3::ZERO, |&joint| joint / body.scale);
+            let motion =
+                fit_motion(&MotionClip::load(path)?, joints, root).with_context(|| path.display().to_string())?;
+            let view = |(pose, &translation): (&[Vec3], &Vec3)| {
+                let placement = Placement::Pelvis { translation };
+                let posed = body.pose(Moment { betas: &body.mean_betas, pose, placement });
+                let view = PosedView::new(&frame.camera, posed);
+                view.seen_by(&resized(&camera_at(frame, view.centre(), 0.0)))
+            };
+            motion.poses.chunks_exact(joints).zip(&motion.trans).map(view).collect()
+        }
+    })
 }
 
 /// A camera like the training camera's, at the same distance as the subject was, that looks level at

@@ -5,18 +5,16 @@ layout(location = 0) in vec3 position;
 layout(location = 1) in vec2 uv;
 layout(location = 2) in uvec4 joints;
 layout(location = 3) in vec4 weights;
-uniform highp sampler2D bones;
+// Three rows a joint; what every device has room for is 256 joints.
+layout(std140) uniform Bones { vec4 bones[768]; };
 uniform mat4 camera;
 out vec2 at;
 void main() {
   vec4 rest = vec4(position, 1.0);
   vec3 world = vec3(0.0);
   for (int i = 0; i < 4; i++) {
-    int joint = int(joints[i]);
-    vec4 x = texelFetch(bones, ivec2(0, joint), 0);
-    vec4 y = texelFetch(bones, ivec2(1, joint), 0);
-    vec4 z = texelFetch(bones, ivec2(2, joint), 0);
-    world += weights[i] * vec3(dot(x, rest), dot(y, rest), dot(z, rest));
+    int row = 3 * int(joints[i]);
+    world += weights[i] * vec3(dot(bones[row], rest), dot(bones[row + 1], rest), dot(bones[row + 2], rest));
   }
   gl_Position = camera * vec4(world, 1.0);
   at = uv;
@@ -52,7 +50,7 @@ void main() { color = shade; }`;
 
 class Scene {
   constructor(canvas, person) {
-    const gl = canvas.getContext("webgl2", { antialias: true, alpha: false });
+    const gl = canvas.getContext("webgl2", { antialias: false, alpha: false });
     if (!gl) throw new Error("This browser has no WebGL 2.");
     this.gl = gl;
     this.person = person;
@@ -82,7 +80,10 @@ class Scene {
     gl.enableVertexAttribArray(1);
     gl.vertexAttribPointer(1, 4, gl.FLOAT, false, 28, 12);
     gl.bindVertexArray(null);
-    this.bones = texture(gl, gl.NEAREST);
+    this.bones = gl.createBuffer();
+    gl.bindBufferBase(gl.UNIFORM_BUFFER, 0, this.bones);
+    gl.bufferData(gl.UNIFORM_BUFFER, 768 * 16, gl.DYNAMIC_DRAW);
+    gl.uniformBlockBinding(this.skinned.id, gl.getUniformBlockIndex(this.skinned.id, "Bones"), 0);
     this.atlas = texture(gl, gl.LINEAR);
     this.confidence = texture(gl, gl.LINEAR);
   }
@@ -107,15 +108,13 @@ class Scene {
     gl.blendFunc(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA);
 
     gl.useProgram(this.skinned.id);
-    gl.activeTexture(gl.TEXTURE0);
-    gl.bindTexture(gl.TEXTURE_2D, this.bones);
-    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA32F, 3, this.person.rest.length, 0, gl.RGBA, gl.FLOAT, this.person.bones);
+    gl.bindBuffer(gl.UNIFORM_BUFFER, this.bones);
+    gl.bufferSubData(gl.UNIFORM_BUFFER, 0, this.person.bones);
     gl.activeTexture(gl.TEXTURE1);
     gl.bindTexture(gl.TEXTURE_2D, this.atlas);
     gl.activeTexture(gl.TEXTURE2);
     gl.bindTexture(gl.TEXTURE_2D, this.confidence);
     gl.activeTexture(gl.TEXTURE0);
-    gl.uniform1i(this.skinned.at("bones"), 0);
     gl.uniform1i(this.skinned.at("atlas"), 1);
     gl.uniform1i(this.skinned.at("confidence"), 2);
     gl.uniform1f(this.skinned.at("shown"), marksConfidence ? 1 : 0);

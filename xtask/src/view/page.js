@@ -4,6 +4,8 @@ const element = (id) => document.getElementById(id);
 const FIELD = (32 * Math.PI) / 180;
 const NEAR = 0.05;
 const FAR = 200;
+// Pixels across each of the window's in a still picture.
+const FINEST = 2;
 
 class Page {
   constructor(person, extra) {
@@ -16,8 +18,11 @@ class Page {
     this.playing = false;
     this.stale = true;
     this.before = 0;
-    // Pixels for each of the window's, while it moves: fewer where the machine is too slow.
-    this.detail = 1;
+    // Pixels across each of the window's while something moves: fewer where the machine is too slow. More than one
+    // smooths edges; multisampling costs software renderers most of a picture's time.
+    this.detail = FINEST;
+    this.touched = -Infinity;
+    this.coarse = false;
     this.pace = 16;
     this.late = 0;
     const [low, high] = person.heights(1);
@@ -95,12 +100,14 @@ class Page {
   turn(yaw, pitch) {
     this.yaw += yaw;
     this.pitch = Math.min(Math.max(this.pitch + pitch, -1.5), 1.5);
+    this.touched = performance.now();
     element("through").checked = false;
     this.stale = true;
   }
 
   magnify(factor) {
     this.zoom = Math.min(Math.max(this.zoom * factor, 0.2), 12);
+    this.touched = performance.now();
     element("through").checked = false;
     this.stale = true;
   }
@@ -194,12 +201,18 @@ class Page {
     requestAnimationFrame((later) => this.tick(later));
   }
 
+  // Whether the next picture follows soon, so that this one need not be fine.
+  moving() {
+    return this.playing || performance.now() - this.touched < 200;
+  }
+
   adapt(elapsed) {
+    if (this.coarse && !this.moving()) this.stale = true;
     if (!this.playing) return;
     this.pace += 0.1 * (elapsed - this.pace);
-    this.late = this.pace > 25 ? this.late + 1 : 0;
-    if (this.late > 12 && this.detail > 0.4) {
-      this.detail *= 0.75;
+    this.late = this.pace > 22 ? this.late + 1 : 0;
+    if (this.late > 6 && this.detail > 0.5) {
+      this.detail = Math.max(0.5, this.detail * Math.max(Math.sqrt(16 / this.pace), 0.5));
       this.late = 0;
       this.pace = 16;
     }
@@ -207,7 +220,8 @@ class Page {
 
   draw() {
     this.stale = false;
-    const dense = Math.min(devicePixelRatio || 1, 2) * (this.playing ? this.detail : 1);
+    this.coarse = this.moving() && this.detail < FINEST;
+    const dense = this.coarse ? this.detail : FINEST;
     const [width, height] = [this.canvas.clientWidth, this.canvas.clientHeight].map((n) => Math.max(Math.round(n * dense), 1));
     if (this.canvas.width !== width || this.canvas.height !== height) {
       this.canvas.width = width;

@@ -7,7 +7,7 @@ mod splats;
 
 pub use glb::to_glb;
 pub use mesh::write_obj;
-pub use motion::{adapt_motion, write_amass};
+pub use motion::{adapt_motion, fit_motion, write_amass};
 pub use splats::{Splats, splats};
 
 use std::io::Cursor;

@@ -50,7 +50,16 @@ fn turned(motion: &MotionClip, turn: Mat3, root: Vec3) -> MotionClip {
 /// # Errors
 /// [`Error::Bake`] for a motion of another skeleton: neither the same number of joints nor both of SMPL's family.
 pub fn adapt_motion(avatar: &Avatar, motion: &MotionClip) -> Result<MotionClip, Error> {
-    let (from, to) = (motion.num_joints, avatar.num_joints());
+    let root = avatar.skeleton.first().map_or(Vec3::ZERO, |joint| joint.rest);
+    fit_motion(motion, avatar.num_joints(), root)
+}
+
+/// [`adapt_motion`] for any body of `to` joints whose root rests at `root`, in metres.
+///
+/// # Errors
+/// As [`adapt_motion`].
+pub fn fit_motion(motion: &MotionClip, to: usize, root: Vec3) -> Result<MotionClip, Error> {
+    let from = motion.num_joints;
     if from != to && !(SMPL_FAMILY.contains(&from) && SMPL_FAMILY.contains(&to)) {
         let expected = format!("{to}, or SMPL's {SMPL_FAMILY:?} for both");
         return Err(Error::Bake(format!("motion of another skeleton: expected joints: {expected}, found {from}")));
@@ -67,7 +76,6 @@ pub fn adapt_motion(avatar: &Avatar, motion: &MotionClip) -> Result<MotionClip, 
         trans.push(translation);
     }
     let fitted = MotionClip { poses, num_joints: to, trans, fps: motion.fps };
-    let root = avatar.skeleton.first().map_or(Vec3::ZERO, |joint| joint.rest);
     // The world axis that the body's own upward direction is nearest to, on the whole.
     let upward: Vec3 =
         (fitted.poses.iter().step_by(to.max(1))).map(|&turn| Quat::from_scaled_axis(turn) * Vec3::Y).sum();
