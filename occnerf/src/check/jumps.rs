@@ -3,7 +3,7 @@
 use glam::{Quat, Vec3};
 use smpl::BodyModel;
 
-use super::Fault;
+use super::frame::Fault;
 use crate::capture::{Capture, Frame};
 
 /// A step is a jump if it is this many times the median step, and at least this large.

@@ -5,7 +5,7 @@ use rayon::prelude::*;
 use smpl::{BodyModel, Placement};
 use volrender::Camera;
 
-use super::View;
+use super::frame::View;
 use super::silhouette::silhouette;
 use crate::capture::{Capture, Frame};
 

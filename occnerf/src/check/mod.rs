@@ -3,12 +3,14 @@
 //! [`check`] compares the posed body's silhouette with the mask of every frame, looks for sudden jumps, and names the
 //! usual mistakes ([`Mistake`]) when undoing them would make a poor fit good.
 
+mod frame;
 mod jumps;
 mod mistakes;
 mod silhouette;
 #[cfg(test)]
 mod tests;
 
+pub use self::frame::Fault;
 pub use self::mistakes::Mistake;
 
 use glam::Vec3;
@@ -17,6 +19,7 @@ use smpl::BodyModel;
 use visibility::{RayMesh, View as Pinhole, visible_vertices};
 use volrender::Camera;
 
+use self::frame::View;
 use self::mistakes::{Overlap, outline};
 use crate::capture::{Capture, CaptureError, Frame, Image, Pixels};
 use crate::config::OccludedRule;
@@ -29,33 +32,6 @@ const VIEWS: usize = 48;
 const SURFACE_VIEWS: usize = 32;
 /// Overlap below which a frame does not fit.
 const LEAST_IOU: f32 = 0.6;
-
-/// Something wrong with one frame.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-#[non_exhaustive]
-pub enum Fault {
-    /// The mask shows nobody.
-    EmptyMask,
-    /// The silhouette and the mask do not overlap.
-    Overlap,
-    /// The body moves much further than between other frames.
-    PlaceJump,
-    /// Joints turn much further than between other frames.
-    PoseJump,
-}
-
-impl Fault {
-    /// A few words for tables.
-    #[must_use]
-    pub fn words(self) -> &'static str {
-        match self {
-            Self::EmptyMask => "mask empty",
-            Self::Overlap => "does not fit",
-            Self::PlaceJump => "jump of place or camera",
-            Self::PoseJump => "jump of pose",
-        }
-    }
-}
 
 /// One frame.
 #[derive(Clone, Debug, PartialEq)]
@@ -95,14 +71,6 @@ impl Check {
     pub fn mean_hidden(&self) -> f32 {
         self.frames.iter().map(|frame| frame.hidden).sum::<f32>() / self.frames.len().max(1) as f32
     }
-}
-
-/// A frame's mask, small.
-struct View {
-    index: usize,
-    camera: Camera,
-    mask: Vec<bool>,
-    occluder: Option<Vec<bool>>,
 }
 
 /// Checks the training frames.
