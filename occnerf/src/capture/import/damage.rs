@@ -20,9 +20,9 @@ use super::*;
 use crate::capture::testing::{Directory, shared};
 use crate::random::Stream;
 
-/// Longest that a mutation may take, and most memory: pickles take 8 times their size and 128 MiB, compressed ones may
+/// Longest that a mutation may take on a busy machine, and most memory: pickles take 8 times their size and 128 MiB, compressed ones may
 /// grow by 64 MiB and more before that; vectors are there twice while they grow.
-const SECONDS: f64 = 1.0;
+const SECONDS: f64 = 5.0;
 const BYTES: u64 = 600 << 20;
 
 fn mutations() -> usize {
