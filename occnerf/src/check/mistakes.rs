@@ -206,7 +206,7 @@ impl<'a> Posed<'a> {
                 camera.world_to_camera.translation /= factor;
                 let (Placement::Pelvis { translation } | Placement::Origin { translation, .. }) = self.placement;
                 let closer = Affine3A::from_translation(translation / factor - translation);
-                camera.world_to_camera = camera.world_to_camera * closer;
+                camera.world_to_camera *= closer;
             }
             Mistake::Focal(factor) => camera.focal /= factor,
             _ => {}
