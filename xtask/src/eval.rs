@@ -16,7 +16,8 @@ use rayon::prelude::*;
 use crate::optimise::logged_seconds;
 use crate::process::{Ending, Lock, note, one_line, say};
 use crate::run::{
-    CHECKPOINT, METRICS, Metrics, NOVEL_VIEWS, RunConfig, Splits, TRAINING_VIEWS, peak_rss_bytes, use_threads,
+    CHECKPOINT, METRICS, Metrics, NOVEL_VIEWS, RunConfig, Splits, TRAINING_VIEWS, make_directory, peak_rss_bytes,
+    use_threads,
 };
 use crate::{pictures, report, table};
 
@@ -273,6 +274,7 @@ pub fn score_run(
 
 /// Writes the contact sheets of both splits.
 fn draw(directory: &Path, novel: Vec<Vec<Result<[RgbImage; 2]>>>, train: Vec<Result<[RgbImage; 2]>>) -> Result<()> {
+    make_directory(&directory.join("renders"))?;
     let rows = novel.into_iter().map(pairs).collect::<Result<Vec<_>>>()?;
     pictures::save(&pictures::sheet(&rows), &directory.join("renders/novel_views.png"))?;
     pictures::save(&pictures::sheet(&[pairs(train)?]), &directory.join("renders/train_views.png"))
