@@ -31,7 +31,9 @@ fn trained() -> &'static Trained {
         let config = Config { steps: STEPS, ..Config::preset(Preset::Fast, Method::Occnerf) };
         let scene = Scene::new(&capture::demo(&demo, &body).unwrap(), &body, &config).unwrap();
         let mut trainer = Trainer::new(&scene, config).unwrap();
-        (0..STEPS).for_each(|_| drop(trainer.step().unwrap()));
+        for _ in 0..STEPS {
+            trainer.step().unwrap();
+        }
         let model = trainer.into_model();
         Trained { scene, model }
     })
@@ -100,7 +102,11 @@ fn skin(bencher: Bencher<'_, '_>) {
     let mut person = BakedPerson::new(avatar(1), model.body().scale);
     let bones: Vec<Affine3A> = model.corrected(&model.frames()[0]).bones.clone();
     let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
-    bencher.bench_local(|| pool.install(|| drop(divan::black_box(person.skin(&bones)))));
+    bencher.bench_local(|| {
+        pool.install(|| {
+            divan::black_box(person.skin(&bones));
+        })
+    });
 }
 
 /// Baking with a surface or three, all threads.

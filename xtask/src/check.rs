@@ -10,6 +10,7 @@ use occnerf::{Check, body_silhouette, photograph, unknown_pixels};
 use smpl::BodyModel;
 
 use crate::pictures::{captioned, sheet, to_rgb};
+use crate::process::say;
 use crate::source::{self, LoadArguments, Source};
 use crate::table;
 
@@ -59,14 +60,14 @@ pub fn check(arguments: &CheckArguments) -> Result<()> {
         _ => PathBuf::from(format!("{}-check.png", crate::train::scene_name(Some(&source.scene)))),
     });
     picture(&source, &found)?.save(&path).with_context(|| path.display().to_string())?;
-    say(&found, arguments.all);
-    println!("picture: {} (outline of the body; green: mask; orange: unknown)", path.display());
+    tell(&found, arguments.all);
+    say!("picture: {} (outline of the body; green: mask; orange: unknown)", path.display());
     Ok(())
 }
 
-fn say(found: &Check, all: bool) {
+fn tell(found: &Check, all: bool) {
     let count = found.frames.len();
-    println!(
+    say!(
         "{count} frames: body and mask overlap {:.2}, {:.0} % of the body hidden, {:.0} % of its surface seen at all",
         found.mean_iou(),
         100.0 * found.mean_hidden(),
@@ -74,7 +75,7 @@ fn say(found: &Check, all: bool) {
     );
     let bad = found.frames.iter().filter(|frame| !frame.faults.is_empty()).count();
     if bad > 0 {
-        println!("{bad} frames do not fit");
+        say!("{bad} frames do not fit");
     }
     let mut lines = vec![["frame", "overlap", "hidden", ""].map(str::to_owned).to_vec()];
     for frame in found.frames.iter().filter(|frame| all || !frame.faults.is_empty()) {
@@ -85,14 +86,14 @@ fn say(found: &Check, all: bool) {
     let more = lines.len().saturating_sub(1 + if all { usize::MAX - 1 } else { LINES });
     if lines.len() > 1 {
         lines.truncate(lines.len() - more);
-        print!("{}", table::aligned(&lines, 1));
+        say!("{}", table::aligned(&lines, 1).trim_end());
     }
     if more > 0 {
-        println!("… and {more} more (--all)");
+        say!("… and {more} more (--all)");
     }
     match found.mistakes.as_slice() {
-        [] => println!("no usual mistake found"),
-        mistakes => mistakes.iter().for_each(|mistake| println!("likely mistake: {mistake}")),
+        [] => say!("no usual mistake found"),
+        mistakes => mistakes.iter().for_each(|mistake| say!("likely mistake: {mistake}")),
     }
 }
 

@@ -15,7 +15,9 @@ use rayon::prelude::*;
 
 use crate::optimise::logged_seconds;
 use crate::process::{Ending, Lock, note, one_line, say};
-use crate::run::{METRICS, Metrics, NOVEL_VIEWS, RunConfig, Splits, TRAINING_VIEWS, peak_rss_bytes, use_threads};
+use crate::run::{
+    METRICS, Metrics, NOVEL_VIEWS, RunConfig, Splits, TRAINING_VIEWS, make_directory, peak_rss_bytes, use_threads,
+};
 use crate::{pictures, report, table};
 
 /// Training frames are many and alike: every tenth is scored.
@@ -275,6 +277,7 @@ pub fn score_run(
 
 /// Writes the contact sheets of both splits.
 fn draw(directory: &Path, novel: Vec<Vec<Result<[RgbImage; 2]>>>, train: Vec<Result<[RgbImage; 2]>>) -> Result<()> {
+    make_directory(&directory.join("renders"))?;
     let rows = novel.into_iter().map(pairs).collect::<Result<Vec<_>>>()?;
     pictures::save(&pictures::sheet(&rows), &directory.join("renders/novel_views.png"))?;
     pictures::save(&pictures::sheet(&[pairs(train)?]), &directory.join("renders/train_views.png"))

@@ -7,6 +7,7 @@ use clap::Args;
 use occnerf::capture::{self, ImportOptions, Imported};
 
 use crate::check::{self, CheckArguments};
+use crate::process::say;
 use crate::synth::{beside, vacant};
 
 /// What a finished directory holds, and nothing else does.
@@ -119,18 +120,18 @@ pub fn import(arguments: &ImportArguments) -> Result<()> {
     };
     say(&imported);
     check::check(&CheckArguments::of(out))?;
-    println!("train on it: cargo xtask train {}", out.display());
+    say!("train on it: cargo xtask train {}", out.display());
     Ok(())
 }
 
 /// What was imported, and what was left out.
 fn say(imported: &Imported) {
     let Imported { tool, person, frames, video_frames, focal, masks, betas_spread, .. } = imported;
-    println!("{}: person {person}, {frames} of {video_frames} frames, focal length {focal:.1} px", tool.name());
-    println!("masks: {masks}; body: {}", imported.body.display());
+    say!("{}: person {person}, {frames} of {video_frames} frames, focal length {focal:.1} px", tool.name());
+    say!("masks: {masks}; body: {}", imported.body.display());
     if !imported.others.is_empty() {
         let each: Vec<String> = imported.others.iter().map(|(id, n)| format!("{id} ({n} frames)")).collect();
-        println!("others there (--person ID): {}", each.join(", "));
+        say!("others there (--person ID): {}", each.join(", "));
     }
     let [before, after, between] = imported.unfitted;
     for (count, what) in [
@@ -141,12 +142,10 @@ fn say(imported: &Imported) {
         (imported.unmasked, "with a fit but without a mask"),
     ] {
         if count > 0 {
-            println!("left out: {count} frames {what}");
+            say!("left out: {count} frames {what}");
         }
     }
     if *betas_spread > 1e-6 {
-        println!(
-            "shape: the robust mean of all frames (standard deviation of a coefficient at most {betas_spread:.2})"
-        );
+        say!("shape: the robust mean of all frames (standard deviation of a coefficient at most {betas_spread:.2})");
     }
 }

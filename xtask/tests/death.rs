@@ -207,7 +207,8 @@ fn scoring_and_tables_killed_at_any_moment_are_whole_or_absent() {
         words(&[&["bench", "stability", "--quick", "--axes", "limbs pressed"][..], &side].concat())
     };
     let synth = |out: &Path| words(&["synth", "--force", "--out", text(out), "--size", "32", "--frames", "4"]);
-    let each: [(&str, &dyn Fn(&Path) -> Vec<String>, u64); 4] =
+    type Command<'a> = (&'a str, &'a dyn Fn(&Path) -> Vec<String>, u64);
+    let each: [Command<'_>; 4] =
         [("eval", &eval, 1000), ("reproduce", &reproduce, 3000), ("bench", &sweep, 4000), ("synth", &synth, 700)];
     let mut random = Random(2);
     for (name, arguments, longest) in each {

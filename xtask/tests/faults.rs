@@ -106,14 +106,14 @@ fn a_folder_in_use_is_refused_until_its_process_has_died() {
 fn signals_save_first_and_the_end_is_the_same_to_the_bit() {
     let folder = folder("signals");
     let whole = folder.join("whole");
-    done(&training(&whole, "400"));
+    done(&training(&whole, "120"));
     for (signal, code) in [("-INT", 130), ("-TERM", 143), ("-HUP", 129)] {
         if ignored(code as u32 - 128) {
             println!("skipped: {signal} is ignored here");
             continue;
         }
         let run = folder.join(code.to_string());
-        let child = start(&training(&run, "400"));
+        let child = start(&training(&run, "120"));
         wait_for(&run.join("train.jsonl"));
         let (ended, said) = stopped(child, signal);
         assert_eq!(ended, code, "{said}");
@@ -129,7 +129,7 @@ fn signals_save_first_and_the_end_is_the_same_to_the_bit() {
 fn what_the_program_was_started_to_ignore_stays_ignored() {
     let run = folder("nohup").join("run");
     let mut command = Command::new("nohup");
-    let child = command.arg(env!("CARGO_BIN_EXE_xtask")).args(training(&run, "400"));
+    let child = command.arg(env!("CARGO_BIN_EXE_xtask")).args(training(&run, "120"));
     let mut child = child.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
     wait_for(&run.join("train.jsonl"));
     assert!(Command::new("kill").args(["-HUP", &child.id().to_string()]).status().unwrap().success());

@@ -166,7 +166,8 @@ impl View {
     /// Share of the picture's border that the mask has.
     fn border(&self) -> f32 {
         let (width, height) = (self.camera.width as usize, self.camera.height as usize);
-        let outer = |i: usize| i < width || i >= width * (height - 1) || i.is_multiple_of(width) || i % width == width - 1;
+        let outer =
+            |i: usize| i < width || i >= width * (height - 1) || i.is_multiple_of(width) || i % width == width - 1;
         let border: Vec<bool> = (0..self.mask.len()).filter(|&i| outer(i)).map(|i| self.mask[i]).collect();
         border.iter().filter(|mask| **mask).count() as f32 / border.len().max(1) as f32
     }
