@@ -137,10 +137,10 @@ pub fn write<K: AsRef<str>>(path: &Path, arrays: &[(K, NdArray)]) -> Result<(), 
     write_with_text(path, arrays, &[])
 }
 
-/// [`write`] with scalar strings besides, as numpy's `str_`.
+/// [`write()`] with scalar strings besides, as numpy's `str_`.
 ///
 /// # Errors
-/// As [`write`].
+/// As [`write()`].
 pub fn write_with_text<K: AsRef<str>>(
     path: &Path,
     arrays: &[(K, NdArray)],
