@@ -6,7 +6,8 @@ use occnerf::capture::{DemoConfig, demo};
 use occnerf::{Config, Method, Preset, Scene, Trainer};
 use smpl::BodyModel;
 
-/// What is left are lists of a number or six for each joint; a batch larger than any before makes buffers grow.
+/// What is left are lists of a number or six for each joint; a batch larger than any before makes
+/// buffers grow.
 #[test]
 fn a_step_allocates_next_to_nothing() {
     let mut config = Config::preset(Preset::Fast, Method::Occnerf);

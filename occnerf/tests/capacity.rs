@@ -1,4 +1,5 @@
-//! Sizes from the scene, and pruning: never more than asked for, never more for less to see, and the same pictures.
+//! Sizes from the scene, and pruning: never more than asked for, never more for less to see, and
+//! the same pictures.
 #![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
 
 mod common;
@@ -94,7 +95,8 @@ fn the_same_scene_is_measured_the_same_on_one_and_on_three_threads() {
         pool.install(|| Capacity::measure(scene(), &config).unwrap())
     });
     assert_eq!(one, three);
-    // The ellipsoid of half axes 0.35, 0.85 and 0.25 m, seen from two sides: something like half of its 2 m².
+    // The ellipsoid of half axes 0.35, 0.85 and 0.25 m, seen from two sides: something like half of
+    // its 2 m².
     let seen = one.measured.cells as f32 * one.measured.metres_a_pixel.powi(2);
     assert!((0.5..3.0).contains(&seen), "{seen} m²");
     let text = serde_json::to_string(&one).unwrap();

@@ -11,8 +11,8 @@ use occnerf::{
     least_seen_quartile,
 };
 
-/// Returns the truth of the frame with a view after `change` has been at the pixels and opacities of
-/// (frame, index).
+/// Returns the truth of the frame with a view after `change` has been at the pixels and opacities
+/// of (frame, index).
 struct Truth<F: Fn(&PreparedFrame, usize, &mut [f32], &mut f32) + Sync>(F);
 
 impl<F: Fn(&PreparedFrame, usize, &mut [f32], &mut f32) + Sync> Renderer for Truth<F> {

@@ -1,4 +1,5 @@
-//! What other programs are given: read back, compared with the avatar, and refused where it cannot be.
+//! What other programs are given: read back, compared with the avatar, and refused where it cannot
+//! be.
 #![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
 
 mod common;
@@ -162,8 +163,8 @@ fn a_motion_of_another_skeleton_is_refused_and_smpl_h_is_taken() {
     assert_eq!(fitted.poses[23], Vec3::ZERO);
 }
 
-/// What a viewer of splats draws (Zwicker et al. 2001; the order and the 0.3 pixels of Kerbl et al. 2023): colour and
-/// opacity along `forward` from far away, one pixel `scale` metres wide.
+/// What a viewer of splats draws (Zwicker et al. 2001; the order and the 0.3 pixels of Kerbl et al.
+/// 2023): colour and opacity along `forward` from far away, one pixel `scale` metres wide.
 fn drawn(splats: &Splats, to_view: Mat3, middle: Vec3, scale: f32, side: usize) -> Vec<(Vec3, f32)> {
     let mut order: Vec<usize> = (0..splats.centres.len()).collect();
     let depth = |i: usize| (to_view * splats.centres[i]).z;

@@ -145,7 +145,8 @@ fn pictures_of_no_pixels_or_one_and_extreme_scales_have_labels() {
         let found = label_pixels(OccludedRule::Unknown, &[0.0], &[true], None, 1, scale);
         assert_eq!(found, [Label::Unknown], "{scale}: beyond the border nothing is known, so nothing erodes it");
     }
-    // So close that the opening is wider than the picture: what the mask leaves free is then misregistration.
+    // So close that the opening is wider than the picture: what the mask leaves free is then
+    // misregistration.
     let silhouette: Vec<bool> = (0..WIDTH * HEIGHT).map(|i| i % WIDTH > 3).collect();
     let found = labels(&[0.0; WIDTH * HEIGHT], &silhouette, 1e5);
     assert!(found.iter().all(|l| *l == Label::Background));

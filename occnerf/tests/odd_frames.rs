@@ -1,4 +1,5 @@
-//! Frames that show little or nothing: they happen in real videos and must cost nothing but themselves.
+//! Frames that show little or nothing: they happen in real videos and must cost nothing but
+//! themselves.
 #![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
 
 mod common;

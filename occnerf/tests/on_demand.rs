@@ -46,7 +46,8 @@ fn training_from_files_is_training_from_memory() {
     let few = Scene::new(&capture, &made.body, &config).unwrap();
     assert_eq!(VertexColors::measure(&few).unwrap(), VertexColors::measure(&scene).unwrap());
     let mut trainer = Trainer::new(&few, config).unwrap();
-    // A picture that goes missing stops training where it was, and nothing is lost when it comes back.
+    // A picture that goes missing stops training where it was, and nothing is lost when it comes
+    // back.
     let (picture, away) = (dir.path("capture/images/frame_000002.png"), dir.path("away.png"));
     let mut missed = 0;
     while trainer.steps_done() < STEPS {

@@ -1,4 +1,5 @@
-//! A field that has become empty: training begins anew at lower rates instead of going on with nothing.
+//! A field that has become empty: training begins anew at lower rates instead of going on with
+//! nothing.
 #![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
 
 mod common;

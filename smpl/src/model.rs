@@ -92,8 +92,8 @@ impl BodyModel {
         Shaped { vertices, joints }
     }
 
-    /// Checks that the parts fit together, that there is a surface, and that every value is finite and
-    /// below 10⁶ units. `file` names the model in errors; keys are those of SMPL's files.
+    /// Checks that the parts fit together, that there is a surface, and that every value is finite
+    /// and below 10⁶ units. `file` names the model in errors; keys are those of SMPL's files.
     ///
     /// # Errors
     /// [`Error::Invalid`], [`Error::NotFinite`].
@@ -171,7 +171,8 @@ impl BodyModel {
     }
 }
 
-/// Within what single precision can place to a tenth of a unit: no body, in whatever unit, reaches farther.
+/// Within what single precision can place to a tenth of a unit: no body, in whatever unit, reaches
+/// farther.
 fn near(file: &str, key: &str, values: &[Vec3]) -> Result<(), Error> {
     match values.iter().position(|v| v.abs().max_element() > MAX_COORDINATE) {
         Some(index) => {

@@ -72,11 +72,12 @@ impl Npz {
         read_array(&file, key, self.entry(key)?)
     }
 
-    /// Reads `key` whatever its elements are: numbers, text, or pickled Python objects ([`crate::pickle`]).
+    /// Reads `key` whatever its elements are: numbers, text, or pickled Python objects
+    /// ([`crate::pickle`]).
     ///
     /// # Errors
-    /// Those of [`Npz::array`]; [`Error::Pickle`]; [`Error::TooLarge`] for what compression makes more than 256 times as
-    /// large and 64 MiB.
+    /// Those of [`Npz::array`]; [`Error::Pickle`]; [`Error::TooLarge`] for what compression makes
+    /// more than 256 times as large and 64 MiB.
     pub fn value(&mut self, key: &str) -> Result<Value, Error> {
         let file = format!("{}: `{key}`", self.file);
         let entry = self.entry(key)?;

@@ -1,7 +1,9 @@
-//! Files that PyTorch's `torch.save` has written: zip archives, and the form from before version 1.6.
+//! Files that PyTorch's `torch.save` has written: zip archives, and the form from before version
+//! 1.6.
 //!
-//! A file is a pickle in which tensors are described, and storages, the bytes that tensors are views of. Opening one
-//! reads the descriptions; the numbers of a tensor are read when they are asked for. Nothing is executed.
+//! A file is a pickle in which tensors are described, and storages, the bytes that tensors are
+//! views of. Opening one reads the descriptions; the numbers of a tensor are read when they are
+//! asked for. Nothing is executed.
 
 use std::collections::HashMap;
 use std::io::{Read, Seek, SeekFrom};
@@ -85,7 +87,8 @@ impl<R: Read + Seek> TorchFile<R> {
         &self.root
     }
 
-    /// The tensor that a value of the file stands for; `None` where it is something else. `key` is for errors.
+    /// The tensor that a value of the file stands for; `None` where it is something else. `key` is
+    /// for errors.
     ///
     /// # Errors
     /// [`Error::Invalid`] for extents, strides or a storage that make no sense.
@@ -103,11 +106,13 @@ impl<R: Read + Seek> TorchFile<R> {
         Ok(Some(Tensor { dtype, shape, strides, offset, storage: storage.to_owned() }))
     }
 
-    /// The numbers of a tensor, row-major whatever its strides are. Expanded tensors (stride 0) and other views are
-    /// written out; all that is read of one file may take 16 times its size and 64 MiB.
+    /// The numbers of a tensor, row-major whatever its strides are. Expanded tensors (stride 0) and
+    /// other views are written out; all that is read of one file may take 16 times its size and 64
+    /// MiB.
     ///
     /// # Errors
-    /// [`Error::Invalid`] where the tensor leaves its storage or the storage is damaged, [`Error::TooLarge`].
+    /// [`Error::Invalid`] where the tensor leaves its storage or the storage is damaged,
+    /// [`Error::TooLarge`].
     pub fn read(&mut self, key: &str, tensor: &Tensor) -> Result<NdArray, Error> {
         let malformed = |what: String| Error::invalid(&self.name, key, what);
         let Tensor { shape, strides, offset, .. } = tensor;
@@ -262,8 +267,8 @@ fn archive<R: Read + Seek>(name: &str, file: R) -> Result<(Value, Storages<R>), 
     Ok((value, Storages::Zip(Box::new(zip), root)))
 }
 
-/// What a file of the older form holds: pickles of a version, of the system, of the tensors and of the storages' keys,
-/// then each storage with its length before it.
+/// What a file of the older form holds: pickles of a version, of the system, of the tensors and of
+/// the storages' keys, then each storage with its length before it.
 fn legacy<R: Read + Seek>(name: &str, mut file: R, length: u64) -> Result<(Value, Storages<R>), Error> {
     let fault = |what: String| Error::invalid(name, "torch.save", what);
     let mut bytes = Vec::new();

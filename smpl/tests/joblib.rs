@@ -1,4 +1,5 @@
-//! What joblib writes: arrays behind their descriptions, compressed or not; and what must not cost memory.
+//! What joblib writes: arrays behind their descriptions, compressed or not; and what must not cost
+//! memory.
 
 mod common;
 

@@ -1,4 +1,5 @@
-//! The same seed and the same inputs give the same bits: on any number of threads, and with a stop in between.
+//! The same seed and the same inputs give the same bits: on any number of threads, and with a stop
+//! in between.
 #![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
 
 mod common;
@@ -11,7 +12,8 @@ use occnerf::{
     checkpoint_config,
 };
 
-/// Every method with both kinds of motion, and the paper's blended distances with its learnable volume.
+/// Every method with both kinds of motion, and the paper's blended distances with its learnable
+/// volume.
 fn configs() -> Vec<Config> {
     let kinds = [MotionKind::Surface, MotionKind::Volume];
     let mut configs: Vec<Config> =

@@ -32,8 +32,8 @@ fn posed_vertices_find_their_way_back_through_the_nearest_surface_point() {
         .collect();
     let [median, most] = [0.5, 0.99].map(|share| quantile(&mut errors, share));
     println!("vertices: median {median}, 99 % {most}");
-    // Skinning is inverted exactly where the nearest point is the vertex itself, which limbs pressed into each other
-    // may prevent.
+    // Skinning is inverted exactly where the nearest point is the vertex itself, which limbs
+    // pressed into each other may prevent.
     assert!(median < 1e-5 && most < 5e-3, "median {median}, 99 % {most}");
 }
 
@@ -87,7 +87,8 @@ fn the_diffused_volume_is_sure_of_everything_inside_the_body() {
     }
 }
 
-/// The published Gaussians are known for the opposite; the difference is why the diffused prior exists.
+/// The published Gaussians are known for the opposite; the difference is why the diffused prior
+/// exists.
 #[test]
 fn the_gaussian_volume_has_holes_at_the_knees() {
     let shaped = body().shaped(&[]);

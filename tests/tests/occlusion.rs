@@ -83,8 +83,8 @@ fn the_demo_shows_nothing_behind_its_obstacle() {
     assert!(hidden > 100, "{hidden}");
 }
 
-/// Overwrites the colour of every pixel with this label in every training frame, and its coverage if it is not one
-/// of the subject.
+/// Overwrites the colour of every pixel with this label in every training frame, and its coverage
+/// if it is not one of the subject.
 fn repainted(label: Label) -> Capture {
     let mut changed = capture().clone();
     let mut count = 0;

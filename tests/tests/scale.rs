@@ -1,4 +1,5 @@
-//! The unit of length is nobody's business: lengths are normalised before anything with a constant in metres.
+//! The unit of length is nobody's business: lengths are normalised before anything with a constant
+//! in metres.
 #![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
 
 mod common;

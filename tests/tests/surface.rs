@@ -1,4 +1,5 @@
-//! Surface queries, ray casts and cameras are written apart from each other; here they must say the same of a body.
+//! Surface queries, ray casts and cameras are written apart from each other; here they must say the
+//! same of a body.
 #![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
 
 mod common;
@@ -24,7 +25,8 @@ fn overlap(query: &SurfaceQuery, scales: usize, a: Vec3, b: Vec3) -> f32 {
     a.intersection(&b).count() as f32 / a.union(&b).count() as f32
 }
 
-/// Surface-based rendering's reason to exist: what one point learns, points near it share, and farther with more scales.
+/// Surface-based rendering's reason to exist: what one point learns, points near it share, and
+/// farther with more scales.
 #[test]
 fn neighbours_overlap_less_with_distance_and_more_at_four_scales_than_at_one() {
     let shaped = body().shaped(&[]);
@@ -34,7 +36,8 @@ fn neighbours_overlap_less_with_distance_and_more_at_four_scales_than_at_one() {
     for (at, &distance) in distances.iter().enumerate() {
         let mut count = 0;
         for (i, &v) in shaped.vertices.iter().enumerate().step_by(7) {
-            // Another vertex at about this distance; the first found in an order that favours no side.
+            // Another vertex at about this distance; the first found in an order that favours no
+            // side.
             let order = (1..shaped.vertices.len()).map(|j| (i + j * 911) % shaped.vertices.len());
             let near = |j: &usize| (shaped.vertices[*j].distance(v) / distance - 1.0).abs() < 0.35;
             let Some(j) = order.into_iter().find(near) else { continue };

@@ -117,7 +117,8 @@ fn vertices_near_visible_pixels_are_counted_and_the_rest_stay_behind() {
     let counts = trainer.model().visibility_counts();
     let total: u64 = counts.iter().sum();
     assert!(total > 0 && total.is_multiple_of(5) && total <= 5 * rays, "{total} of {rays} rays");
-    // Vertices that ray casting never sees are hit by far fewer terminations than those it sees in many frames.
+    // Vertices that ray casting never sees are hit by far fewer terminations than those it sees in
+    // many frames.
     let seen = scene().vertex_frequencies().unwrap();
     let mean = |wanted: &dyn Fn(u64) -> bool| {
         let of: Vec<u64> = seen.iter().zip(counts).filter(|(s, _)| wanted(**s)).map(|(_, c)| *c).collect();

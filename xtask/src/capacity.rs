@@ -18,7 +18,8 @@ pub const FILE: &str = "capacity.json";
 pub enum CapacityName {
     /// The preset's sizes.
     Preset,
-    /// At most the preset's: table, levels, width and samples from what the scene shows, and pruned after training.
+    /// At most the preset's: table, levels, width and samples from what the scene shows, and pruned
+    /// after training.
     Auto,
 }
 
@@ -43,7 +44,8 @@ pub fn read(directory: &Path) -> Result<Option<Capacity>> {
     serde_json::from_str(&text).map(Some).with_context(|| path.display().to_string())
 }
 
-/// Writes what was chosen into the directory of a new run, or sees to it that nothing is said to have been.
+/// Writes what was chosen into the directory of a new run, or sees to it that nothing is said to
+/// have been.
 pub fn begin(directory: &Path, chosen: Option<&Capacity>) -> Result<()> {
     let path = directory.join(FILE);
     match chosen {

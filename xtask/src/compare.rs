@@ -19,7 +19,8 @@ const RUNS: [(Method, OccludedRule); 7] = [
     (Method::Occnerf, OccludedRule::Unknown),
 ];
 
-/// Trains what is missing under OUT/METHOD-RULE and prints all; a finished run is not trained again.
+/// Trains what is missing under OUT/METHOD-RULE and prints all; a finished run is not trained
+/// again.
 pub fn compare(arguments: &TrainArguments) -> Result<()> {
     use_threads(arguments.threads)?;
     let lpips = load_lpips(arguments.lpips.as_deref())?;

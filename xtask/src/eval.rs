@@ -150,10 +150,12 @@ pub fn scored_frames(scene: &Scene) -> impl Iterator<Item = &PreparedFrame> {
     scene.eval.iter().chain(scored_train_frames(scene))
 }
 
-/// Reads every picture that a run is scored on, as those that are not kept in memory have not been read yet.
+/// Reads every picture that a run is scored on, as those that are not kept in memory have not been
+/// read yet.
 pub fn check_pictures(scene: &Scene) -> Result<()> {
     let frames: Vec<&PreparedFrame> = scored_frames(scene).collect();
-    // Collected as results first, so that the error reported is the first in order whatever finishes first.
+    // Collected as results first, so that the error reported is the first in order whatever
+    // finishes first.
     let read: Vec<Result<(), occnerf::Error>> = frames.par_iter().map(|frame| frame.pixels().map(drop)).collect();
     Ok(read.into_iter().collect::<Result<(), _>>()?)
 }

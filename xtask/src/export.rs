@@ -16,7 +16,8 @@ const PATCH: f32 = 0.009;
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 enum Format {
-    /// Skinned, textured avatar with its motions: glTF binary for Blender, three.js, Unity, Unreal, Godot.
+    /// Skinned, textured avatar with its motions: glTF binary for Blender, three.js, Unity, Unreal,
+    /// Godot.
     Glb,
     /// One pose as 3-D Gaussian splats, for viewers of such scenes.
     Ply,
@@ -35,8 +36,8 @@ pub struct ExportArguments {
     /// File to write
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
-    /// Motion capture, an .npz with poses, trans and fps, as AMASS has them: added to a glb, in place of the video's motion
-    /// elsewhere
+    /// Motion capture, an .npz with poses, trans and fps, as AMASS has them: added to a glb, in
+    /// place of the video's motion elsewhere
     #[arg(long, value_name = "CLIP.npz")]
     motion: Option<PathBuf>,
     /// Frame of the motion whose pose a ply or an obj shows [default: the first]

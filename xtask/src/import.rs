@@ -62,8 +62,8 @@ pub struct ImportArguments {
     /// Focal length in pixels [default: the one that the estimator assumed]
     #[arg(long, value_name = "PX")]
     focal: Option<f64>,
-    /// The body model that the estimator fitted, .npz or .pkl [default: the variable SMPL_MODEL, or one that fits in a folder
-    /// `body` near the fit or the frames]
+    /// The body model that the estimator fitted, .npz or .pkl [default: the variable SMPL_MODEL, or
+    /// one that fits in a folder `body` near the fit or the frames]
     #[arg(long, value_name = "FILE")]
     body: Option<PathBuf>,
     /// Copy the frames into the capture; else it has links to them

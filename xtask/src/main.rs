@@ -38,7 +38,8 @@ use clap::{Parser, Subcommand};
 
 use crate::process::note;
 
-/// Turns a video of a moving person, partly hidden behind objects, into a 3-D person that renders from any side.
+/// Turns a video of a moving person, partly hidden behind objects, into a 3-D person that renders
+/// from any side.
 #[derive(Parser)]
 #[command(name = "cargo xtask", bin_name = "cargo xtask", version)]
 struct Arguments {
@@ -56,7 +57,8 @@ enum Command {
     Render(render::RenderArguments),
     /// Draws what the camera saw beside the person from unseen sides: README's picture.
     Front(front::FrontArguments),
-    /// Writes a run's person in a form that other programs open: skinned avatar, splats, mesh, motion.
+    /// Writes a run's person in a form that other programs open: skinned avatar, splats, mesh,
+    /// motion.
     Export(export::ExportArguments),
     /// Writes a run's person as one HTML page, to turn around and play.
     View(view::ViewArguments),
@@ -64,7 +66,8 @@ enum Command {
     Reproduce(reproduce::ReproduceArguments),
     /// Makes a capture of a video from what a body estimator and a segmenter wrote.
     Import(import::ImportArguments),
-    /// Tells whether a capture's body lies on its person: a picture, a table, and the mistakes that are likely.
+    /// Tells whether a capture's body lies on its person: a picture, a table, and the mistakes that
+    /// are likely.
     Check(check::CheckArguments),
     /// Writes an occluded capture of a synthetic person to disk, in a published dataset format.
     Synth(synth::SynthArguments),
@@ -78,8 +81,9 @@ enum Command {
     Convert(convert::ConvertArguments),
 }
 
-/// Exit codes: 0 done; 1 something given is wrong; 2 the command line cannot be read; 3 a result cannot be written; 4 another
-/// process has the folder; 128 + n ended by signal n, with everything saved.
+/// Exit codes: 0 done; 1 something given is wrong; 2 the command line cannot be read; 3 a result
+/// cannot be written; 4 another process has the folder; 128 + n ended by signal n, with everything
+/// saved.
 fn main() -> std::process::ExitCode {
     let command = match Arguments::try_parse() {
         Ok(arguments) => arguments.command,

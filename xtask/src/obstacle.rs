@@ -9,17 +9,19 @@ const TRAVEL: f32 = 0.3;
 
 #[derive(Args, Clone, Debug, serde::Serialize)]
 pub struct ObstacleArguments {
-    /// Part of the person's pixels that is hidden in the frames that the obstacle stands in, no more than its rows have
-    /// [default: 0.5]
+    /// Part of the person's pixels that is hidden in the frames that the obstacle stands in, no
+    /// more than its rows have [default: 0.5]
     #[arg(long, value_name = "0 to 0.95")]
     pub fraction: Option<f32>,
-    /// Part of the video, from its start, that it stands in [default: 0.8]; objects stand in all of it
+    /// Part of the video, from its start, that it stands in [default: 0.8]; objects stand in all of
+    /// it
     #[arg(long, value_name = "0 to 1")]
     pub share: Option<f32>,
     /// How far it stands to the right of the person, in picture widths [default: 0]
     #[arg(long, value_name = "-1 to 1", allow_negative_numbers = true)]
     pub position: Option<f32>,
-    /// How high it is, in picture heights, about the person's middle row [default: 1, a strip as high as the picture]
+    /// How high it is, in picture heights, about the person's middle row [default: 1, a strip as
+    /// high as the picture]
     #[arg(long, value_name = "above 0 to 1")]
     pub height: Option<f32>,
 }

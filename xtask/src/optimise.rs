@@ -45,12 +45,14 @@ pub struct Sitting {
     pub interval: Duration,
 }
 
-/// Takes steps until the end or `stop_after`, with a log, a bar and checkpoints; returns seconds of training, those of
-/// earlier sittings included. A log or a periodic checkpoint that cannot be written is tried again later.
+/// Takes steps until the end or `stop_after`, with a log, a bar and checkpoints; returns seconds of
+/// training, those of earlier sittings included. A log or a periodic checkpoint that cannot be
+/// written is tried again later.
 ///
 /// # Errors
-/// Of a step, after saving what was learnt; [`Ending::Unwritten`] where the last checkpoint cannot be written;
-/// [`Ending::Stopped`] where a signal came, after saving; a training that has diverged, which replaces no checkpoint.
+/// Of a step, after saving what was learnt; [`Ending::Unwritten`] where the last checkpoint cannot
+/// be written; [`Ending::Stopped`] where a signal came, after saving; a training that has diverged,
+/// which replaces no checkpoint.
 pub fn optimise(directory: &Path, trainer: &mut Trainer<'_>, sitting: &Sitting) -> Result<f64> {
     let guard = Guard::begin();
     let total = trainer.model().config().steps;
@@ -201,7 +203,8 @@ impl Log {
     }
 }
 
-/// Seconds of training that the first `steps` steps of the run in `directory` took, as far as its log knows.
+/// Seconds of training that the first `steps` steps of the run in `directory` took, as far as its
+/// log knows.
 pub fn logged_seconds(directory: &Path, steps: u64) -> Result<f64> {
     Ok(earlier_log(&directory.join(LOG), steps)?.seconds)
 }

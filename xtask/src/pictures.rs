@@ -26,7 +26,8 @@ pub fn to_rgb(image: &Image) -> RgbImage {
     })
 }
 
-/// A picture with `coverage` (H × W) composited over grey, so that dark clothes and empty space differ.
+/// A picture with `coverage` (H × W) composited over grey, so that dark clothes and empty space
+/// differ.
 pub fn over_grey(pixels: &[f32], coverage: &[f32], width: u32, height: u32) -> RgbImage {
     let over = pixels.chunks_exact(3).zip(coverage).flat_map(|(p, &m)| p.iter().map(move |c| c + (1.0 - m) * 0.35));
     to_rgb(&Image { width, height, pixels: over.collect() })
@@ -84,8 +85,8 @@ pub fn captioned(sheet: &RgbImage, names: &[&str]) -> Result<RgbImage> {
     Ok(out)
 }
 
-/// The pictures of a [`sheet`], told apart by its white gaps; a sheet whose pictures are of unequal sizes, or white
-/// where they begin, comes apart otherwise.
+/// The pictures of a [`sheet`], told apart by its white gaps; a sheet whose pictures are of unequal
+/// sizes, or white where they begin, comes apart otherwise.
 pub fn cells(sheet: &RgbImage) -> Vec<Vec<RgbImage>> {
     let white = |x, y| sheet.get_pixel(x, y).0 == [255; 3];
     let column = |x| (0..sheet.height()).all(|y| white(x, y));

@@ -57,7 +57,8 @@ pub struct RenderArguments {
     /// What to write besides the pictures
     #[arg(long, default_value = "gif")]
     format: FilmFormat,
-    /// Draw the baked person, by rasterising, instead of the field; bakes it first where RUN has none
+    /// Draw the baked person, by rasterising, instead of the field; bakes it first where RUN has
+    /// none
     #[arg(long)]
     baked: bool,
     /// Threads [default: all cores]
@@ -166,8 +167,8 @@ fn views(
     })
 }
 
-/// A camera like the training camera's, at the same distance as the subject was, that looks level at
-/// `centre`.
+/// A camera like the training camera's, at the same distance as the subject was, that looks level
+/// at `centre`.
 fn camera_at(frame: &PosedView, centre: Vec3, angle: f32) -> Camera {
     // Outstretched arms are as wide as the body is high.
     let distance = 1.15 * frame.camera.world_to_camera.transform_point3(frame.centre()).length();

@@ -98,7 +98,8 @@ pub struct Splits {
 }
 
 impl Splits {
-    /// The views that are shown first, and what they are called: novel ones where the capture keeps any back.
+    /// The views that are shown first, and what they are called: novel ones where the capture keeps
+    /// any back.
     pub fn first(&self) -> Option<(&'static str, &SplitMetrics)> {
         let novel = self.novel_view.as_ref().map(|split| (NOVEL_VIEWS, split));
         novel.or(self.train_view.as_ref().map(|split| (TRAINING_VIEWS, split)))
@@ -124,7 +125,8 @@ impl Metrics {
     }
 }
 
-/// A directory for a new run, which is this process's alone: `out`, or the first free `runs/NAME`, `runs/NAME-2`, …
+/// A directory for a new run, which is this process's alone: `out`, or the first free `runs/NAME`,
+/// `runs/NAME-2`, …
 pub fn new_directory(out: Option<&Path>, name: &str) -> Result<(PathBuf, Lock)> {
     let directory = match out {
         Some(out) => {
@@ -193,7 +195,8 @@ pub fn write(path: &Path, text: &str) -> Result<()> {
     replace_file(path, |to| to.write_all(text.as_bytes())).map_err(unwritten(path))
 }
 
-/// More than any machine has cores; a thousand times as many would keep the system busy for minutes.
+/// More than any machine has cores; a thousand times as many would keep the system busy for
+/// minutes.
 const MAX_THREADS: usize = 1024;
 
 /// Errors for a number of threads that no machine has.

@@ -65,11 +65,12 @@ pub struct SettingArguments {
     /// Seed of every random choice [default: 1]
     #[arg(long, value_parser = clap::value_parser!(u64).range(..=i64::MAX as u64))]
     pub seed: Option<u64>,
-    /// Weights that make the perceptual term LPIPS: SqueezeNet 1.1, VGG16 or AlexNet with LPIPS's linear layers, .safetensors
-    /// or .pth, a file or a directory [default: multi-scale SSIM]
+    /// Weights that make the perceptual term LPIPS: SqueezeNet 1.1, VGG16 or AlexNet with LPIPS's
+    /// linear layers, .safetensors or .pth, a file or a directory [default: multi-scale SSIM]
     #[arg(long, value_name = "PATH")]
     pub perceptual_weights: Option<String>,
-    /// Any other value of the train table in config.toml, such as encoding.n_max=512; may be repeated
+    /// Any other value of the train table in config.toml, such as encoding.n_max=512; may be
+    /// repeated
     #[arg(long = "set", value_name = "KEY=VALUE")]
     pub set: Vec<String>,
 }
@@ -97,8 +98,8 @@ impl SettingArguments {
         Ok(config)
     }
 
-    /// Checks that a run to be resumed was trained with what is asked for; the number of steps may change. `capacity`
-    /// replaced the preset's sizes when the run began.
+    /// Checks that a run to be resumed was trained with what is asked for; the number of steps may
+    /// change. `capacity` replaced the preset's sizes when the run began.
     pub fn resumed(&self, saved: Config, capacity: Option<&Capacity>) -> Result<Config> {
         let mut asked = if self.preset.is_some() || self.method.is_some() { self.config()? } else { saved.clone() };
         capacity.into_iter().for_each(|capacity| capacity.apply(&mut asked));

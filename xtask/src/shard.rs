@@ -8,8 +8,8 @@ use clap::Args;
 /// Which part is this job's.
 #[derive(Args, Clone, Copy, Debug, Default)]
 pub struct ShardArguments {
-    /// Run part I of N only, I from 1 to N, or `slurm`: the part that a Slurm array's variables name. Every part has
-    /// the same --out; parts may overlap, die and be run again
+    /// Run part I of N only, I from 1 to N, or `slurm`: the part that a Slurm array's variables
+    /// name. Every part has the same --out; parts may overlap, die and be run again
     #[arg(long, value_name = "I/N", conflicts_with = "merge")]
     pub shard: Option<Shard>,
     /// Run nothing: put together what the parts have left
@@ -32,8 +32,8 @@ pub struct Shard {
 }
 
 impl Shard {
-    /// Whether run number `run` is of this part. Parts take turns, each round beginning with another, so that runs which
-    /// are long in every scene do not fall to the same part.
+    /// Whether run number `run` is of this part. Parts take turns, each round beginning with
+    /// another, so that runs which are long in every scene do not fall to the same part.
     pub fn has(&self, run: usize) -> bool {
         (run + run / self.count) % self.count == self.index
     }
@@ -101,8 +101,9 @@ mod tests {
         assert!((1..=12).all(|i| long(&format!("{i}/12").parse().unwrap()) == 1));
     }
 
-    /// Seconds of the rows of `reproduce` with 400 steps and 20 scored pictures, from 0.163, 0.166 and 0.229 s a step of
-    /// `occnerf`, `hash-point` and `humannerf` and 0.25 s a picture, measured on a busy machine, and 5 s to load a scene.
+    /// Seconds of the rows of `reproduce` with 400 steps and 20 scored pictures, from 0.163, 0.166
+    /// and 0.229 s a step of `occnerf`, `hash-point` and `humannerf` and 0.25 s a picture, measured
+    /// on a busy machine, and 5 s to load a scene.
     #[test]
     fn a_thousand_jobs_wait_little_for_the_last() {
         let (occnerf, hash_point, humannerf, load) = (65.2, 66.4, 91.6, 5.0);

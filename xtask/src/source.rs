@@ -1,4 +1,5 @@
-//! Where the frames come from: the embedded demo, a character filmed on the spot, or a capture on disk with its body model.
+//! Where the frames come from: the embedded demo, a character filmed on the spot, or a capture on
+//! disk with its body model.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -48,18 +49,19 @@ pub struct LoadArguments {
     /// Training camera of a ZJU-MoCap capture, by folder or by number from 1 [default: the first]
     #[arg(long, value_name = "NAME")]
     camera: Option<String>,
-    /// Simulated obstacle before the training camera of a ZJU-MoCap capture [default: occlusion.json, else central]
+    /// Simulated obstacle before the training camera of a ZJU-MoCap capture [default:
+    /// occlusion.json, else central]
     #[arg(long)]
     occlusion: Option<ObstacleName>,
     #[command(flatten)]
     #[serde(flatten)]
     obstacle: ObstacleArguments,
-    /// Most memory that a capture's bodies and decoded pictures may take, in MiB; pictures beyond it are decoded whenever
-    /// they are needed [default: 1024]
+    /// Most memory that a capture's bodies and decoded pictures may take, in MiB; pictures beyond
+    /// it are decoded whenever they are needed [default: 1024]
     #[arg(long, value_name = "MIB", value_parser = clap::value_parser!(u64).range(1..=1 << 24))]
     memory: Option<u64>,
-    /// Turn every bone of the prior by so many degrees (root mean square), to see what a method bears
-    /// [default: 0]
+    /// Turn every bone of the prior by so many degrees (root mean square), to see what a method
+    /// bears [default: 0]
     #[arg(long, value_name = "DEGREES")]
     wrong_pose: Option<f32>,
     /// Change every shape coefficient of the prior by so many standard deviations [default: 0]
@@ -139,8 +141,8 @@ impl LoadArguments {
     }
 }
 
-/// Loads `scene` (the demo if `None`); the body is `body`, the capture's own, that of the variable SMPL_MODEL, or what lies near
-/// the scene.
+/// Loads `scene` (the demo if `None`); the body is `body`, the capture's own, that of the variable
+/// SMPL_MODEL, or what lies near the scene.
 pub fn load(scene: Option<&str>, body: Option<&Path>, options: &LoadOptions) -> Result<Source> {
     let scene = scene.unwrap_or(DEMO);
     let name = scene.to_owned();

@@ -19,7 +19,8 @@ enum FormatName {
     Humannerf,
     /// Raw ZJU-MoCap, with occlusion.json.
     ZjuMocap,
-    /// HumanNeRF's wild layout, in which OcMotion is distributed: one camera, occluders/, clean/ frames of the same camera.
+    /// HumanNeRF's wild layout, in which OcMotion is distributed: one camera, occluders/, clean/
+    /// frames of the same camera.
     Ocmotion,
 }
 
@@ -38,8 +39,8 @@ enum OcclusionName {
 /// What to make, and where to.
 #[derive(Args)]
 pub struct SynthArguments {
-    /// A rigged .glb or .gltf; the embedded person if left out. Its mesh at rest becomes the body model, with as many
-    /// joints as the rig has (poses are then 3 numbers a joint, not 72)
+    /// A rigged .glb or .gltf; the embedded person if left out. Its mesh at rest becomes the body
+    /// model, with as many joints as the rig has (poses are then 3 numbers a joint, not 72)
     character: Option<PathBuf>,
     /// Directory to write, new or empty
     #[arg(long)]
@@ -67,17 +68,20 @@ pub struct SynthArguments {
     /// Views kept back show every n-th frame [default: 10]
     #[arg(long, value_name = "N")]
     eval_every: Option<usize>,
-    /// Motion capture (.npz with poses, trans, fps), for the embedded person or joints with MakeHuman's, Mixamo's, Unreal's or
-    /// SMPL's names [default: a walk; a character's first animation]
+    /// Motion capture (.npz with poses, trans, fps), for the embedded person or joints with
+    /// MakeHuman's, Mixamo's, Unreal's or SMPL's names [default: a walk; a character's first
+    /// animation]
     #[arg(long, value_name = "CLIP.npz")]
     motion: Option<PathBuf>,
-    /// Full turns added to the motion of a clip or a character over the video, so that all sides are seen [default: 1.15]
+    /// Full turns added to the motion of a clip or a character over the video, so that all sides
+    /// are seen [default: 1.15]
     #[arg(long, value_name = "N", allow_negative_numbers = true)]
     turns: Option<f32>,
     /// Error of each bone's orientation in the poses that are written, degrees rms [default: 1.5]
     #[arg(long, value_name = "DEGREES")]
     pose_noise: Option<f32>,
-    /// Error of the body's shape: at 1 a character's body lies 1 to 3 cm inside it, the embedded person's betas are off by
+    /// Error of the body's shape: at 1 a character's body lies 1 to 3 cm inside it, the embedded
+    /// person's betas are off by
     /// 0.15 under the clothes [default: 1]
     #[arg(long, value_name = "0 to 3")]
     shape_noise: Option<f32>,
@@ -133,7 +137,8 @@ pub fn synth(arguments: &SynthArguments) -> Result<()> {
         let old = beside(out, "old")?;
         if out.exists() {
             vacant(out, arguments.force, MARK)?;
-            // Aside, whole: what is killed while it removes a capture leaves something that nobody dares to replace.
+            // Aside, whole: what is killed while it removes a capture leaves something that nobody
+            // dares to replace.
             std::fs::rename(out, &old).map_err(unwritten(out))?;
         }
         std::fs::rename(&partial, out).map_err(unwritten(out))?;
@@ -166,8 +171,8 @@ fn write(synthetic: &Synthetic, directory: &Path, layout: Layout) -> Result<()> 
     crate::run::write(&directory.join(MARK), &serde_json::to_string_pretty(&mark)?)
 }
 
-/// Errors unless `out` may be written: absent, empty, or an earlier result of the command that leaves `mark`, to be
-/// replaced.
+/// Errors unless `out` may be written: absent, empty, or an earlier result of the command that
+/// leaves `mark`, to be replaced.
 pub fn vacant(out: &Path, force: bool, mark: &str) -> Result<()> {
     let Ok(entries) = std::fs::read_dir(out) else {
         ensure!(!out.exists(), "{}: not a directory", out.display());

@@ -58,7 +58,8 @@ pub fn markdown(rows: &[(String, &Metrics)]) -> String {
     aligned(&lines, 2)
 }
 
-/// Lines of cells, the first of them the header, as a Markdown table; all columns but the first `left` are aligned right.
+/// Lines of cells, the first of them the header, as a Markdown table; all columns but the first
+/// `left` are aligned right.
 pub fn aligned(lines: &[Vec<String>], left: usize) -> String {
     let columns = lines.first().map_or(0, Vec::len);
     let widths: Vec<usize> =

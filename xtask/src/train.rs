@@ -21,8 +21,8 @@ use crate::table;
 
 #[derive(Args)]
 pub struct TrainArguments {
-    /// A capture (raw ZJU-MoCap, or HumanNeRF's prepared or wild layout), or a rigged .glb or .gltf character, of which one
-    /// is made as synth does; the embedded demo if left out
+    /// A capture (raw ZJU-MoCap, or HumanNeRF's prepared or wild layout), or a rigged .glb or .gltf
+    /// character, of which one is made as synth does; the embedded demo if left out
     pub scene: Option<String>,
     /// Run directory [default: runs/SCENE-METHOD]
     #[arg(long)]
@@ -41,7 +41,8 @@ pub struct TrainArguments {
     /// Threads [default: all cores]; the result does not depend on it
     #[arg(long)]
     pub threads: Option<usize>,
-    /// Weights to score LPIPS with: SqueezeNet 1.1, VGG16 or AlexNet, .safetensors or .pth, a file or a directory
+    /// Weights to score LPIPS with: SqueezeNet 1.1, VGG16 or AlexNet, .safetensors or .pth, a file
+    /// or a directory
     #[arg(long, value_name = "PATH")]
     pub lpips: Option<PathBuf>,
     /// Go on with the run in --out from its checkpoint
@@ -52,7 +53,8 @@ pub struct TrainArguments {
     /// Stop after this many steps in all, leaving a checkpoint to resume from
     #[arg(long)]
     pub stop_after: Option<u64>,
-    /// Train every scene of FILE, a path a line, each under OUT; finished ones are not trained again
+    /// Train every scene of FILE, a path a line, each under OUT; finished ones are not trained
+    /// again
     #[arg(long, value_name = "FILE", conflicts_with_all = ["scene", "resume", "stop_after", "compare", "capacity"])]
     pub list: Option<PathBuf>,
     #[command(flatten)]
@@ -190,8 +192,8 @@ pub fn run_one(
     score_run(directory, run, &scene, &trained, lpips, metrics).map(Some)
 }
 
-/// The scores of a run under `directory`: those it has if it finished earlier with the same settings; else it goes on from its
-/// checkpoint, or starts.
+/// The scores of a run under `directory`: those it has if it finished earlier with the same
+/// settings; else it goes on from its checkpoint, or starts.
 pub fn run_unless_finished(
     directory: &Path,
     name: &str,
@@ -217,7 +219,8 @@ pub fn run_unless_finished(
     let earlier = old.is_some_and(|old| old.train == run.train && old.load == run.load);
     if earlier && directory.join(METRICS).is_file() {
         let metrics = Metrics::read(directory)?;
-        // Scores that lack what is asked for now are made anew from the checkpoint, as are those of fewer steps.
+        // Scores that lack what is asked for now are made anew from the checkpoint, as are those of
+        // fewer steps.
         let whole = run.train.method == Method::Prior || metrics.steps >= run.train.steps;
         if whole && (lpips.is_none() || metrics.lpips == network_name(lpips)) {
             say!("{name}: finished earlier");
@@ -231,7 +234,8 @@ pub fn run_unless_finished(
     metrics.with_context(|| format!("{name}: stopped before its end"))
 }
 
-/// The scores under `directory` of a run with the settings `config`; `None` where it has not come to them.
+/// The scores under `directory` of a run with the settings `config`; `None` where it has not come
+/// to them.
 pub fn finished(directory: &Path, config: &Config) -> Result<Option<Metrics>> {
     if !directory.join("config.toml").is_file() || !directory.join(METRICS).is_file() {
         return Ok(None);

@@ -25,9 +25,9 @@ pub enum FilmFormat {
 /// Writes pictures of a film that come one by one, so many a second.
 type Encode = fn(&mut BufWriter<File>, &mut dyn Iterator<Item = Result<RgbImage>>, u32) -> Result<()>;
 
-/// Writes equally large pictures as a film of `fps` a second, `path` with the format's extension, and
-/// returns where it is; `None` where there is no film. The pictures are asked for one by one and not
-/// kept. Whoever opens the file finds the old film or the new one, whole.
+/// Writes equally large pictures as a film of `fps` a second, `path` with the format's extension,
+/// and returns where it is; `None` where there is no film. The pictures are asked for one by one
+/// and not kept. Whoever opens the file finds the old film or the new one, whole.
 pub fn film(
     mut pictures: impl Iterator<Item = Result<RgbImage>>,
     format: FilmFormat,
@@ -99,7 +99,8 @@ mod h264 {
     const QP: u8 = 20;
     /// Levels of H.264 and the macroblocks of 16 × 16 pixels that a picture of theirs has at most.
     const LEVELS: [(u8, usize); 6] = [(31, 3600), (40, 8192), (42, 8704), (50, 22080), (51, 36864), (60, 139_264)];
-    /// From this height on players take the colours for BT.709, below it for BT.601, where a film does not say.
+    /// From this height on players take the colours for BT.709, below it for BT.601, where a film
+    /// does not say.
     const HIGH_DEFINITION: usize = 720;
 
     /// Writes pictures as H.264 (constrained baseline) in MP4, its index first.

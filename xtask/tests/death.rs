@@ -1,6 +1,8 @@
-//! Death at any moment: processes are killed, begun again until they end, and must end as if nothing had happened.
+//! Death at any moment: processes are killed, begun again until they end, and must end as if
+//! nothing had happened.
 //!
-//! A few kills by default; `KILLS=200 cargo test --release -p xtask --test death -- --nocapture` for the table.
+//! A few kills by default; `KILLS=200 cargo test --release -p xtask --test death -- --nocapture`
+//! for the table.
 #![cfg(target_os = "linux")]
 #![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
 
@@ -29,7 +31,8 @@ fn kills() -> usize {
     std::env::var("KILLS").ok().map_or(6, |kills| kills.parse().expect("KILLS is a number"))
 }
 
-/// Checks that every result under `folder` is whole: partial ones have names of their own. Returns how many there were.
+/// Checks that every result under `folder` is whole: partial ones have names of their own. Returns
+/// how many there were.
 fn all_whole(folder: &Path) -> usize {
     let mut count = 0;
     for entry in std::fs::read_dir(folder).into_iter().flatten() {
@@ -80,7 +83,8 @@ struct Toll {
     lost: f64,
 }
 
-/// Runs the work to its end, killing it at random moments up to `longest` milliseconds from its start.
+/// Runs the work to its end, killing it at random moments up to `longest` milliseconds from its
+/// start.
 fn until_it_ends(work: &Work<'_>, longest: u64, random: &mut Random, most: usize, toll: &mut Toll) {
     for attempt in 0.. {
         let mut child = Command::new(env!("CARGO_BIN_EXE_xtask"))

@@ -1,4 +1,5 @@
-//! What the surroundings do to a run: closed pipes, full disks, folders in use, signals. Nothing is lost.
+//! What the surroundings do to a run: closed pipes, full disks, folders in use, signals. Nothing is
+//! lost.
 #![cfg(target_os = "linux")]
 #![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
 
@@ -46,7 +47,8 @@ fn wait_for(path: &Path) {
     }
 }
 
-/// Whether this process was started to ignore a signal, as in the background of a script: what it starts does so too.
+/// Whether this process was started to ignore a signal, as in the background of a script: what it
+/// starts does so too.
 fn ignored(signal: u32) -> bool {
     let status = std::fs::read_to_string("/proc/self/status").unwrap();
     let mask = status.lines().find_map(|line| line.strip_prefix("SigIgn:")).unwrap();
@@ -137,7 +139,8 @@ fn what_the_program_was_started_to_ignore_stays_ignored() {
     assert!(run.join("metrics.json").is_file());
 }
 
-/// The file that a checkpoint is written to leads to a device that is full, once: a failed save removes the link.
+/// The file that a checkpoint is written to leads to a device that is full, once: a failed save
+/// removes the link.
 #[test]
 fn a_periodic_save_that_fails_is_tried_again() {
     let run = folder("save-again").join("run");

@@ -7,7 +7,8 @@ use common::{done, folder, refused, text};
 
 const TITLE: &str = "training views, over visible pixels:";
 
-/// Bodies of 3 + 1 frames take 0.95 MiB, decoding a picture 1.7, keeping it 0.56: two of the four are kept.
+/// Bodies of 3 + 1 frames take 0.95 MiB, decoding a picture 1.7, keeping it 0.56: two of the four
+/// are kept.
 #[test]
 fn pictures_that_are_not_kept_in_memory_are_read_before_training_too() {
     let folder = folder("own-video-memory");

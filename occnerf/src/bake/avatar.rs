@@ -16,30 +16,36 @@ const MAX_LENGTH: f32 = 1e6;
 /// Pose blend-shape terms of a joint other than the root: the entries of R − I.
 const TERMS_PER_JOINT: usize = 9;
 
-/// A person as one to five textured shells of triangles, skinned to a skeleton, with the motions they make.
+/// A person as one to five textured shells of triangles, skinned to a skeleton, with the motions
+/// they make.
 ///
-/// Everything is in metres in a world that is right-handed and y up. The surface stands in the canonical pose (the
-/// T-pose, all rotations zero), facing +z. V vertices, F triangles, J joints, T frames of a clip.
+/// Everything is in metres in a world that is right-handed and y up. The surface stands in the
+/// canonical pose (the T-pose, all rotations zero), facing +z. V vertices, F triangles, J joints, T
+/// frames of a clip.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Avatar {
     /// Name of the scene, as the capture gives it.
     pub name: String,
-    /// Canonical positions of all shells, (V); vertices on a seam of the atlas stand once for each chart.
+    /// Canonical positions of all shells, (V); vertices on a seam of the atlas stand once for each
+    /// chart.
     pub vertices: Vec<Vec3>,
     /// Canonical unit normals, (V).
     pub normals: Vec<Vec3>,
-    /// Place in the atlas, (V): u to the right and v downward, both from 0 to 1 over the whole atlas.
+    /// Place in the atlas, (V): u to the right and v downward, both from 0 to 1 over the whole
+    /// atlas.
     pub uvs: Vec<Vec2>,
-    /// Triangles of all shells, the innermost shell's first, (F), counter-clockwise seen from outside.
+    /// Triangles of all shells, the innermost shell's first, (F), counter-clockwise seen from
+    /// outside.
     pub faces: Vec<[u32; 3]>,
-    /// One past the last triangle of each shell, from the innermost to the outermost; ascending, the last is F.
+    /// One past the last triangle of each shell, from the innermost to the outermost; ascending,
+    /// the last is F.
     pub shell_ends: Vec<u32>,
     /// Joints that move each vertex, (V); those that do not count are repeated or 0.
     pub joints: Vec<[u16; 4]>,
     /// Their weights, (V): not negative, summing to 1.
     pub weights: Vec<[f32; 4]>,
-    /// Pose blend shapes, (V, 9(J−1)), in the order of [`smpl::BodyModel::posedirs`]; no row has any entry where
-    /// skinning alone moves the surface. Formats that have none leave them out.
+    /// Pose blend shapes, (V, 9(J−1)), in the order of [`smpl::BodyModel::posedirs`]; no row has
+    /// any entry where skinning alone moves the surface. Formats that have none leave them out.
     pub posedirs: SparseRows<Vec3>,
     /// Colours and confidence.
     pub atlas: Atlas,
@@ -77,9 +83,11 @@ pub struct Joint {
     pub rest: Vec3,
 }
 
-/// A named motion: axis-angle rotations (T·J) of each joint relative to its parent, and translations (T) of the root.
+/// A named motion: axis-angle rotations (T·J) of each joint relative to its parent, and
+/// translations (T) of the root.
 ///
-/// The root joint stands at its rest position + translation and turns about itself ([`Placement::Pelvis`]).
+/// The root joint stands at its rest position + translation and turns about itself
+/// ([`Placement::Pelvis`]).
 #[derive(Clone, Debug, PartialEq)]
 pub struct Clip {
     /// Such as `video`; unique.
@@ -140,7 +148,8 @@ impl Avatar {
         self.bones(&pose, translation)
     }
 
-    /// Linear blend skinning without pose blend shapes, as glTF has it: Σ w_vi · bones_i · vertices_v, (V).
+    /// Linear blend skinning without pose blend shapes, as glTF has it: Σ w_vi · bones_i ·
+    /// vertices_v, (V).
     ///
     /// # Panics
     /// Unless there are J bones.

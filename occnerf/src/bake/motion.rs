@@ -5,16 +5,18 @@ use smpl::MotionClip;
 
 use super::avatar::Joint;
 
-/// The rotation that takes the direction `up` of a capture's world to +y; none where `up` has no direction.
+/// The rotation that takes the direction `up` of a capture's world to +y; none where `up` has no
+/// direction.
 #[must_use]
 pub fn upright(up: Vec3) -> Mat3 {
     up.try_normalize().map_or(Mat3::IDENTITY, |up| Mat3::from_quat(Quat::from_rotation_arc(up, Vec3::Y)))
 }
 
-/// The motion in which joint j of `skeleton` (J) carries canonical points to the world by `frames[t][j]` (T, J).
+/// The motion in which joint j of `skeleton` (J) carries canonical points to the world by
+/// `frames[t][j]` (T, J).
 ///
-/// Bones that do not hang together, as those of a body that changes its size from frame to frame, keep their
-/// rotations and the root's place.
+/// Bones that do not hang together, as those of a body that changes its size from frame to frame,
+/// keep their rotations and the root's place.
 ///
 /// # Panics
 /// Unless every frame has J transforms.

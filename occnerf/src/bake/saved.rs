@@ -30,12 +30,12 @@ struct Header {
 }
 
 impl Avatar {
-    /// Writes the avatar as `.safetensors`, which [`Avatar::load`] reads back bit for bit. An old file at `path` is
-    /// there until the new one is complete. Equal avatars give equal files.
+    /// Writes the avatar as `.safetensors`, which [`Avatar::load`] reads back bit for bit. An old
+    /// file at `path` is there until the new one is complete. Equal avatars give equal files.
     ///
-    /// Tensors have the names and shapes of the fields; `cameras.intrinsics` is (T, 4): fx fy cx cy,
-    /// `cameras.extrinsics` (T, 3, 4), `cameras.size` (T, 2): width, height; clip K has `clip.K.poses` (T, J, 3) and
-    /// `clip.K.trans` (T, 3).
+    /// Tensors have the names and shapes of the fields; `cameras.intrinsics` is (T, 4): fx fy cx
+    /// cy, `cameras.extrinsics` (T, 3, 4), `cameras.size` (T, 2): width, height; clip K has
+    /// `clip.K.poses` (T, J, 3) and `clip.K.trans` (T, 3).
     ///
     /// # Errors
     /// [`Error::File`] with what [`Avatar::validate`] finds; [`Error::Io`].

@@ -36,8 +36,8 @@ const SMPL_PARENTS: [usize; 24] = [0, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 
 /// Joints that SMPL shares with SMPL-H and SMPL-X.
 const SHARED: usize = 22;
 
-/// Joints with the parents of a body model and these canonical positions, (J). Those of SMPL's tree have SMPL's names,
-/// all others `joint_07`.
+/// Joints with the parents of a body model and these canonical positions, (J). Those of SMPL's tree
+/// have SMPL's names, all others `joint_07`.
 #[must_use]
 pub fn skeleton(parents: &[Option<usize>], rest: &[Vec3]) -> Vec<Joint> {
     let alike = |joint: usize| parents.get(joint).is_some_and(|p| p.unwrap_or(0) == SMPL_PARENTS[joint]);

@@ -35,8 +35,8 @@ pub struct LoadOptions {
     pub occlusion: Option<Obstacle>,
     /// Errors added on purpose.
     pub wrong: Perturbation,
-    /// Whether a capture is read whose cameras see nothing of the body, for [`check`](crate::check()) to say
-    /// why.
+    /// Whether a capture is read whose cameras see nothing of the body, for
+    /// [`check`](crate::check()) to say why.
     #[serde(skip)]
     pub unseen: bool,
 }

@@ -17,9 +17,11 @@ pub enum Mistake {
     CameraToWorld,
     /// The camera's y axis points up and its z axis backward, as in OpenGL.
     CameraYUp,
-    /// The body is turned about the camera's x axis by so many degrees: it was fitted with another axis up.
+    /// The body is turned about the camera's x axis by so many degrees: it was fitted with another
+    /// axis up.
     BodyUp(i32),
-    /// Lengths of the camera (or of the body's place) are so many times too large: 1000 for millimetres.
+    /// Lengths of the camera (or of the body's place) are so many times too large: 1000 for
+    /// millimetres.
     Unit(f32),
     /// Rotations in degrees.
     Degrees,
@@ -29,7 +31,8 @@ pub enum Mistake {
     MaskInverted,
     /// The fit of a picture is that of the picture so many frames later.
     FrameShift(i32),
-    /// The fit lies beside the person in the mask, whichever of these is undone: it is another's, or the mask is.
+    /// The fit lies beside the person in the mask, whichever of these is undone: it is another's,
+    /// or the mask is.
     WrongPerson,
     /// The body is not in the pictures, or far too large or small.
     NoFit,
@@ -70,8 +73,8 @@ impl std::fmt::Display for Mistake {
 /// Angles above a full turn, and the share of all that must be, to be taken for degrees.
 const TURN: f32 = std::f32::consts::TAU;
 const DEGREES_SHARE: f32 = 0.05;
-/// How much better the overlap must be without a mistake: as a factor, and by how much; and how much of the mask the
-/// body must then cover.
+/// How much better the overlap must be without a mistake: as a factor, and by how much; and how
+/// much of the mask the body must then cover.
 const BETTER: f32 = 1.3;
 const BETTER_BY: f32 = 0.12;
 const COVERS: f32 = 0.75;
@@ -143,7 +146,8 @@ pub(super) fn find(capture: &Capture, body: &BodyModel, views: &[View]) -> Vec<M
         Mistake::Unit(100.0),
         Mistake::Unit(0.001),
     ];
-    // Masks of nearly everything look best with a body that fills the picture: they are judged first.
+    // Masks of nearly everything look best with a body that fills the picture: they are judged
+    // first.
     let around = views.iter().map(View::border).sum::<f32>() / views.len().max(1) as f32;
     let (iou, covers) = mean(&overlaps(&posed, body, Some(Mistake::MaskInverted)));
     if around > BORDER && iou > given && covers > given {
@@ -187,7 +191,8 @@ impl<'a> Posed<'a> {
         Self { view, placement: frame.placement, vertices: posed.vertices, pelvis }
     }
 
-    /// The camera without a mistake. The body moves with it where it must: only how they lie to each other counts.
+    /// The camera without a mistake. The body moves with it where it must: only how they lie to
+    /// each other counts.
     fn undone(&self, mistake: Mistake) -> Camera {
         let mut camera = self.view.camera;
         match mistake {

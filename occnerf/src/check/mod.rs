@@ -1,7 +1,7 @@
 //! Whether a fit lies on the person, before anything is trained on it.
 //!
-//! [`check`] compares the posed body's silhouette with the mask of every frame, looks for sudden jumps, and names the
-//! usual mistakes ([`Mistake`]) when undoing them would make a poor fit good.
+//! [`check`] compares the posed body's silhouette with the mask of every frame, looks for sudden
+//! jumps, and names the usual mistakes ([`Mistake`]) when undoing them would make a poor fit good.
 
 mod frame;
 mod jumps;
@@ -38,8 +38,8 @@ const LEAST_IOU: f32 = 0.6;
 pub struct FrameCheck {
     /// As in the capture.
     pub name: String,
-    /// Intersection over union of the silhouette with the mask and the unknown pixels within the silhouette; `None` where
-    /// there is neither mask nor silhouette.
+    /// Intersection over union of the silhouette with the mask and the unknown pixels within the
+    /// silhouette; `None` where there is neither mask nor silhouette.
     pub iou: Option<f32>,
     /// Share of the silhouette that is unknown.
     pub hidden: f32,
@@ -108,8 +108,8 @@ pub fn body_silhouette(frame: &Frame, body: &BodyModel) -> Vec<bool> {
     outline(frame, &frame.camera, body)
 }
 
-/// The picture of a frame as it was taken, what its mask hides included, for people to look at; for pixels that are in
-/// memory alone, what the mask shows.
+/// The picture of a frame as it was taken, what its mask hides included, for people to look at; for
+/// pixels that are in memory alone, what the mask shows.
 ///
 /// # Errors
 /// Pictures that cannot be read.
@@ -197,7 +197,8 @@ fn one(frame: &Frame, view: &View, body: &BodyModel) -> FrameCheck {
     FrameCheck { name: frame.name.clone(), iou, hidden: hidden as f32 / covered.max(1) as f32, faults }
 }
 
-/// Share of the body's vertices that are seen at a pixel of the mask in at least one of up to 32 frames.
+/// Share of the body's vertices that are seen at a pixel of the mask in at least one of up to 32
+/// frames.
 fn surface_seen(capture: &Capture, body: &BodyModel) -> Result<f32, CaptureError> {
     let every = capture.train.len().div_ceil(SURFACE_VIEWS).max(1);
     let mut seen = vec![false; body.num_vertices()];

@@ -3,11 +3,12 @@
 use glam::{Vec2, Vec3};
 use volrender::Camera;
 
-/// Triangles nearer than this share of the furthest vertex's depth are left out: they surround the camera.
+/// Triangles nearer than this share of the furthest vertex's depth are left out: they surround the
+/// camera.
 const NEAR: f32 = 1e-4;
 
-/// Pixels (H × W) of `camera`'s image whose centres the mesh covers. Triangles with a vertex behind the camera are left
-/// out.
+/// Pixels (H × W) of `camera`'s image whose centres the mesh covers. Triangles with a vertex behind
+/// the camera are left out.
 pub(super) fn silhouette(vertices: &[Vec3], faces: &[[u32; 3]], camera: &Camera) -> Vec<bool> {
     let (width, height) = (camera.width as usize, camera.height as usize);
     let mut covered = vec![false; width * height];

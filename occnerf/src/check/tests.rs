@@ -48,7 +48,8 @@ fn made(mistake: Mistake, capture: &Capture, body: &BodyModel) -> Capture {
                 let flip = Affine3A::from_mat3(Mat3::from_diagonal(Vec3::new(1.0, -1.0, -1.0)));
                 camera.world_to_camera = flip * camera.world_to_camera;
             }
-            // The root turned about the camera's x axis, as a fit for another axis up would have it.
+            // The root turned about the camera's x axis, as a fit for another axis up would have
+            // it.
             Mistake::BodyUp(degrees) => {
                 let axis = camera.world_to_camera.inverse().transform_vector3(Vec3::X);
                 let turn = Quat::from_axis_angle(axis, (degrees as f32).to_radians());

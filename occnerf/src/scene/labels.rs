@@ -111,8 +111,8 @@ const CLOTHES: f32 = 0.04;
 ///
 /// `mask`: subject coverage; `silhouette`: pixels that the posed prior covers; `occluder`: known
 /// occluder pixels; `pixels_per_metre`: image scale at the subject's depth. Unknown are the
-/// occluder's pixels, which may be some of many, and the silhouette outside the mask, opened by 3 cm
-/// and dilated by 4 cm.
+/// occluder's pixels, which may be some of many, and the silhouette outside the mask, opened by 3
+/// cm and dilated by 4 cm.
 pub fn label_pixels(
     rule: OccludedRule,
     mask: &[f32],

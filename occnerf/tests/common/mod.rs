@@ -1,4 +1,5 @@
-//! A capture small enough to prepare in no time: an upright ellipsoid with two joints, seen by three cameras.
+//! A capture small enough to prepare in no time: an upright ellipsoid with two joints, seen by
+//! three cameras.
 #![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
 #![allow(dead_code, reason = "not every test file uses everything")]
 
@@ -47,7 +48,8 @@ fn camera(turn: f32, metres: f32) -> Camera {
     Camera::new(intrinsics, extrinsics, SIZE, SIZE).unwrap()
 }
 
-/// What a camera sees of the ellipsoid, coloured by position; the left `hidden` columns are behind something.
+/// What a camera sees of the ellipsoid, coloured by position; the left `hidden` columns are behind
+/// something.
 fn frame(index: usize, turn: f32, hidden: usize, metres: f32) -> Frame {
     let placement = Placement::Origin { rotation: Vec3::ZERO, translation: Vec3::ZERO };
     let pose = vec![Vec3::ZERO; 2];

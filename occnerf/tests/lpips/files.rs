@@ -49,7 +49,8 @@ fn safetensors(tensors: &Tensors) -> Vec<u8> {
     serialize(views.collect::<Vec<_>>(), None).unwrap()
 }
 
-/// The pickle of a state dictionary as `torch.save` writes it: protocol 2, an `OrderedDict` with `_metadata`.
+/// The pickle of a state dictionary as `torch.save` writes it: protocol 2, an `OrderedDict` with
+/// `_metadata`.
 fn state_dict(tensors: &Tensors, legacy: bool) -> Vec<u8> {
     let text = |out: &mut Vec<u8>, text: &str| {
         out.push(b'X');
@@ -188,7 +189,8 @@ fn what_is_wrong_is_named_with_file_tensor_and_shapes() {
     std::fs::write(&path, b"not weights at all, but long enough to be").unwrap();
     refused(&path, &["neither"]);
     refused(&folder.join("none.pth"), &[]);
-    // A damaged file beside the trunk is named where what is missing may be in it, and matters to nobody else.
+    // A damaged file beside the trunk is named where what is missing may be in it, and matters to
+    // nobody else.
     let beside = self::folder("beside");
     let (lonely, cut) = (beside.join("trunk.pth"), beside.join("zlin.pth"));
     std::fs::write(&lonely, archive(&trunk)).unwrap();
@@ -225,7 +227,8 @@ proptest! {
         let (trunk, lin) = weights();
         let few: Tensors = trunk.into_iter().chain(lin).filter(|(name, _)| !name.contains("expand3x3.weight")).collect();
         let mut bytes = [safetensors, archive, legacy][form](&few);
-        // What describes the tensors is small and stands at the start, or in an archive also at the end.
+        // What describes the tensors is small and stands at the start, or in an archive also at the
+        // end.
         let range = if head { bytes.len().min(20_000) } else { bytes.len() };
         let at = if form == 1 && byte % 2 == 0 { bytes.len() - 1 - at.index(range.min(6000)) } else { at.index(range) };
         if cut { bytes.truncate(at) } else { bytes[at] = byte }

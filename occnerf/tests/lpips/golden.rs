@@ -1,4 +1,5 @@
-//! Values and gradients of another implementation in double precision, and properties that any distance has.
+//! Values and gradients of another implementation in double precision, and properties that any
+//! distance has.
 
 use occnerf::{Lpips, Trunk};
 use safetensors::SafeTensors;
@@ -91,7 +92,8 @@ fn gradients_of_every_trunk_agree_with_central_differences() {
         let (a, b) = (noise(3 * w * h, 1), noise(3 * w * h, 2));
         let mut d_a = vec![0.0; a.len()];
         lpips.distance_backward(&a, &b, w, h, 1.0, &mut d_a).unwrap();
-        // Along smooth directions: single pixels of noise meet a kink within any step that single precision resolves.
+        // Along smooth directions: single pixels of noise meet a kink within any step that single
+        // precision resolves.
         let waves: Vec<Vec<f32>> = (0..4)
             .map(|k| (0..a.len()).map(|i| ((i / 3 % w + k * (i / 3 / w)) as f32 * 0.2 + k as f32).sin()).collect())
             .collect();

@@ -14,7 +14,8 @@ use crate::npy::read_file;
 
 /// Bytes that all accessors together may decode to: 256 MiB.
 const MAX_DECODED_BYTES: u64 = 1 << 28;
-/// What the buffers and the pictures of a document may come to, in bytes: 512 MiB. A document may name one file many times.
+/// What the buffers and the pictures of a document may come to, in bytes: 512 MiB. A document may
+/// name one file many times.
 const MAX_RESOLVED_BYTES: u64 = 1 << 29;
 
 /// A document and the bytes that its accessors and images point into. Nothing in it is taken on

@@ -8,14 +8,14 @@ use crate::npy::MAX_FILE_BYTES;
 /// Dictionary of the LZMA decoders in KiB: that of `xz -9`, and as much again for the rest.
 const LZMA_KIBIBYTES: u32 = 128 << 10;
 
-/// Bytes that may come out of `packed` bytes: 256 times as many and 64 MiB, up to the largest file that is read.
-/// Runs of zeros compress a thousandfold, arrays of measurements hardly at all.
+/// Bytes that may come out of `packed` bytes: 256 times as many and 64 MiB, up to the largest file
+/// that is read. Runs of zeros compress a thousandfold, arrays of measurements hardly at all.
 pub(crate) fn unpacked_limit(packed: u64) -> u64 {
     packed.saturating_mul(256).saturating_add(64 << 20).min(MAX_FILE_BYTES)
 }
 
-/// The bytes themselves, or what they are compressed from: zlib, gzip, bzip2, LZMA or xz, told by how they start. No
-/// pickle starts like any of these.
+/// The bytes themselves, or what they are compressed from: zlib, gzip, bzip2, LZMA or xz, told by
+/// how they start. No pickle starts like any of these.
 pub(super) fn unpacked(file: &str, bytes: Vec<u8>) -> Result<Vec<u8>, Error> {
     let source = bytes.as_slice();
     let malformed = |message: String| Error::Pickle { file: file.to_owned(), offset: 0, message };

@@ -12,7 +12,8 @@ impl Machine<'_> {
         self.value(top, &uses, true, 0)
     }
 
-    /// How often each node is referred to, counted up to 2. What is used once can be moved rather than copied.
+    /// How often each node is referred to, counted up to 2. What is used once can be moved rather
+    /// than copied.
     fn uses(&self) -> Vec<u8> {
         let mut uses = vec![0u8; self.nodes.len()];
         let mut count = |id: Id| uses[id] = (uses[id] + 1).min(2);
@@ -28,8 +29,8 @@ impl Machine<'_> {
         uses
     }
 
-    /// The owned tree below a node. Shared nodes are copied, against the budget; `owned` says that no other node leads
-    /// here.
+    /// The owned tree below a node. Shared nodes are copied, against the budget; `owned` says that
+    /// no other node leads here.
     fn value(&mut self, id: Id, uses: &[u8], owned: bool, depth: usize) -> Step<Value> {
         if depth > MAX_DEPTH {
             return Err(format!("nested deeper than {MAX_DEPTH}"));

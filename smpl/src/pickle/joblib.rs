@@ -1,4 +1,5 @@
-//! Arrays of `joblib.dump`: an object that describes the array, and behind its state the array's bytes.
+//! Arrays of `joblib.dump`: an object that describes the array, and behind its state the array's
+//! bytes.
 
 use super::machine::{Id, Machine, Node};
 use super::reader::Step;
@@ -7,9 +8,10 @@ use super::reader::Step;
 const MAX_NESTED: usize = 4;
 
 impl<'a> Machine<'a> {
-    /// The array that a wrapper with these attributes describes, read from behind it: one byte with the padding's
-    /// length, padding, and the elements (up to joblib 1.1 the elements alone; the attribute for the padding is then
-    /// absent); or, for elements that are objects, a pickle of the array.
+    /// The array that a wrapper with these attributes describes, read from behind it: one byte with
+    /// the padding's length, padding, and the elements (up to joblib 1.1 the elements alone; the
+    /// attribute for the padding is then absent); or, for elements that are objects, a pickle of
+    /// the array.
     pub(super) fn joblib_array(&mut self, attributes: &[(Id, Id)]) -> Step<Node<'a>> {
         let find = |name: &str| {
             let named = |id: Id| matches!(&self.nodes[id], Node::Text(text) if text == name);

@@ -8,7 +8,8 @@ use super::reader::{Reader, Step, long, unescape, unquote};
 use super::value::{PERSISTENT, Value};
 use crate::array::NdArray;
 
-/// Index of a node. Nodes live in one arena, because a container can be referred to before it is filled.
+/// Index of a node. Nodes live in one arena, because a container can be referred to before it is
+/// filled.
 pub(super) type Id = usize;
 
 /// A value under construction.
@@ -34,13 +35,16 @@ pub(super) enum Node<'a> {
     Object(&'static str, Option<Id>),
 }
 
-/// Bytes that one item of a vector takes at most: vectors double as they grow, and are there twice while they move.
+/// Bytes that one item of a vector takes at most: vectors double as they grow, and are there twice
+/// while they move.
 pub(super) const fn grown<T>() -> usize {
     3 * size_of::<T>()
 }
-/// Bytes of an entry of the memo: key, value and a control byte in a table that is at least three eighths full.
+/// Bytes of an entry of the memo: key, value and a control byte in a table that is at least three
+/// eighths full.
 const MEMO_ENTRY: usize = 3 * (size_of::<(u64, Id)>() + 1);
-/// Bytes that a pickle may take beside its own: so many for each of its bytes, and so many in any case.
+/// Bytes that a pickle may take beside its own: so many for each of its bytes, and so many in any
+/// case.
 const BUDGET_FACTOR: usize = 8;
 const BUDGET_FLOOR: usize = 128 << 20;
 
@@ -57,8 +61,9 @@ pub(super) struct Machine<'a> {
     pub(super) memo: HashMap<u64, Id>,
     /// How many pickles this one is within.
     pub(super) nesting: usize,
-    /// Bytes that may still be spent, so that a file can ask for no more memory than a multiple of its size, whether
-    /// by opcodes that take one byte each or by referring to one thing many times.
+    /// Bytes that may still be spent, so that a file can ask for no more memory than a multiple of
+    /// its size, whether by opcodes that take one byte each or by referring to one thing many
+    /// times.
     budget: usize,
 }
 

@@ -1,10 +1,11 @@
 //! Python pickles as plain data.
 //!
-//! A small stack machine reads protocols 0 to 5 and understands the few constructors that numpy arrays, joblib's
-//! arrays, chumpy arrays, scipy's `csc_matrix` and descriptions of PyTorch tensors need. Every other global is refused
-//! by name and nothing is ever executed. Beside the input itself a pickle takes at most 8 times its size and 128 MiB;
-//! what joblib has compressed may grow 256-fold and by 64 MiB. Nesting is bounded by [`MAX_DEPTH`]; malformed input
-//! gives [`Error::Pickle`] with the offset of the opcode.
+//! A small stack machine reads protocols 0 to 5 and understands the few constructors that numpy
+//! arrays, joblib's arrays, chumpy arrays, scipy's `csc_matrix` and descriptions of PyTorch tensors
+//! need. Every other global is refused by name and nothing is ever executed. Beside the input
+//! itself a pickle takes at most 8 times its size and 128 MiB; what joblib has compressed may grow
+//! 256-fold and by 64 MiB. Nesting is bounded by [`MAX_DEPTH`]; malformed input gives
+//! [`Error::Pickle`] with the offset of the opcode.
 
 mod compressed;
 mod convert;
@@ -24,7 +25,8 @@ use machine::Machine;
 pub(crate) use compressed::unpacked_limit;
 pub use value::{MAX_DEPTH, PERSISTENT, Value};
 
-/// Reads a pickle file, compressed as joblib compresses or not, or a `.npy` file of either objects or plain values.
+/// Reads a pickle file, compressed as joblib compresses or not, or a `.npy` file of either objects
+/// or plain values.
 ///
 /// # Errors
 /// [`Error::Io`], [`Error::TooLarge`] beyond 2 GiB, [`Error::Pickle`], [`Error::Npy`].
@@ -58,7 +60,8 @@ pub fn parse(file: &str, bytes: &[u8]) -> Result<Value, Error> {
     parse_at(file, bytes, 0)
 }
 
-/// Reads the pickle that starts at byte `start` and says where it ends, for files of several; `file` names them in errors.
+/// Reads the pickle that starts at byte `start` and says where it ends, for files of several;
+/// `file` names them in errors.
 ///
 /// # Errors
 /// [`Error::Pickle`].

@@ -118,7 +118,8 @@ impl<'a> Machine<'a> {
             (Node::Object(class, _), Node::Dict(_)) => {
                 self.nodes[target] = Node::Object(class, Some(state));
             }
-            // Attributes of an `OrderedDict`, such as a state dictionary's versions, are no part of what it holds.
+            // Attributes of an `OrderedDict`, such as a state dictionary's versions, are no part of
+            // what it holds.
             (Node::Dict(_), Node::Dict(_)) => {}
             _ => return Err("state of something that has none".to_owned()),
         }

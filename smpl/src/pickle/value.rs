@@ -9,7 +9,8 @@ const MAX_DENSE: usize = 1 << 25;
 /// Deepest nesting of containers in a [`Value`].
 pub const MAX_DEPTH: usize = 100;
 
-/// Class of a [`Value::Object`] that stands for something outside the pickle; its state is what names it.
+/// Class of a [`Value::Object`] that stands for something outside the pickle; its state is what
+/// names it.
 pub const PERSISTENT: &str = "persistent id";
 
 /// A Python value.
@@ -45,8 +46,9 @@ pub enum Value {
         /// The items, last axis fastest.
         items: Vec<Value>,
     },
-    /// Instance of one of the allowed classes: `chumpy.ch.Ch`, `scipy.sparse.csc_matrix`, `torch.Tensor`, [`PERSISTENT`]; or
-    /// such a class itself, or one of PyTorch's storage classes, without attributes.
+    /// Instance of one of the allowed classes: `chumpy.ch.Ch`, `scipy.sparse.csc_matrix`,
+    /// `torch.Tensor`, [`PERSISTENT`]; or such a class itself, or one of PyTorch's storage classes,
+    /// without attributes.
     Object {
         /// Full name of the class.
         class: &'static str,
@@ -76,8 +78,8 @@ impl Value {
         }
     }
 
-    /// The value under the text `key` of a dict or of an object's attributes. `None` if there is none, and for other
-    /// types.
+    /// The value under the text `key` of a dict or of an object's attributes. `None` if there is
+    /// none, and for other types.
     #[must_use]
     pub fn get(&self, key: &str) -> Option<&Self> {
         match self {
@@ -122,7 +124,8 @@ impl Value {
         }
     }
 
-    /// [`Value::as_array`], or a `csc_matrix` made dense. `Ok(None)` for other types; `file` and `key` are for errors.
+    /// [`Value::as_array`], or a `csc_matrix` made dense. `Ok(None)` for other types; `file` and
+    /// `key` are for errors.
     ///
     /// # Errors
     /// [`Error::Invalid`] for a sparse matrix whose parts do not fit, or that would be too large.

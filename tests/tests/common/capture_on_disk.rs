@@ -83,7 +83,8 @@ fn dictionary<'a>(items: impl IntoIterator<Item = (&'a str, Vec<u8>)>) -> Vec<u8
     [b"}(", items.as_slice(), b"u"].concat()
 }
 
-/// numpy's `_reconstruct(ndarray, (0,), b'b')` with the state (1, shape, dtype('<f8'), False, bytes).
+/// numpy's `_reconstruct(ndarray, (0,), b'b')` with the state (1, shape, dtype('<f8'), False,
+/// bytes).
 fn array(shape: &[u32], values: &[f64]) -> Vec<u8> {
     let mut out = b"cnumpy.core.multiarray\n_reconstruct\ncnumpy\nndarray\nK\0\x85C\x01b\x87R(K\x01(".to_vec();
     for n in shape {

@@ -1,7 +1,9 @@
-//! Every reader of somebody else's files, on damaged ones: no panic, no hang, and no more memory than is said.
+//! Every reader of somebody else's files, on damaged ones: no panic, no hang, and no more memory
+//! than is said.
 //!
-//! A few thousand inputs by default; `FUZZ=1000000 cargo test --release -p testkit --test fuzz -- --nocapture` for a million and a
-//! table. Input number n of a reader is the same on every machine; one that fails is left in `target/tmp`.
+//! A few thousand inputs by default; `FUZZ=1000000 cargo test --release -p testkit --test fuzz --
+//! --nocapture` for a million and a table. Input number n of a reader is the same on every machine;
+//! one that fails is left in `target/tmp`.
 #![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
 
 #[path = "../common/mod.rs"]
@@ -176,7 +178,8 @@ fn pictures() {
         std::fs::write(&path, bytes).unwrap();
         Image::load(&path).is_ok()
     };
-    // 8192 pixels a side is the bound: 16 bytes a pixel of a header that lies, 18 with what is read.
+    // 8192 pixels a side is the bound: 16 bytes a pixel of a header that lies, 18 with what is
+    // read.
     let most = 8192 * 8192 * 18;
     Attack { name: "PNG", form: Form::Png, seeds: seeds::pngs(), share: 60, most }.run(read);
     Attack { name: "JPEG", form: Form::Plain, seeds: seeds::jpegs(), share: 30, most }.run(read);
@@ -201,7 +204,8 @@ fn configurations() {
     );
 }
 
-/// Sizes are those of the configuration in the file, which is bounded by itself: only the sizes of the seed are opened.
+/// Sizes are those of the configuration in the file, which is bounded by itself: only the sizes of
+/// the seed are opened.
 #[test]
 fn checkpoints() {
     let path = place("checkpoint.safetensors");

@@ -1,4 +1,5 @@
-//! Damage that keeps the form: files are taken apart, harmed within, and put together again with right sizes and sums.
+//! Damage that keeps the form: files are taken apart, harmed within, and put together again with
+//! right sizes and sums.
 
 use std::io::{Cursor, Read, Write};
 

@@ -1,4 +1,5 @@
-//! Small real files of every kind, written by the crates themselves or by hand, and those of other programs that the repository has.
+//! Small real files of every kind, written by the crates themselves or by hand, and those of other
+//! programs that the repository has.
 
 use std::io::{Cursor, Write};
 use std::path::{Path, PathBuf};

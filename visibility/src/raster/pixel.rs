@@ -23,8 +23,8 @@ pub struct Pixel<'a> {
 }
 
 impl Pixel<'_> {
-    /// The fragments of every sample, nearest first: at most one fragment a layer. No sample at all where the whole pixel
-    /// sees nothing.
+    /// The fragments of every sample, nearest first: at most one fragment a layer. No sample at all
+    /// where the whole pixel sees nothing.
     #[inline]
     pub fn samples(&self) -> impl ExactSizeIterator<Item = &[Fragment]> {
         self.counts.iter().zip(self.fragments.chunks_exact(self.layers.max(1))).map(|(&n, sample)| &sample[..n])

@@ -67,7 +67,8 @@ impl Level {
     }
 }
 
-/// What a level may change: the capture, as `T` describes it, and how long and at which rates it is trained on.
+/// What a level may change: the capture, as `T` describes it, and how long and at which rates it is
+/// trained on.
 #[derive(Clone, PartialEq)]
 struct Case<T> {
     capture: T,
@@ -118,7 +119,8 @@ fn shortened(mut axes: Vec<Axis>, quick: bool) -> Vec<Axis> {
     axes
 }
 
-/// Every axis of the demo, of pictures `side` pixels a side; the quick form has the easy case and the hardest level of each.
+/// Every axis of the demo, of pictures `side` pixels a side; the quick form has the easy case and
+/// the hardest level of each.
 pub fn of_demo(side: u32, quick: bool) -> Vec<Axis> {
     let demo = DemoConfig { size: side, frames: FRAMES, eval_every: FRAMES / INSTANTS, ..DemoConfig::default() };
     let around = Around::new(Difficulty { demo, ..Difficulty::default() }, Place::Made);
@@ -153,8 +155,8 @@ pub fn of_demo(side: u32, quick: bool) -> Vec<Axis> {
     shortened(axes, quick)
 }
 
-/// Every axis of a capture on disk, read as `load` says, pictures reduced to `side` pixels unless `load` says otherwise.
-/// `obstacle`: whether its layout leaves open what hides the person.
+/// Every axis of a capture on disk, read as `load` says, pictures reduced to `side` pixels unless
+/// `load` says otherwise. `obstacle`: whether its layout leaves open what hides the person.
 pub fn of_capture(place: &Place, side: u32, obstacle: bool, quick: bool) -> Vec<Axis> {
     let Place::Scene { scene, body, load } = place.clone() else { return Vec::new() };
     let side = load.resize.unwrap_or(side);

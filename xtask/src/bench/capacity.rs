@@ -1,4 +1,5 @@
-//! `bench capacity`: parameters and memory against accuracy, of fixed sizes and of those chosen from the scene.
+//! `bench capacity`: parameters and memory against accuracy, of fixed sizes and of those chosen
+//! from the scene.
 
 use std::fmt::Write as _;
 use std::path::Path;
@@ -28,7 +29,8 @@ const AROUND: [(&str, &[&str], bool); 7] = [
 const WORTHS: [(&str, Pick); 2] =
     [("psnr_mask, dB", |l| l.outcome.psnr_mask), ("psnr_hidden, dB", |l| l.outcome.psnr_hidden)];
 
-/// Every point of one capture. `paper_steps`: of the preset `paper` and what is chosen from it, if they are wanted.
+/// Every point of one capture. `paper_steps`: of the preset `paper` and what is chosen from it, if
+/// they are wanted.
 pub fn points(sweep: &Sweep, source: &Source, paper_steps: Option<u64>) -> Result<Vec<Point>> {
     let steps = sweep.steps;
     let setting = |preset, steps, set| Setting { preset, method: Method::Occnerf, steps, set };
@@ -123,7 +125,8 @@ pub fn chart(scene: &str, lines: &[Line], stem: &Path) -> Result<()> {
     picture.write(stem).map(|_| ())
 }
 
-/// A row a point; in brackets what it has of its preset's parameters, and its difference to that preset.
+/// A row a point; in brackets what it has of its preset's parameters, and its difference to that
+/// preset.
 pub fn table(lines: &[Line]) -> String {
     let mut text = String::from("| point | preset | parameters | MB | train s |");
     WORTHS.iter().for_each(|(name, _)| text.push_str(&format!(" {name} |")));

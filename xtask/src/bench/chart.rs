@@ -229,7 +229,8 @@ impl Label {
     }
 }
 
-/// Places names one after another where they cover least of points and other names, near their points.
+/// Places names one after another where they cover least of points and other names, near their
+/// points.
 fn arrange(spots: &[((i32, i32), &str)], area: (i32, i32), scale: i32) -> Vec<Label> {
     let mut placed: Vec<Label> = Vec::new();
     for (index, &(at, name)) in spots.iter().enumerate().filter(|(_, s)| !s.1.is_empty()) {

@@ -1,5 +1,5 @@
-//! `bench cost`: where the time of a training step goes, what that is of what the machine can do, and how time and
-//! memory grow with the work.
+//! `bench cost`: where the time of a training step goes, what that is of what the machine can do,
+//! and how time and memory grow with the work.
 
 mod machine;
 

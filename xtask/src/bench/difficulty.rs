@@ -21,7 +21,8 @@ pub struct Difficulty {
     pub erosion: u32,
     /// Exposure of a training frame as a share of the time from one frame to the next, 0 to 1.
     pub shutter: f32,
-    /// Keep only training frames in which the person's front is within this angle of the camera; 180 keeps all.
+    /// Keep only training frames in which the person's front is within this angle of the camera;
+    /// 180 keeps all.
     pub facing_degrees: f32,
     /// Length of one metre in the capture's unit.
     pub unit: f32,

@@ -1,7 +1,8 @@
 //! The Pareto front: what nothing else beats in both respects.
 
-/// Whether each point (cost, worth) is on the front: no other has at most its cost and at least its worth, and one of
-/// the two strictly. Equal points stand or fall together; a point that is not finite is never on it.
+/// Whether each point (cost, worth) is on the front: no other has at most its cost and at least its
+/// worth, and one of the two strictly. Equal points stand or fall together; a point that is not
+/// finite is never on it.
 pub fn front(points: &[(f64, f64)]) -> Vec<bool> {
     let finite = |p: &(f64, f64)| p.0.is_finite() && p.1.is_finite();
     // −0 becomes 0, which sorts otherwise.

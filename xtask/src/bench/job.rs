@@ -159,12 +159,14 @@ fn score(scene: &Scene, renderer: &mut dyn Renderer, outcome: &mut Outcome) -> R
     Ok(())
 }
 
-/// The child's part: a job as the first line of standard input, which stays open, its outcome as one line on standard output.
+/// The child's part: a job as the first line of standard input, which stays open, its outcome as
+/// one line on standard output.
 pub fn serve() -> Result<()> {
     let mut text = String::new();
     std::io::stdin().lock().take(MAX_JOB_BYTES).read_line(&mut text).context("standard input")?;
     let job: Job = serde_json::from_str(&text).context("standard input is not a job")?;
-    // Standard input ends when the sweep does, however that ends: nobody waits for the outcome then.
+    // Standard input ends when the sweep does, however that ends: nobody waits for the outcome
+    // then.
     std::thread::spawn(|| {
         let _ = std::io::copy(&mut std::io::stdin().lock(), &mut std::io::sink());
         std::process::exit(1);
@@ -173,8 +175,8 @@ pub fn serve() -> Result<()> {
     Ok(())
 }
 
-/// Runs a job in a process of its own, so that its peak of memory is its own and nothing it does ends a sweep: an
-/// error, a panic, and a run longer than `limit` come back as [`Outcome::error`].
+/// Runs a job in a process of its own, so that its peak of memory is its own and nothing it does
+/// ends a sweep: an error, a panic, and a run longer than `limit` come back as [`Outcome::error`].
 ///
 /// # Errors
 /// Where no process can be started; [`Ending::Stopped`] where a signal came.

@@ -48,15 +48,19 @@ pub struct BenchArguments {
 
 #[derive(Subcommand)]
 enum What {
-    /// Seconds against accuracy of every named approximation, each preset and each method: a table and charts.
+    /// Seconds against accuracy of every named approximation, each preset and each method: a table
+    /// and charts.
     Pareto(ParetoArguments),
-    /// Parameters and memory against accuracy, of fixed sizes and of `train --capacity auto`: a table and charts.
+    /// Parameters and memory against accuracy, of fixed sizes and of `train --capacity auto`: a
+    /// table and charts.
     Capacity(CapacityArguments),
-    /// What happens as it gets hard: less to see, worse poses, odd units, …; a table of breaking points and charts.
+    /// What happens as it gets hard: less to see, worse poses, odd units, …; a table of breaking
+    /// points and charts.
     Stability(StabilityArguments),
     /// Cost against error of the geometric kernels; `pareto` draws it too.
     Kernels(KernelArguments),
-    /// Where the time of a step goes, and how time and memory grow with rays, samples, table, vertices, frames and pixels.
+    /// Where the time of a step goes, and how time and memory grow with rays, samples, table,
+    /// vertices, frames and pixels.
     Cost(CostArguments),
     /// A run's baked person against its field: a table of scores and speeds, and pictures.
     Baked(baked::BakedArguments),
@@ -93,7 +97,8 @@ struct CapacityArguments {
     /// Steps of each point [default: 400, quick: 80]
     #[arg(long)]
     steps: Option<u64>,
-    /// The preset `paper` too, and what is chosen from it, with so many steps at the rates of `balanced`
+    /// The preset `paper` too, and what is chosen from it, with so many steps at the rates of
+    /// `balanced`
     #[arg(long, value_name = "STEPS")]
     paper: Option<u64>,
     /// Seed of every point
@@ -113,7 +118,8 @@ struct ParetoArguments {
     /// Fewer points and fewer steps: under 10 minutes on 2 cores
     #[arg(long)]
     quick: bool,
-    /// Steps of each point; presets run their own number at 400 and in proportion otherwise [default: 400, quick: 80]
+    /// Steps of each point; presets run their own number at 400 and in proportion otherwise
+    /// [default: 400, quick: 80]
     #[arg(long)]
     steps: Option<u64>,
     /// Seed of every point
@@ -130,7 +136,8 @@ struct StabilityArguments {
     /// Where to write; what is there is not run again
     #[arg(long, default_value = "runs/bench-stability")]
     out: PathBuf,
-    /// Only the easy case and the hardest level of each axis, fewer steps, one seed: under 10 minutes on 2 cores
+    /// Only the easy case and the hardest level of each axis, fewer steps, one seed: under 10
+    /// minutes on 2 cores
     #[arg(long)]
     quick: bool,
     /// Steps of each run [default: 200, quick: 100]
@@ -139,7 +146,8 @@ struct StabilityArguments {
     /// Only these axes, comma separated, such as hidden,"pose noise" [default: all]
     #[arg(long, value_delimiter = ',')]
     axes: Vec<String>,
-    /// Pixels a side of the pictures, 64 to 512 for figures that mean something; of captures, where --resize is not given
+    /// Pixels a side of the pictures, 64 to 512 for figures that mean something; of captures, where
+    /// --resize is not given
     #[arg(long, default_value_t = 96)]
     side: u32,
     /// Trained runs at most of each scene; those of more seeds are left out first

@@ -110,7 +110,8 @@ pub fn charts(scene: &str, lines: &[Line], stem: &Path) -> Result<()> {
     Ok(())
 }
 
-/// Which points crowd around the base: at most 1.6 times slower or faster, and not much farther off than most changes.
+/// Which points crowd around the base: at most 1.6 times slower or faster, and not much farther off
+/// than most changes.
 fn close_to_base(scored: &[(&Line, (f64, f64), bool)]) -> Vec<bool> {
     let base = scored.iter().find(|s| s.0.point.kind == Kind::Base).map(|s| s.1);
     let Some(base) = base else { return vec![true; scored.len()] };
@@ -121,7 +122,8 @@ fn close_to_base(scored: &[(&Line, (f64, f64), bool)]) -> Vec<bool> {
     scored.iter().map(|s| off(s) <= most && (s.1.0 / base.0).ln().abs() <= 1.6f64.ln()).collect()
 }
 
-/// A row a point, differences to the base in brackets; the last column says on which fronts of training time it is.
+/// A row a point, differences to the base in brackets; the last column says on which fronts of
+/// training time it is.
 pub fn table(lines: &[Line]) -> String {
     let base = lines.iter().find(|l| l.point.kind == Kind::Base);
     let mut text = String::from("| point | changes | train s | s/frame |");

@@ -50,7 +50,8 @@ pub const CHANGES: [Change; 20] = [
     change("surface term", "no surface term", &["surface.surface_term=false", "surface.attention=false"], true),
 ];
 
-/// A change that loses less than this, in dB, can be part of the lean combination, and one that gains more of the rich.
+/// A change that loses less than this, in dB, can be part of the lean combination, and one that
+/// gains more of the rich.
 const NOTHING: f64 = 0.03;
 /// A change that takes more than this part of the base's time does not save any.
 const SAVING: f64 = 0.98;
@@ -152,8 +153,9 @@ impl Sweep {
         Ok(points)
     }
 
-    /// The best combinations of single changes: `lean` takes of each factor the fastest that loses nothing, `rich` the
-    /// one that gains most, `lean and rich` both, gain before speed. None where they would be a point there is.
+    /// The best combinations of single changes: `lean` takes of each factor the fastest that loses
+    /// nothing, `rich` the one that gains most, `lean and rich` both, gain before speed. None where
+    /// they would be a point there is.
     pub fn combinations(&self, lines: &[Line]) -> Result<Vec<Point>> {
         let Some(base) = lines.iter().find(|l| l.point.kind == Kind::Base) else { return Ok(Vec::new()) };
         let tried: Vec<(&Change, f64, f64)> = CHANGES

@@ -72,8 +72,8 @@ impl Line {
     }
 }
 
-/// Reads a log; of several lines for one point the last holds. A last line that was cut off is left out: its point
-/// was not finished.
+/// Reads a log; of several lines for one point the last holds. A last line that was cut off is left
+/// out: its point was not finished.
 ///
 /// # Errors
 /// A file that cannot be read, or a line before the last that is none, by its number.
@@ -139,8 +139,8 @@ pub struct Bench {
 }
 
 impl Bench {
-    /// Goes on in `directory`, which is made if need be. A part of a sweep has a log and a lock of its own, and reads
-    /// those of the others.
+    /// Goes on in `directory`, which is made if need be. A part of a sweep has a log and a lock of
+    /// its own, and reads those of the others.
     pub fn open(directory: &Path, threads: Option<usize>, budget: Duration, shard: Option<Shard>) -> Result<Self> {
         crate::run::make_directory(directory)?;
         let path = directory.join(shard.map_or(LOG.to_owned(), |shard| format!("bench-{}.jsonl", shard.name())));
@@ -162,7 +162,8 @@ impl Bench {
         Ok(Self { path, file, _lock: lock, shard, lines, threads, start, budget, begun: 0, left: 0 })
     }
 
-    /// Runs a point, unless the log has it with the very same job and no error; `None` when time is up.
+    /// Runs a point, unless the log has it with the very same job and no error; `None` when time is
+    /// up.
     pub fn run(&mut self, point: Point) -> Result<Option<Line>> {
         let done = self.lines.iter().find(|l| l.point.job == point.job && l.outcome.error.is_none());
         if let Some(done) = done {

@@ -21,13 +21,15 @@ pub enum Scale {
 }
 
 impl Scale {
-    /// A scale that shows all of `values` that it can: those up to 1e100 either way, above 1e-100 on a logarithmic scale.
+    /// A scale that shows all of `values` that it can: those up to 1e100 either way, above 1e-100
+    /// on a logarithmic scale.
     pub fn around(values: impl Iterator<Item = f64>, logarithmic: bool) -> Self {
         let values = values.filter(|v| fits(*v, logarithmic));
         let place = |v: f64| if logarithmic { v.ln() } else { v };
         let (low, high) = values.map(place).fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), v| (a.min(v), b.max(v)));
         let (low, high) = if low <= high { (low, high) } else { (0.0, 1.0) };
-        // e^0.24 = 1.27: more than lies between any two ticks, so that an axis of one value has one.
+        // e^0.24 = 1.27: more than lies between any two ticks, so that an axis of one value has
+        // one.
         let room = (ROOM * (high - low)).max(if logarithmic { 0.12 } else { 1e-3 + 1e-3 * high.abs() });
         let (low, high) = (low - room, high + room);
         if logarithmic { Self::Logarithmic(low.exp()..high.exp()) } else { Self::Linear(low..high) }

@@ -61,8 +61,8 @@ pub struct Course {
 }
 
 impl Sweep {
-    /// Runs what the log does not have: every level of ours, the easy case and the hardest level of the peers, then
-    /// the peers where ours breaks first, and more seeds where anything does.
+    /// Runs what the log does not have: every level of ours, the easy case and the hardest level of
+    /// the peers, then the peers where ours breaks first, and more seeds where anything does.
     pub fn run(&self, bench: &mut Bench) -> Result<Vec<Line>> {
         let mut runs = Runs { bench, lines: Vec::new(), trained: 0, max_runs: self.max_runs };
         for axis in &self.axes {
@@ -105,8 +105,9 @@ impl Sweep {
     }
 }
 
-/// What the log says of a method along an axis. Broken is a level with an error or anything not finite, one that loses
-/// more than 3 dB against the easiest level measured, and, for what is trained, one below the prior.
+/// What the log says of a method along an axis. Broken is a level with an error or anything not
+/// finite, one that loses more than 3 dB against the easiest level measured, and, for what is
+/// trained, one below the prior.
 pub fn course(axis: &Axis, method: Method, lines: &[Line]) -> Course {
     let of = |level: usize, method: Method| {
         lines.iter().filter(move |l| {

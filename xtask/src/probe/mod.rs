@@ -1,4 +1,5 @@
-//! `probe`: one function of one crate on numpy arrays, for comparing it with another implementation.
+//! `probe`: one function of one crate on numpy arrays, for comparing it with another
+//! implementation.
 
 mod body;
 mod encode;
@@ -19,28 +20,31 @@ use output::Output;
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 enum Op {
-    /// Posed bodies: betas (B,10), poses (B,72), trans (B,3) -> vertices (B,V,3), joints (B,24,3); --model
+    /// Posed bodies: betas (B,10), poses (B,72), trans (B,3) -> vertices (B,V,3), joints (B,24,3);
+    /// --model
     Skin,
-    /// World to rest pose: poses (72), betas (10), trans (3), points (Q,3), kind 0 volume or 1 surface -> canonical (Q,3),
-    /// NaN where no part of the body is near, likelihood (Q); --model, in metres
+    /// World to rest pose: poses (72), betas (10), trans (3), points (Q,3), kind 0 volume or 1
+    /// surface -> canonical (Q,3), NaN where no part of the body is near, likelihood (Q); --model,
+    /// in metres
     Motion,
     /// Farthest point sampling: points (N,3), ratio, levels -> level_1, level_2, ...
     Fps,
     /// Nearest points: points (N,3), queries (Q,3), k -> indices (Q,k), distances (Q,k)
     Knn,
-    /// Neighbours and distances of a mesh: queries (Q,3) -> indices (Q,4,5), blended (Q,3), signed_distance (Q),
-    /// closest_point (Q,3), exact_signed_distance (Q); --mesh
+    /// Neighbours and distances of a mesh: queries (Q,3) -> indices (Q,4,5), blended (Q,3),
+    /// signed_distance (Q), closest_point (Q,3), exact_signed_distance (Q); --mesh
     Surface,
     /// What a camera sees: K (3,3), E (3,4), width, height -> visible (V); --mesh
     Visible,
-    /// Hash encoding: points (Q,D) from 0 to 1, D = 2, 3 or 4, resolutions (L), table (L,2^T,F), optional d_features (Q,L*F)
+    /// Hash encoding: points (Q,D) from 0 to 1, D = 2, 3 or 4, resolutions (L), table (L,2^T,F),
+    /// optional d_features (Q,L*F)
     /// -> features (Q,L*F), d_table, d_points
     HashEncode,
-    /// Volume rendering: sigma (R,S), rgb (R,S,3), edges (R,S+1), background (3), optional d_color (R,3) -> color (R,3),
-    /// opacity (R), depth (R), weights (R,S), termination (R), d_sigma, d_rgb
+    /// Volume rendering: sigma (R,S), rgb (R,S,3), edges (R,S+1), background (3), optional d_color
+    /// (R,3) -> color (R,3), opacity (R), depth (R), weights (R,S), termination (R), d_sigma, d_rgb
     Composite,
-    /// Image metrics: a, b (H,W,3) from 0 to 1, mask (H,W) of booleans -> psnr, ssim, psnr_mask, ssim_mask;
-    /// with --lpips: lpips
+    /// Image metrics: a, b (H,W,3) from 0 to 1, mask (H,W) of booleans -> psnr, ssim, psnr_mask,
+    /// ssim_mask; with --lpips: lpips
     Metrics,
 }
 

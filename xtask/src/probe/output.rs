@@ -13,7 +13,8 @@ pub struct Output {
     arrays: Vec<(String, NdArray)>,
 }
 
-/// Number of values of an output of this shape, if it is small enough to be written; asked before it is computed.
+/// Number of values of an output of this shape, if it is small enough to be written; asked before
+/// it is computed.
 pub fn count(key: &str, shape: &[usize]) -> Result<usize> {
     // The widest values have eight bytes.
     let most = MAX_ARRAY_BYTES as usize / 8;

@@ -10,10 +10,12 @@ use super::print::shown;
 /// Longest message that is printed, in characters: some quote what they found in a file.
 const LONGEST: usize = 2000;
 
-/// Ends that scripts can tell apart; any other error exits with 1, a command line that cannot be read with 2.
+/// Ends that scripts can tell apart; any other error exits with 1, a command line that cannot be
+/// read with 2.
 #[derive(Debug, thiserror::Error)]
 pub enum Ending {
-    /// A result cannot be written: a full disk, a folder that is read-only or gone. What stood there before is whole.
+    /// A result cannot be written: a full disk, a folder that is read-only or gone. What stood
+    /// there before is whole.
     #[error("{}: cannot be written: {source}", path.display())]
     Unwritten { path: PathBuf, source: io::Error },
     /// Another process works in the folder.

@@ -8,8 +8,8 @@ use anyhow::Result;
 use super::ending::{Ending, unwritten};
 use super::print::note;
 
-/// The sole right to write results in a folder. It ends with the process, however that ends: the system holds it, and
-/// the file `.lock` that stays behind means nothing.
+/// The sole right to write results in a folder. It ends with the process, however that ends: the
+/// system holds it, and the file `.lock` that stays behind means nothing.
 #[must_use]
 pub struct Lock {
     _file: Option<File>,

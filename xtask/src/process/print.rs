@@ -1,4 +1,5 @@
-//! Everything that is printed. What cannot be written never stops work, and no text steers a terminal.
+//! Everything that is printed. What cannot be written never stops work, and no text steers a
+//! terminal.
 
 use std::fmt::{Arguments, Write as _};
 use std::io::Write;
@@ -32,8 +33,8 @@ fn line(to: &mut impl Write, text: Arguments<'_>) {
     let _ = to.write_all(text.as_bytes()).and_then(|()| to.flush());
 }
 
-/// Text with everything that a terminal would obey, or that turns the direction of writing, as `\u{…}`; line breaks and
-/// tabs are left.
+/// Text with everything that a terminal would obey, or that turns the direction of writing, as
+/// `\u{…}`; line breaks and tabs are left.
 pub fn shown(text: &str) -> String {
     let mut out = String::with_capacity(text.len());
     for c in text.chars() {

@@ -7,9 +7,9 @@ static SIGNAL: AtomicI32 = AtomicI32::new(0);
 /// Guards that live.
 static GUARDS: AtomicUsize = AtomicUsize::new(0);
 
-/// Work that is asked to end rather than ended: while a guard lives, the first signal is only remembered, and a second
-/// ends the program at once. Without a guard any signal does, and no file is left half written by that: see
-/// [`occnerf::replace_file`].
+/// Work that is asked to end rather than ended: while a guard lives, the first signal is only
+/// remembered, and a second ends the program at once. Without a guard any signal does, and no file
+/// is left half written by that: see [`occnerf::replace_file`].
 #[must_use]
 pub struct Guard(());
 
@@ -32,8 +32,8 @@ impl Drop for Guard {
     }
 }
 
-/// Listens from now on. What the program was started to ignore (SIGHUP under `nohup`, SIGINT in the background of a
-/// script) stays ignored, as far as the system tells.
+/// Listens from now on. What the program was started to ignore (SIGHUP under `nohup`, SIGINT in the
+/// background of a script) stays ignored, as far as the system tells.
 #[cfg(unix)]
 pub fn watch() -> std::io::Result<()> {
     use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
@@ -59,7 +59,8 @@ pub fn watch() -> std::io::Result<()> {
     Ok(())
 }
 
-/// The signals that this process ignores, the first in the lowest bit; `None` where the system does not tell.
+/// The signals that this process ignores, the first in the lowest bit; `None` where the system does
+/// not tell.
 #[cfg(unix)]
 fn ignored() -> Option<u64> {
     let status = std::fs::read_to_string("/proc/self/status").ok()?;

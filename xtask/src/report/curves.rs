@@ -21,7 +21,8 @@ const COLORS: usize = 7;
 pub struct Log(Vec<serde_json::Value>);
 
 impl Log {
-    /// Reads train.jsonl; none if there is none, as for methods that do not train. A last line that was cut off is left out.
+    /// Reads train.jsonl; none if there is none, as for methods that do not train. A last line that
+    /// was cut off is left out.
     pub fn read(path: &Path) -> Result<Option<Self>> {
         if !path.exists() {
             return Ok(None);
@@ -48,7 +49,8 @@ impl Log {
     }
 }
 
-/// One quantity of all logs against seconds, with a key if there are several; nothing without two points.
+/// One quantity of all logs against seconds, with a key if there are several; nothing without two
+/// points.
 pub fn curves(logs: &[(String, Log)], key: &str, label: &str, logarithmic: bool) -> String {
     let courses: Vec<(&str, Vec<(f64, f64)>)> = logs
         .iter()

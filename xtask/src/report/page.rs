@@ -102,7 +102,8 @@ impl Page {
             .map(|(i, text)| format!("<a href=\"#s{i}\">{}</a>", escape(text)))
             .collect();
         let links = if links.len() > 2 { format!("<nav>{}</nav>\n", links.join(" ")) } else { String::new() };
-        // Nothing but what stands here runs, and nothing is fetched: a second lock behind the escaping.
+        // Nothing but what stands here runs, and nothing is fetched: a second lock behind the
+        // escaping.
         let script = STANDARD.encode(Sha256::digest(SCRIPT));
         let policy = format!(
             "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'sha256-{script}'; \

@@ -39,7 +39,8 @@ pub struct ReproduceArguments {
     /// Directory of all runs and results
     #[arg(long, default_value = "runs/reproduce")]
     out: PathBuf,
-    /// Minutes that everything may take; the number of steps follows from a measurement on this machine
+    /// Minutes that everything may take; the number of steps follows from a measurement on this
+    /// machine
     #[arg(long, default_value_t = 60.0)]
     budget: f64,
     /// Runs of each row, with seeds 1 to N; the table gives mean and standard deviation

@@ -52,7 +52,8 @@ pub struct Plan {
 }
 
 impl Plan {
-    /// The plan that an earlier sitting, or another job, left under `directory` for the same request.
+    /// The plan that an earlier sitting, or another job, left under `directory` for the same
+    /// request.
     pub fn read(directory: &Path, request: &Request, steps: Option<u64>) -> Result<Option<Self>> {
         let path = directory.join(FILE);
         if !path.is_file() {

@@ -23,7 +23,8 @@ const SCRIPTS: [&str; 3] = [include_str!("person.js"), include_str!("draw.js"), 
 pub struct ViewArguments {
     /// Run directory
     run: PathBuf,
-    /// Another motion to choose, besides the video's: an .npz with poses, trans and fps, as AMASS has them; repeatable
+    /// Another motion to choose, besides the video's: an .npz with poses, trans and fps, as AMASS
+    /// has them; repeatable
     #[arg(long, value_name = "CLIP.npz")]
     motion: Vec<PathBuf>,
     /// Where to [default: RUN/person.html]

@@ -27,7 +27,8 @@ pub fn text(path: &Path) -> &str {
     path.to_str().unwrap()
 }
 
-/// Fails unless the program ended with one line on standard error that names every one of `words`, and without a panic.
+/// Fails unless the program ended with one line on standard error that names every one of `words`,
+/// and without a panic.
 pub fn refusal(output: &Output, what: &str, words: &[&str]) {
     let text = String::from_utf8_lossy(&output.stderr).into_owned();
     assert!(!output.status.success(), "{what} succeeded");

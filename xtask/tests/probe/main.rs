@@ -1,5 +1,5 @@
-//! `probe` as somebody with numpy arrays meets it: results against values worked out here, and one clear line for
-//! whatever is wrong.
+//! `probe` as somebody with numpy arrays meets it: results against values worked out here, and one
+//! clear line for whatever is wrong.
 #![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
 
 #[path = "../common/mod.rs"]
@@ -72,8 +72,8 @@ fn close(found: &[f32], expected: &[f64], tolerance: f64) {
 const CORNERS: [[f32; 3]; 6] =
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]];
 
-/// A body model in SMPL's form: an octahedron whose corner +X hangs on a second joint at (0.5, 0, 0). Beta 0 moves
-/// everything along y.
+/// A body model in SMPL's form: an octahedron whose corner +X hangs on a second joint at (0.5, 0,
+/// 0). Beta 0 moves everything along y.
 fn octahedron(folder: &Path) -> PathBuf {
     let path = folder.join("octahedron.npz");
     let faces = [[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2], [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]];
@@ -201,7 +201,8 @@ fn surface_gives_neighbours_blend_and_exact_distance() {
     let queries = vec![("queries", floats(&[2, 3], &[2.0, 0.0, 0.0, 0.1, 0.1, 0.1]))];
     let mut out = probe(&folder, "surface", &queries, &["--mesh", mesh.to_str().unwrap()]);
     let indices = out.i64("indices", &[Some(2), Some(4), Some(5)]).unwrap().1;
-    // Nearest first, then four as near as each other; the single vertex of the coarser levels is repeated.
+    // Nearest first, then four as near as each other; the single vertex of the coarser levels is
+    // repeated.
     assert_eq!(indices[..10], [0, 1, 2, 4, 5, 0, 0, 0, 0, 0]);
     // Normals are radial: the four others have |cos| = 1/√5 each and cancel but for x = 0.
     let w = 1.0 / 5f64.sqrt();
@@ -262,8 +263,8 @@ fn hash() -> Arrays {
 fn hash_encode_indexes_dense_and_hashed_levels_as_documented() {
     let folder = folder("hash");
     let mut out = probe(&folder, "hash-encode", &hash(), &[]);
-    // Level 0 is dense, 3 × 3: (0.25, 0.5) lies at (0.5, 1), between rows 3 and 4. Level 1 has 9 × 9 corners for 16 rows:
-    // (2, 4) and (8, 8) are corners.
+    // Level 0 is dense, 3 × 3: (0.25, 0.5) lies at (0.5, 1), between rows 3 and 4. Level 1 has 9 ×
+    // 9 corners for 16 rows: (2, 4) and (8, 8) are corners.
     let row = |x: u32, y: u32| f64::from((x ^ y.wrapping_mul(2_654_435_761)) % 16);
     let expected = [3.5, 16.0 + row(2, 4), 8.0, 16.0 + row(8, 8)];
     close(&out.f32("features", &[Some(2), Some(2)]).unwrap().1, &expected, 1e-6);

@@ -15,7 +15,8 @@ const FLOAT: u32 = 5126;
 /// What a buffer view is for.
 const ARRAY_BUFFER: u32 = 34962;
 const ELEMENT_ARRAY_BUFFER: u32 = 34963;
-/// Texture sampler: linear without mipmaps, whose coarse levels would mix the atlas's charts; clamped at the edge.
+/// Texture sampler: linear without mipmaps, whose coarse levels would mix the atlas's charts;
+/// clamped at the edge.
 const LINEAR: u32 = 9729;
 const CLAMP_TO_EDGE: u32 = 33071;
 
@@ -31,10 +32,10 @@ impl Avatar {
 
 /// Encodes an avatar as glTF 2.0 binary (`.glb`).
 ///
-/// One skinned mesh with a primitive a shell (`POSITION`, `NORMAL`, `TEXCOORD_0`, `JOINTS_0`, `WEIGHTS_0` in 16 bits),
-/// `KHR_materials_unlit`, the atlas as PNG, a node a joint with the rest pose as bind pose, and an animation a clip.
-/// The innermost shell is opaque, those around it are blended over it in order. Pose blend shapes and confidence are
-/// left out.
+/// One skinned mesh with a primitive a shell (`POSITION`, `NORMAL`, `TEXCOORD_0`, `JOINTS_0`,
+/// `WEIGHTS_0` in 16 bits), `KHR_materials_unlit`, the atlas as PNG, a node a joint with the rest
+/// pose as bind pose, and an animation a clip. The innermost shell is opaque, those around it are
+/// blended over it in order. Pose blend shapes and confidence are left out.
 ///
 /// # Errors
 /// [`Error::Bake`] with what [`Avatar::validate`] finds, and for more than 4 GiB.
@@ -155,7 +156,8 @@ fn attributes(avatar: &Avatar, file: &mut File) -> Value {
     json!({ "POSITION": position, "NORMAL": normal, "TEXCOORD_0": place, "JOINTS_0": joints, "WEIGHTS_0": weights })
 }
 
-/// A vertex's weights in parts of 65535 that add up exactly, largest first; each joint once, those without weight 0.
+/// A vertex's weights in parts of 65535 that add up exactly, largest first; each joint once, those
+/// without weight 0.
 fn quantised(joints: [u16; 4], weights: [f32; 4]) -> ([u16; 4], [u16; 4]) {
     const WHOLE: f32 = 65535.0;
     let mut merged: Vec<(u16, f32)> = Vec::with_capacity(4);
@@ -192,7 +194,8 @@ fn animation(avatar: &Avatar, Clip { name, motion }: &Clip, file: &mut File) -> 
         let turns: Vec<f32> = (0..frames)
             .flat_map(|frame| {
                 let turn = Quat::from_scaled_axis(motion.poses[frame * j + joint]).normalize();
-                // The nearer of the two quaternions of a rotation, so that players need not look for it.
+                // The nearer of the two quaternions of a rotation, so that players need not look
+                // for it.
                 before = if before.dot(turn) < 0.0 { -turn } else { turn };
                 before.to_array()
             })

@@ -8,12 +8,13 @@ use glam::{Vec2, Vec3};
 use crate::Error;
 use crate::bake::{Atlas, Avatar, write_whole};
 
-/// Writes `path` (`.obj`) and beside it the same name with `.mtl` and `.png`: the avatar's outermost shell with
-/// `vertices` (V) and `normals` (V) in their places, colours at the vertices (`v x y z r g b`, sRGB from 0 to 1) and
-/// texture coordinates.
+/// Writes `path` (`.obj`) and beside it the same name with `.mtl` and `.png`: the avatar's
+/// outermost shell with `vertices` (V) and `normals` (V) in their places, colours at the vertices
+/// (`v x y z r g b`, sRGB from 0 to 1) and texture coordinates.
 ///
 /// # Errors
-/// [`Error::Bake`] for other numbers of vertices or normals and for an avatar without shells; [`Error::Io`].
+/// [`Error::Bake`] for other numbers of vertices or normals and for an avatar without shells;
+/// [`Error::Io`].
 pub fn write_obj(avatar: &Avatar, vertices: &[Vec3], normals: &[Vec3], path: &Path) -> Result<(), Error> {
     let v = avatar.num_vertices();
     if vertices.len() != v || normals.len() != v {
@@ -67,7 +68,8 @@ pub fn write_obj(avatar: &Avatar, vertices: &[Vec3], normals: &[Vec3], path: &Pa
 }
 
 impl Atlas {
-    /// The colour at a place in the atlas, sRGB in [0, 1], interpolated between the four nearest texels' centres.
+    /// The colour at a place in the atlas, sRGB in [0, 1], interpolated between the four nearest
+    /// texels' centres.
     pub(super) fn color(&self, uv: Vec2) -> Vec3 {
         let (width, height) = (self.width as usize, self.height as usize);
         let at = uv * Vec2::new(width as f32, height as f32) - 0.5;

@@ -11,8 +11,8 @@ use crate::bake::{Avatar, upright};
 /// Joint counts of SMPL and its successors, whose first 22 joints are the same.
 const SMPL_FAMILY: [usize; 3] = [24, 52, 55];
 
-/// Writes clip `clip` as an AMASS `.npz`: `poses` (T, 3J) axis-angle, `trans` (T, 3) of the root, `betas`,
-/// `mocap_framerate`, `gender` (`neutral`). As in AMASS z is up; lengths are metres.
+/// Writes clip `clip` as an AMASS `.npz`: `poses` (T, 3J) axis-angle, `trans` (T, 3) of the root,
+/// `betas`, `mocap_framerate`, `gender` (`neutral`). As in AMASS z is up; lengths are metres.
 ///
 /// # Errors
 /// [`Error::Bake`] if there is no such clip; [`Error::Body`] where the file cannot be written.
@@ -45,10 +45,12 @@ fn turned(motion: &MotionClip, turn: Mat3, root: Vec3) -> MotionClip {
     out
 }
 
-/// Fits motion capture to an avatar: y up, and a rotation for each of the avatar's joints (see [`MotionClip::at`]).
+/// Fits motion capture to an avatar: y up, and a rotation for each of the avatar's joints (see
+/// [`MotionClip::at`]).
 ///
 /// # Errors
-/// [`Error::Bake`] for a motion of another skeleton: neither the same number of joints nor both of SMPL's family.
+/// [`Error::Bake`] for a motion of another skeleton: neither the same number of joints nor both of
+/// SMPL's family.
 pub fn adapt_motion(avatar: &Avatar, motion: &MotionClip) -> Result<MotionClip, Error> {
     let root = avatar.skeleton.first().map_or(Vec3::ZERO, |joint| joint.rest);
     fit_motion(motion, avatar.num_joints(), root)

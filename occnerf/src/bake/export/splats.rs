@@ -9,7 +9,8 @@ use crate::bake::{Avatar, write_whole};
 
 /// Zeroth spherical harmonic, that turns a colour into a coefficient.
 const Y00: f32 = 0.282_094_79;
-/// In-plane spread over that of a triangle's own area: neighbours overlap, so that nothing shines through.
+/// In-plane spread over that of a triangle's own area: neighbours overlap, so that nothing shines
+/// through.
 const SPREAD: f32 = 1.6;
 /// Standard deviation across the surface, in metres.
 const THICKNESS: f32 = 1e-3;
@@ -33,11 +34,12 @@ pub struct Splats {
     pub rotations: Vec<Quat>,
 }
 
-/// Covers the avatar's outermost shell, with `vertices` (V) in their places, by a Gaussian a triangle; triangles whose
-/// longest edge is above `patch` metres are halved until it is not.
+/// Covers the avatar's outermost shell, with `vertices` (V) in their places, by a Gaussian a
+/// triangle; triangles whose longest edge is above `patch` metres are halved until it is not.
 ///
 /// # Errors
-/// [`Error::Bake`] for another number of vertices, a patch that is not above 0, and more than 4 million Gaussians.
+/// [`Error::Bake`] for another number of vertices, a patch that is not above 0, and more than 4
+/// million Gaussians.
 pub fn splats(avatar: &Avatar, vertices: &[Vec3], patch: f32) -> Result<Splats, Error> {
     if vertices.len() != avatar.num_vertices() || avatar.shell_ends.is_empty() {
         let (expected, found) = (avatar.num_vertices(), vertices.len());
@@ -91,7 +93,8 @@ impl Splats {
         let first = along * angle.cos() + across * angle.sin();
         let deviation = |variance: f32| (SPREAD * variance.max(0.0).sqrt()).max(LEAST);
         let large = deviation(mean + root);
-        // A sliver is as wide as a quarter of its length, or it would be too thin to cover what is between it and others.
+        // A sliver is as wide as a quarter of its length, or it would be too thin to cover what is
+        // between it and others.
         let small = deviation(mean - root).max(0.25 * large);
         let uv = (corners[0].1 + corners[1].1 + corners[2].1) / 3.0;
         self.centres.push(centre);
@@ -100,8 +103,9 @@ impl Splats {
         self.rotations.push(Quat::from_mat3(&Mat3::from_cols(first, normal.cross(first), normal)).normalize());
     }
 
-    /// Writes a binary PLY with `x y z f_dc_0..2 opacity scale_0..2 rot_0..3`: opacity as logit, scales as natural
-    /// logarithm, quaternion w x y z. As viewers of such files expect, y is down and z forward in it.
+    /// Writes a binary PLY with `x y z f_dc_0..2 opacity scale_0..2 rot_0..3`: opacity as logit,
+    /// scales as natural logarithm, quaternion w x y z. As viewers of such files expect, y is down
+    /// and z forward in it.
     ///
     /// # Errors
     /// [`Error::Io`].

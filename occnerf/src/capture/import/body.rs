@@ -13,8 +13,8 @@ use crate::capture::CaptureError;
 /// Joints of a hand, and numbers of its pose.
 const HAND: usize = 15;
 
-/// Finds and reads the body for a fit by `tool`: `given`, or the first that fits of the `.npz` and `.pkl` files in
-/// folders `body` beside the places named or above them.
+/// Finds and reads the body for a fit by `tool`: `given`, or the first that fits of the `.npz` and
+/// `.pkl` files in folders `body` beside the places named or above them.
 pub(super) fn find(tool: Tool, given: Option<&Path>, near: &[&Path]) -> Result<(PathBuf, BodyModel), CaptureError> {
     if let Some(path) = given {
         let model = BodyModel::load(path)?;
@@ -66,7 +66,8 @@ fn candidates(place: &Path) -> Vec<PathBuf> {
     found
 }
 
-/// The pose of both hands at rest, left first: 15 joints each. From `hands_meanl` and `hands_meanr` of an SMPL-X file.
+/// The pose of both hands at rest, left first: 15 joints each. From `hands_meanl` and `hands_meanr`
+/// of an SMPL-X file.
 pub(super) fn mean_hands(path: &Path) -> Result<Vec<DVec3>, CaptureError> {
     let mut hands = Vec::new();
     let mut npz = Npz::open(path).ok();

@@ -1,6 +1,7 @@
 //! Damaged and hostile files: one clear line each, no panic, no hang, bounded memory.
 //!
-//! `OCCNERF_MUTATIONS` says how many mutations of all formats together are tried (1 200 if it is not set).
+//! `OCCNERF_MUTATIONS` says how many mutations of all formats together are tried (1 200 if it is
+//! not set).
 
 use std::io::{Cursor, Read, Write};
 use std::path::Path;
@@ -20,8 +21,9 @@ use super::*;
 use crate::capture::testing::{Directory, shared};
 use crate::random::Stream;
 
-/// Longest that a mutation may take on a busy machine, and most memory: pickles take 8 times their size and 128 MiB, compressed ones may
-/// grow by 64 MiB and more before that; vectors are there twice while they grow.
+/// Longest that a mutation may take on a busy machine, and most memory: pickles take 8 times their
+/// size and 128 MiB, compressed ones may grow by 64 MiB and more before that; vectors are there
+/// twice while they grow.
 const SECONDS: f64 = 5.0;
 const BYTES: u64 = 600 << 20;
 
@@ -53,7 +55,8 @@ fn structure(bytes: &[u8]) -> Vec<usize> {
     if found.is_empty() { (0..bytes.len()).collect() } else { found }
 }
 
-/// One to three changes: a byte, an opcode of pickles, a field of ones, a piece left out, repeated or moved, the end.
+/// One to three changes: a byte, an opcode of pickles, a field of ones, a piece left out, repeated
+/// or moved, the end.
 fn mutated(whole: &[u8], places: &[usize], stream: &mut Stream) -> Vec<u8> {
     const OPCODES: &[u8] =
         b"(.012FGIJKLMNQRSTUVX]abcdeghjlopqrstu}\x80\x81\x85\x86\x87\x88\x89\x8a\x8c\x8e\x8f\x93\x94\x95";
@@ -87,7 +90,8 @@ fn mutated(whole: &[u8], places: &[usize], stream: &mut Stream) -> Vec<u8> {
     bytes
 }
 
-/// Entries of an archive, and an archive of entries: checksums are right, so that damage within is met.
+/// Entries of an archive, and an archive of entries: checksums are right, so that damage within is
+/// met.
 fn unzipped(bytes: &[u8]) -> Vec<(String, Vec<u8>)> {
     let mut zip = ZipArchive::new(Cursor::new(bytes)).unwrap();
     let mut entries = Vec::new();

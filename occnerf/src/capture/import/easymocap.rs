@@ -1,6 +1,6 @@
-//! EasyMocap's folder: `smpl/000000.json` (also `smpl/CAMERA/…`, or the files themselves), lists of {`id`, `Rh`, `Th`,
-//! `poses`, `shapes`}; beside or above it `intri.yml` and `extri.yml`. A vertex is R(Rh) · lbs(poses, shapes) + Th, about
-//! the origin of a world whose z points up.
+//! EasyMocap's folder: `smpl/000000.json` (also `smpl/CAMERA/…`, or the files themselves), lists of
+//! {`id`, `Rh`, `Th`, `poses`, `shapes`}; beside or above it `intri.yml` and `extri.yml`. A vertex
+//! is R(Rh) · lbs(poses, shapes) + Th, about the origin of a world whose z points up.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -110,7 +110,8 @@ fn frame(path: &Path, index: usize, record: &Record, camera: &Camera) -> Result<
     })
 }
 
-/// The camera of `intri.yml` and `extri.yml` in `folder` or the nearest folder above: its only one, or the first.
+/// The camera of `intri.yml` and `extri.yml` in `folder` or the nearest folder above: its only one,
+/// or the first.
 fn camera(folder: &Path, video: &Video) -> Result<Camera, CaptureError> {
     let whole = folder.canonicalize().map_err(CaptureError::io(folder))?;
     let above = whole.ancestors().take(3).find(|dir| dir.join("intri.yml").is_file());

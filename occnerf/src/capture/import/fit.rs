@@ -1,4 +1,5 @@
-//! What all estimators say: people, and for each of their frames a pose, a shape, a place and a camera.
+//! What all estimators say: people, and for each of their frames a pose, a shape, a place and a
+//! camera.
 
 use glam::{DMat3, DQuat, DVec3};
 
@@ -117,7 +118,8 @@ impl FitFrame {
         }
     }
 
-    /// The same picture by a camera of another focal length: everything is as many times as far away.
+    /// The same picture by a camera of another focal length: everything is as many times as far
+    /// away.
     pub fn refocused(&mut self, focal: f64, joint: DVec3) {
         let before = self.pelvis(joint);
         let ratio = focal / self.focal[0];

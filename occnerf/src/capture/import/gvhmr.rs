@@ -1,5 +1,6 @@
-//! GVHMR's `hmr4d_results.pt`: `smpl_params_incam` {`body_pose` (L,63), `betas` (L,10), `global_orient` (L,3),
-//! `transl` (L,3)} of SMPL-X, and `K_fullimg` (L,3,3). One person in every frame.
+//! GVHMR's `hmr4d_results.pt`: `smpl_params_incam` {`body_pose` (L,63), `betas` (L,10),
+//! `global_orient` (L,3), `transl` (L,3)} of SMPL-X, and `K_fullimg` (L,3,3). One person in every
+//! frame.
 
 use std::io::{Read, Seek};
 use std::path::Path;

@@ -88,7 +88,8 @@ impl<'a> Item<'a> {
         self.value.as_array().ok_or_else(|| self.invalid("an array", self.value.type_name()))
     }
 
-    /// Finite numbers of exactly this shape, `None` standing for any extent; axes of length 1 in front may be left out.
+    /// Finite numbers of exactly this shape, `None` standing for any extent; axes of length 1 in
+    /// front may be left out.
     pub fn numbers(&self, shape: &[Option<usize>]) -> Result<Vec<f64>, CaptureError> {
         let array = self.array()?;
         let mut wanted = shape;

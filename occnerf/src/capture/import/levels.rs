@@ -85,7 +85,8 @@ impl Levels {
     }
 }
 
-/// The values of a PNG with a palette, or of one with at most 8 bits of grey; `None` for every other picture.
+/// The values of a PNG with a palette, or of one with at most 8 bits of grey; `None` for every
+/// other picture.
 fn indexed(path: &Path) -> Result<Option<Levels>, CaptureError> {
     let file = BufReader::new(File::open(path).map_err(CaptureError::io(path))?);
     let limits = Limits { bytes: (MAX_SIDE as usize).pow(2) };

@@ -160,8 +160,8 @@ impl Seen {
         self.files += 1;
     }
 
-    /// Ids of objects where the values are palette indices, or none of them is a middle shade; coverage where they go up
-    /// to 255.
+    /// Ids of objects where the values are palette indices, or none of them is a middle shade;
+    /// coverage where they go up to 255.
     fn meaning(&self, dir: &Path, options: &ImportOptions) -> Result<(Meaning, &'static str), CaptureError> {
         let found: Vec<usize> = (1..256).filter(|&value| self.values[value]).collect();
         let shades = found.iter().any(|&value| value >= 128);
@@ -208,8 +208,8 @@ fn is_mask(path: &Path) -> bool {
     matches!(extension.as_deref(), Some("png" | "jpg" | "jpeg" | "npy"))
 }
 
-/// Mask files by the index of their frame: by name where all have a frame's name, in order where there are as many as
-/// frames, else by their number, counted from 0.
+/// Mask files by the index of their frame: by name where all have a frame's name, in order where
+/// there are as many as frames, else by their number, counted from 0.
 fn matched(dir: &Path, video: &Video) -> Result<BTreeMap<usize, PathBuf>, CaptureError> {
     let mut files = arrays(dir)?;
     if files.is_empty() {

@@ -1,14 +1,16 @@
 //! Captures from what body estimators and segmenters write.
 //!
-//! [`import`] reads the frames of a video, a fit and masks, and writes a capture in HumanNeRF's wild layout for
-//! [`super::load_capture`]. Formats are told by what is in the files:
+//! [`import`] reads the frames of a video, a fit and masks, and writes a capture in HumanNeRF's
+//! wild layout for [`super::load_capture`]. Formats are told by what is in the files:
 //!
 //! - fits: WHAM, 4D-Humans / PHALP, GVHMR, PromptHMR, ROMP, EasyMocap ([`Tool`]);
-//! - masks: ids of objects (SAM 2's palette PNGs by value, its folders an object, Grounded-SAM-2's `.npy`), coverage
-//!   (MatAnyone, plain 0/255 pictures), or the fit's own (4D-Humans / PHALP, PromptHMR).
+//! - masks: ids of objects (SAM 2's palette PNGs by value, its folders an object, Grounded-SAM-2's
+//!   `.npy`), coverage (MatAnyone, plain 0/255 pictures), or the fit's own (4D-Humans / PHALP,
+//!   PromptHMR).
 //!
-//! All estimators place the body in the camera, for a focal length of their own; the camera stands still in a world with
-//! its axes (with EasyMocap, in the calibrated world), and the body's place is in the extrinsics.
+//! All estimators place the body in the camera, for a focal length of their own; the camera stands
+//! still in a world with its axes (with EasyMocap, in the calibrated world), and the body's place
+//! is in the extrinsics.
 
 mod body;
 #[cfg(test)]
@@ -65,7 +67,8 @@ pub struct Imported {
     pub ghosts: usize,
     /// Frames with a fit but without a mask.
     pub unmasked: usize,
-    /// Largest standard deviation of a shape coefficient over the frames; the capture has their robust mean.
+    /// Largest standard deviation of a shape coefficient over the frames; the capture has their
+    /// robust mean.
     pub betas_spread: f64,
     /// Focal length in pixels of the first frame.
     pub focal: f64,
@@ -75,12 +78,14 @@ pub struct Imported {
     pub body: PathBuf,
 }
 
-/// Writes the capture that `options` describe into the folder `out`, which is made if it is not there.
+/// Writes the capture that `options` describe into the folder `out`, which is made if it is not
+/// there.
 ///
 /// # Errors
-/// Files that are missing, malformed or damaged, of formats that are not known, or that do not belong together: frames
-/// beyond the video, pictures or masks of unequal sizes, a body model of other joints than the fit's. The error names
-/// file and key, what was expected and what was found. What has been written by then stays.
+/// Files that are missing, malformed or damaged, of formats that are not known, or that do not
+/// belong together: frames beyond the video, pictures or masks of unequal sizes, a body model of
+/// other joints than the fit's. The error names file and key, what was expected and what was found.
+/// What has been written by then stays.
 pub fn import(options: &ImportOptions, out: &Path) -> Result<Imported, CaptureError> {
     let video = Video::list(&options.frames)?;
     if let Some(focal) = options.focal.filter(|focal| !(*focal >= 1.0 && *focal <= 1e6)) {
@@ -132,7 +137,8 @@ pub fn import(options: &ImportOptions, out: &Path) -> Result<Imported, CaptureEr
     })
 }
 
-/// The person asked for, or who is there in most frames (of equals the first); and ids and frames of the others.
+/// The person asked for, or who is there in most frames (of equals the first); and ids and frames
+/// of the others.
 fn choose(
     path: &Path,
     mut people: Vec<Person>,
@@ -163,8 +169,8 @@ fn gaps(person: &Person, total: usize) -> [usize; 3] {
     [first.index, total - 1 - last.index, between]
 }
 
-/// The mean of each coefficient over the values within five (scaled) median deviations of the median, and the largest
-/// standard deviation of a coefficient over all values.
+/// The mean of each coefficient over the values within five (scaled) median deviations of the
+/// median, and the largest standard deviation of a coefficient over all values.
 fn robust_mean<'a>(frames: impl Iterator<Item = &'a [f64]> + Clone) -> (Vec<f64>, f64) {
     /// Median absolute deviations in a standard deviation of a normal distribution.
     const SCALE: f64 = 1.4826;
@@ -187,8 +193,8 @@ fn robust_mean<'a>(frames: impl Iterator<Item = &'a [f64]> + Clone) -> (Vec<f64>
     ((0..BETAS).map(mean).collect(), spread)
 }
 
-/// Puts a fitted frame into the capture's form: every joint of the body model posed, and the pelvis where the frame's own
-/// shape has it.
+/// Puts a fitted frame into the capture's form: every joint of the body model posed, and the pelvis
+/// where the frame's own shape has it.
 fn placed(mut frame: FitFrame, betas: &[f64], model: &BodyModel, hands: &[DVec3], focal: Option<f64>) -> Placed {
     let pelvis = |betas: &[f64]| {
         let betas: Vec<f32> = betas.iter().take(model.num_betas()).map(|&beta| beta as f32).collect();

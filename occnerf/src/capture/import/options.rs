@@ -17,7 +17,8 @@ pub struct ImportOptions {
     pub object: Option<u8>,
     /// Values of what stands in front of the person.
     pub occluder_objects: Vec<u8>,
-    /// Focal length in pixels in place of the one that the estimator assumed; the body moves so that the picture stays.
+    /// Focal length in pixels in place of the one that the estimator assumed; the body moves so
+    /// that the picture stays.
     pub focal: Option<f64>,
     /// The body model; `None`: one that fits, from a folder `body` near the fit or the frames.
     pub body: Option<PathBuf>,

@@ -1,6 +1,7 @@
-//! PHALP's and 4D-Humans' `demo_NAME.pkl`: by frame, lists with one entry a track: `tid`, `tracked_time`, `smpl` of
-//! rotation matrices, `camera` (a translation), `size`, `mask`. The focal length is 5000/256 · max(W, H), the principal
-//! point that of the square that the picture is padded to, its own centre.
+//! PHALP's and 4D-Humans' `demo_NAME.pkl`: by frame, lists with one entry a track: `tid`,
+//! `tracked_time`, `smpl` of rotation matrices, `camera` (a translation), `size`, `mask`. The focal
+//! length is 5000/256 · max(W, H), the principal point that of the square that the picture is
+//! padded to, its own centre.
 
 use std::collections::BTreeMap;
 
@@ -30,7 +31,8 @@ pub(super) fn read(frames: &[(String, Item<'_>)], video: &Video) -> Result<Fit, 
             let id = id.whole()?;
             let new = || Person { id: id.to_string(), frames: Vec::new(), ghosts: 0 };
             let person = people.entry(id).or_insert_with(new);
-            // What is left of a track in frames where nothing was found is of an earlier frame, its mask too.
+            // What is left of a track in frames where nothing was found is of an earlier frame, its
+            // mask too.
             if item.entry("tracked_time", track)?.whole()? > 0 {
                 person.ghosts += 1;
             } else {

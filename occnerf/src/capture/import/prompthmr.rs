@@ -1,6 +1,7 @@
-//! PromptHMR's `results.pkl`: `people` {id: `frames` (N), `masks` (N,H,W), `smplx_cam` {`pose` (N,75): root, 21 joints of
-//! the body, jaw, eyes; `shape` (N,10), `trans` (N,3)}}, `camera` {`img_focal`, `img_center`}. SMPL-X with flat hands.
-//! Frames higher than 896 are worked on at a smaller size, twice `img_center`.
+//! PromptHMR's `results.pkl`: `people` {id: `frames` (N), `masks` (N,H,W), `smplx_cam` {`pose`
+//! (N,75): root, 21 joints of the body, jaw, eyes; `shape` (N,10), `trans` (N,3)}}, `camera`
+//! {`img_focal`, `img_center`}. SMPL-X with flat hands. Frames higher than 896 are worked on at a
+//! smaller size, twice `img_center`.
 
 use glam::{DMat3, DVec3};
 use smpl::{Data, NdArray};

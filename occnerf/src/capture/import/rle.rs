@@ -15,7 +15,8 @@ pub(super) struct Rle {
 }
 
 impl Rle {
-    /// Reads `{size: [H, W], counts}`, counts being compressed (`bytes` or `str`) or a list of numbers.
+    /// Reads `{size: [H, W], counts}`, counts being compressed (`bytes` or `str`) or a list of
+    /// numbers.
     pub fn read(item: &Item<'_>) -> Result<Self, CaptureError> {
         let size = item.get("size")?;
         let sides = size.few(2)?;
@@ -63,8 +64,9 @@ impl Rle {
     }
 }
 
-/// Undoes COCO's compression: six bits a character from `0` on, five of them the number's, the lowest first; the sixth
-/// says that more follow. From the third on, a number is the difference to the one two before it.
+/// Undoes COCO's compression: six bits a character from `0` on, five of them the number's, the
+/// lowest first; the sixth says that more follow. From the third on, a number is the difference to
+/// the one two before it.
 fn decompressed(bytes: &[u8], most: usize) -> Result<Vec<u32>, String> {
     let mut runs: Vec<u32> = Vec::new();
     let mut rest = bytes.iter();

@@ -1,6 +1,7 @@
-//! ROMP's `video_results.npz`: `results` {picture's name: {`smpl_thetas` (N,72), `smpl_betas` (N,10), `cam_trans` (N,3),
-//! `track_ids` (N)}}, people in any order. The focal length is 443.4/512 · max(W, H) (60 degrees), the principal point
-//! that of the square that the picture is padded to, its own centre.
+//! ROMP's `video_results.npz`: `results` {picture's name: {`smpl_thetas` (N,72), `smpl_betas`
+//! (N,10), `cam_trans` (N,3), `track_ids` (N)}}, people in any order. The focal length is 443.4/512
+//! · max(W, H) (60 degrees), the principal point that of the square that the picture is padded to,
+//! its own centre.
 
 use std::collections::BTreeMap;
 use std::path::Path;

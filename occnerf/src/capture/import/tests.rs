@@ -61,7 +61,8 @@ fn fit_of(dir: &Path, file: &str, person: Option<&str>) -> (Tool, Person, Vec<(S
     (fit.tool, person, others)
 }
 
-/// What is expected of E, poses and vertices is in the camera, so that it does not matter how they share the motion.
+/// What is expected of E, poses and vertices is in the camera, so that it does not matter how they
+/// share the motion.
 fn vertices(frame: &FitFrame, pose: &[DVec3], model: &BodyModel) -> Vec<f64> {
     let betas: Vec<f32> = frame.betas.iter().map(|&b| b as f32).collect();
     let mut pose: Vec<glam::Vec3> = pose.iter().map(|v| v.as_vec3()).collect();

@@ -1,5 +1,6 @@
-//! WHAM's `wham_output.pkl`: by person id `pose` (T,72) axis-angle in the camera, `trans` (T,3), `betas` (T,10),
-//! `frame_ids` (T). The focal length is not in it: √(W² + H²), the principal point the image's centre.
+//! WHAM's `wham_output.pkl`: by person id `pose` (T,72) axis-angle in the camera, `trans` (T,3),
+//! `betas` (T,10), `frame_ids` (T). The focal length is not in it: √(W² + H²), the principal point
+//! the image's centre.
 
 use glam::{DMat3, DVec3};
 

@@ -45,7 +45,8 @@ pub(super) fn capture(parts: &Parts<'_>, out: &Path) -> Result<(), CaptureError>
         true => None,
         false => Some(folder("occluders")?),
     };
-    // Collected as results first, so that the error reported is the first in order whatever finishes first.
+    // Collected as results first, so that the error reported is the first in order whatever
+    // finishes first.
     let frames: Vec<Result<(), CaptureError>> =
         parts.placed.par_iter().map(|placed| frame(parts, placed, &images, &masks, occluders.as_deref())).collect();
     frames.into_iter().collect::<Result<(), CaptureError>>()?;

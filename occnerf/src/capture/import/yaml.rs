@@ -1,9 +1,10 @@
-//! The part of OpenCV's YAML that calibration files need: numbers, and `!!opencv-matrix` with its `data`.
+//! The part of OpenCV's YAML that calibration files need: numbers, and `!!opencv-matrix` with its
+//! `data`.
 
 use std::collections::BTreeMap;
 
-/// Numbers by name: a matrix row by row, a number as one. Everything else is passed over; numbers that cannot be read
-/// are NaN.
+/// Numbers by name: a matrix row by row, a number as one. Everything else is passed over; numbers
+/// that cannot be read are NaN.
 pub(super) fn parse(text: &str) -> BTreeMap<String, Vec<f64>> {
     let number = |text: &str| text.trim().parse().unwrap_or(f64::NAN);
     let mut found = BTreeMap::new();

@@ -53,8 +53,8 @@ pub struct Synthetic {
 ///
 /// # Errors
 /// [`CaptureError::Setting`] for values outside their ranges, for more pixels than
-/// [`LoadOptions::max_bytes`](crate::capture::LoadOptions::max_bytes) admits by default, and for characters that no body can be made of, or
-/// that `motion` cannot drive.
+/// [`LoadOptions::max_bytes`](crate::capture::LoadOptions::max_bytes) admits by default, and for
+/// characters that no body can be made of, or that `motion` cannot drive.
 pub fn synthesise(
     character: Option<&Character>,
     motion: Option<&MotionClip>,

@@ -1,4 +1,5 @@
-//! What is measured: each kernel in its variants, against its exact form or a truth that was made first.
+//! What is measured: each kernel in its variants, against its exact form or a truth that was made
+//! first.
 
 use std::hint::black_box;
 
@@ -83,7 +84,8 @@ pub fn neighbours(figure: &Figure) -> Result<Kernel> {
     Ok(kernel)
 }
 
-/// The way back to the rest pose, of points that were carried along with their own place on the skin.
+/// The way back to the rest pose, of points that were carried along with their own place on the
+/// skin.
 pub fn motion(figure: &Figure) -> Result<Kernel> {
     let mut kernel = Kernel {
         name: "motion",
@@ -192,8 +194,8 @@ pub fn samples(figure: &Figure, rays: usize) -> Result<Kernel> {
     Ok(kernel)
 }
 
-/// What is wrong with a fine pattern on the skin that was fitted at every other point, at the points between, by the
-/// size of the table.
+/// What is wrong with a fine pattern on the skin that was fitted at every other point, at the
+/// points between, by the size of the table.
 pub fn table(figure: &Figure, steps: usize) -> Result<Kernel> {
     let mut kernel = Kernel {
         name: "hash table",
