@@ -19,7 +19,7 @@ static BODY: LazyLock<BodyModel> = LazyLock::new(|| {
     let body =
         BodyModel {
             v_template: pick(&full.v_template),
-            faces: Vec::new(),
+            faces: vec![[0, 1, 2]],
             shapedirs: full.shapedirs.chunks_exact(full.num_vertices()).flat_map(pick).collect(),
             posedirs: SparseRows::from_rows((0..kept.len()).map(|v| {
                 (0..207).map(move |t| (t as u32, 0.02 * Vec3::new(wave(v, t), wave(v + 1, t), wave(v, t + 1))))
