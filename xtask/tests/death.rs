@@ -199,7 +199,7 @@ fn scoring_and_tables_killed_at_any_moment_are_whole_or_absent() {
     let folder = folder("killed-tables");
     let capture = capture(&folder);
     let without = "humannerf-bg,humannerf-bg-4x,humannerf-bg-time,humannerf,humannerf-4x,humannerf-time,hash-point-bg,\
-                   occnerf-bg,occnerf-published,occnerf,no-surface,no-attention,no-completeness,no-perceptual";
+                   occnerf-bg,occnerf,no-surface,no-attention,no-completeness,no-perceptual";
     let run = folder.join("run");
     done(&[&["train", text(&capture), "--out", text(&run), "--steps", "10"][..], &QUICK].concat());
     let eval = |run: &Path| words(&["eval", text(run)]);

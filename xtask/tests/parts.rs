@@ -23,7 +23,7 @@ fn parts_of_a_reproduction_make_the_table_that_one_job_makes() {
     let capture = folder.join("capture");
     done(&["synth", "--out", text(&capture), "--size", "32", "--frames", "4", "--eval-cameras", "1"]);
     let without = "humannerf-bg,humannerf-bg-4x,humannerf-bg-time,humannerf,humannerf-4x,humannerf-time,hash-point-bg,\
-                   occnerf-bg,occnerf-published,no-surface,no-attention,no-completeness,no-perceptual";
+                   occnerf-bg,no-surface,no-attention,no-completeness,no-perceptual";
     let command = |out: &Path, more: &[&str]| -> Vec<String> {
         let all =
             ["reproduce", text(&capture), "--out", text(out), "--steps", "2", "--seeds", "2", "--without", without];

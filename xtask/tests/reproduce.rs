@@ -18,7 +18,7 @@ fn tables_have_every_row_once_and_a_second_call_trains_nothing() {
     let first = done(&arguments);
     assert_eq!(first.matches(": training\n").count(), 1 + 2 * 5, "{first}");
     let table = std::fs::read_to_string(out.join("capture/reproduce.md")).unwrap();
-    for row in ["prior", "humannerf-bg", "humannerf", "hash-point", "occnerf-published", "occnerf"] {
+    for row in ["prior", "humannerf-bg", "humannerf", "hash-point", "occnerf"] {
         assert_eq!(table.matches(&format!("| {row} ")).count(), 2, "{row}, novel and training views: {table}");
     }
     assert!(table.contains(" ± "), "{table}");
@@ -42,7 +42,7 @@ fn rows_of_any_length_without_views_kept_back_fit_a_budget_and_another_capture_o
     }
     let out = folder.join("out");
     let rest = ["--out", text(&out), "--seeds", "1", "--budget", "0.01", "--without"];
-    let without = "humannerf-bg,humannerf-bg-4x,humannerf-bg-time,hash-point-bg,hash-point,occnerf-bg,occnerf-published,no-surface,\
+    let without = "humannerf-bg,humannerf-bg-4x,humannerf-bg-time,hash-point-bg,hash-point,occnerf-bg,no-surface,\
                    no-attention,no-completeness,no-perceptual";
     let arguments = |capture| [&["reproduce", capture], &rest[..], &[without]].concat();
     done(&arguments(text(&capture)));
