@@ -40,10 +40,8 @@ fn trained() -> &'static Trained {
 }
 
 fn avatar(shells: usize) -> &'static Avatar {
-    static ONE: OnceLock<Avatar> = OnceLock::new();
-    static THREE: OnceLock<Avatar> = OnceLock::new();
-    let of = if shells == 1 { &ONE } else { &THREE };
-    of.get_or_init(|| {
+    static OF: [OnceLock<Avatar>; 6] = [const { OnceLock::new() }; 6];
+    OF[shells].get_or_init(|| {
         let options = BakeOptions { shells, ..BakeOptions::default() };
         bake(&trained().model, Some(&trained().scene), &options).unwrap().0
     })
@@ -83,16 +81,34 @@ fn one_surface_four_samples(bencher: Bencher<'_, '_>, size: (u32, u32)) {
     draw(bencher, 1, Samples::Four, size, 2);
 }
 
+/// One surface, four samples a pixel, one thread.
+#[divan::bench(args = SIZES)]
+fn one_surface_four_samples_one_thread(bencher: Bencher<'_, '_>, size: (u32, u32)) {
+    draw(bencher, 1, Samples::Four, size, 1);
+}
+
 /// Three shells, two threads.
 #[divan::bench(args = SIZES)]
 fn three_shells(bencher: Bencher<'_, '_>, size: (u32, u32)) {
     draw(bencher, 3, Samples::One, size, 2);
 }
 
+/// Three shells, four samples a pixel, two threads.
+#[divan::bench(args = SIZES)]
+fn three_shells_four_samples(bencher: Bencher<'_, '_>, size: (u32, u32)) {
+    draw(bencher, 3, Samples::Four, size, 2);
+}
+
 /// Three shells, one thread.
 #[divan::bench(args = SIZES)]
 fn three_shells_one_thread(bencher: Bencher<'_, '_>, size: (u32, u32)) {
     draw(bencher, 3, Samples::One, size, 1);
+}
+
+/// Five shells, two threads.
+#[divan::bench(args = SIZES)]
+fn five_shells(bencher: Bencher<'_, '_>, size: (u32, u32)) {
+    draw(bencher, 5, Samples::One, size, 2);
 }
 
 /// Skinning alone, one thread.

@@ -47,7 +47,7 @@ pub use capacity::{Capacity, Choice, Measured, Pruned};
 pub use check::{Check, Fault, FrameCheck, Mistake, body_silhouette, check, photograph, unknown_pixels};
 pub use config::{
     Component, Config, ConfigError, DistanceKind, EncodingConfig, FieldConfig, LossConfig, Method, MotionConfig,
-    MotionKind, OccludedRule, Preset, RateConfig, SurfaceConfig, VisibilityKind,
+    MotionKind, OccludedRule, Preset, RateConfig, RegistrationConfig, SurfaceConfig, VisibilityKind,
 };
 pub use error::Error;
 pub use evaluate::{FrameMetrics, SplitMetrics, evaluate, evaluate_with, least_seen_quartile};
@@ -64,5 +64,6 @@ pub use render::picture::{Renderer, Rendering};
 pub use render::prior::PriorRenderer;
 pub use scene::labels::{Label, Labels, label_pixels};
 pub use scene::prepared::{PreparedFrame, Scene};
+pub use scene::registration::register;
 pub use train::report::StepReport;
 pub use train::trainer::Trainer;

@@ -8,7 +8,7 @@ use std::path::Path;
 use common::{TempDir, body, capture, config, scene};
 use glam::Vec3;
 use occnerf::{
-    Error, FieldRenderer, Method, Model, MotionKind, Person, PriorRenderer, Renderer, Trainer, VertexColors,
+    Error, FieldRenderer, Method, Model, MotionKind, Person, PriorRenderer, Renderer, Scene, Trainer, VertexColors,
 };
 
 const CHECKPOINT: &str = "checkpoint.safetensors";
@@ -22,7 +22,7 @@ fn trained(run: &Path, change: impl Fn(&mut occnerf::Config)) -> Model {
     for _ in 0..6 {
         trainer.step().unwrap();
     }
-    Person::save(run, &capture(), body(), &VertexColors::measure(scene()).unwrap()).unwrap();
+    Person::save(run, &scene().capture, body(), &VertexColors::measure(scene()).unwrap()).unwrap();
     trainer.save(&run.join(CHECKPOINT)).unwrap();
     trainer.into_model()
 }
@@ -56,11 +56,32 @@ fn a_model_read_from_its_run_draws_the_same_bits_as_the_trained_one() {
 }
 
 #[test]
+fn a_capture_gets_the_bodies_that_a_run_was_trained_with() {
+    let dir = TempDir::new("person-registered");
+    let mut config = config(Method::Occnerf);
+    config.registration.rounds = 3;
+    let given = capture();
+    let scene = Scene::new(&given, body(), &config).unwrap();
+    assert!(scene.capture.registered && scene.capture.train[0].placement != given.train[0].placement);
+    Person::save(&dir.path(""), &scene.capture, body(), &VertexColors::measure(&scene).unwrap()).unwrap();
+    let mut restored = given.clone();
+    assert!(Person::restore(&dir.path(""), &mut restored, body()).unwrap());
+    let again = Scene::new(&restored, body(), &config).unwrap();
+    for (a, b) in scene.train.iter().chain(&scene.eval).zip(again.train.iter().chain(&again.eval)) {
+        assert_eq!((&a.view.posed, &a.labels), (&b.view.posed, &b.labels));
+    }
+    // A capture of other frames keeps its own.
+    let mut other = given.clone();
+    other.train.pop();
+    assert!(!Person::restore(&dir.path(""), &mut other, body()).unwrap() && !other.registered);
+}
+
+#[test]
 fn the_prior_of_a_run_draws_the_same_bits_too() {
     let dir = TempDir::new("person-prior");
     let colors = VertexColors::measure(scene()).unwrap();
     let run = dir.path("");
-    Person::save(&run, &capture(), body(), &colors).unwrap();
+    Person::save(&run, &scene().capture, body(), &colors).unwrap();
     let person = Person::load(&run, &config(Method::Prior)).unwrap();
     assert_eq!((person.scene.as_str(), &person.colors), (scene().name.as_str(), &colors));
     let view = &scene().train[1].view;
@@ -91,7 +112,8 @@ fn what_is_missing_or_damaged_is_named() {
         std::fs::write(run.join(PERSON), damaged).unwrap();
         assert!(said().contains(PERSON), "{}", said());
     }
-    let claimed = String::from_utf8_lossy(&whole).find("\"frames\":\"2\"").unwrap();
+    let claim = b"\"frames\":\"2\"";
+    let claimed = whole.windows(claim.len()).position(|w| w == claim).unwrap();
     let mut damaged = whole.clone();
     damaged[claimed + 10] = b'9';
     std::fs::write(run.join(PERSON), damaged).unwrap();

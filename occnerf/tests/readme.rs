@@ -58,6 +58,7 @@ fn table() -> String {
         row("λ of squared error, perceptual, completeness", |c| {
             format!("{}, {}, {}", c.loss.mse, c.loss.perceptual, c.loss.completeness)
         }),
+        row("rounds of registration, light", |c| format!("{}, {}", c.registration.rounds, c.field.prior_light)),
         row("frames between knots of the pose corrections", |c| match c.motion.correction_spacing {
             0 => "none".to_owned(),
             frames => frames.to_string(),

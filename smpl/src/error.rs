@@ -5,7 +5,7 @@ use std::path::PathBuf;
 /// A file that cannot be read or does not hold what it should.
 ///
 /// `file` is the path as given, or the name passed with bytes already in memory; `key` is the
-/// array's name.
+/// array's name, which is shown with its control characters escaped: one line whatever it holds.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
@@ -26,7 +26,7 @@ pub enum Error {
         expected: &'static str,
     },
     /// An array that must be there is not.
-    #[error("{file}: no `{key}` (it holds {})", available.join(", "))]
+    #[error("{file}: no `{key}` (it holds {})", available.join(", ").escape_debug())]
     MissingKey {
         /// The file.
         file: String,
@@ -36,7 +36,7 @@ pub enum Error {
         available: Vec<String>,
     },
     /// An array of another shape than its use demands.
-    #[error("{file}: `{key}` has shape {actual:?}, expected {expected}")]
+    #[error("{file}: `{}` has shape {actual:?}, expected {expected}", key.escape_debug())]
     Shape {
         /// The file.
         file: String,
@@ -48,7 +48,7 @@ pub enum Error {
         actual: Vec<usize>,
     },
     /// An array or object of another type than its use demands.
-    #[error("{file}: `{key}` is {actual}, expected {expected}")]
+    #[error("{file}: `{}` is {actual}, expected {expected}", key.escape_debug())]
     Type {
         /// The file.
         file: String,
@@ -60,7 +60,7 @@ pub enum Error {
         actual: String,
     },
     /// NaN, an infinity, or a value too large for `f32`.
-    #[error("{file}: `{key}` is not finite at flat index {index}")]
+    #[error("{file}: `{}` is not finite at flat index {index}", key.escape_debug())]
     NotFinite {
         /// The file.
         file: String,
@@ -72,7 +72,7 @@ pub enum Error {
     /// Readable, but impossible: an index out of range, weights that do not sum to one, a tree with
     /// a cycle. Also what cannot be read of a glTF, OBJ or safetensors file; `key` is then the part
     /// or the line.
-    #[error("{file}: `{key}`: {message}")]
+    #[error("{file}: `{}`: {message}", key.escape_debug())]
     Invalid {
         /// The file.
         file: String,
@@ -83,7 +83,7 @@ pub enum Error {
     },
     /// The file asks for more memory than the reader's limit. Raised before the memory is
     /// allocated.
-    #[error("{file}: `{key}` claims {claimed} bytes, more than the limit of {limit}")]
+    #[error("{file}: `{}` claims {claimed} bytes, more than the limit of {limit}", key.escape_debug())]
     TooLarge {
         /// The file.
         file: String,
@@ -95,7 +95,7 @@ pub enum Error {
         limit: u64,
     },
     /// Malformed or truncated `.npy` or `.npz` structure.
-    #[error("{file}: `{key}`: malformed array file: {message}")]
+    #[error("{file}: `{}`: malformed array file: {message}", key.escape_debug())]
     Npy {
         /// The file.
         file: String,

@@ -145,9 +145,11 @@ fn only_allowed_globals_are_understood() {
         b"c__builtin__\neval\n(S'1'\ntR.",
         b"\x80\x04\x8c\x05posix\x8c\x06system\x93.",
         b"cnumpy\nload\n.",
+        b"\x80\x04\x8c\x04a\n\x1b[\x8c\x01\r\x93.",
     ] {
         let message = pickle::parse("evil", program).unwrap_err().to_string();
         assert!(message.contains("not allowed"), "{message}");
+        assert!(!message.contains(char::is_control), "{message:?}");
     }
 }
 

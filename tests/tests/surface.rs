@@ -9,6 +9,7 @@ use std::collections::BTreeSet;
 
 use common::{body, placement, scene, silhouette, walking};
 use glam::Vec3;
+use occnerf::capture::Light;
 use occnerf::{PriorRenderer, Renderer, VertexColors};
 use proptest::prelude::*;
 use surface_query::{MeshDistance, SurfaceQuery, SurfaceQueryConfig};
@@ -125,7 +126,8 @@ fn distance_structure_and_ray_structure_agree_on_a_walking_body_after_a_refit() 
 fn the_prior_renderers_silhouette_is_that_of_the_ray_casts() {
     let scene = scene();
     let vertices = scene.body.canonical.vertices.len();
-    let colors = VertexColors { colors: vec![Vec3::ONE; vertices], seen: vec![true; vertices] };
+    let colors =
+        VertexColors { colors: vec![Vec3::ONE; vertices], seen: vec![true; vertices], light: Light::default() };
     for frame in [&scene.eval[0], &scene.train[5]] {
         let (vertices, faces) = (&frame.view.posed.vertices, &scene.body.model.faces);
         let rendering = PriorRenderer::new(&scene.body, &colors).render(&frame.view, Vec3::ZERO).unwrap();

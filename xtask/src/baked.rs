@@ -43,6 +43,6 @@ pub fn avatar(run: &Path, model: &Model) -> Result<Avatar> {
 
 fn scene(run: &Path) -> Result<Scene> {
     let config = RunConfig::read(run)?;
-    let source = config.source()?;
+    let source = config.source(run)?;
     Ok(Scene::new(&source.capture, &source.model, &config.train)?)
 }

@@ -108,8 +108,14 @@ fn picture(source: &Source, found: &Check) -> Result<RgbImage> {
         let mut names: Vec<String> = row
             .iter()
             .map(|&i| {
-                let iou = found.frames[i].iou.map_or("-".to_owned(), |iou| format!("{iou:.2}"));
-                format!("{}  {iou}", found.frames[i].name)
+                let frame = &found.frames[i];
+                match frame.iou {
+                    _ if !body_silhouette(&frames[i], &source.model).contains(&true) => {
+                        format!("{}  body not in view", frame.name)
+                    }
+                    Some(iou) => format!("{}  {iou:.2}", frame.name),
+                    None => format!("{}  -", frame.name),
+                }
             })
             .collect();
         // Rows are equally wide.

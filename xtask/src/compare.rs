@@ -3,7 +3,7 @@
 use anyhow::Result;
 use occnerf::{Config, Method, OccludedRule};
 
-use crate::eval::load_lpips;
+use crate::network::load_lpips;
 use crate::process::say;
 use crate::run::{Metrics, RunConfig, use_threads};
 use crate::train::{TrainArguments, run_unless_finished, scene_name};

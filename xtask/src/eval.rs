@@ -13,6 +13,7 @@ use occnerf::{
 };
 use rayon::prelude::*;
 
+use crate::network::{load_lpips, network_name};
 use crate::optimise::logged_seconds;
 use crate::process::{Ending, Lock, note, one_line, say};
 use crate::run::{
@@ -90,7 +91,7 @@ pub fn eval(arguments: &EvalArguments) -> Result<()> {
     let directory = &arguments.run;
     let run = RunConfig::read(directory)?;
     let _lock = Lock::take(directory)?;
-    let source = run.source()?;
+    let source = run.source(directory)?;
     let scene = Scene::new(&source.capture, &source.model, &run.train)?;
     let loaded;
     let drawn = if run.train.method == Method::Prior {
@@ -158,15 +159,6 @@ pub fn check_pictures(scene: &Scene) -> Result<()> {
     // finishes first.
     let read: Vec<Result<(), occnerf::Error>> = frames.par_iter().map(|frame| frame.pixels().map(drop)).collect();
     Ok(read.into_iter().collect::<Result<(), _>>()?)
-}
-
-/// The network that `--lpips` names.
-pub fn load_lpips(path: Option<&Path>) -> Result<Option<Lpips>> {
-    Ok(path.map(Lpips::load).transpose()?)
-}
-
-pub fn network_name(lpips: Option<&Lpips>) -> Option<String> {
-    lpips.map(|lpips| lpips.trunk().name().to_owned())
 }
 
 /// What can be scored and drawn.

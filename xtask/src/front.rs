@@ -33,7 +33,7 @@ pub struct FrontArguments {
 pub fn front(arguments: &FrontArguments) -> Result<()> {
     use_threads(arguments.threads)?;
     let run = RunConfig::read(&arguments.run)?;
-    let source = run.source()?;
+    let source = run.source(&arguments.run)?;
     let scene = Scene::new(&source.capture, &source.model, &run.train)?;
     ensure!(!scene.eval.is_empty(), "{}: the capture keeps no views back", run.scene);
     let model = Model::load(&arguments.run)?;

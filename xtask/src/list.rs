@@ -4,7 +4,7 @@ use std::path::Path;
 
 use anyhow::{Context, Result, bail, ensure};
 
-use crate::eval::load_lpips;
+use crate::network::load_lpips;
 use crate::process::{Ending, one_line, say};
 use crate::run::{self, Metrics, RunConfig, use_threads};
 use crate::train::{TrainArguments, finished, run_unless_finished, scene_name};

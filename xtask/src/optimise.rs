@@ -10,6 +10,7 @@ use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
 use occnerf::{StepReport, Trainer};
 
+use crate::preview::Preview;
 use crate::process::{Ending, Guard, note, one_line, unwritten};
 use crate::run::{self, CHECKPOINT, LOG};
 
@@ -43,6 +44,8 @@ pub struct Sitting {
     pub stop_after: Option<u64>,
     /// Time between two checkpoints.
     pub interval: Duration,
+    /// Whether a picture shows how far the person is.
+    pub preview: bool,
 }
 
 /// Takes steps until the end or `stop_after`, with a log, a bar and checkpoints; returns seconds of
@@ -66,6 +69,7 @@ pub fn optimise(directory: &Path, trainer: &mut Trainer<'_>, sitting: &Sitting) 
     bar.reset_eta();
     let checkpoint = directory.join(CHECKPOINT);
     let (start, mut saved, mut lined) = (Instant::now(), Instant::now(), Instant::now());
+    let mut preview = sitting.preview.then(|| Preview::new(directory));
     let (mut smooth, mut bad, mut restarts) = (None::<StepReport>, 0, None);
     while trainer.steps_done() < end && guard.signal().is_none() {
         let report = match trainer.step() {
@@ -107,6 +111,10 @@ pub fn optimise(directory: &Path, trainer: &mut Trainer<'_>, sitting: &Sitting) 
                 note!("step {}/{total}  {message}  {seconds:.0} s, {left:.0} s left", report.step);
             }
             bar.set_message(message);
+        }
+        if let Some(Err(error)) = preview.as_mut().map(|preview| preview.draw(trainer.model())) {
+            bar.suspend(|| note!("warning: {}; training goes on without a preview", one_line(&error)));
+            preview = None;
         }
         if saved.elapsed() >= sitting.interval && report.step < end {
             if let Err(error) = save(trainer, &checkpoint) {

@@ -8,6 +8,11 @@ use anyhow::{Context, Result};
 use crate::process::say;
 use crate::run;
 
+/// Points of a bench, one JSON line each.
+pub const BENCH_LOG: &str = "bench.jsonl";
+/// What `bench kernels` found.
+pub const KERNELS: &str = "kernels.json";
+
 /// A section of a document.
 pub struct Section<'a> {
     /// Tells it from the others, in lower case.

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, anyhow, bail, ensure};
 use occnerf::capture::LoadOptions;
-use occnerf::{Config, SplitMetrics, replace_file};
+use occnerf::{Config, Person, SplitMetrics, replace_file};
 use serde::{Deserialize, Serialize};
 
 use crate::process::{Lock, unwritten};
@@ -15,6 +15,8 @@ pub const CHECKPOINT: &str = "checkpoint.safetensors";
 const CONFIG: &str = "config.toml";
 pub const METRICS: &str = "metrics.json";
 pub const LOG: &str = "train.jsonl";
+/// The page to turn the person around on.
+pub const PERSON: &str = "person.html";
 
 /// What config.toml holds.
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -54,9 +56,11 @@ impl RunConfig {
             && self.body.as_deref().map(place) == other.body.as_deref().map(place)
     }
 
-    /// The capture it was trained on.
-    pub fn source(&self) -> Result<Source> {
-        source::load(Some(&self.scene), self.body.as_deref(), &self.load)
+    /// The capture that the run in `directory` was trained on, with the bodies that it trained with.
+    pub fn source(&self, directory: &Path) -> Result<Source> {
+        let mut source = source::load(Some(&self.scene), self.body.as_deref(), &self.load)?;
+        Person::restore(directory, &mut source.capture, &source.model)?;
+        Ok(source)
     }
 }
 

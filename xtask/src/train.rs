@@ -8,11 +8,13 @@ use clap::Args;
 use occnerf::{Config, Lpips, Method, Person, Scene, Trainer, VertexColors, checkpoint_config};
 
 use crate::capacity::{self, CapacityName};
-use crate::eval::{Drawn, Split, check_pictures, load_lpips, network_name, score_run, scored_frames, unscored};
+use crate::eval::{Drawn, Split, check_pictures, score_run, scored_frames, unscored};
+use crate::network::{load_lpips, network_name};
 use crate::optimise::{SavingArguments, Sitting, optimise};
 use crate::process::{Lock, say};
 use crate::run::{
-    CHECKPOINT, METRICS, Metrics, RunConfig, existing_directory, make_directory, new_directory, use_threads,
+    CHECKPOINT, METRICS, Metrics, RunConfig, existing_directory, make_directory, new_directory, peak_rss_bytes,
+    use_threads,
 };
 use crate::settings::SettingArguments;
 use crate::shard::ShardArguments;
@@ -50,6 +52,10 @@ pub struct TrainArguments {
     pub resume: bool,
     #[command(flatten)]
     pub saving: SavingArguments,
+    /// Rewrite preview.png in the run directory every few seconds: the first training view as the
+    /// model of that moment has it
+    #[arg(long, conflicts_with_all = ["list", "compare"])]
+    pub preview: bool,
     /// Stop after this many steps in all, leaving a checkpoint to resume from
     #[arg(long)]
     pub stop_after: Option<u64>,
@@ -73,8 +79,9 @@ pub fn train(arguments: &TrainArguments) -> Result<()> {
     let method = arguments.settings.config()?.method;
     let name = format!("{}-{}", scene_name(arguments.scene.as_deref()), method.name());
     let out = arguments.out.as_deref();
-    let sitting =
-        Sitting { resume: arguments.resume, stop_after: arguments.stop_after, interval: arguments.saving.interval()? };
+    let interval = arguments.saving.interval()?;
+    let TrainArguments { resume, stop_after, preview, .. } = *arguments;
+    let sitting = Sitting { resume, stop_after, interval, preview };
     // The lock is held to the end.
     let Begun { directory, source, config, _lock } =
         if arguments.resume { resumed(arguments, &existing_directory(out, &name)?)? } else { begun(arguments, &name)? };
@@ -94,6 +101,9 @@ pub fn train(arguments: &TrainArguments) -> Result<()> {
     }
     say!("\n{}:\n{}", metrics.splits.title(), table::markdown(&rows));
     say!("pictures: {}", directory.join("renders").display());
+    if run.train.method != Method::Prior {
+        say!("a page to turn the person around: cargo xtask view {}", directory.display());
+    }
     Ok(())
 }
 
@@ -136,7 +146,9 @@ fn resumed(arguments: &TrainArguments, directory: &Path) -> Result<Begun> {
     let config = arguments.settings.resumed(begun.unwrap_or(saved.train), capacity.as_ref())?;
     let load = arguments.load.resumed(&saved.load)?;
     let scene = arguments.scene.as_deref().unwrap_or(&saved.scene);
-    let source = source::load(Some(scene), arguments.body.as_deref().or(saved.body.as_deref()), &load)?;
+    let body = arguments.body.as_deref().or(saved.body.as_deref());
+    let mut source = source::load(Some(scene), body, &load)?;
+    Person::restore(directory, &mut source.capture, &source.model)?;
     Ok(Begun { directory: directory.to_owned(), source, config, _lock: lock })
 }
 
@@ -166,12 +178,13 @@ pub fn run_one(
     let start = Instant::now();
     let colors = VertexColors::measure(&scene)?;
     let prior_seconds = start.elapsed().as_secs_f64();
-    Person::save(directory, &source.capture, &source.model, &colors)?;
+    Person::save(directory, &scene.capture, &source.model, &colors)?;
     if run.train.method == Method::Prior {
         let prior = Drawn::Prior(colors);
         let metrics = unscored(run, &prior, prior_seconds);
         return score_run(directory, run, &scene, &prior, lpips, metrics).map(Some);
     }
+    say_memory(&scene, &run.train)?;
     let checkpoint = directory.join(CHECKPOINT);
     let mut trainer = if sitting.resume && checkpoint.is_file() {
         Trainer::resume(&scene, &checkpoint)?
@@ -190,6 +203,31 @@ pub fn run_one(
     let trained = Drawn::Field { model: &model, perceptual };
     let metrics = unscored(run, &trained, seconds);
     score_run(directory, run, &scene, &trained, lpips, metrics).map(Some)
+}
+
+/// Steps that are tried, and forgotten, to know what memory a run takes.
+const TRIED: u64 = 4;
+
+/// Says what memory training takes before it begins. A run of few steps tells soon enough.
+fn say_memory(scene: &Scene, config: &Config) -> Result<()> {
+    let capture = peak_rss_bytes();
+    if capture == 0 || config.steps < 10 * TRIED {
+        return Ok(());
+    }
+    let mut trial = Trainer::new(scene, config.clone())?;
+    // So few that poses are taught, too.
+    trial.set_steps(TRIED);
+    trial.load_perceptual()?;
+    // Each with its gradient and two moments.
+    let parameters = 4 * size_of::<f32>() as u64 * trial.model().num_parameters() as u64;
+    for _ in 0..TRIED {
+        trial.step()?;
+    }
+    let samples = peak_rss_bytes().saturating_sub(capture + parameters);
+    let [whole, capture, parameters, samples] =
+        [capture + parameters + samples, capture, parameters, samples].map(|bytes| bytes.div_ceil(1 << 20));
+    say!("memory: about {whole} MiB (capture {capture}, parameters {parameters}, samples {samples})");
+    Ok(())
 }
 
 /// The scores of a run under `directory`: those it has if it finished earlier with the same
@@ -229,7 +267,7 @@ pub fn run_unless_finished(
     }
     say!("{name}: training");
     run.write(directory)?;
-    let sitting = Sitting { resume: earlier, stop_after: None, interval };
+    let sitting = Sitting { resume: earlier, stop_after: None, interval, preview: false };
     let metrics = run_one(directory, run, source, lpips, &sitting)?;
     metrics.with_context(|| format!("{name}: stopped before its end"))
 }

@@ -1,8 +1,8 @@
 //! Death at any moment: processes are killed, begun again until they end, and must end as if
 //! nothing had happened.
 //!
-//! A few kills by default; `KILLS=200 cargo test --release -p xtask --test death -- --nocapture`
-//! for the table.
+//! A few kills by default; `KILLS=200 cargo test -p xtask --test death -- --nocapture` for the
+//! table: so many of `train`, and so many of all other commands.
 #![cfg(target_os = "linux")]
 #![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
 
@@ -48,6 +48,7 @@ fn all_whole(folder: &Path) -> usize {
             Some("toml") => std::str::from_utf8(&bytes).is_ok_and(|text| text.parse::<toml::Table>().is_ok()),
             Some("png") => bytes.ends_with(b"IEND\xaeB`\x82"),
             Some("html") => bytes.ends_with(b"</html>\n"),
+            Some("glb") => bytes.get(8..12) == Some(&(bytes.len() as u32).to_le_bytes()[..]),
             Some("md") => bytes.ends_with(b"\n"),
             Some("safetensors") => false,
             _ => continue,
@@ -180,7 +181,7 @@ fn a_training_killed_at_any_moment_ends_the_same_to_the_bit() {
                 )
             };
             let work = Work { name: "train", out: out.clone(), arguments: &arguments };
-            until_it_ends(&work, 1500, &mut random, 12, &mut toll);
+            until_it_ends(&work, 1500, &mut random, 12.min(kills()), &mut toll);
             assert!(bytes(&out) == bytes(&whole), "{}", out.display());
             std::fs::remove_dir_all(&out).unwrap();
         }
@@ -211,25 +212,72 @@ fn scoring_and_tables_killed_at_any_moment_are_whole_or_absent() {
         words(&[&["bench", "stability", "--quick", "--axes", "limbs pressed"][..], &side].concat())
     };
     let synth = |out: &Path| words(&["synth", "--force", "--out", text(out), "--size", "32", "--frames", "4"]);
+    let glb = run.join("person.glb");
+    let export = |run: &Path| words(&["export", text(run), "--format", "glb", "--out", text(&glb)]);
+    let view = |run: &Path| words(&["view", text(run)]);
+    let estimators = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared/data/estimators");
+    let (frames, fit) = (estimators.join("frames"), estimators.join("phalp/demo_clip.pkl"));
+    let import =
+        |out: &Path| words(&["import", "--force", "--frames", text(&frames), "--fit", text(&fit), "--out", text(out)]);
     type Command<'a> = (&'a str, &'a dyn Fn(&Path) -> Vec<String>, u64);
-    let each: [Command<'_>; 4] =
-        [("eval", &eval, 1000), ("reproduce", &reproduce, 3000), ("bench", &sweep, 4000), ("synth", &synth, 700)];
+    let mut each: Vec<Command<'_>> = vec![
+        ("eval", &eval, 1000),
+        ("reproduce", &reproduce, 3000),
+        ("bench", &sweep, 4000),
+        ("synth", &synth, 700),
+        // Bakes first.
+        ("export", &export, 1500),
+        ("view", &view, 1500),
+    ];
+    if fit.is_file() {
+        each.push(("import", &import, 1500));
+    } else {
+        println!("import is skipped: {} is absent", fit.display());
+    }
+    // What a command that nobody kills leaves.
+    let results = |name: &str, out: &Path| -> Vec<Vec<u8>> {
+        let files: &[&str] = match name {
+            "export" => &["person.glb", "avatar.safetensors"],
+            "view" => &["person.html", "avatar.safetensors"],
+            "synth" => &["synth.json", "cameras.pkl", "mesh_infos.pkl"],
+            "import" => &["import.json", "metadata.json", "body.safetensors", "masks/000001.png"],
+            _ => &[],
+        };
+        files.iter().map(|file| std::fs::read(out.join(file)).unwrap()).collect()
+    };
     let mut random = Random(2);
-    for (name, arguments, longest) in each {
+    for (name, arguments, longest) in &each {
+        let place = |lives: usize| match *name {
+            "eval" | "export" | "view" => run.clone(),
+            // Again and again over the old one.
+            "synth" | "import" => folder.join(name),
+            _ => folder.join(format!("{name}-{lives}")),
+        };
+        let unbaked = || ["avatar.safetensors", "person.glb", "person.html"].map(|f| std::fs::remove_file(run.join(f)));
+        let whole = if matches!(*name, "export" | "view" | "synth" | "import") {
+            let _ = unbaked();
+            let arguments = arguments(&place(0));
+            done(&arguments.iter().map(String::as_str).collect::<Vec<_>>());
+            results(name, &place(0))
+        } else {
+            Vec::new()
+        };
         let (mut toll, mut lives) = (Toll::default(), 0);
-        while toll.kills < kills().div_ceil(8) {
-            let out = match name {
-                "eval" => run.clone(),
-                // Again and again over the old one.
-                "synth" => folder.join(name),
-                _ => folder.join(format!("{name}-{lives}")),
-            };
+        while toll.kills < kills().div_ceil(each.len()) {
+            let out = place(lives);
             lives += 1;
-            until_it_ends(&Work { name, out: out.clone(), arguments }, longest, &mut random, 12, &mut toll);
-            match name {
+            let _ = unbaked();
+            until_it_ends(
+                &Work { name, out: out.clone(), arguments },
+                *longest,
+                &mut random,
+                12.min(kills()),
+                &mut toll,
+            );
+            assert!(results(name, &out) == whole, "{name}: not what it leaves unkilled");
+            match *name {
                 "reproduce" => assert!(out.join("capture/reproduce.md").is_file()),
                 "bench" => assert!(out.join("stability.md").is_file()),
-                "synth" => assert!(out.join("synth.json").is_file() && out.join("cameras.pkl").is_file()),
                 _ => {}
             }
         }

@@ -62,3 +62,17 @@ fn scores_of_a_run_that_went_on_are_those_of_its_last_step() {
     done(&["train", "--resume", "--out", text(&run), "--steps", "1"]);
     assert!(steps_are("2"));
 }
+
+#[test]
+#[cfg(target_os = "linux")]
+fn training_says_before_it_begins_what_memory_it_takes() {
+    let folder = folder("memory-said");
+    let (capture, run) = (folder.join("capture"), folder.join("run"));
+    done(&["synth", "--out", text(&capture), "--size", "128", "--frames", "4", "--eval-cameras", "1"]);
+    let said = done(&["train", text(&capture), "--out", text(&run), "--preset", "fast", "--steps", "40"]);
+    let mebibytes: f64 = said.split("memory: about ").nth(1).unwrap().split(' ').next().unwrap().parse().unwrap();
+    let metrics = std::fs::read_to_string(run.join("metrics.json")).unwrap();
+    let metrics: serde_json::Value = serde_json::from_str(&metrics).unwrap();
+    let taken = metrics["peak_rss_bytes"].as_f64().unwrap() / f64::from(1 << 20);
+    assert!((taken / mebibytes - 1.0).abs() < 0.3, "{mebibytes} MiB said, {taken} taken");
+}

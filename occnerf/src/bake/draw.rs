@@ -7,7 +7,8 @@ use volrender::Camera;
 
 use super::avatar::Avatar;
 use crate::Error;
-use crate::scene::prepared::pinhole;
+use crate::capture::Light;
+use crate::scene::pinhole::pinhole;
 
 /// Vertices that are skinned together.
 const CHUNK: usize = 1024;
@@ -26,6 +27,7 @@ pub struct BakedPerson<'a> {
     features: Vec<f32>,
     skinned: Vec<Vec3>,
     rasterizer: Rasterizer,
+    light: Light,
 }
 
 impl<'a> BakedPerson<'a> {
@@ -44,7 +46,14 @@ impl<'a> BakedPerson<'a> {
             features: Vec::new(),
             skinned: Vec::new(),
             rasterizer: Rasterizer::default(),
+            light: Light::default(),
         }
+    }
+
+    /// Under this light instead of even light.
+    #[must_use]
+    pub fn lit_by(self, light: Light) -> Self {
+        Self { light, ..self }
     }
 
     /// World positions of the vertices, (V): pose blend shapes, then linear blend skinning by
@@ -92,10 +101,12 @@ impl<'a> BakedPerson<'a> {
         out: &mut [Vec4],
     ) -> Result<(), Error> {
         self.skin(bones);
-        let Self { avatar, texels, skinned, rasterizer, scale, .. } = self;
+        let Self { avatar, texels, skinned, rasterizer, scale, light, .. } = self;
         let options = RasterOptions { samples, cull_back: true, near: 1e-3 * *scale };
         let shells: Vec<&[[u32; 3]]> = (0..avatar.shell_ends.len()).map(|shell| avatar.shell(shell)).collect();
-        let paint = Paint { avatar, texels, size: Vec2::new(avatar.atlas.width as f32, avatar.atlas.height as f32) };
+        let shades = &light.on_surface(skinned, &avatar.faces);
+        let paint =
+            Paint { avatar, texels, shades, size: Vec2::new(avatar.atlas.width as f32, avatar.atlas.height as f32) };
         let shade = |pixel: Pixel<'_>| {
             let samples = pixel.samples();
             let count = samples.len();
@@ -107,6 +118,15 @@ impl<'a> BakedPerson<'a> {
         rasterizer.draw(skinned, &shells, &pinhole(camera), &options, out, shade)?;
         Ok(())
     }
+}
+
+/// Brightness of a fragment between those of its corners; 1 without.
+pub(super) fn shade(avatar: &Avatar, shades: &[f32], fragment: &Fragment) -> f32 {
+    if shades.is_empty() {
+        return 1.0;
+    }
+    let corners = avatar.faces[fragment.face as usize];
+    corners.iter().zip(fragment.barycentric).map(|(&v, b)| b * shades[v as usize]).sum()
 }
 
 /// R − I of each joint but the root relative to its parent, in units of `scale`.
@@ -124,6 +144,8 @@ fn blend_shape_features(avatar: &Avatar, bones: &[Affine3A], scale: f32, out: &m
 struct Paint<'a> {
     avatar: &'a Avatar,
     texels: &'a [Vec4],
+    /// Of each vertex; empty under even light.
+    shades: &'a [f32],
     /// Of the atlas.
     size: Vec2,
 }
@@ -135,7 +157,8 @@ impl Paint<'_> {
         let mut sum = Vec4::ZERO;
         for fragment in sample {
             let colour = self.lookup(atlas_place(self.avatar, fragment) * self.size);
-            sum += (1.0 - sum.w) * colour;
+            let lit = (shade(self.avatar, self.shades, fragment) * colour.truncate()).min(Vec3::splat(colour.w));
+            sum += (1.0 - sum.w) * lit.extend(colour.w);
         }
         sum
     }

@@ -10,7 +10,7 @@ use volrender::Camera;
 use super::avatar::{Atlas, Avatar, Clip, MAX_SHELLS};
 use super::charts::Layout;
 use super::field::CanonicalField;
-use super::motion::{motion_of_bones, upright};
+use super::motion::{motion_of_bones, turn_upright};
 use super::paint::{Texel, dilate, paint, texels};
 use super::refine::refine;
 use super::renderer::TrainedField;
@@ -58,7 +58,7 @@ impl Default for BakeOptions {
 /// What baking did.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct BakeReport {
-    /// What was found of the surface; of several shells, of the middle one.
+    /// What was found of the surface; of several shells, of the innermost.
     pub surface: SurfaceReport,
     /// Vertices of all shells, those on seams once for each chart.
     pub vertices: usize,
@@ -317,7 +317,7 @@ fn atlas(side: u32, texels: &[Texel], colours: &[(Vec3, f32)], confidence: &[f32
 
 /// The video's motion, as training has corrected it, and the cameras, in the avatar's world.
 fn motion(model: &Model, avatar: &Avatar, fps: f32) -> (Vec<Clip>, Vec<Camera>) {
-    let turn = upright(model.up());
+    let turn = turn_upright(model.up());
     let scale = model.body.scale;
     let bones = |view: &Arc<PosedView>| {
         let placed = |bone: &Affine3A| {

@@ -25,7 +25,7 @@ use crate::Error;
 pub use avatar::{Atlas, Avatar, Clip, Joint, MAX_ATLAS_SIDE, MAX_JOINTS, MAX_SHELLS};
 pub use draw::BakedPerson;
 pub use make::{BakeOptions, BakeReport, bake};
-pub use motion::{motion_of_bones, upright};
+pub use motion::{motion_of_bones, turn_upright};
 pub use renderer::BakedRenderer;
 pub use skeleton::skeleton;
 pub use surface::SurfaceReport;

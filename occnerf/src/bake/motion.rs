@@ -8,7 +8,7 @@ use super::avatar::Joint;
 /// The rotation that takes the direction `up` of a capture's world to +y; none where `up` has no
 /// direction.
 #[must_use]
-pub fn upright(up: Vec3) -> Mat3 {
+pub fn turn_upright(up: Vec3) -> Mat3 {
     up.try_normalize().map_or(Mat3::IDENTITY, |up| Mat3::from_quat(Quat::from_rotation_arc(up, Vec3::Y)))
 }
 

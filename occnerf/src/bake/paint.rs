@@ -64,8 +64,8 @@ pub(super) fn texels(
 /// Colour and alpha of each of `texels`, with shells at `heights` (shells, V) over the prior's
 /// `normals` (V).
 ///
-/// A shell stands for the part of the field between the middles of the gaps to its neighbours. A
-/// single one is opaque.
+/// A shell stands for the part of the field between the middles of the gaps to its neighbours. The
+/// innermost is opaque.
 pub(super) fn paint(
     field: &impl CanonicalField,
     prior: &MeshDistance,
@@ -81,19 +81,20 @@ pub(super) fn paint(
             for texel in texels {
                 let [low, high] = slab(heights, texel, field.reach(), field.spacing());
                 texel.normal(normals).places(prior, high, low, field.reach() + high - low, along);
-                counts.push(along.len());
+                counts.push((along.len(), high - low));
                 places.extend(along.iter().map(|(_, place)| *place));
             }
             field.evaluate(places, values);
             let mut rest = &values[..];
-            let colour = |count: usize| {
+            let colour = |(count, thickness): (usize, f32)| {
                 let (own, others) = rest.split_at(count);
                 rest = others;
-                integrate(own, field.spacing())
+                // Points lie at both ends of a slab.
+                integrate(own, STEP.min(thickness / count.max(1) as f32), field.spacing())
             };
-            let colours: Vec<(Vec3, f32)> = counts.into_iter().map(colour).collect();
-            let single = heights.len() == 1;
-            colours.into_iter().map(|(c, a)| (c, if single { 1.0 } else { a })).collect()
+            let colours = counts.into_iter().map(colour);
+            let opaque = |((c, a), texel): ((Vec3, f32), &Texel)| (c, if texel.shell == 0 { 1.0 } else { a });
+            colours.zip(texels).map(opaque).collect()
         })
         .collect();
     chunks.concat()
@@ -110,15 +111,15 @@ fn slab(heights: &[Vec<f32>], texel: &Texel, reach: f32, spacing: f32) -> [f32; 
     [inner.unwrap_or(own - BELOW.max(spacing)), high.max(own + STEP)]
 }
 
-/// Colour and opacity of points one step from each other, outside in: the mean over all places that
-/// samples `spacing` apart can have, as of pixels next to each other.
-fn integrate(points: &[(f32, Vec3)], spacing: f32) -> (Vec3, f32) {
+/// Colour and opacity of points that each stand for a length of `step`, outside in: the mean over
+/// all places that samples `spacing` apart can have, as of pixels next to each other.
+fn integrate(points: &[(f32, Vec3)], step: f32, spacing: f32) -> (Vec3, f32) {
     let stride = ((spacing / STEP).round() as usize).max(1);
     let (mut sum, mut opacity) = (Vec3::ZERO, 0.0);
     for phase in 0..stride.min(points.len()) {
         let mut transmittance = 1.0;
         for &(density, colour) in points[phase..].iter().step_by(stride) {
-            let alpha = 1.0 - (-density * STEP * stride as f32).exp();
+            let alpha = 1.0 - (-density * step * stride as f32).exp();
             sum += transmittance * alpha * colour;
             transmittance *= 1.0 - alpha;
         }

@@ -1,39 +1,43 @@
 //! The texture, drawn towards the training pictures through the rasteriser.
 
-use glam::{Vec2, Vec3};
-use rayon::prelude::*;
-use visibility::{Fragment, RasterOptions, Rasterizer};
+use glam::{Vec2, Vec3, Vec4};
+use visibility::{Pixel, RasterOptions, Rasterizer};
 
 use super::avatar::{Atlas, Avatar};
-use super::draw::{BakedPerson, BilinearCorner, atlas_place};
+use super::draw::{BakedPerson, BilinearCorner, atlas_place, shade};
 use crate::Error;
 use crate::model::trained::Model;
 use crate::scene::labels::Label;
-use crate::scene::prepared::{PreparedFrame, Scene, pinhole};
+use crate::scene::pinhole::pinhole;
+use crate::scene::prepared::{PreparedFrame, Scene};
 
 /// Weight of the field's own colour in that of a texel, in pixels that show it.
-const PRIOR: f32 = 2.0;
+const PRIOR: f32 = 0.3;
 
 /// Training pixels that are looked at, at most; of more, every n-th.
-const MAX_PIXELS: usize = 1 << 21;
+const MAX_PIXELS: usize = 1 << 20;
 
-/// What a training pixel shows: four texels, how much of each, and the colour photographed.
-#[derive(Clone, Copy)]
+/// Four texels of a shell and how much of each a pixel shows.
+type Look = ([u32; 4], [f32; 4]);
+
+/// The colour that was photographed at a pixel, and what the pixel shows of each shell that it
+/// sees.
 struct Sight {
-    texels: [u32; 4],
-    weights: [f32; 4],
     colour: Vec3,
+    looks: Vec<Look>,
 }
 
-/// Moves the colours of the middle shell's texels towards the known pixels of the training frames,
-/// `passes` times, each by a Jacobi step of the least squares problem that keeps unseen texels as
-/// they are. Returns the mean squared error before the first pass and before the last.
+/// Moves the colours of the texels towards the known pixels of the training frames, `passes` times,
+/// each by a Jacobi step of the least squares problem that keeps unseen texels as they are. Returns
+/// the mean squared error before the first pass and before the last.
 pub(super) fn refine(model: &Model, scene: &Scene, avatar: &mut Avatar, passes: u32) -> Result<[f64; 2], Error> {
     let frames = &scene.train;
     let stride = frames.iter().map(|f| f.labels.num_subject()).sum::<usize>().div_ceil(MAX_PIXELS).max(1);
-    let sights: Result<Vec<Vec<Sight>>, Error> =
-        frames.iter().map(|frame| sights(model, avatar, frame, stride)).collect();
-    let sights = sights?.concat();
+    let mut person = BakedPerson::new(avatar, model.body.scale).lit_by(model.base.light);
+    let mut all = Vec::new();
+    for frame in frames {
+        all.extend(sights(model, avatar, &mut person, frame, stride)?);
+    }
     let Atlas { rgba, .. } = &mut avatar.atlas;
     let start: Vec<Vec3> = rgba.as_chunks::<4>().0.iter().map(|&[r, g, b, _]| colour([r, g, b])).collect();
     let mut values = start.clone();
@@ -41,17 +45,16 @@ pub(super) fn refine(model: &Model, scene: &Scene, avatar: &mut Avatar, passes: 
     for pass in 0..passes {
         let mut sums = vec![(Vec3::ZERO, 0.0f32); values.len()];
         let mut error = 0.0;
-        for sight in &sights {
-            let at = sight.texels.map(|i| i as usize);
-            let shown: Vec3 = at.iter().zip(sight.weights).map(|(&i, w)| w * values[i]).sum();
-            let residual = sight.colour - shown;
+        for Sight { colour, looks } in &all {
+            let texels = || looks.iter().flat_map(|(at, w)| at.iter().map(|&i| i as usize).zip(*w));
+            let residual = *colour - texels().map(|(i, w)| w * values[i]).sum::<Vec3>();
             error += f64::from(residual.length_squared()) / 3.0;
-            for (i, w) in at.into_iter().zip(sight.weights) {
+            for (i, w) in texels() {
                 sums[i].0 += w * residual;
                 sums[i].1 += w;
             }
         }
-        errors[usize::from(pass > 0)] = error / sights.len().max(1) as f64;
+        errors[usize::from(pass > 0)] = error / all.len().max(1) as f64;
         for ((value, (sum, weight)), start) in values.iter_mut().zip(sums).zip(&start) {
             *value += (sum + PRIOR * (start - *value)) / (weight + PRIOR);
         }
@@ -68,29 +71,46 @@ fn colour(bytes: [u8; 3]) -> Vec3 {
 }
 
 /// The subject's pixels of a frame that look at the surface well away from its outline.
-fn sights(model: &Model, avatar: &Avatar, frame: &PreparedFrame, stride: usize) -> Result<Vec<Sight>, Error> {
+fn sights(
+    model: &Model,
+    avatar: &Avatar,
+    person: &mut BakedPerson<'_>,
+    frame: &PreparedFrame,
+    stride: usize,
+) -> Result<Vec<Sight>, Error> {
     let pixels = frame.pixels()?;
-    let mut person = BakedPerson::new(avatar, model.body.scale);
     let vertices = person.skin(&model.corrected(&frame.view).bones);
+    let shades = model.base.light.on_surface(vertices, &avatar.faces);
     let options = RasterOptions { cull_back: true, near: 1e-3, ..RasterOptions::default() };
-    let middle = avatar.shell_ends.len() / 2;
-    let first = middle.checked_sub(1).map_or(0, |before| avatar.shell_ends[before]);
-    let drawn = Rasterizer::default().faces(vertices, avatar.shell(middle), &pinhole(&frame.view.camera), &options)?;
-    let size = Vec2::new(avatar.atlas.width as f32, avatar.atlas.height as f32);
-    let sight = |i: usize| {
-        let fragment = drawn[i]?;
-        let fragment = Fragment { face: fragment.face + first, ..fragment };
+    let shells: Vec<&[[u32; 3]]> = (0..avatar.shell_ends.len()).map(|shell| avatar.shell(shell)).collect();
+    let look = |pixel: Pixel<'_>| {
+        let i = pixel.index;
         // Edge pixels are mixed with the background.
-        if frame.labels.at(i as u32) != Label::Subject || pixels.mask[i] < 0.99 {
-            return None;
-        }
-        let corner = BilinearCorner::new(atlas_place(avatar, &fragment) * size, size);
-        let Vec2 { x, y } = corner.share;
+        let wanted = i.is_multiple_of(stride) && frame.labels.at(i as u32) == Label::Subject && pixels.mask[i] >= 0.99;
+        let fragments = pixel.samples().next().filter(|fragments| wanted && !fragments.is_empty())?;
+        let mut before = 1.0;
+        let look = |fragment| look(avatar, atlas_place(avatar, fragment), &mut before);
         Some(Sight {
-            texels: corner.texels(avatar.atlas.width, avatar.atlas.height).map(|t| t as u32),
-            weights: [(1.0 - x) * (1.0 - y), x * (1.0 - y), (1.0 - x) * y, x * y],
-            colour: Vec3::from_slice(&pixels.image.pixels[3 * i..]),
+            colour: Vec3::from_slice(&pixels.image.pixels[3 * i..]) / shade(avatar, &shades, &fragments[0]),
+            looks: fragments.iter().map(look).collect(),
         })
     };
-    Ok((0..drawn.len()).into_par_iter().step_by(stride).filter_map(sight).collect())
+    let mut out: Vec<Option<Sight>> = Vec::new();
+    out.resize_with(pixels.mask.len(), || None);
+    Rasterizer::default().draw(vertices, &shells, &pinhole(&frame.view.camera), &options, &mut out, look)?;
+    Ok(out.into_iter().flatten().collect())
+}
+
+/// What is seen at a `place` of the atlas with the transmittance `before` it, which becomes that
+/// behind it.
+fn look(avatar: &Avatar, place: Vec2, before: &mut f32) -> Look {
+    let Atlas { width, height, ref rgba, .. } = avatar.atlas;
+    let size = Vec2::new(width as f32, height as f32);
+    let corner = BilinearCorner::new(place * size, size);
+    let (texels, Vec2 { x, y }) = (corner.texels(width, height), corner.share);
+    let alphas = Vec4::from(texels.map(|i| f32::from(rgba[4 * i + 3]) / 255.0));
+    let shown = Vec4::new((1.0 - x) * (1.0 - y), x * (1.0 - y), (1.0 - x) * y, x * y) * alphas;
+    let weights = *before * shown;
+    *before *= 1.0 - shown.element_sum();
+    (texels.map(|i| i as u32), weights.to_array())
 }

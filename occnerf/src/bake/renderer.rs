@@ -25,6 +25,8 @@ pub(super) struct TrainedField<'a> {
     code: VertexCode,
     extent: Extent,
     spacing: f32,
+    /// What colours start from at each vertex, under even light.
+    base: Vec<Vec4>,
 }
 
 impl<'a> TrainedField<'a> {
@@ -33,7 +35,9 @@ impl<'a> TrainedField<'a> {
         model.encode_vertices(&mut code);
         let extent = model.measure_extent(&code);
         let spacing = mean_span(model) / model.config.samples as f32;
-        Self { model, code, extent, spacing }
+        let mut base = Vec::new();
+        model.base.before_sigmoid(&[], &mut base);
+        Self { model, code, extent, spacing, base }
     }
 }
 
@@ -57,7 +61,7 @@ impl CanonicalField for TrainedField<'_> {
         let Model { body, config, base, motion, .. } = self.model;
         let blended = needs_neighbours(config.surface.distance);
         let neighbours = blended || self.model.field.surface_term;
-        let based = !base.is_empty() && matches!(motion, MotionField::Surface(_));
+        let based = !base.colors.is_empty() && matches!(motion, MotionField::Surface(_));
         let mut batch = SampleBatch::default();
         batch.samples.clear();
         for place in places {
@@ -73,7 +77,7 @@ impl CanonicalField for TrainedField<'_> {
             }
             if based {
                 let corners = body.model.faces[place.face as usize].into_iter().zip(place.barycentric);
-                samples.base.push(corners.map(|(v, b)| b * base[v as usize]).sum());
+                samples.base.push(corners.map(|(v, b)| b * self.base[v as usize]).sum());
             }
         }
         self.model.evaluate(&self.code, &mut batch, None);
@@ -114,7 +118,7 @@ impl<'a> BakedRenderer<'a> {
         if found != expected {
             return Err(Error::Scene(format!("the avatar has {found} joints, the model {expected}")));
         }
-        let person = BakedPerson::new(avatar, model.body.scale);
+        let person = BakedPerson::new(avatar, model.body.scale).lit_by(model.base.light);
         Ok(Self { model, person, samples, pixels: Vec::new() })
     }
 }

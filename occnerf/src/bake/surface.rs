@@ -22,8 +22,9 @@ const HALF: f32 = std::f32::consts::LN_2;
 const CHUNK: usize = 64;
 /// Least height of a shell over the next one inside.
 const APART: f32 = 0.001;
-/// Passes of smoothing, each halfway to the mean of the neighbours.
-const SMOOTHING: usize = 2;
+/// Samples of a picture's ray that the greatest density so far stands for: a ray that grazes the
+/// surface, as those do that draw the outline, stays about as long in it.
+const GRAZING: f32 = 2.0;
 
 /// What was found of the surface.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -112,9 +113,9 @@ fn crossings(
 type Scratch = (Vec<(f32, Place)>, Vec<Place>, Vec<(f32, Vec3)>);
 
 /// Appends the heights at which the optical depth passes each of `depths`: that from outside down
-/// to there, and that of `spacing` at the greatest density so far, which a sample of a picture
-/// stands for. Where the field is fog that is farther out than the middle of the fog, and where
-/// pictures show its outline. Returns whether a gap, of no more than a tenth of the density before
+/// to there, and that of [`GRAZING`] samples `spacing` apart at the greatest density so far. Where
+/// the field is fog that is farther out than the middle of the fog, and where pictures show its
+/// outline. Returns whether a gap, of no more than a tenth of the density before
 /// it, lies between something opaque outside and something opaque inside.
 fn profile(heights: &[f32], densities: &[(f32, Vec3)], spacing: f32, depths: &[f32], out: &mut Vec<f32>) -> bool {
     let first = out.len();
@@ -126,7 +127,7 @@ fn profile(heights: &[f32], densities: &[(f32, Vec3)], spacing: f32, depths: &[f
     for (&height, &(density, _)) in heights.iter().zip(densities) {
         let added = density * STEP;
         thickest = thickest.max(density);
-        let here = depth + added + thickest * spacing;
+        let here = depth + added + GRAZING * thickest * spacing;
         while next < depths.len() && here >= depths[next] {
             out[first + next] = height + STEP * (0.5 - (depths[next] - before) / (here - before));
             next += 1;
@@ -143,9 +144,9 @@ fn profile(heights: &[f32], densities: &[(f32, Vec3)], spacing: f32, depths: &[f
     double
 }
 
-/// Heights of shells over each normal (V), from the innermost to the outermost: where the opacity
-/// from outside passes ½, or for `shells` of them the middle of each of as many equal parts. Holes
-/// are filled, outliers put between their neighbours, all smoothed.
+/// Heights of `shells` over each normal (V), from the innermost to the outermost: where the opacity
+/// from outside passes ½, and before that equal parts of it. Holes are filled, outliers put between
+/// their neighbours, all smoothed.
 pub(super) fn heights(
     field: &impl CanonicalField,
     prior: &MeshDistance,
@@ -153,7 +154,7 @@ pub(super) fn heights(
     mesh: &Subdivided,
     shells: usize,
 ) -> (Vec<Vec<f32>>, SurfaceReport) {
-    let opacity = |shell: usize| (shell as f32 + 0.5) / shells as f32;
+    let opacity = |shell: usize| 0.5 * (shell as f32 + 1.0) / shells as f32;
     let depths: Vec<f32> = (0..shells).map(|shell| -(1.0 - opacity(shell)).ln()).collect();
     let (found, double) = crossings(field, prior, normals, &depths);
     let near = neighbours(normals.len(), &mesh.faces);
@@ -164,14 +165,12 @@ pub(super) fn heights(
         let holes = heights.iter().filter(|h| h.is_nan()).count();
         fill(&mut heights, &near);
         let outliers = tame(&mut heights, &near);
-        for _ in 0..SMOOTHING {
-            heights = smoothed(&heights, &near);
-        }
+        heights = smoothed(&heights, &near);
         if let Some(inner) = out.last() {
             let above = |(height, inner): (&mut f32, &f32)| *height = height.max(inner + APART);
             heights.iter_mut().zip(inner).for_each(above);
         }
-        if shell == shells / 2 {
+        if out.is_empty() {
             (report.holes, report.outliers) = (holes, outliers);
         }
         out.push(heights);
@@ -197,6 +196,7 @@ fn tame(heights: &mut [f32], near: &[Vec<u32>]) -> usize {
     outliers
 }
 
+/// Halfway to the mean of the neighbours.
 fn smoothed(heights: &[f32], near: &[Vec<u32>]) -> Vec<f32> {
     let mean = |near: &[u32]| near.iter().map(|&v| heights[v as usize]).sum::<f32>() / near.len() as f32;
     let halfway = |(near, &own): (&Vec<u32>, &f32)| if near.is_empty() { own } else { 0.5 * (own + mean(near)) };

@@ -34,7 +34,7 @@ pub enum CaptureError {
         what: String,
     },
     /// A value has the wrong type, shape or size, or makes no sense.
-    #[error("{}: {key}: expected {expected}, found {actual}", path.display())]
+    #[error("{}: {}: expected {expected}, found {}", path.display(), line(key), line(actual))]
     Invalid {
         /// The file.
         path: PathBuf,
@@ -55,6 +55,12 @@ pub enum CaptureError {
         /// Value that was given.
         actual: String,
     },
+}
+
+/// Text of a file, such as a key, as part of a line.
+fn line(text: &str) -> String {
+    let shown = |c: char| if c.is_control() { c.escape_default().to_string() } else { c.to_string() };
+    text.chars().map(shown).collect()
 }
 
 impl CaptureError {

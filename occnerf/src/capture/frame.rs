@@ -58,4 +58,6 @@ pub struct Capture {
     pub eval: Vec<EvalFrame>,
     /// Shape of the canonical body (T-pose).
     pub mean_betas: Vec<f32>,
+    /// Whether [`crate::register`] has corrected the bodies.
+    pub registered: bool,
 }

@@ -59,8 +59,11 @@ impl std::fmt::Display for Mistake {
             }
             Self::Unit(factor) => write!(f, "translations are {factor} times too large"),
             Self::Degrees => f.write_str("poses are in degrees: multiply them by pi/180"),
+            Self::Focal(factor) if *factor < 1.0 => {
+                write!(f, "the focal length is about {:.2} times too short", 1.0 / factor)
+            }
             Self::Focal(factor) => write!(f, "the focal length is about {factor:.2} times too long"),
-            Self::MaskInverted => f.write_str("the masks are inverted: 255 is the person"),
+            Self::MaskInverted => f.write_str("the masks are inverted: 255 must be the person"),
             Self::FrameShift(by) => write!(f, "fit and pictures are off by {by} frame(s)"),
             Self::WrongPerson => {
                 f.write_str("the fit lies beside the mask: another person's fit, or another object's mask")

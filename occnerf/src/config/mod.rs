@@ -6,6 +6,6 @@ mod validate;
 
 pub use self::settings::{
     Component, Config, DistanceKind, EncodingConfig, FieldConfig, LossConfig, Method, MotionConfig, MotionKind,
-    OccludedRule, Preset, RateConfig, SurfaceConfig, VisibilityKind,
+    OccludedRule, Preset, RateConfig, RegistrationConfig, SurfaceConfig, VisibilityKind,
 };
 pub use self::validate::ConfigError;

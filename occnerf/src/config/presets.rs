@@ -2,7 +2,7 @@
 
 use crate::config::settings::{
     Config, DistanceKind, EncodingConfig, FieldConfig, LossConfig, Method, MotionConfig, MotionKind, OccludedRule,
-    Preset, RateConfig, SurfaceConfig, VisibilityKind,
+    Preset, RateConfig, RegistrationConfig, SurfaceConfig, VisibilityKind,
 };
 
 impl Config {
@@ -59,6 +59,7 @@ fn paper() -> Config {
             density_bias: 2.0,
             density_bias_outside: -2.0,
             prior_colors: false,
+            prior_light: false,
         },
         encoding: EncodingConfig {
             levels: 16,
@@ -77,6 +78,7 @@ fn paper() -> Config {
             attention: true,
             visibility: VisibilityKind::Counted,
         },
+        registration: RegistrationConfig { rounds: 0 },
         motion: MotionConfig {
             kind: MotionKind::Volume,
             margin: 0.04,
@@ -112,7 +114,7 @@ fn balanced() -> Config {
         patches: 4,
         samples: 48,
         min_transmittance: 0.01,
-        field: FieldConfig { width: 64, depth: 2, prior_colors: true, ..paper().field },
+        field: FieldConfig { width: 64, depth: 2, prior_colors: true, prior_light: true, ..paper().field },
         encoding: EncodingConfig {
             levels: 10,
             features: 2,
@@ -124,12 +126,13 @@ fn balanced() -> Config {
         },
         surface: SurfaceConfig { distance: DistanceKind::Exact, ..paper().surface },
         loss: LossConfig { mse: 5.0, ..paper().loss },
+        registration: RegistrationConfig { rounds: 12 },
         motion: MotionConfig {
             kind: MotionKind::Surface,
             margin: 0.04,
             falloff: 0.02,
             depth: 0.04,
-            correction_spacing: 4,
+            correction_spacing: 0,
             shell_interval: 32,
         },
         rates: RateConfig {
@@ -137,7 +140,7 @@ fn balanced() -> Config {
             vertices: 1e-4,
             table: 3e-2,
             motion: 1e-3,
-            pose: 2e-4,
+            pose: 0.0,
             final_fraction: 0.05,
             beta_2: 0.99,
         },

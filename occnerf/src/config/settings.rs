@@ -151,6 +151,10 @@ pub struct FieldConfig {
     /// frame saw them. Asks for `motion.kind = surface`.
     #[serde(default)]
     pub prior_colors: bool,
+    /// Whether those colours are told apart from the light that all frames share, where the video
+    /// shows one.
+    #[serde(default)]
+    pub prior_light: bool,
 }
 
 /// The encoding γ.
@@ -223,6 +227,15 @@ impl MotionConfig {
     pub fn reach(&self) -> f32 {
         self.margin + self.falloff
     }
+}
+
+/// Corrections of the prior before training, from the outlines of all frames; see
+/// [`crate::register`].
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RegistrationConfig {
+    /// Gauss-Newton steps; 0 leaves the prior as it is given.
+    pub rounds: usize,
 }
 
 /// Weights of the losses.
@@ -307,6 +320,9 @@ pub struct Config {
     pub encoding: EncodingConfig,
     /// Surface queries and the surface term.
     pub surface: SurfaceConfig,
+    /// Corrections of the prior before training.
+    #[serde(default)]
+    pub registration: RegistrationConfig,
     /// Motion field.
     pub motion: MotionConfig,
     /// Losses.

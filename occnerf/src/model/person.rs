@@ -11,7 +11,7 @@ use smpl::{BodyModel, Placement};
 use volrender::Camera;
 
 use crate::Error;
-use crate::capture::Capture;
+use crate::capture::{Capture, Light};
 use crate::config::Config;
 use crate::model::body::{Body, Moment};
 use crate::model::colors::VertexColors;
@@ -77,6 +77,7 @@ impl Person {
             ("mean_betas", floats(padded(&capture.mean_betas, betas))),
             ("colors", floats(vectors(&colors.colors))),
             ("seen", Array::Bytes(colors.seen.iter().map(|&seen| u8::from(seen)).collect())),
+            ("light", floats(colors.light.slope.to_array().to_vec())),
             ("sizes", Array::Counts(&sizes)),
         ];
         let header = BTreeMap::from([
@@ -86,6 +87,36 @@ impl Person {
             ("frames", capture.train.len().to_string()),
         ]);
         write(&run.join(PERSON), &header, arrays.map(|(name, array)| (name.to_owned(), array)).into())
+    }
+
+    /// Gives `capture` the bodies of the run directory `run`, as registration has corrected them;
+    /// false where it has none, or other frames.
+    ///
+    /// # Errors
+    /// [`Error::Io`] and [`Error::File`] for a file that is damaged.
+    pub fn restore(run: &Path, capture: &mut Capture, model: &BodyModel) -> Result<bool, Error> {
+        let path = run.join(PERSON);
+        if !path.is_file() {
+            return Ok(false);
+        }
+        let bytes = read(&path)?;
+        let contents = Contents::parse(&path, &bytes, FORMAT, &[VERSION])?;
+        let frames = capture.train.len();
+        if contents.require("frames")? != frames.to_string() {
+            return Ok(false);
+        }
+        let moments = moments(&contents, frames, model)?;
+        for (frame, (pose, betas, placement)) in capture.train.iter_mut().zip(&moments) {
+            (frame.pose, frame.betas, frame.placement) = (pose.clone(), betas.clone(), *placement);
+        }
+        for view in &mut capture.eval {
+            if let Some((pose, betas, placement)) = moments.get(view.train_index) {
+                (view.frame.pose, view.frame.betas, view.frame.placement) = (pose.clone(), betas.clone(), *placement);
+            }
+        }
+        capture.mean_betas = contents.floats("mean_betas", model.num_betas())?;
+        capture.registered = true;
+        Ok(true)
     }
 
     /// Reads what [`Person::save`] wrote into the directory `run`, as `config` prepares it.
@@ -106,30 +137,23 @@ impl Person {
         let frames: usize = count.parse().ok().filter(|n| (1..=bytes.len()).contains(n)).ok_or_else(|| {
             contents.wrong(format!("header `frames` is {count:?}, expected a number of frames that fits the file"))
         })?;
-        let (joints, betas, vertices) = (model.num_joints(), model.num_betas(), model.num_vertices());
+        let (betas, vertices) = (model.num_betas(), model.num_vertices());
         let body = Arc::new(Body::new(&model, &contents.floats("mean_betas", betas)?, config)?);
         let cameras = contents.floats("cameras", frames * CAMERA)?;
         let sizes = contents.counts("sizes", frames * 2)?;
-        let poses = triples(&contents.floats("poses", frames * joints * 3)?);
-        let shapes = contents.floats("betas", frames * betas)?;
-        let placements = contents.floats("placements", frames * PLACEMENT)?;
+        let moments = moments(&contents, frames, &model)?;
         let view = |frame: usize| {
             let camera = camera(&cameras[frame * CAMERA..][..CAMERA], &sizes[2 * frame..][..2])
                 .ok_or_else(|| contents.wrong(format!("`cameras` {frame} is no pinhole camera")))?;
-            let placement = &placements[frame * PLACEMENT..][..PLACEMENT];
-            let (rotation, translation) = (Vec3::from_slice(&placement[1..]), Vec3::from_slice(&placement[4..]));
-            let placement = match placement[0] {
-                0.0 => Placement::Pelvis { translation },
-                _ => Placement::Origin { rotation, translation },
-            };
-            let (pose, betas) = (&poses[frame * joints..][..joints], &shapes[frame * betas..][..betas]);
-            Ok(Arc::new(body.view(&camera, frame, Moment { betas, pose, placement })))
+            let (pose, betas, placement) = &moments[frame];
+            Ok(Arc::new(body.view(&camera, frame, Moment { betas, pose, placement: *placement })))
         };
         let frames = (0..frames).map(view).collect::<Result<Vec<_>, Error>>()?;
         let colors = triples(&contents.floats("colors", vertices * 3)?);
         let seen = contents.bytes("seen", vertices)?.iter().map(|&seen| seen != 0).collect();
+        let light = Light { slope: Vec3::from_slice(&contents.floats("light", 3)?) };
         let scene = contents.require("scene")?.to_owned();
-        Ok(Self { scene, body, frames, colors: VertexColors { colors, seen } })
+        Ok(Self { scene, body, frames, colors: VertexColors { colors, seen, light } })
     }
 }
 
@@ -145,11 +169,31 @@ impl Model {
         let contents = parse(&path, &bytes)?;
         let config = config_of(&contents)?;
         let Person { body, frames, colors, .. } = Person::load(run, &config)?;
-        let base = if config.field.prior_colors { colors.before_sigmoid() } else { Vec::new() };
+        let base = if config.field.prior_colors { colors } else { VertexColors::default() };
         let mut model = Self::new(config, body, frames, base)?;
         model.restore(&contents)?;
         Ok(model)
     }
+}
+
+/// Turns of the joints, shape and place of a frame.
+type Pose = (Vec<Vec3>, Vec<f32>, Placement);
+
+fn moments(contents: &Contents<'_>, frames: usize, model: &BodyModel) -> Result<Vec<Pose>, Error> {
+    let (joints, betas) = (model.num_joints(), model.num_betas());
+    let poses = triples(&contents.floats("poses", frames * joints * 3)?);
+    let shapes = contents.floats("betas", frames * betas)?;
+    let placements = contents.floats("placements", frames * PLACEMENT)?;
+    let moment = |frame: usize| {
+        let placement = &placements[frame * PLACEMENT..][..PLACEMENT];
+        let (rotation, translation) = (Vec3::from_slice(&placement[1..]), Vec3::from_slice(&placement[4..]));
+        let placement = match placement[0] {
+            0.0 => Placement::Pelvis { translation },
+            _ => Placement::Origin { rotation, translation },
+        };
+        (poses[frame * joints..][..joints].to_vec(), shapes[frame * betas..][..betas].to_vec(), placement)
+    };
+    Ok((0..frames).map(moment).collect())
 }
 
 fn padded(values: &[f32], len: usize) -> Vec<f32> {

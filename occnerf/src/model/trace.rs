@@ -8,6 +8,7 @@ use volrender::{Bins, Composite, Occupancy, OccupancyConfig, Ray};
 use crate::Error;
 use crate::config::Config;
 use crate::model::body::Body;
+use crate::model::colors::VertexColors;
 use crate::model::distance::{SurfacePoint, needs_neighbours, surface_point};
 use crate::model::extent::Extent;
 use crate::model::samples::Samples;
@@ -23,6 +24,8 @@ pub(crate) const FINE_CELL: f32 = 0.01;
 pub(crate) struct PosedSurface {
     mesh: MeshDistance,
     pub occupancy: Occupancy,
+    /// What colours start from at each vertex, see [`Samples::base`]; may be empty.
+    pub base: Vec<Vec4>,
     cell: f32,
 }
 
@@ -30,12 +33,13 @@ impl PosedSurface {
     /// The canonical body, with an occupancy of cells of side `cell`, normalised metres.
     pub fn new(body: &Body, cell: f32) -> Result<Self, Error> {
         let mesh = MeshDistance::new(&body.canonical.vertices, &body.model.faces)?;
-        Ok(Self { mesh, occupancy: Occupancy::default(), cell })
+        Ok(Self { mesh, occupancy: Occupancy::default(), base: Vec::new(), cell })
     }
 
-    /// Moves it to another pose, out to `extent`.
-    pub fn refit(&mut self, body: &Body, posed: &Posed, extent: &Extent, config: &Config) {
-        let Self { mesh, occupancy, cell } = self;
+    /// Moves it to another pose, out to `extent`, in these colours.
+    pub fn refit(&mut self, body: &Body, posed: &Posed, extent: &Extent, config: &Config, colors: &VertexColors) {
+        let Self { mesh, occupancy, base, cell } = self;
+        colors.before_sigmoid(&colors.light.on_surface(&posed.vertices, &body.model.faces), base);
         let size = OccupancyConfig { margin: config.motion.reach(), depth: config.motion.depth, cell: *cell };
         rayon::join(
             || mesh.refit(&posed.vertices),

@@ -3,7 +3,7 @@
 use std::borrow::Cow;
 use std::sync::Arc;
 
-use glam::{Vec3, Vec4};
+use glam::Vec3;
 use smpl::{MotionField, MotionFrame, Posed, SurfaceMotion, WeightVolume};
 use visibility::VisibilityCounts;
 use volrender::Occupancy;
@@ -12,6 +12,7 @@ use crate::Error;
 use crate::config::{Config, MotionKind};
 use crate::model::arena::Arena;
 use crate::model::body::Body;
+use crate::model::colors::VertexColors;
 use crate::model::correction::{Corrections, corrected};
 use crate::model::distance::needs_neighbours;
 use crate::model::extent::Extent;
@@ -40,8 +41,8 @@ pub struct Model {
     pub(crate) corrections: Corrections,
     /// Where the field ended when it was last looked at.
     pub(crate) extent: Extent,
-    /// What colours start from, V; empty where they start from nothing.
-    pub(crate) base: Vec<Vec4>,
+    /// What colours start from; empty where they start from nothing.
+    pub(crate) base: VertexColors,
     pub(crate) steps_done: u64,
 }
 
@@ -51,7 +52,7 @@ impl Model {
         config: Config,
         body: Arc<Body>,
         frames: Vec<Arc<PosedView>>,
-        base: Vec<Vec4>,
+        base: VertexColors,
     ) -> Result<Self, Error> {
         config.validate()?;
         let (levels, lists) = (body.query.pyramid().levels.len(), body.query.neighbours_per_query());
@@ -195,7 +196,7 @@ impl Model {
             frame,
             near_canonical: &self.near_canonical,
             extent,
-            base: &self.base,
+            base: &surface.base,
             neighbours: self.needs_neighbours(),
             faces: !self.parameters.get(Part::Pose).is_empty(),
         }

@@ -48,7 +48,7 @@ impl Renderer for FieldRenderer<'_> {
     fn render(&mut self, view: &PosedView, background: Vec3) -> Result<Rendering, Error> {
         let Self { model, code, extent, surface } = self;
         let posed = model.corrected(view);
-        surface.refit(&model.body, &posed, extent, &model.config);
+        surface.refit(&model.body, &posed, extent, &model.config, &model.base);
         let motion = MotionFrame::new(&model.body.model, &posed);
         let tracer = model.tracer(surface, extent, &motion);
         paint(view, background, Scratch::default, |scratch, row, columns| {
@@ -91,7 +91,7 @@ mod tests {
         let picture = renderer.render(view, background).unwrap();
         let posed = model.corrected(view);
         let whole = Extent::whole(&scene.body, model.config());
-        renderer.surface.refit(&scene.body, &posed, &whole, model.config());
+        renderer.surface.refit(&scene.body, &posed, &whole, model.config(), &model.base);
         let motion = MotionFrame::new(&body, &posed);
         let tracer = model.tracer(&renderer.surface, &whole, &motion);
         let mut all = SampleBatch::default();

@@ -28,6 +28,8 @@ impl Renderer for PriorRenderer<'_> {
     fn render(&mut self, view: &PosedView, background: Vec3) -> Result<Rendering, Error> {
         let faces = &self.body.model.faces;
         let mesh = visibility::RayMesh::new(&view.posed.vertices, faces)?;
+        let shades = self.colors.light.on_surface(&view.posed.vertices, faces);
+        let lit: Vec<Vec3> = self.colors.lit(&shades).collect();
         let share = 1.0 / (SUPERSAMPLING * SUPERSAMPLING) as f32;
         paint(
             view,
@@ -44,8 +46,7 @@ impl Renderer for PriorRenderer<'_> {
                             if let Some(hit) = mesh.first_hit(ray.origin, ray.direction) {
                                 let corners = faces[hit.face as usize];
                                 let weighted = corners.iter().zip(hit.barycentric);
-                                color +=
-                                    share * weighted.map(|(&v, b)| b * self.colors.colors[v as usize]).sum::<Vec3>();
+                                color += share * weighted.map(|(&v, b)| b * lit[v as usize]).sum::<Vec3>();
                                 opacity += share;
                             }
                         }

@@ -2,64 +2,69 @@
 
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
+use surface_query::vertex_normals;
 
 use crate::Error;
+use crate::capture::Light;
 use crate::model::colors::VertexColors;
-use crate::scene::prepared::{Scene, pinhole};
+use crate::scene::light::{Seen, albedo, measure_light};
+use crate::scene::pinhole::pinhole;
+use crate::scene::prepared::{PreparedFrame, Scene};
 
 impl VertexColors {
-    /// The mean colour of the visible training pixels that saw each vertex, by ray casting; a
-    /// vertex that none saw takes the mean of those that some saw, weighted by their canonical
-    /// distances to the power of −4 (Shepard 1968).
+    /// The colour that is closest to the visible training pixels that saw a vertex, by ray casting,
+    /// under the light of the scene if the configuration asks for one; a vertex that none saw takes
+    /// the mean of those that some saw, weighted by their canonical distances to the power of −4
+    /// (Shepard 1968).
+    ///
+    /// # Errors
+    /// Pictures that cannot be read.
     pub fn measure(scene: &Scene) -> Result<Self, Error> {
-        let per_frame: Result<Vec<Vec<(Vec3, u32)>>, Error> = scene
-            .train
-            .par_iter()
-            .map(|frame| {
-                let mesh = visibility::RayMesh::new(&frame.view.posed.vertices, &scene.body.model.faces)?;
-                let pixels = frame.pixels()?;
-                let usable: Vec<bool> = pixels.mask.iter().map(|&m| m > 0.5).collect();
-                let view = pinhole(&frame.view.camera);
-                let seen = visibility::visible_vertices(&mesh, &frame.view.posed.vertices, &view, Some(&usable));
-                let colour = |(vertex, seen): (&Vec3, bool)| {
-                    let at = seen.then(|| frame.view.camera.project(*vertex)).flatten()?;
-                    let pixel = at.y as usize * frame.view.camera.width as usize + at.x as usize;
-                    let coverage = *pixels.mask.get(pixel)?;
-                    // Edge pixels are mixed with black in proportion to what the mask leaves free.
-                    Some(Vec3::from_slice(&pixels.image.pixels[3 * pixel..]) / coverage.max(0.5))
-                };
-                let colors = frame.view.posed.vertices.iter().zip(seen).map(colour);
-                Ok(colors.map(|c| c.map_or((Vec3::ZERO, 0), |c| (c, 1))).collect())
-            })
-            .collect();
-        let mut sums = vec![(Vec3::ZERO, 0u32); scene.body.canonical.vertices.len()];
-        for frame in per_frame? {
-            for (sum, (color, count)) in sums.iter_mut().zip(frame) {
-                *sum = (sum.0 + color, sum.1 + count);
-            }
-        }
+        let frames: Result<Vec<Vec<Seen>>, Error> = scene.train.par_iter().map(|frame| seen(scene, frame)).collect();
+        let frames = frames?;
         let vertices = &scene.body.canonical.vertices;
-        let known: Vec<usize> = (0..sums.len()).filter(|&v| sums[v].1 > 0).collect();
+        let light = if scene.lit { measure_light(&frames, vertices.len()) } else { Light::default() };
+        let sums = albedo(frames.iter().flatten(), vertices.len(), |normal| light.on(normal));
+        let known: Vec<usize> = (0..sums.len()).filter(|&v| sums[v].1 > 0.0).collect();
+        let color = |v: usize| sums[v].0 / sums[v].1;
         let colors = (0..sums.len())
             .into_par_iter()
             .map(|v| {
-                let (sum, count) = sums[v];
-                if count > 0 {
-                    return sum / count as f32;
+                if sums[v].1 > 0.0 {
+                    return color(v);
                 }
                 let (mut sum, mut weights) = (DVec3::ZERO, 0.0);
                 for &k in &known {
                     // Vertices of a seam may coincide.
                     let squared = f64::from(vertices[k].distance_squared(vertices[v])).max(1e-12);
                     let weight = 1.0 / (squared * squared);
-                    sum += weight * (sums[k].0 / sums[k].1 as f32).as_dvec3();
+                    sum += weight * color(k).as_dvec3();
                     weights += weight;
                 }
                 if weights > 0.0 { (sum / weights).as_vec3() } else { Vec3::splat(0.5) }
             })
             .collect();
-        Ok(Self { colors, seen: sums.iter().map(|sum| sum.1 > 0).collect() })
+        Ok(Self { colors, seen: sums.iter().map(|sum| sum.1 > 0.0).collect(), light })
     }
+}
+
+/// What a frame shows of the vertices at pixels of the subject, by ray casting.
+fn seen(scene: &Scene, frame: &PreparedFrame) -> Result<Vec<Seen>, Error> {
+    let (camera, posed, faces) = (&frame.view.camera, &frame.view.posed.vertices, &scene.body.model.faces);
+    let mesh = visibility::RayMesh::new(posed, faces)?;
+    let pixels = frame.pixels()?;
+    let usable: Vec<bool> = pixels.mask.iter().map(|&m| m > 0.5).collect();
+    let visible = visibility::visible_vertices(&mesh, posed, &pinhole(camera), Some(&usable));
+    let normals = if scene.lit { vertex_normals(posed, faces) } else { vec![Vec3::ZERO; posed.len()] };
+    let color = |v: usize| {
+        let at = visible[v].then(|| camera.project(posed[v])).flatten()?;
+        let pixel = at.y as usize * camera.width as usize + at.x as usize;
+        let coverage = *pixels.mask.get(pixel)?;
+        // Edge pixels are mixed with black in proportion to what the mask leaves free.
+        let color = Vec3::from_slice(&pixels.image.pixels[3 * pixel..]) / coverage.max(0.5);
+        Some((v as u32, color, normals[v].normalize_or_zero()))
+    };
+    Ok((0..posed.len()).filter_map(color).collect())
 }
 
 #[cfg(test)]
@@ -72,14 +77,14 @@ mod tests {
     use crate::train::trainer::Trainer;
     use smpl::MotionFrame;
 
-    /// Face, barycentrics and colour of every sample of the first training frame.
+    /// Face, barycentrics and colour of every sample of a view from another side.
     fn colours_of_samples(trainer: &Trainer<'_>) -> Vec<((u32, [f32; 3]), Vec3)> {
-        let (view, model) = (&*trainer.scene.train[0].view, trainer.model());
+        let (view, model) = (&*trainer.scene.eval[0].view, trainer.model());
         let mut code = VertexCode::default();
         model.encode_vertices(&mut code);
         let posed = model.corrected(view);
         let mut surface = PosedSurface::new(&model.body, CELL).unwrap();
-        surface.refit(&model.body, &posed, &model.extent, &model.config);
+        surface.refit(&model.body, &posed, &model.extent, &model.config, &model.base);
         let motion = MotionFrame::new(&model.body.model, &posed);
         let tracer = model.tracer(&surface, &model.extent, &motion);
         let mut batch = SampleBatch::default();
@@ -97,7 +102,10 @@ mod tests {
         let body = smpl::BodyModel::embedded();
         let demo = crate::capture::DemoConfig { size: 48, frames: 4, eval_cameras: 1, ..Default::default() };
         let capture = crate::capture::demo(&demo, &body).unwrap();
-        let config = Config::preset(Preset::Fast, Method::Occnerf);
+        let mut config = Config::preset(Preset::Fast, Method::Occnerf);
+        config.field.prior_light = false;
+        // Samples know their faces where poses are learnt.
+        config.motion.correction_spacing = 4;
         let scene = Scene::new(&capture, &body, &config).unwrap();
         let shown = VertexColors::measure(&scene).unwrap();
         assert!(shown.colors.iter().all(|c| (c.cmpge(Vec3::ZERO) & c.cmple(Vec3::ONE)).all()));

@@ -1,5 +1,9 @@
-//! A capture made ready: normalised lengths, posed bodies, labelled pixels, colours of the prior.
+//! A capture made ready: normalised lengths, the prior registered, posed bodies, labelled pixels,
+//! colours of the prior and the light on it.
 
 pub(crate) mod colors;
 pub(crate) mod labels;
+pub(crate) mod light;
+pub(crate) mod pinhole;
 pub(crate) mod prepared;
+pub(crate) mod registration;

@@ -4,8 +4,7 @@ use std::sync::Arc;
 
 use rayon::prelude::*;
 use smpl::BodyModel;
-use visibility::{RayMesh, View};
-use volrender::Camera;
+use visibility::RayMesh;
 
 use crate::Error;
 use crate::capture::{Capture, Frame, PixelSource, Pixels};
@@ -13,6 +12,8 @@ use crate::config::Config;
 use crate::model::body::{Body, Moment};
 use crate::model::view::PosedView;
 use crate::scene::labels::{Label, Labels, label_pixels};
+use crate::scene::pinhole::pinhole;
+use crate::scene::registration::register;
 
 /// A frame with its posed prior.
 pub struct PreparedFrame {
@@ -50,6 +51,10 @@ pub struct Scene {
     pub train: Vec<PreparedFrame>,
     /// Evaluation frames, never seen in training.
     pub eval: Vec<PreparedFrame>,
+    /// What was prepared: the bodies as registration has corrected them.
+    pub capture: Capture,
+    /// Whether colours are to be told apart from a light.
+    pub(crate) lit: bool,
 }
 
 impl Scene {
@@ -64,13 +69,24 @@ impl Scene {
             let (name, at, frames) = (&lost.frame.name, lost.train_index, capture.train.len());
             return Err(Error::Scene(format!("view {name} is of training frame {at}, expected one of {frames}")));
         }
+        let mut capture = capture.clone();
+        if config.registration.rounds > 0 && !capture.registered {
+            register(&mut capture, model, config.registration.rounds)?;
+        }
         let body = Arc::new(Body::new(model, &capture.mean_betas, config)?);
         let train: Result<Vec<_>, Error> = (capture.train.par_iter().enumerate())
             .map(|(i, frame)| prepare(&body, frame, i, "", Some(config)))
             .collect();
         let eval: Result<Vec<_>, Error> =
             capture.eval.par_iter().map(|e| prepare(&body, &e.frame, e.train_index, &e.camera_name, None)).collect();
-        let scene = Self { name: capture.name.clone(), train: train?, eval: eval?, body };
+        let scene = Self {
+            name: capture.name.clone(),
+            train: train?,
+            eval: eval?,
+            body,
+            capture,
+            lit: config.field.prior_light,
+        };
         if scene.train.iter().all(|f| f.labels.num_subject() == 0) {
             return Err(Error::Scene(format!("{}: no training mask shows the subject", scene.name)));
         }
@@ -147,14 +163,4 @@ fn silhouette(body: &Body, view: &PosedView) -> Result<Vec<bool>, Error> {
     let mut covered = vec![false; (width * view.camera.height) as usize];
     pixels.iter().zip(&hits).for_each(|(&pixel, hit)| covered[pixel as usize] = hit.is_some());
     Ok(covered)
-}
-
-/// The pinhole view that the visibility crate asks for.
-pub(crate) fn pinhole(camera: &Camera) -> View {
-    View {
-        intrinsics: camera.intrinsics(),
-        extrinsics: camera.world_to_camera,
-        width: camera.width,
-        height: camera.height,
-    }
 }

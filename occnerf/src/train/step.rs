@@ -231,6 +231,7 @@ mod tests {
         let capture = demo(&DemoConfig { size: 40, frames: 4, eval_cameras: 1, ..Default::default() }, &body).unwrap();
         let mut config = Config::preset(Preset::Fast, Method::Occnerf);
         (config.patches, config.patch_size, config.steps) = (2, 24, 100);
+        (config.motion.correction_spacing, config.rates.pose) = (4, 2e-4);
         config.field.density_scale *= 30.0;
         let scene = Scene::new(&capture, &body, &config).unwrap();
         let at = |min_transmittance| step(&scene, &Config { min_transmittance, ..config.clone() });

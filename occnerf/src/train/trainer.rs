@@ -65,7 +65,7 @@ impl<'a> Trainer<'a> {
     /// A configuration that is not valid or not the one that `scene` was prepared for.
     pub fn new(scene: &'a Scene, config: Config) -> Result<Self, Error> {
         let colors = config.field.prior_colors.then(|| VertexColors::measure(scene)).transpose()?;
-        let base = colors.map_or_else(Vec::new, |colors| colors.before_sigmoid());
+        let base = colors.unwrap_or_default();
         let frames = scene.train.iter().map(|frame| frame.view.clone()).collect();
         let mut model = Model::new(config, scene.body.clone(), frames, base)?;
         let surface = &model.config.surface;
@@ -192,7 +192,7 @@ impl<'a> Trainer<'a> {
         if interval > 0 && step > 0 && step.is_multiple_of(interval) {
             model.extent = model.measure_extent(vertex_code);
         }
-        surface.refit(&model.body, posed, &model.extent, &model.config);
+        surface.refit(&model.body, posed, &model.extent, &model.config, &model.base);
         deal(batch, frame, groups);
         let motion = MotionFrame::new(&scene.body.model, posed);
         let pass =

@@ -88,6 +88,7 @@ pub fn capture_from(metres: f32) -> Capture {
         train: vec![frame(0, 0.0, 0, metres), frame(1, 1.0, half, metres)],
         eval: eval.collect(),
         mean_betas: vec![0.0],
+        registered: false,
     }
 }
 
@@ -95,6 +96,7 @@ pub fn capture_from(metres: f32) -> Capture {
 pub fn config(method: Method) -> Config {
     let mut config = Config::preset(Preset::Fast, method);
     config.steps = 6;
+    config.registration.rounds = 0;
     (config.patches, config.patch_size, config.samples) = (2, 8, 12);
     (config.field.width, config.field.depth) = (16, 1);
     (config.encoding.levels, config.encoding.log2_table_size, config.encoding.n_max) = (2, 6, 24);

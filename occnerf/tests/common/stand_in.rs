@@ -1,8 +1,8 @@
 //! A stand-in for a baked person: the posed prior in mean vertex colours, a few texels a face.
 
 use glam::{Affine3A, Vec2, Vec3};
-use occnerf::bake::{Atlas, Avatar, Clip, motion_of_bones, skeleton, upright};
-use occnerf::{Scene, VertexColors, upright as up_of};
+use occnerf::bake::{Atlas, Avatar, Clip, motion_of_bones, skeleton, turn_upright};
+use occnerf::{Scene, VertexColors, upright};
 use volrender::Camera;
 
 /// Texels a side of the square that a face's colours stand in.
@@ -12,8 +12,8 @@ const CELL: usize = 8;
 pub fn stand_in(scene: &Scene, colors: &VertexColors) -> Avatar {
     let body = &scene.body;
     let metres = 1.0 / body.scale;
-    let up = up_of(body, scene.train.iter().map(|frame| &*frame.view));
-    let world = Affine3A::from_mat3(upright(up) * metres);
+    let up = upright(body, scene.train.iter().map(|frame| &*frame.view));
+    let world = Affine3A::from_mat3(turn_upright(up) * metres);
     let model = &body.model;
     let rest: Vec<Vec3> = body.canonical.joints.iter().map(|&joint| joint * metres).collect();
     let skeleton = skeleton(&model.parents, &rest);

@@ -77,7 +77,7 @@ impl Global {
             ("torch", "CharStorage") => Self::Class("torch.CharStorage"),
             ("torch", "ByteStorage") => Self::Class("torch.ByteStorage"),
             ("torch", "BoolStorage") => Self::Class("torch.BoolStorage"),
-            _ => return Err(format!("global `{module} {name}` is not allowed")),
+            _ => return Err(format!("global `{} {}` is not allowed", module.escape_debug(), name.escape_debug())),
         })
     }
 }

@@ -1,8 +1,8 @@
 //! Every reader of somebody else's files, on damaged ones: no panic, no hang, and no more memory
 //! than is said.
 //!
-//! A few thousand inputs by default; `FUZZ=1000000 cargo test --release -p testkit --test fuzz --
-//! --nocapture` for a million and a table. Input number n of a reader is the same on every machine;
+//! A few thousand inputs by default; `FUZZ=1000000 cargo test -p testkit --test fuzz -- --nocapture`
+//! for a million and a table. Input number n of a reader is the same on every machine;
 //! one that fails is left in `target/tmp`.
 #![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
 
@@ -94,8 +94,14 @@ fn place(name: &str) -> PathBuf {
 
 #[test]
 fn pickles() {
-    Attack { name: "pickle", form: Form::Plain, seeds: seeds::pickles(), share: 200, most: 64 * MIB }
+    Attack { name: "pickle", form: Form::Plain, seeds: seeds::pickles(), share: 100, most: 64 * MIB }
         .run(|bytes| pickle::parse("a.pkl", bytes).is_ok());
+}
+
+#[test]
+fn joblib_files() {
+    Attack { name: "joblib", form: Form::Plain, seeds: seeds::joblibs(), share: 100, most: 64 * MIB }
+        .run(|bytes| pickle::from_bytes("a.pkl", bytes.to_vec()).is_ok());
 }
 
 #[test]

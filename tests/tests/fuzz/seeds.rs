@@ -23,6 +23,13 @@ pub fn pickles() -> Vec<Vec<u8>> {
     (0..=5).map(|protocol| fixture(&format!("values.protocol{protocol}.pkl"))).collect()
 }
 
+/// Of `joblib.dump`: arrays behind their pickle, plain and compressed in every way that it has.
+pub fn joblibs() -> Vec<Vec<u8>> {
+    let kinds =
+        ["plain", "plain", "plain", "protocol2", "protocol2", "old", "zlib", "gzip", "bz2", "lzma", "xz", "old_zlib"];
+    kinds.iter().map(|kind| fixture(&format!("joblib.{kind}.pkl"))).collect()
+}
+
 fn array(shape: &[usize], data: Data) -> NdArray {
     NdArray { shape: shape.to_vec(), data }
 }

@@ -57,7 +57,7 @@ impl Level {
         }
         Point {
             bench: "stability".to_owned(),
-            name: format!("{} {}{}", axis.name, super::scale::number(self.value), axis.unit),
+            name: format!("{} {}{}", axis.name, crate::scale::number(self.value), axis.unit),
             factor: axis.name.to_owned(),
             level: Some(self.value),
             kind: if self.easy { Kind::Base } else { Kind::Level },

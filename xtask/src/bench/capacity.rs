@@ -11,8 +11,8 @@ use super::chart::{self, Mark, Panel, Picture, Shape, Style};
 use super::pareto::{Pick, on_front};
 use super::points::{Setting, Sweep};
 use super::runner::{Bench, Kind, Line, Point};
-use super::scale::Scale;
 use crate::capacity;
+use crate::scale::Scale;
 use crate::source::Source;
 
 /// Fixed sizes around `balanced`: name, as `train --set` takes it, whether the quick form has it.

@@ -9,9 +9,9 @@ use plotters::coord::Shift;
 use plotters::prelude::*;
 use plotters::style::text_anchor::{HPos, Pos, VPos};
 
-use super::scale::Scale;
 use crate::font::{FONT, LETTER, register_font};
 use crate::process::say;
+use crate::scale::Scale;
 
 /// PNGs are drawn so much larger and reduced, for smooth edges.
 const OVERSAMPLING: i32 = 2;

@@ -15,7 +15,7 @@ use super::chart::{Line, Mark, Panel, Picture, Shape, Style};
 use super::difficulty::Difficulty;
 use super::job::{Job, Place};
 use super::runner::{Bench, Kind, Point};
-use super::scale::{Scale, number};
+use crate::scale::{Scale, number};
 
 /// Steps of each run; the median is over the second half, when buffers have grown to size.
 const STEPS: u64 = 10;
@@ -41,10 +41,15 @@ const GROWTHS: [Growth; 6] = [
         set: |c, _, l| (c.encoding.log2_table_size, c.encoding.n_max) = (l as u32, 2048),
     },
     Growth { name: "vertices", levels: &[0.0, 1.0, 2.0], set: |_, d, l| d.refined = l as u32 },
-    Growth { name: "frames", levels: &[10.0, 20.0, 40.0, 80.0, 160.0], set: |_, d, l| d.demo.frames = l as usize },
     Growth {
+        name: "frames",
+        levels: &[10.0, 100.0, 1000.0, 3000.0],
+        set: |_, d, l| (d.demo.size, d.demo.frames, d.demo.eval_every) = (64, l as usize, l as usize),
+    },
+    Growth {
+        // The last has as many as 1920 × 1080.
         name: "pixels of a frame",
-        levels: &[96.0, 136.0, 192.0, 272.0, 384.0],
+        levels: &[128.0, 256.0, 512.0, 1024.0, 1440.0],
         set: |_, d, l| d.demo.size = l as u32,
     },
 ];
@@ -65,14 +70,22 @@ pub fn run(bench: &mut Bench, out: &Path) -> Result<String> {
     }
     let mut panels = Vec::new();
     let mut table = String::from(
-        "| what grows | level | step s | step exponent | MB | samples |\n| --- | ---: | ---: | ---: | ---: | ---: |\n",
+        "Seconds to make a capture ready, to take a step and to draw a view; behind each the power of the level that it \
+         grew with since the line before.\n\n\
+         | what grows | level | ready s | | step s | | drawn s | | MB | samples |\n\
+         | --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |\n",
     );
     for growth in &GROWTHS {
         panels.extend(grow(growth, bench, &mut table)?);
     }
+    let linear = ("linear".to_owned(), Style(5, Shape::Dash));
     let picture = Picture {
-        title: "One step of training as the work grows".to_owned(),
-        legend: vec![("measured".to_owned(), Style(0, Shape::Circle)), ("linear".to_owned(), Style(5, Shape::Dash))],
+        title: "Time and memory as the work grows".to_owned(),
+        legend: TIMES
+            .iter()
+            .map(|(name, color)| ((*name).to_owned(), Style(*color, Shape::Circle)))
+            .chain([linear])
+            .collect(),
         columns: 4,
         size: (330, 280),
         panels,
@@ -148,9 +161,12 @@ fn flops(config: &Config) -> f64 {
     widths.windows(2).map(|w| 2.0 * (w[0] * w[1]) as f64).sum()
 }
 
+/// What is timed, and its colour.
+const TIMES: [(&str, usize); 3] = [("a step, or memory", 0), ("making ready", 1), ("drawing a view", 2)];
+
 /// Two panels, time and memory, and rows of the table.
 fn grow(growth: &Growth, bench: &mut Bench, table: &mut String) -> Result<Vec<Panel>> {
-    let (mut time, mut memory) = (Vec::new(), Vec::new());
+    let (mut times, mut memory): ([Vec<(f64, f64)>; 3], _) = (Default::default(), Vec::new());
     for &level in growth.levels {
         let (mut config, mut difficulty) = (Config::preset(Preset::Fast, Method::Occnerf), small());
         config.steps = STEPS;
@@ -158,41 +174,51 @@ fn grow(growth: &Growth, bench: &mut Bench, table: &mut String) -> Result<Vec<Pa
         let Some(line) = bench.run(point(format!("{} {level}", growth.name), growth.name, config, difficulty))? else {
             continue;
         };
-        if let Some(error) = &line.outcome.error {
+        let outcome = &line.outcome;
+        if let Some(error) = &outcome.error {
             bail!("{} {level}: {error}", growth.name);
         }
         let at = match growth.name {
-            "vertices" => line.outcome.vertices as f64,
-            "million parameters" => 1e-6 * line.outcome.parameters as f64,
+            "vertices" => outcome.vertices as f64,
+            "million parameters" => 1e-6 * outcome.parameters as f64,
             "pixels of a frame" => level * level,
             _ => level,
         };
-        time.push((at, line.outcome.step_seconds));
-        memory.push((at, line.outcome.peak_rss_bytes as f64 / 1e6));
-        let exponent = match time.as_slice() {
-            [.., a, b] => format!("{:.2}", (b.1 / a.1).ln() / (b.0 / a.0).ln()),
-            _ => String::new(),
-        };
-        let (step, megabytes) = (line.outcome.step_seconds, line.outcome.peak_rss_bytes as f64 / 1e6);
-        let _ = writeln!(
-            table,
-            "| {} | {} | {step:.3} | {exponent} | {megabytes:.0} | {:.0} |",
-            growth.name,
-            number(at),
-            line.outcome.live_samples
-        );
+        let megabytes = outcome.peak_rss_bytes as f64 / 1e6;
+        let _ = write!(table, "| {} | {} |", growth.name, number(at));
+        let seconds = [outcome.step_seconds, outcome.prepare_seconds, outcome.seconds_per_frame];
+        for (course, seconds) in times.iter_mut().zip(seconds) {
+            course.push((at, seconds));
+        }
+        for i in [1, 0, 2] {
+            let exponent = match times[i].as_slice() {
+                [.., a, b] => format!("{:.2}", (b.1 / a.1).ln() / (b.0 / a.0).ln()),
+                _ => String::new(),
+            };
+            let _ = write!(table, " {:.3} | {exponent} |", seconds[i]);
+        }
+        let _ = writeln!(table, " {megabytes:.0} | {:.0} |", outcome.live_samples);
+        memory.push((at, megabytes));
     }
-    let panel = |what: &str, points: Vec<(f64, f64)>| {
+    let panel = |what: &str, courses: &[Vec<(f64, f64)>]| {
         // Through the last point, so that what grows faster than linearly lies below it before.
         let linear =
-            points.last().map_or(Vec::new(), |end| points.iter().map(|p| (p.0, end.1 * p.0 / end.0)).collect());
+            courses[0].last().map_or(Vec::new(), |end| courses[0].iter().map(|p| (p.0, end.1 * p.0 / end.0)).collect());
+        let all = || courses.iter().flatten();
+        let mut lines = vec![Line { points: linear, color: 5 }];
+        let mut marks = Vec::new();
+        for (course, (_, color)) in courses.iter().zip(TIMES) {
+            lines.push(Line { points: course.clone(), color });
+            let style = Style(color, Shape::Circle);
+            marks.extend(course.iter().map(|&at| Mark { at, name: String::new(), style }));
+        }
         Panel {
             title: format!("{what} against {}", growth.name),
             labels: [growth.name.to_owned(), what.to_owned()],
-            scales: [Scale::around(points.iter().map(|p| p.0), true), Scale::around(points.iter().map(|p| p.1), true)],
-            lines: vec![Line { points: linear, color: 5 }, Line { points: points.clone(), color: 0 }],
-            marks: points.iter().map(|&at| Mark { at, name: String::new(), style: Style(0, Shape::Circle) }).collect(),
+            scales: [Scale::around(all().map(|p| p.0), true), Scale::around(all().map(|p| p.1), true)],
+            lines,
+            marks,
         }
     };
-    Ok(vec![panel("seconds a step", time), panel("MB", memory)])
+    Ok(vec![panel("seconds", &times), panel("MB", &[memory])])
 }

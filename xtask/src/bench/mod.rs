@@ -12,7 +12,6 @@ mod kernels;
 mod pareto;
 mod points;
 mod runner;
-mod scale;
 mod stability;
 
 use std::path::{Path, PathBuf};
@@ -30,10 +29,6 @@ use crate::run::{check_threads, use_threads, write};
 use crate::shard::ShardArguments;
 use crate::source::{LoadArguments, Source};
 use crate::{source, train};
-
-pub use self::kernels::RESULTS;
-pub use self::runner::{LOG, read};
-pub use self::scale::{Scale, number};
 
 /// Steps of a point of `pareto` at which presets run their own number of steps: those of `fast`.
 const FULL_STEPS: u64 = 400;

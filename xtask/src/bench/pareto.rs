@@ -9,7 +9,7 @@ use super::chart::{self, Mark, Panel, Picture, Shape, Style};
 use super::front::front;
 use super::points::Sweep;
 use super::runner::{Bench, Kind, Line};
-use super::scale::Scale;
+use crate::scale::Scale;
 
 /// A measured quantity of a run.
 pub type Pick = fn(&Line) -> Option<f64>;

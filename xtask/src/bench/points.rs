@@ -22,12 +22,15 @@ const fn change(factor: &'static str, name: &'static str, set: &'static [&'stati
 }
 
 /// Every change but of the number of steps, most telling first.
-pub const CHANGES: [Change; 20] = [
+pub const CHANGES: [Change; 23] = [
+    change("registration", "no registration", &["registration.rounds=0"], true),
+    change("light", "even light", &["field.prior_light=false"], false),
+    change("poses", "poses learnt", &["motion.correction_spacing=4", "rates.pose=2e-4"], false),
     change("distance", "blended distance", &["surface.distance=blended"], true),
     change(
         "motion",
         "volume motion",
-        &["motion.kind=volume", "motion.correction_spacing=0", "motion.shell_interval=0", "field.prior_colors=false"],
+        &["motion.kind=volume", "motion.shell_interval=0", "field.prior_colors=false"],
         true,
     ),
     change("span", "every sample", &["motion.shell_interval=0", "min_transmittance=0"], false),

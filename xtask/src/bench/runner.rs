@@ -10,10 +10,9 @@ use serde::{Deserialize, Serialize};
 
 use super::job::{self, Job, Outcome};
 use crate::process::{Lock, say, unwritten};
+use crate::results::BENCH_LOG;
 use crate::shard::Shard;
 
-/// Name of the log.
-pub const LOG: &str = "bench.jsonl";
 /// A run that takes longer is ended and counts as failed.
 const LIMIT: Duration = Duration::from_secs(30 * 60);
 
@@ -100,7 +99,7 @@ fn read_all(directory: &Path) -> Result<Vec<Line>> {
     let of_part = |name: &str| name.starts_with("bench-") && name.ends_with(".jsonl");
     let mut paths: Vec<PathBuf> = entries
         .filter_map(|entry| Some(entry.ok()?.path()))
-        .filter(|path| path.file_name().and_then(|n| n.to_str()).is_some_and(|name| name == LOG || of_part(name)))
+        .filter(|path| path.file_name().and_then(|n| n.to_str()).is_some_and(|name| name == BENCH_LOG || of_part(name)))
         .collect();
     paths.sort();
     let mut lines: Vec<Line> = Vec::new();
@@ -143,7 +142,7 @@ impl Bench {
     /// its own, and reads those of the others.
     pub fn open(directory: &Path, threads: Option<usize>, budget: Duration, shard: Option<Shard>) -> Result<Self> {
         crate::run::make_directory(directory)?;
-        let path = directory.join(shard.map_or(LOG.to_owned(), |shard| format!("bench-{}.jsonl", shard.name())));
+        let path = directory.join(shard.map_or(BENCH_LOG.to_owned(), |shard| format!("bench-{}.jsonl", shard.name())));
         let lock = Lock::take(&match shard {
             None => directory.to_owned(),
             Some(shard) => {
@@ -283,7 +282,7 @@ pub mod tests {
     #[test]
     fn a_last_line_that_was_cut_off_is_dropped_and_any_other_damage_is_named() {
         let folder = folder("damage");
-        let path = folder.join(LOG);
+        let path = folder.join(BENCH_LOG);
         let (a, b) = (line("a", "k", Kind::Change, 20.0, 3.0), line("b", "k", Kind::Change, 21.0, 4.0));
         let (a, b) = (serde_json::to_string(&a).unwrap(), serde_json::to_string(&b).unwrap());
         std::fs::write(&path, format!("{a}\n{}", &b[..b.len() / 2])).unwrap();
@@ -295,7 +294,7 @@ pub mod tests {
         drop(bench);
         std::fs::write(&path, format!("{a}\nnot json\n{b}\n")).unwrap();
         let message = read(&path).unwrap_err().to_string();
-        assert!(message.contains(LOG) && message.contains("line 2"), "{message}");
+        assert!(message.contains(BENCH_LOG) && message.contains("line 2"), "{message}");
         std::fs::remove_dir_all(&folder).unwrap();
     }
 

@@ -10,7 +10,7 @@ use occnerf::Method;
 use super::axes::Axis;
 use super::chart::{self, Mark, Panel, Picture, Shape, Style};
 use super::runner::{Bench, Line, Point};
-use super::scale::Scale;
+use crate::scale::Scale;
 
 /// Methods that are trained, ours first.
 const TRAINED: [Method; 3] = [Method::Occnerf, Method::HashPoint, Method::Humannerf];
@@ -158,7 +158,7 @@ pub fn table(axes: &[Axis], lines: &[Line]) -> String {
     text.push_str("\n| --- |");
     methods.iter().for_each(|_| text.push_str(" --- |"));
     for axis in axes {
-        let name = |i: usize| format!("{}{}", super::scale::number(axis.levels[i].value), axis.unit);
+        let name = |i: usize| format!("{}{}", crate::scale::number(axis.levels[i].value), axis.unit);
         let all: Vec<String> = (0..axis.levels.len()).map(name).collect();
         let _ = write!(text, "\n| {}: {} |", axis.name, all.join(", "));
         for method in &methods {
@@ -221,7 +221,7 @@ pub fn charts(scene: &str, axes: &[Axis], lines: &[Line], stem: &Path) -> Result
             title: axis.name.to_owned(),
             labels: [axis.unit.trim().to_owned(), "psnr_mask, dB".to_owned()],
             scales: [
-                Scale::Named(axis.levels.iter().map(|l| super::scale::number(l.value)).collect()),
+                Scale::Named(axis.levels.iter().map(|l| crate::scale::number(l.value)).collect()),
                 Scale::Linear(0.0..1.0),
             ],
             lines: Vec::new(),

@@ -14,7 +14,7 @@ use anyhow::{Context, Result, bail};
 use clap::{Args, ValueEnum};
 use smpl::{BodyModel, load_mesh};
 
-use crate::eval::load_lpips;
+use crate::network::load_lpips;
 use input::Input;
 use output::Output;
 

@@ -5,8 +5,8 @@ use std::path::Path;
 
 use anyhow::{Context, Result, bail};
 
-use super::page::escape;
-use crate::bench::{Scale, number};
+use crate::html::escape;
+use crate::scale::{Scale, number};
 
 /// Of a drawing, in its own units.
 const SIZE: (f64, f64) = (520.0, 260.0);
@@ -17,11 +17,11 @@ const MOST: usize = 600;
 /// Colours that the style knows.
 const COLORS: usize = 7;
 
-/// A training log: one JSON object a line.
+/// A log of training, or of a bench: one JSON object a line.
 pub struct Log(Vec<serde_json::Value>);
 
 impl Log {
-    /// Reads train.jsonl; none if there is none, as for methods that do not train. A last line that
+    /// Reads a log; none if there is none, as for methods that do not train. A last line that
     /// was cut off is left out.
     pub fn read(path: &Path) -> Result<Option<Self>> {
         if !path.exists() {
@@ -38,6 +38,11 @@ impl Log {
             }
         }
         Ok(Some(Self(values)))
+    }
+
+    /// Its lines.
+    pub fn lines(&self) -> &[serde_json::Value] {
+        &self.0
     }
 
     fn course(&self, key: &str) -> Vec<(f64, f64)> {
@@ -86,7 +91,7 @@ pub fn curves(logs: &[(String, Log)], key: &str, label: &str, logarithmic: bool)
     let (middle, low) = ((left + SIZE.0 - right) / 2.0, SIZE.1 - 6.0);
     let _ = write!(svg, "<text x={middle} y={low} text-anchor=middle>seconds</text>");
     for (i, (_, points)) in courses.iter().enumerate() {
-        let shown = points.iter().filter(|p| y.shows(p.1));
+        let shown = points.iter().filter(|p| x.shows(p.0) && y.shows(p.1));
         let line: Vec<String> = shown.map(|p| format!("{:.1},{:.1}", across(p.0), down(p.1))).collect();
         let _ = write!(svg, "<polyline points=\"{}\" style=\"stroke:var(--c{})\" />", line.join(" "), i % COLORS);
     }
@@ -99,4 +104,84 @@ pub fn curves(logs: &[(String, Log)], key: &str, label: &str, logarithmic: bool)
         svg.push_str("</p>\n");
     }
     format!("<h3>{}</h3>\n{svg}", escape(label))
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::{Duration, Instant};
+
+    use super::*;
+
+    /// `FUZZ` inputs of all readers, of which this one's share is a hundredth; 200 by default.
+    #[test]
+    fn damaged_logs_are_drawn_or_refused_in_a_second() {
+        const PIECES: [&[u8]; 18] = [
+            b"1e308",
+            b"-1e308",
+            b"1e-300",
+            b"1e999",
+            b"NaN",
+            b"null",
+            b"{",
+            b"}",
+            b"[[[[[[[[[[[[[[[[",
+            b"\n",
+            b"\"",
+            b"\xff",
+            b",",
+            b":",
+            b"-0",
+            b"18446744073709551616",
+            b"\"seconds\":1e300,",
+            b"</svg>",
+        ];
+        let inputs: u64 = std::env::var("FUZZ").map_or(20_000, |n| n.parse().expect("FUZZ is a number")) / 100;
+        let line = |i: u64| format!("{{\"step\":{i},\"seconds\":{}.25,\"loss\":0.{i},\"psnr\":1{i}.5}}\n", i / 7);
+        let whole: String = (1..40).map(line).collect();
+        let folder = std::env::temp_dir().join(format!("xtask-curves-{}", std::process::id()));
+        std::fs::create_dir_all(&folder).unwrap();
+        let path = folder.join("train.jsonl");
+        let mut drawn = 0;
+        for case in 0..inputs {
+            // SplitMix64.
+            let mut state = case;
+            let mut below = |end: usize| {
+                state = state.wrapping_add(0x9e37_79b9_7f4a_7c15);
+                let z = (state ^ (state >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+                let z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+                ((z ^ (z >> 31)) % end.max(1) as u64) as usize
+            };
+            let mut bytes = whole.clone().into_bytes();
+            for _ in 0..=below(4) {
+                let at = below(bytes.len());
+                match below(4) {
+                    0 => bytes.truncate(at),
+                    1 => drop(bytes.drain(at..(at + below(40)).min(bytes.len()))),
+                    2 => drop(bytes.splice(at..at, PIECES[below(PIECES.len())].iter().copied())),
+                    // In place of a number.
+                    _ => {
+                        let digit = |i: &usize| bytes[*i].is_ascii_digit() || bytes[*i] == b'.';
+                        let start = (at..bytes.len()).find(digit).unwrap_or(at);
+                        let end = (start..bytes.len()).find(|i| !digit(i)).unwrap_or(bytes.len());
+                        drop(bytes.splice(start..end, PIECES[below(6)].iter().copied()));
+                    }
+                }
+            }
+            std::fs::write(&path, &bytes).unwrap();
+            // What another process kept waiting is tried again.
+            let quick = (0..3).any(|_| {
+                let start = Instant::now();
+                if let Ok(Some(log)) = Log::read(&path) {
+                    let logs = [(String::from("run"), log)];
+                    let svg = curves(&logs, "loss", "loss", true) + &curves(&logs, "psnr", "psnr", false);
+                    assert!(!svg.contains("NaN") && !svg.contains("inf") && svg.len() < 1 << 20, "input {case}: {svg}");
+                    drawn += 1;
+                }
+                start.elapsed() < Duration::from_secs(1)
+            });
+            assert!(quick, "input {case} took longer");
+        }
+        assert!(drawn > inputs / 10, "{drawn} of {inputs} drawn");
+        std::fs::remove_dir_all(&folder).unwrap();
+    }
 }

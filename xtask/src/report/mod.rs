@@ -9,15 +9,15 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, Result, bail, ensure};
 use clap::Args;
 use occnerf::{Capacity, Choice, Pruned};
+use serde_json::Value;
 
 use self::curves::{Log, curves};
 use self::page::Page;
-pub use self::page::escape;
 use self::viewer::{Views, viewers};
-use crate::bench;
 use crate::capacity;
 use crate::process::say;
-use crate::run::{self, LOG, METRICS, Metrics, RunConfig};
+use crate::results;
+use crate::run::{self, LOG, METRICS, Metrics, PERSON, RunConfig};
 use crate::table;
 
 /// Charts and pictures larger than this are left out, and named.
@@ -45,10 +45,16 @@ pub fn report(arguments: &ReportArguments) -> Result<()> {
         directories.extend(expand(directory)?);
     }
     let (benches, runs): (Vec<PathBuf>, Vec<PathBuf>) = directories.into_iter().partition(|d| is_bench(d));
+    let out = match (&arguments.out, &arguments.runs[..]) {
+        (Some(out), _) => out.clone(),
+        (None, [one]) => one.join("report.html"),
+        (None, several) => several[0].parent().unwrap_or(Path::new("")).join("report.html"),
+    };
+    let folder = out.parent().filter(|folder| *folder != Path::new("")).unwrap_or(Path::new("."));
     let mut page = Page::new();
     let runs: Vec<Run> = runs.iter().map(|d| Run::read(d)).collect::<Result<_>>()?;
     if !runs.is_empty() {
-        add_runs(&mut page, &runs)?;
+        add_runs(&mut page, &runs, folder)?;
     }
     for directory in &benches {
         add_bench(&mut page, directory)?;
@@ -57,11 +63,6 @@ pub fn report(arguments: &ReportArguments) -> Result<()> {
         ([one], []) => one.title(),
         ([], [one]) => name(one),
         _ => format!("{} runs and benches", runs.len() + benches.len()),
-    };
-    let out = match (&arguments.out, &arguments.runs[..]) {
-        (Some(out), _) => out.clone(),
-        (None, [one]) => one.join("report.html"),
-        (None, several) => several[0].parent().unwrap_or(Path::new("")).join("report.html"),
     };
     run::write(&out, &page.finish(&title))?;
     say!("written: {}", out.display());
@@ -73,12 +74,12 @@ pub fn write(directory: &Path, metrics: &Metrics) -> Result<()> {
     let run = Run { name: metrics.method.clone(), directory: directory.to_owned(), metrics: metrics.clone() };
     let mut page = Page::new();
     let title = run.title();
-    add_runs(&mut page, &[run])?;
+    add_runs(&mut page, &[run], directory)?;
     run::write(&directory.join("report.html"), &page.finish(&title))
 }
 
 fn is_bench(directory: &Path) -> bool {
-    directory.join(bench::LOG).is_file() || directory.join(bench::RESULTS).is_file()
+    directory.join(results::BENCH_LOG).is_file() || directory.join(results::KERNELS).is_file()
 }
 
 /// The directory itself if it is a run or a bench, else the runs in it.
@@ -92,7 +93,7 @@ fn expand(directory: &Path) -> Result<Vec<PathBuf>> {
     let mut inside: Vec<PathBuf> = entries.filter_map(|e| Some(e.ok()?.path())).filter(|p| is_run(p)).collect();
     inside.sort();
     if inside.is_empty() {
-        let (metrics, log) = (METRICS, bench::LOG);
+        let (metrics, log) = (METRICS, results::BENCH_LOG);
         bail!("{}: neither a run ({metrics}) nor a bench ({log}), nor are there runs in it", directory.display());
     }
     Ok(inside)
@@ -122,7 +123,8 @@ impl Run {
     }
 }
 
-fn add_runs(page: &mut Page, runs: &[Run]) -> Result<()> {
+/// Everything of `runs`, on a page that will lie in `folder`.
+fn add_runs(page: &mut Page, runs: &[Run], folder: &Path) -> Result<()> {
     page.heading("Scores");
     let rows: Vec<(String, &Metrics)> = runs.iter().map(|r| (r.name.clone(), &r.metrics)).collect();
     page.paragraph("Views that training never saw. Methods are ranked by psnr_mask and psnr_hidden, dB.");
@@ -145,6 +147,7 @@ fn add_runs(page: &mut Page, runs: &[Run]) -> Result<()> {
         views.extend(Views::read(&run.directory.join(NOVEL))?.map(|v| (run.name.clone(), v)));
         logs.extend(Log::read(&run.directory.join(LOG))?.map(|l| (run.name.clone(), l)));
     }
+    add_people(page, runs, folder)?;
     let viewer = viewers(&views)?;
     if !viewer.is_empty() {
         page.heading("Truth and result");
@@ -176,6 +179,18 @@ fn add_runs(page: &mut Page, runs: &[Run]) -> Result<()> {
     Ok(())
 }
 
+/// Links the pages that `view` wrote of the runs' people, from a page in `folder`.
+fn add_people(page: &mut Page, runs: &[Run], folder: &Path) -> Result<()> {
+    for run in runs {
+        let path = std::path::absolute(run.directory.join(PERSON))?;
+        if path.is_file() {
+            let from = path.strip_prefix(std::path::absolute(folder)?).unwrap_or(&path);
+            page.link(&from.to_string_lossy(), &format!("{}: the person, to turn around and play", run.name));
+        }
+    }
+    Ok(())
+}
+
 /// Each size that was chosen, with its reason, and what pruning took.
 fn add_capacity(page: &mut Page, capacity: &Capacity) {
     let header = ["size", "preset", "chosen", "why"].map(str::to_owned).to_vec();
@@ -203,11 +218,8 @@ fn add_pictures(page: &mut Page, directory: &Path) -> Result<()> {
 
 fn add_bench(page: &mut Page, directory: &Path) -> Result<()> {
     page.heading(&name(directory));
-    let mut lines = Vec::new();
-    let log = directory.join(bench::LOG);
-    if log.is_file() {
-        lines = bench::read(&log)?;
-    }
+    let log = Log::read(&directory.join(results::BENCH_LOG))?;
+    let lines = log.as_ref().map_or(&[][..], Log::lines);
     for path in files(directory, "md")? {
         let text = std::fs::read_to_string(&path).with_context(|| path.display().to_string())?;
         add_markdown(page, &text);
@@ -218,13 +230,15 @@ fn add_bench(page: &mut Page, directory: &Path) -> Result<()> {
             page.picture("image/svg+xml", &bytes, &name(&path));
         }
     }
-    let commands: Vec<String> =
-        lines.iter().filter_map(|l| Some(format!("{:<24} {}", l.point.name, l.point.command.as_ref()?))).collect();
+    let command = |line: &Value| Some(format!("{:<24} {}", line["name"].as_str()?, line["command"].as_str()?));
+    let mut commands: Vec<String> = lines.iter().filter_map(command).collect();
+    // A point that was run again.
+    commands.dedup();
     if !commands.is_empty() {
         page.folded("What runs each point alone", &commands.join("\n"));
     }
     if let Some(line) = lines.first() {
-        page.folded("Configuration of the first point", &serde_json::to_string_pretty(&line.point.job)?);
+        page.folded("Configuration of the first point", &serde_json::to_string_pretty(&line["job"])?);
     }
     Ok(())
 }

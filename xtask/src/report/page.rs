@@ -6,6 +6,8 @@ use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use sha2::{Digest, Sha256};
 
+use crate::html::escape;
+
 const STYLE: &str = include_str!("page.css");
 const SCRIPT: &str = include_str!("page.js");
 
@@ -15,20 +17,12 @@ pub struct Page {
     headings: Vec<String>,
 }
 
-/// Text as text, wherever it comes from.
-pub fn escape(text: &str) -> String {
-    let mut out = String::with_capacity(text.len());
-    for c in text.chars() {
-        match c {
-            '&' => out.push_str("&amp;"),
-            '<' => out.push_str("&lt;"),
-            '>' => out.push_str("&gt;"),
-            '"' => out.push_str("&quot;"),
-            '\'' => out.push_str("&#39;"),
-            c => out.push(c),
-        }
+/// A byte of a path as an address has it; a colon would make a scheme of what is before it.
+fn address_byte(byte: u8) -> String {
+    match byte {
+        b'a'..=b'z' | b'A'..=b'Z' | b'0'..=b'9' | b'/' | b'.' | b'-' | b'_' => char::from(byte).to_string(),
+        other => format!("%{other:02X}"),
     }
-    out
 }
 
 /// Bytes as an address that needs no network.
@@ -73,6 +67,12 @@ impl Page {
             }
         }
         self.body.push_str("</tr></table></div>\n");
+    }
+
+    /// A line that leads to another file, named from where this one lies.
+    pub fn link(&mut self, path: &str, text: &str) {
+        let address: String = path.bytes().map(address_byte).collect();
+        let _ = writeln!(self.body, "<p><a href=\"{address}\">{}</a></p>", escape(text));
     }
 
     /// Text that keeps its lines, folded away.
@@ -127,4 +127,17 @@ fn strong(text: &str) -> String {
     }
     let wrap = |(i, part): (usize, &&str)| if i % 2 == 1 { format!("<b>{part}</b>") } else { (*part).to_owned() };
     parts.iter().enumerate().map(wrap).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_link_leads_to_a_file_whatever_its_name() {
+        let mut page = Page::new();
+        page.link("javascript:a b\"/é.html", "<x>");
+        let page = page.finish("title");
+        assert!(page.contains("<a href=\"javascript%3Aa%20b%22/%C3%A9.html\">&lt;x&gt;</a>"), "{page}");
+    }
 }

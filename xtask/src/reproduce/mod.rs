@@ -12,8 +12,8 @@ use clap::Args;
 use occnerf::capture::{LoadOptions, Perturbation};
 use occnerf::{Lpips, Preset};
 
-use crate::eval::{load_lpips, network_name};
 use crate::list::unique_name;
+use crate::network::{load_lpips, network_name};
 use crate::optimise::SavingArguments;
 use crate::process::say;
 use crate::process::{Ending, Lock};

@@ -65,12 +65,13 @@ class Scene {
     gl.enableVertexAttribArray(2);
     gl.vertexAttribIPointer(2, 4, gl.UNSIGNED_BYTE, 0, 0);
     attribute(gl, 3, person.weights, 4, gl.UNSIGNED_SHORT, true);
-    this.shells = person.shells.map((indices) => {
+    const upload = (indices) => {
       const buffer = gl.createBuffer();
       gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, buffer);
       gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, indices, gl.STATIC_DRAW);
       return { buffer, count: indices.length, type: indices instanceof Uint16Array ? gl.UNSIGNED_SHORT : gl.UNSIGNED_INT };
-    });
+    };
+    this.shells = person.shells.map((indices) => [upload(indices), upload(merged(indices))]);
     this.segments = gl.createVertexArray();
     this.lineBuffer = gl.createBuffer();
     gl.bindVertexArray(this.segments);
@@ -98,8 +99,9 @@ class Scene {
     gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA, gl.RGBA, gl.UNSIGNED_BYTE, confidence);
   }
 
-  // `ground` and the lines' colours are [r, g, b, a] from 0 to 1; `segments` 7 numbers a line end.
-  draw(camera, ground, segments, marksConfidence) {
+  // `ground` and the lines' colours are [r, g, b, a] from 0 to 1; `segments` 7 numbers a line end; `simple` draws a
+  // quarter of the triangles, where there are such.
+  draw(camera, ground, segments, marksConfidence, simple) {
     const gl = this.gl;
     gl.viewport(0, 0, gl.drawingBufferWidth, gl.drawingBufferHeight);
     gl.clearColor(...ground);
@@ -121,7 +123,8 @@ class Scene {
     gl.uniformMatrix4fv(this.skinned.at("camera"), false, camera);
     gl.bindVertexArray(this.surface);
     gl.enable(gl.CULL_FACE);
-    this.shells.forEach((shell, at) => {
+    this.shells.forEach((levels, at) => {
+      const shell = levels[simple ? 1 : 0];
       // The innermost is opaque, the others lie over it in order.
       gl.uniform1f(this.skinned.at("opaque"), at === 0 ? 1 : 0);
       if (at === 0) gl.disable(gl.BLEND);
@@ -143,6 +146,18 @@ class Scene {
     gl.disable(gl.BLEND);
     gl.bindVertexArray(null);
   }
+}
+
+// Each four triangles that one was divided into as that one; as they are where they are something else.
+function merged(indices) {
+  if (indices.length % 12) return indices;
+  const out = new indices.constructor(indices.length / 4);
+  for (let i = 0; i < out.length; i += 3) {
+    const [a, ab, ca, ab2, b, bc, ca2, bc2, c, ab3, bc3, ca3] = indices.subarray(4 * i, 4 * i + 12);
+    if (ab !== ab2 || ab !== ab3 || bc !== bc2 || bc !== bc3 || ca !== ca2 || ca !== ca3) return indices;
+    out.set([a, b, c], i);
+  }
+  return out;
 }
 
 function program(gl, vertex, fragment) {

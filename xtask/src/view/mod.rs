@@ -12,8 +12,9 @@ use serde_json::{Value, json};
 use volrender::Camera;
 
 use crate::avatar;
+use crate::html::escape;
 use crate::process::say;
-use crate::report::escape;
+use crate::run::PERSON;
 
 const PAGE: &str = include_str!("page.html");
 const STYLE: &str = include_str!("page.css");
@@ -38,7 +39,7 @@ pub fn view(arguments: &ViewArguments) -> Result<()> {
     for path in &arguments.motion {
         avatar::add_motion(&mut person, path)?;
     }
-    let out = arguments.out.clone().unwrap_or_else(|| arguments.run.join("person.html"));
+    let out = arguments.out.clone().unwrap_or_else(|| arguments.run.join(PERSON));
     avatar::check_folder(&out)?;
     let page = page(&person)?;
     crate::run::write(&out, &page)?;

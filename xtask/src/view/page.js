@@ -21,6 +21,8 @@ class Page {
     // Pixels across each of the window's while something moves: fewer where the machine is too slow. More than one
     // smooths edges; multisampling costs software renderers most of a picture's time.
     this.detail = FINEST;
+    // Fewer triangles too, where fewer pixels were not enough.
+    this.simple = false;
     this.touched = -Infinity;
     this.coarse = false;
     this.pace = 16;
@@ -211,7 +213,8 @@ class Page {
     if (!this.playing) return;
     this.pace += 0.1 * (elapsed - this.pace);
     this.late = this.pace > 22 ? this.late + 1 : 0;
-    if (this.late > 6 && this.detail > 0.5) {
+    if (this.late > 6 && !this.simple) {
+      this.simple = this.detail === 0.5;
       this.detail = Math.max(0.5, this.detail * Math.max(Math.sqrt(16 / this.pace), 0.5));
       this.late = 0;
       this.pace = 16;
@@ -234,7 +237,8 @@ class Page {
     const color = (name) => rgb(style.getPropertyValue(name).trim());
     const segments = this.floorLines(color("--line"));
     if (element("cameras").checked) segments.push(...this.cameraLines(color("--faint"), color("--accent")));
-    this.scene.draw(camera, color("--ground"), segments, element("confidence").checked);
+    this.scene.draw(camera, color("--ground"), segments, element("confidence").checked,
+      this.coarse && this.simple);
   }
 
   orbit(width, height) {

@@ -6,7 +6,7 @@ use glam::{Mat3, Quat, Vec3};
 use smpl::{Data, MotionClip, NdArray, Placement, npz};
 
 use crate::Error;
-use crate::bake::{Avatar, upright};
+use crate::bake::{Avatar, turn_upright};
 
 /// Joint counts of SMPL and its successors, whose first 22 joints are the same.
 const SMPL_FAMILY: [usize; 3] = [24, 52, 55];
@@ -84,5 +84,5 @@ pub fn fit_motion(motion: &MotionClip, to: usize, root: Vec3) -> Result<MotionCl
     let axes = [Vec3::Y, Vec3::Z, Vec3::X];
     let nearest = axes.into_iter().max_by(|a, b| upward.dot(*a).abs().total_cmp(&upward.dot(*b).abs()));
     let up = nearest.map_or(Vec3::Y, |axis| axis * upward.dot(axis).signum());
-    Ok(turned(&fitted, upright(up), root))
+    Ok(turned(&fitted, turn_upright(up), root))
 }

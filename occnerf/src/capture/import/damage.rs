@@ -21,10 +21,10 @@ use super::*;
 use crate::capture::testing::{Directory, shared};
 use crate::random::Stream;
 
-/// Longest that a mutation may take on a busy machine, and most memory: pickles take 8 times their
+/// Longest that a mutation may take, and most memory: pickles take 8 times their
 /// size and 128 MiB, compressed ones may grow by 64 MiB and more before that; vectors are there
 /// twice while they grow.
-const SECONDS: f64 = 5.0;
+const SECONDS: f64 = 1.0;
 const BYTES: u64 = 600 << 20;
 
 fn mutations() -> usize {
@@ -114,11 +114,18 @@ fn zipped(entries: &[(String, Vec<u8>)]) -> Vec<u8> {
     zip.finish().unwrap().into_inner()
 }
 
-/// Runs `read` on a mutation; it may say anything in one line but must not take long or much.
-fn bounded(what: &str, case: usize, read: impl FnOnce() -> Result<(), String>) {
-    let (start, mut outcome) = (Instant::now(), Ok(()));
-    let taken = measure(|| outcome = read()).bytes_max;
-    let seconds = start.elapsed().as_secs_f64();
+/// Runs `read` on a mutation; it may say anything in one line but must not take long or much. What
+/// another process kept waiting is tried again.
+fn bounded(what: &str, case: usize, read: impl Fn() -> Result<(), String>) {
+    let (mut outcome, mut taken, mut seconds) = (Ok(()), 0, f64::INFINITY);
+    for _ in 0..3 {
+        let start = Instant::now();
+        taken = measure(|| outcome = read()).bytes_max;
+        seconds = start.elapsed().as_secs_f64().min(seconds);
+        if seconds < SECONDS {
+            break;
+        }
+    }
     assert!(seconds < SECONDS, "{what}, mutation {case}: {seconds} s");
     assert!(taken < BYTES, "{what}, mutation {case}: {taken} bytes");
     if let Err(error) = outcome {

@@ -90,6 +90,7 @@ impl Stage<'_> {
             train,
             eval: eval.into_iter().map(|(_, frame)| frame).collect(),
             mean_betas: self.betas,
+            registered: false,
         })
     }
 }

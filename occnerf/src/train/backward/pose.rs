@@ -119,6 +119,7 @@ mod tests {
         for method in [Method::Occnerf, Method::HashPoint] {
             let mut config = Config::preset(Preset::Fast, method);
             (config.encoding.levels, config.encoding.n_min, config.encoding.n_max) = (2, 3, 5);
+            config.motion.correction_spacing = 4;
             let scene = Scene::new(&capture, &body, &config).unwrap();
             let mut trainer = Trainer::new(&scene, config.clone()).unwrap();
             trainer.model.parameters.get_mut(Part::Table).iter_mut().for_each(|v| *v *= 1e4);
@@ -137,7 +138,7 @@ mod tests {
             // changes.
             let mut surface = PosedSurface::new(&scene.body, CELL).unwrap();
             let mut trace = |posed: &Posed, batch: &mut SampleBatch| -> Vec<usize> {
-                surface.refit(&scene.body, posed, &model.extent, &config);
+                surface.refit(&scene.body, posed, &model.extent, &config, &model.base);
                 let motion = MotionFrame::new(&body, posed);
                 let tracer = model.tracer(&surface, &model.extent, &motion);
                 batch.samples.clear();

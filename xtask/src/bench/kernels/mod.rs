@@ -9,13 +9,11 @@ use anyhow::Result;
 
 use self::figure::{Figure, Sample};
 use super::chart::{Mark, Panel, Picture, Shape, Style};
-use super::scale::Scale;
 use crate::process::say;
-use crate::results::{self, Section};
+use crate::results::{self, KERNELS, Section};
+use crate::scale::Scale;
 use crate::table;
 
-/// Name of the results.
-pub const RESULTS: &str = "kernels.json";
 /// Measures everything and draws it.
 pub fn run(directory: &Path, quick: bool, publish: bool) -> Result<()> {
     crate::run::make_directory(directory)?;
@@ -28,7 +26,7 @@ pub fn run(directory: &Path, quick: bool, publish: bool) -> Result<()> {
         measure::table(&figure, if quick { 20 } else { 60 })?,
     ];
     let results: Vec<&Sample> = kernels.iter().flat_map(|k| &k.samples).collect();
-    let path = directory.join(RESULTS);
+    let path = directory.join(KERNELS);
     crate::run::write(&path, &serde_json::to_string_pretty(&results)?)?;
     let mut text = String::new();
     for kernel in &kernels {

@@ -1,0 +1,92 @@
+//! What a frame asks of its pose and of the shape: that outlines and colours agree.
+
+use glam::Vec3;
+use smpl::{BodyModel, Posed, Shaped};
+
+use crate::scene::registration::colors::Colors;
+use crate::scene::registration::sight::{Edge, Sight};
+use crate::scene::registration::system::Normal;
+use crate::scene::registration::unknowns::{Motion, Motions};
+
+/// Change of a coefficient that its derivatives are taken by.
+pub(super) const BETA_STEP: f32 = 0.5;
+/// Standard deviation of an outline: pixels, and metres by which clothes hang differently.
+const OUTLINE: [f32; 2] = [1.0, 0.01];
+/// Pixels of an outline that tell the same.
+const CORRELATED: f32 = 3.0;
+/// Weight of the colours against their noise: most of what is left is not noise but what one colour
+/// a vertex cannot say.
+const COLOR: f32 = 0.03;
+
+/// The equations of a frame, as they are put together.
+pub(super) struct Equations<'a> {
+    posed: &'a Posed,
+    /// The body with [`BETA_STEP`] more of each shape coefficient.
+    reshaped: Vec<Posed>,
+    motions: Motions<'a>,
+    motion: Motion,
+    row: Vec<f64>,
+    pub normal: Normal,
+}
+
+impl<'a> Equations<'a> {
+    /// Of a body in the pose `posed` of `shape`; `reshaped` has [`BETA_STEP`] more of each shape
+    /// coefficient.
+    pub fn new(model: &'a BodyModel, shape: &'a Shaped, posed: &'a Posed, reshaped: Vec<Posed>) -> Self {
+        let normal = Normal::new(3 * (model.num_joints() + 1), reshaped.len());
+        let motions = Motions::new(model, &shape.vertices, posed);
+        Self { posed, reshaped, motions, motion: Motion::default(), row: Vec::new(), normal }
+    }
+
+    /// Looks how a vertex moves, for [`Equations::add`].
+    fn at(&mut self, v: usize) {
+        let Self { motions, motion, reshaped, posed, normal, .. } = self;
+        motions.of(v, motion);
+        for (k, more) in reshaped.iter().enumerate() {
+            motion.columns.push((normal.own + k) as u32);
+            motion.directions.push((more.vertices[v] - posed.vertices[v]) / BETA_STEP);
+        }
+    }
+
+    /// Adds a residual and its derivative by the place of the vertex.
+    fn add(&mut self, weight: f32, residual: f32, slope: Vec3) {
+        let Self { motion, row, normal, .. } = self;
+        row.clear();
+        row.extend(motion.directions.iter().map(|d| f64::from(d.dot(slope))));
+        normal.add(f64::from(weight), f64::from(residual), &motion.columns, row);
+    }
+
+    /// Asks for outlines where the mask ends, in clothes that become thicker by `thicker` (V).
+    /// `unit` is the length of a metre of a body 1.7 high.
+    pub fn align_outline(&mut self, sight: &Sight, thicker: &[f32], unit: f32) {
+        // As many pixels as a body of this area has around it.
+        let around = 3.5 * (sight.area as f32).sqrt();
+        let alone = (around / (CORRELATED * sight.edges.len().max(1) as f32)).min(1.0);
+        for &Edge { vertex, distance, slope, scale } in &sight.edges {
+            let v = vertex as usize;
+            let residual = thicker[v] * scale - distance;
+            let noise = OUTLINE[0] + OUTLINE[1] * unit * scale;
+            self.at(v);
+            self.add(alone * robust(residual * residual, noise) / (noise * noise), residual, slope);
+        }
+    }
+
+    /// Asks for the colours that all frames agree on, under a blur of `blur` pixels.
+    pub fn align_colors(&mut self, sight: &Sight, colors: &Colors, blur: f32) {
+        // Vertices closer than the blur see the same.
+        let density = sight.seen.len() as f32 / sight.area.max(1) as f32;
+        let alone = (4.0 * std::f32::consts::PI * blur * blur * density).max(1.0).recip();
+        for (seen, slope) in sight.seen.iter().zip(&sight.slopes) {
+            let Some(error) = colors.error(seen) else { continue };
+            let squared = colors.noise * colors.noise;
+            let weight = COLOR * alone * robust(error.length_squared(), colors.noise) / squared;
+            self.at(seen.0 as usize);
+            (0..3).for_each(|c| self.add(weight, error[c], slope[c]));
+        }
+    }
+}
+
+/// The weight of a residual far beyond its standard deviation (Geman and McClure 1985).
+fn robust(squared: f32, noise: f32) -> f32 {
+    (1.0 + squared / (9.0 * noise * noise)).powi(-2)
+}

@@ -1,0 +1,252 @@
+//! Registration: the prior's poses, place and shape, corrected by what all frames together show,
+//! before anything is learnt.
+//!
+//! Along the outline of the posed prior the mask's is searched (Kass, Witkin and Terzopoulos 1988),
+//! where nothing stands in front. Clothes are taken to be as thick in all frames: how far they
+//! stand off a vertex is the mean over the frames that show it on an outline. Once outlines agree,
+//! so do colours: each vertex has one, under a light that all frames share (Lucas and Kanade 1981).
+//! Poses, place and shape take Gauss-Newton steps on all frames at once, in which errors of a
+//! tracker are expected to be small and to change slowly: what a frame hides follows the frames
+//! around it.
+
+mod colors;
+mod equations;
+mod picture;
+mod sight;
+mod system;
+#[cfg(test)]
+mod tests;
+mod unknowns;
+
+use glam::Vec3;
+use nalgebra::DVector;
+use rayon::prelude::*;
+use smpl::{BodyModel, Posed, Shaped};
+use surface_query::vertex_normals;
+use volrender::Aabb;
+
+use self::colors::Colors;
+use self::equations::{BETA_STEP, Equations};
+use self::picture::Picture;
+use self::sight::{Looking, Ridge, Sight, look, ridges};
+use self::system::{Expected, Normal, solve};
+use self::unknowns::{Change, changed};
+use crate::Error;
+use crate::capture::{Capture, Frame};
+
+/// Standard deviations expected of a tracker: turns of a joint (radians), the shift of the whole
+/// (metres of a body 1.7 high), shape coefficients.
+const TURN: f64 = 0.035;
+const SHIFT: f64 = 0.03;
+const SHAPE: f64 = 0.5;
+/// Part of those of turns and shift by which they change from one frame to the next.
+const CHANGE: f64 = 0.1;
+/// Shape coefficients that are corrected: what follows hardly changes the body.
+const BETAS: usize = 10;
+/// How far from the prior's outline the mask's is searched in the first and in the last round,
+/// pixels.
+const REACH: [f32; 2] = [12.0, 5.0];
+/// Blur of the colours in the first round that looks at them, halfway, and in the last, pixels.
+const BLUR: [f32; 2] = [3.0, 1.0];
+/// Frames that a vertex has to be on an outline in before half of what they say of its clothes is
+/// believed, and the farthest that clothes stand off, metres.
+const DOUBT: f32 = 1.0;
+const CLOTHES: f32 = 0.05;
+/// Rounds in which what is known of clothes spreads along the surface.
+const SPREAD: usize = 10;
+/// Most frames that are corrected on their own, and most numbers in their equations: those between
+/// are interpolated.
+const MOST_FRAMES: usize = 400;
+const MOST_NUMBERS: usize = 4_000_000;
+
+/// A body in one of the frames.
+struct Moment {
+    shape: Shaped,
+    posed: Posed,
+    /// The posed vertices with their clothes.
+    dressed: Vec<Vec3>,
+}
+
+/// What is corrected, and what it is corrected by.
+struct Registration<'a> {
+    capture: &'a Capture,
+    model: &'a BodyModel,
+    ridges: Vec<Ridge>,
+    /// Length of a metre of a body 1.7 high, in the units of the capture.
+    unit: f32,
+    /// Indices of the frames that are corrected on their own.
+    frames: Vec<usize>,
+    pictures: Vec<Option<Picture>>,
+    changes: Vec<Change>,
+    betas: Vec<f32>,
+    /// How far clothes stand off each vertex, in the units of the capture.
+    clothes: Vec<f32>,
+}
+
+/// Corrects the poses, the places and the shape that `capture` gives for its frames, and with them
+/// those of the views kept back, in `rounds` Gauss-Newton steps. The result does not depend on the
+/// number of threads.
+///
+/// # Errors
+/// Pictures that cannot be read.
+pub fn register(capture: &mut Capture, model: &BodyModel, rounds: usize) -> Result<(), Error> {
+    let mut registration = Registration::new(capture, model)?;
+    for round in 0..rounds {
+        let late = round as f32 / (rounds - 1).max(1) as f32;
+        let between = |ends: [f32; 2], share: f32| ends[0] + share * (ends[1] - ends[0]);
+        let blur = if 2 * round < rounds { 0.0 } else { between(BLUR, (2.0 * late - 1.0).max(0.0)) };
+        let looking = Looking { reach: between(REACH, late), blur, unit: registration.unit };
+        if !registration.improve(looking)? {
+            break;
+        }
+    }
+    let Registration { frames, changes, betas, .. } = registration;
+    capture.mean_betas = sum(&capture.mean_betas, &betas);
+    for (index, frame) in capture.train.iter_mut().enumerate() {
+        let after = frames.partition_point(|&f| f <= index);
+        let (a, b) = (after - 1, after.min(frames.len() - 1));
+        let share = if a == b { 0.0 } else { (index - frames[a]) as f32 / (frames[b] - frames[a]) as f32 };
+        let change: Change = changes[a].iter().zip(&changes[b]).map(|(a, b)| a.lerp(*b, share)).collect();
+        frame.betas = sum(&frame.betas, &betas);
+        (frame.pose, frame.placement) = changed(frame, &model.shaped(&frame.betas), &change);
+    }
+    for view in &mut capture.eval {
+        if let Some(Frame { pose, placement, betas, .. }) = capture.train.get(view.train_index) {
+            (view.frame.pose, view.frame.placement) = (pose.clone(), *placement);
+            view.frame.betas.clone_from(betas);
+        }
+    }
+    capture.registered = true;
+    Ok(())
+}
+
+impl<'a> Registration<'a> {
+    fn new(capture: &'a Capture, model: &'a BodyModel) -> Result<Self, Error> {
+        let own = 3 * (model.num_joints() + 1);
+        let most = (MOST_NUMBERS / (own * own)).clamp(2, MOST_FRAMES);
+        let frames: Vec<usize> = (0..capture.train.len()).step_by(capture.train.len().div_ceil(most).max(1)).collect();
+        let picture = |&frame: &usize| {
+            let frame = &capture.train[frame];
+            let posed = model.pose(&model.shaped(&frame.betas), &frame.pose, frame.placement);
+            Ok(Picture::new(frame, &posed)?)
+        };
+        let pictures = frames.par_iter().map(picture).collect::<Result<_, Error>>()?;
+        let bounds = Aabb::from_points(&model.shaped(&capture.mean_betas).vertices);
+        Ok(Self {
+            ridges: ridges(&model.faces),
+            unit: (bounds.max.y - bounds.min.y) / 1.7,
+            changes: vec![vec![Vec3::ZERO; model.num_joints() + 1]; frames.len()],
+            betas: vec![0.0; model.num_betas().min(BETAS)],
+            clothes: vec![0.0; model.num_vertices()],
+            capture,
+            model,
+            frames,
+            pictures,
+        })
+    }
+
+    /// Takes one step; false where the equations have no solution.
+    fn improve(&mut self, looking: Looking) -> Result<bool, Error> {
+        let this = &*self;
+        let moments: Vec<Moment> = (0..this.frames.len()).into_par_iter().map(|f| this.moment(f)).collect();
+        let look = |(picture, moment): (&Option<Picture>, &Moment)| match picture {
+            Some(picture) => look(picture, &moment.dressed, (&this.model.faces, &this.ridges), looking),
+            None => Ok(Sight::default()),
+        };
+        let sights: Result<Vec<Sight>, Error> = this.pictures.par_iter().zip(&moments).map(look).collect();
+        let sights = sights?;
+        let clothes = this.measure_clothes(&sights);
+        let thicker: Vec<f32> = clothes.iter().zip(&this.clothes).map(|(after, before)| after - before).collect();
+        let colors = Colors::measure(&sights, this.model.num_vertices());
+        let normals: Vec<Normal> = (0..this.frames.len())
+            .into_par_iter()
+            .map(|f| {
+                let Moment { shape, posed, .. } = &moments[f];
+                let mut equations = Equations::new(this.model, shape, posed, this.reshaped(f));
+                equations.align_outline(&sights[f], &thicker, this.unit);
+                equations.align_colors(&sights[f], &colors, looking.blur);
+                equations.normal
+            })
+            .collect();
+        let own = 3 * (this.model.num_joints() + 1);
+        let shift = SHIFT * f64::from(this.unit);
+        let expected: Vec<f64> =
+            (0..own).map(|i| if i < 3 { (shift * shift).recip() } else { (TURN * TURN).recip() }).collect();
+        let gap = this.frames.get(1).map_or(1, |second| second - this.frames[0]);
+        let change: Vec<f64> = expected.iter().map(|e| e / (CHANGE * CHANGE * gap as f64)).collect();
+        let common = vec![(SHAPE * SHAPE).recip(); this.betas.len()];
+        let flat = |change: &Change| DVector::from_iterator(own, change.iter().flat_map(|v| v.as_dvec3().to_array()));
+        let now: Vec<DVector<f64>> = this.changes.iter().map(flat).collect();
+        let shared = DVector::from_iterator(this.betas.len(), this.betas.iter().map(|&b| f64::from(b)));
+        let expected = Expected { own: &expected, change: &change, shared: &common };
+        let Some((steps, step)) = solve(&normals, &expected, &now, &shared) else { return Ok(false) };
+        if !steps.iter().chain([&step]).all(|s| s.iter().all(|v| v.is_finite())) {
+            return Ok(false);
+        }
+        self.clothes = clothes;
+        for (change, step) in self.changes.iter_mut().zip(&steps) {
+            let each = step.as_slice().chunks_exact(3);
+            change.iter_mut().zip(each).for_each(|(c, s)| *c += glam::DVec3::from_slice(s).as_vec3());
+        }
+        self.betas.iter_mut().zip(step.iter()).for_each(|(beta, step)| *beta += *step as f32);
+        Ok(true)
+    }
+
+    /// The body of a frame, in a shape that is `betas` off the given one, as it is posed by now.
+    fn posed(&self, f: usize, betas: &[f32]) -> (Shaped, Posed) {
+        let frame = &self.capture.train[self.frames[f]];
+        let shape = self.model.shaped(&sum(&frame.betas, betas));
+        let (pose, placement) = changed(frame, &shape, &self.changes[f]);
+        let posed = self.model.pose(&shape, &pose, placement);
+        (shape, posed)
+    }
+
+    fn moment(&self, f: usize) -> Moment {
+        let (shape, posed) = self.posed(f, &self.betas);
+        let normals = vertex_normals(&posed.vertices, &self.model.faces);
+        let each = posed.vertices.iter().zip(&normals).zip(&self.clothes);
+        let dressed = each.map(|((v, n), c)| *v + *c * n.normalize_or_zero()).collect();
+        Moment { shape, posed, dressed }
+    }
+
+    /// The body of a frame with a little more of each shape coefficient.
+    fn reshaped(&self, f: usize) -> Vec<Posed> {
+        let more = |k: usize| {
+            let mut betas = self.betas.clone();
+            betas[k] += BETA_STEP;
+            self.posed(f, &betas).1
+        };
+        (0..self.betas.len()).map(more).collect()
+    }
+
+    /// How far clothes stand off each vertex: the mean over frames and over the vertices around,
+    /// towards 0 where few saw it.
+    fn measure_clothes(&self, sights: &[Sight]) -> Vec<f32> {
+        let most = CLOTHES * self.unit;
+        let mut sums = vec![(0.0f32, 0.0f32); self.clothes.len()];
+        for edge in sights.iter().flat_map(|sight| &sight.edges) {
+            let v = edge.vertex as usize;
+            sums[v].0 += (self.clothes[v] + edge.distance / edge.scale).clamp(-most, most);
+            sums[v].1 += 1.0;
+        }
+        for _ in 0..SPREAD {
+            let mut next = sums.clone();
+            for corners in &self.model.faces {
+                for i in 0..3 {
+                    let (to, from) = (corners[i] as usize, sums[corners[(i + 1) % 3] as usize]);
+                    next[to].0 += 0.15 * from.0;
+                    next[to].1 += 0.15 * from.1;
+                }
+            }
+            // About as much as a vertex with six neighbours gets.
+            sums = next.into_iter().map(|(sum, weight)| (sum / 1.9, weight / 1.9)).collect();
+        }
+        sums.into_iter().map(|(sum, weight)| sum / (weight + DOUBT)).collect()
+    }
+}
+
+/// Shape coefficients, those that are not given taken for 0.
+fn sum(a: &[f32], b: &[f32]) -> Vec<f32> {
+    let at = |v: &[f32], i: usize| v.get(i).copied().unwrap_or(0.0);
+    (0..a.len().max(b.len())).map(|i| at(a, i) + at(b, i)).collect()
+}

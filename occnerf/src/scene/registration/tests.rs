@@ -1,0 +1,125 @@
+//! Priors that are wrong, and what becomes of them.
+
+use super::*;
+use crate::capture::{DemoConfig, Image, Perturbation, Pixels, demo};
+use glam::{Affine3A, Mat3};
+use smpl::Placement;
+
+/// A frame without a subject.
+pub(super) fn frame(pose: Vec<Vec3>, placement: Placement) -> Frame {
+    let camera = volrender::Camera::new(Mat3::IDENTITY, Affine3A::IDENTITY, 1, 1).unwrap();
+    let pixels = Pixels { image: Image::new(1, 1), mask: vec![0.0], occluder: None };
+    Frame { name: String::new(), source: pixels.into(), camera, pose, placement, betas: Vec::new() }
+}
+
+fn small() -> DemoConfig {
+    DemoConfig { size: 96, frames: 60, eval_cameras: 1, eval_every: 30, ..Default::default() }
+}
+
+/// Root mean square distance between the joints of two captures in the training image, pixels.
+fn apart(a: &Capture, b: &Capture, body: &BodyModel) -> f32 {
+    let joints = |frame: &Frame| -> Vec<Vec3> {
+        let posed = body.pose(&body.shaped(&frame.betas), &frame.pose, frame.placement);
+        posed.joints.iter().filter_map(|&joint| frame.camera.project(joint)).collect()
+    };
+    let (mut sum, mut count) = (0.0, 0);
+    for (a, b) in a.train.iter().zip(&b.train) {
+        for (a, b) in joints(a).iter().zip(joints(b)) {
+            sum += a.truncate().distance_squared(b.truncate());
+            count += 1;
+        }
+    }
+    (sum / count as f32).sqrt()
+}
+
+#[test]
+fn what_is_wrong_with_a_prior_is_mostly_mended_whatever_the_number_of_threads() {
+    let body = BodyModel::embedded();
+    let exact = DemoConfig { pose_noise_degrees: 0.0, translation_noise: 0.0, beta_noise: 0.0, ..small() };
+    let truth = demo(&exact, &body).unwrap();
+    for (wrong, most) in [
+        (Perturbation { pose_degrees: 4.0, ..Perturbation::default() }, 0.9),
+        (Perturbation { shape: 1.0, ..Perturbation::default() }, 0.4),
+    ] {
+        let mut given = demo(&small(), &body).unwrap();
+        wrong.apply(&mut given, &body).unwrap();
+        let run = |threads: usize| {
+            let mut capture = given.clone();
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            pool.install(|| register(&mut capture, &body, 8)).unwrap();
+            capture
+        };
+        let (found, again) = (run(1), run(2));
+        let (before, after) = (apart(&truth, &given, &body), apart(&truth, &found, &body));
+        assert!(after < most * before, "{wrong:?}: {before} pixels before, {after} after");
+        assert_eq!(found.mean_betas, again.mean_betas);
+        for (a, b) in found.train.iter().zip(&again.train) {
+            assert!(a.pose == b.pose && a.placement == b.placement && a.betas == b.betas);
+        }
+        let view = &found.eval[0];
+        assert_eq!(view.frame.pose, found.train[view.train_index].pose);
+    }
+}
+
+#[test]
+fn a_right_prior_stays_as_it_is() {
+    let body = BodyModel::embedded();
+    let exact = DemoConfig { pose_noise_degrees: 0.0, translation_noise: 0.0, beta_noise: 0.0, ..small() };
+    let truth = demo(&exact, &body).unwrap();
+    let mut found = truth.clone();
+    register(&mut found, &body, 8).unwrap();
+    let moved = apart(&truth, &found, &body);
+    assert!(moved < 0.4, "{moved} pixels");
+}
+
+#[test]
+fn nothing_is_changed_where_nothing_is_seen() {
+    let body = BodyModel::embedded();
+    let mut given = demo(&small(), &body).unwrap();
+    for frame in &mut given.train {
+        frame.source.change(|pixels| pixels.mask.fill(0.0)).unwrap();
+    }
+    let mut found = given.clone();
+    register(&mut found, &body, 3).unwrap();
+    assert!(apart(&given, &found, &body) < 1e-3);
+}
+
+#[test]
+fn clothes_are_found_as_far_out_as_they_are_and_an_occluder_is_no_outline() {
+    let body = BodyModel::embedded();
+    let mut capture = demo(&DemoConfig { frames: 1, occluded_share: 0.0, size: 256, ..small() }, &body).unwrap();
+    let frame = &mut capture.train[0];
+    let posed = body.pose(&body.shaped(&frame.betas), &frame.pose, frame.placement);
+    let normals = vertex_normals(&posed.vertices, &body.faces);
+    let thick = 0.02;
+    let dressed: Vec<Vec3> =
+        posed.vertices.iter().zip(&normals).map(|(v, n)| *v + thick * n.normalize_or_zero()).collect();
+    let mesh = visibility::RayMesh::new(&dressed, &body.faces).unwrap();
+    let hidden = |column: u32| column >= 128;
+    let (camera, ridges) = (frame.camera, ridges(&body.faces));
+    let mut distances = [false, true].map(|occluded| {
+        let see = |pixels: &mut Pixels| {
+            for i in 0..256 * 256u32 {
+                let ray = camera.ray((i % 256) as f32 + 0.5, (i / 256) as f32 + 0.5);
+                let shows = mesh.first_hit(ray.origin, ray.direction).is_some() && !(occluded && hidden(i % 256));
+                pixels.mask[i as usize] = f32::from(u8::from(shows));
+            }
+        };
+        frame.source.change(see).unwrap();
+        let picture = Picture::new(frame, &posed).unwrap().unwrap();
+        let looking = Looking { reach: 10.0, blur: 0.0, unit: 1.0 };
+        let found = look(&picture, &posed.vertices, (&body.faces, &ridges), looking).unwrap();
+        let each = found.edges.iter().map(|edge| {
+            let column = camera.project(posed.vertices[edge.vertex as usize]).unwrap().x;
+            (edge.distance / edge.scale, column)
+        });
+        each.collect::<Vec<_>>()
+    });
+    assert!(distances[0].len() > 100 && distances[1].len() > 30);
+    assert!(distances[1].iter().all(|&(_, column)| column < 132.0), "an edge at the occluder");
+    for found in &mut distances {
+        found.sort_by(|a, b| a.0.total_cmp(&b.0));
+        let median = found[found.len() / 2].0;
+        assert!((median - thick).abs() < 0.004, "{median}");
+    }
+}

@@ -1,0 +1,149 @@
+//! What registration changes of a prior, and how the posed surface moves with it.
+
+use glam::{Mat3A, Quat, Vec3, Vec3A};
+use smpl::{BodyModel, Placement, Posed, Shaped};
+
+use crate::capture::Frame;
+
+/// How a frame's pose is changed: the whole is shifted in the root's axes, and every joint is
+/// turned in its own.
+pub(super) type Change = Vec<Vec3>;
+
+/// The pose and the place of a frame after `change`: a shift, then a turn for each joint.
+pub(super) fn changed(frame: &Frame, shape: &Shaped, change: &[Vec3]) -> (Vec<Vec3>, Placement) {
+    let turned = |axis: Vec3, turn: Vec3| Quat::from_scaled_axis(axis) * Quat::from_scaled_axis(turn);
+    // What is not finite is to stay so.
+    let each = frame.pose.iter().zip(&change[1..]);
+    let mut pose: Vec<Vec3> =
+        each.map(|(&a, &turn)| if a.is_finite() { turned(a, turn).to_scaled_axis() } else { a }).collect();
+    let root = shape.joints.first().copied().unwrap_or(Vec3::ZERO);
+    let placement = match frame.placement {
+        Placement::Pelvis { translation } => {
+            let before = Quat::from_scaled_axis(frame.pose[0]);
+            Placement::Pelvis { translation: translation + before * change[0] }
+        }
+        Placement::Origin { rotation, translation } => {
+            pose[0] = frame.pose[0];
+            let before = Quat::from_scaled_axis(rotation);
+            let after = turned(rotation, change[1]);
+            let translation = translation + before * (root + change[0]) - after * root;
+            Placement::Origin { rotation: after.to_scaled_axis(), translation }
+        }
+    };
+    (pose, placement)
+}
+
+/// Derivative of one surface point: columns of the unknowns that move it.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Motion {
+    /// Index of an unknown of the frame's [`Change`], flattened.
+    pub columns: Vec<u32>,
+    /// Derivatives of the point in world axes.
+    pub directions: Vec<Vec3>,
+}
+
+/// Derivatives of points of a posed body.
+pub(super) struct Motions<'a> {
+    model: &'a BodyModel,
+    rest: &'a [Vec3],
+    posed: &'a Posed,
+    moved: Vec<Vec3A>,
+    weights: Vec<f32>,
+}
+
+impl<'a> Motions<'a> {
+    /// `rest` (V) are the shaped vertices.
+    pub fn new(model: &'a BodyModel, rest: &'a [Vec3], posed: &'a Posed) -> Self {
+        let joints = model.num_joints();
+        Self { model, rest, posed, moved: vec![Vec3A::ZERO; joints], weights: vec![0.0; joints] }
+    }
+
+    /// The derivatives of a vertex.
+    pub fn of(&mut self, vertex: usize, out: &mut Motion) {
+        out.columns.clear();
+        out.directions.clear();
+        let at = Vec3A::from(self.rest[vertex] + self.posed.pose_offsets[vertex]);
+        let mut highest = 0;
+        for (joint, weight) in self.model.weights.row(vertex) {
+            self.moved[joint] += weight * self.posed.bones[joint].transform_point3a(at);
+            self.weights[joint] += weight;
+            highest = highest.max(joint);
+        }
+        let mut push = |first: usize, axes: Mat3A, column: &dyn Fn(Vec3A) -> Vec3A| {
+            for (i, axis) in [axes.x_axis, axes.y_axis, axes.z_axis].into_iter().enumerate() {
+                out.columns.push((first + i) as u32);
+                out.directions.push(column(axis).into());
+            }
+        };
+        // Children come after their parents.
+        for joint in (0..=highest).rev() {
+            let (moved, weight) = (self.moved[joint], self.weights[joint]);
+            if weight == 0.0 {
+                continue;
+            }
+            (self.moved[joint], self.weights[joint]) = (Vec3A::ZERO, 0.0);
+            let axes = self.posed.bones[joint].matrix3;
+            let arm = moved - weight * Vec3A::from(self.posed.joints[joint]);
+            push(3 + 3 * joint, axes, &|axis| axis.cross(arm));
+            match self.model.parents[joint] {
+                Some(parent) => {
+                    self.moved[parent] += moved;
+                    self.weights[parent] += weight;
+                }
+                None => push(0, axes, &|axis| axis),
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::random::Stream;
+    use proptest::prelude::*;
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(12))]
+
+        /// Pose blend shapes move with the turns a little, which the derivatives leave out.
+        #[test]
+        fn derivatives_of_vertices_are_those_of_finite_differences(seed in any::<u64>(), about_origin in any::<bool>()) {
+            let mut model = BodyModel::embedded();
+            model.posedirs = smpl::SparseRows::from_rows(vec![Vec::new(); model.num_vertices()]);
+            let mut stream = Stream::new(&[seed]);
+            let mut random = |size: f32| size * Vec3::new(stream.normal(), stream.normal(), stream.normal());
+            let mut pose: Vec<Vec3> = (0..model.num_joints()).map(|_| random(0.3)).collect();
+            let placement = if about_origin {
+                pose[0] = Vec3::ZERO;
+                Placement::Origin { rotation: random(1.0), translation: random(1.0) }
+            } else {
+                Placement::Pelvis { translation: random(1.0) }
+            };
+            let shape = model.shaped(&[0.4, -0.7]);
+            let frame = crate::scene::registration::tests::frame(pose, placement);
+            let at = |change: &[Vec3]| {
+                let (pose, placement) = changed(&frame, &shape, change);
+                model.pose(&shape, &pose, placement)
+            };
+            let still = vec![Vec3::ZERO; model.num_joints() + 1];
+            let posed = at(&still);
+            let mut motions = Motions::new(&model, &shape.vertices, &posed);
+            let mut motion = Motion::default();
+            for vertex in (0..model.num_vertices()).step_by(701) {
+                motions.of(vertex, &mut motion);
+                for unknown in 0..3 * still.len() {
+                    let h = 1e-2;
+                    let moved = |h: f32| {
+                        let mut change = still.clone();
+                        change[unknown / 3][unknown % 3] += h;
+                        at(&change).vertices[vertex]
+                    };
+                    let numeric = (moved(h) - moved(-h)) / (2.0 * h);
+                    let column = motion.columns.iter().position(|&c| c as usize == unknown);
+                    let exact = column.map_or(Vec3::ZERO, |c| motion.directions[c]);
+                    prop_assert!(exact.distance(numeric) < 1e-3, "vertex {vertex}, unknown {unknown}: {exact} {numeric}");
+                }
+            }
+        }
+    }
+}
