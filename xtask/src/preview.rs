@@ -39,3 +39,38 @@ impl Preview {
         written
     }
 }
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
+mod tests {
+    use occnerf::capture::{DemoConfig, demo};
+    use occnerf::{Config, Method, Preset, Scene, Trainer};
+
+    use super::*;
+
+    #[test]
+    fn a_picture_is_drawn_when_it_is_due_and_then_not_for_a_while() {
+        let folder = std::env::temp_dir().join(format!("preview-{}", std::process::id()));
+        std::fs::create_dir_all(&folder).unwrap();
+        let body = smpl::BodyModel::embedded();
+        let capture =
+            demo(&DemoConfig { size: 24, frames: 3, eval_cameras: 1, ..DemoConfig::default() }, &body).unwrap();
+        let mut config = Config::preset(Preset::Fast, Method::Occnerf);
+        config.registration.rounds = 0;
+        let scene = Scene::new(&capture, &body, &config).unwrap();
+        let trainer = Trainer::new(&scene, config).unwrap();
+        let mut preview = Preview::new(&folder);
+        preview.draw(trainer.model()).unwrap();
+        assert!(!preview.path.exists(), "not due yet");
+        preview.due = Instant::now();
+        preview.draw(trainer.model()).unwrap();
+        let picture = image::open(&preview.path).unwrap().to_rgb8();
+        assert_eq!(picture.dimensions(), (24, 24));
+        assert!(picture.pixels().any(|pixel| pixel != picture.get_pixel(0, 0)), "nobody is to be seen");
+        assert!(preview.due >= Instant::now() + EVERY / 2);
+        std::fs::remove_file(&preview.path).unwrap();
+        preview.draw(trainer.model()).unwrap();
+        assert!(!preview.path.exists(), "drawn twice");
+        std::fs::remove_dir_all(&folder).unwrap();
+    }
+}

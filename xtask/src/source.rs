@@ -141,12 +141,12 @@ impl LoadArguments {
     }
 }
 
-/// Loads `scene` (the demo if `None`); the body is `body`, the capture's own, that of the variable
+/// Loads `scene`, the demo if it is `None` or named [`DEMO`]; the body is `body`, the capture's own, that of the variable
 /// SMPL_MODEL, or what lies near the scene.
 pub fn load(scene: Option<&str>, body: Option<&Path>, options: &LoadOptions) -> Result<Source> {
     let scene = scene.unwrap_or(DEMO);
     let name = scene.to_owned();
-    if scene == DEMO && !Path::new(scene).exists() {
+    if scene == DEMO {
         if *options != (LoadOptions { wrong: options.wrong, ..LoadOptions::default() }) {
             bail!("the demo takes none of the options that say how a capture is read");
         }

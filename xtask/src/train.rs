@@ -24,7 +24,8 @@ use crate::table;
 #[derive(Args)]
 pub struct TrainArguments {
     /// A capture (raw ZJU-MoCap, or HumanNeRF's prepared or wild layout), or a rigged .glb or .gltf
-    /// character, of which one is made as synth does; the embedded demo if left out
+    /// character, of which one is made as synth does; the embedded demo if left out or "demo" (a
+    /// folder of that name is ./demo)
     pub scene: Option<String>,
     /// Run directory [default: runs/SCENE-METHOD]
     #[arg(long)]

@@ -9,7 +9,7 @@ use super::field::{CanonicalField, Place};
 use super::make::{BakeOptions, bake, surface};
 use super::renderer::BakedRenderer;
 use super::{Avatar, BakeReport, skeleton};
-use crate::capture::{DemoConfig, demo};
+use crate::capture::{DemoConfig, Light, demo};
 use crate::config::{Config, Method, Preset};
 use crate::render::field::FieldRenderer;
 use crate::render::picture::Renderer;
@@ -285,6 +285,21 @@ fn an_atlas_of_one_texel_and_a_back_that_is_not_drawn() {
     }
     let turned = Affine3A::from_rotation_y(std::f32::consts::PI);
     assert!(picture(&avatar, &[turned], 8, Samples::One).iter().all(|p| *p == Vec4::ZERO));
+}
+
+#[test]
+fn a_light_is_as_bright_as_the_surface_is_turned_to_it_and_no_brighter_than_white() {
+    let avatar = square(&[[51, 102, 204, 255]], 1);
+    let albedo = Vec3::new(0.2, 0.4, 0.8);
+    for (degrees, slope) in [(0.0f32, 0.5), (0.0, -0.5), (40.0, 0.5), (-40.0, 0.5), (0.0, 0.0)] {
+        let turned = Affine3A::from_rotation_y(degrees.to_radians());
+        let light = Light { slope: Vec3::new(0.0, 0.0, slope) };
+        let mut out = vec![Vec4::ZERO; 81];
+        let mut person = BakedPerson::new(&avatar, 1.0).lit_by(light);
+        person.draw(&[turned], &in_front(9), Samples::One, &mut out).unwrap();
+        let expected = (albedo * (1.0 + slope * degrees.to_radians().cos())).min(Vec3::ONE).extend(1.0);
+        assert!((out[40] - expected).abs().max_element() < 1e-4, "{degrees} {slope}: {} {expected}", out[40]);
+    }
 }
 
 #[test]
