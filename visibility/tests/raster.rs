@@ -89,7 +89,8 @@ fn check_against_rays(mesh: &TriMesh, view: &View) -> Result<usize, TestCaseErro
                 let apart = at(fragment.barycentric).distance(at(hit.barycentric));
                 // The weights of a sample just outside are cut off at 0.
                 let tolerance = if close(hit.face, pixel) { 0.05 } else { 2e-3 };
-                prop_assert!(apart < tolerance * hit.t, "{:?} {:?}: {}", fragment, hit, apart);
+                // Corners of a unit's size are rounded, too.
+                prop_assert!(apart < tolerance * hit.t + 2e-6, "{:?} {:?}: {}", fragment, hit, apart);
             }
             (Some(fragment), Some(hit)) => {
                 let (a, b) = (depths(mesh, view, fragment.face, pixel), depths(mesh, view, hit.face, pixel));

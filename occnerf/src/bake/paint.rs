@@ -75,27 +75,33 @@ pub(super) fn paint(
 ) -> Vec<(Vec3, f32)> {
     let chunks: Vec<Vec<(Vec3, f32)>> = texels
         .par_chunks(CHUNK)
-        .map_init(Default::default, |(along, places, values): &mut (Vec<_>, Vec<_>, Vec<_>), texels| {
-            places.clear();
-            let mut counts = Vec::with_capacity(texels.len());
-            for texel in texels {
-                let [low, high] = slab(heights, texel, field.reach(), field.spacing());
-                texel.normal(normals).places(prior, high, low, field.reach() + high - low, along);
-                counts.push((along.len(), high - low));
-                places.extend(along.iter().map(|(_, place)| *place));
-            }
-            field.evaluate(places, values);
-            let mut rest = &values[..];
-            let colour = |(count, thickness): (usize, f32)| {
-                let (own, others) = rest.split_at(count);
-                rest = others;
-                // Points lie at both ends of a slab.
-                integrate(own, STEP.min(thickness / count.max(1) as f32), field.spacing())
-            };
-            let colours = counts.into_iter().map(colour);
-            let opaque = |((c, a), texel): ((Vec3, f32), &Texel)| (c, if texel.shell == 0 { 1.0 } else { a });
-            colours.zip(texels).map(opaque).collect()
-        })
+        .map_init(
+            Default::default,
+            |(along, places, lengths, values): &mut (Vec<_>, Vec<_>, Vec<f32>, Vec<_>), texels| {
+                places.clear();
+                lengths.clear();
+                let mut counts = Vec::with_capacity(texels.len());
+                for texel in texels {
+                    let [low, high] = slab(heights, texel, field.reach(), field.spacing());
+                    texel.normal(normals).places(prior, high, low, field.reach() + high - low, along);
+                    counts.push(along.len());
+                    places.extend(along.iter().map(|(_, place)| *place));
+                    // Of the slab, what lies nearest to each point.
+                    let length = |height: f32| (height + 0.5 * STEP).min(high) - (height - 0.5 * STEP).max(low);
+                    lengths.extend(along.iter().map(|(height, _)| length(*height).max(0.0)));
+                }
+                field.evaluate(places, values);
+                let mut first = 0;
+                let colour = |count: usize| {
+                    let own = first..first + count;
+                    first += count;
+                    integrate(&values[own.clone()], &lengths[own], field.spacing())
+                };
+                let colours = counts.into_iter().map(colour);
+                let opaque = |((c, a), texel): ((Vec3, f32), &Texel)| (c, if texel.shell == 0 { 1.0 } else { a });
+                colours.zip(texels).map(opaque).collect()
+            },
+        )
         .collect();
     chunks.concat()
 }
@@ -111,15 +117,15 @@ fn slab(heights: &[Vec<f32>], texel: &Texel, reach: f32, spacing: f32) -> [f32; 
     [inner.unwrap_or(own - BELOW.max(spacing)), high.max(own + STEP)]
 }
 
-/// Colour and opacity of points that each stand for a length of `step`, outside in: the mean over
-/// all places that samples `spacing` apart can have, as of pixels next to each other.
-fn integrate(points: &[(f32, Vec3)], step: f32, spacing: f32) -> (Vec3, f32) {
+/// Colour and opacity of points that stand for `lengths` of a ray, outside in: the mean over all
+/// places that samples `spacing` apart can have, as of pixels next to each other.
+fn integrate(points: &[(f32, Vec3)], lengths: &[f32], spacing: f32) -> (Vec3, f32) {
     let stride = ((spacing / STEP).round() as usize).max(1);
     let (mut sum, mut opacity) = (Vec3::ZERO, 0.0);
     for phase in 0..stride.min(points.len()) {
         let mut transmittance = 1.0;
-        for &(density, colour) in points[phase..].iter().step_by(stride) {
-            let alpha = 1.0 - (-density * step * stride as f32).exp();
+        for (&(density, colour), length) in points.iter().zip(lengths).skip(phase).step_by(stride) {
+            let alpha = 1.0 - (-density * length * stride as f32).exp();
             sum += transmittance * alpha * colour;
             transmittance *= 1.0 - alpha;
         }

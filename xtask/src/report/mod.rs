@@ -218,8 +218,12 @@ fn add_pictures(page: &mut Page, directory: &Path) -> Result<()> {
 
 fn add_bench(page: &mut Page, directory: &Path) -> Result<()> {
     page.heading(&name(directory));
-    let log = Log::read(&directory.join(results::BENCH_LOG))?;
-    let lines = log.as_ref().map_or(&[][..], Log::lines);
+    let log = directory.join(results::BENCH_LOG);
+    let points = Log::read(&log)?;
+    let lines = points.as_ref().map_or(&[][..], Log::lines);
+    if let Some(row) = lines.iter().position(|line| !line["name"].is_string()) {
+        bail!("{}, line {}: not a point of a bench, which has a name", log.display(), row + 1);
+    }
     for path in files(directory, "md")? {
         let text = std::fs::read_to_string(&path).with_context(|| path.display().to_string())?;
         add_markdown(page, &text);
