@@ -9,6 +9,7 @@ use visibility::VisibilityCounts;
 use volrender::Occupancy;
 
 use crate::Error;
+use crate::capture::Light;
 use crate::config::{Config, MotionKind};
 use crate::model::arena::Arena;
 use crate::model::body::Body;
@@ -109,6 +110,13 @@ impl Model {
     /// The training frames' poses as handed in (see [`Model::corrected`]) and cameras.
     pub fn frames(&self) -> &[Arc<PosedView>] {
         &self.frames
+    }
+
+    /// The light that its colours are seen under; even without [`FieldConfig::prior_light`].
+    ///
+    /// [`FieldConfig::prior_light`]: crate::FieldConfig::prior_light
+    pub fn light(&self) -> Light {
+        self.base.light
     }
 
     /// Steps taken so far.
