@@ -19,7 +19,7 @@ use crate::process::{Ending, Lock, note, one_line, say};
 use crate::run::{
     METRICS, Metrics, NOVEL_VIEWS, RunConfig, Splits, TRAINING_VIEWS, make_directory, peak_rss_bytes, use_threads,
 };
-use crate::{pictures, report, table};
+use crate::{budget, pictures, report, table};
 
 /// Training frames are many and alike: every tenth is scored.
 const TRAIN_STRIDE: usize = 10;
@@ -56,6 +56,10 @@ pub struct EvalArguments {
     /// Weights to score LPIPS with, as for `train`
     #[arg(long, value_name = "PATH")]
     lpips: Option<PathBuf>,
+    /// Split the error of unseen views by its causes, as a table and as renders/budget.png; of
+    /// training views where there are no others
+    #[arg(long)]
+    budget: bool,
     /// Threads [default: all cores]
     #[arg(long)]
     threads: Option<usize>,
@@ -131,6 +135,11 @@ pub fn eval(arguments: &EvalArguments) -> Result<()> {
     }
     metrics.lpips = network;
     metrics.write(directory)?;
+    if arguments.budget {
+        let frames: Vec<&PreparedFrame> =
+            if scene.eval.is_empty() { scored_train_frames(&scene).collect() } else { scene.eval.iter().collect() };
+        budget::run(directory, &scene, drawn.renderer(&scene)?.as_mut(), &frames)?;
+    }
     report::write(directory, &metrics)?;
     let mut one = metrics.clone();
     for (name, split) in [(NOVEL_VIEWS, &metrics.splits.novel_view), (TRAINING_VIEWS, &metrics.splits.train_view)] {

@@ -4,6 +4,7 @@
 mod avatar;
 mod baked;
 mod bench;
+mod budget;
 mod capacity;
 mod check;
 mod compare;

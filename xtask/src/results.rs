@@ -25,6 +25,18 @@ pub struct Section<'a> {
     pub charts: &'a [PathBuf],
 }
 
+/// Captures that settings were chosen on; `zju_demo` shows the person of `humannerf_demo`.
+const TUNING: [&str; 3] = ["demo", "humannerf_demo", "zju_demo"];
+
+/// What figures on a scene, by its name, speak for.
+pub fn set_of(scene: &str) -> &'static str {
+    if TUNING.contains(&scene) {
+        "A *tuning* capture: settings were chosen on it"
+    } else {
+        "A *reporting* capture: no setting was chosen on it"
+    }
+}
+
 /// Puts a section into xtask/RESULTS.md, with the command, commit and machine that it comes from.
 pub fn publish(section: &Section<'_>) -> Result<()> {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR"));

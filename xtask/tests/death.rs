@@ -199,7 +199,7 @@ fn a_training_killed_at_any_moment_ends_the_same_to_the_bit() {
 fn scoring_and_tables_killed_at_any_moment_are_whole_or_absent() {
     let folder = folder("killed-tables");
     let capture = capture(&folder);
-    let without = "humannerf-bg,humannerf-bg-4x,humannerf-bg-time,humannerf,humannerf-4x,humannerf-time,hash-point-bg,\
+    let without = "humannerf-style-paper,humannerf-style-bg,humannerf-style-bg-4x,humannerf-style-bg-time,humannerf-style,humannerf-style-4x,humannerf-style-time,hash-point-bg,\
                    occnerf-bg,occnerf,no-surface,no-attention,no-completeness,no-perceptual";
     let run = folder.join("run");
     done(&[&["train", text(&capture), "--out", text(&run), "--steps", "10"][..], &QUICK].concat());

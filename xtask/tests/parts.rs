@@ -22,7 +22,7 @@ fn parts_of_a_reproduction_make_the_table_that_one_job_makes() {
     let folder = folder("parts");
     let capture = folder.join("capture");
     done(&["synth", "--out", text(&capture), "--size", "32", "--frames", "4", "--eval-cameras", "1"]);
-    let without = "humannerf-bg,humannerf-bg-4x,humannerf-bg-time,humannerf,humannerf-4x,humannerf-time,hash-point-bg,\
+    let without = "humannerf-style-paper,humannerf-style-bg,humannerf-style-bg-4x,humannerf-style-bg-time,humannerf-style,humannerf-style-4x,humannerf-style-time,hash-point-bg,\
                    occnerf-bg,no-surface,no-attention,no-completeness,no-perceptual";
     let command = |out: &Path, more: &[&str]| -> Vec<String> {
         let all =

@@ -5,7 +5,7 @@ mod common;
 
 use common::{done, folder, refused, text};
 
-const LEFT_OUT: &str = "humannerf-bg-4x,humannerf-bg-time,humannerf-4x,humannerf-time,hash-point-bg,occnerf-bg,no-surface,\
+const LEFT_OUT: &str = "humannerf-style-paper,humannerf-style-bg-4x,humannerf-style-bg-time,humannerf-style-4x,humannerf-style-time,hash-point-bg,occnerf-bg,no-surface,\
                         no-attention,no-completeness,no-perceptual";
 
 #[test]
@@ -18,7 +18,7 @@ fn tables_have_every_row_once_and_a_second_call_trains_nothing() {
     let first = done(&arguments);
     assert_eq!(first.matches(": training\n").count(), 1 + 2 * 4, "{first}");
     let table = std::fs::read_to_string(out.join("capture/reproduce.md")).unwrap();
-    for row in ["prior", "humannerf-bg", "humannerf", "hash-point", "occnerf"] {
+    for row in ["prior", "humannerf-style-bg", "humannerf-style", "hash-point", "occnerf"] {
         assert_eq!(table.matches(&format!("| {row} ")).count(), 2, "{row}, novel and training views: {table}");
     }
     assert!(table.contains(" ± "), "{table}");
@@ -42,7 +42,7 @@ fn rows_of_any_length_without_views_kept_back_fit_a_budget_and_another_capture_o
     }
     let out = folder.join("out");
     let rest = ["--out", text(&out), "--seeds", "1", "--budget", "0.01", "--without"];
-    let without = "humannerf-bg,humannerf-bg-4x,humannerf-bg-time,hash-point-bg,hash-point,occnerf-bg,no-surface,\
+    let without = "humannerf-style-paper,humannerf-style-bg,humannerf-style-bg-4x,humannerf-style-bg-time,hash-point-bg,hash-point,occnerf-bg,no-surface,\
                    no-attention,no-completeness,no-perceptual";
     let arguments = |capture| [&["reproduce", capture], &rest[..], &[without]].concat();
     done(&arguments(text(&capture)));
@@ -51,8 +51,8 @@ fn rows_of_any_length_without_views_kept_back_fit_a_budget_and_another_capture_o
         let line = table.lines().find(|line| line.starts_with(&format!("| {row} "))).unwrap();
         line.split('|').nth(3).unwrap().trim().parse::<u64>().unwrap()
     };
-    assert_eq!(steps("humannerf-4x"), 4 * steps("humannerf"));
-    assert!(steps("humannerf-time") > 0 && steps("occnerf") == steps("humannerf"));
+    assert_eq!(steps("humannerf-style-4x"), 4 * steps("humannerf-style"));
+    assert!(steps("humannerf-style-time") > 0 && steps("occnerf") == steps("humannerf-style"));
     assert!(!table.contains("Novel views") && out.join("person/reproduce.png").is_file(), "{table}");
     let refusal = common::xtask(&arguments(text(&other)));
     let said = String::from_utf8_lossy(&refusal.stderr);
@@ -65,7 +65,10 @@ fn robustness_is_a_line_for_each_error_of_the_prior() {
     let (capture, out) = (folder.join("capture"), folder.join("out"));
     done(&["synth", "--out", text(&capture), "--size", "48", "--frames", "3", "--eval-cameras", "1"]);
     let arguments = ["reproduce", text(&capture), "--robustness", "--out", text(&out), "--steps", "1", "--seeds", "1"];
-    done(&[&arguments[..], &["--without", "humannerf-bg,humannerf,hash-point"]].concat());
+    done(
+        &[&arguments[..], &["--without", "humannerf-style-paper,humannerf-style-bg,humannerf-style,hash-point"]]
+            .concat(),
+    );
     let table = std::fs::read_to_string(out.join("capture/robustness/robustness.md")).unwrap();
     assert_eq!(table.lines().filter(|line| line.starts_with('|')).count(), 2 + 9, "{table}");
 }

@@ -4,7 +4,7 @@ use glam::{Quat, Vec3};
 use serde::{Deserialize, Serialize};
 use smpl::{BodyModel, Placement};
 
-use super::demo::motion::{Pose, TrackerError, track};
+use super::demo::motion::{Pose, TrackerError, track, wander};
 use super::pixels::Edit;
 use super::synth::noise::normal;
 use super::{Capture, CaptureError, Frame};
@@ -13,6 +13,11 @@ use crate::random::Stream;
 /// Coefficients that are wrong at most: what follows hardly changes the body.
 const BETAS: usize = 10;
 const SHAPE: u64 = 0x5348_4150;
+const DEPTH: u64 = 0x4445_5054;
+const LIMBS: u64 = 0x4c49_4d42;
+/// How far off the plane of symmetry a limb's bone begins, and within which a joint's mirrored twin
+/// is found, metres of a body 1.7 high.
+const ASIDE: f32 = 0.03;
 
 /// Errors added to what a capture says of the body and of its pixels. None by default.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -22,14 +27,52 @@ pub struct Perturbation {
     pub pose_degrees: f32,
     /// Standard deviation of the error of each shape coefficient, the same in all frames, 0 to 5.
     pub shape: f32,
+    /// Root mean square error of the place, metres of a body 1.7 high, smooth in time, 0 to 1.
+    pub translation: f32,
+    /// Root mean square error of the distance from the camera, per cent, smooth in time, 0 to 50.
+    pub depth_percent: f32,
+    /// Standard deviation of the error of the lengths of the limbs' bones, per cent, left as right,
+    /// 0 to 50: see [`Perturbation::spoil_body`].
+    pub limbs_percent: f32,
+    /// Pixels by which the edges of the training masks go to and fro at most, 0 to 64. What is
+    /// added shows black.
+    pub ragged_pixels: f32,
     /// Pixels by which the training masks are larger (smaller if negative) than they should be, −64
     /// to 64. What is added shows black.
     pub mask_pixels: i32,
 }
 
 impl Perturbation {
+    /// No error.
+    pub const NONE: Self = Self {
+        pose_degrees: 0.0,
+        shape: 0.0,
+        translation: 0.0,
+        depth_percent: 0.0,
+        limbs_percent: 0.0,
+        ragged_pixels: 0.0,
+        mask_pixels: 0,
+    };
+    /// What estimators and segmenters make of a real video.
+    pub const REAL: Self = Self {
+        pose_degrees: 4.0,
+        shape: 1.0,
+        translation: 0.02,
+        depth_percent: 2.0,
+        limbs_percent: 5.0,
+        ragged_pixels: 2.0,
+        ..Self::NONE
+    };
+
     pub(super) fn check(&self) -> Result<(), CaptureError> {
-        let real = [("wrong.pose_degrees", self.pose_degrees, 90.0), ("wrong.shape", self.shape, 5.0)];
+        let real = [
+            ("wrong.pose_degrees", self.pose_degrees, 90.0),
+            ("wrong.shape", self.shape, 5.0),
+            ("wrong.translation", self.translation, 1.0),
+            ("wrong.depth_percent", self.depth_percent, 50.0),
+            ("wrong.limbs_percent", self.limbs_percent, 50.0),
+            ("wrong.ragged_pixels", self.ragged_pixels, 64.0),
+        ];
         for (name, value, most) in real {
             if !(0.0..=most).contains(&value) {
                 return Err(CaptureError::setting(name, format!("0 to {most}"), value));
@@ -42,7 +85,7 @@ impl Perturbation {
     }
 
     /// Makes a capture wrong. Views kept back get the wrong bodies of their instants, but keep
-    /// their pixels.
+    /// their pixels. Lengths of limbs are the body's: see [`Perturbation::spoil_body`].
     ///
     /// # Errors
     /// A value out of its range.
@@ -59,20 +102,93 @@ impl Perturbation {
                 betas.iter_mut().zip(&error).for_each(|(beta, error)| *beta += error);
             }
         }
-        if self.pose_degrees > 0.0 {
-            self.turn(capture, body);
+        if self.pose_degrees > 0.0 || self.translation > 0.0 || self.depth_percent > 0.0 {
+            self.displace(capture, body);
         }
-        if self.mask_pixels != 0 {
-            capture.train.iter_mut().for_each(|frame| frame.source.edit(Edit::Grow(self.mask_pixels)));
+        for (index, frame) in capture.train.iter_mut().enumerate() {
+            if self.mask_pixels != 0 {
+                frame.source.edit(Edit::Grow(self.mask_pixels));
+            }
+            if self.ragged_pixels > 0.0 {
+                frame.source.edit(Edit::Fray(self.ragged_pixels, index as u64));
+            }
         }
         Ok(())
     }
 
-    fn turn(&self, capture: &mut Capture, body: &BodyModel) {
+    /// Makes the limbs of a body too long or too short, each bone with its twin on the other side.
+    /// A limb's bone is one that begins and ends off the plane of symmetry, x = 0; what hangs on it
+    /// moves along.
+    pub fn spoil_body(&self, body: &mut BodyModel) {
+        if self.limbs_percent == 0.0 {
+            return;
+        }
+        let joints = body.shaped(&[]).joints;
+        let height = |pick: fn(f32, f32) -> f32| body.v_template.iter().map(|v| v.y).reduce(pick).unwrap_or(0.0);
+        let unit = (height(f32::max) - height(f32::min)) / 1.7;
+        let twin = |j: usize| {
+            let mirrored = joints[j] * Vec3::new(-1.0, 1.0, 1.0);
+            let near = (0..joints.len()).find(|&k| joints[k].distance(mirrored) < ASIDE * unit);
+            near.map_or(j, |k| k.min(j))
+        };
+        let is_aside = |j: usize| joints[j].x.abs() > ASIDE * unit;
+        // By how much of the bone from its parent each joint is too far, and how far it moves.
+        let mut moved = vec![Vec3::ZERO; joints.len()];
+        let mut stretched: Vec<Option<(f32, Vec3)>> = vec![None; joints.len()];
+        for (j, parent) in body.parents.iter().enumerate() {
+            let Some(p) = *parent else { continue };
+            moved[j] = moved[p];
+            if is_aside(j) && is_aside(p) {
+                let longer = 0.01 * self.limbs_percent * normal(&mut Stream::new(&[LIMBS, twin(j) as u64]));
+                let bone = joints[j] - joints[p];
+                moved[j] += longer * bone;
+                // A limb that forks is stretched towards where its first branch begins.
+                stretched[p].get_or_insert((longer, bone));
+            }
+        }
+        for (v, place) in body.v_template.iter_mut().enumerate() {
+            let at = *place;
+            for (j, weight) in body.weights.row(v) {
+                let along = stretched[j].map_or(Vec3::ZERO, |(longer, bone)| {
+                    let part = (at - joints[j]).dot(bone) / bone.length_squared().max(f32::MIN_POSITIVE);
+                    longer * part.clamp(0.0, 1.0) * bone
+                });
+                *place += weight * (moved[j] + along);
+            }
+        }
+    }
+
+    /// Turns bones, and moves the whole.
+    fn displace(&self, capture: &mut Capture, body: &BodyModel) {
+        let shaped = body.shaped(&capture.mean_betas);
+        let height = |pick: fn(f32, f32) -> f32| shaped.vertices.iter().map(|v| v.y).reduce(pick).unwrap_or(0.0);
+        let unit = (height(f32::max) - height(f32::min)) / 1.7;
+        self.turn(capture, body, self.translation * unit);
+        // Of three axes each has a third of the square.
+        let rms = 3.0f32.sqrt() * 0.01 * self.depth_percent;
+        let nearer = wander(&mut Stream::new(&[DEPTH]), capture.train.len(), rms);
+        for (frame, nearer) in capture.train.iter_mut().zip(nearer) {
+            let pelvis = body.shaped(&frame.betas).joints.first().copied().unwrap_or(Vec3::ZERO);
+            let Pose { rotation, translation, .. } = about_origin(frame, pelvis);
+            let away = rotation * pelvis + translation - frame.camera.centre_of_projection();
+            match &mut frame.placement {
+                Placement::Origin { translation, .. } | Placement::Pelvis { translation } => {
+                    *translation += nearer.x * away;
+                }
+            }
+        }
+        for view in &mut capture.eval {
+            if let Some(frame) = capture.train.get(view.train_index) {
+                (view.frame.pose, view.frame.placement) = (frame.pose.clone(), frame.placement);
+            }
+        }
+    }
+
+    fn turn(&self, capture: &mut Capture, body: &BodyModel, translation: f32) {
         let pelvis = |frame: &Frame| body.shaped(&frame.betas).joints.first().copied().unwrap_or(Vec3::ZERO);
         let Some(first) = capture.train.first().map(pelvis) else { return };
         let poses: Vec<Pose> = capture.train.iter().map(|frame| about_origin(frame, pelvis(frame))).collect();
-        let error = TrackerError { seed: 0, rotation: self.pose_degrees.to_radians(), translation: 0.0 };
+        let error = TrackerError { seed: 0, rotation: self.pose_degrees.to_radians(), translation };
         for (frame, pose) in capture.train.iter_mut().zip(track(&poses, &body.parents, first, error)) {
             let Pose { joints, rotation, translation } = pose;
             frame.pose = joints;
@@ -85,11 +201,6 @@ impl Perturbation {
                     frame.pose[0] = rotation.to_scaled_axis();
                     *t = translation + rotation * pelvis - pelvis;
                 }
-            }
-        }
-        for view in &mut capture.eval {
-            if let Some(frame) = capture.train.get(view.train_index) {
-                (view.frame.pose, view.frame.placement) = (frame.pose.clone(), frame.placement);
             }
         }
     }
@@ -117,8 +228,12 @@ mod tests {
     use super::*;
 
     fn capture(body: &BodyModel) -> Capture {
+        sized(body, 48)
+    }
+
+    fn sized(body: &BodyModel, size: u32) -> Capture {
         let exact = DemoConfig { pose_noise_degrees: 0.0, translation_noise: 0.0, ..DemoConfig::default() };
-        demo(&DemoConfig { size: 48, frames: 12, eval_cameras: 1, ..exact }, body).unwrap()
+        demo(&DemoConfig { size, frames: 12, eval_cameras: 1, ..exact }, body).unwrap()
     }
 
     #[test]
@@ -188,10 +303,78 @@ mod tests {
     }
 
     #[test]
+    fn the_whole_moves_by_as_much_as_is_asked_for() {
+        let body = BodyModel::embedded();
+        let before = capture(&body);
+        let pelvis = |frame: &Frame| body.pose(&body.shaped(&frame.betas), &frame.pose, frame.placement).joints[0];
+        for wrong in [
+            Perturbation { translation: 0.05, ..Perturbation::NONE },
+            Perturbation { depth_percent: 3.0, ..Perturbation::NONE },
+        ] {
+            let mut after = before.clone();
+            wrong.apply(&mut after, &body).unwrap();
+            let (mut squares, mut parts) = (0.0, 0.0);
+            for (a, b) in before.train.iter().zip(&after.train) {
+                let (from, to) = (pelvis(a), pelvis(b));
+                let ray = from - a.camera.centre_of_projection();
+                squares += (to - from).length_squared() / before.train.len() as f32;
+                parts += ((to - from).length() / ray.length()).powi(2) / before.train.len() as f32;
+                assert!(wrong.depth_percent == 0.0 || (to - from).cross(ray).length() < 1e-3);
+            }
+            let (rms, part) = (squares.sqrt(), 100.0 * parts.sqrt());
+            // The body is nearly 1.7 high; the shares of the axes are only even on the average.
+            assert!(wrong.translation == 0.0 || (rms / wrong.translation - 1.0).abs() < 0.1, "{rms}");
+            assert!(wrong.depth_percent == 0.0 || (part / wrong.depth_percent - 1.0).abs() < 0.5, "{part}");
+            assert_eq!(after.eval[0].frame.placement, after.train[after.eval[0].train_index].placement);
+        }
+    }
+
+    #[test]
+    fn limbs_become_longer_or_shorter_alike_on_both_sides_and_nothing_else() {
+        let (body, mut wrong) = (BodyModel::embedded(), BodyModel::embedded());
+        Perturbation { limbs_percent: 5.0, ..Perturbation::NONE }.spoil_body(&mut wrong);
+        wrong.validate("limbs").unwrap();
+        let (a, b) = (body.shaped(&[]).joints, wrong.shaped(&[]).joints);
+        let longer = |j: usize| {
+            let p = body.parents[j].unwrap();
+            (b[j] - b[p]).length() / (a[j] - a[p]).length() - 1.0
+        };
+        // Hips, knees, ankles; shoulders, elbows, wrists of SMPL.
+        let changes: Vec<f32> = [(4, 5), (7, 8), (18, 19), (20, 21)]
+            .map(|(l, r)| {
+                assert!((longer(l) - longer(r)).abs() < 0.01, "{l}: {} and {}", longer(l), longer(r));
+                longer(l).abs()
+            })
+            .into();
+        let mean = changes.iter().sum::<f32>() / 4.0;
+        assert!((0.01..0.12).contains(&mean), "{changes:?}");
+        assert!([3, 6, 9, 12, 15].iter().all(|&j| longer(j).abs() < 0.01));
+    }
+
+    #[test]
+    fn ragged_masks_keep_their_size_and_their_middle() {
+        let body = BodyModel::embedded();
+        let (before, mut after) = (sized(&body, 192), sized(&body, 192));
+        Perturbation { ragged_pixels: 2.0, ..Perturbation::NONE }.apply(&mut after, &body).unwrap();
+        let (mut area, mut changed) = ([0.0, 0.0], 0.0);
+        for (a, b) in before.train.iter().zip(&after.train) {
+            let (a, b) = (a.shown(), b.shown());
+            area = [area[0] + a.mask.iter().sum::<f32>(), area[1] + b.mask.iter().sum::<f32>()];
+            changed += a.mask.iter().zip(&b.mask).map(|(a, b)| (a - b).abs()).sum::<f32>();
+            assert!(b.image.pixels.chunks_exact(3).zip(&b.mask).all(|(p, m)| p.iter().all(|c| *c <= m + 1e-5)));
+        }
+        assert!((area[1] / area[0] - 1.0).abs() < 0.05, "{area:?}");
+        assert!(changed > 0.02 * area[0] && changed < 0.3 * area[0], "{changed} of {}", area[0]);
+    }
+
+    #[test]
     fn errors_out_of_range_are_named() {
+        assert_eq!(Perturbation::NONE, Perturbation::default());
+        Perturbation::REAL.check().unwrap();
         for (wrong, name) in [
             (Perturbation { pose_degrees: f32::NAN, ..Perturbation::default() }, "pose_degrees"),
             (Perturbation { shape: -1.0, ..Perturbation::default() }, "shape"),
+            (Perturbation { ragged_pixels: -1.0, ..Perturbation::default() }, "ragged_pixels"),
             (Perturbation { mask_pixels: 65, ..Perturbation::default() }, "mask_pixels"),
         ] {
             assert!(wrong.check().unwrap_err().to_string().contains(name));

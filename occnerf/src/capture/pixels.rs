@@ -2,7 +2,13 @@
 
 use std::ops::Range;
 
+use glam::Vec3;
+
 use super::Image;
+use super::synth::noise::smooth_noise;
+
+/// Pixels over which a ragged edge runs from one side to the other.
+const RAGGED: f32 = 5.0;
 
 /// A rectangle of pixels.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -61,13 +67,35 @@ impl Pixels {
                 ];
                 let values = around.into_iter().flatten().map(|j| old[j]);
                 let new = if pixels > 0 { values.fold(old[i], f32::max) } else { values.fold(old[i], f32::min) };
-                if new < old[i] {
-                    // The picture is premultiplied by the mask.
-                    let share = new / old[i];
-                    self.image.pixels[3 * i..3 * i + 3].iter_mut().for_each(|c| *c *= share);
-                }
-                self.mask[i] = new;
+                self.cover(i, new);
             }
+        }
+    }
+
+    /// Gives a pixel another coverage; what is added shows black.
+    fn cover(&mut self, i: usize, coverage: f32) {
+        if coverage < self.mask[i] {
+            // The picture is premultiplied by the mask.
+            let share = coverage / self.mask[i];
+            self.image.pixels[3 * i..3 * i + 3].iter_mut().for_each(|c| *c *= share);
+        }
+        self.mask[i] = coverage;
+    }
+
+    /// Moves the edge of the mask to and fro by up to so many pixels, in other places for each
+    /// `frame`.
+    fn fray(&mut self, pixels: f32, frame: u64) {
+        let (old, width, height) = (self.mask.clone(), self.image.width as usize, self.image.height as usize);
+        for i in 0..old.len() {
+            let (x, y) = ((i % width) as f32, (i / width) as f32);
+            let wave = |part: f32| {
+                // Frames far from each other in noise have nothing to do with each other.
+                let at = Vec3::new(x / RAGGED, y / RAGGED, 10.0 * (frame % 100_000) as f32 + 5.0 * part);
+                (pixels * (2.0 * smooth_noise(at) - 1.0)).round()
+            };
+            let inside = |c: f32, side: usize| c.clamp(0.0, side as f32 - 1.0) as usize;
+            let from = inside(y + wave(1.0), height) * width + inside(x + wave(0.0), width);
+            self.cover(i, old[from]);
         }
     }
 }
@@ -79,6 +107,8 @@ pub(super) enum Edit {
     Hide(Area),
     /// The mask is larger, or smaller, by so many pixels.
     Grow(i32),
+    /// The edge of the mask goes to and fro by up to so many pixels, as the number decides.
+    Fray(f32, u64),
 }
 
 impl Edit {
@@ -86,6 +116,7 @@ impl Edit {
         match self {
             Self::Hide(area) => pixels.hide(area),
             Self::Grow(by) => pixels.grow(*by),
+            Self::Fray(by, frame) => pixels.fray(*by, *frame),
         }
     }
 }

@@ -202,6 +202,9 @@ pub struct SurfaceConfig {
 pub struct MotionConfig {
     /// Volume or surface.
     pub kind: MotionKind,
+    /// Samples an axis of the weight volume of the volume kinds.
+    #[serde(default = "published_resolution")]
+    pub resolution: usize,
     /// Distance from the prior's surface up to which a point can belong to the subject, normalised
     /// metres.
     pub margin: f32,
@@ -219,6 +222,11 @@ pub struct MotionConfig {
     /// the volume kinds ask for that.
     #[serde(default)]
     pub shell_interval: usize,
+}
+
+/// That of the paper, and of files that do not say.
+fn published_resolution() -> usize {
+    32
 }
 
 impl MotionConfig {

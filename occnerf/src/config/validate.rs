@@ -17,13 +17,15 @@ pub struct ConfigError {
 impl Config {
     /// Checks every value that would otherwise fail later and less clearly.
     pub fn validate(&self) -> Result<(), ConfigError> {
-        let whole: [(&'static str, usize, std::ops::RangeInclusive<usize>, &'static str); 9] = [
+        let whole: [(&'static str, usize, std::ops::RangeInclusive<usize>, &'static str); 10] = [
             ("patches", self.patches, 1..=1024, "expected 1 to 1024"),
             ("patch_size", self.patch_size as usize, 1..=256, "expected 1 to 256 pixels"),
             ("samples", self.samples, 1..=1024, "expected 1 to 1024"),
             ("field.width", self.field.width, 1..=1024, "expected 1 to 1024"),
             ("field.depth", self.field.depth, 1..=16, "expected 1 to 16"),
             ("registration.rounds", self.registration.rounds, 0..=100, "expected at most 100"),
+            // At 128 the weights, their moments and their gradient take 1.3 GB.
+            ("motion.resolution", self.motion.resolution, 2..=128, "expected 2 to 128"),
             ("surface.k", self.surface.k, 1..=32, "expected 1 to 32"),
             ("surface.coarse_levels", self.surface.coarse_levels, 0..=6, "expected 0 to 6"),
             ("steps", usize::try_from(self.steps).unwrap_or(usize::MAX), 0..=100_000_000, "expected at most 10^8"),

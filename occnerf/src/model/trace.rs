@@ -254,7 +254,7 @@ impl Tracer<'_> {
 mod tests {
     use super::*;
     use crate::capture::{DemoConfig, demo};
-    use crate::config::{DistanceKind, Method, Preset};
+    use crate::config::{DistanceKind, Method, MotionKind, Preset};
     use crate::model::view::PosedView;
     use crate::scene::prepared::Scene;
     use crate::train::trainer::Trainer;
@@ -265,6 +265,7 @@ mod tests {
         let capture = demo(&DemoConfig { size: 32, frames: 2, eval_cameras: 1, ..Default::default() }, &body).unwrap();
         for distance in [DistanceKind::Blended, DistanceKind::Exact] {
             let mut config = Config::preset(Preset::Paper, Method::Occnerf);
+            config.motion.kind = MotionKind::Volume;
             (config.surface.distance, config.encoding.log2_table_size) = (distance, 8);
             let scene = Scene::new(&capture, &body, &config).unwrap();
             let trainer = Trainer::new(&scene, config.clone()).unwrap();

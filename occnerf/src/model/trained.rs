@@ -4,7 +4,7 @@ use std::borrow::Cow;
 use std::sync::Arc;
 
 use glam::Vec3;
-use smpl::{MotionField, MotionFrame, Posed, SurfaceMotion, WeightVolume};
+use smpl::{MotionField, MotionFrame, Posed, SurfaceMotion, WeightVolume, WeightVolumeConfig};
 use visibility::VisibilityCounts;
 use volrender::Occupancy;
 
@@ -66,13 +66,14 @@ impl Model {
         let field = Field::new(&config, body.canonical_box)?;
         let volume = |weights: WeightVolume| MotionField::Volume { weights, threshold: VOLUME_THRESHOLD };
         let (prior, shaped) = (&body.model, &body.canonical);
+        let layout = WeightVolumeConfig { resolution: config.motion.resolution, ..Default::default() };
         let motion = match config.motion.kind {
             MotionKind::Surface => {
                 let (margin, falloff) = (config.motion.margin, config.motion.falloff);
                 MotionField::Surface(SurfaceMotion { margin, falloff })
             }
-            MotionKind::Volume => volume(WeightVolume::diffused(prior, shaped, &Default::default())),
-            MotionKind::Gaussian => volume(WeightVolume::gaussian(prior, shaped, &Default::default())),
+            MotionKind::Volume => volume(WeightVolume::diffused(prior, shaped, &layout)),
+            MotionKind::Gaussian => volume(WeightVolume::gaussian(prior, shaped, &layout)),
         };
         let corrections = Corrections::new(frames.len(), config.motion.correction_spacing, prior.num_joints());
         let (near_canonical, log_weights) = match &motion {

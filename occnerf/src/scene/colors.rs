@@ -1,6 +1,6 @@
 //! The colours that a video shows of the prior.
 
-use glam::{DVec3, Vec3};
+use glam::Vec3;
 use rayon::prelude::*;
 use surface_query::vertex_normals;
 
@@ -10,12 +10,13 @@ use crate::model::colors::VertexColors;
 use crate::scene::light::{Seen, albedo, measure_light};
 use crate::scene::pinhole::pinhole;
 use crate::scene::prepared::{PreparedFrame, Scene};
+use crate::scene::unseen::complete;
 
 impl VertexColors {
     /// The colour that is closest to the visible training pixels that saw a vertex, by ray casting,
     /// under the light of the scene if the configuration asks for one; a vertex that none saw takes
-    /// the mean of those that some saw, weighted by their canonical distances to the power of −4
-    /// (Shepard 1968).
+    /// a mean of those that some saw, by their canonical distances, along the stripes if there are
+    /// any.
     ///
     /// # Errors
     /// Pictures that cannot be read.
@@ -25,26 +26,10 @@ impl VertexColors {
         let vertices = &scene.body.canonical.vertices;
         let light = if scene.lit { measure_light(&frames, vertices.len()) } else { Light::default() };
         let sums = albedo(frames.iter().flatten(), vertices.len(), |normal| light.on(normal));
-        let known: Vec<usize> = (0..sums.len()).filter(|&v| sums[v].1 > 0.0).collect();
-        let color = |v: usize| sums[v].0 / sums[v].1;
-        let colors = (0..sums.len())
-            .into_par_iter()
-            .map(|v| {
-                if sums[v].1 > 0.0 {
-                    return color(v);
-                }
-                let (mut sum, mut weights) = (DVec3::ZERO, 0.0);
-                for &k in &known {
-                    // Vertices of a seam may coincide.
-                    let squared = f64::from(vertices[k].distance_squared(vertices[v])).max(1e-12);
-                    let weight = 1.0 / (squared * squared);
-                    sum += weight * color(k).as_dvec3();
-                    weights += weight;
-                }
-                if weights > 0.0 { (sum / weights).as_vec3() } else { Vec3::splat(0.5) }
-            })
-            .collect();
-        Ok(Self { colors, seen: sums.iter().map(|sum| sum.1 > 0.0).collect(), light })
+        let seen: Vec<bool> = sums.iter().map(|sum| sum.1 > 0.0).collect();
+        let mut colors: Vec<Vec3> = sums.iter().map(|(sum, squares)| *sum / squares.max(f32::MIN_POSITIVE)).collect();
+        complete(&scene.body, &mut colors, &seen);
+        Ok(Self { colors, seen, light })
     }
 }
 

@@ -7,3 +7,4 @@ pub(crate) mod light;
 pub(crate) mod pinhole;
 pub(crate) mod prepared;
 pub(crate) mod registration;
+mod unseen;

@@ -6,13 +6,16 @@ use std::ops::Range;
 
 use glam::{DVec3, Vec3};
 use hashgrid::HashGrid;
+use smpl::{MotionField, MotionFrame};
 use testkit::oracle;
 use visibility::VisibilityCounts;
 
-use crate::config::{Config, Method, MotionKind, Preset};
-use crate::model::encoder::Encoder;
-use crate::model::field::SampleBatch;
-use crate::model::parameters::Part;
+use crate::config::{Config, DistanceKind, Method, MotionKind, Preset};
+use crate::model::distance::surface_point;
+use crate::model::encoder::{Coordinates, Encoder};
+use crate::model::parameters::{Arrays, Part};
+use crate::model::samples::Samples;
+use crate::model::trained::Model;
 use crate::random::Stream;
 use crate::scene::prepared::Scene;
 use crate::train::batch::target;
@@ -23,6 +26,8 @@ use crate::train::trainer::Trainer;
 struct Plain<'a, 'b> {
     trainer: &'a Trainer<'b>,
     counts: &'a VisibilityCounts,
+    /// Of the vertices in that step.
+    offsets: &'a [f32],
 }
 
 impl Plain<'_, '_> {
@@ -54,21 +59,62 @@ impl Plain<'_, '_> {
         rows.chunks(resolutions.len() * features).map(<[f64]>::to_vec).collect()
     }
 
+    /// Where the vertices are encoded with `offsets`; neighbours are those without.
+    fn vertices(&self, offsets: &[f32]) -> Coordinates {
+        let Model { body, config, field, .. } = &self.trainer.model;
+        let mut at = Coordinates::default();
+        let mut neighbours = vec![0; body.query.neighbours_per_query()];
+        let each = body.canonical.vertices.iter().zip(offsets.chunks_exact(3)).zip(self.offsets.chunks_exact(3));
+        for ((&vertex, offset), from) in each {
+            body.query.neighbours(vertex + Vec3::from_slice(from), &mut neighbours);
+            let v = vertex + Vec3::from_slice(offset);
+            let d = surface_point(body, &config.surface, v, &neighbours, 1.0).unwrap().distance;
+            field.encoder.push_vertex(v, d, &body.canonical_box, &mut at);
+        }
+        at
+    }
+
+    /// The samples of a segment where the weight volume, if there is one, takes them with `delta`;
+    /// those that live, and their neighbours, are the ones without.
+    fn moved(&self, samples: &Samples, motion: Option<&MotionField>) -> (Samples, Coordinates) {
+        let Model { body, config, field, .. } = &self.trainer.model;
+        let (mut out, mut at) = (samples.clone(), Coordinates::default());
+        let per_sample = samples.neighbours.len().checked_div(samples.len()).unwrap_or(0);
+        let posed = &self.trainer.scene.train[self.trainer.buffers.batch.frame].view.posed;
+        let frame = MotionFrame::new(&body.model, posed);
+        for s in 0..motion.map_or(0, |_| samples.len()) {
+            let mapped = motion.and_then(|motion| motion.map(&frame, samples.world[s], || None)).unwrap();
+            let neighbours = &samples.neighbours[s * per_sample..];
+            let found = surface_point(body, &config.surface, mapped.canonical, neighbours, 1.0).unwrap();
+            (out.canonical[s], out.likelihood[s]) = (mapped.canonical, mapped.likelihood);
+            (out.closest[s], out.distance[s]) = (found.closest, found.distance);
+        }
+        field.encoder.coordinates(&out, &body.canonical_box, &mut at);
+        (out, at)
+    }
+
     /// The loss and the colours of the rays, in the order of the batch.
-    fn step(&self, field: &[f32], table: &[f32]) -> (f64, Vec<DVec3>) {
+    fn step(&self, values: &Arrays) -> (f64, Vec<DVec3>) {
         let trainer = self.trainer;
         let (config, batch) = (&trainer.model.config, &trainer.buffers.batch);
         let frame = &trainer.scene.train[batch.frame];
-        let vertices = self.encode(table, &trainer.buffers.vertex_code.at.surface);
+        let (field, table) = (values.get(Part::Field), values.get(Part::Table));
+        let vertices = self.encode(table, &self.vertices(values.get(Part::Vertices)).surface);
+        let motion = trainer.model.volume().map(|volume| {
+            let mut weights = volume.clone();
+            weights.delta.copy_from_slice(values.get(Part::Motion));
+            weights.update();
+            MotionField::Volume { weights, threshold: 0.0 }
+        });
         let background = batch.background.as_dvec3();
         let mut colors = vec![DVec3::ZERO; batch.pixels.len()];
         let mut completeness = 0.0;
         for state in &trainer.buffers.groups {
             // All samples are one segment.
-            let Some(SampleBatch { samples, at, .. }) = state.segments.all().first().map(|segment| &segment.batch)
-            else {
+            let Some(traced) = state.segments.all().first().map(|segment| &segment.batch.samples) else {
                 continue;
             };
+            let (samples, at) = &self.moved(traced, motion.as_ref());
             let points =
                 if at.surface.is_empty() { self.encode(table, &at.point) } else { self.encode(table, &at.surface) };
             let per_sample = samples.neighbours.len().checked_div(samples.len()).unwrap_or(0);
@@ -98,7 +144,7 @@ impl Plain<'_, '_> {
                     let rgb = base.truncate() + base.w * DVec3::new(raw[1], raw[2], raw[3]);
                     color += transmittance * alpha * rgb.map(|x| 1.0 / (1.0 + (-x).exp()));
                     transmittance *= 1.0 - alpha;
-                    if d < 0.0 {
+                    if traced.distance[s] < 0.0 {
                         let beta = f64::from(config.loss.beta);
                         completeness += ((beta - sigma).max(0.0) - beta).exp();
                     }
@@ -125,12 +171,13 @@ fn levels<const D: usize>(grid: &HashGrid<D>) -> (Vec<Range<usize>>, Vec<u32>) {
     grid.resolutions().iter().enumerate().map(|(l, &n)| (grid.level_range(l), n)).unzip()
 }
 
-fn tiny(method: Method, motion: MotionKind, seed: u64) -> Config {
+fn tiny(method: Method, motion: MotionKind, distance: DistanceKind, seed: u64) -> Config {
     let mut config = Config::preset(Preset::Fast, method);
     (config.seed, config.patches, config.patch_size, config.samples) = (seed, 2, 12, 20);
     (config.field.width, config.field.depth) = (24, 2);
     (config.encoding.levels, config.encoding.log2_table_size, config.encoding.n_max) = (5, 11, 96);
     (config.motion.kind, config.motion.correction_spacing, config.motion.shell_interval) = (motion, 0, 0);
+    (config.motion.resolution, config.surface.distance) = (16, distance);
     config.min_transmittance = 0.0;
     config.field.prior_colors &= motion == MotionKind::Surface;
     // The perceptual term has an oracle of its own.
@@ -139,61 +186,82 @@ fn tiny(method: Method, motion: MotionKind, seed: u64) -> Config {
 }
 
 /// The fast step and the plain one on the same samples: colours to 1e-4, losses to 1e-4 of
-/// themselves, derivatives along random directions to 1e-2 of themselves.
+/// themselves, derivatives of every part but the poses along random directions to 1e-2 of
+/// themselves, those that move places to 6e-2 (the exact surface under a volume: 0.2).
 #[test]
 fn a_step_agrees_with_one_written_straight_from_the_definitions() {
     let body = smpl::BodyModel::embedded();
     let cases = [
-        (Method::Occnerf, MotionKind::Surface),
-        (Method::Occnerf, MotionKind::Volume),
-        (Method::HashPoint, MotionKind::Surface),
-        (Method::Humannerf, MotionKind::Surface),
+        (Method::Occnerf, MotionKind::Surface, DistanceKind::Exact),
+        (Method::Occnerf, MotionKind::Volume, DistanceKind::Exact),
+        (Method::HashPoint, MotionKind::Surface, DistanceKind::Exact),
+        (Method::Humannerf, MotionKind::Surface, DistanceKind::Exact),
+        (Method::Occnerf, MotionKind::Surface, DistanceKind::Blended),
+        (Method::Occnerf, MotionKind::Volume, DistanceKind::Blended),
+        (Method::HashPoint, MotionKind::Volume, DistanceKind::Blended),
     ];
-    for (seed, (method, motion)) in (1u64..).zip(cases) {
+    let mut wrong = Vec::new();
+    for (seed, (method, motion, distance)) in [1u64, 2, 3, 4, 1, 2, 2].into_iter().zip(cases) {
         let demo =
             crate::capture::DemoConfig { size: 48, frames: 3, eval_cameras: 1, eval_every: 3, ..Default::default() };
         let capture = crate::capture::demo(&demo, &body).unwrap();
-        let config = tiny(method, motion, seed);
+        let config = tiny(method, motion, distance, seed);
         let scene = Scene::new(&capture, &body, &config).unwrap();
         let mut trainer = Trainer::new(&scene, config).unwrap();
         for _ in 0..3 {
             trainer.step().unwrap();
         }
         let mut random = Stream::new(&[seed, 21]);
-        trainer.model.parameters.get_mut(Part::Table).iter_mut().for_each(|x| *x += 0.3 * random.normal());
-        let before = trainer.model.parameters.clone();
+        // Vertices away from the folds of the mesh that they start on.
+        for (part, size) in [(Part::Table, 0.3), (Part::Vertices, 2e-3)] {
+            trainer.model.parameters.get_mut(part).iter_mut().for_each(|x| *x += size * random.normal());
+        }
+        let before = trainer.model.parameters.values.clone();
         let counts = trainer.model.counts.clone();
         let report = trainer.step().unwrap();
-        let gradients = [Part::Field, Part::Table].map(|part| trainer.optimiser.gradients.get(part).to_vec());
-        let plain = Plain { trainer: &trainer, counts: &counts };
-        let (field, table) = (before.get(Part::Field), before.get(Part::Table));
-        let (loss, colors) = plain.step(field, table);
+        let gradients = trainer.optimiser.gradients.clone();
+        let plain = Plain { trainer: &trainer, counts: &counts, offsets: before.get(Part::Vertices) };
+        let (loss, colors) = plain.step(&before);
         assert!((loss - report.loss).abs() < 1e-4 * loss, "{method:?}: loss {} plain {loss}", report.loss);
         let rays: Vec<(DVec3, DVec3)> = (trainer.buffers.groups.iter())
             .flat_map(|g| g.rays.iter().zip(&g.composites).map(|(&ray, c)| (c.color.as_dvec3(), colors[ray])))
             .collect();
-        assert!(rays.len() == 288 && report.live_samples > 500, "{} {}", rays.len(), report.live_samples);
+        let live = report.live_samples;
+        assert!(rays.len() == 288 && live > 500, "{method:?} {motion:?} {distance:?}: {} {live}", rays.len());
         for (fast, plain) in rays {
             assert!((fast - plain).abs().max_element() < 1e-4, "{method:?}: {fast} {plain}");
         }
+        // Far enough for f32 to tell places apart, near enough to stay in most cells of the grid.
+        let parts = [(Part::Field, 1e-5), (Part::Table, 1e-5), (Part::Vertices, 1e-5), (Part::Motion, 3e-4)];
         for direction in 0..3 {
             let mut random = Stream::new(&[seed, 22, direction]);
-            for part in [0, 1].into_iter().filter(|&part| ![field, table][part].is_empty()) {
-                let from = [field, table][part];
-                let mut step: Vec<f32> = from.iter().map(|_| 1e-5 * random.normal()).collect();
-                if part == 0 {
+            for (part, size) in parts.into_iter().filter(|(part, _)| !before.get(*part).is_empty()) {
+                let from = before.get(part);
+                let mut step: Vec<f32> = from.iter().map(|_| size * random.normal()).collect();
+                if part == Part::Field {
                     trainer.model.field.mlp.clear_padding(&mut step);
                 }
-                let moved = |sign: f32| from.iter().zip(&step).map(|(x, s)| x + sign * s).collect::<Vec<f32>>();
+                let moved = |sign: f32| {
+                    let mut values = before.clone();
+                    values.get_mut(part).iter_mut().zip(&step).for_each(|(x, s)| *x += sign * s);
+                    values
+                };
                 let (high, low) = (moved(1.0), moved(-1.0));
-                let loss =
-                    |moved: &[f32]| if part == 0 { plain.step(moved, table).0 } else { plain.step(field, moved).0 };
-                let numeric = loss(&high) - loss(&low);
-                let each = gradients[part].iter().zip(high.iter().zip(&low));
+                let numeric = plain.step(&high).0 - plain.step(&low).0;
+                let each = gradients.get(part).iter().zip(high.get(part).iter().zip(low.get(part)));
                 let analytic: f64 = each.map(|(g, (h, l))| f64::from(*g) * (f64::from(*h) - f64::from(*l))).sum();
-                let scale = 1e-2 * numeric.abs().max(1e-7);
-                assert!((numeric - analytic).abs() < scale, "{method:?} {motion:?} part {part}: {numeric} {analytic}");
+                // Places cross cells of the grid; where the exact surface bends, its closest point
+                // does not slide along a plane, which the backward pass takes for granted.
+                let tolerance = match part {
+                    Part::Motion if distance == DistanceKind::Exact => 0.2,
+                    Part::Vertices | Part::Motion => 0.06,
+                    _ => 0.01,
+                };
+                if (numeric - analytic).abs() >= tolerance * numeric.abs().max(1e-7) {
+                    wrong.push(format!("{method:?} {motion:?} {distance:?} {part:?}: {numeric} {analytic}"));
+                }
             }
         }
     }
+    assert!(wrong.is_empty(), "{}", wrong.join("\n"));
 }

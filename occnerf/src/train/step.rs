@@ -160,7 +160,7 @@ pub(crate) fn zero(buffer: &mut Vec<f32>, len: usize) {
 #[cfg(test)]
 mod tests {
     use crate::capture::{DemoConfig, demo};
-    use crate::config::{Config, Method, Preset};
+    use crate::config::{Config, Method, MotionKind, Preset};
     use crate::model::march::MarchOptions;
     use crate::model::parameters::Part;
     use crate::scene::prepared::Scene;
@@ -189,8 +189,10 @@ mod tests {
     fn what_lies_outside_the_prior_at_unknown_pixels_has_no_gradient() {
         let body = smpl::BodyModel::embedded();
         let capture = demo(&DemoConfig { size: 40, frames: 4, eval_cameras: 1, ..Default::default() }, &body).unwrap();
-        for (preset, density_scale) in [(Preset::Fast, 25.0), (Preset::Paper, 25.0), (Preset::Paper, 4.0)] {
+        let (surface, volume) = ((Preset::Fast, MotionKind::Surface), (Preset::Paper, MotionKind::Volume));
+        for ((preset, motion), density_scale) in [(surface, 25.0), (volume, 25.0), (volume, 4.0)] {
             let mut config = Config::preset(preset, Method::Occnerf);
+            config.motion.kind = motion;
             (config.patches, config.patch_size, config.samples, config.seed) = (4, 24, 48, 2);
             (config.loss.perceptual, config.min_transmittance) = (0.0, 0.0);
             config.encoding.log2_table_size = 12;

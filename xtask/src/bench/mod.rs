@@ -11,6 +11,7 @@ mod job;
 mod kernels;
 mod pareto;
 mod points;
+mod registration;
 mod runner;
 mod stability;
 
@@ -59,6 +60,9 @@ enum What {
     Cost(CostArguments),
     /// A run's baked person against its field: a table of scores and speeds, and pictures.
     Baked(baked::BakedArguments),
+    /// What registration makes of wrong priors: degrees and millimetres against the demo's true
+    /// bodies.
+    Registration(registration::RegistrationArguments),
     /// One run, handed over on standard input.
     #[command(hide = true)]
     Point {
@@ -197,6 +201,7 @@ struct KernelArguments {
 pub fn bench(arguments: &BenchArguments) -> Result<()> {
     match &arguments.what {
         What::Baked(arguments) => baked::baked(arguments),
+        What::Registration(arguments) => registration::registration(arguments),
         What::Pareto(arguments) => pareto(arguments),
         What::Capacity(arguments) => capacity_bench(arguments),
         What::Stability(arguments) => stability(arguments),
@@ -301,7 +306,7 @@ fn pareto(arguments: &ParetoArguments) -> Result<()> {
         }
         let name = train::scene_name(Some(scene));
         pareto::charts(&name, &lines, &out.join(format!("pareto-{name}")))?;
-        text.push_str(&format!("## {scene}\n\n{}\n", pareto::table(&lines)));
+        text.push_str(&format!("## {scene}\n\n{}.\n\n{}\n", results::set_of(&name), pareto::table(&lines)));
     }
     finish(&bench, &arguments.sitting, &text, "pareto")?;
     if !arguments.sitting.draw && arguments.sitting.part.writes_tables() {
@@ -324,7 +329,7 @@ fn capacity_bench(arguments: &CapacityArguments) -> Result<()> {
         }
         let name = train::scene_name(Some(scene));
         capacity::chart(&name, &lines, &out.join(format!("capacity-{name}")))?;
-        text.push_str(&format!("## {scene}\n\n{}\n", capacity::table(&lines)));
+        text.push_str(&format!("## {scene}\n\n{}.\n\n{}\n", results::set_of(&name), capacity::table(&lines)));
     }
     finish(&bench, &arguments.sitting, &text, "capacity")
 }
@@ -357,7 +362,8 @@ fn stability(arguments: &StabilityArguments) -> Result<()> {
         let name = train::scene_name(Some(&scene));
         stability::charts(&name, &sweep.axes, &lines, &out.join(format!("stability-{name}")))?;
         let (table, finite) = (stability::table(&sweep.axes, &lines), stability::finite(&lines));
-        text.push_str(&format!("## {scene}\n\n{table}\n{finite}\n\n"));
+        let set = results::set_of(&name);
+        text.push_str(&format!("## {scene}\n\n{set}.\n\n{table}\n{finite}\n\n"));
     }
     finish(&bench, &arguments.sitting, &text, "stability")
 }

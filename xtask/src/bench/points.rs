@@ -29,7 +29,7 @@ pub const CHANGES: [Change; 23] = [
     change("distance", "blended distance", &["surface.distance=blended"], true),
     change(
         "motion",
-        "volume motion",
+        "volume motion, grey, every sample",
         &["motion.kind=volume", "motion.shell_interval=0", "field.prior_colors=false"],
         true,
     ),

@@ -14,16 +14,17 @@ use serde_json::Value;
 use self::curves::{Log, curves};
 use self::page::Page;
 use self::viewer::{Views, viewers};
-use crate::capacity;
 use crate::process::say;
 use crate::results;
 use crate::run::{self, LOG, METRICS, Metrics, PERSON, RunConfig};
 use crate::table;
+use crate::{budget, capacity};
 
 /// Charts and pictures larger than this are left out, and named.
 const MAX_BYTES: u64 = 16 << 20;
 const NOVEL: &str = "renders/novel_views.png";
-const CAPTIONS: [(&str, &str); 2] = [
+const CAPTIONS: [(&str, &str); 3] = [
+    (budget::PICTURE, budget::CAPTION),
     ("novel_views.png", "Views that training never saw: truth left, result right; a row a camera"),
     ("train_views.png", "Training views: what the video showed left, result right"),
 ];
@@ -140,6 +141,13 @@ fn add_runs(page: &mut Page, runs: &[Run], folder: &Path) -> Result<()> {
         if let Some(capacity) = capacity::read(&run.directory)? {
             page.subheading(&format!("{}: sizes from the scene", run.name));
             add_capacity(page, &capacity);
+        }
+    }
+    for run in runs {
+        if let Some(table) = budget::read(&run.directory)? {
+            page.subheading(&format!("{}: where the error comes from", run.name));
+            page.paragraph("Parts of the squared error of the views, and what PSNR would gain without them.");
+            page.table(&cells(&table));
         }
     }
     let (mut views, mut logs) = (Vec::new(), Vec::new());

@@ -1,4 +1,4 @@
-//! `reproduce`: the paper's table on somebody's data.
+//! `reproduce`: the paper's table, and others made in the same way, on somebody's data.
 
 mod plan;
 mod rows;
@@ -24,7 +24,7 @@ use crate::shard::ShardArguments;
 use crate::source::{self, LoadArguments, Source};
 use crate::train::{finished, run_unless_finished};
 use plan::{Plan, Request};
-use rows::{ROWS, Row};
+use rows::{Row, Table};
 use summary::Summary;
 
 #[derive(Args)]
@@ -68,6 +68,12 @@ pub struct ReproduceArguments {
     /// How much wrong poses, shapes and masks cost: the main methods at each, one table
     #[arg(long)]
     robustness: bool,
+    /// The way from the paper's text to the default instead, one change a row
+    #[arg(long, conflicts_with_all = ["robustness", "components"])]
+    story: bool,
+    /// What each component is worth instead: each left out, from a grey start and from ours
+    #[arg(long, conflicts_with = "robustness")]
+    components: bool,
     /// Make the tables a section of xtask/RESULTS.md, and of the first scene the table of README
     #[arg(long)]
     publish: bool,
@@ -75,7 +81,7 @@ pub struct ReproduceArguments {
 
 /// A prior made wrong, and its directory.
 const LEVELS: [(&str, Perturbation); 9] = {
-    let none = Perturbation { pose_degrees: 0.0, shape: 0.0, mask_pixels: 0 };
+    let none = Perturbation::NONE;
     [
         ("as-it-is", none),
         ("pose-2", Perturbation { pose_degrees: 2.0, ..none }),
@@ -88,22 +94,23 @@ const LEVELS: [(&str, Perturbation); 9] = {
         ("mask-plus-3", Perturbation { mask_pixels: 3, ..none }),
     ]
 };
-/// The methods themselves, each by its best pixel rule, and the published baseline.
-const MAIN: [&str; 5] = ["prior", "humannerf-bg", "humannerf", "hash-point", "occnerf"];
+/// The methods themselves, each by its best pixel rule, and the baseline's own.
+const MAIN: [&str; 5] = ["prior", "humannerf-style-bg", "humannerf-style", "hash-point", "occnerf"];
 
 /// Runs the command.
 pub fn reproduce(arguments: &ReproduceArguments) -> Result<()> {
     ensure!(arguments.budget > 0.0 && arguments.budget.is_finite(), "--budget: expected minutes above 0");
+    let known = arguments.table().rows();
     for name in &arguments.without {
-        let known = ROWS.iter().map(|row| row.name).collect::<Vec<_>>().join(", ");
-        ensure!(ROWS.iter().any(|row| row.name == name), "--without {name}: no such row; there are {known}");
+        let names = known.iter().map(|row| &*row.name).collect::<Vec<_>>().join(", ");
+        ensure!(known.iter().any(|row| row.name == *name), "--without {name}: no such row; there are {names}");
     }
     let lpips = load_lpips(arguments.lpips.as_deref())?;
     let demo = [source::DEMO.to_owned()];
     let scenes = if arguments.scenes.is_empty() { &demo[..] } else { &arguments.scenes };
     let minutes = arguments.budget / scenes.len() as f64;
     let runs = Runs::default();
-    let rows = arguments.rows(|row| !arguments.robustness || MAIN.contains(&row.name));
+    let rows = arguments.rows(|row| !arguments.robustness || MAIN.contains(&&*row.name));
     let levels = if arguments.robustness { LEVELS.len() } else { 1 };
     let each = levels * rows.iter().map(|row| row.runs(arguments.seeds) as usize).sum::<usize>();
     for (index, scene) in scenes.iter().enumerate() {
@@ -119,7 +126,9 @@ pub fn reproduce(arguments: &ReproduceArguments) -> Result<()> {
         if arguments.robustness {
             experiment.robustness(&directory.join("robustness"))?;
         } else {
-            experiment.table(&directory)?;
+            let table = arguments.table();
+            let apart = if table == Table::Methods { directory } else { directory.join(table.name()) };
+            experiment.table(&apart)?;
         }
     }
     let missing = runs.missing.into_inner();
@@ -154,13 +163,13 @@ struct Experiment<'a> {
 }
 
 impl Experiment<'_> {
-    fn plan(&self, directory: &Path, source: &Source, rows: &[&Row], minutes: f64) -> Result<Plan> {
+    fn plan(&self, directory: &Path, source: &Source, rows: &[Row], minutes: f64) -> Result<Plan> {
         let preset: Preset = self.arguments.preset;
         let request = Request {
             preset: preset.name().to_owned(),
             seeds: self.arguments.seeds,
             budget: self.arguments.steps.is_none().then_some(minutes),
-            rows: rows.iter().map(|row| row.name.to_owned()).collect(),
+            rows: rows.iter().map(|row| row.name.clone()).collect(),
             load: source.load.clone(),
             perceptual_weights: self.arguments.perceptual_weights.clone().unwrap_or_default(),
             lpips: network_name(self.lpips),
@@ -180,7 +189,7 @@ impl Experiment<'_> {
         source::load(Some(self.scene), self.arguments.body.as_deref(), options)
     }
 
-    /// The paper's table.
+    /// The table that is asked for.
     fn table(&self, directory: &Path) -> Result<()> {
         let source = self.load(&self.arguments.load.options()?)?;
         make_directory(directory)?;
@@ -192,18 +201,21 @@ impl Experiment<'_> {
             return Ok(());
         }
         say!("\n{}", summary.markdown());
-        for name in ["reproduce.md", "reproduce.json", "reproduce.png"].map(|name| directory.join(name)) {
+        for name in ["md", "json", "png"].map(|extension| directory.join(summary.file(extension))) {
             if name.is_file() {
                 say!("written: {}", name.display());
             }
         }
         if self.arguments.publish {
-            let (name, title) = (format!("reproduce-{}", summary.name()), format!("Methods on {}", summary.name()));
+            let (table, scene) = (self.arguments.table(), summary.name());
+            let (name, title) = (format!("{}-{scene}", table.name()), format!("{} on {scene}", table.title()));
             let chart = [summary.chart(directory, &name)?];
             let body = summary.markdown();
             results::publish(&Section { name: &name, title: &title, body: &body, charts: &chart })?;
-            if self.arguments.scenes.first().is_none_or(|first| first == self.scene) {
-                results::publish_table(&summary.front())?;
+            let first = self.arguments.scenes.first().is_none_or(|first| first == self.scene);
+            if first && table == Table::Methods {
+                let (set, table) = (results::set_of(&scene), summary.front());
+                results::publish_table(&format!("{set}.\n\n{table}"))?;
             }
         }
         Ok(())
@@ -216,7 +228,7 @@ impl Experiment<'_> {
             options.wrong == Perturbation::default(),
             "--robustness goes through its own errors: leave --wrong-… out"
         );
-        let rows = self.arguments.rows(|row| MAIN.contains(&row.name));
+        let rows = self.arguments.rows(|row| MAIN.contains(&&*row.name));
         make_directory(directory)?;
         let mut plan = None;
         let mut levels = Vec::new();
@@ -246,23 +258,23 @@ impl Experiment<'_> {
         if self.arguments.publish {
             let scene = crate::train::scene_name(Some(self.scene));
             let (name, title) = (format!("robustness-{scene}"), format!("A wrong prior on {scene}"));
-            let body = summary::by_level(&scene, &levels);
+            let body = format!("{}.\n\n{}", results::set_of(&scene), summary::by_level(&scene, &levels));
             results::publish(&Section { name: &name, title: &title, body: &body, charts: &[] })?;
         }
         Ok(())
     }
 
     /// Trains and scores every row that is not finished, with all its seeds.
-    fn run_rows<'a>(&self, rows: &[&Row], plan: &'a Plan, source: &'a Source, directory: &Path) -> Result<Summary<'a>> {
-        let mut summary = Summary::new(source, plan);
+    fn run_rows<'a>(&self, rows: &[Row], plan: &'a Plan, source: &'a Source, directory: &Path) -> Result<Summary<'a>> {
+        let mut summary = Summary::new(source, plan, self.arguments.table());
         for row in rows {
             for seed in 1..=row.runs(self.arguments.seeds) {
-                let name = if row.learns() { format!("{}-s{seed}", row.name) } else { row.name.to_owned() };
+                let name = if row.learns() { format!("{}-s{seed}", row.name) } else { row.name.clone() };
                 let mut run = RunConfig {
                     scene: source.scene.clone(),
                     body: source.body.clone(),
                     load: source.load.clone(),
-                    train: plan.config(row, self.arguments.preset, seed),
+                    train: plan.config(row, self.arguments.preset, seed)?,
                 };
                 if let Some(path) = &self.arguments.perceptual_weights {
                     run.train.loss.perceptual_weights.clone_from(path);
@@ -307,8 +319,16 @@ impl Experiment<'_> {
 }
 
 impl ReproduceArguments {
-    fn rows(&self, wanted: impl Fn(&Row) -> bool) -> Vec<&'static Row> {
-        let kept = |row: &&Row| self.without.iter().all(|name| name != row.name) && wanted(row);
-        ROWS.iter().filter(kept).collect()
+    fn table(&self) -> Table {
+        match (self.story, self.components) {
+            (true, _) => Table::Story,
+            (_, true) => Table::Components,
+            _ => Table::Methods,
+        }
+    }
+
+    fn rows(&self, wanted: impl Fn(&Row) -> bool) -> Vec<Row> {
+        let kept = |row: &Row| self.without.iter().all(|name| *name != row.name) && wanted(row);
+        self.table().rows().into_iter().filter(kept).collect()
     }
 }

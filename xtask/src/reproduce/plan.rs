@@ -47,7 +47,8 @@ pub struct Plan {
     request: Request,
     /// Of a row that is not longer than the others.
     pub steps: u64,
-    /// Seconds of a step and of a scored picture of each method, measured before everything else.
+    /// Seconds of a step and of a scored picture of each method, by its first row, measured before
+    /// everything else.
     cost: BTreeMap<String, (f64, f64)>,
 }
 
@@ -69,7 +70,7 @@ impl Plan {
     pub fn make(
         directory: &Path,
         source: &Source,
-        rows: &[&Row],
+        rows: &[Row],
         request: Request,
         preset: Preset,
         steps: Option<u64>,
@@ -78,7 +79,7 @@ impl Plan {
         let (mut cost, mut pictures) = (BTreeMap::new(), 0);
         for method in [Method::Humannerf, Method::HashPoint, Method::Occnerf] {
             if let Some(row) = rows.iter().find(|row| row.method == method) {
-                let mut config = row.settings(preset);
+                let mut config = row.settings(preset)?;
                 config.loss.perceptual_weights.clone_from(&request.perceptual_weights);
                 let (seconds, scored) = measure(source, config, lpips)?;
                 cost.insert(method.name().to_owned(), seconds);
@@ -123,8 +124,11 @@ impl Plan {
     }
 
     /// The configuration of a run of `row`.
-    pub fn config(&self, row: &Row, preset: Preset, seed: u64) -> Config {
-        Config { seed, steps: self.steps_of(row), ..row.settings(preset) }
+    ///
+    /// # Errors
+    /// As [`Row::settings`].
+    pub fn config(&self, row: &Row, preset: Preset, seed: u64) -> Result<Config> {
+        Ok(Config { seed, steps: self.steps_of(row), ..row.settings(preset)? })
     }
 
     /// Steps of a row.

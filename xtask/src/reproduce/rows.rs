@@ -1,6 +1,9 @@
-//! The rows of the table.
+//! The tables and their rows.
 
-use occnerf::{Component, Config, Method, OccludedRule, Preset};
+use anyhow::{Context, Result};
+use occnerf::{Config, Method, OccludedRule, Preset};
+
+use crate::settings::set;
 
 /// How long a row trains.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -13,51 +16,183 @@ pub enum Length {
     Seconds,
 }
 
-/// A row of the table.
-#[derive(Debug)]
+/// A row of a table.
+#[derive(Clone, Debug)]
 pub struct Row {
     /// On the command line, in the table and as a directory.
-    pub name: &'static str,
+    pub name: String,
     /// What is trained.
     pub method: Method,
     /// The pixel rule.
     pub occluded: OccludedRule,
     /// How long.
     pub length: Length,
-    /// A component that is switched off.
-    pub without: Option<Component>,
+    /// Where it starts from; `None`: the preset of the command line.
+    preset: Option<Preset>,
+    /// What differs from that, as `--set` takes it.
+    changes: Vec<&'static str>,
 }
 
-const fn row(name: &'static str, method: Method, occluded: OccludedRule, length: Length) -> Row {
-    Row { name, method, occluded, length, without: None }
-}
-
-const fn ablation(name: &'static str, component: Component) -> Row {
-    Row { without: Some(component), ..row(name, Method::Occnerf, OccludedRule::Unknown, Length::Steps) }
+/// A table that `reproduce` can make.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Table {
+    /// The paper's: methods and ablations.
+    Methods,
+    /// From the paper's text to the default, one change a row.
+    Story,
+    /// Each component left out, from a grey start and from ours.
+    Components,
 }
 
 use Length::{FourTimes, Seconds, Steps};
 use Method::{HashPoint, Humannerf, Occnerf, Prior};
 use OccludedRule::{Background, Unknown};
 
-/// Every row, baselines first. Row names say `bg` where hidden pixels are taught to be background.
-pub const ROWS: [Row; 15] = [
-    row("prior", Prior, Unknown, Steps),
-    row("humannerf-bg", Humannerf, Background, Steps),
-    row("humannerf-bg-4x", Humannerf, Background, FourTimes),
-    row("humannerf-bg-time", Humannerf, Background, Seconds),
-    row("humannerf", Humannerf, Unknown, Steps),
-    row("humannerf-4x", Humannerf, Unknown, FourTimes),
-    row("humannerf-time", Humannerf, Unknown, Seconds),
-    row("hash-point-bg", HashPoint, Background, Steps),
-    row("hash-point", HashPoint, Unknown, Steps),
-    row("occnerf-bg", Occnerf, Background, Steps),
-    row("occnerf", Occnerf, Unknown, Steps),
-    ablation("no-surface", Component::Surface),
-    ablation("no-attention", Component::Attention),
-    ablation("no-completeness", Component::Completeness),
-    ablation("no-perceptual", Component::Perceptual),
+/// Changes that make a start know nothing of the prior's colours and of how far its surface is.
+const GREY: [&str; 3] = ["field.prior_colors=false", "field.prior_light=false", "field.density_bias_outside=2"];
+
+/// What HumanNeRF itself has where every other row has this project's way.
+const HUMANNERF: [&str; 6] =
+    [GREY[0], GREY[1], GREY[2], "registration.rounds=0", "motion.kind=volume", "motion.shell_interval=0"];
+
+/// A component left out, or replaced by what it competes with.
+const COMPONENTS: [(&str, &[&str]); 9] = [
+    ("full", &[]),
+    ("no-surface", &["surface.surface_term=false"]),
+    ("no-attention", &["surface.attention=false"]),
+    ("exact-attention", &["surface.visibility=exact"]),
+    ("no-completeness", &["loss.completeness=0"]),
+    ("no-perceptual", &["loss.perceptual=0"]),
+    ("one-neighbour", &["surface.k=1"]),
+    ("one-level", &["surface.coarse_levels=0"]),
+    ("fixed-vertices", &["rates.vertices=0"]),
 ];
+
+/// The way from the paper's text to the default: each row keeps the changes of those before it. The
+/// row `paper` is the preset `paper`; what stands before it are its departures from the text.
+const STORY: [(&str, &[&str]); 11] = [
+    ("text", &["registration.rounds=0", "motion.kind=volume", "rates.table=5e-5", "rates.final_fraction=1"]),
+    ("registered-prior", &["registration.rounds=12"]),
+    ("finer-volume", &["motion.resolution=64"]),
+    ("surface-motion", &["motion.kind=surface", "motion.resolution=32"]),
+    ("paper", &["rates.table=5e-3", "rates.final_fraction=0.1"]),
+    ("squared-error", &["loss.mse=5"]),
+    ("exact-distance", &["surface.distance=exact"]),
+    ("prior-colours", &["field.prior_colors=true", "field.prior_light=true"]),
+    (
+        "higher-rates",
+        &[
+            "rates.table=3e-2",
+            "rates.field=6e-3",
+            "rates.motion=1e-3",
+            "rates.final_fraction=0.05",
+            "rates.beta_2=0.99",
+        ],
+    ),
+    (
+        "smaller-grid",
+        &[
+            "encoding.levels=10",
+            "encoding.log2_table_size=16",
+            "encoding.n_min=12",
+            "encoding.n_max=384",
+            "encoding.distance_min=-0.4",
+            "encoding.distance_max=0.6",
+        ],
+    ),
+    (
+        "balanced",
+        &["patches=4", "samples=48", "min_transmittance=0.01", "motion.depth=0.04", "motion.shell_interval=32"],
+    ),
+];
+
+fn row(name: &str, method: Method, occluded: OccludedRule, length: Length) -> Row {
+    Row { name: name.to_owned(), method, occluded, length, preset: None, changes: Vec::new() }
+}
+
+/// Methods, baselines first, and what each component of ours is worth. Row names say `bg` where
+/// hidden pixels are taught to be background. Every method has the same start, motion and
+/// corrections but `humannerf-style-paper`, which has its paper's.
+fn methods() -> Vec<Row> {
+    let mut rows = vec![
+        row("prior", Prior, Unknown, Steps),
+        Row { changes: HUMANNERF.to_vec(), ..row("humannerf-style-paper", Humannerf, Background, Steps) },
+        row("humannerf-style-bg", Humannerf, Background, Steps),
+        row("humannerf-style-bg-4x", Humannerf, Background, FourTimes),
+        row("humannerf-style-bg-time", Humannerf, Background, Seconds),
+        row("humannerf-style", Humannerf, Unknown, Steps),
+        row("humannerf-style-4x", Humannerf, Unknown, FourTimes),
+        row("humannerf-style-time", Humannerf, Unknown, Seconds),
+        row("hash-point-bg", HashPoint, Background, Steps),
+        row("hash-point", HashPoint, Unknown, Steps),
+        row("occnerf-bg", Occnerf, Background, Steps),
+        row("occnerf", Occnerf, Unknown, Steps),
+    ];
+    for name in ["no-surface", "no-attention", "no-completeness", "no-perceptual"] {
+        let changes = COMPONENTS.iter().find(|(component, _)| *component == name).map_or(&[][..], |c| c.1);
+        rows.push(Row { changes: changes.to_vec(), ..row(name, Occnerf, Unknown, Steps) });
+    }
+    rows
+}
+
+fn story() -> Vec<Row> {
+    let mut changes = Vec::new();
+    let step = |(name, more): &(&str, &[&'static str])| {
+        changes.extend_from_slice(more);
+        Row { preset: Some(Preset::Paper), changes: changes.clone(), ..row(name, Occnerf, Unknown, Steps) }
+    };
+    std::iter::once(row("prior", Prior, Unknown, Steps)).chain(STORY.iter().map(step)).collect()
+}
+
+fn components() -> Vec<Row> {
+    let starts = [("ours", &[][..]), ("grey", &GREY[..])];
+    let of = |(start, from): (&str, &[&'static str])| {
+        let row = |(name, changes): &(&str, &[&'static str])| Row {
+            changes: [from, changes].concat(),
+            ..row(&format!("{start}-{name}"), Occnerf, Unknown, Steps)
+        };
+        COMPONENTS.iter().map(row).collect::<Vec<_>>()
+    };
+    starts.into_iter().flat_map(of).collect()
+}
+
+impl Table {
+    /// Its rows, baselines first.
+    pub fn rows(self) -> Vec<Row> {
+        match self {
+            Self::Methods => methods(),
+            Self::Story => story(),
+            Self::Components => components(),
+        }
+    }
+
+    /// What its files and its section are called.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Methods => "reproduce",
+            Self::Story => "story",
+            Self::Components => "components",
+        }
+    }
+
+    /// Its heading, without the scene.
+    pub fn title(self) -> &'static str {
+        match self {
+            Self::Methods => "Methods",
+            Self::Story => "From the paper to the default",
+            Self::Components => "What each component is worth",
+        }
+    }
+
+    /// Rows whose pictures stand beside the truth.
+    pub fn shown(self) -> &'static [&'static str] {
+        match self {
+            Self::Methods => &["prior", "humannerf-style-bg", "humannerf-style", "hash-point", "occnerf-bg", "occnerf"],
+            Self::Story => &["prior", "text", "registered-prior", "paper", "prior-colours", "balanced"],
+            Self::Components => &["ours-full", "ours-no-surface", "grey-full", "grey-no-surface"],
+        }
+    }
+}
 
 impl Row {
     /// Whether there is anything to learn, and so to repeat with another seed.
@@ -71,11 +206,53 @@ impl Row {
     }
 
     /// Everything but the number of steps.
-    pub fn settings(&self, preset: Preset) -> Config {
+    ///
+    /// # Errors
+    /// If a change does not fit the settings.
+    pub fn settings(&self, preset: Preset) -> Result<Config> {
+        let preset = self.preset.unwrap_or(preset);
         let mut config = Config { occluded: self.occluded, ..Config::preset(preset, self.method) };
-        if let Some(component) = self.without {
-            config.ablate(component);
+        for change in &self.changes {
+            config = set(&config, change).with_context(|| format!("row {}: {change}", self.name))?;
         }
-        config
+        config.validate()?;
+        Ok(config)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const TABLES: [Table; 3] = [Table::Methods, Table::Story, Table::Components];
+
+    #[test]
+    fn every_row_of_every_table_can_be_run_and_none_is_there_twice() {
+        for table in TABLES {
+            let rows = table.rows();
+            for (i, row) in rows.iter().enumerate() {
+                assert!(rows[..i].iter().all(|other| other.name != row.name), "{}", row.name);
+                for preset in [Preset::Fast, Preset::Balanced, Preset::Paper] {
+                    // Colours and corrections hang on the surface motion, which `paper` has not.
+                    if preset != Preset::Paper || row.changes.is_empty() {
+                        row.settings(preset).unwrap();
+                    }
+                }
+            }
+            assert!(table.shown().iter().all(|name| rows.iter().any(|row| row.name == *name)), "{table:?}");
+        }
+    }
+
+    #[test]
+    fn each_row_of_the_story_changes_something_and_it_goes_through_paper_to_balanced() {
+        let rows: Vec<Row> = story().into_iter().filter(Row::learns).collect();
+        let settings = |row: &Row| row.settings(Preset::Fast).unwrap();
+        assert!(rows.windows(2).all(|pair| settings(&pair[0]) != settings(&pair[1])));
+        let named = |name: &str| settings(rows.iter().find(|row| row.name == name).unwrap());
+        for preset in [Preset::Paper, Preset::Balanced] {
+            let whole = Config::preset(preset, Method::Occnerf);
+            let row = Config { preset, steps: whole.steps, ..named(preset.name()) };
+            assert_eq!(row, whole);
+        }
     }
 }

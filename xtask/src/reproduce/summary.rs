@@ -8,20 +8,19 @@ use occnerf::SplitMetrics;
 use serde::Serialize;
 
 use super::plan::Plan;
-use super::rows::Row;
+use super::rows::{Row, Table};
 use crate::run::{self, Metrics};
 use crate::source::Source;
 use crate::train::scene_name;
-use crate::{pictures, table};
-
-/// Rows whose pictures stand beside the truth, as in the paper's figures.
-const SHOWN: [&str; 6] = ["prior", "humannerf-bg", "humannerf", "hash-point", "occnerf-bg", "occnerf"];
+use crate::{pictures, results, table};
 
 /// Results of a scene.
 #[derive(Serialize)]
 pub struct Summary<'a> {
     scene: &'a str,
     plan: &'a Plan,
+    #[serde(skip)]
+    table: Table,
     /// Network of lpips_full, and the perceptual term of training.
     lpips: Option<String>,
     perceptual: String,
@@ -30,7 +29,7 @@ pub struct Summary<'a> {
 
 #[derive(Serialize)]
 struct Entry {
-    name: &'static str,
+    name: String,
     occluded: String,
     steps: u64,
     runs: Vec<Metrics>,
@@ -55,8 +54,8 @@ const COLUMNS: [Column; 9] = [
 ];
 
 impl<'a> Summary<'a> {
-    pub fn new(source: &'a Source, plan: &'a Plan) -> Self {
-        Self { scene: &source.scene, plan, lpips: None, perceptual: String::new(), rows: Vec::new() }
+    pub fn new(source: &'a Source, plan: &'a Plan, table: Table) -> Self {
+        Self { scene: &source.scene, plan, table, lpips: None, perceptual: String::new(), rows: Vec::new() }
     }
 
     /// Adds a run of a row.
@@ -64,7 +63,7 @@ impl<'a> Summary<'a> {
         if self.rows.last().is_none_or(|entry| entry.name != row.name) {
             let sheet = if metrics.splits.novel_view.is_some() { "novel_views.png" } else { "train_views.png" };
             self.rows.push(Entry {
-                name: row.name,
+                name: row.name.clone(),
                 occluded: if row.learns() { metrics.occluded.clone() } else { "–".to_owned() },
                 steps: metrics.steps,
                 runs: Vec::new(),
@@ -83,7 +82,8 @@ impl<'a> Summary<'a> {
 
     /// The table: novel views where the capture has them, and training views on what they show.
     pub fn markdown(&self) -> String {
-        let mut text = format!("# {}\n\n{}; perceptual term: {}", self.scene, self.plan, self.perceptual);
+        let (scene, set) = (self.scene, results::set_of(&self.name()));
+        let mut text = format!("# {scene}\n\n{set}. {}; perceptual term: {}", self.plan, self.perceptual);
         if let Some(network) = &self.lpips {
             text.push_str(&format!("; lpips_full by {network}"));
         }
@@ -93,8 +93,7 @@ impl<'a> Summary<'a> {
             ("Training views, over visible pixels", |m| m.splits.train_view.as_ref()),
         ];
         for (title, split) in splits {
-            let mut lines =
-                vec![vec!["row".to_owned(), "occluded".to_owned(), "steps".to_owned(), "train s".to_owned()]];
+            let mut lines = vec![["row", "occluded", "steps", "train s", "parameters"].map(str::to_owned).to_vec()];
             lines[0].extend(COLUMNS.iter().map(|column| column.0.to_owned()));
             for entry in &self.rows {
                 let scores: Vec<&SplitMetrics> = entry.runs.iter().filter_map(split).collect();
@@ -103,10 +102,11 @@ impl<'a> Summary<'a> {
                 }
                 let seconds = entry.runs.iter().map(|m| m.train_seconds).sum::<f64>() / entry.runs.len() as f64;
                 let mut line = vec![
-                    entry.name.to_owned(),
+                    entry.name.clone(),
                     entry.occluded.clone(),
                     entry.steps.to_string(),
                     format!("{seconds:.0}"),
+                    entry.runs.first().map_or(0, |m| m.parameters).to_string(),
                 ];
                 line.extend(COLUMNS.iter().map(|(_, pick, digits)| {
                     let values: Vec<f64> = scores.iter().filter_map(|s| pick(s)).collect();
@@ -129,7 +129,7 @@ impl<'a> Summary<'a> {
     /// The pictures of all methods under another name, for a folder with those of other scenes.
     pub fn chart(&self, directory: &Path, name: &str) -> Result<PathBuf> {
         let copy = directory.join(format!("{name}.png"));
-        std::fs::copy(directory.join("reproduce.png"), &copy).with_context(|| copy.display().to_string())?;
+        std::fs::copy(directory.join(self.file("png")), &copy).with_context(|| copy.display().to_string())?;
         Ok(copy)
     }
 
@@ -137,13 +137,13 @@ impl<'a> Summary<'a> {
     pub fn front(&self) -> String {
         let heads = ["method", "hidden pixels", "steps", "seconds", "psnr_mask", "psnr_hidden", "ssim_mask"];
         let mut lines = vec![heads.map(str::to_owned).to_vec()];
-        for entry in self.rows.iter().filter(|entry| SHOWN.contains(&entry.name)) {
+        for entry in self.rows.iter().filter(|entry| self.table.shown().contains(&&*entry.name)) {
             let splits: Vec<&SplitMetrics> = entry.runs.iter().filter_map(|m| Some(m.splits.first()?.1)).collect();
             let seconds = entry.runs.iter().map(|m| m.train_seconds).sum::<f64>() / entry.runs.len() as f64;
             let mean = |pick: fn(&SplitMetrics) -> Option<f64>, digits: usize| {
                 cell(&splits.iter().filter_map(|s| pick(s)).collect::<Vec<_>>(), digits)
             };
-            let name = entry.runs.first().map_or(entry.name, |m| &m.method).to_owned();
+            let name = entry.runs.first().map_or(&entry.name, |m| &m.method).clone();
             let (steps, seconds) = (entry.steps.to_string(), format!("{seconds:.0}"));
             let scores = [mean(|s| s.psnr_mask, 2), mean(|s| s.psnr_hidden, 2), mean(|s| s.ssim_mask, 3)];
             lines.push([vec![name, entry.occluded.clone(), steps, seconds], scores.to_vec()].concat());
@@ -157,20 +157,25 @@ impl<'a> Summary<'a> {
             entry.runs.iter().filter_map(|m| m.splits.first()).filter_map(|(_, split)| pick(split)).collect()
         };
         let score = |entry: &Entry| Score {
-            name: entry.name,
+            name: entry.name.clone(),
             psnr_mask: of(entry, |s| s.psnr_mask),
             psnr_hidden: of(entry, |s| s.psnr_hidden),
         };
         self.rows.iter().map(score).collect()
     }
 
-    /// Writes reproduce.md, .json and .png.
+    /// The name of one of its files, by the extension.
+    pub fn file(&self, extension: &str) -> String {
+        format!("{}.{extension}", self.table.name())
+    }
+
+    /// Writes the table as .md and .json, and the pictures as .png.
     pub fn write(&self, directory: &Path) -> Result<()> {
-        run::write(&directory.join("reproduce.md"), &self.markdown())?;
-        run::write(&directory.join("reproduce.json"), &serde_json::to_string_pretty(self)?)?;
+        run::write(&directory.join(self.file("md")), &self.markdown())?;
+        run::write(&directory.join(self.file("json")), &serde_json::to_string_pretty(self)?)?;
         // A row a camera: the truth, then what each method makes of it.
         let (mut columns, mut names): (Vec<Vec<RgbImage>>, _) = (Vec::new(), vec!["truth"]);
-        for entry in SHOWN.iter().filter_map(|name| self.rows.iter().find(|entry| entry.name == *name)) {
+        for entry in self.table.shown().iter().filter_map(|name| self.rows.iter().find(|entry| entry.name == *name)) {
             let sheet = image::open(&entry.pictures).with_context(|| entry.pictures.display().to_string())?.into_rgb8();
             let cells = pictures::cells(&sheet);
             let column = |c: usize| cells.iter().filter_map(|row| row.get(c).cloned()).collect();
@@ -178,7 +183,7 @@ impl<'a> Summary<'a> {
                 columns.push(column(0));
             }
             columns.push(column(1));
-            names.push(entry.name);
+            names.push(&entry.name);
         }
         let cameras = columns.iter().map(Vec::len).min().unwrap_or(0);
         let rows: Vec<Vec<RgbImage>> =
@@ -186,14 +191,14 @@ impl<'a> Summary<'a> {
         if rows.is_empty() {
             return Ok(());
         }
-        pictures::save(&pictures::captioned(&pictures::sheet(&rows), &names)?, &directory.join("reproduce.png"))
+        pictures::save(&pictures::captioned(&pictures::sheet(&rows), &names)?, &directory.join(self.file("png")))
     }
 }
 
 /// What is ranked, of one row at one level.
 #[derive(Serialize)]
 pub struct Score {
-    name: &'static str,
+    name: String,
     psnr_mask: Vec<f64>,
     psnr_hidden: Vec<f64>,
 }
@@ -203,7 +208,7 @@ pub fn by_level(scene: &str, levels: &[(&str, Vec<Score>)]) -> String {
     let mut lines = vec![vec!["prior".to_owned()]];
     for (level, scores) in levels {
         if lines.len() == 1 {
-            lines[0].extend(scores.iter().flat_map(|s| [s.name.to_owned(), "hidden".to_owned()]));
+            lines[0].extend(scores.iter().flat_map(|s| [s.name.clone(), "hidden".to_owned()]));
         }
         let cells = scores.iter().flat_map(|s| [cell(&s.psnr_mask, 2), cell(&s.psnr_hidden, 2)]);
         lines.push(std::iter::once((*level).to_owned()).chain(cells).collect());

@@ -74,7 +74,7 @@ pub(in crate::capture) fn walk(frame: usize, frames: usize, pressed: f32) -> Pos
 
 /// A smooth 3-vector of time with the given root mean square length over the video, (T). Periodic
 /// in twice the video's length, so that its ends are free.
-fn wander(stream: &mut Stream, frames: usize, rms: f32) -> Vec<Vec3> {
+pub(in crate::capture) fn wander(stream: &mut Stream, frames: usize, rms: f32) -> Vec<Vec3> {
     let mut waves = Vec::new();
     for harmonic in 1..=HARMONICS {
         let amplitude = Vec3::from_array([(); 3].map(|()| normal(stream)));

@@ -187,7 +187,7 @@ mod tests {
                         let (m, t) = (moved(0, &mlp, &u_mlp), moved(1, &table, &u_table));
                         value(&mut group, &m, &t, &moved(2, &features, &u_features))
                     };
-                    let h = 2e-4;
+                    let h = 5e-5;
                     let numeric = (at(h) - at(-h)) / (2.0 * f64::from(h));
                     // Some ReLU of some sample switches within any step; their share of the
                     // derivative is small.

@@ -109,8 +109,11 @@ mod tests {
     use crate::train::trainer::Trainer;
     use smpl::MotionFrame;
 
+    /// Radians and metres to each side.
+    const H: f32 = 1.0 / 1024.0;
+
     /// Value = Σ c · features(x) + e · d(x) + p · f(x) of points x that keep still while the pose
-    /// is corrected.
+    /// is corrected; and of d and f alone, which do not depend on how v̂ slides.
     #[test]
     fn gradient_of_the_pose_agrees_with_finite_differences() {
         let body = BodyModel::embedded();
@@ -132,12 +135,13 @@ mod tests {
             for (f, corners) in body.faces.iter().enumerate().step_by(7) {
                 let [a, b, c] = corners.map(|v| after.vertices[v as usize]);
                 let normal = (b - a).cross(c - a).normalize_or_zero();
-                points.push((a + b + c) / 3.0 + ((f % 9) as f32 / 8.0 * 0.024 - 0.012) * normal);
+                // Never on the surface, where the distance has a fold.
+                points.push((a + b + c) / 3.0 + ((f % 8) as f32 / 7.0 * 0.024 - 0.012) * normal);
             }
             // Which points live, and on which face, is decided once: the value jumps where that
             // changes.
             let mut surface = PosedSurface::new(&scene.body, CELL).unwrap();
-            let mut trace = |posed: &Posed, batch: &mut SampleBatch| -> Vec<usize> {
+            let mut trace = |points: &[Vec3], posed: &Posed, batch: &mut SampleBatch| -> Vec<usize> {
                 surface.refit(&scene.body, posed, &model.extent, &config, &model.base);
                 let motion = MotionFrame::new(&body, posed);
                 let tracer = model.tracer(&surface, &model.extent, &motion);
@@ -147,8 +151,24 @@ mod tests {
                 model.field.encoder.coordinates(&batch.samples, &scene.body.canonical_box, &mut batch.at);
                 live
             };
+            // Nor where the nearest surface jumps, from an arm to the hip, as soon as a joint turns.
+            let mut still = vec![true; points.len()];
+            for (j, axis) in (0..correction.len()).flat_map(|j| (0..3).map(move |axis| (j, axis))) {
+                let [a, b] = [H, -H].map(|h| {
+                    let (mut moved, mut batch) = (correction.clone(), SampleBatch::default());
+                    moved[j][axis] += h;
+                    let live = trace(&points, &corrected(&body, &frame.shape, &frame.posed, &moved), &mut batch);
+                    let mut at = vec![None; points.len()];
+                    live.iter().zip(&batch.samples.canonical).for_each(|(&i, &x)| at[i] = Some(x));
+                    at
+                });
+                let stays =
+                    |(a, b): (&Option<Vec3>, &Option<Vec3>)| a.zip(*b).is_some_and(|(a, b)| a.distance(b) < 0.005);
+                still.iter_mut().zip(a.iter().zip(&b)).for_each(|(still, pair)| *still &= stays(pair));
+            }
+            let points: Vec<Vec3> = points.into_iter().zip(still).filter_map(|(p, still)| still.then_some(p)).collect();
             let mut group = SampleBatch::default();
-            let live = trace(&after, &mut group);
+            let live = trace(&points, &after, &mut group);
             assert!(live.len() > 500, "{}", live.len());
             let width = model.field.encoder.num_features();
             let (table, mut features) = (model.parameters.get(Part::Table), vec![0.0; live.len() * width]);
@@ -156,54 +176,67 @@ mod tests {
             group.jacobian = jacobians.take(live.len() * model.field.encoder.jacobian_width());
             let jacobian = jacobians.piece_mut(&group.jacobian);
             model.field.encoder.encode_jacobian(table, group.at.all(), &mut features, jacobian);
-            let d_rows: Vec<f32> = (0..live.len() * width).map(|_| random(1.0).x).collect();
-            group.features = vec![0.0; d_rows.len()];
-            let layout = model.field.encoder.layout(live.len());
-            layout.from_rows(&d_rows, width, 0..live.len(), &mut group.features);
-            group.d_distance = live.iter().map(|_| random(3.0).x).collect();
-            group.d_likelihood = live.iter().map(|_| random(0.3).x).collect();
-            let mut wrenches = vec![Wrench::default(); after.bones.len()];
-            pose_backward(model, &mut group, &jacobians, &after, &mut wrenches);
-            let gradient = correct_backward(&body, &frame.posed, &correction, &after, &wrenches);
+            for distance_alone in [true, false] {
+                let size = if distance_alone { 0.0 } else { 1.0 };
+                let d_rows: Vec<f32> = (0..live.len() * width).map(|_| size * random(1.0).x).collect();
+                group.features = vec![0.0; d_rows.len()];
+                let layout = model.field.encoder.layout(live.len());
+                layout.from_rows(&d_rows, width, 0..live.len(), &mut group.features);
+                group.d_distance = live.iter().map(|_| random(3.0).x).collect();
+                group.d_likelihood = live.iter().map(|_| random(0.3).x).collect();
+                let mut wrenches = vec![Wrench::default(); after.bones.len()];
+                pose_backward(model, &mut group, &jacobians, &after, &mut wrenches);
+                let gradient = correct_backward(&body, &frame.posed, &correction, &after, &wrenches);
 
-            let mut value = |correction: &[Vec3]| -> f64 {
-                let mut moved = SampleBatch::default();
-                let found = trace(&corrected(&body, &frame.shape, &frame.posed, correction), &mut moved);
-                let mut features = vec![0.0; found.len() * width];
-                model.field.encoder.encode(model.parameters.get(Part::Table), moved.at.all(), &mut features);
-                let mut rows = vec![0.0; features.len()];
-                let layout = model.field.encoder.layout(found.len());
-                layout.to_rows(&features, 0..found.len(), &mut rows, width);
-                let at = |i: usize| live.binary_search(&i).ok();
-                let terms = found.iter().enumerate().filter_map(|(s, &i)| {
-                    let l = at(i)?;
-                    let (cotangent, row) = (&d_rows[l * width..][..width], &rows[s * width..][..width]);
-                    let dot: f64 = cotangent.iter().zip(row).map(|(c, v)| f64::from(c * v)).sum();
-                    let d = f64::from(group.d_distance[l] * moved.samples.distance[s]);
-                    Some(dot + d + f64::from(group.d_likelihood[l] * moved.samples.likelihood[s]))
-                });
-                terms.sum()
-            };
-            let (mut numeric_all, mut analytic_all) = (Vec::new(), Vec::new());
-            for j in 0..correction.len() {
-                for axis in 0..3 {
-                    let mut at = |h: f32| {
-                        let mut moved = correction.clone();
-                        moved[j][axis] += h;
-                        value(&moved)
-                    };
-                    let h = 1.0 / 1024.0;
-                    numeric_all.push((at(h) - at(-h)) / (2.0 * f64::from(h)));
-                    analytic_all.push(f64::from(gradient[j][axis]));
+                let mut value = |correction: &[Vec3]| -> f64 {
+                    let mut moved = SampleBatch::default();
+                    let posed = corrected(&body, &frame.shape, &frame.posed, correction);
+                    let found = trace(&points, &posed, &mut moved);
+                    let mut features = vec![0.0; found.len() * width];
+                    model.field.encoder.encode(model.parameters.get(Part::Table), moved.at.all(), &mut features);
+                    let mut rows = vec![0.0; features.len()];
+                    let layout = model.field.encoder.layout(found.len());
+                    layout.to_rows(&features, 0..found.len(), &mut rows, width);
+                    let at = |i: usize| live.binary_search(&i).ok();
+                    let terms = found.iter().enumerate().filter_map(|(s, &i)| {
+                        let l = at(i)?;
+                        let (cotangent, row) = (&d_rows[l * width..][..width], &rows[s * width..][..width]);
+                        let dot: f64 = cotangent.iter().zip(row).map(|(c, v)| f64::from(c * v)).sum();
+                        let d = f64::from(group.d_distance[l] * moved.samples.distance[s]);
+                        Some(dot + d + f64::from(group.d_likelihood[l] * moved.samples.likelihood[s]))
+                    });
+                    terms.sum()
+                };
+                let (mut numeric_all, mut analytic_all) = (Vec::new(), Vec::new());
+                for j in 0..correction.len() {
+                    for axis in 0..3 {
+                        let mut at = |h: f32| {
+                            let mut moved = correction.clone();
+                            moved[j][axis] += h;
+                            value(&moved)
+                        };
+                        numeric_all.push((at(H) - at(-H)) / (2.0 * f64::from(H)));
+                        analytic_all.push(f64::from(gradient[j][axis]));
+                    }
                 }
+                let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
+                let (nn, aa, na) = (
+                    dot(&numeric_all, &numeric_all),
+                    dot(&analytic_all, &analytic_all),
+                    dot(&numeric_all, &analytic_all),
+                );
+                let (cosine, ratio) = (na / (nn * aa).sqrt(), (aa / nn).sqrt());
+                let apart: f64 = numeric_all.iter().zip(&analytic_all).map(|(n, a)| (n - a).powi(2)).sum();
+                let apart = (apart / nn).sqrt();
+                println!("{method:?}: cosine {cosine}, ratio {ratio}, {apart} apart");
+                if distance_alone {
+                    assert!(apart < 0.08, "{method:?}: {apart} apart");
+                    continue;
+                }
+                // The surface is not flat: what slides along a tangent plane there is a tenth or two
+                // off here.
+                assert!(cosine > 0.9 && (0.85..1.2).contains(&ratio), "{method:?}: cosine {cosine}, ratio {ratio}");
             }
-            let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
-            let (nn, aa, na) =
-                (dot(&numeric_all, &numeric_all), dot(&analytic_all, &analytic_all), dot(&numeric_all, &analytic_all));
-            let (cosine, ratio) = (na / (nn * aa).sqrt(), (aa / nn).sqrt());
-            // The surface is not flat: what slides along a tangent plane there is a tenth or two
-            // off here.
-            assert!(cosine > 0.9 && (0.85..1.2).contains(&ratio), "{method:?}: cosine {cosine}, ratio {ratio}");
         }
     }
 }

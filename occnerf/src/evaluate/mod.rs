@@ -1,5 +1,7 @@
 //! Scores of a trained person against pictures that training never saw.
 
+pub mod budget;
+
 use std::time::Instant;
 
 use glam::Vec3;
@@ -114,15 +116,9 @@ pub fn evaluate_with(
         seconds += start.elapsed().as_secs_f64();
         progress(frame, &rendering);
         let truth = frame.pixels()?;
-        let hidden = hidden_pixels(scene, frame, &truth.mask, &least)?;
-        // What a training image does not show cannot be scored.
-        for (i, label) in frame.labels.iter().enumerate() {
-            if label == Label::Unknown {
-                let truth = &truth.image.pixels[3 * i..3 * i + 3];
-                rendering.image.pixels[3 * i..3 * i + 3].copy_from_slice(truth);
-                rendering.opacity[i] = 0.0;
-            }
-        }
+        let nearest = nearest_vertices(scene, frame, &truth.mask)?;
+        let hidden: Vec<bool> = nearest.iter().map(|v| v.is_some_and(|v| least[v as usize])).collect();
+        without_unknown(frame, &truth, &mut rendering);
         scores.push(score(frame, &truth, &rendering, &hidden, lpips)?);
     }
     let mean = |pick: &dyn Fn(&FrameMetrics) -> Option<f64>| {
@@ -176,27 +172,38 @@ fn score(
     })
 }
 
-/// Pixels (H × W) whose first hit on the posed prior is nearest to a vertex of `least`.
-fn hidden_pixels(scene: &Scene, frame: &PreparedFrame, mask: &[f32], least: &[bool]) -> Result<Vec<bool>, Error> {
+/// Takes out of a picture what a training image does not show, which cannot be scored.
+fn without_unknown(frame: &PreparedFrame, truth: &Pixels, rendering: &mut Rendering) {
+    for (i, label) in frame.labels.iter().enumerate() {
+        if label == Label::Unknown {
+            let truth = &truth.image.pixels[3 * i..3 * i + 3];
+            rendering.image.pixels[3 * i..3 * i + 3].copy_from_slice(truth);
+            rendering.opacity[i] = 0.0;
+        }
+    }
+}
+
+/// The vertex nearest to each pixel's first hit on the posed prior (H × W); `None` where there is
+/// none, and outside the mask.
+fn nearest_vertices(scene: &Scene, frame: &PreparedFrame, mask: &[f32]) -> Result<Vec<Option<u32>>, Error> {
     let mesh = RayMesh::new(&frame.view.posed.vertices, &scene.body.model.faces)?;
     let width = frame.view.camera.width as usize;
     let nearest = |i: usize| {
         if mask[i] <= 0.5 {
-            return false;
+            return None;
         }
         let ray = frame.view.camera.ray((i % width) as f32 + 0.5, (i / width) as f32 + 0.5);
-        mesh.first_hit(ray.origin, ray.direction).is_some_and(|hit| {
-            let corners = scene.body.model.faces[hit.face as usize];
-            let [a, b, c] = hit.barycentric;
-            let corner = if a >= b && a >= c {
-                0
-            } else if b >= c {
-                1
-            } else {
-                2
-            };
-            least[corners[corner] as usize]
-        })
+        let hit = mesh.first_hit(ray.origin, ray.direction)?;
+        let corners = scene.body.model.faces[hit.face as usize];
+        let [a, b, c] = hit.barycentric;
+        let corner = if a >= b && a >= c {
+            0
+        } else if b >= c {
+            1
+        } else {
+            2
+        };
+        Some(corners[corner])
     };
     Ok((0..width * frame.view.camera.height as usize).into_par_iter().map(nearest).collect())
 }

@@ -1,0 +1,168 @@
+//! Colours of surface that no frame shows, continued from what surrounds it.
+//!
+//! Hems, belts, cuffs and stripes go around trunk and limbs more often than along them. So a guess
+//! is a mean of what was seen by inverse distances (Shepard 1968) in which a way around the bone is
+//! shorter than one along it, if that is how the seen surface can be told from what surrounds it.
+
+use glam::{DVec3, Vec3};
+use rayon::prelude::*;
+
+use crate::model::body::Body;
+
+/// Lengths that a metre around the bone counts for, against one along it; the first that tells best
+/// the surface around what is unseen is taken.
+const AROUND: [f32; 3] = [1.0, 0.1, 10.0];
+/// How far that reaches from unseen vertices, metres of a body 1.7 high.
+const RIM: f32 = 0.08;
+/// Least distance of a joint from the plane of symmetry, x = 0, in a limb, metres of such a body.
+const ASIDE: f32 = 0.03;
+
+/// Gives each vertex of the canonical `body` that is not `seen` (V) a colour, from those of the
+/// others (V); grey where there are none.
+pub(crate) fn complete(body: &Body, colors: &mut [Vec3], seen: &[bool]) {
+    let known: Vec<usize> = (0..seen.len()).filter(|&v| seen[v]).collect();
+    if known.is_empty() {
+        colors.fill(Vec3::splat(0.5));
+        return;
+    }
+    let guesses = Guesses { vertices: &body.canonical.vertices, axes: axes(body), colors };
+    let unseen: Vec<usize> = (0..seen.len()).filter(|&v| !seen[v]).collect();
+    let around = guesses.choose(&known, &unseen);
+    let found: Vec<Vec3> = unseen.par_iter().map(|&v| guesses.guess(v, &known, around)).collect();
+    unseen.into_iter().zip(found).for_each(|(v, color)| colors[v] = color);
+}
+
+struct Guesses<'a> {
+    vertices: &'a [Vec3],
+    /// Unit direction of the bone that each vertex hangs on, V.
+    axes: Vec<Vec3>,
+    colors: &'a [Vec3],
+}
+
+impl Guesses<'_> {
+    /// The mean of the colours of the vertices `known`, by distances to the power of −4.
+    fn guess(&self, v: usize, known: &[usize], around: f32) -> Vec3 {
+        let (mut sum, mut weights) = (DVec3::ZERO, 0.0);
+        for &k in known {
+            let way = self.vertices[k] - self.vertices[v];
+            let along = way.dot(self.axes[v]);
+            let across = (way.length_squared() - along * along).max(0.0);
+            // Vertices of a seam may coincide.
+            let squared = f64::from(along * along + around * around * across).max(1e-12);
+            let weight = 1.0 / (squared * squared);
+            sum += weight * self.colors[k].as_dvec3();
+            weights += weight;
+        }
+        (sum / weights).as_vec3()
+    }
+
+    /// The entry of [`AROUND`] by which those of the vertices `known` that surround `unseen` are
+    /// guessed best from the others.
+    fn choose(&self, known: &[usize], unseen: &[usize]) -> f32 {
+        let is_near = |v: usize| unseen.iter().any(|&u| self.vertices[u].distance(self.vertices[v]) < RIM);
+        let (held, rest): (Vec<usize>, Vec<usize>) = known.par_iter().partition(|&&v| is_near(v));
+        if rest.is_empty() {
+            return AROUND[0];
+        }
+        let error = |around: f32| -> f32 {
+            let error = |&v: &usize| self.guess(v, &rest, around).distance_squared(self.colors[v]);
+            held.par_iter().map(error).collect::<Vec<f32>>().iter().sum()
+        };
+        let errors = AROUND.map(|around| (error(around), around));
+        errors.into_iter().reduce(|a, b| if b.0 < a.0 { b } else { a }).map_or(AROUND[0], |best| best.1)
+    }
+}
+
+/// The direction, V, of the bone that moves each vertex most: upright in the trunk, along the limb
+/// in a limb.
+fn axes(body: &Body) -> Vec<Vec3> {
+    let (joints, parents) = (&body.canonical.joints, &body.model.parents);
+    let is_aside = |j: usize| joints[j].x.abs() > ASIDE;
+    let mut of_joints = vec![Vec3::Y; joints.len()];
+    for (j, parent) in parents.iter().enumerate() {
+        let Some(p) = *parent else { continue };
+        let child = (j + 1..joints.len()).find(|&child| parents[child] == Some(j));
+        let bone = child.map_or(joints[j] - joints[p], |child| joints[child] - joints[j]);
+        // What begins in the trunk still belongs to it.
+        of_joints[j] = if is_aside(j) && is_aside(p) { bone.normalize_or(of_joints[p]) } else { of_joints[p] };
+    }
+    let strongest = |v: usize| body.model.weights.row(v).reduce(|a, b| if b.1 > a.1 { b } else { a });
+    (0..body.canonical.vertices.len()).map(|v| strongest(v).map_or(Vec3::Y, |(j, _)| of_joints[j])).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::{Config, Method, Preset};
+    use crate::random::Stream;
+    use smpl::BodyModel;
+
+    fn body() -> Body {
+        Body::new(&BodyModel::embedded(), &[], &Config::preset(Preset::Fast, Method::Occnerf)).unwrap()
+    }
+
+    /// A trunk in stripes, its back unseen in the middle: the mean error of the completed colours,
+    /// and that of the smooth mean alone.
+    fn errors(stripe: impl Fn(Vec3) -> f32) -> [f32; 2] {
+        let body = body();
+        let vertices = &body.canonical.vertices;
+        let truth: Vec<Vec3> = vertices.iter().map(|v| Vec3::splat(0.5 + 0.4 * stripe(*v))).collect();
+        let hips = body.canonical.joints[0].y;
+        let hidden = |v: Vec3| v.x.abs() < 0.07 && v.z < -0.02 && v.y > hips && v.y < hips + 0.45;
+        let seen: Vec<bool> = vertices.iter().map(|v| !hidden(*v)).collect();
+        let unseen: Vec<usize> = (0..seen.len()).filter(|&v| !seen[v]).collect();
+        assert!(unseen.len() > 50, "{}", unseen.len());
+        let mut colors = truth.clone();
+        unseen.iter().for_each(|&v| colors[v] = Vec3::ONE);
+        complete(&body, &mut colors, &seen);
+        let known: Vec<usize> = (0..seen.len()).filter(|&v| seen[v]).collect();
+        assert!(known.iter().all(|&v| colors[v] == truth[v]));
+        let smooth = Guesses { vertices, axes: axes(&body), colors: &truth };
+        let mean = |of: &dyn Fn(usize) -> Vec3| {
+            unseen.iter().map(|&v| (of(v).x - truth[v].x).abs()).sum::<f32>() / unseen.len() as f32
+        };
+        [mean(&|v| colors[v]), mean(&|v| smooth.guess(v, &known, 1.0))]
+    }
+
+    #[test]
+    fn stripes_go_on_the_way_that_they_go_where_they_are_seen() {
+        let [rings, smooth] = errors(|v| (60.0 * v.y).sin());
+        assert!(rings < 0.6 * smooth, "{rings} against {smooth}");
+        let [lengthwise, smooth] = errors(|v| (60.0 * v.x).sin());
+        assert!(lengthwise < smooth, "{lengthwise} against {smooth}");
+    }
+
+    #[test]
+    fn guesses_lie_between_what_was_seen_and_are_grey_where_nothing_was() {
+        let body = body();
+        let mut stream = Stream::new(&[11]);
+        let mut random = || stream.uniform();
+        let seen: Vec<bool> = body.canonical.vertices.iter().map(|_| random() < 0.3).collect();
+        let mut colors: Vec<Vec3> = seen.iter().map(|_| 0.2 + 0.5 * Vec3::new(random(), random(), random())).collect();
+        for (color, seen) in colors.iter_mut().zip(&seen) {
+            *color = if *seen { *color } else { Vec3::splat(9.0) };
+        }
+        complete(&body, &mut colors, &seen);
+        assert!(colors.iter().all(|c| c.min_element() >= 0.199 && c.max_element() <= 0.701));
+        complete(&body, &mut colors, &vec![false; seen.len()]);
+        assert!(colors.iter().all(|c| *c == Vec3::splat(0.5)));
+    }
+
+    #[test]
+    fn bones_are_upright_in_trunk_and_legs_and_level_in_arms() {
+        let body = body();
+        let axes = axes(&body);
+        let joints = &body.canonical.joints;
+        let near = |place: Vec3| {
+            let distance = |v: &usize| body.canonical.vertices[*v].distance_squared(place);
+            axes[(0..axes.len()).min_by(|a, b| distance(a).total_cmp(&distance(b))).unwrap()]
+        };
+        // Chest, thigh and shin, forearm of SMPL.
+        assert!(
+            [joints[9], 0.5 * (joints[1] + joints[4]), 0.5 * (joints[4] + joints[7])]
+                .iter()
+                .all(|p| near(*p).y.abs() > 0.9)
+        );
+        assert!(near(0.5 * (joints[18] + joints[20])).x.abs() > 0.9);
+    }
+}
