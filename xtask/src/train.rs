@@ -5,6 +5,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, bail, ensure};
 use clap::Args;
+use occnerf::capture::Capture;
 use occnerf::{Config, Lpips, Method, Person, Scene, Trainer, VertexColors, checkpoint_config};
 
 use crate::capacity::{self, CapacityName};
@@ -160,6 +161,15 @@ pub fn scene_name(scene: Option<&str>) -> String {
     name.chars().map(|c| if c.is_alphanumeric() || c == '_' { c } else { '-' }).collect()
 }
 
+/// What registration made of the focal length, if it is more than the noise of one that is right.
+fn say_focal_length(source: &Source, scene: &Scene) {
+    let focal = |capture: &Capture| capture.train.first().map_or(1.0, |frame| frame.camera.focal.x);
+    let (given, found) = (focal(&source.capture), focal(&scene.capture));
+    if (found / given - 1.0).abs() > 0.1 {
+        say!("focal length: {given:.0} pixels given, {found:.0} found");
+    }
+}
+
 /// Trains, scores and draws one run; `None` if it stopped early.
 pub fn run_one(
     directory: &Path,
@@ -169,6 +179,7 @@ pub fn run_one(
     sitting: &Sitting,
 ) -> Result<Option<Metrics>> {
     let scene = Scene::new(&source.capture, &source.model, &run.train)?;
+    say_focal_length(source, &scene);
     // Before the training, not after it.
     check_pictures(&scene)?;
     if let Some(lpips) = lpips {

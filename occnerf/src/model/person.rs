@@ -89,7 +89,8 @@ impl Person {
         write(&run.join(PERSON), &header, arrays.map(|(name, array)| (name.to_owned(), array)).into())
     }
 
-    /// Gives `capture` the bodies of the run directory `run`, as registration has corrected them;
+    /// Gives `capture` the bodies and focal lengths of the run directory `run`, as registration has
+    /// corrected them;
     /// false where it has none, or other frames.
     ///
     /// # Errors
@@ -106,8 +107,10 @@ impl Person {
             return Ok(false);
         }
         let moments = moments(&contents, frames, model)?;
-        for (frame, (pose, betas, placement)) in capture.train.iter_mut().zip(&moments) {
+        let cameras = cameras(&contents, frames)?;
+        for ((frame, (pose, betas, placement)), camera) in capture.train.iter_mut().zip(&moments).zip(cameras) {
             (frame.pose, frame.betas, frame.placement) = (pose.clone(), betas.clone(), *placement);
+            frame.camera.focal = camera.focal;
         }
         for view in &mut capture.eval {
             if let Some((pose, betas, placement)) = moments.get(view.train_index) {
@@ -139,16 +142,12 @@ impl Person {
         })?;
         let (betas, vertices) = (model.num_betas(), model.num_vertices());
         let body = Arc::new(Body::new(&model, &contents.floats("mean_betas", betas)?, config)?);
-        let cameras = contents.floats("cameras", frames * CAMERA)?;
-        let sizes = contents.counts("sizes", frames * 2)?;
         let moments = moments(&contents, frames, &model)?;
-        let view = |frame: usize| {
-            let camera = camera(&cameras[frame * CAMERA..][..CAMERA], &sizes[2 * frame..][..2])
-                .ok_or_else(|| contents.wrong(format!("`cameras` {frame} is no pinhole camera")))?;
-            let (pose, betas, placement) = &moments[frame];
-            Ok(Arc::new(body.view(&camera, frame, Moment { betas, pose, placement: *placement })))
+        let views = cameras(&contents, frames)?.into_iter().zip(&moments).enumerate();
+        let view = |(frame, (camera, (pose, betas, placement))): (usize, (Camera, &Pose))| {
+            Arc::new(body.view(&camera, frame, Moment { betas, pose, placement: *placement }))
         };
-        let frames = (0..frames).map(view).collect::<Result<Vec<_>, Error>>()?;
+        let frames = views.map(view).collect();
         let colors = triples(&contents.floats("colors", vertices * 3)?);
         let seen = contents.bytes("seen", vertices)?.iter().map(|&seen| seen != 0).collect();
         let light = Light { slope: Vec3::from_slice(&contents.floats("light", 3)?) };
@@ -194,6 +193,16 @@ fn moments(contents: &Contents<'_>, frames: usize, model: &BodyModel) -> Result<
         (poses[frame * joints..][..joints].to_vec(), shapes[frame * betas..][..betas].to_vec(), placement)
     };
     Ok((0..frames).map(moment).collect())
+}
+
+fn cameras(contents: &Contents<'_>, frames: usize) -> Result<Vec<Camera>, Error> {
+    let cameras = contents.floats("cameras", frames * CAMERA)?;
+    let sizes = contents.counts("sizes", frames * 2)?;
+    let each = cameras.chunks_exact(CAMERA).zip(sizes.chunks_exact(2)).enumerate();
+    each.map(|(frame, (numbers, size))| {
+        camera(numbers, size).ok_or_else(|| contents.wrong(format!("`cameras` {frame} is no pinhole camera")))
+    })
+    .collect()
 }
 
 fn padded(values: &[f32], len: usize) -> Vec<f32> {

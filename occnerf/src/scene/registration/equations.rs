@@ -2,6 +2,7 @@
 
 use glam::Vec3;
 use smpl::{BodyModel, Posed, Shaped};
+use volrender::Camera;
 
 use crate::scene::registration::colors::Colors;
 use crate::scene::registration::sight::{Edge, Sight};
@@ -18,9 +19,29 @@ const CORRELATED: f32 = 3.0;
 /// a vertex cannot say.
 const COLOR: f32 = 0.03;
 
+/// What is not known of how far away the body is: its inverse depth, of which the part `nearness`
+/// is left, while the focal length keeps its picture as large as it is.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Perspective {
+    pub nearness: f32,
+    /// Depth of the root before that.
+    pub depth: f32,
+}
+
+impl Perspective {
+    /// How the picture of a point moves with `nearness`, as a shift of the point in the world.
+    pub fn of(&self, camera: &Camera, point: Vec3) -> Vec3 {
+        let at = camera.world_to_camera.transform_point3(point);
+        let share = (self.depth / self.nearness - at.z) / (self.nearness * at.z);
+        camera.world_to_camera.matrix3.transpose() * (share * at.with_z(0.0))
+    }
+}
+
 /// The equations of a frame, as they are put together.
 pub(super) struct Equations<'a> {
     posed: &'a Posed,
+    /// The camera, where its focal length is not known.
+    perspective: Option<(Perspective, Camera)>,
     /// The body with [`BETA_STEP`] more of each shape coefficient.
     reshaped: Vec<Posed>,
     motions: Motions<'a>,
@@ -31,20 +52,30 @@ pub(super) struct Equations<'a> {
 
 impl<'a> Equations<'a> {
     /// Of a body in the pose `posed` of `shape`; `reshaped` has [`BETA_STEP`] more of each shape
-    /// coefficient.
-    pub fn new(model: &'a BodyModel, shape: &'a Shaped, posed: &'a Posed, reshaped: Vec<Posed>) -> Self {
-        let normal = Normal::new(3 * (model.num_joints() + 1), reshaped.len());
+    /// coefficient. Shared are the shape and, if there is one, the perspective.
+    pub fn new(
+        model: &'a BodyModel,
+        (shape, posed): (&'a Shaped, &'a Posed),
+        reshaped: Vec<Posed>,
+        perspective: Option<(Perspective, Camera)>,
+    ) -> Self {
+        let shared = reshaped.len() + usize::from(perspective.is_some());
+        let normal = Normal::new(3 * (model.num_joints() + 1), shared);
         let motions = Motions::new(model, &shape.vertices, posed);
-        Self { posed, reshaped, motions, motion: Motion::default(), row: Vec::new(), normal }
+        Self { posed, perspective, reshaped, motions, motion: Motion::default(), row: Vec::new(), normal }
     }
 
     /// Looks how a vertex moves, for [`Equations::add`].
     fn at(&mut self, v: usize) {
-        let Self { motions, motion, reshaped, posed, normal, .. } = self;
+        let Self { motions, motion, reshaped, posed, perspective, normal, .. } = self;
         motions.of(v, motion);
         for (k, more) in reshaped.iter().enumerate() {
             motion.columns.push((normal.own + k) as u32);
             motion.directions.push((more.vertices[v] - posed.vertices[v]) / BETA_STEP);
+        }
+        if let Some((perspective, camera)) = perspective {
+            motion.columns.push((normal.own + reshaped.len()) as u32);
+            motion.directions.push(perspective.of(camera, posed.vertices[v]));
         }
     }
 

@@ -18,15 +18,15 @@ mod system;
 mod tests;
 mod unknowns;
 
-use glam::Vec3;
+use glam::{Quat, Vec3};
 use nalgebra::DVector;
 use rayon::prelude::*;
-use smpl::{BodyModel, Posed, Shaped};
+use smpl::{BodyModel, Placement, Posed, Shaped};
 use surface_query::vertex_normals;
-use volrender::Aabb;
+use volrender::{Aabb, Camera};
 
 use self::colors::Colors;
-use self::equations::{BETA_STEP, Equations};
+use self::equations::{BETA_STEP, Equations, Perspective};
 use self::picture::Picture;
 use self::sight::{Looking, Ridge, Sight, look, ridges};
 use self::system::{Expected, Normal, solve};
@@ -39,6 +39,10 @@ use crate::capture::{Capture, Frame};
 const TURN: f64 = 0.035;
 const SHIFT: f64 = 0.03;
 const SHAPE: f64 = 0.5;
+/// Standard deviation of the inverse depth of the whole, where the focal length is somebody's guess,
+/// per metre of a body 1.7 high, and the least depth.
+const NEARNESS: f32 = 0.3;
+const NEAREST: f32 = 0.8;
 /// Part of those of turns and shift by which they change from one frame to the next.
 const CHANGE: f64 = 0.1;
 /// Shape coefficients that are corrected: what follows hardly changes the body.
@@ -79,12 +83,17 @@ struct Registration<'a> {
     pictures: Vec<Option<Picture>>,
     changes: Vec<Change>,
     betas: Vec<f32>,
+    /// The way from the plane of the camera to the root in each frame as it is given; none where
+    /// the focal length is known.
+    away: Option<Vec<Vec3>>,
+    /// Part of the given inverse depths, and of focal lengths, by which both are divided.
+    nearness: f32,
     /// How far clothes stand off each vertex, in the units of the capture.
     clothes: Vec<f32>,
 }
 
 /// Corrects the poses, the places and the shape that `capture` gives for its frames, and with them
-/// those of the views kept back, in `rounds` Gauss-Newton steps. The result does not depend on the
+/// those of the views kept back, and without such views the focal length, in `rounds` Gauss-Newton steps. The result does not depend on the
 /// number of threads.
 ///
 /// # Errors
@@ -100,15 +109,18 @@ pub fn register(capture: &mut Capture, model: &BodyModel, rounds: usize) -> Resu
             break;
         }
     }
-    let Registration { frames, changes, betas, .. } = registration;
+    let Registration { frames, changes, betas, nearness, .. } = registration;
     capture.mean_betas = sum(&capture.mean_betas, &betas);
     for (index, frame) in capture.train.iter_mut().enumerate() {
         let after = frames.partition_point(|&f| f <= index);
         let (a, b) = (after - 1, after.min(frames.len() - 1));
         let share = if a == b { 0.0 } else { (index - frames[a]) as f32 / (frames[b] - frames[a]) as f32 };
         let change: Change = changes[a].iter().zip(&changes[b]).map(|(a, b)| a.lerp(*b, share)).collect();
+        let away = if nearness == 1.0 { None } else { away(frame, model) };
         frame.betas = sum(&frame.betas, &betas);
         (frame.pose, frame.placement) = changed(frame, &model.shaped(&frame.betas), &change);
+        frame.placement = shifted(frame.placement, away.unwrap_or_default(), nearness);
+        frame.camera.focal /= nearness;
     }
     for view in &mut capture.eval {
         if let Some(Frame { pose, placement, betas, .. }) = capture.train.get(view.train_index) {
@@ -132,11 +144,17 @@ impl<'a> Registration<'a> {
         };
         let pictures = frames.par_iter().map(picture).collect::<Result<_, Error>>()?;
         let bounds = Aabb::from_points(&model.shaped(&capture.mean_betas).vertices);
+        let unit = (bounds.max.y - bounds.min.y) / 1.7;
+        // A rig that has other cameras is calibrated.
+        let away = |&f: &usize| away(&capture.train[f], model).filter(|away| away.length() > NEAREST * unit);
+        let away = if capture.eval.is_empty() { frames.iter().map(away).collect() } else { None };
         Ok(Self {
             ridges: ridges(&model.faces),
-            unit: (bounds.max.y - bounds.min.y) / 1.7,
+            unit,
             changes: vec![vec![Vec3::ZERO; model.num_joints() + 1]; frames.len()],
             betas: vec![0.0; model.num_betas().min(BETAS)],
+            away,
+            nearness: 1.0,
             clothes: vec![0.0; model.num_vertices()],
             capture,
             model,
@@ -162,7 +180,7 @@ impl<'a> Registration<'a> {
             .into_par_iter()
             .map(|f| {
                 let Moment { shape, posed, .. } = &moments[f];
-                let mut equations = Equations::new(this.model, shape, posed, this.reshaped(f));
+                let mut equations = Equations::new(this.model, (shape, posed), this.reshaped(f), this.perspective(f));
                 equations.align_outline(&sights[f], &thicker, this.unit);
                 equations.align_colors(&sights[f], &colors, looking.blur);
                 equations.normal
@@ -174,10 +192,16 @@ impl<'a> Registration<'a> {
             (0..own).map(|i| if i < 3 { (shift * shift).recip() } else { (TURN * TURN).recip() }).collect();
         let gap = this.frames.get(1).map_or(1, |second| second - this.frames[0]);
         let change: Vec<f64> = expected.iter().map(|e| e / (CHANGE * CHANGE * gap as f64)).collect();
-        let common = vec![(SHAPE * SHAPE).recip(); this.betas.len()];
+        let mut common = vec![(SHAPE * SHAPE).recip(); this.betas.len()];
         let flat = |change: &Change| DVector::from_iterator(own, change.iter().flat_map(|v| v.as_dvec3().to_array()));
         let now: Vec<DVector<f64>> = this.changes.iter().map(flat).collect();
-        let shared = DVector::from_iterator(this.betas.len(), this.betas.iter().map(|&b| f64::from(b)));
+        let mut shared: Vec<f64> = this.betas.iter().map(|&b| f64::from(b)).collect();
+        if let Some(away) = &this.away {
+            let mean = away.iter().map(|away| away.length()).sum::<f32>() / (away.len() as f32 * this.unit);
+            common.push(f64::from(NEARNESS * mean).powi(-2));
+            shared.push(f64::from(this.nearness) - 1.0);
+        }
+        let shared = DVector::from_vec(shared);
         let expected = Expected { own: &expected, change: &change, shared: &common };
         let Some((steps, step)) = solve(&normals, &expected, &now, &shared) else { return Ok(false) };
         if !steps.iter().chain([&step]).all(|s| s.iter().all(|v| v.is_finite())) {
@@ -189,6 +213,14 @@ impl<'a> Registration<'a> {
             change.iter_mut().zip(each).for_each(|(c, s)| *c += glam::DVec3::from_slice(s).as_vec3());
         }
         self.betas.iter_mut().zip(step.iter()).for_each(|(beta, step)| *beta += *step as f32);
+        if let (Some(away), Some(step)) = (&self.away, step.get(self.betas.len())) {
+            let nearest = away.iter().map(|away| away.length()).fold(f32::INFINITY, f32::min);
+            let (before, most) = (self.nearness, nearest / (NEAREST * self.unit));
+            self.nearness = (before + *step as f32).clamp(0.5 * before, (2.0 * before).min(most));
+            for picture in self.pictures.iter_mut().flatten() {
+                picture.camera.focal *= before / self.nearness;
+            }
+        }
         Ok(true)
     }
 
@@ -197,8 +229,15 @@ impl<'a> Registration<'a> {
         let frame = &self.capture.train[self.frames[f]];
         let shape = self.model.shaped(&sum(&frame.betas, betas));
         let (pose, placement) = changed(frame, &shape, &self.changes[f]);
-        let posed = self.model.pose(&shape, &pose, placement);
+        let away = self.away.as_ref().map_or(Vec3::ZERO, |away| away[f]);
+        let posed = self.model.pose(&shape, &pose, shifted(placement, away, self.nearness));
         (shape, posed)
+    }
+
+    /// What is not known of a frame's perspective, and the camera as it is by now.
+    fn perspective(&self, f: usize) -> Option<(Perspective, Camera)> {
+        let (away, picture) = (self.away.as_ref()?, self.pictures[f].as_ref()?);
+        Some((Perspective { nearness: self.nearness, depth: away[f].length() }, picture.camera))
     }
 
     fn moment(&self, f: usize) -> Moment {
@@ -242,6 +281,28 @@ impl<'a> Registration<'a> {
             sums = next.into_iter().map(|(sum, weight)| (sum / 1.9, weight / 1.9)).collect();
         }
         sums.into_iter().map(|(sum, weight)| sum / (weight + DOUBT)).collect()
+    }
+}
+
+/// The way from the plane of the camera to the root of the body in a frame as it is given; `None`
+/// where that lies behind.
+fn away(frame: &Frame, model: &BodyModel) -> Option<Vec3> {
+    let root = model.shaped(&frame.betas).joints.first().copied()?;
+    let root = match frame.placement {
+        Placement::Pelvis { translation } => root + translation,
+        Placement::Origin { rotation, translation } => Quat::from_scaled_axis(rotation) * root + translation,
+    };
+    let to_camera = frame.camera.world_to_camera;
+    let depth = to_camera.transform_point3(root).z;
+    (depth > 0.0).then(|| to_camera.matrix3.transpose() * Vec3::new(0.0, 0.0, depth))
+}
+
+/// A placement whose inverse depth is `nearness` times as large.
+fn shifted(placement: Placement, away: Vec3, nearness: f32) -> Placement {
+    let by = (nearness.recip() - 1.0) * away;
+    match placement {
+        Placement::Pelvis { translation } => Placement::Pelvis { translation: translation + by },
+        Placement::Origin { rotation, translation } => Placement::Origin { rotation, translation: translation + by },
     }
 }
 

@@ -123,3 +123,51 @@ fn clothes_are_found_as_far_out_as_they_are_and_an_occluder_is_no_outline() {
         assert!((median - thick).abs() < 0.004, "{median}");
     }
 }
+
+#[test]
+fn a_wrong_focal_length_is_mostly_mended_where_no_other_camera_says_what_it_is() {
+    let body = BodyModel::embedded();
+    let exact = DemoConfig { pose_noise_degrees: 0.0, translation_noise: 0.0, beta_noise: 0.0, ..small() };
+    let mut truth = demo(&DemoConfig { size: 192, frames: 30, ..exact }, &body).unwrap();
+    truth.eval.clear();
+    for (factor, most) in [(0.5, 0.25), (4.0, 0.3)] {
+        let mut given = truth.clone();
+        for frame in &mut given.train {
+            frame.placement = shifted(frame.placement, away(frame, &body).unwrap(), 1.0 / factor);
+            frame.camera.focal *= factor;
+        }
+        register(&mut given, &body, 12).unwrap();
+        let (found, true_focal) = (given.train[0].camera.focal.x, truth.train[0].camera.focal.x);
+        let left = (true_focal / found - 1.0).abs() / (factor.recip() - 1.0).abs();
+        assert!(left < most, "{factor}: {found} for {true_focal}");
+        assert!(given.train.iter().all(|f| f.camera.focal.x == found));
+    }
+}
+
+#[test]
+fn the_picture_moves_with_the_perspective_as_by_finite_differences() {
+    let body = BodyModel::embedded();
+    let truth = demo(&small(), &body).unwrap();
+    let frame = &truth.train[0];
+    let way = away(frame, &body).unwrap();
+    let posed = |nearness: f32| {
+        let mut camera = frame.camera;
+        camera.focal /= nearness;
+        let placement = shifted(frame.placement, way, nearness);
+        (body.pose(&body.shaped(&frame.betas), &frame.pose, placement), camera)
+    };
+    for nearness in [0.6, 1.0, 1.7] {
+        let (here, camera) = posed(nearness);
+        let perspective = equations::Perspective { nearness, depth: way.length() };
+        let ([more, less], h) = ([posed(nearness + 0.01), posed(nearness - 0.01)], 0.02);
+        let project =
+            |(posed, camera): &(Posed, Camera), v: usize| camera.project(posed.vertices[v]).unwrap().truncate();
+        for v in (0..body.num_vertices()).step_by(11) {
+            let numeric = (project(&more, v) - project(&less, v)) / h;
+            let shift = perspective.of(&camera, here.vertices[v]);
+            let at = |h: f32| camera.project(here.vertices[v] + h * shift).unwrap().truncate();
+            let analytic = (at(0.01) - at(-0.01)) / 0.02;
+            assert!((numeric - analytic).length() < 0.02 + 0.02 * numeric.length(), "{numeric} {analytic}");
+        }
+    }
+}
