@@ -51,7 +51,7 @@ fn draw(bencher: Bencher<'_, '_>, shells: usize, samples: Samples, size: (u32, u
     let model = &trained().model;
     let mut person = BakedPerson::new(avatar(shells), model.body().scale);
     let view = &model.frames()[0];
-    let bones: Vec<Affine3A> = model.corrected(view).bones.clone();
+    let bones: Vec<Affine3A> = view.posed.bones.clone();
     // As high as the square picture, in the middle of a wide one.
     let mut camera: Camera = view.camera.resized(size.1, size.1);
     camera.centre.x += (size.0 - size.1) as f32 / 2.0;
@@ -116,7 +116,7 @@ fn five_shells(bencher: Bencher<'_, '_>, size: (u32, u32)) {
 fn skin(bencher: Bencher<'_, '_>) {
     let model = &trained().model;
     let mut person = BakedPerson::new(avatar(1), model.body().scale);
-    let bones: Vec<Affine3A> = model.corrected(&model.frames()[0]).bones.clone();
+    let bones: Vec<Affine3A> = model.frames()[0].posed.bones.clone();
     let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
     bencher.bench_local(|| {
         pool.install(|| {

@@ -39,7 +39,7 @@ fn a_model_read_from_its_run_draws_the_same_bits_as_the_trained_one() {
         |_| {},
         |c| c.field.prior_colors = false,
         |c| {
-            (c.motion.kind, c.motion.correction_spacing, c.motion.shell_interval) = (MotionKind::Volume, 0, 0);
+            (c.motion.kind, c.motion.shell_interval) = (MotionKind::Volume, 0);
             c.field.prior_colors = false;
         },
     ];

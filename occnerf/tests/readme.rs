@@ -59,13 +59,9 @@ fn table() -> String {
             format!("{}, {}, {}", c.loss.mse, c.loss.perceptual, c.loss.completeness)
         }),
         row("rounds of registration, light", |c| format!("{}, {}", c.registration.rounds, c.field.prior_light)),
-        row("frames between knots of the pose corrections", |c| match c.motion.correction_spacing {
-            0 => "none".to_owned(),
-            frames => frames.to_string(),
-        }),
-        row("rates of F, vertices, table, motion, poses", |c| {
+        row("rates of F, vertices, table, motion", |c| {
             let r = &c.rates;
-            format!("{:e}, {:e}, {:e}, {:e}, {:e}", r.field, r.vertices, r.table, r.motion, r.pose)
+            format!("{:e}, {:e}, {:e}, {:e}", r.field, r.vertices, r.table, r.motion)
         }),
         row("rates fall to", |c| c.rates.final_fraction.to_string()),
     ];

@@ -31,7 +31,7 @@ fn no_seed_starts_empty() {
             for seed in seeds {
                 let mut config = Config::preset(Preset::Fast, method);
                 (config.seed, config.motion.kind) = (seed, motion);
-                (config.motion.correction_spacing, config.motion.shell_interval) = (0, 0);
+                config.motion.shell_interval = 0;
                 config.field.prior_colors &= motion == MotionKind::Surface;
                 config.encoding.log2_table_size = SMALL_TABLE;
                 let (least, mean) = initial_opacity(scene(), config, &scene().eval[0]);

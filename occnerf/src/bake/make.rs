@@ -324,7 +324,7 @@ fn motion(model: &Model, avatar: &Avatar, fps: f32) -> (Vec<Clip>, Vec<Camera>) 
             let bone = Affine3A { translation: bone.translation / scale, ..*bone };
             Affine3A::from_mat3(turn) * bone
         };
-        model.corrected(view).bones.iter().map(placed).collect()
+        view.posed.bones.iter().map(placed).collect()
     };
     let frames: Vec<Vec<Affine3A>> = model.frames().iter().map(bones).collect();
     let motion: MotionClip = motion_of_bones(&avatar.skeleton, &frames, fps);

@@ -79,7 +79,7 @@ fn sights(
     stride: usize,
 ) -> Result<Vec<Sight>, Error> {
     let pixels = frame.pixels()?;
-    let vertices = person.skin(&model.corrected(&frame.view).bones);
+    let vertices = person.skin(&frame.view.posed.bones);
     let shades = model.base.light.on_surface(vertices, &avatar.faces);
     let options = RasterOptions { cull_back: true, near: 1e-3, ..RasterOptions::default() };
     let shells: Vec<&[[u32; 3]]> = (0..avatar.shell_ends.len()).map(|shell| avatar.shell(shell)).collect();

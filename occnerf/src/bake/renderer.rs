@@ -99,10 +99,8 @@ impl CanonicalField for TrainedField<'_> {
     }
 }
 
-/// Draws views with the avatar that was baked of a model, in the poses that the model's training
-/// found.
+/// Draws views with the avatar that was baked of a model.
 pub struct BakedRenderer<'a> {
-    model: &'a Model,
     person: BakedPerson<'a>,
     samples: Samples,
     pixels: Vec<Vec4>,
@@ -113,22 +111,21 @@ impl<'a> BakedRenderer<'a> {
     ///
     /// # Errors
     /// [`Error::Scene`] for the avatar of another skeleton.
-    pub fn new(model: &'a Model, avatar: &'a Avatar, samples: Samples) -> Result<Self, Error> {
+    pub fn new(model: &Model, avatar: &'a Avatar, samples: Samples) -> Result<Self, Error> {
         let (found, expected) = (avatar.num_joints(), model.body.model.num_joints());
         if found != expected {
             return Err(Error::Scene(format!("the avatar has {found} joints, the model {expected}")));
         }
         let person = BakedPerson::new(avatar, model.body.scale).lit_by(model.base.light);
-        Ok(Self { model, person, samples, pixels: Vec::new() })
+        Ok(Self { person, samples, pixels: Vec::new() })
     }
 }
 
 impl Renderer for BakedRenderer<'_> {
     fn render(&mut self, view: &PosedView, background: Vec3) -> Result<Rendering, Error> {
-        let posed = self.model.corrected(view);
         let (width, height) = (view.camera.width, view.camera.height);
         self.pixels.resize(width as usize * height as usize, Vec4::ZERO);
-        self.person.draw(&posed.bones, &view.camera, self.samples, &mut self.pixels)?;
+        self.person.draw(&view.posed.bones, &view.camera, self.samples, &mut self.pixels)?;
         let over = |p: &Vec4| (p.truncate() + (1.0 - p.w) * background).to_array();
         let pixels: Vec<f32> = self.pixels.par_iter().flat_map_iter(over).collect();
         let opacity = self.pixels.iter().map(|p| p.w).collect();

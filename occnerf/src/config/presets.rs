@@ -93,7 +93,6 @@ fn paper() -> Config {
             margin: 0.04,
             falloff: 0.02,
             depth: 0.3,
-            correction_spacing: 0,
             shell_interval: 0,
         },
         loss: LossConfig {
@@ -108,7 +107,6 @@ fn paper() -> Config {
             vertices: 1e-4,
             table: 5e-3,
             motion: 5e-5,
-            pose: 0.0,
             final_fraction: 0.1,
             beta_2: 0.999,
         },
@@ -141,7 +139,6 @@ fn balanced() -> Config {
             vertices: 1e-4,
             table: 3e-2,
             motion: 1e-3,
-            pose: 0.0,
             final_fraction: 0.05,
             beta_2: 0.99,
         },

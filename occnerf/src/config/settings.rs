@@ -214,9 +214,6 @@ pub struct MotionConfig {
     /// lies deeper is hidden behind that much body; a body is nowhere 0.3 deep, so 0.3 keeps every
     /// sample.
     pub depth: f32,
-    /// Frames from one knot of the learnt pose corrections to the next; 0 leaves the prior's poses
-    /// as they are, and the volume kinds ask for that.
-    pub correction_spacing: usize,
     /// Steps from one look at how far from the prior's surface the field has any density to the
     /// next: what lies farther out is skipped until then. 0 never looks and keeps every sample, and
     /// the volume kinds ask for that.
@@ -291,8 +288,6 @@ pub struct RateConfig {
     pub table: f32,
     /// The motion volume's log-weights.
     pub motion: f32,
-    /// The pose corrections, radians and normalised metres.
-    pub pose: f32,
     /// Every rate falls exponentially to this fraction over the run.
     pub final_fraction: f32,
     /// Decay of the second moment.

@@ -48,15 +48,10 @@ impl Config {
             let expected = "patches · patch_size² · samples may be at most 2^23";
             return Err(ConfigError { key: "patches", value: samples.to_string(), expected });
         }
-        let of_the_surface = [
-            ("motion.correction_spacing", self.motion.correction_spacing),
-            ("motion.shell_interval", self.motion.shell_interval),
-        ];
-        for (key, value) in of_the_surface {
-            if value > 0 && self.motion.kind != MotionKind::Surface {
-                let expected = "expected 0 unless motion.kind is surface";
-                return Err(ConfigError { key, value: value.to_string(), expected });
-            }
+        if self.motion.shell_interval > 0 && self.motion.kind != MotionKind::Surface {
+            let (value, expected) =
+                (self.motion.shell_interval.to_string(), "expected 0 unless motion.kind is surface");
+            return Err(ConfigError { key: "motion.shell_interval", value, expected });
         }
         if self.field.prior_colors && self.motion.kind != MotionKind::Surface {
             let expected = "expected false unless motion.kind is surface";
@@ -76,7 +71,7 @@ impl Config {
         let at_least_zero = "expected a finite number of at least 0";
         let above_zero = "expected a finite number above 0";
         let any = "expected a finite number";
-        let real: [(&'static str, f32, f32, &'static str); 20] = [
+        let real: [(&'static str, f32, f32, &'static str); 19] = [
             ("field.density_scale", self.field.density_scale, f32::MIN_POSITIVE, above_zero),
             ("field.density_bias", self.field.density_bias, f32::MIN, any),
             ("field.density_bias_outside", self.field.density_bias_outside, f32::MIN, any),
@@ -93,7 +88,6 @@ impl Config {
             ("rates.vertices", self.rates.vertices, 0.0, at_least_zero),
             ("rates.table", self.rates.table, 0.0, at_least_zero),
             ("rates.motion", self.rates.motion, 0.0, at_least_zero),
-            ("rates.pose", self.rates.pose, 0.0, at_least_zero),
             ("rates.final_fraction", self.rates.final_fraction, f32::MIN_POSITIVE, above_zero),
             ("rates.beta_2", self.rates.beta_2, 0.0, at_least_zero),
             ("1 - rates.beta_2", 1.0 - self.rates.beta_2, f32::MIN_POSITIVE, above_zero),

@@ -3,7 +3,6 @@
 pub(crate) mod arena;
 pub(crate) mod body;
 pub(crate) mod colors;
-pub(crate) mod correction;
 pub(crate) mod distance;
 pub(crate) mod encoder;
 pub(crate) mod extent;

@@ -14,22 +14,15 @@ pub(crate) enum Part {
     Vertices,
     /// Log-weights of the motion volume.
     Motion,
-    /// Corrections of the poses.
-    Pose,
 }
 
 /// Every part with its name in checkpoints.
-pub(crate) const PARTS: [(Part, &str); 5] = [
-    (Part::Field, "field"),
-    (Part::Table, "table"),
-    (Part::Vertices, "vertices"),
-    (Part::Motion, "motion"),
-    (Part::Pose, "pose"),
-];
+pub(crate) const PARTS: [(Part, &str); 4] =
+    [(Part::Field, "field"), (Part::Table, "table"), (Part::Vertices, "vertices"), (Part::Motion, "motion")];
 
 /// An array for each part: values, or their gradients.
 #[derive(Clone, Debug)]
-pub(crate) struct Arrays(pub [Vec<f32>; 5]);
+pub(crate) struct Arrays(pub [Vec<f32>; 4]);
 
 impl Arrays {
     pub fn get(&self, part: Part) -> &[f32] {
@@ -59,7 +52,6 @@ pub(crate) struct Parameters {
 pub(crate) struct Lengths {
     pub vertices: usize,
     pub motion: usize,
-    pub pose: usize,
 }
 
 impl Parameters {
@@ -71,7 +63,6 @@ impl Parameters {
             field.encoder.initial_table(config.seed),
             vec![0.0; vertices],
             vec![0.0; lengths.motion],
-            vec![0.0; lengths.pose],
         ]);
         Self { values, kept_rows: None }
     }

@@ -27,9 +27,6 @@ pub(crate) struct Samples {
     /// What the colour starts from before the sigmoid, and as w the share of what the perceptron
     /// adds; empty where colours start from nothing and it adds all.
     pub base: Vec<Vec4>,
-    /// Face of the posed prior that each sample is mapped by, with barycentrics; empty where no
-    /// gradient of the pose is wanted.
-    pub faces: Vec<(u32, [f32; 3])>,
 }
 
 impl Samples {
@@ -50,7 +47,6 @@ impl Samples {
         self.distance.clear();
         self.neighbours.clear();
         self.base.clear();
-        self.faces.clear();
     }
 
     pub fn len(&self) -> usize {

@@ -72,8 +72,6 @@ pub(crate) struct Tracer<'a> {
     pub base: &'a [Vec4],
     /// Whether neighbours are wanted at all.
     pub neighbours: bool,
-    /// Whether [`Samples::faces`] are wanted; the surface motion alone has them.
-    pub faces: bool,
 }
 
 /// A ray on its way through the scene, front to back.
@@ -225,9 +223,6 @@ impl Tracer<'_> {
                 let corners = self.body.model.faces[found.face as usize].into_iter();
                 let weighted = corners.zip(found.barycentric).map(|(v, b)| b * self.base[v as usize]);
                 samples.base.push(weighted.sum());
-            }
-            if self.faces {
-                samples.faces.push((found.face, found.barycentric));
             }
         }
         (true, looked_up)

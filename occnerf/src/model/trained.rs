@@ -1,10 +1,9 @@
 //! A trained person, or one in training: what it is, and all that drawing it reads.
 
-use std::borrow::Cow;
 use std::sync::Arc;
 
 use glam::Vec3;
-use smpl::{MotionField, MotionFrame, Posed, SurfaceMotion, WeightVolume, WeightVolumeConfig};
+use smpl::{MotionField, MotionFrame, SurfaceMotion, WeightVolume, WeightVolumeConfig};
 use visibility::VisibilityCounts;
 use volrender::Occupancy;
 
@@ -14,7 +13,6 @@ use crate::config::{Config, MotionKind};
 use crate::model::arena::Arena;
 use crate::model::body::Body;
 use crate::model::colors::VertexColors;
-use crate::model::correction::{Corrections, corrected};
 use crate::model::distance::needs_neighbours;
 use crate::model::extent::Extent;
 use crate::model::field::{Field, Learnt, SampleBatch};
@@ -31,7 +29,7 @@ const VOLUME_THRESHOLD: f32 = 1e-3;
 pub struct Model {
     pub(crate) config: Config,
     pub(crate) body: Arc<Body>,
-    /// The training frames' poses, not corrected, and cameras.
+    /// The training frames' poses and cameras.
     pub(crate) frames: Vec<Arc<PosedView>>,
     pub(crate) field: Field,
     pub(crate) parameters: Parameters,
@@ -39,7 +37,6 @@ pub struct Model {
     pub(crate) motion: MotionField,
     /// Where the canonical prior is near; empty for the surface motion.
     near_canonical: Occupancy,
-    pub(crate) corrections: Corrections,
     /// Where the field ended when it was last looked at.
     pub(crate) extent: Extent,
     /// What colours start from; empty where they start from nothing.
@@ -75,13 +72,12 @@ impl Model {
             MotionKind::Volume => volume(WeightVolume::diffused(prior, shaped, &layout)),
             MotionKind::Gaussian => volume(WeightVolume::gaussian(prior, shaped, &layout)),
         };
-        let corrections = Corrections::new(frames.len(), config.motion.correction_spacing, prior.num_joints());
         let (near_canonical, log_weights) = match &motion {
             MotionField::Surface(_) => (Occupancy::default(), 0),
             MotionField::Volume { weights, .. } => (near_canonical(&body, &config), weights.delta.len()),
         };
         let vertices = body.canonical.vertices.len();
-        let lengths = Lengths { vertices, motion: log_weights, pose: corrections.len() };
+        let lengths = Lengths { vertices, motion: log_weights };
         Ok(Self {
             parameters: Parameters::new(&config, &field, lengths),
             counts: VisibilityCounts::new(vertices),
@@ -92,7 +88,6 @@ impl Model {
             field,
             motion,
             near_canonical,
-            corrections,
             base,
             steps_done: 0,
         })
@@ -108,7 +103,7 @@ impl Model {
         &self.body
     }
 
-    /// The training frames' poses as handed in (see [`Model::corrected`]) and cameras.
+    /// The training frames' poses, as registration has corrected them, and cameras.
     pub fn frames(&self) -> &[Arc<PosedView>] {
         &self.frames
     }
@@ -139,9 +134,8 @@ impl Model {
 
     /// The parameters as before the first step.
     pub(crate) fn forget(&mut self) {
-        let length = |part| self.parameters.get(part).len();
-        let (motion, pose) = (length(Part::Motion), length(Part::Pose));
-        let lengths = Lengths { vertices: self.body.canonical.vertices.len(), motion, pose };
+        let motion = self.parameters.get(Part::Motion).len();
+        let lengths = Lengths { vertices: self.body.canonical.vertices.len(), motion };
         self.parameters = Parameters::new(&self.config, &self.field, lengths);
         self.extent = Extent::whole(&self.body, &self.config);
     }
@@ -170,21 +164,6 @@ impl Model {
         }
     }
 
-    /// Shift and turns that training has found for the moment of a view.
-    pub(crate) fn correction(&self, view: &PosedView) -> Option<Vec<Vec3>> {
-        let pose = self.parameters.get(Part::Pose);
-        view.instant.filter(|_| !pose.is_empty()).map(|instant| self.corrections.at(pose, instant))
-    }
-
-    /// The posed prior of a view as training has corrected it; as handed in where nothing is
-    /// corrected.
-    pub fn corrected<'b>(&self, view: &'b PosedView) -> Cow<'b, Posed> {
-        match self.correction(view) {
-            Some(correction) => Cow::Owned(corrected(&self.body.model, &view.shape, &view.posed, &correction)),
-            None => Cow::Borrowed(&view.posed),
-        }
-    }
-
     /// Whether samples are to have their neighbours.
     fn needs_neighbours(&self) -> bool {
         self.field.surface_term || needs_neighbours(self.config.surface.distance)
@@ -207,7 +186,6 @@ impl Model {
             extent,
             base: &surface.base,
             neighbours: self.needs_neighbours(),
-            faces: !self.parameters.get(Part::Pose).is_empty(),
         }
     }
 

@@ -47,9 +47,9 @@ const MARCH: MarchOptions = MarchOptions { segment: 4, min_transmittance: 1e-3 }
 impl Renderer for FieldRenderer<'_> {
     fn render(&mut self, view: &PosedView, background: Vec3) -> Result<Rendering, Error> {
         let Self { model, code, extent, surface } = self;
-        let posed = model.corrected(view);
-        surface.refit(&model.body, &posed, extent, &model.config, &model.base);
-        let motion = MotionFrame::new(&model.body.model, &posed);
+        let posed = &view.posed;
+        surface.refit(&model.body, posed, extent, &model.config, &model.base);
+        let motion = MotionFrame::new(&model.body.model, posed);
         let tracer = model.tracer(surface, extent, &motion);
         paint(view, background, Scratch::default, |scratch, row, columns| {
             let Scratch { segment, marches } = scratch;
@@ -89,10 +89,10 @@ mod tests {
         let model = trainer.model();
         let mut renderer = FieldRenderer::new(model).unwrap();
         let picture = renderer.render(view, background).unwrap();
-        let posed = model.corrected(view);
+        let posed = &view.posed;
         let whole = Extent::whole(&scene.body, model.config());
-        renderer.surface.refit(&scene.body, &posed, &whole, model.config(), &model.base);
-        let motion = MotionFrame::new(&body, &posed);
+        renderer.surface.refit(&scene.body, posed, &whole, model.config(), &model.base);
+        let motion = MotionFrame::new(&body, posed);
         let tracer = model.tracer(&renderer.surface, &whole, &motion);
         let mut all = SampleBatch::default();
         all.samples.clear();

@@ -61,16 +61,17 @@ mod tests {
     use crate::model::vertices::VertexCode;
     use crate::train::trainer::Trainer;
     use smpl::MotionFrame;
+    use surface_query::MeshDistance;
 
-    /// Face, barycentrics and colour of every sample of a view from another side.
-    fn colours_of_samples(trainer: &Trainer<'_>) -> Vec<((u32, [f32; 3]), Vec3)> {
+    /// Face and colour of every sample of a view from another side.
+    fn colours_of_samples(trainer: &Trainer<'_>) -> Vec<(u32, Vec3)> {
         let (view, model) = (&*trainer.scene.eval[0].view, trainer.model());
         let mut code = VertexCode::default();
         model.encode_vertices(&mut code);
-        let posed = model.corrected(view);
+        let posed = &view.posed;
         let mut surface = PosedSurface::new(&model.body, CELL).unwrap();
-        surface.refit(&model.body, &posed, &model.extent, &model.config, &model.base);
-        let motion = MotionFrame::new(&model.body.model, &posed);
+        surface.refit(&model.body, posed, &model.extent, &model.config, &model.base);
+        let motion = MotionFrame::new(&model.body.model, posed);
         let tracer = model.tracer(&surface, &model.extent, &motion);
         let mut batch = SampleBatch::default();
         batch.samples.clear();
@@ -79,7 +80,9 @@ mod tests {
         }
         model.evaluate(&code, &mut batch, None);
         assert!(batch.samples.len() > 500);
-        batch.samples.faces.into_iter().zip(batch.rgb).collect()
+        let mesh = MeshDistance::new(&posed.vertices, &model.body.model.faces).unwrap();
+        let face = |&x: &Vec3| mesh.closest(x, f32::INFINITY).unwrap().face;
+        batch.samples.world.iter().map(face).zip(batch.rgb).collect()
     }
 
     #[test]
@@ -89,8 +92,6 @@ mod tests {
         let capture = crate::capture::demo(&demo, &body).unwrap();
         let mut config = Config::preset(Preset::Fast, Method::Occnerf);
         config.field.prior_light = false;
-        // Samples know their faces where poses are learnt.
-        config.motion.correction_spacing = 4;
         let scene = Scene::new(&capture, &body, &config).unwrap();
         let shown = VertexColors::measure(&scene).unwrap();
         assert!(shown.colors.iter().all(|c| (c.cmpge(Vec3::ZERO) & c.cmple(Vec3::ONE)).all()));
@@ -99,7 +100,7 @@ mod tests {
         // How far each colour lies outside of those at the corners of its face, and whether none of
         // them was seen.
         let strays = |trainer: &Trainer<'_>| -> Vec<(f32, bool)> {
-            let stray = |((face, _), rgb): ((u32, [f32; 3]), Vec3)| {
+            let stray = |(face, rgb): (u32, Vec3)| {
                 let corners = scene.body.model.faces[face as usize];
                 let colors = corners.map(|v| between(shown.colors[v as usize]));
                 let (low, high) = (colors[0].min(colors[1]).min(colors[2]), colors[0].max(colors[1]).max(colors[2]));

@@ -10,7 +10,7 @@ use crate::train::adam::Adam;
 #[derive(Clone, Debug)]
 pub(crate) struct Optimiser {
     pub gradients: Arrays,
-    pub moments: [Adam; 5],
+    pub moments: [Adam; 4],
 }
 
 impl Optimiser {
@@ -29,7 +29,7 @@ impl Optimiser {
     /// finite.
     pub fn step(&mut self, parameters: &mut Parameters, rates: &RateConfig, decay: f32) -> usize {
         parameters.kept_rows = None;
-        let each = [rates.field, rates.table, rates.vertices, rates.motion, rates.pose];
+        let each = [rates.field, rates.table, rates.vertices, rates.motion];
         let parts = parameters.values.0.iter_mut().zip(&self.gradients.0).zip(&mut self.moments);
         parts.zip(each).map(|(((v, g), adam), rate)| adam.step(rate * decay, rates.beta_2, v, g)).sum()
     }

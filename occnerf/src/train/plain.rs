@@ -176,7 +176,7 @@ fn tiny(method: Method, motion: MotionKind, distance: DistanceKind, seed: u64) -
     (config.seed, config.patches, config.patch_size, config.samples) = (seed, 2, 12, 20);
     (config.field.width, config.field.depth) = (24, 2);
     (config.encoding.levels, config.encoding.log2_table_size, config.encoding.n_max) = (5, 11, 96);
-    (config.motion.kind, config.motion.correction_spacing, config.motion.shell_interval) = (motion, 0, 0);
+    (config.motion.kind, config.motion.shell_interval) = (motion, 0);
     (config.motion.resolution, config.surface.distance) = (16, distance);
     config.min_transmittance = 0.0;
     config.field.prior_colors &= motion == MotionKind::Surface;
@@ -186,7 +186,7 @@ fn tiny(method: Method, motion: MotionKind, distance: DistanceKind, seed: u64) -
 }
 
 /// The fast step and the plain one on the same samples: colours to 1e-4, losses to 1e-4 of
-/// themselves, derivatives of every part but the poses along random directions to 1e-2 of
+/// themselves, derivatives of every part along random directions to 1e-2 of
 /// themselves, those that move places to 6e-2 (the exact surface under a volume: 0.2).
 #[test]
 fn a_step_agrees_with_one_written_straight_from_the_definitions() {

@@ -1,7 +1,7 @@
 //! The two halves of a training step that rays go through, group by group.
 
 use glam::Vec3;
-use smpl::{MotionFrame, Posed};
+use smpl::MotionFrame;
 use volrender::Composite;
 
 use crate::model::arena::Arena;
@@ -13,9 +13,7 @@ use crate::model::vertices::VertexCode;
 use crate::random::Stream;
 use crate::scene::labels::Label;
 use crate::scene::prepared::PreparedFrame;
-use crate::train::backward::correction::Wrench;
 use crate::train::backward::motion::volume_backward;
-use crate::train::backward::pose::pose_backward;
 use crate::train::batch::Batch;
 use crate::train::loss::completeness;
 use crate::train::ordered::OrderedSamples;
@@ -38,8 +36,6 @@ pub(crate) struct RayGroup {
     pub d_mlp: Vec<f32>,
     pub d_vertices: Vec<f32>,
     pub d_volume: Vec<f32>,
-    /// What the samples ask of each bone.
-    pub wrenches: Vec<Wrench>,
     /// Sum of the completeness terms.
     pub completeness: f64,
     /// Finest neighbours of the termination points.
@@ -61,12 +57,9 @@ pub(crate) struct Step<'a> {
     pub model: &'a Model,
     pub surface: &'a PosedSurface,
     pub motion: &'a MotionFrame<'a>,
-    pub posed: &'a Posed,
     pub frame: &'a PreparedFrame,
     pub batch: &'a Batch,
     pub vertex_code: &'a VertexCode,
-    /// Whether this step teaches the poses.
-    pub teaches_poses: bool,
     pub options: StepOptions,
 }
 
@@ -85,7 +78,7 @@ impl Step<'_> {
             let hidden = label(ray) == Label::Unknown && self.options.skips_unknown;
             March::new(frame.view.pixel_ray(batch.pixels[ray]), Some(jitter)).only_inside(hidden)
         });
-        let mut jacobians = (model.volume().is_some() || self.teaches_poses).then_some(jacobians);
+        let mut jacobians = model.volume().is_some().then_some(jacobians);
         if let Some(arena) = &mut jacobians {
             arena.clear(rays.len() * config.samples * model.field.encoder.jacobian_width());
         }
@@ -124,8 +117,6 @@ impl Step<'_> {
         if let Some(volume) = model.volume() {
             zero(&mut group.d_volume, volume.weights.len());
         }
-        group.wrenches.clear();
-        group.wrenches.resize(self.posed.bones.len(), Wrench::default());
         group.completeness = 0.0;
         let loss = &model.config.loss;
         let scale = loss.completeness / (batch.pixels.len() * model.config.samples) as f32;
@@ -142,9 +133,6 @@ impl Step<'_> {
             watch.lap(&mut times.perceptron_backward);
             if let Some(volume) = model.volume() {
                 volume_backward(model, volume, self.motion, batch, jacobians, &mut group.d_volume);
-            }
-            if self.teaches_poses {
-                pose_backward(model, batch, jacobians, self.posed, &mut group.wrenches);
             }
             watch.lap(&mut times.motion_backward);
         }
@@ -170,7 +158,7 @@ mod tests {
 
     /// Some steps with all samples, to make the surface opaque, and one more as `config` has it:
     /// its report, the colours of its rays and the gradients.
-    fn step(scene: &Scene, config: &Config) -> (StepReport, Vec<glam::Vec3>, [Vec<f32>; 3]) {
+    fn step(scene: &Scene, config: &Config) -> (StepReport, Vec<glam::Vec3>, [Vec<f32>; 2]) {
         let mut trainer = Trainer::new(scene, Config { min_transmittance: 0.0, ..config.clone() }).unwrap();
         for _ in 0..60 {
             trainer.step().unwrap();
@@ -178,8 +166,7 @@ mod tests {
         let march = MarchOptions { segment: 6, min_transmittance: config.min_transmittance };
         let report = trainer.step_with(StepOptions { march, skips_unknown: true }).unwrap();
         let colors = trainer.buffers.groups.iter().flat_map(|g| g.composites.iter().map(|c| c.color)).collect();
-        let gradients =
-            [Part::Field, Part::Table, Part::Pose].map(|part| trainer.optimiser.gradients.get(part).to_vec());
+        let gradients = [Part::Field, Part::Table].map(|part| trainer.optimiser.gradients.get(part).to_vec());
         (report, colors, gradients)
     }
 
@@ -233,7 +220,6 @@ mod tests {
         let capture = demo(&DemoConfig { size: 40, frames: 4, eval_cameras: 1, ..Default::default() }, &body).unwrap();
         let mut config = Config::preset(Preset::Fast, Method::Occnerf);
         (config.patches, config.patch_size, config.steps) = (2, 24, 100);
-        (config.motion.correction_spacing, config.rates.pose) = (4, 2e-4);
         config.field.density_scale *= 30.0;
         // That of the samples that are evaluated is another one.
         config.loss.completeness = 0.0;

@@ -2,7 +2,7 @@
 //! threads.
 
 use rayon::prelude::*;
-use smpl::{MotionFrame, Posed};
+use smpl::MotionFrame;
 use visibility::VisibilityCounts;
 
 use crate::Error;
@@ -10,7 +10,6 @@ use crate::capacity::Pruned;
 use crate::config::{Config, VisibilityKind};
 use crate::lpips::Lpips;
 use crate::model::colors::VertexColors;
-use crate::model::correction::correct;
 use crate::model::march::MarchOptions;
 use crate::model::parameters::Part;
 use crate::model::times::{StepTimes, Stopwatch};
@@ -19,7 +18,6 @@ use crate::model::trained::Model;
 use crate::model::vertices::VertexCode;
 use crate::scene::labels::Label;
 use crate::scene::prepared::{PreparedFrame, Scene};
-use crate::train::backward::correction::{Wrench, correct_backward};
 use crate::train::batch::Batch;
 use crate::train::optimiser::Optimiser;
 use crate::train::photometric::Photometric;
@@ -30,8 +28,6 @@ use crate::train::step::{RayGroup, Step, StepOptions, zero};
 /// Rays are dealt row by row to this many groups, each with its own gradient buffers, summed in
 /// order: the result does not depend on who computes a group. Eight keep two to eight threads busy.
 const GROUPS: usize = 8;
-/// Share of the steps after which poses are corrected.
-const SETTLED: f32 = 0.1;
 
 /// A model in training.
 pub struct Trainer<'a> {
@@ -50,8 +46,6 @@ pub(crate) struct Buffers {
     pub groups: Vec<RayGroup>,
     pub vertex_code: VertexCode,
     pub surface: PosedSurface,
-    /// The corrected prior.
-    posed: Posed,
     photometric: Photometric,
     /// Weights of the perceptron, transposed.
     transposed: Vec<f32>,
@@ -77,7 +71,6 @@ impl<'a> Trainer<'a> {
             groups: (0..GROUPS).map(|_| RayGroup::default()).collect(),
             vertex_code: VertexCode::default(),
             surface: PosedSurface::new(&scene.body, CELL)?,
-            posed: Posed::default(),
             photometric: Photometric::default(),
             transposed: Vec::new(),
             d_volume: Vec::new(),
@@ -137,14 +130,6 @@ impl<'a> Trainer<'a> {
         self.model.config.steps = steps;
     }
 
-    /// Whether the next step teaches the poses: what a field says of them before it has taken shape
-    /// would lead them astray.
-    fn teaches_poses(&self) -> bool {
-        let since = self.model.steps_done - self.restarts.begun;
-        let settled = since as f32 >= SETTLED * self.model.config.steps as f32;
-        settled && !self.model.parameters.get(Part::Pose).is_empty()
-    }
-
     /// Forgets what was learnt.
     fn begin_anew(&mut self) {
         self.model.forget();
@@ -166,9 +151,8 @@ impl<'a> Trainer<'a> {
     }
 
     pub(crate) fn step_with(&mut self, options: StepOptions) -> Result<StepReport, Error> {
-        let teaches_poses = self.teaches_poses();
         let Self { scene, model, optimiser, restarts, lpips, buffers } = self;
-        let Buffers { batch, groups, vertex_code, surface, posed, photometric, transposed, d_volume } = buffers;
+        let Buffers { batch, groups, vertex_code, surface, photometric, transposed, d_volume } = buffers;
         let loss = &model.config.loss;
         if lpips.is_none() && !loss.perceptual_weights.is_empty() && loss.perceptual > 0.0 {
             return Err(Error::Lpips("the weights of the perceptual term were not loaded".to_owned()));
@@ -178,15 +162,7 @@ impl<'a> Trainer<'a> {
         batch.draw(scene, &model.config, step);
         let frame = &scene.train[batch.frame];
         let shown = frame.pixels()?;
-        let view = &*frame.view;
-        let correction = model.correction(view);
-        let posed = match &correction {
-            Some(correction) => {
-                correct(&model.body.model, &view.shape, &view.posed, correction, posed);
-                &*posed
-            }
-            None => &view.posed,
-        };
+        let posed = &frame.view.posed;
         model.encode_vertices(vertex_code);
         let interval = model.config.motion.shell_interval as u64;
         if interval > 0 && step > 0 && step.is_multiple_of(interval) {
@@ -195,8 +171,7 @@ impl<'a> Trainer<'a> {
         surface.refit(&model.body, posed, &model.extent, &model.config, &model.base);
         deal(batch, frame, groups);
         let motion = MotionFrame::new(&scene.body.model, posed);
-        let pass =
-            Step { model: &*model, surface, motion: &motion, posed, frame, batch, vertex_code, teaches_poses, options };
+        let pass = Step { model: &*model, surface, motion: &motion, frame, batch, vertex_code, options };
         watch.lap(&mut times.prepare);
         groups.par_iter_mut().with_max_len(1).for_each(|group| pass.forward(group));
         let mut watch = Stopwatch::start();
@@ -215,14 +190,6 @@ impl<'a> Trainer<'a> {
             + f64::from(loss.completeness) * report.completeness;
         reduce(model, optimiser, groups, vertex_code, d_volume, &mut times);
         let mut watch = Stopwatch::start();
-        if let (true, Some(correction), Some(instant)) = (teaches_poses, &correction, view.instant) {
-            let mut wrenches = vec![Wrench::default(); posed.bones.len()];
-            for group in &*groups {
-                wrenches.iter_mut().zip(&group.wrenches).for_each(|(to, from)| to.add(from));
-            }
-            let d_correction = correct_backward(&model.body.model, &view.posed, correction, posed, &wrenches);
-            model.corrections.at_backward(instant, &d_correction, optimiser.gradients.get_mut(Part::Pose));
-        }
         if model.config.surface.visibility == VisibilityKind::Counted {
             groups.iter().for_each(|group| model.counts.add(&group.terminations));
         }

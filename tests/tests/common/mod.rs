@@ -43,7 +43,7 @@ pub fn tiny(method: Method, motion: MotionKind) -> Config {
     config.motion.kind = motion;
     config.motion.shell_interval = 2;
     if motion != MotionKind::Surface {
-        (config.motion.correction_spacing, config.motion.shell_interval) = (0, 0);
+        config.motion.shell_interval = 0;
         config.field.prior_colors = false;
     }
     config

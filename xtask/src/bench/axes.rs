@@ -51,7 +51,7 @@ impl Level {
             // Nothing of this means anything to the prior, which is measured once.
             config.steps *= self.steps;
             let rates = &mut config.rates;
-            for rate in [&mut rates.field, &mut rates.vertices, &mut rates.table, &mut rates.motion, &mut rates.pose] {
+            for rate in [&mut rates.field, &mut rates.vertices, &mut rates.table, &mut rates.motion] {
                 *rate *= self.rates;
             }
         }

@@ -236,7 +236,7 @@ fn speed(
     view: &PosedView,
     (shells, count, samples): (usize, usize, Samples),
 ) -> Result<Vec<Speed>> {
-    let bones: Vec<Affine3A> = model.corrected(view).bones.clone();
+    let bones: Vec<Affine3A> = view.posed.bones.clone();
     let mut speeds = Vec::new();
     for threads in [1, 2] {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build()?;

@@ -22,10 +22,9 @@ const fn change(factor: &'static str, name: &'static str, set: &'static [&'stati
 }
 
 /// Every change but of the number of steps, most telling first.
-pub const CHANGES: [Change; 23] = [
+pub const CHANGES: [Change; 22] = [
     change("registration", "no registration", &["registration.rounds=0"], true),
     change("light", "even light", &["field.prior_light=false"], false),
-    change("poses", "poses learnt", &["motion.correction_spacing=4", "rates.pose=2e-4"], false),
     change("distance", "blended distance", &["surface.distance=blended"], true),
     change(
         "motion",
