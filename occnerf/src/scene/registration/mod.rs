@@ -34,16 +34,21 @@ use self::unknowns::{Change, changed};
 use crate::Error;
 use crate::capture::{Capture, Frame};
 
-/// Standard deviations expected of a tracker: turns of a joint (radians), the shift of the whole
-/// (metres of a body 1.7 high), shape coefficients.
+/// Standard deviations expected of a tracker: turns of a joint (radians), shape coefficients.
 const TURN: f64 = 0.035;
-const SHIFT: f64 = 0.03;
 const SHAPE: f64 = 0.5;
+/// Those of the shift of the whole, and of its change from one frame to the next, metres of a body
+/// 1.7 high: at first, and at least. Trackers differ most in this.
+const SHIFT: [f32; 2] = [0.1, 0.02];
+const LEAST_SHIFT: [f32; 2] = [0.03, 0.003];
+/// By how much the first half of the rounds, which holds the shift back, may have found less of it
+/// than there is.
+const HELD_BACK: f32 = 3.0;
 /// Standard deviation of the inverse depth of the whole, where the focal length is somebody's guess,
 /// per metre of a body 1.7 high, and the least depth.
 const NEARNESS: f32 = 0.3;
 const NEAREST: f32 = 0.8;
-/// Part of those of turns and shift by which they change from one frame to the next.
+/// Part of that of turns by which they change from one frame to the next.
 const CHANGE: f64 = 0.1;
 /// Shape coefficients that are corrected: what follows hardly changes the body.
 const BETAS: usize = 10;
@@ -82,6 +87,9 @@ struct Registration<'a> {
     frames: Vec<usize>,
     pictures: Vec<Option<Picture>>,
     changes: Vec<Change>,
+    /// Standard deviations that are expected of the shift, and of its change from one frame to the
+    /// next, in the units of the capture.
+    shift: [f32; 2],
     betas: Vec<f32>,
     /// The way from the plane of the camera to the root in each frame as it is given; none where
     /// the focal length is known.
@@ -107,6 +115,9 @@ pub fn register(capture: &mut Capture, model: &BodyModel, rounds: usize) -> Resu
         let looking = Looking { reach: between(REACH, late), blur, unit: registration.unit };
         if !registration.improve(looking)? {
             break;
+        }
+        if round + 1 == rounds / 2 {
+            registration.expect_what_was_found();
         }
     }
     let Registration { frames, changes, betas, nearness, .. } = registration;
@@ -152,6 +163,7 @@ impl<'a> Registration<'a> {
             ridges: ridges(&model.faces),
             unit,
             changes: vec![vec![Vec3::ZERO; model.num_joints() + 1]; frames.len()],
+            shift: SHIFT.map(|shift| unit * shift),
             betas: vec![0.0; model.num_betas().min(BETAS)],
             away,
             nearness: 1.0,
@@ -187,11 +199,12 @@ impl<'a> Registration<'a> {
             })
             .collect();
         let own = 3 * (this.model.num_joints() + 1);
-        let shift = SHIFT * f64::from(this.unit);
-        let expected: Vec<f64> =
-            (0..own).map(|i| if i < 3 { (shift * shift).recip() } else { (TURN * TURN).recip() }).collect();
-        let gap = this.frames.get(1).map_or(1, |second| second - this.frames[0]);
-        let change: Vec<f64> = expected.iter().map(|e| e / (CHANGE * CHANGE * gap as f64)).collect();
+        let gap = this.frames.get(1).map_or(1, |second| second - this.frames[0]) as f64;
+        let precisions = |shift: f32, turn: f64| -> Vec<f64> {
+            (0..own).map(|i| (if i < 3 { f64::from(shift) } else { turn }).powi(-2)).collect()
+        };
+        let expected = precisions(this.shift[0], TURN);
+        let change: Vec<f64> = precisions(this.shift[1], CHANGE * TURN).iter().map(|e| e / gap).collect();
         let mut common = vec![(SHAPE * SHAPE).recip(); this.betas.len()];
         let flat = |change: &Change| DVector::from_iterator(own, change.iter().flat_map(|v| v.as_dvec3().to_array()));
         let now: Vec<DVector<f64>> = this.changes.iter().map(flat).collect();
@@ -222,6 +235,21 @@ impl<'a> Registration<'a> {
             }
         }
         Ok(true)
+    }
+
+    /// Expects as much of the shift as was found.
+    fn expect_what_was_found(&mut self) {
+        let gap = self.frames.get(1).map_or(1, |second| second - self.frames[0]);
+        let each: f32 = self.changes.iter().map(|change| change[0].length_squared()).sum();
+        let between: f32 = self.changes.windows(2).map(|pair| pair[0][0].distance_squared(pair[1][0])).sum();
+        // Of one axis.
+        let root = |sum: f32, count: usize| (sum / (3 * count.max(1)) as f32).sqrt();
+        let found = [root(each, self.changes.len()), root(between, gap * (self.changes.len() - 1))];
+        for (shift, (found, (most, least))) in
+            self.shift.iter_mut().zip(found.into_iter().zip(SHIFT.into_iter().zip(LEAST_SHIFT)))
+        {
+            *shift = (HELD_BACK * found).clamp(self.unit * least, self.unit * most);
+        }
     }
 
     /// The body of a frame, in a shape that is `betas` off the given one, as it is posed by now.

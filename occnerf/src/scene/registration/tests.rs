@@ -62,6 +62,23 @@ fn what_is_wrong_with_a_prior_is_mostly_mended_whatever_the_number_of_threads() 
 }
 
 #[test]
+fn a_wrong_depth_is_found_from_how_large_the_person_is() {
+    let body = BodyModel::embedded();
+    let exact = DemoConfig { pose_noise_degrees: 0.0, translation_noise: 0.0, beta_noise: 0.0, ..small() };
+    let truth = demo(&DemoConfig { size: 192, ..exact }, &body).unwrap();
+    let mut given = truth.clone();
+    Perturbation { depth_percent: 3.0, ..Perturbation::default() }.apply(&mut given, &body).unwrap();
+    let mut found = given.clone();
+    register(&mut found, &body, 12).unwrap();
+    let apart = |capture: &Capture| -> f32 {
+        let root = |frame: &Frame| body.pose(&body.shaped(&frame.betas), &frame.pose, frame.placement).joints[0];
+        let each = truth.train.iter().zip(&capture.train).map(|(a, b)| root(a).distance_squared(root(b)));
+        (each.sum::<f32>() / truth.train.len() as f32).sqrt()
+    };
+    assert!(apart(&found) < 0.3 * apart(&given), "{} of {} m are left", apart(&found), apart(&given));
+}
+
+#[test]
 fn a_right_prior_stays_as_it_is() {
     let body = BodyModel::embedded();
     let exact = DemoConfig { pose_noise_degrees: 0.0, translation_noise: 0.0, beta_noise: 0.0, ..small() };
