@@ -218,12 +218,10 @@ impl Tracer<'_> {
         samples.canonical.push(mapped.canonical);
         samples.closest.push(at.closest);
         samples.distance.push(at.distance);
-        if let Some(found) = nearest {
-            if !self.base.is_empty() {
-                let corners = self.body.model.faces[found.face as usize].into_iter();
-                let weighted = corners.zip(found.barycentric).map(|(v, b)| b * self.base[v as usize]);
-                samples.base.push(weighted.sum());
-            }
+        if let Some(found) = nearest.filter(|_| !self.base.is_empty()) {
+            let corners = self.body.model.faces[found.face as usize].into_iter();
+            let weighted = corners.zip(found.barycentric).map(|(v, b)| b * self.base[v as usize]);
+            samples.base.push(weighted.sum());
         }
         (true, looked_up)
     }
