@@ -28,7 +28,7 @@ impl Random {
 }
 
 fn kills() -> usize {
-    std::env::var("KILLS").ok().map_or(6, |kills| kills.parse().expect("KILLS is a number"))
+    std::env::var("KILLS").ok().map_or(3, |kills| kills.parse().expect("KILLS is a number"))
 }
 
 /// Checks that every result under `folder` is whole: partial ones have names of their own. Returns
