@@ -142,8 +142,9 @@ impl Person {
         })?;
         let (betas, vertices) = (model.num_betas(), model.num_vertices());
         let body = Arc::new(Body::new(&model, &contents.floats("mean_betas", betas)?, config)?);
+        let cameras = cameras(&contents, frames)?;
         let moments = moments(&contents, frames, &model)?;
-        let views = cameras(&contents, frames)?.into_iter().zip(&moments).enumerate();
+        let views = cameras.into_iter().zip(&moments).enumerate();
         let view = |(frame, (camera, (pose, betas, placement))): (usize, (Camera, &Pose))| {
             Arc::new(body.view(&camera, frame, Moment { betas, pose, placement: *placement }))
         };
