@@ -35,7 +35,6 @@ impl Stream {
     }
 
     /// Standard normal (Box and Muller 1958).
-    #[cfg(test)]
     pub fn normal(&mut self) -> f32 {
         let radius = (-2.0 * (1.0 - self.uniform()).ln()).sqrt();
         radius * (std::f32::consts::TAU * self.uniform()).cos()

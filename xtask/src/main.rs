@@ -7,7 +7,6 @@ mod bench;
 mod budget;
 mod capacity;
 mod check;
-mod compare;
 mod convert;
 mod eval;
 mod export;
@@ -106,7 +105,6 @@ fn main() -> std::process::ExitCode {
         note!("warning: signals end the program unsaved: {error}");
     }
     let outcome = match command {
-        Command::Train(arguments) if arguments.compare => compare::compare(&arguments),
         Command::Train(arguments) if arguments.list.is_some() => list::train_list(&arguments),
         Command::Train(arguments) => train::train(&arguments),
         Command::Eval(arguments) => eval::eval(&arguments),

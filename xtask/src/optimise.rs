@@ -140,7 +140,7 @@ pub fn optimise(directory: &Path, trainer: &mut Trainer<'_>, sitting: &Sitting) 
     }
     if let Some(signal) = guard.signal() {
         let after = format!(
-            "step {} of {total} is saved: --resume --out {} goes on, or the same command if it was reproduce or --compare",
+            "step {} of {total} is saved: --resume --out {} goes on, or the same command if it was reproduce",
             trainer.steps_done(),
             directory.display()
         );

@@ -58,7 +58,7 @@ pub fn publish(section: &Section<'_>) -> Result<()> {
 pub fn publish_table(table: &str) -> Result<()> {
     let document = Path::new(env!("CARGO_MANIFEST_DIR")).with_file_name("README.md");
     let old = std::fs::read_to_string(&document).with_context(|| document.display().to_string())?;
-    run::write(&document, &replaced(&old, "table", &format!("{table}\n{}\n", origin())))?;
+    run::write(&document, &replaced(&old, "table", &format!("{table}\n{}\n", wrapped(&origin()))))?;
     say!("published: {}", document.display());
     Ok(())
 }
@@ -86,6 +86,21 @@ fn replaced(document: &str, name: &str, text: &str) -> String {
         Some((from, to)) => format!("{}{section}{}", &document[..from], &document[to + end.len()..]),
         None => format!("{}\n\n{section}", document.trim_end()),
     }
+}
+
+/// Lines of at most 100 columns, as far as words are no longer.
+fn wrapped(text: &str) -> String {
+    let mut lines = vec![String::new()];
+    for word in text.split(' ') {
+        match lines.last_mut() {
+            Some(line) if line.is_empty() || line.chars().count() + 1 + word.chars().count() <= 100 => {
+                line.push_str(if line.is_empty() { "" } else { " " });
+                line.push_str(word);
+            }
+            _ => lines.push(word.to_owned()),
+        }
+    }
+    lines.join("\n")
 }
 
 /// Headings two levels lower, as parts of a section.
@@ -128,5 +143,6 @@ mod tests {
         let two = replaced(&one, "b", "## B\n");
         assert_eq!(replaced(&two, "a", "## A\n2\n"), two.replace("1\n", "2\n"));
         assert_eq!(demoted("# x\ny\n"), "### x\ny\n");
+        assert_eq!(wrapped(&"word ".repeat(21).trim_end()), format!("{}\nword", "word ".repeat(20).trim_end()));
     }
 }

@@ -9,6 +9,8 @@ const METHODS: &[(Method, &str)] = &[
     (Method::Prior, "The posed prior in mean vertex colours; nothing is trained"),
     (Method::Humannerf, "Point-based, frequency encoding"),
     (Method::HashPoint, "Point-based, hash encoding"),
+    (Method::NeuralBody, "Codes on the prior's vertices, spread through space, in Neural Body's style"),
+    (Method::SelfNerf, "The nearest vertices are encoded one by one, then blended, in SelfNeRF's order"),
     (Method::Occnerf, "Point term and attended surface term"),
 ];
 const PRESETS: &[(Preset, &str)] = &[

@@ -40,7 +40,7 @@ pub struct TrainArguments {
     #[command(flatten)]
     pub settings: SettingArguments,
     /// Sizes of the model [default: preset]
-    #[arg(long, conflicts_with = "compare")]
+    #[arg(long)]
     pub capacity: Option<CapacityName>,
     /// Threads [default: all cores]; the result does not depend on it
     #[arg(long)]
@@ -56,20 +56,17 @@ pub struct TrainArguments {
     pub saving: SavingArguments,
     /// Rewrite preview.png in the run directory every few seconds: the first training view as the
     /// model of that moment has it
-    #[arg(long, conflicts_with_all = ["list", "compare"])]
+    #[arg(long, conflicts_with = "list")]
     pub preview: bool,
     /// Stop after this many steps in all, leaving a checkpoint to resume from
     #[arg(long)]
     pub stop_after: Option<u64>,
     /// Train every scene of FILE, a path a line, each under OUT; finished ones are not trained
     /// again
-    #[arg(long, value_name = "FILE", conflicts_with_all = ["scene", "resume", "stop_after", "compare", "capacity"])]
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["scene", "resume", "stop_after", "capacity"])]
     pub list: Option<PathBuf>,
     #[command(flatten)]
     pub part: ShardArguments,
-    /// Train every method under both pixel rules and print one table
-    #[arg(long, conflicts_with_all = ["resume", "stop_after"])]
-    pub compare: bool,
 }
 
 /// Runs the command.

@@ -23,7 +23,6 @@ fn help_names_the_commands_and_every_option_of_train() {
         "--seed",
         "--threads",
         "--resume",
-        "--compare",
         "--resize",
         "--stride",
         "--max-frames",

@@ -199,13 +199,12 @@ fn a_training_killed_at_any_moment_ends_the_same_to_the_bit() {
 fn scoring_and_tables_killed_at_any_moment_are_whole_or_absent() {
     let folder = folder("killed-tables");
     let capture = capture(&folder);
-    let without = "humannerf-style-paper,humannerf-style-bg,humannerf-style-bg-4x,humannerf-style-bg-time,humannerf-style,humannerf-style-4x,humannerf-style-time,hash-point-bg,\
-                   occnerf-bg,occnerf,no-surface,no-attention,no-completeness,no-perceptual";
+    let rows = "prior,hash-point";
     let run = folder.join("run");
     done(&[&["train", text(&capture), "--out", text(&run), "--steps", "10"][..], &QUICK].concat());
     let eval = |run: &Path| words(&["eval", text(run)]);
     let reproduce = |out: &Path| {
-        words(&["reproduce", text(&capture), "--out", text(out), "--steps", "20", "--seeds", "1", "--without", without])
+        words(&["reproduce", text(&capture), "--out", text(out), "--steps", "20", "--seeds", "1", "--rows", rows])
     };
     let sweep = |out: &Path| {
         let side = ["--side", "24", "--steps", "1", "--out", text(out)];

@@ -22,11 +22,10 @@ fn parts_of_a_reproduction_make_the_table_that_one_job_makes() {
     let folder = folder("parts");
     let capture = folder.join("capture");
     done(&["synth", "--out", text(&capture), "--size", "32", "--frames", "4", "--eval-cameras", "1"]);
-    let without = "humannerf-style-paper,humannerf-style-bg,humannerf-style-bg-4x,humannerf-style-bg-time,humannerf-style,humannerf-style-4x,humannerf-style-time,hash-point-bg,\
-                   occnerf-bg,no-surface,no-attention,no-completeness,no-perceptual";
+    let rows = "prior,hash-point,occnerf";
     let command = |out: &Path, more: &[&str]| -> Vec<String> {
         let all =
-            ["reproduce", text(&capture), "--out", text(out), "--steps", "2", "--seeds", "2", "--without", without];
+            ["reproduce", text(&capture), "--out", text(out), "--steps", "2", "--seeds", "2", "--rows", rows];
         all.iter().chain(more).map(|word| (*word).to_owned()).collect()
     };
     let run = |words: &[String]| done(&words.iter().map(String::as_str).collect::<Vec<_>>());

@@ -5,16 +5,13 @@ mod common;
 
 use common::{done, folder, refused, text};
 
-const LEFT_OUT: &str = "humannerf-style-paper,humannerf-style-bg-4x,humannerf-style-bg-time,humannerf-style-4x,humannerf-style-time,hash-point-bg,occnerf-bg,no-surface,\
-                        no-attention,no-completeness,no-perceptual";
-
 #[test]
 fn tables_have_every_row_once_and_a_second_call_trains_nothing() {
     let folder = folder("reproduce");
     let (capture, out) = (folder.join("capture"), folder.join("out"));
     done(&["synth", "--out", text(&capture), "--size", "32", "--frames", "4", "--eval-cameras", "1"]);
     let arguments = ["reproduce", text(&capture), "--out", text(&out), "--steps", "2", "--seeds", "2"];
-    let arguments = [&arguments[..], &["--without", LEFT_OUT]].concat();
+    let arguments = [&arguments[..], &["--rows", "prior,humannerf-style-bg,humannerf-style,hash-point,occnerf"]].concat();
     let first = done(&arguments);
     assert_eq!(first.matches(": training\n").count(), 1 + 2 * 4, "{first}");
     let table = std::fs::read_to_string(out.join("capture/reproduce.md")).unwrap();
@@ -41,10 +38,9 @@ fn rows_of_any_length_without_views_kept_back_fit_a_budget_and_another_capture_o
         std::fs::remove_dir_all(capture.join("clean")).unwrap();
     }
     let out = folder.join("out");
-    let rest = ["--out", text(&out), "--seeds", "1", "--budget", "0.01", "--without"];
-    let without = "humannerf-style-paper,humannerf-style-bg,humannerf-style-bg-4x,humannerf-style-bg-time,hash-point-bg,hash-point,occnerf-bg,no-surface,\
-                   no-attention,no-completeness,no-perceptual";
-    let arguments = |capture| [&["reproduce", capture], &rest[..], &[without]].concat();
+    let rest = ["--out", text(&out), "--seeds", "1", "--budget", "0.01", "--rows"];
+    let rows = "prior,humannerf-style,humannerf-style-4x,humannerf-style-time,occnerf";
+    let arguments = |capture| [&["reproduce", capture], &rest[..], &[rows]].concat();
     done(&arguments(text(&capture)));
     let table = std::fs::read_to_string(out.join("person/reproduce.md")).unwrap();
     let steps = |row: &str| {
@@ -65,17 +61,14 @@ fn robustness_is_a_line_for_each_error_of_the_prior() {
     let (capture, out) = (folder.join("capture"), folder.join("out"));
     done(&["synth", "--out", text(&capture), "--size", "48", "--frames", "3", "--eval-cameras", "1"]);
     let arguments = ["reproduce", text(&capture), "--robustness", "--out", text(&out), "--steps", "1", "--seeds", "1"];
-    done(
-        &[&arguments[..], &["--without", "humannerf-style-paper,humannerf-style-bg,humannerf-style,hash-point"]]
-            .concat(),
-    );
+    done(&[&arguments[..], &["--rows", "prior,occnerf"]].concat());
     let table = std::fs::read_to_string(out.join("capture/robustness/robustness.md")).unwrap();
     assert_eq!(table.lines().filter(|line| line.starts_with('|')).count(), 2 + 9, "{table}");
 }
 
 #[test]
 fn unknown_rows_and_impossible_budgets_are_refused() {
-    refused(&["reproduce", "--without", "occnerv"], &["occnerv", "hash-point"]);
+    refused(&["reproduce", "--rows", "occnerv"], &["occnerv", "hash-point"]);
     refused(&["reproduce", "--budget", "0"], &["--budget"]);
     refused(&["reproduce", "/nowhere"], &["/nowhere"]);
 }

@@ -19,11 +19,12 @@ impl Config {
             config.surface.attention = false;
             config.loss.completeness = 0.0;
         }
-        if method == Method::Humannerf {
-            // Without a hash grid the perceptron has to hold the whole person.
-            (config.field.width, config.field.depth) = match preset {
-                Preset::Paper => (256, 8),
-                Preset::Fast | Preset::Balanced => (128, 4),
+        if matches!(method, Method::Humannerf | Method::NeuralBody) {
+            // Without a hash grid the perceptron has to hold the whole person, or half of it.
+            (config.field.width, config.field.depth) = match (preset, method) {
+                (Preset::Paper, Method::Humannerf) => (256, 8),
+                (Preset::Paper, _) => (256, 4),
+                (Preset::Fast | Preset::Balanced, _) => (128, 4),
             };
             if matches!(preset, Preset::Fast | Preset::Balanced) {
                 // The higher rate was chosen for a small F behind a hash grid.
@@ -158,7 +159,8 @@ mod tests {
     #[test]
     fn every_preset_of_every_method_is_valid_and_survives_toml() {
         for preset in [Preset::Fast, Preset::Balanced, Preset::Paper] {
-            for method in [Method::Prior, Method::Humannerf, Method::HashPoint, Method::Occnerf] {
+            use Method::{HashPoint, Humannerf, NeuralBody, Occnerf, Prior, SelfNerf};
+            for method in [Prior, Humannerf, HashPoint, NeuralBody, SelfNerf, Occnerf] {
                 let config = Config::preset(preset, method);
                 config.validate().unwrap();
                 let text = toml::to_string(&config).unwrap();

@@ -14,6 +14,12 @@ pub enum Method {
     Humannerf,
     /// Point-based: hash encoding of x̂ alone.
     HashPoint,
+    /// Latent codes on the prior's vertices, spread through space by inverse distances over the
+    /// nearest ones of every level, beside frequencies of x̂ (after Peng et al. 2021, Neural Body).
+    NeuralBody,
+    /// [v_i, d_i] of each nearest vertex is encoded, and the features are blended by inverse
+    /// distances (the order of Peng et al. 2022, SelfNeRF).
+    SelfNerf,
     /// The paper: point term and attended surface term.
     Occnerf,
 }
@@ -25,6 +31,8 @@ impl Method {
             Self::Prior => "prior",
             Self::Humannerf => "humannerf",
             Self::HashPoint => "hash-point",
+            Self::NeuralBody => "neural-body",
+            Self::SelfNerf => "self-nerf",
             Self::Occnerf => "occnerf",
         }
     }

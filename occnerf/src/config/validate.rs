@@ -1,6 +1,6 @@
 //! What a configuration may ask for.
 
-use crate::config::settings::{Config, MotionKind};
+use crate::config::settings::{Config, Method, MotionKind};
 
 /// A configuration that cannot be run: the key and why.
 #[derive(Debug, thiserror::Error, PartialEq)]
@@ -56,6 +56,10 @@ impl Config {
         if self.field.prior_colors && self.motion.kind != MotionKind::Surface {
             let expected = "expected false unless motion.kind is surface";
             return Err(ConfigError { key: "field.prior_colors", value: "true".to_owned(), expected });
+        }
+        if matches!(self.method, Method::NeuralBody | Method::SelfNerf) && self.motion.kind != MotionKind::Surface {
+            let expected = "expected another method unless motion.kind is surface";
+            return Err(ConfigError { key: "method", value: self.method.name().to_owned(), expected });
         }
         let transmittance = self.min_transmittance;
         if !(0.0..1.0).contains(&transmittance) {

@@ -20,7 +20,7 @@ pub(crate) enum Encoder {
     Frequency,
     /// Hash grid on x̂.
     Point(HashGrid<3>),
-    /// Hash grid on [v̂, d], and the interval that d is clamped to, normalised metres.
+    /// Hash grid on [v̂, d], or on that of a neighbour, and the interval that d is clamped to, normalised metres.
     Surface(HashGrid<4>, (f32, f32)),
 }
 
@@ -30,9 +30,9 @@ impl Encoder {
             config.encoding;
         let grid = HashGridConfig { levels, features, log2_table_size, n_min, n_max };
         Ok(match config.method {
-            Method::Prior | Method::Humannerf => Self::Frequency,
+            Method::Prior | Method::Humannerf | Method::NeuralBody => Self::Frequency,
             Method::HashPoint => Self::Point(HashGrid::new(&grid)?),
-            Method::Occnerf => Self::Surface(HashGrid::new(&grid)?, (distance_min, distance_max)),
+            Method::SelfNerf | Method::Occnerf => Self::Surface(HashGrid::new(&grid)?, (distance_min, distance_max)),
         })
     }
 

@@ -1,14 +1,19 @@
 //! The learnable arrays, in the paper's groups.
 
 use crate::config::Config;
-use crate::model::field::Field;
+use crate::model::field::{Field, VertexRows};
+use crate::random::Stream;
+
+const CODES: u64 = 0x434F_4445;
+/// Standard deviation of a number of a vertex's code before the first step.
+const CODE: f32 = 0.1;
 
 /// A part of the parameters.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Part {
     /// The perceptron F.
     Field,
-    /// The hash table.
+    /// The hash table, or the codes of the vertices.
     Table,
     /// Offsets of the vertices, V × 3.
     Vertices,
@@ -57,10 +62,16 @@ pub(crate) struct Lengths {
 impl Parameters {
     /// The values that training starts from.
     pub fn new(config: &Config, field: &Field, lengths: Lengths) -> Self {
-        let vertices = if field.surface_term { 3 * lengths.vertices } else { 0 };
+        let vertices = if field.vertex_rows == VertexRows::Encoded { 3 * lengths.vertices } else { 0 };
+        let table = if field.vertex_rows == VertexRows::Learnt {
+            let mut stream = Stream::new(&[config.seed, CODES]);
+            (0..lengths.vertices * field.encoder.num_features()).map(|_| CODE * stream.normal()).collect()
+        } else {
+            field.encoder.initial_table(config.seed)
+        };
         let values = Arrays([
             field.mlp.initial(config.seed),
-            field.encoder.initial_table(config.seed),
+            table,
             vec![0.0; vertices],
             vec![0.0; lengths.motion],
         ]);

@@ -15,7 +15,7 @@ use crate::model::body::Body;
 use crate::model::colors::VertexColors;
 use crate::model::distance::needs_neighbours;
 use crate::model::extent::Extent;
-use crate::model::field::{Field, Learnt, SampleBatch};
+use crate::model::field::{Field, Learnt, SampleBatch, VertexRows};
 use crate::model::parameters::{Lengths, PARTS, Parameters, Part};
 use crate::model::trace::{PosedSurface, Tracer, near_canonical};
 use crate::model::vertices::VertexCode;
@@ -140,11 +140,15 @@ impl Model {
         self.extent = Extent::whole(&self.body, &self.config);
     }
 
-    /// Encodes the vertices with the current parameters; nothing without a surface term.
+    /// Makes the rows of the vertices, if samples mix any, from the current parameters.
     pub(crate) fn encode_vertices(&self, code: &mut VertexCode) {
-        if self.field.surface_term {
-            let (table, offsets) = (self.parameters.get(Part::Table), self.parameters.get(Part::Vertices));
-            code.encode(&self.body, &self.config.surface, &self.field.encoder, table, offsets);
+        let (table, offsets) = (self.parameters.get(Part::Table), self.parameters.get(Part::Vertices));
+        match self.field.vertex_rows {
+            VertexRows::None => {}
+            VertexRows::Encoded => {
+                code.encode(&self.body, &self.config.surface, &self.field.encoder, table, offsets);
+            }
+            VertexRows::Learnt => table.clone_into(&mut code.rows),
         }
     }
 
@@ -165,8 +169,8 @@ impl Model {
     }
 
     /// Whether samples are to have their neighbours.
-    fn needs_neighbours(&self) -> bool {
-        self.field.surface_term || needs_neighbours(self.config.surface.distance)
+    pub(crate) fn needs_neighbours(&self) -> bool {
+        self.field.reads_neighbours() || needs_neighbours(self.config.surface.distance)
     }
 
     /// What traces rays at the body that `surface` and `frame` are posed as.
@@ -196,6 +200,7 @@ impl Model {
             table: self.parameters.get(Part::Table),
             vertices: &code.rows,
             counts: &self.counts,
+            surface: (&self.body.canonical.vertices, self.body.query.normals()),
         }
     }
 

@@ -89,7 +89,16 @@ impl Plain<'_, '_> {
             (out.canonical[s], out.likelihood[s]) = (mapped.canonical, mapped.likelihood);
             (out.closest[s], out.distance[s]) = (found.closest, found.distance);
         }
-        field.encoder.coordinates(&out, &body.canonical_box, &mut at);
+        if config.method == Method::SelfNerf {
+            for (x, neighbours) in out.canonical.iter().zip(out.neighbours.chunks(per_sample)) {
+                for v in neighbours[..config.surface.k].iter().map(|&v| v as usize) {
+                    let (vertex, normal) = (body.canonical.vertices[v], body.query.normals()[v]);
+                    field.encoder.push_vertex(vertex, normal.dot(*x - vertex), &body.canonical_box, &mut at);
+                }
+            }
+        } else {
+            field.encoder.coordinates(&out, &body.canonical_box, &mut at);
+        }
         (out, at)
     }
 
@@ -99,7 +108,14 @@ impl Plain<'_, '_> {
         let (config, batch) = (&trainer.model.config, &trainer.buffers.batch);
         let frame = &trainer.scene.train[batch.frame];
         let (field, table) = (values.get(Part::Field), values.get(Part::Table));
-        let vertices = self.encode(table, &self.vertices(values.get(Part::Vertices)).surface);
+        let canonical = &trainer.model.body.canonical.vertices;
+        let vertices: Vec<Vec<f64>> = match config.method {
+            Method::NeuralBody => {
+                let codes = table.chunks(table.len() / canonical.len());
+                codes.map(|code| code.iter().map(|&x| f64::from(x)).collect()).collect()
+            }
+            _ => self.encode(table, &self.vertices(values.get(Part::Vertices)).surface),
+        };
         let motion = trainer.model.volume().map(|volume| {
             let mut weights = volume.clone();
             weights.delta.copy_from_slice(values.get(Part::Motion));
@@ -118,21 +134,29 @@ impl Plain<'_, '_> {
             let points =
                 if at.surface.is_empty() { self.encode(table, &at.point) } else { self.encode(table, &at.surface) };
             let per_sample = samples.neighbours.len().checked_div(samples.len()).unwrap_or(0);
+            let near = |s: usize, v: u32| {
+                1.0 / (samples.canonical[s].as_dvec3().distance(canonical[v as usize].as_dvec3()) + 1e-3)
+            };
             for (ends, &ray) in samples.starts.windows(2).zip(&state.rays) {
                 let (mut transmittance, mut color) = (1.0, DVec3::ZERO);
                 for s in ends[0]..ends[1] {
-                    let mut input = points[s].clone();
-                    if trainer.model.field.surface_term {
-                        let neighbours = &samples.neighbours[s * per_sample..][..per_sample];
-                        let count = |v: u32| 1.0 + self.counts.counts()[v as usize] as f64;
-                        let total: f64 = neighbours.iter().map(|&v| count(v)).sum();
-                        let mut mixed = vec![0.0; input.len()];
-                        for &v in neighbours {
-                            let share = count(v) / total;
-                            mixed.iter_mut().zip(&vertices[v as usize]).for_each(|(sum, x)| *sum += share * x);
+                    let neighbours = &samples.neighbours[s * per_sample..][..per_sample];
+                    let input = match config.method {
+                        Method::Humannerf | Method::HashPoint => points[s].clone(),
+                        Method::SelfNerf => {
+                            let k = config.surface.k;
+                            mixed(neighbours[..k].iter().map(|&v| near(s, v)).zip(&points[s * k..]))
                         }
-                        input.extend(mixed);
-                    }
+                        Method::NeuralBody => {
+                            let codes = neighbours.iter().map(|&v| (near(s, v), &vertices[v as usize]));
+                            [points[s].clone(), mixed(codes)].concat()
+                        }
+                        _ => {
+                            let seen = |v: u32| 1.0 + self.counts.counts()[v as usize] as f64;
+                            let rows = neighbours.iter().map(|&v| (seen(v), &vertices[v as usize]));
+                            [points[s].clone(), mixed(rows)].concat()
+                        }
+                    };
                     let raw = trainer.model.field.mlp.plain(field, &input);
                     let d = f64::from(samples.distance[s]);
                     let (f, reach) = (&config.field, f64::from(config.motion.reach()));
@@ -164,6 +188,17 @@ impl Plain<'_, '_> {
         let loss = f64::from(config.loss.mse) * mse + f64::from(config.loss.completeness) * completeness / nominal;
         (loss, colors)
     }
+}
+
+/// The weighted mean of rows.
+fn mixed<'a>(rows: impl Iterator<Item = (f64, &'a Vec<f64>)>) -> Vec<f64> {
+    let (mut total, mut sum) = (0.0, Vec::new());
+    for (weight, row) in rows {
+        sum.resize(row.len(), 0.0);
+        sum.iter_mut().zip(row).for_each(|(sum, x)| *sum += weight * x);
+        total += weight;
+    }
+    sum.iter().map(|x| x / total).collect()
 }
 
 /// Where each level lies in the table, and its cells an axis.
@@ -199,9 +234,11 @@ fn a_step_agrees_with_one_written_straight_from_the_definitions() {
         (Method::Occnerf, MotionKind::Surface, DistanceKind::Blended),
         (Method::Occnerf, MotionKind::Volume, DistanceKind::Blended),
         (Method::HashPoint, MotionKind::Volume, DistanceKind::Blended),
+        (Method::NeuralBody, MotionKind::Surface, DistanceKind::Exact),
+        (Method::SelfNerf, MotionKind::Surface, DistanceKind::Blended),
     ];
     let mut wrong = Vec::new();
-    for (seed, (method, motion, distance)) in [1u64, 2, 3, 4, 1, 2, 2].into_iter().zip(cases) {
+    for (seed, (method, motion, distance)) in [1u64, 2, 3, 4, 1, 2, 2, 1, 2].into_iter().zip(cases) {
         let demo =
             crate::capture::DemoConfig { size: 48, frames: 3, eval_cameras: 1, eval_every: 3, ..Default::default() };
         let capture = crate::capture::demo(&demo, &body).unwrap();

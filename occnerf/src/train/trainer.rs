@@ -10,6 +10,7 @@ use crate::capacity::Pruned;
 use crate::config::{Config, VisibilityKind};
 use crate::lpips::Lpips;
 use crate::model::colors::VertexColors;
+use crate::model::field::VertexRows;
 use crate::model::march::MarchOptions;
 use crate::model::parameters::Part;
 use crate::model::times::{StepTimes, Stopwatch};
@@ -251,11 +252,17 @@ fn reduce(
     sum(d_mlp, &|g| &g.d_mlp);
     model.field.mlp.clear_padding(d_mlp);
     watch.lap(&mut times.update);
-    if model.field.surface_term {
+    if model.field.vertex_rows != VertexRows::None {
         zero(&mut vertex_code.d_rows, vertex_code.rows.len());
         sum(&mut vertex_code.d_rows, &|g| &g.d_vertices);
-        let (table, d_offsets) = (model.parameters.get(Part::Table), gradients.get_mut(Part::Vertices));
-        vertex_code.backward(&model.body, &model.field.encoder, table, d_offsets);
+    }
+    match model.field.vertex_rows {
+        VertexRows::None => {}
+        VertexRows::Encoded => {
+            let (table, d_offsets) = (model.parameters.get(Part::Table), gradients.get_mut(Part::Vertices));
+            vertex_code.backward(&model.body, &model.field.encoder, table, d_offsets);
+        }
+        VertexRows::Learnt => gradients.get_mut(Part::Table).copy_from_slice(&vertex_code.d_rows),
     }
     let samples = groups.iter().flat_map(|group| group.segments.all()).map(|segment| &segment.batch);
     let parts = samples.map(|batch| (batch.at.all(), &batch.features[..])).chain(vertex_code.parts());

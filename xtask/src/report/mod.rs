@@ -31,7 +31,7 @@ const CAPTIONS: [(&str, &str); 3] = [
 
 #[derive(Args)]
 pub struct ReportArguments {
-    /// Directories of runs, of `train --compare`, or of benches
+    /// Directories of runs, of `reproduce`, or of benches
     #[arg(required = true, value_name = "RUN")]
     runs: Vec<PathBuf>,
     /// The page [default: report.html in RUN, or beside the first of several]

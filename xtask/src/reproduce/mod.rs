@@ -58,9 +58,9 @@ pub struct ReproduceArguments {
     /// Weights that make the perceptual term of all rows LPIPS, as in train
     #[arg(long, value_name = "PATH")]
     perceptual_weights: Option<String>,
-    /// Rows to leave out, comma separated, by the names of the table
+    /// Only these rows, comma separated, by the names of the table [default: all]
     #[arg(long, value_delimiter = ',', value_name = "ROW")]
-    without: Vec<String>,
+    rows: Vec<String>,
     #[command(flatten)]
     saving: SavingArguments,
     #[command(flatten)]
@@ -101,9 +101,9 @@ const MAIN: [&str; 5] = ["prior", "humannerf-style-bg", "humannerf-style", "hash
 pub fn reproduce(arguments: &ReproduceArguments) -> Result<()> {
     ensure!(arguments.budget > 0.0 && arguments.budget.is_finite(), "--budget: expected minutes above 0");
     let known = arguments.table().rows();
-    for name in &arguments.without {
+    for name in &arguments.rows {
         let names = known.iter().map(|row| &*row.name).collect::<Vec<_>>().join(", ");
-        ensure!(known.iter().any(|row| row.name == *name), "--without {name}: no such row; there are {names}");
+        ensure!(known.iter().any(|row| row.name == *name), "--rows {name}: no such row; there are {names}");
     }
     let lpips = load_lpips(arguments.lpips.as_deref())?;
     let demo = [source::DEMO.to_owned()];
@@ -328,7 +328,7 @@ impl ReproduceArguments {
     }
 
     fn rows(&self, wanted: impl Fn(&Row) -> bool) -> Vec<Row> {
-        let kept = |row: &Row| self.without.iter().all(|name| *name != row.name) && wanted(row);
+        let kept = |row: &Row| (self.rows.is_empty() || self.rows.contains(&row.name)) && wanted(row);
         self.table().rows().into_iter().filter(kept).collect()
     }
 }

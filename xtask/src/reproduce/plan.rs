@@ -77,7 +77,8 @@ impl Plan {
         lpips: Option<&Lpips>,
     ) -> Result<Self> {
         let (mut cost, mut pictures) = (BTreeMap::new(), 0);
-        for method in [Method::Humannerf, Method::HashPoint, Method::Occnerf] {
+        use Method::{HashPoint, Humannerf, NeuralBody, Occnerf, SelfNerf};
+        for method in [Humannerf, HashPoint, NeuralBody, SelfNerf, Occnerf] {
             if let Some(row) = rows.iter().find(|row| row.method == method) {
                 let mut config = row.settings(preset)?;
                 config.loss.perceptual_weights.clone_from(&request.perceptual_weights);
@@ -99,7 +100,7 @@ impl Plan {
         if steps.is_none() && affordable < FEWEST as f64 {
             note!(
                 "warning: {minutes:.0} minutes do not pay for {FEWEST} steps a run beside {:.0} minutes of scoring; \
-                 fewer --seeds, a larger --eval-stride or --without would",
+                 fewer --seeds, a larger --eval-stride or fewer --rows would",
                 fixed / 60.0
             );
         }

@@ -45,7 +45,7 @@ pub enum Table {
 }
 
 use Length::{FourTimes, Seconds, Steps};
-use Method::{HashPoint, Humannerf, Occnerf, Prior};
+use Method::{HashPoint, Humannerf, NeuralBody, Occnerf, Prior, SelfNerf};
 use OccludedRule::{Background, Unknown};
 
 /// Changes that make a start know nothing of the prior's colours and of how far its surface is.
@@ -56,7 +56,7 @@ const HUMANNERF: [&str; 6] =
     [GREY[0], GREY[1], GREY[2], "registration.rounds=0", "motion.kind=volume", "motion.shell_interval=0"];
 
 /// A component left out, or replaced by what it competes with.
-const COMPONENTS: [(&str, &[&str]); 9] = [
+const COMPONENTS: [(&str, &[&str]); 11] = [
     ("full", &[]),
     ("no-surface", &["surface.surface_term=false"]),
     ("no-attention", &["surface.attention=false"]),
@@ -66,6 +66,8 @@ const COMPONENTS: [(&str, &[&str]); 9] = [
     ("one-neighbour", &["surface.k=1"]),
     ("one-level", &["surface.coarse_levels=0"]),
     ("fixed-vertices", &["rates.vertices=0"]),
+    ("no-registration", &["registration.rounds=0"]),
+    ("even-light", &["field.prior_light=false"]),
 ];
 
 /// The way from the paper's text to the default: each row keeps the changes of those before it. The
@@ -125,6 +127,8 @@ fn methods() -> Vec<Row> {
         row("humannerf-style-time", Humannerf, Unknown, Seconds),
         row("hash-point-bg", HashPoint, Background, Steps),
         row("hash-point", HashPoint, Unknown, Steps),
+        row("neural-body-style", NeuralBody, Unknown, Steps),
+        row("self-nerf-style", SelfNerf, Unknown, Steps),
         row("occnerf-bg", Occnerf, Background, Steps),
         row("occnerf", Occnerf, Unknown, Steps),
     ];
@@ -151,7 +155,9 @@ fn components() -> Vec<Row> {
             changes: [from, changes].concat(),
             ..row(&format!("{start}-{name}"), Occnerf, Unknown, Steps)
         };
-        COMPONENTS.iter().map(row).collect::<Vec<_>>()
+        // A grey start knows of no light.
+        let rows = COMPONENTS.iter().filter(|(name, _)| start == "ours" || *name != "even-light");
+        rows.map(row).collect::<Vec<_>>()
     };
     starts.into_iter().flat_map(of).collect()
 }
@@ -187,7 +193,16 @@ impl Table {
     /// Rows whose pictures stand beside the truth.
     pub fn shown(self) -> &'static [&'static str] {
         match self {
-            Self::Methods => &["prior", "humannerf-style-bg", "humannerf-style", "hash-point", "occnerf-bg", "occnerf"],
+            Self::Methods => &[
+                "prior",
+                "humannerf-style-bg",
+                "humannerf-style",
+                "hash-point",
+                "neural-body-style",
+                "self-nerf-style",
+                "occnerf-bg",
+                "occnerf",
+            ],
             Self::Story => &["prior", "text", "registered-prior", "paper", "prior-colours", "balanced"],
             Self::Components => &["ours-full", "ours-no-surface", "grey-full", "grey-no-surface"],
         }

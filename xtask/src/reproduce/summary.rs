@@ -143,7 +143,8 @@ impl<'a> Summary<'a> {
             let mean = |pick: fn(&SplitMetrics) -> Option<f64>, digits: usize| {
                 cell(&splits.iter().filter_map(|s| pick(s)).collect::<Vec<_>>(), digits)
             };
-            let name = entry.runs.first().map_or(&entry.name, |m| &m.method).clone();
+            // The column beside it says what hidden pixels are taken for.
+            let name = entry.name.trim_end_matches("-bg").to_owned();
             let (steps, seconds) = (entry.steps.to_string(), format!("{seconds:.0}"));
             let scores = [mean(|s| s.psnr_mask, 2), mean(|s| s.psnr_hidden, 2), mean(|s| s.ssim_mask, 3)];
             lines.push([vec![name, entry.occluded.clone(), steps, seconds], scores.to_vec()].concat());

@@ -2,7 +2,7 @@
 
 use glam::Vec3;
 
-use crate::model::field::{Field, Learnt, SampleBatch, sigmoid};
+use crate::model::field::{Field, Learnt, SampleBatch, VertexRows, sigmoid};
 use crate::model::gemm::LANES;
 use crate::model::surface_term::Mix;
 
@@ -22,13 +22,12 @@ impl Field {
         d_mlp: &mut [f32],
         d_vertices: &mut [f32],
     ) {
-        let (n, width) = (batch.samples.len(), self.encoder.num_features());
-        let (row, layout) = (self.mlp.input_width(), self.encoder.layout(n));
+        let (n, width, row) = (batch.samples.len(), self.encoder.num_features(), self.mlp.input_width());
         batch.d_distance.resize(n, 0.0);
         let reached = |s: &usize| batch.d_sigma[*s] != 0.0 || batch.d_rgb[*s] != Vec3::ZERO;
         let ends = (0..n).rev().find(reached).map_or(0, |s| s + 1);
         batch.d_distance[ends..n].fill(0.0);
-        layout.clear(ends..n, &mut batch.features);
+        self.layout(batch).clear(self.points(ends)..self.points(n), &mut batch.features);
         for (block, range) in self.blocks(ends) {
             if self.narrow {
                 self.activate(learnt.perceptron, learnt.vertices, range.clone(), batch, block);
@@ -47,10 +46,10 @@ impl Field {
             }
             let (d_output, d_input) = (&mut batch.d_output, &mut batch.d_input);
             self.mlp.backward(transposed, &batch.blocks[block], range.len(), d_output, d_input, d_mlp);
-            layout.from_rows(d_input, row, range.clone(), &mut batch.features);
-            if self.surface_term {
+            self.point_term_backward(range.clone(), batch);
+            if self.vertex_rows != VertexRows::None {
                 let mix = Mix::new(width, row, range, &batch.samples, &batch.attention);
-                pulp::Arch::new().dispatch(Scatter { mix, d_rows: d_vertices, d_input });
+                pulp::Arch::new().dispatch(Scatter { mix, d_rows: d_vertices, d_input: &batch.d_input });
             }
         }
     }
@@ -122,7 +121,8 @@ mod tests {
             field.narrow = narrow;
             let mut group = group(n, vertices, 20, &mut Stream::new(&[5]));
             let counts = VisibilityCounts::new(vertices);
-            let learnt = Learnt { perceptron: &mlp, table: &table, vertices: &features, counts: &counts };
+            let surface = (&[][..], &[][..]);
+            let learnt = Learnt { perceptron: &mlp, table: &table, vertices: &features, counts: &counts, surface };
             field.forward(&learnt, &mut group, None);
             group.d_sigma.clone_from(&d_sigma);
             group.d_rgb = d_rgb.chunks(3).map(Vec3::from_slice).collect();
@@ -138,7 +138,8 @@ mod tests {
     #[test]
     fn gradients_of_weights_table_vertices_and_bias_agree_with_central_differences() {
         let region = Aabb { min: Vec3::splat(-0.1), max: Vec3::splat(1.1) };
-        for method in [Method::Occnerf, Method::HashPoint, Method::Humannerf] {
+        use Method::{HashPoint, Humannerf, NeuralBody, Occnerf, SelfNerf};
+        for method in [Occnerf, HashPoint, Humannerf, NeuralBody, SelfNerf] {
             let mut config = Config::preset(Preset::Fast, method);
             (config.field.width, config.field.depth) = (20, 2);
             (config.encoding.levels, config.encoding.n_max, config.encoding.log2_table_size) = (3, 20, 10);
@@ -146,6 +147,9 @@ mod tests {
             let mut random = Stream::new(&[3, method as u64]);
             let (n, vertices) = (40, 12);
             let mut group = group(n, vertices, 20, &mut random);
+            let mut place = || Vec3::new(random.uniform(), random.uniform(), random.uniform());
+            let places: [Vec<Vec3>; 2] = std::array::from_fn(|_| (0..vertices).map(|_| place()).collect());
+            let surface = (&places[0][..], &places[1][..]);
             let mut counts = VisibilityCounts::new(vertices);
             counts.add(&[1, 1, 1, 5, 7, 7]);
             let width = field.encoder.num_features();
@@ -155,7 +159,7 @@ mod tests {
             let features = normal(vertices * width, &mut random);
             let (c_sigma, c_rgb) = (normal(n, &mut random), normal(3 * n, &mut random));
             let value = |group: &mut SampleBatch, mlp: &[f32], table: &[f32], features: &[f32]| -> f64 {
-                let learnt = Learnt { perceptron: mlp, table, vertices: features, counts: &counts };
+                let learnt = Learnt { perceptron: mlp, table, vertices: features, counts: &counts, surface };
                 field.forward(&learnt, group, None);
                 let sigma = group.sigma.iter().zip(&c_sigma).map(|(s, c)| f64::from(s * c) * 0.04);
                 let rgb = group.rgb.iter().zip(c_rgb.chunks(3)).map(|(s, c)| f64::from(s.dot(Vec3::from_slice(c))));
@@ -167,7 +171,7 @@ mod tests {
             let (mut transposed, mut d_mlp) = (Vec::new(), vec![0.0; mlp.len()]);
             field.mlp.transposed_weights(&mlp, &mut transposed);
             let mut d_features = vec![0.0; features.len()];
-            let learnt = Learnt { perceptron: &mlp, table: &table, vertices: &features, counts: &counts };
+            let learnt = Learnt { perceptron: &mlp, table: &table, vertices: &features, counts: &counts, surface };
             field.backward(&learnt, &transposed, &mut group, &mut d_mlp, &mut d_features);
             field.mlp.clear_padding(&mut d_mlp);
             let mut d_table = vec![0.0; table.len()];
