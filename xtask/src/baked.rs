@@ -44,5 +44,5 @@ pub fn avatar(run: &Path, model: &Model) -> Result<Avatar> {
 fn scene(run: &Path) -> Result<Scene> {
     let config = RunConfig::read(run)?;
     let source = config.source(run)?;
-    Ok(Scene::new(&source.capture, &source.model, &config.train)?)
+    source.scene(&config.train)
 }

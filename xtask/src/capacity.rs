@@ -4,7 +4,7 @@ use std::path::Path;
 
 use anyhow::{Context, Result, bail};
 use clap::ValueEnum;
-use occnerf::{Capacity, Config, Method, Scene, Trainer};
+use occnerf::{Capacity, Config, Method, Preset, Trainer};
 
 use crate::optimise;
 use crate::process::{say, unwritten};
@@ -16,10 +16,9 @@ pub const FILE: &str = "capacity.json";
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum CapacityName {
-    /// The preset's sizes.
+    /// The preset's sizes, whatever the scene.
     Preset,
-    /// At most the preset's: table, levels, width and samples from what the scene shows, and pruned
-    /// after training.
+    /// Grid, width, samples and steps from what the scene shows, and pruned after training.
     Auto,
 }
 
@@ -28,10 +27,31 @@ pub fn measure(source: &Source, config: &Config, set: &[String]) -> Result<Capac
     if config.method == Method::Prior {
         bail!("--capacity auto: the prior has no sizes to choose");
     }
-    let scene = Scene::new(&source.capture, &source.model, config)?;
+    let scene = source.scene(config)?;
     let mut capacity = Capacity::measure(&scene, config)?;
     capacity.choices.retain(|choice| set.iter().all(|set| set.split('=').next() != Some(&choice.key)));
     Ok(capacity)
+}
+
+/// The sizes that a new run takes from its scene, if any: where nothing is `asked`, those that the
+/// scene needs more of than its preset has.
+pub fn choose(
+    source: &Source,
+    config: &Config,
+    set: &[String],
+    asked: Option<CapacityName>,
+) -> Result<Option<Capacity>> {
+    // The preset `paper` is the paper's setting.
+    let own = config.method == Method::Prior || config.preset == Preset::Paper;
+    match asked {
+        Some(CapacityName::Auto) => measure(source, config, set).map(Some),
+        None if !own => {
+            let mut capacity = measure(source, config, set)?;
+            capacity.keep_growth();
+            Ok(Some(capacity).filter(|capacity| !capacity.choices.is_empty()))
+        }
+        _ => Ok(None),
+    }
 }
 
 /// That of a run whose sizes were chosen; `None` for one with its preset's.

@@ -96,7 +96,7 @@ pub fn eval(arguments: &EvalArguments) -> Result<()> {
     let run = RunConfig::read(directory)?;
     let _lock = Lock::take(directory)?;
     let source = run.source(directory)?;
-    let scene = Scene::new(&source.capture, &source.model, &run.train)?;
+    let scene = source.scene(&run.train)?;
     let loaded;
     let drawn = if run.train.method == Method::Prior {
         Drawn::Prior(VertexColors::measure(&scene)?)

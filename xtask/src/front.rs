@@ -6,7 +6,7 @@ use anyhow::{Result, ensure};
 use clap::Args;
 use glam::Vec3;
 use image::{Rgb, RgbImage, imageops};
-use occnerf::{FieldRenderer, Label, Model, PreparedFrame, Renderer, Scene};
+use occnerf::{FieldRenderer, Label, Model, PreparedFrame, Renderer};
 
 use crate::pictures;
 use crate::process::say;
@@ -34,7 +34,7 @@ pub fn front(arguments: &FrontArguments) -> Result<()> {
     use_threads(arguments.threads)?;
     let run = RunConfig::read(&arguments.run)?;
     let source = run.source(&arguments.run)?;
-    let scene = Scene::new(&source.capture, &source.model, &run.train)?;
+    let scene = source.scene(&run.train)?;
     ensure!(!scene.eval.is_empty(), "{}: the capture keeps no views back", run.scene);
     let model = Model::load(&arguments.run)?;
     let mut renderer = FieldRenderer::new(&model)?;

@@ -1,6 +1,7 @@
 //! Where the frames come from: the embedded demo, a character filmed on the spot, or a capture on
 //! disk with its body model.
 
+use std::cell::RefCell;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
@@ -9,6 +10,7 @@ use clap::{Args, ValueEnum};
 use occnerf::capture::{
     Capture, DemoConfig, LoadOptions, Perturbation, SynthConfig, Synthetic, demo, find_body, load_capture, own_body,
 };
+use occnerf::{Config, Scene};
 use serde::Serialize;
 use serde_json::Value;
 use smpl::BodyModel;
@@ -28,6 +30,29 @@ pub struct Source {
     pub load: LoadOptions,
     pub capture: Capture,
     pub model: BodyModel,
+    /// The capture as so many rounds of registration have corrected it.
+    registered: RefCell<Option<(usize, Capture)>>,
+}
+
+impl Source {
+    /// The capture made ready for a run. Bodies are registered once for all runs that ask for the
+    /// same number of rounds one after another.
+    ///
+    /// # Errors
+    /// Those of [`Scene::new`].
+    pub fn scene(&self, config: &Config) -> Result<Scene> {
+        let rounds = config.registration.rounds;
+        if rounds == 0 || self.capture.registered {
+            return Ok(Scene::new(&self.capture, &self.model, config)?);
+        }
+        let mut kept = self.registered.borrow_mut();
+        if let Some((_, capture)) = kept.as_ref().filter(|kept| kept.0 == rounds) {
+            return Ok(Scene::new(capture, &self.model, config)?);
+        }
+        let scene = Scene::new(&self.capture, &self.model, config)?;
+        *kept = Some((rounds, scene.capture.clone()));
+        Ok(scene)
+    }
 }
 
 /// What a capture's files leave open.
@@ -185,7 +210,7 @@ pub fn load(scene: Option<&str>, body: Option<&Path>, options: &LoadOptions) -> 
         let mut capture = demo(&DemoConfig::default(), &model)?;
         options.wrong.apply(&mut capture, &model)?;
         options.wrong.spoil_body(&mut model);
-        return Ok(Source { scene: name, body: None, load: options.clone(), capture, model });
+        return Ok(Source { scene: name, body: None, load: options.clone(), capture, model, registered: RefCell::default() });
     }
     let directory = Path::new(scene);
     if directory.is_file() && is_character(directory) {
@@ -195,7 +220,7 @@ pub fn load(scene: Option<&str>, body: Option<&Path>, options: &LoadOptions) -> 
         let Synthetic { mut capture, mut body, .. } = film(Some(directory), None, &SynthConfig::default())?;
         options.wrong.apply(&mut capture, &body)?;
         options.wrong.spoil_body(&mut body);
-        return Ok(Source { scene: name, body: None, load: options.clone(), capture, model: body });
+        return Ok(Source { scene: name, body: None, load: options.clone(), capture, model: body, registered: RefCell::default() });
     }
     if !directory.is_dir() {
         bail!("{scene}: no such directory; expected a capture, a .glb or .gltf character, or no SCENE for the demo");
@@ -210,7 +235,7 @@ pub fn load(scene: Option<&str>, body: Option<&Path>, options: &LoadOptions) -> 
     let mut model = BodyModel::load(&body)?;
     let capture = load_capture(directory, &model, options)?;
     options.wrong.spoil_body(&mut model);
-    Ok(Source { scene: name, body: Some(body), load: options.clone(), capture, model })
+    Ok(Source { scene: name, body: Some(body), load: options.clone(), capture, model, registered: RefCell::default() })
 }
 
 #[cfg(test)]

@@ -39,7 +39,7 @@ pub struct TrainArguments {
     pub load: LoadArguments,
     #[command(flatten)]
     pub settings: SettingArguments,
-    /// Sizes of the model [default: preset]
+    /// Sizes of the model [default: the preset's, larger where the video shows more than they hold]
     #[arg(long)]
     pub capacity: Option<CapacityName>,
     /// Threads [default: all cores]; the result does not depend on it
@@ -118,12 +118,13 @@ struct Begun {
 fn begun(arguments: &TrainArguments, name: &str) -> Result<Begun> {
     let mut config = arguments.settings.config()?;
     let source = source::load(arguments.scene.as_deref(), arguments.body.as_deref(), &arguments.load.options()?)?;
-    let mut chosen = None;
-    if arguments.capacity == Some(CapacityName::Auto) {
-        let capacity = capacity::measure(&source, &config, &arguments.settings.set)?;
+    // What is asked for by itself stays as it is asked for.
+    let steps = arguments.settings.steps.map(|_| "steps=".to_owned());
+    let set: Vec<String> = arguments.settings.set.iter().cloned().chain(steps).collect();
+    let chosen = capacity::choose(&source, &config, &set, arguments.capacity)?;
+    if let Some(capacity) = &chosen {
         capacity.apply(&mut config);
         config.validate()?;
-        chosen = Some(capacity);
     }
     // The directory is made only now, so that bad input leaves nothing behind.
     let (directory, lock) = new_directory(arguments.out.as_deref(), name)?;
@@ -175,7 +176,7 @@ pub fn run_one(
     lpips: Option<&Lpips>,
     sitting: &Sitting,
 ) -> Result<Option<Metrics>> {
-    let scene = Scene::new(&source.capture, &source.model, &run.train)?;
+    let scene = source.scene(&run.train)?;
     say_focal_length(source, &scene);
     // Before the training, not after it.
     check_pictures(&scene)?;
@@ -296,7 +297,7 @@ pub fn finished(directory: &Path, config: &Config) -> Result<Option<Metrics>> {
 fn prior_metrics(run: &RunConfig, source: &Source, lpips: Option<&Lpips>) -> Result<Metrics> {
     let mut prior = run.clone();
     prior.train.method = Method::Prior;
-    let scene = Scene::new(&source.capture, &source.model, &prior.train)?;
+    let scene = source.scene(&prior.train)?;
     let start = Instant::now();
     let colors = VertexColors::measure(&scene)?;
     let drawn = Drawn::Prior(colors);

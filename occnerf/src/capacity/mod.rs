@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 pub use self::measure::Measured;
 pub use self::prune::Pruned;
 use crate::Error;
-use crate::config::{Config, Method};
+use crate::config::{Config, Method, Preset};
 use crate::scene::prepared::Scene;
 
 /// Longest side of the finest cell, in pixels of the video at the subject.
@@ -30,8 +30,14 @@ const UNITS: usize = 16;
 /// Mean distance of samples along a ray, normalised metres: that of `fast` on a walking person.
 const STEP: f32 = 0.018;
 
-/// What was measured of a scene, and the sizes that follow from it, none above those it started
-/// from.
+/// Most cells an axis, levels and log₂ of a level's table that a scene is given: the paper's.
+const MOST: (u32, usize, u32) = (2048, 16, 19);
+/// Pixel-wide places that the steps of `fast` and `balanced` are enough for: a person in pictures
+/// of 256 × 256. More take more steps in proportion, up to [`MOST_STEPS`] times as many.
+const PLACES_OF_A_RUN: f64 = 28_000.0;
+const MOST_STEPS: f64 = 2.5;
+
+/// What was measured of a scene, and the sizes that follow from it.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Capacity {
     /// What the video shows of the person.
@@ -50,16 +56,18 @@ pub struct Choice {
     pub key: String,
     /// Value in the preset.
     pub preset: f64,
-    /// Value chosen for the scene, at most `preset`.
+    /// Value chosen for the scene.
     pub chosen: f64,
     /// The reason, in words and figures.
     pub why: String,
 }
 
 impl Capacity {
-    /// Measures a scene and chooses sizes at most those of `config`; the same for the same scene,
-    /// whatever the threads.
+    /// Measures a scene and chooses sizes in place of those of `config`; the same for the same
+    /// scene, whatever the threads.
     ///
+    /// The grid and the number of steps grow beyond the preset's with what the video shows, up to
+    /// the paper's grid; width and samples only shrink.
     /// Of the encodings the hash grids have sizes to choose; `humannerf` keeps its perceptron,
     /// which holds the whole person.
     ///
@@ -80,12 +88,12 @@ impl Capacity {
         if matches!(config.method, Method::Occnerf | Method::HashPoint) {
             let grid = &config.encoding;
             let finest = (measured.extent / (PIXELS_A_CELL * measured.metres_a_pixel)).ceil() as u32;
-            let n_max = finest.clamp(grid.n_min, grid.n_max.max(grid.n_min));
+            let n_max = finest.clamp(grid.n_min, grid.n_max.max(MOST.0).max(grid.n_min));
             let (pixel, extent) = (1e3 * measured.metres_a_pixel, measured.extent);
             let why = format!(
                 "a pixel shows {pixel:.1} mm of {extent:.2} m; the finest cells are {PIXELS_A_CELL} pixel long"
             );
-            add("encoding.n_max", grid.n_max.into(), n_max.min(grid.n_max).into(), why);
+            add("encoding.n_max", grid.n_max.into(), n_max.into(), why);
             let (levels, growth) = levels(grid.levels, grid.n_min, grid.n_max, n_max);
             let why = format!("each is {growth:.2} times finer than the one before, as in the preset");
             add("encoding.levels", grid.levels as f64, levels as f64, why);
@@ -94,7 +102,8 @@ impl Capacity {
             let why = format!(
                 "{pixels} pixels show {cells} places a pixel wide: {PLACES_A_ROW} to a row, and {ROWS_OF_A_BODY} rows for the shape"
             );
-            add("encoding.log2_table_size", grid.log2_table_size.into(), size.min(grid.log2_table_size).into(), why);
+            let size = size.min(grid.log2_table_size.max(MOST.2));
+            add("encoding.log2_table_size", grid.log2_table_size.into(), size.into(), why);
             let units = ((cells / PLACES_A_UNIT).ceil() as usize).next_multiple_of(UNITS).max(MIN_WIDTH);
             let why = format!("a unit for {PLACES_A_UNIT} such places, at least {MIN_WIDTH}");
             add("field.width", config.field.width as f64, units.min(config.field.width) as f64, why);
@@ -102,7 +111,17 @@ impl Capacity {
         let samples = (measured.span / STEP).ceil() as usize;
         let why = format!("{:.2} m of a ray cross the body's box: a sample every {:.0} mm", measured.span, 1e3 * STEP);
         add("samples", config.samples as f64, samples.clamp(1, config.samples) as f64, why);
+        if config.preset != Preset::Paper {
+            let factor = (cells / PLACES_OF_A_RUN).clamp(1.0, MOST_STEPS);
+            let why = format!("{cells} places; the preset's are enough for {PLACES_OF_A_RUN}");
+            add("steps", config.steps as f64, (config.steps as f64 * factor).round(), why);
+        }
         Self { measured, choices, pruned: None }
+    }
+
+    /// Keeps what the scene needs more of than the preset has.
+    pub fn keep_growth(&mut self) {
+        self.choices.retain(|choice| choice.chosen > choice.preset);
     }
 
     /// Puts the chosen sizes into a configuration; keys that are none of its sizes are left alone.
@@ -115,22 +134,23 @@ impl Capacity {
                 "encoding.log2_table_size" => encoding.log2_table_size = *chosen as u32,
                 "field.width" => config.field.width = *chosen as usize,
                 "samples" => config.samples = *chosen as usize,
+                "steps" => config.steps = *chosen as u64,
                 _ => {}
             }
         }
     }
 }
 
-/// Levels up to `n_max` cells that keep the growth from level to level of `most` levels up to
+/// Levels up to `n_max` cells that keep the growth from level to level of `preset` levels up to
 /// `preset_max` cells.
-fn levels(most: usize, n_min: u32, preset_max: u32, n_max: u32) -> (usize, f64) {
+fn levels(preset: usize, n_min: u32, preset_max: u32, n_max: u32) -> (usize, f64) {
     let octaves = |n: u32| (f64::from(n.max(1)) / f64::from(n_min.max(1))).ln();
-    if most < 2 || preset_max <= n_min {
-        return (most, 1.0);
+    if preset < 2 || preset_max <= n_min {
+        return (preset, 1.0);
     }
-    let growth = octaves(preset_max) / (most - 1) as f64;
+    let growth = octaves(preset_max) / (preset - 1) as f64;
     let levels = 1 + (octaves(n_max) / growth).round().max(0.0) as usize;
-    (levels.min(most), growth.exp())
+    (levels.min(preset.max(MOST.1)), growth.exp())
 }
 
 impl fmt::Display for Capacity {

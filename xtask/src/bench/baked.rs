@@ -8,7 +8,7 @@ use clap::Args;
 use glam::{Affine3A, Vec2, Vec4};
 use occnerf::bake::{Avatar, BakeOptions, BakedPerson, BakedRenderer, bake};
 use occnerf::{
-    FieldRenderer, Model, PosedView, PreparedFrame, Renderer, Rendering, Scene, SplitMetrics, evaluate_with,
+    FieldRenderer, Model, PosedView, PreparedFrame, Renderer, Rendering, SplitMetrics, evaluate_with,
 };
 use visibility::Samples;
 use volrender::Camera;
@@ -76,7 +76,7 @@ pub fn baked(arguments: &BakedArguments) -> Result<()> {
     use_threads(arguments.threads)?;
     let run = RunConfig::read(&arguments.run)?;
     let source = run.source(&arguments.run)?;
-    let scene = Scene::new(&source.capture, &source.model, &run.train)?;
+    let scene = source.scene(&run.train)?;
     let model = Model::load(&arguments.run)?;
     std::fs::create_dir_all(&arguments.out).with_context(|| arguments.out.display().to_string())?;
     let frames: Vec<&PreparedFrame> = scene.eval.iter().collect();

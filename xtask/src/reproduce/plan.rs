@@ -7,7 +7,7 @@ use std::time::Instant;
 
 use anyhow::{Context, Result};
 use occnerf::capture::LoadOptions;
-use occnerf::{Config, FieldRenderer, Lpips, Method, PreparedFrame, Preset, Scene, Trainer, evaluate_with};
+use occnerf::{Config, FieldRenderer, Lpips, Method, PreparedFrame, Preset, Trainer, evaluate_with};
 use serde::{Deserialize, Serialize};
 
 use super::rows::{Length, Row};
@@ -154,7 +154,7 @@ impl fmt::Display for Plan {
 
 /// Seconds of a step and of a scored picture, and how many pictures a run is scored on.
 fn measure(source: &Source, config: Config, lpips: Option<&Lpips>) -> Result<((f64, f64), usize)> {
-    let scene = Scene::new(&source.capture, &source.model, &config)?;
+    let scene = source.scene(&config)?;
     let mut trainer = Trainer::new(&scene, config)?;
     trainer.load_perceptual()?;
     for _ in 0..WARM {
