@@ -210,7 +210,14 @@ pub fn load(scene: Option<&str>, body: Option<&Path>, options: &LoadOptions) -> 
         let mut capture = demo(&DemoConfig::default(), &model)?;
         options.wrong.apply(&mut capture, &model)?;
         options.wrong.spoil_body(&mut model);
-        return Ok(Source { scene: name, body: None, load: options.clone(), capture, model, registered: RefCell::default() });
+        return Ok(Source {
+            scene: name,
+            body: None,
+            load: options.clone(),
+            capture,
+            model,
+            registered: RefCell::default(),
+        });
     }
     let directory = Path::new(scene);
     if directory.is_file() && is_character(directory) {
@@ -220,7 +227,14 @@ pub fn load(scene: Option<&str>, body: Option<&Path>, options: &LoadOptions) -> 
         let Synthetic { mut capture, mut body, .. } = film(Some(directory), None, &SynthConfig::default())?;
         options.wrong.apply(&mut capture, &body)?;
         options.wrong.spoil_body(&mut body);
-        return Ok(Source { scene: name, body: None, load: options.clone(), capture, model: body, registered: RefCell::default() });
+        return Ok(Source {
+            scene: name,
+            body: None,
+            load: options.clone(),
+            capture,
+            model: body,
+            registered: RefCell::default(),
+        });
     }
     if !directory.is_dir() {
         bail!("{scene}: no such directory; expected a capture, a .glb or .gltf character, or no SCENE for the demo");

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use glam::Vec3;
 
 use super::CaptureError;
-use super::pixels::Pixels;
+use super::pixels::{Edit, Pixels};
 use super::source::PixelSource;
 
 /// One picture of the subject with everything that is known about it.
@@ -33,6 +33,11 @@ impl Frame {
     /// For files that cannot be read; none for pixels in memory.
     pub fn pixels(&self) -> Result<Arc<Pixels>, CaptureError> {
         self.source.pixels()
+    }
+
+    /// Makes the mask smaller by so many pixels all around, and the picture with it.
+    pub(crate) fn shrink_mask(&mut self, pixels: u32) {
+        self.source.edit(Edit::Grow(-i32::try_from(pixels).unwrap_or(i32::MAX)));
     }
 }
 

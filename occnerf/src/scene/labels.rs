@@ -154,7 +154,7 @@ fn erode(set: &[bool], width: usize, radius: f32) -> Vec<bool> {
 
 /// Squared distance in pixels to the nearest set pixel, infinite where there is none (Felzenszwalb
 /// and Huttenlocher 2012: lower envelopes of parabolas, along columns, then rows).
-fn squared_distance(set: &[bool], width: usize) -> Vec<f32> {
+pub(crate) fn squared_distance(set: &[bool], width: usize) -> Vec<f32> {
     let height = set.len().checked_div(width).unwrap_or(0);
     let mut field: Vec<f32> = set.iter().map(|&s| if s { 0.0 } else { f32::INFINITY }).collect();
     let mut line = vec![0.0; width.max(height)];

@@ -12,6 +12,7 @@ use crate::config::Config;
 use crate::model::body::{Body, Moment};
 use crate::model::view::PosedView;
 use crate::scene::labels::{Label, Labels, label_pixels};
+use crate::scene::masks::trim;
 use crate::scene::pinhole::pinhole;
 use crate::scene::registration::register;
 
@@ -70,8 +71,11 @@ impl Scene {
             return Err(Error::Scene(format!("view {name} is of training frame {at}, expected one of {frames}")));
         }
         let mut capture = capture.clone();
-        if config.registration.rounds > 0 && !capture.registered {
-            register(&mut capture, model, config.registration.rounds)?;
+        if config.registration.rounds > 0 {
+            trim(&mut capture)?;
+            if !capture.registered {
+                register(&mut capture, model, config.registration.rounds)?;
+            }
         }
         let body = Arc::new(Body::new(model, &capture.mean_betas, config)?);
         let train: Result<Vec<_>, Error> = (capture.train.par_iter().enumerate())

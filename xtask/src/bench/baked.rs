@@ -7,9 +7,7 @@ use anyhow::{Context, Result};
 use clap::Args;
 use glam::{Affine3A, Vec2, Vec4};
 use occnerf::bake::{Avatar, BakeOptions, BakedPerson, BakedRenderer, bake};
-use occnerf::{
-    FieldRenderer, Model, PosedView, PreparedFrame, Renderer, Rendering, SplitMetrics, evaluate_with,
-};
+use occnerf::{FieldRenderer, Model, PosedView, PreparedFrame, Renderer, Rendering, SplitMetrics, evaluate_with};
 use visibility::Samples;
 use volrender::Camera;
 
