@@ -14,6 +14,10 @@ use super::video::Video;
 use super::{easymocap, gvhmr, neuman, peoplesnapshot, phalp, prompthmr, romp, wham};
 use crate::capture::CaptureError;
 
+/// What is expected of a file.
+const TOOLS: &str = "a result of WHAM, 4D-Humans / PHALP, GVHMR, PromptHMR or ROMP, EasyMocap's folder, \
+    poses.npz of PeopleSnapshot, or smpl_output_*.pkl of NeuMan";
+
 /// Reads a fit, which is told by what the file holds, not by its name.
 pub(super) fn read(path: &Path, video: &Video) -> Result<Fit, CaptureError> {
     let fit = if path.is_dir() { easymocap::read(path, video)? } else { read_file(path, video)? };
@@ -30,9 +34,13 @@ fn read_file(path: &Path, video: &Video) -> Result<Fit, CaptureError> {
     let name = path.display().to_string();
     if is_torch(&start) {
         // A zip archive of numpy's arrays starts alike.
-        if start.starts_with(b"PK")
-            && let Ok(mut npz) = Npz::open(path)
-        {
+        if start.starts_with(b"PK") {
+            let mut npz = Npz::open(path).map_err(|error| match error {
+                smpl::Error::Npy { message, .. } => {
+                    CaptureError::invalid(path, "the file", "a whole zip archive, of PyTorch or numpy", message)
+                }
+                error => error.into(),
+            })?;
             if npz.keys().iter().any(|key| key == "results") {
                 return romp::read(path, &npz.value("results")?, video);
             }
@@ -42,6 +50,12 @@ fn read_file(path: &Path, video: &Video) -> Result<Fit, CaptureError> {
         }
         let mut file = TorchFile::open(&name, BufReader::new(file))?;
         return gvhmr::read(path, &mut file, video);
+    }
+    // Pickles of protocol 2 and later, of 0 and 1, and what they are compressed by.
+    let begins = |with: &u8| start.first() == Some(with);
+    if !start.is_empty() && !b"\x80(c}]xB\x1f\xfd\x93".iter().any(begins) {
+        let found = format!("a file that begins with {}", start[..start.len().min(4)].escape_ascii());
+        return Err(CaptureError::invalid(path, "the file", TOOLS, found));
     }
     parse(path, &pickle::read(path)?, video)
 }
@@ -64,9 +78,7 @@ pub(super) fn parse(path: &Path, value: &Value, video: &Video) -> Result<Fit, Ca
         romp::read(path, value, video)
     } else {
         let held: Vec<&str> = entries.iter().map(|(name, _)| name.as_str()).take(8).collect();
-        let expected = "a result of WHAM, 4D-Humans / PHALP, GVHMR, PromptHMR or ROMP, EasyMocap's folder, poses.npz of \
-            PeopleSnapshot, or smpl_output_*.pkl of NeuMan";
-        Err(root.invalid(expected, format!("a dictionary of {}", held.join(", "))))
+        Err(root.invalid(TOOLS, format!("a dictionary of {}", held.join(", "))))
     }
 }
 
