@@ -156,7 +156,7 @@ fn check_names_the_mistake_in_a_capture_on_disk() {
     let whole = std::fs::read_to_string(capture.join("metadata.json")).unwrap();
     type Change = fn(&mut serde_json::Value);
     // The extrinsics of an import are a translation alone.
-    let mistakes: [(&str, Change); 5] = [
+    let mistakes: [(&str, Change); 6] = [
         ("camera to world", |record| {
             (0..3).for_each(|row| each(&mut record["cam_extrinsics"][row], |x| if x == 1.0 { x } else { -x }));
         }),
@@ -165,6 +165,7 @@ fn check_names_the_mistake_in_a_capture_on_disk() {
             (0..3).for_each(|row| each(&mut record["cam_extrinsics"][row], |x| if x == 1.0 { x } else { 1000.0 * x }));
         }),
         ("in degrees", |record| each(&mut record["poses"], f64::to_degrees)),
+        ("radians already", |record| each(&mut record["poses"], f64::to_radians)),
         ("times too long", |record| {
             (0..2).for_each(|row| each(&mut record["cam_intrinsics"][row], |x| if x > 200.0 { 2.0 * x } else { x }));
         }),

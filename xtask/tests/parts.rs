@@ -24,8 +24,7 @@ fn parts_of_a_reproduction_make_the_table_that_one_job_makes() {
     done(&["synth", "--out", text(&capture), "--size", "32", "--frames", "4", "--eval-cameras", "1"]);
     let rows = "prior,hash-point,occnerf";
     let command = |out: &Path, more: &[&str]| -> Vec<String> {
-        let all =
-            ["reproduce", text(&capture), "--out", text(out), "--steps", "2", "--seeds", "2", "--rows", rows];
+        let all = ["reproduce", text(&capture), "--out", text(out), "--steps", "2", "--seeds", "2", "--rows", rows];
         all.iter().chain(more).map(|word| (*word).to_owned()).collect()
     };
     let run = |words: &[String]| done(&words.iter().map(String::as_str).collect::<Vec<_>>());

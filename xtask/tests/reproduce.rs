@@ -11,7 +11,8 @@ fn tables_have_every_row_once_and_a_second_call_trains_nothing() {
     let (capture, out) = (folder.join("capture"), folder.join("out"));
     done(&["synth", "--out", text(&capture), "--size", "32", "--frames", "4", "--eval-cameras", "1"]);
     let arguments = ["reproduce", text(&capture), "--out", text(&out), "--steps", "2", "--seeds", "2"];
-    let arguments = [&arguments[..], &["--rows", "prior,humannerf-style-bg,humannerf-style,hash-point,occnerf"]].concat();
+    let arguments =
+        [&arguments[..], &["--rows", "prior,humannerf-style-bg,humannerf-style,hash-point,occnerf"]].concat();
     let first = done(&arguments);
     assert_eq!(first.matches(": training\n").count(), 1 + 2 * 4, "{first}");
     let table = std::fs::read_to_string(out.join("capture/reproduce.md")).unwrap();

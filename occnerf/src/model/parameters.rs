@@ -69,12 +69,7 @@ impl Parameters {
         } else {
             field.encoder.initial_table(config.seed)
         };
-        let values = Arrays([
-            field.mlp.initial(config.seed),
-            table,
-            vec![0.0; vertices],
-            vec![0.0; lengths.motion],
-        ]);
+        let values = Arrays([field.mlp.initial(config.seed), table, vec![0.0; vertices], vec![0.0; lengths.motion]]);
         Self { values, kept_rows: None }
     }
 

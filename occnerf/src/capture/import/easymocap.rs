@@ -129,7 +129,8 @@ fn camera(folder: &Path, video: &Video) -> Result<Camera, CaptureError> {
         let key = format!("{key}_{name}");
         if let Some(found) = inner.get(&key).filter(|found| found.as_slice() != [side]) {
             let expected = format!("{side}, as the frames' {width}×{height}");
-            return Err(CaptureError::invalid(&intri, key, expected, format!("{found:?}")));
+            let found: Vec<String> = found.iter().map(f64::to_string).collect();
+            return Err(CaptureError::invalid(&intri, key, expected, found.join(", ")));
         }
     }
     if let Some(lens) = inner.get(&format!("dist_{name}")).filter(|lens| lens.iter().any(|d| *d != 0.0)) {
