@@ -95,7 +95,7 @@ pub enum Error {
         limit: u64,
     },
     /// Malformed or truncated `.npy` or `.npz` structure.
-    #[error("{file}: `{}`: malformed array file: {message}", key.escape_debug())]
+    #[error("{file}: {}malformed array file: {message}", within(key))]
     Npy {
         /// The file.
         file: String,
@@ -121,4 +121,9 @@ impl Error {
     pub(crate) fn invalid(file: &str, key: &str, message: impl Into<String>) -> Self {
         Self::Invalid { file: file.to_owned(), key: key.to_owned(), message: message.into() }
     }
+}
+
+/// The key with what parts it from the rest of a line; nothing for the file as a whole.
+fn within(key: &str) -> String {
+    if key.is_empty() { String::new() } else { format!("`{}`: ", key.escape_debug()) }
 }

@@ -91,13 +91,17 @@ fn tell(found: &Check, all: bool) {
     if more > 0 {
         say!("… and {more} more (--all)");
     }
+    say!("{}", verdict(found));
+}
+
+fn verdict(found: &Check) -> String {
     match found.mistakes.as_slice() {
-        [] => say!("no usual mistake found"),
-        mistakes => mistakes.iter().for_each(|mistake| say!("likely mistake: {mistake}")),
+        [] => "no usual mistake found".to_owned(),
+        mistakes => mistakes.iter().map(|mistake| format!("likely mistake: {mistake}")).collect::<Vec<_>>().join("\n"),
     }
 }
 
-/// Frames from all over the video.
+/// Frames from all over the video, under the verdict.
 fn picture(source: &Source, found: &Check) -> Result<RgbImage> {
     let frames = &source.capture.train;
     let shown = FRAMES.min(frames.len());
@@ -134,7 +138,7 @@ fn picture(source: &Source, found: &Check) -> Result<RgbImage> {
         imageops::replace(&mut whole, strip, 0, i64::from(top));
         top += strip.height();
     }
-    Ok(whole)
+    captioned(&whole, &[&verdict(found).replace('\n', "; ")])
 }
 
 /// A frame: mask tinted green, unknown pixels orange, the body's outline white within purple.

@@ -26,12 +26,14 @@ Run one estimator and one segmenter as their own pages say, on the same frames (
   PromptHMR         results/CLIP/results.pkl                  (wants --body SMPLX_NEUTRAL.npz; its masks are used, too)
   ROMP              OUTPUT/video_results.npz                  (romp --mode=video -t)
   EasyMocap         OUTPUT, the folder with smpl/; intri.yml and extri.yml in it or above
+  PeopleSnapshot    SUBJECT/poses.npz, as InstantAvatar prepares it, with cameras.npz (--frames images --masks masks)
+  NeuMan            SCENE/smpl_output_romp.pkl, with alignments.npy and sparse/ (--frames images --masks segmentations)
 
 --masks, of the person as far as it is visible:
   SAM 2             OUTPUT/CLIP of vos_inference.py: PNGs by value, or a folder an object (--object, --occluder-objects)
   Grounded-SAM-2    OUTPUT with mask_data/mask_*.npy          (--object, --occluder-objects)
   MatAnyone         OUTPUT/CLIP with pha/0000.png
-  any other         PNGs of 0 and 255, or one .npy (frames, height, width)
+  any other         PNGs of 0 and 255, or one .npy (frames, height, width); inverted ones are told by the border
 
 --body: SMPL_NEUTRAL.pkl of SMPL_python_v.1.1.0 (smpl.is.tue.mpg.de), or SMPLX_NEUTRAL.npz (smpl-x.is.tue.mpg.de).
 

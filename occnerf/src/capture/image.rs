@@ -90,7 +90,10 @@ fn to_byte(value: f32) -> u8 {
 
 fn picture_error(path: &Path, source: image::ImageError) -> CaptureError {
     match source {
-        image::ImageError::IoError(source) => CaptureError::Io { path: path.to_owned(), source },
+        // A file that ends too early is damaged, not out of reach.
+        image::ImageError::IoError(source) if source.kind() != std::io::ErrorKind::UnexpectedEof => {
+            CaptureError::Io { path: path.to_owned(), source }
+        }
         source => CaptureError::Picture { path: path.to_owned(), source },
     }
 }

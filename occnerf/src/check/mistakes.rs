@@ -25,6 +25,8 @@ pub enum Mistake {
     Unit(f32),
     /// Rotations in degrees.
     Degrees,
+    /// Rotations in radians that were taken for degrees and converted.
+    Radians,
     /// The focal length is about so many times too long.
     Focal(f32),
     /// Masks show what is not the person.
@@ -59,12 +61,16 @@ impl std::fmt::Display for Mistake {
             }
             Self::Unit(factor) => write!(f, "translations are {factor} times too large"),
             Self::Degrees => f.write_str("poses are in degrees: multiply them by pi/180"),
+            Self::Radians => f.write_str("poses were radians already: multiply them by 180/pi"),
             Self::Focal(factor) if *factor < 1.0 => {
                 write!(f, "the focal length is about {:.2} times too short", 1.0 / factor)
             }
             Self::Focal(factor) => write!(f, "the focal length is about {factor:.2} times too long"),
             Self::MaskInverted => f.write_str("the masks are inverted: 255 must be the person"),
-            Self::FrameShift(by) => write!(f, "fit and pictures are off by {by} frame(s)"),
+            Self::FrameShift(by) => {
+                let (count, when) = (by.abs(), if *by > 0 { "later" } else { "earlier" });
+                write!(f, "fit and pictures are off by {count}: each picture has the fit of the one {count} {when}")
+            }
             Self::WrongPerson => {
                 f.write_str("the fit lies beside the mask: another person's fit, or another object's mask")
             }
@@ -89,7 +95,10 @@ const BESIDE: f32 = 0.5;
 const SHIFT_ERRORS: f32 = 4.0;
 const SHIFT_BY: f32 = 0.004;
 /// Frames that mistakes are undone in.
-const UNDONE_VIEWS: usize = 24;
+const UNDONE_VIEWS: usize = 12;
+/// Powers of two by which focal lengths are tried to be wrong: a person who is 1.3 times too large
+/// is not seen as such by steps of half an octave.
+const OCTAVES: [f32; 10] = [0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0];
 /// Areas of a body that may be the person's, as multiples of the mask's.
 const AREAS: std::ops::Range<f32> = 0.3..8.0;
 
@@ -134,11 +143,21 @@ pub(super) fn find(capture: &Capture, body: &BodyModel, views: &[View]) -> Vec<M
         return vec![Mistake::Degrees];
     }
     let every = views.len().div_ceil(UNDONE_VIEWS).max(1);
-    let few = views.par_iter().step_by(every).map(|view| Posed::new(view, &capture.train[view.index], body));
-    let posed: Vec<Posed<'_>> = few.collect();
+    let few = |times: f32| -> Vec<Posed<'_>> {
+        let few = views.par_iter().step_by(every);
+        few.map(|view| Posed::new(view, &capture.train[view.index], body, times)).collect()
+    };
+    let posed = few(1.0);
     let as_given = overlaps(&posed, body, None);
     let (given, covered) = mean(&as_given);
-    let focal = (-8..=8).filter(|k| *k != 0).map(|k| Mistake::Focal(2f32.powf(k as f32 / 2.0)));
+    // What would be a possible pose in degrees is nearly none at all in radians.
+    if angles().all(|angle| angle < TURN.to_radians()) {
+        let (iou, _) = mean(&overlaps(&few(180.0 / std::f32::consts::PI), body, None));
+        if iou > given {
+            return vec![Mistake::Radians];
+        }
+    }
+    let focal = OCTAVES.iter().flat_map(|k| [2f32.powf(*k), 2f32.powf(-k)]).map(Mistake::Focal);
     let others = [
         Mistake::CameraToWorld,
         Mistake::CameraYUp,
@@ -188,8 +207,10 @@ struct Posed<'a> {
 }
 
 impl<'a> Posed<'a> {
-    fn new(view: &'a View, frame: &Frame, body: &BodyModel) -> Self {
-        let posed = body.pose(&body.shaped(&frame.betas), &frame.pose, frame.placement);
+    /// With joints turned so many times as far as the frame says.
+    fn new(view: &'a View, frame: &Frame, body: &BodyModel, times: f32) -> Self {
+        let pose: Vec<Vec3> = frame.pose.iter().map(|axis| *axis * times).collect();
+        let posed = body.pose(&body.shaped(&frame.betas), &pose, frame.placement);
         let pelvis = posed.joints.first().copied().unwrap_or(Vec3::ZERO);
         Self { view, placement: frame.placement, vertices: posed.vertices, pelvis }
     }

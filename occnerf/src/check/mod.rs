@@ -160,9 +160,7 @@ impl View {
         let occluder = pixels.occluder.as_ref().map(|o| (0..count).map(|i| o[source(i)]).collect());
         Ok(Self { index, camera, mask, occluder })
     }
-}
 
-impl View {
     /// Share of the picture's border that the mask has.
     fn border(&self) -> f32 {
         let (width, height) = (self.camera.width as usize, self.camera.height as usize);

@@ -9,12 +9,11 @@ use glam::{DMat3, DVec3};
 use serde::Deserialize;
 
 use super::fit::{About, Fit, FitFrame, Person, SMPL, Tool, axis_angle, rotation};
+use super::item::turn;
+use super::read::text;
 use super::video::Video;
 use super::yaml;
 use crate::capture::CaptureError;
-
-/// Longest file that is read: a frame has two kilobytes a person.
-const MAX_BYTES: u64 = 16 << 20;
 
 /// A person as `write_smpl` prints it; matrices of one row.
 #[derive(Deserialize)]
@@ -73,14 +72,6 @@ fn listed(folder: &Path) -> Result<BTreeMap<usize, PathBuf>, CaptureError> {
     Ok(files)
 }
 
-fn text(path: &Path) -> Result<String, CaptureError> {
-    let length = std::fs::metadata(path).map_err(CaptureError::io(path))?.len();
-    if length > MAX_BYTES {
-        return Err(CaptureError::invalid(path, "size", format!("at most {MAX_BYTES} bytes"), length.to_string()));
-    }
-    std::fs::read_to_string(path).map_err(CaptureError::io(path))
-}
-
 fn frame(path: &Path, index: usize, record: &Record, camera: &Camera) -> Result<FitFrame, CaptureError> {
     let key = |name: &str| format!("person {}, {name}", record.id);
     let numbers = |name: &str, rows: &[Vec<f64>], counts: &[usize]| match rows {
@@ -133,12 +124,13 @@ fn camera(folder: &Path, video: &Video) -> Result<Camera, CaptureError> {
         }
     };
     let k = finite(&intri, &inner, format!("K_{name}"), 9)?;
-    let (width, height) = (f64::from(video.size.0), f64::from(video.size.1));
+    let [width, height] = video.sides();
     for (key, side) in [("W", width), ("H", height)] {
         let key = format!("{key}_{name}");
         if let Some(found) = inner.get(&key).filter(|found| found.as_slice() != [side]) {
             let expected = format!("{side}, as the frames' {width}×{height}");
-            return Err(CaptureError::invalid(&intri, key, expected, format!("{found:?}")));
+            let found: Vec<String> = found.iter().map(f64::to_string).collect();
+            return Err(CaptureError::invalid(&intri, key, expected, found.join(", ")));
         }
     }
     if let Some(lens) = inner.get(&format!("dist_{name}")).filter(|lens| lens.iter().any(|d| *d != 0.0)) {
@@ -154,13 +146,7 @@ fn camera(folder: &Path, video: &Video) -> Result<Camera, CaptureError> {
         true => {
             let key = format!("Rot_{name}");
             let values = finite(&extri, &outer, key.clone(), 9)?;
-            let row = |i: usize| DVec3::from_slice(&values[3 * i..]);
-            let matrix = DMat3::from_cols(row(0), row(1), row(2)).transpose();
-            let off = matrix * matrix.transpose() - DMat3::IDENTITY;
-            if off.to_cols_array().iter().any(|x| x.abs() > 1e-2) || matrix.determinant() < 0.0 {
-                return Err(CaptureError::invalid(&extri, key, "a rotation", format!("{values:?}")));
-            }
-            matrix
+            turn(&values).ok_or_else(|| CaptureError::invalid(&extri, key, "a rotation", format!("{values:?}")))?
         }
         false => rotation(DVec3::from_slice(&finite(&extri, &outer, format!("R_{name}"), 3)?)),
     };

@@ -26,6 +26,12 @@ pub enum Tool {
     Romp,
     /// EasyMocap, a folder with `smpl/`, `intri.yml` and `extri.yml`.
     EasyMocap,
+    /// PeopleSnapshot (Alldieck et al. 2018) in InstantAvatar's preparation, `poses.npz` with
+    /// `cameras.npz`.
+    PeopleSnapshot,
+    /// A scene of NeuMan (Jiang et al. 2022), `smpl_output_*.pkl` with `alignments.npy` and
+    /// `sparse/`.
+    NeuMan,
 }
 
 impl Tool {
@@ -39,6 +45,8 @@ impl Tool {
             Self::PromptHmr => "PromptHMR",
             Self::Romp => "ROMP",
             Self::EasyMocap => "EasyMocap",
+            Self::PeopleSnapshot => "PeopleSnapshot",
+            Self::NeuMan => "NeuMan",
         }
     }
 
@@ -110,6 +118,18 @@ pub(super) enum OwnMask {
 }
 
 impl FitFrame {
+    /// In a camera that stands still: pose and place in its axes, the root turning about the pelvis.
+    pub fn still(
+        index: usize,
+        pose: Vec<DVec3>,
+        betas: Vec<f64>,
+        place: &[f64],
+        [focal, centre]: [[f64; 2]; 2],
+    ) -> Self {
+        let (world_to_camera, about, offset) = (DMat3::IDENTITY, About::Pelvis, DVec3::from_slice(place));
+        Self { index, pose, betas, world_to_camera, about, offset, focal, centre, mask: None }
+    }
+
     /// The pelvis in the camera, for a body whose pelvis at rest is at `joint`.
     pub fn pelvis(&self, joint: DVec3) -> DVec3 {
         match self.about {

@@ -5,10 +5,9 @@
 use std::io::{Read, Seek};
 use std::path::Path;
 
-use glam::{DMat3, DVec3};
 use smpl::torch::TorchFile;
 
-use super::fit::{About, BETAS, Fit, FitFrame, Person, Tool};
+use super::fit::{BETAS, Fit, FitFrame, Person, Tool};
 use super::item::{Item, vectors};
 use super::video::Video;
 use crate::capture::CaptureError;
@@ -37,24 +36,15 @@ pub(super) fn read<R: Read + Seek>(path: &Path, file: &mut TorchFile<R>, video: 
     for (item, found) in found {
         item.as_long(roots.len(), found)?;
     }
-    let (width, height) = (f64::from(video.size.0), f64::from(video.size.1));
+    let [width, height] = video.sides();
     if let Some(k) = matrices.chunks_exact(9).find(|k| (2.0 * k[2] - width).hypot(2.0 * k[5] - height) > SIZE) {
         let expected = format!("a principal point at the centre of {width}×{height}, the frames' size");
         return Err(cameras.invalid(expected, format!("({}, {})", k[2], k[5])));
     }
     let frames = (0..roots.len()).map(|index| {
         let k = &matrices[9 * index..][..9];
-        FitFrame {
-            index,
-            pose: [vectors(&roots[index]), vectors(&bodies[index])].concat(),
-            betas: shapes[index].clone(),
-            world_to_camera: DMat3::IDENTITY,
-            about: About::Pelvis,
-            offset: DVec3::from_slice(&places[index]),
-            focal: [k[0], k[4]],
-            centre: [k[2], k[5]],
-            mask: None,
-        }
+        let pose = [vectors(&roots[index]), vectors(&bodies[index])].concat();
+        FitFrame::still(index, pose, shapes[index].clone(), &places[index], [[k[0], k[4]], [k[2], k[5]]])
     });
     let person = Person { id: "0".to_owned(), frames: frames.collect(), ghosts: 0 };
     Ok(Fit { tool: Tool::Gvhmr, people: vec![person] })

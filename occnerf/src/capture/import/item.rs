@@ -175,14 +175,16 @@ impl<'a> Item<'a> {
 
     /// A rotation from nine numbers, row by row.
     pub fn rotation(&self, values: &[f64]) -> Result<DMat3, CaptureError> {
-        let row = |i: usize| DVec3::from_slice(&values[3 * i..]);
-        let matrix = DMat3::from_cols(row(0), row(1), row(2)).transpose();
-        let product = (matrix * matrix.transpose() - DMat3::IDENTITY).to_cols_array();
-        if product.iter().any(|x| x.abs() > ORTHONORMAL) || matrix.determinant() < 0.0 {
-            return Err(self.invalid("a rotation matrix", format!("{values:?}")));
-        }
-        Ok(matrix)
+        turn(values).ok_or_else(|| self.invalid("a rotation matrix", format!("{values:?}")))
     }
+}
+
+/// The rotation of nine numbers, row by row, if they are one.
+pub(super) fn turn(values: &[f64]) -> Option<DMat3> {
+    let row = |i: usize| DVec3::from_slice(&values[3 * i..]);
+    let matrix = DMat3::from_cols(row(0), row(1), row(2)).transpose();
+    let off = (matrix * matrix.transpose() - DMat3::IDENTITY).to_cols_array();
+    (off.iter().all(|x| x.abs() <= ORTHONORMAL) && matrix.determinant() > 0.0).then_some(matrix)
 }
 
 /// Groups of three numbers.

@@ -35,6 +35,8 @@ enum Source {
 enum Meaning {
     /// Coverage of the person, 255 being all.
     Coverage,
+    /// Coverage of all but the person.
+    Background,
     /// The object that is seen, and those that stand in front of the person.
     Objects(u8, Vec<u8>),
     /// Any value but 0 is the person: one folder an object.
@@ -118,6 +120,7 @@ impl Masks {
         let full = |hit: bool| if hit { 255 } else { 0 };
         Ok(match &self.meaning {
             Meaning::Coverage => (levels.values, None),
+            Meaning::Background => (levels.values.iter().map(|v| 255 - v).collect(), None),
             Meaning::Objects(object, front) => {
                 let person = levels.values.iter().map(|v| full(v == object)).collect();
                 let front =
@@ -145,11 +148,17 @@ struct Seen {
     /// Every file says that its values are names of colours, not shades.
     palette: bool,
     files: usize,
+    /// Pixels at the pictures' borders, and those of them that are more than half covered.
+    border: usize,
+    covered: usize,
 }
+
+/// Share of the borders beyond which what is covered is the background.
+const BORDER: f64 = 0.5;
 
 impl Default for Seen {
     fn default() -> Self {
-        Self { values: [false; 256], palette: true, files: 0 }
+        Self { values: [false; 256], palette: true, files: 0, border: 0, covered: 0 }
     }
 }
 
@@ -158,10 +167,18 @@ impl Seen {
         levels.values.iter().for_each(|&value| self.values[usize::from(value)] = true);
         self.palette &= levels.ids;
         self.files += 1;
+        let (width, height) = (levels.width as usize, levels.height as usize);
+        for (y, row) in levels.values.chunks(width.max(1)).enumerate() {
+            let every = if y == 0 || y + 1 == height { 1 } else { width.max(2) - 1 };
+            for value in row.iter().step_by(every) {
+                self.border += 1;
+                self.covered += usize::from(*value >= 128);
+            }
+        }
     }
 
     /// Ids of objects where the values are palette indices, or none of them is a middle shade;
-    /// coverage where they go up to 255.
+    /// coverage where they go up to 255, of the background if it has most of the border.
     fn meaning(&self, dir: &Path, options: &ImportOptions) -> Result<(Meaning, &'static str), CaptureError> {
         let found: Vec<usize> = (1..256).filter(|&value| self.values[value]).collect();
         let shades = found.iter().any(|&value| value >= 128);
@@ -173,6 +190,9 @@ impl Seen {
             if options.object.is_some() || !options.occluder_objects.is_empty() {
                 let expected = "masks that hold ids of objects (--object, --occluder-objects)";
                 return Err(CaptureError::invalid(dir, "values", expected, "coverage from 0 to 255"));
+            }
+            if self.covered as f64 > BORDER * self.border as f64 {
+                return Ok((Meaning::Background, "coverage of all but the person (it is along the border), 0 to 255"));
             }
             return Ok((Meaning::Coverage, "coverage of the person, 0 to 255"));
         }

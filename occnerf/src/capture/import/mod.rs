@@ -3,14 +3,15 @@
 //! [`import`] reads the frames of a video, a fit and masks, and writes a capture in HumanNeRF's
 //! wild layout for [`super::load_capture`]. Formats are told by what is in the files:
 //!
-//! - fits: WHAM, 4D-Humans / PHALP, GVHMR, PromptHMR, ROMP, EasyMocap ([`Tool`]);
+//! - fits: WHAM, 4D-Humans / PHALP, GVHMR, PromptHMR, ROMP, EasyMocap; and of data sets that have
+//!   them, PeopleSnapshot and NeuMan ([`Tool`]);
 //! - masks: ids of objects (SAM 2's palette PNGs by value, its folders an object, Grounded-SAM-2's
 //!   `.npy`), coverage (MatAnyone, plain 0/255 pictures), or the fit's own (4D-Humans / PHALP,
 //!   PromptHMR).
 //!
 //! All estimators place the body in the camera, for a focal length of their own; the camera stands
-//! still in a world with its axes (with EasyMocap, in the calibrated world), and the body's place
-//! is in the extrinsics.
+//! still in a world with its axes (where a file has cameras, in theirs), and the body's place is in
+//! the extrinsics.
 
 mod body;
 #[cfg(test)]
@@ -21,7 +22,9 @@ mod gvhmr;
 mod item;
 mod levels;
 mod masks;
+mod neuman;
 mod options;
+mod peoplesnapshot;
 mod phalp;
 mod prompthmr;
 mod read;

@@ -5,10 +5,9 @@
 
 use std::collections::BTreeMap;
 
-use glam::{DMat3, DVec3};
 use smpl::pickle::Value;
 
-use super::fit::{About, BETAS, Fit, FitFrame, OwnMask, Person, SMPL, Tool, axis_angle};
+use super::fit::{BETAS, Fit, FitFrame, OwnMask, Person, SMPL, Tool, axis_angle};
 use super::item::Item;
 use super::rle::Rle;
 use super::video::Video;
@@ -44,7 +43,7 @@ pub(super) fn read(frames: &[(String, Item<'_>)], video: &Video) -> Result<Fit, 
 }
 
 fn frame(item: &Item<'_>, track: usize, index: usize, video: &Video) -> Result<FitFrame, CaptureError> {
-    let (width, height) = (f64::from(video.size.0), f64::from(video.size.1));
+    let [width, height] = video.sides();
     let size = item.entry("size", track)?;
     let found = size.few(2)?;
     if found != [height, width] {
@@ -70,15 +69,8 @@ fn frame(item: &Item<'_>, track: usize, index: usize, video: &Video) -> Result<F
         }
         None => None,
     };
-    Ok(FitFrame {
-        index,
-        pose,
-        betas: smpl.get("betas")?.numbers(&[Some(1), Some(BETAS)])?,
-        world_to_camera: DMat3::IDENTITY,
-        about: About::Pelvis,
-        offset: DVec3::from_slice(&item.entry("camera", track)?.few(3)?),
-        focal: [5000.0 / 256.0 * width.max(height); 2],
-        centre: [width / 2.0, height / 2.0],
-        mask,
-    })
+    let betas = smpl.get("betas")?.numbers(&[Some(1), Some(BETAS)])?;
+    let lens = [[5000.0 / 256.0 * width.max(height); 2], video.middle()];
+    let place = item.entry("camera", track)?.few(3)?;
+    Ok(FitFrame { mask, ..FitFrame::still(index, pose, betas, &place, lens) })
 }

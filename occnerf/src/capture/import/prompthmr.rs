@@ -3,10 +3,9 @@
 //! {`img_focal`, `img_center`}. SMPL-X with flat hands. Frames higher than 896 are worked on at a
 //! smaller size, twice `img_center`.
 
-use glam::{DMat3, DVec3};
 use smpl::{Data, NdArray};
 
-use super::fit::{About, BETAS, Fit, FitFrame, OwnMask, Person, Tool};
+use super::fit::{BETAS, Fit, FitFrame, OwnMask, Person, Tool};
 use super::item::{Item, vectors};
 use super::video::Video;
 use crate::capture::CaptureError;
@@ -20,12 +19,13 @@ pub(super) fn read(root: &Item<'_>, video: &Video) -> Result<Fit, CaptureError> 
     let camera = root.get("camera")?;
     let (focal, centre) = (camera.get("img_focal")?.number()?, camera.get("img_center")?);
     let at = centre.few(2)?;
-    let (width, height) = (f64::from(video.size.0), f64::from(video.size.1));
+    let [width, height] = video.sides();
     let scale = [width / (2.0 * at[0]), height / (2.0 * at[1])];
     if !(scale[0] > 0.0 && (scale[0] / scale[1] - 1.0).abs() < ASPECT) {
         let expected = format!("half of {width}×{height}, the frames' size, or of the same at another scale");
         return Err(centre.invalid(expected, format!("{at:?}")));
     }
+    let lens = [scale.map(|scale| focal * scale), video.middle()];
     let mut people = Vec::new();
     for (id, person) in root.get("people")?.entries()? {
         let indices = person.get("frames")?.indices()?;
@@ -38,15 +38,8 @@ pub(super) fn read(root: &Item<'_>, video: &Video) -> Result<Fit, CaptureError> 
         let masks = person.find("masks").map(|item| masks(&item, indices.len())).transpose()?;
         let mut masks = masks.into_iter().flatten();
         let frames = indices.into_iter().enumerate().map(|(i, index)| FitFrame {
-            index,
-            pose: vectors(&poses[i]),
-            betas: shapes[i].clone(),
-            world_to_camera: DMat3::IDENTITY,
-            about: About::Pelvis,
-            offset: DVec3::from_slice(&places[i]),
-            focal: [focal * scale[0], focal * scale[1]],
-            centre: [width / 2.0, height / 2.0],
             mask: masks.next(),
+            ..FitFrame::still(index, vectors(&poses[i]), shapes[i].clone(), &places[i], lens)
         });
         people.push(Person { id, frames: frames.collect(), ghosts: 0 });
     }

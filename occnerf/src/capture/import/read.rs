@@ -11,8 +11,12 @@ use smpl::torch::{TorchFile, is_torch};
 use super::fit::{Fit, Person};
 use super::item::Item;
 use super::video::Video;
-use super::{easymocap, gvhmr, phalp, prompthmr, romp, wham};
+use super::{easymocap, gvhmr, neuman, peoplesnapshot, phalp, prompthmr, romp, wham};
 use crate::capture::CaptureError;
+
+/// What is expected of a file.
+const TOOLS: &str = "a result of WHAM, 4D-Humans / PHALP, GVHMR, PromptHMR or ROMP, EasyMocap's folder, \
+    poses.npz of PeopleSnapshot, or smpl_output_*.pkl of NeuMan";
 
 /// Reads a fit, which is told by what the file holds, not by its name.
 pub(super) fn read(path: &Path, video: &Video) -> Result<Fit, CaptureError> {
@@ -30,14 +34,28 @@ fn read_file(path: &Path, video: &Video) -> Result<Fit, CaptureError> {
     let name = path.display().to_string();
     if is_torch(&start) {
         // A zip archive of numpy's arrays starts alike.
-        if start.starts_with(b"PK")
-            && let Ok(mut npz) = Npz::open(path)
-            && npz.keys().iter().any(|key| key == "results")
-        {
-            return romp::read(path, &npz.value("results")?, video);
+        if start.starts_with(b"PK") {
+            let mut npz = Npz::open(path).map_err(|error| match error {
+                smpl::Error::Npy { message, .. } => {
+                    CaptureError::invalid(path, "the file", "a whole zip archive, of PyTorch or numpy", message)
+                }
+                error => error.into(),
+            })?;
+            if npz.keys().iter().any(|key| key == "results") {
+                return romp::read(path, &npz.value("results")?, video);
+            }
+            if peoplesnapshot::is(npz.keys()) {
+                return peoplesnapshot::read(path, &mut npz, video);
+            }
         }
         let mut file = TorchFile::open(&name, BufReader::new(file))?;
         return gvhmr::read(path, &mut file, video);
+    }
+    // Pickles of protocol 2 and later, of 0 and 1, and what they are compressed by.
+    let begins = |with: &u8| start.first() == Some(with);
+    if !start.is_empty() && !b"\x80(c}]xB\x1f\xfd\x93".iter().any(begins) {
+        let found = format!("a file that begins with {}", start[..start.len().min(4)].escape_ascii());
+        return Err(CaptureError::invalid(path, "the file", TOOLS, found));
     }
     parse(path, &pickle::read(path)?, video)
 }
@@ -54,13 +72,26 @@ pub(super) fn parse(path: &Path, value: &Value, video: &Video) -> Result<Fit, Ca
         phalp::read(&entries, video)
     } else if has(&["pose", "trans", "frame_ids"]) {
         wham::read(&entries, video)
+    } else if has(&["pose", "betas"]) && path.with_file_name("alignments.npy").is_file() {
+        neuman::read(path, &entries, video)
     } else if has(&["smpl_thetas", "cam_trans"]) {
         romp::read(path, value, video)
     } else {
         let held: Vec<&str> = entries.iter().map(|(name, _)| name.as_str()).take(8).collect();
-        let expected = "a result of WHAM, 4D-Humans / PHALP, GVHMR, PromptHMR or ROMP, or EasyMocap's folder";
-        Err(root.invalid(expected, format!("a dictionary of {}", held.join(", "))))
+        Err(root.invalid(TOOLS, format!("a dictionary of {}", held.join(", "))))
     }
+}
+
+/// Longest text that is read: COLMAP's images.txt has some 100 kilobytes a picture.
+const MAX_TEXT: u64 = 256 << 20;
+
+/// A text file.
+pub(super) fn text(path: &Path) -> Result<String, CaptureError> {
+    let length = std::fs::metadata(path).map_err(CaptureError::io(path))?.len();
+    if length > MAX_TEXT {
+        return Err(CaptureError::invalid(path, "size", format!("at most {MAX_TEXT} bytes"), length.to_string()));
+    }
+    std::fs::read_to_string(path).map_err(CaptureError::io(path))
 }
 
 /// Indices within the video, each once; a body and a camera that can be.

@@ -6,10 +6,9 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use glam::{DMat3, DVec3};
 use smpl::pickle::Value;
 
-use super::fit::{About, BETAS, Fit, FitFrame, Person, SMPL, Tool};
+use super::fit::{BETAS, Fit, FitFrame, Person, SMPL, Tool};
 use super::item::{Item, vectors};
 use super::video::Video;
 use crate::capture::CaptureError;
@@ -17,7 +16,8 @@ use crate::capture::names::FrameName;
 
 pub(super) fn read(path: &Path, results: &Value, video: &Video) -> Result<Fit, CaptureError> {
     let root = Item { path, key: "results".to_owned(), value: results };
-    let (width, height) = (f64::from(video.size.0), f64::from(video.size.1));
+    let [width, height] = video.sides();
+    let lens = [[443.4 / 512.0 * width.max(height); 2], video.middle()];
     let mut entries = root.entries()?;
     entries.sort_by(|a, b| FrameName(&a.0).cmp(&FrameName(&b.0)));
     let stem = |name: &str| Path::new(name).file_stem().map_or(String::new(), |s| s.to_string_lossy().into_owned());
@@ -44,17 +44,8 @@ pub(super) fn read(path: &Path, results: &Value, video: &Video) -> Result<Fit, C
         }
         for (i, id) in tracks.into_iter().enumerate() {
             let new = || Person { id: id.to_string(), frames: Vec::new(), ghosts: 0 };
-            people.entry(id).or_insert_with(new).frames.push(FitFrame {
-                index,
-                pose: vectors(&poses[i]),
-                betas: shapes[i].clone(),
-                world_to_camera: DMat3::IDENTITY,
-                about: About::Pelvis,
-                offset: DVec3::from_slice(&places[i]),
-                focal: [443.4 / 512.0 * width.max(height); 2],
-                centre: [width / 2.0, height / 2.0],
-                mask: None,
-            });
+            let frame = FitFrame::still(index, vectors(&poses[i]), shapes[i].clone(), &places[i], lens);
+            people.entry(id).or_insert_with(new).frames.push(frame);
         }
     }
     Ok(Fit { tool: Tool::Romp, people: people.into_values().collect() })

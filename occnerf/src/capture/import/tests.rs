@@ -26,6 +26,38 @@ const FITS: [(&str, &str, Option<&str>); 12] = [
     ("easymocap_person1", "easymocap", Some("1")),
 ];
 
+/// A person's motion in the camera, for fixtures of other forms.
+pub(super) struct Motion {
+    pub video: Video,
+    pub k: Vec<f64>,
+    pub betas: Vec<f64>,
+    /// Axis-angle of each joint, the root's in the camera.
+    pub poses: Vec<Vec<DVec3>>,
+    pub pelvises: Vec<DVec3>,
+    /// The pelvis at rest.
+    pub joint: DVec3,
+}
+
+pub(super) fn known(dir: &Path) -> Motion {
+    let mut expected = Expected::open(dir, "easymocap");
+    let (roots, poses) = (expected.values("root_cam"), expected.values("poses"));
+    let betas = expected.values("betas_mean");
+    let poses = poses.chunks_exact(72).zip(roots.chunks_exact(9)).map(|(pose, root)| {
+        let root = fit::axis_angle(item::turn(root).unwrap());
+        [vec![root], item::vectors(&pose[3..])].concat()
+    });
+    let body = BodyModel::load(&dir.join("../body/open_body.npz")).unwrap();
+    let shape: Vec<f32> = betas.iter().map(|&b| b as f32).collect();
+    Motion {
+        video: Video::list(&dir.join("frames")).unwrap(),
+        k: expected.values("K"),
+        poses: poses.collect(),
+        pelvises: item::vectors(&expected.values("pelvis_cam")),
+        joint: body.shaped(&shape).joints[0].as_dvec3(),
+        betas,
+    }
+}
+
 struct Expected(Npz);
 
 impl Expected {
@@ -264,6 +296,14 @@ fn masks_are_matched_by_name_by_order_or_by_number() {
     put("nothing", &[]);
     std::fs::create_dir_all(dir.path().join("nothing")).unwrap();
     assert!(frames("nothing").unwrap_err().contains("masks"));
+    // Masks of all but the person, told by the border.
+    dir.picture("inverted/000001.png", (4, 4), |x, y| if x == 1 && y == 1 { 0 } else { 255 });
+    let square = Video { size: (4, 4), names: video.names.clone(), paths: video.paths.clone() };
+    let path = dir.path().join("inverted");
+    let inverted = Masks::open(&path, &options, &square).unwrap();
+    let levels = inverted.levels(&path, 0, &square).unwrap().0;
+    assert!(inverted.kind.contains("all but the person"));
+    assert!(levels.iter().enumerate().all(|(i, level)| (*level == 255) == (i == 5)));
     dir.picture("empty/000001.png", (4, 2), |_, _| 0);
     assert!(frames("empty").unwrap_err().contains("all masks"));
 }

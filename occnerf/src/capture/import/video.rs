@@ -37,4 +37,14 @@ impl Video {
             size,
         })
     }
+
+    /// Width and height.
+    pub fn sides(&self) -> [f64; 2] {
+        [self.size.0.into(), self.size.1.into()]
+    }
+
+    /// The middle of the picture, where most estimators put the principal point.
+    pub fn middle(&self) -> [f64; 2] {
+        self.sides().map(|side| side / 2.0)
+    }
 }

@@ -2,15 +2,14 @@
 //! `betas` (T,10), `frame_ids` (T). The focal length is not in it: √(W² + H²), the principal point
 //! the image's centre.
 
-use glam::{DMat3, DVec3};
-
-use super::fit::{About, BETAS, Fit, FitFrame, Person, SMPL, Tool};
+use super::fit::{BETAS, Fit, FitFrame, Person, SMPL, Tool};
 use super::item::{Item, vectors};
 use super::video::Video;
 use crate::capture::CaptureError;
 
 pub(super) fn read(people: &[(String, Item<'_>)], video: &Video) -> Result<Fit, CaptureError> {
-    let (width, height) = (f64::from(video.size.0), f64::from(video.size.1));
+    let [width, height] = video.sides();
+    let lens = [[width.hypot(height); 2], video.middle()];
     let person = |(id, item): &(String, Item<'_>)| {
         let indices = item.get("frame_ids")?.indices()?;
         let (pose, trans, betas) = (item.get("pose")?, item.get("trans")?, item.get("betas")?);
@@ -19,17 +18,7 @@ pub(super) fn read(people: &[(String, Item<'_>)], video: &Video) -> Result<Fit, 
             item.as_long(indices.len(), found)?;
         }
         let frames = (indices.into_iter().zip(poses)).zip(places.into_iter().zip(shapes));
-        let frames = frames.map(|((index, pose), (place, betas))| FitFrame {
-            index,
-            pose: vectors(&pose),
-            betas,
-            world_to_camera: DMat3::IDENTITY,
-            about: About::Pelvis,
-            offset: DVec3::from_slice(&place),
-            focal: [width.hypot(height); 2],
-            centre: [width / 2.0, height / 2.0],
-            mask: None,
-        });
+        let frames = frames.map(|((i, pose), (place, betas))| FitFrame::still(i, vectors(&pose), betas, &place, lens));
         Ok(Person { id: id.clone(), frames: frames.collect(), ghosts: 0 })
     };
     // A track that WHAM began and dropped has nothing in it.
