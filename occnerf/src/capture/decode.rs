@@ -88,12 +88,7 @@ impl View {
 
     /// The frames, checked together. Pictures that `budget` has room for are decoded; of the others
     /// headers are read.
-    pub fn frames(
-        self,
-        body: &BodyModel,
-        options: &LoadOptions,
-        budget: &Budget,
-    ) -> Result<Vec<Frame>, CaptureError> {
+    pub fn frames(self, body: &BodyModel, options: &LoadOptions, budget: &Budget) -> Result<Vec<Frame>, CaptureError> {
         let first = Arc::from(self.frames[0].name.as_str());
         let (size, to) = (self.size, options.resized(self.size));
         let frame = |plan: Planned| {

@@ -46,8 +46,8 @@ pub use self::obstacle::Obstacle;
 pub use self::options::LoadOptions;
 pub use self::perturbation::Perturbation;
 pub use self::pixels::Pixels;
-pub(crate) use self::source::Shown;
 pub use self::source::PixelSource;
+pub(crate) use self::source::Shown;
 pub use self::synth::{Occlusion, SynthConfig, Synthetic, synthesise};
 
 use std::path::Path;

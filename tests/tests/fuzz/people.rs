@@ -34,7 +34,8 @@ fn list(items: &[Vec<u8>]) -> Vec<u8> {
 fn array(shape: &[u8], values: &[f64]) -> Vec<u8> {
     let bytes: Vec<u8> = values.iter().flat_map(|v| v.to_le_bytes()).collect();
     let extents: Vec<u8> = shape.iter().flat_map(|&n| [b'K', n]).collect();
-    let kind = b"tcnumpy\ndtype\n(X\x02\0\0\0f8\x89\x88tR(K\x03X\x01\0\0\0<NNNJ\xff\xff\xff\xffJ\xff\xff\xff\xffK\0tb\x89B";
+    let kind =
+        b"tcnumpy\ndtype\n(X\x02\0\0\0f8\x89\x88tR(K\x03X\x01\0\0\0<NNNJ\xff\xff\xff\xffJ\xff\xff\xff\xffK\0tb\x89B";
     [
         &b"cnumpy.core.multiarray\n_reconstruct\n(cnumpy\nndarray\n(K\0tB\x01\0\0\0btR(K\x01("[..],
         &extents,
@@ -94,12 +95,13 @@ pub fn easymocap() -> [Vec<u8>; 2] {
     let matrix = |name: &str, rows: usize, data: &str| {
         format!("{name}: !!opencv-matrix\n  rows: {rows}\n  cols: {rows}\n  dt: d\n  data: [ {data} ]\n")
     };
-    let cameras = ["%YAML:1.0\n---\nnames:\n  - \"1\"\n".to_owned(), matrix("K_1", 3, "9., 0., 4., 0., 9.,\n   4., 0, 0, 1")]
-        .concat()
-        + "H_1: 8\nW_1: 8\n"
-        + &matrix("dist_1", 1, "0, 0, 0, 0, 0")
-        + &matrix("R_1", 3, "0.1, 0.2, 0.3")
-        + &matrix("T_1", 3, "0, 0, 5e0");
+    let cameras =
+        ["%YAML:1.0\n---\nnames:\n  - \"1\"\n".to_owned(), matrix("K_1", 3, "9., 0., 4., 0., 9.,\n   4., 0, 0, 1")]
+            .concat()
+            + "H_1: 8\nW_1: 8\n"
+            + &matrix("dist_1", 1, "0, 0, 0, 0, 0")
+            + &matrix("R_1", 3, "0.1, 0.2, 0.3")
+            + &matrix("T_1", 3, "0, 0, 5e0");
     [person.to_string().into_bytes(), cameras.into_bytes()]
 }
 
@@ -107,7 +109,8 @@ pub fn easymocap() -> [Vec<u8>; 2] {
 pub fn tensors() -> Vec<Vec<u8>> {
     let pickled = |legacy: bool| {
         let tensor = |key: &str| {
-            let of = [&b"ctorch._utils\n_rebuild_tensor_v2\n(("[..], &text("storage"), b"ctorch\nFloatStorage\n"].concat();
+            let of =
+                [&b"ctorch._utils\n_rebuild_tensor_v2\n(("[..], &text("storage"), b"ctorch\nFloatStorage\n"].concat();
             let device = [text(key), text("cpu"), b"K\x06".to_vec()].concat();
             let none: &[u8] = if legacy { b"N" } else { b"" };
             [&of[..], &device, none, b"tQK\0K\x02K\x03\x86K\x03K\x01\x86\x89ccollections\nOrderedDict\n)RtR"].concat()

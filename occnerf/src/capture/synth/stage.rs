@@ -8,8 +8,8 @@ use rayon::prelude::*;
 use volrender::Camera;
 
 use super::render::{Posture, look_at};
-use crate::capture::demo::motion::Pose;
 use crate::capture::decode::PIXEL_BYTES;
+use crate::capture::demo::motion::Pose;
 use crate::capture::spill::Spill;
 use crate::capture::{Capture, CaptureError, EvalFrame, Frame, LoadOptions, PixelSource, Pixels};
 

@@ -163,8 +163,8 @@ fn memory_beyond_the_bound_names_options_that_fit() {
 fn what_is_not_in_memory_is_read_when_asked_for() {
     let (dir, _) = fixture("wild-demand");
     let least = 6 * 8 * 36 + 4 * 10 + 24 * 48;
-    // Four rows of 16 bytes, and the 8 pixels of a stripe of 4 each.
-    let packed = 4 * 16 + 8 * 4;
+    // Four rows of 16 bytes, and the 12 pixels of a stripe of 4 each.
+    let packed = 4 * 16 + 12 * 4;
     let reread = |room: u64| {
         (0..4).for_each(|i| dir.stripe(&format!("images/{i:02}.png"), SIZE, 200));
         let options = LoadOptions { max_bytes: least + room, ..LoadOptions::default() };

@@ -127,7 +127,10 @@ fn without_occlusion_nothing_is_hidden() {
     for layout in LAYOUTS {
         let (_dir, _, read) = round(&made, layout, &format!("write-none-{layout:?}"));
         for (clear, b) in made.clear.iter().zip(&read.train) {
-            assert!(clear.pixels().unwrap().mask.iter().zip(&b.shown().mask).all(|(c, m)| (*c > 0.5) == (*m > 0.5)), "{layout:?}");
+            assert!(
+                clear.pixels().unwrap().mask.iter().zip(&b.shown().mask).all(|(c, m)| (*c > 0.5) == (*m > 0.5)),
+                "{layout:?}"
+            );
         }
     }
 }
