@@ -278,7 +278,7 @@ fn fits_of_estimators() {
     std::fs::create_dir_all(dir.join("smpl")).unwrap();
     let [frame, cameras] = people::easymocap();
     let write = |name: &str, bytes: &[u8]| std::fs::write(dir.join(name), bytes).unwrap();
-    ["intri.yml", "extri.yml"].map(|name| write(name, &cameras));
+    ["intri.yml", "extri.yml"].iter().for_each(|name| write(name, &cameras));
     let attack = |name, seed| Attack { name, form: Form::Plain, seeds: vec![seed], share: 10, most: 64 * MIB };
     attack("EasyMocap JSON", frame.clone()).run(|bytes| {
         write("smpl/000000.json", bytes);
@@ -286,7 +286,7 @@ fn fits_of_estimators() {
     });
     write("smpl/000000.json", &frame);
     attack("EasyMocap YAML", cameras).run(|bytes| {
-        ["intri.yml", "extri.yml"].map(|name| write(name, bytes));
+        ["intri.yml", "extri.yml"].iter().for_each(|name| write(name, bytes));
         imports(&dir, &video)
     });
 }

@@ -78,7 +78,7 @@ pub fn phalp() -> Vec<Vec<u8>> {
         ])
     };
     // 20 + 30 + 14 pixels: six bits a character, five of them the number's.
-    let compressed = [&b"B\x06\0\0\0"[..], b"d0n0>0"].concat();
+    let compressed = [&b"B\x05\0\0\0"[..], b"d0n0>"].concat();
     let plain = list(&[number(20), number(30), number(14)]);
     [compressed, plain]
         .map(|counts| {
