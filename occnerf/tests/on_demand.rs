@@ -11,11 +11,11 @@ use smpl::BodyModel;
 const SIZE: u32 = 32;
 const STEPS: u64 = 8;
 
-/// A capture on disk, read with room for the pictures of so many frames.
-fn read(dir: &TempDir, body: &BodyModel, pictures: u64) -> Capture {
+/// A capture on disk, read with room for so many bytes of pictures and to decode one.
+fn read(dir: &TempDir, body: &BodyModel, room: u64) -> Capture {
     let bodies = 8 * body.num_vertices() as u64 * 36;
     let picture = u64::from(SIZE * SIZE) * 16;
-    let max_bytes = bodies + 4 * picture.div_ceil(42) + (pictures + 3) * picture;
+    let max_bytes = bodies + 4 * picture.div_ceil(42) + 3 * picture + room;
     load_capture(&dir.path("capture"), body, &LoadOptions { max_bytes, ..LoadOptions::default() }).unwrap()
 }
 
@@ -35,14 +35,25 @@ fn training_from_files_is_training_from_memory() {
     made.write(&dir.path("capture"), Layout::HumanNerf, &|_| {}).unwrap();
     let config = occnerf::Config { steps: STEPS, ..config(Method::Occnerf) };
 
-    let capture = read(&dir, &made.body, 8);
+    // Eight pictures, and a quarter again for decoding.
+    let capture = read(&dir, &made.body, 11 * u64::from(SIZE * SIZE) * 16);
     assert_eq!((capture.train.len(), capture.eval.len()), (4, 4));
     let scene = Scene::new(&capture, &made.body, &config).unwrap();
     let mut trainer = Trainer::new(&scene, config.clone()).unwrap();
     (0..STEPS).for_each(|_| assert!(trainer.step().unwrap().loss.is_finite()));
     let in_memory = trained(&dir, &trainer, &scene);
 
-    let capture = read(&dir, &made.body, 1);
+    // Packed they have room in an eighth of it, and are not read again.
+    let capture = read(&dir, &made.body, u64::from(SIZE * SIZE) * 16);
+    let packed = Scene::new(&capture, &made.body, &config).unwrap();
+    let mut trainer = Trainer::new(&packed, config.clone()).unwrap();
+    let (all, hidden) = (dir.path("capture/images"), dir.path("hidden"));
+    std::fs::rename(&all, &hidden).unwrap();
+    (0..STEPS).for_each(|_| assert!(trainer.step().unwrap().loss.is_finite()));
+    assert!(trained(&dir, &trainer, &packed) == in_memory);
+    std::fs::rename(&hidden, &all).unwrap();
+
+    let capture = read(&dir, &made.body, 0);
     let few = Scene::new(&capture, &made.body, &config).unwrap();
     assert_eq!(VertexColors::measure(&few).unwrap(), VertexColors::measure(&scene).unwrap());
     let mut trainer = Trainer::new(&few, config).unwrap();

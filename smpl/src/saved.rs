@@ -61,10 +61,13 @@ impl BodyModel {
         // On the disk before the old file is gone, so that a power cut leaves one of the two.
         let written = std::fs::File::create(&partial).and_then(|mut file| {
             file.write_all(&bytes)?;
-            file.sync_all()
+            file.sync_all()?;
+            std::fs::rename(&partial, path)
         });
-        written.map_err(|source| Error::Io { path: partial.clone(), source })?;
-        std::fs::rename(&partial, path).map_err(|source| Error::Io { path: path.to_owned(), source })
+        written.map_err(|source| {
+            let _ = std::fs::remove_file(&partial);
+            Error::Io { path: path.to_owned(), source }
+        })
     }
 }
 

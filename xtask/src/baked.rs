@@ -3,11 +3,11 @@
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
-use anyhow::{Context, Result};
+use anyhow::{Error, Result};
 use occnerf::bake::{Avatar, BakeOptions, bake};
 use occnerf::{Model, Scene};
 
-use crate::process::{note, say};
+use crate::process::{note, results_in, say};
 use crate::run::{CHECKPOINT, RunConfig};
 
 /// The avatar's file in a run directory.
@@ -35,7 +35,7 @@ pub fn avatar(run: &Path, model: &Model) -> Result<Avatar> {
     let path = path(run);
     let scene = scene(run).map_err(|error| note!("baking without the capture: {error:#}")).ok();
     let (avatar, report) = bake(model, scene.as_ref(), &BakeOptions::default())?;
-    avatar.save(&path).with_context(|| path.display().to_string())?;
+    avatar.save(&path).map_err(Error::from).map_err(results_in(run))?;
     let (side, faces, seconds) = (report.side, report.faces, report.seconds);
     say!("baked {faces} triangles and an atlas of {side} × {side} in {seconds:.1} s: {}", path.display());
     Ok(avatar)

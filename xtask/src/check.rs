@@ -2,14 +2,14 @@
 
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context, Result};
+use anyhow::Result;
 use clap::Args;
 use image::{Rgb, RgbImage, imageops};
 use occnerf::capture::Frame;
 use occnerf::{Check, body_silhouette, photograph, unknown_pixels};
 use smpl::BodyModel;
 
-use crate::pictures::{captioned, sheet, to_rgb};
+use crate::pictures::{captioned, save, sheet, to_rgb};
 use crate::process::say;
 use crate::source::{self, LoadArguments, Source};
 use crate::table;
@@ -59,7 +59,7 @@ pub fn check(arguments: &CheckArguments) -> Result<()> {
         scene if scene.is_dir() => scene.join("check.png"),
         _ => PathBuf::from(format!("{}-check.png", crate::train::scene_name(Some(&source.scene)))),
     });
-    picture(&source, &found)?.save(&path).with_context(|| path.display().to_string())?;
+    save(&picture(&source, &found)?, &path)?;
     tell(&found, arguments.all);
     say!("picture: {} (outline of the body; green: mask; orange: unknown)", path.display());
     Ok(())

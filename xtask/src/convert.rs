@@ -2,10 +2,11 @@
 
 use std::path::PathBuf;
 
-use crate::process::say;
-use anyhow::{Context, Result, ensure};
+use anyhow::{Context, Error, Result, ensure};
 use clap::Args;
 use smpl::BodyModel;
+
+use crate::process::{results_in, say};
 
 /// What to convert, and where to.
 #[derive(Args)]
@@ -34,7 +35,7 @@ pub fn convert(arguments: &ConvertArguments) -> Result<()> {
         ensure!(!same, "{}: input and output are the same file", output.display());
         ensure!(arguments.force, "{}: already there (--force replaces it)", output.display());
     }
-    model.save(output)?;
+    model.save(output).map_err(Error::from).map_err(results_in(output))?;
     let back = BodyModel::load(output)?;
     ensure!(back == model, "{}: reads back differently", output.display());
     let size = std::fs::metadata(output).with_context(|| output.display().to_string())?.len();

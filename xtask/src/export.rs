@@ -3,13 +3,13 @@
 use std::io::Write;
 use std::path::PathBuf;
 
-use anyhow::{Context, Result, bail};
+use anyhow::{Context, Error, Result, bail};
 use clap::{Args, ValueEnum};
 use occnerf::bake::{Avatar, export};
 use occnerf::replace_file;
 
 use crate::avatar;
-use crate::process::{say, unwritten};
+use crate::process::{results_in, say, unwritten};
 
 /// Largest edge of the triangles that a splat stands for, in metres.
 const PATCH: f32 = 0.009;
@@ -68,16 +68,18 @@ pub fn export(arguments: &ExportArguments) -> Result<()> {
         Format::Ply => {
             let Posed { vertices, .. } = posed(&person, clip, arguments)?;
             let splats = export::splats(&person, &vertices, PATCH)?;
-            splats.write(out)?;
+            splats.write(out).map_err(Error::from).map_err(results_in(out))?;
             say!("{}: {} splats", out.display(), splats.centres.len());
         }
         Format::Obj => {
             let Posed { vertices, normals } = posed(&person, clip, arguments)?;
-            export::write_obj(&person, &vertices, &normals, out)?;
+            export::write_obj(&person, &vertices, &normals, out)
+                .map_err(Error::from)
+                .map_err(results_in(out.parent().unwrap_or(out)))?;
             say!("{}: {} triangles", out.display(), person.faces.len());
         }
         Format::Npz => {
-            export::write_amass(&person, clip, out)?;
+            export::write_amass(&person, clip, out).map_err(Error::from).map_err(results_in(out))?;
             say!("{}: {} frames", out.display(), person.clips[clip].motion.num_frames());
         }
     }

@@ -2,13 +2,13 @@
 
 use std::path::PathBuf;
 
-use anyhow::{Context, Result, bail};
+use anyhow::{Error, Result, bail};
 use clap::Args;
 use occnerf::capture::{self, ImportOptions, Imported};
 
 use crate::check::{self, CheckArguments};
-use crate::process::say;
-use crate::synth::{beside, vacant};
+use crate::process::{results_in, say};
+use crate::synth::{beside, take_place, vacant};
 
 /// What a finished directory holds, and nothing else does.
 const MARK: &str = "import.json";
@@ -102,16 +102,12 @@ pub fn import(arguments: &ImportArguments) -> Result<()> {
         }
     }
     let partial = beside(out, "partial")?;
-    let written = capture::import(&options, &partial).map_err(anyhow::Error::from).and_then(|imported| {
+    let written = capture::import(&options, &partial).map_err(Error::from).map_err(results_in(&partial));
+    let written = written.and_then(|imported| {
         let mark =
             serde_json::json!({ "tool": imported.tool.name(), "person": imported.person, "frames": imported.frames });
         crate::run::write(&partial.join(MARK), &serde_json::to_string_pretty(&mark)?)?;
-        if out.exists() {
-            vacant(out, arguments.force, MARK)?;
-            std::fs::remove_dir_all(out).with_context(|| out.display().to_string())?;
-        }
-        std::fs::rename(&partial, out).with_context(|| out.display().to_string())?;
-        Ok(imported)
+        take_place(&partial, out, arguments.force, MARK).map(|()| imported)
     });
     let imported = match written {
         Ok(imported) => imported,

@@ -45,7 +45,7 @@ use crate::process::note;
 /// Turns a video of a moving person, partly hidden behind objects, into a 3-D person that renders
 /// from any side.
 #[derive(Parser)]
-#[command(name = "cargo xtask", bin_name = "cargo xtask", version)]
+#[command(name = "cargo xtask", bin_name = "cargo xtask", version, after_help = EXIT_CODES)]
 struct Arguments {
     #[command(subcommand)]
     command: Command,
@@ -85,9 +85,14 @@ enum Command {
     Convert(convert::ConvertArguments),
 }
 
-/// Exit codes: 0 done; 1 something given is wrong; 2 the command line cannot be read; 3 a result
-/// cannot be written; 4 another process has the folder; 128 + n ended by signal n, with everything
-/// saved.
+const EXIT_CODES: &str = "Exit codes:
+  0        done
+  1        something given is wrong
+  2        the command line cannot be read
+  3        a result cannot be written; what stood there before is whole
+  4        another process has the folder
+  128 + n  ended by signal n, with everything saved";
+
 fn main() -> std::process::ExitCode {
     let command = match Arguments::try_parse() {
         Ok(arguments) => arguments.command,

@@ -284,6 +284,18 @@ mod tests {
             std::fs::write(&path, hostile).unwrap();
             assert!(earlier_log(&path, 30).unwrap().text.lines().count() <= 1);
         }
+        // Any byte may be any other: what is left are whole lines.
+        for n in 0..2000usize {
+            let mut bytes = text.clone().into_bytes();
+            for i in 0..=n % 3 {
+                let at = (n * 7919 + i * 104_729) % bytes.len();
+                bytes[at] = (n * 31 + i * 17) as u8;
+            }
+            std::fs::write(&path, bytes).unwrap();
+            let log = earlier_log(&path, 30).unwrap();
+            let whole = log.text.lines().filter(|line| serde_json::from_str::<serde_json::Value>(line).is_ok());
+            assert_eq!(whole.count(), log.text.lines().count());
+        }
         std::fs::remove_dir_all(&folder).unwrap();
     }
 }

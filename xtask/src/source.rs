@@ -81,8 +81,9 @@ pub struct LoadArguments {
     #[command(flatten)]
     #[serde(flatten)]
     obstacle: ObstacleArguments,
-    /// Most memory that a capture's bodies and decoded pictures may take, in MiB; pictures beyond
-    /// it are decoded whenever they are needed [default: 1024]
+    /// Most memory that a capture's bodies and decoded pictures may take, in MiB; where pictures do
+    /// not fit they stay packed, and those beyond it are decoded whenever they are needed
+    /// [default: 1024]
     #[arg(long, value_name = "MIB", value_parser = clap::value_parser!(u64).range(1..=1 << 24))]
     memory: Option<u64>,
     /// Make the prior and the masks as wrong as something makes them; the options below change

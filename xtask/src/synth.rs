@@ -2,13 +2,13 @@
 
 use std::path::{Path, PathBuf};
 
-use anyhow::{Result, bail, ensure};
+use anyhow::{Error, Result, bail, ensure};
 use clap::{Args, ValueEnum};
 use occnerf::capture::{Layout, Obstacle, Occlusion, SynthConfig, Synthetic};
 
 use crate::film::{bar, film, is_character};
 use crate::obstacle::ObstacleArguments;
-use crate::process::{say, unwritten};
+use crate::process::{results_in, say, unwritten};
 
 /// What a finished directory holds, and nothing else does.
 const MARK: &str = "synth.json";
@@ -133,17 +133,7 @@ pub fn synth(arguments: &SynthArguments) -> Result<()> {
     };
     let synthetic = film(arguments.character.as_deref(), arguments.motion.as_deref(), &config)?;
     let partial = beside(out, "partial")?;
-    let written = write(&synthetic, &partial, layout).and_then(|()| {
-        let old = beside(out, "old")?;
-        if out.exists() {
-            vacant(out, arguments.force, MARK)?;
-            // Aside, whole: what is killed while it removes a capture leaves something that nobody
-            // dares to replace.
-            std::fs::rename(out, &old).map_err(unwritten(out))?;
-        }
-        std::fs::rename(&partial, out).map_err(unwritten(out))?;
-        if old.exists() { std::fs::remove_dir_all(&old).map_err(unwritten(&old)) } else { Ok(()) }
-    });
+    let written = write(&synthetic, &partial, layout).and_then(|()| take_place(&partial, out, arguments.force, MARK));
     if let Err(error) = written {
         let _ = std::fs::remove_dir_all(&partial);
         return Err(error);
@@ -165,7 +155,8 @@ pub fn synth(arguments: &SynthArguments) -> Result<()> {
 fn write(synthetic: &Synthetic, directory: &Path, layout: Layout) -> Result<()> {
     crate::run::make_directory(directory)?;
     let bar = bar("writing", synthetic.num_pictures(layout));
-    synthetic.write(directory, layout, &|_| bar.inc(1))?;
+    let written = synthetic.write(directory, layout, &|_| bar.inc(1));
+    written.map_err(Error::from).map_err(results_in(directory))?;
     bar.finish_and_clear();
     let mark = serde_json::json!({ "config": synthetic.config, "hidden_fraction": synthetic.hidden_fraction });
     crate::run::write(&directory.join(MARK), &serde_json::to_string_pretty(&mark)?)
@@ -185,6 +176,20 @@ pub fn vacant(out: &Path, force: bool, mark: &str) -> Result<()> {
     ensure!(out.join(mark).is_file(), "{}: not empty, and not written by {command} (no {mark})", out.display());
     ensure!(force, "{}: already holds a capture (--force replaces it)", out.display());
     Ok(())
+}
+
+/// Puts the complete directory `partial` where `out` is, an earlier result of the command that leaves
+/// `mark`, if anything.
+pub fn take_place(partial: &Path, out: &Path, force: bool, mark: &str) -> Result<()> {
+    let old = beside(out, "old")?;
+    if out.exists() {
+        vacant(out, force, mark)?;
+        // Aside, whole: what is killed while it removes a capture leaves something that nobody
+        // dares to replace.
+        std::fs::rename(out, &old).map_err(unwritten(out))?;
+    }
+    std::fs::rename(partial, out).map_err(unwritten(out))?;
+    if old.exists() { std::fs::remove_dir_all(&old).map_err(unwritten(&old)) } else { Ok(()) }
 }
 
 /// A free name in the same folder.

@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-use anyhow::{Context, Result, bail, ensure};
+use anyhow::{Context, Error, Result, bail, ensure};
 use clap::Args;
 use occnerf::capture::Capture;
 use occnerf::{Config, Lpips, Method, Person, Scene, Trainer, VertexColors, checkpoint_config};
@@ -12,7 +12,7 @@ use crate::capacity::{self, CapacityName};
 use crate::eval::{Drawn, Split, check_pictures, score_run, scored_frames, unscored};
 use crate::network::{load_lpips, network_name};
 use crate::optimise::{SavingArguments, Sitting, optimise};
-use crate::process::{Lock, say};
+use crate::process::{Lock, results_in, say};
 use crate::run::{
     CHECKPOINT, METRICS, Metrics, RunConfig, existing_directory, make_directory, new_directory, peak_rss_bytes,
     use_threads,
@@ -188,7 +188,8 @@ pub fn run_one(
     let start = Instant::now();
     let colors = VertexColors::measure(&scene)?;
     let prior_seconds = start.elapsed().as_secs_f64();
-    Person::save(directory, &scene.capture, &source.model, &colors)?;
+    let kept = Person::save(directory, &scene.capture, &source.model, &colors);
+    kept.map_err(Error::from).map_err(results_in(directory))?;
     if run.train.method == Method::Prior {
         let prior = Drawn::Prior(colors);
         let metrics = unscored(run, &prior, prior_seconds);

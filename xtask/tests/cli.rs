@@ -12,6 +12,7 @@ fn help_names_the_commands_and_every_option_of_train() {
     for command in ["train", "eval", "render", "bench", "report", "convert"] {
         assert!(general.contains(command), "{general}");
     }
+    assert!(general.contains("Exit codes:") && general.contains("a result cannot be written"), "{general}");
     let train = help(&["train", "--help"]);
     let options = [
         "--out",

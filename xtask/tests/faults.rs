@@ -5,10 +5,11 @@
 
 mod common;
 
+use std::collections::BTreeMap;
 use std::fs::File;
 use std::os::unix::fs::symlink;
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Stdio};
+use std::process::{Child, Command, Output, Stdio};
 use std::sync::OnceLock;
 use std::time::{Duration, Instant};
 
@@ -176,6 +177,81 @@ fn a_result_that_cannot_be_written_has_an_exit_code_and_leaves_the_old_one() {
         assert!(name == "report.html" || std::fs::read(run.join(name)).unwrap() == old);
     }
     refusal(&training(Path::new("/dev/null/run"), "5"), "/dev/null/run");
+}
+
+/// Runs the program where no file may have more than so many KiB, which ends a write as a full disk
+/// does.
+fn cramped(kib: u32, arguments: &[&str]) -> Output {
+    // Blocks of 512 bytes.
+    let script = format!("trap '' XFSZ; ulimit -f {}; exec \"$@\"", 2 * kib);
+    let mut command = Command::new("sh");
+    command.args(["-c", &script, "sh", env!("CARGO_BIN_EXE_xtask")]).args(arguments);
+    command.env_remove("SMPL_MODEL").output().unwrap()
+}
+
+/// Every file below a folder, with its content.
+fn files(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
+    let mut found = BTreeMap::new();
+    for entry in std::fs::read_dir(folder).into_iter().flatten() {
+        let path = entry.unwrap().path();
+        if path.is_dir() {
+            found.append(&mut files(&path));
+        } else {
+            found.insert(path.clone(), std::fs::read(path).unwrap());
+        }
+    }
+    found
+}
+
+#[test]
+fn where_the_disk_is_full_every_command_says_so_in_one_line_and_leaves_what_was_there() {
+    let folder = folder("full-disk");
+    let (run, made) = (folder.join("run"), folder.join("made"));
+    done(&training(&run, "10"));
+    let synth = ["synth", "--force", "--out", text(&made), "--size", "32", "--frames", "2", "--eval-cameras", "1"];
+    done(&synth);
+    let glb = folder.join("person.glb");
+    let export = ["export", text(&run), "--format", "glb", "--out", text(&glb)];
+    let table = folder.join("table");
+    let reproduce = ["reproduce", text(capture()), "--out", text(&table), "--steps", "5", "--seeds", "1"];
+    let bench = ["bench", "kernels", "--quick", "--out", text(&table)];
+    let fresh = folder.join("fresh");
+    let fresh = training(&fresh, "10");
+    let resumed = ["train", "--resume", "--steps", "12", "--out", text(&run)];
+    let view = ["view", text(&run)];
+    let cases: [(u32, &[&str]); 8] = [
+        (1, &fresh),
+        (64, &resumed),
+        (1, &["eval", text(&run)]),
+        (16, &synth),
+        // The baked person itself.
+        (16, &export),
+        (16, &view),
+        (1, &reproduce),
+        (0, &bench),
+    ];
+    for (kib, arguments) in cases {
+        let before = [files(&run), files(&made)];
+        let output = cramped(kib, arguments);
+        let said = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(output.status.code(), Some(3), "{arguments:?}: {said}");
+        let errors: Vec<&str> = said.lines().filter(|line| line.starts_with("error: ")).collect();
+        assert!(errors.len() == 1 && errors[0].contains("cannot be written"), "{arguments:?}: {said}");
+        assert!(!said.contains("panicked") && errors[0].matches("os error").count() == 1, "{arguments:?}: {said}");
+        let after = [files(&run), files(&made)];
+        let lost = |name: &str| {
+            before.iter().zip(&after).any(|(before, after)| {
+                before.iter().any(|(path, old)| path.ends_with(name) && after.get(path) != Some(old))
+            })
+        };
+        // What can be made again may be gone or new, never half.
+        let kept = ["checkpoint.safetensors", "body.safetensors", "metrics.json", "cameras.pkl", "synth.json"];
+        assert!(!kept.iter().any(|name| lost(name)), "{arguments:?}");
+        let partial = after.iter().flat_map(|files| files.keys()).find(|path| text(path).contains("partial"));
+        assert_eq!(partial, None, "{arguments:?}");
+    }
+    done(&resumed);
+    done(&export);
 }
 
 #[test]

@@ -96,7 +96,7 @@ fn what_cannot_be_made_is_refused_and_leaves_nothing_behind() {
     with(&["--fraction", "1.5"], &["fraction", "0.95"]);
     with(&["--position", "-3"], &["position", "-1 to 1"]);
     with(&["--size", "3"], &["size", "16 to 2048"]);
-    with(&["--frames", "10000", "--size", "2048"], &["frames", "MiB"]);
+    with(&["--frames", "10000", "--size", "2048"], &["frames", "GiB"]);
     with(&["--pose-noise", "nan"], &["pose_noise"]);
     with(&["--occlusion", "none", "--share", "0.5"], &["--share"]);
     with(&["--occlusion", "objects", "--share", "0.5"], &["--share", "every frame"]);

@@ -11,11 +11,11 @@ use super::camera::Lens;
 use super::files::{Files, decoding_bytes};
 use super::gate::Gate;
 use super::image::dimensions;
-use super::source::PixelSource;
+use super::source::{Allowance, Keep, PixelSource};
 use super::{CaptureError, Frame, LoadOptions, checks};
 
 /// Bytes that a pixel of a frame takes: three colours and coverage.
-const PIXEL_BYTES: u64 = 16;
+pub(super) const PIXEL_BYTES: u64 = 16;
 /// Bytes that a vertex of a frame's body takes once it is prepared: at rest, its pose offset, and
 /// posed.
 const VERTEX_BYTES: u64 = 36;
@@ -39,26 +39,22 @@ pub(super) struct Planned {
     pub betas: Vec<f32>,
 }
 
-/// Bytes of memory for pictures that are kept, shared out first come, first served, and the way to
-/// those for decoding.
+/// What is kept of pictures, and the way to memory for decoding.
 pub(super) struct Budget {
-    left: u64,
+    keep: Keep,
     gate: Arc<Gate>,
 }
 
 impl Budget {
     /// `left` bytes of which those for decoding are put aside: `picture` for every thread, but at
-    /// most a quarter unless one picture takes more.
-    fn new(left: u64, picture: u64) -> Self {
+    /// most a quarter unless one picture takes more. Pictures are kept as they are if all, of
+    /// `whole` bytes, have room.
+    fn new(left: u64, picture: u64, whole: u64) -> Self {
         let threads = rayon::current_num_threads() as u64;
         let aside = (picture.saturating_mul(threads)).min(left / 4).max(picture);
-        Self { left: left.saturating_sub(aside), gate: Arc::new(Gate::new(aside)) }
-    }
-
-    fn take(&mut self, bytes: u64) -> bool {
-        let left = self.left.checked_sub(bytes);
-        self.left = left.unwrap_or(self.left);
-        left.is_some()
+        let left = left.saturating_sub(aside);
+        let keep = if whole <= left { Keep::Whole } else { Keep::Packed(Arc::new(Allowance::new(left))) };
+        Self { keep, gate: Arc::new(Gate::new(aside)) }
     }
 }
 
@@ -90,15 +86,9 @@ impl View {
         decoding_bytes(self.size)
     }
 
-    /// The frames, checked together. Pictures that `budget` has room for are decoded; headers are
-    /// read of all.
-    pub fn frames(
-        self,
-        body: &BodyModel,
-        options: &LoadOptions,
-        budget: &mut Budget,
-    ) -> Result<Vec<Frame>, CaptureError> {
-        let bytes = self.picture_bytes(options);
+    /// The frames, checked together. Pictures that `budget` has room for are decoded; of the others
+    /// headers are read.
+    pub fn frames(self, body: &BodyModel, options: &LoadOptions, budget: &Budget) -> Result<Vec<Frame>, CaptureError> {
         let first = Arc::from(self.frames[0].name.as_str());
         let (size, to) = (self.size, options.resized(self.size));
         let frame = |plan: Planned| {
@@ -107,7 +97,7 @@ impl View {
             let first = Arc::clone(&first);
             let gate = Arc::clone(&budget.gate);
             let files = Files { image, masks, labels, occluder, hidden, lens, size, to, first, gate };
-            let source = PixelSource::on_disk(files, budget.take(bytes));
+            let source = PixelSource::on_disk(files, budget.keep.clone());
             Frame { name, source, camera: camera.resized(to.0, to.1), pose, placement, betas }
         };
         let frames: Vec<Frame> = self.frames.into_iter().map(frame).collect();
@@ -144,7 +134,8 @@ pub(super) fn budget(
     let bodies = kept(1, 1);
     let picture = views().map(View::decoding_bytes).max().unwrap_or(0);
     if bodies + picture <= limit {
-        return Ok(Budget::new(limit - bodies, picture));
+        let whole = views().map(|view| view.frames.len() as u64 * view.picture_bytes(options)).sum();
+        return Ok(Budget::new(limit - bodies, picture, whole));
     }
     let mut ways = Vec::new();
     let longest = views().map(|view| view.frames.len()).max().unwrap_or(1);

@@ -20,11 +20,13 @@ mod light;
 mod names;
 mod obstacle;
 mod options;
+mod packed;
 mod perturbation;
 mod pictures;
 mod pixels;
 mod records;
 mod source;
+mod spill;
 mod synth;
 #[cfg(test)]
 pub(crate) mod testing;
@@ -45,6 +47,7 @@ pub use self::options::LoadOptions;
 pub use self::perturbation::Perturbation;
 pub use self::pixels::Pixels;
 pub use self::source::PixelSource;
+pub(crate) use self::source::Shown;
 pub use self::synth::{Occlusion, SynthConfig, Synthetic, synthesise};
 
 use std::path::Path;

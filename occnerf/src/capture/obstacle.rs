@@ -171,7 +171,7 @@ impl Obstacle {
             *area = Area { columns, rows: rows.clone() };
         }
         for (frame, area) in frames.iter_mut().zip(&areas).filter(|(_, area)| !area.is_empty()) {
-            frame.source.edit(Edit::Hide(area.clone()));
+            frame.source.edit(Edit::Hide(area.clone()))?;
         }
         Ok(areas)
     }

@@ -1,9 +1,14 @@
 //! The pixels of frames: in memory, or in files that are decoded when asked for.
 
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, OnceLock};
 
+use glam::Vec3;
+
 use super::files::Files;
+use super::packed::Packed;
 use super::pixels::{Edit, Pixels};
+use super::spill::{Spill, Spilled};
 use super::{CaptureError, Image};
 
 /// Where the pixels of a frame are. Copies share what is decoded.
@@ -13,6 +18,7 @@ pub struct PixelSource(Place);
 #[derive(Clone, Debug)]
 enum Place {
     Memory(Arc<Pixels>),
+    Spilled(Arc<Spilled>),
     Disk(Arc<OnDisk>),
 }
 
@@ -20,9 +26,92 @@ enum Place {
 struct OnDisk {
     files: Arc<Files>,
     edits: Vec<Edit>,
-    /// Whether the pixels stay in memory once they are decoded.
-    keep: bool,
-    kept: OnceLock<Arc<Pixels>>,
+    keep: Keep,
+    /// What the first decoding left; `None` where there was no room.
+    kept: OnceLock<Option<Kept>>,
+}
+
+/// What stays in memory of pixels once they are decoded.
+#[derive(Clone, Debug)]
+pub(super) enum Keep {
+    /// All, as they are.
+    Whole,
+    /// Few bytes that say the same, while there is room.
+    Packed(Arc<Allowance>),
+}
+
+#[derive(Clone, Debug)]
+enum Kept {
+    Whole(Arc<Pixels>),
+    Packed(Arc<(Packed, Room)>),
+}
+
+/// Bytes for packed pixels, first come, first served.
+#[derive(Debug)]
+pub(super) struct Allowance {
+    left: AtomicU64,
+    /// Whether somebody had to go without.
+    spent: AtomicBool,
+}
+
+/// Bytes of an [`Allowance`], given back when dropped.
+#[derive(Debug)]
+struct Room {
+    of: Arc<Allowance>,
+    bytes: u64,
+}
+
+impl Allowance {
+    pub fn new(bytes: u64) -> Self {
+        Self { left: AtomicU64::new(bytes), spent: AtomicBool::new(false) }
+    }
+
+    fn take(self: &Arc<Self>, bytes: u64) -> Option<Room> {
+        let less = |left: u64| left.checked_sub(bytes);
+        if self.left.fetch_update(Ordering::Relaxed, Ordering::Relaxed, less).is_err() {
+            self.spent.store(true, Ordering::Relaxed);
+            return None;
+        }
+        Some(Room { of: Arc::clone(self), bytes })
+    }
+}
+
+impl Drop for Room {
+    fn drop(&mut self) {
+        self.of.left.fetch_add(self.bytes, Ordering::Relaxed);
+    }
+}
+
+impl Keep {
+    fn of(&self, pixels: &Arc<Pixels>) -> Option<Kept> {
+        match self {
+            Self::Whole => Some(Kept::Whole(Arc::clone(pixels))),
+            Self::Packed(allowance) => {
+                let packed = Packed::new(pixels);
+                let room = allowance.take(packed.bytes())?;
+                Some(Kept::Packed(Arc::new((packed, room))))
+            }
+        }
+    }
+}
+
+/// Pixels to look at one by one.
+pub(crate) struct Shown(Kept);
+
+impl Shown {
+    /// Premultiplied colour and coverage of a pixel.
+    ///
+    /// # Panics
+    /// Outside the picture.
+    pub fn at(&self, pixel: u32) -> (Vec3, f32) {
+        match &self.0 {
+            Kept::Whole(pixels) => {
+                let i = pixel as usize;
+                (Vec3::from_slice(&pixels.image.pixels[3 * i..]), pixels.mask[i])
+            }
+            Kept::Packed(packed) => packed.0.at(pixel),
+        }
+    }
 }
 
 impl From<Pixels> for PixelSource {
@@ -32,10 +121,15 @@ impl From<Pixels> for PixelSource {
 }
 
 impl PixelSource {
-    /// Pixels that are decoded when asked for, the first time only if `keep`.
-    pub(super) fn on_disk(files: Files, keep: bool) -> Self {
+    /// Pixels that are decoded when asked for, and kept as `keep` says.
+    pub(super) fn on_disk(files: Files, keep: Keep) -> Self {
         let on_disk = OnDisk { files: Arc::new(files), edits: Vec::new(), keep, kept: OnceLock::new() };
         Self(Place::Disk(Arc::new(on_disk)))
+    }
+
+    /// Pixels in a file.
+    pub(super) fn spilled(pixels: &Pixels, spill: &Arc<Spill>) -> Result<Self, CaptureError> {
+        Ok(Self(Place::Spilled(Arc::new(spill.add(pixels)?))))
     }
 
     /// The pixels.
@@ -45,61 +139,93 @@ impl PixelSource {
     pub fn pixels(&self) -> Result<Arc<Pixels>, CaptureError> {
         match &self.0 {
             Place::Memory(pixels) => Ok(Arc::clone(pixels)),
-            Place::Disk(disk) => {
-                if let Some(kept) = disk.kept.get() {
-                    return Ok(Arc::clone(kept));
+            Place::Spilled(spilled) => spilled.pixels().map(Arc::new),
+            Place::Disk(disk) => match disk.kept.get() {
+                Some(Some(Kept::Whole(kept))) => Ok(Arc::clone(kept)),
+                Some(Some(Kept::Packed(packed))) => Ok(Arc::new(packed.0.pixels())),
+                found => {
+                    let mut pixels = disk.files.decode()?;
+                    disk.edits.iter().for_each(|edit| edit.apply(&mut pixels));
+                    let pixels = Arc::new(pixels);
+                    if found.is_none() {
+                        disk.kept.get_or_init(|| disk.keep.of(&pixels));
+                    }
+                    Ok(pixels)
                 }
-                let mut pixels = disk.files.decode()?;
-                disk.edits.iter().for_each(|edit| edit.apply(&mut pixels));
-                let pixels = Arc::new(pixels);
-                Ok(if disk.keep { Arc::clone(disk.kept.get_or_init(|| pixels)) } else { pixels })
-            }
+            },
         }
     }
 
-    /// The picture with what its mask hides; `None` for pixels in memory, which lack that.
+    /// The pixels where a few of them are asked for: packed ones stay so.
+    ///
+    /// # Errors
+    /// As of [`PixelSource::pixels`].
+    pub(crate) fn shown(&self) -> Result<Shown, CaptureError> {
+        if let Place::Disk(disk) = &self.0
+            && let Some(Some(kept)) = disk.kept.get()
+        {
+            return Ok(Shown(kept.clone()));
+        }
+        Ok(Shown(Kept::Whole(self.pixels()?)))
+    }
+
+    /// The picture with what its mask hides; `None` for pixels that were never photographed.
     pub(crate) fn photograph(&self) -> Option<Result<Image, CaptureError>> {
         match &self.0 {
-            Place::Memory(_) => None,
+            Place::Memory(_) | Place::Spilled(_) => None,
             Place::Disk(disk) => Some(disk.files.photograph()),
         }
     }
 
-    /// Changes the pixels; they stay in memory from then on.
+    /// Changes the pixels, which do not come from their files from then on.
     ///
     /// # Errors
     /// As of [`PixelSource::pixels`].
     pub fn change(&mut self, change: impl FnOnce(&mut Pixels)) -> Result<(), CaptureError> {
         let mut pixels = Arc::unwrap_or_clone(self.pixels()?);
         change(&mut pixels);
-        *self = pixels.into();
+        *self = match &self.0 {
+            Place::Spilled(spilled) => Self::spilled(&pixels, spilled.spill())?,
+            _ => pixels.into(),
+        };
         Ok(())
     }
 
     /// Decodes what is to be kept, and looks at the headers of the rest.
     pub(super) fn check(&self) -> Result<(), CaptureError> {
         match &self.0 {
-            Place::Disk(disk) if !disk.keep => disk.files.check(),
+            Place::Disk(disk) if matches!(&disk.keep, Keep::Packed(room) if room.spent.load(Ordering::Relaxed)) => {
+                disk.files.check()
+            }
             _ => self.pixels().map(drop),
         }
     }
 
     /// Makes a change, now or whenever the pixels are decoded.
-    pub(super) fn edit(&mut self, edit: Edit) {
+    ///
+    /// # Errors
+    /// As of [`PixelSource::pixels`] for pixels in a file of their own.
+    pub(super) fn edit(&mut self, edit: Edit) -> Result<(), CaptureError> {
         match &mut self.0 {
             Place::Memory(pixels) => edit.apply(Arc::make_mut(pixels)),
+            Place::Spilled(_) => self.change(|pixels| edit.apply(pixels))?,
             Place::Disk(disk) => {
-                let mut kept = match Arc::get_mut(disk) {
+                let kept = match Arc::get_mut(disk) {
                     Some(own) => own.kept.take(),
                     None => disk.kept.get().cloned(),
                 };
-                if let Some(pixels) = &mut kept {
-                    edit.apply(Arc::make_mut(pixels));
-                }
-                let edits = disk.edits.iter().cloned().chain([edit]).collect();
-                let kept = kept.map_or_else(OnceLock::new, OnceLock::from);
-                *disk = Arc::new(OnDisk { files: Arc::clone(&disk.files), edits, keep: disk.keep, kept });
+                let edits = disk.edits.iter().cloned().chain([edit.clone()]).collect();
+                // Packed pixels are decoded and packed again.
+                let kept = match kept.flatten() {
+                    Some(Kept::Whole(mut pixels)) => {
+                        edit.apply(Arc::make_mut(&mut pixels));
+                        OnceLock::from(Some(Kept::Whole(pixels)))
+                    }
+                    _ => OnceLock::new(),
+                };
+                *disk = Arc::new(OnDisk { files: Arc::clone(&disk.files), edits, keep: disk.keep.clone(), kept });
             }
         }
+        Ok(())
     }
 }

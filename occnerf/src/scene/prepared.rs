@@ -7,7 +7,7 @@ use smpl::BodyModel;
 use visibility::RayMesh;
 
 use crate::Error;
-use crate::capture::{Capture, Frame, PixelSource, Pixels};
+use crate::capture::{Capture, CaptureError, Frame, PixelSource, Pixels, Shown};
 use crate::config::Config;
 use crate::model::body::{Body, Moment};
 use crate::model::view::PosedView;
@@ -37,8 +37,17 @@ impl PreparedFrame {
     /// [`Error::Data`] for files that cannot be read; [`Error::Scene`] where nothing was
     /// photographed.
     pub fn pixels(&self) -> Result<Arc<Pixels>, Error> {
+        self.photographed(PixelSource::pixels)
+    }
+
+    /// The same for those who look at a few pixels.
+    pub(crate) fn shown(&self) -> Result<Shown, Error> {
+        self.photographed(PixelSource::shown)
+    }
+
+    fn photographed<T>(&self, read: impl FnOnce(&PixelSource) -> Result<T, CaptureError>) -> Result<T, Error> {
         let source = self.source.as_ref().ok_or_else(|| Error::Scene("a view without a picture".to_owned()))?;
-        Ok(source.pixels()?)
+        Ok(read(source)?)
     }
 }
 

@@ -1,6 +1,6 @@
 //! The rays of a training step: one frame, several square patches.
 
-use crate::capture::Pixels;
+use crate::capture::Shown;
 use crate::config::Config;
 use crate::random::Stream;
 use crate::scene::labels::{Label, Labels};
@@ -64,10 +64,11 @@ fn frame_of(frames: usize, seed: u64, step: u64, order: &mut Vec<usize>) -> usiz
 }
 
 /// What a ray should show: premultiplied colour over `background`; `None` where nothing is known.
-pub(crate) fn target(labels: &Labels, shown: &Pixels, pixel: u32, background: glam::Vec3) -> Option<glam::Vec3> {
-    let i = pixel as usize;
-    let colour = glam::Vec3::from_slice(&shown.image.pixels[3 * i..]);
-    (labels.at(pixel) != Label::Unknown).then(|| colour + (1.0 - shown.mask[i]) * background)
+pub(crate) fn target(labels: &Labels, shown: &Shown, pixel: u32, background: glam::Vec3) -> Option<glam::Vec3> {
+    (labels.at(pixel) != Label::Unknown).then(|| {
+        let (colour, mask) = shown.at(pixel);
+        colour + (1.0 - mask) * background
+    })
 }
 
 #[cfg(test)]

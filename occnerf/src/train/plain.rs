@@ -176,7 +176,7 @@ impl Plain<'_, '_> {
                 colors[ray] = color + transmittance * background;
             }
         }
-        let shown = frame.pixels().unwrap();
+        let shown = frame.shown().unwrap();
         let known = |&(pixel, _): &(&u32, &DVec3)| target(&frame.labels, &shown, *pixel, batch.background).is_some();
         let rays: Vec<(&u32, &DVec3)> = batch.pixels.iter().zip(&colors).filter(known).collect();
         let error = |&(&pixel, color): &(&u32, &DVec3)| {

@@ -4,6 +4,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use anyhow::Error;
+use occnerf::capture::CaptureError;
 
 use super::print::shown;
 
@@ -40,6 +41,46 @@ impl Ending {
 /// What turns the system's error into one that says which result is missing.
 pub fn unwritten(path: &Path) -> impl FnOnce(io::Error) -> Error + '_ {
     move |source| Ending::Unwritten { path: path.to_owned(), source }.into()
+}
+
+/// What tells errors of the library about files in `place`, where results go, from those about what
+/// was given.
+pub fn results_in(place: &Path) -> impl Fn(Error) -> Error + '_ {
+    move |error| {
+        let found = error.chain().find_map(file_and_reason).filter(|(path, _)| path.starts_with(place));
+        match found {
+            Some((path, reason)) => {
+                // The reason is the error's own: it is said again.
+                let source = io::Error::new(reason.kind(), reason.to_string());
+                Ending::Unwritten { path: path.to_owned(), source }.into()
+            }
+            None => error,
+        }
+    }
+}
+
+fn file_and_reason<'a>(cause: &'a (dyn std::error::Error + 'static)) -> Option<(&'a Path, &'a io::Error)> {
+    fn of_body(error: &smpl::Error) -> Option<(&Path, &io::Error)> {
+        let smpl::Error::Io { path, source } = error else { return None };
+        Some((path, source))
+    }
+    fn of_capture(error: &CaptureError) -> Option<(&Path, &io::Error)> {
+        match error {
+            CaptureError::Io { path, source } => Some((path, source)),
+            CaptureError::Array(error) => of_body(error),
+            _ => None,
+        }
+    }
+    match cause.downcast_ref::<occnerf::Error>() {
+        Some(occnerf::Error::Io { path, source }) => Some((path, source)),
+        Some(occnerf::Error::Data(error)) => of_capture(error),
+        Some(occnerf::Error::Body(error)) => of_body(error),
+        Some(_) => None,
+        None => {
+            let body = || cause.downcast_ref().and_then(of_body);
+            cause.downcast_ref().and_then(of_capture).or_else(body)
+        }
+    }
 }
 
 fn name(signal: i32) -> String {

@@ -5,7 +5,7 @@ mod lock;
 mod print;
 mod stop;
 
-pub use self::ending::{Ending, described, one_line, unwritten};
+pub use self::ending::{Ending, described, one_line, results_in, unwritten};
 pub use self::lock::Lock;
 pub use self::print::{err, out};
 pub(crate) use self::print::{note, say};

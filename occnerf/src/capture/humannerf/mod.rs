@@ -55,11 +55,11 @@ pub(super) fn load(dir: &Path, body: &BodyModel, options: &LoadOptions) -> Resul
     }
 
     let train = train.ok_or_else(|| CaptureError::missing(&dir.join("cameras.pkl"), "frame"))?;
-    let mut budget = budget(&train, &eval, body, options)?;
-    let train = train.frames(body, options, &mut budget)?;
+    let budget = budget(&train, &eval, body, options)?;
+    let train = train.frames(body, options, &budget)?;
     let mut frames = Vec::new();
     for (camera_name, view) in cameras.into_iter().zip(eval) {
-        for frame in view.frames(body, options, &mut budget)? {
+        for frame in view.frames(body, options, &budget)? {
             let train_index = index(&names, &frame.name).unwrap_or_default();
             frames.push(EvalFrame { camera_name: camera_name.clone(), train_index, frame });
         }

@@ -2,8 +2,12 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::capture::decode::PIXEL_BYTES;
 use crate::capture::demo::DemoConfig;
-use crate::capture::{CaptureError, LoadOptions, Obstacle};
+use crate::capture::{CaptureError, Obstacle};
+
+/// Pixels that are filmed at most. Those that memory has no room for wait in a file.
+const MOST_BYTES: u64 = 64 << 30;
 
 /// What stands in front of the person in the training view.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -101,14 +105,12 @@ impl SynthConfig {
             }
         }
         self.demo().check()?;
-        // All of it is in memory until it is written.
         let views = self.frames + self.frames.div_ceil(self.eval_every) * self.eval_cameras;
-        let bytes = views as u64 * u64::from(self.size).pow(2) * 16;
-        let limit = LoadOptions::default().max_bytes;
-        if bytes > limit {
+        let bytes = (views as u64).saturating_mul(u64::from(self.size).pow(2) * PIXEL_BYTES);
+        if bytes > MOST_BYTES {
             let expected =
-                format!("at most {} MiB of pixels in memory (fewer frames or views, or a smaller size)", limit >> 20);
-            let actual = format!("{} MiB in {views} pictures of {1}×{1}", bytes >> 20, self.size);
+                format!("at most {} GiB of pixels (fewer frames or views, or a smaller size)", MOST_BYTES >> 30);
+            let actual = format!("{} GiB in {views} pictures of {1}×{1}", bytes >> 30, self.size);
             return Err(CaptureError::setting("frames", expected, actual));
         }
         Ok(())

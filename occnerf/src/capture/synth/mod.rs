@@ -12,17 +12,15 @@ pub(super) mod stage;
 mod tests;
 mod texture;
 
-use std::sync::Arc;
-
+use rayon::prelude::*;
 use smpl::{BodyModel, Character, MotionClip};
 
 pub use self::config::{Occlusion, SynthConfig};
 
 use self::objects::Objects;
-use self::render::Picture;
 use super::demo::{DemoConfig, film, grounded_walk};
-use super::pixels::{Area, Pixels};
-use super::{Capture, CaptureError, Frame};
+use super::pixels::Area;
+use super::{Capture, CaptureError, Frame, PixelSource};
 
 /// A capture made by [`synthesise`], with what only its maker knows.
 pub struct Synthetic {
@@ -35,7 +33,7 @@ pub struct Synthetic {
     /// Part of the subject's pixels that is hidden, over the frames in which anything is.
     pub hidden_fraction: f32,
     /// The training view without the occlusion.
-    pub(super) clear: Vec<Picture>,
+    pub(super) clear: Vec<PixelSource>,
     /// What the rectangle hides in each training frame; empty for objects.
     pub(super) hidden: Vec<Area>,
     /// The objects and the room.
@@ -52,9 +50,9 @@ pub struct Synthetic {
 /// arguments alone, not on the number of threads.
 ///
 /// # Errors
-/// [`CaptureError::Setting`] for values outside their ranges, for more pixels than
-/// [`LoadOptions::max_bytes`](crate::capture::LoadOptions::max_bytes) admits by default, and for
-/// characters that no body can be made of, or that `motion` cannot drive.
+/// [`CaptureError::Setting`] for values outside their ranges, and for characters that no body can be
+/// made of, or that `motion` cannot drive; [`CaptureError::Io`] where pictures that memory has no
+/// room for cannot be put into the system's temporary folder.
 pub fn synthesise(
     character: Option<&Character>,
     motion: Option<&MotionClip>,
@@ -78,7 +76,7 @@ pub fn synthesise(
             (capture, height, body)
         }
     };
-    let clear: Vec<Picture> = pixels(&capture.train)?.iter().map(|p| (p.image.clone(), p.mask.clone())).collect();
+    let clear: Vec<PixelSource> = capture.train.iter().map(|frame| frame.source.clone()).collect();
     let mut hidden = Vec::new();
     let mut objects = None;
     match config.occlusion {
@@ -89,24 +87,24 @@ pub fn synthesise(
             objects = Some(made);
         }
     }
-    let hidden_fraction = hidden_fraction(&clear, &pixels(&capture.train)?);
+    let hidden_fraction = hidden_fraction(&clear, &capture.train)?;
     Ok(Synthetic { capture, body, config: *config, hidden_fraction, clear, hidden, objects })
 }
 
-fn pixels(frames: &[Frame]) -> Result<Vec<Arc<Pixels>>, CaptureError> {
-    frames.iter().map(Frame::pixels).collect()
-}
-
 /// Part of the subject's pixels that is gone, over the frames that lost any.
-fn hidden_fraction(clear: &[Picture], train: &[Arc<Pixels>]) -> f32 {
-    let count = |mask: &[f32]| mask.iter().filter(|m| **m > 0.5).count() as u64;
+fn hidden_fraction(clear: &[PixelSource], train: &[Frame]) -> Result<f32, CaptureError> {
+    let count = |source: &PixelSource| -> Result<u64, CaptureError> {
+        Ok(source.pixels()?.mask.iter().filter(|m| **m > 0.5).count() as u64)
+    };
+    let counts: Vec<Result<[u64; 2], CaptureError>> =
+        clear.par_iter().zip(train).map(|(before, frame)| Ok([count(before)?, count(&frame.source)?])).collect();
     let (mut whole, mut gone) = (0u64, 0u64);
-    for ((_, before), frame) in clear.iter().zip(train) {
-        let (before, after) = (count(before), count(&frame.mask));
+    for counts in counts {
+        let [before, after] = counts?;
         if after < before {
             whole += before;
             gone += before - after;
         }
     }
-    gone as f32 / whole.max(1) as f32
+    Ok(gone as f32 / whole.max(1) as f32)
 }

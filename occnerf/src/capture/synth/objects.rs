@@ -8,7 +8,7 @@ use volrender::Camera;
 
 use super::noise::smooth_noise;
 use super::render::{Picture, Posture};
-use crate::capture::{CaptureError, Frame, Image};
+use crate::capture::{CaptureError, Frame, Image, Pixels};
 
 /// Distance of the objects' far and near sides from the person's axis, in heights of the person:
 /// beyond a stretched arm, before the camera.
@@ -48,28 +48,27 @@ impl Objects {
         // A picture's width where the objects stand.
         let width = (eye.z - NEAR * height) / camera.focal.x * camera.width as f32;
         let at = |size: f32| picture(&camera, height, size, position * width);
-        let pixels = frames.iter().map(Frame::pixels).collect::<Result<Vec<_>, _>>()?;
-        let hidden = |front: &Picture| {
+        let hidden = |front: &Picture| -> Result<f32, CaptureError> {
             let (mut whole, mut gone) = (0u64, 0u64);
-            for frame in &pixels {
-                for (mask, cover) in frame.mask.iter().zip(&front.1).filter(|(mask, _)| **mask > 0.5) {
+            for frame in frames {
+                for (mask, cover) in frame.pixels()?.mask.iter().zip(&front.1).filter(|(mask, _)| **mask > 0.5) {
                     whole += 1;
                     gone += u64::from(mask * (1.0 - cover) <= 0.5);
                 }
             }
-            gone as f32 / whole.max(1) as f32
+            Ok(gone as f32 / whole.max(1) as f32)
         };
         let (mut low, mut high) = (0.0, if fraction > 0.0 { WIDEST } else { 0.0 });
         for _ in 0..HALVINGS {
             let middle = 0.5 * (low + high);
-            if hidden(&at(middle)?) < fraction {
+            if hidden(&at(middle)?)? < fraction {
                 low = middle;
             } else {
                 high = middle;
             }
         }
         let (below, above) = (at(low)?, at(high)?);
-        let nearer = fraction - hidden(&below) <= hidden(&above) - fraction;
+        let nearer = fraction - hidden(&below)? <= hidden(&above)? - fraction;
         Ok(Self { front: if nearer { below } else { above }, room: room(&camera, height) })
     }
 
@@ -93,7 +92,7 @@ impl Objects {
 
     /// What a camera would take of a person (premultiplied, with its coverage) in the room, behind
     /// the objects if `occluded`.
-    pub fn photograph(&self, (person, mask): &Picture, occluded: bool) -> Image {
+    pub fn photograph(&self, Pixels { image: person, mask, .. }: &Pixels, occluded: bool) -> Image {
         let mut photo = self.room.clone();
         for (i, pixel) in photo.pixels.chunks_exact_mut(3).enumerate() {
             for (c, value) in pixel.iter_mut().enumerate() {

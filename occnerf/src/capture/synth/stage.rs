@@ -1,14 +1,17 @@
 //! Cameras around a person, and the video that they take.
 
 use std::f32::consts::TAU;
+use std::sync::Arc;
 
 use glam::Vec3;
 use rayon::prelude::*;
 use volrender::Camera;
 
-use super::render::{Picture, Posture, look_at};
+use super::render::{Posture, look_at};
+use crate::capture::decode::PIXEL_BYTES;
 use crate::capture::demo::motion::Pose;
-use crate::capture::{Capture, CaptureError, EvalFrame, Frame, Pixels};
+use crate::capture::spill::Spill;
+use crate::capture::{Capture, CaptureError, EvalFrame, Frame, LoadOptions, PixelSource, Pixels};
 
 /// Focal length in picture sides.
 const FOCAL: f32 = 1.45;
@@ -48,30 +51,48 @@ pub(in crate::capture) struct Stage<'a> {
 }
 
 impl Stage<'_> {
-    /// The video, with nothing in front of the person, and the views kept back.
+    /// Bytes of all pictures.
+    fn bytes(&self) -> u64 {
+        let (instants, others) = (self.priors.len() as u64, self.cameras.len().saturating_sub(1) as u64);
+        let pictures = instants + instants.div_ceil(self.eval_every as u64) * others;
+        let pixels = self.cameras.first().map_or(0, |camera| u64::from(camera.width) * u64::from(camera.height));
+        pictures * pixels * PIXEL_BYTES
+    }
+
+    /// The video, with nothing in front of the person, and the views kept back; in a file of the
+    /// system's temporary folder where they take more than [`LoadOptions::max_bytes`] by default.
     pub fn film<'p>(
         self,
         name: &str,
         posture: impl Fn(usize) -> Result<Posture<'p>, CaptureError> + Sync,
     ) -> Result<Capture, CaptureError> {
         let done = std::sync::atomic::AtomicUsize::new(0);
-        let views: Vec<Result<Vec<Picture>, CaptureError>> = (0..self.priors.len())
+        let spill = if self.bytes() > LoadOptions::default().max_bytes { Some(Arc::new(Spill::new()?)) } else { None };
+        let take = |posture: &Posture<'p>, camera: &Camera| -> Result<PixelSource, CaptureError> {
+            let (image, mask) = posture.render(camera);
+            let pixels = Pixels { image, mask, occluder: None };
+            match &spill {
+                Some(spill) => PixelSource::spilled(&pixels, spill),
+                None => Ok(pixels.into()),
+            }
+        };
+        let views: Vec<Result<Vec<PixelSource>, CaptureError>> = (0..self.priors.len())
             .into_par_iter()
             .map(|i| {
                 let posture = posture(i)?;
                 let seen = if i % self.eval_every == 0 { self.cameras.len() } else { 1 };
-                let pictures = self.cameras[..seen].iter().map(|camera| posture.render(camera)).collect();
+                let pictures = self.cameras[..seen].iter().map(|camera| take(&posture, camera)).collect();
                 (self.progress)(done.fetch_add(1, std::sync::atomic::Ordering::Relaxed) + 1);
-                Ok(pictures)
+                pictures
             })
             .collect();
         let mut train = Vec::with_capacity(self.priors.len());
         let mut eval = Vec::new();
         for (i, views) in views.into_iter().enumerate() {
-            for (c, (image, mask)) in views?.into_iter().enumerate() {
+            for (c, source) in views?.into_iter().enumerate() {
                 let frame = Frame {
                     name: format!("frame_{i:06}"),
-                    source: Pixels { image, mask, occluder: None }.into(),
+                    source,
                     camera: self.cameras[c],
                     pose: self.priors[i].joints.clone(),
                     placement: self.priors[i].placement(),

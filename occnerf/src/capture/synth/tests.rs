@@ -39,8 +39,8 @@ fn the_fraction_hidden_is_the_one_asked_for() {
             assert!((made.hidden_fraction - fraction).abs() < 0.05, "{occlusion:?}: {}", made.hidden_fraction);
         }
     }
-    let share = |frames: &[Frame], clear: &[Picture]| {
-        frames.iter().zip(clear).filter(|(frame, clear)| frame.shown().mask != clear.1).count()
+    let share = |frames: &[Frame], clear: &[PixelSource]| {
+        frames.iter().zip(clear).filter(|(frame, clear)| frame.shown().mask != clear.pixels().unwrap().mask).count()
     };
     let half = Obstacle { share: 0.5, ..Obstacle::default() };
     let made = make(&SynthConfig { occlusion: Occlusion::Rectangle(half), ..small() });
@@ -57,7 +57,9 @@ fn objects_move_where_they_are_told_and_cover_what_they_hide() {
     };
     let (left, right) = (made(-0.1), made(0.1));
     assert!(mean(&right) > mean(&left) + 3.0, "{} {}", mean(&left), mean(&right));
-    for (frame, (image, mask)) in right.capture.train.iter().zip(&right.clear) {
+    for (frame, clear) in right.capture.train.iter().zip(&right.clear) {
+        let clear = clear.pixels().unwrap();
+        let (image, mask) = (&clear.image, &clear.mask);
         let cover = right.objects.as_ref().unwrap().coverage();
         for (i, &c) in cover.iter().enumerate() {
             assert_eq!(frame.shown().mask[i], mask[i] * (1.0 - c));
@@ -87,11 +89,11 @@ fn settings_that_cannot_be_are_named() {
             "occlusion.position",
             SynthConfig { occlusion: Occlusion::Objects { fraction: 0.5, position: 2.0 }, ..small() },
         ),
+        ("64 GiB", SynthConfig { size: 2048, frames: 10_000, ..small() }),
         ("occlusion.share", {
             let occlusion = Occlusion::Rectangle(Obstacle { share: 2.0, ..Obstacle::default() });
             SynthConfig { occlusion, ..small() }
         }),
-        ("1024 MiB", SynthConfig { size: 2048, frames: 10_000, ..small() }),
     ] {
         let message = synthesise(None, None, &config, &|_| {}).err().expect(word).to_string();
         assert!(message.contains(word) && message.contains("expected"), "{message}");
@@ -243,5 +245,5 @@ fn a_body_of_one_rigid_part_without_a_texture_is_filmed() {
     let tetrahedron = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.7, 0.0], [0.0, 0.0, 1.0]];
     let made = synthesise(Some(&plate(UNIT, &tetrahedron)), None, &small(), &|_| {}).unwrap();
     assert_eq!((made.body.num_joints(), made.body.num_vertices()), (1, 4));
-    assert!(made.clear.iter().all(|(_, mask)| mask.iter().any(|m| *m > 0.5)));
+    assert!(made.clear.iter().all(|clear| clear.pixels().unwrap().mask.iter().any(|m| *m > 0.5)));
 }

@@ -66,11 +66,11 @@ pub(super) fn load(dir: &Path, body: &BodyModel, options: &LoadOptions) -> Resul
         false => vec![View::new(kept, &clean.join("masks"), &path)?],
     };
 
-    let mut budget = budget(&train, &eval, body, options)?;
-    let train = train.frames(body, options, &mut budget)?;
+    let budget = budget(&train, &eval, body, options)?;
+    let train = train.frames(body, options, &budget)?;
     let mut kept = Vec::new();
     for view in eval {
-        for (train_index, frame) in indices.iter().copied().zip(view.frames(body, options, &mut budget)?) {
+        for (train_index, frame) in indices.iter().copied().zip(view.frames(body, options, &budget)?) {
             kept.push(EvalFrame { camera_name: CLEAN.to_owned(), train_index, frame });
         }
     }

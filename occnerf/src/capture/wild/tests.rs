@@ -158,18 +158,33 @@ fn memory_beyond_the_bound_names_options_that_fit() {
     assert!(message.contains("would fit: memory 1)"), "{message}");
 }
 
-/// As many pictures as fit stay in memory, training frames first; the others are read each time.
+/// As many pictures as fit, packed, stay in memory; the others are read each time.
 #[test]
 fn what_is_not_in_memory_is_read_when_asked_for() {
     let (dir, _) = fixture("wild-demand");
-    let options = LoadOptions { max_bytes: 6 * 8 * 36 + 4 * 10 + 24 * 48 + 2 * 24 * 16, ..LoadOptions::default() };
+    let least = 6 * 8 * 36 + 4 * 10 + 24 * 48;
+    // Four rows of 16 bytes, and the 12 pixels of a stripe of 4 each.
+    let packed = 4 * 16 + 12 * 4;
+    let reread = |room: u64| {
+        (0..4).for_each(|i| dir.stripe(&format!("images/{i:02}.png"), SIZE, 200));
+        let options = LoadOptions { max_bytes: least + room, ..LoadOptions::default() };
+        let capture = load_capture(dir.path(), &body(), &options).unwrap();
+        (0..4).for_each(|i| dir.stripe(&format!("images/{i:02}.png"), SIZE, 100));
+        let level = |i: usize| capture.train[i].pixels().unwrap().image.rgb(3, 0)[0] * 255.0;
+        (0..4).filter(|&i| level(i).round() == 100.0).count()
+    };
+    // The occluder is 8 bytes more; frames kept back are read after those of training.
+    assert_eq!([0, packed - 1, 4 * packed + 8].map(reread), [4, 4, 0]);
+    assert!((2..4).contains(&reread(packed + 8)));
+    (0..4).for_each(|i| dir.stripe(&format!("images/{i:02}.png"), SIZE, 200));
+    let options = LoadOptions { max_bytes: least, ..LoadOptions::default() };
     let capture = load_capture(dir.path(), &body(), &options).unwrap();
     let level = |i: usize| capture.train[i].pixels().map(|pixels| (pixels.image.rgb(3, 0)[0] * 255.0).round());
     assert_eq!(level(3).unwrap(), 200.0);
     for i in 0..4 {
         dir.stripe(&format!("images/{i:02}.png"), SIZE, 100);
     }
-    assert_eq!((0..4).map(|i| level(i).unwrap()).collect::<Vec<_>>(), [200.0, 200.0, 100.0, 100.0]);
+    assert_eq!((0..4).map(|i| level(i).unwrap()).collect::<Vec<_>>(), [100.0; 4]);
     // Damage that came later is told when it is met, as that of headers was at once.
     dir.write("images/02.png", "no picture");
     dir.stripe("masks/03.png", (5, 4), 255);

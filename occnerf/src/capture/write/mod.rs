@@ -56,14 +56,10 @@ impl Synthetic {
 
     /// What a camera takes of training frame `i`.
     fn photograph(&self, i: usize, occluded: bool) -> Result<RgbImage, CaptureError> {
-        let clear = &self.clear[i];
         if let Some(objects) = &self.objects {
-            return Ok(rgb(&objects.photograph(clear, occluded)));
+            return Ok(rgb(&objects.photograph(&*self.clear[i].pixels()?, occluded)));
         }
-        if occluded {
-            let pixels = self.capture.train[i].pixels()?;
-            return Ok(unmixed(&pixels.image, &pixels.mask));
-        }
-        Ok(unmixed(&clear.0, &clear.1))
+        let pixels = if occluded { self.capture.train[i].pixels() } else { self.clear[i].pixels() }?;
+        Ok(unmixed(&pixels.image, &pixels.mask))
     }
 }

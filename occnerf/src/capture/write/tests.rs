@@ -7,7 +7,7 @@ use smpl::BodyModel;
 use super::folder::byte;
 use crate::capture::testing::Directory;
 use crate::capture::{
-    Capture, Frame, Layout, LoadOptions, Obstacle, Occlusion, Perturbation, Pixels, SynthConfig, Synthetic, find_body,
+    Capture, Frame, Layout, LoadOptions, Obstacle, Occlusion, Perturbation, SynthConfig, Synthetic, find_body,
     load_capture, synthesise,
 };
 
@@ -91,9 +91,7 @@ fn every_layout_reads_back_as_it_was_made() {
             assert_eq!(kept, [0, 2, 4]);
             for view in &read.eval {
                 let i = view.train_index;
-                let (image, mask) = made.clear[i].clone();
-                let clear =
-                    Frame { source: Pixels { image, mask, occluder: None }.into(), ..made.capture.train[i].clone() };
+                let clear = Frame { source: made.clear[i].clone(), ..made.capture.train[i].clone() };
                 same_view(&body, &clear, &view.frame);
                 same_picture(layout, &clear, &view.frame);
             }
@@ -129,7 +127,10 @@ fn without_occlusion_nothing_is_hidden() {
     for layout in LAYOUTS {
         let (_dir, _, read) = round(&made, layout, &format!("write-none-{layout:?}"));
         for (clear, b) in made.clear.iter().zip(&read.train) {
-            assert!(clear.1.iter().zip(&b.shown().mask).all(|(c, m)| (*c > 0.5) == (*m > 0.5)), "{layout:?}");
+            assert!(
+                clear.pixels().unwrap().mask.iter().zip(&b.shown().mask).all(|(c, m)| (*c > 0.5) == (*m > 0.5)),
+                "{layout:?}"
+            );
         }
     }
 }

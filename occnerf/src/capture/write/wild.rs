@@ -22,12 +22,12 @@ pub(super) fn write(synthetic: &Synthetic, folder: &Folder<'_>) -> Result<(), Ca
     folder.pictures(&all("images"), |i| synthetic.photograph(i, true))?;
     folder.pictures(&all("masks"), |i| frame_mask(&train[i]))?;
     folder.pictures(&all("occluders"), |i| {
-        let (image, mask) = &synthetic.clear[i];
+        let clear = synthetic.clear[i].pixels()?;
         Ok(match &synthetic.objects {
-            Some(objects) => grey(objects.coverage(), image),
+            Some(objects) => grey(objects.coverage(), &clear.image),
             None => {
-                let covered = |p: usize| f32::from(synthetic.hidden[i].contains(p, image.width));
-                grey(&(0..mask.len()).map(covered).collect::<Vec<f32>>(), image)
+                let covered = |p: usize| f32::from(synthetic.hidden[i].contains(p, clear.image.width));
+                grey(&(0..clear.mask.len()).map(covered).collect::<Vec<f32>>(), &clear.image)
             }
         })
     })?;
@@ -35,8 +35,8 @@ pub(super) fn write(synthetic: &Synthetic, folder: &Folder<'_>) -> Result<(), Ca
     let kept = |kind: &str| -> Vec<String> { all(kind).into_iter().step_by(every).collect() };
     folder.pictures(&kept("clean/images"), |i| synthetic.photograph(i * every, false))?;
     folder.pictures(&kept("clean/masks"), |i| {
-        let (image, mask) = &synthetic.clear[i * every];
-        Ok(mask_rgb(mask, image))
+        let clear = synthetic.clear[i * every].pixels()?;
+        Ok(mask_rgb(&clear.mask, &clear.image))
     })
 }
 

@@ -39,8 +39,8 @@ pub(super) fn write(synthetic: &Synthetic, folder: &Folder<'_>) -> Result<(), Ca
         folder.make(camera)?;
         let training = *camera == TRAINING;
         let picture = |i: usize| match &synthetic.objects {
-            Some(objects) if training => Ok(rgb(&objects.photograph(&synthetic.clear[i], true))),
-            _ if training => Ok(rgb(&synthetic.clear[i].0)),
+            Some(objects) if training => Ok(rgb(&objects.photograph(&*synthetic.clear[i].pixels()?, true))),
+            _ if training => synthetic.clear[i].pixels().map(|clear| rgb(&clear.image)),
             _ => frames[i].1.pixels().map(|pixels| rgb(&pixels.image)),
         };
         let name = |kind: &str, i: &usize| format!("{kind}{camera}/{i:06}.png");
@@ -51,8 +51,7 @@ pub(super) fn write(synthetic: &Synthetic, folder: &Folder<'_>) -> Result<(), Ca
             folder.pictures(&names(kind), |i| {
                 // A rectangle is left to occlusion.json.
                 if training && synthetic.objects.is_none() {
-                    let (image, mask) = &synthetic.clear[i];
-                    return Ok(labels(mask, image));
+                    return synthetic.clear[i].pixels().map(|clear| labels(&clear.mask, &clear.image));
                 }
                 frames[i].1.pixels().map(|pixels| labels(&pixels.mask, &pixels.image))
             })?;

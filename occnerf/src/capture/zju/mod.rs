@@ -96,15 +96,15 @@ pub(super) fn load(dir: &Path, body: &BodyModel, options: &LoadOptions) -> Resul
         }
     }
 
-    let mut budget = budget(&train, &views, body, options)?;
-    let mut train = train.frames(body, options, &mut budget)?;
+    let budget = budget(&train, &views, body, options)?;
+    let mut train = train.frames(body, options, &budget)?;
     if recorded.is_none() {
         options.occlusion.unwrap_or_default().hide(&mut train)?;
     }
     let mut eval = Vec::with_capacity(indices.len());
     let mut indices = indices.into_iter();
     for view in views {
-        for (frame, (other, train_index)) in view.frames(body, options, &mut budget)?.into_iter().zip(&mut indices) {
+        for (frame, (other, train_index)) in view.frames(body, options, &budget)?.into_iter().zip(&mut indices) {
             eval.push(EvalFrame { camera_name: annots.names[other].clone(), train_index, frame });
         }
     }
