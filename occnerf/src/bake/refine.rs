@@ -36,7 +36,7 @@ pub(super) fn refine(model: &Model, scene: &Scene, avatar: &mut Avatar, passes: 
     let mut person = BakedPerson::new(avatar, model.body.scale).lit_by(model.base.light);
     let mut all = Vec::new();
     for frame in frames {
-        all.extend(sights(model, avatar, &mut person, frame, stride)?);
+        all.extend(sights(avatar, &mut person, frame, stride)?);
     }
     let Atlas { rgba, .. } = &mut avatar.atlas;
     let start: Vec<Vec3> = rgba.as_chunks::<4>().0.iter().map(|&[r, g, b, _]| colour([r, g, b])).collect();
@@ -72,15 +72,14 @@ fn colour(bytes: [u8; 3]) -> Vec3 {
 
 /// The subject's pixels of a frame that look at the surface well away from its outline.
 fn sights(
-    model: &Model,
     avatar: &Avatar,
     person: &mut BakedPerson<'_>,
     frame: &PreparedFrame,
     stride: usize,
 ) -> Result<Vec<Sight>, Error> {
     let pixels = frame.pixels()?;
-    let vertices = person.skin(&frame.view.posed.bones);
-    let shades = model.base.light.on_surface(vertices, &avatar.faces);
+    person.skin(&frame.view.posed.bones);
+    let (vertices, shades) = person.posed();
     let options = RasterOptions { cull_back: true, near: 1e-3, ..RasterOptions::default() };
     let shells: Vec<&[[u32; 3]]> = (0..avatar.shell_ends.len()).map(|shell| avatar.shell(shell)).collect();
     let look = |pixel: Pixel<'_>| {
@@ -91,7 +90,7 @@ fn sights(
         let mut before = 1.0;
         let look = |fragment| look(avatar, atlas_place(avatar, fragment), &mut before);
         Some(Sight {
-            colour: Vec3::from_slice(&pixels.image.pixels[3 * i..]) / shade(avatar, &shades, &fragments[0]),
+            colour: Vec3::from_slice(&pixels.image.pixels[3 * i..]) / shade(avatar, shades, &fragments[0]),
             looks: fragments.iter().map(look).collect(),
         })
     };

@@ -12,7 +12,7 @@ class Page {
     this.person = person;
     this.cameras = extra.cameras;
     this.canvas = element("view");
-    this.scene = new Scene(this.canvas, person);
+    this.scene = new Scene(this.canvas, person, extra.light);
     this.clip = null;
     this.frame = 0;
     this.playing = false;
