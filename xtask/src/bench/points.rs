@@ -263,6 +263,18 @@ mod tests {
     }
 
     #[test]
+    fn the_first_baked_point_is_what_render_draws_and_all_are_of_the_base() {
+        assert_eq!(BAKED[0], (Baking::default(), true));
+        for (quick, count) in [(false, BAKED.len()), (true, BAKED.iter().filter(|b| b.1).count())] {
+            let points = sweep(quick).first().unwrap();
+            let base = points.iter().find(|p| p.kind == Kind::Base).unwrap();
+            let baked: Vec<&Point> = points.iter().filter(|p| p.kind == Kind::Baked).collect();
+            assert_eq!(baked.len(), count);
+            assert!(baked.iter().all(|p| p.job.config == base.job.config && p.job.bake.is_some()));
+        }
+    }
+
+    #[test]
     fn combinations_take_what_loses_nothing_and_what_gains() {
         let lines = [
             line("base", "base", Kind::Base, 20.0, 10.0),

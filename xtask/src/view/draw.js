@@ -109,8 +109,8 @@ class Scene {
     gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA, gl.RGBA, gl.UNSIGNED_BYTE, confidence);
   }
 
-  // `ground` and the lines' colours are [r, g, b, a] from 0 to 1; `segments` 7 numbers a line end; `simple` draws a
-  // quarter of the triangles, where there are such.
+  // `ground` and the lines' colours are [r, g, b, a] from 0 to 1; `segments` 7 numbers a line end;
+  // `simple` draws a quarter of the triangles, where there are such.
   draw(camera, ground, segments, marksConfidence, simple) {
     const gl = this.gl;
     gl.viewport(0, 0, gl.drawingBufferWidth, gl.drawingBufferHeight);
@@ -159,7 +159,8 @@ class Scene {
   }
 }
 
-// Each four triangles that one was divided into as that one; as they are where they are something else.
+// Each four triangles that one was divided into as that one; as they are where they are something
+// else.
 function merged(indices) {
   if (indices.length % 12) return indices;
   const out = new indices.constructor(indices.length / 4);

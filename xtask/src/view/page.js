@@ -18,8 +18,9 @@ class Page {
     this.playing = false;
     this.stale = true;
     this.before = 0;
-    // Pixels across each of the window's while something moves: fewer where the machine is too slow. More than one
-    // smooths edges; multisampling costs software renderers most of a picture's time.
+    // Pixels across each of the window's while something moves: fewer where the machine is too
+    // slow. More than one smooths edges; multisampling costs software renderers most of a picture's
+    // time.
     this.detail = FINEST;
     // Fewer triangles too, where fewer pixels were not enough.
     this.simple = false;

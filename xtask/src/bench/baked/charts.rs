@@ -2,8 +2,7 @@
 
 use occnerf::SplitMetrics;
 
-use super::Pick;
-use super::scores::FIELD;
+use super::scores::{FIELD, Pick};
 use crate::bench::chart::{self, Mark, Panel, Picture, Shape, Style};
 use crate::bench::front::front;
 use crate::scale::Scale;

@@ -16,16 +16,13 @@ use occnerf::{FieldRenderer, Lpips, Model, Scene, SplitMetrics};
 
 pub use self::baking::Baking;
 use self::charts::charted;
-use self::scores::{FIELD, Scores};
+use self::scores::{FIELD, Pick, Scores};
 use self::speed::{growth, rates, speeds};
 use crate::network::load_lpips;
 use crate::process::say;
 use crate::results::{self, Section};
 use crate::run::{RunConfig, peak_rss_bytes, use_threads, write};
 use crate::{pictures, table, train};
-
-/// A score of pictures.
-type Pick = fn(&SplitMetrics) -> Option<f64>;
 
 const MADE: [&str; 7] = ["baked", "seconds", "vertices", "faces", "holes", "double", "peak MiB"];
 /// What the default must not lose.
@@ -38,7 +35,7 @@ const KEPT: [(&str, Pick); 4] = [
 
 #[derive(Args)]
 pub struct BakedArguments {
-    /// Run directories; speeds are of the first
+    /// Run directories: the first is baked in all ways and timed, the others as by default
     #[arg(required = true)]
     runs: Vec<PathBuf>,
     /// Where tables, charts and pictures go
@@ -124,7 +121,8 @@ fn of_run(path: &Path, arguments: &BakedArguments, lpips: Option<&Lpips>, timed:
     let mut scores = Scores::new(&scene, lpips);
     scores.add(FIELD, &mut FieldRenderer::new(&model)?)?;
     let (mut made, mut drawn, mut default) = (vec![MADE.map(str::to_owned).to_vec()], Vec::new(), None);
-    for baking in all(arguments) {
+    let ways = if timed { all(arguments) } else { vec![Baking::default()] };
+    for baking in ways {
         let start = Instant::now();
         let (avatar, report) = bake(&model, Some(&scene), &baking.options())?;
         let seconds = start.elapsed().as_secs_f64();
@@ -146,7 +144,7 @@ fn of_run(path: &Path, arguments: &BakedArguments, lpips: Option<&Lpips>, timed:
                 default = Some(scores.points.len());
             }
             scores.add(&baking.name(Some(report.side)), &mut baking.renderer(&model, &avatar)?)?;
-            if whole && refined && baking.shells == 1 {
+            if timed && whole && refined && baking.shells == 1 {
                 let baking = Baking { vertex_colours: true, ..baking };
                 scores.add(&baking.name(Some(report.side)), &mut baking.renderer(&model, &avatar)?)?;
             }

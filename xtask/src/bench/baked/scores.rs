@@ -8,6 +8,9 @@ use super::agreement::Agreement;
 use crate::pictures;
 use crate::process::note;
 
+/// A score of pictures.
+pub type Pick = fn(&SplitMetrics) -> Option<f64>;
+
 /// What the field's pictures are called.
 pub const FIELD: &str = "field";
 /// Pictures a renderer that are kept to be looked at.
