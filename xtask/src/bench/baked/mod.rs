@@ -26,11 +26,11 @@ use crate::{pictures, table, train};
 
 const MADE: [&str; 7] = ["baked", "seconds", "vertices", "faces", "holes", "double", "peak MiB"];
 /// What the default must not lose.
-const KEPT: [(&str, Pick); 4] = [
-    ("psnr_mask", |m| m.psnr_mask),
-    ("psnr_hidden", |m| m.psnr_hidden),
-    ("ssim_mask", |m| m.ssim_mask),
-    ("lpips", |m| m.lpips_full),
+const KEPT: [(&str, Pick, usize); 4] = [
+    ("psnr_mask", |m| m.psnr_mask, 3),
+    ("psnr_hidden", |m| m.psnr_hidden, 3),
+    ("ssim_mask", |m| m.ssim_mask, 3),
+    ("lpips", |m| m.lpips_full, 4),
 ];
 
 #[derive(Args)]
@@ -104,8 +104,8 @@ impl Found {
     /// What the default keeps of the field's scores.
     fn kept(&self) -> Option<Vec<String>> {
         let (field, baked) = (&self.points.first()?.1, &self.points.get(self.default?)?.1);
-        let cell = |(_, pick): &(&str, Pick)| match (pick(field), pick(baked)) {
-            (Some(from), Some(to)) => format!("{from:.3} → {to:.3}"),
+        let cell = |&(_, pick, digits): &(&str, Pick, usize)| match (pick(field), pick(baked)) {
+            (Some(from), Some(to)) => format!("{from:.digits$} → {to:.digits$}"),
             _ => "–".to_owned(),
         };
         Some([self.name.clone(), self.steps.clone()].into_iter().chain(KEPT.iter().map(cell)).collect())
@@ -169,10 +169,18 @@ fn of_run(path: &Path, arguments: &BakedArguments, lpips: Option<&Lpips>, timed:
     if timed {
         growth(capture, &drawn).write(&out.join("baked-growth"))?;
         let rates = table::aligned(&rates(&drawn), 1);
-        text.push_str("Pictures a second, skinning and light included, fastest of three rounds:\n\n");
-        text.push_str(&(rates + "\n"));
+        text.push_str(&format!(
+            "Pictures a second, skinning and light included, fastest of three rounds{}:\n\n{rates}\n",
+            busy()
+        ));
     }
     Ok(Found { name: capture.clone(), steps, points: scores.points, default, text })
+}
+
+/// What else the machine had to do, where the system says so.
+fn busy() -> String {
+    let load = std::fs::read_to_string("/proc/loadavg").unwrap_or_default();
+    load.split(' ').nth(1).map_or(String::new(), |load| format!("; {load} processes ran or waited at a time"))
 }
 
 /// Every number of shells with every number of refinements, and one surface on smaller atlases.

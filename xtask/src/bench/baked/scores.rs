@@ -72,7 +72,7 @@ impl<'a> Scores<'a> {
             mean(scores.psnr_mask),
             mean(scores.psnr_hidden),
             mean(scores.ssim_mask),
-            mean(scores.lpips_full),
+            scores.lpips_full.map_or("–".to_owned(), |lpips| format!("{lpips:.4}")),
             mean(scores.mask_iou),
             if first { "–".to_owned() } else { format!("{:.2}", agreement.psnr()) },
             format!("{:.3}", agreement.area[1] / agreement.area[0]),
