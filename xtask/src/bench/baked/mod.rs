@@ -12,7 +12,7 @@ use std::time::Instant;
 use anyhow::{Context, Result, ensure};
 use clap::Args;
 use occnerf::bake::bake;
-use occnerf::{FieldRenderer, Lpips, Model, Scene, SplitMetrics};
+use occnerf::{FieldRenderer, Lpips, Model, SplitMetrics};
 
 pub use self::baking::Baking;
 use self::charts::charted;
