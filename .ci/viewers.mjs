@@ -1,5 +1,6 @@
-// The checks of .ci/viewers: node viewers.mjs FOLDER CHROMIUM. FOLDER holds person.glb, person.ply, person.html,
-// movement/ (pictures 0000.png … of every frame on white, and movement.mp4) and node/node_modules.
+// The checks of .ci/viewers: node viewers.mjs FOLDER CHROMIUM. FOLDER holds person.glb, person.ply,
+// person.html, movement/ (pictures 0000.png … of every frame on white, and movement.mp4) and
+// node/node_modules.
 import { execFileSync } from "node:child_process";
 import { existsSync, readFileSync, readdirSync, writeFileSync } from "node:fs";
 import { createRequire } from "node:module";
@@ -48,7 +49,8 @@ async function open(browser, options, address) {
   return { page, problems, requests, close: () => context.close() };
 }
 
-// dB between two PNGs, of the whole picture and of the pixels that either paints; decoded by the browser.
+// dB between two PNGs, of the whole picture and of the pixels that either paints; decoded by the
+// browser.
 function decibels(page, a, b) {
   return page.evaluate(async ([a, b]) => {
     const pixels = async (base64) => {
@@ -78,7 +80,8 @@ function decibels(page, a, b) {
 const text = ({ whole, painted, share }) =>
   `${whole.toFixed(2)} dB (${painted.toFixed(2)} dB on the ${(100 * share).toFixed(0)} % that either paints)`;
 
-// A page that draws the person with three.js through a training camera: window.shot(frame, camera) → PNG.
+// A page that draws the person with three.js through a training camera: window.shot(frame, camera)
+// → PNG.
 const THREE_PAGE = (body) => `<!doctype html><meta charset="utf-8"><link rel="icon" href="data:,">
 <script type="importmap">{"imports":{"three":"/node/node_modules/three/build/three.module.js",
 "three/addons/":"/node/node_modules/three/examples/jsm/","spark":"/node/node_modules/@sparkjsdev/spark/dist/spark.module.js"}}</script>
@@ -243,7 +246,11 @@ async function person(browser) {
       WebGL2RenderingContext.prototype.clear = original;
       return (1000 * count) / (performance.now() - start);
     });
-    check(drawn >= 30, `${width} px: ${drawn.toFixed(1)} pictures a second with software WebGL`);
+    const pixels = await page.evaluate(() => {
+      const { width, height } = document.querySelector("canvas");
+      return `${width} × ${height}`;
+    });
+    check(drawn >= 30, `${width} px: ${drawn.toFixed(1)} pictures a second of ${pixels} with software WebGL, expected 30`);
     await page.screenshot({ path: name("play") });
     await page.keyboard.press(" ");
     await page.evaluate(() => { const s = document.querySelector("#scrub"); s.value = 10; s.dispatchEvent(new Event("input")); });

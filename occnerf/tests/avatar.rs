@@ -66,7 +66,8 @@ fn an_avatar_moves_as_the_prior_that_it_came_from() {
 
 #[test]
 fn a_file_holds_every_bit_and_equal_avatars_are_equal_files() {
-    let avatar = avatar(&scene());
+    let mut avatar = avatar(&scene());
+    avatar.light.slope = Vec3::new(0.1, 0.2, -0.3);
     let (a, b) = (place("a.safetensors"), place("b.safetensors"));
     avatar.save(&a).unwrap();
     let back = Avatar::load(&a).unwrap();
@@ -80,7 +81,7 @@ fn a_fault_of_any_part_is_named_and_never_written() {
     let good = avatar(&scene());
     let clip = good.clips[0].clone();
     type Change<'a> = &'a dyn Fn(&mut Avatar);
-    let changes: [(&str, Change<'_>); 20] = [
+    let changes: [(&str, Change<'_>); 21] = [
         ("vertices", &|a| a.vertices[7].y = f32::NAN),
         ("normals", &|a| a.normals.truncate(1)),
         ("normals", &|a| a.normals[0] = Vec3::splat(3.0)),
@@ -96,6 +97,7 @@ fn a_fault_of_any_part_is_named_and_never_written() {
         ("posedirs", &|a| a.posedirs.offsets[1] = u32::MAX),
         ("rgba", &|a| a.atlas.rgba.truncate(3)),
         ("atlas", &|a| a.atlas.width = 0),
+        ("light", &|a| a.light.slope.x = f32::NAN),
         ("skeleton", &|a| a.skeleton[3].parent = Some(3)),
         ("skeleton", &|a| a.skeleton[3].name = a.skeleton[2].name.clone()),
         ("clips", &|a| a.clips.push(clip.clone())),

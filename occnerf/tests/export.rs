@@ -233,6 +233,19 @@ fn splats_cover_the_surface_without_holes_and_show_its_colours() {
 }
 
 #[test]
+fn splats_are_as_bright_as_the_light_makes_the_surface() {
+    let even = avatar();
+    let mut lit = even.clone();
+    lit.light.slope = Vec3::new(0.0, 0.0, -0.5);
+    let [plain, shaded] = [even, &lit].map(|avatar| splats(avatar, &avatar.vertices, 0.05).unwrap());
+    let normal = |i: usize| plain.rotations[i] * Vec3::Z;
+    for i in (0..plain.centres.len()).step_by(31) {
+        let expected = ((1.0 - 0.5 * normal(i).z) * plain.colors[i]).min(Vec3::ONE);
+        assert!(shaded.colors[i].distance(expected) < 1e-4, "{i}: {} {expected}", shaded.colors[i]);
+    }
+}
+
+#[test]
 fn a_splat_file_has_the_fields_that_viewers_read() {
     let avatar = avatar();
     let splats = splats(avatar, &avatar.vertices, 0.05).unwrap();

@@ -29,6 +29,16 @@ fn run(name: &str) -> PathBuf {
     directory
 }
 
+/// A run of two steps, with a checkpoint and nothing baked.
+fn trained(name: &str) -> PathBuf {
+    let folder = folder(name);
+    let (capture, run) = (folder.join("capture"), folder.join("run"));
+    done(&["synth", "--out", text(&capture), "--size", "32", "--frames", "4", "--eval-cameras", "1"]);
+    let set = ["--preset", "fast", "--steps", "2", "--set", "registration.rounds=0"];
+    done(&[&["train", text(&capture), "--out", text(&run)], &set[..]].concat());
+    run
+}
+
 /// Motion capture of so many joints.
 fn clip(path: &Path, joints: usize) {
     let poses = Data::F32(vec![0.1; 4 * 3 * joints]);
@@ -129,4 +139,32 @@ fn whatever_is_wrong_is_said_in_one_line() {
     glb(run_text, out, &[], &["avatar.safetensors", "not a whole"]);
     std::fs::write(run.join("avatar.safetensors"), b"{}").unwrap();
     refused(&["view", run_text], &["avatar.safetensors"]);
+}
+
+#[test]
+fn a_checkpoint_that_is_damaged_or_gone_is_named_by_all_that_need_it() {
+    let run = trained("export-damaged");
+    let out = run.join("person.glb");
+    let motion = run.join("other.npz");
+    clip(&motion, 31);
+    let drawn = ["render", text(&run), "pose", "--baked", "--motion", text(&motion)];
+    refused(&drawn, &["other.npz", "another skeleton", "24", "31"]);
+    let checkpoint = run.join("checkpoint.safetensors");
+    let whole = std::fs::read(&checkpoint).unwrap();
+    let everyone = |words: &[&str]| {
+        refused(&["export", text(&run), "--format", "glb", "--out", text(&out)], words);
+        refused(&["view", text(&run)], words);
+        refused(&["render", text(&run), "tpose", "--baked"], words);
+        refused(&drawn, words);
+        refused(&["bench", "baked", text(&run), "--out", text(&run.join("bench"))], words);
+        assert!(!out.exists());
+    };
+    // Newer than what was baked of it.
+    std::fs::write(&checkpoint, &whole[..whole.len() / 2]).unwrap();
+    std::fs::remove_file(run.join("avatar.safetensors")).unwrap();
+    everyone(&["checkpoint.safetensors", "not a whole"]);
+    std::fs::write(&checkpoint, b"PK").unwrap();
+    everyone(&["checkpoint.safetensors"]);
+    std::fs::remove_file(&checkpoint).unwrap();
+    everyone(&["checkpoint.safetensors"]);
 }

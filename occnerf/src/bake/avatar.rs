@@ -5,6 +5,8 @@ use rayon::prelude::*;
 use smpl::{MotionClip, Placement, SparseRows};
 use volrender::Camera;
 
+use crate::capture::Light;
+
 /// Most shells of an avatar.
 pub const MAX_SHELLS: usize = 5;
 /// Most joints of an avatar.
@@ -13,6 +15,8 @@ pub const MAX_JOINTS: usize = 256;
 pub const MAX_ATLAS_SIDE: u32 = 4096;
 /// Largest coordinate that is taken for one, in metres.
 const MAX_LENGTH: f32 = 1e6;
+/// Steepest light.
+const MAX_SLOPE: f32 = 10.0;
 /// Pose blend-shape terms of a joint other than the root: the entries of R − I.
 const TERMS_PER_JOINT: usize = 9;
 
@@ -49,6 +53,9 @@ pub struct Avatar {
     pub posedirs: SparseRows<Vec3>,
     /// Colours and confidence.
     pub atlas: Atlas,
+    /// The light that the video was taken in, under which the atlas's colours are what it showed.
+    /// Formats that have none leave it out.
+    pub light: Light,
     /// The skeleton at rest, (J); parents come before their children, joint 0 is the only root.
     pub skeleton: Vec<Joint>,
     /// Shape coefficients of the body model that the surface came from; may be empty.
@@ -232,6 +239,7 @@ impl Avatar {
         all("weights", &self.weights, sums, "numbers of at least 0 that sum to 1")?;
         self.validate_posedirs(TERMS_PER_JOINT * (j - 1))?;
         self.atlas.validate()?;
+        vectors("light", &[self.light.slope], MAX_SLOPE)?;
         self.validate_skeleton()?;
         all("betas", &self.betas, |beta| beta.abs() <= MAX_LENGTH, "finite numbers")?;
         self.validate_motion()

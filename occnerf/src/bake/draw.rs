@@ -5,7 +5,7 @@ use rayon::prelude::*;
 use visibility::{Fragment, Pixel, RasterOptions, Rasterizer, Samples};
 use volrender::Camera;
 
-use super::avatar::Avatar;
+use super::avatar::{Atlas, Avatar};
 use crate::Error;
 use crate::capture::Light;
 use crate::scene::pinhole::pinhole;
@@ -24,8 +24,12 @@ pub struct BakedPerson<'a> {
     scale: f32,
     /// Premultiplied colours, (H, W).
     texels: Vec<Vec4>,
+    /// Premultiplied colours of the vertices, (V); empty where the atlas paints.
+    corners: Vec<Vec4>,
     features: Vec<f32>,
     skinned: Vec<Vec3>,
+    /// Brightness of each vertex, (V).
+    shades: Vec<f32>,
     rasterizer: Rasterizer,
     light: Light,
 }
@@ -43,8 +47,10 @@ impl<'a> BakedPerson<'a> {
             vertices: avatar.vertices.iter().map(|v| scale * v).collect(),
             scale,
             texels: avatar.atlas.rgba.as_chunks().0.iter().map(texel).collect(),
+            corners: Vec::new(),
             features: Vec::new(),
             skinned: Vec::new(),
+            shades: Vec::new(),
             rasterizer: Rasterizer::default(),
             light: Light::default(),
         }
@@ -56,19 +62,29 @@ impl<'a> BakedPerson<'a> {
         Self { light, ..self }
     }
 
+    /// Painted between the colours that the atlas has at the vertices, instead of from all of it.
+    #[must_use]
+    pub fn in_vertex_colours(mut self) -> Self {
+        let size = atlas_size(self.avatar);
+        let colour = |uv: &Vec2| lookup(&self.texels, &self.avatar.atlas, *uv * size);
+        self.corners = self.avatar.uvs.iter().map(colour).collect();
+        self
+    }
+
     /// World positions of the vertices, (V): pose blend shapes, then linear blend skinning by
     /// `bones` (J), canonical to world.
     ///
     /// # Panics
     /// Unless there are J bones.
     pub fn skin(&mut self, bones: &[Affine3A]) -> &[Vec3] {
-        let Self { avatar, vertices, scale, features, skinned, .. } = self;
+        let Self { avatar, vertices, scale, features, skinned, shades, light, .. } = self;
         assert_eq!(bones.len(), avatar.num_joints(), "skin: bones");
         blend_shape_features(avatar, bones, *scale, features);
         skinned.resize(vertices.len(), Vec3::ZERO);
-        let rows = skinned.par_chunks_mut(CHUNK).enumerate();
-        rows.for_each(|(chunk, out)| {
-            for (v, out) in (chunk * CHUNK..).zip(out) {
+        shades.resize(vertices.len(), 1.0);
+        let rows = skinned.par_chunks_mut(CHUNK).zip(shades.par_chunks_mut(CHUNK)).enumerate();
+        rows.for_each(|(chunk, (out, shades))| {
+            for (v, (out, shade)) in (chunk * CHUNK..).zip(out.iter_mut().zip(shades)) {
                 let (mut matrix, mut translation) = (Mat3A::ZERO, Vec3A::ZERO);
                 for (joint, weight) in avatar.joints[v].into_iter().zip(avatar.weights[v]) {
                     let bone = &bones[usize::from(joint)];
@@ -80,9 +96,17 @@ impl<'a> BakedPerson<'a> {
                     rest += features[term] * Vec3A::from(direction);
                 }
                 *out = Vec3::from(matrix * rest + translation);
+                // Turned with the bones, so that charts of the atlas share them at their seams.
+                let normal = avatar.normals[v];
+                *shade = light.on(Vec3::from(matrix * Vec3A::from(normal)).normalize_or(normal));
             }
         });
         skinned
+    }
+
+    /// Positions (V) and brightness (V) of the vertices as they were last skinned.
+    pub(super) fn posed(&self) -> (&[Vec3], &[f32]) {
+        (&self.skinned, &self.shades)
     }
 
     /// The person in the pose of `bones` (J) as `camera` sees them: premultiplied colour and
@@ -101,12 +125,10 @@ impl<'a> BakedPerson<'a> {
         out: &mut [Vec4],
     ) -> Result<(), Error> {
         self.skin(bones);
-        let Self { avatar, texels, skinned, rasterizer, scale, light, .. } = self;
+        let Self { avatar, texels, corners, skinned, shades, rasterizer, scale, .. } = self;
         let options = RasterOptions { samples, cull_back: true, near: 1e-3 * *scale };
         let shells: Vec<&[[u32; 3]]> = (0..avatar.shell_ends.len()).map(|shell| avatar.shell(shell)).collect();
-        let shades = &light.on_surface(skinned, &avatar.faces);
-        let paint =
-            Paint { avatar, texels, shades, size: Vec2::new(avatar.atlas.width as f32, avatar.atlas.height as f32) };
+        let paint = Paint { avatar, texels, corners, shades, size: atlas_size(avatar) };
         let shade = |pixel: Pixel<'_>| {
             let samples = pixel.samples();
             let count = samples.len();
@@ -120,13 +142,26 @@ impl<'a> BakedPerson<'a> {
     }
 }
 
-/// Brightness of a fragment between those of its corners; 1 without.
+/// Brightness of a fragment between those of its corners.
+#[inline]
 pub(super) fn shade(avatar: &Avatar, shades: &[f32], fragment: &Fragment) -> f32 {
-    if shades.is_empty() {
-        return 1.0;
-    }
+    between(avatar, fragment, |v| shades[v])
+}
+
+/// What a fragment has between its corners.
+#[inline]
+fn between<T>(avatar: &Avatar, fragment: &Fragment, of: impl Fn(usize) -> T) -> T
+where
+    T: std::iter::Sum<T>,
+    f32: std::ops::Mul<T, Output = T>,
+{
     let corners = avatar.faces[fragment.face as usize];
-    corners.iter().zip(fragment.barycentric).map(|(&v, b)| b * shades[v as usize]).sum()
+    corners.iter().zip(fragment.barycentric).map(|(&v, b)| b * of(v as usize)).sum()
+}
+
+/// Texels to the right and down.
+fn atlas_size(avatar: &Avatar) -> Vec2 {
+    Vec2::new(avatar.atlas.width as f32, avatar.atlas.height as f32)
 }
 
 /// R − I of each joint but the root relative to its parent, in units of `scale`.
@@ -144,7 +179,9 @@ fn blend_shape_features(avatar: &Avatar, bones: &[Affine3A], scale: f32, out: &m
 struct Paint<'a> {
     avatar: &'a Avatar,
     texels: &'a [Vec4],
-    /// Of each vertex; empty under even light.
+    /// Of each vertex; empty where the atlas paints.
+    corners: &'a [Vec4],
+    /// Of each vertex.
     shades: &'a [f32],
     /// Of the atlas.
     size: Vec2,
@@ -156,28 +193,31 @@ impl Paint<'_> {
     fn composite(&self, sample: &[Fragment]) -> Vec4 {
         let mut sum = Vec4::ZERO;
         for fragment in sample {
-            let colour = self.lookup(atlas_place(self.avatar, fragment) * self.size);
+            let colour = if self.corners.is_empty() {
+                lookup(self.texels, &self.avatar.atlas, atlas_place(self.avatar, fragment) * self.size)
+            } else {
+                between(self.avatar, fragment, |v| self.corners[v])
+            };
             let lit = (shade(self.avatar, self.shades, fragment) * colour.truncate()).min(Vec3::splat(colour.w));
             sum += (1.0 - sum.w) * lit.extend(colour.w);
         }
         sum
     }
+}
 
-    /// Between the middles of four texels.
-    #[inline]
-    fn lookup(&self, place: Vec2) -> Vec4 {
-        let corner = BilinearCorner::new(place, self.size);
-        let [a, b, c, d] = corner.texels(self.avatar.atlas.width, self.avatar.atlas.height).map(|i| self.texels[i]);
-        let (top, bottom) = (a + (b - a) * corner.share.x, c + (d - c) * corner.share.x);
-        top + (bottom - top) * corner.share.y
-    }
+/// Between the middles of the four texels about `place`, in texels.
+#[inline]
+fn lookup(texels: &[Vec4], atlas: &Atlas, place: Vec2) -> Vec4 {
+    let corner = BilinearCorner::new(place, Vec2::new(atlas.width as f32, atlas.height as f32));
+    let [a, b, c, d] = corner.texels(atlas.width, atlas.height).map(|i| texels[i]);
+    let (top, bottom) = (a + (b - a) * corner.share.x, c + (d - c) * corner.share.x);
+    top + (bottom - top) * corner.share.y
 }
 
 /// Where a fragment is in the atlas, 0 to 1.
 #[inline]
 pub(super) fn atlas_place(avatar: &Avatar, fragment: &Fragment) -> Vec2 {
-    let corners = avatar.faces[fragment.face as usize];
-    corners.iter().zip(fragment.barycentric).map(|(&v, b)| b * avatar.uvs[v as usize]).sum()
+    between(avatar, fragment, |v| avatar.uvs[v])
 }
 
 /// The first of the four texels about a place, and how far towards the others it is.

@@ -18,6 +18,7 @@ use super::skeleton::skeleton;
 use super::subdivide::{Anchor, Subdivided, normals};
 use super::surface::{Normal, SurfaceReport, heights, normals_of};
 use crate::Error;
+use crate::capture::Light;
 use crate::model::body::Body;
 use crate::model::trained::Model;
 use crate::model::view::PosedView;
@@ -100,6 +101,7 @@ pub fn bake(model: &Model, scene: Option<&Scene>, options: &BakeOptions) -> Resu
     let vertices = model.body.canonical.vertices.len();
     let seen = scene.map_or_else(|| Ok(vec![1.0; vertices]), seen)?;
     let (mut avatar, mut report) = surface(&model.body, &TrainedField::new(model), &seen, pixel, options)?;
+    avatar.light.slope = turn_upright(model.up()) * model.light().slope;
     (avatar.clips, avatar.cameras) = motion(model, &avatar, options.fps);
     if let Some(scene) = scene {
         avatar.name.clone_from(&scene.name);
@@ -179,6 +181,7 @@ pub(super) fn surface(
         weights,
         posedirs: SparseRows::from_rows(posedirs),
         atlas,
+        light: Light::default(),
         skeleton: skeleton(&body.model.parents, &rest),
         betas: body.mean_betas.clone(),
         clips: Vec::new(),

@@ -1,7 +1,7 @@
 //! The texture, drawn towards the training pictures through the rasteriser.
 
 use glam::{Vec2, Vec3, Vec4};
-use visibility::{Pixel, RasterOptions, Rasterizer};
+use visibility::{Pixel, RasterOptions, Rasterizer, Samples};
 
 use super::avatar::{Atlas, Avatar};
 use super::draw::{BakedPerson, BilinearCorner, atlas_place, shade};
@@ -15,7 +15,7 @@ use crate::scene::prepared::{PreparedFrame, Scene};
 const PRIOR: f32 = 0.3;
 
 /// Training pixels that are looked at, at most; of more, every n-th.
-const MAX_PIXELS: usize = 1 << 20;
+const MAX_PIXELS: usize = 1 << 19;
 
 /// Four texels of a shell and how much of each a pixel shows.
 type Look = ([u32; 4], [f32; 4]);
@@ -36,7 +36,7 @@ pub(super) fn refine(model: &Model, scene: &Scene, avatar: &mut Avatar, passes: 
     let mut person = BakedPerson::new(avatar, model.body.scale).lit_by(model.base.light);
     let mut all = Vec::new();
     for frame in frames {
-        all.extend(sights(model, avatar, &mut person, frame, stride)?);
+        all.extend(sights(avatar, &mut person, frame, stride)?);
     }
     let Atlas { rgba, .. } = &mut avatar.atlas;
     let start: Vec<Vec3> = rgba.as_chunks::<4>().0.iter().map(|&[r, g, b, _]| colour([r, g, b])).collect();
@@ -72,28 +72,32 @@ fn colour(bytes: [u8; 3]) -> Vec3 {
 
 /// The subject's pixels of a frame that look at the surface well away from its outline.
 fn sights(
-    model: &Model,
     avatar: &Avatar,
     person: &mut BakedPerson<'_>,
     frame: &PreparedFrame,
     stride: usize,
 ) -> Result<Vec<Sight>, Error> {
     let pixels = frame.pixels()?;
-    let vertices = person.skin(&frame.view.posed.bones);
-    let shades = model.base.light.on_surface(vertices, &avatar.faces);
-    let options = RasterOptions { cull_back: true, near: 1e-3, ..RasterOptions::default() };
+    person.skin(&frame.view.posed.bones);
+    let (vertices, shades) = person.posed();
+    // As pixels are drawn by default, so that the texture makes up for their width.
+    let options = RasterOptions { samples: Samples::Four, cull_back: true, near: 1e-3 };
     let shells: Vec<&[[u32; 3]]> = (0..avatar.shell_ends.len()).map(|shell| avatar.shell(shell)).collect();
     let look = |pixel: Pixel<'_>| {
         let i = pixel.index;
         // Edge pixels are mixed with the background.
         let wanted = i.is_multiple_of(stride) && frame.labels.at(i as u32) == Label::Subject && pixels.mask[i] >= 0.99;
-        let fragments = pixel.samples().next().filter(|fragments| wanted && !fragments.is_empty())?;
-        let mut before = 1.0;
-        let look = |fragment| look(avatar, atlas_place(avatar, fragment), &mut before);
-        Some(Sight {
-            colour: Vec3::from_slice(&pixels.image.pixels[3 * i..]) / shade(avatar, &shades, &fragments[0]),
-            looks: fragments.iter().map(look).collect(),
-        })
+        let count = pixel.samples().len();
+        if !wanted || count == 0 || pixel.samples().any(<[_]>::is_empty) {
+            return None;
+        }
+        let share = 1.0 / count as f32;
+        let brightness: f32 = pixel.samples().map(|fragments| share * shade(avatar, shades, &fragments[0])).sum();
+        let looks = pixel.samples().flat_map(|fragments| {
+            let mut before = share;
+            fragments.iter().map(move |fragment| look(avatar, atlas_place(avatar, fragment), &mut before))
+        });
+        Some(Sight { colour: Vec3::from_slice(&pixels.image.pixels[3 * i..]) / brightness, looks: looks.collect() })
     };
     let mut out: Vec<Option<Sight>> = Vec::new();
     out.resize_with(pixels.mask.len(), || None);

@@ -119,6 +119,12 @@ impl<'a> BakedRenderer<'a> {
         let person = BakedPerson::new(avatar, model.body.scale).lit_by(model.base.light);
         Ok(Self { person, samples, pixels: Vec::new() })
     }
+
+    /// As [`BakedPerson::in_vertex_colours`].
+    #[must_use]
+    pub fn in_vertex_colours(self) -> Self {
+        Self { person: self.person.in_vertex_colours(), ..self }
+    }
 }
 
 impl Renderer for BakedRenderer<'_> {

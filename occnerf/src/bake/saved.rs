@@ -11,6 +11,7 @@ use volrender::Camera;
 
 use super::avatar::{Atlas, Avatar, Clip, Joint};
 use crate::Error;
+use crate::capture::Light;
 
 const FORMAT: &str = "occnerf-avatar";
 const VERSION: u32 = 1;
@@ -26,6 +27,9 @@ struct Header {
     version: u32,
     name: String,
     joints: Vec<String>,
+    /// Slope; even where it is missing.
+    #[serde(default)]
+    light: [f32; 3],
     clips: Vec<(String, f32)>,
 }
 
@@ -46,6 +50,7 @@ impl Avatar {
             version: VERSION,
             name: self.name.clone(),
             joints: self.skeleton.iter().map(|joint| joint.name.clone()).collect(),
+            light: self.light.slope.to_array(),
             clips: self.clips.iter().map(|clip| (clip.name.clone(), clip.motion.fps)).collect(),
         };
         let header = serde_json::to_string(&header).map_err(|e| file(path, format!("header: {e}")))?;
@@ -177,6 +182,7 @@ fn parse(bytes: &[u8]) -> Result<Avatar, String> {
             rgba: bytes("atlas.rgba", &[Some(height), Some(width), Some(4)])?,
             confidence: bytes("atlas.confidence", &[None, None])?,
         },
+        light: Light { slope: header.light.into() },
         skeleton: skeleton?,
         betas: source.floats("betas", &[None])?,
         clips: clips?,

@@ -233,6 +233,7 @@ fn square(rgba: &[[u8; 4]], width: u32) -> Avatar {
             confidence: vec![255; rgba.len()],
         },
         skeleton: skeleton(&[None], &[Vec3::ZERO]),
+        light: Light::default(),
         betas: Vec::new(),
         clips: Vec::new(),
         cameras: Vec::new(),
@@ -300,6 +301,23 @@ fn a_light_is_as_bright_as_the_surface_is_turned_to_it_and_no_brighter_than_whit
         let expected = (albedo * (1.0 + slope * degrees.to_radians().cos())).min(Vec3::ONE).extend(1.0);
         assert!((out[40] - expected).abs().max_element() < 1e-4, "{degrees} {slope}: {} {expected}", out[40]);
     }
+}
+
+#[test]
+fn colours_at_the_vertices_are_interpolated_over_the_faces() {
+    // A column a corner; the atlas's own middle is grey.
+    let mut avatar = square(&[[255, 0, 0, 255], [99, 99, 99, 255], [0, 0, 255, 255]], 3);
+    let between = |avatar: &Avatar, at: usize| {
+        let mut out = vec![Vec4::ZERO; 81];
+        let mut person = BakedPerson::new(avatar, 1.0).in_vertex_colours();
+        person.draw(&[Affine3A::IDENTITY], &in_front(9), Samples::One, &mut out).unwrap();
+        out[at]
+    };
+    assert!((between(&avatar, 40) - Vec4::new(0.5, 0.0, 0.5, 1.0)).abs().max_element() < 1e-4);
+    // Where the atlas is of one colour it makes no difference.
+    avatar.atlas.rgba = [51, 102, 204, 255].repeat(3);
+    let whole = picture(&avatar, &[Affine3A::IDENTITY], 9, Samples::One);
+    assert!([0, 13, 40, 80].into_iter().all(|at| (between(&avatar, at) - whole[at]).abs().max_element() < 1e-5));
 }
 
 #[test]

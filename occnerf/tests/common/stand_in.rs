@@ -2,6 +2,7 @@
 
 use glam::{Affine3A, Vec2, Vec3};
 use occnerf::bake::{Atlas, Avatar, Clip, motion_of_bones, skeleton, turn_upright};
+use occnerf::capture::Light;
 use occnerf::{Scene, VertexColors, upright};
 use volrender::Camera;
 
@@ -103,6 +104,7 @@ pub fn stand_in(scene: &Scene, colors: &VertexColors) -> Avatar {
         weights,
         posedirs,
         atlas,
+        light: Light::default(),
         skeleton,
         betas: body.mean_betas.clone(),
         clips: vec![Clip { name: "video".to_owned(), motion }],

@@ -62,7 +62,7 @@ impl Level {
             level: Some(self.value),
             kind: if self.easy { Kind::Base } else { Kind::Level },
             command: None,
-            job: Job { place: self.place.clone(), views: VIEWS, config, prune: false },
+            job: Job { place: self.place.clone(), views: VIEWS, config, prune: false, bake: None },
         }
     }
 }

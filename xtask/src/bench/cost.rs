@@ -97,7 +97,7 @@ pub fn run(bench: &mut Bench, out: &Path) -> Result<String> {
 
 fn point(name: String, factor: &str, config: Config, difficulty: Difficulty) -> Point {
     let place = Place::Made(difficulty);
-    let job = Job { place, views: 1, config, prune: false };
+    let job = Job { place, views: 1, config, prune: false, bake: None };
     Point {
         bench: "cost".to_owned(),
         name,

@@ -7,6 +7,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, bail};
 use glam::Vec3;
+use occnerf::bake::bake;
 use occnerf::capture::{Capture, LoadOptions};
 use occnerf::{
     Config, FieldRenderer, Method, PreparedFrame, PriorRenderer, Renderer, Scene, StepTimes, Trainer, VertexColors,
@@ -15,6 +16,7 @@ use occnerf::{
 use serde::{Deserialize, Serialize};
 use smpl::BodyModel;
 
+use super::baked::Baking;
 use super::difficulty::Difficulty;
 use crate::process::{Ending, Guard, say};
 use crate::run::peak_rss_bytes;
@@ -63,6 +65,9 @@ pub struct Job {
     /// Whether the trained model is pruned.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub prune: bool,
+    /// How the trained person is baked: what is scored then, instead of the field.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub bake: Option<Baking>,
 }
 
 /// What came of it; all zero or none where there is an error.
@@ -72,6 +77,7 @@ pub struct Outcome {
     pub error: Option<String>,
     /// From the capture to the first step.
     pub prepare_seconds: f64,
+    /// Pruning and baking included.
     pub train_seconds: f64,
     pub seconds_per_frame: f64,
     pub psnr_mask: Option<f64>,
@@ -124,16 +130,21 @@ pub fn measure(job: &Job) -> Result<Outcome> {
             outcome.bad_gradients += report.bad_gradients;
             outcome.live_samples += report.live_samples as f64 / job.config.steps as f64;
         }
-        outcome.train_seconds = start.elapsed().as_secs_f64();
         if job.prune {
             trainer.prune();
         }
+        let model = trainer.into_model();
+        let baked = job.bake.map(|baking| bake(&model, Some(&scene), &baking.options())).transpose()?;
+        outcome.train_seconds = start.elapsed().as_secs_f64();
         seconds.sort_by(f64::total_cmp);
         outcome.step_seconds = seconds.get(seconds.len() / 2).copied().unwrap_or(0.0);
         let mean = |total: f64| total / seconds.len().max(1) as f64;
         outcome.stages = times.stages().map(|(name, total)| (name.to_owned(), mean(total))).to_vec();
-        outcome.parameters = trainer.model().num_parameters();
-        score(&scene, &mut FieldRenderer::new(trainer.model())?, &mut outcome)?;
+        outcome.parameters = model.num_parameters();
+        match job.bake.zip(baked) {
+            Some((baking, (avatar, _))) => score(&scene, &mut baking.renderer(&model, &avatar)?, &mut outcome)?,
+            None => score(&scene, &mut FieldRenderer::new(&model)?, &mut outcome)?,
+        }
     }
     outcome.peak_rss_bytes = peak_rss_bytes();
     Ok(outcome)

@@ -33,6 +33,7 @@ fn style(line: &Line) -> Style {
         Kind::Combination => Style(3, Shape::Circle),
         Kind::Preset | Kind::Auto => Style(2, Shape::Triangle),
         Kind::Baseline => Style(1, Shape::Ring),
+        Kind::Baked => Style(4, Shape::Circle),
     }
 }
 
@@ -64,6 +65,7 @@ pub fn charts(scene: &str, lines: &[Line], stem: &Path) -> Result<()> {
         ("combination", Style(3, Shape::Circle)),
         ("preset", Style(2, Shape::Triangle)),
         ("other method", Style(1, Shape::Ring)),
+        ("baked", Style(4, Shape::Circle)),
     ];
     for (suffix, label, cost) in COSTS {
         let mut panels = Vec::new();

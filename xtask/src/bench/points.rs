@@ -3,6 +3,7 @@
 use anyhow::Result;
 use occnerf::{Config, Method, Preset};
 
+use super::baked::Baking;
 use super::job::{Job, Place};
 use super::runner::{Kind, Line, Point};
 use crate::settings;
@@ -50,6 +51,24 @@ pub const CHANGES: [Change; 22] = [
     change("rates", "rates / 3", &["rates.field=2e-3", "rates.table=1e-2"], true),
     change("loss", "no perceptual term", &["loss.perceptual=0"], true),
     change("surface term", "no surface term", &["surface.surface_term=false", "surface.attention=false"], true),
+];
+
+const fn baked(shells: usize, atlas: u32, vertex_colours: bool, smooth: bool) -> Baking {
+    Baking { shells, atlas, refinements: 4, vertex_colours, smooth }
+}
+
+/// Ways to bake the base, and whether the quick form has them; the first is what `render --baked`
+/// draws.
+const BAKED: [(Baking, bool); 9] = [
+    (baked(1, 2048, false, true), true),
+    (baked(1, 2048, false, false), true),
+    (baked(1, 2048, true, true), false),
+    (baked(1, 256, false, true), false),
+    (baked(1, 128, false, true), false),
+    (baked(3, 2048, false, true), true),
+    (baked(3, 2048, false, false), false),
+    (baked(5, 2048, false, true), false),
+    (baked(5, 2048, false, false), false),
 ];
 
 /// A change that loses less than this, in dB, can be part of the lean combination, and one that
@@ -104,7 +123,7 @@ impl Sweep {
             level: None,
             kind,
             command: Some(command),
-            job: Job { place: self.place.clone(), views: self.views, config, prune: false },
+            job: Job { place: self.place.clone(), views: self.views, config, prune: false, bake: None },
         })
     }
 
@@ -127,6 +146,11 @@ impl Sweep {
         for change in CHANGES.iter().filter(|c| c.quick || !self.quick) {
             points.push(own(Kind::Change, change.factor, change.name, Method::Occnerf, steps, change.set)?);
         }
+        for &(baking, _) in BAKED.iter().filter(|b| b.1 || !self.quick) {
+            let mut point = own(Kind::Baked, "baked", &baking.name(None), Method::Occnerf, steps, &[])?;
+            (point.job.bake, point.command) = (Some(baking), None);
+            points.push(point);
+        }
         // A hundredth of the paper's steps: all of them take longer than the rest of the sweep.
         for (preset, divisor) in [(Preset::Fast, 1), (Preset::Balanced, 1), (Preset::Paper, 100)] {
             let whole = Config::preset(preset, Method::Occnerf).steps;
@@ -139,8 +163,10 @@ impl Sweep {
             let setting = Setting { preset, method: Method::Occnerf, steps, set: &[] };
             let point = self.point(&name, "preset", Kind::Preset, &setting)?;
             // Presets that differ by their steps alone are the base, and a change of its steps.
-            let same =
-                |p: &&mut Point| p.job.config == Config { preset: p.job.config.preset, ..point.job.config.clone() };
+            let same = |p: &&mut Point| {
+                p.job.bake.is_none()
+                    && p.job.config == Config { preset: p.job.config.preset, ..point.job.config.clone() }
+            };
             match points.iter_mut().find(same) {
                 Some(same) => {
                     same.name = format!("{name} ({})", same.name);
@@ -223,7 +249,8 @@ mod tests {
             assert!(fast <= if quick { 15 } else { 25 }, "{fast}");
             for (i, a) in points.iter().enumerate() {
                 assert!(points[..i].iter().all(|b| b.name != a.name && b.job != a.job), "{}", a.name);
-                assert!(a.command.as_ref().unwrap().contains(a.job.config.method.name()));
+                assert!(a.command.as_ref().is_none_or(|c| c.contains(a.job.config.method.name())));
+                assert!(a.command.is_some() || a.job.bake.is_some());
             }
             for (preset, kind) in [("fast", Kind::Base), ("balanced", Kind::Preset), ("paper", Kind::Preset)] {
                 assert!(points.iter().any(|p| p.kind == kind && p.name.starts_with(preset)), "{preset}");
@@ -232,6 +259,18 @@ mod tests {
                 points.iter().any(|p| p.name == "balanced (twice the steps)")
                     && points.iter().all(|p| p.name != "balanced")
             );
+        }
+    }
+
+    #[test]
+    fn the_first_baked_point_is_what_render_draws_and_all_are_of_the_base() {
+        assert_eq!(BAKED[0], (Baking::default(), true));
+        for (quick, count) in [(false, BAKED.len()), (true, BAKED.iter().filter(|b| b.1).count())] {
+            let points = sweep(quick).first().unwrap();
+            let base = points.iter().find(|p| p.kind == Kind::Base).unwrap();
+            let baked: Vec<&Point> = points.iter().filter(|p| p.kind == Kind::Baked).collect();
+            assert_eq!(baked.len(), count);
+            assert!(baked.iter().all(|p| p.job.config == base.job.config && p.job.bake.is_some()));
         }
     }
 

@@ -32,6 +32,8 @@ pub enum Kind {
     Auto,
     /// Another method.
     Baseline,
+    /// The base, baked.
+    Baked,
     /// A level of difficulty.
     Level,
 }
@@ -258,7 +260,7 @@ pub mod tests {
             level: Some(1.0),
             kind,
             command: Some("cargo xtask train".to_owned()),
-            job: Job { place: Place::Made(Difficulty::default()), views: 3, config, prune: false },
+            job: Job { place: Place::Made(Difficulty::default()), views: 3, config, prune: false, bake: None },
         };
         let (psnr_mask, psnr_hidden) = (Some(psnr), Some(psnr));
         let outcome = Outcome {

@@ -5,33 +5,40 @@ layout(location = 0) in vec3 position;
 layout(location = 1) in vec2 uv;
 layout(location = 2) in uvec4 joints;
 layout(location = 3) in vec4 weights;
+layout(location = 4) in vec3 normal;
 // Three rows a joint; what every device has room for is 256 joints.
 layout(std140) uniform Bones { vec4 bones[768]; };
 uniform mat4 camera;
-out vec2 at;
+uniform vec3 light;
+out vec3 at;
 void main() {
-  vec4 rest = vec4(position, 1.0);
-  vec3 world = vec3(0.0);
+  // Rows of the blended bone.
+  vec4 x = vec4(0.0), y = vec4(0.0), z = vec4(0.0);
   for (int i = 0; i < 4; i++) {
     int row = 3 * int(joints[i]);
-    world += weights[i] * vec3(dot(bones[row], rest), dot(bones[row + 1], rest), dot(bones[row + 2], rest));
+    x += weights[i] * bones[row];
+    y += weights[i] * bones[row + 1];
+    z += weights[i] * bones[row + 2];
   }
-  gl_Position = camera * vec4(world, 1.0);
-  at = uv;
+  vec4 rest = vec4(position, 1.0);
+  gl_Position = camera * vec4(dot(x, rest), dot(y, rest), dot(z, rest), 1.0);
+  vec3 turned = vec3(dot(x.xyz, normal), dot(y.xyz, normal), dot(z.xyz, normal));
+  // As brightness is in training: black would say nothing of the colour.
+  at = vec3(uv, max(1.0 + dot(light, turned) * inversesqrt(max(dot(turned, turned), 1e-12)), 0.2));
 }`;
 const TEXTURED = `#version 300 es
 precision mediump float;
-in highp vec2 at;
+in highp vec3 at;
 uniform sampler2D atlas;
 uniform sampler2D confidence;
 uniform float shown;
 uniform float opaque;
 out vec4 color;
 void main() {
-  vec4 texel = texture(atlas, at);
-  float sure = texture(confidence, at).r;
-  vec3 marked = mix(vec3(0.93, 0.45, 0.1), texel.rgb, 0.25 + 0.75 * sure);
-  color = vec4(mix(texel.rgb, marked, shown), max(texel.a, opaque));
+  vec4 texel = texture(atlas, at.xy);
+  vec3 lit = texel.rgb * at.z;
+  if (shown > 0.0) lit = mix(vec3(0.93, 0.45, 0.1), lit, 0.25 + 0.75 * texture(confidence, at.xy).r);
+  color = vec4(lit, max(texel.a, opaque));
 }`;
 const LINE = `#version 300 es
 layout(location = 0) in vec3 position;
@@ -49,11 +56,13 @@ out vec4 color;
 void main() { color = shade; }`;
 
 class Scene {
-  constructor(canvas, person) {
+  // `light`: where surfaces are brightest, and by how much of the mean.
+  constructor(canvas, person, light) {
     const gl = canvas.getContext("webgl2", { antialias: false, alpha: false });
     if (!gl) throw new Error("This browser has no WebGL 2.");
     this.gl = gl;
     this.person = person;
+    this.light = light;
     this.skinned = program(gl, SKINNED, TEXTURED);
     this.plain = program(gl, LINE, TINTED);
     this.surface = gl.createVertexArray();
@@ -65,6 +74,7 @@ class Scene {
     gl.enableVertexAttribArray(2);
     gl.vertexAttribIPointer(2, 4, gl.UNSIGNED_BYTE, 0, 0);
     attribute(gl, 3, person.weights, 4, gl.UNSIGNED_SHORT, true);
+    attribute(gl, 4, person.normals, 3, gl.FLOAT);
     const upload = (indices) => {
       const buffer = gl.createBuffer();
       gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, buffer);
@@ -99,8 +109,8 @@ class Scene {
     gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA, gl.RGBA, gl.UNSIGNED_BYTE, confidence);
   }
 
-  // `ground` and the lines' colours are [r, g, b, a] from 0 to 1; `segments` 7 numbers a line end; `simple` draws a
-  // quarter of the triangles, where there are such.
+  // `ground` and the lines' colours are [r, g, b, a] from 0 to 1; `segments` 7 numbers a line end;
+  // `simple` draws a quarter of the triangles, where there are such.
   draw(camera, ground, segments, marksConfidence, simple) {
     const gl = this.gl;
     gl.viewport(0, 0, gl.drawingBufferWidth, gl.drawingBufferHeight);
@@ -121,6 +131,7 @@ class Scene {
     gl.uniform1i(this.skinned.at("confidence"), 2);
     gl.uniform1f(this.skinned.at("shown"), marksConfidence ? 1 : 0);
     gl.uniformMatrix4fv(this.skinned.at("camera"), false, camera);
+    gl.uniform3fv(this.skinned.at("light"), this.light);
     gl.bindVertexArray(this.surface);
     gl.enable(gl.CULL_FACE);
     this.shells.forEach((levels, at) => {
@@ -148,7 +159,8 @@ class Scene {
   }
 }
 
-// Each four triangles that one was divided into as that one; as they are where they are something else.
+// Each four triangles that one was divided into as that one; as they are where they are something
+// else.
 function merged(indices) {
   if (indices.length % 12) return indices;
   const out = new indices.constructor(indices.length / 4);

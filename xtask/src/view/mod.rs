@@ -53,6 +53,7 @@ pub fn page(person: &Avatar) -> Result<String> {
     let shells = person.shell_ends.len();
     let extra = json!({
         "cameras": person.cameras.iter().map(camera).collect::<Vec<_>>(),
+        "light": person.light.slope.to_array(),
         "confidence": STANDARD.encode(person.atlas.confidence_to_png()?),
     });
     let facts = format!(

@@ -12,14 +12,15 @@ class Page {
     this.person = person;
     this.cameras = extra.cameras;
     this.canvas = element("view");
-    this.scene = new Scene(this.canvas, person);
+    this.scene = new Scene(this.canvas, person, extra.light);
     this.clip = null;
     this.frame = 0;
     this.playing = false;
     this.stale = true;
     this.before = 0;
-    // Pixels across each of the window's while something moves: fewer where the machine is too slow. More than one
-    // smooths edges; multisampling costs software renderers most of a picture's time.
+    // Pixels across each of the window's while something moves: fewer where the machine is too
+    // slow. More than one smooths edges; multisampling costs software renderers most of a picture's
+    // time.
     this.detail = FINEST;
     // Fewer triangles too, where fewer pixels were not enough.
     this.simple = false;

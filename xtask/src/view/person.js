@@ -38,6 +38,7 @@ class Person {
     const primitives = this.json.meshes[0].primitives;
     const attributes = primitives[0].attributes;
     this.positions = this.array(attributes.POSITION);
+    this.normals = this.array(attributes.NORMAL);
     this.uvs = this.array(attributes.TEXCOORD_0);
     this.joints = this.array(attributes.JOINTS_0);
     this.weights = this.array(attributes.WEIGHTS_0);

@@ -26,7 +26,7 @@ const MOST: usize = 4_000_000;
 pub struct Splats {
     /// Centres, metres, y up, (N).
     pub centres: Vec<Vec3>,
-    /// sRGB in [0, 1], (N).
+    /// sRGB in [0, 1] under the avatar's light, (N).
     pub colors: Vec<Vec3>,
     /// Standard deviations along the three axes, metres, (N).
     pub scales: Vec<Vec3>,
@@ -98,7 +98,7 @@ impl Splats {
         let small = deviation(mean - root).max(0.25 * large);
         let uv = (corners[0].1 + corners[1].1 + corners[2].1) / 3.0;
         self.centres.push(centre);
-        self.colors.push(avatar.atlas.color(uv));
+        self.colors.push((avatar.light.on(normal) * avatar.atlas.color(uv)).min(Vec3::ONE));
         self.scales.push(Vec3::new(large, small, THICKNESS.min(small)));
         self.rotations.push(Quat::from_mat3(&Mat3::from_cols(first, normal.cross(first), normal)).normalize());
     }
