@@ -36,8 +36,11 @@ impl Frame {
     }
 
     /// Makes the mask smaller by so many pixels all around, and the picture with it.
-    pub(crate) fn shrink_mask(&mut self, pixels: u32) {
-        self.source.edit(Edit::Grow(-i32::try_from(pixels).unwrap_or(i32::MAX)));
+    ///
+    /// # Errors
+    /// As of [`Frame::pixels`].
+    pub(crate) fn shrink_mask(&mut self, pixels: u32) -> Result<(), CaptureError> {
+        self.source.edit(Edit::Grow(-i32::try_from(pixels).unwrap_or(i32::MAX)))
     }
 }
 

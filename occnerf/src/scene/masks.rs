@@ -27,8 +27,8 @@ const OUTSTANDING: f64 = 1.6;
 /// Pictures that cannot be read.
 pub(crate) fn trim(capture: &mut Capture) -> Result<(), Error> {
     let excess = excess(&capture.train)?;
-    if excess > 0 {
-        capture.train.iter_mut().for_each(|frame| frame.shrink_mask(excess));
+    for frame in capture.train.iter_mut().filter(|_| excess > 0) {
+        frame.shrink_mask(excess)?;
     }
     Ok(())
 }

@@ -5,7 +5,7 @@ use std::path::Path;
 
 use glam::{Affine3A, Mat3, Vec2, Vec3};
 use occnerf::bake::{Atlas, Avatar, Clip, Joint};
-use occnerf::capture::{LoadOptions, load_capture};
+use occnerf::capture::{Light, LoadOptions, load_capture};
 use occnerf::{Config, Method, Person, Preset, VertexColors};
 use smpl::{MotionClip, SparseRows};
 use volrender::Camera;
@@ -166,6 +166,7 @@ pub fn avatars() -> Vec<Vec<u8>> {
         betas: vec![0.5],
         clips: vec![Clip { name: "video".to_owned(), motion }],
         cameras: vec![camera; 2],
+        light: Light { slope: 0.2 * Vec3::Z },
     };
     let path = place("seed-avatar.safetensors");
     avatar.save(&path).unwrap();
