@@ -143,6 +143,6 @@ mod tests {
         let two = replaced(&one, "b", "## B\n");
         assert_eq!(replaced(&two, "a", "## A\n2\n"), two.replace("1\n", "2\n"));
         assert_eq!(demoted("# x\ny\n"), "### x\ny\n");
-        assert_eq!(wrapped(&"word ".repeat(21).trim_end()), format!("{}\nword", "word ".repeat(20).trim_end()));
+        assert_eq!(wrapped("word ".repeat(21).trim_end()), format!("{}\nword", "word ".repeat(20).trim_end()));
     }
 }
