@@ -20,6 +20,10 @@ const FARTHEST: usize = 8;
 const BLUR: usize = 1;
 /// How much more colours change across the outline than across the median line.
 const OUTSTANDING: f64 = 1.6;
+/// Pairs of pixels that a line has to be crossed by, and lines that have to be: of a small picture
+/// nothing is said.
+const PAIRS: u64 = 100;
+const ENOUGH: usize = 8;
 
 /// Shrinks the masks of the training frames by as much as they are too large.
 ///
@@ -41,11 +45,15 @@ fn excess(frames: &[Frame]) -> Result<u32, Error> {
     for changes in changes? {
         sums.iter_mut().zip(changes).for_each(|(sum, (change, pairs))| *sum = (sum.0 + change, sum.1 + pairs));
     }
-    let means = sums.map(|(change, pairs)| change / pairs.max(1) as f64);
-    let mut sorted = means;
+    let crossed = sums.iter().take_while(|sum| sum.1 >= PAIRS);
+    let means: Vec<f64> = crossed.map(|(change, pairs)| change / *pairs as f64).collect();
+    if means.len() < ENOUGH {
+        return Ok(0);
+    }
+    let mut sorted = means.clone();
     sorted.sort_by(f64::total_cmp);
     let most = (BLUR..FARTHEST).max_by(|&a, &b| means[a].total_cmp(&means[b])).unwrap_or(0);
-    Ok(if means[most] > OUTSTANDING * sorted[LINES / 2] { most as u32 + 1 } else { 0 })
+    Ok(if means[most] > OUTSTANDING * sorted[means.len() / 2] { most as u32 + 1 } else { 0 })
 }
 
 /// Sum of the changes of colour across the lines 1, 2, … pixels inside the mask, and how many pairs
@@ -83,7 +91,7 @@ mod tests {
     #[test]
     fn masks_that_are_too_large_are_found_and_trimmed_and_no_others() {
         let body = BodyModel::embedded();
-        let config = DemoConfig { size: 128, frames: 12, eval_cameras: 1, ..DemoConfig::default() };
+        let config = DemoConfig { size: 192, frames: 12, eval_cameras: 1, ..DemoConfig::default() };
         let given = demo(&config, &body).unwrap();
         let area = |c: &Capture| c.train.iter().map(|f| f.shown().mask.iter().sum::<f32>()).sum::<f32>();
         for (mask_pixels, ragged_pixels) in [(0, 0.0), (-3, 0.0), (-1, 0.0), (0, 2.0), (2, 0.0), (3, 0.0), (5, 0.0)] {

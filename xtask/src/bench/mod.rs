@@ -378,11 +378,10 @@ fn finish(bench: &Bench, sitting: &SittingArguments, text: &str, name: &str) -> 
         );
         return Ok(());
     }
+    let (log, minutes) = (bench.path().display(), bench.seconds() / 60.0);
     let path = bench.path().with_file_name(format!("{name}.md"));
     write(&path, text)?;
-    say!("\n{text}");
-    say!("written: {}\nwritten: {}", bench.path().display(), path.display());
-    say!("{begun} runs in {:.1} minutes", bench.seconds() / 60.0);
+    say!("\n{text}\nwritten: {log}\nwritten: {}\n{begun} runs in {minutes:.1} minutes", path.display());
     if left > 0 {
         say!("{left} points are left: the same command goes on with them");
     }

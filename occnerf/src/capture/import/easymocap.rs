@@ -9,8 +9,7 @@ use glam::{DMat3, DVec3};
 use serde::Deserialize;
 
 use super::fit::{About, Fit, FitFrame, Person, SMPL, Tool, axis_angle, rotation};
-use super::item::turn;
-use super::read::text;
+use super::item::{text, turn};
 use super::video::Video;
 use super::yaml;
 use crate::capture::CaptureError;

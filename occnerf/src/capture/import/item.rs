@@ -1,4 +1,5 @@
-//! Values of an estimator's file, with errors that name the file and the way to the value.
+//! Texts, and values of an estimator's file, with errors that name the file and the way to the
+//! value.
 
 use std::path::Path;
 
@@ -10,6 +11,18 @@ use crate::capture::CaptureError;
 
 /// Largest |R Rᵀ − I| of a rotation matrix: estimators write `f32`, EasyMocap a few decimals.
 const ORTHONORMAL: f64 = 1e-2;
+
+/// Longest text that is read: COLMAP's images.txt has some 100 kilobytes a picture.
+const MAX_TEXT: u64 = 256 << 20;
+
+/// A text file.
+pub(super) fn text(path: &Path) -> Result<String, CaptureError> {
+    let length = std::fs::metadata(path).map_err(CaptureError::io(path))?.len();
+    if length > MAX_TEXT {
+        return Err(CaptureError::invalid(path, "size", format!("at most {MAX_TEXT} bytes"), length.to_string()));
+    }
+    std::fs::read_to_string(path).map_err(CaptureError::io(path))
+}
 
 /// A value and how it was reached.
 #[derive(Clone)]

@@ -11,8 +11,7 @@ use glam::{DMat3, DQuat, DVec3};
 use smpl::pickle;
 
 use super::fit::{About, BETAS, Fit, FitFrame, Person, SMPL, Tool, axis_angle, rotation};
-use super::item::{Item, vectors};
-use super::read::text;
+use super::item::{Item, text, vectors};
 use super::video::Video;
 use crate::capture::CaptureError;
 

@@ -82,18 +82,6 @@ pub(super) fn parse(path: &Path, value: &Value, video: &Video) -> Result<Fit, Ca
     }
 }
 
-/// Longest text that is read: COLMAP's images.txt has some 100 kilobytes a picture.
-const MAX_TEXT: u64 = 256 << 20;
-
-/// A text file.
-pub(super) fn text(path: &Path) -> Result<String, CaptureError> {
-    let length = std::fs::metadata(path).map_err(CaptureError::io(path))?.len();
-    if length > MAX_TEXT {
-        return Err(CaptureError::invalid(path, "size", format!("at most {MAX_TEXT} bytes"), length.to_string()));
-    }
-    std::fs::read_to_string(path).map_err(CaptureError::io(path))
-}
-
 /// Indices within the video, each once; a body and a camera that can be.
 pub(super) fn check(path: &Path, person: &Person, video: &Video) -> Result<(), CaptureError> {
     let mut seen = vec![false; video.names.len()];
