@@ -94,7 +94,7 @@ mod tests {
             let mut image = Image::new(5, 4);
             image.pixels[3 * n..3 * n + 9].copy_from_slice(&[0.1, -0.0, 1e-30, 0.5, 0.25, f32::MAX, 0.0, 0.0, 1.0]);
             let mask = (0..20).map(|i| if i == n { 0.75 } else { 0.0 }).collect();
-            Pixels { image, mask, occluder: (n % 2 == 0).then(|| (0..20).map(|i| i > n).collect()) }
+            Pixels { image, mask, occluder: (n.is_multiple_of(2)).then(|| (0..20).map(|i| i > n).collect()) }
         };
         let spilled: Vec<Spilled> = (0..9).map(|n| spill.add(&made(n)).unwrap()).collect();
         for (n, spilled) in spilled.iter().enumerate().rev() {
