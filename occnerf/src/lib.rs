@@ -61,7 +61,7 @@ pub use model::times::StepTimes;
 pub use model::trained::{Model, upright};
 pub use model::view::PosedView;
 pub use render::field::FieldRenderer;
-pub use render::picture::{Renderer, Rendering};
+pub use render::picture::{Renderer, Rendering, Supersampled};
 pub use render::prior::PriorRenderer;
 pub use scene::labels::{Label, Labels, label_pixels};
 pub use scene::prepared::{PreparedFrame, Scene};

@@ -9,7 +9,7 @@ use image::RgbImage;
 use indicatif::ProgressBar;
 use occnerf::{
     FieldRenderer, Lpips, Method, Model, PreparedFrame, PriorRenderer, Renderer, Rendering, Scene, SplitMetrics,
-    VertexColors, evaluate_with,
+    Supersampled, VertexColors, evaluate_with,
 };
 use rayon::prelude::*;
 
@@ -60,6 +60,9 @@ pub struct EvalArguments {
     /// training views where there are no others
     #[arg(long)]
     budget: bool,
+    /// Samples a pixel in each direction; scores of more than one are only printed
+    #[arg(long, default_value_t = 1, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=8))]
+    side: u32,
     /// Threads [default: all cores]
     #[arg(long)]
     threads: Option<usize>,
@@ -123,7 +126,8 @@ pub fn eval(arguments: &EvalArguments) -> Result<()> {
     for split in [Split::NovelView, Split::TrainView] {
         let empty = split == Split::NovelView && scene.eval.is_empty();
         if arguments.split.is_none_or(|only| only == split) {
-            let scores = drawn.score_with_bar(&scene, split, lpips.as_ref(), |_, _| {})?;
+            let side = arguments.side;
+            let scores = drawn.score_with_bar(&scene, split, lpips.as_ref(), side, |_, _| {})?;
             *split.of(&mut metrics.splits) = (!empty).then_some(scores);
         } else if let Some(scores) = split.of(&mut metrics.splits).as_mut().filter(|s| s.lpips_full.is_some()) {
             // One name stands for both splits: what another network measured goes.
@@ -134,13 +138,15 @@ pub fn eval(arguments: &EvalArguments) -> Result<()> {
         }
     }
     metrics.lpips = network;
-    metrics.write(directory)?;
+    if arguments.side == 1 {
+        metrics.write(directory)?;
+        report::write(directory, &metrics)?;
+    }
     if arguments.budget {
         let frames: Vec<&PreparedFrame> =
             if scene.eval.is_empty() { scored_train_frames(&scene).collect() } else { scene.eval.iter().collect() };
         budget::run(directory, &scene, drawn.renderer(&scene)?.as_mut(), &frames)?;
     }
-    report::write(directory, &metrics)?;
     let mut one = metrics.clone();
     for (name, split) in [(NOVEL_VIEWS, &metrics.splits.novel_view), (TRAINING_VIEWS, &metrics.splits.train_view)] {
         if let Some(split) = split {
@@ -189,19 +195,24 @@ impl Drawn<'_> {
         })
     }
 
-    /// Scores a split; `seen` gets each picture.
+    /// Scores a split with `side` × `side` samples a pixel; `seen` gets each picture.
     pub fn score(
         &self,
         scene: &Scene,
         split: Split,
         lpips: Option<&Lpips>,
+        side: u32,
         seen: impl FnMut(&PreparedFrame, &Rendering),
     ) -> Result<SplitMetrics> {
         let frames: Vec<&PreparedFrame> = match split {
             Split::NovelView => scene.eval.iter().collect(),
             Split::TrainView => scored_train_frames(scene).collect(),
         };
-        Ok(evaluate_with(scene, self.renderer(scene)?.as_mut(), &frames, lpips, seen)?)
+        let mut renderer = self.renderer(scene)?;
+        if side > 1 {
+            renderer = Box::new(Supersampled::new(renderer, side));
+        }
+        Ok(evaluate_with(scene, renderer.as_mut(), &frames, lpips, seen)?)
     }
 
     fn score_with_bar(
@@ -209,6 +220,7 @@ impl Drawn<'_> {
         scene: &Scene,
         split: Split,
         lpips: Option<&Lpips>,
+        side: u32,
         mut seen: impl FnMut(&PreparedFrame, &Rendering),
     ) -> Result<SplitMetrics> {
         let frames = match split {
@@ -216,7 +228,7 @@ impl Drawn<'_> {
             Split::TrainView => scored_train_frames(scene).count(),
         };
         let bar = ProgressBar::new(frames as u64).with_message("scoring");
-        let metrics = self.score(scene, split, lpips, |frame, rendering| {
+        let metrics = self.score(scene, split, lpips, side, |frame, rendering| {
             bar.inc(1);
             seen(frame, rendering);
         })?;
@@ -240,7 +252,7 @@ pub fn score_run(
     let names: BTreeSet<&str> = scene.eval.iter().map(|f| f.camera_name.as_str()).collect();
     let most = pictures::MAX_SHEET_PIXELS / (2 * SHEET_INSTANTS * names.len().max(1)) as u64;
     let mut index = 0;
-    let novel = drawn.score_with_bar(scene, Split::NovelView, lpips, |frame, rendering| {
+    let novel = drawn.score_with_bar(scene, Split::NovelView, lpips, 1, |frame, rendering| {
         if cameras.last().is_none_or(|(name, _)| *name != frame.camera_name) {
             cameras.push((frame.camera_name.clone(), Vec::new()));
             index = 0;
@@ -254,7 +266,7 @@ pub fn score_run(
     })?;
     let mut row = Vec::new();
     let most = pictures::MAX_SHEET_PIXELS / (2 * TRAIN_PICTURES) as u64;
-    let train = drawn.score_with_bar(scene, Split::TrainView, lpips, |frame, rendering| {
+    let train = drawn.score_with_bar(scene, Split::TrainView, lpips, 1, |frame, rendering| {
         if row.len() < TRAIN_PICTURES {
             row.push(beside_truth(frame, rendering, most));
         }

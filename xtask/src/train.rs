@@ -305,6 +305,6 @@ fn prior_metrics(run: &RunConfig, source: &Source, lpips: Option<&Lpips>) -> Res
     let mut metrics = unscored(&prior, &drawn, start.elapsed().as_secs_f64());
     metrics.lpips = network_name(lpips);
     let split = if scene.eval.is_empty() { Split::TrainView } else { Split::NovelView };
-    *split.of(&mut metrics.splits) = Some(drawn.score(&scene, split, lpips, |_, _| {})?);
+    *split.of(&mut metrics.splits) = Some(drawn.score(&scene, split, lpips, 1, |_, _| {})?);
     Ok(metrics)
 }
