@@ -1,5 +1,8 @@
 //! Pixels in few bytes: of each row only what is not all zero, in bytes where they say it exactly.
 
+use std::borrow::Cow;
+use std::sync::LazyLock;
+
 use glam::Vec3;
 
 use super::{Image, Pixels};
@@ -33,43 +36,75 @@ struct Span {
 #[derive(Clone, Debug)]
 enum Values {
     /// Levels of the picture before it was multiplied by the mask, and of the mask.
-    Levels(Vec<[u8; 4]>),
+    Levels(Cow<'static, Scale>, Vec<[u8; 4]>),
     Floats(Vec<[f32; 4]>),
 }
 
-/// What a level of 8 bits is in floats, by the one division that readers of pictures make.
-fn level(byte: u8) -> f32 {
-    f32::from(byte) / 255.0
+/// What levels of 8 bits are in floats: 1/255 each, but for the last bit, which readers of grey
+/// pictures have another way.
+#[derive(Clone, Debug, PartialEq)]
+struct Scale {
+    colour: [f32; 256],
+    mask: [f32; 256],
 }
 
-/// The levels that this colour and coverage are made of; `None` if no levels give these very bits.
-fn levels([r, g, b, mask]: [f32; 4]) -> Option<[u8; 4]> {
-    // `as` saturates, and takes NaN to 0.
-    let nearest = |value: f32| (value * 255.0 + 0.5) as u8;
-    let coverage = nearest(mask);
-    let of = |colour: f32| if coverage == 0 { 0 } else { nearest(colour / mask) };
-    let found = [of(r), of(g), of(b), coverage];
-    let same = floats(found).map(f32::to_bits) == [r, g, b, mask].map(f32::to_bits);
-    same.then_some(found)
+/// The scale of most pictures.
+static EVEN: LazyLock<Scale> = LazyLock::new(|| {
+    let even = std::array::from_fn(|level| level as f32 / 255.0);
+    Scale { colour: even, mask: even }
+});
+
+/// `as` saturates, and takes NaN to 0.
+fn nearest(value: f32) -> u8 {
+    (value * 255.0 + 0.5) as u8
 }
 
-fn floats([r, g, b, mask]: [u8; 4]) -> [f32; 4] {
-    let mask = level(mask);
-    [level(r) * mask, level(g) * mask, level(b) * mask, mask]
+impl Scale {
+    /// The scale of these values, if they have one.
+    fn of(values: &[[f32; 4]]) -> Self {
+        let mut scale = EVEN.clone();
+        for [r, g, b, mask] in values {
+            scale.mask[usize::from(nearest(*mask))] = *mask;
+            if *mask == 1.0 {
+                [r, g, b].iter().for_each(|&&colour| scale.colour[usize::from(nearest(colour))] = colour);
+            }
+        }
+        scale
+    }
+
+    /// The levels that this colour and coverage are made of; `None` if no levels give these very
+    /// bits.
+    fn levels(&self, [r, g, b, mask]: [f32; 4]) -> Option<[u8; 4]> {
+        let coverage = nearest(mask);
+        let of = |colour: f32| if coverage == 0 { 0 } else { nearest(colour / mask) };
+        let found = [of(r), of(g), of(b), coverage];
+        let same = self.floats(found).map(f32::to_bits) == [r, g, b, mask].map(f32::to_bits);
+        same.then_some(found)
+    }
+
+    fn floats(&self, [r, g, b, mask]: [u8; 4]) -> [f32; 4] {
+        let mask = self.mask[usize::from(mask)];
+        let [r, g, b] = [r, g, b].map(|colour| self.colour[usize::from(colour)] * mask);
+        [r, g, b, mask]
+    }
 }
 
 impl Packed {
     /// Packs pixels, in levels where all of them are.
     pub fn new(pixels: &Pixels) -> Self {
         let (rows, values) = Rows::new(pixels);
-        let levels: Option<Vec<[u8; 4]>> = values.iter().map(|&value| levels(value)).collect();
-        Self { rows, values: levels.map_or(Values::Floats(values), Values::Levels) }
+        let own = Scale::of(&values);
+        let scale = if own == *EVEN { Cow::Borrowed(&*EVEN) } else { Cow::Owned(own) };
+        let levels: Option<Vec<[u8; 4]>> = values.iter().map(|&value| scale.levels(value)).collect();
+        let values = levels.map_or(Values::Floats(values), |levels| Values::Levels(scale, levels));
+        Self { rows, values }
     }
 
     /// Bytes that it takes.
     pub fn bytes(&self) -> u64 {
         let values = match &self.values {
-            Values::Levels(values) => size_of_val(&values[..]),
+            Values::Levels(Cow::Borrowed(_), values) => size_of_val(&values[..]),
+            Values::Levels(_, values) => size_of::<Scale>() + size_of_val(&values[..]),
             Values::Floats(values) => size_of_val(&values[..]),
         };
         let occluder = self.rows.occluder.as_ref().map_or(0, |bits| size_of_val(&bits[..]));
@@ -89,7 +124,7 @@ impl Packed {
 
     fn value(&self, at: usize) -> [f32; 4] {
         match &self.values {
-            Values::Levels(values) => floats(values[at]),
+            Values::Levels(scale, values) => scale.floats(values[at]),
             Values::Floats(values) => values[at],
         }
     }
@@ -167,14 +202,35 @@ mod tests {
 
     #[test]
     fn every_product_of_levels_is_kept_in_bytes() {
+        let even = &*EVEN;
         for mask in 0..=255 {
             for colour in 0..=255 {
-                let value = floats([colour, 255 - colour, 7, mask]);
+                let value = even.floats([colour, 255 - colour, 7, mask]);
                 // Colours of what no mask shows are gone before.
-                let found = levels(value).unwrap();
-                assert_eq!(floats(found).map(f32::to_bits), value.map(f32::to_bits), "{colour} {mask}");
+                let found = even.levels(value).unwrap();
+                assert_eq!(even.floats(found).map(f32::to_bits), value.map(f32::to_bits), "{colour} {mask}");
             }
         }
+    }
+
+    #[test]
+    fn pictures_and_masks_of_eight_bits_are_kept_in_bytes() {
+        let path = std::env::temp_dir().join(format!("occnerf-packed-{}.png", std::process::id()));
+        let ramp = |x: u32| (x % 256) as u8;
+        let (colour, grey) = (
+            image::RgbImage::from_fn(256, 2, |x, y| image::Rgb([ramp(x), ramp(7 * x + y), 200])),
+            image::GrayImage::from_fn(256, 2, |x, y| image::Luma([ramp(x + 90 * y)])),
+        );
+        for picture in [image::DynamicImage::from(colour), grey.into()] {
+            picture.save(&path).unwrap();
+            let image = Image::load(&path).unwrap();
+            // The first row is seen whole.
+            let mask: Vec<f32> = (0..512).map(|i| if i < 256 { 1.0 } else { image.pixels[3 * (i - 256)] }).collect();
+            let mut pixels = Pixels { image, mask: mask.clone(), occluder: None };
+            pixels.image.multiply(&mask);
+            assert!(matches!(Packed::new(&pixels).values, Values::Levels(..)));
+        }
+        std::fs::remove_file(&path).unwrap();
     }
 
     proptest! {
@@ -183,11 +239,12 @@ mod tests {
             (width, height) in (1u32..9, 1u32..9), exact: bool, marked: bool,
             seeds in prop::collection::vec((any::<[u8; 4]>(), any::<u32>(), prop::bool::weighted(0.6)), 64),
         ) {
+            let even = &*EVEN;
             let value = |(bytes, odd, empty): &([u8; 4], u32, bool)| match (empty, exact) {
                 (true, _) => [0.0; 4],
-                (false, true) => floats(*bytes),
+                (false, true) => even.floats(*bytes),
                 // Any bits at all: −0, NaN, infinities.
-                (false, false) => [f32::from_bits(*odd), level(bytes[0]), -0.0, level(bytes[1])],
+                (false, false) => [f32::from_bits(*odd), even.colour[usize::from(bytes[0])], -0.0, 0.5],
             };
             let values: Vec<[f32; 4]> = seeds[..(width * height) as usize].iter().map(value).collect();
             let occluder = marked.then(|| seeds[..values.len()].iter().map(|(bytes, ..)| bytes[0] > 99).collect());
@@ -195,7 +252,7 @@ mod tests {
             let packed = Packed::new(&pixels);
             let back = packed.pixels();
             prop_assert_eq!(bits(&back), bits(&pixels));
-            prop_assert!(!exact || matches!(packed.values, Values::Levels(_)));
+            prop_assert!(!exact || matches!(packed.values, Values::Levels(..)));
             for i in 0..values.len() {
                 let (colour, mask) = packed.at(i as u32);
                 let found = [colour.x, colour.y, colour.z, mask];
