@@ -74,7 +74,7 @@ pub struct ReproduceArguments {
     /// What each component is worth instead: each left out, from a grey start and from ours
     #[arg(long, conflicts_with = "robustness")]
     components: bool,
-    /// Make the tables a section of xtask/RESULTS.md, and of the first scene the table of README
+    /// Make the tables a section of xtask/RESULTS.md, and that of the demo the table of README
     #[arg(long)]
     publish: bool,
 }
@@ -212,8 +212,8 @@ impl Experiment<'_> {
             let chart = [summary.chart(directory, &name)?];
             let body = summary.markdown();
             results::publish(&Section { name: &name, title: &title, body: &body, charts: &chart })?;
-            let first = self.arguments.scenes.first().is_none_or(|first| first == self.scene);
-            if first && table == Table::Methods {
+            // The one that everybody can make anew.
+            if self.scene == source::DEMO && table == Table::Methods {
                 let (set, table) = (results::set_of(&scene), summary.front());
                 results::publish_table(&format!("{set}.\n\n{table}"))?;
             }
