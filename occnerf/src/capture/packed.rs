@@ -1,6 +1,5 @@
 //! Pixels in few bytes: of each row only what is not all zero, in bytes where they say it exactly.
 
-use std::borrow::Cow;
 use std::sync::LazyLock;
 
 use glam::Vec3;
@@ -35,8 +34,9 @@ struct Span {
 /// Colour and coverage of pixels.
 #[derive(Clone, Debug)]
 enum Values {
-    /// Levels of the picture before it was multiplied by the mask, and of the mask.
-    Levels(Cow<'static, Scale>, Vec<[u8; 4]>),
+    /// Levels of the picture before it was multiplied by the mask, and of the mask; their scale,
+    /// `None` for [`EVEN`].
+    Levels(Option<Box<Scale>>, Vec<[u8; 4]>),
     Floats(Vec<[f32; 4]>),
 }
 
@@ -94,8 +94,8 @@ impl Packed {
     pub fn new(pixels: &Pixels) -> Self {
         let (rows, values) = Rows::new(pixels);
         let own = Scale::of(&values);
-        let scale = if own == *EVEN { Cow::Borrowed(&*EVEN) } else { Cow::Owned(own) };
-        let levels: Option<Vec<[u8; 4]>> = values.iter().map(|&value| scale.levels(value)).collect();
+        let levels: Option<Vec<[u8; 4]>> = values.iter().map(|&value| own.levels(value)).collect();
+        let scale = (own != *EVEN).then(|| Box::new(own));
         let values = levels.map_or(Values::Floats(values), |levels| Values::Levels(scale, levels));
         Self { rows, values }
     }
@@ -103,8 +103,9 @@ impl Packed {
     /// Bytes that it takes.
     pub fn bytes(&self) -> u64 {
         let values = match &self.values {
-            Values::Levels(Cow::Borrowed(_), values) => size_of_val(&values[..]),
-            Values::Levels(_, values) => size_of::<Scale>() + size_of_val(&values[..]),
+            Values::Levels(scale, values) => {
+                scale.as_ref().map_or(0, |_| size_of::<Scale>()) + size_of_val(&values[..])
+            }
             Values::Floats(values) => size_of_val(&values[..]),
         };
         let occluder = self.rows.occluder.as_ref().map_or(0, |bits| size_of_val(&bits[..]));
@@ -124,7 +125,7 @@ impl Packed {
 
     fn value(&self, at: usize) -> [f32; 4] {
         match &self.values {
-            Values::Levels(scale, values) => scale.floats(values[at]),
+            Values::Levels(scale, values) => scale.as_deref().unwrap_or(&EVEN).floats(values[at]),
             Values::Floats(values) => values[at],
         }
     }
