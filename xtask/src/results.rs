@@ -118,7 +118,9 @@ fn origin() -> String {
     });
     let command = arguments.filter(|a| a != "--publish").collect::<Vec<_>>().join(" ");
     let git = |arguments: &[&str]| {
-        let output = Command::new("git").args(arguments).output().ok().filter(|o| o.status.success());
+        // Commands are given from anywhere.
+        let git = || Command::new("git").current_dir(env!("CARGO_MANIFEST_DIR")).args(arguments).output();
+        let output = git().ok().filter(|o| o.status.success());
         output.map(|output| String::from_utf8_lossy(&output.stdout).trim().to_owned())
     };
     let commit = git(&["rev-parse", "--short", "HEAD"]).unwrap_or_else(|| "unknown".to_owned());

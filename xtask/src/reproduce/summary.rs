@@ -82,7 +82,8 @@ impl<'a> Summary<'a> {
 
     /// The table: novel views where the capture has them, and training views on what they show.
     pub fn markdown(&self) -> String {
-        let (scene, set) = (self.scene, results::set_of(&self.name()));
+        // Without the folders: tables are shown elsewhere.
+        let (scene, set) = (self.name(), results::set_of(&self.name()));
         let mut text = format!("# {scene}\n\n{set}. {}; perceptual term: {}", self.plan, self.perceptual);
         if let Some(network) = &self.lpips {
             text.push_str(&format!("; lpips_full by {network}"));
