@@ -60,9 +60,7 @@ proptest! {
             let (field, encoding) = (before.field.clone(), before.encoding.clone());
             prop_assert_eq!(Config { samples: 1, steps: 1, field, encoding, ..after },
                 Config { samples: 1, steps: 1, ..before });
-            let mut growth = capacity.clone();
-            growth.keep_growth();
-            prop_assert!(growth.choices.iter().all(|choice| choice.chosen > choice.preset));
+            prop_assert!(capacity.growth().choices.iter().all(|choice| choice.chosen > choice.preset));
         }
     }
 

@@ -4,10 +4,10 @@ use std::path::Path;
 
 use anyhow::{Context, Result, bail};
 use clap::ValueEnum;
-use occnerf::{Capacity, Config, Method, Preset, Trainer};
+use occnerf::{Capacity, Config, Method, Preset, Scene, Trainer};
 
 use crate::optimise;
-use crate::process::{say, unwritten};
+use crate::process::{note, say, unwritten};
 use crate::run::write;
 use crate::source::Source;
 
@@ -27,8 +27,11 @@ pub fn measure(source: &Source, config: &Config, set: &[String]) -> Result<Capac
     if config.method == Method::Prior {
         bail!("--capacity auto: the prior has no sizes to choose");
     }
-    let scene = source.scene(config)?;
-    let mut capacity = Capacity::measure(&scene, config)?;
+    Ok(of_scene(&source.scene(config)?, config, set)?)
+}
+
+fn of_scene(scene: &Scene, config: &Config, set: &[String]) -> Result<Capacity, occnerf::Error> {
+    let mut capacity = Capacity::measure(scene, config)?;
     capacity.choices.retain(|choice| set.iter().all(|set| set.split('=').next() != Some(&choice.key)));
     Ok(capacity)
 }
@@ -46,9 +49,10 @@ pub fn choose(
     match asked {
         Some(CapacityName::Auto) => measure(source, config, set).map(Some),
         None if !own => {
-            let mut capacity = measure(source, config, set)?;
-            capacity.keep_growth();
-            Ok(Some(capacity).filter(|capacity| !capacity.choices.is_empty()))
+            // Nobody asked: what cannot be measured is trained with the preset's sizes.
+            let measured = of_scene(&source.scene(config)?, config, set);
+            let capacity = measured.map_err(|error| note!("warning: the preset's sizes are kept: {error}"));
+            Ok(capacity.ok().map(Capacity::growth).filter(|capacity| !capacity.choices.is_empty()))
         }
         _ => Ok(None),
     }

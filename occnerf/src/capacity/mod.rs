@@ -119,9 +119,11 @@ impl Capacity {
         Self { measured, choices, pruned: None }
     }
 
-    /// Keeps what the scene needs more of than the preset has.
-    pub fn keep_growth(&mut self) {
+    /// What the scene needs more of than the preset has.
+    #[must_use]
+    pub fn growth(mut self) -> Self {
         self.choices.retain(|choice| choice.chosen > choice.preset);
+        self
     }
 
     /// Puts the chosen sizes into a configuration; keys that are none of its sizes are left alone.
