@@ -7,11 +7,13 @@ use anyhow::{Result, ensure};
 use clap::{Args, ValueEnum};
 use image::RgbImage;
 use indicatif::ProgressBar;
+use occnerf::bake::{Avatar, BakeOptions, BakedRenderer, bake};
 use occnerf::{
     FieldRenderer, Lpips, Method, Model, PreparedFrame, PriorRenderer, Renderer, Rendering, Scene, SplitMetrics,
     Supersampled, VertexColors, evaluate_with,
 };
 use rayon::prelude::*;
+use visibility::Samples;
 
 use crate::network::{load_lpips, network_name};
 use crate::optimise::logged_seconds;
@@ -19,7 +21,7 @@ use crate::process::{Ending, Lock, note, one_line, say};
 use crate::run::{
     METRICS, Metrics, NOVEL_VIEWS, RunConfig, Splits, TRAINING_VIEWS, make_directory, peak_rss_bytes, use_threads,
 };
-use crate::{budget, pictures, report, table};
+use crate::{baked, budget, pictures, report, table};
 
 /// Training frames are many and alike: every tenth is scored.
 const TRAIN_STRIDE: usize = 10;
@@ -63,6 +65,10 @@ pub struct EvalArguments {
     /// Samples a pixel in each direction; scores of more than one are only printed
     #[arg(long, default_value_t = 1, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=8))]
     side: u32,
+    /// The baked person, as `render --baked` draws them, in place of the field; scores are only
+    /// printed
+    #[arg(long)]
+    baked: bool,
     /// Threads [default: all cores]
     #[arg(long)]
     threads: Option<usize>,
@@ -74,6 +80,9 @@ pub fn unscored(run: &RunConfig, drawn: &Drawn<'_>, train_seconds: f64) -> Metri
     let (steps, parameters, perceptual) = match drawn {
         Drawn::Prior(colors) => (0, 3 * colors.colors.len(), String::new()),
         Drawn::Field { model, perceptual } => (model.steps_done(), model.num_parameters(), perceptual.clone()),
+        Drawn::Baked { model, .. } => {
+            (model.steps_done(), model.num_parameters(), model.config().loss.perceptual_name())
+        }
     };
     Metrics {
         method: config.method.name().to_owned(),
@@ -100,9 +109,14 @@ pub fn eval(arguments: &EvalArguments) -> Result<()> {
     let _lock = Lock::take(directory)?;
     let source = run.source(directory)?;
     let scene = source.scene(&run.train)?;
-    let loaded;
+    ensure!(!arguments.baked || run.train.method != Method::Prior, "--baked: a prior is not baked");
+    let (loaded, avatar);
     let drawn = if run.train.method == Method::Prior {
         Drawn::Prior(VertexColors::measure(&scene)?)
+    } else if arguments.baked {
+        loaded = Model::load(directory)?;
+        avatar = baked::avatar(directory, &loaded)?;
+        Drawn::Baked { model: &loaded, avatar: &avatar }
     } else {
         loaded = Model::load(directory)?;
         Drawn::Field { model: &loaded, perceptual: loaded.config().loss.perceptual_name() }
@@ -138,7 +152,7 @@ pub fn eval(arguments: &EvalArguments) -> Result<()> {
         }
     }
     metrics.lpips = network;
-    if arguments.side == 1 {
+    if arguments.side == 1 && !arguments.baked {
         metrics.write(directory)?;
         report::write(directory, &metrics)?;
     }
@@ -148,6 +162,7 @@ pub fn eval(arguments: &EvalArguments) -> Result<()> {
         budget::run(directory, &scene, drawn.renderer(&scene)?.as_mut(), &frames)?;
     }
     let mut one = metrics.clone();
+    one.method.push_str(if arguments.baked { "-baked" } else { "" });
     for (name, split) in [(NOVEL_VIEWS, &metrics.splits.novel_view), (TRAINING_VIEWS, &metrics.splits.train_view)] {
         if let Some(split) = split {
             one.splits = Splits { novel_view: Some(split.clone()), train_view: None };
@@ -184,6 +199,11 @@ pub enum Drawn<'a> {
         perceptual: String,
     },
     Prior(VertexColors),
+    /// As `render --baked` draws them.
+    Baked {
+        model: &'a Model,
+        avatar: &'a Avatar,
+    },
 }
 
 impl Drawn<'_> {
@@ -192,6 +212,7 @@ impl Drawn<'_> {
         Ok(match self {
             Self::Field { model, .. } => Box::new(FieldRenderer::new(model)?),
             Self::Prior(colors) => Box::new(PriorRenderer::new(&scene.body, colors)),
+            Self::Baked { model, avatar } => Box::new(BakedRenderer::new(model, avatar, Samples::Four)?),
         })
     }
 
@@ -288,6 +309,24 @@ pub fn score_run(
         }
     })?;
     Ok(metrics)
+}
+
+/// Bakes a trained person, and scores them under `directory` as [`score_run`] does: seconds are
+/// those of `trained`, the run's own, and of baking; parameters are the colours of the texels and
+/// the places of the vertices.
+pub fn score_baked(
+    directory: &Path,
+    run: &RunConfig,
+    model: &Model,
+    scene: &Scene,
+    lpips: Option<&Lpips>,
+    trained: Metrics,
+) -> Result<Metrics> {
+    let (avatar, report) = bake(model, Some(scene), &BakeOptions::default())?;
+    let (train_seconds, parameters) =
+        (trained.train_seconds + report.seconds, 3 * (report.texels + avatar.num_vertices()));
+    let drawn = Drawn::Baked { model, avatar: &avatar };
+    score_run(directory, run, scene, &drawn, lpips, Metrics { train_seconds, parameters, ..trained })
 }
 
 /// Writes the contact sheets of both splits.

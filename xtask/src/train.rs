@@ -6,10 +6,10 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, Error, Result, bail, ensure};
 use clap::Args;
 use occnerf::capture::Capture;
-use occnerf::{Config, Lpips, Method, Person, Scene, Trainer, VertexColors, checkpoint_config};
+use occnerf::{Config, Lpips, Method, Model, Person, Scene, Trainer, VertexColors, checkpoint_config};
 
 use crate::capacity::{self, CapacityName};
-use crate::eval::{Drawn, Split, check_pictures, score_run, scored_frames, unscored};
+use crate::eval::{Drawn, Split, check_pictures, score_baked, score_run, scored_frames, unscored};
 use crate::network::{load_lpips, network_name};
 use crate::optimise::{SavingArguments, Sitting, optimise};
 use crate::process::{Lock, results_in, say};
@@ -251,6 +251,43 @@ pub fn run_unless_finished(
     lpips: Option<&Lpips>,
     interval: Duration,
 ) -> Result<Metrics> {
+    unless_finished(directory, name, run, lpips, |earlier| {
+        say!("{name}: training");
+        run.write(directory)?;
+        let sitting = Sitting { resume: earlier, stop_after: None, interval, preview: false };
+        let metrics = run_one(directory, run, source, lpips, &sitting)?;
+        metrics.with_context(|| format!("{name}: stopped before its end"))
+    })
+}
+
+/// The scores under `directory` of the baked person of the run under `trained`, which is brought to
+/// its end first where it has not come to it.
+pub fn baked_unless_finished(
+    directory: &Path,
+    trained: &Path,
+    run: &RunConfig,
+    source: &Source,
+    lpips: Option<&Lpips>,
+    interval: Duration,
+) -> Result<Metrics> {
+    let [name, of] = [directory, trained].map(|path| path.file_name().unwrap_or_default().to_string_lossy());
+    unless_finished(directory, &name, run, lpips, |_| {
+        let metrics = run_unless_finished(trained, &of, run, source, lpips, interval)?;
+        say!("{name}: baking");
+        run.write(directory)?;
+        score_baked(directory, run, &Model::load(trained)?, &source.scene(&run.train)?, lpips, metrics)
+    })
+}
+
+/// The scores under `directory` if they are of the same settings; else what `make` makes, which is
+/// told whether a run with these settings has begun there.
+fn unless_finished(
+    directory: &Path,
+    name: &str,
+    run: &RunConfig,
+    lpips: Option<&Lpips>,
+    make: impl FnOnce(bool) -> Result<Metrics>,
+) -> Result<Metrics> {
     make_directory(&directory.join("renders"))?;
     let _lock = Lock::take(directory)?;
     let old = if directory.join("config.toml").is_file() { Some(RunConfig::read(directory)?) } else { None };
@@ -276,11 +313,7 @@ pub fn run_unless_finished(
             return Ok(metrics);
         }
     }
-    say!("{name}: training");
-    run.write(directory)?;
-    let sitting = Sitting { resume: earlier, stop_after: None, interval, preview: false };
-    let metrics = run_one(directory, run, source, lpips, &sitting)?;
-    metrics.with_context(|| format!("{name}: stopped before its end"))
+    make(earlier)
 }
 
 /// The scores under `directory` of a run with the settings `config`; `None` where it has not come

@@ -22,7 +22,7 @@ fn parts_of_a_reproduction_make_the_table_that_one_job_makes() {
     let folder = folder("parts");
     let capture = folder.join("capture");
     done(&["synth", "--out", text(&capture), "--size", "32", "--frames", "4", "--eval-cameras", "1"]);
-    let rows = "prior,hash-point,occnerf";
+    let rows = "prior,hash-point,occnerf,occnerf-baked";
     let command = |out: &Path, more: &[&str]| -> Vec<String> {
         let all = ["reproduce", text(&capture), "--out", text(out), "--steps", "2", "--seeds", "2", "--rows", rows];
         all.iter().chain(more).map(|word| (*word).to_owned()).collect()
@@ -32,6 +32,8 @@ fn parts_of_a_reproduction_make_the_table_that_one_job_makes() {
     run(&command(&one, &[]));
     let first = run(&command(&many, &["--shard", "1/3"]));
     assert!(!many.join("capture/reproduce.md").exists() && first.contains(": training"), "{first}");
+    let seeds = |row: &str| (1..3).map(|seed| many.join(format!("capture/{row}-s{seed}")).exists()).collect::<Vec<_>>();
+    assert_eq!(seeds("occnerf-baked"), seeds("occnerf"), "who trains a person bakes them");
     let merge = command(&many, &["--merge"]);
     refused(&merge.iter().map(String::as_str).collect::<Vec<_>>(), &["have no scores yet"]);
     // The same part twice at once, and another.
@@ -44,7 +46,7 @@ fn parts_of_a_reproduction_make_the_table_that_one_job_makes() {
     run(&merge);
     let table = |out: &Path| timeless(&out.join("capture/reproduce.md"));
     assert_eq!(table(&many), table(&one));
-    assert_eq!(table(&one).len(), 2 * (2 + 3));
+    assert_eq!(table(&one).len(), 2 * (2 + 4));
     refused(&["reproduce", text(&capture), "--out", text(&folder.join("none")), "--merge"], &["no part has begun"]);
 }
 

@@ -5,6 +5,7 @@ mod rows;
 mod summary;
 
 use std::cell::{Cell, RefCell};
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Result, bail, ensure};
@@ -22,7 +23,7 @@ use crate::run::{self, Metrics, RunConfig, make_directory};
 use crate::settings;
 use crate::shard::ShardArguments;
 use crate::source::{self, LoadArguments, Source};
-use crate::train::{finished, run_unless_finished};
+use crate::train::{baked_unless_finished, finished, run_unless_finished};
 use plan::{Plan, Request};
 use rows::{Row, Table};
 use summary::Summary;
@@ -267,9 +268,13 @@ impl Experiment<'_> {
     /// Trains and scores every row that is not finished, with all its seeds.
     fn run_rows<'a>(&self, rows: &[Row], plan: &'a Plan, source: &'a Source, directory: &Path) -> Result<Summary<'a>> {
         let mut summary = Summary::new(source, plan, self.arguments.table());
+        let mut first = BTreeMap::new();
         for row in rows {
+            let own = self.runs.count.get();
+            first.insert(&*row.name, own);
+            // Who trains a person bakes them.
+            let begin = row.baked.and_then(|trained| first.get(trained)).map_or(own, |&index| index);
             for seed in 1..=row.runs(self.arguments.seeds) {
-                let name = if row.learns() { format!("{}-s{seed}", row.name) } else { row.name.clone() };
                 let mut run = RunConfig {
                     scene: source.scene.clone(),
                     body: source.body.clone(),
@@ -279,8 +284,10 @@ impl Experiment<'_> {
                 if let Some(path) = &self.arguments.perceptual_weights {
                     run.train.loss.perceptual_weights.clone_from(path);
                 }
-                if let Some(metrics) = self.run(&directory.join(&name), &name, &run, source)? {
-                    summary.add(row, &directory.join(&name), metrics);
+                self.runs.count.set(self.runs.count.get() + 1);
+                let job = Job { index: begin + seed as usize - 1, row, seed, run };
+                if let Some(metrics) = self.run(directory, &job, source)? {
+                    summary.add(row, &directory.join(row.run(seed)), metrics);
                 }
             }
             // After every row, so that an end before the last leaves a table.
@@ -292,11 +299,23 @@ impl Experiment<'_> {
     }
 }
 
+/// A run of a row.
+struct Job<'a> {
+    /// The part that does it is chosen by this.
+    index: usize,
+    row: &'a Row,
+    seed: u64,
+    run: RunConfig,
+}
+
 impl Experiment<'_> {
-    /// The scores of a run; `None` where it is not this job's, or a merge does not find it.
-    fn run(&self, directory: &Path, name: &str, run: &RunConfig, source: &Source) -> Result<Option<Metrics>> {
-        let part = self.arguments.part;
-        let index = self.runs.count.replace(self.runs.count.get() + 1);
+    /// The scores of a run under `directory`; `None` where it is not this job's, or a merge does
+    /// not find it.
+    fn run(&self, directory: &Path, job: &Job<'_>, source: &Source) -> Result<Option<Metrics>> {
+        let Job { index, row, seed, run } = job;
+        let name = &row.run(*seed);
+        let trained = row.trained(*seed).map(|trained| directory.join(trained));
+        let (directory, part) = (&directory.join(name), self.arguments.part);
         if part.merge {
             let metrics = finished(directory, &run.train)?;
             if metrics.is_none() {
@@ -304,11 +323,15 @@ impl Experiment<'_> {
             }
             return Ok(metrics);
         }
-        if part.shard.is_some_and(|shard| !shard.has(index)) {
+        if part.shard.is_some_and(|shard| !shard.has(*index)) {
             return Ok(None);
         }
         let interval = self.arguments.saving.interval()?;
-        match run_unless_finished(directory, name, run, source, self.lpips, interval) {
+        let scored = match &trained {
+            Some(trained) => baked_unless_finished(directory, trained, run, source, self.lpips, interval),
+            None => run_unless_finished(directory, name, run, source, self.lpips, interval),
+        };
+        match scored {
             Err(error) if part.shard.is_some() && matches!(error.downcast_ref(), Some(Ending::Busy(_))) => {
                 say!("{name}: in another job");
                 Ok(None)

@@ -91,7 +91,10 @@ impl Plan {
         let mut plan = Self { request, steps: 1, cost };
         let (mut a_step, mut fixed) = (0.0, 0.0);
         for row in rows.iter().filter(|row| row.learns()) {
-            let (step, picture) = plan.cost(row);
+            let (mut step, picture) = plan.cost(row);
+            if row.baked.is_some_and(|trained| rows.iter().any(|row| row.name == trained)) {
+                step = 0.0;
+            }
             a_step += row.runs(seeds) as f64 * plan.factor(row) * step;
             fixed += row.runs(seeds) as f64 * pictures as f64 * picture;
         }

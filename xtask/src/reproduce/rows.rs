@@ -31,6 +31,9 @@ pub struct Row {
     preset: Option<Preset>,
     /// What differs from that, as `--set` takes it.
     changes: Vec<&'static str>,
+    /// The row with the same settings whose people are baked, and scored so; `None`: people are
+    /// trained.
+    pub baked: Option<&'static str>,
 }
 
 /// A table that `reproduce` can make.
@@ -109,7 +112,7 @@ const STORY: [(&str, &[&str]); 11] = [
 ];
 
 fn row(name: &str, method: Method, occluded: OccludedRule, length: Length) -> Row {
-    Row { name: name.to_owned(), method, occluded, length, preset: None, changes: Vec::new() }
+    Row { name: name.to_owned(), method, occluded, length, preset: None, changes: Vec::new(), baked: None }
 }
 
 /// Methods, baselines first, and what each component of ours is worth. Row names say `bg` where
@@ -131,6 +134,7 @@ fn methods() -> Vec<Row> {
         row("self-nerf-style", SelfNerf, Unknown, Steps),
         row("occnerf-bg", Occnerf, Background, Steps),
         row("occnerf", Occnerf, Unknown, Steps),
+        Row { baked: Some("occnerf"), ..row("occnerf-baked", Occnerf, Unknown, Steps) },
     ];
     for name in ["no-surface", "no-attention", "no-completeness", "no-perceptual"] {
         let changes = COMPONENTS.iter().find(|(component, _)| *component == name).map_or(&[][..], |c| c.1);
@@ -202,6 +206,7 @@ impl Table {
                 "self-nerf-style",
                 "occnerf-bg",
                 "occnerf",
+                "occnerf-baked",
             ],
             Self::Story => &["prior", "text", "registered-prior", "paper", "prior-colours", "balanced"],
             Self::Components => &["ours-full", "ours-no-surface", "grey-full", "grey-no-surface"],
@@ -213,6 +218,16 @@ impl Row {
     /// Whether there is anything to learn, and so to repeat with another seed.
     pub fn learns(&self) -> bool {
         self.method != Method::Prior
+    }
+
+    /// Directory, under that of the table, of the run with a seed.
+    pub fn run(&self, seed: u64) -> String {
+        if self.learns() { format!("{}-s{seed}", self.name) } else { self.name.clone() }
+    }
+
+    /// The same of the run whose person is baked.
+    pub fn trained(&self, seed: u64) -> Option<String> {
+        self.baked.map(|row| format!("{row}-s{seed}"))
     }
 
     /// Number of runs.
@@ -256,6 +271,19 @@ mod tests {
             }
             assert!(table.shown().iter().all(|name| rows.iter().any(|row| row.name == *name)), "{table:?}");
         }
+    }
+
+    #[test]
+    fn a_baked_row_comes_after_the_row_with_its_settings_that_trains_its_people() {
+        let rows = methods();
+        let at = rows.iter().position(|row| row.name == "occnerf-baked").unwrap();
+        for (at, baked) in rows.iter().enumerate().filter(|(_, row)| row.baked.is_some()) {
+            let trained = rows[..at].iter().find(|row| Some(&*row.name) == baked.baked).unwrap();
+            assert!(trained.baked.is_none() && trained.learns() && trained.length == baked.length);
+            assert_eq!(trained.settings(Preset::Fast).unwrap(), baked.settings(Preset::Fast).unwrap());
+            assert_eq!(baked.trained(2), Some(trained.run(2)));
+        }
+        assert_eq!(rows[at].baked, Some("occnerf"));
     }
 
     #[test]
