@@ -5,7 +5,7 @@ use std::sync::Arc;
 use glam::Vec3;
 
 use super::CaptureError;
-use super::pixels::{Edit, Pixels};
+use super::pixels::{Edit, Pixels, Seen};
 use super::source::PixelSource;
 
 /// One picture of the subject with everything that is known about it.
@@ -41,6 +41,14 @@ impl Frame {
     /// As of [`Frame::pixels`].
     pub(crate) fn shrink_mask(&mut self, pixels: u32) -> Result<(), CaptureError> {
         self.source.edit(Edit::Grow(-i32::try_from(pixels).unwrap_or(i32::MAX)))
+    }
+
+    /// Makes the mask larger by these pixels.
+    ///
+    /// # Errors
+    /// As of [`Frame::pixels`].
+    pub(crate) fn extend_mask(&mut self, seen: Vec<Seen>) -> Result<(), CaptureError> {
+        self.source.edit(Edit::Show(seen.into()))
     }
 }
 

@@ -107,10 +107,10 @@ impl Perturbation {
         }
         for (index, frame) in capture.train.iter_mut().enumerate() {
             if self.mask_pixels != 0 {
-                frame.source.edit(Edit::Grow(self.mask_pixels))?;
+                frame.source.spoil(Edit::Grow(self.mask_pixels))?;
             }
             if self.ragged_pixels > 0.0 {
-                frame.source.edit(Edit::Fray(self.ragged_pixels, index as u64))?;
+                frame.source.spoil(Edit::Fray(self.ragged_pixels, index as u64))?;
             }
         }
         Ok(())

@@ -1,6 +1,7 @@
 //! What a frame shows, and changes to it.
 
 use std::ops::Range;
+use std::sync::Arc;
 
 use glam::Vec3;
 
@@ -72,6 +73,27 @@ impl Pixels {
         }
     }
 
+    /// What a photograph shows where the mask would be if it were larger by so many pixels, of those
+    /// pixels that are `wanted`.
+    pub(crate) fn beyond_mask(&self, photograph: &Image, by: u32, wanted: impl Fn(usize) -> bool) -> Vec<Seen> {
+        let mut larger = self.clone();
+        larger.grow(i32::try_from(by).unwrap_or(i32::MAX));
+        let seen = |pixel: usize| {
+            let coverage = larger.mask[pixel];
+            let color = [0, 1, 2].map(|c| coverage * photograph.pixels[3 * pixel + c]);
+            Seen { pixel: pixel as u32, coverage, color }
+        };
+        (0..self.mask.len()).filter(|&i| larger.mask[i] > self.mask[i] && wanted(i)).map(seen).collect()
+    }
+
+    fn show(&mut self, seen: &[Seen]) {
+        for Seen { pixel, coverage, color } in seen {
+            let i = *pixel as usize;
+            self.mask[i] = *coverage;
+            self.image.pixels[3 * i..3 * i + 3].copy_from_slice(color);
+        }
+    }
+
     /// Gives a pixel another coverage; what is added shows black.
     fn cover(&mut self, i: usize, coverage: f32) {
         if coverage < self.mask[i] {
@@ -109,6 +131,17 @@ pub(super) enum Edit {
     Grow(i32),
     /// The edge of the mask goes to and fro by up to so many pixels, as the number decides.
     Fray(f32, u64),
+    /// The subject is seen at these pixels, too.
+    Show(Arc<[Seen]>),
+}
+
+/// A pixel that a mask leaves out and a photograph has.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Seen {
+    pixel: u32,
+    coverage: f32,
+    /// Multiplied by the coverage.
+    color: [f32; 3],
 }
 
 impl Edit {
@@ -117,6 +150,7 @@ impl Edit {
             Self::Hide(area) => pixels.hide(area),
             Self::Grow(by) => pixels.grow(*by),
             Self::Fray(by, frame) => pixels.fray(*by, *frame),
+            Self::Show(seen) => pixels.show(seen),
         }
     }
 }

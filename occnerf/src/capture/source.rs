@@ -13,7 +13,11 @@ use super::{CaptureError, Image};
 
 /// Where the pixels of a frame are. Copies share what is decoded.
 #[derive(Clone, Debug)]
-pub struct PixelSource(Place);
+pub struct PixelSource {
+    place: Place,
+    /// The pixels before their mask was made wrong, where no file has them.
+    before: Option<Arc<PixelSource>>,
+}
 
 #[derive(Clone, Debug)]
 enum Place {
@@ -116,7 +120,13 @@ impl Shown {
 
 impl From<Pixels> for PixelSource {
     fn from(pixels: Pixels) -> Self {
-        Self(Place::Memory(Arc::new(pixels)))
+        Place::Memory(Arc::new(pixels)).into()
+    }
+}
+
+impl From<Place> for PixelSource {
+    fn from(place: Place) -> Self {
+        Self { place, before: None }
     }
 }
 
@@ -124,12 +134,12 @@ impl PixelSource {
     /// Pixels that are decoded when asked for, and kept as `keep` says.
     pub(super) fn on_disk(files: Files, keep: Keep) -> Self {
         let on_disk = OnDisk { files: Arc::new(files), edits: Vec::new(), keep, kept: OnceLock::new() };
-        Self(Place::Disk(Arc::new(on_disk)))
+        Place::Disk(Arc::new(on_disk)).into()
     }
 
     /// Pixels in a file.
     pub(super) fn spilled(pixels: &Pixels, spill: &Arc<Spill>) -> Result<Self, CaptureError> {
-        Ok(Self(Place::Spilled(Arc::new(spill.add(pixels)?))))
+        Ok(Place::Spilled(Arc::new(spill.add(pixels)?)).into())
     }
 
     /// The pixels.
@@ -137,7 +147,7 @@ impl PixelSource {
     /// # Errors
     /// For files that cannot be read any more, or never were readable; none for pixels in memory.
     pub fn pixels(&self) -> Result<Arc<Pixels>, CaptureError> {
-        match &self.0 {
+        match &self.place {
             Place::Memory(pixels) => Ok(Arc::clone(pixels)),
             Place::Spilled(spilled) => spilled.pixels().map(Arc::new),
             Place::Disk(disk) => match disk.kept.get() {
@@ -161,7 +171,7 @@ impl PixelSource {
     /// # Errors
     /// As of [`PixelSource::pixels`].
     pub(crate) fn shown(&self) -> Result<Shown, CaptureError> {
-        if let Place::Disk(disk) = &self.0
+        if let Place::Disk(disk) = &self.place
             && let Some(Some(kept)) = disk.kept.get()
         {
             return Ok(Shown(kept.clone()));
@@ -171,10 +181,18 @@ impl PixelSource {
 
     /// The picture with what its mask hides; `None` for pixels that were never photographed.
     pub(crate) fn photograph(&self) -> Option<Result<Image, CaptureError>> {
-        match &self.0 {
-            Place::Memory(_) | Place::Spilled(_) => None,
-            Place::Disk(disk) => Some(disk.files.photograph()),
+        match (&self.place, &self.before) {
+            (Place::Disk(disk), _) => Some(disk.files.photograph()),
+            (_, Some(before)) => Some(before.pixels().map(|pixels| pixels.image.clone())),
+            _ => None,
         }
+    }
+
+    /// Whether an obstacle that no photograph shows hides a pixel of a picture of this width.
+    pub(crate) fn hides(&self, pixel: usize, width: u32) -> bool {
+        let Place::Disk(disk) = &self.place else { return false };
+        let edited = disk.edits.iter().any(|edit| matches!(edit, Edit::Hide(area) if area.contains(pixel, width)));
+        edited || disk.files.hidden.is_some()
     }
 
     /// Changes the pixels, which do not come from their files from then on.
@@ -184,7 +202,7 @@ impl PixelSource {
     pub fn change(&mut self, change: impl FnOnce(&mut Pixels)) -> Result<(), CaptureError> {
         let mut pixels = Arc::unwrap_or_clone(self.pixels()?);
         change(&mut pixels);
-        *self = match &self.0 {
+        *self = match &self.place {
             Place::Spilled(spilled) => Self::spilled(&pixels, spilled.spill())?,
             _ => pixels.into(),
         };
@@ -193,7 +211,7 @@ impl PixelSource {
 
     /// Decodes what is to be kept, and looks at the headers of the rest.
     pub(super) fn check(&self) -> Result<(), CaptureError> {
-        match &self.0 {
+        match &self.place {
             Place::Disk(disk) if matches!(&disk.keep, Keep::Packed(room) if room.spent.load(Ordering::Relaxed)) => {
                 disk.files.check()
             }
@@ -201,14 +219,33 @@ impl PixelSource {
         }
     }
 
+    /// Makes the mask wrong, and leaves the photograph as it is: pixels that are in memory alone
+    /// are kept as they were, too.
+    ///
+    /// # Errors
+    /// As of [`PixelSource::pixels`] for pixels in a file of their own.
+    pub(super) fn spoil(&mut self, edit: Edit) -> Result<(), CaptureError> {
+        let before = match &self.place {
+            Place::Disk(_) => None,
+            _ => Some(self.before.clone().unwrap_or_else(|| Arc::new(self.clone()))),
+        };
+        self.edit(edit)?;
+        self.before = before;
+        Ok(())
+    }
+
     /// Makes a change, now or whenever the pixels are decoded.
     ///
     /// # Errors
     /// As of [`PixelSource::pixels`] for pixels in a file of their own.
     pub(super) fn edit(&mut self, edit: Edit) -> Result<(), CaptureError> {
-        match &mut self.0 {
+        match &mut self.place {
             Place::Memory(pixels) => edit.apply(Arc::make_mut(pixels)),
-            Place::Spilled(_) => self.change(|pixels| edit.apply(pixels))?,
+            Place::Spilled(_) => {
+                let before = self.before.take();
+                self.change(|pixels| edit.apply(pixels))?;
+                self.before = before;
+            }
             Place::Disk(disk) => {
                 let kept = match Arc::get_mut(disk) {
                     Some(own) => own.kept.take(),

@@ -12,7 +12,7 @@ use crate::config::Config;
 use crate::model::body::{Body, Moment};
 use crate::model::view::PosedView;
 use crate::scene::labels::{Label, Labels, label_pixels};
-use crate::scene::masks::trim;
+use crate::scene::masks::mend;
 use crate::scene::pinhole::pinhole;
 use crate::scene::registration::register;
 
@@ -81,7 +81,7 @@ impl Scene {
         }
         let mut capture = capture.clone();
         if config.registration.rounds > 0 {
-            trim(&mut capture)?;
+            mend(&mut capture, model)?;
             if !capture.registered {
                 register(&mut capture, model, config.registration.rounds)?;
             }
