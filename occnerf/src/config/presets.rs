@@ -87,7 +87,7 @@ fn paper() -> Config {
             attention: true,
             visibility: VisibilityKind::Counted,
         },
-        registration: RegistrationConfig { rounds: 12 },
+        registration: RegistrationConfig { rounds: 16 },
         motion: MotionConfig {
             kind: MotionKind::Surface,
             resolution: 32,

@@ -77,7 +77,7 @@ const COMPONENTS: [(&str, &[&str]); 11] = [
 /// row `paper` is the preset `paper`; what stands before it are its departures from the text.
 const STORY: [(&str, &[&str]); 11] = [
     ("text", &["registration.rounds=0", "motion.kind=volume", "rates.table=5e-5", "rates.final_fraction=1"]),
-    ("registered-prior", &["registration.rounds=12"]),
+    ("registered-prior", &["registration.rounds=16"]),
     ("finer-volume", &["motion.resolution=64"]),
     ("surface-motion", &["motion.kind=surface", "motion.resolution=32"]),
     ("paper", &["rates.table=5e-3", "rates.final_fraction=0.1"]),

@@ -12,12 +12,12 @@ use crate::scene::registration::unknowns::{Motion, Motions};
 /// Change of a coefficient that its derivatives are taken by.
 pub(super) const BETA_STEP: f32 = 0.5;
 /// Standard deviation of an outline: pixels, and metres by which clothes hang differently.
-const OUTLINE: [f32; 2] = [1.0, 0.01];
+const OUTLINE: [f32; 2] = [0.6, 0.006];
 /// Pixels of an outline that tell the same.
 const CORRELATED: f32 = 3.0;
 /// Weight of the colours against their noise: most of what is left is not noise but what one colour
 /// a vertex cannot say.
-const COLOR: f32 = 0.03;
+const COLOR: f32 = 0.1;
 
 /// What is not known of how far away the body is: its inverse depth, of which the part `nearness`
 /// is left, while the focal length keeps its picture as large as it is.
@@ -52,16 +52,18 @@ pub(super) struct Equations<'a> {
 
 impl<'a> Equations<'a> {
     /// Of a body in the pose `posed` of `shape`; `reshaped` has [`BETA_STEP`] more of each shape
-    /// coefficient. Shared are the shape and, if there is one, the perspective.
+    /// coefficient, `camera` is the frame's. Shared are the shape and, if there is one, the
+    /// perspective.
     pub fn new(
         model: &'a BodyModel,
         (shape, posed): (&'a Shaped, &'a Posed),
         reshaped: Vec<Posed>,
+        camera: &Camera,
         perspective: Option<(Perspective, Camera)>,
     ) -> Self {
         let shared = reshaped.len() + usize::from(perspective.is_some());
         let normal = Normal::new(3 * (model.num_joints() + 1), shared);
-        let motions = Motions::new(model, &shape.vertices, posed);
+        let motions = Motions::new(model, &shape.vertices, posed, camera);
         Self { posed, perspective, reshaped, motions, motion: Motion::default(), row: Vec::new(), normal }
     }
 

@@ -6,8 +6,8 @@
 //! stand off a vertex is the mean over the frames that show it on an outline. Once outlines agree,
 //! so do colours: each vertex has one, under a light that all frames share (Lucas and Kanade 1981).
 //! Poses, place and shape take Gauss-Newton steps on all frames at once, in which errors of a
-//! tracker are expected to be small and to change slowly: what a frame hides follows the frames
-//! around it.
+//! tracker are expected to change slowly: what a frame hides follows the frames around it. How
+//! large they are is learnt on the way ([`Tracker`]).
 
 mod colors;
 mod equations;
@@ -16,6 +16,7 @@ mod sight;
 mod system;
 #[cfg(test)]
 mod tests;
+mod tracker;
 mod unknowns;
 
 use glam::{Quat, Vec3};
@@ -29,27 +30,20 @@ use self::colors::Colors;
 use self::equations::{BETA_STEP, Equations, Perspective};
 use self::picture::Picture;
 use self::sight::{Looking, Ridge, Sight, look, ridges};
-use self::system::{Expected, Normal, solve};
+use self::system::{Expected, Normal, Solution, solve};
+use self::tracker::Tracker;
 use self::unknowns::{Change, changed};
 use crate::Error;
 use crate::capture::{Capture, Frame};
 
-/// Standard deviations expected of a tracker: turns of a joint (radians), shape coefficients.
-const TURN: f64 = 0.035;
+/// Standard deviation of shape coefficients.
 const SHAPE: f64 = 0.5;
-/// Those of the shift of the whole, and of its change from one frame to the next, metres of a body
-/// 1.7 high: at first, and at least. Trackers differ most in this.
-const SHIFT: [f32; 2] = [0.1, 0.02];
-const LEAST_SHIFT: [f32; 2] = [0.03, 0.003];
-/// By how much the first half of the rounds, which holds the shift back, may have found less of it
-/// than there is.
-const HELD_BACK: f32 = 3.0;
+/// Part of the rounds that look at outlines alone.
+const OUTLINES: f32 = 1.0 / 3.0;
 /// Standard deviation of the inverse depth of the whole, where the focal length is somebody's guess,
 /// per metre of a body 1.7 high, and the least depth.
 const NEARNESS: f32 = 0.3;
 const NEAREST: f32 = 0.8;
-/// Part of that of turns by which they change from one frame to the next.
-const CHANGE: f64 = 0.1;
 /// Shape coefficients that are corrected: what follows hardly changes the body.
 const BETAS: usize = 10;
 /// How far from the prior's outline the mask's is searched in the first and in the last round,
@@ -87,9 +81,7 @@ struct Registration<'a> {
     frames: Vec<usize>,
     pictures: Vec<Option<Picture>>,
     changes: Vec<Change>,
-    /// Standard deviations that are expected of the shift, and of its change from one frame to the
-    /// next, in the units of the capture.
-    shift: [f32; 2],
+    tracker: Tracker,
     betas: Vec<f32>,
     /// The way from the plane of the camera to the root in each frame as it is given; none where
     /// the focal length is known.
@@ -108,16 +100,17 @@ struct Registration<'a> {
 /// Pictures that cannot be read.
 pub fn register(capture: &mut Capture, model: &BodyModel, rounds: usize) -> Result<(), Error> {
     let mut registration = Registration::new(capture, model)?;
+    let outlines = (OUTLINES * rounds as f32) as usize;
     for round in 0..rounds {
+        if round == outlines {
+            registration.tracker.turn = Tracker::TURN;
+        }
         let late = round as f32 / (rounds - 1).max(1) as f32;
         let between = |ends: [f32; 2], share: f32| ends[0] + share * (ends[1] - ends[0]);
-        let blur = if 2 * round < rounds { 0.0 } else { between(BLUR, (2.0 * late - 1.0).max(0.0)) };
+        let blur = if round < outlines { 0.0 } else { between(BLUR, (2.0 * late - 1.0).max(0.0)) };
         let looking = Looking { reach: between(REACH, late), blur, unit: registration.unit };
         if !registration.improve(looking)? {
             break;
-        }
-        if round + 1 == rounds / 2 {
-            registration.expect_what_was_found();
         }
     }
     let Registration { frames, changes, betas, nearness, .. } = registration;
@@ -129,7 +122,7 @@ pub fn register(capture: &mut Capture, model: &BodyModel, rounds: usize) -> Resu
         let change: Change = changes[a].iter().zip(&changes[b]).map(|(a, b)| a.lerp(*b, share)).collect();
         let away = if nearness == 1.0 { None } else { away(frame, model) };
         frame.betas = sum(&frame.betas, &betas);
-        (frame.pose, frame.placement) = changed(frame, &model.shaped(&frame.betas), &change);
+        (frame.pose, frame.placement) = changed(frame, model, &model.shaped(&frame.betas), &change);
         frame.placement = shifted(frame.placement, away.unwrap_or_default(), nearness);
         frame.camera.focal /= nearness;
     }
@@ -163,7 +156,7 @@ impl<'a> Registration<'a> {
             ridges: ridges(&model.faces),
             unit,
             changes: vec![vec![Vec3::ZERO; model.num_joints() + 1]; frames.len()],
-            shift: SHIFT.map(|shift| unit * shift),
+            tracker: Tracker::OUTLINES,
             betas: vec![0.0; model.num_betas().min(BETAS)],
             away,
             nearness: 1.0,
@@ -192,19 +185,17 @@ impl<'a> Registration<'a> {
             .into_par_iter()
             .map(|f| {
                 let Moment { shape, posed, .. } = &moments[f];
-                let mut equations = Equations::new(this.model, (shape, posed), this.reshaped(f), this.perspective(f));
+                let camera = &this.capture.train[this.frames[f]].camera;
+                let perspective = this.perspective(f);
+                let mut equations = Equations::new(this.model, (shape, posed), this.reshaped(f), camera, perspective);
                 equations.align_outline(&sights[f], &thicker, this.unit);
                 equations.align_colors(&sights[f], &colors, looking.blur);
                 equations.normal
             })
             .collect();
         let own = 3 * (this.model.num_joints() + 1);
-        let gap = this.frames.get(1).map_or(1, |second| second - this.frames[0]) as f64;
-        let precisions = |shift: f32, turn: f64| -> Vec<f64> {
-            (0..own).map(|i| (if i < 3 { f64::from(shift) } else { turn }).powi(-2)).collect()
-        };
-        let expected = precisions(this.shift[0], TURN);
-        let change: Vec<f64> = precisions(this.shift[1], CHANGE * TURN).iter().map(|e| e / gap).collect();
+        let gap = this.frames.get(1).map_or(1, |second| second - this.frames[0]);
+        let (expected, kept) = this.tracker.expected(this.unit, own, gap);
         let mut common = vec![(SHAPE * SHAPE).recip(); this.betas.len()];
         let flat = |change: &Change| DVector::from_iterator(own, change.iter().flat_map(|v| v.as_dvec3().to_array()));
         let now: Vec<DVector<f64>> = this.changes.iter().map(flat).collect();
@@ -215,8 +206,9 @@ impl<'a> Registration<'a> {
             shared.push(f64::from(this.nearness) - 1.0);
         }
         let shared = DVector::from_vec(shared);
-        let expected = Expected { own: &expected, change: &change, shared: &common };
-        let Some((steps, step)) = solve(&normals, &expected, &now, &shared) else { return Ok(false) };
+        let expected = Expected { own: &expected, kept: &kept, shared: &common };
+        let Some(solution) = solve(&normals, &expected, &now, &shared) else { return Ok(false) };
+        let Solution { own: steps, shared: step, variances } = solution;
         if !steps.iter().chain([&step]).all(|s| s.iter().all(|v| v.is_finite())) {
             return Ok(false);
         }
@@ -225,6 +217,8 @@ impl<'a> Registration<'a> {
             let each = step.as_slice().chunks_exact(3);
             change.iter_mut().zip(each).for_each(|(c, s)| *c += glam::DVec3::from_slice(s).as_vec3());
         }
+        let learnt = self.tracker.learnt(&self.changes, &variances, self.unit);
+        self.tracker = if looking.blur > 0.0 { learnt } else { Tracker { turn: self.tracker.turn, ..learnt } };
         self.betas.iter_mut().zip(step.iter()).for_each(|(beta, step)| *beta += *step as f32);
         if let (Some(away), Some(step)) = (&self.away, step.get(self.betas.len())) {
             let nearest = away.iter().map(|away| away.length()).fold(f32::INFINITY, f32::min);
@@ -237,26 +231,11 @@ impl<'a> Registration<'a> {
         Ok(true)
     }
 
-    /// Expects as much of the shift as was found.
-    fn expect_what_was_found(&mut self) {
-        let gap = self.frames.get(1).map_or(1, |second| second - self.frames[0]);
-        let each: f32 = self.changes.iter().map(|change| change[0].length_squared()).sum();
-        let between: f32 = self.changes.windows(2).map(|pair| pair[0][0].distance_squared(pair[1][0])).sum();
-        // Of one axis.
-        let root = |sum: f32, count: usize| (sum / (3 * count.max(1)) as f32).sqrt();
-        let found = [root(each, self.changes.len()), root(between, gap * (self.changes.len() - 1))];
-        for (shift, (found, (most, least))) in
-            self.shift.iter_mut().zip(found.into_iter().zip(SHIFT.into_iter().zip(LEAST_SHIFT)))
-        {
-            *shift = (HELD_BACK * found).clamp(self.unit * least, self.unit * most);
-        }
-    }
-
     /// The body of a frame, in a shape that is `betas` off the given one, as it is posed by now.
     fn posed(&self, f: usize, betas: &[f32]) -> (Shaped, Posed) {
         let frame = &self.capture.train[self.frames[f]];
         let shape = self.model.shaped(&sum(&frame.betas, betas));
-        let (pose, placement) = changed(frame, &shape, &self.changes[f]);
+        let (pose, placement) = changed(frame, self.model, &shape, &self.changes[f]);
         let away = self.away.as_ref().map_or(Vec3::ZERO, |away| away[f]);
         let posed = self.model.pose(&shape, &pose, shifted(placement, away, self.nearness));
         (shape, posed)

@@ -31,14 +31,25 @@ impl Normal {
     }
 }
 
-/// What unknowns are expected to be before anything is seen.
+/// What unknowns are expected to be before anything is seen: those of the frames wander about 0 (a
+/// stationary Ornstein-Uhlenbeck process).
 pub(super) struct Expected<'a> {
-    /// Inverse variance of each unknown of a frame, (P).
+    /// Variance of each unknown of a frame, (P).
     pub own: &'a [f64],
-    /// Inverse variance of its change from one frame to the next, (P).
-    pub change: &'a [f64],
+    /// Correlation of each unknown with the same of the next frame, 0 to below 1, (P).
+    pub kept: &'a [f64],
     /// Inverse variance of each shared unknown, (B).
     pub shared: &'a [f64],
+}
+
+/// Steps towards the least squares.
+pub(super) struct Solution {
+    /// For the unknowns of each frame, (P).
+    pub own: Vec<DVector<f64>>,
+    /// For the shared unknowns, (B).
+    pub shared: DVector<f64>,
+    /// Variance of each frame's unknowns, were the shared ones known, (P).
+    pub variances: Vec<DVector<f64>>,
 }
 
 /// The steps that take all unknowns to the least squares: for each frame (P), and the shared (B).
@@ -51,9 +62,17 @@ pub(super) fn solve(
     expected: &Expected<'_>,
     own: &[DVector<f64>],
     shared: &DVector<f64>,
-) -> Option<(Vec<DVector<f64>>, DVector<f64>)> {
+) -> Option<Solution> {
     let (p, b) = (expected.own.len(), expected.shared.len());
-    let change = DVector::from_row_slice(expected.change);
+    // The inverse of the process's covariance: ties between neighbours, and what is left for each
+    // frame, at the ends and between.
+    let each = expected.own.iter().zip(expected.kept);
+    let innovation: Vec<f64> = each.map(|(variance, kept)| variance * (1.0 - kept * kept)).collect();
+    let change = DVector::from_fn(p, |i, _| expected.kept[i] / innovation[i]);
+    let least = |i: usize, neighbours: usize| match neighbours {
+        0 => expected.own[i].recip(),
+        _ => (1.0 - expected.kept[i]).powi(neighbours as i32) / innovation[i],
+    };
     // Of a frame: the factor of its block, and the solutions of the right-hand side and of the
     // shared unknowns' columns, before what follows is known.
     let mut factors: Vec<(Cholesky<f64, Dyn>, DMatrix<f64>)> = Vec::with_capacity(frames.len());
@@ -68,10 +87,12 @@ pub(super) fn solve(
         side.view_mut((0, 1), (p, b)).copy_from(&normal.matrix.view((0, p), (p, b)));
         shared_matrix += normal.matrix.view((p, p), (b, b));
         shared_vector -= normal.vector.rows(p, b);
+        let neighbours = || [f.checked_sub(1), Some(f + 1).filter(|&n| n < frames.len())].into_iter().flatten();
         for i in 0..p {
-            block[(i, i)] += expected.own[i];
-            side[(i, 0)] -= expected.own[i] * own[f][i];
-            for neighbour in [f.checked_sub(1), Some(f + 1).filter(|&n| n < frames.len())].into_iter().flatten() {
+            let least = least(i, neighbours().count());
+            block[(i, i)] += least;
+            side[(i, 0)] -= least * own[f][i];
+            for neighbour in neighbours() {
                 block[(i, i)] += change[i];
                 side[(i, 0)] -= change[i] * (own[f][i] - own[neighbour][i]);
             }
@@ -97,8 +118,19 @@ pub(super) fn solve(
     // Back: x_f = A_f⁻¹ (side_f + change · x_{f + 1}), for the right-hand side and each shared
     // unknown.
     let mut solutions: Vec<DMatrix<f64>> = vec![DMatrix::zeros(p, 1 + b); frames.len()];
+    let mut variances: Vec<DVector<f64>> = vec![DVector::zeros(p); frames.len()];
+    let mut covariance = DMatrix::zeros(p, p);
     for f in (0..frames.len()).rev() {
         let (factor, solved) = &factors[f];
+        let alone = factor.inverse();
+        covariance = if f + 1 == frames.len() {
+            alone
+        } else {
+            let mut gain = alone.clone();
+            gain.column_iter_mut().zip(change.iter()).for_each(|(mut column, change)| column *= *change);
+            alone + &gain * covariance * gain.transpose()
+        };
+        variances[f] = covariance.diagonal();
         solutions[f] = match solutions.get(f + 1) {
             None => solved.clone(),
             Some(next) => {
@@ -118,8 +150,8 @@ pub(super) fn solve(
         shared_vector -= coupling * solution.column(0);
     }
     let shared_step = if b == 0 { DVector::zeros(0) } else { Cholesky::new(shared_matrix)?.solve(&shared_vector) };
-    let steps = solutions.iter().map(|s| s.column(0) - s.view((0, 1), (p, b)) * &shared_step).collect();
-    Some((steps, shared_step))
+    let own = solutions.iter().map(|s| s.column(0) - s.view((0, 1), (p, b)) * &shared_step).collect();
+    Some(Solution { own, shared: shared_step, variances })
 }
 
 #[cfg(test)]
@@ -159,22 +191,28 @@ mod tests {
                 }
             }
             let prior: Vec<f64> = (0..p).map(|_| 0.1 + random().abs()).collect();
-            let change: Vec<f64> = (0..p).map(|_| random().abs()).collect();
+            let kept: Vec<f64> = (0..p).map(|_| 0.98 * random().sin().abs()).collect();
             let common: Vec<f64> = (0..b).map(|_| 0.1 + random().abs()).collect();
             for f in 0..frames {
                 for i in 0..p {
-                    add(prior[i], own[f][i], &[(f * p + i, 1.0)]);
-                    if f + 1 < frames {
-                        add(change[i], own[f + 1][i] - own[f][i], &[((f + 1) * p + i, 1.0), (f * p + i, -1.0)]);
+                    // The first is as uncertain as any, each next one is what is kept and some more.
+                    if f == 0 {
+                        add(prior[i].recip(), own[0][i], &[(i, 1.0)]);
+                    } else {
+                        let more = prior[i] * (1.0 - kept[i] * kept[i]);
+                        let residual = own[f][i] - kept[i] * own[f - 1][i];
+                        add(more.recip(), residual, &[(f * p + i, 1.0), ((f - 1) * p + i, -kept[i])]);
                     }
                 }
             }
             (0..b).for_each(|k| add(common[k], shared[k], &[(frames * p + k, 1.0)]));
-            let expected = Expected { own: &prior, change: &change, shared: &common };
-            let (steps, shared_step) = solve(&normals, &expected, &own, &shared).unwrap();
-            let exact = whole.lu().solve(&right).unwrap();
+            let expected = Expected { own: &prior, kept: &kept, shared: &common };
+            let Solution { own: steps, shared: shared_step, variances } = solve(&normals, &expected, &own, &shared).unwrap();
+            let exact = whole.clone().lu().solve(&right).unwrap();
+            let inverse = whole.view((0, 0), (frames * p, frames * p)).into_owned().try_inverse().unwrap();
             for f in 0..frames {
                 prop_assert!((&steps[f] - exact.rows(f * p, p)).amax() < 1e-8);
+                prop_assert!((&variances[f] - inverse.diagonal().rows(f * p, p)).amax() < 1e-8);
             }
             prop_assert!((&shared_step - exact.rows(frames * p, b)).iter().all(|d| d.abs() < 1e-8));
         }

@@ -1,33 +1,54 @@
 //! What registration changes of a prior, and how the posed surface moves with it.
 
-use glam::{Mat3A, Quat, Vec3, Vec3A};
+use glam::{Quat, Vec3, Vec3A};
 use smpl::{BodyModel, Placement, Posed, Shaped};
+
+use volrender::Camera;
 
 use crate::capture::Frame;
 
-/// How a frame's pose is changed: the whole is shifted in the root's axes, and every joint is
-/// turned in its own.
+/// How a frame's pose is changed, in the world's axes: the whole is shifted, and every bone is
+/// turned about its joint, which moves what hangs on it without turning that.
 pub(super) type Change = Vec<Vec3>;
 
-/// The pose and the place of a frame after `change`: a shift, then a turn for each joint.
-pub(super) fn changed(frame: &Frame, shape: &Shaped, change: &[Vec3]) -> (Vec<Vec3>, Placement) {
-    let turned = |axis: Vec3, turn: Vec3| Quat::from_scaled_axis(axis) * Quat::from_scaled_axis(turn);
-    // What is not finite is to stay so.
-    let each = frame.pose.iter().zip(&change[1..]);
-    let mut pose: Vec<Vec3> =
-        each.map(|(&a, &turn)| if a.is_finite() { turned(a, turn).to_scaled_axis() } else { a }).collect();
+/// The pose and the place of a frame after `change`: a shift, then a turn for each bone.
+pub(super) fn changed(frame: &Frame, model: &BodyModel, shape: &Shaped, change: &[Vec3]) -> (Vec<Vec3>, Placement) {
     let root = shape.joints.first().copied().unwrap_or(Vec3::ZERO);
+    let about = match frame.placement {
+        Placement::Origin { rotation, .. } => Quat::from_scaled_axis(rotation),
+        Placement::Pelvis { .. } => Quat::IDENTITY,
+    };
+    let shift = frame.camera.world_to_camera.matrix3.transpose() * change[0];
+    let mut pose = frame.pose.clone();
+    // Where each bone points, before and after.
+    let mut bones: Vec<(Quat, Quat)> = Vec::with_capacity(pose.len());
+    let turns = change[1..].iter().map(|turn| Quat::from_scaled_axis(*turn));
+    for ((local, turn), parent) in pose.iter_mut().zip(turns).zip(&model.parents) {
+        // What is not finite is to stay so.
+        let given = if local.is_finite() { Quat::from_scaled_axis(*local) } else { Quat::IDENTITY };
+        let (before, after) = match parent {
+            Some(parent) => {
+                let (before, after) = (bones[*parent].0 * given, turn * bones[*parent].0 * given);
+                if local.is_finite() {
+                    *local = (bones[*parent].1.inverse() * after).normalize().to_scaled_axis();
+                }
+                (before, after)
+            }
+            None => {
+                if let (Placement::Pelvis { .. }, true) = (frame.placement, local.is_finite()) {
+                    *local = (turn * given).normalize().to_scaled_axis();
+                }
+                (about * given, turn * about * given)
+            }
+        };
+        bones.push((before, after));
+    }
     let placement = match frame.placement {
-        Placement::Pelvis { translation } => {
-            let before = Quat::from_scaled_axis(frame.pose[0]);
-            Placement::Pelvis { translation: translation + before * change[0] }
-        }
-        Placement::Origin { rotation, translation } => {
-            pose[0] = frame.pose[0];
-            let before = Quat::from_scaled_axis(rotation);
-            let after = turned(rotation, change[1]);
-            let translation = translation + before * (root + change[0]) - after * root;
-            Placement::Origin { rotation: after.to_scaled_axis(), translation }
+        Placement::Pelvis { translation } => Placement::Pelvis { translation: translation + shift },
+        Placement::Origin { translation, .. } => {
+            let after = Quat::from_scaled_axis(change[1]) * about;
+            let translation = translation + about * root + shift - after * root;
+            Placement::Origin { rotation: after.normalize().to_scaled_axis(), translation }
         }
     };
     (pose, placement)
@@ -47,15 +68,19 @@ pub(super) struct Motions<'a> {
     model: &'a BodyModel,
     rest: &'a [Vec3],
     posed: &'a Posed,
+    /// The axes of the camera, in which the whole is shifted.
+    axes: [Vec3A; 3],
     moved: Vec<Vec3A>,
     weights: Vec<f32>,
 }
 
 impl<'a> Motions<'a> {
     /// `rest` (V) are the shaped vertices.
-    pub fn new(model: &'a BodyModel, rest: &'a [Vec3], posed: &'a Posed) -> Self {
+    pub fn new(model: &'a BodyModel, rest: &'a [Vec3], posed: &'a Posed, camera: &Camera) -> Self {
         let joints = model.num_joints();
-        Self { model, rest, posed, moved: vec![Vec3A::ZERO; joints], weights: vec![0.0; joints] }
+        let rows = camera.world_to_camera.matrix3.transpose();
+        let axes = [rows.x_axis, rows.y_axis, rows.z_axis];
+        Self { model, rest, posed, axes, moved: vec![Vec3A::ZERO; joints], weights: vec![0.0; joints] }
     }
 
     /// The derivatives of a vertex.
@@ -69,8 +94,8 @@ impl<'a> Motions<'a> {
             self.weights[joint] += weight;
             highest = highest.max(joint);
         }
-        let mut push = |first: usize, axes: Mat3A, column: &dyn Fn(Vec3A) -> Vec3A| {
-            for (i, axis) in [axes.x_axis, axes.y_axis, axes.z_axis].into_iter().enumerate() {
+        let mut push = |first: usize, axes: [Vec3A; 3], column: &dyn Fn(Vec3A) -> Vec3A| {
+            for (i, axis) in axes.into_iter().enumerate() {
                 out.columns.push((first + i) as u32);
                 out.directions.push(column(axis).into());
             }
@@ -82,15 +107,15 @@ impl<'a> Motions<'a> {
                 continue;
             }
             (self.moved[joint], self.weights[joint]) = (Vec3A::ZERO, 0.0);
-            let axes = self.posed.bones[joint].matrix3;
-            let arm = moved - weight * Vec3A::from(self.posed.joints[joint]);
-            push(3 + 3 * joint, axes, &|axis| axis.cross(arm));
+            let place = weight * Vec3A::from(self.posed.joints[joint]);
+            push(3 + 3 * joint, Vec3A::AXES, &|axis| axis.cross(moved - place));
             match self.model.parents[joint] {
+                // The bone above takes the joint along, and does not turn what hangs on it.
                 Some(parent) => {
-                    self.moved[parent] += moved;
+                    self.moved[parent] += place;
                     self.weights[parent] += weight;
                 }
-                None => push(0, axes, &|axis| axis),
+                None => push(0, self.axes, &|axis| axis),
             }
         }
     }
@@ -122,12 +147,12 @@ mod tests {
             let shape = model.shaped(&[0.4, -0.7]);
             let frame = crate::scene::registration::tests::frame(pose, placement);
             let at = |change: &[Vec3]| {
-                let (pose, placement) = changed(&frame, &shape, change);
+                let (pose, placement) = changed(&frame, &model, &shape, change);
                 model.pose(&shape, &pose, placement)
             };
             let still = vec![Vec3::ZERO; model.num_joints() + 1];
             let posed = at(&still);
-            let mut motions = Motions::new(&model, &shape.vertices, &posed);
+            let mut motions = Motions::new(&model, &shape.vertices, &posed, &frame.camera);
             let mut motion = Motion::default();
             for vertex in (0..model.num_vertices()).step_by(701) {
                 motions.of(vertex, &mut motion);
