@@ -76,4 +76,6 @@ pub struct Capture {
     pub mean_betas: Vec<f32>,
     /// Whether [`crate::register`] has corrected the bodies.
     pub registered: bool,
+    /// Whether masks that are too large or too small have been mended.
+    pub mended: bool,
 }

@@ -46,6 +46,7 @@ const NEAR: f32 = 0.1;
 /// # Errors
 /// Pictures that cannot be read.
 pub(crate) fn mend(capture: &mut Capture, model: &BodyModel) -> Result<(), Error> {
+    capture.mended = true;
     let excess = excess(&capture.train)?;
     if excess == 0 {
         return extend(capture, model);

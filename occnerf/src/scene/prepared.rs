@@ -81,7 +81,9 @@ impl Scene {
         }
         let mut capture = capture.clone();
         if config.registration.rounds > 0 {
-            mend(&mut capture, model)?;
+            if !capture.mended {
+                mend(&mut capture, model)?;
+            }
             if !capture.registered {
                 register(&mut capture, model, config.registration.rounds)?;
             }

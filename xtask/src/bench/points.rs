@@ -23,7 +23,7 @@ const fn change(factor: &'static str, name: &'static str, set: &'static [&'stati
 }
 
 /// Every change but of the number of steps, most telling first.
-pub const CHANGES: [Change; 22] = [
+pub const CHANGES: [Change; 23] = [
     change("registration", "no registration", &["registration.rounds=0"], true),
     change("light", "even light", &["field.prior_light=false"], false),
     change("distance", "blended distance", &["surface.distance=blended"], true),
@@ -39,8 +39,9 @@ pub const CHANGES: [Change; 22] = [
     change("samples", "96 samples", &["samples=96"], false),
     change("span", "span 6 cm", &["motion.margin=0.06", "motion.depth=0.06"], false),
     change("neighbours", "k 1", &["surface.k=1"], true),
-    change("neighbours", "1 level", &["surface.coarse_levels=0"], true),
-    change("visibility", "exact visibility", &["surface.visibility=exact"], true),
+    change("neighbours", "4 levels", &["surface.coarse_levels=3"], true),
+    change("attention", "attention", &["surface.attention=true"], true),
+    change("attention", "exact visibility", &["surface.attention=true", "surface.visibility=exact"], false),
     change("table", "table 2^13", &["encoding.log2_table_size=13"], true),
     change("table", "table 2^19", &["encoding.log2_table_size=19"], false),
     change("resolution", "6 levels", &["encoding.levels=6"], false),
@@ -50,7 +51,7 @@ pub const CHANGES: [Change; 22] = [
     change("depth", "depth 1", &["field.depth=1"], false),
     change("rates", "rates / 3", &["rates.field=2e-3", "rates.table=1e-2"], true),
     change("loss", "no perceptual term", &["loss.perceptual=0"], true),
-    change("surface term", "no surface term", &["surface.surface_term=false", "surface.attention=false"], true),
+    change("surface term", "no surface term", &["surface.surface_term=false"], true),
 ];
 
 const fn baked(shells: usize, atlas: u32, vertex_colours: bool, smooth: bool) -> Baking {
@@ -281,14 +282,13 @@ mod tests {
             line("24 samples", "samples", Kind::Change, 20.0, 6.0),
             line("width 32", "field", Kind::Change, 19.0, 5.0),
             line("k 1", "neighbours", Kind::Change, 20.0, 9.0),
-            line("1 level", "neighbours", Kind::Change, 20.0, 8.0),
             line("4 features", "features", Kind::Change, 20.5, 12.0),
-            line("exact visibility", "visibility", Kind::Change, 20.2, 9.0),
+            line("exact visibility", "attention", Kind::Change, 20.2, 9.0),
         ];
         let points = sweep(false).combinations(&lines).unwrap();
         let set = |name: &str| &points.iter().find(|p| p.name == name).unwrap().job.config;
         let lean = set("lean");
-        assert_eq!((lean.samples, lean.surface.k, lean.surface.coarse_levels), (24, 5, 0));
+        assert_eq!((lean.samples, lean.surface.k, lean.surface.coarse_levels), (24, 1, 0));
         assert_eq!((lean.field.width, lean.encoding.features), (64, 2));
         assert_eq!((set("rich").samples, set("rich").encoding.features), (48, 4));
         assert_eq!((set("lean and rich").samples, set("lean and rich").encoding.features), (24, 4));

@@ -58,16 +58,17 @@ const GREY: [&str; 3] = ["field.prior_colors=false", "field.prior_light=false", 
 const HUMANNERF: [&str; 6] =
     [GREY[0], GREY[1], GREY[2], "registration.rounds=0", "motion.kind=volume", "motion.shell_interval=0"];
 
-/// A component left out, or replaced by what it competes with.
-const COMPONENTS: [(&str, &[&str]); 11] = [
+/// A component left out, put back, or replaced by what it competes with.
+const COMPONENTS: [(&str, &[&str]); 12] = [
     ("full", &[]),
     ("no-surface", &["surface.surface_term=false"]),
-    ("no-attention", &["surface.attention=false"]),
-    ("exact-attention", &["surface.visibility=exact"]),
+    ("attention", &["surface.attention=true"]),
+    ("exact-attention", &["surface.attention=true", "surface.visibility=exact"]),
     ("no-completeness", &["loss.completeness=0"]),
     ("no-perceptual", &["loss.perceptual=0"]),
     ("one-neighbour", &["surface.k=1"]),
-    ("one-level", &["surface.coarse_levels=0"]),
+    ("four-levels", &["surface.coarse_levels=3"]),
+    ("four-levels-attention", &["surface.coarse_levels=3", "surface.attention=true"]),
     ("fixed-vertices", &["rates.vertices=0"]),
     ("no-registration", &["registration.rounds=0"]),
     ("even-light", &["field.prior_light=false"]),
@@ -75,7 +76,7 @@ const COMPONENTS: [(&str, &[&str]); 11] = [
 
 /// The way from the paper's text to the default: each row keeps the changes of those before it. The
 /// row `paper` is the preset `paper`; what stands before it are its departures from the text.
-const STORY: [(&str, &[&str]); 11] = [
+const STORY: [(&str, &[&str]); 13] = [
     ("text", &["registration.rounds=0", "motion.kind=volume", "rates.table=5e-5", "rates.final_fraction=1"]),
     ("registered-prior", &["registration.rounds=16"]),
     ("finer-volume", &["motion.resolution=64"]),
@@ -105,6 +106,8 @@ const STORY: [(&str, &[&str]); 11] = [
             "encoding.distance_max=0.6",
         ],
     ),
+    ("one-level", &["surface.coarse_levels=0"]),
+    ("plain-mean", &["surface.attention=false"]),
     (
         "balanced",
         &["patches=4", "samples=48", "min_transmittance=0.01", "motion.depth=0.04", "motion.shell_interval=32"],
@@ -136,7 +139,7 @@ fn methods() -> Vec<Row> {
         row("occnerf", Occnerf, Unknown, Steps),
         Row { baked: Some("occnerf"), ..row("occnerf-baked", Occnerf, Unknown, Steps) },
     ];
-    for name in ["no-surface", "no-attention", "no-completeness", "no-perceptual"] {
+    for name in ["no-surface", "no-completeness", "no-perceptual"] {
         let changes = COMPONENTS.iter().find(|(component, _)| *component == name).map_or(&[][..], |c| c.1);
         rows.push(Row { changes: changes.to_vec(), ..row(name, Occnerf, Unknown, Steps) });
     }

@@ -99,8 +99,10 @@ mod tests {
             let expected = Expected { own: &variances, kept: &kept, shared: &[] };
             let Solution { own: found, variances, .. } =
                 solve(&normals, &expected, &still, &DVector::zeros(0)).unwrap();
-            let change = |x: &DVector<f64>| x.as_slice().chunks(3).map(|c| glam::DVec3::from_slice(c).as_vec3());
-            let changes: Vec<Vec<Vec3>> = found.iter().map(|x| change(x).collect()).collect();
+            let change = |x: &DVector<f64>| -> Vec<Vec3> {
+                x.as_slice().chunks(3).map(|c| glam::DVec3::from_slice(c).as_vec3()).collect()
+            };
+            let changes: Vec<Vec<Vec3>> = found.iter().map(change).collect();
             tracker = tracker.learnt(&changes, &variances, 2.0);
         }
         tracker
