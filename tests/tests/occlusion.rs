@@ -23,20 +23,22 @@ fn shown(frame: u32, x: u32, y: u32) -> bool {
     x.abs_diff(12) < 6 && (4..28).contains(&y) && (frame == 2 || y < 16)
 }
 
-fn load(hidden: u32, distortion: [f64; 5]) -> Capture {
+/// With the files, which frames are read from again.
+fn load(hidden: u32, distortion: [f64; 5]) -> (TempDir, Capture) {
     let dir = TempDir::new("occluded");
     let color = |frame: u32, x: u32, y: u32| {
         let salt = if shown(frame, x, y) { 1 } else { hidden };
         [0, 1, 2].map(|c| noise(3 * (y * 24 + x) + c + 3000 * frame, salt))
     };
     capture_on_disk::write(dir.path(), distortion, color, |frame, x, y| 255 * u8::from(shown(frame, x, y)));
-    load_capture(dir.path(), &capture_on_disk::body(), &LoadOptions::default()).unwrap()
+    let capture = load_capture(dir.path(), &capture_on_disk::body(), &LoadOptions::default()).unwrap();
+    (dir, capture)
 }
 
 #[test]
 fn the_picture_under_the_mask_never_leaves_the_loader() {
     for distortion in [NO_DISTORTION, BARREL] {
-        let (one, other) = (load(2, distortion), load(3, distortion));
+        let ((_one, one), (_other, other)) = (load(2, distortion), load(3, distortion));
         for (a, b) in one.train.iter().zip(&other.train) {
             assert_eq!(a.pixels().unwrap().mask, b.pixels().unwrap().mask);
             assert!(a.pixels().unwrap().mask.iter().any(|&m| m > 0.5));
@@ -61,7 +63,7 @@ fn a_loaded_capture_trains_to_the_same_checkpoint_whatever_is_hidden() {
     let body = capture_on_disk::body();
     // The body has eight vertices, which is enough for its own k nearest.
     let [one, other] = [2, 3].map(|hidden| {
-        let mut capture = load(hidden, NO_DISTORTION);
+        let (_files, mut capture) = load(hidden, NO_DISTORTION);
         capture.name = "occluded".to_owned();
         train(&Scene::new(&capture, &body, &config).unwrap(), &config, 4).1
     });

@@ -84,8 +84,11 @@ fn a_scene_in_centimetres_trains_the_same_within_rounding() {
 
 #[test]
 fn vertices_and_joints_of_a_frame_are_the_same_in_any_unit() {
-    let scene = scaled_scene(1000.0, &configs()[0]);
-    for (ours, theirs) in common::scene().train.iter().zip(&scene.train) {
+    // Registration is left out: where an outline is found, rounding decides.
+    let mut config = configs()[0].clone();
+    config.registration.rounds = 0;
+    let [metres, millimetres] = [1.0, 1000.0].map(|scale| scaled_scene(scale, &config));
+    for (ours, theirs) in metres.train.iter().zip(&millimetres.train) {
         let far = |a: &[Vec3], b: &[Vec3]| a.iter().zip(b).map(|(a, b)| a.distance(*b)).fold(0.0, f32::max);
         // A few units in the last place of coordinates of at most 2.
         assert!(far(&ours.view.posed.vertices, &theirs.view.posed.vertices) < 3e-6);

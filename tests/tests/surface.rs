@@ -169,7 +169,7 @@ fn cameras_and_views_put_vertices_into_the_same_pixels_and_rays_lead_back_to_the
     let mesh = RayMesh::new(&frame.view.posed.vertices, &scene.body.model.faces).unwrap();
     let visible = visibility::visible_vertices(&mesh, &frame.view.posed.vertices, &view, None);
     let mut seen = 0;
-    for (&v, visible) in frame.view.posed.vertices.iter().zip(visible) {
+    for (i, (&v, visible)) in frame.view.posed.vertices.iter().zip(visible).enumerate() {
         let projected = camera.project(v).unwrap();
         let pixel = view.pixel(v).unwrap();
         let edge = (projected.fract() - 0.5).abs();
@@ -182,7 +182,8 @@ fn cameras_and_views_put_vertices_into_the_same_pixels_and_rays_lead_back_to_the
         // Toward a vertex of the silhouette the ray may pass by.
         if let Some(hit) = mesh.first_hit(ray.origin, ray.direction) {
             seen += usize::from(visible);
-            if visible {
+            // Its own faces may be so oblique that a ray a hair beside it meets them far in front.
+            if visible && !scene.body.model.faces[hit.face as usize].contains(&(i as u32)) {
                 assert!(hit.t > distance - 1e-4, "visible at {distance}, but {} is in front", hit.t);
             }
         }

@@ -30,6 +30,7 @@ fn no_seed_starts_empty() {
         for (motion, seeds) in [(MotionKind::Surface, 0..5), (MotionKind::Volume, 5..7)] {
             for seed in seeds {
                 let mut config = Config::preset(Preset::Fast, method);
+                config.surface.coarse_levels = 3;
                 (config.seed, config.motion.kind) = (seed, motion);
                 config.motion.shell_interval = 0;
                 config.field.prior_colors &= motion == MotionKind::Surface;

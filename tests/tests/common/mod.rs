@@ -40,6 +40,8 @@ pub fn tiny(method: Method, motion: MotionKind) -> Config {
     (config.patches, config.patch_size, config.samples) = (3, 16, 24);
     (config.field.width, config.field.depth) = (32, 2);
     (config.encoding.levels, config.encoding.log2_table_size, config.encoding.n_max) = (6, 12, 96);
+    // With all parts of the paper's surface term.
+    (config.surface.coarse_levels, config.surface.attention) = (3, true);
     config.motion.kind = motion;
     config.motion.shell_interval = 2;
     if motion != MotionKind::Surface {

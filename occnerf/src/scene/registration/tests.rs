@@ -38,7 +38,7 @@ fn what_is_wrong_with_a_prior_is_mostly_mended_whatever_the_number_of_threads() 
     let exact = DemoConfig { pose_noise_degrees: 0.0, translation_noise: 0.0, beta_noise: 0.0, ..small() };
     let truth = demo(&exact, &body).unwrap();
     for (wrong, most) in [
-        (Perturbation { pose_degrees: 4.0, ..Perturbation::default() }, 0.55),
+        (Perturbation { pose_degrees: 4.0, ..Perturbation::default() }, 0.8),
         (Perturbation { shape: 1.0, ..Perturbation::default() }, 0.4),
     ] {
         let mut given = demo(&small(), &body).unwrap();
