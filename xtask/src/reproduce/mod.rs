@@ -209,17 +209,25 @@ impl Experiment<'_> {
         }
         if self.arguments.publish {
             let (table, scene) = (self.arguments.table(), summary.name());
-            let (name, title) = (format!("{}-{scene}", table.name()), format!("{} on {scene}", table.title()));
+            let other = self.other();
+            let title = format!("{} on {scene}{other}", table.title());
+            let name = format!("{}-{scene}{}", table.name(), other.replace(" --", "-").replace(' ', "-"));
             let chart = [summary.chart(directory, &name)?];
             let body = summary.markdown();
             results::publish(&Section { name: &name, title: &title, body: &body, charts: &chart })?;
             // The one that everybody can make anew.
-            if self.scene == source::DEMO && table == Table::Methods {
+            if self.scene == source::DEMO && table == Table::Methods && other.is_empty() {
                 let (set, table) = (results::set_of(&scene), summary.front());
                 results::publish_table(&format!("{set}.\n\n{table}"))?;
             }
         }
         Ok(())
+    }
+
+    /// What sets this apart from the scene's main tables, as options.
+    fn other(&self) -> String {
+        let paper = if self.arguments.preset == Preset::Paper { " --preset paper" } else { "" };
+        format!("{paper}{}", self.arguments.load.command_line())
     }
 
     /// The main rows at each level of wrongness.
