@@ -259,6 +259,7 @@ mod tests {
         for distance in [DistanceKind::Blended, DistanceKind::Exact] {
             let mut config = Config::preset(Preset::Paper, Method::Occnerf);
             config.motion.kind = MotionKind::Volume;
+            (config.field.prior_colors, config.field.prior_light) = (false, false);
             (config.surface.distance, config.encoding.log2_table_size) = (distance, 8);
             let scene = Scene::new(&capture, &body, &config).unwrap();
             let trainer = Trainer::new(&scene, config.clone()).unwrap();

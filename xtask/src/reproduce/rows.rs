@@ -77,14 +77,24 @@ const COMPONENTS: [(&str, &[&str]); 12] = [
 /// The way from the paper's text to the default: each row keeps the changes of those before it. The
 /// row `paper` is the preset `paper`; what stands before it are its departures from the text.
 const STORY: [(&str, &[&str]); 13] = [
-    ("text", &["registration.rounds=0", "motion.kind=volume", "rates.table=5e-5", "rates.final_fraction=1"]),
+    (
+        "text",
+        &[
+            GREY[0],
+            GREY[1],
+            "registration.rounds=0",
+            "motion.kind=volume",
+            "rates.table=5e-5",
+            "rates.final_fraction=1",
+        ],
+    ),
     ("registered-prior", &["registration.rounds=16"]),
     ("finer-volume", &["motion.resolution=64"]),
     ("surface-motion", &["motion.kind=surface", "motion.resolution=32"]),
-    ("paper", &["rates.table=5e-3", "rates.final_fraction=0.1"]),
+    ("table-rate", &["rates.table=5e-3", "rates.final_fraction=0.1"]),
+    ("paper", &["field.prior_colors=true", "field.prior_light=true"]),
     ("squared-error", &["loss.mse=5"]),
     ("exact-distance", &["surface.distance=exact"]),
-    ("prior-colours", &["field.prior_colors=true", "field.prior_light=true"]),
     (
         "higher-rates",
         &[
@@ -266,10 +276,7 @@ mod tests {
             for (i, row) in rows.iter().enumerate() {
                 assert!(rows[..i].iter().all(|other| other.name != row.name), "{}", row.name);
                 for preset in [Preset::Fast, Preset::Balanced, Preset::Paper] {
-                    // Colours and corrections hang on the surface motion, which `paper` has not.
-                    if preset != Preset::Paper || row.changes.is_empty() {
-                        row.settings(preset).unwrap();
-                    }
+                    row.settings(preset).unwrap();
                 }
             }
             assert!(table.shown().iter().all(|name| rows.iter().any(|row| row.name == *name)), "{table:?}");
