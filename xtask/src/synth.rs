@@ -85,9 +85,12 @@ pub struct SynthArguments {
     /// 0.15 under the clothes [default: 1]
     #[arg(long, value_name = "0 to 3")]
     shape_noise: Option<f32>,
-    /// Decides the embedded person's shape and all errors [default: 0]
+    /// Decides the light, the embedded person's shape and clothes, and all errors [default: 0]
     #[arg(long, value_name = "N")]
     seed: Option<u64>,
+    /// Strength of the light from one side; at 0 as much comes from everywhere [default: 1]
+    #[arg(long, value_name = "0 to 1")]
+    lamp: Option<f32>,
 }
 
 impl SynthArguments {
@@ -110,6 +113,7 @@ impl SynthArguments {
             eval_cameras: self.eval_cameras.unwrap_or(usual.eval_cameras),
             eval_every: self.eval_every.unwrap_or(usual.eval_every),
             seed: self.seed.unwrap_or(usual.seed),
+            lamp: self.lamp.unwrap_or(usual.lamp),
             pose_noise_degrees: self.pose_noise.unwrap_or(usual.pose_noise_degrees),
             shape_noise: self.shape_noise.unwrap_or(usual.shape_noise),
             turns: self.turns.unwrap_or(usual.turns),

@@ -39,7 +39,8 @@ impl Config {
 const NOTHING: f32 = 1.0 / (1 << 25) as f32;
 
 /// The paper's method: the point term and the attended surface term on the blend of vertices, the
-/// completeness term, its sampler, sizes and number of steps. It leaves the size of F open. Where it departs from the paper's text, which `reproduce --story` takes back one by one:
+/// completeness term, its sampler, sizes and number of steps. It leaves the size of F open. Where it
+/// departs from the paper's text, which `reproduce --story` takes back one by one:
 ///
 /// - `registration`: the prior is corrected first, as it is for every baseline.
 /// - `motion.kind`: weights of the nearest surface point in place of a learnable weight volume of
@@ -47,8 +48,8 @@ const NOTHING: f32 = 1.0 / (1 << 25) as f32;
 ///   between: on recorded walking a tenth of the vertices are taken more than 28 cm from where they
 ///   rest, with 64³ more than 14 cm.
 /// - `rates.table`: a hundred times the 5e-5 of "the rest", falling to a tenth. At 5e-5 an entry
-///   that a tenth of the steps touch has moved by 0.05 at most when the run ends; the code published with
-///   the paper trains the encoder at 5e-4.
+///   that a tenth of the steps touch has moved by 0.05 at most when the run ends; the code published
+///   with the paper trains the encoder at 5e-4.
 /// - `field.prior_colors`, `field.prior_light`: colours start from the corrected prior's in place of
 ///   grey. What no frame shows stays as it starts.
 fn paper() -> Config {

@@ -1,5 +1,6 @@
 //! `reproduce`: the paper's table, and others made in the same way, on somebody's data.
 
+mod curves;
 mod plan;
 mod rows;
 mod summary;
@@ -73,8 +74,11 @@ pub struct ReproduceArguments {
     #[arg(long, conflicts_with_all = ["robustness", "components"])]
     story: bool,
     /// What each component is worth instead: each left out, from a grey start and from ours
-    #[arg(long, conflicts_with = "robustness")]
+    #[arg(long, conflicts_with_all = ["robustness", "curves"])]
     components: bool,
+    /// How good methods are after fewer and more steps, and at other rates, instead
+    #[arg(long, conflicts_with_all = ["robustness", "story"])]
+    curves: bool,
     /// Make the tables a section of xtask/RESULTS.md, and that of the demo the table of README
     #[arg(long)]
     publish: bool,
@@ -202,6 +206,9 @@ impl Experiment<'_> {
             return Ok(());
         }
         say!("\n{}", summary.markdown());
+        if self.arguments.table() == Table::Curves {
+            summary.chart(directory, Table::Curves.name())?;
+        }
         for name in ["md", "json", "png"].map(|extension| directory.join(summary.file(extension))) {
             if name.is_file() {
                 say!("written: {}", name.display());
@@ -351,9 +358,10 @@ impl Experiment<'_> {
 
 impl ReproduceArguments {
     fn table(&self) -> Table {
-        match (self.story, self.components) {
-            (true, _) => Table::Story,
-            (_, true) => Table::Components,
+        match (self.story, self.components, self.curves) {
+            (true, ..) => Table::Story,
+            (_, true, _) => Table::Components,
+            (.., true) => Table::Curves,
             _ => Table::Methods,
         }
     }

@@ -117,8 +117,7 @@ impl Plan {
 
     fn factor(&self, row: &Row) -> f64 {
         match row.length {
-            Length::Steps => 1.0,
-            Length::FourTimes => 4.0,
+            Length::Times(times) => times,
             Length::Seconds => {
                 let reference = self.cost.get(Method::Occnerf.name()).map_or(0.0, |c| c.0);
                 let own = self.cost(row).0;

@@ -8,10 +8,8 @@ use crate::settings::set;
 /// How long a row trains.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Length {
-    /// As many steps as every other row.
-    Steps,
-    /// Four times as many, which the paper gave HumanNeRF.
-    FourTimes,
+    /// As many steps as every other row, times this.
+    Times(f64),
     /// As many seconds as `occnerf`.
     Seconds,
 }
@@ -31,6 +29,8 @@ pub struct Row {
     preset: Option<Preset>,
     /// What differs from that, as `--set` takes it.
     changes: Vec<&'static str>,
+    /// Factor on every learning rate.
+    pub rates: f32,
     /// The row with the same settings whose people are baked, and scored so; `None`: people are
     /// trained.
     pub baked: Option<&'static str>,
@@ -45,9 +45,11 @@ pub enum Table {
     Story,
     /// Each component left out, from a grey start and from ours.
     Components,
+    /// Methods by the number of steps, and by their rates.
+    Curves,
 }
 
-use Length::{FourTimes, Seconds, Steps};
+use Length::{Seconds, Times};
 use Method::{HashPoint, Humannerf, NeuralBody, Occnerf, Prior, SelfNerf};
 use OccludedRule::{Background, Unknown};
 
@@ -57,6 +59,25 @@ const GREY: [&str; 3] = ["field.prior_colors=false", "field.prior_light=false", 
 /// What HumanNeRF itself has where every other row has this project's way.
 const HUMANNERF: [&str; 6] =
     [GREY[0], GREY[1], GREY[2], "registration.rounds=0", "motion.kind=volume", "motion.shell_interval=0"];
+
+/// A prior that is not corrected, in mean colours.
+const AS_GIVEN: [&str; 2] = ["registration.rounds=0", "field.prior_light=false"];
+
+/// As many steps as every other row.
+const STEPS: Length = Times(1.0);
+/// As many as the paper gave HumanNeRF.
+const FOUR_TIMES: Length = Times(4.0);
+
+/// Methods whose curves are drawn, and of each the numbers of steps and the rates, as factors; the
+/// first of each is what all rows have.
+const CURVES: [(&str, Method, OccludedRule); 4] = [
+    ("humannerf-style-bg", Humannerf, Background),
+    ("humannerf-style", Humannerf, Unknown),
+    ("hash-point", HashPoint, Unknown),
+    ("occnerf", Occnerf, Unknown),
+];
+const CURVE_STEPS: [f64; 6] = [1.0, 0.125, 0.25, 0.5, 2.0, 4.0];
+const CURVE_RATES: [f32; 3] = [1.0, 0.33, 3.0];
 
 /// A component left out, put back, or replaced by what it competes with.
 const COMPONENTS: [(&str, &[&str]); 12] = [
@@ -125,7 +146,11 @@ const STORY: [(&str, &[&str]); 13] = [
 ];
 
 fn row(name: &str, method: Method, occluded: OccludedRule, length: Length) -> Row {
-    Row { name: name.to_owned(), method, occluded, length, preset: None, changes: Vec::new(), baked: None }
+    Row { name: name.to_owned(), method, occluded, length, preset: None, changes: Vec::new(), rates: 1.0, baked: None }
+}
+
+fn as_given() -> Row {
+    Row { changes: AS_GIVEN.to_vec(), ..row("prior-as-given", Prior, Unknown, STEPS) }
 }
 
 /// Methods, baselines first, and what each component of ours is worth. Row names say `bg` where
@@ -133,25 +158,26 @@ fn row(name: &str, method: Method, occluded: OccludedRule, length: Length) -> Ro
 /// corrections but `humannerf-style-paper`, which has its paper's.
 fn methods() -> Vec<Row> {
     let mut rows = vec![
-        row("prior", Prior, Unknown, Steps),
-        Row { changes: HUMANNERF.to_vec(), ..row("humannerf-style-paper", Humannerf, Background, Steps) },
-        row("humannerf-style-bg", Humannerf, Background, Steps),
-        row("humannerf-style-bg-4x", Humannerf, Background, FourTimes),
+        as_given(),
+        row("prior", Prior, Unknown, STEPS),
+        Row { changes: HUMANNERF.to_vec(), ..row("humannerf-style-paper", Humannerf, Background, STEPS) },
+        row("humannerf-style-bg", Humannerf, Background, STEPS),
+        row("humannerf-style-bg-4x", Humannerf, Background, FOUR_TIMES),
         row("humannerf-style-bg-time", Humannerf, Background, Seconds),
-        row("humannerf-style", Humannerf, Unknown, Steps),
-        row("humannerf-style-4x", Humannerf, Unknown, FourTimes),
+        row("humannerf-style", Humannerf, Unknown, STEPS),
+        row("humannerf-style-4x", Humannerf, Unknown, FOUR_TIMES),
         row("humannerf-style-time", Humannerf, Unknown, Seconds),
-        row("hash-point-bg", HashPoint, Background, Steps),
-        row("hash-point", HashPoint, Unknown, Steps),
-        row("neural-body-style", NeuralBody, Unknown, Steps),
-        row("self-nerf-style", SelfNerf, Unknown, Steps),
-        row("occnerf-bg", Occnerf, Background, Steps),
-        row("occnerf", Occnerf, Unknown, Steps),
-        Row { baked: Some("occnerf"), ..row("occnerf-baked", Occnerf, Unknown, Steps) },
+        row("hash-point-bg", HashPoint, Background, STEPS),
+        row("hash-point", HashPoint, Unknown, STEPS),
+        row("neural-body-style", NeuralBody, Unknown, STEPS),
+        row("self-nerf-style", SelfNerf, Unknown, STEPS),
+        row("occnerf-bg", Occnerf, Background, STEPS),
+        row("occnerf", Occnerf, Unknown, STEPS),
+        Row { baked: Some("occnerf"), ..row("occnerf-baked", Occnerf, Unknown, STEPS) },
     ];
     for name in ["no-surface", "no-completeness", "no-perceptual"] {
         let changes = COMPONENTS.iter().find(|(component, _)| *component == name).map_or(&[][..], |c| c.1);
-        rows.push(Row { changes: changes.to_vec(), ..row(name, Occnerf, Unknown, Steps) });
+        rows.push(Row { changes: changes.to_vec(), ..row(name, Occnerf, Unknown, STEPS) });
     }
     rows
 }
@@ -160,9 +186,9 @@ fn story() -> Vec<Row> {
     let mut changes = Vec::new();
     let step = |(name, more): &(&str, &[&'static str])| {
         changes.extend_from_slice(more);
-        Row { preset: Some(Preset::Paper), changes: changes.clone(), ..row(name, Occnerf, Unknown, Steps) }
+        Row { preset: Some(Preset::Paper), changes: changes.clone(), ..row(name, Occnerf, Unknown, STEPS) }
     };
-    std::iter::once(row("prior", Prior, Unknown, Steps)).chain(STORY.iter().map(step)).collect()
+    [as_given(), row("prior", Prior, Unknown, STEPS)].into_iter().chain(STORY.iter().map(step)).collect()
 }
 
 fn components() -> Vec<Row> {
@@ -170,13 +196,24 @@ fn components() -> Vec<Row> {
     let of = |(start, from): (&str, &[&'static str])| {
         let row = |(name, changes): &(&str, &[&'static str])| Row {
             changes: [from, changes].concat(),
-            ..row(&format!("{start}-{name}"), Occnerf, Unknown, Steps)
+            ..row(&format!("{start}-{name}"), Occnerf, Unknown, STEPS)
         };
         // A grey start knows of no light.
         let rows = COMPONENTS.iter().filter(|(name, _)| start == "ours" || *name != "even-light");
         rows.map(row).collect::<Vec<_>>()
     };
     starts.into_iter().flat_map(of).collect()
+}
+
+fn curves() -> Vec<Row> {
+    let of = |(name, method, occluded): (&str, Method, OccludedRule)| {
+        let steps = CURVE_STEPS.map(|times| row(&format!("{name}-x{times}"), method, occluded, Times(times)));
+        let rates = CURVE_RATES[1..].iter();
+        let rates =
+            rates.map(|&rates| Row { rates, ..row(&format!("{name}-rates-x{rates}"), method, occluded, STEPS) });
+        steps.into_iter().chain(rates.collect::<Vec<_>>()).collect::<Vec<_>>()
+    };
+    CURVES.into_iter().flat_map(of).collect()
 }
 
 impl Table {
@@ -186,6 +223,7 @@ impl Table {
             Self::Methods => methods(),
             Self::Story => story(),
             Self::Components => components(),
+            Self::Curves => curves(),
         }
     }
 
@@ -195,6 +233,7 @@ impl Table {
             Self::Methods => "reproduce",
             Self::Story => "story",
             Self::Components => "components",
+            Self::Curves => "curves",
         }
     }
 
@@ -204,6 +243,7 @@ impl Table {
             Self::Methods => "Methods",
             Self::Story => "From the paper to the default",
             Self::Components => "What each component is worth",
+            Self::Curves => "Steps and rates of methods",
         }
     }
 
@@ -221,8 +261,9 @@ impl Table {
                 "occnerf",
                 "occnerf-baked",
             ],
-            Self::Story => &["prior", "text", "registered-prior", "paper", "prior-colours", "balanced"],
+            Self::Story => &["prior", "text", "registered-prior", "paper", "balanced"],
             Self::Components => &["ours-full", "ours-no-surface", "grey-full", "grey-no-surface"],
+            Self::Curves => &[],
         }
     }
 }
@@ -258,6 +299,10 @@ impl Row {
         for change in &self.changes {
             config = set(&config, change).with_context(|| format!("row {}: {change}", self.name))?;
         }
+        let rates = &mut config.rates;
+        for rate in [&mut rates.field, &mut rates.vertices, &mut rates.table, &mut rates.motion] {
+            *rate *= self.rates;
+        }
         config.validate()?;
         Ok(config)
     }
@@ -267,7 +312,7 @@ impl Row {
 mod tests {
     use super::*;
 
-    const TABLES: [Table; 3] = [Table::Methods, Table::Story, Table::Components];
+    const TABLES: [Table; 4] = [Table::Methods, Table::Story, Table::Components, Table::Curves];
 
     #[test]
     fn every_row_of_every_table_can_be_run_and_none_is_there_twice() {

@@ -7,6 +7,7 @@ use image::RgbImage;
 use occnerf::SplitMetrics;
 use serde::Serialize;
 
+use super::curves;
 use super::plan::Plan;
 use super::rows::{Row, Table};
 use crate::run::{self, Metrics};
@@ -127,9 +128,14 @@ impl<'a> Summary<'a> {
         scene_name(Some(self.scene))
     }
 
-    /// The pictures of all methods under another name, for a folder with those of other scenes.
+    /// The pictures of all methods under another name, for a folder with those of other scenes; of
+    /// curves their chart.
     pub fn chart(&self, directory: &Path, name: &str) -> Result<PathBuf> {
         let copy = directory.join(format!("{name}.png"));
+        if self.table == Table::Curves {
+            let rows = self.rows.iter().map(|entry| (&*entry.name, &*entry.runs));
+            return curves::draw(&self.name(), rows, &copy);
+        }
         std::fs::copy(directory.join(self.file("png")), &copy).with_context(|| copy.display().to_string())?;
         Ok(copy)
     }

@@ -19,9 +19,9 @@ use smpl::{BodyModel, Shaped};
 use self::landmarks::joint;
 use self::motion::{Pose, TrackerError, track, walk};
 use self::person::Person;
-use self::texture::albedo;
+use self::texture::{Dress, albedo};
 use super::synth::noise::normal;
-use super::synth::render::Posture;
+use super::synth::render::{Lamp, Posture};
 use super::synth::stage::{Progress, Stage, ring};
 use super::{Capture, CaptureError, Frame, Obstacle};
 use crate::random::Stream;
@@ -41,8 +41,10 @@ pub struct DemoConfig {
     pub eval_cameras: usize,
     /// Evaluation cameras see one frame in this many, beginning with the first.
     pub eval_every: usize,
-    /// Decides the person's shape and the errors of the prior.
+    /// Decides the person's shape, clothes and light, and the errors of the prior.
     pub seed: u64,
+    /// Strength of the light that comes from one side, 0 (as much from everywhere) to 1.
+    pub lamp: f32,
     /// Root mean square error of each bone's orientation in the prior, degrees.
     pub pose_noise_degrees: f32,
     /// Root mean square error of the prior's position, metres of a person 1.7 m tall.
@@ -68,6 +70,7 @@ impl Default for DemoConfig {
             eval_cameras: 5,
             eval_every: 10,
             seed: 0,
+            lamp: 1.0,
             pose_noise_degrees: 1.5,
             translation_noise: 0.005,
             beta_noise: 0.15,
@@ -90,6 +93,7 @@ impl DemoConfig {
         within("eval_cameras", self.eval_cameras <= 64, "at most 64", &self.eval_cameras)?;
         within("eval_every", self.eval_every > 0, "at least 1", &self.eval_every)?;
         for (name, value, limit) in [
+            ("lamp", self.lamp, 1.0),
             ("pose_noise_degrees", self.pose_noise_degrees, 45.0),
             ("translation_noise", self.translation_noise, 1.0),
             ("beta_noise", self.beta_noise, 3.0),
@@ -152,15 +156,16 @@ pub(super) fn film(
         betas,
         progress,
     };
+    let (dress, lamp) = (Dress::new(config.seed), Lamp::new(config.lamp, config.seed));
     let color = |face: u32, weights: [f32; 3]| {
         let corners = person.faces[face as usize].iter().zip(weights);
-        albedo(&person.landmarks, corners.map(|(&v, w)| person.rest[v as usize] * w).sum())
+        albedo(&person.landmarks, &dress, corners.map(|(&v, w)| person.rest[v as usize] * w).sum())
     };
     let capture = stage.film("demo", |i| {
         let posed = body.pose(&shaped, &poses[i].joints, poses[i].placement());
         let vertices = person.posed(&posed);
         let normals = surface_query::vertex_normals(&vertices, &person.faces);
-        Posture::new(vertices, normals, &person.faces, &color)
+        Posture::new(vertices, normals, &person.faces, &color, lamp)
     })?;
     Ok((capture, height))
 }

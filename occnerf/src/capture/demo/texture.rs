@@ -6,6 +6,7 @@ use super::clothes::Garment;
 use super::face;
 use super::landmarks::Landmarks;
 use crate::capture::synth::noise::{smooth_noise, smoothstep};
+use crate::random::Stream;
 
 const TEAL: Vec3 = Vec3::new(0.07, 0.40, 0.47);
 const CREAM: Vec3 = Vec3::new(0.94, 0.90, 0.78);
@@ -17,16 +18,43 @@ const LEATHER: Vec3 = Vec3::new(0.25, 0.13, 0.07);
 const BRASS: Vec3 = Vec3::new(0.90, 0.78, 0.42);
 const WHITE: Vec3 = Vec3::new(0.93, 0.93, 0.91);
 
+/// What a person wears.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Dress {
+    /// Height of a stripe with its neighbours, metres, and by how much stripes rise outward.
+    period: f32,
+    slant: f32,
+    /// The channels that red, green and blue are taken from.
+    dye: [usize; 3],
+}
+
+impl Dress {
+    /// The usual one with seed 0.
+    pub fn new(seed: u64) -> Self {
+        if seed == 0 {
+            return Self { period: 0.064, slant: 0.0, dye: [0, 1, 2] };
+        }
+        const DYES: [[usize; 3]; 5] = [[0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0]];
+        let mut stream = Stream::new(&[seed, 0x6472_6573]);
+        let (period, slant) = (0.04 + 0.06 * stream.uniform(), 2.0 * stream.uniform() - 1.0);
+        Self { period, slant, dye: DYES[(5.0 * stream.uniform()) as usize % 5] }
+    }
+
+    fn dyed(&self, color: Vec3) -> Vec3 {
+        Vec3::from_array(self.dye.map(|channel| color[channel]))
+    }
+}
+
 /// The unlit colour at `rest`, a point of the body (not of the clothes above it) in the rest pose.
-pub(super) fn albedo(landmarks: &Landmarks, rest: Vec3) -> Vec3 {
+pub(super) fn albedo(landmarks: &Landmarks, dress: &Dress, rest: Vec3) -> Vec3 {
     let q = landmarks.figure(rest);
     let (garment, below_hem) = landmarks.garment(q);
     let color = match garment {
         Garment::Hair => face::hair(landmarks, q),
-        Garment::Shirt => shirt(landmarks, q),
-        Garment::Belt => belt(q),
-        Garment::Trousers => trousers(landmarks, q),
-        Garment::Shoe => shoe(landmarks, q),
+        Garment::Shirt => dress.dyed(shirt(landmarks, dress, q)),
+        Garment::Belt => dress.dyed(belt(q)),
+        Garment::Trousers => dress.dyed(trousers(landmarks, q)),
+        Garment::Shoe => dress.dyed(shoe(landmarks, q)),
         Garment::Sock => WHITE * 0.9,
         Garment::Skin => face::skin(landmarks, q),
     };
@@ -39,7 +67,7 @@ fn mottled(color: Vec3, q: Vec3, scale: f32, amount: f32) -> Vec3 {
     color * (1.0 + amount * (2.0 * smooth_noise(q * scale) - 1.0))
 }
 
-fn shirt(landmarks: &Landmarks, q: Vec3) -> Vec3 {
+fn shirt(landmarks: &Landmarks, dress: &Dress, q: Vec3) -> Vec3 {
     let ax = q.x.abs();
     let chest = landmarks.chest;
     let seam = landmarks.shoulder_x + 0.012 - 0.18 * (q.y - landmarks.neck.y + 0.04);
@@ -56,8 +84,8 @@ fn shirt(landmarks: &Landmarks, q: Vec3) -> Vec3 {
             return color;
         }
     }
-    let along = if on_sleeve { ax - seam } else { q.y - chest.y };
-    let stripe = (along / 0.064).rem_euclid(1.0);
+    let along = if on_sleeve { ax - seam } else { q.y - chest.y + dress.slant * ax };
+    let stripe = (along / dress.period).rem_euclid(1.0);
     let color = match stripe {
         s if s < 0.42 => TEAL,
         s if s < 0.56 => CORAL,

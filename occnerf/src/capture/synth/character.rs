@@ -10,7 +10,7 @@ use visibility::RayMesh;
 use super::config::SynthConfig;
 use super::noise::smooth_noise;
 use super::perform::{Extent, Skeleton, brought, seconds};
-use super::render::Posture;
+use super::render::{Lamp, Posture};
 use super::stage::{Progress, Stage, ring};
 use super::texture::{decode, pattern, sample};
 use crate::capture::demo::DemoConfig;
@@ -104,7 +104,7 @@ pub(super) fn film(
     let capture = stage.film("character", |i| {
         let vertices = figure.vertices(&stances[i]);
         let normals = figure.normals(&vertices);
-        Posture::new(vertices, normals, &character.faces, &color)
+        Posture::new(vertices, normals, &character.faces, &color, Lamp::new(config.lamp, config.seed))
     })?;
     Ok((capture, height, figure.body))
 }

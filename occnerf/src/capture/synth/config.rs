@@ -37,8 +37,10 @@ pub struct SynthConfig {
     pub eval_cameras: usize,
     /// Evaluation cameras see one frame in this many, beginning with the first.
     pub eval_every: usize,
-    /// Decides the embedded person's shape and the errors of the prior.
+    /// Decides the light, the embedded person's shape and clothes, and the errors of the prior.
     pub seed: u64,
+    /// Strength of the light that comes from one side, 0 (as much from everywhere) to 1.
+    pub lamp: f32,
     /// Root mean square error of each bone's orientation in the prior, degrees, 0 to 45.
     pub pose_noise_degrees: f32,
     /// Error of the prior's shape relative to the usual one, 0 to 3. At 1 the embedded person's
@@ -61,6 +63,7 @@ impl Default for SynthConfig {
             eval_cameras: demo.eval_cameras,
             eval_every: demo.eval_every,
             seed: demo.seed,
+            lamp: demo.lamp,
             pose_noise_degrees: demo.pose_noise_degrees,
             shape_noise: 1.0,
             turns: 1.15,
@@ -79,6 +82,7 @@ impl SynthConfig {
             eval_cameras: self.eval_cameras,
             eval_every: self.eval_every,
             seed: self.seed,
+            lamp: self.lamp,
             pose_noise_degrees: self.pose_noise_degrees,
             beta_noise: usual.beta_noise * self.shape_noise,
             occluded_fraction: 0.0,

@@ -18,6 +18,7 @@ use smpl::{BodyModel, Character, MotionClip};
 pub use self::config::{Occlusion, SynthConfig};
 
 use self::objects::Objects;
+use self::render::Lamp;
 use super::demo::{DemoConfig, film, grounded_walk};
 use super::pixels::Area;
 use super::{Capture, CaptureError, Frame, PixelSource};
@@ -82,7 +83,7 @@ pub fn synthesise(
     match config.occlusion {
         Occlusion::Rectangle(obstacle) => hidden = obstacle.hide(&mut capture.train)?,
         Occlusion::Objects { fraction, position } => {
-            let made = Objects::new(&capture.train, height, fraction, position)?;
+            let made = Objects::new(&capture.train, height, (fraction, position), Lamp::new(config.lamp, config.seed))?;
             made.hide(&mut capture.train)?;
             objects = Some(made);
         }

@@ -7,7 +7,7 @@ use glam::Vec3;
 use volrender::Camera;
 
 use super::noise::smooth_noise;
-use super::render::{Picture, Posture};
+use super::render::{Lamp, Picture, Posture};
 use crate::capture::{CaptureError, Frame, Image, Pixels};
 
 /// Distance of the objects' far and near sides from the person's axis, in heights of the person:
@@ -40,14 +40,19 @@ impl Objects {
     /// Objects so wide that they hide as nearly as pixels allow `fraction` of the subject in
     /// `frames`, `position` picture widths to the right of the person; `height` is what the cameras
     /// stand for.
-    pub fn new(frames: &[Frame], height: f32, fraction: f32, position: f32) -> Result<Self, CaptureError> {
+    pub fn new(
+        frames: &[Frame],
+        height: f32,
+        (fraction, position): (f32, f32),
+        lamp: Lamp,
+    ) -> Result<Self, CaptureError> {
         let Some(camera) = frames.first().map(|frame| frame.camera) else {
             return Err(CaptureError::setting("frames", "at least 1", 0));
         };
         let eye = camera.centre_of_projection();
         // A picture's width where the objects stand.
         let width = (eye.z - NEAR * height) / camera.focal.x * camera.width as f32;
-        let at = |size: f32| picture(&camera, height, size, position * width);
+        let at = |size: f32| picture(&camera, height, (size, position * width), lamp);
         let hidden = |front: &Picture| -> Result<f32, CaptureError> {
             let (mut whole, mut gone) = (0u64, 0u64);
             for frame in frames {
@@ -107,7 +112,7 @@ impl Objects {
 }
 
 /// The desk and the pillars, `size` times as wide as usual, moved right.
-fn picture(camera: &Camera, height: f32, size: f32, right: f32) -> Result<Picture, CaptureError> {
+fn picture(camera: &Camera, height: f32, (size, right): (f32, f32), lamp: Lamp) -> Result<Picture, CaptureError> {
     if size == 0.0 {
         let pixels = camera.width as usize * camera.height as usize;
         return Ok((Image::new(camera.width, camera.height), vec![0.0; pixels]));
@@ -149,7 +154,7 @@ fn picture(camera: &Camera, height: f32, size: f32, right: f32) -> Result<Pictur
             STONE * (0.8 + 0.3 * smooth_noise(at * 30.0)) * if (at.y * 6.0).rem_euclid(1.0) < 0.06 { 0.7 } else { 1.0 }
         }
     };
-    Ok(Posture::new(corners, normals, &faces, &color)?.render(camera))
+    Ok(Posture::new(corners, normals, &faces, &color, lamp)?.render(camera))
 }
 
 /// A tiled floor at y = 0 and a wall.

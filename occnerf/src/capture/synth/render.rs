@@ -1,19 +1,47 @@
 //! Pictures of a mesh by ray casting.
 
+use std::f32::consts::PI;
+
 use glam::{Affine3A, Mat3, Vec2, Vec3};
 use visibility::RayMesh;
 use volrender::Camera;
 
 use crate::capture::{CaptureError, Image};
+use crate::random::Stream;
 
 /// Rays a pixel, along each axis.
 const SAMPLES: u32 = 2;
-/// Toward the lamp: from the training camera's upper left.
-const LAMP: Vec3 = Vec3::new(-0.42, 0.68, 0.60);
-/// Light from everywhere, light from above, light of the lamp.
+/// Light from everywhere, light from above, light of the lamp, and what the lamp gives on average.
 const AMBIENT: f32 = 0.58;
 const SKY: f32 = 0.07;
 const DIRECT: f32 = 0.42;
+const MEAN: f32 = DIRECT / 3.0;
+
+/// The light that a person is filmed under.
+#[derive(Clone, Copy, Debug)]
+pub(in crate::capture) struct Lamp {
+    toward: Vec3,
+    strength: f32,
+}
+
+impl Lamp {
+    /// 1 is as strong as usual; at 0 as much light comes from everywhere. It stands to the training
+    /// camera's upper left with seed 0, elsewhere on that side of the person with others.
+    pub fn new(strength: f32, seed: u64) -> Self {
+        let mut stream = Stream::new(&[seed, 0x006c_616d_70]);
+        let (azimuth, up) = ((stream.uniform() - 0.5) * PI, 0.3 + 0.6 * stream.uniform());
+        let elsewhere = Vec3::new(azimuth.sin(), up, azimuth.cos());
+        Self { toward: if seed == 0 { Vec3::new(-0.42, 0.68, 0.60) } else { elsewhere }, strength }
+    }
+
+    /// What falls on a surface with this normal.
+    fn on(&self, normal: Vec3) -> f32 {
+        let lamp = normal.dot(self.toward.normalize_or(Vec3::Y));
+        // Half-Lambert: the terminator is soft and nothing is black.
+        let direct = (0.5 + 0.5 * lamp).powi(2);
+        AMBIENT + (1.0 - self.strength) * MEAN + self.strength * SKY * normal.y + self.strength * DIRECT * direct
+    }
+}
 
 /// A camera at `eye` that looks at `target`, upright, square, with the focal length in picture
 /// sides.
@@ -42,6 +70,7 @@ pub(in crate::capture) struct Posture<'a> {
     normals: Vec<Vec3>,
     faces: &'a [[u32; 3]],
     albedo: &'a Albedo<'a>,
+    lamp: Lamp,
     mesh: RayMesh,
 }
 
@@ -52,10 +81,11 @@ impl<'a> Posture<'a> {
         normals: Vec<Vec3>,
         faces: &'a [[u32; 3]],
         albedo: &'a Albedo<'a>,
+        lamp: Lamp,
     ) -> Result<Self, CaptureError> {
         let mesh = RayMesh::new(&vertices, faces)
             .map_err(|error| CaptureError::setting("body", "a mesh that rays can hit", error))?;
-        Ok(Self { vertices, normals, faces, albedo, mesh })
+        Ok(Self { vertices, normals, faces, albedo, lamp, mesh })
     }
 
     /// Colour on black, and the share of each pixel that the mesh covers.
@@ -107,11 +137,7 @@ impl<'a> Posture<'a> {
         let corners = self.faces[hit.face as usize];
         let mix = |of: &[Vec3]| -> Vec3 { corners.iter().zip(hit.barycentric).map(|(&v, w)| of[v as usize] * w).sum() };
         let normal = mix(&self.normals).normalize_or(-direction);
-        let lamp = normal.dot(LAMP.normalize_or(Vec3::Y));
-        // Half-Lambert: the terminator is soft and nothing is black.
-        let direct = (0.5 + 0.5 * lamp).powi(2);
-        let light = AMBIENT + SKY * normal.y + DIRECT * direct;
-        let color = (self.albedo)(hit.face, hit.barycentric) * light;
+        let color = (self.albedo)(hit.face, hit.barycentric) * self.lamp.on(normal);
         Some(color.clamp(Vec3::ZERO, Vec3::ONE))
     }
 }
