@@ -116,8 +116,8 @@ fn paper() -> Config {
     }
 }
 
-/// The default. Without the paper's coarser levels and attention, which buy nothing here and cost a
-/// fifth of the time: `reproduce --components`.
+/// The default. Without the paper's coarser levels, attention and learnable vertices, which buy
+/// nothing here and cost a fifth of the time: `reproduce --components`.
 fn balanced() -> Config {
     Config {
         preset: Preset::Balanced,
@@ -138,14 +138,7 @@ fn balanced() -> Config {
         surface: SurfaceConfig { coarse_levels: 0, attention: false, distance: DistanceKind::Exact, ..paper().surface },
         loss: LossConfig { mse: 5.0, ..paper().loss },
         motion: MotionConfig { depth: 0.04, shell_interval: 32, ..paper().motion },
-        rates: RateConfig {
-            field: 6e-3,
-            vertices: 1e-4,
-            table: 3e-2,
-            motion: 1e-3,
-            final_fraction: 0.05,
-            beta_2: 0.99,
-        },
+        rates: RateConfig { field: 6e-3, vertices: 0.0, table: 3e-2, motion: 1e-3, final_fraction: 0.05, beta_2: 0.99 },
         ..paper()
     }
 }

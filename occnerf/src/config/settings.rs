@@ -290,7 +290,7 @@ impl LossConfig {
 pub struct RateConfig {
     /// The perceptron F.
     pub field: f32,
-    /// The vertices of the surface term.
+    /// The vertices of the surface term; at 0 they stay on the prior and are no parameters.
     pub vertices: f32,
     /// The hash table.
     pub table: f32,

@@ -15,7 +15,7 @@ pub(crate) enum Part {
     Field,
     /// The hash table, or the codes of the vertices.
     Table,
-    /// Offsets of the vertices, V × 3.
+    /// Offsets of the vertices, V × 3; none where they are not learnt.
     Vertices,
     /// Log-weights of the motion volume.
     Motion,
@@ -62,7 +62,8 @@ pub(crate) struct Lengths {
 impl Parameters {
     /// The values that training starts from.
     pub fn new(config: &Config, field: &Field, lengths: Lengths) -> Self {
-        let vertices = if field.vertex_rows == VertexRows::Encoded { 3 * lengths.vertices } else { 0 };
+        let moved = field.vertex_rows == VertexRows::Encoded && config.rates.vertices > 0.0;
+        let vertices = if moved { 3 * lengths.vertices } else { 0 };
         let table = if field.vertex_rows == VertexRows::Learnt {
             let mut stream = Stream::new(&[config.seed, CODES]);
             (0..lengths.vertices * field.encoder.num_features()).map(|_| CODE * stream.normal()).collect()

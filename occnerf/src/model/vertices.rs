@@ -36,21 +36,30 @@ struct Chunk {
 }
 
 impl VertexCode {
-    /// Encodes v_i = initial vertex + offset with its signed distance to the initial mesh.
+    /// Encodes v_i = initial vertex + offset with its signed distance to the initial mesh. Without
+    /// `offsets` vertices stay where they are, on that mesh.
     pub fn encode(&mut self, body: &Body, config: &SurfaceConfig, encoder: &Encoder, table: &[f32], offsets: &[f32]) {
         let vertices = &body.canonical.vertices;
-        (0..vertices.len())
-            .into_par_iter()
-            .with_min_len(CHUNK)
-            .map_init(Vec::new, |neighbours, i| {
-                let position = vertices[i] + Vec3::from_slice(&offsets[3 * i..]);
-                let (distance, gradient) = distance_with_gradient(body, config, i, position, neighbours);
-                (position, distance, gradient)
-            })
-            .collect_into_vec(&mut self.state);
-        self.at.clear();
-        for &(v, d, _) in &self.state {
-            encoder.push_vertex(v, d, &body.canonical_box, &mut self.at);
+        let known = offsets.is_empty() && self.at.surface.len() == vertices.len();
+        if !offsets.is_empty() {
+            (0..vertices.len())
+                .into_par_iter()
+                .with_min_len(CHUNK)
+                .map_init(Vec::new, |neighbours, i| {
+                    let position = vertices[i] + Vec3::from_slice(&offsets[3 * i..]);
+                    let (distance, gradient) = distance_with_gradient(body, config, i, position, neighbours);
+                    (position, distance, gradient)
+                })
+                .collect_into_vec(&mut self.state);
+            self.at.clear();
+            for &(v, d, _) in &self.state {
+                encoder.push_vertex(v, d, &body.canonical_box, &mut self.at);
+            }
+        } else if !known {
+            self.at.clear();
+            for &v in vertices {
+                encoder.push_vertex(v, 0.0, &body.canonical_box, &mut self.at);
+            }
         }
         let width = encoder.num_features();
         self.rows.resize(vertices.len() * width, 0.0);
@@ -73,11 +82,18 @@ impl VertexCode {
         })
     }
 
-    /// Gradient of the offsets (V × 3) from that of the features; overwrites.
+    /// Gradient of the offsets (V × 3, or none) from that of the features; overwrites.
     pub fn backward(&mut self, body: &Body, encoder: &Encoder, table: &[f32], d_offsets: &mut [f32]) {
         let Self { at, d_rows, state, chunks, .. } = self;
         let width = encoder.num_features();
         let d_rows = d_rows.par_chunks(CHUNK * width);
+        if d_offsets.is_empty() {
+            d_rows.zip(chunks).for_each(|(d_rows, Chunk { features, .. })| {
+                let n = d_rows.len() / width;
+                encoder.layout(n).from_rows(d_rows, width, 0..n, features);
+            });
+            return;
+        }
         let chunks = d_offsets.par_chunks_mut(3 * CHUNK).zip(d_rows).zip(chunks).enumerate();
         chunks.for_each(|(chunk, ((d_offsets, d_rows), Chunk { features, d_at }))| {
             let n = d_offsets.len() / 3;

@@ -8,4 +8,5 @@ mod masks;
 pub(crate) mod pinhole;
 pub(crate) mod prepared;
 pub(crate) mod registration;
+pub(crate) mod seen;
 mod unseen;

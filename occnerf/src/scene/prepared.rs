@@ -7,14 +7,16 @@ use smpl::BodyModel;
 use visibility::RayMesh;
 
 use crate::Error;
-use crate::capture::{Capture, CaptureError, Frame, PixelSource, Pixels, Shown};
+use crate::capture::{Capture, CaptureError, Frame, Light, PixelSource, Pixels, Shown};
 use crate::config::Config;
 use crate::model::body::{Body, Moment};
 use crate::model::view::PosedView;
-use crate::scene::labels::{Label, Labels, label_pixels};
+use crate::scene::labels::{Label, Labels, label_pixels, squared_distance};
+use crate::scene::light::{Seen, measure_light};
 use crate::scene::masks::mend;
 use crate::scene::pinhole::pinhole;
 use crate::scene::registration::register;
+use crate::scene::seen::{MOST, deeper, seen, strange_edge};
 
 /// A frame with its posed prior.
 pub struct PreparedFrame {
@@ -65,6 +67,8 @@ pub struct Scene {
     pub capture: Capture,
     /// Whether colours are to be told apart from a light.
     pub(crate) lit: bool,
+    /// Pixels on both sides of the masks' edges that may show somebody else's colours.
+    pub(crate) edge: usize,
 }
 
 impl Scene {
@@ -94,18 +98,53 @@ impl Scene {
             .collect();
         let eval: Result<Vec<_>, Error> =
             capture.eval.par_iter().map(|e| prepare(&body, &e.frame, e.train_index, &e.camera_name, None)).collect();
-        let scene = Self {
+        let mut scene = Self {
             name: capture.name.clone(),
             train: train?,
             eval: eval?,
             body,
             capture,
             lit: config.field.prior_light,
+            edge: 0,
         };
+        if config.registration.rounds > 0 {
+            scene.leave_out_edges()?;
+        }
         if scene.train.iter().all(|f| f.labels.num_subject() == 0) {
             return Err(Error::Scene(format!("{}: no training mask shows the subject", scene.name)));
         }
         Ok(scene)
+    }
+
+    /// What each training frame shows of the vertices, and how many pixels inside its mask.
+    pub(crate) fn seen(&self) -> Result<Vec<Vec<(Seen, usize)>>, Error> {
+        let faces = &self.body.model.faces;
+        self.train.par_iter().map(|frame| seen(&frame.view, &*frame.pixels()?, faces)).collect()
+    }
+
+    /// Takes pixels at the edges of masks for unknown, where what they show is not the person's.
+    fn leave_out_edges(&mut self) -> Result<(), Error> {
+        let (vertices, frames) = (self.body.canonical.vertices.len(), self.seen()?);
+        let inside = deeper(&frames, MOST);
+        let light = if self.lit { measure_light(&inside, vertices) } else { Light::default() };
+        self.edge = strange_edge(&frames, light, vertices);
+        // Outside, what is not the mask's may be the person's.
+        let (inner, outer) = (self.edge as f32, self.edge as f32 + 1.0);
+        if self.edge == 0 {
+            return Ok(());
+        }
+        self.train.par_iter_mut().for_each(|frame| {
+            let width = frame.view.camera.width as usize;
+            let labels: Vec<Label> = frame.labels.iter().collect();
+            let subject: Vec<bool> = labels.iter().map(|&l| l == Label::Subject).collect();
+            let other: Vec<bool> = subject.iter().map(|s| !s).collect();
+            let (to_subject, to_other) = (squared_distance(&subject, width), squared_distance(&other, width));
+            let band =
+                |i: usize| if subject[i] { to_other[i] <= inner * inner } else { to_subject[i] <= outer * outer };
+            let each = labels.into_iter().enumerate().map(|(i, l)| if band(i) { Label::Unknown } else { l });
+            frame.labels = Labels::new(&each.collect::<Vec<_>>());
+        });
+        Ok(())
     }
 
     /// How many training frames show each vertex of the prior to the camera at a pixel of the

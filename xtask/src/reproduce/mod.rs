@@ -73,7 +73,7 @@ pub struct ReproduceArguments {
     /// The way from the paper's text to the default instead, one change a row
     #[arg(long, conflicts_with_all = ["robustness", "components"])]
     story: bool,
-    /// What each component is worth instead: each left out, from a grey start and from ours
+    /// What each component is worth instead: each left out, from our start, a grey and a faint one
     #[arg(long, conflicts_with_all = ["robustness", "curves"])]
     components: bool,
     /// How good methods are after fewer and more steps, and at other rates, instead

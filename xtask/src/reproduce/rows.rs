@@ -43,7 +43,7 @@ pub enum Table {
     Methods,
     /// From the paper's text to the default, one change a row.
     Story,
-    /// Each component left out, from a grey start and from ours.
+    /// Each component left out, from our start, a grey and a faint one.
     Components,
     /// Methods by the number of steps, and by their rates.
     Curves,
@@ -79,6 +79,11 @@ const CURVES: [(&str, Method, OccludedRule); 4] = [
 const CURVE_STEPS: [f64; 6] = [1.0, 0.125, 0.25, 0.5, 2.0, 4.0];
 const CURVE_RATES: [f32; 3] = [1.0, 0.33, 3.0];
 
+/// The same, with so little density, and samples so deep, that an empty inside can be seen through:
+/// where completeness has something to do.
+const FAINT: [&str; 5] =
+    [GREY[0], GREY[1], "field.density_bias_outside=-2", "field.density_bias=-2", "motion.depth=0.3"];
+
 /// A component left out, put back, or replaced by what it competes with.
 const COMPONENTS: [(&str, &[&str]); 12] = [
     ("full", &[]),
@@ -90,14 +95,14 @@ const COMPONENTS: [(&str, &[&str]); 12] = [
     ("one-neighbour", &["surface.k=1"]),
     ("four-levels", &["surface.coarse_levels=3"]),
     ("four-levels-attention", &["surface.coarse_levels=3", "surface.attention=true"]),
-    ("fixed-vertices", &["rates.vertices=0"]),
+    ("learnt-vertices", &["rates.vertices=1e-4"]),
     ("no-registration", &["registration.rounds=0"]),
     ("even-light", &["field.prior_light=false"]),
 ];
 
 /// The way from the paper's text to the default: each row keeps the changes of those before it. The
 /// row `paper` is the preset `paper`; what stands before it are its departures from the text.
-const STORY: [(&str, &[&str]); 13] = [
+const STORY: [(&str, &[&str]); 14] = [
     (
         "text",
         &[
@@ -139,6 +144,7 @@ const STORY: [(&str, &[&str]); 13] = [
     ),
     ("one-level", &["surface.coarse_levels=0"]),
     ("plain-mean", &["surface.attention=false"]),
+    ("fixed-vertices", &["rates.vertices=0"]),
     (
         "balanced",
         &["patches=4", "samples=48", "min_transmittance=0.01", "motion.depth=0.04", "motion.shell_interval=32"],
@@ -174,6 +180,7 @@ fn methods() -> Vec<Row> {
         row("occnerf-bg", Occnerf, Background, STEPS),
         row("occnerf", Occnerf, Unknown, STEPS),
         Row { baked: Some("occnerf"), ..row("occnerf-baked", Occnerf, Unknown, STEPS) },
+        Row { preset: Some(Preset::Paper), ..row("paper", Occnerf, Unknown, STEPS) },
     ];
     for name in ["no-surface", "no-completeness", "no-perceptual"] {
         let changes = COMPONENTS.iter().find(|(component, _)| *component == name).map_or(&[][..], |c| c.1);
@@ -192,7 +199,7 @@ fn story() -> Vec<Row> {
 }
 
 fn components() -> Vec<Row> {
-    let starts = [("ours", &[][..]), ("grey", &GREY[..])];
+    let starts = [("ours", &[][..]), ("grey", &GREY[..]), ("faint", &FAINT[..])];
     let of = |(start, from): (&str, &[&'static str])| {
         let row = |(name, changes): &(&str, &[&'static str])| Row {
             changes: [from, changes].concat(),
@@ -260,6 +267,7 @@ impl Table {
                 "occnerf-bg",
                 "occnerf",
                 "occnerf-baked",
+                "paper",
             ],
             Self::Story => &["prior", "text", "registered-prior", "paper", "balanced"],
             Self::Components => &["ours-full", "ours-no-surface", "grey-full", "grey-no-surface"],
