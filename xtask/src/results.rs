@@ -25,12 +25,14 @@ pub struct Section<'a> {
     pub charts: &'a [PathBuf],
 }
 
-/// Captures that settings were chosen on; `zju_demo` shows the person of `humannerf_demo`.
+/// Captures that settings were chosen on, with whatever a dash follows; `zju_demo` shows the person
+/// of `humannerf_demo`.
 const TUNING: [&str; 3] = ["demo", "humannerf_demo", "zju_demo"];
 
 /// What figures on a scene, by its name, speak for.
 pub fn set_of(scene: &str) -> &'static str {
-    if TUNING.contains(&scene) {
+    let of = |name: &&str| scene.strip_prefix(*name).is_some_and(|rest| rest.is_empty() || rest.starts_with('-'));
+    if TUNING.iter().any(|name| of(&name)) {
         "A *tuning* capture: settings were chosen on it"
     } else {
         "A *reporting* capture: no setting was chosen on it"

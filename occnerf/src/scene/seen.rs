@@ -59,6 +59,68 @@ pub(crate) fn strange_edge(frames: &[Vec<(Seen, usize)>], light: Light, vertices
             *error = (error.0 + f64::from(squared), error.1 + 1);
         }
     }
-    let means = errors.map(|(sum, count)| sum / count.max(1) as f64);
+    // NaN, more than which nothing is, where nothing was seen.
+    let means = errors.map(|(sum, count)| sum / count as f64);
     (1..=MOST).take_while(|&depth| means[depth] > STRANGE * means[depth + 1]).last().unwrap_or(0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::capture::{Capture, DemoConfig, Perturbation, demo};
+    use crate::config::{Config, Method, Preset};
+    use crate::model::colors::VertexColors;
+    use crate::scene::labels::Label;
+    use crate::scene::prepared::Scene;
+
+    fn scene(wrong: Perturbation) -> Scene {
+        let body = smpl::BodyModel::embedded();
+        let config = DemoConfig { size: 160, frames: 24, eval_cameras: 0, ..DemoConfig::default() };
+        let mut capture: Capture = demo(&config, &body).unwrap();
+        wrong.apply(&mut capture, &body).unwrap();
+        Scene::new(&capture, &body, &Config::preset(Preset::Fast, Method::Prior)).unwrap()
+    }
+
+    #[test]
+    fn ragged_masks_have_an_edge_that_is_unknown_and_exact_ones_have_none() {
+        let (exact, ragged) =
+            (scene(Perturbation::NONE), scene(Perturbation { ragged_pixels: 2.0, ..Perturbation::NONE }));
+        assert_eq!(exact.edge, 0);
+        assert!((1..=2).contains(&ragged.edge), "{}", ragged.edge);
+        for frame in &ragged.train {
+            let (mask, width) = (&frame.pixels().unwrap().mask, frame.view.camera.width as usize);
+            for (i, label) in frame.labels.iter().enumerate().filter(|(i, _)| i % width > 0) {
+                let differs = (mask[i] > 0.5) != (mask[i - 1] > 0.5);
+                assert!(!differs || label == Label::Unknown, "pixel {i}: {label:?}");
+            }
+        }
+        // Vertices whose colours both know agree better than if edges counted.
+        let truth = VertexColors::measure(&exact).unwrap();
+        let error = |scene: &Scene| -> f32 {
+            let found = VertexColors::measure(scene).unwrap();
+            let known = |v: &usize| truth.seen[*v] && found.seen[*v];
+            let each = (0..truth.seen.len()).filter(known);
+            let errors: Vec<f32> = each.map(|v| truth.colors[v].distance_squared(found.colors[v])).collect();
+            errors.iter().sum::<f32>() / errors.len() as f32
+        };
+        let (without, with) = (error(&ragged), error(&Scene { edge: 0, ..ragged }));
+        assert!(without < 0.7 * with, "{without} without edges, {with} with them");
+    }
+
+    #[test]
+    fn an_edge_is_strange_as_far_as_its_colours_are_wrong() {
+        let seen = |v: u32, depth: usize, strange: usize| {
+            // Wrong by as much at every depth, this way or that.
+            let side = ((v + 7 * depth as u32).wrapping_mul(2_654_435_761) >> 16 & 1) as f32;
+            let shown = if depth <= strange { 0.0 } else { 0.6 + 0.04 * side };
+            ((v, Vec3::splat(shown), Vec3::Y), depth)
+        };
+        for strange in 0..MOST {
+            let frame = |f: u32| (0..200).map(|v| seen(v, 1 + ((v + f) % 9) as usize, strange)).collect();
+            let frames: Vec<Vec<(Seen, usize)>> = (0..9).map(frame).collect();
+            assert_eq!(strange_edge(&frames, Light::default(), 200), strange);
+        }
+        assert_eq!(strange_edge(&[], Light::default(), 0), 0);
+        assert_eq!(strange_edge(&[vec![seen(0, 1, 1)]], Light::default(), 1), 0);
+    }
 }

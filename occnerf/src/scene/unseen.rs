@@ -2,7 +2,8 @@
 //!
 //! Hems, belts, cuffs and stripes go around trunk and limbs more often than along them. So a guess
 //! is a mean of what was seen by inverse distances (Shepard 1968) in which a way around the bone is
-//! shorter than one along it, if that is how the seen surface can be told from what surrounds it.
+//! shorter than one along it, if that is how the seen surface around a piece of unseen surface can be
+//! told from what surrounds it.
 
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
@@ -14,6 +15,10 @@ use crate::model::body::Body;
 const AROUND: [f32; 3] = [1.0, 0.1, 10.0];
 /// How far that reaches from unseen vertices, metres of a body 1.7 high.
 const RIM: f32 = 0.08;
+/// Vertices of that surface that are looked at, at most.
+const MOST_HELD: usize = 1024;
+/// Vertices of a piece of unseen surface from which on it is looked at by itself.
+const FEW: usize = 16;
 /// Least distance of a joint from the plane of symmetry, x = 0, in a limb, metres of such a body.
 const ASIDE: f32 = 0.03;
 
@@ -26,10 +31,12 @@ pub(crate) fn complete(body: &Body, colors: &mut [Vec3], seen: &[bool]) {
         return;
     }
     let guesses = Guesses { vertices: &body.canonical.vertices, axes: axes(body), colors };
-    let unseen: Vec<usize> = (0..seen.len()).filter(|&v| !seen[v]).collect();
-    let around = guesses.choose(&known, &unseen);
-    let found: Vec<Vec3> = unseen.par_iter().map(|&v| guesses.guess(v, &known, around)).collect();
-    unseen.into_iter().zip(found).for_each(|(v, color)| colors[v] = color);
+    let complete = |region: &Vec<usize>| -> Vec<(usize, Vec3)> {
+        let around = guesses.choose(&known, region);
+        region.par_iter().map(|&v| (v, guesses.guess(v, &known, around))).collect()
+    };
+    let found: Vec<(usize, Vec3)> = regions(body, seen).iter().flat_map(complete).collect();
+    found.into_iter().for_each(|(v, color)| colors[v] = color);
 }
 
 struct Guesses<'a> {
@@ -64,13 +71,40 @@ impl Guesses<'_> {
         if rest.is_empty() {
             return AROUND[0];
         }
+        let every = held.len().div_ceil(MOST_HELD).max(1);
         let error = |around: f32| -> f32 {
             let error = |&v: &usize| self.guess(v, &rest, around).distance_squared(self.colors[v]);
-            held.par_iter().map(error).collect::<Vec<f32>>().iter().sum()
+            held.par_iter().step_by(every).map(error).collect::<Vec<f32>>().iter().sum()
         };
         let errors = AROUND.map(|around| (error(around), around));
         errors.into_iter().reduce(|a, b| if b.0 < a.0 { b } else { a }).map_or(AROUND[0], |best| best.1)
     }
+}
+
+/// The vertices that are not `seen` (V), in pieces that hang together; pieces of a few vertices are
+/// one.
+fn regions(body: &Body, seen: &[bool]) -> Vec<Vec<usize>> {
+    let mut next = vec![Vec::new(); seen.len()];
+    for corners in &body.model.faces {
+        let [a, b, c] = corners.map(|v| v as usize);
+        for (from, to) in [(a, b), (b, c), (c, a)] {
+            next[from].push(to);
+            next[to].push(from);
+        }
+    }
+    let mut reached = seen.to_vec();
+    let (mut pieces, mut small) = (Vec::new(), Vec::new());
+    for first in 0..seen.len() {
+        let mut piece = Vec::new();
+        let mut open = if std::mem::replace(&mut reached[first], true) { Vec::new() } else { vec![first] };
+        while let Some(v) = open.pop() {
+            piece.push(v);
+            open.extend(next[v].iter().filter(|&&to| !std::mem::replace(&mut reached[to], true)));
+        }
+        if piece.len() < FEW { small.extend(piece) } else { pieces.push(piece) }
+    }
+    pieces.extend((!small.is_empty()).then_some(small));
+    pieces
 }
 
 /// The direction, V, of the bone that moves each vertex most: upright in the trunk, along the limb
@@ -130,6 +164,22 @@ mod tests {
         assert!(rings < 0.6 * smooth, "{rings} against {smooth}");
         let [lengthwise, smooth] = errors(|v| (60.0 * v.x).sin());
         assert!(lengthwise < smooth, "{lengthwise} against {smooth}");
+    }
+
+    #[test]
+    fn regions_are_apart_and_hold_every_vertex_that_was_not_seen_once() {
+        let body = body();
+        let vertices = &body.canonical.vertices;
+        let seen: Vec<bool> = vertices.iter().map(|v| v.x.abs() < 0.3).collect();
+        let regions = regions(&body, &seen);
+        assert!(regions.iter().filter(|region| region.len() >= FEW).count() >= 2);
+        let mut count = vec![0; seen.len()];
+        regions.iter().flatten().for_each(|&v| count[v] += 1);
+        assert!(count.iter().zip(&seen).all(|(count, seen)| *count == usize::from(!seen)));
+        // The two arms.
+        for region in regions.iter().filter(|region| region.len() >= FEW) {
+            assert!(region.iter().all(|&v| vertices[v].x > 0.0) || region.iter().all(|&v| vertices[v].x < 0.0));
+        }
     }
 
     #[test]
