@@ -198,8 +198,8 @@ impl LoadArguments {
     }
 }
 
-/// Loads `scene`, the demo if it is `None` or named [`DEMO`]; the body is `body`, the capture's own, that of the variable
-/// SMPL_MODEL, or what lies near the scene.
+/// Loads `scene`, the demo if it is `None` or named [`DEMO`]; the body is `body`, the capture's own,
+/// that of the variable SMPL_MODEL, or what lies near the scene.
 pub fn load(scene: Option<&str>, body: Option<&Path>, options: &LoadOptions) -> Result<Source> {
     let scene = scene.unwrap_or(DEMO);
     let name = scene.to_owned();

@@ -20,7 +20,8 @@ pub(crate) enum Encoder {
     Frequency,
     /// Hash grid on x̂.
     Point(HashGrid<3>),
-    /// Hash grid on [v̂, d], or on that of a neighbour, and the interval that d is clamped to, normalised metres.
+    /// Hash grid on [v̂, d], or on that of a neighbour, and the interval that d is clamped to,
+    /// normalised metres.
     Surface(HashGrid<4>, (f32, f32)),
 }
 

@@ -25,7 +25,11 @@ struct Point<'a> {
 /// Writes the chart of rows, by their names and runs, to STEM.png and STEM.svg, and returns the
 /// former.
 pub fn draw<'a>(scene: &str, rows: impl Iterator<Item = (&'a str, &'a [Metrics])>, stem: &Path) -> Result<PathBuf> {
-    let points: Vec<Point<'_>> = rows.filter_map(|(name, runs)| point(name, runs)).collect();
+    let point = |(name, runs): (&'a str, &'a [Metrics])| {
+        let ((method, rates), steps) = (said(name)?, runs.first()?.steps as f64);
+        Some(Point { method, rates, steps, runs })
+    };
+    let points: Vec<Point<'_>> = rows.filter_map(point).collect();
     let mut methods: Vec<&str> = points.iter().map(|p| p.method).collect();
     methods.dedup();
     // Of the row that has neither other steps nor other rates, both charts have a point.
@@ -72,12 +76,31 @@ pub fn draw<'a>(scene: &str, rows: impl Iterator<Item = (&'a str, &'a [Metrics])
     Ok(picture.write(stem)?[1].clone())
 }
 
-/// What the name of a row says.
-fn point<'a>(name: &'a str, runs: &'a [Metrics]) -> Option<Point<'a>> {
-    let steps = runs.first()?.steps as f64;
-    let (method, rates) = match name.rsplit_once("-rates-x") {
-        Some((method, rates)) => (method, rates.parse().ok()?),
-        None => (name.rsplit_once("-x")?.0, 1.0),
-    };
-    Some(Point { method, rates, steps, runs })
+/// What the name of a row says: the method, and the factor on its rates.
+fn said(name: &str) -> Option<(&str, f64)> {
+    match name.rsplit_once("-rates-x") {
+        Some((method, rates)) => Some((method, rates.parse().ok()?)),
+        None => Some((name.rsplit_once("-x")?.0, 1.0)),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::reproduce::rows::Table;
+
+    #[test]
+    fn names_of_all_rows_say_their_method_and_rates_and_the_usual_row_comes_first() {
+        let rows = Table::Curves.rows();
+        let mut methods: Vec<&str> = Vec::new();
+        for row in &rows {
+            let (method, rates) = said(&row.name).unwrap();
+            assert_eq!(rates as f32, row.rates, "{}", row.name);
+            if methods.last() != Some(&method) {
+                assert!(row.name.ends_with("-x1") && !methods.contains(&method), "{}", row.name);
+                methods.push(method);
+            }
+        }
+        assert_eq!(methods.len(), 4);
+    }
 }

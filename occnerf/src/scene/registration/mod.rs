@@ -93,8 +93,8 @@ struct Registration<'a> {
 }
 
 /// Corrects the poses, the places and the shape that `capture` gives for its frames, and with them
-/// those of the views kept back, and without such views the focal length, in `rounds` Gauss-Newton steps. The result does not depend on the
-/// number of threads.
+/// those of the views kept back, and without such views the focal length, in `rounds` Gauss-Newton
+/// steps. The result does not depend on the number of threads.
 ///
 /// # Errors
 /// Pictures that cannot be read.
