@@ -12,7 +12,7 @@ use crate::scene::labels::squared_distance;
 use crate::scene::light::{Seen, albedo};
 use crate::scene::pinhole::pinhole;
 
-/// Pixels within a mask that may show what is beside the person, at most.
+/// Pixels within a mask from which on it shows the person for certain.
 pub(crate) const MOST: usize = 4;
 /// By how much more the colours of such pixels have to be wrong than those of the next farther
 /// inside: bodies that do not quite fit make edges wrong too, but evenly so.
@@ -46,7 +46,7 @@ pub(crate) fn deeper(frames: &[Vec<(Seen, usize)>], edge: usize) -> Vec<Vec<Seen
 }
 
 /// How many pixels at the edge of the masks show other colours of the vertices, under this light,
-/// than what lies farther inside.
+/// than what lies farther inside: as many as are, one after another, more wrong than the next.
 pub(crate) fn strange_edge(frames: &[Vec<(Seen, usize)>], light: Light, vertices: usize) -> usize {
     let inside = deeper(frames, MOST);
     let sums = albedo(inside.iter().flatten(), vertices, |normal| light.on(normal));
@@ -61,7 +61,7 @@ pub(crate) fn strange_edge(frames: &[Vec<(Seen, usize)>], light: Light, vertices
     }
     // NaN, more than which nothing is, where nothing was seen.
     let means = errors.map(|(sum, count)| sum / count as f64);
-    (1..=MOST).take_while(|&depth| means[depth] > STRANGE * means[depth + 1]).last().unwrap_or(0)
+    (1..MOST).take_while(|&depth| means[depth] > STRANGE * means[depth + 1]).last().unwrap_or(0)
 }
 
 #[cfg(test)]
@@ -112,7 +112,8 @@ mod tests {
         let seen = |v: u32, depth: usize, strange: usize| {
             // Wrong by as much at every depth, this way or that.
             let side = ((v + 7 * depth as u32).wrapping_mul(2_654_435_761) >> 16 & 1) as f32;
-            let shown = if depth <= strange { 0.0 } else { 0.6 + 0.04 * side };
+            let wrong = if depth <= strange { 0.1 * 1.5f32.powi((strange + 1 - depth) as i32) } else { 0.0 };
+            let shown = 0.6 + 0.04 * side - wrong;
             ((v, Vec3::splat(shown), Vec3::Y), depth)
         };
         for strange in 0..MOST {

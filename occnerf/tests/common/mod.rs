@@ -102,6 +102,8 @@ pub fn config(method: Method) -> Config {
     (config.field.width, config.field.depth) = (16, 1);
     (config.encoding.levels, config.encoding.log2_table_size, config.encoding.n_max) = (2, 6, 24);
     config.motion.kind = MotionKind::Surface;
+    // Every part of the parameters is there.
+    config.rates.vertices = 1e-4;
     (config.surface.k, config.surface.coarse_levels) = (4, 1);
     config
 }
