@@ -32,7 +32,7 @@ const TUNING: [&str; 3] = ["demo", "humannerf_demo", "zju_demo"];
 /// What figures on a scene, by its name, speak for.
 pub fn set_of(scene: &str) -> &'static str {
     let of = |name: &&str| scene.strip_prefix(*name).is_some_and(|rest| rest.is_empty() || rest.starts_with('-'));
-    if TUNING.iter().any(|name| of(&name)) {
+    if TUNING.iter().any(of) {
         "A *tuning* capture: settings were chosen on it"
     } else {
         "A *reporting* capture: no setting was chosen on it"
@@ -138,6 +138,13 @@ fn origin() -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn captures_that_settings_were_chosen_on_are_told_by_their_names() {
+        let chosen_on = |scene: &str| set_of(scene).contains("*tuning*");
+        assert!(["demo", "demo-hidden-80", "humannerf_demo", "zju_demo"].into_iter().all(chosen_on));
+        assert!(!["mild", "walk", "demonstration", "my-demo"].into_iter().any(chosen_on));
+    }
 
     #[test]
     fn a_section_replaces_its_older_self_and_nothing_else() {

@@ -28,7 +28,7 @@ impl Lamp {
     /// 1 is as strong as usual; at 0 as much light comes from everywhere. It stands to the training
     /// camera's upper left with seed 0, elsewhere on that side of the person with others.
     pub fn new(strength: f32, seed: u64) -> Self {
-        let mut stream = Stream::new(&[seed, 0x006c_616d_70]);
+        let mut stream = Stream::new(&[seed, 0x6c61_6d70]);
         let (azimuth, up) = ((stream.uniform() - 0.5) * PI, 0.3 + 0.6 * stream.uniform());
         let elsewhere = Vec3::new(azimuth.sin(), up, azimuth.cos());
         Self { toward: if seed == 0 { Vec3::new(-0.42, 0.68, 0.60) } else { elsewhere }, strength }
