@@ -37,16 +37,17 @@ struct Chunk {
 
 impl VertexCode {
     /// Encodes v_i = initial vertex + offset with its signed distance to the initial mesh. Without
-    /// `offsets` vertices stay where they are, on that mesh.
+    /// `offsets` vertices stay where they are.
     pub fn encode(&mut self, body: &Body, config: &SurfaceConfig, encoder: &Encoder, table: &[f32], offsets: &[f32]) {
         let vertices = &body.canonical.vertices;
-        let known = offsets.is_empty() && self.at.surface.len() == vertices.len();
-        if !offsets.is_empty() {
+        // Those that stay are looked up once.
+        if !offsets.is_empty() || self.state.len() != vertices.len() {
             (0..vertices.len())
                 .into_par_iter()
                 .with_min_len(CHUNK)
                 .map_init(Vec::new, |neighbours, i| {
-                    let position = vertices[i] + Vec3::from_slice(&offsets[3 * i..]);
+                    let offset = offsets.get(3 * i..).filter(|o| !o.is_empty()).map_or(Vec3::ZERO, Vec3::from_slice);
+                    let position = vertices[i] + offset;
                     let (distance, gradient) = distance_with_gradient(body, config, i, position, neighbours);
                     (position, distance, gradient)
                 })
@@ -54,11 +55,6 @@ impl VertexCode {
             self.at.clear();
             for &(v, d, _) in &self.state {
                 encoder.push_vertex(v, d, &body.canonical_box, &mut self.at);
-            }
-        } else if !known {
-            self.at.clear();
-            for &v in vertices {
-                encoder.push_vertex(v, 0.0, &body.canonical_box, &mut self.at);
             }
         }
         let width = encoder.num_features();

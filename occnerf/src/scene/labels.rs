@@ -142,7 +142,8 @@ pub fn label_pixels(
         .collect()
 }
 
-fn dilate(set: &[bool], width: usize, radius: f32) -> Vec<bool> {
+/// Pixels no farther than `radius` pixels from a set one.
+pub(crate) fn dilate(set: &[bool], width: usize, radius: f32) -> Vec<bool> {
     squared_distance(set, width).iter().map(|&d| d <= radius * radius).collect()
 }
 

@@ -11,7 +11,7 @@ use crate::capture::{Capture, CaptureError, Frame, Light, PixelSource, Pixels, S
 use crate::config::Config;
 use crate::model::body::{Body, Moment};
 use crate::model::view::PosedView;
-use crate::scene::labels::{Label, Labels, label_pixels, squared_distance};
+use crate::scene::labels::{Label, Labels, dilate, label_pixels};
 use crate::scene::light::{Seen, measure_light};
 use crate::scene::masks::mend;
 use crate::scene::pinhole::pinhole;
@@ -138,9 +138,8 @@ impl Scene {
             let labels: Vec<Label> = frame.labels.iter().collect();
             let subject: Vec<bool> = labels.iter().map(|&l| l == Label::Subject).collect();
             let other: Vec<bool> = subject.iter().map(|s| !s).collect();
-            let (to_subject, to_other) = (squared_distance(&subject, width), squared_distance(&other, width));
-            let band =
-                |i: usize| if subject[i] { to_other[i] <= inner * inner } else { to_subject[i] <= outer * outer };
+            let (near_subject, near_other) = (dilate(&subject, width, outer), dilate(&other, width, inner));
+            let band = |i: usize| if subject[i] { near_other[i] } else { near_subject[i] };
             let each = labels.into_iter().enumerate().map(|(i, l)| if band(i) { Label::Unknown } else { l });
             frame.labels = Labels::new(&each.collect::<Vec<_>>());
         });

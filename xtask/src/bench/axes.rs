@@ -6,6 +6,7 @@ use occnerf::{Config, Method, Preset};
 use super::difficulty::Difficulty;
 use super::job::{Job, Place};
 use super::runner::{Kind, Point};
+use crate::settings::scale_rates;
 
 /// Training frames and scored views of the easy case.
 const FRAMES: usize = 50;
@@ -50,10 +51,7 @@ impl Level {
         if method != Method::Prior {
             // Nothing of this means anything to the prior, which is measured once.
             config.steps *= self.steps;
-            let rates = &mut config.rates;
-            for rate in [&mut rates.field, &mut rates.vertices, &mut rates.table, &mut rates.motion] {
-                *rate *= self.rates;
-            }
+            scale_rates(&mut config.rates, self.rates);
         }
         Point {
             bench: "stability".to_owned(),

@@ -3,7 +3,7 @@
 use anyhow::{Context, Result};
 use occnerf::{Config, Method, OccludedRule, Preset};
 
-use crate::settings::set;
+use crate::settings::{scale_rates, set};
 
 /// How long a row trains.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -68,8 +68,8 @@ const STEPS: Length = Times(1.0);
 /// As many as the paper gave HumanNeRF.
 const FOUR_TIMES: Length = Times(4.0);
 
-/// Methods whose curves are drawn, and of each the numbers of steps and the rates, as factors; the
-/// first of each is what all rows have.
+/// Methods whose curves are drawn, and of each the numbers of steps and the rates, as factors; what
+/// all rows have comes first.
 const CURVES: [(&str, Method, OccludedRule); 4] = [
     ("humannerf-style-bg", Humannerf, Background),
     ("humannerf-style", Humannerf, Unknown),
@@ -77,7 +77,7 @@ const CURVES: [(&str, Method, OccludedRule); 4] = [
     ("occnerf", Occnerf, Unknown),
 ];
 const CURVE_STEPS: [f64; 6] = [1.0, 0.125, 0.25, 0.5, 2.0, 4.0];
-const CURVE_RATES: [f32; 3] = [1.0, 0.33, 3.0];
+const CURVE_RATES: [f32; 2] = [0.33, 3.0];
 
 /// The same, with so little density, and samples so deep, that an empty inside can be seen through:
 /// where completeness has something to do.
@@ -215,10 +215,9 @@ fn components() -> Vec<Row> {
 fn curves() -> Vec<Row> {
     let of = |(name, method, occluded): (&str, Method, OccludedRule)| {
         let steps = CURVE_STEPS.map(|times| row(&format!("{name}-x{times}"), method, occluded, Times(times)));
-        let rates = CURVE_RATES[1..].iter();
         let rates =
-            rates.map(|&rates| Row { rates, ..row(&format!("{name}-rates-x{rates}"), method, occluded, STEPS) });
-        steps.into_iter().chain(rates.collect::<Vec<_>>()).collect::<Vec<_>>()
+            CURVE_RATES.map(|rates| Row { rates, ..row(&format!("{name}-rates-x{rates}"), method, occluded, STEPS) });
+        [steps.to_vec(), rates.to_vec()].concat()
     };
     CURVES.into_iter().flat_map(of).collect()
 }
@@ -307,10 +306,7 @@ impl Row {
         for change in &self.changes {
             config = set(&config, change).with_context(|| format!("row {}: {change}", self.name))?;
         }
-        let rates = &mut config.rates;
-        for rate in [&mut rates.field, &mut rates.vertices, &mut rates.table, &mut rates.motion] {
-            *rate *= self.rates;
-        }
+        scale_rates(&mut config.rates, self.rates);
         config.validate()?;
         Ok(config)
     }

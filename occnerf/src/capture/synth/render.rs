@@ -141,3 +141,30 @@ impl<'a> Posture<'a> {
         Some(color.clamp(Vec3::ZERO, Vec3::ONE))
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_weaker_lamp_gives_as_much_light_more_evenly_and_stands_where_the_seed_says() {
+        let normal = |i: usize| {
+            // A lattice of Fibonacci: even over the sphere.
+            let (z, angle) = (1.0 - (2.0 * i as f32 + 1.0) / 4000.0, 2.399_963_2 * i as f32);
+            let r = (1.0 - z * z).sqrt();
+            Vec3::new(r * angle.cos(), z, r * angle.sin())
+        };
+        let on = |lamp: Lamp| -> Vec<f32> { (0..4000).map(|i| lamp.on(normal(i))).collect() };
+        for seed in 0..5 {
+            let mut spread = Vec::new();
+            for strength in [0.0, 0.5, 1.0] {
+                let light = on(Lamp::new(strength, seed));
+                let mean = light.iter().sum::<f32>() / 4000.0;
+                assert!((mean - AMBIENT - MEAN).abs() < 2e-3, "seed {seed}, strength {strength}: {mean}");
+                spread.push(light.iter().copied().fold(0.0, f32::max) - light.iter().copied().fold(9.0, f32::min));
+            }
+            assert!(spread[0] < 1e-6 && spread[0] < spread[1] && spread[1] < spread[2], "{spread:?}");
+        }
+        assert_ne!(on(Lamp::new(1.0, 0)), on(Lamp::new(1.0, 1)));
+    }
+}

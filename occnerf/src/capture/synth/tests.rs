@@ -77,6 +77,8 @@ fn settings_that_cannot_be_are_named() {
     for (word, config) in [
         ("size", SynthConfig { size: 8, ..small() }),
         ("frames", SynthConfig { frames: 0, ..small() }),
+        ("lamp", SynthConfig { lamp: 1.5, ..small() }),
+        ("lamp", SynthConfig { lamp: f32::NAN, ..small() }),
         ("eval_every", SynthConfig { eval_every: 0, ..small() }),
         ("shape_noise", SynthConfig { shape_noise: f32::NAN, ..small() }),
         ("turns", SynthConfig { turns: f32::INFINITY, ..small() }),
