@@ -48,6 +48,10 @@ impl Config {
             let expected = "patches · patch_size² · samples may be at most 2^23";
             return Err(ConfigError { key: "patches", value: samples.to_string(), expected });
         }
+        if self.held_out == 1 {
+            let expected = "expected 0 for none, or at least 2, or nothing is left to learn from";
+            return Err(ConfigError { key: "held_out", value: self.held_out.to_string(), expected });
+        }
         if self.motion.shell_interval > 0 && self.motion.kind != MotionKind::Surface {
             let (value, expected) =
                 (self.motion.shell_interval.to_string(), "expected 0 unless motion.kind is surface");

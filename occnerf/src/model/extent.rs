@@ -12,9 +12,10 @@ use crate::model::field::SampleBatch;
 
 /// From one looked at distance to the next, normalised metres.
 const LAYER: f32 = 0.005;
-/// Opacity below which a sample shows nothing: half a level of 8 bits.
-const EMPTY: f32 = 2e-3;
-/// Length of ray that a sample is taken to stand for, normalised metres.
+/// Opacity below which the field is taken for empty over [`LENGTH`]; a tenth of it costs a quarter
+/// more time and changes no score by more than 0.01 dB (the notes on training).
+const EMPTY: f32 = 2e-2;
+/// Length of ray that a layer is judged by, normalised metres.
 const LENGTH: f32 = 0.04;
 /// Vertices that are looked at together.
 const CHUNK: usize = 256;

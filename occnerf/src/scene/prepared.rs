@@ -28,7 +28,7 @@ pub struct PreparedFrame {
     pub view: Arc<PosedView>,
     /// Picture and mask, as in the capture; `None` where nothing was photographed.
     pub source: Option<PixelSource>,
-    /// Labels of the pixels, H × W; only training frames are labelled.
+    /// Labels of the pixels, H × W; only training frames are labelled, and those held out.
     pub labels: Labels,
 }
 
@@ -52,6 +52,9 @@ impl PreparedFrame {
         Ok(read(source)?)
     }
 }
+
+/// Camera that training frames which are held out are said to be of.
+const HELD_OUT: &str = "held out";
 
 /// Everything that training and scoring read and never change.
 pub struct Scene {
@@ -110,16 +113,41 @@ impl Scene {
         if config.registration.rounds > 0 {
             scene.leave_out_edges()?;
         }
+        if config.held_out > 0 {
+            scene.hold_out(config.held_out);
+        }
         if scene.train.iter().all(|f| f.labels.num_subject() == 0) {
             return Err(Error::Scene(format!("{}: no training mask shows the subject", scene.name)));
         }
         Ok(scene)
     }
 
-    /// What each training frame shows of the vertices, and how many pixels inside its mask.
+    /// What each training frame shows of the vertices, and how many pixels inside its mask. A frame
+    /// of which nothing is known shows nothing.
     pub(crate) fn seen(&self) -> Result<Vec<Vec<(Seen, usize)>>, Error> {
         let faces = &self.body.model.faces;
-        self.train.par_iter().map(|frame| seen(&frame.view, &*frame.pixels()?, faces)).collect()
+        let of = |frame: &PreparedFrame| match frame.labels.num_subject() {
+            0 => Ok(Vec::new()),
+            _ => seen(&frame.view, &*frame.pixels()?, faces),
+        };
+        self.train.par_iter().map(of).collect()
+    }
+
+    /// Makes every `every`-th training frame one to score, of which training knows nothing but the
+    /// pose.
+    fn hold_out(&mut self, every: usize) {
+        self.eval.clear();
+        for frame in self.train.iter_mut().step_by(every) {
+            let unknown = Labels::new(&vec![Label::Unknown; frame.labels.iter().count()]);
+            let labels = std::mem::replace(&mut frame.labels, unknown);
+            self.eval.push(PreparedFrame {
+                name: frame.name.clone(),
+                camera_name: HELD_OUT.to_owned(),
+                view: Arc::clone(&frame.view),
+                source: frame.source.clone(),
+                labels,
+            });
+        }
     }
 
     /// Takes pixels at the edges of masks for unknown, where what they show is not the person's.

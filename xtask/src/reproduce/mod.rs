@@ -79,6 +79,10 @@ pub struct ReproduceArguments {
     /// How good methods are after fewer and more steps, and at other rates, instead
     #[arg(long, conflicts_with_all = ["robustness", "story"])]
     curves: bool,
+    /// Settings of the default instead, one changed a row, scored on every fifth training frame,
+    /// from whose pixels nothing is learnt
+    #[arg(long, conflicts_with_all = ["robustness", "story", "components", "curves"])]
+    choices: bool,
     /// Make the tables a section of xtask/RESULTS.md, and that of the demo the table of README
     #[arg(long)]
     publish: bool,
@@ -234,7 +238,8 @@ impl Experiment<'_> {
     /// What sets this apart from the scene's main tables, as options.
     fn other(&self) -> String {
         let paper = if self.arguments.preset == Preset::Paper { " --preset paper" } else { "" };
-        format!("{paper}{}", self.arguments.load.command_line())
+        let lpips = if self.arguments.perceptual_weights.is_some() { " --perceptual-weights" } else { "" };
+        format!("{paper}{lpips}{}", self.arguments.load.command_line())
     }
 
     /// The main rows at each level of wrongness.
@@ -358,12 +363,13 @@ impl Experiment<'_> {
 
 impl ReproduceArguments {
     fn table(&self) -> Table {
-        match (self.story, self.components, self.curves) {
-            (true, ..) => Table::Story,
-            (_, true, _) => Table::Components,
-            (.., true) => Table::Curves,
-            _ => Table::Methods,
-        }
+        let asked = [
+            (self.story, Table::Story),
+            (self.components, Table::Components),
+            (self.curves, Table::Curves),
+            (self.choices, Table::Choices),
+        ];
+        asked.into_iter().find(|(asked, _)| *asked).map_or(Table::Methods, |(_, table)| table)
     }
 
     fn rows(&self, wanted: impl Fn(&Row) -> bool) -> Vec<Row> {

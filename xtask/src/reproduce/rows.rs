@@ -47,6 +47,8 @@ pub enum Table {
     Components,
     /// Methods by the number of steps, and by their rates.
     Curves,
+    /// Settings of the default, judged by training frames that are held out.
+    Choices,
 }
 
 use Length::{Seconds, Times};
@@ -111,6 +113,9 @@ const STORY: [(&str, &[&str]); 14] = [
             "registration.rounds=0",
             "motion.kind=volume",
             "rates.table=5e-5",
+            "rates.field=5e-4",
+            "rates.motion=5e-5",
+            "rates.beta_2=0.999",
             "rates.final_fraction=1",
         ],
     ),
@@ -118,19 +123,10 @@ const STORY: [(&str, &[&str]); 14] = [
     ("finer-volume", &["motion.resolution=64"]),
     ("surface-motion", &["motion.kind=surface", "motion.resolution=32"]),
     ("table-rate", &["rates.table=5e-3", "rates.final_fraction=0.1"]),
-    ("paper", &["field.prior_colors=true", "field.prior_light=true"]),
+    ("prior-colours", &["field.prior_colors=true", "field.prior_light=true"]),
+    ("paper", &["rates.table=3e-2", "rates.field=6e-3", "rates.motion=1e-3", "rates.beta_2=0.99"]),
     ("squared-error", &["loss.mse=5"]),
     ("exact-distance", &["surface.distance=exact"]),
-    (
-        "higher-rates",
-        &[
-            "rates.table=3e-2",
-            "rates.field=6e-3",
-            "rates.motion=1e-3",
-            "rates.final_fraction=0.05",
-            "rates.beta_2=0.99",
-        ],
-    ),
     (
         "smaller-grid",
         &[
@@ -145,10 +141,33 @@ const STORY: [(&str, &[&str]); 14] = [
     ("one-level", &["surface.coarse_levels=0"]),
     ("plain-mean", &["surface.attention=false"]),
     ("fixed-vertices", &["rates.vertices=0"]),
-    (
-        "balanced",
-        &["patches=4", "samples=48", "min_transmittance=0.01", "motion.depth=0.04", "motion.shell_interval=32"],
-    ),
+    ("balanced", &["patches=3", "min_transmittance=0.05", "motion.depth=0.04", "motion.shell_interval=32"]),
+];
+
+/// The default, and one setting changed in each row; every fifth training frame is held out.
+const HELD_OUT: &str = "held_out=5";
+const CHOICES: [(&str, &[&str]); 21] = [
+    ("as-it-is", &[]),
+    ("samples-48", &["samples=48"]),
+    ("samples-96", &["samples=96"]),
+    ("samples-192", &["samples=192"]),
+    ("patches-2", &["patches=2"]),
+    ("patches-4", &["patches=4"]),
+    ("transmittance-0.01", &["min_transmittance=0.01"]),
+    ("transmittance-0.1", &["min_transmittance=0.1"]),
+    ("depth-2-cm", &["motion.depth=0.02"]),
+    ("depth-8-cm", &["motion.depth=0.08"]),
+    ("squared-error-1", &["loss.mse=1"]),
+    ("squared-error-20", &["loss.mse=20"]),
+    ("no-completeness", &["loss.completeness=0"]),
+    ("no-surface", &["surface.surface_term=false"]),
+    ("rates-half", &["rates.table=1.5e-2", "rates.field=3e-3"]),
+    ("rates-twice", &["rates.table=6e-2", "rates.field=1.2e-2"]),
+    ("final-rate-0.03", &["rates.final_fraction=0.03"]),
+    ("final-rate-0.3", &["rates.final_fraction=0.3"]),
+    ("cells-192", &["encoding.n_max=192"]),
+    ("cells-768", &["encoding.n_max=768"]),
+    ("density-twice", &["field.density_scale=50"]),
 ];
 
 fn row(name: &str, method: Method, occluded: OccludedRule, length: Length) -> Row {
@@ -222,6 +241,14 @@ fn curves() -> Vec<Row> {
     CURVES.into_iter().flat_map(of).collect()
 }
 
+fn choices() -> Vec<Row> {
+    let of = |(name, changes): (&str, &[&'static str])| Row {
+        changes: [&[HELD_OUT], changes].concat(),
+        ..row(name, Occnerf, Unknown, STEPS)
+    };
+    CHOICES.into_iter().map(of).collect()
+}
+
 impl Table {
     /// Its rows, baselines first.
     pub fn rows(self) -> Vec<Row> {
@@ -230,6 +257,7 @@ impl Table {
             Self::Story => story(),
             Self::Components => components(),
             Self::Curves => curves(),
+            Self::Choices => choices(),
         }
     }
 
@@ -240,6 +268,7 @@ impl Table {
             Self::Story => "story",
             Self::Components => "components",
             Self::Curves => "curves",
+            Self::Choices => "choices",
         }
     }
 
@@ -250,6 +279,7 @@ impl Table {
             Self::Story => "From the paper to the default",
             Self::Components => "What each component is worth",
             Self::Curves => "Steps and rates of methods",
+            Self::Choices => "Settings by training frames that are held out",
         }
     }
 
@@ -270,7 +300,7 @@ impl Table {
             ],
             Self::Story => &["prior", "text", "registered-prior", "paper", "balanced"],
             Self::Components => &["ours-full", "ours-no-surface", "grey-full", "grey-no-surface"],
-            Self::Curves => &[],
+            Self::Curves | Self::Choices => &[],
         }
     }
 }
@@ -316,7 +346,7 @@ impl Row {
 mod tests {
     use super::*;
 
-    const TABLES: [Table; 4] = [Table::Methods, Table::Story, Table::Components, Table::Curves];
+    const TABLES: [Table; 5] = [Table::Methods, Table::Story, Table::Components, Table::Curves, Table::Choices];
 
     #[test]
     fn every_row_of_every_table_can_be_run_and_none_is_there_twice() {
