@@ -63,6 +63,16 @@ fn a_glb_reads_back_and_moves_as_the_avatar_does() {
 }
 
 #[test]
+fn a_glb_carries_the_light_beside_the_colours_without_it() {
+    let mut lit = avatar().clone();
+    lit.light.slope = Vec3::new(0.5, 0.25, -0.125);
+    let bytes = lit.to_glb().unwrap();
+    let length = u32::from_le_bytes(bytes[12..16].try_into().unwrap()) as usize;
+    let text = std::str::from_utf8(&bytes[20..20 + length]).unwrap();
+    assert!(text.contains(r#""extras":{"light":[0.5,0.25,-0.125]}"#), "{text}");
+}
+
+#[test]
 fn several_shells_and_many_vertices_stay_whole() {
     let mut avatar = avatar().clone();
     // A second shell outside of the first.

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use anyhow::{Context, Result};
 use image::{Rgb, RgbImage};
-use occnerf::{Cause, PreparedFrame, Renderer, Rendering, Scene, Shares, ViewBudget, budget};
+use occnerf::{Cause, Lpips, PreparedFrame, Renderer, Rendering, Scene, Shares, ViewBudget, budget};
 
 use crate::process::say;
 use crate::run::{make_directory, write};
@@ -22,15 +22,23 @@ const COLORS: [[f32; 3]; 5] = [[0.7, 0.7, 0.7], [1.0, 0.2, 0.2], [0.2, 0.9, 0.3]
 const BRIGHTEST: f32 = 0.5;
 /// Views in the picture.
 const VIEWS: usize = 10;
+/// Scores of never-seen surface.
+const UNSEEN: [&str; 3] = ["psnr_unseen", "ssim_unseen", "lpips_unseen"];
 /// Groups of three pictures in a row of it.
 const COLUMNS: usize = 2;
 
 /// Splits the error of `frames`, prints it and writes it below `directory`.
-pub fn run(directory: &Path, scene: &Scene, renderer: &mut dyn Renderer, frames: &[&PreparedFrame]) -> Result<()> {
+pub fn run(
+    directory: &Path,
+    scene: &Scene,
+    renderer: &mut dyn Renderer,
+    frames: &[&PreparedFrame],
+    lpips: Option<&Lpips>,
+) -> Result<()> {
     let stride = frames.len().div_ceil(VIEWS).max(1);
     let (mut drawn, mut index) = (Vec::new(), 0);
     let most = pictures::MAX_SHEET_PIXELS / (3 * VIEWS) as u64;
-    let views = budget(scene, renderer, frames, |frame, rendering, shares| {
+    let views = budget(scene, renderer, frames, lpips, |frame, rendering, shares| {
         if index % stride == 0 {
             drawn.push(pictures_of(frame, rendering, shares, most));
         }
@@ -59,8 +67,7 @@ pub fn read(directory: &Path) -> Result<Option<String>> {
 /// A row a camera, and one for all views: the part of the squared error that each cause has, with
 /// what PSNR would gain without it, and the scores of never-seen surface.
 fn markdown(views: &[ViewBudget]) -> String {
-    let header =
-        ["camera", "views"].into_iter().chain(Cause::ALL.map(Cause::name)).chain(["psnr_unseen", "ssim_unseen"]);
+    let header = ["camera", "views"].into_iter().chain(Cause::ALL.map(Cause::name)).chain(UNSEEN);
     let mut lines = vec![header.map(str::to_owned).collect::<Vec<_>>()];
     let mut cameras: Vec<&str> = views.iter().map(|view| view.camera.as_str()).collect();
     cameras.dedup();
@@ -68,6 +75,28 @@ fn markdown(views: &[ViewBudget]) -> String {
         lines.extend(cameras.iter().map(|camera| row(camera, views, |view| view.camera == *camera)));
     }
     lines.push(row("all", views, |_| true));
+    format!("{}\n{}", table::aligned(&lines, 1), by_part(views))
+}
+
+/// A row a part of the body over all views, the worst first: its pixels, its part of the error, and
+/// its PSNR. Parts with less than a hundredth of the error are left out.
+fn by_part(views: &[ViewBudget]) -> String {
+    let mut sums: Vec<(&str, u64, f64)> = Vec::new();
+    for part in views.iter().flat_map(|view| &view.parts) {
+        match sums.iter_mut().find(|sum| sum.0 == part.name) {
+            Some(sum) => *sum = (sum.0, sum.1 + part.pixels, sum.2 + part.squared),
+            None => sums.push((&part.name, part.pixels, part.squared)),
+        }
+    }
+    sums.sort_by(|a, b| b.2.total_cmp(&a.2));
+    let (pixels, squared) = sums.iter().fold((0, 0.0), |all, sum| (all.0 + sum.1, all.1 + sum.2));
+    let percent = |part: f64, whole: f64| format!("{:.1} %", 100.0 * part / whole.max(f64::MIN_POSITIVE));
+    let mut lines = vec![["part", "pixels", "error", "psnr"].map(str::to_owned).to_vec()];
+    for (name, own, error) in sums.into_iter().filter(|sum| sum.2 >= 0.01 * squared) {
+        let psnr = -10.0 * (error / (3.0 * own.max(1) as f64)).max(1e-10).log10();
+        let row = [name.to_owned(), percent(own as f64, pixels as f64), percent(error, squared), format!("{psnr:.2}")];
+        lines.push(row.to_vec());
+    }
     table::aligned(&lines, 1)
 }
 
@@ -88,6 +117,7 @@ fn row(name: &str, views: &[ViewBudget], takes: impl Fn(&ViewBudget) -> bool) ->
     row.extend(sums.iter().map(share));
     row.push(mean(|view| view.psnr_unseen).map_or("–".to_owned(), |v| format!("{v:.2}")));
     row.push(mean(|view| view.ssim_unseen).map_or("–".to_owned(), |v| format!("{v:.4}")));
+    row.push(mean(|view| view.lpips_unseen).map_or("–".to_owned(), |v| format!("{v:.4}")));
     row
 }
 
@@ -109,6 +139,8 @@ fn pictures_of(frame: &PreparedFrame, rendering: &Rendering, shares: &[Shares], 
 
 #[cfg(test)]
 mod tests {
+    use occnerf::PartBudget;
+
     use super::*;
 
     #[test]
@@ -119,10 +151,13 @@ mod tests {
             squared,
             psnr_unseen: None,
             ssim_unseen: Some(0.5),
+            lpips_unseen: None,
+            parts: vec![PartBudget { name: "head".to_owned(), pixels: 10, squared: squared[4] }],
         };
         let text = markdown(&[view("a", [1.0, 0.0, 0.0, 0.0, 0.0]), view("b", [0.0, 0.0, 0.0, 0.0, 1.0])]);
         let lines: Vec<&str> = text.lines().collect();
-        assert_eq!(lines.len(), 5);
+        assert_eq!(lines.len(), 9);
+        assert!(lines[8].contains("head") && lines[8].contains("100.0 %") && lines[8].contains("17.78"), "{text}");
         assert!(lines[2].contains("100.0 %") && lines[4].matches("50.0 % (+3.01 dB)").count() == 2, "{text}");
         assert!(lines[4].contains("0.5000") && lines[4].contains('–'), "{text}");
     }

@@ -58,8 +58,8 @@ pub struct EvalArguments {
     /// Weights to score LPIPS with, as for `train`
     #[arg(long, value_name = "PATH")]
     lpips: Option<PathBuf>,
-    /// Split the error of unseen views by its causes, as a table and as renders/budget.png; of
-    /// training views where there are no others
+    /// Split the error of unseen views by its causes and by part of the body, as tables and as
+    /// renders/budget.png; of training views where there are no others
     #[arg(long)]
     budget: bool,
     /// Samples a pixel in each direction; scores of more than one are only printed
@@ -159,7 +159,7 @@ pub fn eval(arguments: &EvalArguments) -> Result<()> {
     if arguments.budget {
         let frames: Vec<&PreparedFrame> =
             if scene.eval.is_empty() { scored_train_frames(&scene).collect() } else { scene.eval.iter().collect() };
-        budget::run(directory, &scene, drawn.renderer(&scene)?.as_mut(), &frames)?;
+        budget::run(directory, &scene, drawn.renderer(&scene)?.as_mut(), &frames, lpips.as_ref())?;
     }
     let mut one = metrics.clone();
     one.method.push_str(if arguments.baked { "-baked" } else { "" });

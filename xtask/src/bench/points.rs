@@ -35,8 +35,8 @@ pub const CHANGES: [Change; 23] = [
     ),
     change("span", "every sample", &["motion.shell_interval=0", "min_transmittance=0"], false),
     change("colours", "colours from grey", &["field.prior_colors=false"], true),
-    change("samples", "24 samples", &["samples=24"], true),
-    change("samples", "96 samples", &["samples=96"], false),
+    change("samples", "48 samples", &["samples=48"], true),
+    change("samples", "192 samples", &["samples=192"], false),
     change("span", "span 6 cm", &["motion.margin=0.06", "motion.depth=0.06"], false),
     change("neighbours", "k 1", &["surface.k=1"], true),
     change("neighbours", "4 levels", &["surface.coarse_levels=3"], true),
@@ -279,7 +279,7 @@ mod tests {
     fn combinations_take_what_loses_nothing_and_what_gains() {
         let lines = [
             line("base", "base", Kind::Base, 20.0, 10.0),
-            line("24 samples", "samples", Kind::Change, 20.0, 6.0),
+            line("48 samples", "samples", Kind::Change, 20.0, 6.0),
             line("width 32", "field", Kind::Change, 19.0, 5.0),
             line("k 1", "neighbours", Kind::Change, 20.0, 9.0),
             line("4 features", "features", Kind::Change, 20.5, 12.0),
@@ -288,10 +288,10 @@ mod tests {
         let points = sweep(false).combinations(&lines).unwrap();
         let set = |name: &str| &points.iter().find(|p| p.name == name).unwrap().job.config;
         let lean = set("lean");
-        assert_eq!((lean.samples, lean.surface.k, lean.surface.coarse_levels), (24, 1, 0));
+        assert_eq!((lean.samples, lean.surface.k, lean.surface.coarse_levels), (48, 1, 0));
         assert_eq!((lean.field.width, lean.encoding.features), (64, 2));
-        assert_eq!((set("rich").samples, set("rich").encoding.features), (48, 4));
-        assert_eq!((set("lean and rich").samples, set("lean and rich").encoding.features), (24, 4));
+        assert_eq!((set("rich").samples, set("rich").encoding.features), (128, 4));
+        assert_eq!((set("lean and rich").samples, set("lean and rich").encoding.features), (48, 4));
         assert!(sweep(false).combinations(&lines[1..]).unwrap().is_empty());
         assert!(sweep(false).combinations(&lines[..1]).unwrap().is_empty());
     }

@@ -4,11 +4,11 @@
 use std::path::PathBuf;
 use std::time::Instant;
 
-use anyhow::Result;
+use anyhow::{Context, Result};
 use clap::Args;
 use glam::Quat;
 use occnerf::capture::{Capture, DemoConfig, Perturbation, demo};
-use occnerf::{Config, Method, Preset, register};
+use occnerf::{Config, Method, PreparedFrame, Preset, PriorRenderer, Scene, VertexColors, evaluate, register};
 use smpl::BodyModel;
 
 use crate::process::say;
@@ -55,6 +55,18 @@ const PRIORS: [(&str, Perturbation); 10] = {
     ]
 };
 
+/// psnr_mask of unseen views of the body as it is, in the mean colours that frames show of it under
+/// the light of the video.
+fn psnr(capture: &Capture, model: &BodyModel) -> Result<f64> {
+    let mut config = Config::preset(Preset::Fast, Method::Prior);
+    config.registration.rounds = 0;
+    let scene = Scene::new(capture, model, &config)?;
+    let colors = VertexColors::measure(&scene)?;
+    let frames: Vec<&PreparedFrame> = scene.eval.iter().collect();
+    let scores = evaluate(&scene, &mut PriorRenderer::new(&scene.body, &colors), &frames, |_, _| {})?;
+    scores.psnr_mask.context("no unseen view shows the person")
+}
+
 /// Runs the bench.
 pub fn registration(arguments: &RegistrationArguments) -> Result<()> {
     use_threads(arguments.threads)?;
@@ -79,14 +91,18 @@ pub fn registration(arguments: &RegistrationArguments) -> Result<()> {
         "after",
         "px shown",
         "after",
+        "dB",
+        "after",
+        "of what the truth gains",
         "seconds",
     ];
     let mut lines = vec![header.map(str::to_owned).to_vec()];
+    let best = psnr(&truth, &body)?;
     for (index, (name, wrong)) in PRIORS.iter().enumerate().filter(|(_, (name, _))| asked(name)) {
         let (mut capture, mut model) = (if index == 0 { truth.clone() } else { demo(&given, &body)? }, body.clone());
         wrong.apply(&mut capture, &model)?;
         wrong.spoil_body(&mut model);
-        let before = Error::measure((&truth, &body), (&capture, &model))?;
+        let (before, given_psnr) = (Error::measure((&truth, &body), (&capture, &model))?, psnr(&capture, &model)?);
         let start = Instant::now();
         register(&mut capture, &model, rounds)?;
         let seconds = start.elapsed().as_secs_f64();
@@ -95,7 +111,10 @@ pub fn registration(arguments: &RegistrationArguments) -> Result<()> {
         for (before, after) in before.rows().into_iter().zip(after.rows()) {
             line.extend([format!("{before:.2}"), format!("{after:.2}")]);
         }
-        line.push(format!("{seconds:.1}"));
+        let found_psnr = psnr(&capture, &model)?;
+        let gained = (found_psnr - given_psnr) / (best - given_psnr);
+        let gained = if best - given_psnr > 0.1 { format!("{:.0} %", 100.0 * gained) } else { "–".to_owned() };
+        line.extend([format!("{given_psnr:.2}"), format!("{found_psnr:.2}"), gained, format!("{seconds:.1}")]);
         say!("{}", line.join(" | "));
         lines.push(line);
     }
@@ -103,8 +122,9 @@ pub fn registration(arguments: &RegistrationArguments) -> Result<()> {
     let text = format!(
         "Root mean square errors of the demo's joints in all {} frames of {side} × {side} pixels, against the bodies that it \
          was filmed with, before and after {} rounds: turns of bones in the world, places in the world, places in the \
-         picture. A joint is shown where the pixel that it falls on shows the person, hidden where it does not. `demo` \
-         is the prior as the demo gives it; what is below comes on top of that.\n\n{}",
+         picture. A joint is shown where the pixel that it falls on shows the person, hidden where it does not. dB: \
+         psnr_mask of unseen views of the body in the mean colours that frames show of its vertices, {best:.2} with \
+         the true bodies. `demo` is the prior as the demo gives it; what is below comes on top of that.\n\n{}",
         truth.train.len(),
         rounds,
         table::aligned(&lines, 1)

@@ -35,7 +35,9 @@ impl Avatar {
 /// One skinned mesh with a primitive a shell (`POSITION`, `NORMAL`, `TEXCOORD_0`, `JOINTS_0`,
 /// `WEIGHTS_0` in 16 bits), `KHR_materials_unlit`, the atlas as PNG, a node a joint with the rest
 /// pose as bind pose, and an animation a clip. The innermost shell is opaque, those around it are
-/// blended over it in order. Pose blend shapes and confidence are left out.
+/// blended over it in order. The atlas is under even light; that of the video is the scene's extra
+/// `light`, a vector: what has the unit normal n is max(1 + light · n, 0.2) as bright. Pose blend
+/// shapes and confidence are left out.
 ///
 /// # Errors
 /// [`Error::Bake`] with what [`Avatar::validate`] finds, and for more than 4 GiB.
@@ -77,7 +79,11 @@ pub fn to_glb(avatar: &Avatar) -> Result<Vec<u8>, Error> {
         "asset": { "version": "2.0", "generator": concat!("occnerf ", env!("CARGO_PKG_VERSION")) },
         "extensionsUsed": ["KHR_materials_unlit"],
         "scene": 0,
-        "scenes": [{ "name": avatar.name, "nodes": [0, j] }],
+        "scenes": [{
+            "name": avatar.name,
+            "nodes": [0, j],
+            "extras": { "light": avatar.light.slope.to_array() },
+        }],
         "nodes": nodes,
         "meshes": [{ "name": "person", "primitives": primitives }],
         "skins": [{ "joints": (0..j).collect::<Vec<_>>(), "skeleton": 0, "inverseBindMatrices": bind }],

@@ -135,7 +135,11 @@ pub fn motion(figure: &Figure) -> Result<Kernel> {
             })
         });
         let dead = 100 * (carried.len() - off.len()) / carried.len().max(1);
-        let name = if dead > 0 { format!("{name} ({dead} % dead)") } else { name };
+        let memory = match &field {
+            MotionField::Volume { weights, .. } => format!(", {:.1} MB", 4e-6 * weights.weights.len() as f64),
+            _ => String::new(),
+        };
+        let name = format!("{name}{memory}{}", if dead > 0 { format!(" ({dead} % dead)") } else { String::new() });
         kernel.add(name, seconds, carried.len(), mean(off.into_iter()), default);
     }
     Ok(kernel)
