@@ -41,6 +41,7 @@ fn values_out_of_range_are_refused_before_anything_is_built() {
         ("samples", "samples = 0", "samples"),
         ("samples", "samples = 1000000", "samples"),
         ("patches", "patches = 0", "patches"),
+        ("held_out", "held_out = 1", "held_out"),
         ("patch_size", "patch_size = 0", "patch_size"),
         ("width", "width = 0", "field.width"),
         ("depth", "depth = 0", "field.depth"),

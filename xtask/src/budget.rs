@@ -75,11 +75,12 @@ fn markdown(views: &[ViewBudget]) -> String {
         lines.extend(cameras.iter().map(|camera| row(camera, views, |view| view.camera == *camera)));
     }
     lines.push(row("all", views, |_| true));
-    format!("{}\n{}", table::aligned(&lines, 1), by_part(views))
+    table::aligned(&lines, 1) + &by_part(views)
 }
 
 /// A row a part of the body over all views, the worst first: its pixels, its part of the error, and
-/// its PSNR. Parts with less than a hundredth of the error are left out.
+/// its PSNR. Parts with less than a hundredth of the error are left out. Nothing where no parts were
+/// told apart, as in what older versions wrote.
 fn by_part(views: &[ViewBudget]) -> String {
     let mut sums: Vec<(&str, u64, f64)> = Vec::new();
     for part in views.iter().flat_map(|view| &view.parts) {
@@ -87,6 +88,9 @@ fn by_part(views: &[ViewBudget]) -> String {
             Some(sum) => *sum = (sum.0, sum.1 + part.pixels, sum.2 + part.squared),
             None => sums.push((&part.name, part.pixels, part.squared)),
         }
+    }
+    if sums.is_empty() {
+        return String::new();
     }
     sums.sort_by(|a, b| b.2.total_cmp(&a.2));
     let (pixels, squared) = sums.iter().fold((0, 0.0), |all, sum| (all.0 + sum.1, all.1 + sum.2));
@@ -97,7 +101,7 @@ fn by_part(views: &[ViewBudget]) -> String {
         let row = [name.to_owned(), percent(own as f64, pixels as f64), percent(error, squared), format!("{psnr:.2}")];
         lines.push(row.to_vec());
     }
-    table::aligned(&lines, 1)
+    format!("\n{}", table::aligned(&lines, 1))
 }
 
 fn row(name: &str, views: &[ViewBudget], takes: impl Fn(&ViewBudget) -> bool) -> Vec<String> {

@@ -9,7 +9,7 @@ use image::RgbImage;
 use indicatif::ProgressBar;
 use occnerf::bake::{Avatar, BakeOptions, BakedRenderer, bake};
 use occnerf::{
-    FieldRenderer, Lpips, Method, Model, PreparedFrame, PriorRenderer, Renderer, Rendering, Scene, SplitMetrics,
+    FieldRenderer, Label, Lpips, Method, Model, PreparedFrame, PriorRenderer, Renderer, Rendering, Scene, SplitMetrics,
     Supersampled, VertexColors, evaluate_with,
 };
 use rayon::prelude::*;
@@ -173,7 +173,9 @@ pub fn eval(arguments: &EvalArguments) -> Result<()> {
 }
 
 fn scored_train_frames(scene: &Scene) -> impl Iterator<Item = &PreparedFrame> {
-    scene.train.iter().step_by(TRAIN_STRIDE)
+    // Of frames that are held out nothing is known that could be scored.
+    let known = |frame: &&PreparedFrame| frame.labels.iter().any(|label| label != Label::Unknown);
+    scene.train.iter().filter(known).step_by(TRAIN_STRIDE)
 }
 
 /// Every frame that a finished run is scored on.

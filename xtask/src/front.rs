@@ -36,6 +36,7 @@ pub fn front(arguments: &FrontArguments) -> Result<()> {
     let source = run.source(&arguments.run)?;
     let scene = source.scene(&run.train)?;
     ensure!(!scene.eval.is_empty(), "{}: the capture keeps no views back", run.scene);
+    ensure!(run.train.held_out == 0, "{}: frames are held out, expected a run with none", arguments.run.display());
     let model = Model::load(&arguments.run)?;
     let mut renderer = FieldRenderer::new(&model)?;
     let mut rows = Vec::new();

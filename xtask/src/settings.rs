@@ -16,7 +16,7 @@ const METHODS: &[(Method, &str)] = &[
 const PRESETS: &[(Preset, &str)] = &[
     (Preset::Fast, "A first look: about a minute"),
     (Preset::Balanced, "The default: about two minutes"),
-    (Preset::Paper, "The paper's method: about five minutes"),
+    (Preset::Paper, "The paper's method: under ten minutes"),
 ];
 const COMPONENTS: &[(Component, &str)] = &[
     (Component::Surface, "The surface term: F sees the point term alone"),

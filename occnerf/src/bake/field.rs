@@ -24,6 +24,10 @@ pub(super) trait CanonicalField: Sync {
     /// From one sample of a picture's ray to the next, normalised metres.
     fn spacing(&self) -> f32;
 
+    /// Length of ray that the greatest density outside a point stands for, normalised metres: a ray
+    /// that grazes the surface, as those do that draw the outline, stays about as long in it.
+    fn grazing(&self) -> f32;
+
     /// How far from the prior there can be anything.
     fn reach(&self) -> f32;
 }

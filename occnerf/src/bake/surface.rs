@@ -22,9 +22,6 @@ const HALF: f32 = std::f32::consts::LN_2;
 const CHUNK: usize = 64;
 /// Least height of a shell over the next one inside.
 const APART: f32 = 0.001;
-/// Length of ray that the greatest density so far stands for, normalised metres: a ray that grazes
-/// the surface, as those do that draw the outline, stays about as long in it.
-const GRAZING: f32 = 0.035;
 
 /// What was found of the surface.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -101,7 +98,7 @@ fn crossings(
             for heights in &profiles {
                 let densities = &values[start..start + heights.len()];
                 start += heights.len();
-                double += usize::from(profile(heights, densities, depths, &mut out));
+                double += usize::from(profile(heights, densities, field.grazing(), depths, &mut out));
             }
             (out, double)
         })
@@ -113,11 +110,11 @@ fn crossings(
 type Scratch = (Vec<(f32, Place)>, Vec<Place>, Vec<(f32, Vec3)>);
 
 /// Appends the heights at which the optical depth passes each of `depths`: that from outside down
-/// to there, and that of [`GRAZING`] at the greatest density so far. Where
-/// the field is fog that is farther out than the middle of the fog, and where pictures show its
-/// outline. Returns whether a gap, of no more than a tenth of the density before
-/// it, lies between something opaque outside and something opaque inside.
-fn profile(heights: &[f32], densities: &[(f32, Vec3)], depths: &[f32], out: &mut Vec<f32>) -> bool {
+/// to there, and that of a length of `grazing` at the greatest density so far. Where the field is fog that is
+/// farther out than the middle of the fog, and where pictures show its outline. Returns whether a
+/// gap, of no more than a tenth of the density before it, lies between something opaque outside and
+/// something opaque inside.
+fn profile(heights: &[f32], densities: &[(f32, Vec3)], grazing: f32, depths: &[f32], out: &mut Vec<f32>) -> bool {
     let first = out.len();
     out.resize(first + depths.len(), f32::NAN);
     let (mut depth, mut next) = (0.0, 0);
@@ -127,7 +124,7 @@ fn profile(heights: &[f32], densities: &[(f32, Vec3)], depths: &[f32], out: &mut
     for (&height, &(density, _)) in heights.iter().zip(densities) {
         let added = density * STEP;
         thickest = thickest.max(density);
-        let here = depth + added + GRAZING * thickest;
+        let here = depth + added + grazing * thickest;
         while next < depths.len() && here >= depths[next] {
             out[first + next] = height + STEP * (0.5 - (depths[next] - before) / (here - before));
             next += 1;

@@ -38,6 +38,10 @@ impl CanonicalField for Known {
         0.0
     }
 
+    fn grazing(&self) -> f32 {
+        0.0
+    }
+
     fn reach(&self) -> f32 {
         0.06
     }

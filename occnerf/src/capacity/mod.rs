@@ -28,7 +28,7 @@ const PLACES_A_UNIT: f64 = 400.0;
 const MIN_WIDTH: usize = 64;
 const UNITS: usize = 16;
 /// Mean distance of samples along a ray, normalised metres: that of `fast` on a walking person.
-const STEP: f32 = 0.018;
+const STEP: f32 = 0.007;
 
 /// Most cells an axis, levels and log₂ of a level's table that a scene is given: the paper's.
 const MOST: (u32, usize, u32) = (2048, 16, 19);

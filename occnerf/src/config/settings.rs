@@ -325,9 +325,9 @@ pub struct Config {
     /// Transmittance of a ray behind which training leaves samples out, below 1; 0 leaves out none.
     #[serde(default)]
     pub min_transmittance: f32,
-    /// Of the training frames every `held_out`-th is registered and no more: nothing is learnt from
-    /// its pixels, and it is scored in place of other cameras' views, so that settings can be chosen
-    /// without those. 0 holds none out.
+    /// Every `held_out`-th training frame is registered, and its mask mended, with the others, but
+    /// neither colours nor the field are learnt from it: it is scored in place of other cameras'
+    /// views, so that settings can be chosen without those. 0 holds none out.
     #[serde(default)]
     pub held_out: usize,
     /// The perceptron.

@@ -49,7 +49,7 @@ impl Config {
             return Err(ConfigError { key: "patches", value: samples.to_string(), expected });
         }
         if self.held_out == 1 {
-            let expected = "expected 0 for none, or at least 2, or nothing is left to learn from";
+            let expected = "expected 0 for none or at least 2: with 1 nothing is left to learn from";
             return Err(ConfigError { key: "held_out", value: self.held_out.to_string(), expected });
         }
         if self.motion.shell_interval > 0 && self.motion.kind != MotionKind::Surface {

@@ -10,6 +10,7 @@ use crate::bake::skeleton;
 use crate::capture::Pixels;
 use crate::lpips::Lpips;
 use crate::render::picture::{Renderer, Rendering};
+use crate::scene::labels::Label;
 use crate::scene::prepared::{PreparedFrame, Scene};
 
 /// Side of the windows that are shifted to where they fit best, as a part of the picture's height,
@@ -74,7 +75,8 @@ pub struct ViewBudget {
     pub psnr_unseen: Option<f64>,
     /// SSIM over the same pixels.
     pub ssim_unseen: Option<f64>,
-    /// LPIPS of the whole picture with everything else shown as it is; `None` without a network.
+    /// LPIPS of the whole picture with everything else shown as it is; `None` without a network,
+    /// and like the others.
     #[serde(default)]
     pub lpips_unseen: Option<f64>,
     /// The error by part of the body, those that are in the picture.
@@ -85,8 +87,8 @@ pub struct ViewBudget {
 /// The error of a part of the body in one view.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct PartBudget {
-    /// The bone that moves the nearest vertices most; [`BESIDE`] for pixels that either the person
-    /// or the picture of it covers and the prior does not.
+    /// The bone that moves the nearest vertices most; [`BESIDE`] for pixels that only one of person
+    /// and prior covers, or neither, and the picture does.
     pub name: String,
     /// Pixels.
     pub pixels: u64,
@@ -94,8 +96,8 @@ pub struct PartBudget {
     pub squared: f64,
 }
 
-/// What pixels beside the prior are of.
-pub const BESIDE: &str = "beside the prior";
+/// What pixels are of that lie beside the person or beside the prior.
+pub const BESIDE: &str = "beside person or prior";
 
 /// Draws `frames` over black and splits the error of each by cause and by part of the body;
 /// `progress` hears of each picture and its pixels' shares (H × W).
@@ -136,10 +138,18 @@ pub fn budget(
             psnr_unseen: if enough { metrics::psnr_masked(a, b, &unseen) } else { None },
             ssim_unseen: if enough { metrics::ssim_masked(a, b, &unseen, width, height) } else { None },
             lpips_unseen,
-            parts: bones.parts(&nearest, &truth, &rendering, &shares),
+            parts: bones.parts(&nearest, &scored(frame, &truth, &rendering), &shares),
         })
     };
     frames.iter().map(view).collect()
+}
+
+/// The pixels (H × W) that the person or the picture of it covers, but unknown ones.
+fn scored(frame: &PreparedFrame, truth: &Pixels, rendering: &Rendering) -> Vec<bool> {
+    let mut scored: Vec<bool> = truth.mask.iter().zip(&rendering.opacity).map(|(&m, &o)| m.max(o) > 0.5).collect();
+    // Views of other cameras have no labels.
+    scored.iter_mut().zip(frame.labels.iter()).for_each(|(scored, label)| *scored &= label != Label::Unknown);
+    scored
 }
 
 /// Which bone moves each vertex most.
@@ -159,18 +169,12 @@ impl Bones {
         }
     }
 
-    /// The error of each part, of the pixels that the person or the picture of it covers.
-    fn parts(
-        &self,
-        nearest: &[Option<u32>],
-        truth: &Pixels,
-        rendering: &Rendering,
-        shares: &[Shares],
-    ) -> Vec<PartBudget> {
+    /// The error of each part, of the pixels that are `scored`.
+    fn parts(&self, nearest: &[Option<u32>], scored: &[bool], shares: &[Shares]) -> Vec<PartBudget> {
         let mut sums = vec![(0, 0.0); self.names.len()];
         for (i, shares) in shares.iter().enumerate() {
             let squared = f64::from(shares.iter().sum::<f32>());
-            if truth.mask[i] > 0.5 || rendering.opacity[i] > 0.5 || squared > 0.0 {
+            if scored[i] || squared > 0.0 {
                 let sum = &mut sums[nearest[i].map_or(self.names.len() - 1, |v| self.of[v as usize])];
                 *sum = (sum.0 + 1, sum.1 + squared);
             }
@@ -317,13 +321,11 @@ mod tests {
     #[test]
     fn parts_get_the_error_of_their_pixels_and_what_is_beside_the_prior_the_rest() {
         let bones = Bones { of: vec![0, 1, 1], names: ["a", "b", BESIDE].map(str::to_owned).to_vec() };
-        let image = Image { width: 3, height: 2, pixels: vec![0.0; 18] };
-        let truth = Pixels { image: image.clone(), mask: vec![1.0, 1.0, 1.0, 1.0, 0.0, 0.0], occluder: None };
-        let rendering = Rendering { image, opacity: vec![0.0, 0.0, 0.0, 0.0, 1.0, 0.0] };
+        let scored = [true, true, true, true, true, false];
         let nearest = [Some(0), Some(1), Some(2), None, None, None];
         let mut shares = [Shares::default(); 6];
         [0.5, 0.25, 0.125, 1.0, 2.0].iter().enumerate().for_each(|(i, &error)| shares[i][i] = error);
-        let found = bones.parts(&nearest, &truth, &rendering, &shares);
+        let found = bones.parts(&nearest, &scored, &shares);
         let expected = [("a", 1, 0.5), ("b", 2, 0.375), (BESIDE, 2, 3.0)];
         let part = |(name, pixels, squared): (&str, u64, f64)| PartBudget { name: name.to_owned(), pixels, squared };
         assert_eq!(found, expected.map(part));

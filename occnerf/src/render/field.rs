@@ -79,7 +79,7 @@ mod tests {
         let capture = crate::capture::demo(&demo, &body).unwrap();
         let mut config = Config { steps: 40, ..Config::preset(Preset::Fast, Method::Occnerf) };
         // Dense enough for rays to end, however little was learnt.
-        config.field.density_scale *= 4.0;
+        config.field.density_scale *= 8.0;
         let scene = Scene::new(&capture, &body, &config).unwrap();
         let mut trainer = Trainer::new(&scene, config).unwrap();
         for _ in 0..40 {
@@ -90,26 +90,29 @@ mod tests {
         let mut renderer = FieldRenderer::new(model).unwrap();
         let picture = renderer.render(view, background).unwrap();
         let posed = &view.posed;
-        let whole = Extent::whole(&scene.body, model.config());
-        renderer.surface.refit(&scene.body, posed, &whole, model.config(), &model.base);
-        let motion = MotionFrame::new(&body, posed);
-        let tracer = model.tracer(&renderer.surface, &whole, &motion);
-        let mut all = SampleBatch::default();
-        all.samples.clear();
-        for pixel in 0..32 * 32 {
-            tracer.trace_all(&mut all.samples, &view.pixel_ray(pixel));
+        // What is taken for empty shows next to nothing.
+        let whole = (Extent::whole(&scene.body, model.config()), 0.01);
+        for (extent, limit) in [(renderer.extent.clone(), MARCH.min_transmittance + 1e-5), whole] {
+            renderer.surface.refit(&scene.body, posed, &extent, model.config(), &model.base);
+            let motion = MotionFrame::new(&body, posed);
+            let tracer = model.tracer(&renderer.surface, &extent, &motion);
+            let mut all = SampleBatch::default();
+            all.samples.clear();
+            for pixel in 0..32 * 32 {
+                tracer.trace_all(&mut all.samples, &view.pixel_ray(pixel));
+            }
+            model.evaluate(&renderer.code, &mut all, None);
+            let (mut weights, mut composites) = (Vec::new(), Vec::new());
+            composite_batch(&all, background, &mut weights, &mut composites);
+            let (mut worst, mut solid) = (0.0f32, 0);
+            for (pixel, expected) in composites.iter().enumerate() {
+                let found = Vec3::from_slice(&picture.image.pixels[3 * pixel..]);
+                worst = worst.max((found - expected.color).abs().max_element());
+                worst = worst.max((picture.opacity[pixel] - expected.opacity).abs());
+                solid += usize::from(expected.opacity > 1.0 - MARCH.min_transmittance);
+            }
+            assert!(solid > 50, "{solid} rays end early");
+            assert!(worst < limit, "{worst}, expected below {limit}");
         }
-        model.evaluate(&renderer.code, &mut all, None);
-        let (mut weights, mut composites) = (Vec::new(), Vec::new());
-        composite_batch(&all, background, &mut weights, &mut composites);
-        let (mut worst, mut solid) = (0.0f32, 0);
-        for (pixel, expected) in composites.iter().enumerate() {
-            let found = Vec3::from_slice(&picture.image.pixels[3 * pixel..]);
-            worst = worst.max((found - expected.color).abs().max_element());
-            worst = worst.max((picture.opacity[pixel] - expected.opacity).abs());
-            solid += usize::from(expected.opacity > 1.0 - MARCH.min_transmittance);
-        }
-        assert!(solid > 50, "{solid} rays end early");
-        assert!(worst < MARCH.min_transmittance + 1e-5, "{worst}");
     }
 }

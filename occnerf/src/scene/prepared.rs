@@ -22,7 +22,7 @@ use crate::scene::seen::{MOST, deeper, seen, strange_edge};
 pub struct PreparedFrame {
     /// Name in the capture.
     pub name: String,
-    /// Name of the camera in the capture; empty for training frames.
+    /// Name of the camera in the capture; empty for training frames, `held out` for those held out.
     pub camera_name: String,
     /// Pose and camera, lengths normalised.
     pub view: Arc<PosedView>,
@@ -53,7 +53,7 @@ impl PreparedFrame {
     }
 }
 
-/// Camera that training frames which are held out are said to be of.
+/// What stands for the name of the camera of a training frame that is held out.
 const HELD_OUT: &str = "held out";
 
 /// Everything that training and scoring read and never change.
@@ -72,6 +72,9 @@ pub struct Scene {
     pub(crate) lit: bool,
     /// Pixels on both sides of the masks' edges that may show somebody else's colours.
     pub(crate) edge: usize,
+    /// Indices of the training frames from whose pixels something is learnt: all but those held
+    /// out.
+    pub(crate) learnt: Vec<usize>,
 }
 
 impl Scene {
@@ -109,7 +112,10 @@ impl Scene {
             capture,
             lit: config.field.prior_light,
             edge: 0,
+            learnt: Vec::new(),
         };
+        let held_out = |i: usize| config.held_out > 0 && i.is_multiple_of(config.held_out);
+        scene.learnt = (0..scene.train.len()).filter(|&i| !held_out(i)).collect();
         if config.registration.rounds > 0 {
             scene.leave_out_edges()?;
         }
@@ -117,24 +123,24 @@ impl Scene {
             scene.hold_out(config.held_out);
         }
         if scene.train.iter().all(|f| f.labels.num_subject() == 0) {
-            return Err(Error::Scene(format!("{}: no training mask shows the subject", scene.name)));
+            let beside = if config.held_out > 0 { " beside the frames that are held out" } else { "" };
+            return Err(Error::Scene(format!("{}: no training mask shows the subject{beside}", scene.name)));
         }
         Ok(scene)
     }
 
-    /// What each training frame shows of the vertices, and how many pixels inside its mask. A frame
-    /// of which nothing is known shows nothing.
+    /// What each training frame shows of the vertices, and how many pixels inside its mask; nothing
+    /// of those held out.
     pub(crate) fn seen(&self) -> Result<Vec<Vec<(Seen, usize)>>, Error> {
         let faces = &self.body.model.faces;
-        let of = |frame: &PreparedFrame| match frame.labels.num_subject() {
-            0 => Ok(Vec::new()),
-            _ => seen(&frame.view, &*frame.pixels()?, faces),
+        let of = |(i, frame): (usize, &PreparedFrame)| match self.learnt.binary_search(&i) {
+            Ok(_) => seen(&frame.view, &*frame.pixels()?, faces),
+            Err(_) => Ok(Vec::new()),
         };
-        self.train.par_iter().map(of).collect()
+        self.train.par_iter().enumerate().map(of).collect()
     }
 
-    /// Makes every `every`-th training frame one to score, of which training knows nothing but the
-    /// pose.
+    /// Makes every `every`-th training frame one to score, of which training knows the pose alone.
     fn hold_out(&mut self, every: usize) {
         self.eval.clear();
         for frame in self.train.iter_mut().step_by(every) {

@@ -29,7 +29,7 @@ impl Batch {
     /// Draws a step's rays from the seed and the step's number alone.
     pub fn draw(&mut self, scene: &Scene, config: &Config, step: u64) {
         let mut random = Stream::new(&[config.seed, DRAW, step]);
-        self.frame = frame_of(scene.train.len(), config.seed, step, &mut self.order);
+        self.frame = scene.learnt[frame_of(scene.learnt.len(), config.seed, step, &mut self.order)];
         let frame = &scene.train[self.frame];
         let (width, height) = (frame.view.camera.width, frame.view.camera.height);
         let size = config.patch_size.min(width).min(height);

@@ -96,7 +96,7 @@ struct CapacityArguments {
     /// Steps of each point [default: 400, quick: 80]
     #[arg(long)]
     steps: Option<u64>,
-    /// The preset `paper` too, and what is chosen from it, with so many steps at the rates of
+    /// The preset `paper` too, and what is chosen from it, with so many steps and the loss of
     /// `balanced`
     #[arg(long, value_name = "STEPS")]
     paper: Option<u64>,

@@ -300,7 +300,8 @@ impl Table {
             ],
             Self::Story => &["prior", "text", "registered-prior", "paper", "balanced"],
             Self::Components => &["ours-full", "ours-no-surface", "grey-full", "grey-no-surface"],
-            Self::Curves | Self::Choices => &[],
+            Self::Choices => &["as-it-is", "samples-48", "no-surface"],
+            Self::Curves => &[],
         }
     }
 }

@@ -90,8 +90,9 @@ impl<'a> Summary<'a> {
             text.push_str(&format!("; lpips_full by {network}"));
         }
         text.push_str(".\n");
+        let unseen = if self.table == Table::Choices { "Training frames that are held out" } else { "Novel views" };
         let splits: [(&str, PickSplit); 2] = [
-            ("Novel views", |m| m.splits.novel_view.as_ref()),
+            (unseen, |m| m.splits.novel_view.as_ref()),
             ("Training views, over visible pixels", |m| m.splits.train_view.as_ref()),
         ];
         for (title, split) in splits {

@@ -136,7 +136,9 @@ pub fn motion(figure: &Figure) -> Result<Kernel> {
         });
         let dead = 100 * (carried.len() - off.len()) / carried.len().max(1);
         let memory = match &field {
-            MotionField::Volume { weights, .. } => format!(", {:.1} MB", 4e-6 * weights.weights.len() as f64),
+            MotionField::Volume { weights, .. } => {
+                format!(", {:.1} MB of weights", 4e-6 * weights.weights.len() as f64)
+            }
             _ => String::new(),
         };
         let name = format!("{name}{memory}{}", if dead > 0 { format!(" ({dead} % dead)") } else { String::new() });
