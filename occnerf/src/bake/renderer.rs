@@ -19,8 +19,8 @@ use crate::model::vertices::VertexCode;
 use crate::model::view::PosedView;
 use crate::render::picture::{Renderer, Rendering};
 
-/// [`CanonicalField::grazing`]; 2 to 6 cm draw outlines that fit those of pictures (IoU .956 to .960 on
-/// the demo, whatever the number of samples), 3 to 4 best.
+/// [`CanonicalField::grazing`]; 2 to 6 cm draw outlines that fit those of pictures (IoU .956 to .960
+/// on the demo, whatever the number of samples), 3 to 4 best.
 const GRAZING: f32 = 0.035;
 
 /// A trained field, its vertices encoded.

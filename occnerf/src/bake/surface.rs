@@ -110,10 +110,10 @@ fn crossings(
 type Scratch = (Vec<(f32, Place)>, Vec<Place>, Vec<(f32, Vec3)>);
 
 /// Appends the heights at which the optical depth passes each of `depths`: that from outside down
-/// to there, and that of a length of `grazing` at the greatest density so far. Where the field is fog that is
-/// farther out than the middle of the fog, and where pictures show its outline. Returns whether a
-/// gap, of no more than a tenth of the density before it, lies between something opaque outside and
-/// something opaque inside.
+/// to there, and that of a length of `grazing` at the greatest density so far. Where the field is
+/// fog that is farther out than the middle of the fog, and where pictures show its outline. Returns
+/// whether a gap, of no more than a tenth of the density before it, lies between something opaque
+/// outside and something opaque inside.
 fn profile(heights: &[f32], densities: &[(f32, Vec3)], grazing: f32, depths: &[f32], out: &mut Vec<f32>) -> bool {
     let first = out.len();
     out.resize(first + depths.len(), f32::NAN);

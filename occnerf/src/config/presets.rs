@@ -39,8 +39,8 @@ impl Config {
 const NOTHING: f32 = 1.0 / (1 << 25) as f32;
 
 /// The paper's method: the point term and the attended surface term on the blend of vertices, the
-/// completeness term, its sampler and sizes. It leaves the size of F open. Where it
-/// departs from the paper's text, which `reproduce --story` takes back one by one, but for the steps:
+/// completeness term, its sampler and sizes. It leaves the size of F open. Where it departs from the
+/// paper's text, which `reproduce --story` takes back one by one, but for the steps:
 ///
 /// - `registration`: the prior is corrected first, as it is for every baseline.
 /// - `motion.kind`: weights of the nearest surface point in place of a learnable weight volume of
@@ -51,8 +51,7 @@ const NOTHING: f32 = 1.0 / (1 << 25) as f32;
 ///   grey. What no frame shows stays as it starts.
 /// - `rates`: 12 to 600 times the paper's, but for the vertices', falling to a tenth. At the 5e-5 of
 ///   "the rest" an entry of the table that a tenth of the steps touch has moved by 0.05 at most after
-///   10 000 steps; the code
-///   published with the paper trains the encoder at 5e-4.
+///   10 000 steps; the code published with the paper trains the encoder at 5e-4.
 /// - `steps`: a tenth of the paper's, which these rates make enough.
 fn paper() -> Config {
     Config {

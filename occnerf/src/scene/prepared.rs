@@ -119,11 +119,10 @@ impl Scene {
         if config.registration.rounds > 0 {
             scene.leave_out_edges()?;
         }
-        if config.held_out > 0 {
-            scene.hold_out(config.held_out);
-        }
+        scene.hold_out();
         if scene.train.iter().all(|f| f.labels.num_subject() == 0) {
-            let beside = if config.held_out > 0 { " beside the frames that are held out" } else { "" };
+            let beside =
+                if scene.learnt.len() < scene.train.len() { " beside the frames that are held out" } else { "" };
             return Err(Error::Scene(format!("{}: no training mask shows the subject{beside}", scene.name)));
         }
         Ok(scene)
@@ -140,10 +139,14 @@ impl Scene {
         self.train.par_iter().enumerate().map(of).collect()
     }
 
-    /// Makes every `every`-th training frame one to score, of which training knows the pose alone.
-    fn hold_out(&mut self, every: usize) {
-        self.eval.clear();
-        for frame in self.train.iter_mut().step_by(every) {
+    /// Makes the training frames that nothing is learnt from those to score, in place of views of
+    /// other cameras.
+    fn hold_out(&mut self) {
+        if self.learnt.len() < self.train.len() {
+            self.eval.clear();
+        }
+        let learnt = &self.learnt;
+        for (_, frame) in self.train.iter_mut().enumerate().filter(|(i, _)| learnt.binary_search(i).is_err()) {
             let unknown = Labels::new(&vec![Label::Unknown; frame.labels.iter().count()]);
             let labels = std::mem::replace(&mut frame.labels, unknown);
             self.eval.push(PreparedFrame {
