@@ -54,7 +54,7 @@ pub use evaluate::budget::{BESIDE, Cause, PartBudget, Shares, ViewBudget, budget
 pub use evaluate::{FrameMetrics, SplitMetrics, evaluate, evaluate_with, least_seen_quartile};
 pub use lpips::{Lpips, Trunk};
 pub use model::body::{Body, Moment};
-pub use model::colors::VertexColors;
+pub use model::colors::PriorColors;
 pub use model::person::Person;
 pub use model::saved::checkpoint_config;
 pub use model::times::StepTimes;

@@ -10,7 +10,7 @@ use std::path::PathBuf;
 use glam::{Vec2, Vec3};
 use occnerf::bake::{Avatar, Clip, turn_upright};
 use occnerf::capture::{DemoConfig, demo};
-use occnerf::{Config, Method, Preset, Scene, VertexColors};
+use occnerf::{Config, Method, Preset, PriorColors, Scene};
 use stand_in::stand_in;
 
 fn scene() -> Scene {
@@ -22,7 +22,7 @@ fn scene() -> Scene {
 }
 
 fn avatar(scene: &Scene) -> Avatar {
-    stand_in(scene, &VertexColors::measure(scene).unwrap())
+    stand_in(scene, &PriorColors::measure(scene).unwrap())
 }
 
 fn place(name: &str) -> PathBuf {

@@ -13,7 +13,7 @@ use glam::{Mat3, Quat, Vec2, Vec3};
 use occnerf::bake::Avatar;
 use occnerf::bake::export::{Splats, adapt_motion, splats, write_amass, write_obj};
 use occnerf::capture::{DemoConfig, demo};
-use occnerf::{Config, Method, Preset, Scene, VertexColors};
+use occnerf::{Config, Method, Preset, PriorColors, Scene};
 use smpl::{Character, MotionClip};
 
 fn avatar() -> &'static Avatar {
@@ -22,7 +22,7 @@ fn avatar() -> &'static Avatar {
         let body = smpl::BodyModel::embedded();
         let capture = demo(&DemoConfig { size: 32, frames: 4, eval_cameras: 1, ..Default::default() }, &body).unwrap();
         let scene = Scene::new(&capture, &body, &Config::preset(Preset::Fast, Method::Occnerf)).unwrap();
-        stand_in::stand_in(&scene, &VertexColors::measure(&scene).unwrap())
+        stand_in::stand_in(&scene, &PriorColors::measure(&scene).unwrap())
     })
 }
 

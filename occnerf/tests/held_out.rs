@@ -5,14 +5,14 @@ mod common;
 
 use common::{body, capture, config};
 use occnerf::capture::{Capture, Pixels};
-use occnerf::{Config, Label, Method, PriorRenderer, Scene, Trainer, VertexColors, evaluate};
+use occnerf::{Config, Label, Method, PriorColors, PriorRenderer, Scene, Trainer, evaluate};
 
 /// Colours of the prior and losses of some steps.
-fn learnt(capture: &Capture, config: &Config) -> (VertexColors, Vec<f64>) {
+fn learnt(capture: &Capture, config: &Config) -> (PriorColors, Vec<f64>) {
     let scene = Scene::new(capture, body(), config).unwrap();
     let mut trainer = Trainer::new(&scene, config.clone()).unwrap();
     let losses = (0..6).map(|_| trainer.step().unwrap().loss).collect();
-    (VertexColors::measure(&scene).unwrap(), losses)
+    (PriorColors::measure(&scene).unwrap(), losses)
 }
 
 /// What training frame 0 shows, inverted.
@@ -44,7 +44,7 @@ fn nothing_is_learnt_from_what_they_show_and_they_are_what_is_scored() {
     assert_eq!((&*frame.name, &*frame.camera_name), (&*scene.train[0].name, "held out"));
     assert!(scene.train[0].labels.iter().all(|label| label == Label::Unknown));
     assert!(frame.labels.num_subject() > 50 && frame.labels.num_subject() < frame.labels.iter().count());
-    let colors = VertexColors::measure(&scene).unwrap();
+    let colors = PriorColors::measure(&scene).unwrap();
     let mut prior = PriorRenderer::new(&scene.body, &colors);
     let scores = evaluate(&scene, &mut prior, &[frame], |_, _| {}).unwrap();
     assert!(scores.psnr_mask.is_some_and(|psnr| psnr > 5.0), "{scores:?}");

@@ -7,7 +7,7 @@ mod common;
 use common::{SIZE, body, capture, config, scene};
 use glam::{Affine3A, Mat3, Vec3};
 use occnerf::capture::{Frame, Pixels};
-use occnerf::{FieldRenderer, Label, Method, PosedView, PriorRenderer, Renderer, Scene, Trainer, VertexColors};
+use occnerf::{FieldRenderer, Label, Method, PosedView, PriorColors, PriorRenderer, Renderer, Scene, Trainer};
 use volrender::Camera;
 
 /// The person wholly hidden, behind the camera, far beside the picture, and around the camera.
@@ -44,7 +44,7 @@ fn training_goes_on_over_frames_that_show_nobody() {
                 assert!(report.loss.is_finite() && report.psnr.is_finite(), "{kind} {method:?}: {report:?}");
                 assert_eq!(report.bad_gradients, 0, "{kind} {method:?}: {report:?}");
             }
-            VertexColors::measure(&scene).unwrap();
+            PriorColors::measure(&scene).unwrap();
             scene.vertex_frequencies().unwrap();
         }
     }
@@ -76,7 +76,7 @@ fn a_capture_that_is_nearly_all_unknown_still_trains() {
 #[test]
 fn pictures_from_anywhere_are_finite_and_empty_where_nobody_is() {
     let trainer = Trainer::new(scene(), config(Method::Occnerf)).unwrap();
-    let colors = VertexColors::measure(scene()).unwrap();
+    let colors = PriorColors::measure(scene()).unwrap();
     let background = Vec3::new(0.2, 0.4, 0.6);
     for kind in ["behind", "beside", "around"] {
         let view = PosedView::new(&odd(kind).camera, scene().body.rest());

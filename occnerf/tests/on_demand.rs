@@ -5,7 +5,7 @@ mod common;
 
 use common::{TempDir, config};
 use occnerf::capture::{Capture, Layout, LoadOptions, SynthConfig, load_capture, synthesise};
-use occnerf::{FieldRenderer, Method, Scene, Trainer, VertexColors, evaluate};
+use occnerf::{FieldRenderer, Method, PriorColors, Scene, Trainer, evaluate};
 use smpl::BodyModel;
 
 const SIZE: u32 = 32;
@@ -55,7 +55,7 @@ fn training_from_files_is_training_from_memory() {
 
     let capture = read(&dir, &made.body, 0);
     let few = Scene::new(&capture, &made.body, &config).unwrap();
-    assert_eq!(VertexColors::measure(&few).unwrap(), VertexColors::measure(&scene).unwrap());
+    assert_eq!(PriorColors::measure(&few).unwrap(), PriorColors::measure(&scene).unwrap());
     let mut trainer = Trainer::new(&few, config).unwrap();
     // A picture that goes missing stops training where it was, and nothing is lost when it comes
     // back.
@@ -74,6 +74,6 @@ fn training_from_files_is_training_from_memory() {
     assert_eq!(missed, 1);
     assert!(trained(&dir, &trainer, &few) == in_memory);
     std::fs::remove_file(&picture).unwrap();
-    let message = VertexColors::measure(&few).unwrap_err().to_string();
+    let message = PriorColors::measure(&few).unwrap_err().to_string();
     assert!(message.contains("frame_000002.png"), "{message}");
 }

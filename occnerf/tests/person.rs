@@ -8,7 +8,7 @@ use std::path::Path;
 use common::{TempDir, body, capture, config, scene};
 use glam::Vec3;
 use occnerf::{
-    Error, FieldRenderer, Method, Model, MotionKind, Person, PriorRenderer, Renderer, Scene, Trainer, VertexColors,
+    Error, FieldRenderer, Method, Model, MotionKind, Person, PriorColors, PriorRenderer, Renderer, Scene, Trainer,
 };
 
 const CHECKPOINT: &str = "checkpoint.safetensors";
@@ -22,7 +22,7 @@ fn trained(run: &Path, change: impl Fn(&mut occnerf::Config)) -> Model {
     for _ in 0..6 {
         trainer.step().unwrap();
     }
-    Person::save(run, &scene().capture, body(), &VertexColors::measure(scene()).unwrap()).unwrap();
+    Person::save(run, &scene().capture, body(), &PriorColors::measure(scene()).unwrap()).unwrap();
     trainer.save(&run.join(CHECKPOINT)).unwrap();
     trainer.into_model()
 }
@@ -63,7 +63,7 @@ fn a_capture_gets_the_bodies_that_a_run_was_trained_with() {
     let given = capture();
     let scene = Scene::new(&given, body(), &config).unwrap();
     assert!(scene.capture.registered && scene.capture.train[0].placement != given.train[0].placement);
-    Person::save(&dir.path(""), &scene.capture, body(), &VertexColors::measure(&scene).unwrap()).unwrap();
+    Person::save(&dir.path(""), &scene.capture, body(), &PriorColors::measure(&scene).unwrap()).unwrap();
     let mut restored = given.clone();
     assert!(Person::restore(&dir.path(""), &mut restored, body()).unwrap());
     let again = Scene::new(&restored, body(), &config).unwrap();
@@ -79,7 +79,7 @@ fn a_capture_gets_the_bodies_that_a_run_was_trained_with() {
 #[test]
 fn the_prior_of_a_run_draws_the_same_bits_too() {
     let dir = TempDir::new("person-prior");
-    let colors = VertexColors::measure(scene()).unwrap();
+    let colors = PriorColors::measure(scene()).unwrap();
     let run = dir.path("");
     Person::save(&run, &scene().capture, body(), &colors).unwrap();
     let person = Person::load(&run, &config(Method::Prior)).unwrap();

@@ -8,7 +8,7 @@ use common::{TempDir, bits, body, checkpoint, demo_config, on_threads, scene, ti
 use glam::Vec3;
 use occnerf::capture::demo;
 use occnerf::{
-    Config, DistanceKind, FieldRenderer, Method, MotionKind, PriorRenderer, Renderer, Scene, Trainer, VertexColors,
+    Config, DistanceKind, FieldRenderer, Method, MotionKind, PriorColors, PriorRenderer, Renderer, Scene, Trainer,
     checkpoint_config,
 };
 
@@ -47,7 +47,7 @@ fn captures_scenes_colours_and_pictures_are_the_same_on_one_and_on_three_threads
             let trained = train(&scene, &config, 2);
             let trainer = Trainer::new(&scene, config.clone()).unwrap();
             let field = FieldRenderer::new(trainer.model()).unwrap().render(&scene.eval[0].view, Vec3::ONE).unwrap();
-            let colors = VertexColors::measure(&scene).unwrap();
+            let colors = PriorColors::measure(&scene).unwrap();
             let prior = PriorRenderer::new(&scene.body, &colors).render(&scene.eval[0].view, Vec3::X).unwrap();
             let counts = scene.vertex_frequencies().unwrap();
             let frames: Vec<_> = capture.train.into_iter().map(|f| (f.pixels().unwrap(), f.pose)).collect();

@@ -8,7 +8,7 @@ mod common;
 use common::{TempDir, body, capture, scene, tiny, train};
 use glam::Vec3;
 use occnerf::capture::{Capture, DemoConfig, LoadOptions, Pixels, demo, load_capture};
-use occnerf::{Label, Method, MotionKind, OccludedRule, Scene, VertexColors, upright};
+use occnerf::{Label, Method, MotionKind, OccludedRule, PriorColors, Scene, upright};
 
 const NO_DISTORTION: [f64; 5] = [0.0; 5];
 const BARREL: [f64; 5] = [-0.2, 0.05, 0.001, -0.002, 0.0];
@@ -124,7 +124,7 @@ fn colours_of_unknown_pixels_have_no_influence_and_those_of_known_ones_have() {
 #[test]
 fn vertex_colours_do_not_depend_on_unknown_pixels() {
     let config = tiny(Method::Prior, MotionKind::Surface);
-    let measure = |capture: &Capture| VertexColors::measure(&Scene::new(capture, body(), &config).unwrap()).unwrap();
+    let measure = |capture: &Capture| PriorColors::measure(&Scene::new(capture, body(), &config).unwrap()).unwrap();
     assert_eq!(measure(capture()), measure(&repainted(Label::Unknown)));
     assert_ne!(measure(capture()), measure(&repainted(Label::Subject)));
 }

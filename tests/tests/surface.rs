@@ -9,8 +9,7 @@ use std::collections::BTreeSet;
 
 use common::{body, placement, scene, silhouette, walking};
 use glam::Vec3;
-use occnerf::capture::Light;
-use occnerf::{PriorRenderer, Renderer, VertexColors};
+use occnerf::{PriorColors, PriorRenderer, Renderer};
 use proptest::prelude::*;
 use surface_query::{MeshDistance, SurfaceQuery, SurfaceQueryConfig};
 use testkit::{oracle, strategy};
@@ -125,9 +124,8 @@ fn distance_structure_and_ray_structure_agree_on_a_walking_body_after_a_refit() 
 #[test]
 fn the_prior_renderers_silhouette_is_that_of_the_ray_casts() {
     let scene = scene();
-    let vertices = scene.body.canonical.vertices.len();
-    let colors =
-        VertexColors { colors: vec![Vec3::ONE; vertices], seen: vec![true; vertices], light: Light::default() };
+    let white = vec![Vec3::ONE; scene.body.canonical.vertices.len()];
+    let colors = PriorColors::of_vertices(white, &scene.body.model.faces);
     for frame in [&scene.eval[0], &scene.train[5]] {
         let (vertices, faces) = (&frame.view.posed.vertices, &scene.body.model.faces);
         let rendering = PriorRenderer::new(&scene.body, &colors).render(&frame.view, Vec3::ZERO).unwrap();

@@ -9,8 +9,8 @@ use image::RgbImage;
 use indicatif::ProgressBar;
 use occnerf::bake::{Avatar, BakeOptions, BakedRenderer, bake};
 use occnerf::{
-    FieldRenderer, Label, Lpips, Method, Model, PreparedFrame, PriorRenderer, Renderer, Rendering, Scene, SplitMetrics,
-    Supersampled, VertexColors, evaluate_with,
+    FieldRenderer, Label, Lpips, Method, Model, PreparedFrame, PriorColors, PriorRenderer, Renderer, Rendering, Scene,
+    SplitMetrics, Supersampled, evaluate_with,
 };
 use rayon::prelude::*;
 use visibility::Samples;
@@ -112,7 +112,7 @@ pub fn eval(arguments: &EvalArguments) -> Result<()> {
     ensure!(!arguments.baked || run.train.method != Method::Prior, "--baked: a prior is not baked");
     let (loaded, avatar);
     let drawn = if run.train.method == Method::Prior {
-        Drawn::Prior(VertexColors::measure(&scene)?)
+        Drawn::Prior(PriorColors::measure(&scene)?)
     } else if arguments.baked {
         loaded = Model::load(directory)?;
         avatar = baked::avatar(directory, &loaded)?;
@@ -200,7 +200,7 @@ pub enum Drawn<'a> {
         /// Name of the perceptual term that it was trained with.
         perceptual: String,
     },
-    Prior(VertexColors),
+    Prior(PriorColors),
     /// As `render --baked` draws them.
     Baked {
         model: &'a Model,

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, Error, Result, bail, ensure};
 use clap::Args;
 use occnerf::capture::Capture;
-use occnerf::{Config, Lpips, Method, Model, Person, Scene, Trainer, VertexColors, checkpoint_config};
+use occnerf::{Config, Lpips, Method, Model, Person, PriorColors, Scene, Trainer, checkpoint_config};
 
 use crate::capacity::{self, CapacityName};
 use crate::eval::{Drawn, Split, check_pictures, score_baked, score_run, scored_frames, unscored};
@@ -186,7 +186,7 @@ pub fn run_one(
         }
     }
     let start = Instant::now();
-    let colors = VertexColors::measure(&scene)?;
+    let colors = PriorColors::measure(&scene)?;
     let prior_seconds = start.elapsed().as_secs_f64();
     let kept = Person::save(directory, &scene.capture, &source.model, &colors);
     kept.map_err(Error::from).map_err(results_in(directory))?;
@@ -333,7 +333,7 @@ fn prior_metrics(run: &RunConfig, source: &Source, lpips: Option<&Lpips>) -> Res
     prior.train.method = Method::Prior;
     let scene = source.scene(&prior.train)?;
     let start = Instant::now();
-    let colors = VertexColors::measure(&scene)?;
+    let colors = PriorColors::measure(&scene)?;
     let drawn = Drawn::Prior(colors);
     let mut metrics = unscored(&prior, &drawn, start.elapsed().as_secs_f64());
     metrics.lpips = network_name(lpips);

@@ -11,7 +11,7 @@ use common::{done, folder, refused, text};
 use glam::Vec3;
 use occnerf::bake::Avatar;
 use occnerf::capture::{DemoConfig, demo};
-use occnerf::{Config, Method, Preset, Scene, VertexColors};
+use occnerf::{Config, Method, Preset, PriorColors, Scene};
 use smpl::{Data, NdArray, npz};
 
 const HOSTILE: &str = "</script><img src=x onerror=alert(1)>\" onload='";
@@ -22,7 +22,7 @@ fn run(name: &str) -> PathBuf {
     let body = smpl::BodyModel::embedded();
     let capture = demo(&DemoConfig { size: 24, frames: 3, eval_cameras: 1, ..Default::default() }, &body).unwrap();
     let scene = Scene::new(&capture, &body, &Config::preset(Preset::Fast, Method::Occnerf)).unwrap();
-    let mut avatar: Avatar = stand_in::stand_in(&scene, &VertexColors::measure(&scene).unwrap());
+    let mut avatar: Avatar = stand_in::stand_in(&scene, &PriorColors::measure(&scene).unwrap());
     avatar.name = HOSTILE.to_owned();
     avatar.clips[0].name = HOSTILE.to_owned();
     avatar.save(&directory.join("avatar.safetensors")).unwrap();

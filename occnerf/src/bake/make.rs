@@ -15,20 +15,19 @@ use super::paint::{Texel, dilate, paint, texels};
 use super::refine::refine;
 use super::renderer::TrainedField;
 use super::skeleton::skeleton;
-use super::subdivide::{Anchor, Subdivided, normals};
 use super::surface::{Normal, SurfaceReport, heights, normals_of};
 use crate::Error;
 use crate::capture::Light;
 use crate::model::body::Body;
+use crate::model::subdivide::{Anchor, Subdivided, normals, times_until};
 use crate::model::trained::Model;
-use crate::model::view::PosedView;
+use crate::model::view::{PosedView, pixel_width};
 use crate::scene::prepared::Scene;
 
-/// Pixels of the training pictures that an edge of the surface may be long, where two subdivisions
-/// are enough for it.
+/// Pixels of the training pictures that an edge of the surface may be long, where so many
+/// subdivisions are enough for it.
 const EDGE: f32 = 1.5;
-/// Most subdivisions: each makes four times the faces.
-const MOST_SUBDIVISIONS: u32 = 2;
+const MOST: u32 = 2;
 /// Texels across a pixel of the training pictures.
 const TEXELS_A_PIXEL: f32 = 2.0;
 /// Share of the training frames that must have seen a place for full confidence.
@@ -95,7 +94,7 @@ pub fn bake(model: &Model, scene: Option<&Scene>, options: &BakeOptions) -> Resu
     if !(options.fps > 0.0 && options.fps <= 1e6) {
         return refuse(format!("{} frames a second", options.fps));
     }
-    let Some(pixel) = pixel_width(model) else {
+    let Some(pixel) = pixel_width(model.frames().iter().map(Arc::as_ref)) else {
         return refuse("no training frame has the body before its camera".to_owned());
     };
     let vertices = model.body.canonical.vertices.len();
@@ -111,18 +110,6 @@ pub fn bake(model: &Model, scene: Option<&Scene>, options: &BakeOptions) -> Resu
     }
     report.seconds = start.elapsed().as_secs_f64();
     Ok((avatar, report))
-}
-
-/// Width of a pixel of the training pictures at the depth of the body, normalised metres: the
-/// median over the frames.
-fn pixel_width(model: &Model) -> Option<f32> {
-    let width = |view: &Arc<PosedView>| {
-        let depth = view.camera.world_to_camera.transform_point3(view.centre()).z;
-        Some(depth / view.camera.focal.max_element()).filter(|width| width.is_finite() && *width > 0.0)
-    };
-    let mut widths: Vec<f32> = model.frames().iter().filter_map(width).collect();
-    widths.sort_by(f32::total_cmp);
-    widths.get(widths.len() / 2).copied()
 }
 
 /// How well the video showed each vertex of the prior, 0 to 1.
@@ -141,7 +128,7 @@ pub(super) fn surface(
     options: &BakeOptions,
 ) -> Result<(Avatar, BakeReport), Error> {
     let (prior, faces) = (&body.canonical.vertices, &body.model.faces);
-    let mesh = Subdivided::new(prior.len(), faces, subdivisions(prior, faces, pixel));
+    let mesh = Subdivided::new(prior.len(), faces, times_until(prior, faces, EDGE * pixel, MOST));
     let feet = normals_of(&mesh, prior, faces);
     let (heights, found) = heights(field, &body.surface, &feet, &mesh, options.shells);
     let layout = Layout::new(prior, faces, options.shells, pixel / TEXELS_A_PIXEL, options.atlas);
@@ -188,16 +175,6 @@ pub(super) fn surface(
         cameras: Vec::new(),
     };
     Ok((avatar, report))
-}
-
-/// How often the prior must be subdivided for its mean edge to be short enough.
-fn subdivisions(prior: &[Vec3], faces: &[[u32; 3]], pixel: f32) -> u32 {
-    let edges = faces.iter().map(|face| {
-        let [a, b, c] = face.map(|v| prior[v as usize]);
-        f64::from(a.distance(b) + b.distance(c) + c.distance(a)) / 3.0
-    });
-    let mean = edges.sum::<f64>() as f32 / faces.len().max(1) as f32;
-    (0..MOST_SUBDIVISIONS).find(|&times| mean / 2f32.powi(times as i32) <= EDGE * pixel).unwrap_or(MOST_SUBDIVISIONS)
 }
 
 /// Vertices of all shells, one for each chart that a vertex of the subdivided prior is in.

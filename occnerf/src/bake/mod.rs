@@ -12,7 +12,6 @@ mod refine;
 mod renderer;
 mod saved;
 mod skeleton;
-mod subdivide;
 mod surface;
 #[cfg(test)]
 mod tests;

@@ -29,8 +29,6 @@ pub(super) struct TrainedField<'a> {
     code: VertexCode,
     extent: Extent,
     spacing: f32,
-    /// What colours start from at each vertex, under even light.
-    base: Vec<Vec4>,
 }
 
 impl<'a> TrainedField<'a> {
@@ -39,9 +37,7 @@ impl<'a> TrainedField<'a> {
         model.encode_vertices(&mut code);
         let extent = model.measure_extent(&code);
         let spacing = mean_span(model) / model.config.samples as f32;
-        let mut base = Vec::new();
-        model.base.before_sigmoid(&[], &mut base);
-        Self { model, code, extent, spacing, base }
+        Self { model, code, extent, spacing }
     }
 }
 
@@ -80,8 +76,7 @@ impl CanonicalField for TrainedField<'_> {
                 }
             }
             if based {
-                let corners = body.model.faces[place.face as usize].into_iter().zip(place.barycentric);
-                samples.base.push(corners.map(|(v, b)| b * self.base[v as usize]).sum());
+                samples.base.push(base.before_sigmoid(place.face, place.barycentric, 1.0));
             }
         }
         self.model.evaluate(&self.code, &mut batch, None);

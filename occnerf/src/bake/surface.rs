@@ -5,7 +5,7 @@ use rayon::prelude::*;
 use surface_query::MeshDistance;
 
 use super::field::{CanonicalField, Place};
-use super::subdivide::{Subdivided, neighbours, normals};
+use crate::model::subdivide::{Anchor, Subdivided, neighbours, normals};
 
 /// From one point of a profile to the next, normalised metres.
 pub(super) const STEP: f32 = 0.0025;
@@ -66,10 +66,8 @@ impl Normal {
 /// The normals of a subdivided prior.
 pub(super) fn normals_of(mesh: &Subdivided, prior: &[Vec3], prior_faces: &[[u32; 3]]) -> Vec<Normal> {
     let directions = normals(prior, prior_faces);
-    let normal = |anchor: &super::subdivide::Anchor| Normal {
-        foot: anchor.mix(prior),
-        direction: anchor.mix(&directions).normalize_or(Vec3::Y),
-    };
+    let normal =
+        |anchor: &Anchor| Normal { foot: anchor.mix(prior), direction: anchor.mix(&directions).normalize_or(Vec3::Y) };
     mesh.anchors.iter().map(normal).collect()
 }
 

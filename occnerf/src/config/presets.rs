@@ -111,8 +111,9 @@ fn paper() -> Config {
     }
 }
 
-/// The default. Without the paper's coarser levels, attention and learnable vertices, which buy
-/// nothing here and cost a fifth of the time: `reproduce --components`.
+/// The default. Without the paper's surface term, and so its coarser levels, attention and learnable
+/// vertices: they buy nothing where density and colours start from the prior's (`reproduce
+/// --components`).
 fn balanced() -> Config {
     Config {
         preset: Preset::Balanced,
@@ -129,7 +130,13 @@ fn balanced() -> Config {
             distance_min: -0.4,
             distance_max: 0.6,
         },
-        surface: SurfaceConfig { coarse_levels: 0, attention: false, distance: DistanceKind::Exact, ..paper().surface },
+        surface: SurfaceConfig {
+            coarse_levels: 0,
+            distance: DistanceKind::Exact,
+            surface_term: false,
+            attention: false,
+            ..paper().surface
+        },
         loss: LossConfig { mse: 5.0, ..paper().loss },
         motion: MotionConfig { depth: 0.04, shell_interval: 32, ..paper().motion },
         rates: RateConfig { vertices: 0.0, ..paper().rates },

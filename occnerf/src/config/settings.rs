@@ -155,7 +155,7 @@ pub struct FieldConfig {
     /// Bias at the outer end of the margin; linear in between.
     pub density_bias_outside: f32,
     /// Whether colours start from those that the video showed of the prior's nearest surface point
-    /// (see [`crate::VertexColors`]): the perceptron adds to them before the sigmoid, where some
+    /// (see [`crate::PriorColors`]): the perceptron adds to them before the sigmoid, where some
     /// frame saw them. Asks for `motion.kind = surface`.
     #[serde(default)]
     pub prior_colors: bool,

@@ -1,38 +1,60 @@
-//! Colours of the prior's vertices: a baseline of their own, and what the field's colours start
-//! from.
+//! Colours of the prior's surface: a baseline of their own, and what the field's colours start from.
+
+use std::sync::Arc;
 
 use glam::{Vec3, Vec4};
 
 use crate::capture::Light;
+use crate::model::subdivide::Subdivided;
 
-/// A colour for each vertex of the prior, and the light that falls on it.
+/// Colours of the prior at the vertices of its surface, subdivided until they lie about as close as
+/// the pixels of the video, and the light that falls on it.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct VertexColors {
-    /// sRGB under even light, V.
+pub struct PriorColors {
+    /// sRGB under even light, those of the V vertices of the prior first.
     pub colors: Vec<Vec3>,
-    /// Whether some training frame saw the vertex, V: its colour is inferred where none did.
+    /// Whether some training frame saw each of them: its colour is inferred where none did.
     pub seen: Vec<bool>,
     /// What the colours are multiplied by.
     pub light: Light,
+    /// The surface that they are of.
+    pub(crate) mesh: Arc<Subdivided>,
 }
 
-impl VertexColors {
-    /// The colours where each vertex is as bright as `shades` say (V, or nothing for 1; see
-    /// [`Light::on_surface`]).
-    pub fn lit(&self, shades: &[f32]) -> impl Iterator<Item = Vec3> {
-        self.colors.iter().enumerate().map(|(v, color)| shades.get(v).map_or(*color, |shade| shade * *color))
+impl PriorColors {
+    /// One colour for each vertex of a prior with these `faces`, all of them seen under even light.
+    pub fn of_vertices(colors: Vec<Vec3>, faces: &[[u32; 3]]) -> Self {
+        let mesh = Arc::new(Subdivided::new(colors.len(), faces, 0));
+        Self { seen: vec![true; colors.len()], colors, light: Light::default(), mesh }
     }
 
-    /// What a sigmoid makes the colours of [`VertexColors::lit`], black and white taken for nearly
-    /// so, and as w how much of what a perceptron says is to be added: nothing where no frame saw
-    /// the vertex, for there nothing has taught it.
-    pub(crate) fn before_sigmoid(&self, shades: &[f32], out: &mut Vec<Vec4>) {
+    /// The colour of a point of a `face` of the prior, and as w how much of what surrounds it some
+    /// frame saw.
+    pub(crate) fn at(&self, face: u32, barycentric: [f32; 3]) -> Vec4 {
+        let (fine, weights) = self.mesh.locate(face, barycentric);
+        let corners = self.mesh.faces[fine as usize].into_iter().zip(weights);
+        let weighted =
+            corners.map(|(v, b)| b * self.colors[v as usize].extend(f32::from(u8::from(self.seen[v as usize]))));
+        weighted.sum()
+    }
+
+    /// What a sigmoid makes the colour of [`PriorColors::at`] a point that is as bright as `shade`
+    /// says, black and white taken for nearly so, and as w how much of what a perceptron says is to
+    /// be added: nothing where no frame saw the point, for there nothing has taught it.
+    pub(crate) fn before_sigmoid(&self, face: u32, barycentric: [f32; 3], shade: f32) -> Vec4 {
         /// 5 levels of 255.
         const LEAST: f32 = 0.02;
-        let inverse = |x: f32| (x / (1.0 - x)).ln();
-        let between = |c: Vec3| c.clamp(Vec3::splat(LEAST), Vec3::splat(1.0 - LEAST));
-        let each = self.lit(shades).zip(&self.seen);
-        out.clear();
-        out.extend(each.map(|(c, &seen)| between(c).map(inverse).extend(f32::from(u8::from(seen)))));
+        let color = self.at(face, barycentric);
+        let between = (shade * color.truncate()).clamp(Vec3::splat(LEAST), Vec3::splat(1.0 - LEAST));
+        between.map(|x| (x / (1.0 - x)).ln()).extend(color.w)
     }
+}
+
+/// How bright a point of the face with these `corners` is, where its vertices are as bright as
+/// `shades` say (V, or nothing for 1; see [`Light::on_surface`]).
+pub(crate) fn shade(shades: &[f32], corners: [u32; 3], barycentric: [f32; 3]) -> f32 {
+    if shades.is_empty() {
+        return 1.0;
+    }
+    corners.into_iter().zip(barycentric).map(|(v, b)| b * shades[v as usize]).sum()
 }

@@ -15,6 +15,7 @@ pub(crate) mod perceptron;
 pub(crate) mod person;
 pub(crate) mod samples;
 pub(crate) mod saved;
+pub(crate) mod subdivide;
 pub(crate) mod surface_term;
 pub(crate) mod times;
 pub(crate) mod trace;

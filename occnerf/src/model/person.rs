@@ -14,9 +14,10 @@ use crate::Error;
 use crate::capture::{Capture, Light};
 use crate::config::Config;
 use crate::model::body::{Body, Moment};
-use crate::model::colors::VertexColors;
+use crate::model::colors::PriorColors;
 use crate::model::file::{Array, Contents, read, write};
 use crate::model::saved::{CHECKPOINT, config_of, parse};
+use crate::model::subdivide::Subdivided;
 use crate::model::trained::Model;
 use crate::model::view::PosedView;
 
@@ -38,7 +39,7 @@ pub struct Person {
     /// The training frames' poses and cameras.
     pub frames: Vec<Arc<PosedView>>,
     /// The colours that the video shows of the prior.
-    pub colors: VertexColors,
+    pub colors: PriorColors,
 }
 
 impl Person {
@@ -46,7 +47,7 @@ impl Person {
     ///
     /// # Errors
     /// Files that cannot be written.
-    pub fn save(run: &Path, capture: &Capture, model: &BodyModel, colors: &VertexColors) -> Result<(), Error> {
+    pub fn save(run: &Path, capture: &Capture, model: &BodyModel, colors: &PriorColors) -> Result<(), Error> {
         model.save(&run.join(BODY))?;
         let (joints, betas) = (model.num_joints(), model.num_betas());
         let vectors = |values: &[Vec3]| values.iter().flat_map(|v| v.to_array()).collect::<Vec<f32>>();
@@ -85,6 +86,7 @@ impl Person {
             ("version", VERSION.to_owned()),
             ("scene", capture.name.clone()),
             ("frames", capture.train.len().to_string()),
+            ("subdivisions", colors.mesh.times().to_string()),
         ]);
         write(&run.join(PERSON), &header, arrays.map(|(name, array)| (name.to_owned(), array)).into())
     }
@@ -149,11 +151,18 @@ impl Person {
             Arc::new(body.view(&camera, frame, Moment { betas, pose, placement: *placement }))
         };
         let frames = views.map(view).collect();
-        let colors = triples(&contents.floats("colors", vertices * 3)?);
-        let seen = contents.bytes("seen", vertices)?.iter().map(|&seen| seen != 0).collect();
+        // Files of before the prior's colours were of its subdivision have no such number.
+        let times = contents.header("subdivisions").unwrap_or("0");
+        let fits = |&times: &u32| times < 8 && model.faces.len() << (2 * times) <= bytes.len();
+        let times = times.parse().ok().filter(|times| *times == 0 || fits(times)).ok_or_else(|| {
+            contents.wrong(format!("header `subdivisions` is {times:?}, expected a number that fits the file"))
+        })?;
+        let mesh = Arc::new(Subdivided::new(vertices, &model.faces, times));
+        let colors = triples(&contents.floats("colors", mesh.anchors.len() * 3)?);
+        let seen = contents.bytes("seen", mesh.anchors.len())?.iter().map(|&seen| seen != 0).collect();
         let light = Light { slope: Vec3::from_slice(&contents.floats("light", 3)?) };
         let scene = contents.require("scene")?.to_owned();
-        Ok(Self { scene, body, frames, colors: VertexColors { colors, seen, light } })
+        Ok(Self { scene, body, frames, colors: PriorColors { colors, seen, light, mesh } })
     }
 }
 
@@ -169,7 +178,7 @@ impl Model {
         let contents = parse(&path, &bytes)?;
         let config = config_of(&contents)?;
         let Person { body, frames, colors, .. } = Person::load(run, &config)?;
-        let base = if config.field.prior_colors { colors } else { VertexColors::default() };
+        let base = if config.field.prior_colors { colors } else { PriorColors::default() };
         let mut model = Self::new(config, body, frames, base)?;
         model.restore(&contents)?;
         Ok(model)

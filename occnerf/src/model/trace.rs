@@ -1,14 +1,15 @@
 //! Tracing: where a ray can meet the subject, and what the surface says of each point there.
 
-use glam::{Vec3, Vec4};
+use glam::Vec3;
 use smpl::{MotionField, MotionFrame, Posed};
 use surface_query::MeshDistance;
 use volrender::{Bins, Composite, Occupancy, OccupancyConfig, Ray};
 
 use crate::Error;
+use crate::capture::Light;
 use crate::config::Config;
 use crate::model::body::Body;
-use crate::model::colors::VertexColors;
+use crate::model::colors::{PriorColors, shade};
 use crate::model::distance::{SurfacePoint, needs_neighbours, surface_point};
 use crate::model::extent::Extent;
 use crate::model::samples::Samples;
@@ -24,8 +25,8 @@ pub(crate) const FINE_CELL: f32 = 0.01;
 pub(crate) struct PosedSurface {
     mesh: MeshDistance,
     pub occupancy: Occupancy,
-    /// What colours start from at each vertex, see [`Samples::base`]; may be empty.
-    pub base: Vec<Vec4>,
+    /// How bright each vertex is, see [`Light::on_surface`].
+    shades: Vec<f32>,
     cell: f32,
 }
 
@@ -33,13 +34,13 @@ impl PosedSurface {
     /// The canonical body, with an occupancy of cells of side `cell`, normalised metres.
     pub fn new(body: &Body, cell: f32) -> Result<Self, Error> {
         let mesh = MeshDistance::new(&body.canonical.vertices, &body.model.faces)?;
-        Ok(Self { mesh, occupancy: Occupancy::default(), base: Vec::new(), cell })
+        Ok(Self { mesh, occupancy: Occupancy::default(), shades: Vec::new(), cell })
     }
 
-    /// Moves it to another pose, out to `extent`, in these colours.
-    pub fn refit(&mut self, body: &Body, posed: &Posed, extent: &Extent, config: &Config, colors: &VertexColors) {
-        let Self { mesh, occupancy, base, cell } = self;
-        colors.before_sigmoid(&colors.light.on_surface(&posed.vertices, &body.model.faces), base);
+    /// Moves it to another pose, out to `extent`, under this light.
+    pub fn refit(&mut self, body: &Body, posed: &Posed, extent: &Extent, config: &Config, light: Light) {
+        let Self { mesh, occupancy, shades, cell } = self;
+        *shades = light.on_surface(&posed.vertices, &body.model.faces);
         let size = OccupancyConfig { margin: config.motion.reach(), depth: config.motion.depth, cell: *cell };
         rayon::join(
             || mesh.refit(&posed.vertices),
@@ -68,8 +69,8 @@ pub(crate) struct Tracer<'a> {
     /// in space.
     pub near_canonical: &'a Occupancy,
     pub extent: &'a Extent,
-    /// What colours start from at each vertex, see [`Samples::base`]; may be empty.
-    pub base: &'a [Vec4],
+    /// What colours start from, see [`Samples::base`]; may be empty.
+    pub base: &'a PriorColors,
     /// Whether neighbours are wanted at all.
     pub neighbours: bool,
 }
@@ -218,10 +219,10 @@ impl Tracer<'_> {
         samples.canonical.push(mapped.canonical);
         samples.closest.push(at.closest);
         samples.distance.push(at.distance);
-        if let Some(found) = nearest.filter(|_| !self.base.is_empty()) {
-            let corners = self.body.model.faces[found.face as usize].into_iter();
-            let weighted = corners.zip(found.barycentric).map(|(v, b)| b * self.base[v as usize]);
-            samples.base.push(weighted.sum());
+        if let Some(found) = nearest.filter(|_| !self.base.colors.is_empty()) {
+            let corners = self.body.model.faces[found.face as usize];
+            let shade = shade(&self.surface.shades, corners, found.barycentric);
+            samples.base.push(self.base.before_sigmoid(found.face, found.barycentric, shade));
         }
         (true, looked_up)
     }

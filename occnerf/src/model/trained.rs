@@ -12,7 +12,7 @@ use crate::capture::Light;
 use crate::config::{Config, MotionKind};
 use crate::model::arena::Arena;
 use crate::model::body::Body;
-use crate::model::colors::VertexColors;
+use crate::model::colors::PriorColors;
 use crate::model::distance::needs_neighbours;
 use crate::model::extent::Extent;
 use crate::model::field::{Field, Learnt, SampleBatch, VertexRows};
@@ -40,17 +40,17 @@ pub struct Model {
     /// Where the field ended when it was last looked at.
     pub(crate) extent: Extent,
     /// What colours start from; empty where they start from nothing.
-    pub(crate) base: VertexColors,
+    pub(crate) base: PriorColors,
     pub(crate) steps_done: u64,
 }
 
 impl Model {
-    /// A model at step 0; `base` is what colours start from at each vertex (V), or empty.
+    /// A model at step 0; `base` is what colours start from, or empty.
     pub(crate) fn new(
         config: Config,
         body: Arc<Body>,
         frames: Vec<Arc<PosedView>>,
-        base: VertexColors,
+        base: PriorColors,
     ) -> Result<Self, Error> {
         config.validate()?;
         let (levels, lists) = (body.query.pyramid().levels.len(), body.query.neighbours_per_query());
@@ -188,7 +188,7 @@ impl Model {
             frame,
             near_canonical: &self.near_canonical,
             extent,
-            base: &surface.base,
+            base: &self.base,
             neighbours: self.needs_neighbours(),
         }
     }

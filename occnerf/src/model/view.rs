@@ -67,3 +67,15 @@ impl PosedView {
         [x0 as u32, y0 as u32, x1 as u32, y1 as u32]
     }
 }
+
+/// Width of a pixel at the depth of the body, normalised metres: the median over `views`; `None`
+/// where none has the body before its camera.
+pub(crate) fn pixel_width<'a>(views: impl Iterator<Item = &'a PosedView>) -> Option<f32> {
+    let width = |view: &PosedView| {
+        let depth = view.camera.world_to_camera.transform_point3(view.centre()).z;
+        Some(depth / view.camera.focal.max_element()).filter(|width| width.is_finite() && *width > 0.0)
+    };
+    let mut widths: Vec<f32> = views.filter_map(width).collect();
+    widths.sort_by(f32::total_cmp);
+    widths.get(widths.len() / 2).copied()
+}

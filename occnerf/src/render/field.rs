@@ -48,7 +48,7 @@ impl Renderer for FieldRenderer<'_> {
     fn render(&mut self, view: &PosedView, background: Vec3) -> Result<Rendering, Error> {
         let Self { model, code, extent, surface } = self;
         let posed = &view.posed;
-        surface.refit(&model.body, posed, extent, &model.config, &model.base);
+        surface.refit(&model.body, posed, extent, &model.config, model.base.light);
         let motion = MotionFrame::new(&model.body.model, posed);
         let tracer = model.tracer(surface, extent, &motion);
         paint(view, background, Scratch::default, |scratch, row, columns| {
@@ -93,7 +93,7 @@ mod tests {
         // What is taken for empty shows next to nothing.
         let whole = (Extent::whole(&scene.body, model.config()), 0.01);
         for (extent, limit) in [(renderer.extent.clone(), MARCH.min_transmittance + 1e-5), whole] {
-            renderer.surface.refit(&scene.body, posed, &extent, model.config(), &model.base);
+            renderer.surface.refit(&scene.body, posed, &extent, model.config(), model.base.light);
             let motion = MotionFrame::new(&body, posed);
             let tracer = model.tracer(&renderer.surface, &extent, &motion);
             let mut all = SampleBatch::default();

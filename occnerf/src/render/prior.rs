@@ -1,22 +1,22 @@
-//! Pictures of the posed prior in one colour a vertex.
+//! Pictures of the posed prior in the colours that the video shows of it.
 
 use glam::Vec3;
 
 use crate::Error;
 use crate::model::body::Body;
-use crate::model::colors::VertexColors;
+use crate::model::colors::{PriorColors, shade};
 use crate::model::view::PosedView;
 use crate::render::picture::{Renderer, Rendering, paint};
 
-/// Draws the prior's mesh with one colour a vertex.
+/// Draws the prior's mesh in colours of its surface.
 pub struct PriorRenderer<'a> {
     body: &'a Body,
-    colors: &'a VertexColors,
+    colors: &'a PriorColors,
 }
 
 impl<'a> PriorRenderer<'a> {
     /// Draws `body` in `colors`.
-    pub fn new(body: &'a Body, colors: &'a VertexColors) -> Self {
+    pub fn new(body: &'a Body, colors: &'a PriorColors) -> Self {
         Self { body, colors }
     }
 }
@@ -29,7 +29,6 @@ impl Renderer for PriorRenderer<'_> {
         let faces = &self.body.model.faces;
         let mesh = visibility::RayMesh::new(&view.posed.vertices, faces)?;
         let shades = self.colors.light.on_surface(&view.posed.vertices, faces);
-        let lit: Vec<Vec3> = self.colors.lit(&shades).collect();
         let share = 1.0 / (SUPERSAMPLING * SUPERSAMPLING) as f32;
         paint(
             view,
@@ -44,9 +43,8 @@ impl Renderer for PriorRenderer<'_> {
                             let (u, v) = (offset(sub % SUPERSAMPLING), offset(sub / SUPERSAMPLING));
                             let ray = view.camera.ray(column as f32 + u, row as f32 + v);
                             if let Some(hit) = mesh.first_hit(ray.origin, ray.direction) {
-                                let corners = faces[hit.face as usize];
-                                let weighted = corners.iter().zip(hit.barycentric);
-                                color += share * weighted.map(|(&v, b)| b * lit[v as usize]).sum::<Vec3>();
+                                let shade = shade(&shades, faces[hit.face as usize], hit.barycentric);
+                                color += share * shade * self.colors.at(hit.face, hit.barycentric).truncate();
                                 opacity += share;
                             }
                         }

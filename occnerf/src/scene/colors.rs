@@ -1,31 +1,73 @@
 //! The colours that a video shows of the prior.
 
+use std::sync::Arc;
+
 use glam::Vec3;
+use rayon::prelude::*;
 
 use crate::Error;
 use crate::capture::Light;
-use crate::model::colors::VertexColors;
-use crate::scene::light::{albedo, measure_light};
+use crate::model::colors::PriorColors;
+use crate::model::subdivide::{Subdivided, times_until};
+use crate::model::view::pixel_width;
+use crate::scene::light::{Seen, measure_light};
 use crate::scene::prepared::Scene;
 use crate::scene::seen::deeper;
 use crate::scene::unseen::complete;
 
-impl VertexColors {
-    /// The colour that is closest to the visible training pixels that saw a vertex, by ray casting,
-    /// under the light of the scene if the configuration asks for one; a vertex that none saw takes
-    /// a mean of those that some saw, by their canonical distances, along the stripes if there are
-    /// any. Pixels at the edge of masks do not count where they show what is beside the person.
+/// Pixels of the training pictures that an edge of the subdivided prior may be long, where so many
+/// subdivisions are enough for it, and most faces that it may have.
+const EDGE: f32 = 0.5;
+const MOST: u32 = 2;
+const MOST_FACES: usize = 1 << 20;
+/// Least part of its size that surface counts with that is seen at a slant.
+const SLANT: f32 = 0.05;
+/// Frames that are looked at together: what they show takes some megabytes each.
+const TOGETHER: usize = 8;
+
+impl PriorColors {
+    /// The colours that are closest to the visible training pixels that saw a place, by ray
+    /// casting, each as large as it is seen, under the light of the scene if the configuration asks
+    /// for one. A vertex that no frame saw takes a mean of those that some saw, by their canonical
+    /// distances, along the stripes if there are any, other places what lies between their
+    /// vertices. Pixels at the edge of masks do not count where they show what is beside the person.
     ///
     /// # Errors
     /// Pictures that cannot be read.
     pub fn measure(scene: &Scene) -> Result<Self, Error> {
-        let vertices = scene.body.canonical.vertices.len();
-        let frames = deeper(&scene.seen()?, scene.edge);
-        let light = if scene.lit { measure_light(&frames, vertices) } else { Light::default() };
-        let sums = albedo(frames.iter().flatten(), vertices, |normal| light.on(normal));
+        let (prior, faces) = (&scene.body.canonical.vertices, &scene.body.model.faces);
+        let light =
+            if scene.lit { measure_light(&deeper(&scene.seen()?, scene.edge), prior.len()) } else { Light::default() };
+        let pixel = pixel_width(scene.train.iter().map(|frame| &*frame.view));
+        let most = (1..=MOST).take_while(|times| faces.len() << (2 * times) <= MOST_FACES).count() as u32;
+        let times = pixel.map_or(0, |pixel| times_until(prior, faces, EDGE * pixel, most));
+        let mesh = Subdivided::new(prior.len(), faces, times);
+        // Terms of Σ s c and Σ s² for colours c under the light s.
+        let shown = |frame: usize| -> Result<Vec<(usize, Vec3, f32)>, Error> {
+            let seen = scene.seen_in(frame, &mesh.anchors)?;
+            let view = &scene.train[frame].view;
+            let eye = view.camera.centre_of_projection();
+            let term = |&((v, color, normal), _): &(Seen, usize)| {
+                let place = mesh.anchors[v as usize].mix(&view.posed.vertices);
+                let (size, shade) = (normal.dot((eye - place).normalize_or_zero()).max(SLANT), light.on(normal));
+                (v as usize, size * shade * color, size * shade * shade)
+            };
+            Ok(seen.iter().filter(|seen| seen.1 > scene.edge).map(term).collect())
+        };
+        let mut sums = vec![(Vec3::ZERO, 0.0); mesh.anchors.len()];
+        for first in (0..scene.train.len()).step_by(TOGETHER) {
+            let frames = first..(first + TOGETHER).min(scene.train.len());
+            let found: Result<Vec<_>, Error> = frames.into_par_iter().map(shown).collect();
+            for (v, sum, squares) in found?.into_iter().flatten() {
+                sums[v] = (sums[v].0 + sum, sums[v].1 + squares);
+            }
+        }
         let seen: Vec<bool> = sums.iter().map(|sum| sum.1 > 0.0).collect();
         let mut colors: Vec<Vec3> = sums.iter().map(|(sum, squares)| *sum / squares.max(f32::MIN_POSITIVE)).collect();
-        complete(&scene.body, &mut colors, &seen);
-        Ok(Self { colors, seen, light })
+        let (vertices, between) = colors.split_at_mut(prior.len());
+        complete(&scene.body, vertices, &seen[..prior.len()]);
+        let rest = between.iter_mut().zip(&mesh.anchors[prior.len()..]).zip(&seen[prior.len()..]);
+        rest.filter(|(_, seen)| !**seen).for_each(|((color, anchor), _)| *color = anchor.mix(vertices));
+        Ok(Self { colors, seen, light, mesh: Arc::new(mesh) })
     }
 }

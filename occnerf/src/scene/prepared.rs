@@ -10,6 +10,7 @@ use crate::Error;
 use crate::capture::{Capture, CaptureError, Frame, Light, PixelSource, Pixels, Shown};
 use crate::config::Config;
 use crate::model::body::{Body, Moment};
+use crate::model::subdivide::Anchor;
 use crate::model::view::PosedView;
 use crate::scene::labels::{Label, Labels, dilate, label_pixels};
 use crate::scene::light::{Seen, measure_light};
@@ -131,12 +132,17 @@ impl Scene {
     /// What each training frame shows of the vertices, and how many pixels inside its mask; nothing
     /// of those held out.
     pub(crate) fn seen(&self) -> Result<Vec<Vec<(Seen, usize)>>, Error> {
-        let faces = &self.body.model.faces;
-        let of = |(i, frame): (usize, &PreparedFrame)| match self.learnt.binary_search(&i) {
-            Ok(_) => seen(&frame.view, &*frame.pixels()?, faces),
-            Err(_) => Ok(Vec::new()),
-        };
-        self.train.par_iter().enumerate().map(of).collect()
+        let anchors: Vec<Anchor> = (0..self.body.canonical.vertices.len() as u32).map(Anchor::vertex).collect();
+        (0..self.train.len()).into_par_iter().map(|frame| self.seen_in(frame, &anchors)).collect()
+    }
+
+    /// The same of points of the prior in one of the frames.
+    pub(crate) fn seen_in(&self, frame: usize, anchors: &[Anchor]) -> Result<Vec<(Seen, usize)>, Error> {
+        if self.learnt.binary_search(&frame).is_err() {
+            return Ok(Vec::new());
+        }
+        let frame = &self.train[frame];
+        seen(&frame.view, &*frame.pixels()?, &self.body.model.faces, anchors)
     }
 
     /// Makes the training frames that nothing is learnt from those to score, in place of views of

@@ -7,6 +7,7 @@ use visibility::RayMesh;
 
 use crate::Error;
 use crate::capture::{Light, Pixels};
+use crate::model::subdivide::Anchor;
 use crate::model::view::PosedView;
 use crate::scene::labels::squared_distance;
 use crate::scene::light::{Seen, albedo};
@@ -18,25 +19,31 @@ pub(crate) const MOST: usize = 4;
 /// inside: bodies that do not quite fit make edges wrong too, but evenly so.
 const STRANGE: f64 = 1.5;
 
-/// What a frame shows of the vertices at pixels of the subject, by ray casting, and how many pixels
-/// inside the mask that is, from 1.
-pub(crate) fn seen(view: &PosedView, pixels: &Pixels, faces: &[[u32; 3]]) -> Result<Vec<(Seen, usize)>, Error> {
+/// What a frame shows of points of the prior at pixels of the subject, by ray casting, and how many
+/// pixels inside the mask that is, from 1. `anchors` say where the points are.
+pub(crate) fn seen(
+    view: &PosedView,
+    pixels: &Pixels,
+    faces: &[[u32; 3]],
+    anchors: &[Anchor],
+) -> Result<Vec<(Seen, usize)>, Error> {
     let (camera, posed) = (&view.camera, &view.posed.vertices);
     let mesh = RayMesh::new(posed, faces)?;
     let usable: Vec<bool> = pixels.mask.iter().map(|&m| m > 0.5).collect();
-    let visible = visibility::visible_vertices(&mesh, posed, &pinhole(camera), Some(&usable));
+    let points: Vec<Vec3> = anchors.iter().map(|anchor| anchor.mix(posed)).collect();
+    let visible = visibility::visible_vertices(&mesh, &points, &pinhole(camera), Some(&usable));
     let unusable: Vec<bool> = usable.iter().map(|usable| !usable).collect();
     let depth = squared_distance(&unusable, camera.width as usize);
     let normals = vertex_normals(posed, faces);
     let color = |v: usize| {
-        let at = visible[v].then(|| camera.project(posed[v])).flatten()?;
+        let at = visible[v].then(|| camera.project(points[v])).flatten()?;
         let pixel = at.y as usize * camera.width as usize + at.x as usize;
         let coverage = *pixels.mask.get(pixel)?;
         // Edge pixels are mixed with black in proportion to what the mask leaves free.
         let color = Vec3::from_slice(&pixels.image.pixels[3 * pixel..]) / coverage.max(0.5);
-        Some(((v as u32, color, normals[v].normalize_or_zero()), (depth[pixel].sqrt() as usize).max(1)))
+        Some(((v as u32, color, anchors[v].mix(&normals).normalize_or_zero()), (depth[pixel].sqrt() as usize).max(1)))
     };
-    Ok((0..posed.len()).filter_map(color).collect())
+    Ok((0..points.len()).filter_map(color).collect())
 }
 
 /// What frames show more than so many pixels inside their masks.
@@ -69,7 +76,7 @@ mod tests {
     use super::*;
     use crate::capture::{Capture, DemoConfig, Perturbation, demo};
     use crate::config::{Config, Method, Preset};
-    use crate::model::colors::VertexColors;
+    use crate::model::colors::PriorColors;
     use crate::scene::labels::Label;
     use crate::scene::prepared::Scene;
 
@@ -95,9 +102,9 @@ mod tests {
             }
         }
         // Vertices whose colours both know agree better than if edges counted.
-        let truth = VertexColors::measure(&exact).unwrap();
+        let truth = PriorColors::measure(&exact).unwrap();
         let error = |scene: &Scene| -> f32 {
-            let found = VertexColors::measure(scene).unwrap();
+            let found = PriorColors::measure(scene).unwrap();
             let known = |v: &usize| truth.seen[*v] && found.seen[*v];
             let each = (0..truth.seen.len()).filter(known);
             let errors: Vec<f32> = each.map(|v| truth.colors[v].distance_squared(found.colors[v])).collect();

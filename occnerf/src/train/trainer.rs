@@ -9,7 +9,7 @@ use crate::Error;
 use crate::capacity::Pruned;
 use crate::config::{Config, VisibilityKind};
 use crate::lpips::Lpips;
-use crate::model::colors::VertexColors;
+use crate::model::colors::PriorColors;
 use crate::model::field::VertexRows;
 use crate::model::march::MarchOptions;
 use crate::model::parameters::Part;
@@ -59,7 +59,7 @@ impl<'a> Trainer<'a> {
     /// # Errors
     /// A configuration that is not valid or not the one that `scene` was prepared for.
     pub fn new(scene: &'a Scene, config: Config) -> Result<Self, Error> {
-        let colors = config.field.prior_colors.then(|| VertexColors::measure(scene)).transpose()?;
+        let colors = config.field.prior_colors.then(|| PriorColors::measure(scene)).transpose()?;
         let base = colors.unwrap_or_default();
         let frames = scene.train.iter().map(|frame| frame.view.clone()).collect();
         let mut model = Model::new(config, scene.body.clone(), frames, base)?;
@@ -169,7 +169,7 @@ impl<'a> Trainer<'a> {
         if interval > 0 && step > 0 && step.is_multiple_of(interval) {
             model.extent = model.measure_extent(vertex_code);
         }
-        surface.refit(&model.body, posed, &model.extent, &model.config, &model.base);
+        surface.refit(&model.body, posed, &model.extent, &model.config, model.base.light);
         deal(batch, frame, groups);
         let motion = MotionFrame::new(&scene.body.model, posed);
         let pass = Step { model: &*model, surface, motion: &motion, frame, batch, vertex_code, options };

@@ -3,14 +3,14 @@
 use glam::{Affine3A, Vec2, Vec3};
 use occnerf::bake::{Atlas, Avatar, Clip, motion_of_bones, skeleton, turn_upright};
 use occnerf::capture::Light;
-use occnerf::{Scene, VertexColors, upright};
+use occnerf::{PriorColors, Scene, upright};
 use volrender::Camera;
 
 /// Texels a side of the square that a face's colours stand in.
 const CELL: usize = 8;
 
 /// The prior of a prepared scene as an avatar of one shell.
-pub fn stand_in(scene: &Scene, colors: &VertexColors) -> Avatar {
+pub fn stand_in(scene: &Scene, colors: &PriorColors) -> Avatar {
     let body = &scene.body;
     let metres = 1.0 / body.scale;
     let up = upright(body, scene.train.iter().map(|frame| &*frame.view));

@@ -6,7 +6,7 @@ use std::path::Path;
 use glam::{Affine3A, Mat3, Vec2, Vec3};
 use occnerf::bake::{Atlas, Avatar, Clip, Joint};
 use occnerf::capture::{Light, LoadOptions, load_capture};
-use occnerf::{Config, Method, Person, Preset, VertexColors};
+use occnerf::{Config, Method, Person, Preset, PriorColors};
 use smpl::{MotionClip, SparseRows};
 use volrender::Camera;
 use zip::write::SimpleFileOptions;
@@ -139,7 +139,7 @@ pub fn tensors() -> Vec<Vec<u8>> {
 pub fn person(run: &Path) -> (Config, Vec<u8>) {
     let (dir, body, _) = seeds::wild_capture(&place("person-wild"));
     let capture = load_capture(&dir, &body, &LoadOptions::default()).unwrap();
-    let colors = VertexColors { colors: vec![Vec3::splat(0.5); 4], seen: vec![true; 4], ..VertexColors::default() };
+    let colors = PriorColors::of_vertices(vec![Vec3::splat(0.5); 4], &body.faces);
     std::fs::create_dir_all(run).unwrap();
     Person::save(run, &capture, &body, &colors).unwrap();
     (Config::preset(Preset::Fast, Method::HashPoint), std::fs::read(run.join("person.safetensors")).unwrap())

@@ -10,7 +10,7 @@ use glam::Vec3;
 use occnerf::bake::bake;
 use occnerf::capture::{Capture, LoadOptions};
 use occnerf::{
-    Config, FieldRenderer, Method, PreparedFrame, PriorRenderer, Renderer, Scene, StepTimes, Trainer, VertexColors,
+    Config, FieldRenderer, Method, PreparedFrame, PriorColors, PriorRenderer, Renderer, Scene, StepTimes, Trainer,
     evaluate,
 };
 use serde::{Deserialize, Serialize};
@@ -112,7 +112,7 @@ pub fn measure(job: &Job) -> Result<Outcome> {
     let mut outcome = Outcome { prepare_seconds, vertices: model.num_vertices(), ..Outcome::default() };
     let start = Instant::now();
     if job.config.method == Method::Prior {
-        let colors = VertexColors::measure(&scene)?;
+        let colors = PriorColors::measure(&scene)?;
         outcome.train_seconds = start.elapsed().as_secs_f64();
         outcome.parameters = 3 * colors.colors.len();
         score(&scene, &mut PriorRenderer::new(&scene.body, &colors), &mut outcome)?;

@@ -23,7 +23,7 @@ const fn change(factor: &'static str, name: &'static str, set: &'static [&'stati
 }
 
 /// Every change but of the number of steps, most telling first.
-pub const CHANGES: [Change; 23] = [
+pub const CHANGES: [Change; 22] = [
     change("registration", "no registration", &["registration.rounds=0"], true),
     change("light", "even light", &["field.prior_light=false"], false),
     change("distance", "blended distance", &["surface.distance=blended"], true),
@@ -38,10 +38,10 @@ pub const CHANGES: [Change; 23] = [
     change("samples", "48 samples", &["samples=48"], true),
     change("samples", "192 samples", &["samples=192"], false),
     change("span", "span 6 cm", &["motion.margin=0.06", "motion.depth=0.06"], false),
-    change("neighbours", "k 1", &["surface.k=1"], true),
-    change("neighbours", "4 levels", &["surface.coarse_levels=3"], true),
-    change("attention", "attention", &["surface.attention=true"], true),
-    change("attention", "exact visibility", &["surface.attention=true", "surface.visibility=exact"], false),
+    change("surface term", "surface term", &["surface.surface_term=true"], true),
+    change("neighbours", "k 1", &["surface.surface_term=true", "surface.k=1"], false),
+    change("neighbours", "4 levels", &["surface.surface_term=true", "surface.coarse_levels=3"], true),
+    change("attention", "attention", &["surface.surface_term=true", "surface.attention=true"], true),
     change("table", "table 2^13", &["encoding.log2_table_size=13"], true),
     change("table", "table 2^19", &["encoding.log2_table_size=19"], false),
     change("resolution", "6 levels", &["encoding.levels=6"], false),
@@ -51,7 +51,6 @@ pub const CHANGES: [Change; 23] = [
     change("depth", "depth 1", &["field.depth=1"], false),
     change("rates", "rates / 3", &["rates.field=2e-3", "rates.table=1e-2"], true),
     change("loss", "no perceptual term", &["loss.perceptual=0"], true),
-    change("surface term", "no surface term", &["surface.surface_term=false"], true),
 ];
 
 const fn baked(shells: usize, atlas: u32, vertex_colours: bool, smooth: bool) -> Baking {

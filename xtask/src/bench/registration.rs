@@ -8,7 +8,7 @@ use anyhow::{Context, Result};
 use clap::Args;
 use glam::Quat;
 use occnerf::capture::{Capture, DemoConfig, Perturbation, demo};
-use occnerf::{Config, Method, PreparedFrame, Preset, PriorRenderer, Scene, VertexColors, evaluate, register};
+use occnerf::{Config, Method, PreparedFrame, Preset, PriorColors, PriorRenderer, Scene, evaluate, register};
 use smpl::BodyModel;
 
 use crate::process::say;
@@ -61,7 +61,7 @@ fn psnr(capture: &Capture, model: &BodyModel) -> Result<f64> {
     let mut config = Config::preset(Preset::Fast, Method::Prior);
     config.registration.rounds = 0;
     let scene = Scene::new(capture, model, &config)?;
-    let colors = VertexColors::measure(&scene)?;
+    let colors = PriorColors::measure(&scene)?;
     let frames: Vec<&PreparedFrame> = scene.eval.iter().collect();
     let scores = evaluate(&scene, &mut PriorRenderer::new(&scene.body, &colors), &frames, |_, _| {})?;
     scores.psnr_mask.context("no unseen view shows the person")

@@ -86,25 +86,27 @@ const CURVE_RATES: [f32; 2] = [0.33, 3.0];
 const FAINT: [&str; 5] =
     [GREY[0], GREY[1], "field.density_bias_outside=-2", "field.density_bias=-2", "motion.depth=0.3"];
 
+const SURFACE_TERM: &str = "surface.surface_term=true";
+
 /// A component left out, put back, or replaced by what it competes with.
 const COMPONENTS: [(&str, &[&str]); 12] = [
     ("full", &[]),
-    ("no-surface", &["surface.surface_term=false"]),
-    ("attention", &["surface.attention=true"]),
-    ("exact-attention", &["surface.attention=true", "surface.visibility=exact"]),
+    ("surface-term", &[SURFACE_TERM]),
+    ("attention", &[SURFACE_TERM, "surface.attention=true"]),
+    ("exact-attention", &[SURFACE_TERM, "surface.attention=true", "surface.visibility=exact"]),
     ("no-completeness", &["loss.completeness=0"]),
     ("no-perceptual", &["loss.perceptual=0"]),
-    ("one-neighbour", &["surface.k=1"]),
-    ("four-levels", &["surface.coarse_levels=3"]),
-    ("four-levels-attention", &["surface.coarse_levels=3", "surface.attention=true"]),
-    ("learnt-vertices", &["rates.vertices=1e-4"]),
+    ("one-neighbour", &[SURFACE_TERM, "surface.k=1"]),
+    ("four-levels", &[SURFACE_TERM, "surface.coarse_levels=3"]),
+    ("four-levels-attention", &[SURFACE_TERM, "surface.coarse_levels=3", "surface.attention=true"]),
+    ("learnt-vertices", &[SURFACE_TERM, "rates.vertices=1e-4"]),
     ("no-registration", &["registration.rounds=0"]),
     ("even-light", &["field.prior_light=false"]),
 ];
 
 /// The way from the paper's text to the default: each row keeps the changes of those before it. The
 /// row `paper` is the preset `paper`; what stands before it are its departures from the text.
-const STORY: [(&str, &[&str]); 14] = [
+const STORY: [(&str, &[&str]); 15] = [
     (
         "text",
         &[
@@ -141,6 +143,7 @@ const STORY: [(&str, &[&str]); 14] = [
     ("one-level", &["surface.coarse_levels=0"]),
     ("plain-mean", &["surface.attention=false"]),
     ("fixed-vertices", &["rates.vertices=0"]),
+    ("no-surface-term", &["surface.surface_term=false"]),
     ("balanced", &["patches=3", "min_transmittance=0.05", "motion.depth=0.04", "motion.shell_interval=32"]),
 ];
 
@@ -160,7 +163,7 @@ const CHOICES: [(&str, &[&str]); 21] = [
     ("squared-error-1", &["loss.mse=1"]),
     ("squared-error-20", &["loss.mse=20"]),
     ("no-completeness", &["loss.completeness=0"]),
-    ("no-surface", &["surface.surface_term=false"]),
+    ("surface-term", &[SURFACE_TERM]),
     ("rates-half", &["rates.table=1.5e-2", "rates.field=3e-3"]),
     ("rates-twice", &["rates.table=6e-2", "rates.field=1.2e-2"]),
     ("final-rate-0.03", &["rates.final_fraction=0.03"]),
@@ -201,7 +204,7 @@ fn methods() -> Vec<Row> {
         Row { baked: Some("occnerf"), ..row("occnerf-baked", Occnerf, Unknown, STEPS) },
         Row { preset: Some(Preset::Paper), ..row("paper", Occnerf, Unknown, STEPS) },
     ];
-    for name in ["no-surface", "no-completeness", "no-perceptual"] {
+    for name in ["surface-term", "no-completeness", "no-perceptual"] {
         let changes = COMPONENTS.iter().find(|(component, _)| *component == name).map_or(&[][..], |c| c.1);
         rows.push(Row { changes: changes.to_vec(), ..row(name, Occnerf, Unknown, STEPS) });
     }
@@ -299,8 +302,8 @@ impl Table {
                 "paper",
             ],
             Self::Story => &["prior", "text", "registered-prior", "paper", "balanced"],
-            Self::Components => &["ours-full", "ours-no-surface", "grey-full", "grey-no-surface"],
-            Self::Choices => &["as-it-is", "samples-48", "no-surface"],
+            Self::Components => &["ours-full", "ours-surface-term", "grey-full", "grey-surface-term"],
+            Self::Choices => &["as-it-is", "samples-48", "surface-term"],
             Self::Curves => &[],
         }
     }

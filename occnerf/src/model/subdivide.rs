@@ -6,7 +6,7 @@ use glam::Vec3;
 
 /// A point of the prior: vertices of one face, ascending, and how much of each.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) struct Anchor {
+pub(crate) struct Anchor {
     pub corners: [u32; 3],
     pub weights: [f32; 3],
 }
@@ -47,14 +47,15 @@ impl Anchor {
 }
 
 /// A subdivided mesh.
-#[derive(Clone, Debug, Default)]
-pub(super) struct Subdivided {
+#[derive(Clone, Debug, Default, PartialEq)]
+pub(crate) struct Subdivided {
     /// (V)
     pub anchors: Vec<Anchor>,
     /// (F)
     pub faces: Vec<[u32; 3]>,
     /// The face of the prior that each face is part of, (F).
     pub parents: Vec<u32>,
+    times: u32,
 }
 
 impl Subdivided {
@@ -65,6 +66,7 @@ impl Subdivided {
             anchors: (0..vertices as u32).map(Anchor::vertex).collect(),
             faces: faces.to_vec(),
             parents: (0..faces.len() as u32).collect(),
+            times,
         };
         for _ in 0..times {
             let mut middles: HashMap<(u32, u32), u32> = HashMap::with_capacity(mesh.faces.len() * 3 / 2);
@@ -85,11 +87,45 @@ impl Subdivided {
         }
         mesh
     }
+
+    /// How often each face of the prior was divided.
+    pub fn times(&self) -> u32 {
+        self.times
+    }
+
+    /// The face that a point of a `face` of the prior lies in, and its weights of that face's
+    /// corners.
+    pub fn locate(&self, face: u32, barycentric: [f32; 3]) -> (u32, [f32; 3]) {
+        let divide = |(face, [a, b, c]): (u32, [f32; 3]), _| {
+            let (first, [a, b, c]) = (4 * face, [2.0 * a, 2.0 * b, 2.0 * c]);
+            if a > 1.0 {
+                (first, [a - 1.0, b, c])
+            } else if b > 1.0 {
+                (first + 1, [a, b - 1.0, c])
+            } else if c > 1.0 {
+                (first + 2, [a, b, c - 1.0])
+            } else {
+                (first + 3, [1.0 - c, 1.0 - a, 1.0 - b])
+            }
+        };
+        (0..self.times).fold((face, barycentric), divide)
+    }
+}
+
+/// How often a mesh must be subdivided for its mean edge to be no longer than `longest`, up to
+/// `most`: each time makes four times the faces.
+pub(crate) fn times_until(vertices: &[Vec3], faces: &[[u32; 3]], longest: f32, most: u32) -> u32 {
+    let edges = faces.iter().map(|face| {
+        let [a, b, c] = face.map(|v| vertices[v as usize]);
+        f64::from(a.distance(b) + b.distance(c) + c.distance(a)) / 3.0
+    });
+    let mean = edges.sum::<f64>() as f32 / faces.len().max(1) as f32;
+    (0..most).find(|&times| mean / 2f32.powi(times as i32) <= longest).unwrap_or(most)
 }
 
 /// Unit normals of vertices: the area-weighted sum of those of the faces about them, zero where
 /// there are none.
-pub(super) fn normals(vertices: &[Vec3], faces: &[[u32; 3]]) -> Vec<Vec3> {
+pub(crate) fn normals(vertices: &[Vec3], faces: &[[u32; 3]]) -> Vec<Vec3> {
     let mut sums = vec![Vec3::ZERO; vertices.len()];
     for face in faces {
         let [a, b, c] = face.map(|v| vertices[v as usize]);
@@ -100,7 +136,7 @@ pub(super) fn normals(vertices: &[Vec3], faces: &[[u32; 3]]) -> Vec<Vec3> {
 }
 
 /// Vertices that share an edge with each, ascending.
-pub(super) fn neighbours(vertices: usize, faces: &[[u32; 3]]) -> Vec<Vec<u32>> {
+pub(crate) fn neighbours(vertices: usize, faces: &[[u32; 3]]) -> Vec<Vec<u32>> {
     let mut lists: Vec<Vec<u32>> = vec![Vec::with_capacity(8); vertices];
     for &[a, b, c] in faces {
         for (from, to) in [(a, b), (b, c), (c, a), (b, a), (c, b), (a, c)] {
@@ -116,7 +152,31 @@ pub(super) fn neighbours(vertices: usize, faces: &[[u32; 3]]) -> Vec<Vec<u32>> {
 
 #[cfg(test)]
 mod tests {
+    use proptest::prelude::*;
+
     use super::*;
+
+    proptest! {
+        #[test]
+        fn a_place_of_the_prior_is_found_in_the_face_that_it_lies_in(
+            face in 0u32..20, a in 0.0f32..=1.0, b in 0.0f32..=1.0, times in 0u32..4, snap in 0u32..4,
+        ) {
+            let ball = testkit::mesh::icosphere(0);
+            // On edges and corners of finer faces as well.
+            let snapped = |x: f32| if snap == 0 { x } else { (x * 8.0).round() / 8.0 };
+            let (a, b) = (snapped(a), snapped(b));
+            let barycentric = if a + b > 1.0 { [1.0 - a, 1.0 - b, a + b - 1.0] } else { [a, b, 1.0 - a - b] };
+            let fine = Subdivided::new(ball.vertices.len(), &ball.faces, times);
+            let (found, weights) = fine.locate(face, barycentric);
+            prop_assert_eq!(fine.parents[found as usize], face);
+            prop_assert!(weights.iter().all(|w| (-1e-5..=1.0 + 1e-5).contains(w)), "{weights:?}");
+            let corner = |v: u32| fine.anchors[v as usize].mix(&ball.vertices);
+            let at: Vec3 = fine.faces[found as usize].into_iter().zip(weights).map(|(v, w)| w * corner(v)).sum();
+            let corners = ball.faces[face as usize].into_iter().zip(barycentric);
+            let expected: Vec3 = corners.map(|(v, w)| w * ball.vertices[v as usize]).sum();
+            prop_assert!(at.distance(expected) < 1e-5, "{at}, expected {expected}");
+        }
+    }
 
     #[test]
     fn a_subdivided_sphere_has_four_times_the_faces_and_the_same_shape() {
