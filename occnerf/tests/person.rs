@@ -118,6 +118,14 @@ fn what_is_missing_or_damaged_is_named() {
     damaged[claimed + 10] = b'9';
     std::fs::write(run.join(PERSON), damaged).unwrap();
     assert!(said().contains("expected F32 [144]"), "{}", said());
+    let claim = b"\"subdivisions\":\"";
+    let claimed = whole.windows(claim.len()).position(|w| w == claim).unwrap();
+    for digit in *b"9x" {
+        let mut damaged = whole.clone();
+        damaged[claimed + claim.len()] = digit;
+        std::fs::write(run.join(PERSON), damaged).unwrap();
+        assert!(said().contains("`subdivisions`") && said().contains("fits the file"), "{}", said());
+    }
     std::fs::write(run.join(PERSON), &whole).unwrap();
     assert!(Model::load(&run).is_ok());
 }

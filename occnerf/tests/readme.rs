@@ -25,7 +25,10 @@ fn table() -> String {
             format!("{} × {}, 2^{}, {} to {}", e.levels, e.features, e.log2_table_size, e.n_min, e.n_max)
         }),
         row("d is told apart in, m", |c| format!("{} to {}", c.encoding.distance_min, c.encoding.distance_max)),
-        row("neighbours × levels", |c| format!("{} × {}", c.surface.k, c.surface.coarse_levels + 1)),
+        row("neighbours × levels of the surface term", |c| match c.surface.surface_term {
+            true => format!("{} × {}", c.surface.k, c.surface.coarse_levels + 1),
+            false => "none".to_owned(),
+        }),
         row("[v̂, d]", |c| {
             let name = match c.surface.distance {
                 DistanceKind::Blended => "blend of vertices",
@@ -45,7 +48,7 @@ fn table() -> String {
             let [margin, falloff, depth] = [c.motion.margin, c.motion.falloff, c.motion.depth].map(centimetres);
             format!("{margin} + {falloff}, {depth}")
         }),
-        row("colours start from", |c| if c.field.prior_colors { "vertex colours" } else { "grey" }.to_owned()),
+        row("colours start from", |c| if c.field.prior_colors { "the prior's" } else { "grey" }.to_owned()),
         row("transmittance behind which samples are left out", |c| match c.min_transmittance {
             0.0 => "none".to_owned(),
             t if t < 1e-4 => format!("{t:.0e}"),

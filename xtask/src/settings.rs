@@ -6,7 +6,7 @@ use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 use occnerf::{Capacity, Component, Config, Method, OccludedRule, Preset, RateConfig};
 
 const METHODS: &[(Method, &str)] = &[
-    (Method::Prior, "The posed prior in mean vertex colours; nothing is trained"),
+    (Method::Prior, "The posed prior in mean colours; nothing is trained"),
     (Method::Humannerf, "Point-based, frequency encoding"),
     (Method::HashPoint, "Point-based, hash encoding"),
     (Method::NeuralBody, "Codes on the prior's vertices, spread through space, in Neural Body's style"),

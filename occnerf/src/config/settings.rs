@@ -6,8 +6,8 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Method {
-    /// No field: the posed prior mesh, each vertex the mean colour of the visible training pixels
-    /// that saw it.
+    /// No field: the posed prior mesh, each place of it in the mean colour of the visible training
+    /// pixels that saw it.
     Prior,
     /// Point-based: frequency encoding of x̂ with 10 bands and a perceptron (after Weng et al.
     /// 2022).

@@ -222,6 +222,7 @@ mod tests {
         let mut config = Config::preset(Preset::Fast, Method::Occnerf);
         (config.patches, config.patch_size, config.steps) = (2, 24, 100);
         config.field.density_scale *= 30.0;
+        config.surface.surface_term = true;
         // That of the samples that are evaluated is another one.
         config.loss.completeness = 0.0;
         let scene = Scene::new(&capture, &body, &config).unwrap();

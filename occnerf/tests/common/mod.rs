@@ -105,6 +105,7 @@ pub fn config(method: Method) -> Config {
     // Every part of the parameters is there.
     config.rates.vertices = 1e-4;
     (config.surface.k, config.surface.coarse_levels) = (4, 1);
+    config.surface.surface_term = method == Method::Occnerf;
     config
 }
 

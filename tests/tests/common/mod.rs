@@ -42,6 +42,7 @@ pub fn tiny(method: Method, motion: MotionKind) -> Config {
     (config.encoding.levels, config.encoding.log2_table_size, config.encoding.n_max) = (6, 12, 96);
     // With all parts of the paper's surface term.
     (config.surface.coarse_levels, config.surface.attention) = (3, true);
+    config.surface.surface_term = method == Method::Occnerf;
     config.motion.kind = motion;
     config.motion.shell_interval = 2;
     if motion != MotionKind::Surface {

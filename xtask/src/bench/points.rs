@@ -282,7 +282,7 @@ mod tests {
             line("width 32", "field", Kind::Change, 19.0, 5.0),
             line("k 1", "neighbours", Kind::Change, 20.0, 9.0),
             line("4 features", "features", Kind::Change, 20.5, 12.0),
-            line("exact visibility", "attention", Kind::Change, 20.2, 9.0),
+            line("surface term", "surface term", Kind::Change, 20.2, 9.0),
         ];
         let points = sweep(false).combinations(&lines).unwrap();
         let set = |name: &str| &points.iter().find(|p| p.name == name).unwrap().job.config;

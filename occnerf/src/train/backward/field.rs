@@ -107,7 +107,8 @@ mod tests {
 
     #[test]
     fn activations_that_are_kept_and_those_worked_out_anew_give_the_same_bits() {
-        let config = Config::preset(Preset::Fast, Method::Occnerf);
+        let mut config = Config::preset(Preset::Fast, Method::Occnerf);
+        config.surface.surface_term = true;
         let mut field = Field::new(&config, Aabb { min: Vec3::splat(-0.1), max: Vec3::splat(1.1) }).unwrap();
         let (n, vertices) = (3 * crate::model::field::BLOCK - 100, 12);
         let mut random = Stream::new(&[4]);
