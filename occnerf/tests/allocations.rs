@@ -13,6 +13,7 @@ fn a_step_allocates_next_to_nothing() {
     let mut config = Config::preset(Preset::Fast, Method::Occnerf);
     // Poses are taught from a tenth on, before the buffers are looked at.
     config.steps = 100;
+    config.surface.surface_term = true;
     // The look at the shell, every 32 steps, is a pass of its own.
     config.motion.shell_interval = 0;
     let body = BodyModel::embedded();

@@ -124,7 +124,7 @@ fn what_is_missing_or_damaged_is_named() {
         let mut damaged = whole.clone();
         damaged[claimed + claim.len()] = digit;
         std::fs::write(run.join(PERSON), damaged).unwrap();
-        assert!(said().contains("`subdivisions`") && said().contains("fits the file"), "{}", said());
+        assert!(said().contains("`subdivisions`") && said().contains("fits the body"), "{}", said());
     }
     std::fs::write(run.join(PERSON), &whole).unwrap();
     assert!(Model::load(&run).is_ok());

@@ -11,7 +11,7 @@ const METHODS: &[(Method, &str)] = &[
     (Method::HashPoint, "Point-based, hash encoding"),
     (Method::NeuralBody, "Codes on the prior's vertices, spread through space, in Neural Body's style"),
     (Method::SelfNerf, "The nearest vertices are encoded one by one, then blended, in SelfNeRF's order"),
-    (Method::Occnerf, "Point term and attended surface term"),
+    (Method::Occnerf, "Point term, and in `paper` the attended surface term"),
 ];
 const PRESETS: &[(Preset, &str)] = &[
     (Preset::Fast, "A first look: about a minute"),
@@ -19,8 +19,8 @@ const PRESETS: &[(Preset, &str)] = &[
     (Preset::Paper, "The paper's method: under ten minutes"),
 ];
 const COMPONENTS: &[(Component, &str)] = &[
-    (Component::Surface, "The surface term: F sees the point term alone"),
-    (Component::Attention, "Its weights: the surface term is a plain mean"),
+    (Component::Surface, "The surface term, which only `paper` has: F sees the point term alone"),
+    (Component::Attention, "Its weights, which only `paper` has: the surface term is a plain mean"),
     (Component::Completeness, "The completeness loss"),
     (Component::Perceptual, "The perceptual loss"),
 ];

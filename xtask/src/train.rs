@@ -185,23 +185,26 @@ pub fn run_one(
             lpips.check_size(frame.view.camera.width as usize, frame.view.camera.height as usize)?;
         }
     }
+    let checkpoint = directory.join(CHECKPOINT);
+    let resumes = sitting.resume && checkpoint.is_file();
+    let scene = if resumes && Person::is_kept(directory) {
+        scene.with_colors(Person::load(directory, &run.train)?.colors)
+    } else {
+        scene
+    };
     let start = Instant::now();
-    let colors = PriorColors::measure(&scene)?;
+    let colors = scene.colors()?;
     let prior_seconds = start.elapsed().as_secs_f64();
-    let kept = Person::save(directory, &scene.capture, &source.model, &colors);
+    let kept = Person::save(directory, &scene.capture, &source.model, colors);
     kept.map_err(Error::from).map_err(results_in(directory))?;
     if run.train.method == Method::Prior {
-        let prior = Drawn::Prior(colors);
+        let prior = Drawn::Prior(colors.clone());
         let metrics = unscored(run, &prior, prior_seconds);
         return score_run(directory, run, &scene, &prior, lpips, metrics).map(Some);
     }
     say_memory(&scene, &run.train)?;
-    let checkpoint = directory.join(CHECKPOINT);
-    let mut trainer = if sitting.resume && checkpoint.is_file() {
-        Trainer::resume(&scene, &checkpoint)?
-    } else {
-        Trainer::new(&scene, run.train.clone())?
-    };
+    let mut trainer =
+        if resumes { Trainer::resume(&scene, &checkpoint)? } else { Trainer::new(&scene, run.train.clone())? };
     trainer.set_steps(run.train.steps);
     trainer.load_perceptual()?;
     let seconds = optimise(directory, &mut trainer, sitting)?;

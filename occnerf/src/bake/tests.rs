@@ -346,7 +346,8 @@ fn shells_are_composited_the_outermost_on_top() {
 
 #[test]
 fn a_person_in_training_is_baked_refined_and_drawn_alike_on_any_number_of_threads() {
-    let config = Config { steps: 60, ..Config::preset(Preset::Fast, Method::Occnerf) };
+    let mut config = Config { steps: 60, ..Config::preset(Preset::Fast, Method::Occnerf) };
+    config.surface.surface_term = true;
     let scene = scene(&config);
     let mut trainer = Trainer::new(&scene, config).unwrap();
     for _ in 0..60 {

@@ -8,6 +8,7 @@ use volrender::Aabb;
 
 use crate::Error;
 use crate::config::Config;
+use crate::model::view::pixel_width;
 use crate::scene::prepared::{PreparedFrame, Scene};
 
 /// Pixels of the subject that are looked at, at most: every n-th, all frames alike. A million keys
@@ -40,10 +41,8 @@ impl Measured {
     /// [`Error::Scene`] where no frame has the body before its camera or no subject pixel's ray
     /// meets the posed prior; [`Error::Visibility`] for a prior that cannot be cast at.
     pub fn of(scene: &Scene, config: &Config) -> Result<Self, Error> {
-        let mut widths: Vec<f32> = scene.train.iter().filter_map(pixel_width).collect();
-        widths.sort_by(f32::total_cmp);
         let none = |what: &str| Error::Scene(format!("{}: capacity: {what}", scene.name));
-        let Some(&width) = widths.get(widths.len() / 2) else {
+        let Some(width) = pixel_width(scene.train.iter().map(|frame| &*frame.view)) else {
             return Err(none("no training frame has the body before its camera"));
         };
         let subject_pixels: usize = scene.train.iter().map(|f| f.labels.num_subject()).sum();
@@ -72,15 +71,6 @@ impl Measured {
             span: (span / f64::from(rays.max(1))) as f32,
         })
     }
-}
-
-/// Width of a pixel at the depth of the body's middle; `None` for a body that is not before the
-/// camera.
-fn pixel_width(frame: &PreparedFrame) -> Option<f32> {
-    let centre = frame.view.posed.vertices.iter().sum::<Vec3>() / frame.view.posed.vertices.len().max(1) as f32;
-    let depth = frame.view.camera.world_to_camera.transform_point3(centre).z;
-    let width = depth / frame.view.camera.focal.max_element();
-    (width.is_finite() && width > 0.0).then_some(width)
 }
 
 /// What every n-th subject pixel of a frame shows.

@@ -20,7 +20,7 @@ pub enum Method {
     /// [v_i, d_i] of each nearest vertex is encoded, and the features are blended by inverse
     /// distances (the order of Peng et al. 2022, SelfNeRF).
     SelfNerf,
-    /// The paper: point term and attended surface term.
+    /// The paper: point term and, in the preset `paper`, attended surface term.
     Occnerf,
 }
 

@@ -7,8 +7,8 @@ use glam::{Vec3, Vec4};
 use crate::capture::Light;
 use crate::model::subdivide::Subdivided;
 
-/// Colours of the prior at the vertices of its surface, subdivided until they lie about as close as
-/// the pixels of the video, and the light that falls on it.
+/// Colours of the prior at the vertices of its surface, subdivided until they lie closer than the pixels
+/// of the video, at most twice, and the light that falls on it.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct PriorColors {
     /// sRGB under even light, those of the V vertices of the prior first.

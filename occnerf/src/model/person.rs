@@ -17,7 +17,7 @@ use crate::model::body::{Body, Moment};
 use crate::model::colors::PriorColors;
 use crate::model::file::{Array, Contents, read, write};
 use crate::model::saved::{CHECKPOINT, config_of, parse};
-use crate::model::subdivide::Subdivided;
+use crate::model::subdivide::{Subdivided, most_times};
 use crate::model::trained::Model;
 use crate::model::view::PosedView;
 
@@ -91,6 +91,11 @@ impl Person {
         write(&run.join(PERSON), &header, arrays.map(|(name, array)| (name.to_owned(), array)).into())
     }
 
+    /// Whether the directory `run` keeps one.
+    pub fn is_kept(run: &Path) -> bool {
+        run.join(PERSON).is_file()
+    }
+
     /// Gives `capture` the bodies and focal lengths of the run directory `run`, as registration has
     /// corrected them;
     /// false where it has none, or other frames.
@@ -99,7 +104,7 @@ impl Person {
     /// [`Error::Io`] and [`Error::File`] for a file that is damaged.
     pub fn restore(run: &Path, capture: &mut Capture, model: &BodyModel) -> Result<bool, Error> {
         let path = run.join(PERSON);
-        if !path.is_file() {
+        if !Self::is_kept(run) {
             return Ok(false);
         }
         let bytes = read(&path)?;
@@ -130,7 +135,7 @@ impl Person {
     /// [`Error::Io`], [`Error::Body`] and [`Error::File`] for files that are missing or damaged.
     pub fn load(run: &Path, config: &Config) -> Result<Self, Error> {
         let path = run.join(PERSON);
-        if !path.is_file() {
+        if !Self::is_kept(run) {
             let what = "is missing; `train --resume` writes it, if the capture is still there".to_owned();
             return Err(Error::File { path, what });
         }
@@ -153,9 +158,9 @@ impl Person {
         let frames = views.map(view).collect();
         // Files of before the prior's colours were of its subdivision have no such number.
         let times = contents.header("subdivisions").unwrap_or("0");
-        let fits = |&times: &u32| times < 8 && model.faces.len() << (2 * times) <= bytes.len();
-        let times = times.parse().ok().filter(|times| *times == 0 || fits(times)).ok_or_else(|| {
-            contents.wrong(format!("header `subdivisions` is {times:?}, expected a number that fits the file"))
+        let fits = |&times: &u32| times == 0 || most_times(model.faces.len()) >= times;
+        let times = times.parse().ok().filter(fits).ok_or_else(|| {
+            contents.wrong(format!("header `subdivisions` is {times:?}, expected a number that fits the body"))
         })?;
         let mesh = Arc::new(Subdivided::new(vertices, &model.faces, times));
         let colors = triples(&contents.floats("colors", mesh.anchors.len() * 3)?);

@@ -112,6 +112,14 @@ impl Subdivided {
     }
 }
 
+/// Most faces that colours are measured on.
+const MOST_FACES: usize = 1 << 20;
+
+/// How often a mesh of so many faces can be subdivided for no more than [`MOST_FACES`].
+pub(crate) fn most_times(faces: usize) -> u32 {
+    (1..10).take_while(|times| faces <= MOST_FACES >> (2 * times)).count() as u32
+}
+
 /// How often a mesh must be subdivided for its mean edge to be no longer than `longest`, up to
 /// `most`: each time makes four times the faces.
 pub(crate) fn times_until(vertices: &[Vec3], faces: &[[u32; 3]], longest: f32, most: u32) -> u32 {

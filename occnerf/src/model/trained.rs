@@ -127,7 +127,7 @@ impl Model {
     }
 
     /// How often each vertex was near a termination point, or in how many frames it is seen: see
-    /// [`VisibilityKind`](crate::VisibilityKind).
+    /// [`VisibilityKind`](crate::VisibilityKind); zeros where no neighbours are looked up.
     pub fn visibility_counts(&self) -> &[u64] {
         self.counts.counts()
     }

@@ -80,6 +80,7 @@ mod tests {
         let mut config = Config { steps: 40, ..Config::preset(Preset::Fast, Method::Occnerf) };
         // Dense enough for rays to end, however little was learnt.
         config.field.density_scale *= 8.0;
+        config.surface.surface_term = true;
         let scene = Scene::new(&capture, &body, &config).unwrap();
         let mut trainer = Trainer::new(&scene, config).unwrap();
         for _ in 0..40 {

@@ -8,7 +8,7 @@ use rayon::prelude::*;
 use crate::Error;
 use crate::capture::Light;
 use crate::model::colors::PriorColors;
-use crate::model::subdivide::{Subdivided, times_until};
+use crate::model::subdivide::{Subdivided, most_times, times_until};
 use crate::model::view::pixel_width;
 use crate::scene::light::{Seen, measure_light};
 use crate::scene::prepared::Scene;
@@ -16,10 +16,9 @@ use crate::scene::seen::deeper;
 use crate::scene::unseen::complete;
 
 /// Pixels of the training pictures that an edge of the subdivided prior may be long, where so many
-/// subdivisions are enough for it, and most faces that it may have.
+/// subdivisions are enough for it; more of them showed no more.
 const EDGE: f32 = 0.5;
 const MOST: u32 = 2;
-const MOST_FACES: usize = 1 << 20;
 /// Least part of its size that surface counts with that is seen at a slant.
 const SLANT: f32 = 0.05;
 /// Frames that are looked at together: what they show takes some megabytes each.
@@ -27,7 +26,7 @@ const TOGETHER: usize = 8;
 
 impl PriorColors {
     /// The colours that are closest to the visible training pixels that saw a place, by ray
-    /// casting, each as large as it is seen, under the light of the scene if the configuration asks
+    /// casting, each by the cosine of its slant, under the light of the scene if the configuration asks
     /// for one. A vertex that no frame saw takes a mean of those that some saw, by their canonical
     /// distances, along the stripes if there are any, other places what lies between their
     /// vertices. Pixels at the edge of masks do not count where they show what is beside the person.
@@ -39,7 +38,7 @@ impl PriorColors {
         let light =
             if scene.lit { measure_light(&deeper(&scene.seen()?, scene.edge), prior.len()) } else { Light::default() };
         let pixel = pixel_width(scene.train.iter().map(|frame| &*frame.view));
-        let most = (1..=MOST).take_while(|times| faces.len() << (2 * times) <= MOST_FACES).count() as u32;
+        let most = MOST.min(most_times(faces.len()));
         let times = pixel.map_or(0, |pixel| times_until(prior, faces, EDGE * pixel, most));
         let mesh = Subdivided::new(prior.len(), faces, times);
         // Terms of Σ s c and Σ s² for colours c under the light s.

@@ -1,6 +1,6 @@
 //! A capture made ready for training: posed bodies and pixel labels.
 
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 
 use rayon::prelude::*;
 use smpl::BodyModel;
@@ -10,6 +10,7 @@ use crate::Error;
 use crate::capture::{Capture, CaptureError, Frame, Light, PixelSource, Pixels, Shown};
 use crate::config::Config;
 use crate::model::body::{Body, Moment};
+use crate::model::colors::PriorColors;
 use crate::model::subdivide::Anchor;
 use crate::model::view::PosedView;
 use crate::scene::labels::{Label, Labels, dilate, label_pixels};
@@ -76,6 +77,8 @@ pub struct Scene {
     /// Indices of the training frames from whose pixels something is learnt: all but those held
     /// out.
     pub(crate) learnt: Vec<usize>,
+    /// What [`Scene::colors`] says, once it is known.
+    pub(crate) colors: OnceLock<PriorColors>,
 }
 
 impl Scene {
@@ -114,6 +117,7 @@ impl Scene {
             lit: config.field.prior_light,
             edge: 0,
             learnt: Vec::new(),
+            colors: OnceLock::new(),
         };
         let held_out = |i: usize| config.held_out > 0 && i.is_multiple_of(config.held_out);
         scene.learnt = (0..scene.train.len()).filter(|&i| !held_out(i)).collect();
@@ -127,6 +131,25 @@ impl Scene {
             return Err(Error::Scene(format!("{}: no training mask shows the subject{beside}", scene.name)));
         }
         Ok(scene)
+    }
+
+    /// The prior's colours, measured when they are first asked for ([`PriorColors::measure`]), or
+    /// those that a run began with.
+    ///
+    /// # Errors
+    /// Pictures that cannot be read.
+    pub fn colors(&self) -> Result<&PriorColors, Error> {
+        if let Some(colors) = self.colors.get() {
+            return Ok(colors);
+        }
+        let measured = PriorColors::measure(self)?;
+        Ok(self.colors.get_or_init(|| measured))
+    }
+
+    /// Takes the colours of a run that is to go on, for what it has learnt belongs to them.
+    #[must_use]
+    pub fn with_colors(self, colors: PriorColors) -> Self {
+        Self { colors: OnceLock::from(colors), ..self }
     }
 
     /// What each training frame shows of the vertices, and how many pixels inside its mask; nothing

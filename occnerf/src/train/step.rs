@@ -180,6 +180,7 @@ mod tests {
         for ((preset, motion), density_scale) in [(surface, 25.0), (volume, 25.0), (volume, 4.0)] {
             let mut config = Config::preset(preset, Method::Occnerf);
             config.motion.kind = motion;
+            config.surface.surface_term = true;
             config.field.prior_colors &= motion == MotionKind::Surface;
             (config.patches, config.patch_size, config.samples, config.seed) = (4, 24, 48, 2);
             (config.loss.perceptual, config.min_transmittance) = (0.0, 0.0);

@@ -59,8 +59,7 @@ impl<'a> Trainer<'a> {
     /// # Errors
     /// A configuration that is not valid or not the one that `scene` was prepared for.
     pub fn new(scene: &'a Scene, config: Config) -> Result<Self, Error> {
-        let colors = config.field.prior_colors.then(|| PriorColors::measure(scene)).transpose()?;
-        let base = colors.unwrap_or_default();
+        let base = if config.field.prior_colors { scene.colors()?.clone() } else { PriorColors::default() };
         let frames = scene.train.iter().map(|frame| frame.view.clone()).collect();
         let mut model = Model::new(config, scene.body.clone(), frames, base)?;
         let surface = &model.config.surface;

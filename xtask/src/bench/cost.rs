@@ -155,7 +155,7 @@ fn profile(preset: Preset, bench: &mut Bench) -> Result<String> {
 /// Floating-point operations of a sample through F, forward.
 fn flops(config: &Config) -> f64 {
     let encoded = config.encoding.levels * config.encoding.features;
-    let mut widths = vec![2 * encoded];
+    let mut widths = vec![encoded * (1 + usize::from(config.surface.surface_term))];
     widths.extend(vec![config.field.width; config.field.depth]);
     widths.push(4);
     widths.windows(2).map(|w| 2.0 * (w[0] * w[1]) as f64).sum()

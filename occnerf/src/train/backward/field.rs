@@ -142,6 +142,7 @@ mod tests {
         use Method::{HashPoint, Humannerf, NeuralBody, Occnerf, SelfNerf};
         for method in [Occnerf, HashPoint, Humannerf, NeuralBody, SelfNerf] {
             let mut config = Config::preset(Preset::Fast, method);
+            (config.surface.surface_term, config.surface.attention) = (true, true);
             (config.field.width, config.field.depth) = (20, 2);
             (config.encoding.levels, config.encoding.n_max, config.encoding.log2_table_size) = (3, 20, 10);
             let field = Field::new(&config, region).unwrap();
