@@ -122,7 +122,7 @@ mod tests {
                     continue;
                 }
                 let normals = surface_query::vertex_normals(&view.posed.vertices, &scene.body.model.faces);
-                let slant = anchor.mix(&normals).normalize().dot((eye - place).normalize()).max(SLANT);
+                let slant = anchor.mix(&normals).normalize_or_zero().dot((eye - place).normalize_or_zero()).max(SLANT);
                 let color = Vec3::from_slice(&pixels.image.pixels[3 * pixel..]) / coverage;
                 (sum, weights) = (sum + f64::from(slant) * color.as_dvec3(), weights + f64::from(slant));
             }
