@@ -77,6 +77,29 @@ fn a_capture_gets_the_bodies_that_a_run_was_trained_with() {
 }
 
 #[test]
+fn a_run_goes_on_with_the_colours_that_it_began_with() {
+    let (dir, fresh) = (TempDir::new("person-colors"), PriorColors::measure(scene()).unwrap());
+    let run = dir.path("");
+    assert_eq!(Person::colors(&run, body()).unwrap(), None);
+    // As runs of before colours lay between the vertices have them, and without the header's line.
+    let began = PriorColors::of_vertices(vec![Vec3::X; body().num_vertices()], &body().faces);
+    assert_ne!(began.colors, fresh.colors);
+    Person::save(&run, &scene().capture, body(), &began).unwrap();
+    let mut bytes = std::fs::read(run.join(PERSON)).unwrap();
+    let at = bytes.windows(12).position(|w| w == b"subdivisions").unwrap();
+    bytes[at] = b'x';
+    std::fs::write(run.join(PERSON), bytes).unwrap();
+    let kept = Person::colors(&run, body()).unwrap().unwrap();
+    assert_eq!(kept, began);
+    let config = config(Method::HashPoint);
+    let first = |scene: &Scene| Trainer::new(scene, config.clone()).unwrap().step().unwrap().loss;
+    let prepared = || Scene::new(&capture(), body(), &config).unwrap();
+    let (fresh_start, resumed) = (first(&prepared()), first(&prepared().with_colors(kept)));
+    assert_ne!(fresh_start, resumed);
+    assert_eq!(prepared().with_colors(began.clone()).colors().unwrap(), &began);
+}
+
+#[test]
 fn the_prior_of_a_run_draws_the_same_bits_too() {
     let dir = TempDir::new("person-prior");
     let colors = PriorColors::measure(scene()).unwrap();

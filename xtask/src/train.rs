@@ -187,11 +187,8 @@ pub fn run_one(
     }
     let checkpoint = directory.join(CHECKPOINT);
     let resumes = sitting.resume && checkpoint.is_file();
-    let scene = if resumes && Person::is_kept(directory) {
-        scene.with_colors(Person::load(directory, &run.train)?.colors)
-    } else {
-        scene
-    };
+    let began_with = if resumes { Person::colors(directory, &source.model)? } else { None };
+    let scene = if let Some(colors) = began_with { scene.with_colors(colors) } else { scene };
     let start = Instant::now();
     let colors = scene.colors()?;
     let prior_seconds = start.elapsed().as_secs_f64();

@@ -91,9 +91,17 @@ impl Person {
         write(&run.join(PERSON), &header, arrays.map(|(name, array)| (name.to_owned(), array)).into())
     }
 
-    /// Whether the directory `run` keeps one.
-    pub fn is_kept(run: &Path) -> bool {
-        run.join(PERSON).is_file()
+    /// The colours of `model` that the run directory `run` began with; `None` where it keeps none.
+    ///
+    /// # Errors
+    /// [`Error::Io`] and [`Error::File`] for a file that is damaged.
+    pub fn colors(run: &Path, model: &BodyModel) -> Result<Option<PriorColors>, Error> {
+        let path = run.join(PERSON);
+        if !path.is_file() {
+            return Ok(None);
+        }
+        let bytes = read(&path)?;
+        colors(&Contents::parse(&path, &bytes, FORMAT, &[VERSION])?, model).map(Some)
     }
 
     /// Gives `capture` the bodies and focal lengths of the run directory `run`, as registration has
@@ -104,7 +112,7 @@ impl Person {
     /// [`Error::Io`] and [`Error::File`] for a file that is damaged.
     pub fn restore(run: &Path, capture: &mut Capture, model: &BodyModel) -> Result<bool, Error> {
         let path = run.join(PERSON);
-        if !Self::is_kept(run) {
+        if !path.is_file() {
             return Ok(false);
         }
         let bytes = read(&path)?;
@@ -135,7 +143,7 @@ impl Person {
     /// [`Error::Io`], [`Error::Body`] and [`Error::File`] for files that are missing or damaged.
     pub fn load(run: &Path, config: &Config) -> Result<Self, Error> {
         let path = run.join(PERSON);
-        if !Self::is_kept(run) {
+        if !path.is_file() {
             let what = "is missing; `train --resume` writes it, if the capture is still there".to_owned();
             return Err(Error::File { path, what });
         }
@@ -147,7 +155,7 @@ impl Person {
         let frames: usize = count.parse().ok().filter(|n| (1..=bytes.len()).contains(n)).ok_or_else(|| {
             contents.wrong(format!("header `frames` is {count:?}, expected a number of frames that fits the file"))
         })?;
-        let (betas, vertices) = (model.num_betas(), model.num_vertices());
+        let betas = model.num_betas();
         let body = Arc::new(Body::new(&model, &contents.floats("mean_betas", betas)?, config)?);
         let cameras = cameras(&contents, frames)?;
         let moments = moments(&contents, frames, &model)?;
@@ -156,18 +164,9 @@ impl Person {
             Arc::new(body.view(&camera, frame, Moment { betas, pose, placement: *placement }))
         };
         let frames = views.map(view).collect();
-        // Files of before the prior's colours were of its subdivision have no such number.
-        let times = contents.header("subdivisions").unwrap_or("0");
-        let fits = |&times: &u32| times == 0 || most_times(model.faces.len()) >= times;
-        let times = times.parse().ok().filter(fits).ok_or_else(|| {
-            contents.wrong(format!("header `subdivisions` is {times:?}, expected a number that fits the body"))
-        })?;
-        let mesh = Arc::new(Subdivided::new(vertices, &model.faces, times));
-        let colors = triples(&contents.floats("colors", mesh.anchors.len() * 3)?);
-        let seen = contents.bytes("seen", mesh.anchors.len())?.iter().map(|&seen| seen != 0).collect();
-        let light = Light { slope: Vec3::from_slice(&contents.floats("light", 3)?) };
+        let colors = colors(&contents, &model)?;
         let scene = contents.require("scene")?.to_owned();
-        Ok(Self { scene, body, frames, colors: PriorColors { colors, seen, light, mesh } })
+        Ok(Self { scene, body, frames, colors })
     }
 }
 
@@ -188,6 +187,21 @@ impl Model {
         model.restore(&contents)?;
         Ok(model)
     }
+}
+
+/// The colours that a file has of `model`.
+fn colors(contents: &Contents<'_>, model: &BodyModel) -> Result<PriorColors, Error> {
+    // Files of before the prior's colours were of its subdivision have no such number.
+    let times = contents.header("subdivisions").unwrap_or("0");
+    let fits = |&times: &u32| times == 0 || most_times(model.faces.len()) >= times;
+    let times = times.parse().ok().filter(fits).ok_or_else(|| {
+        contents.wrong(format!("header `subdivisions` is {times:?}, expected a number that fits the body"))
+    })?;
+    let mesh = Arc::new(Subdivided::new(model.num_vertices(), &model.faces, times));
+    let colors = triples(&contents.floats("colors", mesh.anchors.len() * 3)?);
+    let seen = contents.bytes("seen", mesh.anchors.len())?.iter().map(|&seen| seen != 0).collect();
+    let light = Light { slope: Vec3::from_slice(&contents.floats("light", 3)?) };
+    Ok(PriorColors { colors, seen, light, mesh })
 }
 
 /// Turns of the joints, shape and place of a frame.
