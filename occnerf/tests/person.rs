@@ -10,6 +10,7 @@ use glam::Vec3;
 use occnerf::{
     Error, FieldRenderer, Method, Model, MotionKind, Person, PriorColors, PriorRenderer, Renderer, Scene, Trainer,
 };
+use smpl::BodyModel;
 
 const CHECKPOINT: &str = "checkpoint.safetensors";
 const PERSON: &str = "person.safetensors";
@@ -70,6 +71,13 @@ fn a_capture_gets_the_bodies_that_a_run_was_trained_with() {
     for (a, b) in scene.train.iter().chain(&scene.eval).zip(again.train.iter().chain(&again.eval)) {
         assert_eq!((&a.view.posed, &a.labels), (&b.view.posed, &b.labels));
     }
+    // A run of before a body had as many shapes goes on.
+    let more = BodyModel { shapedirs: [&body().shapedirs[..]; 2].concat(), ..body().clone() };
+    let mut with_more = given.clone();
+    assert!(Person::restore(&dir.path(""), &mut with_more, &more).unwrap());
+    assert_eq!(with_more.mean_betas, restored.mean_betas);
+    let again = Scene::new(&with_more, &more, &config).unwrap();
+    assert_eq!(again.train[0].view.posed, scene.train[0].view.posed);
     // A capture of other frames keeps its own.
     let mut other = given.clone();
     other.train.pop();

@@ -28,6 +28,7 @@ mod character;
 mod clip;
 mod embedded;
 mod error;
+mod limbs;
 mod load;
 mod mesh;
 mod model;
@@ -51,6 +52,7 @@ pub use array::{Data, NdArray};
 pub use character::{Animation, Character, CharacterPose, Texture};
 pub use clip::MotionClip;
 pub use error::Error;
+pub use limbs::Limbs;
 pub use mesh::{Mesh, load_mesh};
 pub use model::{BodyModel, Shaped};
 pub use motion::{

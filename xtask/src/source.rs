@@ -233,7 +233,7 @@ pub fn load(scene: Option<&str>, body: Option<&Path>, options: &LoadOptions) -> 
             body: None,
             load: options.clone(),
             capture,
-            model: body,
+            model: body.with_limb_lengths(),
             registered: RefCell::default(),
         });
     }
@@ -250,7 +250,14 @@ pub fn load(scene: Option<&str>, body: Option<&Path>, options: &LoadOptions) -> 
     let mut model = BodyModel::load(&body)?;
     let capture = load_capture(directory, &model, options)?;
     options.wrong.spoil_body(&mut model);
-    Ok(Source { scene: name, body: Some(body), load: options.clone(), capture, model, registered: RefCell::default() })
+    Ok(Source {
+        scene: name,
+        body: Some(body),
+        load: options.clone(),
+        capture,
+        model: model.with_limb_lengths(),
+        registered: RefCell::default(),
+    })
 }
 
 #[cfg(test)]

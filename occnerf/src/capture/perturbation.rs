@@ -15,9 +15,6 @@ const BETAS: usize = 10;
 const SHAPE: u64 = 0x5348_4150;
 const DEPTH: u64 = 0x4445_5054;
 const LIMBS: u64 = 0x4c49_4d42;
-/// How far off the plane of symmetry a limb's bone begins, and within which a joint's mirrored twin
-/// is found, metres of a body 1.7 high.
-const ASIDE: f32 = 0.03;
 
 /// Errors added to what a capture says of the body and of its pixels. None by default.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -116,46 +113,19 @@ impl Perturbation {
         Ok(())
     }
 
-    /// Makes the limbs of a body too long or too short, each bone with its twin on the other side.
-    /// A limb's bone is one that begins and ends off the plane of symmetry, x = 0; what hangs on it
-    /// moves along.
+    /// Makes the limbs of a body too long or too short, each bone with its twin on the other side
+    /// ([`BodyModel::limbs`]).
     pub fn spoil_body(&self, body: &mut BodyModel) {
         if self.limbs_percent == 0.0 {
             return;
         }
-        let joints = body.shaped(&[]).joints;
-        let height = |pick: fn(f32, f32) -> f32| body.v_template.iter().map(|v| v.y).reduce(pick).unwrap_or(0.0);
-        let unit = (height(f32::max) - height(f32::min)) / 1.7;
-        let twin = |j: usize| {
-            let mirrored = joints[j] * Vec3::new(-1.0, 1.0, 1.0);
-            let near = (0..joints.len()).find(|&k| joints[k].distance(mirrored) < ASIDE * unit);
-            near.map_or(j, |k| k.min(j))
-        };
-        let is_aside = |j: usize| joints[j].x.abs() > ASIDE * unit;
-        // By how much of the bone from its parent each joint is too far, and how far it moves.
-        let mut moved = vec![Vec3::ZERO; joints.len()];
-        let mut stretched: Vec<Option<(f32, Vec3)>> = vec![None; joints.len()];
-        for (j, parent) in body.parents.iter().enumerate() {
-            let Some(p) = *parent else { continue };
-            moved[j] = moved[p];
-            if is_aside(j) && is_aside(p) {
-                let longer = 0.01 * self.limbs_percent * normal(&mut Stream::new(&[LIMBS, twin(j) as u64]));
-                let bone = joints[j] - joints[p];
-                moved[j] += longer * bone;
-                // A limb that forks is stretched towards where its first branch begins.
-                stretched[p].get_or_insert((longer, bone));
-            }
+        let limbs = body.limbs();
+        let mut moved = body.v_template.clone();
+        for pair in limbs.pairs() {
+            let part = 0.01 * self.limbs_percent * normal(&mut Stream::new(&[LIMBS, pair as u64]));
+            moved.iter_mut().zip(limbs.longer(pair)).for_each(|(v, longer)| *v += part * longer);
         }
-        for (v, place) in body.v_template.iter_mut().enumerate() {
-            let at = *place;
-            for (j, weight) in body.weights.row(v) {
-                let along = stretched[j].map_or(Vec3::ZERO, |(longer, bone)| {
-                    let part = (at - joints[j]).dot(bone) / bone.length_squared().max(f32::MIN_POSITIVE);
-                    longer * part.clamp(0.0, 1.0) * bone
-                });
-                *place += weight * (moved[j] + along);
-            }
-        }
+        body.v_template = moved;
     }
 
     /// Turns bones, and moves the whole.

@@ -121,6 +121,10 @@ impl Person {
         if contents.require("frames")? != frames.to_string() {
             return Ok(false);
         }
+        // The body that the shapes are of may have had fewer of them.
+        let body = run.join(BODY);
+        let kept = if body.is_file() { Some(BodyModel::load(&body)?) } else { None };
+        let model = kept.as_ref().unwrap_or(model);
         let moments = moments(&contents, frames, model)?;
         let cameras = cameras(&contents, frames)?;
         for ((frame, (pose, betas, placement)), camera) in capture.train.iter_mut().zip(&moments).zip(cameras) {

@@ -62,6 +62,26 @@ fn what_is_wrong_with_a_prior_is_mostly_mended_whatever_the_number_of_threads() 
 }
 
 #[test]
+fn limbs_of_a_rig_that_are_too_long_or_too_short_are_mended() {
+    let rig = BodyModel { shapedirs: Vec::new(), ..BodyModel::embedded() };
+    let exact = DemoConfig { pose_noise_degrees: 0.0, translation_noise: 0.0, beta_noise: 0.0, ..small() };
+    let truth = demo(&DemoConfig { size: 192, ..exact }, &rig).unwrap();
+    let mut wrong = rig.clone();
+    Perturbation { limbs_percent: 8.0, ..Perturbation::default() }.spoil_body(&mut wrong);
+    let wrong = wrong.with_limb_lengths();
+    let mut found = truth.clone();
+    register(&mut found, &wrong, 12).unwrap();
+    let longest = |body: &BodyModel, betas: &[f32]| -> Vec<f32> {
+        let (limbs, joints) = (rig.limbs(), body.shaped(betas).joints);
+        let pairs = limbs.pairs().into_iter().take(3);
+        pairs.map(|j| joints[j].distance(joints[rig.parents[j].unwrap()])).collect()
+    };
+    let (right, before, after) = (longest(&rig, &[]), longest(&wrong, &[]), longest(&wrong, &found.mean_betas));
+    let error = |lengths: &[f32]| lengths.iter().zip(&right).map(|(a, b)| (a / b - 1.0).abs()).sum::<f32>() / 3.0;
+    assert!(error(&before) > 0.03 && error(&after) < 0.4 * error(&before), "{right:?} {before:?} {after:?}");
+}
+
+#[test]
 fn a_wrong_depth_is_found_from_how_large_the_person_is() {
     let body = BodyModel::embedded();
     let exact = DemoConfig { pose_noise_degrees: 0.0, translation_noise: 0.0, beta_noise: 0.0, ..small() };

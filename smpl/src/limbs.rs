@@ -1,0 +1,157 @@
+//! Limbs of other lengths.
+
+use glam::Vec3;
+
+use crate::model::BodyModel;
+
+/// How far off the plane of symmetry a limb's bone begins, and within which a joint's mirrored twin
+/// is found, of a body's height.
+const ASIDE: f32 = 0.018;
+/// Shape blend shapes from which on a body is taken to know of proportions, and the part of its
+/// length by which a coefficient of 1 makes a limb's bone longer where it does not.
+const SHAPES: usize = 10;
+const LONGER: f32 = 0.1;
+
+/// The bones of a body's limbs: those that begin and end off the plane of symmetry, x = 0.
+///
+/// A bone is named by the joint that it leads to, a pair of twins by the first of the two.
+pub struct Limbs<'a> {
+    body: &'a BodyModel,
+    joints: Vec<Vec3>,
+    /// The pair that the bone of each joint is of, (J).
+    pairs: Vec<Option<usize>>,
+}
+
+impl BodyModel {
+    /// The bones of its limbs at rest, without shape.
+    #[must_use]
+    pub fn limbs(&self) -> Limbs<'_> {
+        let joints = self.shaped(&[]).joints;
+        let height = |pick: fn(f32, f32) -> f32| self.v_template.iter().map(|v| v.y).reduce(pick).unwrap_or(0.0);
+        let aside = ASIDE * (height(f32::max) - height(f32::min));
+        let is_aside = |j: usize| joints[j].x.abs() > aside;
+        let pair = |(j, parent): (usize, &Option<usize>)| {
+            parent.filter(|&p| is_aside(j) && is_aside(p))?;
+            let mirrored = joints[j] * Vec3::new(-1.0, 1.0, 1.0);
+            Some((0..j).find(|&k| joints[k].distance(mirrored) < aside).unwrap_or(j))
+        };
+        Limbs { body: self, pairs: self.parents.iter().enumerate().map(pair).collect(), joints }
+    }
+
+    /// Gives a body with fewer than ten shape blend shapes, as a rigged character is one, more of
+    /// them, up to ten: the lengths of its longest limbs, 10 % a coefficient.
+    #[must_use]
+    pub fn with_limb_lengths(mut self) -> Self {
+        let limbs = self.limbs();
+        let room = SHAPES.saturating_sub(self.num_betas());
+        let longer: Vec<Vec3> = limbs.pairs().into_iter().take(room).flat_map(|pair| limbs.longer(pair)).collect();
+        self.shapedirs.extend(longer.into_iter().map(|v| LONGER * v));
+        self
+    }
+}
+
+impl Limbs<'_> {
+    /// The pairs, those of the longest bones first.
+    #[must_use]
+    pub fn pairs(&self) -> Vec<usize> {
+        let mut pairs: Vec<usize> = (0..self.pairs.len()).filter(|&j| self.pairs[j] == Some(j)).collect();
+        pairs.sort_by(|&a, &b| self.bone(b).length().total_cmp(&self.bone(a).length()));
+        pairs
+    }
+
+    /// How each vertex at rest moves, (V), with the part by which the bones of a pair become longer:
+    /// what hangs on them moves along, what lies beside them is stretched. Motions of several pairs
+    /// add up.
+    #[must_use]
+    pub fn longer(&self, pair: usize) -> Vec<Vec3> {
+        let mut moved = vec![Vec3::ZERO; self.joints.len()];
+        // The joints that the bones begin at. A limb that forks is stretched along its first branch.
+        let mut stretched: Vec<Option<Vec3>> = vec![None; self.joints.len()];
+        let mut forks = vec![false; self.joints.len()];
+        for (j, parent) in self.body.parents.iter().enumerate() {
+            let Some(p) = *parent else { continue };
+            moved[j] = moved[p];
+            if self.pairs[j] == Some(pair) {
+                moved[j] += self.bone(j);
+                stretched[p] = Some(self.bone(j)).filter(|_| !forks[p]);
+            }
+            forks[p] |= self.pairs[j].is_some();
+        }
+        let of = |(v, at): (usize, &Vec3)| {
+            let motion = |(j, weight): (usize, f32)| {
+                let along = stretched[j].map_or(Vec3::ZERO, |bone| {
+                    let part = (*at - self.joints[j]).dot(bone) / bone.length_squared().max(f32::MIN_POSITIVE);
+                    part.clamp(0.0, 1.0) * bone
+                });
+                weight * (moved[j] + along)
+            };
+            self.body.weights.row(v).map(motion).sum()
+        };
+        self.body.v_template.iter().enumerate().map(of).collect()
+    }
+
+    /// From the joint before to `joint`.
+    fn bone(&self, joint: usize) -> Vec3 {
+        self.body.parents[joint].map_or(Vec3::ZERO, |p| self.joints[joint] - self.joints[p])
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The embedded body without shapes of its own.
+    fn bare() -> BodyModel {
+        BodyModel { shapedirs: Vec::new(), ..BodyModel::embedded() }
+    }
+
+    #[test]
+    fn each_pair_becomes_as_much_longer_as_asked_and_nothing_else_does() {
+        let body = bare();
+        let limbs = body.limbs();
+        // Thighs, shins and feet; collars to shoulders, upper arms, forearms and hands of SMPL.
+        let mut pairs = limbs.pairs();
+        let length = |joints: &[Vec3], j: usize| joints[j].distance(joints[body.parents[j].unwrap()]);
+        let (before, sorted) = (body.shaped(&[]).joints, pairs.clone());
+        assert!(sorted.windows(2).all(|pair| length(&before, pair[0]) >= length(&before, pair[1])));
+        pairs.sort_unstable();
+        assert_eq!(pairs, [4, 7, 10, 16, 18, 20, 22]);
+        for pair in pairs {
+            let mut longer = body.clone();
+            longer.v_template.iter_mut().zip(limbs.longer(pair)).for_each(|(v, by)| *v += 0.1 * by);
+            longer.validate("longer").unwrap();
+            let after = longer.shaped(&[]).joints;
+            for j in 1..after.len() {
+                let part = length(&after, j) / length(&before, j) - 1.0;
+                let asked = if limbs.pairs[j] == Some(pair) { 0.1 } else { 0.0 };
+                // Joints are regressed from vertices that not only their own bones move.
+                assert!((part - asked).abs() < 0.035, "{pair}, {j}: {part}");
+            }
+        }
+    }
+
+    #[test]
+    fn bodies_without_shapes_get_their_limbs_and_others_stay_as_they_are() {
+        let body = bare().with_limb_lengths();
+        body.validate("limbs").unwrap();
+        assert_eq!(body.num_betas(), 7);
+        assert_eq!(BodyModel::embedded().with_limb_lengths(), BodyModel::embedded());
+        // The thigh is the longest.
+        let part = |betas: &[f32]| {
+            let joints = body.shaped(betas).joints;
+            joints[4].distance(joints[1])
+        };
+        assert!((part(&[0.5]) / part(&[]) - 1.05).abs() < 0.01);
+        // Nothing has limbs: one bone, a triangle.
+        let single = BodyModel {
+            v_template: vec![Vec3::ZERO, Vec3::X, Vec3::Y],
+            faces: vec![[0, 1, 2]],
+            shapedirs: Vec::new(),
+            posedirs: crate::SparseRows::from_rows(vec![None::<(u32, Vec3)>; 3]),
+            weights: crate::SparseRows::from_rows(vec![[(0, 1.0)]; 3]),
+            j_regressor: crate::SparseRows::from_rows([[(0, 1.0)]]),
+            parents: vec![None],
+        };
+        assert_eq!(single.clone().with_limb_lengths(), single);
+    }
+}
