@@ -1,5 +1,5 @@
-//! Least squares over all frames: each frame has unknowns of its own, tied to those of the next
-//! frame, and all frames share some.
+//! Least squares over all frames: each frame has unknowns of its own, tied to those of the next two
+//! frames, and all frames share some.
 
 use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
 
@@ -32,14 +32,38 @@ impl Normal {
 }
 
 /// What unknowns are expected to be before anything is seen: those of the frames wander about 0 (a
-/// stationary Ornstein-Uhlenbeck process).
+/// stationary autoregressive process of second order).
 pub(super) struct Expected<'a> {
     /// Variance of each unknown of a frame, (P).
     pub own: &'a [f64],
-    /// Correlation of each unknown with the same of the next frame, 0 to below 1, (P).
-    pub kept: &'a [f64],
+    /// What is kept of each unknown in the next frame, and in the one after that, (P).
+    pub kept: &'a [[f64; 2]],
     /// Inverse variance of each shared unknown, (B).
     pub shared: &'a [f64],
+}
+
+impl Expected<'_> {
+    /// Row `t` of the inverse covariance of an unknown over `frames` frames, from the diagonal on.
+    fn precision(&self, i: usize, t: usize, frames: usize) -> [f64; 3] {
+        let (variance, [a, b]) = (self.own[i], self.kept[i]);
+        // Correlation with the next frame (Yule and Walker).
+        let next = a / (1.0 - b);
+        let mut row = [0.0; 3];
+        // The first is as uncertain as any, each next one is what is kept of those before, and some
+        // more.
+        for frame in t..(t + 3).min(frames) {
+            let (of, left) = match frame {
+                0 => ([1.0, 0.0, 0.0], 1.0),
+                1 => ([1.0, -next, 0.0], 1.0 - next * next),
+                _ => ([1.0, -a, -b], (1.0 - b * b) * (1.0 - next * next)),
+            };
+            let back = frame - t;
+            for (entry, k) in row.iter_mut().zip(0..=back) {
+                *entry += of[back] * of[back - k] / (variance * left);
+            }
+        }
+        row
+    }
 }
 
 /// Steps towards the least squares.
@@ -55,8 +79,8 @@ pub(super) struct Solution {
 /// The steps that take all unknowns to the least squares: for each frame (P), and the shared (B).
 /// `own` and `shared` are the unknowns now. `None` where the equations have no solution.
 ///
-/// The frames' blocks are eliminated in order (block tridiagonal Cholesky), the shared unknowns
-/// last.
+/// Frames are eliminated in pairs, in order (block tridiagonal Cholesky), the shared unknowns last.
+/// An odd number is filled up with a frame that shows nothing.
 pub(super) fn solve(
     frames: &[Normal],
     expected: &Expected<'_>,
@@ -64,86 +88,81 @@ pub(super) fn solve(
     shared: &DVector<f64>,
 ) -> Option<Solution> {
     let (p, b) = (expected.own.len(), expected.shared.len());
-    // The inverse of the process's covariance: ties between neighbours, and what is left for each
-    // frame, at the ends and between.
-    let each = expected.own.iter().zip(expected.kept);
-    let innovation: Vec<f64> = each.map(|(variance, kept)| variance * (1.0 - kept * kept)).collect();
-    let change = DVector::from_fn(p, |i, _| expected.kept[i] / innovation[i]);
-    let least = |i: usize, neighbours: usize| match neighbours {
-        0 => expected.own[i].recip(),
-        _ => (1.0 - expected.kept[i]).powi(neighbours as i32) / innovation[i],
+    let (pairs, count) = (frames.len().div_ceil(2), frames.len());
+    let precision: Vec<Vec<[f64; 3]>> =
+        (0..2 * pairs).map(|t| (0..p).map(|i| expected.precision(i, t, 2 * pairs)).collect()).collect();
+    // How a pair is tied to the next: rows of the one, columns of the other.
+    let tie = |g: usize| {
+        let mut tie = DMatrix::zeros(2 * p, 2 * p);
+        for i in 0..p {
+            let [first, second] = [precision[2 * g][i], precision[2 * g + 1][i]];
+            (tie[(i, i)], tie[(p + i, i)], tie[(p + i, p + i)]) = (first[2], second[1], second[2]);
+        }
+        tie
     };
-    // Of a frame: the factor of its block, and the solutions of the right-hand side and of the
-    // shared unknowns' columns, before what follows is known.
-    let mut factors: Vec<(Cholesky<f64, Dyn>, DMatrix<f64>)> = Vec::with_capacity(frames.len());
+    // Of a pair: the factor of its block, and the solutions of the right-hand side and of the shared
+    // unknowns' columns, before what follows is known.
+    let mut factors: Vec<(Cholesky<f64, Dyn>, DMatrix<f64>)> = Vec::with_capacity(pairs);
     let mut shared_matrix = DMatrix::from_diagonal(&DVector::from_row_slice(expected.shared));
     let mut shared_vector = DVector::from_fn(b, |k, _| -expected.shared[k] * shared[k]);
-    let mut sides: Vec<DMatrix<f64>> = Vec::with_capacity(frames.len());
-    for (f, normal) in frames.iter().enumerate() {
-        debug_assert_eq!(normal.own, p);
-        let mut block = normal.matrix.view((0, 0), (p, p)).into_owned();
-        let mut side = DMatrix::zeros(p, 1 + b);
-        side.set_column(0, &(-normal.vector.rows(0, p)));
-        side.view_mut((0, 1), (p, b)).copy_from(&normal.matrix.view((0, p), (p, b)));
+    for normal in frames {
         shared_matrix += normal.matrix.view((p, p), (b, b));
         shared_vector -= normal.vector.rows(p, b);
-        let neighbours = || [f.checked_sub(1), Some(f + 1).filter(|&n| n < frames.len())].into_iter().flatten();
-        for i in 0..p {
-            let least = least(i, neighbours().count());
-            block[(i, i)] += least;
-            side[(i, 0)] -= least * own[f][i];
-            for neighbour in neighbours() {
-                block[(i, i)] += change[i];
-                side[(i, 0)] -= change[i] * (own[f][i] - own[neighbour][i]);
+    }
+    let now = |t: usize, i: usize| own.get(t).map_or(0.0, |own| own[i]);
+    for g in 0..pairs {
+        let mut block = DMatrix::zeros(2 * p, 2 * p);
+        let mut side = DMatrix::zeros(2 * p, 1 + b);
+        for half in 0..2 {
+            let (t, at) = (2 * g + half, half * p);
+            if t < count {
+                let normal = &frames[t];
+                debug_assert_eq!(normal.own, p);
+                block.view_mut((at, at), (p, p)).copy_from(&normal.matrix.view((0, 0), (p, p)));
+                side.view_mut((at, 0), (p, 1)).copy_from(&(-normal.vector.rows(0, p)));
+                side.view_mut((at, 1), (p, b)).copy_from(&normal.matrix.view((0, p), (p, b)));
+            }
+            for i in 0..p {
+                let row = precision[t][i];
+                block[(at + i, at + i)] += row[0];
+                if half == 0 {
+                    block[(i, p + i)] += row[1];
+                    block[(p + i, i)] += row[1];
+                }
+                let back = |k: usize| t.checked_sub(k).map_or(0.0, |s| precision[s][i][k] * now(s, i));
+                let ahead = row[0] * now(t, i) + row[1] * now(t + 1, i) + row[2] * now(t + 2, i);
+                side[(at + i, 0)] -= ahead + back(1) + back(2);
             }
         }
         if let Some((before, solved)) = factors.last() {
-            // The tie to the frame before is −diag(change).
-            let mut tie = DMatrix::from_diagonal(&change);
-            before.solve_mut(&mut tie);
-            for i in 0..p {
-                for j in 0..p {
-                    block[(i, j)] -= change[i] * tie[(i, j)];
-                }
-                for k in 0..=b {
-                    side[(i, k)] += change[i] * solved[(i, k)];
-                }
-            }
+            let between = tie(g - 1);
+            block -= between.tr_mul(&before.solve(&between));
+            side -= between.tr_mul(solved);
         }
         let factor = Cholesky::new(block)?;
         let solved = factor.solve(&side);
-        sides.push(side);
         factors.push((factor, solved));
     }
-    // Back: x_f = A_f⁻¹ (side_f + change · x_{f + 1}), for the right-hand side and each shared
-    // unknown.
-    let mut solutions: Vec<DMatrix<f64>> = vec![DMatrix::zeros(p, 1 + b); frames.len()];
-    let mut variances: Vec<DVector<f64>> = vec![DVector::zeros(p); frames.len()];
-    let mut covariance = DMatrix::zeros(p, p);
-    for f in (0..frames.len()).rev() {
-        let (factor, solved) = &factors[f];
+    // Back: x_g = A_g⁻¹ (side_g − tie · x_{g + 1}), for the right-hand side and each shared unknown.
+    let mut solutions: Vec<DMatrix<f64>> = vec![DMatrix::zeros(p, 1 + b); 2 * pairs];
+    let mut variances: Vec<DVector<f64>> = vec![DVector::zeros(p); 2 * pairs];
+    let (mut covariance, mut later) = (DMatrix::zeros(0, 0), DMatrix::zeros(0, 0));
+    for g in (0..pairs).rev() {
+        let (factor, solved) = &factors[g];
         let alone = factor.inverse();
-        covariance = if f + 1 == frames.len() {
-            alone
+        (covariance, later) = if g + 1 == pairs {
+            (alone, solved.clone())
         } else {
-            let mut gain = alone.clone();
-            gain.column_iter_mut().zip(change.iter()).for_each(|(mut column, change)| column *= *change);
-            alone + &gain * covariance * gain.transpose()
+            let gain = factor.solve(&tie(g));
+            (alone + &gain * covariance * gain.transpose(), solved - gain * later)
         };
-        variances[f] = covariance.diagonal();
-        solutions[f] = match solutions.get(f + 1) {
-            None => solved.clone(),
-            Some(next) => {
-                let mut side = sides[f].clone();
-                for i in 0..p {
-                    for k in 0..=b {
-                        side[(i, k)] += change[i] * next[(i, k)];
-                    }
-                }
-                factor.solve(&side)
-            }
-        };
+        for half in 0..2 {
+            variances[2 * g + half] = covariance.diagonal().rows(half * p, p).into_owned();
+            solutions[2 * g + half] = later.rows(half * p, p).into_owned();
+        }
     }
+    solutions.truncate(count);
+    variances.truncate(count);
     for (normal, solution) in frames.iter().zip(&solutions) {
         let coupling = normal.matrix.view((p, 0), (b, p));
         shared_matrix -= coupling * solution.view((0, 1), (p, b));
@@ -191,17 +210,27 @@ mod tests {
                 }
             }
             let prior: Vec<f64> = (0..p).map(|_| 0.1 + random().abs()).collect();
-            let kept: Vec<f64> = (0..p).map(|_| 0.98 * random().sin().abs()).collect();
+            // Roots within the unit circle.
+            let mut root = || 0.98 * random().sin();
+            let kept: Vec<[f64; 2]> = (0..p).map(|_| (root(), root())).map(|(x, y)| [x + y, -x * y]).collect();
             let common: Vec<f64> = (0..b).map(|_| 0.1 + random().abs()).collect();
             for f in 0..frames {
                 for i in 0..p {
-                    // The first is as uncertain as any, each next one is what is kept and some more.
-                    if f == 0 {
-                        add(prior[i].recip(), own[0][i], &[(i, 1.0)]);
-                    } else {
-                        let more = prior[i] * (1.0 - kept[i] * kept[i]);
-                        let residual = own[f][i] - kept[i] * own[f - 1][i];
-                        add(more.recip(), residual, &[(f * p + i, 1.0), ((f - 1) * p + i, -kept[i])]);
+                    // The variance of what is new, from the Yule-Walker equations.
+                    let [a, c] = kept[i];
+                    let next = a / (1.0 - c);
+                    let new = prior[i] * (1.0 - a * next - c * (a * next + c));
+                    let at = |back: usize| (f - back) * p + i;
+                    match f {
+                        0 => add(prior[i].recip(), own[0][i], &[(at(0), 1.0)]),
+                        1 => {
+                            let residual = own[1][i] - next * own[0][i];
+                            add((prior[i] * (1.0 - next * next)).recip(), residual, &[(at(0), 1.0), (at(1), -next)]);
+                        }
+                        _ => {
+                            let residual = own[f][i] - a * own[f - 1][i] - c * own[f - 2][i];
+                            add(new.recip(), residual, &[(at(0), 1.0), (at(1), -a), (at(2), -c)]);
+                        }
                     }
                 }
             }

@@ -4,9 +4,9 @@ use nalgebra::DVector;
 
 use crate::scene::registration::unknowns::Change;
 
-/// Frames over which errors of a turn, and of the place, are forgotten: their correlation falls to
-/// 1/e.
-const TURN_LASTS: f64 = 10.0;
+/// Frames over which errors are forgotten: over k frames of these the correlation falls to
+/// (1 + k) e^-k for turns, which change smoothly, and to e^-k for the place.
+const TURN_LASTS: f64 = 5.0;
 const PLACE_LASTS: f64 = 1.0;
 
 /// Standard deviations of a tracker's errors along one axis, whatever the frame.
@@ -28,16 +28,18 @@ impl Tracker {
     const LEAST: Self = Self { aside: 0.002, away: 0.002, turn: 0.01 };
     const MOST: Self = Self { aside: 0.2, away: 0.2, turn: 0.15 };
 
-    /// Variances of the unknowns of a frame, and their correlations with those of the frame that
-    /// is `gap` later, (P) each. `unit` is the length of a metre of a body 1.7 high.
-    pub fn expected(&self, unit: f32, own: usize, gap: usize) -> (Vec<f64>, Vec<f64>) {
+    /// Variances of the unknowns of a frame, and what is kept of them `gap` and twice as many frames
+    /// later ([`Expected::kept`]), (P) each. `unit` is the length of a metre of a body 1.7 high.
+    pub fn expected(&self, unit: f32, own: usize, gap: usize) -> (Vec<f64>, Vec<[f64; 2]>) {
         let Self { aside, away, turn } = *self;
         let unit = f64::from(unit);
-        let lasts = |frames: f64| (-(gap as f64) / frames).exp();
+        // Two equal roots, or one.
+        let root = |frames: f64| (-(gap as f64) / frames).exp();
+        let smooth = |root: f64| [2.0 * root, -root * root];
         let each = |i: usize| match i {
-            0 | 1 => ((unit * aside).powi(2), lasts(PLACE_LASTS)),
-            2 => ((unit * away).powi(2), lasts(PLACE_LASTS)),
-            _ => (turn * turn, lasts(TURN_LASTS)),
+            0 | 1 => ((unit * aside).powi(2), [root(PLACE_LASTS), 0.0]),
+            2 => ((unit * away).powi(2), [root(PLACE_LASTS), 0.0]),
+            _ => (turn * turn, smooth(root(TURN_LASTS))),
         };
         (0..own).map(each).unzip()
     }
@@ -80,17 +82,23 @@ mod tests {
         let (variances, kept) = truth.expected(2.0, own, 1);
         let mut stream = Stream::new(&[seed]);
         let mut random = || f64::from(stream.normal());
-        let mut now: Vec<f64> = variances.iter().map(|v| v.sqrt() * random()).collect();
+        let mut now = vec![[0.0f64; 2]; own];
         let mut normals = Vec::new();
-        for _ in 0..frames {
+        // At first they are not yet as wrong as later.
+        for frame in 0..frames + 100 {
             let mut normal = Normal::new(own, 0);
             for i in 0..own {
-                now[i] = kept[i] * now[i] + (variances[i] * (1.0 - kept[i] * kept[i])).sqrt() * random();
+                let [a, b] = kept[i];
+                let next = a / (1.0 - b);
+                let new = variances[i] * (1.0 - a * next - b * (a * next + b));
+                now[i] = [a * now[i][0] + b * now[i][1] + new.sqrt() * random(), now[i][0]];
                 if i % 3 < 2 || i == 2 {
-                    normal.add(noise.powi(-2), -(now[i] + noise * random()), &[i as u32], &[1.0]);
+                    normal.add(noise.powi(-2), -(now[i][0] + noise * random()), &[i as u32], &[1.0]);
                 }
             }
-            normals.push(normal);
+            if frame >= 100 {
+                normals.push(normal);
+            }
         }
         let mut tracker = Tracker { turn: Tracker::TURN, ..Tracker::OUTLINES };
         let still = vec![DVector::zeros(own); frames];
