@@ -252,7 +252,7 @@ fn a_step_agrees_with_one_written_straight_from_the_definitions() {
     ];
     let mut wrong = Vec::new();
     for (seed, (method, motion, distance)) in
-        [1u64, 5, 3, 4, 1, 3, 2, 1, 2, 2, WITHOUT_SURFACE_TERM].into_iter().zip(cases)
+        [1u64, 5, 3, 4, 1, 9, 2, 1, 2, 2, WITHOUT_SURFACE_TERM].into_iter().zip(cases)
     {
         let demo =
             crate::capture::DemoConfig { size: 48, frames: 3, eval_cameras: 1, eval_every: 3, ..Default::default() };
