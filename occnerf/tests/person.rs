@@ -76,6 +76,9 @@ fn a_capture_gets_the_bodies_that_a_run_was_trained_with() {
     let mut with_more = given.clone();
     assert!(Person::restore(&dir.path(""), &mut with_more, &more).unwrap());
     assert_eq!(with_more.mean_betas, restored.mean_betas);
+    let fewer = BodyModel { shapedirs: Vec::new(), ..body().clone() };
+    let error = Person::restore(&dir.path(""), &mut given.clone(), &fewer).unwrap_err().to_string();
+    assert!(error.contains("person.safetensors") && error.contains("betas"), "{error}");
     let again = Scene::new(&with_more, &more, &config).unwrap();
     assert_eq!(again.train[0].view.posed, scene.train[0].view.posed);
     // A capture of other frames keeps its own.

@@ -30,12 +30,14 @@ impl BodyModel {
         let height = |pick: fn(f32, f32) -> f32| self.v_template.iter().map(|v| v.y).reduce(pick).unwrap_or(0.0);
         let aside = ASIDE * (height(f32::max) - height(f32::min));
         let is_aside = |j: usize| joints[j].x.abs() > aside;
-        let pair = |(j, parent): (usize, &Option<usize>)| {
-            parent.filter(|&p| is_aside(j) && is_aside(p))?;
+        let mut pairs: Vec<Option<usize>> = Vec::with_capacity(joints.len());
+        for (j, parent) in self.parents.iter().enumerate() {
             let mirrored = joints[j] * Vec3::new(-1.0, 1.0, 1.0);
-            Some((0..j).find(|&k| joints[k].distance(mirrored) < aside).unwrap_or(j))
-        };
-        Limbs { body: self, pairs: self.parents.iter().enumerate().map(pair).collect(), joints }
+            let is_twin = |&k: &usize| pairs[k].is_some() && joints[k].distance(mirrored) < aside;
+            let pair = || (0..j).find(is_twin).map_or(Some(j), |twin| pairs[twin]);
+            pairs.push(if is_aside(j) && parent.is_some_and(is_aside) { pair() } else { None });
+        }
+        Limbs { body: self, joints, pairs }
     }
 
     /// Gives a body with fewer than ten shape blend shapes, as a rigged character is one, more of
@@ -99,6 +101,7 @@ impl Limbs<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::SparseRows;
 
     /// The embedded body without shapes of its own.
     fn bare() -> BodyModel {
@@ -142,16 +145,31 @@ mod tests {
             joints[4].distance(joints[1])
         };
         assert!((part(&[0.5]) / part(&[]) - 1.05).abs() < 0.01);
-        // Nothing has limbs: one bone, a triangle.
-        let single = BodyModel {
-            v_template: vec![Vec3::ZERO, Vec3::X, Vec3::Y],
+    }
+
+    /// A body whose joints are its first vertices.
+    fn skeleton(places: &[Vec3], parents: &[Option<usize>]) -> BodyModel {
+        let one = |joint: usize| [(joint as u32, 1.0)];
+        BodyModel {
+            v_template: places.to_vec(),
             faces: vec![[0, 1, 2]],
             shapedirs: Vec::new(),
-            posedirs: crate::SparseRows::from_rows(vec![None::<(u32, Vec3)>; 3]),
-            weights: crate::SparseRows::from_rows(vec![[(0, 1.0)]; 3]),
-            j_regressor: crate::SparseRows::from_rows([[(0, 1.0)]]),
-            parents: vec![None],
-        };
+            posedirs: SparseRows::from_rows(places.iter().map(|_| None::<(u32, Vec3)>)),
+            weights: SparseRows::from_rows((0..places.len()).map(|v| one(v.min(parents.len() - 1)))),
+            j_regressor: SparseRows::from_rows((0..parents.len()).map(one)),
+            parents: parents.to_vec(),
+        }
+    }
+
+    #[test]
+    fn a_bone_without_a_twin_is_a_limb_of_its_own_and_a_body_without_limbs_has_none() {
+        let place = |x: f32, y: f32| Vec3::new(x, y, 0.0);
+        let places = [place(0.0, 0.0), place(-0.4, 0.5), place(0.2, 0.5), place(0.4, 0.5), place(0.0, 1.0)];
+        // What lies opposite the last joint ends no limb: its bone begins in the middle.
+        let body = skeleton(&places, &[None, Some(0), Some(0), Some(2)]);
+        assert_eq!(body.limbs().pairs(), [3]);
+        assert_eq!(body.limbs().longer(3)[3], place(0.2, 0.0));
+        let single = skeleton(&places[..3], &[None]);
         assert_eq!(single.clone().with_limb_lengths(), single);
     }
 }

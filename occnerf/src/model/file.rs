@@ -130,6 +130,11 @@ impl<'a> Contents<'a> {
         self.header(key).ok_or_else(|| self.wrong(format!("header lacks `{key}`")))
     }
 
+    /// Number of entries of an array; 0 where there is none.
+    pub fn len(&self, key: &str) -> usize {
+        self.tensors.tensor(key).map_or(0, |view| view.shape().iter().product())
+    }
+
     fn bytes_of(&self, key: &str, dtype: Dtype, len: usize) -> Result<&[u8], Error> {
         let view = self.tensors.tensor(key).map_err(|_| self.wrong(format!("lacks `{key}`")))?;
         if view.dtype() != dtype || view.shape() != [len] {

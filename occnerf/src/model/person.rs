@@ -121,11 +121,9 @@ impl Person {
         if contents.require("frames")? != frames.to_string() {
             return Ok(false);
         }
-        // The body that the shapes are of may have had fewer of them.
-        let body = run.join(BODY);
-        let kept = if body.is_file() { Some(BodyModel::load(&body)?) } else { None };
-        let model = kept.as_ref().unwrap_or(model);
-        let moments = moments(&contents, frames, model)?;
+        // The body may have had fewer shapes.
+        let betas = contents.len("mean_betas").min(model.num_betas());
+        let moments = moments(&contents, frames, (model.num_joints(), betas))?;
         let cameras = cameras(&contents, frames)?;
         for ((frame, (pose, betas, placement)), camera) in capture.train.iter_mut().zip(&moments).zip(cameras) {
             (frame.pose, frame.betas, frame.placement) = (pose.clone(), betas.clone(), *placement);
@@ -136,7 +134,7 @@ impl Person {
                 (view.frame.pose, view.frame.betas, view.frame.placement) = (pose.clone(), betas.clone(), *placement);
             }
         }
-        capture.mean_betas = contents.floats("mean_betas", model.num_betas())?;
+        capture.mean_betas = contents.floats("mean_betas", betas)?;
         capture.registered = true;
         Ok(true)
     }
@@ -162,7 +160,7 @@ impl Person {
         let betas = model.num_betas();
         let body = Arc::new(Body::new(&model, &contents.floats("mean_betas", betas)?, config)?);
         let cameras = cameras(&contents, frames)?;
-        let moments = moments(&contents, frames, &model)?;
+        let moments = moments(&contents, frames, (model.num_joints(), betas))?;
         let views = cameras.into_iter().zip(&moments).enumerate();
         let view = |(frame, (camera, (pose, betas, placement))): (usize, (Camera, &Pose))| {
             Arc::new(body.view(&camera, frame, Moment { betas, pose, placement: *placement }))
@@ -211,8 +209,7 @@ fn colors(contents: &Contents<'_>, model: &BodyModel) -> Result<PriorColors, Err
 /// Turns of the joints, shape and place of a frame.
 type Pose = (Vec<Vec3>, Vec<f32>, Placement);
 
-fn moments(contents: &Contents<'_>, frames: usize, model: &BodyModel) -> Result<Vec<Pose>, Error> {
-    let (joints, betas) = (model.num_joints(), model.num_betas());
+fn moments(contents: &Contents<'_>, frames: usize, (joints, betas): (usize, usize)) -> Result<Vec<Pose>, Error> {
     let poses = triples(&contents.floats("poses", frames * joints * 3)?);
     let shapes = contents.floats("betas", frames * betas)?;
     let placements = contents.floats("placements", frames * PLACEMENT)?;

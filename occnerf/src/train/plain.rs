@@ -252,7 +252,7 @@ fn a_step_agrees_with_one_written_straight_from_the_definitions() {
     ];
     let mut wrong = Vec::new();
     for (seed, (method, motion, distance)) in
-        [1u64, 5, 3, 4, 1, 9, 2, 1, 2, 2, WITHOUT_SURFACE_TERM].into_iter().zip(cases)
+        [1u64, 5, 3, 4, 1, 3, 2, 1, 2, 2, WITHOUT_SURFACE_TERM].into_iter().zip(cases)
     {
         let demo =
             crate::capture::DemoConfig { size: 48, frames: 3, eval_cameras: 1, eval_every: 3, ..Default::default() };
@@ -284,7 +284,7 @@ fn a_step_agrees_with_one_written_straight_from_the_definitions() {
             assert!((fast - plain).abs().max_element() < 1e-4, "{method:?}: {fast} {plain}");
         }
         // Far enough for f32 to tell places apart, near enough to stay in most cells of the grid.
-        let parts = [(Part::Field, 1e-5), (Part::Table, 1e-5), (Part::Vertices, 1e-5), (Part::Motion, 3e-4)];
+        let parts = [(Part::Field, 1e-5), (Part::Table, 1e-5), (Part::Vertices, 5e-7), (Part::Motion, 3e-4)];
         for (part, size) in parts.into_iter().filter(|(part, _)| !before.get(*part).is_empty()) {
             let from = before.get(part);
             let (mut whole, mut apart) = (0.0, 0.0);
@@ -315,7 +315,9 @@ fn a_step_agrees_with_one_written_straight_from_the_definitions() {
             };
             let (whole, apart) = (whole.sqrt(), apart.sqrt());
             println!("{method:?} {motion:?} {distance:?} {part:?}: {apart:.1e} of {whole:.1e}");
-            if apart >= tolerance * whole.max(1e-7) {
+            // A derivative near 0 is to be no farther off than a hundredth of a step.
+            let least = (0.01 * f64::from(size)).min(1e-7);
+            if apart >= tolerance * whole.max(least) {
                 wrong.push(format!("{method:?} {motion:?} {distance:?} {part:?}: {apart} of {whole}"));
             }
         }

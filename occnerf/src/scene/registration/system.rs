@@ -106,9 +106,9 @@ pub(super) fn solve(
         }
         out
     };
-    // Of a pair: the inverse of its block, that times its ties, and the solutions of the right-hand
-    // side and of the shared unknowns' columns, before what follows is known.
-    let mut pieces: Vec<[DMatrix<f64>; 3]> = Vec::with_capacity(pairs);
+    // Of a pair: the inverse of its block, and the solutions of the right-hand side and of the shared
+    // unknowns' columns, before what follows is known.
+    let mut pieces: Vec<[DMatrix<f64>; 2]> = Vec::with_capacity(pairs);
     let mut shared_matrix = DMatrix::from_diagonal(&DVector::from_row_slice(expected.shared));
     let mut shared_vector = DVector::from_fn(b, |k, _| -expected.shared[k] * shared[k]);
     for normal in frames {
@@ -140,25 +140,22 @@ pub(super) fn solve(
                 side[(at + i, 0)] -= ahead + back(1) + back(2);
             }
         }
-        if let Some([_, gain, solved]) = pieces.last() {
-            block -= tied(&gain.transpose(), g - 1);
+        if let Some([alone, solved]) = pieces.last() {
+            block -= tied(&tied(alone, g - 1).transpose(), g - 1);
             side -= tied(&solved.transpose(), g - 1).transpose();
         }
         let alone = inverse(block)?;
-        let (gain, solved) = (tied(&alone, g), &alone * side);
-        pieces.push([alone, gain, solved]);
+        let solved = &alone * side;
+        pieces.push([alone, solved]);
     }
     // Back: x_g = A_g⁻¹ (side_g − tie · x_{g + 1}), for the right-hand side and each shared unknown.
     let mut solutions: Vec<DMatrix<f64>> = vec![DMatrix::zeros(p, 1 + b); 2 * pairs];
     let mut variances: Vec<DVector<f64>> = vec![DVector::zeros(p); 2 * pairs];
-    let (mut covariance, mut later) = (DMatrix::zeros(0, 0), DMatrix::zeros(0, 0));
-    for g in (0..pairs).rev() {
-        let [alone, gain, solved] = &pieces[g];
-        (covariance, later) = if g + 1 == pairs {
-            (alone.clone(), solved.clone())
-        } else {
-            (alone + gain * covariance * gain.transpose(), solved - gain * later)
-        };
+    // The last pair is tied to nothing.
+    let (mut covariance, mut later) = (DMatrix::zeros(2 * p, 2 * p), DMatrix::zeros(2 * p, 1 + b));
+    for (g, [alone, solved]) in pieces.iter().enumerate().rev() {
+        let gain = tied(alone, g);
+        (covariance, later) = (alone + &gain * covariance * gain.transpose(), solved - gain * later);
         for half in 0..2 {
             variances[2 * g + half] = covariance.diagonal().rows(half * p, p).into_owned();
             solutions[2 * g + half] = later.rows(half * p, p).into_owned();
