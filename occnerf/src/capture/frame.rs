@@ -76,6 +76,9 @@ pub struct Capture {
     pub mean_betas: Vec<f32>,
     /// Whether [`crate::register`] has corrected the bodies.
     pub registered: bool,
+    /// How far clothes and hair stand off each vertex of the body along its normal, in the capture's
+    /// units, as registration has found it; empty where nothing is known.
+    pub clothes: Vec<f32>,
     /// Whether masks that are too large or too small have been mended.
     pub mended: bool,
 }

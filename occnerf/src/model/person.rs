@@ -80,6 +80,7 @@ impl Person {
             ("seen", Array::Bytes(colors.seen.iter().map(|&seen| u8::from(seen)).collect())),
             ("light", floats(colors.light.slope.to_array().to_vec())),
             ("sizes", Array::Counts(&sizes)),
+            ("clothes", floats(capture.clothes.clone())),
         ];
         let header = BTreeMap::from([
             ("format", FORMAT.to_owned()),
@@ -135,6 +136,9 @@ impl Person {
             }
         }
         capture.mean_betas = contents.floats("mean_betas", betas)?;
+        // Runs of before clothes were kept have none.
+        let has = contents.len("clothes") > 0;
+        capture.clothes = if has { contents.floats("clothes", model.num_vertices())? } else { Vec::new() };
         capture.registered = true;
         Ok(true)
     }

@@ -74,6 +74,8 @@ pub struct Scene {
     pub(crate) lit: bool,
     /// Pixels on both sides of the masks' edges that may show somebody else's colours.
     pub(crate) edge: usize,
+    /// How far clothes stand off each vertex; empty where that is not known.
+    pub(crate) clothes: Vec<f32>,
     /// Indices of the training frames from whose pixels something is learnt: all but those held
     /// out.
     pub(crate) learnt: Vec<usize>,
@@ -112,6 +114,7 @@ impl Scene {
             name: capture.name.clone(),
             train: train?,
             eval: eval?,
+            clothes: capture.clothes.iter().map(|c| c * body.scale).collect(),
             body,
             capture,
             lit: config.field.prior_light,
@@ -165,7 +168,7 @@ impl Scene {
             return Ok(Vec::new());
         }
         let frame = &self.train[frame];
-        seen(&frame.view, &*frame.pixels()?, &self.body.model.faces, anchors)
+        seen(&frame.view, &*frame.pixels()?, &self.body.model.faces, &self.clothes, anchors)
     }
 
     /// Makes the training frames that nothing is learnt from those to score, in place of views of

@@ -1,6 +1,8 @@
 //! What a frame shows of the prior's vertices, and at which pixels of its mask that is somebody
 //! else's.
 
+use std::borrow::Cow;
+
 use glam::Vec3;
 use surface_query::vertex_normals;
 use visibility::RayMesh;
@@ -19,22 +21,34 @@ pub(crate) const MOST: usize = 4;
 /// inside: bodies that do not quite fit make edges wrong too, but evenly so.
 const STRANGE: f64 = 1.5;
 
+/// Vertices (V) with `clothes` that stand so far off along their normals.
+pub(crate) fn dressed(vertices: &[Vec3], normals: &[Vec3], clothes: &[f32]) -> Vec<Vec3> {
+    let each = vertices.iter().zip(normals).zip(clothes);
+    each.map(|((v, n), c)| *v + *c * n.normalize_or_zero()).collect()
+}
+
 /// What a frame shows of points of the prior at pixels of the subject, by ray casting, and how many
-/// pixels inside the mask that is, from 1. `anchors` say where the points are.
+/// pixels inside the mask that is, from 1. `anchors` say where the points are, on the surface of
+/// `clothes` if they are known (V), else on the body's: what stands off the body is seen beside it.
 pub(crate) fn seen(
     view: &PosedView,
     pixels: &Pixels,
     faces: &[[u32; 3]],
+    clothes: &[f32],
     anchors: &[Anchor],
 ) -> Result<Vec<(Seen, usize)>, Error> {
-    let (camera, posed) = (&view.camera, &view.posed.vertices);
-    let mesh = RayMesh::new(posed, faces)?;
+    let camera = &view.camera;
+    let mut posed = Cow::Borrowed(&view.posed.vertices[..]);
+    if !clothes.is_empty() {
+        posed = dressed(&posed, &vertex_normals(&posed, faces), clothes).into();
+    }
+    let mesh = RayMesh::new(&posed, faces)?;
     let usable: Vec<bool> = pixels.mask.iter().map(|&m| m > 0.5).collect();
-    let points: Vec<Vec3> = anchors.iter().map(|anchor| anchor.mix(posed)).collect();
+    let points: Vec<Vec3> = anchors.iter().map(|anchor| anchor.mix(&posed)).collect();
     let visible = visibility::visible_vertices(&mesh, &points, &pinhole(camera), Some(&usable));
     let unusable: Vec<bool> = usable.iter().map(|usable| !usable).collect();
     let depth = squared_distance(&unusable, camera.width as usize);
-    let normals = vertex_normals(posed, faces);
+    let normals = match std::env::var_os("UNDRESSED") { Some(_) => vertex_normals(&view.posed.vertices, faces), None => vertex_normals(&posed, faces) };
     let color = |v: usize| {
         let at = visible[v].then(|| camera.project(points[v])).flatten()?;
         let pixel = at.y as usize * camera.width as usize + at.x as usize;

@@ -89,6 +89,7 @@ pub fn capture_from(metres: f32) -> Capture {
         eval: eval.collect(),
         mean_betas: vec![0.0],
         registered: false,
+        clothes: Vec::new(),
         mended: false,
     }
 }

@@ -112,6 +112,7 @@ impl Stage<'_> {
             eval: eval.into_iter().map(|(_, frame)| frame).collect(),
             mean_betas: self.betas,
             registered: false,
+            clothes: Vec::new(),
             mended: false,
         })
     }

@@ -35,6 +35,7 @@ use self::tracker::Tracker;
 use self::unknowns::{Change, changed};
 use crate::Error;
 use crate::capture::{Capture, Frame};
+use crate::scene::seen::dressed;
 
 /// Standard deviation of shape coefficients.
 const SHAPE: f64 = 0.5;
@@ -113,7 +114,8 @@ pub fn register(capture: &mut Capture, model: &BodyModel, rounds: usize) -> Resu
             break;
         }
     }
-    let Registration { frames, changes, betas, nearness, .. } = registration;
+    let Registration { frames, changes, betas, nearness, clothes, .. } = registration;
+    capture.clothes = clothes;
     capture.mean_betas = sum(&capture.mean_betas, &betas);
     for (index, frame) in capture.train.iter_mut().enumerate() {
         let after = frames.partition_point(|&f| f <= index);
@@ -250,8 +252,7 @@ impl<'a> Registration<'a> {
     fn moment(&self, f: usize) -> Moment {
         let (shape, posed) = self.posed(f, &self.betas);
         let normals = vertex_normals(&posed.vertices, &self.model.faces);
-        let each = posed.vertices.iter().zip(&normals).zip(&self.clothes);
-        let dressed = each.map(|((v, n), c)| *v + *c * n.normalize_or_zero()).collect();
+        let dressed = dressed(&posed.vertices, &normals, &self.clothes);
         Moment { shape, posed, dressed }
     }
 
