@@ -38,9 +38,11 @@ pub(crate) fn seen(
     anchors: &[Anchor],
 ) -> Result<Vec<(Seen, usize)>, Error> {
     let camera = &view.camera;
+    // Those of the body, by which it is lit.
+    let normals = vertex_normals(&view.posed.vertices, faces);
     let mut posed = Cow::Borrowed(&view.posed.vertices[..]);
     if !clothes.is_empty() {
-        posed = dressed(&posed, &vertex_normals(&posed, faces), clothes).into();
+        posed = dressed(&posed, &normals, clothes).into();
     }
     let mesh = RayMesh::new(&posed, faces)?;
     let usable: Vec<bool> = pixels.mask.iter().map(|&m| m > 0.5).collect();
@@ -48,7 +50,6 @@ pub(crate) fn seen(
     let visible = visibility::visible_vertices(&mesh, &points, &pinhole(camera), Some(&usable));
     let unusable: Vec<bool> = usable.iter().map(|usable| !usable).collect();
     let depth = squared_distance(&unusable, camera.width as usize);
-    let normals = match std::env::var_os("UNDRESSED") { Some(_) => vertex_normals(&view.posed.vertices, faces), None => vertex_normals(&posed, faces) };
     let color = |v: usize| {
         let at = visible[v].then(|| camera.project(points[v])).flatten()?;
         let pixel = at.y as usize * camera.width as usize + at.x as usize;
