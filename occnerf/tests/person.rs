@@ -67,7 +67,9 @@ fn a_capture_gets_the_bodies_that_a_run_was_trained_with() {
     Person::save(&dir.path(""), &scene.capture, body(), &PriorColors::measure(&scene).unwrap()).unwrap();
     let mut restored = given.clone();
     assert!(Person::restore(&dir.path(""), &mut restored, body()).unwrap());
+    assert!(restored.clothes == scene.capture.clothes && restored.clothes.iter().any(|&c| c != 0.0));
     let again = Scene::new(&restored, body(), &config).unwrap();
+    assert_eq!(again.colors().unwrap(), scene.colors().unwrap());
     for (a, b) in scene.train.iter().chain(&scene.eval).zip(again.train.iter().chain(&again.eval)) {
         assert_eq!((&a.view.posed, &a.labels), (&b.view.posed, &b.labels));
     }

@@ -79,6 +79,7 @@ mod tests {
     use crate::capture::{DemoConfig, demo};
     use crate::config::{Config, Method, Preset};
     use crate::random::Stream;
+    use crate::scene::prepared::PreparedFrame;
 
     /// Where the segment from `from` to `to` crosses a triangle, as a part of its length.
     fn crossing(from: DVec3, to: DVec3, [a, b, c]: [DVec3; 3]) -> Option<f64> {
@@ -97,23 +98,40 @@ mod tests {
         let demo_config = DemoConfig { size: 96, frames: 6, eval_cameras: 0, ..DemoConfig::default() };
         let mut config = Config::preset(Preset::Fast, Method::Prior);
         (config.registration.rounds, config.field.prior_light) = (0, false);
-        let scene = Scene::new(&demo(&demo_config, &body).unwrap(), &body, &config).unwrap();
-        let found = PriorColors::measure(&scene).unwrap();
+        let mut scene = Scene::new(&demo(&demo_config, &body).unwrap(), &body, &config).unwrap();
+        assert!(scene.clothes.is_empty());
+        compare(&scene, &vec![0.0; body.num_vertices()]);
+        // Clothes stand off up to 3 cm, and some of what the body shows is hidden behind them.
+        let mut random = Stream::new(&[9]);
+        scene.clothes = (0..body.num_vertices()).map(|_| 0.03 * random.uniform()).collect();
+        compare(&scene, &scene.clothes);
+    }
+
+    /// Compares the colours of some places with those that a loop over all pictures and faces finds.
+    fn compare(scene: &Scene, clothes: &[f32]) {
+        let found = PriorColors::measure(scene).unwrap();
         assert!(found.mesh.times() > 0 && found.colors.len() == found.mesh.anchors.len());
         let mut random = Stream::new(&[8]);
+        let dressed = |frame: &PreparedFrame| -> (Vec<Vec3>, Vec<Vec3>) {
+            let normals = surface_query::vertex_normals(&frame.view.posed.vertices, &scene.body.model.faces);
+            let moved = |v: usize| frame.view.posed.vertices[v] + clothes[v] * normals[v].normalize_or_zero();
+            ((0..normals.len()).map(moved).collect(), normals)
+        };
+        let frames: Vec<(&PreparedFrame, (Vec<Vec3>, Vec<Vec3>))> =
+            scene.train.iter().map(|frame| (frame, dressed(frame))).collect();
         let (mut wrong, mut shown, mut hidden) = (0, 0, 0);
         for _ in 0..150 {
             let v = random.below(found.colors.len());
             let anchor = &found.mesh.anchors[v];
             let (mut sum, mut weights) = (DVec3::ZERO, 0.0);
-            for frame in &scene.train {
+            for (frame, (vertices, normals)) in &frames {
                 let (view, pixels) = (&frame.view, frame.pixels().unwrap());
-                let place = anchor.mix(&view.posed.vertices);
+                let place = anchor.mix(vertices);
                 let Some(at) = view.camera.project(place) else { continue };
                 let pixel = at.y as usize * view.camera.width as usize + at.x as usize;
                 let coverage = pixels.mask.get(pixel).copied().unwrap_or(0.0);
                 let eye = view.camera.centre_of_projection();
-                let corner = |&v: &u32| view.posed.vertices[v as usize].as_dvec3();
+                let corner = |&v: &u32| vertices[v as usize].as_dvec3();
                 let before = |face: &[u32; 3]| {
                     let crossing = crossing(eye.as_dvec3(), place.as_dvec3(), face.each_ref().map(corner));
                     crossing.is_some_and(|t| t > 0.0 && t < 1.0 - 1e-4)
@@ -121,8 +139,8 @@ mod tests {
                 if coverage <= 0.5 || scene.body.model.faces.iter().any(before) {
                     continue;
                 }
-                let normals = surface_query::vertex_normals(&view.posed.vertices, &scene.body.model.faces);
-                let slant = anchor.mix(&normals).normalize_or_zero().dot((eye - place).normalize_or_zero()).max(SLANT);
+                let towards = (eye - anchor.mix(&view.posed.vertices)).normalize_or_zero();
+                let slant = anchor.mix(normals).normalize_or_zero().dot(towards).max(SLANT);
                 let color = Vec3::from_slice(&pixels.image.pixels[3 * pixel..]) / coverage;
                 (sum, weights) = (sum + f64::from(slant) * color.as_dvec3(), weights + f64::from(slant));
             }

@@ -64,7 +64,15 @@ pub(super) fn load(dir: &Path, body: &BodyModel, options: &LoadOptions) -> Resul
             frames.push(EvalFrame { camera_name: camera_name.clone(), train_index, frame });
         }
     }
-    Ok(Capture { name: file_name(dir), train, eval: frames, mean_betas, registered: false, clothes: Vec::new(), mended: false })
+    Ok(Capture {
+        name: file_name(dir),
+        train,
+        eval: frames,
+        mean_betas,
+        registered: false,
+        clothes: Vec::new(),
+        mended: false,
+    })
 }
 
 fn index(names: &[impl AsRef<str>], name: &str) -> Option<usize> {
