@@ -25,9 +25,9 @@ const SLANT: f32 = 0.05;
 const TOGETHER: usize = 8;
 
 impl PriorColors {
-    /// The colours that are closest to the visible training pixels that saw a place, by ray
-    /// casting, each by the cosine of its slant, under the light of the scene if the configuration asks
-    /// for one. A vertex that no frame saw takes a mean of those that some saw, by their canonical
+    /// The colours that are closest to the visible training pixels that saw a place of the prior, or of
+    /// its clothes where registration has found them, by ray casting, each by the cosine of its
+    /// slant, under the light of the scene if the configuration asks for one. A vertex that no frame saw takes a mean of those that some saw, by their canonical
     /// distances, along the stripes if there are any, other places what lies between their
     /// vertices. Pixels at the edge of masks do not count where they show what is beside the person.
     ///
@@ -117,8 +117,7 @@ mod tests {
             let moved = |v: usize| frame.view.posed.vertices[v] + clothes[v] * normals[v].normalize_or_zero();
             ((0..normals.len()).map(moved).collect(), normals)
         };
-        let frames: Vec<(&PreparedFrame, (Vec<Vec3>, Vec<Vec3>))> =
-            scene.train.iter().map(|frame| (frame, dressed(frame))).collect();
+        let frames: Vec<_> = scene.train.iter().map(|frame| (frame, dressed(frame))).collect();
         let (mut wrong, mut shown, mut hidden) = (0, 0, 0);
         for _ in 0..150 {
             let v = random.below(found.colors.len());
