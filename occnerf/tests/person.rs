@@ -70,6 +70,10 @@ fn a_capture_gets_the_bodies_that_a_run_was_trained_with() {
     assert!(restored.clothes == scene.capture.clothes && restored.clothes.iter().any(|&c| c != 0.0));
     let again = Scene::new(&restored, body(), &config).unwrap();
     assert_eq!(again.colors().unwrap(), scene.colors().unwrap());
+    let mut bare = restored.clone();
+    bare.clothes = vec![0.0];
+    let refused = Scene::new(&bare, body(), &config).err().map(|e| e.to_string());
+    assert!(refused.is_some_and(|e| e.contains("clothes are 1 numbers")));
     for (a, b) in scene.train.iter().chain(&scene.eval).zip(again.train.iter().chain(&again.eval)) {
         assert_eq!((&a.view.posed, &a.labels), (&b.view.posed, &b.labels));
     }

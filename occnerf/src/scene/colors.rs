@@ -25,11 +25,12 @@ const SLANT: f32 = 0.05;
 const TOGETHER: usize = 8;
 
 impl PriorColors {
-    /// The colours that are closest to the visible training pixels that saw a place of the prior, or of
-    /// its clothes where registration has found them, by ray casting, each by the cosine of its
-    /// slant, under the light of the scene if the configuration asks for one. A vertex that no frame saw takes a mean of those that some saw, by their canonical
-    /// distances, along the stripes if there are any, other places what lies between their
-    /// vertices. Pixels at the edge of masks do not count where they show what is beside the person.
+    /// The colours that are closest to the visible training pixels that saw a place of the prior, or
+    /// of its clothes where registration has found them, by ray casting, each by the cosine of its
+    /// slant, under the light of the scene if the configuration asks for one. A vertex that no frame
+    /// saw takes a mean of those that some saw, by their canonical distances, along the stripes if
+    /// there are any, other places what lies between their vertices. Pixels at the edge of masks do
+    /// not count where they show what is beside the person.
     ///
     /// # Errors
     /// Pictures that cannot be read.

@@ -95,6 +95,11 @@ impl Scene {
             let (name, at, frames) = (&lost.frame.name, lost.train_index, capture.train.len());
             return Err(Error::Scene(format!("view {name} is of training frame {at}, expected one of {frames}")));
         }
+        let (clothes, vertices) = (&capture.clothes, model.num_vertices());
+        if !(clothes.is_empty() || clothes.len() == vertices && clothes.iter().all(|c| c.is_finite())) {
+            let found = clothes.len();
+            return Err(Error::Scene(format!("clothes are {found} numbers, expected none or {vertices}, all finite")));
+        }
         let mut capture = capture.clone();
         if config.registration.rounds > 0 {
             if !capture.mended {
