@@ -147,9 +147,11 @@ fn words(text: &[&str]) -> Vec<String> {
 
 fn capture(folder: &Path) -> PathBuf {
     let path = folder.join("capture");
-    done(&["synth", "--out", text(&path), "--size", "32", "--frames", "4", "--eval-cameras", "1"]);
+    done(&[&["synth", "--out", text(&path)], &TINY[..]].concat());
     path
 }
+
+const TINY: [&str; 6] = ["--size", "32", "--frames", "4", "--eval-cameras", "1"];
 
 const QUICK: [&str; 8] = ["--preset", "fast", "--method", "hash-point", "--set", "samples=8", "--set", "patches=1"];
 
@@ -206,9 +208,11 @@ fn scoring_and_tables_killed_at_any_moment_are_whole_or_absent() {
     let reproduce = |out: &Path| {
         words(&["reproduce", text(&capture), "--out", text(out), "--steps", "20", "--seeds", "1", "--rows", rows])
     };
+    let zju = folder.join("zju");
+    done(&[&["synth", "--format", "zju-mocap", "--out", text(&zju)], &TINY[..]].concat());
     let sweep = |out: &Path| {
         let side = ["--side", "24", "--steps", "1", "--out", text(out)];
-        words(&[&["bench", "stability", "--quick", "--axes", "limbs pressed"][..], &side].concat())
+        words(&[&["bench", "stability", text(&zju), "--quick", "--axes", "hidden"][..], &side].concat())
     };
     let synth = |out: &Path| words(&["synth", "--force", "--out", text(out), "--size", "32", "--frames", "4"]);
     let glb = run.join("person.glb");

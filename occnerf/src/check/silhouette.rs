@@ -40,13 +40,15 @@ fn fill([a, b, c]: [Vec2; 3], width: usize, height: usize, covered: &mut [bool])
     let first = |x: f32| (x - 0.5).ceil().max(0.0) as usize;
     let after = |x: f32, most: usize| ((x - 0.5).floor() + 1.0).max(0.0).min(most as f32) as usize;
     for y in first(low.y)..after(high.y, height) {
-        for x in first(low.x)..after(high.x, width) {
-            let p = Vec2::new(x as f32 + 0.5, y as f32 + 0.5);
-            let inside =
-                (b - a).perp_dot(p - a) >= 0.0 && (c - b).perp_dot(p - b) >= 0.0 && (a - c).perp_dot(p - c) >= 0.0;
-            if inside {
-                covered[y * width + x] = true;
-            }
+        let inside = |x: &usize| {
+            let p = Vec2::new(*x as f32 + 0.5, y as f32 + 0.5);
+            (b - a).perp_dot(p - a) >= 0.0 && (c - b).perp_dot(p - b) >= 0.0 && (a - c).perp_dot(p - c) >= 0.0
+        };
+        // Each side changes its sign once along a row, whatever the rounding.
+        let mut row = first(low.x)..after(high.x, width);
+        if let Some(start) = row.find(inside) {
+            let end = row.rev().find(inside).unwrap_or(start);
+            covered[y * width + start..=y * width + end].fill(true);
         }
     }
 }
