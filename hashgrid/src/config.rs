@@ -95,7 +95,7 @@ pub enum Error {
     /// `levels` is 0, or there are no resolutions.
     #[error("a hash grid needs at least one level")]
     NoLevels,
-    /// Most levels.
+    /// More levels than a grid can have.
     #[error("{levels} levels, at most {most}")]
     TooManyLevels {
         /// The levels asked for.
@@ -136,7 +136,7 @@ pub enum Error {
     /// All levels together are larger than [`MAX_PARAMETERS`].
     #[error("{parameters} parameters, at most {MAX_PARAMETERS}")]
     TooManyParameters {
-        /// The numbers the table would hold.
+        /// The numbers that the table would hold up to the first level beyond the limit.
         parameters: u64,
     },
 }

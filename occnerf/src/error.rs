@@ -32,7 +32,7 @@ pub enum Error {
     /// Pictures or weights that LPIPS cannot take.
     #[error("LPIPS: {0}")]
     Lpips(String),
-    /// An avatar that cannot be made, or not in the form that is asked for.
+    /// An avatar that cannot be written in the form that is asked for.
     #[error("{0}")]
     Bake(String),
     /// A training whose numbers have grown beyond all bounds.

@@ -13,7 +13,7 @@ const STEPS: u64 = 8;
 
 /// A capture on disk, read with room for so many bytes of pictures and to decode one.
 fn read(dir: &TempDir, body: &BodyModel, room: u64) -> Capture {
-    let bodies = 8 * body.num_vertices() as u64 * 36;
+    let bodies = 8 * body.num_vertices() as u64 * 24;
     let picture = u64::from(SIZE * SIZE) * 16;
     let max_bytes = bodies + 4 * picture.div_ceil(42) + 3 * picture + room;
     load_capture(&dir.path("capture"), body, &LoadOptions { max_bytes, ..LoadOptions::default() }).unwrap()

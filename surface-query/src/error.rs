@@ -21,7 +21,7 @@ pub enum Error {
     /// A nearest-vertex structure needs at least one vertex.
     #[error("no vertices")]
     NoVertices,
-    /// The mesh has more vertices or faces than a `u32` counts.
+    /// The mesh has more vertices or faces than are supported.
     #[error("{count} elements, at most 2^31 are supported")]
     TooMany {
         /// Their number.

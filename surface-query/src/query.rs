@@ -12,7 +12,7 @@ use crate::{Error, Pyramid, vertex_normals};
 pub struct SurfaceQueryConfig {
     /// Neighbours a level, 1 to 65536.
     pub k: usize,
-    /// Levels beyond the finest.
+    /// Levels beyond the finest, at most 32.
     pub coarse_levels: usize,
     /// Size of a level as a share of the one above it, in (0, 1].
     pub ratio: f32,

@@ -12,8 +12,8 @@ use occnerf::{
     checkpoint_config,
 };
 
-/// Every method with both kinds of motion, and the paper's blended distances with its learnable
-/// volume.
+/// Every method that has a field, the main ones with both kinds of motion, and the paper's blended
+/// distances with its learnable volume.
 fn configs() -> Vec<Config> {
     let kinds = [MotionKind::Surface, MotionKind::Volume];
     let mut configs: Vec<Config> =
@@ -21,6 +21,7 @@ fn configs() -> Vec<Config> {
     let mut paper = tiny(Method::Occnerf, MotionKind::Volume);
     paper.surface.distance = DistanceKind::Blended;
     configs.push(paper);
+    configs.extend([Method::NeuralBody, Method::SelfNerf].map(|method| tiny(method, MotionKind::Surface)));
     configs
 }
 

@@ -73,7 +73,8 @@ pub struct Composite {
 /// Composites the samples of one ray and writes their weights (S), w_i = α_i Π_{j<i} (1 − α_j) with
 /// α_i = f_i (1 − exp(−σ_i δ_i)) (Max 1995; the likelihood f as in HumanNeRF, 2022).
 ///
-/// Samples that are known to have α = 0 may be left out: the result is the same. A NaN in the
+/// Samples that are known to have α = 0 may be left out: but for the index of the
+/// termination the result is the same. A NaN in the
 /// inputs makes the colour NaN and never wins the termination.
 ///
 /// Transmittance below 1e-38 counts as 0.

@@ -2,6 +2,7 @@
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
+use std::sync::OnceLock;
 
 use anyhow::{Context, Result};
 
@@ -25,7 +26,7 @@ pub struct Section<'a> {
     pub charts: &'a [PathBuf],
 }
 
-/// Captures that settings were chosen on, with whatever a dash follows; `zju_demo` shows the person
+/// Captures that settings were chosen on, and names that go on with a dash; `zju_demo` shows the person
 /// of `humannerf_demo`.
 const TUNING: [&str; 3] = ["demo", "humannerf_demo", "zju_demo"];
 
@@ -60,7 +61,7 @@ pub fn publish(section: &Section<'_>) -> Result<()> {
 pub fn publish_table(table: &str) -> Result<()> {
     let document = Path::new(env!("CARGO_MANIFEST_DIR")).with_file_name("README.md");
     let old = std::fs::read_to_string(&document).with_context(|| document.display().to_string())?;
-    run::write(&document, &replaced(&old, "table", &format!("{table}\n{}\n", wrapped(&origin()))))?;
+    run::write(&document, &replaced(&old, "table", &format!("{table}\n{}\n", wrapped(origin()))))?;
     say!("published: {}", document.display());
     Ok(())
 }
@@ -111,8 +112,14 @@ fn demoted(text: &str) -> String {
     text.trim().lines().map(line).collect()
 }
 
-/// The command of this process, the commit that it was built from and the machine.
-fn origin() -> String {
+/// The command of this process, the commit that it was begun from and the machine.
+fn origin() -> &'static str {
+    // What is published changes the tree.
+    static ORIGIN: OnceLock<String> = OnceLock::new();
+    ORIGIN.get_or_init(found_origin)
+}
+
+fn found_origin() -> String {
     let arguments = std::env::args().skip(1).map(|argument| {
         // Paths say where somebody keeps files: of those the name is enough.
         let name = Path::new(&argument).file_name().map(|name| name.to_string_lossy().into_owned());

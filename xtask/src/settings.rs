@@ -14,8 +14,8 @@ const METHODS: &[(Method, &str)] = &[
     (Method::Occnerf, "Point term, and in `paper` the attended surface term"),
 ];
 const PRESETS: &[(Preset, &str)] = &[
-    (Preset::Fast, "A first look: about a minute"),
-    (Preset::Balanced, "The default: about two minutes"),
+    (Preset::Fast, "A first look: half a minute"),
+    (Preset::Balanced, "The default: about a minute"),
     (Preset::Paper, "The paper's method: under ten minutes"),
 ];
 const COMPONENTS: &[(Component, &str)] = &[

@@ -16,9 +16,8 @@ use super::{CaptureError, Frame, LoadOptions, checks};
 
 /// Bytes that a pixel of a frame takes: three colours and coverage.
 pub(super) const PIXEL_BYTES: u64 = 16;
-/// Bytes that a vertex of a frame's body takes once it is prepared: at rest, its pose offset, and
-/// posed.
-const VERTEX_BYTES: u64 = 36;
+/// Bytes that a vertex of a frame's body takes once it is prepared: its pose offset, and posed.
+const VERTEX_BYTES: u64 = 24;
 /// A training frame's labels take this part of the bytes of its pixels: see [`crate::Labels`].
 const LABELS_SHARE: u64 = 42;
 

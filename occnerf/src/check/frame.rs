@@ -8,7 +8,7 @@ use volrender::Camera;
 pub enum Fault {
     /// The mask shows nobody.
     EmptyMask,
-    /// The silhouette and the mask do not overlap.
+    /// The silhouette and the mask overlap too little.
     Overlap,
     /// The body moves much further than between other frames.
     PlaceJump,

@@ -2,7 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
-/// Which model is trained; every method shares data, sampler, renderer, losses and budget.
+/// Which model is trained; every method shares data, sampler, renderer, budget
+/// and the losses but completeness.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Method {
@@ -242,7 +243,7 @@ impl MotionConfig {
     }
 }
 
-/// Corrections of the prior before training, from the outlines of all frames; see
+/// Corrections of the prior before training, from outlines and colours of all frames; see
 /// [`crate::register`].
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]

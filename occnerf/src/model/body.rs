@@ -84,24 +84,17 @@ impl Body {
 
     /// The prior at a moment, normalised.
     pub fn pose(&self, moment: Moment<'_>) -> Posed {
-        self.shape_and_pose(moment).1
-    }
-
-    fn shape_and_pose(&self, moment: Moment<'_>) -> (Shaped, Posed) {
-        let mut shape = self.model.shaped(moment.betas);
-        let mut posed = self.model.pose(&shape, moment.pose, moment.placement);
-        shape.vertices.iter_mut().chain(&mut shape.joints).for_each(|v| *v *= self.scale);
+        let mut posed = self.model.pose(&self.model.shaped(moment.betas), moment.pose, moment.placement);
         let Posed { vertices, joints, pose_offsets, .. } = &mut posed;
         vertices.iter_mut().chain(joints).chain(pose_offsets).for_each(|v| *v *= self.scale);
         posed.bones.iter_mut().for_each(|b| b.translation *= self.scale);
-        (shape, posed)
+        posed
     }
 
     /// The training frame `instant` as `camera` (of the capture) sees it.
     pub(crate) fn view(&self, camera: &Camera, instant: usize, moment: Moment<'_>) -> PosedView {
-        let (shape, posed) = self.shape_and_pose(moment);
         let camera = normalised_camera(camera, self.scale);
-        PosedView { camera, instant: Some(instant), posed, shape: Arc::new(shape) }
+        PosedView { camera, instant: Some(instant), posed: self.pose(moment) }
     }
 
     /// The canonical rest pose: no joint turned, the pelvis where the body model has it.

@@ -19,7 +19,7 @@ pub struct StepTimes {
     pub losses: f64,
     /// Perceptron and surface term, backward.
     pub perceptron_backward: f64,
-    /// Weight volume, pose corrections, and the encoding with respect to its coordinates.
+    /// Weight volume, and the encoding with respect to its coordinates.
     pub motion_backward: f64,
     /// Hash grid with respect to its table, and the vertices of the surface term.
     pub encode_backward: f64,

@@ -219,15 +219,15 @@ impl Model {
         }
     }
 
-    /// The world's upward direction: the mean direction from the pelvis to the head over the
-    /// training frames.
+    /// The world's upward direction: the axis that is nearest to the mean direction from the pelvis
+    /// to the head over the training frames.
     pub fn up(&self) -> Vec3 {
         upright(&self.body, self.frames.iter().map(Arc::as_ref))
     }
 }
 
-/// The axis of the world that the bodies of `views` stand along, upwards: the mean direction from
-/// the pelvis to the head.
+/// The axis of the world, and its sense, that is nearest to the mean direction from the pelvis to
+/// the head of the bodies of `views`.
 pub fn upright<'a>(body: &Body, views: impl Iterator<Item = &'a PosedView>) -> Vec3 {
     let joints = &body.canonical.joints;
     let head = (0..joints.len()).max_by(|&a, &b| joints[a].y.total_cmp(&joints[b].y)).unwrap_or(0);

@@ -1,9 +1,7 @@
 //! A posed body before a camera: all that a picture of a model needs to know of its moment.
 
-use std::sync::Arc;
-
 use glam::Vec3;
-use smpl::{Posed, Shaped};
+use smpl::Posed;
 use volrender::{Aabb, Camera, Ray};
 
 /// A pose and a camera, lengths normalised.
@@ -11,20 +9,17 @@ use volrender::{Aabb, Camera, Ray};
 pub struct PosedView {
     /// The camera.
     pub camera: Camera,
-    /// Index of the training frame of the same instant, whose learnt pose correction holds for
-    /// this view too; `None` for poses that no training frame has.
+    /// Index of the training frame of the same instant; `None` for poses that no training frame
+    /// has.
     pub instant: Option<usize>,
-    /// The posed prior as handed in.
+    /// The posed prior.
     pub posed: Posed,
-    /// Its body at rest; empty where `instant` is `None`.
-    pub shape: Arc<Shaped>,
 }
 
 impl PosedView {
     /// A pose that no training frame has, before `camera`.
     pub fn new(camera: &Camera, posed: Posed) -> Self {
-        let shape = Arc::new(Shaped { vertices: Vec::new(), joints: Vec::new() });
-        Self { camera: *camera, instant: None, posed, shape }
+        Self { camera: *camera, instant: None, posed }
     }
 
     /// The same moment before another camera.

@@ -1,7 +1,7 @@
 //! Every reader of somebody else's files, on damaged ones: no panic, no hang, and no more memory
 //! than is said.
 //!
-//! A few thousand inputs by default; `FUZZ=1000000 cargo test -p testkit --test fuzz -- --nocapture`
+//! 20 000 inputs by default; `FUZZ=1000000 cargo test -p testkit --test fuzz -- --nocapture`
 //! for a million and a table. Input number n of a reader is the same on every machine;
 //! one that fails is left in `target/tmp`.
 #![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]

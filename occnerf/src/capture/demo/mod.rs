@@ -52,7 +52,7 @@ pub struct DemoConfig {
     /// Standard deviation of the prior's error in each shape coefficient.
     pub beta_noise: f32,
     /// Part of the subject's pixels in the occluded frames that are hidden, 0 (no obstacle) to
-    /// below 1.
+    /// 0.95.
     pub occluded_fraction: f32,
     /// Part of the training video, from its start, that is occluded, 0 to 1.
     pub occluded_share: f32,

@@ -56,9 +56,9 @@ use super::CaptureError;
 pub struct Imported {
     /// Who wrote the fit.
     pub tool: Tool,
-    /// The person's id, and frames of the capture.
+    /// The person's id.
     pub person: String,
-    /// As many as there are in the capture.
+    /// Frames of the capture.
     pub frames: usize,
     /// The other people: ids, and the frames that each is in.
     pub others: Vec<(String, usize)>,

@@ -136,9 +136,9 @@ fn stride_and_limit_keep_frames_and_their_views_together() {
 #[test]
 fn memory_beyond_the_bound_names_options_that_fit() {
     let (dir, _) = fixture("wild-memory");
-    // 4 + 2 frames whose bodies have 8 vertices of 36 bytes, labels of 4 frames, and 24 pixels of
+    // 4 + 2 frames whose bodies have 8 vertices of 24 bytes, labels of 4 frames, and 24 pixels of
     // 48 bytes to decode.
-    let fits = LoadOptions { max_bytes: 6 * 8 * 36 + 4 * 10 + 24 * 48, ..LoadOptions::default() };
+    let fits = LoadOptions { max_bytes: 6 * 8 * 24 + 4 * 10 + 24 * 48, ..LoadOptions::default() };
     assert!(load_capture(dir.path(), &body(), &fits).is_ok());
     let tight = LoadOptions { max_bytes: fits.max_bytes - 1, ..fits };
     let message = load_capture(dir.path(), &body(), &tight).unwrap_err().to_string();
@@ -162,7 +162,7 @@ fn memory_beyond_the_bound_names_options_that_fit() {
 #[test]
 fn what_is_not_in_memory_is_read_when_asked_for() {
     let (dir, _) = fixture("wild-demand");
-    let least = 6 * 8 * 36 + 4 * 10 + 24 * 48;
+    let least = 6 * 8 * 24 + 4 * 10 + 24 * 48;
     let reread = |room: u64| {
         (0..4).for_each(|i| dir.stripe(&format!("images/{i:02}.png"), SIZE, 200));
         let options = LoadOptions { max_bytes: least + room, ..LoadOptions::default() };

@@ -221,7 +221,7 @@ fn pictures_decoded_on_demand_are_those_decoded_at_once() {
             };
             let read = |options: &LoadOptions| load_capture(dir.path(), &body, options).unwrap();
             let all = read(&at_once);
-            let bodies = (all.train.len() + all.eval.len()) * body.num_vertices() * 36;
+            let bodies = (all.train.len() + all.eval.len()) * body.num_vertices() * 24;
             let picture = 40 * 40 * 16usize;
             let labels = all.train.len() * picture.div_ceil(42);
             // Room for the pictures of two frames, and to decode another.
