@@ -1,8 +1,6 @@
 //! The shaped body that everything hangs on: its canonical surface with the searches over it, and
 //! the prior in any pose.
 
-use std::sync::Arc;
-
 use glam::Vec3;
 use smpl::{BodyModel, Posed, Shaped};
 use surface_query::{MeshDistance, SurfaceQuery, SurfaceQueryConfig};
