@@ -87,10 +87,17 @@ fn a_capture_gets_the_bodies_that_a_run_was_trained_with() {
     assert!(error.contains("person.safetensors") && error.contains("betas"), "{error}");
     let again = Scene::new(&with_more, &more, &config).unwrap();
     assert_eq!(again.train[0].view.posed, scene.train[0].view.posed);
-    // A capture of other frames keeps its own.
-    let mut other = given.clone();
+    // A capture of other frames is another.
+    let (mut other, mut larger) = (given.clone(), given.clone());
     other.train.pop();
-    assert!(!Person::restore(&dir.path(""), &mut other, body()).unwrap() && !other.registered);
+    larger.train[1].camera = larger.train[1].camera.resized(99, 98);
+    for (capture, words) in [(other, "frames, the capture has"), (larger, "the capture in (99, 98)")] {
+        let mut kept = capture.clone();
+        let error = Person::restore(&dir.path(""), &mut kept, body()).unwrap_err().to_string();
+        assert!(error.contains(PERSON) && error.contains(words), "{error}");
+        assert!(!kept.registered && kept.train[0].placement == capture.train[0].placement);
+    }
+    assert!(!Person::restore(&dir.path("elsewhere"), &mut given.clone(), body()).unwrap());
 }
 
 #[test]

@@ -49,7 +49,7 @@ impl MotionClip {
         let key = rates.into_iter().find(|r| npz.keys().iter().any(|k| k == r)).unwrap_or("fps");
         let rate = npz.array(key)?.to_f64();
         let fps = match rate.as_slice() {
-            [rate] if *rate > 0.0 && *rate <= 1e6 => *rate as f32,
+            [rate] if (1e-3..=1e6).contains(rate) => *rate as f32,
             _ => return Err(Error::invalid(&file, key, format!("{rate:?} frames a second"))),
         };
         let vectors = |values: Vec<f32>| values.chunks_exact(3).map(Vec3::from_slice).collect::<Vec<_>>();

@@ -112,6 +112,7 @@ fn wrong_clips_are_refused() {
         ("trans", floats(&[2, 3], &[-1e38; 6])),
         ("fps", floats(&[], &[0.0])),
         ("fps", floats(&[], &[-30.0])),
+        ("fps", floats(&[], &[1e-40])),
         ("fps", floats(&[], &[f32::NAN])),
         ("fps", floats(&[2], &[30.0, 30.0])),
     ] {

@@ -3,15 +3,18 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, ensure};
-use occnerf::Model;
 use occnerf::bake::{Avatar, Clip, export};
+use occnerf::{Method, Model};
 use smpl::MotionClip;
 
 use crate::baked;
+use crate::run::RunConfig;
 
 /// The baked person of a run: see [`baked::avatar`].
 pub fn of_run(run: &Path) -> Result<Avatar> {
     ensure!(run.is_dir(), "{}: no such run", run.display());
+    let has_none = RunConfig::read(run).is_ok_and(|run| run.train.method == Method::Prior);
+    ensure!(!has_none, "{} has no field to bake", run.display());
     match baked::fresh(run)? {
         Some(avatar) => Ok(avatar),
         None => baked::avatar(run, &Model::load(run)?),

@@ -8,7 +8,7 @@ use occnerf::capture::{self, ImportOptions, Imported};
 
 use crate::check::{self, CheckArguments};
 use crate::process::{results_in, say};
-use crate::synth::{beside, take_place, vacant};
+use crate::synth::{beside, not_within, take_place, vacant};
 
 /// What a finished directory holds, and nothing else does.
 const MARK: &str = "import.json";
@@ -99,6 +99,9 @@ pub fn import(arguments: &ImportArguments) -> Result<()> {
     {
         if let Some(path) = path.filter(|path| !path.exists()) {
             bail!("{}: no such file or directory ({what})", path.display());
+        }
+        if let Some(path) = path {
+            not_within(path, out, what)?;
         }
     }
     let partial = beside(out, "partial")?;

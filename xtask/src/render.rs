@@ -99,9 +99,10 @@ pub fn render(arguments: &RenderArguments) -> Result<()> {
     let name = format!("{:?}", arguments.what).to_lowercase();
     let out = arguments.out.clone().unwrap_or_else(|| directory.join("renders").join(&name));
     make_directory(&out)?;
-    let bar = ProgressBar::new(views.len() as u64);
-    let drawn = views.iter().enumerate().map(|(i, view)| {
-        let rendering = renderer.render(view, Vec3::splat(1.0))?;
+    let count = views.len();
+    let bar = ProgressBar::new(count as u64);
+    let drawn = views.enumerate().map(|(i, view)| {
+        let rendering = renderer.render(&view, Vec3::splat(1.0))?;
         let picture = pictures::to_rgb(&rendering.image);
         pictures::save(&picture, &out.join(format!("{i:04}.png")))?;
         bar.inc(1);
@@ -109,7 +110,7 @@ pub fn render(arguments: &RenderArguments) -> Result<()> {
     });
     let path = video::film(drawn, arguments.format, FPS, &out.join(&name))?;
     bar.finish_and_clear();
-    say!("{} pictures and {}", views.len(), path.as_ref().unwrap_or(&out).display());
+    say!("{count} pictures and {}", path.as_ref().unwrap_or(&out).display());
     Ok(())
 }
 
@@ -123,32 +124,38 @@ fn parse_size(text: &str) -> Result<(u32, u32)> {
     Ok((side(width)?, side(height)?))
 }
 
-fn views(
-    body: &Body,
-    frames: &[Arc<PosedView>],
+/// Views, each made when it is drawn: those of a long motion together would fill the memory.
+type Views<'a> = Box<dyn ExactSizeIterator<Item = PosedView> + 'a>;
+
+fn views<'a>(
+    body: &'a Body,
+    frames: &'a [Arc<PosedView>],
     arguments: &RenderArguments,
     size: Option<(u32, u32)>,
-) -> Result<Vec<PosedView>> {
-    let resized = |camera: &Camera| size.map_or(*camera, |(w, h)| camera.resized(w, h));
+) -> Result<Views<'a>> {
+    let resized = move |camera: &Camera| size.map_or(*camera, |(w, h)| camera.resized(w, h));
     let frame = &frames[arguments.frame];
-    let turn = |count: usize| (0..count).map(move |i| i as f32 / count as f32 * std::f32::consts::TAU);
-    let angles = turn(TURN);
+    let angle = |i: usize, count: usize| i as f32 / count as f32 * std::f32::consts::TAU;
+    let angles = (0..TURN).map(move |i| angle(i, TURN));
     // The camera of a frame, gone about the vertical through the body.
     let up = upright(body, frames.iter().map(Arc::as_ref));
-    let around = |frame: &PosedView, angle: f32| {
+    let around = move |frame: &PosedView, angle: f32| {
         let (turn, centre) = (Mat3::from_axis_angle(up, angle), frame.centre());
         let mut camera = frame.camera;
         camera.world_to_camera *= Affine3A::from_mat3_translation(turn, centre - turn * centre);
         frame.seen_by(&resized(&camera))
     };
     Ok(match arguments.what {
-        What::Movement => frames.iter().map(|f| f.seen_by(&resized(&f.camera))).collect(),
-        What::Freeview => angles.map(|angle| around(frame, angle)).collect(),
-        What::Allview => frames.iter().zip(turn(frames.len())).map(|(f, angle)| around(f, angle)).collect(),
+        What::Movement => Box::new(frames.iter().map(move |f| f.seen_by(&resized(&f.camera)))),
+        What::Freeview => Box::new(angles.map(move |angle| around(frame, angle))),
+        What::Allview => {
+            let count = frames.len();
+            Box::new(frames.iter().enumerate().map(move |(i, f)| around(f, angle(i, count))))
+        }
         What::Tpose => {
             let rest = PosedView::new(&frame.camera, body.rest());
             let centre = rest.centre();
-            angles.map(|angle| rest.seen_by(&resized(&camera_at(frame, centre, angle)))).collect()
+            Box::new(angles.map(move |angle| rest.seen_by(&resized(&camera_at(frame, centre, angle)))))
         }
         What::Pose => {
             let path = arguments.motion.as_deref().context("pose: --motion CLIP.npz says which poses")?;
@@ -156,13 +163,15 @@ fn views(
             let root = body.canonical.joints.first().map_or(Vec3::ZERO, |&joint| joint / body.scale);
             let motion =
                 fit_motion(&MotionClip::load(path)?, joints, root).with_context(|| path.display().to_string())?;
-            let view = |(pose, &translation): (&[Vec3], &Vec3)| {
+            let count = motion.trans.len();
+            let view = move |i: usize| {
+                let (pose, translation) = (&motion.poses[i * joints..][..joints], motion.trans[i]);
                 let placement = Placement::Pelvis { translation };
                 let posed = body.pose(Moment { betas: &body.mean_betas, pose, placement });
                 let view = PosedView::new(&frame.camera, posed);
                 view.seen_by(&resized(&camera_at(frame, view.centre(), 0.0)))
             };
-            motion.poses.chunks_exact(joints).zip(&motion.trans).map(view).collect()
+            Box::new((0..count).map(view))
         }
     })
 }

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, anyhow, bail, ensure};
 use occnerf::capture::LoadOptions;
-use occnerf::{Config, Person, SplitMetrics, replace_file};
+use occnerf::{Config, SplitMetrics, replace_file};
 use serde::{Deserialize, Serialize};
 
 use crate::process::{Lock, unwritten};
@@ -59,7 +59,7 @@ impl RunConfig {
     /// The capture that the run in `directory` was trained on, with the bodies that it trained with.
     pub fn source(&self, directory: &Path) -> Result<Source> {
         let mut source = source::load(Some(&self.scene), self.body.as_deref(), &self.load)?;
-        Person::restore(directory, &mut source.capture, &source.model)?;
+        source.restore(directory, &self.train)?;
         Ok(source)
     }
 }

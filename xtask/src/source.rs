@@ -10,7 +10,7 @@ use clap::{Args, ValueEnum};
 use occnerf::capture::{
     Capture, DemoConfig, LoadOptions, Perturbation, SynthConfig, Synthetic, demo, find_body, load_capture, own_body,
 };
-use occnerf::{Config, Scene};
+use occnerf::{Config, Person, Scene, mend_masks};
 use serde::Serialize;
 use serde_json::Value;
 use smpl::BodyModel;
@@ -35,6 +35,16 @@ pub struct Source {
 }
 
 impl Source {
+    /// Gives the capture the bodies that the run in `directory` was begun with, if it kept them: its
+    /// masks are mended before, by the bodies as they are given, as they were then.
+    pub fn restore(&mut self, directory: &Path, config: &Config) -> Result<()> {
+        if config.registration.rounds > 0 {
+            mend_masks(&mut self.capture, &self.model)?;
+        }
+        Person::restore(directory, &mut self.capture, &self.model)?;
+        Ok(())
+    }
+
     /// The capture made ready for a run. Bodies are registered once for all runs that ask for the
     /// same number of rounds one after another.
     ///

@@ -130,6 +130,11 @@ pub fn synth(arguments: &SynthArguments) -> Result<()> {
         bail!("{}: not a character; expected a .glb or .gltf", path.display());
     }
     vacant(out, arguments.force, MARK)?;
+    for (what, path) in [("the character", &arguments.character), ("--motion", &arguments.motion)] {
+        if let Some(path) = path {
+            not_within(path, out, what)?;
+        }
+    }
     let layout = match arguments.format {
         FormatName::Humannerf => Layout::HumanNerf,
         FormatName::ZjuMocap => Layout::ZjuMocap,
@@ -182,6 +187,13 @@ pub fn vacant(out: &Path, force: bool, mark: &str) -> Result<()> {
     Ok(())
 }
 
+/// Errors for something to read that lies in `out`, which goes where `out` is written anew.
+pub fn not_within(path: &Path, out: &Path, what: &str) -> Result<()> {
+    let (Ok(path), Ok(out)) = (path.canonicalize(), out.canonicalize()) else { return Ok(()) };
+    ensure!(!path.starts_with(&out), "{}: lies in --out, which is replaced ({what})", path.display());
+    Ok(())
+}
+
 /// Puts the complete directory `partial` where `out` is, an earlier result of the command that leaves
 /// `mark`, if anything.
 pub fn take_place(partial: &Path, out: &Path, force: bool, mark: &str) -> Result<()> {
@@ -192,7 +204,11 @@ pub fn take_place(partial: &Path, out: &Path, force: bool, mark: &str) -> Result
         // dares to replace.
         std::fs::rename(out, &old).map_err(unwritten(out))?;
     }
-    std::fs::rename(partial, out).map_err(unwritten(out))?;
+    if let Err(error) = std::fs::rename(partial, out) {
+        // What stood there stays.
+        let _ = std::fs::rename(&old, out);
+        return Err(unwritten(out)(error));
+    }
     if old.exists() { std::fs::remove_dir_all(&old).map_err(unwritten(&old)) } else { Ok(()) }
 }
 

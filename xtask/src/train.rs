@@ -148,7 +148,7 @@ fn resumed(arguments: &TrainArguments, directory: &Path) -> Result<Begun> {
     let scene = arguments.scene.as_deref().unwrap_or(&saved.scene);
     let body = arguments.body.as_deref().or(saved.body.as_deref());
     let mut source = source::load(Some(scene), body, &load)?;
-    Person::restore(directory, &mut source.capture, &source.model)?;
+    source.restore(directory, &config)?;
     Ok(Begun { directory: directory.to_owned(), source, config, _lock: lock })
 }
 

@@ -133,6 +133,8 @@ fn whatever_is_wrong_is_said_in_one_line() {
     for size in ["0x0", "100000x100000", "512x0", "many", "1x-1"] {
         refused(&["render", run_text, "tpose", "--size", size], &["--size"]);
     }
+    let png = run.join("person.png");
+    refused(&["export", run_text, "--format", "obj", "--out", text(&png)], &["person.png", "texture"]);
     // A file that was cut, and one that is something else.
     let whole = std::fs::read(run.join("avatar.safetensors")).unwrap();
     std::fs::write(run.join("avatar.safetensors"), &whole[..whole.len() / 2]).unwrap();

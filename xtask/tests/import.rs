@@ -35,6 +35,12 @@ fn a_newcomer_gets_a_person_with_three_commands() {
     let again = ["import", "--frames", text(&frames), "--fit", text(&fit), "--out", text(&capture)];
     refused(&again, &["--force"]);
     done(&[&again[..], &["--force"]].concat());
+    // What lies in the capture is not read while it is replaced.
+    let images = capture.join("images");
+    let count = || std::fs::read_dir(&images).unwrap().filter(|e| e.as_ref().unwrap().path().is_file()).count();
+    let own = ["import", "--force", "--frames", text(&images), "--fit", text(&fit), "--out", text(&capture)];
+    refused(&own, &["images", "--frames", "--out"]);
+    assert_eq!(count(), 18);
 }
 
 #[test]

@@ -64,6 +64,22 @@ fn scores_of_a_run_that_went_on_are_those_of_its_last_step() {
 }
 
 #[test]
+fn a_run_on_masks_that_are_too_small_goes_on_with_those_that_it_began_with() {
+    let folder = folder("mended-masks");
+    let (capture, whole, stopped) = (folder.join("capture"), folder.join("whole"), folder.join("stopped"));
+    let made = ["--size", "160", "--frames", "6", "--format", "ocmotion", "--occlusion", "objects"];
+    done(&[&["synth", "--out", text(&capture)], &made[..]].concat());
+    let wrong = ["--wrong-mask=-3", "--wrong-pose", "6"];
+    let quick = ["--preset", "fast", "--method", "hash-point", "--steps", "4"];
+    let train = |run| [&["train", text(&capture), "--out", run], &wrong[..], &quick].concat();
+    done(&train(text(&whole)));
+    done(&[&train(text(&stopped))[..], &["--stop-after", "2"]].concat());
+    done(&["train", "--resume", "--out", text(&stopped)]);
+    let [one, two] = [whole, stopped].map(|run| std::fs::read(run.join("checkpoint.safetensors")).unwrap());
+    assert!(one == two);
+}
+
+#[test]
 #[cfg(target_os = "linux")]
 fn training_says_before_it_begins_what_memory_it_takes() {
     let folder = folder("memory-said");

@@ -51,6 +51,13 @@ impl Layout {
     /// of a texel do not fit.
     pub fn new(vertices: &[Vec3], faces: &[[u32; 3]], shells: usize, texel: f32, most: u32) -> Option<Self> {
         let directions = directions(vertices, faces);
+        // Texels of which the whole square would not hold enough take memory and tell nothing.
+        let area = |face: &[u32; 3]| {
+            let [a, b, c] = face.map(|v| vertices[v as usize]);
+            0.5 * (b - a).cross(c - a).length()
+        };
+        let least = (shells as f32 * faces.iter().map(area).sum::<f32>()).sqrt() / most as f32;
+        let texel = texel.max(least);
         let charts = charts(vertices, faces, &directions, texel);
         let count = charts.iter().map(|c| c + 1).max().unwrap_or(0) as usize;
         let mut boxes = vec![(0, Vec2::INFINITY, Vec2::NEG_INFINITY); count];

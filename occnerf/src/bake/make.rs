@@ -7,7 +7,7 @@ use glam::{Affine3A, Vec2, Vec3};
 use smpl::{MotionClip, SparseRows};
 use volrender::Camera;
 
-use super::avatar::{Atlas, Avatar, Clip, MAX_SHELLS};
+use super::avatar::{Atlas, Avatar, Clip, MAX_JOINTS, MAX_SHELLS};
 use super::charts::Layout;
 use super::field::CanonicalField;
 use super::motion::{motion_of_bones, turn_upright};
@@ -93,6 +93,10 @@ pub fn bake(model: &Model, scene: Option<&Scene>, options: &BakeOptions) -> Resu
     }
     if !(options.fps > 0.0 && options.fps <= 1e6) {
         return refuse(format!("{} frames a second", options.fps));
+    }
+    let joints = model.body.model.num_joints();
+    if joints > MAX_JOINTS {
+        return refuse(format!("{joints} joints, at most {MAX_JOINTS}"));
     }
     let Some(pixel) = pixel_width(model.frames().iter().map(Arc::as_ref)) else {
         return refuse("no training frame has the body before its camera".to_owned());

@@ -208,6 +208,9 @@ fn an_atlas_that_is_too_small_has_wider_texels_and_degenerate_meshes_have_one_to
     let scene = scene(&Config::preset(Preset::Fast, Method::Occnerf));
     let layout = Layout::new(&scene.body.canonical.vertices, &scene.body.model.faces, 1, 1e-3, 512).unwrap();
     assert!(layout.side <= 512);
+    // As from pictures of millions of pixels, in no more memory.
+    let finest = Layout::new(&scene.body.canonical.vertices, &scene.body.model.faces, 1, 1e-6, 512).unwrap();
+    assert!(finest.side <= 512 && finest.charts == layout.charts);
     for (name, points) in testkit::strategy::degenerate_clouds() {
         if points.iter().all(|p| p.is_finite() && p.abs().max_element() < 1e6) {
             let n = points.len() as u32;

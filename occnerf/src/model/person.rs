@@ -8,10 +8,10 @@ use std::sync::Arc;
 
 use glam::{Affine3A, Vec2, Vec3};
 use smpl::{BodyModel, Placement};
-use volrender::Camera;
+use volrender::{Aabb, Camera};
 
 use crate::Error;
-use crate::capture::{Capture, Light};
+use crate::capture::{Capture, Frame, Light};
 use crate::config::Config;
 use crate::model::body::{Body, Moment};
 use crate::model::colors::PriorColors;
@@ -29,6 +29,9 @@ const VERSION: &str = "1";
 const CAMERA: usize = 16;
 /// Numbers of a placement: whether it is about the origin, rotation, translation.
 const PLACEMENT: usize = 7;
+/// Limits of what captures hold.
+const MAX_BETA: f32 = 1e3;
+const MAX_DISTANCE: f32 = 1e7;
 
 /// A person before anything is learnt.
 pub struct Person {
@@ -106,11 +109,11 @@ impl Person {
     }
 
     /// Gives `capture` the bodies and focal lengths of the run directory `run`, as registration has
-    /// corrected them;
-    /// false where it has none, or other frames.
+    /// corrected them; false where it has none. Masks that are to be mended have to be before
+    /// ([`crate::mend_masks`]), by the bodies as they were given.
     ///
     /// # Errors
-    /// [`Error::Io`] and [`Error::File`] for a file that is damaged.
+    /// [`Error::Io`] and [`Error::File`] for a file that is damaged, or of other frames.
     pub fn restore(run: &Path, capture: &mut Capture, model: &BodyModel) -> Result<bool, Error> {
         let path = run.join(PERSON);
         if !path.is_file() {
@@ -119,13 +122,21 @@ impl Person {
         let bytes = read(&path)?;
         let contents = Contents::parse(&path, &bytes, FORMAT, &[VERSION])?;
         let frames = capture.train.len();
-        if contents.require("frames")? != frames.to_string() {
-            return Ok(false);
+        let count = contents.require("frames")?;
+        if count != frames.to_string() {
+            return Err(contents.wrong(format!("is of {count} frames, the capture has {frames}: it is another")));
         }
         // The body may have had fewer shapes.
         let betas = contents.len("mean_betas").min(model.num_betas());
         let moments = moments(&contents, frames, (model.num_joints(), betas))?;
         let cameras = cameras(&contents, frames)?;
+        for (Frame { name, camera, .. }, of_run) in capture.train.iter().zip(&cameras) {
+            let [found, expected] = [camera, of_run].map(|camera| (camera.width, camera.height));
+            if found != expected {
+                let what = format!("has frame {name} in {expected:?} pixels, the capture in {found:?}: it is another");
+                return Err(contents.wrong(what));
+            }
+        }
         for ((frame, (pose, betas, placement)), camera) in capture.train.iter_mut().zip(&moments).zip(cameras) {
             (frame.pose, frame.betas, frame.placement) = (pose.clone(), betas.clone(), *placement);
             frame.camera.focal = camera.focal;
@@ -135,10 +146,12 @@ impl Person {
                 (view.frame.pose, view.frame.betas, view.frame.placement) = (pose.clone(), betas.clone(), *placement);
             }
         }
-        capture.mean_betas = contents.floats("mean_betas", betas)?;
+        capture.mean_betas = mean_betas(&contents, betas)?;
         // Runs of before clothes were kept have none.
         let has = contents.len("clothes") > 0;
         capture.clothes = if has { contents.floats("clothes", model.num_vertices())? } else { Vec::new() };
+        let Aabb { min, max } = Aabb::from_points(&model.v_template);
+        below(&contents, "clothes", &capture.clothes, (max - min).length())?;
         capture.registered = true;
         Ok(true)
     }
@@ -162,7 +175,7 @@ impl Person {
             contents.wrong(format!("header `frames` is {count:?}, expected a number of frames that fits the file"))
         })?;
         let betas = model.num_betas();
-        let body = Arc::new(Body::new(&model, &contents.floats("mean_betas", betas)?, config)?);
+        let body = Arc::new(Body::new(&model, &mean_betas(&contents, betas)?, config)?);
         let cameras = cameras(&contents, frames)?;
         let moments = moments(&contents, frames, (model.num_joints(), betas))?;
         let views = cameras.into_iter().zip(&moments).enumerate();
@@ -217,6 +230,8 @@ fn moments(contents: &Contents<'_>, frames: usize, (joints, betas): (usize, usiz
     let poses = triples(&contents.floats("poses", frames * joints * 3)?);
     let shapes = contents.floats("betas", frames * betas)?;
     let placements = contents.floats("placements", frames * PLACEMENT)?;
+    below(contents, "betas", &shapes, MAX_BETA)?;
+    below(contents, "placements", &placements, MAX_DISTANCE)?;
     let moment = |frame: usize| {
         let placement = &placements[frame * PLACEMENT..][..PLACEMENT];
         let (rotation, translation) = (Vec3::from_slice(&placement[1..]), Vec3::from_slice(&placement[4..]));
@@ -237,6 +252,20 @@ fn cameras(contents: &Contents<'_>, frames: usize) -> Result<Vec<Camera>, Error>
         camera(numbers, size).ok_or_else(|| contents.wrong(format!("`cameras` {frame} is no pinhole camera")))
     })
     .collect()
+}
+
+fn mean_betas(contents: &Contents<'_>, betas: usize) -> Result<Vec<f32>, Error> {
+    let values = contents.floats("mean_betas", betas)?;
+    below(contents, "mean_betas", &values, MAX_BETA)?;
+    Ok(values)
+}
+
+/// Errors for a number that nobody in a capture has.
+fn below(contents: &Contents<'_>, key: &str, values: &[f32], most: f32) -> Result<(), Error> {
+    match values.iter().find(|value| value.abs() > most) {
+        Some(value) => Err(contents.wrong(format!("`{key}` has {value}, expected numbers up to {most} either way"))),
+        None => Ok(()),
+    }
 }
 
 fn padded(values: &[f32], len: usize) -> Vec<f32> {

@@ -2,7 +2,10 @@
 
 use glam::Vec3;
 use smpl::Posed;
+use visibility::RayMesh;
 use volrender::{Aabb, Camera, Ray};
+
+use crate::Error;
 
 /// A pose and a camera, lengths normalised.
 #[derive(Clone, Debug)]
@@ -60,6 +63,19 @@ impl PosedView {
         let x1 = found[2].clamp(x0 + 1.0, width).ceil();
         let y1 = found[3].clamp(y0 + 1.0, height).ceil();
         [x0 as u32, y0 as u32, x1 as u32, y1 as u32]
+    }
+
+    /// Pixels (H × W) whose ray hits the prior.
+    pub(crate) fn silhouette(&self, faces: &[[u32; 3]]) -> Result<Vec<bool>, Error> {
+        let mesh = RayMesh::new(&self.posed.vertices, faces)?;
+        let (width, [x0, y0, x1, y1]) = (self.camera.width, self.body_box());
+        let pixels: Vec<u32> = (y0..y1).flat_map(|row| (x0..x1).map(move |column| row * width + column)).collect();
+        let ray = |&pixel: &u32| (self.pixel_ray(pixel).origin, self.pixel_ray(pixel).direction);
+        let mut hits = vec![None; pixels.len()];
+        mesh.first_hits(&pixels.iter().map(ray).collect::<Vec<_>>(), &mut hits);
+        let mut covered = vec![false; (width * self.camera.height) as usize];
+        pixels.iter().zip(&hits).for_each(|(&pixel, hit)| covered[pixel as usize] = hit.is_some());
+        Ok(covered)
     }
 }
 

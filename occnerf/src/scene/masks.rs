@@ -8,12 +8,11 @@
 use glam::Vec3;
 use rayon::prelude::*;
 use smpl::BodyModel;
-use visibility::RayMesh;
-use volrender::Camera;
 
 use crate::Error;
 use crate::capture::{Capture, Frame, Pixels};
 use crate::config::OccludedRule;
+use crate::model::view::PosedView;
 use crate::scene::labels::{Label, label_pixels, squared_distance};
 
 /// Frames that are looked at.
@@ -41,11 +40,11 @@ const PASSES: usize = 3;
 const NEAR: f32 = 0.1;
 
 /// Shrinks the masks of the training frames by as much as they are too large, or grows them by as
-/// much as they are too small.
+/// much as they are too small, as [`crate::Scene`] does before it registers bodies.
 ///
 /// # Errors
 /// Pictures that cannot be read.
-pub(crate) fn mend(capture: &mut Capture, model: &BodyModel) -> Result<(), Error> {
+pub fn mend_masks(capture: &mut Capture, model: &BodyModel) -> Result<(), Error> {
     capture.mended = true;
     let excess = excess(&capture.train)?;
     if excess == 0 {
@@ -126,7 +125,7 @@ fn free(frame: &Frame, pixels: &Pixels, model: &BodyModel, reach: u32, near: f32
     let depth = camera.world_to_camera.transform_point3(centre).z.max(1e-3);
     // Pixels of a metre of a body 1.7 high.
     let metre = (height(f32::max) - height(f32::min)) / 1.7 * camera.focal.x / depth;
-    let body = silhouette(&posed.vertices, &model.faces, camera)?;
+    let body = PosedView::new(camera, posed).silhouette(&model.faces)?;
     let reached = larger(&pixels.mask, width, reach as f32);
     let occluder = pixels.occluder.as_deref();
     let labels = label_pixels(OccludedRule::Unknown, &reached, &body, occluder, width, metre);
@@ -141,19 +140,6 @@ fn free(frame: &Frame, pixels: &Pixels, model: &BodyModel, reach: u32, near: f32
 fn larger(mask: &[f32], width: usize, by: f32) -> Vec<f32> {
     let inside: Vec<bool> = mask.iter().map(|&m| m > 0.5).collect();
     squared_distance(&inside, width).into_iter().map(|d| f32::from(d <= by * by)).collect()
-}
-
-fn silhouette(vertices: &[Vec3], faces: &[[u32; 3]], camera: &Camera) -> Result<Vec<bool>, Error> {
-    let mesh = RayMesh::new(vertices, faces)?;
-    let rays: Vec<(Vec3, Vec3)> = (0..camera.width * camera.height)
-        .map(|i| {
-            let ray = camera.ray((i % camera.width) as f32 + 0.5, (i / camera.width) as f32 + 0.5);
-            (ray.origin, ray.direction)
-        })
-        .collect();
-    let mut hits = vec![None; rays.len()];
-    mesh.first_hits(&rays, &mut hits);
-    Ok(hits.iter().map(Option::is_some).collect())
 }
 
 /// Sum of the changes of colour of the photograph across the lines from 12 pixels outside the mask to
@@ -233,7 +219,7 @@ mod tests {
             wrong.apply(&mut capture, &body).unwrap();
             let found = excess(&capture.train).unwrap() as i32;
             let spoilt = area(&capture);
-            mend(&mut capture, &body).unwrap();
+            mend_masks(&mut capture, &body).unwrap();
             println!("{mask_pixels} {ragged_pixels}: {found}");
             if mask_pixels < 2 {
                 // Those that are too small grow.
@@ -289,7 +275,7 @@ mod tests {
         let mut capture = demo(&config, &body).unwrap();
         Perturbation { mask_pixels: -2, ..Perturbation::NONE }.apply(&mut capture, &body).unwrap();
         let small = capture.clone();
-        mend(&mut capture, &body).unwrap();
+        mend_masks(&mut capture, &body).unwrap();
         let mut grown = 0;
         for (frame, small) in capture.train.iter().zip(&small.train) {
             let (frame, small) = (frame.shown(), small.shown());
@@ -308,7 +294,7 @@ mod tests {
         let config = DemoConfig { size: 32, frames: 2, eval_cameras: 1, ..DemoConfig::default() };
         let mut capture = demo(&config, &body).unwrap();
         Perturbation { mask_pixels: -40, ..Perturbation::NONE }.apply(&mut capture, &body).unwrap();
-        mend(&mut capture, &body).unwrap();
+        mend_masks(&mut capture, &body).unwrap();
         assert_eq!(excess(&capture.train).unwrap(), 0);
         assert_eq!(excess(&[]).unwrap(), 0);
     }

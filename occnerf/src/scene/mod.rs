@@ -4,7 +4,7 @@
 pub(crate) mod colors;
 pub(crate) mod labels;
 pub(crate) mod light;
-mod masks;
+pub(crate) mod masks;
 pub(crate) mod pinhole;
 pub(crate) mod prepared;
 pub(crate) mod registration;

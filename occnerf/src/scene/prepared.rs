@@ -15,7 +15,7 @@ use crate::model::subdivide::Anchor;
 use crate::model::view::PosedView;
 use crate::scene::labels::{Label, Labels, dilate, label_pixels};
 use crate::scene::light::{Seen, measure_light};
-use crate::scene::masks::mend;
+use crate::scene::masks::mend_masks;
 use crate::scene::pinhole::pinhole;
 use crate::scene::registration::register;
 use crate::scene::seen::{MOST, deeper, seen, strange_edge};
@@ -103,7 +103,7 @@ impl Scene {
         let mut capture = capture.clone();
         if config.registration.rounds > 0 {
             if !capture.mended {
-                mend(&mut capture, model)?;
+                mend_masks(&mut capture, model)?;
             }
             if !capture.registered {
                 register(&mut capture, model, config.registration.rounds)?;
@@ -258,7 +258,7 @@ fn prepare(
     let mut labels = Labels::default();
     if let Some(config) = config {
         let camera = &view.camera;
-        let silhouette = silhouette(body, &view)?;
+        let silhouette = view.silhouette(&body.model.faces)?;
         let depth = camera.world_to_camera.transform_point3(view.centre()).z.max(1e-3);
         let pixels = frame.pixels()?;
         labels = Labels::new(&label_pixels(
@@ -277,17 +277,4 @@ fn prepare(
         source: Some(frame.source.clone()),
         labels,
     })
-}
-
-/// Pixels (H × W) whose ray hits the posed prior.
-fn silhouette(body: &Body, view: &PosedView) -> Result<Vec<bool>, Error> {
-    let mesh = RayMesh::new(&view.posed.vertices, &body.model.faces)?;
-    let (width, [x0, y0, x1, y1]) = (view.camera.width, view.body_box());
-    let pixels: Vec<u32> = (y0..y1).flat_map(|row| (x0..x1).map(move |column| row * width + column)).collect();
-    let ray = |&pixel: &u32| (view.pixel_ray(pixel).origin, view.pixel_ray(pixel).direction);
-    let mut hits = vec![None; pixels.len()];
-    mesh.first_hits(&pixels.iter().map(ray).collect::<Vec<_>>(), &mut hits);
-    let mut covered = vec![false; (width * view.camera.height) as usize];
-    pixels.iter().zip(&hits).for_each(|(&pixel, hit)| covered[pixel as usize] = hit.is_some());
-    Ok(covered)
 }

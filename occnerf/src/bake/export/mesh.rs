@@ -61,6 +61,10 @@ pub fn write_obj(avatar: &Avatar, vertices: &[Vec3], normals: &[Vec3], path: &Pa
     for [a, b, c] in faces {
         let _ = writeln!(text, "f {a}/{a}/{a} {b}/{b}/{b} {c}/{c}/{c}");
     }
+    if [&picture, &material].iter().any(|name| path.file_name().is_some_and(|own| own == name.as_str())) {
+        let what = "is the name of its texture or material; a mesh is called .obj";
+        return Err(Error::Bake(format!("{}: {what}", path.display())));
+    }
     let library = format!("newmtl person\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd {picture}\n");
     write_whole(&path.with_file_name(picture), &avatar.atlas.to_png()?)?;
     write_whole(&path.with_file_name(material), library.as_bytes())?;

@@ -91,10 +91,10 @@ impl<'a> Item<'a> {
     /// Entry `i` of the list under `name`.
     pub fn entry(&self, name: &str, i: usize) -> Result<Item<'a>, CaptureError> {
         let list = self.get(name)?;
-        let items = list.list()?;
-        let length = items.len();
-        let short = || list.invalid(format!("an entry {i}, one a track"), format!("{length} entries"));
-        items.into_iter().nth(i).ok_or_else(short)
+        let items = list.value.items().ok_or_else(|| list.invalid("a list", list.value.type_name()))?;
+        let short = || list.invalid(format!("an entry {i}, one a track"), format!("{} entries", items.len()));
+        let value = items.get(i).ok_or_else(short)?;
+        Ok(Item { path: list.path, key: format!("{}[{i}]", list.key), value })
     }
 
     pub fn array(&self) -> Result<&'a NdArray, CaptureError> {

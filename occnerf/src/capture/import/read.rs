@@ -99,6 +99,10 @@ pub(super) fn check(path: &Path, person: &Person, video: &Video) -> Result<(), C
         if frame.focal.iter().any(|f| !(*f >= 1.0 && *f <= 1e6)) {
             return Err(invalid("a focal length of 1 to 1000000 pixels".to_owned(), format!("{:?}", frame.focal)));
         }
+        let numbers = frame.pose.iter().flat_map(|angle| angle.to_array()).chain(frame.betas.iter().copied());
+        if let Some(number) = numbers.into_iter().find(|number| number.abs() > 1e3) {
+            return Err(invalid("angles and shape coefficients up to 1000".to_owned(), number.to_string()));
+        }
         if frame.offset.abs().max_element() > 1e5 {
             return Err(invalid("a body within 100 km".to_owned(), format!("{}", frame.offset)));
         }

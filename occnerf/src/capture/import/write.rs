@@ -124,6 +124,11 @@ fn save(levels: Vec<u8>, size: (u32, u32), path: &Path) -> Result<(), CaptureErr
 /// Makes a link to a picture, or a copy where links cannot be made or are not wanted.
 fn linked(from: &Path, to: &Path, copy: bool) -> Result<(), CaptureError> {
     let whole: PathBuf = from.canonicalize().map_err(CaptureError::io(from))?;
+    // A copy through a link that stands there would empty what it leads to.
+    if to.symlink_metadata().is_ok() {
+        let source = std::io::Error::from(std::io::ErrorKind::AlreadyExists);
+        return Err(CaptureError::Io { path: to.to_owned(), source });
+    }
     #[cfg(unix)]
     if !copy && std::os::unix::fs::symlink(&whole, to).is_ok() {
         return Ok(());

@@ -62,6 +62,8 @@ const SPREAD: usize = 10;
 /// are interpolated.
 const MOST_FRAMES: usize = 400;
 const MOST_NUMBERS: usize = 4_000_000;
+/// Most joints of a body: time grows with their cube.
+const MOST_JOINTS: usize = 512;
 
 /// A body in one of the frames.
 struct Moment {
@@ -98,8 +100,13 @@ struct Registration<'a> {
 /// steps. The result does not depend on the number of threads.
 ///
 /// # Errors
-/// Pictures that cannot be read.
+/// [`Error::Scene`] for a body of more than 512 joints; pictures that cannot be read.
 pub fn register(capture: &mut Capture, model: &BodyModel, rounds: usize) -> Result<(), Error> {
+    let joints = model.num_joints();
+    if joints > MOST_JOINTS {
+        let other = "`registration.rounds` of 0 leaves the prior as it is";
+        return Err(Error::Scene(format!("registration: {joints} joints, at most {MOST_JOINTS}; {other}")));
+    }
     let mut registration = Registration::new(capture, model)?;
     let outlines = (OUTLINES * rounds as f32) as usize;
     for round in 0..rounds {
@@ -245,8 +252,10 @@ impl<'a> Registration<'a> {
 
     /// What is not known of a frame's perspective, and the camera as it is by now.
     fn perspective(&self, f: usize) -> Option<(Perspective, Camera)> {
-        let (away, picture) = (self.away.as_ref()?, self.pictures[f].as_ref()?);
-        Some((Perspective { nearness: self.nearness, depth: away[f].length() }, picture.camera))
+        let away = self.away.as_ref()?;
+        // Every frame has the unknown, also one that the body is not in.
+        let camera = self.pictures[f].as_ref().map_or(self.capture.train[self.frames[f]].camera, |p| p.camera);
+        Some((Perspective { nearness: self.nearness, depth: away[f].length() }, camera))
     }
 
     fn moment(&self, f: usize) -> Moment {

@@ -33,6 +33,27 @@ fn apart(a: &Capture, b: &Capture, body: &BodyModel) -> f32 {
 }
 
 #[test]
+fn a_frame_that_the_body_is_not_in_changes_nothing_and_leaves_the_focal_length_unknown() {
+    let body = BodyModel::embedded();
+    let mut given = demo(&DemoConfig { frames: 6, ..small() }, &body).unwrap();
+    given.eval.clear();
+    let aside = |placement: Placement| match placement {
+        Placement::Pelvis { translation } => Placement::Pelvis { translation: translation + Vec3::X * 40.0 },
+        Placement::Origin { rotation, translation } => {
+            Placement::Origin { rotation, translation: translation + Vec3::X * 40.0 }
+        }
+    };
+    given.train[3].placement = aside(given.train[3].placement);
+    let mut found = given.clone();
+    register(&mut found, &body, 4).unwrap();
+    assert!(found.registered && found.train[0].placement != given.train[0].placement);
+    assert!(found.train.iter().all(|frame| frame.pose.iter().all(|angle| angle.is_finite())));
+    // The body is nowhere to be seen.
+    given.train.iter_mut().for_each(|frame| frame.placement = aside(frame.placement));
+    register(&mut given, &body, 4).unwrap();
+}
+
+#[test]
 fn what_is_wrong_with_a_prior_is_mostly_mended_whatever_the_number_of_threads() {
     let body = BodyModel::embedded();
     let exact = DemoConfig { pose_noise_degrees: 0.0, translation_noise: 0.0, beta_noise: 0.0, ..small() };
