@@ -205,9 +205,9 @@ pub fn take_place(partial: &Path, out: &Path, force: bool, mark: &str) -> Result
         std::fs::rename(out, &old).map_err(unwritten(out))?;
     }
     if let Err(error) = std::fs::rename(partial, out) {
-        // What stood there stays.
-        let _ = std::fs::rename(&old, out);
-        return Err(unwritten(out)(error));
+        let back = if old.exists() { std::fs::rename(&old, out) } else { Ok(()) };
+        let error = unwritten(out)(error);
+        return Err(if back.is_ok() { error } else { error.context(format!("{}: what stood there", old.display())) });
     }
     if old.exists() { std::fs::remove_dir_all(&old).map_err(unwritten(&old)) } else { Ok(()) }
 }

@@ -5,7 +5,7 @@ mod common;
 
 use std::path::{Path, PathBuf};
 
-use common::{done, folder, refused, text};
+use common::{TINY, done, folder, refused, text};
 use image::{Rgb, RgbImage};
 use occnerf::{Config, Method, Preset};
 
@@ -26,8 +26,7 @@ fn self_contained(page: &str) {
 /// A tiny capture of a layout, in a folder of the layout's name.
 fn tiny(folder: &Path, format: &str) -> PathBuf {
     let out = folder.join(format);
-    let size = ["--size", "32", "--frames", "4", "--eval-cameras", "1", "--format", format];
-    done(&[&["synth", "--out", text(&out)], &size[..]].concat());
+    done(&[&["synth", "--out", text(&out), "--format", format], &TINY[..]].concat());
     out
 }
 

@@ -12,7 +12,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
-use common::{done, folder, text};
+use common::{TINY, done, folder, text};
 
 /// A small generator of random moments (SplitMix64).
 struct Random(u64);
@@ -150,8 +150,6 @@ fn capture(folder: &Path) -> PathBuf {
     done(&[&["synth", "--out", text(&path)], &TINY[..]].concat());
     path
 }
-
-const TINY: [&str; 6] = ["--size", "32", "--frames", "4", "--eval-cameras", "1"];
 
 const QUICK: [&str; 8] = ["--preset", "fast", "--method", "hash-point", "--set", "samples=8", "--set", "patches=1"];
 

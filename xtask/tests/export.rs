@@ -7,7 +7,7 @@ mod stand_in;
 
 use std::path::{Path, PathBuf};
 
-use common::{done, folder, refused, text};
+use common::{TINY, done, folder, refused, text};
 use glam::Vec3;
 use occnerf::bake::Avatar;
 use occnerf::capture::{DemoConfig, demo};
@@ -33,7 +33,7 @@ fn run(name: &str) -> PathBuf {
 fn trained(name: &str) -> PathBuf {
     let folder = folder(name);
     let (capture, run) = (folder.join("capture"), folder.join("run"));
-    done(&["synth", "--out", text(&capture), "--size", "32", "--frames", "4", "--eval-cameras", "1"]);
+    done(&[&["synth", "--out", text(&capture)], &TINY[..]].concat());
     let set = ["--preset", "fast", "--steps", "2", "--set", "registration.rounds=0"];
     done(&[&["train", text(&capture), "--out", text(&run)], &set[..]].concat());
     run

@@ -5,7 +5,7 @@ mod common;
 
 use std::path::Path;
 
-use common::{done, folder, refused, text, xtask};
+use common::{TINY, done, folder, refused, text, xtask};
 
 /// Rows without what depends on the clock.
 fn timeless(table: &Path) -> Vec<String> {
@@ -21,7 +21,7 @@ fn timeless(table: &Path) -> Vec<String> {
 fn parts_of_a_reproduction_make_the_table_that_one_job_makes() {
     let folder = folder("parts");
     let capture = folder.join("capture");
-    done(&["synth", "--out", text(&capture), "--size", "32", "--frames", "4", "--eval-cameras", "1"]);
+    done(&[&["synth", "--out", text(&capture)], &TINY[..]].concat());
     let rows = "prior,hash-point,occnerf,occnerf-baked";
     let command = |out: &Path, more: &[&str]| -> Vec<String> {
         let all = ["reproduce", text(&capture), "--out", text(out), "--steps", "2", "--seeds", "2", "--rows", rows];

@@ -3,13 +3,13 @@
 
 mod common;
 
-use common::{done, folder, refused, text};
+use common::{TINY, done, folder, refused, text};
 
 #[test]
 fn tables_have_every_row_once_and_a_second_call_trains_nothing() {
     let folder = folder("reproduce");
     let (capture, out) = (folder.join("capture"), folder.join("out"));
-    done(&["synth", "--out", text(&capture), "--size", "32", "--frames", "4", "--eval-cameras", "1"]);
+    done(&[&["synth", "--out", text(&capture)], &TINY[..]].concat());
     let arguments = ["reproduce", text(&capture), "--out", text(&out), "--steps", "2", "--seeds", "2"];
     let arguments =
         [&arguments[..], &["--rows", "prior,humannerf-style-bg,humannerf-style,hash-point,occnerf"]].concat();

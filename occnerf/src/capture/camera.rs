@@ -7,7 +7,7 @@ use super::CaptureError;
 use super::records::Record;
 
 /// Farthest from the origin that a body or a camera may be, in whatever unit.
-pub(super) const MAX_DISTANCE: f32 = 1e7;
+pub(crate) const MAX_DISTANCE: f32 = 1e7;
 /// Largest |R Rᵀ − I| of an extrinsic rotation; files written in `f32` or with a few decimals stay
 /// far below.
 const ORTHONORMAL: f32 = 1e-3;

@@ -16,9 +16,9 @@ const JOINT_TOLERANCE: f32 = 0.04 / 1.7;
 
 /// Largest component of a rotation that is taken for one, in radians: more turns than anybody takes
 /// in a video.
-const MAX_ANGLE: f32 = 1e3;
+pub(super) const MAX_ANGLE: f32 = 1e3;
 /// Largest shape coefficient, in standard deviations.
-const MAX_BETA: f32 = 1e3;
+pub(crate) const MAX_BETA: f32 = 1e3;
 
 /// Errors for a number that nothing in the world has.
 pub(super) fn below(record: &Record<'_>, key: &str, values: &[f32], most: f32) -> Result<(), CaptureError> {

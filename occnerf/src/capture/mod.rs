@@ -35,6 +35,8 @@ mod wild;
 mod write;
 mod zju;
 
+pub(crate) use self::camera::MAX_DISTANCE;
+pub(crate) use self::checks::MAX_BETA;
 pub use self::demo::{DemoConfig, demo};
 pub use self::error::CaptureError;
 pub use self::find::{Layout, find_body, own_body};

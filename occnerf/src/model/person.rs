@@ -11,7 +11,7 @@ use smpl::{BodyModel, Placement};
 use volrender::{Aabb, Camera};
 
 use crate::Error;
-use crate::capture::{Capture, Frame, Light};
+use crate::capture::{Capture, Frame, Light, MAX_BETA, MAX_DISTANCE};
 use crate::config::Config;
 use crate::model::body::{Body, Moment};
 use crate::model::colors::PriorColors;
@@ -29,9 +29,6 @@ const VERSION: &str = "1";
 const CAMERA: usize = 16;
 /// Numbers of a placement: whether it is about the origin, rotation, translation.
 const PLACEMENT: usize = 7;
-/// Limits of what captures hold.
-const MAX_BETA: f32 = 1e3;
-const MAX_DISTANCE: f32 = 1e7;
 
 /// A person before anything is learnt.
 pub struct Person {

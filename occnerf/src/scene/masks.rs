@@ -40,12 +40,15 @@ const PASSES: usize = 3;
 const NEAR: f32 = 0.1;
 
 /// Shrinks the masks of the training frames by as much as they are too large, or grows them by as
-/// much as they are too small, as [`crate::Scene`] does before it registers bodies.
+/// much as they are too small, as [`crate::Scene`] does before it registers bodies;
+/// once for all.
 ///
 /// # Errors
 /// Pictures that cannot be read.
 pub fn mend_masks(capture: &mut Capture, model: &BodyModel) -> Result<(), Error> {
-    capture.mended = true;
+    if std::mem::replace(&mut capture.mended, true) {
+        return Ok(());
+    }
     let excess = excess(&capture.train)?;
     if excess == 0 {
         return extend(capture, model);

@@ -102,9 +102,7 @@ impl Scene {
         }
         let mut capture = capture.clone();
         if config.registration.rounds > 0 {
-            if !capture.mended {
-                mend_masks(&mut capture, model)?;
-            }
+            mend_masks(&mut capture, model)?;
             if !capture.registered {
                 register(&mut capture, model, config.registration.rounds)?;
             }

@@ -39,6 +39,9 @@ pub fn refusal(output: &Output, what: &str, words: &[&str]) {
     }
 }
 
+/// Options of `synth` for a capture that is made in no time.
+pub const TINY: [&str; 6] = ["--size", "32", "--frames", "4", "--eval-cameras", "1"];
+
 /// An empty folder of a test's own.
 pub fn folder(name: &str) -> PathBuf {
     let path = Path::new(env!("CARGO_TARGET_TMPDIR")).join(name);

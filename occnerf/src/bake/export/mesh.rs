@@ -45,6 +45,10 @@ pub fn write_obj(avatar: &Avatar, vertices: &[Vec3], normals: &[Vec3], path: &Pa
         name.chars().map(|c| if c.is_whitespace() || c.is_control() { '_' } else { c }).collect::<String>()
     };
     let (material, picture) = (file_name("mtl"), file_name("png"));
+    if [&picture, &material].iter().any(|name| path.file_name().is_some_and(|own| own == name.as_str())) {
+        let what = "is the name of its texture or material; a mesh is called .obj";
+        return Err(Error::Bake(format!("{}: {what}", path.display())));
+    }
     let mut text = format!("# metres, y up; colours of vertices in sRGB\nmtllib {material}\no person\nusemtl person\n");
     for &i in &used {
         let (at, color) = (vertices[i], avatar.atlas.color(avatar.uvs[i]));
@@ -60,10 +64,6 @@ pub fn write_obj(avatar: &Avatar, vertices: &[Vec3], normals: &[Vec3], path: &Pa
     }
     for [a, b, c] in faces {
         let _ = writeln!(text, "f {a}/{a}/{a} {b}/{b}/{b} {c}/{c}/{c}");
-    }
-    if [&picture, &material].iter().any(|name| path.file_name().is_some_and(|own| own == name.as_str())) {
-        let what = "is the name of its texture or material; a mesh is called .obj";
-        return Err(Error::Bake(format!("{}: {what}", path.display())));
     }
     let library = format!("newmtl person\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd {picture}\n");
     write_whole(&path.with_file_name(picture), &avatar.atlas.to_png()?)?;

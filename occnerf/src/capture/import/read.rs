@@ -13,6 +13,7 @@ use super::item::Item;
 use super::video::Video;
 use super::{easymocap, gvhmr, neuman, peoplesnapshot, phalp, prompthmr, romp, wham};
 use crate::capture::CaptureError;
+use crate::capture::checks::{MAX_ANGLE, MAX_BETA};
 
 /// What is expected of a file.
 const TOOLS: &str = "a result of WHAM, 4D-Humans / PHALP, GVHMR, PromptHMR or ROMP, EasyMocap's folder, \
@@ -99,9 +100,10 @@ pub(super) fn check(path: &Path, person: &Person, video: &Video) -> Result<(), C
         if frame.focal.iter().any(|f| !(*f >= 1.0 && *f <= 1e6)) {
             return Err(invalid("a focal length of 1 to 1000000 pixels".to_owned(), format!("{:?}", frame.focal)));
         }
-        let numbers = frame.pose.iter().flat_map(|angle| angle.to_array()).chain(frame.betas.iter().copied());
-        if let Some(number) = numbers.into_iter().find(|number| number.abs() > 1e3) {
-            return Err(invalid("angles and shape coefficients up to 1000".to_owned(), number.to_string()));
+        let angles = frame.pose.iter().flat_map(|angle| angle.to_array());
+        let mut numbers = angles.map(|a| (a, MAX_ANGLE)).chain(frame.betas.iter().map(|&beta| (beta, MAX_BETA)));
+        if let Some((number, most)) = numbers.find(|(number, most)| number.abs() > f64::from(*most)) {
+            return Err(invalid(format!("angles and shape coefficients up to {most}"), number.to_string()));
         }
         if frame.offset.abs().max_element() > 1e5 {
             return Err(invalid("a body within 100 km".to_owned(), format!("{}", frame.offset)));
