@@ -40,8 +40,8 @@ const PASSES: usize = 3;
 const NEAR: f32 = 0.1;
 
 /// Shrinks the masks of the training frames by as much as they are too large, or grows them by as
-/// much as they are too small, as [`crate::Scene`] does before it registers bodies;
-/// once for all.
+/// much as they are too small, as [`crate::Scene`] does before it registers bodies. What was mended
+/// is left as it is.
 ///
 /// # Errors
 /// Pictures that cannot be read.
