@@ -86,6 +86,24 @@ impl VisibilityCounts {
         }
     }
 
+    /// Attention where counts come from places that are spread over the surface, so that a vertex of
+    /// a coarse part gets more of them: (1 + s_i c_i) / Σ_j (1 + s_j c_j) into `out`. `scale` (V) is
+    /// s, at least 0: the mean area around a vertex over that around each. Positive, sums to 1, and
+    /// uniform before anything was seen.
+    ///
+    /// # Panics
+    /// If the lengths differ or a vertex does not exist.
+    #[inline]
+    pub fn attention_scaled(&self, scale: &[f32], neighbours: &[u32], out: &mut [f32]) {
+        assert_eq!(scale.len(), self.counts.len(), "attention: {} scales of {} counts", scale.len(), self.counts.len());
+        assert_eq!(neighbours.len(), out.len(), "attention: {} neighbours, {} outputs", neighbours.len(), out.len());
+        let weight = |v: u32| 1.0 + f64::from(scale[v as usize]) * self.counts[v as usize] as f64;
+        let inverse = 1.0 / neighbours.iter().map(|&v| weight(v)).sum::<f64>();
+        for (a, &v) in out.iter_mut().zip(neighbours) {
+            *a = (weight(v) * inverse) as f32;
+        }
+    }
+
     /// Sum of all counts.
     #[must_use]
     pub fn total(&self) -> u128 {

@@ -60,7 +60,7 @@ impl CanonicalField for TrainedField<'_> {
     fn evaluate(&self, places: &[Place], out: &mut Vec<(f32, Vec3)>) {
         let Model { body, config, base, motion, .. } = self.model;
         let blended = needs_neighbours(config.surface.distance);
-        let neighbours = self.model.needs_neighbours();
+        let neighbours = config.needs_neighbours();
         let based = !base.colors.is_empty() && matches!(motion, MotionField::Surface(_));
         let mut batch = SampleBatch::default();
         batch.samples.clear();

@@ -88,6 +88,9 @@ pub enum DistanceKind {
 pub enum VisibilityKind {
     /// The paper's running counts: neighbours of the samples in which training rays end.
     Counted,
+    /// Those, divided by the area around each vertex: densely meshed parts end no more rays for each
+    /// vertex than coarse ones.
+    CountedPerArea,
     /// The number of training frames that show a vertex, by ray casting, from the first step on.
     Exact,
 }
@@ -349,6 +352,15 @@ pub struct Config {
 }
 
 impl Config {
+    /// Whether what a sample is depends on the vertices around it.
+    pub(crate) fn needs_neighbours(&self) -> bool {
+        match self.method {
+            Method::NeuralBody | Method::SelfNerf => true,
+            Method::Occnerf if self.surface.surface_term => true,
+            _ => self.surface.distance != DistanceKind::Exact,
+        }
+    }
+
     /// Switches a component of the method off.
     pub fn ablate(&mut self, component: Component) {
         match component {

@@ -65,7 +65,8 @@ impl Body {
         let query = SurfaceQueryConfig {
             k: config.surface.k,
             coarse_levels: config.surface.coarse_levels,
-            cell: 0.02,
+            // Trees alone where no sample asks for its neighbours.
+            cell: if config.needs_neighbours() { 0.02 } else { 0.0 },
             margin: config.motion.reach() + 0.03,
             ratio: 0.25,
         };
@@ -100,6 +101,20 @@ impl Body {
         let joints = vec![Vec3::ZERO; self.model.num_joints()];
         let placement = smpl::Placement::Pelvis { translation: Vec3::ZERO };
         self.pose(Moment { betas: &self.mean_betas, pose: &joints, placement })
+    }
+
+    /// Mean area around a vertex of the canonical mesh over that around each, V; at most a thousand.
+    pub(crate) fn area_scale(&self) -> Vec<f32> {
+        let vertices = &self.canonical.vertices;
+        let mut areas = vec![0.0; vertices.len()];
+        for face in &self.model.faces {
+            let [a, b, c] = face.map(|v| vertices[v as usize]);
+            // Six times the share of each corner, a third of the face.
+            let area = (b - a).cross(c - a).length();
+            face.iter().for_each(|&v| areas[v as usize] += area);
+        }
+        let mean = (areas.iter().sum::<f32>() / areas.len() as f32).max(f32::MIN_POSITIVE);
+        areas.iter().map(|area| mean / area.max(1e-3 * mean)).collect()
     }
 }
 

@@ -47,7 +47,7 @@ impl Extent {
     /// Looks at the field over every vertex; `evaluate` gives samples their density. One layer
     /// beyond the last one that shows something is kept, and as much as over any vertex that shares
     /// a face: the field can grow back there.
-    pub fn measure(body: &Body, config: &Config, neighbours: bool, evaluate: impl Fn(&mut SampleBatch) + Sync) -> Self {
+    pub fn measure(body: &Body, config: &Config, evaluate: impl Fn(&mut SampleBatch) + Sync) -> Self {
         let whole = config.motion.reach();
         let layers = (whole / LAYER).ceil() as usize;
         let (normals, positions) = (body.query.normals(), &body.canonical.vertices);
@@ -60,7 +60,7 @@ impl Extent {
                     for layer in 0..layers {
                         let distance = layer as f32 * LAYER;
                         let at = positions[v] + distance * normals[v];
-                        batch.samples.push_canonical(body, at, positions[v], distance, neighbours);
+                        batch.samples.push_canonical(body, at, positions[v], distance, config.needs_neighbours());
                     }
                 }
                 evaluate(batch);

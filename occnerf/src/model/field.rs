@@ -58,6 +58,8 @@ pub(crate) struct Field {
     /// The rows that the input has beside the point term.
     pub vertex_rows: VertexRows,
     shares: Shares,
+    /// What counts are multiplied by, V; empty for 1.
+    pub count_scale: Vec<f32>,
     /// Nearest vertices whose encodings are blended into the point term; `None` where the sample's
     /// own place is encoded.
     blended: Option<usize>,
@@ -137,6 +139,7 @@ impl Field {
             encoder,
             vertex_rows,
             shares,
+            count_scale: Vec::new(),
             blended,
             density_scale: config.field.density_scale,
             density_bias: (config.field.density_bias, slope),
@@ -282,7 +285,13 @@ impl Field {
         let rows = samples.neighbours.chunks_exact(stored).zip(attention.chunks_exact_mut(used));
         match self.shares {
             Shares::Equal => {}
-            Shares::Counts => rows.for_each(|(neighbours, out)| learnt.counts.attention(neighbours, out)),
+            Shares::Counts if self.count_scale.is_empty() => {
+                rows.for_each(|(neighbours, out)| learnt.counts.attention(neighbours, out));
+            }
+            Shares::Counts => {
+                let scale = &self.count_scale;
+                rows.for_each(|(neighbours, out)| learnt.counts.attention_scaled(scale, neighbours, out));
+            }
             Shares::Nearness => {
                 for ((neighbours, out), x) in rows.zip(&samples.canonical) {
                     let each = out.iter_mut().zip(neighbours);

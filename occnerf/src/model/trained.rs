@@ -9,11 +9,10 @@ use volrender::Occupancy;
 
 use crate::Error;
 use crate::capture::Light;
-use crate::config::{Config, MotionKind};
+use crate::config::{Config, MotionKind, VisibilityKind};
 use crate::model::arena::Arena;
 use crate::model::body::Body;
 use crate::model::colors::PriorColors;
-use crate::model::distance::needs_neighbours;
 use crate::model::extent::Extent;
 use crate::model::field::{Field, Learnt, SampleBatch, VertexRows};
 use crate::model::parameters::{Lengths, PARTS, Parameters, Part};
@@ -60,7 +59,10 @@ impl Model {
             let found = format!("was prepared for {k_of_body} neighbours in each of {levels} levels");
             return Err(Error::Scene(format!("{found}, the configuration asks for {k} in each of {wanted}")));
         }
-        let field = Field::new(&config, body.canonical_box)?;
+        let mut field = Field::new(&config, body.canonical_box)?;
+        if config.surface.visibility == VisibilityKind::CountedPerArea {
+            field.count_scale = body.area_scale();
+        }
         let volume = |weights: WeightVolume| MotionField::Volume { weights, threshold: VOLUME_THRESHOLD };
         let (prior, shaped) = (&body.model, &body.canonical);
         let layout = WeightVolumeConfig { resolution: config.motion.resolution, ..Default::default() };
@@ -168,11 +170,6 @@ impl Model {
         }
     }
 
-    /// Whether samples are to have their neighbours.
-    pub(crate) fn needs_neighbours(&self) -> bool {
-        self.field.reads_neighbours() || needs_neighbours(self.config.surface.distance)
-    }
-
     /// What traces rays at the body that `surface` and `frame` are posed as.
     pub(crate) fn tracer<'b>(
         &'b self,
@@ -189,7 +186,7 @@ impl Model {
             near_canonical: &self.near_canonical,
             extent,
             base: &self.base,
-            neighbours: self.needs_neighbours(),
+            neighbours: self.config.needs_neighbours(),
         }
     }
 
@@ -213,7 +210,7 @@ impl Model {
     pub(crate) fn measure_extent(&self, code: &VertexCode) -> Extent {
         match self.motion {
             MotionField::Volume { .. } => Extent::whole(&self.body, &self.config),
-            MotionField::Surface(_) => Extent::measure(&self.body, &self.config, self.needs_neighbours(), |batch| {
+            MotionField::Surface(_) => Extent::measure(&self.body, &self.config, |batch| {
                 self.evaluate(code, batch, None);
             }),
         }

@@ -134,7 +134,7 @@ impl<'a> Trainer<'a> {
     fn begin_anew(&mut self) {
         self.model.forget();
         self.optimiser = Optimiser::new(&self.model.parameters);
-        if self.model.config.surface.visibility == VisibilityKind::Counted {
+        if self.model.config.surface.visibility != VisibilityKind::Exact {
             self.model.counts = VisibilityCounts::new(self.model.body.canonical.vertices.len());
         }
     }
@@ -190,7 +190,7 @@ impl<'a> Trainer<'a> {
             + f64::from(loss.completeness) * report.completeness;
         reduce(model, optimiser, groups, vertex_code, d_volume, &mut times);
         let mut watch = Stopwatch::start();
-        if model.config.surface.visibility == VisibilityKind::Counted {
+        if model.config.surface.visibility != VisibilityKind::Exact {
             groups.iter().for_each(|group| model.counts.add(&group.terminations));
         }
         let decay = model.config.rates.final_fraction.powf(step as f32 / model.config.steps.max(1) as f32);

@@ -89,10 +89,11 @@ const FAINT: [&str; 5] =
 const SURFACE_TERM: &str = "surface.surface_term=true";
 
 /// A component left out, put back, or replaced by what it competes with.
-const COMPONENTS: [(&str, &[&str]); 12] = [
+const COMPONENTS: [(&str, &[&str]); 13] = [
     ("full", &[]),
     ("surface-term", &[SURFACE_TERM]),
     ("attention", &[SURFACE_TERM, "surface.attention=true"]),
+    ("area-attention", &[SURFACE_TERM, "surface.attention=true", "surface.visibility=counted-per-area"]),
     ("exact-attention", &[SURFACE_TERM, "surface.attention=true", "surface.visibility=exact"]),
     ("no-completeness", &["loss.completeness=0"]),
     ("no-perceptual", &["loss.perceptual=0"]),
