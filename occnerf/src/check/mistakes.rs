@@ -257,8 +257,12 @@ fn overlaps(posed: &[Posed<'_>], body: &BodyModel, undo: Option<Mistake>) -> Vec
 
 /// Pixels of a camera's image that a frame's body covers.
 pub(super) fn outline(frame: &Frame, camera: &Camera, body: &BodyModel) -> Vec<bool> {
-    let posed = body.pose(&body.shaped(&frame.betas), &frame.pose, frame.placement);
-    silhouette(&posed.vertices, &body.faces, camera)
+    silhouette(&posed(frame, body), &body.faces, camera)
+}
+
+/// The vertices of a frame's body.
+fn posed(frame: &Frame, body: &BodyModel) -> Vec<Vec3> {
+    body.pose(&body.shaped(&frame.betas), &frame.pose, frame.placement).vertices
 }
 
 /// The shift of the fit against the pictures that overlaps better than none, beyond chance.
@@ -266,18 +270,24 @@ fn shift(capture: &Capture, body: &BodyModel, views: &[View]) -> Option<Mistake>
     const SHIFTS: [i32; 4] = [-2, -1, 1, 2];
     let last = capture.train.len() as i32 - 1;
     let inner: Vec<&View> = views.iter().filter(|v| (2..=last - 2).contains(&(v.index as i32))).collect();
-    let gains: Vec<[f32; 4]> = inner
-        .par_iter()
-        .map(|view| {
+    let gain = |views: &[&View]| -> Vec<[f32; 4]> {
+        let (Some(first), Some(last)) = (views.first(), views.last()) else { return Vec::new() };
+        let (first, last) = (first.index - 2, last.index + 2);
+        let posed: Vec<Vec<Vec3>> = capture.train[first..=last].iter().map(|frame| posed(frame, body)).collect();
+        let of = |view: &&View| {
             let iou = |by: i32| {
-                let frame = &capture.train[(view.index as i32 + by) as usize];
-                let camera = Camera { world_to_camera: frame.camera.world_to_camera, ..view.camera };
-                Overlap::of(&outline(frame, &camera, body), view, false).iou()
+                let index = (view.index as i32 + by) as usize;
+                let world_to_camera = capture.train[index].camera.world_to_camera;
+                let camera = Camera { world_to_camera, ..view.camera };
+                Overlap::of(&silhouette(&posed[index - first], &body.faces, &camera), view, false).iou()
             };
             let none = iou(0);
             SHIFTS.map(|by| iou(by) - none)
-        })
-        .collect();
+        };
+        views.iter().map(of).collect()
+    };
+    // Neighbouring views share their bodies.
+    let gains: Vec<[f32; 4]> = inner.par_chunks(8).flat_map_iter(gain).collect();
     let count = gains.len() as f32;
     let better = |i: usize| {
         let mean = gains.iter().map(|gain| gain[i]).sum::<f32>() / count;

@@ -30,22 +30,30 @@ pub(super) fn silhouette(vertices: &[Vec3], faces: &[[u32; 3]], camera: &Camera)
 
 /// Sets the pixels whose centres lie in a triangle, its edges included.
 fn fill([a, b, c]: [Vec2; 3], width: usize, height: usize, covered: &mut [bool]) {
+    let (low, high) = (a.min(b).min(c), a.max(b).max(c));
+    // The centre of pixel i is at i + 0.5. `as` saturates, and takes less than a call to round.
+    let first = |x: f32| {
+        let below = (x - 0.5) as usize;
+        below + usize::from((below as f32) < x - 0.5)
+    };
+    let after = |x: f32, most: usize| ((x + 0.5) as usize).min(most);
+    let (rows, columns) = (first(low.y)..after(high.y, height), first(low.x)..after(high.x, width));
+    // Most triangles of a small picture have no centre in them.
+    if rows.is_empty() || columns.is_empty() {
+        return;
+    }
     let area = (b - a).perp_dot(c - a);
     if area == 0.0 || !area.is_finite() {
         return;
     }
     let (b, c) = if area > 0.0 { (b, c) } else { (c, b) };
-    let (low, high) = (a.min(b).min(c), a.max(b).max(c));
-    // The centre of pixel i is at i + 0.5; `as` saturates.
-    let first = |x: f32| (x - 0.5).ceil().max(0.0) as usize;
-    let after = |x: f32, most: usize| ((x - 0.5).floor() + 1.0).max(0.0).min(most as f32) as usize;
-    for y in first(low.y)..after(high.y, height) {
+    for y in rows {
         let inside = |x: &usize| {
             let p = Vec2::new(*x as f32 + 0.5, y as f32 + 0.5);
             (b - a).perp_dot(p - a) >= 0.0 && (c - b).perp_dot(p - b) >= 0.0 && (a - c).perp_dot(p - c) >= 0.0
         };
         // Each side changes its sign once along a row, whatever the rounding.
-        let mut row = first(low.x)..after(high.x, width);
+        let mut row = columns.clone();
         if let Some(start) = row.find(inside) {
             let end = row.rev().find(inside).unwrap_or(start);
             covered[y * width + start..=y * width + end].fill(true);
