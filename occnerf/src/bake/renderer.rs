@@ -11,7 +11,7 @@ use super::draw::BakedPerson;
 use super::field::{CanonicalField, Place};
 use crate::Error;
 use crate::capture::Image;
-use crate::model::distance::{needs_neighbours, surface_point};
+use crate::model::distance::surface_point;
 use crate::model::extent::Extent;
 use crate::model::field::SampleBatch;
 use crate::model::trained::Model;
@@ -59,7 +59,7 @@ fn mean_span(model: &Model) -> f32 {
 impl CanonicalField for TrainedField<'_> {
     fn evaluate(&self, places: &[Place], out: &mut Vec<(f32, Vec3)>) {
         let Model { body, config, base, motion, .. } = self.model;
-        let blended = needs_neighbours(config.surface.distance);
+        let blended = config.surface.distance.needs_neighbours();
         let neighbours = config.needs_neighbours();
         let based = !base.colors.is_empty() && matches!(motion, MotionField::Surface(_));
         let mut batch = SampleBatch::default();

@@ -261,7 +261,7 @@ pub(super) fn outline(frame: &Frame, camera: &Camera, body: &BodyModel) -> Vec<b
 }
 
 /// The vertices of a frame's body.
-fn posed(frame: &Frame, body: &BodyModel) -> Vec<Vec3> {
+pub(super) fn posed(frame: &Frame, body: &BodyModel) -> Vec<Vec3> {
     body.pose(&body.shaped(&frame.betas), &frame.pose, frame.placement).vertices
 }
 

@@ -20,7 +20,7 @@ use visibility::{RayMesh, View as Pinhole, visible_vertices};
 use volrender::Camera;
 
 use self::frame::View;
-use self::mistakes::{Overlap, outline};
+use self::mistakes::{Overlap, outline, posed};
 use crate::capture::{Capture, CaptureError, Frame, Image, Pixels};
 use crate::config::OccludedRule;
 use crate::scene::labels::{Label, label_pixels};
@@ -201,13 +201,13 @@ fn surface_seen(capture: &Capture, body: &BodyModel) -> Result<f32, CaptureError
     let every = capture.train.len().div_ceil(SURFACE_VIEWS).max(1);
     let mut seen = vec![false; body.num_vertices()];
     for frame in capture.train.iter().step_by(every) {
-        let posed = body.pose(&body.shaped(&frame.betas), &frame.pose, frame.placement);
+        let vertices = posed(frame, body);
         // A body that cannot be hit by rays is not seen.
-        let Ok(mesh) = RayMesh::new(&posed.vertices, &body.faces) else { continue };
+        let Ok(mesh) = RayMesh::new(&vertices, &body.faces) else { continue };
         let usable: Vec<bool> = frame.pixels()?.mask.iter().map(|&mask| mask > 0.5).collect();
         let Camera { width, height, world_to_camera, .. } = frame.camera;
         let view = Pinhole { intrinsics: frame.camera.intrinsics(), extrinsics: world_to_camera, width, height };
-        let now = visible_vertices(&mesh, &posed.vertices, &view, Some(&usable));
+        let now = visible_vertices(&mesh, &vertices, &view, Some(&usable));
         seen.iter_mut().zip(now).for_each(|(seen, now)| *seen |= now);
     }
     Ok(seen.iter().filter(|seen| **seen).count() as f32 / seen.len().max(1) as f32)

@@ -82,6 +82,13 @@ pub enum DistanceKind {
     Exact,
 }
 
+impl DistanceKind {
+    /// Whether points need their neighbours for it.
+    pub(crate) fn needs_neighbours(self) -> bool {
+        self != Self::Exact
+    }
+}
+
 /// Where the attention's counts come from.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
@@ -357,7 +364,7 @@ impl Config {
         match self.method {
             Method::NeuralBody | Method::SelfNerf => true,
             Method::Occnerf if self.surface.surface_term => true,
-            _ => self.surface.distance != DistanceKind::Exact,
+            _ => self.surface.distance.needs_neighbours(),
         }
     }
 

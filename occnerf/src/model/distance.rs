@@ -14,11 +14,6 @@ pub(crate) struct SurfacePoint {
     pub distance: f32,
 }
 
-/// Whether points need their neighbours for it.
-pub(crate) fn needs_neighbours(kind: DistanceKind) -> bool {
-    kind != DistanceKind::Exact
-}
-
 /// The place of `x`, whose `neighbours` (finest level first) are read by the blended kind;
 /// `None` where the exact surface is farther than `farthest`.
 pub(crate) fn surface_point(

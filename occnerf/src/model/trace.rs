@@ -10,7 +10,7 @@ use crate::capture::Light;
 use crate::config::Config;
 use crate::model::body::Body;
 use crate::model::colors::{PriorColors, shade};
-use crate::model::distance::{SurfacePoint, needs_neighbours, surface_point};
+use crate::model::distance::{SurfacePoint, surface_point};
 use crate::model::extent::Extent;
 use crate::model::samples::Samples;
 use crate::random::Stream;
@@ -187,7 +187,7 @@ impl Tracer<'_> {
             return (false, None);
         }
         let corner = |v: u32| self.body.canonical.vertices[v as usize];
-        let exact = !needs_neighbours(self.config.surface.distance);
+        let exact = !self.config.surface.distance.needs_neighbours();
         // The closest point keeps its face and barycentrics in the canonical pose.
         let mut at = nearest.filter(|_| exact).map(|found| {
             let weighted = self.body.model.faces[found.face as usize].into_iter().zip(found.barycentric);

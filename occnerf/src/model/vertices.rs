@@ -5,7 +5,7 @@ use rayon::prelude::*;
 
 use crate::config::SurfaceConfig;
 use crate::model::body::Body;
-use crate::model::distance::{SurfacePoint, needs_neighbours, surface_point, surface_point_backward};
+use crate::model::distance::{SurfacePoint, surface_point, surface_point_backward};
 use crate::model::encoder::{At, Coordinates, Encoder, Slopes};
 
 const CHUNK: usize = 512;
@@ -114,7 +114,7 @@ fn distance_with_gradient(
     position: Vec3,
     neighbours: &mut Vec<u32>,
 ) -> (f32, Vec3) {
-    if needs_neighbours(config.distance) {
+    if config.distance.needs_neighbours() {
         neighbours.resize(body.query.neighbours_per_query(), 0);
         body.query.neighbours(position, neighbours);
     }
