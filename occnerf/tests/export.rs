@@ -250,7 +250,9 @@ fn splats_are_as_bright_as_the_light_makes_the_surface() {
     let [plain, shaded] = [even, &lit].map(|avatar| splats(avatar, &avatar.vertices, 0.05).unwrap());
     let normal = |i: usize| plain.rotations[i] * Vec3::Z;
     for i in (0..plain.centres.len()).step_by(31) {
-        let expected = ((1.0 - 0.5 * normal(i).z) * plain.colors[i]).min(Vec3::ONE);
+        let along = normal(i).z;
+        let brightness = 1.0 - 0.5 * along + 0.25 * (along * along - 1.0 / 3.0);
+        let expected = (brightness * plain.colors[i]).min(Vec3::ONE);
         assert!(shaded.colors[i].distance(expected) < 1e-4, "{i}: {} {expected}", shaded.colors[i]);
     }
 }

@@ -305,7 +305,9 @@ fn a_light_is_as_bright_as_the_surface_is_turned_to_it_and_no_brighter_than_whit
         let mut out = vec![Vec4::ZERO; 81];
         let mut person = BakedPerson::new(&avatar, 1.0).lit_by(light);
         person.draw(&[turned], &in_front(9), Samples::One, &mut out).unwrap();
-        let expected = (albedo * (1.0 + slope * degrees.to_radians().cos())).min(Vec3::ONE).extend(1.0);
+        let along = degrees.to_radians().cos();
+        let brightness = 1.0 + slope * along + 0.5 * slope.abs() * (along * along - 1.0 / 3.0);
+        let expected = (albedo * brightness).min(Vec3::ONE).extend(1.0);
         assert!((out[40] - expected).abs().max_element() < 1e-4, "{degrees} {slope}: {} {expected}", out[40]);
     }
 }

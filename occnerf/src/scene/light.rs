@@ -13,9 +13,12 @@ pub(crate) type Seen = (u32, Vec3, Vec3);
 const MOST_SEEN: usize = 1 << 20;
 /// Rounds of colour for light, then light for colour.
 const ROUNDS: usize = 6;
-/// Weight of even light against the observations, for the third band of the harmonics; a tenth for
-/// the others.
-const EVEN: f64 = 0.01;
+/// Weight of even light against the observations.
+const EVEN: f64 = 0.001;
+/// The same for what the third band has beside the lamp: for a shading that is never drawn, and for
+/// a light, of which it would take the side that no frame shows.
+const FREE: f64 = 0.01;
+const BOUND: f64 = 0.03;
 /// Steepest light.
 const MOST_SLOPE: f32 = 0.8;
 /// Least brightness that says anything of a colour.
@@ -41,13 +44,41 @@ pub(crate) fn albedo<'a>(
 type Terms = SVector<f64, 9>;
 
 /// The first three bands of spherical harmonics, each scaled to a convenient size (Ramamoorthi and
-/// Hanrahan 2001).
-fn harmonics(n: Vec3) -> Terms {
+/// Hanrahan 2001), the second with what a lamp in this direction has of the third.
+fn harmonics(lamp: Vec3, n: Vec3) -> Terms {
+    let [along_x, along_y, along_z] = Light::along(lamp, n).as_dvec3().to_array();
     let [x, y, z] = n.as_dvec3().to_array();
-    Terms::from([1.0, x, y, z, x * y, y * z, z * x, x * x - y * y, z * z - 1.0 / 3.0])
+    Terms::from([1.0, along_x, along_y, along_z, x * y, y * z, z * x, x * x - y * y, z * z - 1.0 / 3.0])
 }
 
-/// Brightness by normal in three bands, which says anything of normals that no frame shows.
+/// The harmonics that explain best what was seen of these colours, relative to the first; `None`
+/// where nothing says which. `third` is the weight against the third band.
+fn brightness<'a>(
+    seen: impl Iterator<Item = &'a Seen>,
+    albedo: &[(Vec3, f32)],
+    lamp: Vec3,
+    third: f64,
+) -> Option<Terms> {
+    let (mut matrix, mut vector, mut total) = (SMatrix::<f64, 9, 9>::zeros(), Terms::zeros(), 0.0);
+    for (v, color, normal) in seen {
+        let (sum, squares) = albedo[*v as usize];
+        let (albedo, basis) = (sum / squares, harmonics(lamp, *normal));
+        let squared = f64::from(albedo.length_squared());
+        matrix += squared * basis * basis.transpose();
+        vector += f64::from(albedo.dot(*color)) * basis;
+        total += squared;
+    }
+    for i in 0..9 {
+        matrix[(i, i)] += total * if i < 4 { EVEN } else { third };
+    }
+    vector[0] += EVEN * total;
+    let terms = matrix.try_inverse()? * vector;
+    // What is bright everywhere is the colour's.
+    let terms = terms / terms[0];
+    terms.iter().all(|t| t.is_finite()).then_some(terms)
+}
+
+/// Brightness by normal in three bands, which says nothing of normals that no frame shows.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Shading(Terms);
 
@@ -60,43 +91,33 @@ impl Shading {
 
     /// How bright a surface with this unit normal is.
     pub fn on(&self, normal: Vec3) -> f32 {
-        (self.0.dot(&harmonics(normal)) as f32).max(DARKEST)
-    }
-
-    /// The bands that hold for all normals.
-    fn light(&self) -> Light {
-        let slope = Vec3::new(self.0[1] as f32, self.0[2] as f32, self.0[3] as f32);
-        Light { slope: slope.clamp_length_max(MOST_SLOPE) }
+        (self.0.dot(&harmonics(Vec3::ZERO, normal)) as f32).max(DARKEST)
     }
 
     /// Tells colour and light apart by alternating least squares.
     pub fn measure<'a>(seen: impl Iterator<Item = &'a Seen> + Clone, vertices: usize) -> Self {
         let mut found = Self::even();
         for _ in 0..ROUNDS {
-            let sums = albedo(seen.clone(), vertices, |n| found.on(n));
-            let (mut matrix, mut vector, mut total) = (SMatrix::<f64, 9, 9>::zeros(), Terms::zeros(), 0.0);
-            for (v, color, normal) in seen.clone() {
-                let (sum, squares) = sums[*v as usize];
-                let (albedo, basis) = (sum / squares, harmonics(*normal));
-                let squared = f64::from(albedo.length_squared());
-                matrix += squared * basis * basis.transpose();
-                vector += f64::from(albedo.dot(*color)) * basis;
-                total += squared;
-            }
-            for i in 0..9 {
-                matrix[(i, i)] += EVEN * total * if i < 4 { 0.1 } else { 1.0 };
-            }
-            vector[0] += 0.1 * EVEN * total;
-            let Some(inverse) = matrix.try_inverse() else { return Self::even() };
-            let terms = inverse * vector;
-            // What is bright everywhere is the colour's.
-            found = Self(terms / terms[0]);
-            if !found.0.iter().all(|t| t.is_finite()) {
-                return Self::even();
-            }
+            let albedo = albedo(seen.clone(), vertices, |n| found.on(n));
+            let Some(terms) = brightness(seen.clone(), &albedo, Vec3::ZERO, FREE) else { return Self::even() };
+            found = Self(terms);
         }
         found
     }
+}
+
+/// The lamp among what is seen, in the same way; what of the third band is none of its is left out
+/// of colours.
+fn lamp<'a>(seen: impl Iterator<Item = &'a Seen> + Clone, vertices: usize) -> Light {
+    let mut found = Light::default();
+    for _ in 0..ROUNDS {
+        let albedo = albedo(seen.clone(), vertices, |n| found.on(n));
+        let toward = found.slope.normalize_or_zero();
+        let Some(terms) = brightness(seen.clone(), &albedo, toward, BOUND) else { return Light::default() };
+        let slope = Vec3::new(terms[1] as f32, terms[2] as f32, terms[3] as f32);
+        found = Light { slope: slope.clamp_length_max(MOST_SLOPE) };
+    }
+    found
 }
 
 /// The light on what frames show of the vertices. Even where what is found explains nothing of the
@@ -114,10 +135,10 @@ pub(crate) fn measure_light(frames: &[Vec<Seen>], vertices: usize) -> Light {
         };
         known.map(error).sum()
     };
-    if error(Shading::measure(half(0), vertices).light()) > (1.0 - WORTH) * error(Light::default()) {
+    if error(lamp(half(0), vertices)) > (1.0 - WORTH) * error(Light::default()) {
         return Light::default();
     }
-    Shading::measure(chosen.iter().flat_map(|frame| frame.iter()), vertices).light()
+    lamp(chosen.iter().flat_map(|frame| frame.iter()), vertices)
 }
 
 #[cfg(test)]

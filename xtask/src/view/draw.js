@@ -23,8 +23,10 @@ void main() {
   vec4 rest = vec4(position, 1.0);
   gl_Position = camera * vec4(dot(x, rest), dot(y, rest), dot(z, rest), 1.0);
   vec3 turned = vec3(dot(x.xyz, normal), dot(y.xyz, normal), dot(z.xyz, normal));
+  float lamp = length(light);
+  float along = dot(light, turned) * inversesqrt(max(dot(turned, turned), 1e-12)) / max(lamp, 1e-12);
   // As brightness is in training: black would say nothing of the colour.
-  at = vec3(uv, max(1.0 + dot(light, turned) * inversesqrt(max(dot(turned, turned), 1e-12)), 0.2));
+  at = vec3(uv, max(1.0 + lamp * (along + 0.5 * (along * along - 1.0 / 3.0)), 0.2));
 }`;
 const TEXTURED = `#version 300 es
 precision mediump float;
@@ -56,7 +58,7 @@ out vec4 color;
 void main() { color = shade; }`;
 
 class Scene {
-  // `light`: where surfaces are brightest, and by how much of the mean.
+  // `light`: where the lamp is, and by how much of the mean it lights.
   constructor(canvas, person, light) {
     const gl = canvas.getContext("webgl2", { antialias: false, alpha: false });
     if (!gl) throw new Error("This browser has no WebGL 2.");
