@@ -180,7 +180,7 @@ fn each_mistake_is_found() {
     ] {
         let (mut trials, mut found, mut others) = (0, 0, Vec::new());
         for (name, capture, body) in good() {
-            for window in windows(capture, capture.train.len().min(30), 60) {
+            for window in windows(capture, capture.train.len().min(30), 30) {
                 let wrong = made(mistake, &window, body);
                 let mistakes = likely(&wrong, body, small_views(&wrong).unwrap());
                 trials += 1;
