@@ -3,17 +3,15 @@
 use glam::Vec3;
 use surface_query::vertex_normals;
 
-/// Least brightness: what a light leaves black says nothing of its colour.
-const DARKEST: f32 = 0.2;
-
 /// How much brighter than a linear light surfaces are that face the lamp or turn their back on it,
 /// and darker those that it grazes: 0.94 under a point far away, 0 under an evenly bright half of the
 /// sky. Between them, for lamps have a size; chosen on the tuning captures.
 const LAMP: f32 = 0.5;
 
 /// Brightness by normal n under one lamp and what comes evenly from everywhere,
-/// 1 + s · n + ½ |s| ((ŝ · n)² − ⅓) with s its slope: three bands of spherical harmonics (Ramamoorthi
-/// and Hanrahan 2001), of which the third follows from the second. Even light by default.
+/// 1 + s · n + ½ |s| ((ŝ · n)² − ⅓) with s its slope, at least 0.2: three bands of spherical
+/// harmonics (Ramamoorthi and Hanrahan 2001), of which the third follows from the second. Even light
+/// by default.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Light {
     /// Where the lamp is, in the world, and by how much of the mean it lights.
@@ -21,6 +19,9 @@ pub struct Light {
 }
 
 impl Light {
+    /// Least brightness: what a light leaves black says nothing of its colour.
+    pub(crate) const DARKEST: f32 = 0.2;
+
     /// What the slope is multiplied with to light a surface with this unit normal, for a lamp in
     /// this direction (a unit vector, or zero for a linear light).
     pub(crate) fn along(lamp: Vec3, normal: Vec3) -> Vec3 {
@@ -30,7 +31,7 @@ impl Light {
     /// How bright a surface with this unit normal is, relative to the mean over all directions.
     #[must_use]
     pub fn on(&self, normal: Vec3) -> f32 {
-        (1.0 + self.slope.dot(Self::along(self.slope.normalize_or_zero(), normal))).max(DARKEST)
+        (1.0 + self.slope.dot(Self::along(self.slope.normalize_or_zero(), normal))).max(Self::DARKEST)
     }
 
     /// How bright each vertex of a surface is, (V); nothing under even light, as bright as 1.

@@ -21,8 +21,6 @@ const FREE: f64 = 0.01;
 const BOUND: f64 = 0.03;
 /// Steepest light.
 const MOST_SLOPE: f32 = 0.8;
-/// Least brightness that says anything of a colour.
-const DARKEST: f32 = 0.2;
 /// Share of the squared error that a light has to explain, in frames that it was not measured from.
 const WORTH: f64 = 0.02;
 
@@ -51,17 +49,13 @@ fn harmonics(lamp: Vec3, n: Vec3) -> Terms {
     Terms::from([1.0, along_x, along_y, along_z, x * y, y * z, z * x, x * x - y * y, z * z - 1.0 / 3.0])
 }
 
-/// The harmonics that explain best what was seen of these colours, relative to the first; `None`
-/// where nothing says which. `third` is the weight against the third band.
-fn brightness<'a>(
-    seen: impl Iterator<Item = &'a Seen>,
-    albedo: &[(Vec3, f32)],
-    lamp: Vec3,
-    third: f64,
-) -> Option<Terms> {
+/// The harmonics that explain best what was seen of colours with these sums (see [`albedo`]),
+/// relative to the first; `None` where nothing says which. `third` is the weight against the third
+/// band.
+fn brightness<'a>(seen: impl Iterator<Item = &'a Seen>, sums: &[(Vec3, f32)], lamp: Vec3, third: f64) -> Option<Terms> {
     let (mut matrix, mut vector, mut total) = (SMatrix::<f64, 9, 9>::zeros(), Terms::zeros(), 0.0);
     for (v, color, normal) in seen {
-        let (sum, squares) = albedo[*v as usize];
+        let (sum, squares) = sums[*v as usize];
         let (albedo, basis) = (sum / squares, harmonics(lamp, *normal));
         let squared = f64::from(albedo.length_squared());
         matrix += squared * basis * basis.transpose();
@@ -78,7 +72,7 @@ fn brightness<'a>(
     terms.iter().all(|t| t.is_finite()).then_some(terms)
 }
 
-/// Brightness by normal in three bands, which says nothing of normals that no frame shows.
+/// Brightness by normal in three bands, arbitrary at normals that no frame shows.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Shading(Terms);
 
@@ -91,29 +85,29 @@ impl Shading {
 
     /// How bright a surface with this unit normal is.
     pub fn on(&self, normal: Vec3) -> f32 {
-        (self.0.dot(&harmonics(Vec3::ZERO, normal)) as f32).max(DARKEST)
+        (self.0.dot(&harmonics(Vec3::ZERO, normal)) as f32).max(Light::DARKEST)
     }
 
     /// Tells colour and light apart by alternating least squares.
     pub fn measure<'a>(seen: impl Iterator<Item = &'a Seen> + Clone, vertices: usize) -> Self {
         let mut found = Self::even();
         for _ in 0..ROUNDS {
-            let albedo = albedo(seen.clone(), vertices, |n| found.on(n));
-            let Some(terms) = brightness(seen.clone(), &albedo, Vec3::ZERO, FREE) else { return Self::even() };
+            let sums = albedo(seen.clone(), vertices, |n| found.on(n));
+            let Some(terms) = brightness(seen.clone(), &sums, Vec3::ZERO, FREE) else { return Self::even() };
             found = Self(terms);
         }
         found
     }
 }
 
-/// The lamp among what is seen, in the same way; what of the third band is none of its is left out
-/// of colours.
+/// The lamp that explains best what was seen, found in the same way. What the third band has beside
+/// it is fitted and forgotten.
 fn lamp<'a>(seen: impl Iterator<Item = &'a Seen> + Clone, vertices: usize) -> Light {
     let mut found = Light::default();
     for _ in 0..ROUNDS {
-        let albedo = albedo(seen.clone(), vertices, |n| found.on(n));
+        let sums = albedo(seen.clone(), vertices, |n| found.on(n));
         let toward = found.slope.normalize_or_zero();
-        let Some(terms) = brightness(seen.clone(), &albedo, toward, BOUND) else { return Light::default() };
+        let Some(terms) = brightness(seen.clone(), &sums, toward, BOUND) else { return Light::default() };
         let slope = Vec3::new(terms[1] as f32, terms[2] as f32, terms[3] as f32);
         found = Light { slope: slope.clamp_length_max(MOST_SLOPE) };
     }

@@ -36,8 +36,8 @@ impl Avatar {
 /// `WEIGHTS_0` in 16 bits), `KHR_materials_unlit`, the atlas as PNG, a node a joint with the rest
 /// pose as bind pose, and an animation a clip. The innermost shell is opaque, those around it are
 /// blended over it in order. The atlas is under even light; that of the video is the scene's extra
-/// `light`, a vector: how bright a surface is under it, see [`crate::capture::Light`]. Pose blend
-/// shapes and confidence are left out.
+/// `light`, a vector s: a surface with unit normal n is max(1 + s · n + ½ |s| ((ŝ · n)² − ⅓), 0.2)
+/// times as bright, see [`crate::capture::Light`]. Pose blend shapes and confidence are left out.
 ///
 /// # Errors
 /// [`Error::Bake`] with what [`Avatar::validate`] finds, and for more than 4 GiB.
