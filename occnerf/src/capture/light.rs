@@ -4,14 +4,14 @@ use glam::Vec3;
 use surface_query::vertex_normals;
 
 /// How much brighter than a linear light surfaces are that face the lamp or turn their back on it,
-/// and darker those that it grazes: 0.94 under a point far away, 0 under an evenly bright half of the
-/// sky. Between them, for lamps have a size; chosen on the tuning captures.
+/// and darker those that it grazes: 0.94 under a point far away, 0 under an evenly bright half of
+/// the sky. Between them, for lamps have a size; chosen on the tuning captures.
 const LAMP: f32 = 0.5;
 
 /// Brightness by normal n under one lamp and what comes evenly from everywhere,
 /// 1 + s · n + ½ |s| ((ŝ · n)² − ⅓) with s its slope, at least 0.2: three bands of spherical
-/// harmonics (Ramamoorthi and Hanrahan 2001), of which the third follows from the second. Even light
-/// by default.
+/// harmonics (Ramamoorthi and Hanrahan 2001), of which the third follows from the second. Even
+/// light by default.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Light {
     /// Where the lamp is, in the world, and by how much of the mean it lights.
