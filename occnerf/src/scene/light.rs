@@ -15,9 +15,7 @@ const MOST_SEEN: usize = 1 << 20;
 const ROUNDS: usize = 6;
 /// Weight of even light against the observations.
 const EVEN: f64 = 0.001;
-/// The same for what the third band has beside the lamp: for a shading that is never drawn, and for
-/// a light, of which it would take the side that no frame shows.
-const FREE: f64 = 0.01;
+/// The same for what the third band has beside the lamp: it would take the side that no frame shows.
 const BOUND: f64 = 0.03;
 /// Steepest light.
 const MOST_SLOPE: f32 = 0.8;
@@ -50,9 +48,8 @@ fn harmonics(lamp: Vec3, n: Vec3) -> Terms {
 }
 
 /// The harmonics that explain best what was seen of colours with these sums (see [`albedo`]),
-/// relative to the first; `None` where nothing says which. `third` is the weight against the third
-/// band.
-fn brightness<'a>(seen: impl Iterator<Item = &'a Seen>, sums: &[(Vec3, f32)], lamp: Vec3, third: f64) -> Option<Terms> {
+/// relative to the first; `None` where nothing says which.
+fn brightness<'a>(seen: impl Iterator<Item = &'a Seen>, sums: &[(Vec3, f32)], lamp: Vec3) -> Option<Terms> {
     let (mut matrix, mut vector, mut total) = (SMatrix::<f64, 9, 9>::zeros(), Terms::zeros(), 0.0);
     for (v, color, normal) in seen {
         let (sum, squares) = sums[*v as usize];
@@ -63,7 +60,7 @@ fn brightness<'a>(seen: impl Iterator<Item = &'a Seen>, sums: &[(Vec3, f32)], la
         total += squared;
     }
     for i in 0..9 {
-        matrix[(i, i)] += total * if i < 4 { EVEN } else { third };
+        matrix[(i, i)] += total * if i < 4 { EVEN } else { BOUND };
     }
     vector[0] += EVEN * total;
     let terms = matrix.try_inverse()? * vector;
@@ -72,42 +69,14 @@ fn brightness<'a>(seen: impl Iterator<Item = &'a Seen>, sums: &[(Vec3, f32)], la
     terms.iter().all(|t| t.is_finite()).then_some(terms)
 }
 
-/// Brightness by normal in three bands, arbitrary at normals that no frame shows.
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct Shading(Terms);
-
-impl Shading {
-    fn even() -> Self {
-        let mut even = Terms::zeros();
-        even[0] = 1.0;
-        Self(even)
-    }
-
-    /// How bright a surface with this unit normal is.
-    pub fn on(&self, normal: Vec3) -> f32 {
-        (self.0.dot(&harmonics(Vec3::ZERO, normal)) as f32).max(Light::DARKEST)
-    }
-
-    /// Tells colour and light apart by alternating least squares.
-    pub fn measure<'a>(seen: impl Iterator<Item = &'a Seen> + Clone, vertices: usize) -> Self {
-        let mut found = Self::even();
-        for _ in 0..ROUNDS {
-            let sums = albedo(seen.clone(), vertices, |n| found.on(n));
-            let Some(terms) = brightness(seen.clone(), &sums, Vec3::ZERO, FREE) else { return Self::even() };
-            found = Self(terms);
-        }
-        found
-    }
-}
-
-/// The lamp that explains best what was seen, found in the same way. What the third band has beside
-/// it is fitted and forgotten.
-fn lamp<'a>(seen: impl Iterator<Item = &'a Seen> + Clone, vertices: usize) -> Light {
+/// The lamp that explains best what was seen, told apart from the colours by alternating least
+/// squares. What the third band has beside it is fitted and forgotten.
+pub(crate) fn lamp<'a>(seen: impl Iterator<Item = &'a Seen> + Clone, vertices: usize) -> Light {
     let mut found = Light::default();
     for _ in 0..ROUNDS {
         let sums = albedo(seen.clone(), vertices, |n| found.on(n));
         let toward = found.slope.normalize_or_zero();
-        let Some(terms) = brightness(seen.clone(), &sums, toward, BOUND) else { return Light::default() };
+        let Some(terms) = brightness(seen.clone(), &sums, toward) else { return Light::default() };
         let slope = Vec3::new(terms[1] as f32, terms[2] as f32, terms[3] as f32);
         found = Light { slope: slope.clamp_length_max(MOST_SLOPE) };
     }

@@ -2,7 +2,8 @@
 
 use glam::Vec3;
 
-use crate::scene::light::{Seen, Shading, albedo};
+use crate::capture::Light;
+use crate::scene::light::{Seen, albedo, lamp};
 use crate::scene::registration::sight::Sight;
 
 /// Least noise of a colour, and frames that have to show a vertex.
@@ -13,7 +14,7 @@ const SHOWN: u32 = 3;
 pub(super) struct Colors {
     /// Colour, and in how many frames it was seen, V.
     albedo: Vec<(Vec3, u32)>,
-    shading: Shading,
+    light: Light,
     /// Standard deviation of what is seen from what it should be, by its median.
     pub noise: f32,
 }
@@ -21,12 +22,12 @@ pub(super) struct Colors {
 impl Colors {
     pub fn measure(sights: &[Sight], vertices: usize) -> Self {
         let seen = || sights.iter().flat_map(|sight| &sight.seen);
-        let shading = Shading::measure(seen(), vertices);
+        let light = lamp(seen(), vertices);
         let mut counts = vec![0; vertices];
         seen().for_each(|(v, ..)| counts[*v as usize] += 1);
-        let sums = albedo(seen(), vertices, |normal| shading.on(normal));
+        let sums = albedo(seen(), vertices, |normal| light.on(normal));
         let albedo = sums.iter().zip(counts).map(|(&(sum, squares), n)| (sum / squares.max(f32::MIN_POSITIVE), n));
-        let mut colors = Self { albedo: albedo.collect(), shading, noise: 1.0 };
+        let mut colors = Self { albedo: albedo.collect(), light, noise: 1.0 };
         let mut errors: Vec<f32> =
             seen().filter_map(|seen| Some(colors.error(seen)?.abs().element_sum() / 3.0)).collect();
         if !errors.is_empty() {
@@ -40,6 +41,6 @@ impl Colors {
     /// What is seen less what it should be; `None` where too few frames say what.
     pub fn error(&self, (vertex, color, normal): &Seen) -> Option<Vec3> {
         let (albedo, count) = self.albedo[*vertex as usize];
-        (count >= SHOWN).then(|| *color - self.shading.on(*normal) * albedo)
+        (count >= SHOWN).then(|| *color - self.light.on(*normal) * albedo)
     }
 }
