@@ -35,7 +35,7 @@ const MOST: (u32, usize, u32) = (2048, 16, 19);
 /// Pixel-wide places that the steps of `fast` and `balanced` are enough for: a person in pictures
 /// of 256 × 256. More take more steps in proportion, up to [`MOST_STEPS`] times as many.
 const PLACES_OF_A_RUN: f64 = 28_000.0;
-const MOST_STEPS: f64 = 2.5;
+const MOST_STEPS: f64 = 2.0;
 
 /// What was measured of a scene, and the sizes that follow from it.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
