@@ -24,14 +24,10 @@ const WORTH: f64 = 0.02;
 
 /// Σ s c and Σ s² of the colours c of each vertex and the light s on them: their quotient is closest
 /// to what was seen.
-pub(crate) fn albedo<'a>(
-    seen: impl Iterator<Item = &'a Seen>,
-    vertices: usize,
-    shade: impl Fn(Vec3) -> f32,
-) -> Vec<(Vec3, f32)> {
+pub(crate) fn albedo<'a>(seen: impl Iterator<Item = &'a Seen>, vertices: usize, light: Light) -> Vec<(Vec3, f32)> {
     let mut sums = vec![(Vec3::ZERO, 0.0f32); vertices];
     for (vertex, color, normal) in seen {
-        let (sum, shade) = (&mut sums[*vertex as usize], shade(*normal));
+        let (sum, shade) = (&mut sums[*vertex as usize], light.on(*normal));
         *sum = (sum.0 + shade * *color, sum.1 + shade * shade);
     }
     sums
@@ -47,9 +43,9 @@ fn harmonics(lamp: Vec3, n: Vec3) -> Terms {
     Terms::from([1.0, along_x, along_y, along_z, x * y, y * z, z * x, x * x - y * y, z * z - 1.0 / 3.0])
 }
 
-/// The harmonics that explain best what was seen of colours with these sums (see [`albedo`]),
-/// relative to the first; `None` where nothing says which.
-fn brightness<'a>(seen: impl Iterator<Item = &'a Seen>, sums: &[(Vec3, f32)], lamp: Vec3) -> Option<Terms> {
+/// The slope that explains best, with the third band beside it, what was seen of colours with these
+/// sums (see [`albedo`]); `None` where nothing says which.
+fn slope<'a>(seen: impl Iterator<Item = &'a Seen>, sums: &[(Vec3, f32)], lamp: Vec3) -> Option<Vec3> {
     let (mut matrix, mut vector, mut total) = (SMatrix::<f64, 9, 9>::zeros(), Terms::zeros(), 0.0);
     for (v, color, normal) in seen {
         let (sum, squares) = sums[*v as usize];
@@ -66,7 +62,7 @@ fn brightness<'a>(seen: impl Iterator<Item = &'a Seen>, sums: &[(Vec3, f32)], la
     let terms = matrix.try_inverse()? * vector;
     // What is bright everywhere is the colour's.
     let terms = terms / terms[0];
-    terms.iter().all(|t| t.is_finite()).then_some(terms)
+    terms.iter().all(|t| t.is_finite()).then(|| Vec3::new(terms[1] as f32, terms[2] as f32, terms[3] as f32))
 }
 
 /// The lamp that explains best what was seen, told apart from the colours by alternating least
@@ -74,10 +70,9 @@ fn brightness<'a>(seen: impl Iterator<Item = &'a Seen>, sums: &[(Vec3, f32)], la
 pub(crate) fn lamp<'a>(seen: impl Iterator<Item = &'a Seen> + Clone, vertices: usize) -> Light {
     let mut found = Light::default();
     for _ in 0..ROUNDS {
-        let sums = albedo(seen.clone(), vertices, |n| found.on(n));
+        let sums = albedo(seen.clone(), vertices, found);
         let toward = found.slope.normalize_or_zero();
-        let Some(terms) = brightness(seen.clone(), &sums, toward) else { return Light::default() };
-        let slope = Vec3::new(terms[1] as f32, terms[2] as f32, terms[3] as f32);
+        let Some(slope) = slope(seen.clone(), &sums, toward) else { return Light::default() };
         found = Light { slope: slope.clamp_length_max(MOST_SLOPE) };
     }
     found
@@ -90,7 +85,7 @@ pub(crate) fn measure_light(frames: &[Vec<Seen>], vertices: usize) -> Light {
     let chosen: Vec<&Vec<Seen>> = frames.iter().step_by(frames.len().div_ceil(most).max(1)).collect();
     let half = |first: usize| chosen.iter().skip(first).step_by(2).flat_map(|frame| frame.iter());
     let error = |light: Light| -> f64 {
-        let sums = albedo(half(0), vertices, |n| light.on(n));
+        let sums = albedo(half(0), vertices, light);
         let known = half(1).filter(|seen| sums[seen.0 as usize].1 > 0.0);
         let error = |(v, color, normal): &Seen| {
             let (sum, squares) = sums[*v as usize];

@@ -71,7 +71,7 @@ pub(crate) fn deeper(frames: &[Vec<(Seen, usize)>], edge: usize) -> Vec<Vec<Seen
 /// than what lies farther inside: as many as are, one after another, more wrong than the next.
 pub(crate) fn strange_edge(frames: &[Vec<(Seen, usize)>], light: Light, vertices: usize) -> usize {
     let inside = deeper(frames, MOST);
-    let sums = albedo(inside.iter().flatten(), vertices, |normal| light.on(normal));
+    let sums = albedo(inside.iter().flatten(), vertices, light);
     let mut errors = [(0.0, 0u64); MOST + 2];
     for ((v, color, normal), depth) in frames.iter().flatten() {
         let (sum, squares) = sums[*v as usize];

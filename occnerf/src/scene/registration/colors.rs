@@ -25,7 +25,7 @@ impl Colors {
         let light = lamp(seen(), vertices);
         let mut counts = vec![0; vertices];
         seen().for_each(|(v, ..)| counts[*v as usize] += 1);
-        let sums = albedo(seen(), vertices, |normal| light.on(normal));
+        let sums = albedo(seen(), vertices, light);
         let albedo = sums.iter().zip(counts).map(|(&(sum, squares), n)| (sum / squares.max(f32::MIN_POSITIVE), n));
         let mut colors = Self { albedo: albedo.collect(), light, noise: 1.0 };
         let mut errors: Vec<f32> =
