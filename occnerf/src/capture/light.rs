@@ -34,6 +34,12 @@ impl Light {
         (1.0 + self.slope.dot(Self::along(self.slope.normalize_or_zero(), normal))).max(Self::DARKEST)
     }
 
+    /// How [`Light::on`] changes with the normal.
+    pub(crate) fn change(&self, normal: Vec3) -> Vec3 {
+        let toward = self.slope.normalize_or_zero();
+        if self.on(normal) > Self::DARKEST { (1.0 + 2.0 * LAMP * toward.dot(normal)) * self.slope } else { Vec3::ZERO }
+    }
+
     /// How bright each vertex of a surface is, (V); nothing under even light, as bright as 1.
     ///
     /// # Panics

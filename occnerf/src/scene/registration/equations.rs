@@ -81,11 +81,14 @@ impl<'a> Equations<'a> {
         }
     }
 
-    /// Adds a residual and its derivative by the place of the vertex.
-    fn add(&mut self, weight: f32, residual: f32, slope: Vec3) {
+    /// Adds a residual and its derivatives by the place of the vertex and as the surface turns there.
+    fn add(&mut self, weight: f32, residual: f32, slope: Vec3, turned: Vec3) {
         let Self { motion, row, normal, .. } = self;
         row.clear();
         row.extend(motion.directions.iter().map(|d| f64::from(d.dot(slope))));
+        for (column, turn) in motion.turns() {
+            row[column] += f64::from(turn.dot(turned));
+        }
         normal.add(f64::from(weight), f64::from(residual), &motion.columns, row);
     }
 
@@ -100,7 +103,7 @@ impl<'a> Equations<'a> {
             let residual = thicker[v] * scale - distance;
             let noise = OUTLINE[0] + OUTLINE[1] * unit * scale;
             self.at(v);
-            self.add(alone * robust(residual * residual, noise) / (noise * noise), residual, slope);
+            self.add(alone * robust(residual * residual, noise) / (noise * noise), residual, slope, Vec3::ZERO);
         }
     }
 
@@ -114,7 +117,8 @@ impl<'a> Equations<'a> {
             let squared = colors.noise * colors.noise;
             let weight = COLOR * alone * robust(error.length_squared(), colors.noise) / squared;
             self.at(seen.0 as usize);
-            (0..3).for_each(|c| self.add(weight, error[c], slope[c]));
+            let turned = colors.turned(seen);
+            (0..3).for_each(|c| self.add(weight, error[c], slope[c], turned[c]));
         }
     }
 }

@@ -5,6 +5,7 @@
 //! where nothing stands in front. Clothes are taken to be as thick in all frames: how far they
 //! stand off a vertex is the mean over the frames that show it on an outline. Once outlines agree,
 //! so do colours: each vertex has one, under a light that all frames share (Lucas and Kanade 1981).
+//! How bright a surface is tells how it is turned, also out of the picture's plane (Horn 1970).
 //! Poses, place and shape take Gauss-Newton steps on all frames at once, in which errors of a
 //! tracker are expected to change slowly: what a frame hides follows the frames around it. How
 //! large they are is learnt on the way ([`Tracker`]).
@@ -51,7 +52,7 @@ const BETAS: usize = 10;
 /// pixels.
 const REACH: [f32; 2] = [12.0, 5.0];
 /// Blur of the colours in the first round that looks at them, halfway, and in the last, pixels.
-const BLUR: [f32; 2] = [3.0, 1.0];
+const BLUR: [f32; 2] = [3.0, 0.5];
 /// Frames that a vertex has to be on an outline in before half of what they say of its clothes is
 /// believed, and the farthest that clothes stand off, metres.
 const DOUBT: f32 = 1.0;

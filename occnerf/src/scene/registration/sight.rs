@@ -22,7 +22,7 @@ const BEYOND: f32 = 2.0;
 const BEFORE: f32 = 1.5;
 /// Least cosine between a vertex's normal and the way to the camera at which its colour counts, and
 /// least coverage of the pixels that it is taken from.
-const FACING: f32 = 0.6;
+const FACING: f32 = 0.4;
 const COVERED: f32 = 0.7;
 /// How far behind what a pixel sees a vertex may be, metres.
 const BEHIND: f32 = 0.02;

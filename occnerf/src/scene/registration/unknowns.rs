@@ -61,6 +61,15 @@ pub(super) struct Motion {
     pub columns: Vec<u32>,
     /// Derivatives of the point in world axes.
     pub directions: Vec<Vec3>,
+    /// Where in `columns` the turn of each bone begins that the point hangs on, and by how much.
+    pub bones: Vec<(usize, f32)>,
+}
+
+impl Motion {
+    /// Where in `columns` the unknowns are that turn the surface at the point, and their turns.
+    pub fn turns(&self) -> impl Iterator<Item = (usize, Vec3)> {
+        self.bones.iter().flat_map(|&(first, weight)| (0..3).map(move |i| (first + i, weight * Vec3::AXES[i])))
+    }
 }
 
 /// Derivatives of points of a posed body.
@@ -87,6 +96,7 @@ impl<'a> Motions<'a> {
     pub fn of(&mut self, vertex: usize, out: &mut Motion) {
         out.columns.clear();
         out.directions.clear();
+        out.bones.clear();
         let at = Vec3A::from(self.rest[vertex] + self.posed.pose_offsets[vertex]);
         let mut highest = 0;
         for (joint, weight) in self.model.weights.row(vertex) {
@@ -118,6 +128,9 @@ impl<'a> Motions<'a> {
                 None => push(0, self.axes, &|axis| axis),
             }
         }
+        let column = |joint: usize| out.columns.iter().position(|&c| c as usize == 3 + 3 * joint);
+        let bones = self.model.weights.row(vertex);
+        out.bones.extend(bones.filter_map(|(joint, weight)| Some((column(joint)?, weight))));
     }
 }
 
@@ -167,6 +180,54 @@ mod tests {
                     let column = motion.columns.iter().position(|&c| c as usize == unknown);
                     let exact = column.map_or(Vec3::ZERO, |c| motion.directions[c]);
                     prop_assert!(exact.distance(numeric) < 1e-3, "vertex {vertex}, unknown {unknown}: {exact} {numeric}");
+                }
+            }
+        }
+
+        /// Normals turn with the bone that their surface hangs on, and with no other.
+        #[test]
+        fn normals_turn_as_those_of_finite_differences(seed in any::<u64>()) {
+            let mut model = BodyModel::embedded();
+            model.posedirs = smpl::SparseRows::from_rows(vec![Vec::new(); model.num_vertices()]);
+            let mut stream = Stream::new(&[seed]);
+            let mut random = |size: f32| size * Vec3::new(stream.normal(), stream.normal(), stream.normal());
+            let pose: Vec<Vec3> = (0..model.num_joints()).map(|_| random(0.3)).collect();
+            let shape = model.shaped(&[0.4, -0.7]);
+            let frame = crate::scene::registration::tests::frame(pose, Placement::Pelvis { translation: random(1.0) });
+            let at = |change: &[Vec3]| {
+                let (pose, placement) = changed(&frame, &model, &shape, change);
+                model.pose(&shape, &pose, placement)
+            };
+            let bone = |v: usize| model.weights.row(v).find(|(_, weight)| *weight > 0.9999).map(|(joint, _)| joint);
+            let mut rigid: Vec<Option<usize>> = (0..model.num_vertices()).map(bone).collect();
+            for corners in &model.faces {
+                let [a, b, c] = corners.map(|v| bone(v as usize));
+                if a != b || b != c {
+                    corners.iter().for_each(|v| rigid[*v as usize] = None);
+                }
+            }
+            let rigid: Vec<usize> = (0..rigid.len()).filter(|&v| rigid[v].is_some()).collect();
+            prop_assert!(rigid.len() > 100, "{}", rigid.len());
+            let still = vec![Vec3::ZERO; model.num_joints() + 1];
+            let posed = at(&still);
+            let normals = |posed: &Posed| surface_query::vertex_normals(&posed.vertices, &model.faces);
+            let now = normals(&posed);
+            let mut motions = Motions::new(&model, &shape.vertices, &posed, &frame.camera);
+            let mut motion = Motion::default();
+            for unknown in 0..3 * still.len() {
+                let h = 1e-2;
+                let moved = |h: f32| {
+                    let mut change = still.clone();
+                    change[unknown / 3][unknown % 3] += h;
+                    normals(&at(&change))
+                };
+                let (more, less) = (moved(h), moved(-h));
+                for &v in rigid.iter().step_by(rigid.len() / 9) {
+                    motions.of(v, &mut motion);
+                    let numeric = (more[v].normalize() - less[v].normalize()) / (2.0 * h);
+                    let mine = motion.turns().filter(|(column, _)| motion.columns[*column] as usize == unknown);
+                    let exact: Vec3 = mine.map(|(_, turn)| turn.cross(now[v].normalize())).sum();
+                    prop_assert!(exact.distance(numeric) < 2e-3, "vertex {v}, unknown {unknown}: {exact} {numeric}");
                 }
             }
         }
