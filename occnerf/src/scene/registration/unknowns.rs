@@ -224,9 +224,9 @@ mod tests {
                 let (more, less) = (moved(h), moved(-h));
                 for &v in rigid.iter().step_by(rigid.len() / 9) {
                     motions.of(v, &mut motion);
-                    let numeric = (more[v].normalize() - less[v].normalize()) / (2.0 * h);
+                    let numeric = (more[v].normalize_or_zero() - less[v].normalize_or_zero()) / (2.0 * h);
                     let mine = motion.turns().filter(|(column, _)| motion.columns[*column] as usize == unknown);
-                    let exact: Vec3 = mine.map(|(_, turn)| turn.cross(now[v].normalize())).sum();
+                    let exact: Vec3 = mine.map(|(_, turn)| turn.cross(now[v].normalize_or_zero())).sum();
                     prop_assert!(exact.distance(numeric) < 2e-3, "vertex {v}, unknown {unknown}: {exact} {numeric}");
                 }
             }
