@@ -12,6 +12,7 @@
 
 mod colors;
 mod equations;
+mod habits;
 mod picture;
 mod sight;
 mod system;
@@ -191,7 +192,7 @@ impl<'a> Registration<'a> {
         let clothes = this.measure_clothes(&sights);
         let thicker: Vec<f32> = clothes.iter().zip(&this.clothes).map(|(after, before)| after - before).collect();
         let colors = Colors::measure(&sights, this.model.num_vertices());
-        let normals: Vec<Normal> = (0..this.frames.len())
+        let mut normals: Vec<Normal> = (0..this.frames.len())
             .into_par_iter()
             .map(|f| {
                 let Moment { shape, posed, .. } = &moments[f];
@@ -203,6 +204,8 @@ impl<'a> Registration<'a> {
                 equations.normal
             })
             .collect();
+        let poses: Vec<&Posed> = moments.iter().map(|moment| &moment.posed).collect();
+        habits::keep(this.model, &poses, &mut normals);
         let own = 3 * (this.model.num_joints() + 1);
         let gap = this.frames.get(1).map_or(1, |second| second - this.frames[0]);
         let (expected, kept) = this.tracker.expected(this.unit, own, gap);

@@ -175,7 +175,7 @@ pub(super) fn solve(
 
 /// The inverse of a positive definite matrix, from those of its halves: products of matrices are
 /// many times faster here than solving.
-fn inverse(matrix: DMatrix<f64>) -> Option<DMatrix<f64>> {
+pub(super) fn inverse(matrix: DMatrix<f64>) -> Option<DMatrix<f64>> {
     let (size, half) = (matrix.nrows(), matrix.nrows() / 2);
     if size <= DIRECT {
         return Some(Cholesky::new(matrix)?.inverse());
