@@ -8,7 +8,7 @@
 //! How bright a surface is tells how it is turned, also out of the picture's plane (Horn 1970).
 //! Poses, place and shape take Gauss-Newton steps on all frames at once, in which errors of a
 //! tracker are expected to change slowly: what a frame hides follows the frames around it. How
-//! large they are is learnt on the way ([`Tracker`]).
+//! large they are is learnt on the way ([`Tracker`]), as is what limbs do together ([`habits`]).
 
 mod colors;
 mod equations;
