@@ -97,11 +97,10 @@ pub fn registration(arguments: &RegistrationArguments) -> Result<()> {
         "seconds",
     ];
     let mut lines = vec![header.map(str::to_owned).to_vec()];
-    // Registration also finds clothes, which the true bodies lack. Masks are as wrong as the prior's.
-    let best_with = |wrong: &Perturbation| -> Result<f64> {
+    // Registration also finds clothes, which the true bodies lack.
+    let best_with = |masks: &Perturbation| -> Result<f64> {
         let mut best = truth.clone();
-        let Perturbation { ragged_pixels, mask_pixels, .. } = *wrong;
-        Perturbation { ragged_pixels, mask_pixels, ..Perturbation::NONE }.apply(&mut best, &body)?;
+        masks.apply(&mut best, &body)?;
         register(&mut best, &body, rounds)?;
         psnr(&best, &body)
     };
@@ -120,8 +119,9 @@ pub fn registration(arguments: &RegistrationArguments) -> Result<()> {
             line.extend([format!("{before:.2}"), format!("{after:.2}")]);
         }
         let found_psnr = psnr(&capture, &model)?;
-        let is_exact = wrong.ragged_pixels == 0.0 && wrong.mask_pixels == 0;
-        let best = if is_exact { exact } else { best_with(wrong)? };
+        let Perturbation { ragged_pixels, mask_pixels, .. } = *wrong;
+        let masks = Perturbation { ragged_pixels, mask_pixels, ..Perturbation::NONE };
+        let best = if masks == Perturbation::NONE { exact } else { best_with(&masks)? };
         let gained = (found_psnr - given_psnr) / (best - given_psnr);
         let gained = if best - given_psnr > 0.1 { format!("{:.0} %", 100.0 * gained) } else { "–".to_owned() };
         line.extend([format!("{given_psnr:.2}"), format!("{found_psnr:.2}"), gained, format!("{seconds:.1}")]);

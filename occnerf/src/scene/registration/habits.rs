@@ -8,14 +8,14 @@ use smpl::{BodyModel, Posed};
 
 use crate::scene::registration::system::{Normal, inverse};
 
-/// How far joints are off their habits, radians: what few frames cannot tell of those is not held
-/// against a frame.
+/// Standard deviation, radians an axis, of what a pose does beside all that the video's vary by: of
+/// what few frames do, the variance alone would allow one more frame nothing else.
 const FREE: f64 = 0.087;
 
-/// How all joints are turned against the bones above them, in each frame, about their means.
+/// How joints are turned against the bones above them, from their means over the video.
 struct Turns<'a> {
     model: &'a BodyModel,
-    /// Turn of each joint in the middle of the video, (J).
+    /// Mean turn of each joint, (J).
     means: Vec<Quat>,
 }
 
@@ -77,28 +77,28 @@ fn turn(model: &BodyModel, pose: &Posed, joint: usize) -> Quat {
 /// equations are empty, as they show nothing, are not asked; those whose pose is not finite do not
 /// count either.
 pub(super) fn keep(model: &BodyModel, poses: &[&Posed], normals: &mut [Normal]) {
-    let is_finite = |pose: &&Posed| pose.bones.iter().all(|bone| bone.is_finite());
-    let finite: Vec<&Posed> = poses.iter().copied().filter(is_finite).collect();
-    let turns = Turns::new(model, &finite);
-    let away: Vec<DVector<f64>> = finite.par_iter().map(|pose| turns.of(pose)).collect();
-    let (size, count) = (3 * model.num_joints(), finite.len().max(1) as f64);
+    let is_finite = |pose: &Posed| pose.bones.iter().all(|bone| bone.is_finite());
+    let (poses, normals): (Vec<&Posed>, Vec<&mut Normal>) =
+        poses.iter().copied().zip(normals).filter(|(pose, _)| is_finite(pose)).unzip();
+    let turns = Turns::new(model, &poses);
+    let mut away: Vec<DVector<f64>> = poses.par_iter().map(|pose| turns.of(pose)).collect();
+    let (size, count) = (3 * model.num_joints(), poses.len().max(1) as f64);
     let mean = away.iter().fold(DVector::zeros(size), |sum, away| sum + away) / count;
     let mut variance = DMatrix::from_diagonal_element(size, size, FREE * FREE);
-    for away in &away {
-        let off = away - &mean;
-        variance.ger(count.recip(), &off, &off, 1.0);
+    for away in &mut away {
+        *away -= &mean;
+        variance.ger(count.recip(), away, away, 1.0);
     }
     let Some(precision) = inverse(variance) else { return };
-    let is_asked = |(normal, pose): &(&mut Normal, &&Posed)| normal.matrix.amax() > 0.0 && is_finite(pose);
-    let pairs = normals.par_iter_mut().zip(poses).filter(is_asked);
-    pairs.for_each(|(normal, pose)| {
-        let slopes = turns.slopes(pose, normal.own);
-        let weighted = slopes.tr_mul(&precision);
+    let asked = normals.into_par_iter().zip(poses).zip(away).filter(|((normal, _), _)| normal.matrix.amax() > 0.0);
+    asked.for_each(|((normal, pose), away)| {
         let own = normal.own;
-        let mut matrix = normal.matrix.view_mut((0, 0), (own, own));
-        matrix += &weighted * slopes;
+        let slopes = turns.slopes(pose, own);
+        let weighted = slopes.tr_mul(&precision);
         let mut vector = normal.vector.rows_mut(0, own);
-        vector += weighted * (turns.of(pose) - &mean);
+        vector += &weighted * away;
+        let mut matrix = normal.matrix.view_mut((0, 0), (own, own));
+        matrix += weighted * slopes;
     });
 }
 

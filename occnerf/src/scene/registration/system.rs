@@ -10,7 +10,7 @@ const DIRECT: usize = 24;
 #[derive(Clone, Debug)]
 pub(super) struct Normal {
     pub own: usize,
-    /// Σ w JᵀJ, (P + B)², lower triangle.
+    /// Σ w JᵀJ, (P + B)².
     pub matrix: DMatrix<f64>,
     /// Σ w Jᵀr, (P + B).
     pub vector: DVector<f64>,
