@@ -27,9 +27,9 @@ fn trained() -> &'static Trained {
     static TRAINED: OnceLock<Trained> = OnceLock::new();
     TRAINED.get_or_init(|| {
         let body = smpl::BodyModel::embedded();
-        let demo = capture::DemoConfig { eval_cameras: 1, frames: 12, ..capture::DemoConfig::default() };
+        let demo = synth::DemoConfig { eval_cameras: 1, frames: 12, ..synth::DemoConfig::default() };
         let config = Config { steps: STEPS, ..Config::preset(Preset::Fast, Method::Occnerf) };
-        let scene = Scene::new(&capture::demo(&demo, &body).unwrap(), &body, &config).unwrap();
+        let scene = Scene::new(&synth::demo(&demo, &body).unwrap(), &body, &config).unwrap();
         let mut trainer = Trainer::new(&scene, config).unwrap();
         for _ in 0..STEPS {
             trainer.step().unwrap();

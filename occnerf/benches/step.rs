@@ -8,7 +8,7 @@ use std::sync::OnceLock;
 use divan::Bencher;
 use divan::counter::ItemsCount;
 use glam::Vec3;
-use occnerf::capture::{DemoConfig, demo};
+use synth::{DemoConfig, demo};
 use occnerf::{Config, FieldRenderer, Method, Preset, Renderer, Scene, Trainer};
 
 fn main() {

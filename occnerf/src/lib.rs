@@ -8,8 +8,8 @@
 //!
 //! # fn main() -> Result<(), Box<dyn std::error::Error>> {
 //! let body = smpl::BodyModel::embedded();
-//! let demo = capture::DemoConfig { size: 48, frames: 4, eval_cameras: 1, ..Default::default() };
-//! let capture = capture::demo(&demo, &body)?;
+//! let demo = synth::DemoConfig { size: 48, frames: 4, eval_cameras: 1, ..Default::default() };
+//! let capture = synth::demo(&demo, &body)?;
 //! let mut config = Config::preset(Preset::Fast, Method::Occnerf);
 //! config.steps = 2;
 //! let scene = Scene::new(&capture, &body, &config)?;
@@ -29,7 +29,6 @@
 mod atomic;
 pub mod bake;
 mod capacity;
-pub mod capture;
 mod check;
 mod config;
 mod error;
@@ -37,11 +36,11 @@ mod evaluate;
 #[cfg_attr(not(feature = "lpips"), path = "lpips/absent.rs")]
 mod lpips;
 mod model;
-mod random;
 mod render;
 mod scene;
 mod train;
 
+pub use ::capture;
 pub use atomic::replace_file;
 pub use capacity::{Capacity, Choice, Measured, Pruned};
 pub use check::{Check, Fault, FrameCheck, Mistake, body_silhouette, check, photograph, unknown_pixels};

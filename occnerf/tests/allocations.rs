@@ -2,7 +2,7 @@
 #![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
 
 use allocation_counter::measure;
-use occnerf::capture::{DemoConfig, demo};
+use synth::{DemoConfig, demo};
 use occnerf::{Config, Method, Preset, Scene, Trainer};
 use smpl::BodyModel;
 

@@ -9,7 +9,7 @@ use std::path::PathBuf;
 
 use glam::{Vec2, Vec3};
 use occnerf::bake::{Avatar, Clip, turn_upright};
-use occnerf::capture::{DemoConfig, demo};
+use synth::{DemoConfig, demo};
 use occnerf::{Config, Method, Preset, PriorColors, Scene};
 use stand_in::stand_in;
 

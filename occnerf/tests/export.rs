@@ -12,7 +12,7 @@ use std::sync::OnceLock;
 use glam::{Mat3, Quat, Vec2, Vec3};
 use occnerf::bake::Avatar;
 use occnerf::bake::export::{Splats, adapt_motion, splats, write_amass, write_obj};
-use occnerf::capture::{DemoConfig, demo};
+use synth::{DemoConfig, demo};
 use occnerf::{Config, Method, Preset, PriorColors, Scene};
 use smpl::{Character, MotionClip};
 

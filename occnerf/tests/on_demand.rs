@@ -4,7 +4,8 @@
 mod common;
 
 use common::{TempDir, config};
-use occnerf::capture::{Capture, Layout, LoadOptions, SynthConfig, load_capture, synthesise};
+use occnerf::capture::{Capture, Layout, LoadOptions, load_capture};
+use synth::{SynthConfig, synthesise};
 use occnerf::{FieldRenderer, Method, PriorColors, Scene, Trainer, evaluate};
 use smpl::BodyModel;
 

@@ -18,6 +18,7 @@
 //! Conventions: closed meshes are wound counter-clockwise seen from outside; ties between equally
 //! good answers go to the lower index.
 
+pub mod files;
 pub mod gradient;
 pub mod mesh;
 pub mod oracle;

@@ -6,7 +6,7 @@ mod common;
 
 use common::{TempDir, bits, body, checkpoint, demo_config, on_threads, scene, tiny, train};
 use glam::Vec3;
-use occnerf::capture::demo;
+use synth::demo;
 use occnerf::{
     Config, DistanceKind, FieldRenderer, Method, MotionKind, PriorColors, PriorRenderer, Renderer, Scene, Trainer,
     checkpoint_config,

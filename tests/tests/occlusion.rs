@@ -7,7 +7,8 @@ mod common;
 
 use common::{TempDir, body, capture, scene, tiny, train};
 use glam::Vec3;
-use occnerf::capture::{Capture, DemoConfig, LoadOptions, Pixels, demo, load_capture};
+use occnerf::capture::{Capture, LoadOptions, Pixels, load_capture};
+use synth::{DemoConfig, demo};
 use occnerf::{Label, Method, MotionKind, OccludedRule, PriorColors, Scene, upright};
 
 const NO_DISTORTION: [f64; 5] = [0.0; 5];

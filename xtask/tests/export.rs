@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 use common::{TINY, done, folder, refused, text};
 use glam::Vec3;
 use occnerf::bake::Avatar;
-use occnerf::capture::{DemoConfig, demo};
+use synth::{DemoConfig, demo};
 use occnerf::{Config, Method, Preset, PriorColors, Scene};
 use smpl::{Data, NdArray, npz};
 

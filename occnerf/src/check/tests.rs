@@ -8,7 +8,8 @@ use smpl::{BodyModel, Placement};
 use super::silhouette::silhouette;
 use super::*;
 use crate::capture::testing::{Directory, shared};
-use crate::capture::{DemoConfig, ImportOptions, LoadOptions, demo, import, load_capture};
+use crate::capture::{ImportOptions, LoadOptions, import, load_capture};
+use synth::{DemoConfig, demo};
 
 fn small_demo(body: &BodyModel, seed: u64) -> Capture {
     let config = DemoConfig { size: 128, frames: 60, eval_cameras: 1, seed, ..DemoConfig::default() };

@@ -260,7 +260,7 @@ fn window_sums(values: &[f32], width: i32, height: i32, half: i32) -> Vec<f32> {
 mod tests {
     use super::*;
     use crate::capture::Image;
-    use crate::random::Stream;
+    use volrender::RandomStream;
 
     const SIDE: u32 = 96;
 
@@ -304,7 +304,7 @@ mod tests {
         let found = parts(darker, |_| false);
         assert!(found[3] > 0.6 && found[2] < 0.2, "{found:?}");
         let mut noisy = disc(0.0);
-        let mut stream = Stream::new(&[3]);
+        let mut stream = RandomStream::new(&[3]);
         let inside = noisy.1.iter().flat_map(|&m| [m; 3]);
         noisy.0.pixels.iter_mut().zip(inside).for_each(|(p, m)| *p += m * 0.1 * (stream.uniform() - 0.5));
         let found = parts(noisy, |_| false);
@@ -333,7 +333,7 @@ mod tests {
 
     #[test]
     fn sums_of_windows_are_those_of_their_pixels() {
-        let mut stream = Stream::new(&[4]);
+        let mut stream = RandomStream::new(&[4]);
         let (width, height) = (7, 5);
         let values: Vec<f32> = (0..width * height).map(|_| stream.uniform()).collect();
         for half in [0, 1, 3, 9] {

@@ -202,7 +202,7 @@ fn add<'a, const N: usize>(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::random::Stream;
+    use volrender::RandomStream;
     use proptest::prelude::*;
 
     /// Sums over the nine taps, in double precision.
@@ -236,7 +236,7 @@ mod tests {
             beside in 0usize..3, seed in any::<u64>(),
         ) {
             let random = |address: u64, len: usize| -> Vec<f32> {
-                let mut stream = Stream::new(&[seed, address]);
+                let mut stream = RandomStream::new(&[seed, address]);
                 (0..len).map(|_| 2.0 * stream.uniform() - 1.0).collect()
             };
             let mut input = Maps::zeros(count, [height, width], inputs);

@@ -89,7 +89,7 @@ fn highest(face: &[u32; 3], vertices: &[f32]) -> f32 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::capture::{DemoConfig, demo};
+    use synth::{DemoConfig, demo};
     use crate::config::{Method, Preset};
     use crate::model::vertices::VertexCode;
     use crate::scene::prepared::Scene;

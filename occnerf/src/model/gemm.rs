@@ -205,7 +205,7 @@ mod tests {
             m in 1usize..19, lanes in 1usize..6, k in 1usize..20, seed in any::<u64>()
         ) {
             let n = lanes * LANES;
-            let mut random = crate::random::Stream::new(&[seed]);
+            let mut random = volrender::RandomStream::new(&[seed]);
             let mut fill = |count: usize| (0..count).map(|_| random.uniform() * 2.0 - 1.0).collect::<Vec<f32>>();
             let (a, b, c, row, gate) = (fill(m * k), fill(k * n), fill(m * n), fill(n), fill(m * n));
             let transposed: Vec<f32> = (0..k * m).map(|i| a[(i % m) * k + i / m]).collect();
@@ -243,7 +243,7 @@ mod tests {
             m in 1usize..19, lanes in 1usize..6, k in 1usize..20, nan in any::<prop::sample::Index>(), seed in any::<u64>()
         ) {
             let n = lanes * LANES;
-            let mut random = crate::random::Stream::new(&[seed]);
+            let mut random = volrender::RandomStream::new(&[seed]);
             let mut fill = |count: usize| (0..count).map(|_| random.normal()).collect::<Vec<f32>>();
             let (mut a, b, row) = (fill(m * k), fill(k * n), fill(n));
             a[nan.index(m * k)] = f32::NAN;

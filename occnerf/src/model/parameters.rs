@@ -2,7 +2,7 @@
 
 use crate::config::Config;
 use crate::model::field::{Field, VertexRows};
-use crate::random::Stream;
+use volrender::RandomStream;
 
 const CODES: u64 = 0x434F_4445;
 /// Standard deviation of a number of a vertex's code before the first step.
@@ -65,7 +65,7 @@ impl Parameters {
         let moved = field.vertex_rows == VertexRows::Encoded && config.rates.vertices > 0.0;
         let vertices = if moved { 3 * lengths.vertices } else { 0 };
         let table = if field.vertex_rows == VertexRows::Learnt {
-            let mut stream = Stream::new(&[config.seed, CODES]);
+            let mut stream = RandomStream::new(&[config.seed, CODES]);
             (0..lengths.vertices * field.encoder.num_features()).map(|_| CODE * stream.normal()).collect()
         } else {
             field.encoder.initial_table(config.seed)

@@ -1,7 +1,7 @@
 //! The field's multilayer perceptron: ReLU hidden layers, a linear head, both directions by hand.
 
 use crate::model::gemm::{Finish, LANES, Left, Product, Start};
-use crate::random::Stream;
+use volrender::RandomStream;
 
 /// Shape of a perceptron and where its weights lie in one flat slice.
 ///
@@ -68,7 +68,7 @@ impl Mlp {
     pub fn initial(&self, seed: u64) -> Vec<f32> {
         let mut parameters = vec![0.0; self.num_parameters()];
         for layer in 0..self.num_layers() {
-            let mut random = Stream::new(&[seed, 0x4D4C_5031, layer as u64]);
+            let mut random = RandomStream::new(&[seed, 0x4D4C_5031, layer as u64]);
             let (inputs, outputs) = (self.true_widths[layer], self.true_widths[layer + 1]);
             let gain = if layer + 1 == self.num_layers() { 0.1 } else { 1.0 };
             let bound = gain * (6.0 / inputs as f32).sqrt();
@@ -209,7 +209,7 @@ mod tests {
         let (inputs, samples) = (5, 7);
         let mlp = Mlp::new(inputs, &[18, 9], 4);
         for seed in 0..4 {
-            let mut random = Stream::new(&[seed, 5]);
+            let mut random = RandomStream::new(&[seed, 5]);
             let parameters: Vec<f32> = {
                 let mut p: Vec<f32> = (0..mlp.num_parameters()).map(|_| random.normal() * 0.3).collect();
                 mlp.clear_padding(&mut p);
@@ -230,7 +230,7 @@ mod tests {
             let signs = |a: &Activations| a.layers[1..3].iter().flatten().map(|&v| v > 0.0).collect::<Vec<_>>();
             let mut tested = 0;
             for direction in 0..40 {
-                let mut random = Stream::new(&[seed, 77, direction]);
+                let mut random = RandomStream::new(&[seed, 77, direction]);
                 let mut d: Vec<f32> = (0..mlp.num_parameters()).map(|_| 0.1 * random.normal()).collect();
                 mlp.clear_padding(&mut d);
                 let h = 1e-3;

@@ -13,7 +13,7 @@ use crate::model::colors::{PriorColors, shade};
 use crate::model::distance::{SurfacePoint, surface_point};
 use crate::model::extent::Extent;
 use crate::model::samples::Samples;
-use crate::random::Stream;
+use volrender::RandomStream;
 
 /// Side of a cell of the occupancy for the rays of a step, of which too few pass through one for a
 /// finer grid to pay, normalised metres.
@@ -84,7 +84,7 @@ pub(crate) struct March {
     /// The face that was closest to the last sample bounds the search for the next.
     known: Option<u32>,
     /// Places each sample in its bin, the middle without.
-    jitter: Option<Stream>,
+    jitter: Option<RandomStream>,
     /// Whether samples outside the prior are dead.
     inside: bool,
     /// Whether all bins are traced.
@@ -97,7 +97,7 @@ pub(crate) struct March {
 impl March {
     /// A ray of which nothing is traced yet; `jitter` places each sample in its bin, the middle
     /// without.
-    pub fn new(ray: Ray, jitter: Option<Stream>) -> Self {
+    pub fn new(ray: Ray, jitter: Option<RandomStream>) -> Self {
         let (color, transmittance) = (Vec3::ZERO, 1.0);
         Self { ray, bin: 0, known: None, jitter, inside: false, ended: false, color, transmittance }
     }
@@ -135,7 +135,7 @@ impl Tracer<'_> {
             while march.bin < count && samples.len() - first < most {
                 let bin = march.bin;
                 march.bin += 1;
-                let place = march.jitter.as_mut().map_or(0.5, Stream::uniform);
+                let place = march.jitter.as_mut().map_or(0.5, RandomStream::uniform);
                 let t = bins.at(bin, place);
                 let point = ray.origin + t * ray.direction;
                 if !self.surface.occupancy.is_live(point) {
@@ -247,7 +247,7 @@ impl Tracer<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::capture::{DemoConfig, demo};
+    use synth::{DemoConfig, demo};
     use crate::config::{DistanceKind, Method, MotionKind, Preset};
     use crate::model::view::PosedView;
     use crate::scene::prepared::Scene;
@@ -271,7 +271,7 @@ mod tests {
             let (reach, k) = (config.motion.reach(), config.surface.k);
             let low = frame.posed.vertices.iter().copied().reduce(Vec3::min).unwrap() - 2.0 * reach;
             let size = frame.posed.vertices.iter().copied().reduce(Vec3::max).unwrap() + 2.0 * reach - low;
-            let mut random = Stream::new(&[5]);
+            let mut random = RandomStream::new(&[5]);
             let (mut counts, mut samples) = ([0; 3], Samples::default());
             for _ in 0..20_000 {
                 let point = low + size * Vec3::new(random.uniform(), random.uniform(), random.uniform());

@@ -75,8 +75,8 @@ mod tests {
     #[test]
     fn a_picture_drawn_front_to_back_is_that_of_all_samples_at_once() {
         let body = smpl::BodyModel::embedded();
-        let demo = crate::capture::DemoConfig { size: 32, frames: 3, eval_cameras: 1, ..Default::default() };
-        let capture = crate::capture::demo(&demo, &body).unwrap();
+        let demo = synth::DemoConfig { size: 32, frames: 3, eval_cameras: 1, ..Default::default() };
+        let capture = synth::demo(&demo, &body).unwrap();
         let mut config = Config { steps: 40, ..Config::preset(Preset::Fast, Method::Occnerf) };
         // Dense enough for rays to end, however little was learnt.
         config.field.density_scale *= 8.0;

@@ -77,9 +77,9 @@ mod tests {
     use glam::DVec3;
 
     use super::*;
-    use crate::capture::{DemoConfig, demo};
+    use synth::{DemoConfig, demo};
     use crate::config::{Config, Method, Preset};
-    use crate::random::Stream;
+    use volrender::RandomStream;
     use crate::scene::prepared::PreparedFrame;
 
     /// Where the segment from `from` to `to` crosses a triangle, as a part of its length.
@@ -103,7 +103,7 @@ mod tests {
         assert!(scene.clothes.is_empty());
         compare(&scene, &vec![0.0; body.num_vertices()]);
         // Clothes stand off up to 3 cm, and some of what the body shows is hidden behind them.
-        let mut random = Stream::new(&[9]);
+        let mut random = RandomStream::new(&[9]);
         scene.clothes = (0..body.num_vertices()).map(|_| 0.03 * random.uniform()).collect();
         compare(&scene, &scene.clothes);
     }
@@ -112,7 +112,7 @@ mod tests {
     fn compare(scene: &Scene, clothes: &[f32]) {
         let found = PriorColors::measure(scene).unwrap();
         assert!(found.mesh.times() > 0 && found.colors.len() == found.mesh.anchors.len());
-        let mut random = Stream::new(&[8]);
+        let mut random = RandomStream::new(&[8]);
         let dressed = |frame: &PreparedFrame| -> (Vec<Vec3>, Vec<Vec3>) {
             let normals = surface_query::vertex_normals(&frame.view.posed.vertices, &scene.body.model.faces);
             let moved = |v: usize| frame.view.posed.vertices[v] + clothes[v] * normals[v].normalize_or_zero();

@@ -102,11 +102,11 @@ pub(crate) fn measure_light(frames: &[Vec<Seen>], vertices: usize) -> Light {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::random::Stream;
+    use volrender::RandomStream;
 
     /// Colours of vertices that turn before a camera for some frames.
     fn turning(light: Light, noise: f32) -> Vec<Vec<Seen>> {
-        let mut stream = Stream::new(&[7]);
+        let mut stream = RandomStream::new(&[7]);
         let mut random = || Vec3::new(stream.normal(), stream.normal(), stream.normal());
         let vertices: Vec<(Vec3, Vec3)> =
             (0..400).map(|_| (Vec3::splat(0.5) + 0.1 * random(), random().normalize_or(Vec3::Z))).collect();

@@ -53,13 +53,15 @@ pub fn mend_masks(capture: &mut Capture, model: &BodyModel) -> Result<(), Error>
     if excess == 0 {
         return extend(capture, model);
     }
-    Ok(capture.train.iter_mut().try_for_each(|frame| frame.shrink_mask(excess))?)
+    let by = -i32::try_from(excess).unwrap_or(i32::MAX);
+    capture.train.iter_mut().for_each(|frame| frame.source.edit(move |pixels| pixels.grow(by)));
+    Ok(())
 }
 
 /// By how many pixels the masks are too large; 0 where no line stands out.
 fn excess(frames: &[Frame]) -> Result<u32, Error> {
     let each: Vec<&Frame> = frames.iter().step_by(frames.len().div_ceil(FRAMES).max(1)).collect();
-    let changes: Result<Vec<_>, Error> = each.par_iter().map(|frame| Ok(changes(&*frame.pixels()?))).collect();
+    let changes: Result<Vec<_>, Error> = each.par_iter().map(|frame| Ok(changes(&frame.pixels()?))).collect();
     let mut sums = [(0.0, 0u64); LINES];
     for changes in changes? {
         sums.iter_mut().zip(changes).for_each(|(sum, (change, pairs))| *sum = (sum.0 + change, sum.1 + pairs));
@@ -86,7 +88,9 @@ fn extend(capture: &mut Capture, model: &BodyModel) -> Result<(), Error> {
             let Some(photograph) = frame.source.photograph().transpose()? else { return Ok(()) };
             let pixels = frame.pixels()?;
             let free = free(frame, &pixels, model, missing, NEAR)?;
-            Ok(frame.extend_mask(pixels.beyond_mask(&photograph, missing, |i| free[i]))?)
+            let added = pixels.beyond_mask(&photograph, missing, |i| free[i]);
+            frame.source.edit(move |pixels| pixels.show(&added));
+            Ok(())
         })?;
     }
     Ok(())
@@ -132,7 +136,7 @@ fn free(frame: &Frame, pixels: &Pixels, model: &BodyModel, reach: u32, near: f32
     let reached = larger(&pixels.mask, width, reach as f32);
     let occluder = pixels.occluder.as_deref();
     let labels = label_pixels(OccludedRule::Unknown, &reached, &body, occluder, width, metre);
-    let hidden = |i: usize| occluder.is_some_and(|o| o[i]) || frame.source.hides(i, camera.width);
+    let hidden = |i: usize| occluder.is_some_and(|o| o[i]) || frame.source.is_hidden();
     let covered: Vec<bool> = labels.iter().enumerate().map(|(i, &l)| l == Label::Unknown || hidden(i)).collect();
     let (away, covered) = (squared_distance(&body, width), squared_distance(&covered, width));
     let (near, reach) = (near * metre, reach as f32);
@@ -208,14 +212,14 @@ fn changes(pixels: &Pixels) -> [(f64, u64); LINES] {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::capture::{DemoConfig, Perturbation, demo};
+    use synth::{DemoConfig, Perturbation, demo};
 
     #[test]
     fn masks_that_are_too_large_are_found_and_trimmed_and_no_others() {
         let body = BodyModel::embedded();
         let config = DemoConfig { size: 192, frames: 12, eval_cameras: 1, ..DemoConfig::default() };
         let given = demo(&config, &body).unwrap();
-        let area = |c: &Capture| c.train.iter().map(|f| f.shown().mask.iter().sum::<f32>()).sum::<f32>();
+        let area = |c: &Capture| c.train.iter().map(|f| f.pixels().unwrap().mask.iter().sum::<f32>()).sum::<f32>();
         for (mask_pixels, ragged_pixels) in [(0, 0.0), (-3, 0.0), (-1, 0.0), (0, 2.0), (2, 0.0), (3, 0.0), (5, 0.0)] {
             let mut capture = given.clone();
             let wrong = Perturbation { mask_pixels, ragged_pixels, ..Perturbation::NONE };
@@ -251,7 +255,7 @@ mod tests {
             let error = |c: &Capture| -> f32 {
                 let frames = c.train.iter().zip(&given.train);
                 let each = frames.map(|(frame, given)| {
-                    let (frame, given) = (frame.shown(), given.shown());
+                    let (frame, given) = (frame.pixels().unwrap(), given.pixels().unwrap());
                     // Whatever is taken for the person is as the person is.
                     let colors = frame.image.pixels.iter().zip(&given.image.pixels);
                     assert!(mask_pixels > 0 || ragged_pixels > 0.0 || colors.into_iter().all(|(a, b)| *a <= b + 1e-6));
@@ -281,7 +285,7 @@ mod tests {
         mend_masks(&mut capture, &body).unwrap();
         let mut grown = 0;
         for (frame, small) in capture.train.iter().zip(&small.train) {
-            let (frame, small) = (frame.shown(), small.shown());
+            let (frame, small) = (frame.pixels().unwrap(), small.pixels().unwrap());
             let covered = frame.occluder.as_deref().unwrap();
             for i in (0..covered.len()).filter(|&i| frame.mask[i] != small.mask[i]) {
                 assert!(!covered[i] && frame.mask[i] > small.mask[i]);

@@ -7,7 +7,7 @@ use smpl::BodyModel;
 use visibility::RayMesh;
 
 use crate::Error;
-use crate::capture::{Capture, CaptureError, Frame, Light, PixelSource, Pixels, Shown};
+use crate::capture::{Capture, CaptureError, Frame, Light, PixelSource, PixelReader, Pixels};
 use crate::config::Config;
 use crate::model::body::{Body, Moment};
 use crate::model::colors::PriorColors;
@@ -40,13 +40,13 @@ impl PreparedFrame {
     /// # Errors
     /// [`Error::Data`] for files that cannot be read; [`Error::Scene`] where nothing was
     /// photographed.
-    pub fn pixels(&self) -> Result<Arc<Pixels>, Error> {
+    pub fn pixels(&self) -> Result<Pixels, Error> {
         self.photographed(PixelSource::pixels)
     }
 
-    /// The same for those who look at a few pixels.
-    pub(crate) fn shown(&self) -> Result<Shown, Error> {
-        self.photographed(PixelSource::shown)
+    /// The same for reading single pixels.
+    pub(crate) fn reader(&self) -> Result<PixelReader, Error> {
+        self.photographed(PixelSource::reader)
     }
 
     fn photographed<T>(&self, read: impl FnOnce(&PixelSource) -> Result<T, CaptureError>) -> Result<T, Error> {
@@ -171,7 +171,7 @@ impl Scene {
             return Ok(Vec::new());
         }
         let frame = &self.train[frame];
-        seen(&frame.view, &*frame.pixels()?, &self.body.model.faces, &self.clothes, anchors)
+        seen(&frame.view, &frame.pixels()?, &self.body.model.faces, &self.clothes, anchors)
     }
 
     /// Makes the training frames that nothing is learnt from those to score, in place of views of

@@ -89,7 +89,8 @@ pub(crate) fn strange_edge(frames: &[Vec<(Seen, usize)>], light: Light, vertices
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::capture::{Capture, DemoConfig, Perturbation, demo};
+    use crate::capture::Capture;
+use synth::{DemoConfig, Perturbation, demo};
     use crate::config::{Config, Method, Preset};
     use crate::model::colors::PriorColors;
     use crate::scene::labels::Label;

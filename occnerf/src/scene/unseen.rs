@@ -128,7 +128,7 @@ fn axes(body: &Body) -> Vec<Vec3> {
 mod tests {
     use super::*;
     use crate::config::{Config, Method, Preset};
-    use crate::random::Stream;
+    use volrender::RandomStream;
     use smpl::BodyModel;
 
     fn body() -> Body {
@@ -185,7 +185,7 @@ mod tests {
     #[test]
     fn guesses_lie_between_what_was_seen_and_are_grey_where_nothing_was() {
         let body = body();
-        let mut stream = Stream::new(&[11]);
+        let mut stream = RandomStream::new(&[11]);
         let mut random = || stream.uniform();
         let seen: Vec<bool> = body.canonical.vertices.iter().map(|_| random() < 0.3).collect();
         let mut colors: Vec<Vec3> = seen.iter().map(|_| 0.2 + 0.5 * Vec3::new(random(), random(), random())).collect();

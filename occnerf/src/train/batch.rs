@@ -1,8 +1,8 @@
 //! The rays of a training step: one frame, several square patches.
 
-use crate::capture::Shown;
+use crate::capture::PixelReader;
 use crate::config::Config;
-use crate::random::Stream;
+use volrender::RandomStream;
 use crate::scene::labels::{Label, Labels};
 use crate::scene::prepared::Scene;
 
@@ -28,7 +28,7 @@ pub(crate) struct Batch {
 impl Batch {
     /// Draws a step's rays from the seed and the step's number alone.
     pub fn draw(&mut self, scene: &Scene, config: &Config, step: u64) {
-        let mut random = Stream::new(&[config.seed, DRAW, step]);
+        let mut random = RandomStream::new(&[config.seed, DRAW, step]);
         self.frame = scene.learnt[frame_of(scene.learnt.len(), config.seed, step, &mut self.order)];
         let frame = &scene.train[self.frame];
         let (width, height) = (frame.view.camera.width, frame.view.camera.height);
@@ -54,7 +54,7 @@ impl Batch {
 /// Frames come in a new random order each time round, so that none waits longer than two rounds.
 fn frame_of(frames: usize, seed: u64, step: u64, order: &mut Vec<usize>) -> usize {
     let (round, place) = (step / frames as u64, (step % frames as u64) as usize);
-    let mut random = Stream::new(&[seed, 0x4652_414D, round]);
+    let mut random = RandomStream::new(&[seed, 0x4652_414D, round]);
     order.clear();
     order.extend(0..frames);
     for i in (1..frames).rev() {
@@ -64,7 +64,7 @@ fn frame_of(frames: usize, seed: u64, step: u64, order: &mut Vec<usize>) -> usiz
 }
 
 /// What a ray should show: premultiplied colour over `background`; `None` where nothing is known.
-pub(crate) fn target(labels: &Labels, shown: &Shown, pixel: u32, background: glam::Vec3) -> Option<glam::Vec3> {
+pub(crate) fn target(labels: &Labels, shown: &PixelReader, pixel: u32, background: glam::Vec3) -> Option<glam::Vec3> {
     (labels.at(pixel) != Label::Unknown).then(|| {
         let (colour, mask) = shown.at(pixel);
         colour + (1.0 - mask) * background

@@ -187,11 +187,11 @@ pub(crate) fn completeness(sigma: f32, beta: f32) -> (f32, f32) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::random::Stream;
+    use volrender::RandomStream;
     use testkit::gradient::{Tolerance, assert_gradient};
 
     fn patch(size: usize, seed: u64) -> Vec<f32> {
-        let mut random = Stream::new(&[seed]);
+        let mut random = RandomStream::new(&[seed]);
         (0..size * size * 3).map(|_| random.uniform()).collect()
     }
 

@@ -5,7 +5,7 @@ use glam::Vec3;
 use rayon::prelude::*;
 
 use crate::Error;
-use crate::capture::Shown;
+use crate::capture::PixelReader;
 use crate::config::LossConfig;
 use crate::lpips::Lpips;
 use crate::scene::labels::Labels;
@@ -38,7 +38,7 @@ impl Photometric {
         lpips: Option<&Lpips>,
         groups: &[RayGroup],
         batch: &Batch,
-        (labels, pixels): (&Labels, &Shown),
+        (labels, pixels): (&Labels, &PixelReader),
         report: &mut StepReport,
     ) -> Result<(), Error> {
         let Self { targets, d_colors, prediction, .. } = self;

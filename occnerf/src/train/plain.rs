@@ -16,7 +16,7 @@ use crate::model::encoder::{Coordinates, Encoder};
 use crate::model::parameters::{Arrays, Part};
 use crate::model::samples::Samples;
 use crate::model::trained::Model;
-use crate::random::Stream;
+use volrender::RandomStream;
 use crate::scene::prepared::Scene;
 use crate::train::batch::target;
 use crate::train::trainer::Trainer;
@@ -182,7 +182,7 @@ impl Plain<'_, '_> {
                 colors[ray] = color + transmittance * background;
             }
         }
-        let shown = frame.shown().unwrap();
+        let shown = frame.reader().unwrap();
         let known = |&(pixel, _): &(&u32, &DVec3)| target(&frame.labels, &shown, *pixel, batch.background).is_some();
         let rays: Vec<(&u32, &DVec3)> = batch.pixels.iter().zip(&colors).filter(known).collect();
         let error = |&(&pixel, color): &(&u32, &DVec3)| {
@@ -278,15 +278,15 @@ fn a_step_agrees_with_one_written_straight_from_the_definitions() {
         [1u64, 5, 3, 4, 1, 3, 2, 1, 2, 2, WITHOUT_SURFACE_TERM, PER_AREA].into_iter().zip(cases)
     {
         let demo =
-            crate::capture::DemoConfig { size: 48, frames: 3, eval_cameras: 1, eval_every: 3, ..Default::default() };
-        let capture = crate::capture::demo(&demo, &body).unwrap();
+            synth::DemoConfig { size: 48, frames: 3, eval_cameras: 1, eval_every: 3, ..Default::default() };
+        let capture = synth::demo(&demo, &body).unwrap();
         let config = tiny(method, motion, distance, seed);
         let scene = Scene::new(&capture, &body, &config).unwrap();
         let mut trainer = Trainer::new(&scene, config).unwrap();
         for _ in 0..3 {
             trainer.step().unwrap();
         }
-        let mut random = Stream::new(&[seed, 21]);
+        let mut random = RandomStream::new(&[seed, 21]);
         // Vertices away from the folds of the mesh that they start on.
         for (part, size) in [(Part::Table, 0.3), (Part::Vertices, 2e-3)] {
             trainer.model.parameters.get_mut(part).iter_mut().for_each(|x| *x += size * random.normal());
@@ -314,7 +314,7 @@ fn a_step_agrees_with_one_written_straight_from_the_definitions() {
             let from = before.get(part);
             let (mut whole, mut apart) = (0.0, 0.0);
             for direction in 0..3 {
-                let mut random = Stream::new(&[seed, 22, direction]);
+                let mut random = RandomStream::new(&[seed, 22, direction]);
                 let mut step: Vec<f32> = from.iter().map(|_| size * random.normal()).collect();
                 if part == Part::Field {
                     trainer.model.field.mlp.clear_padding(&mut step);

@@ -10,7 +10,7 @@ use crate::model::times::{StepTimes, Stopwatch};
 use crate::model::trace::{March, PosedSurface};
 use crate::model::trained::Model;
 use crate::model::vertices::VertexCode;
-use crate::random::Stream;
+use volrender::RandomStream;
 use crate::scene::labels::Label;
 use crate::scene::prepared::PreparedFrame;
 use crate::train::backward::motion::volume_backward;
@@ -74,7 +74,7 @@ impl Step<'_> {
         let RayGroup { rays, segments, ordered, composites, terminations, times, jacobians, .. } = group;
         let label = |ray: usize| frame.labels.at(batch.pixels[ray]);
         let marches = rays.iter().map(|&ray| {
-            let jitter = Stream::new(&[config.seed, JITTER, model.steps_done, ray as u64]);
+            let jitter = RandomStream::new(&[config.seed, JITTER, model.steps_done, ray as u64]);
             let hidden = label(ray) == Label::Unknown && self.options.skips_unknown;
             March::new(frame.view.pixel_ray(batch.pixels[ray]), Some(jitter)).only_inside(hidden)
         });
@@ -147,7 +147,7 @@ pub(crate) fn zero(buffer: &mut Vec<f32>, len: usize) {
 
 #[cfg(test)]
 mod tests {
-    use crate::capture::{DemoConfig, demo};
+    use synth::{DemoConfig, demo};
     use crate::config::{Config, Method, MotionKind, Preset};
     use crate::model::march::MarchOptions;
     use crate::model::parameters::Part;

@@ -161,7 +161,7 @@ impl<'a> Trainer<'a> {
         let (mut times, mut watch) = (StepTimes::default(), Stopwatch::start());
         batch.draw(scene, &model.config, step);
         let frame = &scene.train[batch.frame];
-        let shown = frame.shown()?;
+        let shown = frame.reader()?;
         let posed = &frame.view.posed;
         model.encode_vertices(vertex_code);
         let interval = model.config.motion.shell_interval as u64;

@@ -6,7 +6,8 @@ use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 
 use glam::Vec3;
-use occnerf::capture::{Capture, DemoConfig, demo};
+use occnerf::capture::Capture;
+use synth::{DemoConfig, demo};
 use occnerf::{Config, Method, MotionKind, PreparedFrame, Preset, Scene, StepReport, Trainer};
 use smpl::{BodyModel, Placement};
 use visibility::RayMesh;

@@ -105,7 +105,7 @@ pub(super) fn keep(model: &BodyModel, poses: &[&Posed], normals: &mut [Normal]) 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::random::Stream;
+    use volrender::RandomStream;
     use crate::scene::registration::system::{Expected, Solution, solve};
     use crate::scene::registration::tests::frame;
     use crate::scene::registration::unknowns::changed;
@@ -135,7 +135,7 @@ mod tests {
         #[test]
         fn turns_change_as_by_finite_differences(seed in any::<u64>()) {
             let model = BodyModel::embedded();
-            let (mut stream, shape) = (Stream::new(&[seed]), model.shaped(&[]));
+            let (mut stream, shape) = (RandomStream::new(&[seed]), model.shaped(&[]));
             let mut random = |size: f32| -> Vec<Vec3> {
                 let mut one = || size * stream.normal();
                 (0..model.num_joints()).map(|_| Vec3::new(one(), one(), one())).collect()

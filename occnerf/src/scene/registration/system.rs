@@ -197,12 +197,12 @@ pub(super) fn inverse(matrix: DMatrix<f64>) -> Option<DMatrix<f64>> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::random::Stream;
+    use volrender::RandomStream;
     use proptest::prelude::*;
 
     #[test]
     fn a_matrix_times_its_inverse_is_one_and_what_is_not_positive_has_none() {
-        let mut stream = Stream::new(&[5]);
+        let mut stream = RandomStream::new(&[5]);
         for size in [1, DIRECT, DIRECT + 1, 75, 150] {
             let root = DMatrix::from_fn(size, size, |_, _| f64::from(stream.normal()));
             let mut matrix = &root * root.transpose() + DMatrix::identity(size, size);
@@ -219,7 +219,7 @@ mod tests {
         /// All equations in one dense matrix.
         #[test]
         fn blocks_give_what_the_whole_matrix_gives(seed in any::<u64>(), frames in 1usize..6, p in 1usize..15, b in 0usize..4) {
-            let mut stream = Stream::new(&[seed]);
+            let mut stream = RandomStream::new(&[seed]);
             let mut random = || f64::from(stream.normal());
             let mut normals = vec![Normal::new(p, b); frames];
             let columns: Vec<u32> = (0..(p + b) as u32).collect();

@@ -1,7 +1,8 @@
 //! Priors that are wrong, and what becomes of them.
 
 use super::*;
-use crate::capture::{DemoConfig, Image, Perturbation, Pixels, demo};
+use crate::capture::{Image, Pixels};
+use synth::{DemoConfig, Perturbation, demo};
 use glam::{Affine3A, Mat3};
 use smpl::Placement;
 

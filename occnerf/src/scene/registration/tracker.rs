@@ -72,7 +72,7 @@ impl Tracker {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::random::Stream;
+    use volrender::RandomStream;
     use crate::scene::registration::system::{Expected, Normal, Solution, solve};
     use glam::Vec3;
 
@@ -80,7 +80,7 @@ mod tests {
     fn learnt(truth: Tracker, seed: u64) -> Tracker {
         let (own, frames, noise) = (12, 300, 0.01f64);
         let (variances, kept) = truth.expected(2.0, own, 1);
-        let mut stream = Stream::new(&[seed]);
+        let mut stream = RandomStream::new(&[seed]);
         let mut random = || f64::from(stream.normal());
         let mut now = vec![[0.0f64; 2]; own];
         let mut normals = Vec::new();

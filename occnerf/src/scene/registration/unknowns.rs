@@ -137,7 +137,7 @@ impl<'a> Motions<'a> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::random::Stream;
+    use volrender::RandomStream;
     use proptest::prelude::*;
 
     proptest! {
@@ -149,7 +149,7 @@ mod tests {
         fn vertices_and_normals_move_as_by_finite_differences(seed in any::<u64>(), about_origin in any::<bool>()) {
             let mut model = BodyModel::embedded();
             model.posedirs = smpl::SparseRows::from_rows(vec![Vec::new(); model.num_vertices()]);
-            let mut stream = Stream::new(&[seed]);
+            let mut stream = RandomStream::new(&[seed]);
             let mut random = |size: f32| size * Vec3::new(stream.normal(), stream.normal(), stream.normal());
             let mut pose: Vec<Vec3> = (0..model.num_joints()).map(|_| random(0.3)).collect();
             let placement = if about_origin {

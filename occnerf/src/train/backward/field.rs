@@ -89,9 +89,9 @@ mod tests {
 
     use super::*;
     use crate::config::{Config, Method, Preset};
-    use crate::random::Stream;
+    use volrender::RandomStream;
 
-    fn group(n: usize, vertices: usize, per_sample: usize, random: &mut Stream) -> SampleBatch {
+    fn group(n: usize, vertices: usize, per_sample: usize, random: &mut RandomStream) -> SampleBatch {
         let mut group = SampleBatch::default();
         let s = &mut group.samples;
         for _ in 0..n {
@@ -111,7 +111,7 @@ mod tests {
         config.surface.surface_term = true;
         let mut field = Field::new(&config, Aabb { min: Vec3::splat(-0.1), max: Vec3::splat(1.1) }).unwrap();
         let (n, vertices) = (3 * crate::model::field::BLOCK - 100, 12);
-        let mut random = Stream::new(&[4]);
+        let mut random = RandomStream::new(&[4]);
         let mut normal = |n: usize| (0..n).map(|_| random.normal()).collect::<Vec<f32>>();
         let (mlp, table) = (field.mlp.initial(1), normal(field.encoder.num_parameters()));
         let features = normal(vertices * field.encoder.num_features());
@@ -120,7 +120,7 @@ mod tests {
         field.mlp.transposed_weights(&mlp, &mut transposed);
         let [anew, kept] = [true, false].map(|narrow| {
             field.narrow = narrow;
-            let mut group = group(n, vertices, 20, &mut Stream::new(&[5]));
+            let mut group = group(n, vertices, 20, &mut RandomStream::new(&[5]));
             let counts = VisibilityCounts::new(vertices);
             let surface = (&[][..], &[][..]);
             let learnt = Learnt { perceptron: &mlp, table: &table, vertices: &features, counts: &counts, surface };
@@ -146,7 +146,7 @@ mod tests {
             (config.field.width, config.field.depth) = (20, 2);
             (config.encoding.levels, config.encoding.n_max, config.encoding.log2_table_size) = (3, 20, 10);
             let field = Field::new(&config, region).unwrap();
-            let mut random = Stream::new(&[3, method as u64]);
+            let mut random = RandomStream::new(&[3, method as u64]);
             let (n, vertices) = (40, 12);
             let mut group = group(n, vertices, 20, &mut random);
             let mut place = || Vec3::new(random.uniform(), random.uniform(), random.uniform());
@@ -156,7 +156,7 @@ mod tests {
             counts.add(&[1, 1, 1, 5, 7, 7]);
             let width = field.encoder.num_features();
             let mlp = field.mlp.initial(1);
-            let normal = |n: usize, random: &mut Stream| (0..n).map(|_| random.normal()).collect::<Vec<f32>>();
+            let normal = |n: usize, random: &mut RandomStream| (0..n).map(|_| random.normal()).collect::<Vec<f32>>();
             let table: Vec<f32> = normal(field.encoder.num_parameters(), &mut random);
             let features = normal(vertices * width, &mut random);
             let (c_sigma, c_rgb) = (normal(n, &mut random), normal(3 * n, &mut random));
@@ -179,7 +179,7 @@ mod tests {
             let mut d_table = vec![0.0; table.len()];
             field.encoder.encode_backward(std::iter::once((group.at.all(), &group.features[..])), &mut d_table);
             for direction in 0..6 {
-                let mut random = Stream::new(&[17, direction]);
+                let mut random = RandomStream::new(&[17, direction]);
                 let mut u_mlp = normal(mlp.len(), &mut random);
                 field.mlp.clear_padding(&mut u_mlp);
                 let (u_table, u_features) = (normal(table.len(), &mut random), normal(features.len(), &mut random));

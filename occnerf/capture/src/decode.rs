@@ -1,0 +1,155 @@
+//! From a list of files to frames: the part that all layouts share.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use glam::Vec3;
+use rayon::prelude::*;
+use smpl::{BodyModel, Placement};
+
+use super::camera::Lens;
+use super::files::{Files, decoding_bytes};
+use super::gate::Gate;
+use super::image::dimensions;
+use super::pixels::Area;
+use super::source::{Allowance, PixelSource};
+use super::{CaptureError, Frame, LoadOptions, checks};
+
+/// Bytes that a pixel of a frame takes: three colours and coverage.
+pub const PIXEL_BYTES: u64 = 16;
+/// Bytes that a vertex of a frame's body takes once it is prepared: its pose offset, and posed.
+const VERTEX_BYTES: u64 = 24;
+/// A training frame's labels take this part of the bytes of its pixels: see [`crate::Labels`].
+const LABELS_SHARE: u64 = 42;
+
+/// A frame whose pictures have not been read.
+pub(super) struct Planned {
+    pub name: String,
+    pub image: PathBuf,
+    /// The subject is where any of these says so; at least one.
+    pub masks: Vec<PathBuf>,
+    /// Masks hold labels, each but 0 a part of the subject, rather than coverage with 255 for all.
+    pub labels: bool,
+    pub occluder: Option<PathBuf>,
+    /// Pixels of the files that a simulated obstacle hides.
+    pub hidden: Option<Area>,
+    pub lens: Lens,
+    pub pose: Vec<Vec3>,
+    pub placement: Placement,
+    pub betas: Vec<f32>,
+}
+
+/// Memory for packed pictures and for decoding.
+pub(super) struct Budget {
+    kept: Arc<Allowance>,
+    gate: Arc<Gate>,
+}
+
+impl Budget {
+    /// `left` bytes less those for decoding: `picture` for every thread, but at most a quarter
+    /// unless one picture takes more.
+    fn new(left: u64, picture: u64) -> Self {
+        let threads = rayon::current_num_threads() as u64;
+        let aside = (picture.saturating_mul(threads)).min(left / 4).max(picture);
+        Self { kept: Arc::new(Allowance::new(left.saturating_sub(aside))), gate: Arc::new(Gate::new(aside)) }
+    }
+}
+
+/// The frames of one camera, all of one size.
+pub(super) struct View {
+    frames: Vec<Planned>,
+    size: (u32, u32),
+    /// Named where no mask shows the subject, and where no camera sees the body.
+    masks: PathBuf,
+    cameras: PathBuf,
+}
+
+impl View {
+    /// `masks` and `cameras` are named in errors about all frames. There must be a frame.
+    pub fn new(frames: Vec<Planned>, masks: &Path, cameras: &Path) -> Result<Self, CaptureError> {
+        let first = frames.first().ok_or_else(|| CaptureError::invalid(cameras, "all frames", "a frame", "none"))?;
+        let size = dimensions(&first.image)?;
+        Ok(Self { frames, size, masks: masks.to_owned(), cameras: cameras.to_owned() })
+    }
+
+    /// Bytes of a frame's pixels.
+    fn picture_bytes(&self, options: &LoadOptions) -> u64 {
+        let (width, height) = options.resized(self.size);
+        u64::from(width) * u64::from(height) * PIXEL_BYTES
+    }
+
+    /// Bytes that decoding a frame takes.
+    fn decoding_bytes(&self) -> u64 {
+        decoding_bytes(self.size)
+    }
+
+    /// The frames, checked together. Pictures that `budget` has room for are decoded; of the others
+    /// headers are read.
+    pub fn frames(self, body: &BodyModel, options: &LoadOptions, budget: &Budget) -> Result<Vec<Frame>, CaptureError> {
+        let first = Arc::from(self.frames[0].name.as_str());
+        let (size, to) = (self.size, options.resized(self.size));
+        let frame = |plan: Planned| {
+            let Planned { name, image, masks, labels, occluder, hidden, lens, pose, placement, betas } = plan;
+            let camera = volrender::Camera { width: size.0, height: size.1, ..lens.camera };
+            let first = Arc::clone(&first);
+            let gate = Arc::clone(&budget.gate);
+            let files = Files { image, masks, labels, occluder, hidden, lens, size, to, first, gate };
+            let source = PixelSource::on_disk(files, Arc::clone(&budget.kept));
+            Frame { name, source, camera: camera.resized(to.0, to.1), pose, placement, betas }
+        };
+        let frames: Vec<Frame> = self.frames.into_iter().map(frame).collect();
+        // Collected as results first, so that the error reported is the first in order whatever
+        // finishes first.
+        let checked: Vec<Result<(), CaptureError>> = frames.par_iter().map(|f| f.source.check()).collect();
+        checked.into_iter().collect::<Result<(), CaptureError>>()?;
+        checks::subject_is_seen(&self.masks, &frames)?;
+        if !options.unseen {
+            checks::body_is_seen(&self.cameras, &frames, body)?;
+        }
+        Ok(frames)
+    }
+}
+
+/// Bytes for pixels that [`LoadOptions::max_bytes`] leaves beside the bodies of all views. Errors
+/// where no picture can be decoded in that, naming values that fit.
+pub(super) fn budget(
+    train: &View,
+    eval: &[View],
+    body: &BodyModel,
+    options: &LoadOptions,
+) -> Result<Budget, CaptureError> {
+    let limit = options.max_bytes;
+    let body_bytes = body.num_vertices() as u64 * VERTEX_BYTES;
+    let views = || std::iter::once(train).chain(eval);
+    // Bytes of what is kept of every frame: of every n-th in training, and of every m-th view kept
+    // back.
+    let kept = |n: usize, m: usize| {
+        let (frames, views) =
+            (train.frames.len().div_ceil(n), eval.iter().map(|v| v.frames.len().div_ceil(m)).sum::<usize>());
+        (frames + views) as u64 * body_bytes + frames as u64 * train.picture_bytes(options).div_ceil(LABELS_SHARE)
+    };
+    let bodies = kept(1, 1);
+    let picture = views().map(View::decoding_bytes).max().unwrap_or(0);
+    if bodies + picture <= limit {
+        return Ok(Budget::new(limit - bodies, picture));
+    }
+    let mut ways = Vec::new();
+    let longest = views().map(|view| view.frames.len()).max().unwrap_or(1);
+    let fits = |n: usize, m: usize| kept(n, m) + picture <= limit;
+    if let Some(n) = (2..=longest).find(|&n| fits(n, n)) {
+        match options.max_frames {
+            Some(_) => ways.push(format!("max_frames {}", train.frames.len().div_ceil(n))),
+            None => ways.push(format!("stride {}", n.saturating_mul(options.stride))),
+        }
+    }
+    if let Some(m) = (2..=longest).find(|&m| !eval.is_empty() && fits(1, m)) {
+        ways.push(format!("eval_stride {}", m.saturating_mul(options.eval_stride)));
+    }
+    let mebibytes = |bytes: u64| bytes.div_ceil(1 << 20);
+    ways.push(format!("memory {}", mebibytes(bodies + picture)));
+    let frames: usize = views().map(|view| view.frames.len()).sum();
+    let expected =
+        format!("all bodies and a picture within {} MiB (would fit: {})", mebibytes(limit), ways.join(", or "));
+    let actual = format!("{frames} bodies of {} vertices and {picture} bytes to decode a picture", body.num_vertices());
+    Err(CaptureError::setting("max_bytes", expected, actual))
+}

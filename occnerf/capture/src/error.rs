@@ -1,0 +1,91 @@
+use std::path::{Path, PathBuf};
+
+/// What is wrong with a capture, in one line that names the file, the key within it, what was
+/// expected and what was found.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum CaptureError {
+    /// A file or directory cannot be read or written.
+    #[error("{}: {source}", path.display())]
+    Io {
+        /// The file or directory.
+        path: PathBuf,
+        /// The system's reason.
+        source: std::io::Error,
+    },
+    /// A picture cannot be decoded or encoded.
+    #[error("{}: not a readable picture: {source}", path.display())]
+    Picture {
+        /// The picture.
+        path: PathBuf,
+        /// The codec's reason.
+        source: image::ImageError,
+    },
+    /// A pickle or array file is truncated or malformed, or an array in it has the wrong type or
+    /// shape.
+    #[error(transparent)]
+    Array(#[from] smpl::Error),
+    /// A file that the layout demands is absent.
+    #[error("{}: missing {what}", path.display())]
+    Missing {
+        /// Path where it should be.
+        path: PathBuf,
+        /// Name of what is absent, and who refers to it.
+        what: String,
+    },
+    /// A value has the wrong type, shape or size, or makes no sense.
+    #[error("{}: {}: expected {expected}, found {}", path.display(), line(key), line(actual))]
+    Invalid {
+        /// The file.
+        path: PathBuf,
+        /// The value within the file.
+        key: String,
+        /// Values that would have been right.
+        expected: String,
+        /// Value that is there.
+        actual: String,
+    },
+    /// A setting that no capture can be made with.
+    #[error("{name}: expected {expected}, found {actual}")]
+    Setting {
+        /// The setting.
+        name: &'static str,
+        /// Values that would have been right.
+        expected: String,
+        /// Value that was given.
+        actual: String,
+    },
+}
+
+/// Text of a file, such as a key, as part of a line.
+fn line(text: &str) -> String {
+    let shown = |c: char| if c.is_control() { c.escape_default().to_string() } else { c.to_string() };
+    text.chars().map(shown).collect()
+}
+
+impl CaptureError {
+    /// A value that is not as expected.
+    pub fn invalid(
+        path: &Path,
+        key: impl Into<String>,
+        expected: impl Into<String>,
+        actual: impl Into<String>,
+    ) -> Self {
+        Self::Invalid { path: path.to_owned(), key: key.into(), expected: expected.into(), actual: actual.into() }
+    }
+
+    /// A file that is absent.
+    pub fn missing(path: &Path, what: impl Into<String>) -> Self {
+        Self::Missing { path: path.to_owned(), what: what.into() }
+    }
+
+    /// A setting out of its range.
+    pub fn setting(name: &'static str, expected: impl Into<String>, actual: impl ToString) -> Self {
+        Self::Setting { name, expected: expected.into(), actual: actual.to_string() }
+    }
+
+    /// A failure of the system on `path`.
+    pub fn io(path: &Path) -> impl FnOnce(std::io::Error) -> Self + '_ {
+        move |source| Self::Io { path: path.to_owned(), source }
+    }
+}

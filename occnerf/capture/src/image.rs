@@ -1,0 +1,246 @@
+//! RGB pictures in memory, and reading and writing them.
+
+use std::path::Path;
+
+use image::imageops::{FilterType, resize as resize_picture};
+use image::{DynamicImage, ImageBuffer, ImageReader, Luma, Rgb};
+
+use super::CaptureError;
+
+/// Longest side that is decoded; anything larger is taken for a broken or hostile file.
+pub const MAX_SIDE: u32 = 8192;
+
+/// An sRGB picture with values from 0 to 1.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Image {
+    /// Columns.
+    pub width: u32,
+    /// Rows.
+    pub height: u32,
+    /// (H, W, 3), row-major from the top left.
+    pub pixels: Vec<f32>,
+}
+
+impl Image {
+    /// A black picture.
+    #[must_use]
+    pub fn new(width: u32, height: u32) -> Self {
+        Self { width, height, pixels: vec![0.0; width as usize * height as usize * 3] }
+    }
+
+    /// The colour at `column`, `row`.
+    ///
+    /// # Panics
+    /// Outside the picture.
+    #[must_use]
+    pub fn rgb(&self, column: u32, row: u32) -> [f32; 3] {
+        assert!(
+            column < self.width && row < self.height,
+            "Image::rgb: ({column}, {row}) of {}×{}",
+            self.width,
+            self.height
+        );
+        let i = (row as usize * self.width as usize + column as usize) * 3;
+        [self.pixels[i], self.pixels[i + 1], self.pixels[i + 2]]
+    }
+
+    /// Reads a PNG or JPEG of 8 or 16 bits a channel; grey becomes RGB, transparency is dropped.
+    ///
+    /// # Errors
+    /// [`CaptureError::Io`], [`CaptureError::Picture`], and [`CaptureError::Invalid`] for a side of
+    /// 0 or above 8192, which is found before anything is decoded.
+    pub fn load(path: &Path) -> Result<Self, CaptureError> {
+        let decoded = decode(path)?.into_rgb32f();
+        Ok(Self { width: decoded.width(), height: decoded.height(), pixels: decoded.into_raw() })
+    }
+
+    /// Writes an 8-bit PNG; values are clamped to 0 to 1 and NaN becomes 0.
+    ///
+    /// # Errors
+    /// [`CaptureError::Io`] or [`CaptureError::Picture`] where the file cannot be written,
+    /// [`CaptureError::Setting`] where `pixels` is not (H, W, 3).
+    pub fn save_png(&self, path: &Path) -> Result<(), CaptureError> {
+        let bytes = self.pixels.iter().copied().map(to_byte).collect();
+        let picture = image::RgbImage::from_raw(self.width, self.height, bytes);
+        let picture = picture.ok_or_else(|| {
+            let expected = format!("{}×{}×3 values", self.height, self.width);
+            CaptureError::setting("pixels", expected, self.pixels.len())
+        })?;
+        picture.save_with_format(path, image::ImageFormat::Png).map_err(|source| picture_error(path, source))
+    }
+
+    /// Multiplies every pixel by its entry of `mask` (H, W).
+    ///
+    /// # Panics
+    /// Where `mask` has another size.
+    pub fn multiply(&mut self, mask: &[f32]) {
+        assert_eq!(mask.len() * 3, self.pixels.len(), "Image::multiply: mask is not ({}, {})", self.height, self.width);
+        for (pixel, coverage) in self.pixels.chunks_exact_mut(3).zip(mask) {
+            for channel in pixel {
+                *channel *= coverage;
+            }
+        }
+    }
+}
+
+/// Nearest of 256 levels. `as` saturates, and takes NaN to 0.
+fn to_byte(value: f32) -> u8 {
+    (value * 255.0 + 0.5) as u8
+}
+
+fn picture_error(path: &Path, source: image::ImageError) -> CaptureError {
+    match source {
+        // A file that ends too early is damaged, not out of reach.
+        image::ImageError::IoError(source) if source.kind() != std::io::ErrorKind::UnexpectedEof => {
+            CaptureError::Io { path: path.to_owned(), source }
+        }
+        source => CaptureError::Picture { path: path.to_owned(), source },
+    }
+}
+
+fn open(path: &Path) -> Result<ImageReader<std::io::BufReader<std::fs::File>>, CaptureError> {
+    ImageReader::open(path).and_then(ImageReader::with_guessed_format).map_err(CaptureError::io(path))
+}
+
+/// Width and height from the header alone.
+pub(super) fn dimensions(path: &Path) -> Result<(u32, u32), CaptureError> {
+    let (width, height) = open(path)?.into_dimensions().map_err(|source| picture_error(path, source))?;
+    if width.min(height) == 0 || width.max(height) > MAX_SIDE {
+        return Err(CaptureError::invalid(
+            path,
+            "size",
+            format!("1 to {MAX_SIDE} pixels a side"),
+            format!("{width}×{height}"),
+        ));
+    }
+    Ok((width, height))
+}
+
+pub(super) fn decode(path: &Path) -> Result<DynamicImage, CaptureError> {
+    dimensions(path)?;
+    open(path)?.decode().map_err(|source| picture_error(path, source))
+}
+
+/// Coverage in [0,1] from a mask picture, with its width and height: the largest of a pixel's
+/// colour channels, full scale (255) being 1.
+pub(super) fn load_mask(path: &Path) -> Result<(u32, u32, Vec<f32>), CaptureError> {
+    let picture = Image::load(path)?;
+    let mask = picture.pixels.chunks_exact(3).map(|p| p[0].max(p[1]).max(p[2])).collect();
+    Ok((picture.width, picture.height, mask))
+}
+
+/// Resamples values of `channels` (1 or 3) a pixel with a tent filter as wide as the reduction
+/// needs; the outer edges of both pictures coincide. Linear, so that what is premultiplied by its
+/// mask stays so.
+pub(super) fn resize(values: Vec<f32>, channels: usize, from: (u32, u32), to: (u32, u32)) -> Vec<f32> {
+    fn resample<P>(values: Vec<f32>, from: (u32, u32), to: (u32, u32)) -> Vec<f32>
+    where
+        P: image::Pixel<Subpixel = f32> + 'static,
+    {
+        let picture = ImageBuffer::<P, _>::from_raw(from.0, from.1, values);
+        picture.map_or(Vec::new(), |p| resize_picture(&p, to.0, to.1, FilterType::Triangle).into_raw())
+    }
+    if from == to {
+        return values;
+    }
+    assert_eq!(values.len(), channels * from.0 as usize * from.1 as usize, "resize: values of {from:?}");
+    if channels == 1 { resample::<Luma<f32>>(values, from, to) } else { resample::<Rgb<f32>>(values, from, to) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn directory(name: &str) -> std::path::PathBuf {
+        let path = std::env::temp_dir().join(format!("occnerf-image-{name}-{}", std::process::id()));
+        std::fs::create_dir_all(&path).unwrap();
+        path
+    }
+
+    #[test]
+    fn what_is_written_is_read_back_to_the_nearest_level() {
+        let path = directory("round").join("a.png");
+        let mut picture = Image::new(5, 3);
+        for (i, p) in picture.pixels.iter_mut().enumerate() {
+            *p = i as f32 / 44.0;
+        }
+        picture.save_png(&path).unwrap();
+        let back = Image::load(&path).unwrap();
+        assert_eq!((back.width, back.height), (5, 3));
+        for (a, b) in picture.pixels.iter().zip(&back.pixels) {
+            assert!((a - b).abs() <= 0.5 / 255.0 + 1e-6, "{a} {b}");
+        }
+        back.save_png(&path).unwrap();
+        assert_eq!(Image::load(&path).unwrap(), back, "levels are kept exactly");
+    }
+
+    #[test]
+    fn resizing_keeps_ramps_and_means() {
+        // 12 × 8 to 6 × 4: a ramp across the columns, inside the border that the tent leaves.
+        let ramp: Vec<f32> = (0..96).map(|i| (i % 12) as f32 / 16.0).collect();
+        let small = resize(ramp.clone(), 1, (12, 8), (6, 4));
+        for (i, value) in small.iter().enumerate().filter(|(i, _)| (1..5).contains(&(i % 6))) {
+            // Column c of the small picture is centred at 2c + 1 − 0.5 of the large one's indices.
+            let expected = (2.0 * (i % 6) as f32 + 0.5) / 16.0;
+            assert!((value - expected).abs() < 1e-6, "{i}: {value} {expected}");
+        }
+        let colour: Vec<f32> = ramp.iter().flat_map(|&r| [r, 0.5, 1.0 - r]).collect();
+        let both = resize(colour, 3, (12, 8), (6, 4));
+        for (pixel, value) in both.chunks(3).zip(&small) {
+            assert!((pixel[0] - value).abs() < 1e-6 && (pixel[1] - 0.5).abs() < 1e-6);
+        }
+        assert_eq!(resize(ramp.clone(), 1, (12, 8), (12, 8)), ramp);
+        let stripes: Vec<f32> = (0..96).map(|i| (i % 2) as f32).collect();
+        // Every second column lit: an unfiltered reduction would give all or nothing.
+        assert!(resize(stripes, 1, (12, 8), (6, 4)).iter().all(|v| (0.3..0.7).contains(v)));
+    }
+
+    #[test]
+    fn values_outside_the_range_are_clamped() {
+        assert_eq!([-1.0, 0.0, 0.5, 1.0, 7.0, f32::NAN].map(to_byte), [0, 0, 128, 255, 255, 0]);
+    }
+
+    #[test]
+    fn a_header_of_absurd_size_is_refused_before_decoding() {
+        // A PNG signature and IHDR of 100000×100000 8-bit RGB, and no data at all.
+        let mut header = b"\x89PNG\r\n\x1a\n\0\0\0\x0dIHDR".to_vec();
+        header.extend(100_000u32.to_be_bytes());
+        header.extend(100_000u32.to_be_bytes());
+        header.extend([8, 2, 0, 0, 0]);
+        let crc = crc32(&header[12..]);
+        header.extend(crc.to_be_bytes());
+        header.extend(b"\0\0\0\0IDAT");
+        header.extend(crc32(b"IDAT").to_be_bytes());
+        let path = directory("absurd").join("a.png");
+        std::fs::write(&path, header).unwrap();
+        let message = Image::load(&path).unwrap_err().to_string();
+        assert!(message.contains("100000×100000") && message.contains("8192"), "{message}");
+    }
+
+    fn crc32(bytes: &[u8]) -> u32 {
+        !bytes.iter().fold(!0u32, |crc, byte| {
+            (0..8).fold(crc ^ u32::from(*byte), |c, _| if c & 1 == 1 { c >> 1 ^ 0xEDB8_8320 } else { c >> 1 })
+        })
+    }
+
+    #[test]
+    fn jpeg_and_grey_and_16_bit_are_read_and_rubbish_is_named() {
+        let dir = directory("kinds");
+        let grey = image::GrayImage::from_pixel(4, 2, image::Luma([255]));
+        grey.save(dir.join("grey.jpg")).unwrap();
+        // The format is told by content, not by extension.
+        std::fs::copy(dir.join("grey.jpg"), dir.join("really_a_jpeg.png")).unwrap();
+        let deep = image::ImageBuffer::<image::Rgb<u16>, _>::from_pixel(4, 2, image::Rgb([65535u16; 3]));
+        deep.save(dir.join("deep.png")).unwrap();
+        for name in ["grey.jpg", "really_a_jpeg.png", "deep.png"] {
+            let picture = Image::load(&dir.join(name)).unwrap();
+            assert!(picture.pixels.iter().all(|p| *p > 0.99), "{name}");
+            assert_eq!(load_mask(&dir.join(name)).unwrap().2.len(), 8);
+        }
+        std::fs::write(dir.join("rubbish.png"), b"not a picture").unwrap();
+        let message = Image::load(&dir.join("rubbish.png")).unwrap_err().to_string();
+        assert!(message.contains("rubbish.png"), "{message}");
+        let message = Image::load(&dir.join("none.png")).unwrap_err().to_string();
+        assert!(message.contains("none.png"), "{message}");
+    }
+}

@@ -1,0 +1,88 @@
+//! The body model that a fit belongs to.
+
+use std::path::{Path, PathBuf};
+
+use glam::DVec3;
+use smpl::npz::Npz;
+use smpl::pickle;
+use smpl::{BodyModel, NdArray};
+
+use super::fit::{SMPL, SMPLX, Tool};
+use crate::CaptureError;
+
+/// Joints of a hand, and numbers of its pose.
+const HAND: usize = 15;
+
+/// Finds and reads the body for a fit by `tool`: `given`, or the first that fits of the `.npz` and
+/// `.pkl` files in folders `body` beside the places named or above them.
+pub(super) fn find(tool: Tool, given: Option<&Path>, near: &[&Path]) -> Result<(PathBuf, BodyModel), CaptureError> {
+    if let Some(path) = given {
+        let model = BodyModel::load(path)?;
+        return match fits(tool, &model) {
+            true => Ok((path.to_owned(), model)),
+            false => {
+                let expected = format!("{} joints: {} fits {}", tool.joints(), tool.name(), download(tool));
+                Err(CaptureError::invalid(path, "kintree_table", expected, format!("{} joints", model.num_joints())))
+            }
+        };
+    }
+    for path in near.iter().flat_map(|place| candidates(place)) {
+        if let Some(model) = BodyModel::load(&path).ok().filter(|model| fits(tool, model)) {
+            return Ok((path, model));
+        }
+    }
+    let place = near.first().map_or(Path::new("body"), |place| place);
+    let what =
+        format!("body model with {} joints, as {} fits (--body FILE): {}", tool.joints(), tool.name(), download(tool));
+    Err(CaptureError::missing(place, what))
+}
+
+fn fits(tool: Tool, model: &BodyModel) -> bool {
+    model.num_joints() == tool.joints() && model.num_betas() >= super::fit::BETAS
+}
+
+/// What to get where the body is missing or another.
+fn download(tool: Tool) -> &'static str {
+    match tool.joints() {
+        SMPL => "SMPL; download SMPL_NEUTRAL.pkl (SMPL_python_v.1.1.0) from smpl.is.tue.mpg.de and give it as --body",
+        SMPLX => {
+            "SMPL-X; download SMPLX_NEUTRAL.npz (models_smplx_v1_1) from smpl-x.is.tue.mpg.de and give it as --body"
+        }
+        _ => "a body that this program does not know",
+    }
+}
+
+/// Files that may be bodies, near a place.
+fn candidates(place: &Path) -> Vec<PathBuf> {
+    let Ok(whole) = place.canonicalize() else { return Vec::new() };
+    let mut found: Vec<PathBuf> = Vec::new();
+    for above in whole.ancestors() {
+        let files = std::fs::read_dir(above.join("body")).into_iter().flatten().filter_map(|e| Some(e.ok()?.path()));
+        let mut files: Vec<PathBuf> =
+            files.filter(|path| path.extension().is_some_and(|e| e == "npz" || e == "pkl")).collect();
+        files.sort();
+        found.extend(files);
+    }
+    found
+}
+
+/// The pose of both hands at rest, left first: 15 joints each. From `hands_meanl` and `hands_meanr`
+/// of an SMPL-X file.
+pub(super) fn mean_hands(path: &Path) -> Result<Vec<DVec3>, CaptureError> {
+    let mut hands = Vec::new();
+    let mut npz = Npz::open(path).ok();
+    let value = if npz.is_none() { Some(pickle::read(path)?) } else { None };
+    for key in ["hands_meanl", "hands_meanr"] {
+        let array: NdArray = match (&mut npz, &value) {
+            (Some(npz), _) => npz.array(key)?,
+            (None, Some(value)) => {
+                let found = value.get(key).and_then(|value| value.as_array());
+                found.cloned().ok_or_else(|| CaptureError::invalid(path, key, "an array of 45 numbers", "none"))?
+            }
+            (None, None) => return Err(CaptureError::missing(path, key)),
+        };
+        let values = array.to_f32(&path.display().to_string(), key, &[Some(3 * HAND)])?;
+        hands.extend(values.chunks_exact(3).map(|v| DVec3::new(v[0].into(), v[1].into(), v[2].into())));
+    }
+    Ok(hands)
+}

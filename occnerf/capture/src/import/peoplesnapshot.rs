@@ -1,0 +1,157 @@
+//! PeopleSnapshot as InstantAvatar prepares it: `poses.npz` {`betas` (10), `transl` (N,3), and
+//! `thetas` (N,72) or `global_orient` (N,3) and `body_pose` (N,69)}, a row a frame; beside it or in
+//! the folder above `cameras.npz` {`intrinsic` (3,3), `extrinsic` (4,4) world to camera, `height`,
+//! `width`}. The root turns about the pelvis.
+
+use std::path::Path;
+
+use glam::DVec3;
+use smpl::npz::Npz;
+use smpl::pickle::Value;
+
+use super::fit::{About, BETAS, Fit, FitFrame, Person, SMPL, Tool};
+use super::item::{Item, vectors};
+use super::video::Video;
+use crate::CaptureError;
+
+/// Whether an archive with these names is one.
+pub(super) fn is(keys: &[String]) -> bool {
+    let has = |key: &str| keys.iter().any(|other| other == key);
+    has("transl") && has("betas") && (has("thetas") || has("body_pose"))
+}
+
+pub(super) fn read(path: &Path, npz: &mut Npz, video: &Video) -> Result<Fit, CaptureError> {
+    let beside = path.ancestors().skip(1).take(2).map(|dir| dir.join("cameras.npz")).find(|file| file.is_file());
+    let cameras = beside.ok_or_else(|| {
+        CaptureError::missing(&path.with_file_name("cameras.npz"), "file (nor in the folder above): the camera")
+    })?;
+    let (camera, fit) = (dictionary(&mut Npz::open(&cameras)?)?, dictionary(npz)?);
+    let (camera, fit) = (Item::new(&cameras, &camera), Item::new(path, &fit));
+    for (key, side) in ["width", "height"].into_iter().zip(video.sides()) {
+        let given = camera.get(key)?;
+        let found = given.number()?;
+        if found != side {
+            return Err(given.invalid(format!("{side}, as the frames"), found.to_string()));
+        }
+    }
+    let k = camera.get("intrinsic")?.numbers(&[Some(3), Some(3)])?;
+    let extrinsic = camera.get("extrinsic")?;
+    let e = extrinsic.numbers(&[Some(4), Some(4)])?;
+    let turn = extrinsic.rotation(&[&e[0..3], &e[4..7], &e[8..11]].concat())?;
+    let moved = DVec3::new(e[3], e[7], e[11]);
+
+    let place = fit.get("transl")?;
+    let places = place.rows(3)?;
+    let poses = match fit.find("thetas") {
+        Some(thetas) => thetas.rows(3 * SMPL)?,
+        None => {
+            let (roots, bodies) = (fit.get("global_orient")?.rows(3)?, fit.get("body_pose")?.rows(3 * SMPL - 3)?);
+            roots.into_iter().zip(bodies).map(|(root, body)| [root, body].concat()).collect()
+        }
+    };
+    let betas = fit.get("betas")?.numbers(&[Some(1), Some(BETAS)])?;
+    place.as_long(poses.len(), places.len())?;
+    // Poses of a split alone do not say which frames they are of.
+    if places.len() != video.names.len() {
+        let expected = format!("{} rows, one a frame of the video", video.names.len());
+        return Err(place.invalid(expected, places.len().to_string()));
+    }
+    let lens = [[k[0], k[4]], [k[2], k[5]]];
+    let frames = poses.iter().zip(&places).enumerate().map(|(index, (pose, place))| FitFrame {
+        world_to_camera: turn,
+        about: About::Origin(turn),
+        offset: turn * DVec3::from_slice(place) + moved,
+        ..FitFrame::still(index, vectors(pose), betas.clone(), place, lens)
+    });
+    let person = Person { id: "0".to_owned(), frames: frames.collect(), ghosts: 0 };
+    Ok(Fit { tool: Tool::PeopleSnapshot, people: vec![person] })
+}
+
+fn dictionary(npz: &mut Npz) -> Result<Value, CaptureError> {
+    let keys = npz.keys().to_vec();
+    let entries = keys.into_iter().map(|key| Ok((Value::Str(key.clone()), npz.value(&key)?)));
+    Ok(Value::Dict(entries.collect::<Result<_, smpl::Error>>()?))
+}
+
+#[cfg(test)]
+mod tests {
+    use smpl::{Data, NdArray, npz};
+
+    use super::*;
+    use crate::import::fit::{axis_angle, rotation};
+    use crate::import::read;
+    use crate::import::tests::{Motion, known};
+    use crate::testing::{Directory, shared};
+
+    #[test]
+    fn what_is_prepared_from_a_known_motion_is_that_motion() {
+        let Some(dir) = shared("estimators") else { return };
+        let Motion { video, k, betas, poses, pelvises, joint } = known(&dir);
+        let out = Directory::new("import-peoplesnapshot");
+        let array = |shape: &[usize], values: Vec<f64>| NdArray { shape: shape.to_vec(), data: Data::F64(values) };
+        let (turn, moved) = (rotation(DVec3::new(3.0, 0.2, -0.4)), DVec3::new(0.3, -0.2, 1.5));
+        let row = |i: usize| [turn.row(i).x, turn.row(i).y, turn.row(i).z, moved[i]];
+        let extrinsic = [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]].concat();
+        let write = |name: &str, arrays: &[(&str, NdArray)]| npz::write(&out.path().join(name), arrays).unwrap();
+        let cameras = |width: f64| {
+            write(
+                "cameras.npz",
+                &[
+                    ("intrinsic", array(&[3, 3], k.clone())),
+                    ("extrinsic", array(&[4, 4], extrinsic.clone())),
+                    ("height", array(&[], vec![256.0])),
+                    ("width", array(&[], vec![width])),
+                ],
+            );
+        };
+        cameras(256.0);
+        let count = poses.len();
+        let roots: Vec<DVec3> = poses.iter().map(|pose| axis_angle(turn.transpose() * rotation(pose[0]))).collect();
+        let thetas = poses.iter().zip(&roots).flat_map(|(pose, root)| [&[*root], &pose[1..]].concat());
+        let thetas: Vec<f64> = thetas.flat_map(|v| v.to_array()).collect();
+        let places = pelvises.iter().flat_map(|p| (turn.transpose() * (*p - moved) - joint).to_array());
+        let transl = array(&[count, 3], places.collect());
+        let betas = array(&[1, 10], betas);
+        write(
+            "poses.npz",
+            &[("betas", betas.clone()), ("thetas", array(&[count, 72], thetas.clone())), ("transl", transl.clone())],
+        );
+        // The other form of the same, in a folder below.
+        std::fs::create_dir_all(out.path().join("poses")).unwrap();
+        let part = |from: usize, to: usize| thetas.chunks_exact(72).flat_map(|row| row[from..to].to_vec()).collect();
+        write(
+            "poses/train.npz",
+            &[
+                ("betas", betas.clone()),
+                ("global_orient", array(&[count, 3], part(0, 3))),
+                ("body_pose", array(&[count, 69], part(3, 72))),
+                ("transl", transl),
+            ],
+        );
+        for file in ["poses.npz", "poses/train.npz"] {
+            let fit = read::read(&out.path().join(file), &video).unwrap();
+            assert_eq!((fit.tool, fit.people.len(), fit.people[0].frames.len()), (Tool::PeopleSnapshot, 1, count));
+            for (i, frame) in fit.people[0].frames.iter().enumerate() {
+                assert_eq!((frame.index, frame.focal, frame.centre), (i, [k[0], k[4]], [k[2], k[5]]));
+                assert!(frame.pelvis(joint).distance(pelvises[i]) < 1e-5);
+                let root = frame.world_to_camera * rotation(frame.pose[0]);
+                assert!(root.abs_diff_eq(rotation(poses[i][0]), 1e-5) && frame.world_to_camera == turn);
+                assert!(frame.pose[1..].iter().zip(&poses[i][1..]).all(|(a, b)| a.distance(*b) < 1e-9));
+            }
+        }
+        let refused = |words: &[&str]| {
+            let error = read::read(&out.path().join("poses.npz"), &video).err().unwrap().to_string();
+            assert!(words.iter().all(|word| error.contains(word)), "{error}");
+        };
+        cameras(1080.0);
+        refused(&["cameras.npz", "width", "256", "1080"]);
+        cameras(256.0);
+        write(
+            "poses.npz",
+            &[("betas", betas), ("thetas", array(&[2, 72], vec![0.0; 144])), ("transl", array(&[2, 3], vec![0.0; 6]))],
+        );
+        refused(&["poses.npz", "transl", "20 rows", "found 2"]);
+        std::fs::remove_file(out.path().join("cameras.npz")).unwrap();
+        refused(&["cameras.npz", "missing"]);
+    }
+}

@@ -1,0 +1,113 @@
+//! Reading a fit, whichever estimator wrote it.
+
+use std::fs::File;
+use std::io::{BufReader, Read};
+use std::path::Path;
+
+use smpl::npz::Npz;
+use smpl::pickle::{self, Value};
+use smpl::torch::{TorchFile, is_torch};
+
+use super::fit::{Fit, Person};
+use super::item::Item;
+use super::video::Video;
+use super::{easymocap, gvhmr, neuman, peoplesnapshot, phalp, prompthmr, romp, wham};
+use crate::CaptureError;
+use crate::checks::{MAX_ANGLE, MAX_BETA};
+
+/// What is expected of a file.
+const TOOLS: &str = "a result of WHAM, 4D-Humans / PHALP, GVHMR, PromptHMR or ROMP, EasyMocap's folder, \
+    poses.npz of PeopleSnapshot, or smpl_output_*.pkl of NeuMan";
+
+/// Reads a fit, which is told by what the file holds, not by its name.
+pub(super) fn read(path: &Path, video: &Video) -> Result<Fit, CaptureError> {
+    let fit = if path.is_dir() { easymocap::read(path, video)? } else { read_file(path, video)? };
+    for person in &fit.people {
+        check(path, person, video)?;
+    }
+    Ok(Fit { people: fit.people.into_iter().filter(|person| !person.frames.is_empty()).collect(), ..fit })
+}
+
+fn read_file(path: &Path, video: &Video) -> Result<Fit, CaptureError> {
+    let mut file = File::open(path).map_err(CaptureError::io(path))?;
+    let mut start = Vec::new();
+    (&mut file).take(64).read_to_end(&mut start).map_err(CaptureError::io(path))?;
+    let name = path.display().to_string();
+    if is_torch(&start) {
+        // A zip archive of numpy's arrays starts alike.
+        if start.starts_with(b"PK") {
+            let mut npz = Npz::open(path).map_err(|error| match error {
+                smpl::Error::Npy { message, .. } => {
+                    CaptureError::invalid(path, "the file", "a whole zip archive, of PyTorch or numpy", message)
+                }
+                error => error.into(),
+            })?;
+            if npz.keys().iter().any(|key| key == "results") {
+                return romp::read(path, &npz.value("results")?, video);
+            }
+            if peoplesnapshot::is(npz.keys()) {
+                return peoplesnapshot::read(path, &mut npz, video);
+            }
+        }
+        let mut file = TorchFile::open(&name, BufReader::new(file))?;
+        return gvhmr::read(path, &mut file, video);
+    }
+    // Pickles of protocol 2 and later, of 0 and 1, and what they are compressed by.
+    let begins = |with: &u8| start.first() == Some(with);
+    if !start.is_empty() && !b"\x80(c}]xB\x1f\xfd\x93".iter().any(begins) {
+        let found = format!("a file that begins with {}", start[..start.len().min(4)].escape_ascii());
+        return Err(CaptureError::invalid(path, "the file", TOOLS, found));
+    }
+    parse(path, &pickle::read(path)?, video)
+}
+
+/// Reads a pickle's value.
+pub(super) fn parse(path: &Path, value: &Value, video: &Video) -> Result<Fit, CaptureError> {
+    let root = Item::new(path, value);
+    if value.get("people").is_some() && value.get("camera").is_some() {
+        return prompthmr::read(&root, video);
+    }
+    let entries = root.entries()?;
+    let has = |keys: &[&str]| entries.iter().any(|(_, item)| keys.iter().all(|key| item.value.get(key).is_some()));
+    if has(&["tid", "smpl", "camera"]) {
+        phalp::read(&entries, video)
+    } else if has(&["pose", "trans", "frame_ids"]) {
+        wham::read(&entries, video)
+    } else if has(&["pose", "betas"]) && path.with_file_name("alignments.npy").is_file() {
+        neuman::read(path, &entries, video)
+    } else if has(&["smpl_thetas", "cam_trans"]) {
+        romp::read(path, value, video)
+    } else {
+        let held: Vec<&str> = entries.iter().map(|(name, _)| name.as_str()).take(8).collect();
+        Err(root.invalid(TOOLS, format!("a dictionary of {}", held.join(", "))))
+    }
+}
+
+/// Indices within the video, each once; a body and a camera that can be.
+pub(super) fn check(path: &Path, person: &Person, video: &Video) -> Result<(), CaptureError> {
+    let mut seen = vec![false; video.names.len()];
+    for frame in &person.frames {
+        let key = format!("person {}, frame {}", person.id, frame.index);
+        let invalid = |expected: String, actual: String| CaptureError::invalid(path, key.as_str(), expected, actual);
+        match seen.get_mut(frame.index) {
+            Some(seen) if !*seen => *seen = true,
+            Some(_) => return Err(invalid("each frame once".to_owned(), "it twice".to_owned())),
+            None => {
+                let expected = format!("a frame of the video, which has {} (counted from 0)", video.names.len());
+                return Err(invalid(expected, format!("frame {}", frame.index)));
+            }
+        }
+        if frame.focal.iter().any(|f| !(*f >= 1.0 && *f <= 1e6)) {
+            return Err(invalid("a focal length of 1 to 1000000 pixels".to_owned(), format!("{:?}", frame.focal)));
+        }
+        let angles = frame.pose.iter().flat_map(|angle| angle.to_array());
+        let mut numbers = angles.map(|a| (a, MAX_ANGLE)).chain(frame.betas.iter().map(|&beta| (beta, MAX_BETA)));
+        if let Some((number, most)) = numbers.find(|(number, most)| number.abs() > f64::from(*most)) {
+            return Err(invalid(format!("angles and shape coefficients up to {most}"), number.to_string()));
+        }
+        if frame.offset.abs().max_element() > 1e5 {
+            return Err(invalid("a body within 100 km".to_owned(), format!("{}", frame.offset)));
+        }
+    }
+    Ok(())
+}

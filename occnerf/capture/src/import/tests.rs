@@ -1,0 +1,339 @@
+//! Every estimator's file against what another reader made of it.
+
+use std::path::{Path, PathBuf};
+
+use glam::{DMat3, DVec3};
+use smpl::npz::Npz;
+use smpl::{BodyModel, NdArray, Placement};
+
+use super::fit::{FitFrame, SMPLX, rotation};
+use super::*;
+use crate::testing::{Directory, shared};
+
+/// Name in `expected/`, file, person asked for.
+const FITS: [(&str, &str, Option<&str>); 12] = [
+    ("wham", "wham/wham_output.pkl", None),
+    ("wham_person1", "wham/wham_output.pkl", Some("1")),
+    ("wham_gap", "wham/wham_output_gap.pkl", None),
+    ("phalp", "phalp/demo_clip.pkl", None),
+    ("phalp_person2", "phalp/demo_clip.pkl", Some("2")),
+    ("gvhmr", "gvhmr/hmr4d_results.pt", None),
+    ("prompthmr", "prompthmr/results.pkl", None),
+    ("prompthmr_person2", "prompthmr/results.pkl", Some("2")),
+    ("romp", "romp/video_results.npz", None),
+    ("romp_person2", "romp/video_results.npz", Some("2")),
+    ("easymocap", "easymocap", None),
+    ("easymocap_person1", "easymocap", Some("1")),
+];
+
+/// A person's motion in the camera, for fixtures of other forms.
+pub(super) struct Motion {
+    pub video: Video,
+    pub k: Vec<f64>,
+    pub betas: Vec<f64>,
+    /// Axis-angle of each joint, the root's in the camera.
+    pub poses: Vec<Vec<DVec3>>,
+    pub pelvises: Vec<DVec3>,
+    /// The pelvis at rest.
+    pub joint: DVec3,
+}
+
+pub(super) fn known(dir: &Path) -> Motion {
+    let mut expected = Expected::open(dir, "easymocap");
+    let (roots, poses) = (expected.values("root_cam"), expected.values("poses"));
+    let betas = expected.values("betas_mean");
+    let poses = poses.chunks_exact(72).zip(roots.chunks_exact(9)).map(|(pose, root)| {
+        let root = fit::axis_angle(item::turn(root).unwrap());
+        [vec![root], item::vectors(&pose[3..])].concat()
+    });
+    let body = BodyModel::load(&dir.join("../body/open_body.npz")).unwrap();
+    let shape: Vec<f32> = betas.iter().map(|&b| b as f32).collect();
+    Motion {
+        video: Video::list(&dir.join("frames")).unwrap(),
+        k: expected.values("K"),
+        poses: poses.collect(),
+        pelvises: item::vectors(&expected.values("pelvis_cam")),
+        joint: body.shaped(&shape).joints[0].as_dvec3(),
+        betas,
+    }
+}
+
+struct Expected(Npz);
+
+impl Expected {
+    fn open(dir: &Path, name: &str) -> Self {
+        Self(Npz::open(&dir.join(format!("expected/expected_{name}.npz"))).unwrap())
+    }
+
+    fn array(&mut self, key: &str) -> NdArray {
+        self.0.array(key).unwrap()
+    }
+
+    fn values(&mut self, key: &str) -> Vec<f64> {
+        self.array(key).to_f64()
+    }
+}
+
+#[track_caller]
+fn near(what: &str, found: &[f64], expected: &[f64], tolerance: f64) {
+    assert_eq!(found.len(), expected.len(), "{what}");
+    let worst = found.iter().zip(expected).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+    assert!(worst <= tolerance, "{what}: off by {worst}");
+}
+
+fn rows(m: DMat3) -> [f64; 9] {
+    m.transpose().to_cols_array()
+}
+
+fn fit_of(dir: &Path, file: &str, person: Option<&str>) -> (Tool, Person, Vec<(String, usize)>) {
+    let video = Video::list(&dir.join("frames")).unwrap();
+    let path = dir.join(file);
+    let fit = read::read(&path, &video).unwrap_or_else(|e| panic!("{e}"));
+    let (person, others) = choose(&path, fit.people, person).unwrap();
+    (fit.tool, person, others)
+}
+
+/// What is expected of E, poses and vertices is in the camera, so that it does not matter how they
+/// share the motion.
+fn vertices(frame: &FitFrame, pose: &[DVec3], model: &BodyModel) -> Vec<f64> {
+    let betas: Vec<f32> = frame.betas.iter().map(|&b| b as f32).collect();
+    let mut pose: Vec<glam::Vec3> = pose.iter().map(|v| v.as_vec3()).collect();
+    // At rest about the pelvis, so that the places are sums of small numbers.
+    let root = frame.world_to_camera * rotation(frame.pose[0]);
+    pose[0] = glam::Vec3::ZERO;
+    let posed = model.pose(&model.shaped(&betas), &pose, Placement::default());
+    let pelvis = posed.joints[0].as_dvec3();
+    let at = frame.pelvis(pelvis);
+    posed.vertices.iter().flat_map(|v| (root * (v.as_dvec3() - pelvis) + at).to_array()).collect()
+}
+
+#[test]
+fn cameras_poses_shapes_and_vertices_are_as_another_reader_has_them() {
+    let Some(dir) = shared("estimators") else { return };
+    for (name, file, asked) in FITS {
+        let (tool, person, _) = fit_of(&dir, file, asked);
+        let (body_path, model) = body::find(tool, None, &[&dir]).unwrap();
+        let hands = if tool == Tool::Gvhmr { body::mean_hands(&body_path).unwrap() } else { Vec::new() };
+        let mut expected = Expected::open(&dir, name);
+        let indices: Vec<f64> = person.frames.iter().map(|frame| frame.index as f64).collect();
+        near(name, &indices, &expected.values("frame_index"), 0.0);
+        let k = expected.values("K");
+        let (e, roots) = (expected.values("E"), expected.values("root_cam"));
+        let (poses, betas) = (expected.values("poses"), expected.values("betas"));
+        let pelvises = expected.values("pelvis_cam");
+        let people_shown = expected.0.keys().iter().any(|key| key == "vertices");
+        let mut shown = |key: &str| if people_shown { expected.values(key) } else { Vec::new() };
+        let (rows_of, shown) = (shown("vertices_row"), shown("vertices"));
+        for (i, frame) in person.frames.iter().enumerate() {
+            let [fx, fy] = frame.focal;
+            near(name, &[fx, 0.0, frame.centre[0], 0.0, fy, frame.centre[1], 0.0, 0.0, 1.0], &k, 1e-5);
+            near(name, &frame.betas, &betas[10 * i..][..10], 1e-5);
+            let placed = placed(frame.clone(), &frame.betas, &model, &hands, None);
+            assert_eq!(placed.pose.len(), tool.joints());
+            let pose: Vec<f64> = placed.pose.iter().flat_map(|v| v.to_array()).collect();
+            near(&format!("{name} pose {i}"), &pose, &poses[pose.len() * i..][..pose.len()], 1e-5);
+            let root = frame.world_to_camera * rotation(frame.pose[0]);
+            near(&format!("{name} root {i}"), &rows(root), &roots[9 * i..][..9], 1e-5);
+            let betas: Vec<f32> = frame.betas.iter().map(|&b| b as f32).collect();
+            let pelvis = frame.pelvis(model.shaped(&betas).joints[0].as_dvec3());
+            near(&format!("{name} pelvis {i}"), &pelvis.to_array(), &pelvises[3 * i..][..3], 1e-5);
+            let (r, t) = (rows(frame.world_to_camera), placed.translation);
+            let row = |j: usize| [r[3 * j], r[3 * j + 1], r[3 * j + 2], t[j]];
+            near(&format!("{name} E {i}"), &[row(0), row(1), row(2)].concat(), &e[16 * i..][..12], 1e-5);
+            if let Some(at) = rows_of.iter().position(|&row| row == i as f64) {
+                let count = 3 * model.num_vertices();
+                let shown = &shown[count * at..][..count];
+                near(&format!("{name} vertices {i}"), &vertices(frame, &placed.pose, &model), shown, 1e-4);
+            }
+        }
+        let (mean, spread) = robust_mean(person.frames.iter().map(|frame| frame.betas.as_slice()));
+        // Of few frames some are left out as outliers.
+        near(name, &mean, &expected.values("betas_mean"), spread + 1e-6);
+    }
+}
+
+#[test]
+fn the_person_in_most_frames_is_chosen_and_the_others_are_named() {
+    let Some(dir) = shared("estimators") else { return };
+    for (file, tool, id, others, ghosts) in [
+        ("wham/wham_output.pkl", Tool::Wham, "0", vec![("1".to_owned(), 6)], 0),
+        ("phalp/demo_clip.pkl", Tool::Phalp, "1", vec![("2".to_owned(), 5)], 2),
+        ("gvhmr/hmr4d_results.pt", Tool::Gvhmr, "0", vec![], 0),
+        ("prompthmr/results.pkl", Tool::PromptHmr, "1", vec![("2".to_owned(), 3)], 0),
+        ("romp/video_results.npz", Tool::Romp, "1", vec![("2".to_owned(), 5)], 0),
+        ("easymocap/smpl", Tool::EasyMocap, "0", vec![("1".to_owned(), 5)], 0),
+    ] {
+        let (found, person, rest) = fit_of(&dir, file, None);
+        assert_eq!((found, person.id.as_str(), rest, person.ghosts), (tool, id, others, ghosts), "{file}");
+    }
+    let (_, person, _) = fit_of(&dir, "wham/wham_output_gap.pkl", None);
+    assert_eq!(gaps(&person, 20), [0, 0, 3]);
+    let (_, person, _) = fit_of(&dir, "prompthmr/results.pkl", None);
+    assert_eq!(gaps(&person, 20), [4, 4, 0]);
+}
+
+#[test]
+fn masks_are_as_another_reader_has_them() {
+    let Some(dir) = shared("estimators") else { return };
+    let video = Video::list(&dir.join("frames")).unwrap();
+    for name in ["sam2", "sam2_per_object", "grounded_sam2", "matanyone", "phalp", "prompthmr"] {
+        let mut expected = Expected::open(&dir, &format!("masks_{name}"));
+        let packed = expected.array("masks_packed");
+        let (packed, indices) = (packed.to_f64(), expected.values("frame_index"));
+        let each = 256 * 256 / 8;
+        let path = dir.join(name);
+        let own = match name {
+            "phalp" => Some("phalp/demo_clip.pkl"),
+            "prompthmr" => Some("prompthmr/results.pkl"),
+            _ => None,
+        };
+        let found: Vec<(usize, Vec<u8>)> = match own {
+            Some(file) => {
+                let person = fit_of(&dir, file, None).1;
+                let frames = person.frames.iter().map(|frame| {
+                    let mask = frame.mask.as_ref().unwrap();
+                    (frame.index, write::own_levels(mask, video.size, &path, name).unwrap())
+                });
+                frames.collect()
+            }
+            None => {
+                let masks = Masks::open(&path, &ImportOptions::default(), &video).unwrap();
+                let held = (0..20).filter(|&i| masks.has(i));
+                held.map(|i| (i, masks.levels(&path, i, &video).unwrap().0)).collect()
+            }
+        };
+        assert_eq!(found.len(), indices.len(), "{name}");
+        for (i, (index, levels)) in found.iter().enumerate() {
+            assert_eq!(*index as f64, indices[i], "{name}");
+            for (at, level) in levels.iter().enumerate() {
+                let bit = packed[i * each + at / 8] as u8 >> (7 - at % 8) & 1;
+                assert_eq!(u8::from(*level >= 128), bit, "{name}, frame {index}, pixel {at}");
+            }
+        }
+    }
+}
+
+#[test]
+fn objects_in_front_become_occluders() {
+    let Some(dir) = shared("estimators") else { return };
+    let video = Video::list(&dir.join("frames")).unwrap();
+    let options = ImportOptions { occluder_objects: vec![2], ..ImportOptions::default() };
+    let (values, folders) = (dir.join("sam2"), dir.join("sam2_per_object"));
+    let by_value = Masks::open(&values, &options, &video).unwrap();
+    let by_folder = Masks::open(&folders, &options, &video).unwrap();
+    for i in [0, 7, 19] {
+        let (a, b) = (by_value.levels(&values, i, &video).unwrap(), by_folder.levels(&folders, i, &video).unwrap());
+        assert!(a == b, "frame {i}");
+        let front = a.1.unwrap();
+        assert!(front.iter().filter(|v| **v == 255).count() > 1000);
+        assert!(front.iter().zip(&a.0).all(|(front, person)| front & person == 0));
+    }
+    let wrong = ImportOptions { object: Some(9), ..ImportOptions::default() };
+    for path in [&values, &folders] {
+        let error = Masks::open(path, &wrong, &video).err().unwrap().to_string();
+        assert!(error.contains("object 9") && error.contains("1, 2"), "{error}");
+    }
+}
+
+#[test]
+fn another_focal_length_leaves_the_pelvis_on_its_pixel() {
+    let Some(dir) = shared("estimators") else { return };
+    for (_, file, _) in FITS {
+        let (_, person, _) = fit_of(&dir, file, None);
+        for frame in &person.frames {
+            let joint = DVec3::new(0.0, -0.22, 0.02);
+            let pixel = |frame: &FitFrame| {
+                let p = frame.pelvis(joint);
+                [frame.focal[0] * p.x / p.z, frame.focal[1] * p.y / p.z]
+            };
+            let mut other = frame.clone();
+            other.refocused(700.0, joint);
+            near(file, &pixel(&other), &pixel(frame), 1e-9);
+            near(
+                file,
+                &[other.focal[0], other.pelvis(joint).z / 700.0],
+                &[700.0, frame.pelvis(joint).z / frame.focal[0]],
+                1e-9,
+            );
+        }
+    }
+}
+
+#[test]
+fn outliers_do_not_move_the_mean_shape() {
+    let mut frames: Vec<Vec<f64>> = (0..20).map(|i| vec![1.0 + 0.01 * f64::from(i % 5 - 2); BETAS]).collect();
+    frames[3] = vec![40.0; BETAS];
+    let (mean, spread) = robust_mean(frames.iter().map(Vec::as_slice));
+    assert!(mean.iter().all(|m| (m - 1.0).abs() < 0.01), "{mean:?}");
+    assert!(spread > 5.0);
+}
+
+#[test]
+fn masks_are_matched_by_name_by_order_or_by_number() {
+    let dir = Directory::new("import-match");
+    let video =
+        Video { names: (1..=4).map(|i| format!("{i:06}")).collect(), paths: vec![PathBuf::new(); 4], size: (4, 2) };
+    let options = ImportOptions::default();
+    let frames = |folder: &str| {
+        let masks = Masks::open(&dir.path().join(folder), &options, &video);
+        masks.map(|masks| (0..4).filter(|&i| masks.has(i)).collect::<Vec<_>>()).map_err(|e| e.to_string())
+    };
+    let put = |folder: &str, names: &[&str]| {
+        for name in names {
+            dir.picture(&format!("{folder}/{name}.png"), (4, 2), |x, _| if x == 1 { 255 } else { 0 });
+        }
+    };
+    put("names", &["000002", "000004"]);
+    assert_eq!(frames("names").unwrap(), [1, 3]);
+    put("order", &["0000", "0001", "0002", "0003"]);
+    assert_eq!(frames("order").unwrap(), [0, 1, 2, 3]);
+    put("number", &["00000", "00002"]);
+    assert_eq!(frames("number").unwrap(), [0, 2]);
+    put("beyond", &["00007"]);
+    assert!(frames("beyond").unwrap_err().contains("00007"));
+    put("twice", &["a_01", "b_01"]);
+    assert!(frames("twice").unwrap_err().contains("number 1"));
+    put("nothing", &[]);
+    std::fs::create_dir_all(dir.path().join("nothing")).unwrap();
+    assert!(frames("nothing").unwrap_err().contains("masks"));
+    // Masks of all but the person, told by the border.
+    dir.picture("inverted/000001.png", (4, 4), |x, y| if x == 1 && y == 1 { 0 } else { 255 });
+    let square = Video { size: (4, 4), names: video.names.clone(), paths: video.paths.clone() };
+    let path = dir.path().join("inverted");
+    let inverted = Masks::open(&path, &options, &square).unwrap();
+    let levels = inverted.levels(&path, 0, &square).unwrap().0;
+    assert!(inverted.kind.contains("all but the person"));
+    assert!(levels.iter().enumerate().all(|(i, level)| (*level == 255) == (i == 5)));
+    dir.picture("empty/000001.png", (4, 2), |_, _| 0);
+    assert!(frames("empty").unwrap_err().contains("all masks"));
+}
+
+#[test]
+fn fits_that_are_wrong_are_named() {
+    let Some(dir) = shared("estimators") else { return };
+    let video = Video::list(&dir.join("frames")).unwrap();
+    let few = Video { names: video.names[..7].to_vec(), paths: video.paths[..7].to_vec(), size: video.size };
+    for (_, file, _) in FITS {
+        let error = read::read(&dir.join(file), &few).err().unwrap().to_string();
+        assert!(error.contains("7") || error.contains("000007"), "{file}: {error}");
+    }
+    let tall = Video { size: (256, 512), names: video.names, paths: video.paths };
+    for file in ["phalp/demo_clip.pkl", "prompthmr/results.pkl", "easymocap", "gvhmr/hmr4d_results.pt"] {
+        let error = read::read(&dir.join(file), &tall).err().unwrap().to_string();
+        assert!(error.contains("512"), "{file}: {error}");
+    }
+    let (_, person, _) = fit_of(&dir, "wham/wham_output.pkl", None);
+    let error = choose(Path::new("f"), vec![person], Some("5")).err().unwrap().to_string();
+    assert!(error.contains("person 5") && error.contains("0 (20 frames)"), "{error}");
+    let bodies = dir.join("../body");
+    for (tool, body, words) in [
+        (Tool::Gvhmr, "open_body.npz", ["SMPLX_NEUTRAL.npz", "smpl-x.is.tue.mpg.de"]),
+        (Tool::Wham, "open_body_x.npz", ["SMPL_NEUTRAL.pkl", "smpl.is.tue.mpg.de"]),
+    ] {
+        let error = body::find(tool, Some(&bodies.join(body)), &[]).err().unwrap().to_string();
+        assert!(words.iter().all(|word| error.contains(word)), "{error}");
+        let error = body::find(tool, None, &[Path::new("/")]).err().unwrap().to_string();
+        assert!(words.iter().all(|word| error.contains(word)), "{error}");
+    }
+    assert_eq!(SMPLX, Tool::PromptHmr.joints());
+}

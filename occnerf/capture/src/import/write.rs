@@ -1,0 +1,152 @@
+//! The capture on disk.
+
+use std::path::{Path, PathBuf};
+
+use glam::DVec3;
+use image::{GrayImage, ImageFormat};
+use rayon::prelude::*;
+use serde_json::{Map, Value, json};
+use smpl::BodyModel;
+
+use super::fit::{FitFrame, OwnMask};
+use super::masks::Masks;
+use super::options::ImportOptions;
+use super::video::Video;
+use crate::CaptureError;
+
+/// A person in one frame, as the capture has it.
+pub(super) struct Placed {
+    pub index: usize,
+    /// Axis-angle of every joint of the body model.
+    pub pose: Vec<DVec3>,
+    pub frame: FitFrame,
+    /// The extrinsics' translation.
+    pub translation: DVec3,
+}
+
+/// What a capture is written from.
+pub(super) struct Parts<'a> {
+    pub options: &'a ImportOptions,
+    pub video: &'a Video,
+    pub placed: &'a [Placed],
+    pub betas: &'a [f64],
+    /// `None`: the fit's own.
+    pub masks: Option<&'a Masks>,
+}
+
+/// Writes `images`, `masks`, `occluders` and `metadata.json`.
+pub(super) fn capture(parts: &Parts<'_>, out: &Path) -> Result<(), CaptureError> {
+    let folder = |name: &str| {
+        let path = out.join(name);
+        std::fs::create_dir_all(&path).map_err(CaptureError::io(&path)).map(|()| path)
+    };
+    let (images, masks) = (folder("images")?, folder("masks")?);
+    let occluders = match parts.options.occluder_objects.is_empty() {
+        true => None,
+        false => Some(folder("occluders")?),
+    };
+    // Collected as results first, so that the error reported is the first in order whatever
+    // finishes first.
+    let frames: Vec<Result<(), CaptureError>> =
+        parts.placed.par_iter().map(|placed| frame(parts, placed, &images, &masks, occluders.as_deref())).collect();
+    frames.into_iter().collect::<Result<(), CaptureError>>()?;
+    let records =
+        parts.placed.iter().map(|placed| (parts.video.names[placed.index].clone(), record(placed, parts.betas)));
+    let path = out.join("metadata.json");
+    let text = Value::Object(records.collect::<Map<_, _>>()).to_string();
+    std::fs::write(&path, text).map_err(CaptureError::io(&path))
+}
+
+/// Writes the body model where [`crate::own_body`] looks for it.
+pub(super) fn body(model: &BodyModel, out: &Path) -> Result<(), CaptureError> {
+    Ok(model.save(&out.join("body.safetensors"))?)
+}
+
+fn frame(
+    parts: &Parts<'_>,
+    placed: &Placed,
+    images: &Path,
+    masks: &Path,
+    occluders: Option<&Path>,
+) -> Result<(), CaptureError> {
+    let (name, source) = (&parts.video.names[placed.index], &parts.video.paths[placed.index]);
+    let extension = source.extension().map_or("png".into(), |e| e.to_string_lossy());
+    linked(source, &images.join(format!("{name}.{extension}")), parts.options.copy)?;
+    let size = parts.video.size;
+    let (mask, front) = match (parts.masks, &placed.frame.mask) {
+        (Some(masks), _) => {
+            let path = parts.options.masks.as_deref().unwrap_or(&parts.options.fit);
+            masks.levels(path, placed.index, parts.video)?
+        }
+        (None, Some(own)) => (own_levels(own, size, &parts.options.fit, name)?, None),
+        (None, None) => return Err(CaptureError::missing(&parts.options.fit, format!("mask of frame {name}"))),
+    };
+    let file = format!("{name}.png");
+    save(mask, size, &masks.join(&file))?;
+    match (occluders, front) {
+        (Some(folder), Some(front)) => save(front, size, &folder.join(&file)),
+        _ => Ok(()),
+    }
+}
+
+/// The fit's own mask at the frames' size: one worked out at another scale takes the nearest pixel.
+pub(super) fn own_levels(mask: &OwnMask, size: (u32, u32), fit: &Path, name: &str) -> Result<Vec<u8>, CaptureError> {
+    let (height, width, pixels) = match mask {
+        OwnMask::Runs(rle) => (rle.height, rle.width, rle.pixels()),
+        OwnMask::Pixels(height, width, pixels) => (*height, *width, pixels.clone()),
+    };
+    let (to_width, to_height) = (size.0 as usize, size.1 as usize);
+    let (across, down) = (width as f64 / to_width as f64, height as f64 / to_height as f64);
+    let scaled = matches!(mask, OwnMask::Pixels(..)) && across > 0.0 && (across / down - 1.0).abs() < 0.01;
+    if !scaled && (width, height) != (to_width, to_height) {
+        let expected = format!("{to_width}×{to_height}, as the frames");
+        return Err(CaptureError::invalid(fit, format!("mask of {name}"), expected, format!("{width}×{height}")));
+    }
+    let nearest = |i: usize, scale: f64, most: usize| (((i as f64 + 0.5) * scale) as usize).min(most.saturating_sub(1));
+    let level = |i: usize| {
+        let (x, y) = (nearest(i % to_width, across, width), nearest(i / to_width, down, height));
+        if pixels[y * width + x] { 255 } else { 0 }
+    };
+    Ok((0..to_width * to_height).map(level).collect())
+}
+
+fn save(levels: Vec<u8>, size: (u32, u32), path: &Path) -> Result<(), CaptureError> {
+    let found = levels.len();
+    let picture = GrayImage::from_raw(size.0, size.1, levels).ok_or_else(|| {
+        CaptureError::invalid(path, "size", format!("{}×{} values", size.0, size.1), found.to_string())
+    })?;
+    picture.save_with_format(path, ImageFormat::Png).map_err(|source| match source {
+        image::ImageError::IoError(source) => CaptureError::Io { path: path.to_owned(), source },
+        source => CaptureError::Picture { path: path.to_owned(), source },
+    })
+}
+
+/// Makes a link to a picture, or a copy where links cannot be made or are not wanted.
+fn linked(from: &Path, to: &Path, copy: bool) -> Result<(), CaptureError> {
+    let whole: PathBuf = from.canonicalize().map_err(CaptureError::io(from))?;
+    // A copy through a link that stands there would empty what it leads to.
+    if to.symlink_metadata().is_ok() {
+        let source = std::io::Error::from(std::io::ErrorKind::AlreadyExists);
+        return Err(CaptureError::Io { path: to.to_owned(), source });
+    }
+    #[cfg(unix)]
+    if !copy && std::os::unix::fs::symlink(&whole, to).is_ok() {
+        return Ok(());
+    }
+    let _ = copy;
+    std::fs::copy(&whole, to).map_err(CaptureError::io(from)).map(drop)
+}
+
+/// A frame of `metadata.json`.
+fn record(placed: &Placed, betas: &[f64]) -> Value {
+    let frame = &placed.frame;
+    let poses: Vec<f64> = placed.pose.iter().flat_map(|v| v.to_array()).collect();
+    let (r, t) = (frame.world_to_camera.transpose(), placed.translation);
+    let row = |axis: usize| [r.col(axis).x, r.col(axis).y, r.col(axis).z, t[axis]];
+    json!({
+        "poses": poses,
+        "betas": betas,
+        "cam_intrinsics": [[frame.focal[0], 0.0, frame.centre[0]], [0.0, frame.focal[1], frame.centre[1]], [0.0, 0.0, 1.0]],
+        "cam_extrinsics": [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]],
+    })
+}

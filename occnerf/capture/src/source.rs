@@ -1,0 +1,218 @@
+//! Where the pixels of a frame are: in memory, or in files that are decoded when asked for.
+
+use std::fmt;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::{Arc, OnceLock};
+
+use super::files::Files;
+use super::packed::PackedPixels;
+use super::pixels::{Area, Pixels};
+use super::{CaptureError, Image};
+
+/// The pixels of a frame, packed in memory or in files. Clones share what is decoded.
+#[derive(Clone, Debug)]
+pub struct PixelSource(Place);
+
+#[derive(Clone, Debug)]
+enum Place {
+    Memory(Arc<PackedPixels>),
+    Disk(Arc<OnDisk>),
+}
+
+/// A change of pixels that is made again whenever they are decoded.
+type Edit = Arc<dyn Fn(&mut Pixels) + Send + Sync>;
+
+struct OnDisk {
+    files: Arc<Files>,
+    edits: Vec<Edit>,
+    allowance: Arc<Allowance>,
+    /// The first decoding, `None` where the allowance was spent.
+    kept: OnceLock<Option<Kept>>,
+}
+
+#[derive(Clone, Debug)]
+struct Kept(Arc<(PackedPixels, Room)>);
+
+/// Bytes for packed pixels, first come, first served.
+#[derive(Debug)]
+pub(super) struct Allowance {
+    left: AtomicU64,
+    /// Whether a request was refused.
+    spent: AtomicBool,
+}
+
+/// Bytes of an [`Allowance`], given back when dropped.
+#[derive(Debug)]
+struct Room {
+    of: Arc<Allowance>,
+    bytes: u64,
+}
+
+impl Allowance {
+    pub fn new(bytes: u64) -> Self {
+        Self { left: AtomicU64::new(bytes), spent: AtomicBool::new(false) }
+    }
+
+    fn take(self: &Arc<Self>, bytes: u64) -> Option<Room> {
+        let less = |left: u64| left.checked_sub(bytes);
+        if self.left.fetch_update(Ordering::Relaxed, Ordering::Relaxed, less).is_err() {
+            self.spent.store(true, Ordering::Relaxed);
+            return None;
+        }
+        Some(Room { of: Arc::clone(self), bytes })
+    }
+}
+
+impl Drop for Room {
+    fn drop(&mut self) {
+        self.of.left.fetch_add(self.bytes, Ordering::Relaxed);
+    }
+}
+
+impl fmt::Debug for OnDisk {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("OnDisk").field("files", &self.files).finish_non_exhaustive()
+    }
+}
+
+impl OnDisk {
+    fn decode(&self) -> Result<Pixels, CaptureError> {
+        let mut pixels = self.files.decode()?;
+        self.edits.iter().for_each(|edit| edit(&mut pixels));
+        Ok(pixels)
+    }
+
+    /// A copy of the description with nothing decoded.
+    fn anew(&self) -> Self {
+        Self {
+            files: Arc::clone(&self.files),
+            edits: self.edits.clone(),
+            allowance: Arc::clone(&self.allowance),
+            kept: OnceLock::new(),
+        }
+    }
+}
+
+/// Pixels to read one by one.
+pub struct PixelReader(Packed);
+
+enum Packed {
+    Memory(Arc<PackedPixels>),
+    Kept(Kept),
+}
+
+impl std::ops::Deref for PixelReader {
+    type Target = PackedPixels;
+
+    fn deref(&self) -> &PackedPixels {
+        match &self.0 {
+            Packed::Memory(packed) => packed,
+            Packed::Kept(kept) => &kept.0.0,
+        }
+    }
+}
+
+impl From<Pixels> for PixelSource {
+    fn from(pixels: Pixels) -> Self {
+        Self(Place::Memory(Arc::new(PackedPixels::new(&pixels))))
+    }
+}
+
+impl PixelSource {
+    /// Pixels that are decoded when asked for, and kept packed while `allowance` lasts.
+    pub(super) fn on_disk(files: Files, allowance: Arc<Allowance>) -> Self {
+        let (files, edits, kept) = (Arc::new(files), Vec::new(), OnceLock::new());
+        Self(Place::Disk(Arc::new(OnDisk { files, edits, allowance, kept })))
+    }
+
+    /// The pixels, unpacked or decoded.
+    ///
+    /// # Errors
+    /// Files that cannot be read any more, or never were readable; none for pixels in memory.
+    pub fn pixels(&self) -> Result<Pixels, CaptureError> {
+        match &self.0 {
+            Place::Memory(packed) => Ok(packed.pixels()),
+            Place::Disk(disk) => match disk.kept.get() {
+                Some(Some(Kept(kept))) => Ok(kept.0.pixels()),
+                Some(None) => disk.decode(),
+                None => {
+                    let pixels = disk.decode()?;
+                    disk.kept.get_or_init(|| {
+                        let packed = PackedPixels::new(&pixels);
+                        let room = disk.allowance.take(packed.bytes())?;
+                        Some(Kept(Arc::new((packed, room))))
+                    });
+                    Ok(pixels)
+                }
+            },
+        }
+    }
+
+    /// The pixels for reading some of them, without unpacking.
+    ///
+    /// # Errors
+    /// As of [`PixelSource::pixels`].
+    pub fn reader(&self) -> Result<PixelReader, CaptureError> {
+        let disk = match &self.0 {
+            Place::Memory(packed) => return Ok(PixelReader(Packed::Memory(Arc::clone(packed)))),
+            Place::Disk(disk) => disk,
+        };
+        if disk.kept.get().is_none() {
+            self.pixels()?;
+        }
+        Ok(PixelReader(match disk.kept.get() {
+            Some(Some(kept)) => Packed::Kept(kept.clone()),
+            _ => Packed::Memory(Arc::new(PackedPixels::new(&self.pixels()?))),
+        }))
+    }
+
+    /// The picture without its mask; `None` for pixels that no file has.
+    #[must_use]
+    pub fn photograph(&self) -> Option<Result<Image, CaptureError>> {
+        match &self.0 {
+            Place::Disk(disk) => Some(disk.files.photograph()),
+            Place::Memory(_) => None,
+        }
+    }
+
+    /// Whether a simulated obstacle, which the photograph does not show, hides pixels.
+    #[must_use]
+    pub fn is_hidden(&self) -> bool {
+        matches!(&self.0, Place::Disk(disk) if disk.files.hidden.is_some())
+    }
+
+    /// Decodes what is to be kept, and checks the headers of the rest.
+    pub(super) fn check(&self) -> Result<(), CaptureError> {
+        match &self.0 {
+            Place::Disk(disk) if disk.allowance.spent.load(Ordering::Relaxed) => disk.files.check(),
+            _ => self.pixels().map(drop),
+        }
+    }
+
+    /// Changes the pixels, now or whenever they are decoded; their photograph stays as it is.
+    pub fn edit(&mut self, edit: impl Fn(&mut Pixels) + Send + Sync + 'static) {
+        match &mut self.0 {
+            Place::Memory(packed) => {
+                let mut pixels = packed.pixels();
+                edit(&mut pixels);
+                *self = pixels.into();
+            }
+            Place::Disk(disk) => {
+                let mut changed = disk.anew();
+                changed.edits.push(Arc::new(edit));
+                *disk = Arc::new(changed);
+            }
+        }
+    }
+
+    /// Puts a simulated obstacle in front of an area of pixels, in place of an earlier one.
+    pub fn hide(&mut self, area: Area) {
+        match &mut self.0 {
+            Place::Memory(_) => self.edit(move |pixels| pixels.hide(&area)),
+            Place::Disk(disk) => {
+                let files = Arc::new(disk.files.hidden_behind(&area));
+                *disk = Arc::new(OnDisk { files, ..disk.anew() });
+            }
+        }
+    }
+}

@@ -1,0 +1,87 @@
+//! A tiny body, a writer of the few pickle opcodes that captures take, and directories that go
+//! away.
+
+use glam::Vec3;
+use smpl::{BodyModel, SparseRows};
+
+/// A box with a joint at either end and one beta that lengthens it.
+pub fn body() -> BodyModel {
+    let corner = |i: u32, axis: u32| if i >> axis & 1 == 1 { 1.0 } else { -1.0 };
+    let v_template: Vec<Vec3> =
+        (0..8).map(|i| Vec3::new(corner(i, 0) * 0.2, corner(i, 1) * 0.85, corner(i, 2) * 0.1)).collect();
+    let face = |[a, b, c, d]: [u32; 4]| [[a, b, c], [a, c, d]];
+    let quads = [[0, 4, 6, 2], [1, 3, 7, 5], [0, 1, 5, 4], [2, 6, 7, 3], [0, 2, 3, 1], [4, 5, 7, 6]];
+    let top = |i: u32| u32::from(i >> 1 & 1 == 1);
+    BodyModel {
+        faces: quads.into_iter().flat_map(face).collect(),
+        shapedirs: v_template.iter().map(|v| Vec3::Y * v.y * 0.1).collect(),
+        posedirs: SparseRows::from_rows((0..8).map(|_| Vec::<(u32, Vec3)>::new())),
+        weights: SparseRows::from_rows((0..8).map(|i| [(top(i), 1.0f32)])),
+        j_regressor: SparseRows::from_rows([[0, 1, 4, 5], [2, 3, 6, 7]].map(|row: [u32; 4]| row.map(|v| (v, 0.25f32)))),
+        parents: vec![None, Some(0)],
+        v_template,
+    }
+}
+
+pub use synth::Py;
+pub use testkit::files::{Directory, shared};
+
+fn npy_header(descr: &str, shape: &str) -> Vec<u8> {
+    let header = format!("{{'descr': '{descr}', 'fortran_order': False, 'shape': {shape}, }}\n");
+    let mut out = b"\x93NUMPY\x01\x00".to_vec();
+    out.extend((header.len() as u16).to_le_bytes());
+    out.extend(header.as_bytes());
+    out
+}
+
+/// An array of points as `numpy.save` writes it.
+pub fn points_npy(points: &[Vec3]) -> Vec<u8> {
+    let mut out = npy_header("<f4", &format!("({}, 3)", points.len()));
+    out.extend(points.iter().flat_map(|p| p.to_array()).flat_map(f32::to_le_bytes));
+    out
+}
+
+pub fn array(shape: &[u32], values: &[f64]) -> Py {
+    Py::Array(shape.to_vec(), values.to_vec())
+}
+
+pub fn flat(points: &[Vec3]) -> Vec<f64> {
+    points.iter().flat_map(|p| p.to_array()).map(f64::from).collect()
+}
+
+/// Variants of a file, each with a few bytes replaced, left out or repeated; always the same ones.
+pub fn damaged(whole: &[u8], count: usize) -> impl Iterator<Item = Vec<u8>> + '_ {
+    (0..count).map(|case| {
+        let mut stream = volrender::RandomStream::new(&[0x6461_6d61, case as u64]);
+        let mut bytes = whole.to_vec();
+        for _ in 0..=case % 3 {
+            let at = (stream.uniform() * bytes.len() as f32) as usize % bytes.len().max(1);
+            let end = (at + (stream.uniform() * 40.0) as usize).min(bytes.len());
+            match case % 4 {
+                0 => drop(bytes.drain(at..end)),
+                1 => bytes.extend_from_within(at..end),
+                _ => bytes[at] = (stream.uniform() * 256.0) as u8,
+            }
+        }
+        bytes
+    })
+}
+
+/// Overlap of the posed body's silhouette with the mask, over the pixels that no known occluder
+/// covers.
+pub fn overlap(frame: &super::Frame, body: &BodyModel) -> f32 {
+    let posed = body.pose(&body.shaped(&frame.betas), &frame.pose, frame.placement);
+    let mesh = visibility::RayMesh::new(&posed.vertices, &body.faces).unwrap();
+    let (mut both, mut either) = (0, 0);
+    for (i, &mask) in frame.pixels().unwrap().mask.iter().enumerate() {
+        if frame.pixels().unwrap().occluder.as_ref().is_some_and(|o| o[i]) {
+            continue;
+        }
+        let (column, row) = (i as u32 % frame.pixels().unwrap().image.width, i as u32 / frame.pixels().unwrap().image.width);
+        let ray = frame.camera.ray(column as f32 + 0.5, row as f32 + 0.5);
+        let (covered, subject) = (mesh.first_hit(ray.origin, ray.direction).is_some(), mask > 0.5);
+        both += usize::from(covered && subject);
+        either += usize::from(covered || subject);
+    }
+    both as f32 / either.max(1) as f32
+}

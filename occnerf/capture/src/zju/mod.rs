@@ -1,0 +1,255 @@
+//! Raw ZJU-MoCap (Peng et al. 2021), many cameras around one person.
+//!
+//! ```text
+//! annots.npy                   {cams: {K (C,3,3), R (C,3,3), T (C,3) in millimetres, D (C,5)?},
+//!                               ims: [{ims: [paths]}]}
+//! Camera_B1/000000.jpg …       the paths of `ims`: a frame's pictures, a folder a camera
+//! mask_cihp/Camera_B1/… .png   labels, 0 being background; or mask/; where there are both, either
+//! new_params/0.npy …           {poses (1,3J), Rh (1,3), Th (1,3), shapes (1,≤B)}, counted from 0,
+//!                              or all from 1
+//! new_vertices/0.npy …         (V,3), where present compared with the model
+//! occlusion.json               {camera, image_size (w,h), rect {x0, y0, x1, y1}, frames}, where
+//!                              present; of one that moves, also rects, one for each of frames
+//! ```
+
+mod annots;
+#[cfg(test)]
+mod tests;
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use glam::Vec3;
+use rayon::prelude::*;
+use serde::Deserialize;
+use smpl::{BodyModel, Placement};
+
+use self::annots::Annots;
+use super::decode::{Planned, View, budget};
+use super::image::dimensions;
+use super::pixels::Area;
+use super::pictures::{file_name, is_directory};
+use super::records::{Record, Records, triples};
+use super::{Capture, CaptureError, EvalFrame, LoadOptions, checks};
+
+/// How far a vertex may be from where the file has it, as a fraction of the body's largest extent,
+/// 1 cm at 1.7 m.
+const VERTEX_TOLERANCE: f32 = 0.01 / 1.7;
+/// Longest `occlusion.json` that is read.
+const MAX_OCCLUSION_BYTES: u64 = 1 << 20;
+
+/// Reads a capture in this layout.
+pub(super) fn load(dir: &Path, body: &BodyModel, options: &LoadOptions) -> Result<Capture, CaptureError> {
+    let annots = Annots::read(dir, options)?;
+    let camera = annots.camera(options)?;
+    let instants = options.select(annots.instants(camera));
+    let bodies = bodies(dir, &annots, &instants, body)?;
+
+    let plan = |camera: usize, index: usize| -> Result<Option<Planned>, CaptureError> {
+        let Some(path) = annots.picture(instants[index], camera) else { return Ok(None) };
+        let fitted = &bodies[index];
+        Ok(Some(Planned {
+            name: format!("frame_{:06}", instants[index]),
+            image: dir.join(path),
+            masks: masks(dir, path)?,
+            labels: true,
+            occluder: None,
+            hidden: None,
+            lens: annots.lenses[camera],
+            pose: fitted.pose.clone(),
+            placement: fitted.placement,
+            betas: fitted.betas.clone(),
+        }))
+    };
+    let mut train = Vec::new();
+    for index in 0..instants.len() {
+        train.extend(plan(camera, index)?);
+    }
+    if let Some(recorded) = Recorded::read(dir, &annots, camera, &train)? {
+        for (frame, instant) in train.iter_mut().zip(&instants) {
+            frame.hidden = recorded.areas.get(instant).cloned();
+        }
+    }
+    let mask_dir = |frame: &Planned| frame.masks[0].parent().unwrap_or(dir).to_owned();
+    let first_masks = train.first().map_or(dir.to_owned(), mask_dir);
+    let train = View::new(train, &first_masks, &annots.path)?;
+
+    let (mut views, mut indices) = (Vec::new(), Vec::new());
+    for other in (0..annots.lenses.len()).filter(|&c| c != camera) {
+        let mut kept = Vec::new();
+        for index in (0..instants.len()).step_by(options.eval_stride) {
+            let there = match annots.picture(instants[index], other).map(|path| dir.join(path)) {
+                Some(path) => !is_directory(&path)? && path.is_file(),
+                None => false,
+            };
+            if let Some(frame) = if there { plan(other, index)? } else { None } {
+                kept.push(frame);
+                indices.push((other, index));
+            }
+        }
+        if let Some(first) = kept.first() {
+            let masks = mask_dir(first);
+            views.push(View::new(kept, &masks, &annots.path)?);
+        }
+    }
+
+    let budget = budget(&train, &views, body, options)?;
+    let train = train.frames(body, options, &budget)?;
+    let mut eval = Vec::with_capacity(indices.len());
+    let mut indices = indices.into_iter();
+    for view in views {
+        for (frame, (other, train_index)) in view.frames(body, options, &budget)?.into_iter().zip(&mut indices) {
+            eval.push(EvalFrame { camera_name: annots.names[other].clone(), train_index, frame });
+        }
+    }
+    let mean_betas = checks::mean_betas(train.iter().map(|f| f.betas.as_slice()));
+    Ok(Capture { name: file_name(dir), train, eval, mean_betas, registered: false, clothes: Vec::new(), mended: false })
+}
+
+/// The masks that exist of a picture.
+fn masks(dir: &Path, picture: &Path) -> Result<Vec<PathBuf>, CaptureError> {
+    let wanted = ["mask_cihp", "mask"].map(|kind| dir.join(kind).join(picture).with_extension("png"));
+    let found: Vec<PathBuf> = wanted.iter().filter(|path| path.is_file()).cloned().collect();
+    if found.is_empty() {
+        let what = format!("mask of {} (nor is it in mask/)", picture.display());
+        return Err(CaptureError::missing(&wanted[0], what));
+    }
+    Ok(found)
+}
+
+/// A body fitted to all pictures of an instant.
+struct Fitted {
+    pose: Vec<Vec3>,
+    placement: Placement,
+    betas: Vec<f32>,
+}
+
+/// The fitted bodies of the given instants.
+fn bodies(dir: &Path, annots: &Annots, instants: &[usize], body: &BodyModel) -> Result<Vec<Fitted>, CaptureError> {
+    let file = |kind: &str, number: usize| dir.join(kind).join(format!("{number}.npy"));
+    // Some subjects count from 1; a folder that merely lacks 0.npy is not one of them.
+    let last = annots.num_instants();
+    let offset = usize::from(!file("new_params", 0).is_file() && file("new_params", last).is_file());
+    // Collected as results first, so that the error reported is the first in order whatever
+    // finishes first.
+    let fitted: Vec<Result<Fitted, CaptureError>> = instants
+        .par_iter()
+        .map(|&instant| {
+            let path = file("new_params", instant + offset);
+            if !path.is_file() {
+                let what = format!("body parameters of ims[{instant}] in {}", annots.path.display());
+                return Err(CaptureError::missing(&path, what));
+            }
+            let records = Records::load(&path)?;
+            let fitted = fit(&records.whole(), body)?;
+            let vertices = file("new_vertices", instant + offset);
+            if vertices.is_file() {
+                compare(&vertices, &fitted, body)?;
+            }
+            Ok(fitted)
+        })
+        .collect();
+    fitted.into_iter().collect()
+}
+
+fn fit(record: &Record<'_>, body: &BodyModel) -> Result<Fitted, CaptureError> {
+    Ok(Fitted {
+        pose: checks::rootless_pose(record, body)?,
+        placement: checks::origin(record)?,
+        betas: checks::betas(record, "shapes", body)?,
+    })
+}
+
+/// Errors unless the model's vertices are those of the file.
+fn compare(path: &Path, fitted: &Fitted, body: &BodyModel) -> Result<(), CaptureError> {
+    let key = "vertices";
+    let pattern = [Some(body.num_vertices()), Some(3)];
+    let expected = triples(&smpl::npz::read_npy(path)?.to_f32(&path.display().to_string(), key, &pattern)?);
+    let posed = body.pose(&body.shaped(&fitted.betas), &fitted.pose, fitted.placement);
+    let low = expected.iter().copied().fold(Vec3::INFINITY, Vec3::min);
+    let high = expected.iter().copied().fold(Vec3::NEG_INFINITY, Vec3::max);
+    let tolerance = VERTEX_TOLERANCE * (high - low).max_element();
+    for (vertex, (model, file)) in posed.vertices.iter().zip(&expected).enumerate() {
+        let distance = model.distance(*file);
+        if distance.is_nan() || distance > tolerance {
+            return Err(CaptureError::invalid(
+                path,
+                key,
+                format!(
+                    "the posed body model's vertices within {tolerance:.3} (is it the model that the capture was \
+                     fitted with, and are files numbered as the frames are?)"
+                ),
+                format!("vertex {vertex} at {file}, {distance:.3} from the model's"),
+            ));
+        }
+    }
+    Ok(())
+}
+
+/// The obstacle of `occlusion.json` by instant, in pixels of the files.
+struct Recorded {
+    areas: BTreeMap<usize, Area>,
+}
+
+#[derive(Deserialize)]
+struct OcclusionFile {
+    camera: String,
+    image_size: [u32; 2],
+    rect: Rectangle,
+    frames: Vec<usize>,
+    rects: Option<Vec<Rectangle>>,
+}
+
+#[derive(Clone, Copy, Deserialize)]
+struct Rectangle {
+    x0: u32,
+    y0: u32,
+    x1: u32,
+    y1: u32,
+}
+
+impl Recorded {
+    /// `None` where there is no file, or it is about another camera.
+    fn read(dir: &Path, annots: &Annots, camera: usize, train: &[Planned]) -> Result<Option<Self>, CaptureError> {
+        let path = dir.join("occlusion.json");
+        let (true, Some(first)) = (path.is_file(), train.first()) else { return Ok(None) };
+        let length = std::fs::metadata(&path).map_err(CaptureError::io(&path))?.len();
+        if length > MAX_OCCLUSION_BYTES {
+            let expected = format!("at most {MAX_OCCLUSION_BYTES} bytes");
+            return Err(CaptureError::invalid(&path, "size", expected, length.to_string()));
+        }
+        let text = std::fs::read(&path).map_err(CaptureError::io(&path))?;
+        let OcclusionFile { camera: name, image_size, rect, frames, rects } =
+            serde_json::from_slice(&text).map_err(|e| {
+                let expected = "camera, image_size (width, height), rect with x0 y0 x1 y1, and frames";
+                CaptureError::invalid(&path, "the file", expected, e.to_string())
+            })?;
+        if name != annots.names[camera] {
+            return Ok(None);
+        }
+        let (width, height) = dimensions(&first.image)?;
+        if image_size != [width, height] {
+            let expected = format!("[{width}, {height}], as of {}", first.image.display());
+            return Err(CaptureError::invalid(&path, "image_size", expected, format!("{image_size:?}")));
+        }
+        for rect in rects.iter().flatten().chain([&rect]) {
+            if rect.x0 > rect.x1 || rect.y0 > rect.y1 || rect.x1 > width || rect.y1 > height {
+                let expected = format!("0 ≤ x0 ≤ x1 ≤ {width} and 0 ≤ y0 ≤ y1 ≤ {height}");
+                let actual = format!("{} {} {} {}", rect.x0, rect.y0, rect.x1, rect.y1);
+                return Err(CaptureError::invalid(&path, "rect", expected, actual));
+            }
+        }
+        let rects = rects.unwrap_or_else(|| vec![rect; frames.len()]);
+        if rects.len() != frames.len() {
+            let expected = format!("{}, as many as frames", frames.len());
+            return Err(CaptureError::invalid(&path, "rects", expected, rects.len().to_string()));
+        }
+        let count = annots.num_instants();
+        if let Some(beyond) = frames.iter().find(|&&frame| frame >= count) {
+            let expected = format!("indices below {count}, as of ims in {}", annots.path.display());
+            return Err(CaptureError::invalid(&path, "frames", expected, beyond.to_string()));
+        }
+        let area = |r: Rectangle| Area { columns: r.x0..r.x1, rows: r.y0..r.y1 };
+        Ok(Some(Self { areas: frames.into_iter().zip(rects.into_iter().map(area)).collect() }))
+    }
+}

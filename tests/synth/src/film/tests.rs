@@ -1,0 +1,270 @@
+use smpl::{Character, MotionClip};
+
+use super::*;
+use testkit::files::shared;
+use crate::{DemoConfig, Obstacle, demo};
+
+fn small() -> SynthConfig {
+    SynthConfig { size: 64, frames: 6, eval_cameras: 1, eval_every: 3, ..SynthConfig::default() }
+}
+
+fn make(config: &SynthConfig) -> Synthetic {
+    synthesise(None, None, config, &|_| {}).unwrap()
+}
+
+fn character(name: &str) -> Option<Character> {
+    shared("character").map(|dir| Character::load(&dir.join(name)).unwrap())
+}
+
+fn clip(name: &str) -> Option<MotionClip> {
+    shared("mocap").map(|dir| MotionClip::load(&dir.join(name)).unwrap())
+}
+
+#[test]
+fn the_default_is_the_demo() {
+    let demo_config = DemoConfig { size: 64, frames: 6, eval_cameras: 1, eval_every: 3, ..DemoConfig::default() };
+    let made = make(&small());
+    let expected = demo(&demo_config, &made.body).unwrap();
+    assert_eq!(format!("{expected:?}"), format!("{:?}", made.capture));
+}
+
+#[test]
+fn the_fraction_hidden_is_the_one_asked_for() {
+    for fraction in [0.2, 0.5, 0.7] {
+        let obstacle = Obstacle { fraction, ..Obstacle::default() };
+        let objects = Occlusion::Objects { fraction, position: 0.0 };
+        for occlusion in [Occlusion::Rectangle(obstacle), objects] {
+            let made = make(&SynthConfig { occlusion, ..small() });
+            // A column of 64 is some 5 % of a person.
+            assert!((made.hidden_fraction - fraction).abs() < 0.05, "{occlusion:?}: {}", made.hidden_fraction);
+        }
+    }
+    let share = |frames: &[Frame], clear: &[PixelSource]| {
+        frames.iter().zip(clear).filter(|(frame, clear)| frame.pixels().unwrap().mask != clear.pixels().unwrap().mask).count()
+    };
+    let half = Obstacle { share: 0.5, ..Obstacle::default() };
+    let made = make(&SynthConfig { occlusion: Occlusion::Rectangle(half), ..small() });
+    assert_eq!(share(&made.capture.train, &made.clear), 3);
+}
+
+#[test]
+fn objects_move_where_they_are_told_and_cover_what_they_hide() {
+    let made = |position| make(&SynthConfig { occlusion: Occlusion::Objects { fraction: 0.3, position }, ..small() });
+    let mean = |s: &Synthetic| {
+        let cover = s.objects.as_ref().unwrap().coverage();
+        let (sum, all) = cover.iter().enumerate().fold((0.0, 0.0), |(s, a), (i, c)| (s + c * (i % 64) as f32, a + c));
+        sum / all
+    };
+    let (left, right) = (made(-0.1), made(0.1));
+    assert!(mean(&right) > mean(&left) + 3.0, "{} {}", mean(&left), mean(&right));
+    for (frame, clear) in right.capture.train.iter().zip(&right.clear) {
+        let clear = clear.pixels().unwrap();
+        let (image, mask) = (&clear.image, &clear.mask);
+        let cover = right.objects.as_ref().unwrap().coverage();
+        for (i, &c) in cover.iter().enumerate() {
+            assert_eq!(frame.pixels().unwrap().mask[i], mask[i] * (1.0 - c));
+            assert_eq!(frame.pixels().unwrap().image.pixels[3 * i], image.pixels[3 * i] * (1.0 - c));
+            assert_eq!(frame.pixels().unwrap().occluder.as_ref().unwrap()[i], c > 0.5);
+        }
+    }
+    let none = make(&SynthConfig { occlusion: Occlusion::Objects { fraction: 0.0, position: 0.0 }, ..small() });
+    assert_eq!(none.hidden_fraction, 0.0);
+    assert!(none.objects.unwrap().coverage().iter().all(|c| *c == 0.0));
+}
+
+#[test]
+fn settings_that_cannot_be_are_named() {
+    for (word, config) in [
+        ("size", SynthConfig { size: 8, ..small() }),
+        ("frames", SynthConfig { frames: 0, ..small() }),
+        ("lamp", SynthConfig { lamp: 1.5, ..small() }),
+        ("lamp", SynthConfig { lamp: f32::NAN, ..small() }),
+        ("eval_every", SynthConfig { eval_every: 0, ..small() }),
+        ("shape_noise", SynthConfig { shape_noise: f32::NAN, ..small() }),
+        ("turns", SynthConfig { turns: f32::INFINITY, ..small() }),
+        ("pose_noise", SynthConfig { pose_noise_degrees: -1.0, ..small() }),
+        (
+            "occlusion.fraction",
+            SynthConfig { occlusion: Occlusion::Objects { fraction: 1.0, position: 0.0 }, ..small() },
+        ),
+        (
+            "occlusion.position",
+            SynthConfig { occlusion: Occlusion::Objects { fraction: 0.5, position: 2.0 }, ..small() },
+        ),
+        ("64 GiB", SynthConfig { size: 2048, frames: 10_000, ..small() }),
+        ("occlusion.share", {
+            let occlusion = Occlusion::Rectangle(Obstacle { share: 2.0, ..Obstacle::default() });
+            SynthConfig { occlusion, ..small() }
+        }),
+    ] {
+        let message = synthesise(None, None, &config, &|_| {}).err().expect(word).to_string();
+        assert!(message.contains(word) && message.contains("expected"), "{message}");
+    }
+}
+
+#[test]
+fn a_character_without_errors_is_its_own_prior() {
+    let exact = SynthConfig { pose_noise_degrees: 0.0, shape_noise: 0.0, ..small() };
+    for name in ["makehuman_walk.glb", "CesiumMan.glb"] {
+        let Some(character) = character(name) else { return };
+        let made = synthesise(Some(&character), None, &exact, &|_| {}).unwrap();
+        assert_eq!(made.body.num_joints(), character.num_joints(), "{name}");
+        assert_eq!(made.capture.mean_betas, [0.0]);
+        let views = made.capture.eval.iter().map(|e| &e.frame);
+        for frame in views {
+            let overlap = overlap(frame, &made.body);
+            // The translation noise of 5 mm, and edges of pixels of 4 cm.
+            assert!(overlap > 0.85, "{name} {}: {overlap}", frame.name);
+        }
+    }
+}
+
+#[test]
+fn a_characters_prior_lies_inside_it_by_centimetres() {
+    let Some(character) = character("makehuman_walk.glb") else { return };
+    let made = synthesise(Some(&character), None, &small(), &|_| {}).unwrap();
+    let body = &made.body;
+    assert_eq!(made.capture.mean_betas, [1.0]);
+    let (own, prior) = (body.shaped(&[0.0]), body.shaped(&[1.0]));
+    let mut depths: Vec<f32> = own.vertices.iter().zip(&prior.vertices).map(|(a, b)| a.distance(*b)).collect();
+    depths.sort_by(f32::total_cmp);
+    assert!(depths[depths.len() - 1] <= 0.033, "{}", depths[depths.len() - 1]);
+    let median = depths[depths.len() / 2];
+    assert!((0.003..0.025).contains(&median), "{median}");
+    // Joints are where the rig has them, nearly the same for the sunken shape.
+    for (j, (a, b)) in own.joints.iter().zip(&prior.joints).enumerate() {
+        assert!(a.distance(*b) < 0.03, "joint {j}: {a} {b}");
+    }
+    let inside = |f: &Frame| {
+        let posed = body.pose(&body.shaped(&f.betas), &f.pose, f.placement);
+        let hit = posed.vertices.iter().filter(|&&v| {
+            let p = f.camera.project(v).unwrap();
+            f.pixels().unwrap().mask[p.y as usize * 64 + p.x as usize] > 0.0
+        });
+        hit.count() as f32 / posed.vertices.len() as f32
+    };
+    for view in &made.capture.eval {
+        assert!(inside(&view.frame) > 0.9, "{}", inside(&view.frame));
+    }
+    let numbers = made.capture.train[0].pose.len();
+    assert_eq!(numbers, 31);
+}
+
+#[test]
+fn motion_capture_drives_the_person_and_characters_with_known_names() {
+    let (Some(clip), Some(makehuman), Some(cesium)) =
+        (clip("walk.npz"), character("makehuman_walk.glb"), character("CesiumMan.glb"))
+    else {
+        return;
+    };
+    let exact = SynthConfig { pose_noise_degrees: 0.0, shape_noise: 0.0, ..small() };
+    for actor in [None, Some(&makehuman)] {
+        let made = synthesise(actor, Some(&clip), &exact, &|_| {}).unwrap();
+        for view in &made.capture.eval {
+            let overlap = overlap(&view.frame, &made.body);
+            // Clothes are wider than the body.
+            assert!(overlap > if actor.is_some() { 0.85 } else { 0.6 }, "{overlap}");
+        }
+        let poses: Vec<_> = made.capture.train.iter().map(|f| &f.pose).collect();
+        assert_ne!(poses[0], poses[3]);
+    }
+    // The character's own animation is the same take: its limbs must go where the clip takes them.
+    let (own, driven) = (
+        synthesise(Some(&makehuman), None, &exact, &|_| {}).unwrap(),
+        synthesise(Some(&makehuman), Some(&clip), &exact, &|_| {}).unwrap(),
+    );
+    for (a, b) in own.capture.train.iter().zip(&driven.capture.train) {
+        let joints = |f: &Frame| own.body.pose(&own.body.shaped(&[0.0]), &f.pose, f.placement).joints;
+        let (p, q) = (joints(a), joints(b));
+        let mean = p.iter().zip(&q).map(|(p, q)| p.distance(*q)).sum::<f32>() / p.len() as f32;
+        assert!(mean < 0.06, "{}: {mean}", a.name);
+    }
+    let message = synthesise(Some(&cesium), Some(&clip), &exact, &|_| {}).err().unwrap().to_string();
+    assert!(message.contains("motion") && message.contains("hips"), "{message}");
+}
+
+#[test]
+fn threads_and_runs_do_not_change_a_character() {
+    let Some(character) = character("CesiumMan.glb") else { return };
+    let on = |threads: usize| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        pool.install(|| synthesise(Some(&character), None, &small(), &|_| {}).unwrap())
+    };
+    let (one, two) = (on(1), on(2));
+    assert_eq!(format!("{:?}", one.capture), format!("{:?}", two.capture));
+    assert_eq!(one.body, two.body);
+    let other = synthesise(Some(&character), None, &SynthConfig { seed: 1, ..small() }, &|_| {}).unwrap();
+    assert_ne!(other.capture.train[0].pose, one.capture.train[0].pose);
+}
+
+/// Two triangles over four positions on one joint, as a .glb.
+fn plate(matrix: &str, positions: &[[f32; 3]]) -> Character {
+    let mut bytes: Vec<u8> = positions.as_flattened().iter().flat_map(|v| v.to_le_bytes()).collect();
+    let (faces, count) = (bytes.len(), positions.len());
+    bytes.extend([0u16, 1, 2, 0, 2, 3].iter().flat_map(|v| v.to_le_bytes()));
+    let all = bytes.len();
+    let mut json = format!(
+        r#"{{"asset":{{"version":"2.0"}},"scene":0,"scenes":[{{"nodes":[0]}}],
+        "nodes":[{{"mesh":0,"matrix":{matrix}}}],
+        "meshes":[{{"primitives":[{{"attributes":{{"POSITION":0}},"indices":1}}]}}],
+        "buffers":[{{"byteLength":{all}}}],
+        "bufferViews":[{{"buffer":0,"byteLength":{faces}}},{{"buffer":0,"byteOffset":{faces},"byteLength":12}}],
+        "accessors":[{{"bufferView":0,"componentType":5126,"count":{count},"type":"VEC3","min":[0,0,0],"max":[0,0,0]}},
+        {{"bufferView":1,"componentType":5123,"count":6,"type":"SCALAR"}}]}}"#
+    );
+    while json.len() % 4 > 0 {
+        json.push(' ');
+    }
+    let mut file = b"glTF\x02\0\0\0".to_vec();
+    file.extend((28 + json.len() as u32 + all as u32).to_le_bytes());
+    for (kind, chunk) in [(b"JSON", json.as_bytes()), (b"BIN\0", bytes.as_slice())] {
+        file.extend((chunk.len() as u32).to_le_bytes());
+        file.extend(kind);
+        file.extend(chunk);
+    }
+    Character::from_bytes("plate.glb", &file).unwrap()
+}
+
+const UNIT: &str = "[1,0,0,0, 0,1,0,0, 0,0,1,0, 0,0,0,1]";
+
+#[test]
+fn characters_that_are_no_bodies_are_refused() {
+    let square = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]];
+    for (word, character) in [
+        ("flat", plate(UNIT, &square)),
+        ("height", plate(UNIT, &[[0.0; 3], [1.0, 0.0, 0.0], [1.0, 0.0, 1.0], [0.0, 0.0, 1.0]])),
+        ("height", plate(UNIT, &[[1.0; 3]; 4])),
+        ("inverted", plate("[0,0,0,0, 0,0,0,0, 0,0,0,0, 0,0,0,1]", &square)),
+        ("character", plate("[1e30,0,0,0, 0,1e30,0,0, 0,0,1e30,0, 0,0,0,1]", &square)),
+    ] {
+        let message = synthesise(Some(&character), None, &small(), &|_| {}).err().expect(word).to_string();
+        assert!(message.contains(word) && message.contains("expected"), "{word}: {message}");
+    }
+}
+
+#[test]
+fn a_body_of_one_rigid_part_without_a_texture_is_filmed() {
+    let tetrahedron = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.7, 0.0], [0.0, 0.0, 1.0]];
+    let made = synthesise(Some(&plate(UNIT, &tetrahedron)), None, &small(), &|_| {}).unwrap();
+    assert_eq!((made.body.num_joints(), made.body.num_vertices()), (1, 4));
+    assert!(made.clear.iter().all(|clear| clear.pixels().unwrap().mask.iter().any(|m| *m > 0.5)));
+}
+
+/// Overlap of the posed body's silhouette with the mask, over the pixels that no known occluder
+/// covers.
+fn overlap(frame: &Frame, body: &BodyModel) -> f32 {
+    let posed = body.pose(&body.shaped(&frame.betas), &frame.pose, frame.placement);
+    let mesh = visibility::RayMesh::new(&posed.vertices, &body.faces).unwrap();
+    let (mut both, mut either) = (0, 0);
+    for (i, &mask) in frame.pixels().unwrap().mask.iter().enumerate() {
+        if frame.pixels().unwrap().occluder.as_ref().is_some_and(|o| o[i]) {
+            continue;
+        }
+        let (column, row) = (i as u32 % frame.pixels().unwrap().image.width, i as u32 / frame.pixels().unwrap().image.width);
+        let ray = frame.camera.ray(column as f32 + 0.5, row as f32 + 0.5);
+        let (covered, subject) = (mesh.first_hit(ray.origin, ray.direction).is_some(), mask > 0.5);
+        both += usize::from(covered && subject);
+        either += usize::from(covered || subject);
+    }
+    both as f32 / either.max(1) as f32
+}

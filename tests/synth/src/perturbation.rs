@@ -1,0 +1,374 @@
+//! Priors and masks made wrong on purpose, to see what a method bears.
+
+use glam::{Quat, Vec3};
+use serde::{Deserialize, Serialize};
+use smpl::{BodyModel, Placement};
+
+use crate::demo::motion::{Pose, TrackerError, track, wander};
+use crate::film::noise::{normal, smooth_noise};
+use capture::{Capture, CaptureError, Frame, Pixels};
+use volrender::RandomStream;
+
+/// Coefficients that are wrong at most: what follows hardly changes the body.
+const BETAS: usize = 10;
+const SHAPE: u64 = 0x5348_4150;
+const DEPTH: u64 = 0x4445_5054;
+const LIMBS: u64 = 0x4c49_4d42;
+
+/// Errors added to what a capture says of the body and of its pixels. None by default.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Perturbation {
+    /// Root mean square error of each bone's global orientation, degrees, smooth in time, 0 to 90.
+    pub pose_degrees: f32,
+    /// Standard deviation of the error of each shape coefficient, the same in all frames, 0 to 5.
+    pub shape: f32,
+    /// Root mean square error of the place, metres of a body 1.7 high, smooth in time, 0 to 1.
+    pub translation: f32,
+    /// Root mean square error of the distance from the camera, per cent, smooth in time, 0 to 50.
+    pub depth_percent: f32,
+    /// Standard deviation of the error of the lengths of the limbs' bones, per cent, left as right,
+    /// 0 to 50: see [`Perturbation::spoil_body`].
+    pub limbs_percent: f32,
+    /// Pixels by which the edges of the training masks go to and fro at most, 0 to 64. What is
+    /// added shows black.
+    pub ragged_pixels: f32,
+    /// Pixels by which the training masks are larger (smaller if negative) than they should be, −64
+    /// to 64. What is added shows black.
+    pub mask_pixels: i32,
+}
+
+impl Perturbation {
+    /// No error.
+    pub const NONE: Self = Self {
+        pose_degrees: 0.0,
+        shape: 0.0,
+        translation: 0.0,
+        depth_percent: 0.0,
+        limbs_percent: 0.0,
+        ragged_pixels: 0.0,
+        mask_pixels: 0,
+    };
+    /// What estimators and segmenters make of a real video.
+    pub const REAL: Self = Self {
+        pose_degrees: 4.0,
+        shape: 1.0,
+        translation: 0.02,
+        depth_percent: 2.0,
+        limbs_percent: 5.0,
+        ragged_pixels: 2.0,
+        ..Self::NONE
+    };
+
+    fn check(&self) -> Result<(), CaptureError> {
+        let real = [
+            ("wrong.pose_degrees", self.pose_degrees, 90.0),
+            ("wrong.shape", self.shape, 5.0),
+            ("wrong.translation", self.translation, 1.0),
+            ("wrong.depth_percent", self.depth_percent, 50.0),
+            ("wrong.limbs_percent", self.limbs_percent, 50.0),
+            ("wrong.ragged_pixels", self.ragged_pixels, 64.0),
+        ];
+        for (name, value, most) in real {
+            if !(0.0..=most).contains(&value) {
+                return Err(CaptureError::setting(name, format!("0 to {most}"), value));
+            }
+        }
+        if !(-64..=64).contains(&self.mask_pixels) {
+            return Err(CaptureError::setting("wrong.mask_pixels", "-64 to 64", self.mask_pixels));
+        }
+        Ok(())
+    }
+
+    /// Makes a capture wrong. Views kept back get the wrong bodies of their instants, but keep
+    /// their pixels. Lengths of limbs are the body's: see [`Perturbation::spoil_body`].
+    ///
+    /// # Errors
+    /// A value out of its range.
+    pub fn apply(&self, capture: &mut Capture, body: &BodyModel) -> Result<(), CaptureError> {
+        self.check()?;
+        if self.shape > 0.0 {
+            let mut stream = RandomStream::new(&[SHAPE]);
+            let count = body.num_betas().min(BETAS);
+            let error: Vec<f32> = (0..count).map(|_| self.shape * normal(&mut stream)).collect();
+            let frames = capture.train.iter_mut().map(|f| &mut f.betas);
+            let views = capture.eval.iter_mut().map(|v| &mut v.frame.betas);
+            for betas in frames.chain(views).chain([&mut capture.mean_betas]) {
+                betas.resize(betas.len().max(count), 0.0);
+                betas.iter_mut().zip(&error).for_each(|(beta, error)| *beta += error);
+            }
+        }
+        if self.pose_degrees > 0.0 || self.translation > 0.0 || self.depth_percent > 0.0 {
+            self.displace(capture, body);
+        }
+        for (index, frame) in capture.train.iter_mut().enumerate() {
+            if self.mask_pixels != 0 {
+                let by = self.mask_pixels;
+                frame.source.edit(move |pixels| pixels.grow(by));
+            }
+            if self.ragged_pixels > 0.0 {
+                let by = self.ragged_pixels;
+                frame.source.edit(move |pixels| fray(pixels, by, index as u64));
+            }
+        }
+        Ok(())
+    }
+
+    /// Makes the limbs of a body too long or too short, each bone with its twin on the other side
+    /// ([`BodyModel::limbs`]).
+    pub fn spoil_body(&self, body: &mut BodyModel) {
+        if self.limbs_percent == 0.0 {
+            return;
+        }
+        let limbs = body.limbs();
+        let mut moved = body.v_template.clone();
+        for pair in limbs.pairs() {
+            let part = 0.01 * self.limbs_percent * normal(&mut RandomStream::new(&[LIMBS, pair as u64]));
+            moved.iter_mut().zip(limbs.longer(pair)).for_each(|(v, longer)| *v += part * longer);
+        }
+        body.v_template = moved;
+    }
+
+    /// Turns bones, and moves the whole.
+    fn displace(&self, capture: &mut Capture, body: &BodyModel) {
+        let shaped = body.shaped(&capture.mean_betas);
+        let height = |pick: fn(f32, f32) -> f32| shaped.vertices.iter().map(|v| v.y).reduce(pick).unwrap_or(0.0);
+        let unit = (height(f32::max) - height(f32::min)) / 1.7;
+        self.turn(capture, body, self.translation * unit);
+        // Of three axes each has a third of the square.
+        let rms = 3.0f32.sqrt() * 0.01 * self.depth_percent;
+        let nearer = wander(&mut RandomStream::new(&[DEPTH]), capture.train.len(), rms);
+        for (frame, nearer) in capture.train.iter_mut().zip(nearer) {
+            let pelvis = body.shaped(&frame.betas).joints.first().copied().unwrap_or(Vec3::ZERO);
+            let Pose { rotation, translation, .. } = about_origin(frame, pelvis);
+            let away = rotation * pelvis + translation - frame.camera.centre_of_projection();
+            match &mut frame.placement {
+                Placement::Origin { translation, .. } | Placement::Pelvis { translation } => {
+                    *translation += nearer.x * away;
+                }
+            }
+        }
+        for view in &mut capture.eval {
+            if let Some(frame) = capture.train.get(view.train_index) {
+                (view.frame.pose, view.frame.placement) = (frame.pose.clone(), frame.placement);
+            }
+        }
+    }
+
+    fn turn(&self, capture: &mut Capture, body: &BodyModel, translation: f32) {
+        let pelvis = |frame: &Frame| body.shaped(&frame.betas).joints.first().copied().unwrap_or(Vec3::ZERO);
+        let Some(first) = capture.train.first().map(pelvis) else { return };
+        let poses: Vec<Pose> = capture.train.iter().map(|frame| about_origin(frame, pelvis(frame))).collect();
+        let error = TrackerError { seed: 0, rotation: self.pose_degrees.to_radians(), translation };
+        for (frame, pose) in capture.train.iter_mut().zip(track(&poses, &body.parents, first, error)) {
+            let Pose { joints, rotation, translation } = pose;
+            frame.pose = joints;
+            match &mut frame.placement {
+                Placement::Origin { rotation: r, translation: t } => {
+                    (*r, *t) = (rotation.to_scaled_axis(), translation);
+                }
+                Placement::Pelvis { translation: t } => {
+                    let pelvis = body.shaped(&frame.betas).joints.first().copied().unwrap_or(Vec3::ZERO);
+                    frame.pose[0] = rotation.to_scaled_axis();
+                    *t = translation + rotation * pelvis - pelvis;
+                }
+            }
+        }
+    }
+}
+
+/// Wavelength of ragged mask edges, pixels.
+const RAGGED: f32 = 5.0;
+
+/// Displaces the edge of the mask by up to `by` pixels of smooth noise, independent for each
+/// `frame`.
+fn fray(pixels: &mut Pixels, by: f32, frame: u64) {
+    let (old, width, height) = (pixels.mask.clone(), pixels.image.width as usize, pixels.image.height as usize);
+    for i in 0..old.len() {
+        let (x, y) = ((i % width) as f32, (i / width) as f32);
+        let wave = |part: f32| {
+            // Noise at distant points is independent.
+            let at = Vec3::new(x / RAGGED, y / RAGGED, 10.0 * (frame % 100_000) as f32 + 5.0 * part);
+            (by * (2.0 * smooth_noise(at) - 1.0)).round()
+        };
+        let inside = |c: f32, side: usize| c.clamp(0.0, side as f32 - 1.0) as usize;
+        let from = inside(y + wave(1.0), height) * width + inside(x + wave(0.0), width);
+        pixels.cover(i, old[from]);
+    }
+}
+
+/// The pose with its global rotation about the origin.
+fn about_origin(frame: &Frame, pelvis: Vec3) -> Pose {
+    let mut joints = frame.pose.clone();
+    let (rotation, translation) = match frame.placement {
+        Placement::Origin { rotation, translation } => (Quat::from_scaled_axis(rotation), translation),
+        Placement::Pelvis { translation } => {
+            let rotation = Quat::from_scaled_axis(joints.first().copied().unwrap_or(Vec3::ZERO));
+            (rotation, translation + pelvis - rotation * pelvis)
+        }
+    };
+    if let Some(root) = joints.first_mut() {
+        *root = Vec3::ZERO;
+    }
+    Pose { joints, rotation, translation }
+}
+
+#[cfg(test)]
+mod tests {
+    use crate::{DemoConfig, demo};
+    use super::*;
+
+    fn capture(body: &BodyModel) -> Capture {
+        sized(body, 48)
+    }
+
+    fn sized(body: &BodyModel, size: u32) -> Capture {
+        let exact = DemoConfig { pose_noise_degrees: 0.0, translation_noise: 0.0, ..DemoConfig::default() };
+        demo(&DemoConfig { size, frames: 12, eval_cameras: 1, ..exact }, body).unwrap()
+    }
+
+    #[test]
+    fn nothing_changes_by_default() {
+        let body = BodyModel::embedded();
+        let (before, mut after) = (capture(&body), capture(&body));
+        Perturbation::default().apply(&mut after, &body).unwrap();
+        for (a, b) in before.train.iter().zip(&after.train) {
+            assert!(
+                a.pose == b.pose
+                    && a.betas == b.betas
+                    && a.pixels().unwrap().mask == b.pixels().unwrap().mask
+                    && a.placement == b.placement
+            );
+        }
+    }
+
+    #[test]
+    fn bones_turn_by_the_angle_asked_for_about_the_pelvis_in_both_placements() {
+        let body = BodyModel::embedded();
+        let before = capture(&body);
+        let wrong = Perturbation { pose_degrees: 6.0, ..Perturbation::default() };
+        let mut about_pelvis = before.clone();
+        for frame in &mut about_pelvis.train {
+            let pelvis = body.shaped(&frame.betas).joints[0];
+            let Placement::Origin { rotation, translation } = frame.placement else { panic!("the demo's placement") };
+            frame.pose[0] = rotation;
+            let kept = Quat::from_scaled_axis(rotation) * pelvis - pelvis;
+            frame.placement = Placement::Pelvis { translation: translation + kept };
+        }
+        for mut after in [before.clone(), about_pelvis] {
+            wrong.apply(&mut after, &body).unwrap();
+            let (mut squares, mut count) = (0.0, 0.0);
+            for (a, b) in before.train.iter().zip(&after.train) {
+                let shape = body.shaped(&a.betas);
+                let (a, b) = (body.pose(&shape, &a.pose, a.placement), body.pose(&shape, &b.pose, b.placement));
+                assert!(a.joints[0].distance(b.joints[0]) < 1e-4);
+                for (a, b) in a.bones.iter().zip(&b.bones) {
+                    let turn = Quat::from_mat3a(&(b.matrix3 * a.matrix3.inverse()));
+                    squares += turn.normalize().to_scaled_axis().length_squared();
+                    count += 1.0;
+                }
+            }
+            let rms = (squares / count).sqrt().to_degrees();
+            assert!((rms - 6.0).abs() < 0.1, "{rms}");
+            let view = &after.eval[0];
+            assert_eq!(view.frame.pose, after.train[view.train_index].pose);
+        }
+    }
+
+    #[test]
+    fn masks_grow_and_shrink_and_pictures_stay_within_them() {
+        let body = BodyModel::embedded();
+        let before = capture(&body);
+        let area = |c: &Capture| c.train.iter().map(|f| f.pixels().unwrap().mask.iter().sum::<f32>()).sum::<f32>();
+        for (mask_pixels, grows) in [(2, true), (-2, false)] {
+            let mut after = before.clone();
+            Perturbation { mask_pixels, ..Perturbation::default() }.apply(&mut after, &body).unwrap();
+            assert_eq!(area(&after) > 1.1 * area(&before), grows);
+            assert_eq!(area(&after) < 0.9 * area(&before), !grows);
+            for frame in &after.train {
+                let pixels = frame.pixels().unwrap();
+                let mut each = pixels.image.pixels.chunks_exact(3).zip(&pixels.mask);
+                assert!(each.all(|(p, m)| p.iter().all(|c| *c <= m + 1e-5)));
+            }
+        }
+    }
+
+    #[test]
+    fn the_whole_moves_by_as_much_as_is_asked_for() {
+        let body = BodyModel::embedded();
+        let before = capture(&body);
+        let pelvis = |frame: &Frame| body.pose(&body.shaped(&frame.betas), &frame.pose, frame.placement).joints[0];
+        for wrong in [
+            Perturbation { translation: 0.05, ..Perturbation::NONE },
+            Perturbation { depth_percent: 3.0, ..Perturbation::NONE },
+        ] {
+            let mut after = before.clone();
+            wrong.apply(&mut after, &body).unwrap();
+            let (mut squares, mut parts) = (0.0, 0.0);
+            for (a, b) in before.train.iter().zip(&after.train) {
+                let (from, to) = (pelvis(a), pelvis(b));
+                let ray = from - a.camera.centre_of_projection();
+                squares += (to - from).length_squared() / before.train.len() as f32;
+                parts += ((to - from).length() / ray.length()).powi(2) / before.train.len() as f32;
+                assert!(wrong.depth_percent == 0.0 || (to - from).cross(ray).length() < 1e-3);
+            }
+            let (rms, part) = (squares.sqrt(), 100.0 * parts.sqrt());
+            // The body is nearly 1.7 high; the shares of the axes are only even on the average.
+            assert!(wrong.translation == 0.0 || (rms / wrong.translation - 1.0).abs() < 0.1, "{rms}");
+            assert!(wrong.depth_percent == 0.0 || (part / wrong.depth_percent - 1.0).abs() < 0.5, "{part}");
+            assert_eq!(after.eval[0].frame.placement, after.train[after.eval[0].train_index].placement);
+        }
+    }
+
+    #[test]
+    fn limbs_become_longer_or_shorter_alike_on_both_sides_and_nothing_else() {
+        let (body, mut wrong) = (BodyModel::embedded(), BodyModel::embedded());
+        Perturbation { limbs_percent: 5.0, ..Perturbation::NONE }.spoil_body(&mut wrong);
+        wrong.validate("limbs").unwrap();
+        let (a, b) = (body.shaped(&[]).joints, wrong.shaped(&[]).joints);
+        let longer = |j: usize| {
+            let p = body.parents[j].unwrap();
+            (b[j] - b[p]).length() / (a[j] - a[p]).length() - 1.0
+        };
+        // Hips, knees, ankles; shoulders, elbows, wrists of SMPL.
+        let changes: Vec<f32> = [(4, 5), (7, 8), (18, 19), (20, 21)]
+            .map(|(l, r)| {
+                assert!((longer(l) - longer(r)).abs() < 0.01, "{l}: {} and {}", longer(l), longer(r));
+                longer(l).abs()
+            })
+            .into();
+        let mean = changes.iter().sum::<f32>() / 4.0;
+        assert!((0.01..0.12).contains(&mean), "{changes:?}");
+        assert!([3, 6, 9, 12, 15].iter().all(|&j| longer(j).abs() < 0.01));
+    }
+
+    #[test]
+    fn ragged_masks_keep_their_size_and_their_middle() {
+        let body = BodyModel::embedded();
+        let (before, mut after) = (sized(&body, 192), sized(&body, 192));
+        Perturbation { ragged_pixels: 2.0, ..Perturbation::NONE }.apply(&mut after, &body).unwrap();
+        let (mut area, mut changed) = ([0.0, 0.0], 0.0);
+        for (a, b) in before.train.iter().zip(&after.train) {
+            let (a, b) = (a.pixels().unwrap(), b.pixels().unwrap());
+            area = [area[0] + a.mask.iter().sum::<f32>(), area[1] + b.mask.iter().sum::<f32>()];
+            changed += a.mask.iter().zip(&b.mask).map(|(a, b)| (a - b).abs()).sum::<f32>();
+            assert!(b.image.pixels.chunks_exact(3).zip(&b.mask).all(|(p, m)| p.iter().all(|c| *c <= m + 1e-5)));
+        }
+        assert!((area[1] / area[0] - 1.0).abs() < 0.05, "{area:?}");
+        assert!(changed > 0.02 * area[0] && changed < 0.3 * area[0], "{changed} of {}", area[0]);
+    }
+
+    #[test]
+    fn errors_out_of_range_are_named() {
+        assert_eq!(Perturbation::NONE, Perturbation::default());
+        Perturbation::REAL.check().unwrap();
+        for (wrong, name) in [
+            (Perturbation { pose_degrees: f32::NAN, ..Perturbation::default() }, "pose_degrees"),
+            (Perturbation { shape: -1.0, ..Perturbation::default() }, "shape"),
+            (Perturbation { ragged_pixels: -1.0, ..Perturbation::default() }, "ragged_pixels"),
+            (Perturbation { mask_pixels: 65, ..Perturbation::default() }, "mask_pixels"),
+        ] {
+            assert!(wrong.check().unwrap_err().to_string().contains(name));
+        }
+    }
+}
