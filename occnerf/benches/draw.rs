@@ -7,7 +7,7 @@ use std::sync::OnceLock;
 use divan::Bencher;
 use glam::{Affine3A, Vec4};
 use occnerf::bake::{Avatar, BakeOptions, BakedPerson, bake};
-use occnerf::{Config, Method, Model, Preset, Scene, Trainer, capture};
+use occnerf::{Config, Method, Model, Preset, Scene, Trainer};
 use visibility::Samples;
 use volrender::Camera;
 

@@ -195,7 +195,7 @@ fn an_error_of_the_renderer_comes_through() {
 #[test]
 fn captures_that_show_nobody_are_refused() {
     let mut blank = capture();
-    blank.train.iter_mut().for_each(|f| f.source.change(|pixels| pixels.mask.fill(0.0)).unwrap());
+    blank.train.iter_mut().for_each(|f| f.source.edit(|pixels| pixels.mask.fill(0.0)));
     let message = Scene::new(&blank, body(), &config(Method::Occnerf)).err().unwrap().to_string();
     assert!(message.contains("ellipsoid") && message.contains("mask"), "{message}");
     blank.train.clear();

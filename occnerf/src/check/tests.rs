@@ -7,7 +7,7 @@ use smpl::{BodyModel, Placement};
 
 use super::silhouette::silhouette;
 use super::*;
-use crate::capture::testing::{Directory, shared};
+use testkit::files::{Directory, shared};
 use crate::capture::{ImportOptions, LoadOptions, import, load_capture};
 use synth::{DemoConfig, demo};
 
@@ -100,7 +100,7 @@ fn made(mistake: Mistake, capture: &Capture, body: &BodyModel) -> Capture {
             Mistake::Radians => frame.pose.iter_mut().for_each(|axis| *axis *= std::f32::consts::PI / 180.0),
             Mistake::Focal(factor) => camera.focal *= factor,
             Mistake::MaskInverted => {
-                frame.source.change(|pixels| pixels.mask.iter_mut().for_each(|m| *m = 1.0 - *m)).unwrap();
+                frame.source.edit(|pixels| pixels.mask.iter_mut().for_each(|m| *m = 1.0 - *m));
             }
             Mistake::FrameShift(by) => {
                 let other = (i as i32 - by).clamp(0, count as i32 - 1) as usize;
@@ -223,7 +223,7 @@ fn a_silhouette_is_where_rays_hit() {
 fn jumps_empty_masks_and_frames_that_do_not_fit_are_marked() {
     let body = BodyModel::embedded();
     let mut capture = small_demo(&body, 1);
-    capture.train[10].source.change(|pixels| pixels.mask.fill(0.0)).unwrap();
+    capture.train[10].source.edit(|pixels| pixels.mask.fill(0.0));
     capture.train[20].camera.world_to_camera.translation.x += 1.5;
     capture.train[30].pose.iter_mut().skip(1).for_each(|axis| *axis += Vec3::splat(0.9));
     let found = check(&capture, &body).unwrap();

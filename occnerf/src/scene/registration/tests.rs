@@ -136,7 +136,7 @@ fn nothing_is_changed_where_nothing_is_seen() {
     let body = BodyModel::embedded();
     let mut given = demo(&small(), &body).unwrap();
     for frame in &mut given.train {
-        frame.source.change(|pixels| pixels.mask.fill(0.0)).unwrap();
+        frame.source.edit(|pixels| pixels.mask.fill(0.0));
     }
     let mut found = given.clone();
     register(&mut found, &body, 3).unwrap();
@@ -164,7 +164,7 @@ fn clothes_are_found_as_far_out_as_they_are_and_an_occluder_is_no_outline() {
                 pixels.mask[i as usize] = f32::from(u8::from(shows));
             }
         };
-        frame.source.change(see).unwrap();
+        frame.source.edit(see);
         let picture = Picture::new(frame, &posed).unwrap().unwrap();
         let looking = Looking { reach: 10.0, blur: 0.0, unit: 1.0 };
         let found = look(&picture, &posed.vertices, (&body.faces, &ridges), looking).unwrap();
