@@ -5,8 +5,8 @@ use std::path::Path;
 
 use array_files::npz::Npz;
 use array_files::pickle::{self, Value};
+use array_files::read_file;
 use array_files::torch::{TorchFile, is_torch};
-use array_files::{Error, read_file};
 
 fn list(name: &str, value: &Value) {
     match value {
@@ -26,17 +26,23 @@ fn list(name: &str, value: &Value) {
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let name = std::env::args().nth(1).ok_or("usage: list_arrays FILE")?;
     let path = Path::new(&name);
-    let value = match Npz::open(path) {
-        Ok(mut npz) if !npz.keys().iter().any(|key| key.ends_with("data.pkl")) => {
-            let entries = npz.keys().to_vec().into_iter().map(|key| Ok((Value::Str(key.clone()), npz.value(&key)?)));
-            Value::Dict(entries.collect::<Result<_, Error>>()?)
+    if let Ok(mut npz) = Npz::open(path)
+        && !npz.keys().iter().any(|key| key.ends_with("data.pkl"))
+    {
+        for key in npz.keys().to_vec() {
+            match npz.value(&key) {
+                Ok(value) => list(&key, &value),
+                Err(error) => println!("{error}"),
+            }
         }
-        _ if is_torch(&read_file(path)?) => {
-            let mut file = TorchFile::open(&name, File::open(path)?)?;
-            let root = file.root().clone();
-            file.resolve("", &root)?
-        }
-        _ => pickle::read(path)?,
+        return Ok(());
+    }
+    let value = if is_torch(&read_file(path)?) {
+        let mut file = TorchFile::open(&name, File::open(path)?)?;
+        let root = file.root().clone();
+        file.resolve("", &root)?
+    } else {
+        pickle::read(path)?
     };
     list("", &value);
     Ok(())

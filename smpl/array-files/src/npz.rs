@@ -101,7 +101,7 @@ impl Npz {
         read_array(&file, key, self.entry(key)?)
     }
 
-    /// Reads `key` of any element type: numbers, text or pickled objects.
+    /// Reads `key`, an array of plain values or of pickled objects.
     ///
     /// # Errors
     /// Those of [`Npz::array`]; [`Error::Pickle`]; [`Error::TooLarge`] for an entry that expands by

@@ -24,19 +24,19 @@ const MAX_AXES: usize = 64;
 
 /// Open file and its description.
 ///
-/// ```no_run
+/// ```
 /// use array_files::torch::TorchFile;
-///
-/// let file = std::fs::File::open("vgg16.pth").unwrap();
-/// let mut weights = TorchFile::open("vgg16.pth", file)?;
-/// let name = "features.0.weight";
-/// if let Some(value) = weights.root().get(name)
-///     && let Some(tensor) = weights.tensor(name, value)?
-/// {
-///     println!("{} {:?}", tensor.dtype, tensor.shape);
-///     let first = weights.read(name, &tensor)?.to_f64()[0];
-///     println!("{first}");
-/// }
+/// # let bytes = [
+/// #     b"\x80\x02\x8a\x0al\xfc\x9cF\xf9 j\xa8P\x19.M\xe9\x03.}.}(S'bias'\nctorch._utils\n_rebuild_tensor_v2\n(".as_slice(),
+/// #     b"(S'storage'\nctorch\nFloatStorage\nS'0'\nS'cpu'\nK\x02NtQK\0(K\x02t(K\x01ttRu.](S'0'\ne.",
+/// #     b"\x02\0\0\0\0\0\0\0\0\0\x80\x3f\0\0\0\x40",
+/// # ]
+/// # .concat();
+/// // bytes: torch.save({"bias": torch.tensor([1.0, 2.0])})
+/// let mut weights = TorchFile::open("weights.pth", std::io::Cursor::new(bytes))?;
+/// let value = weights.root().get("bias").unwrap();
+/// let bias = weights.tensor("bias", value)?.unwrap();
+/// assert_eq!(weights.read("bias", &bias)?.to_f64(), [1.0, 2.0]);
 /// # Ok::<(), array_files::Error>(())
 /// ```
 pub struct TorchFile<R> {
@@ -63,12 +63,17 @@ impl<R> fmt::Debug for TorchFile<R> {
 
 /// Description of a tensor whose values have not been read, from [`TorchFile::tensor`].
 ///
-/// ```no_run
+/// ```
 /// # use array_files::torch::TorchFile;
-/// # let file = TorchFile::open("vgg16.pth", std::fs::File::open("vgg16.pth").unwrap())?;
-/// let value = file.root().get("classifier.6.bias").unwrap();
-/// let tensor = file.tensor("classifier.6.bias", value)?.unwrap();
-/// assert!(tensor.is_float() && tensor.shape == [1000]);
+/// # let bytes = [
+/// #     b"\x80\x02\x8a\x0al\xfc\x9cF\xf9 j\xa8P\x19.M\xe9\x03.}.}(S'bias'\nctorch._utils\n_rebuild_tensor_v2\n(".as_slice(),
+/// #     b"(S'storage'\nctorch\nFloatStorage\nS'0'\nS'cpu'\nK\x02NtQK\0(K\x02t(K\x01ttRu.](S'0'\ne.",
+/// #     b"\x02\0\0\0\0\0\0\0\0\0\x80\x3f\0\0\0\x40",
+/// # ]
+/// # .concat();
+/// # let file = TorchFile::open("weights.pth", std::io::Cursor::new(bytes))?;
+/// let bias = file.tensor("bias", file.root().get("bias").unwrap())?.unwrap();
+/// assert!(bias.is_float() && bias.dtype == "float32" && bias.shape == [2]);
 /// # Ok::<(), array_files::Error>(())
 /// ```
 #[derive(Clone, Debug, PartialEq)]
