@@ -17,6 +17,9 @@ pub enum Error {
     /// A body model that cannot be read.
     #[error(transparent)]
     Body(#[from] smpl::Error),
+    /// A file of arrays that cannot be read or written.
+    #[error(transparent)]
+    Array(#[from] array_files::Error),
     /// The canonical or a posed mesh, as a set of points.
     #[error("surface query: {0}")]
     Surface(#[from] surface_query::Error),

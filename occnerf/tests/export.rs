@@ -151,7 +151,7 @@ fn motion_goes_out_and_comes_back_standing() {
         let pose = |m: &MotionClip| avatar.bones(&m.poses[24 * frame..24 * (frame + 1)], m.trans[frame]);
         assert!(worst(&avatar.skin(&pose(&back)), &avatar.skin(&pose(motion))) < 1e-4);
     }
-    let mut npz = smpl::npz::Npz::open(&path).unwrap();
+    let mut npz = array_files::npz::Npz::open(&path).unwrap();
     assert_eq!(npz.f32("betas", &[None]).unwrap().1, avatar.betas);
     assert!(npz.keys().iter().any(|key| key == "gender"));
     assert!(write_amass(avatar, 7, &path).is_err());

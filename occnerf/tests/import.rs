@@ -3,11 +3,11 @@
 
 use std::path::{Path, PathBuf};
 
+use array_files::npz::Npz;
 use glam::{DMat3, DQuat, DVec3};
 use occnerf::capture::{ImportOptions, Imported, LoadOptions, Tool, import, load_capture};
 use serde_json::Value;
 use smpl::BodyModel;
-use smpl::npz::Npz;
 
 fn estimators() -> Option<PathBuf> {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared/data/estimators");

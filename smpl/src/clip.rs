@@ -2,11 +2,11 @@
 
 use std::path::Path;
 
+use array_files::npz::Npz;
 use glam::{Quat, Vec3};
 
 use crate::Error;
 use crate::model::MAX_COORDINATE;
-use crate::npz::Npz;
 use crate::pose::Placement;
 
 /// Joints that SMPL, SMPL-H and SMPL-X share: the body without hands and face.

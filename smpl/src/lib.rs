@@ -23,7 +23,6 @@
 //! [`WeightVolumeConfig`] assume metres. The canonical space is the rest pose of a [`Shaped`] body.
 //! Arithmetic is `f32` and independent of the number of threads.
 
-mod array;
 mod character;
 mod clip;
 mod embedded;
@@ -33,22 +32,19 @@ mod load;
 mod mesh;
 mod model;
 mod motion;
-mod npy;
-pub mod npz;
-pub mod pickle;
 mod pose;
 mod pose_backward;
 mod rotation;
 mod saved;
 mod sparse;
-pub mod torch;
 
 /// The README's example, compiled as a test.
 #[cfg(doctest)]
 #[doc = include_str!("../README.md")]
 struct Readme;
 
-pub use array::{Data, NdArray};
+/// Error within [`Error::File`].
+pub use array_files::Error as FileError;
 pub use character::{Animation, Character, CharacterPose, Texture};
 pub use clip::MotionClip;
 pub use error::Error;

@@ -2,14 +2,13 @@
 
 use std::path::Path;
 
+use array_files::npz::Npz;
+use array_files::pickle::{self, Value};
+use array_files::{Error as FileError, NdArray, read_file};
 use glam::Vec3;
 
 use crate::Error;
-use crate::array::NdArray;
 use crate::model::{BodyModel, TERMS_PER_JOINT};
-use crate::npy::read_file;
-use crate::npz::Npz;
-use crate::pickle::{self, Value};
 use crate::saved;
 use crate::sparse::SparseRows;
 
@@ -58,8 +57,8 @@ fn kind(bytes: &[u8]) -> Option<&'static str> {
 }
 
 /// The array under `key` of the model's dictionary, made dense.
-fn from_pickle(file: &str, value: &Value, key: &str) -> Result<NdArray, Error> {
-    let wrong = |key: &str, expected, value: &Value| Error::Type {
+fn from_pickle(file: &str, value: &Value, key: &str) -> Result<NdArray, FileError> {
+    let wrong = |key: &str, expected, value: &Value| FileError::Type {
         file: file.to_owned(),
         key: key.to_owned(),
         expected,
@@ -70,7 +69,7 @@ fn from_pickle(file: &str, value: &Value, key: &str) -> Result<NdArray, Error> {
     };
     let Some(found) = value.get(key) else {
         let names = entries.iter().filter_map(|(k, _)| k.as_str());
-        return Err(Error::MissingKey {
+        return Err(FileError::MissingKey {
             file: file.to_owned(),
             key: key.to_owned(),
             available: names.map(str::to_owned).collect(),
@@ -79,7 +78,7 @@ fn from_pickle(file: &str, value: &Value, key: &str) -> Result<NdArray, Error> {
     found.to_dense(file, key)?.ok_or_else(|| wrong(key, "an array", found))
 }
 
-fn build(file: &str, mut array: impl FnMut(&str) -> Result<NdArray, Error>) -> Result<BodyModel, Error> {
+fn build(file: &str, mut array: impl FnMut(&str) -> Result<NdArray, FileError>) -> Result<BodyModel, Error> {
     let v_template = array("v_template")?.to_f32(file, "v_template", &[None, Some(3)])?;
     let v = v_template.len() / 3;
 

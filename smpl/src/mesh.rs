@@ -2,12 +2,12 @@
 
 use std::path::Path;
 
+use array_files::read_file;
 use glam::Vec3;
 
 use crate::Error;
 use crate::character::Character;
 use crate::model::{BodyModel, MAX_COORDINATE};
-use crate::npy::read_file;
 
 /// A triangle mesh.
 #[derive(Clone, Debug, PartialEq)]
@@ -34,9 +34,7 @@ pub fn load_mesh(path: &Path) -> Result<Mesh, Error> {
             let character = Character::load(path)?;
             let mesh = Mesh { vertices: character.rest().vertices, faces: character.faces };
             match mesh.vertices.iter().position(|v| !v.is_finite() || v.abs().max_element() > MAX_COORDINATE) {
-                Some(v) => {
-                    Err(Error::NotFinite { file: path.display().to_string(), key: "vertices".to_owned(), index: 3 * v })
-                }
+                Some(v) => Err(Error::not_finite(&path.display().to_string(), "vertices", 3 * v)),
                 None => Ok(mesh),
             }
         }

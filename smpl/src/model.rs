@@ -96,7 +96,7 @@ impl BodyModel {
     /// and below 10⁶ units. `file` names the model in errors; keys are those of SMPL's files.
     ///
     /// # Errors
-    /// [`Error::Invalid`], [`Error::NotFinite`].
+    /// [`Error::Invalid`], [`FileError::NotFinite`](crate::FileError::NotFinite).
     pub fn validate(&self, file: &str) -> Result<(), Error> {
         let invalid = |key: &str, message: String| Err(Error::invalid(file, key, message));
         let (v, j) = (self.num_vertices(), self.num_joints());
@@ -185,7 +185,7 @@ fn near(file: &str, key: &str, values: &[Vec3]) -> Result<(), Error> {
 
 fn finite(file: &str, key: &str, values: &[Vec3]) -> Result<(), Error> {
     match values.iter().position(|v| !v.is_finite()) {
-        Some(index) => Err(Error::NotFinite { file: file.to_owned(), key: key.to_owned(), index: 3 * index }),
+        Some(index) => Err(Error::not_finite(file, key, 3 * index)),
         None => Ok(()),
     }
 }

@@ -4,6 +4,7 @@ use std::collections::HashMap;
 use std::io::Write;
 use std::path::Path;
 
+use array_files::Error as FileError;
 use glam::Vec3;
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 
@@ -24,7 +25,7 @@ impl BodyModel {
     /// models give equal files.
     ///
     /// # Errors
-    /// What [`BodyModel::validate`] finds; [`Error::Io`].
+    /// What [`BodyModel::validate`] finds; [`Error::File`].
     pub fn save(&self, path: &Path) -> Result<(), Error> {
         let file = path.display().to_string();
         self.validate(&file)?;
@@ -66,7 +67,7 @@ impl BodyModel {
         });
         written.map_err(|source| {
             let _ = std::fs::remove_file(&partial);
-            Error::Io { path: path.to_owned(), source }
+            FileError::Io { path: path.to_owned(), source }.into()
         })
     }
 }
@@ -114,7 +115,7 @@ impl Source<'_> {
         let Ok(view) = self.tensors.tensor(key) else {
             let mut available: Vec<String> = self.tensors.names().into_iter().map(str::to_owned).collect();
             available.sort();
-            return Err(Error::MissingKey { file: self.file.to_owned(), key: key.to_owned(), available });
+            return Err(FileError::MissingKey { file: self.file.to_owned(), key: key.to_owned(), available }.into());
         };
         if view.dtype() != kind {
             let message = format!("its type is {:?}, expected {kind:?}", view.dtype());
@@ -123,12 +124,13 @@ impl Source<'_> {
         let shape = view.shape().to_vec();
         if shape.len() != pattern.len() || shape.iter().zip(pattern).any(|(n, p)| p.is_some_and(|p| p != *n)) {
             let sizes: Vec<String> = pattern.iter().map(|p| p.map_or("_".to_owned(), |n| n.to_string())).collect();
-            return Err(Error::Shape {
+            return Err(FileError::Shape {
                 file: self.file.to_owned(),
                 key: key.to_owned(),
                 expected: format!("[{}]", sizes.join(", ")),
                 actual: shape,
-            });
+            }
+            .into());
         }
         Ok((shape, view.data().as_chunks::<N>().0.iter().map(|&bytes| word(bytes)).collect()))
     }

@@ -1,4 +1,5 @@
-//! Bodies of every size and form: SMPL-H and SMPL-X like archives, and the saved form.
+//! Bodies of every size and form: archives like those of SMPL-H and SMPL-X, the saved form, and
+//! faults that are named.
 #![allow(clippy::unwrap_used, reason = "helpers of tests")]
 
 mod common;
@@ -7,10 +8,11 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::sync::LazyLock;
 
+use array_files::{Data, NdArray, npz};
 use common::shared;
 use glam::Vec3;
 use proptest::prelude::*;
-use smpl::{BodyModel, Placement};
+use smpl::{BodyModel, Error, FileError, Placement};
 
 fn temporary(name: &str) -> PathBuf {
     Path::new(env!("CARGO_TARGET_TMPDIR")).join(name)
@@ -207,4 +209,82 @@ fn bodies_without_a_surface_or_larger_than_anything_are_refused() {
     refused(|body| body.v_template[7].y = 1e30, ["`v_template`", "row 7"]);
     refused(|body| body.shapedirs[3] = Vec3::splat(-2e6), ["`shapedirs`", "row 3"]);
     refused(|body| body.posedirs.values[5].z = 1e30, ["`posedirs`", "row 5"]);
+}
+
+/// Arrays of a body of three vertices and two joints.
+fn tiny_body() -> Vec<(&'static str, Vec<usize>, Vec<f64>)> {
+    vec![
+        ("v_template", vec![3, 3], vec![0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0]),
+        ("f", vec![1, 3], vec![0.0, 1.0, 2.0]),
+        ("weights", vec![3, 2], vec![1.0, 0.0, 0.5, 0.5, 0.0, 1.0]),
+        ("J_regressor", vec![2, 3], vec![1.0, 0.0, 0.0, 0.0, 0.5, 0.5]),
+        ("kintree_table", vec![2, 2], vec![4294967295.0, 0.0, 0.0, 1.0]),
+        ("shapedirs", vec![3, 3, 1], vec![0.1; 9]),
+        ("posedirs", vec![3, 3, 9], vec![0.0; 81]),
+    ]
+}
+
+fn write_body(name: &str, arrays: &[(&'static str, Vec<usize>, Vec<f64>)]) -> PathBuf {
+    let path = temporary(name);
+    let array = |(key, shape, values): &(&'static str, Vec<usize>, Vec<f64>)| {
+        let integers = matches!(*key, "f" | "kintree_table");
+        let whole = || Data::I64(values.iter().map(|&x| x as i64).collect());
+        let data = if integers { whole() } else { Data::F64(values.clone()) };
+        (*key, NdArray { shape: shape.clone(), data })
+    };
+    npz::write(&path, &arrays.iter().map(array).collect::<Vec<_>>()).unwrap();
+    path
+}
+
+#[test]
+fn a_tiny_body_is_read() {
+    let file = write_body("tiny.npz", &tiny_body());
+    let body = BodyModel::load(&file).unwrap();
+    assert_eq!((body.num_vertices(), body.num_joints(), body.num_betas()), (3, 2, 1));
+    assert_eq!(body.parents, [None, Some(0)]);
+}
+
+#[test]
+fn faults_of_a_model_name_the_array() {
+    let cases: [(&str, usize, f64); 11] = [
+        ("v_template", 4, f64::NAN),
+        ("v_template", 0, f64::INFINITY),
+        ("f", 2, 3.0),
+        ("f", 0, -1.0),
+        ("weights", 0, 0.5),
+        ("weights", 2, -0.5),
+        ("weights", 0, f64::NAN),
+        ("J_regressor", 0, 9.0),
+        ("kintree_table", 1, 1.0),
+        ("shapedirs", 3, f64::NEG_INFINITY),
+        ("posedirs", 80, f64::NAN),
+    ];
+    for (i, (key, index, value)) in cases.into_iter().enumerate() {
+        let mut arrays = tiny_body();
+        arrays.iter_mut().find(|a| a.0 == key).unwrap().2[index] = value;
+        let file = write_body(&format!("fault{i}.npz"), &arrays);
+        let message = BodyModel::load(&file).expect_err(key).to_string();
+        let name = format!("fault{i}.npz");
+        assert!(message.contains(&format!("`{key}`")) && message.contains(&name), "{message}");
+    }
+}
+
+#[test]
+fn missing_and_misshapen_arrays_of_a_model_are_named() {
+    for i in 0..tiny_body().len() {
+        let mut arrays = tiny_body();
+        let (key, shape, _) = &mut arrays[i];
+        let key = *key;
+        shape.push(1);
+        let shown = format!("{shape:?}");
+        let file = write_body(&format!("shape{i}.npz"), &arrays);
+        let message = BodyModel::load(&file).expect_err(key).to_string();
+        assert!(message.contains(&format!("`{key}`")) && message.contains(&shown), "{message}");
+
+        arrays.remove(i);
+        let file = write_body(&format!("missing{i}.npz"), &arrays);
+        let error = BodyModel::load(&file).expect_err(key);
+        assert!(matches!(&error, Error::File(FileError::MissingKey { key: k, .. }) if k == key), "{error}");
+    }
+    assert!(matches!(load("plain.py", b"import numpy").unwrap_err(), Error::Extension { .. }));
 }

@@ -2,9 +2,9 @@
 
 mod common;
 
+use array_files::npz::Npz;
 use common::shared;
 use glam::Vec3;
-use smpl::npz::Npz;
 use smpl::{BodyModel, Placement};
 
 fn vectors(values: &[f32]) -> Vec<Vec3> {

@@ -7,12 +7,12 @@ mod stand_in;
 
 use std::path::{Path, PathBuf};
 
+use array_files::{Data, NdArray, npz};
 use common::{TINY, done, folder, refused, text};
 use glam::Vec3;
 use occnerf::bake::Avatar;
 use synth::{DemoConfig, demo};
 use occnerf::{Config, Method, Preset, PriorColors, Scene};
-use smpl::{Data, NdArray, npz};
 
 const HOSTILE: &str = "</script><img src=x onerror=alert(1)>\" onload='";
 

@@ -79,5 +79,5 @@ pub fn own_body(dir: &Path) -> Option<PathBuf> {
 
 /// Whether an archive holds a template; poses and reference values may lie beside the body.
 fn is_body(path: &Path) -> bool {
-    smpl::npz::Npz::open(path).is_ok_and(|npz| npz.keys().iter().any(|key| key == "v_template"))
+    array_files::npz::Npz::open(path).is_ok_and(|npz| npz.keys().iter().any(|key| key == "v_template"))
 }

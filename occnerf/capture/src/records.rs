@@ -3,9 +3,9 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
+use array_files::pickle::{self, Value};
+use array_files::{Data, NdArray};
 use glam::Vec3;
-use smpl::pickle::{self, Value};
-use smpl::{Data, NdArray};
 
 use super::CaptureError;
 use super::names::FrameName;

@@ -5,10 +5,10 @@ use std::fs::File;
 use std::io::{BufReader, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
+use array_files::Data;
+use array_files::pickle::Value;
+use array_files::torch::{self, TorchFile};
 use safetensors::tensor::{Dtype, Metadata};
-use smpl::Data;
-use smpl::pickle::Value;
-use smpl::torch::{self, TorchFile};
 
 use super::trunk::Trunk;
 use crate::Error;

@@ -1,9 +1,9 @@
 //! Values and gradients of another implementation in double precision, and properties that any
 //! distance has.
 
+use array_files::npz::Npz;
 use occnerf::{Lpips, Trunk};
 use safetensors::SafeTensors;
-use smpl::npz::Npz;
 use testkit::gradient::{Tolerance, assert_gradient};
 
 use crate::formula::{network, tensor, weight};

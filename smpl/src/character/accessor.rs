@@ -3,6 +3,7 @@
 use std::cell::Cell;
 use std::path::{Component, Path};
 
+use array_files::read_file;
 use base64::Engine;
 use gltf::json::accessor::{Accessor, ComponentType};
 use gltf::json::buffer::View;
@@ -10,7 +11,6 @@ use gltf::json::validation::Checked;
 use gltf::json::{Index, Root};
 
 use crate::Error;
-use crate::npy::read_file;
 
 /// Bytes that all accessors together may decode to: 256 MiB.
 const MAX_DECODED_BYTES: u64 = 1 << 28;
@@ -122,12 +122,7 @@ impl<'a> Source<'a> {
         }
         let cost = count * (N * size_of::<T>()) as u64;
         let Some(left) = self.left.get().checked_sub(cost) else {
-            return Err(Error::TooLarge {
-                file: self.file.to_owned(),
-                key: place,
-                claimed: u128::from(cost),
-                limit: MAX_DECODED_BYTES,
-            });
+            return Err(Error::too_large(self.file, &place, u128::from(cost), MAX_DECODED_BYTES));
         };
         self.left.set(left);
         // Both fit: they lie within the bytes.
@@ -196,11 +191,9 @@ impl<'a> Source<'a> {
 
     /// Takes what an address leads to off what the document may still ask for.
     fn spend(&self, place: &str, bytes: u64) -> Result<(), Error> {
-        let left = self.resolvable.get().checked_sub(bytes).ok_or_else(|| Error::TooLarge {
-            file: self.file.to_owned(),
-            key: place.to_owned(),
-            claimed: u128::from(MAX_RESOLVED_BYTES - self.resolvable.get()) + u128::from(bytes),
-            limit: MAX_RESOLVED_BYTES,
+        let left = self.resolvable.get().checked_sub(bytes).ok_or_else(|| {
+            let claimed = u128::from(MAX_RESOLVED_BYTES - self.resolvable.get()) + u128::from(bytes);
+            Error::too_large(self.file, place, claimed, MAX_RESOLVED_BYTES)
         })?;
         self.resolvable.set(left);
         Ok(())

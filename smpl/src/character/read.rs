@@ -3,6 +3,7 @@
 use std::collections::HashMap;
 use std::path::Path;
 
+use array_files::read_file;
 use glam::{Affine3A, Mat4, Quat, Vec3, Vec4};
 use gltf::json::animation::{Interpolation as Kind, Property};
 use gltf::json::validation::Checked;
@@ -12,7 +13,6 @@ use super::accessor::Source;
 use super::animation::{Animation, Channel, Interpolation, Part, unit, widen};
 use super::{Character, Local, Node};
 use crate::Error;
-use crate::npy::read_file;
 use crate::sparse::SparseRows;
 
 impl Character {

@@ -1,12 +1,6 @@
 //! Where test data lie.
-#![allow(dead_code, reason = "not every test file uses both")]
 
 use std::path::{Path, PathBuf};
-
-/// A file committed beside the tests; `fixtures/make_pickles.py` writes them.
-pub fn fixture(name: &str) -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures").join(name)
-}
 
 /// A file of the shared data, or `None` with a printed reason.
 pub fn shared(name: &str) -> Option<PathBuf> {

@@ -19,13 +19,14 @@ use std::path::PathBuf;
 use std::sync::LazyLock;
 use std::time::{Duration, Instant};
 
+use array_files::npz::{Npz, read_npy};
+use array_files::pickle;
+use array_files::torch::TorchFile;
 use mutate::{Form, Random, damaged};
 use occnerf::bake::Avatar;
 use occnerf::capture::{Image, ImportOptions, LoadOptions, import, load_capture};
 use occnerf::{Config, Lpips, Person, Trainer, checkpoint_config};
-use smpl::npz::{Npz, read_npy};
-use smpl::torch::TorchFile;
-use smpl::{BodyModel, Character, MotionClip, load_mesh, pickle};
+use smpl::{BodyModel, Character, MotionClip, load_mesh};
 
 /// Longest that a reader may take.
 const LONGEST: Duration = Duration::from_secs(1);

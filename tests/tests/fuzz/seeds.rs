@@ -4,18 +4,19 @@
 use std::io::{Cursor, Write};
 use std::path::{Path, PathBuf};
 
+use array_files::{Data, NdArray, npz};
 use glam::Vec3;
 use occnerf::capture::{LoadOptions, load_capture};
 use occnerf::{Config, Method, MotionKind, Preset, Scene, Trainer};
-use smpl::{BodyModel, Data, NdArray, SparseRows, npz};
+use smpl::{BodyModel, SparseRows};
 use zip::write::SimpleFileOptions;
 use zip::{CompressionMethod, ZipWriter};
 
 use crate::{common, place};
 
-/// Files of the body crate's own tests, which numpy and Python have written.
+/// Files of the reader crate's own tests, written by numpy and Python.
 fn fixture(name: &str) -> Vec<u8> {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../smpl/tests/fixtures").join(name);
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../smpl/array-files/tests/fixtures").join(name);
     std::fs::read(path).unwrap()
 }
 

@@ -4,9 +4,9 @@ use std::ops::RangeInclusive;
 use std::path::Path;
 
 use anyhow::{Result, bail, ensure};
+use array_files::npz::Npz;
+use array_files::{Data, NdArray};
 use glam::Vec3;
-use smpl::npz::Npz;
-use smpl::{Data, NdArray};
 
 /// The arrays of an archive that has all the keys it must have, and no other.
 pub struct Input {

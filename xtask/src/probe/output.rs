@@ -3,9 +3,9 @@
 use std::path::Path;
 
 use anyhow::{Result, bail, ensure};
+use array_files::npz::{self, MAX_ARRAY_BYTES};
+use array_files::{Data, NdArray};
 use glam::Vec3;
-use smpl::npz::{self, MAX_ARRAY_BYTES};
-use smpl::{Data, NdArray};
 
 /// Named arrays, written together at the end.
 #[derive(Default)]

@@ -60,25 +60,32 @@ pub fn results_in(place: &Path) -> impl Fn(Error) -> Error + '_ {
 }
 
 fn file_and_reason<'a>(cause: &'a (dyn std::error::Error + 'static)) -> Option<(&'a Path, &'a io::Error)> {
-    fn of_body(error: &smpl::Error) -> Option<(&Path, &io::Error)> {
-        let smpl::Error::Io { path, source } = error else { return None };
+    fn of_array(error: &array_files::Error) -> Option<(&Path, &io::Error)> {
+        let array_files::Error::Io { path, source } = error else { return None };
         Some((path, source))
+    }
+    fn of_body(error: &smpl::Error) -> Option<(&Path, &io::Error)> {
+        let smpl::Error::File(error) = error else { return None };
+        of_array(error)
     }
     fn of_capture(error: &CaptureError) -> Option<(&Path, &io::Error)> {
         match error {
             CaptureError::Io { path, source } => Some((path, source)),
-            CaptureError::Array(error) => of_body(error),
+            CaptureError::Array(error) => of_array(error),
+            CaptureError::Body(error) => of_body(error),
             _ => None,
         }
     }
     match cause.downcast_ref::<occnerf::Error>() {
         Some(occnerf::Error::Io { path, source }) => Some((path, source)),
         Some(occnerf::Error::Data(error)) => of_capture(error),
+        Some(occnerf::Error::Array(error)) => of_array(error),
         Some(occnerf::Error::Body(error)) => of_body(error),
         Some(_) => None,
         None => {
             let body = || cause.downcast_ref().and_then(of_body);
-            cause.downcast_ref().and_then(of_capture).or_else(body)
+            let array = || cause.downcast_ref().and_then(of_array);
+            cause.downcast_ref().and_then(of_capture).or_else(body).or_else(array)
         }
     }
 }
@@ -141,7 +148,7 @@ mod tests {
     fn a_cause_is_said_once_on_one_line_without_escapes() {
         let gone = io::Error::from(io::ErrorKind::NotFound);
         let path = PathBuf::from("a\u{1b}[31m\nb.npz");
-        let error = Error::from(smpl::Error::Io { path, source: gone }).context("the body");
+        let error = Error::from(array_files::Error::Io { path, source: gone }).context("the body");
         let (text, code) = described(&error);
         assert_eq!((text.as_str(), code), ("error: the body: a\\u{1b}[31m b.npz: entity not found", 1));
     }

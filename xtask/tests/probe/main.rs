@@ -9,8 +9,8 @@ mod refusals;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
-use smpl::npz::{self, Npz};
-use smpl::{Data, NdArray};
+use array_files::npz::{self, Npz};
+use array_files::{Data, NdArray};
 use testkit::oracle;
 
 type Arrays = Vec<(&'static str, NdArray)>;

@@ -2,10 +2,11 @@
 
 use std::path::{Path, PathBuf};
 
+use array_files::NdArray;
+use array_files::npz::Npz;
+use array_files::pickle;
 use glam::DVec3;
-use smpl::npz::Npz;
-use smpl::pickle;
-use smpl::{BodyModel, NdArray};
+use smpl::BodyModel;
 
 use super::fit::{SMPL, SMPLX, Tool};
 use crate::CaptureError;

@@ -8,10 +8,10 @@ use std::path::Path;
 use std::time::Instant;
 
 use allocation_counter::measure;
-use smpl::npz::Npz;
-use smpl::pickle::{self, Value};
-use smpl::torch::TorchFile;
-use smpl::{Data, NdArray};
+use array_files::npz::Npz;
+use array_files::pickle::{self, Value};
+use array_files::torch::TorchFile;
+use array_files::{Data, NdArray};
 use zip::write::SimpleFileOptions;
 use zip::{CompressionMethod, ZipArchive, ZipWriter};
 

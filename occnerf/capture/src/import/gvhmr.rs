@@ -5,7 +5,7 @@
 use std::io::{Read, Seek};
 use std::path::Path;
 
-use smpl::torch::TorchFile;
+use array_files::torch::TorchFile;
 
 use super::fit::{BETAS, Fit, FitFrame, Person, Tool};
 use super::item::{Item, vectors};

@@ -3,9 +3,9 @@
 
 use std::path::Path;
 
+use array_files::NdArray;
+use array_files::pickle::Value;
 use glam::{DMat3, DVec3};
-use smpl::NdArray;
-use smpl::pickle::Value;
 
 use crate::CaptureError;
 

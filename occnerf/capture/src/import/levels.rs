@@ -4,10 +4,10 @@ use std::fs::File;
 use std::io::BufReader;
 use std::path::Path;
 
+use array_files::npz::read_npy;
+use array_files::{Data, NdArray};
 use image::DynamicImage;
 use png::{ColorType, Decoder, Limits};
-use smpl::npz::read_npy;
-use smpl::{Data, NdArray};
 
 use crate::CaptureError;
 use crate::image::{MAX_SIDE, decode, dimensions};

@@ -3,8 +3,8 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
-use smpl::npz::read_npy;
-use smpl::{Data, NdArray};
+use array_files::npz::read_npy;
+use array_files::{Data, NdArray};
 
 use super::levels::Levels;
 use super::options::ImportOptions;

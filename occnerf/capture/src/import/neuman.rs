@@ -7,8 +7,8 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
+use array_files::pickle;
 use glam::{DMat3, DQuat, DVec3};
-use smpl::pickle;
 
 use super::fit::{About, BETAS, Fit, FitFrame, Person, SMPL, Tool, axis_angle, rotation};
 use super::item::{Item, text, vectors};

@@ -5,9 +5,9 @@
 
 use std::path::Path;
 
+use array_files::npz::Npz;
+use array_files::pickle::Value;
 use glam::DVec3;
-use smpl::npz::Npz;
-use smpl::pickle::Value;
 
 use super::fit::{About, BETAS, Fit, FitFrame, Person, SMPL, Tool};
 use super::item::{Item, vectors};
@@ -75,7 +75,7 @@ fn dictionary(npz: &mut Npz) -> Result<Value, CaptureError> {
 
 #[cfg(test)]
 mod tests {
-    use smpl::{Data, NdArray, npz};
+    use array_files::{Data, NdArray, npz};
 
     use super::*;
     use crate::import::fit::{axis_angle, rotation};

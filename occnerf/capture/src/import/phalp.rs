@@ -5,7 +5,7 @@
 
 use std::collections::BTreeMap;
 
-use smpl::pickle::Value;
+use array_files::pickle::Value;
 
 use super::fit::{BETAS, Fit, FitFrame, OwnMask, Person, SMPL, Tool, axis_angle};
 use super::item::Item;

@@ -3,7 +3,7 @@
 //! {`img_focal`, `img_center`}. SMPL-X with flat hands. Frames higher than 896 are worked on at a
 //! smaller size, twice `img_center`.
 
-use smpl::{Data, NdArray};
+use array_files::{Data, NdArray};
 
 use super::fit::{BETAS, Fit, FitFrame, OwnMask, Person, Tool};
 use super::item::{Item, vectors};

@@ -4,9 +4,9 @@ use std::fs::File;
 use std::io::{BufReader, Read};
 use std::path::Path;
 
-use smpl::npz::Npz;
-use smpl::pickle::{self, Value};
-use smpl::torch::{TorchFile, is_torch};
+use array_files::npz::Npz;
+use array_files::pickle::{self, Value};
+use array_files::torch::{TorchFile, is_torch};
 
 use super::fit::{Fit, Person};
 use super::item::Item;
@@ -37,7 +37,7 @@ fn read_file(path: &Path, video: &Video) -> Result<Fit, CaptureError> {
         // A zip archive of numpy's arrays starts alike.
         if start.starts_with(b"PK") {
             let mut npz = Npz::open(path).map_err(|error| match error {
-                smpl::Error::Npy { message, .. } => {
+                array_files::Error::Npy { message, .. } => {
                     CaptureError::invalid(path, "the file", "a whole zip archive, of PyTorch or numpy", message)
                 }
                 error => error.into(),

@@ -1,6 +1,6 @@
 //! COCO's run lengths: masks column by column, runs of 0 and 1 in turn, beginning with 0.
 
-use smpl::pickle::Value;
+use array_files::pickle::Value;
 
 use super::item::Item;
 use crate::CaptureError;
@@ -103,8 +103,8 @@ fn decompressed(bytes: &[u8], most: usize) -> Result<Vec<u32>, String> {
 mod tests {
     use std::path::Path;
 
+    use array_files::{Data, NdArray};
     use proptest::prelude::*;
-    use smpl::{Data, NdArray};
 
     use super::*;
 

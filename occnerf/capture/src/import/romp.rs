@@ -6,7 +6,7 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use smpl::pickle::Value;
+use array_files::pickle::Value;
 
 use super::fit::{BETAS, Fit, FitFrame, Person, SMPL, Tool};
 use super::item::{Item, vectors};

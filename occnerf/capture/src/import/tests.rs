@@ -2,9 +2,10 @@
 
 use std::path::{Path, PathBuf};
 
+use array_files::NdArray;
+use array_files::npz::Npz;
 use glam::{DMat3, DVec3};
-use smpl::npz::Npz;
-use smpl::{BodyModel, NdArray, Placement};
+use smpl::{BodyModel, Placement};
 
 use super::fit::{FitFrame, SMPLX, rotation};
 use super::*;

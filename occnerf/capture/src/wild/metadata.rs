@@ -5,9 +5,9 @@ use std::io::Read;
 use std::marker::PhantomData;
 use std::path::Path;
 
+use array_files::pickle::Value;
+use array_files::{Data, NdArray};
 use serde::de::{Deserialize, Deserializer, Error, IgnoredAny, MapAccess, SeqAccess, Visitor};
-use smpl::pickle::Value;
-use smpl::{Data, NdArray};
 
 use crate::CaptureError;
 use crate::records::Records;

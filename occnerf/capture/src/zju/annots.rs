@@ -3,8 +3,8 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Component, Path, PathBuf};
 
+use array_files::pickle::Value;
 use glam::{Affine3A, Vec3};
-use smpl::pickle::Value;
 use volrender::Distortion;
 
 use crate::camera::{Lens, pinhole, rotation};

@@ -164,7 +164,7 @@ fn fit(record: &Record<'_>, body: &BodyModel) -> Result<Fitted, CaptureError> {
 fn compare(path: &Path, fitted: &Fitted, body: &BodyModel) -> Result<(), CaptureError> {
     let key = "vertices";
     let pattern = [Some(body.num_vertices()), Some(3)];
-    let expected = triples(&smpl::npz::read_npy(path)?.to_f32(&path.display().to_string(), key, &pattern)?);
+    let expected = triples(&array_files::npz::read_npy(path)?.to_f32(&path.display().to_string(), key, &pattern)?);
     let posed = body.pose(&body.shaped(&fitted.betas), &fitted.pose, fitted.placement);
     let low = expected.iter().copied().fold(Vec3::INFINITY, Vec3::min);
     let high = expected.iter().copied().fold(Vec3::NEG_INFINITY, Vec3::max);

@@ -2,8 +2,9 @@
 
 use std::path::Path;
 
+use array_files::{Data, NdArray, npz};
 use glam::{Mat3, Quat, Vec3};
-use smpl::{Data, MotionClip, NdArray, Placement, npz};
+use smpl::{MotionClip, Placement};
 
 use crate::Error;
 use crate::bake::{Avatar, turn_upright};

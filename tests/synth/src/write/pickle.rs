@@ -158,7 +158,7 @@ impl Py {
 
 #[cfg(test)]
 mod tests {
-    use smpl::pickle::{Value, parse};
+    use array_files::pickle::{Value, parse};
 
     use super::Py;
 
@@ -179,7 +179,7 @@ mod tests {
         let npy = written.npy();
         let path = std::env::temp_dir().join(format!("occnerf-pickle-{}.npy", std::process::id()));
         std::fs::write(&path, &npy).unwrap();
-        assert_eq!(smpl::pickle::read(&path).unwrap(), value);
+        assert_eq!(array_files::pickle::read(&path).unwrap(), value);
         std::fs::remove_file(path).unwrap();
         let start = 10 + usize::from(u16::from_le_bytes([npy[8], npy[9]]));
         assert_eq!((start % 64, npy[start - 1]), (0, b'\n'));

@@ -50,7 +50,7 @@ fn posed_bodies_are_the_files_vertices_and_cover_the_subject() {
     assert_eq!((capture.train.len(), capture.eval.len()), (20, 100));
     for (i, frame) in capture.train.iter().enumerate() {
         let path = scene.join(format!("new_vertices/{}.npy", 5 * i));
-        let expected = smpl::npz::read_npy(&path).unwrap().to_f64();
+        let expected = array_files::npz::read_npy(&path).unwrap().to_f64();
         let posed = body.pose(&body.shaped(&frame.betas), &frame.pose, frame.placement);
         for (v, e) in posed.vertices.iter().zip(expected.chunks(3)) {
             let off = v.as_dvec3().distance(glam::DVec3::from_slice(e));

@@ -1,17 +1,15 @@
-//! Arrays of `joblib.dump`: an object that describes the array, and behind its state the array's
-//! bytes.
+//! Arrays of `joblib.dump`: a describing object, and behind its state the array's bytes.
 
 use super::machine::{Id, Machine, Node};
 use super::reader::Step;
 
-/// Pickles within pickles: an array of objects is one.
+/// Deepest nesting of pickles in pickles; an array of objects is one.
 const MAX_NESTED: usize = 4;
 
 impl<'a> Machine<'a> {
-    /// The array that a wrapper with these attributes describes, read from behind it: one byte with
-    /// the padding's length, padding, and the elements (up to joblib 1.1 the elements alone; the
-    /// attribute for the padding is then absent); or, for elements that are objects, a pickle of
-    /// the array.
+    /// The array described by a wrapper's attributes. Behind the wrapper follow the length of the
+    /// padding (one byte), padding and elements; up to joblib 1.1, which lacks the attribute for
+    /// the alignment, the elements alone; and for elements that are objects a pickle of the array.
     pub(super) fn joblib_array(&mut self, attributes: &[(Id, Id)]) -> Step<Node<'a>> {
         let find = |name: &str| {
             let named = |id: Id| matches!(&self.nodes[id], Node::Text(text) if text == name);
@@ -19,7 +17,7 @@ impl<'a> Machine<'a> {
         };
         let demand = |name: &str| find(name).ok_or_else(|| format!("joblib array without `{name}`"));
         let (shape, order, dtype) = (demand("shape")?, demand("order")?, demand("dtype")?);
-        let aligned = find("numpy_array_alignment_bytes").filter(|&id| !matches!(self.nodes[id], Node::None));
+        let aligned = find("numpy_array_alignment_bytes").is_some_and(|id| !matches!(self.nodes[id], Node::None));
         let (dtype, shape) = (self.dtype(dtype)?, self.shape(shape)?);
         let fortran = match self.text(order)?.as_ref() {
             "C" => false,
@@ -27,15 +25,14 @@ impl<'a> Machine<'a> {
             other => return Err(format!("order {other:?} of a joblib array, expected C or F")),
         };
         let Some(length) = dtype.raw_bytes(&shape)? else { return self.nested() };
-        if aligned.is_some() {
-            let padding = self.reader.u8()?;
-            self.reader.take(padding.into())?;
+        if aligned {
+            self.reader.counted(1)?;
         }
         let bytes = self.reader.take(length)?;
         self.raw_array(dtype, shape, fortran, bytes)
     }
 
-    /// The value of the pickle that starts here. It has a stack and a memo of its own.
+    /// The value of the pickle that starts here, with a stack and a memo of its own.
     fn nested(&mut self) -> Step<Node<'a>> {
         if self.nesting >= MAX_NESTED {
             return Err(format!("pickles nested deeper than {MAX_NESTED}"));

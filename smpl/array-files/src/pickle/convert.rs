@@ -1,9 +1,14 @@
-//! What the machine has built, as values.
+//! Conversion of the machine's nodes to values.
 
 use super::globals::{Global, WRAPPER};
 use super::machine::{Id, Machine, Node};
+use super::numpy::latin1;
 use super::reader::Step;
-use super::value::{MAX_DEPTH, Value};
+use super::value::Value;
+use crate::array::{Data, NdArray};
+
+/// Deepest nesting of containers.
+const MAX_DEPTH: usize = 100;
 
 impl Machine<'_> {
     /// The owned tree below `top`, once the machine has stopped.
@@ -12,8 +17,7 @@ impl Machine<'_> {
         self.value(top, &uses, true, 0)
     }
 
-    /// How often each node is referred to, counted up to 2. What is used once can be moved rather
-    /// than copied.
+    /// Number of references to each node, counted up to 2. A node with one is moved, not copied.
     fn uses(&self) -> Vec<u8> {
         let mut uses = vec![0u8; self.nodes.len()];
         let mut count = |id: Id| uses[id] = (uses[id] + 1).min(2);
@@ -29,51 +33,50 @@ impl Machine<'_> {
         uses
     }
 
-    /// The owned tree below a node. Shared nodes are copied, against the budget; `owned` says that
-    /// no other node leads here.
+    /// The owned tree below a node. Copies of shared nodes are charged to the budget; `owned` says
+    /// that the path to this node is the only one.
     fn value(&mut self, id: Id, uses: &[u8], owned: bool, depth: usize) -> Step<Value> {
         if depth > MAX_DEPTH {
             return Err(format!("nested deeper than {MAX_DEPTH}"));
         }
-        self.spend(size_of::<Value>())?;
+        self.budget.spend(size_of::<Value>())?;
         let owned = owned && uses[id] < 2;
         let below = |machine: &mut Self, id: Id| machine.value(id, uses, owned, depth + 1);
-        Ok(match &self.nodes[id] {
+        Ok(match &mut self.nodes[id] {
             Node::None => Value::None,
             Node::Bool(value) => Value::Bool(*value),
             Node::Int(value) => Value::Int(*value),
             Node::Float(value) => Value::Float(*value),
             Node::Text(text) => {
-                let text = text.to_string();
-                self.spend(text.len())?;
-                Value::Str(text)
+                self.budget.spend(text.len())?;
+                Value::Str(text.to_string())
             }
             Node::ByteString(bytes) => {
                 // Latin-1 beyond ASCII takes two bytes in UTF-8.
-                let length = 2 * bytes.len();
-                let text = bytes.iter().map(|&b| char::from(b)).collect();
-                self.spend(length)?;
-                Value::Str(text)
+                self.budget.spend(2 * bytes.len())?;
+                Value::Str(latin1(bytes))
             }
             Node::Bytes(bytes) => {
-                let bytes = bytes.to_vec();
-                self.spend(bytes.len())?;
-                Value::Bytes(bytes)
+                self.budget.spend(bytes.len())?;
+                Value::Bytes(bytes.to_vec())
             }
-            Node::Array(_) if owned => match std::mem::replace(&mut self.nodes[id], Node::None) {
-                Node::Array(array) => Value::Array(*array),
-                _ => Value::None,
-            },
+            Node::Array(array) if owned => {
+                let empty = NdArray { shape: Vec::new(), data: Data::Bool(Vec::new()) };
+                Value::Array(std::mem::replace(array, empty))
+            }
             Node::Array(array) => {
-                self.spend(8 * array.len())?;
-                match &self.nodes[id] {
-                    Node::Array(array) => Value::Array(array.as_ref().clone()),
-                    _ => Value::None,
+                self.budget.spend(8 * array.len())?;
+                Value::Array(array.as_ref().clone())
+            }
+            Node::List(items) | Node::Tuple(items) | Node::Set(items) => {
+                let items = items.clone();
+                let items = self.values(items, below)?;
+                match self.nodes[id] {
+                    Node::List(_) => Value::List(items),
+                    Node::Tuple(_) => Value::Tuple(items),
+                    _ => Value::Set(items),
                 }
             }
-            Node::List(items) => Value::List(self.values(items.clone(), below)?),
-            Node::Tuple(items) => Value::Tuple(self.values(items.clone(), below)?),
-            Node::Set(items) => Value::Set(self.values(items.clone(), below)?),
             Node::Objects(objects) => {
                 let (shape, items) = objects.as_ref().clone();
                 match items.as_slice() {
@@ -83,7 +86,7 @@ impl Machine<'_> {
             }
             Node::Dict(items) => {
                 let items = items.clone();
-                self.spend(items.len() * (size_of::<(Id, Id)>() + size_of::<(Value, Value)>()))?;
+                self.budget.spend(items.len() * (size_of::<(Id, Id)>() + size_of::<(Value, Value)>()))?;
                 let mut out = Vec::with_capacity(items.len());
                 for (key, value) in items {
                     out.push((below(self, key)?, below(self, value)?));
@@ -93,14 +96,10 @@ impl Machine<'_> {
             Node::Object(WRAPPER, _) | Node::Global(Global::Class(WRAPPER)) => {
                 return Err("joblib array without its state".to_owned());
             }
-            &Node::Object(class, state) => Value::Object {
-                class,
-                state: Box::new(match state {
-                    Some(state) => below(self, state)?,
-                    None => Value::Dict(Vec::new()),
-                }),
-            },
-            &Node::Global(Global::Class(class)) => Value::Object { class, state: Box::new(Value::Dict(Vec::new())) },
+            &mut Node::Object(class, Some(state)) => Value::Object { class, state: Box::new(below(self, state)?) },
+            &mut (Node::Object(class, None) | Node::Global(Global::Class(class))) => {
+                Value::Object { class, state: Box::new(Value::Dict(Vec::new())) }
+            }
             Node::Global(_) => return Err("a class or function as a value".to_owned()),
             Node::Dtype(_) => return Err("a dtype as a value".to_owned()),
             Node::BlankArray => return Err("array without data".to_owned()),
@@ -108,11 +107,7 @@ impl Machine<'_> {
     }
 
     fn values(&mut self, ids: Vec<Id>, mut below: impl FnMut(&mut Self, Id) -> Step<Value>) -> Step<Vec<Value>> {
-        self.spend(ids.len() * (size_of::<Id>() + size_of::<Value>()))?;
-        let mut out = Vec::with_capacity(ids.len());
-        for id in ids {
-            out.push(below(self, id)?);
-        }
-        Ok(out)
+        self.budget.spend(ids.len() * (size_of::<Id>() + size_of::<Value>()))?;
+        ids.into_iter().map(|id| below(self, id)).collect()
     }
 }

@@ -1,19 +1,27 @@
-//! Python values, as plain data.
+//! Python values as plain data.
 
+use super::globals::{CHUMPY, CSC_MATRIX};
 use crate::Error;
 use crate::array::{Data, NdArray};
 
 /// Most values of a sparse matrix made dense.
 const MAX_DENSE: usize = 1 << 25;
 
-/// Deepest nesting of containers in a [`Value`].
-pub const MAX_DEPTH: usize = 100;
-
-/// Class of a [`Value::Object`] that stands for something outside the pickle; its state is what
-/// names it.
+/// Class of a [`Value::Object`] that refers to something outside the pickle; its state is the
+/// reference.
 pub const PERSISTENT: &str = "persistent id";
 
 /// A Python value.
+///
+/// ```
+/// use array_files::pickle::{self, Value};
+///
+/// let people = pickle::parse("people.pkl", b"}(S'ann'\nK\x07S'bob'\n]u.")?; // {"ann": 7, "bob": []}
+/// assert_eq!(people.get("ann"), Some(&Value::Int(7)));
+/// assert_eq!(people.get("bob").and_then(Value::items), Some(&[][..]));
+/// assert_eq!(people.get("eve"), None);
+/// # Ok::<(), array_files::Error>(())
+/// ```
 #[derive(Clone, Debug, PartialEq)]
 #[non_exhaustive]
 pub enum Value {
@@ -21,11 +29,11 @@ pub enum Value {
     None,
     /// `bool`.
     Bool(bool),
-    /// `int` that fits 64 bits.
+    /// `int` of 64 bits.
     Int(i64),
     /// `float`.
     Float(f64),
-    /// `str`; Python 2's byte strings are read as Latin-1.
+    /// `str`; byte strings of Python 2 are read as Latin-1.
     Str(String),
     /// `bytes` or `bytearray`.
     Bytes(Vec<u8>),
@@ -35,24 +43,23 @@ pub enum Value {
     Tuple(Vec<Value>),
     /// `set` or `frozenset`, in the file's order.
     Set(Vec<Value>),
-    /// `dict` or `OrderedDict`, in the file's order; of equal keys the last counts.
+    /// `dict`, `OrderedDict` or `defaultdict`, in the file's order; the last of equal keys counts.
     Dict(Vec<(Value, Value)>),
     /// numpy array of booleans, integers or floats. A numpy scalar has an empty shape.
     Array(NdArray),
-    /// numpy array of objects or strings, row-major. One of no axes is replaced by its only item.
+    /// numpy array of objects or strings, row-major. An array of no axes is replaced by its item.
     Objects {
         /// Extent of every axis.
         shape: Vec<usize>,
         /// The items, last axis fastest.
         items: Vec<Value>,
     },
-    /// Instance of one of the allowed classes: `chumpy.ch.Ch`, `scipy.sparse.csc_matrix`,
-    /// `torch.Tensor`, [`PERSISTENT`]; or such a class itself, or one of PyTorch's storage classes,
-    /// without attributes.
+    /// Instance of an allowed class (`chumpy.ch.Ch`, `scipy.sparse.csc_matrix`, `torch.Tensor`,
+    /// [`PERSISTENT`]), or, without attributes, such a class or a storage class of PyTorch.
     Object {
         /// Full name of the class.
         class: &'static str,
-        /// Its attributes, a [`Value::Dict`]; the arguments that a `torch.Tensor` is made from.
+        /// Attributes, a [`Value::Dict`]; for `torch.Tensor` its arguments.
         state: Box<Value>,
     },
 }
@@ -83,10 +90,7 @@ impl Value {
     #[must_use]
     pub fn get(&self, key: &str) -> Option<&Self> {
         match self {
-            Self::Dict(items) => {
-                let found = items.iter().rev().find(|(k, _)| k.as_str() == Some(key));
-                found.map(|(_, value)| value)
-            }
+            Self::Dict(items) => items.iter().rev().find(|(k, _)| k.as_str() == Some(key)).map(|(_, value)| value),
             Self::Object { state, .. } => state.get(key),
             _ => None,
         }
@@ -111,12 +115,12 @@ impl Value {
         }
     }
 
-    /// The array of numbers that this is or (chumpy) wraps. `None` for other types.
+    /// This array of numbers, or the one that a chumpy object wraps. `None` for other types.
     #[must_use]
     pub fn as_array(&self) -> Option<&NdArray> {
         match self {
             Self::Array(array) => Some(array),
-            Self::Object { class: "chumpy.ch.Ch", state } => match state.get("x") {
+            Self::Object { class: CHUMPY, state } => match state.get("x") {
                 Some(Self::Array(array)) => Some(array),
                 _ => None,
             },
@@ -125,19 +129,28 @@ impl Value {
     }
 
     /// [`Value::as_array`], or a `csc_matrix` made dense. `Ok(None)` for other types; `file` and
-    /// `key` are for errors.
+    /// `key` name it in errors.
     ///
     /// # Errors
-    /// [`Error::Invalid`] for a sparse matrix whose parts do not fit, or that would be too large.
+    /// [`Error::Invalid`] for a sparse matrix whose parts disagree, or of more than 2²⁵ values.
     pub fn to_dense(&self, file: &str, key: &str) -> Result<Option<NdArray>, Error> {
-        if let Some(array) = self.as_array() {
-            return Ok(Some(array.clone()));
-        }
         match self {
-            Self::Object { class: "scipy.sparse.csc_matrix", state } => {
+            Self::Object { class: CSC_MATRIX, state } => {
                 dense_columns(state).map(Some).map_err(|message| Error::invalid(file, key, message))
             }
-            _ => Ok(None),
+            _ => Ok(self.as_array().cloned()),
+        }
+    }
+
+    /// A sequence of whole numbers, such as a shape.
+    pub(crate) fn as_extents(&self) -> Option<Vec<usize>> {
+        self.items()?.iter().map(Self::as_extent).collect()
+    }
+
+    pub(crate) fn as_extent(&self) -> Option<usize> {
+        match self {
+            Self::Int(n) => usize::try_from(*n).ok(),
+            _ => None,
         }
     }
 }
@@ -151,26 +164,15 @@ fn dense_columns(state: &Value) -> Result<NdArray, String> {
     let (starts, rows) = (integers("indptr")?, integers("indices")?);
     let data = state.get("data").and_then(Value::as_array);
     let data = data.ok_or("sparse matrix without `data`")?.to_f64();
-    let shape = state.get("_shape").or_else(|| state.get("shape"));
-    let extents: Option<Vec<usize>> = shape.and_then(Value::items).and_then(|items| {
-        let extent = |v: &Value| match v {
-            Value::Int(n) => usize::try_from(*n).ok(),
-            _ => None,
-        };
-        items.iter().map(extent).collect()
-    });
-    let Some(&[height, width]) = extents.as_deref() else {
+    let shape = state.get("_shape").or_else(|| state.get("shape")).and_then(Value::as_extents);
+    let Some(&[height, width]) = shape.as_deref() else {
         return Err("sparse matrix without a shape of two axes".to_owned());
     };
     let count = height.checked_mul(width).filter(|&n| n <= MAX_DENSE);
     let count = count.ok_or_else(|| format!("sparse matrix of shape [{height}, {width}] is too large"))?;
     if starts.len() != width.saturating_add(1) || rows.len() != data.len() {
-        return Err(format!(
-            "sparse matrix of {width} columns with {} starts, {} rows, {} values",
-            starts.len(),
-            rows.len(),
-            data.len()
-        ));
+        let (starts, rows, values) = (starts.len(), rows.len(), data.len());
+        return Err(format!("sparse matrix of {width} columns with {starts} starts, {rows} rows, {values} values"));
     }
     let mut dense = vec![0.0; count];
     for column in 0..width {

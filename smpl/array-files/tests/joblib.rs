@@ -6,9 +6,9 @@ mod common;
 use std::io::Write;
 
 use allocation_counter::measure;
+use array_files::pickle::{self, Value};
+use array_files::{Data, Error, NdArray};
 use common::fixture;
-use smpl::pickle::{self, Value};
-use smpl::{Data, Error, NdArray};
 
 fn array(shape: &[usize], data: Data) -> Value {
     Value::Array(NdArray { shape: shape.to_vec(), data })

@@ -1,4 +1,4 @@
-//! The allowed globals: what they construct, and how their state is set.
+//! Calls of the allowed globals, and the states of what they construct.
 
 use std::borrow::Cow;
 
@@ -11,16 +11,10 @@ impl<'a> Machine<'a> {
     pub(super) fn construct(&mut self, global: Global, arguments: &[Id]) -> Step<Node<'a>> {
         let wrong = |what: &str| Err(format!("arguments of {what}"));
         Ok(match (global, arguments) {
-            // The arguments say shape 0 and type byte; BUILD brings the real ones.
+            // The arguments are placeholders; BUILD sets shape, type and data.
             (Global::Reconstruct | Global::Ndarray, _) => Node::BlankArray,
             (Global::Dtype, [name, ..]) => Node::Dtype(Dtype::parse(&self.text(*name)?)?),
-            (Global::Scalar, [dtype, rest @ ..]) => {
-                let dtype = self.dtype(*dtype)?;
-                match rest {
-                    [raw] => self.array(dtype, Vec::new(), false, *raw)?,
-                    _ => return wrong("scalar"),
-                }
-            }
+            (Global::Scalar, [dtype, raw]) => self.array(self.dtype(*dtype)?, Vec::new(), false, *raw)?,
             (Global::FromBuffer, [raw, dtype, shape, order]) => {
                 let (dtype, shape) = (self.dtype(*dtype)?, self.shape(*shape)?);
                 let fortran = self.text(*order)? == "F";
@@ -35,44 +29,44 @@ impl<'a> Machine<'a> {
             (Global::Set, []) => Node::Set(Vec::new()),
             (Global::Set, [items]) => match &self.nodes[*items] {
                 Node::List(items) | Node::Tuple(items) | Node::Set(items) => {
-                    let items = items.clone();
-                    self.spend(8 + 8 * items.len())?;
-                    Node::Set(items)
+                    self.budget.spend(8 + 8 * items.len())?;
+                    Node::Set(items.clone())
                 }
                 _ => return wrong("set"),
             },
             (Global::Bytes, []) => Node::Bytes(Cow::Borrowed(&[])),
-            (Global::Bytes, [raw]) => Node::Bytes(self.bytes(*raw)?),
-            (Global::OrderedDict | Global::DefaultDict | Global::Dict, []) => Node::Dict(Vec::new()),
-            // What it makes entries from is not needed to read those that are there.
-            (Global::DefaultDict, [_]) => Node::Dict(Vec::new()),
+            (Global::Bytes, [raw]) => match &self.nodes[*raw] {
+                Node::Bytes(bytes) | Node::ByteString(bytes) => {
+                    self.budget.spend(bytes.len())?;
+                    Node::Bytes(bytes.clone())
+                }
+                _ => return wrong("bytes"),
+            },
             (Global::List, []) => Node::List(Vec::new()),
-            (Global::OrderedDict, [items]) => {
-                let Node::List(items) = &self.nodes[*items] else {
-                    return wrong("OrderedDict");
-                };
-                let pairs = items.iter().map(|&item| match &self.nodes[item] {
-                    Node::List(kv) | Node::Tuple(kv) if kv.len() == 2 => Some((kv[0], kv[1])),
-                    _ => None,
-                });
-                let Some(pairs) = pairs.collect::<Option<Vec<_>>>() else {
-                    return wrong("OrderedDict");
-                };
-                self.spend(16 * pairs.len())?;
-                Node::Dict(pairs)
-            }
+            (Global::Dict, []) => Node::Dict(Vec::new()),
+            (Global::Dict, [argument]) => match &self.nodes[*argument] {
+                Node::List(items) => {
+                    self.budget.spend(16 * items.len())?;
+                    let pairs = items.iter().map(|&item| match &self.nodes[item] {
+                        Node::List(kv) | Node::Tuple(kv) if kv.len() == 2 => Ok((kv[0], kv[1])),
+                        _ => Err("arguments of OrderedDict"),
+                    });
+                    Node::Dict(pairs.collect::<Result<_, _>>()?)
+                }
+                // The factory of a `defaultdict`.
+                Node::None | Node::Global(_) => Node::Dict(Vec::new()),
+                _ => return wrong("OrderedDict"),
+            },
             (Global::Encode, [text, ..]) => {
                 let Node::Text(text) = &self.nodes[*text] else {
                     return wrong("encode");
                 };
-                let bytes = text.chars().map(|c| u8::try_from(u32::from(c)));
-                let bytes: Result<Vec<u8>, _> = bytes.collect();
-                let bytes = bytes.map_err(|_| "text beyond Latin-1".to_owned())?;
-                self.spend(bytes.len())?;
-                Node::Bytes(Cow::Owned(bytes))
+                self.budget.spend(text.len())?;
+                let bytes = text.chars().map(u8::try_from).collect::<Result<_, _>>();
+                Node::Bytes(Cow::Owned(bytes.map_err(|_| "text beyond Latin-1")?))
             }
             (Global::RebuildTensor, [_, _, _, _, ..]) => {
-                self.spend(8 * arguments.len())?;
+                self.budget.spend(8 * arguments.len())?;
                 let state = self.add(Node::Tuple(arguments.to_vec()))?;
                 Node::Object("torch.Tensor", Some(state))
             }
@@ -99,12 +93,9 @@ impl<'a> Machine<'a> {
                 };
                 self.nodes[target] = self.array(dtype, shape, fortran, raw)?;
             }
-            (Node::Dtype(dtype), Node::Tuple(items)) => {
-                let order = match items.get(1) {
-                    Some(&order) => self.text(order)?,
-                    None => return Err("state of a dtype".to_owned()),
-                };
-                let dtype = match *dtype {
+            (&Node::Dtype(dtype), Node::Tuple(items)) => {
+                let order = self.text(*items.get(1).ok_or("state of a dtype")?)?;
+                let dtype = match dtype {
                     Dtype::Number(element) => Dtype::Number(element.with_order(&order)),
                     Dtype::WideText { size, .. } => Dtype::WideText { size, big_endian: order == ">" },
                     other => other,
@@ -115,57 +106,54 @@ impl<'a> Machine<'a> {
                 let items = items.clone();
                 self.nodes[target] = self.joblib_array(&items)?;
             }
-            (Node::Object(class, _), Node::Dict(_)) => {
-                self.nodes[target] = Node::Object(class, Some(state));
-            }
-            // Attributes of an `OrderedDict`, such as a state dictionary's versions, are no part of
-            // what it holds.
+            (&Node::Object(class, _), Node::Dict(_)) => self.nodes[target] = Node::Object(class, Some(state)),
+            // Attributes of an `OrderedDict`, such as a state dictionary's versions, are dropped.
             (Node::Dict(_), Node::Dict(_)) => {}
             _ => return Err("state of something that has none".to_owned()),
         }
         Ok(())
     }
 
+    /// An array from its bytes or, for objects, a list of items.
     fn array(&mut self, dtype: Dtype, shape: Vec<usize>, fortran: bool, raw: Id) -> Step<Node<'a>> {
         let Dtype::Object = dtype else {
-            return match &self.nodes[raw] {
-                Node::Bytes(Cow::Borrowed(bytes)) | Node::ByteString(Cow::Borrowed(bytes)) => {
-                    let bytes = *bytes;
-                    self.raw_array(dtype, shape, fortran, bytes)
-                }
-                Node::Bytes(_) | Node::ByteString(_) => {
-                    let bytes = self.bytes(raw)?;
-                    self.raw_array(dtype, shape, fortran, &bytes)
-                }
-                _ => Err("data of an array".to_owned()),
+            let (Node::Bytes(bytes) | Node::ByteString(bytes)) = &self.nodes[raw] else {
+                return Err("data of an array".to_owned());
             };
+            if let Cow::Owned(bytes) = bytes {
+                self.budget.spend(bytes.len())?;
+            }
+            let bytes = bytes.clone();
+            return self.raw_array(dtype, shape, fortran, &bytes);
         };
         if fortran && shape.len() > 1 {
-            // Objects in Fortran order do not occur in the formats this is for.
             return Err("column-major array of objects".to_owned());
         }
         let count = count(&shape)?;
+        self.budget.spend(8 * shape.len())?;
         let items = match &self.nodes[raw] {
-            Node::List(items) if items.len() == count => items.clone(),
+            Node::List(items) if items.len() == count => {
+                self.budget.spend(8 * count)?;
+                items.clone()
+            }
             Node::List(items) => return Err(mismatch(&shape, items.len())),
             // A scalar of object type holds the object itself.
             _ if shape.is_empty() => vec![raw],
             _ => return Err("data of an array".to_owned()),
         };
-        self.spend(8 * items.len() + 8 * shape.len())?;
         Ok(Node::Objects(Box::new((shape, items))))
     }
 
     /// An array from the bytes of its elements, which are not objects.
     pub(super) fn raw_array(&mut self, dtype: Dtype, shape: Vec<usize>, fortran: bool, raw: &[u8]) -> Step<Node<'a>> {
         let count = count(&shape)?;
-        self.spend(8 * shape.len())?;
+        self.budget.spend(8 * shape.len())?;
         match dtype {
             Dtype::Number(element) => {
-                // What is put in another order is there twice for a while.
+                // Reordering holds two copies for a while.
                 let copies = if fortran { 2 } else { 1 };
                 let length = count.min(raw.len());
-                self.spend(length.saturating_mul(copies * element.size_in_memory()))?;
+                self.budget.spend(length.saturating_mul(copies * element.size_in_memory()))?;
                 let array = element.decode(raw, &shape, fortran);
                 Ok(Node::Array(Box::new(array.ok_or_else(|| mismatch(&shape, raw.len()))?)))
             }
@@ -177,12 +165,12 @@ impl<'a> Machine<'a> {
                 if count.checked_mul(size) != Some(raw.len()) {
                     return Err(mismatch(&shape, raw.len()));
                 }
-                self.spend(2 * raw.len() + count.saturating_mul(grown::<Id>()))?;
+                self.budget.spend(2 * raw.len() + count.saturating_mul(grown::<Id>()))?;
                 let mut items = Vec::with_capacity(count);
                 for item in raw.chunks_exact(size) {
                     let text = match dtype {
                         Dtype::WideText { big_endian, .. } => wide_text(item, big_endian)?,
-                        _ => item.iter().copied().map(char::from).collect(),
+                        _ => latin1(item),
                     };
                     let text = text.trim_end_matches('\0').to_owned();
                     items.push(self.add(Node::Text(Cow::Owned(text)))?);
@@ -216,22 +204,9 @@ impl<'a> Machine<'a> {
     pub(super) fn text(&self, id: Id) -> Step<Cow<'_, str>> {
         match &self.nodes[id] {
             Node::Text(text) if text.len() <= 64 => Ok(Cow::Borrowed(text)),
-            Node::ByteString(bytes) | Node::Bytes(bytes) if bytes.len() <= 64 => {
-                let text = bytes.iter().map(|&b| char::from(b)).collect();
-                Ok(Cow::Owned(text))
-            }
+            Node::ByteString(bytes) | Node::Bytes(bytes) if bytes.len() <= 64 => Ok(Cow::Owned(latin1(bytes))),
             _ => Err("expected a short text".to_owned()),
         }
-    }
-
-    /// A copy of bytes, paid for.
-    fn bytes(&mut self, id: Id) -> Step<Cow<'a, [u8]>> {
-        let (Node::Bytes(bytes) | Node::ByteString(bytes)) = &self.nodes[id] else {
-            return Err("expected bytes".to_owned());
-        };
-        let bytes = bytes.clone();
-        self.spend(bytes.len())?;
-        Ok(bytes)
     }
 }
 
@@ -239,12 +214,12 @@ fn mismatch(shape: &[usize], found: usize) -> String {
     format!("shape {shape:?} with {found} bytes or items of data")
 }
 
+pub(super) fn latin1(bytes: &[u8]) -> String {
+    bytes.iter().copied().map(char::from).collect()
+}
+
 fn wide_text(bytes: &[u8], big_endian: bool) -> Step<String> {
-    let units = bytes.chunks_exact(4).map(|c| {
-        let unit = [c[0], c[1], c[2], c[3]];
-        let code = if big_endian { u32::from_be_bytes(unit) } else { u32::from_le_bytes(unit) };
-        char::from_u32(code)
-    });
-    let text: Option<String> = units.collect();
+    let decode = if big_endian { u32::from_be_bytes } else { u32::from_le_bytes };
+    let text: Option<String> = bytes.as_chunks().0.iter().map(|&unit| char::from_u32(decode(unit))).collect();
     text.ok_or_else(|| "text is not UTF-32".to_owned())
 }

@@ -2,11 +2,11 @@
 
 mod common;
 
+use array_files::npz::read_npy;
+use array_files::pickle::{self, Value};
+use array_files::{Data, Error, NdArray};
 use common::{fixture, shared};
 use proptest::prelude::*;
-use smpl::npz::read_npy;
-use smpl::pickle::{self, Value};
-use smpl::{Data, Error, NdArray};
 
 fn array(shape: &[usize], data: Data) -> Value {
     Value::Array(NdArray { shape: shape.to_vec(), data })

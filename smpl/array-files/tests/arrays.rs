@@ -1,22 +1,21 @@
-//! Array files and models in them: right values from good files, typed errors from bad ones.
+//! numpy's files: correct values from good files, typed errors from bad ones.
 #![allow(clippy::unwrap_used, reason = "helpers of tests")]
 
 mod common;
 
-use std::io::Write;
 use std::path::{Path, PathBuf};
 
+use array_files::npz::{self, Npz, read_npy};
+use array_files::{Data, Error, NdArray};
 use common::fixture;
 use proptest::prelude::*;
-use smpl::npz::{self, Npz, read_npy};
-use smpl::{BodyModel, Data, Error, NdArray};
 
 /// A file that is removed at the end of the test.
 struct Temporary(PathBuf);
 
 impl Temporary {
     fn new(name: &str, bytes: &[u8]) -> Self {
-        let path = std::env::temp_dir().join(format!("smpl-{}-{name}", std::process::id()));
+        let path = std::env::temp_dir().join(format!("array-files-{}-{name}", std::process::id()));
         std::fs::write(&path, bytes).unwrap();
         Self(path)
     }
@@ -154,92 +153,6 @@ proptest! {
     fn random_bytes_are_no_archive(bytes in prop::collection::vec(any::<u8>(), 0..200)) {
         prop_assert!(Npz::from_bytes("random", bytes).is_err());
     }
-}
-
-/// Arrays of a body of three vertices and two joints.
-fn tiny_body() -> Vec<(&'static str, Vec<u64>, Vec<f64>)> {
-    vec![
-        ("v_template", vec![3, 3], vec![0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0]),
-        ("f", vec![1, 3], vec![0.0, 1.0, 2.0]),
-        ("weights", vec![3, 2], vec![1.0, 0.0, 0.5, 0.5, 0.0, 1.0]),
-        ("J_regressor", vec![2, 3], vec![1.0, 0.0, 0.0, 0.0, 0.5, 0.5]),
-        ("kintree_table", vec![2, 2], vec![4294967295.0, 0.0, 0.0, 1.0]),
-        ("shapedirs", vec![3, 3, 1], vec![0.1; 9]),
-        ("posedirs", vec![3, 3, 9], vec![0.0; 81]),
-    ]
-}
-
-fn write_body(name: &str, arrays: &[(&str, Vec<u64>, Vec<f64>)]) -> Temporary {
-    let mut zip = zip::ZipWriter::new(std::io::Cursor::new(Vec::new()));
-    for (key, shape, values) in arrays {
-        let options = zip::write::SimpleFileOptions::default();
-        zip.start_file(format!("{key}.npy"), options).unwrap();
-        let integers = matches!(*key, "f" | "kintree_table");
-        let extents: Vec<String> = shape.iter().map(|n| format!("{n},")).collect();
-        let header = format!(
-            "{{'descr': '<{}', 'fortran_order': False, 'shape': ({}), }}",
-            if integers { "i8" } else { "f8" },
-            extents.concat()
-        );
-        let bytes = values.iter().flat_map(|&x| if integers { (x as i64).to_le_bytes() } else { x.to_le_bytes() });
-        zip.write_all(&npy(&header, &bytes.collect::<Vec<_>>())).unwrap();
-    }
-    Temporary::new(name, &zip.finish().unwrap().into_inner())
-}
-
-#[test]
-fn a_tiny_body_is_read() {
-    let file = write_body("tiny.npz", &tiny_body());
-    let body = BodyModel::load(&file.0).unwrap();
-    assert_eq!((body.num_vertices(), body.num_joints(), body.num_betas()), (3, 2, 1));
-    assert_eq!(body.parents, [None, Some(0)]);
-}
-
-#[test]
-fn faults_of_a_model_name_the_array() {
-    let cases: [(&str, usize, f64); 11] = [
-        ("v_template", 4, f64::NAN),
-        ("v_template", 0, f64::INFINITY),
-        ("f", 2, 3.0),
-        ("f", 0, -1.0),
-        ("weights", 0, 0.5),
-        ("weights", 2, -0.5),
-        ("weights", 0, f64::NAN),
-        ("J_regressor", 0, 9.0),
-        ("kintree_table", 1, 1.0),
-        ("shapedirs", 3, f64::NEG_INFINITY),
-        ("posedirs", 80, f64::NAN),
-    ];
-    for (i, (key, index, value)) in cases.into_iter().enumerate() {
-        let mut arrays = tiny_body();
-        arrays.iter_mut().find(|a| a.0 == key).unwrap().2[index] = value;
-        let file = write_body(&format!("fault{i}.npz"), &arrays);
-        let message = BodyModel::load(&file.0).expect_err(key).to_string();
-        let name = format!("fault{i}.npz");
-        assert!(message.contains(&format!("`{key}`")) && message.contains(&name), "{message}");
-    }
-}
-
-#[test]
-fn missing_and_misshapen_arrays_of_a_model_are_named() {
-    for i in 0..tiny_body().len() {
-        let mut arrays = tiny_body();
-        let (key, shape, values) = &mut arrays[i];
-        let key = *key;
-        shape.push(1);
-        let shown = format!("{shape:?}");
-        let _ = values;
-        let file = write_body(&format!("shape{i}.npz"), &arrays);
-        let message = BodyModel::load(&file.0).expect_err(key).to_string();
-        assert!(message.contains(&format!("`{key}`")) && message.contains(&shown), "{message}");
-
-        arrays.remove(i);
-        let file = write_body(&format!("missing{i}.npz"), &arrays);
-        let error = BodyModel::load(&file.0).expect_err(key);
-        assert!(matches!(&error, Error::MissingKey { key: k, .. } if k == key), "{error}");
-    }
-    let other = BodyModel::load(&fixture("make_pickles.py")).unwrap_err();
-    assert!(matches!(other, Error::Extension { .. }));
 }
 
 fn any_array() -> impl Strategy<Value = NdArray> {

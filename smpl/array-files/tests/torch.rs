@@ -6,9 +6,9 @@ mod common;
 use std::io::{Cursor, Write};
 
 use allocation_counter::measure;
+use array_files::torch::{TorchFile, is_torch};
+use array_files::{Data, Error, NdArray};
 use common::shared;
-use smpl::torch::{TorchFile, is_torch};
-use smpl::{Data, Error, NdArray};
 use zip::write::SimpleFileOptions;
 use zip::{CompressionMethod, ZipWriter};
 
