@@ -1,11 +1,10 @@
-//! The embedded body and the form it is stored in.
+//! The embedded body and its file format.
 //!
-//! `assets/open_body.bin` is a zlib stream of 32-bit words, stored as four planes of bytes, the
-//! lowest first. A word is a zigzag-coded integer. Lengths are multiples of 2⁻¹⁶ m and weights of
-//! 2⁻¹⁶; the rows of both matrices sum to exactly 1. The words: V, F, J, B; the template, (3, V);
-//! faces, (F, 3); shape blend shapes, (3, B·V); parents, (J), −1 for the root; then pose blend
-//! shapes, skinning weights and joint regressor as sparse rows: the length of each row, all
-//! columns, all values, those of vectors again one coordinate after the other.
+//! `assets/open_body.bin` is a zlib stream of zigzag-coded 32-bit integers, stored as four byte
+//! planes, least significant first. Lengths are in units of 2⁻¹⁶ m and weights of 2⁻¹⁶; rows of
+//! weights sum to exactly 1. In order: V, F, J, B; template, (3, V); faces, (F, 3); shape blend
+//! shapes, (3, B·V); parents, (J), −1 for the root; pose blend shapes, skinning weights and joint
+//! regressor as sparse rows: length of each row, columns, values ((3, N) for vectors).
 //!
 //! Made from an SMPL-format npz by
 //! `OPEN_BODY=open_body.npz cargo test -p smpl --lib write_the_asset -- --ignored`.
@@ -18,7 +17,7 @@ use crate::model::BodyModel;
 use crate::sparse::SparseRows;
 
 const PACKED: &[u8] = include_bytes!("../assets/open_body.bin");
-/// Words a metre, and a weight of 1.
+/// Units per metre, and of a weight of 1.
 const SCALE: f32 = 65536.0;
 
 impl BodyModel {
@@ -32,7 +31,7 @@ impl BodyModel {
     /// width, 8 leg length, 9 arm length and thickness. Pose blend shapes are fitted to the
     /// difference between dual-quaternion and linear skinning. Coordinates are rounded to 15 µm.
     ///
-    /// Each call decodes it anew, in some ten milliseconds: keep the result.
+    /// Each call decodes the asset, some ten milliseconds: keep the result.
     ///
     /// ```
     /// let body = smpl::BodyModel::embedded();
@@ -55,7 +54,7 @@ impl BodyModel {
     }
 }
 
-/// The words that are left to read.
+/// The remaining integers of the asset.
 struct Words(std::vec::IntoIter<i32>);
 
 impl Words {
@@ -99,7 +98,8 @@ impl Words {
 mod tests {
     use super::*;
 
-    /// `values`, which sum to 1, in words that sum to [`SCALE`]: the largest takes the rest.
+    /// Quantises `values`, which sum to 1, to integers that sum to [`SCALE`]: the largest absorbs
+    /// the rounding.
     fn units(values: &[f32]) -> Vec<i32> {
         let mut words: Vec<i32> = values.iter().map(|x| (x * SCALE).round() as i32).collect();
         let rest = SCALE as i32 - words.iter().sum::<i32>();
@@ -109,7 +109,7 @@ mod tests {
         words
     }
 
-    /// The words of `body`, those that are no more than 0 left out of the sparse rows.
+    /// The integers of the file, before zigzag coding.
     fn words(body: &BodyModel) -> Vec<i32> {
         let size = |n: usize| n as i32;
         let vectors = |values: &[Vec3]| {

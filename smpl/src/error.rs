@@ -1,15 +1,21 @@
-//! Errors of files.
+//! Errors of reading and writing files.
 
 use std::path::PathBuf;
 
-/// A file that cannot be read or does not hold what it should.
+/// An error of a file: I/O, format, or content.
 ///
-/// `file` is the path as given, or the name passed with bytes already in memory; `key` is the
-/// array's name, which is shown with its control characters escaped: one line whatever it holds.
+/// `file` is the path as given, or the name passed with bytes in memory; `key` is the array's name,
+/// displayed with control characters escaped. Messages are one line.
+///
+/// ```
+/// let error = smpl::BodyModel::load("no_such_body.npz".as_ref()).unwrap_err();
+/// assert!(matches!(error, smpl::Error::Io { .. }));
+/// assert!(error.to_string().starts_with("no_such_body.npz: "));
+/// ```
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
-    /// The operating system refused.
+    /// The operating system reported an error.
     #[error("{}: {source}", path.display())]
     Io {
         /// The path as given.
@@ -17,46 +23,46 @@ pub enum Error {
         /// The cause.
         source: std::io::Error,
     },
-    /// The file name ends in nothing this crate reads.
+    /// A file extension this crate does not read.
     #[error("{}: unknown kind of file (expected {expected})", path.display())]
     Extension {
         /// The path as given.
         path: PathBuf,
-        /// The extensions that would do.
+        /// Supported extensions.
         expected: &'static str,
     },
-    /// An array that must be there is not.
+    /// A required array is missing.
     #[error("{file}: no `{key}` (it holds {})", available.join(", ").escape_debug())]
     MissingKey {
         /// The file.
         file: String,
-        /// The name that was looked for.
+        /// Requested name.
         key: String,
-        /// The names that are there instead.
+        /// Available names.
         available: Vec<String>,
     },
-    /// An array of another shape than its use demands.
+    /// An array of the wrong shape.
     #[error("{file}: `{}` has shape {actual:?}, expected {expected}", key.escape_debug())]
     Shape {
         /// The file.
         file: String,
         /// The array.
         key: String,
-        /// Pattern, `_` standing for any size.
+        /// Expected pattern; `_` is any size.
         expected: String,
         /// The shape in the file.
         actual: Vec<usize>,
     },
-    /// An array or object of another type than its use demands.
+    /// An array or object of the wrong type.
     #[error("{file}: `{}` is {actual}, expected {expected}", key.escape_debug())]
     Type {
         /// The file.
         file: String,
         /// The array.
         key: String,
-        /// The type that is expected.
+        /// Expected type.
         expected: &'static str,
-        /// The type found.
+        /// Actual type.
         actual: String,
     },
     /// NaN, an infinity, or a value too large for `f32`.
@@ -69,9 +75,8 @@ pub enum Error {
         /// Position of the first such value, row-major.
         index: usize,
     },
-    /// Readable, but impossible: an index out of range, weights that do not sum to one, a tree with
-    /// a cycle. Also what cannot be read of a glTF, OBJ or safetensors file; `key` is then the part
-    /// or the line.
+    /// Inconsistent content: an index out of range, weights that do not sum to one, a tree with a
+    /// cycle. Also malformed glTF, OBJ and safetensors files; `key` is then the part or the line.
     #[error("{file}: `{}`: {message}", key.escape_debug())]
     Invalid {
         /// The file.
@@ -81,17 +86,16 @@ pub enum Error {
         /// The fault.
         message: String,
     },
-    /// The file asks for more memory than the reader's limit. Raised before the memory is
-    /// allocated.
+    /// The file claims more memory than the reader's limit. Raised before allocation.
     #[error("{file}: `{}` claims {claimed} bytes, more than the limit of {limit}", key.escape_debug())]
     TooLarge {
         /// The file.
         file: String,
         /// The array; empty for the file as a whole.
         key: String,
-        /// Bytes that the header claims.
+        /// Claimed size, bytes.
         claimed: u128,
-        /// Bytes that are allowed.
+        /// Limit, bytes.
         limit: u64,
     },
     /// Malformed or truncated `.npy` or `.npz` structure.
@@ -101,7 +105,7 @@ pub enum Error {
         file: String,
         /// The array; empty for the archive as a whole.
         key: String,
-        /// The fault found.
+        /// The fault.
         message: String,
     },
     /// Malformed, truncated or disallowed pickle.
@@ -111,7 +115,7 @@ pub enum Error {
         file: String,
         /// Offset of the opcode at fault from the start of the file.
         offset: usize,
-        /// The fault found.
+        /// The fault.
         message: String,
     },
 }
@@ -123,7 +127,7 @@ impl Error {
     }
 }
 
-/// The key with what parts it from the rest of a line; nothing for the file as a whole.
+/// The key with its separator; empty for the file as a whole.
 fn within(key: &str) -> String {
     if key.is_empty() { String::new() } else { format!("`{}`: ", key.escape_debug()) }
 }

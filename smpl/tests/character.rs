@@ -145,7 +145,7 @@ fn refused(json: &str, binary: &[u8], words: &[&str]) {
 }
 
 #[test]
-fn wrong_documents_are_refused_by_what_is_wrong() {
+fn errors_name_the_fault_of_a_document() {
     let (json, binary) = arm();
     let swap = |from: &str, to: &str| {
         assert!(json.contains(from), "{from}");
@@ -295,7 +295,7 @@ fn cut_characters_are_refused() {
 }
 
 #[test]
-fn joints_hang_on_the_nearest_joint_above() {
+fn parents_are_the_nearest_ancestor_joints() {
     let Some(character) = shared_character("makehuman_walk.glb") else { return };
     let (names, parents) = (&character.joint_names, character.joint_parents());
     let above = |name: &str| {
@@ -324,7 +324,7 @@ fn one_file_named_many_times_is_refused_before_it_fills_the_memory() {
 }
 
 #[test]
-fn vertices_beyond_anything_are_refused() {
+fn huge_coordinates_are_refused() {
     let (json, mut bytes) = arm();
     bytes[..4].copy_from_slice(&1e30f32.to_le_bytes());
     let message = Character::from_bytes("arm.glb", &glb(&json, &bytes)).unwrap_err().to_string();
