@@ -20,8 +20,8 @@ const LONGER: f32 = 0.1;
 /// let body = smpl::BodyModel::embedded();
 /// let limbs = body.limbs();
 /// let longest = limbs.pairs()[0];
-/// assert_eq!(longest, 4); // the thighs, which end at the knees
-/// // 5 % longer thighs:
+/// assert_eq!(longest, 7); // the shins, which end at the ankles
+/// // 5 % longer shins:
 /// let mut taller = body.clone();
 /// taller.v_template.iter_mut().zip(limbs.longer(longest)).for_each(|(v, d)| *v += 0.05 * d);
 /// ```
@@ -151,10 +151,10 @@ mod tests {
         body.validate("limbs").unwrap();
         assert_eq!(body.num_betas(), 6);
         assert_eq!(BodyModel::embedded().with_limb_lengths(), BodyModel::embedded());
-        // The thigh is the longest.
+        let longest = body.limbs().pairs()[0];
         let part = |betas: &[f32]| {
             let joints = body.shaped(betas).joints;
-            joints[4].distance(joints[1])
+            joints[longest].distance(joints[longest - 3])
         };
         assert!((part(&[0.5]) / part(&[]) - 1.05).abs() < 0.01);
     }

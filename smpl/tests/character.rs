@@ -162,8 +162,8 @@ fn errors_name_the_fault_of_a_document() {
     refused(&swap(r#""bufferView":0,"componentType":5126,"count":4"#, no_view), &binary, &["accessor 0", "no data"]);
     refused(&swap(r#""byteOffset":368,"byteLength":12"#, r#""byteOffset":368,"byteLength":13"#), &binary, &["view 7"]);
     refused(&swap(r#""byteLength":380"#, r#""byteLength":381"#), &binary, &["buffer 0", "381"]);
-    refused(&swap(r#""input":3"#, r#""input":33"#), &binary, &["animation 0", "item 33 of 8"]);
-    refused(&swap(r#""channels":[{"sampler":0"#, r#""channels":[{"sampler":9"#), &binary, &["animation 0", "item 9"]);
+    refused(&swap(r#""input":3"#, r#""input":33"#), &binary, &["animation 0", "index 33 of 8"]);
+    refused(&swap(r#""channels":[{"sampler":0"#, r#""channels":[{"sampler":9"#), &binary, &["animation 0", "index 9"]);
     refused(&swap(r#""joints":[0,1]"#, r#""joints":[0]"#), &binary, &["mesh 0", "joint 1 of 1"]);
     refused(&swap(r#""joints":[0,1]"#, r#""joints":[0,1,1]"#), &binary, &["skin 0", "2 inverse bind matrices for 3"]);
     refused(&swap(r#""indices":7"#, r#""indices":7,"mode":5"#), &binary, &["strips"]);
