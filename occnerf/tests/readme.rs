@@ -38,8 +38,7 @@ fn table() -> String {
         }),
         row("motion field", |c| {
             let name = match c.motion.kind {
-                MotionKind::Volume => "diffused volume",
-                MotionKind::Gaussian => "Gaussian volume",
+                MotionKind::Volume => "Gaussian volume",
                 MotionKind::Surface => "nearest surface",
             };
             name.to_owned()

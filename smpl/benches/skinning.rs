@@ -1,8 +1,5 @@
-//! Skinning, motion fields and construction. The shared SMPL-sized body (6890 vertices, 207 sparse
-//! pose terms) is used where it is there, else the embedded one; `dense` fills every pose term, as
-//! in SMPL itself.
-
-use std::path::Path;
+//! Skinning, motion fields and construction, for the embedded body (6890 vertices, 4 % of the 207
+//! pose terms not zero); `dense` fills every pose term, as in SMPL itself.
 
 use divan::counter::ItemsCount;
 use divan::{Bencher, black_box};
@@ -17,8 +14,7 @@ fn main() {
 const BETAS: [f32; 10] = [0.5, -0.5, 0.3, 0.2, 0.1, 0.0, 0.4, -0.2, 0.6, -0.7];
 
 fn body() -> BodyModel {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared/data/body/open_body.npz");
-    BodyModel::load(&path).unwrap_or_else(|_| BodyModel::embedded())
+    BodyModel::embedded()
 }
 
 fn dense() -> BodyModel {
@@ -161,7 +157,7 @@ mod motion {
         let shaped = body.shaped(&BETAS);
         let posed = body.pose(&shaped, &pose(0), Placement::default());
         let to_canonical = posed.to_canonical();
-        let volume = WeightVolume::diffused(&body, &shaped, &WeightVolumeConfig::default());
+        let volume = WeightVolume::gaussian(&body, &shaped, &WeightVolumeConfig::default());
         bencher.counter(ItemsCount::new(posed.vertices.len())).bench(|| {
             let mut sum = Vec3::ZERO;
             for &x in &posed.vertices {
@@ -179,7 +175,7 @@ mod motion {
         let shaped = body.shaped(&BETAS);
         let posed = body.pose(&shaped, &pose(0), Placement::default());
         let to_canonical = posed.to_canonical();
-        let volume = WeightVolume::diffused(&body, &shaped, &WeightVolumeConfig::default());
+        let volume = WeightVolume::gaussian(&body, &shaped, &WeightVolumeConfig::default());
         let mut d_weights = vec![0.0; volume.weights.len()];
         bencher.counter(ItemsCount::new(posed.vertices.len())).bench_local(|| {
             for &x in &posed.vertices {
@@ -192,7 +188,7 @@ mod motion {
     fn volume_update(bencher: Bencher<'_, '_>) {
         let body = body();
         let shaped = body.shaped(&BETAS);
-        let mut volume = WeightVolume::diffused(&body, &shaped, &WeightVolumeConfig::default());
+        let mut volume = WeightVolume::gaussian(&body, &shaped, &WeightVolumeConfig::default());
         bencher.bench_local(|| volume.update());
     }
 }
@@ -206,14 +202,9 @@ mod construction {
     }
 
     #[divan::bench(sample_count = 5)]
-    fn diffused_volume(bencher: Bencher<'_, '_>) {
+    fn volume(bencher: Bencher<'_, '_>) {
         let body = body();
         let shaped = body.shaped(&BETAS);
-        bencher.bench(|| WeightVolume::diffused(&body, &shaped, &WeightVolumeConfig::default()));
-    }
-
-    #[divan::bench(sample_count = 5)]
-    fn load(bencher: Bencher<'_, '_>) {
-        bencher.bench(body);
+        bencher.bench(|| WeightVolume::gaussian(&body, &shaped, &WeightVolumeConfig::default()));
     }
 }

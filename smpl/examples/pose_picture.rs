@@ -1,129 +1,47 @@
-//! Draws the embedded body at rest, walking, sitting, and in its shapes. Usage: `pose_picture
-//! [OUT.png [BODY.npz]]`.
+//! Draws a body in poses and shapes: `pose_picture [OUT.png [BODY.npz]]`.
 
-use std::error::Error;
-use std::f32::consts::FRAC_PI_2;
-use std::path::PathBuf;
+use glam::{Mat3, Vec2, Vec3};
+use image::{GrayImage, Luma, imageops};
+use smpl::{BodyModel, Placement};
 
-use glam::{Vec2, Vec3};
-use smpl::{BodyModel, Placement, Posed};
+/// Side of a view and pixels per metre, before the picture is halved.
+const SIDE: u32 = 480;
+const SCALE: f32 = 280.0;
+/// Joints of SMPL and their axis-angle rotations.
+type Pose = &'static [(usize, Vec3)];
+const WALK: Pose = &[(1, Vec3::new(-0.5, 0.0, 0.0)), (5, Vec3::X), (16, Vec3::new(0.3, 0.0, -1.2)), (17, Vec3::Z)];
+const SIT: Pose = &[(1, Vec3::new(-1.5, 0.1, 0.0)), (2, Vec3::new(-1.5, 0.0, 0.0)), (4, Vec3::X), (5, Vec3::X)];
 
-const WIDTH: usize = 420;
-const HEIGHT: usize = 460;
-
-/// What is in the middle of a picture, and pixels a metre.
-const WHOLE: (Vec3, f32) = (Vec3::new(0.0, -0.28, 0.0), 232.0);
-
-fn main() -> Result<(), Box<dyn Error>> {
-    let mut arguments = std::env::args().skip(1).map(PathBuf::from);
-    let out = arguments.next().unwrap_or_else(|| "poses.png".into());
-    let body = match arguments.next() {
-        Some(path) => BodyModel::load(&path)?,
-        None => BodyModel::embedded(),
-    };
-    println!("{} vertices, {} faces", body.num_vertices(), body.faces.len());
-
-    let joint = |rotations: &[(usize, [f32; 3])]| {
+fn main() -> Result<(), Box<dyn std::error::Error>> {
+    let mut arguments = std::env::args().skip(1);
+    let out = arguments.next().unwrap_or("poses.png".into());
+    let body = arguments.next().map_or_else(|| Ok(BodyModel::embedded()), |path| BodyModel::load(path.as_ref()))?;
+    let (heavy, slim): (&[f32], &[f32]) = (&[0.0, 2.0], &[1.0, -1.5, -2.0]);
+    let views = [(&[][..], &[][..], 0.0), (WALK, &[], 0.7), (SIT, &[], 0.9), (WALK, heavy, 0.0), (WALK, slim, 0.0)];
+    let mut sheet = GrayImage::from_pixel(SIDE * views.len() as u32, SIDE, Luma([245]));
+    for (column, (rotations, betas, turn)) in views.into_iter().enumerate() {
         let mut pose = vec![Vec3::ZERO; body.num_joints()];
-        for &(joint, rotation) in rotations {
-            pose[joint] = Vec3::from(rotation);
-        }
-        pose
-    };
-    let rest = joint(&[]);
-    let walk = joint(&[
-        (1, [-0.5, 0.0, 0.0]),
-        (2, [0.35, 0.0, 0.0]),
-        (4, [0.35, 0.0, 0.0]),
-        (5, [0.7, 0.0, 0.0]),
-        (16, [0.3, 0.0, -1.25]),
-        (17, [-0.4, 0.0, 1.25]),
-        (18, [0.0, -0.4, 0.0]),
-        (19, [0.0, 0.6, 0.0]),
-    ]);
-    let sit = joint(&[
-        (1, [-1.5, 0.1, 0.0]),
-        (2, [-1.5, -0.1, 0.0]),
-        (4, [1.6, 0.0, 0.0]),
-        (5, [1.6, 0.0, 0.0]),
-        (12, [0.2, 0.0, 0.0]),
-        (16, [0.0, -0.9, -0.6]),
-        (17, [0.0, 0.5, 1.1]),
-        (18, [0.0, -1.8, 0.0]),
-        (19, [0.0, 1.4, 0.0]),
-    ]);
-    let last = body.num_betas().min(4);
-    let shape = |beta: usize, value: f32| {
-        let mut betas = vec![0.0; last];
-        if let Some(b) = betas.get_mut(beta) {
-            *b = value;
-        }
-        betas
-    };
-    let views = [
-        (&rest, vec![], 0.0, WHOLE),
-        (&rest, vec![], 0.7, WHOLE),
-        (&rest, vec![], FRAC_PI_2, WHOLE),
-        (&rest, vec![], 3.6, WHOLE),
-        (&walk, vec![], 0.5, WHOLE),
-        (&walk, vec![], FRAC_PI_2, WHOLE),
-        (&sit, vec![], 0.8, WHOLE),
-        (&rest, vec![], 0.6, (Vec3::new(0.0, 0.42, 0.0), 1500.0)),
-        (&walk, shape(1, 2.0), 0.5, WHOLE),
-        (&walk, shape(1, -2.0), 0.5, WHOLE),
-        (&walk, shape(2, -2.0), 0.5, WHOLE),
-        (&walk, shape(3, 2.0), 0.5, WHOLE),
-    ];
-    let mut sheet = image::GrayImage::new((4 * WIDTH) as u32, (3 * HEIGHT) as u32);
-    for (i, (pose, betas, turn, (centre, scale))) in views.into_iter().enumerate() {
-        let posed = body.pose(&body.shaped(&betas), pose, Placement::default());
-        let picture = draw(&body, &posed, turn, centre, scale);
-        let corner = ((i % 4) * WIDTH, (i / 4) * HEIGHT);
-        image::imageops::replace(&mut sheet, &picture, corner.0 as i64, corner.1 as i64);
-    }
-    // Drawn larger, for smooth edges.
-    let (width, height) = (sheet.width() * 2 / 5, sheet.height() * 2 / 5);
-    image::imageops::resize(&sheet, width, height, image::imageops::FilterType::Triangle).save(&out)?;
-    println!("wrote {}", out.display());
-    Ok(())
-}
-
-/// Smooth-shaded orthographic view, the body turned about the vertical by `turn` radians.
-fn draw(body: &BodyModel, posed: &Posed, turn: f32, centre: Vec3, scale: f32) -> image::GrayImage {
-    let rotation = glam::Mat3::from_rotation_y(turn);
-    let vertices: Vec<Vec3> = posed.vertices.iter().map(|&v| rotation * v).collect();
-    let mut normals = vec![Vec3::ZERO; vertices.len()];
-    for face in &body.faces {
-        let [a, b, c] = face.map(|i| vertices[i as usize]);
-        face.iter().for_each(|&i| normals[i as usize] += (b - a).cross(c - a));
-    }
-    let light = Vec3::new(0.4, 0.5, 0.8).normalize_or_zero();
-    let middle = Vec2::new(WIDTH as f32, HEIGHT as f32) / 2.0;
-    let screen = |v: Vec3| middle + scale * Vec2::new(v.x - centre.x, centre.y - v.y);
-    let mut depth = vec![f32::NEG_INFINITY; WIDTH * HEIGHT];
-    let mut picture = image::GrayImage::from_pixel(WIDTH as u32, HEIGHT as u32, image::Luma([245]));
-    for face in &body.faces {
-        let corners = face.map(|i| vertices[i as usize]);
-        let [a, b, c] = corners.map(screen);
-        let area = (b - a).perp_dot(c - a);
-        let (low, high) = (a.min(b).min(c).max(Vec2::ZERO), a.max(b).max(c));
-        for y in low.y as usize..(high.y as usize + 1).min(HEIGHT) {
-            for x in low.x as usize..(high.x as usize + 1).min(WIDTH) {
-                let p = Vec2::new(x as f32 + 0.5, y as f32 + 0.5);
-                let w = [(c - b).perp_dot(p - b), (a - c).perp_dot(p - c), (b - a).perp_dot(p - a)];
-                let w = w.map(|w| w / area);
-                if w.iter().any(|w| w.is_nan() || *w < 0.0) {
-                    continue;
-                }
-                let z: f32 = (0..3).map(|i| w[i] * corners[i].z).sum();
-                if z > depth[y * WIDTH + x] {
-                    depth[y * WIDTH + x] = z;
-                    let normal: Vec3 = (0..3).map(|i| w[i] * normals[face[i] as usize]).sum();
-                    let shade = normal.normalize_or_zero().dot(light).max(0.0);
-                    picture.put_pixel(x as u32, y as u32, image::Luma([(45.0 + 190.0 * shade) as u8]));
+        rotations.iter().for_each(|&(joint, rotation)| pose[joint] = rotation);
+        let posed = body.pose(&body.shaped(betas), &pose, Placement::default());
+        let view: Vec<Vec3> = posed.vertices.iter().map(|&v| Mat3::from_rotation_y(turn) * v).collect();
+        let centre = SIDE as f32 * Vec2::new(column as f32 + 0.5, 0.34);
+        let mut depth = vec![f32::NEG_INFINITY; (sheet.width() * SIDE) as usize];
+        for corners in body.faces.iter().map(|face| face.map(|v| view[v as usize])) {
+            let normal = (corners[1] - corners[0]).cross(corners[2] - corners[0]).normalize_or_zero();
+            let shade = 45.0 + 190.0 * normal.dot(Vec3::new(0.39, 0.49, 0.78)).max(0.0);
+            let [a, b, c] = corners.map(|v| centre + SCALE * Vec2::new(v.x, -v.y));
+            let (low, high) = (a.min(b).min(c).as_uvec2(), a.max(b).max(c).as_uvec2());
+            for (x, y) in (low.x..=high.x).flat_map(|x| (low.y..=high.y.min(SIDE - 1)).map(move |y| (x, y))) {
+                let p = Vec2::new(x as f32, y as f32) + 0.5;
+                let inside = [(a, b), (b, c), (c, a)].iter().all(|(a, b)| (b - a).perp_dot(p - a) <= 0.0);
+                let nearest = &mut depth[(y * sheet.width() + x.min(sheet.width() - 1)) as usize];
+                if inside && x < sheet.width() && corners[0].z > *nearest {
+                    *nearest = corners[0].z;
+                    sheet.put_pixel(x, y, Luma([shade as u8]));
                 }
             }
         }
     }
-    picture
+    imageops::resize(&sheet, sheet.width() / 2, SIDE / 2, imageops::FilterType::Triangle).save(out)?;
+    Ok(())
 }

@@ -1,4 +1,4 @@
-//! Motion capture in SMPL's parameters.
+//! Motion capture as SMPL parameters.
 
 use std::path::Path;
 
@@ -6,33 +6,48 @@ use array_files::npz::Npz;
 use glam::{Quat, Vec3};
 
 use crate::Error;
-use crate::model::MAX_COORDINATE;
+use crate::model::check_vectors;
 use crate::pose::Placement;
 
 /// Joints that SMPL, SMPL-H and SMPL-X share: the body without hands and face.
 const SHARED: usize = 22;
 /// Finger joints of both hands in SMPL-H and SMPL-X.
 const FINGERS: usize = 30;
-/// Longest rotation that is taken for one, in radians.
+/// Largest rotation accepted, in radians.
 const MAX_ANGLE: f32 = 1e3;
 
 /// A motion of T frames and J joints, for bodies in SMPL's form.
+///
+/// ```
+/// use glam::Vec3;
+/// use smpl::{BodyModel, MotionClip, Placement};
+///
+/// // Two frames: the left knee (joint 4) bends by 1 rad while the body moves 1 m forward.
+/// let mut poses = vec![Vec3::ZERO; 48];
+/// poses[24 + 4].x = 1.0;
+/// let clip = MotionClip { poses, num_joints: 24, trans: vec![Vec3::ZERO, Vec3::Z], fps: 30.0 };
+/// let body = BodyModel::embedded();
+/// let (pose, placement) = clip.at(0.5 / 30.0, body.num_joints());
+/// assert!((pose[4].x - 0.5).abs() < 1e-6);
+/// assert_eq!(placement, Placement::Pelvis { translation: 0.5 * Vec3::Z });
+/// let posed = body.pose(&body.shaped(&[]), &pose, placement);
+/// ```
 #[derive(Clone, Debug, PartialEq)]
 pub struct MotionClip {
     /// Axis-angle rotations relative to the parent, (T·J): those of the first frame first.
     pub poses: Vec<Vec3>,
-    /// J.
+    /// Joints per frame, J.
     pub num_joints: usize,
     /// Translation of the body, (T), in metres.
     pub trans: Vec<Vec3>,
-    /// Frames a second.
+    /// Frames per second.
     pub fps: f32,
 }
 
 impl MotionClip {
     /// Reads an `.npz` with `poses` (T, 3J), `trans` (T, 3) and one of `fps`, `mocap_framerate` and
-    /// `mocap_frame_rate`, as AMASS has them (156 columns for SMPL-H, 165 for SMPL-X). Other arrays
-    /// are left alone. AMASS has z up.
+    /// `mocap_frame_rate`, as in AMASS (156 columns for SMPL-H, 165 for SMPL-X), which is z up.
+    /// Other arrays are ignored.
     ///
     /// # Errors
     /// Any [`Error`] of arrays; [`Error::Invalid`] without frames, for a rate that is not positive,
@@ -42,7 +57,7 @@ impl MotionClip {
         let file = npz.file().to_owned();
         let (shape, poses) = npz.f32("poses", &[None, None])?;
         if shape[0] == 0 || shape[1] == 0 || !shape[1].is_multiple_of(3) {
-            return Err(Error::invalid(&file, "poses", format!("shape {shape:?}, expected frames of three a joint")));
+            return Err(Error::invalid(&file, "poses", format!("shape {shape:?}, expected (T, 3J)")));
         }
         let (_, trans) = npz.f32("trans", &[Some(shape[0]), Some(3)])?;
         let rates = ["fps", "mocap_framerate", "mocap_frame_rate"];
@@ -50,21 +65,18 @@ impl MotionClip {
         let rate = npz.array(key)?.to_f64();
         let fps = match rate.as_slice() {
             [rate] if (1e-3..=1e6).contains(rate) => *rate as f32,
-            _ => return Err(Error::invalid(&file, key, format!("{rate:?} frames a second"))),
+            _ => return Err(Error::invalid(&file, key, format!("{rate:?} frames per second"))),
         };
         let vectors = |values: Vec<f32>| values.chunks_exact(3).map(Vec3::from_slice).collect::<Vec<_>>();
         let clip = Self { poses: vectors(poses), num_joints: shape[1] / 3, trans: vectors(trans), fps };
-        if let Some(i) = clip.trans.iter().position(|t| t.abs().max_element() > MAX_COORDINATE) {
-            let message = format!("{} at frame {i}, expected at most {MAX_COORDINATE} either way", clip.trans[i]);
-            return Err(Error::invalid(&file, "trans", message));
-        }
+        check_vectors(&file, "trans", &clip.trans)?;
         match clip.poses.iter().position(|r| r.length() > MAX_ANGLE) {
             Some(i) => Err(Error::invalid(&file, "poses", format!("a rotation of {} rad", clip.poses[i].length()))),
             None => Ok(clip),
         }
     }
 
-    /// T.
+    /// Number of frames, T.
     #[must_use]
     pub fn num_frames(&self) -> usize {
         self.trans.len()
@@ -76,17 +88,16 @@ impl MotionClip {
         self.num_frames().saturating_sub(1) as f32 / self.fps
     }
 
-    /// The pose at `seconds` for a body of `joints` joints, and where it stands: the root turns
-    /// about the pelvis.
+    /// The pose and placement at `seconds`, for a body of `joints` joints.
     ///
     /// Between frames, rotations are interpolated along the shorter great arc and translations
-    /// linearly; the clip is held before its first and after its last frame. A body with as many
-    /// joints as the clip gets all of them. Otherwise the first 22 are the body's and the same in
-    /// SMPL, SMPL-H and SMPL-X; fingers go from SMPL-H (52 joints) to SMPL-X (55) and back; every
-    /// other joint (SMPL's two hands, jaw and eyes) stays at rest.
+    /// linearly; time is clamped to the clip. A body with as many joints as the clip gets all of
+    /// them. Otherwise the first 22, which SMPL, SMPL-H and SMPL-X share, are copied, fingers are
+    /// mapped between SMPL-H (52 joints) and SMPL-X (55), and every other joint (SMPL's two hands,
+    /// jaw and eyes) stays at rest.
     ///
     /// # Panics
-    /// If the clip has no frame, or `poses` is not T·J long.
+    /// If the clip has no frames, or `poses` does not have T·J entries.
     #[must_use]
     pub fn at(&self, seconds: f32, joints: usize) -> (Vec<Vec3>, Placement) {
         let frames = self.num_frames();

@@ -1,9 +1,8 @@
 //! Parametric bodies in SMPL's form.
 //!
-//! Load one (or take the embedded one), shape it, pose it, skin it, and carry points of the posed
-//! world back to the canonical pose; or go backward from vertices to pose and shape. Beside them:
-//! rigged glTF characters ([`Character`]), motion capture ([`MotionClip`]) and plain meshes
-//! ([`load_mesh`]).
+//! [`BodyModel`] loads, shapes, poses and skins a body, with derivatives; [`MotionField`] maps points
+//! of world space back to the canonical pose. Also rigged glTF characters ([`Character`]), motion
+//! capture ([`MotionClip`]) and triangle meshes ([`load_mesh`]).
 //!
 //! ```
 //! use glam::Vec3;

@@ -1,29 +1,40 @@
-//! Limbs of other lengths.
+//! Limb lengths as shape blend shapes.
 
 use glam::Vec3;
 
 use crate::model::BodyModel;
 
-/// How far off the plane of symmetry a limb's bone begins, and within which a joint's mirrored twin
-/// is found, of a body's height.
+/// Distance from the plane of symmetry beyond which a joint belongs to a limb, and within which a
+/// joint's mirror image is matched, as a fraction of the body's height.
 const ASIDE: f32 = 0.018;
-/// Shape blend shapes from which on a body is taken to know of proportions, and the part of its
-/// length by which a coefficient of 1 makes a limb's bone longer where it does not.
+/// Number of shape blend shapes up to which [`BodyModel::with_limb_lengths`] adds some.
 const SHAPES: usize = 10;
+/// Relative lengthening of a bone by a coefficient of 1.
 const LONGER: f32 = 0.1;
 
 /// The bones of a body's limbs: those that begin and end off the plane of symmetry, x = 0.
 ///
-/// A bone is named by the joint that it leads to, a pair of twins by the first of the two.
+/// A bone is identified by the joint at its end, a left–right pair by the lower of its two joints.
+///
+/// ```
+/// let body = smpl::BodyModel::embedded();
+/// let limbs = body.limbs();
+/// let longest = limbs.pairs()[0];
+/// assert_eq!(longest, 7); // the shins, which end at the ankles
+/// // 5 % longer shins:
+/// let mut taller = body.clone();
+/// taller.v_template.iter_mut().zip(limbs.longer(longest)).for_each(|(v, d)| *v += 0.05 * d);
+/// ```
+#[derive(Clone, Debug)]
 pub struct Limbs<'a> {
     body: &'a BodyModel,
     joints: Vec<Vec3>,
-    /// The pair that the bone of each joint is of, (J).
+    /// Pair of the bone that ends at each joint, (J); `None` for bones outside limbs.
     pairs: Vec<Option<usize>>,
 }
 
 impl BodyModel {
-    /// The bones of its limbs at rest, without shape.
+    /// The bones of the limbs, in the rest pose with zero betas.
     #[must_use]
     pub fn limbs(&self) -> Limbs<'_> {
         let joints = self.shaped(&[]).joints;
@@ -40,8 +51,8 @@ impl BodyModel {
         Limbs { body: self, joints, pairs }
     }
 
-    /// Gives a body with fewer than ten shape blend shapes, as a rigged character is one, more of
-    /// them, up to ten: the lengths of its longest limbs, 10 % a coefficient.
+    /// Adds the lengths of the longest limbs as shape blend shapes, 10 % per unit of coefficient,
+    /// up to ten shapes in all. Made for rigged characters, which have none of their own.
     #[must_use]
     pub fn with_limb_lengths(mut self) -> Self {
         let limbs = self.limbs();
@@ -53,7 +64,7 @@ impl BodyModel {
 }
 
 impl Limbs<'_> {
-    /// The pairs, those of the longest bones first.
+    /// The pairs, longest bones first.
     #[must_use]
     pub fn pairs(&self) -> Vec<usize> {
         let mut pairs: Vec<usize> = (0..self.pairs.len()).filter(|&j| self.pairs[j] == Some(j)).collect();
@@ -61,13 +72,14 @@ impl Limbs<'_> {
         pairs
     }
 
-    /// How each vertex at rest moves, (V), with the part by which the bones of a pair become longer:
-    /// what hangs on them moves along, what lies beside them is stretched. Motions of several pairs
-    /// add up.
+    /// Derivative of the rest vertices, (V), with respect to the relative length of a pair's bones:
+    /// vertices of descendant joints translate, those along the bones are stretched. Contributions
+    /// of several pairs add.
     #[must_use]
     pub fn longer(&self, pair: usize) -> Vec<Vec3> {
         let mut moved = vec![Vec3::ZERO; self.joints.len()];
-        // The joints that the bones begin at. A limb that forks is stretched along its first branch.
+        // Bone to stretch along, by its first joint. A limb that forks is stretched along the first
+        // branch.
         let mut stretched: Vec<Option<Vec3>> = vec![None; self.joints.len()];
         let mut forks = vec![false; self.joints.len()];
         for (j, parent) in self.body.parents.iter().enumerate() {
@@ -92,7 +104,7 @@ impl Limbs<'_> {
         self.body.v_template.iter().enumerate().map(of).collect()
     }
 
-    /// From the joint before to `joint`.
+    /// Vector from the parent of `joint` to it.
     fn bone(&self, joint: usize) -> Vec3 {
         self.body.parents[joint].map_or(Vec3::ZERO, |p| self.joints[joint] - self.joints[p])
     }
@@ -112,13 +124,13 @@ mod tests {
     fn each_pair_becomes_as_much_longer_as_asked_and_nothing_else_does() {
         let body = bare();
         let limbs = body.limbs();
-        // Thighs, shins and feet; collars to shoulders, upper arms, forearms and hands of SMPL.
+        // Thighs, shins and feet; upper arms, forearms and hands of SMPL.
         let mut pairs = limbs.pairs();
         let length = |joints: &[Vec3], j: usize| joints[j].distance(joints[body.parents[j].unwrap()]);
         let (before, sorted) = (body.shaped(&[]).joints, pairs.clone());
         assert!(sorted.windows(2).all(|pair| length(&before, pair[0]) >= length(&before, pair[1])));
         pairs.sort_unstable();
-        assert_eq!(pairs, [4, 7, 10, 16, 18, 20, 22]);
+        assert_eq!(pairs, [4, 7, 10, 18, 20, 22]);
         for pair in pairs {
             let mut longer = body.clone();
             longer.v_template.iter_mut().zip(limbs.longer(pair)).for_each(|(v, by)| *v += 0.1 * by);
@@ -137,12 +149,12 @@ mod tests {
     fn bodies_without_shapes_get_their_limbs_and_others_stay_as_they_are() {
         let body = bare().with_limb_lengths();
         body.validate("limbs").unwrap();
-        assert_eq!(body.num_betas(), 7);
+        assert_eq!(body.num_betas(), 6);
         assert_eq!(BodyModel::embedded().with_limb_lengths(), BodyModel::embedded());
-        // The thigh is the longest.
+        let longest = body.limbs().pairs()[0];
         let part = |betas: &[f32]| {
             let joints = body.shaped(betas).joints;
-            joints[4].distance(joints[1])
+            joints[longest].distance(joints[longest - 3])
         };
         assert!((part(&[0.5]) / part(&[]) - 1.05).abs() < 0.01);
     }

@@ -1,4 +1,4 @@
-//! Reading body models.
+//! Body models from files.
 
 use std::path::Path;
 
@@ -14,17 +14,17 @@ use crate::sparse::SparseRows;
 
 impl BodyModel {
     /// Reads a body in SMPL's form: an `.npz`, a `.pkl` in the style of the original release
-    /// (chumpy arrays, sparse regressor), or this crate's own `.safetensors` ([`BodyModel::save`]).
-    /// The first bytes tell which; where they do not, the extension. Nothing in a pickle is
-    /// executed.
+    /// (chumpy arrays, sparse regressor), or this crate's own `.safetensors` ([`BodyModel::save`],
+    /// which has an example). The format is recognised by the first bytes, else by the extension.
+    /// Nothing in a pickle is executed.
     ///
     /// An npz or pickle needs `v_template` (V,3), `f` (F,3), `weights` (V,J), `J_regressor` (J,V),
     /// `kintree_table` (2,J), `shapedirs` (V,3,B) and `posedirs` (V,3,9(J−1)), for any J and B:
-    /// SMPL (24), SMPL-H (52) and SMPL-X (55, its expressions among the B) alike. Other arrays are
-    /// left alone. Whatever stands for the root's parent will do.
+    /// SMPL (24), SMPL-H (52) and SMPL-X (55; B includes the expressions). Other arrays and the
+    /// root's parent are ignored.
     ///
     /// # Errors
-    /// Any [`Error`]; those about the content name the array.
+    /// Any [`Error`]; errors of the content name the array.
     pub fn load(path: &Path) -> Result<Self, Error> {
         let file = path.display().to_string();
         let extension = path.extension().and_then(|e| e.to_str()).unwrap_or("").to_ascii_lowercase();
@@ -45,8 +45,8 @@ impl BodyModel {
     }
 }
 
-/// The usual extension for what the bytes begin like: a zip archive, a pickle of protocol 2 or
-/// later, or the length and the opening brace of a safetensors header.
+/// Extension of the format recognised by its first bytes: zip, safetensors (length and opening
+/// brace of the header), or a pickle of protocol 2 or later.
 fn kind(bytes: &[u8]) -> Option<&'static str> {
     match bytes {
         [b'P', b'K', 3 | 5, 4 | 6, ..] => Some("npz"),
@@ -126,7 +126,7 @@ fn build(file: &str, mut array: impl FnMut(&str) -> Result<NdArray, FileError>) 
     Ok(model)
 }
 
-/// Parents from the two rows of `kintree_table`: parent, joint.
+/// Parents from the two rows of `kintree_table`, parent and joint.
 fn parents(file: &str, kintree: &[i64]) -> Result<Vec<Option<usize>>, Error> {
     let (parents, joints) = kintree.split_at(kintree.len() / 2);
     let invalid = |message| Err(Error::invalid(file, "kintree_table", message));
@@ -136,23 +136,14 @@ fn parents(file: &str, kintree: &[i64]) -> Result<Vec<Option<usize>>, Error> {
     if let Some(i) = (0..joints.len()).find(|&i| joints[i] != i as i64) {
         return invalid(format!("column {i} is for joint {}", joints[i]));
     }
-    let mut out = vec![None];
-    for (i, &parent) in parents.iter().enumerate().skip(1) {
-        match usize::try_from(parent) {
-            Ok(p) if p < i => out.push(Some(p)),
-            _ => {
-                return invalid(format!("parent of joint {i} is {parent}, expected a joint before it"));
-            }
-        }
-    }
-    Ok(out)
+    Ok(std::iter::once(None).chain(parents[1..].iter().map(|&p| usize::try_from(p).ok())).collect())
 }
 
 fn triples<T: Copy>(values: &[T]) -> impl Iterator<Item = [T; 3]> + '_ {
     values.chunks_exact(3).map(|c| [c[0], c[1], c[2]])
 }
 
-/// Rows of a dense matrix with `columns` columns, without the zeros.
+/// The non-zero entries of a dense matrix.
 fn sparse(dense: &[f32], columns: usize) -> SparseRows<f32> {
     SparseRows::from_rows(dense.chunks_exact(columns.max(1)).map(|row| {
         let entries = row.iter().enumerate().filter(|(_, w)| **w != 0.0);

@@ -1,4 +1,4 @@
-//! Plain triangle meshes from files.
+//! Triangle meshes from files.
 
 use std::path::Path;
 
@@ -7,9 +7,9 @@ use glam::Vec3;
 
 use crate::Error;
 use crate::character::Character;
-use crate::model::{BodyModel, MAX_COORDINATE};
+use crate::model::{BodyModel, MAX_COORDINATE, check_vectors};
 
-/// A triangle mesh.
+/// A triangle mesh, from [`load_mesh`].
 #[derive(Clone, Debug, PartialEq)]
 pub struct Mesh {
     /// Positions, (V), in the file's order.
@@ -18,11 +18,18 @@ pub struct Mesh {
     pub faces: Vec<[u32; 3]>,
 }
 
-/// Reads a mesh, by its extension: Wavefront `.obj`; `.glb` and `.gltf`, every triangle mesh of the
-/// scene at rest in the world; a body model (see [`BodyModel::load`]), its template.
+/// Reads a mesh by its extension: Wavefront `.obj`; all triangle meshes of the scene of a `.glb` or
+/// `.gltf`, at rest, in world space; the template of a body model (see [`BodyModel::load`]).
 ///
-/// Of an OBJ file the statements `v` and `f` count; polygons become fans. Vertices keep the file's
-/// order, so that results by vertex index compare with those of other programs.
+/// Of an OBJ file the statements `v` and `f` are read; polygons become fans. Vertices keep the
+/// file's order, so that vertex indices agree with other programs.
+///
+/// ```
+/// let path = std::env::temp_dir().join("smpl_load_mesh_example.obj");
+/// std::fs::write(&path, "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3 4\n").unwrap();
+/// let mesh = smpl::load_mesh(&path).unwrap();
+/// assert_eq!(mesh.faces, [[0, 1, 2], [0, 2, 3]]);
+/// ```
 ///
 /// # Errors
 /// Any [`Error`]; those about an OBJ file name the line.
@@ -33,10 +40,8 @@ pub fn load_mesh(path: &Path) -> Result<Mesh, Error> {
         "glb" | "gltf" => {
             let character = Character::load(path)?;
             let mesh = Mesh { vertices: character.rest().vertices, faces: character.faces };
-            match mesh.vertices.iter().position(|v| !v.is_finite() || v.abs().max_element() > MAX_COORDINATE) {
-                Some(v) => Err(Error::not_finite(&path.display().to_string(), "vertices", 3 * v)),
-                None => Ok(mesh),
-            }
+            check_vectors(&path.display().to_string(), "vertices", &mesh.vertices)?;
+            Ok(mesh)
         }
         "npz" | "pkl" | "safetensors" => {
             let body = BodyModel::load(path)?;
@@ -50,7 +55,7 @@ fn parse_obj(file: &str, bytes: &[u8]) -> Result<Mesh, Error> {
     let text = String::from_utf8_lossy(bytes);
     let mut mesh = Mesh { vertices: Vec::new(), faces: Vec::new() };
     let mut polygon: Vec<u32> = Vec::new();
-    // Where each triangle comes from: an index may name a vertex that follows.
+    // Line of each triangle: an index may refer to a vertex that follows, so it is checked last.
     let mut lines: Vec<usize> = Vec::new();
     let mut joined = String::new();
     for (number, line) in text.lines().enumerate().map(|(i, line)| (i + 1, line)) {
@@ -69,12 +74,12 @@ fn parse_obj(file: &str, bytes: &[u8]) -> Result<Mesh, Error> {
                 let mut position = [0.0f32; 3];
                 for value in &mut position {
                     let word = words.next().ok_or_else(|| invalid("fewer than three coordinates".to_owned()))?;
-                    *value = word.parse().map_err(|_| invalid(format!("{word:?} is no number")))?;
+                    *value = word.parse().map_err(|_| invalid(format!("{word:?} is not a number")))?;
                     if !value.is_finite() {
                         return Err(invalid(format!("{word:?} is not finite")));
                     }
                     if value.abs() > MAX_COORDINATE {
-                        return Err(invalid(format!("{word:?}: expected at most {MAX_COORDINATE} either way")));
+                        return Err(invalid(format!("{word:?}: expected at most {MAX_COORDINATE}")));
                     }
                 }
                 mesh.vertices.push(position.into());
@@ -83,14 +88,14 @@ fn parse_obj(file: &str, bytes: &[u8]) -> Result<Mesh, Error> {
                 polygon.clear();
                 for word in words {
                     let index: i64 = (word.split('/').next().and_then(|w| w.parse().ok()))
-                        .ok_or_else(|| invalid(format!("{word:?} is no vertex")))?;
+                        .ok_or_else(|| invalid(format!("{word:?} is not a vertex")))?;
                     // From 1, or from the end of the vertices so far.
                     let from_zero = if index < 0 { mesh.vertices.len() as i64 + index } else { index - 1 };
-                    let vertex = u32::try_from(from_zero).map_err(|_| invalid(format!("{word:?} is no vertex")))?;
+                    let vertex = u32::try_from(from_zero).map_err(|_| invalid(format!("{word:?} is not a vertex")))?;
                     polygon.push(vertex);
                 }
                 if polygon.len() < 3 {
-                    return Err(invalid(format!("a face of {} corners", polygon.len())));
+                    return Err(invalid(format!("a face with {} corners", polygon.len())));
                 }
                 for pair in polygon[1..].windows(2) {
                     mesh.faces.push([polygon[0], pair[0], pair[1]]);

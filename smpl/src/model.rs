@@ -12,8 +12,26 @@ pub(crate) const MAX_COORDINATE: f32 = 1e6;
 
 /// A body in SMPL's form: V vertices, J joints, B shape and P pose blend shapes.
 ///
-/// Lengths are in the model's own unit. Everything is public so that bodies can be put together
-/// from other sources; [`BodyModel::validate`] tells whether the parts fit.
+/// Lengths are in the model's own unit. All fields are public, so that a body can be assembled from
+/// any source; [`BodyModel::validate`] checks that the parts fit.
+///
+/// ```
+/// use glam::Vec3;
+/// use smpl::{BodyModel, SparseRows};
+///
+/// // One triangle on one joint.
+/// let body = BodyModel {
+///     v_template: vec![Vec3::ZERO, Vec3::X, Vec3::Y],
+///     faces: vec![[0, 1, 2]],
+///     shapedirs: Vec::new(),
+///     posedirs: SparseRows::from_rows([[]; 3]),
+///     weights: SparseRows::from_rows([[(0, 1.0)]; 3]),
+///     j_regressor: SparseRows::from_rows([[(0, 0.5), (1, 0.5)]]),
+///     parents: vec![None],
+/// };
+/// body.validate("triangle").unwrap();
+/// assert_eq!(body.shaped(&[]).joints, [Vec3::new(0.5, 0.0, 0.0)]);
+/// ```
 #[derive(Clone, Debug, PartialEq)]
 pub struct BodyModel {
     /// Template, (V).
@@ -33,7 +51,7 @@ pub struct BodyModel {
     pub parents: Vec<Option<usize>>,
 }
 
-/// A body of one person at rest: template plus shape blend shapes.
+/// The rest pose of one person: template plus shape blend shapes, from [`BodyModel::shaped`].
 #[derive(Clone, Debug, PartialEq)]
 pub struct Shaped {
     /// Vertices in the rest pose, (V).
@@ -43,32 +61,38 @@ pub struct Shaped {
 }
 
 impl BodyModel {
-    /// V.
+    /// Number of vertices, V.
     #[must_use]
     pub fn num_vertices(&self) -> usize {
         self.v_template.len()
     }
 
-    /// J.
+    /// Number of joints, J.
     #[must_use]
     pub fn num_joints(&self) -> usize {
         self.parents.len()
     }
 
-    /// B.
+    /// Number of shape coefficients, B.
     #[must_use]
     pub fn num_betas(&self) -> usize {
         self.shapedirs.len() / self.num_vertices().max(1)
     }
 
-    /// Applies the shape blend shapes and regresses the joints: template + B_S(β), J = regressor ·
-    /// that.
+    /// Applies the shape blend shapes, template + B_S(β), and regresses the joints from the result.
+    /// Missing betas are 0.
     ///
-    /// Betas beyond those given are 0.
+    /// ```
+    /// let body = smpl::BodyModel::embedded();
+    /// let height = |betas: &[f32]| {
+    ///     let vertices = body.shaped(betas).vertices;
+    ///     vertices.iter().map(|v| v.y).fold(f32::MIN, f32::max) - vertices.iter().map(|v| v.y).fold(f32::MAX, f32::min)
+    /// };
+    /// assert!(height(&[1.0]) > height(&[]) + 0.05);
+    /// ```
     ///
     /// # Panics
-    /// With more betas than the model has: compare with [`BodyModel::num_betas`] first where they
-    /// come from a file.
+    /// With more betas than [`BodyModel::num_betas`].
     #[must_use]
     pub fn shaped(&self, betas: &[f32]) -> Shaped {
         assert!(betas.len() <= self.num_betas(), "shaped: {} betas, the model has {}", betas.len(), self.num_betas());
@@ -103,8 +127,7 @@ impl BodyModel {
         if v == 0 {
             return invalid("v_template", "no vertices".to_owned());
         }
-        finite(file, "v_template", &self.v_template)?;
-        near(file, "v_template", &self.v_template)?;
+        check_vectors(file, "v_template", &self.v_template)?;
         for (i, face) in self.faces.iter().enumerate() {
             if let Some(bad) = face.iter().find(|&&index| index as usize >= v) {
                 return invalid("f", format!("face {i} names vertex {bad} of {v}"));
@@ -117,11 +140,10 @@ impl BodyModel {
         let vertex = |i: u32| self.v_template[i as usize].as_dvec3();
         let area = |f: &[u32; 3]| (vertex(f[1]) - vertex(f[0])).cross(vertex(f[2]) - vertex(f[0])).length();
         if !self.faces.iter().any(|face| area(face) > 0.0) {
-            let what = if self.faces.is_empty() { "no faces" } else { "all faces are degenerate" };
-            return invalid("f", what.to_owned());
+            let fault = if self.faces.is_empty() { "no faces" } else { "all faces are degenerate" };
+            return invalid("f", fault.to_owned());
         }
-        finite(file, "shapedirs", &self.shapedirs)?;
-        near(file, "shapedirs", &self.shapedirs)?;
+        check_vectors(file, "shapedirs", &self.shapedirs)?;
         if self.parents.first() != Some(&None) {
             return invalid("kintree_table", "joint 0 is not the root".to_owned());
         }
@@ -141,13 +163,12 @@ impl BodyModel {
                 return invalid(key, message);
             }
         }
-        // Posing takes a row of P entries for one that has every column in its place.
+        // Posing reads a row of P entries as dense.
         let ascends = |row: usize| self.posedirs.row(row).zip(self.posedirs.row(row).skip(1)).all(|(a, b)| a.0 < b.0);
         if let Some(row) = (0..v).find(|&row| !ascends(row)) {
             return invalid("posedirs", format!("columns of row {row} do not ascend"));
         }
-        finite(file, "posedirs", &self.posedirs.values)?;
-        near(file, "posedirs", &self.posedirs.values)?;
+        check_vectors(file, "posedirs", &self.posedirs.values)?;
         for i in 0..v {
             let mut sum = 0.0;
             for (_, w) in self.weights.row(i) {
@@ -171,21 +192,16 @@ impl BodyModel {
     }
 }
 
-/// Within what single precision can place to a tenth of a unit: no body, in whatever unit, reaches
-/// farther.
-fn near(file: &str, key: &str, values: &[Vec3]) -> Result<(), Error> {
-    match values.iter().position(|v| v.abs().max_element() > MAX_COORDINATE) {
-        Some(index) => {
-            let message = format!("{} at row {index}, expected at most {MAX_COORDINATE} either way", values[index]);
-            Err(Error::invalid(file, key, message))
+/// Checks that every vector is finite and, for the precision of `f32`, below [`MAX_COORDINATE`].
+pub(crate) fn check_vectors(file: &str, key: &str, values: &[Vec3]) -> Result<(), Error> {
+    for (i, v) in values.iter().enumerate() {
+        if !v.is_finite() {
+            return Err(Error::not_finite(file, key, 3 * i));
         }
-        None => Ok(()),
+        if v.abs().max_element() > MAX_COORDINATE {
+            let message = format!("{v} at row {i}, expected coordinates of at most {MAX_COORDINATE}");
+            return Err(Error::invalid(file, key, message));
+        }
     }
-}
-
-fn finite(file: &str, key: &str, values: &[Vec3]) -> Result<(), Error> {
-    match values.iter().position(|v| !v.is_finite()) {
-        Some(index) => Err(Error::not_finite(file, key, 3 * index)),
-        None => Ok(()),
-    }
+    Ok(())
 }

@@ -6,32 +6,44 @@ use rayon::prelude::*;
 use crate::model::{BodyModel, Shaped, TERMS_PER_JOINT};
 use crate::rotation::rodrigues;
 
-/// Vertices a parallel task.
+/// Vertices per parallel task.
 pub(crate) const CHUNK: usize = 1024;
 
-/// Frames that share one pass over the pose blend shapes: a cache line of coefficients.
+/// Frames per pass over the pose blend shapes: a cache line of coefficients.
 const LANES: usize = 16;
 
-/// Vertices a parallel task of a batch. Their blend shapes stay in the second-level cache from one
-/// block of frames to the next, their offsets for all lanes in the first between the two passes.
+/// Vertices per parallel task of a batch: their blend shapes fit in the L2 cache, their offsets for
+/// all lanes in L1.
 const TILE: usize = 64;
 
-/// Dense rows of blend shapes that are summed side by side, so that additions do not wait for each
-/// other.
+/// Dense rows of blend shapes summed in an interleaved way, to hide the latency of additions.
 const GROUP: usize = 4;
 
-/// Place of a posed body in the world. The two differ in the point that the global rotation turns
-/// about.
+/// Global placement of a posed body. The variants differ in the centre of the global rotation.
+///
+/// ```
+/// use glam::Vec3;
+/// use smpl::{BodyModel, Placement};
+///
+/// let body = BodyModel::embedded();
+/// let (shaped, mut pose) = (body.shaped(&[]), vec![Vec3::ZERO; 24]);
+/// let turn = Vec3::Y * 1.5;
+/// let origin = Placement::Origin { rotation: turn, translation: Vec3::ZERO };
+/// let about_origin = body.pose(&shaped, &pose, origin);
+/// pose[0] = turn;
+/// let about_pelvis = body.pose(&shaped, &pose, Placement::Pelvis { translation: Vec3::ZERO });
+/// assert_eq!(about_pelvis.joints[0], shaped.joints[0]);
+/// assert!(about_origin.joints[0].distance(shaped.joints[0]) > 0.01);
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Placement {
-    /// SMPL's own: the root joint (pelvis) turns by `pose[0]` about itself, then everything moves
-    /// by `translation`.
+    /// SMPL's own: rotation by `pose[0]` about the root joint (pelvis), then `translation`.
     Pelvis {
-        /// Shift in the model's unit.
+        /// In the model's unit.
         translation: Vec3,
     },
-    /// ZJU-MoCap's: x = R(Rh) · lbs(pose with a zero root) + Th, a rotation about the **origin**.
-    /// `pose[0]` is not used.
+    /// ZJU-MoCap's: x = R(Rh) · lbs(pose with a zero root) + Th, rotation about the **origin**.
+    /// `pose[0]` is ignored.
     Origin {
         /// Rh, axis-angle.
         rotation: Vec3,
@@ -47,7 +59,7 @@ impl Default for Placement {
     }
 }
 
-/// A posed body in the world.
+/// A posed body in world space, from [`BodyModel::pose`].
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Posed {
     /// Vertices, (V).
@@ -73,8 +85,20 @@ impl BodyModel {
     /// Poses `shaped` (from [`BodyModel::shaped`] of this model) by the axis-angle rotations
     /// `pose`, (J), of each joint relative to its parent.
     ///
-    /// Work is spread over the current rayon pool; the result does not depend on its size, and
-    /// equals that of [`BodyModel::pose_batch`] bit for bit.
+    /// Runs on the current rayon pool. The result does not depend on its size and equals that of
+    /// [`BodyModel::pose_batch`] bit for bit.
+    ///
+    /// ```
+    /// use glam::Vec3;
+    /// use smpl::{BodyModel, Placement};
+    ///
+    /// let body = BodyModel::embedded();
+    /// let shaped = body.shaped(&[]);
+    /// let mut pose = vec![Vec3::ZERO; body.num_joints()];
+    /// pose[18].y = -1.5; // left elbow
+    /// let posed = body.pose(&shaped, &pose, Placement::default());
+    /// assert!(posed.joints[20].z > shaped.joints[20].z + 0.2, "the wrist has come forward");
+    /// ```
     ///
     /// # Panics
     /// If a length is not the model's.
@@ -92,8 +116,17 @@ impl BodyModel {
         Posed { vertices, joints: frame.joints, bones: frame.bones, pose_offsets }
     }
 
-    /// [`BodyModel::pose`] for many frames at once, which reads the pose blend shapes from memory
-    /// once for all of them.
+    /// [`BodyModel::pose`] for many frames; reads the pose blend shapes once per block of frames.
+    ///
+    /// ```
+    /// use glam::Vec3;
+    /// use smpl::{BodyModel, Placement};
+    ///
+    /// let body = BodyModel::embedded();
+    /// let (shaped, pose) = (body.shaped(&[]), vec![Vec3::splat(0.1); body.num_joints()]);
+    /// let frame = (&shaped, pose.as_slice(), Placement::default());
+    /// assert_eq!(body.pose_batch(&[frame; 3])[2], body.pose(&shaped, &pose, Placement::default()));
+    /// ```
     ///
     /// # Panics
     /// If a length is not the model's.
@@ -202,10 +235,10 @@ struct Kinematics {
     bones: Vec<Affine3A>,
 }
 
-// What runs under pulp's dispatch is a type of its own: a closure would not be inlined into the
-// function that carries the wide instructions, and be compiled without them.
+// The tasks dispatched by pulp are structs: a closure would not be inlined into the function that
+// enables the wide instructions.
 
-/// A run of vertices in one frame.
+/// Consecutive vertices of one frame.
 struct OneFrame<'a> {
     body: &'a BodyModel,
     frame: &'a Kinematics,
@@ -225,7 +258,7 @@ impl pulp::NullaryFnOnce for OneFrame<'_> {
         let count = self.offsets.len();
         let mut i = 0;
         while i < count {
-            // Rows of full length need no columns. Terms are added in the same order either way.
+            // Rows of full length need no columns. The order of summation is the same.
             let full = |k: usize| (rows[k + 1] - rows[k]) as usize == features.len();
             if i + GROUP <= count && (i..i + GROUP).all(full) {
                 let values = &self.body.posedirs.values[rows[i] as usize..][..GROUP * features.len()];
@@ -244,7 +277,7 @@ impl pulp::NullaryFnOnce for OneFrame<'_> {
     }
 }
 
-/// B_P of a group of vertices whose rows, `values`, hold every term.
+/// B_P of a group of vertices with dense rows `values`.
 #[inline(always)]
 fn dense_offsets(values: &[Vec3], features: &[f32]) -> [Vec3; GROUP] {
     let mut sums = [Vec3::ZERO; GROUP];

@@ -5,8 +5,15 @@ use glam::{DMat3, Mat3, Vec3};
 /// Rotation matrix of the axis-angle vector `axis_angle` (direction: axis; length: radians), by
 /// Rodrigues' formula R = I + a·K + b·K² with a = sin θ/θ and b = (1 − cos θ)/θ².
 ///
-/// Both coefficients are evaluated without cancellation, so that rotations of any size, zero
-/// included, are exact to rounding. A vector that is not finite gives a matrix of NaN.
+/// Both coefficients are evaluated without cancellation: exact to rounding at every angle, zero
+/// included. A vector that is not finite gives a matrix of NaN.
+///
+/// ```
+/// use glam::Vec3;
+///
+/// let quarter = smpl::rodrigues(Vec3::Z * std::f32::consts::FRAC_PI_2);
+/// assert!((quarter * Vec3::X).distance(Vec3::Y) < 1e-6);
+/// ```
 #[must_use]
 pub fn rodrigues(axis_angle: Vec3) -> Mat3 {
     // f64, because a product of a dozen of these is held against references in f64.

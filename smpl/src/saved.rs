@@ -1,4 +1,4 @@
-//! Bodies as safetensors: this crate's own form, bit-exact and quick to read.
+//! Bodies as safetensors: this crate's own format, bit-exact and fast to read.
 
 use std::collections::HashMap;
 use std::io::Write;
@@ -12,16 +12,25 @@ use crate::Error;
 use crate::model::BodyModel;
 use crate::sparse::SparseRows;
 
-/// Key and value of the header that tell what the file is, and in which version of the form.
+/// Key and value in the header that identify the format and its version.
 const FORMAT: (&str, &str) = ("format", "smpl-body 1");
 
 impl BodyModel {
-    /// Writes the model as `.safetensors`, which [`BodyModel::load`] reads back bit for bit. An old
-    /// file at `path` is there until the new one is complete.
+    /// Writes the model as `.safetensors`, which [`BodyModel::load`] reads back bit for bit. The
+    /// file is replaced atomically.
+    ///
+    /// ```
+    /// use smpl::BodyModel;
+    ///
+    /// let path = std::env::temp_dir().join("smpl_save_example.safetensors");
+    /// let body = BodyModel::embedded();
+    /// body.save(&path).unwrap();
+    /// assert_eq!(BodyModel::load(&path).unwrap(), body);
+    /// ```
     ///
     /// The header says `format: smpl-body 1`. Tensors: `v_template` (V,3), `f` (F,3), `shapedirs`
     /// (B,V,3), `parents` (J) with −1 for the root; `posedirs`, `weights` and `J_regressor` as
-    /// compressed sparse rows, each in three parts `.offsets`, `.columns` and `.values`. Equal
+    /// compressed sparse rows, in three parts each: `.offsets`, `.columns` and `.values`. Equal
     /// models give equal files.
     ///
     /// # Errors

@@ -1,7 +1,15 @@
-//! Sparse rows.
+//! Compressed sparse rows.
 
 /// Compressed sparse rows: the non-zero entries of row i are `columns[offsets[i]..offsets[i + 1]]`,
 /// columns ascending, with their `values`.
+///
+/// ```
+/// use smpl::SparseRows;
+///
+/// let matrix = SparseRows::from_rows([vec![(0, 0.25), (2, 0.75)], vec![]]);
+/// assert_eq!(matrix.num_rows(), 2);
+/// assert_eq!(matrix.row(0).collect::<Vec<_>>(), [(0, 0.25), (2, 0.75)]);
+/// ```
 #[derive(Clone, Debug, PartialEq)]
 pub struct SparseRows<T> {
     /// Start of each row, and the end of the last: (rows + 1), from 0, not decreasing.
@@ -12,11 +20,11 @@ pub struct SparseRows<T> {
     pub values: Vec<T>,
 }
 
-/// Skinning weights, (V, J): a row is a vertex, a column a joint.
+/// Skinning weights, (V, J): rows are vertices, columns joints.
 pub type SkinningWeights = SparseRows<f32>;
 
 impl<T: Copy> SparseRows<T> {
-    /// Collects the entries of each row in turn.
+    /// Collects (column, value) pairs, row by row.
     pub fn from_rows(rows: impl IntoIterator<Item = impl IntoIterator<Item = (u32, T)>>) -> Self {
         let mut out = Self { offsets: vec![0], columns: Vec::new(), values: Vec::new() };
         for row in rows {
@@ -38,14 +46,14 @@ impl<T: Copy> SparseRows<T> {
     /// The (column, value) pairs of row `row`.
     ///
     /// # Panics
-    /// If there is no such row.
+    /// If `row` is out of range.
     #[inline]
     pub fn row(&self, row: usize) -> impl Iterator<Item = (usize, T)> + '_ {
         let range = self.offsets[row] as usize..self.offsets[row + 1] as usize;
         self.columns[range.clone()].iter().zip(&self.values[range]).map(|(&column, &value)| (column as usize, value))
     }
 
-    /// The fault of the structure, if there is any.
+    /// Describes what is wrong with the structure, if anything.
     pub(crate) fn fault(&self, rows: usize, columns: usize) -> Option<String> {
         if self.offsets.len() != rows + 1 {
             return Some(format!("{} rows, expected {rows}", self.num_rows()));

@@ -131,7 +131,7 @@ fn the_shared_body_is_the_same_from_every_form() {
 }
 
 #[test]
-fn models_that_are_none_are_not_saved() {
+fn invalid_bodies_are_not_saved() {
     let mut body = BodyModel::embedded();
     body.v_template[3].x = f32::NAN;
     let path = temporary("never.safetensors");
@@ -196,7 +196,7 @@ proptest! {
 }
 
 #[test]
-fn bodies_without_a_surface_or_larger_than_anything_are_refused() {
+fn bodies_without_faces_or_with_huge_coordinates_are_refused() {
     let refused = |change: fn(&mut BodyModel), words: [&str; 2]| {
         let mut body = BodyModel::embedded();
         change(&mut body);

@@ -217,12 +217,12 @@ fn joints_follow_the_shape() {
 
 #[test]
 #[should_panic(expected = "11 betas, the model has 10")]
-fn too_many_betas_are_a_callers_bug() {
+fn too_many_betas_panic() {
     let _ = BODY.shaped(&[0.0; 11]);
 }
 
 #[test]
-fn likelihood_is_one_inside_then_falls_smoothly_to_nothing() {
+fn likelihood_is_one_inside_then_falls_smoothly_to_zero() {
     let field = SurfaceMotion { margin: 0.05, falloff: 0.1 };
     for d in [-1.0, -0.01, 0.0, 0.05] {
         assert_eq!(field.likelihood(d), 1.0);

@@ -145,7 +145,7 @@ fn refused(json: &str, binary: &[u8], words: &[&str]) {
 }
 
 #[test]
-fn wrong_documents_are_refused_by_what_is_wrong() {
+fn errors_name_the_fault_of_a_document() {
     let (json, binary) = arm();
     let swap = |from: &str, to: &str| {
         assert!(json.contains(from), "{from}");
@@ -162,8 +162,8 @@ fn wrong_documents_are_refused_by_what_is_wrong() {
     refused(&swap(r#""bufferView":0,"componentType":5126,"count":4"#, no_view), &binary, &["accessor 0", "no data"]);
     refused(&swap(r#""byteOffset":368,"byteLength":12"#, r#""byteOffset":368,"byteLength":13"#), &binary, &["view 7"]);
     refused(&swap(r#""byteLength":380"#, r#""byteLength":381"#), &binary, &["buffer 0", "381"]);
-    refused(&swap(r#""input":3"#, r#""input":33"#), &binary, &["animation 0", "item 33 of 8"]);
-    refused(&swap(r#""channels":[{"sampler":0"#, r#""channels":[{"sampler":9"#), &binary, &["animation 0", "item 9"]);
+    refused(&swap(r#""input":3"#, r#""input":33"#), &binary, &["animation 0", "index 33 of 8"]);
+    refused(&swap(r#""channels":[{"sampler":0"#, r#""channels":[{"sampler":9"#), &binary, &["animation 0", "index 9"]);
     refused(&swap(r#""joints":[0,1]"#, r#""joints":[0]"#), &binary, &["mesh 0", "joint 1 of 1"]);
     refused(&swap(r#""joints":[0,1]"#, r#""joints":[0,1,1]"#), &binary, &["skin 0", "2 inverse bind matrices for 3"]);
     refused(&swap(r#""indices":7"#, r#""indices":7,"mode":5"#), &binary, &["strips"]);
@@ -295,7 +295,7 @@ fn cut_characters_are_refused() {
 }
 
 #[test]
-fn joints_hang_on_the_nearest_joint_above() {
+fn parents_are_the_nearest_ancestor_joints() {
     let Some(character) = shared_character("makehuman_walk.glb") else { return };
     let (names, parents) = (&character.joint_names, character.joint_parents());
     let above = |name: &str| {
@@ -324,7 +324,7 @@ fn one_file_named_many_times_is_refused_before_it_fills_the_memory() {
 }
 
 #[test]
-fn vertices_beyond_anything_are_refused() {
+fn huge_coordinates_are_refused() {
     let (json, mut bytes) = arm();
     bytes[..4].copy_from_slice(&1e30f32.to_le_bytes());
     let message = Character::from_bytes("arm.glb", &glb(&json, &bytes)).unwrap_err().to_string();

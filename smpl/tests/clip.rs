@@ -85,7 +85,7 @@ fn frames_are_interpolated_and_held_at_the_ends() {
 }
 
 #[test]
-fn wrong_clips_are_refused() {
+fn invalid_clips_are_refused() {
     let good = |key: &str| match key {
         "poses" => floats(&[2, 72], &[0.0; 144]),
         "trans" => floats(&[2, 3], &[0.0; 6]),

@@ -27,7 +27,7 @@ fn obj_files_keep_their_order_and_split_polygons() {
 }
 
 #[test]
-fn wrong_obj_files_are_refused_by_line() {
+fn errors_of_obj_files_name_the_line() {
     for (text, word) in [
         ("v 0 0\n", "line 1"),
         ("v 0 0 0\nv 0 nan 0\n", "line 2"),

@@ -132,7 +132,7 @@ fn gradients_do_not_depend_on_the_number_of_threads() {
 
 #[test]
 #[should_panic(expected = "pose_backward: d_vertices")]
-fn cotangents_of_another_length_are_a_callers_bug() {
+fn cotangents_of_another_length_panic() {
     let shaped = BODY.shaped(&[]);
     let posed = BODY.pose(&shaped, &[Vec3::ZERO; 24], Placement::default());
     let _ = BODY.pose_backward(&shaped, &[Vec3::ZERO; 24], Placement::default(), &posed, &[Vec3::ZERO; 3], &[]);

@@ -3,7 +3,7 @@
 //! the mean error around it, front and back, and a slice through armpits and crotch.
 //!
 //! `blended_error [FOLDER] [BODY.npz]`: writes `blended_error.png` and `blended_slice.png` into
-//! FOLDER (default `.`). Without BODY, the embedded body of `smpl`, whose hands are mittens.
+//! FOLDER (default `.`). Without BODY, the embedded body of `smpl`.
 
 use std::path::{Path, PathBuf};
 

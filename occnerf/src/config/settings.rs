@@ -63,11 +63,9 @@ impl OccludedRule {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum MotionKind {
-    /// Weight volume whose prior is the skinning weights diffused into space; learnable.
+    /// The paper's learnable weight volume with oriented Gaussians as prior, which has holes at the
+    /// joints.
     Volume,
-    /// Weight volume with the published oriented Gaussians, which has holes at the joints;
-    /// learnable.
-    Gaussian,
     /// Skinning weights of the nearest point of the posed surface.
     Surface,
 }
@@ -221,7 +219,7 @@ pub struct SurfaceConfig {
 pub struct MotionConfig {
     /// Volume or surface.
     pub kind: MotionKind,
-    /// Samples an axis of the weight volume of the volume kinds.
+    /// Samples an axis of the weight volume.
     #[serde(default = "published_resolution")]
     pub resolution: usize,
     /// Distance from the prior's surface up to which a point can belong to the subject, normalised

@@ -63,16 +63,16 @@ impl Model {
         if config.surface.visibility == VisibilityKind::CountedPerArea {
             field.count_scale = body.area_scale();
         }
-        let volume = |weights: WeightVolume| MotionField::Volume { weights, threshold: VOLUME_THRESHOLD };
-        let (prior, shaped) = (&body.model, &body.canonical);
-        let layout = WeightVolumeConfig { resolution: config.motion.resolution, ..Default::default() };
         let motion = match config.motion.kind {
             MotionKind::Surface => {
                 let (margin, falloff) = (config.motion.margin, config.motion.falloff);
                 MotionField::Surface(SurfaceMotion { margin, falloff })
             }
-            MotionKind::Volume => volume(WeightVolume::diffused(prior, shaped, &layout)),
-            MotionKind::Gaussian => volume(WeightVolume::gaussian(prior, shaped, &layout)),
+            MotionKind::Volume => {
+                let layout = WeightVolumeConfig { resolution: config.motion.resolution, ..Default::default() };
+                let weights = WeightVolume::gaussian(&body.model, &body.canonical, &layout);
+                MotionField::Volume { weights, threshold: VOLUME_THRESHOLD }
+            }
         };
         let (near_canonical, log_weights) = match &motion {
             MotionField::Surface(_) => (Occupancy::default(), 0),

@@ -12,23 +12,21 @@ use gltf::json::{Index, Root};
 
 use crate::Error;
 
-/// Bytes that all accessors together may decode to: 256 MiB.
+/// Total decoded size of all accessors, in bytes: 256 MiB.
 const MAX_DECODED_BYTES: u64 = 1 << 28;
-/// What the buffers and the pictures of a document may come to, in bytes: 512 MiB. A document may
-/// name one file many times.
+/// Total size of buffers and images, in bytes: 512 MiB. A document may name one file many times.
 const MAX_RESOLVED_BYTES: u64 = 1 << 29;
 
-/// A document and the bytes that its accessors and images point into. Nothing in it is taken on
-/// trust: every index and range is checked where it is used.
+/// A document with its buffers. Every index and range is checked where it is used.
 pub(super) struct Source<'a> {
     pub(super) file: &'a str,
     pub(super) root: &'a Root,
-    /// Directory where other files may lie; `None` admits none.
+    /// Directory of files it may refer to; `None` allows none.
     folder: Option<&'a Path>,
     data: Vec<Vec<u8>>,
-    /// Bytes that may still be decoded: many accessors may share one range.
+    /// Remaining budget of decoded bytes: many accessors may share one range.
     left: Cell<u64>,
-    /// Bytes that addresses may still lead to.
+    /// Remaining budget of bytes read through URIs.
     resolvable: Cell<u64>,
 }
 
@@ -52,10 +50,10 @@ impl<'a> Source<'a> {
             let place = format!("buffer {i}");
             let bytes = match &buffer.uri {
                 Some(uri) => source.resolve(&place, uri)?.1,
-                None => blob.take().ok_or_else(|| source.invalid(&place, "neither an address nor a chunk"))?,
+                None => blob.take().ok_or_else(|| source.invalid(&place, "neither a URI nor a binary chunk"))?,
             };
             if buffer.byte_length.0 > bytes.len() as u64 {
-                let message = format!("{} bytes announced, {} there", buffer.byte_length.0, bytes.len());
+                let message = format!("{} bytes declared, {} present", buffer.byte_length.0, bytes.len());
                 return Err(source.invalid(&place, message));
             }
             source.data.push(bytes);
@@ -63,9 +61,9 @@ impl<'a> Source<'a> {
         Ok(source)
     }
 
-    /// The item that `index` names, for what stands at `place`.
+    /// The item at `index`; errors name `place`.
     pub(super) fn get<'b, T>(&self, items: &'b [T], index: Index<T>, place: &str) -> Result<&'b T, Error> {
-        let missing = || self.invalid(place, format!("it names item {index} of {}", items.len()));
+        let missing = || self.invalid(place, format!("index {index} of {}", items.len()));
         items.get(index.value()).ok_or_else(missing)
     }
 
@@ -142,7 +140,7 @@ impl<'a> Source<'a> {
         Ok(out)
     }
 
-    /// Finite floats; integers are taken only as normalised.
+    /// Finite floats; integers only if normalised.
     pub(super) fn floats<const N: usize>(&self, index: Index<Accessor>, place: &str) -> Result<Vec<[f32; N]>, Error> {
         self.elements(index, place, |kind, normalized, bytes| match kind {
             ComponentType::F32 => Some(f32::from_le_bytes(bytes.try_into().ok()?)).filter(|x| x.is_finite()),
@@ -165,12 +163,12 @@ impl<'a> Source<'a> {
         })
     }
 
-    /// Media type and bytes of a data URI, or of a file in the folder. Addresses that leave the
-    /// folder are refused.
+    /// Media type and bytes of a data URI, or of a file in the folder. URIs that leave the folder
+    /// are refused.
     pub(super) fn resolve(&self, place: &str, uri: &str) -> Result<(String, Vec<u8>), Error> {
         if let Some(rest) = uri.strip_prefix("data:") {
             let Some((mime, text)) = rest.split_once(";base64,") else {
-                return Err(self.invalid(place, "a data address that is not base64"));
+                return Err(self.invalid(place, "a data URI that is not base64"));
             };
             self.spend(place, text.len() as u64 / 4 * 3)?;
             let bytes = base64::engine::general_purpose::STANDARD.decode(text);
@@ -185,11 +183,11 @@ impl<'a> Source<'a> {
                 self.spend(place, std::fs::metadata(&path).map_or(0, |file| file.len()))?;
                 Ok((String::new(), read_file(&path)?))
             }
-            _ => Err(self.invalid(place, format!("the address {uri:?} does not lead to a file beside it"))),
+            _ => Err(self.invalid(place, format!("the URI {uri:?} does not name a file beside it"))),
         }
     }
 
-    /// Takes what an address leads to off what the document may still ask for.
+    /// Charges the bytes behind a URI to the document's budget.
     fn spend(&self, place: &str, bytes: u64) -> Result<(), Error> {
         let left = self.resolvable.get().checked_sub(bytes).ok_or_else(|| {
             let claimed = u128::from(MAX_RESOLVED_BYTES - self.resolvable.get()) + u128::from(bytes);

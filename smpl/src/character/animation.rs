@@ -4,10 +4,10 @@ use glam::{Quat, Vec3, Vec4};
 
 use super::Local;
 
-/// An animation of a [`super::Character`]'s nodes.
+/// Keyframe animation of a [`super::Character`]'s nodes, applied by [`super::Character::pose`].
 #[derive(Clone, Debug, PartialEq)]
 pub struct Animation {
-    /// Empty where the file gives none.
+    /// Empty if the file gives none.
     pub name: String,
     /// Time of the last key, in seconds.
     pub duration: f32,
@@ -21,7 +21,7 @@ pub(super) struct Channel {
     pub(super) interpolation: Interpolation,
     /// Seconds, increasing, at least one.
     pub(super) times: Vec<f32>,
-    /// A value a key; in-tangent, value and out-tangent for cubic splines. Vectors leave w at 0.
+    /// One value per key; in-tangent, value and out-tangent for cubic splines. Vectors have w = 0.
     pub(super) values: Vec<Vec4>,
 }
 
@@ -40,8 +40,7 @@ pub(super) enum Interpolation {
 }
 
 impl Animation {
-    /// Replaces what the channels drive. Nodes given as matrices are left alone; the reader admits
-    /// none with a channel.
+    /// Replaces the animated transforms. The reader refuses channels of nodes given as matrices.
     pub(super) fn apply(&self, seconds: f32, locals: &mut [Local]) {
         for channel in &self.channels {
             let value = channel.at(seconds);
@@ -94,7 +93,7 @@ pub(super) fn unit(q: Vec4) -> Quat {
     q.try_normalize().map_or(Quat::IDENTITY, Quat::from_vec4)
 }
 
-/// Pads a vector to the width of the values.
+/// Pads a vector to four components.
 pub(super) fn widen(v: [f32; 3]) -> Vec4 {
     Vec3::from(v).extend(0.0)
 }

@@ -16,16 +16,31 @@ use crate::sparse::SkinningWeights;
 /// A rigged character: every triangle mesh of a glTF scene merged into one, with V vertices and J
 /// joints.
 ///
-/// Meshes without a skin are bound rigidly to a joint that stands for their node. Not read: morph
-/// targets, sparse accessors, materials other than the first base-colour texture. Lengths are
-/// metres, y up, as in glTF.
+/// Meshes without a skin are bound rigidly to an extra joint for their node. Not read: morph
+/// targets, sparse accessors, materials other than the first base-colour texture. Metres, y up, as
+/// in glTF.
+///
+/// ```
+/// // One triangle without a skin: it follows its node, 1 m up.
+/// let gltf = r#"{"asset": {"version": "2.0"},
+///     "nodes": [{"mesh": 0, "translation": [0, 1, 0]}],
+///     "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}],
+///     "accessors": [{"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3",
+///                    "min": [0, 0, 0], "max": [1, 1, 0]}],
+///     "bufferViews": [{"buffer": 0, "byteLength": 36}],
+///     "buffers": [{"byteLength": 36, "uri":
+///         "data:application/octet-stream;base64,AAAAAAAAAAAAAAAAAACAPwAAAAAAAAAAAAAAAAAAgD8AAAAA"}]}"#;
+/// let character = smpl::Character::from_bytes("triangle.gltf", gltf.as_bytes()).unwrap();
+/// assert_eq!((character.num_joints(), character.faces.len()), (1, 1));
+/// assert_eq!(character.rest().vertices[1], glam::Vec3::new(1.0, 1.0, 0.0));
+/// ```
 #[derive(Clone, Debug, PartialEq)]
 pub struct Character {
-    /// Vertices as the file has them, in the space that the inverse bind matrices start from, (V).
+    /// Vertices in bind space, as in the file, (V).
     pub vertices: Vec<Vec3>,
-    /// Normals in that space, (V); empty if any part of the mesh has none.
+    /// Normals in bind space, (V); empty if any primitive has none.
     pub normals: Vec<Vec3>,
-    /// Texture coordinates, (V), v downward; empty if any part of the mesh has none.
+    /// Texture coordinates, (V), v downward; empty if any primitive has none.
     pub uvs: Vec<Vec2>,
     /// Triangles, (F), counter-clockwise seen from outside.
     pub faces: Vec<[u32; 3]>,
@@ -46,16 +61,16 @@ pub struct Character {
     joint_nodes: Vec<usize>,
 }
 
-/// An encoded picture.
+/// An encoded image, [`Character::texture`].
 #[derive(Clone, Debug, PartialEq)]
 pub struct Texture {
-    /// Usually `image/png` or `image/jpeg`; empty where the file does not say.
+    /// Media type, usually `image/png` or `image/jpeg`; empty if the file does not state it.
     pub mime: String,
-    /// The file's own bytes.
+    /// The encoded bytes.
     pub bytes: Vec<u8>,
 }
 
-/// A posed character in the world.
+/// A posed character in world space, from [`Character::pose`].
 #[derive(Clone, Debug, PartialEq)]
 pub struct CharacterPose {
     /// Vertices, (V).
@@ -85,21 +100,21 @@ enum Local {
 }
 
 impl Character {
-    /// J.
+    /// Number of joints, J.
     #[must_use]
     pub fn num_joints(&self) -> usize {
         self.joint_nodes.len()
     }
 
-    /// The nearest joint above each, (J): that of the nearest node above which is a joint. Of
-    /// joints that share a node the first is above the others.
+    /// Parent of each joint, (J): the joint of the nearest ancestor node that is one. Of joints that
+    /// share a node, the first is the parent of the others.
     #[must_use]
     pub fn joint_parents(&self) -> Vec<Option<usize>> {
         let mut first = vec![None; self.nodes.len()];
         for (joint, &node) in self.joint_nodes.iter().enumerate().rev() {
             first[node] = Some(joint);
         }
-        let above = |(joint, &node): (usize, &usize)| {
+        let parent = |(joint, &node): (usize, &usize)| {
             if first[node] != Some(joint) {
                 return first[node];
             }
@@ -112,25 +127,25 @@ impl Character {
             }
             None
         };
-        self.joint_nodes.iter().enumerate().map(above).collect()
+        self.joint_nodes.iter().enumerate().map(parent).collect()
     }
 
-    /// The character as its nodes stand in the file.
+    /// The character in the pose of the file's nodes.
     #[must_use]
     pub fn rest(&self) -> CharacterPose {
-        self.place(self.nodes.iter().map(|n| n.rest).collect())
+        self.posed(self.nodes.iter().map(|n| n.rest).collect())
     }
 
-    /// The character at `seconds` of animation `animation`, held before its first and after its
-    /// last key. Nodes that it does not move stand as in the file.
+    /// The character at `seconds` of animation `animation`; time is clamped to the keys. Nodes
+    /// without a channel keep the file's transform.
     ///
     /// # Panics
-    /// If there is no such animation.
+    /// If `animation` is out of range.
     #[must_use]
     pub fn pose(&self, animation: usize, seconds: f32) -> CharacterPose {
         let mut locals: Vec<Local> = self.nodes.iter().map(|n| n.rest).collect();
         self.animations[animation].apply(seconds, &mut locals);
-        self.place(locals)
+        self.posed(locals)
     }
 
     /// Linear blend skinning by `bones`, (J): Σ w_vi · bones_i · vertices_v, (V).
@@ -150,7 +165,7 @@ impl Character {
         out
     }
 
-    fn place(&self, locals: Vec<Local>) -> CharacterPose {
+    fn posed(&self, locals: Vec<Local>) -> CharacterPose {
         let mut world = vec![Affine3A::IDENTITY; self.nodes.len()];
         for &node in &self.order {
             let local = locals[node].matrix();

@@ -1,4 +1,4 @@
-//! The mesh of a character, part by part.
+//! Mesh primitives of a character.
 
 use glam::{Vec2, Vec3};
 use gltf::json::accessor::Accessor;
@@ -13,8 +13,8 @@ use crate::Error;
 use crate::model::MAX_COORDINATE;
 
 impl Character {
-    /// Appends a primitive's vertices and triangles. `skinned`: its own joints and weights count,
-    /// within `joints`; else it follows the first of those.
+    /// Appends a primitive's vertices and triangles. If `skinned`, its joint indices are relative to
+    /// `joints`; else it is bound to the first of those.
     pub(super) fn add_primitive(
         &mut self,
         source: &Source<'_>,
@@ -35,12 +35,12 @@ impl Character {
         let positions = attribute(Semantic::Positions).ok_or_else(|| invalid("no positions".to_owned()))?;
         let positions = source.floats::<3>(positions, &format!("{place}, POSITION"))?;
         if let Some(far) = positions.iter().find(|p| p.iter().any(|x| x.abs() > MAX_COORDINATE)) {
-            return Err(invalid(format!("POSITION {far:?}: expected at most {MAX_COORDINATE} either way")));
+            return Err(invalid(format!("POSITION {far:?}: expected coordinates of at most {MAX_COORDINATE}")));
         }
         let (first, count) = (self.vertices.len() as u32, positions.len());
         self.vertices.extend(positions.into_iter().map(Vec3::from));
         let fits = |n: usize, name: &str| {
-            if n == count { Ok(()) } else { Err(invalid(format!("{n} of {name} for {count} positions"))) }
+            if n == count { Ok(()) } else { Err(invalid(format!("{n} {name} for {count} positions"))) }
         };
         if let Some(normals) = attribute(Semantic::Normals) {
             let normals = source.floats::<3>(normals, &format!("{place}, NORMAL"))?;
@@ -66,7 +66,7 @@ impl Character {
             None => (0..count as u32).collect(),
         };
         if !corners.len().is_multiple_of(3) {
-            return Err(invalid(format!("{} corners of triangles", corners.len())));
+            return Err(invalid(format!("{} triangle corners", corners.len())));
         }
         if let Some(bad) = corners.iter().find(|&&c| c as usize >= count) {
             return Err(invalid(format!("index {bad} of {count} vertices")));
@@ -89,8 +89,8 @@ impl Character {
         Ok(())
     }
 
-    /// Appends a vertex's weights, normalised, one entry a joint. Without any weight, where glTF
-    /// leaves it open, `default` keeps the vertex with the body.
+    /// Appends a vertex's weights, normalised, with one entry per joint. A vertex without weights,
+    /// undefined in glTF, is bound to `default`.
     fn push_weights(&mut self, mut row: Vec<(u32, f32)>, default: u32) {
         if row.is_empty() {
             row.push((default, 1.0));
@@ -110,7 +110,7 @@ impl Character {
     }
 }
 
-/// Adds one set of four joints and weights a vertex.
+/// Adds one set of four joints and weights per vertex.
 fn influences(
     source: &Source<'_>,
     place: &str,
@@ -157,6 +157,6 @@ fn texture(source: &Source<'_>, place: &str, colour: &gltf::json::texture::Info)
             let (found, bytes) = source.resolve(&place, uri)?;
             Ok(Texture { mime: mime.unwrap_or(found), bytes })
         }
-        (None, None) => Err(source.invalid(&place, "neither an address nor a buffer view")),
+        (None, None) => Err(source.invalid(&place, "neither a URI nor a buffer view")),
     }
 }

@@ -16,15 +16,15 @@ use crate::Error;
 use crate::sparse::SparseRows;
 
 impl Character {
-    /// Reads a `.glb`, or a `.gltf` whose buffers are data addresses or files beside it.
+    /// Reads a `.glb`, or a `.gltf` whose buffers are data URIs or files beside it.
     ///
     /// # Errors
-    /// Any [`Error`]; those about the content name the part of the document.
+    /// Any [`Error`]; errors of the content name the part of the document.
     pub fn load(path: &Path) -> Result<Self, Error> {
         read(&path.display().to_string(), &read_file(path)?, path.parent())
     }
 
-    /// Reads a character from bytes in memory, which may not point to other files; `file` names
+    /// Reads a character from bytes in memory, which may not refer to other files; `file` names
     /// them in errors.
     ///
     /// # Errors
@@ -136,8 +136,7 @@ fn nodes(source: &Source<'_>) -> Result<Vec<Node>, Error> {
     Ok(out)
 }
 
-/// Nodes with parents before children. A cycle has no root, so what is not reached is on one or
-/// below it.
+/// Nodes with parents before children. Nodes not reached from a root are on a cycle or below one.
 fn order(source: &Source<'_>, nodes: &[Node]) -> Result<Vec<usize>, Error> {
     let mut children = vec![Vec::new(); nodes.len()];
     let mut order = Vec::with_capacity(nodes.len());
@@ -158,7 +157,7 @@ fn order(source: &Source<'_>, nodes: &[Node]) -> Result<Vec<usize>, Error> {
     Ok(order)
 }
 
-/// The nodes of the default scene, else of the first, else all; in the file's order.
+/// Nodes of the default scene, else of the first, else all, in the file's order.
 fn in_scene(source: &Source<'_>) -> Result<Vec<usize>, Error> {
     let root = source.root;
     let scene = match root.scene {
@@ -179,7 +178,7 @@ fn in_scene(source: &Source<'_>) -> Result<Vec<usize>, Error> {
     Ok((0..seen.len()).filter(|&i| seen[i]).collect())
 }
 
-/// Consecutive joints of a [`Character`]: the first, and how many.
+/// Consecutive joints of a [`Character`]: first and count.
 pub(super) type Joints = (u32, u32);
 
 impl Character {

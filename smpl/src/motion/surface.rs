@@ -10,11 +10,26 @@ use crate::pose::{Posed, blend};
 ///
 /// The likelihood is 1 inside the body and outside up to `margin` from it, then falls with a
 /// continuous derivative to 0 at `margin + falloff`.
+///
+/// ```
+/// use glam::Vec3;
+/// use smpl::{BodyModel, Placement, SurfaceMotion};
+///
+/// let body = BodyModel::embedded();
+/// let shaped = body.shaped(&[]);
+/// let posed = body.pose(&shaped, &vec![Vec3::splat(0.1); 24], Placement::default());
+/// // 1 cm outside the first corner of face 10:
+/// let [a, b, c] = body.faces[10].map(|v| posed.vertices[v as usize]);
+/// let x = a + 0.01 * (b - a).cross(c - a).normalize_or_zero();
+/// let sample = SurfaceMotion::default().map(&body, &posed, x, 10, [1.0, 0.0, 0.0], 0.01).unwrap();
+/// let off = sample.canonical.distance(shaped.vertices[body.faces[10][0] as usize]);
+/// assert!((off - 0.01).abs() < 1e-3 && sample.likelihood == 1.0);
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SurfaceMotion {
     /// Distance from the surface up to which f is 1, in the unit of the model.
     pub margin: f32,
-    /// Length over which f falls to 0 beyond the margin, in the unit of the model; 0 gives a step.
+    /// Width of the fall of f to 0 beyond the margin, in the unit of the model; 0 gives a step.
     pub falloff: f32,
 }
 
@@ -36,8 +51,8 @@ impl SurfaceMotion {
     ///
     /// `None` (dead) where the likelihood is 0, and for anything not finite.
     ///
-    /// Weak spots: x̂ jumps where the nearest point does (the medial axis, so also between touching
-    /// limbs), and where a fold is so sharp that one bone takes over.
+    /// Limits: x̂ is discontinuous where the nearest point is (on the medial axis, so also between
+    /// touching limbs), and where a fold is so sharp that one bone takes over.
     ///
     /// # Panics
     /// If `face` is not a face of `model`, or `posed` is not of it.
@@ -82,18 +97,10 @@ impl SurfaceMotion {
         let s = beyond / self.falloff;
         1.0 - s * s * (3.0 - 2.0 * s)
     }
-
-    /// Derivative of [`SurfaceMotion::likelihood`] with respect to the distance; 0 where that has
-    /// none.
-    #[must_use]
-    pub fn likelihood_slope(&self, signed_distance: f32) -> f32 {
-        let s = (signed_distance - self.margin) / self.falloff;
-        if s > 0.0 && s < 1.0 { -6.0 * s * (1.0 - s) / self.falloff } else { 0.0 }
-    }
 }
 
-/// The joint with the largest total weight, the lower of equals.
-pub(super) fn heaviest(weights: impl Iterator<Item = (usize, f32)>) -> usize {
+/// The joint with the largest total weight; of equals, the lower.
+fn heaviest(weights: impl Iterator<Item = (usize, f32)>) -> usize {
     let mut totals: Vec<(usize, f32)> = Vec::new();
     for (joint, w) in weights {
         match totals.iter_mut().find(|(j, _)| *j == joint) {

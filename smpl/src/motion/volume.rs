@@ -1,84 +1,144 @@
-//! The volume kind: canonical weight volumes.
+//! The volume kind: learnable weight volumes in canonical space (HumanNeRF, Weng et al. 2022).
 
-use glam::{Affine3A, Vec3, Vec3A};
+use glam::{Affine3A, Mat3, Vec3, Vec3A};
 use rayon::prelude::*;
 
 use super::MotionSample;
+use crate::model::{BodyModel, Shaped};
 
-/// Voxels a parallel task of the softmax.
-pub(super) const BLOCK: usize = 2048;
+/// Samples per parallel task of the softmax.
+const BLOCK: usize = 2048;
+/// Least prior of the background: with 0, learning could not raise it inside the body.
+const BACKGROUND_FLOOR: f32 = 1e-3;
+/// A bone is switched off at samples where its Gaussian is below this. The tails matter at the
+/// joints.
+const GAUSSIAN_CUT: f32 = 1e-4;
 
-/// Layout and initial values of a [`WeightVolume`]. Lengths are in the unit of the model; defaults
-/// fit metres.
+/// Layout and prior of a [`WeightVolume`]. Lengths are in the unit of the model; the defaults fit
+/// metres.
+///
+/// ```
+/// use smpl::{BodyModel, WeightVolume, WeightVolumeConfig};
+///
+/// let body = BodyModel::embedded();
+/// let coarse = WeightVolumeConfig { resolution: 16, ..Default::default() };
+/// let volume = WeightVolume::gaussian(&body, &body.shaped(&[]), &coarse);
+/// assert_eq!(volume.weights.len(), 25 * 16 * 16 * 16);
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct WeightVolumeConfig {
-    /// Samples an axis, at least 2. 32 is the paper's.
+    /// Samples per axis, at least 2. 32 is the paper's.
     pub resolution: usize,
-    /// Diffused prior: the body takes everything up to this distance from the surface. It is raised
-    /// to 0.7 of a cell's diagonal where that is longer, so that interpolation at the surface sees
-    /// hardly any background. The smaller, the less do limbs close to each other disturb each
-    /// other.
-    pub margin: f32,
-    /// Diffused prior: the background takes over along this length beyond the margin.
-    pub falloff: f32,
-    /// Gaussian prior: standard deviation along a bone, as a fraction of its length.
-    pub gaussian_along: f32,
-    /// Gaussian prior: standard deviation across a bone.
-    pub gaussian_across: f32,
+    /// Standard deviation of a Gaussian along its bone, as a fraction of the bone's length.
+    pub along: f32,
+    /// Standard deviation of a Gaussian across its bone. The box is that much larger than the
+    /// body's on every side.
+    pub across: f32,
 }
 
 impl Default for WeightVolumeConfig {
     fn default() -> Self {
-        Self { resolution: 32, margin: 0.03, falloff: 0.03, gaussian_along: 0.18, gaussian_across: 0.09 }
+        Self { resolution: 32, along: 0.18, across: 0.09 }
     }
 }
 
 /// Motion field of learnable weights on a grid in canonical space.
 ///
-/// K + 1 channels, one a joint and the background last, on `resolution`³ samples that span `min` to
-/// `max` with samples on the faces of the box. Layout of every array: (K+1, n, n, n) for channel,
+/// K + 1 channels, one per joint and the background last, on `resolution`³ samples that span `min`
+/// to `max` with samples on the faces of the box. Layout of every array: (K+1, n, n, n) for channel,
 /// z, y, x.
+///
+/// The prior has holes: Σ w is about 0.9 in the middle of a thigh and a few percent at knees and
+/// elbows, in the canonical pose already. There f, and with it the opacity, starts low, and limbs
+/// come apart until Δ has filled the holes. [`super::SurfaceMotion`] has none.
+///
+/// ```
+/// use smpl::{BodyModel, Placement, WeightVolume, WeightVolumeConfig};
+///
+/// let body = BodyModel::embedded();
+/// let shaped = body.shaped(&[]);
+/// let volume = WeightVolume::gaussian(&body, &shaped, &WeightVolumeConfig::default());
+/// let posed = body.pose(&shaped, &vec![glam::Vec3::ZERO; 24], Placement::default());
+/// let thigh = shaped.joints[1].midpoint(shaped.joints[4]);
+/// let sample = volume.map(&posed.to_canonical(), thigh, 1e-3).unwrap();
+/// assert!(sample.canonical.distance(thigh) < 1e-4 && sample.likelihood > 0.8);
+/// ```
 #[derive(Clone, Debug, PartialEq)]
 pub struct WeightVolume {
-    /// Samples an axis, n.
+    /// Samples per axis, n.
     pub resolution: usize,
     /// Corner of the first sample.
     pub min: Vec3,
     /// Corner of the last sample.
     pub max: Vec3,
-    /// K + 1.
+    /// K + 1, one per joint and the background.
     pub channels: usize,
-    /// Logarithm of the prior; −∞ where a channel is switched off for good.
+    /// Logarithm of the prior; −∞ where a channel is switched off permanently.
     pub log_prior: Vec<f32>,
     /// Δ, learnable, 0 at the start. Call [`WeightVolume::update`] after changing it.
     pub delta: Vec<f32>,
     /// softmax over the channels of `log_prior + delta`.
     pub weights: Vec<f32>,
     /// Range of samples x, y, z in which each bone's prior is above −∞.
-    pub(super) support: Vec<Support>,
+    support: Vec<Support>,
 }
 
-/// Box, in steps of the grid from its first sample and inclusive, outside which interpolated
-/// weights are 0. Empty where low is above high.
+/// Box in grid units, inclusive, outside which the interpolated weights are 0. Empty if low > high.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) struct Support {
+struct Support {
     low: Vec3A,
     high: Vec3A,
 }
 
-/// A cell and a position in it.
-pub(super) struct Cell {
+/// Trilinear interpolation in one cell.
+struct Cell {
     /// Flat index of the corner with the smallest coordinates, within a channel.
-    pub(super) corner: usize,
+    corner: usize,
     /// Weights of the eight corners, x fastest.
-    pub(super) mix: [f32; 8],
-    /// Position in the cell, 0 to 1.
-    pub(super) t: Vec3,
+    mix: [f32; 8],
 }
 
 impl WeightVolume {
+    /// The paper's prior: bone i, from joint i to each of its children (leaves: to twice the mean
+    /// of their own vertices), is an oriented Gaussian g_i; the background is 1 − min(Σ g, 1).
+    ///
+    /// # Panics
+    /// If the resolution is below 2, or `shaped` is not of `model`.
+    #[must_use]
+    pub fn gaussian(model: &BodyModel, shaped: &Shaped, config: &WeightVolumeConfig) -> Self {
+        let n = config.resolution;
+        assert!(n >= 2, "weight volume: resolution {n}, need at least 2");
+        let min = shaped.vertices.iter().copied().fold(Vec3::INFINITY, Vec3::min) - config.across;
+        let max = shaped.vertices.iter().copied().fold(Vec3::NEG_INFINITY, Vec3::max) + config.across;
+        let cell = (max - min) / (n - 1) as f32;
+        let (samples, joints) = (n.pow(3), model.num_joints());
+        let mut prior = vec![0.0f32; samples * (joints + 1)];
+        let (body, background) = prior.split_at_mut(samples * joints);
+        for (joint, channel) in body.chunks_exact_mut(samples).enumerate() {
+            let start = shaped.joints[joint];
+            let children = (0..joints).filter(|&child| model.parents[child] == Some(joint));
+            let mut ends: Vec<Vec3> = children.map(|child| shaped.joints[child]).collect();
+            if ends.is_empty() {
+                ends.push(2.0 * own_centre(model, shaped, joint) - start);
+            }
+            let bones: Vec<Gaussian> = ends.iter().map(|&end| Gaussian::new(start, end, config)).collect();
+            for (i, value) in channel.iter_mut().enumerate() {
+                let x = min + Vec3::new((i % n) as f32, (i / n % n) as f32, (i / (n * n)) as f32) * cell;
+                let g: f32 = bones.iter().map(|g| g.value(x)).sum();
+                if g > GAUSSIAN_CUT {
+                    *value = g.min(1.0);
+                    background[i] += g;
+                }
+            }
+        }
+        for value in background {
+            *value = (1.0 - value.min(1.0)).max(BACKGROUND_FLOOR);
+        }
+        Self::from_prior(n, min, max, &prior)
+    }
+
     /// Builds a volume from a prior, (K+1, n, n, n), whose channels sum to 1 at every sample.
-    pub(super) fn from_prior(resolution: usize, min: Vec3, max: Vec3, prior: &[f32]) -> Self {
+    fn from_prior(resolution: usize, min: Vec3, max: Vec3, prior: &[f32]) -> Self {
         let samples = resolution.pow(3);
         let channels = prior.len() / samples;
         let log_prior: Vec<f32> = prior.iter().map(|p| p.ln()).collect();
@@ -104,8 +164,7 @@ impl WeightVolume {
         let samples = self.resolution.pow(3);
         let (log_prior, delta) = (&self.log_prior, &self.delta);
         let logit = |i: usize| log_prior[i] + delta[i];
-        // Blocks of every channel, regrouped by block, so that a task owns one block of all
-        // channels.
+        // Regrouped by block: a task owns one block of all channels.
         let mut blocks: Vec<Vec<&mut [f32]>> = Vec::new();
         blocks.resize_with(samples.div_ceil(BLOCK), Vec::new);
         for channel in self.weights.chunks_exact_mut(samples) {
@@ -116,17 +175,18 @@ impl WeightVolume {
         blocks.par_iter_mut().enumerate().for_each(|(block, parts)| {
             let start = block * BLOCK;
             let length = parts[0].len();
-            let mut most = vec![f32::NEG_INFINITY; length];
+            let mut largest = vec![f32::NEG_INFINITY; length];
             for channel in 0..parts.len() {
                 for i in 0..length {
-                    most[i] = most[i].max(logit(channel * samples + start + i));
+                    largest[i] = largest[i].max(logit(channel * samples + start + i));
                 }
             }
             let mut sum = vec![0.0f32; length];
             for (channel, part) in parts.iter_mut().enumerate() {
                 for i in 0..length {
                     let index = channel * samples + start + i;
-                    part[i] = if log_prior[index] == f32::NEG_INFINITY { 0.0 } else { (logit(index) - most[i]).exp() };
+                    part[i] =
+                        if log_prior[index] == f32::NEG_INFINITY { 0.0 } else { (logit(index) - largest[i]).exp() };
                     sum[i] += part[i];
                 }
             }
@@ -148,19 +208,7 @@ impl WeightVolume {
     /// Unless there are K transforms.
     #[must_use]
     pub fn map(&self, to_canonical: &[Affine3A], point: Vec3, threshold: f32) -> Option<MotionSample> {
-        assert_eq!(to_canonical.len(), self.channels - 1, "map: transforms of bones");
-        let samples = self.resolution.pow(3);
-        let (mut sum, mut mean) = (0.0f32, Vec3A::ZERO);
-        let point = Vec3A::from(point);
-        for (bone, transform) in to_canonical.iter().enumerate() {
-            let y = transform.transform_point3a(point);
-            let Some(cell) = self.cell(bone, y) else {
-                continue;
-            };
-            let w = self.sample(&self.weights[bone * samples..][..samples], &cell);
-            sum += w;
-            mean += w * y;
-        }
+        let (sum, mean) = self.blend(to_canonical, point);
         // Not `<`, so that NaN is dead too.
         if !(sum >= threshold && sum > 0.0) {
             return None;
@@ -169,8 +217,84 @@ impl WeightVolume {
         canonical.is_finite().then_some(MotionSample { canonical, likelihood: sum.min(1.0) })
     }
 
+    /// Propagates the gradient of [`WeightVolume::map`] to the softmaxed weights: ∂x̂/∂w_i = (y_i −
+    /// x̂)/Σw, and ∂f/∂w_i = 1 where Σ w < 1, else 0. Adds to `d_weights`, laid out like `weights`.
+    ///
+    /// Nothing is added for a sample that is dead at any threshold. Derivatives with respect to the
+    /// point and the transforms are not computed.
+    ///
+    /// # Panics
+    /// If a length does not fit.
+    pub fn map_backward(
+        &self,
+        to_canonical: &[Affine3A],
+        point: Vec3,
+        d_canonical: Vec3,
+        d_likelihood: f32,
+        d_weights: &mut [f32],
+    ) {
+        assert_eq!(d_weights.len(), self.weights.len(), "map_backward: d_weights");
+        let (sum, mean) = self.blend(to_canonical, point);
+        if sum.is_nan() || sum <= 0.0 {
+            return;
+        }
+        let samples = self.resolution.pow(3);
+        let canonical = mean / sum;
+        let d_sum = if sum < 1.0 { d_likelihood } else { 0.0 };
+        let (point, d_canonical) = (Vec3A::from(point), Vec3A::from(d_canonical));
+        for (bone, transform) in to_canonical.iter().enumerate() {
+            let y = transform.transform_point3a(point);
+            let Some(cell) = self.cell(bone, y) else { continue };
+            let d_w = d_canonical.dot(y - canonical) / sum + d_sum;
+            let channel = &mut d_weights[bone * samples..][..samples];
+            for (corner, mix) in self.corners(cell.corner).into_iter().zip(cell.mix) {
+                channel[corner] += mix * d_w;
+            }
+        }
+    }
+
+    /// Propagates the gradient of [`WeightVolume::update`]: adds w_c (d_c − Σ_k w_k d_k) to
+    /// `d_delta`. All three arrays share one layout.
+    ///
+    /// # Panics
+    /// If a length does not fit.
+    pub fn softmax_backward(&self, d_weights: &[f32], d_delta: &mut [f32]) {
+        assert_eq!(d_weights.len(), self.weights.len(), "softmax_backward: d_weights");
+        assert_eq!(d_delta.len(), self.weights.len(), "softmax_backward: d_delta");
+        let samples = self.resolution.pow(3);
+        let mut mean = vec![0.0f32; samples];
+        for (w, d) in (self.weights.chunks_exact(samples)).zip(d_weights.chunks_exact(samples)) {
+            for i in 0..samples {
+                mean[i] += w[i] * d[i];
+            }
+        }
+        let channels = self.weights.chunks_exact(samples).zip(d_weights.chunks_exact(samples));
+        for (out, (w, d)) in d_delta.chunks_exact_mut(samples).zip(channels) {
+            for i in 0..samples {
+                out[i] += w[i] * (d[i] - mean[i]);
+            }
+        }
+    }
+
+    /// Σ w_i and Σ w_i y_i over the K bones.
     #[inline(always)]
-    pub(super) fn sample(&self, channel: &[f32], cell: &Cell) -> f32 {
+    fn blend(&self, to_canonical: &[Affine3A], point: Vec3) -> (f32, Vec3A) {
+        assert_eq!(to_canonical.len(), self.channels - 1, "map: transforms of bones");
+        let samples = self.resolution.pow(3);
+        let (mut sum, mut mean) = (0.0f32, Vec3A::ZERO);
+        let point = Vec3A::from(point);
+        for (bone, transform) in to_canonical.iter().enumerate() {
+            let y = transform.transform_point3a(point);
+            let Some(cell) = self.cell(bone, y) else { continue };
+            let w = self.sample(&self.weights[bone * samples..][..samples], &cell);
+            sum += w;
+            mean += w * y;
+        }
+        (sum, mean)
+    }
+
+    #[inline(always)]
+    fn sample(&self, channel: &[f32], cell: &Cell) -> f32 {
         let mut w = 0.0;
         for (corner, mix) in self.corners(cell.corner).into_iter().zip(cell.mix) {
             w += mix * channel[corner];
@@ -180,15 +304,14 @@ impl WeightVolume {
 
     /// Flat indices of a cell's corners, x fastest.
     #[inline(always)]
-    pub(super) fn corners(&self, first: usize) -> [usize; 8] {
+    fn corners(&self, first: usize) -> [usize; 8] {
         let (row, slice) = (self.resolution, self.resolution * self.resolution);
         [0, 1, row, row + 1, slice, slice + 1, slice + row, slice + row + 1].map(|o| first + o)
     }
 
-    /// The cell that holds `y`, if it is in the box and any of its corners in the support of
-    /// `bone`.
+    /// The cell containing `y`, if it is in the box and in the support of `bone`.
     #[inline(always)]
-    pub(super) fn cell(&self, bone: usize, y: Vec3A) -> Option<Cell> {
+    fn cell(&self, bone: usize, y: Vec3A) -> Option<Cell> {
         let n = self.resolution;
         let scale = (n - 1) as f32 / Vec3A::from(self.max - self.min);
         let at = (y - Vec3A::from(self.min)) * scale;
@@ -197,7 +320,7 @@ impl WeightVolume {
         if !(at.cmpge(support.low) & at.cmple(support.high)).all() {
             return None;
         }
-        // Truncation is the floor of what is not negative, without a call.
+        // Truncation equals floor for values that are not negative, and needs no call.
         let [x, y, z] = at.to_array().map(|c| (c as usize).min(n - 2));
         let t = Vec3::from(at) - Vec3::new(x as f32, y as f32, z as f32);
         let s = 1.0 - t;
@@ -211,7 +334,7 @@ impl WeightVolume {
             s.x * t.y * t.z,
             t.x * t.y * t.z,
         ];
-        Some(Cell { corner: (z * n + y) * n + x, mix, t })
+        Some(Cell { corner: (z * n + y) * n + x, mix })
     }
 }
 
@@ -227,4 +350,43 @@ impl Support {
         }
         Self { low: out.low.max(Vec3A::ZERO), high: out.high.min(Vec3A::splat((n - 1) as f32)) }
     }
+}
+
+/// exp(−½ (x − centre)ᵀ Σ⁻¹ (x − centre)) with one deviation along a bone and another across.
+struct Gaussian {
+    centre: Vec3,
+    /// World to standard deviations.
+    whiten: Mat3,
+}
+
+impl Gaussian {
+    fn new(start: Vec3, end: Vec3, config: &WeightVolumeConfig) -> Self {
+        let direction = (end - start).normalize_or(Vec3::Y);
+        let (u, v) = direction.any_orthonormal_pair();
+        // Short bones (pelvis to hips) would otherwise be sheets.
+        let along = (config.along * start.distance(end)).max(0.5 * config.across);
+        let across = config.across;
+        Self {
+            centre: start.midpoint(end),
+            whiten: Mat3::from_cols(direction / along, u / across, v / across).transpose(),
+        }
+    }
+
+    fn value(&self, x: Vec3) -> f32 {
+        (-0.5 * (self.whiten * (x - self.centre)).length_squared()).exp()
+    }
+}
+
+/// Mean of the vertices weighted by their skinning weight of `joint`; the joint itself if all are 0.
+fn own_centre(model: &BodyModel, shaped: &Shaped, joint: usize) -> Vec3 {
+    let (mut sum, mut total) = (Vec3::ZERO, 0.0);
+    for (v, &vertex) in shaped.vertices.iter().enumerate() {
+        for (column, w) in model.weights.row(v) {
+            if column == joint {
+                sum += w * vertex;
+                total += w;
+            }
+        }
+    }
+    if total > 0.0 { sum / total } else { shaped.joints[joint] }
 }

@@ -54,7 +54,7 @@ pub fn motion(mut input: Input, model: &BodyModel, output: &mut Output) -> Resul
         bail!("vertex {v} of the posed body overflows: betas, poses or trans are too large");
     }
     let samples: Vec<Option<MotionSample>> = if kind == 0 {
-        let volume = WeightVolume::diffused(model, &shaped, &WeightVolumeConfig::default());
+        let volume = WeightVolume::gaussian(model, &shaped, &WeightVolumeConfig::default());
         let to_canonical = posed.to_canonical();
         points.iter().map(|&x| volume.map(&to_canonical, x, VOLUME_THRESHOLD)).collect()
     } else {

@@ -114,10 +114,8 @@ pub fn motion(figure: &Figure) -> Result<Kernel> {
     let learnable = |weights| MotionField::Volume { weights, threshold: 1e-3 };
     let fields = [
         ("surface".to_owned(), MotionField::Surface(SurfaceMotion::default()), true),
-        ("volume 16".to_owned(), learnable(WeightVolume::diffused(body, shaped, &volume(16))), false),
-        ("volume 32".to_owned(), learnable(WeightVolume::diffused(body, shaped, &volume(32))), false),
-        ("volume 64".to_owned(), learnable(WeightVolume::diffused(body, shaped, &volume(64))), false),
-        ("Gaussians 32".to_owned(), learnable(WeightVolume::gaussian(body, shaped, &volume(32))), false),
+        ("volume 32".to_owned(), learnable(WeightVolume::gaussian(body, shaped, &volume(32))), false),
+        ("volume 64".to_owned(), learnable(WeightVolume::gaussian(body, shaped, &volume(64))), false),
     ];
     for (name, field, default) in fields {
         let map = |x: Vec3| {
