@@ -23,7 +23,7 @@ fn another_picture() -> Capture {
             colour.iter_mut().for_each(|c| *c = mask - *c);
         }
     };
-    capture.train[0].source.change(invert).unwrap();
+    capture.train[0].source.edit(invert);
     capture
 }
 

@@ -17,7 +17,7 @@ fn odd(kind: &str) -> Frame {
         pixels.mask.fill(0.0);
         pixels.image.pixels.fill(0.0);
     };
-    frame.source.change(empty).unwrap();
+    frame.source.edit(empty);
     let camera = &mut frame.camera.world_to_camera;
     match kind {
         "hidden" => {}
@@ -60,7 +60,7 @@ fn a_capture_that_is_nearly_all_unknown_still_trains() {
             pixels.mask.iter_mut().filter(|m| **m > 0.5).for_each(|m| *m = f32::from(std::mem::take(&mut first)));
             pixels.occluder = Some(vec![true; (SIZE * SIZE) as usize]);
         };
-        frame.source.change(nearly_all).unwrap();
+        frame.source.edit(nearly_all);
     }
     let config = config(Method::Occnerf);
     let scene = Scene::new(&capture, body(), &config).unwrap();

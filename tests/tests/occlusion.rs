@@ -92,7 +92,7 @@ fn repainted(label: Label) -> Capture {
     let mut changed = capture().clone();
     let mut count = 0;
     for (frame, prepared) in changed.train.iter_mut().zip(&scene().train) {
-        let repaint = |pixels: &mut Pixels| {
+        let mut repaint = |pixels: &mut Pixels| {
             for (i, _) in prepared.labels.iter().enumerate().filter(|(_, l)| *l == label) {
                 count += 1;
                 for c in 0..3 {
@@ -103,7 +103,9 @@ fn repainted(label: Label) -> Capture {
                 }
             }
         };
-        frame.source.change(repaint).unwrap();
+        let mut pixels = frame.pixels().unwrap();
+        repaint(&mut pixels);
+        frame.source = pixels.into();
     }
     assert!(count > 50, "{count} pixels of {label:?}");
     changed

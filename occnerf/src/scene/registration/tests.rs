@@ -164,7 +164,9 @@ fn clothes_are_found_as_far_out_as_they_are_and_an_occluder_is_no_outline() {
                 pixels.mask[i as usize] = f32::from(u8::from(shows));
             }
         };
-        frame.source.edit(see);
+        let mut pixels = frame.pixels().unwrap();
+        see(&mut pixels);
+        frame.source = pixels.into();
         let picture = Picture::new(frame, &posed).unwrap().unwrap();
         let looking = Looking { reach: 10.0, blur: 0.0, unit: 1.0 };
         let found = look(&picture, &posed.vertices, (&body.faces, &ridges), looking).unwrap();
