@@ -49,8 +49,7 @@ pub use config::{
     MotionKind, OccludedRule, Preset, RateConfig, RegistrationConfig, SurfaceConfig, VisibilityKind,
 };
 pub use error::Error;
-pub use evaluate::budget::{BESIDE, Cause, PartBudget, Shares, ViewBudget, budget};
-pub use evaluate::{FrameMetrics, SplitMetrics, evaluate, evaluate_with, least_seen_quartile};
+pub use evaluate::{FrameMetrics, SplitMetrics, evaluate, evaluate_with, least_seen_quartile, nearest_vertices};
 pub use lpips::{Lpips, Trunk};
 pub use model::body::{Body, Moment};
 pub use model::colors::PriorColors;

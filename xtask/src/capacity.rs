@@ -14,6 +14,7 @@ use crate::source::Source;
 /// What was measured, chosen and pruned, in a run directory.
 pub const FILE: &str = "capacity.json";
 
+/// Sizes of the model.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum CapacityName {
     /// The preset's sizes, whatever the scene.

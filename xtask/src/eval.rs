@@ -21,7 +21,7 @@ use crate::process::{Ending, Lock, note, one_line, say};
 use crate::run::{
     METRICS, Metrics, NOVEL_VIEWS, RunConfig, Splits, TRAINING_VIEWS, make_directory, peak_rss_bytes, use_threads,
 };
-use crate::{baked, budget, pictures, report, table};
+use crate::{baked, pictures, report, table};
 
 /// Training frames are many and alike: every tenth is scored.
 const TRAIN_STRIDE: usize = 10;
@@ -30,6 +30,7 @@ const SHEET_INSTANTS: usize = 3;
 /// Training frames on their sheet.
 const TRAIN_PICTURES: usize = 5;
 
+/// Which frames are scored.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum Split {
     /// Cameras that training never saw.
@@ -48,6 +49,7 @@ impl Split {
     }
 }
 
+/// Arguments of `eval`.
 #[derive(Args)]
 pub struct EvalArguments {
     /// Run directory
@@ -58,10 +60,6 @@ pub struct EvalArguments {
     /// Weights to score LPIPS with, as for `train`
     #[arg(long, value_name = "PATH")]
     lpips: Option<PathBuf>,
-    /// Split the error of unseen views by its causes and by part of the body, as tables and as
-    /// renders/budget.png; of training views where there are no others
-    #[arg(long)]
-    budget: bool,
     /// Samples a pixel in each direction; scores of more than one are only printed
     #[arg(long, default_value_t = 1, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=8))]
     side: u32,
@@ -156,11 +154,6 @@ pub fn eval(arguments: &EvalArguments) -> Result<()> {
         metrics.write(directory)?;
         report::write(directory, &metrics)?;
     }
-    if arguments.budget {
-        let frames: Vec<&PreparedFrame> =
-            if scene.eval.is_empty() { scored_train_frames(&scene).collect() } else { scene.eval.iter().collect() };
-        budget::run(directory, &scene, drawn.renderer(&scene)?.as_mut(), &frames, lpips.as_ref())?;
-    }
     let mut one = metrics.clone();
     one.method.push_str(if arguments.baked { "-baked" } else { "" });
     for (name, split) in [(NOVEL_VIEWS, &metrics.splits.novel_view), (TRAINING_VIEWS, &metrics.splits.train_view)] {
@@ -195,15 +188,20 @@ pub fn check_pictures(scene: &Scene) -> Result<()> {
 
 /// What can be scored and drawn.
 pub enum Drawn<'a> {
+    /// The field of a trained model.
     Field {
+        /// The model.
         model: &'a Model,
         /// Name of the perceptual term that it was trained with.
         perceptual: String,
     },
+    /// The posed prior in mean colours.
     Prior(PriorColors),
     /// As `render --baked` draws them.
     Baked {
+        /// The model that was baked.
         model: &'a Model,
+        /// What was baked of it.
         avatar: &'a Avatar,
     },
 }

@@ -7,8 +7,8 @@ use clap::Args;
 use occnerf::capture::{self, ImportOptions, Imported};
 
 use crate::check::{self, CheckArguments};
+use crate::place::{beside, not_within, take_place, vacant};
 use crate::process::{results_in, say};
-use crate::synth::{beside, not_within, take_place, vacant};
 
 /// What a finished directory holds, and nothing else does.
 const MARK: &str = "import.json";

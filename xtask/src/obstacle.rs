@@ -7,6 +7,7 @@ use occnerf::capture::Obstacle;
 /// How far a moving obstacle moves to the right over the video, in picture widths.
 const TRAVEL: f32 = 0.3;
 
+/// Where the simulated obstacle stands, and how large it is.
 #[derive(Args, Clone, Debug, serde::Serialize)]
 pub struct ObstacleArguments {
     /// Part of the person's pixels that is hidden in the frames that the obstacle stands in, no

@@ -4,13 +4,11 @@ use std::fs::File;
 use std::io::BufWriter;
 use std::path::Path;
 
+use ab_glyph::{Font, FontRef, Glyph, ScaleFont, point};
 use anyhow::{Context, Result};
 use image::{ImageError, ImageFormat, ImageResult, Rgb, RgbImage, imageops};
 use occnerf::capture::Image;
-use plotters::prelude::*;
-use plotters::style::text_anchor::{HPos, Pos, VPos};
 
-use crate::font::{FONT, LETTER, register_font};
 use crate::process::unwritten;
 
 /// Pixels of a sheet: 96 MiB in memory, and less than what a reader of pictures takes for a bomb.
@@ -63,25 +61,34 @@ pub fn sheet(rows: &[Vec<RgbImage>]) -> RgbImage {
 /// A sheet with a name above each column.
 pub fn captioned(sheet: &RgbImage, names: &[&str]) -> Result<RgbImage> {
     const STRIP: u32 = 20;
-    /// Largest height of a letter in pixels.
-    const LARGEST: f64 = 14.0;
-    register_font()?;
-    let (width, column) = (sheet.width(), (sheet.width() - GAP) as f64 / names.len().max(1) as f64);
-    let longest = names.iter().map(|name| name.chars().count()).max().unwrap_or(0).max(1);
-    let letter = LARGEST.min((column - f64::from(GAP)) / (LETTER * longest as f64));
-    let mut strip = vec![255; 3 * (width * STRIP) as usize];
-    let area = BitMapBackend::with_buffer(&mut strip, (width, STRIP)).into_drawing_area();
-    let style = (FONT, letter).into_font().color(&BLACK).pos(Pos::new(HPos::Center, VPos::Center));
-    for (c, name) in names.iter().enumerate() {
-        let middle = f64::from(GAP) / 2.0 + (c as f64 + 0.5) * column;
-        area.draw_text(name, &style, (middle as i32, STRIP as i32 / 2))?;
-    }
-    area.present()?;
-    drop(area);
-    let strip = RgbImage::from_raw(width, STRIP, strip).context("captions of no size")?;
-    let mut out = RgbImage::new(width, STRIP + sheet.height());
-    imageops::replace(&mut out, &strip, 0, 0);
+    /// Largest height of a line of text in pixels.
+    const LARGEST: f32 = 14.0;
+    // Systems may have no font.
+    let font = FontRef::try_from_slice(dejavu::sans::regular())?;
+    let advance = |c: char| font.as_scaled(LARGEST).h_advance(font.glyph_id(c));
+    let column = (sheet.width() - GAP) as f32 / names.len().max(1) as f32;
+    let widths: Vec<f32> = names.iter().map(|name| name.chars().map(advance).sum()).collect();
+    let shrunk = widths.iter().fold(1.0f32, |scale, width| scale.min((column - GAP as f32) / width));
+    let mut out = RgbImage::from_pixel(sheet.width(), STRIP + sheet.height(), Rgb([255; 3]));
     imageops::replace(&mut out, sheet, 0, i64::from(STRIP));
+    let scaled = font.as_scaled(shrunk * LARGEST);
+    let baseline = 0.5 * (STRIP as f32 + scaled.ascent() + scaled.descent());
+    for (c, (name, width)) in names.iter().zip(widths).enumerate() {
+        let mut x = 0.5 * GAP as f32 + (c as f32 + 0.5) * column - 0.5 * shrunk * width;
+        for letter in name.chars() {
+            let glyph = Glyph { position: point(x, baseline), ..scaled.scaled_glyph(letter) };
+            x += shrunk * advance(letter);
+            let Some(outline) = font.outline_glyph(glyph) else { continue };
+            let corner = outline.px_bounds().min;
+            outline.draw(|u, v, cover| {
+                let (u, v) = (corner.x as i64 + i64::from(u), corner.y as i64 + i64::from(v));
+                if (0..i64::from(out.width())).contains(&u) && (0..i64::from(STRIP)).contains(&v) {
+                    let pixel = out.get_pixel_mut(u as u32, v as u32);
+                    pixel.0 = pixel.0.map(|value| (f32::from(value) * (1.0 - cover.min(1.0))) as u8);
+                }
+            });
+        }
+    }
     Ok(out)
 }
 

@@ -11,9 +11,12 @@ use serde::{Deserialize, Serialize};
 use crate::process::{Lock, unwritten};
 use crate::source::{self, Source};
 
+/// File of values, moments and counts.
 pub const CHECKPOINT: &str = "checkpoint.safetensors";
 const CONFIG: &str = "config.toml";
+/// File of the scores.
 pub const METRICS: &str = "metrics.json";
+/// Log of the training.
 pub const LOG: &str = "train.jsonl";
 /// The page to turn the person around on.
 pub const PERSON: &str = "person.html";
@@ -71,14 +74,23 @@ fn is_default(options: &LoadOptions) -> bool {
 /// What metrics.json holds.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct Metrics {
+    /// Name of the method.
     pub method: String,
+    /// Name of the preset.
     pub preset: String,
+    /// Name of the rule for hidden pixels.
     pub occluded: String,
+    /// `demo` or a directory.
     pub scene: String,
+    /// Seed of every random choice.
     pub seed: u64,
+    /// Optimisation steps.
     pub steps: u64,
+    /// Wall clock of the training.
     pub train_seconds: f64,
+    /// Largest resident set.
     pub peak_rss_bytes: u64,
+    /// Learnt numbers.
     pub parameters: usize,
     /// Perceptual term of the training.
     #[serde(default)]
@@ -86,17 +98,22 @@ pub struct Metrics {
     /// Network of `lpips_full`.
     #[serde(default)]
     pub lpips: Option<String>,
+    /// Scores.
     pub splits: Splits,
 }
 
+/// Title of scores on views that training never saw.
 pub const NOVEL_VIEWS: &str = "novel views";
+/// Title of scores on training frames.
 pub const TRAINING_VIEWS: &str = "training views, over visible pixels";
 
 /// Scores of each split that was measured.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub struct Splits {
+    /// Cameras that training never saw.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub novel_view: Option<SplitMetrics>,
+    /// Every tenth training frame, on what it shows.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub train_view: Option<SplitMetrics>,
 }

@@ -1,8 +1,6 @@
-//! An axis: linear, logarithmic, or a row of names.
+//! An axis of numbers, linear or logarithmic.
 
 use std::ops::Range;
-
-use plotters::coord::ranged1d::{KeyPointHint, NoDefaultFormatting, Ranged, ValueFormatter};
 
 /// Share of its extent by which a linear or logarithmic axis reaches beyond its values.
 const ROOM: f64 = 0.06;
@@ -14,10 +12,10 @@ const MOST_DECADES: f64 = 12.0;
 /// From values to places.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Scale {
+    /// Equal steps are equally long.
     Linear(Range<f64>),
+    /// Equal factors are equally long.
     Logarithmic(Range<f64>),
-    /// The values are 0, 1, …, each with a name.
-    Named(Vec<String>),
 }
 
 impl Scale {
@@ -45,14 +43,12 @@ impl Scale {
         match self {
             Self::Linear(r) => (value - r.start) / (r.end - r.start),
             Self::Logarithmic(r) => (value / r.start).ln() / (r.end / r.start).ln(),
-            Self::Named(names) => (value + 0.5) / names.len().max(1) as f64,
         }
     }
 
     /// Values that get a line and a number.
     pub fn ticks(&self) -> Vec<f64> {
         match self {
-            Self::Named(names) => (0..names.len()).map(|i| i as f64).collect(),
             Self::Linear(r) => {
                 let rough = (r.end - r.start) / 6.0;
                 let power = 10f64.powf(rough.log10().floor());
@@ -81,35 +77,6 @@ impl Scale {
 /// Whether there is a place for a value: sums and powers of what has one stay finite.
 fn fits(value: f64, logarithmic: bool) -> bool {
     value.abs() <= LARGEST && (!logarithmic || value >= 1.0 / LARGEST)
-}
-
-impl Ranged for Scale {
-    type FormatOption = NoDefaultFormatting;
-    type ValueType = f64;
-
-    fn map(&self, value: &f64, limit: (i32, i32)) -> i32 {
-        limit.0 + (self.share(*value) * f64::from(limit.1 - limit.0)).round() as i32
-    }
-
-    fn key_points<Hint: KeyPointHint>(&self, _: Hint) -> Vec<f64> {
-        self.ticks()
-    }
-
-    fn range(&self) -> Range<f64> {
-        match self {
-            Self::Linear(r) | Self::Logarithmic(r) => r.clone(),
-            Self::Named(names) => -0.5..names.len() as f64 - 0.5,
-        }
-    }
-}
-
-impl ValueFormatter<f64> for Scale {
-    fn format_ext(&self, value: &f64) -> String {
-        if let Self::Named(names) = self {
-            return names.get(value.round().max(0.0) as usize).cloned().unwrap_or_default();
-        }
-        number(*value)
-    }
 }
 
 /// Four digits at most, no zeros at the end.

@@ -25,10 +25,15 @@ const BODY_VARIABLE: &str = "SMPL_MODEL";
 
 /// A capture with its prior, and where both came from.
 pub struct Source {
+    /// `demo`, a character or a directory.
     pub scene: String,
+    /// The body model's file.
     pub body: Option<PathBuf>,
+    /// How the capture was read.
     pub load: LoadOptions,
+    /// Frames with masks, cameras and poses.
     pub capture: Capture,
+    /// The body model.
     pub model: BodyModel,
     /// The capture as so many rounds of registration have corrected it.
     registered: RefCell<Option<(usize, Capture)>>,

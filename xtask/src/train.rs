@@ -22,6 +22,7 @@ use crate::shard::ShardArguments;
 use crate::source::{self, LoadArguments, Source};
 use crate::table;
 
+/// Arguments of `train`.
 #[derive(Args)]
 pub struct TrainArguments {
     /// A capture (raw ZJU-MoCap, or HumanNeRF's prepared or wild layout), or a rigged .glb or .gltf
@@ -35,8 +36,10 @@ pub struct TrainArguments {
     /// body.safetensors in the capture, the variable SMPL_MODEL, or body/*.npz near the capture]
     #[arg(long)]
     pub body: Option<PathBuf>,
+    /// How the capture is read.
     #[command(flatten)]
     pub load: LoadArguments,
+    /// What is trained.
     #[command(flatten)]
     pub settings: SettingArguments,
     /// Sizes of the model [default: the preset's, larger where the video shows more than they hold]
@@ -52,6 +55,7 @@ pub struct TrainArguments {
     /// Go on with the run in --out from its checkpoint
     #[arg(long)]
     pub resume: bool,
+    /// How often it is saved.
     #[command(flatten)]
     pub saving: SavingArguments,
     /// Rewrite preview.png in the run directory every few seconds: the first training view as the
@@ -65,6 +69,7 @@ pub struct TrainArguments {
     /// again
     #[arg(long, value_name = "FILE", conflicts_with_all = ["scene", "resume", "stop_after", "capacity"])]
     pub list: Option<PathBuf>,
+    /// Which part of a list is trained.
     #[command(flatten)]
     pub part: ShardArguments,
 }

@@ -1,4 +1,4 @@
-//! `train --capacity auto` and `bench capacity` on a tiny capture.
+//! `train --capacity auto` on a tiny capture.
 #![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
 
 mod common;
@@ -6,12 +6,12 @@ mod common;
 use std::path::{Path, PathBuf};
 
 use common::{done, folder, refused, text};
+use occnerf::capture::Layout;
 use serde_json::Value;
 
 fn capture(folder: &Path) -> PathBuf {
     let out = folder.join("capture");
-    let size = ["--size", "32", "--frames", "4", "--eval-cameras", "1", "--eval-every", "2"];
-    done(&[&["synth", "--out", text(&out)], &size[..]].concat());
+    common::capture(&out, Layout::HumanNerf, 32, 4);
     out
 }
 
@@ -58,30 +58,6 @@ fn sizes_are_chosen_once_recorded_kept_on_resuming_and_pruned_at_the_end() {
     assert_eq!(json(&run.join("metrics.json"))["parameters"], metrics["parameters"]);
 
     std::fs::write(run.join("capacity.json"), "{\"measured\": 3}").unwrap();
-    refused(&["report", text(&run)], &["capacity.json"]);
+    refused(&["eval", text(&run)], &["capacity.json"]);
     refused(&["train", text(&capture), "--capacity", "auto", "--method", "prior"], &["prior", "--capacity"]);
-}
-
-#[test]
-fn the_bench_has_every_preset_and_its_scene_sized_form() {
-    let folder = folder("bench-capacity");
-    let (capture, out) = (capture(&folder), folder.join("out"));
-    let bench = ["bench", "capacity", text(&capture), "--quick", "--steps", "1", "--paper", "1", "--out", text(&out)];
-    let said = done(&bench);
-    assert!(said.contains("7 runs in"), "{said}");
-    let table = std::fs::read_to_string(out.join("capacity.md")).unwrap();
-    for row in ["| balanced |", "| balanced, auto |", "| paper |", "| paper, auto |", "| table 2^13 |", "| width 32 |"]
-    {
-        assert!(table.contains(row), "{row}: {table}");
-    }
-    assert!(out.join("capacity-capture.svg").is_file() && out.join("capacity-capture.png").is_file());
-    let log = std::fs::read_to_string(out.join("bench.jsonl")).unwrap();
-    let lines: Vec<Value> = log.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
-    let of = |name: &str| lines.iter().find(|l| l["name"] == name).unwrap();
-    let (fixed, auto) = (of("balanced"), of("balanced, auto"));
-    assert!(auto["error"].is_null() && auto["parameters"].as_u64() < fixed["parameters"].as_u64(), "{auto}");
-    assert!(auto["command"].as_str().unwrap().ends_with("--capacity auto"), "{auto}");
-    assert!(done(&bench).contains("0 runs in"));
-    refused(&["bench", "capacity", "/no/such/place"], &["/no/such/place"]);
-    refused(&["bench", "capacity", "--steps", "0"], &["--steps 0"]);
 }

@@ -9,7 +9,7 @@ use common::{folder, refused, text, xtask};
 fn help_names_the_commands_and_every_option_of_train() {
     let help = |arguments: &[&str]| String::from_utf8(xtask(arguments).stdout).unwrap();
     let general = help(&["--help"]);
-    for command in ["train", "eval", "render", "bench", "report", "convert"] {
+    for command in ["train", "eval", "render", "export", "convert"] {
         assert!(general.contains(command), "{general}");
     }
     assert!(general.contains("Exit codes:") && general.contains("a result cannot be written"), "{general}");

@@ -12,7 +12,8 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
-use common::{TINY, done, folder, text};
+use common::{done, folder, text};
+use occnerf::capture::Layout;
 
 /// A small generator of random moments (SplitMix64).
 struct Random(u64);
@@ -147,7 +148,7 @@ fn words(text: &[&str]) -> Vec<String> {
 
 fn capture(folder: &Path) -> PathBuf {
     let path = folder.join("capture");
-    done(&[&["synth", "--out", text(&path)], &TINY[..]].concat());
+    common::capture(&path, Layout::HumanNerf, 32, 4);
     path
 }
 
@@ -196,23 +197,12 @@ fn a_training_killed_at_any_moment_ends_the_same_to_the_bit() {
 }
 
 #[test]
-fn scoring_and_tables_killed_at_any_moment_are_whole_or_absent() {
-    let folder = folder("killed-tables");
+fn scores_and_exports_killed_at_any_moment_are_whole_or_absent() {
+    let folder = folder("killed-exports");
     let capture = capture(&folder);
-    let rows = "prior,hash-point";
     let run = folder.join("run");
     done(&[&["train", text(&capture), "--out", text(&run), "--steps", "10"][..], &QUICK].concat());
     let eval = |run: &Path| words(&["eval", text(run)]);
-    let reproduce = |out: &Path| {
-        words(&["reproduce", text(&capture), "--out", text(out), "--steps", "20", "--seeds", "1", "--rows", rows])
-    };
-    let zju = folder.join("zju");
-    done(&[&["synth", "--format", "zju-mocap", "--out", text(&zju)], &TINY[..]].concat());
-    let sweep = |out: &Path| {
-        let side = ["--side", "24", "--steps", "1", "--out", text(out)];
-        words(&[&["bench", "stability", text(&zju), "--quick", "--axes", "hidden"][..], &side].concat())
-    };
-    let synth = |out: &Path| words(&["synth", "--force", "--out", text(out), "--size", "32", "--frames", "4"]);
     let glb = run.join("person.glb");
     let export = |run: &Path| words(&["export", text(run), "--format", "glb", "--out", text(&glb)]);
     let view = |run: &Path| words(&["view", text(run)]);
@@ -223,9 +213,6 @@ fn scoring_and_tables_killed_at_any_moment_are_whole_or_absent() {
     type Command<'a> = (&'a str, &'a dyn Fn(&Path) -> Vec<String>);
     let mut each: Vec<Command<'_>> = vec![
         ("eval", &eval),
-        ("reproduce", &reproduce),
-        ("bench", &sweep),
-        ("synth", &synth),
         // Bakes first.
         ("export", &export),
         ("view", &view),
@@ -240,7 +227,6 @@ fn scoring_and_tables_killed_at_any_moment_are_whole_or_absent() {
         let files: &[&str] = match name {
             "export" => &["person.glb", "avatar.safetensors"],
             "view" => &["person.html", "avatar.safetensors"],
-            "synth" => &["synth.json", "cameras.pkl", "mesh_infos.pkl"],
             "import" => &["import.json", "metadata.json", "body.safetensors", "masks/000001.png"],
             _ => &[],
         };
@@ -248,25 +234,18 @@ fn scoring_and_tables_killed_at_any_moment_are_whole_or_absent() {
     };
     let mut random = Random(2);
     for (name, arguments) in &each {
-        let place = |lives: usize| match *name {
-            "eval" | "export" | "view" => run.clone(),
-            // Again and again over the old one.
-            "synth" | "import" => folder.join(name),
-            _ => folder.join(format!("{name}-{lives}")),
-        };
-        let mut lives = 0;
+        // Again and again over the old one.
+        let out = if *name == "import" { folder.join(name) } else { run.clone() };
         let unbaked = || ["avatar.safetensors", "person.glb", "person.html"].map(|f| std::fs::remove_file(run.join(f)));
         let _ = unbaked();
-        let unkilled = arguments(&place(lives));
+        let unkilled = arguments(&out);
         let begun = Instant::now();
         done(&unkilled.iter().map(String::as_str).collect::<Vec<_>>());
         // Moments of the whole course on this machine, the last ones of writing included.
         let longest = (begun.elapsed().as_millis() as u64 * 11 / 10).max(20);
-        let whole = results(name, &place(lives));
+        let whole = results(name, &out);
         let mut toll = Toll::default();
         while toll.kills < kills().div_ceil(each.len()) {
-            lives += 1;
-            let out = place(lives);
             let _ = unbaked();
             until_it_ends(
                 &Work { name, out: out.clone(), arguments },
@@ -276,11 +255,6 @@ fn scoring_and_tables_killed_at_any_moment_are_whole_or_absent() {
                 &mut toll,
             );
             assert!(results(name, &out) == whole, "{name}: not what it leaves unkilled");
-            match *name {
-                "reproduce" => assert!(out.join("capture/reproduce.md").is_file()),
-                "bench" => assert!(out.join("stability.md").is_file()),
-                _ => {}
-            }
         }
         println!("{name}: {} kills, {} ends, {} files looked at were whole", toll.kills, toll.ends, toll.whole);
     }

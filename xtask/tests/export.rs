@@ -8,9 +8,10 @@ mod stand_in;
 use std::path::{Path, PathBuf};
 
 use array_files::{Data, NdArray, npz};
-use common::{TINY, done, folder, refused, text};
+use common::{done, folder, refused, text};
 use glam::Vec3;
 use occnerf::bake::Avatar;
+use occnerf::capture::Layout;
 use synth::{DemoConfig, demo};
 use occnerf::{Config, Method, Preset, PriorColors, Scene};
 
@@ -33,7 +34,7 @@ fn run(name: &str) -> PathBuf {
 fn trained(name: &str) -> PathBuf {
     let folder = folder(name);
     let (capture, run) = (folder.join("capture"), folder.join("run"));
-    done(&[&["synth", "--out", text(&capture)], &TINY[..]].concat());
+    common::capture(&capture, Layout::HumanNerf, 32, 4);
     let set = ["--preset", "fast", "--steps", "2", "--set", "registration.rounds=0"];
     done(&[&["train", text(&capture), "--out", text(&run)], &set[..]].concat());
     run
@@ -158,7 +159,6 @@ fn a_checkpoint_that_is_damaged_or_gone_is_named_by_all_that_need_it() {
         refused(&["view", text(&run)], words);
         refused(&["render", text(&run), "tpose", "--baked"], words);
         refused(&drawn, words);
-        refused(&["bench", "baked", text(&run), "--out", text(&run.join("bench"))], words);
         assert!(!out.exists());
     };
     // Newer than what was baked of it.

@@ -14,13 +14,14 @@ use std::sync::OnceLock;
 use std::time::{Duration, Instant};
 
 use common::{done, folder, refused, text, xtask};
+use occnerf::capture::Layout;
 
 /// A capture that trains at a thousand steps a minute or more.
 fn capture() -> &'static Path {
     static MADE: OnceLock<PathBuf> = OnceLock::new();
     MADE.get_or_init(|| {
         let path = folder("faults").join("capture");
-        done(&["synth", "--out", text(&path), "--size", "32", "--frames", "4", "--eval-cameras", "1"]);
+        common::capture(&path, Layout::HumanNerf, 32, 4);
         path
     })
 }
@@ -206,48 +207,36 @@ fn files(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
 #[test]
 fn where_the_disk_is_full_every_command_says_so_in_one_line_and_leaves_what_was_there() {
     let folder = folder("full-disk");
-    let (run, made) = (folder.join("run"), folder.join("made"));
+    let run = folder.join("run");
     done(&training(&run, "10"));
-    let synth = ["synth", "--force", "--out", text(&made), "--size", "32", "--frames", "2", "--eval-cameras", "1"];
-    done(&synth);
     let glb = folder.join("person.glb");
     let export = ["export", text(&run), "--format", "glb", "--out", text(&glb)];
-    let table = folder.join("table");
-    let reproduce = ["reproduce", text(capture()), "--out", text(&table), "--steps", "5", "--seeds", "1"];
-    let bench = ["bench", "kernels", "--quick", "--out", text(&table)];
     let fresh = folder.join("fresh");
     let fresh = training(&fresh, "10");
     let resumed = ["train", "--resume", "--steps", "12", "--out", text(&run)];
     let view = ["view", text(&run)];
-    let cases: [(u32, &[&str]); 8] = [
+    let cases: [(u32, &[&str]); 5] = [
         (1, &fresh),
         (64, &resumed),
         (1, &["eval", text(&run)]),
-        (16, &synth),
         // The baked person itself.
         (16, &export),
         (16, &view),
-        (1, &reproduce),
-        (0, &bench),
     ];
     for (kib, arguments) in cases {
-        let before = [files(&run), files(&made)];
+        let before = files(&run);
         let output = cramped(kib, arguments);
         let said = String::from_utf8_lossy(&output.stderr);
         assert_eq!(output.status.code(), Some(3), "{arguments:?}: {said}");
         let errors: Vec<&str> = said.lines().filter(|line| line.starts_with("error: ")).collect();
         assert!(errors.len() == 1 && errors[0].contains("cannot be written"), "{arguments:?}: {said}");
         assert!(!said.contains("panicked") && errors[0].matches("os error").count() == 1, "{arguments:?}: {said}");
-        let after = [files(&run), files(&made)];
-        let lost = |name: &str| {
-            before.iter().zip(&after).any(|(before, after)| {
-                before.iter().any(|(path, old)| path.ends_with(name) && after.get(path) != Some(old))
-            })
-        };
+        let after = files(&run);
+        let lost = |name: &str| before.iter().any(|(path, old)| path.ends_with(name) && after.get(path) != Some(old));
         // What can be made again may be gone or new, never half.
-        let kept = ["checkpoint.safetensors", "body.safetensors", "metrics.json", "cameras.pkl", "synth.json"];
+        let kept = ["checkpoint.safetensors", "body.safetensors", "metrics.json"];
         assert!(!kept.iter().any(|name| lost(name)), "{arguments:?}");
-        let partial = after.iter().flat_map(|files| files.keys()).find(|path| text(path).contains("partial"));
+        let partial = after.keys().find(|path| text(path).contains("partial"));
         assert_eq!(partial, None, "{arguments:?}");
     }
     done(&resumed);
@@ -290,7 +279,7 @@ fn numbers_on_the_command_line_are_blamed_by_their_own_name() {
     };
     let seed = said(&["train", "--seed", "18446744073709551615", "--set", "samples=8"]);
     assert!(seed.contains("--seed") && !seed.contains("--set samples"), "{seed}");
-    for command in [&["train"][..], &["eval", "x"], &["render", "x", "tpose"], &["bench", "pareto"]] {
+    for command in [&["train"][..], &["eval", "x"], &["render", "x", "tpose"]] {
         let begun = Instant::now();
         let threads = said(&[command, &["--threads", "1000000"]].concat());
         assert!(threads.contains("--threads 1000000: expected 1 to 1024"), "{threads}");

@@ -4,6 +4,7 @@
 mod common;
 
 use common::{done, folder, refused, text};
+use occnerf::capture::{Layout, Occlusion, SynthConfig, synthesise};
 
 const TITLE: &str = "training views, over visible pixels:";
 
@@ -13,7 +14,7 @@ const TITLE: &str = "training views, over visible pixels:";
 fn pictures_that_are_not_kept_in_memory_are_read_before_training_too() {
     let folder = folder("own-video-memory");
     let (capture, run) = (folder.join("capture"), folder.join("run"));
-    done(&["synth", "--out", text(&capture), "--size", "192", "--frames", "3", "--format", "ocmotion"]);
+    common::capture(&capture, Layout::Wild, 192, 3);
     let quick = ["--preset", "fast", "--method", "hash-point", "--steps", "1", "--memory", "4"];
     done(&[&["train", text(&capture), "--out", text(&run)], &quick[..]].concat());
     let clean = capture.join("clean/images/000000.png");
@@ -28,7 +29,7 @@ fn pictures_that_are_not_kept_in_memory_are_read_before_training_too() {
 fn scores_are_called_what_they_are() {
     let folder = folder("own-video");
     let (capture, run) = (folder.join("capture"), folder.join("run"));
-    done(&["synth", "--out", text(&capture), "--size", "32", "--frames", "3", "--format", "ocmotion"]);
+    common::capture(&capture, Layout::Wild, 32, 3);
     std::fs::remove_dir_all(capture.join("clean")).unwrap();
     let quick = ["--preset", "fast", "--method", "hash-point", "--steps", "1"];
     let said = done(&[&["train", text(&capture), "--out", text(&run)], &quick[..]].concat());
@@ -46,7 +47,7 @@ fn scores_are_called_what_they_are() {
 fn scores_of_a_run_that_went_on_are_those_of_its_last_step() {
     let folder = folder("scored-twice");
     let (capture, run) = (folder.join("capture"), folder.join("run"));
-    done(&["synth", "--out", text(&capture), "--size", "32", "--frames", "3"]);
+    common::capture(&capture, Layout::HumanNerf, 32, 3);
     let quick = ["--preset", "fast", "--method", "hash-point", "--steps", "3"];
     let train = [&["train", text(&capture), "--out", text(&run)], &quick[..]].concat();
     let steps_are = |steps: &str| {
@@ -67,8 +68,9 @@ fn scores_of_a_run_that_went_on_are_those_of_its_last_step() {
 fn a_run_on_masks_that_are_too_small_goes_on_with_those_that_it_began_with() {
     let folder = folder("mended-masks");
     let (capture, whole, stopped) = (folder.join("capture"), folder.join("whole"), folder.join("stopped"));
-    let made = ["--size", "160", "--frames", "6", "--format", "ocmotion", "--occlusion", "objects"];
-    done(&[&["synth", "--out", text(&capture)], &made[..]].concat());
+    let occlusion = Occlusion::Objects { fraction: 0.5, position: 0.0 };
+    let config = SynthConfig { size: 160, frames: 6, occlusion, ..SynthConfig::default() };
+    synthesise(None, None, &config, &|_| {}).unwrap().write(&capture, Layout::Wild, &|_| {}).unwrap();
     let wrong = ["--wrong-mask=-3", "--wrong-pose", "6"];
     let quick = ["--preset", "fast", "--method", "hash-point", "--steps", "4"];
     let train = |run| [&["train", text(&capture), "--out", run], &wrong[..], &quick].concat();
@@ -84,7 +86,7 @@ fn a_run_on_masks_that_are_too_small_goes_on_with_those_that_it_began_with() {
 fn training_says_before_it_begins_what_memory_it_takes() {
     let folder = folder("memory-said");
     let (capture, run) = (folder.join("capture"), folder.join("run"));
-    done(&["synth", "--out", text(&capture), "--size", "128", "--frames", "4", "--eval-cameras", "1"]);
+    common::capture(&capture, Layout::HumanNerf, 128, 4);
     let said = done(&["train", text(&capture), "--out", text(&run), "--preset", "fast", "--steps", "40"]);
     let mebibytes: f64 = said.split("memory: about ").nth(1).unwrap().split(' ').next().unwrap().parse().unwrap();
     let metrics = std::fs::read_to_string(run.join("metrics.json")).unwrap();

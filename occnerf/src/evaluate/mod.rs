@@ -1,7 +1,5 @@
 //! Scores of a trained person against pictures that training never saw.
 
-pub mod budget;
-
 use std::time::Instant;
 
 use glam::Vec3;
@@ -185,7 +183,7 @@ fn without_unknown(frame: &PreparedFrame, truth: &Pixels, rendering: &mut Render
 
 /// The vertex nearest to each pixel's first hit on the posed prior (H × W); `None` where there is
 /// none, and outside the mask.
-fn nearest_vertices(scene: &Scene, frame: &PreparedFrame, mask: &[f32]) -> Result<Vec<Option<u32>>, Error> {
+pub fn nearest_vertices(scene: &Scene, frame: &PreparedFrame, mask: &[f32]) -> Result<Vec<Option<u32>>, Error> {
     let mesh = RayMesh::new(&frame.view.posed.vertices, &scene.body.model.faces)?;
     let width = frame.view.camera.width as usize;
     let nearest = |i: usize| {

@@ -10,8 +10,7 @@ use std::path::{Path, PathBuf};
 
 use imports::{Imports, imports};
 
-const CRATES: [&str; 9] =
-    ["smpl", "smpl/array-files", "surface-query", "visibility", "hashgrid", "volrender", "occnerf", "xtask", "tests"];
+const CRATES: [&str; 5] = ["occnerf", "occnerf/capture", "xtask", "tests/lab", "tests/synth"];
 
 fn workspace() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("..")
@@ -60,7 +59,7 @@ fn no_files_of_a_crate_import_each_other_in_a_circle() {
     let mut found = Vec::new();
     for name in CRATES {
         let imports = imports(&workspace().join(name).join("src")).unwrap();
-        assert!(name == "tests" || imports.len() > 5, "{name}: {} imports were read", imports.len());
+        assert!(imports.len() > 5, "{name}: {} imports were read", imports.len());
         found.extend(complaints(name, &imports));
     }
     assert!(found.is_empty(), "{} circles\n{}", found.len(), found.join("\n"));

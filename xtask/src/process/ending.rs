@@ -18,13 +18,23 @@ pub enum Ending {
     /// A result cannot be written: a full disk, a folder that is read-only or gone. What stood
     /// there before is whole.
     #[error("{}: cannot be written: {source}", path.display())]
-    Unwritten { path: PathBuf, source: io::Error },
+    Unwritten {
+        /// The file.
+        path: PathBuf,
+        /// Why not.
+        source: io::Error,
+    },
     /// Another process works in the folder.
     #[error("{} is in use by another process: wait for its end, or give another --out", .0.display())]
     Busy(PathBuf),
     /// A signal came; everything is saved.
     #[error("stopped by {}; {after}", name(*.signal))]
-    Stopped { signal: i32, after: String },
+    Stopped {
+        /// Its number.
+        signal: i32,
+        /// What is saved.
+        after: String,
+    },
 }
 
 impl Ending {

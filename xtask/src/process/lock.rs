@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use anyhow::Result;
 
 use super::ending::{Ending, unwritten};
-use super::print::note;
+use crate::note;
 
 /// The sole right to write results in a folder. It ends with the process, however that ends: the
 /// system holds it, and the file `.lock` that stays behind means nothing.

@@ -3,10 +3,12 @@
 mod ending;
 mod lock;
 mod print;
+mod program;
 mod stop;
 
 pub use self::ending::{Ending, described, one_line, results_in, unwritten};
 pub use self::lock::Lock;
 pub use self::print::{err, out};
-pub(crate) use self::print::{note, say};
+pub use self::program::{EXIT_CODES, program};
 pub use self::stop::{Guard, watch};
+pub use crate::{note, say};

@@ -5,16 +5,16 @@ use std::fmt::{Arguments, Write as _};
 use std::io::Write;
 
 /// Prints a line on standard output, as `println!` takes it.
+#[macro_export]
 macro_rules! say {
     ($($text:tt)*) => { $crate::process::out(format_args!($($text)*)) };
 }
 
 /// Prints a line on standard error.
+#[macro_export]
 macro_rules! note {
     ($($text:tt)*) => { $crate::process::err(format_args!($($text)*)) };
 }
-
-pub(crate) use {note, say};
 
 /// Prints a line on standard output.
 pub fn out(text: Arguments<'_>) {

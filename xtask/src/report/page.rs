@@ -31,6 +31,7 @@ pub fn data_uri(kind: &str, bytes: &[u8]) -> String {
 }
 
 impl Page {
+    /// An empty page.
     pub fn new() -> Self {
         Self { body: String::new(), headings: Vec::new() }
     }
@@ -41,10 +42,12 @@ impl Page {
         self.headings.push(text.to_owned());
     }
 
+    /// A smaller heading.
     pub fn subheading(&mut self, text: &str) {
         let _ = writeln!(self.body, "<h3>{}</h3>", escape(text));
     }
 
+    /// A paragraph of text.
     pub fn paragraph(&mut self, text: &str) {
         let _ = writeln!(self.body, "<p>{}</p>", escape(text));
     }

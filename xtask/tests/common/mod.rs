@@ -4,6 +4,8 @@
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
+use occnerf::capture::{Layout, SynthConfig, synthesise};
+
 /// Runs the program.
 pub fn xtask(arguments: &[&str]) -> Output {
     Command::new(env!("CARGO_BIN_EXE_xtask")).args(arguments).env_remove("SMPL_MODEL").output().unwrap()
@@ -39,8 +41,11 @@ pub fn refusal(output: &Output, what: &str, words: &[&str]) {
     }
 }
 
-/// Options of `synth` for a capture that is made in no time.
-pub const TINY: [&str; 6] = ["--size", "32", "--frames", "4", "--eval-cameras", "1"];
+/// Writes a capture of the embedded person, of pictures `size` pixels a side.
+pub fn capture(out: &Path, layout: Layout, size: u32, frames: usize) {
+    let config = SynthConfig { size, frames, eval_cameras: 1, eval_every: 2, ..SynthConfig::default() };
+    synthesise(None, None, &config, &|_| {}).unwrap().write(out, layout, &|_| {}).unwrap();
+}
 
 /// An empty folder of a test's own.
 pub fn folder(name: &str) -> PathBuf {

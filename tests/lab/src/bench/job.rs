@@ -1,0 +1,249 @@
+//! One measured run: what it is, and what came of it.
+
+use std::io::{BufRead, Read, Write};
+use std::path::PathBuf;
+use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, Result, bail};
+use glam::Vec3;
+use occnerf::bake::bake;
+use occnerf::capture::{Capture, LoadOptions};
+use occnerf::{
+    Config, FieldRenderer, Method, PreparedFrame, PriorColors, PriorRenderer, Renderer, Scene, StepTimes, Trainer,
+    evaluate,
+};
+use serde::{Deserialize, Serialize};
+use smpl::BodyModel;
+
+use super::baked::Baking;
+use super::difficulty::Difficulty;
+use xtask::process::{Ending, Guard, say};
+use xtask::run::peak_rss_bytes;
+use xtask::source;
+
+/// A job on standard input may be this long.
+const MAX_JOB_BYTES: u64 = 1 << 20;
+
+/// Where the frames come from.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Place {
+    /// As `train` reads them.
+    Scene { scene: String, body: Option<PathBuf>, load: LoadOptions },
+    /// Made for the purpose.
+    Made(Difficulty),
+}
+
+impl Place {
+    /// What charts and tables call it.
+    pub fn name(&self) -> &str {
+        match self {
+            Self::Scene { scene, .. } => scene,
+            Self::Made(_) => source::DEMO,
+        }
+    }
+
+    fn load(&self) -> Result<(Capture, BodyModel)> {
+        match self {
+            Self::Scene { scene, body, load } => {
+                let source = source::load(Some(scene), body.as_deref(), load)?;
+                Ok((source.capture, source.model))
+            }
+            Self::Made(difficulty) => difficulty.make(),
+        }
+    }
+}
+
+/// A run to be measured.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Job {
+    pub place: Place,
+    /// At most so many unseen views are scored, evenly chosen.
+    pub views: usize,
+    pub config: Config,
+    /// Whether the trained model is pruned.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub prune: bool,
+    /// How the trained person is baked: what is scored then, instead of the field.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub bake: Option<Baking>,
+}
+
+/// What came of it; all zero or none where there is an error.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct Outcome {
+    pub error: Option<String>,
+    /// From the capture to the first step.
+    pub prepare_seconds: f64,
+    /// Pruning and baking included.
+    pub train_seconds: f64,
+    pub seconds_per_frame: f64,
+    pub psnr_mask: Option<f64>,
+    pub ssim_mask: Option<f64>,
+    pub psnr_hidden: Option<f64>,
+    pub mask_iou: Option<f64>,
+    pub parameters: usize,
+    pub peak_rss_bytes: u64,
+    /// Median of a step in the second half of the run, when buffers have grown to size.
+    pub step_seconds: f64,
+    /// Mean seconds of each stage of those steps, summed over threads.
+    pub stages: Vec<(String, f64)>,
+    /// Mean of a step.
+    pub live_samples: f64,
+    /// Of the body model.
+    pub vertices: usize,
+    /// Left out by the optimiser.
+    pub bad_gradients: usize,
+    /// Losses of steps and numbers of scored pictures that are not finite.
+    pub non_finite: usize,
+}
+
+/// Trains and scores.
+pub fn measure(job: &Job) -> Result<Outcome> {
+    let (mut capture, model) = job.place.load()?;
+    let stride = capture.eval.len().div_ceil(job.views.max(1)).max(1);
+    capture.eval = capture.eval.into_iter().step_by(stride).collect();
+    let start = Instant::now();
+    let scene = Scene::new(&capture, &model, &job.config)?;
+    drop(capture);
+    let prepare_seconds = start.elapsed().as_secs_f64();
+    let mut outcome = Outcome { prepare_seconds, vertices: model.num_vertices(), ..Outcome::default() };
+    let start = Instant::now();
+    if job.config.method == Method::Prior {
+        let colors = PriorColors::measure(&scene)?;
+        outcome.train_seconds = start.elapsed().as_secs_f64();
+        outcome.parameters = 3 * colors.colors.len();
+        score(&scene, &mut PriorRenderer::new(&scene.body, &colors), &mut outcome)?;
+    } else {
+        let mut trainer = Trainer::new(&scene, job.config.clone())?;
+        let (mut seconds, mut times) = (Vec::new(), StepTimes::default());
+        for step in 0..job.config.steps {
+            let begun = Instant::now();
+            let report = trainer.step()?;
+            if 2 * step >= job.config.steps {
+                seconds.push(begun.elapsed().as_secs_f64());
+                times += report.times;
+            }
+            outcome.non_finite += usize::from(!report.loss.is_finite());
+            outcome.bad_gradients += report.bad_gradients;
+            outcome.live_samples += report.live_samples as f64 / job.config.steps as f64;
+        }
+        if job.prune {
+            trainer.prune();
+        }
+        let model = trainer.into_model();
+        let baked = job.bake.map(|baking| bake(&model, Some(&scene), &baking.options())).transpose()?;
+        outcome.train_seconds = start.elapsed().as_secs_f64();
+        seconds.sort_by(f64::total_cmp);
+        outcome.step_seconds = seconds.get(seconds.len() / 2).copied().unwrap_or(0.0);
+        let mean = |total: f64| total / seconds.len().max(1) as f64;
+        outcome.stages = times.stages().map(|(name, total)| (name.to_owned(), mean(total))).to_vec();
+        outcome.parameters = model.num_parameters();
+        match job.bake.zip(baked) {
+            Some((baking, (avatar, _))) => score(&scene, &mut baking.renderer(&model, &avatar)?, &mut outcome)?,
+            None => score(&scene, &mut FieldRenderer::new(&model)?, &mut outcome)?,
+        }
+    }
+    outcome.peak_rss_bytes = peak_rss_bytes();
+    Ok(outcome)
+}
+
+fn score(scene: &Scene, renderer: &mut dyn Renderer, outcome: &mut Outcome) -> Result<()> {
+    let frames: Vec<&PreparedFrame> = scene.eval.iter().collect();
+    let mut bad = 0;
+    // The first picture pays for what later ones find ready.
+    if let Some(first) = frames.first() {
+        renderer.render(&first.view, Vec3::ZERO)?;
+    }
+    let metrics = evaluate(scene, renderer, &frames, |_, rendering| {
+        let numbers = rendering.image.pixels.iter().chain(&rendering.opacity);
+        bad += numbers.filter(|x| !x.is_finite()).count();
+    })?;
+    outcome.non_finite += bad;
+    outcome.seconds_per_frame = metrics.render_seconds_per_frame;
+    outcome.psnr_mask = metrics.psnr_mask;
+    outcome.ssim_mask = metrics.ssim_mask;
+    outcome.psnr_hidden = metrics.psnr_hidden;
+    outcome.mask_iou = metrics.mask_iou;
+    Ok(())
+}
+
+/// The child's part: a job as the first line of standard input, which stays open, its outcome as
+/// one line on standard output.
+pub fn serve() -> Result<()> {
+    let mut text = String::new();
+    std::io::stdin().lock().take(MAX_JOB_BYTES).read_line(&mut text).context("standard input")?;
+    let job: Job = serde_json::from_str(&text).context("standard input is not a job")?;
+    // Standard input ends when the sweep does, however that ends: nobody waits for the outcome
+    // then.
+    std::thread::spawn(|| {
+        let _ = std::io::copy(&mut std::io::stdin().lock(), &mut std::io::sink());
+        std::process::exit(1);
+    });
+    say!("{}", serde_json::to_string(&measure(&job)?)?);
+    Ok(())
+}
+
+/// Runs a job in a process of its own, so that its peak of memory is its own and nothing it does
+/// ends a sweep: an error, a panic, and a run longer than `limit` come back as [`Outcome::error`].
+///
+/// # Errors
+/// Where no process can be started; [`Ending::Stopped`] where a signal came.
+pub fn run(job: &Job, threads: Option<usize>, limit: Duration) -> Result<Outcome> {
+    let program = std::env::current_exe().context("the path of this program")?;
+    let mut command = Command::new(program);
+    command.args(["bench", "point"]);
+    if let Some(threads) = threads {
+        command.args(["--threads", &threads.to_string()]);
+    }
+    command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped());
+    let mut child = command.spawn().context("cannot start a run")?;
+    let guard = Guard::begin();
+    let outcome = converse(&mut child, job, limit, &guard);
+    // Whatever happened, nothing is left running.
+    if outcome.is_err() {
+        let _ = child.kill();
+        let _ = child.wait();
+    }
+    if let Some(signal) = guard.signal() {
+        let after = "what has been run is in the log: the same command goes on".to_owned();
+        return Err(Ending::Stopped { signal, after }.into());
+    }
+    Ok(outcome.unwrap_or_else(|error| Outcome { error: Some(format!("{error:#}")), ..Outcome::default() }))
+}
+
+fn converse(child: &mut Child, job: &Job, limit: Duration, guard: &Guard) -> Result<Outcome> {
+    let read = |mut pipe: Box<dyn Read + Send>| {
+        std::thread::spawn(move || {
+            let mut bytes = Vec::new();
+            let _ = pipe.read_to_end(&mut bytes);
+            String::from_utf8_lossy(&bytes).into_owned()
+        })
+    };
+    let (out, err) = (child.stdout.take().context("no output")?, child.stderr.take().context("no output")?);
+    let (out, err) = (read(Box::new(out)), read(Box::new(err)));
+    let mut input = child.stdin.take().context("no input")?;
+    input.write_all((serde_json::to_string(job)? + "\n").as_bytes()).context("handing over the job")?;
+    let start = Instant::now();
+    let status = loop {
+        if let Some(status) = child.try_wait()? {
+            break status;
+        }
+        if guard.signal().is_some() {
+            bail!("stopped by a signal");
+        }
+        if start.elapsed() > limit {
+            bail!("stopped after {:.0} s", limit.as_secs_f64());
+        }
+        std::thread::sleep(Duration::from_millis(20));
+    };
+    let (out, err) = (out.join().unwrap_or_default(), err.join().unwrap_or_default());
+    if !status.success() {
+        let lines: Vec<&str> = err.lines().filter(|l| !l.trim().is_empty() && !l.starts_with("note:")).collect();
+        let reason = lines.iter().take(3).copied().collect::<Vec<_>>().join(" ");
+        bail!("{}", if reason.is_empty() { status.to_string() } else { reason });
+    }
+    serde_json::from_str(out.trim()).context("unexpected answer of a run")
+}

@@ -1,0 +1,400 @@
+//! `bench`: what every approximation costs and is worth, and where methods break.
+
+mod axes;
+mod baked;
+mod capacity;
+pub mod chart;
+mod cost;
+mod difficulty;
+mod front;
+mod job;
+mod kernels;
+mod pareto;
+mod points;
+mod registration;
+mod runner;
+mod stability;
+
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use anyhow::Result;
+use clap::{Args, Subcommand};
+use occnerf::capture::Layout;
+
+use self::job::Place;
+use self::runner::Bench;
+use crate::results::{self, Section};
+use xtask::process::say;
+use xtask::run::{check_threads, use_threads, write};
+use xtask::shard::ShardArguments;
+use xtask::source::{LoadArguments, Source};
+use xtask::{source, train};
+
+/// Steps of a point of `pareto` at which presets run their own number of steps: those of `fast`.
+const FULL_STEPS: u64 = 400;
+/// Unseen views that a point of `pareto` is scored on, and in the quick form.
+const VIEWS: (usize, usize) = (50, 20);
+
+#[derive(Args)]
+pub struct BenchArguments {
+    #[command(subcommand)]
+    what: What,
+}
+
+#[derive(Subcommand)]
+enum What {
+    /// Seconds against accuracy of every named approximation, each preset and each method: a table
+    /// and charts.
+    Pareto(ParetoArguments),
+    /// Parameters and memory against accuracy, of fixed sizes and of `train --capacity auto`: a
+    /// table and charts.
+    Capacity(CapacityArguments),
+    /// What happens as it gets hard: less to see, worse poses, odd units, …; a table of breaking
+    /// points and charts.
+    Stability(StabilityArguments),
+    /// Cost against error of the geometric kernels; `pareto` draws it too.
+    Kernels(KernelArguments),
+    /// Where the time of a step goes, and how time and memory grow with rays, samples, table,
+    /// vertices, frames and pixels.
+    Cost(CostArguments),
+    /// A run's baked person against its field: a table of scores and speeds, and pictures.
+    Baked(baked::BakedArguments),
+    /// What registration makes of wrong priors: degrees and millimetres against the demo's true
+    /// bodies.
+    Registration(registration::RegistrationArguments),
+    /// One run, handed over on standard input.
+    #[command(hide = true)]
+    Point {
+        #[arg(long)]
+        threads: Option<usize>,
+    },
+}
+
+/// What a sweep over captures is run on.
+#[derive(Args)]
+struct SceneArguments {
+    /// Captures, as `train` takes them [default: the embedded demo]
+    scenes: Vec<String>,
+    /// The body model of the captures
+    #[arg(long)]
+    body: Option<PathBuf>,
+    #[command(flatten)]
+    load: LoadArguments,
+}
+
+#[derive(Args)]
+struct CapacityArguments {
+    #[command(flatten)]
+    on: SceneArguments,
+    /// Where to write; what is there is not run again
+    #[arg(long, default_value = "runs/bench-capacity")]
+    out: PathBuf,
+    /// Fewer points and fewer steps: about 10 minutes on 2 cores
+    #[arg(long)]
+    quick: bool,
+    /// Steps of each point [default: 400, quick: 80]
+    #[arg(long)]
+    steps: Option<u64>,
+    /// The preset `paper` too, and what is chosen from it, with so many steps and the loss of
+    /// `balanced`
+    #[arg(long, value_name = "STEPS")]
+    paper: Option<u64>,
+    /// Seed of every point
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+    #[command(flatten)]
+    sitting: SittingArguments,
+}
+
+#[derive(Args)]
+struct ParetoArguments {
+    #[command(flatten)]
+    on: SceneArguments,
+    /// Where to write; what is there is not run again
+    #[arg(long, default_value = "runs/bench-pareto")]
+    out: PathBuf,
+    /// Fewer points and fewer steps: under 10 minutes on 2 cores
+    #[arg(long)]
+    quick: bool,
+    /// Steps of each point; presets run their own number at 400 and in proportion otherwise
+    /// [default: 400, quick: 80]
+    #[arg(long)]
+    steps: Option<u64>,
+    /// Seed of every point
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+    #[command(flatten)]
+    sitting: SittingArguments,
+}
+
+#[derive(Args)]
+struct StabilityArguments {
+    #[command(flatten)]
+    on: SceneArguments,
+    /// Where to write; what is there is not run again
+    #[arg(long, default_value = "runs/bench-stability")]
+    out: PathBuf,
+    /// Only the easy case and the hardest level of each axis, fewer steps, one seed: under 10
+    /// minutes on 2 cores
+    #[arg(long)]
+    quick: bool,
+    /// Steps of each run [default: 200, quick: 100]
+    #[arg(long)]
+    steps: Option<u64>,
+    /// Only these axes, comma separated, such as hidden,"pose noise" [default: all]
+    #[arg(long, value_delimiter = ',')]
+    axes: Vec<String>,
+    /// Pixels a side of the pictures, 64 to 512 for figures that mean something; of captures, where
+    /// --resize is not given
+    #[arg(long, default_value_t = 96)]
+    side: u32,
+    /// Trained runs at most of each scene; those of more seeds are left out first
+    #[arg(long, default_value_t = 60)]
+    max_runs: usize,
+    #[command(flatten)]
+    sitting: SittingArguments,
+}
+
+/// How a sweep is run this time.
+#[derive(Args)]
+struct SittingArguments {
+    /// Threads of each run [default: all cores]
+    #[arg(long)]
+    threads: Option<usize>,
+    /// Begin no run after so many minutes; the same command goes on later [default: no limit]
+    #[arg(long)]
+    minutes: Option<f64>,
+    /// Only draw what has been run
+    #[arg(long)]
+    draw: bool,
+    #[command(flatten)]
+    part: ShardArguments,
+    /// Make what is found a section of tests/lab/RESULTS.md
+    #[arg(long)]
+    publish: bool,
+}
+
+#[derive(Args)]
+struct CostArguments {
+    /// Where to write; what is there is not run again
+    #[arg(long, default_value = "runs/bench-cost")]
+    out: PathBuf,
+    #[command(flatten)]
+    sitting: SittingArguments,
+}
+
+#[derive(Args)]
+struct KernelArguments {
+    /// Where to write
+    #[arg(long, default_value = "runs/bench-kernels")]
+    out: PathBuf,
+    /// Fewer queries
+    #[arg(long)]
+    quick: bool,
+    /// Make what is found a section of tests/lab/RESULTS.md
+    #[arg(long)]
+    publish: bool,
+}
+
+/// Runs the command.
+pub fn bench(arguments: &BenchArguments) -> Result<()> {
+    match &arguments.what {
+        What::Baked(arguments) => baked::baked(arguments),
+        What::Registration(arguments) => registration::registration(arguments),
+        What::Pareto(arguments) => pareto(arguments),
+        What::Capacity(arguments) => capacity_bench(arguments),
+        What::Stability(arguments) => stability(arguments),
+        What::Kernels(arguments) => kernels::run(&arguments.out, arguments.quick, arguments.publish),
+        What::Cost(arguments) => {
+            use_threads(arguments.sitting.threads)?;
+            let alone = arguments.sitting.part.shard.is_none();
+            anyhow::ensure!(alone, "bench cost measures one machine: it has no parts");
+            let mut bench = arguments.sitting.open(&arguments.out)?;
+            let text = cost::run(&mut bench, &arguments.out)?;
+            finish(&bench, &arguments.sitting, &text, "cost")
+        }
+        What::Point { threads } => {
+            use_threads(*threads)?;
+            job::serve()
+        }
+    }
+}
+
+impl SittingArguments {
+    fn open(&self, out: &Path) -> Result<Bench> {
+        let minutes = if self.draw || self.part.merge { 0.0 } else { self.minutes.unwrap_or(1e6) };
+        anyhow::ensure!((0.0..=1e6).contains(&minutes), "--minutes {minutes}: expected 0 to 1000000");
+        check_threads(self.threads)?;
+        Bench::open(out, self.threads, Duration::from_secs_f64(60.0 * minutes), self.part.shard)
+    }
+}
+
+impl SceneArguments {
+    /// The scenes; what is wrong with a capture is said before anything is run.
+    fn checked(&self) -> Result<Vec<String>> {
+        let scenes = if self.scenes.is_empty() { vec![source::DEMO.to_owned()] } else { self.scenes.clone() };
+        for scene in scenes.iter().filter(|s| *s != source::DEMO || !self.load.command_line().is_empty()) {
+            self.read(scene)?;
+        }
+        Ok(scenes)
+    }
+
+    fn read(&self, scene: &str) -> Result<Source> {
+        source::load(Some(scene), self.body.as_deref(), &self.load.options()?)
+    }
+
+    fn sweep(&self, scene: &str, steps: u64, seed: u64, quick: bool) -> Result<points::Sweep> {
+        let (body, load) = (self.body.clone(), self.load.options()?);
+        Ok(points::Sweep {
+            scene_arguments: self.command_line(scene),
+            place: Place::Scene { scene: scene.to_owned(), body, load },
+            views: if quick { VIEWS.1 } else { VIEWS.0 },
+            steps,
+            full_steps: FULL_STEPS,
+            seed,
+            quick,
+        })
+    }
+
+    /// What `bench stability` does to a scene.
+    fn axes(&self, scene: &str, side: u32, quick: bool) -> Result<Vec<axes::Axis>> {
+        if scene == source::DEMO {
+            anyhow::ensure!(
+                self.load.command_line().is_empty(),
+                "bench stability makes the demo anew, without options"
+            );
+            return Ok(axes::of_demo(side, quick));
+        }
+        anyhow::ensure!(
+            Path::new(scene).is_dir(),
+            "{scene}: expected the demo, or a capture on disk (synth makes one)"
+        );
+        // The one layout that leaves open what hides the person.
+        let obstacle = Layout::detect(Path::new(scene))? == Layout::ZjuMocap;
+        let place = Place::Scene { scene: scene.to_owned(), body: self.body.clone(), load: self.load.options()? };
+        Ok(axes::of_capture(&place, side, obstacle, quick))
+    }
+
+    /// What makes `train` read the same capture.
+    fn command_line(&self, scene: &str) -> String {
+        let mut text = if scene == source::DEMO { String::new() } else { format!(" {scene}") };
+        if let Some(body) = &self.body {
+            text.push_str(&format!(" --body {}", body.display()));
+        }
+        text + &self.load.command_line()
+    }
+}
+
+/// Steps of a point: as asked, or the usual number.
+fn steps(asked: Option<u64>, quick: bool) -> Result<u64> {
+    let steps = asked.unwrap_or(if quick { FULL_STEPS / 5 } else { FULL_STEPS });
+    anyhow::ensure!((1..=1_000_000).contains(&steps), "--steps {steps}: expected 1 to 1000000");
+    Ok(steps)
+}
+
+fn pareto(arguments: &ParetoArguments) -> Result<()> {
+    let ParetoArguments { on, out, quick, seed, .. } = arguments;
+    let steps = steps(arguments.steps, *quick)?;
+    let scenes = on.checked()?;
+    let mut bench = arguments.sitting.open(out)?;
+    let mut text = String::new();
+    for scene in &scenes {
+        let lines = pareto::run(&on.sweep(scene, steps, *seed, *quick)?, &mut bench)?;
+        if !arguments.sitting.part.writes_tables() {
+            continue;
+        }
+        let name = train::scene_name(Some(scene));
+        pareto::charts(&name, &lines, &out.join(format!("pareto-{name}")))?;
+        text.push_str(&format!("## {scene}\n\n{}.\n\n{}\n", results::set_of(&name), pareto::table(&lines)));
+    }
+    finish(&bench, &arguments.sitting, &text, "pareto")?;
+    if !arguments.sitting.draw && arguments.sitting.part.writes_tables() {
+        kernels::run(out, *quick, arguments.sitting.publish)?;
+    }
+    Ok(())
+}
+
+fn capacity_bench(arguments: &CapacityArguments) -> Result<()> {
+    let CapacityArguments { on, out, quick, seed, paper, .. } = arguments;
+    let steps = steps(arguments.steps, *quick)?;
+    let scenes = on.checked()?;
+    let mut bench = arguments.sitting.open(out)?;
+    let mut text = String::new();
+    for scene in &scenes {
+        let points = capacity::points(&on.sweep(scene, steps, *seed, *quick)?, &on.read(scene)?, *paper)?;
+        let lines = capacity::run(points, &mut bench)?;
+        if !arguments.sitting.part.writes_tables() {
+            continue;
+        }
+        let name = train::scene_name(Some(scene));
+        capacity::chart(&name, &lines, &out.join(format!("capacity-{name}")))?;
+        text.push_str(&format!("## {scene}\n\n{}.\n\n{}\n", results::set_of(&name), capacity::table(&lines)));
+    }
+    finish(&bench, &arguments.sitting, &text, "capacity")
+}
+
+fn stability(arguments: &StabilityArguments) -> Result<()> {
+    let StabilityArguments { on, out, quick, side, max_runs, .. } = arguments;
+    let steps = arguments.steps.unwrap_or(if *quick { 100 } else { 200 });
+    anyhow::ensure!((1..=1_000_000).contains(&steps), "--steps {steps}: expected 1 to 1000000");
+    anyhow::ensure!((16..=2048).contains(side), "--side {side}: expected 16 to 2048");
+    let mut of_scenes = Vec::new();
+    for scene in on.checked()? {
+        let mut axes = on.axes(&scene, *side, *quick)?;
+        if !arguments.axes.is_empty() {
+            let known = axes.iter().map(|a| a.name).collect::<Vec<_>>().join(", ");
+            if let Some(unknown) = arguments.axes.iter().find(|name| axes.iter().all(|a| a.name != name.trim())) {
+                anyhow::bail!("--axes {unknown}: of {scene} there are {known}");
+            }
+            axes.retain(|axis| arguments.axes.iter().any(|name| name.trim() == axis.name));
+        }
+        of_scenes.push((scene, axes));
+    }
+    let mut bench = arguments.sitting.open(out)?;
+    let mut text = String::new();
+    for (scene, axes) in of_scenes {
+        let sweep = stability::Sweep { axes, steps, quick: *quick, max_runs: *max_runs };
+        let lines = sweep.run(&mut bench)?;
+        if !arguments.sitting.part.writes_tables() {
+            continue;
+        }
+        let name = train::scene_name(Some(&scene));
+        stability::charts(&name, &sweep.axes, &lines, &out.join(format!("stability-{name}")))?;
+        let (table, finite) = (stability::table(&sweep.axes, &lines), stability::finite(&lines));
+        let set = results::set_of(&name);
+        text.push_str(&format!("## {scene}\n\n{set}.\n\n{table}\n{finite}\n\n"));
+    }
+    finish(&bench, &arguments.sitting, &text, "stability")
+}
+
+/// Prints and writes the table, and says what there is.
+fn finish(bench: &Bench, sitting: &SittingArguments, text: &str, name: &str) -> Result<()> {
+    let (begun, left) = bench.counts();
+    if bench.is_part() {
+        say!(
+            "{begun} runs in {:.1} minutes; {left} are of other parts, or left; --merge draws",
+            bench.seconds() / 60.0
+        );
+        return Ok(());
+    }
+    let (log, minutes) = (bench.path().display(), bench.seconds() / 60.0);
+    let path = bench.path().with_file_name(format!("{name}.md"));
+    write(&path, text)?;
+    say!("\n{text}\nwritten: {log}\nwritten: {}\n{begun} runs in {minutes:.1} minutes", path.display());
+    if left > 0 {
+        say!("{left} points are left: the same command goes on with them");
+    }
+    if sitting.publish {
+        let title = match name {
+            "pareto" => "Speed against accuracy",
+            "capacity" => "Parameters against accuracy",
+            "stability" => "Where methods break",
+            _ => "What a step costs",
+        };
+        let stem = if name == "cost" { "growth" } else { name };
+        let charts = results::charts(bench.path().parent().unwrap_or(Path::new(".")), stem)?;
+        results::publish(&Section { name, title, body: text, charts: &charts })?;
+    }
+    Ok(())
+}

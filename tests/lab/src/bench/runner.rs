@@ -1,0 +1,342 @@
+//! Runs points one after another and remembers them: one JSON line a point in bench.jsonl.
+
+use std::fs::File;
+use std::io::Write;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, Result, bail};
+use serde::{Deserialize, Serialize};
+
+use super::job::{self, Job, Outcome};
+use crate::results::BENCH_LOG;
+use xtask::process::{Lock, say, unwritten};
+use xtask::shard::Shard;
+
+/// A run that takes longer is ended and counts as failed.
+const LIMIT: Duration = Duration::from_secs(30 * 60);
+
+/// Why a point is in the sweep.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Kind {
+    /// What the single changes are changes of.
+    Base,
+    /// One factor changed.
+    Change,
+    /// Several at once.
+    Combination,
+    /// A named preset as it is.
+    Preset,
+    /// Sizes chosen from the scene.
+    Auto,
+    /// Another method.
+    Baseline,
+    /// The base, baked.
+    Baked,
+    /// A level of difficulty.
+    Level,
+}
+
+/// A named run.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Point {
+    /// `pareto`, `stability` or `capacity`.
+    pub bench: String,
+    pub name: String,
+    /// What is changed.
+    pub factor: String,
+    /// How far, where that is a number.
+    pub level: Option<f64>,
+    pub kind: Kind,
+    /// What runs it alone, where `train` can.
+    pub command: Option<String>,
+    pub job: Job,
+}
+
+/// A point and what came of it.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Line {
+    #[serde(flatten)]
+    pub point: Point,
+    #[serde(flatten)]
+    pub outcome: Outcome,
+}
+
+impl Line {
+    /// Whether two lines are of one point, so that the later one holds.
+    fn replaces(&self, other: &Self) -> bool {
+        let (a, b) = (&self.point, &other.point);
+        (&a.bench, &a.name, &a.factor) == (&b.bench, &b.name, &b.factor)
+            && a.job.place.name() == b.job.place.name()
+            && (a.job.config.method, a.job.config.seed) == (b.job.config.method, b.job.config.seed)
+    }
+}
+
+/// Reads a log; of several lines for one point the last holds. A last line that was cut off is left
+/// out: its point was not finished.
+///
+/// # Errors
+/// A file that cannot be read, or a line before the last that is none, by its number.
+pub fn read(path: &Path) -> Result<Vec<Line>> {
+    let text = std::fs::read_to_string(path).with_context(|| path.display().to_string())?;
+    let rows: Vec<(usize, &str)> = text.lines().enumerate().filter(|(_, l)| !l.trim().is_empty()).collect();
+    let mut lines: Vec<Line> = Vec::new();
+    for (at, &(row, content)) in rows.iter().enumerate() {
+        match serde_json::from_str::<Line>(content) {
+            Ok(line) => {
+                lines.retain(|old| !line.replaces(old));
+                lines.push(line);
+            }
+            Err(_) if at + 1 == rows.len() => {}
+            Err(error) => bail!("{}, line {}: {error}", path.display(), row + 1),
+        }
+    }
+    Ok(lines)
+}
+
+/// Reads the logs of a sweep: its own, and those of its parts.
+fn read_all(directory: &Path) -> Result<Vec<Line>> {
+    let entries = std::fs::read_dir(directory).with_context(|| directory.display().to_string())?;
+    let of_part = |name: &str| name.starts_with("bench-") && name.ends_with(".jsonl");
+    let mut paths: Vec<PathBuf> = entries
+        .filter_map(|entry| Some(entry.ok()?.path()))
+        .filter(|path| path.file_name().and_then(|n| n.to_str()).is_some_and(|name| name == BENCH_LOG || of_part(name)))
+        .collect();
+    paths.sort();
+    let mut lines: Vec<Line> = Vec::new();
+    for path in paths {
+        for line in read(&path)? {
+            // A part that failed does not replace one that did not.
+            if line.outcome.error.is_none() || lines.iter().all(|old| !line.replaces(old)) {
+                lines.retain(|old| !line.replaces(old));
+                lines.push(line);
+            }
+        }
+    }
+    Ok(lines)
+}
+
+/// What tells a point from all others, the same in every part.
+fn name(point: &Point) -> String {
+    let config = &point.job.config;
+    let place = point.job.place.name();
+    format!("{} {place} {} {} {} {}", point.bench, point.factor, point.name, config.method.name(), config.seed)
+}
+
+/// A sweep in progress.
+pub struct Bench {
+    path: PathBuf,
+    file: File,
+    _lock: Lock,
+    shard: Option<Shard>,
+    lines: Vec<Line>,
+    threads: Option<usize>,
+    start: Instant,
+    /// No point is begun after this.
+    budget: Duration,
+    begun: usize,
+    left: usize,
+}
+
+impl Bench {
+    /// Goes on in `directory`, which is made if need be. A part of a sweep has a log and a lock of
+    /// its own, and reads those of the others.
+    pub fn open(directory: &Path, threads: Option<usize>, budget: Duration, shard: Option<Shard>) -> Result<Self> {
+        xtask::run::make_directory(directory)?;
+        let path = directory.join(shard.map_or(BENCH_LOG.to_owned(), |shard| format!("bench-{}.jsonl", shard.name())));
+        let lock = Lock::take(&match shard {
+            None => directory.to_owned(),
+            Some(shard) => {
+                let own = directory.join("parts").join(shard.name());
+                xtask::run::make_directory(&own)?;
+                own
+            }
+        })?;
+        let own = if path.exists() { read(&path)? } else { Vec::new() };
+        // Written anew, so that a line that was cut off does not spoil the next.
+        let text: Vec<String> = own.iter().map(serde_json::to_string).collect::<Result<_, _>>()?;
+        xtask::run::write(&path, &text.iter().map(|l| format!("{l}\n")).collect::<String>())?;
+        let file = File::options().append(true).open(&path).map_err(unwritten(&path))?;
+        let lines = read_all(directory)?;
+        let start = Instant::now();
+        Ok(Self { path, file, _lock: lock, shard, lines, threads, start, budget, begun: 0, left: 0 })
+    }
+
+    /// Runs a point, unless the log has it with the very same job and no error; `None` when time is
+    /// up.
+    pub fn run(&mut self, point: Point) -> Result<Option<Line>> {
+        let done = self.lines.iter().find(|l| l.point.job == point.job && l.outcome.error.is_none());
+        if let Some(done) = done {
+            let line = Line { point, outcome: done.outcome.clone() };
+            if !self.lines.contains(&line) && self.shard.is_none() {
+                self.add(line.clone())?;
+            }
+            return Ok(Some(line));
+        }
+        let others = self.shard.is_some_and(|shard| !shard.has_name(&name(&point)));
+        if others || self.start.elapsed() >= self.budget {
+            self.left += 1;
+            return Ok(None);
+        }
+        self.begun += 1;
+        let outcome = job::run(&point.job, self.threads, LIMIT)?;
+        let line = Line { point, outcome };
+        self.add(line.clone())?;
+        say!("{}", summary(&line));
+        Ok(Some(line))
+    }
+
+    fn add(&mut self, line: Line) -> Result<()> {
+        let text = serde_json::to_string(&line)? + "\n";
+        let length = self.file.metadata().map(|m| m.len());
+        let written = self.file.write_all(text.as_bytes()).and_then(|()| self.file.sync_data());
+        if let (Err(_), Ok(length)) = (&written, length) {
+            // No half line stays for others to read.
+            let _ = self.file.set_len(length);
+        }
+        written.map_err(unwritten(&self.path))?;
+        self.lines.retain(|old| !line.replaces(old));
+        self.lines.push(line);
+        Ok(())
+    }
+
+    /// Whether this is one of several parts, so that there is nothing to draw yet.
+    pub fn is_part(&self) -> bool {
+        self.shard.is_some()
+    }
+
+    /// The log's path.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Points that were run now, and those that time was too short for.
+    pub fn counts(&self) -> (usize, usize) {
+        (self.begun, self.left)
+    }
+
+    /// Since the sweep was opened.
+    pub fn seconds(&self) -> f64 {
+        self.start.elapsed().as_secs_f64()
+    }
+}
+
+/// One line on the terminal.
+fn summary(line: &Line) -> String {
+    let Line { point, outcome } = line;
+    let number = |v: Option<f64>, digits: usize| v.map_or("–".to_owned(), |v| format!("{v:.digits$}"));
+    let what = format!("{:<34} {:<10}", point.name, point.job.config.method.name());
+    if let Some(error) = &outcome.error {
+        return format!("{what} failed: {error}");
+    }
+    format!(
+        "{what} {:7.1} s  {:6.3} s/frame  psnr_mask {:>5}  psnr_hidden {:>5}  ssim_mask {:>6}  {:4.0} MB",
+        outcome.train_seconds,
+        outcome.seconds_per_frame,
+        number(outcome.psnr_mask, 2),
+        number(outcome.psnr_hidden, 2),
+        number(outcome.ssim_mask, 4),
+        outcome.peak_rss_bytes as f64 / 1e6,
+    )
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
+pub mod tests {
+    use occnerf::{Config, Method, Preset};
+
+    use super::*;
+    use crate::bench::difficulty::Difficulty;
+    use crate::bench::job::Place;
+
+    /// A line of a point called `name` that scored `psnr` in `seconds`.
+    pub fn line(name: &str, factor: &str, kind: Kind, psnr: f64, seconds: f64) -> Line {
+        let config = Config::preset(Preset::Fast, Method::Occnerf);
+        let point = Point {
+            bench: "pareto".to_owned(),
+            name: name.to_owned(),
+            factor: factor.to_owned(),
+            level: Some(1.0),
+            kind,
+            command: Some("cargo xtask train".to_owned()),
+            job: Job { place: Place::Made(Difficulty::default()), views: 3, config, prune: false, bake: None },
+        };
+        let (psnr_mask, psnr_hidden) = (Some(psnr), Some(psnr));
+        let outcome = Outcome {
+            train_seconds: seconds,
+            seconds_per_frame: 0.1,
+            psnr_mask,
+            psnr_hidden,
+            ssim_mask: Some(0.5),
+            ..Outcome::default()
+        };
+        Line { point, outcome }
+    }
+
+    fn folder(name: &str) -> PathBuf {
+        let path = std::env::temp_dir().join(format!("xtask-runner-{name}-{}", std::process::id()));
+        let _ = std::fs::remove_dir_all(&path);
+        std::fs::create_dir_all(&path).unwrap();
+        path
+    }
+
+    #[test]
+    fn a_last_line_that_was_cut_off_is_dropped_and_any_other_damage_is_named() {
+        let folder = folder("damage");
+        let path = folder.join(BENCH_LOG);
+        let (a, b) = (line("a", "k", Kind::Change, 20.0, 3.0), line("b", "k", Kind::Change, 21.0, 4.0));
+        let (a, b) = (serde_json::to_string(&a).unwrap(), serde_json::to_string(&b).unwrap());
+        std::fs::write(&path, format!("{a}\n{}", &b[..b.len() / 2])).unwrap();
+        assert_eq!(read(&path).unwrap().len(), 1);
+        let bench = Bench::open(&folder, None, Duration::ZERO, None).unwrap();
+        assert_eq!(bench.lines.len(), 1);
+        assert!(Bench::open(&folder, None, Duration::ZERO, None).is_err(), "another process has it");
+        assert_eq!(std::fs::read_to_string(bench.path()).unwrap(), format!("{a}\n"));
+        drop(bench);
+        std::fs::write(&path, format!("{a}\nnot json\n{b}\n")).unwrap();
+        let message = read(&path).unwrap_err().to_string();
+        assert!(message.contains(BENCH_LOG) && message.contains("line 2"), "{message}");
+        std::fs::remove_dir_all(&folder).unwrap();
+    }
+
+    #[test]
+    fn parts_share_points_out_and_read_each_others_logs() {
+        let folder = folder("parts");
+        let shards = ["1/2", "2/2"].map(|text| text.parse::<Shard>().unwrap());
+        let lines: Vec<Line> = (0..9).map(|i| line(&format!("p{i}"), "k", Kind::Change, 20.0, 3.0)).collect();
+        for shard in shards {
+            let mut bench = Bench::open(&folder, None, Duration::ZERO, Some(shard)).unwrap();
+            let own: Vec<&Line> = lines.iter().filter(|l| shard.has_name(&name(&l.point))).collect();
+            assert!((1..9).contains(&own.len()));
+            own.into_iter().for_each(|line| bench.add(line.clone()).unwrap());
+            assert!(Bench::open(&folder, None, Duration::ZERO, Some(shard)).is_err(), "its twin runs");
+        }
+        let mut whole = Bench::open(&folder, None, Duration::ZERO, None).unwrap();
+        for line in &lines {
+            assert_eq!(whole.run(line.point.clone()).unwrap().as_ref(), Some(line));
+        }
+        assert_eq!(whole.counts(), (0, 0));
+        std::fs::remove_dir_all(&folder).unwrap();
+    }
+
+    #[test]
+    fn a_finished_point_is_not_run_again_and_its_later_line_holds() {
+        let folder = folder("again");
+        let old = line("a", "k", Kind::Change, 20.0, 3.0);
+        let mut bench = Bench::open(&folder, None, Duration::ZERO, None).unwrap();
+        bench.add(old.clone()).unwrap();
+        assert_eq!(bench.run(old.point.clone()).unwrap().unwrap(), old);
+        // Other settings are another run, for which there is no time here.
+        let mut other = old.point.clone();
+        other.job.config.steps += 1;
+        assert_eq!(bench.run(other).unwrap(), None);
+        let mut failed = old.clone();
+        failed.outcome.error = Some("out of luck".to_owned());
+        bench.add(failed).unwrap();
+        assert_eq!(bench.run(old.point.clone()).unwrap(), None);
+        assert_eq!(bench.counts(), (0, 2));
+        assert_eq!(read(bench.path()).unwrap().len(), 1);
+        std::fs::remove_dir_all(&folder).unwrap();
+    }
+}

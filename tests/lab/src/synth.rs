@@ -1,0 +1,173 @@
+//! `synth`: a capture made to order, in a published dataset format.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::{Error, Result, bail, ensure};
+use clap::{Args, ValueEnum};
+use occnerf::capture::{Layout, Obstacle, Occlusion, SynthConfig, Synthetic};
+
+use xtask::film::{bar, film, is_character};
+use xtask::obstacle::ObstacleArguments;
+use xtask::place::{beside, not_within, take_place, vacant};
+use xtask::process::{results_in, say};
+
+/// What a finished directory holds, and nothing else does.
+const MARK: &str = "synth.json";
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+enum FormatName {
+    /// HumanNeRF's prepared layout, with eval/ cameras.
+    Humannerf,
+    /// Raw ZJU-MoCap, with occlusion.json.
+    ZjuMocap,
+    /// HumanNeRF's wild layout, in which OcMotion is distributed: one camera, occluders/, clean/
+    /// frames of the same camera.
+    Ocmotion,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+enum OcclusionName {
+    /// Nothing in front of the person.
+    None,
+    /// The paper's fixed rectangle.
+    Central,
+    /// The same, moving by three tenths of the picture.
+    Moving,
+    /// A desk and pillars of 3-D geometry, in every frame.
+    Objects,
+}
+
+/// What to make, and where to.
+#[derive(Args)]
+pub struct SynthArguments {
+    /// A rigged .glb or .gltf; the embedded person if left out. Its mesh at rest becomes the body
+    /// model, with as many joints as the rig has (poses are then 3 numbers a joint, not 72)
+    character: Option<PathBuf>,
+    /// Directory to write, new or empty
+    #[arg(long)]
+    out: PathBuf,
+    /// Replace what an earlier synth wrote to --out
+    #[arg(long)]
+    force: bool,
+    /// Layout of the files
+    #[arg(long, default_value = "humannerf")]
+    format: FormatName,
+    /// What hides the person
+    #[arg(long, default_value = "central")]
+    occlusion: OcclusionName,
+    #[command(flatten)]
+    obstacle: ObstacleArguments,
+    /// Frames of the video [default: 100]
+    #[arg(long, value_name = "N")]
+    frames: Option<usize>,
+    /// Pixels a side [default: 192]
+    #[arg(long, value_name = "PIXELS")]
+    size: Option<u32>,
+    /// Cameras kept back [default: 5]; the ocmotion layout has none
+    #[arg(long, value_name = "N")]
+    eval_cameras: Option<usize>,
+    /// Views kept back show every n-th frame [default: 10]
+    #[arg(long, value_name = "N")]
+    eval_every: Option<usize>,
+    /// Motion capture (.npz with poses, trans, fps), for the embedded person or joints with
+    /// MakeHuman's, Mixamo's, Unreal's or SMPL's names [default: a walk; a character's first
+    /// animation]
+    #[arg(long, value_name = "CLIP.npz")]
+    motion: Option<PathBuf>,
+    /// Full turns added to the motion of a clip or a character over the video, so that all sides
+    /// are seen [default: 1.15]
+    #[arg(long, value_name = "N", allow_negative_numbers = true)]
+    turns: Option<f32>,
+    /// Error of each bone's orientation in the poses that are written, degrees rms [default: 1.5]
+    #[arg(long, value_name = "DEGREES")]
+    pose_noise: Option<f32>,
+    /// Error of the body's shape: at 1 a character's body lies 1 to 3 cm inside it, the embedded
+    /// person's betas are off by
+    /// 0.15 under the clothes [default: 1]
+    #[arg(long, value_name = "0 to 3")]
+    shape_noise: Option<f32>,
+    /// Decides the light, the embedded person's shape and clothes, and all errors [default: 0]
+    #[arg(long, value_name = "N")]
+    seed: Option<u64>,
+    /// Strength of the light from one side; at 0 as much comes from everywhere [default: 1]
+    #[arg(long, value_name = "0 to 1")]
+    lamp: Option<f32>,
+}
+
+impl SynthArguments {
+    fn config(&self) -> Result<SynthConfig> {
+        let usual = SynthConfig::default();
+        let occlusion = match self.occlusion {
+            OcclusionName::None => Occlusion::Rectangle(self.obstacle.none()?),
+            OcclusionName::Central => Occlusion::Rectangle(self.obstacle.central()),
+            OcclusionName::Moving => Occlusion::Rectangle(self.obstacle.moving()),
+            OcclusionName::Objects => {
+                let said = "--occlusion objects has no --share (they stand in every frame) and no --height";
+                ensure!(self.obstacle.share.or(self.obstacle.height).is_none(), said);
+                let Obstacle { fraction, position, .. } = self.obstacle.central();
+                Occlusion::Objects { fraction, position }
+            }
+        };
+        Ok(SynthConfig {
+            size: self.size.unwrap_or(usual.size),
+            frames: self.frames.unwrap_or(usual.frames),
+            eval_cameras: self.eval_cameras.unwrap_or(usual.eval_cameras),
+            eval_every: self.eval_every.unwrap_or(usual.eval_every),
+            seed: self.seed.unwrap_or(usual.seed),
+            lamp: self.lamp.unwrap_or(usual.lamp),
+            pose_noise_degrees: self.pose_noise.unwrap_or(usual.pose_noise_degrees),
+            shape_noise: self.shape_noise.unwrap_or(usual.shape_noise),
+            turns: self.turns.unwrap_or(usual.turns),
+            occlusion,
+        })
+    }
+}
+
+/// Runs the command: everything is written beside --out and takes its place when it is complete.
+pub fn synth(arguments: &SynthArguments) -> Result<()> {
+    let config = arguments.config()?;
+    let out = &arguments.out;
+    if let Some(path) = arguments.character.as_deref().filter(|path| !is_character(path)) {
+        bail!("{}: not a character; expected a .glb or .gltf", path.display());
+    }
+    vacant(out, arguments.force, MARK)?;
+    for (what, path) in [("the character", &arguments.character), ("--motion", &arguments.motion)] {
+        if let Some(path) = path {
+            not_within(path, out, what)?;
+        }
+    }
+    let layout = match arguments.format {
+        FormatName::Humannerf => Layout::HumanNerf,
+        FormatName::ZjuMocap => Layout::ZjuMocap,
+        FormatName::Ocmotion => Layout::Wild,
+    };
+    let synthetic = film(arguments.character.as_deref(), arguments.motion.as_deref(), &config)?;
+    let partial = beside(out, "partial")?;
+    let written = write(&synthetic, &partial, layout).and_then(|()| take_place(&partial, out, arguments.force, MARK));
+    if let Err(error) = written {
+        let _ = std::fs::remove_dir_all(&partial);
+        return Err(error);
+    }
+    let capture = &synthetic.capture;
+    say!(
+        "{}: {} frames, {} views kept back, {:.1} % of the person hidden where anything is, {} joints, {} vertices",
+        out.display(),
+        capture.train.len(),
+        if layout == Layout::Wild { capture.train.len().div_ceil(config.eval_every) } else { capture.eval.len() },
+        100.0 * synthetic.hidden_fraction,
+        synthetic.body.num_joints(),
+        synthetic.body.num_vertices(),
+    );
+    say!("train on it: cargo xtask train {}", out.display());
+    Ok(())
+}
+
+fn write(synthetic: &Synthetic, directory: &Path, layout: Layout) -> Result<()> {
+    xtask::run::make_directory(directory)?;
+    let bar = bar("writing", synthetic.num_pictures(layout));
+    let written = synthetic.write(directory, layout, &|_| bar.inc(1));
+    written.map_err(Error::from).map_err(results_in(directory))?;
+    bar.finish_and_clear();
+    let mark = serde_json::json!({ "config": synthetic.config, "hidden_fraction": synthetic.hidden_fraction });
+    xtask::run::write(&directory.join(MARK), &serde_json::to_string_pretty(&mark)?)
+}

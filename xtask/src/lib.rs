@@ -1,0 +1,35 @@
+//! The command line of OccNeRF as a library, for programs that train, score and draw as it does.
+#![warn(clippy::print_stdout, clippy::print_stderr, reason = "printing must never stop work: see process::print")]
+
+mod avatar;
+mod baked;
+pub mod capacity;
+mod check;
+mod commands;
+mod convert;
+pub mod eval;
+mod export;
+pub mod film;
+mod html;
+mod import;
+pub mod list;
+pub mod network;
+pub mod obstacle;
+pub mod optimise;
+pub mod pictures;
+pub mod place;
+mod preview;
+pub mod process;
+mod render;
+pub mod report;
+pub mod run;
+pub mod scale;
+pub mod settings;
+pub mod shard;
+pub mod source;
+pub mod table;
+pub mod train;
+mod video;
+mod view;
+
+pub use commands::Arguments;

@@ -1,0 +1,44 @@
+//! A program from its first line to its exit code.
+
+use std::process::ExitCode;
+
+use anyhow::Result;
+use clap::Parser;
+
+use super::{described, note, watch};
+
+/// Exit codes, for the end of `--help`.
+pub const EXIT_CODES: &str = "Exit codes:
+  0        done
+  1        something given is wrong
+  2        the command line cannot be read
+  3        a result cannot be written; what stood there before is whole
+  4        another process has the folder
+  128 + n  ended by signal n, with everything saved";
+
+/// Reads the command line, runs `command` on it, and says in one line what went wrong.
+pub fn program<A: Parser>(command: impl FnOnce(A) -> Result<()>) -> ExitCode {
+    let arguments = match A::try_parse() {
+        Ok(arguments) => arguments,
+        // Help is ours; an error quotes what was given.
+        Err(error) if !error.use_stderr() => {
+            let _ = error.print();
+            return ExitCode::SUCCESS;
+        }
+        Err(error) => {
+            note!("{}", error.to_string().trim_end());
+            return ExitCode::from(2);
+        }
+    };
+    if let Err(error) = watch() {
+        note!("warning: signals end the program unsaved: {error}");
+    }
+    match command(arguments) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            let (text, code) = described(&error);
+            note!("{text}");
+            ExitCode::from(code)
+        }
+    }
+}
