@@ -4,7 +4,7 @@ use std::path::Path;
 
 use anyhow::{Context, Result};
 use indicatif::{ProgressBar, ProgressStyle};
-use occnerf::capture::{SynthConfig, Synthetic, synthesise};
+use synth::{SynthConfig, Synthetic, synthesise};
 use smpl::{Character, MotionClip};
 
 /// Whether `path` is named like a rigged character.

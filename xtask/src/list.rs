@@ -37,8 +37,7 @@ pub fn train_list(arguments: &TrainArguments) -> Result<()> {
             continue;
         }
         let trained = source::load(Some(scene), arguments.body.as_deref(), &load).and_then(|source| {
-            let (body, load) = (source.body.clone(), source.load.clone());
-            let run = RunConfig { scene: source.scene.clone(), body, load, train: config.clone() };
+            let run = RunConfig::new(&source, config.clone());
             run_unless_finished(&directory, &name, &run, &source, lpips.as_ref(), interval)
         });
         match trained {

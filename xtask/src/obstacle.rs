@@ -2,7 +2,7 @@
 
 use anyhow::{Result, ensure};
 use clap::Args;
-use occnerf::capture::Obstacle;
+use synth::Obstacle;
 
 /// How far a moving obstacle moves to the right over the video, in picture widths.
 const TRAVEL: f32 = 0.3;

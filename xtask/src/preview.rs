@@ -43,7 +43,7 @@ impl Preview {
 #[cfg(test)]
 #[allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
 mod tests {
-    use occnerf::capture::{DemoConfig, demo};
+    use synth::{DemoConfig, demo};
     use occnerf::{Config, Method, Preset, Scene, Trainer};
 
     use super::*;

@@ -5,15 +5,14 @@ use std::cell::RefCell;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context, Result, bail};
+use anyhow::{Context, Result, bail, ensure};
 use clap::{Args, ValueEnum};
-use occnerf::capture::{
-    Capture, DemoConfig, LoadOptions, Perturbation, SynthConfig, Synthetic, demo, find_body, load_capture, own_body,
-};
+use occnerf::capture::{Area, Capture, Layout, LoadOptions, find_body, load_capture, own_body};
 use occnerf::{Config, Person, Scene, mend_masks};
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use smpl::BodyModel;
+use synth::{DemoConfig, Obstacle, Perturbation, SynthConfig, Synthetic, demo};
 
 use crate::film::{film, is_character};
 use crate::obstacle::ObstacleArguments;
@@ -29,8 +28,8 @@ pub struct Source {
     pub scene: String,
     /// The body model's file.
     pub body: Option<PathBuf>,
-    /// How the capture was read.
-    pub load: LoadOptions,
+    /// How the capture was read and corrupted.
+    pub load: SceneOptions,
     /// Frames with masks, cameras and poses.
     pub capture: Capture,
     /// The body model.
@@ -68,6 +67,56 @@ impl Source {
         *kept = Some((rounds, scene.capture.clone()));
         Ok(scene)
     }
+}
+
+/// How the files of a scene are read, and the capture corrupted.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct SceneOptions {
+    /// How the files are read.
+    pub files: LoadOptions,
+    /// Corruptions of the capture once it is read.
+    pub corruption: Corruption,
+}
+
+/// Corruptions of a capture for experiments.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Corruption {
+    /// The simulated obstacle before the training camera of raw ZJU-MoCap. `None`: what
+    /// `occlusion.json` says, or the default [`Obstacle`] where there is none.
+    pub occlusion: Option<Obstacle>,
+    /// Errors of priors and masks.
+    pub wrong: Perturbation,
+}
+
+impl SceneOptions {
+    /// Whether all but the errors of priors and masks is as by default.
+    fn only_wrong(&self) -> bool {
+        self.files == LoadOptions::default() && self.corruption.occlusion.is_none()
+    }
+}
+
+/// Puts the simulated obstacle before the training camera of raw ZJU-MoCap.
+fn occlude(capture: &mut Capture, directory: &Path, occlusion: Option<Obstacle>) -> Result<()> {
+    if Layout::detect(directory)? != Layout::ZjuMocap {
+        ensure!(
+            occlusion.is_none(),
+            "occlusion: expected none (the masks of {} say what is hidden), found an obstacle",
+            directory.display()
+        );
+        return Ok(());
+    }
+    let recorded = directory.join("occlusion.json").is_file();
+    if recorded && occlusion.is_some() {
+        // The obstacle asked for stands in place of the recorded one.
+        let nowhere = Area { columns: 0..0, rows: 0..0 };
+        capture.train.iter_mut().for_each(|frame| frame.source.hide(nowhere.clone()));
+    }
+    if !recorded || occlusion.is_some() {
+        occlusion.unwrap_or_default().hide(&mut capture.train)?;
+    }
+    Ok(())
 }
 
 /// What a capture's files leave open.
@@ -163,7 +212,7 @@ impl LoadArguments {
     }
 
     /// The same for the library.
-    pub fn options(&self) -> Result<LoadOptions> {
+    pub fn options(&self) -> Result<SceneOptions> {
         let occlusion = match self.occlusion {
             Some(ObstacleName::None) => Some(self.obstacle.none()?),
             Some(ObstacleName::Moving) => Some(self.obstacle.moving()),
@@ -180,17 +229,16 @@ impl LoadArguments {
             ragged_pixels: self.wrong_edge.unwrap_or(as_wrong.ragged_pixels),
             mask_pixels: self.wrong_mask.unwrap_or(as_wrong.mask_pixels),
         };
-        Ok(LoadOptions {
+        let files = LoadOptions {
             resize: self.resize,
             stride: self.stride.unwrap_or(1),
             max_frames: self.max_frames,
             eval_stride: self.eval_stride.unwrap_or(1),
             camera: self.camera.clone(),
-            occlusion,
-            wrong,
             max_bytes: self.memory.map_or(LoadOptions::default().max_bytes, |mib| mib << 20),
             ..LoadOptions::default()
-        })
+        };
+        Ok(SceneOptions { files, corruption: Corruption { occlusion, wrong } })
     }
 
     /// The same as on the command line: every flag that was given.
@@ -201,31 +249,34 @@ impl LoadArguments {
     }
 
     /// How a run to be resumed read its capture, checked against what is asked for.
-    pub fn resumed(&self, saved: &LoadOptions) -> Result<LoadOptions> {
+    pub fn resumed(&self, saved: &SceneOptions) -> Result<SceneOptions> {
         let asked = self.options()?;
-        if asked != LoadOptions::default() && asked != *saved {
+        if asked != SceneOptions::default() && asked != *saved {
             bail!(
                 "the run to resume read its capture with other options; leave them out, or start a new run with --out"
             );
         }
-        let max_bytes = if self.memory.is_some() { asked.max_bytes } else { saved.max_bytes };
-        Ok(LoadOptions { max_bytes, ..saved.clone() })
+        let mut resumed = saved.clone();
+        if self.memory.is_some() {
+            resumed.files.max_bytes = asked.files.max_bytes;
+        }
+        Ok(resumed)
     }
 }
 
 /// Loads `scene`, the demo if it is `None` or named [`DEMO`]; the body is `body`, the capture's own,
 /// that of the variable SMPL_MODEL, or what lies near the scene.
-pub fn load(scene: Option<&str>, body: Option<&Path>, options: &LoadOptions) -> Result<Source> {
-    let scene = scene.unwrap_or(DEMO);
+pub fn load(scene: Option<&str>, body: Option<&Path>, options: &SceneOptions) -> Result<Source> {
+    let (scene, wrong) = (scene.unwrap_or(DEMO), options.corruption.wrong);
     let name = scene.to_owned();
     if scene == DEMO {
-        if *options != (LoadOptions { wrong: options.wrong, ..LoadOptions::default() }) {
+        if !options.only_wrong() {
             bail!("the demo takes none of the options that say how a capture is read");
         }
         let mut model = BodyModel::embedded();
         let mut capture = demo(&DemoConfig::default(), &model)?;
-        options.wrong.apply(&mut capture, &model)?;
-        options.wrong.spoil_body(&mut model);
+        wrong.apply(&mut capture, &model)?;
+        wrong.spoil_body(&mut model);
         return Ok(Source {
             scene: name,
             body: None,
@@ -237,12 +288,12 @@ pub fn load(scene: Option<&str>, body: Option<&Path>, options: &LoadOptions) -> 
     }
     let directory = Path::new(scene);
     if directory.is_file() && is_character(directory) {
-        if *options != (LoadOptions { wrong: options.wrong, ..LoadOptions::default() }) || body.is_some() {
+        if !options.only_wrong() || body.is_some() {
             bail!("{scene}: a character takes none of the options of a capture; use synth to choose how it is filmed");
         }
         let Synthetic { mut capture, mut body, .. } = film(Some(directory), None, &SynthConfig::default())?;
-        options.wrong.apply(&mut capture, &body)?;
-        options.wrong.spoil_body(&mut body);
+        wrong.apply(&mut capture, &body)?;
+        wrong.spoil_body(&mut body);
         return Ok(Source {
             scene: name,
             body: None,
@@ -263,8 +314,10 @@ pub fn load(scene: Option<&str>, body: Option<&Path>, options: &LoadOptions) -> 
         })?,
     };
     let mut model = BodyModel::load(&body)?;
-    let capture = load_capture(directory, &model, options)?;
-    options.wrong.spoil_body(&mut model);
+    let mut capture = load_capture(directory, &model, &options.files)?;
+    occlude(&mut capture, directory, options.corruption.occlusion)?;
+    wrong.apply(&mut capture, &model)?;
+    wrong.spoil_body(&mut model);
     Ok(Source {
         scene: name,
         body: Some(body),
@@ -298,7 +351,7 @@ mod tests {
             assert_eq!(again.split_whitespace().count(), words.split_whitespace().count(), "{again}");
             let options = load.options().unwrap();
             let read = Line::parse_from(again.split_whitespace()).load.options().unwrap();
-            assert_eq!((read.max_bytes, read), (options.max_bytes, options));
+            assert_eq!((read.files.max_bytes, read), (options.files.max_bytes, options));
         }
     }
 
@@ -310,7 +363,7 @@ mod tests {
             [("x", 9), ("x --resize 64", 9), ("x --memory 20", 20), ("x --memory 20 --resize 64", 20)]
         {
             let resumed = load(words).resumed(&saved).unwrap();
-            assert_eq!((resumed.max_bytes, &resumed), (mebibytes << 20, &saved));
+            assert_eq!((resumed.files.max_bytes, &resumed), (mebibytes << 20, &saved));
         }
         assert!(load("x --resize 65").resumed(&saved).is_err() && load("x --stride 2").resumed(&saved).is_err());
     }

@@ -89,8 +89,7 @@ pub fn train(arguments: &TrainArguments) -> Result<()> {
     // The lock is held to the end.
     let Begun { directory, source, config, _lock } =
         if arguments.resume { resumed(arguments, &existing_directory(out, &name)?)? } else { begun(arguments, &name)? };
-    let run =
-        RunConfig { scene: source.scene.clone(), body: source.body.clone(), load: source.load.clone(), train: config };
+    let run = RunConfig::new(&source, config);
     run.write(&directory)?;
     say!("run: {}", directory.display());
     let Some(metrics) = run_one(&directory, &run, &source, lpips.as_ref(), &sitting)? else {
@@ -148,8 +147,8 @@ fn resumed(arguments: &TrainArguments, directory: &Path) -> Result<Begun> {
     // A run that ended before its first checkpoint begins anew.
     let begun = if checkpoint.is_file() { Some(checkpoint_config(&checkpoint)?) } else { None };
     let saved = RunConfig::read(directory)?;
+    let load = arguments.load.resumed(&saved.options())?;
     let config = arguments.settings.resumed(begun.unwrap_or(saved.train), capacity.as_ref())?;
-    let load = arguments.load.resumed(&saved.load)?;
     let scene = arguments.scene.as_deref().unwrap_or(&saved.scene);
     let body = arguments.body.as_deref().or(saved.body.as_deref());
     let mut source = source::load(Some(scene), body, &load)?;
@@ -307,7 +306,7 @@ fn unless_finished(
             body(run)
         );
     }
-    let earlier = old.is_some_and(|old| old.train == run.train && old.load == run.load);
+    let earlier = old.is_some_and(|old| old.train == run.train && old.options() == run.options());
     if earlier && directory.join(METRICS).is_file() {
         let metrics = Metrics::read(directory)?;
         // Scores that lack what is asked for now are made anew from the checkpoint, as are those of

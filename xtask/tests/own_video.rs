@@ -4,7 +4,8 @@
 mod common;
 
 use common::{done, folder, refused, text};
-use occnerf::capture::{Layout, Occlusion, SynthConfig, synthesise};
+use occnerf::capture::Layout;
+use synth::{Occlusion, SynthConfig, synthesise};
 
 const TITLE: &str = "training views, over visible pixels:";
 

@@ -4,7 +4,8 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Error, Result, bail, ensure};
 use clap::{Args, ValueEnum};
-use occnerf::capture::{Layout, Obstacle, Occlusion, SynthConfig, Synthetic};
+use occnerf::capture::Layout;
+use synth::{Obstacle, Occlusion, SynthConfig, Synthetic};
 
 use xtask::film::{bar, film, is_character};
 use xtask::obstacle::ObstacleArguments;

@@ -4,7 +4,8 @@
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
-use occnerf::capture::{Layout, SynthConfig, synthesise};
+use occnerf::capture::Layout;
+use synth::{SynthConfig, synthesise};
 
 /// Runs the program.
 pub fn xtask(arguments: &[&str]) -> Output {

@@ -1,6 +1,7 @@
 //! The ways in which `bench stability` makes it hard.
 
-use occnerf::capture::{DemoConfig, LoadOptions, Obstacle};
+use synth::{DemoConfig, Obstacle};
+use xtask::source::SceneOptions;
 use occnerf::{Config, Method, Preset};
 
 use super::difficulty::Difficulty;
@@ -157,27 +158,29 @@ pub fn of_demo(side: u32, quick: bool) -> Vec<Axis> {
 /// `load` says otherwise. `obstacle`: whether its layout leaves open what hides the person.
 pub fn of_capture(place: &Place, side: u32, obstacle: bool, quick: bool) -> Vec<Axis> {
     let Place::Scene { scene, body, load } = place.clone() else { return Vec::new() };
-    let side = load.resize.unwrap_or(side);
-    let occlusion = load.occlusion.or_else(|| obstacle.then(Obstacle::default));
-    let load = LoadOptions { resize: Some(side), occlusion, ..load };
+    let mut load = load;
+    let side = *load.files.resize.get_or_insert(side);
+    if obstacle {
+        load.corruption.occlusion.get_or_insert_default();
+    }
     let around = Around::new(load, move |load| Place::Scene { scene: scene.clone(), body: body.clone(), load });
-    let axis = |name, unit, values: &[f64], change: &dyn Fn(&mut LoadOptions, f32)| {
+    let axis = |name, unit, values: &[f64], change: &dyn Fn(&mut SceneOptions, f32)| {
         around.axis(name, unit, values, |c, v| change(&mut c.capture, v as f32))
     };
     let mut axes = Vec::new();
     if obstacle {
-        let fraction = |load: &mut LoadOptions, v: f32| {
-            load.occlusion.iter_mut().for_each(|obstacle| obstacle.fraction = v / 100.0);
+        let fraction = |load: &mut SceneOptions, v: f32| {
+            load.corruption.occlusion.iter_mut().for_each(|obstacle| obstacle.fraction = v / 100.0);
         };
         axes.push(axis("hidden", " %", &[0.0, 50.0, 80.0, 95.0], &fraction));
     }
     axes.extend([
-        axis("one frame of", "", &[1.0, 5.0, 20.0], &|l, v| l.stride *= v as usize),
-        axis("pose noise", "°", &[0.0, 1.5, 5.0, 10.0], &|l, v| l.wrong.pose_degrees = v),
-        axis("wrong shape", " σ", &[0.0, 2.0], &|l, v| l.wrong.shape = v),
-        axis("mask erosion", " px", &[0.0, 2.0, 4.0], &|l, v| l.wrong.mask_pixels = -(v as i32)),
-        axis("mask growth", " px", &[0.0, 4.0], &|l, v| l.wrong.mask_pixels = v as i32),
-        axis("image side", " px", &sides(side), &|l, v| l.resize = Some(v as u32)),
+        axis("one frame of", "", &[1.0, 5.0, 20.0], &|l, v| l.files.stride *= v as usize),
+        axis("pose noise", "°", &[0.0, 1.5, 5.0, 10.0], &|l, v| l.corruption.wrong.pose_degrees = v),
+        axis("wrong shape", " σ", &[0.0, 2.0], &|l, v| l.corruption.wrong.shape = v),
+        axis("mask erosion", " px", &[0.0, 2.0, 4.0], &|l, v| l.corruption.wrong.mask_pixels = -(v as i32)),
+        axis("mask growth", " px", &[0.0, 4.0], &|l, v| l.corruption.wrong.mask_pixels = v as i32),
+        axis("image side", " px", &sides(side), &|l, v| l.files.resize = Some(v as u32)),
     ]);
     axes.extend(around.training());
     shortened(axes, quick)
@@ -189,7 +192,8 @@ mod tests {
 
     #[test]
     fn every_axis_has_the_easy_case_and_a_harder_one() {
-        let load = LoadOptions { stride: 2, ..LoadOptions::default() };
+        let mut load = SceneOptions::default();
+        load.files.stride = 2;
         let capture = Place::Scene { scene: "somewhere".to_owned(), body: None, load };
         for (quick, on_disk) in [(false, false), (true, false), (false, true), (true, true)] {
             let axes = if on_disk { of_capture(&capture, 96, true, quick) } else { of_demo(96, quick) };

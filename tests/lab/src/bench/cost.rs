@@ -7,7 +7,7 @@ use std::fmt::Write as _;
 use std::path::Path;
 
 use anyhow::{Result, bail};
-use occnerf::capture::DemoConfig;
+use synth::DemoConfig;
 use occnerf::{Config, Method, Preset};
 
 use self::machine::Machine;

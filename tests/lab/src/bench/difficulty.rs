@@ -5,7 +5,8 @@ use std::ops::{Add, Mul};
 
 use anyhow::{Result, ensure};
 use glam::{Quat, Vec3};
-use occnerf::capture::{Capture, DemoConfig, Frame, Perturbation, Pixels, demo};
+use occnerf::capture::{Capture, Frame, Pixels};
+use synth::{DemoConfig, Perturbation, demo};
 use serde::{Deserialize, Serialize};
 use smpl::{BodyModel, Placement, SparseRows};
 

@@ -8,7 +8,8 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, Result, bail};
 use glam::Vec3;
 use occnerf::bake::bake;
-use occnerf::capture::{Capture, LoadOptions};
+use occnerf::capture::Capture;
+use xtask::source::SceneOptions;
 use occnerf::{
     Config, FieldRenderer, Method, PreparedFrame, PriorColors, PriorRenderer, Renderer, Scene, StepTimes, Trainer,
     evaluate,
@@ -30,7 +31,7 @@ const MAX_JOB_BYTES: u64 = 1 << 20;
 #[serde(rename_all = "kebab-case")]
 pub enum Place {
     /// As `train` reads them.
-    Scene { scene: String, body: Option<PathBuf>, load: LoadOptions },
+    Scene { scene: String, body: Option<PathBuf>, load: SceneOptions },
     /// Made for the purpose.
     Made(Difficulty),
 }

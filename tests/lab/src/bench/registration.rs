@@ -7,7 +7,8 @@ use std::time::Instant;
 use anyhow::{Context, Result};
 use clap::Args;
 use glam::Quat;
-use occnerf::capture::{Capture, DemoConfig, Perturbation, demo};
+use occnerf::capture::Capture;
+use synth::{DemoConfig, Perturbation, demo};
 use occnerf::{Config, Method, PreparedFrame, Preset, PriorColors, PriorRenderer, Scene, evaluate, register};
 use smpl::BodyModel;
 

@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Result, bail, ensure};
 use clap::Args;
-use occnerf::capture::{LoadOptions, Perturbation};
+use synth::Perturbation;
 use occnerf::{Lpips, Preset};
 
 use crate::results::{self, Section};
@@ -26,7 +26,7 @@ use xtask::process::{Ending, Lock};
 use xtask::run::{self, Metrics, RunConfig, make_directory};
 use xtask::settings;
 use xtask::shard::ShardArguments;
-use xtask::source::{self, LoadArguments, Source};
+use xtask::source::{Corruption, LoadArguments, SceneOptions, Source, self};
 use xtask::train::{baked_unless_finished, finished, run_unless_finished};
 
 #[derive(Args)]
@@ -194,7 +194,7 @@ impl Experiment<'_> {
         }
     }
 
-    fn load(&self, options: &LoadOptions) -> Result<Source> {
+    fn load(&self, options: &SceneOptions) -> Result<Source> {
         source::load(Some(self.scene), self.arguments.body.as_deref(), options)
     }
 
@@ -246,7 +246,7 @@ impl Experiment<'_> {
     fn robustness(&self, directory: &Path) -> Result<()> {
         let options = self.arguments.load.options()?;
         ensure!(
-            options.wrong == Perturbation::default(),
+            options.corruption.wrong == Perturbation::default(),
             "--robustness goes through its own errors: leave --wrong-… out"
         );
         let rows = self.arguments.rows(|row| MAIN.contains(&&*row.name));
@@ -255,7 +255,8 @@ impl Experiment<'_> {
         let mut levels = Vec::new();
         for (name, wrong) in LEVELS {
             say!("{name}");
-            let source = self.load(&LoadOptions { wrong, ..options.clone() })?;
+            let corruption = Corruption { wrong, ..options.corruption };
+            let source = self.load(&SceneOptions { corruption, ..options.clone() })?;
             let plan = match &mut plan {
                 Some(plan) => plan,
                 none => none.insert(self.plan(directory, &source, &rows, self.minutes / LEVELS.len() as f64)?),
@@ -295,12 +296,7 @@ impl Experiment<'_> {
             // Who trains a person bakes them.
             let begin = row.baked.and_then(|trained| first.get(trained)).map_or(own, |&index| index);
             for seed in 1..=row.runs(self.arguments.seeds) {
-                let mut run = RunConfig {
-                    scene: source.scene.clone(),
-                    body: source.body.clone(),
-                    load: source.load.clone(),
-                    train: plan.config(row, self.arguments.preset, seed)?,
-                };
+                let mut run = RunConfig::new(source, plan.config(row, self.arguments.preset, seed)?);
                 if let Some(path) = &self.arguments.perceptual_weights {
                     run.train.loss.perceptual_weights.clone_from(path);
                 }

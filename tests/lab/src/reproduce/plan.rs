@@ -6,7 +6,7 @@ use std::path::Path;
 use std::time::Instant;
 
 use anyhow::{Context, Result};
-use occnerf::capture::LoadOptions;
+use xtask::source::SceneOptions;
 use occnerf::{Config, FieldRenderer, Lpips, Method, PreparedFrame, Preset, Trainer, evaluate_with};
 use serde::{Deserialize, Serialize};
 
@@ -34,7 +34,7 @@ pub struct Request {
     /// Names of the rows.
     pub rows: Vec<String>,
     /// How the capture is read.
-    pub load: LoadOptions,
+    pub load: SceneOptions,
     /// Weights of the perceptual term, empty for the embedded one, and network of the score.
     pub perceptual_weights: String,
     pub lpips: Option<String>,
