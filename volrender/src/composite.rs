@@ -2,7 +2,7 @@ use std::ops::Range;
 
 use glam::{Vec3, Vec4};
 
-use crate::exponential::one_minus_exp;
+use crate::exponential::{one_minus_exp, optical_depth};
 use crate::simd::Kernel;
 
 /// Samples whose exponentials are computed together in SIMD lanes.
@@ -105,7 +105,7 @@ fn forward(samples: RaySamples<'_>, background: Vec3, weights: &mut [f32]) -> Co
         let alpha = &mut alpha[..sigma.len()];
         let inputs = sigma.iter().zip(likelihood).zip(delta);
         for (alpha, ((&sigma, &likelihood), &delta)) in alpha.iter_mut().zip(inputs) {
-            *alpha = likelihood * one_minus_exp(sigma * delta).0;
+            *alpha = likelihood * one_minus_exp(optical_depth(sigma, delta)).0;
         }
         if let Some(i) = first_largest(alpha, &mut largest) {
             termination = Some((block * BLOCK + i) as u32);

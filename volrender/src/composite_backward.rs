@@ -1,7 +1,7 @@
 use glam::Vec3;
 
 use crate::composite::{BLOCK, RaySamples, flushed};
-use crate::exponential::one_minus_exp;
+use crate::exponential::{one_minus_exp, optical_depth, saturated};
 use crate::simd::Kernel;
 
 /// Outputs for the gradients of one ray's samples, each (S); overwritten.
@@ -64,8 +64,8 @@ fn backward(
         let inputs = sigma.iter().zip(likelihood).zip(delta);
         let outputs = d_sigma.iter_mut().zip(&mut *d_likelihood);
         for (((&sigma, &likelihood), &delta), (d_sigma, d_likelihood)) in inputs.zip(outputs) {
-            let (absorbed, passed) = one_minus_exp(sigma * delta);
-            *d_sigma = likelihood * delta * passed;
+            let (absorbed, passed) = one_minus_exp(optical_depth(sigma, delta));
+            *d_sigma = likelihood * saturated(delta) * passed;
             *d_likelihood = absorbed;
         }
         for ((&likelihood, &d_likelihood), d_rgb) in likelihood.iter().zip(&*d_likelihood).zip(d_rgb) {
@@ -83,7 +83,7 @@ fn backward(
         let d_alpha = d_rgb.x * (value - behind);
         let alpha = likelihood * *d_likelihood;
         behind = alpha * value + (1.0 - alpha) * behind;
-        *d_sigma *= d_alpha;
+        *d_sigma = saturated(*d_sigma * d_alpha);
         *d_likelihood *= d_alpha;
         *d_rgb = weight * d_color;
     }

@@ -6,7 +6,7 @@ use glam::Vec3;
 use proptest::prelude::*;
 use testkit::gradient::{Tolerance, assert_gradient};
 use testkit::oracle;
-use volrender::{Composite, RaySamples, SampleGradients, composite, composite_backward};
+use volrender::{Composite, RaySamples, SampleGradients, bin_midpoints, bin_widths, composite, composite_backward};
 
 #[derive(Clone, Debug, Default)]
 struct Samples {
@@ -164,6 +164,28 @@ proptest! {
         let (some, _) = live.composite(background);
         prop_assert_eq!((all.color, all.opacity, all.depth), (some.color, some.opacity, some.depth));
         prop_assert_eq!(all.termination.is_some(), some.termination.is_some());
+    }
+
+    #[test]
+    fn bins_of_any_finite_width_give_finite_pixels_and_gradients(
+        mut edges in prop::collection::vec(prop::sample::select(vec![-3.4e38, -3e38, -1.0, 0.0, 1.0, 1e30, 3e38, 3.4e38f32]), 2..40),
+        sigma in prop::collection::vec(prop::sample::select(vec![0.0, 1e-38, 1e-30, 1.0, 1e30, f32::MAX, f32::INFINITY]), 40),
+        likelihood in prop::sample::select(vec![0.0, 0.3, 1.0f32]), d_opacity in -1.0f32..1.0,
+    ) {
+        edges.sort_by(f32::total_cmp);
+        let n = edges.len() - 1;
+        let (mut t, mut delta) = (vec![0.0; n], vec![0.0; n]);
+        bin_midpoints(&edges, &mut t);
+        bin_widths(&edges, &mut delta);
+        let ray = Samples { sigma: sigma[..n].to_vec(), likelihood: vec![likelihood; n], delta, t, rgb: vec![Vec3::X; n] };
+        let (got, weights) = ray.composite(Vec3::ONE);
+        prop_assert!(got.color.is_finite() && got.depth.is_finite() && (0.0..=1.0).contains(&got.opacity), "{got:?}");
+        prop_assert!(weights.iter().all(|w| (0.0..=1.0).contains(w)), "{weights:?}");
+        let d = ray.backward(Vec3::ONE, Vec3::new(1.0, -2.0, 0.5), d_opacity);
+        prop_assert!(d.sigma.iter().chain(&d.likelihood).all(|d| d.is_finite()), "{:?}", d.sigma);
+        // More of an opaque sample changes nothing, however wide its bin is.
+        let opaque = |i: &usize| ray.sigma[*i] > 0.0 && f64::from(ray.sigma[*i]) * f64::from(ray.delta[*i]) > 100.0;
+        prop_assert!((0..n).filter(opaque).all(|i| d.sigma[i] == 0.0), "{:?}", d.sigma);
     }
 
     #[test]
