@@ -108,27 +108,6 @@ fn first_hit_split_obvhs(bencher: Bencher<'_, '_>, focal: f32) {
     });
 }
 
-/// All together, at twice the faces, one thread.
-#[divan::bench(args = FOCALS)]
-fn first_hits_split_one_thread(bencher: Bencher<'_, '_>, focal: f32) {
-    together(bencher, 1, focal);
-}
-
-/// The same on two threads.
-#[divan::bench(args = FOCALS)]
-fn first_hits_split_two_threads(bencher: Bencher<'_, '_>, focal: f32) {
-    together(bencher, 2, focal);
-}
-
-fn together(bencher: Bencher<'_, '_>, threads: usize, focal: f32) {
-    let mesh = split(&body::body_or_ball());
-    let mesh = RayMesh::new(&mesh.vertices, &mesh.faces).unwrap();
-    let rays = image_rays(focal);
-    let mut hits = vec![None; rays.len()];
-    let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-    bencher.counter(ItemsCount::new(rays.len())).bench_local(|| pool.install(|| mesh.first_hits(&rays, &mut hits)));
-}
-
 /// Random segments through the body's box, one thread.
 #[divan::bench]
 fn first_hit_random(bencher: Bencher<'_, '_>) {

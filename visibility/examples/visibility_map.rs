@@ -67,7 +67,6 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     // Right of the middle, from the head down.
     let usable: Vec<bool> = (0..SIZE * SIZE).map(|i| i % SIZE < SIZE / 2 || i / SIZE < SIZE / 6).collect();
     let mut random = Random(1);
-    let mut hits = vec![None; (SIZE * SIZE) as usize];
     let mut casting = std::time::Duration::ZERO;
     for frame in 0..FRAMES {
         let view = circling(frame as f32 / FRAMES as f32 * std::f32::consts::TAU, middle);
@@ -75,7 +74,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         exact.add_visible(&visible_vertices(&mesh, vertices, &view, Some(&usable)));
         casting += start.elapsed();
         let rays = rays(&view);
-        mesh.first_hits(&rays, &mut hits);
+        let hits: Vec<_> = rays.iter().map(|&(o, d)| mesh.first_hit(o, d)).collect();
         let subject: Vec<usize> = (0..hits.len()).filter(|&i| usable[i] && hits[i].is_some()).collect();
         for _ in 0..RAYS.min(subject.len() * RAYS) {
             let pixel = subject[(random.unit() * subject.len() as f32) as usize % subject.len()];
@@ -98,9 +97,8 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         let ranks = ranks(counts.counts());
         let view = circling(angle, middle);
         let rays = rays(&view);
-        mesh.first_hits(&rays, &mut hits);
-        for (i, hit) in (0u32..).zip(&hits) {
-            let Some(hit) = hit else { continue };
+        for (i, &(o, d)) in (0u32..).zip(&rays) {
+            let Some(hit) = mesh.first_hit(o, d) else { continue };
             let face = faces[hit.face as usize].map(|v| v as usize);
             let [a, b, c] = face.map(|v| vertices[v]);
             let normal = (b - a).cross(c - a).normalize_or(Vec3::Y);

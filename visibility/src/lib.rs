@@ -40,7 +40,6 @@
 
 mod counts;
 mod error;
-mod packet;
 mod raster;
 mod ray_mesh;
 mod tree;

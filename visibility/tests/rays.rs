@@ -150,55 +150,6 @@ proptest! {
     }
 }
 
-proptest! {
-    #![proptest_config(ProptestConfig::with_cases(24))]
-
-    #[test]
-    fn many_rays_at_once_hit_what_each_hits_alone(
-        mesh in strategy::bumpy_sphere(),
-        rays in prop::collection::vec((strategy::vec3(2.5), strategy::vec3(1.0)), 0..150),
-        spread in prop::sample::select(vec![1.0f32, 0.1, 0.0]),
-    ) {
-        let structure = build(&mesh);
-        // From directions all over to rays that are all alike; some aimed at vertices exactly.
-        let rays: Vec<(Vec3, Vec3)> = (rays.iter().enumerate())
-            .map(|(i, &(o, d))| {
-                let origin = rays[0].0.lerp(o, spread);
-                let target = mesh.vertices[i % mesh.vertices.len()];
-                (origin, if i % 5 == 0 { target - origin } else { rays[0].1.lerp(d, spread) })
-            })
-            .collect();
-        let mut hits = vec![None; rays.len()];
-        structure.first_hits(&rays, &mut hits);
-        for (&(o, d), found) in rays.iter().zip(&hits) {
-            prop_assert_eq!(*found, structure.first_hit(o, d), "{} {}", o, d);
-        }
-    }
-}
-
-#[test]
-fn useless_rays_among_others_meet_nothing() {
-    let mesh = build(&mesh::icosphere(2));
-    let good = (Vec3::X * 3.0, -Vec3::X);
-    let bad = [
-        (Vec3::X * 3.0, Vec3::ZERO),
-        (Vec3::NAN, Vec3::X),
-        (Vec3::ZERO, Vec3::splat(f32::INFINITY)),
-        (Vec3::X * 1e20, -Vec3::X),
-    ];
-    let rays: Vec<(Vec3, Vec3)> = bad.into_iter().flat_map(|bad| [bad, good]).collect();
-    let mut hits = vec![None; rays.len()];
-    mesh.first_hits(&rays, &mut hits);
-    let alone = mesh.first_hit(good.0, good.1);
-    assert!(alone.is_some());
-    for pair in hits.chunks(2) {
-        assert_eq!(pair, [None, alone]);
-    }
-    let mut none = [alone; 1];
-    RayMesh::new(&[], &[]).unwrap().first_hits(&[good], &mut none);
-    assert_eq!(none, [None]);
-}
-
 #[test]
 fn both_sides_and_the_surface_itself_are_hit() {
     let sheet = build(&mesh::open_grid(2));

@@ -5,7 +5,7 @@ use std::sync::OnceLock;
 use glam::{Affine3A, Mat3, Quat, Vec3};
 use smpl::{BodyModel, Placement};
 
-use super::silhouette::silhouette;
+use crate::model::view::silhouette;
 use super::*;
 use crate::capture::testing::{Directory, shared};
 use crate::capture::{DemoConfig, ImportOptions, LoadOptions, demo, import, load_capture};
@@ -145,7 +145,7 @@ fn good_captures_raise_no_alarm() {
             alarms.push(format!("{name}: {:?}, {} faults", whole.mistakes, faults(&whole)));
         }
         for window in windows(capture, 20, 20) {
-            let mistakes = likely(&window, body, small_views(&window).unwrap());
+            let mistakes = likely(&window, body, small_views(&window).unwrap()).unwrap();
             if !mistakes.is_empty() {
                 alarms.push(format!("{name} from {}: {mistakes:?}", window.train[0].name));
             }
@@ -182,7 +182,7 @@ fn each_mistake_is_found() {
         for (name, capture, body) in good() {
             for window in windows(capture, capture.train.len().min(30), 30) {
                 let wrong = made(mistake, &window, body);
-                let mistakes = likely(&wrong, body, small_views(&wrong).unwrap());
+                let mistakes = likely(&wrong, body, small_views(&wrong).unwrap()).unwrap();
                 trials += 1;
                 if mistakes.first().is_some_and(|first| same(*first, mistake)) {
                     found += 1;
@@ -207,7 +207,7 @@ fn a_silhouette_is_where_rays_hit() {
     for frame in capture.train.iter().step_by(20) {
         let posed = body.pose(&body.shaped(&frame.betas), &frame.pose, frame.placement);
         let mesh = RayMesh::new(&posed.vertices, &body.faces).unwrap();
-        let covered = silhouette(&posed.vertices, &body.faces, &frame.camera);
+        let covered = silhouette(&posed.vertices, &body.faces, &frame.camera).unwrap();
         let wrong = covered.iter().enumerate().filter(|(i, covered)| {
             let (x, y) = (*i as u32 % frame.camera.width, *i as u32 / frame.camera.width);
             let ray = frame.camera.ray(x as f32 + 0.5, y as f32 + 0.5);

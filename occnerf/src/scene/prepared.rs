@@ -16,7 +16,7 @@ use crate::model::view::PosedView;
 use crate::scene::labels::{Label, Labels, dilate, label_pixels};
 use crate::scene::light::{Seen, measure_light};
 use crate::scene::masks::mend_masks;
-use crate::scene::pinhole::pinhole;
+use crate::model::view::pinhole;
 use crate::scene::registration::register;
 use crate::scene::seen::{MOST, deeper, seen, strange_edge};
 

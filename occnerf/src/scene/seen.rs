@@ -13,7 +13,7 @@ use crate::model::subdivide::Anchor;
 use crate::model::view::PosedView;
 use crate::scene::labels::squared_distance;
 use crate::scene::light::{Seen, albedo};
-use crate::scene::pinhole::pinhole;
+use crate::model::view::pinhole;
 
 /// Pixels within a mask from which on it shows the person for certain.
 pub(crate) const MOST: usize = 4;

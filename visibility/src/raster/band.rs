@@ -90,7 +90,7 @@ impl Band<'_> {
         let first_row = (band * BAND) as i32;
         for chunk in self.chunks.iter().filter(|chunk| !chunk.bins[band].is_empty()) {
             let layer = &mut strip.layers[chunk.layer];
-            crate::packet::arch().dispatch(Fill { layer, first_row, chunk, bin: &chunk.bins[band] });
+            arch().dispatch(Fill { layer, first_row, chunk, bin: &chunk.bins[band] });
         }
         strip
             .layers
@@ -152,6 +152,16 @@ impl Band<'_> {
         let depth = weights.dot(DVec3::new(a.z, b.z, c.z)).max(f64::from(self.projection.near));
         Fragment { face, depth: depth.min(f64::from(f32::MAX)) as f32, barycentric: weights.as_vec3().to_array() }
     }
+}
+
+/// AVX2 on x86-64, also where `pulp` is built with AVX-512 and the machine has it: a row is filled
+/// eight samples at a time.
+fn arch() -> pulp::Arch {
+    #[cfg(target_arch = "x86_64")]
+    if let Some(simd) = pulp::x86::V3::try_new() {
+        return pulp::Arch::V3(simd);
+    }
+    pulp::Arch::new()
 }
 
 /// The triangles of a bin, compiled for the widest instructions of the machine.

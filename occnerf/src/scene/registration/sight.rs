@@ -11,7 +11,7 @@ use crate::Error;
 use crate::config::OccludedRule;
 use crate::scene::labels::{Label, Labels, label_pixels};
 use crate::scene::light::Seen;
-use crate::scene::pinhole::pinhole;
+use crate::model::view::pinhole;
 use crate::scene::registration::picture::{Look, Picture};
 
 /// Pixels from one look at the mask to the next.
