@@ -8,7 +8,7 @@ use std::collections::HashMap;
 
 use divan::Bencher;
 use divan::counter::ItemsCount;
-use glam::{Affine3A, Mat3, Quat, Vec3};
+use glam::{Affine3A, Quat, Vec2, Vec3};
 use testkit::TriMesh;
 use visibility::{RasterOptions, Rasterizer, Samples, View};
 
@@ -20,12 +20,9 @@ fn main() {
 fn view(width: u32, height: u32) -> View {
     let focal = height as f32 * 1.4;
     View {
-        intrinsics: Mat3::from_cols(
-            Vec3::X * focal,
-            Vec3::Y * focal,
-            Vec3::new(width as f32 / 2.0, height as f32 / 2.0, 1.0),
-        ),
-        extrinsics: Affine3A::from_rotation_translation(
+        focal: Vec2::splat(focal),
+        centre: Vec2::new(width as f32, height as f32) / 2.0,
+        world_to_camera: Affine3A::from_rotation_translation(
             Quat::from_rotation_x(std::f32::consts::PI),
             Vec3::new(0.0, -0.2, 3.0),
         ),

@@ -5,10 +5,10 @@ use std::sync::OnceLock;
 use glam::{Affine3A, Mat3, Quat, Vec3};
 use smpl::{BodyModel, Placement};
 
-use crate::model::view::silhouette;
 use super::*;
 use crate::capture::testing::{Directory, shared};
 use crate::capture::{DemoConfig, ImportOptions, LoadOptions, demo, import, load_capture};
+use crate::model::view::silhouette;
 
 fn small_demo(body: &BodyModel, seed: u64) -> Capture {
     let config = DemoConfig { size: 128, frames: 60, eval_cameras: 1, seed, ..DemoConfig::default() };
@@ -201,20 +201,24 @@ fn each_mistake_is_found() {
 }
 
 #[test]
-fn a_silhouette_is_where_rays_hit() {
+fn a_silhouette_is_where_rays_hit_also_around_a_camera_within_the_body() {
     let body = BodyModel::embedded();
     let capture = small_demo(&body, 3);
     for frame in capture.train.iter().step_by(20) {
         let posed = body.pose(&body.shaped(&frame.betas), &frame.pose, frame.placement);
         let mesh = RayMesh::new(&posed.vertices, &body.faces).unwrap();
-        let covered = silhouette(&posed.vertices, &body.faces, &frame.camera).unwrap();
-        let wrong = covered.iter().enumerate().filter(|(i, covered)| {
-            let (x, y) = (*i as u32 % frame.camera.width, *i as u32 / frame.camera.width);
-            let ray = frame.camera.ray(x as f32 + 0.5, y as f32 + 0.5);
-            mesh.first_hit(ray.origin, ray.direction).is_some() != **covered
-        });
-        // Rounding at the outline.
-        assert!(covered.iter().filter(|c| **c).count() > 500 && wrong.count() <= 3);
+        let mut within = frame.camera;
+        within.world_to_camera.translation -= within.world_to_camera.transform_point3a(posed.joints[0].into());
+        for camera in [frame.camera, within] {
+            let covered = silhouette(&posed.vertices, &body.faces, &camera).unwrap();
+            let wrong = covered.iter().enumerate().filter(|(i, covered)| {
+                let (x, y) = (*i as u32 % camera.width, *i as u32 / camera.width);
+                let ray = camera.ray(x as f32 + 0.5, y as f32 + 0.5);
+                mesh.first_hit(ray.origin, ray.direction).is_some() != **covered
+            });
+            // Rounding at the outline.
+            assert!(covered.iter().filter(|c| **c).count() > 500 && wrong.count() <= 3);
+        }
     }
 }
 

@@ -77,12 +77,8 @@ impl PosedView {
 
 /// The camera as the visibility crate takes it.
 pub(crate) fn pinhole(camera: &Camera) -> View {
-    View {
-        intrinsics: camera.intrinsics(),
-        extrinsics: camera.world_to_camera,
-        width: camera.width,
-        height: camera.height,
-    }
+    let Camera { focal, centre, world_to_camera, width, height } = *camera;
+    View { focal, centre, world_to_camera, width, height }
 }
 
 /// Pixels (H × W) whose centre a mesh covers. A mesh that reaches behind the camera is clipped.
