@@ -16,6 +16,9 @@ use rayon::prelude::*;
 use surface_query::{MeshDistance, Pyramid, SurfaceQuery, SurfaceQueryConfig, farthest_points};
 use testkit::{TriMesh, oracle};
 
+/// A grid for a body in metres.
+const GRID: SurfaceQueryConfig = SurfaceQueryConfig { k: 5, coarse_levels: 3, ratio: 0.25, cell: 0.02, margin: 0.12 };
+
 fn main() {
     divan::main();
 }
@@ -42,20 +45,20 @@ fn whole_query(bencher: Bencher<'_, '_>, config: &SurfaceQueryConfig) {
 /// k = 5 at 4 scales, blend and signed distance, random order, within 5 cm of the surface.
 #[divan::bench]
 fn neighbours_and_blend_grid(bencher: Bencher<'_, '_>) {
-    whole_query(bencher, &SurfaceQueryConfig::BODY);
+    whole_query(bencher, &GRID);
 }
 
 /// The same through the k-d trees.
 #[divan::bench]
 fn neighbours_and_blend_trees(bencher: Bencher<'_, '_>) {
-    whole_query(bencher, &SurfaceQueryConfig::TREES);
+    whole_query(bencher, &SurfaceQueryConfig::default());
 }
 
 /// As many queries as the peers were given, on two threads.
 #[divan::bench(sample_count = 10)]
 fn neighbours_and_blend_two_threads(bencher: Bencher<'_, '_>) {
     let mesh = body::body_or_ball();
-    let query = SurfaceQuery::new(&mesh.vertices, &mesh.faces, &SurfaceQueryConfig::BODY).unwrap();
+    let query = SurfaceQuery::new(&mesh.vertices, &mesh.faces, &GRID).unwrap();
     let points = Random(1).near_surface(&mesh, 200_000, 0.05);
     let pool = rayon::ThreadPoolBuilder::new().num_threads(2).build().unwrap();
     let one = |p: &Vec3| {
@@ -118,7 +121,7 @@ fn neighbours_brute_force(bencher: Bencher<'_, '_>) {
 #[divan::bench]
 fn blend(bencher: Bencher<'_, '_>) {
     let mesh = body::body_or_ball();
-    let query = SurfaceQuery::new(&mesh.vertices, &mesh.faces, &SurfaceQueryConfig::BODY).unwrap();
+    let query = SurfaceQuery::new(&mesh.vertices, &mesh.faces, &GRID).unwrap();
     let points = near(&mesh);
     let lists: Vec<[u32; 20]> = (points.iter())
         .map(|&p| {
@@ -142,7 +145,7 @@ fn mesh_distance(bencher: Bencher<'_, '_>, reach: u32) {
     let points = near(&mesh);
     bencher.counter(ItemsCount::new(points.len())).bench_local(|| {
         for &p in &points {
-            black_box(distance.closest(p, reach as f32 * 0.01));
+            black_box(distance.closest_within(p, reach as f32 * 0.01));
         }
     });
 }
@@ -163,7 +166,7 @@ fn mesh_distance_split_two_threads(bencher: Bencher<'_, '_>) {
         .collect();
     let distance = MeshDistance::new(&vertices, &faces).unwrap();
     let pool = rayon::ThreadPoolBuilder::new().num_threads(2).build().unwrap();
-    let one = |p: &Vec3| distance.closest(*p, f32::INFINITY);
+    let one = |p: &Vec3| distance.closest(*p);
     bencher
         .counter(ItemsCount::new(points.len()))
         .bench_local(|| pool.install(|| points.par_iter().with_min_len(1024).map(one).collect::<Vec<_>>()));
@@ -191,7 +194,7 @@ fn mesh_distance_along_rays(bencher: Bencher<'_, '_>) {
         .collect();
     bencher.counter(ItemsCount::new(points.len())).bench_local(|| {
         for &p in &points {
-            black_box(distance.closest(p, 0.06));
+            black_box(distance.closest_within(p, 0.06));
         }
     });
 }
@@ -212,7 +215,7 @@ fn mesh_distance_build(bencher: Bencher<'_, '_>) {
 #[divan::bench(sample_count = 5)]
 fn surface_query_build(bencher: Bencher<'_, '_>) {
     let mesh = body::body_or_ball();
-    bencher.bench_local(|| SurfaceQuery::new(&mesh.vertices, &mesh.faces, &SurfaceQueryConfig::BODY));
+    bencher.bench_local(|| SurfaceQuery::new(&mesh.vertices, &mesh.faces, &GRID));
 }
 
 /// Farthest point sampling of a quarter of the vertices.

@@ -1,10 +1,23 @@
 use glam::Vec3;
 
-/// Sum of weights below which all normals are perpendicular to the query's directions, and what is
-/// left of the cosines is rounding.
+/// Sum of weights below which the cosines are mere rounding.
 const MIN_WEIGHT: f32 = 1e-5;
 
-/// Blend of the nearest vertices, OccNeRF §3.2 (surface-based rendering).
+/// Normal-weighted mean of the nearest vertices (surface-based rendering, OccNeRF §3.2), the result
+/// of [`crate::SurfaceQuery::blend`]. Cheap and smooth for a fixed set of neighbours, but no exact
+/// distance.
+///
+/// ```
+/// use glam::Vec3;
+/// use surface_query::{SurfaceQuery, SurfaceQueryConfig};
+///
+/// let vertices = [Vec3::ZERO, Vec3::X, Vec3::Y];
+/// let surface = SurfaceQuery::new(&vertices, &[[0, 1, 2]], &SurfaceQueryConfig::default())?;
+/// let blended = surface.blend(Vec3::new(0.0, 0.0, -2.0), &[0]);
+/// assert_eq!((blended.point, blended.normal), (Vec3::ZERO, Vec3::Z));
+/// assert_eq!(blended.signed_distance, -2.0);
+/// # Ok::<(), surface_query::Error>(())
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Blended {
     /// v̂ = Σ w_i v_i / Σ w_i.
@@ -15,13 +28,13 @@ pub struct Blended {
     pub signed_distance: f32,
 }
 
-/// Weights of the blend and what the backward pass needs of them.
+/// Weighted sums, shared by the forward and backward pass.
 pub(crate) struct Sums {
     pub weight: f32,
     pub point: Vec3,
     /// Σ w_i n_i, not normalised.
     pub normal: Vec3,
-    /// Whether inverse distances stand in for the cosines.
+    /// Whether the weights are inverse distances instead of cosines.
     pub inverse_distance: bool,
 }
 
@@ -43,8 +56,8 @@ pub(crate) fn sums(vertices: &[Vec3], normals: &[Vec3], query: Vec3, finest: &[u
     Sums { inverse_distance: true, ..accumulate(vertices, normals, query, finest, inverse) }
 }
 
-/// Σ w, Σ w v / Σ w and Σ w n. The points are averaged as offsets from the query, which keeps the
-/// digits of a small distance far from the origin.
+/// Σ w, Σ w v / Σ w and Σ w n. The mean is taken over offsets from the query: no cancellation far
+/// from the origin.
 #[inline(always)]
 fn accumulate(
     vertices: &[Vec3],

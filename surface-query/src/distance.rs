@@ -1,3 +1,5 @@
+use std::fmt;
+
 use glam::{DVec3, Vec3, Vec4};
 
 use crate::Error;
@@ -7,47 +9,78 @@ use crate::search::Search;
 use crate::tree::{Child, STACK, Tree, WIDTH};
 use crate::triangle::{Foot, Pack, closest_on_triangle};
 
-/// Queries farther than this many sizes of the mesh are answered in `f64`: from there `f32` would
-/// take faces for equally near of which one looks at the query and the other away.
+/// Distance, in radii of the mesh, from which queries are answered in `f64`: beyond it `f32` takes
+/// faces on either side of an edge for equally near.
 const FAR: f32 = 32.0;
+/// Distance, in radii of the mesh, from which the closest point depends on the direction alone to
+/// within 10⁻¹⁰ of the distance, and to which farther queries are moved to find it.
+const HORIZON: f64 = 1e5;
 
-/// The nearest point of a mesh.
+/// The closest point of a mesh.
+///
+/// ```
+/// use glam::Vec3;
+/// use surface_query::MeshDistance;
+///
+/// let vertices = [Vec3::ZERO, Vec3::X, Vec3::Y];
+/// let closest = MeshDistance::new(&vertices, &[[0, 1, 2]])?.closest(Vec3::new(0.5, 0.25, 3.0));
+/// assert_eq!((closest.signed_distance, closest.point), (3.0, Vec3::new(0.5, 0.25, 0.0)));
+/// assert_eq!((closest.face, closest.barycentric), (0, [0.25, 0.5, 0.25]));
+/// # Ok::<(), surface_query::Error>(())
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Closest {
-    /// The face it lies on; one of them where several share the point.
+    /// Index of the face that holds the point; one of them where several share it.
     pub face: u32,
-    /// Its weights of the face's corners: non-negative, sum 1.
+    /// Barycentric coordinates of the point: non-negative, sum 1.
     pub barycentric: [f32; 3],
-    /// Its position.
+    /// Position of the point.
     pub point: Vec3,
-    /// Distance from it to the query, positive outside.
+    /// Distance from the point to the query, positive outside.
     pub signed_distance: f32,
 }
 
 /// Exact signed distance to a triangle mesh: a bounding volume hierarchy finds the closest point,
-/// the angle-weighted pseudonormal of the face, edge or vertex it lies on gives the sign (Bærentzen
-/// and Aanæs 2005).
+/// the angle-weighted pseudonormal of the face, edge or vertex that holds it gives the sign
+/// (Bærentzen and Aanæs 2005).
 ///
-/// The faces keep their connectivity for life; [`MeshDistance::refit`] moves the vertices. Queries
-/// take `&self` and may run on any number of threads.
+/// Queries take `&self` and may run on any number of threads. [`MeshDistance::refit`] moves the
+/// vertices of a deforming mesh.
 ///
-/// **Accuracy.** The tree is searched in `f32` with an allowance for rounding, and all faces it
-/// leaves are compared in `f64`: the distance is the true one rounded to `f32`. Only slivers,
-/// triangles several hundred times as long as high, may lose to a face that is farther by up to
-/// 10⁻⁶ of their length.
+/// ```
+/// use glam::Vec3;
+/// use surface_query::MeshDistance;
 ///
-/// **The sign** is that of inside and outside for a closed mesh without self-intersections. See the
-/// crate's README for what it means on others.
+/// // A tetrahedron, counter-clockwise seen from outside.
+/// let mut vertices = [Vec3::ZERO, Vec3::X, Vec3::Y, Vec3::Z];
+/// let faces = [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]];
+/// let mut mesh = MeshDistance::new(&vertices, &faces)?;
+/// assert_eq!(mesh.closest(Vec3::new(0.25, 0.25, -2.0)).signed_distance, 2.0);
+/// assert_eq!(mesh.closest(Vec3::new(0.25, 0.25, 0.125)).signed_distance, -0.125);
+///
+/// // The same faces, moved.
+/// vertices.iter_mut().for_each(|v| v.z -= 1.0);
+/// mesh.refit(&vertices);
+/// assert_eq!(mesh.closest(Vec3::new(0.25, 0.25, -2.0)).signed_distance, 1.0);
+/// # Ok::<(), surface_query::Error>(())
+/// ```
+///
+/// **Accuracy.** The tree is searched in `f32` with an allowance for rounding; the remaining faces
+/// are compared in `f64`. The distance is the true one rounded to `f32`, whatever the unit of
+/// length and however far the query. Only slivers, triangles several hundred times as long as high,
+/// may lose to a face that is farther by up to 10⁻⁶ of their length.
+///
+/// **Sign.** Negative inside, positive outside of a closed mesh without self-intersections. The
+/// crate's README says what the sign means on other meshes.
 pub struct MeshDistance {
     faces: Vec<[u32; 3]>,
-    /// Multiplied by `scale`, a power of two, which is exact and brings products of four lengths
-    /// into range.
+    /// Multiplied by `scale`, a power of two: exact, and products of four lengths stay in range.
     vertices: Vec<Vec3>,
     scale: f32,
-    /// Centre and radius of the box of all faces, scaled.
+    /// Centre and half the longest side of the bounding box, scaled.
     centre: Vec3,
     radius: f32,
-    /// Error that rounding may add to a distance measured in `f32`, scaled.
+    /// Bound of the rounding error of a distance in `f32`, scaled.
     error: f32,
     tree: Tree,
     /// The triangles of each leaf of the tree.
@@ -56,14 +89,16 @@ pub struct MeshDistance {
 }
 
 impl MeshDistance {
-    /// Takes a mesh of `vertices` (V) and `faces` (F), counter-clockwise seen from outside.
-    /// Vertices at exactly the same position are treated as one when the sign is decided, now and
-    /// after every refit.
+    /// Builds the tree of `vertices` (V) and `faces` (F), counter-clockwise seen from outside.
+    /// Vertices at exactly the same position here share a pseudonormal, also after a refit.
     ///
     /// # Errors
-    /// A vertex that is not finite, or a face that names no vertex.
+    /// No faces, a vertex that is not finite, or a face with an index outside `vertices`.
     pub fn new(vertices: &[Vec3], faces: &[[u32; 3]]) -> Result<Self, Error> {
         check_mesh(vertices, faces)?;
+        if faces.is_empty() {
+            return Err(Error::NoFaces);
+        }
         let scale = power_of_two_scale(vertices);
         let scaled: Vec<Vec3> = vertices.iter().map(|v| *v * scale).collect();
         let mut this = Self {
@@ -81,14 +116,13 @@ impl MeshDistance {
         Ok(this)
     }
 
-    /// Moves the vertices (V); the faces stay. Linear in the size of the mesh.
+    /// Moves the vertices (V) and keeps the faces, in time linear in the size of the mesh.
     ///
-    /// The tree keeps the shape it was built with: after a change that is no deformation queries
-    /// stay exact but become slow. Faces with a vertex that is not finite are nowhere until the
-    /// next refit.
+    /// The topology of the tree stays: after a large rearrangement queries are exact but slow.
+    /// Faces with a vertex that is not finite are ignored until the next refit.
     ///
     /// # Panics
-    /// If the number of vertices is another than at the start.
+    /// If the number of vertices changes.
     pub fn refit(&mut self, vertices: &[Vec3]) {
         assert_eq!(
             vertices.len(),
@@ -110,7 +144,7 @@ impl MeshDistance {
         packs.clear();
         packs.extend((tree.leaves.iter()).map(|leaf| {
             Pack::new([0, 1, 2, 3].map(|lane| {
-                // Lanes that only fill up the leaf hold nothing.
+                // Padding lanes never hit.
                 let filler = lane > 0 && leaf[lane] == leaf[0];
                 if filler { [Vec3::NAN; 3] } else { corners(leaf[lane]) }
             }))
@@ -146,54 +180,85 @@ impl MeshDistance {
         }
     }
 
-    /// The point of the mesh closest to `query`, if it is at most `max_distance` away (infinity:
-    /// any).
+    /// The point of the mesh closest to `query`.
     ///
-    /// `None` for a mesh without faces, a query that is not finite, and a `max_distance` that is
-    /// negative or NaN. A tight `max_distance` makes queries that fail, and those that succeed,
-    /// faster.
+    /// Its point and distance are NaN for a query that is not finite, and where a refit left no
+    /// face with finite vertices. A distance beyond the range of `f32` is infinite.
     #[must_use]
-    pub fn closest(&self, query: Vec3, max_distance: f32) -> Option<Closest> {
+    pub fn closest(&self, query: Vec3) -> Closest {
+        let undefined = Closest { face: 0, barycentric: [1.0, 0.0, 0.0], point: Vec3::NAN, signed_distance: f32::NAN };
+        self.closest_within(query, f32::INFINITY).unwrap_or(undefined)
+    }
+
+    /// The point of the mesh closest to `query`, if it is at most `max_distance` away. The tighter
+    /// the bound, the faster the query.
+    ///
+    /// `None` also for a query that is not finite, and a `max_distance` that is negative or NaN.
+    ///
+    /// ```
+    /// # use glam::Vec3;
+    /// # use surface_query::MeshDistance;
+    /// let mesh = MeshDistance::new(&[Vec3::ZERO, Vec3::X, Vec3::Y], &[[0, 1, 2]])?;
+    /// assert!(mesh.closest_within(Vec3::Z, 1.0).is_some());
+    /// assert!(mesh.closest_within(Vec3::Z, 0.9).is_none());
+    /// # Ok::<(), surface_query::Error>(())
+    /// ```
+    #[must_use]
+    pub fn closest_within(&self, query: Vec3, max_distance: f32) -> Option<Closest> {
         let q = query * self.scale;
         let reach = max_distance * self.scale;
-        if !(query.is_finite() && reach >= 0.0) || self.tree.nodes.is_empty() {
+        if !(query.is_finite() && reach >= 0.0) {
             return None;
         }
         let exact = query.as_dvec3() * f64::from(self.scale);
-        let is_near = (q - self.centre).abs().max_element() <= self.radius * FAR;
-        let (face, foot) = if is_near && self.tree.stack <= STACK {
-            // A little more than asked for: the exact comparison follows.
-            self.nearest(q, exact, (reach * (1.0 + 1e-5) + f32::MIN_POSITIVE).min(1e18))?
-        } else {
-            self.nearest_to_far(exact)?
-        };
         let scale = f64::from(self.scale);
-        let distance = foot.offset.length() / scale;
-        if distance > f64::from(max_distance) || distance > f64::from(f32::MAX) {
+        let is_near = (q - self.centre).abs().max_element() <= self.radius * FAR;
+        let (face, foot, beyond) = if is_near && self.tree.stack <= STACK {
+            // A little more than asked for: the exact comparison follows.
+            let (face, foot) = self.nearest(q, exact, (reach * (1.0 + 1e-5) + f32::MIN_POSITIVE).min(1e18))?;
+            (face, foot, DVec3::ZERO)
+        } else {
+            let from_centre = exact - self.centre.as_dvec3();
+            let moved = from_centre.clamp_length_max(HORIZON * f64::from(self.radius));
+            let (face, foot) = self.nearest_foot(self.centre.as_dvec3() + moved, f64::INFINITY)?;
+            (face, foot, from_centre - moved)
+        };
+        let distance = (foot.offset + beyond).length() / scale;
+        if distance > f64::from(max_distance) {
             return None;
         }
         let side = foot.offset.dot(self.pseudonormals.of(face, foot.feature).as_dvec3());
+        let point = if beyond == DVec3::ZERO { exact - foot.offset } else { self.interpolate(face, foot.barycentric) };
         Some(Closest {
             face,
             barycentric: foot.barycentric.map(|w| w as f32),
-            point: ((exact - foot.offset) / scale).as_vec3(),
+            point: (point / scale).as_vec3(),
             signed_distance: if side < 0.0 { -distance } else { distance } as f32,
         })
     }
 
-    /// Unsigned distance from `query` to one face. As a `max_distance` it makes the query of a
-    /// point near the one whose closest face this was several times faster.
+    /// Unsigned distance from `query` to one face: as the bound of
+    /// [`MeshDistance::closest_within`], with the closest face of a neighbouring query, it makes
+    /// the search several times faster.
+    ///
+    /// ```
+    /// # use glam::Vec3;
+    /// # use surface_query::MeshDistance;
+    /// let mesh = MeshDistance::new(&[Vec3::ZERO, Vec3::X, Vec3::Y], &[[0, 1, 2]])?;
+    /// assert_eq!(mesh.distance_to_face(Vec3::new(0.2, 0.2, -3.0), 0), 3.0);
+    /// # Ok::<(), surface_query::Error>(())
+    /// ```
     ///
     /// # Panics
-    /// Where there is no such face.
+    /// If `face` is out of range.
     #[must_use]
     pub fn distance_to_face(&self, query: Vec3, face: u32) -> f32 {
         let scale = f64::from(self.scale);
         (self.foot(face, query.as_dvec3() * scale).offset.length() / scale) as f32
     }
 
-    /// Nearest face and its closest point, scaled, if that is about as near as `reach`; `q` and
-    /// `exact` are the scaled query.
+    /// Nearest face within about `reach` and its closest point; `q` and `exact` are the scaled
+    /// query.
     #[inline(always)]
     fn nearest(&self, q: Vec3, exact: DVec3, reach: f32) -> Option<(u32, Foot)> {
         let q = [q.x, q.y, q.z].map(Vec4::splat);
@@ -228,7 +293,7 @@ impl MeshDistance {
                 }
             }
         }
-        if search.crowded {
+        if search.overflowed {
             return self.nearest_foot(exact, f64::from(search.bound));
         }
         (search.candidates())
@@ -239,25 +304,21 @@ impl MeshDistance {
             .min_by(|a, b| a.1.distance_squared.total_cmp(&b.1.distance_squared))
     }
 
+    fn corners(&self, face: u32) -> [DVec3; 3] {
+        self.faces[face as usize].map(|v| self.vertices[v as usize].as_dvec3())
+    }
+
     /// Closest point of one face to the scaled query `q`.
     fn foot(&self, face: u32, q: DVec3) -> Foot {
-        let corners = self.faces[face as usize].map(|v| self.vertices[v as usize].as_dvec3());
-        closest_on_triangle(corners, q)
+        closest_on_triangle(self.corners(face), q)
     }
 
-    /// [`MeshDistance::nearest`] for a query far outside, and for a tree too deep for that.
-    fn nearest_to_far(&self, q: DVec3) -> Option<(u32, Foot)> {
-        // From here on the nearest point depends on the direction alone, and f64 still tells faces
-        // apart.
-        let (centre, horizon) = (self.centre.as_dvec3(), 1e7 * f64::from(self.radius));
-        let (face, foot) = self.nearest_foot(centre + (q - centre).clamp_length_max(horizon), f64::INFINITY)?;
-        let moved = q - centre - (q - centre).clamp_length_max(horizon);
-        let offset = foot.offset + moved;
-        Some((face, Foot { offset, ..foot }))
+    /// Scaled position of barycentric coordinates on a face.
+    fn interpolate(&self, face: u32, barycentric: [f64; 3]) -> DVec3 {
+        self.corners(face).into_iter().zip(barycentric).map(|(corner, weight)| corner * weight).sum()
     }
 
-    /// Nearest face and its closest point if its squared distance is at most `best`: the tree in
-    /// `f64`.
+    /// Nearest face and its closest point, if its squared distance is at most `best`, in `f64`.
     fn nearest_foot(&self, q: DVec3, mut best: f64) -> Option<(u32, Foot)> {
         let mut found = None;
         let mut stack = vec![(0.0, 0u32)];
@@ -291,7 +352,14 @@ impl MeshDistance {
     }
 }
 
-/// Next node of the stack that is not beyond the bound.
+impl fmt::Debug for MeshDistance {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let (vertices, faces) = (self.vertices.len(), self.faces.len());
+        f.debug_struct("MeshDistance").field("vertices", &vertices).field("faces", &faces).finish_non_exhaustive()
+    }
+}
+
+/// Pops the next node within the bound.
 #[inline(always)]
 fn pop(stack: &[(f32, u32)], height: &mut usize, bound: f32) -> Option<u32> {
     while *height > 0 {
@@ -304,8 +372,8 @@ fn pop(stack: &[(f32, u32)], height: &mut usize, bound: f32) -> Option<u32> {
     None
 }
 
-/// The power of two that brings the largest finite coordinate to about 1, within the exponents
-/// whose inverse and whose product with any coordinate are normal.
+/// The power of two that brings the largest finite coordinate to about 1, clamped to exponents
+/// whose inverse is normal.
 fn power_of_two_scale(vertices: &[Vec3]) -> f32 {
     let largest = vertices.iter().filter(|v| v.is_finite()).fold(0.0, |m: f32, v| m.max(v.abs().max_element()));
     if largest == 0.0 {
@@ -330,7 +398,7 @@ mod tests {
     }
 
     #[test]
-    fn a_tree_too_deep_for_the_stack_is_searched_all_the_same() {
+    fn a_tree_deeper_than_the_fixed_stack_gives_the_same_distances() {
         let ball = testkit::mesh::icosphere(3);
         let usual = MeshDistance::new(&ball.vertices, &ball.faces).unwrap();
         assert!(usual.tree.stack <= STACK, "{} places", usual.tree.stack);
@@ -340,7 +408,7 @@ mod tests {
             let turn = i as f32 * 2.4;
             let q = Vec3::new(turn.cos(), turn.sin(), i as f32 / 200.0 - 1.0) * (0.3 + i as f32 * 0.003);
             for reach in [0.2, f32::INFINITY] {
-                let (one, other) = (usual.closest(q, reach), deep.closest(q, reach));
+                let (one, other) = (usual.closest_within(q, reach), deep.closest_within(q, reach));
                 let distance = |c: Closest| c.signed_distance;
                 assert_eq!(one.map(distance), other.map(distance), "{q}");
             }

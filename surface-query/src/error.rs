@@ -1,13 +1,21 @@
-/// Errors of meshes and configurations.
+/// Why a mesh or a configuration is refused.
+///
+/// ```
+/// use surface_query::{Error, MeshDistance};
+///
+/// let refused = MeshDistance::new(&[glam::Vec3::ZERO], &[[0, 0, 1]]).unwrap_err();
+/// assert_eq!(refused, Error::FaceIndex { face: 0, vertex: 1, vertices: 1 });
+/// assert_eq!(refused.to_string(), "face 0 has vertex index 1, but there are only 1 vertices");
+/// ```
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
-    /// A face names a vertex that does not exist.
-    #[error("face {face} names vertex {vertex}, but there are only {vertices} vertices")]
+    /// A face has an index outside the vertices.
+    #[error("face {face} has vertex index {vertex}, but there are only {vertices} vertices")]
     FaceIndex {
-        /// The face.
+        /// Index of the face.
         face: usize,
-        /// The vertex it names.
+        /// The vertex index out of range.
         vertex: u32,
         /// Number of vertices.
         vertices: usize,
@@ -15,16 +23,26 @@ pub enum Error {
     /// A vertex has a NaN or infinite coordinate.
     #[error("vertex {vertex} is not finite")]
     NotFinite {
-        /// The vertex.
+        /// Index of the vertex.
         vertex: usize,
     },
-    /// A nearest-vertex structure needs at least one vertex.
+    /// A coordinate beyond 10¹⁸, where squared distances approach the range of `f32`; for
+    /// [`crate::SurfaceQuery`] alone.
+    #[error("vertex {vertex} has a coordinate beyond 1e18")]
+    OutOfRange {
+        /// Index of the vertex.
+        vertex: usize,
+    },
+    /// [`crate::MeshDistance`] needs at least one face.
+    #[error("no faces")]
+    NoFaces,
+    /// [`crate::SurfaceQuery`] needs at least one vertex.
     #[error("no vertices")]
     NoVertices,
     /// The mesh has more vertices or faces than are supported.
     #[error("{count} elements, at most 2^31 are supported")]
     TooMany {
-        /// Their number.
+        /// Number of elements.
         count: usize,
     },
     /// A configuration value out of its range.
@@ -37,8 +55,7 @@ pub enum Error {
         /// The range allowed.
         expected: &'static str,
     },
-    /// The candidate grid would need too many cells: the cell is too small for the extent of the
-    /// vertices.
+    /// Too many cells in the candidate grid: the cell is too small for the extent of the vertices.
     #[error("candidate grid of {cells:.3e} cells, at most {limit:.3e}: choose larger cells")]
     GridTooLarge {
         /// Cells of the bounding box.

@@ -1,5 +1,5 @@
-//! A grid of cells around the vertices, each with a list per level of every point that can be among
-//! the k nearest of any query in the cell.
+//! Grid of cells around the vertices. Each cell lists, per level, every point that can be among the
+//! k nearest of a query in it.
 
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
@@ -15,12 +15,8 @@ const MAX_BLOCKS: f64 = (1 << 24) as f64;
 const EMPTY: u32 = u32::MAX;
 /// Levels of at most this many points are searched whole when the lists are built.
 const SMALL_LEVEL: usize = 128;
-/// Magnitude beyond which squared distances come near the end of `f32`, and the margins below mean
-/// nothing.
-const MAX_COORDINATE: f32 = 1e18;
 
-/// Candidate lists, in the narrowest integer that holds the indices: they are most of the memory
-/// traffic.
+/// Candidate lists, in the narrowest integer that holds the indices to save memory traffic.
 enum Lists {
     Narrow(Vec<u16>),
     Wide(Vec<u32>),
@@ -42,13 +38,10 @@ pub(crate) struct CandidateGrid {
 
 impl CandidateGrid {
     /// Cells of side `cell` wherever a query may be within `margin` of a vertex.
-    pub fn new(levels: &[Level], k: usize, cell: f32, margin: f32) -> Result<Option<Self>, Error> {
+    pub fn new(levels: &[Level], k: usize, cell: f32, margin: f32) -> Result<Self, Error> {
         let points = &levels[0].points;
         let (min, max) = points.iter().fold((Vec3::MAX, Vec3::MIN), |(min, max), &p| (min.min(p), max.max(p)));
         let reach = margin + cell;
-        if min.abs().max(max.abs()).max_element() + reach > MAX_COORDINATE {
-            return Ok(None);
-        }
         let origin = min - Vec3::splat(reach);
         let block_size = f64::from(cell) * BLOCK as f64;
         let extent = (max.as_dvec3() + f64::from(reach) - origin.as_dvec3()) / block_size;
@@ -63,10 +56,10 @@ impl CandidateGrid {
         let per_cell = 1.0 / cell;
         let shape = Shape {
             origin: origin.as_dvec3(),
-            // The cell that the lookup really uses, after the rounding of its reciprocal.
+            // Cell size of the lookup, after the rounding of its reciprocal.
             cell: 1.0 / f64::from(per_cell),
-            // The lookup rounds the offset from the origin three times; its cells reach that much
-            // further. Half an ulp each, so four whole ulps are ample.
+            // Rounding of the lookup's offset from the origin: three operations of half an ulp
+            // each, so four whole ulps are ample.
             rounding: 4.0 * f64::from(f32::EPSILON) * (blocks.max_element() * block_size + f64::from(reach)),
             margin: f64::from(margin),
             k,
@@ -98,15 +91,8 @@ impl CandidateGrid {
             wide.shrink_to_fit();
             Lists::Wide(wide)
         };
-        Ok(Some(Self {
-            origin,
-            per_cell,
-            cells: (blocks * BLOCK as f64).as_vec3(),
-            blocks: [nx, nx * ny],
-            table,
-            offsets,
-            lists,
-        }))
+        let cells = (blocks * BLOCK as f64).as_vec3();
+        Ok(Self { origin, per_cell, cells, blocks: [nx, nx * ny], table, offsets, lists })
     }
 
     /// Row of the query's cell in the offsets, in units of levels; `None` outside every block.
@@ -124,8 +110,8 @@ impl CandidateGrid {
         (slot != EMPTY).then_some(slot as usize * BLOCK_CELLS + cell)
     }
 
-    /// k nearest of every level, level after level into `out`; false where the query's cell has no
-    /// lists.
+    /// Writes the k nearest of every level, level after level, into `out`; false if the query's
+    /// cell has no lists.
     #[inline(always)]
     pub fn nearest(&self, levels: &[Level], k: usize, q: Vec3, out: &mut [u32]) -> bool {
         let Some(row) = self.row(q) else {
@@ -158,7 +144,7 @@ fn nearest_of_lists<I: Copy + Into<u32>>(
     }
 }
 
-/// The lists of one block: local indices, and where the list of (cell, level) ends.
+/// The lists of one block: local indices, and the end of the list of each (cell, level).
 struct Block {
     list: Vec<u32>,
     ends: Vec<u32>,
@@ -226,8 +212,8 @@ impl Shape {
         })
     }
 
-    /// Appends every point of `near` that can be among the k nearest of a query in the cell. `near`
-    /// holds them.
+    /// Appends every point that can be among the k nearest of a query in the cell; `near` is a
+    /// superset of them.
     ///
     /// A point is left out only where k others are closer for certain. Queries compare squared
     /// distances in `f32`, off by at most 4 ulp relative (2.4e-7) and, near underflow, by a few
@@ -256,8 +242,8 @@ impl Shape {
                 max: far.length_squared(),
             }
         }));
-        // First sieve: k points are certainly within `bound`, so whatever is certainly beyond it is
-        // out.
+        // First sieve: k points are certainly within `bound`; points certainly beyond it are
+        // dropped.
         if scratch.len() > self.k {
             scratch.select_nth_unstable_by(self.k - 1, |a, b| a.max.total_cmp(&b.max));
             let bound = scratch[self.k - 1].max * (1.0 + RELATIVE) + ABSOLUTE;

@@ -1,4 +1,4 @@
-//! The k nearest points of one level, exactly: by squared `f32` distance, ties by lower index.
+//! Exact k nearest points of one level, by squared `f32` distance, ties by lower index.
 
 use std::num::NonZero;
 
@@ -13,8 +13,8 @@ pub(crate) const MAX_K: usize = 1 << 16;
 /// Largest k whose list is kept on the stack.
 const SMALL_K: usize = 64;
 
-/// Squared distance of a query to a point. Everything that ranks points goes through this one
-/// expression, so that the grid, the tree and brute force agree to the last bit.
+/// Squared distance of a query to a point. Every ranking uses this expression, so that grid, tree
+/// and brute force agree to the last bit.
 #[inline(always)]
 pub(crate) fn distance_squared(p: Vec3, q: Vec3) -> f32 {
     let d = q - p;
@@ -45,8 +45,8 @@ impl Level {
         Ok(Self { ids, points, tree })
     }
 
-    /// An upper bound of the distance from `centre` to the k-th nearest point; infinite where there
-    /// are not k points or the distance overflows.
+    /// Upper bound of the distance from `centre` to the k-th nearest point; infinite for fewer than
+    /// k points or on overflow.
     pub fn kth_distance(&self, centre: Vec3, k: usize) -> f32 {
         let Some(k_nonzero) = NonZero::new(k) else {
             return 0.0;
@@ -56,7 +56,7 @@ impl Level {
             return f32::INFINITY;
         }
         let squared = found.iter().fold(0.0, |m: f32, item| m.max(item.distance));
-        // The tree may sum the squares in another order than we do; also covers underflow.
+        // Covers another order of summation in the tree, and underflow.
         (squared * (1.0 + SLACK) + f32::MIN_POSITIVE).sqrt() * (1.0 + SLACK)
     }
 
@@ -76,11 +76,11 @@ impl Level {
             .collect()
     }
 
-    /// The k nearest through the tree: original indices into `out` (k).
+    /// Writes the original indices of the k nearest points into `out` (k), by way of the tree.
     pub fn nearest(&self, q: Vec3, out: &mut [u32]) {
         let wanted = out.len().min(self.points.len());
         if !q.is_finite() {
-            // Every distance counts as infinite.
+            // All distances are taken as infinite.
             self.write(out, |j| j as u64, wanted);
             return;
         }
@@ -90,11 +90,10 @@ impl Level {
         self.nearest_of(&near, q, out);
     }
 
-    /// The k nearest of the candidates `list`, which must hold them: original indices into `out`
-    /// (k).
+    /// Writes the original indices of the k nearest of the candidates `list` into `out` (k).
     #[inline(always)]
     pub fn nearest_of<I: Copy + Into<u32>>(&self, list: &[I], q: Vec3, out: &mut [u32]) {
-        // The usual k's get a buffer that stays in registers.
+        // Buffers of common sizes stay in registers.
         match out.len() {
             1 => self.select::<I, 1>(list, q, out),
             3 => self.select::<I, 3>(list, q, out),
@@ -138,8 +137,8 @@ impl Level {
     }
 }
 
-/// Relative allowance for everything the tree may round differently: its incremental box distances
-/// are off by a few ulp per level of the tree, so 1e-4 holds with three decimal digits to spare.
+/// Relative allowance for the rounding of the tree's incremental box distances: a few ulp per level
+/// of the tree.
 const SLACK: f32 = 1e-4;
 
 /// Sorts the smallest keys of the list into `best`.

@@ -4,12 +4,18 @@ use glam::{DVec3, Vec3};
 /// at the vertex (Thürmer and Wüthrich 1998; Bærentzen and Aanæs 2005). Faces are wound
 /// counter-clockwise seen from outside.
 ///
-/// A vertex without a face, or whose faces have no area or cancel, gets +Y, so that every normal is
-/// unit. Vertices are told apart by index: a seam of duplicated vertices gets the normals of either
-/// side.
+/// The fallback is +Y: for a vertex without faces, or with faces whose normals cancel or have no
+/// area. Duplicated vertices along a seam get the normals of their own side.
+///
+/// ```
+/// use glam::Vec3;
+///
+/// let normals = surface_query::vertex_normals(&[Vec3::ZERO, Vec3::X, Vec3::Y], &[[0, 1, 2]]);
+/// assert_eq!(normals, [Vec3::Z; 3]);
+/// ```
 ///
 /// # Panics
-/// If a face names a vertex that does not exist.
+/// If a face has an index outside `vertices`.
 #[must_use]
 pub fn vertex_normals(vertices: &[Vec3], faces: &[[u32; 3]]) -> Vec<Vec3> {
     let mut sums = vec![DVec3::ZERO; vertices.len()];

@@ -1,5 +1,5 @@
-//! Angle-weighted pseudonormals of faces, edges and vertices (Bærentzen and Aanæs 2005): the side
-//! of the nearest feature's pseudonormal a point is on is the side of the surface.
+//! Angle-weighted pseudonormals of faces, edges and vertices (Bærentzen and Aanæs 2005). The sign
+//! of a point is that of its offset from the closest point times the pseudonormal there.
 
 use std::collections::HashMap;
 
@@ -8,12 +8,11 @@ use glam::{DVec3, Vec3};
 use crate::normals::{corner_angles, face_normal};
 use crate::triangle::Feature;
 
-/// The part of the mesh's connectivity that the normals need. Vertices at the same position count
-/// as one, so that the seams of textured meshes do not look like holes.
+/// Connectivity with duplicated vertices merged: the seams of textured meshes are no borders.
 struct Topology {
     /// Edge i of a face goes from corner i to corner i+1.
     edges: Vec<[u32; 3]>,
-    /// Faces with their vertices renumbered.
+    /// Faces over merged vertices.
     welded: Vec<[u32; 3]>,
 }
 
@@ -25,17 +24,17 @@ pub(crate) struct Pseudonormals {
 }
 
 impl Pseudonormals {
-    /// Connectivity of the mesh; the normals are those of [`Pseudonormals::update`].
+    /// Connectivity of the mesh; [`Pseudonormals::update`] computes the normals.
     pub fn new(vertices: &[Vec3], faces: &[[u32; 3]]) -> Self {
         let mut positions: HashMap<[u32; 3], u32> = HashMap::with_capacity(vertices.len());
-        let names: Vec<u32> = (vertices.iter())
+        let merged: Vec<u32> = (vertices.iter())
             .map(|v| {
                 let next = positions.len() as u32;
                 // Adding zero makes −0 the same as 0.
                 *positions.entry((*v + 0.0).to_array().map(f32::to_bits)).or_insert(next)
             })
             .collect();
-        let welded: Vec<[u32; 3]> = (faces.iter()).map(|face| face.map(|v| names[v as usize])).collect();
+        let welded: Vec<[u32; 3]> = (faces.iter()).map(|face| face.map(|v| merged[v as usize])).collect();
         let mut numbers: HashMap<(u32, u32), u32> = HashMap::with_capacity(faces.len() * 3 / 2);
         let edges = (welded.iter())
             .map(|face| {
@@ -54,8 +53,7 @@ impl Pseudonormals {
         }
     }
 
-    /// Normals of the same faces at new positions. None is normalised but those of the faces: only
-    /// their side matters.
+    /// Recomputes the normals. Only those of faces have unit length: the sign needs no more.
     pub fn update(&mut self, vertices: &[Vec3], faces: &[[u32; 3]]) {
         self.edges.fill(Vec3::ZERO);
         self.vertices.fill(Vec3::ZERO);
@@ -76,7 +74,7 @@ impl Pseudonormals {
         }
     }
 
-    /// Pseudonormal of a feature of a face; zero where all its faces are without area.
+    /// Pseudonormal of a feature of a face; zero where no adjacent face has an area.
     pub fn of(&self, face: u32, feature: Feature) -> Vec3 {
         let face = face as usize;
         match feature {

@@ -1,16 +1,25 @@
 use glam::{DVec3, Vec3};
 
-/// Points of one leaf of the sampling tree. Smaller leaves skip more distances but cost more box
+/// Points of a leaf of the sampling tree: smaller leaves skip more distances but cost more box
 /// tests.
 const BUCKET: usize = 32;
 
 /// Nested subsets of a point set: level 0 holds every point, each further level a farthest point
 /// sampling of the level above it.
+///
+/// ```
+/// use glam::Vec3;
+/// use surface_query::Pyramid;
+///
+/// let points: Vec<Vec3> = (0..8).map(|i| Vec3::X * i as f32).collect();
+/// let pyramid = Pyramid::new(&points, 0.5, 2);
+/// assert_eq!(pyramid.levels[1..], [vec![0, 7, 3, 5], vec![0, 7]]);
+/// ```
 #[derive(Clone, Debug, PartialEq)]
 pub struct Pyramid {
-    /// `levels[0]` is 0, 1, …, N−1; further levels are in the order of sampling and hold indices
-    /// into the original points. Each level is a prefix of the one above it from level 1 on:
-    /// farthest point sampling is greedy, so sampling a sampled set again repeats its beginning.
+    /// Indices into the points: 0, 1, …, N−1 at level 0, in the order of sampling at further
+    /// levels. From level 1 on each level is a prefix of the one above it, since the sampling is
+    /// greedy.
     pub levels: Vec<Vec<u32>>,
 }
 
@@ -40,15 +49,21 @@ impl Pyramid {
     }
 }
 
-/// Exact farthest point sampling (Gonzalez 1985): `count` distinct indices, first index 0, then
-/// again and again the point whose distance to the nearest chosen point is largest; ties go to the
-/// lower index. At most N are returned.
+/// Exact farthest point sampling (Gonzalez 1985): `count` distinct indices, at most N. The first is
+/// index 0, each further one the point farthest from all chosen before; ties go to the lower index.
+///
+/// ```
+/// use glam::Vec3;
+///
+/// let line: Vec<Vec3> = (0..5).map(|i| Vec3::X * i as f32).collect();
+/// assert_eq!(surface_query::farthest_points(&line, 3), [0, 4, 2]);
+/// ```
 ///
 /// Distances are compared in `f64`, in which the squared distance of two `f32` points is exact or
 /// nearly so. Points that are not finite are chosen last, in the order of their indices.
 ///
-/// The work is that of a k-d tree of buckets (Han et al., *QuickFPS*, 2023): whatever lies in a box
-/// that is farther from the new sample than any point in it is from the chosen ones is skipped.
+/// A k-d tree of buckets (Han et al., *QuickFPS*, 2023) skips the boxes that a new sample cannot
+/// change.
 #[must_use]
 pub fn farthest_points(points: &[Vec3], count: usize) -> Vec<u32> {
     let count = count.min(points.len());
@@ -68,14 +83,14 @@ pub fn farthest_points(points: &[Vec3], count: usize) -> Vec<u32> {
     chosen
 }
 
-/// Some points, their box, and how far they are from the chosen ones.
+/// A subset of the points, its box, and its largest distance to the chosen points.
 struct Node {
     min: DVec3,
     max: DVec3,
     /// Largest squared distance of a point to the nearest chosen one, infinite before the first; −1
     /// where all are chosen themselves.
     gap: f64,
-    /// The lowest index of the points that have it.
+    /// Lowest index of a point at that distance.
     farthest: u32,
     content: Content,
 }
@@ -85,7 +100,7 @@ enum Content {
     Halves(Box<[Node; 2]>),
 }
 
-/// A few neighbouring points.
+/// Points of a leaf, coordinates by axis.
 struct Bucket {
     /// Ascending.
     ids: Vec<u32>,
@@ -148,7 +163,7 @@ impl Node {
         self.refresh();
     }
 
-    /// Takes account of a new sample.
+    /// Shortens the distances by a new sample.
     fn update(&mut self, s: DVec3) {
         if self.distance_squared(s) >= self.gap {
             return;

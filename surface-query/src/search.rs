@@ -1,12 +1,12 @@
-//! State of a closest-point search while it walks the tree.
+//! State of a closest-point search during the traversal of the tree.
 
 use crate::tree::LANES;
 
-/// Faces kept for the exact comparison. Six meet at a usual vertex; more than this are compared in
-/// `f64` from the start.
+/// Capacity for faces to compare in `f64`. Six meet at a usual vertex; where the capacity is
+/// exceeded the whole search is repeated in `f64`.
 const MAX_CANDIDATES: usize = 32;
 
-/// Faces that may be the nearest, given that `f32` distances are off by up to `error`.
+/// Candidates for the nearest face, given that `f32` distances are off by up to `error`.
 pub(crate) struct Search {
     error: f32,
     /// Smallest squared distance so far.
@@ -15,12 +15,12 @@ pub(crate) struct Search {
     pub bound: f32,
     candidates: [(f32, u32); MAX_CANDIDATES],
     count: usize,
-    /// Set when there were more candidates than fit.
-    pub crowded: bool,
+    /// Set when the candidates exceed the capacity.
+    pub overflowed: bool,
 }
 
 impl Search {
-    /// Faces about as near as `reach`.
+    /// A search for faces within about `reach`.
     #[inline(always)]
     pub fn new(reach: f32, error: f32) -> Self {
         Self {
@@ -29,11 +29,11 @@ impl Search {
             bound: allow(reach, error),
             candidates: [(0.0, 0); MAX_CANDIDATES],
             count: 0,
-            crowded: false,
+            overflowed: false,
         }
     }
 
-    /// Takes the squared distances of the faces of a leaf; NaN for none.
+    /// Adds the faces of a leaf by squared distance; NaN distances are ignored.
     #[inline(always)]
     pub fn visit(&mut self, leaf: u32, squared: [f32; LANES]) {
         for (lane, d) in squared.into_iter().enumerate() {
@@ -56,11 +56,11 @@ impl Search {
             *free = (d, slot);
             self.count += 1;
         } else {
-            self.crowded = true;
+            self.overflowed = true;
         }
     }
 
-    /// Drops the candidates that are out by now.
+    /// Drops the candidates beyond the current bound.
     #[cold]
     fn sift(&mut self) {
         let mut kept = 0;
@@ -73,7 +73,7 @@ impl Search {
         self.count = kept;
     }
 
-    /// Leaf and lane of the candidates that are left.
+    /// Leaf and lane of the candidates within the bound.
     pub fn candidates(&self) -> impl Iterator<Item = (usize, usize)> + '_ {
         (self.candidates[..self.count].iter())
             .filter(|(d, _)| *d <= self.bound)
@@ -81,7 +81,7 @@ impl Search {
     }
 }
 
-/// Square of a distance with the error on top.
+/// Square of a distance plus the error.
 #[inline(always)]
 fn allow(distance: f32, error: f32) -> f32 {
     let with_error = (distance + error) * (1.0 + 1e-6);

@@ -1,5 +1,5 @@
-//! Tree of boxes over triangles, built by obvhs and laid out for this crate's traversal: eight
-//! children a node, whose boxes are tested together, four triangles a leaf.
+//! Bounding volume hierarchy over triangles, built by obvhs and widened for SIMD: eight children a
+//! node, whose boxes are tested together, and four triangles a leaf.
 
 use std::time::Duration;
 
@@ -13,10 +13,10 @@ use obvhs::bvh2::builder::build_bvh2;
 pub(crate) const LANES: usize = 4;
 /// Children of a node.
 pub(crate) const WIDTH: usize = 8;
-/// Marks a child that is a leaf; the other bits are its number.
+/// Flags a child that is a leaf; the other bits are its index.
 const LEAF: u32 = 1 << 31;
-/// Places of a stack of fixed size: of a tree 18 nodes deep, which not even triangles over all
-/// scales of `f32` make.
+/// Capacity of the fixed traversal stack, enough for a tree 18 nodes deep: triangles spread over
+/// all scales of `f32` stay below it.
 pub(crate) const STACK: usize = 128;
 
 /// Bounds of the children: lowest and highest corner along each axis, a lane for each child.
@@ -24,7 +24,7 @@ pub(crate) const STACK: usize = 128;
 pub(crate) struct Node {
     low: [[Vec4; WIDTH / 4]; 3],
     high: [[Vec4; WIDTH / 4]; 3],
-    /// The first `count` are there; the boxes of the others are infinitely far away.
+    /// The first `count` are in use; the boxes of the others are inside out.
     children: [u32; WIDTH],
     pub count: usize,
 }
@@ -44,7 +44,7 @@ impl Child {
 }
 
 impl Node {
-    /// A node without children: all are nowhere.
+    /// A node without children.
     const EMPTY: Self = Self { low: [[Vec4::MAX; 2]; 3], high: [[Vec4::MIN; 2]; 3], children: [0; WIDTH], count: 0 };
 
     /// [`Child::new`]'s argument for one of the children.
@@ -84,7 +84,7 @@ impl Node {
     }
 }
 
-/// Box of a child that holds nothing: infinitely far from everything.
+/// Empty box, inside out: infinitely far from every point.
 const NOTHING: [Vec3; 2] = [Vec3::MAX, Vec3::MIN];
 
 pub(crate) struct Tree {
@@ -92,7 +92,7 @@ pub(crate) struct Tree {
     pub nodes: Vec<Node>,
     /// Faces of each leaf; a leaf of fewer than four repeats its first.
     pub leaves: Vec<[u32; LANES]>,
-    /// Children that can wait for their turn at once, at most.
+    /// Most entries of a traversal stack.
     pub stack: usize,
 }
 
@@ -150,7 +150,7 @@ impl Tree {
         self.stack = depth * (WIDTH - 1) + 1;
     }
 
-    /// Makes a leaf of all triangles below their node.
+    /// Collapses the subtree below `node` into a leaf.
     fn leaf(&mut self, bvh: &Bvh2, node: usize) -> u32 {
         let (mut stack, mut primitives) = (vec![node], Vec::with_capacity(LANES));
         while let Some(node) = stack.pop() {
@@ -170,14 +170,14 @@ impl Tree {
         (self.leaves.len() as u32 - 1) | LEAF
     }
 
-    /// Box of everything; `None` if there is nothing.
+    /// Bounding box of all faces; `None` if there are none.
     pub fn bounds(&self) -> Option<[Vec3; 2]> {
         let [min, max] = self.nodes.first()?.bounds();
         (min.x <= max.x).then_some([min, max])
     }
 
-    /// Recomputes every box. `leaf_box` gives the lowest and highest corner of the faces of a leaf;
-    /// `None` if all of them are nowhere.
+    /// Recomputes every box. `leaf_box` gives the lowest and highest corner of the faces of a leaf,
+    /// `None` if none has finite corners.
     pub fn refit(&mut self, leaf_box: impl Fn(&[u32; LANES]) -> Option<[Vec3; 2]>) {
         for n in (0..self.nodes.len()).rev() {
             for place in 0..self.nodes[n].count {

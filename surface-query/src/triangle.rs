@@ -1,11 +1,11 @@
-//! Distance from a point to triangles: four at a time in `f32` to find the nearest, one in `f64` to
-//! measure it.
+//! Distance from a point to triangles: four at a time in `f32` for the search, one in `f64` for the
+//! result.
 
 use glam::{DVec3, Vec3, Vec4};
 
 use crate::tree::LANES;
 
-/// Four triangles, lane by lane: corner a and the edges from it.
+/// Four triangles in SIMD lanes: corner a and the edges from it.
 #[derive(Clone, Copy)]
 pub(crate) struct Pack {
     a: [Vec4; 3],
@@ -18,8 +18,7 @@ fn dot(u: [Vec4; 3], v: [Vec4; 3]) -> Vec4 {
     u[0] * v[0] + u[1] * v[1] + u[2] * v[2]
 }
 
-/// |p − s·ab − t·ac|², the residual formed before it is squared so that small distances keep their
-/// digits.
+/// |p − s·ab − t·ac|², by way of the residual vector: no cancellation at small distances.
 #[inline(always)]
 fn residual(p: [Vec4; 3], ab: [Vec4; 3], ac: [Vec4; 3], s: Vec4, t: Vec4) -> Vec4 {
     let r = [0, 1, 2].map(|i| p[i] - s * ab[i] - t * ac[i]);
@@ -29,7 +28,7 @@ fn residual(p: [Vec4; 3], ab: [Vec4; 3], ac: [Vec4; 3], s: Vec4, t: Vec4) -> Vec
 /// x / y clamped to [0, 1]; 0 where y is 0.
 #[inline(always)]
 fn unit_ratio(x: Vec4, y: Vec4) -> Vec4 {
-    // y > 0 whenever it is not 0, and x / MIN_POSITIVE clamps to the right end.
+    // y is never negative; x / MIN_POSITIVE clamps to the end of the sign of x.
     (x / y.max(Vec4::splat(f32::MIN_POSITIVE))).clamp(Vec4::ZERO, Vec4::ONE)
 }
 
@@ -52,7 +51,7 @@ impl Pack {
     /// The least of the distances to the three edges and, where it falls inside, to the foot of the
     /// perpendicular. Each is the distance to a real point of the triangle, so a sliver whose foot
     /// is badly conditioned is never reported too close, and its edges bound the error by its
-    /// width. A lane with a corner that is not finite gives NaN, which is below no bound.
+    /// width. A lane with a corner that is not finite gives NaN; comparisons with it are false.
     #[inline(always)]
     pub fn distance_squared(&self, q: [Vec4; 3]) -> Vec4 {
         let (ab, ac) = (self.ab, self.ac);
@@ -79,7 +78,7 @@ impl Pack {
     }
 }
 
-/// The part of a triangle a closest point lies on.
+/// The face, edge or vertex that holds a closest point.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) enum Feature {
     Face,
@@ -98,7 +97,7 @@ pub(crate) struct Foot {
     pub offset: DVec3,
 }
 
-/// Squared sine of the angle at the first corner from which on a triangle is no sliver.
+/// Squared sine of the angle at the first corner below which a triangle counts as a sliver.
 const WELL_SHAPED: f64 = 1e-4;
 
 /// Closest point of the triangle to `q`, in `f64`; the same case distinction as
@@ -119,7 +118,7 @@ pub(crate) fn closest_on_triangle(corners: [DVec3; 3], q: DVec3) -> Foot {
     if determinant > 0.0 && v > 0.0 && w > 0.0 && v + w < 1.0 {
         let inside = foot([1.0 - v - w, v, w], Feature::Face);
         if determinant > WELL_SHAPED * bb * cc {
-            // Rounding cannot have moved it beyond an edge by more than itself: no edge is nearer.
+            // Well conditioned: no edge is nearer.
             return inside;
         }
         best = Some(inside);

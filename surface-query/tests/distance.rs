@@ -56,7 +56,7 @@ fn distance_to_the_closest_face_is_the_distance_and_no_face_is_nearer() {
     let mut random = Random(5);
     for _ in 0..300 {
         let q = random.vec3(1.5);
-        let closest = distance.closest(q, f32::INFINITY).unwrap();
+        let closest = distance.closest(q);
         let to_face = |face| distance.distance_to_face(q, face);
         assert_eq!(to_face(closest.face), closest.signed_distance.abs());
         let nearest = (0..sphere.faces.len() as u32).map(to_face).fold(f32::INFINITY, f32::min);
@@ -102,7 +102,7 @@ proptest! {
     ) {
         let distance = build(&mesh);
         for q in queries.into_iter().chain(near.iter().map(|at| place(&mesh, at))) {
-            let found = distance.closest(q, f32::INFINITY).unwrap();
+            let found = distance.closest(q);
             check(&mesh, q, &found)?;
             check_sign(&mesh, q, &found)?;
         }
@@ -116,7 +116,7 @@ proptest! {
     ) {
         let distance = build(&mesh);
         for q in queries.into_iter().chain(near.iter().map(|at| place(&mesh, at))) {
-            let found = distance.closest(q, f32::INFINITY).unwrap();
+            let found = distance.closest(q);
             check(&mesh, q, &found)?;
             check_sign(&mesh, q, &found)?;
         }
@@ -126,9 +126,27 @@ proptest! {
     fn closest_point_is_never_farther_than_any_vertex(
         mesh in strategy::bumpy_sphere(), q in strategy::vec3(3.0),
     ) {
-        let found = build(&mesh).closest(q, f32::INFINITY).unwrap();
+        let found = build(&mesh).closest(q);
         let nearest = mesh.vertices.iter().map(|v| v.distance(q)).fold(f32::MAX, f32::min);
         prop_assert!(found.signed_distance.abs() <= nearest * (1.0 + 1e-6));
+    }
+
+    #[test]
+    fn queries_of_any_magnitude_find_the_farthest_reaching_point_of_the_mesh_and_are_outside(
+        mesh in spiky(), direction in strategy::unit_vec3(), exponent in 0.5f32..38.0,
+    ) {
+        let q = direction * 10f32.powf(exponent);
+        let found = build(&mesh).closest(q);
+        let corners = mesh.faces[found.face as usize].map(|i| mesh.vertices[i as usize].as_dvec3());
+        let point = (0..3).map(|i| corners[i] * f64::from(found.barycentric[i])).sum::<glam::DVec3>();
+        prop_assert!(point.distance(found.point.as_dvec3()) < 1e-6, "{}: {} is off the mesh", q, found.point);
+        let (_, _, distance) = oracle::closest_point(&mesh.vertices, &mesh.faces, q);
+        prop_assert!((f64::from(found.signed_distance) / distance - 1.0).abs() < 1e-7, "{}: {:?}", q, found);
+        if exponent > 4.0 {
+            let along = |p: glam::DVec3| p.dot(q.as_dvec3().normalize_or_zero());
+            let farthest = mesh.vertices.iter().map(|v| along(v.as_dvec3())).fold(f64::MIN, f64::max);
+            prop_assert!(along(point) > farthest - 1e-3, "{}: {:?}", q, found);
+        }
     }
 
     #[test]
@@ -145,7 +163,7 @@ proptest! {
         let soup = TriMesh { vertices, faces };
         let distance = build(&soup);
         for q in queries.into_iter().chain(soup.vertices.iter().copied()) {
-            check(&soup, q, &distance.closest(q, f32::INFINITY).unwrap())?;
+            check(&soup, q, &distance.closest(q))?;
         }
     }
 
@@ -154,8 +172,8 @@ proptest! {
         mesh in strategy::bumpy_sphere(), q in strategy::vec3(2.0), bound in 0.0f32..1.0,
     ) {
         let distance = build(&mesh);
-        let all = distance.closest(q, f32::INFINITY).unwrap();
-        match distance.closest(q, bound) {
+        let all = distance.closest(q);
+        match distance.closest_within(q, bound) {
             Some(found) => {
                 prop_assert!(found.signed_distance.abs() <= bound);
                 prop_assert_eq!(found, all);
@@ -163,7 +181,7 @@ proptest! {
             None => prop_assert!(all.signed_distance.abs() >= bound * (1.0 - 1e-6)),
         }
         // Exactly at the distance the point is still found.
-        prop_assert!(distance.closest(q, all.signed_distance.abs() * (1.0 + 1e-6)).is_some());
+        prop_assert!(distance.closest_within(q, all.signed_distance.abs() * (1.0 + 1e-6)).is_some());
     }
 
     #[test]
@@ -180,7 +198,7 @@ proptest! {
         let fresh = build(&after);
         for q in queries {
             let q = (q + shift) * size;
-            let (a, b) = (refitted.closest(q, 1e9).unwrap(), fresh.closest(q, 1e9).unwrap());
+            let (a, b) = (refitted.closest(q), fresh.closest(q));
             check(&after, q, &a)?;
             // The trees differ, so of equally near faces another may win.
             prop_assert!(f64::from((a.signed_distance - b.signed_distance).abs()) <= tolerance(&after, q));
@@ -193,8 +211,8 @@ proptest! {
     ) {
         // Powers of two change no digit, so nothing but the exponents may change.
         let unit = 2f32.powi(exponent);
-        let found = build(&mesh).closest(q, 4.0).unwrap();
-        let scaled = build(&mesh.map(|p| p * unit)).closest(q * unit, 4.0 * unit).unwrap();
+        let found = build(&mesh).closest(q);
+        let scaled = build(&mesh.map(|p| p * unit)).closest(q * unit);
         prop_assert_eq!(found.face, scaled.face);
         prop_assert_eq!(found.barycentric, scaled.barycentric);
         prop_assert_eq!(found.signed_distance * unit, scaled.signed_distance);
@@ -214,17 +232,17 @@ fn a_cube_is_measured_exactly() {
         (Vec3::X, 0.0),
         (Vec3::ONE, 0.0),
     ] {
-        assert_eq!(distance.closest(q, 10.0).unwrap().signed_distance, expected, "{q}");
+        assert_eq!(distance.closest(q).signed_distance, expected, "{q}");
     }
 }
 
 #[test]
-fn far_and_extreme_queries_are_finite_or_none() {
+fn distances_of_far_queries_are_right_and_of_infinite_ones_nan() {
     let ball = mesh::icosphere(2);
     let distance = build(&ball);
     for exponent in 0..38 {
         let q = Vec3::new(0.6, -0.8, 0.0) * 10f32.powi(exponent);
-        let found = distance.closest(q, f32::INFINITY).unwrap();
+        let found = distance.closest(q);
         let length = q.as_dvec3().length();
         let share = f64::from(found.signed_distance) / length;
         assert!((share - 1.0).abs() < 1.0 / length + 1e-6, "{q}: {share}");
@@ -239,12 +257,12 @@ fn far_and_extreme_queries_are_finite_or_none() {
     }
     let infinite = Vec3::new(f32::INFINITY, 0.0, 0.0);
     for q in [Vec3::NAN, infinite, Vec3::new(0.0, f32::NAN, 1.0)] {
-        assert_eq!(distance.closest(q, f32::INFINITY), None);
+        assert!(distance.closest(q).signed_distance.is_nan() && distance.closest_within(q, f32::INFINITY).is_none());
     }
     for bound in [f32::NAN, -1.0, f32::NEG_INFINITY] {
-        assert_eq!(distance.closest(Vec3::X * 2.0, bound), None);
+        assert_eq!(distance.closest_within(Vec3::X * 2.0, bound), None);
     }
-    assert!(distance.closest(Vec3::MAX, f32::INFINITY).is_none(), "farther than any f32");
+    assert_eq!(distance.closest(Vec3::MAX).signed_distance, f32::INFINITY);
 }
 
 #[test]
@@ -259,16 +277,17 @@ fn degenerate_meshes_are_answered_or_refused() {
                 assert!(!soup.vertices[vertex].is_finite(), "{name}");
                 continue;
             }
+            Err(Error::NoFaces) => {
+                assert!(soup.faces.is_empty(), "{name}");
+                continue;
+            }
             Err(error) => panic!("{name}: {error}"),
         };
         let size = soup.vertices.iter().fold(0.0, |m: f32, p| m.max(p.abs().max_element()));
         let mut random = Random(5);
         for _ in 0..40 {
             let q = random.vec3(size * 2.0);
-            match distance.closest(q, f32::INFINITY) {
-                Some(found) => check(&soup, q, &found).unwrap_or_else(|e| panic!("{name}: {e}")),
-                None => assert!(soup.faces.is_empty(), "{name}"),
-            }
+            check(&soup, q, &distance.closest(q)).unwrap_or_else(|e| panic!("{name}: {e}"));
         }
     }
 }
@@ -281,15 +300,15 @@ fn faces_that_become_infinite_disappear_until_the_next_refit() {
     broken[7] = Vec3::new(f32::NAN, f32::INFINITY, 0.0);
     distance.refit(&broken);
     let q = Vec3::new(-3.0, 0.2, 0.1);
-    assert_eq!(distance.closest(q, 9.0).unwrap().signed_distance, 2.0);
+    assert_eq!(distance.closest(q).signed_distance, 2.0);
     for &p in &broken[..7] {
-        let found = distance.closest(p * 1.1, 9.0).unwrap();
+        let found = distance.closest(p * 1.1);
         assert!(!cube.faces[found.face as usize].contains(&7));
     }
     distance.refit(&[Vec3::NAN; 8]);
-    assert_eq!(distance.closest(q, f32::INFINITY), None);
+    assert!(distance.closest(q).signed_distance.is_nan());
     distance.refit(&cube.vertices);
-    assert_eq!(distance.closest(Vec3::splat(2.0), 9.0).unwrap().point, Vec3::ONE);
+    assert_eq!(distance.closest(Vec3::splat(2.0)).point, Vec3::ONE);
 }
 
 #[test]
@@ -302,11 +321,7 @@ fn seams_of_duplicated_vertices_do_not_change_the_sign() {
     let mut random = Random(2);
     for _ in 0..2000 {
         let q = random.vec3(1.3);
-        assert_eq!(
-            whole.closest(q, 9.0).unwrap().signed_distance,
-            torn.closest(q, 9.0).unwrap().signed_distance,
-            "{q}"
-        );
+        assert_eq!(whole.closest(q).signed_distance, torn.closest(q).signed_distance, "{q}");
     }
 }
 
@@ -319,7 +334,7 @@ fn an_open_sheet_is_positive_on_the_side_of_its_normals_even_beyond_its_border()
         (Vec3::new(4.0, 0.2, 4.0), 5.0),
         (Vec3::new(4.0, 0.2, -4.0), -5.0),
     ] {
-        assert_eq!(distance.closest(q, 9.0).unwrap().signed_distance, expected);
+        assert_eq!(distance.closest(q).signed_distance, expected);
     }
 }
 
@@ -334,7 +349,7 @@ fn together(mut a: TriMesh, b: TriMesh) -> TriMesh {
 #[test]
 fn the_surroundings_of_a_component_inside_another_are_positive() {
     let distance = build(&together(mesh::cuboid(Vec3::splat(3.0)), mesh::cuboid(Vec3::ONE)));
-    let at = |x: f32| distance.closest(Vec3::X * x, 9.0).unwrap().signed_distance;
+    let at = |x: f32| distance.closest(Vec3::X * x).signed_distance;
     assert_eq!([0.5, 1.5, 2.5, 4.0].map(at), [-0.5, 0.5, -0.5, 1.0]);
 }
 
@@ -348,20 +363,17 @@ fn outside_two_boxes_that_share_a_wall_every_distance_is_positive() {
     for q in rim.collect::<Vec<_>>().into_iter().chain((0..2000).map(|_| random.vec3(4.0))) {
         let beyond = ((q - Vec3::X).abs() - Vec3::new(2.0, 1.0, 1.0)).max(Vec3::ZERO).length();
         if beyond > 0.0 {
-            let found = distance.closest(q, 9.0).unwrap().signed_distance;
+            let found = distance.closest(q).signed_distance;
             assert!((found - beyond).abs() <= 1e-6, "{q}: {found}, expected {beyond}");
         }
     }
 }
 
 #[test]
-fn a_mesh_without_faces_is_nowhere() {
-    assert_eq!(MeshDistance::new(&[], &[]).unwrap().closest(Vec3::ZERO, 1.0), None);
-    assert_eq!(MeshDistance::new(&[Vec3::ZERO], &[]).unwrap().closest(Vec3::ZERO, 1.0), None);
-    assert_eq!(
-        MeshDistance::new(&[Vec3::ZERO], &[[0, 1, 0]]).map(|_| ()),
-        Err(Error::FaceIndex { face: 0, vertex: 1, vertices: 1 })
-    );
+fn meshes_without_faces_or_with_indices_out_of_range_are_errors() {
+    assert_eq!(MeshDistance::new(&[Vec3::ZERO], &[]).unwrap_err(), Error::NoFaces);
+    let out_of_range = MeshDistance::new(&[Vec3::ZERO], &[[0, 1, 0]]).unwrap_err();
+    assert_eq!(out_of_range, Error::FaceIndex { face: 0, vertex: 1, vertices: 1 });
 }
 
 #[test]
@@ -377,7 +389,7 @@ fn signs_and_distances_of_the_open_body_equal_brute_force() {
         let mut queries = random.near_surface(&mesh, 150, 0.1);
         queries.extend((0..50).map(|_| random.vec3(1.0)));
         for q in queries {
-            let found = distance.closest(q, f32::INFINITY).unwrap();
+            let found = distance.closest(q);
             check(&mesh, q, &found).unwrap();
             check_sign(&mesh, q, &found).unwrap();
         }

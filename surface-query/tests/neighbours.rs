@@ -23,18 +23,18 @@ fn brute_force(points: &[Vec3], level: &[u32], q: Vec3, k: usize) -> Vec<u32> {
     (0..k).map(|j| all[j % found].1).collect()
 }
 
-fn check(query: &SurfaceQuery, k: usize, q: Vec3) -> Result<(), TestCaseError> {
+fn check(query: &SurfaceQuery, points: &[Vec3], k: usize, q: Vec3) -> Result<(), TestCaseError> {
     let mut found = vec![0; query.neighbours_per_query()];
     query.neighbours(q, &mut found);
     for (l, level) in query.pyramid().levels.iter().enumerate() {
-        let expected = brute_force(query.vertices(), level, q, k);
+        let expected = brute_force(points, level, q, k);
         prop_assert_eq!(&found[l * k..][..k], &expected[..], "level {} of {}", l, q);
     }
     Ok(())
 }
 
 fn config(k: usize, cell: f32, margin: f32) -> SurfaceQueryConfig {
-    SurfaceQueryConfig { k, cell, margin, ..SurfaceQueryConfig::BODY }
+    SurfaceQueryConfig { k, cell, margin, ..Default::default() }
 }
 
 proptest! {
@@ -49,7 +49,7 @@ proptest! {
     ) {
         let query = SurfaceQuery::new(&points, &[], &config(k, cell, 0.3)).unwrap();
         for q in queries.into_iter().chain(points.iter().copied()) {
-            check(&query, k, q)?;
+            check(&query, &points, k, q)?;
         }
     }
 
@@ -65,8 +65,8 @@ proptest! {
             .map(|&i| Vec3::new((i % 7) as f32, (i / 7 % 7) as f32, (i / 49) as f32))
             .collect();
         let query = SurfaceQuery::new(&points, &[], &config(k, cell, 1.0)).unwrap();
-        check(&query, k, Vec3::from(at.map(f32::from)) * 0.25)?;
-        check(&query, k, Vec3::from(at.map(f32::from)) * 0.5 - 3.0)?;
+        check(&query, &points, k, Vec3::from(at.map(f32::from)) * 0.25)?;
+        check(&query, &points, k, Vec3::from(at.map(f32::from)) * 0.5 - 3.0)?;
     }
 
     #[test]
@@ -76,14 +76,14 @@ proptest! {
         exponent in 0i32..38,
     ) {
         let query = SurfaceQuery::new(&points, &[], &config(5, 0.2, 0.2)).unwrap();
-        check(&query, 5, direction * 10f32.powi(exponent))?;
+        check(&query, &points, 5, direction * 10f32.powi(exponent))?;
     }
 }
 
 #[test]
 fn neighbours_of_degenerate_clouds_equal_brute_force_or_are_refused() {
     for (name, points) in strategy::degenerate_clouds() {
-        for settings in [SurfaceQueryConfig::TREES, config(3, 0.1, 0.2)] {
+        for settings in [SurfaceQueryConfig::default(), config(3, 0.1, 0.2)] {
             let query = match SurfaceQuery::new(&points, &[], &settings) {
                 Ok(query) => query,
                 Err(Error::NoVertices) => {
@@ -107,7 +107,7 @@ fn neighbours_of_degenerate_clouds_equal_brute_force_or_are_refused() {
             queries.extend([Vec3::NAN, Vec3::INFINITY, Vec3::MAX, Vec3::MIN, Vec3::ZERO]);
             queries.push(Vec3::new(0.0, f32::NEG_INFINITY, f32::NAN));
             for q in queries {
-                check(&query, settings.k, q).unwrap_or_else(|e| panic!("{name}: {e}"));
+                check(&query, &points, settings.k, q).unwrap_or_else(|e| panic!("{name}: {e}"));
             }
         }
     }
@@ -123,7 +123,7 @@ fn neighbours_on_cell_faces_of_a_grid_far_from_the_origin_equal_brute_force() {
     for i in 0..3000 {
         let cells = Vec3::new((i % 15) as f32, (i / 15 % 15) as f32, (i / 225) as f32);
         let on_face = corner + cells * 0.1;
-        check(&query, 5, on_face).unwrap();
+        check(&query, &points, 5, on_face).unwrap();
     }
 }
 
@@ -132,8 +132,8 @@ fn a_grid_answers_every_query_within_the_margin_like_the_trees_do() {
     let Some(body) = body::open_body() else {
         return;
     };
-    let grid = SurfaceQuery::new(&body.vertices, &body.faces, &SurfaceQueryConfig::BODY).unwrap();
-    let trees = SurfaceQuery::new(&body.vertices, &body.faces, &SurfaceQueryConfig::TREES).unwrap();
+    let grid = SurfaceQuery::new(&body.vertices, &body.faces, &config(5, 0.02, 0.12)).unwrap();
+    let trees = SurfaceQuery::new(&body.vertices, &body.faces, &SurfaceQueryConfig::default()).unwrap();
     let (mut a, mut b) = ([0; 20], [0; 20]);
     let mut random = Random(3);
     let mut queries = random.near_surface(&body, 20_000, 0.2);
@@ -143,7 +143,7 @@ fn a_grid_answers_every_query_within_the_margin_like_the_trees_do() {
         trees.neighbours(q, &mut b);
         assert_eq!(a, b, "{q}");
         if i % 100 == 0 {
-            check(&grid, 5, q).unwrap();
+            check(&grid, &body.vertices, 5, q).unwrap();
         }
     }
 }
@@ -154,7 +154,7 @@ fn more_than_65536_vertices_are_searched_too() {
     let points: Vec<Vec3> = (0..70_000).map(|_| random.vec3(1.0)).collect();
     let query = SurfaceQuery::new(&points, &[], &config(5, 0.1, 0.05)).unwrap();
     for _ in 0..50 {
-        check(&query, 5, random.vec3(1.0)).unwrap();
+        check(&query, &points, 5, random.vec3(1.0)).unwrap();
     }
 }
 
@@ -169,7 +169,7 @@ fn long_lists_equal_brute_force() {
                 SurfaceQuery::new(&points, &[], &SurfaceQueryConfig { coarse_levels: 0, ..config(k, cell, 0.3) });
             let query = query.unwrap();
             for _ in 0..20 {
-                check(&query, k, random.vec3(1.5)).unwrap();
+                check(&query, &points, k, random.vec3(1.5)).unwrap();
             }
         }
     }
@@ -191,7 +191,7 @@ fn a_level_of_fewer_than_k_points_repeats_its_list() {
 fn neighbour_sets_overlap_less_with_distance_and_more_with_scales() {
     let ball = mesh::icosphere(4);
     let overlap = |coarse_levels: usize, step: f32| {
-        let settings = SurfaceQueryConfig { coarse_levels, ..SurfaceQueryConfig::TREES };
+        let settings = SurfaceQueryConfig { coarse_levels, ..SurfaceQueryConfig::default() };
         let query = SurfaceQuery::new(&ball.vertices, &ball.faces, &settings).unwrap();
         let n = query.neighbours_per_query();
         let mut random = Random(11);
@@ -226,13 +226,13 @@ fn bad_meshes_and_settings_are_errors() {
     let ball = mesh::icosphere(1);
     let build = |settings| SurfaceQuery::new(&ball.vertices, &ball.faces, &settings).map(|_| ());
     for (name, settings) in [
-        ("k", SurfaceQueryConfig { k: 0, ..SurfaceQueryConfig::BODY }),
-        ("k", SurfaceQueryConfig { k: 65_537, ..SurfaceQueryConfig::BODY }),
-        ("ratio", SurfaceQueryConfig { ratio: 0.0, ..SurfaceQueryConfig::BODY }),
-        ("ratio", SurfaceQueryConfig { ratio: f32::NAN, ..SurfaceQueryConfig::BODY }),
-        ("cell", SurfaceQueryConfig { cell: -1.0, ..SurfaceQueryConfig::BODY }),
-        ("margin", SurfaceQueryConfig { margin: f32::INFINITY, ..SurfaceQueryConfig::BODY }),
-        ("coarse_levels", SurfaceQueryConfig { coarse_levels: 33, ..SurfaceQueryConfig::BODY }),
+        ("k", SurfaceQueryConfig { k: 0, ..Default::default() }),
+        ("k", SurfaceQueryConfig { k: 65_537, ..Default::default() }),
+        ("ratio", SurfaceQueryConfig { ratio: 0.0, ..Default::default() }),
+        ("ratio", SurfaceQueryConfig { ratio: f32::NAN, ..Default::default() }),
+        ("cell", SurfaceQueryConfig { cell: -1.0, ..Default::default() }),
+        ("margin", SurfaceQueryConfig { margin: f32::INFINITY, ..Default::default() }),
+        ("coarse_levels", SurfaceQueryConfig { coarse_levels: 33, ..Default::default() }),
     ] {
         match build(settings) {
             Err(Error::Config { name: found, .. }) => assert_eq!(found, name),
@@ -240,7 +240,9 @@ fn bad_meshes_and_settings_are_errors() {
         }
     }
     assert!(matches!(build(config(5, 1e-6, 1.0)), Err(Error::GridTooLarge { .. })));
-    let outside = SurfaceQuery::new(&ball.vertices, &[[0, 1, 42]], &SurfaceQueryConfig::TREES);
+    let far = SurfaceQuery::new(&[Vec3::ZERO, Vec3::X * 1.1e18], &[], &SurfaceQueryConfig::default());
+    assert_eq!(far.unwrap_err(), Error::OutOfRange { vertex: 1 });
+    let outside = SurfaceQuery::new(&ball.vertices, &[[0, 1, 42]], &SurfaceQueryConfig::default());
     assert_eq!(outside.map(|_| ()), Err(Error::FaceIndex { face: 0, vertex: 42, vertices: 42 }));
 }
 

@@ -19,7 +19,7 @@ fn posed() -> (Shaped, Posed) {
 }
 
 fn to_canonical(motion: &SurfaceMotion, posed: &Posed, mesh: &MeshDistance, x: Vec3) -> Option<(Vec3, f32)> {
-    let closest = mesh.closest(x, 0.2)?;
+    let closest = mesh.closest_within(x, 0.2)?;
     let mapped = motion.map(body(), posed, x, closest.face, closest.barycentric, closest.signed_distance)?;
     Some((mapped.canonical, closest.signed_distance))
 }
@@ -51,7 +51,7 @@ fn points_off_the_posed_surface_keep_their_distance_in_the_canonical_pose() {
         let mut errors = Vec::new();
         for (&v, &n) in posed.vertices.iter().zip(&normals) {
             if let Some((x, d)) = to_canonical(&motion, &posed, &mesh, v + offset * n) {
-                errors.push((canonical.closest(x, 1.0).unwrap().signed_distance - d).abs());
+                errors.push((canonical.closest(x).signed_distance - d).abs());
             }
         }
         assert!(errors.len() * 10 > posed.vertices.len() * 9, "{} alive at {offset}", errors.len());
@@ -91,7 +91,7 @@ fn recorded_poses_are_mapped_back_by_the_nearest_surface_point() {
         let (error, dead) = mapping_error(&poses, &shaped.vertices, |posed| {
             let mesh = MeshDistance::new(&posed.vertices, &body.faces).unwrap();
             let map = |&x: &Vec3| {
-                let at = mesh.closest(x, 0.2)?;
+                let at = mesh.closest_within(x, 0.2)?;
                 Some(motion.map(&body, posed, x, at.face, at.barycentric, at.signed_distance)?.canonical)
             };
             posed.vertices.iter().map(map).collect()

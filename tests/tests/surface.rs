@@ -30,7 +30,12 @@ fn overlap(query: &SurfaceQuery, scales: usize, a: Vec3, b: Vec3) -> f32 {
 #[test]
 fn neighbours_overlap_less_with_distance_and_more_at_four_scales_than_at_one() {
     let shaped = body().shaped(&[]);
-    let query = SurfaceQuery::new(&shaped.vertices, &body().faces, &SurfaceQueryConfig::BODY).unwrap();
+    let query = SurfaceQuery::new(
+        &shaped.vertices,
+        &body().faces,
+        &SurfaceQueryConfig { cell: 0.02, margin: 0.12, ..Default::default() },
+    )
+    .unwrap();
     let distances = [0.01, 0.03, 0.06, 0.12, 0.25];
     let mut means = [[0.0f32; 5]; 2];
     for (at, &distance) in distances.iter().enumerate() {
@@ -67,7 +72,7 @@ proptest! {
     fn the_same_point_shares_everything_and_far_sides_share_nothing_at_the_finest_scale(
         mesh in strategy::bumpy_sphere(), q in strategy::unit_vec3(),
     ) {
-        let query = SurfaceQuery::new(&mesh.vertices, &mesh.faces, &SurfaceQueryConfig::TREES).unwrap();
+        let query = SurfaceQuery::new(&mesh.vertices, &mesh.faces, &SurfaceQueryConfig::default()).unwrap();
         prop_assert_eq!(overlap(&query, 4, q, q), 1.0);
         prop_assert_eq!(overlap(&query, 1, q, -q), 0.0);
         prop_assert!(overlap(&query, 4, q, q * 1.01) > 0.5);
@@ -79,12 +84,12 @@ proptest! {
     ) {
         let rays = RayMesh::new(&mesh.vertices, &mesh.faces).unwrap();
         let distances = MeshDistance::new(&mesh.vertices, &mesh.faces).unwrap();
-        let from = distances.closest(o, f32::INFINITY).unwrap().signed_distance;
+        let from = distances.closest(o).signed_distance;
         let hit = rays.first_hit(o, d * length);
         prop_assert!(hit.is_some() || from > 0.0, "no way out from inside, at {from}");
         if let Some(hit) = hit {
             let p = o + hit.t * length * d;
-            let closest = distances.closest(p, f32::INFINITY).unwrap();
+            let closest = distances.closest(p);
             prop_assert!(closest.signed_distance.abs() < 1e-5, "{}", closest.signed_distance);
             prop_assert!(hit.t * length >= from.abs() - 1e-5);
             // Both name the same point of the same surface.
@@ -99,9 +104,8 @@ proptest! {
 fn distance_structure_and_ray_structure_agree_on_a_walking_body_after_a_refit() {
     let shaped = body().shaped(&[]);
     let posed = body().pose(&shaped, &walking(), placement());
-    let mut rays = RayMesh::new(&shaped.vertices, &body().faces).unwrap();
+    let rays = RayMesh::new(&posed.vertices, &body().faces).unwrap();
     let mut distances = MeshDistance::new(&shaped.vertices, &body().faces).unwrap();
-    rays.refit(&posed.vertices);
     distances.refit(&posed.vertices);
     let centre = posed.vertices.iter().sum::<Vec3>() / posed.vertices.len() as f32;
     let mut hits = 0;
@@ -111,10 +115,10 @@ fn distance_structure_and_ray_structure_agree_on_a_walking_body_after_a_refit() 
         let target = centre + Vec3::new((turn * 3.7).sin() * 0.4, height, (turn * 5.3).sin() * 0.2);
         let Some(hit) = rays.first_hit(origin, target - origin) else { continue };
         hits += 1;
-        let closest = distances.closest(origin + hit.t * (target - origin), 0.1).unwrap();
+        let closest = distances.closest(origin + hit.t * (target - origin));
         assert!(closest.signed_distance.abs() < 2e-6, "{}", closest.signed_distance);
         // Just before the hit the ray is outside. Grazing rays may be closer to another fold.
-        let before = distances.closest(origin + (hit.t - 1e-3) * (target - origin), 0.1).unwrap();
+        let before = distances.closest(origin + (hit.t - 1e-3) * (target - origin));
         assert!(before.signed_distance > 0.0, "{}", before.signed_distance);
     }
     assert!(hits > 1000, "{hits}");
@@ -159,8 +163,9 @@ fn cameras_and_views_put_vertices_into_the_same_pixels_and_rays_lead_back_to_the
     let frame = &scene.train[0];
     let camera = &frame.view.camera;
     let view = View {
-        intrinsics: camera.intrinsics(),
-        extrinsics: camera.world_to_camera,
+        focal: camera.focal,
+        centre: camera.centre,
+        world_to_camera: camera.world_to_camera,
         width: camera.width,
         height: camera.height,
     };

@@ -1,5 +1,4 @@
-//! Cost of rasterising a body of 13776 triangles (a ball of 20480 where that is not at hand), and
-//! of casting the rays of the same pictures at it.
+//! Cost of rasterising a body of 13776 triangles (a ball of 20480 where that is not at hand).
 #![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
 
 #[path = "../tests/body/mod.rs"]
@@ -9,9 +8,9 @@ use std::collections::HashMap;
 
 use divan::Bencher;
 use divan::counter::ItemsCount;
-use glam::{Affine3A, Mat3, Quat, Vec3};
+use glam::{Affine3A, Quat, Vec2, Vec3};
 use testkit::TriMesh;
-use visibility::{RasterOptions, Rasterizer, RayMesh, Samples, View};
+use visibility::{RasterOptions, Rasterizer, Samples, View};
 
 fn main() {
     divan::main();
@@ -21,12 +20,9 @@ fn main() {
 fn view(width: u32, height: u32) -> View {
     let focal = height as f32 * 1.4;
     View {
-        intrinsics: Mat3::from_cols(
-            Vec3::X * focal,
-            Vec3::Y * focal,
-            Vec3::new(width as f32 / 2.0, height as f32 / 2.0, 1.0),
-        ),
-        extrinsics: Affine3A::from_rotation_translation(
+        focal: Vec2::splat(focal),
+        centre: Vec2::new(width as f32, height as f32) / 2.0,
+        world_to_camera: Affine3A::from_rotation_translation(
             Quat::from_rotation_x(std::f32::consts::PI),
             Vec3::new(0.0, -0.2, 3.0),
         ),
@@ -104,23 +100,4 @@ fn three_layers_512(bencher: Bencher<'_, '_>) {
 #[divan::bench(args = [(256, 256), (1920, 1080)])]
 fn faces(bencher: Bencher<'_, '_>, (width, height): (u32, u32)) {
     draw(bencher, &subdivided(1), &view(width, height), 2, 1, Samples::One);
-}
-
-/// What the ray caster needs for the picture of 512 × 512, on two threads, its tree at hand.
-#[divan::bench(args = [0, 1])]
-fn rays_512(bencher: Bencher<'_, '_>, times: u32) {
-    let mesh = subdivided(times);
-    let rays = RayMesh::new(&mesh.vertices, &mesh.faces).unwrap();
-    let view = view(512, 512);
-    let (origin, to_world) = (view.centre().unwrap(), view.extrinsics.inverse());
-    let inverse = view.intrinsics.inverse();
-    let all: Vec<(Vec3, Vec3)> = (0..512 * 512)
-        .map(|i| {
-            let pixel = Vec3::new((i % 512) as f32 + 0.5, (i / 512) as f32 + 0.5, 1.0);
-            (origin, to_world.transform_vector3(inverse * pixel))
-        })
-        .collect();
-    let mut hits = vec![None; all.len()];
-    let pool = pool(2);
-    bencher.counter(ItemsCount::new(all.len())).bench_local(|| pool.install(|| rays.first_hits(&all, &mut hits)));
 }

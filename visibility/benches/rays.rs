@@ -11,7 +11,7 @@ use std::time::Duration;
 use body::Random;
 use divan::Bencher;
 use divan::counter::ItemsCount;
-use glam::{Affine3A, Mat3, Quat, Vec3, Vec3A};
+use glam::{Affine3A, Quat, Vec2, Vec3, Vec3A};
 use obvhs::BvhBuildParams;
 use obvhs::cwbvh::builder::build_cwbvh_from_tris;
 use obvhs::ray::{Ray, RayHit};
@@ -28,8 +28,9 @@ fn view(size: u32, focal: f32) -> View {
     let focal = size as f32 * focal;
     let centre = size as f32 / 2.0;
     View {
-        intrinsics: Mat3::from_cols(Vec3::X * focal, Vec3::Y * focal, Vec3::new(centre, centre, 1.0)),
-        extrinsics: Affine3A::from_rotation_translation(
+        focal: Vec2::splat(focal),
+        centre: Vec2::splat(centre),
+        world_to_camera: Affine3A::from_rotation_translation(
             Quat::from_rotation_x(std::f32::consts::PI),
             Vec3::new(0.0, -0.2, 3.0),
         ),
@@ -54,13 +55,12 @@ fn split(mesh: &TriMesh) -> TriMesh {
 /// The rays through the pixels of a 256×256 image, row by row.
 fn image_rays(focal: f32) -> Vec<(Vec3, Vec3)> {
     let view = view(256, focal);
-    let origin = view.centre().unwrap();
-    let to_world = view.extrinsics.inverse();
-    let inverse = view.intrinsics.inverse();
+    let origin = view.centre_of_projection().unwrap();
+    let to_world = view.world_to_camera.inverse();
     (0..256 * 256)
         .map(|i| {
-            let pixel = Vec3::new((i % 256) as f32 + 0.5, (i / 256) as f32 + 0.5, 1.0);
-            (origin, to_world.transform_vector3(inverse * pixel))
+            let pixel = Vec2::new((i % 256) as f32 + 0.5, (i / 256) as f32 + 0.5);
+            (origin, to_world.transform_vector3(((pixel - view.centre) / view.focal).extend(1.0)))
         })
         .collect()
 }
@@ -108,27 +108,6 @@ fn first_hit_split_obvhs(bencher: Bencher<'_, '_>, focal: f32) {
     });
 }
 
-/// All together, at twice the faces, one thread.
-#[divan::bench(args = FOCALS)]
-fn first_hits_split_one_thread(bencher: Bencher<'_, '_>, focal: f32) {
-    together(bencher, 1, focal);
-}
-
-/// The same on two threads.
-#[divan::bench(args = FOCALS)]
-fn first_hits_split_two_threads(bencher: Bencher<'_, '_>, focal: f32) {
-    together(bencher, 2, focal);
-}
-
-fn together(bencher: Bencher<'_, '_>, threads: usize, focal: f32) {
-    let mesh = split(&body::body_or_ball());
-    let mesh = RayMesh::new(&mesh.vertices, &mesh.faces).unwrap();
-    let rays = image_rays(focal);
-    let mut hits = vec![None; rays.len()];
-    let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-    bencher.counter(ItemsCount::new(rays.len())).bench_local(|| pool.install(|| mesh.first_hits(&rays, &mut hits)));
-}
-
 /// Random segments through the body's box, one thread.
 #[divan::bench]
 fn first_hit_random(bencher: Bencher<'_, '_>) {
@@ -162,7 +141,7 @@ fn frequency_over_a_capture(bencher: Bencher<'_, '_>) {
     let views: Vec<View> = (0..100)
         .map(|i| {
             let mut view = view(512, 1.2);
-            view.extrinsics *= Affine3A::from_rotation_y(i as f32 * 0.0628);
+            view.world_to_camera *= Affine3A::from_rotation_y(i as f32 * 0.0628);
             view
         })
         .collect();
@@ -173,13 +152,6 @@ fn frequency_over_a_capture(bencher: Bencher<'_, '_>) {
         }
         counts
     });
-}
-
-#[divan::bench]
-fn refit(bencher: Bencher<'_, '_>) {
-    let mesh = body::body_or_ball();
-    let mut rays = RayMesh::new(&mesh.vertices, &mesh.faces).unwrap();
-    bencher.bench_local(|| rays.refit(&mesh.vertices));
 }
 
 #[divan::bench]

@@ -1,20 +1,32 @@
-/// Counts of how often each vertex of a mesh was seen.
+/// Running counts of how often each vertex of a mesh was seen, and attention weights from them.
 ///
-/// Counts are whole numbers in 64 bits, so they go on growing where `f32` would stop at 2²⁴, and
-/// they do not depend on the order in which they were added.
+/// 64-bit integers: exact beyond the 2²⁴ of `f32`, saturating, independent of the order of
+/// addition.
+///
+/// ```
+/// use visibility::VisibilityCounts;
+///
+/// let mut counts = VisibilityCounts::new(3);
+/// counts.add_visible(&[true, false, true]);
+/// counts.add(&[2, 2]);
+/// assert_eq!(counts.counts(), [1, 0, 3]);
+/// let mut attention = [0.0; 2];
+/// counts.attention(&[1, 2], &mut attention);
+/// assert_eq!(attention, [0.2, 0.8]);
+/// ```
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct VisibilityCounts {
     counts: Vec<u64>,
 }
 
 impl VisibilityCounts {
-    /// `n` vertices, none seen yet.
+    /// Zero counts of `n` vertices.
     #[must_use]
     pub fn new(n: usize) -> Self {
         Self { counts: vec![0; n] }
     }
 
-    /// Continues from counts saved earlier, (V).
+    /// Restores saved counts, (V).
     #[must_use]
     pub fn from_counts(counts: Vec<u64>) -> Self {
         Self { counts }
@@ -26,10 +38,10 @@ impl VisibilityCounts {
         &self.counts
     }
 
-    /// Adds 1 to every vertex named; one named several times gets as many.
+    /// Adds 1 to each of `vertices`, once per occurrence.
     ///
     /// # Panics
-    /// If a vertex does not exist.
+    /// If an index is out of range.
     pub fn add(&mut self, vertices: &[u32]) {
         let n = self.counts.len();
         for &v in vertices {
@@ -39,10 +51,10 @@ impl VisibilityCounts {
         }
     }
 
-    /// Adds 1 to every vertex that is `visible` (V), as [`crate::visible_vertices`] tells.
+    /// Adds 1 to every vertex marked in `visible` (V), as [`crate::visible_vertices`] returns it.
     ///
     /// # Panics
-    /// If `visible` has another length.
+    /// If `visible` does not have an entry per vertex.
     pub fn add_visible(&mut self, visible: &[bool]) {
         assert_eq!(
             visible.len(),
@@ -56,25 +68,11 @@ impl VisibilityCounts {
         }
     }
 
-    /// Forgets a share of the past: every count becomes ⌊`keep` · count⌋.
+    /// Writes attention weights (OccNeRF §3.3) of `neighbours` into `out`, of the same length:
+    /// (1 + c_i) / Σ_j (1 + c_j). Positive, sum 1, uniform for zero counts.
     ///
     /// # Panics
-    /// Unless 0 ≤ `keep` ≤ 1.
-    pub fn decay(&mut self, keep: f64) {
-        assert!((0.0..=1.0).contains(&keep), "decay: keep = {keep}, expected 0 to 1");
-        if keep < 1.0 {
-            for count in &mut self.counts {
-                // Truncates; the product is never above the count, which f64 may have rounded up.
-                *count = ((*count as f64 * keep) as u64).min(*count);
-            }
-        }
-    }
-
-    /// Attention of a list of vertices, OccNeRF §3.3: (1 + c_i) / Σ_j (1 + c_j) into `out` (as
-    /// many). Positive, sums to 1, and uniform before anything was seen.
-    ///
-    /// # Panics
-    /// If the lengths differ or a vertex does not exist.
+    /// If the lengths differ or an index is out of range.
     #[inline]
     pub fn attention(&self, neighbours: &[u32], out: &mut [f32]) {
         assert_eq!(neighbours.len(), out.len(), "attention: {} neighbours, {} outputs", neighbours.len(), out.len());
@@ -86,13 +84,12 @@ impl VisibilityCounts {
         }
     }
 
-    /// Attention where counts come from places that are spread over the surface, so that a vertex of
-    /// a coarse part gets more of them: (1 + s_i c_i) / Σ_j (1 + s_j c_j) into `out`. `scale` (V) is
-    /// s, at least 0: the mean area around a vertex over that around each. Positive, sums to 1, and
-    /// uniform before anything was seen.
+    /// [`VisibilityCounts::attention`] of scaled counts: (1 + s_i c_i) / Σ_j (1 + s_j c_j), with
+    /// `scale` (V) at least 0. The inverse area around each vertex, times the mean, corrects counts
+    /// of surface points for the density of the mesh.
     ///
     /// # Panics
-    /// If the lengths differ or a vertex does not exist.
+    /// If the lengths differ or an index is out of range.
     #[inline]
     pub fn attention_scaled(&self, scale: &[f32], neighbours: &[u32], out: &mut [f32]) {
         assert_eq!(scale.len(), self.counts.len(), "attention: {} scales of {} counts", scale.len(), self.counts.len());
@@ -102,18 +99,5 @@ impl VisibilityCounts {
         for (a, &v) in out.iter_mut().zip(neighbours) {
             *a = (weight(v) * inverse) as f32;
         }
-    }
-
-    /// Sum of all counts.
-    #[must_use]
-    pub fn total(&self) -> u128 {
-        self.counts.iter().map(|&c| u128::from(c)).sum()
-    }
-
-    /// Share of each vertex in the total, (V); zeros before anything was seen.
-    #[must_use]
-    pub fn frequencies(&self) -> Vec<f32> {
-        let total = self.total().max(1) as f64;
-        (self.counts.iter()).map(|&c| (c as f64 / total) as f32).collect()
     }
 }

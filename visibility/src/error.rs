@@ -1,13 +1,21 @@
-/// Errors of meshes.
+/// Why a mesh or an image is refused.
+///
+/// ```
+/// use visibility::{Error, RayMesh};
+///
+/// let refused = RayMesh::new(&[glam::Vec3::ZERO], &[[0, 0, 1]]).unwrap_err();
+/// assert_eq!(refused, Error::FaceIndex { face: 0, vertex: 1, vertices: 1 });
+/// assert_eq!(refused.to_string(), "face 0 has vertex index 1, but there are only 1 vertices");
+/// ```
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
-    /// A face names a vertex that does not exist.
-    #[error("face {face} names vertex {vertex}, but there are only {vertices} vertices")]
+    /// A face has an index outside the vertices.
+    #[error("face {face} has vertex index {vertex}, but there are only {vertices} vertices")]
     FaceIndex {
-        /// The face.
+        /// Index of the face.
         face: usize,
-        /// The vertex it names.
+        /// The vertex index out of range.
         vertex: u32,
         /// Number of vertices.
         vertices: usize,
@@ -15,23 +23,23 @@ pub enum Error {
     /// A vertex has a NaN or infinite coordinate.
     #[error("vertex {vertex} is not finite")]
     NotFinite {
-        /// The vertex.
+        /// Index of the vertex.
         vertex: usize,
     },
     /// The mesh has more vertices or faces than are supported.
     #[error("{count} elements, at most 2^31 are supported")]
     TooMany {
-        /// Their number.
+        /// Number of elements.
         count: usize,
     },
-    /// A picture that is too large to rasterise.
-    #[error("a picture of {width} × {height} pixels, at most {most} × {most} can be rasterised")]
+    /// An image too large to rasterise.
+    #[error("an image of {width} × {height} pixels, at most {most} × {most} are supported")]
     ImageSize {
-        /// Pixels a row.
+        /// Width in pixels.
         width: u32,
-        /// Rows.
+        /// Height in pixels.
         height: u32,
-        /// Most pixels a row or column, with the samples a pixel asked for.
+        /// Largest width and height at this number of samples a pixel.
         most: u32,
     },
 }

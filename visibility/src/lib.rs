@@ -1,53 +1,49 @@
-//! Which vertices of a mesh were seen, and how often: ray casts against a mesh, the vertices a
-//! camera sees, a rasteriser that says which triangle every pixel sees, running counts, and the
-//! attention weights made of them.
+//! Visibility of a triangle mesh: a software rasteriser, watertight ray casts, the vertices that a
+//! camera sees, and running counts of how often each was seen.
 //!
 //! ```
-//! use glam::{Affine3A, Mat3, Vec3};
-//! use visibility::{RasterOptions, Rasterizer, RayMesh, View, VisibilityCounts, visible_vertices};
+//! use glam::{Affine3A, Vec2, Vec3};
+//! use visibility::{RasterOptions, Rasterizer, RayMesh, View, visible_vertices};
 //!
 //! // A triangle at depth 2 and one behind it.
-//! let front = [Vec3::new(-1.0, -1.0, 2.0), Vec3::new(1.0, -1.0, 2.0), Vec3::new(0.0, 1.0, 2.0)];
-//! let back = [Vec3::new(0.0, 0.0, 4.0), Vec3::new(3.5, 0.0, 4.0), Vec3::new(0.0, -3.5, 4.0)];
-//! let vertices = [front, back].concat();
-//! let mesh = RayMesh::new(&vertices, &[[0, 1, 2], [3, 4, 5]])?;
-//! assert_eq!(mesh.first_hit(Vec3::ZERO, Vec3::Z).unwrap().t, 2.0);
-//!
+//! let front = [(-1.0, -1.0, 2.0), (1.0, -1.0, 2.0), (0.0, 1.0, 2.0)];
+//! let back = [(0.0, 0.0, 4.0), (3.5, 0.0, 4.0), (0.0, -3.5, 4.0)];
+//! let vertices = [front, back].concat().into_iter().map(Vec3::from).collect::<Vec<_>>();
+//! let faces = [[0, 1, 2], [3, 4, 5]];
 //! let view = View {
-//!     intrinsics: Mat3::from_cols(Vec3::X * 10.0, Vec3::Y * 10.0, Vec3::new(10.0, 10.0, 1.0)),
-//!     extrinsics: Affine3A::IDENTITY,
+//!     focal: Vec2::splat(10.0),
+//!     centre: Vec2::splat(10.0),
+//!     world_to_camera: Affine3A::IDENTITY,
 //!     width: 20,
 //!     height: 20,
 //! };
-//! let seen = visible_vertices(&mesh, &vertices, &view, None);
-//! assert_eq!(seen, [true, true, true, false, true, true]);
 //!
-//! let fragments = Rasterizer::default().faces(&vertices, &[[0, 1, 2], [3, 4, 5]], &view, &RasterOptions::default())?;
+//! // The face and depth of the pixel in column 10 and row 10.
+//! let options = RasterOptions::default();
+//! let fragments = Rasterizer::default().faces(&vertices, &faces, &view, &options)?;
 //! assert_eq!(fragments[10 * 20 + 10].map(|f| (f.face, f.depth)), Some((0, 2.0)));
 //!
-//! let mut counts = VisibilityCounts::new(vertices.len());
-//! counts.add_visible(&seen);
-//! let mut attention = [0.0; 2];
-//! counts.attention(&[0, 3], &mut attention);
-//! assert_eq!(attention, [2.0 / 3.0, 1.0 / 3.0]);
+//! let mesh = RayMesh::new(&vertices, &faces)?;
+//! assert_eq!(mesh.first_hit(Vec3::ZERO, Vec3::Z).map(|hit| hit.t), Some(2.0));
+//! let visible = visible_vertices(&mesh, &vertices, &view, None);
+//! assert_eq!(visible, [true, true, true, false, true, true]);
 //! # Ok::<(), visibility::Error>(())
 //! ```
 //!
 //! Conventions: cameras are OpenCV (x right, y down, z forward), extrinsics map world to camera,
-//! the first pixel's centre is (0.5, 0.5). Lengths are in the units of the vertices. Nothing
-//! depends on the number of threads.
+//! the first pixel's centre is (0.5, 0.5). Lengths are in the units of the vertices. Results do not
+//! depend on the number of threads.
 #![forbid(unsafe_code)]
 
 mod counts;
 mod error;
-mod packet;
 mod raster;
 mod ray_mesh;
 mod tree;
 mod triangle;
 mod view;
 
-/// The README's examples, compiled as tests.
+/// The README's example as a test.
 #[cfg(doctest)]
 #[doc = include_str!("../README.md")]
 struct Readme;

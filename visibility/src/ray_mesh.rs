@@ -1,112 +1,91 @@
+use std::fmt;
+
 use glam::Vec3;
 
 use crate::Error;
 use crate::error::check_mesh;
 use crate::tree::{Child, LANES, MAX_DEPTH, Tree};
-use crate::triangle::{Pack, Ray};
+use crate::triangle::{Ray, Triangles};
 
-/// Sizes of the mesh beyond which an origin's own rounding is larger than the mesh.
+/// Distance of an origin, in sizes of the mesh, beyond which its rounding exceeds the mesh.
 const FAR: f32 = 1e15;
 
-/// Margin of the boxes around their faces, in units of the tree, where coordinates are at most 2:
-/// two ulp. A ray within a side of a box is then inside whatever the sign of its zeros.
-const PADDING: f32 = 2.0 * f32::EPSILON;
-
-/// The point where a ray meets a mesh.
+/// The intersection of a ray with a mesh.
+///
+/// ```
+/// use glam::Vec3;
+/// use visibility::RayMesh;
+///
+/// let vertices = [Vec3::ZERO, Vec3::X, Vec3::Y];
+/// let mesh = RayMesh::new(&vertices, &[[0, 1, 2]])?;
+/// let hit = mesh.first_hit(Vec3::new(0.25, 0.5, 4.0), -2.0 * Vec3::Z).unwrap();
+/// assert_eq!((hit.t, hit.face, hit.barycentric), (2.0, 0, [0.25, 0.25, 0.5]));
+/// # Ok::<(), visibility::Error>(())
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Hit {
-    /// Position along the ray, in units of its direction: the point is origin + t · direction.
+    /// Ray parameter: the point is origin + t · direction.
     pub t: f32,
-    /// The face.
+    /// Index of the face.
     pub face: u32,
-    /// Weights of its corners: non-negative, sum 1.
+    /// Barycentric coordinates on the face: non-negative, sum 1.
     pub barycentric: [f32; 3],
 }
 
-/// A triangle mesh to cast rays at. Both sides of a triangle are hit, and the intersection is
+/// A triangle mesh for ray casts. Both sides of a triangle are hit, and the intersection is
 /// watertight: no ray slips through an edge or a vertex that triangles share.
 ///
-/// The faces keep their connectivity for life; [`RayMesh::refit`] moves the vertices. Queries take
-/// `&self` and may run on any number of threads.
+/// Queries take `&self` and may run on any number of threads.
+///
+/// ```
+/// use glam::Vec3;
+/// use visibility::RayMesh;
+///
+/// let vertices = [Vec3::ZERO, Vec3::X, Vec3::Y, Vec3::Z];
+/// let mesh = RayMesh::new(&vertices, &[[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])?;
+/// assert_eq!(mesh.first_hit(Vec3::new(0.25, 0.25, -3.0), Vec3::Z).map(|hit| hit.t), Some(3.0));
+/// assert_eq!(mesh.first_hit(Vec3::new(0.25, 0.25, -3.0), Vec3::X), None);
+/// # Ok::<(), visibility::Error>(())
+/// ```
 pub struct RayMesh {
     faces: Vec<[u32; 3]>,
     /// Multiplied by `scale`, a power of two, so that products neither overflow nor vanish.
     vertices: Vec<Vec3>,
     scale: f32,
-    pub(crate) tree: Tree,
-    pub(crate) packs: Vec<Pack>,
+    tree: Tree,
+    /// The triangles of each leaf of the tree.
+    leaves: Vec<Triangles>,
 }
 
 impl RayMesh {
-    /// Takes a mesh of `vertices` (V) and `faces` (F). A mesh without faces is never hit.
+    /// Builds the tree of `vertices` (V) and `faces` (F). A mesh without faces is never hit.
     ///
     /// # Errors
-    /// A vertex that is not finite, or a face that names no vertex.
+    /// A vertex that is not finite, or a face with an index outside `vertices`.
     pub fn new(vertices: &[Vec3], faces: &[[u32; 3]]) -> Result<Self, Error> {
         check_mesh(vertices, faces)?;
-        let scale = power_of_two_scale(vertices);
-        let scaled: Vec<Vec3> = vertices.iter().map(|v| *v * scale).collect();
-        let mut mesh =
-            Self { faces: faces.to_vec(), tree: Tree::new(&scaled, faces), vertices: scaled, scale, packs: Vec::new() };
-        mesh.update();
-        Ok(mesh)
-    }
-
-    /// Moves the vertices (V); the faces stay. Linear in the size of the mesh.
-    ///
-    /// The tree keeps the shape it was built with: after a change that is no deformation queries
-    /// stay exact but become slow. Faces with a vertex that is not finite are nowhere until the
-    /// next refit.
-    ///
-    /// # Panics
-    /// If the number of vertices is another than at the start.
-    pub fn refit(&mut self, vertices: &[Vec3]) {
-        assert_eq!(
-            vertices.len(),
-            self.vertices.len(),
-            "refit: {} vertices, the mesh has {}",
-            vertices.len(),
-            self.vertices.len()
-        );
-        self.scale = power_of_two_scale(vertices);
-        for (scaled, v) in self.vertices.iter_mut().zip(vertices) {
-            *scaled = *v * self.scale;
-        }
-        self.update();
-    }
-
-    fn update(&mut self) {
-        let Self { faces, vertices, tree, packs, .. } = self;
+        let largest = vertices.iter().fold(0.0, |largest: f32, v| largest.max(v.abs().max_element()));
+        let scale = inverse_power_of_two(largest);
+        let vertices: Vec<Vec3> = vertices.iter().map(|v| *v * scale).collect();
         let corners = |face: u32| faces[face as usize].map(|v| vertices[v as usize]);
-        packs.clear();
-        packs.extend(tree.leaves.iter().map(|leaf| Pack::new(leaf.map(corners))));
-        tree.refit(|leaf| {
-            let mut bounds: Option<[Vec3; 2]> = None;
-            for &face in leaf {
-                let [a, b, c] = corners(face);
-                if !(a.is_finite() && b.is_finite() && c.is_finite()) {
-                    continue;
-                }
-                let [min, max] = bounds.unwrap_or([a, a]);
-                bounds = Some([min.min(a).min(b).min(c), max.max(a).max(b).max(c)]);
-            }
-            bounds.map(|[min, max]| [min - PADDING, max + PADDING])
-        });
+        let tree = Tree::new(&vertices, faces);
+        let leaves = tree.leaves.iter().map(|leaf| Triangles::new(leaf.map(corners))).collect();
+        Ok(Self { faces: faces.to_vec(), vertices, scale, tree, leaves })
     }
 
-    /// The first face the ray from `origin` along `direction` (of any length but zero) meets, at t
-    /// ≥ 0.
+    /// The first intersection with the ray from `origin` along `direction`, of any length, at t ≥
+    /// 0. Of faces at the same t it is the one of lowest index.
     ///
-    /// `None` where it meets none; a ray in the plane of a triangle does not meet it. Also `None`
-    /// for a direction of zero, an origin or direction that is not finite, and an origin farther
-    /// than 10¹⁵ times the size of the mesh. Of faces hit at the same t it is the lowest.
+    /// `None` without an intersection. A ray in the plane of a triangle does not intersect it, nor
+    /// does one of zero direction, one that is not finite, or one from beyond 10¹⁵ sizes of the
+    /// mesh.
     #[must_use]
     pub fn first_hit(&self, origin: Vec3, direction: Vec3) -> Option<Hit> {
         let (ray, to_t) = self.ray(origin, direction)?;
         let mut first: Option<Hit> = None;
         let mut end = f32::INFINITY;
-        self.walk(&ray, f32::INFINITY, |leaf| {
-            let hits = self.packs[leaf].intersect(&ray);
+        self.traverse(&ray, f32::INFINITY, |leaf| {
+            let hits = self.leaves[leaf].intersect(&ray);
             let t = hits.t.to_array();
             for lane in 0..LANES {
                 let face = self.tree.leaves[leaf][lane];
@@ -125,15 +104,9 @@ impl RayMesh {
         first
     }
 
-    /// Whether the ray meets any face at 0 ≤ t < `t_max`, t in units of `direction`. False for the
+    /// Whether a face that `counts` accepts intersects the ray at 0 ≤ t < `t_max`. False for the
     /// rays for which [`RayMesh::first_hit`] is `None`, and for a `t_max` of NaN.
-    #[must_use]
-    pub fn is_blocked(&self, origin: Vec3, direction: Vec3, t_max: f32) -> bool {
-        self.is_blocked_by(origin, direction, t_max, |_| true)
-    }
-
-    /// [`RayMesh::is_blocked`] counting only faces that `counts` accepts.
-    pub(crate) fn is_blocked_by(
+    pub(crate) fn is_occluded_by(
         &self,
         origin: Vec3,
         direction: Vec3,
@@ -148,8 +121,8 @@ impl RayMesh {
             return false;
         }
         let mut blocked = false;
-        self.walk(&ray, end, |leaf| {
-            let t = self.packs[leaf].intersect(&ray).t.to_array();
+        self.traverse(&ray, end, |leaf| {
+            let t = self.leaves[leaf].intersect(&ray).t.to_array();
             for lane in 0..LANES {
                 let face = self.tree.leaves[leaf][lane] as usize;
                 blocked |= t[lane] < end && counts(&self.faces[face]);
@@ -164,13 +137,13 @@ impl RayMesh {
         self.vertices.get(index) == Some(&(position * self.scale))
     }
 
-    /// The ray in the units of the tree, its direction multiplied by a power of two; and the factor
-    /// that turns a depth along it into one in units of `direction`.
+    /// The ray in the units of the tree, its direction scaled by a power of two, and the factor
+    /// from its depths to those in units of `direction`.
     #[inline(always)]
-    pub(crate) fn ray(&self, origin: Vec3, direction: Vec3) -> Option<(Ray, f64)> {
+    fn ray(&self, origin: Vec3, direction: Vec3) -> Option<(Ray, f64)> {
         let longest = direction.abs().max_element();
         let o = origin * self.scale;
-        // Written so that NaN falls through.
+        // False for NaN.
         let usable = longest > 0.0 && direction.is_finite() && o.abs().max_element() < FAR;
         if !usable || !origin.is_finite() {
             return None;
@@ -188,10 +161,10 @@ impl RayMesh {
         Some((Ray::new(o, d), to_t))
     }
 
-    /// Visits the leaves the ray meets before `end`, nearest box first. `visit` returns the new
-    /// end, or `None` to stop.
+    /// Visits the leaves whose boxes the ray enters before `end`, nearest first. `visit` returns
+    /// the new end, or `None` to stop.
     #[inline(always)]
-    fn walk(&self, ray: &Ray, mut end: f32, mut visit: impl FnMut(usize) -> Option<f32>) {
+    fn traverse(&self, ray: &Ray, mut end: f32, mut visit: impl FnMut(usize) -> Option<f32>) {
         if self.tree.nodes.is_empty() {
             return;
         }
@@ -211,7 +184,7 @@ impl RayMesh {
             let near = usize::from(t[1] < t[0]);
             let far = 1 - near;
             let mut next = None;
-            // A box may begin exactly where a face is hit, so only a later one is out.
+            // Boxes at exactly the depth of the hit may hold a face of lower index.
             if t[near] <= end && t[near] < f32::INFINITY {
                 match n.child(near) {
                     Child::Leaf(leaf) => match visit(leaf as usize) {
@@ -250,12 +223,14 @@ impl RayMesh {
     }
 }
 
-/// The power of two that brings the largest finite coordinate to about 1.
-fn power_of_two_scale(vertices: &[Vec3]) -> f32 {
-    inverse_power_of_two(vertices.iter().filter(|v| v.is_finite()).fold(0.0, |m: f32, v| m.max(v.abs().max_element())))
+impl fmt::Debug for RayMesh {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let (vertices, faces) = (self.vertices.len(), self.faces.len());
+        f.debug_struct("RayMesh").field("vertices", &vertices).field("faces", &faces).finish_non_exhaustive()
+    }
 }
 
-/// 2^−n for a `length` in [2^n, 2^(n+1)), within the exponents whose inverse is normal; 1 for 0.
+/// 2^−n for a `length` in [2^n, 2^(n+1)), clamped to exponents whose inverse is normal; 1 for 0.
 fn inverse_power_of_two(length: f32) -> f32 {
     if length == 0.0 {
         return 1.0;

@@ -5,13 +5,13 @@ use glam::{Vec3, Vec4};
 
 use crate::tree::LANES;
 
-/// Four triangles, lane by lane: corners a, b, c by axis.
+/// Four triangles in SIMD lanes: corners a, b, c by axis.
 #[derive(Clone, Copy)]
-pub(crate) struct Pack {
-    pub corners: [[Vec4; 3]; 3],
+pub(crate) struct Triangles {
+    corners: [[Vec4; 3]; 3],
 }
 
-/// A ray, sheared so that it runs along its longest axis.
+/// A ray with the shear that makes it the z axis, `axes[2]` being its longest axis.
 pub(crate) struct Ray {
     pub origin: [Vec4; 3],
     pub inverse: [Vec4; 3],
@@ -24,7 +24,7 @@ impl Ray {
     pub fn new(origin: Vec3, direction: Vec3) -> Self {
         let z = direction.abs().max_position();
         let (x, y) = ((z + 1) % 3, (z + 2) % 3);
-        // A finite stand-in for 1/0: no 0 · ∞ where the origin lies on the side of a box.
+        // Finite in place of 1/0: no 0 · ∞ for an origin on the side of a box.
         let inverse = direction.to_array().map(|d| {
             let d = if d.abs() < 1e-30 { 1e-30f32.copysign(d) } else { d };
             Vec4::splat(1.0 / d)
@@ -48,14 +48,8 @@ pub(crate) struct Hits {
     pub barycentric: [Vec4; 3],
 }
 
-impl Pack {
-    /// A triangle with a corner that is not finite is never hit.
-    pub fn new(mut triangles: [[Vec3; 3]; LANES]) -> Self {
-        for triangle in &mut triangles {
-            if triangle.iter().any(|v| !v.is_finite()) {
-                *triangle = [Vec3::NAN; 3];
-            }
-        }
+impl Triangles {
+    pub fn new(triangles: [[Vec3; 3]; LANES]) -> Self {
         Self {
             corners: [0, 1, 2].map(|corner| {
                 [0, 1, 2].map(|axis| Vec4::from([0, 1, 2, 3].map(|lane: usize| triangles[lane][corner][axis])))
@@ -63,7 +57,7 @@ impl Pack {
         }
     }
 
-    /// Intersects both sides; depths from 0 on.
+    /// Intersects both sides at depths of at least 0.
     #[inline(always)]
     pub fn intersect(&self, ray: &Ray) -> Hits {
         let [kx, ky, kz] = ray.axes;
@@ -81,8 +75,8 @@ impl Pack {
         let mut w = b[0] * a[1] - b[1] * a[0];
         let zero = Vec4::ZERO;
         if (u.cmpeq(zero) | v.cmpeq(zero) | w.cmpeq(zero)).any() {
-            // Products of two f32 are exact in f64: the sign of an edge function is then right, and
-            // the same for both triangles of the edge.
+            // Products of two f32 are exact in f64: the sign of an edge function is right, and the
+            // same for both triangles of the edge.
             u = exact(u, c, b);
             v = exact(v, a, c);
             w = exact(w, b, a);

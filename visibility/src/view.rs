@@ -1,63 +1,98 @@
-use glam::{Affine3A, DVec3, Mat3, Vec3};
+use glam::{Affine3A, DVec3, Mat3, Vec2, Vec3};
 use rayon::prelude::*;
 
 use crate::RayMesh;
 
-/// Share of a vertex's distance by which something must be closer to hide it. Far above the
-/// rounding of the intersection (1e-6) and below any gap that matters (0.03 mm at 3 m).
+/// Relative margin by which an occluder must be closer than a vertex: far above the rounding of the
+/// intersection (10⁻⁶), far below a gap that matters (0.03 mm at 3 m).
 const MARGIN: f32 = 1e-5;
 
 /// A pinhole camera of the OpenCV convention: x right, y down, z forward; the centre of the first
 /// pixel is at (0.5, 0.5).
+///
+/// ```
+/// use glam::{Affine3A, Vec2, Vec3};
+/// use visibility::View;
+///
+/// let view = View {
+///     focal: Vec2::splat(100.0),
+///     centre: Vec2::new(32.0, 24.0),
+///     world_to_camera: Affine3A::from_translation(Vec3::Z * 2.0),
+///     width: 64,
+///     height: 48,
+/// };
+/// assert_eq!(view.centre_of_projection(), Some(-2.0 * Vec3::Z));
+/// assert_eq!(view.pixel(Vec3::ZERO), Some(24 * 64 + 32));
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct View {
-    /// Pixels from normalised camera coordinates.
-    pub intrinsics: Mat3,
-    /// Camera from world.
-    pub extrinsics: Affine3A,
-    /// Pixels a row.
+    /// Focal lengths in pixels.
+    pub focal: Vec2,
+    /// Principal point in pixels; (0, 0) is the outer corner of the first pixel.
+    pub centre: Vec2,
+    /// Extrinsics.
+    pub world_to_camera: Affine3A,
+    /// Width in pixels.
     pub width: u32,
-    /// Rows.
+    /// Height in pixels.
     pub height: u32,
 }
 
 impl View {
-    /// The centre of projection in the world; `None` if the extrinsics have no inverse.
+    /// Position of the camera in the world; `None` if the extrinsics are singular.
     #[must_use]
-    pub fn centre(&self) -> Option<Vec3> {
-        let rotation = Mat3::from(self.extrinsics.matrix3).as_dmat3();
+    pub fn centre_of_projection(&self) -> Option<Vec3> {
+        let rotation = Mat3::from(self.world_to_camera.matrix3).as_dmat3();
         let determinant = rotation.determinant();
         if determinant == 0.0 || !determinant.is_finite() {
             return None;
         }
-        let translation: DVec3 = Vec3::from(self.extrinsics.translation).as_dvec3();
+        let translation: DVec3 = Vec3::from(self.world_to_camera.translation).as_dvec3();
         let centre = (rotation.inverse() * -translation).as_vec3();
         centre.is_finite().then_some(centre)
     }
 
-    /// Row-major index of the pixel that a point of the world falls into; `None` behind the camera,
+    /// Row-major index of the pixel that holds the projection of `point`; `None` behind the camera,
     /// outside the image, or for a point that is not finite.
     #[must_use]
     pub fn pixel(&self, point: Vec3) -> Option<usize> {
-        let p = self.extrinsics.transform_point3(point);
-        let projected = self.intrinsics * p;
+        let p = self.world_to_camera.transform_point3(point);
+        let projected = self.intrinsics() * p;
         let (u, v) = (projected.x / projected.z, projected.y / projected.z);
         // False for NaN.
         let inside = p.z > 0.0 && u >= 0.0 && v >= 0.0 && u < self.width as f32 && v < self.height as f32;
         inside.then(|| v as usize * self.width as usize + u as usize)
     }
+
+    /// The calibration matrix.
+    pub(crate) fn intrinsics(&self) -> Mat3 {
+        Mat3::from_cols(Vec3::X * self.focal.x, Vec3::Y * self.focal.y, self.centre.extend(1.0))
+    }
 }
 
-/// Marks those of `vertices` (V) that the view sees: those in front of the camera that fall into a
-/// pixel of the image, and into one that is `usable` (H·W row-major, `true` = nothing but the mesh
-/// is in front; `None`: all are), to which nothing of `mesh` blocks the way from the camera.
+/// Marks those of `vertices` (V) that the view sees: in front of the camera, inside the image at a
+/// pixel that is `usable` (H·W row-major; `None`: all), and not occluded by `mesh`.
 ///
-/// The vertices are usually those of the mesh, in its order. Such a vertex is not hidden by its own
-/// faces, however obliquely they are seen; other points are, unless they lie within a relative 1e-5
-/// of the surface. Nothing is visible where the extrinsics have no inverse.
+/// `vertices` are usually those of the mesh, in its order: a vertex is not occluded by its own
+/// faces. Other points are visible only within a relative 10⁻⁵ of the surface or in front of it.
+/// Without a centre of projection nothing is visible.
+///
+/// ```
+/// use glam::{Affine3A, Vec2, Vec3};
+/// use visibility::{RayMesh, View, visible_vertices};
+///
+/// // A triangle in front of a point.
+/// let corners = [(-1.0, -1.0, 2.0), (1.0, -1.0, 2.0), (0.0, 1.0, 2.0)].map(Vec3::from);
+/// let mesh = RayMesh::new(&corners, &[[0, 1, 2]])?;
+/// let (focal, centre) = (Vec2::splat(10.0), Vec2::splat(10.0));
+/// let view = View { focal, centre, world_to_camera: Affine3A::IDENTITY, width: 20, height: 20 };
+/// assert_eq!(visible_vertices(&mesh, &corners, &view, None), [true; 3]);
+/// assert_eq!(visible_vertices(&mesh, &[3.0 * Vec3::Z], &view, None), [false]);
+/// # Ok::<(), visibility::Error>(())
+/// ```
 ///
 /// # Panics
-/// If `usable` has not `width · height` entries.
+/// If `usable` does not have `width · height` entries.
 #[must_use]
 pub fn visible_vertices(mesh: &RayMesh, vertices: &[Vec3], view: &View, usable: Option<&[bool]>) -> Vec<bool> {
     let pixels = view.width as usize * view.height as usize;
@@ -71,7 +106,7 @@ pub fn visible_vertices(mesh: &RayMesh, vertices: &[Vec3], view: &View, usable: 
             view.height
         );
     }
-    let Some(centre) = view.centre() else {
+    let Some(centre) = view.centre_of_projection() else {
         return vec![false; vertices.len()];
     };
     vertices
@@ -87,7 +122,7 @@ pub fn visible_vertices(mesh: &RayMesh, vertices: &[Vec3], view: &View, usable: 
             }
             let own = mesh.is_vertex(i, v);
             let counts = |face: &[u32; 3]| !(own && face.contains(&(i as u32)));
-            !mesh.is_blocked_by(centre, v - centre, 1.0 - MARGIN, counts)
+            !mesh.is_occluded_by(centre, v - centre, 1.0 - MARGIN, counts)
         })
         .collect()
 }

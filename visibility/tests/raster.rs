@@ -4,7 +4,7 @@
 mod body;
 
 use body::Random;
-use glam::{Affine3A, DVec3, Mat3, Quat, Vec3};
+use glam::{Affine3A, DVec3, Mat3, Quat, Vec2, Vec3};
 use proptest::prelude::*;
 use testkit::{TriMesh, mesh, strategy};
 use visibility::{Error, Fragment, Pixel, RasterOptions, Rasterizer, RayMesh, Samples, View};
@@ -15,8 +15,9 @@ fn camera(rotation: Quat, eye: Vec3, focal: f32, size: u32) -> View {
     let rotation = Mat3::from_quat(rotation);
     let centre = size as f32 / 2.0;
     View {
-        intrinsics: Mat3::from_cols(Vec3::X * focal, Vec3::Y * focal, Vec3::new(centre, centre, 1.0)),
-        extrinsics: Affine3A::from_mat3_translation(rotation, rotation * -eye),
+        focal: Vec2::splat(focal),
+        centre: Vec2::splat(centre),
+        world_to_camera: Affine3A::from_mat3_translation(rotation, rotation * -eye),
         width: size,
         height: size,
     }
@@ -37,8 +38,8 @@ fn draw(mesh: &TriMesh, view: &View) -> Vec<Option<Fragment>> {
 /// The direction through a pixel's centre, not normalised: its third camera coordinate is 1.
 fn direction(view: &View, pixel: usize) -> Vec3 {
     let (x, y) = (pixel % view.width as usize, pixel / view.width as usize);
-    let local = view.intrinsics.inverse() * Vec3::new(x as f32 + 0.5, y as f32 + 0.5, 1.0);
-    view.extrinsics.inverse().transform_vector3(local)
+    let local = (Vec2::new(x as f32 + 0.5, y as f32 + 0.5) - view.centre) / view.focal;
+    view.world_to_camera.inverse().transform_vector3(local.extend(1.0))
 }
 
 /// How far, in pixels, the centre of a pixel is from the nearest line along a side of a face.
@@ -46,7 +47,8 @@ fn from_edge(mesh: &TriMesh, view: &View, face: u32, pixel: usize) -> f64 {
     let (x, y) = (pixel % view.width as usize, pixel / view.width as usize);
     let centre = DVec3::new(x as f64 + 0.5, y as f64 + 0.5, 1.0);
     let clip = mesh.faces[face as usize]
-        .map(|v| (view.intrinsics * view.extrinsics.transform_point3(mesh.vertices[v as usize])).as_dvec3());
+        .map(|v| view.world_to_camera.transform_point3(mesh.vertices[v as usize]))
+        .map(|p| (view.focal * p.truncate() + view.centre * p.z).extend(p.z).as_dvec3());
     (0..3)
         .map(|i| {
             let line = clip[i].cross(clip[(i + 1) % 3]);
@@ -58,11 +60,11 @@ fn from_edge(mesh: &TriMesh, view: &View, face: u32, pixel: usize) -> f64 {
 /// Least and greatest depth of a face's plane within the rounding of its corners about the centre
 /// of a pixel.
 fn depths(mesh: &TriMesh, view: &View, face: u32, pixel: usize) -> [f64; 2] {
-    let eye = view.centre().unwrap().as_dvec3();
+    let eye = view.centre_of_projection().unwrap().as_dvec3();
     let [a, b, c] = mesh.faces[face as usize].map(|v| mesh.vertices[v as usize].as_dvec3() - eye);
     let normal = (b - a).cross(c - a);
     let around = [Vec3::ZERO, Vec3::X, -Vec3::X, Vec3::Y, -Vec3::Y].map(|step| {
-        let moved = View { intrinsics: Mat3::from_translation((step * 0.01).truncate()) * view.intrinsics, ..*view };
+        let moved = View { centre: view.centre + (step * 0.01).truncate(), ..*view };
         normal.dot(a) / normal.dot(direction(&moved, pixel).as_dvec3())
     });
     [around.into_iter().fold(f64::INFINITY, f64::min), around.into_iter().fold(f64::NEG_INFINITY, f64::max)]
@@ -71,7 +73,7 @@ fn depths(mesh: &TriMesh, view: &View, face: u32, pixel: usize) -> [f64; 2] {
 /// Compares every pixel with the ray through its centre; returns how many hit.
 fn check_against_rays(mesh: &TriMesh, view: &View) -> Result<usize, TestCaseError> {
     let rays = RayMesh::new(&mesh.vertices, &mesh.faces).unwrap();
-    let eye = view.centre().unwrap();
+    let eye = view.centre_of_projection().unwrap();
     let drawn = draw(mesh, view);
     // Corners are rounded to 1/256 of a pixel, twice 1/512 at worst, and rays to a part in 10⁶ of
     // the picture.
@@ -121,7 +123,7 @@ fn claims(mesh: &TriMesh, view: &View) -> Vec<u32> {
 
 /// One unit is a pixel at depth 1, the origin the corner of the picture.
 fn flat_view(size: u32) -> View {
-    View { intrinsics: Mat3::IDENTITY, extrinsics: Affine3A::IDENTITY, width: size, height: size }
+    View { focal: Vec2::ONE, centre: Vec2::ZERO, world_to_camera: Affine3A::IDENTITY, width: size, height: size }
 }
 
 /// A grid of 2·n² triangles over [0, n·cell]² at depth 1, its inner vertices moved by `jitter`.
@@ -338,13 +340,18 @@ fn triangles_without_area_behind_the_camera_or_not_finite_are_not_drawn() {
 
 #[test]
 fn any_points_and_any_camera_give_fragments_of_existing_faces() {
-    let bad_intrinsics = [Mat3::ZERO, Mat3::NAN, Mat3::from_diagonal(Vec3::splat(f32::MAX)), Mat3::IDENTITY * -20.0];
+    let bad_intrinsics =
+        [(0.0, 0.0), (f32::NAN, f32::NAN), (f32::MAX, 0.0), (f32::MAX, f32::MAX), (-20.0, 0.0), (30.0, f32::INFINITY)];
     for (name, points) in strategy::degenerate_clouds() {
         let n = points.len() as u32;
         let faces: Vec<[u32; 3]> = (0..n.saturating_sub(2)).map(|i| [i, i + 1, i + 2]).collect();
         for rotation in [Quat::IDENTITY, Quat::from_rotation_y(2.0), Quat::from_rotation_x(-1.0)] {
             let usual = camera(rotation, Vec3::new(0.2, 0.1, -0.3), 30.0, 40);
-            let others = bad_intrinsics.map(|intrinsics| View { intrinsics, ..usual });
+            let others = bad_intrinsics.map(|(focal, centre)| View {
+                focal: Vec2::splat(focal),
+                centre: Vec2::splat(centre),
+                ..usual
+            });
             for view in others.iter().chain([&usual]) {
                 let options = RasterOptions { near: f32::NAN, ..OPTIONS };
                 for options in [OPTIONS, options] {
@@ -361,14 +368,14 @@ fn any_points_and_any_camera_give_fragments_of_existing_faces() {
 }
 
 #[test]
-fn what_cannot_be_drawn_is_an_error_that_says_so() {
+fn indices_out_of_range_and_large_images_are_errors() {
     let mut rasterizer = Rasterizer::default();
     let view = flat_view(4);
     let error = rasterizer.faces(&[Vec3::Z; 3], &[[0, 1, 2], [0, 3, 1]], &view, &OPTIONS).unwrap_err();
     assert_eq!(error, Error::FaceIndex { face: 1, vertex: 3, vertices: 3 });
     let wide = View { width: 100_000, height: 1, ..view };
     let error = rasterizer.faces(&[], &[], &wide, &OPTIONS).unwrap_err();
-    assert_eq!(error.to_string(), "a picture of 100000 × 1 pixels, at most 16384 × 16384 can be rasterised");
+    assert_eq!(error.to_string(), "an image of 100000 × 1 pixels, at most 16384 × 16384 are supported");
     for view in [View { width: 0, ..view }, View { height: 0, ..view }] {
         assert_eq!(rasterizer.faces(&[Vec3::Z; 3], &[[0, 1, 2]], &view, &OPTIONS), Ok(vec![]));
     }
@@ -377,7 +384,7 @@ fn what_cannot_be_drawn_is_an_error_that_says_so() {
 
 #[test]
 #[should_panic(expected = "3 values for 4 × 4 pixels")]
-fn an_image_of_another_size_is_a_bug_of_the_caller() {
+fn an_output_of_another_size_panics() {
     let _ = Rasterizer::default().draw(&[], &[], &flat_view(4), &OPTIONS, &mut [0; 3], |_| 0);
 }
 

@@ -109,19 +109,17 @@ fn picture(source: &Source, found: &Check) -> Result<RgbImage> {
     let mut strips = Vec::new();
     for row in chosen.chunks(COLUMNS) {
         let mut cells = row.iter().map(|&i| cell(&frames[i], &source.model)).collect::<Result<Vec<_>>>()?;
-        let mut names: Vec<String> = row
-            .iter()
-            .map(|&i| {
-                let frame = &found.frames[i];
-                match frame.iou {
-                    _ if !body_silhouette(&frames[i], &source.model).contains(&true) => {
-                        format!("{}  body not in view", frame.name)
-                    }
-                    Some(iou) => format!("{}  {iou:.2}", frame.name),
-                    None => format!("{}  -", frame.name),
+        let mut names = Vec::new();
+        for &i in row {
+            let frame = &found.frames[i];
+            names.push(match frame.iou {
+                _ if !body_silhouette(&frames[i], &source.model)?.contains(&true) => {
+                    format!("{}  body not in view", frame.name)
                 }
-            })
-            .collect();
+                Some(iou) => format!("{}  {iou:.2}", frame.name),
+                None => format!("{}  -", frame.name),
+            });
+        }
         // Rows are equally wide.
         let size = cells.first().map_or((1, 1), RgbImage::dimensions);
         let missing = COLUMNS.min(shown) - cells.len();
@@ -144,7 +142,7 @@ fn picture(source: &Source, found: &Check) -> Result<RgbImage> {
 /// A frame: mask tinted green, unknown pixels orange, the body's outline white within purple.
 fn cell(frame: &Frame, model: &BodyModel) -> Result<RgbImage> {
     let pixels = frame.pixels()?;
-    let silhouette = body_silhouette(frame, model);
+    let silhouette = body_silhouette(frame, model)?;
     let unknown = unknown_pixels(frame, &pixels, &silhouette, model);
     let mut picture = to_rgb(&photograph(frame)?);
     let (width, height) = picture.dimensions();

@@ -8,7 +8,7 @@ use volrender::Camera;
 use super::avatar::{Atlas, Avatar};
 use crate::Error;
 use crate::capture::Light;
-use crate::scene::pinhole::pinhole;
+use crate::model::view::pinhole;
 
 /// Vertices that are skinned together.
 const CHUNK: usize = 1024;

@@ -50,8 +50,8 @@ pub(super) fn texels(
     describe: impl Fn(u32) -> (usize, [u32; 3]),
 ) -> Result<Vec<Texel>, Error> {
     let flat: Vec<Vec3> = places.iter().map(|place| place.extend(1.0)).collect();
-    let view =
-        View { intrinsics: glam::Mat3::IDENTITY, extrinsics: glam::Affine3A::IDENTITY, width: side, height: side };
+    let (focal, centre, world_to_camera) = (Vec2::ONE, Vec2::ZERO, glam::Affine3A::IDENTITY);
+    let view = View { focal, centre, world_to_camera, width: side, height: side };
     let drawn = Rasterizer::default().faces(&flat, faces, &view, &RasterOptions::default())?;
     let texel = |(index, fragment): (u32, Option<visibility::Fragment>)| {
         let fragment = fragment?;

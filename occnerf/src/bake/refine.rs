@@ -7,8 +7,8 @@ use super::avatar::{Atlas, Avatar};
 use super::draw::{BakedPerson, BilinearCorner, atlas_place, shade};
 use crate::Error;
 use crate::model::trained::Model;
+use crate::model::view::pinhole;
 use crate::scene::labels::Label;
-use crate::scene::pinhole::pinhole;
 use crate::scene::prepared::{PreparedFrame, Scene};
 
 /// Weight of the field's own colour in that of a texel, in pixels that show it.

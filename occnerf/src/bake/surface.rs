@@ -52,7 +52,7 @@ impl Normal {
         for step in (0..=steps).rev() {
             let height = high - step as f32 * STEP;
             let at = self.foot + height * self.direction;
-            let Some(closest) = prior.closest(at, farthest) else { break };
+            let Some(closest) = prior.closest_within(at, farthest) else { break };
             if height > 0.0 && closest.signed_distance < OWN * height {
                 break;
             }

@@ -68,7 +68,7 @@ const SOLID: Known = Known { density: |_, d| if d < HEIGHT { 5000.0 } else { 0.0
 
 /// Canonical distances of an avatar's vertices from the prior, normalised metres.
 fn distances(scene: &Scene, avatar: &Avatar) -> Vec<f32> {
-    let distance = |v: &Vec3| scene.body.surface.closest(scene.body.scale * v, 1.0).unwrap().signed_distance;
+    let distance = |v: &Vec3| scene.body.surface.closest(scene.body.scale * v).signed_distance;
     avatar.vertices.iter().map(distance).collect()
 }
 
@@ -87,7 +87,7 @@ fn the_surface_is_where_a_known_field_becomes_opaque_and_has_its_colours() {
             let [x, y] = (*uv * size).to_array().map(|x| (x as usize).min(size as usize - 1));
             let texel = 4 * (y * size as usize + x);
             let found = Vec3::from([0, 1, 2].map(|c| f32::from(avatar.atlas.rgba[texel + c]) / 255.0));
-            let below = scene.body.surface.closest(scene.body.scale * v, 1.0).unwrap().point;
+            let below = scene.body.surface.closest(scene.body.scale * v).point;
             (found - known_colour(below)).abs().max_element()
         })
         .collect();

@@ -6,8 +6,9 @@ use smpl::{BodyModel, Placement};
 use volrender::Camera;
 
 use super::frame::View;
-use super::silhouette::silhouette;
 use crate::capture::{Capture, Frame};
+use crate::error::Error;
+use crate::model::view::silhouette;
 
 /// What is wrong with a capture as a whole.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -136,11 +137,11 @@ impl Overlap {
 }
 
 /// The mistakes that are likely; none for a good capture.
-pub(super) fn find(capture: &Capture, body: &BodyModel, views: &[View]) -> Vec<Mistake> {
+pub(super) fn find(capture: &Capture, body: &BodyModel, views: &[View]) -> Result<Vec<Mistake>, Error> {
     let angles = || capture.train.iter().flat_map(|frame| frame.pose.iter().skip(1)).map(|axis| axis.length());
     let beyond = angles().filter(|angle| *angle > TURN).count();
     if beyond as f32 > DEGREES_SHARE * angles().count().max(1) as f32 {
-        return vec![Mistake::Degrees];
+        return Ok(vec![Mistake::Degrees]);
     }
     let every = views.len().div_ceil(UNDONE_VIEWS).max(1);
     let few = |times: f32| -> Vec<Posed<'_>> {
@@ -148,13 +149,13 @@ pub(super) fn find(capture: &Capture, body: &BodyModel, views: &[View]) -> Vec<M
         few.map(|view| Posed::new(view, &capture.train[view.index], body, times)).collect()
     };
     let posed = few(1.0);
-    let as_given = overlaps(&posed, body, None);
+    let as_given = overlaps(&posed, body, None)?;
     let (given, covered) = mean(&as_given);
     // What would be a possible pose in degrees is nearly none at all in radians.
     if angles().all(|angle| angle < TURN.to_radians()) {
-        let (iou, _) = mean(&overlaps(&few(180.0 / std::f32::consts::PI), body, None));
+        let (iou, _) = mean(&overlaps(&few(180.0 / std::f32::consts::PI), body, None)?);
         if iou > given {
-            return vec![Mistake::Radians];
+            return Ok(vec![Mistake::Radians]);
         }
     }
     let focal = OCTAVES.iter().flat_map(|k| [2f32.powf(*k), 2f32.powf(-k)]).map(Mistake::Focal);
@@ -171,24 +172,26 @@ pub(super) fn find(capture: &Capture, body: &BodyModel, views: &[View]) -> Vec<M
     // Masks of nearly everything look best with a body that fills the picture: they are judged
     // first.
     let around = views.iter().map(View::border).sum::<f32>() / views.len().max(1) as f32;
-    let (iou, covers) = mean(&overlaps(&posed, body, Some(Mistake::MaskInverted)));
+    let (iou, covers) = mean(&overlaps(&posed, body, Some(Mistake::MaskInverted))?);
     if around > BORDER && iou > given && covers > given {
-        return vec![Mistake::MaskInverted];
+        return Ok(vec![Mistake::MaskInverted]);
     }
-    let undone = others.into_iter().chain(focal).filter_map(|mistake| {
-        let (iou, covers) = mean(&overlaps(&posed, body, Some(mistake)));
-        let better = iou > BETTER * given && iou > given + BETTER_BY && covers > COVERS;
-        better.then_some((mistake, iou))
-    });
-    if let Some((mistake, _)) = undone.max_by(|a, b| a.1.total_cmp(&b.1)) {
-        return vec![mistake];
+    let mut undone = Vec::new();
+    for mistake in others.into_iter().chain(focal) {
+        let (iou, covers) = mean(&overlaps(&posed, body, Some(mistake))?);
+        if iou > BETTER * given && iou > given + BETTER_BY && covers > COVERS {
+            undone.push((mistake, iou));
+        }
+    }
+    if let Some((mistake, _)) = undone.into_iter().max_by(|a, b| a.1.total_cmp(&b.1)) {
+        return Ok(vec![mistake]);
     }
     if covered < BESIDE {
         let sized = |overlap: &&Overlap| AREAS.contains(&(overlap.body as f32 / overlap.mask.max(1) as f32));
         let most = 2 * as_given.iter().filter(sized).count() > as_given.len();
-        return vec![if most { Mistake::WrongPerson } else { Mistake::NoFit }];
+        return Ok(vec![if most { Mistake::WrongPerson } else { Mistake::NoFit }]);
     }
-    shift(capture, body, views).into_iter().collect()
+    Ok(shift(capture, body, views)?.into_iter().collect())
 }
 
 /// Mean overlap and mean share of the mask covered.
@@ -243,21 +246,21 @@ impl<'a> Posed<'a> {
         camera
     }
 
-    fn overlap(&self, undo: Option<Mistake>, body: &BodyModel) -> Overlap {
+    fn overlap(&self, undo: Option<Mistake>, body: &BodyModel) -> Result<Overlap, Error> {
         let camera = undo.map_or(self.view.camera, |mistake| self.undone(mistake));
-        let silhouette = silhouette(&self.vertices, &body.faces, &camera);
-        Overlap::of(&silhouette, self.view, undo == Some(Mistake::MaskInverted))
+        let silhouette = silhouette(&self.vertices, &body.faces, &camera)?;
+        Ok(Overlap::of(&silhouette, self.view, undo == Some(Mistake::MaskInverted)))
     }
 }
 
 /// The overlap of every view, with a mistake undone.
-fn overlaps(posed: &[Posed<'_>], body: &BodyModel, undo: Option<Mistake>) -> Vec<Overlap> {
+fn overlaps(posed: &[Posed<'_>], body: &BodyModel, undo: Option<Mistake>) -> Result<Vec<Overlap>, Error> {
     posed.par_iter().map(|posed| posed.overlap(undo, body)).collect()
 }
 
 /// Pixels of a camera's image that a frame's body covers.
-pub(super) fn outline(frame: &Frame, camera: &Camera, body: &BodyModel) -> Vec<bool> {
-    silhouette(&posed(frame, body), &body.faces, camera)
+pub(super) fn outline(frame: &Frame, camera: &Camera, body: &BodyModel) -> Result<Vec<bool>, Error> {
+    Ok(silhouette(&posed(frame, body), &body.faces, camera)?)
 }
 
 /// The vertices of a frame's body.
@@ -266,28 +269,30 @@ pub(super) fn posed(frame: &Frame, body: &BodyModel) -> Vec<Vec3> {
 }
 
 /// The shift of the fit against the pictures that overlaps better than none, beyond chance.
-fn shift(capture: &Capture, body: &BodyModel, views: &[View]) -> Option<Mistake> {
+fn shift(capture: &Capture, body: &BodyModel, views: &[View]) -> Result<Option<Mistake>, Error> {
     const SHIFTS: [i32; 4] = [-2, -1, 1, 2];
     let last = capture.train.len() as i32 - 1;
     let inner: Vec<&View> = views.iter().filter(|v| (2..=last - 2).contains(&(v.index as i32))).collect();
-    let gain = |views: &[&View]| -> Vec<[f32; 4]> {
+    let gain = |views: &[&View]| -> Vec<Result<[f32; 4], Error>> {
         let (Some(first), Some(last)) = (views.first(), views.last()) else { return Vec::new() };
         let (first, last) = (first.index - 2, last.index + 2);
         let posed: Vec<Vec<Vec3>> = capture.train[first..=last].iter().map(|frame| posed(frame, body)).collect();
         let of = |view: &&View| {
-            let iou = |by: i32| {
+            let iou = |by: i32| -> Result<f32, Error> {
                 let index = (view.index as i32 + by) as usize;
                 let world_to_camera = capture.train[index].camera.world_to_camera;
                 let camera = Camera { world_to_camera, ..view.camera };
-                Overlap::of(&silhouette(&posed[index - first], &body.faces, &camera), view, false).iou()
+                Ok(Overlap::of(&silhouette(&posed[index - first], &body.faces, &camera)?, view, false).iou())
             };
-            let none = iou(0);
-            SHIFTS.map(|by| iou(by) - none)
+            let none = iou(0)?;
+            let [a, b, c, d] = SHIFTS.map(iou);
+            Ok([a? - none, b? - none, c? - none, d? - none])
         };
         views.iter().map(of).collect()
     };
     // Neighbouring views share their bodies.
-    let gains: Vec<[f32; 4]> = inner.par_chunks(8).flat_map_iter(gain).collect();
+    let gains: Result<Vec<[f32; 4]>, Error> = inner.par_chunks(8).flat_map_iter(gain).collect();
+    let gains = gains?;
     let count = gains.len() as f32;
     let better = |i: usize| {
         let mean = gains.iter().map(|gain| gain[i]).sum::<f32>() / count;
@@ -296,9 +301,9 @@ fn shift(capture: &Capture, body: &BodyModel, views: &[View]) -> Option<Mistake>
         significant.then_some((SHIFTS[i], mean))
     };
     if gains.len() < 6 {
-        return None;
+        return Ok(None);
     }
     let best = (0..SHIFTS.len()).filter_map(better).max_by(|a, b| a.1.total_cmp(&b.1));
     // What lies in the frame `by` later fits this picture: the fit comes so much too early.
-    best.map(|(by, _)| Mistake::FrameShift(-by))
+    Ok(best.map(|(by, _)| Mistake::FrameShift(-by)))
 }

@@ -6,7 +6,6 @@
 mod frame;
 mod jumps;
 mod mistakes;
-mod silhouette;
 #[cfg(test)]
 mod tests;
 
@@ -16,13 +15,15 @@ pub use self::mistakes::Mistake;
 use glam::Vec3;
 use rayon::prelude::*;
 use smpl::BodyModel;
-use visibility::{RayMesh, View as Pinhole, visible_vertices};
+use visibility::{RayMesh, visible_vertices};
 use volrender::Camera;
 
 use self::frame::View;
 use self::mistakes::{Overlap, outline, posed};
 use crate::capture::{Capture, CaptureError, Frame, Image, Pixels};
 use crate::config::OccludedRule;
+use crate::error::Error;
+use crate::model::view::pinhole;
 use crate::scene::labels::{Label, label_pixels};
 
 /// Longest side in pixels of the pictures that silhouettes are compared at.
@@ -77,23 +78,24 @@ impl Check {
 ///
 /// # Errors
 /// Pictures that cannot be read.
-pub fn check(capture: &Capture, body: &BodyModel) -> Result<Check, CaptureError> {
+pub fn check(capture: &Capture, body: &BodyModel) -> Result<Check, Error> {
     let small = small_views(capture)?;
-    let mut frames: Vec<FrameCheck> =
+    let checked: Vec<Result<FrameCheck, Error>> =
         small.par_iter().map(|view| one(&capture.train[view.index], view, body)).collect();
+    let mut frames = checked.into_iter().collect::<Result<Vec<_>, _>>()?;
     for (frame, faults) in frames.iter_mut().zip(jumps::find(capture, body)) {
         frame.faults.extend(faults);
     }
-    let mistakes = likely(capture, body, small);
+    let mistakes = likely(capture, body, small)?;
     Ok(Check { frames, surface_seen: surface_seen(capture, body)?, mistakes })
 }
 
 /// The mistakes that some of the frames with a mask tell of.
-fn likely(capture: &Capture, body: &BodyModel, small: Vec<View>) -> Vec<Mistake> {
+fn likely(capture: &Capture, body: &BodyModel, small: Vec<View>) -> Result<Vec<Mistake>, Error> {
     let shown: Vec<View> = small.into_iter().filter(|view| view.mask.contains(&true)).collect();
     let every = shown.len().div_ceil(VIEWS).max(1);
     let views: Vec<View> = shown.into_iter().step_by(every).collect();
-    if views.is_empty() { Vec::new() } else { mistakes::find(capture, body, &views) }
+    if views.is_empty() { Ok(Vec::new()) } else { mistakes::find(capture, body, &views) }
 }
 
 fn small_views(capture: &Capture) -> Result<Vec<View>, CaptureError> {
@@ -103,8 +105,10 @@ fn small_views(capture: &Capture) -> Result<Vec<View>, CaptureError> {
 }
 
 /// Pixels (H × W) of a frame's picture that the posed body covers.
-#[must_use]
-pub fn body_silhouette(frame: &Frame, body: &BodyModel) -> Vec<bool> {
+///
+/// # Errors
+/// A picture of more than 16384 pixels a side.
+pub fn body_silhouette(frame: &Frame, body: &BodyModel) -> Result<Vec<bool>, Error> {
     outline(frame, &frame.camera, body)
 }
 
@@ -171,8 +175,8 @@ impl View {
     }
 }
 
-fn one(frame: &Frame, view: &View, body: &BodyModel) -> FrameCheck {
-    let silhouette = outline(frame, &view.camera, body);
+fn one(frame: &Frame, view: &View, body: &BodyModel) -> Result<FrameCheck, Error> {
+    let silhouette = outline(frame, &view.camera, body)?;
     let mask: Vec<f32> = view.mask.iter().map(|&m| f32::from(m)).collect();
     let unknown = unknown(&mask, &silhouette, view.occluder.as_deref(), &view.camera, frame, body);
     let (mut known, mut either, mut hidden) = (0, 0, 0);
@@ -192,7 +196,7 @@ fn one(frame: &Frame, view: &View, body: &BodyModel) -> FrameCheck {
     } else if beside || iou.is_some_and(|iou| iou < LEAST_IOU) {
         faults.push(Fault::Overlap);
     }
-    FrameCheck { name: frame.name.clone(), iou, hidden: hidden as f32 / covered.max(1) as f32, faults }
+    Ok(FrameCheck { name: frame.name.clone(), iou, hidden: hidden as f32 / covered.max(1) as f32, faults })
 }
 
 /// Share of the body's vertices that are seen at a pixel of the mask in at least one of up to 32
@@ -205,9 +209,7 @@ fn surface_seen(capture: &Capture, body: &BodyModel) -> Result<f32, CaptureError
         // A body that cannot be hit by rays is not seen.
         let Ok(mesh) = RayMesh::new(&vertices, &body.faces) else { continue };
         let usable: Vec<bool> = frame.pixels()?.mask.iter().map(|&mask| mask > 0.5).collect();
-        let Camera { width, height, world_to_camera, .. } = frame.camera;
-        let view = Pinhole { intrinsics: frame.camera.intrinsics(), extrinsics: world_to_camera, width, height };
-        let now = visible_vertices(&mesh, &vertices, &view, Some(&usable));
+        let now = visible_vertices(&mesh, &vertices, &pinhole(&frame.camera), Some(&usable));
         seen.iter_mut().zip(now).for_each(|(seen, now)| *seen |= now);
     }
     Ok(seen.iter().filter(|seen| **seen).count() as f32 / seen.len().max(1) as f32)

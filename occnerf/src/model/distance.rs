@@ -29,7 +29,7 @@ pub(crate) fn surface_point(
             Some(SurfacePoint { closest: blended.point, distance: blended.signed_distance })
         }
         DistanceKind::Exact => {
-            let found = body.surface.closest(x, farthest)?;
+            let found = body.surface.closest_within(x, farthest)?;
             Some(SurfacePoint { closest: found.point, distance: found.signed_distance })
         }
     }

@@ -163,7 +163,7 @@ impl Tracer<'_> {
         // Rounding may put the face itself a hair beyond its own distance.
         let bound = near.map_or(f32::INFINITY, |face| 1.000_01 * mesh.distance_to_face(point, face) + 1e-6);
         let farthest = self.extent.farthest.max(self.config.motion.depth);
-        let found = mesh.closest(point, farthest.min(bound))?;
+        let found = mesh.closest_within(point, farthest.min(bound))?;
         let (face, barycentric, signed_distance) = (found.face, found.barycentric, found.signed_distance);
         Some(Nearest { face, barycentric, signed_distance })
     }
@@ -279,7 +279,7 @@ mod tests {
                     assert!(!tracer.push_point(&mut samples, point));
                     continue;
                 };
-                let exact = scene.body.surface.closest(mapped.canonical, f32::INFINITY).unwrap().signed_distance;
+                let exact = scene.body.surface.closest(mapped.canonical).signed_distance;
                 let mut neighbours = vec![0; scene.body.query.neighbours_per_query()];
                 scene.body.query.neighbours(mapped.canonical, &mut neighbours);
                 let blended = scene.body.query.blend(mapped.canonical, &neighbours[..k]).signed_distance;

@@ -2,7 +2,7 @@
 
 use glam::Vec3;
 use smpl::Posed;
-use visibility::RayMesh;
+use visibility::{Pixel, RasterOptions, Rasterizer, View};
 use volrender::{Aabb, Camera, Ray};
 
 use crate::Error;
@@ -65,18 +65,33 @@ impl PosedView {
         [x0 as u32, y0 as u32, x1 as u32, y1 as u32]
     }
 
-    /// Pixels (H × W) whose ray hits the prior.
+    /// Pixels (H × W) whose centre the prior covers.
     pub(crate) fn silhouette(&self, faces: &[[u32; 3]]) -> Result<Vec<bool>, Error> {
-        let mesh = RayMesh::new(&self.posed.vertices, faces)?;
-        let (width, [x0, y0, x1, y1]) = (self.camera.width, self.body_box());
-        let pixels: Vec<u32> = (y0..y1).flat_map(|row| (x0..x1).map(move |column| row * width + column)).collect();
-        let ray = |&pixel: &u32| (self.pixel_ray(pixel).origin, self.pixel_ray(pixel).direction);
-        let mut hits = vec![None; pixels.len()];
-        mesh.first_hits(&pixels.iter().map(ray).collect::<Vec<_>>(), &mut hits);
-        let mut covered = vec![false; (width * self.camera.height) as usize];
-        pixels.iter().zip(&hits).for_each(|(&pixel, hit)| covered[pixel as usize] = hit.is_some());
-        Ok(covered)
+        let vertices = &self.posed.vertices;
+        if let Some(vertex) = vertices.iter().position(|v| !v.is_finite()) {
+            return Err(visibility::Error::NotFinite { vertex }.into());
+        }
+        Ok(silhouette(vertices, faces, &self.camera)?)
     }
+}
+
+/// The camera as the visibility crate takes it.
+pub(crate) fn pinhole(camera: &Camera) -> View {
+    let Camera { focal, centre, world_to_camera, width, height } = *camera;
+    View { focal, centre, world_to_camera, width, height }
+}
+
+/// Pixels (H × W) whose centre a mesh covers. A mesh that reaches behind the camera is clipped.
+pub(crate) fn silhouette(
+    vertices: &[Vec3],
+    faces: &[[u32; 3]],
+    camera: &Camera,
+) -> Result<Vec<bool>, visibility::Error> {
+    let mut covered = vec![false; camera.width as usize * camera.height as usize];
+    let options = RasterOptions::default();
+    let is_covered = |pixel: Pixel<'_>| pixel.samples().any(|sample| !sample.is_empty());
+    Rasterizer::default().draw(vertices, &[faces], &pinhole(camera), &options, &mut covered, is_covered)?;
+    Ok(covered)
 }
 
 /// Width of a pixel at the depth of the body, normalised metres: the median over `views`; `None`

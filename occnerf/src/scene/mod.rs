@@ -5,7 +5,6 @@ pub(crate) mod colors;
 pub(crate) mod labels;
 pub(crate) mod light;
 pub(crate) mod masks;
-pub(crate) mod pinhole;
 pub(crate) mod prepared;
 pub(crate) mod registration;
 pub(crate) mod seen;

@@ -4,7 +4,7 @@ use std::sync::{Arc, OnceLock};
 
 use rayon::prelude::*;
 use smpl::BodyModel;
-use visibility::RayMesh;
+use visibility::{RayMesh, VisibilityCounts};
 
 use crate::Error;
 use crate::capture::{Capture, CaptureError, Frame, Light, PixelSource, PixelReader, Pixels};
@@ -13,10 +13,10 @@ use crate::model::body::{Body, Moment};
 use crate::model::colors::PriorColors;
 use crate::model::subdivide::Anchor;
 use crate::model::view::PosedView;
+use crate::model::view::pinhole;
 use crate::scene::labels::{Label, Labels, dilate, label_pixels};
 use crate::scene::light::{Seen, measure_light};
 use crate::scene::masks::mend_masks;
-use crate::scene::pinhole::pinhole;
 use crate::scene::registration::register;
 use crate::scene::seen::{MOST, deeper, seen, strange_edge};
 
@@ -221,7 +221,7 @@ impl Scene {
     /// How many training frames show each vertex of the prior to the camera at a pixel of the
     /// subject, by ray casting.
     pub fn vertex_frequencies(&self) -> Result<Vec<u64>, Error> {
-        let seen: Result<Vec<Vec<bool>>, Error> = self
+        let visible: Result<Vec<Vec<bool>>, Error> = self
             .train
             .par_iter()
             .map(|frame| {
@@ -235,11 +235,9 @@ impl Scene {
                 ))
             })
             .collect();
-        let mut counts = vec![0; self.body.canonical.vertices.len()];
-        for frame in seen? {
-            counts.iter_mut().zip(frame).for_each(|(count, seen)| *count += u64::from(seen));
-        }
-        Ok(counts)
+        let mut counts = VisibilityCounts::new(self.body.canonical.vertices.len());
+        visible?.iter().for_each(|visible| counts.add_visible(visible));
+        Ok(counts.counts().to_vec())
     }
 }
 

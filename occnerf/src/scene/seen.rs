@@ -11,9 +11,9 @@ use crate::Error;
 use crate::capture::{Light, Pixels};
 use crate::model::subdivide::Anchor;
 use crate::model::view::PosedView;
+use crate::model::view::pinhole;
 use crate::scene::labels::squared_distance;
 use crate::scene::light::{Seen, albedo};
-use crate::scene::pinhole::pinhole;
 
 /// Pixels within a mask from which on it shows the person for certain.
 pub(crate) const MOST: usize = 4;

@@ -1,4 +1,4 @@
-//! Drawing of a band of rows: depth and face of every sample, then barycentrics.
+//! Drawing of a band of rows: depth test of every sample, then barycentrics.
 
 use glam::{DVec3, Vec3};
 
@@ -8,15 +8,15 @@ use super::triangle::{BAND, Chunk, Triangle};
 
 /// Samples of a row that are tested together.
 const LANES: usize = 8;
-/// Columns over which edge functions are stepped in 32 bits.
+/// Columns of a block, within which edge functions are stepped in 32 bits.
 const BLOCK: i32 = 32;
-/// Edge functions beyond this keep their sign throughout a block: a step is at most 2²⁴, and there
-/// are fewer than 64.
+/// Magnitude from which an edge function keeps its sign within a block: fewer than 64 steps of at
+/// most 2²⁴.
 const CERTAIN: i64 = 1 << 30;
 /// No face.
 const NONE: u32 = u32::MAX;
 
-/// What a picture is drawn from.
+/// Inputs of a band.
 pub(super) struct Band<'a> {
     pub projection: &'a Projection,
     pub projected: &'a [Projected],
@@ -39,7 +39,7 @@ struct Layer {
     inverse: Vec<f32>,
     face: Vec<u32>,
     stride: usize,
-    /// Columns that something was drawn in.
+    /// Range of columns with a triangle.
     columns: [usize; 2],
 }
 
@@ -74,8 +74,7 @@ impl Band<'_> {
         }
     }
 
-    /// Depth and face of every sample; the first column that is drawn in, and the one after the
-    /// last.
+    /// Depth-tests all triangles; returns the range of columns with any.
     fn fill(&self, band: usize, strip: &mut Strip) -> [usize; 2] {
         let stride = self.projection.width.next_multiple_of(LANES) + LANES;
         strip.layers.resize_with(self.layers.len(), Layer::default);
@@ -90,7 +89,7 @@ impl Band<'_> {
         let first_row = (band * BAND) as i32;
         for chunk in self.chunks.iter().filter(|chunk| !chunk.bins[band].is_empty()) {
             let layer = &mut strip.layers[chunk.layer];
-            crate::packet::arch().dispatch(Fill { layer, first_row, chunk, bin: &chunk.bins[band] });
+            arch().dispatch(Fill { layer, first_row, chunk, bin: &chunk.bins[band] });
         }
         strip
             .layers
@@ -98,7 +97,7 @@ impl Band<'_> {
             .fold([usize::MAX, 0], |[low, high], layer| [low.min(layer.columns[0]), high.max(layer.columns[1])])
     }
 
-    /// What a sample sees, nearest first; returns how much.
+    /// Writes the fragments of a sample, nearest first; returns their number.
     fn resolve(&self, layers: &[Layer], [x, y]: [usize; 2], band: usize, out: &mut [Fragment]) -> usize {
         let mut count = 0;
         let (mut first, centre) = (0, Vec3::new(x as f32 + 0.5, (band * BAND + y) as f32 + 0.5, 0.0));
@@ -119,9 +118,8 @@ impl Band<'_> {
         count
     }
 
-    /// The triangle's plane where the ray through the `centre` of a sample meets it (Olano and
-    /// Greer 1997: edge functions of homogeneous coordinates, right also for corners behind the
-    /// camera).
+    /// Intersection of a triangle with the ray through the `centre` of a sample, by homogeneous
+    /// edge functions (Olano and Greer 1997), which hold for corners behind the camera too.
     fn fragment(&self, face: u32, corners: [u32; 3], centre: Vec3) -> Fragment {
         let projected = corners.map(|v| &self.projected[v as usize]);
         if projected.iter().any(|v| v.inverse == 0.0) {
@@ -130,7 +128,7 @@ impl Band<'_> {
         let [a, b, c] = projected.map(|v| v.clip);
         let [p, q, r] = [a, b, c].map(|v| v.truncate() - centre.truncate() * v.z);
         let weights = Vec3::new(q.perp_dot(r), r.perp_dot(p), p.perp_dot(q));
-        // Rounding of the corners draws samples that are a little outside.
+        // Rounded corners also cover samples slightly outside of the triangle.
         let inside = (weights * (weights.x + weights.y + weights.z).signum()).max(Vec3::ZERO);
         let scale = 1.0 / (inside.x + inside.y + inside.z);
         if !scale.is_finite() || scale == 0.0 {
@@ -140,7 +138,7 @@ impl Band<'_> {
         Fragment { face, depth: inside.dot(Vec3::new(a.z, b.z, c.z)), barycentric: inside.to_array() }
     }
 
-    /// The same for triangles that reach behind the camera or so far that an f32 is not enough.
+    /// [`Band::fragment`] in `f64`, for clipped triangles and where `f32` is not enough.
     #[cold]
     fn large_fragment(&self, face: u32, corners: [u32; 3], centre: DVec3) -> Fragment {
         let [a, b, c] = corners.map(|v| self.projection.exact(self.vertices[v as usize]));
@@ -154,7 +152,17 @@ impl Band<'_> {
     }
 }
 
-/// The triangles of a bin, compiled for the widest instructions of the machine.
+/// AVX2 on x86-64, also where `pulp` is built with AVX-512 and the machine has it: a row is filled
+/// eight samples at a time.
+fn arch() -> pulp::Arch {
+    #[cfg(target_arch = "x86_64")]
+    if let Some(simd) = pulp::x86::V3::try_new() {
+        return pulp::Arch::V3(simd);
+    }
+    pulp::Arch::new()
+}
+
+/// Fills the triangles of a bin; a struct, since `pulp` compiles closures for the baseline.
 struct Fill<'a> {
     layer: &'a mut Layer,
     first_row: i32,
@@ -180,7 +188,7 @@ impl pulp::WithSimd for Fill<'_> {
 }
 
 impl Layer {
-    /// Draws the columns of a triangle from `start` on, a block of them.
+    /// Draws a block of columns of a triangle, from `start`.
     #[inline(always)]
     fn fill(&mut self, triangle: &Triangle, start: i32, first_row: i32) {
         let end = (triangle.columns[1] + 1).min(start + BLOCK);
@@ -192,9 +200,9 @@ impl Layer {
             let j = (i + 1) % 3;
             let (dx, dy) = (x[j] - x[i], y[j] - y[i]);
             let edge = i64::from(dx) * i64::from(py - y[i]) - i64::from(dy) * i64::from(px - x[i]);
-            // Samples on an edge belong to the triangle whose top or left edge it is.
+            // Top-left rule for samples on an edge.
             let owned = dy < 0 || (dy == 0 && dx > 0);
-            // Steps are whole multiples of STEP, so that what is below one decides no sign.
+            // Steps are multiples of STEP: lower bits decide no sign.
             edges[i] = ((edge - i64::from(!owned)) >> STEP.trailing_zeros()).clamp(-CERTAIN, CERTAIN) as i32;
             (across[i], down[i]) = (-dy, dx);
         }

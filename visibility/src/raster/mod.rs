@@ -1,8 +1,7 @@
-//! A software rasteriser: which triangle every pixel sees, where on the triangle, and how far away.
+//! A software rasteriser: face, barycentric coordinates and depth of every sample.
 //!
-//! Vertices are projected, triangles are set up and sorted into bands of rows, and every band is
-//! drawn by one task: first depth and face of every sample, then the barycentrics of the faces that
-//! won.
+//! Vertices are projected, triangles are set up and binned into bands of rows, and each band is one
+//! task: a depth test of all its triangles, then the barycentrics of the visible faces.
 
 mod band;
 mod clip;

@@ -1,24 +1,39 @@
-//! How triangles are drawn.
+//! Settings of the rasteriser.
 
-/// How triangles are drawn.
+/// Settings of the rasteriser.
+///
+/// ```
+/// use visibility::{RasterOptions, Samples};
+///
+/// // A closed mesh in millimetres, antialiased.
+/// let options = RasterOptions { samples: Samples::Four, cull_back: true, near: 1.0 };
+/// # let _ = options;
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RasterOptions {
-    /// Samples of a pixel.
+    /// Samples a pixel.
     pub samples: Samples,
-    /// Leaves out triangles that the camera sees clockwise: the inside of closed meshes.
+    /// Culls triangles that are clockwise in the image: the inside of closed meshes.
     pub cull_back: bool,
-    /// Nothing closer than this depth is drawn, in the units of the vertices; above 0.
+    /// Depth of the near plane, in the units of the vertices; above 0.
     pub near: f32,
 }
 
 impl Default for RasterOptions {
-    /// One sample a pixel, both sides, everything farther than 10⁻⁴ units.
+    /// One sample a pixel, no culling, near plane at 10⁻⁴ units.
     fn default() -> Self {
         Self { samples: Samples::One, cull_back: false, near: 1e-4 }
     }
 }
 
-/// Where a pixel looks.
+/// Samples of a pixel.
+///
+/// ```
+/// use visibility::Samples;
+///
+/// let samples = if cfg!(debug_assertions) { Samples::One } else { Samples::Four };
+/// # let _ = samples;
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Samples {
     /// At its centre.

@@ -1,4 +1,4 @@
-//! From the world to fixed-point pixels.
+//! Projection of vertices to fixed-point image coordinates.
 
 use glam::{Affine3A, DVec3, Mat3, Vec3};
 use rayon::prelude::*;
@@ -8,7 +8,7 @@ use crate::view::View;
 
 /// Steps of fixed-point coordinates between samples.
 pub(super) const STEP: i32 = 256;
-/// How far outside the image, in samples, corners may lie before triangles are clipped.
+/// Guard band: distance outside the image, in samples, from which triangles are clipped.
 pub(super) const GUARD: f32 = (1 << 15) as f32;
 
 /// A vertex as the camera sees it.
@@ -16,15 +16,15 @@ pub(super) const GUARD: f32 = (1 << 15) as f32;
 pub(super) struct Projected {
     /// Homogeneous coordinates in the image: samples times depth, and depth.
     pub clip: Vec3,
-    /// Reciprocal of the depth; 0 for a vertex whose triangles are clipped, NaN for one that is
-    /// nowhere.
+    /// Reciprocal of the depth; 0 for a vertex whose triangles are clipped, NaN for one that is not
+    /// finite.
     pub inverse: f32,
     /// Fixed-point position.
     pub x: i32,
     pub y: i32,
 }
 
-/// A camera, in samples.
+/// A camera in units of samples.
 pub(super) struct Projection {
     pub width: usize,
     pub height: usize,
@@ -34,24 +34,24 @@ pub(super) struct Projection {
     pub side: usize,
     matrix: Affine3A,
     intrinsics: Mat3,
-    extrinsics: Affine3A,
+    world_to_camera: Affine3A,
 }
 
 impl Projection {
     pub fn new(view: &View, options: &RasterOptions) -> Self {
         let side = options.samples.per_side();
         let scale = side as f32;
-        let intrinsics = Mat3::from_diagonal(Vec3::new(scale, scale, 1.0)) * view.intrinsics;
+        let intrinsics = Mat3::from_diagonal(Vec3::new(scale, scale, 1.0)) * view.intrinsics();
         Self {
             width: (view.width * side) as usize,
             height: (view.height * side) as usize,
-            // Also where it is NaN.
+            // `max` replaces NaN too.
             near: options.near.max(f32::MIN_POSITIVE),
             cull_back: options.cull_back,
             side: side as usize,
-            matrix: Affine3A::from_mat3(intrinsics) * view.extrinsics,
+            matrix: Affine3A::from_mat3(intrinsics) * view.world_to_camera,
             intrinsics,
-            extrinsics: view.extrinsics,
+            world_to_camera: view.world_to_camera,
         }
     }
 
@@ -69,10 +69,10 @@ impl Projection {
         projected
     }
 
-    /// Homogeneous coordinates in f64, where they cannot overflow.
+    /// Homogeneous coordinates in `f64`, which cannot overflow.
     pub fn exact(&self, v: Vec3) -> DVec3 {
-        let camera = Mat3::from(self.extrinsics.matrix3).as_dmat3() * v.as_dvec3()
-            + Vec3::from(self.extrinsics.translation).as_dvec3();
+        let camera = Mat3::from(self.world_to_camera.matrix3).as_dmat3() * v.as_dvec3()
+            + Vec3::from(self.world_to_camera.translation).as_dvec3();
         self.intrinsics.as_dmat3() * camera
     }
 }

@@ -1,4 +1,4 @@
-//! The order of the work: projection, set-up, bands.
+//! The stages of the rasteriser: projection, set-up, bands.
 
 use glam::Vec3;
 use rayon::prelude::*;
@@ -11,10 +11,27 @@ use super::triangle::{BAND, CHUNK, Chunk};
 use crate::error::Error;
 use crate::view::View;
 
-/// Most samples a row or column of the image.
+/// Largest width and height of the image in samples.
 const MOST_SAMPLES: u32 = 1 << 14;
 
-/// Draws triangle meshes; keeps its buffers from picture to picture.
+/// Draws triangle meshes; its buffers are reused from image to image.
+///
+/// ```
+/// use glam::{Affine3A, Vec2, Vec3};
+/// use visibility::{RasterOptions, Rasterizer, Samples, View};
+///
+/// // A slanted triangle over the left half of the image.
+/// let vertices = [(-1.0, -3.0, 1.0), (0.0, 0.0, 1.0), (-1.0, 3.0, 1.0)].map(Vec3::from);
+/// let (focal, centre) = (Vec2::splat(4.0), Vec2::splat(4.0));
+/// let view = View { focal, centre, world_to_camera: Affine3A::IDENTITY, width: 8, height: 8 };
+/// let options = RasterOptions { samples: Samples::Four, ..Default::default() };
+/// let mut coverage = vec![0.0; 8 * 8];
+/// Rasterizer::default().draw(&vertices, &[&[[0, 1, 2]]], &view, &options, &mut coverage, |pixel| {
+///     pixel.samples().filter(|sample| !sample.is_empty()).count() as f32 / 4.0
+/// })?;
+/// assert_eq!((coverage[4 * 8], coverage[4 * 8 + 7]), (1.0, 0.0));
+/// # Ok::<(), visibility::Error>(())
+/// ```
 #[derive(Debug, Default)]
 pub struct Rasterizer {
     projected: Vec<Projected>,
@@ -22,26 +39,25 @@ pub struct Rasterizer {
 }
 
 impl Rasterizer {
-    /// Draws `layers` of faces over the same `vertices` (V) as `view` sees them, and writes what
-    /// `shade` makes of each pixel into `out` (H·W, row-major).
+    /// Draws `layers` of faces over the same `vertices` (V) and writes the result of `shade` for
+    /// each pixel into `out` (H·W, row-major).
     ///
-    /// Every layer has a depth buffer of its own, so that a sample sees the nearest face of each:
-    /// nested shells can be composited. With one layer it is a plain visibility buffer; see
-    /// [`Rasterizer::faces`].
+    /// Every layer has its own depth buffer, so that a sample has a fragment of each: nested shells
+    /// can be composited. [`Rasterizer::faces`] is the plain visibility buffer of one layer.
     ///
-    /// A sample is inside a triangle by exact arithmetic on corners rounded to 1/256 of a sample's
-    /// spacing, one on an edge or corner by the top-left rule: an edge that two triangles share
-    /// belongs to one of them. Of faces at the same depth the first is seen. Triangles without area
-    /// are not drawn, nor are those with a corner that is not finite; those that reach behind the
-    /// camera are clipped. Triangles 10¹² times as large as they are far are clipped imprecisely.
-    /// Work is spread over the current rayon pool; the result does not depend on its size.
+    /// Coverage is exact on corners rounded to 1/256 of the sample spacing, by the top-left rule on
+    /// edges: an edge shared by two triangles belongs to one of them. Of faces at the same depth
+    /// the first is visible. Triangles without area or with a corner that is not finite are
+    /// skipped; those that reach behind the near plane are clipped, imprecisely if 10¹² times as
+    /// large as they are far. Work is spread over the current rayon pool; the result does not
+    /// depend on its size.
     ///
     /// # Errors
     /// [`Error::FaceIndex`]; [`Error::ImageSize`] for more than 16384 samples a row or column;
     /// [`Error::TooMany`].
     ///
     /// # Panics
-    /// If `out` has not `width · height` entries.
+    /// If `out` does not have `width · height` entries.
     pub fn draw<T: Send>(
         &mut self,
         vertices: &[Vec3],
@@ -78,8 +94,7 @@ impl Rasterizer {
         Ok(())
     }
 
-    /// The nearest face of a single mesh at every pixel's centre (H·W, row-major): a visibility
-    /// buffer.
+    /// Visibility buffer: the nearest face of a mesh at the centre of every pixel (H·W, row-major).
     ///
     /// # Errors
     /// As [`Rasterizer::draw`].

@@ -1,4 +1,4 @@
-//! Triangles in fixed point, sorted into the bands of rows that they reach.
+//! Triangle set-up in fixed point and binning into bands of rows.
 
 use std::ops::Range;
 
@@ -10,36 +10,36 @@ use crate::error::Error;
 
 /// Rows of samples of a band.
 pub(super) const BAND: usize = 16;
-/// Faces that are set up together.
+/// Faces of a set-up task.
 pub(super) const CHUNK: usize = 2048;
 
-/// A triangle on the screen, wound so that its area is positive.
+/// A triangle in the image, wound so that its area is positive.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Triangle {
     /// Fixed-point corners.
     pub x: [i32; 3],
     pub y: [i32; 3],
-    /// Samples that its bounding box holds: first and last column, first and last row.
+    /// Samples in its bounding box: first and last column, first and last row.
     pub columns: [i32; 2],
     pub rows: [i32; 2],
-    /// Counted through all layers.
+    /// Index of the face, counted through all layers.
     pub face: u32,
     /// Reciprocal of the depth: at the first corner, least and most.
     pub inverse: [f32; 3],
-    /// How the reciprocal grows per step of fixed point.
+    /// Gradient of the reciprocal depth per fixed-point step.
     pub slope: [f64; 2],
 }
 
-/// Some faces of a layer, set up.
+/// Set-up triangles of consecutive faces of a layer.
 #[derive(Debug, Default)]
 pub(super) struct Chunk {
     pub layer: usize,
     /// Faces of the layer.
     pub range: Range<usize>,
-    /// The first of them, counted through all layers.
+    /// Index of the first, counted through all layers.
     first: usize,
     pub triangles: Vec<Triangle>,
-    /// Triangles that reach into each band.
+    /// Indices of the triangles that overlap each band.
     pub bins: Vec<Vec<u32>>,
 }
 
@@ -90,7 +90,7 @@ impl Chunk {
         }
         let [bx, by, cx, cy] = [b.0[0] - a.0[0], b.0[1] - a.0[1], c.0[0] - a.0[0], c.0[1] - a.0[1]];
         let area = i64::from(bx) * i64::from(cy) - i64::from(cx) * i64::from(by);
-        // Rows grow downwards: what is counter-clockwise to the eye has a negative area.
+        // Rows grow downwards: counter-clockwise triangles have a negative area.
         if area == 0 || (projection.cull_back && area > 0) {
             return;
         }

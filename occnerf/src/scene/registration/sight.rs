@@ -9,9 +9,9 @@ use visibility::{Fragment, RasterOptions, Rasterizer};
 
 use crate::Error;
 use crate::config::OccludedRule;
+use crate::model::view::pinhole;
 use crate::scene::labels::{Label, Labels, label_pixels};
 use crate::scene::light::Seen;
-use crate::scene::pinhole::pinhole;
 use crate::scene::registration::picture::{Look, Picture};
 
 /// Pixels from one look at the mask to the next.

@@ -61,7 +61,7 @@ pub fn motion(mut input: Input, model: &BodyModel, output: &mut Output) -> Resul
         let mesh = MeshDistance::new(&posed.vertices, &model.faces).context("the posed body")?;
         let motion = SurfaceMotion::default();
         let map = |x| {
-            let near = mesh.closest(x, f32::INFINITY)?;
+            let near = mesh.closest(x);
             motion.map(model, &posed, x, near.face, near.barycentric, near.signed_distance)
         };
         points.iter().map(|&x| map(x)).collect()

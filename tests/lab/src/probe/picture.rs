@@ -1,7 +1,7 @@
 //! Functions of `visibility` and `volrender`: what a camera sees, compositing, image metrics.
 
 use anyhow::{Context, Result, ensure};
-use glam::{Affine3A, Mat3, Vec3};
+use glam::{Affine3A, Mat3, Vec2, Vec3};
 use occnerf::Lpips;
 use smpl::Mesh;
 use visibility::{RayMesh, View, visible_vertices};
@@ -17,18 +17,16 @@ const MAX_SIDE: i64 = 1 << 24;
 pub fn visible(mut input: Input, mesh: &Mesh, output: &mut Output) -> Result<()> {
     let (_, k) = input.floats("K", &[Some(3), Some(3)])?;
     let (_, e) = input.floats("E", &[Some(3), Some(4)])?;
-    // Both are row-major, glam's constructors take columns.
-    let intrinsics = Mat3::from_cols_slice(&k).transpose();
-    ensure!(
-        k[6..] == [0.0, 0.0, 1.0] && intrinsics.determinant() != 0.0,
-        input.wrong("K", "is no calibration matrix: expected a last row of 0, 0, 1 and an inverse")
-    );
+    let is_calibration = k[0] * k[4] != 0.0 && [k[1], k[3]] == [0.0; 2] && k[6..] == [0.0, 0.0, 1.0];
+    ensure!(is_calibration, input.wrong("K", "is no calibration matrix: expected fx 0 cx, 0 fy cy, 0 0 1"));
+    // Row-major, glam's constructors take columns.
     let column = |c: usize| Vec3::new(e[c], e[4 + c], e[8 + c]);
     let extrinsics = Affine3A::from_mat3_translation(Mat3::from_cols(column(0), column(1), column(2)), column(3));
     let width = input.integer("width", 1..=MAX_SIDE)? as u32;
     let height = input.integer("height", 1..=MAX_SIDE)? as u32;
-    let view = View { intrinsics, extrinsics, width, height };
-    ensure!(view.centre().is_some(), input.wrong("E", "has no inverse"));
+    let (focal, centre) = (Vec2::new(k[0], k[4]), Vec2::new(k[2], k[5]));
+    let view = View { focal, centre, world_to_camera: extrinsics, width, height };
+    ensure!(view.centre_of_projection().is_some(), input.wrong("E", "has no inverse"));
     let rays = RayMesh::new(&mesh.vertices, &mesh.faces).context("the mesh")?;
     let visible = visible_vertices(&rays, &mesh.vertices, &view, None);
     output.booleans("visible", &[visible.len()], visible)

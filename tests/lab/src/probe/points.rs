@@ -37,7 +37,7 @@ pub fn knn(mut input: Input, output: &mut Output) -> Result<()> {
     let queries = input.points("queries")?;
     let k = input.integer("k", 1..=points.len() as i64)?;
     let shape = [queries.len(), k];
-    let config = SurfaceQueryConfig { k, coarse_levels: 0, ..SurfaceQueryConfig::TREES };
+    let config = SurfaceQueryConfig { k, coarse_levels: 0, ..Default::default() };
     let mut indices = vec![0; count("indices", &shape)?];
     let search = SurfaceQuery::new(&points, &[], &config).context("k")?;
     indices.par_chunks_mut(k).zip(&queries).for_each(|(indices, &q)| search.neighbours(q, indices));
@@ -52,7 +52,7 @@ pub fn knn(mut input: Input, output: &mut Output) -> Result<()> {
 pub fn surface(mut input: Input, mesh: &Mesh, output: &mut Output) -> Result<()> {
     let queries = input.points("queries")?;
     // The paper's neighbourhoods: ratio 0.25, k = 5, 4 levels.
-    let config = SurfaceQueryConfig::TREES;
+    let config = SurfaceQueryConfig::default();
     let search = SurfaceQuery::new(&mesh.vertices, &mesh.faces, &config).context("the mesh")?;
     let exact = MeshDistance::new(&mesh.vertices, &mesh.faces).context("the mesh")?;
     let levels = config.coarse_levels + 1;
@@ -63,9 +63,7 @@ pub fn surface(mut input: Input, mesh: &Mesh, output: &mut Output) -> Result<()>
         .for_each(|(indices, &q)| search.neighbours(q, indices));
     let rows = indices.chunks(search.neighbours_per_query());
     let blended: Vec<_> = queries.iter().zip(rows).map(|(&q, row)| search.blend(q, &row[..config.k])).collect();
-    let closest: Vec<_> = queries.par_iter().map(|&q| exact.closest(q, f32::INFINITY)).collect();
-    let closest: Option<Vec<_>> = closest.into_iter().collect();
-    let closest = closest.context("the mesh has no faces, or a query is too far from it")?;
+    let closest: Vec<_> = queries.par_iter().map(|&q| exact.closest(q)).collect();
     let n = queries.len();
     let points = |of: &dyn Fn(usize) -> Vec3| (0..n).map(of).collect::<Vec<_>>();
     output.vectors("blended", &[n, 3], &points(&|i| blended[i].point))?;

@@ -13,12 +13,15 @@ use volrender::{Aabb, Bins, Ray, RaySamples, composite};
 
 use super::figure::{Figure, Kernel, REACH, Random, mean, median};
 
+/// The paper's neighbourhoods, with a grid for a body in metres.
+const GRID: SurfaceQueryConfig = SurfaceQueryConfig { k: 5, coarse_levels: 3, ratio: 0.25, cell: 0.02, margin: 0.12 };
+
 /// Signed distance: the blend of the k nearest vertices against the exact closest point.
 pub fn distance(figure: &Figure) -> Result<Kernel> {
     let mut kernel = Kernel { name: "distance", cost: "ns a query", error: "mean error, mm", samples: Vec::new() };
     let exact = MeshDistance::new(&figure.shaped.vertices, &figure.body.faces)?;
     let queries = figure.queries();
-    let at = |q: Vec3| exact.closest(q, f32::INFINITY).map_or(f32::NAN, |c| c.signed_distance);
+    let at = |q: Vec3| exact.closest(q).signed_distance;
     let truth: Vec<f32> = queries.iter().map(|&q| at(q)).collect();
     let seconds = median(|| {
         queries.iter().for_each(|&q| {
@@ -27,7 +30,7 @@ pub fn distance(figure: &Figure) -> Result<Kernel> {
     });
     kernel.add("exact".to_owned(), seconds, queries.len(), 0.0, true);
     for k in [1, 2, 3, 5, 8, 16] {
-        let config = SurfaceQueryConfig { k, coarse_levels: 0, ..SurfaceQueryConfig::BODY };
+        let config = SurfaceQueryConfig { k, coarse_levels: 0, ..GRID };
         let surface = SurfaceQuery::new(&figure.shaped.vertices, &figure.body.faces, &config)?;
         let mut out = vec![0; k];
         let mut blend = |q: Vec3| {
@@ -64,7 +67,7 @@ pub fn neighbours(figure: &Figure) -> Result<Kernel> {
         (8, 1, true),
         (16, 0, true),
     ] {
-        let config = if grid { SurfaceQueryConfig::BODY } else { SurfaceQueryConfig::TREES };
+        let config = if grid { GRID } else { SurfaceQueryConfig::default() };
         let config = SurfaceQueryConfig { k, coarse_levels, ..config };
         let surface = SurfaceQuery::new(&figure.shaped.vertices, &figure.body.faces, &config)?;
         let (mut here, mut there) = (vec![0; surface.neighbours_per_query()], vec![0; surface.neighbours_per_query()]);
@@ -120,7 +123,7 @@ pub fn motion(figure: &Figure) -> Result<Kernel> {
     for (name, field, default) in fields {
         let map = |x: Vec3| {
             field.map(&frame, x, || {
-                let closest = mesh.closest(x, 2.0 * REACH)?;
+                let closest = mesh.closest_within(x, 2.0 * REACH)?;
                 let (barycentric, signed_distance) = (closest.barycentric, closest.signed_distance);
                 Some(SurfacePoint { face: closest.face, barycentric, signed_distance })
             })
@@ -170,7 +173,7 @@ pub fn samples(figure: &Figure, rays: usize) -> Result<Kernel> {
         for i in 0..n {
             (t[i], delta[i]) = (bins.at(i, 0.5), bins.width());
             let at = ray.at(t[i]);
-            let closest = mesh.closest(at, 0.04);
+            let closest = mesh.closest_within(at, 0.04);
             let depth = closest.as_ref().map_or(1.0, |c| c.signed_distance);
             // About what a field learns: solid inside, gone 2 cm outside.
             sigma[i] = if closest.is_some() { 150.0 * (0.5 - 25.0 * depth).clamp(0.0, 1.0) } else { 0.0 };
