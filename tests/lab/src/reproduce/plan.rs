@@ -5,8 +5,8 @@ use std::fmt;
 use std::path::Path;
 use std::time::Instant;
 
+use crate::scene::SceneOptions;
 use anyhow::{Context, Result};
-use xtask::source::SceneOptions;
 use occnerf::{Config, FieldRenderer, Lpips, Method, PreparedFrame, Preset, Trainer, evaluate_with};
 use serde::{Deserialize, Serialize};
 
