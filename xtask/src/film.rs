@@ -4,8 +4,8 @@ use std::path::Path;
 
 use anyhow::{Context, Result};
 use indicatif::{ProgressBar, ProgressStyle};
-use synth::{SynthConfig, Synthetic, synthesise};
 use smpl::{Character, MotionClip};
+use synth::{SynthConfig, Synthetic, synthesise};
 
 /// Whether `path` is named like a rigged character.
 pub fn is_character(path: &Path) -> bool {

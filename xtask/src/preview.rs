@@ -43,8 +43,8 @@ impl Preview {
 #[cfg(test)]
 #[allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
 mod tests {
-    use synth::{DemoConfig, demo};
     use occnerf::{Config, Method, Preset, Scene, Trainer};
+    use synth::{DemoConfig, demo};
 
     use super::*;
 

@@ -12,8 +12,8 @@ use common::{done, folder, refused, text};
 use glam::Vec3;
 use occnerf::bake::Avatar;
 use occnerf::capture::Layout;
-use synth::{DemoConfig, demo};
 use occnerf::{Config, Method, Preset, PriorColors, Scene};
+use synth::{DemoConfig, demo};
 
 const HOSTILE: &str = "</script><img src=x onerror=alert(1)>\" onload='";
 

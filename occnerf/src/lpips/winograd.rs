@@ -202,8 +202,8 @@ fn add<'a, const N: usize>(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use volrender::RandomStream;
     use proptest::prelude::*;
+    use volrender::RandomStream;
 
     /// Sums over the nine taps, in double precision.
     fn plain(input: &Maps, weight: &[f32], outputs: usize) -> Vec<f64> {

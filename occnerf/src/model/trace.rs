@@ -247,11 +247,11 @@ impl Tracer<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use synth::{DemoConfig, demo};
     use crate::config::{DistanceKind, Method, MotionKind, Preset};
     use crate::model::view::PosedView;
     use crate::scene::prepared::Scene;
     use crate::train::trainer::Trainer;
+    use synth::{DemoConfig, demo};
 
     #[test]
     fn with_a_volume_a_sample_lives_where_the_canonical_prior_is_near() {

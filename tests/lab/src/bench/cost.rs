@@ -7,8 +7,8 @@ use std::fmt::Write as _;
 use std::path::Path;
 
 use anyhow::{Result, bail};
-use synth::DemoConfig;
 use occnerf::{Config, Method, Preset};
+use synth::DemoConfig;
 
 use self::machine::Machine;
 use super::chart::{Axis, Line, Mark, Panel, Picture, Shape, Style};

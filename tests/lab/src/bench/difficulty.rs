@@ -6,9 +6,9 @@ use std::ops::{Add, Mul};
 use anyhow::{Result, ensure};
 use glam::{Quat, Vec3};
 use occnerf::capture::{Capture, Frame, Pixels};
-use synth::{DemoConfig, Perturbation, demo};
 use serde::{Deserialize, Serialize};
 use smpl::{BodyModel, Placement, SparseRows};
+use synth::{DemoConfig, Perturbation, demo};
 
 /// Moments that a frame's exposure can be made of.
 const MOMENTS: usize = 8;

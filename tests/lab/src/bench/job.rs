@@ -9,13 +9,13 @@ use anyhow::{Context, Result, bail};
 use glam::Vec3;
 use occnerf::bake::bake;
 use occnerf::capture::Capture;
-use xtask::source::SceneOptions;
 use occnerf::{
     Config, FieldRenderer, Method, PreparedFrame, PriorColors, PriorRenderer, Renderer, Scene, StepTimes, Trainer,
     evaluate,
 };
 use serde::{Deserialize, Serialize};
 use smpl::BodyModel;
+use xtask::source::SceneOptions;
 
 use super::baked::Baking;
 use super::difficulty::Difficulty;

@@ -8,9 +8,9 @@ use anyhow::{Context, Result};
 use clap::Args;
 use glam::Quat;
 use occnerf::capture::Capture;
-use synth::{DemoConfig, Perturbation, demo};
 use occnerf::{Config, Method, PreparedFrame, Preset, PriorColors, PriorRenderer, Scene, evaluate, register};
 use smpl::BodyModel;
+use synth::{DemoConfig, Perturbation, demo};
 
 use crate::results::{self, Section};
 use xtask::process::say;

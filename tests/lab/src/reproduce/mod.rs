@@ -11,8 +11,8 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Result, bail, ensure};
 use clap::Args;
-use synth::Perturbation;
 use occnerf::{Lpips, Preset};
+use synth::Perturbation;
 
 use crate::results::{self, Section};
 use plan::{Plan, Request};
@@ -26,7 +26,7 @@ use xtask::process::{Ending, Lock};
 use xtask::run::{self, Metrics, RunConfig, make_directory};
 use xtask::settings;
 use xtask::shard::ShardArguments;
-use xtask::source::{Corruption, LoadArguments, SceneOptions, Source, self};
+use xtask::source::{self, Corruption, LoadArguments, SceneOptions, Source};
 use xtask::train::{baked_unless_finished, finished, run_unless_finished};
 
 #[derive(Args)]

@@ -6,9 +6,9 @@ use std::path::Path;
 use std::time::Instant;
 
 use anyhow::{Context, Result};
-use xtask::source::SceneOptions;
 use occnerf::{Config, FieldRenderer, Lpips, Method, PreparedFrame, Preset, Trainer, evaluate_with};
 use serde::{Deserialize, Serialize};
+use xtask::source::SceneOptions;
 
 use super::rows::{Length, Row};
 use xtask::process::note;
