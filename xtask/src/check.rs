@@ -52,7 +52,7 @@ impl CheckArguments {
 pub fn check(arguments: &CheckArguments) -> Result<()> {
     let mut load = arguments.load.options()?;
     // A camera that sees nothing of the body is what is to be explained.
-    load.files.unseen = true;
+    load.unseen = true;
     let source = source::load(arguments.scene.as_deref(), arguments.body.as_deref(), &load)?;
     let found = occnerf::check(&source.capture, &source.model)?;
     let path = arguments.out.clone().unwrap_or_else(|| match Path::new(&source.scene) {

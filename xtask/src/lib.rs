@@ -14,7 +14,6 @@ mod html;
 mod import;
 pub mod list;
 pub mod network;
-pub mod obstacle;
 pub mod optimise;
 pub mod pictures;
 pub mod place;

@@ -9,7 +9,7 @@ use occnerf::{Config, SplitMetrics, replace_file};
 use serde::{Deserialize, Serialize};
 
 use crate::process::{Lock, unwritten};
-use crate::source::{self, Corruption, SceneOptions, Source};
+use crate::source::{self, Source};
 
 /// File of values, moments and counts.
 pub const CHECKPOINT: &str = "checkpoint.safetensors";
@@ -32,9 +32,6 @@ pub struct RunConfig {
     /// How the capture is read.
     #[serde(default, skip_serializing_if = "is_default")]
     pub load: LoadOptions,
-    /// How the capture is corrupted.
-    #[serde(default, skip_serializing_if = "is_none")]
-    pub corruption: Corruption,
     /// Everything else.
     pub train: Config,
 }
@@ -42,8 +39,7 @@ pub struct RunConfig {
 impl RunConfig {
     /// A run of a source.
     pub fn new(source: &Source, train: Config) -> Self {
-        let SceneOptions { files, corruption } = source.load.clone();
-        Self { scene: source.scene.clone(), body: source.body.clone(), load: files, corruption, train }
+        Self { scene: source.scene.clone(), body: source.body.clone(), load: source.load.clone(), train }
     }
 
     /// Reads a run's config.toml.
@@ -68,21 +64,12 @@ impl RunConfig {
             && self.body.as_deref().map(place) == other.body.as_deref().map(place)
     }
 
-    /// How the scene is read and corrupted.
-    pub fn options(&self) -> SceneOptions {
-        SceneOptions { files: self.load.clone(), corruption: self.corruption }
-    }
-
     /// The capture that the run in `directory` was trained on, with the bodies that it trained with.
     pub fn source(&self, directory: &Path) -> Result<Source> {
-        let mut source = source::load(Some(&self.scene), self.body.as_deref(), &self.options())?;
+        let mut source = source::load(Some(&self.scene), self.body.as_deref(), &self.load)?;
         source.restore(directory, &self.train)?;
         Ok(source)
     }
-}
-
-fn is_none(corruption: &Corruption) -> bool {
-    *corruption == Corruption::default()
 }
 
 fn is_default(options: &LoadOptions) -> bool {

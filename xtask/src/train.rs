@@ -147,8 +147,8 @@ fn resumed(arguments: &TrainArguments, directory: &Path) -> Result<Begun> {
     // A run that ended before its first checkpoint begins anew.
     let begun = if checkpoint.is_file() { Some(checkpoint_config(&checkpoint)?) } else { None };
     let saved = RunConfig::read(directory)?;
-    let load = arguments.load.resumed(&saved.options())?;
     let config = arguments.settings.resumed(begun.unwrap_or(saved.train), capacity.as_ref())?;
+    let load = arguments.load.resumed(&saved.load)?;
     let scene = arguments.scene.as_deref().unwrap_or(&saved.scene);
     let body = arguments.body.as_deref().or(saved.body.as_deref());
     let mut source = source::load(Some(scene), body, &load)?;
@@ -306,7 +306,7 @@ fn unless_finished(
             body(run)
         );
     }
-    let earlier = old.is_some_and(|old| old.train == run.train && old.options() == run.options());
+    let earlier = old.is_some_and(|old| old.train == run.train && old.load == run.load);
     if earlier && directory.join(METRICS).is_file() {
         let metrics = Metrics::read(directory)?;
         // Scores that lack what is asked for now are made anew from the checkpoint, as are those of

@@ -29,7 +29,6 @@ fn help_names_the_commands_and_every_option_of_train() {
         "--max-frames",
         "--eval-stride",
         "--camera",
-        "--occlusion",
         "--lpips",
         "--perceptual-weights",
         "--capacity",

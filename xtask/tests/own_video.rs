@@ -5,7 +5,7 @@ mod common;
 
 use common::{done, folder, refused, text};
 use occnerf::capture::Layout;
-use synth::{Occlusion, SynthConfig, synthesise};
+use synth::{Occlusion, Perturbation, SynthConfig, synthesise};
 
 const TITLE: &str = "training views, over visible pixels:";
 
@@ -71,10 +71,12 @@ fn a_run_on_masks_that_are_too_small_goes_on_with_those_that_it_began_with() {
     let (capture, whole, stopped) = (folder.join("capture"), folder.join("whole"), folder.join("stopped"));
     let occlusion = Occlusion::Objects { fraction: 0.5, position: 0.0 };
     let config = SynthConfig { size: 160, frames: 6, occlusion, ..SynthConfig::default() };
-    synthesise(None, None, &config, &|_| {}).unwrap().write(&capture, Layout::Wild, &|_| {}).unwrap();
-    let wrong = ["--wrong-mask=-3", "--wrong-pose", "6"];
+    let mut made = synthesise(None, None, &config, &|_| {}).unwrap();
+    let wrong = Perturbation { mask_pixels: -3, pose_degrees: 6.0, ..Perturbation::NONE };
+    wrong.apply(&mut made.capture, &made.body).unwrap();
+    made.write(&capture, Layout::Wild, &|_| {}).unwrap();
     let quick = ["--preset", "fast", "--method", "hash-point", "--steps", "4"];
-    let train = |run| [&["train", text(&capture), "--out", run], &wrong[..], &quick].concat();
+    let train = |run| [&["train", text(&capture), "--out", run], &quick[..]].concat();
     done(&train(text(&whole)));
     done(&[&train(text(&stopped))[..], &["--stop-after", "2"]].concat());
     done(&["train", "--resume", "--out", text(&stopped)]);

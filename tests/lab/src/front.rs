@@ -10,7 +10,9 @@ use occnerf::{FieldRenderer, Label, Model, PreparedFrame, Renderer};
 
 use xtask::pictures;
 use xtask::process::say;
-use xtask::run::{RunConfig, use_threads};
+use xtask::run::use_threads;
+
+use crate::scene;
 
 /// Moments that are shown, a row each.
 const ROWS: usize = 3;
@@ -32,8 +34,7 @@ pub struct FrontArguments {
 /// Runs the command.
 pub fn front(arguments: &FrontArguments) -> Result<()> {
     use_threads(arguments.threads)?;
-    let run = RunConfig::read(&arguments.run)?;
-    let source = run.source(&arguments.run)?;
+    let (run, source) = scene::of_run(&arguments.run)?;
     let scene = source.scene(&run.train)?;
     ensure!(!scene.eval.is_empty(), "{}: the capture keeps no views back", run.scene);
     ensure!(run.train.held_out == 0, "{}: frames are held out, expected a run with none", arguments.run.display());

@@ -4,10 +4,12 @@
 mod bench;
 mod budget;
 mod front;
+mod obstacle;
 mod probe;
 mod report;
 mod reproduce;
 mod results;
+mod scene;
 mod synth;
 
 use anyhow::Result;

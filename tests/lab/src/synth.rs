@@ -7,8 +7,8 @@ use clap::{Args, ValueEnum};
 use occnerf::capture::Layout;
 use synth::{Obstacle, Occlusion, SynthConfig, Synthetic};
 
+use crate::obstacle::ObstacleArguments;
 use xtask::film::{bar, film, is_character};
-use xtask::obstacle::ObstacleArguments;
 use xtask::place::{beside, not_within, take_place, vacant};
 use xtask::process::{results_in, say};
 

@@ -50,7 +50,7 @@ fn a_sweep_goes_on_where_it_was_cut_off() {
         let line: serde_json::Value = serde_json::from_str(line).unwrap();
         assert!(line["error"].is_null() && line["psnr_mask"].as_f64().unwrap() > 1.0, "{line}");
         assert!(line["peak_rss_bytes"].as_u64().is_some() && line["seconds_per_frame"].as_f64().unwrap() > 0.0);
-        assert_eq!(line["job"]["place"]["scene"]["load"]["resize"], 24, "{line}");
+        assert_eq!(line["job"]["place"]["scene"]["load"]["files"]["resize"], 24, "{line}");
     }
     assert!(done(&sweep).contains("0 runs in"));
     std::fs::write(out.join("bench.jsonl"), &log[..log.len() - 200]).unwrap();

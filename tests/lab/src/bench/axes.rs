@@ -1,8 +1,8 @@
 //! The ways in which `bench stability` makes it hard.
 
+use crate::scene::SceneOptions;
 use occnerf::{Config, Method, Preset};
 use synth::{DemoConfig, Obstacle};
-use xtask::source::SceneOptions;
 
 use super::difficulty::Difficulty;
 use super::job::{Job, Place};

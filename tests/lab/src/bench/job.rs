@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
+use crate::scene::SceneOptions;
 use anyhow::{Context, Result, bail};
 use glam::Vec3;
 use occnerf::bake::bake;
@@ -48,7 +49,7 @@ impl Place {
     fn load(&self) -> Result<(Capture, BodyModel)> {
         match self {
             Self::Scene { scene, body, load } => {
-                let source = source::load(Some(scene), body.as_deref(), load)?;
+                let source = load.load(scene, body.as_deref())?;
                 Ok((source.capture, source.model))
             }
             Self::Made(difficulty) => difficulty.make(),

@@ -28,7 +28,7 @@ use crate::results::{self, Section};
 use xtask::process::say;
 use xtask::run::{check_threads, use_threads, write};
 use xtask::shard::ShardArguments;
-use xtask::source::{LoadArguments, Source};
+use xtask::source::Source;
 use xtask::{source, train};
 
 /// Steps of a point of `pareto` at which presets run their own number of steps: those of `fast`.
@@ -80,7 +80,7 @@ struct SceneArguments {
     #[arg(long)]
     body: Option<PathBuf>,
     #[command(flatten)]
-    load: LoadArguments,
+    load: crate::scene::SceneArguments,
 }
 
 #[derive(Args)]
@@ -241,7 +241,7 @@ impl SceneArguments {
     }
 
     fn read(&self, scene: &str) -> Result<Source> {
-        source::load(Some(scene), self.body.as_deref(), &self.load.options()?)
+        self.load.options()?.load(scene, self.body.as_deref())
     }
 
     fn sweep(&self, scene: &str, steps: u64, seed: u64, quick: bool) -> Result<points::Sweep> {

@@ -10,8 +10,10 @@ use image::{Rgb, RgbImage};
 use occnerf::{Lpips, Method, Model, PreparedFrame, PriorColors, Renderer, Rendering, Scene};
 use xtask::eval::{Drawn, scored_frames};
 use xtask::network::load_lpips;
-use xtask::run::{RunConfig, make_directory, use_threads, write};
+use xtask::run::{make_directory, use_threads, write};
 use xtask::{pictures, say, table};
+
+use crate::scene;
 
 use self::causes::{Cause, Shares, ViewBudget, split_error};
 
@@ -50,8 +52,8 @@ pub fn budget(arguments: &BudgetArguments) -> Result<()> {
     use_threads(arguments.threads)?;
     let lpips = load_lpips(arguments.lpips.as_deref())?;
     for directory in &arguments.runs {
-        let run = RunConfig::read(directory)?;
-        let scene = run.source(directory)?.scene(&run.train)?;
+        let (run, source) = scene::of_run(directory)?;
+        let scene = source.scene(&run.train)?;
         let model;
         let drawn = if run.train.method == Method::Prior {
             Drawn::Prior(PriorColors::measure(&scene)?)

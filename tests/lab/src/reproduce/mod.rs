@@ -15,6 +15,7 @@ use occnerf::{Lpips, Preset};
 use synth::Perturbation;
 
 use crate::results::{self, Section};
+use crate::scene::{Corruption, SceneArguments, SceneOptions};
 use plan::{Plan, Request};
 use rows::{Row, Table};
 use summary::Summary;
@@ -26,7 +27,7 @@ use xtask::process::{Ending, Lock};
 use xtask::run::{self, Metrics, RunConfig, make_directory};
 use xtask::settings;
 use xtask::shard::ShardArguments;
-use xtask::source::{self, Corruption, LoadArguments, SceneOptions, Source};
+use xtask::source::{self, Source};
 use xtask::train::{baked_unless_finished, finished, run_unless_finished};
 
 #[derive(Args)]
@@ -37,7 +38,7 @@ pub struct ReproduceArguments {
     #[arg(long)]
     body: Option<PathBuf>,
     #[command(flatten)]
-    load: LoadArguments,
+    load: SceneArguments,
     /// Directory of all runs and results
     #[arg(long, default_value = "runs/reproduce")]
     out: PathBuf,
@@ -179,7 +180,7 @@ impl Experiment<'_> {
             seeds: self.arguments.seeds,
             budget: self.arguments.steps.is_none().then_some(minutes),
             rows: rows.iter().map(|row| row.name.clone()).collect(),
-            load: source.load.clone(),
+            load: self.arguments.load.options()?,
             perceptual_weights: self.arguments.perceptual_weights.clone().unwrap_or_default(),
             lpips: network_name(self.lpips),
         };
@@ -195,17 +196,18 @@ impl Experiment<'_> {
     }
 
     fn load(&self, options: &SceneOptions) -> Result<Source> {
-        source::load(Some(self.scene), self.arguments.body.as_deref(), options)
+        options.load(self.scene, self.arguments.body.as_deref())
     }
 
     /// The table that is asked for.
     fn table(&self, directory: &Path) -> Result<()> {
-        let source = self.load(&self.arguments.load.options()?)?;
+        let options = self.arguments.load.options()?;
+        let source = self.load(&options)?;
         make_directory(directory)?;
         let rows = self.arguments.rows(|_| true);
         let plan = self.plan(directory, &source, &rows, self.minutes)?;
         say!("{plan}");
-        let summary = self.run_rows(&rows, &plan, &source, directory)?;
+        let summary = self.run_rows(&rows, &plan, (&source, options.corruption), directory)?;
         if !self.arguments.part.writes_tables() {
             return Ok(());
         }
@@ -264,7 +266,7 @@ impl Experiment<'_> {
             say!("{plan}");
             let at = directory.join(name);
             make_directory(&at)?;
-            levels.push((name, self.run_rows(&rows, plan, &source, &at)?.scores()));
+            levels.push((name, self.run_rows(&rows, plan, (&source, corruption), &at)?.scores()));
             if !self.arguments.part.writes_tables() {
                 continue;
             }
@@ -287,7 +289,13 @@ impl Experiment<'_> {
     }
 
     /// Trains and scores every row that is not finished, with all its seeds.
-    fn run_rows<'a>(&self, rows: &[Row], plan: &'a Plan, source: &'a Source, directory: &Path) -> Result<Summary<'a>> {
+    fn run_rows<'a>(
+        &self,
+        rows: &[Row],
+        plan: &'a Plan,
+        (source, corruption): (&'a Source, Corruption),
+        directory: &Path,
+    ) -> Result<Summary<'a>> {
         let mut summary = Summary::new(source, plan, self.arguments.table());
         let mut first = BTreeMap::new();
         for row in rows {
@@ -301,7 +309,7 @@ impl Experiment<'_> {
                     run.train.loss.perceptual_weights.clone_from(path);
                 }
                 self.runs.count.set(self.runs.count.get() + 1);
-                let job = Job { index: begin + seed as usize - 1, row, seed, run };
+                let job = Job { index: begin + seed as usize - 1, row, seed, run, corruption };
                 if let Some(metrics) = self.run(directory, &job, source)? {
                     summary.add(row, &directory.join(row.run(seed)), metrics);
                 }
@@ -322,13 +330,14 @@ struct Job<'a> {
     row: &'a Row,
     seed: u64,
     run: RunConfig,
+    corruption: Corruption,
 }
 
 impl Experiment<'_> {
     /// The scores of a run under `directory`; `None` where it is not this job's, or a merge does
     /// not find it.
     fn run(&self, directory: &Path, job: &Job<'_>, source: &Source) -> Result<Option<Metrics>> {
-        let Job { index, row, seed, run } = job;
+        let Job { index, row, seed, run, corruption } = job;
         let name = &row.run(*seed);
         let trained = row.trained(*seed).map(|trained| directory.join(trained));
         let (directory, part) = (&directory.join(name), self.arguments.part);
@@ -343,6 +352,10 @@ impl Experiment<'_> {
             return Ok(None);
         }
         let interval = self.arguments.saving.interval()?;
+        for run in trained.iter().chain([directory]) {
+            make_directory(run)?;
+            corruption.keep(run)?;
+        }
         let scored = match &trained {
             Some(trained) => baked_unless_finished(directory, trained, run, source, self.lpips, interval),
             None => run_unless_finished(directory, name, run, source, self.lpips, interval),

@@ -5,6 +5,7 @@ use std::fmt;
 use std::path::Path;
 use std::time::Instant;
 
+use crate::scene::SceneOptions;
 use anyhow::{Context, Result};
 use occnerf::{Config, FieldRenderer, Lpips, Method, PreparedFrame, Preset, Trainer, evaluate_with};
 use serde::{Deserialize, Serialize};

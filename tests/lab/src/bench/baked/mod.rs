@@ -21,7 +21,7 @@ use self::speed::{growth, rates, speeds};
 use crate::results::{self, Section};
 use xtask::network::load_lpips;
 use xtask::process::say;
-use xtask::run::{RunConfig, peak_rss_bytes, use_threads, write};
+use xtask::run::{peak_rss_bytes, use_threads, write};
 use xtask::{pictures, table, train};
 
 const MADE: [&str; 7] = ["baked", "seconds", "vertices", "faces", "holes", "double", "peak MiB"];
@@ -113,8 +113,7 @@ impl Found {
 }
 
 fn of_run(path: &Path, arguments: &BakedArguments, lpips: Option<&Lpips>, timed: bool) -> Result<Found> {
-    let run = RunConfig::read(path)?;
-    let source = run.source(path)?;
+    let (run, source) = crate::scene::of_run(path)?;
     let scene = source.scene(&run.train)?;
     ensure!(!scene.eval.is_empty(), "{}: the capture keeps no views back", run.scene);
     let model = Model::load(path)?;

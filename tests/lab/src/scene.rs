@@ -1,0 +1,223 @@
+//! Captures as they are read and corrupted for an experiment.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use anyhow::{Context, Result, ensure};
+use clap::{Args, ValueEnum};
+use occnerf::capture::{Area, Capture, Layout, LoadOptions};
+use serde::{Deserialize, Serialize};
+use serde_json::Value;
+use synth::{Obstacle, Perturbation};
+use xtask::run::{RunConfig, write};
+use xtask::source::{LoadArguments, Source, load_with};
+
+use crate::obstacle::ObstacleArguments;
+
+/// The file of a run directory that says how the capture was corrupted.
+const FILE: &str = "corruption.json";
+
+/// How the files of a scene are read, and the capture corrupted.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct SceneOptions {
+    pub files: LoadOptions,
+    pub corruption: Corruption,
+}
+
+/// Corruptions of a capture.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Corruption {
+    /// The simulated obstacle before the training camera of raw ZJU-MoCap. `None`: what
+    /// `occlusion.json` says, or the default [`Obstacle`] where there is none.
+    pub occlusion: Option<Obstacle>,
+    /// Errors of priors and masks.
+    pub wrong: Perturbation,
+}
+
+impl SceneOptions {
+    /// The capture, corrupted.
+    pub fn load(&self, scene: &str, body: Option<&Path>) -> Result<Source> {
+        let Corruption { occlusion, wrong } = self.corruption;
+        load_with(Some(scene), body, &self.files, |capture, model| {
+            occlude(capture, Path::new(scene), occlusion)?;
+            wrong.apply(capture, model)?;
+            wrong.spoil_body(model);
+            Ok(())
+        })
+    }
+}
+
+/// Puts the simulated obstacle before the training camera of raw ZJU-MoCap.
+fn occlude(capture: &mut Capture, directory: &Path, occlusion: Option<Obstacle>) -> Result<()> {
+    if !directory.is_dir() || Layout::detect(directory)? != Layout::ZjuMocap {
+        let scene = directory.display();
+        ensure!(occlusion.is_none(), "{scene}: takes no obstacle, only raw ZJU-MoCap does");
+        return Ok(());
+    }
+    let recorded = directory.join("occlusion.json").is_file();
+    if recorded && occlusion.is_some() {
+        // The obstacle asked for stands in place of the recorded one.
+        let nowhere = Area { columns: 0..0, rows: 0..0 };
+        capture.train.iter_mut().for_each(|frame| frame.source.hide(nowhere.clone()));
+    }
+    if !recorded || occlusion.is_some() {
+        occlusion.unwrap_or_default().hide(&mut capture.train)?;
+    }
+    Ok(())
+}
+
+impl Corruption {
+    /// Writes it into a run directory.
+    ///
+    /// # Errors
+    /// If the run that is there has another.
+    pub fn keep(&self, run: &Path) -> Result<()> {
+        let begun = run.join("config.toml").is_file();
+        ensure!(
+            !begun || Self::of_run(run)? == *self,
+            "{} holds a run with other errors of prior or masks: give another --out",
+            run.display()
+        );
+        if *self == Self::default() { Ok(()) } else { write(&run.join(FILE), &serde_json::to_string_pretty(self)?) }
+    }
+
+    fn of_run(run: &Path) -> Result<Self> {
+        let path = run.join(FILE);
+        if !path.is_file() {
+            return Ok(Self::default());
+        }
+        let text = std::fs::read_to_string(&path).with_context(|| path.display().to_string())?;
+        serde_json::from_str(&text).with_context(|| path.display().to_string())
+    }
+}
+
+/// A run, and its capture with the bodies and the errors that it was trained with.
+pub fn of_run(directory: &Path) -> Result<(RunConfig, Source)> {
+    let run = RunConfig::read(directory)?;
+    let options = SceneOptions { files: run.load.clone(), corruption: Corruption::of_run(directory)? };
+    let mut source = options.load(&run.scene, run.body.as_deref())?;
+    source.restore(directory, &run.train)?;
+    Ok((run, source))
+}
+
+/// What a capture's files leave open, and what is made wrong of it.
+#[derive(Args, Clone, Debug, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub struct SceneArguments {
+    #[command(flatten)]
+    #[serde(flatten)]
+    load: LoadArguments,
+    /// Simulated obstacle before the training camera of a ZJU-MoCap capture [default:
+    /// occlusion.json, else central]
+    #[arg(long)]
+    occlusion: Option<ObstacleName>,
+    #[command(flatten)]
+    #[serde(flatten)]
+    obstacle: ObstacleArguments,
+    /// Make the prior and the masks as wrong as something makes them; the options below change
+    /// single errors of it
+    #[arg(long)]
+    wrong: Option<WrongName>,
+    /// Turn every bone of the prior by so many degrees (root mean square), to see what a method
+    /// bears [default: 0]
+    #[arg(long, value_name = "DEGREES")]
+    wrong_pose: Option<f32>,
+    /// Change every shape coefficient of the prior by so many standard deviations [default: 0]
+    #[arg(long, value_name = "N")]
+    wrong_shape: Option<f32>,
+    /// Move the prior by so many metres of a body 1.7 m high (root mean square) [default: 0]
+    #[arg(long, value_name = "METRES")]
+    wrong_translation: Option<f32>,
+    /// Change the prior's distance from the camera by so many per cent (root mean square)
+    /// [default: 0]
+    #[arg(long, value_name = "PERCENT")]
+    wrong_depth: Option<f32>,
+    /// Make the bones of the prior's limbs longer or shorter by so many per cent (standard
+    /// deviation) [default: 0]
+    #[arg(long, value_name = "PERCENT")]
+    wrong_limbs: Option<f32>,
+    /// Let the edges of the training masks go to and fro by up to so many pixels [default: 0]
+    #[arg(long, value_name = "PIXELS")]
+    wrong_edge: Option<f32>,
+    /// Grow the training masks by so many pixels, or shrink them [default: 0]
+    #[arg(long, value_name = "PIXELS", allow_negative_numbers = true)]
+    wrong_mask: Option<i32>,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, ValueEnum)]
+#[serde(rename_all = "kebab-case")]
+enum ObstacleName {
+    /// No obstacle.
+    None,
+    /// The paper's: half of the person on four fifths of the frames.
+    Central,
+    /// The same, moving by three tenths of the picture.
+    Moving,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, ValueEnum)]
+#[serde(rename_all = "kebab-case")]
+enum WrongName {
+    /// What estimators and segmenters make of a real video: poses by 4°, 2 cm, depth by 2 %, limbs
+    /// by 5 %, shape by 1, ragged masks.
+    Real,
+}
+
+impl SceneArguments {
+    /// The same as options.
+    pub fn options(&self) -> Result<SceneOptions> {
+        let occlusion = match self.occlusion {
+            Some(ObstacleName::None) => Some(self.obstacle.none()?),
+            Some(ObstacleName::Moving) => Some(self.obstacle.moving()),
+            Some(ObstacleName::Central) => Some(self.obstacle.central()),
+            None => self.obstacle.given().then(|| self.obstacle.central()),
+        };
+        let as_wrong = self.wrong.map_or(Perturbation::NONE, |WrongName::Real| Perturbation::REAL);
+        let wrong = Perturbation {
+            pose_degrees: self.wrong_pose.unwrap_or(as_wrong.pose_degrees),
+            shape: self.wrong_shape.unwrap_or(as_wrong.shape),
+            translation: self.wrong_translation.unwrap_or(as_wrong.translation),
+            depth_percent: self.wrong_depth.unwrap_or(as_wrong.depth_percent),
+            limbs_percent: self.wrong_limbs.unwrap_or(as_wrong.limbs_percent),
+            ragged_pixels: self.wrong_edge.unwrap_or(as_wrong.ragged_pixels),
+            mask_pixels: self.wrong_mask.unwrap_or(as_wrong.mask_pixels),
+        };
+        Ok(SceneOptions { files: self.load.options()?, corruption: Corruption { occlusion, wrong } })
+    }
+
+    /// The same as on the command line: every flag that was given.
+    pub fn command_line(&self) -> String {
+        let flags = serde_json::to_string(self).and_then(|text| serde_json::from_str::<BTreeMap<String, Value>>(&text));
+        let given = flags.unwrap_or_default().into_iter().filter(|(_, value)| !value.is_null());
+        given.map(|(flag, value)| format!(" --{flag} {}", value.to_string().trim_matches('"'))).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::Parser;
+
+    use super::*;
+
+    #[derive(Parser)]
+    struct Line {
+        #[command(flatten)]
+        load: SceneArguments,
+    }
+
+    #[test]
+    fn a_command_line_made_of_options_says_all_of_them() {
+        let words = "x --resize 64 --stride 2 --max-frames 9 --eval-stride 3 --camera B2 --occlusion moving --fraction 0.4 \
+                     --share 0.7 --position -0.1 --height 0.5 --memory 2048 --wrong-pose 2.5 --wrong-shape 1 --wrong-mask -3";
+        let wrong = "x --wrong real --wrong-translation 0.05 --wrong-depth 3 --wrong-limbs 4 --wrong-edge 1";
+        for words in [words, wrong, "x"] {
+            let load = Line::parse_from(words.split_whitespace()).load;
+            let again = format!("x{}", load.command_line());
+            assert_eq!(again.split_whitespace().count(), words.split_whitespace().count(), "{again}");
+            let read = Line::parse_from(again.split_whitespace()).load.options().unwrap();
+            assert_eq!(read, load.options().unwrap());
+        }
+    }
+}
