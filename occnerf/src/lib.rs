@@ -34,7 +34,6 @@ mod check;
 mod config;
 mod error;
 mod evaluate;
-#[cfg_attr(not(feature = "lpips"), path = "lpips/absent.rs")]
 mod lpips;
 mod model;
 mod random;
@@ -42,6 +41,7 @@ mod render;
 mod scene;
 mod train;
 
+pub use self::lpips::Lpips;
 pub use atomic::replace_file;
 pub use capacity::{Capacity, Choice, Measured, Pruned};
 pub use check::{Check, Fault, FrameCheck, Mistake, body_silhouette, check, photograph, unknown_pixels};
@@ -52,7 +52,6 @@ pub use config::{
 pub use error::Error;
 pub use evaluate::budget::{BESIDE, Cause, PartBudget, Shares, ViewBudget, budget};
 pub use evaluate::{FrameMetrics, SplitMetrics, evaluate, evaluate_with, least_seen_quartile};
-pub use lpips::{Lpips, Trunk};
 pub use model::body::{Body, Moment};
 pub use model::colors::PriorColors;
 pub use model::person::Person;

@@ -10,7 +10,8 @@ use std::path::{Path, PathBuf};
 
 use imports::{Imports, imports};
 
-const CRATES: [&str; 8] = ["smpl", "surface-query", "visibility", "hashgrid", "volrender", "occnerf", "xtask", "tests"];
+const CRATES: [&str; 9] =
+    ["smpl", "surface-query", "visibility", "hashgrid", "volrender", "occnerf", "occnerf/lpips", "xtask", "tests"];
 
 fn workspace() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("..")
