@@ -2,7 +2,7 @@
 
 use crate::scene::SceneOptions;
 use occnerf::{Config, Method, Preset};
-use synth::{DemoConfig, Obstacle};
+use synth::DemoConfig;
 
 use super::difficulty::Difficulty;
 use super::job::{Job, Place};

@@ -16,7 +16,7 @@ use occnerf::{
 };
 use serde::{Deserialize, Serialize};
 use smpl::BodyModel;
-use xtask::source::SceneOptions;
+use crate::scene::SceneOptions;
 
 use super::baked::Baking;
 use super::difficulty::Difficulty;
