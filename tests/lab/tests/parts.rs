@@ -5,7 +5,7 @@ mod common;
 
 use std::path::Path;
 
-use common::{TINY, done, folder, refused, text, xtask};
+use common::{TINY, done, folder, refused, text};
 
 /// Rows without what depends on the clock.
 fn timeless(table: &Path) -> Vec<String> {

@@ -16,7 +16,6 @@ use occnerf::{
 };
 use serde::{Deserialize, Serialize};
 use smpl::BodyModel;
-use crate::scene::SceneOptions;
 
 use super::baked::Baking;
 use super::difficulty::Difficulty;

@@ -9,7 +9,6 @@ use crate::scene::SceneOptions;
 use anyhow::{Context, Result};
 use occnerf::{Config, FieldRenderer, Lpips, Method, PreparedFrame, Preset, Trainer, evaluate_with};
 use serde::{Deserialize, Serialize};
-use crate::scene::SceneOptions;
 
 use super::rows::{Length, Row};
 use xtask::process::note;
