@@ -46,7 +46,7 @@ fn perceptual_term(bencher: Bencher<'_, '_>, trunk: Trunk) {
         .bench_local(|| lpips.distance_backward(&a, &b, SIZE, SIZE, 1.0, &mut d_a).unwrap());
 }
 
-/// A picture of 256 × 256 against another, as when a run is scored.
+/// Distance of two images of 256 × 256, as in scoring.
 #[divan::bench(args = [Trunk::Vgg16, Trunk::AlexNet, Trunk::SqueezeNet], sample_size = 1, sample_count = 5)]
 fn picture(bencher: Bencher<'_, '_>, trunk: Trunk) {
     let lpips = network(trunk);

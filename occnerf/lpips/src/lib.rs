@@ -68,10 +68,17 @@ const PIXELS_AT_ONCE: usize = 1 << 13;
 
 /// A network with its weights.
 ///
-/// ```no_run
-/// let network = lpips::Lpips::load("vgg16_lpips.safetensors".as_ref())?;
-/// let [a, b] = [vec![0.2; 3 * 64 * 64], vec![0.7; 3 * 64 * 64]];
-/// println!("{}: {:.4}", network.name(), network.distance(&a, &b, 64, 64)?[0]);
+/// ```
+/// use lpips::{Lpips, Trunk};
+///
+/// // In place of `Lpips::load("weights/".as_ref())`.
+/// let network = Lpips::new(Trunk::SqueezeNet, |_, shape| Ok(vec![0.01; shape.iter().product()]))?;
+/// assert_eq!(network.name(), "squeezenet");
+/// assert!(network.check_size(16, 16).is_err() && network.check_size(1920, 1080).is_ok());
+///
+/// // Two pairs of images of 32 × 32 pixels.
+/// let image: Vec<f32> = (0..3 * 32 * 32).map(|i| (i % 11) as f32 / 10.0).collect();
+/// assert_eq!(network.distance(&image.repeat(2), &image.repeat(2), 32, 32)?, [0.0, 0.0]);
 /// # Ok::<(), lpips::Error>(())
 /// ```
 pub struct Lpips {

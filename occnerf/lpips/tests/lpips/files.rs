@@ -153,8 +153,7 @@ fn what_is_wrong_is_named_with_file_tensor_and_shapes() {
     std::fs::write(&path, b"not weights at all, but long enough to be").unwrap();
     refused(&path, &["neither"]);
     refused(&folder.join("none.pth"), &[]);
-    // A damaged file beside the trunk is named where what is missing may be in it, and matters to
-    // nobody else.
+    // A damaged file beside the trunk is an error only if no other file has the linear layers.
     let beside = self::folder("beside");
     let (lonely, cut) = (beside.join("trunk.pth"), beside.join("zlin.pth"));
     std::fs::write(&lonely, archive(&trunk)).unwrap();
@@ -191,8 +190,7 @@ proptest! {
         let (trunk, lin) = weights();
         let few: Tensors = trunk.into_iter().chain(lin).filter(|(name, _)| !name.contains("expand3x3.weight")).collect();
         let mut bytes = [safetensors, archive, legacy][form](&few);
-        // What describes the tensors is small and stands at the start, or in an archive also at the
-        // end.
+        // Descriptions of tensors are short and lie at the start, in an archive also at the end.
         let range = if head { bytes.len().min(20_000) } else { bytes.len() };
         let at = if form == 1 && byte % 2 == 0 { bytes.len() - 1 - at.index(range.min(6000)) } else { at.index(range) };
         if cut { bytes.truncate(at) } else { bytes[at] = byte }
