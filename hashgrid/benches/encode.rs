@@ -1,8 +1,6 @@
-//! The paper's encoding (D 4, L 16, F 2, T 2^19), forward and backward, against a plain
-//! implementation; the target's points are uniform in the unit cube, those of a trained scene lie
-//! on a surface and share more corners.
-//!
-//! `cargo bench -p hashgrid`: times are a call of [`POINTS`] points; items/s are points.
+//! Encoding with the paper's sizes (D 4, L 16, F 2, T 2^19), forward and backward, against the
+//! definition. Uniform points share few corners; points near a surface share more, as in a trained
+//! scene. `cargo bench -p hashgrid`: times are per call of [`POINTS`] points; items/s are points.
 
 use divan::counter::ItemsCount;
 use divan::{Bencher, black_box};
@@ -10,12 +8,11 @@ use hashgrid::{HashGrid, HashGridConfig};
 use rayon::prelude::*;
 
 const POINTS: usize = 1 << 16;
-/// Points a task, as a caller that parallelises would choose.
+/// Points per parallel task.
 const TASK: usize = 16_384;
 const CONFIG: HashGridConfig = HashGridConfig { levels: 16, features: 2, log2_table_size: 19, n_min: 16, n_max: 2048 };
 
 fn main() {
-    // The targets are for two threads.
     let _ = rayon::ThreadPoolBuilder::new().num_threads(2).build_global();
     divan::main();
 }
@@ -97,7 +94,7 @@ fn encode_backward_points(bencher: Bencher<'_, '_>, kind: Points) {
     });
 }
 
-/// Forward with the derivatives, and the backward pass to the points that uses them.
+/// Forward pass with the Jacobian, and the backward pass to the points by it.
 #[divan::bench(args = [Points::Uniform, Points::Surface])]
 fn encode_jacobian_and_backward_points(bencher: Bencher<'_, '_>, kind: Points) {
     let Case { grid, table, points, d_features } = case(kind);
@@ -116,7 +113,7 @@ fn encode_jacobian_and_backward_points(bencher: Bencher<'_, '_>, kind: Points) {
     });
 }
 
-/// The same encoding written straight from the definition, point by point.
+/// The encoding by its definition, point by point.
 #[divan::bench(args = [Points::Uniform, Points::Surface])]
 fn encode_plain(bencher: Bencher<'_, '_>, kind: Points) {
     let Case { grid, table, points, .. } = case(kind);

@@ -10,16 +10,16 @@ impl<const D: usize> HashGrid<D> {
     ///
     /// Levels run in parallel on the current rayon pool; each adds its points in their order, so
     /// that the result does not depend on the number of threads. The encoding is linear in the
-    /// table: no table is needed.
+    /// table, so its gradient does not depend on the table.
     ///
     /// # Panics
-    /// Where a slice has another length.
+    /// If the length of a slice is wrong.
     pub fn encode_backward(&self, points: &[[f32; D]], d_features: &[f32], d_table: &mut [f32]) {
         self.encode_backward_parts(std::iter::once((points, d_features)), d_table);
     }
 
-    /// [`HashGrid::encode_backward`] of points that lie in several places, one part after the
-    /// other: a level's part of the table comes to the cache once for all of them.
+    /// [`HashGrid::encode_backward`] for points in several slices, in their order: each level's
+    /// table is loaded into the cache once for all of them.
     ///
     /// # Panics
     /// As [`HashGrid::encode_backward`].
@@ -46,7 +46,8 @@ impl<const D: usize> HashGrid<D> {
         levels.into_par_iter().with_max_len(1).for_each(|(l, d_table)| {
             let level = &self.levels[l];
             for (points, d_features) in parts.clone() {
-                let d_features = &d_features[self.features_range(l, points.len(), 0, points.len())];
+                let width = points.len() * self.features;
+                let d_features = &d_features[l * width..][..width];
                 arch.dispatch(Kernel(
                     #[inline(always)]
                     || for_widths!(self.features, backward_level::<D>(level, points, d_features, d_table)),

@@ -1,4 +1,4 @@
-use crate::corners::{BLOCK, Corners, Lanes, MAX_CORNERS, for_widths, row};
+use crate::corners::{BLOCK, Corners, MAX_CORNERS, for_widths, interpolate_with_slopes, row};
 use crate::encode::CHUNK;
 use crate::grid::{HashGrid, Level};
 use crate::simd::{Kernel, arch};
@@ -7,12 +7,12 @@ impl<const D: usize> HashGrid<D> {
     /// Adds the gradient of the coordinates to `d_points` (Q, D), given `table`, `points` (Q, D)
     /// and the gradient of their features `d_features` (L, Q, F). Runs on the calling thread.
     ///
-    /// The encoding is d-linear within a cell and only continuous across cells: on a face the
-    /// derivative is that of the upper cell (at x = 1, of the last cell). Coordinates outside \[0,
-    /// 1\] and NaN get no gradient.
+    /// The encoding is d-linear within a cell and continuous across cells: on a face the derivative
+    /// is that of the upper cell (at x = 1, of the last cell). Coordinates outside \[0, 1\] and NaN
+    /// get no gradient.
     ///
     /// # Panics
-    /// Where a slice has another length.
+    /// If the length of a slice is wrong.
     pub fn encode_backward_points(
         &self,
         table: &[f32],
@@ -24,16 +24,13 @@ impl<const D: usize> HashGrid<D> {
         self.assert_features("d_features", d_features, points.len());
         assert_eq!(d_points.len(), points.len(), "d_points has {} points, expected {}", d_points.len(), points.len());
         let arch = arch();
-        let chunks = points.chunks(CHUNK).zip(d_points.chunks_mut(CHUNK));
-        for (chunk, (part, d_points)) in chunks.enumerate() {
-            for (l, level) in self.levels.iter().enumerate() {
-                let table = &table[self.level_range(l)];
-                let d_features = &d_features[self.features_range(l, points.len(), chunk * CHUNK, part.len())];
-                arch.dispatch(Kernel(
-                    #[inline(always)]
-                    || for_widths!(self.features, level_backward_points::<D>(level, table, part, d_features, d_points)),
-                ));
-            }
+        for pass in self.passes(points.len(), CHUNK) {
+            let (points, d_points) = (&points[pass.points.clone()], &mut d_points[pass.points]);
+            let (level, table, d_features) = (pass.level, &table[pass.table], &d_features[pass.features]);
+            arch.dispatch(Kernel(
+                #[inline(always)]
+                || for_widths!(self.features, level_backward_points::<D>(level, table, points, d_features, d_points)),
+            ));
         }
     }
 }
@@ -50,7 +47,7 @@ fn level_backward_points<const D: usize, const W: usize>(
 ) {
     let n = level.resolution as f32;
     let mut corners = Corners::new();
-    let mut projected = [[0.0f32; BLOCK]; MAX_CORNERS];
+    let mut dots = [[[0.0f32]; BLOCK]; MAX_CORNERS];
     let blocks = points.chunks(BLOCK).zip(d_features.chunks(BLOCK * stride)).zip(d_points.chunks_mut(BLOCK));
     for ((points, d_features), d_points) in blocks {
         corners.fill(level, points);
@@ -62,38 +59,16 @@ fn level_backward_points<const D: usize, const W: usize>(
                 for f in 0..W {
                     dot += values[f] * d_sum[f];
                 }
-                projected[k][b] = dot;
+                dots[k][b] = [dot];
             }
         }
+        let slopes = interpolate_with_slopes::<D, 1>(&mut dots, &corners.fraction);
         for j in 0..D {
-            let slope = slope::<D>(&projected, &corners.fraction, j);
-            for ((point, d_point), slope) in points.iter().zip(&mut *d_points).zip(slope) {
+            for ((point, d_point), [slope]) in points.iter().zip(&mut *d_points).zip(slopes[j]) {
                 if (0.0..=1.0).contains(&point[j]) {
                     d_point[j] += n * slope;
                 }
             }
         }
     }
-}
-
-/// Derivative along axis `j` of the d-linear interpolation of corner `values`, a cell's side being
-/// 1.
-#[inline(always)]
-fn slope<const D: usize>(values: &[Lanes<f32>; MAX_CORNERS], fraction: &[Lanes<f32>; 4], j: usize) -> Lanes<f32> {
-    let mut folded = *values;
-    for axis in (0..D).rev() {
-        let half = 1 << axis;
-        let (low, high) = folded.split_at_mut(half);
-        for k in 0..half {
-            for b in 0..BLOCK {
-                let difference = high[k][b] - low[k][b];
-                if axis == j {
-                    low[k][b] = difference;
-                } else {
-                    low[k][b] += fraction[axis][b] * difference;
-                }
-            }
-        }
-    }
-    folded[0]
 }

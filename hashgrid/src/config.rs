@@ -1,30 +1,40 @@
-/// Most cells an axis may have: the integers an `f32` coordinate can still tell apart.
+/// Largest resolution of a level, in cells per axis: the integers an `f32` represents exactly.
 ///
-/// From 2^20 cells on little is left of an `f32` coordinate's 24 bits for the place within a cell.
+/// From 2^20 cells on, an `f32` coordinate has less than 4 bits for the position within a cell.
 pub const MAX_RESOLUTION: u32 = 1 << 24;
 
 /// Largest log2 of the rows of one level.
-pub const MAX_LOG2_TABLE_SIZE: u32 = 28;
+const MAX_LOG2_TABLE_SIZE: u32 = 28;
 
-/// Most numbers in one table: 8 GiB of `f32`.
-pub const MAX_PARAMETERS: usize = 1 << 31;
+/// Largest number of parameters: 8 GiB of `f32`.
+pub(crate) const MAX_PARAMETERS: usize = 1 << 31;
 
 /// Shape of an encoding whose resolutions grow geometrically from `n_min` to `n_max`.
 ///
 /// N_l = ⌊n_min · b^l⌋ with b = (n_max / n_min)^(1 / (levels − 1)) (Müller et al. 2022, eq. 2 and
 /// 3); the first and the last level are exactly `n_min` and `n_max`. With one level, only `n_min`
 /// is used.
+///
+/// ```
+/// use hashgrid::{HashGrid, HashGridConfig};
+///
+/// // The paper's settings for a 3-D scene: growth b = 1.38.
+/// let config = HashGridConfig { levels: 16, features: 2, log2_table_size: 19, n_min: 16, n_max: 2048 };
+/// let grid = HashGrid::<3>::new(&config)?;
+/// assert_eq!(grid.resolutions()[..4], [16, 22, 30, 42]);
+/// # Ok::<(), hashgrid::Error>(())
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct HashGridConfig {
-    /// L, at least 1.
+    /// L: number of levels, 1 to 64.
     pub levels: usize,
-    /// F, numbers stored at a corner, at least 1. 1, 2, 4 and 8 have kernels of their own.
+    /// F: features per level, 1 to 256. 1, 2, 4 and 8 have specialised kernels.
     pub features: usize,
-    /// T: a level has at most 2^T rows.
+    /// T: a level has at most 2^T rows; at most 28.
     pub log2_table_size: u32,
-    /// Cells an axis of the coarsest level, at least 1.
+    /// Resolution of the coarsest level in cells per axis, at least 1.
     pub n_min: u32,
-    /// Cells an axis of the finest level, at least `n_min`, at most [`MAX_RESOLUTION`].
+    /// Resolution of the finest level in cells per axis, `n_min` to [`MAX_RESOLUTION`].
     pub n_max: u32,
 }
 
@@ -45,7 +55,7 @@ impl HashGridConfig {
         }
         let growth = (f64::from(n_max) / f64::from(n_min)).ln() / (levels - 1) as f64;
         let grown = |level: usize| {
-            // A whole number must not fall below itself by the rounding of exp and ln.
+            // Keeps the floor of an integer N_l from dropping by the rounding of exp and ln.
             let n = f64::from(n_min) * (growth * level as f64).exp() * (1.0 + 1e-12);
             (n as u32).clamp(n_min, n_max)
         };
@@ -73,7 +83,7 @@ fn check_resolution(level: usize, resolution: u32) -> Result<(), Error> {
     Err(Error::Resolution { level, resolution })
 }
 
-/// Checks everything but the total size.
+/// Validates all settings but the total size.
 pub(crate) fn check(resolutions: &[u32], features: usize, log2_table_size: u32) -> Result<(), Error> {
     check_levels(resolutions.len())?;
     if !(1..=MAX_FEATURES).contains(&features) {
@@ -88,55 +98,63 @@ pub(crate) fn check(resolutions: &[u32], features: usize, log2_table_size: u32) 
     Ok(())
 }
 
-/// Why a grid cannot be built.
+/// Invalid configuration of a grid.
+///
+/// ```
+/// use hashgrid::{Error, HashGrid};
+///
+/// let error = HashGrid::<3>::with_resolutions(&[16, 0], 2, 14).unwrap_err();
+/// assert_eq!(error, Error::Resolution { level: 1, resolution: 0 });
+/// assert_eq!(error.to_string(), "level 1 has a resolution of 0, expected 1 to 16777216");
+/// ```
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
     /// `levels` is 0, or there are no resolutions.
     #[error("a hash grid needs at least one level")]
     NoLevels,
-    /// More levels than a grid can have.
+    /// More than 64 levels.
     #[error("{levels} levels, at most {most}")]
     TooManyLevels {
-        /// The levels asked for.
+        /// Requested levels.
         levels: usize,
-        /// The limit.
+        /// Upper limit.
         most: usize,
     },
-    /// No features at a corner, or absurdly many.
-    #[error("{features} features a corner, expected 1 to {most}")]
+    /// Number of features out of range.
+    #[error("{features} features per level, expected 1 to {most}")]
     Features {
-        /// The features asked for.
+        /// Requested features.
         features: usize,
-        /// The limit.
+        /// Upper limit.
         most: usize,
     },
-    /// 2^T rows are too many.
-    #[error("a table of 2^{log2_table_size} rows a level, at most 2^{MAX_LOG2_TABLE_SIZE}")]
+    /// T above 28.
+    #[error("a table of 2^{log2_table_size} rows per level, at most 2^{MAX_LOG2_TABLE_SIZE}")]
     TableSize {
-        /// The T asked for.
+        /// Requested T.
         log2_table_size: u32,
     },
-    /// A level with no cells, or with more than [`MAX_RESOLUTION`].
-    #[error("level {level} has {resolution} cells an axis, expected 1 to {MAX_RESOLUTION}")]
+    /// A resolution of 0 or above [`MAX_RESOLUTION`].
+    #[error("level {level} has a resolution of {resolution}, expected 1 to {MAX_RESOLUTION}")]
     Resolution {
         /// Index of the level.
         level: usize,
-        /// Its cells an axis.
+        /// Its cells per axis.
         resolution: u32,
     },
     /// `n_max` below `n_min`.
     #[error("n_max {n_max} is below n_min {n_min}")]
     ResolutionOrder {
-        /// Coarsest.
+        /// Coarsest resolution.
         n_min: u32,
-        /// Finest.
+        /// Finest resolution.
         n_max: u32,
     },
-    /// All levels together are larger than [`MAX_PARAMETERS`].
+    /// More than 2^31 parameters in all levels together.
     #[error("{parameters} parameters, at most {MAX_PARAMETERS}")]
     TooManyParameters {
-        /// The numbers that the table would hold up to the first level beyond the limit.
+        /// Parameters up to and including the first level beyond the limit.
         parameters: u64,
     },
 }

@@ -1,23 +1,23 @@
-//! Rows and weights of the 2^D corners around a block of points: the part all three passes share.
+//! Table rows, interpolation weights and slopes at the 2^D cell corners of a block of points.
 
 use crate::grid::Level;
 
-/// Points handled together, so that index arithmetic runs in SIMD lanes.
+/// Points per block, so that index arithmetic runs in SIMD lanes.
 pub(crate) const BLOCK: usize = 16;
 pub(crate) const MAX_CORNERS: usize = 16;
 
 const PRIMES: [u32; 4] = [1, 2_654_435_761, 805_459_861, 3_674_653_429];
 
-/// One number for every point of a block.
+/// One value for every point of a block.
 pub(crate) type Lanes<T> = [T; BLOCK];
-/// The rows of a block's corners, corner by corner.
+/// Features at the corners of a block's points, corner by corner.
 pub(crate) type Values<const W: usize> = [Lanes<[f32; W]>; MAX_CORNERS];
 
 /// Corner k lies at c_j + 1 where bit j of k is set, at c_j where it is not.
 pub(crate) struct Corners {
-    /// Rows of the level's table.
+    /// Row indices in the level's table.
     pub row: [Lanes<u32>; MAX_CORNERS],
-    /// Place of the point within its cell, an axis each, in [0, 1].
+    /// Position of the point within its cell along each axis, in [0, 1].
     pub fraction: [Lanes<f32>; 4],
 }
 
@@ -26,8 +26,7 @@ impl Corners {
         Self { row: [[0; BLOCK]; MAX_CORNERS], fraction: [[0.0; BLOCK]; 4] }
     }
 
-    /// Fills the block from up to [`BLOCK`] `points`; lanes beyond them hold the corners of the
-    /// origin.
+    /// Computes rows and fractions of up to [`BLOCK`] `points`; unused lanes get those of the origin.
     #[inline(always)]
     pub fn fill<const D: usize>(&mut self, level: &Level, points: &[[f32; D]]) {
         if level.hashed {
@@ -39,7 +38,7 @@ impl Corners {
                 }
             }
         } else {
-            // Every stride is at most the rows of a dense level, which fit u32.
+            // Strides do not exceed the number of rows, so they fit u32.
             let side = level.resolution + 1;
             let mut strides = [1; 4];
             for j in 1..D {
@@ -71,7 +70,7 @@ impl Corners {
             let fraction = &mut self.fraction[j];
             for b in 0..BLOCK {
                 // x · N is exact in f64, so cells and fractions are too.
-                let p = f64::from(unit(x[j][b])) * n;
+                let p = f64::from(clamp_unit(x[j][b])) * n;
                 let cell = (p as i32).min(last);
                 fraction[b] = (p - f64::from(cell)) as f32;
                 low[b] = (cell as u32).wrapping_mul(factors[j]);
@@ -93,7 +92,7 @@ impl Corners {
         }
     }
 
-    /// Products of the D factors of each corner; their sum is 1.
+    /// d-linear interpolation weights of the corners; their sum is 1.
     #[inline(always)]
     pub fn weights<const D: usize>(&self) -> [Lanes<f32>; MAX_CORNERS] {
         let mut weight = [[1.0; BLOCK]; MAX_CORNERS];
@@ -109,8 +108,8 @@ impl Corners {
         weight
     }
 
-    /// Reads the rows of all corners before anything is done with them: more of them are on their
-    /// way at a time where the table is larger than the cache.
+    /// Loads the features of all corners up front, which overlaps more cache misses than loading
+    /// each where it is used.
     #[inline(always)]
     pub fn gather<const D: usize, const W: usize>(
         &self,
@@ -127,9 +126,9 @@ impl Corners {
     }
 }
 
-/// A number of each point, once for each of its features.
+/// Repeats the value of each point for its W features.
 #[inline(always)]
-pub(crate) fn spread<const W: usize>(lanes: &Lanes<f32>) -> Lanes<[f32; W]> {
+pub(crate) fn broadcast<const W: usize>(lanes: &Lanes<f32>) -> Lanes<[f32; W]> {
     let mut wide = [[0.0; W]; BLOCK];
     for b in 0..BLOCK {
         wide[b] = [lanes[b]; W];
@@ -137,18 +136,54 @@ pub(crate) fn spread<const W: usize>(lanes: &Lanes<f32>) -> Lanes<[f32; W]> {
     wide
 }
 
+/// d-linear interpolation of the corners' `values` into `values[0]`; returns its derivatives along
+/// the axes in units of 1/cell.
+#[inline(always)]
+pub(crate) fn interpolate_with_slopes<const D: usize, const W: usize>(
+    values: &mut Values<W>,
+    fraction: &[Lanes<f32>; 4],
+) -> [Lanes<[f32; W]>; D] {
+    let mut slopes = [[[[0.0f32; W]; BLOCK]; MAX_CORNERS / 2]; D];
+    for axis in (0..D).rev() {
+        let half = 1 << axis;
+        let t = broadcast::<W>(&fraction[axis]);
+        let t = t.as_flattened();
+        // Derivatives along the axes done before are interpolated along this one.
+        for slope in &mut slopes[axis + 1..] {
+            let (low, high) = slope.split_at_mut(half);
+            for k in 0..half {
+                let (low, high) = (low[k].as_flattened_mut(), high[k].as_flattened());
+                for i in 0..BLOCK * W {
+                    low[i] += t[i] * (high[i] - low[i]);
+                }
+            }
+        }
+        let (low, high) = values.split_at_mut(half);
+        for k in 0..half {
+            let (low, high) = (low[k].as_flattened_mut(), high[k].as_flattened());
+            let slope = slopes[axis][k].as_flattened_mut();
+            for i in 0..BLOCK * W {
+                let difference = high[i] - low[i];
+                slope[i] = difference;
+                low[i] += t[i] * difference;
+            }
+        }
+    }
+    slopes.map(|slope| slope[0])
+}
+
 /// Clamped to [0, 1]; NaN is 0.
 #[inline(always)]
-fn unit(x: f32) -> f32 {
+fn clamp_unit(x: f32) -> f32 {
     let above = if x > 0.0 { x } else { 0.0 };
     if above < 1.0 { above } else { 1.0 }
 }
 
-/// `W` numbers of row `row`, `offset` numbers into it, in a level whose rows have `stride` numbers.
+/// Features `offset..offset + W` of row `row` in a level with `stride` features per row.
 #[inline(always)]
 pub(crate) fn row<const W: usize>(table: &[f32], stride: usize, offset: usize, row: u32) -> &[f32; W] {
     if stride == W {
-        // Known at compile time in the specialised kernels: one bounds check instead of two.
+        // Constant in the specialised kernels: one bounds check instead of two.
         return &table.as_chunks::<W>().0[row as usize];
     }
     let start = row as usize * stride + offset;

@@ -1,36 +1,31 @@
-use crate::corners::{BLOCK, Corners, MAX_CORNERS, for_widths, spread};
+use crate::corners::{BLOCK, Corners, MAX_CORNERS, broadcast, for_widths};
 use crate::grid::{HashGrid, Level};
 use crate::simd::{Kernel, arch};
 
-/// Points that go through one level before the next level starts: enough to share what it takes to
-/// bring a level's table to the cache, few enough for their coordinates to stay there from level to
-/// level.
+/// Points encoded at one level before the next level starts: enough to amortise loading the level's
+/// table into the cache, few enough for their coordinates to stay there from level to level.
 pub(crate) const CHUNK: usize = 1 << 15;
 
 impl<const D: usize> HashGrid<D> {
     /// Encodes `points` (Q, D) with `table` ([`HashGrid::num_parameters`]) into `features` (L, Q,
     /// F), overwritten.
     ///
-    /// Runs on the calling thread; split the points to use more. Thousands of points a call are
-    /// faster a point than a few, because a level's part of the table then stays in the cache (a
-    /// third faster with 16 k than with 4 k where the table is far larger than the cache), and is
-    /// brought there once for all of them.
+    /// Runs on the calling thread; split the points to use more. Calls with thousands of points
+    /// take less time per point, because each level's table is loaded into the cache once per call
+    /// (a third less with 16 k than with 4 k points, if the table is far larger than the cache).
     ///
     /// # Panics
-    /// Where a slice has another length.
+    /// If the length of a slice is wrong.
     pub fn encode(&self, table: &[f32], points: &[[f32; D]], features: &mut [f32]) {
         self.assert_table("table", table);
         self.assert_features("features", features, points.len());
         let arch = arch();
-        for (chunk, part) in points.chunks(CHUNK).enumerate() {
-            for (l, level) in self.levels.iter().enumerate() {
-                let table = &table[self.level_range(l)];
-                let features = &mut features[self.features_range(l, points.len(), chunk * CHUNK, part.len())];
-                arch.dispatch(Kernel(
-                    #[inline(always)]
-                    || for_widths!(self.features, encode_level::<D>(level, table, part, features)),
-                ));
-            }
+        for pass in self.passes(points.len(), CHUNK) {
+            let (table, points, features) = (&table[pass.table], &points[pass.points], &mut features[pass.features]);
+            arch.dispatch(Kernel(
+                #[inline(always)]
+                || for_widths!(self.features, encode_level::<D>(pass.level, table, points, features)),
+            ));
         }
     }
 }
@@ -53,7 +48,7 @@ fn encode_level<const D: usize, const W: usize>(
         let weight = corners.weights::<D>();
         let mut sum = [[0.0f32; W]; BLOCK];
         for k in 0..1 << D {
-            let weight = spread::<W>(&weight[k]);
+            let weight = broadcast::<W>(&weight[k]);
             let terms = weight.as_flattened().iter().zip(values[k].as_flattened());
             for (sum, (weight, value)) in sum.as_flattened_mut().iter_mut().zip(terms) {
                 *sum += weight * value;

@@ -9,6 +9,19 @@ use crate::layout::Layout;
 ///
 /// Holds the shape only; the table of parameters belongs to the caller, so that optimisers and
 /// checkpoints see one flat slice.
+///
+/// ```
+/// let grid = hashgrid::HashGrid::<2>::with_resolutions(&[4, 100], 2, 10)?;
+/// // The coarse level stores its 5 × 5 corners, the fine one hashes 101 × 101 corners to 2^10 rows.
+/// assert_eq!((grid.level_range(0), grid.level_range(1)), (0..50, 50..2098));
+///
+/// let table = grid.init_table(1);
+/// let mut features = [0.0; 4];
+/// grid.encode(&table, &[[0.5, 0.25]], &mut features);
+/// // This point is corner (2, 1) of the coarse level, row 2 + 1 · 5.
+/// assert_eq!(features[..2], table[14..16]);
+/// # Ok::<(), hashgrid::Error>(())
+/// ```
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct HashGrid<const D: usize> {
     pub(crate) levels: Vec<Level>,
@@ -26,18 +39,29 @@ pub(crate) struct Level {
     pub start: usize,
 }
 
+/// One level of a chunk of points.
+pub(crate) struct Pass<'a> {
+    pub level: &'a Level,
+    /// Range of the level in the table.
+    pub table: Range<usize>,
+    /// Range of the chunk in the points.
+    pub points: Range<usize>,
+    /// Range of the chunk's features of this level in (L, Q, F).
+    pub features: Range<usize>,
+}
+
 impl<const D: usize> HashGrid<D> {
     /// A grid with geometrically growing resolutions.
     ///
     /// # Errors
-    /// A configuration that has no meaning (no levels, no features, `n_max` < `n_min`, a resolution
-    /// of 0) or no sensible size (see the limits of this crate).
+    /// [`Error`] for a setting outside the ranges of [`HashGridConfig`], or more than 2^31
+    /// parameters.
     pub fn new(config: &HashGridConfig) -> Result<Self, Error> {
         let resolutions = config.resolutions()?;
         Self::with_resolutions(&resolutions, config.features, config.log2_table_size)
     }
 
-    /// A grid with the given cells an axis for each level (L), in any order.
+    /// A grid with the given resolutions in cells per axis (L), in any order.
     ///
     /// # Errors
     /// As for [`HashGrid::new`].
@@ -51,7 +75,7 @@ impl<const D: usize> HashGrid<D> {
         // At most 64 levels · 2^28 rows · 256 features: no overflow.
         let mut start = 0u64;
         for &resolution in resolutions {
-            // A power beyond u64 is certainly beyond the table.
+            // A power that overflows u64 exceeds the table, too.
             let corners = (u64::from(resolution) + 1).checked_pow(D as u32);
             let dense = corners.filter(|&corners| corners <= most_rows);
             let rows = dense.unwrap_or(most_rows);
@@ -70,7 +94,7 @@ impl<const D: usize> HashGrid<D> {
         self.level_range(self.levels.len() - 1).end
     }
 
-    /// L·F, the length of one encoded point.
+    /// L·F, the number of features of one point.
     #[must_use]
     pub fn num_features(&self) -> usize {
         self.levels.len() * self.features
@@ -79,7 +103,7 @@ impl<const D: usize> HashGrid<D> {
     /// Range of level `level` in the flat table: min((N + 1)^D, 2^T) rows of F numbers.
     ///
     /// # Panics
-    /// Where there is no such level.
+    /// If there is no such level.
     #[must_use]
     pub fn level_range(&self, level: usize) -> Range<usize> {
         assert!(level < self.levels.len(), "level {level} of {}", self.levels.len());
@@ -93,19 +117,18 @@ impl<const D: usize> HashGrid<D> {
         Layout { levels: self.levels.len(), points, features: self.features }
     }
 
-    /// Cells an axis of every level (L).
+    /// Resolutions of the levels in cells per axis (L).
     #[must_use]
     pub fn resolutions(&self) -> &[u32] {
         &self.resolutions
     }
 
-    /// A table to start from: uniform in ±1e-4 (Müller et al. 2022, section 3), the same for the
-    /// same seed.
+    /// An initial table: uniform in ±1e-4 (Müller et al. 2022, section 3), determined by `seed`.
     #[must_use]
     pub fn init_table(&self, seed: u64) -> Vec<f32> {
         const AMPLITUDE: f32 = 1e-4;
         let mut table = vec![0.0; self.num_parameters()];
-        // Every number depends on its index alone, so that threads cannot matter.
+        // Counter-based random numbers: the result does not depend on the number of threads.
         table.par_iter_mut().enumerate().for_each(|(i, value)| {
             let bits = splitmix64(splitmix64(seed).wrapping_add(i as u64)) >> 40;
             *value = (bits as f32 / (1u32 << 23) as f32 - 1.0) * AMPLITUDE;
@@ -123,10 +146,16 @@ impl<const D: usize> HashGrid<D> {
         );
     }
 
-    /// Range of level `level` of the features of `points` points, from point `first` on.
-    pub(crate) fn features_range(&self, level: usize, points: usize, first: usize, count: usize) -> Range<usize> {
-        let start = (level * points + first) * self.features;
-        start..start + count * self.features
+    /// Passes over the features of `points` points: all levels of `chunk` points, then of the next.
+    pub(crate) fn passes(&self, points: usize, chunk: usize) -> impl Iterator<Item = Pass<'_>> {
+        let chunks = (0..points).step_by(chunk).map(move |first| first..points.min(first + chunk));
+        chunks.flat_map(move |range| {
+            self.levels.iter().enumerate().map(move |(l, level)| {
+                let first = l * points;
+                let features = (first + range.start) * self.features..(first + range.end) * self.features;
+                Pass { level, table: self.level_range(l), points: range.clone(), features }
+            })
+        })
     }
 
     pub(crate) fn assert_features(&self, what: &str, features: &[f32], points: usize) {

@@ -1,63 +1,68 @@
-use crate::corners::{BLOCK, Corners, Lanes, MAX_CORNERS, Values, for_widths, spread};
+use crate::corners::{BLOCK, Corners, MAX_CORNERS, for_widths, interpolate_with_slopes};
 use crate::encode::CHUNK;
 use crate::grid::{HashGrid, Level};
 use crate::simd::{Kernel, arch};
 
 impl<const D: usize> HashGrid<D> {
-    /// Length of the Jacobian of `points` points: L·Q·D·F.
+    /// Length L·Q·D·F of the Jacobian of `points` points.
     #[must_use]
     pub fn jacobian_len(&self, points: usize) -> usize {
         self.num_features() * D * points
     }
 
-    /// [`HashGrid::encode`], up to rounding, that also writes the derivatives of the features by
-    /// the coordinates, (L, Q, D, F), overwritten: where a backward pass to the points follows,
-    /// [`HashGrid::jacobian_backward`] need not read the table again, which costs most where it is
-    /// larger than the cache. Runs on the calling thread.
+    /// [`HashGrid::encode`], up to rounding, that also writes the derivatives of the features with
+    /// respect to the coordinates, (L, Q, D, F), overwritten. [`HashGrid::jacobian_backward`] then
+    /// gives the gradient of the points without reading the table again. Runs on the calling thread.
     ///
-    /// On the faces of cells and outside \[0, 1\] the derivatives are those of
+    /// On cell faces and outside \[0, 1\] the derivatives are those of
     /// [`HashGrid::encode_backward_points`].
     ///
+    /// ```
+    /// let grid = hashgrid::HashGrid::<2>::with_resolutions(&[2], 1, 4)?;
+    /// // Corner (i, j) of the 3 × 3 holds x + 2 y, so that the encoding is this function.
+    /// let table: Vec<f32> = (0..9).map(|c| 0.5 * (c % 3 + 2 * (c / 3)) as f32).collect();
+    /// let (mut features, mut jacobian) = ([0.0], [0.0; 2]);
+    /// grid.encode_jacobian(&table, &[[0.25, 0.75]], &mut features, &mut jacobian);
+    /// assert_eq!((features, jacobian), ([1.75], [1.0, 2.0]));
+    ///
+    /// let mut d_points = [[0.0; 2]];
+    /// grid.jacobian_backward(&jacobian, &[10.0], &mut d_points);
+    /// assert_eq!(d_points, [[10.0, 20.0]]);
+    /// # Ok::<(), hashgrid::Error>(())
+    /// ```
+    ///
     /// # Panics
-    /// Where a slice has another length.
+    /// If the length of a slice is wrong.
     pub fn encode_jacobian(&self, table: &[f32], points: &[[f32; D]], features: &mut [f32], jacobian: &mut [f32]) {
         self.assert_table("table", table);
         self.assert_features("features", features, points.len());
         self.assert_jacobian(jacobian, points.len());
         let arch = arch();
-        for (chunk, part) in points.chunks(CHUNK).enumerate() {
-            for (l, level) in self.levels.iter().enumerate() {
-                let table = &table[self.level_range(l)];
-                let range = self.features_range(l, points.len(), chunk * CHUNK, part.len());
-                let jacobian = &mut jacobian[range.start * D..range.end * D];
-                let features = &mut features[range];
-                arch.dispatch(Kernel(
-                    #[inline(always)]
-                    || for_widths!(self.features, level_jacobian::<D>(level, table, part, features, jacobian)),
-                ));
-            }
+        for pass in self.passes(points.len(), CHUNK) {
+            let jacobian = &mut jacobian[pass.features.start * D..pass.features.end * D];
+            let (table, points, features) = (&table[pass.table], &points[pass.points], &mut features[pass.features]);
+            arch.dispatch(Kernel(
+                #[inline(always)]
+                || for_widths!(self.features, level_jacobian::<D>(pass.level, table, points, features, jacobian)),
+            ));
         }
     }
 
-    /// Adds the gradient of the coordinates to `d_points` (Q, D), given what
-    /// [`HashGrid::encode_jacobian`] wrote and the gradient of the features `d_features` (L, Q, F).
+    /// Adds the gradient of the coordinates to `d_points` (Q, D), given the Jacobian written by
+    /// [`HashGrid::encode_jacobian`] and the gradient of the features `d_features` (L, Q, F).
     /// Runs on the calling thread.
     ///
     /// # Panics
-    /// Where a slice has another length.
+    /// If the length of a slice is wrong.
     pub fn jacobian_backward(&self, jacobian: &[f32], d_features: &[f32], d_points: &mut [[f32; D]]) {
-        /// Points whose gradients stay in the first-level cache while all levels pass over them.
-        const PART: usize = 512;
+        /// Points per pass, so that their gradients stay in the first-level cache.
+        const CHUNK: usize = 512;
         self.assert_jacobian(jacobian, d_points.len());
         self.assert_features("d_features", d_features, d_points.len());
-        let points = d_points.len();
-        for (part, d_points) in d_points.chunks_mut(PART).enumerate() {
-            for l in 0..self.levels.len() {
-                let range = self.features_range(l, points, part * PART, d_points.len());
-                let jacobian = &jacobian[range.start * D..range.end * D];
-                let d_features = &d_features[range];
-                for_widths!(self.features, project::<D>(jacobian, d_features, d_points));
-            }
+        for pass in self.passes(d_points.len(), CHUNK) {
+            let jacobian = &jacobian[pass.features.start * D..pass.features.end * D];
+            let (d_features, d_points) = (&d_features[pass.features], &mut d_points[pass.points]);
+            for_widths!(self.features, level_jacobian_backward::<D>(jacobian, d_features, d_points));
         }
     }
 
@@ -84,7 +89,7 @@ fn level_jacobian<const D: usize, const W: usize>(
     for ((points, features), jacobian) in blocks.zip(jacobian.chunks_mut(BLOCK * D * stride)) {
         corners.fill(level, points);
         corners.gather::<D, W>(table, stride, offset, &mut values);
-        let slopes = fold::<D, W>(&mut values, &corners.fraction);
+        let slopes = interpolate_with_slopes::<D, W>(&mut values, &corners.fraction);
         let rows = features.chunks_exact_mut(stride).zip(jacobian.chunks_exact_mut(D * stride));
         for (b, (point, (features, jacobian))) in points.iter().zip(rows).enumerate() {
             features[offset..][..W].copy_from_slice(&values[0][b]);
@@ -99,9 +104,9 @@ fn level_jacobian<const D: usize, const W: usize>(
     }
 }
 
-/// Adds the Jacobian of one level, transposed, times the gradients of its features.
+/// Adds Jᵀ d_features of one level to `d_points`.
 #[inline(always)]
-fn project<const D: usize, const W: usize>(
+fn level_jacobian_backward<const D: usize, const W: usize>(
     jacobian: &[f32],
     d_features: &[f32],
     d_points: &mut [[f32; D]],
@@ -116,41 +121,4 @@ fn project<const D: usize, const W: usize>(
             *d += slopes.iter().zip(d_features).map(|(slope, d)| slope * d).sum::<f32>();
         }
     }
-}
-
-/// Interpolates the corners' values into `values[0]`; returns its derivatives along the axes, a
-/// cell's side being 1.
-#[inline(always)]
-fn fold<const D: usize, const W: usize>(values: &mut Values<W>, fraction: &[Lanes<f32>; 4]) -> [Lanes<[f32; W]>; D] {
-    let mut slopes = [[[[0.0f32; W]; BLOCK]; MAX_CORNERS / 2]; D];
-    for axis in (0..D).rev() {
-        let half = 1 << axis;
-        let t = spread::<W>(&fraction[axis]);
-        let t = t.as_flattened();
-        // The derivatives along the axes that are folded already are interpolated along this one.
-        for slope in &mut slopes[axis + 1..] {
-            let (low, high) = slope.split_at_mut(half);
-            for k in 0..half {
-                let (low, high) = (low[k].as_flattened_mut(), high[k].as_flattened());
-                for i in 0..BLOCK * W {
-                    low[i] += t[i] * (high[i] - low[i]);
-                }
-            }
-        }
-        let (low, high) = values.split_at_mut(half);
-        for k in 0..half {
-            let (low, high) = (low[k].as_flattened_mut(), high[k].as_flattened());
-            let slope = slopes[axis][k].as_flattened_mut();
-            for i in 0..BLOCK * W {
-                let difference = high[i] - low[i];
-                slope[i] = difference;
-                low[i] += t[i] * difference;
-            }
-        }
-    }
-    let mut first = [[[0.0; W]; BLOCK]; D];
-    for j in 0..D {
-        first[j] = slopes[j][0];
-    }
-    first
 }

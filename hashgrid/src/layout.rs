@@ -1,54 +1,54 @@
 use std::ops::Range;
 
-/// Shape of encoded points, (L, Q, F): levels, points, features of a level.
+/// Memory layout (L, Q, F) of encoded points, which an encoder reads and writes level by level, and
+/// its conversion to and from rows of one point each, Q × (L·F), as perceptrons take them. Both
+/// convert a range of points at a time, so that the rows fit a cache.
 ///
-/// A pass over one level reads and writes what belongs together; perceptrons want a row for each
-/// point, Q × (L·F). The two functions here go from one to the other, a range of points at a time,
-/// so that rows need never be more than fit a cache.
+/// ```
+/// let layout = hashgrid::Layout { levels: 2, points: 3, features: 1 };
+/// let mut features = [1.0, 2.0, 3.0, 10.0, 20.0, 30.0];
+/// let mut rows = [0.0; 4];
+/// layout.to_rows(&features, 1..3, &mut rows, 2);
+/// assert_eq!(rows, [2.0, 20.0, 3.0, 30.0]);
+///
+/// layout.clear(0..3, &mut features);
+/// layout.from_rows(&rows, 2, 1..3, &mut features);
+/// assert_eq!(features, [0.0, 2.0, 3.0, 0.0, 20.0, 30.0]);
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Layout {
-    /// L.
+    /// L, levels.
     pub levels: usize,
-    /// Q.
+    /// Q, points.
     pub points: usize,
-    /// F.
+    /// F, features per level.
     pub features: usize,
 }
 
 impl Layout {
-    /// Length of all features, and of the rows of all points without gaps.
-    #[must_use]
-    pub fn len(&self) -> usize {
+    fn len(&self) -> usize {
         self.levels * self.points * self.features
     }
 
-    /// Whether there are none.
-    #[must_use]
-    pub fn is_empty(&self) -> bool {
-        self.len() == 0
-    }
-
-    /// Copies the features of the points in `range` to the starts of `rows`, `stride` numbers
-    /// apart.
+    /// Copies the features of the points in `range` to `rows`, which start `stride` numbers apart.
     ///
     /// # Panics
-    /// Where a slice has another length or is too short, a point is not there, `stride` is less
-    /// than L·F, or that is 0.
+    /// If the length of a slice is wrong, the range exceeds the points, `stride` is less than L·F,
+    /// or L·F is 0.
     pub fn to_rows(&self, features: &[f32], range: Range<usize>, rows: &mut [f32], stride: usize) {
         self.check(features.len(), &range, rows.len(), stride);
         for l in 0..self.levels {
             let from = &features[(l * self.points + range.start) * self.features..][..range.len() * self.features];
             let rows = rows.chunks_mut(stride);
             match self.features {
-                // Known lengths are copied without a call.
+                // Constant lengths are copied without a call to memcpy.
                 2 => from.as_chunks::<2>().0.iter().zip(rows).for_each(|(x, row)| row[2 * l..][..2].copy_from_slice(x)),
                 f => from.chunks_exact(f).zip(rows).for_each(|(x, row)| row[f * l..][..f].copy_from_slice(x)),
             }
         }
     }
 
-    /// The way back: `features` of the points in `range` from the starts of `rows`, `stride`
-    /// numbers apart.
+    /// Inverse of [`Layout::to_rows`]: copies `rows` to the `features` of the points in `range`.
     ///
     /// # Panics
     /// As [`Layout::to_rows`].
@@ -70,7 +70,7 @@ impl Layout {
     /// Zeroes `features` of the points in `range`.
     ///
     /// # Panics
-    /// Where the slice has another length or a point is not there.
+    /// If the length of the slice is wrong or the range exceeds the points.
     pub fn clear(&self, range: Range<usize>, features: &mut [f32]) {
         assert_eq!(features.len(), self.len(), "features of {self:?}");
         assert!(range.end <= self.points, "points {range:?} of {}", self.points);
@@ -80,7 +80,7 @@ impl Layout {
         }
     }
 
-    /// Panics unless there is something to copy from and to.
+    /// Asserts the lengths of both slices.
     fn check(&self, features: usize, range: &Range<usize>, rows: usize, stride: usize) {
         assert_eq!(features, self.len(), "features of {self:?}");
         assert!(range.start <= range.end && range.end <= self.points, "points {range:?} of {}", self.points);
@@ -98,7 +98,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn rows_hold_each_feature_where_they_should_and_go_back(
+        fn rows_hold_the_features_of_their_points_and_convert_back(
             levels in 1usize..5, points in 0usize..20, features in 1usize..5, gap in 0usize..3,
             cut in (0usize..=20, 0usize..=20),
         ) {

@@ -2,9 +2,9 @@
 //! Primitives with a Multiresolution Hash Encoding*, 2022) in 2, 3 or 4 dimensions, with its
 //! backward passes written by hand.
 //!
-//! A point of the unit cube is looked up in L grids of growing resolution; every grid corner owns F
-//! learnable numbers, which are interpolated d-linearly. Grids too fine for their share of the
-//! table index it by a hash.
+//! L grids of growing resolution cover the unit cube; every grid corner has F learnable features,
+//! which are interpolated d-linearly at a point. Levels with more corners than table rows share
+//! rows by a spatial hash.
 //!
 //! ```
 //! use hashgrid::{HashGrid, HashGridConfig};
@@ -25,16 +25,17 @@
 //!
 //! # Conventions
 //!
-//! * Level l has N_l cells an axis; p = x · N_l, cell c = min(⌊p⌋, N_l − 1), corners c and c + 1,
+//! * Level l has N_l cells per axis; p = x · N_l, cell c = min(⌊p⌋, N_l − 1), corners c and c + 1,
 //!   so x = 1 is inside the last cell.
 //! * Where (N_l + 1)^D corners fit the 2^T rows, corner c has row Σ_j c_j (N_l + 1)^j (*dense*);
 //!   else (⊕_j c_j · π_j) mod 2^T in wrapping `u32`, π = 1, 2654435761, 805459861, 3674653429
 //!   (*hashed*).
 //! * Coordinates are clamped to \[0, 1\]; NaN counts as 0. Neither gets a gradient.
-//! * The table is one flat slice owned by the caller, level after level, a dense level holding only
-//!   the rows it has: [`HashGrid::level_range`] says where. Features are (L, Q, F), a level's
-//!   features of all points after each other; [`Layout`] copies them to rows of a point each, and
-//!   back.
+//! * The table is one flat slice owned by the caller, level after level; a dense level has only its
+//!   (N_l + 1)^D rows. [`HashGrid::level_range`] gives the range of a level.
+//! * Features are (L, Q, F): levels, points, features per level. [`Layout`] converts them to and
+//!   from one row per point.
+//! * `encode` overwrites its output; the backward passes add to theirs.
 //! * Results do not depend on the number of threads, bit for bit.
 
 mod backward;
@@ -52,6 +53,6 @@ mod simd;
 #[doc = include_str!("../README.md")]
 struct Readme;
 
-pub use config::{Error, HashGridConfig, MAX_LOG2_TABLE_SIZE, MAX_PARAMETERS, MAX_RESOLUTION};
+pub use config::{Error, HashGridConfig, MAX_RESOLUTION};
 pub use grid::HashGrid;
 pub use layout::Layout;

@@ -1,7 +1,7 @@
-/// A kernel to be compiled for the widest instructions of the machine it runs on.
+/// Closure that [`pulp::Arch::dispatch`] compiles for each instruction set.
 ///
-/// It takes `FnMut`, whose call is the closure's own body: `FnOnce`, which [`pulp::Arch::dispatch`]
-/// takes, goes through a shim that is compiled for the baseline.
+/// `FnMut` inlines the closure's body; `FnOnce`, which `dispatch` accepts directly, calls it through
+/// a shim compiled for the baseline.
 pub(crate) struct Kernel<F>(pub F);
 
 impl<R, F: FnMut() -> R> pulp::WithSimd for Kernel<F> {
@@ -13,8 +13,8 @@ impl<R, F: FnMut() -> R> pulp::WithSimd for Kernel<F> {
     }
 }
 
-/// AVX2 on x86-64, also where `pulp` is built with AVX-512 and the machine has it: rows are put
-/// together from pieces of 8 bytes, which do not go into wider registers any faster.
+/// AVX2 on x86-64 even where AVX-512 is available: rows are gathered in pieces of 8 bytes, which
+/// wider registers do not speed up.
 pub(crate) fn arch() -> pulp::Arch {
     #[cfg(target_arch = "x86_64")]
     if let Some(simd) = pulp::x86::V3::try_new() {

@@ -1,14 +1,14 @@
-//! Shapes of grids, and configurations that are none.
+//! Resolutions, table sizes and errors of configurations.
 
 use approx::assert_abs_diff_eq;
-use hashgrid::{Error, HashGrid, HashGridConfig, MAX_LOG2_TABLE_SIZE, MAX_RESOLUTION};
+use hashgrid::{Error, HashGrid, HashGridConfig, MAX_RESOLUTION};
 use proptest::prelude::*;
 
 const CONFIG: HashGridConfig = HashGridConfig { levels: 16, features: 2, log2_table_size: 19, n_min: 16, n_max: 2048 };
 
 #[test]
 fn resolutions_grow_geometrically_from_n_min_to_n_max() {
-    // b = 2: whole numbers must not be lost to rounding.
+    // b = 2: rounding must not lower the integers.
     let config = HashGridConfig { levels: 8, n_max: 2048, ..CONFIG };
     let grid = HashGrid::<3>::new(&config).unwrap();
     assert_eq!(grid.resolutions(), [16, 32, 64, 128, 256, 512, 1024, 2048]);
@@ -25,7 +25,7 @@ fn resolutions_grow_geometrically_from_n_min_to_n_max() {
 }
 
 #[test]
-fn levels_hold_the_rows_they_need() {
+fn dense_levels_have_a_row_per_corner_and_hashed_ones_the_table_size() {
     let grid = HashGrid::<4>::with_resolutions(&[1, 15, 16, 2048], 2, 16).unwrap();
     assert_eq!(grid.level_range(0), 0..32);
     assert_eq!(grid.level_range(1), 32..32 + (2 << 16));
@@ -34,8 +34,8 @@ fn levels_hold_the_rows_they_need() {
 }
 
 #[test]
-fn corners_beyond_u64_are_hashed() {
-    // (2^24 + 1)^4 overflows u64; 65536^4 = 2^64 would wrap to a power that seems to fit.
+fn levels_whose_corner_count_overflows_u64_are_hashed() {
+    // (2^24 + 1)^4 overflows u64; 65536^4 = 2^64 would wrap to 0, which would fit.
     for resolution in [MAX_RESOLUTION, (1 << 16) - 1, 1 << 16] {
         let grid = HashGrid::<4>::with_resolutions(&[resolution], 1, 10).unwrap();
         assert_eq!(grid.num_parameters(), 1024);
@@ -43,13 +43,13 @@ fn corners_beyond_u64_are_hashed() {
 }
 
 #[test]
-fn absurd_configurations_are_errors() {
+fn settings_out_of_range_are_errors() {
     let error = |config| HashGrid::<4>::new(&config).unwrap_err();
     assert_eq!(error(HashGridConfig { levels: 0, ..CONFIG }), Error::NoLevels);
     assert!(matches!(error(HashGridConfig { levels: 1 << 40, ..CONFIG }), Error::TooManyLevels { .. }));
     assert!(matches!(error(HashGridConfig { features: 0, ..CONFIG }), Error::Features { .. }));
     assert!(matches!(error(HashGridConfig { features: usize::MAX, ..CONFIG }), Error::Features { .. }));
-    for t in [MAX_LOG2_TABLE_SIZE + 1, 40, 64, u32::MAX] {
+    for t in [29, 40, 64, u32::MAX] {
         let expected = Error::TableSize { log2_table_size: t };
         assert_eq!(error(HashGridConfig { log2_table_size: t, ..CONFIG }), expected);
     }
@@ -62,19 +62,19 @@ fn absurd_configurations_are_errors() {
     assert_eq!(HashGrid::<2>::with_resolutions(&[], 1, 1), Err(Error::NoLevels));
     assert_eq!(
         HashGrid::<2>::with_resolutions(&[4, 0], 1, 1).unwrap_err().to_string(),
-        "level 1 has 0 cells an axis, expected 1 to 16777216"
+        "level 1 has a resolution of 0, expected 1 to 16777216"
     );
 }
 
 #[test]
-fn the_first_table_is_small_spread_and_the_seeds() {
+fn the_initial_table_is_uniform_and_determined_by_the_seed() {
     let grid = HashGrid::<3>::new(&HashGridConfig { levels: 4, log2_table_size: 12, ..CONFIG }).unwrap();
     let table = grid.init_table(1);
     assert_eq!(table.len(), grid.num_parameters());
     assert!(table.iter().all(|x| x.abs() <= 1e-4));
     let mean = table.iter().map(|&x| f64::from(x)).sum::<f64>() / table.len() as f64;
     let variance = table.iter().map(|&x| f64::from(x).powi(2)).sum::<f64>() / table.len() as f64;
-    // A uniform distribution in ±a has variance a²/3; 32 k samples.
+    // A uniform distribution in ±a has variance a² / 3; 32 k samples.
     assert!(mean.abs() < 2e-6, "{mean}");
     assert_abs_diff_eq!(variance / (1e-8 / 3.0), 1.0, epsilon = 0.03);
     assert_eq!(table, grid.init_table(1));
@@ -85,7 +85,7 @@ proptest! {
     #![proptest_config(ProptestConfig::with_cases(256))]
 
     #[test]
-    fn any_configuration_is_a_grid_or_an_error(
+    fn every_configuration_gives_a_grid_within_its_limits_or_an_error(
         levels in 0usize..70, features in 0usize..300, log2_table_size in 0u32..34, n_min: u32, n_max: u32,
     ) {
         let config = HashGridConfig { levels, features, log2_table_size, n_min: n_min >> 8, n_max: n_max >> 7 };

@@ -8,8 +8,8 @@ use std::sync::OnceLock;
 use divan::Bencher;
 use divan::counter::ItemsCount;
 use glam::Vec3;
-use synth::{DemoConfig, demo};
 use occnerf::{Config, FieldRenderer, Method, Preset, Renderer, Scene, Trainer};
+use synth::{DemoConfig, demo};
 
 fn main() {
     let _ = rayon::ThreadPoolBuilder::new().num_threads(2).build_global();

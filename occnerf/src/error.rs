@@ -32,9 +32,13 @@ pub enum Error {
     /// A capture that cannot be trained on.
     #[error("scene: {0}")]
     Scene(String),
-    /// Pictures or weights that LPIPS cannot take.
-    #[error("LPIPS: {0}")]
-    Lpips(String),
+    /// Weights or images that LPIPS cannot take.
+    #[cfg(feature = "lpips")]
+    #[error(transparent)]
+    Lpips(#[from] lpips::Error),
+    /// A perceptual term without its weights.
+    #[error("perceptual term: {0}")]
+    Perceptual(String),
     /// An avatar that cannot be written in the form that is asked for.
     #[error("{0}")]
     Bake(String),

@@ -33,13 +33,13 @@ mod check;
 mod config;
 mod error;
 mod evaluate;
-#[cfg_attr(not(feature = "lpips"), path = "lpips/absent.rs")]
 mod lpips;
 mod model;
 mod render;
 mod scene;
 mod train;
 
+pub use self::lpips::Lpips;
 pub use ::capture;
 pub use atomic::replace_file;
 pub use capacity::{Capacity, Choice, Measured, Pruned};
@@ -50,7 +50,6 @@ pub use config::{
 };
 pub use error::Error;
 pub use evaluate::{FrameMetrics, SplitMetrics, evaluate, evaluate_with, least_seen_quartile, nearest_vertices};
-pub use lpips::{Lpips, Trunk};
 pub use model::body::{Body, Moment};
 pub use model::colors::PriorColors;
 pub use model::person::Person;

@@ -2,9 +2,9 @@
 #![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
 
 use allocation_counter::measure;
-use synth::{DemoConfig, demo};
 use occnerf::{Config, Method, Preset, Scene, Trainer};
 use smpl::BodyModel;
+use synth::{DemoConfig, demo};
 
 /// What is left are lists of a number or six for each joint; a batch larger than any before makes
 /// buffers grow.

@@ -9,9 +9,9 @@ use std::path::PathBuf;
 
 use glam::{Vec2, Vec3};
 use occnerf::bake::{Avatar, Clip, turn_upright};
-use synth::{DemoConfig, demo};
 use occnerf::{Config, Method, Preset, PriorColors, Scene};
 use stand_in::stand_in;
+use synth::{DemoConfig, demo};
 
 fn scene() -> Scene {
     let body = smpl::BodyModel::embedded();

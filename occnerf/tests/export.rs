@@ -12,9 +12,9 @@ use std::sync::OnceLock;
 use glam::{Mat3, Quat, Vec2, Vec3};
 use occnerf::bake::Avatar;
 use occnerf::bake::export::{Splats, adapt_motion, splats, write_amass, write_obj};
-use synth::{DemoConfig, demo};
 use occnerf::{Config, Method, Preset, PriorColors, Scene};
 use smpl::{Character, MotionClip};
+use synth::{DemoConfig, demo};
 
 fn avatar() -> &'static Avatar {
     static AVATAR: OnceLock<Avatar> = OnceLock::new();

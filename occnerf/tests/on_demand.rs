@@ -5,9 +5,9 @@ mod common;
 
 use common::{TempDir, config};
 use occnerf::capture::{Capture, Layout, LoadOptions, load_capture};
-use synth::{SynthConfig, synthesise};
 use occnerf::{FieldRenderer, Method, PriorColors, Scene, Trainer, evaluate};
 use smpl::BodyModel;
+use synth::{SynthConfig, synthesise};
 
 const SIZE: u32 = 32;
 const STEPS: u64 = 8;

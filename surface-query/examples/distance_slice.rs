@@ -35,7 +35,8 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         let query = Vec3::new(column as f32 - 240.0, 240.0 - row as f32, 0.0) / 60.0;
         let d = mesh.closest(query).signed_distance;
         // Bands of 0.1 that fade with the distance.
-        let fade = (-0.8 * d.abs()).exp() * if (d.abs() / 0.1) as u32 % 2 == 0 { 1.0 } else { 0.88 };
+        let band = (d.abs() / 0.1).floor();
+        let fade = (-0.08 * band).exp() * if band % 2.0 == 0.0 { 1.0 } else { 0.88 };
         let colour = if d < 0.0 { [0.3, 0.55, 1.0] } else { [1.0, 0.7, 0.3] };
         if d.abs() < 0.02 { Rgb([255; 3]) } else { Rgb(colour.map(|c| (c * fade * 255.0) as u8)) }
     });

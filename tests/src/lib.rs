@@ -1,5 +1,5 @@
-//! Test kit of the workspace: meshes, proptest strategies, a finite-difference gradient checker,
-//! rank statistics and brute-force oracles.
+//! Test kit of the workspace: meshes, proptest strategies, a finite-difference gradient checker
+//! and brute-force oracles.
 //!
 //! Everything here is written to be obviously right rather than fast. The oracles take slices and
 //! glam values only, compute in `f64`, and share no code with the crates they check.
@@ -22,7 +22,6 @@ pub mod files;
 pub mod gradient;
 pub mod mesh;
 pub mod oracle;
-pub mod statistics;
 pub mod strategy;
 
 pub use glam;

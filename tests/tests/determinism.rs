@@ -6,11 +6,11 @@ mod common;
 
 use common::{TempDir, bits, body, checkpoint, demo_config, on_threads, scene, tiny, train};
 use glam::Vec3;
-use synth::demo;
 use occnerf::{
     Config, DistanceKind, FieldRenderer, Method, MotionKind, PriorColors, PriorRenderer, Renderer, Scene, Trainer,
     checkpoint_config,
 };
+use synth::demo;
 
 /// Every method that has a field, the main ones with both kinds of motion, and the paper's blended
 /// distances with its learnable volume.

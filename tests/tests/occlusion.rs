@@ -8,8 +8,8 @@ mod common;
 use common::{TempDir, body, capture, scene, tiny, train};
 use glam::Vec3;
 use occnerf::capture::{Capture, LoadOptions, Pixels, load_capture};
-use synth::{DemoConfig, demo};
 use occnerf::{Label, Method, MotionKind, OccludedRule, PriorColors, Scene, upright};
+use synth::{DemoConfig, demo};
 
 const NO_DISTORTION: [f64; 5] = [0.0; 5];
 const BARREL: [f64; 5] = [-0.2, 0.05, 0.001, -0.002, 0.0];

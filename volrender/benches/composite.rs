@@ -1,5 +1,5 @@
 //! Compositing 6144 rays (six patches of 32×32) of 128 samples, forward and backward, on two
-//! threads, against a plain implementation. items/s are samples.
+//! threads, against the definition. items/s are samples.
 
 use divan::counter::ItemsCount;
 use divan::{Bencher, black_box};
@@ -12,12 +12,11 @@ const SAMPLES: usize = 128;
 const TOTAL: usize = RAYS * SAMPLES;
 
 fn main() {
-    // The targets are for two threads.
     let _ = rayon::ThreadPoolBuilder::new().num_threads(2).build_global();
     divan::main();
 }
 
-/// Empty space, then a soft surface, then a solid inside.
+/// Rays through empty space, a soft surface and an opaque inside.
 struct Rays {
     sigma: Vec<f32>,
     likelihood: Vec<f32>,
@@ -71,7 +70,7 @@ impl Rays {
 
 type Run<'a> = dyn Fn(RaySamples<'_>, &mut [f32], SampleGradients<'_>) + Sync + 'a;
 
-/// One ray's inputs and outputs at a time, on the pool.
+/// Calls `run` for each ray in parallel.
 fn each_ray(rays: &Rays, out: &mut Outputs, run: &Run<'_>) {
     let Outputs { weights, d_sigma, d_rgb, d_likelihood } = out;
     weights
@@ -109,7 +108,7 @@ fn forward_and_backward(bencher: Bencher<'_, '_>) {
     });
 }
 
-/// The same from the definition: libm's exp, and a suffix sum divided by 1 − α.
+/// The definition: libm's exp, and a suffix sum divided by 1 − α.
 #[divan::bench]
 fn forward_and_backward_plain(bencher: Bencher<'_, '_>) {
     let (rays, mut out) = (Rays::new(), Outputs::new());
@@ -141,7 +140,7 @@ fn forward_and_backward_plain(bencher: Bencher<'_, '_>) {
     });
 }
 
-/// One ray again and again on one thread: the arithmetic without the memory.
+/// One ray in the cache on one thread: arithmetic without memory traffic.
 #[divan::bench]
 fn forward_and_backward_in_cache(bencher: Bencher<'_, '_>) {
     let (rays, mut out) = (Rays::new(), Outputs::new());

@@ -1,4 +1,4 @@
-//! Metrics of 256×256 images on two threads, against the test kit's plain SSIM. items/s are pixels.
+//! Metrics of 256×256 images on two threads, against the test kit's reference SSIM. items/s are pixels.
 
 use divan::counter::ItemsCount;
 use divan::{Bencher, black_box};

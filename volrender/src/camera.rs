@@ -4,21 +4,42 @@ use crate::distortion::Distortion;
 use crate::ray::Ray;
 
 /// A pinhole camera in OpenCV's convention: x right, y down, z forward.
+///
+/// ```
+/// use glam::{Affine3A, Mat3, Vec3};
+/// use volrender::Camera;
+///
+/// // fx, fy 80; cx 32, cy 24; two metres in front of the origin.
+/// let intrinsics = Mat3::from_cols_array(&[80.0, 0.0, 0.0, 0.0, 80.0, 0.0, 32.0, 24.0, 1.0]);
+/// let camera = Camera::new(intrinsics, Affine3A::from_translation(Vec3::Z * 2.0), 64, 48)?;
+/// assert_eq!(camera.centre_of_projection(), Vec3::Z * -2.0);
+/// assert_eq!(camera.ray(32.0, 24.0).direction, Vec3::Z);
+/// assert_eq!(camera.project(Vec3::X), Some(Vec3::new(72.0, 24.0, 2.0))); // pixel and depth
+/// # Ok::<(), volrender::Error>(())
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Camera {
     /// Focal lengths in pixels.
     pub focal: Vec2,
-    /// Principal point in pixels; (0, 0) is the outer corner of the first pixel.
+    /// Principal point in pixels; (0, 0) is the outer corner of the top left pixel.
     pub centre: Vec2,
-    /// Extrinsics.
+    /// Extrinsics, world to camera.
     pub world_to_camera: Affine3A,
-    /// Pixels a row.
+    /// Image width in pixels.
     pub width: u32,
-    /// Rows.
+    /// Image height in pixels.
     pub height: u32,
 }
 
-/// Why a camera or a metric cannot be had.
+/// Invalid camera parameters, or an image too small for a metric.
+///
+/// ```
+/// use volrender::{Error, metrics};
+///
+/// let small = metrics::ssim(&[0.5; 75], &[0.5; 75], 5, 5).unwrap_err();
+/// assert_eq!(small, Error::ImageSize { width: 5, height: 5, least: 7 });
+/// assert_eq!(small.to_string(), "an image of 5×5 pixels is smaller than 7×7");
+/// ```
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
@@ -26,31 +47,31 @@ pub enum Error {
     /// finite focal lengths.
     #[error("intrinsics {0} are not [fx 0 cx; 0 fy cy; 0 0 1] with positive focal lengths")]
     Intrinsics(Mat3),
-    /// Values that are not finite, or a linear part that cannot be inverted.
+    /// Extrinsics with values that are not finite, or with a singular linear part.
     #[error("extrinsics {0} are not finite and invertible")]
     Extrinsics(Affine3A),
     /// An image without pixels, or one smaller than a metric's window.
     #[error("an image of {width}×{height} pixels is smaller than {least}×{least}")]
     ImageSize {
-        /// Pixels a row.
+        /// Image width in pixels.
         width: usize,
-        /// Rows.
+        /// Image height in pixels.
         height: usize,
         /// Smallest side allowed.
         least: usize,
     },
 }
 
-/// Skew, relative to the focal length, below which it is rounding of a calibration file.
+/// Skew relative to the focal length that is tolerated as rounding of a calibration file.
 const SKEW: f32 = 1e-5;
 
 impl Camera {
     /// A camera from a 3×3 calibration matrix and extrinsics that map world to camera.
     ///
     /// # Errors
-    /// Skewed or otherwise unusual intrinsics, extrinsics that are not finite or not invertible, no
-    /// pixels. A rotation that is not quite orthonormal, or scaled, is accepted: rays stay exact
-    /// and of unit length, the depth of [`Camera::project`] is then in the camera's unit.
+    /// Skewed or otherwise invalid intrinsics, extrinsics that are not finite or not invertible, an
+    /// image without pixels. Scaled and not quite orthonormal rotations are accepted: rays stay
+    /// exact and of unit length, the depth of [`Camera::project`] is in the camera's unit.
     pub fn new(intrinsics: Mat3, world_to_camera: Affine3A, width: u32, height: u32) -> Result<Self, Error> {
         let k = intrinsics;
         let focal = Vec2::new(k.x_axis.x, k.y_axis.y);
@@ -80,7 +101,7 @@ impl Camera {
         Mat3::from_cols(Vec3::new(self.focal.x, 0.0, 0.0), Vec3::new(0.0, self.focal.y, 0.0), self.centre.extend(1.0))
     }
 
-    /// Position of the camera in the world.
+    /// Centre of projection in the world.
     #[must_use]
     pub fn centre_of_projection(&self) -> Vec3 {
         self.world_to_camera.inverse().translation.into()
@@ -96,8 +117,8 @@ impl Camera {
         Ray { origin: camera_to_world.translation.into(), direction: direction.normalize_or_zero() }
     }
 
-    /// Image position and depth (u, v, z) of a point of the world, whether inside the image or not.
-    /// `None` where it is not in front of the camera, or the result is not finite.
+    /// Pixel coordinates and depth (u, v, z) of a world point, inside the image or not. `None` if it
+    /// is not in front of the camera or the result is not finite.
     #[must_use]
     pub fn project(&self, x: Vec3) -> Option<Vec3> {
         let p = self.world_to_camera.transform_point3(x);
@@ -109,7 +130,7 @@ impl Camera {
         projected.is_finite().then_some(projected)
     }
 
-    /// The camera of the same picture scaled to `width` × `height` pixels (each at least 1).
+    /// The camera of the image resized to `width` × `height` pixels (each at least 1).
     #[must_use]
     pub fn resized(&self, width: u32, height: u32) -> Self {
         let (width, height) = (width.max(1), height.max(1));
@@ -117,8 +138,8 @@ impl Camera {
         Self { focal: self.focal * scale, centre: self.centre * scale, width, height, ..*self }
     }
 
-    /// The pixel where a lens with `distortion` puts what a perfect lens puts at `pixel`: read a
-    /// distorted photograph here to fill `pixel` of the undistorted one.
+    /// Position in the distorted image of `pixel` in the undistorted one: the lookup that undistorts
+    /// an image.
     #[must_use]
     pub fn distort_pixel(&self, distortion: &Distortion, pixel: Vec2) -> Vec2 {
         let p = (pixel - self.centre) / self.focal;

@@ -5,32 +5,52 @@ use glam::{Vec3, Vec4};
 use crate::exponential::{one_minus_exp, optical_depth};
 use crate::simd::Kernel;
 
-/// Samples whose exponentials are computed together in SIMD lanes.
+/// Samples per block of SIMD exponentials.
 pub(crate) const BLOCK: usize = 32;
 
-/// Alphas compared together.
+/// Alphas compared at once.
 const LANES: usize = 8;
 
 /// The samples of one ray, nearest first. All slices are (S).
+///
+/// ```
+/// use glam::Vec3;
+/// use volrender::{RaySamples, composite};
+///
+/// // Two rays of two samples each, in one set of slices: fog that absorbs half, then a wall.
+/// let sigma = [2f32.ln(), 1e9, 0.0, 2f32.ln()];
+/// let samples = RaySamples {
+///     sigma: &sigma,
+///     likelihood: &[1.0; 4],
+///     delta: &[1.0; 4],
+///     t: &[0.5, 1.5, 0.5, 1.5],
+///     rgb: &[Vec3::X, Vec3::Y, Vec3::X, Vec3::Y],
+/// };
+/// let mut weights = [0.0; 2];
+/// let pixel = composite(samples.slice(0..2), Vec3::ZERO, &mut weights);
+/// assert!(pixel.color.distance(Vec3::new(0.5, 0.5, 0.0)) < 1e-6 && pixel.termination == Some(1));
+/// let pixel = composite(samples.slice(2..4), Vec3::ZERO, &mut weights);
+/// assert!(pixel.color.distance(Vec3::new(0.0, 0.5, 0.0)) < 1e-6);
+/// ```
 #[derive(Clone, Copy, Debug, Default)]
 pub struct RaySamples<'a> {
-    /// Density σ in 1/length, at least 0, however large.
+    /// Density σ ≥ 0 in 1/length; infinity counts as `f32::MAX`.
     pub sigma: &'a [f32],
-    /// Likelihood f in [0, 1] that anything is there, which scales α; 1 for an ordinary renderer.
+    /// Foreground likelihood f in [0, 1], which scales α; 1 for an ordinary renderer.
     pub likelihood: &'a [f32],
-    /// Width δ of the sample's own bin.
+    /// Width δ ≥ 0 of the sample's own bin; infinity counts as `f32::MAX`.
     pub delta: &'a [f32],
-    /// Depth.
+    /// Depth, finite.
     pub t: &'a [f32],
     /// Colour c.
     pub rgb: &'a [Vec3],
 }
 
 impl RaySamples<'_> {
-    /// The samples in `range`: one ray of many whose samples stand one after the other.
+    /// The samples in `range`: one ray of several stored consecutively.
     ///
     /// # Panics
-    /// Where a slice ends before the range.
+    /// If the range exceeds a slice.
     #[must_use]
     pub fn slice(&self, range: Range<usize>) -> Self {
         Self {
@@ -42,7 +62,7 @@ impl RaySamples<'_> {
         }
     }
 
-    /// Panics where the lengths of the slices, or those of the results, differ.
+    /// Asserts that all slices and results have the same length.
     pub(crate) fn assert_lengths<const N: usize>(&self, results: [usize; N]) {
         let Self { sigma, likelihood, delta, t, rgb } = self;
         let n = sigma.len();
@@ -58,13 +78,20 @@ impl RaySamples<'_> {
 }
 
 /// One composited ray.
+///
+/// ```
+/// use glam::Vec3;
+///
+/// let pixel = volrender::composite(Default::default(), Vec3::X, &mut []);
+/// assert_eq!((pixel.color, pixel.opacity, pixel.termination), (Vec3::X, 0.0, None));
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Composite {
     /// C = Σ w_i c_i + (1 − Σ w_i) · background.
     pub color: Vec3,
     /// Σ w_i, in [0, 1].
     pub opacity: f32,
-    /// Σ w_i t_i; divide by the opacity for the mean depth of what was hit.
+    /// Σ w_i t_i; divide by the opacity for the expected depth of the surface.
     pub depth: f32,
     /// Lowest index among the samples of largest α; `None` without samples or where every α is 0.
     pub termination: Option<u32>,
@@ -73,14 +100,13 @@ pub struct Composite {
 /// Composites the samples of one ray and writes their weights (S), w_i = α_i Π_{j<i} (1 − α_j) with
 /// α_i = f_i (1 − exp(−σ_i δ_i)) (Max 1995; the likelihood f as in HumanNeRF, 2022).
 ///
-/// Samples that are known to have α = 0 may be left out: but for the index of the
-/// termination the result is the same. A NaN in the
-/// inputs makes the colour NaN and never wins the termination.
-///
-/// Transmittance below 1e-38 counts as 0.
+/// Omitting samples with α = 0 changes nothing but the index of the termination. A NaN in the
+/// inputs makes the colour NaN and is never the termination. Transmittance below 1e-38 counts as 0.
+/// Bins of any width and densities of any size give finite results, if depths are below 3.4e38 and
+/// colours are finite. [`RaySamples`] has an example.
 ///
 /// # Panics
-/// Where the slices differ in length.
+/// If the slices differ in length.
 pub fn composite(samples: RaySamples<'_>, background: Vec3, weights: &mut [f32]) -> Composite {
     samples.assert_lengths([weights.len()]);
     pulp::Arch::new().dispatch(Kernel(
@@ -110,8 +136,7 @@ fn forward(samples: RaySamples<'_>, background: Vec3, weights: &mut [f32]) -> Co
         if let Some(i) = first_largest(alpha, &mut largest) {
             termination = Some((block * BLOCK + i) as u32);
         }
-        // One sum each, in the order of the samples: leaving out those with α = 0 then changes no
-        // bit.
+        // Sequential sums: omitting samples with α = 0 changes no bit.
         let outputs = weights.iter_mut().zip(t).zip(rgb);
         for (&alpha, ((weight, &t), &rgb)) in alpha.iter().zip(outputs) {
             *weight = transmittance * alpha;
@@ -121,13 +146,13 @@ fn forward(samples: RaySamples<'_>, background: Vec3, weights: &mut [f32]) -> Co
         }
         transmittance = flushed(transmittance);
     }
-    // Rounding may carry a sum of weights past 1.
+    // The sum of weights may exceed 1 by rounding.
     let opacity = if opacity > 1.0 { 1.0 } else { opacity };
     Composite { color: sum.truncate() + (1.0 - opacity) * background, opacity, depth: sum.w, termination }
 }
 
-/// The first index of the largest of `alpha` (at most [`BLOCK`]) that is larger than `largest`,
-/// which it then becomes; `None` where there is none. NaN is not larger than anything.
+/// Lowest index of the maximum of `alpha` (at most [`BLOCK`]) if that exceeds `largest`, which it
+/// then replaces; else `None`. NaN is ignored.
 #[inline(always)]
 fn first_largest(alpha: &[f32], largest: &mut f32) -> Option<usize> {
     let mut lanes = [0.0f32; LANES];
@@ -144,7 +169,7 @@ fn first_largest(alpha: &[f32], largest: &mut f32) -> Option<usize> {
     alpha.iter().position(|&alpha| alpha == most)
 }
 
-/// Transmittance after a block. Denormal numbers are flushed: they change no pixel and are slow.
+/// Transmittance after a block, denormal numbers flushed to 0: they are slow and change no pixel.
 #[inline(always)]
 pub(crate) fn flushed(transmittance: f32) -> f32 {
     if transmittance < f32::MIN_POSITIVE { 0.0 } else { transmittance }

@@ -4,6 +4,17 @@ use glam::{Mat2, Vec2};
 ///
 /// With r² = x² + y² and s = 1 + k1 r² + k2 r⁴ + k3 r⁶: x' = s x + 2 p1 x y + p2 (r² + 2 x²) and
 /// y' = s y + p1 (r² + 2 y²) + 2 p2 x y (Brown 1966).
+///
+/// ```
+/// use glam::Vec2;
+/// use volrender::Distortion;
+///
+/// let barrel = Distortion::from_opencv([-0.1, 0.0, 0.0, 0.0, 0.0]);
+/// let distorted = barrel.distort(Vec2::new(0.5, 0.0));
+/// assert!((distorted.x - 0.4875).abs() < 1e-6); // 0.5 (1 − 0.1 · 0.25)
+/// assert!(barrel.undistort(distorted).unwrap().distance(Vec2::new(0.5, 0.0)) < 1e-6);
+/// assert!((barrel.fold_radius() - (1.0f32 / 0.3).sqrt()).abs() < 1e-6);
+/// ```
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Distortion {
     /// Radial, r².
@@ -18,30 +29,29 @@ pub struct Distortion {
     pub k3: f32,
 }
 
-/// Newton steps before giving up; a lens anybody sells needs fewer than 10.
+/// Largest number of Newton steps; photographic lenses need fewer than 10.
 const MAX_STEPS: usize = 50;
 
 impl Distortion {
-    /// Takes OpenCV's order (k1, k2, p1, p2, k3).
+    /// Coefficients in OpenCV's order (k1, k2, p1, p2, k3).
     #[must_use]
     pub fn from_opencv([k1, k2, p1, p2, k3]: [f32; 5]) -> Self {
         Self { k1, k2, p1, p2, k3 }
     }
 
-    /// Whether the lens is perfect.
+    /// Whether all coefficients are 0.
     #[must_use]
-    pub fn is_none(&self) -> bool {
+    pub fn is_identity(&self) -> bool {
         *self == Self::default()
     }
 
-    /// Ideal distance from the axis from which on the radial part folds back, so that a picture
-    /// would show the same twice: the first at which r · (1 + k1 r² + k2 r⁴ + k3 r⁶) no longer
-    /// grows; infinite where it always does.
+    /// Smallest undistorted radius at which r · (1 + k1 r² + k2 r⁴ + k3 r⁶) stops growing; infinite
+    /// if it always grows. Beyond it the model is not invertible.
     #[must_use]
     pub fn fold_radius(&self) -> f32 {
         let [a, b, c] = [3.0 * f64::from(self.k1), 5.0 * f64::from(self.k2), 7.0 * f64::from(self.k3)];
         let slope = |u: f64| 1.0 + u * (a + u * (b + u * c));
-        // Between its turning points the slope, a cubic in u = r², crosses zero at most once.
+        // Between its extrema the slope, a cubic in u = r², crosses zero at most once.
         let discriminant = (b * b - 3.0 * a * c).max(0.0).sqrt();
         let mut ends = if c == 0.0 {
             vec![-a / (2.0 * b)]
@@ -68,19 +78,19 @@ impl Distortion {
         f32::INFINITY
     }
 
-    /// Ideal to distorted coordinates.
+    /// Undistorted to distorted coordinates.
     #[must_use]
     pub fn distort(&self, p: Vec2) -> Vec2 {
         self.distort_with_jacobian(p).0
     }
 
-    /// Distorted to ideal coordinates, by Newton's method from `p`.
+    /// Distorted to undistorted coordinates, by Newton's method from `p`.
     ///
-    /// `None` where it does not converge: beyond the radius where the model folds back nothing maps
-    /// to `p`, and the point it finds may then lie on another branch of the fold.
+    /// `None` if it does not converge. Beyond the [fold radius](Self::fold_radius) there may be no
+    /// solution, or the one found lies on another branch.
     #[must_use]
     pub fn undistort(&self, p: Vec2) -> Option<Vec2> {
-        if self.is_none() {
+        if self.is_identity() {
             return Some(p);
         }
         let tolerance = 4.0 * f32::EPSILON * (1.0 + p.length());
@@ -129,7 +139,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn the_radius_grows_up_to_the_fold_and_no_farther(
+        fn the_distorted_radius_grows_exactly_up_to_the_fold_radius(
             k1 in prop_oneof![Just(0.0f32), -1.0f32..1.0],
             k2 in prop_oneof![Just(0.0f32), -1.0f32..1.0],
             k3 in prop_oneof![Just(0.0f32), -1.0f32..1.0],
@@ -143,7 +153,7 @@ mod tests {
             let end = fold.min(1e3);
             for i in 0..1000 {
                 let r = end * f64::from(i) / 1000.0;
-                // Where the slope touches zero without crossing it, rounding decides.
+                // A double root of the slope is decided by rounding.
                 prop_assert!(slope(r) > -1e-6 * (1.0 + r.powi(6)), "{r} of {fold}: {}", slope(r));
             }
             if fold.is_finite() {
@@ -153,7 +163,7 @@ mod tests {
     }
 
     #[test]
-    fn the_jacobian_is_the_slope_of_distort() {
+    fn the_jacobian_equals_finite_differences() {
         let lens = Distortion::from_opencv([0.3, -0.2, 0.1, -0.15, 0.25]);
         for p in [Vec2::new(0.4, -0.3), Vec2::new(-0.6, 0.1), Vec2::ZERO] {
             let (_, jacobian) = lens.distort_with_jacobian(p);

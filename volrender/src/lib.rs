@@ -1,5 +1,5 @@
-//! The outer parts of a volume renderer: cameras and rays, patches of pixels, bounds, the cells
-//! worth sampling, samples along a ray, alpha compositing with its backward pass, and image
+//! Volume rendering on the CPU without the field: pinhole cameras and lens distortion, rays and
+//! boxes, occupancy grids, stratified samples, alpha compositing with its backward pass, and image
 //! metrics.
 //!
 //! ```

@@ -7,8 +7,13 @@ use crate::camera::Error;
 /// Peak signal-to-noise ratio in dB, −10 log10 of the mean squared difference of all values (any
 /// shape). Infinite for equal images, NaN for empty ones.
 ///
+/// ```
+/// let psnr = volrender::metrics::psnr(&[0.5; 12], &[0.6; 12]);
+/// assert!((psnr - 20.0).abs() < 1e-5);
+/// ```
+///
 /// # Panics
-/// Where the lengths differ.
+/// If the lengths differ.
 #[must_use]
 pub fn psnr(a: &[f32], b: &[f32]) -> f64 {
     assert_eq!(a.len(), b.len(), "images of {} and {} values", a.len(), b.len());
@@ -16,11 +21,16 @@ pub fn psnr(a: &[f32], b: &[f32]) -> f64 {
     decibels(sum / a.len() as f64)
 }
 
-/// [`psnr`] of the pixels where `mask` (H·W) is true, all three channels of each. `None` where it
-/// never is.
+/// [`psnr`] over the pixels where `mask` (H·W) is true. `None` for an empty mask.
+///
+/// ```
+/// let (a, b) = ([0.5; 6], [0.5, 0.5, 0.5, 0.6, 0.6, 0.6]);
+/// let psnr = volrender::metrics::psnr_masked(&a, &b, &[false, true]).unwrap();
+/// assert!((psnr - 20.0).abs() < 1e-5);
+/// ```
 ///
 /// # Panics
-/// Where the lengths are not 3·H·W, 3·H·W and H·W.
+/// If the lengths are not 3·H·W, 3·H·W and H·W.
 #[must_use]
 pub fn psnr_masked(a: &[f32], b: &[f32], mask: &[bool]) -> Option<f64> {
     assert_mask(a, b, mask);
@@ -52,39 +62,43 @@ const BORDER: usize = WINDOW / 2;
 /// data_range=1, channel_axis=-1)`: 7×7 uniform window, sample covariance (n / (n − 1)), K1 0.01,
 /// K2 0.03, data range 1.
 ///
+/// ```
+/// let image: Vec<f32> = (0..3 * 8 * 8).map(|i| (i % 10) as f32 / 10.0).collect();
+/// let darker: Vec<f32> = image.iter().map(|x| 0.9 * x).collect();
+/// assert_eq!(volrender::metrics::ssim(&image, &image, 8, 8)?, 1.0);
+/// assert!(volrender::metrics::ssim(&image, &darker, 8, 8)? < 1.0);
+/// # Ok::<(), volrender::Error>(())
+/// ```
+///
 /// # Errors
 /// [`Error::ImageSize`] for an image smaller than the window.
 ///
 /// # Panics
-/// Where the lengths are not 3·H·W.
+/// If the lengths are not 3·H·W.
 pub fn ssim(a: &[f32], b: &[f32], width: usize, height: usize) -> Result<f64, Error> {
     if width < WINDOW || height < WINDOW {
         return Err(Error::ImageSize { width, height, least: WINDOW });
     }
-    let map = map_f64(a, b, width, height);
+    let map = ssim_map(a, b, width, height);
     let rows = map.chunks_exact(width).take(height - BORDER).skip(BORDER);
     let sum: f64 = rows.flat_map(|row| &row[BORDER..width - BORDER]).sum();
     Ok(sum / ((width - 2 * BORDER) * (height - 2 * BORDER)) as f64)
 }
 
-/// Structural similarity around every pixel (H·W), channels averaged, with the constants of
-/// [`ssim`]. Beyond the border the image is mirrored with the edge sample repeated (scipy's
-/// `reflect`), so any size but 0 has a map.
+/// Structural similarity averaged over the pixels where `mask` (H·W) is true, with the constants of
+/// [`ssim`]. `None` for an empty mask.
+///
+/// Beyond the border the image is mirrored with the edge sample repeated (scipy's `reflect`).
+/// Windows extend 3 pixels beyond the mask's edge, so the pixels there have an influence.
+///
+/// ```
+/// let (a, b) = ([0.5; 3 * 16], [0.25; 3 * 16]);
+/// let ssim = volrender::metrics::ssim_masked(&a, &b, &[true; 16], 4, 4).unwrap();
+/// assert!((ssim - 0.8001).abs() < 1e-4); // (2 · 0.5 · 0.25 + C1) / (0.5² + 0.25² + C1)
+/// ```
 ///
 /// # Panics
-/// Where the lengths are not 3·H·W.
-#[must_use]
-pub fn ssim_map(a: &[f32], b: &[f32], width: usize, height: usize) -> Vec<f32> {
-    let map = map_f64(a, b, width, height);
-    map.into_iter().map(|ssim| ssim as f32).collect()
-}
-
-/// Mean of [`ssim_map`] over the pixels where `mask` (H·W) is true. `None` where it never is.
-///
-/// Windows reach 3 pixels over the mask's edge, so what lies there has an influence.
-///
-/// # Panics
-/// Where the lengths are not 3·H·W, 3·H·W and H·W.
+/// If the lengths are not 3·H·W, 3·H·W and H·W.
 #[must_use]
 pub fn ssim_masked(a: &[f32], b: &[f32], mask: &[bool], width: usize, height: usize) -> Option<f64> {
     assert_mask(a, b, mask);
@@ -92,7 +106,7 @@ pub fn ssim_masked(a: &[f32], b: &[f32], mask: &[bool], width: usize, height: us
     if count == 0 {
         return None;
     }
-    let map = map_f64(a, b, width, height);
+    let map = ssim_map(a, b, width, height);
     let inside = map.iter().zip(mask).filter(|(_, inside)| **inside);
     Some(inside.map(|(ssim, _)| ssim).sum::<f64>() / count as f64)
 }
@@ -111,7 +125,8 @@ fn assert_mask(a: &[f32], b: &[f32], mask: &[bool]) {
 const MOMENTS: usize = 5;
 type Moments = [f64; 3 * MOMENTS];
 
-fn map_f64(a: &[f32], b: &[f32], width: usize, height: usize) -> Vec<f64> {
+/// Structural similarity around every pixel (H·W), channels averaged.
+fn ssim_map(a: &[f32], b: &[f32], width: usize, height: usize) -> Vec<f64> {
     assert!(
         a.len() == 3 * width * height && b.len() == a.len(),
         "images of {} and {} values, expected 3 × {width} × {height}",

@@ -3,59 +3,74 @@ use rayon::prelude::*;
 
 use crate::Aabb;
 
-/// Cells an axis at most; a body with outstretched arms at 1 cm needs about 200.
+/// Largest number of cells per axis; a body with outstretched arms at 1 cm needs about 200.
 const MAX_CELLS: f32 = 256.0;
-/// Layers of cells that are marked together.
+/// Layers of cells per parallel task.
 const LAYERS: usize = 8;
 
-/// A coarse grid of the cells in which a body can be, so that samples in empty space cost nothing
-/// (Müller et al. 2022, section 5.1, made from a mesh rather than from a field).
+/// Occupancy grid around a triangle mesh, to skip samples in empty space (Müller et al. 2022,
+/// section 5.1, built from a mesh instead of a field).
 ///
-/// It marks a superset of the points within a margin of a triangle mesh that turns by no more than
-/// 120° at its edges, or enclosed by it and not too deep.
+/// The occupied cells cover all points within a margin outside the mesh, and inside it down to a
+/// depth, if the dihedral turn at its edges is at most 120°.
+///
+/// ```
+/// use glam::Vec3;
+/// use volrender::{Occupancy, OccupancyConfig};
+///
+/// let (vertices, faces) = ([Vec3::X, Vec3::Y, Vec3::Z], [[0, 1, 2]]);
+/// let mut occupancy = Occupancy::default();
+/// occupancy.rebuild(&vertices, &faces, &[0.05], OccupancyConfig { margin: 0.05, depth: 0.0, cell: 0.02 });
+/// assert!(occupancy.is_occupied(Vec3::splat(1.0 / 3.0)) && !occupancy.is_occupied(Vec3::ZERO));
+/// assert_eq!(occupancy.region().max, Vec3::splat(1.05));
+/// ```
 #[derive(Clone, Debug, Default)]
 pub struct Occupancy {
     min: Vec3,
     per_cell: f32,
     size: IVec3,
-    /// A bit a cell, z by z, y by y: `words` for the cells of a row. All of them together fit a
-    /// second-level cache.
-    live: Vec<u64>,
+    /// One bit per cell, x fastest, each row padded to `words`; fits a second-level cache.
+    bits: Vec<u64>,
     words: usize,
-    reaches: Vec<Reach>,
+    regions: Vec<FaceRegion>,
     outside: Vec<bool>,
     queue: Vec<usize>,
     region: Option<Aabb>,
 }
 
-/// Distance from a mesh within which cells are marked, and their size, in the unit of its vertices.
+/// Thickness of the occupied shell around a mesh and size of the cells, in the unit of its
+/// vertices. [`Occupancy`] has an example.
+///
+/// ```
+/// // 5 cm around a body and its whole inside, in cells of 2 cm.
+/// let config = volrender::OccupancyConfig { margin: 0.05, depth: 1.0, cell: 0.02 };
+/// ```
 #[derive(Clone, Copy, Debug)]
 pub struct OccupancyConfig {
-    /// Upper bound of the margins of the faces, outside.
+    /// Upper bound of the margins of the faces, to the outside.
     pub margin: f32,
-    /// Depth down to which the inside is marked; all of it where this is above `margin`.
+    /// Depth of the occupied shell inside; above `margin` the whole inside is occupied.
     pub depth: f32,
-    /// Side of a cell; longer where an axis would have more than about 256.
+    /// Side of a cell; enlarged if an axis would have more than 256 cells.
     pub cell: f32,
 }
 
 impl Occupancy {
-    /// Rebuilds in place for `vertices` (V) and `faces` (F), which may be open: the cells at a
-    /// triangle seal the inside off from the outside. Wanted are points outside within the
-    /// `margins` (F) of the triangles they are closest to (where they are closest to an edge or a
-    /// corner, of all triangles there), none above `config.margin`, and inside down to
-    /// `config.depth`.
+    /// Rebuilds the grid in place for the mesh of `vertices` (V) and `faces` (F), which may be open if
+    /// the occupied cells close its holes. A point outside is occupied if it is within the entry of
+    /// `margins` (F), capped at `config.margin`, of its closest face (of all of them at an edge or
+    /// a vertex).
     ///
-    /// A mesh without vertices, or with one that is not finite, is nowhere, and so is one so large
-    /// that lengths overflow. Lengths of `config` that are negative or NaN count as 0.
+    /// A mesh without vertices, with one that is not finite, or with lengths that overflow has no
+    /// occupied cells. Lengths of `config` that are negative or NaN count as 0.
     ///
     /// # Panics
-    /// Where `margins` has not one entry a face, or a face names a vertex that is not there.
+    /// If `margins` has not one entry per face, or a face has an index out of range.
     pub fn rebuild(&mut self, vertices: &[Vec3], faces: &[[u32; 3]], margins: &[f32], config: OccupancyConfig) {
         assert_eq!(margins.len(), faces.len(), "{} margins for {} faces", margins.len(), faces.len());
         let low = vertices.iter().copied().fold(Vec3::INFINITY, Vec3::min);
         let high = vertices.iter().copied().fold(Vec3::NEG_INFINITY, Vec3::max);
-        self.live.clear();
+        self.bits.clear();
         self.region = None;
         self.size = IVec3::ZERO;
         let (margin, depth) = (config.margin.max(0.0), config.depth.max(0.0));
@@ -64,7 +79,7 @@ impl Occupancy {
         let border = Vec3::splat(margin + 1.5 * cell);
         let per_cell = 1.0 / cell;
         let size = (high - low + 2.0 * border) * per_cell;
-        // Infinite where any length is, and where there are no vertices.
+        // Not finite if a length is not, or without vertices.
         if !(size.is_finite() && vertices.iter().all(|v| v.is_finite())) {
             return;
         }
@@ -74,36 +89,35 @@ impl Occupancy {
         self.size = size.ceil().as_ivec3().max(IVec3::ONE);
         self.words = (self.size.x as usize).div_ceil(64);
         let layer = self.words * self.size.y as usize;
-        self.live.resize(layer * self.size.z as usize, 0);
-        // Deeper than any margin: the whole inside, sealed off.
+        self.bits.resize(layer * self.size.z as usize, 0);
+        // Deeper than any margin: flood-fill the whole inside.
         let fills = depth > margin;
         let depth = if fills { 0.0 } else { depth };
-        let Self { min, size, words, reaches, live, .. } = self;
+        let Self { min, size, words, regions, bits, .. } = self;
         (faces.par_iter().zip(margins))
             .map(|(face, &own)| {
                 let corners = face.map(|v| (vertices[v as usize] - *min) * per_cell);
-                Reach::new(corners, own.max(0.0).min(margin) * per_cell, depth * per_cell, fills, *size)
+                FaceRegion::new(corners, own.max(0.0).min(margin) * per_cell, depth * per_cell, fills, *size)
             })
-            .collect_into_vec(reaches);
-        live.par_chunks_mut(LAYERS * layer).enumerate().for_each(|(chunk, live)| {
+            .collect_into_vec(regions);
+        bits.par_chunks_mut(LAYERS * layer).enumerate().for_each(|(chunk, bits)| {
             let z = (chunk * LAYERS) as i32;
-            let layers = z..z + (live.len() / layer) as i32;
-            reaches.iter().for_each(|reach| reach.mark(layers.clone(), size.y as usize, *words, live));
+            let layers = z..z + (bits.len() / layer) as i32;
+            regions.iter().for_each(|region| region.mark(layers.clone(), size.y as usize, *words, bits));
         });
         if fills {
             self.fill_enclosed();
         }
     }
 
-    /// Cells that the outside cannot reach without crossing a marked one are inside.
+    /// Marks the cells that are not connected to the border: a flood fill of the outside.
     fn fill_enclosed(&mut self) {
         let size = self.size;
         let mut outside = std::mem::take(&mut self.outside);
         outside.clear();
         outside.resize((size.x * size.y * size.z) as usize, false);
         self.queue.clear();
-        // The border is wider than a cell, so the outermost layer is empty and the first cell
-        // reaches all of it.
+        // The border is wider than a cell, so the outermost layer is empty and connected.
         self.queue.push(0);
         outside[0] = true;
         while let Some(index) = self.queue.pop() {
@@ -118,7 +132,7 @@ impl Occupancy {
                         continue;
                     }
                     let index = (at + step * stride) as usize;
-                    if !outside[index] && !self.is_marked(next) {
+                    if !outside[index] && !self.is_set(next) {
                         outside[index] = true;
                         self.queue.push(index);
                     }
@@ -126,70 +140,69 @@ impl Occupancy {
             }
         }
         let rows = outside.chunks_exact(size.x as usize);
-        for (live, outside) in self.live.chunks_exact_mut(self.words).zip(rows) {
-            for (word, outside) in live.iter_mut().zip(outside.chunks(64)) {
+        for (bits, outside) in self.bits.chunks_exact_mut(self.words).zip(rows) {
+            for (word, outside) in bits.iter_mut().zip(outside.chunks(64)) {
                 *word = outside.iter().enumerate().fold(0, |word, (bit, &outside)| word | u64::from(!outside) << bit);
             }
         }
         self.outside = outside;
     }
 
-    /// The box of everything within the margin of the mesh, where rays can meet anything; `None`
-    /// for a mesh that is nowhere.
+    /// Bounding box of the mesh and its margin; [`Aabb::EMPTY`] without occupied cells.
     #[must_use]
-    pub fn region(&self) -> Option<Aabb> {
-        self.region
+    pub fn region(&self) -> Aabb {
+        self.region.unwrap_or(Aabb::EMPTY)
     }
 
-    /// Whether `point` can be within the margin or inside; false only where it certainly is not.
+    /// Whether `point` lies in an occupied cell.
     #[inline]
     #[must_use]
-    pub fn is_live(&self, point: Vec3) -> bool {
-        // Truncation is the floor of what is not negative; NaN fails the comparison, and huge
+    pub fn is_occupied(&self, point: Vec3) -> bool {
+        // Truncation is the floor of non-negative values; NaN fails the comparison, and huge
         // values saturate.
-        let place = (point - self.min) * self.per_cell;
-        if !place.cmpge(Vec3::ZERO).all() {
+        let p = (point - self.min) * self.per_cell;
+        if !p.cmpge(Vec3::ZERO).all() {
             return false;
         }
-        let cell = place.as_ivec3();
-        cell.cmplt(self.size).all() && self.is_marked(cell)
+        let cell = p.as_ivec3();
+        cell.cmplt(self.size).all() && self.is_set(cell)
     }
 
     #[inline]
-    fn is_marked(&self, cell: IVec3) -> bool {
+    fn is_set(&self, cell: IVec3) -> bool {
         let row = (cell.z * self.size.y + cell.y) as usize * self.words;
-        self.live[row + cell.x as usize / 64] >> (cell.x % 64) & 1 == 1
+        self.bits[row + cell.x as usize / 64] >> (cell.x % 64) & 1 == 1
     }
 }
 
-/// The cells that are within a triangle's margins, in units of cells: those that three bodies have
-/// in common.
+/// Conservative voxelisation of the points within the margins of a triangle, in units of cells: the
+/// intersection of
 ///
-/// - A box: what is closest to the triangle lies in the direction of its normal, or within 60° of
-///   it.
-/// - What lies between two planes parallel to the triangle: what is closest to it, or to one of its
-///   edges or corners, is no farther from its plane than from itself.
-/// - What is no farther than the larger margin from the triangle's box.
+/// - the triangle's box extended by the directions within 60° of its normal, which include those
+///   from a closest point on the triangle;
+/// - the slab between two planes parallel to the triangle: a point is no farther from its plane
+///   than from the triangle;
+/// - the points within the larger margin of the triangle's box.
 #[derive(Clone, Copy, Debug)]
-struct Reach {
-    /// First and last cell of the first body, cut off where the grid ends.
+struct FaceRegion {
+    /// First and last cell of the extended box, clipped to the grid.
     first: IVec3,
     last: IVec3,
-    /// Bounds of normal · (centre of a cell).
+    /// Slab: bounds of normal · (centre of a cell).
     normal: Vec3,
     low: f32,
     high: f32,
-    /// One over the first coordinate of the normal, finite.
+    /// Finite reciprocal of normal.x.
     per_x: f32,
-    /// Corners of the triangle's box, and the square of the larger margin; infinite where the
-    /// inside is to be sealed off, which whole boxes do.
+    /// The triangle's box and the square of the larger margin; infinite for the flood fill, whose
+    /// barrier needs whole extended boxes.
     box_low: Vec3,
     box_high: Vec3,
     farthest: f32,
 }
 
-impl Reach {
-    /// Margin for rounding, cells.
+impl FaceRegion {
+    /// Tolerance for rounding in cells.
     const ROUNDING: f32 = 0.01;
 
     fn new(corners: [Vec3; 3], margin: f32, depth: f32, fills: bool, size: IVec3) -> Self {
@@ -198,7 +211,7 @@ impl Reach {
         let behind = (margin * support(-normal)).max(depth * support(normal));
         let box_low = corners[0].min(corners[1]).min(corners[2]);
         let box_high = corners[0].max(corners[1]).max(corners[2]);
-        // A cell is between the planes where any of it is: half its extent along the normal.
+        // Half the extent of a cell along the normal.
         let half = 0.5 * normal.abs().element_sum() + Self::ROUNDING;
         let at = normal.dot(corners[0]);
         let x = if normal.x.abs() < 1e-6 { 1e-6 } else { normal.x };
@@ -215,9 +228,9 @@ impl Reach {
         }
     }
 
-    /// Marks the cells of some layers, whose rows are `live`.
-    fn mark(&self, layers: std::ops::Range<i32>, rows: usize, words: usize, live: &mut [u64]) {
-        // Between a row of cells and the triangle's box.
+    /// Marks the cells of `layers`; `bits` holds their rows.
+    fn mark(&self, layers: std::ops::Range<i32>, rows: usize, words: usize, bits: &mut [u64]) {
+        // Distance along an axis between a cell and the triangle's box.
         let gap = |axis: usize, cell: i32| {
             (self.box_low[axis] - (cell + 1) as f32).max(cell as f32 - self.box_high[axis]).max(0.0)
         };
@@ -231,26 +244,25 @@ impl Reach {
                 let (from, to) = self.row(y, z, left.sqrt());
                 if from <= to {
                     let row = ((z - layers.start) as usize * rows + y as usize) * words;
-                    set_bits(&mut live[row..row + words], from as usize, to as usize);
+                    set_bits(&mut bits[row..row + words], from as usize, to as usize);
                 }
             }
         }
     }
 
-    /// First and last cell of row (y, z) that are no farther than `left` along x; none where the
-    /// first lies after the last.
+    /// First and last cell of row (y, z) within `left` along x; empty if the first is larger.
     #[inline]
     fn row(&self, y: i32, z: i32, left: f32) -> (i32, i32) {
         let rest = self.normal.y * (y as f32 + 0.5) + self.normal.z * (z as f32 + 0.5);
         let (a, b) = ((self.low - rest) * self.per_x - 0.5, (self.high - rest) * self.per_x - 0.5);
-        // Conversions saturate.
+        // The conversions saturate.
         let from = (self.box_low.x - left).floor().max(a.min(b).ceil()) as i32;
         let to = (self.box_high.x + left).floor().min(a.max(b).floor()) as i32;
         (self.first.x.max(from), self.last.x.min(to))
     }
 }
 
-/// Sets bits `from` to `to`, the last one too.
+/// Sets bits `from..=to`.
 fn set_bits(words: &mut [u64], from: usize, to: usize) {
     let (first, last) = (from / 64, to / 64);
     let (low, high) = (u64::MAX << (from % 64), u64::MAX >> (63 - to % 64));
@@ -263,14 +275,13 @@ fn set_bits(words: &mut [u64], from: usize, to: usize) {
     }
 }
 
-/// Extent along each axis of the unit vectors within 60° of `normal`, at least 0. A point lies in
-/// the direction of the normal from a closest point inside a face, and between the normals around
-/// from one on an edge or a corner: within 60° of one of them unless the surface turns by more than
-/// 120° there.
+/// Extent along each axis of the unit vectors within 60° of `normal`, at least 0. The direction from
+/// the closest point on a face is its normal; at an edge or vertex it lies between the normals of
+/// the faces, within 60° of one of them unless the surface turns by more than 120°.
 fn support(normal: Vec3) -> Vec3 {
     const COS: f32 = 0.5;
     const SIN: f32 = 0.866_025_4;
-    // cos(a − 60°) for the angle a between the axis and the normal, where that is larger than 60°.
+    // cos(a − 60°) if the angle a between axis and normal is larger than 60°.
     let turned = COS * normal + SIN * (Vec3::ONE - normal * normal).max(Vec3::ZERO).map(f32::sqrt);
     Vec3::select(normal.cmpge(Vec3::splat(COS)), Vec3::ONE, turned.max(Vec3::ZERO))
 }

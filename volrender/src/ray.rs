@@ -1,6 +1,13 @@
 use glam::Vec3;
 
-/// A half-line.
+/// A ray x(t) = origin + t · direction.
+///
+/// ```
+/// use glam::Vec3;
+///
+/// let ray = volrender::Ray { origin: Vec3::X, direction: Vec3::Z };
+/// assert_eq!(ray.at(2.0), Vec3::new(1.0, 0.0, 2.0));
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Ray {
     /// The point at t = 0.
@@ -17,7 +24,17 @@ impl Ray {
     }
 }
 
-/// An axis-aligned box. Empty where `min` exceeds `max` on an axis.
+/// An axis-aligned bounding box; empty if `min` exceeds `max` on an axis.
+///
+/// ```
+/// use glam::Vec3;
+/// use volrender::{Aabb, Ray};
+///
+/// let bounds = Aabb::from_points(&[Vec3::ZERO, Vec3::ONE]);
+/// let ray = Ray { origin: Vec3::new(0.5, 0.5, -2.0), direction: Vec3::Z };
+/// assert_eq!(bounds.intersect(&ray), Some((2.0, 3.0)));
+/// assert_eq!(Aabb::EMPTY.intersect(&ray), None);
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Aabb {
     /// Lowest corner.
@@ -30,8 +47,8 @@ impl Aabb {
     /// The box without any point.
     pub const EMPTY: Self = Self { min: Vec3::INFINITY, max: Vec3::NEG_INFINITY };
 
-    /// The smallest box around `points`. Points that are not finite do not count; without any point
-    /// it is [`Aabb::EMPTY`].
+    /// The bounding box of `points`, ignoring those that are not finite; [`Aabb::EMPTY`] without
+    /// any.
     #[must_use]
     pub fn from_points(points: &[Vec3]) -> Self {
         points
@@ -40,36 +57,16 @@ impl Aabb {
             .fold(Self::EMPTY, |bounds, &p| Self { min: bounds.min.min(p), max: bounds.max.max(p) })
     }
 
-    /// The box with every face moved outwards by `margin`. A negative margin shrinks it, an empty
-    /// box stays empty.
-    #[must_use]
-    pub fn inflated(&self, margin: f32) -> Self {
-        if self.is_empty() {
-            return Self::EMPTY;
-        }
-        Self { min: self.min - margin, max: self.max + margin }
-    }
-
-    /// Whether no point lies in the box.
+    /// Whether the box contains no point.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         !self.min.cmple(self.max).all()
     }
 
-    /// Whether `point` lies in the box or on its faces.
-    #[must_use]
-    pub fn contains(&self, point: Vec3) -> bool {
-        self.min.cmple(point).all() && point.cmple(self.max).all()
-    }
-
     /// The range of t ≥ 0 for which the ray is in the box, as (near, far) with near < far.
     ///
-    /// `None` where the ray misses, where it touches in a single point (a flat box seen from its
-    /// side is touched by no ray for longer), where the direction is zero, the box empty, or
-    /// anything is NaN or infinite.
-    ///
-    /// A direction parallel to a face is handled exactly: such an axis either excludes the ray or
-    /// does not bound it.
+    /// `None` if the ray misses or touches in a single point, if the direction is zero, the box
+    /// empty, or anything NaN or infinite. Directions parallel to a face are handled exactly.
     #[must_use]
     pub fn intersect(&self, ray: &Ray) -> Option<(f32, f32)> {
         if self.is_empty() || !ray.origin.is_finite() || !ray.direction.is_finite() {

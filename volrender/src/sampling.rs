@@ -1,6 +1,6 @@
-/// The pixels of a square of side `size` around the pixel (column, row) `around`, moved and cut as
-/// much as it takes to be inside an image of (W, H), of at most 2^32 pixels: row-major indices into
-/// (H, W), row by row. What the square is around may be outside.
+/// Row-major pixel indices of a square patch of side `size` around pixel (column, row) `around`,
+/// shifted, and cropped if necessary, to lie inside an image of (W, H), at most 2^32 pixels.
+/// `around` may lie outside.
 ///
 /// ```
 /// let corner = volrender::patch((0, 1), 2, (4, 3));
@@ -13,7 +13,7 @@ pub fn patch(around: (u32, u32), size: u32, (width, height): (u32, u32)) -> impl
     (top..top + size).flat_map(move |row| (left..left + size).map(move |column| row * width + column))
 }
 
-/// Equal bins along a ray, each with one sample: stratified sampling.
+/// Equal bins along a ray for stratified sampling, one sample per bin.
 ///
 /// ```
 /// let bins = volrender::Bins::new(1.0, 3.0, 4);
@@ -26,29 +26,36 @@ pub struct Bins {
 }
 
 impl Bins {
-    /// `n` bins between the depths `near` and `far`. Without any, the width is 0.
+    /// `n` bins between the depths 0 ≤ `near` ≤ `far`; of width 0 if `n` is 0.
     #[must_use]
     pub fn new(near: f32, far: f32, n: usize) -> Self {
         Self { near, width: if n == 0 { 0.0 } else { (far - near) / n as f32 } }
     }
 
-    /// The width δ of each.
+    /// Width δ of a bin.
     #[must_use]
     pub fn width(&self) -> f32 {
         self.width
     }
 
-    /// The depth in bin `i` at `place`, from 0 at its near end to 1 at its far end.
+    /// Depth in bin `i` at `offset`, from 0 at its near end to 1 at its far end.
     #[must_use]
-    pub fn at(&self, i: usize, place: f32) -> f32 {
-        self.near + (i as f32 + place) * self.width
+    pub fn at(&self, i: usize, offset: f32) -> f32 {
+        self.near + (i as f32 + offset) * self.width
     }
 }
 
-/// Writes the middle of each bin into `t` (S), for `edges` (S + 1).
+/// Writes the midpoint of each bin into `t` (S), for `edges` (S + 1).
+///
+/// ```
+/// let (edges, mut t, mut delta) = ([0.0, 1.0, 3.0], [0.0; 2], [0.0; 2]);
+/// volrender::bin_midpoints(&edges, &mut t);
+/// volrender::bin_widths(&edges, &mut delta);
+/// assert_eq!((t, delta), ([0.5, 2.0], [1.0, 2.0]));
+/// ```
 ///
 /// # Panics
-/// Where the lengths do not fit.
+/// If there is not one edge more than bins.
 pub fn bin_midpoints(edges: &[f32], t: &mut [f32]) {
     assert_bins(edges, t);
     for (t, bin) in t.iter_mut().zip(edges.windows(2)) {
@@ -56,10 +63,11 @@ pub fn bin_midpoints(edges: &[f32], t: &mut [f32]) {
     }
 }
 
-/// Writes the width δ of each bin into `delta` (S), for `edges` (S + 1).
+/// Writes the width δ of each bin into `delta` (S), for `edges` (S + 1); infinite if the difference
+/// of two edges overflows. [`bin_midpoints`] has an example.
 ///
 /// # Panics
-/// Where the lengths do not fit.
+/// If there is not one edge more than bins.
 pub fn bin_widths(edges: &[f32], delta: &mut [f32]) {
     assert_bins(edges, delta);
     for (delta, bin) in delta.iter_mut().zip(edges.windows(2)) {

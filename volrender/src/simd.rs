@@ -1,7 +1,7 @@
-/// A kernel to be compiled for the widest instructions of the machine it runs on.
+/// Closure that [`pulp::Arch::dispatch`] compiles for each instruction set.
 ///
-/// It takes `FnMut`, whose call is the closure's own body: `FnOnce`, which [`pulp::Arch::dispatch`]
-/// takes, goes through a shim that is compiled for the baseline.
+/// `FnMut` inlines the closure's body; `FnOnce`, which `dispatch` accepts directly, calls it through
+/// a shim compiled for the baseline.
 pub(crate) struct Kernel<F>(pub F);
 
 impl<R, F: FnMut() -> R> pulp::WithSimd for Kernel<F> {

@@ -1,5 +1,5 @@
-//! Compositing against the plain one of the test kit, its gradients against finite differences of
-//! that.
+//! Compositing against the test kit's reference in f64, its gradients against finite differences
+//! of the reference.
 
 use approx::{abs_diff_eq, assert_abs_diff_eq};
 use glam::Vec3;
@@ -41,14 +41,14 @@ impl Samples {
     fn backward(&self, background: Vec3, d_color: Vec3, d_opacity: f32) -> Gradients {
         let n = self.sigma.len();
         let (_, weights) = self.composite(background);
-        // Outputs are overwritten, whatever stood in them.
+        // NaN shows outputs that are not overwritten.
         let mut d = Gradients { sigma: vec![f32::NAN; n], rgb: vec![Vec3::NAN; n], likelihood: vec![f32::NAN; n] };
         let gradients = SampleGradients { d_sigma: &mut d.sigma, d_rgb: &mut d.rgb, d_likelihood: &mut d.likelihood };
         composite_backward(self.as_ray(), background, &weights, d_color, d_opacity, gradients);
         d
     }
 
-    /// The scalar whose gradient `backward` computes, in f64.
+    /// The loss whose gradient `backward` computes, in f64.
     fn loss(&self, background: Vec3, d_color: Vec3, d_opacity: f32) -> f64 {
         let Self { sigma, likelihood, delta, rgb, .. } = self;
         let (color, opacity, ..) = oracle::composite(sigma, likelihood, delta, rgb, background);
@@ -57,8 +57,8 @@ impl Samples {
 
     fn check_gradients(&self, background: Vec3, d_color: Vec3, d_opacity: f32) {
         let d = self.backward(background, d_color, d_opacity);
-        // The oracle is exact, so what is left is the backward's f32 rounding (a few ulps a sample,
-        // values up to about 4) and the third derivative of exp, δ³ step² / 6.
+        // The oracle is exact; the error is f32 rounding of the backward pass (a few ulps per
+        // sample, values up to 4) and the third derivative of exp, δ³ step² / 6.
         let ulps = 8.0 * f64::from(f32::EPSILON) * (4 + self.sigma.len()) as f64;
         let tolerance = Tolerance { abs: ulps, rel: 1e-3 };
         assert_gradient("likelihood", &self.likelihood, &d.likelihood, 1e-3, tolerance, |x| {
@@ -71,7 +71,7 @@ impl Samples {
             let rgb = x.as_chunks::<3>().0.iter().map(|&c| Vec3::from(c)).collect();
             Self { rgb, ..self.clone() }.loss(background, d_color, d_opacity)
         });
-        // A step lost to rounding is no test: the densities that are huge have their own below.
+        // Steps are lost to rounding in huge densities, which have a test below.
         let movable: Vec<usize> = (0..self.sigma.len()).filter(|&i| self.sigma[i] < 1e4).collect();
         let pick = |from: &[f32]| -> Vec<f32> { movable.iter().map(|&i| from[i]).collect() };
         assert_gradient("sigma", &pick(&self.sigma), &pick(&d.sigma), 1e-2, tolerance, |x| {
@@ -94,7 +94,7 @@ fn color() -> impl Strategy<Value = Vec3> {
     prop::array::uniform3(0.0f32..=1.0).prop_map(Vec3::from)
 }
 
-/// Rays through fog with empty space, walls, likelihoods of 0 and 1 and bins without width.
+/// Rays through fog, empty space and opaque samples, with likelihoods of 0 and 1 and empty bins.
 fn ray(count: std::ops::Range<usize>) -> impl Strategy<Value = Samples> {
     let sigma = prop_oneof![4 => 0.0f32..30.0, 1 => 0.0f32..1e-4, 1 => Just(0.0), 1 => Just(1e30), 1 => 50.0f32..2e3];
     let likelihood = prop_oneof![2 => 0.0f32..=1.0, 2 => Just(1.0), 1 => Just(0.0)];
@@ -106,11 +106,15 @@ fn ray(count: std::ops::Range<usize>) -> impl Strategy<Value = Samples> {
     })
 }
 
+fn numbers(values: &'static [f32], count: std::ops::Range<usize>) -> impl Strategy<Value = Vec<f32>> {
+    prop::collection::vec(prop::sample::select(values), count)
+}
+
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(256))]
 
     #[test]
-    fn compositing_equals_the_plain_one(ray in ray(0..150), background in color()) {
+    fn compositing_equals_the_reference(ray in ray(0..150), background in color()) {
         let (got, weights) = ray.composite(background);
         let (color, opacity, expected, _) =
             oracle::composite(&ray.sigma, &ray.likelihood, &ray.delta, &ray.rgb, background);
@@ -135,7 +139,7 @@ proptest! {
         match got.termination {
             None => prop_assert_eq!(largest, 0.0),
             Some(i) => {
-                // Alphas that differ by less than f32 shows are ties, which the lower index wins.
+                // Alphas equal within f32 rounding are ties.
                 prop_assert!(alpha[i as usize] >= largest * (1.0 - 5e-7));
                 prop_assert!(alpha[..i as usize].iter().all(|a| *a <= alpha[i as usize] * (1.0 + 5e-7)));
                 prop_assert!(largest < 1.0 || alpha[i as usize] >= 1.0 - 6e-8);
@@ -152,7 +156,7 @@ proptest! {
     }
 
     #[test]
-    fn leaving_out_dead_samples_changes_nothing(ray in ray(0..150), background in color()) {
+    fn omitting_samples_of_alpha_zero_changes_nothing(ray in ray(0..150), background in color()) {
         let mut live = Samples::default();
         for i in 0..ray.sigma.len() {
             if ray.sigma[i] * ray.delta[i] * ray.likelihood[i] > 0.0 {
@@ -168,8 +172,8 @@ proptest! {
 
     #[test]
     fn bins_of_any_finite_width_give_finite_pixels_and_gradients(
-        mut edges in prop::collection::vec(prop::sample::select(vec![-3.4e38, -3e38, -1.0, 0.0, 1.0, 1e30, 3e38, 3.4e38f32]), 2..40),
-        sigma in prop::collection::vec(prop::sample::select(vec![0.0, 1e-38, 1e-30, 1.0, 1e30, f32::MAX, f32::INFINITY]), 40),
+        mut edges in numbers(&[-3.4e38, -3e38, -1.0, 0.0, 1.0, 1e30, 3e38, 3.4e38], 2..40),
+        sigma in numbers(&[0.0, 1e-38, 1e-30, 1.0, 1e30, f32::MAX, f32::INFINITY], 40..41),
         likelihood in prop::sample::select(vec![0.0, 0.3, 1.0f32]), d_opacity in -1.0f32..1.0,
     ) {
         edges.sort_by(f32::total_cmp);
@@ -177,24 +181,25 @@ proptest! {
         let (mut t, mut delta) = (vec![0.0; n], vec![0.0; n]);
         bin_midpoints(&edges, &mut t);
         bin_widths(&edges, &mut delta);
-        let ray = Samples { sigma: sigma[..n].to_vec(), likelihood: vec![likelihood; n], delta, t, rgb: vec![Vec3::X; n] };
+        let (sigma, likelihood, rgb) = (sigma[..n].to_vec(), vec![likelihood; n], vec![Vec3::X; n]);
+        let ray = Samples { sigma, likelihood, delta, t, rgb };
         let (got, weights) = ray.composite(Vec3::ONE);
         prop_assert!(got.color.is_finite() && got.depth.is_finite() && (0.0..=1.0).contains(&got.opacity), "{got:?}");
         prop_assert!(weights.iter().all(|w| (0.0..=1.0).contains(w)), "{weights:?}");
         let d = ray.backward(Vec3::ONE, Vec3::new(1.0, -2.0, 0.5), d_opacity);
         prop_assert!(d.sigma.iter().chain(&d.likelihood).all(|d| d.is_finite()), "{:?}", d.sigma);
-        // More of an opaque sample changes nothing, however wide its bin is.
+        // The density of an opaque sample has no influence.
         let opaque = |i: &usize| ray.sigma[*i] > 0.0 && f64::from(ray.sigma[*i]) * f64::from(ray.delta[*i]) > 100.0;
         prop_assert!((0..n).filter(opaque).all(|i| d.sigma[i] == 0.0), "{:?}", d.sigma);
     }
 
     #[test]
-    fn gradients_are_the_slopes(ray in ray(0..70), background in color(), d_color in color(), d_opacity in -1.0f32..1.0) {
+    fn gradients_equal_finite_differences(ray in ray(0..70), background in color(), d_color in color(), d_opacity in -1.0f32..1.0) {
         ray.check_gradients(background, d_color - 0.5, d_opacity);
     }
 }
 
-/// Three samples of fog around one that is opaque.
+/// Three samples of fog around a sample of density `sigma`.
 fn wall(sigma: f32) -> Samples {
     let mut ray = Samples::default();
     for (i, sigma) in [1.0, sigma, 2.0, 0.0].into_iter().enumerate() {
@@ -205,7 +210,7 @@ fn wall(sigma: f32) -> Samples {
 }
 
 #[test]
-fn a_wall_has_exact_gradients() {
+fn opaque_samples_have_exact_gradients() {
     for sigma in [80.0, 1e3, 1e30, f32::MAX, f32::INFINITY] {
         let ray = wall(sigma);
         let (got, weights) = ray.composite(Vec3::ONE);
@@ -213,19 +218,19 @@ fn a_wall_has_exact_gradients() {
         assert_eq!(got.termination, Some(1));
         assert_eq!(weights[2..], [0.0, 0.0]);
         let d = ray.backward(Vec3::ONE, Vec3::new(1.0, -2.0, 0.5), 0.3);
-        // Nothing behind the wall matters, and the wall can not get denser.
+        // Samples behind the wall have no influence, nor has the wall's density.
         assert_eq!(d.rgb[2..], [Vec3::ZERO; 2]);
         assert_eq!(d.sigma[2..], [0.0; 2]);
         assert_eq!(d.likelihood[2..], [0.0; 2]);
         assert!(d.sigma[1].abs() < 1e-8);
-        // But it can get thinner: the division-by-(1 − α) form has 0/0 here.
+        // Its likelihood has: dividing by 1 − α would give 0/0 here.
         assert!(d.likelihood[1].abs() > 0.1);
         ray.check_gradients(Vec3::ONE, Vec3::new(1.0, -2.0, 0.5), 0.3);
     }
 }
 
 #[test]
-fn empty_space_has_a_gradient() {
+fn zero_density_has_a_gradient() {
     let mut ray = wall(0.0);
     ray.sigma = vec![0.0; 4];
     let (got, _) = ray.composite(Vec3::X);
@@ -239,7 +244,7 @@ fn empty_space_has_a_gradient() {
 }
 
 #[test]
-fn no_samples_are_background() {
+fn a_ray_without_samples_shows_the_background() {
     let (got, _) = Samples::default().composite(Vec3::new(0.1, 0.2, 0.3));
     let expected = Composite { color: Vec3::new(0.1, 0.2, 0.3), opacity: 0.0, depth: 0.0, termination: None };
     assert_eq!(got, expected);
@@ -255,7 +260,7 @@ fn faint_fog_keeps_its_relative_accuracy() {
 }
 
 #[test]
-fn thousands_of_half_transparent_samples_underflow_quietly() {
+fn transmittance_underflows_to_zero_with_finite_gradients() {
     let mut ray = Samples::default();
     for _ in 0..5000 {
         ray.push((10.0, 0.9, 0.1, Vec3::ONE));
@@ -268,7 +273,7 @@ fn thousands_of_half_transparent_samples_underflow_quietly() {
 }
 
 #[test]
-fn nan_is_passed_on_and_never_terminates_a_ray() {
+fn nan_propagates_to_the_colour_and_is_never_the_termination() {
     let mut ray = wall(3.0);
     ray.sigma[2] = f32::NAN;
     let (got, weights) = ray.composite(Vec3::ZERO);
@@ -279,7 +284,7 @@ fn nan_is_passed_on_and_never_terminates_a_ray() {
 
 #[test]
 #[should_panic(expected = "2 sigma, 1 likelihood")]
-fn slices_of_different_lengths_are_the_callers_bug() {
+fn slices_of_different_lengths_panic() {
     let samples = RaySamples { sigma: &[1.0; 2], likelihood: &[1.0], ..RaySamples::default() };
     composite(samples, Vec3::ZERO, &mut [0.0; 2]);
 }

@@ -12,5 +12,5 @@ pub fn load_lpips(path: Option<&Path>) -> Result<Option<Lpips>> {
 
 /// Its name, as metrics.json has it.
 pub fn network_name(lpips: Option<&Lpips>) -> Option<String> {
-    lpips.map(|lpips| lpips.trunk().name().to_owned())
+    lpips.map(|lpips| lpips.name().to_owned())
 }

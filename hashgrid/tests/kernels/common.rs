@@ -1,9 +1,9 @@
-//! What the tests of this crate share.
+//! Oracles, strategies and random tables.
 
 use hashgrid::HashGrid;
 use proptest::prelude::*;
 
-/// The (L, 2^T, F) table of the oracle, holes 0, from the compact one.
+/// The oracle's (L, 2^T, F) table, zero-padded, from the compact one.
 pub fn padded<const D: usize>(grid: &HashGrid<D>, table: &[f32], log2: u32, f: usize) -> Vec<f32> {
     let rows = 1usize << log2;
     let mut padded = vec![0.0; grid.resolutions().len() * rows * f];
@@ -26,7 +26,7 @@ pub fn encode<const D: usize>(grid: &HashGrid<D>, table: &[f32], points: &[[f32;
     features
 }
 
-/// [`encode`], a row for each point.
+/// [`encode`] in rows, (Q, L·F).
 pub fn encode_rows<const D: usize>(grid: &HashGrid<D>, table: &[f32], points: &[[f32; D]]) -> Vec<f32> {
     let features = encode(grid, table, points);
     let mut rows = vec![f32::NAN; features.len()];
@@ -34,12 +34,12 @@ pub fn encode_rows<const D: usize>(grid: &HashGrid<D>, table: &[f32], points: &[
     rows
 }
 
-/// A table with values of magnitude one: those of `init_table` are too small to show an error.
+/// A random table in ±1: the values of `init_table` are below the tolerances.
 pub fn table<const D: usize>(grid: &HashGrid<D>, seed: u64) -> Vec<f32> {
     grid.init_table(seed).iter().map(|x| x * 1e4).collect()
 }
 
-/// Coordinates mostly inside, sometimes on or beyond the ends, on faces, or no number at all.
+/// Coordinates mostly in [0, 1], sometimes at or beyond its ends, on cell faces or not finite.
 pub fn coordinate() -> impl Strategy<Value = f32> {
     prop_oneof![
         12 => 0.0f32..=1.0,
@@ -58,7 +58,7 @@ pub fn points<const D: usize>(count: std::ops::Range<usize>) -> impl Strategy<Va
     prop::collection::vec(point, count)
 }
 
-/// Numbers in ±1 that do not matter otherwise.
+/// Random numbers in ±1.
 pub fn noise(n: usize, seed: u64) -> Vec<f32> {
     let mut state = seed.wrapping_mul(0x9E37_79B9_7F4A_7C15) | 1;
     (0..n)

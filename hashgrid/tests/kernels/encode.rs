@@ -1,4 +1,4 @@
-//! The encoding against the plain one of the test kit.
+//! The encoding against the test kit's reference encoding in f64.
 
 use crate::common::{encode, encode_rows, oracle, points, table};
 use approx::{abs_diff_eq, assert_abs_diff_eq};
@@ -38,7 +38,7 @@ proptest! {
     #![proptest_config(ProptestConfig::with_cases(64))]
 
     #[test]
-    fn in_two_dimensions_it_equals_the_plain_encoding(
+    fn the_2d_encoding_equals_the_reference(
         resolutions in resolutions(), points in points::<2>(0..40), log2 in 0u32..12, features in 1usize..20, seed: u64,
     ) {
         let grid = HashGrid::with_resolutions(&resolutions, features, log2).unwrap();
@@ -46,7 +46,7 @@ proptest! {
     }
 
     #[test]
-    fn in_three_dimensions_it_equals_the_plain_encoding(
+    fn the_3d_encoding_equals_the_reference(
         resolutions in resolutions(), points in points::<3>(0..40), log2 in 0u32..12, features in 1usize..10, seed: u64,
     ) {
         let grid = HashGrid::with_resolutions(&resolutions, features, log2).unwrap();
@@ -54,7 +54,7 @@ proptest! {
     }
 
     #[test]
-    fn in_four_dimensions_it_equals_the_plain_encoding(
+    fn the_4d_encoding_equals_the_reference(
         resolutions in resolutions(), points in points::<4>(0..40), log2 in 0u32..14, features in 1usize..10, seed: u64,
     ) {
         let grid = HashGrid::with_resolutions(&resolutions, features, log2).unwrap();
@@ -62,7 +62,7 @@ proptest! {
     }
 
     #[test]
-    fn a_constant_table_encodes_to_the_constant(points in points::<4>(1..40)) {
+    fn interpolation_weights_sum_to_one(points in points::<4>(1..40)) {
         let grid = HashGrid::<4>::with_resolutions(&[3, 17, 300], 2, 9).unwrap();
         let features = encode(&grid, &vec![0.75; grid.num_parameters()], &points);
         for feature in features {
@@ -90,8 +90,8 @@ proptest! {
 }
 
 #[test]
-fn both_dense_and_hashed_levels_are_compared() {
-    // Guards the strategies above: at T = 9 in 3-D, 7 cells (8³ corners) are the last that fit.
+fn the_dense_index_and_the_hash_follow_their_definitions() {
+    // At T = 9 in 3-D, 7 cells per axis (8³ corners) is the finest dense level.
     let grid = HashGrid::<3>::with_resolutions(&[7, 8], 1, 9).unwrap();
     assert_eq!(grid.level_range(0), 0..512);
     assert_eq!(grid.level_range(1), 512..1024);
@@ -104,7 +104,7 @@ fn both_dense_and_hashed_levels_are_compared() {
 }
 
 #[test]
-fn splitting_the_points_changes_no_bit() {
+fn splitting_the_points_into_calls_changes_no_bit() {
     let grid = HashGrid::<4>::with_resolutions(&[3, 20, 50], 2, 10).unwrap();
     let table = table(&grid, 1);
     let points: Vec<[f32; 4]> =
@@ -117,7 +117,7 @@ fn splitting_the_points_changes_no_bit() {
 }
 
 #[test]
-fn points_outside_are_clamped_and_nan_is_zero() {
+fn coordinates_outside_are_clamped_and_nan_is_zero() {
     let grid = HashGrid::<2>::with_resolutions(&[5, 100], 4, 7).unwrap();
     let table = table(&grid, 4);
     let at = |x, y| encode(&grid, &table, &[[x, y]]);
@@ -130,7 +130,7 @@ fn points_outside_are_clamped_and_nan_is_zero() {
 }
 
 #[test]
-fn no_points_are_fine() {
+fn empty_batches_write_nothing() {
     let grid = HashGrid::<2>::with_resolutions(&[5], 1, 7).unwrap();
     let mut table = table(&grid, 4);
     grid.encode(&table, &[], &mut []);
@@ -142,7 +142,7 @@ fn no_points_are_fine() {
 
 #[test]
 #[should_panic(expected = "table has 3 numbers, expected num_parameters() = 36")]
-fn a_table_of_another_length_is_the_callers_bug() {
+fn a_table_of_the_wrong_length_panics() {
     let grid = HashGrid::<2>::with_resolutions(&[5], 1, 7).unwrap();
     grid.encode(&[0.0; 3], &[[0.0; 2]], &mut [0.0]);
 }

@@ -1,4 +1,4 @@
-//! The backward passes against finite differences, and as adjoints of the forward.
+//! The backward passes against finite differences, and as adjoints of the forward pass.
 
 use crate::common::{dot, encode, noise, points, table};
 use approx::abs_diff_eq;
@@ -6,7 +6,7 @@ use hashgrid::HashGrid;
 use proptest::prelude::*;
 use testkit::gradient::{Tolerance, assert_gradient};
 
-/// The finest of nested levels: a point off its faces is off those of the others.
+/// Finest of nested levels: a point off its faces is off those of the coarser levels.
 const FINEST: u32 = 64;
 const NESTED: [u32; 4] = [2, 8, 16, FINEST];
 
@@ -17,9 +17,8 @@ fn off_faces<const D: usize>(count: usize) -> impl Strategy<Value = Vec<[f32; D]
     prop::collection::vec(point, count)
 }
 
-/// Within a cell the encoding is linear in each coordinate, so the step may be large and only
-/// rounding is left: `terms` values of magnitude ≤ 1, each with an error of some ulps, over twice
-/// the step.
+/// Within a cell the encoding is linear in each coordinate: a large step has no truncation error,
+/// and the tolerance is the rounding of L·F features of magnitude ≤ 1 over twice the step.
 fn check_points<const D: usize>(points: &[[f32; D]], log2: u32, features: usize, seed: u64) {
     let grid = HashGrid::<D>::with_resolutions(&NESTED, features, log2).expect("a grid");
     let table = table(&grid, seed);
@@ -43,7 +42,7 @@ fn check_table<const D: usize>(points: &[[f32; D]], features: usize, seed: u64) 
     let d_features = noise(points.len() * grid.num_features(), seed ^ 1);
     let mut d_table = vec![0.0; grid.num_parameters()];
     grid.encode_backward(points, &d_features, &mut d_table);
-    // Linear in the table: any step is right.
+    // Linear in the table: any step is exact.
     let tolerance = Tolerance { abs: 2e-6 * points.len() as f64, rel: 1e-4 };
     assert_gradient("encode in the table", &table, &d_table, 1.0, tolerance, |table| {
         dot(&encode(&grid, table, points), &d_features)
@@ -54,7 +53,7 @@ proptest! {
     #![proptest_config(ProptestConfig::with_cases(24))]
 
     #[test]
-    fn the_gradient_of_the_points_is_the_slope_of_the_encoding(
+    fn the_gradient_of_the_points_equals_finite_differences(
         two in off_faces::<2>(5), three in off_faces::<3>(5), four in off_faces::<4>(20), features in 1usize..12, seed: u64,
     ) {
         check_points(&two, 8, features, seed);
@@ -63,7 +62,7 @@ proptest! {
     }
 
     #[test]
-    fn the_gradient_of_the_table_is_the_slope_of_the_encoding(
+    fn the_gradient_of_the_table_equals_finite_differences(
         two in points::<2>(1..20), three in points::<3>(1..20), four in points::<4>(1..20), features in 1usize..12, seed: u64,
     ) {
         check_table(&two, features, seed);
@@ -86,7 +85,7 @@ proptest! {
     }
 
     #[test]
-    fn the_jacobian_carries_gradients_as_the_table_does(
+    fn jacobian_backward_equals_encode_backward_points(
         points in points::<4>(0..300), features in 1usize..12, log2 in 0u32..12, seed: u64,
     ) {
         let grid = HashGrid::<4>::with_resolutions(&[1, 4, 9, 700], features, log2).unwrap();
@@ -109,7 +108,7 @@ proptest! {
     }
 
     #[test]
-    fn gradients_accumulate(points in points::<3>(1..30), seed: u64) {
+    fn backward_passes_add_to_their_outputs(points in points::<3>(1..30), seed: u64) {
         let grid = HashGrid::<3>::with_resolutions(&[4, 40], 2, 8).unwrap();
         let values = table(&grid, seed);
         let d_features = noise(points.len() * grid.num_features(), seed);
@@ -129,7 +128,7 @@ proptest! {
 }
 
 #[test]
-fn coordinates_that_were_clamped_get_no_gradient() {
+fn clamped_coordinates_get_no_gradient() {
     let grid = HashGrid::<2>::with_resolutions(&[4, 50], 2, 8).unwrap();
     let table = table(&grid, 9);
     let points = [[-0.1, 0.3], [1.1, 0.3], [f32::NAN, 0.3], [0.0, 0.3], [1.0, 0.3]];
@@ -139,14 +138,14 @@ fn coordinates_that_were_clamped_get_no_gradient() {
         assert_eq!(clamped[0], 0.0);
         assert_ne!(clamped[1], 0.0);
     }
-    // The ends themselves have the slope of their cell.
+    // 0 and 1 themselves have the slope of their cell.
     for end in &d_points[3..] {
         assert_ne!(end[0], 0.0);
     }
 }
 
 #[test]
-fn splitting_the_points_changes_no_bit() {
+fn splitting_the_points_into_parts_changes_no_bit() {
     let grid = HashGrid::<4>::with_resolutions(&[2, 5, 9, 33, 100], 3, 10).unwrap();
     let table = table(&grid, 2);
     let points: Vec<[f32; 4]> = noise(4 * 40_000, 5).as_chunks::<4>().0.iter().map(|p| p.map(f32::abs)).collect();
@@ -165,7 +164,7 @@ fn splitting_the_points_changes_no_bit() {
     grid.encode_backward(&points, &d_features, &mut d_whole);
     for size in [17, 5000] {
         let (layout, width) = (grid.layout(points.len()), grid.num_features());
-        // Features of some of the points, and gradients like them.
+        // The (L, count, F) features of `count` points.
         let cut = |all: &[f32], first: usize, count: usize| {
             let (mut rows, mut part) = (vec![0.0; count * width], vec![0.0; count * width]);
             layout.to_rows(all, first..first + count, &mut rows, width);

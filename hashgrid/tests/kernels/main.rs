@@ -1,4 +1,4 @@
-//! Every kernel in every dimension; one binary, because compiling them takes longest.
+//! Every kernel in every dimension, in one binary because compiling the kernels dominates.
 
 mod common;
 mod encode;

@@ -126,7 +126,7 @@ impl Files {
         };
         // Without known occluders the silhouette tells what is unknown.
         let occluder = occluder.map(|covered: Vec<f32>| {
-            let everything = (!distortion.is_none()).then(|| vec![1.0; covered.len()]);
+            let everything = (!distortion.is_identity()).then(|| vec![1.0; covered.len()]);
             // A pixel that an occluder touches is not known to show background.
             let mut unknown: Vec<bool> = resample(covered, 1).into_iter().map(|covered| covered > 0.0).collect();
             if let Some(everything) = everything {

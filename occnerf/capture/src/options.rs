@@ -53,16 +53,8 @@ impl Default for LoadOptions {
 impl PartialEq for LoadOptions {
     fn eq(&self, other: &Self) -> bool {
         fn read(options: &LoadOptions) -> impl PartialEq + '_ {
-            let LoadOptions {
-                pixel_centre,
-                resize,
-                stride,
-                max_frames,
-                eval_stride,
-                max_bytes: _,
-                camera,
-                unseen: _,
-            } = options;
+            let LoadOptions { pixel_centre, resize, stride, max_frames, eval_stride, max_bytes: _, camera, unseen: _ } =
+                options;
             (pixel_centre, resize, stride, max_frames, eval_stride, camera)
         }
         read(self) == read(other)

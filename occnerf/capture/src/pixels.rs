@@ -1,7 +1,7 @@
 //! The decoded pixels of a frame.
 
-use std::ops::Range;
 use super::Image;
+use std::ops::Range;
 
 /// A rectangle of pixels.
 #[derive(Clone, Debug, PartialEq, Eq)]

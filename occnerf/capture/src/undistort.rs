@@ -6,7 +6,7 @@ use volrender::{Camera, Distortion};
 /// What a perfect lens would have shown in place of `source` (H, W, channels), which `camera` saw
 /// through `distortion`: bilinear, 0 beyond the border and where the model of the lens folds back.
 pub(super) fn undistort(source: Vec<f32>, channels: usize, camera: &Camera, distortion: &Distortion) -> Vec<f32> {
-    if distortion.is_none() {
+    if distortion.is_identity() {
         return source;
     }
     let (width, height) = (camera.width as usize, camera.height as usize);

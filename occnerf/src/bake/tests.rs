@@ -10,12 +10,12 @@ use super::make::{BakeOptions, bake, surface};
 use super::renderer::BakedRenderer;
 use super::{Avatar, BakeReport, skeleton};
 use crate::capture::Light;
-use synth::{DemoConfig, demo};
 use crate::config::{Config, Method, Preset};
 use crate::render::field::FieldRenderer;
 use crate::render::picture::Renderer;
 use crate::scene::prepared::Scene;
 use crate::train::trainer::Trainer;
+use synth::{DemoConfig, demo};
 
 /// Height of the known field over the prior.
 const HEIGHT: f32 = 0.0123;

@@ -89,11 +89,11 @@ fn highest(face: &[u32; 3], vertices: &[f32]) -> f32 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use synth::{DemoConfig, demo};
     use crate::config::{Method, Preset};
     use crate::model::vertices::VertexCode;
     use crate::scene::prepared::Scene;
     use crate::train::trainer::Trainer;
+    use synth::{DemoConfig, demo};
 
     fn scene(config: &Config) -> Scene {
         let body = smpl::BodyModel::embedded();

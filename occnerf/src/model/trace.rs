@@ -129,7 +129,7 @@ impl Tracer<'_> {
         let ray = march.ray;
         let count = self.config.samples;
         let first = samples.len();
-        let span = self.surface.occupancy.region().and_then(|region| region.intersect(&ray));
+        let span = self.surface.occupancy.region().intersect(&ray);
         if let Some((near, far)) = span.filter(|(near, far)| far > near) {
             let bins = Bins::new(near, far, count);
             while march.bin < count && samples.len() - first < most {
@@ -138,7 +138,7 @@ impl Tracer<'_> {
                 let place = march.jitter.as_mut().map_or(0.5, RandomStream::uniform);
                 let t = bins.at(bin, place);
                 let point = ray.origin + t * ray.direction;
-                if !self.surface.occupancy.is_live(point) {
+                if !self.surface.occupancy.is_occupied(point) {
                     continue;
                 }
                 let live;
@@ -183,7 +183,7 @@ impl Tracer<'_> {
         }
         let looked_up = nearest.map(|found| found.face);
         let Some(mapped) = self.motion.map(self.frame, point, || nearest) else { return (false, looked_up) };
-        if nearest.is_none() && !self.near_canonical.is_live(mapped.canonical) {
+        if nearest.is_none() && !self.near_canonical.is_occupied(mapped.canonical) {
             return (false, None);
         }
         let corner = |v: u32| self.body.canonical.vertices[v as usize];
@@ -247,11 +247,11 @@ impl Tracer<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use synth::{DemoConfig, demo};
     use crate::config::{DistanceKind, Method, MotionKind, Preset};
     use crate::model::view::PosedView;
     use crate::scene::prepared::Scene;
     use crate::train::trainer::Trainer;
+    use synth::{DemoConfig, demo};
 
     #[test]
     fn with_a_volume_a_sample_lives_where_the_canonical_prior_is_near() {

@@ -77,10 +77,10 @@ mod tests {
     use glam::DVec3;
 
     use super::*;
-    use synth::{DemoConfig, demo};
     use crate::config::{Config, Method, Preset};
-    use volrender::RandomStream;
     use crate::scene::prepared::PreparedFrame;
+    use synth::{DemoConfig, demo};
+    use volrender::RandomStream;
 
     /// Where the segment from `from` to `to` crosses a triangle, as a part of its length.
     fn crossing(from: DVec3, to: DVec3, [a, b, c]: [DVec3; 3]) -> Option<f64> {

@@ -211,14 +211,26 @@ fn changes(pixels: &Pixels) -> [(f64, u64); LINES] {
 
 #[cfg(test)]
 mod tests {
+    use synth::{DemoConfig, Perturbation, SynthConfig, demo, synthesise};
+    use testkit::files::Directory;
+
     use super::*;
-    use synth::{DemoConfig, Perturbation, demo};
+    use crate::capture::{Layout, LoadOptions, load_capture};
+
+    /// A synthetic capture in files, whose photographs masks can grow into.
+    fn on_disk(name: &str, size: u32, layout: Layout) -> (Directory, Capture) {
+        let config = SynthConfig { size, frames: 12, eval_cameras: 1, eval_every: 12, ..SynthConfig::default() };
+        let made = synthesise(None, None, &config, &|_| {}).unwrap();
+        let directory = Directory::new(name);
+        made.write(directory.path(), layout, &|_| {}).unwrap();
+        let capture = load_capture(directory.path(), &made.body, &LoadOptions::default()).unwrap();
+        (directory, capture)
+    }
 
     #[test]
     fn masks_that_are_too_large_are_found_and_trimmed_and_no_others() {
         let body = BodyModel::embedded();
-        let config = DemoConfig { size: 192, frames: 12, eval_cameras: 1, ..DemoConfig::default() };
-        let given = demo(&config, &body).unwrap();
+        let (_directory, given) = on_disk("masks-large", 192, Layout::HumanNerf);
         let area = |c: &Capture| c.train.iter().map(|f| f.pixels().unwrap().mask.iter().sum::<f32>()).sum::<f32>();
         for (mask_pixels, ragged_pixels) in [(0, 0.0), (-3, 0.0), (-1, 0.0), (0, 2.0), (2, 0.0), (3, 0.0), (5, 0.0)] {
             let mut capture = given.clone();
@@ -244,8 +256,9 @@ mod tests {
     fn masks_that_are_too_small_grow_into_the_photograph_and_no_others() {
         let body = BodyModel::embedded();
         let config = DemoConfig { frames: 12, eval_cameras: 0, ..DemoConfig::default() };
-        let given = demo(&config, &body).unwrap();
-        assert_eq!(missing(&given.train, &body).unwrap(), 0, "without a photograph nothing is known");
+        let drawn = demo(&config, &body).unwrap();
+        let (_directory, given) = on_disk("masks-small", config.size, Layout::HumanNerf);
+        assert_eq!(missing(&drawn.train, &body).unwrap(), 0, "without a photograph nothing is known");
         // So little does not move an edge, and leaves a photograph.
         let right = [(0, 0.4), (0, 2.0), (0, 4.0), (2, 0.0), (3, 0.0)];
         for (mask_pixels, ragged_pixels) in right.into_iter().chain([(-1, 0.0), (-2, 0.0), (-3, 0.0), (-2, 2.0)]) {
@@ -278,8 +291,7 @@ mod tests {
     #[test]
     fn masks_never_grow_into_what_is_known_to_stand_before_the_person() {
         let body = BodyModel::embedded();
-        let config = DemoConfig { frames: 12, eval_cameras: 0, known_occluder: true, ..DemoConfig::default() };
-        let mut capture = demo(&config, &body).unwrap();
+        let (_directory, mut capture) = on_disk("masks-occluder", 192, Layout::Wild);
         Perturbation { mask_pixels: -2, ..Perturbation::NONE }.apply(&mut capture, &body).unwrap();
         let small = capture.clone();
         mend_masks(&mut capture, &body).unwrap();

@@ -7,7 +7,7 @@ use smpl::BodyModel;
 use visibility::{RayMesh, VisibilityCounts};
 
 use crate::Error;
-use crate::capture::{Capture, CaptureError, Frame, Light, PixelSource, PixelReader, Pixels};
+use crate::capture::{Capture, CaptureError, Frame, Light, PixelReader, PixelSource, Pixels};
 use crate::config::Config;
 use crate::model::body::{Body, Moment};
 use crate::model::colors::PriorColors;

@@ -90,11 +90,11 @@ pub(crate) fn strange_edge(frames: &[Vec<(Seen, usize)>], light: Light, vertices
 mod tests {
     use super::*;
     use crate::capture::Capture;
-use synth::{DemoConfig, Perturbation, demo};
     use crate::config::{Config, Method, Preset};
     use crate::model::colors::PriorColors;
     use crate::scene::labels::Label;
     use crate::scene::prepared::Scene;
+    use synth::{DemoConfig, Perturbation, demo};
 
     fn scene(wrong: Perturbation) -> Scene {
         let body = smpl::BodyModel::embedded();

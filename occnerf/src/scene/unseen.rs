@@ -128,8 +128,8 @@ fn axes(body: &Body) -> Vec<Vec3> {
 mod tests {
     use super::*;
     use crate::config::{Config, Method, Preset};
-    use volrender::RandomStream;
     use smpl::BodyModel;
+    use volrender::RandomStream;
 
     fn body() -> Body {
         Body::new(&BodyModel::embedded(), &[], &Config::preset(Preset::Fast, Method::Occnerf)).unwrap()

@@ -2,9 +2,9 @@
 
 use crate::capture::PixelReader;
 use crate::config::Config;
-use volrender::RandomStream;
 use crate::scene::labels::{Label, Labels};
 use crate::scene::prepared::Scene;
+use volrender::RandomStream;
 
 /// Share of patches centred on a pixel of the subject; the rest fall anywhere in the body's box.
 const ON_SUBJECT: f32 = 0.8;

@@ -187,8 +187,8 @@ pub(crate) fn completeness(sigma: f32, beta: f32) -> (f32, f32) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use volrender::RandomStream;
     use testkit::gradient::{Tolerance, assert_gradient};
+    use volrender::RandomStream;
 
     fn patch(size: usize, seed: u64) -> Vec<f32> {
         let mut random = RandomStream::new(&[seed]);

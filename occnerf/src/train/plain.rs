@@ -16,10 +16,10 @@ use crate::model::encoder::{Coordinates, Encoder};
 use crate::model::parameters::{Arrays, Part};
 use crate::model::samples::Samples;
 use crate::model::trained::Model;
-use volrender::RandomStream;
 use crate::scene::prepared::Scene;
 use crate::train::batch::target;
 use crate::train::trainer::Trainer;
+use volrender::RandomStream;
 
 /// What the plain step reads besides the parameters under test: the samples of a step that was
 /// taken.
@@ -277,8 +277,7 @@ fn a_step_agrees_with_one_written_straight_from_the_definitions() {
     for (seed, (method, motion, distance)) in
         [1u64, 5, 3, 4, 1, 3, 2, 1, 2, 2, WITHOUT_SURFACE_TERM, PER_AREA].into_iter().zip(cases)
     {
-        let demo =
-            synth::DemoConfig { size: 48, frames: 3, eval_cameras: 1, eval_every: 3, ..Default::default() };
+        let demo = synth::DemoConfig { size: 48, frames: 3, eval_cameras: 1, eval_every: 3, ..Default::default() };
         let capture = synth::demo(&demo, &body).unwrap();
         let config = tiny(method, motion, distance, seed);
         let scene = Scene::new(&capture, &body, &config).unwrap();

@@ -10,13 +10,13 @@ use crate::model::times::{StepTimes, Stopwatch};
 use crate::model::trace::{March, PosedSurface};
 use crate::model::trained::Model;
 use crate::model::vertices::VertexCode;
-use volrender::RandomStream;
 use crate::scene::labels::Label;
 use crate::scene::prepared::PreparedFrame;
 use crate::train::backward::motion::volume_backward;
 use crate::train::batch::Batch;
 use crate::train::loss::completeness;
 use crate::train::ordered::OrderedSamples;
+use volrender::RandomStream;
 
 const JITTER: u64 = 0x4A49_5454;
 
@@ -147,7 +147,6 @@ pub(crate) fn zero(buffer: &mut Vec<f32>, len: usize) {
 
 #[cfg(test)]
 mod tests {
-    use synth::{DemoConfig, demo};
     use crate::config::{Config, Method, MotionKind, Preset};
     use crate::model::march::MarchOptions;
     use crate::model::parameters::Part;
@@ -155,6 +154,7 @@ mod tests {
     use crate::train::report::StepReport;
     use crate::train::step::StepOptions;
     use crate::train::trainer::Trainer;
+    use synth::{DemoConfig, demo};
 
     /// Some steps with all samples, to make the surface opaque, and one more as `config` has it:
     /// its report, the colours of its rays and the gradients.

@@ -93,7 +93,8 @@ impl<'a> Trainer<'a> {
     /// [`Trainer::step`], also of a resumed run.
     ///
     /// # Errors
-    /// Those of [`Lpips::load`]; [`Error::Lpips`] for patches too small for the network.
+    /// Those of [`Lpips::load`] and, for patches too small for the network, of
+    /// [`Lpips::check_size`].
     pub fn load_perceptual(&mut self) -> Result<(), Error> {
         let config = &self.model.config;
         if config.loss.perceptual > 0.0 && !config.loss.perceptual_weights.is_empty() {
@@ -115,7 +116,7 @@ impl<'a> Trainer<'a> {
     /// or `none`.
     pub fn perceptual(&self) -> String {
         match &self.lpips {
-            Some(lpips) => format!("lpips {}", lpips.trunk().name()),
+            Some(lpips) => format!("lpips {}", lpips.name()),
             None => self.model.config.loss.perceptual_name(),
         }
     }
@@ -142,7 +143,7 @@ impl<'a> Trainer<'a> {
     /// Takes one optimisation step.
     ///
     /// # Errors
-    /// [`Error::Data`] where the step's picture cannot be decoded; [`Error::Lpips`] where
+    /// [`Error::Data`] where the step's picture cannot be decoded; [`Error::Perceptual`] where
     /// the configuration names weights of the perceptual term and [`Trainer::load_perceptual`] was
     /// not called. The model is then as it was before.
     pub fn step(&mut self) -> Result<StepReport, Error> {
@@ -155,7 +156,7 @@ impl<'a> Trainer<'a> {
         let Buffers { batch, groups, vertex_code, surface, photometric, transposed, d_volume } = buffers;
         let loss = &model.config.loss;
         if lpips.is_none() && !loss.perceptual_weights.is_empty() && loss.perceptual > 0.0 {
-            return Err(Error::Lpips("the weights of the perceptual term were not loaded".to_owned()));
+            return Err(Error::Perceptual("its weights were not loaded".to_owned()));
         }
         let step = model.steps_done;
         let (mut times, mut watch) = (StepTimes::default(), Stopwatch::start());

@@ -215,8 +215,8 @@ fn about_origin(frame: &Frame, pelvis: Vec3) -> Pose {
 
 #[cfg(test)]
 mod tests {
-    use crate::{DemoConfig, demo};
     use super::*;
+    use crate::{DemoConfig, demo};
 
     fn capture(body: &BodyModel) -> Capture {
         sized(body, 48)

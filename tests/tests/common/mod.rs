@@ -7,9 +7,9 @@ use std::sync::OnceLock;
 
 use glam::Vec3;
 use occnerf::capture::Capture;
-use synth::{DemoConfig, demo};
 use occnerf::{Config, Method, MotionKind, PreparedFrame, Preset, Scene, StepReport, Trainer};
 use smpl::{BodyModel, Placement};
+use synth::{DemoConfig, demo};
 use visibility::RayMesh;
 
 pub const METHODS: [Method; 3] = [Method::Occnerf, Method::HashPoint, Method::Humannerf];

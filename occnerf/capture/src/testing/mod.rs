@@ -77,7 +77,8 @@ pub fn overlap(frame: &super::Frame, body: &BodyModel) -> f32 {
         if frame.pixels().unwrap().occluder.as_ref().is_some_and(|o| o[i]) {
             continue;
         }
-        let (column, row) = (i as u32 % frame.pixels().unwrap().image.width, i as u32 / frame.pixels().unwrap().image.width);
+        let (column, row) =
+            (i as u32 % frame.pixels().unwrap().image.width, i as u32 / frame.pixels().unwrap().image.width);
         let ray = frame.camera.ray(column as f32 + 0.5, row as f32 + 0.5);
         let (covered, subject) = (mesh.first_hit(ray.origin, ray.direction).is_some(), mask > 0.5);
         both += usize::from(covered && subject);

@@ -107,7 +107,10 @@ fn poses_may_be_rows_and_a_pixel_that_an_occluder_touches_is_covered() {
     let capture = load_capture(dir.path(), &body(), &options).unwrap();
     assert_eq!(capture.train[1].pose, capture.train[0].pose);
     // Half of the first column was covered.
-    assert_eq!(capture.train[1].pixels().unwrap().occluder.as_deref().unwrap(), [true, false, false, true, false, false]);
+    assert_eq!(
+        capture.train[1].pixels().unwrap().occluder.as_deref().unwrap(),
+        [true, false, false, true, false, false]
+    );
 }
 
 #[test]

@@ -27,8 +27,8 @@ use smpl::{BodyModel, Placement};
 use self::annots::Annots;
 use super::decode::{Planned, View, budget};
 use super::image::dimensions;
-use super::pixels::Area;
 use super::pictures::{file_name, is_directory};
+use super::pixels::Area;
 use super::records::{Record, Records, triples};
 use super::{Capture, CaptureError, EvalFrame, LoadOptions, checks};
 

@@ -105,13 +105,13 @@ pub(super) fn keep(model: &BodyModel, poses: &[&Posed], normals: &mut [Normal]) 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use volrender::RandomStream;
     use crate::scene::registration::system::{Expected, Solution, solve};
     use crate::scene::registration::tests::frame;
     use crate::scene::registration::unknowns::changed;
     use glam::Vec3;
     use proptest::prelude::*;
     use smpl::Placement;
+    use volrender::RandomStream;
 
     const ELBOWS: [usize; 2] = [18, 19];
 

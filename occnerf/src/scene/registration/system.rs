@@ -197,8 +197,8 @@ pub(super) fn inverse(matrix: DMatrix<f64>) -> Option<DMatrix<f64>> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use volrender::RandomStream;
     use proptest::prelude::*;
+    use volrender::RandomStream;
 
     #[test]
     fn a_matrix_times_its_inverse_is_one_and_what_is_not_positive_has_none() {

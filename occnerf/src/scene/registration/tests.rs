@@ -2,9 +2,9 @@
 
 use super::*;
 use crate::capture::{Image, Pixels};
-use synth::{DemoConfig, Perturbation, demo};
 use glam::{Affine3A, Mat3};
 use smpl::Placement;
+use synth::{DemoConfig, Perturbation, demo};
 
 /// A frame without a subject.
 pub(super) fn frame(pose: Vec<Vec3>, placement: Placement) -> Frame {

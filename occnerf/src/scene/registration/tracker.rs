@@ -72,9 +72,9 @@ impl Tracker {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use volrender::RandomStream;
     use crate::scene::registration::system::{Expected, Normal, Solution, solve};
     use glam::Vec3;
+    use volrender::RandomStream;
 
     /// A walk of bones as wrong as `truth`, of which the first two axes of each are measured.
     fn learnt(truth: Tracker, seed: u64) -> Tracker {

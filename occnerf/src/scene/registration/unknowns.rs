@@ -137,8 +137,8 @@ impl<'a> Motions<'a> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use volrender::RandomStream;
     use proptest::prelude::*;
+    use volrender::RandomStream;
 
     proptest! {
         #![proptest_config(ProptestConfig::with_cases(12))]

@@ -23,8 +23,8 @@ use self::texture::{Dress, albedo};
 use crate::film::noise::normal;
 use crate::film::render::{Lamp, Posture};
 use crate::film::stage::{Progress, Stage, ring};
-use capture::{Capture, CaptureError, Frame};
 use crate::obstacle::Obstacle;
+use capture::{Capture, CaptureError, Frame};
 use volrender::RandomStream;
 
 /// Shape coefficients of the person and of the tracker's guess that are not zero.

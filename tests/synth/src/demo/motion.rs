@@ -110,12 +110,7 @@ pub(crate) struct TrackerError {
 
 /// What a tracker would report for `poses`: the errors of bones are independent of each other and
 /// smooth in time. `pelvis` is the pelvis joint at rest, about which the global error turns.
-pub(crate) fn track(
-    poses: &[Pose],
-    parents: &[Option<usize>],
-    pelvis: Vec3,
-    error: TrackerError,
-) -> Vec<Pose> {
+pub(crate) fn track(poses: &[Pose], parents: &[Option<usize>], pelvis: Vec3, error: TrackerError) -> Vec<Pose> {
     let joints = parents.len();
     let noise: Vec<Vec<Vec3>> = (0..joints as u64)
         .map(|j| wander(&mut RandomStream::new(&[error.seed, 0x706f_7365, j]), poses.len(), error.rotation))

@@ -56,7 +56,11 @@ fn what_the_obstacle_hides_is_zero_and_the_rest_untouched() {
         }
     }
     for (with, without) in occluded().eval.iter().zip(&clear().eval) {
-        assert_eq!(with.frame.pixels().unwrap().image, without.frame.pixels().unwrap().image, "evaluation views are never occluded");
+        assert_eq!(
+            with.frame.pixels().unwrap().image,
+            without.frame.pixels().unwrap().image,
+            "evaluation views are never occluded"
+        );
     }
 }
 
@@ -77,8 +81,9 @@ fn every_camera_sees_the_whole_person_filling_three_quarters_of_the_height() {
     let frames = clear().train.iter().chain(clear().eval.iter().map(|e| &e.frame));
     for frame in frames {
         let size = config().size as usize;
-        let rows: Vec<usize> =
-            (0..size).filter(|row| frame.pixels().unwrap().mask[row * size..(row + 1) * size].iter().any(|m| *m > 0.5)).collect();
+        let rows: Vec<usize> = (0..size)
+            .filter(|row| frame.pixels().unwrap().mask[row * size..(row + 1) * size].iter().any(|m| *m > 0.5))
+            .collect();
         let (top, bottom) = (rows[0], rows[rows.len() - 1]);
         let share = (bottom + 1 - top) as f32 / size as f32;
         assert!((0.68..0.84).contains(&share), "{}: {share}", frame.name);
@@ -183,7 +188,8 @@ fn a_body_in_centimetres_gives_the_same_pictures() {
     }
     let (metres, centimetres) = (demo(&small(), body()).unwrap(), demo(&small(), &centimetres).unwrap());
     for (a, b) in metres.train.iter().zip(&centimetres.train) {
-        let differences = a.pixels().unwrap().mask.iter().zip(&b.pixels().unwrap().mask).filter(|(a, b)| a != b).count();
+        let differences =
+            a.pixels().unwrap().mask.iter().zip(&b.pixels().unwrap().mask).filter(|(a, b)| a != b).count();
         assert!(differences <= 3, "{differences} pixels of {} differ", a.name);
         let distance = |f: &Frame| f.camera.centre_of_projection().length();
         assert!((distance(b) / distance(a) - 100.0).abs() < 1e-2);

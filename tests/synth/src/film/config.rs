@@ -2,10 +2,10 @@
 
 use serde::{Deserialize, Serialize};
 
-use capture::PIXEL_BYTES;
 use crate::demo::DemoConfig;
-use capture::CaptureError;
 use crate::obstacle::Obstacle;
+use capture::CaptureError;
+use capture::PIXEL_BYTES;
 
 /// Limit on the size of all pictures before they are packed, which leaves a small part.
 const MOST_BYTES: u64 = 32 << 30;

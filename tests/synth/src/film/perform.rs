@@ -6,9 +6,9 @@ use glam::{Affine3A, Quat, Vec3};
 use rayon::prelude::*;
 use smpl::{BodyModel, MotionClip, Placement, Shaped};
 
-use capture::CaptureError;
 use crate::demo::landmarks::joint;
 use crate::demo::motion::Pose;
+use capture::CaptureError;
 
 /// Radius of what a person needs around the axis, in the heights that cameras stand for.
 const REACH: f32 = 0.6;

@@ -1,8 +1,8 @@
 use smpl::{Character, MotionClip};
 
 use super::*;
-use testkit::files::shared;
 use crate::{DemoConfig, Obstacle, demo};
+use testkit::files::shared;
 
 fn small() -> SynthConfig {
     SynthConfig { size: 64, frames: 6, eval_cameras: 1, eval_every: 3, ..SynthConfig::default() }
@@ -40,7 +40,11 @@ fn the_fraction_hidden_is_the_one_asked_for() {
         }
     }
     let share = |frames: &[Frame], clear: &[PixelSource]| {
-        frames.iter().zip(clear).filter(|(frame, clear)| frame.pixels().unwrap().mask != clear.pixels().unwrap().mask).count()
+        frames
+            .iter()
+            .zip(clear)
+            .filter(|(frame, clear)| frame.pixels().unwrap().mask != clear.pixels().unwrap().mask)
+            .count()
     };
     let half = Obstacle { share: 0.5, ..Obstacle::default() };
     let made = make(&SynthConfig { occlusion: Occlusion::Rectangle(half), ..small() });
@@ -260,7 +264,8 @@ fn overlap(frame: &Frame, body: &BodyModel) -> f32 {
         if frame.pixels().unwrap().occluder.as_ref().is_some_and(|o| o[i]) {
             continue;
         }
-        let (column, row) = (i as u32 % frame.pixels().unwrap().image.width, i as u32 / frame.pixels().unwrap().image.width);
+        let (column, row) =
+            (i as u32 % frame.pixels().unwrap().image.width, i as u32 / frame.pixels().unwrap().image.width);
         let ray = frame.camera.ray(column as f32 + 0.5, row as f32 + 0.5);
         let (covered, subject) = (mesh.first_hit(ray.origin, ray.direction).is_some(), mask > 0.5);
         both += usize::from(covered && subject);

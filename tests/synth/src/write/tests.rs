@@ -5,8 +5,8 @@ use glam::Vec3;
 use smpl::BodyModel;
 
 use super::folder::byte;
-use testkit::files::Directory;
 use capture::{Capture, Frame, Layout, LoadOptions, find_body, load_capture};
+use testkit::files::Directory;
 
 use crate::{Obstacle, Occlusion, Perturbation, SynthConfig, Synthetic, synthesise};
 
@@ -67,7 +67,8 @@ fn same_picture(layout: Layout, made: &Frame, read: &Frame) {
             continue;
         }
         for c in 0..3 {
-            let (p, q) = (made.pixels().unwrap().image.pixels[3 * i + c], read.pixels().unwrap().image.pixels[3 * i + c]);
+            let (p, q) =
+                (made.pixels().unwrap().image.pixels[3 * i + c], read.pixels().unwrap().image.pixels[3 * i + c]);
             assert!((p - q).abs() < 1.5 / 255.0, "{layout:?} {}: {p} {q}", made.name);
         }
     }
@@ -127,7 +128,13 @@ fn without_occlusion_nothing_is_hidden() {
         let (_dir, _, read) = round(&made, layout, &format!("write-none-{layout:?}"));
         for (clear, b) in made.clear.iter().zip(&read.train) {
             assert!(
-                clear.pixels().unwrap().mask.iter().zip(&b.pixels().unwrap().mask).all(|(c, m)| (*c > 0.5) == (*m > 0.5)),
+                clear
+                    .pixels()
+                    .unwrap()
+                    .mask
+                    .iter()
+                    .zip(&b.pixels().unwrap().mask)
+                    .all(|(c, m)| (*c > 0.5) == (*m > 0.5)),
                 "{layout:?}"
             );
         }
@@ -157,7 +164,9 @@ fn objects_are_in_the_pictures_and_marked_in_the_wild_layout() {
         let picture = image::open(dir.path().join(path)).unwrap().into_rgb8();
         assert!(picture.pixels().all(|p| p.0 != [0; 3]), "{layout:?}");
         let mask = &read.train[0].pixels().unwrap().mask;
-        assert!(read.train[0].pixels().unwrap().image.pixels.chunks(3).zip(mask).all(|(p, m)| *m > 0.0 || p == [0.0; 3]));
+        assert!(
+            read.train[0].pixels().unwrap().image.pixels.chunks(3).zip(mask).all(|(p, m)| *m > 0.0 || p == [0.0; 3])
+        );
     }
 }
 
@@ -212,10 +221,7 @@ fn pictures_decoded_on_demand_are_those_decoded_at_once() {
         let (dir, body, _) = round(made, layout, &format!("write-demand-{layout:?}"));
         let moving = Obstacle { travel: 0.2, ..Obstacle::default() };
         for mask_pixels in [0, 2, -1] {
-            let at_once = LoadOptions {
-                resize: Some(40),
-                ..LoadOptions::default()
-            };
+            let at_once = LoadOptions { resize: Some(40), ..LoadOptions::default() };
             let read = |options: &LoadOptions| {
                 let mut capture = load_capture(dir.path(), &body, options).unwrap();
                 moving.hide(&mut capture.train).unwrap();

@@ -6,8 +6,8 @@ use serde_json::{Value, json};
 
 use super::folder::{Folder, flat, origin, rgb, rows};
 use super::pickle::Py;
-use capture::Area;
 use crate::film::Synthetic;
+use capture::Area;
 use capture::{CaptureError, Frame, Image};
 
 /// Folder of the training camera.

@@ -17,7 +17,10 @@ fn a_whole_capture_is_read() {
     assert_eq!(names, ["frame_000000", "frame_000001", "frame_000002"]);
     assert_eq!(capture.mean_betas, [0.5]);
     let frame = &capture.train[1];
-    assert_eq!((frame.pixels().unwrap().image.width, frame.pixels().unwrap().image.height, frame.pixels().unwrap().mask.len()), (6, 4, 24));
+    assert_eq!(
+        (frame.pixels().unwrap().image.width, frame.pixels().unwrap().image.height, frame.pixels().unwrap().mask.len()),
+        (6, 4, 24)
+    );
     assert_eq!(frame.pose, [Vec3::ZERO, Vec3::new(0.0, 0.25, 0.0)]);
     assert_eq!(
         frame.placement,

@@ -33,7 +33,8 @@ fn a_whole_capture_is_read() {
     assert_eq!(subject, [4, 5, 6, 7]);
     assert!(frame.pixels().unwrap().mask.iter().all(|m| [0.0, 1.0].contains(m)));
     assert!(
-        (frame.pixels().unwrap().image.rgb(5, 0)[0] - 200.0 / 255.0).abs() < 0.02 && frame.pixels().unwrap().image.rgb(0, 0) == [0.0; 3]
+        (frame.pixels().unwrap().image.rgb(5, 0)[0] - 200.0 / 255.0).abs() < 0.02
+            && frame.pixels().unwrap().image.rgb(0, 0) == [0.0; 3]
     );
 
     // The second camera lacks frame 1; the last picture that the file lists is not on disk.
@@ -107,7 +108,10 @@ fn hidden_pixels_never_reach_training_and_kept_back_views_are_whole() {
                 assert!(*mask > 0.0 || pixel == [0.0; 3], "a hidden colour");
             }
         }
-        assert_eq!(capture.eval[0].frame.pixels().unwrap().mask.iter().filter(|m| **m > 0.5).count(), 4 * SIZE.1 as usize);
+        assert_eq!(
+            capture.eval[0].frame.pixels().unwrap().mask.iter().filter(|m| **m > 0.5).count(),
+            4 * SIZE.1 as usize
+        );
         let columns =
             |f: &crate::Frame| (0..SIZE.0 as usize).filter(|&x| f.pixels().unwrap().mask[x] > 0.5).collect::<Vec<_>>();
         capture.train.iter().map(columns).collect::<Vec<_>>()
@@ -176,7 +180,10 @@ fn resizing_scales_projections_exactly() {
     let options = LoadOptions { resize: Some(6), ..clear() };
     let small = load_capture(fixture.dir.path(), &body(), &options).unwrap();
     for (a, b) in large.train.iter().zip(&small.train) {
-        assert_eq!((b.pixels().unwrap().image.width, b.pixels().unwrap().image.height, b.pixels().unwrap().mask.len()), (6, 4, 24));
+        assert_eq!(
+            (b.pixels().unwrap().image.width, b.pixels().unwrap().image.height, b.pixels().unwrap().mask.len()),
+            (6, 4, 24)
+        );
         let posed = body().pose(&body().shaped(&a.betas), &a.pose, a.placement);
         for v in posed.vertices {
             let (p, q) = (a.camera.project(v).unwrap(), b.camera.project(v).unwrap());

@@ -1,19 +1,15 @@
-//! Weights in every form that people have them in, and damaged ones.
+//! Files of weights in every form, and damaged ones.
 
-use std::collections::BTreeMap;
 use std::io::{Cursor, Write};
 use std::path::{Path, PathBuf};
 
-use occnerf::{Error, Lpips, Trunk};
+use lpips::{Lpips, Trunk};
 use proptest::prelude::*;
-use safetensors::tensor::{Dtype, TensorView, serialize};
 use zip::write::SimpleFileOptions;
 use zip::{CompressionMethod, ZipWriter};
 
-use crate::formula::{network, tensor};
+use crate::formula::{Tensors, bytes, network, safetensors, weights};
 use crate::noise;
-
-type Tensors = BTreeMap<String, (Vec<usize>, Vec<f32>)>;
 
 /// An empty folder of a test's own.
 fn folder(name: &str) -> PathBuf {
@@ -21,32 +17,6 @@ fn folder(name: &str) -> PathBuf {
     let _ = std::fs::remove_dir_all(&path);
     std::fs::create_dir_all(&path).unwrap();
     path
-}
-
-/// Formula weights of SqueezeNet: trunk, and linear layers as the package names and shapes them.
-fn weights() -> (Tensors, Tensors) {
-    let (mut trunk, mut lin) = (Tensors::new(), Tensors::new());
-    Lpips::new(Trunk::SqueezeNet, |name, shape| {
-        let values = tensor(name, shape, &mut |_| vec![1.0; shape[0]]);
-        match name.strip_suffix(".weight").filter(|name| name.starts_with("lin")) {
-            Some(layer) => lin.insert(format!("{layer}.model.1.weight"), (vec![1, shape[0], 1, 1], values.clone())),
-            None => trunk.insert(name.to_owned(), (shape.to_vec(), values.clone())),
-        };
-        Ok::<_, Error>(values)
-    })
-    .unwrap();
-    (trunk, lin)
-}
-
-fn bytes(values: &[f32]) -> Vec<u8> {
-    values.iter().flat_map(|v| v.to_le_bytes()).collect()
-}
-
-fn safetensors(tensors: &Tensors) -> Vec<u8> {
-    let data: Vec<_> = tensors.iter().map(|(name, (shape, values))| (name, shape, bytes(values))).collect();
-    let views =
-        data.iter().map(|(name, shape, data)| (name, TensorView::new(Dtype::F32, (*shape).clone(), data).unwrap()));
-    serialize(views.collect::<Vec<_>>(), None).unwrap()
 }
 
 /// The pickle of a state dictionary as `torch.save` writes it: protocol 2, an `OrderedDict` with
@@ -123,12 +93,6 @@ fn legacy(tensors: &Tensors) -> Vec<u8> {
     out
 }
 
-/// Writes a SqueezeNet of formula weights.
-pub fn squeezenet_file(path: &Path) {
-    let (trunk, lin) = weights();
-    std::fs::write(path, safetensors(&trunk.into_iter().chain(lin).collect())).unwrap();
-}
-
 fn value(lpips: &Lpips) -> f64 {
     lpips.distance(&noise(3 * 32 * 32, 8), &noise(3 * 32 * 32, 9), 32, 32).unwrap()[0]
 }
@@ -189,8 +153,7 @@ fn what_is_wrong_is_named_with_file_tensor_and_shapes() {
     std::fs::write(&path, b"not weights at all, but long enough to be").unwrap();
     refused(&path, &["neither"]);
     refused(&folder.join("none.pth"), &[]);
-    // A damaged file beside the trunk is named where what is missing may be in it, and matters to
-    // nobody else.
+    // A damaged file beside the trunk is an error only if no other file has the linear layers.
     let beside = self::folder("beside");
     let (lonely, cut) = (beside.join("trunk.pth"), beside.join("zlin.pth"));
     std::fs::write(&lonely, archive(&trunk)).unwrap();
@@ -227,8 +190,7 @@ proptest! {
         let (trunk, lin) = weights();
         let few: Tensors = trunk.into_iter().chain(lin).filter(|(name, _)| !name.contains("expand3x3.weight")).collect();
         let mut bytes = [safetensors, archive, legacy][form](&few);
-        // What describes the tensors is small and stands at the start, or in an archive also at the
-        // end.
+        // Descriptions of tensors are short and lie at the start, in an archive also at the end.
         let range = if head { bytes.len().min(20_000) } else { bytes.len() };
         let at = if form == 1 && byte % 2 == 0 { bytes.len() - 1 - at.index(range.min(6000)) } else { at.index(range) };
         if cut { bytes.truncate(at) } else { bytes[at] = byte }

@@ -1,13 +1,20 @@
-//! LPIPS as the perceptual term of a training.
+//! LPIPS as the perceptual term of a training, and as a score.
+#![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
 
-#[path = "../common/mod.rs"]
 mod common;
+#[allow(dead_code, reason = "this test writes one network")]
+#[path = "../lpips/tests/lpips/formula.rs"]
+mod formula;
 
 use std::path::Path;
 
 use occnerf::{Config, Error, FieldRenderer, Lpips, Method, StepReport, Trainer, evaluate_with};
 
-use crate::files::squeezenet_file;
+/// Writes a SqueezeNet of formula weights.
+fn squeezenet_file(path: &Path) {
+    let (trunk, lin) = formula::weights();
+    std::fs::write(path, formula::safetensors(&trunk.into_iter().chain(lin).collect())).unwrap();
+}
 
 fn config(weights: &Path) -> Config {
     let mut config = common::config(Method::Occnerf);
@@ -56,7 +63,7 @@ fn weights_that_are_gone_and_patches_that_are_too_small_are_errors_before_the_fi
     let directory = common::TempDir::new("lpips-refused");
     let weights = directory.path("net.safetensors");
     let mut trainer = Trainer::new(common::scene(), config(&weights)).unwrap();
-    assert!(matches!(trainer.load_perceptual(), Err(Error::Io { path, .. }) if path == weights));
+    assert!(matches!(trainer.load_perceptual(), Err(Error::Lpips(lpips::Error::Io { path, .. })) if path == weights));
     squeezenet_file(&weights);
     let mut trainer = Trainer::new(common::scene(), Config { patch_size: 16, ..config(&weights) }).unwrap();
     let error = trainer.load_perceptual().unwrap_err().to_string();

@@ -2,12 +2,12 @@
 //! target and the gradient by the prediction. VGG16 and the others with random weights, two
 //! threads.
 //!
-//! `cargo bench -p occnerf --bench lpips`: items/s are pixels of the prediction.
+//! `cargo bench -p lpips`: items/s are pixels of the prediction.
 #![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
 
 use divan::Bencher;
 use divan::counter::ItemsCount;
-use occnerf::{Error, Lpips, Trunk};
+use lpips::{Lpips, Trunk};
 
 const PATCHES: usize = 6;
 const SIZE: usize = 32;
@@ -28,7 +28,7 @@ fn random(address: usize) -> f32 {
 fn network(trunk: Trunk) -> Lpips {
     Lpips::new(trunk, |_, shape| {
         let scale = 2.0 * (6.0 / shape[1..].iter().product::<usize>() as f32).sqrt();
-        Ok::<_, Error>((0..shape.iter().product()).map(|i| scale * (random(i) - 0.5)).collect())
+        Ok((0..shape.iter().product()).map(|i| scale * (random(i) - 0.5)).collect())
     })
     .unwrap()
 }
@@ -46,7 +46,7 @@ fn perceptual_term(bencher: Bencher<'_, '_>, trunk: Trunk) {
         .bench_local(|| lpips.distance_backward(&a, &b, SIZE, SIZE, 1.0, &mut d_a).unwrap());
 }
 
-/// A picture of 256 × 256 against another, as when a run is scored.
+/// Distance of two images of 256 × 256, as in scoring.
 #[divan::bench(args = [Trunk::Vgg16, Trunk::AlexNet, Trunk::SqueezeNet], sample_size = 1, sample_count = 5)]
 fn picture(bencher: Bencher<'_, '_>, trunk: Trunk) {
     let lpips = network(trunk);

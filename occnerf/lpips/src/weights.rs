@@ -1,4 +1,4 @@
-//! Files of weights: which tensors there are, and reading those that are asked for.
+//! Files of weights: finding a trunk with its linear layers, and reading single tensors.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -10,15 +10,15 @@ use array_files::pickle::Value;
 use array_files::torch::{self, TorchFile};
 use safetensors::tensor::{Dtype, Metadata};
 
-use super::trunk::Trunk;
-use crate::Error;
+use crate::error::Error;
+use crate::trunk::Trunk;
 
 /// Longest header of a safetensors file, as in the format's own library.
 const MAX_HEADER: u64 = 100_000_000;
-/// Files of a directory that are looked into.
+/// Most files of a directory that are opened.
 const MAX_FILES: usize = 256;
 
-/// A tensor of a file.
+/// A tensor of a file, not read yet.
 #[derive(Clone, Debug)]
 struct Tensor {
     shape: Vec<usize>,
@@ -27,16 +27,9 @@ struct Tensor {
 
 #[derive(Clone, Debug)]
 enum Place {
-    /// Type, and where the bytes start in a safetensors file.
+    /// Type and offset in a safetensors file.
     Bytes(Dtype, u64),
     Torch(torch::Tensor),
-}
-
-/// An open file and what it holds.
-pub(super) struct Weights {
-    path: PathBuf,
-    source: Source,
-    tensors: BTreeMap<String, Tensor>,
 }
 
 enum Source {
@@ -44,23 +37,22 @@ enum Source {
     Torch(TorchFile<BufReader<File>>),
 }
 
-pub(super) fn fault(path: &Path, what: impl Into<String>) -> Error {
-    Error::File { path: path.to_owned(), what: what.into() }
-}
-
-pub(super) fn io(path: &Path) -> impl Fn(std::io::Error) -> Error {
-    move |source| Error::Io { path: path.to_owned(), source }
+/// An open file and its tensors.
+struct Weights {
+    path: PathBuf,
+    source: Source,
+    tensors: BTreeMap<String, Tensor>,
 }
 
 /// A trunk with its linear layers, in one file or two.
-pub(super) struct Found {
+pub(crate) struct Found {
     pub trunk: Trunk,
     weights: Weights,
     lin: Option<Weights>,
 }
 
 impl Found {
-    /// Reads a tensor of exactly `shape`, axes of one beside.
+    /// Reads a tensor of exactly `shape`; that of a linear layer may have further axes of length 1.
     pub fn read(&mut self, name: &str, shape: &[usize]) -> Result<Vec<f32>, Error> {
         match &mut self.lin {
             Some(lin) if name.starts_with("lin") => lin.read(name, shape),
@@ -68,17 +60,25 @@ impl Found {
         }
     }
 
-    /// `error` with the file's name.
+    /// Adds the file's name to the error of a tensor.
     pub fn blame(&self, error: Error) -> Error {
         match error {
-            Error::Lpips(what) => fault(&self.weights.path, what),
+            Error::Tensor { .. } => fault(&self.weights.path, error.to_string()),
             other => other,
         }
     }
 }
 
-/// The weights at `path`, as [`Lpips::load`](super::Lpips::load) looks for them.
-pub(super) fn find(path: &Path) -> Result<Found, Error> {
+fn fault(path: &Path, what: impl Into<String>) -> Error {
+    Error::File { path: path.to_owned(), what: what.into() }
+}
+
+fn io(path: &Path) -> impl Fn(std::io::Error) -> Error {
+    move |source| Error::Io { path: path.to_owned(), source }
+}
+
+/// Searches `path` as [`Lpips::load`](crate::Lpips::load) describes.
+pub(crate) fn find(path: &Path) -> Result<Found, Error> {
     if !std::fs::metadata(path).map_err(io(path))?.is_dir() {
         let weights = Weights::open(path)?;
         let trunk = weights.trunk().ok_or_else(|| {
@@ -86,55 +86,46 @@ pub(super) fn find(path: &Path) -> Result<Found, Error> {
             let expected = "expected `features.0.weight` and the other layers of SqueezeNet 1.1, VGG16 or AlexNet";
             fault(path, format!("holds no trunk: {expected}; it starts with {}", names.join(", ")))
         })?;
-        if weights.has_lin(trunk) {
-            return Ok(Found { trunk, weights, lin: None });
-        }
         let beside = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-        let (others, damaged) = open_all(&files(beside)?);
-        let lin = others.into_iter().find(|other| other.has_lin(trunk));
-        let lin = lin.ok_or_else(|| damaged.unwrap_or_else(|| no_lin(path, trunk)))?;
-        return Ok(Found { trunk, weights, lin: Some(lin) });
+        return with_lin(weights, trunk, beside);
     }
-    let (mut open, damaged) = open_all(&files(path)?);
-    let mut lonely = None;
-    for i in 0..open.len() {
-        let Some(trunk) = open[i].trunk() else { continue };
-        if open[i].has_lin(trunk) {
-            return Ok(Found { trunk, weights: open.swap_remove(i), lin: None });
-        }
-        if let Some(other) = (0..open.len()).find(|&other| open[other].has_lin(trunk)) {
-            let weights = open.swap_remove(i);
-            // The last file has moved to the place that became free.
-            let other = if other == open.len() { i } else { other };
-            return Ok(Found { trunk, weights, lin: Some(open.swap_remove(other)) });
-        }
-        lonely = lonely.or_else(|| Some(no_lin(&open[i].path, trunk)));
-    }
-    Err(damaged.or(lonely).unwrap_or_else(|| fault(path, "has no .safetensors, .pth or .pt file with a trunk in it")))
-}
-
-/// The files that can be read, and what is wrong with the first that cannot: it matters where what
-/// is needed is in none of the others.
-fn open_all(paths: &[PathBuf]) -> (Vec<Weights>, Option<Error>) {
-    let (mut open, mut damaged) = (Vec::new(), None);
-    for path in paths {
-        match Weights::open(path) {
-            Ok(weights) => open.push(weights),
-            Err(error) => damaged = damaged.or(Some(error)),
+    let mut first_error = None;
+    for file in files(path)? {
+        let found = Weights::open(&file).and_then(|weights| match weights.trunk() {
+            Some(trunk) => with_lin(weights, trunk, path).map(Some),
+            None => Ok(None),
+        });
+        match found {
+            Ok(Some(found)) => return Ok(found),
+            Ok(None) => {}
+            Err(error) => first_error = first_error.or(Some(error)),
         }
     }
-    (open, damaged)
+    Err(first_error.unwrap_or_else(|| fault(path, "has no .safetensors, .pth or .pt file with a trunk in it")))
 }
 
-fn no_lin(path: &Path, trunk: Trunk) -> Error {
-    let name = trunk.name();
-    fault(
-        path,
-        format!("is {name} without LPIPS's linear layers: no `lin0.weight` of {name} in it or in a file beside it"),
-    )
+/// Completes a trunk with linear layers from its own file or from a file in `directory`. A damaged
+/// file there is an error only if no other file has them.
+fn with_lin(weights: Weights, trunk: Trunk, directory: &Path) -> Result<Found, Error> {
+    if weights.has_lin(trunk) {
+        return Ok(Found { trunk, weights, lin: None });
+    }
+    let mut first_error = None;
+    for file in files(directory)? {
+        match Weights::open(&file) {
+            Ok(lin) if lin.has_lin(trunk) => return Ok(Found { trunk, weights, lin: Some(lin) }),
+            Ok(_) => {}
+            Err(error) => first_error = first_error.or(Some(error)),
+        }
+    }
+    Err(first_error.unwrap_or_else(|| {
+        let name = trunk.name();
+        let what = "without LPIPS's linear layers: no `lin0.weight`";
+        fault(&weights.path, format!("is {name} {what} of {name} in it or in a file beside it"))
+    }))
 }
 
-/// Files of weights in a directory, by name.
+/// Files of weights in a directory, sorted by name.
 fn files(directory: &Path) -> Result<Vec<PathBuf>, Error> {
     let mut found = Vec::new();
     for entry in std::fs::read_dir(directory).map_err(io(directory))? {
@@ -149,8 +140,8 @@ fn files(directory: &Path) -> Result<Vec<PathBuf>, Error> {
 }
 
 impl Weights {
-    /// Finds out what a file holds, without reading more than that.
-    pub fn open(path: &Path) -> Result<Self, Error> {
+    /// Reads the names, types and shapes of a file's tensors.
+    fn open(path: &Path) -> Result<Self, Error> {
         let mut file = File::open(path).map_err(io(path))?;
         let mut start = Vec::new();
         (&mut file).take(64).read_to_end(&mut start).map_err(io(path))?;
@@ -165,8 +156,8 @@ impl Weights {
         Ok(Self { path: path.to_owned(), source, tensors })
     }
 
-    /// Which trunk this is: all of its first and last layers' names tell it from its relatives.
-    pub fn trunk(&self) -> Option<Trunk> {
+    /// The trunk in the file, told by the names of its layers.
+    fn trunk(&self) -> Option<Trunk> {
         let has = |name: &str| self.tensors.contains_key(name);
         let first = self.tensors.get("features.0.weight")?;
         match first.shape.last() {
@@ -177,27 +168,23 @@ impl Weights {
         }
     }
 
-    /// Whether the linear layers of `trunk` are here.
-    pub fn has_lin(&self, trunk: Trunk) -> bool {
-        let channels: &[usize] = match trunk {
-            Trunk::Vgg16 => &[64, 128, 256, 512, 512],
-            Trunk::AlexNet => &[64, 192, 384, 256, 256],
-            Trunk::SqueezeNet => &[64, 128, 256, 384, 384, 512, 512],
-        };
+    /// Whether the file has the linear layers of `trunk`.
+    fn has_lin(&self, trunk: Trunk) -> bool {
+        let taps = trunk.taps();
         let fits = |(i, &channels): (usize, &usize)| {
             let tensor = self.find(&format!("lin{i}.weight"));
             tensor.is_some_and(|(_, t)| t.shape.iter().product::<usize>() == channels)
         };
-        channels.iter().enumerate().all(fits) && self.find(&format!("lin{}.weight", channels.len())).is_none()
+        taps.iter().enumerate().all(fits) && self.find(&format!("lin{}.weight", taps.len())).is_none()
     }
 
-    /// The tensor `name`; the package's own files put `model.1` into the names of linear layers.
+    /// The tensor `name`. The files of the Python package `lpips` name linear layers
+    /// `lin0.model.1.weight`.
     fn find(&self, name: &str) -> Option<(&String, &Tensor)> {
         let found = self.tensors.get_key_value(name);
         found.or_else(|| self.tensors.get_key_value(&name.replace(".weight", ".model.1.weight")))
     }
 
-    /// Reads a tensor of exactly `shape`, axes of one beside.
     fn read(&mut self, name: &str, shape: &[usize]) -> Result<Vec<f32>, Error> {
         let path = &self.path;
         let found = self.find(name).map(|(name, tensor)| (name.clone(), tensor.clone()));
@@ -214,7 +201,7 @@ impl Weights {
             let found = &tensor.shape;
             return Err(fault(path, format!("`{name}` is {dtype} {found:?}, expected floats {shape:?}")));
         }
-        // The shape is one of ours, so this is at most a few megabytes.
+        // `shape` is that of a layer: at most 9 MB.
         match (&mut self.source, &tensor.place) {
             (Source::Safetensors(file), Place::Bytes(dtype, at)) => {
                 let size = dtype.bitsize() / 8;
@@ -234,7 +221,7 @@ impl Weights {
     }
 }
 
-/// The tensors of a state dictionary, alone or as `state_dict` of a training checkpoint.
+/// Tensors of a state dictionary, saved alone or as `state_dict` of a training checkpoint.
 fn torch_tensors(file: &TorchFile<BufReader<File>>) -> Result<BTreeMap<String, Tensor>, Error> {
     let root = file.root();
     let mut tensors = BTreeMap::new();
@@ -250,7 +237,7 @@ fn torch_tensors(file: &TorchFile<BufReader<File>>) -> Result<BTreeMap<String, T
     Ok(tensors)
 }
 
-/// A little-endian float.
+/// Converts a little-endian float of any width.
 fn number(dtype: Dtype, word: &[u8]) -> f32 {
     match (dtype, word) {
         (Dtype::F16, &[a, b]) => half(u16::from_le_bytes([a, b])),
@@ -261,10 +248,10 @@ fn number(dtype: Dtype, word: &[u8]) -> f32 {
     }
 }
 
-/// IEEE half precision: the exponent's bias is 15 instead of 127.
+/// Converts IEEE half precision, whose exponent has the bias 15 instead of 127.
 fn half(bits: u16) -> f32 {
     let (sign, rest) = (u32::from(bits & 0x8000) << 16, u32::from(bits & 0x7fff));
-    // As a float with a wrong bias it is too small by 2¹¹², subnormal numbers included.
+    // Read with the bias 127, normal and subnormal numbers are too small by 2¹¹².
     let magnitude = if rest >= 0x7c00 {
         f32::from_bits(rest << 13 | 0x7f80_0000)
     } else {
@@ -273,6 +260,7 @@ fn half(bits: u16) -> f32 {
     f32::from_bits(sign | magnitude.to_bits())
 }
 
+/// Tensors of a safetensors file, from its header.
 fn safetensors(path: &Path, file: &mut File) -> Result<BTreeMap<String, Tensor>, Error> {
     let length = file.metadata().map_err(io(path))?.len();
     let mut start = [0; 8];
@@ -288,8 +276,7 @@ fn safetensors(path: &Path, file: &mut File) -> Result<BTreeMap<String, Tensor>,
     let found = length - 8 - header;
     let mut tensors = BTreeMap::new();
     for (name, info) in metadata.tensors() {
-        // Types and shapes fit the offsets: safetensors has looked. Whether the bytes are there it
-        // cannot know.
+        // `Metadata` checks types and shapes against the offsets, not the offsets against the file.
         let (start, end) = (info.data_offsets.0 as u64, info.data_offsets.1 as u64);
         if end > found {
             let (dtype, shape) = (info.dtype, &info.shape);

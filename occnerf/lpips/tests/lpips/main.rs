@@ -1,17 +1,15 @@
 //! LPIPS against golden values and gradients, and against damaged files.
-#![cfg(feature = "lpips")]
 #![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
 
 mod files;
 mod formula;
 mod golden;
-mod training;
 
 use std::path::{Path, PathBuf};
 
 /// A file of the shared data, or `None` with a message where it is absent.
 fn shared(name: &str) -> Option<PathBuf> {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared/data/lpips").join(name);
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared/data/lpips").join(name);
     if !path.exists() {
         eprintln!("skipped: {} is absent", path.display());
         return None;
