@@ -60,7 +60,7 @@ fn rows_of_any_length_without_views_kept_back_fit_a_budget_and_another_capture_o
 fn robustness_is_a_line_for_each_error_of_the_prior() {
     let folder = folder("robustness");
     let (capture, out) = (folder.join("capture"), folder.join("out"));
-    done(&["synth", "--out", text(&capture), "--size", "48", "--frames", "3", "--eval-cameras", "1"]);
+    done(&["synth", "--out", text(&capture), "--size", "64", "--frames", "3", "--eval-cameras", "1"]);
     let arguments = ["reproduce", text(&capture), "--robustness", "--out", text(&out), "--steps", "1", "--seeds", "1"];
     done(&[&arguments[..], &["--rows", "prior,occnerf"]].concat());
     let table = std::fs::read_to_string(out.join("capture/robustness/robustness.md")).unwrap();
