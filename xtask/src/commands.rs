@@ -18,7 +18,7 @@ pub struct Arguments {
 #[derive(Subcommand)]
 enum Command {
     /// Trains on a scene, scores the result on unseen views, and draws it.
-    Train(train::TrainArguments),
+    Train(Box<train::TrainArguments>),
     /// Scores a run, prints a table and writes its metrics.json.
     Eval(eval::EvalArguments),
     /// Draws a run's person: its movement, from all around, or in the rest pose.

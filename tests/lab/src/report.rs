@@ -34,7 +34,7 @@ pub fn report(arguments: &ReportArguments) -> Result<()> {
         (None, several) => several[0].parent().unwrap_or(Path::new("")).join("report.html"),
     };
     let folder = out.parent().filter(|folder| *folder != Path::new("")).unwrap_or(Path::new("."));
-    let mut page = Page::new();
+    let mut page = Page::default();
     let runs: Vec<Run> = runs.iter().map(|d| Run::read(d)).collect::<Result<_>>()?;
     if !runs.is_empty() {
         add_runs(&mut page, &runs, folder)?;
@@ -143,7 +143,7 @@ mod tests {
 
     #[test]
     fn markdown_becomes_headings_of_any_depth_tables_and_paragraphs() {
-        let mut page = Page::new();
+        let mut page = Page::default();
         add_markdown(&mut page, "## a\n\ntext\n\n### `b`: c\n| d | e |\n| --- | ---: |\n| f | 1.5 |");
         let page = page.finish("title");
         assert!(page.contains("<h3>a</h3>") && page.contains("<h3>`b`: c</h3>") && !page.contains("##"), "{page}");

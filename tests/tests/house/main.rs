@@ -88,15 +88,17 @@ fn the_folders_of_occnerf_import_each_other_as_drawn() {
     assert!(drawn.len() > 2, "ARCHITECTURE.md has no block ```folders");
     let mut found: BTreeMap<String, BTreeSet<String>> = BTreeMap::new();
     for (from, to) in imports(&workspace().join("occnerf/src")).unwrap().keys() {
-        // `lib.rs` only hands names on.
         let (from, to) = (folder(from), folder(to));
+        // `lib.rs` only hands names on, those of other crates too.
+        if [from, to].contains(&"lib") {
+            continue;
+        }
         found.entry(to.to_owned()).or_default();
         let imported = found.entry(from.to_owned()).or_default();
         if from != to {
             imported.insert(to.to_owned());
         }
     }
-    found.remove("lib");
     let text = |folders: &BTreeMap<String, BTreeSet<String>>| {
         let line = |(name, imported): (&String, &BTreeSet<String>)| {
             let imported: Vec<&str> = imported.iter().map(String::as_str).collect();

@@ -27,7 +27,7 @@ const CAPTIONS: [(&str, &str); 2] = [
 /// The page of a run that has just been scored.
 pub fn write(directory: &Path, metrics: &Metrics) -> Result<()> {
     let run = Run { name: metrics.method.clone(), directory: directory.to_owned(), metrics: metrics.clone() };
-    let mut page = Page::new();
+    let mut page = Page::default();
     let title = run.title();
     add_runs(&mut page, &[run], directory)?;
     run::write(&directory.join("report.html"), &page.finish(&title))

@@ -12,6 +12,7 @@ const STYLE: &str = include_str!("page.css");
 const SCRIPT: &str = include_str!("page.js");
 
 /// A page in the making.
+#[derive(Default)]
 pub struct Page {
     body: String,
     headings: Vec<String>,
@@ -31,11 +32,6 @@ pub fn data_uri(kind: &str, bytes: &[u8]) -> String {
 }
 
 impl Page {
-    /// An empty page.
-    pub fn new() -> Self {
-        Self { body: String::new(), headings: Vec::new() }
-    }
-
     /// A section's heading, which the page's top links to.
     pub fn heading(&mut self, text: &str) {
         let _ = writeln!(self.body, "<h2 id=\"s{}\">{}</h2>", self.headings.len(), escape(text));
@@ -138,7 +134,7 @@ mod tests {
 
     #[test]
     fn a_link_leads_to_a_file_whatever_its_name() {
-        let mut page = Page::new();
+        let mut page = Page::default();
         page.link("javascript:a b\"/é.html", "<x>");
         let page = page.finish("title");
         assert!(page.contains("<a href=\"javascript%3Aa%20b%22/%C3%A9.html\">&lt;x&gt;</a>"), "{page}");

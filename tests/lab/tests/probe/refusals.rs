@@ -51,7 +51,12 @@ fn whatever_is_wrong_with_the_arrays_is_named_in_one_line() {
         ("knn", with(knn(), "queries", floats(&[1, 3], &[0.0, f32::INFINITY, 0.0])), &[], &["`queries`", "1"]),
         ("knn", with(knn(), "queries", floats(&[1, 3], &[3e38; 3])), &[], &["`distances`", "overflows"]),
         ("surface", with(surface(), "queries", floats(&[1, 2], &[0.0; 2])), &mesh, &["`queries`", "[1, 2]"]),
-        ("surface", with(surface(), "queries", floats(&[1, 3], &[3e38; 3])), &mesh, &["exact_signed_distance", "too large"]),
+        (
+            "surface",
+            with(surface(), "queries", floats(&[1, 3], &[3e38; 3])),
+            &mesh,
+            &["exact_signed_distance", "too large"],
+        ),
         ("visible", with(visible(), "width", whole(&[], &[0])), &mesh, &["`width`", "0"]),
         ("visible", with(visible(), "height", whole(&[], &[1 << 40])), &mesh, &["`height`"]),
         ("visible", with(visible(), "K", floats(&[3, 3], &[0.0; 9])), &mesh, &["`K`"]),
