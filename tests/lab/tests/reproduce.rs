@@ -51,7 +51,7 @@ fn rows_of_any_length_without_views_kept_back_fit_a_budget_and_another_capture_o
     assert_eq!(steps("humannerf-style-4x"), 4 * steps("humannerf-style"));
     assert!(steps("humannerf-style-time") > 0 && steps("occnerf") == steps("humannerf-style"));
     assert!(!table.contains("Novel views") && out.join("person/reproduce.png").is_file(), "{table}");
-    let refusal = common::xtask(&arguments(text(&other)));
+    let refusal = common::lab(&arguments(text(&other)));
     let said = String::from_utf8_lossy(&refusal.stderr);
     assert!(!refusal.status.success() && said.contains("one/person") && said.contains("two/person"), "{said}");
 }

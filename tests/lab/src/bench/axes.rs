@@ -137,7 +137,7 @@ pub fn of_demo(side: u32, quick: bool) -> Vec<Axis> {
         demo("frames", "", &[200.0, 50.0, 20.0, 5.0], &|d, v| frames(d, v as usize)),
         demo("pose noise", "°", &[0.0, 1.5, 5.0, 10.0], &|d, v| d.pose_noise_degrees = v),
         demo("wrong shape", " σ", &[0.15, 2.0], &|d, v| d.beta_noise = v),
-        made("mask erosion", " px", &[0.0, 2.0, 4.0], &|d, v| d.erosion = v as u32),
+        made("mask erosion", " px", &[0.0, 2.0, 4.0], &|d, v| d.wrong.mask_pixels = -(v as i32)),
         made("motion blur", " of a frame", &[0.0, 1.0], &|d, v| d.shutter = v),
         demo("image side", " px", &sides(side), &|d, v| d.size = v as u32),
         made("seen from within", "°", &[180.0, 70.0], &|d, v| {

@@ -12,6 +12,7 @@ use plotters::prelude::*;
 use plotters::style::FontStyle;
 use plotters::style::text_anchor::{HPos, Pos, VPos};
 
+use super::front::front;
 use xtask::process::say;
 use xtask::scale::{Scale, number};
 
@@ -132,6 +133,29 @@ pub struct Panel {
     pub scales: [Axis; 2],
     pub lines: Vec<Line>,
     pub marks: Vec<Mark>,
+}
+
+impl Panel {
+    /// Marks, and a line along the front of `all`.
+    pub fn scatter(title: &str, labels: [&str; 2], marks: Vec<Mark>, all: &[(f64, f64)]) -> Self {
+        let mut along: Vec<(f64, f64)> = all.iter().zip(front(all)).filter(|(_, on)| *on).map(|(at, _)| *at).collect();
+        along.sort_by(|a, b| a.0.total_cmp(&b.0));
+        Self {
+            title: title.to_owned(),
+            labels: labels.map(str::to_owned),
+            scales: [
+                Axis::around(marks.iter().map(|m| m.at.0), true),
+                Axis::around(marks.iter().map(|m| m.at.1), false),
+            ],
+            lines: vec![Line { points: along, color: 5 }],
+            marks,
+        }
+    }
+}
+
+/// Entries of a legend.
+pub fn legend(entries: &[(&str, Style)]) -> Vec<(String, Style)> {
+    entries.iter().map(|&(name, style)| (name.to_owned(), style)).collect()
 }
 
 /// Panels in rows under a title and a legend.

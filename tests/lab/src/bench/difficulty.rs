@@ -18,8 +18,8 @@ const MOMENTS: usize = 8;
 #[serde(default, deny_unknown_fields)]
 pub struct Difficulty {
     pub demo: DemoConfig,
-    /// Pixels by which training masks are eaten away from their border.
-    pub erosion: u32,
+    /// Errors of priors and masks.
+    pub wrong: Perturbation,
     /// Exposure of a training frame as a share of the time from one frame to the next, 0 to 1.
     pub shutter: f32,
     /// Keep only training frames in which the person's front is within this angle of the camera;
@@ -33,7 +33,7 @@ pub struct Difficulty {
 
 impl Default for Difficulty {
     fn default() -> Self {
-        Self { demo: DemoConfig::default(), erosion: 0, shutter: 0.0, facing_degrees: 180.0, unit: 1.0, refined: 0 }
+        Self { demo: DemoConfig::default(), wrong: Perturbation::NONE, shutter: 0.0, facing_degrees: 180.0, unit: 1.0, refined: 0 }
     }
 }
 
@@ -51,8 +51,7 @@ impl Difficulty {
             enlarge(&mut body, self.unit);
         }
         let mut capture = if self.shutter > 0.0 { self.exposed(&body)? } else { demo(&self.demo, &body)? };
-        let mask_pixels = i32::try_from(self.erosion).map_or(i32::MIN, |pixels| -pixels);
-        Perturbation { mask_pixels, ..Perturbation::default() }.apply(&mut capture, &body)?;
+        self.wrong.apply(&mut capture, &body)?;
         if self.facing_degrees < 180.0 {
             keep(&mut capture, |frame| facing(frame) <= self.facing_degrees);
             let degrees = self.facing_degrees;
@@ -202,19 +201,6 @@ mod tests {
         let (coarse, fine) = (posed(&body), posed(&fine));
         for (a, b) in coarse.vertices.iter().zip(&fine.vertices) {
             assert!(a.distance(*b) < 1e-6, "{a} {b}");
-        }
-    }
-
-    #[test]
-    fn erosion_takes_mask_and_picture_away_together() {
-        let (whole, _) = small().make().unwrap();
-        let (eroded, _) = Difficulty { erosion: 1, ..small() }.make().unwrap();
-        assert!(coverage(&eroded) < 0.9 * coverage(&whole) && coverage(&eroded) > 0.0);
-        for frame in &eroded.train {
-            for (colour, &m) in frame.pixels().unwrap().image.pixels.chunks_exact(3).zip(&frame.pixels().unwrap().mask)
-            {
-                assert!(colour.iter().all(|&c| c <= m + 1e-5));
-            }
         }
     }
 

@@ -23,7 +23,7 @@ use clap::{Args, Subcommand};
 use occnerf::capture::Layout;
 
 use self::job::Place;
-use self::runner::Bench;
+use self::runner::{Bench, Line};
 use crate::results::{self, Section};
 use xtask::process::say;
 use xtask::run::{check_threads, use_threads, write};
@@ -83,19 +83,29 @@ struct SceneArguments {
     load: crate::scene::SceneArguments,
 }
 
+/// What a sweep is, and where it goes.
 #[derive(Args)]
-struct CapacityArguments {
+struct SweepArguments {
     #[command(flatten)]
     on: SceneArguments,
-    /// Where to write; what is there is not run again
-    #[arg(long, default_value = "runs/bench-capacity")]
-    out: PathBuf,
+    /// Where to write; what is there is not run again [default: runs/bench-NAME]
+    #[arg(long)]
+    out: Option<PathBuf>,
     /// Fewer points and fewer steps: about 10 minutes on 2 cores
     #[arg(long)]
     quick: bool,
-    /// Steps of each point [default: 400, quick: 80]
+    /// Steps of each run [default: 400, quick: 80; stability: 200, quick: 100]; presets of pareto run
+    /// their own number at 400 and in proportion otherwise
     #[arg(long)]
     steps: Option<u64>,
+    #[command(flatten)]
+    sitting: SittingArguments,
+}
+
+#[derive(Args)]
+struct CapacityArguments {
+    #[command(flatten)]
+    sweep: SweepArguments,
     /// The preset `paper` too, and what is chosen from it, with so many steps and the loss of
     /// `balanced`
     #[arg(long, value_name = "STEPS")]
@@ -103,45 +113,21 @@ struct CapacityArguments {
     /// Seed of every point
     #[arg(long, default_value_t = 1)]
     seed: u64,
-    #[command(flatten)]
-    sitting: SittingArguments,
 }
 
 #[derive(Args)]
 struct ParetoArguments {
     #[command(flatten)]
-    on: SceneArguments,
-    /// Where to write; what is there is not run again
-    #[arg(long, default_value = "runs/bench-pareto")]
-    out: PathBuf,
-    /// Fewer points and fewer steps: under 10 minutes on 2 cores
-    #[arg(long)]
-    quick: bool,
-    /// Steps of each point; presets run their own number at 400 and in proportion otherwise
-    /// [default: 400, quick: 80]
-    #[arg(long)]
-    steps: Option<u64>,
+    sweep: SweepArguments,
     /// Seed of every point
     #[arg(long, default_value_t = 1)]
     seed: u64,
-    #[command(flatten)]
-    sitting: SittingArguments,
 }
 
 #[derive(Args)]
 struct StabilityArguments {
     #[command(flatten)]
-    on: SceneArguments,
-    /// Where to write; what is there is not run again
-    #[arg(long, default_value = "runs/bench-stability")]
-    out: PathBuf,
-    /// Only the easy case and the hardest level of each axis, fewer steps, one seed: under 10
-    /// minutes on 2 cores
-    #[arg(long)]
-    quick: bool,
-    /// Steps of each run [default: 200, quick: 100]
-    #[arg(long)]
-    steps: Option<u64>,
+    sweep: SweepArguments,
     /// Only these axes, comma separated, such as hidden,"pose noise" [default: all]
     #[arg(long, value_delimiter = ',')]
     axes: Vec<String>,
@@ -152,8 +138,6 @@ struct StabilityArguments {
     /// Trained runs at most of each scene; those of more seeds are left out first
     #[arg(long, default_value_t = 60)]
     max_runs: usize,
-    #[command(flatten)]
-    sitting: SittingArguments,
 }
 
 /// How a sweep is run this time.
@@ -244,19 +228,6 @@ impl SceneArguments {
         self.load.options()?.load(scene, self.body.as_deref())
     }
 
-    fn sweep(&self, scene: &str, steps: u64, seed: u64, quick: bool) -> Result<points::Sweep> {
-        let (body, load) = (self.body.clone(), self.load.options()?);
-        Ok(points::Sweep {
-            scene_arguments: self.command_line(scene),
-            place: Place::Scene { scene: scene.to_owned(), body, load },
-            views: if quick { VIEWS.1 } else { VIEWS.0 },
-            steps,
-            full_steps: FULL_STEPS,
-            seed,
-            quick,
-        })
-    }
-
     /// What `bench stability` does to a scene.
     fn axes(&self, scene: &str, side: u32, quick: bool) -> Result<Vec<axes::Axis>> {
         if scene == source::DEMO {
@@ -286,62 +257,96 @@ impl SceneArguments {
     }
 }
 
-/// Steps of a point: as asked, or the usual number.
-fn steps(asked: Option<u64>, quick: bool) -> Result<u64> {
-    let steps = asked.unwrap_or(if quick { FULL_STEPS / 5 } else { FULL_STEPS });
-    anyhow::ensure!((1..=1_000_000).contains(&steps), "--steps {steps}: expected 1 to 1000000");
-    Ok(steps)
+impl SweepArguments {
+    fn out(&self, name: &str) -> PathBuf {
+        self.out.clone().unwrap_or_else(|| Path::new("runs").join(format!("bench-{name}")))
+    }
+
+    fn steps(&self, usual: u64, quick: u64) -> Result<u64> {
+        let steps = self.steps.unwrap_or(if self.quick { quick } else { usual });
+        anyhow::ensure!((1..=1_000_000).contains(&steps), "--steps {steps}: expected 1 to 1000000");
+        Ok(steps)
+    }
+
+    /// The sweep of `pareto` and `capacity` around a scene.
+    fn around(&self, scene: &str, seed: u64) -> Result<points::Sweep> {
+        let on = &self.on;
+        Ok(points::Sweep {
+            scene_arguments: on.command_line(scene),
+            place: Place::Scene { scene: scene.to_owned(), body: on.body.clone(), load: on.load.options()? },
+            views: if self.quick { VIEWS.1 } else { VIEWS.0 },
+            steps: self.steps(FULL_STEPS, FULL_STEPS / 5)?,
+            full_steps: FULL_STEPS,
+            seed,
+            quick: self.quick,
+        })
+    }
+
+    /// The scenes, after a look at what is asked of them.
+    fn scenes(&self) -> Result<Vec<(String, ())>> {
+        self.steps(FULL_STEPS, FULL_STEPS / 5)?;
+        Ok(self.on.checked()?.into_iter().map(|scene| (scene, ())).collect())
+    }
+
+    /// Runs `run` on each of `scenes`, then `draw`, which gets the stem of its charts and returns a
+    /// section of the table.
+    fn sweep<S>(
+        &self,
+        name: &str,
+        scenes: &[(String, S)],
+        run: impl Fn(&str, &S, &mut Bench) -> Result<Vec<Line>>,
+        draw: impl Fn(&str, &S, &[Line], &Path) -> Result<String>,
+    ) -> Result<()> {
+        let out = self.out(name);
+        let mut bench = self.sitting.open(&out)?;
+        let mut text = String::new();
+        for (scene, of_scene) in scenes {
+            let lines = run(scene, of_scene, &mut bench)?;
+            if self.sitting.part.writes_tables() {
+                let short = train::scene_name(Some(scene));
+                let section = draw(&short, of_scene, &lines, &out.join(format!("{name}-{short}")))?;
+                text.push_str(&format!("## {scene}\n\n{}.\n\n{section}\n", results::set_of(&short)));
+            }
+        }
+        finish(&bench, &self.sitting, &text, name)
+    }
 }
 
 fn pareto(arguments: &ParetoArguments) -> Result<()> {
-    let ParetoArguments { on, out, quick, seed, .. } = arguments;
-    let steps = steps(arguments.steps, *quick)?;
-    let scenes = on.checked()?;
-    let mut bench = arguments.sitting.open(out)?;
-    let mut text = String::new();
-    for scene in &scenes {
-        let lines = pareto::run(&on.sweep(scene, steps, *seed, *quick)?, &mut bench)?;
-        if !arguments.sitting.part.writes_tables() {
-            continue;
-        }
-        let name = train::scene_name(Some(scene));
-        pareto::charts(&name, &lines, &out.join(format!("pareto-{name}")))?;
-        text.push_str(&format!("## {scene}\n\n{}.\n\n{}\n", results::set_of(&name), pareto::table(&lines)));
+    let ParetoArguments { sweep, seed } = arguments;
+    let scenes = sweep.scenes()?;
+    let run = |scene: &str, _: &(), bench: &mut Bench| pareto::run_sweep(&sweep.around(scene, *seed)?, bench);
+    sweep.sweep("pareto", &scenes, run, |name, _, lines, stem| {
+        pareto::charts(name, lines, &pareto::SECONDS, stem)?;
+        Ok(pareto::table(lines, pareto::SECONDS[0]))
+    })?;
+    let sitting = &sweep.sitting;
+    if sitting.draw || !sitting.part.writes_tables() {
+        return Ok(());
     }
-    finish(&bench, &arguments.sitting, &text, "pareto")?;
-    if !arguments.sitting.draw && arguments.sitting.part.writes_tables() {
-        kernels::run(out, *quick, arguments.sitting.publish)?;
-    }
-    Ok(())
+    kernels::run(&sweep.out("pareto"), sweep.quick, sitting.publish)
 }
 
 fn capacity_bench(arguments: &CapacityArguments) -> Result<()> {
-    let CapacityArguments { on, out, quick, seed, paper, .. } = arguments;
-    let steps = steps(arguments.steps, *quick)?;
-    let scenes = on.checked()?;
-    let mut bench = arguments.sitting.open(out)?;
-    let mut text = String::new();
-    for scene in &scenes {
-        let points = capacity::points(&on.sweep(scene, steps, *seed, *quick)?, &on.read(scene)?, *paper)?;
-        let lines = capacity::run(points, &mut bench)?;
-        if !arguments.sitting.part.writes_tables() {
-            continue;
-        }
-        let name = train::scene_name(Some(scene));
-        capacity::chart(&name, &lines, &out.join(format!("capacity-{name}")))?;
-        text.push_str(&format!("## {scene}\n\n{}.\n\n{}\n", results::set_of(&name), capacity::table(&lines)));
-    }
-    finish(&bench, &arguments.sitting, &text, "capacity")
+    let CapacityArguments { sweep, seed, paper } = arguments;
+    let scenes = sweep.scenes()?;
+    let run = |scene: &str, _: &(), bench: &mut Bench| {
+        let points = capacity::points(&sweep.around(scene, *seed)?, &sweep.on.read(scene)?, *paper)?;
+        pareto::run(points, bench)
+    };
+    sweep.sweep("capacity", &scenes, run, |name, _, lines, stem| {
+        pareto::charts(name, lines, &pareto::PARAMETERS, stem)?;
+        Ok(pareto::table(lines, pareto::PARAMETERS[0]))
+    })
 }
 
 fn stability(arguments: &StabilityArguments) -> Result<()> {
-    let StabilityArguments { on, out, quick, side, max_runs, .. } = arguments;
-    let steps = arguments.steps.unwrap_or(if *quick { 100 } else { 200 });
-    anyhow::ensure!((1..=1_000_000).contains(&steps), "--steps {steps}: expected 1 to 1000000");
+    let StabilityArguments { sweep, side, max_runs, .. } = arguments;
+    let (quick, steps) = (sweep.quick, sweep.steps(200, 100)?);
     anyhow::ensure!((16..=2048).contains(side), "--side {side}: expected 16 to 2048");
     let mut of_scenes = Vec::new();
-    for scene in on.checked()? {
-        let mut axes = on.axes(&scene, *side, *quick)?;
+    for scene in sweep.on.checked()? {
+        let mut axes = sweep.on.axes(&scene, *side, quick)?;
         if !arguments.axes.is_empty() {
             let known = axes.iter().map(|a| a.name).collect::<Vec<_>>().join(", ");
             if let Some(unknown) = arguments.axes.iter().find(|name| axes.iter().all(|a| a.name != name.trim())) {
@@ -349,23 +354,13 @@ fn stability(arguments: &StabilityArguments) -> Result<()> {
             }
             axes.retain(|axis| arguments.axes.iter().any(|name| name.trim() == axis.name));
         }
-        of_scenes.push((scene, axes));
+        of_scenes.push((scene, stability::Sweep { axes, steps, quick, max_runs: *max_runs }));
     }
-    let mut bench = arguments.sitting.open(out)?;
-    let mut text = String::new();
-    for (scene, axes) in of_scenes {
-        let sweep = stability::Sweep { axes, steps, quick: *quick, max_runs: *max_runs };
-        let lines = sweep.run(&mut bench)?;
-        if !arguments.sitting.part.writes_tables() {
-            continue;
-        }
-        let name = train::scene_name(Some(&scene));
-        stability::charts(&name, &sweep.axes, &lines, &out.join(format!("stability-{name}")))?;
-        let (table, finite) = (stability::table(&sweep.axes, &lines), stability::finite(&lines));
-        let set = results::set_of(&name);
-        text.push_str(&format!("## {scene}\n\n{set}.\n\n{table}\n{finite}\n\n"));
-    }
-    finish(&bench, &arguments.sitting, &text, "stability")
+    let run = |_: &str, of_scene: &stability::Sweep, bench: &mut Bench| of_scene.run(bench);
+    sweep.sweep("stability", &of_scenes, run, |name, of_scene, lines, stem| {
+        stability::charts(name, &of_scene.axes, lines, stem)?;
+        Ok(format!("{}\n{}\n", stability::table(&of_scene.axes, lines), stability::finite(lines)))
+    })
 }
 
 /// Prints and writes the table, and says what there is.

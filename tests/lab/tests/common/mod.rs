@@ -5,13 +5,13 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
 /// Runs the program.
-pub fn xtask(arguments: &[&str]) -> Output {
+pub fn lab(arguments: &[&str]) -> Output {
     Command::new(env!("CARGO_BIN_EXE_lab")).args(arguments).env_remove("SMPL_MODEL").output().unwrap()
 }
 
 /// Runs the program, which must succeed; returns what it prints.
 pub fn done(arguments: &[&str]) -> String {
-    let output = xtask(arguments);
+    let output = lab(arguments);
     let errors = String::from_utf8_lossy(&output.stderr);
     assert!(output.status.success(), "{arguments:?}: {errors}");
     String::from_utf8(output.stdout).unwrap()
@@ -19,7 +19,7 @@ pub fn done(arguments: &[&str]) -> String {
 
 /// Runs the program, which must refuse its arguments as [`refusal`] says.
 pub fn refused(arguments: &[&str], words: &[&str]) {
-    refusal(&xtask(arguments), &format!("{arguments:?}"), words);
+    refusal(&lab(arguments), &format!("{arguments:?}"), words);
 }
 
 /// A path as an argument.

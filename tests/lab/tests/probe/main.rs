@@ -342,7 +342,7 @@ fn metrics_are_those_of_the_whole_and_of_the_mask() {
 
 #[test]
 fn metrics_with_weights_give_the_golden_lpips() {
-    let shared = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared/data/lpips");
+    let shared = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared/data/lpips");
     if !cfg!(feature = "lpips") || !shared.exists() {
         eprintln!("skipped: {} is absent", shared.display());
         return;
