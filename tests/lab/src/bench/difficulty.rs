@@ -33,7 +33,14 @@ pub struct Difficulty {
 
 impl Default for Difficulty {
     fn default() -> Self {
-        Self { demo: DemoConfig::default(), wrong: Perturbation::NONE, shutter: 0.0, facing_degrees: 180.0, unit: 1.0, refined: 0 }
+        Self {
+            demo: DemoConfig::default(),
+            wrong: Perturbation::NONE,
+            shutter: 0.0,
+            facing_degrees: 180.0,
+            unit: 1.0,
+            refined: 0,
+        }
     }
 }
 

@@ -118,8 +118,7 @@ pub fn table(lines: &[Line], cost: Cost) -> String {
     text.push_str(" parameters | MB | on the front of |\n| --- | --- | ---: | ---: |");
     WORTHS.iter().for_each(|_| text.push_str(" ---: |"));
     text.push_str(" ---: | ---: | --- |\n");
-    let fronts =
-        WORTHS.map(|(_, worth, _)| front(&lines.iter().map(|l| place(l, cost.2, worth)).collect::<Vec<_>>()));
+    let fronts = WORTHS.map(|(_, worth, _)| front(&lines.iter().map(|l| place(l, cost.2, worth)).collect::<Vec<_>>()));
     for (i, line) in lines.iter().enumerate() {
         let (point, outcome) = (&line.point, &line.outcome);
         let _ = write!(text, "| {} | {} |", point.name, point.factor);
@@ -127,9 +126,8 @@ pub fn table(lines: &[Line], cost: Cost) -> String {
             let _ = writeln!(text, " failed: {} | | | | | | | |", error.replace(['|', '\n'], " "));
             continue;
         }
-        let is_base = |l: &&Line| {
-            l.point.kind == Kind::Base || (l.point.kind == Kind::Preset && l.point.factor == point.factor)
-        };
+        let is_base =
+            |l: &&Line| l.point.kind == Kind::Base || (l.point.kind == Kind::Preset && l.point.factor == point.factor);
         let base = lines.iter().find(is_base).filter(|base| base.point.name != point.name);
         let _ = write!(text, " {:.1} | {:.3} |", outcome.train_seconds, outcome.seconds_per_frame);
         for (_, pick, digits) in WORTHS {
