@@ -126,7 +126,7 @@ fn a_nan_pixel_affects_only_the_windows_that_contain_it() {
     let mut a = noise(3 * 20 * 20, 1);
     let b = a.clone();
     a[3 * (10 * 20 + 10)] = f32::NAN;
-    for i in 0..400 {
+    for i in 0..400usize {
         let near = (i % 20).abs_diff(10) <= 3 && (i / 20).abs_diff(10) <= 3;
         assert_eq!(ssim_at(&a, &b, 20, 20, i).is_nan(), near, "pixel {i}");
     }
