@@ -1,6 +1,7 @@
 //! Renders a striped ball of fog and its depth: `cargo run --release -p volrender --example
 //! soft_sphere [OUT.png]`.
 
+use glam::camera::rh::view::look_at_affine3a;
 use glam::{Affine3A, Mat3, Vec3};
 use volrender::{Aabb, Bins, Camera, RaySamples, composite};
 
@@ -9,11 +10,9 @@ const SAMPLES: usize = 96;
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let intrinsics = Mat3::from_cols_array(&[300.0, 0.0, 0.0, 0.0, 300.0, 0.0, 128.0, 128.0, 1.0]);
-    let eye = Vec3::new(0.0, 1.0, -3.0);
-    let forward = (-eye).normalize_or_zero();
-    let right = forward.cross(Vec3::Y).normalize_or_zero();
-    let rotation = Mat3::from_cols(right, forward.cross(right), forward).transpose();
-    let camera = Camera::new(intrinsics, Affine3A::from_mat3_translation(rotation, -(rotation * eye)), SIDE, SIDE)?;
+    // glam's views are OpenGL's, y up and z backward; ours are OpenCV's, y down and z forward.
+    let view = look_at_affine3a(Vec3::new(0.0, 1.0, -3.0), Vec3::ZERO, Vec3::Y);
+    let camera = Camera::new(intrinsics, Affine3A::from_scale(Vec3::new(1.0, -1.0, -1.0)) * view, SIDE, SIDE)?;
     let bounds = Aabb { min: Vec3::splat(-1.0), max: Vec3::splat(1.0) };
     let mut image = image::RgbImage::new(2 * SIDE, SIDE);
     for (row, column) in (0..SIDE * SIDE).map(|i| (i / SIDE, i % SIDE)) {

@@ -189,7 +189,7 @@ proptest! {
         let d = ray.backward(Vec3::ONE, Vec3::new(1.0, -2.0, 0.5), d_opacity);
         prop_assert!(d.sigma.iter().chain(&d.likelihood).all(|d| d.is_finite()), "{:?}", d.sigma);
         // The density of an opaque sample has no influence.
-        let opaque = |i: &usize| ray.sigma[*i] > 0.0 && f64::from(ray.sigma[*i]) * f64::from(ray.delta[*i]) > 100.0;
+        let opaque = |i: &usize| ray.sigma[*i].min(f32::MAX) * ray.delta[*i].min(f32::MAX) > 100.0;
         prop_assert!((0..n).filter(opaque).all(|i| d.sigma[i] == 0.0), "{:?}", d.sigma);
     }
 

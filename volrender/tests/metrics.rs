@@ -40,7 +40,7 @@ fn mask(width: usize, height: usize) -> Vec<bool> {
 /// SSIM around one pixel.
 fn ssim_at(a: &[f32], b: &[f32], width: usize, height: usize, pixel: usize) -> f64 {
     let mask: Vec<bool> = (0..width * height).map(|i| i == pixel).collect();
-    ssim_masked(a, b, &mask, width, height).unwrap()
+    ssim_masked(a, b, &mask, width, height).expect("a pixel")
 }
 
 #[test]
@@ -126,7 +126,7 @@ fn a_nan_pixel_affects_only_the_windows_that_contain_it() {
     let mut a = noise(3 * 20 * 20, 1);
     let b = a.clone();
     a[3 * (10 * 20 + 10)] = f32::NAN;
-    for i in 0..400usize {
+    for i in 0..20 * 20usize {
         let near = (i % 20).abs_diff(10) <= 3 && (i / 20).abs_diff(10) <= 3;
         assert_eq!(ssim_at(&a, &b, 20, 20, i).is_nan(), near, "pixel {i}");
     }
