@@ -86,7 +86,8 @@ fn a_constant_error_has_its_decibels_in_every_set() {
 #[test]
 fn errors_outside_the_subject_count_in_the_whole_picture_alone() {
     let outside = |frame: &PreparedFrame, i: usize, pixel: &mut [f32], _: &mut f32| {
-        if frame.pixels().unwrap().mask[i] <= 0.5 {
+        let frame = frame.source.as_ref().unwrap().reader().unwrap();
+        if frame.at(i as u32).1 <= 0.5 {
             pixel.fill(0.5);
         }
     };

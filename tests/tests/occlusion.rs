@@ -76,10 +76,11 @@ fn the_demo_shows_nothing_behind_its_obstacle() {
     let clear = demo(&DemoConfig { occluded_fraction: 0.0, ..common::demo_config() }, body()).unwrap();
     let mut hidden = 0;
     for (with, without) in capture().train.iter().zip(&clear.train) {
-        for (i, (&m, &full)) in with.pixels().unwrap().mask.iter().zip(&without.pixels().unwrap().mask).enumerate() {
+        let (with, without) = (with.pixels().unwrap(), without.pixels().unwrap());
+        for (i, (&m, &full)) in with.mask.iter().zip(&without.mask).enumerate() {
             if m == 0.0 {
                 hidden += usize::from(full > 0.0);
-                assert_eq!(with.pixels().unwrap().image.pixels[3 * i..][..3], [0.0; 3]);
+                assert_eq!(with.image.pixels[3 * i..][..3], [0.0; 3]);
             }
         }
     }

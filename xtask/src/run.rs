@@ -23,6 +23,7 @@ pub const PERSON: &str = "person.html";
 
 /// What config.toml holds.
 #[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct RunConfig {
     /// `demo` or a directory.
     pub scene: String,

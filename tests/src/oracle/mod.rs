@@ -8,6 +8,6 @@ mod render;
 
 pub use encoding::{hash_encode, hash_index};
 pub use geometry::{closest_point, first_hit, inside, winding_number};
-pub use metrics::{psnr, ssim, ssim_map};
+pub use metrics::{mask_iou, psnr, ssim, ssim_map};
 pub use points::{farthest_points, knn};
 pub use render::composite;

@@ -67,22 +67,14 @@ pub fn damaged(whole: &[u8], count: usize) -> impl Iterator<Item = Vec<u8>> + '_
     })
 }
 
-/// Overlap of the posed body's silhouette with the mask, over the pixels that no known occluder
-/// covers.
+/// Intersection over union of the posed body's silhouette and the mask, over the pixels that no
+/// known occluder covers.
 pub fn overlap(frame: &super::Frame, body: &BodyModel) -> f32 {
     let posed = body.pose(&body.shaped(&frame.betas), &frame.pose, frame.placement);
     let mesh = visibility::RayMesh::new(&posed.vertices, &body.faces).unwrap();
-    let (mut both, mut either) = (0, 0);
-    for (i, &mask) in frame.pixels().unwrap().mask.iter().enumerate() {
-        if frame.pixels().unwrap().occluder.as_ref().is_some_and(|o| o[i]) {
-            continue;
-        }
-        let (column, row) =
-            (i as u32 % frame.pixels().unwrap().image.width, i as u32 / frame.pixels().unwrap().image.width);
-        let ray = frame.camera.ray(column as f32 + 0.5, row as f32 + 0.5);
-        let (covered, subject) = (mesh.first_hit(ray.origin, ray.direction).is_some(), mask > 0.5);
-        both += usize::from(covered && subject);
-        either += usize::from(covered || subject);
-    }
-    both as f32 / either.max(1) as f32
+    let (pixels, width) = (frame.pixels().unwrap(), frame.camera.width);
+    testkit::oracle::mask_iou(&pixels.mask, pixels.occluder.as_deref(), |i| {
+        let ray = frame.camera.ray((i as u32 % width) as f32 + 0.5, (i as u32 / width) as f32 + 0.5);
+        mesh.first_hit(ray.origin, ray.direction).is_some()
+    })
 }

@@ -1,5 +1,7 @@
 use std::sync::OnceLock;
 
+use capture::Pixels;
+
 use super::*;
 
 fn body() -> &'static BodyModel {
@@ -46,12 +48,13 @@ fn half_of_the_subject_is_hidden_in_the_first_four_fifths() {
 #[test]
 fn what_the_obstacle_hides_is_zero_and_the_rest_untouched() {
     for (with, without) in occluded().train.iter().zip(&clear().train) {
-        for pixel in 0..with.pixels().unwrap().mask.len() {
-            let color = |f: &Frame| [0, 1, 2].map(|c| f.pixels().unwrap().image.pixels[3 * pixel + c]);
-            if with.pixels().unwrap().mask[pixel] == without.pixels().unwrap().mask[pixel] {
-                assert_eq!(color(with), color(without));
+        let (with, without) = (with.pixels().unwrap(), without.pixels().unwrap());
+        for pixel in 0..with.mask.len() {
+            let color = |pixels: &Pixels| [0, 1, 2].map(|c| pixels.image.pixels[3 * pixel + c]);
+            if with.mask[pixel] == without.mask[pixel] {
+                assert_eq!(color(&with), color(&without));
             } else {
-                assert_eq!((with.pixels().unwrap().mask[pixel], color(with)), (0.0, [0.0; 3]));
+                assert_eq!((with.mask[pixel], color(&with)), (0.0, [0.0; 3]));
             }
         }
     }
@@ -81,14 +84,14 @@ fn every_camera_sees_the_whole_person_filling_three_quarters_of_the_height() {
     let frames = clear().train.iter().chain(clear().eval.iter().map(|e| &e.frame));
     for frame in frames {
         let size = config().size as usize;
-        let rows: Vec<usize> = (0..size)
-            .filter(|row| frame.pixels().unwrap().mask[row * size..(row + 1) * size].iter().any(|m| *m > 0.5))
-            .collect();
+        let mask = frame.pixels().unwrap().mask;
+        let rows: Vec<usize> =
+            (0..size).filter(|row| mask[row * size..(row + 1) * size].iter().any(|m| *m > 0.5)).collect();
         let (top, bottom) = (rows[0], rows[rows.len() - 1]);
         let share = (bottom + 1 - top) as f32 / size as f32;
         assert!((0.68..0.84).contains(&share), "{}: {share}", frame.name);
         assert!(top > 4 && bottom < size - 5, "{}: rows {top} to {bottom}", frame.name);
-        let border = |x: usize| (0..size).any(|row| frame.pixels().unwrap().mask[row * size + x] > 0.0);
+        let border = |x: usize| (0..size).any(|row| mask[row * size + x] > 0.0);
         assert!(!border(0) && !border(size - 1), "{} is cut off at a side", frame.name);
     }
 }
@@ -99,10 +102,11 @@ fn the_prior_lies_within_the_picture_of_the_person_but_is_not_the_truth() {
     let mut all = 0;
     for frame in clear().train.iter().chain(clear().eval.iter().map(|e| &e.frame)) {
         let posed = body().pose(&body().shaped(&frame.betas), &frame.pose, frame.placement);
+        let mask = frame.pixels().unwrap().mask;
         for &v in &posed.vertices {
             let p = frame.camera.project(v).unwrap();
             let pixel = p.y as usize * config().size as usize + p.x as usize;
-            inside += usize::from(frame.pixels().unwrap().mask[pixel] > 0.5);
+            inside += usize::from(mask[pixel] > 0.5);
             all += 1;
         }
     }
@@ -150,7 +154,7 @@ fn a_known_obstacle_is_marked_where_it_is() {
         let occluder = pixels.occluder.as_ref().unwrap();
         assert_eq!(occluder.iter().any(|o| *o), i < 5, "frame {i}");
         for (pixel, hidden) in occluder.iter().enumerate() {
-            assert!(!hidden || frame.pixels().unwrap().mask[pixel] == 0.0);
+            assert!(!hidden || pixels.mask[pixel] == 0.0);
             assert_eq!(*hidden, occluder[pixel % 48], "the obstacle is as high as the picture");
         }
     }

@@ -64,11 +64,11 @@ fn objects_move_where_they_are_told_and_cover_what_they_hide() {
     for (frame, clear) in right.capture.train.iter().zip(&right.clear) {
         let clear = clear.pixels().unwrap();
         let (image, mask) = (&clear.image, &clear.mask);
-        let cover = right.objects.as_ref().unwrap().coverage();
+        let (pixels, cover) = (frame.pixels().unwrap(), right.objects.as_ref().unwrap().coverage());
         for (i, &c) in cover.iter().enumerate() {
-            assert_eq!(frame.pixels().unwrap().mask[i], mask[i] * (1.0 - c));
-            assert_eq!(frame.pixels().unwrap().image.pixels[3 * i], image.pixels[3 * i] * (1.0 - c));
-            assert_eq!(frame.pixels().unwrap().occluder.as_ref().unwrap()[i], c > 0.5);
+            assert_eq!(pixels.mask[i], mask[i] * (1.0 - c));
+            assert_eq!(pixels.image.pixels[3 * i], image.pixels[3 * i] * (1.0 - c));
+            assert_eq!(pixels.occluder.as_ref().unwrap()[i], c > 0.5);
         }
     }
     let none = make(&SynthConfig { occlusion: Occlusion::Objects { fraction: 0.0, position: 0.0 }, ..small() });
@@ -141,9 +141,10 @@ fn a_characters_prior_lies_inside_it_by_centimetres() {
     }
     let inside = |f: &Frame| {
         let posed = body.pose(&body.shaped(&f.betas), &f.pose, f.placement);
+        let mask = f.pixels().unwrap().mask;
         let hit = posed.vertices.iter().filter(|&&v| {
             let p = f.camera.project(v).unwrap();
-            f.pixels().unwrap().mask[p.y as usize * 64 + p.x as usize] > 0.0
+            mask[p.y as usize * 64 + p.x as usize] > 0.0
         });
         hit.count() as f32 / posed.vertices.len() as f32
     };
@@ -254,22 +255,14 @@ fn a_body_of_one_rigid_part_without_a_texture_is_filmed() {
     assert!(made.clear.iter().all(|clear| clear.pixels().unwrap().mask.iter().any(|m| *m > 0.5)));
 }
 
-/// Overlap of the posed body's silhouette with the mask, over the pixels that no known occluder
-/// covers.
+/// Intersection over union of the posed body's silhouette and the mask, over the pixels that no
+/// known occluder covers.
 fn overlap(frame: &Frame, body: &BodyModel) -> f32 {
     let posed = body.pose(&body.shaped(&frame.betas), &frame.pose, frame.placement);
     let mesh = visibility::RayMesh::new(&posed.vertices, &body.faces).unwrap();
-    let (mut both, mut either) = (0, 0);
-    for (i, &mask) in frame.pixels().unwrap().mask.iter().enumerate() {
-        if frame.pixels().unwrap().occluder.as_ref().is_some_and(|o| o[i]) {
-            continue;
-        }
-        let (column, row) =
-            (i as u32 % frame.pixels().unwrap().image.width, i as u32 / frame.pixels().unwrap().image.width);
-        let ray = frame.camera.ray(column as f32 + 0.5, row as f32 + 0.5);
-        let (covered, subject) = (mesh.first_hit(ray.origin, ray.direction).is_some(), mask > 0.5);
-        both += usize::from(covered && subject);
-        either += usize::from(covered || subject);
-    }
-    both as f32 / either.max(1) as f32
+    let (pixels, width) = (frame.pixels().unwrap(), frame.camera.width);
+    testkit::oracle::mask_iou(&pixels.mask, pixels.occluder.as_deref(), |i| {
+        let ray = frame.camera.ray((i as u32 % width) as f32 + 0.5, (i as u32 / width) as f32 + 0.5);
+        mesh.first_hit(ray.origin, ray.direction).is_some()
+    })
 }

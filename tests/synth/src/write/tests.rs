@@ -57,7 +57,8 @@ fn same_view(body: &BodyModel, a: &Frame, b: &Frame) {
 /// Pictures as near as 8 bits and the layout's masks allow.
 #[track_caller]
 fn same_picture(layout: Layout, made: &Frame, read: &Frame) {
-    for (i, (m, r)) in made.pixels().unwrap().mask.iter().zip(&read.pixels().unwrap().mask).enumerate() {
+    let (a, b) = (made.pixels().unwrap(), read.pixels().unwrap());
+    for (i, (m, r)) in a.mask.iter().zip(&b.mask).enumerate() {
         let subject = (*m > 0.5, *r > 0.5);
         assert_eq!(subject.0, subject.1, "{layout:?} {}: pixel {i}, {m} {r}", made.name);
         let labels = layout == Layout::ZjuMocap;
@@ -67,8 +68,7 @@ fn same_picture(layout: Layout, made: &Frame, read: &Frame) {
             continue;
         }
         for c in 0..3 {
-            let (p, q) =
-                (made.pixels().unwrap().image.pixels[3 * i + c], read.pixels().unwrap().image.pixels[3 * i + c]);
+            let (p, q) = (a.image.pixels[3 * i + c], b.image.pixels[3 * i + c]);
             assert!((p - q).abs() < 1.5 / 255.0, "{layout:?} {}: {p} {q}", made.name);
         }
     }
