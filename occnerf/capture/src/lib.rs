@@ -1,8 +1,8 @@
 //! Captures: frames with images, masks, cameras and body parameters.
 //!
-//! A [`Capture`] comes from a directory ([`load_capture`]) or is made on the spot ([`demo`]).
-//! Either way the images hold nothing of what the masks hide, so that no hidden pixel can reach
-//! training.
+//! A [`Capture`] comes from a directory ([`load_capture`]), which [`import`] makes of what body
+//! estimators and segmenters write. Its images hold nothing of what the masks hide, so that no
+//! hidden pixel can reach training.
 
 mod camera;
 mod checks;
@@ -49,9 +49,9 @@ use std::path::Path;
 /// it:
 ///
 /// - **raw ZJU-MoCap** (Peng et al. 2021; `annots.npy`, pictures by camera, `mask_cihp` or `mask`,
-///   `new_params`): one camera is for training, the others are kept back. The training camera is
-///   occluded as in the paper, see [`LoadOptions::occlusion`]. Kept-back pictures that are not
-///   there are left out.
+///   `new_params`): one camera is for training, the others are kept back. What
+///   `occlusion.json` says of a simulated obstacle is hidden. Kept-back pictures that are not there
+///   are left out.
 /// - **HumanNeRF's prepared layout** (Weng et al. 2022; `cameras.pkl`, `mesh_infos.pkl`,
 ///   `canonical_joints.pkl`, `images`, `masks`), cameras kept back in `eval/*`.
 /// - **HumanNeRF's wild layout** (`metadata.json`, `images`, `masks`), with `occluders` where it is

@@ -22,10 +22,9 @@ pub struct LoadOptions {
     pub max_frames: Option<usize>,
     /// Views kept back are those of every n-th training frame, beginning with the first.
     pub eval_stride: usize,
-    /// Most bytes that the bodies of all frames (24 a vertex), the labels of the training frames (3
-    /// bits a pixel), pictures kept in memory (16 a pixel if all fit, else 4 or 16 a pixel of the
-    /// person) and pictures being decoded (48 a pixel of the file) may take. Pictures beyond it are
-    /// decoded whenever they are asked for.
+    /// Memory limit in bytes for the bodies of all frames (24 a vertex), the labels of the training
+    /// frames (3 bits a pixel), packed pictures (4 or 16 a pixel of the person) and pictures being
+    /// decoded (48 a pixel of the file). Pictures beyond it are decoded at every use.
     pub max_bytes: u64,
     /// The training camera: its folder's name, or its number counted from 1. The first if `None`.
     pub camera: Option<String>,

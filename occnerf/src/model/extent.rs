@@ -13,7 +13,7 @@ use crate::model::field::SampleBatch;
 /// From one looked at distance to the next, normalised metres.
 const LAYER: f32 = 0.005;
 /// Opacity below which the field is taken for empty over [`LENGTH`]; a tenth of it costs a quarter
-/// more time and changes no score by more than 0.01 dB (the notes on the model).
+/// more time and changes no score by more than 0.01 dB (`tests/lab/notes/model.md`).
 const EMPTY: f32 = 2e-2;
 /// Length of ray that a layer is judged by, normalised metres.
 const LENGTH: f32 = 0.04;
