@@ -234,7 +234,7 @@ fn scale(config: &Config, vertices: &[glam::Vec3], faces: &[[u32; 3]]) -> Vec<f6
 
 fn tiny(method: Method, motion: MotionKind, distance: DistanceKind, seed: u64) -> Config {
     let mut config = Config::preset(Preset::Fast, method);
-    (config.seed, config.patches, config.patch_size, config.samples) = (seed, 2, 12, 20);
+    (config.seed, config.patches, config.patch_size, config.samples) = (seed, 2, 12, 24);
     (config.field.width, config.field.depth) = (24, 2);
     (config.encoding.levels, config.encoding.log2_table_size, config.encoding.n_max) = (5, 11, 96);
     (config.motion.kind, config.motion.shell_interval) = (motion, 0);

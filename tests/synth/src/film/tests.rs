@@ -95,7 +95,7 @@ fn settings_that_cannot_be_are_named() {
             "occlusion.position",
             SynthConfig { occlusion: Occlusion::Objects { fraction: 0.5, position: 2.0 }, ..small() },
         ),
-        ("64 GiB", SynthConfig { size: 2048, frames: 10_000, ..small() }),
+        ("32 GiB", SynthConfig { size: 2048, frames: 10_000, ..small() }),
         ("occlusion.share", {
             let occlusion = Occlusion::Rectangle(Obstacle { share: 2.0, ..Obstacle::default() });
             SynthConfig { occlusion, ..small() }
