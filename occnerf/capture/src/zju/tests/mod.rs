@@ -10,15 +10,10 @@ use self::fixture::{Fixture, SIZE};
 use crate::testing::{Py, array, body};
 use crate::{LoadOptions, load_capture};
 
-/// As the fixture's pictures are, with nothing simulated in front.
-fn clear() -> LoadOptions {
-    LoadOptions::default()
-}
-
 #[test]
 fn a_whole_capture_is_read() {
     let fixture = Fixture::new("zju-whole");
-    let capture = load_capture(fixture.dir.path(), &body(), &clear()).unwrap();
+    let capture = load_capture(fixture.dir.path(), &body(), &LoadOptions::default()).unwrap();
     let names: Vec<&str> = capture.train.iter().map(|f| f.name.as_str()).collect();
     assert_eq!(names, ["frame_000000", "frame_000001", "frame_000002"]);
     assert_eq!(capture.mean_betas, [0.5]);
@@ -48,14 +43,14 @@ fn the_training_camera_is_chosen_by_name_or_number() {
     let fixture = Fixture::new("zju-camera");
     fixture.dir.stripe("Camera_B2/000002.png", SIZE, 200);
     for camera in ["2", "Camera_B2"] {
-        let options = LoadOptions { camera: Some(camera.to_owned()), ..clear() };
+        let options = LoadOptions { camera: Some(camera.to_owned()), ..LoadOptions::default() };
         let capture = load_capture(fixture.dir.path(), &body(), &options).unwrap();
         let names: Vec<&str> = capture.train.iter().map(|f| f.name.as_str()).collect();
         assert_eq!(names, ["frame_000000", "frame_000002"]);
         let eval: Vec<(&str, usize)> = capture.eval.iter().map(|e| (e.camera_name.as_str(), e.train_index)).collect();
         assert_eq!(eval, [("Camera_B1", 0), ("Camera_B1", 1)]);
     }
-    let options = LoadOptions { camera: Some("3".to_owned()), ..clear() };
+    let options = LoadOptions { camera: Some("3".to_owned()), ..LoadOptions::default() };
     let message = load_capture(fixture.dir.path(), &body(), &options).unwrap_err().to_string();
     assert!(message.contains("camera") && message.contains("Camera_B1, Camera_B2"), "{message}");
 }
@@ -81,7 +76,7 @@ fn parameters_counted_from_one_and_the_names_of_newer_numpy_are_read() {
     let protocol = newer.iter().position(|b| *b == 0x80).unwrap();
     newer[protocol + 1] = 5;
     fixture.dir.write("annots.npy", newer);
-    let capture = load_capture(fixture.dir.path(), &body(), &clear()).unwrap();
+    let capture = load_capture(fixture.dir.path(), &body(), &LoadOptions::default()).unwrap();
     assert_eq!(capture.train.len(), 3);
 }
 
@@ -94,7 +89,7 @@ fn cameras_may_be_nested_lists_or_whole_arrays() {
     *fixture.annots.at(&["cams", "T"]) = array(&[2, 3], &[0.0, 0.0, 4000.0, 0.0, 0.0, 4000.0]);
     *fixture.annots.at(&["cams", "D"]) = array(&[2, 1, 5], &[0.0; 10]);
     fixture.write();
-    let capture = load_capture(fixture.dir.path(), &body(), &clear()).unwrap();
+    let capture = load_capture(fixture.dir.path(), &body(), &LoadOptions::default()).unwrap();
     assert_eq!(capture.eval[0].frame.camera, capture.train[0].camera);
 }
 
@@ -151,7 +146,7 @@ fn lens_distortion_is_undone() {
     let k = [80.0, 0.0, 50.0, 0.0, 80.0, 30.0, 0.0, 0.0, 1.0];
     *fixture.annots.at(&["cams", "K", "0"]) = array(&[3, 3], &k);
     let error = |fixture: &Fixture| {
-        let capture = load_capture(fixture.dir.path(), &body(), &clear()).unwrap();
+        let capture = load_capture(fixture.dir.path(), &body(), &LoadOptions::default()).unwrap();
         let frame = &capture.train[0];
         let (mut worst, mut seen) = (0.0f32, 0);
         let shown = frame.pixels().unwrap();
@@ -176,8 +171,8 @@ fn lens_distortion_is_undone() {
 #[test]
 fn resizing_scales_projections_exactly() {
     let fixture = Fixture::new("zju-resize");
-    let large = load_capture(fixture.dir.path(), &body(), &clear()).unwrap();
-    let options = LoadOptions { resize: Some(6), ..clear() };
+    let large = load_capture(fixture.dir.path(), &body(), &LoadOptions::default()).unwrap();
+    let options = LoadOptions { resize: Some(6), ..LoadOptions::default() };
     let small = load_capture(fixture.dir.path(), &body(), &options).unwrap();
     for (a, b) in large.train.iter().zip(&small.train) {
         assert_eq!(
@@ -196,7 +191,7 @@ fn resizing_scales_projections_exactly() {
             assert!((pixel[0] - mask * 200.0 / 255.0).abs() < 0.02);
         }
     }
-    let options = LoadOptions { resize: Some(100), ..clear() };
+    let options = LoadOptions { resize: Some(100), ..LoadOptions::default() };
     let same = load_capture(fixture.dir.path(), &body(), &options).unwrap();
     assert_eq!(same.train[0].pixels().unwrap().image, large.train[0].pixels().unwrap().image, "nothing is enlarged");
 }
