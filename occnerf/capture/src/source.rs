@@ -82,6 +82,15 @@ impl OnDisk {
         Ok(pixels)
     }
 
+    /// Packs the decoded pixels while the allowance lasts.
+    fn keep(&self, pixels: &Pixels) {
+        self.kept.get_or_init(|| {
+            let packed = PackedPixels::new(pixels);
+            let room = self.allowance.take(packed.bytes())?;
+            Some(Kept(Arc::new((packed, room))))
+        });
+    }
+
     /// A copy of the description with nothing decoded.
     fn anew(&self) -> Self {
         Self {
@@ -137,11 +146,7 @@ impl PixelSource {
                 Some(None) => disk.decode(),
                 None => {
                     let pixels = disk.decode()?;
-                    disk.kept.get_or_init(|| {
-                        let packed = PackedPixels::new(&pixels);
-                        let room = disk.allowance.take(packed.bytes())?;
-                        Some(Kept(Arc::new((packed, room))))
-                    });
+                    disk.keep(&pixels);
                     Ok(pixels)
                 }
             },
@@ -199,6 +204,11 @@ impl PixelSource {
             }
             Place::Disk(disk) => {
                 let mut changed = disk.anew();
+                if let Some(Some(Kept(kept))) = disk.kept.get() {
+                    let mut pixels = kept.0.pixels();
+                    edit(&mut pixels);
+                    changed.keep(&pixels);
+                }
                 changed.edits.push(Arc::new(edit));
                 *disk = Arc::new(changed);
             }

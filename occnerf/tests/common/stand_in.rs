@@ -86,12 +86,11 @@ pub fn stand_in(scene: &Scene, colors: &PriorColors) -> Avatar {
         face.iter().for_each(|&v| sums[v as usize] += (b - a).cross(c - a));
     }
     let smooth = model.faces.iter().flatten().map(|&v| sums[v as usize].normalize_or(Vec3::Y)).collect();
-    let posedirs =
-        smpl::SparseRows::from_rows(
-            model.faces.iter().flatten().map(|&v| {
-                model.posedirs.row(v as usize).map(|(term, d)| (term as u32, d * metres)).collect::<Vec<_>>()
-            }),
-        );
+    // Pose blend shapes are in the unit of the body model already.
+    let posedirs = smpl::SparseRows::from_rows(
+        (model.faces.iter().flatten())
+            .map(|&v| model.posedirs.row(v as usize).map(|(term, d)| (term as u32, d)).collect::<Vec<_>>()),
+    );
     let motion = motion_of_bones(&skeleton, &frames, 30.0);
     Avatar {
         name: scene.name.clone(),
