@@ -56,7 +56,7 @@ pub struct Capture {
     pub eval: Vec<EvalFrame>,
     /// Shape of the canonical body (T-pose).
     pub mean_betas: Vec<f32>,
-    /// Whether [`crate::register`] has corrected the bodies.
+    /// Whether registration has corrected the bodies.
     pub registered: bool,
     /// How far clothes and hair stand off each vertex of the body along its normal, in the capture's
     /// units, as registration has found it; empty where nothing is known.

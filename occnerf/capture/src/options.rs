@@ -29,7 +29,7 @@ pub struct LoadOptions {
     /// The training camera: its folder's name, or its number counted from 1. The first if `None`.
     pub camera: Option<String>,
     /// Whether a capture is read whose cameras see nothing of the body, for
-    /// [`check`](crate::check()) to say why.
+    /// `occnerf::check` to say why.
     #[serde(skip)]
     pub unseen: bool,
 }

@@ -20,7 +20,7 @@ use capture::{CaptureError, Layout};
 const BODY: &str = "body.safetensors";
 
 impl Synthetic {
-    /// Writes the capture into `dir`, which is made if it is not there, for [`super::load_capture`]
+    /// Writes the capture into `dir`, which is made if it is not there, for `capture::load_capture`
     /// to read, with the body model as `body.safetensors`.
     ///
     /// What a rectangle hides is black in HumanNeRF's layouts and 0 in their masks; raw ZJU-MoCap
