@@ -46,12 +46,13 @@ pub use capacity::{Capacity, Choice, Measured, Pruned};
 pub use check::{Check, Fault, FrameCheck, Mistake, body_silhouette, check, photograph, unknown_pixels};
 pub use config::{
     Component, Config, ConfigError, DistanceKind, EncodingConfig, FieldConfig, LossConfig, Method, MotionConfig,
-    MotionKind, OccludedRule, Preset, RateConfig, RegistrationConfig, SurfaceConfig, VisibilityKind,
+    MotionKind, OccludedRule, Preset, RateConfig, RegistrationConfig, SurfaceConfig,
 };
 pub use error::Error;
 pub use evaluate::{FrameMetrics, SplitMetrics, evaluate, evaluate_with, least_seen_quartile, nearest_vertices};
 pub use model::body::{Body, Moment};
 pub use model::colors::PriorColors;
+pub use model::encoder::PointEncoder;
 pub use model::person::Person;
 pub use model::saved::checkpoint_config;
 pub use model::times::StepTimes;

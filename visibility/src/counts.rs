@@ -83,21 +83,4 @@ impl VisibilityCounts {
             *a = ((self.counts[v as usize] as f64 + 1.0) * inverse) as f32;
         }
     }
-
-    /// [`VisibilityCounts::attention`] of scaled counts: (1 + s_i c_i) / Σ_j (1 + s_j c_j), with
-    /// `scale` (V) at least 0. The inverse area around each vertex, times the mean, corrects counts
-    /// of surface points for the density of the mesh.
-    ///
-    /// # Panics
-    /// If the lengths differ or an index is out of range.
-    #[inline]
-    pub fn attention_scaled(&self, scale: &[f32], neighbours: &[u32], out: &mut [f32]) {
-        assert_eq!(scale.len(), self.counts.len(), "attention: {} scales of {} counts", scale.len(), self.counts.len());
-        assert_eq!(neighbours.len(), out.len(), "attention: {} neighbours, {} outputs", neighbours.len(), out.len());
-        let weight = |v: u32| 1.0 + f64::from(scale[v as usize]) * self.counts[v as usize] as f64;
-        let inverse = 1.0 / neighbours.iter().map(|&v| weight(v)).sum::<f64>();
-        for (a, &v) in out.iter_mut().zip(neighbours) {
-            *a = (weight(v) * inverse) as f32;
-        }
-    }
 }

@@ -24,23 +24,6 @@ proptest! {
     }
 
     #[test]
-    fn scaled_attention_is_that_of_scaled_counts(
-        counts in prop::collection::vec((0u64..1 << 30, 0u64..1000), 1..30),
-        picks in prop::collection::vec(any::<prop::sample::Index>(), 1..30),
-    ) {
-        let neighbours: Vec<u32> = picks.iter().map(|i| i.index(counts.len()) as u32).collect();
-        let (seen, scale): (Vec<u64>, Vec<f32>) = counts.iter().map(|&(c, s)| (c, s as f32)).unzip();
-        let mut scaled = vec![0.0; neighbours.len()];
-        VisibilityCounts::from_counts(seen).attention_scaled(&scale, &neighbours, &mut scaled);
-        let mut whole = vec![0.0; neighbours.len()];
-        let products = counts.iter().map(|&(c, s)| c * s).collect();
-        VisibilityCounts::from_counts(products).attention(&neighbours, &mut whole);
-        for (a, b) in scaled.iter().zip(&whole) {
-            prop_assert!((a - b).abs() < 1e-6, "{a} {b}");
-        }
-    }
-
-    #[test]
     fn the_order_of_additions_does_not_matter(
         (forward, shuffled) in prop::collection::vec(0u32..20, 0..200)
             .prop_flat_map(|list| (Just(list.clone()), Just(list).prop_shuffle())),

@@ -7,10 +7,7 @@ use occnerf::{Capacity, Component, Config, Method, OccludedRule, Preset, RateCon
 
 const METHODS: &[(Method, &str)] = &[
     (Method::Prior, "The posed prior in mean colours; nothing is trained"),
-    (Method::Humannerf, "Point-based, frequency encoding"),
     (Method::HashPoint, "Point-based, hash encoding"),
-    (Method::NeuralBody, "Codes on the prior's vertices, spread through space, in Neural Body's style"),
-    (Method::SelfNerf, "The nearest vertices are encoded one by one, then blended, in SelfNeRF's order"),
     (Method::Occnerf, "Point term, and in `paper` the attended surface term"),
 ];
 const PRESETS: &[(Preset, &str)] = &[

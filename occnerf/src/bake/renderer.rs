@@ -80,7 +80,7 @@ impl CanonicalField for TrainedField<'_> {
             }
         }
         self.model.evaluate(&self.code, &mut batch, None);
-        let likelihood = SurfaceMotion { margin: config.motion.margin, falloff: config.motion.falloff };
+        let likelihood = SurfaceMotion { margin: config.motion.margin, falloff: FALLOFF };
         let value = |((place, sigma), rgb): ((&Place, &f32), &Vec3)| {
             let lives = place.distance <= self.extent.faces[place.face as usize];
             (if lives { likelihood.likelihood(place.distance) * sigma } else { 0.0 }, *rgb)

@@ -68,8 +68,6 @@ impl Capacity {
     ///
     /// The grid and the number of steps grow beyond the preset's with what the video shows, up to
     /// the paper's grid; width and samples only shrink.
-    /// Of the encodings the hash grids have sizes to choose; `humannerf` keeps its perceptron,
-    /// which holds the whole person.
     ///
     /// # Errors
     /// A configuration that is not valid, and those of [`Measured::of`].
@@ -85,7 +83,7 @@ impl Capacity {
             choices.push(Choice { key: key.to_owned(), preset, chosen, why });
         };
         let cells = measured.cells.max(1) as f64;
-        if matches!(config.method, Method::Occnerf | Method::HashPoint) {
+        if config.method != Method::Prior {
             let grid = &config.encoding;
             let finest = (measured.extent / (PIXELS_A_CELL * measured.metres_a_pixel)).ceil() as u32;
             let n_max = finest.clamp(grid.n_min, grid.n_max.max(MOST.0).max(grid.n_min));

@@ -5,7 +5,7 @@ mod settings;
 mod validate;
 
 pub use self::settings::{
-    Component, Config, DistanceKind, EncodingConfig, FieldConfig, LossConfig, Method, MotionConfig, MotionKind,
-    OccludedRule, Preset, RateConfig, RegistrationConfig, SurfaceConfig, VisibilityKind,
+    Component, Config, DistanceKind, EncodingConfig, FALLOFF, FieldConfig, LossConfig, Method, MotionConfig,
+    MotionKind, OccludedRule, Preset, RateConfig, RegistrationConfig, SurfaceConfig,
 };
 pub use self::validate::ConfigError;

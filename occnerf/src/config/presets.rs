@@ -2,7 +2,7 @@
 
 use crate::config::settings::{
     Config, DistanceKind, EncodingConfig, FieldConfig, LossConfig, Method, MotionConfig, MotionKind, OccludedRule,
-    Preset, RateConfig, RegistrationConfig, SurfaceConfig, VisibilityKind,
+    Preset, RateConfig, RegistrationConfig, SurfaceConfig,
 };
 
 impl Config {
@@ -18,18 +18,6 @@ impl Config {
             config.surface.surface_term = false;
             config.surface.attention = false;
             config.loss.completeness = 0.0;
-        }
-        if matches!(method, Method::Humannerf | Method::NeuralBody) {
-            // Without a hash grid the perceptron has to hold the whole person, or half of it.
-            (config.field.width, config.field.depth) = match (preset, method) {
-                (Preset::Paper, Method::Humannerf) => (256, 8),
-                (Preset::Paper, _) => (256, 4),
-                (Preset::Fast | Preset::Balanced, _) => (128, 4),
-            };
-            if matches!(preset, Preset::Fast | Preset::Balanced) {
-                // The higher rate was chosen for a small F behind a hash grid.
-                config.rates.field = 2e-3;
-            }
         }
         config
     }
@@ -89,14 +77,12 @@ fn paper() -> Config {
             distance: DistanceKind::Blended,
             surface_term: true,
             attention: true,
-            visibility: VisibilityKind::Counted,
         },
         registration: RegistrationConfig { rounds: 16 },
         motion: MotionConfig {
             kind: MotionKind::Surface,
             resolution: 32,
             margin: 0.04,
-            falloff: 0.02,
             depth: 0.3,
             shell_interval: 0,
         },
@@ -105,7 +91,6 @@ fn paper() -> Config {
             perceptual: 1.0,
             perceptual_weights: String::new(),
             completeness: 10.0,
-            beta: 10.0,
         },
         rates: RateConfig { field: 6e-3, vertices: 1e-4, table: 3e-2, motion: 1e-3, final_fraction: 0.1, beta_2: 0.99 },
     }
@@ -156,8 +141,7 @@ mod tests {
     #[test]
     fn every_preset_of_every_method_is_valid_and_survives_toml() {
         for preset in [Preset::Fast, Preset::Balanced, Preset::Paper] {
-            use Method::{HashPoint, Humannerf, NeuralBody, Occnerf, Prior, SelfNerf};
-            for method in [Prior, Humannerf, HashPoint, NeuralBody, SelfNerf, Occnerf] {
+            for method in [Method::Prior, Method::HashPoint, Method::Occnerf] {
                 let config = Config::preset(preset, method);
                 config.validate().unwrap();
                 let text = toml::to_string(&config).unwrap();

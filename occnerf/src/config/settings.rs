@@ -10,17 +10,8 @@ pub enum Method {
     /// No field: the posed prior mesh, each place of it in the mean colour of the visible training
     /// pixels that saw it.
     Prior,
-    /// Point-based: frequency encoding of x̂ with 10 bands and a perceptron (after Weng et al.
-    /// 2022).
-    Humannerf,
     /// Point-based: hash encoding of x̂ alone.
     HashPoint,
-    /// Latent codes on the prior's vertices, spread through space by inverse distances over the
-    /// nearest ones of every level, beside frequencies of x̂ (after Peng et al. 2021, Neural Body).
-    NeuralBody,
-    /// [v_i, d_i] of each nearest vertex is encoded, and the features are blended by inverse
-    /// distances (the order of Peng et al. 2022, SelfNeRF).
-    SelfNerf,
     /// The paper: point term and, in the preset `paper`, attended surface term.
     Occnerf,
 }
@@ -30,10 +21,7 @@ impl Method {
     pub fn name(self) -> &'static str {
         match self {
             Self::Prior => "prior",
-            Self::Humannerf => "humannerf",
             Self::HashPoint => "hash-point",
-            Self::NeuralBody => "neural-body",
-            Self::SelfNerf => "self-nerf",
             Self::Occnerf => "occnerf",
         }
     }
@@ -85,19 +73,6 @@ impl DistanceKind {
     pub(crate) fn needs_neighbours(self) -> bool {
         self != Self::Exact
     }
-}
-
-/// Where the attention's counts come from.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum VisibilityKind {
-    /// The paper's running counts: neighbours of the samples in which training rays end.
-    Counted,
-    /// Those, divided by the area around each vertex: densely meshed parts end no more rays for each
-    /// vertex than coarse ones.
-    CountedPerArea,
-    /// The number of training frames that show a vertex, by ray casting, from the first step on.
-    Exact,
 }
 
 /// A named set of defaults.
@@ -166,11 +141,9 @@ pub struct FieldConfig {
     /// Whether colours start from those that the video showed of the prior's nearest surface point
     /// (see [`crate::PriorColors`]): the perceptron adds to them before the sigmoid, where some
     /// frame saw them. Asks for `motion.kind = surface`.
-    #[serde(default)]
     pub prior_colors: bool,
     /// Whether those colours are told apart from the light that all frames share, where the video
     /// shows one.
-    #[serde(default)]
     pub prior_light: bool,
 }
 
@@ -209,8 +182,6 @@ pub struct SurfaceConfig {
     pub surface_term: bool,
     /// Whether the surface term is weighted by the visibility counts.
     pub attention: bool,
-    /// Where the attention's counts come from.
-    pub visibility: VisibilityKind,
 }
 
 /// The motion field.
@@ -220,13 +191,10 @@ pub struct MotionConfig {
     /// Volume or surface.
     pub kind: MotionKind,
     /// Samples an axis of the weight volume.
-    #[serde(default = "published_resolution")]
     pub resolution: usize,
     /// Distance from the prior's surface up to which a point can belong to the subject, normalised
     /// metres.
     pub margin: f32,
-    /// Width of the fall to zero beyond the margin, normalised metres.
-    pub falloff: f32,
     /// Depth below the prior's surface down to which there are samples, normalised metres. What
     /// lies deeper is hidden behind that much body; a body is nowhere 0.3 deep, so 0.3 keeps every
     /// sample.
@@ -234,26 +202,23 @@ pub struct MotionConfig {
     /// Steps from one look at how far from the prior's surface the field has any density to the
     /// next: what lies farther out is skipped until then. 0 never looks and keeps every sample, and
     /// the volume kinds ask for that.
-    #[serde(default)]
     pub shell_interval: usize,
 }
 
-/// That of the paper, and of files that do not say.
-fn published_resolution() -> usize {
-    32
-}
+/// Width of the fall of the likelihood to 0 beyond `motion.margin`, normalised metres.
+pub(crate) const FALLOFF: f32 = 0.02;
 
 impl MotionConfig {
     /// Distance from the prior's surface beyond which nothing belongs to the subject, normalised
     /// metres.
     pub fn reach(&self) -> f32 {
-        self.margin + self.falloff
+        self.margin + FALLOFF
     }
 }
 
 /// Corrections of the prior before training, from outlines and colours of all frames; see
 /// [`crate::register`].
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RegistrationConfig {
     /// Gauss-Newton steps; 0 leaves the prior as it is given.
@@ -270,26 +235,16 @@ pub struct LossConfig {
     pub perceptual: f32,
     /// File or directory of weights that makes the perceptual term LPIPS (see
     /// [`crate::Lpips::load`]); empty: multi-scale SSIM, which needs none.
-    #[serde(default)]
     pub perceptual_weights: String,
     /// λ₃, completeness.
     pub completeness: f32,
-    /// β of the completeness term, in units of the density.
-    pub beta: f32,
 }
 
 impl LossConfig {
     /// The perceptual term: `ms-ssim`, `lpips` or `none`.
     pub fn perceptual_name(&self) -> String {
-        let embedded = self.perceptual_weights.is_empty();
-        if self.perceptual == 0.0 {
-            "none"
-        } else if embedded {
-            "ms-ssim"
-        } else {
-            "lpips"
-        }
-        .to_owned()
+        let name = if self.perceptual_weights.is_empty() { "ms-ssim" } else { "lpips" };
+        if self.perceptual == 0.0 { "none" } else { name }.to_owned()
     }
 }
 
@@ -332,12 +287,10 @@ pub struct Config {
     /// Samples a ray across the body's box.
     pub samples: usize,
     /// Transmittance of a ray behind which training leaves samples out, below 1; 0 leaves out none.
-    #[serde(default)]
     pub min_transmittance: f32,
     /// Every `held_out`-th training frame is registered, and its mask mended, with the others, but
     /// neither colours nor the field are learnt from it: it is scored in place of other cameras'
     /// views, so that settings can be chosen without those. 0 holds none out.
-    #[serde(default)]
     pub held_out: usize,
     /// The perceptron.
     pub field: FieldConfig,
@@ -346,7 +299,6 @@ pub struct Config {
     /// Surface queries and the surface term.
     pub surface: SurfaceConfig,
     /// Corrections of the prior before training.
-    #[serde(default)]
     pub registration: RegistrationConfig,
     /// Motion field.
     pub motion: MotionConfig,
@@ -357,13 +309,14 @@ pub struct Config {
 }
 
 impl Config {
-    /// Whether what a sample is depends on the vertices around it.
+    /// Whether F sees the surface term, which only [`Method::Occnerf`] has.
+    pub(crate) fn has_surface_term(&self) -> bool {
+        self.method == Method::Occnerf && self.surface.surface_term
+    }
+
+    /// Whether samples need their nearest vertices.
     pub(crate) fn needs_neighbours(&self) -> bool {
-        match self.method {
-            Method::NeuralBody | Method::SelfNerf => true,
-            Method::Occnerf if self.surface.surface_term => true,
-            _ => self.surface.distance.needs_neighbours(),
-        }
+        self.has_surface_term() || self.surface.distance.needs_neighbours()
     }
 
     /// Switches a component of the method off.

@@ -1,6 +1,6 @@
 //! What a configuration may ask for.
 
-use crate::config::settings::{Config, Method, MotionKind};
+use crate::config::settings::{Config, MotionKind};
 
 /// A configuration that cannot be run: the key and why.
 #[derive(Debug, thiserror::Error, PartialEq)]
@@ -61,37 +61,29 @@ impl Config {
             let expected = "expected false unless motion.kind is surface";
             return Err(ConfigError { key: "field.prior_colors", value: "true".to_owned(), expected });
         }
-        if matches!(self.method, Method::NeuralBody | Method::SelfNerf) && self.motion.kind != MotionKind::Surface {
-            let expected = "expected another method unless motion.kind is surface";
-            return Err(ConfigError { key: "method", value: self.method.name().to_owned(), expected });
-        }
         let transmittance = self.min_transmittance;
         if !(0.0..1.0).contains(&transmittance) {
             let expected = "expected at least 0 and below 1";
             return Err(ConfigError { key: "min_transmittance", value: transmittance.to_string(), expected });
         }
-        for (key, value) in [("motion.margin", self.motion.margin), ("motion.falloff", self.motion.falloff)] {
-            if value > 0.3 {
-                let expected = "expected at most 0.3 normalised metres";
-                return Err(ConfigError { key, value: value.to_string(), expected });
-            }
+        if self.motion.margin > 0.3 {
+            let (value, expected) = (self.motion.margin.to_string(), "expected at most 0.3 normalised metres");
+            return Err(ConfigError { key: "motion.margin", value, expected });
         }
         let at_least_zero = "expected a finite number of at least 0";
         let above_zero = "expected a finite number above 0";
         let any = "expected a finite number";
-        let real: [(&'static str, f32, f32, &'static str); 19] = [
+        let real: [(&'static str, f32, f32, &'static str); 17] = [
             ("field.density_scale", self.field.density_scale, f32::MIN_POSITIVE, above_zero),
             ("field.density_bias", self.field.density_bias, f32::MIN, any),
             ("field.density_bias_outside", self.field.density_bias_outside, f32::MIN, any),
             ("encoding.distance_max", self.encoding.distance_max, f32::MIN_POSITIVE, above_zero),
             ("-encoding.distance_min", -self.encoding.distance_min, f32::MIN_POSITIVE, above_zero),
             ("motion.margin", self.motion.margin, f32::MIN_POSITIVE, above_zero),
-            ("motion.falloff", self.motion.falloff, f32::MIN_POSITIVE, above_zero),
             ("motion.depth", self.motion.depth, f32::MIN_POSITIVE, above_zero),
             ("loss.mse", self.loss.mse, 0.0, at_least_zero),
             ("loss.perceptual", self.loss.perceptual, 0.0, at_least_zero),
             ("loss.completeness", self.loss.completeness, 0.0, at_least_zero),
-            ("loss.beta", self.loss.beta, 0.0, at_least_zero),
             ("rates.field", self.rates.field, 0.0, at_least_zero),
             ("rates.vertices", self.rates.vertices, 0.0, at_least_zero),
             ("rates.table", self.rates.table, 0.0, at_least_zero),

@@ -102,20 +102,6 @@ impl Body {
         let placement = smpl::Placement::Pelvis { translation: Vec3::ZERO };
         self.pose(Moment { betas: &self.mean_betas, pose: &joints, placement })
     }
-
-    /// Mean area around a vertex of the canonical mesh over that around each, V; at most a thousand.
-    pub(crate) fn area_scale(&self) -> Vec<f32> {
-        let vertices = &self.canonical.vertices;
-        let mut areas = vec![0.0; vertices.len()];
-        for face in &self.model.faces {
-            let [a, b, c] = face.map(|v| vertices[v as usize]);
-            // Six times the share of each corner, a third of the face.
-            let area = (b - a).cross(c - a).length();
-            face.iter().for_each(|&v| areas[v as usize] += area);
-        }
-        let mean = (areas.iter().sum::<f32>() / areas.len() as f32).max(f32::MIN_POSITIVE);
-        areas.iter().map(|area| mean / area.max(1e-3 * mean)).collect()
-    }
 }
 
 /// A camera with its lengths multiplied by `scale`.

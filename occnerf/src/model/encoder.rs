@@ -1,6 +1,8 @@
 //! The encoding γ of each method.
 
+use std::fmt::Debug;
 use std::ops::Range;
+use std::sync::Arc;
 
 use glam::Vec3;
 use hashgrid::{HashGrid, HashGridConfig, Layout};
@@ -10,19 +12,36 @@ use crate::Error;
 use crate::config::{Config, EncodingConfig, Method};
 use crate::model::samples::Samples;
 
-/// Bands of the frequency encoding (Weng et al. 2022).
-const BANDS: usize = 10;
+/// An encoding of canonical points x̂ (normalised metres) that is defined outside of this crate; see
+/// [`Trainer::with_encoder`](crate::Trainer::with_encoder).
+///
+/// Its parameters are one flat slice, trained at the rate of the hash table. Features are N × F,
+/// a row a point. The same input has to give the same bits on any thread.
+pub trait PointEncoder: Debug + Send + Sync {
+    /// Features F of a point.
+    fn num_features(&self) -> usize;
+    /// Parameters before the first step; none by default.
+    fn initial(&self, _seed: u64) -> Vec<f32> {
+        Vec::new()
+    }
+    /// Writes the features of `points`.
+    fn encode(&self, parameters: &[f32], points: &[[f32; 3]], features: &mut [f32]);
+    /// Adds the gradient of the parameters.
+    fn encode_backward(&self, _points: &[[f32; 3]], _d_features: &[f32], _d_parameters: &mut [f32]) {}
+    /// Adds the gradient of the points, which `motion.kind = volume` learns from. By default
+    /// features pass none on.
+    fn encode_backward_points(&self, _points: &[[f32; 3]], _d_features: &[f32], _d_points: &mut [[f32; 3]]) {}
+}
 
-/// What F is fed with at a point.
+/// The encoding γ.
 #[derive(Clone, Debug)]
 pub(crate) enum Encoder {
-    /// sin and cos of 2^b · x̂, and x̂ itself.
-    Frequency,
     /// Hash grid on x̂.
     Point(HashGrid<3>),
-    /// Hash grid on [v̂, d], or on that of a neighbour, and the interval that d is clamped to,
-    /// normalised metres.
+    /// Hash grid on [v̂, d], and the interval that d is clamped to, normalised metres.
     Surface(HashGrid<4>, (f32, f32)),
+    /// The caller's, of x̂.
+    Custom(Arc<dyn PointEncoder>),
 }
 
 impl Encoder {
@@ -31,48 +50,46 @@ impl Encoder {
             config.encoding;
         let grid = HashGridConfig { levels, features, log2_table_size, n_min, n_max };
         Ok(match config.method {
-            Method::Prior | Method::Humannerf | Method::NeuralBody => Self::Frequency,
-            Method::HashPoint => Self::Point(HashGrid::new(&grid)?),
-            Method::SelfNerf | Method::Occnerf => Self::Surface(HashGrid::new(&grid)?, (distance_min, distance_max)),
+            Method::Prior | Method::HashPoint => Self::Point(HashGrid::new(&grid)?),
+            Method::Occnerf => Self::Surface(HashGrid::new(&grid)?, (distance_min, distance_max)),
         })
     }
 
     #[cfg(test)]
     pub fn num_parameters(&self) -> usize {
         match self {
-            Self::Frequency => 0,
             Self::Point(grid) => grid.num_parameters(),
             Self::Surface(grid, _) => grid.num_parameters(),
+            Self::Custom(encoder) => encoder.initial(0).len(),
         }
     }
 
     pub fn num_features(&self) -> usize {
         match self {
-            Self::Frequency => 3 + 6 * BANDS,
             Self::Point(grid) => grid.num_features(),
             Self::Surface(grid, _) => grid.num_features(),
+            Self::Custom(encoder) => encoder.num_features(),
         }
     }
 
     pub fn initial_table(&self, seed: u64) -> Vec<f32> {
         match self {
-            Self::Frequency => Vec::new(),
             Self::Point(grid) => grid.init_table(seed),
             Self::Surface(grid, _) => grid.init_table(seed),
+            Self::Custom(encoder) => encoder.initial(seed),
         }
     }
 
-    /// The coordinates that samples are encoded at: x̂ for the frequencies, in the unit box for a
-    /// grid.
+    /// The coordinates that samples are encoded at, in the unit box for a grid.
     pub fn coordinates(&self, samples: &Samples, region: &Aabb, out: &mut Coordinates) {
         out.point.clear();
         out.surface.clear();
         match self {
-            Self::Frequency => out.point.extend(samples.canonical.iter().map(Vec3::to_array)),
             Self::Point(_) => out.point.extend(samples.canonical.iter().map(|&x| in_box(x, region).to_array())),
             Self::Surface(_, range) => out.surface.extend(
                 samples.closest.iter().zip(&samples.distance).map(|(&v, &d)| surface_coordinates(v, d, region, *range)),
             ),
+            Self::Custom(_) => out.point.extend(samples.canonical.iter().map(Vec3::to_array)),
         }
     }
 
@@ -88,41 +105,31 @@ impl Encoder {
         matches!(self, Self::Surface(_, (low, high)) if d > *low && d < *high)
     }
 
-    /// How the features of `points` points lie; a frequency encoding is one level.
+    /// How the features of `points` points lie.
     pub fn layout(&self, points: usize) -> Layout {
         match self {
-            Self::Frequency => Layout { levels: 1, points, features: self.num_features() },
             Self::Point(grid) => grid.layout(points),
             Self::Surface(grid, _) => grid.layout(points),
+            Self::Custom(encoder) => Layout { levels: 1, points, features: encoder.num_features() },
         }
     }
 
     /// Features ([`Encoder::layout`]) of the coordinates.
     pub fn encode(&self, table: &[f32], at: At<'_>, features: &mut [f32]) {
         match self {
-            Self::Frequency => {
-                for (x, row) in at.point.iter().zip(features.chunks_exact_mut(self.num_features())) {
-                    row[..3].copy_from_slice(x);
-                    for (band, pair) in row[3..].chunks_exact_mut(6).enumerate() {
-                        let frequency = (1u32 << band) as f32;
-                        for axis in 0..3 {
-                            (pair[axis], pair[3 + axis]) = (x[axis] * frequency).sin_cos();
-                        }
-                    }
-                }
-            }
             Self::Point(grid) => grid.encode(table, at.point, features),
             Self::Surface(grid, _) => grid.encode(table, at.surface, features),
+            Self::Custom(encoder) => encoder.encode(table, at.point, features),
         }
     }
 
-    /// Derivatives that [`Encoder::encode_jacobian`] writes for each point; none where there is no
-    /// table.
+    /// Derivatives that [`Encoder::encode_jacobian`] writes for each point; none of the caller's
+    /// encoding.
     pub fn jacobian_width(&self) -> usize {
         match self {
-            Self::Frequency => 0,
             Self::Point(grid) => grid.jacobian_len(1),
             Self::Surface(grid, _) => grid.jacobian_len(1),
+            Self::Custom(_) => 0,
         }
     }
 
@@ -130,9 +137,9 @@ impl Encoder {
     /// alone.
     pub fn encode_jacobian(&self, table: &[f32], at: At<'_>, features: &mut [f32], jacobian: &mut [f32]) {
         match self {
-            Self::Frequency => self.encode(table, at, features),
             Self::Point(grid) => grid.encode_jacobian(table, at.point, features, jacobian),
             Self::Surface(grid, _) => grid.encode_jacobian(table, at.surface, features, jacobian),
+            Self::Custom(encoder) => encoder.encode(table, at.point, features),
         }
     }
 
@@ -143,39 +150,29 @@ impl Encoder {
         d_table: &mut [f32],
     ) {
         match self {
-            Self::Frequency => {}
             Self::Point(grid) => grid.encode_backward_parts(parts.map(|(at, d)| (at.point, d)), d_table),
             Self::Surface(grid, _) => grid.encode_backward_parts(parts.map(|(at, d)| (at.surface, d)), d_table),
+            Self::Custom(encoder) => parts.for_each(|(at, d)| encoder.encode_backward(at.point, d, d_table)),
         }
     }
 
     /// Gradients of the coordinates; overwrites `d_at`.
-    pub fn encode_backward_points(&self, slopes: Slopes<'_>, at: At<'_>, d_features: &[f32], d_at: &mut Coordinates) {
+    pub fn encode_backward_points(&self, from: Jacobian<'_>, at: At<'_>, d_features: &[f32], d_at: &mut Coordinates) {
         d_at.clear();
         d_at.point.resize(at.point.len(), [0.0; 3]);
         d_at.surface.resize(at.surface.len(), [0.0; 4]);
         match self {
-            Self::Frequency => {
-                let rows = d_features.chunks_exact(self.num_features());
-                for ((d, x), d_row) in d_at.point.iter_mut().zip(at.point).zip(rows) {
-                    d.copy_from_slice(&d_row[..3]);
-                    for (band, pair) in d_row[3..].chunks_exact(6).enumerate() {
-                        let frequency = (1u32 << band) as f32;
-                        for axis in 0..3 {
-                            let (sin, cos) = (x[axis] * frequency).sin_cos();
-                            d[axis] += frequency * (cos * pair[axis] - sin * pair[3 + axis]);
-                        }
-                    }
+            Self::Point(grid) => match from {
+                Jacobian::OfTable(table) => grid.encode_backward_points(table, at.point, d_features, &mut d_at.point),
+                Jacobian::Stored(jacobian) => grid.jacobian_backward(jacobian, d_features, &mut d_at.point),
+            },
+            Self::Surface(grid, _) => match from {
+                Jacobian::OfTable(table) => {
+                    grid.encode_backward_points(table, at.surface, d_features, &mut d_at.surface);
                 }
-            }
-            Self::Point(grid) => match slopes {
-                Slopes::Table(table) => grid.encode_backward_points(table, at.point, d_features, &mut d_at.point),
-                Slopes::Jacobian(jacobian) => grid.jacobian_backward(jacobian, d_features, &mut d_at.point),
+                Jacobian::Stored(jacobian) => grid.jacobian_backward(jacobian, d_features, &mut d_at.surface),
             },
-            Self::Surface(grid, _) => match slopes {
-                Slopes::Table(table) => grid.encode_backward_points(table, at.surface, d_features, &mut d_at.surface),
-                Slopes::Jacobian(jacobian) => grid.jacobian_backward(jacobian, d_features, &mut d_at.surface),
-            },
+            Self::Custom(encoder) => encoder.encode_backward_points(at.point, d_features, &mut d_at.point),
         }
     }
 
@@ -183,7 +180,7 @@ impl Encoder {
     pub fn d_metres(&self, d_at: &Coordinates, index: usize, region: &Aabb) -> (Vec3, f32) {
         let per_metre = (region.max - region.min).recip();
         match self {
-            Self::Frequency => (Vec3::from_array(d_at.point[index]), 0.0),
+            Self::Custom(_) => (Vec3::from_array(d_at.point[index]), 0.0),
             Self::Point(_) => (Vec3::from_array(d_at.point[index]) * per_metre, 0.0),
             Self::Surface(_, (low, high)) => {
                 let [x, y, z, w] = d_at.surface[index];
@@ -195,11 +192,11 @@ impl Encoder {
 
 /// Where the derivatives of a grid's features by the coordinates come from.
 #[derive(Clone, Copy)]
-pub(crate) enum Slopes<'a> {
+pub(crate) enum Jacobian<'a> {
     /// They are computed from the table.
-    Table(&'a [f32]),
+    OfTable(&'a [f32]),
     /// [`Encoder::encode_jacobian`] has written them.
-    Jacobian(&'a [f32]),
+    Stored(&'a [f32]),
 }
 
 /// Where samples are encoded; one of the two is filled.
@@ -242,9 +239,8 @@ fn surface_coordinates(v: Vec3, d: f32, region: &Aabb, (low, high): (f32, f32)) 
     [p.x, p.y, p.z, (d.clamp(low, high) - low) / (high - low)]
 }
 
-/// Makes a buffer of `len` values that the caller writes all of. One that grows makes room for an
-/// eighth more, where a vector would for twice as many: of what each segment of samples keeps for
-/// itself, features are the most.
+/// Makes a buffer of `len` values, all of which the caller writes. It grows by an eighth, where a
+/// vector doubles: features are the largest array of a segment of samples.
 pub(crate) fn fit(buffer: &mut Vec<f32>, len: usize) {
     if buffer.capacity() < len {
         *buffer = Vec::new();

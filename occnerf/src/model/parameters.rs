@@ -1,19 +1,14 @@
 //! The learnable arrays, in the paper's groups.
 
 use crate::config::Config;
-use crate::model::field::{Field, VertexRows};
-use volrender::RandomStream;
-
-const CODES: u64 = 0x434F_4445;
-/// Standard deviation of a number of a vertex's code before the first step.
-const CODE: f32 = 0.1;
+use crate::model::field::Field;
 
 /// A part of the parameters.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Part {
     /// The perceptron F.
     Field,
-    /// The hash table, or the codes of the vertices.
+    /// The hash table, or the parameters of a [`PointEncoder`](crate::PointEncoder).
     Table,
     /// Offsets of the vertices, V × 3; none where they are not learnt.
     Vertices,
@@ -62,14 +57,9 @@ pub(crate) struct Lengths {
 impl Parameters {
     /// The values that training starts from.
     pub fn new(config: &Config, field: &Field, lengths: Lengths) -> Self {
-        let moved = field.vertex_rows == VertexRows::Encoded && config.rates.vertices > 0.0;
+        let moved = field.surface_term && config.rates.vertices > 0.0;
         let vertices = if moved { 3 * lengths.vertices } else { 0 };
-        let table = if field.vertex_rows == VertexRows::Learnt {
-            let mut stream = RandomStream::new(&[config.seed, CODES]);
-            (0..lengths.vertices * field.encoder.num_features()).map(|_| CODE * stream.normal()).collect()
-        } else {
-            field.encoder.initial_table(config.seed)
-        };
+        let table = field.encoder.initial_table(config.seed);
         let values = Arrays([field.mlp.initial(config.seed), table, vec![0.0; vertices], vec![0.0; lengths.motion]]);
         Self { values, kept_rows: None }
     }

@@ -9,12 +9,13 @@ use volrender::Occupancy;
 
 use crate::Error;
 use crate::capture::Light;
-use crate::config::{Config, MotionKind, VisibilityKind};
+use crate::config::{Config, FALLOFF, MotionKind};
 use crate::model::arena::Arena;
 use crate::model::body::Body;
 use crate::model::colors::PriorColors;
 use crate::model::extent::Extent;
-use crate::model::field::{Field, Learnt, SampleBatch, VertexRows};
+use crate::model::encoder::Encoder;
+use crate::model::field::{Field, Learnt, SampleBatch};
 use crate::model::parameters::{Lengths, PARTS, Parameters, Part};
 use crate::model::trace::{PosedSurface, Tracer, near_canonical};
 use crate::model::vertices::VertexCode;
@@ -59,14 +60,10 @@ impl Model {
             let found = format!("was prepared for {k_of_body} neighbours in each of {levels} levels");
             return Err(Error::Scene(format!("{found}, the configuration asks for {k} in each of {wanted}")));
         }
-        let mut field = Field::new(&config, body.canonical_box)?;
-        if config.surface.visibility == VisibilityKind::CountedPerArea {
-            field.count_scale = body.area_scale();
-        }
+        let field = Field::new(Encoder::new(&config)?, &config, body.canonical_box);
         let motion = match config.motion.kind {
             MotionKind::Surface => {
-                let (margin, falloff) = (config.motion.margin, config.motion.falloff);
-                MotionField::Surface(SurfaceMotion { margin, falloff })
+                MotionField::Surface(SurfaceMotion { margin: config.motion.margin, falloff: FALLOFF })
             }
             MotionKind::Volume => {
                 let layout = WeightVolumeConfig { resolution: config.motion.resolution, ..Default::default() };
@@ -128,8 +125,7 @@ impl Model {
             + self.field.mlp.num_true_parameters()
     }
 
-    /// How often each vertex was near a termination point, or in how many frames it is seen: see
-    /// [`VisibilityKind`](crate::VisibilityKind); zeros where no neighbours are looked up.
+    /// How many training rays ended near each vertex; zeros where no neighbours are looked up.
     pub fn visibility_counts(&self) -> &[u64] {
         self.counts.counts()
     }
@@ -140,17 +136,14 @@ impl Model {
         let lengths = Lengths { vertices: self.body.canonical.vertices.len(), motion };
         self.parameters = Parameters::new(&self.config, &self.field, lengths);
         self.extent = Extent::whole(&self.body, &self.config);
+        self.counts = VisibilityCounts::new(lengths.vertices);
     }
 
-    /// Makes the rows of the vertices, if samples mix any, from the current parameters.
+    /// Encodes the vertices of the surface term, if there is one, with the current parameters.
     pub(crate) fn encode_vertices(&self, code: &mut VertexCode) {
-        let (table, offsets) = (self.parameters.get(Part::Table), self.parameters.get(Part::Vertices));
-        match self.field.vertex_rows {
-            VertexRows::None => {}
-            VertexRows::Encoded => {
-                code.encode(&self.body, &self.config.surface, &self.field.encoder, table, offsets);
-            }
-            VertexRows::Learnt => table.clone_into(&mut code.rows),
+        if self.field.surface_term {
+            let (table, offsets) = (self.parameters.get(Part::Table), self.parameters.get(Part::Vertices));
+            code.encode(&self.body, &self.config.surface, &self.field.encoder, table, offsets);
         }
     }
 
@@ -197,7 +190,6 @@ impl Model {
             table: self.parameters.get(Part::Table),
             vertices: &code.rows,
             counts: &self.counts,
-            surface: (&self.body.canonical.vertices, self.body.query.normals()),
         }
     }
 

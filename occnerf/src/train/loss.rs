@@ -173,15 +173,14 @@ impl Windows {
     }
 }
 
+/// β of the completeness term, in units of the density (paper §4.1).
+pub(crate) const BETA: f32 = 10.0;
+
 /// Completeness of one sample inside the body, on the activated density (paper §3.4): e^(ReLU(β −
 /// σ) − β), which is 1 at σ = 0 and e^−β from σ = β on. Returns the value and its derivative by σ.
-pub(crate) fn completeness(sigma: f32, beta: f32) -> (f32, f32) {
-    if sigma < beta {
-        let value = (-sigma).exp();
-        (value, -value)
-    } else {
-        ((-beta).exp(), 0.0)
-    }
+pub(crate) fn completeness(sigma: f32) -> (f32, f32) {
+    let value = (-sigma.min(BETA)).exp();
+    (value, if sigma < BETA { -value } else { 0.0 })
 }
 
 #[cfg(test)]
@@ -257,11 +256,11 @@ mod tests {
 
     #[test]
     fn completeness_is_one_when_empty_and_flat_beyond_beta() {
-        assert_eq!(completeness(0.0, 10.0), (1.0, -1.0));
-        assert_eq!(completeness(10.0, 10.0), ((-10.0f32).exp(), 0.0));
-        assert_eq!(completeness(1e30, 10.0).1, 0.0);
+        assert_eq!(completeness(0.0), (1.0, -1.0));
+        assert_eq!(completeness(10.0), ((-10.0f32).exp(), 0.0));
+        assert_eq!(completeness(1e30).1, 0.0);
         let (h, s) = (1e-2, 1.7);
-        let numeric = (completeness(s + h, 10.0).0 - completeness(s - h, 10.0).0) / (2.0 * h);
-        assert!((numeric - completeness(s, 10.0).1).abs() < 1e-4);
+        let numeric = (completeness(s + h).0 - completeness(s - h).0) / (2.0 * h);
+        assert!((numeric - completeness(s).1).abs() < 1e-4);
     }
 }

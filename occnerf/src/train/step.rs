@@ -123,7 +123,7 @@ impl Step<'_> {
         for Segment { batch, .. } in segments.all_mut() {
             if loss.completeness > 0.0 {
                 for s in (0..batch.samples.len()).filter(|&s| batch.samples.distance[s] < 0.0) {
-                    let (value, slope) = completeness(batch.sigma[s], loss.beta);
+                    let (value, slope) = completeness(batch.sigma[s]);
                     group.completeness += f64::from(value);
                     batch.d_sigma[s] += scale * slope;
                 }

@@ -1,16 +1,18 @@
 //! Training: a model, an optimiser and the buffers of a step, deterministic whatever the number of
 //! threads.
 
+use std::sync::Arc;
+
 use rayon::prelude::*;
 use smpl::MotionFrame;
-use visibility::VisibilityCounts;
 
 use crate::Error;
 use crate::capacity::Pruned;
-use crate::config::{Config, VisibilityKind};
+use crate::config::Config;
 use crate::lpips::Lpips;
 use crate::model::colors::PriorColors;
-use crate::model::field::VertexRows;
+use crate::model::encoder::{Encoder, PointEncoder};
+use crate::model::field::Field;
 use crate::model::march::MarchOptions;
 use crate::model::parameters::Part;
 use crate::model::times::{StepTimes, Stopwatch};
@@ -61,11 +63,7 @@ impl<'a> Trainer<'a> {
     pub fn new(scene: &'a Scene, config: Config) -> Result<Self, Error> {
         let base = if config.field.prior_colors { scene.colors()?.clone() } else { PriorColors::default() };
         let frames = scene.train.iter().map(|frame| frame.view.clone()).collect();
-        let mut model = Model::new(config, scene.body.clone(), frames, base)?;
-        let surface = &model.config.surface;
-        if surface.attention && surface.visibility == VisibilityKind::Exact {
-            model.counts = VisibilityCounts::from_counts(scene.vertex_frequencies()?);
-        }
+        let model = Model::new(config, scene.body.clone(), frames, base)?;
         let buffers = Buffers {
             batch: Batch::default(),
             groups: (0..GROUPS).map(|_| RayGroup::default()).collect(),
@@ -77,6 +75,20 @@ impl<'a> Trainer<'a> {
         };
         let optimiser = Optimiser::new(&model.parameters);
         Ok(Self { scene, model, optimiser, restarts: Restarts::default(), lpips: None, buffers })
+    }
+
+    /// Feeds the perceptron with the features of `encoder` in place of the method's, and begins anew.
+    /// A checkpoint does not hold the encoder: such a run cannot be resumed, nor its model loaded.
+    ///
+    /// # Panics
+    /// With the surface term, whose vertices no encoder of points encodes.
+    #[must_use]
+    pub fn with_encoder(mut self, encoder: Arc<dyn PointEncoder>) -> Self {
+        let Model { config, body, field, .. } = &mut self.model;
+        assert!(!config.has_surface_term(), "the surface term of {} has no encoder", config.method.name());
+        *field = Field::new(Encoder::Custom(encoder), config, body.canonical_box);
+        self.begin_anew();
+        self
     }
 
     /// The model as it is now.
@@ -135,9 +147,6 @@ impl<'a> Trainer<'a> {
     fn begin_anew(&mut self) {
         self.model.forget();
         self.optimiser = Optimiser::new(&self.model.parameters);
-        if self.model.config.surface.visibility != VisibilityKind::Exact {
-            self.model.counts = VisibilityCounts::new(self.model.body.canonical.vertices.len());
-        }
     }
 
     /// Takes one optimisation step.
@@ -191,9 +200,7 @@ impl<'a> Trainer<'a> {
             + f64::from(loss.completeness) * report.completeness;
         reduce(model, optimiser, groups, vertex_code, d_volume, &mut times);
         let mut watch = Stopwatch::start();
-        if model.config.surface.visibility != VisibilityKind::Exact {
-            groups.iter().for_each(|group| model.counts.add(&group.terminations));
-        }
+        groups.iter().for_each(|group| model.counts.add(&group.terminations));
         let decay = model.config.rates.final_fraction.powf(step as f32 / model.config.steps.max(1) as f32);
         let rates = &model.config.rates;
         report.bad_gradients = optimiser.step(&mut model.parameters, rates, decay * restarts.rates());
@@ -252,17 +259,11 @@ fn reduce(
     sum(d_mlp, &|g| &g.d_mlp);
     model.field.mlp.clear_padding(d_mlp);
     watch.lap(&mut times.update);
-    if model.field.vertex_rows != VertexRows::None {
+    if model.field.surface_term {
         zero(&mut vertex_code.d_rows, vertex_code.rows.len());
         sum(&mut vertex_code.d_rows, &|g| &g.d_vertices);
-    }
-    match model.field.vertex_rows {
-        VertexRows::None => {}
-        VertexRows::Encoded => {
-            let (table, d_offsets) = (model.parameters.get(Part::Table), gradients.get_mut(Part::Vertices));
-            vertex_code.backward(&model.body, &model.field.encoder, table, d_offsets);
-        }
-        VertexRows::Learnt => gradients.get_mut(Part::Table).copy_from_slice(&vertex_code.d_rows),
+        let (table, d_offsets) = (model.parameters.get(Part::Table), gradients.get_mut(Part::Vertices));
+        vertex_code.backward(&model.body, &model.field.encoder, table, d_offsets);
     }
     let samples = groups.iter().flat_map(|group| group.segments.all()).map(|segment| &segment.batch);
     let parts = samples.map(|batch| (batch.at.all(), &batch.features[..])).chain(vertex_code.parts());

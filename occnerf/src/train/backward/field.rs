@@ -2,7 +2,7 @@
 
 use glam::Vec3;
 
-use crate::model::field::{Field, Learnt, SampleBatch, VertexRows, sigmoid};
+use crate::model::field::{Field, Learnt, SampleBatch, sigmoid};
 use crate::model::gemm::LANES;
 use crate::model::surface_term::Mix;
 
@@ -27,7 +27,8 @@ impl Field {
         let reached = |s: &usize| batch.d_sigma[*s] != 0.0 || batch.d_rgb[*s] != Vec3::ZERO;
         let ends = (0..n).rev().find(reached).map_or(0, |s| s + 1);
         batch.d_distance[ends..n].fill(0.0);
-        self.layout(batch).clear(self.points(ends)..self.points(n), &mut batch.features);
+        let layout = self.encoder.layout(n);
+        layout.clear(ends..n, &mut batch.features);
         for (block, range) in self.blocks(ends) {
             if self.narrow {
                 self.activate(learnt.perceptron, learnt.vertices, range.clone(), batch, block);
@@ -38,16 +39,16 @@ impl Field {
             for ((s, raw), d_raw) in range.clone().zip(outputs).zip(batch.d_output.chunks_exact_mut(LANES)) {
                 let distance = batch.samples.distance[s];
                 d_raw[0] = batch.d_sigma[s] * self.density_scale * sigmoid(raw[0] + self.bias(distance));
-                let slopes = distance > 0.0 && distance < self.reach;
-                batch.d_distance[s] = if slopes { d_raw[0] * self.density_bias.1 } else { 0.0 };
+                let sloped = distance > 0.0 && distance < self.reach;
+                batch.d_distance[s] = if sloped { d_raw[0] * self.density_bias.1 } else { 0.0 };
                 let (rgb, d_rgb) = (batch.rgb[s], batch.d_rgb[s]);
                 let share = batch.samples.base(s).w;
                 (share * d_rgb * rgb * (Vec3::ONE - rgb)).write_to_slice(&mut d_raw[1..4]);
             }
             let (d_output, d_input) = (&mut batch.d_output, &mut batch.d_input);
             self.mlp.backward(transposed, &batch.blocks[block], range.len(), d_output, d_input, d_mlp);
-            self.point_term_backward(range.clone(), batch);
-            if self.vertex_rows != VertexRows::None {
+            layout.from_rows(&batch.d_input, row, range.clone(), &mut batch.features);
+            if self.surface_term {
                 let mix = Mix::new(width, row, range, &batch.samples, &batch.attention);
                 pulp::Arch::new().dispatch(Scatter { mix, d_rows: d_vertices, d_input: &batch.d_input });
             }

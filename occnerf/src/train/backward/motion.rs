@@ -5,16 +5,9 @@ use smpl::{MotionFrame, WeightVolume};
 
 use crate::model::arena::Arena;
 use crate::model::distance::{SurfacePoint, surface_point_backward};
-use crate::model::encoder::Slopes;
+use crate::model::encoder::Jacobian;
 use crate::model::field::SampleBatch;
 use crate::model::trained::Model;
-
-/// Fills `d_at` of a batch: the gradients of the coordinates that its samples were encoded at.
-pub(crate) fn d_coordinates(model: &Model, batch: &mut SampleBatch, jacobians: &Arena) {
-    let SampleBatch { at, d_at, jacobian, features, .. } = batch;
-    let slopes = Slopes::Jacobian(jacobians.piece(jacobian));
-    model.field.encoder.encode_backward_points(slopes, at.all(), features, d_at);
-}
 
 /// Carries the gradients of the encoding's coordinates and of f into the weight volume.
 pub(crate) fn volume_backward(
@@ -25,8 +18,10 @@ pub(crate) fn volume_backward(
     jacobians: &Arena,
     d_volume: &mut [f32],
 ) {
-    d_coordinates(model, batch, jacobians);
-    let (samples, encoder) = (&batch.samples, &model.field.encoder);
+    let encoder = &model.field.encoder;
+    let jacobian = Jacobian::Stored(jacobians.piece(&batch.jacobian));
+    encoder.encode_backward_points(jacobian, batch.at.all(), &batch.features, &mut batch.d_at);
+    let samples = &batch.samples;
     let per_sample = samples.neighbours.len().checked_div(samples.len()).unwrap_or(0);
     let on_surface = !batch.at.surface.is_empty();
     for s in 0..samples.len() {
