@@ -50,7 +50,7 @@ pub use config::{
 };
 pub use error::Error;
 pub use evaluate::{FrameMetrics, SplitMetrics, evaluate, evaluate_with, least_seen_quartile, nearest_vertices};
-pub use model::body::{Body, Moment};
+pub use model::body::{Body, PosedFrame};
 pub use model::colors::PriorColors;
 pub use model::encoder::PointEncoder;
 pub use model::person::Person;

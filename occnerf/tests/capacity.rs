@@ -10,7 +10,7 @@ use occnerf::{Capacity, Config, Error, FieldRenderer, Measured, Method, Preset, 
 use proptest::prelude::*;
 
 const PRESETS: [Preset; 3] = [Preset::Fast, Preset::Balanced, Preset::Paper];
-const METHODS: [Method; 3] = [Method::Occnerf, Method::HashPoint, Method::Humannerf];
+const METHODS: [Method; 2] = [Method::Occnerf, Method::HashPoint];
 const SIZES: [&str; 6] =
     ["encoding.n_max", "encoding.levels", "encoding.log2_table_size", "field.width", "samples", "steps"];
 
@@ -186,13 +186,4 @@ fn a_pruned_model_draws_the_same_pictures_with_fewer_parameters_also_from_its_fi
     // Training on, all rows can be learnt again, and both go the same way.
     assert_eq!(resumed.step().unwrap().loss.to_bits(), trainer.step().unwrap().loss.to_bits());
     assert_eq!(resumed.model().num_parameters(), whole);
-}
-
-#[test]
-fn methods_without_a_table_have_nothing_to_prune() {
-    let mut trainer = Trainer::new(scene(), config(Method::Humannerf)).unwrap();
-    trainer.step().unwrap();
-    let whole = trainer.model().num_parameters();
-    let pruned = trainer.prune();
-    assert_eq!((pruned.rows, pruned.dropped, pruned.parameters as usize), (0, 0, whole));
 }

@@ -231,7 +231,7 @@ fn configurations_that_cannot_be_run_are_refused() {
         ("log2_table_size", "log2_table_size = 40"),
         ("n_min", "n_min = 0"),
         ("margin", "margin = nan"),
-        ("method", "method = \"humannerf\""),
+        ("method", "method = \"hash-point\""),
     ] {
         refused(scene(), &path, &edited(&bytes, key, by), by);
     }

@@ -32,7 +32,7 @@ fn odd(kind: &str) -> Frame {
 #[test]
 fn training_goes_on_over_frames_that_show_nobody() {
     for kind in ["hidden", "behind", "beside", "around"] {
-        for method in [Method::Occnerf, Method::HashPoint, Method::Humannerf] {
+        for method in [Method::Occnerf, Method::HashPoint] {
             let mut capture = capture();
             capture.train.push(odd(kind));
             let config = config(method);

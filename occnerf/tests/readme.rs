@@ -43,9 +43,9 @@ fn table() -> String {
             };
             name.to_owned()
         }),
-        row("margin + falloff outside, depth inside, cm", |c| {
-            let [margin, falloff, depth] = [c.motion.margin, c.motion.falloff, c.motion.depth].map(centimetres);
-            format!("{margin} + {falloff}, {depth}")
+        row("reach outside, depth inside, cm", |c| {
+            let [reach, depth] = [c.motion.reach(), c.motion.depth].map(centimetres);
+            format!("{reach}, {depth}")
         }),
         row("colours start from", |c| if c.field.prior_colors { "the prior's" } else { "grey" }.to_owned()),
         row("transmittance behind which samples are left out", |c| match c.min_transmittance {

@@ -21,7 +21,6 @@ fn configs() -> Vec<Config> {
     let mut paper = tiny(Method::Occnerf, MotionKind::Volume);
     paper.surface.distance = DistanceKind::Blended;
     configs.push(paper);
-    configs.extend([Method::NeuralBody, Method::SelfNerf].map(|method| tiny(method, MotionKind::Surface)));
     configs
 }
 

@@ -44,7 +44,7 @@ fn configs() -> [Config; 3] {
     [
         tiny(Method::Occnerf, MotionKind::Surface),
         tiny(Method::Occnerf, MotionKind::Volume),
-        tiny(Method::Humannerf, MotionKind::Surface),
+        tiny(Method::HashPoint, MotionKind::Surface),
     ]
 }
 

@@ -9,7 +9,7 @@ use glam::{Affine3A, Mat3, Vec3};
 use indicatif::ProgressBar;
 use occnerf::bake::BakedRenderer;
 use occnerf::bake::export::fit_motion;
-use occnerf::{Body, FieldRenderer, Method, Model, Moment, Person, PosedView, PriorRenderer, Renderer, upright};
+use occnerf::{Body, FieldRenderer, Method, Model, PosedFrame, Person, PosedView, PriorRenderer, Renderer, upright};
 use smpl::{MotionClip, Placement};
 use visibility::Samples;
 use volrender::Camera;
@@ -167,7 +167,7 @@ fn views<'a>(
             let view = move |i: usize| {
                 let (pose, translation) = (&motion.poses[i * joints..][..joints], motion.trans[i]);
                 let placement = Placement::Pelvis { translation };
-                let posed = body.pose(Moment { betas: &body.mean_betas, pose, placement });
+                let posed = body.pose(PosedFrame { betas: &body.mean_betas, pose, placement });
                 let view = PosedView::new(&frame.camera, posed);
                 view.seen_by(&resized(&camera_at(frame, view.centre(), 0.0)))
             };

@@ -2,7 +2,7 @@
 
 use glam::{Vec3, Vec4};
 use rayon::prelude::*;
-use smpl::{MotionField, SurfaceMotion};
+use smpl::MotionField;
 use visibility::Samples;
 use volrender::{Aabb, Ray};
 
@@ -14,7 +14,7 @@ use crate::capture::Image;
 use crate::model::distance::surface_point;
 use crate::model::extent::Extent;
 use crate::model::field::SampleBatch;
-use crate::model::trained::Model;
+use crate::model::trained::{Model, surface_motion};
 use crate::model::vertices::VertexCode;
 use crate::model::view::PosedView;
 use crate::render::picture::{Renderer, Rendering};
@@ -76,11 +76,11 @@ impl CanonicalField for TrainedField<'_> {
                 }
             }
             if based {
-                samples.base.push(base.before_sigmoid(place.face, place.barycentric, 1.0));
+                samples.base.push(base.logit(place.face, place.barycentric, 1.0));
             }
         }
         self.model.evaluate(&self.code, &mut batch, None);
-        let likelihood = SurfaceMotion { margin: config.motion.margin, falloff: FALLOFF };
+        let likelihood = surface_motion(&config.motion);
         let value = |((place, sigma), rgb): ((&Place, &f32), &Vec3)| {
             let lives = place.distance <= self.extent.faces[place.face as usize];
             (if lives { likelihood.likelihood(place.distance) * sigma } else { 0.0 }, *rgb)

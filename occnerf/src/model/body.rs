@@ -36,7 +36,7 @@ pub struct Body {
 
 /// A person's pose at one moment, in the units of the capture.
 #[derive(Clone, Copy, Debug)]
-pub struct Moment<'a> {
+pub struct PosedFrame<'a> {
     /// Shape coefficients.
     pub betas: &'a [f32],
     /// Axis-angle rotation of each joint, (J).
@@ -82,7 +82,7 @@ impl Body {
     }
 
     /// The prior at a moment, normalised.
-    pub fn pose(&self, moment: Moment<'_>) -> Posed {
+    pub fn pose(&self, moment: PosedFrame<'_>) -> Posed {
         let mut posed = self.model.pose(&self.model.shaped(moment.betas), moment.pose, moment.placement);
         let Posed { vertices, joints, pose_offsets, .. } = &mut posed;
         vertices.iter_mut().chain(joints).chain(pose_offsets).for_each(|v| *v *= self.scale);
@@ -91,7 +91,7 @@ impl Body {
     }
 
     /// The training frame `instant` as `camera` (of the capture) sees it.
-    pub(crate) fn view(&self, camera: &Camera, instant: usize, moment: Moment<'_>) -> PosedView {
+    pub(crate) fn view(&self, camera: &Camera, instant: usize, moment: PosedFrame<'_>) -> PosedView {
         let camera = normalised_camera(camera, self.scale);
         PosedView { camera, instant: Some(instant), posed: self.pose(moment) }
     }
@@ -100,7 +100,7 @@ impl Body {
     pub fn rest(&self) -> Posed {
         let joints = vec![Vec3::ZERO; self.model.num_joints()];
         let placement = smpl::Placement::Pelvis { translation: Vec3::ZERO };
-        self.pose(Moment { betas: &self.mean_betas, pose: &joints, placement })
+        self.pose(PosedFrame { betas: &self.mean_betas, pose: &joints, placement })
     }
 }
 

@@ -41,7 +41,7 @@ impl PriorColors {
     /// What a sigmoid makes the colour of [`PriorColors::at`] a point that is as bright as `shade`
     /// says, black and white taken for nearly so, and as w how much of what a perceptron says is to
     /// be added: nothing where no frame saw the point, for there nothing has taught it.
-    pub(crate) fn before_sigmoid(&self, face: u32, barycentric: [f32; 3], shade: f32) -> Vec4 {
+    pub(crate) fn logit(&self, face: u32, barycentric: [f32; 3], shade: f32) -> Vec4 {
         /// 5 levels of 255.
         const LEAST: f32 = 0.02;
         let color = self.at(face, barycentric);

@@ -88,7 +88,7 @@ pub(crate) fn read(path: &Path) -> Result<Vec<u8>, Error> {
     let io = |source| Error::Io { path: path.to_owned(), source };
     let size = std::fs::metadata(path).map_err(io)?.len();
     if size > MAX_BYTES {
-        return Err(wrong(path, format!("has {size} bytes, expected at most {MAX_BYTES}")));
+        return Err(corrupt(path, format!("has {size} bytes, expected at most {MAX_BYTES}")));
     }
     std::fs::read(path).map_err(io)
 }
@@ -103,21 +103,21 @@ pub(crate) struct Contents<'a> {
 impl<'a> Contents<'a> {
     /// Takes `bytes` of `path` apart, whose header is to name `format` in one of `versions`.
     pub fn parse(path: &Path, bytes: &'a [u8], format: &str, versions: &[&str]) -> Result<Self, Error> {
-        let not_ours = |e: safetensors::SafeTensorError| wrong(path, format!("is not a whole safetensors file: {e}"));
+        let not_ours = |e: safetensors::SafeTensorError| corrupt(path, format!("is not a whole safetensors file: {e}"));
         let (_, metadata) = SafeTensors::read_metadata(bytes).map_err(not_ours)?;
         let tensors = SafeTensors::deserialize(bytes).map_err(not_ours)?;
         let header = metadata.metadata().clone().unwrap_or_default();
         let found = |key: &str| header.get(key).map_or("nothing", String::as_str);
         if found("format") != format || !versions.contains(&found("version")) {
             let (is, version, wanted) = (found("format"), found("version"), versions.join(" or "));
-            return Err(wrong(path, format!("is {is} version {version}, expected {format} version {wanted}")));
+            return Err(corrupt(path, format!("is {is} version {version}, expected {format} version {wanted}")));
         }
         Ok(Self { path: path.to_owned(), header, tensors })
     }
 
     /// An error that names the file.
-    pub fn wrong(&self, what: impl Into<String>) -> Error {
-        wrong(&self.path, what.into())
+    pub fn corrupt(&self, what: impl Into<String>) -> Error {
+        corrupt(&self.path, what.into())
     }
 
     /// A key of the header that may be missing.
@@ -127,7 +127,7 @@ impl<'a> Contents<'a> {
 
     /// A key of the header that has to be there.
     pub fn require(&self, key: &str) -> Result<&str, Error> {
-        self.header(key).ok_or_else(|| self.wrong(format!("header lacks `{key}`")))
+        self.header(key).ok_or_else(|| self.corrupt(format!("header lacks `{key}`")))
     }
 
     /// Number of entries of an array; 0 where there is none.
@@ -136,10 +136,10 @@ impl<'a> Contents<'a> {
     }
 
     fn bytes_of(&self, key: &str, dtype: Dtype, len: usize) -> Result<&[u8], Error> {
-        let view = self.tensors.tensor(key).map_err(|_| self.wrong(format!("lacks `{key}`")))?;
+        let view = self.tensors.tensor(key).map_err(|_| self.corrupt(format!("lacks `{key}`")))?;
         if view.dtype() != dtype || view.shape() != [len] {
             let (found, shape) = (view.dtype(), view.shape());
-            return Err(self.wrong(format!("`{key}` is {found:?} {shape:?}, expected {dtype:?} [{len}]")));
+            return Err(self.corrupt(format!("`{key}` is {found:?} {shape:?}, expected {dtype:?} [{len}]")));
         }
         Ok(view.data())
     }
@@ -154,7 +154,7 @@ impl<'a> Contents<'a> {
         let bytes = self.bytes_of(key, Dtype::F32, len)?;
         let values: Vec<f32> = bytes.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect();
         match values.iter().position(|v| !v.is_finite()) {
-            Some(at) => Err(self.wrong(format!("`{key}` is {} at {at}, expected finite numbers", values[at]))),
+            Some(at) => Err(self.corrupt(format!("`{key}` is {} at {at}, expected finite numbers", values[at]))),
             None => Ok(values),
         }
     }
@@ -166,6 +166,6 @@ impl<'a> Contents<'a> {
     }
 }
 
-fn wrong(path: &Path, what: String) -> Error {
+fn corrupt(path: &Path, what: String) -> Error {
     Error::File { path: path.to_owned(), what }
 }

@@ -97,8 +97,8 @@ impl Mlp {
         for layer in 0..self.num_layers() {
             let (inputs, outputs) = (self.widths[layer], self.widths[layer + 1]);
             let (weights, biases) = self.layer(parameters, layer);
-            let (before, after) = activations.layers.split_at_mut(layer + 1);
-            let (x, y) = (&before[layer][..samples * inputs], &mut after[0][..samples * outputs]);
+            let (previous, next) = activations.layers.split_at_mut(layer + 1);
+            let (x, y) = (&previous[layer][..samples * inputs], &mut next[0][..samples * outputs]);
             let finish = if layer + 1 < self.num_layers() { Finish::Relu } else { Finish::Plain };
             let (a, start) = (Left::Rows(x), Start::Row(biases));
             Product { m: samples, n: outputs, k: inputs, a, b: weights, start, finish, c: y }.run();

@@ -13,7 +13,7 @@ use volrender::{Aabb, Camera};
 use crate::Error;
 use crate::capture::{Capture, Frame, Light, MAX_BETA, MAX_DISTANCE};
 use crate::config::Config;
-use crate::model::body::{Body, Moment};
+use crate::model::body::{Body, PosedFrame};
 use crate::model::colors::PriorColors;
 use crate::model::file::{Array, Contents, read, write};
 use crate::model::saved::{CHECKPOINT, config_of, parse};
@@ -121,7 +121,7 @@ impl Person {
         let frames = capture.train.len();
         let count = contents.require("frames")?;
         if count != frames.to_string() {
-            return Err(contents.wrong(format!("is of {count} frames, the capture has {frames}: it is another")));
+            return Err(contents.corrupt(format!("is of {count} frames, the capture has {frames}: it is another")));
         }
         // The body may have had fewer shapes.
         let betas = contents.len("mean_betas").min(model.num_betas());
@@ -131,7 +131,7 @@ impl Person {
             let [found, expected] = [camera, of_run].map(|camera| (camera.width, camera.height));
             if found != expected {
                 let what = format!("has frame {name} in {expected:?} pixels, the capture in {found:?}: it is another");
-                return Err(contents.wrong(what));
+                return Err(contents.corrupt(what));
             }
         }
         for ((frame, (pose, betas, placement)), camera) in capture.train.iter_mut().zip(&moments).zip(cameras) {
@@ -169,7 +169,7 @@ impl Person {
         let count = contents.require("frames")?;
         // As many as there can be bytes for.
         let frames: usize = count.parse().ok().filter(|n| (1..=bytes.len()).contains(n)).ok_or_else(|| {
-            contents.wrong(format!("header `frames` is {count:?}, expected a number of frames that fits the file"))
+            contents.corrupt(format!("header `frames` is {count:?}, expected a number of frames that fits the file"))
         })?;
         let betas = model.num_betas();
         let body = Arc::new(Body::new(&model, &mean_betas(&contents, betas)?, config)?);
@@ -177,7 +177,7 @@ impl Person {
         let moments = moments(&contents, frames, (model.num_joints(), betas))?;
         let views = cameras.into_iter().zip(&moments).enumerate();
         let view = |(frame, (camera, (pose, betas, placement))): (usize, (Camera, &Pose))| {
-            Arc::new(body.view(&camera, frame, Moment { betas, pose, placement: *placement }))
+            Arc::new(body.view(&camera, frame, PosedFrame { betas, pose, placement: *placement }))
         };
         let frames = views.map(view).collect();
         let colors = colors(&contents, &model)?;
@@ -211,7 +211,7 @@ fn colors(contents: &Contents<'_>, model: &BodyModel) -> Result<PriorColors, Err
     let times = contents.header("subdivisions").unwrap_or("0");
     let fits = |&times: &u32| times == 0 || most_times(model.faces.len()) >= times;
     let times = times.parse().ok().filter(fits).ok_or_else(|| {
-        contents.wrong(format!("header `subdivisions` is {times:?}, expected a number that fits the body"))
+        contents.corrupt(format!("header `subdivisions` is {times:?}, expected a number that fits the body"))
     })?;
     let mesh = Arc::new(Subdivided::new(model.num_vertices(), &model.faces, times));
     let colors = triples(&contents.floats("colors", mesh.anchors.len() * 3)?);
@@ -246,7 +246,7 @@ fn cameras(contents: &Contents<'_>, frames: usize) -> Result<Vec<Camera>, Error>
     let sizes = contents.counts("sizes", frames * 2)?;
     let each = cameras.chunks_exact(CAMERA).zip(sizes.chunks_exact(2)).enumerate();
     each.map(|(frame, (numbers, size))| {
-        camera(numbers, size).ok_or_else(|| contents.wrong(format!("`cameras` {frame} is no pinhole camera")))
+        camera(numbers, size).ok_or_else(|| contents.corrupt(format!("`cameras` {frame} is no pinhole camera")))
     })
     .collect()
 }
@@ -260,7 +260,7 @@ fn mean_betas(contents: &Contents<'_>, betas: usize) -> Result<Vec<f32>, Error> 
 /// Errors for a number that nobody in a capture has.
 fn below(contents: &Contents<'_>, key: &str, values: &[f32], most: f32) -> Result<(), Error> {
     match values.iter().find(|value| value.abs() > most) {
-        Some(value) => Err(contents.wrong(format!("`{key}` has {value}, expected numbers up to {most} either way"))),
+        Some(value) => Err(contents.corrupt(format!("`{key}` has {value}, expected numbers up to {most} either way"))),
         None => Ok(()),
     }
 }

@@ -77,7 +77,7 @@ impl Model {
     pub(crate) fn restore(&mut self, contents: &Contents<'_>) -> Result<(), Error> {
         let steps = contents.require("steps_done")?;
         self.steps_done = steps.parse().ok().filter(|&steps| steps <= MAX_STEPS).ok_or_else(|| {
-            contents.wrong(format!("header `steps_done` is {steps:?}, expected a whole number up to {MAX_STEPS}"))
+            contents.corrupt(format!("header `steps_done` is {steps:?}, expected a whole number up to {MAX_STEPS}"))
         })?;
         if contents.header("version") == Some(PRUNED) {
             let rows = self.parameters.get(Part::Table).len() / self.config.encoding.features.max(1);
@@ -95,7 +95,7 @@ impl Model {
             let whole = self.extent.farthest;
             if let Some(at) = ends.iter().position(|end| !(0.0..=whole).contains(end)) {
                 let what = format!("`{EXTENT}` is {} at {at}, expected 0 to {whole}", ends[at]);
-                return Err(contents.wrong(what));
+                return Err(contents.corrupt(what));
             }
             self.extent = Extent::new(&self.body, ends);
         }
@@ -112,8 +112,8 @@ pub(crate) fn parse<'a>(path: &Path, bytes: &'a [u8]) -> Result<Contents<'a>, Er
 /// The configuration in a checkpoint's header.
 pub(crate) fn config_of(contents: &Contents<'_>) -> Result<Config, Error> {
     let text = contents.require("config")?;
-    let config: Config = toml::from_str(text).map_err(|e| contents.wrong(format!("header `config`: {e}")))?;
-    config.validate().map_err(|e| contents.wrong(format!("header {e}")))?;
+    let config: Config = toml::from_str(text).map_err(|e| contents.corrupt(format!("header `config`: {e}")))?;
+    config.validate().map_err(|e| contents.corrupt(format!("header {e}")))?;
     Ok(config)
 }
 

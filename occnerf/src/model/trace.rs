@@ -222,7 +222,7 @@ impl Tracer<'_> {
         if let Some(found) = nearest.filter(|_| !self.base.colors.is_empty()) {
             let corners = self.body.model.faces[found.face as usize];
             let shade = shade(&self.surface.shades, corners, found.barycentric);
-            samples.base.push(self.base.before_sigmoid(found.face, found.barycentric, shade));
+            samples.base.push(self.base.logit(found.face, found.barycentric, shade));
         }
         (true, looked_up)
     }

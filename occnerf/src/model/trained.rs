@@ -9,7 +9,7 @@ use volrender::Occupancy;
 
 use crate::Error;
 use crate::capture::Light;
-use crate::config::{Config, FALLOFF, MotionKind};
+use crate::config::{Config, FALLOFF, MotionConfig, MotionKind};
 use crate::model::arena::Arena;
 use crate::model::body::Body;
 use crate::model::colors::PriorColors;
@@ -63,7 +63,7 @@ impl Model {
         let field = Field::new(Encoder::new(&config)?, &config, body.canonical_box);
         let motion = match config.motion.kind {
             MotionKind::Surface => {
-                MotionField::Surface(SurfaceMotion { margin: config.motion.margin, falloff: FALLOFF })
+                MotionField::Surface(surface_motion(&config.motion))
             }
             MotionKind::Volume => {
                 let layout = WeightVolumeConfig { resolution: config.motion.resolution, ..Default::default() };
@@ -213,6 +213,11 @@ impl Model {
     pub fn up(&self) -> Vec3 {
         upright(&self.body, self.frames.iter().map(Arc::as_ref))
     }
+}
+
+/// The surface motion, whose likelihood falls to 0 beyond the margin.
+pub(crate) fn surface_motion(config: &MotionConfig) -> SurfaceMotion {
+    SurfaceMotion { margin: config.margin, falloff: FALLOFF }
 }
 
 /// The axis of the world, and its sense, that is nearest to the mean direction from the pelvis to

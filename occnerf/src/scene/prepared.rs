@@ -9,7 +9,7 @@ use visibility::{RayMesh, VisibilityCounts};
 use crate::Error;
 use crate::capture::{Capture, CaptureError, Frame, Light, PixelReader, PixelSource, Pixels};
 use crate::config::Config;
-use crate::model::body::{Body, Moment};
+use crate::model::body::{Body, PosedFrame};
 use crate::model::colors::PriorColors;
 use crate::model::subdivide::Anchor;
 use crate::model::view::PosedView;
@@ -249,7 +249,7 @@ fn prepare(
     camera_name: &str,
     config: Option<&Config>,
 ) -> Result<PreparedFrame, Error> {
-    let moment = Moment { betas: &frame.betas, pose: &frame.pose, placement: frame.placement };
+    let moment = PosedFrame { betas: &frame.betas, pose: &frame.pose, placement: frame.placement };
     let view = body.view(&frame.camera, instant, moment);
     let mut labels = Labels::default();
     if let Some(config) = config {

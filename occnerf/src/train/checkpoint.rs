@@ -58,14 +58,14 @@ impl<'a> Trainer<'a> {
         let trained_on = contents.require("scene")?;
         if trained_on != scene.name {
             let what = format!("was trained on scene {trained_on:?}, expected {:?}", scene.name);
-            return Err(contents.wrong(what));
+            return Err(contents.corrupt(what));
         }
         let config = config_of(&contents)?;
-        let mut trainer = Self::new(scene, config).map_err(|e| contents.wrong(e.to_string()))?;
+        let mut trainer = Self::new(scene, config).map_err(|e| contents.corrupt(e.to_string()))?;
         trainer.model.restore(&contents)?;
         let steps_done = trainer.model.steps_done;
         if let Some(text) = contents.header(RESTARTS) {
-            let wrong = |what: String| contents.wrong(format!("header `{RESTARTS}`: {what}"));
+            let wrong = |what: String| contents.corrupt(format!("header `{RESTARTS}`: {what}"));
             trainer.restarts = serde_json::from_str(text).map_err(|e| wrong(e.to_string()))?;
             trainer.restarts.check(steps_done).map_err(wrong)?;
         }
@@ -74,7 +74,7 @@ impl<'a> Trainer<'a> {
             adam.second = trainer.model.restored(&contents, part, &format!("{name}.second_moment"))?;
             if let Some(at) = adam.second.iter().position(|&v| v < 0.0) {
                 let what = format!("`{name}.second_moment` is {} at {at}, expected at least 0", adam.second[at]);
-                return Err(contents.wrong(what));
+                return Err(contents.corrupt(what));
             }
             adam.steps = steps_done - trainer.restarts.begun;
         }

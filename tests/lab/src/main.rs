@@ -4,6 +4,7 @@
 mod bench;
 mod budget;
 mod front;
+mod methods;
 mod obstacle;
 mod probe;
 mod report;

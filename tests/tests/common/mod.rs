@@ -12,7 +12,7 @@ use smpl::{BodyModel, Placement};
 use synth::{DemoConfig, demo};
 use visibility::RayMesh;
 
-pub const METHODS: [Method; 3] = [Method::Occnerf, Method::HashPoint, Method::Humannerf];
+pub const METHODS: [Method; 2] = [Method::Occnerf, Method::HashPoint];
 
 pub fn body() -> &'static BodyModel {
     static BODY: OnceLock<BodyModel> = OnceLock::new();

@@ -207,7 +207,7 @@ pub fn wild_capture(dir: &Path) -> (PathBuf, BodyModel, Vec<u8>) {
 
 pub fn configurations() -> Vec<Vec<u8>> {
     let text = |preset, method| toml::to_string(&Config::preset(preset, method)).unwrap().into_bytes();
-    vec![text(Preset::Fast, Method::Occnerf), text(Preset::Paper, Method::Humannerf)]
+    vec![text(Preset::Fast, Method::Occnerf), text(Preset::Paper, Method::HashPoint)]
 }
 
 /// A scene, a checkpoint of a training on it, and its configuration.

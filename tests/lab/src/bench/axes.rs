@@ -1,12 +1,13 @@
 //! The ways in which `bench stability` makes it hard.
 
 use crate::scene::SceneOptions;
-use occnerf::{Config, Method, Preset};
+use occnerf::{Config, Preset};
 use synth::DemoConfig;
 
 use super::difficulty::Difficulty;
 use super::job::{Job, Place};
 use super::runner::{Kind, Point};
+use crate::methods::Method;
 use xtask::settings::scale_rates;
 
 /// Training frames and scored views of the easy case.
@@ -47,7 +48,7 @@ impl Axis {
 impl Level {
     /// The run of a method.
     pub fn point(&self, axis: &Axis, method: Method, steps: u64, seed: u64) -> Point {
-        let mut config = Config { seed, steps, ..Config::preset(Preset::Fast, method) };
+        let mut config = Config { seed, steps, ..method.preset(Preset::Fast) };
         (config.patches, config.samples) = (2, 32);
         if method != Method::Prior {
             // Nothing of this means anything to the prior, which is measured once.
@@ -61,7 +62,7 @@ impl Level {
             level: Some(self.value),
             kind: if self.easy { Kind::Base } else { Kind::Level },
             command: None,
-            job: Job { place: self.place.clone(), views: VIEWS, config, prune: false, bake: None },
+            job: Job { place: self.place.clone(), views: VIEWS, method, config, prune: false, bake: None },
         }
     }
 }

@@ -1,12 +1,13 @@
 //! The points of `bench capacity`: fixed sizes, and those chosen from the scene.
 
 use anyhow::Result;
-use occnerf::{Config, Method, Preset};
+use occnerf::Preset;
 use xtask::capacity;
 use xtask::source::Source;
 
 use super::points::{Setting, Sweep};
 use super::runner::{Kind, Point};
+use crate::methods::Method;
 
 /// Fixed sizes around `balanced`: name, as `train --set` takes it, whether the quick form has it.
 const AROUND: [(&str, &[&str], bool); 7] = [
@@ -26,7 +27,7 @@ pub fn points(sweep: &Sweep, source: &Source, paper_steps: Option<u64>) -> Resul
     let setting = |preset, steps, set| Setting { preset, method: Method::Occnerf, steps, set };
     let mut points = Vec::new();
     // With one loss, the sizes alone differ.
-    let mse = format!("loss.mse={}", Config::preset(Preset::Balanced, Method::Occnerf).loss.mse);
+    let mse = format!("loss.mse={}", Method::Occnerf.preset(Preset::Balanced).loss.mse);
     let loss = [mse.as_str()];
     // `fast` is `balanced` with fewer steps.
     let presets = [(Preset::Balanced, Some(steps), &[][..]), (Preset::Paper, paper_steps, &loss)];

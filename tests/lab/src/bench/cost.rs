@@ -7,7 +7,7 @@ use std::fmt::Write as _;
 use std::path::Path;
 
 use anyhow::{Result, bail};
-use occnerf::{Config, Method, Preset};
+use occnerf::{Config, Preset};
 use synth::DemoConfig;
 
 use self::machine::Machine;
@@ -15,6 +15,7 @@ use super::chart::{Axis, Line, Mark, Panel, Picture, Shape, Style};
 use super::difficulty::Difficulty;
 use super::job::{Job, Place};
 use super::runner::{Bench, Kind, Point};
+use crate::methods::Method;
 use xtask::scale::number;
 
 /// Steps of each run; the median is over the second half, when buffers have grown to size.
@@ -97,7 +98,7 @@ pub fn run(bench: &mut Bench, out: &Path) -> Result<String> {
 
 fn point(name: String, factor: &str, config: Config, difficulty: Difficulty) -> Point {
     let place = Place::Made(difficulty);
-    let job = Job { place, views: 1, config, prune: false, bake: None };
+    let job = Job { place, views: 1, method: Method::Occnerf, config, prune: false, bake: None };
     Point {
         bench: "cost".to_owned(),
         name,
@@ -117,7 +118,7 @@ fn small() -> Difficulty {
 /// Shares of the stages at a preset.
 fn profile(preset: Preset, bench: &mut Bench) -> Result<String> {
     // So few that poses are taught too, as in all but the first tenth of a run.
-    let config = Config { steps: STEPS, ..Config::preset(preset, Method::Occnerf) };
+    let config = Config { steps: STEPS, ..Method::Occnerf.preset(preset) };
     let Some(line) = bench.run(point(preset.name().to_owned(), "profile", config.clone(), small()))? else {
         return Ok(String::new());
     };
@@ -168,7 +169,7 @@ const TIMES: [(&str, usize); 3] = [("a step, or memory", 0), ("making ready", 1)
 fn grow(growth: &Growth, bench: &mut Bench, table: &mut String) -> Result<Vec<Panel>> {
     let (mut times, mut memory): ([Vec<(f64, f64)>; 3], _) = (Default::default(), Vec::new());
     for &level in growth.levels {
-        let (mut config, mut difficulty) = (Config::preset(Preset::Fast, Method::Occnerf), small());
+        let (mut config, mut difficulty) = (Method::Occnerf.preset(Preset::Fast), small());
         config.steps = STEPS;
         (growth.set)(&mut config, &mut difficulty, level);
         let Some(line) = bench.run(point(format!("{} {level}", growth.name), growth.name, config, difficulty))? else {

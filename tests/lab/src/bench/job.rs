@@ -11,14 +11,14 @@ use glam::Vec3;
 use occnerf::bake::bake;
 use occnerf::capture::Capture;
 use occnerf::{
-    Config, FieldRenderer, Method, PreparedFrame, PriorColors, PriorRenderer, Renderer, Scene, StepTimes, Trainer,
-    evaluate,
+    Config, FieldRenderer, PreparedFrame, PriorColors, PriorRenderer, Renderer, Scene, StepTimes, evaluate,
 };
 use serde::{Deserialize, Serialize};
 use smpl::BodyModel;
 
 use super::baked::Baking;
 use super::difficulty::Difficulty;
+use crate::methods::Method;
 use xtask::process::{Ending, Guard, say};
 use xtask::run::peak_rss_bytes;
 use xtask::source;
@@ -62,6 +62,7 @@ pub struct Job {
     pub place: Place,
     /// At most so many unseen views are scored, evenly chosen.
     pub views: usize,
+    pub method: Method,
     pub config: Config,
     /// Whether the trained model is pruned.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
@@ -112,13 +113,13 @@ pub fn measure(job: &Job) -> Result<Outcome> {
     let prepare_seconds = start.elapsed().as_secs_f64();
     let mut outcome = Outcome { prepare_seconds, vertices: model.num_vertices(), ..Outcome::default() };
     let start = Instant::now();
-    if job.config.method == Method::Prior {
+    if job.method == Method::Prior {
         let colors = PriorColors::measure(&scene)?;
         outcome.train_seconds = start.elapsed().as_secs_f64();
         outcome.parameters = 3 * colors.colors.len();
         score(&scene, &mut PriorRenderer::new(&scene.body, &colors), &mut outcome)?;
     } else {
-        let mut trainer = Trainer::new(&scene, job.config.clone())?;
+        let mut trainer = job.method.trainer(&scene, job.config.clone())?;
         let (mut seconds, mut times) = (Vec::new(), StepTimes::default());
         for step in 0..job.config.steps {
             let begun = Instant::now();

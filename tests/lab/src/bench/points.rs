@@ -1,11 +1,12 @@
 //! The sweep of `bench pareto`: one factor at a time, then what is worth combining.
 
 use anyhow::Result;
-use occnerf::{Config, Method, Preset};
+use occnerf::{Config, Preset};
 
 use super::baked::Baking;
 use super::job::{Job, Place};
 use super::runner::{Kind, Line, Point};
+use crate::methods::Method;
 use xtask::settings;
 
 /// One change of one factor.
@@ -103,7 +104,7 @@ impl Sweep {
     /// A point of `bench pareto`.
     pub fn point(&self, name: &str, factor: &str, kind: Kind, setting: &Setting<'_>) -> Result<Point> {
         let Setting { preset, method, steps, set } = *setting;
-        let mut config = Config { steps, seed: self.seed, ..Config::preset(preset, method) };
+        let mut config = Config { steps, seed: self.seed, ..method.preset(preset) };
         for assignment in set {
             config = settings::set(&config, assignment)?;
         }
@@ -122,8 +123,8 @@ impl Sweep {
             factor: factor.to_owned(),
             level: None,
             kind,
-            command: Some(command),
-            job: Job { place: self.place.clone(), views: self.views, config, prune: false, bake: None },
+            command: method.is_product().then_some(command),
+            job: Job { place: self.place.clone(), views: self.views, method, config, prune: false, bake: None },
         })
     }
 
@@ -153,7 +154,7 @@ impl Sweep {
         }
         // A tenth of the steps of `paper`: all of them take as long as much of the sweep.
         for (preset, divisor) in [(Preset::Fast, 1), (Preset::Balanced, 1), (Preset::Paper, 10)] {
-            let whole = Config::preset(preset, Method::Occnerf).steps;
+            let whole = Method::Occnerf.preset(preset).steps;
             let steps = (whole * self.steps / (self.full_steps * divisor)).max(1);
             let name = if steps == whole {
                 preset.name().to_owned()
@@ -249,8 +250,8 @@ mod tests {
             assert!(fast <= if quick { 15 } else { 25 }, "{fast}");
             for (i, a) in points.iter().enumerate() {
                 assert!(points[..i].iter().all(|b| b.name != a.name && b.job != a.job), "{}", a.name);
-                assert!(a.command.as_ref().is_none_or(|c| c.contains(a.job.config.method.name())));
-                assert!(a.command.is_some() || a.job.bake.is_some());
+                assert!(a.command.as_ref().is_none_or(|c| c.contains(a.job.method.name())));
+                assert!(a.command.is_some() || a.job.bake.is_some() || !a.job.method.is_product());
             }
             for (preset, kind) in [("fast", Kind::Base), ("balanced", Kind::Preset), ("paper", Kind::Preset)] {
                 assert!(points.iter().any(|p| p.kind == kind && p.name.starts_with(preset)), "{preset}");

@@ -69,7 +69,7 @@ impl Line {
         let (a, b) = (&self.point, &other.point);
         (&a.bench, &a.name, &a.factor) == (&b.bench, &b.name, &b.factor)
             && a.job.place.name() == b.job.place.name()
-            && (a.job.config.method, a.job.config.seed) == (b.job.config.method, b.job.config.seed)
+            && (a.job.method, a.job.config.seed) == (b.job.method, b.job.config.seed)
     }
 }
 
@@ -121,7 +121,7 @@ fn read_all(directory: &Path) -> Result<Vec<Line>> {
 fn name(point: &Point) -> String {
     let config = &point.job.config;
     let place = point.job.place.name();
-    format!("{} {place} {} {} {} {}", point.bench, point.factor, point.name, config.method.name(), config.seed)
+    format!("{} {place} {} {} {} {}", point.bench, point.factor, point.name, point.job.method.name(), config.seed)
 }
 
 /// A sweep in progress.
@@ -226,7 +226,7 @@ impl Bench {
 fn summary(line: &Line) -> String {
     let Line { point, outcome } = line;
     let number = |v: Option<f64>, digits: usize| v.map_or("–".to_owned(), |v| format!("{v:.digits$}"));
-    let what = format!("{:<34} {:<10}", point.name, point.job.config.method.name());
+    let what = format!("{:<34} {:<10}", point.name, point.job.method.name());
     if let Some(error) = &outcome.error {
         return format!("{what} failed: {error}");
     }
@@ -244,15 +244,16 @@ fn summary(line: &Line) -> String {
 #[cfg(test)]
 #[allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
 pub mod tests {
-    use occnerf::{Config, Method, Preset};
+    use occnerf::Preset;
 
     use super::*;
     use crate::bench::difficulty::Difficulty;
     use crate::bench::job::Place;
+    use crate::methods::Method;
 
     /// A line of a point called `name` that scored `psnr` in `seconds`.
     pub fn line(name: &str, factor: &str, kind: Kind, psnr: f64, seconds: f64) -> Line {
-        let config = Config::preset(Preset::Fast, Method::Occnerf);
+        let (method, config) = (Method::Occnerf, Method::Occnerf.preset(Preset::Fast));
         let point = Point {
             bench: "pareto".to_owned(),
             name: name.to_owned(),
@@ -260,7 +261,7 @@ pub mod tests {
             level: Some(1.0),
             kind,
             command: Some("cargo xtask train".to_owned()),
-            job: Job { place: Place::Made(Difficulty::default()), views: 3, config, prune: false, bake: None },
+            job: Job { place: Place::Made(Difficulty::default()), views: 3, method, config, prune: false, bake: None },
         };
         let (psnr_mask, psnr_hidden) = (Some(psnr), Some(psnr));
         let outcome = Outcome {

@@ -5,11 +5,11 @@ use std::fmt::Write as _;
 use std::path::Path;
 
 use anyhow::Result;
-use occnerf::Method;
 
 use super::axes::Axis;
 use super::chart::{self, Mark, Panel, Picture, Shape, Style};
 use super::runner::{Bench, Line, Point};
+use crate::methods::Method;
 
 /// Methods that are trained, ours first.
 const TRAINED: [Method; 3] = [Method::Occnerf, Method::HashPoint, Method::Humannerf];
@@ -38,7 +38,7 @@ struct Runs<'a> {
 
 impl Runs<'_> {
     fn run(&mut self, point: Point) -> Result<()> {
-        let prior = point.job.config.method == Method::Prior;
+        let prior = point.job.method == Method::Prior;
         let known = self.lines.iter().any(|l| l.point.job == point.job);
         if !prior && !known {
             if self.trained >= self.max_runs {
@@ -113,7 +113,7 @@ pub fn course(axis: &Axis, method: Method, lines: &[Line]) -> Course {
             let point = &l.point;
             point.factor == axis.name
                 && point.level == Some(axis.levels[level].value)
-                && point.job.config.method == method
+                && point.job.method == method
         })
     };
     let mean = |values: &[f64]| (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64);
@@ -198,7 +198,7 @@ pub fn finite(lines: &[Line]) -> String {
             let what = outcome.error.clone().unwrap_or_else(|| {
                 format!("{} numbers and {} gradients not finite", outcome.non_finite, outcome.bad_gradients)
             });
-            format!("{}, {}: {what}", point.name, point.job.config.method.name())
+            format!("{}, {}: {what}", point.name, point.job.method.name())
         })
         .collect();
     if odd.is_empty() {

@@ -28,7 +28,7 @@ use xtask::run::{self, Metrics, RunConfig, make_directory};
 use xtask::settings;
 use xtask::shard::ShardArguments;
 use xtask::source::{self, Source};
-use xtask::train::{baked_unless_finished, finished, run_unless_finished};
+use xtask::train::{baked_unless_finished, finished};
 
 #[derive(Args)]
 pub struct ReproduceArguments {
@@ -358,7 +358,7 @@ impl Experiment<'_> {
         }
         let scored = match &trained {
             Some(trained) => baked_unless_finished(directory, trained, run, source, self.lpips, interval),
-            None => run_unless_finished(directory, name, run, source, self.lpips, interval),
+            None => row.method.run_unless_finished(directory, name, run, source, self.lpips, interval),
         };
         match scored {
             Err(error) if part.shard.is_some() && matches!(error.downcast_ref(), Some(Ending::Busy(_))) => {

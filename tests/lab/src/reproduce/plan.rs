@@ -7,10 +7,11 @@ use std::time::Instant;
 
 use crate::scene::SceneOptions;
 use anyhow::{Context, Result};
-use occnerf::{Config, FieldRenderer, Lpips, Method, PreparedFrame, Preset, Trainer, evaluate_with};
+use occnerf::{Config, FieldRenderer, Lpips, PreparedFrame, Preset, evaluate_with};
 use serde::{Deserialize, Serialize};
 
 use super::rows::{Length, Row};
+use crate::methods::Method;
 use xtask::process::note;
 use xtask::run;
 use xtask::source::Source;
@@ -82,7 +83,7 @@ impl Plan {
             if let Some(row) = rows.iter().find(|row| row.method == method) {
                 let mut config = row.settings(preset)?;
                 config.loss.perceptual_weights.clone_from(&request.perceptual_weights);
-                let (seconds, scored) = measure(source, config, lpips)?;
+                let (seconds, scored) = measure(source, method, config, lpips)?;
                 cost.insert(method.name().to_owned(), seconds);
                 pictures = scored;
             }
@@ -155,9 +156,9 @@ impl fmt::Display for Plan {
 }
 
 /// Seconds of a step and of a scored picture, and how many pictures a run is scored on.
-fn measure(source: &Source, config: Config, lpips: Option<&Lpips>) -> Result<((f64, f64), usize)> {
+fn measure(source: &Source, method: Method, config: Config, lpips: Option<&Lpips>) -> Result<((f64, f64), usize)> {
     let scene = source.scene(&config)?;
-    let mut trainer = Trainer::new(&scene, config)?;
+    let mut trainer = method.trainer(&scene, config)?;
     trainer.load_perceptual()?;
     for _ in 0..WARM {
         trainer.step()?;

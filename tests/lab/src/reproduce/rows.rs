@@ -1,8 +1,9 @@
 //! The tables and their rows.
 
 use anyhow::{Context, Result};
-use occnerf::{Config, Method, OccludedRule, Preset};
+use occnerf::{Config, OccludedRule, Preset};
 
+use crate::methods::Method;
 use xtask::settings::{scale_rates, set};
 
 /// How long a row trains.
@@ -89,12 +90,10 @@ const FAINT: [&str; 5] =
 const SURFACE_TERM: &str = "surface.surface_term=true";
 
 /// A component left out, put back, or replaced by what it competes with.
-const COMPONENTS: [(&str, &[&str]); 13] = [
+const COMPONENTS: [(&str, &[&str]); 11] = [
     ("full", &[]),
     ("surface-term", &[SURFACE_TERM]),
     ("attention", &[SURFACE_TERM, "surface.attention=true"]),
-    ("area-attention", &[SURFACE_TERM, "surface.attention=true", "surface.visibility=counted-per-area"]),
-    ("exact-attention", &[SURFACE_TERM, "surface.attention=true", "surface.visibility=exact"]),
     ("no-completeness", &["loss.completeness=0"]),
     ("no-perceptual", &["loss.perceptual=0"]),
     ("one-neighbour", &[SURFACE_TERM, "surface.k=1"]),
@@ -337,7 +336,7 @@ impl Row {
     /// If a change does not fit the settings.
     pub fn settings(&self, preset: Preset) -> Result<Config> {
         let preset = self.preset.unwrap_or(preset);
-        let mut config = Config { occluded: self.occluded, ..Config::preset(preset, self.method) };
+        let mut config = Config { occluded: self.occluded, ..self.method.preset(preset) };
         for change in &self.changes {
             config = set(&config, change).with_context(|| format!("row {}: {change}", self.name))?;
         }
@@ -387,7 +386,7 @@ mod tests {
         assert!(rows.windows(2).all(|pair| settings(&pair[0]) != settings(&pair[1])));
         let named = |name: &str| settings(rows.iter().find(|row| row.name == name).unwrap());
         for preset in [Preset::Paper, Preset::Balanced] {
-            let whole = Config::preset(preset, Method::Occnerf);
+            let whole = Method::Occnerf.preset(preset);
             let row = Config { preset, steps: whole.steps, ..named(preset.name()) };
             assert_eq!(row, whole);
         }
