@@ -9,7 +9,7 @@ use glam::{Affine3A, Mat3, Vec3};
 use indicatif::ProgressBar;
 use occnerf::bake::BakedRenderer;
 use occnerf::bake::export::fit_motion;
-use occnerf::{Body, FieldRenderer, Method, Model, PosedFrame, Person, PosedView, PriorRenderer, Renderer, upright};
+use occnerf::{Body, FieldRenderer, Method, Model, Person, PosedFrame, PosedView, PriorRenderer, Renderer, upright};
 use smpl::{MotionClip, Placement};
 use visibility::Samples;
 use volrender::Camera;

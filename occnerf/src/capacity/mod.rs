@@ -1,5 +1,5 @@
-//! How much model a scene needs: sizes of the encoding, the perceptron and the sampling from what
-//! its video shows.
+//! Model capacity from the scene: sizes of the encoding, the perceptron and the sampling from the
+//! detail that the video shows.
 
 mod measure;
 mod prune;
@@ -37,14 +37,14 @@ const MOST: (u32, usize, u32) = (2048, 16, 19);
 const PLACES_OF_A_RUN: f64 = 28_000.0;
 const MOST_STEPS: f64 = 2.0;
 
-/// What was measured of a scene, and the sizes that follow from it.
+/// Measurements of a scene, and the sizes that follow from them.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Capacity {
-    /// What the video shows of the person.
+    /// Detail that the video shows.
     pub measured: Measured,
     /// Sizes with their reasons.
     pub choices: Vec<Choice>,
-    /// What pruning took away after training.
+    /// Result of pruning after training.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub pruned: Option<Pruned>,
 }
@@ -76,7 +76,7 @@ impl Capacity {
         Ok(Self::choose(Measured::of(scene, config)?, config))
     }
 
-    /// The sizes that follow from what was measured.
+    /// The sizes that follow from measurements.
     pub fn choose(measured: Measured, config: &Config) -> Self {
         let mut choices = Vec::new();
         let mut add = |key: &str, preset: f64, chosen: f64, why: String| {
@@ -117,7 +117,7 @@ impl Capacity {
         Self { measured, choices, pruned: None }
     }
 
-    /// What the scene needs more of than the preset has.
+    /// The sizes that exceed the preset's.
     #[must_use]
     pub fn growth(mut self) -> Self {
         self.choices.retain(|choice| choice.chosen > choice.preset);

@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 use crate::model::parameters::Part;
 use crate::model::trained::Model;
 
-/// Counts of what pruning took away.
+/// Rows of the hash table before and after pruning.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Pruned {
     /// Rows of the hash table before.
@@ -26,7 +26,7 @@ impl Model {
         let table = self.parameters.get_mut(Part::Table);
         let mut kept = Vec::with_capacity(table.len() / features);
         for (row, first) in table.chunks_exact_mut(features).zip(initial.chunks_exact(features)) {
-            // A row that is zero was emptied before.
+            // A zero row was pruned earlier.
             kept.push(row.iter().zip(first).any(|(v, first)| *v != 0.0 && v != first));
             if kept.last() == Some(&false) {
                 row.fill(0.0);

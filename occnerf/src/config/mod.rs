@@ -1,4 +1,4 @@
-//! Every setting of a run, the named presets, and what makes a configuration valid.
+//! Every setting of a run, the named presets, and validation.
 
 mod presets;
 mod settings;

@@ -23,8 +23,8 @@ impl Config {
     }
 }
 
-/// 2⁻²⁵: what remains behind it is lost when it is added to an f32 near 1.
-const NOTHING: f32 = 1.0 / (1 << 25) as f32;
+/// 2⁻²⁵, half the spacing of f32 below 1: a smaller contribution is lost in rounding.
+const NEGLIGIBLE: f32 = 1.0 / (1 << 25) as f32;
 
 /// The paper's method: the point term and the attended surface term on the blend of vertices, the
 /// completeness term, its sampler and sizes. It leaves the size of F open. Where it departs from the
@@ -51,7 +51,7 @@ fn paper() -> Config {
         patches: 6,
         patch_size: 32,
         samples: 128,
-        min_transmittance: NOTHING,
+        min_transmittance: NEGLIGIBLE,
         held_out: 0,
         field: FieldConfig {
             width: 64,
@@ -79,19 +79,8 @@ fn paper() -> Config {
             attention: true,
         },
         registration: RegistrationConfig { rounds: 16 },
-        motion: MotionConfig {
-            kind: MotionKind::Surface,
-            resolution: 32,
-            margin: 0.04,
-            depth: 0.3,
-            shell_interval: 0,
-        },
-        loss: LossConfig {
-            mse: 0.2,
-            perceptual: 1.0,
-            perceptual_weights: String::new(),
-            completeness: 10.0,
-        },
+        motion: MotionConfig { kind: MotionKind::Surface, resolution: 32, margin: 0.04, depth: 0.3, shell_interval: 0 },
+        loss: LossConfig { mse: 0.2, perceptual: 1.0, perceptual_weights: String::new(), completeness: 10.0 },
         rates: RateConfig { field: 6e-3, vertices: 1e-4, table: 3e-2, motion: 1e-3, final_fraction: 0.1, beta_2: 0.99 },
     }
 }

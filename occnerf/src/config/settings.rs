@@ -138,12 +138,11 @@ pub struct FieldConfig {
     pub density_bias: f32,
     /// Bias at the outer end of the margin; linear in between.
     pub density_bias_outside: f32,
-    /// Whether colours start from those that the video showed of the prior's nearest surface point
-    /// (see [`crate::PriorColors`]): the perceptron adds to them before the sigmoid, where some
-    /// frame saw them. Asks for `motion.kind = surface`.
+    /// Whether colours start from those of the prior's nearest surface point
+    /// ([`crate::PriorColors`]): the perceptron adds to their logits where some frame saw them. Asks
+    /// for `motion.kind = surface`.
     pub prior_colors: bool,
-    /// Whether those colours are told apart from the light that all frames share, where the video
-    /// shows one.
+    /// Whether those colours are separated from the light that all frames share.
     pub prior_light: bool,
 }
 
@@ -161,10 +160,10 @@ pub struct EncodingConfig {
     pub n_min: u32,
     /// Cells an axis of the finest level.
     pub n_max: u32,
-    /// Least d that is told from smaller ones, normalised metres. A wide interval makes cells long
-    /// in d, along which appearance hardly changes, and leaves more of the table to the surface.
+    /// Lower clamp of d, normalised metres. A wide interval makes cells long in d, along which
+    /// appearance hardly changes, and leaves more of the table to the surface.
     pub distance_min: f32,
-    /// Largest d that is told from greater ones, normalised metres.
+    /// Upper clamp of d, normalised metres.
     pub distance_max: f32,
 }
 
@@ -195,13 +194,11 @@ pub struct MotionConfig {
     /// Distance from the prior's surface up to which a point can belong to the subject, normalised
     /// metres.
     pub margin: f32,
-    /// Depth below the prior's surface down to which there are samples, normalised metres. What
-    /// lies deeper is hidden behind that much body; a body is nowhere 0.3 deep, so 0.3 keeps every
-    /// sample.
+    /// Depth below the prior's surface down to which there are samples, normalised metres. No body is
+    /// 0.3 deep: 0.3 keeps every sample.
     pub depth: f32,
-    /// Steps from one look at how far from the prior's surface the field has any density to the
-    /// next: what lies farther out is skipped until then. 0 never looks and keeps every sample, and
-    /// the volume kinds ask for that.
+    /// Steps between measurements of the field's outer end, beyond which samples are skipped; 0 never
+    /// skips, which `volume` asks for.
     pub shell_interval: usize,
 }
 
@@ -209,8 +206,7 @@ pub struct MotionConfig {
 pub(crate) const FALLOFF: f32 = 0.02;
 
 impl MotionConfig {
-    /// Distance from the prior's surface beyond which nothing belongs to the subject, normalised
-    /// metres.
+    /// Distance from the prior's surface at which the likelihood is 0, normalised metres.
     pub fn reach(&self) -> f32 {
         self.margin + FALLOFF
     }
@@ -286,11 +282,10 @@ pub struct Config {
     pub patch_size: u32,
     /// Samples a ray across the body's box.
     pub samples: usize,
-    /// Transmittance of a ray behind which training leaves samples out, below 1; 0 leaves out none.
+    /// Transmittance, below 1, at which a training ray ends; 0 never.
     pub min_transmittance: f32,
-    /// Every `held_out`-th training frame is registered, and its mask mended, with the others, but
-    /// neither colours nor the field are learnt from it: it is scored in place of other cameras'
-    /// views, so that settings can be chosen without those. 0 holds none out.
+    /// Every `held_out`-th training frame is registered with the others, but neither colours nor the
+    /// field are learnt from it: it is scored in place of other cameras' views. 0 holds none out.
     pub held_out: usize,
     /// The perceptron.
     pub field: FieldConfig,

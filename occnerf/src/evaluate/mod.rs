@@ -98,7 +98,7 @@ pub fn evaluate(
     evaluate_with(scene, renderer, frames, None, progress)
 }
 
-/// Does what [`evaluate`] does, with LPIPS over the whole image where `lpips` is given.
+/// [`evaluate`], with LPIPS over the whole image where `lpips` is given.
 pub fn evaluate_with(
     scene: &Scene,
     renderer: &mut dyn Renderer,
@@ -170,7 +170,7 @@ fn score(
     })
 }
 
-/// Takes out of a picture what a training image does not show, which cannot be scored.
+/// Removes from a picture the pixels that a training image does not show.
 fn without_unknown(frame: &PreparedFrame, truth: &Pixels, rendering: &mut Rendering) {
     for (i, label) in frame.labels.iter().enumerate() {
         if label == Label::Unknown {

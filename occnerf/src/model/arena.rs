@@ -1,10 +1,9 @@
-//! One buffer for what many segments of samples leave to the backward pass.
+//! One buffer that many segments of samples share, for the backward pass.
 
 use std::ops::Range;
 
-/// Numbers handed out piece by piece. What all pieces of a step take together is known far better
-/// beforehand than what each takes, and a buffer for each would in the end be as long as its piece
-/// ever was.
+/// Numbers handed out piece by piece. The total of a step is bounded; a buffer for each segment would
+/// keep the largest size that its piece ever had.
 #[derive(Debug, Default)]
 pub(crate) struct Arena {
     buffer: Vec<f32>,
@@ -12,9 +11,8 @@ pub(crate) struct Arena {
 }
 
 impl Arena {
-    /// Takes all pieces back and makes room for `most` numbers. That is address space: memory is
-    /// taken as it is written to, and there is no buffer to grow, with the copy that this takes and
-    /// the holes that it leaves. Where so much is not to be had, the buffer grows after all.
+    /// Takes all pieces back and reserves room for `most` numbers: address space, committed as it is
+    /// written, in place of a buffer that grows by copies. A failed reservation falls back to growing.
     pub fn clear(&mut self, most: usize) {
         self.used = 0;
         if self.buffer.capacity() < most {
@@ -25,7 +23,7 @@ impl Arena {
         }
     }
 
-    /// The next `len` numbers, whatever they are.
+    /// The next `len` numbers, uninitialised.
     pub fn take(&mut self, len: usize) -> Range<usize> {
         let piece = self.used..self.used + len;
         self.used = piece.end;

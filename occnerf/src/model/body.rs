@@ -1,5 +1,4 @@
-//! The shaped body that everything hangs on: its canonical surface with the searches over it, and
-//! the prior in any pose.
+//! The shaped body: its canonical surface with nearest-point structures, and the prior in any pose.
 
 use glam::Vec3;
 use smpl::{BodyModel, Posed, Shaped};
@@ -34,7 +33,7 @@ pub struct Body {
     pub surface: MeshDistance,
 }
 
-/// A person's pose at one moment, in the units of the capture.
+/// Parameters of the body in one frame, in the units of the capture.
 #[derive(Clone, Copy, Debug)]
 pub struct PosedFrame<'a> {
     /// Shape coefficients.
@@ -81,9 +80,9 @@ impl Body {
         })
     }
 
-    /// The prior at a moment, normalised.
-    pub fn pose(&self, moment: PosedFrame<'_>) -> Posed {
-        let mut posed = self.model.pose(&self.model.shaped(moment.betas), moment.pose, moment.placement);
+    /// The posed prior of a frame, normalised.
+    pub fn pose(&self, frame: PosedFrame<'_>) -> Posed {
+        let mut posed = self.model.pose(&self.model.shaped(frame.betas), frame.pose, frame.placement);
         let Posed { vertices, joints, pose_offsets, .. } = &mut posed;
         vertices.iter_mut().chain(joints).chain(pose_offsets).for_each(|v| *v *= self.scale);
         posed.bones.iter_mut().for_each(|b| b.translation *= self.scale);
@@ -91,9 +90,9 @@ impl Body {
     }
 
     /// The training frame `instant` as `camera` (of the capture) sees it.
-    pub(crate) fn view(&self, camera: &Camera, instant: usize, moment: PosedFrame<'_>) -> PosedView {
+    pub(crate) fn view(&self, camera: &Camera, instant: usize, frame: PosedFrame<'_>) -> PosedView {
         let camera = normalised_camera(camera, self.scale);
-        PosedView { camera, instant: Some(instant), posed: self.pose(moment) }
+        PosedView { camera, instant: Some(instant), posed: self.pose(frame) }
     }
 
     /// The canonical rest pose: no joint turned, the pelvis where the body model has it.

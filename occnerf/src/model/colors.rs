@@ -1,4 +1,4 @@
-//! Colours of the prior's surface: a baseline of their own, and what the field's colours start from.
+//! Colours of the prior's surface: a baseline, and the field's initial colours.
 
 use std::sync::Arc;
 
@@ -28,8 +28,7 @@ impl PriorColors {
         Self { seen: vec![true; colors.len()], colors, light: Light::default(), mesh }
     }
 
-    /// The colour of a point of a `face` of the prior, and as w how much of what surrounds it some
-    /// frame saw.
+    /// The colour of a point of a `face` of the prior and, as w, the weight of its seen corners.
     pub(crate) fn at(&self, face: u32, barycentric: [f32; 3]) -> Vec4 {
         let (fine, weights) = self.mesh.locate(face, barycentric);
         let corners = self.mesh.faces[fine as usize].into_iter().zip(weights);
@@ -38,9 +37,8 @@ impl PriorColors {
         weighted.sum()
     }
 
-    /// What a sigmoid makes the colour of [`PriorColors::at`] a point that is as bright as `shade`
-    /// says, black and white taken for nearly so, and as w how much of what a perceptron says is to
-    /// be added: nothing where no frame saw the point, for there nothing has taught it.
+    /// Logit of the colour of [`PriorColors::at`] times `shade`, clamped away from black and white,
+    /// and, as w, the weight of the perceptron's output: 0 where no frame saw the point.
     pub(crate) fn logit(&self, face: u32, barycentric: [f32; 3], shade: f32) -> Vec4 {
         /// 5 levels of 255.
         const LEAST: f32 = 0.02;
@@ -50,8 +48,8 @@ impl PriorColors {
     }
 }
 
-/// How bright a point of the face with these `corners` is, where its vertices are as bright as
-/// `shades` say (V, or nothing for 1; see [`Light::on_surface`]).
+/// Shading of a point of the face with these `corners`, interpolated from its vertices' (V, or empty
+/// for 1; see [`Light::on_surface`]).
 pub(crate) fn shade(shades: &[f32], corners: [u32; 3], barycentric: [f32; 3]) -> f32 {
     if shades.is_empty() {
         return 1.0;

@@ -105,7 +105,7 @@ impl Encoder {
         matches!(self, Self::Surface(_, (low, high)) if d > *low && d < *high)
     }
 
-    /// How the features of `points` points lie.
+    /// Memory layout of the features of `points` points.
     pub fn layout(&self, points: usize) -> Layout {
         match self {
             Self::Point(grid) => grid.layout(points),
@@ -133,8 +133,7 @@ impl Encoder {
         }
     }
 
-    /// [`Encoder::encode`] with what [`Encoder::encode_backward_points`] needs to leave the table
-    /// alone.
+    /// [`Encoder::encode`], storing the derivatives for [`Encoder::encode_backward_points`].
     pub fn encode_jacobian(&self, table: &[f32], at: At<'_>, features: &mut [f32], jacobian: &mut [f32]) {
         match self {
             Self::Point(grid) => grid.encode_jacobian(table, at.point, features, jacobian),

@@ -1,5 +1,5 @@
-//! How far from the prior's surface the field has anything to show: samples farther out are
-//! skipped, in training once that has emptied the space there, and in pictures.
+//! Outer end of the field over the prior's surface: samples farther out are skipped, in training and
+//! in drawing.
 //!
 //! An occupancy grid (Müller et al. 2022, section 5.1) in the coordinates that the field has
 //! anyway: place on the surface and distance from it.
@@ -10,22 +10,22 @@ use crate::config::Config;
 use crate::model::body::Body;
 use crate::model::field::SampleBatch;
 
-/// From one looked at distance to the next, normalised metres.
+/// Distance between layers, normalised metres.
 const LAYER: f32 = 0.005;
 /// Opacity below which the field is taken for empty over [`LENGTH`]; a tenth of it costs a quarter
 /// more time and changes no score by more than 0.01 dB (`tests/lab/notes/model.md`).
 const EMPTY: f32 = 2e-2;
-/// Length of ray that a layer is judged by, normalised metres.
+/// Length of ray for the opacity of a layer, normalised metres.
 const LENGTH: f32 = 0.04;
-/// Vertices that are looked at together.
+/// Vertices that are evaluated together.
 const CHUNK: usize = 256;
 
 /// The outer end of the field over each part of the prior's surface, normalised metres.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(crate) struct Extent {
-    /// V, what training goes on from.
+    /// (V)
     pub vertices: Vec<f32>,
-    /// F, the farthest of the corners.
+    /// (F), the farthest of the corners.
     pub faces: Vec<f32>,
     /// The farthest of all.
     pub farthest: f32,
@@ -44,9 +44,9 @@ impl Extent {
         Self { vertices, faces, farthest }
     }
 
-    /// Looks at the field over every vertex; `evaluate` gives samples their density. One layer
-    /// beyond the last one that shows something is kept, and as much as over any vertex that shares
-    /// a face: the field can grow back there.
+    /// Evaluates the field in layers over every vertex; `evaluate` gives samples their density. The
+    /// end is one layer beyond the last opaque one, and the farthest of the adjacent vertices, so
+    /// that the field can grow back.
     pub fn measure(body: &Body, config: &Config, evaluate: impl Fn(&mut SampleBatch) + Sync) -> Self {
         let whole = config.motion.reach();
         let layers = (whole / LAYER).ceil() as usize;
@@ -65,15 +65,15 @@ impl Extent {
                 }
                 evaluate(batch);
                 let shows = |sigma: &f32| 1.0 - (-sigma * LENGTH).exp() >= EMPTY;
-                // Of nothing at all the skin is kept.
+                // An empty field keeps the skin.
                 let last = |sigmas: &[f32]| sigmas.iter().rposition(shows).unwrap_or(0);
                 batch.sigma.chunks(layers).map(|sigmas| ((last(sigmas) + 1) as f32 * LAYER).min(whole)).collect()
             })
             .collect();
-        let own = chunks.concat();
-        let mut ends = own.clone();
+        let measured = chunks.concat();
+        let mut ends = measured.clone();
         for face in &body.model.faces {
-            let highest = highest(face, &own);
+            let highest = highest(face, &measured);
             for &v in face {
                 ends[v as usize] = ends[v as usize].max(highest);
             }

@@ -71,7 +71,7 @@ pub(crate) struct SampleBatch {
     pub times: StepTimes,
 }
 
-/// What a field has learnt, as evaluating it reads it.
+/// Parameters that evaluating a field reads.
 #[derive(Clone, Copy)]
 pub(crate) struct Learnt<'a> {
     /// Weights of the perceptron.

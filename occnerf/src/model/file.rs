@@ -47,7 +47,7 @@ impl Array<'_> {
     }
 }
 
-/// What a safetensors header says of an array, its keys in order.
+/// An array's entry in a safetensors header, its keys in order.
 #[derive(serde::Serialize)]
 struct Entry {
     data_offsets: [usize; 2],
@@ -55,8 +55,7 @@ struct Entry {
     shape: [usize; 1],
 }
 
-/// Writes a file array by array (the crate's own writers want all of them as bytes, or make a file
-/// that nobody else may read). Equal contents are equal files: keys are in order. The old file
+/// Writes a file array by array, keys in order, so that equal contents are equal files. The old file
 /// stays until the new one is complete and on the disk.
 pub(crate) fn write(
     path: &Path,

@@ -12,17 +12,17 @@ pub(crate) enum Left<'a> {
     Ones,
 }
 
-/// What an element of the result is before anything is added.
+/// Initial value of an element of the result.
 #[derive(Clone, Copy)]
 pub(crate) enum Start<'a> {
-    /// What it holds.
+    /// Its present value.
     Held,
     Zero,
     /// The number of its column (n).
     Row(&'a [f32]),
 }
 
-/// What becomes of the sums.
+/// Function applied to the sums.
 #[derive(Clone, Copy)]
 pub(crate) enum Finish<'a> {
     Plain,
@@ -80,7 +80,7 @@ impl Product<'_> {
         }
     }
 
-    /// `V` vectors of columns at a time, and what is left of them one at a time.
+    /// `V` vectors of columns at a time, and the remainder one at a time.
     #[inline(always)]
     fn columns<S: pulp::Simd, const R: usize, const V: usize>(&mut self, simd: S) {
         let mut column = 0;

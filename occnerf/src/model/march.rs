@@ -1,5 +1,5 @@
 //! The march along rays: samples are traced and evaluated front to back, a segment of every ray at
-//! a time, so that those behind an opaque surface need not be.
+//! a time, with early termination.
 
 use glam::Vec3;
 use volrender::{Composite, RaySamples, composite};
@@ -12,16 +12,15 @@ use crate::model::trace::{March, Tracer};
 /// How far rays are marched.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct MarchOptions {
-    /// Live samples of a ray that are evaluated before it is asked whether it goes on.
+    /// Live samples of a ray between two tests for termination.
     pub segment: usize,
     /// Transmittance behind which a ray ends; with 0 none does, and all samples are one segment.
     pub min_transmittance: f32,
 }
 
 impl MarchOptions {
-    /// Segments for training: about as many samples as there are from one side of a surface to the
-    /// other. Where next to nothing may be left out more of them make larger batches, which read a
-    /// table that is larger than the cache faster.
+    /// Segments for training: the samples across a surface. Where hardly any ray terminates, longer
+    /// segments make larger batches, which read a table larger than the cache faster.
     pub fn training(min_transmittance: f32) -> Self {
         Self { segment: if min_transmittance < 1e-6 { 24 } else { 6 }, min_transmittance }
     }
@@ -38,8 +37,8 @@ pub(crate) struct Segment {
 }
 
 impl Segment {
-    /// Traces the next samples of every ray that goes on and has `evaluate` give them density and
-    /// colour; false where no ray goes on.
+    /// Traces the next samples of every ray that goes on; `evaluate` gives them density and colour.
+    /// False where no ray goes on.
     pub fn advance(
         &mut self,
         tracer: &Tracer<'_>,

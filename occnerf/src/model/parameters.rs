@@ -43,11 +43,11 @@ impl Arrays {
 #[derive(Clone, Debug)]
 pub(crate) struct Parameters {
     pub values: Arrays,
-    /// Rows of the table that pruning has left, if it took any; the others are zero.
+    /// Rows of the table that pruning left, if it dropped any; the others are zero.
     pub kept_rows: Option<Vec<bool>>,
 }
 
-/// Lengths of the parts that the field does not know.
+/// Lengths that do not follow from the field.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Lengths {
     pub vertices: usize,
@@ -72,7 +72,7 @@ impl Parameters {
         self.values.get_mut(part)
     }
 
-    /// Numbers of a part that carry something.
+    /// Numbers of a part without the pruned rows.
     pub fn count(&self, part: Part) -> usize {
         let all = self.get(part).len();
         match &self.kept_rows {

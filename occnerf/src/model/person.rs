@@ -1,5 +1,5 @@
-//! What a run directory keeps of the person beside what is learnt, so that a model can be drawn
-//! with the capture gone: the body, the moments and cameras of the video, the prior's colours.
+//! The part of a run directory that is known before training and that drawing needs without the
+//! capture: the body, poses and cameras of the video, the prior's colours.
 
 use std::borrow::Cow;
 use std::collections::BTreeMap;
@@ -30,7 +30,7 @@ const CAMERA: usize = 16;
 /// Numbers of a placement: whether it is about the origin, rotation, translation.
 const PLACEMENT: usize = 7;
 
-/// A person before anything is learnt.
+/// A person before training.
 pub struct Person {
     /// Name of the scene.
     pub scene: String,
@@ -92,7 +92,7 @@ impl Person {
         write(&run.join(PERSON), &header, arrays.map(|(name, array)| (name.to_owned(), array)).into())
     }
 
-    /// The colours of `model` that the run directory `run` began with; `None` where it keeps none.
+    /// The initial colours of `model` in the run directory `run`; `None` where it has none.
     ///
     /// # Errors
     /// [`Error::Io`] and [`Error::File`] for a file that is damaged.
@@ -105,9 +105,8 @@ impl Person {
         colors(&Contents::parse(&path, &bytes, FORMAT, &[VERSION])?, model).map(Some)
     }
 
-    /// Gives `capture` the bodies and focal lengths of the run directory `run`, as registration has
-    /// corrected them; false where it has none. Masks that are to be mended have to be before
-    /// ([`crate::mend_masks`]), by the bodies as they were given.
+    /// Gives `capture` the registered bodies and focal lengths of the run directory `run`; false
+    /// where it has none. Mend masks first ([`crate::mend_masks`]): that takes the bodies as given.
     ///
     /// # Errors
     /// [`Error::Io`] and [`Error::File`] for a file that is damaged, or of other frames.
@@ -125,7 +124,7 @@ impl Person {
         }
         // The body may have had fewer shapes.
         let betas = contents.len("mean_betas").min(model.num_betas());
-        let moments = moments(&contents, frames, (model.num_joints(), betas))?;
+        let poses = read_poses(&contents, frames, (model.num_joints(), betas))?;
         let cameras = cameras(&contents, frames)?;
         for (Frame { name, camera, .. }, of_run) in capture.train.iter().zip(&cameras) {
             let [found, expected] = [camera, of_run].map(|camera| (camera.width, camera.height));
@@ -134,17 +133,17 @@ impl Person {
                 return Err(contents.corrupt(what));
             }
         }
-        for ((frame, (pose, betas, placement)), camera) in capture.train.iter_mut().zip(&moments).zip(cameras) {
+        for ((frame, (pose, betas, placement)), camera) in capture.train.iter_mut().zip(&poses).zip(cameras) {
             (frame.pose, frame.betas, frame.placement) = (pose.clone(), betas.clone(), *placement);
             frame.camera.focal = camera.focal;
         }
         for view in &mut capture.eval {
-            if let Some((pose, betas, placement)) = moments.get(view.train_index) {
+            if let Some((pose, betas, placement)) = poses.get(view.train_index) {
                 (view.frame.pose, view.frame.betas, view.frame.placement) = (pose.clone(), betas.clone(), *placement);
             }
         }
         capture.mean_betas = mean_betas(&contents, betas)?;
-        // Runs of before clothes were kept have none.
+        // Optional array.
         let has = contents.len("clothes") > 0;
         capture.clothes = if has { contents.floats("clothes", model.num_vertices())? } else { Vec::new() };
         let Aabb { min, max } = Aabb::from_points(&model.v_template);
@@ -153,7 +152,7 @@ impl Person {
         Ok(true)
     }
 
-    /// Reads what [`Person::save`] wrote into the directory `run`, as `config` prepares it.
+    /// Reads the files that [`Person::save`] wrote into the directory `run`.
     ///
     /// # Errors
     /// [`Error::Io`], [`Error::Body`] and [`Error::File`] for files that are missing or damaged.
@@ -167,15 +166,14 @@ impl Person {
         let bytes = read(&path)?;
         let contents = Contents::parse(&path, &bytes, FORMAT, &[VERSION])?;
         let count = contents.require("frames")?;
-        // As many as there can be bytes for.
         let frames: usize = count.parse().ok().filter(|n| (1..=bytes.len()).contains(n)).ok_or_else(|| {
             contents.corrupt(format!("header `frames` is {count:?}, expected a number of frames that fits the file"))
         })?;
         let betas = model.num_betas();
         let body = Arc::new(Body::new(&model, &mean_betas(&contents, betas)?, config)?);
         let cameras = cameras(&contents, frames)?;
-        let moments = moments(&contents, frames, (model.num_joints(), betas))?;
-        let views = cameras.into_iter().zip(&moments).enumerate();
+        let poses = read_poses(&contents, frames, (model.num_joints(), betas))?;
+        let views = cameras.into_iter().zip(&poses).enumerate();
         let view = |(frame, (camera, (pose, betas, placement))): (usize, (Camera, &Pose))| {
             Arc::new(body.view(&camera, frame, PosedFrame { betas, pose, placement: *placement }))
         };
@@ -187,8 +185,7 @@ impl Person {
 }
 
 impl Model {
-    /// Reads the model of the run directory `run`, without what only training needs: neither the
-    /// capture nor the moments of the optimiser.
+    /// Reads the model of the run directory `run`, without the capture and the optimiser's moments.
     ///
     /// # Errors
     /// [`Error::Io`], [`Error::Body`] and [`Error::File`] for files that are missing or damaged.
@@ -207,7 +204,7 @@ impl Model {
 
 /// The colours that a file has of `model`.
 fn colors(contents: &Contents<'_>, model: &BodyModel) -> Result<PriorColors, Error> {
-    // Files of before the prior's colours were of its subdivision have no such number.
+    // Optional key.
     let times = contents.header("subdivisions").unwrap_or("0");
     let fits = |&times: &u32| times == 0 || most_times(model.faces.len()) >= times;
     let times = times.parse().ok().filter(fits).ok_or_else(|| {
@@ -220,16 +217,16 @@ fn colors(contents: &Contents<'_>, model: &BodyModel) -> Result<PriorColors, Err
     Ok(PriorColors { colors, seen, light, mesh })
 }
 
-/// Turns of the joints, shape and place of a frame.
+/// Joint rotations, shape and placement of a frame.
 type Pose = (Vec<Vec3>, Vec<f32>, Placement);
 
-fn moments(contents: &Contents<'_>, frames: usize, (joints, betas): (usize, usize)) -> Result<Vec<Pose>, Error> {
+fn read_poses(contents: &Contents<'_>, frames: usize, (joints, betas): (usize, usize)) -> Result<Vec<Pose>, Error> {
     let poses = triples(&contents.floats("poses", frames * joints * 3)?);
     let shapes = contents.floats("betas", frames * betas)?;
     let placements = contents.floats("placements", frames * PLACEMENT)?;
     below(contents, "betas", &shapes, MAX_BETA)?;
     below(contents, "placements", &placements, MAX_DISTANCE)?;
-    let moment = |frame: usize| {
+    let pose = |frame: usize| {
         let placement = &placements[frame * PLACEMENT..][..PLACEMENT];
         let (rotation, translation) = (Vec3::from_slice(&placement[1..]), Vec3::from_slice(&placement[4..]));
         let placement = match placement[0] {
@@ -238,7 +235,7 @@ fn moments(contents: &Contents<'_>, frames: usize, (joints, betas): (usize, usiz
         };
         (poses[frame * joints..][..joints].to_vec(), shapes[frame * betas..][..betas].to_vec(), placement)
     };
-    Ok((0..frames).map(moment).collect())
+    Ok((0..frames).map(pose).collect())
 }
 
 fn cameras(contents: &Contents<'_>, frames: usize) -> Result<Vec<Camera>, Error> {
@@ -257,7 +254,7 @@ fn mean_betas(contents: &Contents<'_>, betas: usize) -> Result<Vec<f32>, Error> 
     Ok(values)
 }
 
-/// Errors for a number that nobody in a capture has.
+/// Checks that every magnitude is at most `most`.
 fn below(contents: &Contents<'_>, key: &str, values: &[f32], most: f32) -> Result<(), Error> {
     match values.iter().find(|value| value.abs() > most) {
         Some(value) => Err(contents.corrupt(format!("`{key}` has {value}, expected numbers up to {most} either way"))),
@@ -273,7 +270,7 @@ fn triples(values: &[f32]) -> Vec<Vec3> {
     values.chunks_exact(3).map(Vec3::from_slice).collect()
 }
 
-/// A camera from its numbers, `None` where they are none of a camera.
+/// A camera from its numbers; `None` for a degenerate one.
 fn camera(numbers: &[f32], size: &[u64]) -> Option<Camera> {
     let mut columns = [0.0; 12];
     columns.copy_from_slice(&numbers[4..]);

@@ -22,15 +22,15 @@ pub(crate) struct Samples {
     pub closest: Vec<Vec3>,
     /// d.
     pub distance: Vec<f32>,
-    /// All levels, finest first; empty where nothing asks for them.
+    /// All levels, finest first; empty where not needed.
     pub neighbours: Vec<u32>,
-    /// What the colour starts from before the sigmoid, and as w the share of what the perceptron
-    /// adds; empty where colours start from nothing and it adds all.
+    /// Initial colour before the sigmoid and, as w, the weight of the perceptron's output; empty for
+    /// grey and 1.
     pub base: Vec<Vec4>,
 }
 
 impl Samples {
-    /// What the colour of sample `s` starts from, and the share w of what the perceptron adds.
+    /// [`Samples::base`] of sample `s`.
     pub fn base(&self, s: usize) -> Vec4 {
         self.base.get(s).copied().unwrap_or(Vec4::W)
     }

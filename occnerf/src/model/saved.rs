@@ -1,5 +1,5 @@
-//! What a checkpoint holds of the model itself: configuration, values, counts and where the field
-//! ends. What training goes on from besides is added, and read, by the trainer.
+//! The model's part of a checkpoint: configuration, values, counts and the field's outer end. The
+//! trainer adds the state of the optimiser.
 
 use std::borrow::Cow;
 use std::collections::BTreeMap;
@@ -20,10 +20,10 @@ const VERSION: &str = "1";
 /// and the rows whose bit is set.
 const PRUNED: &str = "2";
 const KEPT: &str = "table.kept";
-/// Where `motion.shell_interval` is not 0: how far the field reaches over each vertex.
+/// Where `motion.shell_interval` is not 0: outer end of the field over each vertex.
 const EXTENT: &str = "shell";
 const COUNTS: &str = "visibility_counts";
-/// Far more than anybody trains, and far from where counting on would overflow.
+/// Bound for forged files: far from overflow.
 const MAX_STEPS: u64 = 1 << 40;
 
 impl Model {
@@ -63,7 +63,7 @@ impl Model {
         arrays
     }
 
-    /// The numbers of a part that [`Model::stored`] made, all rows, those that were not kept zero.
+    /// All rows of a part that [`Model::stored`] made; dropped ones are zero.
     pub(crate) fn restored(&self, contents: &Contents<'_>, part: Part, key: &str) -> Result<Vec<f32>, Error> {
         let all = self.parameters.get(part).len();
         let values = contents.floats(key, self.parameters.count(part))?;
@@ -73,7 +73,7 @@ impl Model {
         })
     }
 
-    /// Takes what [`Model::header`] and [`Model::arrays`] gave from a checkpoint.
+    /// Reads [`Model::header`] and [`Model::arrays`] from a checkpoint.
     pub(crate) fn restore(&mut self, contents: &Contents<'_>) -> Result<(), Error> {
         let steps = contents.require("steps_done")?;
         self.steps_done = steps.parse().ok().filter(|&steps| steps <= MAX_STEPS).ok_or_else(|| {
@@ -132,7 +132,7 @@ fn rows_left(array: &[f32], kept: &[bool]) -> Vec<f32> {
     rows.zip(kept).filter(|(_, kept)| **kept).flat_map(|(row, _)| row).copied().collect()
 }
 
-/// All rows, `all` numbers, those that were not kept zero.
+/// All rows, `all` numbers; dropped ones are zero.
 fn rows_filled(values: &[f32], kept: &[bool], all: usize) -> Vec<f32> {
     let width = (all / kept.len().max(1)).max(1);
     let (mut rows, mut array) = (values.chunks_exact(width), vec![0.0; all]);

@@ -1,10 +1,10 @@
-//! The canonical prior with its triangles in four, as often as a picture can tell.
+//! Subdivision of the canonical prior: four triangles for one.
 
 use std::collections::HashMap;
 
 use glam::Vec3;
 
-/// A point of the prior: vertices of one face, ascending, and how much of each.
+/// A point of the prior: vertices of one face, ascending, with their weights.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Anchor {
     pub corners: [u32; 3],
@@ -88,7 +88,7 @@ impl Subdivided {
         mesh
     }
 
-    /// How often each face of the prior was divided.
+    /// Number of subdivisions.
     pub fn times(&self) -> u32 {
         self.times
     }
@@ -115,7 +115,7 @@ impl Subdivided {
 /// Most faces that colours are measured on.
 const MOST_FACES: usize = 1 << 20;
 
-/// How often a mesh of so many faces can be subdivided for no more than [`MOST_FACES`].
+/// Subdivisions that keep a mesh within [`MOST_FACES`].
 pub(crate) fn most_times(faces: usize) -> u32 {
     (1..10).take_while(|times| faces <= MOST_FACES >> (2 * times)).count() as u32
 }

@@ -1,4 +1,4 @@
-//! Tracing: where a ray can meet the subject, and what the surface says of each point there.
+//! Tracing: live samples of a ray, each with its canonical point and its surface coordinates.
 
 use glam::Vec3;
 use smpl::{MotionField, MotionFrame, Posed};
@@ -15,10 +15,10 @@ use crate::model::extent::Extent;
 use crate::model::samples::Samples;
 use volrender::RandomStream;
 
-/// Side of a cell of the occupancy for the rays of a step, of which too few pass through one for a
-/// finer grid to pay, normalised metres.
+/// Side of an occupancy cell in training, normalised metres: a step has too few rays for a finer
+/// grid to pay.
 pub(crate) const CELL: f32 = 0.02;
-/// Side of a cell for the rays of a picture, a tenth of whose time it saves, normalised metres.
+/// Side of an occupancy cell in drawing, normalised metres: saves a tenth of the time.
 pub(crate) const FINE_CELL: f32 = 0.01;
 
 /// A posed prior ready to be sampled; refitted in place for each frame.
@@ -37,7 +37,7 @@ impl PosedSurface {
         Ok(Self { mesh, occupancy: Occupancy::default(), shades: Vec::new(), cell })
     }
 
-    /// Moves it to another pose, out to `extent`, under this light.
+    /// Refits to another pose, out to `extent`, under this light.
     pub fn refit(&mut self, body: &Body, posed: &Posed, extent: &Extent, config: &Config, light: Light) {
         let Self { mesh, occupancy, shades, cell } = self;
         *shades = light.on_surface(&posed.vertices, &body.model.faces);
@@ -49,7 +49,7 @@ impl PosedSurface {
     }
 }
 
-/// Cells near the canonical prior, which are marked once and for all.
+/// Cells near the canonical prior.
 pub(crate) fn near_canonical(body: &Body, config: &Config) -> Occupancy {
     let (mut occupancy, whole) = (Occupancy::default(), Extent::whole(body, config));
     let size = OccupancyConfig { margin: whole.farthest, depth: config.motion.depth, cell: FINE_CELL };
@@ -65,17 +65,16 @@ pub(crate) struct Tracer<'a> {
     pub surface: &'a PosedSurface,
     pub motion: &'a MotionField,
     pub frame: &'a MotionFrame<'a>,
-    /// Where the canonical prior is near; read for volumes, of which it is not known from the point
-    /// in space.
+    /// Cells near the canonical prior; read for volumes, which have no posed closest point.
     pub near_canonical: &'a Occupancy,
     pub extent: &'a Extent,
-    /// What colours start from, see [`Samples::base`]; may be empty.
+    /// Initial colours, see [`Samples::base`]; may be empty.
     pub base: &'a PriorColors,
-    /// Whether neighbours are wanted at all.
+    /// Whether samples need their neighbours.
     pub neighbours: bool,
 }
 
-/// A ray on its way through the scene, front to back.
+/// State of the march along a ray, front to back.
 #[derive(Clone, Debug)]
 pub(crate) struct March {
     ray: Ray,
@@ -89,14 +88,13 @@ pub(crate) struct March {
     inside: bool,
     /// Whether all bins are traced.
     ended: bool,
-    /// Colour, over black, and transmittance of what was traced and evaluated.
+    /// Colour, over black, and transmittance so far.
     pub color: Vec3,
     pub transmittance: f32,
 }
 
 impl March {
-    /// A ray of which nothing is traced yet; `jitter` places each sample in its bin, the middle
-    /// without.
+    /// The start of a ray; `jitter` places each sample in its bin, the middle without.
     pub fn new(ray: Ray, jitter: Option<RandomStream>) -> Self {
         let (color, transmittance) = (Vec3::ZERO, 1.0);
         Self { ray, bin: 0, known: None, jitter, inside: false, ended: false, color, transmittance }
@@ -107,12 +105,12 @@ impl March {
         Self { inside, ..self }
     }
 
-    /// Whether there are bins left that can be seen through what is before them.
+    /// Whether there are visible bins left.
     pub fn goes_on(&self, min_transmittance: f32) -> bool {
         !self.ended && self.transmittance > min_transmittance
     }
 
-    /// Takes in the samples that were traced last, composited over black.
+    /// Accumulates the last samples, composited over black.
     pub fn pass(&mut self, composite: &Composite) {
         self.color += self.transmittance * composite.color;
         self.transmittance *= (1.0 - composite.opacity).max(0.0);
@@ -123,8 +121,7 @@ impl March {
 type Nearest = smpl::SurfacePoint;
 
 impl Tracer<'_> {
-    /// Appends the next live samples of a ray to `samples`, at most `most`, and takes the march to
-    /// where they end.
+    /// Appends the next live samples of a ray, at most `most`, and advances the march.
     pub fn trace(&self, samples: &mut Samples, most: usize, march: &mut March) {
         let ray = march.ray;
         let count = self.config.samples;
@@ -156,8 +153,8 @@ impl Tracer<'_> {
         samples.starts.push(samples.t.len());
     }
 
-    /// The closest point of the posed prior, as far as anything there can live; `near` is a face
-    /// that is probably close.
+    /// The closest point of the posed prior within the live range; `near` is a face that is probably
+    /// close.
     fn nearest(&self, point: Vec3, near: Option<u32>) -> Option<Nearest> {
         let mesh = &self.surface.mesh;
         // Rounding may put the face itself a hair beyond its own distance.
@@ -168,9 +165,8 @@ impl Tracer<'_> {
         Some(Nearest { face, barycentric, signed_distance })
     }
 
-    /// Maps a point, looks up its surface and appends it; false, with nothing appended, if it is
-    /// dead. `near` is a posed face that is probably close; returns the closest one where it was
-    /// looked up. `inside`: only d < 0 lives.
+    /// Maps a point, looks up its surface and appends it if it is live, which is returned with the
+    /// closest posed face. `near` is a face that is probably close; `inside` keeps d < 0 alone.
     fn push(&self, samples: &mut Samples, point: Vec3, near: Option<u32>, inside: bool) -> (bool, Option<u32>) {
         let (reach, depth) = (self.config.motion.reach(), self.config.motion.depth);
         let mut nearest = None;

@@ -1,4 +1,4 @@
-//! A trained person, or one in training: what it is, and all that drawing it reads.
+//! A trained person, or one in training.
 
 use std::sync::Arc;
 
@@ -13,18 +13,18 @@ use crate::config::{Config, FALLOFF, MotionConfig, MotionKind};
 use crate::model::arena::Arena;
 use crate::model::body::Body;
 use crate::model::colors::PriorColors;
-use crate::model::extent::Extent;
 use crate::model::encoder::Encoder;
+use crate::model::extent::Extent;
 use crate::model::field::{Field, Learnt, SampleBatch};
 use crate::model::parameters::{Lengths, PARTS, Parameters, Part};
 use crate::model::trace::{PosedSurface, Tracer, near_canonical};
 use crate::model::vertices::VertexCode;
 use crate::model::view::PosedView;
 
-/// Σ w below which the weight volume says nothing.
+/// Σ w below which the weight volume has no correspondence.
 const VOLUME_THRESHOLD: f32 = 1e-3;
 
-/// The field of one person on its body, with the moments that it was learnt from.
+/// The field of one person on its body, with the training frames' poses and cameras.
 #[derive(Clone)]
 pub struct Model {
     pub(crate) config: Config,
@@ -35,17 +35,17 @@ pub struct Model {
     pub(crate) parameters: Parameters,
     pub(crate) counts: VisibilityCounts,
     pub(crate) motion: MotionField,
-    /// Where the canonical prior is near; empty for the surface motion.
+    /// Cells near the canonical prior; empty for the surface motion.
     near_canonical: Occupancy,
-    /// Where the field ended when it was last looked at.
+    /// Outer end of the field at its last measurement.
     pub(crate) extent: Extent,
-    /// What colours start from; empty where they start from nothing.
+    /// Initial colours; may be empty.
     pub(crate) base: PriorColors,
     pub(crate) steps_done: u64,
 }
 
 impl Model {
-    /// A model at step 0; `base` is what colours start from, or empty.
+    /// A model at step 0; `base` are the initial colours, or empty.
     pub(crate) fn new(
         config: Config,
         body: Arc<Body>,
@@ -62,9 +62,7 @@ impl Model {
         }
         let field = Field::new(Encoder::new(&config)?, &config, body.canonical_box);
         let motion = match config.motion.kind {
-            MotionKind::Surface => {
-                MotionField::Surface(surface_motion(&config.motion))
-            }
+            MotionKind::Surface => MotionField::Surface(surface_motion(&config.motion)),
             MotionKind::Volume => {
                 let layout = WeightVolumeConfig { resolution: config.motion.resolution, ..Default::default() };
                 let weights = WeightVolume::gaussian(&body.model, &body.canonical, &layout);
@@ -130,7 +128,7 @@ impl Model {
         self.counts.counts()
     }
 
-    /// The parameters as before the first step.
+    /// Resets to step 0, but for `steps_done`.
     pub(crate) fn forget(&mut self) {
         let motion = self.parameters.get(Part::Motion).len();
         let lengths = Lengths { vertices: self.body.canonical.vertices.len(), motion };
@@ -163,7 +161,7 @@ impl Model {
         }
     }
 
-    /// What traces rays at the body that `surface` and `frame` are posed as.
+    /// A tracer of the body in the pose of `surface` and `frame`.
     pub(crate) fn tracer<'b>(
         &'b self,
         surface: &'b PosedSurface,
@@ -183,7 +181,7 @@ impl Model {
         }
     }
 
-    /// What the field has learnt, with the vertices as [`Model::encode_vertices`] encodes them.
+    /// Parameters for the field, with the rows of [`Model::encode_vertices`].
     pub(crate) fn learnt<'b>(&'b self, code: &'b VertexCode) -> Learnt<'b> {
         Learnt {
             perceptron: self.parameters.get(Part::Field),
@@ -198,7 +196,7 @@ impl Model {
         self.field.forward(&self.learnt(code), batch, jacobians);
     }
 
-    /// Looks where the field ends; everything out to the margin where the motion is a volume.
+    /// Measures the outer end of the field; the whole margin where the motion is a volume.
     pub(crate) fn measure_extent(&self, code: &VertexCode) -> Extent {
         match self.motion {
             MotionField::Volume { .. } => Extent::whole(&self.body, &self.config),
@@ -227,7 +225,7 @@ pub fn upright<'a>(body: &Body, views: impl Iterator<Item = &'a PosedView>) -> V
     let head = (0..joints.len()).max_by(|&a, &b| joints[a].y.total_cmp(&joints[b].y)).unwrap_or(0);
     let upward = |view: &PosedView| (view.posed.joints[head] - view.posed.joints[0]).normalize_or_zero();
     let sum: Vec3 = views.map(upward).sum();
-    // Leaning averages out in the plane; the world's axes are upright in every known layout.
+    // Leaning averages out; every known layout has an upright axis.
     let axes = [Vec3::X, Vec3::Y, Vec3::Z].into_iter();
     let axis = axes.max_by(|a, b| sum.dot(*a).abs().total_cmp(&sum.dot(*b).abs()));
     axis.map_or(Vec3::Y, |a| a * sum.dot(a).signum())

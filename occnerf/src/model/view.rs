@@ -1,4 +1,4 @@
-//! A posed body before a camera: all that a picture of a model needs to know of its moment.
+//! A posed body before a camera.
 
 use glam::Vec3;
 use smpl::Posed;
@@ -25,7 +25,7 @@ impl PosedView {
         Self { camera: *camera, instant: None, posed }
     }
 
-    /// The same moment before another camera.
+    /// The same pose before another camera.
     #[must_use]
     pub fn seen_by(&self, camera: &Camera) -> Self {
         Self { camera: *camera, ..self.clone() }

@@ -21,7 +21,7 @@ pub struct FieldRenderer<'a> {
 }
 
 impl<'a> FieldRenderer<'a> {
-    /// Encodes the vertices once for every picture to come, and looks where the field is empty.
+    /// Encodes the vertices and measures the field's extent, once for all pictures.
     ///
     /// # Errors
     /// For a body whose surface cannot be searched.
@@ -39,9 +39,7 @@ struct Scratch {
     marches: Vec<March>,
 }
 
-/// Live samples of a ray that are evaluated before it is asked whether it goes on, and the
-/// transmittance behind which nothing is looked at: it could change a colour by a thousandth, a
-/// quarter of a level of 8 bits.
+/// Rays end at a transmittance that could change a colour by a quarter of a level of 8 bits.
 const MARCH: MarchOptions = MarchOptions { segment: 4, min_transmittance: 1e-3 };
 
 impl Renderer for FieldRenderer<'_> {
@@ -91,7 +89,7 @@ mod tests {
         let mut renderer = FieldRenderer::new(model).unwrap();
         let picture = renderer.render(view, background).unwrap();
         let posed = &view.posed;
-        // What is taken for empty shows next to nothing.
+        // Space beyond the extent contributes less than 0.01.
         let whole = (Extent::whole(&scene.body, model.config()), 0.01);
         for (extent, limit) in [(renderer.extent.clone(), MARCH.min_transmittance + 1e-5), whole] {
             renderer.surface.refit(&scene.body, posed, &extent, model.config(), model.base.light);

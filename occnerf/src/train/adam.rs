@@ -1,15 +1,13 @@
-//! Adam (Kingma and Ba 2015), one instance for each parameter group. What no gradient has ever
-//! reached is passed over: there a step would change nothing, so the result is that of the dense
-//! one to the bit.
+//! Adam (Kingma and Ba 2015), one instance for each parameter group. Blocks that no gradient has
+//! reached are skipped: their step is 0, so the result equals the dense one to the bit.
 
 use rayon::prelude::*;
 
 const BETA_1: f32 = 0.9;
-/// Small beside any gradient that matters; hash-grid gradients are often below 1e-8 (Müller et al.
-/// 2022 use 1e-15).
+/// Hash-grid gradients are often below 1e-8 (Müller et al. 2022 use 1e-15).
 const EPSILON: f32 = 1e-12;
 const CHUNK: usize = 1 << 14;
-/// Numbers that are passed over together.
+/// Numbers that are skipped together.
 const BLOCK: usize = 64;
 
 /// First and second moments of a group, with the number of steps taken.
@@ -18,8 +16,7 @@ pub(crate) struct Adam {
     pub first: Vec<f32>,
     pub second: Vec<f32>,
     pub steps: u64,
-    /// Blocks that a gradient has reached; empty before the first step, which finds out from the
-    /// moments.
+    /// Blocks that a gradient has reached; derived from the moments in the first step.
     reached: Vec<bool>,
 }
 

@@ -51,7 +51,7 @@ impl Batch {
     }
 }
 
-/// Frames come in a new random order each time round, so that none waits longer than two rounds.
+/// A random permutation of the frames each round.
 fn frame_of(frames: usize, seed: u64, step: u64, order: &mut Vec<usize>) -> usize {
     let (round, place) = (step / frames as u64, (step % frames as u64) as usize);
     let mut random = RandomStream::new(&[seed, 0x4652_414D, round]);
@@ -63,7 +63,7 @@ fn frame_of(frames: usize, seed: u64, step: u64, order: &mut Vec<usize>) -> usiz
     order[place]
 }
 
-/// What a ray should show: premultiplied colour over `background`; `None` where nothing is known.
+/// Target of a ray: premultiplied colour over `background`; `None` at an unknown pixel.
 pub(crate) fn target(labels: &Labels, shown: &PixelReader, pixel: u32, background: glam::Vec3) -> Option<glam::Vec3> {
     (labels.at(pixel) != Label::Unknown).then(|| {
         let (colour, mask) = shown.at(pixel);

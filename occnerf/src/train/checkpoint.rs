@@ -1,4 +1,4 @@
-//! Checkpoints: the model with everything that training goes on from, replaced atomically.
+//! Checkpoints: the model with the state of training, replaced atomically.
 
 use std::path::Path;
 
@@ -9,16 +9,15 @@ use crate::model::saved::{config_of, parse};
 use crate::scene::prepared::Scene;
 use crate::train::trainer::Trainer;
 
-/// Key of what is known of restarts, in the header as JSON; read as none where it is absent.
+/// Header key of the restarts, as JSON; optional.
 const RESTARTS: &str = "restarts";
 
 impl<'a> Trainer<'a> {
-    /// Writes everything that training goes on from. An old file survives until the new one is
-    /// complete and on the disk.
+    /// Writes the model and the state of training. An old file survives until the new one is complete
+    /// and on the disk.
     ///
     /// # Errors
-    /// [`Error::Diverged`] where a number is not finite, so that what could be gone on from is not
-    /// replaced by what cannot; [`Error::Io`].
+    /// [`Error::Diverged`] where a number is not finite: the old file stays; [`Error::Io`].
     pub fn save(&self, path: &Path) -> Result<(), Error> {
         self.check_finite()?;
         let unwritable = |what: String| Error::File { path: path.to_owned(), what };
@@ -47,8 +46,7 @@ impl<'a> Trainer<'a> {
         Ok(())
     }
 
-    /// Goes on from a checkpoint of the same scene and configuration; the number of steps may
-    /// differ.
+    /// Resumes from a checkpoint of the same scene and configuration; the number of steps may differ.
     ///
     /// # Errors
     /// [`Error::Io`]; [`Error::File`] for a damaged checkpoint, or one of another scene.

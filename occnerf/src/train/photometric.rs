@@ -14,7 +14,7 @@ use crate::train::loss::Dissimilarity;
 use crate::train::report::StepReport;
 use crate::train::step::RayGroup;
 
-/// What the losses of a step read and write, kept from step to step; of each ray of the batch.
+/// Buffers of the losses, kept from step to step; an entry a ray of the batch.
 #[derive(Default)]
 pub(crate) struct Photometric {
     targets: Vec<Option<Vec3>>,

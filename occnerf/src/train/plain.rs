@@ -210,9 +210,7 @@ fn a_step_agrees_with_one_written_straight_from_the_definitions() {
         (Method::Occnerf, MotionKind::Surface, DistanceKind::Exact),
     ];
     let mut failures = Vec::new();
-    for (seed, (method, motion, distance)) in
-        [1u64, 5, 3, 1, 3, 2, 2, WITHOUT_SURFACE_TERM].into_iter().zip(cases)
-    {
+    for (seed, (method, motion, distance)) in [1u64, 5, 3, 1, 3, 2, 2, WITHOUT_SURFACE_TERM].into_iter().zip(cases) {
         let demo = synth::DemoConfig { size: 48, frames: 3, eval_cameras: 1, eval_every: 3, ..Default::default() };
         let capture = synth::demo(&demo, &body).unwrap();
         let config = tiny(method, motion, distance, seed);

@@ -1,18 +1,17 @@
-//! A field that has become empty starts again: nothing would teach it, since what has no density
-//! has no gradient either.
+//! Restart of a field that has become empty: without density it has no gradient.
 
 use serde::{Deserialize, Serialize};
 
-/// Steps after which it is looked at what they met.
+/// Steps between two tests.
 const WINDOW: u64 = 32;
-/// A field is lost where fewer than one in so many rays at the subject meets it.
+/// A field is lost if fewer than one in `LOST` rays at the subject meets it.
 const LOST: u64 = 10;
 /// Each restart takes the learning rates down by this factor.
 const SLOWER: f32 = 0.1;
-/// Restarts at most: rates a thousand times too high.
+/// Restarts at most.
 const MOST: u32 = 3;
 
-/// What training has met lately, and how often it began anew.
+/// Rays of the current window, and restarts so far.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct Restarts {
@@ -27,13 +26,13 @@ pub(crate) struct Restarts {
 }
 
 impl Restarts {
-    /// Takes note of a ray at the subject.
+    /// Counts a ray at the subject.
     pub fn note(&mut self, opacity: f32) {
         self.rays += 1;
         self.met += u64::from(opacity > 0.5);
     }
 
-    /// Whether training is to begin anew, asked after each step; `steps` are taken.
+    /// Whether training restarts, tested after each step; `steps` are taken.
     pub fn due(&mut self, steps: u64) -> bool {
         if !steps.is_multiple_of(WINDOW) {
             return false;
@@ -47,12 +46,12 @@ impl Restarts {
         lost
     }
 
-    /// What the learning rates are multiplied by.
+    /// Factor on the learning rates.
     pub fn rates(&self) -> f32 {
         SLOWER.powi(self.count as i32)
     }
 
-    /// What is wrong with those of a checkpoint after `steps`.
+    /// Checks the state of a checkpoint after `steps`.
     pub fn check(&self, steps: u64) -> Result<(), String> {
         let possible = self.count <= MOST && self.begun <= steps && self.met <= self.rays && self.rays <= 1 << 40;
         if possible { Ok(()) } else { Err(format!("{self:?} is not possible after {steps} steps")) }

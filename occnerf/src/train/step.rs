@@ -42,17 +42,15 @@ pub(crate) struct RayGroup {
     pub terminations: Vec<u32>,
 }
 
-/// What a step may do otherwise than its configuration says, so that tests can tell that it does
-/// not matter.
+/// Choices of a step that do not change its result, which tests vary.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct StepOptions {
     pub march: MarchOptions,
-    /// Whether rays at unknown pixels have only their samples inside the prior evaluated: the
-    /// others have no gradient.
+    /// Whether rays at unknown pixels evaluate only samples inside the prior: others have no gradient.
     pub skips_unknown: bool,
 }
 
-/// What every group of a step reads.
+/// Inputs of every group of a step.
 pub(crate) struct Step<'a> {
     pub model: &'a Model,
     pub surface: &'a PosedSurface,
@@ -64,9 +62,8 @@ pub(crate) struct Step<'a> {
 }
 
 impl Step<'_> {
-    /// Traces, encodes, evaluates and composites the rays of a group. What lies outside the prior
-    /// on a ray at an unknown pixel is dead: no photometric term asks for the ray's colour, and
-    /// completeness for the inside alone.
+    /// Traces, encodes, evaluates and composites the rays of a group. Samples outside the prior at an
+    /// unknown pixel are dead: no photometric term reads that ray, and completeness only the inside.
     pub fn forward(&self, group: &mut RayGroup) {
         let Self { model, frame, batch, .. } = *self;
         let config = &model.config;

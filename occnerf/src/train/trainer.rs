@@ -43,7 +43,7 @@ pub struct Trainer<'a> {
     pub(crate) buffers: Buffers,
 }
 
-/// What a step fills, kept for the next one.
+/// Buffers of a step, kept for the next one.
 pub(crate) struct Buffers {
     pub batch: Batch,
     pub groups: Vec<RayGroup>,
@@ -96,7 +96,7 @@ impl<'a> Trainer<'a> {
         &self.model
     }
 
-    /// The model without what training it further takes.
+    /// The model without optimiser and buffers.
     pub fn into_model(self) -> Model {
         self.model
     }
@@ -143,7 +143,7 @@ impl<'a> Trainer<'a> {
         self.model.config.steps = steps;
     }
 
-    /// Forgets what was learnt.
+    /// Resets the parameters.
     fn begin_anew(&mut self) {
         self.model.forget();
         self.optimiser = Optimiser::new(&self.model.parameters);

@@ -1,4 +1,4 @@
-//! Backward passes of what the model does forward.
+//! Backward passes of the model.
 
 pub(crate) mod field;
 pub(crate) mod motion;

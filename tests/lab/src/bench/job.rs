@@ -10,9 +10,7 @@ use anyhow::{Context, Result, bail};
 use glam::Vec3;
 use occnerf::bake::bake;
 use occnerf::capture::Capture;
-use occnerf::{
-    Config, FieldRenderer, PreparedFrame, PriorColors, PriorRenderer, Renderer, Scene, StepTimes, evaluate,
-};
+use occnerf::{Config, FieldRenderer, PreparedFrame, PriorColors, PriorRenderer, Renderer, Scene, StepTimes, evaluate};
 use serde::{Deserialize, Serialize};
 use smpl::BodyModel;
 

@@ -111,9 +111,7 @@ pub fn course(axis: &Axis, method: Method, lines: &[Line]) -> Course {
     let of = |level: usize, method: Method| {
         lines.iter().filter(move |l| {
             let point = &l.point;
-            point.factor == axis.name
-                && point.level == Some(axis.levels[level].value)
-                && point.job.method == method
+            point.factor == axis.name && point.level == Some(axis.levels[level].value) && point.job.method == method
         })
     };
     let mean = |values: &[f64]| (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64);
