@@ -49,7 +49,7 @@ pub use config::{
     MotionKind, OccludedRule, Preset, RateConfig, RegistrationConfig, SurfaceConfig,
 };
 pub use error::Error;
-pub use evaluate::{FrameMetrics, SplitMetrics, evaluate, evaluate_with, least_seen_quartile, nearest_vertices};
+pub use evaluate::{FrameMetrics, SplitMetrics, evaluate, least_seen_quartile, nearest_vertices};
 pub use model::body::{Body, PosedFrame};
 pub use model::colors::PriorColors;
 pub use model::encoder::PointEncoder;

@@ -34,7 +34,7 @@ fn scores(
     change: impl Fn(&PreparedFrame, usize, &mut [f32], &mut f32) + Sync,
 ) -> SplitMetrics {
     let frames: Vec<&PreparedFrame> = frames.iter().collect();
-    evaluate(scene(), &mut Truth(change), &frames, |_, _| {}).unwrap()
+    evaluate(scene(), &mut Truth(change), &frames, None, |_, _| {}).unwrap()
 }
 
 fn near(a: Option<f64>, b: f64) -> bool {
@@ -171,7 +171,7 @@ fn no_frames_give_no_scores_and_progress_hears_of_every_frame() {
     let frames: Vec<&PreparedFrame> = scene().eval.iter().collect();
     let mut heard = Vec::new();
     let mut truth = Truth(|_: &PreparedFrame, _: usize, _: &mut [f32], _: &mut f32| {});
-    evaluate(scene(), &mut truth, &frames, |frame, rendering| {
+    evaluate(scene(), &mut truth, &frames, None, |frame, rendering| {
         heard.push((frame.camera_name.clone(), rendering.opacity.len()));
     })
     .unwrap();
@@ -189,7 +189,7 @@ impl Renderer for Broken {
 
 #[test]
 fn an_error_of_the_renderer_comes_through() {
-    let error = evaluate(scene(), &mut Broken, &[&scene().eval[0]], |_, _| {}).unwrap_err();
+    let error = evaluate(scene(), &mut Broken, &[&scene().eval[0]], None, |_, _| {}).unwrap_err();
     assert!(error.to_string().contains("paint"));
 }
 

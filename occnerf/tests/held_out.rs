@@ -46,6 +46,6 @@ fn nothing_is_learnt_from_what_they_show_and_they_are_what_is_scored() {
     assert!(frame.labels.num_subject() > 50 && frame.labels.num_subject() < frame.labels.iter().count());
     let colors = PriorColors::measure(&scene).unwrap();
     let mut prior = PriorRenderer::new(&scene.body, &colors);
-    let scores = evaluate(&scene, &mut prior, &[frame], |_, _| {}).unwrap();
+    let scores = evaluate(&scene, &mut prior, &[frame], None, |_, _| {}).unwrap();
     assert!(scores.psnr_mask.is_some_and(|psnr| psnr > 5.0), "{scores:?}");
 }

@@ -24,7 +24,7 @@ fn read(dir: &TempDir, body: &BodyModel, room: u64) -> Capture {
 fn trained(dir: &TempDir, trainer: &Trainer<'_>, scene: &Scene) -> (Vec<u8>, Option<f64>) {
     trainer.save(&dir.path("checkpoint")).unwrap();
     let frames: Vec<_> = scene.eval.iter().collect();
-    let scores = evaluate(scene, &mut FieldRenderer::new(trainer.model()).unwrap(), &frames, |_, _| {}).unwrap();
+    let scores = evaluate(scene, &mut FieldRenderer::new(trainer.model()).unwrap(), &frames, None, |_, _| {}).unwrap();
     (std::fs::read(dir.path("checkpoint")).unwrap(), scores.psnr_mask)
 }
 

@@ -8,7 +8,7 @@ mod formula;
 
 use std::path::Path;
 
-use occnerf::{Config, Error, FieldRenderer, Lpips, Method, StepReport, Trainer, evaluate_with};
+use occnerf::{Config, Error, FieldRenderer, Lpips, Method, StepReport, Trainer, evaluate};
 
 /// Writes a SqueezeNet of formula weights.
 fn squeezenet_file(path: &Path) {
@@ -83,7 +83,7 @@ fn scoring_reports_lpips_where_weights_are_given() {
     let frames: Vec<_> = scene.eval.iter().collect();
     let mut seen = Vec::new();
     let mut renderer = FieldRenderer::new(trainer.model()).unwrap();
-    let scores = evaluate_with(scene, &mut renderer, &frames, Some(&lpips), |frame, rendering| {
+    let scores = evaluate(scene, &mut renderer, &frames, Some(&lpips), |frame, rendering| {
         let size = (frame.view.camera.width as usize, frame.view.camera.height as usize);
         let truth = frame.pixels().unwrap();
         seen.push(lpips.distance(&rendering.image.pixels, &truth.image.pixels, size.0, size.1).unwrap()[0]);
@@ -93,6 +93,6 @@ fn scoring_reports_lpips_where_weights_are_given() {
     assert_eq!(found, seen);
     assert!((scores.lpips_full.unwrap() - seen.iter().sum::<f64>() / seen.len() as f64).abs() < 1e-12);
     let mut renderer = FieldRenderer::new(trainer.model()).unwrap();
-    let without = evaluate_with(scene, &mut renderer, &frames, None, |_, _| {}).unwrap();
+    let without = evaluate(scene, &mut renderer, &frames, None, |_, _| {}).unwrap();
     assert_eq!(without.lpips_full, None);
 }

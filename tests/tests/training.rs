@@ -72,7 +72,7 @@ fn a_short_training_lowers_the_loss_and_beats_its_own_start() {
         let psnr = |trainer: &Trainer<'_>| {
             let frames: Vec<&PreparedFrame> = scene().eval.iter().collect();
             let mut renderer = FieldRenderer::new(trainer.model()).unwrap();
-            evaluate(scene(), &mut renderer, &frames, |_, _| {}).unwrap().psnr_mask.unwrap()
+            evaluate(scene(), &mut renderer, &frames, None, |_, _| {}).unwrap().psnr_mask.unwrap()
         };
         let start = psnr(&trainer);
         let reports: Vec<_> = (0..STEPS).map(|_| trainer.step().unwrap()).collect();

@@ -10,7 +10,7 @@ use indicatif::ProgressBar;
 use occnerf::bake::{Avatar, BakeOptions, BakedRenderer, bake};
 use occnerf::{
     FieldRenderer, Label, Lpips, Method, Model, PreparedFrame, PriorColors, PriorRenderer, Renderer, Rendering, Scene,
-    SplitMetrics, Supersampled, evaluate_with,
+    SplitMetrics, Supersampled, evaluate,
 };
 use rayon::prelude::*;
 use visibility::Samples;
@@ -233,7 +233,7 @@ impl Drawn<'_> {
         if side > 1 {
             renderer = Box::new(Supersampled::new(renderer, side));
         }
-        Ok(evaluate_with(scene, renderer.as_mut(), &frames, lpips, seen)?)
+        Ok(evaluate(scene, renderer.as_mut(), &frames, lpips, seen)?)
     }
 
     fn score_with_bar(

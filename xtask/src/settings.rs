@@ -3,7 +3,7 @@
 use anyhow::{Context, Result, bail};
 use clap::Args;
 use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
-use occnerf::{Capacity, Component, Config, Method, OccludedRule, Preset, RateConfig};
+use occnerf::{Capacity, Component, Config, Method, OccludedRule, Preset};
 
 const METHODS: &[(Method, &str)] = &[
     (Method::Prior, "The posed prior in mean colours; nothing is trained"),
@@ -132,11 +132,4 @@ pub fn set(config: &Config, assignment: &str) -> Result<Config> {
     };
     at.insert(last.to_owned(), new);
     Ok(table.try_into()?)
-}
-
-/// Multiplies every learning rate.
-pub fn scale_rates(rates: &mut RateConfig, by: f32) {
-    for rate in [&mut rates.field, &mut rates.vertices, &mut rates.table, &mut rates.motion] {
-        *rate *= by;
-    }
 }

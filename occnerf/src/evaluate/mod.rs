@@ -88,18 +88,9 @@ pub fn least_seen_quartile(scene: &Scene) -> Result<Vec<bool>, Error> {
     Ok(least)
 }
 
-/// Renders `frames` over black and scores them; `progress` hears of each finished picture.
+/// Renders `frames` over black and scores them, with LPIPS over the whole image where `lpips` is given;
+/// `progress` hears of each finished picture.
 pub fn evaluate(
-    scene: &Scene,
-    renderer: &mut dyn Renderer,
-    frames: &[&PreparedFrame],
-    progress: impl FnMut(&PreparedFrame, &Rendering),
-) -> Result<SplitMetrics, Error> {
-    evaluate_with(scene, renderer, frames, None, progress)
-}
-
-/// [`evaluate`], with LPIPS over the whole image where `lpips` is given.
-pub fn evaluate_with(
     scene: &Scene,
     renderer: &mut dyn Renderer,
     frames: &[&PreparedFrame],

@@ -28,33 +28,29 @@ pub struct StepTimes {
 }
 
 impl StepTimes {
-    /// Every stage with its name, in the order of the step.
-    pub fn stages(&self) -> [(&'static str, f64); 9] {
+    fn stages_mut(&mut self) -> [(&'static str, &mut f64); 9] {
         [
-            ("prepare", self.prepare),
-            ("trace", self.trace),
-            ("encode", self.encode),
-            ("perceptron", self.perceptron),
-            ("losses", self.losses),
-            ("perceptron backward", self.perceptron_backward),
-            ("motion backward", self.motion_backward),
-            ("encode backward", self.encode_backward),
-            ("update", self.update),
+            ("prepare", &mut self.prepare),
+            ("trace", &mut self.trace),
+            ("encode", &mut self.encode),
+            ("perceptron", &mut self.perceptron),
+            ("losses", &mut self.losses),
+            ("perceptron backward", &mut self.perceptron_backward),
+            ("motion backward", &mut self.motion_backward),
+            ("encode backward", &mut self.encode_backward),
+            ("update", &mut self.update),
         ]
+    }
+
+    /// Every stage with its name, in the order of the step.
+    pub fn stages(mut self) -> [(&'static str, f64); 9] {
+        self.stages_mut().map(|(name, seconds)| (name, *seconds))
     }
 }
 
 impl AddAssign for StepTimes {
     fn add_assign(&mut self, other: Self) {
-        self.prepare += other.prepare;
-        self.trace += other.trace;
-        self.encode += other.encode;
-        self.perceptron += other.perceptron;
-        self.losses += other.losses;
-        self.perceptron_backward += other.perceptron_backward;
-        self.motion_backward += other.motion_backward;
-        self.encode_backward += other.encode_backward;
-        self.update += other.update;
+        self.stages_mut().into_iter().zip(other.stages()).for_each(|((_, sum), (_, seconds))| *sum += seconds);
     }
 }
 

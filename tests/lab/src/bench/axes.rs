@@ -7,8 +7,7 @@ use synth::DemoConfig;
 use super::difficulty::Difficulty;
 use super::job::{Job, Place};
 use super::runner::{Kind, Point};
-use crate::methods::Method;
-use xtask::settings::scale_rates;
+use crate::methods::{Method, scale_rates};
 
 /// Training frames and scored views of the easy case.
 const FRAMES: usize = 50;

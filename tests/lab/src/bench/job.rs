@@ -157,7 +157,7 @@ fn score(scene: &Scene, renderer: &mut dyn Renderer, outcome: &mut Outcome) -> R
     if let Some(first) = frames.first() {
         renderer.render(&first.view, Vec3::ZERO)?;
     }
-    let metrics = evaluate(scene, renderer, &frames, |_, rendering| {
+    let metrics = evaluate(scene, renderer, &frames, None, |_, rendering| {
         let numbers = rendering.image.pixels.iter().chain(&rendering.opacity);
         bad += numbers.filter(|x| !x.is_finite()).count();
     })?;

@@ -64,7 +64,7 @@ fn psnr(capture: &Capture, model: &BodyModel) -> Result<f64> {
     let scene = Scene::new(capture, model, &config)?;
     let colors = PriorColors::measure(&scene)?;
     let frames: Vec<&PreparedFrame> = scene.eval.iter().collect();
-    let scores = evaluate(&scene, &mut PriorRenderer::new(&scene.body, &colors), &frames, |_, _| {})?;
+    let scores = evaluate(&scene, &mut PriorRenderer::new(&scene.body, &colors), &frames, None, |_, _| {})?;
     scores.psnr_mask.context("no unseen view shows the person")
 }
 

@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, ensure};
 use glam::Vec3;
-use occnerf::{Body, Config, Lpips, MotionKind, PointEncoder, Preset, Scene, Trainer};
+use occnerf::{Body, Config, Lpips, MotionKind, PointEncoder, Preset, RateConfig, Scene, Trainer};
 use serde::{Deserialize, Serialize};
 use surface_query::{SurfaceQuery, SurfaceQueryConfig};
 
@@ -150,6 +150,13 @@ impl Method {
         let mut metrics = unscored(run, &drawn, start.elapsed().as_secs_f64());
         metrics.method = self.name().to_owned();
         score_run(directory, run, &scene, &drawn, lpips, metrics)
+    }
+}
+
+/// Multiplies every learning rate.
+pub fn scale_rates(rates: &mut RateConfig, by: f32) {
+    for rate in [&mut rates.field, &mut rates.vertices, &mut rates.table, &mut rates.motion] {
+        *rate *= by;
     }
 }
 

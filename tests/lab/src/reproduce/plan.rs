@@ -7,7 +7,7 @@ use std::time::Instant;
 
 use crate::scene::SceneOptions;
 use anyhow::{Context, Result};
-use occnerf::{Config, FieldRenderer, Lpips, PreparedFrame, Preset, evaluate_with};
+use occnerf::{Config, FieldRenderer, Lpips, PreparedFrame, Preset, evaluate};
 use serde::{Deserialize, Serialize};
 
 use super::rows::{Length, Row};
@@ -172,6 +172,6 @@ fn measure(source: &Source, method: Method, config: Config, lpips: Option<&Lpips
     let first = &scored[..scored.len().min(1)];
     let mut renderer = FieldRenderer::new(trainer.model())?;
     let start = Instant::now();
-    evaluate_with(&scene, &mut renderer, first, lpips, |_, _| {})?;
+    evaluate(&scene, &mut renderer, first, lpips, |_, _| {})?;
     Ok(((step, start.elapsed().as_secs_f64()), scored.len()))
 }

@@ -3,8 +3,8 @@
 use anyhow::{Context, Result};
 use occnerf::{Config, OccludedRule, Preset};
 
-use crate::methods::Method;
-use xtask::settings::{scale_rates, set};
+use crate::methods::{Method, scale_rates};
+use xtask::settings::set;
 
 /// How long a row trains.
 #[derive(Clone, Copy, Debug, PartialEq)]

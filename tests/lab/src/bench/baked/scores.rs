@@ -2,7 +2,7 @@
 
 use anyhow::Result;
 use image::RgbImage;
-use occnerf::{Lpips, PreparedFrame, Renderer, Rendering, Scene, SplitMetrics, evaluate_with};
+use occnerf::{Lpips, PreparedFrame, Renderer, Rendering, Scene, SplitMetrics, evaluate};
 
 use super::agreement::Agreement;
 use xtask::pictures;
@@ -53,7 +53,7 @@ impl<'a> Scores<'a> {
         let (mut row, mut agreement, first) = (Vec::new(), Agreement::default(), of_field.is_empty());
         let stride = frames.len().div_ceil(SHOWN).max(1);
         let mut index = 0;
-        let scores = evaluate_with(scene, renderer, frames, *lpips, |frame, rendering| {
+        let scores = evaluate(scene, renderer, frames, *lpips, |frame, rendering| {
             if index % stride == 0 {
                 let (width, height) = (frame.view.camera.width, frame.view.camera.height);
                 row.push(pictures::over_grey(&rendering.image.pixels, &rendering.opacity, width, height));
