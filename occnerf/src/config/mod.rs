@@ -4,8 +4,9 @@ mod presets;
 mod settings;
 mod validate;
 
+pub(crate) use self::settings::FALLOFF;
 pub use self::settings::{
-    Component, Config, DistanceKind, EncodingConfig, FALLOFF, FieldConfig, LossConfig, Method, MotionConfig,
-    MotionKind, OccludedRule, Preset, RateConfig, RegistrationConfig, SurfaceConfig,
+    Component, Config, DistanceKind, EncodingConfig, FieldConfig, LossConfig, Method, MotionConfig, MotionKind,
+    OccludedRule, Preset, RateConfig, RegistrationConfig, SurfaceConfig,
 };
 pub use self::validate::ConfigError;
