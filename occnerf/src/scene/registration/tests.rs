@@ -59,12 +59,12 @@ fn what_is_wrong_with_a_prior_is_mostly_mended_whatever_the_number_of_threads() 
     let body = BodyModel::embedded();
     let exact = DemoConfig { pose_noise_degrees: 0.0, translation_noise: 0.0, beta_noise: 0.0, ..small() };
     let truth = demo(&exact, &body).unwrap();
-    for (wrong, most) in [
+    for (noise, most) in [
         (Perturbation { pose_degrees: 4.0, ..Perturbation::default() }, 0.8),
         (Perturbation { shape: 1.0, ..Perturbation::default() }, 0.4),
     ] {
         let mut given = demo(&small(), &body).unwrap();
-        wrong.apply(&mut given, &body).unwrap();
+        noise.apply(&mut given, &body).unwrap();
         let run = |threads: usize| {
             let mut capture = given.clone();
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
@@ -73,7 +73,7 @@ fn what_is_wrong_with_a_prior_is_mostly_mended_whatever_the_number_of_threads() 
         };
         let (found, again) = (run(1), run(2));
         let (before, after) = (apart(&truth, &given, &body), apart(&truth, &found, &body));
-        assert!(after < most * before, "{wrong:?}: {before} pixels before, {after} after");
+        assert!(after < most * before, "{noise:?}: {before} pixels before, {after} after");
         assert_eq!(found.mean_betas, again.mean_betas);
         for (a, b) in found.train.iter().zip(&again.train) {
             assert!(a.pose == b.pose && a.placement == b.placement && a.betas == b.betas);
@@ -155,7 +155,7 @@ fn clothes_are_found_as_far_out_as_they_are_and_an_occluder_is_no_outline() {
         posed.vertices.iter().zip(&normals).map(|(v, n)| *v + thick * n.normalize_or_zero()).collect();
     let mesh = visibility::RayMesh::new(&dressed, &body.faces).unwrap();
     let hidden = |column: u32| column >= 128;
-    let (camera, ridges) = (frame.camera, ridges(&body.faces));
+    let (camera, shared_edges) = (frame.camera, shared_edges(&body.faces));
     let mut distances = [false, true].map(|occluded| {
         let see = |pixels: &mut Pixels| {
             for i in 0..256 * 256u32 {
@@ -167,9 +167,9 @@ fn clothes_are_found_as_far_out_as_they_are_and_an_occluder_is_no_outline() {
         let mut pixels = frame.pixels().unwrap();
         see(&mut pixels);
         frame.source = pixels.into();
-        let picture = Picture::new(frame, &posed).unwrap().unwrap();
-        let looking = Looking { reach: 10.0, blur: 0.0, unit: 1.0 };
-        let found = look(&picture, &posed.vertices, (&body.faces, &ridges), looking).unwrap();
+        let crop = Crop::new(frame, &posed).unwrap().unwrap();
+        let options = ObservationOptions { reach: 10.0, blur: 0.0, unit: 1.0 };
+        let found = observe(&crop, &posed.vertices, (&body.faces, &shared_edges), options).unwrap();
         let each = found.edges.iter().map(|edge| {
             let column = camera.project(posed.vertices[edge.vertex as usize]).unwrap().x;
             (edge.distance / edge.scale, column)
@@ -194,7 +194,7 @@ fn a_wrong_focal_length_is_mostly_mended_where_no_other_camera_says_what_it_is()
     for (factor, most) in [(0.5, 0.25), (4.0, 0.3)] {
         let mut given = truth.clone();
         for frame in &mut given.train {
-            frame.placement = shifted(frame.placement, away(frame, &body).unwrap(), 1.0 / factor);
+            frame.placement = rescaled(frame.placement, root_depth(frame, &body).unwrap(), 1.0 / factor);
             frame.camera.focal *= factor;
         }
         register(&mut given, &body, 12).unwrap();
@@ -210,22 +210,22 @@ fn the_picture_moves_with_the_perspective_as_by_finite_differences() {
     let body = BodyModel::embedded();
     let truth = demo(&small(), &body).unwrap();
     let frame = &truth.train[0];
-    let way = away(frame, &body).unwrap();
-    let posed = |nearness: f32| {
+    let way = root_depth(frame, &body).unwrap();
+    let posed = |inverse_depth: f32| {
         let mut camera = frame.camera;
-        camera.focal /= nearness;
-        let placement = shifted(frame.placement, way, nearness);
+        camera.focal /= inverse_depth;
+        let placement = rescaled(frame.placement, way, inverse_depth);
         (body.pose(&body.shaped(&frame.betas), &frame.pose, placement), camera)
     };
-    for nearness in [0.6, 1.0, 1.7] {
-        let (here, camera) = posed(nearness);
-        let perspective = equations::Perspective { nearness, depth: way.length() };
-        let ([more, less], h) = ([posed(nearness + 0.01), posed(nearness - 0.01)], 0.02);
+    for inverse_depth in [0.6, 1.0, 1.7] {
+        let (here, camera) = posed(inverse_depth);
+        let perspective = equations::Perspective { inverse_depth, depth: way.length() };
+        let ([more, less], h) = ([posed(inverse_depth + 0.01), posed(inverse_depth - 0.01)], 0.02);
         let project =
             |(posed, camera): &(Posed, Camera), v: usize| camera.project(posed.vertices[v]).unwrap().truncate();
         for v in (0..body.num_vertices()).step_by(11) {
             let numeric = (project(&more, v) - project(&less, v)) / h;
-            let shift = perspective.of(&camera, here.vertices[v]);
+            let shift = perspective.derivative(&camera, here.vertices[v]);
             let at = |h: f32| camera.project(here.vertices[v] + h * shift).unwrap().truncate();
             let analytic = (at(0.01) - at(-0.01)) / 0.02;
             assert!((numeric - analytic).length() < 0.02 + 0.02 * numeric.length(), "{numeric} {analytic}");
