@@ -26,7 +26,7 @@ struct Word {
     subject: u64,
     unknown: u64,
     /// Subject pixels of all previous words.
-    before: u32,
+    previous: u32,
 }
 
 impl Labels {
@@ -38,7 +38,7 @@ impl Labels {
             let bits = |wanted: Label| {
                 labels.iter().enumerate().fold(0, |bits, (i, label)| bits | u64::from(*label == wanted) << i)
             };
-            let word = Word { subject: bits(Label::Subject), unknown: bits(Label::Unknown), before: subject };
+            let word = Word { subject: bits(Label::Subject), unknown: bits(Label::Unknown), previous: subject };
             subject += word.subject.count_ones();
             word
         };
@@ -80,7 +80,7 @@ impl Labels {
     /// Number of subject pixels.
     #[must_use]
     pub fn num_subject(&self) -> usize {
-        self.words.last().map_or(0, |word| word.before + word.subject.count_ones()) as usize
+        self.words.last().map_or(0, |word| word.previous + word.subject.count_ones()) as usize
     }
 
     /// The `n`-th subject pixel in order.
@@ -90,10 +90,10 @@ impl Labels {
     #[must_use]
     pub fn subject(&self, n: usize) -> u32 {
         assert!(n < self.num_subject(), "subject pixel {n} of {}", self.num_subject());
-        let after = self.words.partition_point(|word| word.before as usize <= n);
+        let after = self.words.partition_point(|word| word.previous as usize <= n);
         let word = self.words[after - 1];
         let mut bits = word.subject;
-        for _ in word.before as usize..n {
+        for _ in word.previous as usize..n {
             // Clears the lowest set bit.
             bits &= bits - 1;
         }

@@ -32,13 +32,13 @@ pub(super) fn corrected(
     for ((local, turn), parent) in pose.iter_mut().zip(turns).zip(&model.parents) {
         // A rotation that is not finite stays as it is.
         let given = if local.is_finite() { Quat::from_scaled_axis(*local) } else { Quat::IDENTITY };
-        let (before, after) = match parent {
+        let (original, corrected) = match parent {
             Some(parent) => {
-                let (before, after) = (bones[*parent].0 * given, turn * bones[*parent].0 * given);
+                let (original, corrected) = (bones[*parent].0 * given, turn * bones[*parent].0 * given);
                 if local.is_finite() {
-                    *local = (bones[*parent].1.inverse() * after).normalize().to_scaled_axis();
+                    *local = (bones[*parent].1.inverse() * corrected).normalize().to_scaled_axis();
                 }
-                (before, after)
+                (original, corrected)
             }
             None => {
                 if let (Placement::Pelvis { .. }, true) = (frame.placement, local.is_finite()) {
@@ -47,7 +47,7 @@ pub(super) fn corrected(
                 (about * given, turn * about * given)
             }
         };
-        bones.push((before, after));
+        bones.push((original, corrected));
     }
     let placement = match frame.placement {
         Placement::Pelvis { translation } => Placement::Pelvis { translation: translation + shift },
