@@ -11,7 +11,7 @@ use occnerf::{Config, Lpips, Method, Model, Person, PriorColors, Scene, Trainer,
 use crate::capacity::{self, CapacityName};
 use crate::eval::{Drawn, Split, check_pictures, score_baked, score_run, scored_frames, unscored};
 use crate::network::{load_lpips, network_name};
-use crate::optimise::{SavingArguments, RunOptions, optimise};
+use crate::optimise::{RunOptions, SavingArguments, optimise};
 use crate::process::{Lock, results_in, say};
 use crate::run::{
     CHECKPOINT, METRICS, Metrics, RunConfig, existing_directory, make_directory, new_directory, peak_rss_bytes,

@@ -271,7 +271,7 @@ mod tests {
             let prior = Prior { per_frame: &variances, ar_coefficients: &ar_coefficients, global: &common };
             let Solution { per_frame: steps, global: step, variances } = solve(&normals, &prior, &per_frame, &global).unwrap();
             let exact = whole.clone().lu().solve(&right).unwrap();
-            let inverse = whole.view((0, 0), (frames * p, frames * p)).into_per_frameed().try_inverse().unwrap();
+            let inverse = whole.view((0, 0), (frames * p, frames * p)).into_owned().try_inverse().unwrap();
             for f in 0..frames {
                 prop_assert!((&steps[f] - exact.rows(f * p, p)).amax() < 1e-8);
                 prop_assert!((&variances[f] - inverse.diagonal().rows(f * p, p)).amax() < 1e-8);
