@@ -166,7 +166,7 @@ pub fn scene_name(scene: Option<&str>) -> String {
 /// What registration made of the focal length, if it is more than the noise of one that is right.
 fn say_focal_length(source: &Source, scene: &Scene) {
     let focal = |capture: &Capture| capture.train.first().map_or(1.0, |frame| frame.camera.focal.x);
-    let (given, found) = (focal(&source.capture), focal(&scene.capture));
+    let (given, found) = (focal(&source.capture), focal(&scene.registered.capture));
     if (found / given - 1.0).abs() > 0.1 {
         say!("focal length: {given:.0} pixels given, {found:.0} found");
     }
@@ -196,7 +196,7 @@ pub fn run_one(
     let start = Instant::now();
     let colors = scene.colors()?;
     let prior_seconds = start.elapsed().as_secs_f64();
-    let kept = Person::save(directory, &scene.capture, &source.model, colors);
+    let kept = Person::save(directory, &scene.registered, &source.model, colors);
     kept.map_err(Error::from).map_err(results_in(directory))?;
     if run.train.method == Method::Prior {
         let prior = Drawn::Prior(colors.clone());

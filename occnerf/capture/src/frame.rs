@@ -56,18 +56,25 @@ pub struct Capture {
     pub eval: Vec<EvalFrame>,
     /// Shape of the canonical body (T-pose).
     pub mean_betas: Vec<f32>,
-    /// Whether registration has corrected the bodies.
-    pub registered: bool,
+}
+
+/// A capture with corrected masks, or with masks to be taken as they are.
+#[derive(Clone, Debug)]
+pub struct Mended(pub Capture);
+
+/// A mended capture with registered bodies, or with bodies to be taken as they are.
+#[derive(Clone, Debug)]
+pub struct Registered {
+    /// The capture.
+    pub capture: Capture,
     /// Registered offset of clothes and hair along each vertex normal, in the capture's units; empty
     /// where unknown.
     pub clothes: Vec<f32>,
-    /// Whether masks that are too large or too small have been mended.
-    pub mended: bool,
 }
 
-impl Capture {
-    /// A capture as loaded, before mask correction and registration.
-    pub fn new(name: String, train: Vec<Frame>, eval: Vec<EvalFrame>, mean_betas: Vec<f32>) -> Self {
-        Self { name, train, eval, mean_betas, registered: false, clothes: Vec::new(), mended: false }
+impl From<Capture> for Registered {
+    /// Takes masks and bodies as they are.
+    fn from(capture: Capture) -> Self {
+        Self { capture, clothes: Vec::new() }
     }
 }

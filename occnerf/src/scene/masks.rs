@@ -9,7 +9,7 @@ use rayon::prelude::*;
 use smpl::BodyModel;
 
 use crate::Error;
-use crate::capture::{Capture, Frame, Pixels};
+use crate::capture::{Capture, Frame, Mended, Pixels};
 use crate::config::OccludedRule;
 use crate::model::view::PosedView;
 use crate::scene::labels::{Label, label_pixels, squared_distance};
@@ -37,22 +37,19 @@ const PASSES: usize = 3;
 /// Largest distance of grown pixels from the body, metres.
 const NEAR: f32 = 0.1;
 
-/// Erodes or dilates the masks of the training frames to the person's outline, as [`crate::Scene`]
-/// does before registration. Corrected captures are left as they are.
+/// Erodes or dilates the masks of the training frames to the person's outline.
 ///
 /// # Errors
 /// Pictures that cannot be read.
-pub fn mend_masks(capture: &mut Capture, model: &BodyModel) -> Result<(), Error> {
-    if std::mem::replace(&mut capture.mended, true) {
-        return Ok(());
+pub fn mend_masks(mut capture: Capture, model: &BodyModel) -> Result<Mended, Error> {
+    match excess(&capture.train)? {
+        0 => extend(&mut capture, model)?,
+        excess => {
+            let by = -i32::try_from(excess).unwrap_or(i32::MAX);
+            capture.train.iter_mut().for_each(|frame| frame.source.edit(move |pixels| pixels.grow(by)));
+        }
     }
-    let excess = excess(&capture.train)?;
-    if excess == 0 {
-        return extend(capture, model);
-    }
-    let by = -i32::try_from(excess).unwrap_or(i32::MAX);
-    capture.train.iter_mut().for_each(|frame| frame.source.edit(move |pixels| pixels.grow(by)));
-    Ok(())
+    Ok(Mended(capture))
 }
 
 /// Number of pixels by which the masks are too large; 0 where no level set stands out.
@@ -233,19 +230,19 @@ mod tests {
         let area = |c: &Capture| c.train.iter().map(|f| f.pixels().unwrap().mask.iter().sum::<f32>()).sum::<f32>();
         for (mask_pixels, ragged_pixels) in [(0, 0.0), (-3, 0.0), (-1, 0.0), (0, 2.0), (2, 0.0), (3, 0.0), (5, 0.0)] {
             let mut capture = given.clone();
-            let wrong = Perturbation { mask_pixels, ragged_pixels, ..Perturbation::NONE };
-            wrong.apply(&mut capture, &body).unwrap();
+            let noise = Perturbation { mask_pixels, ragged_pixels, ..Perturbation::NONE };
+            noise.apply(&mut capture, &body).unwrap();
             let found = excess(&capture.train).unwrap() as i32;
-            let spoilt = area(&capture);
-            mend_masks(&mut capture, &body).unwrap();
+            let corrupted = area(&capture);
+            let Mended(capture) = mend_masks(capture, &body).unwrap();
             println!("{mask_pixels} {ragged_pixels}: {found}");
             if mask_pixels < 2 {
                 // Those that are too small grow.
-                let kept = mask_pixels < 0 || area(&capture) == spoilt;
+                let kept = mask_pixels < 0 || area(&capture) == corrupted;
                 assert!(found == 0 && kept, "{mask_pixels} {ragged_pixels}: {found}");
             } else {
                 assert!((found - mask_pixels).abs() <= 1, "{mask_pixels}: {found}");
-                let (left, was) = ((area(&capture) - area(&given)).abs(), spoilt - area(&given));
+                let (left, was) = ((area(&capture) - area(&given)).abs(), corrupted - area(&given));
                 assert!(left < 0.4 * was, "{mask_pixels}: {left} of {was}");
             }
         }
@@ -262,8 +259,8 @@ mod tests {
         let right = [(0, 0.4), (0, 2.0), (0, 4.0), (2, 0.0), (3, 0.0)];
         for (mask_pixels, ragged_pixels) in right.into_iter().chain([(-1, 0.0), (-2, 0.0), (-3, 0.0), (-2, 2.0)]) {
             let mut capture = given.clone();
-            let wrong = Perturbation { mask_pixels, ragged_pixels, ..Perturbation::NONE };
-            wrong.apply(&mut capture, &body).unwrap();
+            let noise = Perturbation { mask_pixels, ragged_pixels, ..Perturbation::NONE };
+            noise.apply(&mut capture, &body).unwrap();
             let error = |c: &Capture| -> f32 {
                 let frames = c.train.iter().zip(&given.train);
                 let each = frames.map(|(frame, given)| {
@@ -292,10 +289,9 @@ mod tests {
         let body = BodyModel::embedded();
         let (_directory, mut capture) = on_disk("masks-occluder", 192, Layout::Wild);
         Perturbation { mask_pixels: -2, ..Perturbation::NONE }.apply(&mut capture, &body).unwrap();
-        let small = capture.clone();
-        mend_masks(&mut capture, &body).unwrap();
+        let Mended(grown_capture) = mend_masks(capture.clone(), &body).unwrap();
         let mut grown = 0;
-        for (frame, small) in capture.train.iter().zip(&small.train) {
+        for (frame, small) in grown_capture.train.iter().zip(&capture.train) {
             let (frame, small) = (frame.pixels().unwrap(), small.pixels().unwrap());
             let covered = frame.occluder.as_deref().unwrap();
             for i in (0..covered.len()).filter(|&i| frame.mask[i] != small.mask[i]) {
@@ -312,7 +308,7 @@ mod tests {
         let config = DemoConfig { size: 32, frames: 2, eval_cameras: 1, ..DemoConfig::default() };
         let mut capture = demo(&config, &body).unwrap();
         Perturbation { mask_pixels: -40, ..Perturbation::NONE }.apply(&mut capture, &body).unwrap();
-        mend_masks(&mut capture, &body).unwrap();
+        let Mended(capture) = mend_masks(capture, &body).unwrap();
         assert_eq!(excess(&capture.train).unwrap(), 0);
         assert_eq!(excess(&[]).unwrap(), 0);
     }

@@ -7,7 +7,7 @@ use smpl::BodyModel;
 use visibility::{RayMesh, VisibilityCounts};
 
 use crate::Error;
-use crate::capture::{Capture, CaptureError, Frame, Light, PixelReader, PixelSource, Pixels};
+use crate::capture::{Capture, CaptureError, Frame, Light, PixelReader, PixelSource, Pixels, Registered};
 use crate::config::Config;
 use crate::model::body::{Body, Moment};
 use crate::model::colors::PriorColors;
@@ -67,8 +67,8 @@ pub struct Scene {
     pub train: Vec<PreparedFrame>,
     /// Evaluation frames, never seen in training.
     pub eval: Vec<PreparedFrame>,
-    /// The capture with registered bodies.
-    pub capture: Capture,
+    /// The capture with its bodies.
+    pub registered: Registered,
     /// Whether albedo and light are separated.
     pub(crate) lit: bool,
     /// Width of the masks' contaminated edge, pixels.
@@ -82,28 +82,36 @@ pub struct Scene {
 }
 
 impl Scene {
-    /// Prepares a capture with its prior.
+    /// Corrects the masks of a capture, registers its bodies, and prepares it; takes masks and bodies
+    /// as they are for `registration.rounds` of 0.
+    ///
+    /// # Errors
+    /// Those of [`Scene::prepare`].
+    pub fn new(capture: &Capture, model: &BodyModel, config: &Config) -> Result<Self, Error> {
+        config.validate()?;
+        let registered = match config.registration.rounds {
+            0 => capture.clone().into(),
+            rounds => register(mend_masks(capture.clone(), model)?, model, rounds)?,
+        };
+        Self::prepare(registered, model, config)
+    }
+
+    /// Prepares a registered capture.
     ///
     /// # Errors
     /// A configuration that is not valid; [`Error::Scene`] for a capture that cannot be trained on;
     /// pictures that cannot be read.
-    pub fn new(capture: &Capture, model: &BodyModel, config: &Config) -> Result<Self, Error> {
+    pub fn prepare(registered: Registered, model: &BodyModel, config: &Config) -> Result<Self, Error> {
         config.validate()?;
+        let Registered { capture, clothes } = &registered;
         if let Some(lost) = capture.eval.iter().find(|e| e.train_index >= capture.train.len()) {
             let (name, at, frames) = (&lost.frame.name, lost.train_index, capture.train.len());
             return Err(Error::Scene(format!("view {name} is of training frame {at}, expected one of {frames}")));
         }
-        let (clothes, vertices) = (&capture.clothes, model.num_vertices());
+        let vertices = model.num_vertices();
         if !(clothes.is_empty() || clothes.len() == vertices && clothes.iter().all(|c| c.is_finite())) {
             let found = clothes.len();
             return Err(Error::Scene(format!("clothes are {found} numbers, expected none or {vertices}, all finite")));
-        }
-        let mut capture = capture.clone();
-        if config.registration.rounds > 0 {
-            mend_masks(&mut capture, model)?;
-            if !capture.registered {
-                register(&mut capture, model, config.registration.rounds)?;
-            }
         }
         let body = Arc::new(Body::new(model, &capture.mean_betas, config)?);
         let train: Result<Vec<_>, Error> = (capture.train.par_iter().enumerate())
@@ -115,9 +123,9 @@ impl Scene {
             name: capture.name.clone(),
             train: train?,
             eval: eval?,
-            clothes: capture.clothes.iter().map(|c| c * body.scale).collect(),
+            clothes: clothes.iter().map(|c| c * body.scale).collect(),
             body,
-            capture,
+            registered,
             lit: config.field.prior_light,
             edge: 0,
             learnt: Vec::new(),

@@ -64,7 +64,7 @@ pub(super) fn load(dir: &Path, body: &BodyModel, options: &LoadOptions) -> Resul
             frames.push(EvalFrame { camera_name: camera_name.clone(), train_index, frame });
         }
     }
-    Ok(Capture::new(file_name(dir), train, frames, mean_betas))
+    Ok(Capture { name: file_name(dir), train, eval: frames, mean_betas })
 }
 
 fn index(names: &[impl AsRef<str>], name: &str) -> Option<usize> {

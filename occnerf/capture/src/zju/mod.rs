@@ -104,7 +104,7 @@ pub(super) fn load(dir: &Path, body: &BodyModel, options: &LoadOptions) -> Resul
         }
     }
     let mean_betas = checks::mean_betas(train.iter().map(|f| f.betas.as_slice()));
-    Ok(Capture::new(file_name(dir), train, eval, mean_betas))
+    Ok(Capture { name: file_name(dir), train, eval, mean_betas })
 }
 
 /// The masks that exist of a picture.

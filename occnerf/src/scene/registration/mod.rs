@@ -35,7 +35,7 @@ use self::observations::{ObservationOptions, Observations, SharedEdge, observe, 
 use self::pose_error::PoseErrorModel;
 use self::system::{NormalEquations, Prior, Solution, solve};
 use crate::Error;
-use crate::capture::{Capture, Frame};
+use crate::capture::{Capture, Frame, Mended, Registered};
 use crate::scene::seen::dressed;
 
 /// Standard deviation of shape coefficients.
@@ -101,13 +101,13 @@ struct Registration<'a> {
 ///
 /// # Errors
 /// [`Error::Scene`] for a body of more than 512 joints; pictures that cannot be read.
-pub fn register(capture: &mut Capture, model: &BodyModel, rounds: usize) -> Result<(), Error> {
+pub fn register(Mended(mut capture): Mended, model: &BodyModel, rounds: usize) -> Result<Registered, Error> {
     let joints = model.num_joints();
     if joints > MOST_JOINTS {
         let other = "`registration.rounds` of 0 leaves the prior as it is";
         return Err(Error::Scene(format!("registration: {joints} joints, at most {MOST_JOINTS}; {other}")));
     }
-    let mut registration = Registration::new(capture, model)?;
+    let mut registration = Registration::new(&capture, model)?;
     let outlines = (OUTLINES * rounds as f32) as usize;
     for round in 0..rounds {
         if round == outlines {
@@ -122,7 +122,6 @@ pub fn register(capture: &mut Capture, model: &BodyModel, rounds: usize) -> Resu
         }
     }
     let Registration { frames, corrections, betas, inverse_depth, clothes, .. } = registration;
-    capture.clothes = clothes;
     capture.mean_betas = sum(&capture.mean_betas, &betas);
     for (index, frame) in capture.train.iter_mut().enumerate() {
         let after = frames.partition_point(|&f| f <= index);
@@ -142,8 +141,7 @@ pub fn register(capture: &mut Capture, model: &BodyModel, rounds: usize) -> Resu
             view.frame.betas.clone_from(betas);
         }
     }
-    capture.registered = true;
-    Ok(())
+    Ok(Registered { capture, clothes })
 }
 
 impl<'a> Registration<'a> {

@@ -13,6 +13,10 @@ pub(super) fn frame(pose: Vec<Vec3>, placement: Placement) -> Frame {
     Frame { name: String::new(), source: pixels.into(), camera, pose, placement, betas: Vec::new() }
 }
 
+fn registered(capture: &Capture, body: &BodyModel, rounds: usize) -> Capture {
+    register(Mended(capture.clone()), body, rounds).unwrap().capture
+}
+
 fn small() -> DemoConfig {
     DemoConfig { size: 96, frames: 60, eval_cameras: 1, eval_every: 30, ..Default::default() }
 }
@@ -45,13 +49,12 @@ fn a_frame_that_the_body_is_not_in_changes_nothing_and_leaves_the_focal_length_u
         }
     };
     given.train[3].placement = aside(given.train[3].placement);
-    let mut found = given.clone();
-    register(&mut found, &body, 4).unwrap();
-    assert!(found.registered && found.train[0].placement != given.train[0].placement);
+    let found = registered(&given, &body, 4);
+    assert_ne!(found.train[0].placement, given.train[0].placement);
     assert!(found.train.iter().all(|frame| frame.pose.iter().all(|angle| angle.is_finite())));
     // The body is nowhere to be seen.
     given.train.iter_mut().for_each(|frame| frame.placement = aside(frame.placement));
-    register(&mut given, &body, 4).unwrap();
+    registered(&given, &body, 4);
 }
 
 #[test]
@@ -66,10 +69,8 @@ fn what_is_wrong_with_a_prior_is_mostly_mended_whatever_the_number_of_threads() 
         let mut given = demo(&small(), &body).unwrap();
         noise.apply(&mut given, &body).unwrap();
         let run = |threads: usize| {
-            let mut capture = given.clone();
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-            pool.install(|| register(&mut capture, &body, 8)).unwrap();
-            capture
+            pool.install(|| registered(&given, &body, 8))
         };
         let (found, again) = (run(1), run(2));
         let (before, after) = (apart(&truth, &given, &body), apart(&truth, &found, &body));
@@ -88,17 +89,16 @@ fn limbs_of_a_rig_that_are_too_long_or_too_short_are_mended() {
     let rig = BodyModel { shapedirs: Vec::new(), ..BodyModel::embedded() };
     let exact = DemoConfig { pose_noise_degrees: 0.0, translation_noise: 0.0, beta_noise: 0.0, ..small() };
     let truth = demo(&DemoConfig { size: 192, ..exact }, &rig).unwrap();
-    let mut wrong = rig.clone();
-    Perturbation { limbs_percent: 8.0, ..Perturbation::default() }.spoil_body(&mut wrong);
-    let wrong = wrong.with_limb_lengths();
-    let mut found = truth.clone();
-    register(&mut found, &wrong, 12).unwrap();
+    let mut longer = rig.clone();
+    Perturbation { limbs_percent: 8.0, ..Perturbation::default() }.spoil_body(&mut longer);
+    let longer = longer.with_limb_lengths();
+    let found = registered(&truth, &longer, 12);
     let longest = |body: &BodyModel, betas: &[f32]| -> Vec<f32> {
         let (limbs, joints) = (rig.limbs(), body.shaped(betas).joints);
         let pairs = limbs.pairs().into_iter().take(3);
         pairs.map(|j| joints[j].distance(joints[rig.parents[j].unwrap()])).collect()
     };
-    let (right, before, after) = (longest(&rig, &[]), longest(&wrong, &[]), longest(&wrong, &found.mean_betas));
+    let (right, before, after) = (longest(&rig, &[]), longest(&longer, &[]), longest(&longer, &found.mean_betas));
     let error = |lengths: &[f32]| lengths.iter().zip(&right).map(|(a, b)| (a / b - 1.0).abs()).sum::<f32>() / 3.0;
     assert!(error(&before) > 0.03 && error(&after) < 0.4 * error(&before), "{right:?} {before:?} {after:?}");
 }
@@ -110,8 +110,7 @@ fn a_wrong_depth_is_found_from_how_large_the_person_is() {
     let truth = demo(&DemoConfig { size: 192, ..exact }, &body).unwrap();
     let mut given = truth.clone();
     Perturbation { depth_percent: 3.0, ..Perturbation::default() }.apply(&mut given, &body).unwrap();
-    let mut found = given.clone();
-    register(&mut found, &body, 12).unwrap();
+    let found = registered(&given, &body, 12);
     let apart = |capture: &Capture| -> f32 {
         let root = |frame: &Frame| body.pose(&body.shaped(&frame.betas), &frame.pose, frame.placement).joints[0];
         let each = truth.train.iter().zip(&capture.train).map(|(a, b)| root(a).distance_squared(root(b)));
@@ -125,8 +124,7 @@ fn a_right_prior_stays_as_it_is() {
     let body = BodyModel::embedded();
     let exact = DemoConfig { pose_noise_degrees: 0.0, translation_noise: 0.0, beta_noise: 0.0, ..small() };
     let truth = demo(&exact, &body).unwrap();
-    let mut found = truth.clone();
-    register(&mut found, &body, 8).unwrap();
+    let found = registered(&truth, &body, 8);
     let moved = apart(&truth, &found, &body);
     assert!(moved < 0.4, "{moved} pixels");
 }
@@ -138,8 +136,7 @@ fn nothing_is_changed_where_nothing_is_seen() {
     for frame in &mut given.train {
         frame.source.edit(|pixels| pixels.mask.fill(0.0));
     }
-    let mut found = given.clone();
-    register(&mut found, &body, 3).unwrap();
+    let found = registered(&given, &body, 3);
     assert!(apart(&given, &found, &body) < 1e-3);
 }
 
@@ -197,11 +194,11 @@ fn a_wrong_focal_length_is_mostly_mended_where_no_other_camera_says_what_it_is()
             frame.placement = rescaled(frame.placement, root_depth(frame, &body).unwrap(), 1.0 / factor);
             frame.camera.focal *= factor;
         }
-        register(&mut given, &body, 12).unwrap();
-        let (found, true_focal) = (given.train[0].camera.focal.x, truth.train[0].camera.focal.x);
+        let registered = registered(&given, &body, 12);
+        let (found, true_focal) = (registered.train[0].camera.focal.x, truth.train[0].camera.focal.x);
         let left = (true_focal / found - 1.0).abs() / (factor.recip() - 1.0).abs();
         assert!(left < most, "{factor}: {found} for {true_focal}");
-        assert!(given.train.iter().all(|f| f.camera.focal.x == found));
+        assert!(registered.train.iter().all(|f| f.camera.focal.x == found));
     }
 }
 
