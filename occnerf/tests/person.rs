@@ -7,8 +7,10 @@ use std::path::Path;
 
 use common::{TempDir, body, capture, config, scene};
 use glam::Vec3;
+use occnerf::capture::{Mended, Registered};
 use occnerf::{
     Error, FieldRenderer, Method, Model, MotionKind, Person, PriorColors, PriorRenderer, Renderer, Scene, Trainer,
+    mend_masks,
 };
 use smpl::BodyModel;
 
@@ -23,7 +25,7 @@ fn trained(run: &Path, change: impl Fn(&mut occnerf::Config)) -> Model {
     for _ in 0..6 {
         trainer.step().unwrap();
     }
-    Person::save(run, &scene().capture, body(), &PriorColors::measure(scene()).unwrap()).unwrap();
+    Person::save(run, &scene().registered, body(), &PriorColors::measure(scene()).unwrap()).unwrap();
     trainer.save(&run.join(CHECKPOINT)).unwrap();
     trainer.into_model()
 }
@@ -63,41 +65,37 @@ fn a_capture_gets_the_bodies_that_a_run_was_trained_with() {
     config.registration.rounds = 3;
     let given = capture();
     let scene = Scene::new(&given, body(), &config).unwrap();
-    assert!(scene.capture.registered && scene.capture.train[0].placement != given.train[0].placement);
-    Person::save(&dir.path(""), &scene.capture, body(), &PriorColors::measure(&scene).unwrap()).unwrap();
-    let mut restored = given.clone();
-    assert!(Person::restore(&dir.path(""), &mut restored, body()).unwrap());
-    assert!(restored.clothes == scene.capture.clothes && restored.clothes.iter().any(|&c| c != 0.0));
-    let again = Scene::new(&restored, body(), &config).unwrap();
+    assert_ne!(scene.registered.capture.train[0].placement, given.train[0].placement);
+    Person::save(&dir.path(""), &scene.registered, body(), &PriorColors::measure(&scene).unwrap()).unwrap();
+    let mended = mend_masks(given.clone(), body()).unwrap();
+    let restored = Person::restore(&dir.path(""), mended.clone(), body()).unwrap().unwrap();
+    assert!(restored.clothes == scene.registered.clothes && restored.clothes.iter().any(|&c| c != 0.0));
+    let again = Scene::prepare(restored.clone(), body(), &config).unwrap();
     assert_eq!(again.colors().unwrap(), scene.colors().unwrap());
-    let mut bare = restored.clone();
-    bare.clothes = vec![0.0];
-    let refused = Scene::new(&bare, body(), &config).err().map(|e| e.to_string());
+    let bare = Registered { clothes: vec![0.0], ..restored.clone() };
+    let refused = Scene::prepare(bare, body(), &config).err().map(|e| e.to_string());
     assert!(refused.is_some_and(|e| e.contains("clothes are 1 numbers")));
     for (a, b) in scene.train.iter().chain(&scene.eval).zip(again.train.iter().chain(&again.eval)) {
         assert_eq!((&a.view.posed, &a.labels), (&b.view.posed, &b.labels));
     }
     // A run of before a body had as many shapes goes on.
     let more = BodyModel { shapedirs: [&body().shapedirs[..]; 2].concat(), ..body().clone() };
-    let mut with_more = given.clone();
-    assert!(Person::restore(&dir.path(""), &mut with_more, &more).unwrap());
-    assert_eq!(with_more.mean_betas, restored.mean_betas);
+    let with_more = Person::restore(&dir.path(""), mended.clone(), &more).unwrap().unwrap();
+    assert_eq!(with_more.capture.mean_betas, restored.capture.mean_betas);
     let fewer = BodyModel { shapedirs: Vec::new(), ..body().clone() };
-    let error = Person::restore(&dir.path(""), &mut given.clone(), &fewer).unwrap_err().to_string();
+    let error = Person::restore(&dir.path(""), mended.clone(), &fewer).unwrap_err().to_string();
     assert!(error.contains("person.safetensors") && error.contains("betas"), "{error}");
-    let again = Scene::new(&with_more, &more, &config).unwrap();
+    let again = Scene::prepare(with_more, &more, &config).unwrap();
     assert_eq!(again.train[0].view.posed, scene.train[0].view.posed);
     // A capture of other frames is another.
     let (mut other, mut larger) = (given.clone(), given.clone());
     other.train.pop();
     larger.train[1].camera = larger.train[1].camera.resized(99, 98);
     for (capture, words) in [(other, "frames, the capture has"), (larger, "the capture in (99, 98)")] {
-        let mut kept = capture.clone();
-        let error = Person::restore(&dir.path(""), &mut kept, body()).unwrap_err().to_string();
+        let error = Person::restore(&dir.path(""), Mended(capture), body()).unwrap_err().to_string();
         assert!(error.contains(PERSON) && error.contains(words), "{error}");
-        assert!(!kept.registered && kept.train[0].placement == capture.train[0].placement);
     }
-    assert!(!Person::restore(&dir.path("elsewhere"), &mut given.clone(), body()).unwrap());
+    assert!(Person::restore(&dir.path("elsewhere"), mended, body()).unwrap().is_none());
 }
 
 #[test]
@@ -108,7 +106,7 @@ fn a_run_goes_on_with_the_colours_that_it_began_with() {
     // As runs of before colours lay between the vertices have them, and without the header's line.
     let began = PriorColors::of_vertices(vec![Vec3::X; body().num_vertices()], &body().faces);
     assert_ne!(began.colors, fresh.colors);
-    Person::save(&run, &scene().capture, body(), &began).unwrap();
+    Person::save(&run, &scene().registered, body(), &began).unwrap();
     let mut bytes = std::fs::read(run.join(PERSON)).unwrap();
     let at = bytes.windows(12).position(|w| w == b"subdivisions").unwrap();
     bytes[at] = b'x';
@@ -128,7 +126,7 @@ fn the_prior_of_a_run_draws_the_same_bits_too() {
     let dir = TempDir::new("person-prior");
     let colors = PriorColors::measure(scene()).unwrap();
     let run = dir.path("");
-    Person::save(&run, &scene().capture, body(), &colors).unwrap();
+    Person::save(&run, &scene().registered, body(), &colors).unwrap();
     let person = Person::load(&run, &config(Method::Prior)).unwrap();
     assert_eq!((person.scene.as_str(), &person.colors), (scene().name.as_str(), &colors));
     let view = &scene().train[1].view;

@@ -1,4 +1,4 @@
-//! The baked person of a run, and what else it can do.
+//! The avatar of a run for export, with additional motion clips.
 
 use std::path::{Path, PathBuf};
 
@@ -33,7 +33,7 @@ pub fn add_motion(avatar: &mut Avatar, path: &Path) -> Result<()> {
     Ok(())
 }
 
-/// Errors unless the folder that `out` is to lie in exists.
+/// Errors unless the parent folder of `out` exists.
 pub fn check_folder(out: &Path) -> Result<()> {
     let folder = match out.parent() {
         Some(parent) if parent != Path::new("") => parent.to_owned(),

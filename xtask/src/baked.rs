@@ -1,4 +1,4 @@
-//! A run's person as an avatar, baked when it is first asked for.
+//! The avatar of a run, baked on first use.
 
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
@@ -13,12 +13,12 @@ use crate::run::{CHECKPOINT, RunConfig};
 /// The avatar's file in a run directory.
 pub const AVATAR: &str = "avatar.safetensors";
 
-/// Where the avatar of a run lies.
+/// Path of the avatar of a run.
 pub fn path(run: &Path) -> PathBuf {
     run.join(AVATAR)
 }
 
-/// The avatar in a run's directory, unless there is none or the checkpoint is newer.
+/// The saved avatar of a run, unless the checkpoint is newer.
 pub fn fresh(run: &Path) -> Result<Option<Avatar>> {
     let written = |path: PathBuf| -> Option<SystemTime> { path.metadata().ok()?.modified().ok() };
     let (avatar, checkpoint) = (written(path(run)), written(run.join(CHECKPOINT)));
@@ -26,8 +26,8 @@ pub fn fresh(run: &Path) -> Result<Option<Avatar>> {
     Ok(if fresh { Some(Avatar::load(&path(run))?) } else { None })
 }
 
-/// The avatar of a run: that in its directory where it is not older than the checkpoint, else
-/// baked, and written there. Baking looks at the capture again, where it is still to be had.
+/// The saved avatar of a run if [`fresh`], else baked and saved. Baking uses the capture if it is
+/// still available.
 pub fn avatar(run: &Path, model: &Model) -> Result<Avatar> {
     if let Some(avatar) = fresh(run)? {
         return Ok(avatar);

@@ -1,4 +1,4 @@
-//! `--capacity auto`: sizes from the scene before training, pruning after it, and both on record.
+//! `--capacity auto`: model sizes from the scene, pruning after training, and their record.
 
 use std::path::Path;
 
@@ -11,7 +11,7 @@ use crate::process::{note, say, unwritten};
 use crate::run::write;
 use crate::source::Source;
 
-/// What was measured, chosen and pruned, in a run directory.
+/// Record in a run directory.
 pub const FILE: &str = "capacity.json";
 
 /// Sizes of the model.
@@ -23,7 +23,7 @@ pub enum CapacityName {
     Auto,
 }
 
-/// What a scene needs, starting from `config`; sizes that `set` names stay as they are.
+/// Capacity of a scene, relative to `config`; sizes named by `set` are kept.
 pub fn measure(source: &Source, config: &Config, set: &[String]) -> Result<Capacity> {
     if config.method == Method::Prior {
         bail!("--capacity auto: the prior has no sizes to choose");
@@ -37,8 +37,7 @@ fn of_scene(scene: &Scene, config: &Config, set: &[String]) -> Result<Capacity, 
     Ok(capacity)
 }
 
-/// The sizes that a new run takes from its scene, if any: where nothing is `asked`, those that the
-/// scene needs more of than its preset has.
+/// Sizes of a new run from its scene, if any; by default, only those above its preset's.
 pub fn choose(
     source: &Source,
     config: &Config,
@@ -50,7 +49,7 @@ pub fn choose(
     match asked {
         Some(CapacityName::Auto) => measure(source, config, set).map(Some),
         None if !own => {
-            // Nobody asked: what cannot be measured is trained with the preset's sizes.
+            // By default, a failed measurement falls back to the preset.
             let measured = of_scene(&source.scene(config)?, config, set);
             let capacity = measured.map_err(|error| note!("warning: the preset's sizes are kept: {error}"));
             Ok(capacity.ok().map(Capacity::growth).filter(|capacity| !capacity.choices.is_empty()))
@@ -59,7 +58,7 @@ pub fn choose(
     }
 }
 
-/// That of a run whose sizes were chosen; `None` for one with its preset's.
+/// Record of a run; `None` for preset sizes.
 pub fn read(directory: &Path) -> Result<Option<Capacity>> {
     let path = directory.join(FILE);
     if !path.is_file() {
@@ -69,8 +68,7 @@ pub fn read(directory: &Path) -> Result<Option<Capacity>> {
     serde_json::from_str(&text).map(Some).with_context(|| path.display().to_string())
 }
 
-/// Writes what was chosen into the directory of a new run, or sees to it that nothing is said to
-/// have been.
+/// Writes the record of a new run, or removes an old one.
 pub fn begin(directory: &Path, chosen: Option<&Capacity>) -> Result<()> {
     let path = directory.join(FILE);
     match chosen {
@@ -80,12 +78,12 @@ pub fn begin(directory: &Path, chosen: Option<&Capacity>) -> Result<()> {
     }
 }
 
-/// Writes it into a run directory.
+/// Writes the record.
 pub fn save(directory: &Path, capacity: &Capacity) -> Result<()> {
     write(&directory.join(FILE), &serde_json::to_string_pretty(capacity)?)
 }
 
-/// Checks what is asked of a run that goes on against what it was begun with.
+/// Checks the option of a resumed run against its record.
 pub fn resumed(directory: &Path, asked: Option<CapacityName>) -> Result<Option<Capacity>> {
     let capacity = read(directory)?;
     let begun = if capacity.is_some() { CapacityName::Auto } else { CapacityName::Preset };
@@ -95,7 +93,7 @@ pub fn resumed(directory: &Path, asked: Option<CapacityName>) -> Result<Option<C
     Ok(capacity)
 }
 
-/// Prunes a trained run whose sizes were chosen, saves it and says what that gave.
+/// Prunes and saves a trained run with a record.
 pub fn prune(directory: &Path, trainer: &mut Trainer<'_>, checkpoint: &Path) -> Result<()> {
     let Some(mut capacity) = read(directory)? else { return Ok(()) };
     let pruned = trainer.prune();

@@ -1,4 +1,4 @@
-//! `check`: whether a capture's body lies on its person, before anything is trained.
+//! `check`: validates the fit of a capture before training.
 
 use std::path::{Path, PathBuf};
 
@@ -51,7 +51,7 @@ impl CheckArguments {
 /// Runs the command.
 pub fn check(arguments: &CheckArguments) -> Result<()> {
     let mut load = arguments.load.options()?;
-    // A camera that sees nothing of the body is what is to be explained.
+    // A camera without the body in view is to be diagnosed, not refused.
     load.unseen = true;
     let source = source::load(arguments.scene.as_deref(), arguments.body.as_deref(), &load)?;
     let found = occnerf::check(&source.capture, &source.model)?;

@@ -30,8 +30,7 @@ enum Command {
     View(view::ViewArguments),
     /// Makes a capture of a video from what a body estimator and a segmenter wrote.
     Import(import::ImportArguments),
-    /// Tells whether a capture's body lies on its person: a picture, a table, and the mistakes that
-    /// are likely.
+    /// Checks that a capture's body lies on its person: a picture, a table, and likely mistakes.
     Check(check::CheckArguments),
     /// Converts a body model, .npz or .pkl, to .safetensors.
     Convert(convert::ConvertArguments),

@@ -1,4 +1,4 @@
-//! `convert`: body models to the form that loads quickly.
+//! `convert`: body models to `.safetensors`.
 
 use std::path::PathBuf;
 
@@ -8,7 +8,7 @@ use smpl::BodyModel;
 
 use crate::process::{results_in, say};
 
-/// What to convert, and where to.
+/// Arguments of `convert`.
 #[derive(Args)]
 pub struct ConvertArguments {
     /// The body model: .npz, or .pkl as SMPL is released (read as data, never executed).

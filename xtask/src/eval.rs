@@ -1,4 +1,4 @@
-//! `eval`: scores a run on frames that training did not see, or on those it saw.
+//! `eval`: metrics of a run on evaluation and training frames.
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -23,9 +23,9 @@ use crate::run::{
 };
 use crate::{baked, pictures, report, table};
 
-/// Training frames are many and alike: every tenth is scored.
+/// Stride of scored training frames.
 const TRAIN_STRIDE: usize = 10;
-/// Pictures of a sheet: one row a camera, so many instants.
+/// Instants of a contact sheet with one row a camera.
 const SHEET_INSTANTS: usize = 3;
 /// Training frames on their sheet.
 const TRAIN_PICTURES: usize = 5;
@@ -72,7 +72,7 @@ pub struct EvalArguments {
     threads: Option<usize>,
 }
 
-/// What is known of a run before it is scored.
+/// Metrics of a run before scoring.
 pub fn unscored(run: &RunConfig, drawn: &Drawn<'_>, train_seconds: f64) -> Metrics {
     let config = &run.train;
     let (steps, parameters, perceptual) = match drawn {
@@ -126,7 +126,7 @@ pub fn eval(arguments: &EvalArguments) -> Result<()> {
         let Metrics { steps, train_seconds, .. } = metrics;
         metrics = Metrics::read(directory)?;
         if metrics.steps != steps {
-            // Training has gone on since it was last scored.
+            // Trained further since the last scores.
             (metrics.steps, metrics.train_seconds) = (steps, train_seconds);
         }
     }
@@ -142,7 +142,7 @@ pub fn eval(arguments: &EvalArguments) -> Result<()> {
             let scores = drawn.score_with_bar(&scene, split, lpips.as_ref(), side, |_, _| {})?;
             *split.of(&mut metrics.splits) = (!empty).then_some(scores);
         } else if let Some(scores) = split.of(&mut metrics.splits).as_mut().filter(|s| s.lpips_full.is_some()) {
-            // One name stands for both splits: what another network measured goes.
+            // One network name holds for both splits; scores of another are dropped.
             match &network {
                 Some(network) if metrics.lpips.as_ref() != Some(network) => scores.lpips_full = None,
                 _ => network = metrics.lpips.clone(),
@@ -166,7 +166,7 @@ pub fn eval(arguments: &EvalArguments) -> Result<()> {
 }
 
 fn scored_train_frames(scene: &Scene) -> impl Iterator<Item = &PreparedFrame> {
-    // Of frames that are held out nothing is known that could be scored.
+    // Held-out frames have unknown pixels only.
     let known = |frame: &&PreparedFrame| frame.labels.iter().any(|label| label != Label::Unknown);
     scene.train.iter().filter(known).step_by(TRAIN_STRIDE)
 }
@@ -176,8 +176,7 @@ pub fn scored_frames(scene: &Scene) -> impl Iterator<Item = &PreparedFrame> {
     scene.eval.iter().chain(scored_train_frames(scene))
 }
 
-/// Reads every picture that a run is scored on, as those that are not kept in memory have not been
-/// read yet.
+/// Reads every picture of the scored frames, which may be on disk only.
 pub fn check_pictures(scene: &Scene) -> Result<()> {
     let frames: Vec<&PreparedFrame> = scored_frames(scene).collect();
     // Collected as results first, so that the error reported is the first in order whatever
@@ -186,7 +185,7 @@ pub fn check_pictures(scene: &Scene) -> Result<()> {
     Ok(read.into_iter().collect::<Result<(), _>>()?)
 }
 
-/// What can be scored and drawn.
+/// A model to score and render.
 pub enum Drawn<'a> {
     /// The field of a trained model.
     Field {
@@ -197,17 +196,17 @@ pub enum Drawn<'a> {
     },
     /// The posed prior in mean colours.
     Prior(PriorColors),
-    /// As `render --baked` draws them.
+    /// The baked avatar.
     Baked {
-        /// The model that was baked.
+        /// The model.
         model: &'a Model,
-        /// What was baked of it.
+        /// Its avatar.
         avatar: &'a Avatar,
     },
 }
 
 impl Drawn<'_> {
-    /// Something that draws it.
+    /// Its renderer.
     pub fn renderer<'s>(&'s self, scene: &'s Scene) -> Result<Box<dyn Renderer + 's>> {
         Ok(match self {
             Self::Field { model, .. } => Box::new(FieldRenderer::new(model)?),
@@ -301,7 +300,7 @@ pub fn score_run(
     draw(directory, cameras, row).and_then(|()| report::write(directory, &metrics)).or_else(|error| {
         match error.downcast_ref::<Ending>() {
             Some(_) => Err(error),
-            // The scores are there: what cannot be drawn is no reason to end in an error.
+            // The scores are saved; failed pictures are a warning.
             None => {
                 note!("warning: not all was drawn: {}", one_line(&error));
                 Ok(())
@@ -311,9 +310,8 @@ pub fn score_run(
     Ok(metrics)
 }
 
-/// Bakes a trained person, and scores them under `directory` as [`score_run`] does: seconds are
-/// those of `trained`, the run's own, and of baking; parameters are the colours of the texels and
-/// the places of the vertices.
+/// Bakes a trained person and scores it under `directory` as [`score_run`] does. Baking time adds to
+/// the seconds of `trained`, the run's own metrics; parameters are texel colours and vertices.
 pub fn score_baked(
     directory: &Path,
     run: &RunConfig,

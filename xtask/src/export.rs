@@ -1,4 +1,4 @@
-//! `export`: a trained person in the forms that other programs open.
+//! `export`: a trained person in standard formats.
 
 use std::io::Write;
 use std::path::PathBuf;
@@ -11,7 +11,7 @@ use occnerf::replace_file;
 use crate::avatar;
 use crate::process::{results_in, say, unwritten};
 
-/// Largest edge of the triangles that a splat stands for, in metres.
+/// Largest triangle edge of a splat, metres.
 const PATCH: f32 = 0.009;
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]

@@ -1,6 +1,6 @@
-//! HTML that the pages have in common.
+//! HTML escaping.
 
-/// Text as text, wherever it comes from.
+/// Escapes text for HTML.
 pub fn escape(text: &str) -> String {
     let mut out = String::with_capacity(text.len());
     for c in text.chars() {

@@ -1,4 +1,4 @@
-//! `import`: a capture from what a body estimator and a segmenter wrote.
+//! `import`: a capture from the results of a body estimator and a segmenter.
 
 use std::path::PathBuf;
 
@@ -10,12 +10,12 @@ use crate::check::{self, CheckArguments};
 use crate::place::{beside, not_within, take_place, vacant};
 use crate::process::{results_in, say};
 
-/// What a finished directory holds, and nothing else does.
+/// Marker of a finished directory.
 const MARK: &str = "import.json";
 /// Environment variable that names a body model.
 const BODY_VARIABLE: &str = "SMPL_MODEL";
 
-/// Where each tool leaves its file.
+/// Output paths of each tool.
 const TOOLS: &str = "\
 Run one estimator and one segmenter as their own pages say, on the same frames (ffmpeg -i clip.mp4 frames/%06d.png).
 
@@ -39,7 +39,7 @@ Run one estimator and one segmenter as their own pages say, on the same frames (
 
 Then: cargo xtask train CAPTURE";
 
-/// What to read, and where to write.
+/// Arguments of `import`.
 #[derive(Args)]
 #[command(after_long_help = TOOLS, after_help = "--help says where each tool leaves its file")]
 pub struct ImportArguments {
@@ -79,7 +79,7 @@ pub struct ImportArguments {
     force: bool,
 }
 
-/// Runs the command: everything is written beside --out and takes its place when it is complete.
+/// Runs the command; --out is replaced once complete.
 pub fn import(arguments: &ImportArguments) -> Result<()> {
     let out = &arguments.out;
     vacant(out, arguments.force, MARK)?;
@@ -125,7 +125,7 @@ pub fn import(arguments: &ImportArguments) -> Result<()> {
     Ok(())
 }
 
-/// What was imported, and what was left out.
+/// Prints a summary of an import.
 fn say(imported: &Imported) {
     let Imported { tool, person, frames, video_frames, focal, masks, betas_spread, .. } = imported;
     say!("{}: person {person}, {frames} of {video_frames} frames, focal length {focal:.1} px", tool.name());

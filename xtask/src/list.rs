@@ -13,8 +13,8 @@ use crate::{source, table};
 /// Longest list that is read.
 const MAX_BYTES: u64 = 16 << 20;
 
-/// Trains the scenes of the list that are this job's, under OUT/SCENE; `--merge` makes the table.
-/// What is wrong with a scene is said and the others go on; it is an error at the end.
+/// Trains this job's scenes of the list under OUT/SCENE; `--merge` makes the table. A failed scene is
+/// reported, and is an error after all others.
 pub fn train_list(arguments: &TrainArguments) -> Result<()> {
     use_threads(arguments.threads)?;
     let lpips = load_lpips(arguments.lpips.as_deref())?;

@@ -1,16 +1,16 @@
-//! The network of LPIPS, where `--lpips` names one.
+//! The LPIPS network of `--lpips`.
 
 use std::path::Path;
 
 use anyhow::Result;
 use occnerf::Lpips;
 
-/// The network that `--lpips` names.
+/// Loads the network.
 pub fn load_lpips(path: Option<&Path>) -> Result<Option<Lpips>> {
     Ok(path.map(Lpips::load).transpose()?)
 }
 
-/// Its name, as metrics.json has it.
+/// Its name in metrics.json.
 pub fn network_name(lpips: Option<&Lpips>) -> Option<String> {
     lpips.map(|lpips| lpips.name().to_owned())
 }

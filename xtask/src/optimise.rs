@@ -1,4 +1,4 @@
-//! The steps of a run: log, bar and checkpoints, and going on where any of these fails.
+//! The optimisation loop of a run, with log, progress bar and checkpoints.
 
 use std::fs::File;
 use std::io::{IsTerminal, Write};
@@ -15,10 +15,10 @@ use crate::process::{Ending, Guard, note, one_line, unwritten};
 use crate::run::{self, CHECKPOINT, LOG};
 
 const LOG_EVERY: u64 = 10;
-/// Without a terminal the progress is a line this often.
+/// Interval of progress lines without a terminal.
 const LINE_EVERY: Duration = Duration::from_secs(15);
 
-/// How much may be lost.
+/// Checkpoint interval.
 #[derive(Args, Clone, Copy, Debug)]
 pub struct SavingArguments {
     /// Save a checkpoint every so many seconds: no more is lost, whatever ends the program
@@ -35,31 +35,29 @@ impl SavingArguments {
     }
 }
 
-/// How a run is gone about this time.
+/// Options of one invocation, not stored with the run.
 #[derive(Clone, Copy, Debug)]
-pub struct Sitting {
-    /// Whether it goes on from its checkpoint, if it has one.
+pub struct RunOptions {
+    /// Whether to continue from the checkpoint, if there is one.
     pub resume: bool,
-    /// Steps in all after which it stops early.
+    /// Total steps after which to stop early.
     pub stop_after: Option<u64>,
-    /// Time between two checkpoints.
+    /// Checkpoint interval.
     pub interval: Duration,
-    /// Whether a picture shows how far the person is.
+    /// Whether to write preview pictures.
     pub preview: bool,
 }
 
-/// Takes steps until the end or `stop_after`, with a log, a bar and checkpoints; returns seconds of
-/// training, those of earlier sittings included. A log or a periodic checkpoint that cannot be
-/// written is tried again later.
+/// Takes steps until the end or `stop_after`; returns seconds of training, earlier invocations
+/// included. A failed write of the log or of a periodic checkpoint is retried later.
 ///
 /// # Errors
-/// Of a step, after saving what was learnt; [`Ending::Unwritten`] where the last checkpoint cannot
-/// be written; [`Ending::Stopped`] where a signal came, after saving; a training that has diverged,
-/// which replaces no checkpoint.
-pub fn optimise(directory: &Path, trainer: &mut Trainer<'_>, sitting: &Sitting) -> Result<f64> {
+/// Of a step, after saving; [`Ending::Unwritten`] for the last checkpoint; [`Ending::Stopped`] after
+/// a signal and saving; a diverged training, which replaces no checkpoint.
+pub fn optimise(directory: &Path, trainer: &mut Trainer<'_>, options: &RunOptions) -> Result<f64> {
     let guard = Guard::begin();
     let total = trainer.model().config().steps;
-    let end = sitting.stop_after.unwrap_or(total).min(total);
+    let end = options.stop_after.unwrap_or(total).min(total);
     let earlier = earlier_log(&directory.join(LOG), trainer.steps_done())?;
     let mut log = Log::begin(directory.join(LOG), &earlier.text)?;
     let bar = ProgressBar::new(total);
@@ -69,7 +67,7 @@ pub fn optimise(directory: &Path, trainer: &mut Trainer<'_>, sitting: &Sitting) 
     bar.reset_eta();
     let checkpoint = directory.join(CHECKPOINT);
     let (start, mut saved, mut lined) = (Instant::now(), Instant::now(), Instant::now());
-    let mut preview = sitting.preview.then(|| Preview::new(directory));
+    let mut preview = options.preview.then(|| Preview::new(directory));
     let (mut smooth, mut bad, mut restarts) = (None::<StepReport>, 0, None);
     while trainer.steps_done() < end && guard.signal().is_none() {
         let report = match trainer.step() {
@@ -85,7 +83,7 @@ pub fn optimise(directory: &Path, trainer: &mut Trainer<'_>, sitting: &Sitting) 
             }
         };
         bad += report.bad_gradients;
-        if restarts.replace(report.restarts).is_some_and(|before| before < report.restarts) {
+        if restarts.replace(report.restarts).is_some_and(|previous| previous < report.restarts) {
             let said = format!("step {}: nothing was left of the person", report.step);
             bar.suspend(|| note!("{said}; begun anew at a tenth of the learning rates"));
         }
@@ -116,7 +114,7 @@ pub fn optimise(directory: &Path, trainer: &mut Trainer<'_>, sitting: &Sitting) 
             bar.suspend(|| note!("warning: {}; training goes on without a preview", one_line(&error)));
             preview = None;
         }
-        if saved.elapsed() >= sitting.interval && report.step < end {
+        if saved.elapsed() >= options.interval && report.step < end {
             if let Err(error) = save(trainer, &checkpoint) {
                 if diverged(&error) {
                     bar.abandon();
@@ -152,7 +150,7 @@ pub fn optimise(directory: &Path, trainer: &mut Trainer<'_>, sitting: &Sitting) 
 /// Writes the checkpoint.
 ///
 /// # Errors
-/// [`Ending::Unwritten`]; a training that has diverged, with what there is to go on from.
+/// [`Ending::Unwritten`]; a diverged training, with the kept checkpoint.
 pub fn save(trainer: &Trainer<'_>, checkpoint: &Path) -> Result<()> {
     trainer.save(checkpoint).map_err(|error| match error {
         occnerf::Error::Io { path, source } => unwritten(&path)(source),
@@ -170,19 +168,19 @@ fn diverged(error: &Error) -> bool {
     error.chain().any(of_ours)
 }
 
-/// train.jsonl, which never ends in half a line for long.
+/// Writer of train.jsonl in whole lines.
 struct Log {
     path: PathBuf,
     file: File,
-    /// Bytes that are whole lines.
+    /// Bytes of whole lines.
     length: u64,
-    /// Lines that could not be written yet.
+    /// Lines to be written.
     pending: String,
     told: bool,
 }
 
 impl Log {
-    /// Begins with the lines of earlier sittings.
+    /// Starts with the lines of earlier invocations.
     fn begin(path: PathBuf, earlier: &str) -> Result<Self> {
         run::write(&path, earlier)?;
         let file = File::options().append(true).open(&path).map_err(unwritten(&path))?;
@@ -194,7 +192,7 @@ impl Log {
         self.flush(bar);
     }
 
-    /// Writes what is pending, or nothing of it, and says the first time that it cannot.
+    /// Writes all pending lines or none; warns at the first failure.
     fn flush(&mut self, bar: &ProgressBar) {
         match self.file.write_all(self.pending.as_bytes()) {
             Ok(()) => {
@@ -211,8 +209,7 @@ impl Log {
     }
 }
 
-/// Seconds of training that the first `steps` steps of the run in `directory` took, as far as its
-/// log knows.
+/// Training time of the first `steps` steps of a run by its log, seconds.
 pub fn logged_seconds(directory: &Path, steps: u64) -> Result<f64> {
     Ok(earlier_log(&directory.join(LOG), steps)?.seconds)
 }
@@ -223,7 +220,7 @@ struct EarlierLog {
     steps: u64,
 }
 
-/// The log up to the checkpoint; lines of steps that the checkpoint does not hold are dropped.
+/// The log up to the checkpoint's step.
 fn earlier_log(path: &Path, steps: u64) -> Result<EarlierLog> {
     let mut log = EarlierLog { text: String::new(), seconds: 0.0, steps };
     if steps == 0 || !path.exists() {
@@ -241,7 +238,7 @@ fn earlier_log(path: &Path, steps: u64) -> Result<EarlierLog> {
     Ok(log)
 }
 
-/// A running mean over about fifty steps.
+/// Exponential moving average over about fifty steps.
 fn blend(mean: Option<StepReport>, new: StepReport) -> StepReport {
     let Some(old) = mean else { return new };
     let mix = |old: f64, new: f64| old + 0.02 * (new - old);

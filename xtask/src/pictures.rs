@@ -11,7 +11,7 @@ use occnerf::capture::Image;
 
 use crate::process::unwritten;
 
-/// Pixels of a sheet: 96 MiB in memory, and less than what a reader of pictures takes for a bomb.
+/// Most pixels of a sheet: 96 MiB in memory, below the limits of image readers.
 pub const MAX_SHEET_PIXELS: u64 = 1 << 25;
 /// Gap between the cells of a sheet in pixels.
 const GAP: u32 = 4;
@@ -24,14 +24,13 @@ pub fn to_rgb(image: &Image) -> RgbImage {
     })
 }
 
-/// A picture with `coverage` (H × W) composited over grey, so that dark clothes and empty space
-/// differ.
+/// A premultiplied picture composited over grey by its `coverage` (H × W).
 pub fn over_grey(pixels: &[f32], coverage: &[f32], width: u32, height: u32) -> RgbImage {
     let over = pixels.chunks_exact(3).zip(coverage).flat_map(|(p, &m)| p.iter().map(move |c| c + (1.0 - m) * 0.35));
     to_rgb(&Image { width, height, pixels: over.collect() })
 }
 
-/// The picture with at most `most` pixels, of the same shape.
+/// Downsamples a picture to at most `most` pixels.
 pub fn reduced(picture: RgbImage, most: u64) -> RgbImage {
     let (width, height) = picture.dimensions();
     let scale = (most as f64 / (f64::from(width) * f64::from(height))).sqrt();
@@ -63,7 +62,7 @@ pub fn captioned(sheet: &RgbImage, names: &[&str]) -> Result<RgbImage> {
     const STRIP: u32 = 20;
     /// Largest height of a line of text in pixels.
     const LARGEST: f32 = 14.0;
-    // Systems may have no font.
+    // Embedded; systems may have no font.
     let font = FontRef::try_from_slice(dejavu::sans::regular())?;
     let advance = |c: char| font.as_scaled(LARGEST).h_advance(font.glyph_id(c));
     let column = (sheet.width() - GAP) as f32 / names.len().max(1) as f32;
@@ -92,8 +91,8 @@ pub fn captioned(sheet: &RgbImage, names: &[&str]) -> Result<RgbImage> {
     Ok(out)
 }
 
-/// The pictures of a [`sheet`], told apart by its white gaps; a sheet whose pictures are of unequal
-/// sizes, or white where they begin, comes apart otherwise.
+/// The pictures of a [`sheet`], separated at its white gaps. Assumes equal sizes and edges that are
+/// not white.
 pub fn cells(sheet: &RgbImage) -> Vec<Vec<RgbImage>> {
     let white = |x, y| sheet.get_pixel(x, y).0 == [255; 3];
     let column = |x| (0..sheet.height()).all(|y| white(x, y));
@@ -119,7 +118,7 @@ pub fn save(picture: &RgbImage, path: &Path) -> Result<()> {
     replace(path, |to| picture.write_to(to, ImageFormat::Png))
 }
 
-/// Replaces a file by what `encode` writes.
+/// Replaces a file atomically by the output of `encode`.
 fn replace(path: &Path, encode: impl FnOnce(&mut BufWriter<File>) -> ImageResult<()>) -> Result<()> {
     let mut failed = None;
     let written = occnerf::replace_file(path, |to| match encode(to) {

@@ -1,4 +1,4 @@
-//! Folders that are written beside their place and take it when they are complete.
+//! Atomic replacement of folders.
 
 use std::path::{Path, PathBuf};
 
@@ -6,8 +6,7 @@ use anyhow::{Result, bail, ensure};
 
 use crate::process::unwritten;
 
-/// Errors unless `out` may be written: absent, empty, or an earlier result of the command that
-/// leaves `mark`, to be replaced.
+/// Errors unless `out` is absent, empty, or with `force` an earlier result marked by the file `mark`.
 pub fn vacant(out: &Path, force: bool, mark: &str) -> Result<()> {
     let Ok(entries) = std::fs::read_dir(out) else {
         ensure!(!out.exists(), "{}: not a directory", out.display());
@@ -22,21 +21,19 @@ pub fn vacant(out: &Path, force: bool, mark: &str) -> Result<()> {
     Ok(())
 }
 
-/// Errors for something to read that lies in `out`, which goes where `out` is written anew.
+/// Errors for an input within `out`, which is replaced.
 pub fn not_within(path: &Path, out: &Path, what: &str) -> Result<()> {
     let (Ok(path), Ok(out)) = (path.canonicalize(), out.canonicalize()) else { return Ok(()) };
     ensure!(!path.starts_with(&out), "{}: lies in --out, which is replaced ({what})", path.display());
     Ok(())
 }
 
-/// Puts the complete directory `partial` where `out` is, an earlier result of the command that leaves
-/// `mark`, if anything.
+/// Moves the complete directory `partial` to `out`, replacing what [`vacant`] permits.
 pub fn take_place(partial: &Path, out: &Path, force: bool, mark: &str) -> Result<()> {
     let old = beside(out, "old")?;
     if out.exists() {
         vacant(out, force, mark)?;
-        // Aside, whole: what is killed while it removes a capture leaves something that nobody
-        // dares to replace.
+        // Renamed first: a directory whose removal is interrupted would lose its mark.
         std::fs::rename(out, &old).map_err(unwritten(out))?;
     }
     if let Err(error) = std::fs::rename(partial, out) {

@@ -1,4 +1,4 @@
-//! `train --preview`: a picture of the person while training goes on.
+//! `train --preview`: a rendering during training.
 
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
@@ -13,7 +13,7 @@ use crate::pictures;
 pub const PREVIEW: &str = "preview.png";
 /// Least time between two pictures.
 const EVERY: Duration = Duration::from_secs(5);
-/// Least time between two, in times of what the last one took: drawing is a hundredth of training.
+/// Least time between two in multiples of the last rendering's.
 const SHARE: u32 = 100;
 
 /// A picture that is replaced every few seconds.
@@ -27,7 +27,7 @@ impl Preview {
         Self { path: directory.join(PREVIEW), due: Instant::now() + EVERY }
     }
 
-    /// Draws the first training view as `model` has it, if it is time for that.
+    /// Renders the first training view, if due.
     pub fn draw(&mut self, model: &Model) -> Result<()> {
         let start = Instant::now();
         let Some(view) = model.frames().first().filter(|_| start >= self.due) else { return Ok(()) };

@@ -1,4 +1,4 @@
-//! `render`: pictures and a film of a trained person.
+//! `render`: pictures and videos of a trained person.
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -19,7 +19,7 @@ use crate::run::{RunConfig, make_directory, use_threads};
 use crate::video::{self, FilmFormat};
 use crate::{baked, pictures};
 
-/// Views of a full turn.
+/// Views of an orbit.
 const TURN: usize = 36;
 const FPS: u32 = 15;
 
@@ -124,7 +124,7 @@ fn parse_size(text: &str) -> Result<(u32, u32)> {
     Ok((side(width)?, side(height)?))
 }
 
-/// Views, each made when it is drawn: those of a long motion together would fill the memory.
+/// Lazy views; those of a long motion would fill the memory.
 type Views<'a> = Box<dyn ExactSizeIterator<Item = PosedView> + 'a>;
 
 fn views<'a>(
@@ -137,7 +137,7 @@ fn views<'a>(
     let frame = &frames[arguments.frame];
     let angle = |i: usize, count: usize| i as f32 / count as f32 * std::f32::consts::TAU;
     let angles = (0..TURN).map(move |i| angle(i, TURN));
-    // The camera of a frame, gone about the vertical through the body.
+    // The camera of a frame, orbited about the vertical through the body.
     let up = upright(body, frames.iter().map(Arc::as_ref));
     let around = move |frame: &PosedView, angle: f32| {
         let (turn, centre) = (Mat3::from_axis_angle(up, angle), frame.centre());
@@ -176,10 +176,9 @@ fn views<'a>(
     })
 }
 
-/// A camera like the training camera's, at the same distance as the subject was, that looks level
-/// at `centre`.
+/// A level camera that looks at `centre`, with the training camera's intrinsics and distance.
 fn camera_at(frame: &PosedView, centre: Vec3, angle: f32) -> Camera {
-    // Outstretched arms are as wide as the body is high.
+    // Room for outstretched arms.
     let distance = 1.15 * frame.camera.world_to_camera.transform_point3(frame.centre()).length();
     let back = Vec3::new(angle.sin(), 0.0, angle.cos());
     let eye = centre + distance * back;

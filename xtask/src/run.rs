@@ -1,4 +1,4 @@
-//! The run directory: what a run was trained with, its log, checkpoint, scores and pictures.
+//! The run directory: configuration, log, checkpoint, metrics and pictures.
 
 use std::io::{ErrorKind, Write};
 use std::path::{Path, PathBuf};
@@ -11,17 +11,17 @@ use serde::{Deserialize, Serialize};
 use crate::process::{Lock, unwritten};
 use crate::source::{self, Source};
 
-/// File of values, moments and counts.
+/// Parameters, Adam moments and visibility counts.
 pub const CHECKPOINT: &str = "checkpoint.safetensors";
 const CONFIG: &str = "config.toml";
-/// File of the scores.
+/// Metrics.
 pub const METRICS: &str = "metrics.json";
 /// Log of the training.
 pub const LOG: &str = "train.jsonl";
-/// The page to turn the person around on.
+/// Viewer page.
 pub const PERSON: &str = "person.html";
 
-/// What config.toml holds.
+/// Contents of config.toml.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RunConfig {
@@ -30,15 +30,15 @@ pub struct RunConfig {
     /// The body model's file.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub body: Option<PathBuf>,
-    /// How the capture is read.
+    /// Options of loading the capture.
     #[serde(default, skip_serializing_if = "is_default")]
     pub load: LoadOptions,
-    /// Everything else.
+    /// Training configuration.
     pub train: Config,
 }
 
 impl RunConfig {
-    /// A run of a source.
+    /// Configuration of a new run.
     pub fn new(source: &Source, train: Config) -> Self {
         Self { scene: source.scene.clone(), body: source.body.clone(), load: source.load.clone(), train }
     }
@@ -58,14 +58,14 @@ impl RunConfig {
         write(&run.join(CONFIG), &toml::to_string(self)?)
     }
 
-    /// Whether two runs are of the same files.
+    /// Whether two runs have the same capture and body.
     pub fn same_scene(&self, other: &Self) -> bool {
         let place = |path: &Path| path.canonicalize().unwrap_or_else(|_| path.to_owned());
         place(self.scene.as_ref()) == place(other.scene.as_ref())
             && self.body.as_deref().map(place) == other.body.as_deref().map(place)
     }
 
-    /// The capture that the run in `directory` was trained on, with the bodies that it trained with.
+    /// The capture of the run in `directory`, with its registered bodies.
     pub fn source(&self, directory: &Path) -> Result<Source> {
         let mut source = source::load(Some(&self.scene), self.body.as_deref(), &self.load)?;
         source.restore(directory, &self.train)?;
@@ -77,14 +77,14 @@ fn is_default(options: &LoadOptions) -> bool {
     *options == LoadOptions::default()
 }
 
-/// What metrics.json holds.
+/// Contents of metrics.json.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct Metrics {
     /// Name of the method.
     pub method: String,
     /// Name of the preset.
     pub preset: String,
-    /// Name of the rule for hidden pixels.
+    /// Name of the rule for occluded pixels.
     pub occluded: String,
     /// `demo` or a directory.
     pub scene: String,
@@ -96,7 +96,7 @@ pub struct Metrics {
     pub train_seconds: f64,
     /// Largest resident set.
     pub peak_rss_bytes: u64,
-    /// Learnt numbers.
+    /// Number of parameters.
     pub parameters: usize,
     /// Perceptual term of the training.
     #[serde(default)]
@@ -108,31 +108,30 @@ pub struct Metrics {
     pub splits: Splits,
 }
 
-/// Title of scores on views that training never saw.
+/// Title of evaluation views.
 pub const NOVEL_VIEWS: &str = "novel views";
-/// Title of scores on training frames.
+/// Title of training frames.
 pub const TRAINING_VIEWS: &str = "training views, over visible pixels";
 
-/// Scores of each split that was measured.
+/// Metrics of each split.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub struct Splits {
-    /// Cameras that training never saw.
+    /// Held-out cameras.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub novel_view: Option<SplitMetrics>,
-    /// Every tenth training frame, on what it shows.
+    /// Every tenth training frame, on its known pixels.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub train_view: Option<SplitMetrics>,
 }
 
 impl Splits {
-    /// The views that are shown first, and what they are called: novel ones where the capture keeps
-    /// any back.
+    /// Title and metrics of the main split: novel views if there are any.
     pub fn first(&self) -> Option<(&'static str, &SplitMetrics)> {
         let novel = self.novel_view.as_ref().map(|split| (NOVEL_VIEWS, split));
         novel.or(self.train_view.as_ref().map(|split| (TRAINING_VIEWS, split)))
     }
 
-    /// What [`Splits::first`] calls them.
+    /// Title of [`Splits::first`].
     pub fn title(&self) -> &'static str {
         self.first().map_or("nothing to score", |(title, _)| title)
     }
@@ -152,7 +151,7 @@ impl Metrics {
     }
 }
 
-/// A directory for a new run, which is this process's alone: `out`, or the first free `runs/NAME`,
+/// Creates and locks the directory of a new run: `out`, or the first free `runs/NAME`,
 /// `runs/NAME-2`, …
 pub fn new_directory(out: Option<&Path>, name: &str) -> Result<(PathBuf, Lock)> {
     let directory = match out {
@@ -170,7 +169,7 @@ pub fn new_directory(out: Option<&Path>, name: &str) -> Result<(PathBuf, Lock)> 
     Ok((directory, lock))
 }
 
-/// Makes the first of the default names that nobody has made, whoever else is looking for one.
+/// Creates the first free default name, free of races.
 fn free_directory(name: &str) -> Result<PathBuf> {
     for directory in candidates(name) {
         make_directory(directory.parent().unwrap_or(Path::new(".")))?;
@@ -182,7 +181,7 @@ fn free_directory(name: &str) -> Result<PathBuf> {
     bail!("no free directory under runs/")
 }
 
-/// The run to go on with: `out`, or the latest of the default names.
+/// Directory of the run to resume: `out`, or the latest default name.
 pub fn existing_directory(out: Option<&Path>, name: &str) -> Result<PathBuf> {
     let directory = match out {
         Some(out) => out.to_owned(),
@@ -199,14 +198,14 @@ fn candidates(name: &str) -> impl Iterator<Item = PathBuf> {
     (1..10_000).map(move |i| Path::new("runs").join(if i == 1 { name.clone() } else { format!("{name}-{i}") }))
 }
 
-/// Largest resident set of this process so far; 0 where the system does not tell.
+/// Peak resident set of this process; 0 where unknown.
 pub fn peak_rss_bytes() -> u64 {
     let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
     let line = status.lines().find_map(|l| l.strip_prefix("VmHWM:"));
     line.and_then(|l| l.trim().trim_end_matches(" kB").parse::<u64>().ok()).unwrap_or(0) * 1024
 }
 
-/// Makes a directory, and those above it, where there is none.
+/// Creates a directory and its parents.
 ///
 /// # Errors
 /// [`Ending::Unwritten`](crate::process::Ending::Unwritten).
@@ -214,7 +213,7 @@ pub fn make_directory(path: &Path) -> Result<()> {
     std::fs::create_dir_all(path).map_err(unwritten(path))
 }
 
-/// Replaces a file by a text; whoever reads it finds the old one or the new one, whole.
+/// Replaces a text file atomically.
 ///
 /// # Errors
 /// [`Ending::Unwritten`](crate::process::Ending::Unwritten).
@@ -222,18 +221,17 @@ pub fn write(path: &Path, text: &str) -> Result<()> {
     replace_file(path, |to| to.write_all(text.as_bytes())).map_err(unwritten(path))
 }
 
-/// More than any machine has cores; a thousand times as many would keep the system busy for
-/// minutes.
+/// Most threads.
 const MAX_THREADS: usize = 1024;
 
-/// Errors for a number of threads that no machine has.
+/// Checks `--threads`.
 pub fn check_threads(threads: Option<usize>) -> Result<()> {
     let fits = threads.is_none_or(|threads| (1..=MAX_THREADS).contains(&threads));
     ensure!(fits, "--threads {}: expected 1 to {MAX_THREADS}", threads.unwrap_or_default());
     Ok(())
 }
 
-/// Sets the number of threads of everything that follows.
+/// Sets the size of the global thread pool.
 pub fn use_threads(threads: Option<usize>) -> Result<()> {
     check_threads(threads)?;
     if let Some(threads) = threads {

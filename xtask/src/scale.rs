@@ -2,14 +2,14 @@
 
 use std::ops::Range;
 
-/// Share of its extent by which a linear or logarithmic axis reaches beyond its values.
+/// Margin of an axis relative to the range of its values.
 const ROOM: f64 = 0.06;
-/// Of values that have a place.
+/// Largest shown value.
 const LARGEST: f64 = 1e100;
-/// Decades of an axis that all have a tick.
+/// Most decades with a tick each.
 const MOST_DECADES: f64 = 12.0;
 
-/// From values to places.
+/// Axis transform.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Scale {
     /// Equal steps are equally long.
@@ -19,21 +19,20 @@ pub enum Scale {
 }
 
 impl Scale {
-    /// A scale that shows all of `values` that it can: those up to 1e100 either way, above 1e-100
-    /// on a logarithmic scale.
+    /// Scale over the range of `values`, of those up to 1e100 in magnitude and, on a logarithmic
+    /// scale, above 1e-100.
     pub fn around(values: impl Iterator<Item = f64>, logarithmic: bool) -> Self {
         let values = values.filter(|v| fits(*v, logarithmic));
         let place = |v: f64| if logarithmic { v.ln() } else { v };
         let (low, high) = values.map(place).fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), v| (a.min(v), b.max(v)));
         let (low, high) = if low <= high { (low, high) } else { (0.0, 1.0) };
-        // e^0.24 = 1.27: more than lies between any two ticks, so that an axis of one value has
-        // one.
+        // e^0.24 = 1.27 is above the ratio of any two ticks, so that an axis of one value has one.
         let room = (ROOM * (high - low)).max(if logarithmic { 0.12 } else { 1e-3 + 1e-3 * high.abs() });
         let (low, high) = (low - room, high + room);
         if logarithmic { Self::Logarithmic(low.exp()..high.exp()) } else { Self::Linear(low..high) }
     }
 
-    /// Whether a value has a place on it.
+    /// Whether a value is shown.
     pub fn shows(&self, value: f64) -> bool {
         fits(value, matches!(self, Self::Logarithmic(_)))
     }
@@ -46,7 +45,7 @@ impl Scale {
         }
     }
 
-    /// Values that get a line and a number.
+    /// Tick values.
     pub fn ticks(&self) -> Vec<f64> {
         match self {
             Self::Linear(r) => {
@@ -74,7 +73,7 @@ impl Scale {
     }
 }
 
-/// Whether there is a place for a value: sums and powers of what has one stay finite.
+/// Whether a value is shown; sums and powers of shown values are finite.
 fn fits(value: f64, logarithmic: bool) -> bool {
     value.abs() <= LARGEST && (!logarithmic || value >= 1.0 / LARGEST)
 }

@@ -1,11 +1,11 @@
-//! A part of many independent runs, for jobs on many machines that share nothing but a folder.
+//! Sharding of independent runs over jobs that share a folder.
 
 use std::str::FromStr;
 
 use anyhow::{Context, Error, Result, ensure};
 use clap::Args;
 
-/// Which part is this job's.
+/// Shard of this job.
 #[derive(Args, Clone, Copy, Debug, Default)]
 pub struct ShardArguments {
     /// Run part I of N only, I from 1 to N, or `slurm`: the part that a Slurm array's variables
@@ -18,7 +18,7 @@ pub struct ShardArguments {
 }
 
 impl ShardArguments {
-    /// Whether this job writes the tables: all but the parts do.
+    /// Whether this job writes the tables, as all but shards do.
     pub fn writes_tables(&self) -> bool {
         self.shard.is_none()
     }
@@ -32,13 +32,13 @@ pub struct Shard {
 }
 
 impl Shard {
-    /// Whether run number `run` is of this part. Parts take turns, each round beginning with
-    /// another, so that runs which are long in every scene do not fall to the same part.
+    /// Whether run number `run` is in this shard. Round robin with a rotating start, so that the same
+    /// run of each scene is spread over shards.
     pub fn has(&self, run: usize) -> bool {
         (run + run / self.count) % self.count == self.index
     }
 
-    /// Whether what is called `name` is of this part, whatever else there is.
+    /// Whether the item `name` is in this shard, by its hash.
     pub fn has_name(&self, name: &str) -> bool {
         // FNV-1a, the same on every machine.
         let hash = name.bytes().fold(0xcbf2_9ce4_8422_2325u64, |h, b| (h ^ u64::from(b)).wrapping_mul(0x100_0000_01b3));

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail, ensure};
 use clap::Args;
-use occnerf::capture::{Capture, LoadOptions, find_body, load_capture, own_body};
+use occnerf::capture::{Capture, LoadOptions, Mended, Registered, find_body, load_capture, own_body};
 use occnerf::{Config, Person, Scene, mend_masks};
 use serde::Serialize;
 use smpl::BodyModel;
@@ -31,37 +31,34 @@ pub struct Source {
     pub capture: Capture,
     /// The body model.
     pub model: BodyModel,
-    /// The capture as so many rounds of registration have corrected it.
-    registered: RefCell<Option<(usize, Capture)>>,
+    /// The registered capture of a number of rounds, or of a run to be resumed.
+    registered: RefCell<Option<(Option<usize>, Registered)>>,
 }
 
 impl Source {
-    /// Gives the capture the bodies that the run in `directory` was begun with, if it kept them: its
-    /// masks are mended before, by the bodies as they are given, as they were then.
+    /// Takes the registered bodies of the run in `directory`, if it kept them.
     pub fn restore(&mut self, directory: &Path, config: &Config) -> Result<()> {
-        if config.registration.rounds > 0 {
-            mend_masks(&mut self.capture, &self.model)?;
-        }
-        Person::restore(directory, &mut self.capture, &self.model)?;
+        let mended = match config.registration.rounds {
+            0 => Mended(self.capture.clone()),
+            _ => mend_masks(self.capture.clone(), &self.model)?,
+        };
+        let restored = Person::restore(directory, mended, &self.model)?;
+        self.registered.replace(restored.map(|registered| (None, registered)));
         Ok(())
     }
 
-    /// The capture made ready for a run. Bodies are registered once for all runs that ask for the
-    /// same number of rounds one after another.
+    /// The capture prepared for a run; registration is cached for its number of rounds.
     ///
     /// # Errors
     /// Those of [`Scene::new`].
     pub fn scene(&self, config: &Config) -> Result<Scene> {
         let rounds = config.registration.rounds;
-        if rounds == 0 || self.capture.registered {
-            return Ok(Scene::new(&self.capture, &self.model, config)?);
-        }
-        let mut kept = self.registered.borrow_mut();
-        if let Some((_, capture)) = kept.as_ref().filter(|kept| kept.0 == rounds) {
-            return Ok(Scene::new(capture, &self.model, config)?);
+        let mut cache = self.registered.borrow_mut();
+        if let Some((_, registered)) = cache.as_ref().filter(|cached| cached.0.is_none_or(|of| of == rounds)) {
+            return Ok(Scene::prepare(registered.clone(), &self.model, config)?);
         }
         let scene = Scene::new(&self.capture, &self.model, config)?;
-        *kept = Some((rounds, scene.capture.clone()));
+        *cache = Some((Some(rounds), scene.registered.clone()));
         Ok(scene)
     }
 }

@@ -11,7 +11,7 @@ use occnerf::{Config, Lpips, Method, Model, Person, PriorColors, Scene, Trainer,
 use crate::capacity::{self, CapacityName};
 use crate::eval::{Drawn, Split, check_pictures, score_baked, score_run, scored_frames, unscored};
 use crate::network::{load_lpips, network_name};
-use crate::optimise::{SavingArguments, Sitting, optimise};
+use crate::optimise::{RunOptions, SavingArguments, optimise};
 use crate::process::{Lock, results_in, say};
 use crate::run::{
     CHECKPOINT, METRICS, Metrics, RunConfig, existing_directory, make_directory, new_directory, peak_rss_bytes,
@@ -85,14 +85,14 @@ pub fn train(arguments: &TrainArguments) -> Result<()> {
     let out = arguments.out.as_deref();
     let interval = arguments.saving.interval()?;
     let TrainArguments { resume, stop_after, preview, .. } = *arguments;
-    let sitting = Sitting { resume, stop_after, interval, preview };
+    let options = RunOptions { resume, stop_after, interval, preview };
     // The lock is held to the end.
     let Begun { directory, source, config, _lock } =
         if arguments.resume { resumed(arguments, &existing_directory(out, &name)?)? } else { begun(arguments, &name)? };
     let run = RunConfig::new(&source, config);
     run.write(&directory)?;
     say!("run: {}", directory.display());
-    let Some(metrics) = run_one(&directory, &run, &source, lpips.as_ref(), &sitting)? else {
+    let Some(metrics) = run_one(&directory, &run, &source, lpips.as_ref(), &options)? else {
         say!("stopped; go on with --resume --out {}", directory.display());
         return Ok(());
     };
@@ -166,7 +166,7 @@ pub fn scene_name(scene: Option<&str>) -> String {
 /// What registration made of the focal length, if it is more than the noise of one that is right.
 fn say_focal_length(source: &Source, scene: &Scene) {
     let focal = |capture: &Capture| capture.train.first().map_or(1.0, |frame| frame.camera.focal.x);
-    let (given, found) = (focal(&source.capture), focal(&scene.capture));
+    let (given, found) = (focal(&source.capture), focal(&scene.registered.capture));
     if (found / given - 1.0).abs() > 0.1 {
         say!("focal length: {given:.0} pixels given, {found:.0} found");
     }
@@ -178,7 +178,7 @@ pub fn run_one(
     run: &RunConfig,
     source: &Source,
     lpips: Option<&Lpips>,
-    sitting: &Sitting,
+    options: &RunOptions,
 ) -> Result<Option<Metrics>> {
     let scene = source.scene(&run.train)?;
     say_focal_length(source, &scene);
@@ -190,13 +190,13 @@ pub fn run_one(
         }
     }
     let checkpoint = directory.join(CHECKPOINT);
-    let resumes = sitting.resume && checkpoint.is_file();
+    let resumes = options.resume && checkpoint.is_file();
     let began_with = if resumes { Person::colors(directory, &source.model)? } else { None };
     let scene = if let Some(colors) = began_with { scene.with_colors(colors) } else { scene };
     let start = Instant::now();
     let colors = scene.colors()?;
     let prior_seconds = start.elapsed().as_secs_f64();
-    let kept = Person::save(directory, &scene.capture, &source.model, colors);
+    let kept = Person::save(directory, &scene.registered, &source.model, colors);
     kept.map_err(Error::from).map_err(results_in(directory))?;
     if run.train.method == Method::Prior {
         let prior = Drawn::Prior(colors.clone());
@@ -208,7 +208,7 @@ pub fn run_one(
         if resumes { Trainer::resume(&scene, &checkpoint)? } else { Trainer::new(&scene, run.train.clone())? };
     trainer.set_steps(run.train.steps);
     trainer.load_perceptual()?;
-    let seconds = optimise(directory, &mut trainer, sitting)?;
+    let seconds = optimise(directory, &mut trainer, options)?;
     if trainer.steps_done() < run.train.steps {
         return Ok(None);
     }
@@ -258,8 +258,8 @@ pub fn run_unless_finished(
     unless_finished(directory, name, run, lpips, |earlier| {
         say!("{name}: training");
         run.write(directory)?;
-        let sitting = Sitting { resume: earlier, stop_after: None, interval, preview: false };
-        let metrics = run_one(directory, run, source, lpips, &sitting)?;
+        let options = RunOptions { resume: earlier, stop_after: None, interval, preview: false };
+        let metrics = run_one(directory, run, source, lpips, &options)?;
         metrics.with_context(|| format!("{name}: stopped before its end"))
     })
 }

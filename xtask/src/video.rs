@@ -1,4 +1,4 @@
-//! Films: pictures one after another as a GIF or, with the feature `mp4`, as H.264 in MP4.
+//! Video output: GIF or, with the feature `mp4`, H.264 in MP4.
 
 use std::fs::File;
 use std::io::BufWriter;
@@ -11,7 +11,7 @@ use image::{Delay, Frame, RgbImage};
 
 use crate::process::unwritten;
 
-/// What a film is written as.
+/// Video format.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum FilmFormat {
     /// H.264, plays in every browser.
@@ -22,12 +22,11 @@ pub enum FilmFormat {
     Gif,
 }
 
-/// Writes pictures of a film that come one by one, so many a second.
+/// Encoder of lazy pictures at a frame rate.
 type Encode = fn(&mut BufWriter<File>, &mut dyn Iterator<Item = Result<RgbImage>>, u32) -> Result<()>;
 
-/// Writes equally large pictures as a film of `fps` a second, `path` with the format's extension,
-/// and returns where it is; `None` where there is no film. The pictures are asked for one by one
-/// and not kept. Whoever opens the file finds the old film or the new one, whole.
+/// Writes pictures of equal size as a video to `path` with the format's extension, replaced
+/// atomically; returns its path, `None` without a video. Pictures are consumed one by one.
 pub fn film(
     mut pictures: impl Iterator<Item = Result<RgbImage>>,
     format: FilmFormat,
@@ -74,7 +73,7 @@ fn gif(to: &mut BufWriter<File>, pictures: &mut dyn Iterator<Item = Result<RgbIm
     Ok(())
 }
 
-/// The system's error, where an encoder only hands one on.
+/// Unwraps an I/O error.
 fn unquoted(error: image::ImageError) -> anyhow::Error {
     match error {
         image::ImageError::IoError(error) => error.into(),
@@ -93,23 +92,22 @@ mod h264 {
     use rusty_h264_common::YuvFrame;
     use rusty_h264_encoder::{Encoder, EncoderConfig, Preset};
 
-    /// Pictures from one that stands alone to the next.
+    /// Key frame interval.
     const KEY_INTERVAL: u32 = 30;
     /// Quantisation: 42 dB on synthetic pictures of 512 × 512.
     const QP: u8 = 20;
-    /// Levels of H.264 and the macroblocks of 16 × 16 pixels that a picture of theirs has at most.
+    /// Levels of H.264 and their most macroblocks of 16 × 16 pixels.
     const LEVELS: [(u8, usize); 6] = [(31, 3600), (40, 8192), (42, 8704), (50, 22080), (51, 36864), (60, 139_264)];
-    /// From this height on players take the colours for BT.709, below it for BT.601, where a film
-    /// does not say.
+    /// Height from which players assume BT.709 instead of BT.601 in untagged videos.
     const HIGH_DEFINITION: usize = 720;
 
-    /// Writes pictures as H.264 (constrained baseline) in MP4, its index first.
+    /// Writes H.264 (constrained baseline) in MP4 with the index first.
     pub fn mp4(to: &mut BufWriter<File>, pictures: &mut dyn Iterator<Item = Result<RgbImage>>, fps: u32) -> Result<()> {
         let mut pictures = pictures.peekable();
         let Some(Ok(first)) = pictures.peek() else {
             return pictures.next().map_or(Ok(()), |first| first.map(drop));
         };
-        // Chroma is shared by 2 × 2 pixels: an odd side grows by its last row or column.
+        // Chroma is subsampled by 2 × 2: an odd side repeats its last row or column.
         let (width, height) = first.dimensions();
         let [even_width, even_height] = [width, height].map(|side| side.next_multiple_of(2));
         let mut config = EncoderConfig::baseline(even_width as usize, even_height as usize);
@@ -127,7 +125,7 @@ mod h264 {
             MuxerBuilder::new(to).video(VideoCodec::H264, even_width, even_height, f64::from(fps)).build()?;
         let mut written = 0u32;
         let mut write = |unit: Vec<u8>| {
-            // An encoder may hold pictures back.
+            // Encoders may delay output.
             if unit.is_empty() {
                 return Ok(());
             }
@@ -142,7 +140,7 @@ mod h264 {
         Ok(muxer.finish()?)
     }
 
-    /// Whether a byte stream has a slice of a picture that stands alone (NAL unit type 5).
+    /// Whether a byte stream has an IDR slice (NAL unit type 5).
     fn has_key_picture(unit: &[u8]) -> bool {
         unit.windows(4).any(|w| w[..3] == [0, 0, 1] && w[3] & 0x1f == 5)
     }

@@ -6,15 +6,14 @@ use volrender::{Camera, Distortion};
 use super::CaptureError;
 use super::records::Record;
 
-/// Farthest from the origin that a body or a camera may be, in whatever unit.
+/// Largest distance of a body or a camera from the origin, in the capture's unit.
 pub const MAX_DISTANCE: f32 = 1e7;
-/// Largest |R Rᵀ − I| of an extrinsic rotation; files written in `f32` or with a few decimals stay
-/// far below.
+/// Largest |R Rᵀ − I| of an extrinsic rotation, far above rounding.
 const ORTHONORMAL: f32 = 1e-3;
-/// Focal lengths, in pixels, from a fisheye's on a picture of a few pixels to a telescope's.
+/// Range of focal lengths, pixels.
 const FOCAL: (f32, f32) = (0.01, 1e7);
 
-/// A lens and where it stands. The camera's image is 1 × 1 until the picture has been read.
+/// A camera with lens distortion. Its image is 1 × 1 until the picture has been read.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Lens {
     pub camera: Camera,
@@ -36,7 +35,7 @@ pub(super) fn rotation(values: &[f32], columns: usize) -> Option<Mat3> {
 }
 
 /// A camera from a row-major calibration matrix (9) that puts the first pixel's centre at
-/// `pixel_centre`; the error says what is wrong with it.
+/// `pixel_centre`; the error describes the fault.
 pub(super) fn pinhole(k: &[f32], extrinsics: Affine3A, pixel_centre: f32) -> Result<Camera, String> {
     let mut intrinsics = Mat3::from_cols_slice(k).transpose();
     let focal = k[0].min(k[4])..=k[0].max(k[4]);
@@ -50,7 +49,7 @@ pub(super) fn pinhole(k: &[f32], extrinsics: Affine3A, pixel_centre: f32) -> Res
         let expected = format!("expected at most {MAX_DISTANCE} either way");
         return Err(format!("a translation of {}, {expected}", extrinsics.translation));
     }
-    // The camera's own convention has the first pixel's centre at 0.5.
+    // `Camera` has the first pixel's centre at 0.5.
     intrinsics.z_axis += Vec3::new(1.0, 1.0, 0.0) * (0.5 - pixel_centre);
     Camera::new(intrinsics, extrinsics, 1, 1).map_err(|error| error.to_string())
 }

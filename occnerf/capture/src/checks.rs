@@ -1,4 +1,4 @@
-//! Whether body model, cameras and pictures belong together.
+//! Consistency of body model, cameras and pictures.
 
 use std::path::Path;
 
@@ -9,18 +9,16 @@ use super::camera::MAX_DISTANCE;
 use super::records::{Record, triples};
 use super::{CaptureError, Frame};
 
-/// How far a joint may be from where the file has it, as a fraction of the body's largest extent: 4
-/// cm at 1.7 m. The same model agrees to rounding, another model of a person is several times as
-/// far off.
+/// Tolerance of a joint against the file's, as a fraction of the body's largest extent: 4 cm at
+/// 1.7 m. The same model agrees to rounding, others are several times as far off.
 const JOINT_TOLERANCE: f32 = 0.04 / 1.7;
 
-/// Largest component of a rotation that is taken for one, in radians: more turns than anybody takes
-/// in a video.
+/// Largest component of a rotation, radians.
 pub(super) const MAX_ANGLE: f32 = 1e3;
 /// Largest shape coefficient, in standard deviations.
 pub const MAX_BETA: f32 = 1e3;
 
-/// Errors for a number that nothing in the world has.
+/// Errors for a value above `most` in magnitude.
 pub(super) fn below(record: &Record<'_>, key: &str, values: &[f32], most: f32) -> Result<(), CaptureError> {
     match values.iter().find(|value| value.abs() > most) {
         Some(value) => Err(record.invalid(key, format!("numbers up to {most} either way"), value.to_string())),
@@ -28,7 +26,7 @@ pub(super) fn below(record: &Record<'_>, key: &str, values: &[f32], most: f32) -
     }
 }
 
-/// Shape coefficients that the model can take.
+/// Shape coefficients, at most as many as the model's.
 pub(super) fn betas(record: &Record<'_>, key: &str, body: &BodyModel) -> Result<Vec<f32>, CaptureError> {
     let (shape, values) = record.array(key)?;
     if shape.len() != 1 || values.len() > body.num_betas() || values.is_empty() && body.num_betas() > 0 {
@@ -54,7 +52,7 @@ pub(super) fn pose(record: &Record<'_>, body: &BodyModel) -> Result<Vec<Vec3>, C
     Ok(triples(&values))
 }
 
-/// [`pose`] where the global rotation is elsewhere.
+/// [`pose`] with a zero root, for a separate global rotation.
 pub(super) fn rootless_pose(record: &Record<'_>, body: &BodyModel) -> Result<Vec<Vec3>, CaptureError> {
     let pose = pose(record, body)?;
     if let Some(root) = pose.first().filter(|root| **root != Vec3::ZERO) {
@@ -72,7 +70,7 @@ pub(super) fn origin(record: &Record<'_>) -> Result<Placement, CaptureError> {
     Ok(Placement::Origin { rotation, translation })
 }
 
-/// The mean of all frames' shape coefficients, those that a frame lacks being 0.
+/// Mean shape coefficients of all frames, missing ones being 0.
 pub(super) fn mean_betas<'a>(frames: impl ExactSizeIterator<Item = &'a [f32]>) -> Vec<f32> {
     let count = frames.len() as f64;
     let mut sums = Vec::new();
@@ -110,7 +108,7 @@ pub(super) fn joints(record: &Record<'_>, key: &str, betas: &[f32], body: &BodyM
 /// At least one mask shows the subject. `dir` holds the masks.
 pub(super) fn subject_is_seen(dir: &Path, frames: &[Frame]) -> Result<(), CaptureError> {
     let mut brightest = 0.0f32;
-    // Nearly always the first frame answers.
+    // The first frame nearly always decides.
     for frame in frames {
         brightest = frame.pixels()?.mask.iter().copied().fold(brightest, f32::max);
         if brightest > 0.5 {
@@ -138,7 +136,7 @@ pub(super) fn body_is_seen(path: &Path, frames: &[Frame], body: &BodyModel) -> R
             })
         })
     };
-    // Nearly always the first frame answers.
+    // The first frame nearly always decides.
     if frames.iter().any(sees) {
         return Ok(());
     }

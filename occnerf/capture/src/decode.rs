@@ -1,4 +1,4 @@
-//! From a list of files to frames: the part that all layouts share.
+//! Planned frames, memory budget, and decoding, for all layouts.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -15,23 +15,23 @@ use super::pixels::Area;
 use super::source::{Allowance, PixelSource};
 use super::{CaptureError, Frame, LoadOptions, checks};
 
-/// Bytes that a pixel of a frame takes: three colours and coverage.
+/// Bytes per pixel of a frame: three colours and coverage.
 pub const PIXEL_BYTES: u64 = 16;
-/// Bytes that a vertex of a frame's body takes once it is prepared: its pose offset, and posed.
+/// Bytes per vertex of a prepared body: pose offset and posed position.
 const VERTEX_BYTES: u64 = 24;
-/// A training frame's labels take this part of the bytes of its pixels: see [`crate::Labels`].
+/// Ratio of the bytes of a training frame's pixels to its labels', 3 bits a pixel.
 const LABELS_SHARE: u64 = 42;
 
 /// A frame whose pictures have not been read.
 pub(super) struct Planned {
     pub name: String,
     pub image: PathBuf,
-    /// The subject is where any of these says so; at least one.
+    /// The subject is their union; at least one.
     pub masks: Vec<PathBuf>,
-    /// Masks hold labels, each but 0 a part of the subject, rather than coverage with 255 for all.
+    /// Whether masks hold part labels, with background 0, instead of coverage.
     pub labels: bool,
     pub occluder: Option<PathBuf>,
-    /// Pixels of the files that a simulated obstacle hides.
+    /// Simulated obstacle, in pixels of the files.
     pub hidden: Option<Area>,
     pub lens: Lens,
     pub pose: Vec<Vec3>,
@@ -46,8 +46,8 @@ pub(super) struct Budget {
 }
 
 impl Budget {
-    /// `left` bytes less those for decoding: `picture` for every thread, but at most a quarter
-    /// unless one picture takes more.
+    /// Splits `left` bytes: `picture` for each thread's decoding, at most a quarter of all unless a
+    /// single picture takes more, and the rest for packed pictures.
     fn new(left: u64, picture: u64) -> Self {
         let threads = rayon::current_num_threads() as u64;
         let aside = (picture.saturating_mul(threads)).min(left / 4).max(picture);
@@ -59,7 +59,7 @@ impl Budget {
 pub(super) struct View {
     frames: Vec<Planned>,
     size: (u32, u32),
-    /// Named where no mask shows the subject, and where no camera sees the body.
+    /// Named in errors about all masks and about all cameras.
     masks: PathBuf,
     cameras: PathBuf,
 }
@@ -78,13 +78,13 @@ impl View {
         u64::from(width) * u64::from(height) * PIXEL_BYTES
     }
 
-    /// Bytes that decoding a frame takes.
+    /// Bytes for decoding a frame.
     fn decoding_bytes(&self) -> u64 {
         decoding_bytes(self.size)
     }
 
-    /// The frames, checked together. Pictures that `budget` has room for are decoded; of the others
-    /// headers are read.
+    /// The frames, checked together. Pictures within `budget` are decoded; of the others, headers are
+    /// checked.
     pub fn frames(self, body: &BodyModel, options: &LoadOptions, budget: &Budget) -> Result<Vec<Frame>, CaptureError> {
         let first = Arc::from(self.frames[0].name.as_str());
         let (size, to) = (self.size, options.resized(self.size));
@@ -98,8 +98,7 @@ impl View {
             Frame { name, source, camera: camera.resized(to.0, to.1), pose, placement, betas }
         };
         let frames: Vec<Frame> = self.frames.into_iter().map(frame).collect();
-        // Collected as results first, so that the error reported is the first in order whatever
-        // finishes first.
+        // Collected as results first: the first error in order is reported.
         let checked: Vec<Result<(), CaptureError>> = frames.par_iter().map(|f| f.source.check()).collect();
         checked.into_iter().collect::<Result<(), CaptureError>>()?;
         checks::subject_is_seen(&self.masks, &frames)?;
@@ -110,8 +109,8 @@ impl View {
     }
 }
 
-/// Bytes for pixels that [`LoadOptions::max_bytes`] leaves beside the bodies of all views. Errors
-/// where no picture can be decoded in that, naming values that fit.
+/// Budget for pixels within [`LoadOptions::max_bytes`] beside the bodies of all views. Errors if no
+/// picture can be decoded in that, naming options that fit.
 pub(super) fn budget(
     train: &View,
     eval: &[View],
@@ -121,8 +120,7 @@ pub(super) fn budget(
     let limit = options.max_bytes;
     let body_bytes = body.num_vertices() as u64 * VERTEX_BYTES;
     let views = || std::iter::once(train).chain(eval);
-    // Bytes of what is kept of every frame: of every n-th in training, and of every m-th view kept
-    // back.
+    // Bytes of bodies and labels, for every n-th training frame and every m-th evaluation view.
     let kept = |n: usize, m: usize| {
         let (frames, views) =
             (train.frames.len().div_ceil(n), eval.iter().map(|v| v.frames.len().div_ceil(m)).sum::<usize>());

@@ -1,7 +1,6 @@
 use std::path::{Path, PathBuf};
 
-/// What is wrong with a capture, in one line that names the file, the key within it, what was
-/// expected and what was found.
+/// A fault of a capture, in one line with file, key, expected and actual value.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum CaptureError {
@@ -33,7 +32,7 @@ pub enum CaptureError {
     Missing {
         /// Path where it should be.
         path: PathBuf,
-        /// Name of what is absent, and who refers to it.
+        /// The missing item, and its reference.
         what: String,
     },
     /// A value has the wrong type, shape or size, or makes no sense.
@@ -48,7 +47,7 @@ pub enum CaptureError {
         /// Value that is there.
         actual: String,
     },
-    /// A setting that no capture can be made with.
+    /// An option out of range.
     #[error("{name}: expected {expected}, found {actual}")]
     Setting {
         /// The setting.
@@ -60,7 +59,7 @@ pub enum CaptureError {
     },
 }
 
-/// Text of a file, such as a key, as part of a line.
+/// Escapes control characters of a text from a file.
 fn line(text: &str) -> String {
     let shown = |c: char| if c.is_control() { c.escape_default().to_string() } else { c.to_string() };
     text.chars().map(shown).collect()

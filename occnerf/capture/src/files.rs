@@ -1,5 +1,6 @@
-//! The files of a frame, checked by their headers and decoded to pixels.
+//! The files of a frame: header checks and decoding.
 
+use std::io::Read;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -11,38 +12,49 @@ use super::pixels::{Area, Pixels};
 use super::undistort::undistort;
 use super::{CaptureError, Image};
 
-/// The files of a frame, and how they become its pixels.
+/// The files of a frame, and parameters of decoding.
 #[derive(Clone, Debug)]
 pub(super) struct Files {
     pub image: PathBuf,
-    /// The subject is where any of these says so; at least one.
+    /// The subject is their union; at least one.
     pub masks: Vec<PathBuf>,
-    /// Masks hold labels, each but 0 a part of the subject, rather than coverage with 255 for all.
+    /// Whether masks hold part labels, with background 0, instead of coverage.
     pub labels: bool,
     pub occluder: Option<PathBuf>,
-    /// Pixels of the files that a simulated obstacle hides.
+    /// Simulated obstacle, in pixels of the files.
     pub hidden: Option<Area>,
     pub lens: Lens,
-    /// Columns and rows of every file, and what they are reduced to.
+    /// Width and height of every file, and after resizing.
     pub size: (u32, u32),
     pub to: (u32, u32),
-    /// Name of the frame that `size` was read from.
+    /// Name of the frame with `size`.
     pub first: Arc<str>,
-    /// Lets as many decode at once as there is memory for.
+    /// Memory limit of concurrent decoding.
     pub gate: Arc<Gate>,
 }
 
-/// Bytes that a pixel of a file takes while it is decoded, at the worst: picture and masks as they
-/// come out of the file and in floats, rectified and reduced.
+/// Peak bytes per pixel of a file during decoding: integers and floats of picture and masks,
+/// undistorted and resized.
 const DECODED_BYTES: u64 = 48;
 
-/// Bytes that decoding a picture of so many columns and rows takes.
+/// Bytes for decoding a picture of this width and height.
 pub(super) fn decoding_bytes((width, height): (u32, u32)) -> u64 {
     u64::from(width) * u64::from(height) * DECODED_BYTES
 }
 
+/// Reads a text file of at most `most` bytes.
+pub(super) fn read_text(path: &Path, most: u64) -> Result<String, CaptureError> {
+    let file = std::fs::File::open(path).map_err(CaptureError::io(path))?;
+    let mut text = String::new();
+    file.take(most + 1).read_to_string(&mut text).map_err(CaptureError::io(path))?;
+    if text.len() as u64 > most {
+        return Err(CaptureError::invalid(path, "size", format!("at most {most} bytes"), "more"));
+    }
+    Ok(text)
+}
+
 impl Files {
-    /// The same files behind an obstacle over an area of the decoded pixels.
+    /// The files with a simulated obstacle over an area of the decoded pixels.
     pub fn hidden_behind(&self, area: &Area) -> Self {
         let scaled = |range: &Range<u32>, from: u32, to: u32| {
             let scale = f64::from(to) / f64::from(from.max(1));
@@ -54,8 +66,7 @@ impl Files {
         Self { hidden: Some(Area { columns, rows }), ..self.clone() }
     }
 
-    /// Whether the headers say what they should; nothing is decoded that the memory check did not
-    /// count.
+    /// Checks the sizes in the headers against the memory budget's.
     pub fn check(&self) -> Result<(), CaptureError> {
         self.same_size(&self.image, dimensions(&self.image)?)?;
         self.masks.iter().chain(&self.occluder).try_for_each(|path| self.same_size(path, dimensions(path)?))
@@ -70,13 +81,13 @@ impl Files {
         Err(CaptureError::invalid(path, "size", format!("{}, as of {of}", text(self.size)), text(found)))
     }
 
-    /// A mask, which may have changed since its header was read.
+    /// A mask; its size is checked again.
     fn mask(&self, path: &Path) -> Result<Vec<f32>, CaptureError> {
         let (width, height, levels) = load_mask(path)?;
         self.same_size(path, (width, height)).map(|()| levels)
     }
 
-    /// The picture without its mask, as large as the pixels are.
+    /// The unmasked picture at the size of the pixels.
     pub fn photograph(&self) -> Result<Image, CaptureError> {
         self.gate.pass(decoding_bytes(self.size), || {
             let image = Image::load(&self.image)?;
@@ -87,7 +98,7 @@ impl Files {
         })
     }
 
-    /// Reads the pictures, when there is room for it.
+    /// Decodes the pictures within the memory limit.
     pub fn decode(&self) -> Result<Pixels, CaptureError> {
         self.check()?;
         self.gate.pass(decoding_bytes(self.size), || self.decode_now())
@@ -115,7 +126,7 @@ impl Files {
             Some(path) => Some(self.mask(path)?.into_iter().map(|level| f32::from(level > 0.5)).collect()),
             None => None,
         };
-        // Masked first, or interpolation would draw hidden colours into the mask's edge.
+        // Masked first, since interpolation would mix hidden colours into the mask's edge.
         image.multiply(&mask);
 
         let Lens { camera, distortion } = self.lens;
@@ -124,13 +135,12 @@ impl Files {
         let resample = |values: Vec<f32>, channels: usize| {
             resize(undistort(values, channels, &camera, &distortion), channels, size, to)
         };
-        // Without known occluders the silhouette tells what is unknown.
         let occluder = occluder.map(|covered: Vec<f32>| {
             let everything = (!distortion.is_identity()).then(|| vec![1.0; covered.len()]);
-            // A pixel that an occluder touches is not known to show background.
+            // A pixel touched by an occluder is unknown,
             let mut unknown: Vec<bool> = resample(covered, 1).into_iter().map(|covered| covered > 0.0).collect();
             if let Some(everything) = everything {
-                // Nor is one that the lens never saw.
+                // and so is one outside the distorted image.
                 unknown.iter_mut().zip(resample(everything, 1)).for_each(|(unknown, seen)| *unknown |= seen < 0.5);
             }
             unknown

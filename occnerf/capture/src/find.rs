@@ -1,4 +1,4 @@
-//! Which layout a directory has, and where its body model is.
+//! Detection of a directory's layout and of its body model.
 
 use std::path::{Path, PathBuf};
 
@@ -16,8 +16,7 @@ pub enum Layout {
 }
 
 impl Layout {
-    /// In the order in which they are looked for: HumanNeRF's tool puts its files beside the
-    /// `metadata.json` that it made them from.
+    /// In order of precedence: HumanNeRF's tool writes its files beside the `metadata.json`.
     const ALL: [(&'static [&'static str], &'static str, Self); 3] = [
         (&["annots.npy"], "raw ZJU-MoCap", Self::ZjuMocap),
         (&["metadata.json"], "HumanNeRF's wild layout", Self::Wild),
@@ -53,17 +52,9 @@ pub fn find_body(dir: &Path) -> Result<PathBuf, CaptureError> {
     if let Some(found) = own_body(dir) {
         return Ok(found);
     }
-    // Ancestors of a relative path end where the path does, not at the root of the file system.
+    // The ancestors of a relative path are incomplete.
     let whole = dir.canonicalize().map_err(CaptureError::io(dir))?;
-    let found = whole.ancestors().find_map(|above| {
-        let mut files: Vec<PathBuf> = std::fs::read_dir(above.join("body"))
-            .ok()?
-            .filter_map(|entry| Some(entry.ok()?.path()))
-            .filter(|path| path.extension().is_some_and(|e| e == "npz"))
-            .collect();
-        files.sort();
-        files.into_iter().find(|path| is_body(path))
-    });
+    let found = near_bodies(&whole, &["npz"]).into_iter().find(|path| is_body(path));
     found.ok_or_else(|| {
         CaptureError::missing(
             &dir.join("body.npz"),
@@ -77,7 +68,21 @@ pub fn own_body(dir: &Path) -> Option<PathBuf> {
     ["body.npz", "body.safetensors"].map(|name| dir.join(name)).into_iter().find(|path| path.is_file())
 }
 
-/// Whether an archive holds a template; poses and reference values may lie beside the body.
+/// Files with one of `extensions` in directories `body` beside `place` and its ancestors, the nearest
+/// first, by name.
+pub(super) fn near_bodies(place: &Path, extensions: &[&str]) -> Vec<PathBuf> {
+    let mut found = Vec::new();
+    for above in place.ancestors() {
+        let files = std::fs::read_dir(above.join("body")).into_iter().flatten().filter_map(|e| Some(e.ok()?.path()));
+        let known = |path: &PathBuf| path.extension().is_some_and(|e| extensions.iter().any(|known| e == *known));
+        let mut files: Vec<PathBuf> = files.filter(known).collect();
+        files.sort();
+        found.extend(files);
+    }
+    found
+}
+
+/// Whether an archive holds a template, not poses or reference values.
 fn is_body(path: &Path) -> bool {
     array_files::npz::Npz::open(path).is_ok_and(|npz| npz.keys().iter().any(|key| key == "v_template"))
 }

@@ -1,4 +1,4 @@
-//! A capture as plain data: frames, views kept back, and what they have in common.
+//! A capture as plain data: training frames and evaluation views.
 
 use glam::Vec3;
 
@@ -6,7 +6,7 @@ use super::CaptureError;
 use super::pixels::Pixels;
 use super::source::PixelSource;
 
-/// One picture of the subject with everything that is known about it.
+/// One picture of the subject with its camera and body parameters.
 #[derive(Clone, Debug)]
 pub struct Frame {
     /// Name within its camera, such as `frame_000012`.
@@ -18,7 +18,7 @@ pub struct Frame {
     /// Axis-angle rotation of each joint, (J). Joint 0 is zero where `placement` carries the global
     /// rotation.
     pub pose: Vec<Vec3>,
-    /// How the posed body stands in the world.
+    /// Placement of the posed body in the world.
     pub placement: smpl::Placement,
     /// Shape coefficients, at most as many as the body model has.
     pub betas: Vec<f32>,
@@ -34,33 +34,47 @@ impl Frame {
     }
 }
 
-/// A picture kept back for evaluation: nothing occluded, black background.
+/// An evaluation view, unoccluded over a black background.
 #[derive(Clone, Debug)]
 pub struct EvalFrame {
     /// Directory or given name of its camera.
     pub camera_name: String,
-    /// The training frame of the same instant: same pose, and the occlusion that training saw then.
+    /// Training frame of the same instant, with the same pose.
     pub train_index: usize,
     /// The picture, its camera and body parameters.
     pub frame: Frame,
 }
 
-/// A monocular video of one person, and views of the same instants from elsewhere.
+/// A monocular video of one person, with evaluation views of the same instants.
 #[derive(Clone, Debug)]
 pub struct Capture {
     /// Name of the directory it comes from, or `demo`.
     pub name: String,
     /// The training video in time order; never empty.
     pub train: Vec<Frame>,
-    /// Views kept back, by camera and then time; may be empty.
+    /// Evaluation views, by camera and then time; may be empty.
     pub eval: Vec<EvalFrame>,
     /// Shape of the canonical body (T-pose).
     pub mean_betas: Vec<f32>,
-    /// Whether registration has corrected the bodies.
-    pub registered: bool,
-    /// How far clothes and hair stand off each vertex of the body along its normal, in the capture's
-    /// units, as registration has found it; empty where nothing is known.
+}
+
+/// A capture with corrected masks, or with masks to be taken as they are.
+#[derive(Clone, Debug)]
+pub struct Mended(pub Capture);
+
+/// A mended capture with registered bodies, or with bodies to be taken as they are.
+#[derive(Clone, Debug)]
+pub struct Registered {
+    /// The capture.
+    pub capture: Capture,
+    /// Registered offset of clothes and hair along each vertex normal, in the capture's units; empty
+    /// where unknown.
     pub clothes: Vec<f32>,
-    /// Whether masks that are too large or too small have been mended.
-    pub mended: bool,
+}
+
+impl From<Capture> for Registered {
+    /// Takes masks and bodies as they are.
+    fn from(capture: Capture) -> Self {
+        Self { capture, clothes: Vec::new() }
+    }
 }

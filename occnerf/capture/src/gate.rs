@@ -1,8 +1,8 @@
-//! How much may be decoded at once.
+//! Memory limit of concurrent decoding.
 
 use std::sync::{Condvar, Mutex, PoisonError};
 
-/// As many decode at once as memory has been put aside for; the others wait.
+/// Weighted semaphore over bytes.
 #[derive(Debug)]
 pub(super) struct Gate {
     limit: u64,
@@ -11,17 +11,16 @@ pub(super) struct Gate {
 }
 
 impl Gate {
-    /// Lets in what takes `limit` bytes together.
+    /// Admits `limit` bytes in total.
     pub fn new(limit: u64) -> Self {
         Self { limit, taken: Mutex::new(0), freed: Condvar::new() }
     }
 
-    /// Runs `work`, which takes so many bytes and no thread but this one: who waits here must not
-    /// keep who is inside from ending. What is larger than all that was put aside has the gate to
-    /// itself.
+    /// Runs `work` once its bytes are admitted; work above the limit runs alone. `work` must not wait
+    /// for other threads, which may be blocked here.
     pub fn pass<T>(&self, bytes: u64, work: impl FnOnce() -> T) -> T {
         let fits = |taken: &mut u64| *taken > 0 && taken.saturating_add(bytes) > self.limit;
-        // A decoder that panics poisons the count, not the memory.
+        // The count stays valid when a decoder panics.
         let taken = self.taken.lock().unwrap_or_else(PoisonError::into_inner);
         let mut taken = self.freed.wait_while(taken, fits).unwrap_or_else(PoisonError::into_inner);
         *taken += bytes;
@@ -31,7 +30,7 @@ impl Gate {
     }
 }
 
-/// Leaves the gate, also where the decoder panics.
+/// Releases the bytes on drop, also on a panic.
 struct Leave<'a> {
     gate: &'a Gate,
     bytes: u64,

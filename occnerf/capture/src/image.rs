@@ -7,7 +7,7 @@ use image::{DynamicImage, ImageBuffer, ImageReader, Luma, Rgb};
 
 use super::CaptureError;
 
-/// Longest side that is decoded; anything larger is taken for a broken or hostile file.
+/// Longest decoded side.
 pub const MAX_SIDE: u32 = 8192;
 
 /// An sRGB picture with values from 0 to 1.
@@ -47,8 +47,8 @@ impl Image {
     /// Reads a PNG or JPEG of 8 or 16 bits a channel; grey becomes RGB, transparency is dropped.
     ///
     /// # Errors
-    /// [`CaptureError::Io`], [`CaptureError::Picture`], and [`CaptureError::Invalid`] for a side of
-    /// 0 or above 8192, which is found before anything is decoded.
+    /// [`CaptureError::Io`], [`CaptureError::Picture`], and, before decoding, [`CaptureError::Invalid`]
+    /// for a side of 0 or above 8192.
     pub fn load(path: &Path) -> Result<Self, CaptureError> {
         let decoded = decode(path)?.into_rgb32f();
         Ok(Self { width: decoded.width(), height: decoded.height(), pixels: decoded.into_raw() })
@@ -90,7 +90,7 @@ fn to_byte(value: f32) -> u8 {
 
 fn picture_error(path: &Path, source: image::ImageError) -> CaptureError {
     match source {
-        // A file that ends too early is damaged, not out of reach.
+        // A truncated file is damaged.
         image::ImageError::IoError(source) if source.kind() != std::io::ErrorKind::UnexpectedEof => {
             CaptureError::Io { path: path.to_owned(), source }
         }
@@ -130,8 +130,7 @@ pub(super) fn load_mask(path: &Path) -> Result<(u32, u32, Vec<f32>), CaptureErro
 }
 
 /// Resamples values of `channels` (1 or 3) a pixel with a tent filter as wide as the reduction
-/// needs; the outer edges of both pictures coincide. Linear, so that what is premultiplied by its
-/// mask stays so.
+/// needs; the outer edges of both pictures coincide. Linear, which preserves premultiplication.
 pub(super) fn resize(values: Vec<f32>, channels: usize, from: (u32, u32), to: (u32, u32)) -> Vec<f32> {
     fn resample<P>(values: Vec<f32>, from: (u32, u32), to: (u32, u32)) -> Vec<f32>
     where

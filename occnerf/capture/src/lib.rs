@@ -1,8 +1,8 @@
 //! Captures: frames with images, masks, cameras and body parameters.
 //!
-//! A [`Capture`] comes from a directory ([`load_capture`]), which [`import`] makes of what body
-//! estimators and segmenters write. Its images hold nothing of what the masks hide, so that no
-//! hidden pixel can reach training.
+//! A [`Capture`] is loaded from a directory ([`load_capture`]), which [`import`] writes from the
+//! results of body estimators and segmenters. Images are multiplied by their masks, so that no
+//! masked pixel reaches training.
 
 mod camera;
 mod checks;
@@ -34,7 +34,7 @@ pub use self::checks::MAX_BETA;
 pub use self::decode::PIXEL_BYTES;
 pub use self::error::CaptureError;
 pub use self::find::{Layout, find_body, own_body};
-pub use self::frame::{Capture, EvalFrame, Frame};
+pub use self::frame::{Capture, EvalFrame, Frame, Mended, Registered};
 pub use self::image::{Image, MAX_SIDE};
 pub use self::import::{ImportOptions, Imported, Tool, import};
 pub use self::light::Light;
@@ -49,31 +49,27 @@ use std::path::Path;
 /// it:
 ///
 /// - **raw ZJU-MoCap** (Peng et al. 2021; `annots.npy`, pictures by camera, `mask_cihp` or `mask`,
-///   `new_params`): one camera is for training, the others are kept back. What
-///   `occlusion.json` says of a simulated obstacle is hidden. Kept-back pictures that are not there
-///   are left out.
+///   `new_params`): one camera for training, the others, as far as present, for evaluation;
+///   `occlusion.json` gives a simulated obstacle.
 /// - **HumanNeRF's prepared layout** (Weng et al. 2022; `cameras.pkl`, `mesh_infos.pkl`,
-///   `canonical_joints.pkl`, `images`, `masks`), cameras kept back in `eval/*`.
-/// - **HumanNeRF's wild layout** (`metadata.json`, `images`, `masks`), with `occluders` where it is
-///   known what stands in front, and `clean/images`, `clean/masks` of the training camera kept
-///   back.
+///   `canonical_joints.pkl`, `images`, `masks`), evaluation cameras in `eval/*`.
+/// - **HumanNeRF's wild layout** (`metadata.json`, `images`, `masks`), with masks of occluders in
+///   `occluders`, and unoccluded frames in `clean/images`, `clean/masks` for evaluation.
 ///
-/// Pictures are decoded at once, in parallel, as far as [`LoadOptions::max_bytes`] admits; of the
-/// rest the headers are looked at, and each is decoded whenever it is asked for.
+/// Pictures are decoded in parallel within [`LoadOptions::max_bytes`]; of the rest, headers are
+/// checked, and each is decoded at every use.
 ///
-/// Images are multiplied by their masks. Lens distortion is taken out of both, and both are reduced
-/// to [`LoadOptions::resize`]. A frame without any subject pixel is kept (the subject may be wholly
-/// hidden for a while); a camera without any in all its frames is an error. No views kept back
-/// leave [`Capture::eval`] empty.
+/// Images are multiplied by their masks; both are undistorted and resized to
+/// [`LoadOptions::resize`]. A frame may have no subject pixel (fully occluded), but not all frames of
+/// a camera.
 ///
 /// # Errors
-/// The first problem in the order files are read, training view before views kept back: a directory
-/// of no known layout; files that are missing, unreadable, truncated (but for pictures that there
-/// is no room for, whose headers alone are read) or name anything to execute; frames without camera
-/// or body parameters; images and masks of unequal sizes or above 8192 pixels; more bodies than
-/// [`LoadOptions::max_bytes`] admits; arrays of the wrong shape, or not finite; cameras that no
-/// projection fits, or that see nothing of the body in any frame; a body model whose joints or
-/// vertices are not the file's; options outside their ranges.
+/// The first problem in the order files are read, training before evaluation: an unknown layout;
+/// files that are missing, unreadable, truncated (except undecoded pictures) or name anything to
+/// execute; frames without camera or body parameters; images and masks of unequal sizes or above 8192
+/// pixels; bodies beyond [`LoadOptions::max_bytes`]; arrays of another shape, or not finite; invalid
+/// cameras, or none with the body in view; a body model with other joints or vertices than the
+/// file's; options outside their ranges.
 pub fn load_capture(dir: &Path, body: &smpl::BodyModel, options: &LoadOptions) -> Result<Capture, CaptureError> {
     options.check()?;
     match find::Layout::detect(dir)? {

@@ -1,4 +1,4 @@
-//! Names of frames, in the order that they were taken.
+//! Natural order of frame names.
 
 use std::cmp::Ordering;
 
@@ -23,7 +23,7 @@ impl Ord for FrameName<'_> {
             }
             (a, b) = (after_x, after_y);
         }
-        // Equal but for leading zeros, or the beginning of the other.
+        // Equal up to leading zeros, or a prefix of the other.
         a.len().cmp(&b.len()).then_with(|| self.0.cmp(other.0))
     }
 }

@@ -3,24 +3,21 @@ use serde::{Deserialize, Serialize};
 use super::CaptureError;
 use super::image::MAX_SIDE;
 
-/// Settings that a capture's files leave open, and how much of them is read. Every layout obeys all
-/// of it, but `camera`, which only raw ZJU-MoCap leaves open. Two are equal where
-/// they read the same: `max_bytes` and `unseen` are not compared.
+/// Options of loading a capture, valid for every layout except `camera`, for raw ZJU-MoCap only.
+/// Equality is that of the loaded data: `max_bytes` and `unseen` are not compared.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct LoadOptions {
-    /// Where the intrinsics put the centre of the first pixel: 0.5 where they count from the
-    /// image's corner, 0 where they count from the first pixel's centre, as HumanNeRF's own rays
-    /// do.
+    /// Image coordinate of the first pixel's centre in the intrinsics: 0.5, or 0 as in HumanNeRF's
+    /// own rays.
     pub pixel_centre: f32,
-    /// Longest side in pixels that pictures are reduced to; smaller ones, and all if `None`, stay
-    /// as they are.
+    /// Largest side after resizing, pixels; `None` keeps all sizes.
     pub resize: Option<u32>,
-    /// Training frames are every n-th, beginning with the first.
+    /// Stride of training frames.
     pub stride: usize,
     /// At most this many training frames, the first ones after `stride`.
     pub max_frames: Option<usize>,
-    /// Views kept back are those of every n-th training frame, beginning with the first.
+    /// Stride of training frames whose evaluation views are loaded.
     pub eval_stride: usize,
     /// Memory limit in bytes for the bodies of all frames (24 a vertex), the labels of the training
     /// frames (3 bits a pixel), packed pictures (4 or 16 a pixel of the person) and pictures being
@@ -28,8 +25,7 @@ pub struct LoadOptions {
     pub max_bytes: u64,
     /// The training camera: its folder's name, or its number counted from 1. The first if `None`.
     pub camera: Option<String>,
-    /// Whether a capture is read whose cameras see nothing of the body, for
-    /// `occnerf::check` to say why.
+    /// Whether cameras without the body in view are accepted, for `occnerf::check` to diagnose.
     #[serde(skip)]
     pub unseen: bool,
 }
@@ -83,7 +79,7 @@ impl LoadOptions {
         items.into_iter().step_by(self.stride).take(self.max_frames.unwrap_or(usize::MAX)).collect()
     }
 
-    /// Errors where an option is given that means nothing in `layout`.
+    /// Errors for an option without meaning in `layout`.
     pub(super) fn only_zju(&self, layout: &str) -> Result<(), CaptureError> {
         if let Some(camera) = &self.camera {
             let expected = format!("none ({layout} has one training camera)");

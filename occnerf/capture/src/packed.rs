@@ -1,4 +1,4 @@
-//! Pixels in few bytes: of each row only what is not all zero, in bytes where they say it exactly.
+//! Lossless compression of pixels: row spans of non-zero pixels, in 8-bit levels where exact.
 
 use std::sync::LazyLock;
 
@@ -6,15 +6,14 @@ use glam::Vec3;
 
 use super::{Image, Pixels};
 
-/// A picture, its mask and its occluder in few bytes, without loss: [`PackedPixels::pixels`]
-/// returns the same bits.
+/// A compressed picture with mask and occluder; [`PackedPixels::pixels`] returns the same bits.
 #[derive(Clone, Debug)]
 pub struct PackedPixels {
     rows: Rows,
     values: Values,
 }
 
-/// Where the values of a picture lie.
+/// Layout of the values of a picture.
 #[derive(Clone, Debug)]
 struct Rows {
     width: u32,
@@ -23,7 +22,7 @@ struct Rows {
     occluder: Option<Vec<u64>>,
 }
 
-/// Columns of a row that hold something, and the place of the first one's value.
+/// Non-zero columns of a row, and the index of the first value.
 #[derive(Clone, Copy, Debug)]
 struct Span {
     start: u32,
@@ -40,8 +39,7 @@ enum Values {
     Floats(Vec<[f32; 4]>),
 }
 
-/// What levels of 8 bits are in floats: 1/255 each, but for the last bit, which readers of grey
-/// pictures have another way.
+/// Floats of the 8-bit levels: level / 255, up to rounding that differs for grey pictures.
 #[derive(Clone, Debug, PartialEq)]
 struct Scale {
     colour: [f32; 256],
@@ -60,7 +58,7 @@ fn nearest(value: f32) -> u8 {
 }
 
 impl Scale {
-    /// The scale of these values, if they have one.
+    /// The scale of these values, if they are levels.
     fn of(values: &[[f32; 4]]) -> Self {
         let mut scale = EVEN.clone();
         for [r, g, b, mask] in values {
@@ -151,7 +149,7 @@ impl Rows {
             let colour = &pixels.image.pixels[3 * i..3 * i + 3];
             [colour[0], colour[1], colour[2], pixels.mask[i]]
         };
-        // −0 is something, too.
+        // −0 is kept.
         let holds = |i: &usize| value(*i).map(f32::to_bits) != [0; 4];
         let (mut spans, mut values) = (Vec::new(), Vec::new());
         for row in 0..pixels.mask.len() / width {

@@ -34,13 +34,12 @@ pub struct Pixels {
     /// Coverage of each pixel by the *visible* subject, 0 to 1, (H, W); above 0.5 the pixel counts
     /// as subject.
     pub mask: Vec<f32>,
-    /// Pixels known to be covered by something in front of the subject, (H, W); `None` where nobody
-    /// marked them.
+    /// Known occluder pixels, (H, W); `None` where unknown.
     pub occluder: Option<Vec<bool>>,
 }
 
 impl Pixels {
-    /// Hides everything in an area.
+    /// Masks an area.
     pub fn hide(&mut self, area: &Area) {
         let width = self.image.width;
         let visible: Vec<f32> = (0..self.mask.len()).map(|p| if area.contains(p, width) { 0.0 } else { 1.0 }).collect();

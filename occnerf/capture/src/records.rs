@@ -1,4 +1,4 @@
-//! Pickled dictionaries of arrays, with errors that name file, frame and key.
+//! Pickled dictionaries of arrays; errors name file, frame and key.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -142,8 +142,8 @@ impl<'a> Record<'a> {
     }
 }
 
-/// An array, or lists of them stacked; the inner error says what is there instead. Pickles bound
-/// the depth.
+/// An array, or nested lists of arrays stacked; the inner error is the actual type. Pickles bound the
+/// depth.
 fn stack(value: &Value, file: &str, key: &str) -> Result<Result<NdArray, String>, CaptureError> {
     if let Some(array) = value.to_dense(file, key)? {
         return Ok(Ok(array));

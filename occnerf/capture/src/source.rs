@@ -1,4 +1,4 @@
-//! Where the pixels of a frame are: in memory, or in files that are decoded when asked for.
+//! Sources of a frame's pixels: memory, or files decoded on demand.
 
 use std::fmt;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -9,7 +9,7 @@ use super::packed::PackedPixels;
 use super::pixels::{Area, Pixels};
 use super::{CaptureError, Image};
 
-/// The pixels of a frame, packed in memory or in files. Clones share what is decoded.
+/// The pixels of a frame, packed in memory or in files. Clones share decoded pixels.
 #[derive(Clone, Debug)]
 pub struct PixelSource(Place);
 
@@ -19,14 +19,14 @@ enum Place {
     Disk(Arc<OnDisk>),
 }
 
-/// A change of pixels that is made again whenever they are decoded.
+/// An edit of pixels, repeated at each decoding.
 type Edit = Arc<dyn Fn(&mut Pixels) + Send + Sync>;
 
 struct OnDisk {
     files: Arc<Files>,
     edits: Vec<Edit>,
     allowance: Arc<Allowance>,
-    /// The first decoding, `None` where the allowance was spent.
+    /// Packed pixels after the first decoding; `None` with the allowance exhausted.
     kept: OnceLock<Option<Kept>>,
 }
 
@@ -41,7 +41,7 @@ pub(super) struct Allowance {
     spent: AtomicBool,
 }
 
-/// Bytes of an [`Allowance`], given back when dropped.
+/// Bytes of an [`Allowance`], returned on drop.
 #[derive(Debug)]
 struct Room {
     of: Arc<Allowance>,
@@ -82,7 +82,7 @@ impl OnDisk {
         Ok(pixels)
     }
 
-    /// Packs the decoded pixels while the allowance lasts.
+    /// Keeps the decoded pixels packed, within the allowance.
     fn keep(&self, pixels: &Pixels) {
         self.kept.get_or_init(|| {
             let packed = PackedPixels::new(pixels);
@@ -91,7 +91,7 @@ impl OnDisk {
         });
     }
 
-    /// A copy of the description with nothing decoded.
+    /// A copy without decoded pixels.
     fn anew(&self) -> Self {
         Self {
             files: Arc::clone(&self.files),
@@ -102,7 +102,7 @@ impl OnDisk {
     }
 }
 
-/// Pixels to read one by one.
+/// Random access to packed pixels.
 pub struct PixelReader(Packed);
 
 enum Packed {
@@ -128,7 +128,7 @@ impl From<Pixels> for PixelSource {
 }
 
 impl PixelSource {
-    /// Pixels that are decoded when asked for, and kept packed while `allowance` lasts.
+    /// Pixels decoded on demand, and kept packed within `allowance`.
     pub(super) fn on_disk(files: Files, allowance: Arc<Allowance>) -> Self {
         let (files, edits, kept) = (Arc::new(files), Vec::new(), OnceLock::new());
         Self(Place::Disk(Arc::new(OnDisk { files, edits, allowance, kept })))
@@ -137,7 +137,7 @@ impl PixelSource {
     /// The pixels, unpacked or decoded.
     ///
     /// # Errors
-    /// Files that cannot be read any more, or never were readable; none for pixels in memory.
+    /// Unreadable files; none for pixels in memory.
     pub fn pixels(&self) -> Result<Pixels, CaptureError> {
         match &self.0 {
             Place::Memory(packed) => Ok(packed.pixels()),
@@ -153,7 +153,7 @@ impl PixelSource {
         }
     }
 
-    /// The pixels for reading some of them, without unpacking.
+    /// Random access without unpacking.
     ///
     /// # Errors
     /// As of [`PixelSource::pixels`].
@@ -171,7 +171,7 @@ impl PixelSource {
         }))
     }
 
-    /// The picture without its mask; `None` for pixels that no file has.
+    /// The unmasked picture; `None` for pixels in memory.
     #[must_use]
     pub fn photograph(&self) -> Option<Result<Image, CaptureError>> {
         match &self.0 {
@@ -180,13 +180,13 @@ impl PixelSource {
         }
     }
 
-    /// Whether a simulated obstacle, which the photograph does not show, hides pixels.
+    /// Whether a simulated obstacle, absent from the photograph, masks pixels.
     #[must_use]
     pub fn is_hidden(&self) -> bool {
         matches!(&self.0, Place::Disk(disk) if disk.files.hidden.is_some())
     }
 
-    /// Decodes what is to be kept, and checks the headers of the rest.
+    /// Decodes within the allowance, and checks headers beyond it.
     pub(super) fn check(&self) -> Result<(), CaptureError> {
         match &self.0 {
             Place::Disk(disk) if disk.allowance.spent.load(Ordering::Relaxed) => disk.files.check(),
@@ -194,7 +194,7 @@ impl PixelSource {
         }
     }
 
-    /// Changes the pixels, now or whenever they are decoded; their photograph stays as it is.
+    /// Edits the pixels, now or at each decoding; the photograph is unchanged.
     pub fn edit(&mut self, edit: impl Fn(&mut Pixels) + Send + Sync + 'static) {
         match &mut self.0 {
             Place::Memory(packed) => {
@@ -215,7 +215,7 @@ impl PixelSource {
         }
     }
 
-    /// Puts a simulated obstacle in front of an area of pixels, in place of an earlier one.
+    /// Simulates an obstacle over an area of pixels, replacing an earlier one.
     pub fn hide(&mut self, area: Area) {
         match &mut self.0 {
             Place::Memory(_) => self.edit(move |pixels| pixels.hide(&area)),

@@ -1,10 +1,10 @@
-//! Taking a lens's distortion out of pictures.
+//! Undistortion of pictures.
 
 use glam::Vec2;
 use volrender::{Camera, Distortion};
 
-/// What a perfect lens would have shown in place of `source` (H, W, channels), which `camera` saw
-/// through `distortion`: bilinear, 0 beyond the border and where the model of the lens folds back.
+/// Undistorts `source` (H, W, channels) of `camera` with `distortion`: bilinear, 0 beyond the border
+/// and where the distortion model folds back.
 pub(super) fn undistort(source: Vec<f32>, channels: usize, camera: &Camera, distortion: &Distortion) -> Vec<f32> {
     if distortion.is_identity() {
         return source;

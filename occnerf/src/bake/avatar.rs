@@ -1,4 +1,4 @@
-//! The plain types of a baked person, their checks, and how it moves.
+//! The avatar as plain data, its validation and its skinning.
 
 use glam::{Affine3A, Mat3, Mat3A, Vec2, Vec3, Vec3A};
 use rayon::prelude::*;
@@ -13,15 +13,14 @@ pub const MAX_SHELLS: usize = 5;
 pub const MAX_JOINTS: usize = 256;
 /// Longest side of an atlas in texels.
 pub const MAX_ATLAS_SIDE: u32 = 4096;
-/// Largest coordinate that is taken for one, in metres.
+/// Largest coordinate, in metres.
 const MAX_LENGTH: f32 = 1e6;
 /// Steepest light.
 const MAX_SLOPE: f32 = 10.0;
 /// Pose blend-shape terms of a joint other than the root: the entries of R − I.
 const TERMS_PER_JOINT: usize = 9;
 
-/// A person as one to five textured shells of triangles, skinned to a skeleton, with the motions
-/// they make.
+/// A person as one to five textured, skinned shells of triangles, with motion clips.
 ///
 /// Everything is in metres in a world that is right-handed and y up. The surface stands in the
 /// canonical pose (the T-pose, all rotations zero), facing +z. V vertices, F triangles, J joints, T
@@ -30,13 +29,11 @@ const TERMS_PER_JOINT: usize = 9;
 pub struct Avatar {
     /// Name of the scene, as the capture gives it.
     pub name: String,
-    /// Canonical positions of all shells, (V); vertices on a seam of the atlas stand once for each
-    /// chart.
+    /// Canonical positions of all shells, (V); a vertex on a seam of the atlas has a copy per chart.
     pub vertices: Vec<Vec3>,
     /// Canonical unit normals, (V).
     pub normals: Vec<Vec3>,
-    /// Place in the atlas, (V): u to the right and v downward, both from 0 to 1 over the whole
-    /// atlas.
+    /// Texture coordinates, (V): u to the right and v downward, 0 to 1 over the atlas.
     pub uvs: Vec<Vec2>,
     /// Triangles of all shells, the innermost shell's first, (F), counter-clockwise seen from
     /// outside.
@@ -44,17 +41,17 @@ pub struct Avatar {
     /// One past the last triangle of each shell, from the innermost to the outermost; ascending,
     /// the last is F.
     pub shell_ends: Vec<u32>,
-    /// Joints that move each vertex, (V); those that do not count are repeated or 0.
+    /// Joints of each vertex, (V); unused entries are repeated or 0.
     pub joints: Vec<[u16; 4]>,
     /// Their weights, (V): not negative, summing to 1.
     pub weights: Vec<[f32; 4]>,
-    /// Pose blend shapes, (V, 9(J−1)), in the order of [`smpl::BodyModel::posedirs`]; no row has
-    /// any entry where skinning alone moves the surface. Formats that have none leave them out.
+    /// Pose blend shapes, (V, 9(J−1)), in the order of [`smpl::BodyModel::posedirs`]; empty rows for
+    /// skinning alone. Formats without them leave them out.
     pub posedirs: SparseRows<Vec3>,
     /// Colours and confidence.
     pub atlas: Atlas,
-    /// The light that the video was taken in, under which the atlas's colours are what it showed.
-    /// Formats that have none leave it out.
+    /// Light of the video: shading times the atlas's albedo is the video's colour. Formats without
+    /// light leave it out.
     pub light: Light,
     /// The skeleton at rest, (J); parents come before their children, joint 0 is the only root.
     pub skeleton: Vec<Joint>,
@@ -66,7 +63,7 @@ pub struct Avatar {
     pub cameras: Vec<Camera>,
 }
 
-/// The picture that the surface is painted with.
+/// The texture.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Atlas {
     /// Texels a row.
@@ -75,7 +72,7 @@ pub struct Atlas {
     pub height: u32,
     /// 8-bit sRGB and linear alpha, not premultiplied, (H, W, 4), row-major from the top left.
     pub rgba: Vec<u8>,
-    /// How well the video showed each texel, (H, W): 0 never, 255 often.
+    /// Observation confidence of each texel, (H, W): 0 unobserved, 255 full.
     pub confidence: Vec<u8>,
 }
 
@@ -84,7 +81,7 @@ pub struct Atlas {
 pub struct Joint {
     /// Such as `left_knee`; unique.
     pub name: String,
-    /// The joint it hangs from; `None` for the root alone.
+    /// Parent joint; `None` for the root alone.
     pub parent: Option<u16>,
     /// Canonical position.
     pub rest: Vec3,
@@ -122,7 +119,7 @@ impl Avatar {
     /// If there is no such shell.
     #[must_use]
     pub fn shell(&self, shell: usize) -> &[[u32; 3]] {
-        let start = shell.checked_sub(1).map_or(0, |before| self.shell_ends[before] as usize);
+        let start = shell.checked_sub(1).map_or(0, |previous| self.shell_ends[previous] as usize);
         &self.faces[start..self.shell_ends[shell] as usize]
     }
 
@@ -201,10 +198,10 @@ impl Avatar {
         self.normals.par_iter().enumerate().map(turned).collect()
     }
 
-    /// Says what does not fit together, names the part, and what is expected and found.
+    /// Checks that the parts fit together.
     ///
     /// # Errors
-    /// The first fault in the order of the fields.
+    /// The first fault in the order of the fields: its part, expected and found.
     pub fn validate(&self) -> Result<(), String> {
         let (v, j) = (self.num_vertices(), self.num_joints());
         let each = [
@@ -332,9 +329,9 @@ fn expect(holds: bool, message: impl FnOnce() -> String) -> Result<(), String> {
     if holds { Ok(()) } else { Err(message()) }
 }
 
-/// Every entry must do; NaN does not pass comparisons.
-fn all<T: std::fmt::Debug>(key: &str, values: &[T], does: impl Fn(&T) -> bool, expected: &str) -> Result<(), String> {
-    match values.iter().position(|value| !does(value)) {
+/// Errors for the first entry that is not `valid`; NaN fails comparisons.
+fn all<T: std::fmt::Debug>(key: &str, values: &[T], valid: impl Fn(&T) -> bool, expected: &str) -> Result<(), String> {
+    match values.iter().position(|value| !valid(value)) {
         Some(at) => Err(format!("`{key}`: expected {expected}, found {:?} at {at}", values[at])),
         None => Ok(()),
     }

@@ -1,4 +1,4 @@
-//! The atlas: the prior's faces in charts that look one way, side by side in a square.
+//! Atlas parameterisation: axis-aligned projection charts of the prior's faces, packed in a square.
 
 use std::collections::{HashMap, VecDeque};
 
@@ -6,28 +6,27 @@ use glam::{Mat3, Vec2, Vec3};
 
 /// Texels between charts and around them.
 pub(super) const PADDING: u32 = 4;
-/// Directions that charts look in: the axes, both ways.
+/// Projection directions of charts.
 const DIRECTIONS: [Vec3; 6] = [Vec3::Z, Vec3::NEG_Z, Vec3::X, Vec3::NEG_X, Vec3::Y, Vec3::NEG_Y];
-/// Passes in which faces join the chart that most of their neighbours are in.
+/// Passes of majority voting among neighbouring faces.
 const VOTES: usize = 6;
-/// Least cosine between a face's normal and the direction of a chart that it joins for its
-/// neighbours' sake.
+/// Least cosine between a face's normal and a direction taken by majority.
 const LEAST_COSINE: f32 = 0.35;
 
-/// Charts over the faces of a mesh, laid out.
+/// Packed charts of a mesh.
 #[derive(Clone, Debug, Default)]
-pub(super) struct Layout {
+pub(super) struct AtlasLayout {
     /// Side of the square, texels.
     pub side: u32,
     /// The chart of each face, (F).
     pub charts: Vec<u32>,
-    /// Charts of a shell.
+    /// Number of charts of a shell.
     count: usize,
-    /// Where a point of the mesh is in the square, texels, chart by chart.
+    /// Projection of each chart.
     places: Vec<Projection>,
 }
 
-/// Along an axis onto the plane.
+/// Orthographic projection along an axis, to texels.
 #[derive(Clone, Copy, Debug)]
 struct Projection {
     direction: usize,
@@ -36,7 +35,7 @@ struct Projection {
 }
 
 impl Projection {
-    /// On the plane, in the mesh's unit: as seen against the direction, right side out.
+    /// Projected point in the mesh's unit, viewed against the direction.
     fn flat(direction: usize, v: Vec3) -> Vec2 {
         let forward = DIRECTIONS[direction];
         let up = if forward.y == 0.0 { Vec3::Y } else { Vec3::Z };
@@ -45,13 +44,12 @@ impl Projection {
     }
 }
 
-impl Layout {
-    /// Charts for a mesh of `vertices` and `faces`, `texel` wide texels; wider ones where they need
-    /// more than a square of `most` × `most`. All of them `shells` times. `None` where even charts
-    /// of a texel do not fit.
+impl AtlasLayout {
+    /// Charts of a mesh, repeated for `shells` shells, at a texel width of `texel`, or wider to fit a
+    /// square of `most` × `most`. `None` where even charts of one texel do not fit.
     pub fn new(vertices: &[Vec3], faces: &[[u32; 3]], shells: usize, texel: f32, most: u32) -> Option<Self> {
         let directions = directions(vertices, faces);
-        // Texels of which the whole square would not hold enough take memory and tell nothing.
+        // Lower bound of the texel width, from the area.
         let area = |face: &[u32; 3]| {
             let [a, b, c] = face.map(|v| vertices[v as usize]);
             0.5 * (b - a).cross(c - a).length()
@@ -90,14 +88,14 @@ impl Layout {
         None
     }
 
-    /// Where a point of the mesh is in the square, texels.
+    /// Atlas coordinates of a point of the mesh, texels.
     pub fn place(&self, shell: usize, chart: u32, point: Vec3) -> Vec2 {
         let Projection { direction, scale, offset } = self.places[shell * self.count + chart as usize];
         scale * Projection::flat(direction, point) + offset
     }
 }
 
-/// The direction that each face belongs to: the nearest, then by majority.
+/// Projection direction of each face: the nearest to its normal, then by majority voting.
 fn directions(vertices: &[Vec3], faces: &[[u32; 3]]) -> Vec<usize> {
     let normals: Vec<Vec3> = faces
         .iter()
@@ -121,7 +119,7 @@ fn directions(vertices: &[Vec3], faces: &[[u32; 3]]) -> Vec<usize> {
     of
 }
 
-/// Faces that share an edge with each.
+/// Neighbours of each face across its edges.
 fn adjacent(faces: &[[u32; 3]]) -> Vec<Vec<u32>> {
     let mut edges: HashMap<(u32, u32), Vec<u32>> = HashMap::with_capacity(faces.len() * 3 / 2);
     let sides = |&[a, b, c]: &[u32; 3]| [(a, b), (b, c), (c, a)].map(|(a, b)| (a.min(b), a.max(b)));
@@ -135,14 +133,13 @@ fn adjacent(faces: &[[u32; 3]]) -> Vec<Vec<u32>> {
     (0..).zip(faces).map(others).collect()
 }
 
-/// Connected faces of one direction that do not hide each other, none twice as many texels as its
-/// own.
+/// Charts of the faces: connected faces of one direction whose projections do not overlap.
 fn charts(vertices: &[Vec3], faces: &[[u32; 3]], directions: &[usize], texel: f32) -> Vec<u32> {
     const NONE: u32 = u32::MAX;
     let near = adjacent(faces);
     let (mut charts, mut count) = (vec![NONE; faces.len()], 0);
     let (mut queue, mut taken) = (VecDeque::new(), HashMap::new());
-    // Faces that were refused by the chart being grown.
+    // Faces refused by the current chart.
     let mut refused = vec![NONE; faces.len()];
     for seed in 0..faces.len() {
         if charts[seed] != NONE {
@@ -164,14 +161,14 @@ fn charts(vertices: &[Vec3], faces: &[[u32; 3]], directions: &[usize], texel: f3
             charts[face] = count;
             queue.extend(near[face].iter().map(|&n| n as usize));
         }
-        // A seed that covers itself twice cannot be refused.
+        // A seed is never refused.
         charts[seed] = count;
         count += 1;
     }
     charts
 }
 
-/// Texels whose middles are well inside a triangle.
+/// Texels with their centres inside a triangle.
 fn inner_texels([a, b, c]: [Vec2; 3]) -> Vec<[i32; 2]> {
     let (low, high) = (a.min(b).min(c).floor(), a.max(b).max(c).ceil());
     let area = (b - a).perp_dot(c - a);
@@ -188,8 +185,7 @@ fn inner_texels([a, b, c]: [Vec2; 3]) -> Vec<[i32; 2]> {
     texels
 }
 
-/// The side of a square, at most `most`, and the corners of boxes side by side in it, row by row,
-/// the highest first.
+/// Shelf packing of boxes by descending height: side of the square, at most `most`, and corners.
 fn pack(sizes: &[[u32; 2]], most: u32) -> Option<(u32, Vec<[u32; 2]>)> {
     let mut order: Vec<usize> = (0..sizes.len()).collect();
     order.sort_by_key(|&i| (std::cmp::Reverse(sizes[i][1]), std::cmp::Reverse(sizes[i][0]), i));

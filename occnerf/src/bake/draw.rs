@@ -1,4 +1,4 @@
-//! Pictures of a baked person: skinned, rasterised, painted from the atlas.
+//! Rendering of a baked person: skinning, rasterisation, texture lookup, shading.
 
 use glam::{Affine3A, Mat3, Mat3A, Vec2, Vec3, Vec3A, Vec4};
 use rayon::prelude::*;
@@ -10,25 +10,25 @@ use crate::Error;
 use crate::capture::Light;
 use crate::model::view::pinhole;
 
-/// Vertices that are skinned together.
+/// Vertices per parallel task.
 const CHUNK: usize = 1024;
 /// Pose blend-shape terms of a joint other than the root.
 const TERMS: usize = 9;
 
-/// An avatar made ready to be drawn; keeps its buffers from picture to picture.
+/// An avatar with the buffers to render it.
 pub struct BakedPerson<'a> {
     avatar: &'a Avatar,
     /// Canonical positions in the unit of the bones, (V).
     vertices: Vec<Vec3>,
-    /// What one unit of the avatar is in that of the bones.
+    /// Length of a unit of the avatar in that of the bones.
     scale: f32,
     /// Premultiplied colours, (H, W).
     texels: Vec<Vec4>,
-    /// Premultiplied colours of the vertices, (V); empty where the atlas paints.
+    /// Premultiplied colours of the vertices, (V); empty under texture lookup.
     corners: Vec<Vec4>,
     features: Vec<f32>,
     skinned: Vec<Vec3>,
-    /// Brightness of each vertex, (V).
+    /// Shading of each vertex, (V).
     shades: Vec<f32>,
     rasterizer: Rasterizer,
     light: Light,
@@ -56,13 +56,13 @@ impl<'a> BakedPerson<'a> {
         }
     }
 
-    /// Under this light instead of even light.
+    /// Sets the light; even by default.
     #[must_use]
     pub fn lit_by(self, light: Light) -> Self {
         Self { light, ..self }
     }
 
-    /// Painted between the colours that the atlas has at the vertices, instead of from all of it.
+    /// Interpolates the colours of the vertices instead of texture lookup.
     #[must_use]
     pub fn in_vertex_colours(mut self) -> Self {
         let size = atlas_size(self.avatar);
@@ -96,7 +96,7 @@ impl<'a> BakedPerson<'a> {
                     rest += features[term] * Vec3A::from(direction);
                 }
                 *out = Vec3::from(matrix * rest + translation);
-                // Turned with the bones, so that charts of the atlas share them at their seams.
+                // Rotated with the bones: equal on both sides of a seam.
                 let normal = avatar.normals[v];
                 *shade = light.on(Vec3::from(matrix * Vec3A::from(normal)).normalize_or(normal));
             }
@@ -104,7 +104,7 @@ impl<'a> BakedPerson<'a> {
         skinned
     }
 
-    /// Positions (V) and brightness (V) of the vertices as they were last skinned.
+    /// Positions (V) and shading (V) of the last skinning.
     pub(super) fn posed(&self) -> (&[Vec3], &[f32]) {
         (&self.skinned, &self.shades)
     }
@@ -142,13 +142,13 @@ impl<'a> BakedPerson<'a> {
     }
 }
 
-/// Brightness of a fragment between those of its corners.
+/// Interpolated shading of a fragment.
 #[inline]
 pub(super) fn shade(avatar: &Avatar, shades: &[f32], fragment: &Fragment) -> f32 {
     between(avatar, fragment, |v| shades[v])
 }
 
-/// What a fragment has between its corners.
+/// Barycentric interpolation at a fragment.
 #[inline]
 fn between<T>(avatar: &Avatar, fragment: &Fragment, of: impl Fn(usize) -> T) -> T
 where
@@ -159,7 +159,7 @@ where
     corners.iter().zip(fragment.barycentric).map(|(&v, b)| b * of(v as usize)).sum()
 }
 
-/// Texels to the right and down.
+/// Width and height of the atlas, texels.
 fn atlas_size(avatar: &Avatar) -> Vec2 {
     Vec2::new(avatar.atlas.width as f32, avatar.atlas.height as f32)
 }
@@ -175,20 +175,17 @@ fn blend_shape_features(avatar: &Avatar, bones: &[Affine3A], scale: f32, out: &m
     }
 }
 
-/// What the faces are painted with.
+/// Inputs of a fragment's colour.
 struct Paint<'a> {
     avatar: &'a Avatar,
     texels: &'a [Vec4],
-    /// Of each vertex; empty where the atlas paints.
     corners: &'a [Vec4],
-    /// Of each vertex.
     shades: &'a [f32],
-    /// Of the atlas.
     size: Vec2,
 }
 
 impl Paint<'_> {
-    /// Fragments over each other, the nearest on top.
+    /// Front-to-back compositing of fragments.
     #[inline]
     fn composite(&self, sample: &[Fragment]) -> Vec4 {
         let mut sum = Vec4::ZERO;
@@ -205,7 +202,7 @@ impl Paint<'_> {
     }
 }
 
-/// Between the middles of the four texels about `place`, in texels.
+/// Bilinear lookup at `place`, in texels.
 #[inline]
 fn lookup(texels: &[Vec4], atlas: &Atlas, place: Vec2) -> Vec4 {
     let corner = BilinearCorner::new(place, Vec2::new(atlas.width as f32, atlas.height as f32));
@@ -214,13 +211,13 @@ fn lookup(texels: &[Vec4], atlas: &Atlas, place: Vec2) -> Vec4 {
     top + (bottom - top) * corner.share.y
 }
 
-/// Where a fragment is in the atlas, 0 to 1.
+/// Atlas coordinates of a fragment, 0 to 1.
 #[inline]
 pub(super) fn atlas_place(avatar: &Avatar, fragment: &Fragment) -> Vec2 {
     between(avatar, fragment, |v| avatar.uvs[v])
 }
 
-/// The first of the four texels about a place, and how far towards the others it is.
+/// The first of the four texels of a bilinear lookup, and the fractional offset.
 pub(super) struct BilinearCorner {
     x: usize,
     y: usize,
@@ -231,13 +228,13 @@ impl BilinearCorner {
     /// At `place`, in texels of an atlas of `size`.
     #[inline]
     pub fn new(place: Vec2, size: Vec2) -> Self {
-        // Texels at the border go on beyond it.
+        // Clamped to the edge.
         let at = (place - 0.5).clamp(Vec2::ZERO, (size - 1.0).max(Vec2::ZERO));
         let corner = at.floor().min((size - 2.0).max(Vec2::ZERO));
         Self { x: corner.x as usize, y: corner.y as usize, share: at - corner }
     }
 
-    /// Row by row; an atlas of one row or column has its only one twice.
+    /// Indices row by row; the only row or column of a thin atlas occurs twice.
     #[inline]
     pub fn texels(&self, width: u32, height: u32) -> [usize; 4] {
         let first = self.y * width as usize + self.x;

@@ -1,4 +1,4 @@
-//! What a bake asks of a trained person: density and colour at points of the canonical space.
+//! The field in canonical space, as baking samples it.
 
 use glam::Vec3;
 
@@ -11,23 +11,22 @@ pub(super) struct Place {
     pub closest: Vec3,
     pub face: u32,
     pub barycentric: [f32; 3],
-    /// From there, positive outside.
+    /// Signed distance from there, positive outside.
     pub distance: f32,
 }
 
 /// A trained person in the canonical space.
 pub(super) trait CanonicalField: Sync {
-    /// Density, in 1 / normalised metre and 0 where nothing can be, and colour at each of `places`;
+    /// Density, in 1 / normalised metre and 0 outside the extent, and colour at each of `places`;
     /// overwrites `out`.
     fn evaluate(&self, places: &[Place], out: &mut Vec<(f32, Vec3)>);
 
-    /// From one sample of a picture's ray to the next, normalised metres.
+    /// Sample spacing along a rendered ray, normalised metres.
     fn spacing(&self) -> f32;
 
-    /// Length of ray that the greatest density outside a point stands for, normalised metres: a ray
-    /// that grazes the surface, as those do that draw the outline, stays about as long in it.
+    /// Path length of a ray that grazes the surface, as on the outline, normalised metres.
     fn grazing(&self) -> f32;
 
-    /// How far from the prior there can be anything.
+    /// Largest distance of the extent from the prior.
     fn reach(&self) -> f32;
 }

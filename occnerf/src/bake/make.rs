@@ -1,4 +1,4 @@
-//! From a trained person to an avatar.
+//! Baking of a trained person to an avatar.
 
 use std::sync::Arc;
 use std::time::Instant;
@@ -8,14 +8,14 @@ use smpl::{MotionClip, SparseRows};
 use volrender::Camera;
 
 use super::avatar::{Atlas, Avatar, Clip, MAX_JOINTS, MAX_SHELLS};
-use super::charts::Layout;
+use super::charts::AtlasLayout;
 use super::field::CanonicalField;
 use super::motion::{motion_of_bones, turn_upright};
 use super::paint::{Texel, dilate, paint, texels};
 use super::refine::refine;
 use super::renderer::TrainedField;
 use super::skeleton::skeleton;
-use super::surface::{Normal, SurfaceReport, heights, normals_of};
+use super::surface::{NormalRay, SurfaceReport, heights, normal_rays};
 use crate::Error;
 use crate::capture::Light;
 use crate::model::body::Body;
@@ -24,27 +24,24 @@ use crate::model::trained::Model;
 use crate::model::view::{PosedView, pixel_width};
 use crate::scene::prepared::Scene;
 
-/// Pixels of the training pictures that an edge of the surface may be long, where so many
-/// subdivisions are enough for it.
+/// Target edge length of the surface, pixels of the training frames, and most subdivisions.
 const EDGE: f32 = 1.5;
 const MOST: u32 = 2;
-/// Texels across a pixel of the training pictures.
+/// Texels across a pixel of the training frames.
 const TEXELS_A_PIXEL: f32 = 2.0;
-/// Share of the training frames that must have seen a place for full confidence.
+/// Share of the training frames with a point visible for full confidence.
 const FULL_CONFIDENCE: f32 = 0.1;
 
-/// How a person is baked.
+/// Options of [`bake`].
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct BakeOptions {
-    /// Surfaces over each other, 1 to 5: one is opaque, the others have alpha.
+    /// Number of nested shells, 1 to 5: the innermost is opaque, the others have alpha.
     pub shells: usize,
-    /// Longest side of the atlas, texels; it is as large as the training pictures ask for, up to
-    /// this.
+    /// Largest side of the atlas, texels; the resolution of the training frames decides below.
     pub atlas: u32,
-    /// Passes over the training pictures in which the texture is drawn towards them; 0 leaves it as
-    /// the field has it.
+    /// Steps of texture optimisation on the training frames; 0 keeps the field's colours.
     pub refinements: u32,
-    /// Frames a second of the video's motion.
+    /// Frames per second of the video's motion.
     pub fps: f32,
 }
 
@@ -55,12 +52,12 @@ impl Default for BakeOptions {
     }
 }
 
-/// What baking did.
+/// Statistics of [`bake`].
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct BakeReport {
-    /// What was found of the surface; of several shells, of the innermost.
+    /// Surface extraction of the innermost shell.
     pub surface: SurfaceReport,
-    /// Vertices of all shells, those on seams once for each chart.
+    /// Vertices of all shells, a copy for each chart.
     pub vertices: usize,
     /// Triangles of all shells.
     pub faces: usize,
@@ -68,16 +65,15 @@ pub struct BakeReport {
     pub side: u32,
     /// Texels on the surface.
     pub texels: usize,
-    /// Mean squared error over the known pixels of the training frames that show the surface,
-    /// before the first pass of refinement and before the last.
+    /// Mean squared error over known training pixels on the surface, before the first step of texture
+    /// optimisation and before the last.
     pub errors: [f64; 2],
     /// Wall clock, seconds.
     pub seconds: f64,
 }
 
-/// Bakes a trained person. The scene that it was trained on says how well each place was seen, and
-/// what the texture is refined by; without it every place counts as seen, and the texture is the
-/// field's.
+/// Bakes a trained person. The scene of its training gives the confidence and the frames of texture
+/// optimisation; without it all confidence is 1 and the texture is the field's.
 ///
 /// # Errors
 /// [`Error::Scene`] for options outside their ranges, a body that no camera sees, or one that needs
@@ -116,14 +112,14 @@ pub fn bake(model: &Model, scene: Option<&Scene>, options: &BakeOptions) -> Resu
     Ok((avatar, report))
 }
 
-/// How well the video showed each vertex of the prior, 0 to 1.
+/// Confidence of each vertex of the prior, 0 to 1.
 fn seen(scene: &Scene) -> Result<Vec<f32>, Error> {
     let enough = (FULL_CONFIDENCE * scene.train.len() as f32).max(1.0);
     Ok(scene.vertex_frequencies()?.iter().map(|&n| (n as f32 / enough).min(1.0)).collect())
 }
 
-/// The avatar without name and motion, from pictures whose pixels are `pixel` normalised metres
-/// wide, and which have `seen` each vertex of the prior so well, (V).
+/// The avatar without name and motion, for a pixel width of `pixel` normalised metres and a confidence
+/// `seen` of each vertex of the prior, (V).
 pub(super) fn surface(
     body: &Body,
     field: &impl CanonicalField,
@@ -133,9 +129,9 @@ pub(super) fn surface(
 ) -> Result<(Avatar, BakeReport), Error> {
     let (prior, faces) = (&body.canonical.vertices, &body.model.faces);
     let mesh = Subdivided::new(prior.len(), faces, times_until(prior, faces, EDGE * pixel, MOST));
-    let feet = normals_of(&mesh, prior, faces);
+    let feet = normal_rays(&mesh, prior, faces);
     let (heights, found) = heights(field, &body.surface, &feet, &mesh, options.shells);
-    let layout = Layout::new(prior, faces, options.shells, pixel / TEXELS_A_PIXEL, options.atlas);
+    let layout = AtlasLayout::new(prior, faces, options.shells, pixel / TEXELS_A_PIXEL, options.atlas);
     let layout = layout.ok_or_else(|| Error::Scene("bake: too many charts".to_owned()))?;
     let split = Split::new(&mesh, &layout, options.shells);
     let places = split.places(&layout, &feet);
@@ -181,7 +177,7 @@ pub(super) fn surface(
     Ok((avatar, report))
 }
 
-/// Vertices of all shells, one for each chart that a vertex of the subdivided prior is in.
+/// Vertices of all shells, a copy of each vertex of the subdivided prior for each of its charts.
 struct Split {
     /// Shell, chart and vertex of the subdivided prior.
     vertices: Vec<(usize, u32, u32)>,
@@ -189,7 +185,7 @@ struct Split {
 }
 
 impl Split {
-    fn new(mesh: &Subdivided, layout: &Layout, shells: usize) -> Self {
+    fn new(mesh: &Subdivided, layout: &AtlasLayout, shells: usize) -> Self {
         let mut split = Self { vertices: Vec::new(), faces: Vec::with_capacity(shells * mesh.faces.len()) };
         for shell in 0..shells {
             let mut copies: Vec<Vec<(u32, u32)>> = vec![Vec::new(); mesh.anchors.len()];
@@ -210,20 +206,20 @@ impl Split {
         split
     }
 
-    /// In the atlas, texels.
-    fn places(&self, layout: &Layout, feet: &[Normal]) -> Vec<Vec2> {
+    /// Atlas coordinates, texels.
+    fn places(&self, layout: &AtlasLayout, feet: &[NormalRay]) -> Vec<Vec2> {
         self.vertices.iter().map(|&(shell, chart, v)| layout.place(shell, chart, feet[v as usize].foot)).collect()
     }
 
     /// Canonical positions and unit normals, normalised metres.
-    fn positions(&self, mesh: &Subdivided, feet: &[Normal], heights: &[Vec<f32>]) -> (Vec<Vec3>, Vec<Vec3>) {
+    fn positions(&self, mesh: &Subdivided, feet: &[NormalRay], heights: &[Vec<f32>]) -> (Vec<Vec3>, Vec<Vec3>) {
         let shells: Vec<(Vec<Vec3>, Vec<Vec3>)> = heights
             .iter()
             .map(|heights| {
-                let raised = |(normal, height): (&Normal, &f32)| normal.foot + height * normal.direction;
+                let raised = |(normal, height): (&NormalRay, &f32)| normal.foot + height * normal.direction;
                 let vertices: Vec<Vec3> = feet.iter().zip(heights).map(raised).collect();
                 let normals = normals(&vertices, &mesh.faces);
-                let usable = |(normal, foot): (Vec3, &Normal)| normal.try_normalize().unwrap_or(foot.direction);
+                let usable = |(normal, foot): (Vec3, &NormalRay)| normal.try_normalize().unwrap_or(foot.direction);
                 let normals = normals.into_iter().zip(feet).map(usable).collect();
                 (vertices, normals)
             })
@@ -260,7 +256,7 @@ impl Split {
     }
 }
 
-/// The four heaviest joints of each row with their weights, which are made to sum to 1.
+/// The four largest weights of each row, normalised, and their joints.
 fn four_joints(rows: &[Vec<(u32, f32)>]) -> (Vec<[u16; 4]>, Vec<[f32; 4]>) {
     let heaviest = |row: &Vec<(u32, f32)>| {
         let mut row = row.clone();
@@ -279,7 +275,7 @@ fn four_joints(rows: &[Vec<(u32, f32)>]) -> (Vec<[u16; 4]>, Vec<[f32; 4]>) {
     rows.iter().map(heaviest).unzip()
 }
 
-/// The atlas of painted texels, with their colours spread to what is between the charts.
+/// The atlas of painted texels, dilated between the charts.
 fn atlas(side: u32, texels: &[Texel], colours: &[(Vec3, f32)], confidence: &[f32]) -> Atlas {
     let count = (side * side) as usize;
     let (mut values, mut known) = (vec![[0.0f32; 5]; count], vec![false; count]);
@@ -294,12 +290,12 @@ fn atlas(side: u32, texels: &[Texel], colours: &[(Vec3, f32)], confidence: &[f32
         width: side,
         height: side,
         rgba: values.iter().flat_map(|v| [v[0], v[1], v[2], v[3]].map(byte)).collect(),
-        // What no frame ever saw stays 0; what any saw does not become it.
+        // Zero means unobserved, so rounding must not reach it.
         confidence: values.iter().map(|v| if v[4] > 0.0 { byte(v[4]).max(1) } else { 0 }).collect(),
     }
 }
 
-/// The video's motion, as training has corrected it, and the cameras, in the avatar's world.
+/// The corrected motion of the video and the cameras, in the avatar's world.
 fn motion(model: &Model, avatar: &Avatar, fps: f32) -> (Vec<Clip>, Vec<Camera>) {
     let turn = turn_upright(model.up());
     let scale = model.body.scale;

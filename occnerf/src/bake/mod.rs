@@ -1,4 +1,4 @@
-//! A trained person as a skinned, textured surface, which anything that draws triangles can show.
+//! Baking: a trained person as a skinned, textured mesh.
 
 mod avatar;
 mod charts;
@@ -29,7 +29,7 @@ pub use renderer::BakedRenderer;
 pub use skeleton::skeleton;
 pub use surface::SurfaceReport;
 
-/// Writes a file that is either the old one or complete.
+/// Replaces a file atomically.
 fn write_whole(path: &Path, bytes: &[u8]) -> Result<(), Error> {
     crate::replace_file(path, |to| to.write_all(bytes)).map_err(|source| Error::Io { path: path.to_owned(), source })
 }

@@ -5,18 +5,17 @@ use smpl::MotionClip;
 
 use super::avatar::Joint;
 
-/// The rotation that takes the direction `up` of a capture's world to +y; none where `up` has no
-/// direction.
+/// Rotation from the direction `up` of a capture's world to +y; the identity for a zero `up`.
 #[must_use]
 pub fn turn_upright(up: Vec3) -> Mat3 {
     up.try_normalize().map_or(Mat3::IDENTITY, |up| Mat3::from_quat(Quat::from_rotation_arc(up, Vec3::Y)))
 }
 
-/// The motion in which joint j of `skeleton` (J) carries canonical points to the world by
-/// `frames[t][j]` (T, J).
+/// The motion whose joint j of `skeleton` (J) has the canonical to world transform `frames[t][j]`
+/// (T, J).
 ///
-/// Bones that do not hang together, as those of a body that changes its size from frame to frame,
-/// keep their rotations and the root's place.
+/// Bones that do not meet at their joints, as of a body that changes its size, keep their rotations
+/// and the root's position.
 ///
 /// # Panics
 /// Unless every frame has J transforms.
@@ -30,7 +29,7 @@ pub fn motion_of_bones(skeleton: &[Joint], frames: &[Vec<Affine3A>], fps: f32) -
         for (joint, &turn) in skeleton.iter().zip(&turns) {
             let parent = joint.parent.map_or(Quat::IDENTITY, |parent| turns[usize::from(parent)]);
             let local = parent.inverse() * turn;
-            // Of the two quaternions of a rotation, the one of at most half a turn.
+            // Quaternion of the smaller angle.
             let shorter = if local.w < 0.0 { -local } else { local };
             poses.push(shorter.to_scaled_axis());
         }

@@ -1,19 +1,18 @@
-//! The atlas's colours: the field integrated through each shell.
+//! Texture baking: the field integrated along the normals through each shell.
 
 use glam::{Vec2, Vec3};
 use rayon::prelude::*;
 use surface_query::MeshDistance;
 
 use super::field::CanonicalField;
-use super::surface::{Normal, STEP};
+use super::surface::{NormalRay, STEP};
 use crate::Error;
 use visibility::{RasterOptions, Rasterizer, View};
 
-/// How far beyond the outermost shell, and below the innermost, the field is integrated, normalised
-/// metres.
+/// Range of integration beyond the outermost and below the innermost shell, normalised metres.
 const BEYOND: f32 = 0.02;
 const BELOW: f32 = 0.0125;
-/// Texels that are evaluated together.
+/// Texels of a batch.
 const CHUNK: usize = 128;
 
 /// A texel on the surface.
@@ -21,7 +20,7 @@ const CHUNK: usize = 128;
 pub(super) struct Texel {
     /// In the atlas, row-major.
     pub index: u32,
-    /// Vertices of the subdivided prior, and how much of each.
+    /// Vertices of the subdivided prior and their barycentric weights.
     pub corners: [u32; 3],
     pub weights: [f32; 3],
     pub shell: usize,
@@ -32,17 +31,16 @@ impl Texel {
         self.corners.iter().zip(self.weights).map(|(&v, w)| w * values[v as usize]).sum()
     }
 
-    fn normal(&self, normals: &[Normal]) -> Normal {
-        let sum = |part: fn(&Normal) -> Vec3| {
+    fn normal(&self, normals: &[NormalRay]) -> NormalRay {
+        let sum = |part: fn(&NormalRay) -> Vec3| {
             self.corners.iter().zip(self.weights).map(|(&v, w)| w * part(&normals[v as usize])).sum::<Vec3>()
         };
-        Normal { foot: sum(|n| n.foot), direction: sum(|n| n.direction).normalize_or(Vec3::Y) }
+        NormalRay { foot: sum(|n| n.foot), direction: sum(|n| n.direction).normalize_or(Vec3::Y) }
     }
 }
 
-/// The texels whose middles lie on a face: `places` (V) of the vertices of `faces`, in texels of a
-/// square of `side`. `describe` says of a face which shell it is of and which vertices of the
-/// subdivided prior it has.
+/// Rasterises `faces` with vertices at `places` (V, texels) into a square of `side`: the texels whose
+/// centres are covered. `describe` maps a face to its shell and its vertices in the subdivided prior.
 pub(super) fn texels(
     side: u32,
     places: &[Vec2],
@@ -64,12 +62,12 @@ pub(super) fn texels(
 /// Colour and alpha of each of `texels`, with shells at `heights` (shells, V) over the prior's
 /// `normals` (V).
 ///
-/// A shell stands for the part of the field between the middles of the gaps to its neighbours. The
-/// innermost is opaque.
+/// A shell represents the field up to the middles of the gaps to its neighbours. The innermost is
+/// opaque.
 pub(super) fn paint(
     field: &impl CanonicalField,
     prior: &MeshDistance,
-    normals: &[Normal],
+    normals: &[NormalRay],
     heights: &[Vec<f32>],
     texels: &[Texel],
 ) -> Vec<(Vec3, f32)> {
@@ -86,7 +84,7 @@ pub(super) fn paint(
                     texel.normal(normals).places(prior, high, low, field.reach() + high - low, along);
                     counts.push(along.len());
                     places.extend(along.iter().map(|(_, place)| *place));
-                    // Of the slab, what lies nearest to each point.
+                    // Quadrature weight of each point within the slab.
                     let length = |height: f32| (height + 0.5 * STEP).min(high) - (height - 0.5 * STEP).max(low);
                     lengths.extend(along.iter().map(|(height, _)| length(*height).max(0.0)));
                 }
@@ -106,8 +104,7 @@ pub(super) fn paint(
     chunks.concat()
 }
 
-/// Heights between which a texel's shell stands for the field, of which pictures take samples
-/// `spacing` apart.
+/// Height range that a texel's shell represents, for a sample spacing of `spacing`.
 fn slab(heights: &[Vec<f32>], texel: &Texel, reach: f32, spacing: f32) -> [f32; 2] {
     let own = texel.mix(&heights[texel.shell]);
     let to = |shell: Option<&Vec<f32>>| shell.map(|heights| 0.5 * (own + texel.mix(heights)));
@@ -117,8 +114,8 @@ fn slab(heights: &[Vec<f32>], texel: &Texel, reach: f32, spacing: f32) -> [f32; 
     [inner.unwrap_or(own - BELOW.max(spacing)), high.max(own + STEP)]
 }
 
-/// Colour and opacity of points that stand for `lengths` of a ray, outside in: the mean over all
-/// places that samples `spacing` apart can have, as of pixels next to each other.
+/// Volume rendering of points, outside in, with quadrature weights `lengths`: the mean over all phases
+/// of a sampling at `spacing`, as over neighbouring pixels.
 fn integrate(points: &[(f32, Vec3)], lengths: &[f32], spacing: f32) -> (Vec3, f32) {
     let stride = ((spacing / STEP).round() as usize).max(1);
     let (mut sum, mut opacity) = (Vec3::ZERO, 0.0);
@@ -134,13 +131,13 @@ fn integrate(points: &[(f32, Vec3)], lengths: &[f32], spacing: f32) -> (Vec3, f3
     if opacity > 1e-3 {
         return (sum / opacity, opacity / stride as f32);
     }
-    // Of next to nothing, the colour of what is there.
+    // The colour of a transparent ray is the mean of its points.
     let mean = points.iter().map(|p| p.1).sum::<Vec3>() / points.len().max(1) as f32;
     (mean, 0.0)
 }
 
-/// Spreads the values of the texels that `known` marks to all others, ring by ring, so that lookups
-/// between texels at the rim of a chart find its colours.
+/// Dilates the values of the `known` texels over all others, ring by ring, for bilinear lookups at the
+/// rim of a chart.
 pub(super) fn dilate<const N: usize>(side: usize, values: &mut [[f32; N]], known: &mut [bool]) {
     let mut rim: Vec<usize> = (0..known.len()).filter(|&i| !known[i]).collect();
     while !rim.is_empty() {

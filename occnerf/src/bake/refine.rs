@@ -1,4 +1,4 @@
-//! The texture, drawn towards the training pictures through the rasteriser.
+//! Texture optimisation: the atlas fitted to the training frames through the rasteriser.
 
 use glam::{Vec2, Vec3, Vec4};
 use visibility::{Pixel, RasterOptions, Rasterizer, Samples};
@@ -11,32 +11,31 @@ use crate::model::view::pinhole;
 use crate::scene::labels::Label;
 use crate::scene::prepared::{PreparedFrame, Scene};
 
-/// Weight of the field's own colour in that of a texel, in pixels that show it.
+/// Regularisation of a texel towards the field's colour, in pixels.
 const PRIOR: f32 = 0.3;
 
-/// Training pixels that are looked at, at most; of more, every n-th.
+/// Most sampled training pixels.
 const MAX_PIXELS: usize = 1 << 19;
 
-/// Four texels of a shell and how much of each a pixel shows.
-type Look = ([u32; 4], [f32; 4]);
+/// A bilinear lookup in one shell: four texels and their compositing weights.
+type Lookup = ([u32; 4], [f32; 4]);
 
-/// The colour that was photographed at a pixel, and what the pixel shows of each shell that it
-/// sees.
-struct Sight {
+/// A photographed pixel as a linear function of the texels.
+struct PixelEquation {
     colour: Vec3,
-    looks: Vec<Look>,
+    lookups: Vec<Lookup>,
 }
 
-/// Moves the colours of the texels towards the known pixels of the training frames, `passes` times,
-/// each by a Jacobi step of the least squares problem that keeps unseen texels as they are. Returns
-/// the mean squared error before the first pass and before the last.
+/// Fits the colours of the texels to the known pixels of the training frames by `passes` Jacobi steps
+/// of regularised least squares; unobserved texels keep their colours. Returns the mean squared error
+/// before the first step and before the last.
 pub(super) fn refine(model: &Model, scene: &Scene, avatar: &mut Avatar, passes: u32) -> Result<[f64; 2], Error> {
     let frames = &scene.train;
     let stride = frames.iter().map(|f| f.labels.num_subject()).sum::<usize>().div_ceil(MAX_PIXELS).max(1);
     let mut person = BakedPerson::new(avatar, model.body.scale).lit_by(model.base.light);
     let mut all = Vec::new();
     for frame in frames {
-        all.extend(sights(avatar, &mut person, frame, stride)?);
+        all.extend(equations(avatar, &mut person, frame, stride)?);
     }
     let Atlas { rgba, .. } = &mut avatar.atlas;
     let start: Vec<Vec3> = rgba.as_chunks::<4>().0.iter().map(|&[r, g, b, _]| colour([r, g, b])).collect();
@@ -45,8 +44,8 @@ pub(super) fn refine(model: &Model, scene: &Scene, avatar: &mut Avatar, passes: 
     for pass in 0..passes {
         let mut sums = vec![(Vec3::ZERO, 0.0f32); values.len()];
         let mut error = 0.0;
-        for Sight { colour, looks } in &all {
-            let texels = || looks.iter().flat_map(|(at, w)| at.iter().map(|&i| i as usize).zip(*w));
+        for PixelEquation { colour, lookups } in &all {
+            let texels = || lookups.iter().flat_map(|(at, w)| at.iter().map(|&i| i as usize).zip(*w));
             let residual = *colour - texels().map(|(i, w)| w * values[i]).sum::<Vec3>();
             error += f64::from(residual.length_squared()) / 3.0;
             for (i, w) in texels() {
@@ -70,20 +69,20 @@ fn colour(bytes: [u8; 3]) -> Vec3 {
     Vec3::from(bytes.map(|byte| f32::from(byte) / 255.0))
 }
 
-/// The subject's pixels of a frame that look at the surface well away from its outline.
-fn sights(
+/// Equations of the fully covered subject pixels of a frame.
+fn equations(
     avatar: &Avatar,
     person: &mut BakedPerson<'_>,
     frame: &PreparedFrame,
     stride: usize,
-) -> Result<Vec<Sight>, Error> {
+) -> Result<Vec<PixelEquation>, Error> {
     let pixels = frame.pixels()?;
     person.skin(&frame.view.posed.bones);
     let (vertices, shades) = person.posed();
-    // As pixels are drawn by default, so that the texture makes up for their width.
+    // Supersampled as by default, so that the texture compensates the pixel footprint.
     let options = RasterOptions { samples: Samples::Four, cull_back: true, near: 1e-3 };
     let shells: Vec<&[[u32; 3]]> = (0..avatar.shell_ends.len()).map(|shell| avatar.shell(shell)).collect();
-    let look = |pixel: Pixel<'_>| {
+    let equation = |pixel: Pixel<'_>| {
         let i = pixel.index;
         // Edge pixels are mixed with the background.
         let wanted = i.is_multiple_of(stride) && frame.labels.at(i as u32) == Label::Subject && pixels.mask[i] >= 0.99;
@@ -93,28 +92,28 @@ fn sights(
         }
         let share = 1.0 / count as f32;
         let brightness: f32 = pixel.samples().map(|fragments| share * shade(avatar, shades, &fragments[0])).sum();
-        let looks = pixel.samples().flat_map(|fragments| {
-            let mut before = share;
-            fragments.iter().map(move |fragment| look(avatar, atlas_place(avatar, fragment), &mut before))
+        let lookups = pixel.samples().flat_map(|fragments| {
+            let mut transmittance = share;
+            fragments.iter().map(move |fragment| lookup(avatar, atlas_place(avatar, fragment), &mut transmittance))
         });
-        Some(Sight { colour: Vec3::from_slice(&pixels.image.pixels[3 * i..]) / brightness, looks: looks.collect() })
+        let colour = Vec3::from_slice(&pixels.image.pixels[3 * i..]) / brightness;
+        Some(PixelEquation { colour, lookups: lookups.collect() })
     };
-    let mut out: Vec<Option<Sight>> = Vec::new();
+    let mut out: Vec<Option<PixelEquation>> = Vec::new();
     out.resize_with(pixels.mask.len(), || None);
-    Rasterizer::default().draw(vertices, &shells, &pinhole(&frame.view.camera), &options, &mut out, look)?;
+    Rasterizer::default().draw(vertices, &shells, &pinhole(&frame.view.camera), &options, &mut out, equation)?;
     Ok(out.into_iter().flatten().collect())
 }
 
-/// What is seen at a `place` of the atlas with the transmittance `before` it, which becomes that
-/// behind it.
-fn look(avatar: &Avatar, place: Vec2, before: &mut f32) -> Look {
+/// The lookup at a `place` of the atlas; attenuates the `transmittance` in front of it.
+fn lookup(avatar: &Avatar, place: Vec2, transmittance: &mut f32) -> Lookup {
     let Atlas { width, height, ref rgba, .. } = avatar.atlas;
     let size = Vec2::new(width as f32, height as f32);
     let corner = BilinearCorner::new(place * size, size);
     let (texels, Vec2 { x, y }) = (corner.texels(width, height), corner.share);
     let alphas = Vec4::from(texels.map(|i| f32::from(rgba[4 * i + 3]) / 255.0));
     let shown = Vec4::new((1.0 - x) * (1.0 - y), x * (1.0 - y), (1.0 - x) * y, x * y) * alphas;
-    let weights = *before * shown;
-    *before *= 1.0 - shown.element_sum();
+    let weights = *transmittance * shown;
+    *transmittance *= 1.0 - shown.element_sum();
     (texels.map(|i| i as u32), weights.to_array())
 }

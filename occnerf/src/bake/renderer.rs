@@ -1,4 +1,4 @@
-//! Where a bake meets a trained person: the field in the canonical space, and pictures of views.
+//! Canonical field and renderer of a trained model for baking.
 
 use glam::{Vec3, Vec4};
 use rayon::prelude::*;
@@ -23,7 +23,7 @@ use crate::render::picture::{Renderer, Rendering};
 /// on the demo, whatever the number of samples), 3 to 4 best.
 const GRAZING: f32 = 0.035;
 
-/// A trained field, its vertices encoded.
+/// A trained field with encoded vertices.
 pub(super) struct TrainedField<'a> {
     model: &'a Model,
     code: VertexCode,
@@ -41,8 +41,7 @@ impl<'a> TrainedField<'a> {
     }
 }
 
-/// Mean length of the rays through the middle of the body within its box, along which samples are
-/// spread, over the training frames.
+/// Mean length of the central ray within the body's bounding box over the training frames.
 fn mean_span(model: &Model) -> f32 {
     let reach = model.config.motion.reach();
     let spans = model.frames.iter().filter_map(|view| {
@@ -102,7 +101,7 @@ impl CanonicalField for TrainedField<'_> {
     }
 }
 
-/// Draws views with the avatar that was baked of a model.
+/// Renders views with the baked avatar of a model.
 pub struct BakedRenderer<'a> {
     person: BakedPerson<'a>,
     samples: Samples,
@@ -110,7 +109,7 @@ pub struct BakedRenderer<'a> {
 }
 
 impl<'a> BakedRenderer<'a> {
-    /// Takes the avatar of `model`.
+    /// Renderer for the avatar of `model`.
     ///
     /// # Errors
     /// [`Error::Scene`] for the avatar of another skeleton.

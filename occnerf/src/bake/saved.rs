@@ -17,25 +17,25 @@ const FORMAT: &str = "occnerf-avatar";
 const VERSION: u32 = 1;
 /// Key of the header that [`Header`] stands under, as JSON.
 const KEY: &str = "avatar";
-/// Larger files are not ours.
+/// Largest file.
 const MAX_BYTES: u64 = 1 << 30;
 
-/// What is not an array.
+/// Metadata beside the arrays.
 #[derive(Serialize, Deserialize)]
 struct Header {
     format: String,
     version: u32,
     name: String,
     joints: Vec<String>,
-    /// Slope; even where it is missing.
+    /// Slope; even light if absent.
     #[serde(default)]
     light: [f32; 3],
     clips: Vec<(String, f32)>,
 }
 
 impl Avatar {
-    /// Writes the avatar as `.safetensors`, which [`Avatar::load`] reads back bit for bit. An old
-    /// file at `path` is there until the new one is complete. Equal avatars give equal files.
+    /// Writes the avatar as `.safetensors`, which [`Avatar::load`] reads back bit for bit. The file is
+    /// replaced atomically; equal avatars give equal files.
     ///
     /// Tensors have the names and shapes of the fields; `cameras.intrinsics` is (T, 4): fx fy cx
     /// cy, `cameras.extrinsics` (T, 3, 4), `cameras.size` (T, 2): width, height; clip K has
@@ -112,10 +112,10 @@ impl Avatar {
         tensors
     }
 
-    /// Reads what [`Avatar::save`] writes.
+    /// Reads a file of [`Avatar::save`].
     ///
     /// # Errors
-    /// [`Error::Io`]; [`Error::File`] for anything that is not a whole and valid avatar.
+    /// [`Error::Io`]; [`Error::File`] for anything but a complete, valid avatar.
     pub fn load(path: &Path) -> Result<Self, Error> {
         let io = |source| Error::Io { path: path.to_owned(), source };
         let size = std::fs::metadata(path).map_err(io)?.len();

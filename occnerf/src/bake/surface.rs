@@ -1,4 +1,4 @@
-//! Where the person's surface is: along the prior's normals, where the field becomes opaque.
+//! Surface extraction: heights along the prior's normals at which the field becomes opaque.
 
 use glam::Vec3;
 use rayon::prelude::*;
@@ -7,48 +7,47 @@ use surface_query::MeshDistance;
 use super::field::{CanonicalField, Place};
 use crate::model::subdivide::{Anchor, Subdivided, neighbours, normals};
 
-/// From one point of a profile to the next, normalised metres.
+/// Sampling step of a density profile, normalised metres.
 pub(super) const STEP: f32 = 0.0025;
-/// How deep below the prior the surface may be.
+/// Largest depth of the surface below the prior.
 const DEPTH: f32 = 0.03;
-/// Share of its height above the prior that a point's distance from it must have: nearer ones
-/// belong to another part.
+/// Least ratio of a point's distance from the prior to its height along the normal; below it, the
+/// point belongs to another part.
 const OWN: f32 = 0.7;
-/// Farther from the median of its neighbours than this a surface point is taken for noise.
+/// Largest distance of a surface point from the median of its neighbours; others are noise.
 const OUTLIER: f32 = 0.01;
 /// Optical depth of opacity ½.
 const HALF: f32 = std::f32::consts::LN_2;
-/// Vertices whose profiles are evaluated together.
+/// Vertices of a batch.
 const CHUNK: usize = 64;
-/// Least height of a shell over the next one inside.
+/// Least gap between shells.
 const APART: f32 = 0.001;
 
-/// What was found of the surface.
+/// Statistics of surface extraction.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct SurfaceReport {
-    /// Vertices over which the field never becomes opaque; they take the height of their
-    /// neighbours.
+    /// Vertices without an opaque crossing, filled from their neighbours.
     pub holes: usize,
-    /// Vertices with a gap behind the surface found, and something opaque behind that.
+    /// Vertices with a second opaque layer behind a gap.
     pub double: usize,
-    /// Vertices so far from their neighbours that they were put between them.
+    /// Vertices moved to the median of their neighbours.
     pub outliers: usize,
 }
 
-/// A normal of the prior.
+/// A normal ray of the prior.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Normal {
+pub(super) struct NormalRay {
     pub foot: Vec3,
     pub direction: Vec3,
 }
 
-impl Normal {
-    /// The points at heights `high`, `high` − STEP, … down to `low`, outside in, that belong to
-    /// this part of the prior, with their heights.
+impl NormalRay {
+    /// Heights `high`, `high` − STEP, … down to `low`, outside in, and their points, as far as they
+    /// belong to this part of the prior.
     pub fn places(&self, prior: &MeshDistance, high: f32, low: f32, farthest: f32, out: &mut Vec<(f32, Place)>) {
         out.clear();
         let steps = ((high - low) / STEP).ceil().max(0.0) as usize;
-        // Inside out, so that the first point of another part ends it.
+        // Inside out, up to the first point of another part.
         for step in (0..=steps).rev() {
             let height = high - step as f32 * STEP;
             let at = self.foot + height * self.direction;
@@ -63,21 +62,22 @@ impl Normal {
     }
 }
 
-/// The normals of a subdivided prior.
-pub(super) fn normals_of(mesh: &Subdivided, prior: &[Vec3], prior_faces: &[[u32; 3]]) -> Vec<Normal> {
+/// The normal rays of a subdivided prior.
+pub(super) fn normal_rays(mesh: &Subdivided, prior: &[Vec3], prior_faces: &[[u32; 3]]) -> Vec<NormalRay> {
     let directions = normals(prior, prior_faces);
-    let normal =
-        |anchor: &Anchor| Normal { foot: anchor.mix(prior), direction: anchor.mix(&directions).normalize_or(Vec3::Y) };
-    mesh.anchors.iter().map(normal).collect()
+    let ray = |anchor: &Anchor| NormalRay {
+        foot: anchor.mix(prior),
+        direction: anchor.mix(&directions).normalize_or(Vec3::Y),
+    };
+    mesh.anchors.iter().map(ray).collect()
 }
 
-/// Height over the prior, along each normal (V), at which the optical depth from outside passes
-/// each of `depths`, which ascend: (V · depths), with NaN for none. And how many have something
-/// opaque behind a gap.
+/// Height along each normal (V) at which the optical depth from outside passes each of the ascending
+/// `depths`, (V · depths), NaN for none; and the number of normals with a second opaque layer.
 fn crossings(
     field: &impl CanonicalField,
     prior: &MeshDistance,
-    normals: &[Normal],
+    normals: &[NormalRay],
     depths: &[f32],
 ) -> (Vec<f32>, usize) {
     let reach = field.reach();
@@ -107,27 +107,26 @@ fn crossings(
 
 type Scratch = (Vec<(f32, Place)>, Vec<Place>, Vec<(f32, Vec3)>);
 
-/// Appends the heights at which the optical depth passes each of `depths`: that from outside down
-/// to there, and that of a length of `grazing` at the greatest density so far. Where the field is
-/// fog that is farther out than the middle of the fog, and where pictures show its outline. Returns
-/// whether a gap, of no more than a tenth of the density before it, lies between something opaque
-/// outside and something opaque inside.
+/// Appends the heights at which the optical depth passes each of `depths`. The optical depth is the
+/// integral from outside plus a length of `grazing` at the greatest density so far, which puts the
+/// surface of a fuzzy field at its rendered outline. Returns whether a gap, with at most a tenth of
+/// the peak density, separates two opaque layers.
 fn profile(heights: &[f32], densities: &[(f32, Vec3)], grazing: f32, depths: &[f32], out: &mut Vec<f32>) -> bool {
     let first = out.len();
     out.resize(first + depths.len(), f32::NAN);
     let (mut depth, mut next) = (0.0, 0);
     // Greatest density and optical depth since the last gap.
     let (mut peak, mut since, mut gap, mut double) = (0.0f32, 0.0, false, false);
-    let (mut thickest, mut before) = (0.0f32, 0.0);
+    let (mut thickest, mut previous) = (0.0f32, 0.0);
     for (&height, &(density, _)) in heights.iter().zip(densities) {
         let added = density * STEP;
         thickest = thickest.max(density);
         let here = depth + added + grazing * thickest;
         while next < depths.len() && here >= depths[next] {
-            out[first + next] = height + STEP * (0.5 - (depths[next] - before) / (here - before));
+            out[first + next] = height + STEP * (0.5 - (depths[next] - previous) / (here - previous));
             next += 1;
         }
-        (before, depth) = (here, depth + added);
+        (previous, depth) = (here, depth + added);
         if since >= HALF && density < 0.1 * peak {
             gap = true;
             (peak, since) = (0.0, 0.0);
@@ -139,13 +138,13 @@ fn profile(heights: &[f32], densities: &[(f32, Vec3)], grazing: f32, depths: &[f
     double
 }
 
-/// Heights of `shells` over each normal (V), from the innermost to the outermost: where the opacity
-/// from outside passes ½, and before that equal parts of it. Holes are filled, outliers put between
-/// their neighbours, all smoothed.
+/// Heights of `shells` along each normal (V), from the innermost to the outermost: level sets of the
+/// opacity from outside in equal steps up to ½. Holes are filled, outliers replaced by the median,
+/// and all smoothed.
 pub(super) fn heights(
     field: &impl CanonicalField,
     prior: &MeshDistance,
-    normals: &[Normal],
+    normals: &[NormalRay],
     mesh: &Subdivided,
     shells: usize,
 ) -> (Vec<Vec<f32>>, SurfaceReport) {
@@ -159,7 +158,7 @@ pub(super) fn heights(
         let mut heights: Vec<f32> = found.iter().skip(shell).step_by(shells).copied().collect();
         let holes = heights.iter().filter(|h| h.is_nan()).count();
         fill(&mut heights, &near);
-        let outliers = tame(&mut heights, &near);
+        let outliers = replace_outliers(&mut heights, &near);
         heights = smoothed(&heights, &near);
         if let Some(inner) = out.last() {
             let above = |(height, inner): (&mut f32, &f32)| *height = height.max(inner + APART);
@@ -173,8 +172,8 @@ pub(super) fn heights(
     (out, report)
 }
 
-/// Puts heights that are far from the median of their neighbours there; returns how many.
-fn tame(heights: &mut [f32], near: &[Vec<u32>]) -> usize {
+/// Replaces outliers by the median of their neighbours; returns their number.
+fn replace_outliers(heights: &mut [f32], near: &[Vec<u32>]) -> usize {
     let median = |(near, &own): (&Vec<u32>, &f32)| {
         let mut about: Vec<f32> = near.iter().map(|&v| heights[v as usize]).collect();
         about.sort_by(f32::total_cmp);
@@ -191,15 +190,15 @@ fn tame(heights: &mut [f32], near: &[Vec<u32>]) -> usize {
     outliers
 }
 
-/// Halfway to the mean of the neighbours.
+/// Laplacian smoothing by half a step.
 fn smoothed(heights: &[f32], near: &[Vec<u32>]) -> Vec<f32> {
     let mean = |near: &[u32]| near.iter().map(|&v| heights[v as usize]).sum::<f32>() / near.len() as f32;
     let halfway = |(near, &own): (&Vec<u32>, &f32)| if near.is_empty() { own } else { 0.5 * (own + mean(near)) };
     near.iter().zip(heights).map(halfway).collect()
 }
 
-/// Gives what is NaN the mean of its neighbours, from the rim inwards; 0, the prior itself, where
-/// nothing is known.
+/// Fills NaN with the mean of the neighbours, from the rim inwards; 0, the prior itself, without any
+/// finite height.
 fn fill(heights: &mut [f32], near: &[Vec<u32>]) {
     let mut missing: Vec<usize> = (0..heights.len()).filter(|&v| heights[v].is_nan()).collect();
     while !missing.is_empty() {

@@ -3,7 +3,7 @@
 use glam::{Affine3A, Mat3, Vec2, Vec3, Vec4};
 use visibility::Samples;
 
-use super::charts::{Layout, PADDING};
+use super::charts::{AtlasLayout, PADDING};
 use super::draw::BakedPerson;
 use super::field::{CanonicalField, Place};
 use super::make::{BakeOptions, bake, surface};
@@ -188,7 +188,7 @@ fn covered(corners: [Vec2; 3], side: u32) -> Vec<usize> {
 fn no_two_faces_share_a_texel_and_charts_keep_their_distance() {
     let scene = scene(&Config::preset(Preset::Fast, Method::Occnerf));
     let (vertices, faces) = (&scene.body.canonical.vertices, &scene.body.model.faces);
-    let layout = Layout::new(vertices, faces, 2, 0.006, 1024).unwrap();
+    let layout = AtlasLayout::new(vertices, faces, 2, 0.006, 1024).unwrap();
     let side = layout.side;
     let mut owner = vec![None; (side * side) as usize];
     let mut doubles = 0;
@@ -220,16 +220,16 @@ fn no_two_faces_share_a_texel_and_charts_keep_their_distance() {
 #[test]
 fn an_atlas_that_is_too_small_has_wider_texels_and_degenerate_meshes_have_one_too() {
     let scene = scene(&Config::preset(Preset::Fast, Method::Occnerf));
-    let layout = Layout::new(&scene.body.canonical.vertices, &scene.body.model.faces, 1, 1e-3, 512).unwrap();
+    let layout = AtlasLayout::new(&scene.body.canonical.vertices, &scene.body.model.faces, 1, 1e-3, 512).unwrap();
     assert!(layout.side <= 512);
     // As from pictures of millions of pixels, in no more memory.
-    let finest = Layout::new(&scene.body.canonical.vertices, &scene.body.model.faces, 1, 1e-6, 512).unwrap();
+    let finest = AtlasLayout::new(&scene.body.canonical.vertices, &scene.body.model.faces, 1, 1e-6, 512).unwrap();
     assert!(finest.side <= 512 && finest.charts == layout.charts);
     for (name, points) in testkit::strategy::degenerate_clouds() {
         if points.iter().all(|p| p.is_finite() && p.abs().max_element() < 1e6) {
             let n = points.len() as u32;
             let faces: Vec<[u32; 3]> = (0..n.saturating_sub(2)).map(|i| [i, i + 1, i + 2]).collect();
-            assert!(Layout::new(&points, &faces, 1, 0.01, 512).is_some_and(|l| l.side <= 512), "{name}");
+            assert!(AtlasLayout::new(&points, &faces, 1, 0.01, 512).is_some_and(|l| l.side <= 512), "{name}");
         }
     }
 }

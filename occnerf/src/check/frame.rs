@@ -1,23 +1,23 @@
-//! What is looked at in a frame, and what can be wrong with it.
+//! Downsampled frames, and their faults.
 
 use volrender::Camera;
 
-/// Something wrong with one frame.
+/// A fault of one frame.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum Fault {
-    /// The mask shows nobody.
+    /// The mask is empty.
     EmptyMask,
     /// The silhouette and the mask overlap too little.
     Overlap,
-    /// The body moves much further than between other frames.
+    /// The translation of the body is an outlier.
     PlaceJump,
-    /// Joints turn much further than between other frames.
+    /// The rotation of a joint is an outlier.
     PoseJump,
 }
 
 impl Fault {
-    /// A few words for tables.
+    /// Short name for tables.
     #[must_use]
     pub fn words(self) -> &'static str {
         match self {
@@ -29,7 +29,7 @@ impl Fault {
     }
 }
 
-/// A frame's mask, small.
+/// A downsampled frame.
 pub(super) struct View {
     pub index: usize,
     pub camera: Camera,

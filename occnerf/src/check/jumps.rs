@@ -1,4 +1,4 @@
-//! Frames where a fit jumps.
+//! Temporal outliers of a fit.
 
 use glam::{Quat, Vec3};
 use smpl::BodyModel;
@@ -6,15 +6,15 @@ use smpl::BodyModel;
 use super::frame::Fault;
 use crate::capture::{Capture, Frame};
 
-/// A step is a jump if it is this many times the median step, and at least this large.
+/// Least ratio of a jump to the median step.
 const TIMES: f32 = 8.0;
-/// Of the pelvis across the view, in multiples of its depth; and of its depth, as a logarithm.
+/// Least lateral jump of the pelvis in multiples of its depth, and least logarithmic jump of depth.
 const PLACE: f32 = 0.08;
 const DEPTH: f32 = 0.25;
-/// Of the joint that turns most, radians.
+/// Least jump of a joint's rotation, radians.
 const TURN: f32 = 1.2;
 
-/// The jumps of each frame from the one before it.
+/// The jumps of each frame from the previous one.
 pub(super) fn find(capture: &Capture, body: &BodyModel) -> Vec<Vec<Fault>> {
     let states: Vec<State> = capture.train.iter().map(|frame| State::of(frame, body)).collect();
     let steps: Vec<[f32; 3]> = states.windows(2).map(|pair| pair[0].step(&pair[1])).collect();
@@ -27,7 +27,7 @@ pub(super) fn find(capture: &Capture, body: &BodyModel) -> Vec<Vec<Fault>> {
     let limits: Vec<f32> = limits.collect();
     let faults = |step: &[f32; 3]| {
         let mut faults = Vec::new();
-        // NaN, of a pelvis behind the camera, is no jump: it does not fit anyway.
+        // A pelvis behind the camera gives NaN; comparisons with it are false.
         if step[0] > limits[0] || step[1] > limits[1] {
             faults.push(Fault::PlaceJump);
         }
@@ -40,7 +40,7 @@ pub(super) fn find(capture: &Capture, body: &BodyModel) -> Vec<Vec<Fault>> {
     first.into_iter().chain(steps.iter().map(faults)).collect()
 }
 
-/// Where a body is in its camera, and how its joints are turned.
+/// A body in its camera.
 struct State {
     pelvis: Vec3,
     bones: Vec<Quat>,
@@ -55,7 +55,7 @@ impl State {
         Self { pelvis: camera.transform_point3(pelvis), bones: posed.bones.iter().map(turn).collect() }
     }
 
-    /// How far the pelvis moves across the view and in depth, and the largest turn of a joint.
+    /// Lateral and depth step of the pelvis, and the largest rotation of a joint.
     fn step(&self, next: &Self) -> [f32; 3] {
         let direction = |p: Vec3| p.truncate() / p.z;
         let across = direction(self.pelvis).distance(direction(next.pelvis));

@@ -1,4 +1,4 @@
-//! The usual mistakes, each found by undoing it: where that makes a poor fit good, it was made.
+//! Common convention errors, each detected by the gain in overlap from undoing it.
 
 use glam::{Affine3A, Mat3, Vec3};
 use rayon::prelude::*;
@@ -10,7 +10,7 @@ use crate::capture::{Capture, Frame};
 use crate::error::Error;
 use crate::model::view::silhouette;
 
-/// What is wrong with a capture as a whole.
+/// A systematic error of a capture.
 #[derive(Clone, Copy, Debug, PartialEq)]
 #[non_exhaustive]
 pub enum Mistake {
@@ -18,26 +18,24 @@ pub enum Mistake {
     CameraToWorld,
     /// The camera's y axis points up and its z axis backward, as in OpenGL.
     CameraYUp,
-    /// The body is turned about the camera's x axis by so many degrees: it was fitted with another
-    /// axis up.
+    /// The body is rotated about the camera's x axis by this many degrees: another axis was up.
     BodyUp(i32),
-    /// Lengths of the camera (or of the body's place) are so many times too large: 1000 for
+    /// Translations of the camera (or of the body) are too large by this factor: 1000 for
     /// millimetres.
     Unit(f32),
     /// Rotations in degrees.
     Degrees,
-    /// Rotations in radians that were taken for degrees and converted.
+    /// Rotations in radians, converted as if in degrees.
     Radians,
-    /// The focal length is about so many times too long.
+    /// The focal length is too long by about this factor.
     Focal(f32),
-    /// Masks show what is not the person.
+    /// Masks are inverted.
     MaskInverted,
-    /// The fit of a picture is that of the picture so many frames later.
+    /// The fit of a picture belongs to the picture this many frames later.
     FrameShift(i32),
-    /// The fit lies beside the person in the mask, whichever of these is undone: it is another's,
-    /// or the mask is.
+    /// The fit lies beside the mask: they are of different people.
     WrongPerson,
-    /// The body is not in the pictures, or far too large or small.
+    /// The body is outside the pictures, or of another size.
     NoFit,
 }
 
@@ -80,35 +78,34 @@ impl std::fmt::Display for Mistake {
     }
 }
 
-/// Angles above a full turn, and the share of all that must be, to be taken for degrees.
+/// Degrees are detected by this share of angles above a full turn.
 const TURN: f32 = std::f32::consts::TAU;
 const DEGREES_SHARE: f32 = 0.05;
-/// How much better the overlap must be without a mistake: as a factor, and by how much; and how
-/// much of the mask the body must then cover.
+/// Least gain in overlap from undoing an error, as a factor and as a difference, and least share of
+/// the mask covered then.
 const BETTER: f32 = 1.3;
 const BETTER_BY: f32 = 0.12;
 const COVERS: f32 = 0.75;
-/// Share of the picture's border that masks may have.
+/// Largest share of the image border inside a mask.
 const BORDER: f32 = 0.5;
-/// A fit that covers less of the mask than this is wrong.
+/// Least share of the mask that a fit covers.
 const BESIDE: f32 = 0.5;
-/// A frame shift must be this many standard errors better than none, and by this much.
+/// Least gain in overlap from a frame shift: in standard errors, and as a difference.
 const SHIFT_ERRORS: f32 = 4.0;
 const SHIFT_BY: f32 = 0.004;
-/// Frames that mistakes are undone in.
+/// Most frames for this.
 const UNDONE_VIEWS: usize = 12;
-/// Powers of two by which focal lengths are tried to be wrong: a person who is 1.3 times too large
-/// is not seen as such by steps of half an octave.
+/// Focal length errors to try, octaves; finer below one, where the overlap changes fast.
 const OCTAVES: [f32; 10] = [0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0];
-/// Areas of a body that may be the person's, as multiples of the mask's.
+/// Plausible areas of the silhouette, as multiples of the mask's.
 const AREAS: std::ops::Range<f32> = 0.3..8.0;
 
-/// How a silhouette and a mask lie.
+/// Pixel counts of a silhouette and a mask.
 #[derive(Clone, Copy, Default)]
 pub(super) struct Overlap {
     pub both: usize,
     pub mask: usize,
-    /// Pixels of the silhouette that no known occluder covers.
+    /// Pixels of the silhouette outside known occluders.
     pub body: usize,
 }
 
@@ -125,18 +122,18 @@ impl Overlap {
         counts
     }
 
-    /// Intersection over union, where nothing is known to stand in front.
+    /// Intersection over union outside known occluders.
     pub fn iou(self) -> f32 {
         self.both as f32 / (self.mask + self.body - self.both).max(1) as f32
     }
 
-    /// Share of the mask that the body covers.
+    /// Share of the mask inside the silhouette.
     pub fn covered(self) -> f32 {
         self.both as f32 / self.mask.max(1) as f32
     }
 }
 
-/// The mistakes that are likely; none for a good capture.
+/// Likely errors; none for a good capture.
 pub(super) fn find(capture: &Capture, body: &BodyModel, views: &[View]) -> Result<Vec<Mistake>, Error> {
     let angles = || capture.train.iter().flat_map(|frame| frame.pose.iter().skip(1)).map(|axis| axis.length());
     let beyond = angles().filter(|angle| *angle > TURN).count();
@@ -151,7 +148,7 @@ pub(super) fn find(capture: &Capture, body: &BodyModel, views: &[View]) -> Resul
     let posed = few(1.0);
     let as_given = overlaps(&posed, body, None)?;
     let (given, covered) = mean(&as_given);
-    // What would be a possible pose in degrees is nearly none at all in radians.
+    // Radians converted as if in degrees are close to the rest pose.
     if angles().all(|angle| angle < TURN.to_radians()) {
         let (iou, _) = mean(&overlaps(&few(180.0 / std::f32::consts::PI), body, None)?);
         if iou > given {
@@ -169,8 +166,7 @@ pub(super) fn find(capture: &Capture, body: &BodyModel, views: &[View]) -> Resul
         Mistake::Unit(100.0),
         Mistake::Unit(0.001),
     ];
-    // Masks of nearly everything look best with a body that fills the picture: they are judged
-    // first.
+    // First: an inverted mask overlaps best with a body that fills the image.
     let around = views.iter().map(View::border).sum::<f32>() / views.len().max(1) as f32;
     let (iou, covers) = mean(&overlaps(&posed, body, Some(Mistake::MaskInverted))?);
     if around > BORDER && iou > given && covers > given {
@@ -201,7 +197,7 @@ fn mean(overlaps: &[Overlap]) -> (f32, f32) {
     (sum(Overlap::iou), sum(Overlap::covered))
 }
 
-/// A view and its body, which all mistakes share.
+/// A view and its posed body.
 struct Posed<'a> {
     view: &'a View,
     placement: Placement,
@@ -210,7 +206,7 @@ struct Posed<'a> {
 }
 
 impl<'a> Posed<'a> {
-    /// With joints turned so many times as far as the frame says.
+    /// Poses the body with the frame's rotations scaled by `times`.
     fn new(view: &'a View, frame: &Frame, body: &BodyModel, times: f32) -> Self {
         let pose: Vec<Vec3> = frame.pose.iter().map(|axis| *axis * times).collect();
         let posed = body.pose(&body.shaped(&frame.betas), &pose, frame.placement);
@@ -218,8 +214,7 @@ impl<'a> Posed<'a> {
         Self { view, placement: frame.placement, vertices: posed.vertices, pelvis }
     }
 
-    /// The camera without a mistake. The body moves with it where it must: only how they lie to
-    /// each other counts.
+    /// The camera with a mistake undone; corrections of the body are applied to the camera.
     fn undone(&self, mistake: Mistake) -> Camera {
         let mut camera = self.view.camera;
         match mistake {
@@ -253,7 +248,7 @@ impl<'a> Posed<'a> {
     }
 }
 
-/// The overlap of every view, with a mistake undone.
+/// Overlap of every view, with a mistake undone.
 fn overlaps(posed: &[Posed<'_>], body: &BodyModel, undo: Option<Mistake>) -> Result<Vec<Overlap>, Error> {
     posed.par_iter().map(|posed| posed.overlap(undo, body)).collect()
 }
@@ -268,7 +263,7 @@ pub(super) fn posed(frame: &Frame, body: &BodyModel) -> Vec<Vec3> {
     body.pose(&body.shaped(&frame.betas), &frame.pose, frame.placement).vertices
 }
 
-/// The shift of the fit against the pictures that overlaps better than none, beyond chance.
+/// The frame shift with the largest significant gain in overlap.
 fn shift(capture: &Capture, body: &BodyModel, views: &[View]) -> Result<Option<Mistake>, Error> {
     const SHIFTS: [i32; 4] = [-2, -1, 1, 2];
     let last = capture.train.len() as i32 - 1;
@@ -304,6 +299,6 @@ fn shift(capture: &Capture, body: &BodyModel, views: &[View]) -> Result<Option<M
         return Ok(None);
     }
     let best = (0..SHIFTS.len()).filter_map(better).max_by(|a, b| a.1.total_cmp(&b.1));
-    // What lies in the frame `by` later fits this picture: the fit comes so much too early.
+    // The fit of the frame `by` later overlaps with this picture.
     Ok(best.map(|(by, _)| Mistake::FrameShift(-by)))
 }

@@ -1,7 +1,7 @@
-//! Whether a fit lies on the person, before anything is trained on it.
+//! Validation of a fit before training.
 //!
-//! [`check`] compares the posed body's silhouette with the mask of every frame, looks for sudden
-//! jumps, and names the usual mistakes ([`Mistake`]) when undoing them would make a poor fit good.
+//! [`check`] compares the posed body's silhouette with the mask of every frame, detects temporal
+//! outliers, and diagnoses common convention errors ([`Mistake`]) by undoing them.
 
 mod frame;
 mod jumps;
@@ -26,25 +26,25 @@ use crate::error::Error;
 use crate::model::view::pinhole;
 use crate::scene::labels::{Label, label_pixels};
 
-/// Longest side in pixels of the pictures that silhouettes are compared at.
+/// Longest side of downsampled frames, pixels.
 const SIDE: u32 = 192;
-/// Frames that mistakes are looked for in, and that say what is seen of the surface.
+/// Most frames for detecting mistakes, and for the visible share of the surface.
 const VIEWS: usize = 48;
 const SURFACE_VIEWS: usize = 32;
-/// Overlap below which a frame does not fit.
+/// Least overlap of a frame.
 const LEAST_IOU: f32 = 0.6;
 
 /// One frame.
 #[derive(Clone, Debug, PartialEq)]
 pub struct FrameCheck {
-    /// As in the capture.
+    /// Name in the capture.
     pub name: String,
     /// Intersection over union of the silhouette with the mask and the unknown pixels within the
     /// silhouette; `None` where there is neither mask nor silhouette.
     pub iou: Option<f32>,
     /// Share of the silhouette that is unknown.
     pub hidden: f32,
-    /// What is wrong.
+    /// Faults found.
     pub faults: Vec<Fault>,
 }
 
@@ -53,9 +53,9 @@ pub struct FrameCheck {
 pub struct Check {
     /// The training frames in order.
     pub frames: Vec<FrameCheck>,
-    /// Share of the body's vertices that some frame shows at a pixel of the mask.
+    /// Share of the body's vertices visible at a mask pixel in some frame.
     pub surface_seen: f32,
-    /// Likely mistakes; none for a good capture.
+    /// Likely errors; none for a good capture.
     pub mistakes: Vec<Mistake>,
 }
 
@@ -90,7 +90,7 @@ pub fn check(capture: &Capture, body: &BodyModel) -> Result<Check, Error> {
     Ok(Check { frames, surface_seen: surface_seen(capture, body)?, mistakes })
 }
 
-/// The mistakes that some of the frames with a mask tell of.
+/// Likely mistakes by a sample of the frames with a mask.
 fn likely(capture: &Capture, body: &BodyModel, small: Vec<View>) -> Result<Vec<Mistake>, Error> {
     let shown: Vec<View> = small.into_iter().filter(|view| view.mask.contains(&true)).collect();
     let every = shown.len().div_ceil(VIEWS).max(1);
@@ -112,8 +112,7 @@ pub fn body_silhouette(frame: &Frame, body: &BodyModel) -> Result<Vec<bool>, Err
     outline(frame, &frame.camera, body)
 }
 
-/// The picture of a frame as it was taken, what its mask hides included, for people to look at; for
-/// pixels that are in memory alone, what the mask shows.
+/// The unmasked photograph of a frame, for display; the masked picture of pixels in memory.
 ///
 /// # Errors
 /// Pictures that cannot be read.
@@ -124,7 +123,7 @@ pub fn photograph(frame: &Frame) -> Result<Image, CaptureError> {
     }
 }
 
-/// Pixels (H × W) of a frame of which nothing is known, where `silhouette` is the body's.
+/// Unknown pixels (H × W) of a frame, given the body's `silhouette`.
 #[must_use]
 pub fn unknown_pixels(frame: &Frame, pixels: &Pixels, silhouette: &[bool], body: &BodyModel) -> Vec<bool> {
     unknown(&pixels.mask, silhouette, pixels.occluder.as_deref(), &frame.camera, frame, body)
@@ -153,7 +152,7 @@ impl View {
         let scale = (f64::from(SIDE) / f64::from(width.max(height))).min(1.0);
         let side = |n: u32| ((f64::from(n) * scale).round() as u32).max(1);
         let camera = frame.camera.resized(side(width), side(height));
-        // The pixel that holds the small one's centre.
+        // Nearest-neighbour sampling.
         let source = |i: u32| {
             let (x, y) = (i % camera.width, i / camera.width);
             let at = |i: u32, small: u32, large: u32| (2 * i + 1) as usize * large as usize / (2 * small as usize);
@@ -165,7 +164,7 @@ impl View {
         Ok(Self { index, camera, mask, occluder })
     }
 
-    /// Share of the picture's border that the mask has.
+    /// Share of the image border inside the mask.
     fn border(&self) -> f32 {
         let (width, height) = (self.camera.width as usize, self.camera.height as usize);
         let outer =
@@ -188,7 +187,7 @@ fn one(frame: &Frame, view: &View, body: &BodyModel) -> Result<FrameCheck, Error
     let covered = silhouette.iter().filter(|c| **c).count();
     let iou = (either > 0).then(|| known as f32 / either as f32);
     let empty = !view.mask.contains(&true);
-    // Half of a fit that misses the mask is unknown: what counts then is the mask.
+    // A fit beside the mask may be unknown to a large part; its coverage of the mask decides.
     let beside = !empty && Overlap::of(&silhouette, view, false).covered() < 0.5;
     let mut faults = Vec::new();
     if empty {
@@ -199,14 +198,13 @@ fn one(frame: &Frame, view: &View, body: &BodyModel) -> Result<FrameCheck, Error
     Ok(FrameCheck { name: frame.name.clone(), iou, hidden: hidden as f32 / covered.max(1) as f32, faults })
 }
 
-/// Share of the body's vertices that are seen at a pixel of the mask in at least one of up to 32
-/// frames.
+/// Share of the body's vertices visible at a mask pixel in at least one of up to 32 frames.
 fn surface_seen(capture: &Capture, body: &BodyModel) -> Result<f32, CaptureError> {
     let every = capture.train.len().div_ceil(SURFACE_VIEWS).max(1);
     let mut seen = vec![false; body.num_vertices()];
     for frame in capture.train.iter().step_by(every) {
         let vertices = posed(frame, body);
-        // A body that cannot be hit by rays is not seen.
+        // A degenerate body has no visible vertices.
         let Ok(mesh) = RayMesh::new(&vertices, &body.faces) else { continue };
         let usable: Vec<bool> = frame.pixels()?.mask.iter().map(|&mask| mask > 0.5).collect();
         let now = visible_vertices(&mesh, &vertices, &pinhole(&frame.camera), Some(&usable));

@@ -11,7 +11,7 @@ use smpl::{BodyModel, Placement};
 use volrender::{Aabb, Camera};
 
 use crate::Error;
-use crate::capture::{Capture, Frame, Light, MAX_BETA, MAX_DISTANCE};
+use crate::capture::{Frame, Light, MAX_BETA, MAX_DISTANCE, Mended, Registered};
 use crate::config::Config;
 use crate::model::body::{Body, PosedFrame};
 use crate::model::colors::PriorColors;
@@ -47,7 +47,8 @@ impl Person {
     ///
     /// # Errors
     /// Files that cannot be written.
-    pub fn save(run: &Path, capture: &Capture, model: &BodyModel, colors: &PriorColors) -> Result<(), Error> {
+    pub fn save(run: &Path, registered: &Registered, model: &BodyModel, colors: &PriorColors) -> Result<(), Error> {
+        let Registered { capture, clothes } = registered;
         model.save(&run.join(BODY))?;
         let (joints, betas) = (model.num_joints(), model.num_betas());
         let vectors = |values: &[Vec3]| values.iter().flat_map(|v| v.to_array()).collect::<Vec<f32>>();
@@ -80,7 +81,7 @@ impl Person {
             ("seen", Array::Bytes(colors.seen.iter().map(|&seen| u8::from(seen)).collect())),
             ("light", floats(colors.light.slope.to_array().to_vec())),
             ("sizes", Array::Counts(&sizes)),
-            ("clothes", floats(capture.clothes.clone())),
+            ("clothes", floats(clothes.clone())),
         ];
         let header = BTreeMap::from([
             ("format", FORMAT.to_owned()),
@@ -105,15 +106,15 @@ impl Person {
         colors(&Contents::parse(&path, &bytes, FORMAT, &[VERSION])?, model).map(Some)
     }
 
-    /// Gives `capture` the registered bodies and focal lengths of the run directory `run`; false
-    /// where it has none. Mend masks first ([`crate::mend_masks`]): that takes the bodies as given.
+    /// The capture with the registered bodies and focal lengths of the run directory `run`; `None`
+    /// where it has none.
     ///
     /// # Errors
     /// [`Error::Io`] and [`Error::File`] for a file that is damaged, or of other frames.
-    pub fn restore(run: &Path, capture: &mut Capture, model: &BodyModel) -> Result<bool, Error> {
-        let path = run.join(PERSON);
+    pub fn restore(run: &Path, mended: Mended, model: &BodyModel) -> Result<Option<Registered>, Error> {
+        let (path, Mended(mut capture)) = (run.join(PERSON), mended);
         if !path.is_file() {
-            return Ok(false);
+            return Ok(None);
         }
         let bytes = read(&path)?;
         let contents = Contents::parse(&path, &bytes, FORMAT, &[VERSION])?;
@@ -145,11 +146,10 @@ impl Person {
         capture.mean_betas = mean_betas(&contents, betas)?;
         // Optional array.
         let has = contents.len("clothes") > 0;
-        capture.clothes = if has { contents.floats("clothes", model.num_vertices())? } else { Vec::new() };
+        let clothes = if has { contents.floats("clothes", model.num_vertices())? } else { Vec::new() };
         let Aabb { min, max } = Aabb::from_points(&model.v_template);
-        below(&contents, "clothes", &capture.clothes, (max - min).length())?;
-        capture.registered = true;
-        Ok(true)
+        below(&contents, "clothes", &clothes, (max - min).length())?;
+        Ok(Some(Registered { capture, clothes }))
     }
 
     /// Reads the files that [`Person::save`] wrote into the directory `run`.

@@ -1,4 +1,4 @@
-//! The colours that a video shows of the prior.
+//! Albedo of the prior from the training frames.
 
 use std::sync::Arc;
 
@@ -10,27 +10,25 @@ use crate::capture::Light;
 use crate::model::colors::PriorColors;
 use crate::model::subdivide::{Subdivided, most_times, times_until};
 use crate::model::view::pixel_width;
-use crate::scene::light::{Seen, measure_light};
+use crate::scene::light::{ColorObservation, measure_light};
 use crate::scene::prepared::Scene;
 use crate::scene::seen::deeper;
 use crate::scene::unseen::complete;
 
-/// Pixels of the training pictures that an edge of the subdivided prior may be long, where so many
-/// subdivisions are enough for it; more of them showed no more.
+/// Target edge length of the subdivided prior, pixels of the training frames, and most subdivisions.
 const EDGE: f32 = 0.5;
 const MOST: u32 = 2;
-/// Least part of its size that surface counts with that is seen at a slant.
+/// Least foreshortening weight of an observation.
 const SLANT: f32 = 0.05;
-/// Frames that are looked at together: what they show takes some megabytes each.
+/// Frames in flight, at some megabytes of observations each.
 const TOGETHER: usize = 8;
 
 impl PriorColors {
-    /// The colours that are closest to the visible training pixels that saw a place of the prior, or
-    /// of its clothes where registration has found them, by ray casting, each by the cosine of its
-    /// slant, under the light of the scene if the configuration asks for one. A vertex that no frame
-    /// saw takes a mean of those that some saw, by their canonical distances, along the stripes if
-    /// there are any, other places what lies between their vertices. Pixels at the edge of masks do
-    /// not count where they show what is beside the person.
+    /// Least-squares albedo over the visible training pixels of each point of the subdivided prior,
+    /// or of its clothes if registered, weighted by foreshortening, under the light of the scene if
+    /// the configuration asks for one. Contaminated edge pixels of masks are left out. Unobserved
+    /// vertices are completed by inverse distance weighting, other unobserved points interpolated
+    /// from their vertices.
     ///
     /// # Errors
     /// Pictures that cannot be read.
@@ -47,7 +45,7 @@ impl PriorColors {
             let seen = scene.seen_in(frame, &mesh.anchors)?;
             let view = &scene.train[frame].view;
             let eye = view.camera.centre_of_projection();
-            let term = |&((v, color, normal), _): &(Seen, usize)| {
+            let term = |&((v, color, normal), _): &(ColorObservation, usize)| {
                 let place = mesh.anchors[v as usize].mix(&view.posed.vertices);
                 let (size, shade) = (normal.dot((eye - place).normalize_or_zero()).max(SLANT), light.on(normal));
                 (v as usize, size * shade * color, size * shade * shade)

@@ -7,9 +7,9 @@ use crate::config::OccludedRule;
 pub enum Label {
     /// The mask shows the subject here.
     Subject,
-    /// The subject is certainly not here.
+    /// Free of the subject.
     Background,
-    /// Something stands in front: the subject may or may not be behind it.
+    /// Occluded: the subject may be behind.
     Unknown,
 }
 
@@ -25,8 +25,8 @@ pub struct Labels {
 struct Word {
     subject: u64,
     unknown: u64,
-    /// Subject pixels of all words before.
-    before: u32,
+    /// Subject pixels of all previous words.
+    previous: u32,
 }
 
 impl Labels {
@@ -38,20 +38,20 @@ impl Labels {
             let bits = |wanted: Label| {
                 labels.iter().enumerate().fold(0, |bits, (i, label)| bits | u64::from(*label == wanted) << i)
             };
-            let word = Word { subject: bits(Label::Subject), unknown: bits(Label::Unknown), before: subject };
+            let word = Word { subject: bits(Label::Subject), unknown: bits(Label::Unknown), previous: subject };
             subject += word.subject.count_ones();
             word
         };
         Self { words: labels.chunks(64).map(word).collect(), len: labels.len() }
     }
 
-    /// How many pixels are labelled.
+    /// Number of pixels.
     #[must_use]
     pub fn len(&self) -> usize {
         self.len
     }
 
-    /// Whether no pixel is.
+    /// Whether there are no pixels.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.len == 0
@@ -77,42 +77,41 @@ impl Labels {
         (0..self.len as u32).map(|pixel| self.at(pixel))
     }
 
-    /// How many pixels show the subject.
+    /// Number of subject pixels.
     #[must_use]
     pub fn num_subject(&self) -> usize {
-        self.words.last().map_or(0, |word| word.before + word.subject.count_ones()) as usize
+        self.words.last().map_or(0, |word| word.previous + word.subject.count_ones()) as usize
     }
 
-    /// The `n`-th of them in order.
+    /// The `n`-th subject pixel in order.
     ///
     /// # Panics
     /// From [`Labels::num_subject`] on.
     #[must_use]
     pub fn subject(&self, n: usize) -> u32 {
         assert!(n < self.num_subject(), "subject pixel {n} of {}", self.num_subject());
-        let after = self.words.partition_point(|word| word.before as usize <= n);
+        let after = self.words.partition_point(|word| word.previous as usize <= n);
         let word = self.words[after - 1];
         let mut bits = word.subject;
-        for _ in word.before as usize..n {
-            // Clears the lowest bit that is set.
+        for _ in word.previous as usize..n {
+            // Clears the lowest set bit.
             bits &= bits - 1;
         }
         (after - 1) as u32 * 64 + bits.trailing_zeros()
     }
 }
 
-/// Width below which a piece of silhouette outside the mask is taken for misregistration of the
-/// prior, metres.
+/// Width of silhouette outside the mask that counts as misregistration of the prior, metres.
 const SLIVER: f32 = 0.03;
-/// Thickness of clothes that an occluder may hide beyond the prior's silhouette, metres.
+/// Largest thickness of occluded clothes beyond the prior's silhouette, metres.
 const CLOTHES: f32 = 0.04;
 
 /// Labels the pixels of a frame of `width` × H pixels.
 ///
 /// `mask`: subject coverage; `silhouette`: pixels that the posed prior covers; `occluder`: known
-/// occluder pixels; `pixels_per_metre`: image scale at the subject's depth. Unknown are the
-/// occluder's pixels, which may be some of many, and the silhouette outside the mask, opened by 3
-/// cm and dilated by 4 cm.
+/// occluder pixels, possibly incomplete; `pixels_per_metre`: image scale at the subject's depth.
+/// Unknown are the occluder's pixels, and the silhouette outside the mask, opened by 3 cm and
+/// dilated by 4 cm.
 pub fn label_pixels(
     rule: OccludedRule,
     mask: &[f32],
@@ -147,7 +146,7 @@ pub(crate) fn dilate(set: &[bool], width: usize, radius: f32) -> Vec<bool> {
     squared_distance(set, width).iter().map(|&d| d <= radius * radius).collect()
 }
 
-/// Beyond the image nothing is known, so the border does not erode.
+/// Erosion; pixels beyond the image count as set.
 fn erode(set: &[bool], width: usize, radius: f32) -> Vec<bool> {
     let unset: Vec<bool> = set.iter().map(|s| !s).collect();
     squared_distance(&unset, width).iter().map(|&d| d > radius * radius).collect()

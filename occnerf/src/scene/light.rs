@@ -1,30 +1,34 @@
-//! Colour and light told apart: each vertex has a colour, and a light that all frames share falls
-//! on it by its normal.
+//! Intrinsic decomposition of the vertices' colours: albedo a vertex, and shading by one light of
+//! all frames.
 
 use glam::Vec3;
 use nalgebra::{SMatrix, SVector};
 
 use crate::capture::Light;
 
-/// What a frame shows of a vertex: its colour, and its unit normal in the world.
-pub(crate) type Seen = (u32, Vec3, Vec3);
+/// A vertex as one frame shows it: index, colour, and unit normal in the world.
+pub(crate) type ColorObservation = (u32, Vec3, Vec3);
 
-/// Most observations that a light is measured from.
+/// Most observations of a light estimate.
 const MOST_SEEN: usize = 1 << 20;
-/// Rounds of colour for light, then light for colour.
+/// Rounds of alternating least squares.
 const ROUNDS: usize = 6;
-/// Weight of even light against the observations.
+/// Regularisation towards even light.
 const EVEN: f64 = 0.001;
-/// The same for what the third band has beside the lamp: it would take the side that no frame shows.
+/// Regularisation of the free third band, which would otherwise explain unobserved directions.
 const BOUND: f64 = 0.03;
 /// Steepest light.
 const MOST_SLOPE: f32 = 0.8;
-/// Share of the squared error that a light has to explain, in frames that it was not measured from.
+/// Least share of the squared error of held-out frames that a light must explain.
 const WORTH: f64 = 0.02;
 
-/// Σ s c and Σ s² of the colours c of each vertex and the light s on them: their quotient is closest
-/// to what was seen.
-pub(crate) fn albedo<'a>(seen: impl Iterator<Item = &'a Seen>, vertices: usize, light: Light) -> Vec<(Vec3, f32)> {
+/// Σ s c and Σ s² over the observed colours c of each vertex with shading s, (V). Their quotient is
+/// the least-squares albedo.
+pub(crate) fn albedo<'a>(
+    seen: impl Iterator<Item = &'a ColorObservation>,
+    vertices: usize,
+    light: Light,
+) -> Vec<(Vec3, f32)> {
     let mut sums = vec![(Vec3::ZERO, 0.0f32); vertices];
     for (vertex, color, normal) in seen {
         let (sum, shade) = (&mut sums[*vertex as usize], light.on(*normal));
@@ -35,17 +39,17 @@ pub(crate) fn albedo<'a>(seen: impl Iterator<Item = &'a Seen>, vertices: usize, 
 
 type Terms = SVector<f64, 9>;
 
-/// The first three bands of spherical harmonics, each scaled to a convenient size (Ramamoorthi and
-/// Hanrahan 2001), the second with what a lamp in this direction has of the third.
+/// The first three bands of spherical harmonics, scaled (Ramamoorthi and Hanrahan 2001); the second
+/// includes the third-band term of a lamp in direction `lamp`.
 fn harmonics(lamp: Vec3, n: Vec3) -> Terms {
     let [along_x, along_y, along_z] = Light::along(lamp, n).as_dvec3().to_array();
     let [x, y, z] = n.as_dvec3().to_array();
     Terms::from([1.0, along_x, along_y, along_z, x * y, y * z, z * x, x * x - y * y, z * z - 1.0 / 3.0])
 }
 
-/// The slope that explains best, with the third band beside it, what was seen of colours with these
-/// sums (see [`albedo`]); `None` where nothing says which.
-fn slope<'a>(seen: impl Iterator<Item = &'a Seen>, sums: &[(Vec3, f32)], lamp: Vec3) -> Option<Vec3> {
+/// Least-squares light for the albedo of these sums (see [`albedo`]), with a free third band; `None`
+/// for a singular system.
+fn slope<'a>(seen: impl Iterator<Item = &'a ColorObservation>, sums: &[(Vec3, f32)], lamp: Vec3) -> Option<Vec3> {
     let (mut matrix, mut vector, mut total) = (SMatrix::<f64, 9, 9>::zeros(), Terms::zeros(), 0.0);
     for (v, color, normal) in seen {
         let (sum, squares) = sums[*v as usize];
@@ -60,14 +64,13 @@ fn slope<'a>(seen: impl Iterator<Item = &'a Seen>, sums: &[(Vec3, f32)], lamp: V
     }
     vector[0] += EVEN * total;
     let terms = matrix.try_inverse()? * vector;
-    // What is bright everywhere is the colour's.
+    // The constant band is part of the albedo.
     let terms = terms / terms[0];
     terms.iter().all(|t| t.is_finite()).then(|| Vec3::new(terms[1] as f32, terms[2] as f32, terms[3] as f32))
 }
 
-/// The lamp that explains best what was seen, told apart from the colours by alternating least
-/// squares. What the third band has beside it is fitted and forgotten.
-pub(crate) fn lamp<'a>(seen: impl Iterator<Item = &'a Seen> + Clone, vertices: usize) -> Light {
+/// Least-squares light, alternating with the albedo. The free third band is fitted and dropped.
+pub(crate) fn lamp<'a>(seen: impl Iterator<Item = &'a ColorObservation> + Clone, vertices: usize) -> Light {
     let mut found = Light::default();
     for _ in 0..ROUNDS {
         let sums = albedo(seen.clone(), vertices, found);
@@ -78,16 +81,16 @@ pub(crate) fn lamp<'a>(seen: impl Iterator<Item = &'a Seen> + Clone, vertices: u
     found
 }
 
-/// The light on what frames show of the vertices. Even where what is found explains nothing of the
-/// frames that it was not found in, every other one.
-pub(crate) fn measure_light(frames: &[Vec<Seen>], vertices: usize) -> Light {
+/// Light of the observations of each frame. Even light unless the estimate from every other frame
+/// explains [`WORTH`] of the squared error in the rest.
+pub(crate) fn measure_light(frames: &[Vec<ColorObservation>], vertices: usize) -> Light {
     let most = MOST_SEEN.div_ceil(vertices.max(1)).max(4);
-    let chosen: Vec<&Vec<Seen>> = frames.iter().step_by(frames.len().div_ceil(most).max(1)).collect();
+    let chosen: Vec<&Vec<ColorObservation>> = frames.iter().step_by(frames.len().div_ceil(most).max(1)).collect();
     let half = |first: usize| chosen.iter().skip(first).step_by(2).flat_map(|frame| frame.iter());
     let error = |light: Light| -> f64 {
         let sums = albedo(half(0), vertices, light);
         let known = half(1).filter(|seen| sums[seen.0 as usize].1 > 0.0);
-        let error = |(v, color, normal): &Seen| {
+        let error = |(v, color, normal): &ColorObservation| {
             let (sum, squares) = sums[*v as usize];
             f64::from((sum / squares * light.on(*normal)).distance_squared(*color))
         };
@@ -105,7 +108,7 @@ mod tests {
     use volrender::RandomStream;
 
     /// Colours of vertices that turn before a camera for some frames.
-    fn turning(light: Light, noise: f32) -> Vec<Vec<Seen>> {
+    fn turning(light: Light, noise: f32) -> Vec<Vec<ColorObservation>> {
         let mut stream = RandomStream::new(&[7]);
         let mut random = || Vec3::new(stream.normal(), stream.normal(), stream.normal());
         let vertices: Vec<(Vec3, Vec3)> =

@@ -1,71 +1,60 @@
-//! Masks that are too large or too small: where they end, pictures should have an edge.
+//! Correction of masks that are dilated or eroded by a constant number of pixels.
 //!
-//! A segmenter that errs by some pixels errs so all around and in every frame. Of all lines inside
-//! the mask at an even distance from where it ends, the one across which colours change most is
-//! then the person's outline, and not the mask's. Outside the mask photographs are looked at, which
-//! captures on disk have; without them nothing can be told of a mask that is too small.
+//! The person's outline is the level set of the distance to the mask's edge with the largest mean
+//! colour gradient over all frames. Level sets outside the mask need the unmasked photograph, which
+//! captures on disk have.
 
 use glam::Vec3;
 use rayon::prelude::*;
 use smpl::BodyModel;
 
 use crate::Error;
-use crate::capture::{Capture, Frame, Pixels};
+use crate::capture::{Capture, Frame, Mended, Pixels};
 use crate::config::OccludedRule;
 use crate::model::view::PosedView;
 use crate::scene::labels::{Label, label_pixels, squared_distance};
 
-/// Frames that are looked at.
+/// Most sampled frames.
 const FRAMES: usize = 16;
-/// Lines that are compared, and the last of them that can be the outline, pixels inside the mask.
+/// Level sets inside the mask, one a pixel, and the deepest candidate for the outline.
 const LINES: usize = 12;
 const FARTHEST: usize = 8;
-/// Edges of half covered pixels, which an exact mask has, lie this far inside.
+/// Depth of the antialiased edge of an exact mask, pixels.
 const BLUR: usize = 1;
-/// How much more colours change across the outline than across the median line.
+/// Least ratio of the gradient across the outline to the median level set's.
 const OUTSTANDING: f64 = 1.6;
-/// Pairs of pixels that a line has to be crossed by, and lines that have to be: of a small picture
-/// nothing is said.
+/// Least pixel pairs across a level set, and least level sets with that many.
 const PAIRS: u64 = 100;
 const ENOUGH: usize = 8;
-/// Lines around a mask: so many outside it, its edge, and 4 inside.
+/// Level sets around a mask: [`LINES`] outside, the edge, and 4 inside.
 const AROUND: usize = LINES + 5;
-/// Part of the largest change that the outline has, and of the outline's that the line outside it
-/// can have at most.
+/// Least gradient of the outline relative to the largest, and largest gradient of the next level set
+/// outside relative to the outline's.
 const NEARLY: f64 = 0.75;
 const RISE: f64 = 0.6;
-/// How often masks are looked at again after they have grown.
+/// Passes of growing.
 const PASSES: usize = 3;
-/// How far from the body a mask can be too small, metres.
+/// Largest distance of grown pixels from the body, metres.
 const NEAR: f32 = 0.1;
 
-/// Shrinks the masks of the training frames by as much as they are too large, or grows them by as
-/// much as they are too small, as [`crate::Scene`] does before it registers bodies. What was mended
-/// is left as it is.
+/// Erodes or dilates the masks of the training frames to the person's outline.
 ///
 /// # Errors
 /// Pictures that cannot be read.
-pub fn mend_masks(capture: &mut Capture, model: &BodyModel) -> Result<(), Error> {
-    if std::mem::replace(&mut capture.mended, true) {
-        return Ok(());
+pub fn mend_masks(mut capture: Capture, model: &BodyModel) -> Result<Mended, Error> {
+    match excess(&capture.train)? {
+        0 => extend(&mut capture, model)?,
+        excess => {
+            let by = -i32::try_from(excess).unwrap_or(i32::MAX);
+            capture.train.iter_mut().for_each(|frame| frame.source.edit(move |pixels| pixels.grow(by)));
+        }
     }
-    let excess = excess(&capture.train)?;
-    if excess == 0 {
-        return extend(capture, model);
-    }
-    let by = -i32::try_from(excess).unwrap_or(i32::MAX);
-    capture.train.iter_mut().for_each(|frame| frame.source.edit(move |pixels| pixels.grow(by)));
-    Ok(())
+    Ok(Mended(capture))
 }
 
-/// By how many pixels the masks are too large; 0 where no line stands out.
+/// Number of pixels by which the masks are too large; 0 where no level set stands out.
 fn excess(frames: &[Frame]) -> Result<u32, Error> {
-    let each: Vec<&Frame> = frames.iter().step_by(frames.len().div_ceil(FRAMES).max(1)).collect();
-    let changes: Result<Vec<_>, Error> = each.par_iter().map(|frame| Ok(changes(&frame.pixels()?))).collect();
-    let mut sums = [(0.0, 0u64); LINES];
-    for changes in changes? {
-        sums.iter_mut().zip(changes).for_each(|(sum, (change, pairs))| *sum = (sum.0 + change, sum.1 + pairs));
-    }
+    let sums = total(frames, |frame| Ok(Some(inner_gradients(&frame.pixels()?))))?;
     let crossed = sums.iter().take_while(|sum| sum.1 >= PAIRS);
     let means: Vec<f64> = crossed.map(|(change, pairs)| change / *pairs as f64).collect();
     if means.len() < ENOUGH {
@@ -77,7 +66,21 @@ fn excess(frames: &[Frame]) -> Result<u32, Error> {
     Ok(if means[most] > OUTSTANDING * sorted[means.len() / 2] { most as u32 + 1 } else { 0 })
 }
 
-/// Grows the masks into what photographs show near the body, but not into what hides it.
+/// Sums over the sampled frames.
+fn total<const N: usize>(
+    frames: &[Frame],
+    gradients: impl Fn(&Frame) -> Result<Option<Gradients<N>>, Error> + Sync,
+) -> Result<Gradients<N>, Error> {
+    let sampled: Vec<&Frame> = frames.iter().step_by(frames.len().div_ceil(FRAMES).max(1)).collect();
+    let each: Result<Vec<_>, Error> = sampled.par_iter().map(|frame| gradients(frame)).collect();
+    let mut sums = [(0.0, 0); N];
+    for gradients in each?.into_iter().flatten() {
+        sums.iter_mut().zip(gradients).for_each(|(sum, (change, pairs))| *sum = (sum.0 + change, sum.1 + pairs));
+    }
+    Ok(sums)
+}
+
+/// Grows the masks into the photographs near the body, away from occluders.
 fn extend(capture: &mut Capture, model: &BodyModel) -> Result<(), Error> {
     for _ in 0..PASSES {
         let missing = missing(&capture.train, model)?;
@@ -96,17 +99,12 @@ fn extend(capture: &mut Capture, model: &BodyModel) -> Result<(), Error> {
     Ok(())
 }
 
-/// By how many pixels the masks are too small; 0 where no line outside them is the outline.
+/// Number of pixels by which the masks are too small; 0 where no level set outside is the outline.
 ///
-/// That is the outermost line across which colours change nearly as much as across any, if it rises
-/// from what lies outside. Ragged and blurred outlines rise slowly.
+/// The outline is the outermost level set with nearly the largest gradient, if the next one outside
+/// has a much smaller one. Ragged and blurred outlines rise slowly.
 fn missing(frames: &[Frame], model: &BodyModel) -> Result<u32, Error> {
-    let each: Vec<&Frame> = frames.iter().step_by(frames.len().div_ceil(FRAMES).max(1)).collect();
-    let changes: Result<Vec<_>, Error> = each.par_iter().map(|frame| changes_around(frame, model)).collect();
-    let mut sums = [(0.0, 0u64); AROUND];
-    for changes in changes?.into_iter().flatten() {
-        sums.iter_mut().zip(changes).for_each(|(sum, (change, pairs))| *sum = (sum.0 + change, sum.1 + pairs));
-    }
+    let sums = total(frames, |frame| outer_gradients(frame, model))?;
     if sums.iter().any(|sum| sum.1 < PAIRS) {
         return Ok(0);
     }
@@ -117,12 +115,12 @@ fn missing(frames: &[Frame], model: &BodyModel) -> Result<u32, Error> {
     let most = means[candidates.clone()].iter().copied().fold(0.0, f64::max);
     let outline = candidates.clone().find(|&line| means[line] > NEARLY * most).unwrap_or(LINES);
     let rises = means[outline - 1] < RISE * means[outline] && means[outline] > OUTSTANDING * outside[LINES / 2];
-    // The first candidate may be the end of something that begins farther out.
+    // The first candidate may belong to an edge farther out.
     Ok(if outline > candidates.start && outline < LINES && rises { (LINES - outline) as u32 } else { 0 })
 }
 
-/// Pixels (H × W) into which a mask may grow by `reach`: within `near` metres of the body, and not
-/// near what covers it or may.
+/// Pixels (H × W) into which a mask may grow by `reach`: within `near` metres of the body, and away
+/// from known and possible occluders.
 fn free(frame: &Frame, pixels: &Pixels, model: &BodyModel, reach: u32, near: f32) -> Result<Vec<bool>, Error> {
     let (width, camera) = (pixels.image.width as usize, &frame.camera);
     let shaped = model.shaped(&frame.betas);
@@ -143,15 +141,18 @@ fn free(frame: &Frame, pixels: &Pixels, model: &BodyModel, reach: u32, near: f32
     Ok(away.into_iter().zip(covered).map(|(away, covered)| away <= near * near && covered > reach * reach).collect())
 }
 
-/// A mask that is larger by so many pixels.
+/// The mask dilated by `by` pixels.
 fn larger(mask: &[f32], width: usize, by: f32) -> Vec<f32> {
     let inside: Vec<bool> = mask.iter().map(|&m| m > 0.5).collect();
     squared_distance(&inside, width).into_iter().map(|d| f32::from(d <= by * by)).collect()
 }
 
-/// Sum of the changes of colour of the photograph across the lines from 12 pixels outside the mask to
-/// 4 inside, and of how many pairs of pixels; `None` without a photograph of the subject.
-fn changes_around(frame: &Frame, model: &BodyModel) -> Result<Option<[(f64, u64); AROUND]>, Error> {
+/// Summed colour difference across each of N level sets, and number of pixel pairs.
+type Gradients<const N: usize> = [(f64, u64); N];
+
+/// Gradients of the photograph from 12 pixels outside the mask to 4 inside; `None` without a
+/// photograph of the subject.
+fn outer_gradients(frame: &Frame, model: &BodyModel) -> Result<Option<Gradients<AROUND>>, Error> {
     let Some(photograph) = frame.source.photograph().transpose()? else { return Ok(None) };
     let pixels = frame.pixels()?;
     let width = photograph.width as usize;
@@ -163,45 +164,40 @@ fn changes_around(frame: &Frame, model: &BodyModel) -> Result<Option<[(f64, u64)
     let outside: Vec<bool> = inside.iter().map(|i| !i).collect();
     let (within, without) = (squared_distance(&outside, width), squared_distance(&inside, width));
     let depth = |i: usize| if inside[i] { within[i].sqrt() } else { 1.0 - without[i].sqrt() };
-    let color = |i: usize| photograph.pixels[3 * i..3 * i + 3].iter();
-    let mut sums = [(0.0, 0); AROUND];
-    let usable = |i: usize| inside[i] || free[i];
-    for i in (0..inside.len()).filter(|&i| usable(i)) {
-        let neighbours = [(i % width + 1 < width).then_some(i + 1), Some(i + width)];
-        for j in neighbours.into_iter().flatten().filter(|&j| j < inside.len() && usable(j)) {
-            let (near, far) = (depth(i).min(depth(j)), depth(i).max(depth(j)));
-            let change: f32 = color(i).zip(color(j)).map(|(a, b)| (a - b).abs()).sum();
-            for line in near.ceil() as i64..far.ceil() as i64 {
-                if let Ok(line) = usize::try_from(line + LINES as i64)
-                    && line < AROUND
-                {
-                    sums[line].0 += f64::from(change);
-                    sums[line].1 += 1;
-                }
-            }
-        }
-    }
-    Ok(Some(sums))
+    let color = |i: usize, c: usize| photograph.pixels[3 * i + c];
+    let usable: Vec<bool> = inside.iter().zip(free).map(|(&inside, free)| inside || free).collect();
+    Ok(Some(gradients(&usable, width, depth, color, -(LINES as i64))))
 }
 
-/// Sum of the changes of colour across the lines 1, 2, … pixels inside the mask, and how many pairs
-/// of pixels they were taken from.
-fn changes(pixels: &Pixels) -> [(f64, u64); LINES] {
+/// Gradients 1, 2, … pixels inside the mask.
+fn inner_gradients(pixels: &Pixels) -> Gradients<LINES> {
     let width = pixels.image.width as usize;
-    let outside: Vec<bool> = pixels.mask.iter().map(|&m| m <= 0.5).collect();
+    let inside: Vec<bool> = pixels.mask.iter().map(|&m| m > 0.5).collect();
+    let outside: Vec<bool> = inside.iter().map(|i| !i).collect();
     let depth: Vec<f32> = squared_distance(&outside, width).into_iter().map(f32::sqrt).collect();
-    let color = |i: usize| pixels.image.pixels[3 * i..3 * i + 3].iter().map(move |c| c / pixels.mask[i]);
-    let mut sums = [(0.0, 0); LINES];
-    for i in (0..outside.len()).filter(|&i| !outside[i]) {
+    let color = |i: usize, c: usize| pixels.image.pixels[3 * i + c] / pixels.mask[i];
+    gradients(&inside, width, |i| depth[i], color, 1)
+}
+
+/// Sums over pairs of `usable` neighbours across the level sets of `depth` from `first` on.
+fn gradients<const N: usize>(
+    usable: &[bool],
+    width: usize,
+    depth: impl Fn(usize) -> f32,
+    color: impl Fn(usize, usize) -> f32,
+    first: i64,
+) -> Gradients<N> {
+    let mut sums = [(0.0, 0); N];
+    for i in (0..usable.len()).filter(|&i| usable[i]) {
         let neighbours = [(i % width + 1 < width).then_some(i + 1), Some(i + width)];
-        for j in neighbours.into_iter().flatten().filter(|&j| j < outside.len() && !outside[j]) {
-            let (near, far) = (depth[i].min(depth[j]), depth[i].max(depth[j]));
-            let change: f32 = color(i).zip(color(j)).map(|(a, b)| (a - b).abs()).sum();
-            // Neighbours are less than two lines apart.
-            for line in near.ceil() as usize..far.ceil() as usize {
-                if (1..=LINES).contains(&line) {
-                    sums[line - 1].0 += f64::from(change);
-                    sums[line - 1].1 += 1;
+        for j in neighbours.into_iter().flatten().filter(|&j| j < usable.len() && usable[j]) {
+            let (near, far) = (depth(i).min(depth(j)), depth(i).max(depth(j)));
+            let change: f32 = (0..3).map(|c| (color(i, c) - color(j, c)).abs()).sum();
+            // Neighbours are less than two level sets apart.
+            for line in near.ceil() as i64..far.ceil() as i64 {
+                let sum = usize::try_from(line - first).ok().and_then(|line| sums.get_mut(line));
+                if let Some(sum) = sum {
+                    *sum = (sum.0 + f64::from(change), sum.1 + 1);
                 }
             }
         }
@@ -234,19 +230,19 @@ mod tests {
         let area = |c: &Capture| c.train.iter().map(|f| f.pixels().unwrap().mask.iter().sum::<f32>()).sum::<f32>();
         for (mask_pixels, ragged_pixels) in [(0, 0.0), (-3, 0.0), (-1, 0.0), (0, 2.0), (2, 0.0), (3, 0.0), (5, 0.0)] {
             let mut capture = given.clone();
-            let wrong = Perturbation { mask_pixels, ragged_pixels, ..Perturbation::NONE };
-            wrong.apply(&mut capture, &body).unwrap();
+            let noise = Perturbation { mask_pixels, ragged_pixels, ..Perturbation::NONE };
+            noise.apply(&mut capture, &body).unwrap();
             let found = excess(&capture.train).unwrap() as i32;
-            let spoilt = area(&capture);
-            mend_masks(&mut capture, &body).unwrap();
+            let corrupted = area(&capture);
+            let Mended(capture) = mend_masks(capture, &body).unwrap();
             println!("{mask_pixels} {ragged_pixels}: {found}");
             if mask_pixels < 2 {
                 // Those that are too small grow.
-                let kept = mask_pixels < 0 || area(&capture) == spoilt;
+                let kept = mask_pixels < 0 || area(&capture) == corrupted;
                 assert!(found == 0 && kept, "{mask_pixels} {ragged_pixels}: {found}");
             } else {
                 assert!((found - mask_pixels).abs() <= 1, "{mask_pixels}: {found}");
-                let (left, was) = ((area(&capture) - area(&given)).abs(), spoilt - area(&given));
+                let (left, was) = ((area(&capture) - area(&given)).abs(), corrupted - area(&given));
                 assert!(left < 0.4 * was, "{mask_pixels}: {left} of {was}");
             }
         }
@@ -263,8 +259,8 @@ mod tests {
         let right = [(0, 0.4), (0, 2.0), (0, 4.0), (2, 0.0), (3, 0.0)];
         for (mask_pixels, ragged_pixels) in right.into_iter().chain([(-1, 0.0), (-2, 0.0), (-3, 0.0), (-2, 2.0)]) {
             let mut capture = given.clone();
-            let wrong = Perturbation { mask_pixels, ragged_pixels, ..Perturbation::NONE };
-            wrong.apply(&mut capture, &body).unwrap();
+            let noise = Perturbation { mask_pixels, ragged_pixels, ..Perturbation::NONE };
+            noise.apply(&mut capture, &body).unwrap();
             let error = |c: &Capture| -> f32 {
                 let frames = c.train.iter().zip(&given.train);
                 let each = frames.map(|(frame, given)| {
@@ -293,10 +289,9 @@ mod tests {
         let body = BodyModel::embedded();
         let (_directory, mut capture) = on_disk("masks-occluder", 192, Layout::Wild);
         Perturbation { mask_pixels: -2, ..Perturbation::NONE }.apply(&mut capture, &body).unwrap();
-        let small = capture.clone();
-        mend_masks(&mut capture, &body).unwrap();
+        let Mended(grown_capture) = mend_masks(capture.clone(), &body).unwrap();
         let mut grown = 0;
-        for (frame, small) in capture.train.iter().zip(&small.train) {
+        for (frame, small) in grown_capture.train.iter().zip(&capture.train) {
             let (frame, small) = (frame.pixels().unwrap(), small.pixels().unwrap());
             let covered = frame.occluder.as_deref().unwrap();
             for i in (0..covered.len()).filter(|&i| frame.mask[i] != small.mask[i]) {
@@ -313,7 +308,7 @@ mod tests {
         let config = DemoConfig { size: 32, frames: 2, eval_cameras: 1, ..DemoConfig::default() };
         let mut capture = demo(&config, &body).unwrap();
         Perturbation { mask_pixels: -40, ..Perturbation::NONE }.apply(&mut capture, &body).unwrap();
-        mend_masks(&mut capture, &body).unwrap();
+        let Mended(capture) = mend_masks(capture, &body).unwrap();
         assert_eq!(excess(&capture.train).unwrap(), 0);
         assert_eq!(excess(&[]).unwrap(), 0);
     }

@@ -1,4 +1,4 @@
-//! A capture made ready for training: posed bodies and pixel labels.
+//! A capture prepared for training: posed bodies and pixel labels.
 
 use std::sync::{Arc, OnceLock};
 
@@ -7,7 +7,7 @@ use smpl::BodyModel;
 use visibility::{RayMesh, VisibilityCounts};
 
 use crate::Error;
-use crate::capture::{Capture, CaptureError, Frame, Light, PixelReader, PixelSource, Pixels};
+use crate::capture::{Capture, CaptureError, Frame, Light, PixelReader, PixelSource, Pixels, Registered};
 use crate::config::Config;
 use crate::model::body::{Body, PosedFrame};
 use crate::model::colors::PriorColors;
@@ -15,7 +15,7 @@ use crate::model::subdivide::Anchor;
 use crate::model::view::PosedView;
 use crate::model::view::pinhole;
 use crate::scene::labels::{Label, Labels, dilate, label_pixels};
-use crate::scene::light::{Seen, measure_light};
+use crate::scene::light::{ColorObservation, measure_light};
 use crate::scene::masks::mend_masks;
 use crate::scene::registration::register;
 use crate::scene::seen::{MOST, deeper, seen, strange_edge};
@@ -28,7 +28,7 @@ pub struct PreparedFrame {
     pub camera_name: String,
     /// Pose and camera, lengths normalised.
     pub view: Arc<PosedView>,
-    /// Picture and mask, as in the capture; `None` where nothing was photographed.
+    /// Picture and mask, as in the capture; `None` for a synthetic view.
     pub source: Option<PixelSource>,
     /// Labels of the pixels, H × W; only training frames are labelled, and those held out.
     pub labels: Labels,
@@ -38,13 +38,12 @@ impl PreparedFrame {
     /// The picture and its mask.
     ///
     /// # Errors
-    /// [`Error::Data`] for files that cannot be read; [`Error::Scene`] where nothing was
-    /// photographed.
+    /// [`Error::Data`] for files that cannot be read; [`Error::Scene`] for a view without a picture.
     pub fn pixels(&self) -> Result<Pixels, Error> {
         self.photographed(PixelSource::pixels)
     }
 
-    /// The same for reading single pixels.
+    /// A reader of single pixels.
     pub(crate) fn reader(&self) -> Result<PixelReader, Error> {
         self.photographed(PixelSource::reader)
     }
@@ -55,10 +54,10 @@ impl PreparedFrame {
     }
 }
 
-/// What stands for the name of the camera of a training frame that is held out.
+/// Camera name of a held-out training frame.
 const HELD_OUT: &str = "held out";
 
-/// Everything that training and scoring read and never change.
+/// Immutable input of training and evaluation.
 pub struct Scene {
     /// Name of the capture.
     pub name: String,
@@ -68,44 +67,51 @@ pub struct Scene {
     pub train: Vec<PreparedFrame>,
     /// Evaluation frames, never seen in training.
     pub eval: Vec<PreparedFrame>,
-    /// What was prepared: the bodies as registration has corrected them.
-    pub capture: Capture,
-    /// Whether colours are to be told apart from a light.
+    /// The capture with its bodies.
+    pub registered: Registered,
+    /// Whether albedo and light are separated.
     pub(crate) lit: bool,
-    /// Pixels on both sides of the masks' edges that may show somebody else's colours.
+    /// Width of the masks' contaminated edge, pixels.
     pub(crate) edge: usize,
-    /// How far clothes stand off each vertex; empty where that is not known.
+    /// Offset of the clothes at each vertex, normalised metres; empty where unknown.
     pub(crate) clothes: Vec<f32>,
-    /// Indices of the training frames from whose pixels something is learnt: all but those held
-    /// out.
+    /// Ascending indices of the training frames that are not held out.
     pub(crate) learnt: Vec<usize>,
-    /// What [`Scene::colors`] says, once it is known.
+    /// Cache of [`Scene::colors`].
     pub(crate) colors: OnceLock<PriorColors>,
 }
 
 impl Scene {
-    /// Prepares a capture with its prior.
+    /// Corrects the masks of a capture, registers its bodies, and prepares it; takes masks and bodies
+    /// as they are for `registration.rounds` of 0.
+    ///
+    /// # Errors
+    /// Those of [`Scene::prepare`].
+    pub fn new(capture: &Capture, model: &BodyModel, config: &Config) -> Result<Self, Error> {
+        config.validate()?;
+        let registered = match config.registration.rounds {
+            0 => capture.clone().into(),
+            rounds => register(mend_masks(capture.clone(), model)?, model, rounds)?,
+        };
+        Self::prepare(registered, model, config)
+    }
+
+    /// Prepares a registered capture.
     ///
     /// # Errors
     /// A configuration that is not valid; [`Error::Scene`] for a capture that cannot be trained on;
     /// pictures that cannot be read.
-    pub fn new(capture: &Capture, model: &BodyModel, config: &Config) -> Result<Self, Error> {
+    pub fn prepare(registered: Registered, model: &BodyModel, config: &Config) -> Result<Self, Error> {
         config.validate()?;
+        let Registered { capture, clothes } = &registered;
         if let Some(lost) = capture.eval.iter().find(|e| e.train_index >= capture.train.len()) {
             let (name, at, frames) = (&lost.frame.name, lost.train_index, capture.train.len());
             return Err(Error::Scene(format!("view {name} is of training frame {at}, expected one of {frames}")));
         }
-        let (clothes, vertices) = (&capture.clothes, model.num_vertices());
+        let vertices = model.num_vertices();
         if !(clothes.is_empty() || clothes.len() == vertices && clothes.iter().all(|c| c.is_finite())) {
             let found = clothes.len();
             return Err(Error::Scene(format!("clothes are {found} numbers, expected none or {vertices}, all finite")));
-        }
-        let mut capture = capture.clone();
-        if config.registration.rounds > 0 {
-            mend_masks(&mut capture, model)?;
-            if !capture.registered {
-                register(&mut capture, model, config.registration.rounds)?;
-            }
         }
         let body = Arc::new(Body::new(model, &capture.mean_betas, config)?);
         let train: Result<Vec<_>, Error> = (capture.train.par_iter().enumerate())
@@ -117,9 +123,9 @@ impl Scene {
             name: capture.name.clone(),
             train: train?,
             eval: eval?,
-            clothes: capture.clothes.iter().map(|c| c * body.scale).collect(),
+            clothes: clothes.iter().map(|c| c * body.scale).collect(),
             body,
-            capture,
+            registered,
             lit: config.field.prior_light,
             edge: 0,
             learnt: Vec::new(),
@@ -139,8 +145,8 @@ impl Scene {
         Ok(scene)
     }
 
-    /// The prior's colours, measured when they are first asked for ([`PriorColors::measure`]), or
-    /// those that a run began with.
+    /// Colours of the prior, measured on first use ([`PriorColors::measure`]), or those of a resumed
+    /// run.
     ///
     /// # Errors
     /// Pictures that cannot be read.
@@ -152,21 +158,21 @@ impl Scene {
         Ok(self.colors.get_or_init(|| measured))
     }
 
-    /// Takes the colours of a run that is to go on, for what it has learnt belongs to them.
+    /// Sets the colours of a resumed run, which its field is relative to.
     #[must_use]
     pub fn with_colors(self, colors: PriorColors) -> Self {
         Self { colors: OnceLock::from(colors), ..self }
     }
 
-    /// What each training frame shows of the vertices, and how many pixels inside its mask; nothing
-    /// of those held out.
-    pub(crate) fn seen(&self) -> Result<Vec<Vec<(Seen, usize)>>, Error> {
+    /// Colour observations of the vertices in each training frame, with their depth inside the mask;
+    /// none of held-out frames.
+    pub(crate) fn seen(&self) -> Result<Vec<Vec<(ColorObservation, usize)>>, Error> {
         let anchors: Vec<Anchor> = (0..self.body.canonical.vertices.len() as u32).map(Anchor::vertex).collect();
         (0..self.train.len()).into_par_iter().map(|frame| self.seen_in(frame, &anchors)).collect()
     }
 
-    /// The same of points of the prior in one of the frames.
-    pub(crate) fn seen_in(&self, frame: usize, anchors: &[Anchor]) -> Result<Vec<(Seen, usize)>, Error> {
+    /// [`Scene::seen`] for points of the prior in one frame.
+    pub(crate) fn seen_in(&self, frame: usize, anchors: &[Anchor]) -> Result<Vec<(ColorObservation, usize)>, Error> {
         if self.learnt.binary_search(&frame).is_err() {
             return Ok(Vec::new());
         }
@@ -174,8 +180,7 @@ impl Scene {
         seen(&frame.view, &frame.pixels()?, &self.body.model.faces, &self.clothes, anchors)
     }
 
-    /// Makes the training frames that nothing is learnt from those to score, in place of views of
-    /// other cameras.
+    /// Makes held-out training frames, if any, the evaluation frames in place of other cameras'.
     fn hold_out(&mut self) {
         if self.learnt.len() < self.train.len() {
             self.eval.clear();
@@ -194,13 +199,13 @@ impl Scene {
         }
     }
 
-    /// Takes pixels at the edges of masks for unknown, where what they show is not the person's.
+    /// Labels the contaminated edge pixels of masks as unknown.
     fn leave_out_edges(&mut self) -> Result<(), Error> {
         let (vertices, frames) = (self.body.canonical.vertices.len(), self.seen()?);
         let inside = deeper(&frames, MOST);
         let light = if self.lit { measure_light(&inside, vertices) } else { Light::default() };
         self.edge = strange_edge(&frames, light, vertices);
-        // Outside, what is not the mask's may be the person's.
+        // The mask may be as much too small.
         let (inner, outer) = (self.edge as f32, self.edge as f32 + 1.0);
         if self.edge == 0 {
             return Ok(());
@@ -218,8 +223,8 @@ impl Scene {
         Ok(())
     }
 
-    /// How many training frames show each vertex of the prior to the camera at a pixel of the
-    /// subject, by ray casting.
+    /// Number of training frames in which each vertex of the prior is visible at a subject pixel, by
+    /// ray casting.
     pub fn vertex_frequencies(&self) -> Result<Vec<u64>, Error> {
         let visible: Result<Vec<Vec<bool>>, Error> = self
             .train

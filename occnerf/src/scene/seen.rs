@@ -1,5 +1,4 @@
-//! What a frame shows of the prior's vertices, and at which pixels of its mask that is somebody
-//! else's.
+//! Colour observations of the prior's vertices, and the width of a mask's contaminated edge.
 
 use std::borrow::Cow;
 
@@ -13,32 +12,32 @@ use crate::model::subdivide::Anchor;
 use crate::model::view::PosedView;
 use crate::model::view::pinhole;
 use crate::scene::labels::squared_distance;
-use crate::scene::light::{Seen, albedo};
+use crate::scene::light::{ColorObservation, albedo};
 
-/// Pixels within a mask from which on it shows the person for certain.
+/// Depth inside a mask of reliable pixels.
 pub(crate) const MOST: usize = 4;
-/// By how much more the colours of such pixels have to be wrong than those of the next farther
-/// inside: bodies that do not quite fit make edges wrong too, but evenly so.
+/// Least ratio of the squared colour residual of a contaminated edge pixel to the next one inside;
+/// misregistration raises both.
 const STRANGE: f64 = 1.5;
 
-/// Vertices (V) with `clothes` that stand so far off along their normals.
+/// Vertices (V) offset along their normals by `clothes`.
 pub(crate) fn dressed(vertices: &[Vec3], normals: &[Vec3], clothes: &[f32]) -> Vec<Vec3> {
     let each = vertices.iter().zip(normals).zip(clothes);
     each.map(|((v, n), c)| *v + *c * n.normalize_or_zero()).collect()
 }
 
-/// What a frame shows of points of the prior at pixels of the subject, by ray casting, and how many
-/// pixels inside the mask that is, from 1. `anchors` say where the points are, on the surface of
-/// `clothes` if they are known (V), else on the body's: what stands off the body is seen beside it.
+/// Colour observations of the points `anchors` of the prior, by ray casting against subject pixels,
+/// each with its depth inside the mask in pixels, from 1. The points lie on the surface of `clothes`
+/// (V), or on the body for empty `clothes`.
 pub(crate) fn seen(
     view: &PosedView,
     pixels: &Pixels,
     faces: &[[u32; 3]],
     clothes: &[f32],
     anchors: &[Anchor],
-) -> Result<Vec<(Seen, usize)>, Error> {
+) -> Result<Vec<(ColorObservation, usize)>, Error> {
     let camera = &view.camera;
-    // Those of the body, by which it is lit.
+    // Shading uses the normals of the body.
     let normals = vertex_normals(&view.posed.vertices, faces);
     let mut posed = Cow::Borrowed(&view.posed.vertices[..]);
     if !clothes.is_empty() {
@@ -54,22 +53,23 @@ pub(crate) fn seen(
         let at = visible[v].then(|| camera.project(points[v])).flatten()?;
         let pixel = at.y as usize * camera.width as usize + at.x as usize;
         let coverage = *pixels.mask.get(pixel)?;
-        // Edge pixels are mixed with black in proportion to what the mask leaves free.
+        // Masked pixels are premultiplied by coverage.
         let color = Vec3::from_slice(&pixels.image.pixels[3 * pixel..]) / coverage.max(0.5);
         Some(((v as u32, color, anchors[v].mix(&normals).normalize_or_zero()), (depth[pixel].sqrt() as usize).max(1)))
     };
     Ok((0..points.len()).filter_map(color).collect())
 }
 
-/// What frames show more than so many pixels inside their masks.
-pub(crate) fn deeper(frames: &[Vec<(Seen, usize)>], edge: usize) -> Vec<Vec<Seen>> {
-    let deep = |frame: &Vec<(Seen, usize)>| frame.iter().filter(|seen| seen.1 > edge).map(|seen| seen.0).collect();
+/// Observations more than `edge` pixels inside their masks.
+pub(crate) fn deeper(frames: &[Vec<(ColorObservation, usize)>], edge: usize) -> Vec<Vec<ColorObservation>> {
+    let deep =
+        |frame: &Vec<(ColorObservation, usize)>| frame.iter().filter(|seen| seen.1 > edge).map(|seen| seen.0).collect();
     frames.iter().map(deep).collect()
 }
 
-/// How many pixels at the edge of the masks show other colours of the vertices, under this light,
-/// than what lies farther inside: as many as are, one after another, more wrong than the next.
-pub(crate) fn strange_edge(frames: &[Vec<(Seen, usize)>], light: Light, vertices: usize) -> usize {
+/// Width in pixels of the masks' edge whose colours disagree with the albedo of the inside, under
+/// this light: the run of depths with a residual [`STRANGE`] times the next one's.
+pub(crate) fn strange_edge(frames: &[Vec<(ColorObservation, usize)>], light: Light, vertices: usize) -> usize {
     let inside = deeper(frames, MOST);
     let sums = albedo(inside.iter().flatten(), vertices, light);
     let mut errors = [(0.0, 0u64); MOST + 2];
@@ -81,7 +81,7 @@ pub(crate) fn strange_edge(frames: &[Vec<(Seen, usize)>], light: Light, vertices
             *error = (error.0 + f64::from(squared), error.1 + 1);
         }
     }
-    // NaN, more than which nothing is, where nothing was seen.
+    // The mean of an unobserved depth is NaN; comparisons with it are false.
     let means = errors.map(|(sum, count)| sum / count as f64);
     (1..MOST).take_while(|&depth| means[depth] > STRANGE * means[depth + 1]).last().unwrap_or(0)
 }
@@ -141,7 +141,7 @@ mod tests {
         };
         for strange in 0..MOST {
             let frame = |f: u32| (0..200).map(|v| seen(v, 1 + ((v + f) % 9) as usize, strange)).collect();
-            let frames: Vec<Vec<(Seen, usize)>> = (0..9).map(frame).collect();
+            let frames: Vec<Vec<(ColorObservation, usize)>> = (0..9).map(frame).collect();
             assert_eq!(strange_edge(&frames, Light::default(), 200), strange);
         }
         assert_eq!(strange_edge(&[], Light::default(), 0), 0);

@@ -1,29 +1,27 @@
-//! Colours of surface that no frame shows, continued from what surrounds it.
+//! Colours of unobserved vertices by inverse distance weighting (Shepard 1968).
 //!
-//! Hems, belts, cuffs and stripes go around trunk and limbs more often than along them. So a guess
-//! is a mean of what was seen by inverse distances (Shepard 1968) in which a way around the bone is
-//! shorter than one along it, if that is how the seen surface around a piece of unseen surface can be
-//! told from what surrounds it.
+//! Distances are anisotropic about the bone, since hems, belts, cuffs and stripes go around trunk and
+//! limbs more often than along them. Each unobserved piece chooses the anisotropy that predicts the
+//! observed vertices around it best.
 
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 
 use crate::model::body::Body;
 
-/// Lengths that a metre around the bone counts for, against one along it; the first that tells best
-/// the surface around what is unseen is taken.
+/// Candidate anisotropies: length of a metre around the bone relative to one along it.
 const AROUND: [f32; 3] = [1.0, 0.1, 10.0];
-/// How far that reaches from unseen vertices, metres of a body 1.7 high.
+/// Distance from unobserved vertices of the validation vertices, metres of a body 1.7 high.
 const RIM: f32 = 0.08;
-/// Vertices of that surface that are looked at, at most.
+/// Most validation vertices of a piece.
 const MOST_HELD: usize = 1024;
-/// Vertices of a piece of unseen surface from which on it is looked at by itself.
+/// Least vertices of a piece; smaller ones are merged.
 const FEW: usize = 16;
-/// Least distance of a joint from the plane of symmetry, x = 0, in a limb, metres of such a body.
+/// Least distance of a limb's joint from the plane of symmetry, x = 0, metres of such a body.
 const ASIDE: f32 = 0.03;
 
-/// Gives each vertex of the canonical `body` that is not `seen` (V) a colour, from those of the
-/// others (V); grey where there are none.
+/// Fills the `colors` (V) of the vertices of the canonical `body` that are not `seen` (V); grey
+/// where none is.
 pub(crate) fn complete(body: &Body, colors: &mut [Vec3], seen: &[bool]) {
     let known: Vec<usize> = (0..seen.len()).filter(|&v| seen[v]).collect();
     if known.is_empty() {
@@ -41,13 +39,13 @@ pub(crate) fn complete(body: &Body, colors: &mut [Vec3], seen: &[bool]) {
 
 struct Guesses<'a> {
     vertices: &'a [Vec3],
-    /// Unit direction of the bone that each vertex hangs on, V.
+    /// Unit direction of each vertex's bone, (V).
     axes: Vec<Vec3>,
     colors: &'a [Vec3],
 }
 
 impl Guesses<'_> {
-    /// The mean of the colours of the vertices `known`, by distances to the power of −4.
+    /// Mean colour of the vertices `known`, weighted by distance⁻⁴.
     fn guess(&self, v: usize, known: &[usize], around: f32) -> Vec3 {
         let (mut sum, mut weights) = (DVec3::ZERO, 0.0);
         for &k in known {
@@ -63,8 +61,8 @@ impl Guesses<'_> {
         (sum / weights).as_vec3()
     }
 
-    /// The entry of [`AROUND`] by which those of the vertices `known` that surround `unseen` are
-    /// guessed best from the others.
+    /// The anisotropy of [`AROUND`] with the least error in predicting the vertices of `known` around
+    /// `unseen` from the others.
     fn choose(&self, known: &[usize], unseen: &[usize]) -> f32 {
         let is_near = |v: usize| unseen.iter().any(|&u| self.vertices[u].distance(self.vertices[v]) < RIM);
         let (held, rest): (Vec<usize>, Vec<usize>) = known.par_iter().partition(|&&v| is_near(v));
@@ -81,8 +79,8 @@ impl Guesses<'_> {
     }
 }
 
-/// The vertices that are not `seen` (V), in pieces that hang together; pieces of a few vertices are
-/// one.
+/// Connected components of the vertices that are not `seen` (V); components of fewer than [`FEW`]
+/// vertices are merged.
 fn regions(body: &Body, seen: &[bool]) -> Vec<Vec<usize>> {
     let mut next = vec![Vec::new(); seen.len()];
     for corners in &body.model.faces {
@@ -107,8 +105,8 @@ fn regions(body: &Body, seen: &[bool]) -> Vec<Vec<usize>> {
     pieces
 }
 
-/// The direction, V, of the bone that moves each vertex most: upright in the trunk, along the limb
-/// in a limb.
+/// Direction of the bone with the largest weight at each vertex, (V): upright in the trunk, along
+/// the limb in a limb.
 fn axes(body: &Body) -> Vec<Vec3> {
     let (joints, parents) = (&body.canonical.joints, &body.model.parents);
     let is_aside = |j: usize| joints[j].x.abs() > ASIDE;
@@ -117,7 +115,7 @@ fn axes(body: &Body) -> Vec<Vec3> {
         let Some(p) = *parent else { continue };
         let child = (j + 1..joints.len()).find(|&child| parents[child] == Some(j));
         let bone = child.map_or(joints[j] - joints[p], |child| joints[child] - joints[j]);
-        // What begins in the trunk still belongs to it.
+        // A bone that begins in the trunk belongs to it.
         of_joints[j] = if is_aside(j) && is_aside(p) { bone.normalize_or(of_joints[p]) } else { of_joints[p] };
     }
     let strongest = |v: usize| body.model.weights.row(v).reduce(|a, b| if b.1 > a.1 { b } else { a });

@@ -88,9 +88,6 @@ pub fn capture_from(metres: f32) -> Capture {
         train: vec![frame(0, 0.0, 0, metres), frame(1, 1.0, half, metres)],
         eval: eval.collect(),
         mean_betas: vec![0.0],
-        registered: false,
-        clothes: Vec::new(),
-        mended: false,
     }
 }
 

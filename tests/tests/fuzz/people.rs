@@ -141,7 +141,7 @@ pub fn person(run: &Path) -> (Config, Vec<u8>) {
     let capture = load_capture(&dir, &body, &LoadOptions::default()).unwrap();
     let colors = PriorColors::of_vertices(vec![Vec3::splat(0.5); 4], &body.faces);
     std::fs::create_dir_all(run).unwrap();
-    Person::save(run, &capture, &body, &colors).unwrap();
+    Person::save(run, &capture.into(), &body, &colors).unwrap();
     (Config::preset(Preset::Fast, Method::HashPoint), std::fs::read(run.join("person.safetensors")).unwrap())
 }
 

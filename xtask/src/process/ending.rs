@@ -1,4 +1,4 @@
-//! How the program ends: a message of one line, and an exit code for scripts.
+//! Exit codes and one-line error messages.
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -8,15 +8,13 @@ use occnerf::capture::CaptureError;
 
 use super::print::shown;
 
-/// Longest message that is printed, in characters: some quote what they found in a file.
+/// Longest message, characters; some quote a file.
 const LONGEST: usize = 2000;
 
-/// Ends that scripts can tell apart; any other error exits with 1, a command line that cannot be
-/// read with 2.
+/// Errors with their own exit code; others exit with 1, a malformed command line with 2.
 #[derive(Debug, thiserror::Error)]
 pub enum Ending {
-    /// A result cannot be written: a full disk, a folder that is read-only or gone. What stood
-    /// there before is whole.
+    /// A result cannot be written; the previous file is intact.
     #[error("{}: cannot be written: {source}", path.display())]
     Unwritten {
         /// The file.
@@ -42,25 +40,24 @@ impl Ending {
         match self {
             Self::Unwritten { .. } => 3,
             Self::Busy(_) => 4,
-            // As a shell has it.
+            // Shell convention.
             Self::Stopped { signal, .. } => 128 + u8::try_from(*signal).unwrap_or(0) % 127,
         }
     }
 }
 
-/// What turns the system's error into one that says which result is missing.
+/// Converts an I/O error of a result.
 pub fn unwritten(path: &Path) -> impl FnOnce(io::Error) -> Error + '_ {
     move |source| Ending::Unwritten { path: path.to_owned(), source }.into()
 }
 
-/// What tells errors of the library about files in `place`, where results go, from those about what
-/// was given.
+/// Converts library errors on files in `place`, where results go; others are returned as they are.
 pub fn results_in(place: &Path) -> impl Fn(Error) -> Error + '_ {
     move |error| {
         let found = error.chain().find_map(file_and_reason).filter(|(path, _)| path.starts_with(place));
         match found {
             Some((path, reason)) => {
-                // The reason is the error's own: it is said again.
+                // I/O errors cannot be cloned.
                 let source = io::Error::new(reason.kind(), reason.to_string());
                 Ending::Unwritten { path: path.to_owned(), source }.into()
             }
@@ -109,7 +106,7 @@ fn name(signal: i32) -> String {
     }
 }
 
-/// The one line that is printed of an error that ends the program, and the exit code.
+/// Message and exit code of an error that ends the program.
 pub fn described(error: &Error) -> (String, u8) {
     let ending = error.chain().find_map(|cause| cause.downcast_ref::<Ending>());
     let line = one_line(error);
@@ -119,12 +116,12 @@ pub fn described(error: &Error) -> (String, u8) {
     }
 }
 
-/// An error and its causes on one line, each said once, not longer than anybody reads.
+/// An error and its causes, without repetitions, on one line of limited length.
 pub fn one_line(error: &Error) -> String {
     let mut text = String::new();
     for cause in error.chain() {
         let cause = cause.to_string();
-        // Errors of the crates below quote their cause and hand it on as well.
+        // Transparent errors quote their cause.
         if text.ends_with(&cause) {
             continue;
         }
@@ -137,7 +134,7 @@ pub fn one_line(error: &Error) -> String {
     cut(&shown(&lines.join(" ")))
 }
 
-/// The beginning and the end of what is too long.
+/// Elides the middle of a long text.
 fn cut(text: &str) -> String {
     let count = text.chars().count();
     if count <= LONGEST {

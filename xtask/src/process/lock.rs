@@ -1,4 +1,4 @@
-//! Folders that one process at a time may write.
+//! Exclusive locks on folders.
 
 use std::fs::{File, TryLockError};
 use std::path::{Path, PathBuf};
@@ -8,8 +8,8 @@ use anyhow::Result;
 use super::ending::{Ending, unwritten};
 use crate::note;
 
-/// The sole right to write results in a folder. It ends with the process, however that ends: the
-/// system holds it, and the file `.lock` that stays behind means nothing.
+/// Exclusive lock on writing a folder, held by the system until the process ends; a `.lock` file left
+/// behind has no meaning.
 #[must_use]
 pub struct Lock {
     _file: Option<File>,
@@ -59,7 +59,7 @@ impl Lock {
     }
 }
 
-/// Some network file systems have no locks: work goes on, and the user has been told.
+/// A warning in place of a lock, for network file systems without locks.
 fn without(path: &Path, error: &std::io::Error) -> Lock {
     note!("warning: {}: no locks here ({error}): let no other process write this folder", path.display());
     Lock { _file: None }

@@ -1,4 +1,4 @@
-//! The program among others: what it prints, how it ends, what stops it, and what it has to itself.
+//! Output, exit codes, signals and locks.
 
 mod ending;
 mod lock;

@@ -1,5 +1,4 @@
-//! Everything that is printed. What cannot be written never stops work, and no text steers a
-//! terminal.
+//! Printing, which ignores failed writes and escapes terminal control characters.
 
 use std::fmt::{Arguments, Write as _};
 use std::io::Write;
@@ -29,12 +28,11 @@ pub fn err(text: Arguments<'_>) {
 fn line(to: &mut impl Write, text: Arguments<'_>) {
     let mut text = shown(&text.to_string());
     text.push('\n');
-    // A closed pipe or a full disk: there is nobody to tell, and results do not depend on it.
+    // Results do not depend on a closed pipe or a full disk.
     let _ = to.write_all(text.as_bytes()).and_then(|()| to.flush());
 }
 
-/// Text with everything that a terminal would obey, or that turns the direction of writing, as
-/// `\u{…}`; line breaks and tabs are left.
+/// Text with control and bidirectional characters, except line breaks and tabs, as `\u{…}`.
 pub fn shown(text: &str) -> String {
     let mut out = String::with_capacity(text.len());
     for c in text.chars() {

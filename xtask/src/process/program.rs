@@ -1,4 +1,4 @@
-//! A program from its first line to its exit code.
+//! Entry point of a program.
 
 use std::process::ExitCode;
 
@@ -16,11 +16,11 @@ pub const EXIT_CODES: &str = "Exit codes:
   4        another process has the folder
   128 + n  ended by signal n, with everything saved";
 
-/// Reads the command line, runs `command` on it, and says in one line what went wrong.
+/// Parses the command line, runs `command`, and prints errors as one line.
 pub fn program<A: Parser>(command: impl FnOnce(A) -> Result<()>) -> ExitCode {
     let arguments = match A::try_parse() {
         Ok(arguments) => arguments,
-        // Help is ours; an error quotes what was given.
+        // Errors quote the arguments and are escaped; help is not.
         Err(error) if !error.use_stderr() => {
             let _ = error.print();
             return ExitCode::SUCCESS;

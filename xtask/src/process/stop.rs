@@ -1,26 +1,25 @@
-//! Signals that ask the program to end: Ctrl-C, SIGTERM, and SIGHUP of a closed terminal.
+//! Termination signals: SIGINT, SIGTERM and SIGHUP.
 
 use std::sync::atomic::{AtomicI32, AtomicUsize, Ordering};
 
-/// The signal that came while something was guarded; 0 for none.
+/// Signal received under a guard; 0 for none.
 static SIGNAL: AtomicI32 = AtomicI32::new(0);
-/// Guards that live.
+/// Number of guards.
 static GUARDS: AtomicUsize = AtomicUsize::new(0);
 
-/// Work that is asked to end rather than ended: while a guard lives, the first signal is only
-/// remembered, and a second ends the program at once. Without a guard any signal does, and no file
-/// is left half written by that: see [`occnerf::replace_file`].
+/// Defers the first signal; a second one, or one without a guard, ends the program at once. Files
+/// stay whole, see [`occnerf::replace_file`].
 #[must_use]
 pub struct Guard(());
 
 impl Guard {
-    /// Guards what follows.
+    /// Starts deferring signals.
     pub fn begin() -> Self {
         GUARDS.fetch_add(1, Ordering::SeqCst);
         Self(())
     }
 
-    /// The signal that came, if one did.
+    /// The deferred signal.
     pub fn signal(&self) -> Option<i32> {
         Some(SIGNAL.load(Ordering::SeqCst)).filter(|&signal| signal != 0)
     }
@@ -32,8 +31,8 @@ impl Drop for Guard {
     }
 }
 
-/// Listens from now on. What the program was started to ignore (SIGHUP under `nohup`, SIGINT in the
-/// background of a script) stays ignored, as far as the system tells.
+/// Starts listening. Signals ignored at start (SIGHUP under `nohup`, SIGINT in the background of a
+/// script) stay ignored.
 #[cfg(unix)]
 pub fn watch() -> std::io::Result<()> {
     use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
@@ -53,14 +52,13 @@ pub fn watch() -> std::io::Result<()> {
     Ok(())
 }
 
-/// Elsewhere the system's own way holds.
+/// No handling on other systems.
 #[cfg(not(unix))]
 pub fn watch() -> std::io::Result<()> {
     Ok(())
 }
 
-/// The signals that this process ignores, the first in the lowest bit; `None` where the system does
-/// not tell.
+/// Mask of ignored signals, the first in the lowest bit; `None` where unknown.
 #[cfg(unix)]
 fn ignored() -> Option<u64> {
     let status = std::fs::read_to_string("/proc/self/status").ok()?;

@@ -1,4 +1,4 @@
-//! Quantities of training logs over time, as inline SVG.
+//! Training curves as inline SVG.
 
 use std::fmt::Write as _;
 use std::path::Path;
@@ -8,13 +8,13 @@ use anyhow::{Context, Result, bail};
 use crate::html::escape;
 use crate::scale::{Scale, number};
 
-/// Of a drawing, in its own units.
+/// Size of a plot in SVG units.
 const SIZE: (f64, f64) = (520.0, 260.0);
 /// Left, right, top and bottom of the plot.
 const MARGIN: (f64, f64, f64, f64) = (56.0, 12.0, 10.0, 40.0);
-/// More points than pixels show nothing.
+/// Most points of a curve.
 const MOST: usize = 600;
-/// Colours that the style knows.
+/// Colours of the style sheet.
 const COLORS: usize = 7;
 
 /// A log of training, or of a bench: one JSON object a line.
@@ -54,7 +54,7 @@ impl Log {
     }
 }
 
-/// One quantity of all logs against seconds, with a key if there are several; nothing without two
+/// Plot of one quantity of all logs against seconds, with a legend for several; empty below two
 /// points.
 pub fn curves(logs: &[(String, Log)], key: &str, label: &str, logarithmic: bool) -> String {
     let courses: Vec<(&str, Vec<(f64, f64)>)> = logs

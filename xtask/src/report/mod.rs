@@ -1,4 +1,4 @@
-//! Runs on one page that needs no other file.
+//! HTML report of runs in a single file.
 
 mod curves;
 mod page;
@@ -16,7 +16,7 @@ use self::viewer::{Views, viewers};
 use crate::run::{self, LOG, Metrics, PERSON, RunConfig};
 use crate::{capacity, table};
 
-/// Charts and pictures larger than this are left out, and named.
+/// Largest embedded file.
 const MAX_BYTES: u64 = 16 << 20;
 const NOVEL: &str = "renders/novel_views.png";
 const CAPTIONS: [(&str, &str); 2] = [
@@ -24,7 +24,7 @@ const CAPTIONS: [(&str, &str); 2] = [
     ("train_views.png", "Training views: what the video showed left, result right"),
 ];
 
-/// The page of a run that has just been scored.
+/// Writes the report of a run.
 pub fn write(directory: &Path, metrics: &Metrics) -> Result<()> {
     let run = Run { name: metrics.method.clone(), directory: directory.to_owned(), metrics: metrics.clone() };
     let mut page = Page::default();
@@ -119,7 +119,7 @@ pub fn add_runs(page: &mut Page, runs: &[Run], folder: &Path) -> Result<()> {
     Ok(())
 }
 
-/// Links the pages that `view` wrote of the runs' people, from a page in `folder`.
+/// Links the runs' viewer pages from a page in `folder`.
 fn add_people(page: &mut Page, runs: &[Run], folder: &Path) -> Result<()> {
     for run in runs {
         let path = std::path::absolute(run.directory.join(PERSON))?;
@@ -131,7 +131,7 @@ fn add_people(page: &mut Page, runs: &[Run], folder: &Path) -> Result<()> {
     Ok(())
 }
 
-/// Each size that was chosen, with its reason, and what pruning took.
+/// Adds the chosen sizes with their reasons, and pruning.
 fn add_capacity(page: &mut Page, capacity: &Capacity) {
     let header = ["size", "preset", "chosen", "why"].map(str::to_owned).to_vec();
     let row = |c: &Choice| vec![c.key.clone(), c.preset.to_string(), c.chosen.to_string(), c.why.clone()];
@@ -168,7 +168,7 @@ pub fn files(directory: &Path, extension: &str) -> Result<Vec<PathBuf>> {
     Ok(paths)
 }
 
-/// The file's bytes; where there are too many, the page says so.
+/// The file's bytes; `None` for a large file, which the page names.
 pub fn bytes(page: &mut Page, path: &Path) -> Result<Option<Vec<u8>>> {
     let size = std::fs::metadata(path).with_context(|| path.display().to_string())?.len();
     if size > MAX_BYTES {

@@ -1,4 +1,4 @@
-//! The page around everything: style, script, and what keeps text from files text.
+//! HTML page with style and script, and escaping.
 
 use std::fmt::Write as _;
 
@@ -18,7 +18,7 @@ pub struct Page {
     headings: Vec<String>,
 }
 
-/// A byte of a path as an address has it; a colon would make a scheme of what is before it.
+/// Percent-encodes a byte of a relative URL, colons included.
 fn address_byte(byte: u8) -> String {
     match byte {
         b'a'..=b'z' | b'A'..=b'Z' | b'0'..=b'9' | b'/' | b'.' | b'-' | b'_' => char::from(byte).to_string(),
@@ -26,13 +26,13 @@ fn address_byte(byte: u8) -> String {
     }
 }
 
-/// Bytes as an address that needs no network.
+/// Data URI.
 pub fn data_uri(kind: &str, bytes: &[u8]) -> String {
     format!("data:{kind};base64,{}", STANDARD.encode(bytes))
 }
 
 impl Page {
-    /// A section's heading, which the page's top links to.
+    /// A section's heading, linked from the top.
     pub fn heading(&mut self, text: &str) {
         let _ = writeln!(self.body, "<h2 id=\"s{}\">{}</h2>", self.headings.len(), escape(text));
         self.headings.push(text.to_owned());
@@ -68,13 +68,13 @@ impl Page {
         self.body.push_str("</tr></table></div>\n");
     }
 
-    /// A line that leads to another file, named from where this one lies.
+    /// A link to a relative path.
     pub fn link(&mut self, path: &str, text: &str) {
         let address: String = path.bytes().map(address_byte).collect();
         let _ = writeln!(self.body, "<p><a href=\"{address}\">{}</a></p>", escape(text));
     }
 
-    /// Text that keeps its lines, folded away.
+    /// Preformatted text in a collapsed section.
     pub fn folded(&mut self, title: &str, text: &str) {
         let (title, text) = (escape(title), escape(text));
         let _ = writeln!(self.body, "<details><summary>{title}</summary><pre>{text}</pre></details>");
@@ -89,7 +89,7 @@ impl Page {
         );
     }
 
-    /// Markup made here, not read from anywhere.
+    /// Trusted markup.
     pub fn raw(&mut self, markup: &str) {
         self.body.push_str(markup);
     }
@@ -101,8 +101,7 @@ impl Page {
             .map(|(i, text)| format!("<a href=\"#s{i}\">{}</a>", escape(text)))
             .collect();
         let links = if links.len() > 2 { format!("<nav>{}</nav>\n", links.join(" ")) } else { String::new() };
-        // Nothing but what stands here runs, and nothing is fetched: a second lock behind the
-        // escaping.
+        // Defence in depth behind the escaping: no other script, no network.
         let script = STANDARD.encode(Sha256::digest(SCRIPT));
         let policy = format!(
             "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'sha256-{script}'; \

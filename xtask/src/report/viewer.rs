@@ -1,4 +1,4 @@
-//! Two pictures of one view under a slider.
+//! Before/after slider of two pictures of a view.
 
 use std::io::Cursor;
 use std::path::Path;
@@ -11,19 +11,19 @@ use image::{ImageFormat, RgbImage};
 use crate::pictures;
 use crate::process::note;
 
-/// Views of a viewer at most.
+/// Most views of a viewer.
 const MOST: usize = 15;
-/// Pixels of a sheet that is taken apart; more than any that is written now.
+/// Most pixels of a contact sheet.
 const MAX_PIXELS: u64 = pictures::MAX_SHEET_PIXELS + pictures::MAX_SHEET_PIXELS / 8;
 
-/// Truth and results of some unseen views, as `eval` draws them side by side.
+/// Ground truth and renderings of evaluation views, from `eval`'s contact sheet.
 pub struct Views {
     /// Name of a view, truth, result.
     pairs: Vec<(String, RgbImage, RgbImage)>,
 }
 
 impl Views {
-    /// Takes a sheet of pairs apart; none if there is no such file.
+    /// Reads a sheet of pairs; `None` without a file.
     pub fn read(path: &Path) -> Result<Option<Self>> {
         if !path.exists() {
             return Ok(None);
@@ -44,7 +44,7 @@ impl Views {
         Ok(Some(Self { pairs: pairs.into_iter().step_by(stride).collect() }))
     }
 
-    /// Whether both show the same views.
+    /// Whether both have the same ground truth.
     fn alike(&self, other: &Self) -> bool {
         self.pairs.len() == other.pairs.len() && self.pairs.iter().zip(&other.pairs).all(|(a, b)| a.1 == b.1)
     }
@@ -56,7 +56,7 @@ fn encode(picture: &RgbImage) -> Result<String> {
     Ok(STANDARD.encode(bytes.into_inner()))
 }
 
-/// A viewer for each set of views: truth and every run that drew it can be put on either side.
+/// A viewer for each set of views, with the ground truth and every run selectable on either side.
 pub fn viewers(runs: &[(String, Views)]) -> Result<String> {
     let mut text = String::new();
     let mut groups: Vec<Vec<&(String, Views)>> = Vec::new();
@@ -77,7 +77,7 @@ pub fn viewers(runs: &[(String, Views)]) -> Result<String> {
             sides.push(side(name, views.pairs.iter().map(|p| &p.2).collect())?);
         }
         let views: Vec<&str> = first.iter().map(|p| p.0.as_str()).collect();
-        // Within a script only `<` could end it.
+        // `<` could end the script element.
         let data = serde_json::json!({ "views": views, "sides": sides }).to_string().replace('<', "\\u003c");
         text.push_str("<div class=viewer><div><select aria-label=\"view\"></select>");
         text.push_str("<select aria-label=\"left\"></select><select aria-label=\"right\"></select></div>");

@@ -1,4 +1,4 @@
-//! `view`: one HTML file of a trained person, to turn around and play.
+//! `view`: an interactive viewer of a trained person in one HTML file.
 
 use std::hash::{DefaultHasher, Hash, Hasher};
 use std::path::PathBuf;
@@ -76,13 +76,13 @@ pub fn page(person: &Avatar) -> Result<String> {
             ("style", STYLE),
             ("script", &script),
             ("avatar", &glb),
-            // Nothing in a string may end the element that it stands in.
+            // `<` could end the script element.
             ("extra", &extra.to_string().replace('<', "\\u003c")),
         ],
     )
 }
 
-/// The template with its places filled; what fills one is not looked at again.
+/// Substitutes `{key}` in a template, in one pass.
 fn fill(template: &str, parts: &[(&str, &str)]) -> Result<String> {
     let mut out = String::with_capacity(template.len() + parts.iter().map(|part| part.1.len()).sum::<usize>());
     let mut rest = template;

@@ -64,22 +64,14 @@ pub(super) fn load(dir: &Path, body: &BodyModel, options: &LoadOptions) -> Resul
             frames.push(EvalFrame { camera_name: camera_name.clone(), train_index, frame });
         }
     }
-    Ok(Capture {
-        name: file_name(dir),
-        train,
-        eval: frames,
-        mean_betas,
-        registered: false,
-        clothes: Vec::new(),
-        mended: false,
-    })
+    Ok(Capture { name: file_name(dir), train, eval: frames, mean_betas })
 }
 
 fn index(names: &[impl AsRef<str>], name: &str) -> Option<usize> {
     names.binary_search_by(|n| FrameName(n.as_ref()).cmp(&FrameName(name))).ok()
 }
 
-/// The frames of a directory that `choose` keeps of their sorted names; `None` where it keeps none.
+/// The frames of a directory that `choose` selects by their sorted names; `None` if none.
 fn plan(
     dir: &Path,
     body: &BodyModel,
@@ -107,8 +99,7 @@ fn plan(
         return Err(CaptureError::invalid(path, "camera of the image", expected, "none"));
     }
     let chosen = choose(lenses.keys().map(|name| name.0).collect())?;
-    // Collected as results first, so that the error reported is the first in order whatever
-    // finishes first.
+    // Collected as results first: the first error in order is reported.
     let frames: Vec<Result<Planned, CaptureError>> = chosen
         .par_iter()
         .map(|&name| {

@@ -10,12 +10,13 @@ use smpl::BodyModel;
 
 use super::fit::{SMPL, SMPLX, Tool};
 use crate::CaptureError;
+use crate::find::near_bodies;
 
 /// Joints of a hand, and numbers of its pose.
 const HAND: usize = 15;
 
-/// Finds and reads the body for a fit by `tool`: `given`, or the first that fits of the `.npz` and
-/// `.pkl` files in folders `body` beside the places named or above them.
+/// Reads the body of a fit by `tool`: `given`, or the first that fits of the `.npz` and `.pkl` files
+/// in folders `body` beside `near` or above.
 pub(super) fn find(tool: Tool, given: Option<&Path>, near: &[&Path]) -> Result<(PathBuf, BodyModel), CaptureError> {
     if let Some(path) = given {
         let model = BodyModel::load(path)?;
@@ -27,7 +28,8 @@ pub(super) fn find(tool: Tool, given: Option<&Path>, near: &[&Path]) -> Result<(
             }
         };
     }
-    for path in near.iter().flat_map(|place| candidates(place)) {
+    let whole = near.iter().filter_map(|place| place.canonicalize().ok());
+    for path in whole.flat_map(|place| near_bodies(&place, &["npz", "pkl"])) {
         if let Some(model) = BodyModel::load(&path).ok().filter(|model| fits(tool, model)) {
             return Ok((path, model));
         }
@@ -42,7 +44,7 @@ fn fits(tool: Tool, model: &BodyModel) -> bool {
     model.num_joints() == tool.joints() && model.num_betas() >= super::fit::BETAS
 }
 
-/// What to get where the body is missing or another.
+/// Download hint for a missing or unsuitable body.
 fn download(tool: Tool) -> &'static str {
     match tool.joints() {
         SMPL => "SMPL; download SMPL_NEUTRAL.pkl (SMPL_python_v.1.1.0) from smpl.is.tue.mpg.de and give it as --body",
@@ -51,20 +53,6 @@ fn download(tool: Tool) -> &'static str {
         }
         _ => "a body that this program does not know",
     }
-}
-
-/// Files that may be bodies, near a place.
-fn candidates(place: &Path) -> Vec<PathBuf> {
-    let Ok(whole) = place.canonicalize() else { return Vec::new() };
-    let mut found: Vec<PathBuf> = Vec::new();
-    for above in whole.ancestors() {
-        let files = std::fs::read_dir(above.join("body")).into_iter().flatten().filter_map(|e| Some(e.ok()?.path()));
-        let mut files: Vec<PathBuf> =
-            files.filter(|path| path.extension().is_some_and(|e| e == "npz" || e == "pkl")).collect();
-        files.sort();
-        found.extend(files);
-    }
-    found
 }
 
 /// The pose of both hands at rest, left first: 15 joints each. From `hands_meanl` and `hands_meanr`

@@ -1,5 +1,4 @@
-//! What all estimators say: people, and for each of their frames a pose, a shape, a place and a
-//! camera.
+//! Fits of all estimators in one form: people with pose, shape, translation and camera per frame.
 
 use glam::{DMat3, DQuat, DVec3};
 
@@ -35,7 +34,7 @@ pub enum Tool {
 }
 
 impl Tool {
-    /// Its name as its authors write it.
+    /// Its name by its authors.
     #[must_use]
     pub fn name(self) -> &'static str {
         match self {
@@ -50,13 +49,13 @@ impl Tool {
         }
     }
 
-    /// Joints of the bodies that it fits.
+    /// Joints of its body model.
     #[must_use]
     pub fn joints(self) -> usize {
         if self.hands_at_mean().is_some() { SMPLX } else { SMPL }
     }
 
-    /// For SMPL-X, whether the hands rest at the body model's mean rather than flat.
+    /// For SMPL-X, whether the hands have the mean pose rather than a flat one.
     pub(super) fn hands_at_mean(self) -> Option<bool> {
         match self {
             Self::Gvhmr => Some(true),
@@ -66,7 +65,7 @@ impl Tool {
     }
 }
 
-/// What a file says.
+/// The fit of a file.
 pub(super) struct Fit {
     pub tool: Tool,
     pub people: Vec<Person>,
@@ -77,7 +76,7 @@ pub(super) struct Person {
     pub id: String,
     /// By index, each once.
     pub frames: Vec<FitFrame>,
-    /// Frames in which what the file says is of another frame.
+    /// Frames with stale values of another frame.
     pub ghosts: usize,
 }
 
@@ -86,12 +85,12 @@ pub(super) struct Person {
 pub(super) struct FitFrame {
     /// Counted from 0.
     pub index: usize,
-    /// Axis-angle of each joint that the tool fits, the root's in the world.
+    /// Axis-angle of each fitted joint, the root's in the world.
     pub pose: Vec<DVec3>,
     pub betas: Vec<f64>,
     /// The world's axes in the camera.
     pub world_to_camera: DMat3,
-    /// What the root turns about, and where that leaves the body in the camera.
+    /// Centre of the root's rotation, and translation in the camera.
     pub about: About,
     pub offset: DVec3,
     /// Focal lengths and principal point in pixels of the video.
@@ -100,7 +99,7 @@ pub(super) struct FitFrame {
     pub mask: Option<OwnMask>,
 }
 
-/// Where the pelvis is in the camera, J being its place in the body at rest.
+/// Position of the pelvis in the camera, for its rest position J.
 #[derive(Clone, Copy)]
 pub(super) enum About {
     /// At J + offset.
@@ -109,7 +108,7 @@ pub(super) enum About {
     Origin(DMat3),
 }
 
-/// A mask that the estimator's file holds.
+/// A mask in the estimator's file.
 #[derive(Clone)]
 pub(super) enum OwnMask {
     Runs(Rle),
@@ -118,7 +117,7 @@ pub(super) enum OwnMask {
 }
 
 impl FitFrame {
-    /// In a camera that stands still: pose and place in its axes, the root turning about the pelvis.
+    /// For a static camera: pose and translation in its axes, rotation about the pelvis.
     pub fn still(
         index: usize,
         pose: Vec<DVec3>,
@@ -138,12 +137,10 @@ impl FitFrame {
         }
     }
 
-    /// The same picture by a camera of another focal length: everything is as many times as far
-    /// away.
+    /// Changes the focal length and scales the depth with it.
     pub fn refocused(&mut self, focal: f64, joint: DVec3) {
-        let before = self.pelvis(joint);
         let ratio = focal / self.focal[0];
-        self.offset.z += before.z * (ratio - 1.0);
+        self.offset.z += self.pelvis(joint).z * (ratio - 1.0);
         self.focal = self.focal.map(|f| f * ratio);
     }
 }

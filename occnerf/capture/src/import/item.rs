@@ -1,5 +1,4 @@
-//! Texts, and values of an estimator's file, with errors that name the file and the way to the
-//! value.
+//! Texts, and values of an estimator's file; errors name the file and the path of keys.
 
 use std::path::Path;
 
@@ -8,23 +7,20 @@ use array_files::pickle::Value;
 use glam::{DMat3, DVec3};
 
 use crate::CaptureError;
+use crate::files::read_text;
 
 /// Largest |R Rᵀ − I| of a rotation matrix: estimators write `f32`, EasyMocap a few decimals.
 const ORTHONORMAL: f64 = 1e-2;
 
-/// Longest text that is read: COLMAP's images.txt has some 100 kilobytes a picture.
+/// Largest text: COLMAP's images.txt has some 100 kilobytes a picture.
 const MAX_TEXT: u64 = 256 << 20;
 
-/// A text file.
+/// Reads a text file.
 pub(super) fn text(path: &Path) -> Result<String, CaptureError> {
-    let length = std::fs::metadata(path).map_err(CaptureError::io(path))?.len();
-    if length > MAX_TEXT {
-        return Err(CaptureError::invalid(path, "size", format!("at most {MAX_TEXT} bytes"), length.to_string()));
-    }
-    std::fs::read_to_string(path).map_err(CaptureError::io(path))
+    read_text(path, MAX_TEXT)
 }
 
-/// A value and how it was reached.
+/// A value and its path of keys.
 #[derive(Clone)]
 pub(super) struct Item<'a> {
     pub path: &'a Path,
@@ -115,7 +111,7 @@ impl<'a> Item<'a> {
             return Err(self.invalid(format!("shape [{}]", text.join(", ")), format!("shape {:?}", array.shape)));
         }
         let values = array.to_f64();
-        // Beyond f32 as well: that is what the body is posed in.
+        // Finite in f32, the type of poses.
         match values.iter().position(|value| !(*value as f32).is_finite()) {
             Some(at) => Err(self.invalid("finite numbers", format!("{} at flat index {at}", values[at]))),
             None => Ok(values),
@@ -178,7 +174,7 @@ impl<'a> Item<'a> {
         values.iter().enumerate().map(whole).collect()
     }
 
-    /// A list as long as another, whose length is known.
+    /// Checks that a list has `length` entries.
     pub fn as_long(&self, length: usize, found: usize) -> Result<(), CaptureError> {
         if length == found {
             return Ok(());
@@ -192,7 +188,7 @@ impl<'a> Item<'a> {
     }
 }
 
-/// The rotation of nine numbers, row by row, if they are one.
+/// The rotation of nine numbers, row by row; `None` unless they are one.
 pub(super) fn turn(values: &[f64]) -> Option<DMat3> {
     let row = |i: usize| DVec3::from_slice(&values[3 * i..]);
     let matrix = DMat3::from_cols(row(0), row(1), row(2)).transpose();

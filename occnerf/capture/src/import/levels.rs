@@ -1,4 +1,4 @@
-//! A mask file's values as they are in the file: palette indices, not colours.
+//! Raw values of a mask file: palette indices, not colours.
 
 use std::fs::File;
 use std::io::BufReader;
@@ -18,7 +18,7 @@ pub(super) struct Levels {
     pub height: u32,
     /// Row by row.
     pub values: Vec<u8>,
-    /// The file says that values are not shades: a palette, or whole numbers of a `.npy` file.
+    /// Whether values are ids: of a palette, or integers of a `.npy` file.
     pub ids: bool,
 }
 
@@ -48,7 +48,7 @@ impl Levels {
         Ok(Self { width, height, values, ids: false })
     }
 
-    /// From an array (H,W), axes of 1 beside; floats are coverage from 0 to 1.
+    /// From an array (H,W), ignoring axes of length 1; floats are coverage from 0 to 1.
     pub fn from_array(path: &Path, array: &NdArray) -> Result<Self, CaptureError> {
         let bare: Vec<usize> = array.shape.iter().copied().filter(|&n| n != 1).collect();
         let sides = match (array.shape.as_slice(), bare.as_slice()) {
@@ -75,7 +75,7 @@ impl Levels {
         Ok(Self { width, height, values: values?, ids })
     }
 
-    /// The same, if it is as large as the frames.
+    /// Checks the size against the frames'.
     pub fn sized(self, path: &Path, size: (u32, u32)) -> Result<Self, CaptureError> {
         if (self.width, self.height) == size {
             return Ok(self);
@@ -85,8 +85,7 @@ impl Levels {
     }
 }
 
-/// The values of a PNG with a palette, or of one with at most 8 bits of grey; `None` for every
-/// other picture.
+/// The values of a PNG with a palette or at most 8 bits of grey; `None` for others.
 fn indexed(path: &Path) -> Result<Option<Levels>, CaptureError> {
     let file = BufReader::new(File::open(path).map_err(CaptureError::io(path))?);
     let limits = Limits { bytes: (MAX_SIDE as usize).pow(2) };
@@ -96,7 +95,7 @@ fn indexed(path: &Path) -> Result<Option<Levels>, CaptureError> {
     if !matches!(kind, ColorType::Indexed | ColorType::Grayscale) || depth > 8 {
         return Ok(None);
     }
-    // Names the file and its size where that is absurd.
+    // Checks the size.
     let (width, height) = dimensions(path)?;
     let malformed = |what: String| CaptureError::invalid(path, "pixels", "a whole PNG", what);
     let length = reader.output_buffer_size().ok_or_else(|| malformed("no size".to_owned()))?;
@@ -113,7 +112,7 @@ fn indexed(path: &Path) -> Result<Option<Levels>, CaptureError> {
     });
     let mut values: Vec<u8> = values.collect();
     if kind == ColorType::Grayscale && depth == 1 {
-        // One bit of grey is black and white.
+        // One bit of grey is 0 or 255.
         values.iter_mut().for_each(|value| *value *= 255);
     }
     Ok(Some(Levels { width, height, values, ids: kind == ColorType::Indexed }))

@@ -1,4 +1,4 @@
-//! Masks of segmenters: which files there are, which frame each is of, and what its values mean.
+//! Masks of segmenters: files, their frames, and the meaning of their values.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -6,8 +6,8 @@ use std::path::{Path, PathBuf};
 use array_files::npz::read_npy;
 use array_files::{Data, NdArray};
 
+use super::ImportOptions;
 use super::levels::Levels;
-use super::options::ImportOptions;
 use super::video::Video;
 use crate::names::FrameName;
 use crate::pictures::file_name;
@@ -15,29 +15,29 @@ use crate::{CaptureError, pictures::Pictures};
 
 /// The masks of a video.
 pub(super) struct Masks {
-    /// What the files are, for people.
+    /// Kind of the files, for messages.
     pub kind: &'static str,
     frames: BTreeMap<usize, Source>,
     meaning: Meaning,
-    /// Folders of the objects that stand in front, one a list.
+    /// Files of each occluder.
     occluders: Vec<BTreeMap<usize, PathBuf>>,
 }
 
-/// Where the values of a frame are.
+/// Source of a frame's values.
 enum Source {
     File(PathBuf),
     /// In a stack that has been read: row by row.
     Stack(NdArray),
 }
 
-/// What a value means.
+/// Meaning of a value.
 #[derive(Clone, PartialEq)]
 enum Meaning {
     /// Coverage of the person, 255 being all.
     Coverage,
     /// Coverage of all but the person.
     Background,
-    /// The object that is seen, and those that stand in front of the person.
+    /// Ids of the person and of the occluders.
     Objects(u8, Vec<u8>),
     /// Any value but 0 is the person: one folder an object.
     Any,
@@ -69,11 +69,11 @@ impl Masks {
             });
         }
         let files = matched(dir, video)?;
-        let mut seen = Seen::default();
+        let mut statistics = ValueStatistics::default();
         for path in files.values() {
-            seen.add(&Levels::load(path)?);
+            statistics.add(&Levels::load(path)?);
         }
-        let (meaning, kind) = seen.meaning(dir, options)?;
+        let (meaning, kind) = statistics.meaning(dir, options)?;
         let frames = files.into_iter().map(|(i, path)| (i, Source::File(path))).collect();
         Ok(Self { kind, frames, meaning, occluders: Vec::new() })
     }
@@ -88,7 +88,7 @@ impl Masks {
             let expected = format!("at most {} masks, one a frame", video.names.len());
             return Err(CaptureError::invalid(path, "shape", expected, n.to_string()));
         }
-        let (each, mut seen, mut frames) = (height * width, Seen::default(), BTreeMap::new());
+        let (each, mut statistics, mut frames) = (height * width, ValueStatistics::default(), BTreeMap::new());
         for index in 0..n {
             let span = index * each..(index + 1) * each;
             let data = match &array.data {
@@ -98,19 +98,19 @@ impl Masks {
                 Data::F64(v) => Data::F64(v[span].to_vec()),
             };
             let part = NdArray { shape: vec![height, width], data };
-            seen.add(&Levels::from_array(path, &part)?);
+            statistics.add(&Levels::from_array(path, &part)?);
             frames.insert(index, Source::Stack(part));
         }
-        let (meaning, kind) = seen.meaning(path, options)?;
+        let (meaning, kind) = statistics.meaning(path, options)?;
         Ok(Self { kind, frames, meaning, occluders: Vec::new() })
     }
 
-    /// The frames that have a mask.
+    /// Whether a frame has a mask.
     pub fn has(&self, index: usize) -> bool {
         self.frames.contains_key(&index)
     }
 
-    /// Coverage of the person in a frame, and what stands in front, row by row, 255 being all.
+    /// Coverage of the person and of occluders in a frame, row by row, 0 to 255.
     pub fn levels(&self, path: &Path, index: usize, video: &Video) -> Result<(Vec<u8>, Option<Vec<u8>>), CaptureError> {
         let levels = match self.frames.get(&index) {
             Some(Source::File(file)) => Levels::load(file)?.sized(file, video.size)?,
@@ -142,27 +142,27 @@ impl Masks {
     }
 }
 
-/// The values that a video's masks have.
-struct Seen {
+/// Statistics of the values of a video's masks.
+struct ValueStatistics {
     values: [bool; 256],
-    /// Every file says that its values are names of colours, not shades.
+    /// Whether every file has palette indices.
     palette: bool,
     files: usize,
-    /// Pixels at the pictures' borders, and those of them that are more than half covered.
+    /// Pixels at the image borders, and of them those above half coverage.
     border: usize,
     covered: usize,
 }
 
-/// Share of the borders beyond which what is covered is the background.
+/// Covered share of the borders above which a mask is the background's.
 const BORDER: f64 = 0.5;
 
-impl Default for Seen {
+impl Default for ValueStatistics {
     fn default() -> Self {
         Self { values: [false; 256], palette: true, files: 0, border: 0, covered: 0 }
     }
 }
 
-impl Seen {
+impl ValueStatistics {
     fn add(&mut self, levels: &Levels) {
         levels.values.iter().for_each(|&value| self.values[usize::from(value)] = true);
         self.palette &= levels.ids;
@@ -177,8 +177,8 @@ impl Seen {
         }
     }
 
-    /// Ids of objects where the values are palette indices, or none of them is a middle shade;
-    /// coverage where they go up to 255, of the background if it has most of the border.
+    /// Coverage for values of 128 and above outside palettes, or 255 alone, of the background if it
+    /// has most of the border; object ids otherwise.
     fn meaning(&self, dir: &Path, options: &ImportOptions) -> Result<(Meaning, &'static str), CaptureError> {
         let found: Vec<usize> = (1..256).filter(|&value| self.values[value]).collect();
         let shades = found.iter().any(|&value| value >= 128);
@@ -208,7 +208,7 @@ impl Seen {
     }
 }
 
-/// Folders named by numbers, where there is no mask beside them.
+/// Folders named by numbers, unless there is a mask beside them.
 fn object_folders(dir: &Path) -> Result<Option<BTreeMap<u8, PathBuf>>, CaptureError> {
     let mut folders = BTreeMap::new();
     for entry in std::fs::read_dir(dir).map_err(CaptureError::io(dir))? {
@@ -228,8 +228,8 @@ fn is_mask(path: &Path) -> bool {
     matches!(extension.as_deref(), Some("png" | "jpg" | "jpeg" | "npy"))
 }
 
-/// Mask files by the index of their frame: by name where all have a frame's name, in order where
-/// there are as many as frames, else by their number, counted from 0.
+/// Mask files by the index of their frame: by name if all have a frame's name, in order if there are
+/// as many as frames, else by number from 0.
 fn matched(dir: &Path, video: &Video) -> Result<BTreeMap<usize, PathBuf>, CaptureError> {
     let mut files = arrays(dir)?;
     if files.is_empty() {

@@ -1,17 +1,15 @@
-//! Captures from what body estimators and segmenters write.
+//! Import of the results of body estimators and segmenters.
 //!
 //! [`import`] reads the frames of a video, a fit and masks, and writes a capture in HumanNeRF's
-//! wild layout for [`super::load_capture`]. Formats are told by what is in the files:
+//! wild layout for [`super::load_capture`]. Formats are detected by content:
 //!
-//! - fits: WHAM, 4D-Humans / PHALP, GVHMR, PromptHMR, ROMP, EasyMocap; and of data sets that have
-//!   them, PeopleSnapshot and NeuMan ([`Tool`]);
-//! - masks: ids of objects (SAM 2's palette PNGs by value, its folders an object, Grounded-SAM-2's
-//!   `.npy`), coverage (MatAnyone, plain 0/255 pictures), or the fit's own (4D-Humans / PHALP,
-//!   PromptHMR).
+//! - fits: WHAM, 4D-Humans / PHALP, GVHMR, PromptHMR, ROMP, EasyMocap, and the data sets
+//!   PeopleSnapshot and NeuMan ([`Tool`]);
+//! - masks: object ids (SAM 2's palette PNGs or folders, Grounded-SAM-2's `.npy`), coverage
+//!   (MatAnyone, plain 0/255 pictures), or the fit's own (4D-Humans / PHALP, PromptHMR).
 //!
-//! All estimators place the body in the camera, for a focal length of their own; the camera stands
-//! still in a world with its axes (where a file has cameras, in theirs), and the body's place is in
-//! the extrinsics.
+//! Estimators place the body in camera space for an assumed focal length. The capture's world has
+//! the camera's axes, or those of the file's cameras; the body's translation is in the extrinsics.
 
 mod body;
 #[cfg(test)]
@@ -23,7 +21,6 @@ mod item;
 mod levels;
 mod masks;
 mod neuman;
-mod options;
 mod peoplesnapshot;
 mod phalp;
 mod prompthmr;
@@ -38,7 +35,6 @@ mod write;
 mod yaml;
 
 pub use self::fit::Tool;
-pub use self::options::ImportOptions;
 
 use std::path::{Path, PathBuf};
 
@@ -51,44 +47,66 @@ use self::video::Video;
 use self::write::Placed;
 use super::CaptureError;
 
-/// What was imported, and what was not.
+/// The files of an import, and its options.
+#[derive(Clone, Debug, Default)]
+pub struct ImportOptions {
+    /// Folder of the video's frames, `.png` or `.jpg`, in the order of their names.
+    pub frames: PathBuf,
+    /// The estimator's file, or EasyMocap's folder.
+    pub fit: PathBuf,
+    /// The segmenter's folder, or one `.npy` file; `None`: the masks in the fit.
+    pub masks: Option<PathBuf>,
+    /// The estimator's id of the person; `None`: the one in most frames.
+    pub person: Option<String>,
+    /// The person's value in masks of object ids, 1 if `None`.
+    pub object: Option<u8>,
+    /// Values of the occluders.
+    pub occluder_objects: Vec<u8>,
+    /// Focal length in pixels replacing the estimator's; the body is moved in depth to keep its
+    /// size in the image.
+    pub focal: Option<f64>,
+    /// The body model; `None`: one that fits, from a folder `body` near the fit or the frames.
+    pub body: Option<PathBuf>,
+    /// Whether pictures are copied rather than linked.
+    pub copy: bool,
+}
+
+/// Statistics of an import.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Imported {
-    /// Who wrote the fit.
+    /// The estimator of the fit.
     pub tool: Tool,
     /// The person's id.
     pub person: String,
     /// Frames of the capture.
     pub frames: usize,
-    /// The other people: ids, and the frames that each is in.
+    /// Ids and numbers of frames of the other people.
     pub others: Vec<(String, usize)>,
     /// Frames of the video.
     pub video_frames: usize,
     /// Frames before the person's first, after the last, and between without a fit.
     pub unfitted: [usize; 3],
-    /// Frames in which the fit is left over from an earlier one.
+    /// Frames with a stale fit of an earlier frame.
     pub ghosts: usize,
     /// Frames with a fit but without a mask.
     pub unmasked: usize,
-    /// Largest standard deviation of a shape coefficient over the frames; the capture has their
-    /// robust mean.
+    /// Largest standard deviation of a shape coefficient over the frames; the capture has the robust
+    /// mean.
     pub betas_spread: f64,
     /// Focal length in pixels of the first frame.
     pub focal: f64,
-    /// What the masks are.
+    /// Kind of the masks.
     pub masks: &'static str,
     /// The body model's file.
     pub body: PathBuf,
 }
 
-/// Writes the capture that `options` describe into the folder `out`, which is made if it is not
-/// there.
+/// Writes the capture of `options` into the folder `out`, created if absent.
 ///
 /// # Errors
-/// Files that are missing, malformed or damaged, of formats that are not known, or that do not
-/// belong together: frames beyond the video, pictures or masks of unequal sizes, a body model of
-/// other joints than the fit's. The error names file and key, what was expected and what was found.
-/// What has been written by then stays.
+/// Files that are missing, malformed, of unknown format, or inconsistent: frames beyond the video,
+/// pictures or masks of unequal sizes, a body model with other joints than the fit's. The error names
+/// file, key, expected and actual value. Files already written are left.
 pub fn import(options: &ImportOptions, out: &Path) -> Result<Imported, CaptureError> {
     let video = Video::list(&options.frames)?;
     if let Some(focal) = options.focal.filter(|focal| !(*focal >= 1.0 && *focal <= 1e6)) {
@@ -140,8 +158,8 @@ pub fn import(options: &ImportOptions, out: &Path) -> Result<Imported, CaptureEr
     })
 }
 
-/// The person asked for, or who is there in most frames (of equals the first); and ids and frames
-/// of the others.
+/// The person `asked` for, or the one in most frames (the first of equals); and ids and numbers of
+/// frames of the others.
 fn choose(
     path: &Path,
     mut people: Vec<Person>,
@@ -196,8 +214,8 @@ fn robust_mean<'a>(frames: impl Iterator<Item = &'a [f64]> + Clone) -> (Vec<f64>
     ((0..BETAS).map(mean).collect(), spread)
 }
 
-/// Puts a fitted frame into the capture's form: every joint of the body model posed, and the pelvis
-/// where the frame's own shape has it.
+/// Converts a fitted frame to the capture's form: all joints of the body model, and a translation that
+/// keeps the pelvis of the frame's own shape.
 fn placed(mut frame: FitFrame, betas: &[f64], model: &BodyModel, hands: &[DVec3], focal: Option<f64>) -> Placed {
     let pelvis = |betas: &[f64]| {
         let betas: Vec<f32> = betas.iter().take(model.num_betas()).map(|&beta| beta as f32).collect();

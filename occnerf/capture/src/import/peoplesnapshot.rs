@@ -51,7 +51,7 @@ pub(super) fn read(path: &Path, npz: &mut Npz, video: &Video) -> Result<Fit, Cap
     };
     let betas = fit.get("betas")?.numbers(&[Some(1), Some(BETAS)])?;
     place.as_long(poses.len(), places.len())?;
-    // Poses of a split alone do not say which frames they are of.
+    // The frames of a partial split are unknown.
     if places.len() != video.names.len() {
         let expected = format!("{} rows, one a frame of the video", video.names.len());
         return Err(place.invalid(expected, places.len().to_string()));

@@ -30,8 +30,7 @@ pub(super) fn read(frames: &[(String, Item<'_>)], video: &Video) -> Result<Fit, 
             let id = id.whole()?;
             let new = || Person { id: id.to_string(), frames: Vec::new(), ghosts: 0 };
             let person = people.entry(id).or_insert_with(new);
-            // What is left of a track in frames where nothing was found is of an earlier frame, its
-            // mask too.
+            // A track without a detection repeats an earlier frame, mask included.
             if item.entry("tracked_time", track)?.whole()? > 0 {
                 person.ghosts += 1;
             } else {

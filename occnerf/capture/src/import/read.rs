@@ -1,4 +1,4 @@
-//! Reading a fit, whichever estimator wrote it.
+//! Detection of a fit's format.
 
 use std::fs::File;
 use std::io::{BufReader, Read};
@@ -15,11 +15,11 @@ use super::{easymocap, gvhmr, neuman, peoplesnapshot, phalp, prompthmr, romp, wh
 use crate::CaptureError;
 use crate::checks::{MAX_ANGLE, MAX_BETA};
 
-/// What is expected of a file.
+/// Expected formats.
 const TOOLS: &str = "a result of WHAM, 4D-Humans / PHALP, GVHMR, PromptHMR or ROMP, EasyMocap's folder, \
     poses.npz of PeopleSnapshot, or smpl_output_*.pkl of NeuMan";
 
-/// Reads a fit, which is told by what the file holds, not by its name.
+/// Reads a fit; the format is detected by content.
 pub(super) fn read(path: &Path, video: &Video) -> Result<Fit, CaptureError> {
     let fit = if path.is_dir() { easymocap::read(path, video)? } else { read_file(path, video)? };
     for person in &fit.people {
@@ -34,7 +34,7 @@ fn read_file(path: &Path, video: &Video) -> Result<Fit, CaptureError> {
     (&mut file).take(64).read_to_end(&mut start).map_err(CaptureError::io(path))?;
     let name = path.display().to_string();
     if is_torch(&start) {
-        // A zip archive of numpy's arrays starts alike.
+        // Archives of numpy have the same magic.
         if start.starts_with(b"PK") {
             let mut npz = Npz::open(path).map_err(|error| match error {
                 array_files::Error::Npy { message, .. } => {
@@ -52,7 +52,7 @@ fn read_file(path: &Path, video: &Video) -> Result<Fit, CaptureError> {
         let mut file = TorchFile::open(&name, BufReader::new(file))?;
         return gvhmr::read(path, &mut file, video);
     }
-    // Pickles of protocol 2 and later, of 0 and 1, and what they are compressed by.
+    // First bytes of pickles and of compressed files.
     let begins = |with: &u8| start.first() == Some(with);
     if !start.is_empty() && !b"\x80(c}]xB\x1f\xfd\x93".iter().any(begins) {
         let found = format!("a file that begins with {}", start[..start.len().min(4)].escape_ascii());
@@ -83,7 +83,7 @@ pub(super) fn parse(path: &Path, value: &Value, video: &Video) -> Result<Fit, Ca
     }
 }
 
-/// Indices within the video, each once; a body and a camera that can be.
+/// Checks that indices are unique and within the video, and values plausible.
 pub(super) fn check(path: &Path, person: &Person, video: &Video) -> Result<(), CaptureError> {
     let mut seen = vec![false; video.names.len()];
     for frame in &person.frames {

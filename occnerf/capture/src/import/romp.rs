@@ -22,7 +22,7 @@ pub(super) fn read(path: &Path, results: &Value, video: &Video) -> Result<Fit, C
     entries.sort_by(|a, b| FrameName(&a.0).cmp(&FrameName(&b.0)));
     let stem = |name: &str| Path::new(name).file_stem().map_or(String::new(), |s| s.to_string_lossy().into_owned());
     let named = |name: &str| video.names.iter().position(|frame| *frame == stem(name));
-    // Pictures that ROMP took from the video itself have other names than the frames.
+    // Frames extracted by ROMP itself have other names.
     let by_order = entries.len() == video.names.len() && entries.iter().all(|(name, _)| named(name).is_none());
     let mut people: BTreeMap<i64, Person> = BTreeMap::new();
     for (place, (name, item)) in entries.iter().enumerate() {

@@ -43,7 +43,7 @@ impl Video {
         [self.size.0.into(), self.size.1.into()]
     }
 
-    /// The middle of the picture, where most estimators put the principal point.
+    /// The image centre, most estimators' principal point.
     pub fn middle(&self) -> [f64; 2] {
         self.sides().map(|side| side / 2.0)
     }

@@ -21,7 +21,7 @@ pub(super) fn read(people: &[(String, Item<'_>)], video: &Video) -> Result<Fit, 
         let frames = frames.map(|((i, pose), (place, betas))| FitFrame::still(i, vectors(&pose), betas, &place, lens));
         Ok(Person { id: id.clone(), frames: frames.collect(), ghosts: 0 })
     };
-    // A track that WHAM began and dropped has nothing in it.
+    // Dropped tracks are empty.
     let begun = people.iter().filter(|(_, item)| item.value.get("pose").is_some());
     Ok(Fit { tool: Tool::Wham, people: begun.map(person).collect::<Result<_, CaptureError>>()? })
 }

@@ -1,4 +1,4 @@
-//! The capture on disk.
+//! Writing of an imported capture.
 
 use std::path::{Path, PathBuf};
 
@@ -8,13 +8,13 @@ use rayon::prelude::*;
 use serde_json::{Map, Value, json};
 use smpl::BodyModel;
 
+use super::ImportOptions;
 use super::fit::{FitFrame, OwnMask};
 use super::masks::Masks;
-use super::options::ImportOptions;
 use super::video::Video;
 use crate::CaptureError;
 
-/// A person in one frame, as the capture has it.
+/// A frame in the capture's form.
 pub(super) struct Placed {
     pub index: usize,
     /// Axis-angle of every joint of the body model.
@@ -24,7 +24,7 @@ pub(super) struct Placed {
     pub translation: DVec3,
 }
 
-/// What a capture is written from.
+/// Contents of a capture.
 pub(super) struct Parts<'a> {
     pub options: &'a ImportOptions,
     pub video: &'a Video,
@@ -45,8 +45,7 @@ pub(super) fn capture(parts: &Parts<'_>, out: &Path) -> Result<(), CaptureError>
         true => None,
         false => Some(folder("occluders")?),
     };
-    // Collected as results first, so that the error reported is the first in order whatever
-    // finishes first.
+    // Collected as results first: the first error in order is reported.
     let frames: Vec<Result<(), CaptureError>> =
         parts.placed.par_iter().map(|placed| frame(parts, placed, &images, &masks, occluders.as_deref())).collect();
     frames.into_iter().collect::<Result<(), CaptureError>>()?;
@@ -57,7 +56,7 @@ pub(super) fn capture(parts: &Parts<'_>, out: &Path) -> Result<(), CaptureError>
     std::fs::write(&path, text).map_err(CaptureError::io(&path))
 }
 
-/// Writes the body model where [`crate::own_body`] looks for it.
+/// Writes the body model for [`crate::own_body`].
 pub(super) fn body(model: &BodyModel, out: &Path) -> Result<(), CaptureError> {
     Ok(model.save(&out.join("body.safetensors"))?)
 }
@@ -89,7 +88,7 @@ fn frame(
     }
 }
 
-/// The fit's own mask at the frames' size: one worked out at another scale takes the nearest pixel.
+/// The fit's own mask at the frames' size, resampled by nearest neighbour if its aspect ratio fits.
 pub(super) fn own_levels(mask: &OwnMask, size: (u32, u32), fit: &Path, name: &str) -> Result<Vec<u8>, CaptureError> {
     let (height, width, pixels) = match mask {
         OwnMask::Runs(rle) => (rle.height, rle.width, rle.pixels()),
@@ -121,10 +120,10 @@ fn save(levels: Vec<u8>, size: (u32, u32), path: &Path) -> Result<(), CaptureErr
     })
 }
 
-/// Makes a link to a picture, or a copy where links cannot be made or are not wanted.
+/// Links a picture, or copies it if `copy` or where links fail.
 fn linked(from: &Path, to: &Path, copy: bool) -> Result<(), CaptureError> {
     let whole: PathBuf = from.canonicalize().map_err(CaptureError::io(from))?;
-    // A copy through a link that stands there would empty what it leads to.
+    // A copy through an existing link would truncate its target.
     if to.symlink_metadata().is_ok() {
         let source = std::io::Error::from(std::io::ErrorKind::AlreadyExists);
         return Err(CaptureError::Io { path: to.to_owned(), source });

@@ -3,8 +3,7 @@
 
 use std::collections::BTreeMap;
 
-/// Numbers by name: a matrix row by row, a number as one. Everything else is passed over; numbers
-/// that cannot be read are NaN.
+/// Numbers and matrices, row by row, by name. Everything else is ignored; malformed numbers are NaN.
 pub(super) fn parse(text: &str) -> BTreeMap<String, Vec<f64>> {
     let number = |text: &str| text.trim().parse().unwrap_or(f64::NAN);
     let mut found = BTreeMap::new();

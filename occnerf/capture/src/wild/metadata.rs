@@ -1,7 +1,6 @@
 //! `metadata.json` as records.
 
 use std::fmt;
-use std::io::Read;
 use std::marker::PhantomData;
 use std::path::Path;
 
@@ -10,22 +9,18 @@ use array_files::{Data, NdArray};
 use serde::de::{Deserialize, Deserializer, Error, IgnoredAny, MapAccess, SeqAccess, Visitor};
 
 use crate::CaptureError;
+use crate::files::read_text;
 use crate::records::Records;
 
-/// Longest file that is read: tens of thousands of frames.
+/// Largest file: tens of thousands of frames.
 const MAX_BYTES: u64 = 64 << 20;
-/// What a frame has; anything else is passed over.
+/// Keys of a frame; others are ignored.
 const KEYS: [&str; 5] = ["poses", "betas", "cam_intrinsics", "cam_extrinsics", "distortions"];
 
-/// Reads the file; memory stays within a few times its size, and the parser bounds the nesting.
+/// Reads the file; memory is bounded by a few times its size, nesting by the parser.
 pub(super) fn read(path: &Path) -> Result<Records, CaptureError> {
-    let file = std::fs::File::open(path).map_err(CaptureError::io(path))?;
-    let mut text = Vec::new();
-    file.take(MAX_BYTES + 1).read_to_end(&mut text).map_err(CaptureError::io(path))?;
-    if text.len() as u64 > MAX_BYTES {
-        return Err(CaptureError::invalid(path, "size", format!("at most {MAX_BYTES} bytes"), "more"));
-    }
-    let Keyed(frames) = serde_json::from_slice::<Keyed<Keyed<Numbers>>>(&text).map_err(|error| {
+    let text = read_text(path, MAX_BYTES)?;
+    let Keyed(frames) = serde_json::from_str::<Keyed<Keyed<Numbers>>>(&text).map_err(|error| {
         CaptureError::invalid(path, "the file", "JSON of frames and their arrays", error.to_string())
     })?;
     let key = |key: String| Value::Str(key);
@@ -35,12 +30,12 @@ pub(super) fn read(path: &Path) -> Result<Records, CaptureError> {
     Records::new(path, Value::Dict(frames.into_iter().map(|(k, items)| (key(k), frame(items))).collect()))
 }
 
-/// A JSON object whose keys lead the errors of their values.
+/// A JSON object whose keys prefix the errors of their values.
 struct Keyed<T>(Vec<(String, T)>);
 
-/// What may be in an object.
+/// A value of an object.
 trait Item: for<'de> Deserialize<'de> {
-    /// Whether a value under `key` is read at all.
+    /// Whether a value under `key` is read.
     fn is_read(key: &str) -> bool;
 }
 

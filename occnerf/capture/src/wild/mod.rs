@@ -75,15 +75,7 @@ pub(super) fn load(dir: &Path, body: &BodyModel, options: &LoadOptions) -> Resul
         }
     }
     let mean_betas = checks::mean_betas(train.iter().map(|f| f.betas.as_slice()));
-    Ok(Capture {
-        name: file_name(dir),
-        train,
-        eval: kept,
-        mean_betas,
-        registered: false,
-        clothes: Vec::new(),
-        mended: false,
-    })
+    Ok(Capture { name: file_name(dir), train, eval: kept, mean_betas })
 }
 
 fn optional(dir: &Path) -> Result<Option<Pictures>, CaptureError> {

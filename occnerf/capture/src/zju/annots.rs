@@ -1,4 +1,4 @@
-//! `annots.npy`: cameras, and which picture shows which instant.
+//! `annots.npy`: cameras, and the pictures of each instant.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Component, Path, PathBuf};
@@ -62,7 +62,7 @@ impl Annots {
         })
     }
 
-    /// Number of instants, seen by whatever camera.
+    /// Number of instants over all cameras.
     pub fn num_instants(&self) -> usize {
         self.pictures.len()
     }
@@ -130,7 +130,7 @@ fn lists(whole: &Record<'_>) -> Result<Vec<Vec<PathBuf>>, CaptureError> {
         let path = |path: &Value| {
             let text = path.as_str().ok_or_else(|| whole.invalid(&key, "a picture's path", path.type_name()))?;
             let path = PathBuf::from(text);
-            // A capture names nothing outside its own directory.
+            // Paths must stay within the capture's directory.
             let inside = path.components().all(|part| matches!(part, Component::Normal(_)));
             if inside && path.file_name().is_some() {
                 return Ok(path);
@@ -146,7 +146,7 @@ fn folder(picture: &Path) -> String {
     picture.parent().map(|p| p.to_string_lossy().into_owned()).unwrap_or_default()
 }
 
-/// The folder of each of `count` cameras, told by a frame that lists pictures of all.
+/// The folder of each of `count` cameras, by a frame with pictures of all.
 fn folders(path: &Path, lists: &[Vec<PathBuf>], count: usize) -> Result<Vec<String>, CaptureError> {
     let longest = lists.iter().map(Vec::len).max().unwrap_or(0);
     if longest != count {

@@ -26,14 +26,15 @@ use smpl::{BodyModel, Placement};
 
 use self::annots::Annots;
 use super::decode::{Planned, View, budget};
+use super::files::read_text;
 use super::image::dimensions;
 use super::pictures::{file_name, is_directory};
 use super::pixels::Area;
 use super::records::{Record, Records, triples};
 use super::{Capture, CaptureError, EvalFrame, LoadOptions, checks};
 
-/// How far a vertex may be from where the file has it, as a fraction of the body's largest extent,
-/// 1 cm at 1.7 m.
+/// Tolerance of a vertex against the file's, as a fraction of the body's largest extent, 1 cm at
+/// 1.7 m.
 const VERTEX_TOLERANCE: f32 = 0.01 / 1.7;
 /// Longest `occlusion.json` that is read.
 const MAX_OCCLUSION_BYTES: u64 = 1 << 20;
@@ -103,7 +104,7 @@ pub(super) fn load(dir: &Path, body: &BodyModel, options: &LoadOptions) -> Resul
         }
     }
     let mean_betas = checks::mean_betas(train.iter().map(|f| f.betas.as_slice()));
-    Ok(Capture { name: file_name(dir), train, eval, mean_betas, registered: false, clothes: Vec::new(), mended: false })
+    Ok(Capture { name: file_name(dir), train, eval, mean_betas })
 }
 
 /// The masks that exist of a picture.
@@ -127,11 +128,10 @@ struct Fitted {
 /// The fitted bodies of the given instants.
 fn bodies(dir: &Path, annots: &Annots, instants: &[usize], body: &BodyModel) -> Result<Vec<Fitted>, CaptureError> {
     let file = |kind: &str, number: usize| dir.join(kind).join(format!("{number}.npy"));
-    // Some subjects count from 1; a folder that merely lacks 0.npy is not one of them.
+    // Some subjects count from 1: 0.npy is absent and the last number present.
     let last = annots.num_instants();
     let offset = usize::from(!file("new_params", 0).is_file() && file("new_params", last).is_file());
-    // Collected as results first, so that the error reported is the first in order whatever
-    // finishes first.
+    // Collected as results first: the first error in order is reported.
     let fitted: Vec<Result<Fitted, CaptureError>> = instants
         .par_iter()
         .map(|&instant| {
@@ -209,18 +209,13 @@ struct Rectangle {
 }
 
 impl Recorded {
-    /// `None` where there is no file, or it is about another camera.
+    /// `None` without a file, or for one of another camera.
     fn read(dir: &Path, annots: &Annots, camera: usize, train: &[Planned]) -> Result<Option<Self>, CaptureError> {
         let path = dir.join("occlusion.json");
         let (true, Some(first)) = (path.is_file(), train.first()) else { return Ok(None) };
-        let length = std::fs::metadata(&path).map_err(CaptureError::io(&path))?.len();
-        if length > MAX_OCCLUSION_BYTES {
-            let expected = format!("at most {MAX_OCCLUSION_BYTES} bytes");
-            return Err(CaptureError::invalid(&path, "size", expected, length.to_string()));
-        }
-        let text = std::fs::read(&path).map_err(CaptureError::io(&path))?;
+        let text = read_text(&path, MAX_OCCLUSION_BYTES)?;
         let OcclusionFile { camera: name, image_size, rect, frames, rects } =
-            serde_json::from_slice(&text).map_err(|e| {
+            serde_json::from_str(&text).map_err(|e| {
                 let expected = "camera, image_size (width, height), rect with x0 y0 x1 y1, and frames";
                 CaptureError::invalid(&path, "the file", expected, e.to_string())
             })?;

@@ -12,93 +12,84 @@ const UNSIGNED_BYTE: u32 = 5121;
 const UNSIGNED_SHORT: u32 = 5123;
 const UNSIGNED_INT: u32 = 5125;
 const FLOAT: u32 = 5126;
-/// What a buffer view is for.
+/// Targets of buffer views.
 const ARRAY_BUFFER: u32 = 34962;
 const ELEMENT_ARRAY_BUFFER: u32 = 34963;
-/// Texture sampler: linear without mipmaps, whose coarse levels would mix the atlas's charts;
-/// clamped at the edge.
+/// Texture sampler: linear without mipmaps, which would mix charts; clamped at the edge.
 const LINEAR: u32 = 9729;
 const CLAMP_TO_EDGE: u32 = 33071;
 
 impl Avatar {
-    /// glTF 2.0 binary: see [`to_glb`].
+    /// glTF 2.0 binary (`.glb`).
+    ///
+    /// One skinned mesh with a primitive a shell (`POSITION`, `NORMAL`, `TEXCOORD_0`, `JOINTS_0`,
+    /// `WEIGHTS_0` in 16 bits), `KHR_materials_unlit`, the atlas as PNG, a node a joint with the rest
+    /// pose as bind pose, and an animation a clip. The innermost shell is opaque, those around it are
+    /// blended over it in order. The atlas is under even light; that of the video is the scene's extra
+    /// `light`, a vector s: a surface with unit normal n is max(1 + s · n + ½ |s| ((ŝ · n)² − ⅓), 0.2)
+    /// times as bright, see [`crate::capture::Light`]. Pose blend shapes and confidence are left out.
     ///
     /// # Errors
-    /// As [`to_glb`].
+    /// [`Error::Bake`] with what [`Avatar::validate`] finds, and for more than 4 GiB.
     pub fn to_glb(&self) -> Result<Vec<u8>, Error> {
-        to_glb(self)
-    }
-}
+        self.validate().map_err(Error::Bake)?;
+        let mut file = File::default();
+        let attributes = attributes(self, &mut file);
+        let shells = self.shell_ends.len();
+        let primitives: Vec<Value> = (0..shells)
+            .map(|shell| {
+                let indices = file.indices(self.shell(shell), self.num_vertices());
+                json!({ "attributes": attributes, "indices": indices, "material": usize::from(shell > 0) })
+            })
+            .collect();
+        let bind: Vec<f32> = self.skeleton.iter().flat_map(|joint| inverse_bind(joint.rest)).collect();
+        let bind = file.floats(&bind, "MAT4", None);
+        let animations: Vec<Value> = self.clips.iter().map(|clip| animation(self, clip, &mut file)).collect();
+        let picture = file.view(&self.atlas.to_png()?, None);
 
-/// Encodes an avatar as glTF 2.0 binary (`.glb`).
-///
-/// One skinned mesh with a primitive a shell (`POSITION`, `NORMAL`, `TEXCOORD_0`, `JOINTS_0`,
-/// `WEIGHTS_0` in 16 bits), `KHR_materials_unlit`, the atlas as PNG, a node a joint with the rest
-/// pose as bind pose, and an animation a clip. The innermost shell is opaque, those around it are
-/// blended over it in order. The atlas is under even light; that of the video is the scene's extra
-/// `light`, a vector s: a surface with unit normal n is max(1 + s · n + ½ |s| ((ŝ · n)² − ⅓), 0.2)
-/// times as bright, see [`crate::capture::Light`]. Pose blend shapes and confidence are left out.
-///
-/// # Errors
-/// [`Error::Bake`] with what [`Avatar::validate`] finds, and for more than 4 GiB.
-pub fn to_glb(avatar: &Avatar) -> Result<Vec<u8>, Error> {
-    avatar.validate().map_err(Error::Bake)?;
-    let mut file = File::default();
-    let attributes = attributes(avatar, &mut file);
-    let shells = avatar.shell_ends.len();
-    let primitives: Vec<Value> = (0..shells)
-        .map(|shell| {
-            let indices = file.indices(avatar.shell(shell), avatar.num_vertices());
-            json!({ "attributes": attributes, "indices": indices, "material": usize::from(shell > 0) })
-        })
-        .collect();
-    let bind: Vec<f32> = avatar.skeleton.iter().flat_map(|joint| inverse_bind(joint.rest)).collect();
-    let bind = file.floats(&bind, "MAT4", None);
-    let animations: Vec<Value> = avatar.clips.iter().map(|clip| animation(avatar, clip, &mut file)).collect();
-    let picture = file.view(&avatar.atlas.to_png()?, None);
-
-    let j = avatar.num_joints();
-    let mut nodes: Vec<Value> = (avatar.skeleton.iter().enumerate())
-        .map(|(at, joint)| {
-            let origin = joint.parent.map_or(Vec3::ZERO, |parent| avatar.skeleton[usize::from(parent)].rest);
-            let children: Vec<usize> =
-                (0..j).filter(|&child| avatar.skeleton[child].parent.map(usize::from) == Some(at)).collect();
-            let mut node = json!({ "name": joint.name, "translation": (joint.rest - origin).to_array() });
-            if !children.is_empty() {
-                node["children"] = json!(children);
-            }
-            node
-        })
-        .collect();
-    nodes.push(json!({ "name": "person", "mesh": 0, "skin": 0 }));
-    let mut materials = vec![material("person", "OPAQUE")];
-    if shells > 1 {
-        materials.push(material("shell", "BLEND"));
+        let j = self.num_joints();
+        let mut nodes: Vec<Value> = (self.skeleton.iter().enumerate())
+            .map(|(at, joint)| {
+                let origin = joint.parent.map_or(Vec3::ZERO, |parent| self.skeleton[usize::from(parent)].rest);
+                let children: Vec<usize> =
+                    (0..j).filter(|&child| self.skeleton[child].parent.map(usize::from) == Some(at)).collect();
+                let mut node = json!({ "name": joint.name, "translation": (joint.rest - origin).to_array() });
+                if !children.is_empty() {
+                    node["children"] = json!(children);
+                }
+                node
+            })
+            .collect();
+        nodes.push(json!({ "name": "person", "mesh": 0, "skin": 0 }));
+        let mut materials = vec![material("person", "OPAQUE")];
+        if shells > 1 {
+            materials.push(material("shell", "BLEND"));
+        }
+        let mut root = json!({
+            "asset": { "version": "2.0", "generator": concat!("occnerf ", env!("CARGO_PKG_VERSION")) },
+            "extensionsUsed": ["KHR_materials_unlit"],
+            "scene": 0,
+            "scenes": [{
+                "name": self.name,
+                "nodes": [0, j],
+                "extras": { "light": self.light.slope.to_array() },
+            }],
+            "nodes": nodes,
+            "meshes": [{ "name": "person", "primitives": primitives }],
+            "skins": [{ "joints": (0..j).collect::<Vec<_>>(), "skeleton": 0, "inverseBindMatrices": bind }],
+            "materials": materials,
+            "textures": [{ "source": 0, "sampler": 0 }],
+            "samplers": [{ "magFilter": LINEAR, "minFilter": LINEAR, "wrapS": CLAMP_TO_EDGE, "wrapT": CLAMP_TO_EDGE }],
+            "images": [{ "name": "atlas", "mimeType": "image/png", "bufferView": picture }],
+            "accessors": file.accessors,
+            "bufferViews": file.views,
+            "buffers": [{ "byteLength": file.bytes.len() }],
+        });
+        if !animations.is_empty() {
+            root["animations"] = json!(animations);
+        }
+        container(&root, file.bytes)
     }
-    let mut root = json!({
-        "asset": { "version": "2.0", "generator": concat!("occnerf ", env!("CARGO_PKG_VERSION")) },
-        "extensionsUsed": ["KHR_materials_unlit"],
-        "scene": 0,
-        "scenes": [{
-            "name": avatar.name,
-            "nodes": [0, j],
-            "extras": { "light": avatar.light.slope.to_array() },
-        }],
-        "nodes": nodes,
-        "meshes": [{ "name": "person", "primitives": primitives }],
-        "skins": [{ "joints": (0..j).collect::<Vec<_>>(), "skeleton": 0, "inverseBindMatrices": bind }],
-        "materials": materials,
-        "textures": [{ "source": 0, "sampler": 0 }],
-        "samplers": [{ "magFilter": LINEAR, "minFilter": LINEAR, "wrapS": CLAMP_TO_EDGE, "wrapT": CLAMP_TO_EDGE }],
-        "images": [{ "name": "atlas", "mimeType": "image/png", "bufferView": picture }],
-        "accessors": file.accessors,
-        "bufferViews": file.views,
-        "buffers": [{ "byteLength": file.bytes.len() }],
-    });
-    if !animations.is_empty() {
-        root["animations"] = json!(animations);
-    }
-    container(&root, file.bytes)
 }
 
 /// Lays out the two chunks of a binary glTF.
@@ -162,8 +153,8 @@ fn attributes(avatar: &Avatar, file: &mut File) -> Value {
     json!({ "POSITION": position, "NORMAL": normal, "TEXCOORD_0": place, "JOINTS_0": joints, "WEIGHTS_0": weights })
 }
 
-/// A vertex's weights in parts of 65535 that add up exactly, largest first; each joint once, those
-/// without weight 0.
+/// A vertex's weights in parts of 65535 with an exact sum, largest first, each joint once; unused
+/// entries are 0.
 fn quantised(joints: [u16; 4], weights: [f32; 4]) -> ([u16; 4], [u16; 4]) {
     const WHOLE: f32 = 65535.0;
     let mut merged: Vec<(u16, f32)> = Vec::with_capacity(4);
@@ -196,14 +187,13 @@ fn animation(avatar: &Avatar, Clip { name, motion }: &Clip, file: &mut File) -> 
         samplers.push(json!({ "input": input, "output": output }));
     };
     for joint in 0..j {
-        let mut before = Quat::IDENTITY;
+        let mut previous = Quat::IDENTITY;
         let turns: Vec<f32> = (0..frames)
             .flat_map(|frame| {
                 let turn = Quat::from_scaled_axis(motion.poses[frame * j + joint]).normalize();
-                // The nearer of the two quaternions of a rotation, so that players need not look
-                // for it.
-                before = if before.dot(turn) < 0.0 { -turn } else { turn };
-                before.to_array()
+                // In the hemisphere of the previous key, so that players take the shorter arc.
+                previous = if previous.dot(turn) < 0.0 { -turn } else { turn };
+                previous.to_array()
             })
             .collect();
         channel(file.floats(&turns, "VEC4", None), joint, "rotation");
@@ -213,7 +203,7 @@ fn animation(avatar: &Avatar, Clip { name, motion }: &Clip, file: &mut File) -> 
     json!({ "name": name, "samplers": samplers, "channels": channels })
 }
 
-/// The binary chunk and what says where its parts are.
+/// The binary chunk with its buffer views and accessors.
 #[derive(Default)]
 struct File {
     bytes: Vec<u8>,
@@ -254,7 +244,7 @@ impl File {
         }))
     }
 
-    /// Says between which corners an accessor's points lie.
+    /// Sets the bounds of an accessor.
     fn bound(&mut self, accessor: usize, points: &[Vec3]) {
         let Aabb { min: low, max: high } = Aabb::from_points(points);
         self.accessors[accessor]["min"] = json!(low.to_array());
@@ -263,7 +253,7 @@ impl File {
 
     fn indices(&mut self, faces: &[[u32; 3]], vertices: usize) -> usize {
         let flat = faces.as_flattened();
-        // The largest number restarts a strip, so that it must not occur.
+        // The largest index is reserved for primitive restart.
         let (bytes, kind): (Vec<u8>, u32) = if vertices <= usize::from(u16::MAX) {
             (flat.iter().flat_map(|&i| (i as u16).to_le_bytes()).collect(), UNSIGNED_SHORT)
         } else {

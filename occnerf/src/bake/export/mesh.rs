@@ -24,7 +24,7 @@ pub fn write_obj(avatar: &Avatar, vertices: &[Vec3], normals: &[Vec3], path: &Pa
     let Some(outermost) = avatar.shell_ends.len().checked_sub(1) else {
         return Err(Error::Bake("mesh: the avatar has no shells".to_owned()));
     };
-    // Only what the shell uses, in the order in which it is used.
+    // Vertices of the shell, in order of first use.
     let mut places = vec![0u32; v];
     let mut used: Vec<usize> = Vec::new();
     let faces: Vec<[u32; 3]> = (avatar.shell(outermost).iter())
@@ -40,7 +40,7 @@ pub fn write_obj(avatar: &Avatar, vertices: &[Vec3], normals: &[Vec3], path: &Pa
         })
         .collect();
     let file_name = |extension: &str| {
-        // Names with blanks or line ends would not survive in an OBJ's statements.
+        // OBJ statements are separated by white space.
         let name = path.with_extension(extension).file_name().unwrap_or_default().to_string_lossy().into_owned();
         name.chars().map(|c| if c.is_whitespace() || c.is_control() { '_' } else { c }).collect::<String>()
     };
@@ -72,8 +72,7 @@ pub fn write_obj(avatar: &Avatar, vertices: &[Vec3], normals: &[Vec3], path: &Pa
 }
 
 impl Atlas {
-    /// The colour at a place in the atlas, sRGB in [0, 1], interpolated between the four nearest
-    /// texels' centres.
+    /// Bilinear lookup, sRGB in [0, 1].
     pub(super) fn color(&self, uv: Vec2) -> Vec3 {
         let (width, height) = (self.width as usize, self.height as usize);
         let at = uv * Vec2::new(width as f32, height as f32) - 0.5;

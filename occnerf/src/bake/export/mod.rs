@@ -1,11 +1,10 @@
-//! Avatars in the forms that other programs open.
+//! Exporters of avatars.
 
 mod glb;
 mod mesh;
 mod motion;
 mod splats;
 
-pub use glb::to_glb;
 pub use mesh::write_obj;
 pub use motion::{adapt_motion, fit_motion, write_amass};
 pub use splats::{Splats, splats};
@@ -19,10 +18,10 @@ use super::Atlas;
 use crate::Error;
 
 impl Atlas {
-    /// The colours as a PNG, without alpha where every texel is opaque.
+    /// The texture as a PNG, without alpha if opaque.
     ///
     /// # Errors
-    /// [`Error::Bake`] where the encoder refuses, as for a picture that is not (H, W, 4).
+    /// [`Error::Bake`] of the encoder, as for data that are not (H, W, 4).
     pub fn to_png(&self) -> Result<Vec<u8>, Error> {
         if self.is_opaque() {
             let rgb: Vec<u8> = self.rgba.chunks_exact(4).flat_map(|texel| [texel[0], texel[1], texel[2]]).collect();
@@ -39,7 +38,7 @@ impl Atlas {
         self.encode(&self.confidence, ExtendedColorType::L8)
     }
 
-    /// Whether nothing shines through.
+    /// Whether every texel is opaque.
     #[must_use]
     pub fn is_opaque(&self) -> bool {
         self.rgba.chunks_exact(4).all(|texel| texel[3] == 255)
@@ -48,7 +47,7 @@ impl Atlas {
     fn encode(&self, values: &[u8], kind: ExtendedColorType) -> Result<Vec<u8>, Error> {
         let mut bytes = Cursor::new(Vec::new());
         let fault = |error: image::ImageError| Error::Bake(format!("atlas: {error}"));
-        // The encoder asserts what it is given.
+        // The encoder asserts the size.
         let channels = usize::from(kind.channel_count());
         if values.len() != self.width as usize * self.height as usize * channels {
             let (w, h) = (self.width, self.height);

@@ -1,4 +1,4 @@
-//! Motions out as AMASS's files, and in from motion capture.
+//! Export and retargeting of motion clips in AMASS's form.
 
 use std::path::Path;
 
@@ -35,7 +35,7 @@ pub fn write_amass(avatar: &Avatar, clip: usize, path: &Path) -> Result<(), Erro
     Ok(())
 }
 
-/// The same motion in a world turned by `turn`; `root` is where the root joint rests.
+/// The motion in a world rotated by `turn`; `root` is the rest position of the root joint.
 fn turned(motion: &MotionClip, turn: Mat3, root: Vec3) -> MotionClip {
     let mut out = motion.clone();
     let about = Quat::from_mat3(&turn);
@@ -70,7 +70,7 @@ pub fn fit_motion(motion: &MotionClip, to: usize, root: Vec3) -> Result<MotionCl
     let frames = motion.num_frames();
     let (mut poses, mut trans) = (Vec::with_capacity(frames * to), Vec::with_capacity(frames));
     for frame in 0..frames {
-        // One frame at a time, so that no time between frames is asked for.
+        // One frame at a time, without interpolation.
         let row = motion.poses[frame * from..][..from].to_vec();
         let still = MotionClip { poses: row, num_joints: from, trans: vec![motion.trans[frame]], fps: motion.fps };
         let (pose, placement) = still.at(0.0, to);
@@ -79,7 +79,7 @@ pub fn fit_motion(motion: &MotionClip, to: usize, root: Vec3) -> Result<MotionCl
         trans.push(translation);
     }
     let fitted = MotionClip { poses, num_joints: to, trans, fps: motion.fps };
-    // The world axis that the body's own upward direction is nearest to, on the whole.
+    // World axis nearest to the body's mean upward direction.
     let upward: Vec3 =
         (fitted.poses.iter().step_by(to.max(1))).map(|&turn| Quat::from_scaled_axis(turn) * Vec3::Y).sum();
     let axes = [Vec3::Y, Vec3::Z, Vec3::X];

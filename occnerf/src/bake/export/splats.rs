@@ -7,16 +7,15 @@ use glam::{Mat3, Quat, Vec2, Vec3};
 use crate::Error;
 use crate::bake::{Avatar, write_whole};
 
-/// Zeroth spherical harmonic, that turns a colour into a coefficient.
+/// Zeroth spherical harmonic.
 const Y00: f32 = 0.282_094_79;
-/// In-plane spread over that of a triangle's own area: neighbours overlap, so that nothing shines
-/// through.
+/// In-plane scale over a triangle's own standard deviation, so that neighbours overlap.
 const SPREAD: f32 = 1.6;
 /// Standard deviation across the surface, in metres.
 const THICKNESS: f32 = 1e-3;
-/// Thinner ones crash viewers.
+/// Least standard deviation; viewers crash on thinner splats.
 const LEAST: f32 = 1e-6;
-/// Opacity of each in its middle.
+/// Peak opacity.
 const OPACITY: f32 = 0.99;
 /// Most Gaussians of a file.
 const MOST: usize = 4_000_000;
@@ -55,7 +54,7 @@ pub fn splats(avatar: &Avatar, vertices: &[Vec3], patch: f32) -> Result<Splats, 
         while let Some(corners) = todo.pop() {
             let edge = |i: usize| corners[i].0.distance(corners[(i + 1) % 3].0);
             let longest = (0..3).max_by(|&a, &b| edge(a).total_cmp(&edge(b))).unwrap_or(0);
-            // An infinite edge stays infinite however often it is halved.
+            // Halving an infinite edge would not end.
             if edge(longest) > patch && edge(longest).is_finite() {
                 let [a, b, c] = [0, 1, 2].map(|i| corners[(longest + i) % 3]);
                 let middle = (a.0.midpoint(b.0), a.1.midpoint(b.1));
@@ -93,8 +92,7 @@ impl Splats {
         let first = along * angle.cos() + across * angle.sin();
         let deviation = |variance: f32| (SPREAD * variance.max(0.0).sqrt()).max(LEAST);
         let large = deviation(mean + root);
-        // A sliver is as wide as a quarter of its length, or it would be too thin to cover what is
-        // between it and others.
+        // Slivers are widened to a quarter of their length, to cover the gaps beside them.
         let small = deviation(mean - root).max(0.25 * large);
         let uv = (corners[0].1 + corners[1].1 + corners[2].1) / 3.0;
         self.centres.push(centre);

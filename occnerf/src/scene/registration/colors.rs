@@ -1,27 +1,27 @@
-//! Colours that all frames agree on.
+//! Per-vertex albedo and light shared by all frames, and the colour residuals against them.
 
 use glam::Vec3;
 
 use crate::capture::Light;
-use crate::scene::light::{Seen, albedo, lamp};
-use crate::scene::registration::sight::Sight;
+use crate::scene::light::{ColorObservation, albedo, lamp};
+use crate::scene::registration::observations::Observations;
 
-/// Least noise of a colour, and frames that have to show a vertex.
+/// Least standard deviation of a colour residual, and least number of frames that observe a vertex.
 const NOISE: f32 = 0.05;
-const SHOWN: u32 = 3;
+const LEAST_FRAMES: u32 = 3;
 
-/// The colours of the vertices under even light, and the light.
+/// Albedo of the vertices, and the light.
 pub(super) struct Colors {
-    /// Colour, and in how many frames it was seen, V.
+    /// Albedo and number of observations, (V).
     albedo: Vec<(Vec3, u32)>,
     light: Light,
-    /// Standard deviation of what is seen from what it should be, by its median.
+    /// Robust standard deviation of the residuals (scaled median absolute deviation).
     pub noise: f32,
 }
 
 impl Colors {
-    pub fn measure(sights: &[Sight], vertices: usize) -> Self {
-        let seen = || sights.iter().flat_map(|sight| &sight.seen);
+    pub fn measure(observations: &[Observations], vertices: usize) -> Self {
+        let seen = || observations.iter().flat_map(|observed| &observed.colors);
         let light = lamp(seen(), vertices);
         let mut counts = vec![0; vertices];
         seen().for_each(|(v, ..)| counts[*v as usize] += 1);
@@ -29,23 +29,23 @@ impl Colors {
         let albedo = sums.iter().zip(counts).map(|(&(sum, squares), n)| (sum / squares.max(f32::MIN_POSITIVE), n));
         let mut colors = Self { albedo: albedo.collect(), light, noise: 1.0 };
         let mut errors: Vec<f32> =
-            seen().filter_map(|seen| Some(colors.error(seen)?.abs().element_sum() / 3.0)).collect();
+            seen().filter_map(|seen| Some(colors.residual(seen)?.abs().element_sum() / 3.0)).collect();
         if !errors.is_empty() {
             let middle = errors.len() / 2;
-            // Of a normal distribution.
+            // 1.48 scales a median absolute deviation to a normal distribution's σ.
             colors.noise = (1.48 * *errors.select_nth_unstable_by(middle, f32::total_cmp).1).max(NOISE);
         }
         colors
     }
 
-    /// What is seen less what it should be; `None` where too few frames say what.
-    pub fn error(&self, (vertex, color, normal): &Seen) -> Option<Vec3> {
+    /// Observed colour minus shaded albedo; `None` for a vertex with too few observations.
+    pub fn residual(&self, (vertex, color, normal): &ColorObservation) -> Option<Vec3> {
         let (albedo, count) = self.albedo[*vertex as usize];
-        (count >= SHOWN).then(|| *color - self.light.on(*normal) * albedo)
+        (count >= LEAST_FRAMES).then(|| *color - self.light.on(*normal) * albedo)
     }
 
-    /// How what [`Colors::error`] says changes as the surface turns about an axis, a row a channel.
-    pub fn turned(&self, (vertex, _, normal): &Seen) -> [Vec3; 3] {
+    /// Jacobian of [`Colors::residual`] with respect to a rotation of the surface, a row a channel.
+    pub fn rotation_jacobian(&self, (vertex, _, normal): &ColorObservation) -> [Vec3; 3] {
         let turn = self.light.change(*normal).cross(*normal);
         self.albedo[*vertex as usize].0.to_array().map(|albedo| albedo * turn)
     }
@@ -59,7 +59,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn errors_change_with_the_surfaces_turn_as_finite_differences_do(
+        fn residuals_change_with_rotations_as_by_finite_differences(
             slope in prop::array::uniform3(-2.0f32..2.0),
             normal in prop::array::uniform3(-1.0f32..1.0),
             albedo in prop::array::uniform3(0.0f32..1.0),
@@ -71,10 +71,10 @@ mod tests {
             // Where it becomes darkest it has a kink.
             let is_darkest = |h: f32| light.on(turned(h)) == Light::DARKEST;
             prop_assume!(is_darkest(h) == is_darkest(-h));
-            let colors = Colors { albedo: vec![(Vec3::from(albedo), SHOWN)], light, noise: 1.0 };
-            let error = |h: f32| colors.error(&(0, Vec3::splat(0.5), turned(h))).unwrap();
-            let numeric = (error(h) - error(-h)) / (2.0 * h);
-            let exact = Vec3::from(colors.turned(&(0, Vec3::ZERO, normal)).map(|turned| turned.dot(axis)));
+            let colors = Colors { albedo: vec![(Vec3::from(albedo), LEAST_FRAMES)], light, noise: 1.0 };
+            let residual = |h: f32| colors.residual(&(0, Vec3::splat(0.5), turned(h))).unwrap();
+            let numeric = (residual(h) - residual(-h)) / (2.0 * h);
+            let exact = Vec3::from(colors.rotation_jacobian(&(0, Vec3::ZERO, normal)).map(|turned| turned.dot(axis)));
             prop_assert!(exact.distance(numeric) < 2e-3, "{exact} {numeric}");
         }
     }

@@ -1,27 +1,29 @@
-//! Least squares over all frames: each frame has unknowns of its own, tied to those of the next two
-//! frames, and all frames share some.
+//! Regularised linear least squares over all frames: per-frame unknowns coupled over two frames by
+//! the prior, and global unknowns.
 
 use nalgebra::{Cholesky, DMatrix, DVector};
 
-/// Sides of matrices that are inverted as they are.
+/// Size from which matrices are inverted by blocks.
 const DIRECT: usize = 24;
 
-/// The normal equations of one frame: its own unknowns (P) and the shared ones (B).
+/// Normal equations of one frame, the per-frame unknowns (P) before the global ones (B).
 #[derive(Clone, Debug)]
-pub(super) struct Normal {
-    pub own: usize,
+pub(super) struct NormalEquations {
+    /// P.
+    pub per_frame: usize,
     /// Σ w JᵀJ, (P + B)².
     pub matrix: DMatrix<f64>,
     /// Σ w Jᵀr, (P + B).
     pub vector: DVector<f64>,
 }
 
-impl Normal {
-    pub fn new(own: usize, shared: usize) -> Self {
-        Self { own, matrix: DMatrix::zeros(own + shared, own + shared), vector: DVector::zeros(own + shared) }
+impl NormalEquations {
+    pub fn new(per_frame: usize, global: usize) -> Self {
+        let size = per_frame + global;
+        Self { per_frame, matrix: DMatrix::zeros(size, size), vector: DVector::zeros(size) }
     }
 
-    /// Adds a residual with the derivatives `row` of the unknowns `columns`.
+    /// Adds a residual with the sparse Jacobian `row` in `columns`.
     pub fn add(&mut self, weight: f64, residual: f64, columns: &[u32], row: &[f64]) {
         for (&i, &a) in columns.iter().zip(row) {
             let (i, a) = (i as usize, weight * a);
@@ -34,27 +36,26 @@ impl Normal {
     }
 }
 
-/// What unknowns are expected to be before anything is seen: those of the frames wander about 0 (a
-/// stationary autoregressive process of second order).
-pub(super) struct Expected<'a> {
-    /// Variance of each unknown of a frame, (P).
-    pub own: &'a [f64],
-    /// What is kept of each unknown in the next frame, and in the one after that, (P).
-    pub kept: &'a [[f64; 2]],
-    /// Inverse variance of each shared unknown, (B).
-    pub shared: &'a [f64],
+/// Gaussian prior with zero mean: per-frame unknowns are stationary autoregressive processes of
+/// second order over the frames.
+pub(super) struct Prior<'a> {
+    /// Variance of each per-frame unknown, (P).
+    pub per_frame: &'a [f64],
+    /// Coefficients of each per-frame unknown at lags 1 and 2, (P).
+    pub ar_coefficients: &'a [[f64; 2]],
+    /// Inverse variance of each global unknown, (B).
+    pub global: &'a [f64],
 }
 
-impl Expected<'_> {
-    /// Row `t` of the inverse covariance of an unknown over `frames` frames, from the diagonal on.
+impl Prior<'_> {
+    /// Row `t` of the inverse covariance of unknown `i` over `frames` frames, from the diagonal on.
     fn precision(&self, i: usize, t: usize, frames: usize) -> [f64; 3] {
-        let (variance, [a, b]) = (self.own[i], self.kept[i]);
-        // Correlation with the next frame (Yule and Walker).
+        let (variance, [a, b]) = (self.per_frame[i], self.ar_coefficients[i]);
+        // Autocorrelation at lag 1 (Yule and Walker).
         let next = a / (1.0 - b);
         let mut row = [0.0; 3];
-        // The first is as uncertain as any, each next one is what is kept of those before, and some
-        // more.
         for frame in t..(t + 3).min(frames) {
+            // Prediction error filter, and its variance relative to the process's.
             let (of, left) = match frame {
                 0 => ([1.0, 0.0, 0.0], 1.0),
                 1 => ([1.0, -next, 0.0], 1.0 - next * next),
@@ -69,34 +70,33 @@ impl Expected<'_> {
     }
 }
 
-/// Steps towards the least squares.
+/// Gauss-Newton step.
 pub(super) struct Solution {
-    /// For the unknowns of each frame, (P).
-    pub own: Vec<DVector<f64>>,
-    /// For the shared unknowns, (B).
-    pub shared: DVector<f64>,
-    /// Variance of each frame's unknowns, were the shared ones known, (P).
+    /// Step of each frame's unknowns, (P).
+    pub per_frame: Vec<DVector<f64>>,
+    /// Step of the global unknowns, (B).
+    pub global: DVector<f64>,
+    /// Posterior variance of each frame's unknowns, given the global ones, (P).
     pub variances: Vec<DVector<f64>>,
 }
 
-/// The steps that take all unknowns to the least squares: for each frame (P), and the shared (B).
-/// `own` and `shared` are the unknowns now. `None` where the equations have no solution.
+/// Solves for the steps of all unknowns, whose current values are `per_frame` (P a frame) and
+/// `global` (B). `None` for a singular system.
 ///
-/// Frames are eliminated in pairs, in order (block tridiagonal Cholesky), the shared unknowns last.
-/// An odd number is filled up with a frame that shows nothing.
+/// Pairs of frames are eliminated in order (block tridiagonal Cholesky), the global unknowns last
+/// (Schur complement). An odd number of frames is padded with one without observations.
 pub(super) fn solve(
-    frames: &[Normal],
-    expected: &Expected<'_>,
-    own: &[DVector<f64>],
-    shared: &DVector<f64>,
+    frames: &[NormalEquations],
+    prior: &Prior<'_>,
+    per_frame: &[DVector<f64>],
+    global: &DVector<f64>,
 ) -> Option<Solution> {
-    let (p, b) = (expected.own.len(), expected.shared.len());
+    let (p, b) = (prior.per_frame.len(), prior.global.len());
     let (pairs, count) = (frames.len().div_ceil(2), frames.len());
     let precision: Vec<Vec<[f64; 3]>> =
-        (0..2 * pairs).map(|t| (0..p).map(|i| expected.precision(i, t, 2 * pairs)).collect()).collect();
-    // A matrix times the ties of a pair to the next, which are few: its rows and the columns of the
-    // next are tied.
-    let tied = |matrix: &DMatrix<f64>, g: usize| {
+        (0..2 * pairs).map(|t| (0..p).map(|i| prior.precision(i, t, 2 * pairs)).collect()).collect();
+    // Product of a matrix with the sparse off-diagonal block between pairs g and g + 1.
+    let coupled = |matrix: &DMatrix<f64>, g: usize| {
         let mut out = DMatrix::zeros(matrix.nrows(), 2 * p);
         for i in 0..p {
             let [first, second] = [precision[2 * g][i], precision[2 * g + 1][i]];
@@ -106,16 +106,16 @@ pub(super) fn solve(
         }
         out
     };
-    // Of a pair: the inverse of its block, and the solutions of the right-hand side and of the shared
-    // unknowns' columns, before what follows is known.
+    // Of each pair: the inverse of its block after elimination of earlier pairs, and that times the
+    // right-hand side and the columns of the global unknowns.
     let mut pieces: Vec<[DMatrix<f64>; 2]> = Vec::with_capacity(pairs);
-    let mut shared_matrix = DMatrix::from_diagonal(&DVector::from_row_slice(expected.shared));
-    let mut shared_vector = DVector::from_fn(b, |k, _| -expected.shared[k] * shared[k]);
+    let mut global_matrix = DMatrix::from_diagonal(&DVector::from_row_slice(prior.global));
+    let mut global_vector = DVector::from_fn(b, |k, _| -prior.global[k] * global[k]);
     for normal in frames {
-        shared_matrix += normal.matrix.view((p, p), (b, b));
-        shared_vector -= normal.vector.rows(p, b);
+        global_matrix += normal.matrix.view((p, p), (b, b));
+        global_vector -= normal.vector.rows(p, b);
     }
-    let now = |t: usize, i: usize| own.get(t).map_or(0.0, |own| own[i]);
+    let now = |t: usize, i: usize| per_frame.get(t).map_or(0.0, |values| values[i]);
     for g in 0..pairs {
         let mut block = DMatrix::zeros(2 * p, 2 * p);
         let mut side = DMatrix::zeros(2 * p, 1 + b);
@@ -123,7 +123,7 @@ pub(super) fn solve(
             let (t, at) = (2 * g + half, half * p);
             if t < count {
                 let normal = &frames[t];
-                debug_assert_eq!(normal.own, p);
+                debug_assert_eq!(normal.per_frame, p);
                 block.view_mut((at, at), (p, p)).copy_from(&normal.matrix.view((0, 0), (p, p)));
                 side.view_mut((at, 0), (p, 1)).copy_from(&(-normal.vector.rows(0, p)));
                 side.view_mut((at, 1), (p, b)).copy_from(&normal.matrix.view((0, p), (p, b)));
@@ -140,22 +140,21 @@ pub(super) fn solve(
                 side[(at + i, 0)] -= ahead + back(1) + back(2);
             }
         }
-        if let Some([alone, solved]) = pieces.last() {
-            block -= tied(&tied(alone, g - 1).transpose(), g - 1);
-            side -= tied(&solved.transpose(), g - 1).transpose();
+        if let Some([inverse, solved]) = pieces.last() {
+            block -= coupled(&coupled(inverse, g - 1).transpose(), g - 1);
+            side -= coupled(&solved.transpose(), g - 1).transpose();
         }
-        let alone = inverse(block)?;
-        let solved = &alone * side;
-        pieces.push([alone, solved]);
+        let inverse = inverse(block)?;
+        let solved = &inverse * side;
+        pieces.push([inverse, solved]);
     }
-    // Back: x_g = A_g⁻¹ (side_g − tie · x_{g + 1}), for the right-hand side and each shared unknown.
+    // Back substitution: x_g = A_g⁻¹ (side_g − coupling · x_{g + 1}).
     let mut solutions: Vec<DMatrix<f64>> = vec![DMatrix::zeros(p, 1 + b); 2 * pairs];
     let mut variances: Vec<DVector<f64>> = vec![DVector::zeros(p); 2 * pairs];
-    // The last pair is tied to nothing.
     let (mut covariance, mut later) = (DMatrix::zeros(2 * p, 2 * p), DMatrix::zeros(2 * p, 1 + b));
-    for (g, [alone, solved]) in pieces.iter().enumerate().rev() {
-        let gain = tied(alone, g);
-        (covariance, later) = (alone + &gain * covariance * gain.transpose(), solved - gain * later);
+    for (g, [inverse, solved]) in pieces.iter().enumerate().rev() {
+        let gain = coupled(inverse, g);
+        (covariance, later) = (inverse + &gain * covariance * gain.transpose(), solved - gain * later);
         for half in 0..2 {
             variances[2 * g + half] = covariance.diagonal().rows(half * p, p).into_owned();
             solutions[2 * g + half] = later.rows(half * p, p).into_owned();
@@ -165,16 +164,16 @@ pub(super) fn solve(
     variances.truncate(count);
     for (normal, solution) in frames.iter().zip(&solutions) {
         let coupling = normal.matrix.view((p, 0), (b, p));
-        shared_matrix -= coupling * solution.view((0, 1), (p, b));
-        shared_vector -= coupling * solution.column(0);
+        global_matrix -= coupling * solution.view((0, 1), (p, b));
+        global_vector -= coupling * solution.column(0);
     }
-    let shared_step = if b == 0 { DVector::zeros(0) } else { Cholesky::new(shared_matrix)?.solve(&shared_vector) };
-    let own = solutions.iter().map(|s| s.column(0) - s.view((0, 1), (p, b)) * &shared_step).collect();
-    Some(Solution { own, shared: shared_step, variances })
+    let global = if b == 0 { DVector::zeros(0) } else { Cholesky::new(global_matrix)?.solve(&global_vector) };
+    let per_frame = solutions.iter().map(|s| s.column(0) - s.view((0, 1), (p, b)) * &global).collect();
+    Some(Solution { per_frame, global, variances })
 }
 
-/// The inverse of a positive definite matrix, from those of its halves: products of matrices are
-/// many times faster here than solving.
+/// Inverse of a positive definite matrix by recursive 2 × 2 blocks, whose matrix products are faster
+/// than triangular solves.
 pub(super) fn inverse(matrix: DMatrix<f64>) -> Option<DMatrix<f64>> {
     let (size, half) = (matrix.nrows(), matrix.nrows() / 2);
     if size <= DIRECT {
@@ -221,12 +220,12 @@ mod tests {
         fn blocks_give_what_the_whole_matrix_gives(seed in any::<u64>(), frames in 1usize..6, p in 1usize..15, b in 0usize..4) {
             let mut stream = RandomStream::new(&[seed]);
             let mut random = || f64::from(stream.normal());
-            let mut normals = vec![Normal::new(p, b); frames];
+            let mut normals = vec![NormalEquations::new(p, b); frames];
             let columns: Vec<u32> = (0..(p + b) as u32).collect();
             let size = frames * p + b;
             let (mut whole, mut right) = (DMatrix::<f64>::zeros(size, size), DVector::<f64>::zeros(size));
-            let own: Vec<DVector<f64>> = (0..frames).map(|_| DVector::from_fn(p, |_, _| random())).collect();
-            let shared = DVector::from_fn(b, |_, _| random());
+            let per_frame: Vec<DVector<f64>> = (0..frames).map(|_| DVector::from_fn(p, |_, _| random())).collect();
+            let global = DVector::from_fn(b, |_, _| random());
             let mut add = |weight: f64, residual: f64, entries: &[(usize, f64)]| {
                 for &(i, a) in entries {
                     right[i] -= weight * a * residual;
@@ -243,41 +242,41 @@ mod tests {
                     add(weight, residual, &entries);
                 }
             }
-            let prior: Vec<f64> = (0..p).map(|_| 0.1 + random().abs()).collect();
+            let variances: Vec<f64> = (0..p).map(|_| 0.1 + random().abs()).collect();
             // Roots within the unit circle.
             let mut root = || 0.98 * random().sin();
-            let kept: Vec<[f64; 2]> = (0..p).map(|_| (root(), root())).map(|(x, y)| [x + y, -x * y]).collect();
+            let ar_coefficients: Vec<[f64; 2]> = (0..p).map(|_| (root(), root())).map(|(x, y)| [x + y, -x * y]).collect();
             let common: Vec<f64> = (0..b).map(|_| 0.1 + random().abs()).collect();
             for f in 0..frames {
                 for i in 0..p {
-                    // The variance of what is new, from the Yule-Walker equations.
-                    let [a, c] = kept[i];
+                    // Variance of the innovation, by the Yule-Walker equations.
+                    let [a, c] = ar_coefficients[i];
                     let next = a / (1.0 - c);
-                    let new = prior[i] * (1.0 - a * next - c * (a * next + c));
+                    let new = variances[i] * (1.0 - a * next - c * (a * next + c));
                     let at = |back: usize| (f - back) * p + i;
                     match f {
-                        0 => add(prior[i].recip(), own[0][i], &[(at(0), 1.0)]),
+                        0 => add(variances[i].recip(), per_frame[0][i], &[(at(0), 1.0)]),
                         1 => {
-                            let residual = own[1][i] - next * own[0][i];
-                            add((prior[i] * (1.0 - next * next)).recip(), residual, &[(at(0), 1.0), (at(1), -next)]);
+                            let residual = per_frame[1][i] - next * per_frame[0][i];
+                            add((variances[i] * (1.0 - next * next)).recip(), residual, &[(at(0), 1.0), (at(1), -next)]);
                         }
                         _ => {
-                            let residual = own[f][i] - a * own[f - 1][i] - c * own[f - 2][i];
+                            let residual = per_frame[f][i] - a * per_frame[f - 1][i] - c * per_frame[f - 2][i];
                             add(new.recip(), residual, &[(at(0), 1.0), (at(1), -a), (at(2), -c)]);
                         }
                     }
                 }
             }
-            (0..b).for_each(|k| add(common[k], shared[k], &[(frames * p + k, 1.0)]));
-            let expected = Expected { own: &prior, kept: &kept, shared: &common };
-            let Solution { own: steps, shared: shared_step, variances } = solve(&normals, &expected, &own, &shared).unwrap();
+            (0..b).for_each(|k| add(common[k], global[k], &[(frames * p + k, 1.0)]));
+            let prior = Prior { per_frame: &variances, ar_coefficients: &ar_coefficients, global: &common };
+            let Solution { per_frame: steps, global: step, variances } = solve(&normals, &prior, &per_frame, &global).unwrap();
             let exact = whole.clone().lu().solve(&right).unwrap();
             let inverse = whole.view((0, 0), (frames * p, frames * p)).into_owned().try_inverse().unwrap();
             for f in 0..frames {
                 prop_assert!((&steps[f] - exact.rows(f * p, p)).amax() < 1e-8);
                 prop_assert!((&variances[f] - inverse.diagonal().rows(f * p, p)).amax() < 1e-8);
             }
-            prop_assert!((&shared_step - exact.rows(frames * p, b)).iter().all(|d| d.abs() < 1e-8));
+            prop_assert!((&step - exact.rows(frames * p, b)).iter().all(|d| d.abs() < 1e-8));
         }
     }
 }

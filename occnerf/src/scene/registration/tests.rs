@@ -13,6 +13,10 @@ pub(super) fn frame(pose: Vec<Vec3>, placement: Placement) -> Frame {
     Frame { name: String::new(), source: pixels.into(), camera, pose, placement, betas: Vec::new() }
 }
 
+fn registered(capture: &Capture, body: &BodyModel, rounds: usize) -> Capture {
+    register(Mended(capture.clone()), body, rounds).unwrap().capture
+}
+
 fn small() -> DemoConfig {
     DemoConfig { size: 96, frames: 60, eval_cameras: 1, eval_every: 30, ..Default::default() }
 }
@@ -45,13 +49,12 @@ fn a_frame_that_the_body_is_not_in_changes_nothing_and_leaves_the_focal_length_u
         }
     };
     given.train[3].placement = aside(given.train[3].placement);
-    let mut found = given.clone();
-    register(&mut found, &body, 4).unwrap();
-    assert!(found.registered && found.train[0].placement != given.train[0].placement);
+    let found = registered(&given, &body, 4);
+    assert_ne!(found.train[0].placement, given.train[0].placement);
     assert!(found.train.iter().all(|frame| frame.pose.iter().all(|angle| angle.is_finite())));
     // The body is nowhere to be seen.
     given.train.iter_mut().for_each(|frame| frame.placement = aside(frame.placement));
-    register(&mut given, &body, 4).unwrap();
+    registered(&given, &body, 4);
 }
 
 #[test]
@@ -59,21 +62,19 @@ fn what_is_wrong_with_a_prior_is_mostly_mended_whatever_the_number_of_threads() 
     let body = BodyModel::embedded();
     let exact = DemoConfig { pose_noise_degrees: 0.0, translation_noise: 0.0, beta_noise: 0.0, ..small() };
     let truth = demo(&exact, &body).unwrap();
-    for (wrong, most) in [
+    for (noise, most) in [
         (Perturbation { pose_degrees: 4.0, ..Perturbation::default() }, 0.8),
         (Perturbation { shape: 1.0, ..Perturbation::default() }, 0.4),
     ] {
         let mut given = demo(&small(), &body).unwrap();
-        wrong.apply(&mut given, &body).unwrap();
+        noise.apply(&mut given, &body).unwrap();
         let run = |threads: usize| {
-            let mut capture = given.clone();
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-            pool.install(|| register(&mut capture, &body, 8)).unwrap();
-            capture
+            pool.install(|| registered(&given, &body, 8))
         };
         let (found, again) = (run(1), run(2));
         let (before, after) = (apart(&truth, &given, &body), apart(&truth, &found, &body));
-        assert!(after < most * before, "{wrong:?}: {before} pixels before, {after} after");
+        assert!(after < most * before, "{noise:?}: {before} pixels before, {after} after");
         assert_eq!(found.mean_betas, again.mean_betas);
         for (a, b) in found.train.iter().zip(&again.train) {
             assert!(a.pose == b.pose && a.placement == b.placement && a.betas == b.betas);
@@ -88,17 +89,16 @@ fn limbs_of_a_rig_that_are_too_long_or_too_short_are_mended() {
     let rig = BodyModel { shapedirs: Vec::new(), ..BodyModel::embedded() };
     let exact = DemoConfig { pose_noise_degrees: 0.0, translation_noise: 0.0, beta_noise: 0.0, ..small() };
     let truth = demo(&DemoConfig { size: 192, ..exact }, &rig).unwrap();
-    let mut wrong = rig.clone();
-    Perturbation { limbs_percent: 8.0, ..Perturbation::default() }.spoil_body(&mut wrong);
-    let wrong = wrong.with_limb_lengths();
-    let mut found = truth.clone();
-    register(&mut found, &wrong, 12).unwrap();
+    let mut longer = rig.clone();
+    Perturbation { limbs_percent: 8.0, ..Perturbation::default() }.spoil_body(&mut longer);
+    let longer = longer.with_limb_lengths();
+    let found = registered(&truth, &longer, 12);
     let longest = |body: &BodyModel, betas: &[f32]| -> Vec<f32> {
         let (limbs, joints) = (rig.limbs(), body.shaped(betas).joints);
         let pairs = limbs.pairs().into_iter().take(3);
         pairs.map(|j| joints[j].distance(joints[rig.parents[j].unwrap()])).collect()
     };
-    let (right, before, after) = (longest(&rig, &[]), longest(&wrong, &[]), longest(&wrong, &found.mean_betas));
+    let (right, before, after) = (longest(&rig, &[]), longest(&longer, &[]), longest(&longer, &found.mean_betas));
     let error = |lengths: &[f32]| lengths.iter().zip(&right).map(|(a, b)| (a / b - 1.0).abs()).sum::<f32>() / 3.0;
     assert!(error(&before) > 0.03 && error(&after) < 0.4 * error(&before), "{right:?} {before:?} {after:?}");
 }
@@ -110,8 +110,7 @@ fn a_wrong_depth_is_found_from_how_large_the_person_is() {
     let truth = demo(&DemoConfig { size: 192, ..exact }, &body).unwrap();
     let mut given = truth.clone();
     Perturbation { depth_percent: 3.0, ..Perturbation::default() }.apply(&mut given, &body).unwrap();
-    let mut found = given.clone();
-    register(&mut found, &body, 12).unwrap();
+    let found = registered(&given, &body, 12);
     let apart = |capture: &Capture| -> f32 {
         let root = |frame: &Frame| body.pose(&body.shaped(&frame.betas), &frame.pose, frame.placement).joints[0];
         let each = truth.train.iter().zip(&capture.train).map(|(a, b)| root(a).distance_squared(root(b)));
@@ -125,8 +124,7 @@ fn a_right_prior_stays_as_it_is() {
     let body = BodyModel::embedded();
     let exact = DemoConfig { pose_noise_degrees: 0.0, translation_noise: 0.0, beta_noise: 0.0, ..small() };
     let truth = demo(&exact, &body).unwrap();
-    let mut found = truth.clone();
-    register(&mut found, &body, 8).unwrap();
+    let found = registered(&truth, &body, 8);
     let moved = apart(&truth, &found, &body);
     assert!(moved < 0.4, "{moved} pixels");
 }
@@ -138,8 +136,7 @@ fn nothing_is_changed_where_nothing_is_seen() {
     for frame in &mut given.train {
         frame.source.edit(|pixels| pixels.mask.fill(0.0));
     }
-    let mut found = given.clone();
-    register(&mut found, &body, 3).unwrap();
+    let found = registered(&given, &body, 3);
     assert!(apart(&given, &found, &body) < 1e-3);
 }
 
@@ -155,7 +152,7 @@ fn clothes_are_found_as_far_out_as_they_are_and_an_occluder_is_no_outline() {
         posed.vertices.iter().zip(&normals).map(|(v, n)| *v + thick * n.normalize_or_zero()).collect();
     let mesh = visibility::RayMesh::new(&dressed, &body.faces).unwrap();
     let hidden = |column: u32| column >= 128;
-    let (camera, ridges) = (frame.camera, ridges(&body.faces));
+    let (camera, shared_edges) = (frame.camera, shared_edges(&body.faces));
     let mut distances = [false, true].map(|occluded| {
         let see = |pixels: &mut Pixels| {
             for i in 0..256 * 256u32 {
@@ -167,9 +164,9 @@ fn clothes_are_found_as_far_out_as_they_are_and_an_occluder_is_no_outline() {
         let mut pixels = frame.pixels().unwrap();
         see(&mut pixels);
         frame.source = pixels.into();
-        let picture = Picture::new(frame, &posed).unwrap().unwrap();
-        let looking = Looking { reach: 10.0, blur: 0.0, unit: 1.0 };
-        let found = look(&picture, &posed.vertices, (&body.faces, &ridges), looking).unwrap();
+        let crop = Crop::new(frame, &posed).unwrap().unwrap();
+        let options = ObservationOptions { reach: 10.0, blur: 0.0, unit: 1.0 };
+        let found = observe(&crop, &posed.vertices, (&body.faces, &shared_edges), options).unwrap();
         let each = found.edges.iter().map(|edge| {
             let column = camera.project(posed.vertices[edge.vertex as usize]).unwrap().x;
             (edge.distance / edge.scale, column)
@@ -194,14 +191,14 @@ fn a_wrong_focal_length_is_mostly_mended_where_no_other_camera_says_what_it_is()
     for (factor, most) in [(0.5, 0.25), (4.0, 0.3)] {
         let mut given = truth.clone();
         for frame in &mut given.train {
-            frame.placement = shifted(frame.placement, away(frame, &body).unwrap(), 1.0 / factor);
+            frame.placement = rescaled(frame.placement, root_depth(frame, &body).unwrap(), 1.0 / factor);
             frame.camera.focal *= factor;
         }
-        register(&mut given, &body, 12).unwrap();
-        let (found, true_focal) = (given.train[0].camera.focal.x, truth.train[0].camera.focal.x);
+        let registered = registered(&given, &body, 12);
+        let (found, true_focal) = (registered.train[0].camera.focal.x, truth.train[0].camera.focal.x);
         let left = (true_focal / found - 1.0).abs() / (factor.recip() - 1.0).abs();
         assert!(left < most, "{factor}: {found} for {true_focal}");
-        assert!(given.train.iter().all(|f| f.camera.focal.x == found));
+        assert!(registered.train.iter().all(|f| f.camera.focal.x == found));
     }
 }
 
@@ -210,22 +207,22 @@ fn the_picture_moves_with_the_perspective_as_by_finite_differences() {
     let body = BodyModel::embedded();
     let truth = demo(&small(), &body).unwrap();
     let frame = &truth.train[0];
-    let way = away(frame, &body).unwrap();
-    let posed = |nearness: f32| {
+    let way = root_depth(frame, &body).unwrap();
+    let posed = |inverse_depth: f32| {
         let mut camera = frame.camera;
-        camera.focal /= nearness;
-        let placement = shifted(frame.placement, way, nearness);
+        camera.focal /= inverse_depth;
+        let placement = rescaled(frame.placement, way, inverse_depth);
         (body.pose(&body.shaped(&frame.betas), &frame.pose, placement), camera)
     };
-    for nearness in [0.6, 1.0, 1.7] {
-        let (here, camera) = posed(nearness);
-        let perspective = equations::Perspective { nearness, depth: way.length() };
-        let ([more, less], h) = ([posed(nearness + 0.01), posed(nearness - 0.01)], 0.02);
+    for inverse_depth in [0.6, 1.0, 1.7] {
+        let (here, camera) = posed(inverse_depth);
+        let perspective = equations::Perspective { inverse_depth, depth: way.length() };
+        let ([more, less], h) = ([posed(inverse_depth + 0.01), posed(inverse_depth - 0.01)], 0.02);
         let project =
             |(posed, camera): &(Posed, Camera), v: usize| camera.project(posed.vertices[v]).unwrap().truncate();
         for v in (0..body.num_vertices()).step_by(11) {
             let numeric = (project(&more, v) - project(&less, v)) / h;
-            let shift = perspective.of(&camera, here.vertices[v]);
+            let shift = perspective.derivative(&camera, here.vertices[v]);
             let at = |h: f32| camera.project(here.vertices[v] + h * shift).unwrap().truncate();
             let analytic = (at(0.01) - at(-0.01)) / 0.02;
             assert!((numeric - analytic).length() < 0.02 + 0.02 * numeric.length(), "{numeric} {analytic}");

@@ -7,7 +7,7 @@ use std::time::Instant;
 use anyhow::{Context, Result};
 use clap::Args;
 use glam::Quat;
-use occnerf::capture::Capture;
+use occnerf::capture::{Capture, Mended, Registered};
 use occnerf::{Config, Method, PreparedFrame, Preset, PriorColors, PriorRenderer, Scene, evaluate, register};
 use smpl::BodyModel;
 use synth::{DemoConfig, Perturbation, demo};
@@ -58,10 +58,10 @@ const PRIORS: [(&str, Perturbation); 10] = {
 
 /// psnr_mask of unseen views of the body as it is, in the mean colours that frames show of it under
 /// the light of the video.
-fn psnr(capture: &Capture, model: &BodyModel) -> Result<f64> {
+fn psnr(registered: Registered, model: &BodyModel) -> Result<f64> {
     let mut config = Config::preset(Preset::Fast, Method::Prior);
     config.registration.rounds = 0;
-    let scene = Scene::new(capture, model, &config)?;
+    let scene = Scene::prepare(registered, model, &config)?;
     let colors = PriorColors::measure(&scene)?;
     let frames: Vec<&PreparedFrame> = scene.eval.iter().collect();
     let scores = evaluate(&scene, &mut PriorRenderer::new(&scene.body, &colors), &frames, None, |_, _| {})?;
@@ -102,24 +102,24 @@ pub fn registration(arguments: &RegistrationArguments) -> Result<()> {
     let best_with = |masks: &Perturbation| -> Result<f64> {
         let mut best = truth.clone();
         masks.apply(&mut best, &body)?;
-        register(&mut best, &body, rounds)?;
-        psnr(&best, &body)
+        psnr(register(Mended(best), &body, rounds)?, &body)
     };
     let exact = best_with(&Perturbation::NONE)?;
     for (index, (name, wrong)) in PRIORS.iter().enumerate().filter(|(_, (name, _))| asked(name)) {
         let (mut capture, mut model) = (if index == 0 { truth.clone() } else { demo(&given, &body)? }, body.clone());
         wrong.apply(&mut capture, &model)?;
         wrong.spoil_body(&mut model);
-        let (before, given_psnr) = (Error::measure((&truth, &body), (&capture, &model))?, psnr(&capture, &model)?);
+        let before = Error::measure((&truth, &body), (&capture, &model))?;
+        let given_psnr = psnr(capture.clone().into(), &model)?;
         let start = Instant::now();
-        register(&mut capture, &model, rounds)?;
+        let registered = register(Mended(capture), &model, rounds)?;
         let seconds = start.elapsed().as_secs_f64();
-        let after = Error::measure((&truth, &body), (&capture, &model))?;
+        let after = Error::measure((&truth, &body), (&registered.capture, &model))?;
         let mut line = vec![(*name).to_owned()];
         for (before, after) in before.rows().into_iter().zip(after.rows()) {
             line.extend([format!("{before:.2}"), format!("{after:.2}")]);
         }
-        let found_psnr = psnr(&capture, &model)?;
+        let found_psnr = psnr(registered, &model)?;
         let Perturbation { ragged_pixels, mask_pixels, .. } = *wrong;
         let masks = Perturbation { ragged_pixels, mask_pixels, ..Perturbation::NONE };
         let best = if masks == Perturbation::NONE { exact } else { best_with(&masks)? };

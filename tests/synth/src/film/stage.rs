@@ -95,9 +95,6 @@ impl Stage<'_> {
             train,
             eval: eval.into_iter().map(|(_, frame)| frame).collect(),
             mean_betas: self.betas,
-            registered: false,
-            clothes: Vec::new(),
-            mended: false,
         })
     }
 }

@@ -1,4 +1,4 @@
-//! What registration changes of a prior, and how the posed surface moves with it.
+//! The unknowns of a frame: corrections of its pose, and the Jacobian of the posed surface by them.
 
 use glam::{Quat, Vec3, Vec3A};
 use smpl::{BodyModel, Placement, Posed, Shaped};
@@ -7,32 +7,38 @@ use volrender::Camera;
 
 use crate::capture::Frame;
 
-/// How a frame's pose is changed, in the world's axes: the whole is shifted, and every bone is
-/// turned about its joint, which moves what hangs on it without turning that.
-pub(super) type Change = Vec<Vec3>;
+/// Correction of a frame's pose: a translation of the body in camera axes, then a rotation vector of
+/// each bone about its joint in world axes. A bone's rotation translates its children and does not
+/// rotate them.
+pub(super) type Correction = Vec<Vec3>;
 
-/// The pose and the place of a frame after `change`: a shift, then a turn for each bone.
-pub(super) fn changed(frame: &Frame, model: &BodyModel, shape: &Shaped, change: &[Vec3]) -> (Vec<Vec3>, Placement) {
+/// The corrected pose and placement of a frame.
+pub(super) fn corrected(
+    frame: &Frame,
+    model: &BodyModel,
+    shape: &Shaped,
+    correction: &[Vec3],
+) -> (Vec<Vec3>, Placement) {
     let root = shape.joints.first().copied().unwrap_or(Vec3::ZERO);
     let about = match frame.placement {
         Placement::Origin { rotation, .. } => Quat::from_scaled_axis(rotation),
         Placement::Pelvis { .. } => Quat::IDENTITY,
     };
-    let shift = frame.camera.world_to_camera.matrix3.transpose() * change[0];
+    let shift = frame.camera.world_to_camera.matrix3.transpose() * correction[0];
     let mut pose = frame.pose.clone();
-    // Where each bone points, before and after.
+    // World orientation of each bone, given and corrected.
     let mut bones: Vec<(Quat, Quat)> = Vec::with_capacity(pose.len());
-    let turns = change[1..].iter().map(|turn| Quat::from_scaled_axis(*turn));
+    let turns = correction[1..].iter().map(|turn| Quat::from_scaled_axis(*turn));
     for ((local, turn), parent) in pose.iter_mut().zip(turns).zip(&model.parents) {
-        // What is not finite is to stay so.
+        // A rotation that is not finite stays as it is.
         let given = if local.is_finite() { Quat::from_scaled_axis(*local) } else { Quat::IDENTITY };
-        let (before, after) = match parent {
+        let (original, corrected) = match parent {
             Some(parent) => {
-                let (before, after) = (bones[*parent].0 * given, turn * bones[*parent].0 * given);
+                let (original, corrected) = (bones[*parent].0 * given, turn * bones[*parent].0 * given);
                 if local.is_finite() {
-                    *local = (bones[*parent].1.inverse() * after).normalize().to_scaled_axis();
+                    *local = (bones[*parent].1.inverse() * corrected).normalize().to_scaled_axis();
                 }
-                (before, after)
+                (original, corrected)
             }
             None => {
                 if let (Placement::Pelvis { .. }, true) = (frame.placement, local.is_finite()) {
@@ -41,12 +47,12 @@ pub(super) fn changed(frame: &Frame, model: &BodyModel, shape: &Shaped, change: 
                 (about * given, turn * about * given)
             }
         };
-        bones.push((before, after));
+        bones.push((original, corrected));
     }
     let placement = match frame.placement {
         Placement::Pelvis { translation } => Placement::Pelvis { translation: translation + shift },
         Placement::Origin { translation, .. } => {
-            let after = Quat::from_scaled_axis(change[1]) * about;
+            let after = Quat::from_scaled_axis(correction[1]) * about;
             let translation = translation + about * root + shift - after * root;
             Placement::Origin { rotation: after.normalize().to_scaled_axis(), translation }
         }
@@ -54,36 +60,37 @@ pub(super) fn changed(frame: &Frame, model: &BodyModel, shape: &Shaped, change: 
     (pose, placement)
 }
 
-/// Derivative of one surface point: columns of the unknowns that move it.
+/// Sparse Jacobian of one surface point.
 #[derive(Clone, Debug, Default)]
-pub(super) struct Motion {
-    /// Index of an unknown of the frame's [`Change`], flattened.
+pub(super) struct PointJacobian {
+    /// Index of each unknown of the frame's [`Correction`], flattened.
     pub columns: Vec<u32>,
     /// Derivatives of the point in world axes.
     pub directions: Vec<Vec3>,
-    /// Where in `columns` the turn of each bone begins that the point hangs on, and by how much.
+    /// Position in `columns` of each bone's rotation that the point is skinned to, and its weight.
     pub bones: Vec<(usize, f32)>,
 }
 
-impl Motion {
-    /// Where in `columns` the unknowns are that turn the surface at the point, and their turns.
-    pub fn turns(&self) -> impl Iterator<Item = (usize, Vec3)> {
+impl PointJacobian {
+    /// Positions in `columns` of the unknowns that rotate the surface at the point, with its angular
+    /// velocity by them.
+    pub fn rotations(&self) -> impl Iterator<Item = (usize, Vec3)> {
         self.bones.iter().flat_map(|&(first, weight)| (0..3).map(move |i| (first + i, weight * Vec3::AXES[i])))
     }
 }
 
-/// Derivatives of points of a posed body.
-pub(super) struct Motions<'a> {
+/// Jacobian of the points of a posed body, without pose blend shapes.
+pub(super) struct SurfaceJacobian<'a> {
     model: &'a BodyModel,
     rest: &'a [Vec3],
     posed: &'a Posed,
-    /// The axes of the camera, in which the whole is shifted.
+    /// Camera axes in the world.
     axes: [Vec3A; 3],
     moved: Vec<Vec3A>,
     weights: Vec<f32>,
 }
 
-impl<'a> Motions<'a> {
+impl<'a> SurfaceJacobian<'a> {
     /// `rest` (V) are the shaped vertices.
     pub fn new(model: &'a BodyModel, rest: &'a [Vec3], posed: &'a Posed, camera: &Camera) -> Self {
         let joints = model.num_joints();
@@ -92,8 +99,8 @@ impl<'a> Motions<'a> {
         Self { model, rest, posed, axes, moved: vec![Vec3A::ZERO; joints], weights: vec![0.0; joints] }
     }
 
-    /// The derivatives of a vertex.
-    pub fn of(&mut self, vertex: usize, out: &mut Motion) {
+    /// Jacobian of a vertex.
+    pub fn at(&mut self, vertex: usize, out: &mut PointJacobian) {
         out.columns.clear();
         out.directions.clear();
         out.bones.clear();
@@ -120,7 +127,7 @@ impl<'a> Motions<'a> {
             let place = weight * Vec3A::from(self.posed.joints[joint]);
             push(3 + 3 * joint, Vec3A::AXES, &|axis| axis.cross(moved - place));
             match self.model.parents[joint] {
-                // The bone above takes the joint along, and does not turn what hangs on it.
+                // The parent's rotation moves the joint alone.
                 Some(parent) => {
                     self.moved[parent] += place;
                     self.weights[parent] += weight;
@@ -160,8 +167,8 @@ mod tests {
             };
             let shape = model.shaped(&[0.4, -0.7]);
             let frame = crate::scene::registration::tests::frame(pose, placement);
-            let at = |change: &[Vec3]| {
-                let (pose, placement) = changed(&frame, &model, &shape, change);
+            let at = |correction: &[Vec3]| {
+                let (pose, placement) = corrected(&frame, &model, &shape, correction);
                 let posed = model.pose(&shape, &pose, placement);
                 let mut normals = surface_query::vertex_normals(&posed.vertices, &model.faces);
                 normals.iter_mut().for_each(|n| *n = n.normalize_or_zero());
@@ -186,27 +193,27 @@ mod tests {
             prop_assert!(rigid.len() > 100, "{}", rigid.len());
             let still = vec![Vec3::ZERO; model.num_joints() + 1];
             let (posed, normals) = at(&still);
-            let mut motions = Motions::new(&model, &shape.vertices, &posed, &frame.camera);
-            let mut motion = Motion::default();
+            let mut surface = SurfaceJacobian::new(&model, &shape.vertices, &posed, &frame.camera);
+            let mut jacobian = PointJacobian::default();
             for unknown in 0..3 * still.len() {
                 let h = 1e-2;
                 let moved = |h: f32| {
-                    let mut change = still.clone();
-                    change[unknown / 3][unknown % 3] = h;
-                    at(&change)
+                    let mut correction = still.clone();
+                    correction[unknown / 3][unknown % 3] = h;
+                    at(&correction)
                 };
                 let ((more, more_normals), (less, less_normals)) = (moved(h), moved(-h));
                 for v in (0..model.num_vertices()).step_by(701) {
-                    motions.of(v, &mut motion);
+                    surface.at(v, &mut jacobian);
                     let numeric = (more.vertices[v] - less.vertices[v]) / (2.0 * h);
-                    let column = motion.columns.iter().position(|&c| c as usize == unknown);
-                    let exact = column.map_or(Vec3::ZERO, |c| motion.directions[c]);
+                    let column = jacobian.columns.iter().position(|&c| c as usize == unknown);
+                    let exact = column.map_or(Vec3::ZERO, |c| jacobian.directions[c]);
                     prop_assert!(exact.distance(numeric) < 1e-3, "vertex {v}, unknown {unknown}: {exact} {numeric}");
                 }
                 for &v in rigid.iter().step_by(rigid.len() / 9) {
-                    motions.of(v, &mut motion);
+                    surface.at(v, &mut jacobian);
                     let numeric = (more_normals[v] - less_normals[v]) / (2.0 * h);
-                    let mine = motion.turns().filter(|(column, _)| motion.columns[*column] as usize == unknown);
+                    let mine = jacobian.rotations().filter(|(column, _)| jacobian.columns[*column] as usize == unknown);
                     let exact: Vec3 = mine.map(|(_, turn)| turn.cross(normals[v])).sum();
                     prop_assert!(exact.distance(numeric) < 2e-3, "normal {v}, unknown {unknown}: {exact} {numeric}");
                 }

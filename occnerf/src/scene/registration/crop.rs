@@ -1,4 +1,4 @@
-//! A training frame, cut to the subject and reduced to what registration needs to see.
+//! A training frame, cropped to the subject and downsampled.
 
 use glam::{Vec2, Vec3};
 use smpl::Posed;
@@ -6,38 +6,38 @@ use volrender::Camera;
 
 use crate::capture::{CaptureError, Frame};
 
-/// Height of the subject in a reduced picture, pixels: an outline found to a tenth of its pixels is
-/// finer than what is known of any body's surface.
+/// Height of the subject in a crop, pixels: a tenth of one is below the accuracy of a body's
+/// surface.
 const HEIGHT: f32 = 240.0;
-/// Share of the subject's height by which a picture reaches beyond the posed prior.
+/// Margin around the posed prior, in multiples of the subject's height.
 const BORDER: f32 = 0.15;
-/// Largest side of a reduced picture.
+/// Largest side of a crop.
 const LARGEST: u32 = 1024;
 
-/// The subject in a frame, and what is known to stand in front.
-pub(super) struct Picture {
+/// The subject in a frame, and the known occluder.
+pub(super) struct Crop {
     pub camera: Camera,
-    /// Colour, premultiplied by coverage, and coverage, 0 to 255, (H, W).
+    /// Premultiplied colour and coverage, 0 to 255, (H, W).
     pixels: Vec<[u8; 4]>,
     pub occluder: Option<Vec<bool>>,
 }
 
-/// Colours of a picture, blurred: premultiplied by coverage, and coverage, (H, W).
+/// A blurred crop: premultiplied colour and coverage, (H, W).
 pub(super) struct Blurred {
     width: usize,
     pixels: Vec<[f32; 4]>,
 }
 
-/// A colour and its derivatives along the image's axes.
+/// A colour and its image derivatives.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Look {
+pub(super) struct ColorSample {
     pub color: Vec3,
     pub dx: Vec3,
     pub dy: Vec3,
 }
 
-impl Picture {
-    /// Cuts and reduces a frame around `posed`; `None` where that is outside the picture.
+impl Crop {
+    /// Crops a frame to `posed`; `None` where that is outside the image.
     pub fn new(frame: &Frame, posed: &Posed) -> Result<Option<Self>, CaptureError> {
         let (mut low, mut high) = (Vec2::INFINITY, Vec2::NEG_INFINITY);
         for p in posed.vertices.iter().filter_map(|&v| frame.camera.project(v)) {
@@ -56,7 +56,7 @@ impl Picture {
         let (width, height) = (reduced(x0, high.x), reduced(y0, high.y));
         let shown = frame.pixels()?;
         let across = frame.camera.width;
-        // Pixels of the frame that one of the reduced picture stands for.
+        // Pixels of the frame under one pixel of the crop.
         let block = |i: u32| {
             let (left, top) = (x0 + i % width * factor, y0 + i / width * factor);
             let rows = top..(top + factor).min(frame.camera.height);
@@ -65,12 +65,10 @@ impl Picture {
         let share = 255.0 / (factor * factor) as f32;
         let mean = |i: u32| {
             let mut sum = [0.0f32; 4];
-            for p in block(i) {
-                // Nothing is known of other pixels: something may stand in front.
-                if shown.mask[p] > 0.5 {
-                    sum[3] += shown.mask[p];
-                    (0..3).for_each(|c| sum[c] += shown.image.pixels[3 * p + c]);
-                }
+            // Pixels outside the mask may show an occluder.
+            for p in block(i).filter(|&p| shown.mask[p] > 0.5) {
+                sum[3] += shown.mask[p];
+                (0..3).for_each(|c| sum[c] += shown.image.pixels[3 * p + c]);
             }
             sum.map(|sum| (share * sum).round() as u8)
         };
@@ -87,29 +85,29 @@ impl Picture {
         self.pixels.iter().map(|p| f32::from(p[3]) / 255.0).collect()
     }
 
-    /// The pixel that a point of the image falls into.
+    /// Index of the pixel at an image point; `None` outside.
     pub fn pixel(&self, at: Vec2) -> Option<usize> {
         let (width, height) = (self.camera.width as f32, self.camera.height as f32);
         let inside = at.x >= 0.0 && at.y >= 0.0 && at.x < width && at.y < height;
         inside.then(|| at.y as usize * self.camera.width as usize + at.x as usize)
     }
 
-    /// Coverage between pixel centres; `None` beyond them.
-    pub fn between(&self, at: Vec2) -> Option<f32> {
+    /// Coverage, interpolated bilinearly; `None` beyond the outermost pixel centres.
+    pub fn coverage_at(&self, at: Vec2) -> Option<f32> {
         let (corners, share) = corners(at, self.camera.width as usize, self.camera.height as usize)?;
         let [a, b, c, d] = corners.map(|i| f32::from(self.pixels[i][3]) / 255.0);
         let (top, bottom) = (a + share.x * (b - a), c + share.x * (d - c));
         Some(top + share.y * (bottom - top))
     }
 
-    /// The picture under a Gaussian of this standard deviation, pixels.
+    /// The crop under a Gaussian blur with standard deviation `sigma`, pixels; black and empty beyond
+    /// its border.
     pub fn blurred(&self, sigma: f32) -> Blurred {
         let (width, height) = (self.camera.width as usize, self.camera.height as usize);
         let radius = (2.5 * sigma).ceil() as usize;
         let weight = |k: usize| (-0.5 * ((k as f32 - radius as f32) / sigma).powi(2)).exp();
         let total: f32 = (0..=2 * radius).map(weight).sum();
         let kernel: Vec<f32> = (0..=2 * radius).map(|k| weight(k) / total).collect();
-        // Beyond the picture there is nothing.
         let along = |from: &[[f32; 4]], length: usize, stride: usize| -> Vec<[f32; 4]> {
             let at = |i: usize| {
                 let place = i / stride % length;
@@ -131,9 +129,9 @@ impl Picture {
 }
 
 impl Blurred {
-    /// The subject's colour between pixel centres; `None` beyond them, and where it does not cover
-    /// `least` of every pixel around.
-    pub fn look(&self, at: Vec2, least: f32) -> Option<Look> {
+    /// The subject's colour, interpolated bilinearly; `None` beyond the outermost pixel centres, and
+    /// where the coverage of one of the four pixels is below `least`.
+    pub fn sample(&self, at: Vec2, least: f32) -> Option<ColorSample> {
         let (corners, share) = corners(at, self.width, self.pixels.len() / self.width.max(1))?;
         let corners = corners.map(|i| self.pixels[i]);
         if corners.iter().any(|c| c[3] < least) {
@@ -141,11 +139,11 @@ impl Blurred {
         }
         let [a, b, c, d] = corners.map(|c| Vec3::new(c[0], c[1], c[2]) / c[3]);
         let (top, bottom) = (a.lerp(b, share.x), c.lerp(d, share.x));
-        Some(Look { color: top.lerp(bottom, share.y), dx: (b - a).lerp(d - c, share.y), dy: bottom - top })
+        Some(ColorSample { color: top.lerp(bottom, share.y), dx: (b - a).lerp(d - c, share.y), dy: bottom - top })
     }
 }
 
-/// The four pixels whose centres lie around a point, row by row, and how far towards the last it is;
+/// The four pixels around a point, row by row, and its fractional offset from the first centre;
 /// `None` beyond the centres.
 fn corners(at: Vec2, width: usize, height: usize) -> Option<([usize; 4], Vec2)> {
     let at = at - 0.5;
