@@ -25,7 +25,7 @@ const LINES: usize = 20;
 /// What to check.
 #[derive(Args)]
 pub struct CheckArguments {
-    /// A capture, as of `train`; the embedded demo if left out
+    /// A capture, as of `train`; the demo if left out
     scene: Option<String>,
     /// The picture to write [default: check.png in the capture, or demo-check.png]
     #[arg(long, value_name = "FILE.png")]
