@@ -55,9 +55,9 @@ pub fn check(arguments: &CheckArguments) -> Result<()> {
     load.unseen = true;
     let source = source::load(arguments.scene.as_deref(), arguments.body.as_deref(), &load)?;
     let found = occnerf::check(&source.capture, &source.model)?;
-    let path = arguments.out.clone().unwrap_or_else(|| match Path::new(&source.scene) {
-        scene if scene.is_dir() => scene.join("check.png"),
-        _ => PathBuf::from(format!("{}-check.png", crate::train::scene_name(Some(&source.scene)))),
+    let path = arguments.out.clone().unwrap_or_else(|| match source.scene.as_str() {
+        source::DEMO => PathBuf::from("demo-check.png"),
+        scene => Path::new(scene).join("check.png"),
     });
     save(&picture(&source, &found)?, &path)?;
     tell(&found, arguments.all);
