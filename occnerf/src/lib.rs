@@ -4,12 +4,13 @@
 //! frame, becomes a field of density and colour in the body's rest pose that renders from any side.
 //!
 //! ```
-//! use occnerf::{Config, Method, Preset, Scene, Trainer, capture};
+//! use occnerf::capture::{LoadOptions, load_capture};
+//! use occnerf::{Config, Method, Preset, Scene, Trainer};
 //!
 //! # fn main() -> Result<(), Box<dyn std::error::Error>> {
 //! let body = smpl::BodyModel::embedded();
-//! let demo = synth::DemoConfig { size: 48, frames: 4, eval_cameras: 1, ..Default::default() };
-//! let capture = synth::demo(&demo, &body)?;
+//! let options = LoadOptions { resize: Some(48), max_frames: Some(4), ..Default::default() };
+//! let capture = load_capture("../xtask/demo".as_ref(), &body, &options)?;
 //! let mut config = Config::preset(Preset::Fast, Method::Occnerf);
 //! config.steps = 2;
 //! let scene = Scene::new(&capture, &body, &config)?;

@@ -25,7 +25,7 @@ const LINES: usize = 20;
 /// What to check.
 #[derive(Args)]
 pub struct CheckArguments {
-    /// A capture, as of `train`; the embedded demo if left out
+    /// A capture, as of `train`; the demo if left out
     scene: Option<String>,
     /// The picture to write [default: check.png in the capture, or demo-check.png]
     #[arg(long, value_name = "FILE.png")]
@@ -55,9 +55,9 @@ pub fn check(arguments: &CheckArguments) -> Result<()> {
     load.unseen = true;
     let source = source::load(arguments.scene.as_deref(), arguments.body.as_deref(), &load)?;
     let found = occnerf::check(&source.capture, &source.model)?;
-    let path = arguments.out.clone().unwrap_or_else(|| match Path::new(&source.scene) {
-        scene if scene.is_dir() => scene.join("check.png"),
-        _ => PathBuf::from(format!("{}-check.png", crate::train::scene_name(Some(&source.scene)))),
+    let path = arguments.out.clone().unwrap_or_else(|| match source.scene.as_str() {
+        source::DEMO => PathBuf::from("demo-check.png"),
+        scene => Path::new(scene).join("check.png"),
     });
     save(&picture(&source, &found)?, &path)?;
     tell(&found, arguments.all);

@@ -9,7 +9,6 @@ mod commands;
 mod convert;
 pub mod eval;
 mod export;
-pub mod film;
 mod html;
 mod import;
 pub mod list;

@@ -1,27 +1,25 @@
-//! Where the frames come from: the embedded demo, a character filmed on the spot, or a capture on
-//! disk with its body model.
+//! Where the frames come from: a capture on disk with its body model, or the demo, which is one too.
 
 use std::cell::RefCell;
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context, Result, bail, ensure};
+use anyhow::{Context, Result, bail};
 use clap::Args;
 use occnerf::capture::{Capture, LoadOptions, Mended, Registered, find_body, load_capture, own_body};
 use occnerf::{Config, Person, Scene, mend_masks};
 use serde::Serialize;
 use smpl::BodyModel;
-use synth::{DemoConfig, SynthConfig, Synthetic, demo};
 
-use crate::film::{film, is_character};
-
-/// Name of the scene that needs no files.
+/// Name of the scene that needs no other files.
 pub const DEMO: &str = "demo";
+/// The demo's capture, which `cargo lab synth --no-body --out xtask/demo --force` writes.
+pub const DEMO_FOLDER: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/demo");
 /// Environment variable that names a body model.
 const BODY_VARIABLE: &str = "SMPL_MODEL";
 
 /// A capture with its prior, and where both came from.
 pub struct Source {
-    /// `demo`, a character or a directory.
+    /// `demo`, or a directory.
     pub scene: String,
     /// The body model's file.
     pub body: Option<PathBuf>,
@@ -144,37 +142,39 @@ pub fn load_with(
     edit: impl FnOnce(&mut Capture, &mut BodyModel) -> Result<()>,
 ) -> Result<Source> {
     let scene = scene.unwrap_or(DEMO);
-    let directory = Path::new(scene);
-    let given = *options != LoadOptions::default();
-    let (file, mut capture, mut model) = if scene == DEMO {
-        ensure!(!given, "the demo takes none of the options that say how a capture is read");
-        let model = BodyModel::embedded();
-        (None, demo(&DemoConfig::default(), &model)?, model)
-    } else if directory.is_file() && is_character(directory) {
-        if given || body.is_some() {
-            bail!("{scene}: a character takes none of the options of a capture; use synth to choose how it is filmed");
-        }
-        let Synthetic { capture, body, .. } = film(Some(directory), None, &SynthConfig::default())?;
-        (None, capture, body)
-    } else if directory.is_dir() {
-        let variable = std::env::var_os(BODY_VARIABLE).map(PathBuf::from);
-        let file = match body.map(Path::to_owned).or_else(|| own_body(directory)).or(variable) {
-            Some(file) => file,
-            None => find_body(directory).with_context(|| {
-                format!("a capture needs the body model it was fitted with (--body FILE.npz, or {BODY_VARIABLE})")
-            })?,
-        };
-        let model = BodyModel::load(&file)?;
-        let capture = load_capture(directory, &model, options)?;
-        (Some(file), capture, model)
+    let directory = Path::new(if scene == DEMO { DEMO_FOLDER } else { scene });
+    if directory.is_file() && is_character(directory) {
+        bail!("{scene}: a character; film it with cargo lab synth {scene} --out DIR, then cargo xtask train DIR");
+    }
+    if !directory.is_dir() {
+        let expected =
+            if scene == DEMO { "the demo, in a clone of the sources" } else { "a capture, or no SCENE for the demo" };
+        bail!("{}: no such directory; expected {expected}", directory.display());
+    }
+    let file = if scene == DEMO {
+        None
     } else {
-        bail!("{scene}: no such directory; expected a capture, a .glb or .gltf character, or no SCENE for the demo");
+        let variable = || std::env::var_os(BODY_VARIABLE).map(PathBuf::from);
+        match body.map(Path::to_owned).or_else(|| own_body(directory)).or_else(variable) {
+            Some(file) => Some(file),
+            None => Some(find_body(directory).with_context(|| {
+                format!("a capture needs the body model it was fitted with (--body FILE.npz, or {BODY_VARIABLE})")
+            })?),
+        }
     };
+    let mut model = file.as_deref().map_or_else(|| Ok(BodyModel::embedded()), BodyModel::load)?;
+    let mut capture = load_capture(directory, &model, options)?;
     edit(&mut capture, &mut model)?;
     // The demo's bodies have the lengths that the embedded body has.
     let model = if scene == DEMO { model } else { model.with_limb_lengths() };
     let (scene, load) = (scene.to_owned(), options.clone());
     Ok(Source { scene, body: file, load, capture, model, registered: RefCell::default() })
+}
+
+/// Whether `path` is named like a rigged character.
+pub fn is_character(path: &Path) -> bool {
+    let extension = path.extension().and_then(|e| e.to_str()).unwrap_or("");
+    ["glb", "gltf"].iter().any(|known| extension.eq_ignore_ascii_case(known))
 }
 
 #[cfg(test)]

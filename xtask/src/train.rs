@@ -25,9 +25,8 @@ use crate::table;
 /// Arguments of `train`.
 #[derive(Args)]
 pub struct TrainArguments {
-    /// A capture (raw ZJU-MoCap, or HumanNeRF's prepared or wild layout), or a rigged .glb or .gltf
-    /// character, of which one is made as synth does; the embedded demo if left out or "demo" (a
-    /// folder of that name is ./demo)
+    /// A capture: raw ZJU-MoCap, or HumanNeRF's prepared or wild layout; the demo if left out or
+    /// "demo" (a folder of that name is ./demo)
     pub scene: Option<String>,
     /// Run directory [default: runs/SCENE-METHOD]
     #[arg(long)]

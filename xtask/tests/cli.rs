@@ -49,6 +49,9 @@ fn scenes_that_are_none_are_refused_and_leave_no_run_behind() {
     refused(&["train", text(&empty), "--out", text(&out)], &[text(&empty), "body model", "--body"]);
     let body = empty.join("none.npz");
     refused(&["train", text(&empty), "--body", text(&body), "--out", text(&out)], &["none.npz"]);
+    let character = empty.join("walker.GLB");
+    std::fs::write(&character, b"glTF").unwrap();
+    refused(&["train", text(&character), "--out", text(&out)], &["walker.GLB", "cargo lab synth", "cargo xtask train"]);
     assert!(!out.exists());
 }
 
@@ -58,7 +61,6 @@ fn settings_that_cannot_be_are_refused_by_key() {
     refused(&["train", "--set", "samples=0"], &["samples", "1 to 1024"]);
     refused(&["train", "--set", "rates.table=nan"], &["rates.table"]);
     refused(&["train", "--set", "samples=many"], &["samples=many", "whole number"]);
-    refused(&["train", "--resize", "64"], &["demo", "options"]);
 }
 
 #[test]

@@ -3,6 +3,7 @@
 
 mod bench;
 mod budget;
+mod corrupt;
 mod front;
 mod methods;
 mod obstacle;
@@ -39,6 +40,8 @@ enum Command {
     Front(front::FrontArguments),
     /// Writes an occluded capture of a synthetic person to disk, in a published dataset format.
     Synth(synth::SynthArguments),
+    /// Writes a capture with a corrupted prior, corrupted masks or an obstacle to disk.
+    Corrupt(corrupt::CorruptArguments),
     /// Runs one function of one crate on numpy arrays.
     Probe(probe::ProbeArguments),
 }
@@ -51,6 +54,7 @@ fn run(arguments: Arguments) -> Result<()> {
         Command::Report(arguments) => report::report(&arguments),
         Command::Front(arguments) => front::front(&arguments),
         Command::Synth(arguments) => synth::synth(&arguments),
+        Command::Corrupt(arguments) => corrupt::corrupt(&arguments),
         Command::Probe(arguments) => probe::probe(&arguments),
     }
 }

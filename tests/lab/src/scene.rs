@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use synth::{Obstacle, Perturbation};
 use xtask::run::{RunConfig, write};
-use xtask::source::{LoadArguments, Source, load_with};
+use xtask::source::{DEMO, LoadArguments, Source, load_with};
 
 use crate::obstacle::ObstacleArguments;
 
@@ -51,7 +51,7 @@ impl SceneOptions {
 
 /// Puts the simulated obstacle before the training camera of raw ZJU-MoCap.
 fn occlude(capture: &mut Capture, directory: &Path, occlusion: Option<Obstacle>) -> Result<()> {
-    if !directory.is_dir() || Layout::detect(directory)? != Layout::ZjuMocap {
+    if directory == Path::new(DEMO) || Layout::detect(directory)? != Layout::ZjuMocap {
         let scene = directory.display();
         ensure!(occlusion.is_none(), "{scene}: takes no obstacle, only raw ZJU-MoCap does");
         return Ok(());

@@ -2,15 +2,17 @@
 
 use std::path::{Path, PathBuf};
 
-use anyhow::{Error, Result, bail, ensure};
+use anyhow::{Context, Error, Result, bail, ensure};
 use clap::{Args, ValueEnum};
+use indicatif::{ProgressBar, ProgressStyle};
 use occnerf::capture::Layout;
-use synth::{Obstacle, Occlusion, SynthConfig, Synthetic};
+use smpl::{Character, MotionClip};
+use synth::{BODY, Obstacle, Occlusion, SynthConfig, Synthetic, synthesise};
 
 use crate::obstacle::ObstacleArguments;
-use xtask::film::{bar, film, is_character};
 use xtask::place::{beside, not_within, take_place, vacant};
 use xtask::process::{results_in, say};
+use xtask::source::is_character;
 
 /// What a finished directory holds, and nothing else does.
 const MARK: &str = "synth.json";
@@ -38,18 +40,49 @@ enum OcclusionName {
     Objects,
 }
 
+/// Where a capture is written.
+#[derive(Args)]
+pub struct OutArguments {
+    /// Directory to write, new or empty
+    #[arg(long)]
+    pub out: PathBuf,
+    /// Replace what the same command wrote to --out earlier
+    #[arg(long)]
+    force: bool,
+}
+
+impl OutArguments {
+    /// Errors unless --out may be written.
+    pub fn vacant(&self, mark: &str) -> Result<()> {
+        vacant(&self.out, self.force, mark)
+    }
+
+    /// Fills --out: everything is written beside it, `text` into the file `mark`, and takes its
+    /// place when it is complete.
+    pub fn fill(&self, mark: &str, text: &str, write: impl FnOnce(&Path) -> Result<()>) -> Result<()> {
+        let partial = beside(&self.out, "partial")?;
+        let written = xtask::run::make_directory(&partial)
+            .and_then(|()| write(&partial))
+            .and_then(|()| xtask::run::write(&partial.join(mark), text))
+            .and_then(|()| take_place(&partial, &self.out, self.force, mark));
+        if written.is_err() {
+            let _ = std::fs::remove_dir_all(&partial);
+        }
+        written
+    }
+}
+
 /// What to make, and where to.
 #[derive(Args)]
 pub struct SynthArguments {
     /// A rigged .glb or .gltf; the embedded person if left out. Its mesh at rest becomes the body
     /// model, with as many joints as the rig has (poses are then 3 numbers a joint, not 72)
     character: Option<PathBuf>,
-    /// Directory to write, new or empty
+    #[command(flatten)]
+    out: OutArguments,
+    /// Write no body.safetensors: for the demo of xtask, whose program has the embedded person's body
     #[arg(long)]
-    out: PathBuf,
-    /// Replace what an earlier synth wrote to --out
-    #[arg(long)]
-    force: bool,
+    no_body: bool,
     /// Layout of the files
     #[arg(long, default_value = "humannerf")]
     format: FormatName,
@@ -124,14 +157,14 @@ impl SynthArguments {
     }
 }
 
-/// Runs the command: everything is written beside --out and takes its place when it is complete.
+/// Runs the command.
 pub fn synth(arguments: &SynthArguments) -> Result<()> {
     let config = arguments.config()?;
-    let out = &arguments.out;
+    let out = &arguments.out.out;
     if let Some(path) = arguments.character.as_deref().filter(|path| !is_character(path)) {
         bail!("{}: not a character; expected a .glb or .gltf", path.display());
     }
-    vacant(out, arguments.force, MARK)?;
+    arguments.out.vacant(MARK)?;
     for (what, path) in [("the character", &arguments.character), ("--motion", &arguments.motion)] {
         if let Some(path) = path {
             not_within(path, out, what)?;
@@ -143,12 +176,14 @@ pub fn synth(arguments: &SynthArguments) -> Result<()> {
         FormatName::Ocmotion => Layout::Wild,
     };
     let synthetic = film(arguments.character.as_deref(), arguments.motion.as_deref(), &config)?;
-    let partial = beside(out, "partial")?;
-    let written = write(&synthetic, &partial, layout).and_then(|()| take_place(&partial, out, arguments.force, MARK));
-    if let Err(error) = written {
-        let _ = std::fs::remove_dir_all(&partial);
-        return Err(error);
-    }
+    let mark = serde_json::json!({ "config": synthetic.config, "hidden_fraction": synthetic.hidden_fraction });
+    arguments.out.fill(MARK, &serde_json::to_string_pretty(&mark)?, |directory| {
+        let bar = bar("writing", synthetic.num_pictures(layout));
+        let written = synthetic.write(directory, layout, &|_| bar.inc(1));
+        bar.finish_and_clear();
+        written.map_err(Error::from).map_err(results_in(directory))?;
+        if arguments.no_body { std::fs::remove_file(directory.join(BODY)).map_err(Error::from) } else { Ok(()) }
+    })?;
     let capture = &synthetic.capture;
     say!(
         "{}: {} frames, {} views kept back, {:.1} % of the person hidden where anything is, {} joints, {} vertices",
@@ -163,12 +198,25 @@ pub fn synth(arguments: &SynthArguments) -> Result<()> {
     Ok(())
 }
 
-fn write(synthetic: &Synthetic, directory: &Path, layout: Layout) -> Result<()> {
-    xtask::run::make_directory(directory)?;
-    let bar = bar("writing", synthetic.num_pictures(layout));
-    let written = synthetic.write(directory, layout, &|_| bar.inc(1));
-    written.map_err(Error::from).map_err(results_in(directory))?;
+/// Films `character`, or the embedded person, with a bar.
+fn film(character: Option<&Path>, motion: Option<&Path>, config: &SynthConfig) -> Result<Synthetic> {
+    let named = |path: &Path| path.display().to_string();
+    let character = character.map(|path| Character::load(path).map(|c| (c, named(path)))).transpose()?;
+    let motion = motion.map(MotionClip::load).transpose()?;
+    let bar = bar("filming", config.frames);
+    let synthetic = synthesise(character.as_ref().map(|(c, _)| c), motion.as_ref(), config, &|_| bar.inc(1));
     bar.finish_and_clear();
-    let mark = serde_json::json!({ "config": synthetic.config, "hidden_fraction": synthetic.hidden_fraction });
-    xtask::run::write(&directory.join(MARK), &serde_json::to_string_pretty(&mark)?)
+    match character {
+        Some((_, name)) => synthetic.context(name),
+        None => Ok(synthetic?),
+    }
+}
+
+/// A bar of `length` steps.
+pub fn bar(what: &'static str, length: usize) -> ProgressBar {
+    let bar = ProgressBar::new(length as u64);
+    if let Ok(style) = ProgressStyle::with_template("{bar:28} {pos}/{len} {msg}  {elapsed}") {
+        bar.set_style(style);
+    }
+    bar.with_message(what)
 }

@@ -82,7 +82,6 @@ fn without_time_a_sweep_says_what_is_left() {
     let said = done(&["bench", "pareto", "--minutes", "0", "--draw", "--out", out.to_str().unwrap()]);
     assert!(said.contains("0 runs in") && said.contains("points are left"), "{said}");
     refused(&["bench", "pareto", "/no/such/place"], &["/no/such/place"]);
-    refused(&["bench", "pareto", "--resize", "64"], &["demo", "options"]);
     refused(&["bench", "pareto", "--minutes=-1"], &["minutes"]);
     refused(&["bench", "stability", "--axes", "weather"], &["weather", "pose noise"]);
     refused(&["bench", "stability", "--side", "4"], &["--side 4"]);

@@ -5,8 +5,8 @@ mod common;
 
 use std::path::Path;
 
-use common::{folder, lab, refused, text};
-use occnerf::capture::LoadOptions;
+use common::{done, folder, lab, refused, text};
+use occnerf::capture::{Capture, Frame, LoadOptions, load_capture};
 use occnerf::{Config, Method, Preset, Trainer};
 
 /// Runs `synth` with few small frames, which must succeed; returns what it says.
@@ -37,6 +37,51 @@ fn every_format_is_written_and_trained_on() {
         assert!(Trainer::new(&scene, config).unwrap().step().unwrap().loss.is_finite());
     }
     assert_eq!(files(&place), 3, "nothing else is left beside them");
+}
+
+/// C libraries differ in the last bits of sines: numbers by so much, and hardly any pixel at all.
+const ROUNDING: f32 = 1e-5;
+
+#[test]
+fn the_demo_of_the_product_is_what_the_command_writes() {
+    let out = folder("synth-demo").join("demo");
+    done(&["synth", "--no-body", "--out", text(&out)]);
+    assert!(!out.join("body.safetensors").exists());
+    let body = smpl::BodyModel::embedded();
+    let read = |directory: &Path| load_capture(directory, &body, &LoadOptions::default()).unwrap();
+    let (made, kept) = (read(&out), read(Path::new(xtask::source::DEMO_FOLDER)));
+    let views = |capture: &Capture| -> Vec<(String, usize, Frame)> {
+        let train = capture.train.iter().enumerate().map(|(i, frame)| (String::new(), i, frame.clone()));
+        train.chain(capture.eval.iter().map(|v| (v.camera_name.clone(), v.train_index, v.frame.clone()))).collect()
+    };
+    let (made, kept) = (views(&made), views(&kept));
+    assert_eq!((made.len(), kept.len()), (150, 150));
+    for ((camera, index, a), (other, other_index, b)) in made.iter().zip(&kept) {
+        assert_eq!((camera, index, &a.name), (other, other_index, &b.name));
+        assert!(a.pose.iter().zip(&b.pose).all(|(a, b)| a.distance(*b) < ROUNDING), "{camera} {}", a.name);
+        assert!(a.betas.iter().zip(&b.betas).all(|(a, b)| (a - b).abs() < ROUNDING));
+        let matrix = |frame: &Frame| frame.camera.world_to_camera;
+        assert!(matrix(a).abs_diff_eq(matrix(b), ROUNDING) && a.camera.focal == b.camera.focal);
+        let (a, b) = (a.pixels().unwrap(), b.pixels().unwrap());
+        let differ = a.image.pixels.iter().zip(&b.image.pixels).filter(|(a, b)| a != b).count();
+        assert!(differ < 100 && a.image.width == b.image.width, "{camera} {index}: {differ}");
+    }
+}
+
+#[test]
+fn a_capture_is_corrupted_on_disk() {
+    let place = folder("corrupt");
+    let (capture, out) = (place.join("capture"), place.join("wrong"));
+    small(&capture, &[]);
+    let corrupt = ["corrupt", text(&capture), "--out", text(&out), "--wrong-pose", "5", "--wrong-mask", "-1"];
+    assert!(done(&corrupt).contains("4 frames, 2 views"));
+    refused(&corrupt, &["already holds a capture", "--force"]);
+    refused(&["corrupt", text(&out), "--out", text(&out), "--force"], &["lies in --out"]);
+    let read = |directory: &Path| xtask::source::load(Some(text(directory)), None, &LoadOptions::default()).unwrap();
+    let (right, wrong) = (read(&capture), read(&out));
+    let area = |source: &xtask::source::Source| source.capture.train[3].pixels().unwrap().mask.iter().sum::<f32>();
+    assert!(area(&wrong) < area(&right) && wrong.capture.train[0].pose != right.capture.train[0].pose);
+    assert_eq!(files(&place), 2, "nothing else is left beside them");
 }
 
 #[test]

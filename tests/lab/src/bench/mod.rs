@@ -74,7 +74,7 @@ enum What {
 /// What a sweep over captures is run on.
 #[derive(Args)]
 struct SceneArguments {
-    /// Captures, as `train` takes them [default: the embedded demo]
+    /// Captures, as `train` takes them [default: the demo]
     scenes: Vec<String>,
     /// The body model of the captures
     #[arg(long)]

@@ -1,22 +1,32 @@
 //! Where the files of a capture go, and its pictures and matrices as files hold them.
 
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicUsize, Ordering};
 
 use glam::{Affine3A, Mat3, Vec3};
 use image::{GrayImage, ImageFormat, RgbImage};
 use rayon::prelude::*;
-use smpl::Placement;
+use smpl::{BodyModel, Placement};
 
+use super::BODY;
 use capture::{CaptureError, Frame, Image};
 
 /// Where files go.
 pub(super) struct Folder<'a> {
     pub dir: &'a Path,
     pub progress: &'a (dyn Fn(usize) + Sync),
-    pub written: std::sync::atomic::AtomicUsize,
+    pub written: AtomicUsize,
 }
 
-impl Folder<'_> {
+impl<'a> Folder<'a> {
+    /// Makes the folder, with the body model in it.
+    pub fn new(dir: &'a Path, body: &BodyModel, progress: &'a (dyn Fn(usize) + Sync)) -> Result<Self, CaptureError> {
+        let folder = Self { dir, progress, written: AtomicUsize::new(0) };
+        folder.make("")?;
+        body.save(&dir.join(BODY))?;
+        Ok(folder)
+    }
+
     pub fn make(&self, below: &str) -> Result<PathBuf, CaptureError> {
         let path = self.dir.join(below);
         std::fs::create_dir_all(&path).map_err(CaptureError::io(&path))?;
@@ -41,7 +51,7 @@ impl Folder<'_> {
                 image::ImageError::IoError(source) => CaptureError::Io { path, source },
                 source => CaptureError::Picture { path, source },
             })?;
-            (self.progress)(self.written.fetch_add(1, std::sync::atomic::Ordering::Relaxed) + 1);
+            (self.progress)(self.written.fetch_add(1, Ordering::Relaxed) + 1);
             Ok(())
         };
         // Collected as results first, so that the error reported is the first in order whatever

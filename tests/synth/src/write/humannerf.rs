@@ -1,20 +1,29 @@
 //! HumanNeRF's prepared layout.
 
-use super::folder::{Folder, extrinsics, flat, frame_mask, origin, rows, unmixed};
-use super::pickle::Py;
-use crate::film::Synthetic;
-use capture::{CaptureError, Frame};
+use image::RgbImage;
+use smpl::{BodyModel, Placement};
 
-pub(super) fn write(synthetic: &Synthetic, folder: &Folder<'_>) -> Result<(), CaptureError> {
-    let capture = &synthetic.capture;
+use super::folder::{Folder, extrinsics, flat, frame_mask, rows, unmixed};
+use super::pickle::Py;
+use crate::demo::motion::Pose;
+use crate::perturbation::about_origin;
+use capture::{Capture, CaptureError, Frame};
+
+/// `photograph` gives the picture of a training frame.
+pub(super) fn write(
+    capture: &Capture,
+    body: &BodyModel,
+    photograph: &(dyn Fn(usize) -> Result<RgbImage, CaptureError> + Sync),
+    folder: &Folder<'_>,
+) -> Result<(), CaptureError> {
     let train: Vec<&Frame> = capture.train.iter().collect();
-    view(synthetic, folder, "", &train)?;
+    view(body, folder, "", &train)?;
     let names = |kind: &str, below: &str, frames: &[&Frame]| -> Vec<String> {
         frames.iter().map(|f| format!("{below}{kind}/{}.png", f.name)).collect()
     };
-    folder.pictures(&names("images", "", &train), |i| synthetic.photograph(i, true))?;
+    folder.pictures(&names("images", "", &train), photograph)?;
     folder.pictures(&names("masks", "", &train), |i| frame_mask(train[i]))?;
-    let shaped = synthetic.body.shaped(&capture.mean_betas);
+    let shaped = body.shaped(&capture.mean_betas);
     let canonical = Py::record([
         ("joints", Py::floats(&[shaped.joints.len(), 3], &flat(&shaped.joints))),
         ("avg_betas", Py::floats(&[capture.mean_betas.len()], &capture.mean_betas)),
@@ -24,7 +33,7 @@ pub(super) fn write(synthetic: &Synthetic, folder: &Folder<'_>) -> Result<(), Ca
     for frames in capture.eval.chunk_by(|a, b| a.camera_name == b.camera_name) {
         let below = format!("eval/{}/", frames[0].camera_name);
         let frames: Vec<&Frame> = frames.iter().map(|e| &e.frame).collect();
-        view(synthetic, folder, &below, &frames)?;
+        view(body, folder, &below, &frames)?;
         let picture = |i: usize| frames[i].pixels().map(|p| unmixed(&p.image, &p.mask));
         folder.pictures(&names("images", &below, &frames), picture)?;
         folder.pictures(&names("masks", &below, &frames), |i| frame_mask(frames[i]))?;
@@ -33,7 +42,7 @@ pub(super) fn write(synthetic: &Synthetic, folder: &Folder<'_>) -> Result<(), Ca
 }
 
 /// Cameras and bodies of one camera's frames, and folders for its pictures.
-fn view(synthetic: &Synthetic, folder: &Folder<'_>, below: &str, frames: &[&Frame]) -> Result<(), CaptureError> {
+fn view(body: &BodyModel, folder: &Folder<'_>, below: &str, frames: &[&Frame]) -> Result<(), CaptureError> {
     for kind in ["images", "masks"] {
         folder.make(&format!("{below}{kind}"))?;
     }
@@ -46,15 +55,20 @@ fn view(synthetic: &Synthetic, folder: &Folder<'_>, below: &str, frames: &[&Fram
         (frame.name.clone(), camera)
     });
     folder.file(&format!("{below}cameras.pkl"), Py::Dict(cameras.collect()).pickle())?;
-    let body = &synthetic.body;
     let infos = frames.iter().map(|frame| {
-        let (rh, th) = origin(frame);
         let shaped = body.shaped(&frame.betas);
-        let posed = body.pose(&shaped, &frame.pose, smpl::Placement::default());
+        let (pose, rh, th) = match frame.placement {
+            Placement::Origin { rotation, translation } => (frame.pose.clone(), rotation, translation),
+            Placement::Pelvis { .. } => {
+                let Pose { joints, rotation, translation } = about_origin(frame, shaped.joints[0]);
+                (joints, rotation.to_scaled_axis(), translation)
+            }
+        };
+        let posed = body.pose(&shaped, &pose, Placement::default());
         let info = Py::record([
             ("Rh", Py::floats(&[3], &rh.to_array())),
             ("Th", Py::floats(&[3], &th.to_array())),
-            ("poses", Py::floats(&[3 * frame.pose.len()], &flat(&frame.pose))),
+            ("poses", Py::floats(&[3 * pose.len()], &flat(&pose))),
             ("betas", Py::floats(&[frame.betas.len()], &frame.betas)),
             ("joints", Py::floats(&[posed.joints.len(), 3], &flat(&posed.joints))),
             ("tpose_joints", Py::floats(&[shaped.joints.len(), 3], &flat(&shaped.joints))),

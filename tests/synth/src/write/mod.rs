@@ -11,13 +11,36 @@ mod zju;
 use std::path::Path;
 
 use image::RgbImage;
+use smpl::BodyModel;
 
 use self::folder::{Folder, rgb, unmixed};
 use crate::film::Synthetic;
-use capture::{CaptureError, Layout};
+use capture::{Capture, CaptureError, Layout};
 
-/// The body model's file, found by [`super::find_body`].
-const BODY: &str = "body.safetensors";
+/// The body model's file in a written capture.
+pub const BODY: &str = "body.safetensors";
+
+/// Writes any capture into `dir` in HumanNeRF's prepared layout, with the body model as
+/// `body.safetensors`. Training frames that were read from files keep their photographs, others are
+/// black outside the mask. Masks of occluders are not written: the layout has none.
+///
+/// # Errors
+/// As of [`Synthetic::write`], and for pictures that cannot be read.
+pub fn write_capture(
+    capture: &Capture,
+    body: &BodyModel,
+    dir: &Path,
+    progress: &(dyn Fn(usize) + Sync),
+) -> Result<(), CaptureError> {
+    let photograph = |i: usize| {
+        let source = &capture.train[i].source;
+        match source.photograph() {
+            Some(photograph) if !source.is_hidden() => photograph.map(|image| rgb(&image)),
+            _ => source.pixels().map(|pixels| unmixed(&pixels.image, &pixels.mask)),
+        }
+    };
+    humannerf::write(capture, body, &photograph, &Folder::new(dir, body, progress)?)
+}
 
 impl Synthetic {
     /// Writes the capture into `dir`, which is made if it is not there, for `capture::load_capture`
@@ -33,11 +56,9 @@ impl Synthetic {
     /// [`CaptureError::Io`], [`CaptureError::Picture`], [`CaptureError::Array`]. What has been
     /// written by then stays.
     pub fn write(&self, dir: &Path, layout: Layout, progress: &(dyn Fn(usize) + Sync)) -> Result<(), CaptureError> {
-        let folder = Folder { dir, progress, written: std::sync::atomic::AtomicUsize::new(0) };
-        folder.make("")?;
-        self.body.save(&dir.join(BODY))?;
+        let folder = Folder::new(dir, &self.body, progress)?;
         match layout {
-            Layout::HumanNerf => humannerf::write(self, &folder),
+            Layout::HumanNerf => humannerf::write(&self.capture, &self.body, &|i| self.photograph(i, true), &folder),
             Layout::ZjuMocap => zju::write(self, &folder),
             Layout::Wild => wild::write(self, &folder),
         }

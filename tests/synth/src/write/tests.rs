@@ -8,7 +8,7 @@ use super::folder::byte;
 use capture::{Capture, Frame, Layout, LoadOptions, find_body, load_capture};
 use testkit::files::Directory;
 
-use crate::{Obstacle, Occlusion, Perturbation, SynthConfig, Synthetic, synthesise};
+use crate::{Obstacle, Occlusion, Perturbation, SynthConfig, Synthetic, synthesise, write_capture};
 
 const LAYOUTS: [Layout; 3] = [Layout::HumanNerf, Layout::ZjuMocap, Layout::Wild];
 
@@ -102,6 +102,30 @@ fn every_layout_reads_back_as_it_was_made() {
             assert_eq!((&a.camera_name, a.train_index), (&b.camera_name, b.train_index));
             same_view(&body, &a.frame, &b.frame);
             same_picture(layout, &a.frame, &b.frame);
+        }
+    }
+}
+
+#[test]
+fn a_corrupted_capture_reads_back_from_every_layout() {
+    for layout in LAYOUTS {
+        let (_from, mut body, mut capture) = round(central(), layout, &format!("corrupt-from-{layout:?}"));
+        let wrong = Perturbation { mask_pixels: -1, ..Perturbation::REAL };
+        wrong.apply(&mut capture, &body).unwrap();
+        wrong.spoil_body(&mut body);
+        let dir = Directory::new(&format!("corrupt-{layout:?}"));
+        write_capture(&capture, &body, dir.path(), &|_| {}).unwrap();
+        assert!(BodyModel::load(&find_body(dir.path()).unwrap()).unwrap() == body);
+        let read = load_capture(dir.path(), &body, &LoadOptions::default()).unwrap();
+        assert_eq!(read.mean_betas, capture.mean_betas);
+        let frames = |c: &Capture| -> Vec<Frame> {
+            c.train.iter().chain(c.eval.iter().map(|view| &view.frame)).cloned().collect()
+        };
+        let (given, found) = (frames(&capture), frames(&read));
+        assert_eq!(given.len(), found.len());
+        for (a, b) in given.iter().zip(&found) {
+            same_view(&body, a, b);
+            same_picture(Layout::HumanNerf, a, b);
         }
     }
 }
