@@ -53,7 +53,7 @@ impl<T: Copy> SparseRows<T> {
         self.columns[range.clone()].iter().zip(&self.values[range]).map(|(&column, &value)| (column as usize, value))
     }
 
-    /// Describes what is wrong with the structure, if anything.
+    /// The first fault of the structure.
     pub(crate) fn fault(&self, rows: usize, columns: usize) -> Option<String> {
         if self.offsets.len() != rows + 1 {
             return Some(format!("{} rows, expected {rows}", self.num_rows()));

@@ -19,7 +19,7 @@ pub const FILE: &str = "capacity.json";
 pub enum CapacityName {
     /// The preset's sizes, whatever the scene.
     Preset,
-    /// Grid, width, samples and steps from what the scene shows, and pruned after training.
+    /// Grid, width, samples and steps measured from the scene, and pruned after training.
     Auto,
 }
 

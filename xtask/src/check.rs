@@ -14,7 +14,7 @@ use crate::process::say;
 use crate::source::{self, LoadArguments, Source};
 use crate::table;
 
-/// Frames in the picture, and how many in a row.
+/// Frames in the picture, and in a row of it.
 const FRAMES: usize = 8;
 const COLUMNS: usize = 4;
 /// Longest side of a frame in the picture, pixels.

@@ -28,7 +28,7 @@ enum Command {
     Export(export::ExportArguments),
     /// Writes a run's person as one HTML page, to turn around and play.
     View(view::ViewArguments),
-    /// Makes a capture of a video from what a body estimator and a segmenter wrote.
+    /// Makes a capture of a video from the results of a body estimator and a segmenter.
     Import(import::ImportArguments),
     /// Checks that a capture's body lies on its person: a picture, a table, and likely mistakes.
     Check(check::CheckArguments),

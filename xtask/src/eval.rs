@@ -35,7 +35,7 @@ const TRAIN_PICTURES: usize = 5;
 pub enum Split {
     /// Cameras that training never saw.
     NovelView,
-    /// Every tenth training frame, on what it shows.
+    /// Every tenth training frame, on its known pixels.
     TrainView,
 }
 

@@ -91,7 +91,7 @@ struct Posed {
     normals: Vec<glam::Vec3>,
 }
 
-/// The person at the frame that is asked for.
+/// The person at `--frame`.
 fn posed(person: &Avatar, clip: usize, arguments: &ExportArguments) -> Result<Posed> {
     let motion = &person.clips.get(clip).context("the person has no motion")?.motion;
     let (frame, frames) = (arguments.frame.unwrap_or(0), motion.num_frames());

@@ -58,7 +58,7 @@ pub struct ImportArguments {
     /// The person's value in masks of ids [default: 1]
     #[arg(long, value_name = "ID")]
     object: Option<u8>,
-    /// Values, in masks of ids, of what stands in front of the person
+    /// Values of occluders in masks of ids
     #[arg(long, value_name = "IDS", value_delimiter = ',')]
     occluder_objects: Vec<u8>,
     /// Focal length in pixels [default: the one that the estimator assumed]

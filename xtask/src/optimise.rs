@@ -21,7 +21,7 @@ const LINE_EVERY: Duration = Duration::from_secs(15);
 /// Checkpoint interval.
 #[derive(Args, Clone, Copy, Debug)]
 pub struct SavingArguments {
-    /// Save a checkpoint every so many seconds: no more is lost, whatever ends the program
+    /// Interval between checkpoints, seconds: the most that can be lost
     #[arg(long, value_name = "SECONDS", default_value_t = 30.0)]
     checkpoint_every: f64,
 }

@@ -12,7 +12,7 @@ pub struct ShardArguments {
     /// name. Every part has the same --out; parts may overlap, die and be run again
     #[arg(long, value_name = "I/N", conflicts_with = "merge")]
     pub shard: Option<Shard>,
-    /// Run nothing: put together what the parts have left
+    /// Run nothing: merge the results of the parts
     #[arg(long)]
     pub merge: bool,
 }

@@ -11,9 +11,10 @@ use super::camera::Lens;
 use super::files::{Files, decoding_bytes};
 use super::gate::Gate;
 use super::image::dimensions;
+use super::pictures::file_name;
 use super::pixels::Area;
 use super::source::{Allowance, PixelSource};
-use super::{CaptureError, Frame, LoadOptions, checks};
+use super::{Capture, CaptureError, EvalFrame, Frame, LoadOptions, checks};
 
 /// Bytes per pixel of a frame: three colours and coverage.
 pub const PIXEL_BYTES: u64 = 16;
@@ -40,7 +41,7 @@ pub(super) struct Planned {
 }
 
 /// Memory for packed pictures and for decoding.
-pub(super) struct Budget {
+struct Budget {
     kept: Arc<Allowance>,
     gate: Arc<Gate>,
 }
@@ -85,7 +86,7 @@ impl View {
 
     /// The frames, checked together. Pictures within `budget` are decoded; of the others, headers are
     /// checked.
-    pub fn frames(self, body: &BodyModel, options: &LoadOptions, budget: &Budget) -> Result<Vec<Frame>, CaptureError> {
+    fn frames(self, body: &BodyModel, options: &LoadOptions, budget: &Budget) -> Result<Vec<Frame>, CaptureError> {
         let first = Arc::from(self.frames[0].name.as_str());
         let (size, to) = (self.size, options.resized(self.size));
         let frame = |plan: Planned| {
@@ -109,14 +110,34 @@ impl View {
     }
 }
 
-/// Budget for pixels within [`LoadOptions::max_bytes`] beside the bodies of all views. Errors if no
-/// picture can be decoded in that, naming options that fit.
-pub(super) fn budget(
-    train: &View,
-    eval: &[View],
+/// An evaluation view, with camera name and training index of each frame.
+pub(super) type EvalView = (View, Vec<(String, usize)>);
+
+/// Decodes all views within [`LoadOptions::max_bytes`]. `mean_betas` are by default those of the
+/// training frames.
+pub(super) fn capture(
+    dir: &Path,
+    train: View,
+    eval: Vec<EvalView>,
+    mean_betas: Option<Vec<f32>>,
     body: &BodyModel,
     options: &LoadOptions,
-) -> Result<Budget, CaptureError> {
+) -> Result<Capture, CaptureError> {
+    let (eval, indices): (Vec<View>, Vec<_>) = eval.into_iter().unzip();
+    let budget = budget(&train, &eval, body, options)?;
+    let train = train.frames(body, options, &budget)?;
+    let mut frames = Vec::new();
+    for (view, indices) in eval.into_iter().zip(indices) {
+        let each = view.frames(body, options, &budget)?.into_iter().zip(indices);
+        frames.extend(each.map(|(frame, (camera_name, train_index))| EvalFrame { camera_name, train_index, frame }));
+    }
+    let mean_betas = mean_betas.unwrap_or_else(|| checks::mean_betas(train.iter().map(|f| f.betas.as_slice())));
+    Ok(Capture { name: file_name(dir), train, eval: frames, mean_betas })
+}
+
+/// Budget for pixels within [`LoadOptions::max_bytes`] beside the bodies of all views. Errors if no
+/// picture can be decoded in that, naming options that fit.
+fn budget(train: &View, eval: &[View], body: &BodyModel, options: &LoadOptions) -> Result<Budget, CaptureError> {
     let limit = options.max_bytes;
     let body_bytes = body.num_vertices() as u64 * VERTEX_BYTES;
     let views = || std::iter::once(train).chain(eval);

@@ -15,8 +15,7 @@ pub(super) fn file_name(path: &Path) -> String {
 /// Whether there is a directory at `path`.
 ///
 /// # Errors
-/// [`CaptureError::Io`] for a link that leads nowhere or in a circle, and whatever else cannot be
-/// looked at: what it should lead to would be passed over in silence.
+/// [`CaptureError::Io`] for a broken or circular link, and for unreadable metadata.
 pub(super) fn is_directory(path: &Path) -> Result<bool, CaptureError> {
     match std::fs::metadata(path) {
         Ok(found) => Ok(found.is_dir()),

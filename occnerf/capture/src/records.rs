@@ -128,7 +128,7 @@ impl<'a> Record<'a> {
         Ok((array.shape, values))
     }
 
-    /// [`Record::array`] of exactly this shape; `what` says why the shape is expected.
+    /// [`Record::array`] of exactly this shape; `what` is the reason in the error.
     pub fn shaped(&self, key: &str, shape: &[usize], what: &str) -> Result<Vec<f32>, CaptureError> {
         let (actual, values) = self.array(key)?;
         if actual != shape {

@@ -22,7 +22,7 @@ const TERMS_PER_JOINT: usize = 9;
 
 /// A person as one to five textured, skinned shells of triangles, with motion clips.
 ///
-/// Everything is in metres in a world that is right-handed and y up. The surface stands in the
+/// Everything is in metres in a world that is right-handed and y up. The surface is in the
 /// canonical pose (the T-pose, all rotations zero), facing +z. V vertices, F triangles, J joints, T
 /// frames of a clip.
 #[derive(Clone, Debug, PartialEq)]
@@ -90,7 +90,7 @@ pub struct Joint {
 /// A named motion: axis-angle rotations (T·J) of each joint relative to its parent, and
 /// translations (T) of the root.
 ///
-/// The root joint stands at its rest position + translation and turns about itself
+/// The root joint is at its rest position + translation and rotates about itself
 /// ([`Placement::Pelvis`]).
 #[derive(Clone, Debug, PartialEq)]
 pub struct Clip {

@@ -15,7 +15,7 @@ use crate::capture::Light;
 
 const FORMAT: &str = "occnerf-avatar";
 const VERSION: u32 = 1;
-/// Key of the header that [`Header`] stands under, as JSON.
+/// Key of [`Header`] as JSON in the file's metadata.
 const KEY: &str = "avatar";
 /// Largest file.
 const MAX_BYTES: u64 = 1 << 30;

@@ -20,11 +20,11 @@ use rayon::prelude::*;
 use smpl::BodyModel;
 
 use super::camera::Lens;
-use super::decode::{Planned, View, budget};
+use super::decode::{Planned, View, capture};
 use super::names::FrameName;
 use super::pictures::{Pictures, file_name, is_directory};
 use super::records::{Record, Records};
-use super::{Capture, CaptureError, EvalFrame, LoadOptions, checks};
+use super::{Capture, CaptureError, LoadOptions, checks};
 
 /// Reads a capture in this layout.
 pub(super) fn load(dir: &Path, body: &BodyModel, options: &LoadOptions) -> Result<Capture, CaptureError> {
@@ -37,8 +37,9 @@ pub(super) fn load(dir: &Path, body: &BodyModel, options: &LoadOptions) -> Resul
     let names = options.select(all.iter());
     let mean_betas = mean_betas(dir, body)?;
 
-    let (mut cameras, mut eval) = (Vec::new(), Vec::new());
+    let mut eval = Vec::new();
     for camera in eval_directories(dir)? {
+        let mut indices = Vec::new();
         let view = plan(&camera, body, options, |mut seen| {
             if let Some(odd) = seen.iter().find(|name| index(&all, name).is_none()) {
                 let expected = format!("the name of a frame of {}", dir.join("cameras.pkl").display());
@@ -46,25 +47,15 @@ pub(super) fn load(dir: &Path, body: &BodyModel, options: &LoadOptions) -> Resul
                 return Err(CaptureError::invalid(&file, *odd, expected, "no such training frame"));
             }
             seen.retain(|name| index(&names, name).is_some_and(|i| i % options.eval_stride == 0));
+            let found = seen.iter().filter_map(|name| index(&names, name));
+            indices.extend(found.map(|index| (file_name(&camera), index)));
             Ok(seen)
         })?;
-        if let Some(view) = view {
-            cameras.push(file_name(&camera));
-            eval.push(view);
-        }
+        eval.extend(view.map(|view| (view, indices)));
     }
 
     let train = train.ok_or_else(|| CaptureError::missing(&dir.join("cameras.pkl"), "frame"))?;
-    let budget = budget(&train, &eval, body, options)?;
-    let train = train.frames(body, options, &budget)?;
-    let mut frames = Vec::new();
-    for (camera_name, view) in cameras.into_iter().zip(eval) {
-        for frame in view.frames(body, options, &budget)? {
-            let train_index = index(&names, &frame.name).unwrap_or_default();
-            frames.push(EvalFrame { camera_name: camera_name.clone(), train_index, frame });
-        }
-    }
-    Ok(Capture { name: file_name(dir), train, eval: frames, mean_betas })
+    capture(dir, train, eval, Some(mean_betas), body, options)
 }
 
 fn index(names: &[impl AsRef<str>], name: &str) -> Option<usize> {

@@ -4,7 +4,7 @@
 //! images/NAME.png …       masks/NAME.png …      (PNG or JPEG; masks 0 to 255, the visible person)
 //! metadata.json           {NAME: {poses (3J), betas (≤ B), cam_intrinsics (3,3),
 //!                          cam_extrinsics (4,4), distortions (5)?}}
-//! occluders/NAME.png …    where known: 255 where something stands in front of the person
+//! occluders/NAME.png …    where known: 255 for an occluder of the person
 //! clean/images, masks/    some of the frames again without occluders, kept back
 //! ```
 //!
@@ -21,11 +21,11 @@ use std::path::Path;
 use smpl::{BodyModel, Placement};
 
 use super::camera::Lens;
-use super::decode::{Planned, View, budget};
+use super::decode::{Planned, View, capture};
 use super::names::FrameName;
-use super::pictures::{Pictures, file_name, is_directory};
+use super::pictures::{Pictures, is_directory};
 use super::records::Record;
-use super::{Capture, CaptureError, EvalFrame, LoadOptions, checks};
+use super::{Capture, CaptureError, LoadOptions, checks};
 
 /// Camera name of the frames under `clean`.
 const CLEAN: &str = "clean";
@@ -56,26 +56,16 @@ pub(super) fn load(dir: &Path, body: &BodyModel, options: &LoadOptions) -> Resul
         let masks = Pictures::list(&clean.join("masks"))?;
         for (index, (FrameName(name), record)) in frames.iter().enumerate().step_by(options.eval_stride) {
             if images.get(name).is_some() {
-                indices.push(index);
+                indices.push((CLEAN.to_owned(), index));
                 kept.push(plan(name, record, [&images, &masks], &path, body, options)?);
             }
         }
     }
-    let eval: Vec<View> = match kept.is_empty() {
+    let eval = match kept.is_empty() {
         true => Vec::new(),
-        false => vec![View::new(kept, &clean.join("masks"), &path)?],
+        false => vec![(View::new(kept, &clean.join("masks"), &path)?, indices)],
     };
-
-    let budget = budget(&train, &eval, body, options)?;
-    let train = train.frames(body, options, &budget)?;
-    let mut kept = Vec::new();
-    for view in eval {
-        for (train_index, frame) in indices.iter().copied().zip(view.frames(body, options, &budget)?) {
-            kept.push(EvalFrame { camera_name: CLEAN.to_owned(), train_index, frame });
-        }
-    }
-    let mean_betas = checks::mean_betas(train.iter().map(|f| f.betas.as_slice()));
-    Ok(Capture { name: file_name(dir), train, eval: kept, mean_betas })
+    capture(dir, train, eval, None, body, options)
 }
 
 fn optional(dir: &Path) -> Result<Option<Pictures>, CaptureError> {

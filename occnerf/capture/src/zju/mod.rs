@@ -25,13 +25,13 @@ use serde::Deserialize;
 use smpl::{BodyModel, Placement};
 
 use self::annots::Annots;
-use super::decode::{Planned, View, budget};
+use super::decode::{Planned, View, capture};
 use super::files::read_text;
 use super::image::dimensions;
-use super::pictures::{file_name, is_directory};
+use super::pictures::is_directory;
 use super::pixels::Area;
 use super::records::{Record, Records, triples};
-use super::{Capture, CaptureError, EvalFrame, LoadOptions, checks};
+use super::{Capture, CaptureError, LoadOptions, checks};
 
 /// Tolerance of a vertex against the file's, as a fraction of the body's largest extent, 1 cm at
 /// 1.7 m.
@@ -75,9 +75,9 @@ pub(super) fn load(dir: &Path, body: &BodyModel, options: &LoadOptions) -> Resul
     let first_masks = train.first().map_or(dir.to_owned(), mask_dir);
     let train = View::new(train, &first_masks, &annots.path)?;
 
-    let (mut views, mut indices) = (Vec::new(), Vec::new());
+    let mut views = Vec::new();
     for other in (0..annots.lenses.len()).filter(|&c| c != camera) {
-        let mut kept = Vec::new();
+        let (mut kept, mut indices) = (Vec::new(), Vec::new());
         for index in (0..instants.len()).step_by(options.eval_stride) {
             let there = match annots.picture(instants[index], other).map(|path| dir.join(path)) {
                 Some(path) => !is_directory(&path)? && path.is_file(),
@@ -85,26 +85,15 @@ pub(super) fn load(dir: &Path, body: &BodyModel, options: &LoadOptions) -> Resul
             };
             if let Some(frame) = if there { plan(other, index)? } else { None } {
                 kept.push(frame);
-                indices.push((other, index));
+                indices.push((annots.names[other].clone(), index));
             }
         }
         if let Some(first) = kept.first() {
             let masks = mask_dir(first);
-            views.push(View::new(kept, &masks, &annots.path)?);
+            views.push((View::new(kept, &masks, &annots.path)?, indices));
         }
     }
-
-    let budget = budget(&train, &views, body, options)?;
-    let train = train.frames(body, options, &budget)?;
-    let mut eval = Vec::with_capacity(indices.len());
-    let mut indices = indices.into_iter();
-    for view in views {
-        for (frame, (other, train_index)) in view.frames(body, options, &budget)?.into_iter().zip(&mut indices) {
-            eval.push(EvalFrame { camera_name: annots.names[other].clone(), train_index, frame });
-        }
-    }
-    let mean_betas = checks::mean_betas(train.iter().map(|f| f.betas.as_slice()));
-    Ok(Capture { name: file_name(dir), train, eval, mean_betas })
+    capture(dir, train, views, None, body, options)
 }
 
 /// The masks that exist of a picture.

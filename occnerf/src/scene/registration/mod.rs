@@ -66,7 +66,7 @@ const MOST_NUMBERS: usize = 4_000_000;
 const MOST_JOINTS: usize = 512;
 
 /// A body in one of the frames.
-struct PosedFrame {
+struct ClothedBody {
     shape: Shaped,
     posed: Posed,
     /// Posed vertices with their clothes.
@@ -179,14 +179,12 @@ impl<'a> Registration<'a> {
     /// Takes one Gauss-Newton step; false for a singular system.
     fn step(&mut self, options: ObservationOptions) -> Result<bool, Error> {
         let this = &*self;
-        let posed_frames: Vec<PosedFrame> =
-            (0..this.frames.len()).into_par_iter().map(|f| this.posed_frame(f)).collect();
-        let observe = |(crop, frame): (&Option<Crop>, &PosedFrame)| match crop {
-            Some(crop) => observe(crop, &frame.dressed, (&this.model.faces, &this.shared_edges), options),
+        let bodies: Vec<ClothedBody> = (0..this.frames.len()).into_par_iter().map(|f| this.clothed_body(f)).collect();
+        let observe = |(crop, body): (&Option<Crop>, &ClothedBody)| match crop {
+            Some(crop) => observe(crop, &body.dressed, (&this.model.faces, &this.shared_edges), options),
             None => Ok(Observations::default()),
         };
-        let observations: Result<Vec<Observations>, Error> =
-            this.crops.par_iter().zip(&posed_frames).map(observe).collect();
+        let observations: Result<Vec<Observations>, Error> = this.crops.par_iter().zip(&bodies).map(observe).collect();
         let observations = observations?;
         let clothes = this.measure_clothes(&observations);
         let thicker: Vec<f32> = clothes.iter().zip(&this.clothes).map(|(next, now)| next - now).collect();
@@ -194,7 +192,7 @@ impl<'a> Registration<'a> {
         let mut normals: Vec<NormalEquations> = (0..this.frames.len())
             .into_par_iter()
             .map(|f| {
-                let PosedFrame { shape, posed, .. } = &posed_frames[f];
+                let ClothedBody { shape, posed, .. } = &bodies[f];
                 let camera = &this.capture.train[this.frames[f]].camera;
                 let perspective = this.perspective(f);
                 let mut equations = Equations::new(this.model, (shape, posed), this.reshaped(f), camera, perspective);
@@ -203,7 +201,7 @@ impl<'a> Registration<'a> {
                 equations.normal
             })
             .collect();
-        let poses: Vec<&Posed> = posed_frames.iter().map(|frame| &frame.posed).collect();
+        let poses: Vec<&Posed> = bodies.iter().map(|body| &body.posed).collect();
         pose_prior::add(this.model, &poses, &mut normals);
         let size = 3 * (this.model.num_joints() + 1);
         let gap = this.frames.get(1).map_or(1, |second| second - this.frames[0]);
@@ -261,11 +259,11 @@ impl<'a> Registration<'a> {
         Some((Perspective { inverse_depth: self.inverse_depth, depth: depths[f].length() }, camera))
     }
 
-    fn posed_frame(&self, f: usize) -> PosedFrame {
+    fn clothed_body(&self, f: usize) -> ClothedBody {
         let (shape, posed) = self.posed(f, &self.betas);
         let normals = vertex_normals(&posed.vertices, &self.model.faces);
         let dressed = dressed(&posed.vertices, &normals, &self.clothes);
-        PosedFrame { shape, posed, dressed }
+        ClothedBody { shape, posed, dressed }
     }
 
     /// Bodies of a frame with [`BETA_STEP`] added to each shape coefficient.
