@@ -10,6 +10,7 @@ mod report;
 mod reproduce;
 mod results;
 mod scene;
+mod sweep;
 mod synth;
 
 use anyhow::Result;

@@ -5,8 +5,7 @@ use occnerf::{Config, Method, Preset};
 use synth::DemoConfig;
 
 use super::difficulty::Difficulty;
-use super::job::{Job, Place};
-use super::runner::{Kind, Point};
+use crate::sweep::{Job, Kind, Place, Point};
 use xtask::settings::scale_rates;
 
 /// Training frames and scored views of the easy case.
@@ -61,7 +60,7 @@ impl Level {
             level: Some(self.value),
             kind: if self.easy { Kind::Base } else { Kind::Level },
             command: None,
-            job: Job { place: self.place.clone(), views: VIEWS, config, prune: false, bake: None },
+            job: Job::new(self.place.clone(), VIEWS, config),
         }
     }
 }
