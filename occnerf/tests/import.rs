@@ -8,15 +8,7 @@ use glam::{DMat3, DQuat, DVec3};
 use occnerf::capture::{ImportOptions, Imported, LoadOptions, Tool, import, load_capture};
 use serde_json::Value;
 use smpl::BodyModel;
-
-fn estimators() -> Option<PathBuf> {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared/data/estimators");
-    if path.is_dir() {
-        return Some(path);
-    }
-    println!("skipped: {} is absent", path.display());
-    None
-}
+use testkit::files::shared;
 
 fn folder(name: &str) -> PathBuf {
     let path = Path::new(env!("CARGO_TARGET_TMPDIR")).join("import").join(name);
@@ -53,7 +45,7 @@ fn rotation(axis: &[f64]) -> DMat3 {
 
 #[test]
 fn captures_hold_what_another_reader_made_of_the_same_files() {
-    let Some(dir) = estimators() else { return };
+    let Some(dir) = shared("estimators") else { return };
     for (name, fit, masks, tool, left_out) in [
         ("wham", "wham/wham_output.pkl", Some("sam2"), Tool::Wham, 0),
         ("wham_gap", "wham/wham_output_gap.pkl", Some("sam2"), Tool::Wham, 3),
@@ -97,7 +89,7 @@ fn captures_hold_what_another_reader_made_of_the_same_files() {
 
 #[test]
 fn options_of_an_import_do_what_they_say() {
-    let Some(dir) = estimators() else { return };
+    let Some(dir) = shared("estimators") else { return };
     let run = |name: &str, change: fn(&mut ImportOptions)| -> (Imported, PathBuf) {
         let mut options = options(&dir, "wham/wham_output.pkl", Some("sam2"));
         change(&mut options);
@@ -135,7 +127,7 @@ fn options_of_an_import_do_what_they_say() {
 
 #[test]
 fn the_true_focal_length_brings_the_capture_back() {
-    let Some(dir) = estimators() else { return };
+    let Some(dir) = shared("estimators") else { return };
     let out = folder("true-focal");
     let mut options = options(&dir, "wham/wham_output.pkl", Some("sam2"));
     options.focal = Some(415.0);

@@ -2,17 +2,15 @@
 //! faults that are named.
 #![allow(clippy::unwrap_used, reason = "helpers of tests")]
 
-mod common;
-
 use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::sync::LazyLock;
 
 use array_files::{Data, NdArray, npz};
-use common::shared;
 use glam::Vec3;
 use proptest::prelude::*;
 use smpl::{BodyModel, Error, FileError, Placement};
+use testkit::files::shared;
 
 fn temporary(name: &str) -> PathBuf {
     Path::new(env!("CARGO_TARGET_TMPDIR")).join(name)

@@ -2,13 +2,11 @@
 //! wrong.
 #![allow(clippy::unwrap_used, reason = "helpers of tests")]
 
-mod common;
-
 use base64::Engine;
-use common::shared;
 use glam::{Affine3A, Vec3};
 use proptest::prelude::*;
 use smpl::{Character, load_mesh};
+use testkit::files::{glb, shared};
 
 /// A strip of two triangles on two joints, the second 1 above the first and turning about z.
 fn arm() -> (String, Vec<u8>) {
@@ -56,20 +54,6 @@ fn arm() -> (String, Vec<u8>) {
         views.join(",")
     );
     (json, bytes)
-}
-
-fn glb(json: &str, binary: &[u8]) -> Vec<u8> {
-    let mut json = json.as_bytes().to_vec();
-    json.resize(json.len().next_multiple_of(4), b' ');
-    let mut out = b"glTF\x02\0\0\0".to_vec();
-    out.extend((28 + json.len() as u32 + binary.len() as u32).to_le_bytes());
-    out.extend((json.len() as u32).to_le_bytes());
-    out.extend(b"JSON");
-    out.extend(&json);
-    out.extend((binary.len() as u32).to_le_bytes());
-    out.extend(b"BIN\0");
-    out.extend(binary);
-    out
 }
 
 fn read(json: &str, binary: &[u8]) -> Result<Character, smpl::Error> {

@@ -1,14 +1,12 @@
 //! Motion capture: AMASS's forms, and the shared clips.
 #![allow(clippy::unwrap_used, reason = "helpers of tests")]
 
-mod common;
-
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
-use common::shared;
 use glam::{Quat, Vec3};
 use smpl::{BodyModel, MotionClip, Placement};
+use testkit::files::shared;
 
 fn floats(shape: &[usize], values: &[f32]) -> Vec<u8> {
     let shape: String = shape.iter().map(|n| format!("{n},")).collect();

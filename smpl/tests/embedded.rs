@@ -1,8 +1,6 @@
 //! The embedded body is a closed, well-formed, plausible human.
 #![allow(clippy::unwrap_used, reason = "helpers of tests")]
 
-mod common;
-
 use std::collections::{BTreeMap, HashMap, HashSet};
 use std::sync::LazyLock;
 
@@ -189,7 +187,7 @@ fn bent_limbs_keep_their_volume() {
 
 #[test]
 fn it_is_the_open_body_to_within_rounding() {
-    let Some(path) = common::shared("body/open_body.npz") else { return };
+    let Some(path) = testkit::files::shared("body/open_body.npz") else { return };
     let open = BodyModel::load(&path).unwrap();
     assert_eq!((&BODY.faces, &BODY.parents), (&open.faces, &open.parents));
     let differ = |a: &[Vec3], b: &[Vec3]| a.iter().zip(b).map(|(a, b)| (a - b).abs().max_element()).fold(0.0, f32::max);

@@ -1,11 +1,9 @@
 //! Against `smplx.lbs.lbs` in f64.
 
-mod common;
-
 use array_files::npz::Npz;
-use common::shared;
 use glam::Vec3;
 use smpl::{BodyModel, Placement};
+use testkit::files::shared;
 
 fn vectors(values: &[f32]) -> Vec<Vec3> {
     values.chunks_exact(3).map(Vec3::from_slice).collect()

@@ -1,14 +1,12 @@
 //! Meshes from files.
 #![allow(clippy::unwrap_used, reason = "helpers of tests")]
 
-mod common;
-
 use std::path::{Path, PathBuf};
 
-use common::shared;
 use glam::Vec3;
 use proptest::prelude::*;
 use smpl::{Mesh, load_mesh};
+use testkit::files::shared;
 
 fn written(name: &str, text: impl AsRef<[u8]>) -> PathBuf {
     let path = Path::new(env!("CARGO_TARGET_TMPDIR")).join(name);

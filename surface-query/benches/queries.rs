@@ -1,19 +1,16 @@
 //! Cost of the queries on a body of 6890 vertices (a ball of 10242 where that is not at hand).
 #![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
 
-#[path = "../tests/body/mod.rs"]
-mod body;
-
 use std::hint::black_box;
 use std::num::NonZero;
 
-use body::Random;
 use divan::Bencher;
 use divan::counter::ItemsCount;
 use glam::Vec3;
 use kiddo::{ImmutableKdTree, SquaredEuclidean};
 use rayon::prelude::*;
 use surface_query::{MeshDistance, Pyramid, SurfaceQuery, SurfaceQueryConfig, farthest_points};
+use testkit::body::Random;
 use testkit::{TriMesh, oracle};
 
 /// A grid for a body in metres.
@@ -28,7 +25,7 @@ fn near(mesh: &TriMesh) -> Vec<Vec3> {
 }
 
 fn whole_query(bencher: Bencher<'_, '_>, config: &SurfaceQueryConfig) {
-    let mesh = body::body_or_ball();
+    let mesh = testkit::body::body_or_ball();
     let query = SurfaceQuery::new(&mesh.vertices, &mesh.faces, config).unwrap();
     let points = near(&mesh);
     bencher.counter(ItemsCount::new(points.len())).bench_local(|| {
@@ -57,7 +54,7 @@ fn neighbours_and_blend_trees(bencher: Bencher<'_, '_>) {
 /// As many queries as the peers were given, on two threads.
 #[divan::bench(sample_count = 10)]
 fn neighbours_and_blend_two_threads(bencher: Bencher<'_, '_>) {
-    let mesh = body::body_or_ball();
+    let mesh = testkit::body::body_or_ball();
     let query = SurfaceQuery::new(&mesh.vertices, &mesh.faces, &GRID).unwrap();
     let points = Random(1).near_surface(&mesh, 200_000, 0.05);
     let pool = rayon::ThreadPoolBuilder::new().num_threads(2).build().unwrap();
@@ -80,7 +77,7 @@ fn level_points(mesh: &TriMesh) -> Vec<Vec<[f32; 3]>> {
 /// The 20 neighbours alone, from four trees of plain kiddo (ties as they fall).
 #[divan::bench]
 fn neighbours_plain_kiddo(bencher: Bencher<'_, '_>) {
-    let mesh = body::body_or_ball();
+    let mesh = testkit::body::body_or_ball();
     let trees: Vec<ImmutableKdTree<f32, 3>> =
         level_points(&mesh).iter().map(|points| ImmutableKdTree::new_from_slice(points).unwrap()).collect();
     let points = near(&mesh);
@@ -97,7 +94,7 @@ fn neighbours_plain_kiddo(bencher: Bencher<'_, '_>) {
 /// The 20 neighbours alone, by looking at every vertex.
 #[divan::bench(sample_count = 10)]
 fn neighbours_brute_force(bencher: Bencher<'_, '_>) {
-    let mesh = body::body_or_ball();
+    let mesh = testkit::body::body_or_ball();
     let levels = level_points(&mesh);
     let points = &near(&mesh)[..500];
     bencher.counter(ItemsCount::new(points.len())).bench_local(|| {
@@ -120,7 +117,7 @@ fn neighbours_brute_force(bencher: Bencher<'_, '_>) {
 
 #[divan::bench]
 fn blend(bencher: Bencher<'_, '_>) {
-    let mesh = body::body_or_ball();
+    let mesh = testkit::body::body_or_ball();
     let query = SurfaceQuery::new(&mesh.vertices, &mesh.faces, &GRID).unwrap();
     let points = near(&mesh);
     let lists: Vec<[u32; 20]> = (points.iter())
@@ -140,7 +137,7 @@ fn blend(bencher: Bencher<'_, '_>) {
 /// Exact closest point with sign, by the largest distance asked for, in cm.
 #[divan::bench(args = [6, 100])]
 fn mesh_distance(bencher: Bencher<'_, '_>, reach: u32) {
-    let mesh = body::body_or_ball();
+    let mesh = testkit::body::body_or_ball();
     let distance = MeshDistance::new(&mesh.vertices, &mesh.faces).unwrap();
     let points = near(&mesh);
     bencher.counter(ItemsCount::new(points.len())).bench_local(|| {
@@ -153,7 +150,7 @@ fn mesh_distance(bencher: Bencher<'_, '_>, reach: u32) {
 /// The same at twice the faces, on two threads.
 #[divan::bench(sample_count = 10)]
 fn mesh_distance_split_two_threads(bencher: Bencher<'_, '_>) {
-    let mesh = body::body_or_ball();
+    let mesh = testkit::body::body_or_ball();
     let points = Random(1).near_surface(&mesh, 200_000, 0.05);
     let mut vertices = mesh.vertices.clone();
     // Every triangle in two, at the middle of its first edge.
@@ -175,7 +172,7 @@ fn mesh_distance_split_two_threads(bencher: Bencher<'_, '_>) {
 /// Exact closest point by looking at every face.
 #[divan::bench(sample_count = 5)]
 fn mesh_distance_brute_force(bencher: Bencher<'_, '_>) {
-    let mesh = body::body_or_ball();
+    let mesh = testkit::body::body_or_ball();
     let points = &near(&mesh)[..50];
     bencher.counter(ItemsCount::new(points.len())).bench_local(|| {
         for &p in points {
@@ -187,7 +184,7 @@ fn mesh_distance_brute_force(bencher: Bencher<'_, '_>) {
 /// Along lines, as the samples of rays are; one thread.
 #[divan::bench]
 fn mesh_distance_along_rays(bencher: Bencher<'_, '_>) {
-    let mesh = body::body_or_ball();
+    let mesh = testkit::body::body_or_ball();
     let distance = MeshDistance::new(&mesh.vertices, &mesh.faces).unwrap();
     let points: Vec<Vec3> = (near(&mesh).chunks(2).take(400))
         .flat_map(|ends| (0..50).map(|i| ends[0] + Vec3::Z * (i as f32 * 0.002 - 0.05)).collect::<Vec<_>>())
@@ -201,26 +198,26 @@ fn mesh_distance_along_rays(bencher: Bencher<'_, '_>) {
 
 #[divan::bench]
 fn mesh_distance_refit(bencher: Bencher<'_, '_>) {
-    let mesh = body::body_or_ball();
+    let mesh = testkit::body::body_or_ball();
     let mut distance = MeshDistance::new(&mesh.vertices, &mesh.faces).unwrap();
     bencher.bench_local(|| distance.refit(&mesh.vertices));
 }
 
 #[divan::bench]
 fn mesh_distance_build(bencher: Bencher<'_, '_>) {
-    let mesh = body::body_or_ball();
+    let mesh = testkit::body::body_or_ball();
     bencher.bench_local(|| MeshDistance::new(&mesh.vertices, &mesh.faces));
 }
 
 #[divan::bench(sample_count = 5)]
 fn surface_query_build(bencher: Bencher<'_, '_>) {
-    let mesh = body::body_or_ball();
+    let mesh = testkit::body::body_or_ball();
     bencher.bench_local(|| SurfaceQuery::new(&mesh.vertices, &mesh.faces, &GRID));
 }
 
 /// Farthest point sampling of a quarter of the vertices.
 #[divan::bench]
 fn farthest_points_quarter(bencher: Bencher<'_, '_>) {
-    let mesh = body::body_or_ball();
+    let mesh = testkit::body::body_or_ball();
     bencher.bench_local(|| farthest_points(&mesh.vertices, mesh.vertices.len() / 4));
 }

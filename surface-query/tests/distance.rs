@@ -1,12 +1,10 @@
 //! Closest points and signs against brute force in `f64`.
 #![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
 
-mod body;
-
-use body::Random;
 use glam::{Quat, Vec3};
 use proptest::prelude::*;
 use surface_query::{Closest, Error, MeshDistance};
+use testkit::body::Random;
 use testkit::{TriMesh, mesh, oracle, strategy};
 
 /// Rounding of coordinates to `f32`, and a share of it for the oracle's different route.
@@ -378,7 +376,7 @@ fn meshes_without_faces_or_with_indices_out_of_range_are_errors() {
 
 #[test]
 fn signs_and_distances_of_the_open_body_equal_brute_force() {
-    let Some(body) = body::open_body() else {
+    let Some(body) = testkit::body::open_body() else {
         return;
     };
     let posed = body.clone().map(|p| Quat::from_rotation_y(p.y) * p);

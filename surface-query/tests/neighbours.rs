@@ -1,12 +1,10 @@
 //! Neighbour lists against brute force, bit for bit.
 #![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
 
-mod body;
-
-use body::Random;
 use glam::Vec3;
 use proptest::prelude::*;
 use surface_query::{Error, Pyramid, SurfaceQuery, SurfaceQueryConfig, vertex_normals};
+use testkit::body::Random;
 use testkit::{mesh, strategy};
 
 /// Sorts everything by the distance and tie rule the documentation states.
@@ -129,7 +127,7 @@ fn neighbours_on_cell_faces_of_a_grid_far_from_the_origin_equal_brute_force() {
 
 #[test]
 fn a_grid_answers_every_query_within_the_margin_like_the_trees_do() {
-    let Some(body) = body::open_body() else {
+    let Some(body) = testkit::body::open_body() else {
         return;
     };
     let grid = SurfaceQuery::new(&body.vertices, &body.faces, &config(5, 0.02, 0.12)).unwrap();

@@ -1,7 +1,5 @@
 //! Farthest point sampling against the plain algorithm.
 
-mod body;
-
 use glam::Vec3;
 use proptest::prelude::*;
 use surface_query::{Pyramid, farthest_points};
@@ -71,7 +69,7 @@ fn ratios_that_f32_rounds_down_give_the_decimal_size() {
 
 #[test]
 fn sampling_the_open_body_equals_the_plain_algorithm() {
-    let Some(body) = body::open_body() else {
+    let Some(body) = testkit::body::open_body() else {
         return;
     };
     // The oracle is cubic, so every ninth vertex; mirror-symmetric ties are among them.

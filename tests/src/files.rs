@@ -60,13 +60,29 @@ fn make(dir: &Path) {
     std::fs::create_dir_all(dir).unwrap_or_else(|error| panic!("{}: {error}", dir.display()));
 }
 
-/// The directory of shared test data; `None`, with a message, where it is absent.
+/// A directory or a file of the shared test data; `None`, with a message, where it is absent.
 #[must_use]
 pub fn shared(below: &str) -> Option<PathBuf> {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared/data").join(below);
-    if path.is_dir() {
+    if path.exists() {
         return Some(path);
     }
     println!("skipped: {} is absent", path.display());
     None
+}
+
+/// A .glb of one JSON and one binary chunk.
+#[must_use]
+pub fn glb(json: impl AsRef<[u8]>, binary: &[u8]) -> Vec<u8> {
+    let mut json = json.as_ref().to_vec();
+    json.resize(json.len().next_multiple_of(4), b' ');
+    let mut out = b"glTF\x02\0\0\0".to_vec();
+    out.extend((28 + json.len() as u32 + binary.len() as u32).to_le_bytes());
+    out.extend((json.len() as u32).to_le_bytes());
+    out.extend(b"JSON");
+    out.extend(&json);
+    out.extend((binary.len() as u32).to_le_bytes());
+    out.extend(b"BIN\0");
+    out.extend(binary);
+    out
 }

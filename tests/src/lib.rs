@@ -18,10 +18,12 @@
 //! Conventions: closed meshes are wound counter-clockwise seen from outside; ties between equally
 //! good answers go to the lower index.
 
+pub mod body;
 pub mod files;
 pub mod gradient;
 pub mod mesh;
 pub mod oracle;
+pub mod program;
 pub mod strategy;
 
 pub use glam;

@@ -3,8 +3,6 @@
 
 mod common;
 
-use std::path::Path;
-
 use common::{body, placement, quantile, walking};
 use glam::Vec3;
 use smpl::{BodyModel, MotionClip, Posed, Shaped, SurfaceMotion, WeightVolume, WeightVolumeConfig};
@@ -73,15 +71,11 @@ fn mapping_error(poses: &[Posed], rest: &[Vec3], map: impl Fn(&Posed) -> Vec<Opt
 
 #[test]
 fn recorded_poses_are_mapped_back_by_the_nearest_surface_point() {
-    let data = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared/data");
-    if !data.join("mocap").is_dir() {
-        println!("skipped: no {}", data.display());
-        return;
-    }
-    let body = BodyModel::load(&data.join("body/open_body.npz")).unwrap();
+    let Some(clips) = testkit::files::shared("mocap") else { return };
+    let body = BodyModel::load(&clips.join("../body/open_body.npz")).unwrap();
     let shaped = body.shaped(&[]);
     for name in ["walk", "turn"] {
-        let clip = MotionClip::load(&data.join(format!("mocap/{name}.npz"))).unwrap();
+        let clip = MotionClip::load(&clips.join(format!("{name}.npz"))).unwrap();
         let pose = |frame: usize| {
             let (pose, placement) = clip.at(frame as f32 / clip.fps, body.num_joints());
             body.pose(&shaped, &pose, placement)

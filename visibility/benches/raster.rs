@@ -1,9 +1,6 @@
 //! Cost of rasterising a body of 13776 triangles (a ball of 20480 where that is not at hand).
 #![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
 
-#[path = "../tests/body/mod.rs"]
-mod body;
-
 use std::collections::HashMap;
 
 use divan::Bencher;
@@ -33,7 +30,7 @@ fn view(width: u32, height: u32) -> View {
 
 /// Every triangle in four, `times` over.
 fn subdivided(times: u32) -> TriMesh {
-    let mut mesh = body::body_or_ball();
+    let mut mesh = testkit::body::body_or_ball();
     for _ in 0..times {
         let TriMesh { vertices, faces } = &mut mesh;
         let mut middles = HashMap::new();

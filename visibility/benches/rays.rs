@@ -2,13 +2,9 @@
 //! and at the same with every triangle split in two.
 #![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
 
-#[path = "../tests/body/mod.rs"]
-mod body;
-
 use std::hint::black_box;
 use std::time::Duration;
 
-use body::Random;
 use divan::Bencher;
 use divan::counter::ItemsCount;
 use glam::{Affine3A, Quat, Vec2, Vec3, Vec3A};
@@ -17,6 +13,7 @@ use obvhs::cwbvh::builder::build_cwbvh_from_tris;
 use obvhs::ray::{Ray, RayHit};
 use obvhs::triangle::Triangle;
 use testkit::TriMesh;
+use testkit::body::Random;
 use visibility::{RayMesh, View, VisibilityCounts, visible_vertices};
 
 fn main() {
@@ -72,13 +69,13 @@ const FOCALS: [f32; 2] = [1.2, 12.0];
 /// One ray at a time, one thread.
 #[divan::bench(args = FOCALS)]
 fn first_hit(bencher: Bencher<'_, '_>, focal: f32) {
-    single(bencher, &body::body_or_ball(), focal);
+    single(bencher, &testkit::body::body_or_ball(), focal);
 }
 
 /// The same at twice the faces.
 #[divan::bench(args = FOCALS)]
 fn first_hit_split(bencher: Bencher<'_, '_>, focal: f32) {
-    single(bencher, &split(&body::body_or_ball()), focal);
+    single(bencher, &split(&testkit::body::body_or_ball()), focal);
 }
 
 fn single(bencher: Bencher<'_, '_>, mesh: &TriMesh, focal: f32) {
@@ -94,7 +91,7 @@ fn single(bencher: Bencher<'_, '_>, mesh: &TriMesh, focal: f32) {
 /// The same by obvhs as it comes: its widest tree, its traversal, its triangles.
 #[divan::bench(args = FOCALS)]
 fn first_hit_split_obvhs(bencher: Bencher<'_, '_>, focal: f32) {
-    let mesh = split(&body::body_or_ball());
+    let mesh = split(&testkit::body::body_or_ball());
     let corners = |face: &[u32; 3]| face.map(|v| Vec3A::from(mesh.vertices[v as usize]));
     let triangles: Vec<Triangle> = mesh.faces.iter().map(corners).map(|[v0, v1, v2]| Triangle { v0, v1, v2 }).collect();
     let tree = build_cwbvh_from_tris(&triangles, BvhBuildParams::medium_build(), &mut Duration::default());
@@ -111,7 +108,7 @@ fn first_hit_split_obvhs(bencher: Bencher<'_, '_>, focal: f32) {
 /// Random segments through the body's box, one thread.
 #[divan::bench]
 fn first_hit_random(bencher: Bencher<'_, '_>) {
-    let mesh = body::body_or_ball();
+    let mesh = testkit::body::body_or_ball();
     let rays = RayMesh::new(&mesh.vertices, &mesh.faces).unwrap();
     let mut random = Random(3);
     let segments: Vec<(Vec3, Vec3)> = (0..20_000).map(|_| (random.vec3(1.0), random.vec3(1.0))).collect();
@@ -125,7 +122,7 @@ fn first_hit_random(bencher: Bencher<'_, '_>) {
 /// All vertices of the body in one view, all threads.
 #[divan::bench]
 fn visible_vertices_of_a_view(bencher: Bencher<'_, '_>) {
-    let mesh = body::body_or_ball();
+    let mesh = testkit::body::body_or_ball();
     let rays = RayMesh::new(&mesh.vertices, &mesh.faces).unwrap();
     let view = view(512, 1.2);
     bencher
@@ -136,7 +133,7 @@ fn visible_vertices_of_a_view(bencher: Bencher<'_, '_>) {
 /// Counts of all vertices over 100 views around the body, all threads.
 #[divan::bench(sample_count = 10)]
 fn frequency_over_a_capture(bencher: Bencher<'_, '_>) {
-    let mesh = body::body_or_ball();
+    let mesh = testkit::body::body_or_ball();
     let rays = RayMesh::new(&mesh.vertices, &mesh.faces).unwrap();
     let views: Vec<View> = (0..100)
         .map(|i| {
@@ -156,7 +153,7 @@ fn frequency_over_a_capture(bencher: Bencher<'_, '_>) {
 
 #[divan::bench]
 fn build(bencher: Bencher<'_, '_>) {
-    let mesh = body::body_or_ball();
+    let mesh = testkit::body::body_or_ball();
     bencher.bench_local(|| RayMesh::new(&mesh.vertices, &mesh.faces));
 }
 

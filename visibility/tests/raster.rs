@@ -1,11 +1,9 @@
 //! The rasteriser against the ray caster, and against what must hold of any picture.
 #![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
 
-mod body;
-
-use body::Random;
 use glam::{Affine3A, DVec3, Mat3, Quat, Vec2, Vec3};
 use proptest::prelude::*;
+use testkit::body::Random;
 use testkit::{TriMesh, mesh, strategy};
 use visibility::{Error, Fragment, Pixel, RasterOptions, Rasterizer, RayMesh, Samples, View};
 
@@ -390,7 +388,7 @@ fn an_output_of_another_size_panics() {
 
 #[test]
 fn the_open_body_is_drawn_as_its_rays_see_it() {
-    let Some(body) = body::open_body() else {
+    let Some(body) = testkit::body::open_body() else {
         return;
     };
     let view = camera(Quat::from_rotation_x(std::f32::consts::PI), Vec3::new(0.0, -0.2, 3.0), 150.0, 128);

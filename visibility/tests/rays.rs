@@ -1,11 +1,9 @@
 //! Ray casts against brute force in `f64`.
 #![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
 
-mod body;
-
-use body::Random;
 use glam::Vec3;
 use proptest::prelude::*;
+use testkit::body::Random;
 use testkit::{TriMesh, mesh, oracle, strategy};
 use visibility::{Error, RayMesh};
 
@@ -212,7 +210,7 @@ fn degenerate_meshes_are_hit_as_by_brute_force_or_are_errors() {
 
 #[test]
 fn first_hits_of_the_open_body_equal_brute_force() {
-    let Some(body) = body::open_body() else {
+    let Some(body) = testkit::body::open_body() else {
         return;
     };
     let built = build(&body);

@@ -1,8 +1,6 @@
 //! Visible vertices against brute force.
 #![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
 
-mod body;
-
 use glam::{Affine3A, Mat3, Vec2, Vec3};
 use proptest::prelude::*;
 use testkit::{TriMesh, mesh, oracle, strategy};
@@ -162,7 +160,7 @@ fn a_mask_of_another_size_panics() {
 
 #[test]
 fn about_half_of_the_open_body_is_visible_from_the_front() {
-    let Some(body) = body::open_body() else {
+    let Some(body) = testkit::body::open_body() else {
         return;
     };
     let view = look(Vec3::new(0.0, -0.2, 4.0), Vec3::new(0.0, -0.2, 0.0), 900.0, 1000);

@@ -78,7 +78,7 @@ fn is_default(options: &LoadOptions) -> bool {
 }
 
 /// Contents of metrics.json.
-#[derive(Clone, Debug, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Metrics {
     /// Name of the method.
     pub method: String,
@@ -114,7 +114,7 @@ pub const NOVEL_VIEWS: &str = "novel views";
 pub const TRAINING_VIEWS: &str = "training views, over visible pixels";
 
 /// Metrics of each split.
-#[derive(Clone, Debug, Default, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Splits {
     /// Held-out cameras.
     #[serde(skip_serializing_if = "Option::is_none")]

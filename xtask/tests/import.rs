@@ -6,19 +6,11 @@ mod common;
 use std::path::{Path, PathBuf};
 
 use common::{done, folder, refused, text};
-
-fn estimators() -> Option<PathBuf> {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared/data/estimators");
-    if path.is_dir() {
-        return Some(path);
-    }
-    println!("skipped: {} is absent", path.display());
-    None
-}
+use testkit::files::shared;
 
 #[test]
 fn a_newcomer_gets_a_person_with_three_commands() {
-    let Some(dir) = estimators() else { return };
+    let Some(dir) = shared("estimators") else { return };
     let folder = folder("import-newcomer");
     let (capture, run) = (folder.join("capture"), folder.join("run"));
     let (frames, fit) = (dir.join("frames"), dir.join("phalp"));
@@ -45,7 +37,7 @@ fn a_newcomer_gets_a_person_with_three_commands() {
 
 #[test]
 fn what_cannot_be_imported_is_said_in_one_line_and_leaves_nothing() {
-    let Some(dir) = estimators() else { return };
+    let Some(dir) = shared("estimators") else { return };
     let folder = folder("import-refused");
     let out = folder.join("capture");
     let (frames, wham, masks) = (dir.join("frames"), dir.join("wham/wham_output.pkl"), dir.join("sam2"));
@@ -96,7 +88,7 @@ fn own(dir: &Path, indices: &[usize], out: &Path) {
 /// tool whose focal length is worst, and what is known before training.
 #[test]
 fn training_views_are_as_good_as_from_the_captures_own_metadata() {
-    let Some(dir) = estimators() else { return };
+    let Some(dir) = shared("estimators") else { return };
     let folder = folder("import-trained");
     let long = std::env::var_os("OCCNERF_TOOLS").is_some();
     let how = if long { "--preset fast --steps 100 --seed 1" } else { "--method prior" };
@@ -152,7 +144,7 @@ fn each(list: &mut serde_json::Value, change: impl Fn(f64) -> f64) {
 
 #[test]
 fn check_names_the_mistake_in_a_capture_on_disk() {
-    let Some(dir) = estimators() else { return };
+    let Some(dir) = shared("estimators") else { return };
     let folder = folder("check-mistakes");
     let capture = folder.join("capture");
     let (frames, fit, masks) = (dir.join("frames"), dir.join("wham/wham_output.pkl"), dir.join("sam2"));

@@ -5,8 +5,9 @@ mod common;
 use array_files::npz::read_npy;
 use array_files::pickle::{self, Value};
 use array_files::{Data, Error, NdArray};
-use common::{fixture, shared};
+use common::fixture;
 use proptest::prelude::*;
+use testkit::files::shared;
 
 fn array(shape: &[usize], data: Data) -> Value {
     Value::Array(NdArray { shape: shape.to_vec(), data })

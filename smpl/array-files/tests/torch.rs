@@ -1,14 +1,12 @@
 //! Files of `torch.save`: views of every kind, in both forms, and what is wrong with others.
 #![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
 
-mod common;
-
 use std::io::{Cursor, Write};
 
 use allocation_counter::measure;
 use array_files::torch::{TorchFile, is_torch};
 use array_files::{Data, Error, NdArray};
-use common::shared;
+use testkit::files::shared;
 use zip::write::SimpleFileOptions;
 use zip::{CompressionMethod, ZipWriter};
 

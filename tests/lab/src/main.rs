@@ -12,6 +12,7 @@ mod report;
 mod reproduce;
 mod results;
 mod scene;
+mod sweep;
 mod synth;
 
 use anyhow::Result;

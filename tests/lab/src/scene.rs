@@ -9,13 +9,14 @@ use occnerf::capture::{Area, Capture, Layout, LoadOptions};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use synth::{Obstacle, Perturbation};
-use xtask::run::{RunConfig, write};
+use xtask::run::RunConfig;
 use xtask::source::{DEMO, LoadArguments, Source, load_with};
 
 use crate::obstacle::ObstacleArguments;
 
-/// The file of a run directory that says how the capture was corrupted.
-const FILE: &str = "corruption.json";
+/// Begins the recorded scene of a run on a corrupted capture, before the JSON of the scene and its
+/// [`Corruption`]. No file has such a name, so `xtask` refuses the run.
+const CORRUPTED: &str = "lab:";
 
 /// How the files of a scene are read, and the capture corrupted.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -37,24 +38,28 @@ pub struct Corruption {
 }
 
 impl SceneOptions {
-    /// The capture, corrupted.
+    /// The capture, corrupted; the scene of the source names the corruption.
     pub fn load(&self, scene: &str, body: Option<&Path>) -> Result<Source> {
-        let Corruption { occlusion, wrong } = self.corruption;
-        load_with(Some(scene), body, &self.files, |capture, model| {
-            occlude(capture, Path::new(scene), occlusion)?;
-            wrong.apply(capture, model)?;
-            wrong.spoil_body(model);
+        let mut corruption = self.corruption;
+        let mut source = load_with(Some(scene), body, &self.files, |capture, model| {
+            corruption.occlusion = occlude(capture, Path::new(scene), corruption.occlusion)?;
+            corruption.wrong.apply(capture, model)?;
+            corruption.wrong.spoil_body(model);
             Ok(())
-        })
+        })?;
+        if corruption != Corruption::default() {
+            source.scene = format!("{CORRUPTED}{}", serde_json::to_string(&(scene, corruption))?);
+        }
+        Ok(source)
     }
 }
 
-/// Puts the simulated obstacle before the training camera of raw ZJU-MoCap.
-fn occlude(capture: &mut Capture, directory: &Path, occlusion: Option<Obstacle>) -> Result<()> {
+/// Puts the simulated obstacle before the training camera of raw ZJU-MoCap, and returns it.
+fn occlude(capture: &mut Capture, directory: &Path, occlusion: Option<Obstacle>) -> Result<Option<Obstacle>> {
     if directory == Path::new(DEMO) || Layout::detect(directory)? != Layout::ZjuMocap {
         let scene = directory.display();
         ensure!(occlusion.is_none(), "{scene}: takes no obstacle, only raw ZJU-MoCap does");
-        return Ok(());
+        return Ok(None);
     }
     let recorded = directory.join("occlusion.json").is_file();
     if recorded && occlusion.is_some() {
@@ -62,42 +67,20 @@ fn occlude(capture: &mut Capture, directory: &Path, occlusion: Option<Obstacle>)
         let nowhere = Area { columns: 0..0, rows: 0..0 };
         capture.train.iter_mut().for_each(|frame| frame.source.hide(nowhere.clone()));
     }
-    if !recorded || occlusion.is_some() {
-        occlusion.unwrap_or_default().hide(&mut capture.train)?;
-    }
-    Ok(())
-}
-
-impl Corruption {
-    /// Writes it into a run directory.
-    ///
-    /// # Errors
-    /// If the run that is there has another.
-    pub fn keep(&self, run: &Path) -> Result<()> {
-        let begun = run.join("config.toml").is_file();
-        ensure!(
-            !begun || Self::of_run(run)? == *self,
-            "{} holds a run with other errors of prior or masks: give another --out",
-            run.display()
-        );
-        if *self == Self::default() { Ok(()) } else { write(&run.join(FILE), &serde_json::to_string_pretty(self)?) }
-    }
-
-    fn of_run(run: &Path) -> Result<Self> {
-        let path = run.join(FILE);
-        if !path.is_file() {
-            return Ok(Self::default());
-        }
-        let text = std::fs::read_to_string(&path).with_context(|| path.display().to_string())?;
-        serde_json::from_str(&text).with_context(|| path.display().to_string())
-    }
+    let obstacle = if recorded { occlusion } else { Some(occlusion.unwrap_or_default()) };
+    obstacle.iter().try_for_each(|obstacle| obstacle.hide(&mut capture.train).map(drop))?;
+    Ok(obstacle)
 }
 
 /// A run, and its capture with the bodies and the errors that it was trained with.
 pub fn of_run(directory: &Path) -> Result<(RunConfig, Source)> {
     let run = RunConfig::read(directory)?;
-    let options = SceneOptions { files: run.load.clone(), corruption: Corruption::of_run(directory)? };
-    let mut source = options.load(&run.scene, run.body.as_deref())?;
+    let (scene, corruption) = match run.scene.strip_prefix(CORRUPTED) {
+        Some(text) => serde_json::from_str(text).with_context(|| format!("{}: config.toml", directory.display()))?,
+        None => (run.scene.clone(), Corruption::default()),
+    };
+    let options = SceneOptions { files: run.load.clone(), corruption };
+    let mut source = options.load(&scene, run.body.as_deref())?;
     source.restore(directory, &run.train)?;
     Ok((run, source))
 }

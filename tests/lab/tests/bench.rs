@@ -5,7 +5,7 @@ mod common;
 
 use std::path::{Path, PathBuf};
 
-use common::{TINY, done, folder, refused, text};
+use common::{done, folder, refused, text};
 use image::{Rgb, RgbImage};
 use occnerf::{Config, Method, Preset};
 
@@ -26,7 +26,7 @@ fn self_contained(page: &str) {
 /// A tiny capture of a layout, in a folder of the layout's name.
 fn tiny(folder: &Path, format: &str) -> PathBuf {
     let out = folder.join(format);
-    done(&[&["synth", "--out", text(&out), "--format", format], &TINY[..]].concat());
+    common::tiny(&out, format);
     out
 }
 
@@ -79,7 +79,7 @@ fn captures_are_made_hard_as_their_layout_allows() {
 #[test]
 fn without_time_a_sweep_says_what_is_left() {
     let out = folder("no-time");
-    let said = done(&["bench", "pareto", "--minutes", "0", "--draw", "--out", out.to_str().unwrap()]);
+    let said = done(&["bench", "stability", "--minutes", "0", "--out", text(&out)]);
     assert!(said.contains("0 runs in") && said.contains("points are left"), "{said}");
     refused(&["bench", "pareto", "/no/such/place"], &["/no/such/place"]);
     refused(&["bench", "pareto", "--minutes=-1"], &["minutes"]);

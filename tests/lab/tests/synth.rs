@@ -5,7 +5,7 @@ mod common;
 
 use std::path::Path;
 
-use common::{done, folder, lab, refused, text};
+use common::{done, folder, refused, text};
 use occnerf::capture::{Capture, Frame, LoadOptions, load_capture};
 use occnerf::{Config, Method, Preset, Trainer};
 
@@ -13,9 +13,7 @@ use occnerf::{Config, Method, Preset, Trainer};
 fn small(out: &Path, more: &[&str]) -> String {
     let usual = ["--size", "32", "--eval-cameras", "1", "--eval-every", "2"];
     let frames: &[&str] = if more.contains(&"--frames") { &[] } else { &["--frames", "4"] };
-    let output = lab(&[&["synth", "--out", text(out)], &usual[..], frames, more].concat());
-    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
-    String::from_utf8(output.stdout).unwrap()
+    done(&[&["synth", "--out", text(out)], &usual[..], frames, more].concat())
 }
 
 fn files(directory: &Path) -> usize {
@@ -86,11 +84,7 @@ fn a_capture_is_corrupted_on_disk() {
 
 #[test]
 fn a_character_is_written_and_keeps_its_joints() {
-    let character = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared/data/character/CesiumMan.glb");
-    if !character.is_file() {
-        println!("skipped: {} is absent", character.display());
-        return;
-    }
+    let Some(character) = testkit::files::shared("character/CesiumMan.glb") else { return };
     let out = folder("synth-character").join("capture");
     let said = small(&out, &[text(&character), "--occlusion", "objects", "--fraction", "0.4", "--format", "ocmotion"]);
     assert!(said.contains("19 joints"), "{said}");

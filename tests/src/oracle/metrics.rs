@@ -79,12 +79,12 @@ pub fn ssim(a: &[f32], b: &[f32], width: usize, height: usize) -> f64 {
     sum / ((width - 2 * border) * (height - 2 * border)) as f64
 }
 
-/// Intersection over union of a mask, at 0.5, and of the pixels that are `covered`, over the pixels
-/// outside `ignored`.
-pub fn mask_iou(mask: &[f32], ignored: Option<&[bool]>, covered: impl Fn(usize) -> bool) -> f32 {
+/// Intersection over union of a mask, at 0.5, and of the pixels whose centres are `covered`, over
+/// the pixels outside `ignored`.
+pub fn mask_iou(mask: &[f32], ignored: Option<&[bool]>, width: usize, covered: impl Fn(f32, f32) -> bool) -> f32 {
     let (mut both, mut either) = (0, 0);
     for (i, &coverage) in mask.iter().enumerate().filter(|(i, _)| !ignored.is_some_and(|ignored| ignored[*i])) {
-        let (covered, subject) = (covered(i), coverage > 0.5);
+        let (covered, subject) = (covered((i % width) as f32 + 0.5, (i / width) as f32 + 0.5), coverage > 0.5);
         both += usize::from(covered && subject);
         either += usize::from(covered || subject);
     }

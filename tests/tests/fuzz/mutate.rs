@@ -254,15 +254,7 @@ fn glb(random: &mut Random, seed: &[u8]) -> Vec<u8> {
     } else {
         json = harm(random, json, &binary);
     }
-    let mut out = b"glTF\x02\0\0\0".to_vec();
-    out.extend((28 + json.len() as u32 + binary.len() as u32).to_le_bytes());
-    out.extend((json.len() as u32).to_le_bytes());
-    out.extend(b"JSON");
-    out.extend(&json);
-    out.extend((binary.len() as u32).to_le_bytes());
-    out.extend(b"BIN\0");
-    out.extend(&binary);
-    out
+    testkit::files::glb(&json, &binary)
 }
 
 fn safetensors(random: &mut Random, seed: &[u8]) -> Vec<u8> {

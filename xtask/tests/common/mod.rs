@@ -1,57 +1,15 @@
-//! What the tests of the command line share; each uses a part of it.
+//! Helpers for tests of the command line.
 #![allow(dead_code, reason = "each test uses a part")]
 
-use std::path::{Path, PathBuf};
-use std::process::{Command, Output};
+use std::path::Path;
 
 use occnerf::capture::Layout;
 use synth::{SynthConfig, synthesise};
 
-/// Runs the program.
-pub fn xtask(arguments: &[&str]) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_xtask")).args(arguments).env_remove("SMPL_MODEL").output().unwrap()
-}
-
-/// Runs the program, which must succeed; returns what it prints.
-pub fn done(arguments: &[&str]) -> String {
-    let output = xtask(arguments);
-    let errors = String::from_utf8_lossy(&output.stderr);
-    assert!(output.status.success(), "{arguments:?}: {errors}");
-    String::from_utf8(output.stdout).unwrap()
-}
-
-/// Runs the program, which must refuse its arguments as [`refusal`] says.
-pub fn refused(arguments: &[&str], words: &[&str]) {
-    refusal(&xtask(arguments), &format!("{arguments:?}"), words);
-}
-
-/// A path as an argument.
-pub fn text(path: &Path) -> &str {
-    path.to_str().unwrap()
-}
-
-/// Fails unless the program ended with one line on standard error that names every one of `words`,
-/// and without a panic.
-pub fn refusal(output: &Output, what: &str, words: &[&str]) {
-    let text = String::from_utf8_lossy(&output.stderr).into_owned();
-    assert!(!output.status.success(), "{what} succeeded");
-    assert_eq!(text.trim_end().lines().count(), 1, "{what}: {text}");
-    assert!(text.starts_with("error: ") && !text.contains("panicked"), "{what}: {text}");
-    for word in words {
-        assert!(text.contains(word), "{what} should name {word}: {text}");
-    }
-}
+testkit::program!(xtask);
 
 /// Writes a capture of the embedded person, of pictures `size` pixels a side.
 pub fn capture(out: &Path, layout: Layout, size: u32, frames: usize) {
     let config = SynthConfig { size, frames, eval_cameras: 1, eval_every: 2, ..SynthConfig::default() };
     synthesise(None, None, &config, &|_| {}).unwrap().write(out, layout, &|_| {}).unwrap();
-}
-
-/// An empty folder of a test's own.
-pub fn folder(name: &str) -> PathBuf {
-    let path = Path::new(env!("CARGO_TARGET_TMPDIR")).join(name);
-    let _ = std::fs::remove_dir_all(&path);
-    std::fs::create_dir_all(&path).unwrap();
-    path
 }

@@ -72,9 +72,9 @@ pub fn damaged(whole: &[u8], count: usize) -> impl Iterator<Item = Vec<u8>> + '_
 pub fn overlap(frame: &super::Frame, body: &BodyModel) -> f32 {
     let posed = body.pose(&body.shaped(&frame.betas), &frame.pose, frame.placement);
     let mesh = visibility::RayMesh::new(&posed.vertices, &body.faces).unwrap();
-    let (pixels, width) = (frame.pixels().unwrap(), frame.camera.width);
-    testkit::oracle::mask_iou(&pixels.mask, pixels.occluder.as_deref(), |i| {
-        let ray = frame.camera.ray((i as u32 % width) as f32 + 0.5, (i as u32 / width) as f32 + 0.5);
+    let (pixels, width) = (frame.pixels().unwrap(), frame.camera.width as usize);
+    testkit::oracle::mask_iou(&pixels.mask, pixels.occluder.as_deref(), width, |x, y| {
+        let ray = frame.camera.ray(x, y);
         mesh.first_hit(ray.origin, ray.direction).is_some()
     })
 }

@@ -9,12 +9,7 @@ use std::path::{Path, PathBuf};
 
 /// A file of the shared data, or `None` with a message where it is absent.
 fn shared(name: &str) -> Option<PathBuf> {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared/data/lpips").join(name);
-    if !path.exists() {
-        eprintln!("skipped: {} is absent", path.display());
-        return None;
-    }
-    Some(path)
+    testkit::files::shared(&format!("lpips/{name}"))
 }
 
 /// Noise in [0, 1], a function of its seed.

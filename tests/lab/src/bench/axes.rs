@@ -5,9 +5,8 @@ use occnerf::{Config, Preset};
 use synth::DemoConfig;
 
 use super::difficulty::Difficulty;
-use super::job::{Job, Place};
-use super::runner::{Kind, Point};
 use crate::methods::{Method, scale_rates};
+use crate::sweep::{Job, Kind, Place, Point};
 
 /// Training frames and scored views of the easy case.
 const FRAMES: usize = 50;
@@ -61,7 +60,7 @@ impl Level {
             level: Some(self.value),
             kind: if self.easy { Kind::Base } else { Kind::Level },
             command: None,
-            job: Job { place: self.place.clone(), views: VIEWS, method, config, prune: false, bake: None },
+            job: Job::new(self.place.clone(), VIEWS, method, config),
         }
     }
 }

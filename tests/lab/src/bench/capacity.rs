@@ -6,8 +6,8 @@ use xtask::capacity;
 use xtask::source::Source;
 
 use super::points::{Setting, Sweep};
-use super::runner::{Kind, Point};
 use crate::methods::Method;
+use crate::sweep::{Kind, Point};
 
 /// Fixed sizes around `balanced`: name, as `train --set` takes it, whether the quick form has it.
 const AROUND: [(&str, &[&str], bool); 7] = [

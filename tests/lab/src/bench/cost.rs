@@ -13,9 +13,8 @@ use synth::DemoConfig;
 use self::machine::Machine;
 use super::chart::{Axis, Line, Mark, Panel, Picture, Shape, Style};
 use super::difficulty::Difficulty;
-use super::job::{Job, Place};
-use super::runner::{Bench, Kind, Point};
 use crate::methods::Method;
+use crate::sweep::{Job, Kind, Place, Point, Runner};
 use xtask::scale::number;
 
 /// Steps of each run; the median is over the second half, when buffers have grown to size.
@@ -56,7 +55,7 @@ const GROWTHS: [Growth; 6] = [
 ];
 
 /// Runs everything, writes cost.md, growth.svg and growth.png.
-pub fn run(bench: &mut Bench, out: &Path) -> Result<String> {
+pub fn run(runner: &mut Runner, out: &Path) -> Result<String> {
     let machine = Machine::measure();
     let mut text = format!(
         "A plain product of 256×64 by 64×64 runs at {:.0} GFLOP/s on one thread, {:.0} on all;\n",
@@ -67,7 +66,7 @@ pub fn run(bench: &mut Bench, out: &Path) -> Result<String> {
     );
     // `fast` is `balanced` with fewer steps.
     for preset in [Preset::Balanced, Preset::Paper] {
-        text.push_str(&profile(preset, bench)?);
+        text.push_str(&profile(preset, runner)?);
     }
     let mut panels = Vec::new();
     let mut table = String::from(
@@ -77,7 +76,7 @@ pub fn run(bench: &mut Bench, out: &Path) -> Result<String> {
          | --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |\n",
     );
     for growth in &GROWTHS {
-        panels.extend(grow(growth, bench, &mut table)?);
+        panels.extend(grow(growth, runner, &mut table)?);
     }
     let linear = ("linear".to_owned(), Style(5, Shape::Dash));
     let picture = Picture {
@@ -97,8 +96,7 @@ pub fn run(bench: &mut Bench, out: &Path) -> Result<String> {
 }
 
 fn point(name: String, factor: &str, config: Config, difficulty: Difficulty) -> Point {
-    let place = Place::Made(difficulty);
-    let job = Job { place, views: 1, method: Method::Occnerf, config, prune: false, bake: None };
+    let job = Job::new(Place::Made(difficulty), 1, Method::Occnerf, config);
     Point {
         bench: "cost".to_owned(),
         name,
@@ -116,10 +114,10 @@ fn small() -> Difficulty {
 }
 
 /// Shares of the stages at a preset.
-fn profile(preset: Preset, bench: &mut Bench) -> Result<String> {
+fn profile(preset: Preset, runner: &mut Runner) -> Result<String> {
     // So few that poses are taught too, as in all but the first tenth of a run.
     let config = Config { steps: STEPS, ..Method::Occnerf.preset(preset) };
-    let Some(line) = bench.run(point(preset.name().to_owned(), "profile", config.clone(), small()))? else {
+    let Some(line) = runner.run(point(preset.name().to_owned(), "profile", config.clone(), small()))? else {
         return Ok(String::new());
     };
     let outcome = &line.outcome;
@@ -166,13 +164,13 @@ fn flops(config: &Config) -> f64 {
 const TIMES: [(&str, usize); 3] = [("a step, or memory", 0), ("making ready", 1), ("drawing a view", 2)];
 
 /// Two panels, time and memory, and rows of the table.
-fn grow(growth: &Growth, bench: &mut Bench, table: &mut String) -> Result<Vec<Panel>> {
+fn grow(growth: &Growth, runner: &mut Runner, table: &mut String) -> Result<Vec<Panel>> {
     let (mut times, mut memory): ([Vec<(f64, f64)>; 3], _) = (Default::default(), Vec::new());
     for &level in growth.levels {
         let (mut config, mut difficulty) = (Method::Occnerf.preset(Preset::Fast), small());
         config.steps = STEPS;
         (growth.set)(&mut config, &mut difficulty, level);
-        let Some(line) = bench.run(point(format!("{} {level}", growth.name), growth.name, config, difficulty))? else {
+        let Some(line) = runner.run(point(format!("{} {level}", growth.name), growth.name, config, difficulty))? else {
             continue;
         };
         let outcome = &line.outcome;

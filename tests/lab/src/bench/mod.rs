@@ -7,27 +7,24 @@ pub mod chart;
 mod cost;
 mod difficulty;
 mod front;
-mod job;
 mod kernels;
 mod pareto;
 mod points;
 mod registration;
-mod runner;
 mod stability;
 
 use std::path::{Path, PathBuf};
-use std::time::Duration;
 
-use anyhow::Result;
+use anyhow::{Result, bail, ensure};
 use clap::{Args, Subcommand};
 use occnerf::capture::Layout;
 
-use self::job::Place;
-use self::runner::{Bench, Line};
+pub use self::baked::Baking;
+pub use self::difficulty::Difficulty;
 use crate::results::{self, Section};
+use crate::sweep::{Line, Place, Runner, SittingArguments, job};
 use xtask::process::say;
-use xtask::run::{check_threads, use_threads, write};
-use xtask::shard::ShardArguments;
+use xtask::run::{use_threads, write};
 use xtask::source::Source;
 use xtask::{source, train};
 
@@ -46,7 +43,7 @@ pub struct BenchArguments {
 enum What {
     /// Seconds against accuracy of every named approximation, each preset and each method: a table
     /// and charts.
-    Pareto(ParetoArguments),
+    Pareto(SweepArguments),
     /// Parameters and memory against accuracy, of fixed sizes and of `train --capacity auto`: a
     /// table and charts.
     Capacity(CapacityArguments),
@@ -110,18 +107,6 @@ struct CapacityArguments {
     /// `balanced`
     #[arg(long, value_name = "STEPS")]
     paper: Option<u64>,
-    /// Seed of every point
-    #[arg(long, default_value_t = 1)]
-    seed: u64,
-}
-
-#[derive(Args)]
-struct ParetoArguments {
-    #[command(flatten)]
-    sweep: SweepArguments,
-    /// Seed of every point
-    #[arg(long, default_value_t = 1)]
-    seed: u64,
 }
 
 #[derive(Args)]
@@ -138,25 +123,6 @@ struct StabilityArguments {
     /// Trained runs at most of each scene; those of more seeds are left out first
     #[arg(long, default_value_t = 60)]
     max_runs: usize,
-}
-
-/// How a sweep is run this time.
-#[derive(Args)]
-struct SittingArguments {
-    /// Threads of each run [default: all cores]
-    #[arg(long)]
-    threads: Option<usize>,
-    /// Begin no run after so many minutes; the same command goes on later [default: no limit]
-    #[arg(long)]
-    minutes: Option<f64>,
-    /// Only draw what has been run
-    #[arg(long)]
-    draw: bool,
-    #[command(flatten)]
-    part: ShardArguments,
-    /// Make what is found a section of tests/lab/RESULTS.md
-    #[arg(long)]
-    publish: bool,
 }
 
 #[derive(Args)]
@@ -193,24 +159,15 @@ pub fn bench(arguments: &BenchArguments) -> Result<()> {
         What::Cost(arguments) => {
             use_threads(arguments.sitting.threads)?;
             let alone = arguments.sitting.part.shard.is_none();
-            anyhow::ensure!(alone, "bench cost measures one machine: it has no parts");
-            let mut bench = arguments.sitting.open(&arguments.out)?;
-            let text = cost::run(&mut bench, &arguments.out)?;
-            finish(&bench, &arguments.sitting, &text, "cost")
+            ensure!(alone, "bench cost measures one machine: it has no parts");
+            let mut runner = arguments.sitting.open(&arguments.out)?;
+            let text = cost::run(&mut runner, &arguments.out)?;
+            finish(&runner, &arguments.sitting, &text, "cost")
         }
         What::Point { threads } => {
             use_threads(*threads)?;
             job::serve()
         }
-    }
-}
-
-impl SittingArguments {
-    fn open(&self, out: &Path) -> Result<Bench> {
-        let minutes = if self.draw || self.part.merge { 0.0 } else { self.minutes.unwrap_or(1e6) };
-        anyhow::ensure!((0.0..=1e6).contains(&minutes), "--minutes {minutes}: expected 0 to 1000000");
-        check_threads(self.threads)?;
-        Bench::open(out, self.threads, Duration::from_secs_f64(60.0 * minutes), self.part.shard)
     }
 }
 
@@ -231,16 +188,10 @@ impl SceneArguments {
     /// What `bench stability` does to a scene.
     fn axes(&self, scene: &str, side: u32, quick: bool) -> Result<Vec<axes::Axis>> {
         if scene == source::DEMO {
-            anyhow::ensure!(
-                self.load.command_line().is_empty(),
-                "bench stability makes the demo anew, without options"
-            );
+            ensure!(self.load.command_line().is_empty(), "bench stability makes the demo anew, without options");
             return Ok(axes::of_demo(side, quick));
         }
-        anyhow::ensure!(
-            Path::new(scene).is_dir(),
-            "{scene}: expected the demo, or a capture on disk (synth makes one)"
-        );
+        ensure!(Path::new(scene).is_dir(), "{scene}: expected the demo, or a capture on disk (synth makes one)");
         // The one layout that leaves open what hides the person.
         let obstacle = Layout::detect(Path::new(scene))? == Layout::ZjuMocap;
         let place = Place::Scene { scene: scene.to_owned(), body: self.body.clone(), load: self.load.options()? };
@@ -264,12 +215,12 @@ impl SweepArguments {
 
     fn steps(&self, usual: u64, quick: u64) -> Result<u64> {
         let steps = self.steps.unwrap_or(if self.quick { quick } else { usual });
-        anyhow::ensure!((1..=1_000_000).contains(&steps), "--steps {steps}: expected 1 to 1000000");
+        ensure!((1..=1_000_000).contains(&steps), "--steps {steps}: expected 1 to 1000000");
         Ok(steps)
     }
 
     /// The sweep of `pareto` and `capacity` around a scene.
-    fn around(&self, scene: &str, seed: u64) -> Result<points::Sweep> {
+    fn around(&self, scene: &str) -> Result<points::Sweep> {
         let on = &self.on;
         Ok(points::Sweep {
             scene_arguments: on.command_line(scene),
@@ -277,7 +228,6 @@ impl SweepArguments {
             views: if self.quick { VIEWS.1 } else { VIEWS.0 },
             steps: self.steps(FULL_STEPS, FULL_STEPS / 5)?,
             full_steps: FULL_STEPS,
-            seed,
             quick: self.quick,
         })
     }
@@ -294,45 +244,48 @@ impl SweepArguments {
         &self,
         name: &str,
         scenes: &[(String, S)],
-        run: impl Fn(&str, &S, &mut Bench) -> Result<Vec<Line>>,
+        run: impl Fn(&str, &S, &mut Runner) -> Result<Vec<Line>>,
         draw: impl Fn(&str, &S, &[Line], &Path) -> Result<String>,
     ) -> Result<()> {
         let out = self.out(name);
-        let mut bench = self.sitting.open(&out)?;
+        let mut runner = self.sitting.open(&out)?;
         let mut text = String::new();
         for (scene, of_scene) in scenes {
-            let lines = run(scene, of_scene, &mut bench)?;
+            let lines = run(scene, of_scene, &mut runner)?;
             if self.sitting.part.writes_tables() {
                 let short = train::scene_name(Some(scene));
                 let section = draw(&short, of_scene, &lines, &out.join(format!("{name}-{short}")))?;
                 text.push_str(&format!("## {scene}\n\n{}.\n\n{section}\n", results::set_of(&short)));
             }
         }
-        finish(&bench, &self.sitting, &text, name)
+        finish(&runner, &self.sitting, &text, name)
     }
 }
 
-fn pareto(arguments: &ParetoArguments) -> Result<()> {
-    let ParetoArguments { sweep, seed } = arguments;
+fn pareto(sweep: &SweepArguments) -> Result<()> {
     let scenes = sweep.scenes()?;
-    let run = |scene: &str, _: &(), bench: &mut Bench| pareto::run_sweep(&sweep.around(scene, *seed)?, bench);
+    let run = |scene: &str, _: &(), runner: &mut Runner| {
+        let around = sweep.around(scene)?;
+        let mut lines = runner.run_all(around.first()?)?;
+        lines.extend(runner.run_all(around.combinations(&lines)?)?);
+        Ok(lines)
+    };
     sweep.sweep("pareto", &scenes, run, |name, _, lines, stem| {
         pareto::charts(name, lines, &pareto::SECONDS, stem)?;
         Ok(pareto::table(lines, pareto::SECONDS[0]))
     })?;
-    let sitting = &sweep.sitting;
-    if sitting.draw || !sitting.part.writes_tables() {
+    let SittingArguments { part, publish, .. } = sweep.sitting;
+    if part.merge || part.shard.is_some() {
         return Ok(());
     }
-    kernels::run(&sweep.out("pareto"), sweep.quick, sitting.publish)
+    kernels::run(&sweep.out("pareto"), sweep.quick, publish)
 }
 
 fn capacity_bench(arguments: &CapacityArguments) -> Result<()> {
-    let CapacityArguments { sweep, seed, paper } = arguments;
+    let CapacityArguments { sweep, paper } = arguments;
     let scenes = sweep.scenes()?;
-    let run = |scene: &str, _: &(), bench: &mut Bench| {
-        let points = capacity::points(&sweep.around(scene, *seed)?, &sweep.on.read(scene)?, *paper)?;
-        pareto::run(points, bench)
+    let run = |scene: &str, _: &(), runner: &mut Runner| {
+        runner.run_all(capacity::points(&sweep.around(scene)?, &sweep.on.read(scene)?, *paper)?)
     };
     sweep.sweep("capacity", &scenes, run, |name, _, lines, stem| {
         pareto::charts(name, lines, &pareto::PARAMETERS, stem)?;
@@ -343,20 +296,20 @@ fn capacity_bench(arguments: &CapacityArguments) -> Result<()> {
 fn stability(arguments: &StabilityArguments) -> Result<()> {
     let StabilityArguments { sweep, side, max_runs, .. } = arguments;
     let (quick, steps) = (sweep.quick, sweep.steps(200, 100)?);
-    anyhow::ensure!((16..=2048).contains(side), "--side {side}: expected 16 to 2048");
+    ensure!((16..=2048).contains(side), "--side {side}: expected 16 to 2048");
     let mut of_scenes = Vec::new();
     for scene in sweep.on.checked()? {
         let mut axes = sweep.on.axes(&scene, *side, quick)?;
         if !arguments.axes.is_empty() {
             let known = axes.iter().map(|a| a.name).collect::<Vec<_>>().join(", ");
             if let Some(unknown) = arguments.axes.iter().find(|name| axes.iter().all(|a| a.name != name.trim())) {
-                anyhow::bail!("--axes {unknown}: of {scene} there are {known}");
+                bail!("--axes {unknown}: of {scene} there are {known}");
             }
             axes.retain(|axis| arguments.axes.iter().any(|name| name.trim() == axis.name));
         }
         of_scenes.push((scene, stability::Sweep { axes, steps, quick, max_runs: *max_runs }));
     }
-    let run = |_: &str, of_scene: &stability::Sweep, bench: &mut Bench| of_scene.run(bench);
+    let run = |_: &str, of_scene: &stability::Sweep, runner: &mut Runner| of_scene.run(runner);
     sweep.sweep("stability", &of_scenes, run, |name, of_scene, lines, stem| {
         stability::charts(name, &of_scene.axes, lines, stem)?;
         Ok(format!("{}\n{}\n", stability::table(&of_scene.axes, lines), stability::finite(lines)))
@@ -364,23 +317,15 @@ fn stability(arguments: &StabilityArguments) -> Result<()> {
 }
 
 /// Prints and writes the table, and says what there is.
-fn finish(bench: &Bench, sitting: &SittingArguments, text: &str, name: &str) -> Result<()> {
-    let (begun, left) = bench.counts();
-    if bench.is_part() {
-        say!(
-            "{begun} runs in {:.1} minutes; {left} are of other parts, or left; --merge draws",
-            bench.seconds() / 60.0
-        );
-        return Ok(());
+fn finish(runner: &Runner, sitting: &SittingArguments, text: &str, name: &str) -> Result<()> {
+    if sitting.part.writes_tables() {
+        let log = runner.path();
+        let path = log.with_file_name(format!("{name}.md"));
+        write(&path, text)?;
+        say!("\n{text}\nwritten: {}\nwritten: {}", log.display(), path.display());
     }
-    let (log, minutes) = (bench.path().display(), bench.seconds() / 60.0);
-    let path = bench.path().with_file_name(format!("{name}.md"));
-    write(&path, text)?;
-    say!("\n{text}\nwritten: {log}\nwritten: {}\n{begun} runs in {minutes:.1} minutes", path.display());
-    if left > 0 {
-        say!("{left} points are left: the same command goes on with them");
-    }
-    if sitting.publish {
+    runner.end(&sitting.part)?;
+    if sitting.publish && sitting.part.writes_tables() {
         let title = match name {
             "pareto" => "Speed against accuracy",
             "capacity" => "Parameters against accuracy",
@@ -388,7 +333,7 @@ fn finish(bench: &Bench, sitting: &SittingArguments, text: &str, name: &str) -> 
             _ => "What a step costs",
         };
         let stem = if name == "cost" { "growth" } else { name };
-        let charts = results::charts(bench.path().parent().unwrap_or(Path::new(".")), stem)?;
+        let charts = results::charts(runner.path().parent().unwrap_or(Path::new(".")), stem)?;
         results::publish(&Section { name, title, body: text, charts: &charts })?;
     }
     Ok(())

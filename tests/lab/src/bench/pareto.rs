@@ -7,8 +7,7 @@ use anyhow::Result;
 
 use super::chart::{Mark, Panel, Picture, Shape, Style, legend};
 use super::front::front;
-use super::points::Sweep;
-use super::runner::{Bench, Kind, Line, Point};
+use crate::sweep::{Kind, Line};
 
 /// A measured quantity of a run.
 type Pick = fn(&Line) -> Option<f64>;
@@ -39,22 +38,6 @@ const STYLES: [(Kind, &str, Style); 7] = [
     (Kind::Baseline, "other method", Style(1, Shape::Ring)),
     (Kind::Baked, "baked", Style(4, Shape::Circle)),
 ];
-
-/// Runs points in order.
-pub fn run(points: Vec<Point>, bench: &mut Bench) -> Result<Vec<Line>> {
-    let mut lines = Vec::new();
-    for point in points {
-        lines.extend(bench.run(point)?);
-    }
-    Ok(lines)
-}
-
-/// Runs the sweep of one capture: single changes, then their best combinations.
-pub fn run_sweep(sweep: &Sweep, bench: &mut Bench) -> Result<Vec<Line>> {
-    let mut lines = run(sweep.first()?, bench)?;
-    lines.extend(run(sweep.combinations(&lines)?, bench)?);
-    Ok(lines)
-}
 
 /// Cost and worth of a line that did not fail; NaN where either is missing.
 fn place(line: &Line, cost: Pick, worth: Pick) -> (f64, f64) {
@@ -151,7 +134,7 @@ pub fn table(lines: &[Line], cost: Cost) -> String {
 #[allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
 mod tests {
     use super::*;
-    use crate::bench::runner::tests::line;
+    use crate::sweep::tests::line;
 
     #[test]
     fn the_table_names_the_front_and_failed_points_and_compares_each_with_its_base() {

@@ -4,9 +4,8 @@ use anyhow::Result;
 use occnerf::{Config, Preset};
 
 use super::baked::Baking;
-use super::job::{Job, Place};
-use super::runner::{Kind, Line, Point};
 use crate::methods::Method;
+use crate::sweep::{Job, Kind, Line, Place, Point};
 use xtask::settings;
 
 /// One change of one factor.
@@ -88,7 +87,6 @@ pub struct Sweep {
     pub steps: u64,
     /// Steps of the base at which presets run their own number of steps.
     pub full_steps: u64,
-    pub seed: u64,
     pub quick: bool,
 }
 
@@ -104,17 +102,16 @@ impl Sweep {
     /// A point of `bench pareto`.
     pub fn point(&self, name: &str, factor: &str, kind: Kind, setting: &Setting<'_>) -> Result<Point> {
         let Setting { preset, method, steps, set } = *setting;
-        let mut config = Config { steps, seed: self.seed, ..method.preset(preset) };
+        let mut config = Config { steps, seed: 1, ..method.preset(preset) };
         for assignment in set {
             config = settings::set(&config, assignment)?;
         }
         config.validate()?;
         let mut command = format!(
-            "cargo xtask train{} --preset {} --method {} --steps {steps} --seed {}",
+            "cargo xtask train{} --preset {} --method {} --steps {steps} --seed 1",
             self.scene_arguments,
             preset.name(),
-            method.name(),
-            self.seed
+            method.name()
         );
         set.iter().for_each(|assignment| command.push_str(&format!(" --set {assignment}")));
         Ok(Point {
@@ -124,7 +121,7 @@ impl Sweep {
             level: None,
             kind,
             command: method.is_product().then_some(command),
-            job: Job { place: self.place.clone(), views: self.views, method, config, prune: false, bake: None },
+            job: Job::new(self.place.clone(), self.views, method, config),
         })
     }
 
@@ -233,12 +230,12 @@ pub fn worth(line: &Line) -> Option<f64> {
 #[allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
 mod tests {
     use super::*;
-    use crate::bench::difficulty::Difficulty;
-    use crate::bench::runner::tests::line;
+    use crate::bench::Difficulty;
+    use crate::sweep::tests::line;
 
     fn sweep(quick: bool) -> Sweep {
         let place = Place::Made(Difficulty::default());
-        Sweep { place, scene_arguments: String::new(), views: 5, steps: 400, full_steps: 400, seed: 1, quick }
+        Sweep { place, scene_arguments: String::new(), views: 5, steps: 400, full_steps: 400, quick }
     }
 
     #[test]

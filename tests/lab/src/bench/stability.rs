@@ -8,8 +8,8 @@ use anyhow::Result;
 
 use super::axes::Axis;
 use super::chart::{self, Mark, Panel, Picture, Shape, Style};
-use super::runner::{Bench, Line, Point};
 use crate::methods::Method;
+use crate::sweep::{Line, Point, Runner};
 
 /// Methods that are trained, ours first.
 const TRAINED: [Method; 3] = [Method::Occnerf, Method::HashPoint, Method::Humannerf];
@@ -29,7 +29,7 @@ pub struct Sweep {
 
 /// Runs of a sweep, by their points.
 struct Runs<'a> {
-    bench: &'a mut Bench,
+    runner: &'a mut Runner,
     lines: Vec<Line>,
     /// Trained runs so far, and what they may come to.
     trained: usize,
@@ -47,7 +47,7 @@ impl Runs<'_> {
             self.trained += 1;
         }
         if self.lines.iter().all(|l| l.point != point) {
-            self.lines.extend(self.bench.run(point)?);
+            self.lines.extend(self.runner.run(point)?);
         }
         Ok(())
     }
@@ -62,8 +62,8 @@ pub struct Course {
 impl Sweep {
     /// Runs what the log does not have: every level of ours, the easy case and the hardest level of
     /// the peers, then the peers where ours breaks first, and more seeds where anything does.
-    pub fn run(&self, bench: &mut Bench) -> Result<Vec<Line>> {
-        let mut runs = Runs { bench, lines: Vec::new(), trained: 0, max_runs: self.max_runs };
+    pub fn run(&self, runner: &mut Runner) -> Result<Vec<Line>> {
+        let mut runs = Runs { runner, lines: Vec::new(), trained: 0, max_runs: self.max_runs };
         for axis in &self.axes {
             for level in &axis.levels {
                 runs.run(level.point(axis, Method::Prior, self.steps, 1))?;
@@ -246,7 +246,7 @@ pub fn charts(scene: &str, axes: &[Axis], lines: &[Line], stem: &Path) -> Result
 mod tests {
     use super::*;
     use crate::bench::axes;
-    use crate::bench::job::Outcome;
+    use crate::sweep::Outcome;
 
     /// Lines of a method along an axis with these scores, level by level.
     fn lines(axis: &Axis, method: Method, scores: &[Option<f64>]) -> Vec<Line> {

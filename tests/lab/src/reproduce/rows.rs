@@ -4,16 +4,8 @@ use anyhow::{Context, Result};
 use occnerf::{Config, OccludedRule, Preset};
 
 use crate::methods::{Method, scale_rates};
+use synth::Perturbation;
 use xtask::settings::set;
-
-/// How long a row trains.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Length {
-    /// As many steps as every other row, times this.
-    Times(f64),
-    /// As many seconds as `occnerf`.
-    Seconds,
-}
 
 /// A row of a table.
 #[derive(Clone, Debug)]
@@ -24,8 +16,8 @@ pub struct Row {
     pub method: Method,
     /// The pixel rule.
     pub occluded: OccludedRule,
-    /// How long.
-    pub length: Length,
+    /// Factor on the number of steps.
+    pub times: f64,
     /// Where it starts from; `None`: the preset of the command line.
     preset: Option<Preset>,
     /// What differs from that, as `--set` takes it.
@@ -50,11 +42,30 @@ pub enum Table {
     Curves,
     /// Settings of the default, judged by training frames that are held out.
     Choices,
+    /// The main methods with a prior or masks made wrong.
+    Robustness,
 }
 
-use Length::{Seconds, Times};
 use Method::{HashPoint, Humannerf, NeuralBody, Occnerf, Prior, SelfNerf};
 use OccludedRule::{Background, Unknown};
+
+/// Priors made wrong, each with the name of its directory.
+const LEVELS: [(&str, Perturbation); 9] = {
+    let none = Perturbation::NONE;
+    [
+        ("as-it-is", none),
+        ("pose-2", Perturbation { pose_degrees: 2.0, ..none }),
+        ("pose-5", Perturbation { pose_degrees: 5.0, ..none }),
+        ("pose-10", Perturbation { pose_degrees: 10.0, ..none }),
+        ("shape-1", Perturbation { shape: 1.0, ..none }),
+        ("shape-2", Perturbation { shape: 2.0, ..none }),
+        ("mask-minus-3", Perturbation { mask_pixels: -3, ..none }),
+        ("mask-minus-1", Perturbation { mask_pixels: -1, ..none }),
+        ("mask-plus-3", Perturbation { mask_pixels: 3, ..none }),
+    ]
+};
+/// The methods themselves, each by its best pixel rule, and the baseline's own.
+const MAIN: [&str; 5] = ["prior", "humannerf-style-bg", "humannerf-style", "hash-point", "occnerf"];
 
 /// Changes that make a start know nothing of the prior's colours and of how far its surface is.
 const GREY: [&str; 3] = ["field.prior_colors=false", "field.prior_light=false", "field.density_bias_outside=2"];
@@ -65,11 +76,6 @@ const HUMANNERF: [&str; 6] =
 
 /// A prior that is not corrected, in mean colours.
 const AS_GIVEN: [&str; 2] = ["registration.rounds=0", "field.prior_light=false"];
-
-/// As many steps as every other row.
-const STEPS: Length = Times(1.0);
-/// As many as the paper gave HumanNeRF.
-const FOUR_TIMES: Length = Times(4.0);
 
 /// Methods whose curves are drawn, and of each the numbers of steps and the rates, as factors; what
 /// all rows have comes first.
@@ -173,12 +179,18 @@ const CHOICES: [(&str, &[&str]); 21] = [
     ("density-twice", &["field.density_scale=50"]),
 ];
 
-fn row(name: &str, method: Method, occluded: OccludedRule, length: Length) -> Row {
-    Row { name: name.to_owned(), method, occluded, length, preset: None, changes: Vec::new(), rates: 1.0, baked: None }
+fn row(name: &str, method: Method, occluded: OccludedRule) -> Row {
+    let (name, changes) = (name.to_owned(), Vec::new());
+    Row { name, method, occluded, times: 1.0, preset: None, changes, rates: 1.0, baked: None }
 }
 
 fn as_given() -> Row {
-    Row { changes: AS_GIVEN.to_vec(), ..row("prior-as-given", Prior, Unknown, STEPS) }
+    Row { changes: AS_GIVEN.to_vec(), ..row("prior-as-given", Prior, Unknown) }
+}
+
+/// As many steps as the paper gave HumanNeRF.
+fn four_times(name: &str, occluded: OccludedRule) -> Row {
+    Row { times: 4.0, ..row(name, Humannerf, occluded) }
 }
 
 /// Methods, baselines first, and what each component of ours is worth. Row names say `bg` where
@@ -187,26 +199,24 @@ fn as_given() -> Row {
 fn methods() -> Vec<Row> {
     let mut rows = vec![
         as_given(),
-        row("prior", Prior, Unknown, STEPS),
-        Row { changes: HUMANNERF.to_vec(), ..row("humannerf-style-paper", Humannerf, Background, STEPS) },
-        row("humannerf-style-bg", Humannerf, Background, STEPS),
-        row("humannerf-style-bg-4x", Humannerf, Background, FOUR_TIMES),
-        row("humannerf-style-bg-time", Humannerf, Background, Seconds),
-        row("humannerf-style", Humannerf, Unknown, STEPS),
-        row("humannerf-style-4x", Humannerf, Unknown, FOUR_TIMES),
-        row("humannerf-style-time", Humannerf, Unknown, Seconds),
-        row("hash-point-bg", HashPoint, Background, STEPS),
-        row("hash-point", HashPoint, Unknown, STEPS),
-        row("neural-body-style", NeuralBody, Unknown, STEPS),
-        row("self-nerf-style", SelfNerf, Unknown, STEPS),
-        row("occnerf-bg", Occnerf, Background, STEPS),
-        row("occnerf", Occnerf, Unknown, STEPS),
-        Row { baked: Some("occnerf"), ..row("occnerf-baked", Occnerf, Unknown, STEPS) },
-        Row { preset: Some(Preset::Paper), ..row("paper", Occnerf, Unknown, STEPS) },
+        row("prior", Prior, Unknown),
+        Row { changes: HUMANNERF.to_vec(), ..row("humannerf-style-paper", Humannerf, Background) },
+        row("humannerf-style-bg", Humannerf, Background),
+        four_times("humannerf-style-bg-4x", Background),
+        row("humannerf-style", Humannerf, Unknown),
+        four_times("humannerf-style-4x", Unknown),
+        row("hash-point-bg", HashPoint, Background),
+        row("hash-point", HashPoint, Unknown),
+        row("neural-body-style", NeuralBody, Unknown),
+        row("self-nerf-style", SelfNerf, Unknown),
+        row("occnerf-bg", Occnerf, Background),
+        row("occnerf", Occnerf, Unknown),
+        Row { baked: Some("occnerf"), ..row("occnerf-baked", Occnerf, Unknown) },
+        Row { preset: Some(Preset::Paper), ..row("paper", Occnerf, Unknown) },
     ];
     for name in ["surface-term", "no-completeness", "no-perceptual"] {
         let changes = COMPONENTS.iter().find(|(component, _)| *component == name).map_or(&[][..], |c| c.1);
-        rows.push(Row { changes: changes.to_vec(), ..row(name, Occnerf, Unknown, STEPS) });
+        rows.push(Row { changes: changes.to_vec(), ..row(name, Occnerf, Unknown) });
     }
     rows
 }
@@ -215,9 +225,9 @@ fn story() -> Vec<Row> {
     let mut changes = Vec::new();
     let step = |(name, more): &(&str, &[&'static str])| {
         changes.extend_from_slice(more);
-        Row { preset: Some(Preset::Paper), changes: changes.clone(), ..row(name, Occnerf, Unknown, STEPS) }
+        Row { preset: Some(Preset::Paper), changes: changes.clone(), ..row(name, Occnerf, Unknown) }
     };
-    [as_given(), row("prior", Prior, Unknown, STEPS)].into_iter().chain(STORY.iter().map(step)).collect()
+    [as_given(), row("prior", Prior, Unknown)].into_iter().chain(STORY.iter().map(step)).collect()
 }
 
 fn components() -> Vec<Row> {
@@ -225,7 +235,7 @@ fn components() -> Vec<Row> {
     let of = |(start, from): (&str, &[&'static str])| {
         let row = |(name, changes): &(&str, &[&'static str])| Row {
             changes: [from, changes].concat(),
-            ..row(&format!("{start}-{name}"), Occnerf, Unknown, STEPS)
+            ..row(&format!("{start}-{name}"), Occnerf, Unknown)
         };
         // A grey start knows of no light.
         let rows = COMPONENTS.iter().filter(|(name, _)| start == "ours" || *name != "even-light");
@@ -236,9 +246,8 @@ fn components() -> Vec<Row> {
 
 fn curves() -> Vec<Row> {
     let of = |(name, method, occluded): (&str, Method, OccludedRule)| {
-        let steps = CURVE_STEPS.map(|times| row(&format!("{name}-x{times}"), method, occluded, Times(times)));
-        let rates =
-            CURVE_RATES.map(|rates| Row { rates, ..row(&format!("{name}-rates-x{rates}"), method, occluded, STEPS) });
+        let steps = CURVE_STEPS.map(|times| Row { times, ..row(&format!("{name}-x{times}"), method, occluded) });
+        let rates = CURVE_RATES.map(|rates| Row { rates, ..row(&format!("{name}-rates-x{rates}"), method, occluded) });
         [steps.to_vec(), rates.to_vec()].concat()
     };
     CURVES.into_iter().flat_map(of).collect()
@@ -247,7 +256,7 @@ fn curves() -> Vec<Row> {
 fn choices() -> Vec<Row> {
     let of = |(name, changes): (&str, &[&'static str])| Row {
         changes: [&[HELD_OUT], changes].concat(),
-        ..row(name, Occnerf, Unknown, STEPS)
+        ..row(name, Occnerf, Unknown)
     };
     CHOICES.into_iter().map(of).collect()
 }
@@ -261,7 +270,13 @@ impl Table {
             Self::Components => components(),
             Self::Curves => curves(),
             Self::Choices => choices(),
+            Self::Robustness => methods().into_iter().filter(|row| MAIN.contains(&&*row.name)).collect(),
         }
+    }
+
+    /// Errors of the prior that every row meets.
+    pub fn levels(self) -> &'static [(&'static str, Perturbation)] {
+        if self == Self::Robustness { &LEVELS } else { &LEVELS[..1] }
     }
 
     /// What its files and its section are called.
@@ -272,6 +287,7 @@ impl Table {
             Self::Components => "components",
             Self::Curves => "curves",
             Self::Choices => "choices",
+            Self::Robustness => "robustness",
         }
     }
 
@@ -283,6 +299,7 @@ impl Table {
             Self::Components => "What each component is worth",
             Self::Curves => "Steps and rates of methods",
             Self::Choices => "Settings by training frames that are held out",
+            Self::Robustness => "A wrong prior",
         }
     }
 
@@ -304,7 +321,7 @@ impl Table {
             Self::Story => &["prior", "text", "registered-prior", "paper", "balanced"],
             Self::Components => &["ours-full", "ours-surface-term", "grey-full", "grey-surface-term"],
             Self::Choices => &["as-it-is", "samples-48", "surface-term"],
-            Self::Curves => &[],
+            Self::Curves | Self::Robustness => &[],
         }
     }
 }
@@ -320,23 +337,19 @@ impl Row {
         if self.learns() { format!("{}-s{seed}", self.name) } else { self.name.clone() }
     }
 
-    /// The same of the run whose person is baked.
-    pub fn trained(&self, seed: u64) -> Option<String> {
-        self.baked.map(|row| format!("{row}-s{seed}"))
-    }
-
     /// Number of runs.
     pub fn runs(&self, seeds: u64) -> u64 {
         if self.learns() { seeds } else { 1 }
     }
 
-    /// Everything but the number of steps.
+    /// Settings of a run, where a row of no more steps than usual has `steps`.
     ///
     /// # Errors
     /// If a change does not fit the settings.
-    pub fn settings(&self, preset: Preset) -> Result<Config> {
+    pub fn config(&self, preset: Preset, steps: u64, seed: u64) -> Result<Config> {
+        let steps = ((steps as f64 * self.times).round() as u64).max(1);
         let preset = self.preset.unwrap_or(preset);
-        let mut config = Config { occluded: self.occluded, ..self.method.preset(preset) };
+        let mut config = Config { occluded: self.occluded, steps, seed, ..self.method.preset(preset) };
         for change in &self.changes {
             config = set(&config, change).with_context(|| format!("row {}: {change}", self.name))?;
         }
@@ -350,16 +363,16 @@ impl Row {
 mod tests {
     use super::*;
 
-    const TABLES: [Table; 5] = [Table::Methods, Table::Story, Table::Components, Table::Curves, Table::Choices];
+    use Table::{Choices, Components, Curves, Methods, Robustness, Story};
 
     #[test]
     fn every_row_of_every_table_can_be_run_and_none_is_there_twice() {
-        for table in TABLES {
+        for table in [Methods, Story, Components, Curves, Choices, Robustness] {
             let rows = table.rows();
             for (i, row) in rows.iter().enumerate() {
                 assert!(rows[..i].iter().all(|other| other.name != row.name), "{}", row.name);
                 for preset in [Preset::Fast, Preset::Balanced, Preset::Paper] {
-                    row.settings(preset).unwrap();
+                    row.config(preset, 9, 1).unwrap();
                 }
             }
             assert!(table.shown().iter().all(|name| rows.iter().any(|row| row.name == *name)), "{table:?}");
@@ -372,9 +385,8 @@ mod tests {
         let at = rows.iter().position(|row| row.name == "occnerf-baked").unwrap();
         for (at, baked) in rows.iter().enumerate().filter(|(_, row)| row.baked.is_some()) {
             let trained = rows[..at].iter().find(|row| Some(&*row.name) == baked.baked).unwrap();
-            assert!(trained.baked.is_none() && trained.learns() && trained.length == baked.length);
-            assert_eq!(trained.settings(Preset::Fast).unwrap(), baked.settings(Preset::Fast).unwrap());
-            assert_eq!(baked.trained(2), Some(trained.run(2)));
+            assert!(trained.baked.is_none() && trained.learns() && trained.times == baked.times);
+            assert_eq!(trained.config(Preset::Fast, 9, 1).unwrap(), baked.config(Preset::Fast, 9, 1).unwrap());
         }
         assert_eq!(rows[at].baked, Some("occnerf"));
     }
@@ -382,12 +394,12 @@ mod tests {
     #[test]
     fn each_row_of_the_story_changes_something_and_it_goes_through_paper_to_balanced() {
         let rows: Vec<Row> = story().into_iter().filter(Row::learns).collect();
-        let settings = |row: &Row| row.settings(Preset::Fast).unwrap();
+        let settings = |row: &Row| row.config(Preset::Fast, 9, 1).unwrap();
         assert!(rows.windows(2).all(|pair| settings(&pair[0]) != settings(&pair[1])));
         let named = |name: &str| settings(rows.iter().find(|row| row.name == name).unwrap());
         for preset in [Preset::Paper, Preset::Balanced] {
             let whole = Method::Occnerf.preset(preset);
-            let row = Config { preset, steps: whole.steps, ..named(preset.name()) };
+            let row = Config { preset, steps: whole.steps, seed: whole.seed, ..named(preset.name()) };
             assert_eq!(row, whole);
         }
     }

@@ -8,11 +8,9 @@ use occnerf::SplitMetrics;
 use serde::Serialize;
 
 use super::curves;
-use super::plan::Plan;
 use super::rows::{Row, Table};
 use crate::results;
 use xtask::run::{self, Metrics};
-use xtask::source::Source;
 use xtask::train::scene_name;
 use xtask::{pictures, table};
 
@@ -20,7 +18,8 @@ use xtask::{pictures, table};
 #[derive(Serialize)]
 pub struct Summary<'a> {
     scene: &'a str,
-    plan: &'a Plan,
+    /// What every row starts from, and how many runs it has.
+    settings: &'a str,
     #[serde(skip)]
     table: Table,
     /// Network of lpips_full, and the perceptual term of training.
@@ -56,8 +55,8 @@ const COLUMNS: [Column; 9] = [
 ];
 
 impl<'a> Summary<'a> {
-    pub fn new(source: &'a Source, plan: &'a Plan, table: Table) -> Self {
-        Self { scene: &source.scene, plan, table, lpips: None, perceptual: String::new(), rows: Vec::new() }
+    pub fn new(scene: &'a str, settings: &'a str, table: Table) -> Self {
+        Self { scene, settings, table, lpips: None, perceptual: String::new(), rows: Vec::new() }
     }
 
     /// Adds a run of a row.
@@ -86,7 +85,7 @@ impl<'a> Summary<'a> {
     pub fn markdown(&self) -> String {
         // Without the folders: tables are shown elsewhere.
         let (scene, set) = (self.name(), results::set_of(&self.name()));
-        let mut text = format!("# {scene}\n\n{set}. {}; perceptual term: {}", self.plan, self.perceptual);
+        let mut text = format!("# {scene}\n\n{set}. {}; perceptual term: {}", self.settings, self.perceptual);
         if let Some(network) = &self.lpips {
             text.push_str(&format!("; lpips_full by {network}"));
         }

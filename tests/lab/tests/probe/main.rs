@@ -344,11 +344,7 @@ fn metrics_are_those_of_the_whole_and_of_the_mask() {
 
 #[test]
 fn metrics_with_weights_give_the_golden_lpips() {
-    let shared = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared/data/lpips");
-    if !cfg!(feature = "lpips") || !shared.exists() {
-        eprintln!("skipped: {} is absent", shared.display());
-        return;
-    }
+    let Some(shared) = testkit::files::shared("lpips").filter(|_| cfg!(feature = "lpips")) else { return };
     let folder = folder("lpips");
     let mut golden = Npz::open(&shared.join("golden.npz")).unwrap();
     let mut picture = |key: &str| {
@@ -363,7 +359,7 @@ fn metrics_with_weights_give_the_golden_lpips() {
     npz::write(&folder.join("in.npz"), &metrics()).unwrap();
     let options = ["--lpips", shared.to_str().unwrap()];
     let small = run("metrics", &folder.join("in.npz"), &folder.join("small.npz"), &options);
-    common::refusal(&small, "a small picture", &["9 × 8", "at least 17"]);
+    testkit::program::refusal(&small, "a small picture", &["9 × 8", "at least 17"]);
 }
 
 #[test]

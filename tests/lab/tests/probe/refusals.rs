@@ -1,7 +1,7 @@
 //! One clear line for whatever is wrong.
 
-use super::common::refusal;
 use super::*;
+use testkit::program::refusal;
 
 #[test]
 fn whatever_is_wrong_with_the_arrays_is_named_in_one_line() {

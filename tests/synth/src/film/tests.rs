@@ -260,9 +260,9 @@ fn a_body_of_one_rigid_part_without_a_texture_is_filmed() {
 fn overlap(frame: &Frame, body: &BodyModel) -> f32 {
     let posed = body.pose(&body.shaped(&frame.betas), &frame.pose, frame.placement);
     let mesh = visibility::RayMesh::new(&posed.vertices, &body.faces).unwrap();
-    let (pixels, width) = (frame.pixels().unwrap(), frame.camera.width);
-    testkit::oracle::mask_iou(&pixels.mask, pixels.occluder.as_deref(), |i| {
-        let ray = frame.camera.ray((i as u32 % width) as f32 + 0.5, (i as u32 / width) as f32 + 0.5);
+    let (pixels, width) = (frame.pixels().unwrap(), frame.camera.width as usize);
+    testkit::oracle::mask_iou(&pixels.mask, pixels.occluder.as_deref(), width, |x, y| {
+        let ray = frame.camera.ray(x, y);
         mesh.first_hit(ray.origin, ray.direction).is_some()
     })
 }

@@ -4,20 +4,19 @@
 
 use std::io::Read;
 
+use crate::files::shared;
+use crate::{TriMesh, mesh};
 use glam::Vec3;
-use testkit::{TriMesh, mesh};
 
 /// The open body, 6890 vertices in metres; `None`, with the reason printed, where the file is not
 /// there.
+///
+/// # Panics
+/// If it is misread.
+#[must_use]
 pub fn open_body() -> Option<TriMesh> {
-    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../../shared/data/body/open_body.npz");
-    let file = match std::fs::File::open(path) {
-        Ok(file) => file,
-        Err(error) => {
-            eprintln!("skipped: {path}: {error}");
-            return None;
-        }
-    };
+    let path = shared("body/open_body.npz")?;
+    let file = std::fs::File::open(&path).unwrap();
     let mut archive = zip::ZipArchive::new(file).unwrap();
     let mut rows = |name: &str| {
         let mut bytes = Vec::new();
@@ -34,21 +33,18 @@ pub fn open_body() -> Option<TriMesh> {
         vertices: (rows("v_template.npy").into_iter()).map(|v| Vec3::from(v.map(f32::from_le_bytes))).collect(),
         faces: (rows("f.npy").into_iter()).map(|f| f.map(u32::from_le_bytes)).collect(),
     };
-    assert!(mesh.is_closed(), "{path} was misread");
+    assert!(mesh.is_closed(), "{} was misread", path.display());
     Some(mesh)
 }
 
 /// The open body, or a bumpy ball of similar size and resolution.
-#[allow(dead_code, reason = "not every target that includes this module needs it")]
 pub fn body_or_ball() -> TriMesh {
     open_body().unwrap_or_else(|| mesh::icosphere(5).map(|p| p * (0.4 + 0.05 * (7.0 * p.x).sin() * (9.0 * p.y).cos())))
 }
 
 /// Splitmix64: points that are the same on every machine.
-#[allow(dead_code, reason = "not every target that includes this module needs it")]
 pub struct Random(pub u64);
 
-#[allow(dead_code, reason = "not every target that includes this module needs it")]
 impl Random {
     /// Uniform in [0, 1).
     pub fn unit(&mut self) -> f32 {

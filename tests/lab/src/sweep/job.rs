@@ -1,28 +1,40 @@
-//! One measured run: what it is, and what came of it.
+//! A run of a sweep: its description, its outcome, and the child process that takes it there.
 
 use std::io::{BufRead, Read, Write};
 use std::path::PathBuf;
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
-use crate::scene::SceneOptions;
 use anyhow::{Context, Result, bail};
 use glam::Vec3;
 use occnerf::bake::bake;
 use occnerf::capture::Capture;
-use occnerf::{Config, FieldRenderer, PreparedFrame, PriorColors, PriorRenderer, Renderer, Scene, StepTimes, evaluate};
+use occnerf::{
+    Config, FieldRenderer, PreparedFrame, PriorColors, PriorRenderer, Renderer, Scene, SplitMetrics, StepTimes,
+    evaluate,
+};
 use serde::{Deserialize, Serialize};
 use smpl::BodyModel;
 
-use super::baked::Baking;
-use super::difficulty::Difficulty;
+use crate::bench::{Baking, Difficulty};
 use crate::methods::Method;
-use xtask::process::{Ending, Guard, say};
-use xtask::run::peak_rss_bytes;
+use crate::scene::SceneOptions;
+use xtask::network::load_lpips;
+use xtask::process::{Ending, Guard, one_line, say};
+use xtask::run::{Metrics, RunConfig, peak_rss_bytes};
 use xtask::source;
+use xtask::train::baked_unless_finished;
 
-/// A job on standard input may be this long.
+/// Longest job on standard input.
 const MAX_JOB_BYTES: u64 = 1 << 20;
+/// A run that is not kept is ended after this time and counts as failed.
+const LIMIT: Duration = Duration::from_secs(30 * 60);
+/// Time between two checkpoints of a kept run.
+const INTERVAL: Duration = Duration::from_secs(30);
+/// Time that a kept run has to write its checkpoint after a signal.
+const GRACE: Duration = Duration::from_secs(60);
+/// Exit code of a run whose directory another process holds, see [`xtask::process::EXIT_CODES`].
+const BUSY: i32 = 4;
 
 /// Where the frames come from.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -68,6 +80,27 @@ pub struct Job {
     /// How the trained person is baked: what is scored then, instead of the field.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub bake: Option<Baking>,
+    /// Run directory, scored and drawn as `train` does it; measured and forgotten where there is
+    /// none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub keep: Option<Keep>,
+}
+
+/// The run directory of a job.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Keep {
+    pub directory: PathBuf,
+    /// Directory of the trained run whose baked person is scored; trained first if need be.
+    pub trained: Option<PathBuf>,
+    /// Weights of LPIPS.
+    pub lpips: Option<PathBuf>,
+}
+
+impl Job {
+    /// A run that is measured and forgotten.
+    pub fn new(place: Place, views: usize, method: Method, config: Config) -> Self {
+        Self { place, views, method, config, prune: false, bake: None, keep: None }
+    }
 }
 
 /// What came of it; all zero or none where there is an error.
@@ -98,10 +131,38 @@ pub struct Outcome {
     pub bad_gradients: usize,
     /// Losses of steps and numbers of scored pictures that are not finite.
     pub non_finite: usize,
+    /// All scores of a kept run.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub metrics: Option<Metrics>,
+}
+
+/// Trains and scores in the run directory, unless it holds the finished run.
+fn keep_run(job: &Job, Keep { directory, trained, lpips }: &Keep) -> Result<Outcome> {
+    let Place::Scene { scene, body, load } = &job.place else { bail!("a capture made on the spot is not kept") };
+    let source = load.load(scene, body.as_deref())?;
+    let run = RunConfig::new(&source, job.config.clone());
+    let (lpips, name) = (load_lpips(lpips.as_deref())?, directory.file_name().unwrap_or_default().to_string_lossy());
+    let metrics = match trained {
+        Some(trained) => baked_unless_finished(directory, trained, &run, &source, lpips.as_ref(), INTERVAL)?,
+        None => job.method.run_unless_finished(directory, &name, &run, &source, lpips.as_ref(), INTERVAL)?,
+    };
+    let mut outcome = Outcome {
+        train_seconds: metrics.train_seconds,
+        parameters: metrics.parameters,
+        peak_rss_bytes: metrics.peak_rss_bytes,
+        ..Outcome::default()
+    };
+    if let Some((_, split)) = metrics.splits.first() {
+        outcome.take(split);
+    }
+    Ok(Outcome { metrics: Some(metrics), ..outcome })
 }
 
 /// Trains and scores.
-pub fn measure(job: &Job) -> Result<Outcome> {
+fn measure(job: &Job) -> Result<Outcome> {
+    if let Some(keep) = &job.keep {
+        return keep_run(job, keep);
+    }
     let (mut capture, model) = job.place.load()?;
     let stride = capture.eval.len().div_ceil(job.views.max(1)).max(1);
     capture.eval = capture.eval.into_iter().step_by(stride).collect();
@@ -162,46 +223,64 @@ fn score(scene: &Scene, renderer: &mut dyn Renderer, outcome: &mut Outcome) -> R
         bad += numbers.filter(|x| !x.is_finite()).count();
     })?;
     outcome.non_finite += bad;
-    outcome.seconds_per_frame = metrics.render_seconds_per_frame;
-    outcome.psnr_mask = metrics.psnr_mask;
-    outcome.ssim_mask = metrics.ssim_mask;
-    outcome.psnr_hidden = metrics.psnr_hidden;
-    outcome.mask_iou = metrics.mask_iou;
+    outcome.take(&metrics);
     Ok(())
 }
 
-/// The child's part: a job as the first line of standard input, which stays open, its outcome as
-/// one line on standard output.
+impl Outcome {
+    fn take(&mut self, split: &SplitMetrics) {
+        self.seconds_per_frame = split.render_seconds_per_frame;
+        self.psnr_mask = split.psnr_mask;
+        self.ssim_mask = split.ssim_mask;
+        self.psnr_hidden = split.psnr_hidden;
+        self.mask_iou = split.mask_iou;
+    }
+
+    fn failed(error: &anyhow::Error) -> Self {
+        Self { error: Some(one_line(error)), ..Self::default() }
+    }
+}
+
+/// The child's part: a job as the first line of standard input, which stays open, its outcome, an
+/// error among them, as the last line of standard output.
+///
+/// # Errors
+/// Where standard input is no job; an [`Ending`] of the run.
 pub fn serve() -> Result<()> {
     let mut text = String::new();
     std::io::stdin().lock().take(MAX_JOB_BYTES).read_line(&mut text).context("standard input")?;
     let job: Job = serde_json::from_str(&text).context("standard input is not a job")?;
-    // Standard input ends when the sweep does, however that ends: nobody waits for the outcome
-    // then.
+    // Standard input ends with the sweep, whatever ends it: nobody waits for the outcome then.
     std::thread::spawn(|| {
         let _ = std::io::copy(&mut std::io::stdin().lock(), &mut std::io::sink());
         std::process::exit(1);
     });
-    say!("{}", serde_json::to_string(&measure(&job)?)?);
+    let outcome = match measure(&job) {
+        Err(error) if error.chain().any(|cause| cause.is::<Ending>()) => return Err(error),
+        other => other.unwrap_or_else(|error| Outcome::failed(&error)),
+    };
+    say!("{}", serde_json::to_string(&outcome)?);
     Ok(())
 }
 
 /// Runs a job in a process of its own, so that its peak of memory is its own and nothing it does
-/// ends a sweep: an error, a panic, and a run longer than `limit` come back as [`Outcome::error`].
+/// ends a sweep: an error, a panic, and a run longer than the limit come back as
+/// [`Outcome::error`]. `None`: another process works in the run directory.
 ///
 /// # Errors
 /// Where no process can be started; [`Ending::Stopped`] where a signal came.
-pub fn run(job: &Job, threads: Option<usize>, limit: Duration) -> Result<Outcome> {
+pub fn run(job: &Job, threads: Option<usize>) -> Result<Option<Outcome>> {
     let program = std::env::current_exe().context("the path of this program")?;
     let mut command = Command::new(program);
     command.args(["bench", "point"]);
     if let Some(threads) = threads {
         command.args(["--threads", &threads.to_string()]);
     }
-    command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped());
+    // Standard error is the child's too: bars and warnings of a run are seen as it goes.
+    command.stdin(Stdio::piped()).stdout(Stdio::piped());
     let mut child = command.spawn().context("cannot start a run")?;
     let guard = Guard::begin();
-    let outcome = converse(&mut child, job, limit, &guard);
+    let outcome = converse(&mut child, job, &guard);
     // Whatever happened, nothing is left running.
     if outcome.is_err() {
         let _ = child.kill();
@@ -211,39 +290,42 @@ pub fn run(job: &Job, threads: Option<usize>, limit: Duration) -> Result<Outcome
         let after = "what has been run is in the log: the same command goes on".to_owned();
         return Err(Ending::Stopped { signal, after }.into());
     }
-    Ok(outcome.unwrap_or_else(|error| Outcome { error: Some(format!("{error:#}")), ..Outcome::default() }))
+    Ok(outcome.unwrap_or_else(|error| Some(Outcome::failed(&error))))
 }
 
-fn converse(child: &mut Child, job: &Job, limit: Duration, guard: &Guard) -> Result<Outcome> {
-    let read = |mut pipe: Box<dyn Read + Send>| {
-        std::thread::spawn(move || {
-            let mut bytes = Vec::new();
-            let _ = pipe.read_to_end(&mut bytes);
-            String::from_utf8_lossy(&bytes).into_owned()
-        })
-    };
-    let (out, err) = (child.stdout.take().context("no output")?, child.stderr.take().context("no output")?);
-    let (out, err) = (read(Box::new(out)), read(Box::new(err)));
+fn converse(child: &mut Child, job: &Job, guard: &Guard) -> Result<Option<Outcome>> {
+    let mut pipe = child.stdout.take().context("no output")?;
+    let out = std::thread::spawn(move || {
+        let mut bytes = Vec::new();
+        let _ = pipe.read_to_end(&mut bytes);
+        String::from_utf8_lossy(&bytes).into_owned()
+    });
     let mut input = child.stdin.take().context("no input")?;
     input.write_all((serde_json::to_string(job)? + "\n").as_bytes()).context("handing over the job")?;
-    let start = Instant::now();
+    let (start, mut stopped) = (Instant::now(), None);
     let status = loop {
         if let Some(status) = child.try_wait()? {
             break status;
         }
         if guard.signal().is_some() {
-            bail!("stopped by a signal");
+            // The terminal sent the signal to the child too.
+            let since: &Instant = stopped.get_or_insert_with(Instant::now);
+            if job.keep.is_none() || since.elapsed() > GRACE {
+                bail!("stopped by a signal");
+            }
         }
-        if start.elapsed() > limit {
-            bail!("stopped after {:.0} s", limit.as_secs_f64());
+        if job.keep.is_none() && start.elapsed() > LIMIT {
+            bail!("stopped after {:.0} s", LIMIT.as_secs_f64());
         }
         std::thread::sleep(Duration::from_millis(20));
     };
-    let (out, err) = (out.join().unwrap_or_default(), err.join().unwrap_or_default());
-    if !status.success() {
-        let lines: Vec<&str> = err.lines().filter(|l| !l.trim().is_empty() && !l.starts_with("note:")).collect();
-        let reason = lines.iter().take(3).copied().collect::<Vec<_>>().join(" ");
-        bail!("{}", if reason.is_empty() { status.to_string() } else { reason });
+    let out = out.join().unwrap_or_default();
+    match status.code() {
+        Some(0) => {
+            let line = out.trim_end().lines().last().unwrap_or_default();
+            serde_json::from_str(line).map(Some).context("unexpected answer of a run")
+        }
+        Some(BUSY) => Ok(None),
+        _ => bail!("{status}"),
     }
-    serde_json::from_str(out.trim()).context("unexpected answer of a run")
 }

@@ -1,20 +1,48 @@
-//! Runs points one after another and remembers them: one JSON line a point in bench.jsonl.
+//! The sweep engine: runs points one after another, each in a process of its own, and logs them as
+//! a JSON line each in bench.jsonl, from which a later call goes on.
+
+pub mod job;
 
 use std::fs::File;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-use anyhow::{Context, Result, bail};
+use anyhow::{Context, Result, bail, ensure};
+use clap::Args;
 use serde::{Deserialize, Serialize};
 
-use super::job::{self, Job, Outcome};
+pub use self::job::{Job, Keep, Outcome, Place};
 use crate::results::BENCH_LOG;
 use xtask::process::{Lock, say, unwritten};
-use xtask::shard::Shard;
+use xtask::run::{METRICS, check_threads};
+use xtask::shard::{Shard, ShardArguments};
 
-/// A run that takes longer is ended and counts as failed.
-const LIMIT: Duration = Duration::from_secs(30 * 60);
+/// How a sweep is run this time.
+#[derive(Args)]
+pub struct SittingArguments {
+    /// Threads of each run [default: all cores]
+    #[arg(long)]
+    pub threads: Option<usize>,
+    /// Begin no run after so many minutes; the same command goes on later [default: no limit]
+    #[arg(long)]
+    minutes: Option<f64>,
+    #[command(flatten)]
+    pub part: ShardArguments,
+    /// Make the tables a section of tests/lab/RESULTS.md
+    #[arg(long)]
+    pub publish: bool,
+}
+
+impl SittingArguments {
+    /// Goes on with the sweep in `out`.
+    pub fn open(&self, out: &Path) -> Result<Runner> {
+        let minutes = if self.part.merge { 0.0 } else { self.minutes.unwrap_or(1e6) };
+        ensure!((0.0..=1e6).contains(&minutes), "--minutes {minutes}: expected 0 to 1000000");
+        check_threads(self.threads)?;
+        Runner::open(out, self.threads, Duration::from_secs_f64(60.0 * minutes), self.part.shard)
+    }
+}
 
 /// Why a point is in the sweep.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
@@ -36,12 +64,14 @@ pub enum Kind {
     Baked,
     /// A level of difficulty.
     Level,
+    /// A row of a table.
+    Row,
 }
 
 /// A named run.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Point {
-    /// `pareto`, `stability` or `capacity`.
+    /// `pareto`, `stability`, `capacity`, `cost`, or a table of `reproduce`.
     pub bench: String,
     pub name: String,
     /// What is changed.
@@ -125,7 +155,7 @@ fn name(point: &Point) -> String {
 }
 
 /// A sweep in progress.
-pub struct Bench {
+pub struct Runner {
     path: PathBuf,
     file: File,
     _lock: Lock,
@@ -136,13 +166,14 @@ pub struct Bench {
     /// No point is begun after this.
     budget: Duration,
     begun: usize,
-    left: usize,
+    /// Names of points without a line.
+    left: Vec<String>,
 }
 
-impl Bench {
+impl Runner {
     /// Goes on in `directory`, which is made if need be. A part of a sweep has a log and a lock of
     /// its own, and reads those of the others.
-    pub fn open(directory: &Path, threads: Option<usize>, budget: Duration, shard: Option<Shard>) -> Result<Self> {
+    fn open(directory: &Path, threads: Option<usize>, budget: Duration, shard: Option<Shard>) -> Result<Self> {
         xtask::run::make_directory(directory)?;
         let path = directory.join(shard.map_or(BENCH_LOG.to_owned(), |shard| format!("bench-{}.jsonl", shard.name())));
         let lock = Lock::take(&match shard {
@@ -160,13 +191,29 @@ impl Bench {
         let file = File::options().append(true).open(&path).map_err(unwritten(&path))?;
         let lines = read_all(directory)?;
         let start = Instant::now();
-        Ok(Self { path, file, _lock: lock, shard, lines, threads, start, budget, begun: 0, left: 0 })
+        Ok(Self { path, file, _lock: lock, shard, lines, threads, start, budget, begun: 0, left: Vec::new() })
+    }
+
+    /// Runs points in order.
+    pub fn run_all(&mut self, points: Vec<Point>) -> Result<Vec<Line>> {
+        points.into_iter().filter_map(|point| self.run(point).transpose()).collect()
     }
 
     /// Runs a point, unless the log has it with the very same job and no error; `None` when time is
-    /// up.
+    /// up, or another part has it.
     pub fn run(&mut self, point: Point) -> Result<Option<Line>> {
-        let done = self.lines.iter().find(|l| l.point.job == point.job && l.outcome.error.is_none());
+        let mine = self.shard.is_none_or(|shard| shard.has_name(&name(&point)));
+        self.run_if(mine, point)
+    }
+
+    /// The same; parts take turns by the number `turn` of the point, the same in every part.
+    pub fn run_turn(&mut self, turn: usize, point: Point) -> Result<Option<Line>> {
+        self.run_if(self.shard.is_none_or(|shard| shard.has(turn)), point)
+    }
+
+    fn run_if(&mut self, mine: bool, point: Point) -> Result<Option<Line>> {
+        let there = point.job.keep.as_ref().is_none_or(|keep| keep.directory.join(METRICS).is_file());
+        let done = self.lines.iter().find(|l| there && l.point.job == point.job && l.outcome.error.is_none());
         if let Some(done) = done {
             let line = Line { point, outcome: done.outcome.clone() };
             if !self.lines.contains(&line) && self.shard.is_none() {
@@ -174,17 +221,35 @@ impl Bench {
             }
             return Ok(Some(line));
         }
-        let others = self.shard.is_some_and(|shard| !shard.has_name(&name(&point)));
-        if others || self.start.elapsed() >= self.budget {
-            self.left += 1;
-            return Ok(None);
+        if mine && self.start.elapsed() < self.budget {
+            self.begun += 1;
+            if let Some(outcome) = job::run(&point.job, self.threads)? {
+                let line = Line { point, outcome };
+                self.add(line.clone())?;
+                say!("{}", summary(&line));
+                return Ok(Some(line));
+            }
         }
-        self.begun += 1;
-        let outcome = job::run(&point.job, self.threads, LIMIT)?;
-        let line = Line { point, outcome };
-        self.add(line.clone())?;
-        say!("{}", summary(&line));
-        Ok(Some(line))
+        self.left.push(format!("{} of {}", point.name, point.job.place.name()));
+        Ok(None)
+    }
+
+    /// Says what was run, and what is left.
+    ///
+    /// # Errors
+    /// With `--merge` if anything is left.
+    pub fn end(&self, part: &ShardArguments) -> Result<()> {
+        let (begun, minutes) = (self.begun, self.start.elapsed().as_secs_f64() / 60.0);
+        say!("{begun} runs in {minutes:.1} minutes");
+        match &self.left[..] {
+            [] => {}
+            [first, ..] if part.merge => {
+                bail!("{} points have no scores yet, such as {first}: run their parts again", self.left.len())
+            }
+            left if self.shard.is_some() => say!("{} are of other parts, or left; --merge draws", left.len()),
+            left => say!("{} points are left: the same command goes on with them", left.len()),
+        }
+        Ok(())
     }
 
     fn add(&mut self, line: Line) -> Result<()> {
@@ -201,24 +266,9 @@ impl Bench {
         Ok(())
     }
 
-    /// Whether this is one of several parts, so that there is nothing to draw yet.
-    pub fn is_part(&self) -> bool {
-        self.shard.is_some()
-    }
-
     /// The log's path.
     pub fn path(&self) -> &Path {
         &self.path
-    }
-
-    /// Points that were run now, and those that time was too short for.
-    pub fn counts(&self) -> (usize, usize) {
-        (self.begun, self.left)
-    }
-
-    /// Since the sweep was opened.
-    pub fn seconds(&self) -> f64 {
-        self.start.elapsed().as_secs_f64()
     }
 }
 
@@ -247,8 +297,7 @@ pub mod tests {
     use occnerf::Preset;
 
     use super::*;
-    use crate::bench::difficulty::Difficulty;
-    use crate::bench::job::Place;
+    use crate::bench::Difficulty;
     use crate::methods::Method;
 
     /// A line of a point called `name` that scored `psnr` in `seconds`.
@@ -261,7 +310,7 @@ pub mod tests {
             level: Some(1.0),
             kind,
             command: Some("cargo xtask train".to_owned()),
-            job: Job { place: Place::Made(Difficulty::default()), views: 3, method, config, prune: false, bake: None },
+            job: Job::new(Place::Made(Difficulty::default()), 3, method, config),
         };
         let (psnr_mask, psnr_hidden) = (Some(psnr), Some(psnr));
         let outcome = Outcome {
@@ -290,11 +339,11 @@ pub mod tests {
         let (a, b) = (serde_json::to_string(&a).unwrap(), serde_json::to_string(&b).unwrap());
         std::fs::write(&path, format!("{a}\n{}", &b[..b.len() / 2])).unwrap();
         assert_eq!(read(&path).unwrap().len(), 1);
-        let bench = Bench::open(&folder, None, Duration::ZERO, None).unwrap();
-        assert_eq!(bench.lines.len(), 1);
-        assert!(Bench::open(&folder, None, Duration::ZERO, None).is_err(), "another process has it");
-        assert_eq!(std::fs::read_to_string(bench.path()).unwrap(), format!("{a}\n"));
-        drop(bench);
+        let runner = Runner::open(&folder, None, Duration::ZERO, None).unwrap();
+        assert_eq!(runner.lines.len(), 1);
+        assert!(Runner::open(&folder, None, Duration::ZERO, None).is_err(), "another process has it");
+        assert_eq!(std::fs::read_to_string(runner.path()).unwrap(), format!("{a}\n"));
+        drop(runner);
         std::fs::write(&path, format!("{a}\nnot json\n{b}\n")).unwrap();
         let message = read(&path).unwrap_err().to_string();
         assert!(message.contains(BENCH_LOG) && message.contains("line 2"), "{message}");
@@ -307,17 +356,17 @@ pub mod tests {
         let shards = ["1/2", "2/2"].map(|text| text.parse::<Shard>().unwrap());
         let lines: Vec<Line> = (0..9).map(|i| line(&format!("p{i}"), "k", Kind::Change, 20.0, 3.0)).collect();
         for shard in shards {
-            let mut bench = Bench::open(&folder, None, Duration::ZERO, Some(shard)).unwrap();
+            let mut runner = Runner::open(&folder, None, Duration::ZERO, Some(shard)).unwrap();
             let own: Vec<&Line> = lines.iter().filter(|l| shard.has_name(&name(&l.point))).collect();
             assert!((1..9).contains(&own.len()));
-            own.into_iter().for_each(|line| bench.add(line.clone()).unwrap());
-            assert!(Bench::open(&folder, None, Duration::ZERO, Some(shard)).is_err(), "its twin runs");
+            own.into_iter().for_each(|line| runner.add(line.clone()).unwrap());
+            assert!(Runner::open(&folder, None, Duration::ZERO, Some(shard)).is_err(), "its twin runs");
         }
-        let mut whole = Bench::open(&folder, None, Duration::ZERO, None).unwrap();
+        let mut whole = Runner::open(&folder, None, Duration::ZERO, None).unwrap();
         for line in &lines {
             assert_eq!(whole.run(line.point.clone()).unwrap().as_ref(), Some(line));
         }
-        assert_eq!(whole.counts(), (0, 0));
+        assert_eq!((whole.begun, whole.left.len()), (0, 0));
         std::fs::remove_dir_all(&folder).unwrap();
     }
 
@@ -325,19 +374,19 @@ pub mod tests {
     fn a_finished_point_is_not_run_again_and_its_later_line_holds() {
         let folder = folder("again");
         let old = line("a", "k", Kind::Change, 20.0, 3.0);
-        let mut bench = Bench::open(&folder, None, Duration::ZERO, None).unwrap();
-        bench.add(old.clone()).unwrap();
-        assert_eq!(bench.run(old.point.clone()).unwrap().unwrap(), old);
+        let mut runner = Runner::open(&folder, None, Duration::ZERO, None).unwrap();
+        runner.add(old.clone()).unwrap();
+        assert_eq!(runner.run(old.point.clone()).unwrap().unwrap(), old);
         // Other settings are another run, for which there is no time here.
         let mut other = old.point.clone();
         other.job.config.steps += 1;
-        assert_eq!(bench.run(other).unwrap(), None);
+        assert_eq!(runner.run(other).unwrap(), None);
         let mut failed = old.clone();
         failed.outcome.error = Some("out of luck".to_owned());
-        bench.add(failed).unwrap();
-        assert_eq!(bench.run(old.point.clone()).unwrap(), None);
-        assert_eq!(bench.counts(), (0, 2));
-        assert_eq!(read(bench.path()).unwrap().len(), 1);
+        runner.add(failed).unwrap();
+        assert_eq!(runner.run(old.point.clone()).unwrap(), None);
+        assert_eq!((runner.begun, runner.left.len()), (0, 2));
+        assert_eq!(read(runner.path()).unwrap().len(), 1);
         std::fs::remove_dir_all(&folder).unwrap();
     }
 }
