@@ -283,7 +283,7 @@ mod tests {
     }
 
     #[test]
-    fn training_lowers_the_loss_gives_the_same_bits_on_any_threads_and_draws() {
+    fn training_gives_the_same_bits_on_any_threads_and_draws() {
         for method in OURS {
             let config = tiny(method);
             let scene = scene(&config);
