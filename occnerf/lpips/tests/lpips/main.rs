@@ -5,7 +5,7 @@ mod files;
 mod formula;
 mod golden;
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 /// A file of the shared data, or `None` with a message where it is absent.
 fn shared(name: &str) -> Option<PathBuf> {

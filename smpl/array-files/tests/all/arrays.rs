@@ -1,0 +1,205 @@
+//! numpy's files: correct values from good files, typed errors from bad ones.
+
+use crate::common;
+
+use std::path::{Path, PathBuf};
+
+use array_files::npz::{self, Npz, read_npy};
+use array_files::{Data, Error, NdArray};
+use common::fixture;
+use proptest::prelude::*;
+
+/// A file that is removed at the end of the test.
+struct Temporary(PathBuf);
+
+impl Temporary {
+    fn new(name: &str, bytes: &[u8]) -> Self {
+        let path = std::env::temp_dir().join(format!("array-files-{}-{name}", std::process::id()));
+        std::fs::write(&path, bytes).unwrap();
+        Self(path)
+    }
+}
+
+impl Drop for Temporary {
+    fn drop(&mut self) {
+        let _ = std::fs::remove_file(&self.0);
+    }
+}
+
+#[test]
+fn npz_arrays_are_read_with_shape_and_type() {
+    let mut npz = Npz::open(&fixture("numpy.npz")).unwrap();
+    assert_eq!(npz.keys()[0], "f4");
+    let (shape, values) = npz.f32("f4", &[None, Some(3)]).unwrap();
+    assert_eq!((shape.as_slice(), values.as_slice()), (&[2, 3][..], &[0.0, 1.0, 2.0, 3.0, 4.0, 5.0][..]));
+    assert_eq!(npz.f32("f8_columns", &[Some(2), None]).unwrap().1, [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]);
+    assert_eq!(npz.i64("i2_big", &[None]).unwrap().1, [1, -2, 300]);
+    assert_eq!(npz.i64("bool", &[Some(2)]).unwrap().1, [1, 0]);
+    assert_eq!(npz.f32("scalar", &[]).unwrap().1, [0.25]);
+    assert!(npz.f32("empty", &[None, Some(3)]).unwrap().1.is_empty());
+}
+
+#[test]
+fn npz_errors_name_file_key_and_shapes() {
+    let mut npz = Npz::open(&fixture("numpy.npz")).unwrap();
+    let e = npz.f32("f4", &[Some(6890), None]).unwrap_err().to_string();
+    for part in ["numpy.npz", "`f4`", "[2, 3]", "[6890, _]"] {
+        assert!(e.contains(part), "{e:?} lacks {part:?}");
+    }
+    let e = npz.f32("nothing", &[]).unwrap_err();
+    assert!(matches!(&e, Error::MissingKey { key, available, .. } if key == "nothing" && available.len() == 10));
+    assert!(matches!(npz.f32("nan", &[None]), Err(Error::NotFinite { index: 1, key, .. }) if key == "nan"));
+    assert!(matches!(npz.f32("huge", &[None]), Err(Error::NotFinite { index: 0, .. })));
+    assert!(matches!(npz.i64("f4", &[None, None]), Err(Error::Type { .. })));
+    assert!(matches!(npz.array("text"), Err(Error::Type { key, .. }) if key == "text"));
+    assert!(matches!(Npz::open(Path::new("/no/such.npz")), Err(Error::Io { .. })));
+}
+
+/// The bytes of a `.npy` file with the given header and data.
+fn npy(header: &str, data: &[u8]) -> Vec<u8> {
+    let mut out = b"\x93NUMPY\x01\x00".to_vec();
+    out.extend((header.len() as u16).to_le_bytes());
+    out.extend(header.as_bytes());
+    out.extend(data);
+    out
+}
+
+#[test]
+fn headers_that_claim_too_much_are_refused_before_memory_is_taken() {
+    for (i, (shape, large)) in [
+        ("(4611686018427387904, 4)", true),
+        ("(18446744073709551615, 18446744073709551615, 18446744073709551615)", true),
+        ("(1000000000,)", true),
+        ("(99999999999999999999999,)", false),
+        ("(-1,)", false),
+        // Below the limit, but not there.
+        ("(100000000,)", false),
+        ("(0, 4611686018427387904)", false),
+    ]
+    .into_iter()
+    .enumerate()
+    {
+        let header = format!("{{'descr': '<f4', 'fortran_order': False, 'shape': {shape}, }}");
+        let file = Temporary::new(&format!("claim{i}.npy"), &npy(&header, &[0; 8]));
+        let error = read_npy(&file.0).expect_err(shape);
+        match error {
+            Error::TooLarge { .. } => assert!(large, "{shape}: {error}"),
+            Error::Npy { .. } => assert!(!large, "{shape}: {error}"),
+            _ => panic!("{shape}: {error}"),
+        }
+    }
+}
+
+#[test]
+fn malformed_npy_headers_are_errors() {
+    for (i, header) in [
+        "",
+        "{",
+        "{}",
+        "{'descr': '<f4'}",
+        "{'descr': '<f4', 'fortran_order': False}",
+        "{'descr': '<f4', 'fortran_order': Maybe, 'shape': (2,)}",
+        "{'descr': '<f4', 'fortran_order': False, 'shape': (2}",
+        "{'descr': '<f4', 'fortran_order': False, 'shape': (2,), 'more': 1}",
+        "{'descr': [('a', '<f4')], 'fortran_order': False, 'shape': (2,)}",
+        "{'descr': 'é', 'fortran_order': False, 'shape': (2,)}",
+        "{'descr': '<f', 'fortran_order': False, 'shape': (2,)}",
+        "{'descr': '', 'fortran_order': False, 'shape': (2,)}",
+        "{'descr': '<c8', 'fortran_order': False, 'shape': (1,)}",
+        "{'descr': '<f4', 'fortran_order': False, 'shape': (1,)}",
+        "{'descr': '<f4', 'fortran_order': False, 'shape': (3,)}",
+    ]
+    .into_iter()
+    .enumerate()
+    {
+        let file = Temporary::new(&format!("header{i}.npy"), &npy(header, &[0; 8]));
+        let error = read_npy(&file.0).expect_err(header);
+        assert!(matches!(error, Error::Npy { .. } | Error::Type { .. }), "{header}: {error}");
+    }
+}
+
+#[test]
+fn archives_cut_anywhere_are_errors() {
+    let bytes = std::fs::read(fixture("numpy.npz")).unwrap();
+    for length in 0..bytes.len() {
+        let read = Npz::from_bytes("cut", bytes[..length].to_vec()).and_then(|mut npz| {
+            let keys = npz.keys().to_vec();
+            keys.iter().try_for_each(|key| npz.array(key).map(drop))
+        });
+        assert!(read.is_err(), "{length} of {} bytes were accepted", bytes.len());
+    }
+}
+
+#[test]
+fn a_changed_byte_of_data_fails_the_checksum() {
+    let bytes = std::fs::read(fixture("numpy.npz")).unwrap();
+    let mut npz = Npz::from_bytes("good", bytes.clone()).unwrap();
+    let good = npz.array("f4").unwrap();
+    for at in 0..bytes.len() {
+        let mut bad = bytes.clone();
+        bad[at] ^= 0x10;
+        let read = Npz::from_bytes("bad", bad).and_then(|mut npz| npz.array("f4"));
+        if let Ok(array) = read {
+            assert_eq!(array, good, "byte {at}");
+        }
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(2000))]
+
+    #[test]
+    fn random_bytes_are_no_archive(bytes in prop::collection::vec(any::<u8>(), 0..200)) {
+        prop_assert!(Npz::from_bytes("random", bytes).is_err());
+    }
+}
+
+fn any_array() -> impl Strategy<Value = NdArray> {
+    (prop::collection::vec(0usize..5, 0..4), 0..4, any::<u64>()).prop_map(|(shape, kind, seed)| {
+        let bits = (0..shape.iter().product::<usize>() as u64).map(|i| (seed ^ i).wrapping_mul(0x9E37_79B9_7F4A_7C15));
+        let data = match kind {
+            0 => Data::F64(bits.map(|b| b as i64 as f64 / 3.0).collect()),
+            1 => Data::F32(bits.map(|b| b as i32 as f32 / 3.0).collect()),
+            2 => Data::I64(bits.map(|b| b as i64).collect()),
+            _ => Data::Bool(bits.map(|b| b & 1 == 1).collect()),
+        };
+        NdArray { shape, data }
+    })
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(48))]
+
+    #[test]
+    fn written_arrays_are_read_back_with_type_shape_and_bits(arrays in prop::collection::vec(any_array(), 0..4)) {
+        let file = Temporary::new("written.npz", b"");
+        let names = ["a", "b_1", "ü", "last"];
+        let named: Vec<_> = names.into_iter().zip(arrays).collect();
+        npz::write(&file.0, &named).unwrap();
+        let mut read = Npz::open(&file.0).unwrap();
+        prop_assert_eq!(read.keys().len(), named.len());
+        for (key, array) in &named {
+            prop_assert_eq!(&read.array(key).unwrap(), array);
+        }
+    }
+}
+
+#[test]
+fn arrays_that_cannot_be_written_are_errors() {
+    let array = |shape| NdArray { shape, data: Data::I64(vec![1, 2, 3]) };
+    let file = Temporary::new("unwritten.npz", b"");
+    let error = npz::write(&file.0, &[("x", array(vec![2, 2]))]).unwrap_err();
+    assert!(matches!(&error, Error::Invalid { key, .. } if key == "x"), "{error}");
+    let error = npz::write(&file.0, &[("x", array(vec![3])), ("x", array(vec![3]))]).unwrap_err();
+    assert!(matches!(&error, Error::Npy { key, .. } if key == "x"), "{error}");
+    let error = npz::write(Path::new("/no/such/place.npz"), &[("x", array(vec![3]))]).unwrap_err();
+    assert!(matches!(error, Error::Io { .. }), "{error}");
+}
+
+#[test]
+fn the_limit_of_an_array_counts_the_memory_it_takes_decoded() {
+    // 200 MB of bytes in the file, 1.6 GB once they are 64-bit integers.
+    let header = "{'descr': '|u1', 'fortran_order': False, 'shape': (200000000,), }";
+    let file = Temporary::new("widened.npy", &npy(header, &[]));
+    assert!(matches!(read_npy(&file.0), Err(Error::TooLarge { claimed: 1_600_000_000, .. })));
+}

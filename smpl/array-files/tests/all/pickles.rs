@@ -1,0 +1,211 @@
+//! Pickles: right values from good files, typed errors from bad ones.
+
+use crate::common;
+
+use array_files::npz::read_npy;
+use array_files::pickle::{self, Value};
+use array_files::{Data, Error, NdArray};
+use common::fixture;
+use proptest::prelude::*;
+use testkit::files::shared;
+
+fn array(shape: &[usize], data: Data) -> Value {
+    Value::Array(NdArray { shape: shape.to_vec(), data })
+}
+
+fn text(s: &str) -> Value {
+    Value::Str(s.to_owned())
+}
+
+#[test]
+fn every_protocol_gives_the_values_python_wrote() {
+    for protocol in 0..6 {
+        let path = fixture(&format!("values.protocol{protocol}.pkl"));
+        let value = pickle::read(&path).unwrap_or_else(|e| panic!("protocol {protocol}: {e}"));
+        let get = |key: &str| value.get(key).unwrap_or_else(|| panic!("{protocol}: no {key}"));
+        let expect = |key: &str, expected: Value| {
+            assert_eq!(get(key), &expected, "protocol {protocol}, `{key}`");
+        };
+        let ints = |list: &[i64]| list.iter().map(|&i| Value::Int(i)).collect::<Vec<_>>();
+        expect("none", Value::None);
+        expect("flags", Value::Tuple(vec![Value::Bool(true), Value::Bool(false)]));
+        let numbers = [0, -1, 255, 256, 65535, 65536, -(1 << 31), 1 << 40, i64::MIN];
+        expect("ints", Value::List(ints(&numbers)));
+        let floats = [0.0, -2.5, 1e300].map(Value::Float);
+        expect("floats", Value::List(floats.to_vec()));
+        expect("text", text("ü \\ \n 漢 𝄞"));
+        expect("bytes", Value::Bytes(b"\x00\xff'\n\\".to_vec()));
+        expect("set", Value::Set(ints(&[3])));
+        expect("frozen", Value::Set(ints(&[4])));
+        let ordered = vec![(text("b"), Value::Int(1)), (text("a"), Value::Int(2))];
+        expect("ordered", Value::Dict(ordered));
+        expect("twice", Value::List(vec![Value::List(ints(&[1, 2])); 2]));
+        let six = [0, 1, 2, 3, 4, 5];
+        expect("f4", array(&[2, 3], Data::F32(six.map(|i| i as f32).to_vec())));
+        expect("f8_columns", array(&[2, 3], Data::F64(six.map(f64::from).to_vec())));
+        let Value::Array(NdArray { data: Data::F32(halves), .. }) = get("f2") else {
+            panic!("f2: {:?}", get("f2"));
+        };
+        assert_eq!(halves[..2], [1.5, -0.25]);
+        assert!((halves[2] - 6e-8).abs() < 3e-8, "subnormal half {}", halves[2]);
+        expect("i2_big", array(&[3], Data::I64(vec![1, -2, 300])));
+        expect("u1", array(&[2], Data::I64(vec![0, 255])));
+        expect("bool", array(&[2], Data::Bool(vec![true, false])));
+        expect("scalar", array(&[], Data::F32(vec![0.5])));
+        expect("zero_d", array(&[], Data::I64(vec![7])));
+        expect("empty", array(&[0, 3], Data::F64(vec![])));
+        let one = Value::Dict(vec![(text("k"), Value::Int(1))]);
+        let objects = |items: Vec<Value>| Value::Objects { shape: vec![2], items };
+        expect("objects", objects(vec![one, Value::None]));
+        expect("strings", objects(vec![text("ab"), text("c")]));
+        let dense = get("sparse").to_dense("values", "sparse").unwrap().unwrap();
+        assert_eq!(dense.shape, [2, 3]);
+        assert_eq!(dense.data, Data::F64(vec![0.0, 2.0, 0.0, 1.0, 0.0, 3.0]));
+    }
+}
+
+#[test]
+fn captures_are_read() {
+    let demo = "captures/humannerf_demo";
+    if let Some(path) = shared(&format!("{demo}/cameras.pkl")) {
+        let cameras = pickle::read(&path).unwrap();
+        let first = cameras.get("frame_000000").unwrap();
+        assert_eq!(first.get("intrinsics").unwrap().as_array().unwrap().shape, [3, 3]);
+        assert_eq!(first.get("extrinsics").unwrap().as_array().unwrap().shape, [4, 4]);
+    }
+    if let Some(path) = shared(&format!("{demo}/mesh_infos.pkl")) {
+        let infos = pickle::read(&path).unwrap();
+        let first = infos.get("frame_000000").unwrap();
+        let poses = first.get("poses").unwrap().as_array().unwrap();
+        assert_eq!(poses.len(), 72);
+        assert!(poses.to_f64().iter().all(|x| x.is_finite()));
+    }
+    if let Some(path) = shared(&format!("{demo}/canonical_joints.pkl")) {
+        let canonical = pickle::read(&path).unwrap();
+        assert_eq!(canonical.get("joints").unwrap().as_array().unwrap().shape, [24, 3]);
+    }
+    if let Some(path) = shared("captures/zju_demo/annots.npy") {
+        let annots = pickle::read(&path).unwrap();
+        assert_eq!(annots.get("cams").unwrap().get("K").unwrap().items().unwrap().len(), 6);
+        let ims = annots.get("ims").unwrap().items().unwrap();
+        assert_eq!(ims.len(), 100);
+        let paths = ims[0].get("ims").unwrap().items().unwrap();
+        assert!(paths.iter().all(|p| p.as_str().is_some()));
+    }
+    if let Some(path) = shared("captures/zju_demo/new_params/0.npy") {
+        let params = pickle::read(&path).unwrap();
+        assert_eq!(params.get("poses").unwrap().as_array().unwrap().shape, [1, 72]);
+        assert_eq!(params.get("Rh").unwrap().as_array().unwrap().shape, [1, 3]);
+    }
+    if let Some(path) = shared("captures/zju_demo/new_vertices/0.npy") {
+        assert_eq!(read_npy(&path).unwrap().shape, [6890, 3]);
+        assert!(matches!(pickle::read(&path).unwrap(), Value::Array(_)));
+    }
+}
+
+#[test]
+fn pickles_cut_anywhere_are_errors_with_an_offset() {
+    for protocol in 0..6 {
+        let bytes = std::fs::read(fixture(&format!("values.protocol{protocol}.pkl"))).unwrap();
+        for length in 0..bytes.len() {
+            match pickle::parse("cut", &bytes[..length]) {
+                Err(Error::Pickle { offset, .. }) => assert!(offset <= length),
+                other => panic!("protocol {protocol}, {length} bytes: {other:?}"),
+            }
+        }
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(3000))]
+
+    #[test]
+    fn changed_pickles_never_panic(
+        protocol in 0..6,
+        changes in prop::collection::vec((any::<prop::sample::Index>(), any::<u8>()), 1..6),
+    ) {
+        let path = fixture(&format!("values.protocol{protocol}.pkl"));
+        let mut bytes = std::fs::read(path).unwrap();
+        for (at, byte) in changes {
+            let at = at.index(bytes.len());
+            bytes[at] = byte;
+        }
+        let _ = pickle::parse("changed", &bytes);
+    }
+
+    #[test]
+    fn random_bytes_never_panic(bytes in prop::collection::vec(any::<u8>(), 0..200)) {
+        let _ = pickle::parse("random", &bytes);
+    }
+}
+
+#[test]
+fn only_allowed_globals_are_understood() {
+    for program in [
+        &b"cos\nsystem\n(S'true'\ntR."[..],
+        b"c__builtin__\neval\n(S'1'\ntR.",
+        b"\x80\x04\x8c\x05posix\x8c\x06system\x93.",
+        b"cnumpy\nload\n.",
+        b"\x80\x04\x8c\x04a\n\x1b[\x8c\x01\r\x93.",
+    ] {
+        let message = pickle::parse("evil", program).unwrap_err().to_string();
+        assert!(message.contains("not allowed"), "{message}");
+        assert!(!message.contains(char::is_control), "{message:?}");
+    }
+}
+
+#[test]
+fn malicious_pickles_end_in_errors() {
+    let mut deep = b"]".repeat(100_000);
+    deep.extend(b"a".repeat(99_999));
+    deep.push(b'.');
+    // Each list holds the one before ten times over.
+    let mut laughs = b"\x80\x02]q\x00K\x01a".to_vec();
+    for level in 1..=30u8 {
+        laughs.extend([b']', b'q', level, b'(']);
+        laughs.extend([b'h', level - 1].repeat(10));
+        laughs.push(b'e');
+    }
+    laughs.push(b'.');
+    // One megabyte of data made into ten thousand arrays.
+    let mut arrays = b"\x80\x02cnumpy\ndtype\nq\x00U\x02u1\x85Rq\x01B".to_vec();
+    arrays.extend(1_000_000u32.to_le_bytes());
+    arrays.extend(vec![0u8; 1_000_000]);
+    arrays.extend(b"q\x02cnumpy.core.numeric\n_frombuffer\nq\x03J\x40\x42\x0f\x00\x85q\x04U\x01Cq\x05(");
+    for _ in 0..10_000 {
+        arrays.extend(b"h\x03(h\x02h\x01h\x04h\x05tR");
+    }
+    arrays.extend(b"l.");
+    for (name, program) in [
+        ("deep", deep.as_slice()),
+        ("laughs", &laughs),
+        ("arrays", &arrays),
+        ("contains itself", b"]q\x00h\x00a."),
+        ("dict of itself", b"}q\x00K\x01h\x00s."),
+        ("huge length", b"\x8e\xff\xff\xff\xff\xff\xff\xff\xffx."),
+        ("huge memo", b"Nr\xff\xff\xff\xffh\x01."),
+        ("negative memo", b"Np-1\ng7\n."),
+        ("pop of nothing", b"0."),
+        ("tuple of nothing", b"\x87."),
+        ("items without mark", b"]e."),
+        ("pop across a mark", b"N(\x85."),
+        ("odd items", b"}(K\x01u."),
+        ("append to an int", b"K\x01K\x02a."),
+        ("build on none", b"N}b."),
+        ("wide integer", b"\x8a\x09\x00\x00\x00\x00\x00\x00\x00\x00\x01."),
+        ("wide text integer", b"I99999999999999999999\n."),
+        ("protocol 9", b"\x80\x09N."),
+        ("persistent", b"P1\n."),
+        ("shape", b"cnumpy.core.multiarray\n_reconstruct\n)R(K\x01(J\xff\xff\xff\x7fJ\xff\xff\xff\x7fJ\xff\xff\xff\x7ftcnumpy\ndtype\n(U\x02f8tRI00\nU\x00tb."),
+        ("blank array", b"cnumpy.core.multiarray\n_reconstruct\n)R."),
+        ("a class", b"cnumpy\nndarray\n."),
+        ("empty", b""),
+    ] {
+        let start = std::time::Instant::now();
+        match pickle::parse(name, program) {
+            Err(Error::Pickle { file, .. }) => assert_eq!(file, name),
+            other => panic!("{name}: {other:?}"),
+        }
+        assert!(start.elapsed().as_secs() < 10, "{name} took {:?}", start.elapsed());
+    }
+}

@@ -1,0 +1,287 @@
+//! Bodies of every size and form: archives like those of SMPL-H and SMPL-X, the saved form, and
+//! faults that are named.
+
+use std::io::Write;
+use std::path::{Path, PathBuf};
+use std::sync::LazyLock;
+
+use array_files::{Data, NdArray, npz};
+use glam::Vec3;
+use proptest::prelude::*;
+use smpl::{BodyModel, Error, FileError, Placement};
+use testkit::files::shared;
+
+fn temporary(name: &str) -> PathBuf {
+    Path::new(env!("CARGO_TARGET_TMPDIR")).join(name)
+}
+
+/// A `.npy` of little-endian words.
+fn npy(descr: &str, shape: &[usize], bytes: Vec<u8>) -> Vec<u8> {
+    let shape: String = shape.iter().map(|n| format!("{n},")).collect();
+    let header = format!("{{'descr': '{descr}', 'fortran_order': False, 'shape': ({shape}), }}\n");
+    let mut out = b"\x93NUMPY\x01\0".to_vec();
+    out.extend((header.len() as u16).to_le_bytes());
+    out.extend(header.as_bytes());
+    out.extend(bytes);
+    out
+}
+
+fn floats(shape: &[usize], value: impl Fn(usize) -> f32) -> Vec<u8> {
+    npy("<f4", shape, (0..shape.iter().product()).flat_map(|i| value(i).to_le_bytes()).collect())
+}
+
+/// How an archive writes the parent of the root.
+#[derive(Clone, Copy, Debug)]
+enum Root {
+    U32,
+    I64Wrapped,
+    MinusOne,
+}
+
+/// A body of `joints` joints and 3 vertices each, in a chain, with the further arrays of a SMPL-X
+/// archive.
+fn archive(name: &str, joints: usize, betas: usize, root: Root) -> PathBuf {
+    let v = 3 * joints;
+    let wave = |i: usize| (i as f32 * 0.71).sin();
+    let parents = (0..joints as i64).map(|j| match (j, root) {
+        (0, Root::MinusOne) => -1,
+        (0, _) => i64::from(u32::MAX),
+        _ => j - 1,
+    });
+    let tree: Vec<i64> = parents.chain(0..joints as i64).collect();
+    let tree = match root {
+        Root::U32 => npy("<u4", &[2, joints], tree.iter().flat_map(|&p| (p as u32).to_le_bytes()).collect()),
+        _ => npy("<i8", &[2, joints], tree.iter().flat_map(|p| p.to_le_bytes()).collect()),
+    };
+    let faces = (0..joints as u32).flat_map(|j| [3 * j, 3 * j + 1, 3 * j + 2]).flat_map(u32::to_le_bytes).collect();
+    let arrays = [
+        ("v_template", floats(&[v, 3], |i| (i / 9) as f32 * 0.1 + wave(i))),
+        ("f", npy("<u4", &[joints, 3], faces)),
+        ("shapedirs", floats(&[v, 3, betas], |i| 0.01 * wave(i))),
+        ("posedirs", floats(&[v, 3, 9 * (joints - 1)], |i| if i % 7 == 0 { 0.001 * wave(i) } else { 0.0 })),
+        ("weights", floats(&[v, joints], |i| f32::from(u8::from(i / joints / 3 == i % joints)))),
+        ("J_regressor", floats(&[joints, v], |i| if i % v / 3 == i / v { 1.0 / 3.0 } else { 0.0 })),
+        ("kintree_table", tree),
+        // Not read: what SMPL-H and SMPL-X carry besides, objects included.
+        ("lmk_faces_idx", npy("<i8", &[2], vec![0; 16])),
+        ("hands_componentsl", floats(&[45, 45], wave)),
+        ("hands_meanl", floats(&[45], wave)),
+        ("joint2num", npy("|O", &[], b"not even a pickle".to_vec())),
+    ];
+    let mut zip = zip::ZipWriter::new(std::io::Cursor::new(Vec::new()));
+    for (key, bytes) in arrays {
+        zip.start_file(format!("{key}.npy"), zip::write::SimpleFileOptions::default()).unwrap();
+        zip.write_all(&bytes).unwrap();
+    }
+    let path = temporary(name);
+    std::fs::write(&path, zip.finish().unwrap().into_inner()).unwrap();
+    path
+}
+
+#[test]
+fn bodies_with_hands_and_faces_load_pose_and_survive_saving() {
+    for (joints, betas, root) in
+        [(52, 16, Root::U32), (55, 400, Root::I64Wrapped), (55, 20, Root::MinusOne), (1, 0, Root::MinusOne)]
+    {
+        let body = BodyModel::load(&archive(&format!("hands-{joints}-{betas}.npz"), joints, betas, root)).unwrap();
+        assert_eq!((body.num_joints(), body.num_betas(), body.num_vertices()), (joints, betas, 3 * joints));
+        assert_eq!(body.parents[0], None);
+        let shaped = body.shaped(&vec![0.5; betas]);
+        let pose: Vec<Vec3> = (0..joints).map(|j| Vec3::new(0.1, 0.0, 0.01) * j as f32).collect();
+        let posed = body.pose(&shaped, &pose, Placement::default());
+        assert!(posed.vertices.iter().all(|v| v.is_finite()));
+        let gradient = body.pose_backward(&shaped, &pose, Placement::default(), &posed, &posed.vertices, &[]);
+        assert_eq!((gradient.pose.len(), body.shaped_backward(&gradient.shaped).len()), (joints, betas));
+
+        let saved = temporary(&format!("hands-{joints}-{betas}.safetensors"));
+        body.save(&saved).unwrap();
+        let back = BodyModel::load(&saved).unwrap();
+        assert_eq!(bits(&back), bits(&body));
+        assert_eq!(back, body);
+        // The content tells the kind, whatever the name.
+        let renamed = temporary(&format!("hands-{joints}-{betas}.body"));
+        std::fs::copy(&saved, &renamed).unwrap();
+        assert_eq!(BodyModel::load(&renamed).unwrap(), body);
+        let again = temporary(&format!("hands-{joints}-{betas}-again.safetensors"));
+        body.save(&again).unwrap();
+        assert_eq!(std::fs::read(&saved).unwrap(), std::fs::read(&again).unwrap());
+    }
+}
+
+/// Every float of a model: equality of floats takes −0 for 0.
+fn bits(body: &BodyModel) -> Vec<u32> {
+    let vectors = [&body.v_template, &body.shapedirs, &body.posedirs.values];
+    let scalars = body.weights.values.iter().chain(&body.j_regressor.values);
+    vectors.into_iter().flatten().flat_map(|v| v.to_array()).chain(scalars.copied()).map(f32::to_bits).collect()
+}
+
+#[test]
+fn the_shared_body_is_the_same_from_every_form() {
+    let Some(path) = shared("body/open_body.npz") else { return };
+    let body = BodyModel::load(&path).unwrap();
+    let saved = temporary("open_body.safetensors");
+    body.save(&saved).unwrap();
+    assert_eq!(bits(&BodyModel::load(&saved).unwrap()), bits(&body));
+    let pickled = BodyModel::load(&shared("body/open_body.pkl").unwrap()).unwrap();
+    pickled.save(&saved).unwrap();
+    assert_eq!(bits(&BodyModel::load(&saved).unwrap()), bits(&pickled));
+}
+
+#[test]
+fn invalid_bodies_are_not_saved() {
+    let mut body = BodyModel::embedded();
+    body.v_template[3].x = f32::NAN;
+    let path = temporary("never.safetensors");
+    let _ = std::fs::remove_file(&path);
+    assert!(body.save(&path).unwrap_err().to_string().contains("v_template"));
+    assert!(!path.exists());
+    assert!(BodyModel::embedded().save(Path::new("/no/such/folder/a.safetensors")).is_err());
+}
+
+/// The saved form of a body of three joints: written once, as tests run at once and would read what
+/// another is writing.
+static SMALL: LazyLock<Vec<u8>> = LazyLock::new(|| {
+    let body = BodyModel::load(&archive("small.npz", 3, 2, Root::U32)).unwrap();
+    let path = temporary("small.safetensors");
+    body.save(&path).unwrap();
+    std::fs::read(path).unwrap()
+});
+
+fn load(name: &str, bytes: &[u8]) -> Result<BodyModel, smpl::Error> {
+    let path = temporary(name);
+    std::fs::write(&path, bytes).unwrap();
+    BodyModel::load(&path)
+}
+
+#[test]
+fn truncated_and_foreign_files_are_refused() {
+    let bytes = SMALL.clone();
+    for n in (0..bytes.len()).step_by(7) {
+        assert!(load("cut.safetensors", &bytes[..n]).is_err(), "{n} bytes");
+    }
+    let text = String::from_utf8_lossy(&bytes).into_owned();
+    assert!(text.contains("smpl-body 1"));
+    let swap = |from: &str, to: &str| {
+        let at = bytes.windows(from.len()).position(|w| w == from.as_bytes()).unwrap();
+        let mut bytes = bytes.clone();
+        bytes[at..at + from.len()].copy_from_slice(to.as_bytes());
+        load("swapped.safetensors", &bytes).unwrap_err().to_string()
+    };
+    assert!(swap("smpl-body 1", "smpl-body 9").contains("smpl-body 9"));
+    assert!(swap("\"parents\"", "\"porents\"").contains("no `parents`"));
+    let mut huge = bytes.clone();
+    huge[..8].copy_from_slice(&u64::MAX.to_le_bytes());
+    assert!(load("huge.safetensors", &huge).is_err());
+    assert!(load("plain.body", b"hello").unwrap_err().to_string().contains(".npz, .pkl or .safetensors"));
+}
+
+proptest! {
+    #[test]
+    fn damaged_files_give_errors_or_bodies_that_pose(
+        edits in prop::collection::vec((any::<prop::sample::Index>(), any::<u8>()), 1..5),
+    ) {
+        let mut bytes = SMALL.clone();
+        for (at, value) in edits {
+            let at = at.index(bytes.len());
+            bytes[at] = value;
+        }
+        if let Ok(body) = load("damaged.safetensors", &bytes) {
+            let pose = vec![Vec3::ONE; body.num_joints()];
+            prop_assert_eq!(body.pose(&body.shaped(&[]), &pose, Placement::default()).vertices.len(), body.num_vertices());
+        }
+    }
+}
+
+#[test]
+fn bodies_without_faces_or_with_huge_coordinates_are_refused() {
+    let refused = |change: fn(&mut BodyModel), words: [&str; 2]| {
+        let mut body = BodyModel::embedded();
+        change(&mut body);
+        let message = body.validate("a.npz").unwrap_err().to_string();
+        assert!(words.iter().all(|word| message.contains(word)), "{words:?}: {message}");
+    };
+    refused(|body| body.faces.clear(), ["`f`", "no faces"]);
+    refused(|body| body.faces.iter_mut().for_each(|f| f[1] = f[0]), ["`f`", "degenerate"]);
+    refused(|body| body.v_template.fill(Vec3::ONE), ["`f`", "degenerate"]);
+    refused(|body| body.v_template[7].y = 1e30, ["`v_template`", "row 7"]);
+    refused(|body| body.shapedirs[3] = Vec3::splat(-2e6), ["`shapedirs`", "row 3"]);
+    refused(|body| body.posedirs.values[5].z = 1e30, ["`posedirs`", "row 5"]);
+}
+
+/// Arrays of a body of three vertices and two joints.
+fn tiny_body() -> Vec<(&'static str, Vec<usize>, Vec<f64>)> {
+    vec![
+        ("v_template", vec![3, 3], vec![0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0]),
+        ("f", vec![1, 3], vec![0.0, 1.0, 2.0]),
+        ("weights", vec![3, 2], vec![1.0, 0.0, 0.5, 0.5, 0.0, 1.0]),
+        ("J_regressor", vec![2, 3], vec![1.0, 0.0, 0.0, 0.0, 0.5, 0.5]),
+        ("kintree_table", vec![2, 2], vec![4294967295.0, 0.0, 0.0, 1.0]),
+        ("shapedirs", vec![3, 3, 1], vec![0.1; 9]),
+        ("posedirs", vec![3, 3, 9], vec![0.0; 81]),
+    ]
+}
+
+fn write_body(name: &str, arrays: &[(&'static str, Vec<usize>, Vec<f64>)]) -> PathBuf {
+    let path = temporary(name);
+    let array = |(key, shape, values): &(&'static str, Vec<usize>, Vec<f64>)| {
+        let integers = matches!(*key, "f" | "kintree_table");
+        let whole = || Data::I64(values.iter().map(|&x| x as i64).collect());
+        let data = if integers { whole() } else { Data::F64(values.clone()) };
+        (*key, NdArray { shape: shape.clone(), data })
+    };
+    npz::write(&path, &arrays.iter().map(array).collect::<Vec<_>>()).unwrap();
+    path
+}
+
+#[test]
+fn a_tiny_body_is_read() {
+    let file = write_body("tiny.npz", &tiny_body());
+    let body = BodyModel::load(&file).unwrap();
+    assert_eq!((body.num_vertices(), body.num_joints(), body.num_betas()), (3, 2, 1));
+    assert_eq!(body.parents, [None, Some(0)]);
+}
+
+#[test]
+fn faults_of_a_model_name_the_array() {
+    let cases: [(&str, usize, f64); 11] = [
+        ("v_template", 4, f64::NAN),
+        ("v_template", 0, f64::INFINITY),
+        ("f", 2, 3.0),
+        ("f", 0, -1.0),
+        ("weights", 0, 0.5),
+        ("weights", 2, -0.5),
+        ("weights", 0, f64::NAN),
+        ("J_regressor", 0, 9.0),
+        ("kintree_table", 1, 1.0),
+        ("shapedirs", 3, f64::NEG_INFINITY),
+        ("posedirs", 80, f64::NAN),
+    ];
+    for (i, (key, index, value)) in cases.into_iter().enumerate() {
+        let mut arrays = tiny_body();
+        arrays.iter_mut().find(|a| a.0 == key).unwrap().2[index] = value;
+        let file = write_body(&format!("fault{i}.npz"), &arrays);
+        let message = BodyModel::load(&file).expect_err(key).to_string();
+        let name = format!("fault{i}.npz");
+        assert!(message.contains(&format!("`{key}`")) && message.contains(&name), "{message}");
+    }
+}
+
+#[test]
+fn missing_and_misshapen_arrays_of_a_model_are_named() {
+    for i in 0..tiny_body().len() {
+        let mut arrays = tiny_body();
+        let (key, shape, _) = &mut arrays[i];
+        let key = *key;
+        shape.push(1);
+        let shown = format!("{shape:?}");
+        let file = write_body(&format!("shape{i}.npz"), &arrays);
+        let message = BodyModel::load(&file).expect_err(key).to_string();
+        assert!(message.contains(&format!("`{key}`")) && message.contains(&shown), "{message}");
+
+        arrays.remove(i);
+        let file = write_body(&format!("missing{i}.npz"), &arrays);
+        let error = BodyModel::load(&file).expect_err(key);
+        assert!(matches!(&error, Error::File(FileError::MissingKey { key: k, .. }) if k == key), "{error}");
+    }
+    assert!(matches!(load("plain.py", b"import numpy").unwrap_err(), Error::Extension { .. }));
+}

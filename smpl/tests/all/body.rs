@@ -1,0 +1,273 @@
+//! Properties of shaping, posing and the surface motion field.
+
+use std::sync::LazyLock;
+
+use glam::{Affine3A, Quat, Vec3};
+use proptest::prelude::*;
+use smpl::{BodyModel, Placement, Posed, SparseRows, SurfaceMotion, rodrigues};
+use testkit::strategy::{rotation, vec3};
+
+static BODY: LazyLock<BodyModel> = LazyLock::new(BodyModel::embedded);
+
+/// Rotations of all joints, up to about 0.9 rad each; the root's can be anything.
+fn pose() -> impl Strategy<Value = Vec<Vec3>> {
+    (prop::collection::vec(vec3(0.5), 24), rotation()).prop_map(|(mut pose, root)| {
+        pose[0] = root.to_scaled_axis();
+        pose
+    })
+}
+
+fn betas() -> impl Strategy<Value = Vec<f32>> {
+    prop::collection::vec(-2.0f32..2.0, 0..=10)
+}
+
+fn pelvis(translation: Vec3) -> Placement {
+    Placement::Pelvis { translation }
+}
+
+fn largest(a: &[Vec3], b: &[Vec3]) -> f32 {
+    assert_eq!(a.len(), b.len());
+    a.iter().zip(b).map(|(a, b)| a.distance(*b)).fold(0.0, f32::max)
+}
+
+fn moved(points: &[Vec3], by: Affine3A) -> Vec<Vec3> {
+    points.iter().map(|&p| by.transform_point3(p)).collect()
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(24))]
+
+    #[test]
+    fn zero_pose_gives_the_shaped_body(betas in betas(), translation in vec3(2.0)) {
+        let shaped = BODY.shaped(&betas);
+        let posed = BODY.pose(&shaped, &[Vec3::ZERO; 24], pelvis(translation));
+        let by = Affine3A::from_translation(translation);
+        prop_assert!(largest(&posed.vertices, &moved(&shaped.vertices, by)) < 2e-6);
+        prop_assert!(largest(&posed.joints, &moved(&shaped.joints, by)) < 2e-6);
+        prop_assert!(posed.pose_offsets.iter().all(|&o| o == Vec3::ZERO));
+    }
+
+    #[test]
+    fn a_rigid_motion_of_the_placement_moves_the_body_rigidly(
+        mut pose in pose(),
+        turn in rotation(),
+        shift in vec3(2.0),
+    ) {
+        pose[0] = Vec3::ZERO;
+        let shaped = BODY.shaped(&[1.0, -1.0]);
+        let plain = BODY.pose(&shaped, &pose, Placement::Origin { rotation: Vec3::ZERO, translation: Vec3::ZERO });
+        let axis = turn.to_scaled_axis();
+        let placed = BODY.pose(&shaped, &pose, Placement::Origin { rotation: axis, translation: shift });
+        let by = Affine3A::from_rotation_translation(turn, shift);
+        prop_assert!(largest(&placed.vertices, &moved(&plain.vertices, by)) < 5e-6);
+        prop_assert!(largest(&placed.joints, &moved(&plain.joints, by)) < 5e-6);
+    }
+
+    #[test]
+    fn a_turn_of_the_root_is_a_turn_about_the_pelvis(mut pose in pose(), turn in rotation()) {
+        pose[0] = Vec3::ZERO;
+        let shaped = BODY.shaped(&[]);
+        let plain = BODY.pose(&shaped, &pose, Placement::default());
+        pose[0] = turn.to_scaled_axis();
+        let turned = BODY.pose(&shaped, &pose, Placement::default());
+        let about = Affine3A::from_translation(shaped.joints[0])
+            * Affine3A::from_quat(turn)
+            * Affine3A::from_translation(-shaped.joints[0]);
+        prop_assert!(largest(&turned.vertices, &moved(&plain.vertices, about)) < 5e-6);
+    }
+
+    #[test]
+    fn the_two_placements_agree_where_they_should(pose in pose(), translation in vec3(2.0)) {
+        // R (x − p) + p + t = R x + (p − R p + t)
+        let shaped = BODY.shaped(&[0.3]);
+        let a = BODY.pose(&shaped, &pose, pelvis(translation));
+        let root = shaped.joints[0];
+        let th = root - rodrigues(pose[0]) * root + translation;
+        let b = BODY.pose(&shaped, &pose, Placement::Origin { rotation: pose[0], translation: th });
+        prop_assert!(largest(&a.vertices, &b.vertices) < 5e-6);
+    }
+
+    #[test]
+    fn vertices_are_the_blend_of_bones_that_the_documentation_says(pose in pose(), betas in betas()) {
+        let shaped = BODY.shaped(&betas);
+        let posed = BODY.pose(&shaped, &pose, pelvis(Vec3::X));
+        for v in (0..BODY.num_vertices()).step_by(37) {
+            let rest = shaped.vertices[v] + posed.pose_offsets[v];
+            let expected: Vec3 = BODY.weights.row(v)
+                .map(|(joint, w)| w * posed.bones[joint].transform_point3(rest))
+                .sum();
+            prop_assert!(posed.vertices[v].distance(expected) < 3e-6);
+        }
+    }
+
+    #[test]
+    fn bones_carry_rest_joints_to_posed_joints(pose in pose(), betas in betas()) {
+        let shaped = BODY.shaped(&betas);
+        let posed = BODY.pose(&shaped, &pose, Placement::default());
+        let to_canonical = posed.to_canonical();
+        for joint in 0..24 {
+            let carried = posed.bones[joint].transform_point3(shaped.joints[joint]);
+            prop_assert!(carried.distance(posed.joints[joint]) < 3e-6);
+            let back = to_canonical[joint].transform_point3(posed.joints[joint]);
+            prop_assert!(back.distance(shaped.joints[joint]) < 3e-6);
+        }
+    }
+
+    #[test]
+    fn batches_equal_single_frames_bit_for_bit(poses in prop::collection::vec(pose(), 1..20), betas in betas()) {
+        let shaped = BODY.shaped(&betas);
+        let frames: Vec<_> = poses.iter().map(|p| (&shaped, p.as_slice(), pelvis(Vec3::Y))).collect();
+        let batch = BODY.pose_batch(&frames);
+        prop_assert_eq!(batch.len(), poses.len());
+        for (posed, pose) in batch.iter().zip(&poses) {
+            prop_assert_eq!(posed, &BODY.pose(&shaped, pose, pelvis(Vec3::Y)));
+        }
+    }
+
+    #[test]
+    fn posed_surface_points_map_back_to_rest(
+        pose in pose(),
+        face in any::<prop::sample::Index>(),
+        corner in 0usize..3,
+    ) {
+        let shaped = BODY.shaped(&[0.5, 0.5]);
+        let posed = BODY.pose(&shaped, &pose, pelvis(Vec3::new(1.0, 2.0, 3.0)));
+        let face = face.index(BODY.faces.len());
+        let mut barycentric = [0.0; 3];
+        barycentric[corner] = 1.0;
+        let v = BODY.faces[face][corner] as usize;
+        if determinant(&posed, v) < 0.06 {
+            // One bone takes over there: not an inverse, but still a finite point.
+            return Ok(());
+        }
+        let sample = SurfaceMotion::default()
+            .map(&BODY, &posed, posed.vertices[v], face as u32, barycentric, 0.0)
+            .unwrap();
+        prop_assert_eq!(sample.likelihood, 1.0);
+        let error = sample.canonical.distance(shaped.vertices[v]);
+        prop_assert!(error < 5e-5, "{}", error);
+    }
+}
+
+fn determinant(posed: &Posed, v: usize) -> f32 {
+    let mut sum = glam::Mat3A::ZERO;
+    for (joint, w) in BODY.weights.row(v) {
+        sum += posed.bones[joint].matrix3 * w;
+    }
+    sum.determinant()
+}
+
+#[test]
+fn poses_do_not_depend_on_the_number_of_threads() {
+    let shaped = BODY.shaped(&[1.0]);
+    let pose: Vec<Vec3> = (0..24).map(|i| Vec3::new(0.1, -0.05, 0.02) * i as f32).collect();
+    let on = |threads: usize| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        pool.install(|| BODY.pose(&shaped, &pose, Placement::default()))
+    };
+    assert_eq!(on(1), on(5));
+}
+
+#[test]
+fn dense_rows_are_summed_like_any_other() {
+    // Full rows, which go four at a time, with a sparse and an empty one among them.
+    let mut body = BODY.clone();
+    let wave = |i: usize| (i as f32 * 0.618).sin();
+    body.posedirs = SparseRows::from_rows((0..body.num_vertices()).map(|v| {
+        let kept = move |t: &usize| v % 11 != 5 || (v & 1 == 0 && t.is_multiple_of(3));
+        (0..207).filter(kept).map(move |t| (t as u32, 0.01 * Vec3::new(wave(v + t), wave(v * t), wave(t))))
+    }));
+    body.validate("dense").unwrap();
+    let shaped = body.shaped(&[]);
+    let poses: Vec<Vec<Vec3>> = (0..37)
+        .map(|f| (0..24).map(|j| 0.3 * Vec3::new(wave(f + j), wave(2 * f + j), wave(f * j))).collect())
+        .collect();
+    let frames: Vec<_> = poses.iter().map(|p| (&shaped, p.as_slice(), pelvis(Vec3::Z))).collect();
+    let on = |threads: usize| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        pool.install(|| body.pose_batch(&frames))
+    };
+    let batch = on(1);
+    assert_eq!(batch, on(3));
+    for (posed, pose) in batch.iter().zip(&poses) {
+        assert_eq!(posed, &body.pose(&shaped, pose, pelvis(Vec3::Z)));
+        for v in (0..body.num_vertices()).step_by(7) {
+            let mut expected = glam::DVec3::ZERO;
+            for (term, direction) in body.posedirs.row(v) {
+                let entry = rodrigues(pose[1 + term / 9]).transpose().to_cols_array()[term % 9];
+                let identity = f32::from(u8::from(term % 9 % 4 == 0));
+                expected += f64::from(entry - identity) * direction.as_dvec3();
+            }
+            assert!(posed.pose_offsets[v].as_dvec3().distance(expected) < 1e-6);
+        }
+    }
+    assert!(body.pose_batch(&[]).is_empty());
+}
+
+#[test]
+fn joints_follow_the_shape() {
+    let plain = BODY.shaped(&[]);
+    let tall = BODY.shaped(&[2.0]);
+    let knee = |s: &smpl::Shaped| s.joints[1].distance(s.joints[4]);
+    assert!(knee(&tall) > 1.04 * knee(&plain));
+    // Betas that are not given are 0.
+    assert_eq!(BODY.shaped(&[0.0; 10]), plain);
+}
+
+#[test]
+#[should_panic(expected = "11 betas, the model has 10")]
+fn too_many_betas_panic() {
+    let _ = BODY.shaped(&[0.0; 11]);
+}
+
+#[test]
+fn likelihood_is_one_inside_then_falls_smoothly_to_zero() {
+    let field = SurfaceMotion { margin: 0.05, falloff: 0.1 };
+    for d in [-1.0, -0.01, 0.0, 0.05] {
+        assert_eq!(field.likelihood(d), 1.0);
+    }
+    for d in [0.15, 0.2, f32::INFINITY] {
+        assert_eq!(field.likelihood(d), 0.0);
+    }
+    let mut last = (1.0f32, 0.0f32);
+    for i in 0..=1000 {
+        let f = field.likelihood(0.04 + 0.12 * i as f32 / 1000.0);
+        let slope = f - last.0;
+        assert!(slope <= 1e-6, "rises at {i}");
+        // The largest slope is 1.5 / falloff, the largest change of slope 6 / falloff².
+        assert!((slope - last.1).abs() < 6.0 / 0.01 * 0.00012f32.powi(2) * 1.1 + 1e-6);
+        last = (f, slope);
+    }
+    let step = SurfaceMotion { margin: 0.05, falloff: 0.0 };
+    assert_eq!((step.likelihood(0.05), step.likelihood(0.0501)), (1.0, 0.0));
+}
+
+#[test]
+fn dead_and_broken_samples_are_none() {
+    let shaped = BODY.shaped(&[]);
+    let posed = BODY.pose(&shaped, &[Vec3::ZERO; 24], Placement::default());
+    let field = SurfaceMotion::default();
+    let map = |p, d| field.map(&BODY, &posed, p, 0, [1.0, 0.0, 0.0], d);
+    assert!(map(Vec3::ZERO, 0.0).is_some());
+    assert!(map(Vec3::ZERO, 0.11).is_none());
+    assert!(map(Vec3::ZERO, f32::NAN).is_none());
+    assert!(map(Vec3::NAN, 0.0).is_none());
+    assert!(map(Vec3::splat(f32::INFINITY), 0.0).is_none());
+}
+
+#[test]
+fn a_fold_gives_finite_points_of_the_heaviest_bone() {
+    let shaped = BODY.shaped(&[]);
+    let mut pose = vec![Vec3::ZERO; 24];
+    pose[18] = Quat::from_rotation_y(-3.1).to_scaled_axis();
+    let posed = BODY.pose(&shaped, &pose, Placement::default());
+    let mut folded = 0;
+    for (i, face) in BODY.faces.iter().enumerate() {
+        let v = face[0] as usize;
+        folded += usize::from(determinant(&posed, v) < 0.05);
+        let sample =
+            SurfaceMotion::default().map(&BODY, &posed, posed.vertices[v], i as u32, [1.0, 0.0, 0.0], 0.0).unwrap();
+        assert!(sample.canonical.distance(shaped.vertices[v]) < 0.15);
+    }
+    assert!(folded > 0, "the fold reaches no vertex: the test tests nothing");
+}

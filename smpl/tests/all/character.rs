@@ -1,0 +1,315 @@
+//! Rigged characters: the shared ones where they are there, and small ones made here, right and
+//! wrong.
+
+use base64::Engine;
+use glam::{Affine3A, Vec3};
+use proptest::prelude::*;
+use smpl::{Character, load_mesh};
+use testkit::files::{glb, shared};
+
+/// A strip of two triangles on two joints, the second 1 above the first and turning about z.
+fn arm() -> (String, Vec<u8>) {
+    let mut bytes: Vec<u8> = Vec::new();
+    let mut floats = |values: &[f32]| bytes.extend(values.iter().flat_map(|v| v.to_le_bytes()));
+    // 0: positions at 0, 4 × 3
+    floats(&[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 2.0, 0.0, 1.0, 2.0, 0.0]);
+    // 1: weights at 48, 4 × 4; not normalised on purpose
+    floats(&[2.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.5, 0.5, 0.0, 0.0]);
+    // 2: inverse bind matrices at 112, 2 × 16: identity, and 1 down
+    floats(&[1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0]);
+    floats(&[1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, -1.0, 0.0, 1.0]);
+    // 3: times at 240, 2
+    floats(&[1.0, 3.0]);
+    // 4: rotations at 248, 2 × 4: none, and a quarter turn about z
+    let half = std::f32::consts::FRAC_1_SQRT_2;
+    floats(&[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, half, half]);
+    // 5: cubic translations at 280, 6 × 3: in, value, out; from (0,1,0) at rest to (2,1,0) at rest
+    floats(&[0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 2.0, 1.0, 0.0, 0.0, 0.0, 0.0]);
+    // 6: joints at 352, 4 × 4 u8
+    bytes.extend([0, 0, 0, 0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0]);
+    // 7: indices at 368, 6 u16
+    bytes.extend([0u16, 1, 2, 2, 1, 3].iter().flat_map(|v| v.to_le_bytes()));
+    let views = [(0, 48), (48, 64), (112, 128), (240, 8), (248, 32), (280, 72), (352, 16), (368, 12)];
+    let views: Vec<String> =
+        (views.iter()).map(|(at, n)| format!(r#"{{"buffer":0,"byteOffset":{at},"byteLength":{n}}}"#)).collect();
+    let json = format!(
+        r#"{{"asset":{{"version":"2.0"}},"scene":0,"scenes":[{{"nodes":[0,2]}}],
+"nodes":[{{"children":[1],"name":"root"}},{{"translation":[0,1,0],"name":"tip"}},{{"mesh":0,"skin":0}}],
+"meshes":[{{"primitives":[{{"attributes":{{"POSITION":0,"WEIGHTS_0":1,"JOINTS_0":6}},"indices":7}}]}}],
+"skins":[{{"joints":[0,1],"inverseBindMatrices":2}}],
+"animations":[{{"name":"bend","samplers":[{{"input":3,"output":4}},{{"input":3,"output":5,"interpolation":"CUBICSPLINE"}},{{"input":3,"output":4,"interpolation":"STEP"}}],
+"channels":[{{"sampler":0,"target":{{"node":1,"path":"rotation"}}}}]}},
+{{"samplers":[{{"input":3,"output":5,"interpolation":"CUBICSPLINE"}}],"channels":[{{"sampler":0,"target":{{"node":1,"path":"translation"}}}}]}},
+{{"samplers":[{{"input":3,"output":4,"interpolation":"STEP"}}],"channels":[{{"sampler":0,"target":{{"node":1,"path":"rotation"}}}}]}}],
+"accessors":[{{"bufferView":0,"componentType":5126,"count":4,"type":"VEC3","min":[0,0,0],"max":[1,2,0]}},
+{{"bufferView":1,"componentType":5126,"count":4,"type":"VEC4"}},
+{{"bufferView":2,"componentType":5126,"count":2,"type":"MAT4"}},
+{{"bufferView":3,"componentType":5126,"count":2,"type":"SCALAR","min":[1],"max":[3]}},
+{{"bufferView":4,"componentType":5126,"count":2,"type":"VEC4"}},
+{{"bufferView":5,"componentType":5126,"count":6,"type":"VEC3"}},
+{{"bufferView":6,"componentType":5121,"count":4,"type":"VEC4"}},
+{{"bufferView":7,"componentType":5123,"count":6,"type":"SCALAR"}}],
+"bufferViews":[{}],"buffers":[{{"byteLength":380}}]}}"#,
+        views.join(",")
+    );
+    (json, bytes)
+}
+
+fn read(json: &str, binary: &[u8]) -> Result<Character, smpl::Error> {
+    Character::from_bytes("made.glb", &glb(json, binary))
+}
+
+fn close(a: Vec3, b: Vec3) {
+    assert!(a.distance(b) < 1e-5, "{a} is not {b}");
+}
+
+#[test]
+fn a_small_character_moves_as_worked_out_by_hand() {
+    let (json, binary) = arm();
+    let arm = read(&json, &binary).unwrap();
+    assert_eq!((arm.num_joints(), arm.joint_names.join(" ")), (2, "root tip".to_owned()));
+    assert_eq!(arm.faces, [[0, 1, 2], [2, 1, 3]]);
+    assert_eq!(arm.rest().vertices, arm.vertices);
+    assert_eq!((arm.animations[0].name.as_str(), arm.animations[0].duration), ("bend", 3.0));
+    // A quarter turn about (0, 1, 0) takes (0, 2, 0) to (−1, 1, 0); vertex 3 is halfway between (1,
+    // 2, 0) and (−1, 2, 0).
+    let bent = arm.pose(0, 3.0);
+    close(bent.vertices[0], Vec3::ZERO);
+    close(bent.vertices[2], Vec3::new(-1.0, 1.0, 0.0));
+    close(bent.vertices[3], Vec3::new(0.0, 2.0, 0.0));
+    close(Vec3::from(bent.joints[1].translation), Vec3::Y);
+    // Halfway in time is an eighth of a turn: slerp, not lerp. A quarter of the way, a sixteenth.
+    let turned = |seconds: f32| arm.pose(0, seconds).joints[1].matrix3.x_axis.y;
+    assert!((turned(2.0) - (std::f32::consts::FRAC_PI_4).sin()).abs() < 1e-6);
+    assert!((turned(1.5) - (std::f32::consts::FRAC_PI_8).sin()).abs() < 1e-6);
+    // Held outside the keys.
+    assert_eq!(arm.pose(0, 99.0), bent);
+    assert_eq!(arm.pose(0, -1.0).vertices, arm.vertices);
+    assert_eq!(arm.pose(0, f32::NAN).vertices, arm.vertices);
+    // The cubic spline with flat tangents is the smooth step.
+    let x = |seconds: f32| arm.pose(1, seconds).joints[1].translation.x;
+    assert!((x(1.5) - 2.0 * 0.15625).abs() < 1e-6 && (x(2.0) - 1.0).abs() < 1e-6 && x(3.0) == 2.0);
+    // A step holds until the next key.
+    assert_eq!(arm.pose(2, 2.999).vertices, arm.vertices);
+    close(arm.pose(2, 3.0).vertices[2], Vec3::new(-1.0, 1.0, 0.0));
+}
+
+#[test]
+fn buffers_may_stand_in_the_document_but_not_outside_the_folder() {
+    let (json, binary) = arm();
+    let data = base64::engine::general_purpose::STANDARD.encode(&binary);
+    let with = |uri: &str| json.replace(r#""byteLength":380"#, &format!(r#""byteLength":380,"uri":"{uri}""#));
+    let inline = with(&format!("data:application/octet-stream;base64,{data}"));
+    assert_eq!(Character::from_bytes("a", inline.as_bytes()).unwrap(), read(&json, &binary).unwrap());
+    for uri in ["../secret.bin", "/etc/passwd", "a/../../b.bin", "data:,plain", "data:a;base64,***"] {
+        assert!(Character::from_bytes("a", with(uri).as_bytes()).is_err(), "{uri}");
+    }
+    let folder = std::path::Path::new(env!("CARGO_TARGET_TMPDIR"));
+    std::fs::write(folder.join("arm.bin"), &binary).unwrap();
+    std::fs::write(folder.join("arm.gltf"), with("arm.bin")).unwrap();
+    assert_eq!(load_mesh(&folder.join("arm.gltf")).unwrap().faces.len(), 2);
+}
+
+#[test]
+fn meshes_without_a_skin_follow_their_node() {
+    let (json, binary) = arm();
+    let json = json.replace(r#""mesh":0,"skin":0"#, r#""mesh":0,"translation":[0,0,5],"scale":[2,2,2]"#);
+    let plain = read(&json, &binary).unwrap();
+    assert_eq!(plain.num_joints(), 1);
+    close(plain.rest().vertices[3], Vec3::new(2.0, 4.0, 5.0));
+}
+
+/// Fails unless reading gives an error that names every one of `words`.
+fn refused(json: &str, binary: &[u8], words: &[&str]) {
+    let error = read(json, binary).map(|_| ()).unwrap_err().to_string();
+    for word in words.iter().chain(&["made.glb"]) {
+        assert!(error.contains(word), "should name {word:?}: {error}");
+    }
+}
+
+#[test]
+fn errors_name_the_fault_of_a_document() {
+    let (json, binary) = arm();
+    let swap = |from: &str, to: &str| {
+        assert!(json.contains(from), "{from}");
+        json.replacen(from, to, 1)
+    };
+    refused(&swap(r#"{"translation":[0,1,0]"#, r#"{"translation":[0,1,0],"children":[0]"#), &binary, &["cycle"]);
+    refused(&swap(r#"{"children":[1]"#, r#"{"children":[1,1]"#), &binary, &["node 1", "two parents"]);
+    refused(&swap(r#"{"translation":[0,1,0]"#, r#"{"translation":[0,1e39,0]"#), &binary, &["node 1", "not finite"]);
+    let huge = r#""bufferView":0,"componentType":5126,"count":4294967295"#;
+    refused(&swap(r#""bufferView":0,"componentType":5126,"count":4"#, huge), &binary, &["accessor 0", "4294967295"]);
+    let most = r#""bufferView":0,"componentType":5126,"count":18446744073709551615"#;
+    refused(&swap(r#""bufferView":0,"componentType":5126,"count":4"#, most), &binary, &["accessor 0"]);
+    let no_view = r#""componentType":5126,"count":4"#;
+    refused(&swap(r#""bufferView":0,"componentType":5126,"count":4"#, no_view), &binary, &["accessor 0", "no data"]);
+    refused(&swap(r#""byteOffset":368,"byteLength":12"#, r#""byteOffset":368,"byteLength":13"#), &binary, &["view 7"]);
+    refused(&swap(r#""byteLength":380"#, r#""byteLength":381"#), &binary, &["buffer 0", "381"]);
+    refused(&swap(r#""input":3"#, r#""input":33"#), &binary, &["animation 0", "index 33 of 8"]);
+    refused(&swap(r#""channels":[{"sampler":0"#, r#""channels":[{"sampler":9"#), &binary, &["animation 0", "index 9"]);
+    refused(&swap(r#""joints":[0,1]"#, r#""joints":[0]"#), &binary, &["mesh 0", "joint 1 of 1"]);
+    refused(&swap(r#""joints":[0,1]"#, r#""joints":[0,1,1]"#), &binary, &["skin 0", "2 inverse bind matrices for 3"]);
+    refused(&swap(r#""indices":7"#, r#""indices":7,"mode":5"#), &binary, &["strips"]);
+    refused(&swap(r#""indices":7"#, r#""indices":7,"mode":0"#), &binary, &["no triangles"]);
+    refused(&swap(r#""WEIGHTS_0":1,"#, ""), &binary, &["JOINTS_0", "without weights"]);
+    refused(&swap(r#""type":"VEC3","min""#, r#""type":"VEC2","min""#), &binary, &["POSITION"]);
+    let poke = |at: usize, bytes: &[u8]| {
+        let mut binary = binary.clone();
+        binary[at..at + bytes.len()].copy_from_slice(bytes);
+        binary
+    };
+    refused(&json, &poke(368, &4u16.to_le_bytes()), &["index 4 of 4"]);
+    refused(&json, &poke(112, &f32::NAN.to_le_bytes()), &["skin 0", "not finite"]);
+    refused(&json, &poke(0, &f32::INFINITY.to_le_bytes()), &["POSITION", "not finite"]);
+    refused(&json, &poke(48, &(-1.0f32).to_le_bytes()), &["set 0", "-1"]);
+    refused(&json, &poke(240, &3.0f32.to_le_bytes()), &["animation 0", "times"]);
+}
+
+#[test]
+fn one_small_accessor_used_often_does_not_fill_the_memory() {
+    // 40 000 nodes show one mesh of 32 000 vertices: 1.3 · 10⁹ vertices from 400 kB.
+    let count = 32_000;
+    let binary = vec![0u8; 12 * count];
+    let nodes = vec![r#"{"mesh":0}"#; 40_000].join(",");
+    let json = format!(
+        r#"{{"asset":{{"version":"2.0"}},"nodes":[{nodes}],"meshes":[{{"primitives":[{{"attributes":{{"POSITION":0}}}}]}}],
+"accessors":[{{"bufferView":0,"componentType":5126,"count":{count},"type":"VEC3","min":[0,0,0],"max":[0,0,0]}}],
+"bufferViews":[{{"buffer":0,"byteLength":{n}}}],"buffers":[{{"byteLength":{n}}}]}}"#,
+        n = binary.len()
+    );
+    let json = json.replace("32000,\"type\"", "31998,\"type\"");
+    refused(&json, &binary, &["limit"]);
+}
+
+#[test]
+fn every_truncation_is_an_error() {
+    let (json, binary) = arm();
+    let whole = glb(&json, &binary);
+    for n in 0..whole.len() {
+        assert!(Character::from_bytes("cut", &whole[..n]).is_err(), "{n} of {} bytes", whole.len());
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(1500))]
+
+    #[test]
+    fn damaged_files_give_errors_or_characters_that_pose(
+        edits in prop::collection::vec((any::<prop::sample::Index>(), any::<u8>()), 1..6),
+    ) {
+        let (json, binary) = arm();
+        let mut bytes = glb(&json, &binary);
+        for (at, value) in edits {
+            let at = at.index(bytes.len());
+            bytes[at] = value;
+        }
+        if let Ok(character) = Character::from_bytes("damaged", &bytes) {
+            prop_assert_eq!(character.rest().vertices.len(), character.vertices.len());
+            for animation in 0..character.animations.len() {
+                let _ = character.pose(animation, 1.7);
+            }
+        }
+    }
+}
+
+/// A shared character, at bind and in motion.
+fn shared_character(name: &str) -> Option<Character> {
+    let character = Character::load(&shared(&format!("character/{name}"))?).unwrap();
+    for v in 0..character.vertices.len() {
+        let sum: f32 = character.weights.row(v).map(|(_, w)| w).sum();
+        assert!((sum - 1.0).abs() < 1e-5, "weights of vertex {v} sum to {sum}");
+    }
+    let texture = character.texture.as_ref().unwrap();
+    assert_eq!(texture.mime, "image/png");
+    let size = image::load_from_memory(&texture.bytes).unwrap();
+    assert!(size.width() >= 256);
+    assert_eq!((character.normals.len(), character.uvs.len()), (character.vertices.len(), character.vertices.len()));
+    // Joints where the inverse bind matrices say give back the file's vertices.
+    let identity = vec![Affine3A::IDENTITY; character.num_joints()];
+    let skinned = character.skin(&identity);
+    assert!(skinned.iter().zip(&character.vertices).all(|(a, b)| a.distance(*b) < 1e-5));
+    Some(character)
+}
+
+#[test]
+fn the_makehuman_character_stands_at_bind_and_walks_on_the_floor() {
+    let Some(character) = shared_character("makehuman_walk.glb") else { return };
+    assert_eq!((character.vertices.len(), character.faces.len(), character.num_joints()), (14517, 26756, 31));
+    let rest = character.rest();
+    let off = rest.vertices.iter().zip(&character.vertices).map(|(a, b)| a.distance(*b)).fold(0.0, f32::max);
+    assert!(off < 1e-4, "rest and bind differ by {off} m");
+    let walk = &character.animations[0];
+    assert_eq!(walk.name, "cmu_131_01_walk");
+    assert!((walk.duration - 248.0 / 30.0).abs() < 1e-3, "{}", walk.duration);
+    let (mut lowest, mut highest, mut moved) = (f32::INFINITY, f32::NEG_INFINITY, 0.0f32);
+    for i in 0..100 {
+        let posed = character.pose(0, i as f32 * walk.duration / 99.0);
+        let feet = posed.vertices.iter().map(|v| v.y).fold(f32::INFINITY, f32::min);
+        (lowest, highest) = (lowest.min(feet), highest.max(feet));
+        moved = moved.max(posed.vertices[0].distance(rest.vertices[0]));
+    }
+    println!("lowest vertex between {lowest} and {highest} m, {moved} m walked");
+    assert!(lowest > -0.05 && highest < 0.08, "feet between {lowest} and {highest}");
+    assert!(moved > 0.5, "it does not walk");
+}
+
+#[test]
+fn the_cesium_man_stands_upright_and_moves() {
+    let Some(character) = shared_character("CesiumMan.glb") else { return };
+    assert_eq!((character.vertices.len(), character.num_joints()), (3273, 19));
+    let posed = character.pose(0, 0.5);
+    let y = |f: fn(f32, f32) -> f32, start| posed.vertices.iter().map(|v| v.y).fold(start, f);
+    let (low, high) = (y(f32::min, f32::INFINITY), y(f32::max, f32::NEG_INFINITY));
+    assert!((1.3..1.8).contains(&(high - low)), "height {}", high - low);
+    assert!(low.abs() < 0.05, "feet at {low}");
+    assert!((character.animations[0].duration - 2.0).abs() < 0.01);
+    let later = character.pose(0, 1.0).vertices;
+    let moved = posed.vertices.iter().zip(&later).map(|(a, b)| a.distance(*b));
+    assert!(moved.fold(0.0, f32::max) > 0.1);
+}
+
+#[test]
+fn cut_characters_are_refused() {
+    let Some(path) = shared("character/CesiumMan.glb") else { return };
+    let bytes = std::fs::read(path).unwrap();
+    for part in [0, 3, 11, 12, 19, 500, 5000, 100_000, bytes.len() - 1] {
+        assert!(Character::from_bytes("cut", &bytes[..part]).is_err(), "{part} bytes");
+    }
+}
+
+#[test]
+fn parents_are_the_nearest_ancestor_joints() {
+    let Some(character) = shared_character("makehuman_walk.glb") else { return };
+    let (names, parents) = (&character.joint_names, character.joint_parents());
+    let above = |name: &str| {
+        let joint = names.iter().position(|n| n == name).unwrap();
+        parents[joint].map(|p| names[p].as_str())
+    };
+    assert_eq!(above("Hips"), None);
+    assert_eq!(above("LeftForeArm"), Some("LeftArm"));
+    assert_eq!(above("RightUpLeg"), Some("RHipJoint"));
+    assert_eq!(parents.iter().filter(|p| p.is_none()).count(), 1);
+}
+
+/// A few bytes of text asked for gigabytes.
+#[test]
+fn one_file_named_many_times_is_refused_before_it_fills_the_memory() {
+    let folder = std::path::Path::new(env!("CARGO_TARGET_TMPDIR")).join("named-often");
+    std::fs::create_dir_all(&folder).unwrap();
+    let size = 32 << 20;
+    // Sparse: it takes no room on the disk.
+    std::fs::File::create(folder.join("big.bin")).unwrap().set_len(size).unwrap();
+    let buffers = vec![format!(r#"{{"byteLength":{size},"uri":"big.bin"}}"#); 400].join(",");
+    let path = folder.join("often.gltf");
+    std::fs::write(&path, format!(r#"{{"asset":{{"version":"2.0"}},"buffers":[{buffers}]}}"#)).unwrap();
+    let message = Character::load(&path).unwrap_err().to_string();
+    assert!(message.contains("buffer 16") && message.contains("more than the limit"), "{message}");
+}
+
+#[test]
+fn huge_coordinates_are_refused() {
+    let (json, mut bytes) = arm();
+    bytes[..4].copy_from_slice(&1e30f32.to_le_bytes());
+    let message = Character::from_bytes("arm.glb", &glb(&json, &bytes)).unwrap_err().to_string();
+    assert!(message.contains("POSITION") && message.contains("1000000"), "{message}");
+}

@@ -1,0 +1,147 @@
+//! Motion capture: AMASS's forms, and the shared clips.
+
+use std::io::Write;
+use std::path::{Path, PathBuf};
+
+use glam::{Quat, Vec3};
+use smpl::{BodyModel, MotionClip, Placement};
+use testkit::files::shared;
+
+fn floats(shape: &[usize], values: &[f32]) -> Vec<u8> {
+    let shape: String = shape.iter().map(|n| format!("{n},")).collect();
+    let header = format!("{{'descr': '<f4', 'fortran_order': False, 'shape': ({shape}), }}\n");
+    let mut out = b"\x93NUMPY\x01\0".to_vec();
+    out.extend((header.len() as u16).to_le_bytes());
+    out.extend(header.as_bytes());
+    out.extend(values.iter().flat_map(|v| v.to_le_bytes()));
+    out
+}
+
+fn archive(name: &str, arrays: &[(&str, Vec<u8>)]) -> PathBuf {
+    let mut zip = zip::ZipWriter::new(std::io::Cursor::new(Vec::new()));
+    for (key, bytes) in arrays {
+        zip.start_file(format!("{key}.npy"), zip::write::SimpleFileOptions::default()).unwrap();
+        zip.write_all(bytes).unwrap();
+    }
+    let path = Path::new(env!("CARGO_TARGET_TMPDIR")).join(name);
+    std::fs::write(&path, zip.finish().unwrap().into_inner()).unwrap();
+    path
+}
+
+/// Two frames in which joint j has the rotation (j, 0, 0) / 100, then twice that. Tests run at
+/// once: each has files of its own.
+fn clip(test: &str, joints: usize, rate: &str) -> PathBuf {
+    let mut poses = vec![0.0; 6 * joints];
+    for j in 0..joints {
+        poses[3 * j] = j as f32 / 100.0;
+        poses[3 * (joints + j)] = j as f32 / 50.0;
+    }
+    archive(
+        &format!("clip-{test}-{joints}.npz"),
+        &[
+            ("poses", floats(&[2, 3 * joints], &poses)),
+            ("trans", floats(&[2, 3], &[0.0, 1.0, 0.0, 0.0, 1.0, 4.0])),
+            (rate, floats(&[], &[120.0])),
+            ("dmpls", floats(&[2, 8], &[0.0; 16])),
+        ],
+    )
+}
+
+#[test]
+fn clips_of_every_form_drive_bodies_of_every_form() {
+    let x = |pose: &[Vec3]| pose.iter().map(|r| (100.0 * r.x).round() as i32).collect::<Vec<_>>();
+    let all = |n: i32| (0..n).collect::<Vec<_>>();
+    let on = |rate, clip_joints, body| {
+        let clip = MotionClip::load(&clip("rates", clip_joints, rate)).unwrap();
+        assert_eq!((clip.num_frames(), clip.num_joints, clip.fps), (2, clip_joints, 120.0));
+        x(&clip.at(0.0, body).0)
+    };
+    let body_then = |n: usize| [all(22), vec![0; n - 22]].concat();
+    assert_eq!(on("fps", 24, 24), all(24));
+    assert_eq!(on("mocap_framerate", 52, 52), all(52));
+    assert_eq!(on("mocap_framerate", 52, 24), body_then(24));
+    assert_eq!(on("mocap_frame_rate", 55, 24), body_then(24));
+    assert_eq!(on("fps", 24, 55), body_then(55));
+    assert_eq!(on("fps", 24, 10), all(10));
+    // Fingers keep their place behind jaw and eyes.
+    assert_eq!(on("mocap_framerate", 52, 55), [all(22), vec![0; 3], (22..52).collect()].concat());
+    assert_eq!(on("mocap_frame_rate", 55, 52), [all(22), (25..55).collect()].concat());
+}
+
+#[test]
+fn frames_are_interpolated_and_held_at_the_ends() {
+    let clip = MotionClip::load(&clip("ends", 24, "fps")).unwrap();
+    assert!((clip.duration() - 1.0 / 120.0).abs() < 1e-9);
+    let (pose, placement) = clip.at(0.5 / 120.0, 24);
+    assert!((pose[20].x - 0.3).abs() < 1e-6 && pose[20].y == 0.0);
+    assert_eq!(placement, Placement::Pelvis { translation: Vec3::new(0.0, 1.0, 2.0) });
+    assert_eq!(clip.at(-3.0, 24), clip.at(0.0, 24));
+    assert_eq!(clip.at(f32::NAN, 24), clip.at(0.0, 24));
+    assert_eq!(clip.at(99.0, 24), clip.at(f32::INFINITY, 24));
+    assert_eq!(clip.at(99.0, 24).0[5].x, 0.1);
+}
+
+#[test]
+fn invalid_clips_are_refused() {
+    let good = |key: &str| match key {
+        "poses" => floats(&[2, 72], &[0.0; 144]),
+        "trans" => floats(&[2, 3], &[0.0; 6]),
+        _ => floats(&[], &[30.0]),
+    };
+    let with = |key: &str, bytes: Vec<u8>| {
+        let mut arrays: Vec<_> = ["poses", "trans", "fps"].map(|k| (k, good(k))).into();
+        arrays.retain(|(k, _)| *k != key);
+        if !bytes.is_empty() {
+            arrays.push((key, bytes));
+        }
+        MotionClip::load(&archive("wrong-clip.npz", &arrays)).map(|_| ()).unwrap_err().to_string()
+    };
+    for (key, bytes) in [
+        ("poses", Vec::new()),
+        ("trans", Vec::new()),
+        ("fps", Vec::new()),
+        ("poses", floats(&[2, 71], &[0.0; 142])),
+        ("poses", floats(&[0, 72], &[])),
+        ("poses", floats(&[3, 72], &[0.0; 216])),
+        ("poses", floats(&[2, 72], &[f32::NAN; 144])),
+        ("poses", floats(&[2, 72], &[1e30; 144])),
+        ("trans", floats(&[2, 2], &[0.0; 4])),
+        ("trans", floats(&[2, 3], &[-1e38; 6])),
+        ("fps", floats(&[], &[0.0])),
+        ("fps", floats(&[], &[-30.0])),
+        ("fps", floats(&[], &[1e-40])),
+        ("fps", floats(&[], &[f32::NAN])),
+        ("fps", floats(&[2], &[30.0, 30.0])),
+    ] {
+        // Another number of frames shows first where the translations are held against it.
+        let named = if bytes == floats(&[3, 72], &[0.0; 216]) { "trans" } else { key };
+        let error = with(key, bytes);
+        assert!(error.contains(named) && error.contains("wrong-clip.npz"), "{key}: {error}");
+    }
+}
+
+#[test]
+fn the_shared_clips_keep_the_shared_body_on_the_floor() {
+    let (Some(path), Some(turn)) = (shared("body/open_body.npz"), shared("mocap/turn.npz")) else { return };
+    let body = BodyModel::load(&path).unwrap();
+    let shaped = body.shaped(&[]);
+    let lowest = |clip: &MotionClip, seconds: f32| {
+        let (pose, placement) = clip.at(seconds, body.num_joints());
+        body.pose(&shaped, &pose, placement).vertices.iter().map(|v| v.y).fold(f32::INFINITY, f32::min)
+    };
+    let walk = MotionClip::load(&shared("mocap/walk.npz").unwrap()).unwrap();
+    assert_eq!((walk.num_frames(), walk.num_joints, walk.fps), (249, 24, 30.0));
+    for i in 0..60 {
+        let y = lowest(&walk, walk.duration() * i as f32 / 59.0);
+        assert!((-0.05..0.08).contains(&y), "lowest vertex at {y} m");
+    }
+    // Between two frames the root is between theirs.
+    let turn = MotionClip::load(&turn).unwrap();
+    assert_eq!(turn.num_frames(), 312);
+    for frame in (0..300).step_by(13) {
+        let root = |f: f32| Quat::from_scaled_axis(turn.at((frame as f32 + f) / 30.0, 24).0[0]);
+        let (a, b, half) = (root(0.0), root(1.0), root(0.5));
+        let (whole, part) = (a.angle_between(b), a.angle_between(half));
+        assert!((part - 0.5 * whole).abs() < 2e-3, "{frame}: {part} of {whole}");
+    }
+}

@@ -1,0 +1,12 @@
+//! The crate against oracles, files and golden values.
+#![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
+
+mod bodies;
+mod body;
+mod character;
+mod clip;
+mod embedded;
+mod golden;
+mod mesh;
+mod pose_gradient;
+mod volume;

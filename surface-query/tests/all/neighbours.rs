@@ -1,0 +1,266 @@
+//! Neighbour lists against brute force, bit for bit.
+
+use glam::Vec3;
+use proptest::prelude::*;
+use surface_query::{Error, Pyramid, SurfaceQuery, SurfaceQueryConfig, vertex_normals};
+use testkit::body::Random;
+use testkit::{mesh, strategy};
+
+/// Sorts everything by the distance and tie rule the documentation states.
+fn brute_force(points: &[Vec3], level: &[u32], q: Vec3, k: usize) -> Vec<u32> {
+    let mut all: Vec<(f32, u32)> = (level.iter())
+        .map(|&i| {
+            let d = q - points[i as usize];
+            let squared = d.x * d.x + d.y * d.y + d.z * d.z;
+            (if q.is_finite() { squared } else { f32::INFINITY }, i)
+        })
+        .collect();
+    all.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+    let found = k.min(all.len());
+    (0..k).map(|j| all[j % found].1).collect()
+}
+
+fn check(query: &SurfaceQuery, points: &[Vec3], k: usize, q: Vec3) -> Result<(), TestCaseError> {
+    let mut found = vec![0; query.neighbours_per_query()];
+    query.neighbours(q, &mut found);
+    for (l, level) in query.pyramid().levels.iter().enumerate() {
+        let expected = brute_force(points, level, q, k);
+        prop_assert_eq!(&found[l * k..][..k], &expected[..], "level {} of {}", l, q);
+    }
+    Ok(())
+}
+
+fn config(k: usize, cell: f32, margin: f32) -> SurfaceQueryConfig {
+    SurfaceQueryConfig { k, cell, margin, ..Default::default() }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(48))]
+
+    #[test]
+    fn neighbours_equal_brute_force_in_and_outside_the_grid(
+        points in strategy::cloud(1..400, 1.0),
+        queries in strategy::cloud(60..61, 1.6),
+        k in 1usize..9,
+        cell in prop::sample::select(vec![0.0f32, 0.05, 0.2, 0.7, 5.0]),
+    ) {
+        let query = SurfaceQuery::new(&points, &[], &config(k, cell, 0.3)).unwrap();
+        for q in queries.into_iter().chain(points.iter().copied()) {
+            check(&query, &points, k, q)?;
+        }
+    }
+
+    #[test]
+    fn neighbours_on_a_lattice_break_every_tie_by_index(
+        shuffle in Just((0..343u32).collect::<Vec<_>>()).prop_shuffle(),
+        at in prop::array::uniform3(0u8..29),
+        k in 1usize..12,
+        cell in prop::sample::select(vec![0.0f32, 0.25, 0.4, 1.0]),
+    ) {
+        // Quarter steps: corners, edge, face and cell centres of the lattice, all distances exact.
+        let points: Vec<Vec3> = (shuffle.iter())
+            .map(|&i| Vec3::new((i % 7) as f32, (i / 7 % 7) as f32, (i / 49) as f32))
+            .collect();
+        let query = SurfaceQuery::new(&points, &[], &config(k, cell, 1.0)).unwrap();
+        check(&query, &points, k, Vec3::from(at.map(f32::from)) * 0.25)?;
+        check(&query, &points, k, Vec3::from(at.map(f32::from)) * 0.5 - 3.0)?;
+    }
+
+    #[test]
+    fn neighbours_far_away_where_distances_round_to_ties_equal_brute_force(
+        points in strategy::cloud(10..200, 1.0),
+        direction in strategy::unit_vec3(),
+        exponent in 0i32..38,
+    ) {
+        let query = SurfaceQuery::new(&points, &[], &config(5, 0.2, 0.2)).unwrap();
+        check(&query, &points, 5, direction * 10f32.powi(exponent))?;
+    }
+}
+
+#[test]
+fn neighbours_of_degenerate_clouds_equal_brute_force_or_are_refused() {
+    for (name, points) in strategy::degenerate_clouds() {
+        for settings in [SurfaceQueryConfig::default(), config(3, 0.1, 0.2)] {
+            let query = match SurfaceQuery::new(&points, &[], &settings) {
+                Ok(query) => query,
+                Err(Error::NoVertices) => {
+                    assert_eq!(name, "empty");
+                    continue;
+                }
+                Err(Error::NotFinite { vertex }) => {
+                    assert!(!points[vertex].is_finite(), "{name}");
+                    continue;
+                }
+                Err(Error::GridTooLarge { .. }) => {
+                    assert!(name == "huge" && settings.cell > 0.0, "{name}");
+                    continue;
+                }
+                Err(error) => panic!("{name}: {error}"),
+            };
+            let mut random = Random(1);
+            let scale = points.iter().fold(0.0, |m: f32, p| m.max(p.abs().max_element()));
+            let mut queries: Vec<Vec3> = (0..50).map(|_| random.vec3(scale * 1.5)).collect();
+            queries.extend(&points);
+            queries.extend([Vec3::NAN, Vec3::INFINITY, Vec3::MAX, Vec3::MIN, Vec3::ZERO]);
+            queries.push(Vec3::new(0.0, f32::NEG_INFINITY, f32::NAN));
+            for q in queries {
+                check(&query, &points, settings.k, q).unwrap_or_else(|e| panic!("{name}: {e}"));
+            }
+        }
+    }
+}
+
+#[test]
+fn neighbours_on_cell_faces_of_a_grid_far_from_the_origin_equal_brute_force() {
+    // At 4096 the cell is a few hundred ulp: the rounding of the cell lookup matters here.
+    let mut random = Random(7);
+    let points: Vec<Vec3> = (0..600).map(|_| random.vec3(0.5) + 4096.0).collect();
+    let query = SurfaceQuery::new(&points, &[], &config(5, 0.1, 0.2)).unwrap();
+    let corner = points.iter().fold(Vec3::MAX, |m, p| m.min(*p)) - 0.3;
+    for i in 0..3000 {
+        let cells = Vec3::new((i % 15) as f32, (i / 15 % 15) as f32, (i / 225) as f32);
+        let on_face = corner + cells * 0.1;
+        check(&query, &points, 5, on_face).unwrap();
+    }
+}
+
+#[test]
+fn a_grid_answers_every_query_within_the_margin_like_the_trees_do() {
+    let Some(body) = testkit::body::open_body() else {
+        return;
+    };
+    let grid = SurfaceQuery::new(&body.vertices, &body.faces, &config(5, 0.02, 0.12)).unwrap();
+    let trees = SurfaceQuery::new(&body.vertices, &body.faces, &SurfaceQueryConfig::default()).unwrap();
+    let (mut a, mut b) = ([0; 20], [0; 20]);
+    let mut random = Random(3);
+    let mut queries = random.near_surface(&body, 20_000, 0.2);
+    queries.extend((0..5000).map(|_| random.vec3(1.5)));
+    for (i, q) in queries.into_iter().enumerate() {
+        grid.neighbours(q, &mut a);
+        trees.neighbours(q, &mut b);
+        assert_eq!(a, b, "{q}");
+        if i % 100 == 0 {
+            check(&grid, &body.vertices, 5, q).unwrap();
+        }
+    }
+}
+
+#[test]
+fn more_than_65536_vertices_are_searched_too() {
+    let mut random = Random(5);
+    let points: Vec<Vec3> = (0..70_000).map(|_| random.vec3(1.0)).collect();
+    let query = SurfaceQuery::new(&points, &[], &config(5, 0.1, 0.05)).unwrap();
+    for _ in 0..50 {
+        check(&query, &points, 5, random.vec3(1.0)).unwrap();
+    }
+}
+
+#[test]
+fn long_lists_equal_brute_force() {
+    let mut random = Random(6);
+    let mut points: Vec<Vec3> = (0..200).map(|_| random.vec3(1.0)).collect();
+    points.extend_from_within(50..150);
+    for k in [64, 65, 150, 300] {
+        for cell in [0.0, 0.5] {
+            let query =
+                SurfaceQuery::new(&points, &[], &SurfaceQueryConfig { coarse_levels: 0, ..config(k, cell, 0.3) });
+            let query = query.unwrap();
+            for _ in 0..20 {
+                check(&query, &points, k, random.vec3(1.5)).unwrap();
+            }
+        }
+    }
+}
+
+#[test]
+fn a_level_of_fewer_than_k_points_repeats_its_list() {
+    let points = [Vec3::ZERO, Vec3::X, Vec3::X * 3.0];
+    for cell in [0.0, 0.5] {
+        let query = SurfaceQuery::new(&points, &[], &config(5, cell, 1.0)).unwrap();
+        let mut out = [9; 20];
+        query.neighbours(Vec3::X * 0.9, &mut out);
+        assert_eq!(out[..5], [1, 0, 2, 1, 0]);
+        assert_eq!(out[5..], [0; 15], "coarse levels hold vertex 0 alone");
+    }
+}
+
+#[test]
+fn neighbour_sets_overlap_less_with_distance_and_more_with_scales() {
+    let ball = mesh::icosphere(4);
+    let overlap = |coarse_levels: usize, step: f32| {
+        let settings = SurfaceQueryConfig { coarse_levels, ..SurfaceQueryConfig::default() };
+        let query = SurfaceQuery::new(&ball.vertices, &ball.faces, &settings).unwrap();
+        let n = query.neighbours_per_query();
+        let mut random = Random(11);
+        let mut shared = 0;
+        for _ in 0..300 {
+            let p = random.vec3(1.0).normalize_or(Vec3::X);
+            let aside = p.cross(random.vec3(1.0)).normalize_or(Vec3::X);
+            let (mut a, mut b) = (vec![0; n], vec![0; n]);
+            query.neighbours(p, &mut a);
+            query.neighbours(p + aside * step, &mut b);
+            // Within a level, a vertex stands once.
+            shared +=
+                a.chunks(5).zip(b.chunks(5)).map(|(a, b)| a.iter().filter(|i| b.contains(i)).count()).sum::<usize>();
+        }
+        shared as f32 / (300 * n) as f32
+    };
+    let steps = [0.0, 0.01, 0.03, 0.1, 0.3];
+    let fine = steps.map(|s| overlap(0, s));
+    let scaled = steps.map(|s| overlap(3, s));
+    assert_eq!((fine[0], scaled[0]), (1.0, 1.0));
+    for i in 1..steps.len() {
+        assert!(fine[i] < fine[i - 1] && scaled[i] < scaled[i - 1], "{fine:?} {scaled:?}");
+        assert!(scaled[i] > fine[i], "{fine:?} {scaled:?}");
+    }
+    // At a third of the way to the next but one vertex most of the coarse neighbours are still the
+    // same.
+    assert!(scaled[3] > 1.5 * fine[3], "{fine:?} {scaled:?}");
+}
+
+#[test]
+fn bad_meshes_and_settings_are_errors() {
+    let ball = mesh::icosphere(1);
+    let build = |settings| SurfaceQuery::new(&ball.vertices, &ball.faces, &settings).map(|_| ());
+    for (name, settings) in [
+        ("k", SurfaceQueryConfig { k: 0, ..Default::default() }),
+        ("k", SurfaceQueryConfig { k: 65_537, ..Default::default() }),
+        ("ratio", SurfaceQueryConfig { ratio: 0.0, ..Default::default() }),
+        ("ratio", SurfaceQueryConfig { ratio: f32::NAN, ..Default::default() }),
+        ("cell", SurfaceQueryConfig { cell: -1.0, ..Default::default() }),
+        ("margin", SurfaceQueryConfig { margin: f32::INFINITY, ..Default::default() }),
+        ("coarse_levels", SurfaceQueryConfig { coarse_levels: 33, ..Default::default() }),
+    ] {
+        match build(settings) {
+            Err(Error::Config { name: found, .. }) => assert_eq!(found, name),
+            other => panic!("{name}: {other:?}"),
+        }
+    }
+    assert!(matches!(build(config(5, 1e-6, 1.0)), Err(Error::GridTooLarge { .. })));
+    let far = SurfaceQuery::new(&[Vec3::ZERO, Vec3::X * 1.1e18], &[], &SurfaceQueryConfig::default());
+    assert_eq!(far.unwrap_err(), Error::OutOfRange { vertex: 1 });
+    let outside = SurfaceQuery::new(&ball.vertices, &[[0, 1, 42]], &SurfaceQueryConfig::default());
+    assert_eq!(outside.map(|_| ()), Err(Error::FaceIndex { face: 0, vertex: 42, vertices: 42 }));
+}
+
+#[test]
+fn vertex_normals_weigh_faces_by_angle() {
+    // All faces at a cube's corner span 90° together, however they are triangulated.
+    let cube = mesh::cuboid(Vec3::ONE);
+    for (v, n) in cube.vertices.iter().zip(vertex_normals(&cube.vertices, &cube.faces)) {
+        assert!(n.distance(v.normalize_or_zero()) < 1e-6, "{v}: {n}");
+    }
+    let lonely = vertex_normals(&[Vec3::ZERO, Vec3::X, Vec3::X * 2.0], &[[0, 1, 2], [0, 0, 0]]);
+    assert_eq!(lonely, [Vec3::Y; 3]);
+}
+
+#[test]
+fn levels_of_a_body_have_the_sizes_of_the_paper() {
+    let sizes = |n: usize| {
+        let points: Vec<Vec3> = (0..n).map(|i| Vec3::X * i as f32).collect();
+        Pyramid::new(&points, 0.25, 3).levels.iter().map(Vec::len).collect::<Vec<_>>()
+    };
+    assert_eq!(sizes(6890), [6890, 1722, 430, 107]);
+    assert_eq!(sizes(3), [3, 1, 1, 1]);
+    assert_eq!(sizes(0), [0, 0, 0, 0]);
+}

@@ -1,0 +1,139 @@
+//! A small demo capture, settings that train it in milliseconds a step, and places for files.
+
+use std::path::{Path, PathBuf};
+use std::sync::OnceLock;
+
+use glam::Vec3;
+use occnerf::capture::Capture;
+use occnerf::{Config, Method, MotionKind, PreparedFrame, Preset, Scene, StepReport, Trainer};
+use smpl::{BodyModel, Placement};
+use synth::{DemoConfig, demo};
+use visibility::RayMesh;
+
+pub const METHODS: [Method; 2] = [Method::Occnerf, Method::HashPoint];
+
+pub fn body() -> &'static BodyModel {
+    static BODY: OnceLock<BodyModel> = OnceLock::new();
+    BODY.get_or_init(BodyModel::embedded)
+}
+
+pub fn demo_config() -> DemoConfig {
+    DemoConfig { size: 48, frames: 6, eval_cameras: 2, eval_every: 3, ..DemoConfig::default() }
+}
+
+pub fn capture() -> &'static Capture {
+    static CAPTURE: OnceLock<Capture> = OnceLock::new();
+    CAPTURE.get_or_init(|| demo(&demo_config(), body()).unwrap())
+}
+
+/// Labels and queries do not depend on the method, so one scene serves all of them.
+pub fn scene() -> &'static Scene {
+    static SCENE: OnceLock<Scene> = OnceLock::new();
+    SCENE.get_or_init(|| Scene::new(capture(), body(), &tiny(Method::Occnerf, MotionKind::Surface)).unwrap())
+}
+
+/// The fast preset with small patches and a small field.
+pub fn tiny(method: Method, motion: MotionKind) -> Config {
+    let mut config = Config::preset(Preset::Fast, method);
+    config.steps = 8;
+    (config.patches, config.patch_size, config.samples) = (3, 16, 24);
+    (config.field.width, config.field.depth) = (32, 2);
+    (config.encoding.levels, config.encoding.log2_table_size, config.encoding.n_max) = (6, 12, 96);
+    // With all parts of the paper's surface term.
+    (config.surface.coarse_levels, config.surface.attention) = (3, true);
+    config.surface.surface_term = method == Method::Occnerf;
+    config.motion.kind = motion;
+    config.motion.shell_interval = 2;
+    if motion != MotionKind::Surface {
+        config.motion.shell_interval = 0;
+        config.field.prior_colors = false;
+    }
+    config
+}
+
+/// Trains from the start for `steps` and returns the reports and the checkpoint.
+pub fn train(scene: &Scene, config: &Config, steps: u64) -> (Vec<StepReport>, Vec<u8>) {
+    let mut trainer = Trainer::new(scene, config.clone()).unwrap();
+    let reports = (0..steps).map(|_| trainer.step().unwrap()).collect();
+    (reports, checkpoint(&trainer))
+}
+
+/// The bytes that a trainer saves.
+pub fn checkpoint(trainer: &Trainer<'_>) -> Vec<u8> {
+    let dir = TempDir::new("checkpoint");
+    let path = dir.path().join("checkpoint.safetensors");
+    trainer.save(&path).unwrap();
+    std::fs::read(path).unwrap()
+}
+
+/// Bits of every loss, so that NaN and −0 are told apart too.
+pub fn bits(reports: &[StepReport]) -> Vec<[u64; 4]> {
+    reports.iter().map(|r| [r.loss, r.mse, r.perceptual, r.completeness].map(f64::to_bits)).collect()
+}
+
+/// Runs `work` on a pool of its own.
+pub fn on_threads<T: Send>(threads: usize, work: impl FnOnce() -> T + Send) -> T {
+    rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap().install(work)
+}
+
+/// Pixels whose centre's ray hits the posed prior.
+pub fn silhouette(scene: &Scene, frame: &PreparedFrame) -> Vec<bool> {
+    let mesh = RayMesh::new(&frame.view.posed.vertices, &scene.body.model.faces).unwrap();
+    let camera = &frame.view.camera;
+    let pixels = (0..camera.height).flat_map(|row| (0..camera.width).map(move |column| (row, column)));
+    let rays = pixels.map(|(row, column)| camera.ray(column as f32 + 0.5, row as f32 + 0.5));
+    rays.map(|ray| mesh.first_hit(ray.origin, ray.direction).is_some()).collect()
+}
+
+/// In mid-stride: a leg forward with a bent knee, arms down and swinging, elbows bent.
+pub fn walking() -> Vec<Vec3> {
+    let mut pose = vec![Vec3::ZERO; body().num_joints()];
+    for (joint, rotation) in [
+        (1, [-0.5, 0.0, 0.0]),
+        (2, [0.35, 0.0, 0.0]),
+        (4, [0.35, 0.0, 0.0]),
+        (5, [0.7, 0.0, 0.0]),
+        (16, [0.3, 0.0, -1.25]),
+        (17, [-0.4, 0.0, 1.25]),
+        (18, [0.0, -0.4, 0.0]),
+        (19, [0.0, 0.6, 0.0]),
+    ] {
+        pose[joint] = Vec3::from(rotation);
+    }
+    pose
+}
+
+/// Turned and moved, so that nothing can hide in a pose at the origin.
+pub fn placement() -> Placement {
+    Placement::Origin { rotation: Vec3::new(0.1, 0.7, -0.05), translation: Vec3::new(0.3, -0.2, 0.5) }
+}
+
+/// The value below which a share of `values` lies.
+pub fn quantile(values: &mut [f32], share: f32) -> f32 {
+    values.sort_by(f32::total_cmp);
+    values[((values.len() - 1) as f32 * share) as usize]
+}
+
+/// A directory that is removed when dropped.
+pub struct TempDir(PathBuf);
+
+impl TempDir {
+    pub fn new(name: &str) -> Self {
+        static COUNT: std::sync::atomic::AtomicUsize = std::sync::atomic::AtomicUsize::new(0);
+        let count = COUNT.fetch_add(1, std::sync::atomic::Ordering::Relaxed);
+        let name = format!("{name}-{}-{count}", std::process::id());
+        let path = Path::new(env!("CARGO_TARGET_TMPDIR")).join(name);
+        std::fs::create_dir_all(&path).unwrap();
+        Self(path)
+    }
+
+    pub fn path(&self) -> &Path {
+        &self.0
+    }
+}
+
+impl Drop for TempDir {
+    fn drop(&mut self) {
+        let _ = std::fs::remove_dir_all(&self.0);
+    }
+}

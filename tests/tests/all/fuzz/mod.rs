@@ -1,0 +1,321 @@
+//! Every reader of somebody else's files, on damaged ones: no panic, no hang, and no more memory
+//! than is said.
+//!
+//! 20 000 inputs by default; `FUZZ=1000000 cargo test -p testkit fuzz:: -- --nocapture`
+//! for a million and a table. Input number n of a reader is the same on every machine;
+//! one that fails is left in `target/tmp`.
+
+mod mutate;
+mod people;
+mod seeds;
+
+use std::hint::black_box;
+use std::io::Cursor;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::path::PathBuf;
+use std::sync::LazyLock;
+use std::time::{Duration, Instant};
+
+use array_files::npz::{Npz, read_npy};
+use array_files::pickle;
+use array_files::torch::TorchFile;
+use mutate::{Form, Random, damaged};
+use occnerf::bake::Avatar;
+use occnerf::capture::{Image, ImportOptions, LoadOptions, import, load_capture};
+use occnerf::{Config, Lpips, Person, Trainer, checkpoint_config};
+use smpl::{BodyModel, Character, MotionClip, load_mesh};
+
+/// Longest that a reader may take.
+const LONGEST: Duration = Duration::from_secs(1);
+const MIB: u64 = 1 << 20;
+
+/// A reader under attack.
+struct Attack {
+    name: &'static str,
+    form: Form,
+    seeds: Vec<Vec<u8>>,
+    /// Part of all inputs, in thousandths.
+    share: u64,
+    /// Most memory, in bytes, that any of these inputs (at most 1 MiB each) may take.
+    most: u64,
+}
+
+impl Attack {
+    /// Reads damaged files; `read` says whether one was accepted.
+    fn run(self, mut read: impl FnMut(&[u8]) -> bool) {
+        let total: u64 = std::env::var("FUZZ").map_or(20_000, |n| n.parse().expect("FUZZ is a number"));
+        let inputs = (total * self.share).div_ceil(1000);
+        assert!(self.seeds.iter().all(|seed| read(seed)), "{}: a seed is refused", self.name);
+        let (mut accepted, mut slowest, mut largest) = (0u64, Duration::ZERO, 0);
+        let begun = Instant::now();
+        for number in 0..inputs {
+            let mut random = Random(number.wrapping_mul(0x2545_f491_4f6c_dd1d) ^ self.name.len() as u64);
+            let bytes = damaged(&mut random, self.form, &self.seeds);
+            let mut outcome = Ok(false);
+            let (mut seconds, mut memory) = (Duration::MAX, 0);
+            // What other processes kept waiting all the same is tried again.
+            for _ in 0..3 {
+                let start = busy();
+                memory = allocation_counter::measure(|| {
+                    outcome = catch_unwind(AssertUnwindSafe(|| read(&bytes)));
+                })
+                .bytes_max;
+                seconds = seconds.min(busy().saturating_sub(start));
+                if seconds < LONGEST {
+                    break;
+                }
+            }
+            if outcome.is_err() || seconds >= LONGEST || memory > self.most {
+                let path = PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join(format!("fuzz-{}-{number}", self.name));
+                std::fs::write(&path, &bytes).unwrap();
+                let panicked = if outcome.is_err() { "panicked" } else { "no panic" };
+                panic!("{}: {panicked}, {seconds:?}, {} MiB: {}", self.name, memory / MIB, path.display());
+            }
+            accepted += u64::from(outcome.unwrap_or(false));
+            (slowest, largest) = (slowest.max(seconds), largest.max(memory));
+        }
+        println!(
+            "| {} | {inputs} | {accepted} | {} ms | {:.1} MiB | {:.0} s |",
+            self.name,
+            slowest.as_millis(),
+            largest as f64 / MIB as f64,
+            begun.elapsed().as_secs_f64()
+        );
+        // A fuzzer that gets nothing in tests the first line of a reader.
+        assert!(inputs < 100 || accepted > 0, "{}: nothing was accepted", self.name);
+    }
+}
+
+/// Time that this thread has had a core, as far as the system tells; else time.
+fn busy() -> Duration {
+    static START: LazyLock<Instant> = LazyLock::new(Instant::now);
+    let found = std::fs::read_to_string("/proc/thread-self/schedstat").ok();
+    let nanoseconds = found.and_then(|text| text.split(' ').next()?.parse().ok());
+    nanoseconds.map_or_else(|| START.elapsed(), Duration::from_nanos)
+}
+
+/// Where the damaged file of a reader of paths is put.
+fn place(name: &str) -> PathBuf {
+    let shared = PathBuf::from("/dev/shm");
+    let folder = if shared.is_dir() { shared } else { std::env::temp_dir() };
+    let folder = folder.join(format!("fuzz-{}", std::process::id()));
+    std::fs::create_dir_all(&folder).unwrap();
+    folder.join(name)
+}
+
+#[test]
+fn pickles() {
+    Attack { name: "pickle", form: Form::Plain, seeds: seeds::pickles(), share: 80, most: 64 * MIB }
+        .run(|bytes| pickle::parse("a.pkl", bytes).is_ok());
+}
+
+#[test]
+fn joblib_files() {
+    Attack { name: "joblib", form: Form::Plain, seeds: seeds::joblibs(), share: 80, most: 64 * MIB }
+        .run(|bytes| pickle::from_bytes("a.pkl", bytes.to_vec()).is_ok());
+}
+
+#[test]
+fn archives_of_arrays() {
+    Attack { name: "npz", form: Form::Zip, seeds: seeds::archives(), share: 106, most: 64 * MIB }.run(|bytes| {
+        let Ok(mut npz) = Npz::from_bytes("a.npz", bytes.to_vec()) else { return false };
+        let keys: Vec<String> = npz.keys().iter().take(50).cloned().collect();
+        // The seed of numpy's has an array of a type that is refused.
+        keys.iter().filter(|key| npz.array(key).is_ok()).count() > 1
+    });
+}
+
+#[test]
+fn single_arrays() {
+    let path = place("a.npy");
+    Attack { name: "npy", form: Form::Plain, seeds: seeds::arrays(), share: 80, most: 64 * MIB }.run(|bytes| {
+        std::fs::write(&path, bytes).unwrap();
+        read_npy(&path).is_ok()
+    });
+}
+
+#[test]
+fn bodies() {
+    let path = place("body.npz");
+    let read = |bytes: &[u8]| {
+        std::fs::write(&path, bytes).unwrap();
+        let Ok(body) = BodyModel::load(&path) else { return false };
+        let pose = vec![glam::Vec3::splat(0.1); body.num_joints()];
+        black_box(body.pose(&body.shaped(&[]), &pose, smpl::Placement::default()));
+        true
+    };
+    Attack { name: "body npz", form: Form::Zip, seeds: seeds::body_archives(), share: 60, most: 64 * MIB }.run(read);
+    Attack {
+        name: "body safetensors",
+        form: Form::Safetensors,
+        seeds: seeds::saved_bodies(),
+        share: 60,
+        most: 64 * MIB,
+    }
+    .run(read);
+}
+
+#[test]
+fn clips() {
+    let path = place("clip.npz");
+    Attack { name: "motion clip", form: Form::Zip, seeds: seeds::clips(), share: 50, most: 64 * MIB }.run(|bytes| {
+        std::fs::write(&path, bytes).unwrap();
+        let Ok(clip) = MotionClip::load(&path) else { return false };
+        black_box(clip.at(clip.duration() * 0.4, 24));
+        true
+    });
+}
+
+#[test]
+fn characters() {
+    Attack { name: "glTF", form: Form::Glb, seeds: seeds::characters(), share: 100, most: 64 * MIB }.run(|bytes| {
+        let Ok(character) = Character::from_bytes("a.glb", bytes) else { return false };
+        black_box(character.rest());
+        for animation in 0..character.animations.len().min(4) {
+            black_box(character.pose(animation, 0.3));
+        }
+        black_box(character.joint_parents());
+        true
+    });
+}
+
+#[test]
+fn meshes() {
+    let path = place("a.obj");
+    Attack { name: "OBJ", form: Form::Plain, seeds: seeds::meshes(), share: 70, most: 128 * MIB }.run(|bytes| {
+        std::fs::write(&path, bytes).unwrap();
+        load_mesh(&path).is_ok()
+    });
+}
+
+#[test]
+fn pictures() {
+    let path = place("a.png");
+    let read = |bytes: &[u8]| {
+        std::fs::write(&path, bytes).unwrap();
+        Image::load(&path).is_ok()
+    };
+    // 8192 pixels a side is the bound: 16 bytes a pixel of a header that lies, 18 with what is
+    // read.
+    let most = 8192 * 8192 * 18;
+    Attack { name: "PNG", form: Form::Png, seeds: seeds::pngs(), share: 60, most }.run(read);
+    Attack { name: "JPEG", form: Form::Plain, seeds: seeds::jpegs(), share: 30, most }.run(read);
+}
+
+#[test]
+fn metadata_of_captures() {
+    let (dir, body, seed) = seeds::wild_capture(&place("wild"));
+    Attack { name: "metadata.json", form: Form::Plain, seeds: vec![seed], share: 30, most: 64 * MIB }.run(|bytes| {
+        std::fs::write(dir.join("metadata.json"), bytes).unwrap();
+        load_capture(&dir, &body, &LoadOptions::default()).is_ok()
+    });
+}
+
+#[test]
+fn configurations() {
+    Attack { name: "TOML", form: Form::Plain, seeds: seeds::configurations(), share: 30, most: 64 * MIB }.run(
+        |bytes| {
+            let Ok(text) = std::str::from_utf8(bytes) else { return false };
+            toml::from_str::<Config>(text).is_ok_and(|config| config.validate().is_ok())
+        },
+    );
+}
+
+/// Sizes are those of the configuration in the file, which is bounded by itself: only the sizes of
+/// the seed are opened.
+#[test]
+fn checkpoints() {
+    let path = place("checkpoint.safetensors");
+    let (scene, seed, config) = seeds::checkpoint();
+    let attack = Attack { name: "checkpoint", form: Form::Safetensors, seeds: vec![seed], share: 4, most: 64 * MIB };
+    attack.run(|bytes| {
+        std::fs::write(&path, bytes).unwrap();
+        match checkpoint_config(&path) {
+            Ok(found) if found == config => Trainer::resume(scene, &path).is_ok(),
+            other => other.is_ok(),
+        }
+    });
+}
+
+#[test]
+fn weights_of_networks() {
+    let path = place("weights.pth");
+    // The network that is wanted is not there: everything up to the names of the tensors is read.
+    let attack = Attack { name: "torch", form: Form::Zip, seeds: seeds::weights(), share: 10, most: 64 * MIB };
+    attack.run(|bytes| {
+        std::fs::write(&path, bytes).unwrap();
+        let refused = Lpips::load(&path).err().map(|error| error.to_string()).unwrap_or_default();
+        refused.contains("trunk") || refused.contains("expected floats") || refused.contains("lacks")
+    });
+}
+
+#[test]
+fn tensors() {
+    let read = |bytes: &[u8]| {
+        let Ok(mut file) = TorchFile::open("a.pt", Cursor::new(bytes)) else { return false };
+        let root = file.root().clone();
+        let keys = ["a", "b"];
+        let found = keys.iter().filter_map(|key| file.tensor(key, root.get(key)?).ok()?).collect::<Vec<_>>();
+        found.iter().filter(|tensor| file.read("a", tensor).is_ok()).count() > 0
+    };
+    let [zip, legacy] = people::tensors().try_into().unwrap();
+    // 16 times the file and 64 MiB, twice while a vector grows.
+    let most = 256 * MIB;
+    Attack { name: "tensors", form: Form::Zip, seeds: vec![zip], share: 20, most }.run(read);
+    Attack { name: "tensors, old form", form: Form::Plain, seeds: vec![legacy], share: 20, most }.run(read);
+}
+
+/// Up to the body model, which is not there: nothing is written.
+fn imports(fit: &std::path::Path, video: &std::path::Path) -> bool {
+    let options = ImportOptions { frames: video.to_owned(), fit: fit.to_owned(), ..ImportOptions::default() };
+    let refused = import(&options, &place("imported")).err().map(|error| error.to_string());
+    refused.is_none_or(|error| error.contains("missing body model"))
+}
+
+#[test]
+fn fits_of_estimators() {
+    let (video, path) = (people::video(), place("phalp.pkl"));
+    let attack =
+        Attack { name: "PHALP, COCO runs", form: Form::Plain, seeds: people::phalp(), share: 40, most: 128 * MIB };
+    attack.run(|bytes| {
+        std::fs::write(&path, bytes).unwrap();
+        imports(&path, &video)
+    });
+    let dir = place("easymocap");
+    std::fs::create_dir_all(dir.join("smpl")).unwrap();
+    let [frame, cameras] = people::easymocap();
+    let write = |name: &str, bytes: &[u8]| std::fs::write(dir.join(name), bytes).unwrap();
+    ["intri.yml", "extri.yml"].iter().for_each(|name| write(name, &cameras));
+    let attack = |name, seed| Attack { name, form: Form::Plain, seeds: vec![seed], share: 10, most: 64 * MIB };
+    attack("EasyMocap JSON", frame.clone()).run(|bytes| {
+        write("smpl/000000.json", bytes);
+        imports(&dir, &video)
+    });
+    write("smpl/000000.json", &frame);
+    attack("EasyMocap YAML", cameras).run(|bytes| {
+        ["intri.yml", "extri.yml"].iter().for_each(|name| write(name, bytes));
+        imports(&dir, &video)
+    });
+}
+
+#[test]
+fn people_of_runs() {
+    let run = place("run");
+    let (config, seed) = people::person(&run);
+    let attack = Attack { name: "person", form: Form::Safetensors, seeds: vec![seed], share: 20, most: 64 * MIB };
+    attack.run(|bytes| {
+        std::fs::write(run.join("person.safetensors"), bytes).unwrap();
+        Person::load(&run, &config).is_ok()
+    });
+    let path = place("avatar.safetensors");
+    Attack { name: "avatar", form: Form::Safetensors, seeds: people::avatars(), share: 30, most: 64 * MIB }.run(
+        |bytes| {
+            std::fs::write(&path, bytes).unwrap();
+            let Ok(avatar) = Avatar::load(&path) else { return false };
+            if !avatar.clips.is_empty() {
+                black_box(avatar.skin(&avatar.bones_at(0, 0.02)));
+            }
+            true
+        },
+    );
+}

@@ -1,0 +1,174 @@
+//! Small files of what is known of people: estimators' fits, tensors, and what a run keeps.
+
+use std::io::{Cursor, Write};
+use std::path::Path;
+
+use glam::{Affine3A, Mat3, Vec2, Vec3};
+use occnerf::bake::{Atlas, Avatar, Clip, Joint};
+use occnerf::capture::{Light, LoadOptions, load_capture};
+use occnerf::{Config, Method, Person, Preset, PriorColors};
+use smpl::{MotionClip, SparseRows};
+use volrender::Camera;
+use zip::write::SimpleFileOptions;
+use zip::{CompressionMethod, ZipWriter};
+
+use super::{place, seeds};
+
+fn text(text: &str) -> Vec<u8> {
+    let mut out = vec![b'X'];
+    out.extend((text.len() as u32).to_le_bytes());
+    out.extend(text.as_bytes());
+    out
+}
+
+fn dictionary(items: &[(&str, Vec<u8>)]) -> Vec<u8> {
+    let entries = items.iter().flat_map(|(key, value)| [text(key), value.clone()].concat());
+    [&b"}("[..], &entries.collect::<Vec<u8>>(), b"u"].concat()
+}
+
+fn list(items: &[Vec<u8>]) -> Vec<u8> {
+    [&b"]("[..], &items.concat(), b"e"].concat()
+}
+
+/// An array of f64 as numpy pickles it.
+fn array(shape: &[u8], values: &[f64]) -> Vec<u8> {
+    let bytes: Vec<u8> = values.iter().flat_map(|v| v.to_le_bytes()).collect();
+    let extents: Vec<u8> = shape.iter().flat_map(|&n| [b'K', n]).collect();
+    let kind =
+        b"tcnumpy\ndtype\n(X\x02\0\0\0f8\x89\x88tR(K\x03X\x01\0\0\0<NNNJ\xff\xff\xff\xffJ\xff\xff\xff\xffK\0tb\x89B";
+    [
+        &b"cnumpy.core.multiarray\n_reconstruct\n(cnumpy\nndarray\n(K\0tB\x01\0\0\0btR(K\x01("[..],
+        &extents,
+        kind,
+        &(bytes.len() as u32).to_le_bytes(),
+        &bytes,
+        b"tb",
+    ]
+    .concat()
+}
+
+/// Folder of two frames of 8 × 8 pixels, which fits belong to.
+pub fn video() -> std::path::PathBuf {
+    let dir = place("video");
+    std::fs::create_dir_all(&dir).unwrap();
+    for name in ["1.png", "2.png"] {
+        image::RgbImage::from_pixel(8, 8, image::Rgb([9; 3])).save(dir.join(name)).unwrap();
+    }
+    dir
+}
+
+/// PHALP's tracks, whose masks are COCO's run lengths: compressed, and as numbers.
+pub fn phalp() -> Vec<Vec<u8>> {
+    let turn = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0];
+    let smpl = dictionary(&[
+        ("global_orient", array(&[1, 3, 3], &turn)),
+        ("body_pose", array(&[23, 3, 3], &turn.repeat(23))),
+        ("betas", array(&[10], &[0.1; 10])),
+    ]);
+    let number = |n: u8| vec![b'K', n];
+    let frame = |counts: Vec<u8>| {
+        let mask = dictionary(&[("size", list(&[number(8), number(8)])), ("counts", counts)]);
+        dictionary(&[
+            ("tid", list(&[number(1)])),
+            ("tracked_time", list(&[number(0)])),
+            ("size", list(&[list(&[number(8), number(8)])])),
+            ("smpl", list(std::slice::from_ref(&smpl))),
+            ("camera", list(&[array(&[3], &[0.1, 0.2, 9.0])])),
+            ("mask", list(&[list(&[mask])])),
+        ])
+    };
+    // 20 + 30 + 14 pixels: six bits a character, five of them the number's.
+    let compressed = [&b"B\x05\0\0\0"[..], b"d0n0>"].concat();
+    let plain = list(&[number(20), number(30), number(14)]);
+    [compressed, plain]
+        .map(|counts| {
+            let both = dictionary(&[("1.png", frame(counts.clone())), ("2.png", frame(counts))]);
+            [&b"\x80\x03"[..], &both, b"."].concat()
+        })
+        .into()
+}
+
+/// EasyMocap's file of a frame, and one of cameras that serves as both of them.
+pub fn easymocap() -> [Vec<u8>; 2] {
+    let row = |count: usize| vec![vec![0.125; count]];
+    let person = serde_json::json!([{ "id": 0, "Rh": row(3), "Th": row(3), "poses": row(72), "shapes": row(10) }]);
+    let matrix = |name: &str, rows: usize, data: &str| {
+        format!("{name}: !!opencv-matrix\n  rows: {rows}\n  cols: {rows}\n  dt: d\n  data: [ {data} ]\n")
+    };
+    let cameras =
+        ["%YAML:1.0\n---\nnames:\n  - \"1\"\n".to_owned(), matrix("K_1", 3, "9., 0., 4., 0., 9.,\n   4., 0, 0, 1")]
+            .concat()
+            + "H_1: 8\nW_1: 8\n"
+            + &matrix("dist_1", 1, "0, 0, 0, 0, 0")
+            + &matrix("R_1", 3, "0.1, 0.2, 0.3")
+            + &matrix("T_1", 3, "0, 0, 5e0");
+    [person.to_string().into_bytes(), cameras.into_bytes()]
+}
+
+/// A dictionary of two tensors, as `torch.save` writes it and as it did before version 1.6.
+pub fn tensors() -> Vec<Vec<u8>> {
+    let pickled = |legacy: bool| {
+        let tensor = |key: &str| {
+            let of =
+                [&b"ctorch._utils\n_rebuild_tensor_v2\n(("[..], &text("storage"), b"ctorch\nFloatStorage\n"].concat();
+            let device = [text(key), text("cpu"), b"K\x06".to_vec()].concat();
+            let none: &[u8] = if legacy { b"N" } else { b"" };
+            [&of[..], &device, none, b"tQK\0K\x02K\x03\x86K\x03K\x01\x86\x89ccollections\nOrderedDict\n)RtR"].concat()
+        };
+        [&b"\x80\x02"[..], &dictionary(&[("a", tensor("0")), ("b", tensor("1"))]), b"."].concat()
+    };
+    let storages = [[0u8; 24], [63; 24]];
+    let mut zip = ZipWriter::new(Cursor::new(Vec::new()));
+    let stored = SimpleFileOptions::default().compression_method(CompressionMethod::Stored);
+    for (name, bytes) in [("data.pkl", &pickled(false)[..]), ("data/0", &storages[0]), ("data/1", &storages[1])] {
+        zip.start_file(format!("x/{name}"), stored).unwrap();
+        zip.write_all(bytes).unwrap();
+    }
+    let mut legacy = b"\x80\x02\x8a\x0al\xfc\x9cF\xf9 j\xa8P\x19.\x80\x02M\xe9\x03.\x80\x02}.".to_vec();
+    legacy.extend(pickled(true));
+    legacy.extend(b"\x80\x02](U\x010U\x011e.");
+    for bytes in storages {
+        legacy.extend(6u64.to_le_bytes());
+        legacy.extend(bytes);
+    }
+    vec![zip.finish().unwrap().into_inner(), legacy]
+}
+
+/// What a run keeps of a person of four vertices: its settings, and `person.safetensors` beside
+/// `body.safetensors` in the folder `run`.
+pub fn person(run: &Path) -> (Config, Vec<u8>) {
+    let (dir, body, _) = seeds::wild_capture(&place("person-wild"));
+    let capture = load_capture(&dir, &body, &LoadOptions::default()).unwrap();
+    let colors = PriorColors::of_vertices(vec![Vec3::splat(0.5); 4], &body.faces);
+    std::fs::create_dir_all(run).unwrap();
+    Person::save(run, &capture.into(), &body, &colors).unwrap();
+    (Config::preset(Preset::Fast, Method::HashPoint), std::fs::read(run.join("person.safetensors")).unwrap())
+}
+
+/// A baked person of four vertices, two joints and two frames.
+pub fn avatars() -> Vec<Vec<u8>> {
+    let intrinsics = Mat3::from_cols(Vec3::X * 9.0, Vec3::Y * 9.0, Vec3::new(4.0, 4.0, 1.0));
+    let camera = Camera::new(intrinsics, Affine3A::from_translation(Vec3::Z * 5.0), 8, 8).unwrap();
+    let joint = |name: &str, parent, rest| Joint { name: name.to_owned(), parent, rest };
+    let motion = MotionClip { num_joints: 2, fps: 30.0, poses: vec![Vec3::splat(0.1); 4], trans: vec![Vec3::Y; 2] };
+    let avatar = Avatar {
+        name: "tiny".to_owned(),
+        vertices: (0..4).map(|i| Vec3::new((i & 1) as f32, (i >> 1) as f32, 0.0)).collect(),
+        normals: vec![Vec3::Z; 4],
+        uvs: (0..4).map(|i| Vec2::new((i & 1) as f32, (i >> 1) as f32)).collect(),
+        faces: vec![[0, 1, 2], [1, 3, 2]],
+        shell_ends: vec![1, 2],
+        joints: vec![[0, 1, 0, 0]; 4],
+        weights: vec![[0.5, 0.5, 0.0, 0.0]; 4],
+        posedirs: SparseRows::from_rows((0..4).map(|i| vec![(i as u32, Vec3::splat(0.02))])),
+        atlas: Atlas { width: 2, height: 2, rgba: vec![200; 16], confidence: vec![255; 4] },
+        skeleton: vec![joint("root", None, Vec3::ZERO), joint("knee", Some(0), Vec3::Y)],
+        betas: vec![0.5],
+        clips: vec![Clip { name: "video".to_owned(), motion }],
+        cameras: vec![camera; 2],
+        light: Light { slope: 0.2 * Vec3::Z },
+    };
+    let path = place("seed-avatar.safetensors");
+    avatar.save(&path).unwrap();
+    vec![std::fs::read(path).unwrap()]
+}

@@ -1,0 +1,251 @@
+//! Small real files of every kind, written by the crates themselves or by hand, and those of other
+//! programs that the repository has.
+
+use std::io::{Cursor, Write};
+use std::path::{Path, PathBuf};
+
+use array_files::{Data, NdArray, npz};
+use glam::Vec3;
+use occnerf::capture::{LoadOptions, load_capture};
+use occnerf::{Config, Method, MotionKind, Preset, Scene, Trainer};
+use smpl::{BodyModel, SparseRows};
+use zip::write::SimpleFileOptions;
+use zip::{CompressionMethod, ZipWriter};
+
+use super::place;
+use crate::common;
+
+/// Files of the reader crate's own tests, written by numpy and Python.
+fn fixture(name: &str) -> Vec<u8> {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../smpl/array-files/tests/fixtures").join(name);
+    std::fs::read(path).unwrap()
+}
+
+pub fn pickles() -> Vec<Vec<u8>> {
+    (0..=5).map(|protocol| fixture(&format!("values.protocol{protocol}.pkl"))).collect()
+}
+
+/// Of `joblib.dump`: arrays behind their pickle, plain and compressed in every way that it has.
+pub fn joblibs() -> Vec<Vec<u8>> {
+    let kinds =
+        ["plain", "plain", "plain", "protocol2", "protocol2", "old", "zlib", "gzip", "bz2", "lzma", "xz", "old_zlib"];
+    kinds.iter().map(|kind| fixture(&format!("joblib.{kind}.pkl"))).collect()
+}
+
+fn array(shape: &[usize], data: Data) -> NdArray {
+    NdArray { shape: shape.to_vec(), data }
+}
+
+fn floats(shape: &[usize], value: impl Fn(usize) -> f32) -> NdArray {
+    array(shape, Data::F32((0..shape.iter().product()).map(value).collect()))
+}
+
+fn written(name: &str, arrays: &[(&str, NdArray)]) -> Vec<u8> {
+    let path = place(name);
+    npz::write(&path, arrays).unwrap();
+    std::fs::read(path).unwrap()
+}
+
+pub fn archives() -> Vec<Vec<u8>> {
+    let own = [
+        ("a", floats(&[2, 3], |i| i as f32)),
+        ("b", array(&[], Data::F64(vec![0.5]))),
+        ("c", array(&[0, 4], Data::I64(vec![]))),
+        ("d", array(&[3], Data::Bool(vec![true, false, true]))),
+    ];
+    vec![fixture("numpy.npz"), written("own.npz", &own)]
+}
+
+pub fn arrays() -> Vec<Vec<u8>> {
+    let npy = |header: &str, bytes: Vec<u8>| {
+        let mut out = b"\x93NUMPY\x01\0".to_vec();
+        out.extend((header.len() as u16).to_le_bytes());
+        out.extend(header.as_bytes());
+        out.extend(bytes);
+        out
+    };
+    vec![
+        npy("{'descr': '<f4', 'fortran_order': False, 'shape': (2, 3), }\n", vec![0; 24]),
+        npy("{'descr': '>i8', 'fortran_order': True, 'shape': (3, 2), }\n", vec![1; 48]),
+        npy("{'descr': '|b1', 'fortran_order': False, 'shape': (), }\n", vec![1]),
+        npy("{'descr': '<f2', 'fortran_order': False, 'shape': (5,), }\n", vec![7; 10]),
+    ]
+}
+
+/// Four vertices, two joints, two shapes.
+fn tiny_body() -> BodyModel {
+    let corner = |i: usize| Vec3::new((i & 1) as f32, (i >> 1) as f32, 0.3 * i as f32);
+    BodyModel {
+        v_template: (0..4).map(corner).collect(),
+        faces: vec![[0, 1, 2], [1, 3, 2]],
+        shapedirs: vec![Vec3::splat(0.01); 8],
+        posedirs: SparseRows::from_rows((0..4).map(|i| vec![(i as u32, Vec3::splat(0.02))])),
+        weights: SparseRows::from_rows((0..4).map(|i| vec![(u32::from(i > 1), 1.0f32)])),
+        j_regressor: SparseRows::from_rows((0..2).map(|j| vec![(2 * j as u32, 0.5f32), (2 * j as u32 + 1, 0.5)])),
+        parents: vec![None, Some(0)],
+    }
+}
+
+pub fn body_archives() -> Vec<Vec<u8>> {
+    let parts = [
+        ("v_template", floats(&[4, 3], |i| (i * i % 7) as f32 * 0.3)),
+        ("f", array(&[2, 3], Data::I64(vec![0, 1, 2, 1, 3, 2]))),
+        ("weights", floats(&[4, 2], |i| f32::from(u8::from((i % 2 == 1) == (i >= 4))))),
+        ("J_regressor", floats(&[2, 4], |_| 0.25)),
+        ("kintree_table", array(&[2, 2], Data::I64(vec![-1, 0, 0, 1]))),
+        ("shapedirs", floats(&[4, 3, 2], |i| i as f32 * 0.01)),
+        ("posedirs", floats(&[4, 3, 9], |i| (i % 5) as f32 * 0.01)),
+    ];
+    vec![written("seed-body.npz", &parts)]
+}
+
+pub fn saved_bodies() -> Vec<Vec<u8>> {
+    let path = place("seed-body.safetensors");
+    tiny_body().save(&path).unwrap();
+    vec![std::fs::read(path).unwrap()]
+}
+
+pub fn clips() -> Vec<Vec<u8>> {
+    let clip = |joints: usize, rate: &'static str| {
+        let parts = [
+            ("poses", floats(&[3, 3 * joints], |i| (i % 11) as f32 * 0.1)),
+            ("trans", floats(&[3, 3], |i| i as f32)),
+            (rate, array(&[], Data::F64(vec![30.0]))),
+        ];
+        written("seed-clip.npz", &parts)
+    };
+    vec![clip(24, "fps"), clip(52, "mocap_framerate")]
+}
+
+/// Two triangles on two joints, one of which turns.
+pub fn characters() -> Vec<Vec<u8>> {
+    let mut binary: Vec<u8> = Vec::new();
+    let mut add = |values: &[f32]| binary.extend(values.iter().flat_map(|v| v.to_le_bytes()));
+    add(&[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 2.0, 0.0, 1.0, 2.0, 0.0]);
+    add(&[1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.5, 0.5, 0.0, 0.0]);
+    add(&[0.0, 1.0]);
+    add(&[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.7, 0.7]);
+    binary.extend([0, 0, 0, 0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0]);
+    binary.extend([0u16, 1, 2, 2, 1, 3].iter().flat_map(|v| v.to_le_bytes()));
+    let views: Vec<String> = [(0, 48), (48, 64), (112, 8), (120, 32), (152, 16), (168, 12)]
+        .map(|(at, n)| format!(r#"{{"buffer":0,"byteOffset":{at},"byteLength":{n}}}"#))
+        .into();
+    let json = format!(
+        r#"{{"asset":{{"version":"2.0"}},"scene":0,"scenes":[{{"nodes":[0,2]}}],
+"nodes":[{{"children":[1],"name":"root"}},{{"translation":[0,1,0]}},{{"mesh":0,"skin":0}}],
+"meshes":[{{"primitives":[{{"attributes":{{"POSITION":0,"WEIGHTS_0":1,"JOINTS_0":4}},"indices":5,"material":0}}]}}],
+"materials":[{{"pbrMetallicRoughness":{{"baseColorTexture":{{"index":0}}}}}}],"textures":[{{"source":0}}],
+"images":[{{"uri":"data:image/png;base64,iVBORw0KGgo="}}],"skins":[{{"joints":[0,1]}}],
+"animations":[{{"samplers":[{{"input":2,"output":3}}],"channels":[{{"sampler":0,"target":{{"node":1,"path":"rotation"}}}}]}}],
+"accessors":[{{"bufferView":0,"componentType":5126,"count":4,"type":"VEC3","min":[0,0,0],"max":[1,2,0]}},
+{{"bufferView":1,"componentType":5126,"count":4,"type":"VEC4"}},
+{{"bufferView":2,"componentType":5126,"count":2,"type":"SCALAR","min":[0],"max":[1]}},
+{{"bufferView":3,"componentType":5126,"count":2,"type":"VEC4"}},
+{{"bufferView":4,"componentType":5121,"count":4,"type":"VEC4"}},
+{{"bufferView":5,"componentType":5123,"count":6,"type":"SCALAR"}}],
+"bufferViews":[{}],"buffers":[{{"byteLength":180}}]}}"#,
+        views.join(",")
+    );
+    let mut out = b"glTF\x02\0\0\0".to_vec();
+    out.extend((28 + json.len() as u32 + binary.len() as u32).to_le_bytes());
+    out.extend((json.len() as u32).to_le_bytes());
+    out.extend(b"JSON");
+    out.extend(json.as_bytes());
+    out.extend((binary.len() as u32).to_le_bytes());
+    out.extend(b"BIN\0");
+    out.extend(binary);
+    vec![out]
+}
+
+pub fn meshes() -> Vec<Vec<u8>> {
+    let text = "# a pyramid\no thing\nv 0 0 0 1 1 1\r\nv 1 0 0\nv 1 0 1\nvt 0 0\nvn 0 1 0\nusemtl x\n\
+                f 1/1/1 2//1 3 4\nv 0 0 1 # late\nv 9e0 -1.5 \\\n 2\nf -1 -2 1\n";
+    vec![text.as_bytes().to_vec(), b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n".to_vec()]
+}
+
+fn encoded(picture: &image::DynamicImage, format: image::ImageFormat) -> Vec<u8> {
+    let mut out = Cursor::new(Vec::new());
+    picture.write_to(&mut out, format).unwrap();
+    out.into_inner()
+}
+
+pub fn pngs() -> Vec<Vec<u8>> {
+    let rgb = image::RgbImage::from_fn(9, 7, |x, y| image::Rgb([x as u8 * 20, y as u8 * 30, 9]));
+    let deep =
+        image::ImageBuffer::<image::Rgba<u16>, _>::from_fn(5, 4, |x, y| image::Rgba([x as u16, y as u16, 9, 65535]));
+    let grey = image::GrayImage::from_fn(16, 3, |x, _| image::Luma([x as u8]));
+    [rgb.into(), image::DynamicImage::ImageRgba16(deep), grey.into()]
+        .map(|picture| encoded(&picture, image::ImageFormat::Png))
+        .into()
+}
+
+pub fn jpegs() -> Vec<Vec<u8>> {
+    let rgb = image::RgbImage::from_fn(24, 17, |x, y| image::Rgb([x as u8 * 9, y as u8 * 12, 99]));
+    let grey = image::GrayImage::from_fn(8, 8, |x, y| image::Luma([(x * y) as u8]));
+    [rgb.into(), grey.into()].map(|picture: image::DynamicImage| encoded(&picture, image::ImageFormat::Jpeg)).into()
+}
+
+/// A capture of two frames in the wild layout: its directory, body and metadata.
+pub fn wild_capture(dir: &Path) -> (PathBuf, BodyModel, Vec<u8>) {
+    let body = tiny_body();
+    let frame = serde_json::json!({
+        "poses": [[0.0, 0.1, 0.0], [0.0, 0.0, 0.2]], "betas": [0.5, -0.25],
+        "cam_intrinsics": [[8.0, 0.0, 4.0], [0.0, 8.0, 4.0], [0.0, 0.0, 1.0]],
+        "cam_extrinsics": [[1, 0, 0, 0], [0, -1, 0, 1], [0, 0, -1, 5], [0, 0, 0, 1]],
+        "distortions": [0.01, 0.0, 0.0, 0.0, 0.0], "more": [1, "two"],
+    });
+    let metadata = serde_json::json!({ "1": frame, "2": frame }).to_string().into_bytes();
+    for kind in ["images", "masks"] {
+        std::fs::create_dir_all(dir.join(kind)).unwrap();
+        for name in ["1.png", "2.png"] {
+            image::RgbImage::from_pixel(8, 8, image::Rgb([255; 3])).save(dir.join(kind).join(name)).unwrap();
+        }
+    }
+    std::fs::write(dir.join("metadata.json"), &metadata).unwrap();
+    load_capture(dir, &body, &LoadOptions::default()).unwrap();
+    (dir.to_owned(), body, metadata)
+}
+
+pub fn configurations() -> Vec<Vec<u8>> {
+    let text = |preset, method| toml::to_string(&Config::preset(preset, method)).unwrap().into_bytes();
+    vec![text(Preset::Fast, Method::Occnerf), text(Preset::Paper, Method::HashPoint)]
+}
+
+/// A scene, a checkpoint of a training on it, and its configuration.
+pub fn checkpoint() -> (&'static Scene, Vec<u8>, Config) {
+    let mut config = common::tiny(Method::Occnerf, MotionKind::Surface);
+    (config.field.width, config.field.depth) = (16, 1);
+    (config.encoding.levels, config.encoding.log2_table_size) = (2, 6);
+    let mut trainer = Trainer::new(common::scene(), config.clone()).unwrap();
+    trainer.step().unwrap();
+    (common::scene(), common::checkpoint(&trainer), config)
+}
+
+/// Two tensors of a state dictionary as `torch.save` writes it.
+pub fn weights() -> Vec<Vec<u8>> {
+    let mut pickle = b"\x80\x02ccollections\nOrderedDict\nq\x00)Rq\x01(".to_vec();
+    for (key, name) in ["features.0.weight", "features.0.bias"].iter().enumerate() {
+        let text = |out: &mut Vec<u8>, text: &str| {
+            out.push(b'X');
+            out.extend((text.len() as u32).to_le_bytes());
+            out.extend(text.as_bytes());
+        };
+        text(&mut pickle, name);
+        pickle.extend(b"ctorch._utils\n_rebuild_tensor_v2\n((");
+        text(&mut pickle, "storage");
+        pickle.extend(b"ctorch\nFloatStorage\n");
+        text(&mut pickle, &key.to_string());
+        text(&mut pickle, "cpu");
+        pickle.extend(b"K\x06tQK\x00K\x02K\x03\x86K\x03K\x01\x86\x89ccollections\nOrderedDict\n)RtR");
+    }
+    pickle.extend(b"u.");
+    let mut zip = ZipWriter::new(Cursor::new(Vec::new()));
+    let stored = SimpleFileOptions::default().compression_method(CompressionMethod::Stored);
+    for (name, bytes) in
+        [("data.pkl", &pickle[..]), ("byteorder", b"little"), ("data/0", &[0; 24]), ("data/1", &[1; 24])]
+    {
+        zip.start_file(format!("weights/{name}"), stored).unwrap();
+        zip.write_all(bytes).unwrap();
+    }
+    vec![zip.finish().unwrap().into_inner()]
+}

@@ -1,0 +1,165 @@
+//! What an occluder hides must not reach training by any way.
+
+use crate::capture_on_disk;
+use crate::common;
+
+use common::{TempDir, body, capture, scene, tiny, train};
+use glam::Vec3;
+use occnerf::capture::{Capture, LoadOptions, Pixels, load_capture};
+use occnerf::{Label, Method, MotionKind, OccludedRule, PriorColors, Scene, upright};
+use synth::{DemoConfig, demo};
+
+const NO_DISTORTION: [f64; 5] = [0.0; 5];
+const BARREL: [f64; 5] = [-0.2, 0.05, 0.001, -0.002, 0.0];
+
+/// Some colour that changes from pixel to pixel.
+fn noise(i: u32, salt: u32) -> u8 {
+    (i.wrapping_mul(2_654_435_761).wrapping_add(salt).wrapping_mul(2_246_822_519) >> 24) as u8
+}
+
+/// The subject is a column in the middle; an obstacle hides its lower half in the first two frames.
+fn shown(frame: u32, x: u32, y: u32) -> bool {
+    x.abs_diff(12) < 6 && (4..28).contains(&y) && (frame == 2 || y < 16)
+}
+
+/// With the files, which frames are read from again.
+fn load(hidden: u32, distortion: [f64; 5]) -> (TempDir, Capture) {
+    let dir = TempDir::new("occluded");
+    let color = |frame: u32, x: u32, y: u32| {
+        let salt = if shown(frame, x, y) { 1 } else { hidden };
+        [0, 1, 2].map(|c| noise(3 * (y * 24 + x) + c + 3000 * frame, salt))
+    };
+    capture_on_disk::write(dir.path(), distortion, color, |frame, x, y| 255 * u8::from(shown(frame, x, y)));
+    let capture = load_capture(dir.path(), &capture_on_disk::body(), &LoadOptions::default()).unwrap();
+    (dir, capture)
+}
+
+#[test]
+fn the_picture_under_the_mask_never_leaves_the_loader() {
+    for distortion in [NO_DISTORTION, BARREL] {
+        let ((_one, one), (_other, other)) = (load(2, distortion), load(3, distortion));
+        for (a, b) in one.train.iter().zip(&other.train) {
+            assert_eq!(a.pixels().unwrap().mask, b.pixels().unwrap().mask);
+            assert!(a.pixels().unwrap().mask.iter().any(|&m| m > 0.5));
+            let differing = a
+                .pixels()
+                .unwrap()
+                .image
+                .pixels
+                .iter()
+                .zip(&b.pixels().unwrap().image.pixels)
+                .filter(|(a, b)| a != b)
+                .count();
+            assert_eq!(differing, 0, "{}: values that depend on what is hidden, {distortion:?}", a.name);
+        }
+    }
+}
+
+#[test]
+fn a_loaded_capture_trains_to_the_same_checkpoint_whatever_is_hidden() {
+    let mut config = tiny(Method::Occnerf, MotionKind::Surface);
+    config.surface.coarse_levels = 1;
+    let body = capture_on_disk::body();
+    // The body has eight vertices, which is enough for its own k nearest.
+    let [one, other] = [2, 3].map(|hidden| {
+        let (_files, mut capture) = load(hidden, NO_DISTORTION);
+        capture.name = "occluded".to_owned();
+        train(&Scene::new(&capture, &body, &config).unwrap(), &config, 4).1
+    });
+    assert!(one == other);
+}
+
+#[test]
+fn the_demo_shows_nothing_behind_its_obstacle() {
+    let clear = demo(&DemoConfig { occluded_fraction: 0.0, ..common::demo_config() }, body()).unwrap();
+    let mut hidden = 0;
+    for (with, without) in capture().train.iter().zip(&clear.train) {
+        let (with, without) = (with.pixels().unwrap(), without.pixels().unwrap());
+        for (i, (&m, &full)) in with.mask.iter().zip(&without.mask).enumerate() {
+            if m == 0.0 {
+                hidden += usize::from(full > 0.0);
+                assert_eq!(with.image.pixels[3 * i..][..3], [0.0; 3]);
+            }
+        }
+    }
+    assert!(hidden > 100, "{hidden}");
+}
+
+/// Overwrites the colour of every pixel with this label in every training frame, and its coverage
+/// if it is not one of the subject.
+fn repainted(label: Label) -> Capture {
+    let mut changed = capture().clone();
+    let mut count = 0;
+    for (frame, prepared) in changed.train.iter_mut().zip(&scene().train) {
+        let mut repaint = |pixels: &mut Pixels| {
+            for (i, _) in prepared.labels.iter().enumerate().filter(|(_, l)| *l == label) {
+                count += 1;
+                for c in 0..3 {
+                    pixels.image.pixels[3 * i + c] = f32::from(noise((3 * i + c) as u32, 9)) / 255.0;
+                }
+                if label != Label::Subject {
+                    pixels.mask[i] = 0.4;
+                }
+            }
+        };
+        let mut pixels = frame.pixels().unwrap();
+        repaint(&mut pixels);
+        frame.source = pixels.into();
+    }
+    assert!(count > 50, "{count} pixels of {label:?}");
+    changed
+}
+
+#[test]
+fn colours_of_unknown_pixels_have_no_influence_and_those_of_known_ones_have() {
+    let configs = common::METHODS.map(|method| tiny(method, MotionKind::Surface));
+    let truth = configs.each_ref().map(|config| train(scene(), config, 5).1);
+    for label in [Label::Unknown, Label::Subject, Label::Background] {
+        let scene = Scene::new(&repainted(label), body(), &configs[0]).unwrap();
+        for (config, truth) in configs.iter().zip(&truth) {
+            let (_, changed) = train(&scene, config, 5);
+            assert_eq!(changed == *truth, label == Label::Unknown, "{:?} {label:?}", config.method);
+        }
+    }
+}
+
+#[test]
+fn vertex_colours_do_not_depend_on_unknown_pixels() {
+    let config = tiny(Method::Prior, MotionKind::Surface);
+    let measure = |capture: &Capture| PriorColors::measure(&Scene::new(capture, body(), &config).unwrap()).unwrap();
+    assert_eq!(measure(capture()), measure(&repainted(Label::Unknown)));
+    assert_ne!(measure(capture()), measure(&repainted(Label::Subject)));
+}
+
+#[test]
+fn the_background_rule_leaves_nothing_unknown_and_changes_training() {
+    let config = tiny(Method::HashPoint, MotionKind::Surface);
+    let mut background = config.clone();
+    background.occluded = OccludedRule::Background;
+    let known = Scene::new(capture(), body(), &background).unwrap();
+    assert!(known.train.iter().flat_map(|f| f.labels.iter()).all(|l| l != Label::Unknown));
+    let [(a, _), (b, _)] = [train(scene(), &config, 4), train(&known, &background, 4)];
+    assert_ne!(common::bits(&a), common::bits(&b));
+}
+
+/// A known obstacle is unknown wherever it is not the subject, over empty ground too.
+#[test]
+fn what_a_known_occluder_covers_is_unknown() {
+    let config = tiny(Method::Occnerf, MotionKind::Surface);
+    let known = demo(&DemoConfig { known_occluder: true, ..common::demo_config() }, body()).unwrap();
+    let scene = Scene::new(&known, body(), &config).unwrap();
+    for (frame, prepared) in known.train.iter().zip(&scene.train) {
+        let pixels = frame.pixels().unwrap();
+        let occluder = pixels.occluder.as_ref().unwrap();
+        for ((&occluded, label), &m) in occluder.iter().zip(prepared.labels.iter()).zip(&pixels.mask) {
+            match (m > 0.5, occluded) {
+                (true, _) => assert_eq!(label, Label::Subject),
+                (false, true) => assert_eq!(label, Label::Unknown),
+                // Background, or inferred to be hidden.
+                (false, false) => assert_ne!(label, Label::Subject),
+            }
+        }
+    }
+    let up = upright(&scene.body, scene.train.iter().map(|frame| &*frame.view));
+    assert!(up.distance(Vec3::Y) < 1e-6, "{up}");
+}

@@ -1,0 +1,97 @@
+//! The unit of length is nobody's business: lengths are normalised before anything with a constant
+//! in metres.
+
+use crate::common;
+
+use approx::assert_abs_diff_eq;
+use common::{bits, body, capture, tiny, train};
+use glam::Vec3;
+use occnerf::capture::{Capture, Frame};
+use occnerf::{Config, Method, MotionKind, Scene};
+use smpl::{BodyModel, Placement, SparseRows};
+
+const STEPS: u64 = 6;
+
+/// The same body with `scale` times as many units to the metre.
+fn scaled_body(scale: f32) -> BodyModel {
+    let mut body = body().clone();
+    body.v_template.iter_mut().chain(&mut body.shapedirs).for_each(|v| *v *= scale);
+    let rows = (0..body.posedirs.num_rows())
+        .map(|v| body.posedirs.row(v).map(|(term, d)| (term as u32, d * scale)).collect::<Vec<_>>());
+    body.posedirs = SparseRows::from_rows(rows.collect::<Vec<_>>());
+    body
+}
+
+fn scaled_capture(scale: f32) -> Capture {
+    let frame = |frame: &mut Frame| {
+        frame.camera.world_to_camera.translation *= scale;
+        let (Placement::Pelvis { translation } | Placement::Origin { translation, .. }) = &mut frame.placement;
+        *translation *= scale;
+    };
+    let mut capture = capture().clone();
+    capture.train.iter_mut().for_each(frame);
+    capture.eval.iter_mut().map(|e| &mut e.frame).for_each(frame);
+    capture
+}
+
+/// The scene in another unit; it does not depend on method or motion.
+fn scaled_scene(scale: f32, config: &Config) -> Scene {
+    Scene::new(&scaled_capture(scale), &scaled_body(scale), config).unwrap()
+}
+
+fn configs() -> [Config; 3] {
+    [
+        tiny(Method::Occnerf, MotionKind::Surface),
+        tiny(Method::Occnerf, MotionKind::Volume),
+        tiny(Method::HashPoint, MotionKind::Surface),
+    ]
+}
+
+/// Powers of two scale without rounding, so that nothing at all may change.
+#[test]
+fn a_unit_that_is_a_power_of_two_changes_no_bit() {
+    let scene = scaled_scene(128.0, &configs()[0]);
+    assert_eq!(scene.body.scale * 128.0, common::scene().body.scale);
+    for config in configs() {
+        let (metres, ours) = train(common::scene(), &config, STEPS);
+        let (units, theirs) = train(&scene, &config, STEPS);
+        assert_eq!(bits(&metres), bits(&units), "{:?} {:?}", config.method, config.motion.kind);
+        assert!(ours == theirs, "{:?} {:?}: checkpoints differ", config.method, config.motion.kind);
+    }
+}
+
+#[test]
+fn a_scene_in_centimetres_trains_the_same_within_rounding() {
+    // Registration is left out: where an outline is found, rounding decides.
+    let mut unregistered = configs()[0].clone();
+    unregistered.registration.rounds = 0;
+    let [metric, scene] = [1.0, 100.0].map(|scale| scaled_scene(scale, &unregistered));
+    assert_abs_diff_eq!(scene.body.scale * 100.0, metric.body.scale, epsilon = 1e-6);
+    for config in configs() {
+        let (metres, _) = train(&metric, &config, STEPS);
+        let (centimetres, _) = train(&scene, &config, STEPS);
+        for (a, b) in metres.iter().zip(&centimetres) {
+            let kind = (config.method, config.motion.kind);
+            println!("{kind:?} {}: {} {} {} {}", a.step, a.loss, b.loss, a.live_samples, b.live_samples);
+            // A sample at the edge of the margin may fall to the other side; nothing else moves.
+            assert!((a.loss - b.loss).abs() < 2e-3 * a.loss, "{kind:?} step {}: {} {}", a.step, a.loss, b.loss);
+            let live = a.live_samples.abs_diff(b.live_samples);
+            assert!(live <= 1 + a.live_samples / 500, "{kind:?} step {}: {live} samples differ", a.step);
+        }
+    }
+}
+
+#[test]
+fn vertices_and_joints_of_a_frame_are_the_same_in_any_unit() {
+    // Registration is left out: where an outline is found, rounding decides.
+    let mut config = configs()[0].clone();
+    config.registration.rounds = 0;
+    let [metres, millimetres] = [1.0, 1000.0].map(|scale| scaled_scene(scale, &config));
+    for (ours, theirs) in metres.train.iter().zip(&millimetres.train) {
+        let far = |a: &[Vec3], b: &[Vec3]| a.iter().zip(b).map(|(a, b)| a.distance(*b)).fold(0.0, f32::max);
+        // A few units in the last place of coordinates of at most 2.
+        assert!(far(&ours.view.posed.vertices, &theirs.view.posed.vertices) < 3e-6);
+        assert!(far(&ours.view.posed.joints, &theirs.view.posed.joints) < 3e-6);
+        assert_eq!(ours.labels, theirs.labels);
+    }
+}

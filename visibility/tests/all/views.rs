@@ -1,0 +1,174 @@
+//! Visible vertices against brute force.
+
+use glam::{Affine3A, Mat3, Vec2, Vec3};
+use proptest::prelude::*;
+use testkit::{TriMesh, mesh, oracle, strategy};
+use visibility::{RayMesh, View, VisibilityCounts, visible_vertices};
+
+/// A camera at `eye` that looks at `target`.
+fn look(eye: Vec3, target: Vec3, focal: f32, size: u32) -> View {
+    let forward = (target - eye).normalize_or(Vec3::Z);
+    let down = (forward.any_orthonormal_vector()).normalize_or(Vec3::Y);
+    let right = down.cross(forward);
+    let rotation = Mat3::from_cols(right, down, forward).transpose();
+    let centre = size as f32 / 2.0;
+    View {
+        focal: Vec2::splat(focal),
+        centre: Vec2::splat(centre),
+        world_to_camera: Affine3A::from_mat3_translation(rotation, rotation * -eye),
+        width: size,
+        height: size,
+    }
+}
+
+fn visible(mesh: &TriMesh, view: &View) -> Vec<bool> {
+    let rays = RayMesh::new(&mesh.vertices, &mesh.faces).unwrap();
+    visible_vertices(&rays, &mesh.vertices, view, None)
+}
+
+/// Whether anything but the vertex's own faces is in front of it; `None` within rounding of an
+/// edge.
+fn plain(mesh: &TriMesh, view: &View, vertex: usize) -> Option<bool> {
+    let v = mesh.vertices[vertex];
+    let eye = view.centre_of_projection().unwrap();
+    let others: Vec<[u32; 3]> = (mesh.faces.iter().copied()).filter(|f| !f.contains(&(vertex as u32))).collect();
+    let blocked =
+        |o: Vec3, share: f64| oracle::first_hit(&mesh.vertices, &others, o, v - o).is_some_and(|(_, t)| t < share);
+    let answer = blocked(eye, 1.0 - 1e-5);
+    let clear = [Vec3::X, Vec3::Y, Vec3::Z]
+        .iter()
+        .all(|axis| [-3e-6, 3e-6].iter().all(|s| blocked(eye + *axis * *s, 1.0 - 1e-5 + f64::from(*s)) == answer));
+    clear.then_some(!answer)
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(24))]
+
+    #[test]
+    fn visible_vertices_equal_brute_force(
+        mesh in strategy::bumpy_sphere(), direction in strategy::unit_vec3(), r in 1.625f32..5.0,
+    ) {
+        // Wide enough to see everything in front.
+        let view = look(direction * r, Vec3::ZERO, 20.0, 400);
+        let found = visible(&mesh, &view);
+        for (i, &found) in found.iter().enumerate() {
+            if view.pixel(mesh.vertices[i]).is_none() {
+                prop_assert!(!found);
+            } else if let Some(expected) = plain(&mesh, &view, i) {
+                prop_assert_eq!(found, expected, "vertex {}", i);
+            }
+        }
+    }
+
+    #[test]
+    fn counts_over_a_capture_are_the_frames_in_which_brute_force_sees_a_vertex(
+        mesh in strategy::bumpy_sphere(), tilt in -0.5f32..0.5, r in 2.0f32..4.0,
+    ) {
+        let rays = RayMesh::new(&mesh.vertices, &mesh.faces).unwrap();
+        // The image's right third is hidden.
+        let usable: Vec<bool> = (0..300 * 300).map(|pixel| pixel % 300 < 200).collect();
+        let views: Vec<View> = (0..5)
+            .map(|i| {
+                let (sin, cos) = (i as f32 * 1.25 + tilt).sin_cos();
+                look(Vec3::new(sin, tilt, cos) * r, Vec3::ZERO, 90.0, 300)
+            })
+            .collect();
+        let mut counts = VisibilityCounts::new(mesh.vertices.len());
+        for view in &views {
+            counts.add_visible(&visible_vertices(&rays, &mesh.vertices, view, Some(&usable)));
+        }
+        for (i, &count) in counts.counts().iter().enumerate() {
+            let seen = |view: &View| match view.pixel(mesh.vertices[i]) {
+                Some(pixel) if usable[pixel] => plain(&mesh, view, i),
+                _ => Some(false),
+            };
+            let answers: Option<Vec<bool>> = views.iter().map(seen).collect();
+            if let Some(answers) = answers {
+                prop_assert_eq!(count, answers.into_iter().filter(|seen| *seen).count() as u64, "vertex {}", i);
+            }
+        }
+    }
+
+    #[test]
+    fn a_convex_mesh_shows_the_vertices_of_the_faces_that_look_at_the_camera(
+        direction in strategy::unit_vec3(), r in 1.5f32..10.0,
+    ) {
+        let ball = mesh::icosphere(3);
+        let eye = direction * r;
+        let mut expected = vec![false; ball.vertices.len()];
+        let mut grazing = expected.clone();
+        for face in &ball.faces {
+            let [a, b, c] = face.map(|i| ball.vertices[i as usize]);
+            let above = (b - a).cross(c - a).normalize_or_zero().dot(eye - a);
+            for &i in face {
+                expected[i as usize] |= above > 0.0;
+                grazing[i as usize] |= above.abs() < 1e-4;
+            }
+        }
+        let found = visible(&ball, &look(eye, Vec3::ZERO, 300.0, 4000));
+        for i in 0..found.len() {
+            prop_assert!(grazing[i] || found[i] == expected[i], "vertex {i}: {}", found[i]);
+        }
+    }
+}
+
+#[test]
+fn outside_the_image_behind_the_camera_and_behind_occluders_nothing_is_visible() {
+    let points =
+        [Vec3::ZERO, Vec3::new(0.6, 0.0, 0.0), Vec3::new(0.0, -0.6, 0.0), Vec3::new(0.0, 0.0, -9.0), Vec3::NAN];
+    let rays = RayMesh::new(&[], &[]).unwrap();
+    // One unit is 20 pixels, the image 20 wide.
+    let mut view = look(-Vec3::Z, Vec3::ZERO, 20.0, 20);
+    assert_eq!(visible_vertices(&rays, &points, &view, None), [true, false, false, false, false]);
+    assert_eq!(view.pixel(Vec3::ZERO), Some(10 * 20 + 10));
+    let mut usable = vec![true; 400];
+    usable[210] = false;
+    assert_eq!(visible_vertices(&rays, &points[..1], &view, Some(&usable)), [false]);
+    view.world_to_camera = Affine3A::from_scale(Vec3::ZERO);
+    assert_eq!(view.centre_of_projection(), None);
+    assert_eq!(visible_vertices(&rays, &points, &view, None), [false; 5]);
+}
+
+#[test]
+fn image_borders_are_half_open() {
+    let rays = RayMesh::new(&[], &[]).unwrap();
+    let view = View { focal: Vec2::ONE, centre: Vec2::ZERO, world_to_camera: Affine3A::IDENTITY, width: 2, height: 3 };
+    let at = |u: f32, v: f32| visible_vertices(&rays, &[Vec3::new(u, v, 1.0)], &view, None)[0];
+    assert!(at(0.0, 0.0) && at(1.99, 2.99));
+    assert!(!at(2.0, 0.0) && !at(0.0, 3.0) && !at(-0.01, 0.0) && !at(0.0, -0.01));
+}
+
+#[test]
+fn the_answer_does_not_depend_on_the_unit_of_length() {
+    let ball = mesh::icosphere(2).map(|p| p * Vec3::new(1.0, 0.4, 0.7));
+    let eye = Vec3::new(2.0, 1.0, -1.5);
+    let metres = visible(&ball, &look(eye, Vec3::ZERO, 200.0, 400));
+    for unit in [1e-9, 100.0, 1e9] {
+        let scaled = ball.clone().map(|p| p * unit);
+        assert_eq!(visible(&scaled, &look(eye * unit, Vec3::ZERO, 200.0, 400)), metres, "{unit}");
+    }
+}
+
+#[test]
+#[should_panic(expected = "3 usable flags for 4 × 4 pixels")]
+fn a_mask_of_another_size_panics() {
+    let rays = RayMesh::new(&[], &[]).unwrap();
+    let view = look(-Vec3::Z, Vec3::ZERO, 20.0, 4);
+    let _ = visible_vertices(&rays, &[Vec3::ZERO], &view, Some(&[true; 3]));
+}
+
+#[test]
+fn about_half_of_the_open_body_is_visible_from_the_front() {
+    let Some(body) = testkit::body::open_body() else {
+        return;
+    };
+    let view = look(Vec3::new(0.0, -0.2, 4.0), Vec3::new(0.0, -0.2, 0.0), 900.0, 1000);
+    let found = visible(&body, &view);
+    let share = found.iter().filter(|v| **v).count() as f32 / found.len() as f32;
+    assert!((0.35..0.6).contains(&share), "{share}");
+    for i in (0..body.vertices.len()).step_by(61) {
+        if let Some(expected) = plain(&body, &view, i) {
+            assert_eq!(found[i], expected, "vertex {i}");
+        }
+    }
+}

@@ -1,0 +1,92 @@
+//! The command line as somebody meets it: help, and one clear line for whatever is wrong.
+
+use crate::common;
+
+use common::{folder, refused, text, xtask};
+
+#[test]
+fn help_names_the_commands_and_every_option_of_train() {
+    let help = |arguments: &[&str]| String::from_utf8(xtask(arguments).stdout).unwrap();
+    let general = help(&["--help"]);
+    for command in ["train", "eval", "render", "export", "convert"] {
+        assert!(general.contains(command), "{general}");
+    }
+    assert!(general.contains("Exit codes:") && general.contains("a result cannot be written"), "{general}");
+    let train = help(&["train", "--help"]);
+    let options = [
+        "--out",
+        "--preset",
+        "--method",
+        "--ablate",
+        "--occluded",
+        "--steps",
+        "--seed",
+        "--threads",
+        "--resume",
+        "--resize",
+        "--stride",
+        "--max-frames",
+        "--eval-stride",
+        "--camera",
+        "--lpips",
+        "--perceptual-weights",
+        "--capacity",
+    ];
+    for option in options {
+        assert!(train.contains(option), "{train}");
+    }
+}
+
+#[test]
+fn scenes_that_are_none_are_refused_and_leave_no_run_behind() {
+    let out = folder("no-scene").join("run");
+    refused(&["train", "/no/such/place", "--out", text(&out)], &["/no/such/place", "no such directory"]);
+    let empty = folder("empty-scene");
+    let layouts = ["annots.npy", "metadata.json", "mesh_infos.pkl"];
+    refused(&["train", text(&empty), "--out", text(&out)], &[&[text(&empty)], &layouts[..]].concat());
+    std::fs::write(empty.join("mesh_infos.pkl"), b"not a pickle").unwrap();
+    refused(&["train", text(&empty), "--out", text(&out)], &[text(&empty), "body model", "--body"]);
+    let body = empty.join("none.npz");
+    refused(&["train", text(&empty), "--body", text(&body), "--out", text(&out)], &["none.npz"]);
+    let character = empty.join("walker.GLB");
+    std::fs::write(&character, b"glTF").unwrap();
+    refused(&["train", text(&character), "--out", text(&out)], &["walker.GLB", "cargo lab synth", "cargo xtask train"]);
+    assert!(!out.exists());
+}
+
+#[test]
+fn settings_that_cannot_be_are_refused_by_key() {
+    refused(&["train", "--set", "encoding.nmax=5"], &["encoding.nmax", "no key"]);
+    refused(&["train", "--set", "samples=0"], &["samples", "1 to 1024"]);
+    refused(&["train", "--set", "rates.table=nan"], &["rates.table"]);
+    refused(&["train", "--set", "samples=many"], &["samples=many", "whole number"]);
+}
+
+#[test]
+fn runs_that_are_none_are_refused() {
+    let empty = folder("no-run");
+    refused(&["train", "--resume", "--out", text(&empty)], &["checkpoint.safetensors", "no-run"]);
+    refused(&["eval", text(&empty)], &["config.toml", "not a run"]);
+    refused(&["render", text(&empty), "tpose"], &["config.toml", "not a run"]);
+    std::fs::write(empty.join("checkpoint.safetensors"), [0xff; 64]).unwrap();
+    refused(&["train", "--resume", "--out", text(&empty)], &["checkpoint.safetensors", "safetensors"]);
+    refused(&["train", "--out", text(&empty)], &["already holds a run", "--resume"]);
+}
+
+#[test]
+fn bodies_are_converted_and_nothing_is_overwritten_unasked() {
+    let help = String::from_utf8(xtask(&["convert", "--help"]).stdout).unwrap();
+    assert!(help.contains(".safetensors") && help.contains("--force"), "{help}");
+    let out = folder("convert");
+    let (first, second) = (out.join("a.safetensors"), out.join("b.safetensors"));
+    smpl::BodyModel::embedded().save(&first).unwrap();
+    assert!(xtask(&["convert", text(&first), text(&second)]).status.success());
+    assert_eq!(std::fs::read(&first).unwrap(), std::fs::read(&second).unwrap());
+    refused(&["convert", text(&first), text(&second)], &["b.safetensors", "--force"]);
+    refused(&["convert", text(&first), text(&first), "--force"], &["same file"]);
+    refused(&["convert", text(&first), text(&out.join("a.npz"))], &["a.npz", ".safetensors"]);
+    refused(&["convert", "/no/such.pkl", text(&second)], &["/no/such.pkl"]);
+    std::fs::write(out.join("bad.npz"), b"not a zip").unwrap();
+    refused(&["convert", text(&out.join("bad.npz")), text(&out.join("c.safetensors"))], &["bad.npz"]);
+    assert!(!out.join("c.safetensors").exists());
+}

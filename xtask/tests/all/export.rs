@@ -1,0 +1,170 @@
+//! `export` and `view` of a run, and one clear line for whatever is wrong.
+
+use crate::common;
+use crate::stand_in;
+
+use std::path::{Path, PathBuf};
+
+use array_files::{Data, NdArray, npz};
+use common::{done, folder, refused, text};
+use glam::Vec3;
+use occnerf::bake::Avatar;
+use occnerf::capture::Layout;
+use occnerf::{Config, Method, Preset, PriorColors, Scene};
+use synth::{DemoConfig, demo};
+
+const HOSTILE: &str = "</script><img src=x onerror=alert(1)>\" onload='";
+
+/// A run that has been baked, under a name that wants to be more than text.
+fn run(name: &str) -> PathBuf {
+    let directory = folder(name);
+    let body = smpl::BodyModel::embedded();
+    let capture = demo(&DemoConfig { size: 24, frames: 3, eval_cameras: 1, ..Default::default() }, &body).unwrap();
+    let scene = Scene::new(&capture, &body, &Config::preset(Preset::Fast, Method::Occnerf)).unwrap();
+    let mut avatar: Avatar = stand_in::stand_in(&scene, &PriorColors::measure(&scene).unwrap());
+    avatar.name = HOSTILE.to_owned();
+    avatar.clips[0].name = HOSTILE.to_owned();
+    avatar.save(&directory.join("avatar.safetensors")).unwrap();
+    directory
+}
+
+/// A run of two steps, with a checkpoint and nothing baked.
+fn trained(name: &str) -> PathBuf {
+    let folder = folder(name);
+    let (capture, run) = (folder.join("capture"), folder.join("run"));
+    common::capture(&capture, Layout::HumanNerf, 32, 4);
+    let set = ["--preset", "fast", "--steps", "2", "--set", "registration.rounds=0"];
+    done(&[&["train", text(&capture), "--out", text(&run)], &set[..]].concat());
+    run
+}
+
+/// Motion capture of so many joints.
+fn clip(path: &Path, joints: usize) {
+    let poses = Data::F32(vec![0.1; 4 * 3 * joints]);
+    let arrays = [
+        ("poses", NdArray { shape: vec![4, 3 * joints], data: poses }),
+        ("trans", NdArray { shape: vec![4, 3], data: Data::F32(vec![0.5; 12]) }),
+        ("fps", NdArray { shape: vec![], data: Data::F64(vec![25.0]) }),
+    ];
+    npz::write(path, &arrays).unwrap();
+}
+
+#[test]
+fn every_format_is_written_and_read_back() {
+    let run = run("export-formats");
+    let motion = run.join("dance.npz");
+    clip(&motion, 52);
+    let out = |name: &str| run.join(name);
+    let glb = out("person.glb");
+    let said = done(&["export", text(&run), "--format", "glb", "--out", text(&glb), "--motion", text(&motion)]);
+    assert!(said.contains("person.glb") && said.contains("dance"), "{said}");
+    let character = smpl::Character::load(&glb).unwrap();
+    let names: Vec<&str> = character.animations.iter().map(|a| a.name.as_str()).collect();
+    assert_eq!(names, [HOSTILE, "dance"]);
+    assert!((character.animations[1].duration - 3.0 / 25.0).abs() < 1e-6);
+
+    let ply = out("person.ply");
+    done(&["export", text(&run), "--format", "ply", "--out", text(&ply), "--frame", "2"]);
+    assert!(std::fs::read(&ply).unwrap().starts_with(b"ply\nformat binary_little_endian 1.0\n"));
+
+    let obj = out("person.obj");
+    done(&["export", text(&run), "--format", "obj", "--out", text(&obj), "--frame", "1"]);
+    assert!(out("person.mtl").exists() && out("person.png").exists());
+    let first = smpl::load_mesh(&obj).unwrap();
+    done(&["export", text(&run), "--format", "obj", "--out", text(&obj), "--frame", "1", "--motion", text(&motion)]);
+    let danced = smpl::load_mesh(&obj).unwrap();
+    assert_eq!(first.faces, danced.faces);
+    assert!(first.vertices[0].distance(danced.vertices[0]) > 0.01);
+
+    let poses = out("poses.npz");
+    done(&["export", text(&run), "--format", "npz", "--out", text(&poses)]);
+    let motion = smpl::MotionClip::load(&poses).unwrap();
+    assert_eq!((motion.num_frames(), motion.num_joints), (3, 24));
+    assert!(motion.poses.iter().any(|pose| *pose != Vec3::ZERO));
+}
+
+#[test]
+fn the_page_is_one_file_that_asks_for_nothing_and_shows_names_as_text() {
+    let run = run("view-page");
+    let motion = run.join("dance.npz");
+    clip(&motion, 24);
+    let said = done(&["view", text(&run), "--motion", text(&motion), "--motion", text(&motion)]);
+    assert!(said.contains("person.html"), "{said}");
+    let page = std::fs::read_to_string(run.join("person.html")).unwrap();
+    assert!(page.len() < 10_000_000, "{}", page.len());
+    assert!(page.contains("default-src 'none'") && !page.contains("unsafe-"));
+    // Addresses of other places: none, but for the data that is inlined.
+    for word in ["http://", "https://", "src=\"/", "@import", "url(", "fetch(", "XMLHttpRequest"] {
+        assert!(!page.contains(word), "{word}");
+    }
+    assert!(!page.contains("<img") && page.contains("&lt;img"));
+    let ends = page.matches("</script>").count();
+    assert_eq!((ends, page.matches("<script").count()), (3, 3));
+    let again = run.join("again.html");
+    done(&["view", text(&run), "--motion", text(&motion), "--motion", text(&motion), "--out", text(&again)]);
+    assert_eq!(std::fs::read_to_string(again).unwrap(), page, "the same run gives the same page");
+}
+
+#[test]
+fn whatever_is_wrong_is_said_in_one_line() {
+    let run = run("export-wrong");
+    let run_text = text(&run);
+    let out = run.join("person.glb");
+    let out = text(&out);
+    let glb = |run: &str, out: &str, more: &[&str], words: &[&str]| {
+        refused(&[&["export", run, "--format", "glb", "--out", out], more].concat(), words);
+    };
+    glb("/no/such/run", out, &[], &["/no/such/run", "no such run"]);
+    let empty = folder("export-empty");
+    glb(text(&empty), out, &[], &["checkpoint.safetensors", "export-empty"]);
+    refused(&["view", text(&empty)], &["checkpoint.safetensors"]);
+    glb(run_text, text(&run.join("none/person.glb")), &[], &["--out", "no such folder", "none"]);
+    glb(run_text, run_text, &[], &["--out", "is a folder"]);
+    refused(&["view", run_text, "--out", text(&run.join("none/a.html"))], &["--out", "no such folder"]);
+    let motion = run.join("other.npz");
+    clip(&motion, 31);
+    glb(run_text, out, &["--motion", text(&motion)], &["other.npz", "another skeleton", "24", "31"]);
+    refused(&["view", run_text, "--motion", text(&motion)], &["other.npz", "another skeleton"]);
+    glb(run_text, out, &["--motion", text(&run.join("absent.npz"))], &["absent.npz"]);
+    glb(run_text, out, &["--frame", "1"], &["--frame", "ply or obj"]);
+    let frame = ["export", run_text, "--format", "obj", "--out", out, "--frame", "3"];
+    refused(&frame, &["--frame 3", "0 to 2"]);
+    for size in ["0x0", "100000x100000", "512x0", "many", "1x-1"] {
+        refused(&["render", run_text, "tpose", "--size", size], &["--size"]);
+    }
+    let png = run.join("person.png");
+    refused(&["export", run_text, "--format", "obj", "--out", text(&png)], &["person.png", "texture"]);
+    // A file that was cut, and one that is something else.
+    let whole = std::fs::read(run.join("avatar.safetensors")).unwrap();
+    std::fs::write(run.join("avatar.safetensors"), &whole[..whole.len() / 2]).unwrap();
+    glb(run_text, out, &[], &["avatar.safetensors", "not a whole"]);
+    std::fs::write(run.join("avatar.safetensors"), b"{}").unwrap();
+    refused(&["view", run_text], &["avatar.safetensors"]);
+}
+
+#[test]
+fn a_checkpoint_that_is_damaged_or_gone_is_named_by_all_that_need_it() {
+    let run = trained("export-damaged");
+    let out = run.join("person.glb");
+    let motion = run.join("other.npz");
+    clip(&motion, 31);
+    let drawn = ["render", text(&run), "pose", "--baked", "--motion", text(&motion)];
+    refused(&drawn, &["other.npz", "another skeleton", "24", "31"]);
+    let checkpoint = run.join("checkpoint.safetensors");
+    let whole = std::fs::read(&checkpoint).unwrap();
+    let everyone = |words: &[&str]| {
+        refused(&["export", text(&run), "--format", "glb", "--out", text(&out)], words);
+        refused(&["view", text(&run)], words);
+        refused(&["render", text(&run), "tpose", "--baked"], words);
+        refused(&drawn, words);
+        assert!(!out.exists());
+    };
+    // Newer than what was baked of it.
+    std::fs::write(&checkpoint, &whole[..whole.len() / 2]).unwrap();
+    std::fs::remove_file(run.join("avatar.safetensors")).unwrap();
+    everyone(&["checkpoint.safetensors", "not a whole"]);
+    std::fs::write(&checkpoint, b"PK").unwrap();
+    everyone(&["checkpoint.safetensors"]);
+    std::fs::remove_file(&checkpoint).unwrap();
+    everyone(&["checkpoint.safetensors"]);
+}

@@ -1,0 +1,35 @@
+//! `train --list`: parts of a list of scenes, and what they come to together.
+
+use crate::common;
+
+use common::{done, folder, refused, text, xtask};
+use occnerf::capture::Layout;
+
+#[test]
+fn a_list_of_scenes_is_trained_in_parts() {
+    let folder = folder("list");
+    for name in ["a", "b", "c"] {
+        common::capture(&folder.join(name), Layout::HumanNerf, 32, 3);
+    }
+    let list = folder.join("scenes.txt");
+    let of = |name: &str| text(&folder.join(name)).to_owned();
+    std::fs::write(&list, format!("# captures\n{}\n\n{} # the second\n{}\n", of("a"), of("b"), of("c"))).unwrap();
+    let out = folder.join("out");
+    let command = ["train", "--list", text(&list), "--out", text(&out), "--steps", "2", "--method", "hash-point"];
+    let with = |more: &[&'static str]| [&command[..], more].concat();
+    done(&with(&["--shard", "1/2"]));
+    refused(&with(&["--merge"]), &["of 3 scenes have no scores yet"]);
+    done(&with(&["--shard", "2/2"]));
+    let said = done(&with(&["--merge"]));
+    let table = std::fs::read_to_string(out.join("list.md")).unwrap();
+    assert!(["| a ", "| b ", "| c "].iter().all(|row| table.contains(row) && said.contains(row)), "{table}");
+    assert_eq!(done(&with(&[])).matches(": finished earlier").count(), 3);
+    // A scene that is none does not keep the others.
+    std::fs::write(&list, format!("/no/such/scene\n{}\n", of("a"))).unwrap();
+    let output = xtask(&with(&[]));
+    assert_eq!(output.status.code(), Some(1));
+    let printed = String::from_utf8_lossy(&output.stdout).into_owned() + &String::from_utf8_lossy(&output.stderr);
+    assert!(printed.contains("a: finished earlier") && printed.contains("1 of 2 scenes failed"), "{printed}");
+    refused(&["train", "--shard", "1/2"], &["--list"]);
+    assert_eq!(xtask(&["train", "--list", text(&list), "--shard", "3/2"]).status.code(), Some(2));
+}

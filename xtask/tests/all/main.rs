@@ -1,0 +1,16 @@
+//! The command line as its users see it.
+#![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
+
+mod capacity;
+mod cli;
+mod common;
+#[cfg(target_os = "linux")]
+mod death;
+mod export;
+#[cfg(target_os = "linux")]
+mod faults;
+mod import;
+mod list;
+mod own_video;
+#[path = "../../../occnerf/tests/all/common/stand_in.rs"]
+mod stand_in;
