@@ -178,7 +178,8 @@ mod tests {
                 model.weights.row(v as usize).find(|(_, weight)| *weight > 0.9999).map(|(joint, _)| joint)
             };
             let mut is_rigid = vec![true; model.num_vertices()];
-            // Normals of shorter edges are too coarse in f32 for differences by a hundredth of a radian.
+            // Rounding of f32 places at metres turns normals of 5 mm edges by 1e-4, a hundredth of the
+            // difference's step.
             let short = |[a, b]: [u32; 2]| {
                 shape.vertices[a as usize].distance(shape.vertices[b as usize]) < 5e-3
             };
@@ -215,7 +216,7 @@ mod tests {
                     let numeric = (more_normals[v] - less_normals[v]) / (2.0 * h);
                     let mine = jacobian.rotations().filter(|(column, _)| jacobian.columns[*column] as usize == unknown);
                     let exact: Vec3 = mine.map(|(_, turn)| turn.cross(normals[v])).sum();
-                    prop_assert!(exact.distance(numeric) < 2e-3, "normal {v}, unknown {unknown}: {exact} {numeric}");
+                    prop_assert!(exact.distance(numeric) < 1e-2, "normal {v}, unknown {unknown}: {exact} {numeric}");
                 }
             }
         }
