@@ -6,8 +6,8 @@ use std::path::{Path, PathBuf};
 use array_files::npz::read_npy;
 use array_files::{Data, NdArray};
 
-use super::ImportOptions;
 use super::levels::Levels;
+use super::options::ImportOptions;
 use super::video::Video;
 use crate::names::FrameName;
 use crate::pictures::file_name;

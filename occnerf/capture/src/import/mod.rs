@@ -21,6 +21,7 @@ mod item;
 mod levels;
 mod masks;
 mod neuman;
+mod options;
 mod peoplesnapshot;
 mod phalp;
 mod prompthmr;
@@ -42,34 +43,12 @@ use glam::DVec3;
 use smpl::BodyModel;
 
 use self::fit::{BETAS, FitFrame, Person, SMPLX};
+pub use self::options::ImportOptions;
+
 use self::masks::Masks;
 use self::video::Video;
 use self::write::Placed;
 use super::CaptureError;
-
-/// The files of an import, and its options.
-#[derive(Clone, Debug, Default)]
-pub struct ImportOptions {
-    /// Folder of the video's frames, `.png` or `.jpg`, in the order of their names.
-    pub frames: PathBuf,
-    /// The estimator's file, or EasyMocap's folder.
-    pub fit: PathBuf,
-    /// The segmenter's folder, or one `.npy` file; `None`: the masks in the fit.
-    pub masks: Option<PathBuf>,
-    /// The estimator's id of the person; `None`: the one in most frames.
-    pub person: Option<String>,
-    /// The person's value in masks of object ids, 1 if `None`.
-    pub object: Option<u8>,
-    /// Values of the occluders.
-    pub occluder_objects: Vec<u8>,
-    /// Focal length in pixels replacing the estimator's; the body is moved in depth to keep its
-    /// size in the image.
-    pub focal: Option<f64>,
-    /// The body model; `None`: one that fits, from a folder `body` near the fit or the frames.
-    pub body: Option<PathBuf>,
-    /// Whether pictures are copied rather than linked.
-    pub copy: bool,
-}
 
 /// Statistics of an import.
 #[derive(Clone, Debug, PartialEq)]

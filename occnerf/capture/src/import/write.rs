@@ -8,9 +8,9 @@ use rayon::prelude::*;
 use serde_json::{Map, Value, json};
 use smpl::BodyModel;
 
-use super::ImportOptions;
 use super::fit::{FitFrame, OwnMask};
 use super::masks::Masks;
+use super::options::ImportOptions;
 use super::video::Video;
 use crate::CaptureError;
 

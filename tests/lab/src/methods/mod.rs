@@ -2,6 +2,7 @@
 //! points ([`PointEncoder`]).
 
 mod frequency;
+mod neighbours;
 mod neural_body;
 mod self_nerf;
 
@@ -10,12 +11,11 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, ensure};
-use glam::Vec3;
-use occnerf::{Body, Config, Lpips, MotionKind, PointEncoder, Preset, RateConfig, Scene, Trainer};
+use occnerf::{Config, Lpips, MotionKind, PointEncoder, Preset, RateConfig, Scene, Trainer};
 use serde::{Deserialize, Serialize};
-use surface_query::{SurfaceQuery, SurfaceQueryConfig};
 
 use frequency::Frequencies;
+use neighbours::Neighbours;
 use neural_body::NeuralBody;
 use self_nerf::SelfNerf;
 use xtask::eval::{Drawn, score_run, unscored};
@@ -157,46 +157,6 @@ impl Method {
 pub fn scale_rates(rates: &mut RateConfig, by: f32) {
     for rate in [&mut rates.field, &mut rates.vertices, &mut rates.table, &mut rates.motion] {
         *rate *= by;
-    }
-}
-
-/// The nearest vertices of the canonical body, every level of the pyramid.
-#[derive(Debug)]
-struct Neighbours {
-    query: SurfaceQuery,
-    vertices: Vec<Vec3>,
-}
-
-impl Neighbours {
-    fn new(body: &Body, config: &Config) -> Result<Self> {
-        let vertices = body.canonical.vertices.clone();
-        let query = SurfaceQueryConfig {
-            k: config.surface.k,
-            coarse_levels: config.surface.coarse_levels,
-            cell: 0.02,
-            margin: config.motion.reach() + 0.03,
-            ratio: 0.25,
-        };
-        Ok(Self { query: SurfaceQuery::new(&vertices, &body.model.faces, &query)?, vertices })
-    }
-
-    /// Calls `each` with every point of `points`, its first `count` neighbours, and their inverse
-    /// distances, which add up to 1.
-    fn of(&self, points: &[[f32; 3]], count: usize, mut each: impl FnMut(usize, Vec3, &[u32], &[f32])) {
-        /// Added to distances before they are inverted, normalised metres: a point may lie on a
-        /// vertex.
-        const NEAREST: f32 = 1e-3;
-        let (mut neighbours, mut shares) = (vec![0; self.query.neighbours_per_query()], vec![0.0; count]);
-        for (index, &x) in points.iter().enumerate() {
-            let x = Vec3::from_array(x);
-            self.query.neighbours(x, &mut neighbours);
-            for (share, &v) in shares.iter_mut().zip(&neighbours) {
-                *share = (x.distance(self.vertices[v as usize]) + NEAREST).recip();
-            }
-            let sum: f32 = shares.iter().sum();
-            shares.iter_mut().for_each(|share| *share /= sum);
-            each(index, x, &neighbours[..count], &shares);
-        }
     }
 }
 

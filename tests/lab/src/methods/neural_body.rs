@@ -5,8 +5,8 @@
 use occnerf::PointEncoder;
 use volrender::RandomStream;
 
-use super::Neighbours;
 use super::frequency::{FEATURES, encode};
+use super::neighbours::Neighbours;
 
 const SEED: u64 = 0x434F_4445;
 /// Standard deviation of a code's entries before the first step.

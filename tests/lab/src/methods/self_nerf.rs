@@ -6,7 +6,7 @@ use hashgrid::{HashGrid, HashGridConfig};
 use occnerf::{Body, Config, EncodingConfig, PointEncoder};
 use volrender::Aabb;
 
-use super::Neighbours;
+use super::neighbours::Neighbours;
 
 /// A hash grid over the coordinates of vertices.
 #[derive(Debug)]

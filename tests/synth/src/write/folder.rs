@@ -8,8 +8,10 @@ use image::{GrayImage, ImageFormat, RgbImage};
 use rayon::prelude::*;
 use smpl::{BodyModel, Placement};
 
-use super::BODY;
 use capture::{CaptureError, Frame, Image};
+
+/// The body model's file in a written capture.
+pub const BODY: &str = "body.safetensors";
 
 /// Where files go.
 pub(super) struct Folder<'a> {

@@ -13,12 +13,10 @@ use std::path::Path;
 use image::RgbImage;
 use smpl::BodyModel;
 
+pub use self::folder::BODY;
 use self::folder::{Folder, rgb, unmixed};
 use crate::film::Synthetic;
 use capture::{Capture, CaptureError, Layout};
-
-/// The body model's file in a written capture.
-pub const BODY: &str = "body.safetensors";
 
 /// Writes any capture into `dir` in HumanNeRF's prepared layout, with the body model as
 /// `body.safetensors`. Training frames that were read from files keep their photographs, others are

@@ -125,7 +125,14 @@ fn a_corrupted_capture_reads_back_from_every_layout() {
         assert_eq!(given.len(), found.len());
         for (a, b) in given.iter().zip(&found) {
             same_view(&body, a, b);
-            same_picture(Layout::HumanNerf, a, b);
+            // A pixel that the error adds to a mask is black in memory and photographed on disk.
+            let (a, b) = (a.pixels().unwrap(), b.pixels().unwrap());
+            for (i, (m, r)) in a.mask.iter().zip(&b.mask).enumerate() {
+                assert!((m - r).abs() <= 0.5 / 255.0 + 1e-6, "{layout:?} {i}: {m} {r}");
+                let of = |pixels: &capture::Pixels| Vec3::from_slice(&pixels.image.pixels[3 * i..]);
+                let (p, q) = (of(&a), of(&b));
+                assert!(p == Vec3::ZERO || (p - q).abs().max_element() < 2.0 / 255.0, "{layout:?} {i}: {p} {q}");
+            }
         }
     }
 }

@@ -1,0 +1,27 @@
+//! The files of an import, and its options.
+
+use std::path::PathBuf;
+
+/// The files of an import, and its options.
+#[derive(Clone, Debug, Default)]
+pub struct ImportOptions {
+    /// Folder of the video's frames, `.png` or `.jpg`, in the order of their names.
+    pub frames: PathBuf,
+    /// The estimator's file, or EasyMocap's folder.
+    pub fit: PathBuf,
+    /// The segmenter's folder, or one `.npy` file; `None`: the masks in the fit.
+    pub masks: Option<PathBuf>,
+    /// The estimator's id of the person; `None`: the one in most frames.
+    pub person: Option<String>,
+    /// The person's value in masks of object ids, 1 if `None`.
+    pub object: Option<u8>,
+    /// Values of the occluders.
+    pub occluder_objects: Vec<u8>,
+    /// Focal length in pixels replacing the estimator's; the body is moved in depth to keep its
+    /// size in the image.
+    pub focal: Option<f64>,
+    /// The body model; `None`: one that fits, from a folder `body` near the fit or the frames.
+    pub body: Option<PathBuf>,
+    /// Whether pictures are copied rather than linked.
+    pub copy: bool,
+}
