@@ -164,6 +164,7 @@ pub fn scale_rates(rates: &mut RateConfig, by: f32) {
 #[allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
 mod tests {
     use super::*;
+    use glam::Vec3;
     use occnerf::{FieldRenderer, Renderer};
     use synth::{DemoConfig, demo};
     use volrender::RandomStream;
