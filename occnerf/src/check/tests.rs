@@ -180,16 +180,16 @@ fn each_mistake_is_found() {
         Mistake::WrongPerson,
     ] {
         let (mut trials, mut found, mut others) = (0, 0, Vec::new());
-        for (name, capture, body) in good() {
-            for window in windows(capture, capture.train.len().min(30), 30) {
-                let wrong = made(mistake, &window, body);
-                let mistakes = likely(&wrong, body, small_views(&wrong).unwrap()).unwrap();
-                trials += 1;
-                if mistakes.first().is_some_and(|first| same(*first, mistake)) {
-                    found += 1;
-                } else {
-                    others.push(format!("{name} from {}: {mistakes:?}", window.train[0].name));
-                }
+        // The estimators' files are of one video.
+        for (name, capture, body) in good().iter().take(8) {
+            let window = Capture { train: capture.train[..capture.train.len().min(30)].to_vec(), ..capture.clone() };
+            let wrong = made(mistake, &window, body);
+            let mistakes = likely(&wrong, body, small_views(&wrong).unwrap()).unwrap();
+            trials += 1;
+            if mistakes.first().is_some_and(|first| same(*first, mistake)) {
+                found += 1;
+            } else {
+                others.push(format!("{name}: {mistakes:?}"));
             }
         }
         lines.push((format!("{mistake:?}: {found} of {trials}"), found * 100 >= 95 * trials, others));
