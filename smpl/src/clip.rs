@@ -45,8 +45,10 @@ pub struct MotionClip {
 }
 
 impl MotionClip {
-    /// Reads an `.npz` with `poses` (T, 3J), `trans` (T, 3) and one of `fps`, `mocap_framerate` and
-    /// `mocap_frame_rate`, as in AMASS (156 columns for SMPL-H, 165 for SMPL-X), which is z up.
+    /// Reads an `.npz` as in AMASS (156 columns for SMPL-H, 165 for SMPL-X), which is z up: rotations
+    /// `poses` (T, 3J) or (T, J, 3), or, of the body, `root_orient` and `pose_body`, or
+    /// `global_orient` and `body_pose`; translations `trans` or `transl` (T, 3); one of `fps`,
+    /// `mocap_framerate` and `mocap_frame_rate`, without which [`MotionClip::ASSUMED_FPS`] is taken.
     /// Other arrays are ignored.
     ///
     /// # Errors
@@ -55,25 +57,50 @@ impl MotionClip {
     pub fn load(path: &Path) -> Result<Self, Error> {
         let mut npz = Npz::open(path)?;
         let file = npz.file().to_owned();
-        let (shape, poses) = npz.f32("poses", &[None, None])?;
-        if shape[0] == 0 || shape[1] == 0 || !shape[1].is_multiple_of(3) {
-            return Err(Error::invalid(&file, "poses", format!("shape {shape:?}, expected (T, 3J)")));
-        }
-        let (_, trans) = npz.f32("trans", &[Some(shape[0]), Some(3)])?;
-        let rates = ["fps", "mocap_framerate", "mocap_frame_rate"];
-        let key = rates.into_iter().find(|r| npz.keys().iter().any(|k| k == r)).unwrap_or("fps");
-        let rate = npz.array(key)?.to_f64();
-        let fps = match rate.as_slice() {
-            [rate] if (1e-3..=1e6).contains(rate) => *rate as f32,
-            _ => return Err(Error::invalid(&file, key, format!("{rate:?} frames per second"))),
+        let fps = rate(&mut npz)?.unwrap_or(Self::ASSUMED_FPS);
+        let has = |npz: &Npz, key: &str| npz.keys().iter().any(|k| k == key);
+        let parts = [["root_orient", "pose_body"], ["global_orient", "body_pose"]];
+        let keys = match parts.iter().find(|parts| parts.iter().all(|key| has(&npz, key))) {
+            Some(parts) if !has(&npz, "poses") => parts.to_vec(),
+            _ => vec!["poses"],
         };
-        let vectors = |values: Vec<f32>| values.chunks_exact(3).map(Vec3::from_slice).collect::<Vec<_>>();
-        let clip = Self { poses: vectors(poses), num_joints: shape[1] / 3, trans: vectors(trans), fps };
-        check_vectors(&file, "trans", &clip.trans)?;
+        let mut parts = Vec::new();
+        for key in keys {
+            let array = npz.array(key)?;
+            let width = array.shape.iter().skip(1).product::<usize>();
+            if array.shape.len() < 2 || array.shape[0] == 0 || width == 0 || !width.is_multiple_of(3) {
+                let message = format!("shape {:?}, expected (T, 3J) or (T, J, 3)", array.shape);
+                return Err(Error::invalid(&file, key, message));
+            }
+            let values = array.to_f32(&file, key, &vec![None; array.shape.len()])?;
+            parts.push((key, array.shape[0], width, values));
+        }
+        let frames = parts[0].1;
+        if let Some((key, found, ..)) = parts.iter().find(|part| part.1 != frames) {
+            return Err(Error::invalid(&file, key, format!("{found} frames, expected {frames}")));
+        }
+        let key = if has(&npz, "transl") && !has(&npz, "trans") { "transl" } else { "trans" };
+        let (_, trans) = npz.f32(key, &[Some(frames), Some(3)])?;
+        let vectors = |values: &[f32]| values.chunks_exact(3).map(Vec3::from_slice).collect::<Vec<_>>();
+        let row = |frame: usize| parts.iter().map(move |(_, _, width, values)| &values[frame * width..][..*width]);
+        let poses: Vec<Vec3> = (0..frames).flat_map(row).flat_map(vectors).collect();
+        let clip = Self { num_joints: poses.len() / frames, poses, trans: vectors(&trans), fps };
+        check_vectors(&file, key, &clip.trans)?;
         match clip.poses.iter().position(|r| r.length() > MAX_ANGLE) {
             Some(i) => Err(Error::invalid(&file, "poses", format!("a rotation of {} rad", clip.poses[i].length()))),
             None => Ok(clip),
         }
+    }
+
+    /// Frames per second of a clip that does not say.
+    pub const ASSUMED_FPS: f32 = 30.0;
+
+    /// Frames per second in a file; `None` where it does not say.
+    ///
+    /// # Errors
+    /// As [`MotionClip::load`].
+    pub fn rate_of(path: &Path) -> Result<Option<f32>, Error> {
+        rate(&mut Npz::open(path)?)
     }
 
     /// Number of frames, T.
@@ -118,6 +145,16 @@ impl MotionClip {
         };
         let pose = (0..joints).map(|j| source(self.num_joints, joints, j).map_or(Vec3::ZERO, turn)).collect();
         (pose, Placement::Pelvis { translation: self.trans[first].lerp(self.trans[second], s) })
+    }
+}
+
+/// Frames per second, if the archive says.
+fn rate(npz: &mut Npz) -> Result<Option<f32>, Error> {
+    let rates = ["fps", "mocap_framerate", "mocap_frame_rate"];
+    let Some(key) = rates.into_iter().find(|rate| npz.keys().iter().any(|key| key == rate)) else { return Ok(None) };
+    match npz.array(key)?.to_f64().as_slice() {
+        [rate] if (1e-3..=1e6).contains(rate) => Ok(Some(*rate as f32)),
+        rate => Err(Error::invalid(npz.file(), key, format!("{rate:?} frames per second"))),
     }
 }
 

@@ -68,12 +68,13 @@ fn from_pickle(file: &str, value: &Value, key: &str) -> Result<NdArray, FileErro
         return Err(wrong("", "a dictionary", value));
     };
     let Some(found) = value.get(key) else {
-        let names = entries.iter().filter_map(|(k, _)| k.as_str());
-        return Err(FileError::MissingKey {
-            file: file.to_owned(),
-            key: key.to_owned(),
-            available: names.map(str::to_owned).collect(),
-        });
+        let name = |key: &Value| match key {
+            Value::Str(text) => Some(text.clone()),
+            Value::Bytes(bytes) => Some(String::from_utf8_lossy(bytes).into_owned()),
+            _ => None,
+        };
+        let available = entries.iter().filter_map(|(key, _)| name(key)).collect();
+        return Err(FileError::MissingKey { file: file.to_owned(), key: key.to_owned(), available });
     };
     found.to_dense(file, key)?.ok_or_else(|| wrong(key, "an array", found))
 }

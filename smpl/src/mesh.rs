@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use array_files::read_file;
+use array_files::{decode_text, read_file};
 use glam::Vec3;
 
 use crate::Error;
@@ -37,7 +37,7 @@ pub fn load_mesh(path: &Path) -> Result<Mesh, Error> {
     let extension = path.extension().and_then(|e| e.to_str()).unwrap_or("").to_ascii_lowercase();
     match extension.as_str() {
         "obj" => parse_obj(&path.display().to_string(), &read_file(path)?),
-        "glb" | "gltf" => {
+        "glb" | "gltf" | "vrm" => {
             let character = Character::load(path)?;
             let mesh = Mesh { vertices: character.rest().vertices, faces: character.faces };
             check_vectors(&path.display().to_string(), "vertices", &mesh.vertices)?;
@@ -47,12 +47,12 @@ pub fn load_mesh(path: &Path) -> Result<Mesh, Error> {
             let body = BodyModel::load(path)?;
             Ok(Mesh { vertices: body.v_template, faces: body.faces })
         }
-        _ => Err(Error::Extension { path: path.to_owned(), expected: ".obj, .glb, .gltf, .npz, .pkl or .safetensors" }),
+        _ => Err(Error::Extension { path: path.to_owned(), expected: ".obj, .glb, .gltf, .vrm, .npz, .pkl or .safetensors" }),
     }
 }
 
 fn parse_obj(file: &str, bytes: &[u8]) -> Result<Mesh, Error> {
-    let text = String::from_utf8_lossy(bytes);
+    let text = decode_text(bytes);
     let mut mesh = Mesh { vertices: Vec::new(), faces: Vec::new() };
     let mut polygon: Vec<u32> = Vec::new();
     // Line of each triangle: an index may refer to a vertex that follows, so it is checked last.

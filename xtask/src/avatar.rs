@@ -8,6 +8,7 @@ use occnerf::{Method, Model};
 use smpl::MotionClip;
 
 use crate::baked;
+use crate::process::{say, unwritten};
 use crate::run::RunConfig;
 
 /// The baked person of a run: see [`baked::avatar`].
@@ -21,9 +22,21 @@ pub fn of_run(run: &Path) -> Result<Avatar> {
     }
 }
 
+/// Reads a motion of `fps` frames per second, by default as many as the file says.
+pub fn load_motion(path: &Path, fps: Option<f32>) -> Result<MotionClip> {
+    let mut motion = MotionClip::load(path)?;
+    if let Some(fps) = fps {
+        ensure!((1e-3..=1e6).contains(&fps), "--fps {fps}: expected 0.001 to 1000000");
+        motion.fps = fps;
+    } else if MotionClip::rate_of(path)?.is_none() {
+        say!("{}: no frames per second in it, {} are assumed (--fps)", path.display(), motion.fps);
+    }
+    Ok(motion)
+}
+
 /// Adds a motion from a file, named after it.
-pub fn add_motion(avatar: &mut Avatar, path: &Path) -> Result<()> {
-    let motion = MotionClip::load(path)?;
+pub fn add_motion(avatar: &mut Avatar, path: &Path, fps: Option<f32>) -> Result<()> {
+    let motion = load_motion(path, fps)?;
     let motion = export::adapt_motion(avatar, &motion).with_context(|| path.display().to_string())?;
     let stem = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
     let taken = |name: &str| avatar.clips.iter().any(|clip| clip.name == name);
@@ -33,13 +46,13 @@ pub fn add_motion(avatar: &mut Avatar, path: &Path) -> Result<()> {
     Ok(())
 }
 
-/// Errors unless the parent folder of `out` exists.
+/// Makes the parent folder of the file `out`.
 pub fn check_folder(out: &Path) -> Result<()> {
     let folder = match out.parent() {
         Some(parent) if parent != Path::new("") => parent.to_owned(),
         _ => PathBuf::from("."),
     };
-    ensure!(folder.is_dir(), "--out {}: no such folder {}", out.display(), folder.display());
+    std::fs::create_dir_all(&folder).map_err(unwritten(&folder))?;
     ensure!(!out.is_dir(), "--out {}: is a folder, expected a file", out.display());
     Ok(())
 }

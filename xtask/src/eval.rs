@@ -330,8 +330,10 @@ pub fn score_baked(
 /// Writes the contact sheets of both splits.
 fn draw(directory: &Path, novel: Vec<Vec<Result<[RgbImage; 2]>>>, train: Vec<Result<[RgbImage; 2]>>) -> Result<()> {
     make_directory(&directory.join("renders"))?;
-    let rows = novel.into_iter().map(pairs).collect::<Result<Vec<_>>>()?;
-    pictures::save(&pictures::sheet(&rows), &directory.join("renders/novel_views.png"))?;
+    if !novel.is_empty() {
+        let rows = novel.into_iter().map(pairs).collect::<Result<Vec<_>>>()?;
+        pictures::save(&pictures::sheet(&rows), &directory.join("renders/novel_views.png"))?;
+    }
     pictures::save(&pictures::sheet(&[pairs(train)?]), &directory.join("renders/train_views.png"))
 }
 

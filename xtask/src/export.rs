@@ -31,8 +31,9 @@ enum Format {
 pub struct ExportArguments {
     /// Run directory
     run: PathBuf,
+    /// What to write [default: by the extension of --out]
     #[arg(long)]
-    format: Format,
+    format: Option<Format>,
     /// File to write
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
@@ -40,6 +41,9 @@ pub struct ExportArguments {
     /// place of the video's motion elsewhere
     #[arg(long, value_name = "CLIP.npz")]
     motion: Option<PathBuf>,
+    /// Frames per second of --motion [default: as the file says]
+    #[arg(long, value_name = "N", requires = "motion")]
+    fps: Option<f32>,
     /// Frame of the motion whose pose a ply or an obj shows [default: the first]
     #[arg(long, value_name = "N")]
     frame: Option<usize>,
@@ -49,15 +53,16 @@ pub struct ExportArguments {
 pub fn export(arguments: &ExportArguments) -> Result<()> {
     let out = &arguments.out;
     avatar::check_folder(out)?;
-    if arguments.frame.is_some() && !matches!(arguments.format, Format::Ply | Format::Obj) {
+    let format = format(arguments)?;
+    if arguments.frame.is_some() && !matches!(format, Format::Ply | Format::Obj) {
         bail!("--frame is of one pose: --format ply or obj");
     }
     let mut person = avatar::of_run(&arguments.run)?;
     if let Some(path) = &arguments.motion {
-        avatar::add_motion(&mut person, path)?;
+        avatar::add_motion(&mut person, path, arguments.fps)?;
     }
     let clip = if arguments.motion.is_some() { person.clips.len() - 1 } else { 0 };
-    match arguments.format {
+    match format {
         Format::Glb => {
             let bytes = person.to_glb()?;
             replace_file(out, |to| to.write_all(&bytes)).map_err(unwritten(out))?;
@@ -84,6 +89,20 @@ pub fn export(arguments: &ExportArguments) -> Result<()> {
         }
     }
     Ok(())
+}
+
+/// The format asked for, or that of the file's extension; both must agree.
+fn format(arguments: &ExportArguments) -> Result<Format> {
+    let out = &arguments.out;
+    let extension = out.extension().map(|e| e.to_string_lossy().to_lowercase()).unwrap_or_default();
+    let named = Format::from_str(&extension, true).ok();
+    match (arguments.format, named) {
+        (Some(asked), Some(named)) if asked != named => {
+            bail!("--out {}: a name of another format than --format {asked:?}", out.display())
+        }
+        (Some(format), _) | (None, Some(format)) => Ok(format),
+        (None, None) => bail!("--out {}: expected .glb, .ply, .obj or .npz, or --format", out.display()),
+    }
 }
 
 struct Posed {

@@ -1,8 +1,9 @@
 //! `import`: a capture from the results of a body estimator and a segmenter.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
+use std::process::Command;
 
-use anyhow::{Error, Result, bail};
+use anyhow::{Context, Error, Result, bail};
 use clap::Args;
 use occnerf::capture::{self, ImportOptions, Imported};
 
@@ -24,6 +25,7 @@ Run one estimator and one segmenter as their own pages say, on the same frames (
   4D-Humans, PHALP  outputs/results/demo_CLIP.pkl             (track.py; its masks are used without --masks)
   GVHMR             outputs/demo/CLIP/hmr4d_results.pt        (wants --body SMPLX_NEUTRAL.npz)
   PromptHMR         results/CLIP/results.pkl                  (wants --body SMPLX_NEUTRAL.npz; its masks are used, too)
+  VIBE, PyMAF       output/CLIP/vibe_output.pkl
   ROMP              OUTPUT/video_results.npz                  (romp --mode=video -t)
   EasyMocap         OUTPUT, the folder with smpl/; intri.yml and extri.yml in it or above
   PeopleSnapshot    SUBJECT/poses.npz, as InstantAvatar prepares it, with cameras.npz (--frames images --masks masks)
@@ -43,24 +45,27 @@ Then: cargo xtask train CAPTURE";
 #[derive(Args)]
 #[command(after_long_help = TOOLS, after_help = "--help says where each tool leaves its file")]
 pub struct ImportArguments {
-    /// Folder of the video's frames, PNG or JPEG, in the order of their names
-    #[arg(long, value_name = "DIR")]
+    /// Folder of the video's frames, PNG or JPEG, in the order of their names; or the video, where
+    /// ffmpeg is installed
+    #[arg(long, value_name = "DIR|VIDEO")]
     frames: PathBuf,
     /// What the estimator wrote: a file, or EasyMocap's folder
     #[arg(long, value_name = "FILE")]
     fit: PathBuf,
-    /// What the segmenter wrote: a folder, or a .npy file [default: the masks in the fit]
+    /// What the segmenter wrote: a folder, a .npy or a .npz file [default: the masks in the fit, or the
+    /// frames' alpha]
     #[arg(long, value_name = "DIR|FILE")]
     masks: Option<PathBuf>,
-    /// The estimator's id of the person [default: who is there in most frames]
-    #[arg(long, value_name = "ID")]
+    /// The estimator's id of the person, or several ids of one person, as 0,4,17 [default: who is there
+    /// in most frames]
+    #[arg(long, value_name = "IDS")]
     person: Option<String>,
     /// The person's value in masks of ids [default: 1]
     #[arg(long, value_name = "ID")]
-    object: Option<u8>,
+    object: Option<u32>,
     /// Values of occluders in masks of ids
     #[arg(long, value_name = "IDS", value_delimiter = ',')]
-    occluder_objects: Vec<u8>,
+    occluder_objects: Vec<u32>,
     /// Focal length in pixels [default: the one that the estimator assumed]
     #[arg(long, value_name = "PX")]
     focal: Option<f64>,
@@ -83,7 +88,7 @@ pub struct ImportArguments {
 pub fn import(arguments: &ImportArguments) -> Result<()> {
     let out = &arguments.out;
     vacant(out, arguments.force, MARK)?;
-    let options = ImportOptions {
+    let mut options = ImportOptions {
         frames: arguments.frames.clone(),
         fit: arguments.fit.clone(),
         masks: arguments.masks.clone(),
@@ -104,6 +109,11 @@ pub fn import(arguments: &ImportArguments) -> Result<()> {
             not_within(path, out, what)?;
         }
     }
+    let decoded = beside(out, "frames")?;
+    if options.frames.is_file() {
+        decode(&options.frames, &decoded)?;
+        (options.frames, options.copy) = (decoded.clone(), true);
+    }
     let partial = beside(out, "partial")?;
     let written = capture::import(&options, &partial).map_err(Error::from).map_err(results_in(&partial));
     let written = written.and_then(|imported| {
@@ -112,6 +122,9 @@ pub fn import(arguments: &ImportArguments) -> Result<()> {
         crate::run::write(&partial.join(MARK), &serde_json::to_string_pretty(&mark)?)?;
         take_place(&partial, out, arguments.force, MARK).map(|()| imported)
     });
+    if options.frames == decoded {
+        std::fs::remove_dir_all(&decoded).with_context(|| decoded.display().to_string())?;
+    }
     let imported = match written {
         Ok(imported) => imported,
         Err(error) => {
@@ -123,6 +136,23 @@ pub fn import(arguments: &ImportArguments) -> Result<()> {
     check::check(&CheckArguments::of(out))?;
     say!("train on it: cargo xtask train {}", out.display());
     Ok(())
+}
+
+/// Decodes a video into a folder by ffmpeg.
+fn decode(video: &Path, into: &Path) -> Result<()> {
+    let command = format!("ffmpeg -i {} FRAMES/%06d.png", video.display());
+    if into.exists() {
+        std::fs::remove_dir_all(into).with_context(|| into.display().to_string())?;
+    }
+    std::fs::create_dir_all(into).with_context(|| into.display().to_string())?;
+    let run = Command::new("ffmpeg").args(["-nostdin", "-v", "error", "-i"]).arg(video).arg(into.join("%06d.png")).output();
+    let refused = match run {
+        Ok(output) if output.status.success() => return Ok(()),
+        Ok(output) => String::from_utf8_lossy(&output.stderr).trim().to_owned(),
+        Err(error) => format!("ffmpeg: {error}"),
+    };
+    std::fs::remove_dir_all(into).with_context(|| into.display().to_string())?;
+    bail!("--frames {}: expected a folder of frames, or a video that ffmpeg reads ({command}): {refused}", video.display())
 }
 
 /// Prints a summary of an import.
@@ -141,11 +171,13 @@ fn say(imported: &Imported) {
         (between, "between, without a fit"),
         (imported.ghosts, "of these with a fit left over from an earlier frame"),
         (imported.unmasked, "with a fit but without a mask"),
+        (imported.absent, "of the fit without a picture"),
     ] {
         if count > 0 {
             say!("left out: {count} frames {what}");
         }
     }
+    imported.notes.iter().for_each(|note| say!("{note}"));
     if *betas_spread > 1e-6 {
         say!("shape: the robust mean of all frames (standard deviation of a coefficient at most {betas_spread:.2})");
     }

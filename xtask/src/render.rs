@@ -10,10 +10,11 @@ use indicatif::ProgressBar;
 use occnerf::bake::BakedRenderer;
 use occnerf::bake::export::fit_motion;
 use occnerf::{Body, FieldRenderer, Method, Model, Person, PosedFrame, PosedView, PriorRenderer, Renderer, upright};
-use smpl::{MotionClip, Placement};
+use smpl::Placement;
 use visibility::Samples;
 use volrender::Camera;
 
+use crate::avatar::load_motion;
 use crate::process::say;
 use crate::run::{RunConfig, make_directory, use_threads};
 use crate::video::{self, FilmFormat};
@@ -43,11 +44,14 @@ pub struct RenderArguments {
     run: PathBuf,
     what: What,
     /// Training frame of `freeview` [default: the first]
-    #[arg(long, default_value_t = 0)]
-    frame: usize,
+    #[arg(long, value_name = "N")]
+    frame: Option<usize>,
     /// Motion capture for `pose`, an .npz with poses, trans and fps, as AMASS has them
     #[arg(long, value_name = "CLIP.npz", required_if_eq("what", "pose"))]
     motion: Option<PathBuf>,
+    /// Frames per second of --motion [default: as the file says]
+    #[arg(long, value_name = "N", requires = "motion")]
+    fps: Option<f32>,
     /// Size of the pictures, WIDTHxHEIGHT [default: as in training]
     #[arg(long)]
     size: Option<String>,
@@ -89,8 +93,8 @@ pub fn render(arguments: &RenderArguments) -> Result<()> {
         };
         (&**model.body(), model.frames(), renderer)
     };
-    if arguments.frame >= frames.len() {
-        bail!("--frame {}: {} has frames 0 to {}", arguments.frame, run.scene, frames.len() - 1);
+    if let Some(frame) = arguments.frame.filter(|frame| *frame >= frames.len()) {
+        bail!("--frame {frame}: {} has frames 0 to {}", run.scene, frames.len() - 1);
     }
     if arguments.motion.is_some() && arguments.what != What::Pose {
         bail!("--motion is for `render RUN pose`");
@@ -134,7 +138,7 @@ fn views<'a>(
     size: Option<(u32, u32)>,
 ) -> Result<Views<'a>> {
     let resized = move |camera: &Camera| size.map_or(*camera, |(w, h)| camera.resized(w, h));
-    let frame = &frames[arguments.frame];
+    let frame = &frames[arguments.frame.unwrap_or(0)];
     let angle = |i: usize, count: usize| i as f32 / count as f32 * std::f32::consts::TAU;
     let angles = (0..TURN).map(move |i| angle(i, TURN));
     // The camera of a frame, orbited about the vertical through the body.
@@ -162,7 +166,7 @@ fn views<'a>(
             let joints = body.model.num_joints();
             let root = body.canonical.joints.first().map_or(Vec3::ZERO, |&joint| joint / body.scale);
             let motion =
-                fit_motion(&MotionClip::load(path)?, joints, root).with_context(|| path.display().to_string())?;
+                fit_motion(&load_motion(path, arguments.fps)?, joints, root).with_context(|| path.display().to_string())?;
             let count = motion.trans.len();
             let view = move |i: usize| {
                 let (pose, translation) = (&motion.poses[i * joints..][..joints], motion.trans[i]);

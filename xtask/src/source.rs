@@ -146,6 +146,9 @@ pub fn load_with(
     if directory.is_file() && is_character(directory) {
         bail!("{scene}: a character; film it with cargo lab synth {scene} --out DIR, then cargo xtask train DIR");
     }
+    if directory.is_file() {
+        bail!("{scene}: a file, expected a capture's folder; of a video: cargo xtask import --frames {scene} --help");
+    }
     if !directory.is_dir() {
         let expected =
             if scene == DEMO { "the demo, in a clone of the sources" } else { "a capture, or no SCENE for the demo" };
@@ -174,7 +177,7 @@ pub fn load_with(
 /// Whether `path` is named like a rigged character.
 pub fn is_character(path: &Path) -> bool {
     let extension = path.extension().and_then(|e| e.to_str()).unwrap_or("");
-    ["glb", "gltf"].iter().any(|known| extension.eq_ignore_ascii_case(known))
+    ["glb", "gltf", "vrm"].iter().any(|known| extension.eq_ignore_ascii_case(known))
 }
 
 #[cfg(test)]

@@ -5,6 +5,8 @@ use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use array_files::decode_text;
+
 use super::camera::Lens;
 use super::gate::Gate;
 use super::image::{dimensions, load_mask, resize};
@@ -42,15 +44,19 @@ pub(super) fn decoding_bytes((width, height): (u32, u32)) -> u64 {
     u64::from(width) * u64::from(height) * DECODED_BYTES
 }
 
-/// Reads a text file of at most `most` bytes.
+/// Reads a text file of at most `most` bytes, of any encoding of [`decode_text`].
 pub(super) fn read_text(path: &Path, most: u64) -> Result<String, CaptureError> {
     let file = std::fs::File::open(path).map_err(CaptureError::io(path))?;
-    let mut text = String::new();
-    file.take(most + 1).read_to_string(&mut text).map_err(CaptureError::io(path))?;
-    if text.len() as u64 > most {
+    let mut bytes = Vec::new();
+    file.take(most + 1).read_to_end(&mut bytes).map_err(CaptureError::io(path))?;
+    if bytes.len() as u64 > most {
         return Err(CaptureError::invalid(path, "size", format!("at most {most} bytes"), "more"));
     }
-    Ok(text)
+    let text = decode_text(&bytes);
+    match text.contains(char::REPLACEMENT_CHARACTER) {
+        true => Err(CaptureError::invalid(path, "encoding", "UTF-8, or UTF-16 with its mark", "other bytes")),
+        false => Ok(text),
+    }
 }
 
 impl Files {

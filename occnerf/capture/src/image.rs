@@ -3,7 +3,8 @@
 use std::path::Path;
 
 use image::imageops::{FilterType, resize as resize_picture};
-use image::{DynamicImage, ImageBuffer, ImageReader, Luma, Rgb};
+use image::metadata::Orientation;
+use image::{DynamicImage, ImageBuffer, ImageDecoder, ImageReader, Luma, Rgb};
 
 use super::CaptureError;
 
@@ -44,7 +45,9 @@ impl Image {
         [self.pixels[i], self.pixels[i + 1], self.pixels[i + 2]]
     }
 
-    /// Reads a PNG or JPEG of 8 or 16 bits a channel; grey becomes RGB, transparency is dropped.
+    /// Reads a PNG or JPEG of 8 or 16 bits a channel, turned upright by the orientation of its Exif
+    /// data; grey becomes RGB, transparency is dropped. Colours are taken for sRGB: embedded profiles
+    /// and gamma chunks are not applied.
     ///
     /// # Errors
     /// [`CaptureError::Io`], [`CaptureError::Picture`], and, before decoding, [`CaptureError::Invalid`]
@@ -102,9 +105,28 @@ fn open(path: &Path) -> Result<ImageReader<std::io::BufReader<std::fs::File>>, C
     ImageReader::open(path).and_then(ImageReader::with_guessed_format).map_err(CaptureError::io(path))
 }
 
-/// Width and height from the header alone.
+/// Width and height from the header alone, upright.
 pub(super) fn dimensions(path: &Path) -> Result<(u32, u32), CaptureError> {
-    let (width, height) = open(path)?.into_dimensions().map_err(|source| picture_error(path, source))?;
+    header(path).map(|(_, _, size)| size)
+}
+
+/// Whether a picture has a colour profile that is not named sRGB.
+pub(super) fn has_profile(path: &Path) -> Result<bool, CaptureError> {
+    let profile = header(path)?.0.icc_profile().map_err(|source| picture_error(path, source))?;
+    // Version 4 has UTF-16.
+    let bytes: Vec<u8> = profile.unwrap_or_default().into_iter().filter(|byte| *byte != 0).collect();
+    Ok(!bytes.is_empty() && !bytes.windows(4).any(|word| word == b"sRGB"))
+}
+
+/// A decoder, the orientation of Exif, and the upright size.
+fn header(path: &Path) -> Result<(impl ImageDecoder, Orientation, (u32, u32)), CaptureError> {
+    use Orientation::{Rotate90, Rotate90FlipH, Rotate270, Rotate270FlipH};
+    let mut decoder = open(path)?.into_decoder().map_err(|source| picture_error(path, source))?;
+    let orientation = decoder.orientation().map_err(|source| picture_error(path, source))?;
+    let (mut width, mut height) = decoder.dimensions();
+    if matches!(orientation, Rotate90 | Rotate90FlipH | Rotate270 | Rotate270FlipH) {
+        (width, height) = (height, width);
+    }
     if width.min(height) == 0 || width.max(height) > MAX_SIDE {
         return Err(CaptureError::invalid(
             path,
@@ -113,20 +135,36 @@ pub(super) fn dimensions(path: &Path) -> Result<(u32, u32), CaptureError> {
             format!("{width}×{height}"),
         ));
     }
-    Ok((width, height))
+    Ok((decoder, orientation, (width, height)))
 }
 
+/// The picture, upright.
 pub(super) fn decode(path: &Path) -> Result<DynamicImage, CaptureError> {
-    dimensions(path)?;
-    open(path)?.decode().map_err(|source| picture_error(path, source))
+    let (decoder, orientation, _) = header(path)?;
+    let mut picture = DynamicImage::from_decoder(decoder).map_err(|source| picture_error(path, source))?;
+    picture.apply_orientation(orientation);
+    Ok(picture)
 }
 
-/// Coverage in [0,1] from a mask picture, with its width and height: the largest of a pixel's
-/// colour channels, full scale (255) being 1.
+/// The alpha channel, 16 bits, where a pixel is not opaque.
+pub(super) fn alpha(picture: &DynamicImage) -> Option<Vec<u16>> {
+    if !picture.color().has_alpha() {
+        return None;
+    }
+    let alpha: Vec<u16> = picture.to_luma_alpha16().pixels().map(|pixel| pixel.0[1]).collect();
+    alpha.iter().any(|a| *a < u16::MAX).then_some(alpha)
+}
+
+/// Coverage in [0,1] from a mask picture, with its width and height: alpha where a pixel is not
+/// opaque, else the largest of a pixel's colour channels, full scale (255) being 1.
 pub(super) fn load_mask(path: &Path) -> Result<(u32, u32, Vec<f32>), CaptureError> {
-    let picture = Image::load(path)?;
-    let mask = picture.pixels.chunks_exact(3).map(|p| p[0].max(p[1]).max(p[2])).collect();
-    Ok((picture.width, picture.height, mask))
+    let picture = decode(path)?;
+    let (width, height) = (picture.width(), picture.height());
+    let mask = match alpha(&picture) {
+        Some(alpha) => alpha.into_iter().map(|a| f32::from(a) / f32::from(u16::MAX)).collect(),
+        None => picture.into_rgb32f().pixels().map(|p| p[0].max(p[1]).max(p[2])).collect(),
+    };
+    Ok((width, height, mask))
 }
 
 /// Resamples values of `channels` (1 or 3) a pixel with a tent filter as wide as the reduction
@@ -214,6 +252,54 @@ mod tests {
         std::fs::write(&path, header).unwrap();
         let message = Image::load(&path).unwrap_err().to_string();
         assert!(message.contains("100000×100000") && message.contains("8192"), "{message}");
+    }
+
+    /// A JPEG with an orientation, 1 to 8, in Exif data.
+    fn oriented(picture: &image::RgbImage, orientation: u8) -> Vec<u8> {
+        let mut jpeg = Vec::new();
+        image::codecs::jpeg::JpegEncoder::new_with_quality(&mut jpeg, 100).encode_image(picture).unwrap();
+        let mut exif = b"Exif\0\0MM\0\x2a\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0".to_vec();
+        exif.extend([orientation, 0, 0, 0, 0, 0, 0]);
+        let mut segment = vec![0xFF, 0xE1];
+        segment.extend((exif.len() as u16 + 2).to_be_bytes());
+        segment.extend(exif);
+        jpeg.splice(2..2, segment);
+        jpeg
+    }
+
+    #[test]
+    fn pictures_of_every_orientation_stand_upright() {
+        let dir = directory("upright");
+        // Blocks of eight pixels, which JPEG keeps apart: red, green, blue, white, black, yellow.
+        let colors = [[255, 0, 0], [0, 255, 0], [0, 0, 255], [255; 3], [0; 3], [255, 255, 0]];
+        let upright = image::RgbImage::from_fn(24, 16, |x, y| image::Rgb(colors[(x / 8 + 3 * (y / 8)) as usize]));
+        // How a camera that is held so stores the upright picture: (column, row) of a stored pixel.
+        type Stored = fn(u32, u32) -> (u32, u32);
+        let stored: [(u32, u32, Stored); 8] = [
+            (24, 16, |x, y| (x, y)),
+            (24, 16, |x, y| (23 - x, y)),
+            (24, 16, |x, y| (23 - x, 15 - y)),
+            (24, 16, |x, y| (x, 15 - y)),
+            (16, 24, |x, y| (y, x)),
+            (16, 24, |x, y| (23 - y, x)),
+            (16, 24, |x, y| (23 - y, 15 - x)),
+            (16, 24, |x, y| (y, 15 - x)),
+        ];
+        for (i, (width, height, from)) in stored.into_iter().enumerate() {
+            let turned = image::RgbImage::from_fn(width, height, |x, y| {
+                let (x, y) = from(x, y);
+                *upright.get_pixel(x, y)
+            });
+            let path = dir.join(format!("{i}.jpg"));
+            std::fs::write(&path, oriented(&turned, i as u8 + 1)).unwrap();
+            assert_eq!(dimensions(&path).unwrap(), (24, 16), "{}", i + 1);
+            let read = Image::load(&path).unwrap();
+            for (x, y, color) in upright.enumerate_pixels().filter(|(x, y, _)| x % 8 == 4 && y % 8 == 4) {
+                let difference = [0, 1, 2].map(|c| (read.rgb(x, y)[c] - f32::from(color[c]) / 255.0).abs());
+                assert!(difference.iter().all(|d| *d < 0.2), "{} ({x}, {y}): {difference:?}", i + 1);
+            }
+            assert_eq!(load_mask(&path).unwrap().0, 24);
+        }
     }
 
     fn crc32(bytes: &[u8]) -> u32 {

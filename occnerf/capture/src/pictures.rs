@@ -12,6 +12,11 @@ pub(super) fn file_name(path: &Path) -> String {
     name.to_string_lossy().into_owned()
 }
 
+/// Whether a file is one that systems leave behind: `._x.png`, `.DS_Store`.
+pub(super) fn is_hidden(path: &Path) -> bool {
+    file_name(path).starts_with('.')
+}
+
 /// Whether there is a directory at `path`.
 ///
 /// # Errors
@@ -35,6 +40,9 @@ impl Pictures {
         let mut found = BTreeMap::new();
         for entry in std::fs::read_dir(dir).map_err(CaptureError::io(dir))? {
             let path = entry.map_err(CaptureError::io(dir))?.path();
+            if is_hidden(&path) {
+                continue;
+            }
             let extension = path.extension().map(|e| e.to_string_lossy().to_lowercase());
             if !matches!(extension.as_deref(), Some("png" | "jpg" | "jpeg")) {
                 continue;

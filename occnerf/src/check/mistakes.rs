@@ -29,6 +29,12 @@ pub enum Mistake {
     Radians,
     /// The focal length is too long by about this factor.
     Focal(f32),
+    /// Focal length and principal point are those of pictures larger by this factor.
+    Scaled(f32),
+    /// The principal point is far from the picture's centre: 0 where it was left out.
+    PrincipalPoint,
+    /// The pictures are mirrored left to right, the fit is not, or the reverse.
+    Mirrored,
     /// Masks are inverted.
     MaskInverted,
     /// The fit of a picture belongs to the picture this many frames later.
@@ -65,6 +71,13 @@ impl std::fmt::Display for Mistake {
                 write!(f, "the focal length is about {:.2} times too short", 1.0 / factor)
             }
             Self::Focal(factor) => write!(f, "the focal length is about {factor:.2} times too long"),
+            Self::Scaled(factor) => write!(
+                f,
+                "the intrinsics are of pictures {factor:.2} times as large: multiply focal length and principal point by {:.2}",
+                1.0 / factor
+            ),
+            Self::PrincipalPoint => f.write_str("the principal point is far off: it is the centre of the picture"),
+            Self::Mirrored => f.write_str("pictures and fit are mirrored, left to right: flip the pictures"),
             Self::MaskInverted => f.write_str("the masks are inverted: 255 must be the person"),
             Self::FrameShift(by) => {
                 let (count, when) = (by.abs(), if *by > 0 { "later" } else { "earlier" });
@@ -97,6 +110,11 @@ const SHIFT_BY: f32 = 0.004;
 const UNDONE_VIEWS: usize = 12;
 /// Focal length errors to try, octaves; finer below one, where the overlap changes fast.
 const OCTAVES: [f32; 10] = [0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0];
+/// Sizes of other pictures that intrinsics may be of, and bisections of the best focal length.
+const SCALES: [f32; 10] = [0.25, 1.0 / 3.0, 0.5, 2.0 / 3.0, 0.75, 4.0 / 3.0, 1.5, 2.0, 3.0, 4.0];
+const REFINEMENTS: usize = 5;
+/// Least distance of a wrong principal point from the centre, as a share of the picture's side.
+const OFF_CENTRE: f32 = 0.2;
 /// Plausible areas of the silhouette, as multiples of the mask's.
 const AREAS: std::ops::Range<f32> = 0.3..8.0;
 
@@ -172,15 +190,24 @@ pub(super) fn find(capture: &Capture, body: &BodyModel, views: &[View]) -> Resul
     if around > BORDER && iou > given && covers > given {
         return Ok(vec![Mistake::MaskInverted]);
     }
-    let mut undone = Vec::new();
-    for mistake in others.into_iter().chain(focal) {
+    let mut best: Option<(Mistake, f32)> = None;
+    let pictures = SCALES.map(Mistake::Scaled).into_iter().chain([Mistake::PrincipalPoint, Mistake::Mirrored]);
+    for mistake in others.into_iter().chain(pictures).chain(focal) {
+        let is_off = views.iter().any(|view| off_centre(&view.camera) > OFF_CENTRE);
+        if mistake == Mistake::PrincipalPoint && !is_off {
+            continue;
+        }
         let (iou, covers) = mean(&overlaps(&posed, body, Some(mistake))?);
-        if iou > BETTER * given && iou > given + BETTER_BY && covers > COVERS {
-            undone.push((mistake, iou));
+        let is_likely = iou > BETTER * given && iou > given + BETTER_BY && covers > COVERS;
+        if is_likely && best.is_none_or(|(_, most)| iou > most) {
+            best = Some((mistake, iou));
         }
     }
-    if let Some((mistake, _)) = undone.into_iter().max_by(|a, b| a.1.total_cmp(&b.1)) {
-        return Ok(vec![mistake]);
+    if let Some((mistake, iou)) = best {
+        return Ok(vec![match mistake {
+            Mistake::Focal(factor) => Mistake::Focal(refined(factor, iou, &posed, body)?),
+            mistake => mistake,
+        }]);
     }
     if covered < BESIDE {
         let sized = |overlap: &&Overlap| AREAS.contains(&(overlap.body as f32 / overlap.mask.max(1) as f32));
@@ -188,6 +215,27 @@ pub(super) fn find(capture: &Capture, body: &BodyModel, views: &[View]) -> Resul
         return Ok(vec![if most { Mistake::WrongPerson } else { Mistake::NoFit }]);
     }
     Ok(shift(capture, body, views)?.into_iter().collect())
+}
+
+/// The focal length error of most overlap near `factor`, whose overlap is `most`.
+fn refined(mut factor: f32, mut most: f32, posed: &[Posed<'_>], body: &BodyModel) -> Result<f32, Error> {
+    let mut octaves = 0.25;
+    for _ in 0..REFINEMENTS {
+        for other in [factor * 2f32.powf(octaves), factor * 2f32.powf(-octaves)] {
+            let (iou, _) = mean(&overlaps(posed, body, Some(Mistake::Focal(other)))?);
+            if iou > most {
+                (factor, most) = (other, iou);
+            }
+        }
+        octaves /= 2.0;
+    }
+    Ok(factor)
+}
+
+/// Largest distance of the principal point from the centre, as a share of the side.
+fn off_centre(camera: &Camera) -> f32 {
+    let size = glam::Vec2::new(camera.width as f32, camera.height as f32);
+    (camera.centre / size - 0.5).abs().max_element()
 }
 
 /// Mean overlap and mean share of the mask covered.
@@ -236,6 +284,13 @@ impl<'a> Posed<'a> {
                 camera.world_to_camera *= closer;
             }
             Mistake::Focal(factor) => camera.focal /= factor,
+            Mistake::Scaled(factor) => {
+                camera.focal /= factor;
+                camera.centre /= factor;
+            }
+            Mistake::PrincipalPoint => {
+                camera.centre = glam::Vec2::new(camera.width as f32, camera.height as f32) / 2.0;
+            }
             _ => {}
         }
         camera
@@ -243,7 +298,10 @@ impl<'a> Posed<'a> {
 
     fn overlap(&self, undo: Option<Mistake>, body: &BodyModel) -> Result<Overlap, Error> {
         let camera = undo.map_or(self.view.camera, |mistake| self.undone(mistake));
-        let silhouette = silhouette(&self.vertices, &body.faces, &camera)?;
+        let mut silhouette = silhouette(&self.vertices, &body.faces, &camera)?;
+        if undo == Some(Mistake::Mirrored) {
+            silhouette.chunks_exact_mut(camera.width as usize).for_each(<[bool]>::reverse);
+        }
         Ok(Overlap::of(&silhouette, self.view, undo == Some(Mistake::MaskInverted)))
     }
 }

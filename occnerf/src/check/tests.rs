@@ -99,6 +99,20 @@ fn made(mistake: Mistake, capture: &Capture, body: &BodyModel) -> Capture {
             Mistake::Degrees => frame.pose.iter_mut().for_each(|axis| *axis *= 180.0 / std::f32::consts::PI),
             Mistake::Radians => frame.pose.iter_mut().for_each(|axis| *axis *= std::f32::consts::PI / 180.0),
             Mistake::Focal(factor) => camera.focal *= factor,
+            Mistake::Scaled(factor) => {
+                camera.focal *= factor;
+                camera.centre *= factor;
+            }
+            Mistake::PrincipalPoint => camera.centre = glam::Vec2::ZERO,
+            Mistake::Mirrored => frame.source.edit(|pixels| {
+                let width = pixels.image.width as usize;
+                pixels.mask.chunks_exact_mut(width).for_each(<[f32]>::reverse);
+                pixels.image.pixels.chunks_exact_mut(3 * width).for_each(|row| {
+                    row.reverse();
+                    row.chunks_exact_mut(3).for_each(<[f32]>::reverse);
+                });
+                pixels.occluder.iter_mut().for_each(|o| o.chunks_exact_mut(width).for_each(<[bool]>::reverse));
+            }),
             Mistake::MaskInverted => {
                 frame.source.edit(|pixels| pixels.mask.iter_mut().for_each(|m| *m = 1.0 - *m));
             }
@@ -121,8 +135,7 @@ fn made(mistake: Mistake, capture: &Capture, body: &BodyModel) -> Capture {
 
 fn same(found: Mistake, made: Mistake) -> bool {
     match (found, made) {
-        // To half an octave.
-        (Mistake::Focal(a), Mistake::Focal(b)) => (a / b).log2().abs() < 0.6,
+        (Mistake::Focal(a), Mistake::Focal(b)) => (a / b - 1.0).abs() < 0.15,
         (found, made) => found == made,
     }
 }
@@ -173,6 +186,10 @@ fn each_mistake_is_found() {
         Mistake::Focal(2.0),
         Mistake::Focal(0.5),
         Mistake::Focal(8.0),
+        Mistake::Scaled(0.5),
+        Mistake::Scaled(2.0),
+        Mistake::PrincipalPoint,
+        Mistake::Mirrored,
         Mistake::MaskInverted,
         Mistake::FrameShift(1),
         Mistake::FrameShift(-1),

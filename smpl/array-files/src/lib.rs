@@ -43,4 +43,4 @@ struct Readme;
 
 pub use array::{Data, NdArray};
 pub use error::Error;
-pub use file::read_file;
+pub use file::{decode_text, read_file};

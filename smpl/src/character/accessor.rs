@@ -100,15 +100,19 @@ impl<'a> Source<'a> {
         if accessor.sparse.is_some() {
             return invalid("sparse accessors are not read");
         }
-        let Some(view) = accessor.buffer_view else {
-            return invalid("no data");
-        };
-        let (view, bytes) = self.view(view, &place)?;
         let kind = kind.0;
+        let count = accessor.count.0;
+        let cost = count.saturating_mul((N * size_of::<T>()) as u64);
+        let Some(left) = self.left.get().checked_sub(cost) else {
+            return Err(Error::too_large(self.file, &place, u128::from(cost), MAX_DECODED_BYTES));
+        };
+        self.left.set(left);
+        // Without a view, zeros.
+        let Some(view) = accessor.buffer_view else { return Ok(vec![[T::default(); N]; count as usize]) };
+        let (view, bytes) = self.view(view, &place)?;
         let width = kind.size();
         let size = N * width;
         let stride = view.byte_stride.map_or(size, |stride| stride.0);
-        let count = accessor.count.0;
         let start = accessor.byte_offset.unwrap_or_default().0;
         let last = count.checked_sub(1).and_then(|n| n.checked_mul(stride as u64));
         let end = last.and_then(|n| n.checked_add(size as u64)).and_then(|n| n.checked_add(start));
@@ -118,11 +122,6 @@ impl<'a> Source<'a> {
         if stride < size {
             return invalid(&format!("a stride of {stride} for elements of {size} bytes"));
         }
-        let cost = count * (N * size_of::<T>()) as u64;
-        let Some(left) = self.left.get().checked_sub(cost) else {
-            return Err(Error::too_large(self.file, &place, u128::from(cost), MAX_DECODED_BYTES));
-        };
-        self.left.set(left);
         // Both fit: they lie within the bytes.
         let (count, start) = (count as usize, start as usize);
         let mut out = Vec::with_capacity(count);
@@ -140,11 +139,19 @@ impl<'a> Source<'a> {
         Ok(out)
     }
 
-    /// Finite floats; integers only if normalised.
+    /// Finite floats; integers if normalised, or where the document quantises (KHR_mesh_quantization).
     pub(super) fn floats<const N: usize>(&self, index: Index<Accessor>, place: &str) -> Result<Vec<[f32; N]>, Error> {
+        let quantized = self.root.extensions_required.iter().any(|name| name == "KHR_mesh_quantization");
         self.elements(index, place, |kind, normalized, bytes| match kind {
             ComponentType::F32 => Some(f32::from_le_bytes(bytes.try_into().ok()?)).filter(|x| x.is_finite()),
-            _ if !normalized => None,
+            _ if !normalized && !quantized => None,
+            _ if !normalized => match *bytes {
+                [a] if kind == ComponentType::U8 => Some(f32::from(a)),
+                [a] => Some(f32::from(a as i8)),
+                [a, b] if kind == ComponentType::U16 => Some(f32::from(u16::from_le_bytes([a, b]))),
+                [a, b] => Some(f32::from(i16::from_le_bytes([a, b]))),
+                _ => None,
+            },
             ComponentType::U8 => Some(f32::from(*bytes.first()?) / 255.0),
             ComponentType::U16 => Some(f32::from(u16::from_le_bytes(bytes.try_into().ok()?)) / 65535.0),
             ComponentType::I8 => Some((f32::from(*bytes.first()? as i8) / 127.0).max(-1.0)),
@@ -174,7 +181,8 @@ impl<'a> Source<'a> {
             let bytes = base64::engine::general_purpose::STANDARD.decode(text);
             return Ok((mime.to_owned(), bytes.map_err(|e| self.invalid(place, e.to_string()))?));
         }
-        let path = Path::new(uri);
+        let decoded = percent_decoded(uri);
+        let path = Path::new(&decoded);
         let inside = path.components().all(|c| matches!(c, Component::Normal(_) | Component::CurDir));
         match self.folder {
             Some(folder) if inside => {
@@ -200,4 +208,17 @@ impl<'a> Source<'a> {
     pub(super) fn invalid(&self, place: &str, message: impl Into<String>) -> Error {
         Error::invalid(self.file, place, message)
     }
+}
+
+/// A URI with its %XX replaced by their bytes.
+fn percent_decoded(uri: &str) -> String {
+    let (mut out, mut rest) = (Vec::new(), uri.as_bytes());
+    while let Some((&first, after)) = rest.split_first() {
+        let digits = after.get(..2).filter(|_| first == b'%').and_then(|hex| std::str::from_utf8(hex).ok());
+        match digits.and_then(|hex| u8::from_str_radix(hex, 16).ok()) {
+            Some(byte) => (out.push(byte), rest = &after[2..]).1,
+            None => (out.push(first), rest = after).1,
+        }
+    }
+    String::from_utf8_lossy(&out).into_owned()
 }

@@ -16,9 +16,9 @@ use crate::sparse::SkinningWeights;
 /// A rigged character: every triangle mesh of a glTF scene merged into one, with V vertices and J
 /// joints.
 ///
-/// Meshes without a skin are bound rigidly to an extra joint for their node. Not read: morph
-/// targets, sparse accessors, materials other than the first base-colour texture. Metres, y up, as
-/// in glTF.
+/// Meshes without a skin are bound rigidly to an extra joint for their node; morph targets are at
+/// their default weights. Not read: sparse accessors, materials other than the first base-colour
+/// texture ([`Character::ignored`] names what the file has of them). Metres, y up, as in glTF.
 ///
 /// ```
 /// // One triangle without a skin: it follows its node, 1 m up.
@@ -52,6 +52,9 @@ pub struct Character {
     pub joint_names: Vec<String>,
     /// Base colour of the first material that has a texture, as the file encodes it.
     pub texture: Option<Texture>,
+    /// Features of the file that are not read, in words: more textures, factors, colours of vertices,
+    /// transparency.
+    pub ignored: Vec<String>,
     /// Animations, in the file's order.
     pub animations: Vec<Animation>,
     nodes: Vec<Node>,

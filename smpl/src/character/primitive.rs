@@ -13,15 +13,15 @@ use crate::Error;
 use crate::model::MAX_COORDINATE;
 
 impl Character {
-    /// Appends a primitive's vertices and triangles. If `skinned`, its joint indices are relative to
-    /// `joints`; else it is bound to the first of those.
+    /// Appends a primitive's vertices, morphed by `morph`, and triangles. If `skinned`, its joint
+    /// indices are relative to `joints`; else it is bound to the first of those.
     pub(super) fn add_primitive(
         &mut self,
         source: &Source<'_>,
         place: &str,
         primitive: &Primitive,
-        joints: Joints,
-        skinned: bool,
+        (joints, skinned): (Joints, bool),
+        morph: &[f32],
     ) -> Result<(), Error> {
         let invalid = |message: String| source.invalid(place, message);
         match primitive.mode {
@@ -33,8 +33,18 @@ impl Character {
         }
         let attribute = |semantic| primitive.attributes.get(&Checked::Valid(semantic)).copied();
         let positions = attribute(Semantic::Positions).ok_or_else(|| invalid("no positions".to_owned()))?;
-        let positions = source.floats::<3>(positions, &format!("{place}, POSITION"))?;
-        if let Some(far) = positions.iter().find(|p| p.iter().any(|x| x.abs() > MAX_COORDINATE)) {
+        let mut positions = source.floats::<3>(positions, &format!("{place}, POSITION"))?;
+        for (target, &weight) in primitive.targets.iter().flatten().zip(morph).filter(|(_, weight)| **weight != 0.0) {
+            let Some(displacements) = target.positions else { continue };
+            let displacements = source.floats::<3>(displacements, &format!("{place}, morph target"))?;
+            if displacements.len() != positions.len() {
+                let message = format!("a morph target of {} for {} positions", displacements.len(), positions.len());
+                return Err(invalid(message));
+            }
+            let moved = positions.iter_mut().flatten().zip(displacements.iter().flatten());
+            moved.for_each(|(position, by)| *position += weight * by);
+        }
+        if let Some(far) = positions.iter().find(|p| p.iter().any(|x| !(x.abs() <= MAX_COORDINATE))) {
             return Err(invalid(format!("POSITION {far:?}: expected coordinates of at most {MAX_COORDINATE}")));
         }
         let (first, count) = (self.vertices.len() as u32, positions.len());
@@ -51,10 +61,16 @@ impl Character {
             Some(index) => base_colour(source.get(&source.root.materials, index, place)?),
             None => None,
         };
-        if let Some(uvs) = attribute(Semantic::TexCoords(colour.map_or(0, |c| c.tex_coord))) {
+        let transform = colour.and_then(|c| c.extensions.as_ref()?.texture_transform.as_ref());
+        let set = transform.and_then(|t| t.tex_coord).or(colour.map(|c| c.tex_coord)).unwrap_or(0);
+        if let Some(uvs) = attribute(Semantic::TexCoords(set)) {
             let uvs = source.floats::<2>(uvs, &format!("{place}, TEXCOORD"))?;
             fits(uvs.len(), "TEXCOORD")?;
-            self.uvs.extend(uvs.into_iter().map(Vec2::from));
+            let turned = |uv: Vec2| match transform {
+                Some(t) => Vec2::from_angle(-t.rotation.0).rotate(uv * Vec2::from(t.scale.0)) + Vec2::from(t.offset.0),
+                None => uv,
+            };
+            self.uvs.extend(uvs.into_iter().map(|uv| turned(Vec2::from(uv))));
         }
         if let (None, Some(colour)) = (&self.texture, colour) {
             self.texture = Some(texture(source, place, colour)?);
@@ -147,7 +163,12 @@ fn base_colour(material: &material::Material) -> Option<&gltf::json::texture::In
 
 fn texture(source: &Source<'_>, place: &str, colour: &gltf::json::texture::Info) -> Result<Texture, Error> {
     let root = source.root;
-    let index = source.get(&root.textures, colour.index, place)?.source;
+    let texture = source.get(&root.textures, colour.index, place)?;
+    let index = texture.source;
+    if index.value() >= root.images.len() && texture.extensions.is_some() {
+        let names = texture.extensions.iter().flat_map(|e| e.others.keys()).map(String::as_str).collect::<Vec<_>>();
+        return Err(source.invalid(place, format!("a texture of {} alone, which is not read", names.join(", "))));
+    }
     let image = source.get(&root.images, index, place)?;
     let place = format!("image {index}");
     let mime = image.mime_type.as_ref().map(|m| m.0.clone());

@@ -6,6 +6,8 @@ use std::path::Path;
 use array_files::read_file;
 use glam::{Affine3A, Mat4, Quat, Vec3, Vec4};
 use gltf::json::animation::{Interpolation as Kind, Property};
+use gltf::json::material::AlphaMode;
+use gltf::json::mesh::Semantic;
 use gltf::json::validation::Checked;
 use gltf::json::{Index, Root};
 
@@ -36,8 +38,12 @@ impl Character {
 
 fn read(file: &str, bytes: &[u8], folder: Option<&Path>) -> Result<Character, Error> {
     let (json, blob) = if bytes.starts_with(b"glTF") { chunks(file, bytes)? } else { (bytes, None) };
-    let root: Root =
-        gltf::json::deserialize::from_slice(json).map_err(|e| Error::invalid(file, "document", e.to_string()))?;
+    let root = document(json).map_err(|e| Error::invalid(file, "document", e.to_string()))?;
+    let known = |extension: &&String| !UNREAD.contains(&extension.as_str());
+    if let Some(extension) = root.extensions_required.iter().find(|extension| !known(extension)) {
+        let message = format!("it requires {extension}, which is not read (gltf-transform copy decodes it)");
+        return Err(Error::invalid(file, "extensionsRequired", message));
+    }
     let source = Source::new(file, &root, blob, folder)?;
     let nodes = nodes(&source)?;
     let order = order(&source, &nodes)?;
@@ -50,6 +56,7 @@ fn read(file: &str, bytes: &[u8], folder: Option<&Path>) -> Result<Character, Er
         inverse_bind: Vec::new(),
         joint_names: Vec::new(),
         texture: None,
+        ignored: ignored(&root),
         animations: animations(&source, &nodes)?,
         nodes,
         order,
@@ -67,14 +74,18 @@ fn read(file: &str, bytes: &[u8], folder: Option<&Path>) -> Result<Character, Er
             },
             None => out.add_joint(&source, index, Affine3A::IDENTITY),
         };
-        for (i, primitive) in source.get(&root.meshes, mesh, &place)?.primitives.iter().enumerate() {
+        let gltf::json::Mesh { primitives, weights: mesh_weights, .. } = source.get(&root.meshes, mesh, &place)?;
+        for (i, primitive) in primitives.iter().enumerate() {
             let place = format!("mesh {mesh}, primitive {i}");
-            out.add_primitive(&source, &place, primitive, joints, node.skin.is_some())?;
+            let weights = node.weights.as_ref().or(mesh_weights.as_ref());
+            let weights = weights.map_or(&[][..], Vec::as_slice);
+            out.add_primitive(&source, &place, primitive, (joints, node.skin.is_some()), weights)?;
         }
     }
     if out.faces.is_empty() {
         return Err(Error::invalid(file, "meshes", "no triangles in the scene"));
     }
+    out.wind();
     if out.normals.len() != out.vertices.len() {
         out.normals.clear();
     }
@@ -82,6 +93,51 @@ fn read(file: &str, bytes: &[u8], folder: Option<&Path>) -> Result<Character, Er
         out.uvs.clear();
     }
     Ok(out)
+}
+
+/// Extensions without which a document means something else.
+const UNREAD: [&str; 4] =
+    ["KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_texture_basisu", "EXT_texture_webp"];
+
+/// The document. Channels without a node, which glTF leaves to extensions, are dropped.
+fn document(json: &[u8]) -> Result<Root, serde_json::Error> {
+    let first = match gltf::json::deserialize::from_slice(json) {
+        Ok(root) => return Ok(root),
+        Err(error) => error,
+    };
+    let mut value: serde_json::Value = serde_json::from_slice(json)?;
+    let animations = value.get_mut("animations").and_then(|a| a.as_array_mut()).into_iter().flatten();
+    for channels in animations.filter_map(|animation| animation.get_mut("channels")?.as_array_mut()) {
+        channels.retain(|channel| channel.get("target").is_none_or(|target| target.get("node").is_some()));
+    }
+    serde_json::from_value(value).map_err(|_| first)
+}
+
+/// What a document has that a [`Character`] has not, in words.
+fn ignored(root: &Root) -> Vec<String> {
+    let mut out = Vec::new();
+    let mut textures: Vec<usize> = root.materials.iter().filter_map(|material| {
+        material.pbr_metallic_roughness.base_color_texture.as_ref().map(|info| info.index.value())
+    }).collect();
+    textures.sort_unstable();
+    textures.dedup();
+    let primitives = || root.meshes.iter().flat_map(|mesh| &mesh.primitives);
+    let has_colors = primitives().any(|primitive| {
+        primitive.attributes.keys().any(|semantic| matches!(semantic, Checked::Valid(Semantic::Colors(_))))
+    });
+    let is_tinted = root.materials.iter().any(|m| m.pbr_metallic_roughness.base_color_factor.0 != [1.0; 4]);
+    let is_cut = root.materials.iter().any(|m| m.alpha_mode != Checked::Valid(AlphaMode::Opaque));
+    for (has, what) in [
+        (textures.len() > 1, format!("{} base-colour textures besides the first", textures.len().saturating_sub(1))),
+        (is_tinted, "base-colour factors".to_owned()),
+        (has_colors, "colours of vertices (COLOR_0)".to_owned()),
+        (is_cut, "transparency (alphaMode)".to_owned()),
+    ] {
+        if has {
+            out.push(what);
+        }
+    }
+    out
 }
 
 /// JSON and binary chunk of a `.glb` (glTF 2.0, section 4.4).
@@ -182,6 +238,17 @@ fn in_scene(source: &Source<'_>) -> Result<Vec<usize>, Error> {
 pub(super) type Joints = (u32, u32);
 
 impl Character {
+    /// Turns faces that a mirroring transform turned inside out.
+    fn wind(&mut self) {
+        let bones = self.rest().bones;
+        for face in &mut self.faces {
+            let strongest = self.weights.row(face[0] as usize).max_by(|a, b| a.1.total_cmp(&b.1));
+            if strongest.is_some_and(|(joint, _)| bones[joint as usize].matrix3.determinant() < 0.0) {
+                face.swap(1, 2);
+            }
+        }
+    }
+
     fn add_joint(&mut self, source: &Source<'_>, node: usize, inverse_bind: Affine3A) -> Joints {
         let first = self.joint_nodes.len() as u32;
         self.joint_nodes.push(node);

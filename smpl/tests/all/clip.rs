@@ -82,6 +82,38 @@ fn frames_are_interpolated_and_held_at_the_ends() {
 }
 
 #[test]
+fn clips_without_a_rate_and_under_other_names_are_read() {
+    let (rotations, places) = ((0..144).map(|i| i as f32 * 0.01).collect::<Vec<_>>(), [0.5f32; 6]);
+    let columns = |range: std::ops::Range<usize>| -> Vec<f32> {
+        (0..2).flat_map(|frame| rotations[72 * frame..][range.clone()].to_vec()).collect()
+    };
+    let path = archive("flat.npz", &[
+        ("poses", floats(&[2, 72], &rotations)),
+        ("trans", floats(&[2, 3], &places)),
+        ("fps", floats(&[], &[MotionClip::ASSUMED_FPS])),
+    ]);
+    let expected = MotionClip::load(&path).unwrap();
+    assert_eq!(MotionClip::rate_of(&path).unwrap(), Some(30.0));
+    for arrays in [
+        vec![("poses", floats(&[2, 24, 3], &rotations)), ("transl", floats(&[2, 3], &places))],
+        vec![
+            ("root_orient", floats(&[2, 3], &columns(0..3))),
+            ("pose_body", floats(&[2, 69], &columns(3..72))),
+            ("trans", floats(&[2, 3], &places)),
+        ],
+        vec![
+            ("global_orient", floats(&[2, 1, 3], &columns(0..3))),
+            ("body_pose", floats(&[2, 23, 3], &columns(3..72))),
+            ("transl", floats(&[2, 3], &places)),
+        ],
+    ] {
+        let path = archive("other-names.npz", &arrays);
+        assert_eq!(MotionClip::load(&path).unwrap(), expected);
+        assert_eq!(MotionClip::rate_of(&path).unwrap(), None);
+    }
+}
+
+#[test]
 fn invalid_clips_are_refused() {
     let good = |key: &str| match key {
         "poses" => floats(&[2, 72], &[0.0; 144]),
@@ -99,7 +131,6 @@ fn invalid_clips_are_refused() {
     for (key, bytes) in [
         ("poses", Vec::new()),
         ("trans", Vec::new()),
-        ("fps", Vec::new()),
         ("poses", floats(&[2, 71], &[0.0; 142])),
         ("poses", floats(&[0, 72], &[])),
         ("poses", floats(&[3, 72], &[0.0; 216])),

@@ -202,6 +202,9 @@ pub fn synth(arguments: &SynthArguments) -> Result<()> {
 fn film(character: Option<&Path>, motion: Option<&Path>, config: &SynthConfig) -> Result<Synthetic> {
     let named = |path: &Path| path.display().to_string();
     let character = character.map(|path| Character::load(path).map(|c| (c, named(path)))).transpose()?;
+    for what in character.iter().flat_map(|(character, _)| &character.ignored) {
+        say!("of the character is left out: {what}");
+    }
     let motion = motion.map(MotionClip::load).transpose()?;
     let bar = bar("filming", config.frames);
     let synthetic = synthesise(character.as_ref().map(|(c, _)| c), motion.as_ref(), config, &|_| bar.inc(1));

@@ -28,6 +28,9 @@ pub struct ViewArguments {
     /// has them; repeatable
     #[arg(long, value_name = "CLIP.npz")]
     motion: Vec<PathBuf>,
+    /// Frames per second of every --motion [default: as the files say]
+    #[arg(long, value_name = "N", requires = "motion")]
+    fps: Option<f32>,
     /// Where to [default: RUN/person.html]
     #[arg(long, value_name = "FILE")]
     out: Option<PathBuf>,
@@ -37,7 +40,7 @@ pub struct ViewArguments {
 pub fn view(arguments: &ViewArguments) -> Result<()> {
     let mut person = avatar::of_run(&arguments.run)?;
     for path in &arguments.motion {
-        avatar::add_motion(&mut person, path)?;
+        avatar::add_motion(&mut person, path, arguments.fps)?;
     }
     let out = arguments.out.clone().unwrap_or_else(|| arguments.run.join(PERSON));
     avatar::check_folder(&out)?;

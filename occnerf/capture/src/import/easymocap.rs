@@ -46,14 +46,31 @@ pub(super) fn read(dir: &Path, video: &Video) -> Result<Fit, CaptureError> {
     let mut people: BTreeMap<i64, Person> = BTreeMap::new();
     for (index, path) in &files {
         let text = text(path)?;
-        let records: Vec<Record> = serde_json::from_str(&text)
+        let records = records(&text)
             .map_err(|e| CaptureError::invalid(path, "the file", "JSON of id, Rh, Th, poses, shapes", e.to_string()))?;
         for record in records {
-            let new = || Person { id: record.id.to_string(), frames: Vec::new(), ghosts: 0 };
+            let new = || Person { id: record.id.to_string(), ..Person::default() };
             people.entry(record.id).or_insert_with(new).frames.push(frame(path, *index, &record, &camera)?);
         }
     }
-    Ok(Fit { tool: Tool::EasyMocap, people: people.into_values().collect() })
+    Ok(Fit { tool: Tool::EasyMocap, people: people.into_values().collect(), names: None })
+}
+
+/// The people of a file: a list, a list under `annots`, or a map by their ids.
+fn records(text: &str) -> serde_json::Result<Vec<Record>> {
+    use serde_json::{Value, from_value};
+    let mut file: Value = serde_json::from_str(text)?;
+    if let Some(list) = file.get_mut("annots") {
+        file = list.take();
+    }
+    let Value::Object(map) = file else { return from_value(file) };
+    let with_id = map.into_iter().map(|(key, mut person)| {
+        if let (Value::Object(fields), Ok(id)) = (&mut person, key.parse::<i64>()) {
+            fields.entry("id").or_insert_with(|| id.into());
+        }
+        person
+    });
+    from_value(Value::Array(with_id.collect()))
 }
 
 /// The files of frames by their numbers.

@@ -21,6 +21,8 @@ pub enum Tool {
     Gvhmr,
     /// PromptHMR (Wang et al. 2025), `results.pkl`.
     PromptHmr,
+    /// VIBE (Kocabas et al. 2020), also PyMAF, `vibe_output.pkl`.
+    Vibe,
     /// ROMP (Sun et al. 2021), `video_results.npz`.
     Romp,
     /// EasyMocap, a folder with `smpl/`, `intri.yml` and `extri.yml`.
@@ -42,6 +44,7 @@ impl Tool {
             Self::Phalp => "4D-Humans / PHALP",
             Self::Gvhmr => "GVHMR",
             Self::PromptHmr => "PromptHMR",
+            Self::Vibe => "VIBE / PyMAF",
             Self::Romp => "ROMP",
             Self::EasyMocap => "EasyMocap",
             Self::PeopleSnapshot => "PeopleSnapshot",
@@ -69,15 +72,21 @@ impl Tool {
 pub(super) struct Fit {
     pub tool: Tool,
     pub people: Vec<Person>,
+    /// Names of the pictures that indices count; `None` where indices count the frames of a video
+    /// from 0.
+    pub names: Option<Vec<String>>,
 }
 
 /// One person.
+#[derive(Default)]
 pub(super) struct Person {
     pub id: String,
     /// By index, each once.
     pub frames: Vec<FitFrame>,
     /// Frames with stale values of another frame.
     pub ghosts: usize,
+    /// Frames whose picture is absent.
+    pub absent: usize,
 }
 
 /// A person in one frame. Lengths in metres, OpenCV axes.

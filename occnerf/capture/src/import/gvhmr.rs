@@ -5,6 +5,7 @@
 use std::io::{Read, Seek};
 use std::path::Path;
 
+use array_files::pickle::Value;
 use array_files::torch::TorchFile;
 
 use super::fit::{BETAS, Fit, FitFrame, Person, Tool};
@@ -12,6 +13,11 @@ use super::item::{Item, vectors};
 use super::video::Video;
 use crate::CaptureError;
 
+/// Keys of the body's parameters, of GVHMR and of its relative GEM (`smpl_params.pt`), and of the
+/// cameras.
+const GVHMR: &str = "smpl_params_incam";
+const GEM: &str = "body_params_incam";
+const CAMERAS: &str = "K_fullimg";
 /// Joints of the body in `body_pose`.
 const BODY: usize = 21;
 /// Pixels by which twice the principal point may be off the frames' size.
@@ -20,19 +26,41 @@ const SIZE: f64 = 2.0;
 pub(super) fn read<R: Read + Seek>(path: &Path, file: &mut TorchFile<R>, video: &Video) -> Result<Fit, CaptureError> {
     let root = file.root().clone();
     let whole = Item::new(path, &root);
-    let (incam, cameras) = (whole.get("smpl_params_incam")?, whole.get("K_fullimg")?);
+    let incam = whole.find(GEM).map_or_else(|| whole.get(GVHMR), Ok)?;
+    let cameras = whole.get(CAMERAS)?;
     let params = file.resolve(&incam.key, incam.value)?;
     let cameras_value = file.resolve(&cameras.key, cameras.value)?;
-    let incam = Item { value: &params, ..incam };
-    let cameras = Item { value: &cameras_value, ..cameras };
+    frames(&Item { value: &params, ..incam }, &Item { value: &cameras_value, ..cameras }, video)
+}
 
+/// The same re-saved by numpy, nested or with joined names; `None` where it is not that.
+pub(super) fn from_arrays(whole: &Item<'_>, video: &Video) -> Result<Option<Fit>, CaptureError> {
+    let Some(cameras) = whole.find(CAMERAS) else { return Ok(None) };
+    for name in [GVHMR, GEM] {
+        if let Some(incam) = whole.find(name) {
+            return frames(&incam, &cameras, video).map(Some);
+        }
+        let prefix = format!("{name}_");
+        let entries = whole.entries()?.into_iter();
+        let below = entries.filter_map(|(key, item)| {
+            Some((Value::Str(key.strip_prefix(&prefix)?.to_owned()), item.value.clone()))
+        });
+        let below = Value::Dict(below.collect());
+        if below.get("body_pose").is_some() {
+            return frames(&Item { path: whole.path, key: name.to_owned(), value: &below }, &cameras, video).map(Some);
+        }
+    }
+    Ok(None)
+}
+
+fn frames(incam: &Item<'_>, cameras: &Item<'_>, video: &Video) -> Result<Fit, CaptureError> {
     let (orient, body) = (incam.get("global_orient")?, incam.get("body_pose")?);
     let (transl, shape) = (incam.get("transl")?, incam.get("betas")?);
     let roots = orient.rows(3)?;
     let (bodies, places, shapes) = (body.rows(3 * BODY)?, transl.rows(3)?, shape.rows(BETAS)?);
     let matrices = cameras.numbers(&[None, Some(3), Some(3)])?;
     let found =
-        [(&body, bodies.len()), (&transl, places.len()), (&shape, shapes.len()), (&cameras, matrices.len() / 9)];
+        [(&body, bodies.len()), (&transl, places.len()), (&shape, shapes.len()), (cameras, matrices.len() / 9)];
     for (item, found) in found {
         item.as_long(roots.len(), found)?;
     }
@@ -46,6 +74,6 @@ pub(super) fn read<R: Read + Seek>(path: &Path, file: &mut TorchFile<R>, video: 
         let pose = [vectors(&roots[index]), vectors(&bodies[index])].concat();
         FitFrame::still(index, pose, shapes[index].clone(), &places[index], [[k[0], k[4]], [k[2], k[5]]])
     });
-    let person = Person { id: "0".to_owned(), frames: frames.collect(), ghosts: 0 };
-    Ok(Fit { tool: Tool::Gvhmr, people: vec![person] })
+    let person = Person { id: "0".to_owned(), frames: frames.collect(), ..Person::default() };
+    Ok(Fit { tool: Tool::Gvhmr, people: vec![person], names: None })
 }

@@ -3,6 +3,7 @@
 use std::path::Path;
 
 use array_files::NdArray;
+use array_files::npz::Npz;
 use array_files::pickle::Value;
 use glam::{DMat3, DVec3};
 
@@ -194,6 +195,13 @@ pub(super) fn turn(values: &[f64]) -> Option<DMat3> {
     let matrix = DMat3::from_cols(row(0), row(1), row(2)).transpose();
     let off = (matrix * matrix.transpose() - DMat3::IDENTITY).to_cols_array();
     (off.iter().all(|x| x.abs() <= ORTHONORMAL) && matrix.determinant() > 0.0).then_some(matrix)
+}
+
+/// The arrays of an archive as a dictionary.
+pub(super) fn dictionary(npz: &mut Npz) -> Result<Value, CaptureError> {
+    let keys = npz.keys().to_vec();
+    let entries = keys.into_iter().map(|key| Ok((Value::Str(key.clone()), npz.value(&key)?)));
+    Ok(Value::Dict(entries.collect::<Result<_, array_files::Error>>()?))
 }
 
 /// Groups of three numbers.

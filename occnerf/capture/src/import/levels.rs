@@ -6,20 +6,23 @@ use std::path::Path;
 
 use array_files::npz::read_npy;
 use array_files::{Data, NdArray};
-use image::DynamicImage;
 use png::{ColorType, Decoder, Limits};
 
 use crate::CaptureError;
-use crate::image::{MAX_SIDE, decode, dimensions};
+use crate::image::{MAX_SIDE, alpha, decode, dimensions};
 
 /// One value a pixel.
 pub(super) struct Levels {
     pub width: u32,
     pub height: u32,
     /// Row by row.
-    pub values: Vec<u8>,
+    pub values: Vec<u32>,
+    /// Full coverage, where values are coverage: 255 or 65535.
+    pub full: u32,
     /// Whether values are ids: of a palette, or integers of a `.npy` file.
     pub ids: bool,
+    /// Whether values are of an alpha channel.
+    pub alpha: bool,
 }
 
 impl Levels {
@@ -31,24 +34,28 @@ impl Levels {
         if let Some(levels) = indexed(path)? {
             return Ok(levels);
         }
-        let (width, height) = dimensions(path)?;
-        let values = match decode(path)? {
-            DynamicImage::ImageLuma8(grey) => grey.into_raw(),
-            DynamicImage::ImageLuma16(grey) => grey.into_raw().into_iter().map(|v| (v >> 8) as u8).collect(),
-            DynamicImage::ImageLumaA8(grey) => grey.into_raw().chunks_exact(2).map(|p| p[0]).collect(),
-            other => {
-                let rgb = other.into_rgb8();
-                if let Some(pixel) = rgb.pixels().find(|p| p[0].abs_diff(p[1]).max(p[1].abs_diff(p[2])) > 16) {
-                    let expected = "shades of grey, or a palette whose indices are objects";
-                    return Err(CaptureError::invalid(path, "colours", expected, format!("colour {:?}", pixel.0)));
-                }
-                rgb.into_raw().chunks_exact(3).map(|p| p[0]).collect()
-            }
-        };
-        Ok(Self { width, height, values, ids: false })
+        let picture = decode(path)?;
+        let (width, height) = (picture.width(), picture.height());
+        if let Some(alpha) = alpha(&picture) {
+            let values = alpha.into_iter().map(u32::from).collect();
+            return Ok(Self { width, height, values, full: 65535, ids: false, alpha: true });
+        }
+        // Levels of 8 bits are not scaled: they may be ids.
+        let depth = picture.color().bytes_per_pixel() / picture.color().channel_count();
+        let scale = if depth > 1 { 1 } else { 257 };
+        let rgb = picture.into_rgb16();
+        let spread = |p: &image::Rgb<u16>| p[0].abs_diff(p[1]).max(p[1].abs_diff(p[2]));
+        if let Some(pixel) = rgb.pixels().find(|p| spread(p) > 16 * 257) {
+            let expected = "shades of grey, a palette whose indices are objects, or transparency (alpha)";
+            let found = format!("colour {:?}", pixel.0.map(|c| c / 257));
+            return Err(CaptureError::invalid(path, "colours", expected, found));
+        }
+        let values = rgb.pixels().map(|p| u32::from(p[0]) / scale).collect();
+        Ok(Self { width, height, values, full: 65535 / scale, ids: false, alpha: false })
     }
 
-    /// From an array (H,W), ignoring axes of length 1; floats are coverage from 0 to 1.
+    /// From an array (H,W), ignoring axes of length 1; floats are coverage from 0 to 1, or whole
+    /// numbers.
     pub fn from_array(path: &Path, array: &NdArray) -> Result<Self, CaptureError> {
         let bare: Vec<usize> = array.shape.iter().copied().filter(|&n| n != 1).collect();
         let sides = match (array.shape.as_slice(), bare.as_slice()) {
@@ -61,18 +68,26 @@ impl Levels {
             let expected = format!("(height, width) of 1 to {MAX_SIDE}");
             CaptureError::invalid(path, "shape", expected, format!("{:?}", array.shape))
         })?;
-        let wrong = |value: String| CaptureError::invalid(path, "values", "ids of 0 to 255, or 0 to 1", value);
-        let share = |value: f64| {
-            let fits = (0.0..=1.0).contains(&value);
-            fits.then_some((value * 255.0).round() as u8).ok_or_else(|| wrong(value.to_string()))
+        let wrong = |value: String| {
+            CaptureError::invalid(path, "values", "ids of objects from 0, or coverage from 0 to 1", value)
         };
-        let (values, ids): (Result<Vec<u8>, _>, bool) = match &array.data {
-            Data::Bool(v) => (Ok(v.iter().map(|&b| u8::from(b)).collect()), true),
-            Data::I64(v) => (v.iter().map(|&id| u8::try_from(id).map_err(|_| wrong(id.to_string()))).collect(), true),
-            Data::F32(v) => (v.iter().map(|&x| share(x.into())).collect(), false),
-            Data::F64(v) => (v.iter().map(|&x| share(x)).collect(), false),
+        let whole = |id: i64| u32::try_from(id).map_err(|_| wrong(id.to_string()));
+        let (values, ids): (Result<Vec<u32>, _>, bool) = match &array.data {
+            Data::Bool(v) => (Ok(v.iter().map(|&b| u32::from(b)).collect()), true),
+            Data::I64(v) => (v.iter().map(|&id| whole(id)).collect(), true),
+            Data::F32(_) | Data::F64(_) => {
+                let values = array.to_f64();
+                let ids = values.iter().any(|x| *x > 1.0) && values.iter().all(|x| x.fract() == 0.0);
+                let share = |&x: &f64| match ids {
+                    true => whole(x as i64),
+                    false if (0.0..=1.0).contains(&x) => Ok((x * 65535.0).round() as u32),
+                    false => Err(wrong(x.to_string())),
+                };
+                (values.iter().map(share).collect(), ids)
+            }
         };
-        Ok(Self { width, height, values: values?, ids })
+        let full = if ids { 255 } else { 65535 };
+        Ok(Self { width, height, values: values?, full, ids, alpha: false })
     }
 
     /// Checks the size against the frames'.
@@ -107,13 +122,13 @@ fn indexed(path: &Path) -> Result<Option<Levels>, CaptureError> {
         // The leftmost pixel is in the highest bits.
         (0..width as usize).map(move |x| {
             let at = x * depth;
-            row.get(at / 8).map_or(0, |byte| byte >> (8 - depth - at % 8) & mask)
+            row.get(at / 8).map_or(0, |byte| u32::from(byte >> (8 - depth - at % 8) & mask))
         })
     });
-    let mut values: Vec<u8> = values.collect();
+    let mut values: Vec<u32> = values.collect();
     if kind == ColorType::Grayscale && depth == 1 {
         // One bit of grey is 0 or 255.
         values.iter_mut().for_each(|value| *value *= 255);
     }
-    Ok(Some(Levels { width, height, values, ids: kind == ColorType::Indexed }))
+    Ok(Some(Levels { width, height, values, full: 255, ids: kind == ColorType::Indexed, alpha: false }))
 }

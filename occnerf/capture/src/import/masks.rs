@@ -3,20 +3,24 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
-use array_files::npz::read_npy;
+use array_files::npz::{Npz, read_npy};
 use array_files::{Data, NdArray};
 
+use super::join::{self, Disjoint};
 use super::levels::Levels;
 use super::options::ImportOptions;
 use super::video::Video;
 use crate::names::FrameName;
-use crate::pictures::file_name;
+use crate::image::{alpha, decode};
+use crate::pictures::{file_name, is_hidden};
 use crate::{CaptureError, pictures::Pictures};
 
 /// The masks of a video.
 pub(super) struct Masks {
     /// Kind of the files, for messages.
     pub kind: &'static str,
+    /// How they were joined with the pictures, where that is worth a word.
+    pub notes: Vec<String>,
     frames: BTreeMap<usize, Source>,
     meaning: Meaning,
     /// Files of each occluder.
@@ -33,12 +37,12 @@ enum Source {
 /// Meaning of a value.
 #[derive(Clone, PartialEq)]
 enum Meaning {
-    /// Coverage of the person, 255 being all.
-    Coverage,
+    /// Coverage of the person, of this full scale.
+    Coverage(u32),
     /// Coverage of all but the person.
-    Background,
+    Background(u32),
     /// Ids of the person and of the occluders.
-    Objects(u8, Vec<u8>),
+    Objects(u32, Vec<u32>),
     /// Any value but 0 is the person: one folder an object.
     Any,
 }
@@ -53,43 +57,59 @@ impl Masks {
         let dir = inner.as_deref().unwrap_or(path);
         let object = options.object.unwrap_or(1);
         if let Some(folders) = object_folders(dir)? {
-            let find = |id: u8| {
+            let find = |id: u32| {
                 folders.get(&id).ok_or_else(|| {
-                    let found: Vec<String> = folders.keys().map(u8::to_string).collect();
+                    let found: Vec<String> = folders.keys().map(u32::to_string).collect();
                     CaptureError::invalid(dir, "objects", format!("a folder of object {id}"), found.join(", "))
                 })
             };
-            let frames = matched(find(object)?, video)?.into_iter().map(|(i, path)| (i, Source::File(path)));
-            let occluders = options.occluder_objects.iter().map(|&id| matched(find(id)?, video));
+            let (files, notes) = matched(find(object)?, video)?;
+            let occluders =
+                options.occluder_objects.iter().map(|&id| matched(find(id)?, video).map(|(files, _)| files));
             return Ok(Self {
                 kind: "one folder an object, as SAM 2 writes them",
-                frames: frames.collect(),
+                notes,
+                frames: files.into_iter().map(|(i, path)| (i, Source::File(path))).collect(),
                 meaning: Meaning::Any,
                 occluders: occluders.collect::<Result<_, _>>()?,
             });
         }
-        let files = matched(dir, video)?;
+        let (files, notes) = matched(dir, video)?;
         let mut statistics = ValueStatistics::default();
         for path in files.values() {
             statistics.add(&Levels::load(path)?);
         }
         let (meaning, kind) = statistics.meaning(dir, options)?;
         let frames = files.into_iter().map(|(i, path)| (i, Source::File(path))).collect();
-        Ok(Self { kind, frames, meaning, occluders: Vec::new() })
+        Ok(Self { kind, notes, frames, meaning, occluders: Vec::new() })
     }
 
-    /// Masks (N,H,W) in one file.
+    /// The pictures' own alpha channels, where the first has one.
+    pub fn of_alpha(options: &ImportOptions, video: &Video) -> Result<Option<Self>, CaptureError> {
+        let has_alpha = alpha(&decode(&video.paths[0])?).is_some();
+        has_alpha.then(|| Self::open(&options.frames, options, video)).transpose()
+    }
+
+    /// Masks (N,H,W), (N,1,H,W) or (N,H,W,1) in one file.
     fn stack(path: &Path, options: &ImportOptions, video: &Video) -> Result<Self, CaptureError> {
-        let array = read_npy(path)?;
-        let &[n, height, width] = array.shape.as_slice() else {
-            return Err(CaptureError::invalid(path, "shape", "(frames, height, width)", format!("{:?}", array.shape)));
+        let array = match path.extension().is_some_and(|e| e == "npz") {
+            true => only_array(path)?,
+            false => read_npy(path)?,
         };
-        if n > video.names.len() {
+        let (n, height, width) = match array.shape.as_slice() {
+            &[n, height, width] | &[n, 1, height, width] | &[n, height, width, 1] => (n, height, width),
+            shape => {
+                let expected = "(frames, height, width), or the same with an axis of 1";
+                return Err(CaptureError::invalid(path, "shape", expected, format!("{shape:?}")));
+            }
+        };
+        let joined = join::by_index(video, &(0..n).collect()).ok_or_else(|| {
             let expected = format!("at most {} masks, one a frame", video.names.len());
-            return Err(CaptureError::invalid(path, "shape", expected, n.to_string()));
-        }
+            CaptureError::invalid(path, "shape", expected, n.to_string())
+        })?;
         let (each, mut statistics, mut frames) = (height * width, ValueStatistics::default(), BTreeMap::new());
-        for index in 0..n {
+        for (index, at) in joined.at.into_iter().enumerate() {
+            let Some(at) = at else { continue };
             let span = index * each..(index + 1) * each;
             let data = match &array.data {
                 Data::Bool(v) => Data::Bool(v[span].to_vec()),
@@ -99,10 +119,10 @@ impl Masks {
             };
             let part = NdArray { shape: vec![height, width], data };
             statistics.add(&Levels::from_array(path, &part)?);
-            frames.insert(index, Source::Stack(part));
+            frames.insert(at, Source::Stack(part));
         }
         let (meaning, kind) = statistics.meaning(path, options)?;
-        Ok(Self { kind, frames, meaning, occluders: Vec::new() })
+        Ok(Self { kind, notes: joined.note.into_iter().collect(), frames, meaning, occluders: Vec::new() })
     }
 
     /// Whether a frame has a mask.
@@ -119,8 +139,8 @@ impl Masks {
         };
         let full = |hit: bool| if hit { 255 } else { 0 };
         Ok(match &self.meaning {
-            Meaning::Coverage => (levels.values, None),
-            Meaning::Background => (levels.values.iter().map(|v| 255 - v).collect(), None),
+            Meaning::Coverage(all) => (levels.values.iter().map(|v| byte(*v, *all)).collect(), None),
+            Meaning::Background(all) => (levels.values.iter().map(|v| 255 - byte(*v, *all)).collect(), None),
             Meaning::Objects(object, front) => {
                 let person = levels.values.iter().map(|v| full(v == object)).collect();
                 let front =
@@ -142,13 +162,38 @@ impl Masks {
     }
 }
 
+/// Coverage in bytes.
+fn byte(value: u32, full: u32) -> u8 {
+    ((u64::from(value.min(full)) * 255 + u64::from(full / 2)) / u64::from(full.max(1))) as u8
+}
+
+/// The only array of an archive.
+fn only_array(path: &Path) -> Result<NdArray, CaptureError> {
+    let mut npz = Npz::open(path)?;
+    match npz.keys() {
+        [key] => {
+            let key = key.clone();
+            Ok(npz.array(&key)?)
+        }
+        keys => Err(CaptureError::invalid(path, "keys", "one array of masks", keys.join(", "))),
+    }
+}
+
+/// Most different values of a video's masks.
+const MAX_VALUES: usize = 1 << 17;
+
 /// Statistics of the values of a video's masks.
+#[derive(Default)]
 struct ValueStatistics {
-    values: [bool; 256],
-    /// Whether every file has palette indices.
-    palette: bool,
+    values: BTreeSet<u32>,
+    /// The largest full scale.
+    full: u32,
+    /// Whether some file has an alpha channel.
+    alpha: bool,
+    /// Files without palette indices.
+    shaded: usize,
     files: usize,
-    /// Pixels at the image borders, and of them those above half coverage.
+    /// Pixels at the image borders, and of them those of at least half coverage.
     border: usize,
     covered: usize,
 }
@@ -156,50 +201,56 @@ struct ValueStatistics {
 /// Covered share of the borders above which a mask is the background's.
 const BORDER: f64 = 0.5;
 
-impl Default for ValueStatistics {
-    fn default() -> Self {
-        Self { values: [false; 256], palette: true, files: 0, border: 0, covered: 0 }
-    }
-}
-
 impl ValueStatistics {
     fn add(&mut self, levels: &Levels) {
-        levels.values.iter().for_each(|&value| self.values[usize::from(value)] = true);
-        self.palette &= levels.ids;
+        let mut last = None;
+        for &value in &levels.values {
+            if last.replace(value) != Some(value) && self.values.len() < MAX_VALUES {
+                self.values.insert(value);
+            }
+        }
+        self.shaded += usize::from(!levels.ids);
+        self.full = self.full.max(levels.full);
+        self.alpha |= levels.alpha;
         self.files += 1;
         let (width, height) = (levels.width as usize, levels.height as usize);
         for (y, row) in levels.values.chunks(width.max(1)).enumerate() {
             let every = if y == 0 || y + 1 == height { 1 } else { width.max(2) - 1 };
             for value in row.iter().step_by(every) {
                 self.border += 1;
-                self.covered += usize::from(*value >= 128);
+                self.covered += usize::from(*value > levels.full / 2);
             }
         }
     }
 
-    /// Coverage for values of 128 and above outside palettes, or 255 alone, of the background if it
-    /// has most of the border; object ids otherwise.
+    /// Coverage for alpha, for values of at least half of the full scale outside palettes, or for 255
+    /// alone, of the background if it has most of the border; object ids otherwise.
     fn meaning(&self, dir: &Path, options: &ImportOptions) -> Result<(Meaning, &'static str), CaptureError> {
-        let found: Vec<usize> = (1..256).filter(|&value| self.values[value]).collect();
-        let shades = found.iter().any(|&value| value >= 128);
+        let found: Vec<u32> = self.values.iter().copied().filter(|value| *value > 0).collect();
+        let shades = self.shaded > 0 && found.iter().any(|&value| value > self.full / 2);
         if self.files > 0 && found.is_empty() {
             let expected = "a pixel of the person in at least one mask";
             return Err(CaptureError::invalid(dir, "all masks", expected, format!("0 in all of {}", self.files)));
         }
-        if found == [255] || (shades && !self.palette) {
+        let full = if found == [255] { 255 } else { self.full };
+        if found == [255] || shades || self.alpha {
             if options.object.is_some() || !options.occluder_objects.is_empty() {
                 let expected = "masks that hold ids of objects (--object, --occluder-objects)";
                 return Err(CaptureError::invalid(dir, "values", expected, "coverage from 0 to 255"));
             }
-            if self.covered as f64 > BORDER * self.border as f64 {
-                return Ok((Meaning::Background, "coverage of all but the person (it is along the border), 0 to 255"));
+            if self.alpha {
+                return Ok((Meaning::Coverage(full), "coverage of the person, in the alpha channel"));
             }
-            return Ok((Meaning::Coverage, "coverage of the person, 0 to 255"));
+            if self.covered as f64 > BORDER * self.border as f64 {
+                let kind = "coverage of all but the person (it is along the border), 0 to 255";
+                return Ok((Meaning::Background(full), kind));
+            }
+            return Ok((Meaning::Coverage(full), "coverage of the person, 0 to 255"));
         }
         let object = options.object.unwrap_or(1);
         for id in [object].iter().chain(&options.occluder_objects) {
-            if !found.contains(&usize::from(*id)) {
-                let held: Vec<String> = found.iter().take(20).map(usize::to_string).collect();
+            if !found.contains(id) {
+                let held: Vec<String> = found.iter().take(20).map(u32::to_string).collect();
                 let expected = format!("object {id} in at least one mask");
                 return Err(CaptureError::invalid(dir, "values", expected, format!("objects {}", held.join(", "))));
             }
@@ -209,11 +260,11 @@ impl ValueStatistics {
 }
 
 /// Folders named by numbers, unless there is a mask beside them.
-fn object_folders(dir: &Path) -> Result<Option<BTreeMap<u8, PathBuf>>, CaptureError> {
+fn object_folders(dir: &Path) -> Result<Option<BTreeMap<u32, PathBuf>>, CaptureError> {
     let mut folders = BTreeMap::new();
     for entry in std::fs::read_dir(dir).map_err(CaptureError::io(dir))? {
         let path = entry.map_err(CaptureError::io(dir))?.path();
-        let number = file_name(&path).parse::<u8>().ok();
+        let number = file_name(&path).parse::<u32>().ok();
         match number {
             Some(id) if path.is_dir() => drop(folders.insert(id, path)),
             _ if is_mask(&path) => return Ok(None),
@@ -225,12 +276,11 @@ fn object_folders(dir: &Path) -> Result<Option<BTreeMap<u8, PathBuf>>, CaptureEr
 
 fn is_mask(path: &Path) -> bool {
     let extension = path.extension().map(|e| e.to_string_lossy().to_lowercase());
-    matches!(extension.as_deref(), Some("png" | "jpg" | "jpeg" | "npy"))
+    !is_hidden(path) && matches!(extension.as_deref(), Some("png" | "jpg" | "jpeg" | "npy"))
 }
 
-/// Mask files by the index of their frame: by name if all have a frame's name, in order if there are
-/// as many as frames, else by number from 0.
-fn matched(dir: &Path, video: &Video) -> Result<BTreeMap<usize, PathBuf>, CaptureError> {
+/// Mask files by the index of their frame, and how they were joined.
+fn matched(dir: &Path, video: &Video) -> Result<(BTreeMap<usize, PathBuf>, Vec<String>), CaptureError> {
     let mut files = arrays(dir)?;
     if files.is_empty() {
         files = Pictures::list(dir)?.iter().map(|(name, path)| (name.clone(), path.clone())).collect();
@@ -240,34 +290,23 @@ fn matched(dir: &Path, video: &Video) -> Result<BTreeMap<usize, PathBuf>, Captur
         return Err(CaptureError::invalid(dir, "files", expected, "none"));
     }
     files.sort_by(|a, b| FrameName(&a.0).cmp(&FrameName(&b.0)));
-    let names: BTreeMap<&str, usize> = video.names.iter().enumerate().map(|(i, name)| (name.as_str(), i)).collect();
-    if files.iter().all(|(name, _)| names.contains_key(name.as_str())) {
-        return Ok(files.into_iter().map(|(name, path)| (names[name.as_str()], path)).collect());
-    }
-    if files.len() == video.names.len() {
-        return Ok(files.into_iter().enumerate().map(|(i, (_, path))| (i, path)).collect());
-    }
-    let (mut found, mut twice) = (BTreeMap::new(), BTreeSet::new());
-    for (name, path) in files {
-        let digits = name.rfind(|c: char| c.is_ascii_digit()).map(|end| {
-            let start = name[..end].rfind(|c: char| !c.is_ascii_digit()).map_or(0, |at| at + 1);
-            name[start..=end].parse::<usize>().unwrap_or(usize::MAX)
-        });
-        let number = digits.filter(|&number| number < video.names.len());
-        let number = number.ok_or_else(|| {
-            let expected = format!("a frame's name, or a number below {}, the number of frames", video.names.len());
-            CaptureError::invalid(&path, "name", expected, name.as_str())
-        })?;
-        if found.insert(number, path).is_some() {
-            twice.insert(number);
+    let names: Vec<&str> = files.iter().map(|(name, _)| name.as_str()).collect();
+    let joined = join::by_name(video, &names).map_err(|why| match why {
+        Disjoint::Twice(number) => {
+            CaptureError::invalid(dir, format!("number {number}"), "one mask a frame", "several files")
         }
-    }
-    match twice.first() {
-        Some(number) => {
-            Err(CaptureError::invalid(dir, format!("number {number}"), "one mask a frame", "several files"))
+        Disjoint::Apart => {
+            let expected = format!("names or numbers of pictures, as {}", video.names[0]);
+            CaptureError::invalid(&files[0].1, "name", expected, names[0])
         }
-        None => Ok(found),
+    })?;
+    let absent = joined.at.iter().filter(|at| at.is_none()).count();
+    let mut notes: Vec<String> = joined.note.into_iter().collect();
+    if absent > 0 {
+        notes.push(format!("{absent} of {} masks have no picture", files.len()));
     }
+    let files = joined.at.iter().zip(files).filter_map(|(at, (_, path))| Some(((*at)?, path)));
+    Ok((files.collect(), notes))
 }
 
 /// `.npy` files by name without extension.
@@ -275,7 +314,7 @@ fn arrays(dir: &Path) -> Result<Vec<(String, PathBuf)>, CaptureError> {
     let mut files = Vec::new();
     for entry in std::fs::read_dir(dir).map_err(CaptureError::io(dir))? {
         let path = entry.map_err(CaptureError::io(dir))?.path();
-        if path.extension().is_some_and(|e| e == "npy") {
+        if path.extension().is_some_and(|e| e == "npy") && !is_hidden(&path) {
             let stem = path.file_stem().map_or(String::new(), |s| s.to_string_lossy().into_owned());
             files.push((stem, path));
         }

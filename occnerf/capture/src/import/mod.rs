@@ -3,7 +3,7 @@
 //! [`import`] reads the frames of a video, a fit and masks, and writes a capture in HumanNeRF's
 //! wild layout for [`super::load_capture`]. Formats are detected by content:
 //!
-//! - fits: WHAM, 4D-Humans / PHALP, GVHMR, PromptHMR, ROMP, EasyMocap, and the data sets
+//! - fits: WHAM, 4D-Humans / PHALP, GVHMR, PromptHMR, VIBE / PyMAF, ROMP, EasyMocap, and the data sets
 //!   PeopleSnapshot and NeuMan ([`Tool`]);
 //! - masks: object ids (SAM 2's palette PNGs or folders, Grounded-SAM-2's `.npy`), coverage
 //!   (MatAnyone, plain 0/255 pictures), or the fit's own (4D-Humans / PHALP, PromptHMR).
@@ -18,6 +18,7 @@ mod easymocap;
 mod fit;
 mod gvhmr;
 mod item;
+mod join;
 mod levels;
 mod masks;
 mod neuman;
@@ -30,6 +31,7 @@ mod rle;
 mod romp;
 #[cfg(test)]
 mod tests;
+mod vibe;
 mod video;
 mod wham;
 mod write;
@@ -49,6 +51,7 @@ use self::masks::Masks;
 use self::video::Video;
 use self::write::Placed;
 use super::CaptureError;
+use crate::image::has_profile;
 
 /// Statistics of an import.
 #[derive(Clone, Debug, PartialEq)]
@@ -69,6 +72,10 @@ pub struct Imported {
     pub ghosts: usize,
     /// Frames with a fit but without a mask.
     pub unmasked: usize,
+    /// Frames with a fit but without a picture.
+    pub absent: usize,
+    /// What a user should know: gaps of the pictures, and what was joined other than by name.
+    pub notes: Vec<String>,
     /// Largest standard deviation of a shape coefficient over the frames; the capture has the robust
     /// mean.
     pub betas_spread: f64,
@@ -91,9 +98,16 @@ pub fn import(options: &ImportOptions, out: &Path) -> Result<Imported, CaptureEr
     if let Some(focal) = options.focal.filter(|focal| !(*focal >= 1.0 && *focal <= 1e6)) {
         return Err(CaptureError::setting("focal", "1 to 1000000 pixels", focal));
     }
-    let fit = read::read(&options.fit, &video)?;
+    let (fit, joined) = read::read(&options.fit, &video)?;
     let tool = fit.tool;
-    let (person, others) = choose(&options.fit, fit.people, options.person.as_deref())?;
+    let (person, others, continued) = choose(&options.fit, fit.people, options.person.as_deref())?;
+    let gaps_of_video = Some(video.gaps()).filter(|gaps| !gaps.is_empty());
+    let mut notes: Vec<String> = gaps_of_video.map(|gaps| format!("pictures: numbers without one: {gaps}")).into_iter().collect();
+    if has_profile(&video.paths[0])? {
+        notes.push("pictures: their colour profile is not applied, colours are taken for sRGB".to_owned());
+    }
+    notes.extend(joined.map(|note| format!("fit: {note}")));
+    notes.extend(continued);
     let (body_path, model) = body::find(tool, options.body.as_deref(), &[&options.fit, &options.frames])?;
     let hands = match tool.hands_at_mean() {
         Some(true) => body::mean_hands(&body_path)?,
@@ -101,14 +115,21 @@ pub fn import(options: &ImportOptions, out: &Path) -> Result<Imported, CaptureEr
     };
     let (betas, betas_spread) = robust_mean(person.frames.iter().map(|frame| frame.betas.as_slice()));
     let unfitted = gaps(&person, video.names.len());
-    let masks = options.masks.as_ref().map(|path| Masks::open(path, options, &video)).transpose()?;
+    let masks = match &options.masks {
+        Some(path) => Some(Masks::open(path, options, &video)?),
+        None if person.frames.iter().all(|frame| frame.mask.is_none()) => Masks::of_alpha(options, &video)?,
+        None => None,
+    };
+    notes.extend(masks.iter().flat_map(|masks| &masks.notes).map(|note| format!("masks: {note}")));
     let has_mask = |frame: &FitFrame| masks.as_ref().map_or(frame.mask.is_some(), |masks| masks.has(frame.index));
     let fitted = person.frames.len();
     let frames: Vec<FitFrame> = person.frames.into_iter().filter(has_mask).collect();
     if frames.is_empty() {
         let (path, what) = match &options.masks {
             Some(path) => (path, "a mask of a frame with a fit"),
-            None => (&options.fit, "masks in the fit (4D-Humans and PromptHMR have them), or --masks"),
+            None => {
+                (&options.fit, "masks in the fit (4D-Humans and PromptHMR have them) or in the frames' alpha, or --masks")
+            }
         };
         return Err(CaptureError::invalid(path, "masks", what, format!("none, of {fitted} fitted frames")));
     }
@@ -130,6 +151,8 @@ pub fn import(options: &ImportOptions, out: &Path) -> Result<Imported, CaptureEr
         unfitted,
         ghosts: person.ghosts,
         unmasked,
+        absent: person.absent,
+        notes,
         betas_spread,
         focal: placed.first().map_or(0.0, |placed| placed.frame.focal[0]),
         masks: kind,
@@ -137,29 +160,53 @@ pub fn import(options: &ImportOptions, out: &Path) -> Result<Imported, CaptureEr
     })
 }
 
-/// The person `asked` for, or the one in most frames (the first of equals); and ids and numbers of
-/// frames of the others.
-fn choose(
-    path: &Path,
-    mut people: Vec<Person>,
-    asked: Option<&str>,
-) -> Result<(Person, Vec<(String, usize)>), CaptureError> {
-    let held = || {
-        let each = people.iter().map(|p| format!("{} ({} frames)", p.id, p.frames.len()));
-        each.collect::<Vec<_>>().join(", ")
+/// The person chosen, ids and numbers of frames of the others, and a hint at one person's other ids.
+type Choice = (Person, Vec<(String, usize)>, Option<String>);
+
+/// The person `asked` for, of one id or of several (`0,4,17`), or the one in most frames (the first of
+/// equals).
+fn choose(path: &Path, mut people: Vec<Person>, asked: Option<&str>) -> Result<Choice, CaptureError> {
+    let most = (0..people.len()).min_by_key(|&i| (usize::MAX - people[i].frames.len(), i));
+    let ids: Vec<String> = match (asked, most) {
+        (Some(asked), _) => asked.split(',').map(|id| id.trim().to_owned()).collect(),
+        (None, Some(most)) => vec![people[most].id.clone()],
+        (None, None) => return Err(CaptureError::invalid(path, "people", "a person", "nobody")),
     };
-    let at = match asked {
-        Some(id) => people.iter().position(|person| person.id == id),
-        None => (0..people.len()).min_by_key(|&i| (usize::MAX - people[i].frames.len(), i)),
-    };
-    let Some(at) = at else {
-        let expected = asked.map_or("a person".to_owned(), |id| format!("person {id}"));
-        let found = if people.is_empty() { "nobody".to_owned() } else { held() };
-        return Err(CaptureError::invalid(path, "people", expected, found));
-    };
-    let mut person = people.remove(at);
+    let mut person = Person::default();
+    for id in &ids {
+        let Some(at) = people.iter().position(|person| person.id == *id) else {
+            let each = people.iter().map(|p| format!("{} ({} frames)", p.id, p.frames.len()));
+            let found = each.collect::<Vec<_>>().join(", ");
+            return Err(CaptureError::invalid(path, "people", format!("person {id}"), found));
+        };
+        let part = people.remove(at);
+        // Where two ids have a frame, that of the id named first.
+        let new = part.frames.into_iter().filter(|new| person.frames.iter().all(|frame| frame.index != new.index));
+        let new: Vec<FitFrame> = new.collect();
+        person.frames.extend(new);
+        person.ghosts += part.ghosts;
+        person.absent += part.absent;
+    }
+    person.id = ids.join(",");
     person.frames.sort_by_key(|frame| frame.index);
-    Ok((person, people.into_iter().map(|other| (other.id, other.frames.len())).collect()))
+    let continued = people.iter().filter(|other| continues(&person, other)).map(|other| other.id.as_str());
+    let continued = continued.collect::<Vec<_>>().join(",");
+    let hint = format!("fit: person {continued} goes on in time and place where person {} ends: the same? --person {},{continued}", person.id, person.id);
+    let others = people.iter().map(|other| (other.id.clone(), other.frames.len())).collect();
+    Ok((person, others, (!continued.is_empty()).then_some(hint)))
+}
+
+/// Whether two tracks may be of one person: no frame in common, and ends within a second and a metre.
+fn continues(a: &Person, b: &Person) -> bool {
+    const FRAMES: usize = 30;
+    const METRES: f64 = 1.0;
+    let disjoint = b.frames.iter().all(|b| a.frames.iter().all(|a| a.index != b.index));
+    let near = |a: Option<&FitFrame>, b: Option<&FitFrame>| {
+        a.zip(b).is_some_and(|(a, b)| {
+            a.index.abs_diff(b.index) <= FRAMES && a.pelvis(DVec3::ZERO).distance(b.pelvis(DVec3::ZERO)) < METRES
+        })
+    };
+    disjoint && (near(a.frames.last(), b.frames.first()) || near(a.frames.first(), b.frames.last()))
 }
 
 /// Frames before the person's first, after the last, and between without a fit.

@@ -22,7 +22,7 @@ pub(super) fn read(path: &Path, people: &[(String, Item<'_>)], video: &Video) ->
     let lenses = lenses(&sparse.join("cameras.txt"), video)?;
     let images = sparse.join("images.txt");
     let lines = text(&images)?;
-    let mut read = Vec::new();
+    let (mut read, mut names, mut index) = (Vec::new(), Vec::new(), BTreeMap::new());
     for (id, item) in people {
         let (pose, shape) = (item.get("pose")?, item.get("betas")?);
         let (poses, shapes) = (pose.rows(3 * SMPL)?, shape.rows(BETAS)?);
@@ -41,8 +41,10 @@ pub(super) fn read(path: &Path, people: &[(String, Item<'_>)], video: &Video) ->
             };
             let lens = *lenses.get(*camera).ok_or_else(|| invalid("a camera of cameras.txt", camera))?;
             let stem = Path::new(name).file_stem().and_then(|stem| stem.to_str()).unwrap_or_default();
-            let index = video.names.iter().position(|frame| frame == stem);
-            let index = index.ok_or_else(|| invalid("a picture of the video", name))?;
+            let index = *index.entry(stem.to_owned()).or_insert_with(|| {
+                names.push(stem.to_owned());
+                names.len() - 1
+            });
             let row = stem.parse::<usize>().ok().filter(|row| *row < poses.len());
             let row = row.ok_or_else(|| invalid(&format!("a number below {}, the poses", poses.len()), name))?;
             let quaternion = DQuat::from_xyzw(x, y, z, w);
@@ -65,9 +67,9 @@ pub(super) fn read(path: &Path, people: &[(String, Item<'_>)], video: &Video) ->
                 ..FitFrame::still(index, pose, shapes[row].clone(), &a, lens)
             });
         }
-        read.push(Person { id: id.clone(), frames, ghosts: 0 });
+        read.push(Person { id: id.clone(), frames, ..Person::default() });
     }
-    Ok(Fit { tool: Tool::NeuMan, people: read })
+    Ok(Fit { tool: Tool::NeuMan, people: read, names: Some(names) })
 }
 
 /// Focal lengths and principal point of each camera.
@@ -154,7 +156,7 @@ mod tests {
         let cameras = format!("# Camera list\n1 OPENCV 256 256 {} {} {} {} 0.01 0 0 0\n", k[0], k[4], k[2], k[5]);
         out.write("sparse/cameras.txt", &cameras);
         out.write("sparse/images.txt", &images);
-        let fit = read::read(&out.path().join("smpl_output_romp.pkl"), &video).unwrap();
+        let (fit, _) = read::read(&out.path().join("smpl_output_romp.pkl"), &video).unwrap();
         assert_eq!((fit.tool, fit.people[0].id.as_str(), fit.people[0].frames.len()), (Tool::NeuMan, "1", poses.len()));
         for (i, frame) in fit.people[0].frames.iter().enumerate() {
             assert_eq!((frame.index, frame.focal, frame.centre), (i, [k[0], k[4]], [k[2], k[5]]));
@@ -172,7 +174,7 @@ mod tests {
         refused("sparse/cameras.txt", &cameras.replace("OPENCV", "FISHEYE"), &["line 2", "PINHOLE", "FISHEYE"]);
         refused("sparse/cameras.txt", &cameras.replace("256 256", "256 512"), &["256×256, as the frames"]);
         refused("sparse/images.txt", "1 1 0 0 0 0 0 0 2 00000.png", &["line 1", "camera of cameras.txt", "found 2"]);
-        refused("sparse/images.txt", "1 1 0 0 0 0 0 0 1 00099.png", &["picture of the video", "00099.png"]);
+        refused("sparse/images.txt", "1 1 0 0 0 0 0 0 1 00099.png", &["a number below", "00099.png"]);
         refused("sparse/images.txt", "1 1 0 0 nan 0 0 0 1 00000.png", &["rotation (4)", "nan"]);
         refused("sparse/images.txt", "1 9 0 0 0 0 0 0 1 00000.png", &["unit quaternion"]);
     }

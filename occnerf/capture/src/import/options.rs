@@ -9,14 +9,15 @@ pub struct ImportOptions {
     pub frames: PathBuf,
     /// The estimator's file, or EasyMocap's folder.
     pub fit: PathBuf,
-    /// The segmenter's folder, or one `.npy` file; `None`: the masks in the fit.
+    /// The segmenter's folder, or one `.npy` or `.npz` file; `None`: the masks in the fit, or the alpha
+    /// channels of the frames.
     pub masks: Option<PathBuf>,
     /// The estimator's id of the person; `None`: the one in most frames.
     pub person: Option<String>,
     /// The person's value in masks of object ids, 1 if `None`.
-    pub object: Option<u8>,
+    pub object: Option<u32>,
     /// Values of the occluders.
-    pub occluder_objects: Vec<u8>,
+    pub occluder_objects: Vec<u32>,
     /// Focal length in pixels replacing the estimator's; the body is moved in depth to keep its
     /// size in the image.
     pub focal: Option<f64>,

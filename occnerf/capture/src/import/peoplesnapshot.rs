@@ -6,11 +6,10 @@
 use std::path::Path;
 
 use array_files::npz::Npz;
-use array_files::pickle::Value;
 use glam::DVec3;
 
 use super::fit::{About, BETAS, Fit, FitFrame, Person, SMPL, Tool};
-use super::item::{Item, vectors};
+use super::item::{Item, dictionary, vectors};
 use super::video::Video;
 use crate::CaptureError;
 
@@ -52,7 +51,7 @@ pub(super) fn read(path: &Path, npz: &mut Npz, video: &Video) -> Result<Fit, Cap
     let betas = fit.get("betas")?.numbers(&[Some(1), Some(BETAS)])?;
     place.as_long(poses.len(), places.len())?;
     // The frames of a partial split are unknown.
-    if places.len() != video.names.len() {
+    if places.len() < video.names.len() {
         let expected = format!("{} rows, one a frame of the video", video.names.len());
         return Err(place.invalid(expected, places.len().to_string()));
     }
@@ -63,14 +62,8 @@ pub(super) fn read(path: &Path, npz: &mut Npz, video: &Video) -> Result<Fit, Cap
         offset: turn * DVec3::from_slice(place) + moved,
         ..FitFrame::still(index, vectors(pose), betas.clone(), place, lens)
     });
-    let person = Person { id: "0".to_owned(), frames: frames.collect(), ghosts: 0 };
-    Ok(Fit { tool: Tool::PeopleSnapshot, people: vec![person] })
-}
-
-fn dictionary(npz: &mut Npz) -> Result<Value, CaptureError> {
-    let keys = npz.keys().to_vec();
-    let entries = keys.into_iter().map(|key| Ok((Value::Str(key.clone()), npz.value(&key)?)));
-    Ok(Value::Dict(entries.collect::<Result<_, smpl::Error>>()?))
+    let person = Person { id: "0".to_owned(), frames: frames.collect(), ..Person::default() };
+    Ok(Fit { tool: Tool::PeopleSnapshot, people: vec![person], names: None })
 }
 
 #[cfg(test)]
@@ -129,7 +122,7 @@ mod tests {
             ],
         );
         for file in ["poses.npz", "poses/train.npz"] {
-            let fit = read::read(&out.path().join(file), &video).unwrap();
+            let (fit, _) = read::read(&out.path().join(file), &video).unwrap();
             assert_eq!((fit.tool, fit.people.len(), fit.people[0].frames.len()), (Tool::PeopleSnapshot, 1, count));
             for (i, frame) in fit.people[0].frames.iter().enumerate() {
                 assert_eq!((frame.index, frame.focal, frame.centre), (i, [k[0], k[4]], [k[2], k[5]]));

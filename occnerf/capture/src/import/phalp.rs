@@ -4,6 +4,7 @@
 //! padded to, its own centre.
 
 use std::collections::BTreeMap;
+use std::path::Path;
 
 use array_files::pickle::Value;
 
@@ -18,8 +19,11 @@ pub(super) fn read(frames: &[(String, Item<'_>)], video: &Video) -> Result<Fit, 
     let mut people: BTreeMap<i64, Person> = BTreeMap::new();
     let mut frames: Vec<&(String, Item<'_>)> = frames.iter().collect();
     frames.sort_by(|a, b| FrameName(&a.0).cmp(&FrameName(&b.0)));
+    let stem = |name: &str| Path::new(name).file_stem().map_or(String::new(), |s| s.to_string_lossy().into_owned());
+    let names: Vec<String> = frames.iter().map(|(name, _)| stem(name)).collect();
+    let is_named = names.iter().any(|name| video.index(name).is_some());
     for (place, (_, item)) in frames.into_iter().enumerate() {
-        let index = match item.find("time") {
+        let index = match item.find("time").filter(|_| !is_named) {
             Some(time) => {
                 let index = time.whole()?;
                 usize::try_from(index).map_err(|_| time.invalid("an index of a frame", index.to_string()))?
@@ -28,7 +32,7 @@ pub(super) fn read(frames: &[(String, Item<'_>)], video: &Video) -> Result<Fit, 
         };
         for (track, id) in item.get("tid")?.list()?.iter().enumerate() {
             let id = id.whole()?;
-            let new = || Person { id: id.to_string(), frames: Vec::new(), ghosts: 0 };
+            let new = || Person { id: id.to_string(), ..Person::default() };
             let person = people.entry(id).or_insert_with(new);
             // A track without a detection repeats an earlier frame, mask included.
             if item.entry("tracked_time", track)?.whole()? > 0 {
@@ -38,7 +42,7 @@ pub(super) fn read(frames: &[(String, Item<'_>)], video: &Video) -> Result<Fit, 
             }
         }
     }
-    Ok(Fit { tool: Tool::Phalp, people: people.into_values().collect() })
+    Ok(Fit { tool: Tool::Phalp, people: people.into_values().collect(), names: is_named.then_some(names) })
 }
 
 fn frame(item: &Item<'_>, track: usize, index: usize, video: &Video) -> Result<FitFrame, CaptureError> {

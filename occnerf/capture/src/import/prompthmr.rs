@@ -12,6 +12,8 @@ use crate::CaptureError;
 
 /// Joints in `pose`.
 const JOINTS: usize = 25;
+/// Height above which frames are worked on at a smaller size.
+const WORKED_ON: f64 = 896.0;
 /// How far the two sides' scales may be apart.
 const ASPECT: f64 = 0.01;
 
@@ -21,11 +23,17 @@ pub(super) fn read(root: &Item<'_>, video: &Video) -> Result<Fit, CaptureError> 
     let at = centre.few(2)?;
     let [width, height] = video.sides();
     let scale = [width / (2.0 * at[0]), height / (2.0 * at[1])];
-    if !(scale[0] > 0.0 && (scale[0] / scale[1] - 1.0).abs() < ASPECT) {
-        let expected = format!("half of {width}×{height}, the frames' size, or of the same at another scale");
-        return Err(centre.invalid(expected, format!("{at:?}")));
-    }
-    let lens = [scale.map(|scale| focal * scale), video.middle()];
+    let lens = if scale[0] > 0.0 && (scale[0] / scale[1] - 1.0).abs() < ASPECT {
+        [scale.map(|scale| focal * scale), video.middle()]
+    } else {
+        // Of a cropped video, whose principal point is not its centre.
+        let scale = (height / WORKED_ON).max(1.0);
+        if !(0.0..=width).contains(&(scale * at[0])) || !(0.0..=height).contains(&(scale * at[1])) {
+            let expected = format!("a point of {width}×{height}, the frames' size, or of the same at another scale");
+            return Err(centre.invalid(expected, format!("{at:?}")));
+        }
+        [[focal * scale; 2], [at[0] * scale, at[1] * scale]]
+    };
     let mut people = Vec::new();
     for (id, person) in root.get("people")?.entries()? {
         let indices = person.get("frames")?.indices()?;
@@ -41,9 +49,9 @@ pub(super) fn read(root: &Item<'_>, video: &Video) -> Result<Fit, CaptureError> 
             mask: masks.next(),
             ..FitFrame::still(index, vectors(&poses[i]), shapes[i].clone(), &places[i], lens)
         });
-        people.push(Person { id, frames: frames.collect(), ghosts: 0 });
+        people.push(Person { id, frames: frames.collect(), ..Person::default() });
     }
-    Ok(Fit { tool: Tool::PromptHmr, people })
+    Ok(Fit { tool: Tool::PromptHmr, people, names: None })
 }
 
 /// `masks` (N,H,W), one by one.

@@ -1,5 +1,6 @@
 //! Detection of a fit's format.
 
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;
 use std::io::{BufReader, Read};
 use std::path::Path;
@@ -8,28 +9,64 @@ use array_files::npz::Npz;
 use array_files::pickle::{self, Value};
 use array_files::torch::{TorchFile, is_torch};
 
-use super::fit::{Fit, Person};
-use super::item::Item;
+use super::fit::{Fit, FitFrame, Person};
+use super::item::{Item, dictionary};
 use super::video::Video;
-use super::{easymocap, gvhmr, neuman, peoplesnapshot, phalp, prompthmr, romp, wham};
+use super::{easymocap, gvhmr, join, neuman, peoplesnapshot, phalp, prompthmr, romp, vibe, wham};
 use crate::CaptureError;
 use crate::checks::{MAX_ANGLE, MAX_BETA};
 
 /// Expected formats.
-const TOOLS: &str = "a result of WHAM, 4D-Humans / PHALP, GVHMR, PromptHMR or ROMP, EasyMocap's folder, \
+const TOOLS: &str = "a result of WHAM, 4D-Humans / PHALP, GVHMR, PromptHMR, VIBE or ROMP, EasyMocap's folder, \
     poses.npz of PeopleSnapshot, or smpl_output_*.pkl of NeuMan";
 
-/// Reads a fit; the format is detected by content.
-pub(super) fn read(path: &Path, video: &Video) -> Result<Fit, CaptureError> {
-    let fit = if path.is_dir() { easymocap::read(path, video)? } else { read_file(path, video)? };
+/// Reads a fit; the format is detected by content. Also returns how its frames were joined with the
+/// pictures, unless by name.
+pub(super) fn read(path: &Path, video: &Video) -> Result<(Fit, Option<String>), CaptureError> {
+    let mut fit = if path.is_dir() { easymocap::read(path, video)? } else { read_file(path, video)? };
+    let note = join(path, &mut fit, video)?;
     for person in &fit.people {
         check(path, person, video)?;
     }
-    Ok(Fit { people: fit.people.into_iter().filter(|person| !person.frames.is_empty()).collect(), ..fit })
+    fit.people.retain(|person| !person.frames.is_empty());
+    Ok((fit, note))
+}
+
+/// Replaces indices of a fit by those of the video's pictures; the note of [`Joined`].
+fn join(path: &Path, fit: &mut Fit, video: &Video) -> Result<Option<String>, CaptureError> {
+    let indices: BTreeSet<usize> = fit.people.iter().flat_map(|person| &person.frames).map(|f| f.index).collect();
+    let Some(last) = indices.last() else { return Ok(None) };
+    let (joined, indices) = match &fit.names {
+        Some(names) => {
+            let names: Vec<&str> = names.iter().map(String::as_str).collect();
+            let expected = || format!("names of pictures, as {}", video.names[0]);
+            let joined = join::by_name(video, &names)
+                .map_err(|_| CaptureError::invalid(path, "pictures", expected(), format!("{} and others", names[0])))?;
+            (joined, (0..names.len()).collect())
+        }
+        None => {
+            let expected = || format!("frames of the video, which has {} (counted from 0)", video.names.len());
+            let beyond = || CaptureError::invalid(path, "frames", expected(), format!("frame {last}"));
+            (join::by_index(video, &indices).ok_or_else(beyond)?, indices)
+        }
+    };
+    let at: BTreeMap<usize, Option<usize>> = indices.into_iter().zip(joined.at).collect();
+    for person in &mut fit.people {
+        let before = person.frames.len();
+        let placed = std::mem::take(&mut person.frames).into_iter();
+        let placed = placed.filter_map(|frame| Some(FitFrame { index: (*at.get(&frame.index)?)?, ..frame }));
+        person.frames = placed.collect();
+        person.absent = before - person.frames.len();
+    }
+    Ok(joined.note)
 }
 
 fn read_file(path: &Path, video: &Video) -> Result<Fit, CaptureError> {
     let mut file = File::open(path).map_err(CaptureError::io(path))?;
+    if let Some(name @ ("tracking_results.pth" | "slam_results.pth")) = path.file_name().and_then(|name| name.to_str()) {
+        let expected = "wham_output.pkl, WHAM's result (demo.py --save_pkl)";
+        return Err(CaptureError::invalid(path, "the file", expected, format!("{name}, of a step before")));
+    }
     let mut start = Vec::new();
     (&mut file).take(64).read_to_end(&mut start).map_err(CaptureError::io(path))?;
     let name = path.display().to_string();
@@ -43,10 +80,21 @@ fn read_file(path: &Path, video: &Video) -> Result<Fit, CaptureError> {
                 error => error.into(),
             })?;
             if npz.keys().iter().any(|key| key == "results") {
-                return romp::read(path, &npz.value("results")?, video);
+                let results = npz.value("results")?;
+                if results.get("smpl_thetas").is_some() {
+                    let expected = "ROMP's result of a video (romp --mode=video)";
+                    return Err(CaptureError::invalid(path, "results", expected, "that of one picture"));
+                }
+                return romp::read(path, &results, video);
             }
             if peoplesnapshot::is(npz.keys()) {
                 return peoplesnapshot::read(path, &mut npz, video);
+            }
+            if !npz.keys().is_empty() {
+                let value = dictionary(&mut npz)?;
+                return gvhmr::from_arrays(&Item::new(path, &value), video)?.ok_or_else(|| {
+                    CaptureError::invalid(path, "the file", TOOLS, format!("an archive of {}", npz.keys().join(", ")))
+                });
             }
         }
         let mut file = TorchFile::open(&name, BufReader::new(file))?;
@@ -73,6 +121,8 @@ pub(super) fn parse(path: &Path, value: &Value, video: &Video) -> Result<Fit, Ca
         phalp::read(&entries, video)
     } else if has(&["pose", "trans", "frame_ids"]) {
         wham::read(&entries, video)
+    } else if has(&["pose", "orig_cam", "frame_ids"]) {
+        vibe::read(&entries, video)
     } else if has(&["pose", "betas"]) && path.with_file_name("alignments.npy").is_file() {
         neuman::read(path, &entries, video)
     } else if has(&["smpl_thetas", "cam_trans"]) {

@@ -7,6 +7,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use array_files::pickle::Value;
+use glam::DVec3;
 
 use super::fit::{BETAS, Fit, FitFrame, Person, SMPL, Tool};
 use super::item::{Item, vectors};
@@ -21,32 +22,41 @@ pub(super) fn read(path: &Path, results: &Value, video: &Video) -> Result<Fit, C
     let mut entries = root.entries()?;
     entries.sort_by(|a, b| FrameName(&a.0).cmp(&FrameName(&b.0)));
     let stem = |name: &str| Path::new(name).file_stem().map_or(String::new(), |s| s.to_string_lossy().into_owned());
-    let named = |name: &str| video.names.iter().position(|frame| *frame == stem(name));
-    // Frames extracted by ROMP itself have other names.
-    let by_order = entries.len() == video.names.len() && entries.iter().all(|(name, _)| named(name).is_none());
+    let names = entries.iter().map(|(name, _)| stem(name)).collect();
     let mut people: BTreeMap<i64, Person> = BTreeMap::new();
-    for (place, (name, item)) in entries.iter().enumerate() {
-        let index = if by_order { Some(place) } else { named(name) };
-        let index = index.ok_or_else(|| {
-            let expected =
-                format!("the name of a frame ({} to {})", video.names[0], video.names[video.names.len() - 1]);
-            item.invalid(expected, name.as_str())
-        })?;
+    let mut last: BTreeMap<i64, DVec3> = BTreeMap::new();
+    for (index, (_, item)) in entries.iter().enumerate() {
         let (thetas, betas, trans) = (item.get("smpl_thetas")?, item.get("smpl_betas")?, item.get("cam_trans")?);
         let (poses, shapes, places) = (thetas.rows(3 * SMPL)?, betas.rows(BETAS)?, trans.rows(3)?);
         let tracks = match item.find("track_ids") {
             Some(tracks) => tracks.numbers(&[None])?.iter().map(|id| *id as i64).collect(),
-            None if poses.len() == 1 => vec![0],
-            None => return Err(item.invalid("`track_ids`, as ROMP writes them with -t", "several people without")),
+            None => tracked(&places, &mut last),
         };
         for (item, found) in [(&thetas, poses.len()), (&betas, shapes.len()), (&trans, places.len())] {
             item.as_long(tracks.len(), found)?;
         }
         for (i, id) in tracks.into_iter().enumerate() {
-            let new = || Person { id: id.to_string(), frames: Vec::new(), ghosts: 0 };
+            let new = || Person { id: id.to_string(), ..Person::default() };
             let frame = FitFrame::still(index, vectors(&poses[i]), shapes[i].clone(), &places[i], lens);
             people.entry(id).or_insert_with(new).frames.push(frame);
         }
     }
-    Ok(Fit { tool: Tool::Romp, people: people.into_values().collect() })
+    Ok(Fit { tool: Tool::Romp, people: people.into_values().collect(), names: Some(names) })
+}
+
+/// Ids of people at these places, where the file has none: of whoever was last seen nearest, within two
+/// metres.
+fn tracked(places: &[Vec<f64>], last: &mut BTreeMap<i64, DVec3>) -> Vec<i64> {
+    const METRES: f64 = 2.0;
+    let mut taken = Vec::new();
+    for place in places.iter().map(|place| DVec3::from_slice(place)) {
+        let is_only = places.len() == 1 && last.len() <= 1;
+        let near = |at: &DVec3| is_only || at.distance(place) < METRES;
+        let free = last.iter().filter(|(id, at)| !taken.contains(*id) && near(at));
+        let nearest = free.min_by(|a, b| a.1.distance(place).total_cmp(&b.1.distance(place))).map(|(id, _)| *id);
+        let id = nearest.unwrap_or_else(|| last.keys().next_back().map_or(0, |id| id + 1));
+        last.insert(id, place);
+        taken.push(id);
+    }
+    taken
 }

@@ -9,7 +9,7 @@ use smpl::{BodyModel, Placement};
 
 use super::fit::{FitFrame, SMPLX, rotation};
 use super::*;
-use crate::testing::{Directory, shared};
+use crate::testing::{Directory, array, shared};
 
 /// Name in `expected/`, file, person asked for.
 const FITS: [(&str, &str, Option<&str>); 12] = [
@@ -89,8 +89,8 @@ fn rows(m: DMat3) -> [f64; 9] {
 fn fit_of(dir: &Path, file: &str, person: Option<&str>) -> (Tool, Person, Vec<(String, usize)>) {
     let video = Video::list(&dir.join("frames")).unwrap();
     let path = dir.join(file);
-    let fit = read::read(&path, &video).unwrap_or_else(|e| panic!("{e}"));
-    let (person, others) = choose(&path, fit.people, person).unwrap();
+    let (fit, _) = read::read(&path, &video).unwrap_or_else(|e| panic!("{e}"));
+    let (person, others, _) = choose(&path, fit.people, person).unwrap();
     (fit.tool, person, others)
 }
 
@@ -307,6 +307,163 @@ fn masks_are_matched_by_name_by_order_or_by_number() {
     assert!(levels.iter().enumerate().all(|(i, level)| (*level == 255) == (i == 5)));
     dir.picture("empty/000001.png", (4, 2), |_, _| 0);
     assert!(frames("empty").unwrap_err().contains("all masks"));
+}
+
+/// Masks of a video of one frame per value of `make`.
+fn levels_of(name: &str, count: usize, options: &ImportOptions, make: impl Fn(usize, &Path)) -> Vec<Vec<u8>> {
+    let dir = Directory::new(name);
+    let names: Vec<String> = (0..count).map(|i| format!("{i:06}")).collect();
+    std::fs::create_dir_all(dir.path().join("masks")).unwrap();
+    for (i, name) in names.iter().enumerate() {
+        make(i, &dir.path().join("masks").join(name));
+    }
+    let path = dir.path().join("masks");
+    // What systems leave beside pictures.
+    for leftover in ["._000000.png", ".DS_Store", "Thumbs.db"] {
+        std::fs::write(path.join(leftover), b"Mac OS X").unwrap();
+    }
+    let video = Video { paths: vec![PathBuf::new(); count], names, size: (4, 2) };
+    let masks = Masks::open(&path, options, &video).unwrap_or_else(|e| panic!("{name}: {e}"));
+    (0..count).map(|i| masks.levels(&path, i, &video).unwrap().0).collect()
+}
+
+#[test]
+fn ids_are_integers_at_any_depth() {
+    use image::{ImageBuffer, Luma, Rgb};
+    // Pixel 3 of a frame is the person, pixel 5 somebody else.
+    let value = |i: u32, id: u32, other: u32| if i == 3 { id } else if i == 5 { other } else { 0 };
+    let at = |x: u32, y: u32| y * 4 + x;
+    for (id, other) in [(1, 2), (2, 1), (7, 120), (300, 1), (1, 300), (30_000, 2)] {
+        let options = ImportOptions { object: Some(id), ..ImportOptions::default() };
+        let expected = |levels: Vec<Vec<u8>>, kind: &str| {
+            for (i, level) in levels.iter().flatten().enumerate() {
+                assert_eq!(*level, if i % 8 == 3 { 255 } else { 0 }, "{kind} of {id}, {other}");
+            }
+        };
+        let deep = |_: usize, path: &Path| {
+            let picture = ImageBuffer::from_fn(4, 2, |x, y| Luma([value(at(x, y), id, other) as u16]));
+            picture.save(path.with_extension("png")).unwrap();
+        };
+        expected(levels_of("ids-16", 2, &options, deep), "16 bits");
+        let array = |_: usize, path: &Path| {
+            let values: Vec<f64> = (0..8).map(|i| f64::from(value(i, id, other))).collect();
+            std::fs::write(path.with_extension("npy"), array(&[1, 2, 4], &values).npy()).unwrap();
+        };
+        expected(levels_of("ids-npy", 2, &options, array), ".npy");
+        if id.max(other) < 128 {
+            let color = |_: usize, path: &Path| {
+                let picture = ImageBuffer::from_fn(4, 2, |x, y| Rgb([value(at(x, y), id, other) as u8; 3]));
+                picture.save(path.with_extension("png")).unwrap();
+            };
+            expected(levels_of("ids-rgb", 2, &options, color), "grey of three channels");
+        }
+    }
+}
+
+#[test]
+fn masks_in_alpha_and_of_16_bits_are_coverage() {
+    use image::{ImageBuffer, Luma, LumaA, Rgba};
+    let options = ImportOptions::default();
+    let expected = [0, 0, 0, 255, 0, 0, 51, 0];
+    let pixel = |x: u32, y: u32| expected[(y * 4 + x) as usize];
+    // Cut out of a photograph, or white; the rest of the picture is as background removers leave it.
+    let cut = |color: [u8; 3]| {
+        move |_: usize, path: &Path| {
+            let [r, g, b] = color;
+            let picture = ImageBuffer::from_fn(4, 2, |x, y| Rgba([r, g, b, pixel(x, y)]));
+            picture.save(path.with_extension("png")).unwrap();
+        }
+    };
+    let grey = |_: usize, path: &Path| {
+        ImageBuffer::from_fn(4, 2, |x, y| LumaA([255, pixel(x, y)])).save(path.with_extension("png")).unwrap();
+    };
+    let deep = |_: usize, path: &Path| {
+        let picture = ImageBuffer::from_fn(4, 2, |x, y| Luma([u16::from(pixel(x, y)) * 257]));
+        picture.save(path.with_extension("png")).unwrap();
+    };
+    for levels in [
+        levels_of("alpha-white", 2, &options, cut([255; 3])),
+        levels_of("alpha-cut", 2, &options, cut([200, 30, 90])),
+        levels_of("alpha-grey", 2, &options, grey),
+        levels_of("coverage-16", 2, &options, deep),
+    ] {
+        assert_eq!(levels, [expected, expected]);
+    }
+}
+
+#[test]
+fn a_stack_with_an_axis_of_one_and_an_archive_are_masks() {
+    let dir = Directory::new("import-stack");
+    let values: Vec<f64> = (0..24).map(|i| f64::from(i % 8 == 3)).collect();
+    let video = Video { names: ["1", "2", "3"].map(str::to_owned).into(), paths: vec![PathBuf::new(); 3], size: (4, 2) };
+    let data = array_files::Data::F64(values.clone());
+    for shape in [&[3, 2, 4][..], &[3, 1, 2, 4], &[3, 2, 4, 1]] {
+        let extents: Vec<u32> = shape.iter().map(|n| *n as u32).collect();
+        dir.write("stack.npy", array(&extents, &values).npy());
+        let array = array_files::NdArray { shape: shape.to_vec(), data: data.clone() };
+        array_files::npz::write(&dir.path().join("stack.npz"), &[("masks", array)]).unwrap();
+        for file in ["stack.npy", "stack.npz"] {
+            let path = dir.path().join(file);
+            let masks = Masks::open(&path, &ImportOptions::default(), &video).unwrap();
+            let levels = masks.levels(&path, 2, &video).unwrap().0;
+            assert!(levels.iter().enumerate().all(|(i, level)| (*level == 255) == (i == 3)), "{file} {shape:?}");
+        }
+    }
+}
+
+#[test]
+fn a_lost_picture_costs_its_own_frame_alone() {
+    let Some(dir) = shared("estimators") else { return };
+    let video = Video::list(&dir.join("frames")).unwrap();
+    let lost = 6;
+    let mut short = Video::list(&dir.join("frames")).unwrap();
+    short.names.remove(lost);
+    short.paths.remove(lost);
+    for (_, file, person) in FITS {
+        let frames = |video: &Video| {
+            let (fit, note) = read::read(&dir.join(file), video).unwrap();
+            let (person, ..) = choose(Path::new(file), fit.people, person).unwrap();
+            (person, note)
+        };
+        let ((whole, _), (part, note)) = (frames(&video), frames(&short));
+        for frame in &part.frames {
+            let name = &short.names[frame.index];
+            let same = whole.frames.iter().find(|other| video.names[other.index] == *name).unwrap();
+            assert_eq!((&frame.pose, frame.offset), (&same.pose, same.offset), "{file} {name}: {note:?}");
+        }
+        let had = whole.frames.iter().any(|frame| frame.index == lost);
+        assert_eq!((part.frames.len(), part.absent), (whole.frames.len() - usize::from(had), usize::from(had)));
+    }
+    for masks in ["sam2", "sam2_per_object", "matanyone"] {
+        let path = dir.join(masks);
+        let open = |video: &Video| Masks::open(&path, &ImportOptions::default(), video).unwrap();
+        let (all, some) = (open(&video), open(&short));
+        for (i, name) in short.names.iter().enumerate() {
+            let other = video.names.iter().position(|other| other == name).unwrap();
+            assert_eq!(some.has(i), all.has(other), "{masks} {name}");
+            if some.has(i) {
+                assert_eq!(some.levels(&path, i, &short).unwrap(), all.levels(&path, other, &video).unwrap(), "{name}");
+            }
+        }
+    }
+}
+
+#[test]
+fn one_person_under_several_ids_is_joined() {
+    let frame = |index: usize, x: f64| FitFrame::still(index, Vec::new(), Vec::new(), &[x, 0.0, 3.0], [[1.0; 2]; 2]);
+    let track = |id: &str, frames: std::ops::Range<usize>, x: f64| Person {
+        id: id.to_owned(),
+        frames: frames.map(|i| frame(i, x)).collect(),
+        ..Person::default()
+    };
+    let people = || vec![track("0", 0..10, 0.0), track("4", 12..20, 0.2), track("9", 3..8, 0.1), track("17", 25..30, 4.0)];
+    let (person, others, hint) = choose(Path::new("f"), people(), None).unwrap();
+    assert_eq!((person.id.as_str(), person.frames.len(), others.len()), ("0", 10, 3));
+    assert!(hint.unwrap().contains("--person 0,4"), "9 is there at the same time, 17 elsewhere");
+    let (person, others, hint) = choose(Path::new("f"), people(), Some("0, 4,17")).unwrap();
+    assert_eq!((person.frames.len(), others.len(), hint), (23, 1, None));
+    assert!(person.frames.windows(2).all(|pair| pair[0].index < pair[1].index));
+    assert!(choose(Path::new("f"), people(), Some("0,5")).err().unwrap().to_string().contains("person 5"));
 }
 
 #[test]

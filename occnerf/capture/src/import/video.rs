@@ -1,7 +1,9 @@
 //! The frames of a video.
 
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
+use super::join::number;
 use crate::CaptureError;
 use crate::image::dimensions;
 use crate::names::FrameName;
@@ -21,7 +23,14 @@ impl Video {
         let mut found: Vec<(&String, &PathBuf)> = pictures.iter().collect();
         found.sort_by(|a, b| FrameName(a.0).cmp(&FrameName(b.0)));
         let Some((_, first)) = found.first() else {
-            return Err(CaptureError::invalid(dir, "files", "the video's frames, .png or .jpg", "none"));
+            let entries = std::fs::read_dir(dir).map_err(CaptureError::io(dir))?.filter_map(Result::ok);
+            let others = entries.filter_map(|entry| Some(entry.path().extension()?.to_string_lossy().to_lowercase()));
+            let others: BTreeSet<String> = others.collect();
+            let found = match others.is_empty() {
+                true => "none".to_owned(),
+                false => format!("files of {} (ffmpeg converts pictures)", Vec::from_iter(others).join(", ")),
+            };
+            return Err(CaptureError::invalid(dir, "files", "the video's frames, .png or .jpg", found));
         };
         let size = dimensions(first)?;
         for (_, path) in &found {
@@ -36,6 +45,32 @@ impl Video {
             paths: found.iter().map(|(_, path)| (*path).clone()).collect(),
             size,
         })
+    }
+
+    /// The frame called `name`.
+    pub fn index(&self, name: &str) -> Option<usize> {
+        self.names.binary_search_by(|frame| FrameName(frame).cmp(&FrameName(name))).ok()
+    }
+
+    /// The numbers of the frames, where all have one and they ascend.
+    pub fn numbers(&self) -> Option<Vec<usize>> {
+        let numbers: Option<Vec<usize>> = self.names.iter().map(|name| number(name)).collect();
+        numbers.filter(|numbers| numbers.windows(2).all(|pair| pair[0] < pair[1]))
+    }
+
+    /// The gaps between the frames' numbers, in words; empty where there are none.
+    pub fn gaps(&self) -> String {
+        let numbers = self.numbers().unwrap_or_default();
+        let gap = |pair: &[usize]| match pair[1] - pair[0] {
+            1 => None,
+            2 => Some(format!("{}", pair[0] + 1)),
+            _ => Some(format!("{} to {}", pair[0] + 1, pair[1] - 1)),
+        };
+        let gaps: Vec<String> = numbers.windows(2).filter_map(gap).collect();
+        match gaps.len() {
+            0..=8 => gaps.join(", "),
+            n => format!("{}, … {n} in all", gaps[..8].join(", ")),
+        }
     }
 
     /// Width and height.

@@ -19,9 +19,9 @@ pub(super) fn read(people: &[(String, Item<'_>)], video: &Video) -> Result<Fit, 
         }
         let frames = (indices.into_iter().zip(poses)).zip(places.into_iter().zip(shapes));
         let frames = frames.map(|((i, pose), (place, betas))| FitFrame::still(i, vectors(&pose), betas, &place, lens));
-        Ok(Person { id: id.clone(), frames: frames.collect(), ghosts: 0 })
+        Ok(Person { id: id.clone(), frames: frames.collect(), ..Person::default() })
     };
     // Dropped tracks are empty.
     let begun = people.iter().filter(|(_, item)| item.value.get("pose").is_some());
-    Ok(Fit { tool: Tool::Wham, people: begun.map(person).collect::<Result<_, CaptureError>>()? })
+    Ok(Fit { tool: Tool::Wham, people: begun.map(person).collect::<Result<_, CaptureError>>()?, names: None })
 }

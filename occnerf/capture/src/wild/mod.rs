@@ -35,10 +35,12 @@ pub(super) fn load(dir: &Path, body: &BodyModel, options: &LoadOptions) -> Resul
     options.only_zju("HumanNeRF's wild layout")?;
     let path = dir.join("metadata.json");
     let records = metadata::read(&path)?;
-    let frames = options.select(records.frames()?);
+    let all = records.frames()?;
+    let names: Vec<&str> = all.iter().map(|(FrameName(name), _)| *name).collect();
+    let frames = options.select(all);
 
     let (images, masks) = (Pictures::list(&dir.join("images"))?, Pictures::list(&dir.join("masks"))?);
-    let occluders = optional(&dir.join("occluders"))?;
+    let occluders = optional(&dir.join("occluders"), &names)?;
     let train: Result<Vec<Planned>, CaptureError> = frames
         .iter()
         .map(|(FrameName(name), record)| {
@@ -52,7 +54,7 @@ pub(super) fn load(dir: &Path, body: &BodyModel, options: &LoadOptions) -> Resul
     let clean = dir.join(CLEAN);
     let (mut indices, mut kept) = (Vec::new(), Vec::new());
     is_directory(&clean)?;
-    if let Some(images) = optional(&clean.join("images"))? {
+    if let Some(images) = optional(&clean.join("images"), &names)? {
         let masks = Pictures::list(&clean.join("masks"))?;
         for (index, (FrameName(name), record)) in frames.iter().enumerate().step_by(options.eval_stride) {
             if images.get(name).is_some() {
@@ -68,8 +70,19 @@ pub(super) fn load(dir: &Path, body: &BodyModel, options: &LoadOptions) -> Resul
     capture(dir, train, eval, None, body, options)
 }
 
-fn optional(dir: &Path) -> Result<Option<Pictures>, CaptureError> {
-    if is_directory(dir)? { Pictures::list(dir).map(Some) } else { Ok(None) }
+/// The pictures of a folder that need not be there; if there are any, one has a frame's name.
+fn optional(dir: &Path, names: &[&str]) -> Result<Option<Pictures>, CaptureError> {
+    if !is_directory(dir)? {
+        return Ok(None);
+    }
+    let pictures = Pictures::list(dir)?;
+    if let Some((first, _)) = pictures.iter().next()
+        && names.iter().all(|name| pictures.get(name).is_none())
+    {
+        let expected = format!("names of frames of metadata.json, as {}", names.first().unwrap_or(&""));
+        return Err(CaptureError::invalid(dir, "names", expected, first.as_str()));
+    }
+    Ok(Some(pictures))
 }
 
 fn plan(

@@ -6,7 +6,9 @@ use crate::element::{ElementType, Kind, byte_count};
 /// Class of joblib's describing object, which never becomes a value.
 pub(super) const WRAPPER: &str = "joblib.numpy_pickle.NumpyArrayWrapper";
 pub(super) const CHUMPY: &str = "chumpy.ch.Ch";
-pub(super) const CSC_MATRIX: &str = "scipy.sparse.csc_matrix";
+pub(super) const CSC: &str = "scipy.sparse.csc_matrix";
+pub(super) const CSR: &str = "scipy.sparse.csr_matrix";
+pub(super) const COO: &str = "scipy.sparse.coo_matrix";
 
 /// PyTorch's storage classes, its names of their elements, and those elements.
 pub(crate) const STORAGES: [(&str, &str, ElementType); 10] = [
@@ -77,7 +79,9 @@ impl Global {
             ("joblib.numpy_pickle", "NumpyArrayWrapper") => Self::Class(WRAPPER),
             ("_codecs", "encode") => Self::Encode,
             ("chumpy.ch", "Ch") => Self::Class(CHUMPY),
-            ("scipy.sparse.csc" | "scipy.sparse._csc", "csc_matrix") => Self::Class(CSC_MATRIX),
+            ("scipy.sparse.csc" | "scipy.sparse._csc", "csc_matrix" | "csc_array") => Self::Class(CSC),
+            ("scipy.sparse.csr" | "scipy.sparse._csr", "csr_matrix" | "csr_array") => Self::Class(CSR),
+            ("scipy.sparse.coo" | "scipy.sparse._coo", "coo_matrix" | "coo_array") => Self::Class(COO),
             ("torch._utils", "_rebuild_tensor" | "_rebuild_tensor_v2") => Self::RebuildTensor,
             ("torch._utils", "_rebuild_parameter") => Self::RebuildParameter,
             _ => {

@@ -1,6 +1,6 @@
 //! Python values as plain data.
 
-use super::globals::{CHUMPY, CSC_MATRIX};
+use super::globals::{CHUMPY, COO, CSC, CSR};
 use crate::Error;
 use crate::array::{Data, NdArray};
 
@@ -54,7 +54,7 @@ pub enum Value {
         /// The items, last axis fastest.
         items: Vec<Value>,
     },
-    /// Instance of an allowed class (`chumpy.ch.Ch`, `scipy.sparse.csc_matrix`, `torch.Tensor`,
+    /// Instance of an allowed class (`chumpy.ch.Ch`, scipy's sparse matrices, `torch.Tensor`,
     /// [`PERSISTENT`]), or, without attributes, such a class or a storage class of PyTorch.
     Object {
         /// Full name of the class.
@@ -85,14 +85,23 @@ impl Value {
         }
     }
 
-    /// The value under the text `key` of a dict or of an object's attributes. `None` if there is
-    /// none, and for other types.
+    /// The value under the text `key`, or the byte string of that text, of a dict or of an object's
+    /// attributes. `None` if there is none, and for other types.
     #[must_use]
     pub fn get(&self, key: &str) -> Option<&Self> {
         match self {
-            Self::Dict(items) => items.iter().rev().find(|(k, _)| k.as_str() == Some(key)).map(|(_, value)| value),
+            Self::Dict(items) => items.iter().rev().find(|(k, _)| k.is_text(key)).map(|(_, value)| value),
             Self::Object { state, .. } => state.get(key),
             _ => None,
+        }
+    }
+
+    /// Whether this is the text `key`, or the byte string of it.
+    fn is_text(&self, key: &str) -> bool {
+        match self {
+            Self::Str(text) => text == key,
+            Self::Bytes(bytes) => bytes == key.as_bytes(),
+            _ => false,
         }
     }
 
@@ -128,15 +137,15 @@ impl Value {
         }
     }
 
-    /// [`Value::as_array`], or a `csc_matrix` made dense. `Ok(None)` for other types; `file` and
+    /// [`Value::as_array`], or a sparse matrix (CSC, CSR, COO) made dense. `Ok(None)` for other types; `file` and
     /// `key` name it in errors.
     ///
     /// # Errors
     /// [`Error::Invalid`] for a sparse matrix whose parts disagree, or of more than 2²⁵ values.
     pub fn to_dense(&self, file: &str, key: &str) -> Result<Option<NdArray>, Error> {
         match self {
-            Self::Object { class: CSC_MATRIX, state } => {
-                dense_columns(state).map(Some).map_err(|message| Error::invalid(file, key, message))
+            Self::Object { class: class @ (CSC | CSR | COO), state } => {
+                dense(class, state).map(Some).map_err(|message| Error::invalid(file, key, message))
             }
             _ => Ok(self.as_array().cloned()),
         }
@@ -155,13 +164,12 @@ impl Value {
     }
 }
 
-/// Compressed sparse columns, made dense.
-fn dense_columns(state: &Value) -> Result<NdArray, String> {
+/// A sparse matrix, made dense.
+fn dense(class: &str, state: &Value) -> Result<NdArray, String> {
     let integers = |name: &str| match state.get(name).and_then(Value::as_array) {
         Some(NdArray { data: Data::I64(values), .. }) => Ok(values.as_slice()),
         _ => Err(format!("sparse matrix without `{name}`")),
     };
-    let (starts, rows) = (integers("indptr")?, integers("indices")?);
     let data = state.get("data").and_then(Value::as_array);
     let data = data.ok_or("sparse matrix without `data`")?.to_f64();
     let shape = state.get("_shape").or_else(|| state.get("shape")).and_then(Value::as_extents);
@@ -170,21 +178,38 @@ fn dense_columns(state: &Value) -> Result<NdArray, String> {
     };
     let count = height.checked_mul(width).filter(|&n| n <= MAX_DENSE);
     let count = count.ok_or_else(|| format!("sparse matrix of shape [{height}, {width}] is too large"))?;
-    if starts.len() != width.saturating_add(1) || rows.len() != data.len() {
-        let (starts, rows, values) = (starts.len(), rows.len(), data.len());
-        return Err(format!("sparse matrix of {width} columns with {starts} starts, {rows} rows, {values} values"));
+    // The second index of each value, and the first.
+    let (inner, outer) = if class == COO {
+        // Newer versions of scipy keep a tuple.
+        let axis = |i: usize, name: &str| match state.get("coords").and_then(Value::items).and_then(|c| c.get(i)) {
+            Some(Value::Array(NdArray { data: Data::I64(values), .. })) => Ok(values.clone()),
+            _ => integers(name).map(<[i64]>::to_vec),
+        };
+        (axis(1, "col")?, axis(0, "row")?)
+    } else {
+        let (starts, inner) = (integers("indptr")?, integers("indices")?.to_vec());
+        let lines = if class == CSR { height } else { width };
+        let (first, last) = (starts.first().copied(), starts.last().copied());
+        let whole = first == Some(0) && last.and_then(|n| usize::try_from(n).ok()) == Some(inner.len());
+        if starts.len() != lines.saturating_add(1) || !whole || starts.windows(2).any(|pair| pair[0] > pair[1]) {
+            let (starts, values) = (starts.len(), inner.len());
+            return Err(format!("sparse matrix of {lines} lines with {starts} starts up to {last:?} of {values} values"));
+        }
+        let spans = starts.windows(2).enumerate();
+        let outer = spans.flat_map(|(line, span)| std::iter::repeat_n(line as i64, (span[1] - span[0]) as usize));
+        (inner, outer.collect())
+    };
+    let (rows, columns) = if class == CSC { (inner, outer) } else { (outer, inner) };
+    if rows.len() != data.len() || columns.len() != data.len() {
+        let (rows, columns, values) = (rows.len(), columns.len(), data.len());
+        return Err(format!("sparse matrix of {rows} rows, {columns} columns and {values} values"));
     }
     let mut dense = vec![0.0; count];
-    for column in 0..width {
-        let (start, end) = (starts[column], starts[column + 1]);
-        let range = usize::try_from(start).ok().zip(usize::try_from(end).ok());
-        let range = range.filter(|&(start, end)| start <= end && end <= rows.len());
-        let (start, end) = range.ok_or_else(|| format!("column {column} spans {start}..{end}"))?;
-        for i in start..end {
-            let row = usize::try_from(rows[i]).ok().filter(|&r| r < height);
-            let row = row.ok_or_else(|| format!("row {} of {height}", rows[i]))?;
-            dense[row * width + column] += data[i];
-        }
+    for ((row, column), value) in rows.iter().zip(&columns).zip(data) {
+        let within = |i: i64, end: usize| usize::try_from(i).ok().filter(|i| *i < end);
+        let place = within(*row, height).zip(within(*column, width));
+        let (row, column) = place.ok_or_else(|| format!("row {row}, column {column} of [{height}, {width}]"))?;
+        dense[row * width + column] += value;
     }
     Ok(NdArray { shape: vec![height, width], data: Data::F64(dense) })
 }
