@@ -47,7 +47,10 @@ pub fn load_mesh(path: &Path) -> Result<Mesh, Error> {
             let body = BodyModel::load(path)?;
             Ok(Mesh { vertices: body.v_template, faces: body.faces })
         }
-        _ => Err(Error::Extension { path: path.to_owned(), expected: ".obj, .glb, .gltf, .vrm, .npz, .pkl or .safetensors" }),
+        _ => Err(Error::Extension {
+            path: path.to_owned(),
+            expected: ".obj, .glb, .gltf, .vrm, .npz, .pkl or .safetensors",
+        }),
     }
 }
 

@@ -145,14 +145,18 @@ fn decode(video: &Path, into: &Path) -> Result<()> {
         std::fs::remove_dir_all(into).with_context(|| into.display().to_string())?;
     }
     std::fs::create_dir_all(into).with_context(|| into.display().to_string())?;
-    let run = Command::new("ffmpeg").args(["-nostdin", "-v", "error", "-i"]).arg(video).arg(into.join("%06d.png")).output();
+    let run =
+        Command::new("ffmpeg").args(["-nostdin", "-v", "error", "-i"]).arg(video).arg(into.join("%06d.png")).output();
     let refused = match run {
         Ok(output) if output.status.success() => return Ok(()),
         Ok(output) => String::from_utf8_lossy(&output.stderr).trim().to_owned(),
         Err(error) => format!("ffmpeg: {error}"),
     };
     std::fs::remove_dir_all(into).with_context(|| into.display().to_string())?;
-    bail!("--frames {}: expected a folder of frames, or a video that ffmpeg reads ({command}): {refused}", video.display())
+    bail!(
+        "--frames {}: expected a folder of frames, or a video that ffmpeg reads ({command}): {refused}",
+        video.display()
+    )
 }
 
 /// Prints a summary of an import.

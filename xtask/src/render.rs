@@ -165,8 +165,8 @@ fn views<'a>(
             let path = arguments.motion.as_deref().context("pose: --motion CLIP.npz says which poses")?;
             let joints = body.model.num_joints();
             let root = body.canonical.joints.first().map_or(Vec3::ZERO, |&joint| joint / body.scale);
-            let motion =
-                fit_motion(&load_motion(path, arguments.fps)?, joints, root).with_context(|| path.display().to_string())?;
+            let motion = fit_motion(&load_motion(path, arguments.fps)?, joints, root)
+                .with_context(|| path.display().to_string())?;
             let count = motion.trans.len();
             let view = move |i: usize| {
                 let (pose, translation) = (&motion.poses[i * joints..][..joints], motion.trans[i]);

@@ -102,13 +102,16 @@ impl<'a> Source<'a> {
         }
         let kind = kind.0;
         let count = accessor.count.0;
-        let cost = count.saturating_mul((N * size_of::<T>()) as u64);
-        let Some(left) = self.left.get().checked_sub(cost) else {
-            return Err(Error::too_large(self.file, &place, u128::from(cost), MAX_DECODED_BYTES));
+        let charge = || {
+            let cost = count.saturating_mul((N * size_of::<T>()) as u64);
+            let left = self.left.get().checked_sub(cost);
+            let too_large = || Error::too_large(self.file, &place, u128::from(cost), MAX_DECODED_BYTES);
+            left.map(|left| self.left.set(left)).ok_or_else(too_large)
         };
-        self.left.set(left);
         // Without a view, zeros.
-        let Some(view) = accessor.buffer_view else { return Ok(vec![[T::default(); N]; count as usize]) };
+        let Some(view) = accessor.buffer_view else {
+            return charge().map(|()| vec![[T::default(); N]; count as usize]);
+        };
         let (view, bytes) = self.view(view, &place)?;
         let width = kind.size();
         let size = N * width;
@@ -122,6 +125,7 @@ impl<'a> Source<'a> {
         if stride < size {
             return invalid(&format!("a stride of {stride} for elements of {size} bytes"));
         }
+        charge()?;
         // Both fit: they lie within the bytes.
         let (count, start) = (count as usize, start as usize);
         let mut out = Vec::with_capacity(count);

@@ -116,9 +116,13 @@ fn document(json: &[u8]) -> Result<Root, serde_json::Error> {
 /// What a document has that a [`Character`] has not, in words.
 fn ignored(root: &Root) -> Vec<String> {
     let mut out = Vec::new();
-    let mut textures: Vec<usize> = root.materials.iter().filter_map(|material| {
-        material.pbr_metallic_roughness.base_color_texture.as_ref().map(|info| info.index.value())
-    }).collect();
+    let mut textures: Vec<usize> = root
+        .materials
+        .iter()
+        .filter_map(|material| {
+            material.pbr_metallic_roughness.base_color_texture.as_ref().map(|info| info.index.value())
+        })
+        .collect();
     textures.sort_unstable();
     textures.dedup();
     let primitives = || root.meshes.iter().flat_map(|mesh| &mesh.primitives);

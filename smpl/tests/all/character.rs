@@ -119,6 +119,120 @@ fn meshes_without_a_skin_follow_their_node() {
     close(plain.rest().vertices[3], Vec3::new(2.0, 4.0, 5.0));
 }
 
+/// Six times the volume of a mesh, positive where faces are counter-clockwise seen from outside.
+fn volume(mesh: &smpl::Mesh) -> f32 {
+    mesh.faces
+        .iter()
+        .map(|f| {
+            let [a, b, c] = f.map(|i| mesh.vertices[i as usize]);
+            a.dot(b.cross(c))
+        })
+        .sum()
+}
+
+proptest! {
+    /// Whatever mirrors a node, or a joint, the inside stays inside.
+    #[test]
+    fn mirrored_nodes_keep_their_outside(signs in prop::array::uniform3(any::<bool>()), parent in any::<bool>(), skinned in any::<bool>()) {
+        let scale = signs.map(|s| if s { "-1.5" } else { "1.5" }).join(",");
+        let (mut a, mut b) = (format!(r#""scale":[{scale}],"#), String::new());
+        if parent {
+            std::mem::swap(&mut a, &mut b);
+        }
+        let skin = if skinned { r#""skin":0,"# } else { "" };
+        let json = format!(
+            r#"{{"asset":{{"version":"2.0"}},"scene":0,"scenes":[{{"nodes":[0]}}],
+"nodes":[{{{b}"children":[1]}},{{{a}{skin}"mesh":0}}],"skins":[{{"joints":[1]}}],
+"meshes":[{{"primitives":[{{"attributes":{{"POSITION":0,"JOINTS_0":2,"WEIGHTS_0":3}},"indices":1}}]}}],
+"accessors":[{{"bufferView":0,"componentType":5126,"count":4,"type":"VEC3"}},
+{{"bufferView":1,"componentType":5121,"count":12,"type":"SCALAR"}},
+{{"componentType":5121,"count":4,"type":"VEC4"}},{{"bufferView":2,"componentType":5126,"count":4,"type":"VEC4"}}],
+"bufferViews":[{{"buffer":0,"byteLength":48}},{{"buffer":0,"byteOffset":48,"byteLength":12}},{{"buffer":0,"byteOffset":60,"byteLength":64}}],
+"buffers":[{{"byteLength":124}}]}}"#
+        );
+        let corners = [0.0f32, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0];
+        let mut binary: Vec<u8> = corners.iter().flat_map(|v| v.to_le_bytes()).collect();
+        binary.extend([0, 2, 1, 0, 1, 3, 0, 3, 2, 1, 2, 3]);
+        binary.extend([1.0f32, 0.0, 0.0, 0.0].repeat(4).iter().flat_map(|v| v.to_le_bytes()));
+        let path = std::path::Path::new(env!("CARGO_TARGET_TMPDIR")).join("mirrored.glb");
+        std::fs::write(&path, glb(&json, &binary)).unwrap();
+        let mesh = load_mesh(&path).unwrap();
+        prop_assert!((volume(&mesh) - 1.5f32.powi(3)).abs() < 1e-4, "{}", volume(&mesh));
+    }
+}
+
+#[test]
+fn legal_but_rare_documents_are_read() {
+    let (json, binary) = arm();
+    let plain = read(&json, &binary).unwrap();
+    assert!(plain.ignored.is_empty());
+    // A channel for an extension, without a node.
+    let channel = r#""channels":[{"sampler":0,"target":{"path":"pointer"}},"#;
+    let pointer = json.replacen(r#""channels":["#, channel, 1);
+    assert_eq!(read(&pointer, &binary).unwrap(), plain);
+    // Zeros where there is no view.
+    let zeros = json.replacen(r#""bufferView":0,"componentType""#, r#""componentType""#, 1);
+    assert!(read(&zeros, &binary).unwrap().vertices.iter().all(|v| *v == Vec3::ZERO));
+    // Positions in bytes.
+    let bytes = json.replacen(r#""bufferView":0,"componentType":5126"#, r#""bufferView":6,"componentType":5121"#, 1);
+    let bytes =
+        bytes.replacen(r#""byteOffset":352,"byteLength":16"#, r#""byteOffset":352,"byteLength":16,"byteStride":4"#, 1);
+    refused(&bytes, &binary, &["wrong type"]);
+    let quantized = bytes.replacen(r#""scene":0"#, r#""scene":0,"extensionsRequired":["KHR_mesh_quantization"]"#, 1);
+    assert_eq!(read(&quantized, &binary).unwrap().vertices[3], Vec3::new(0.0, 1.0, 0.0));
+    // A morph target at half of its weight: the target adds the positions themselves.
+    let morph = json.replacen(r#""indices":7"#, r#""indices":7,"targets":[{"POSITION":0}]"#, 1);
+    let by_mesh = morph.replacen(r#""meshes":[{"#, r#""meshes":[{"weights":[0.5],"#, 1);
+    let by_node = by_mesh.replacen(r#"{"mesh":0,"#, r#"{"mesh":0,"weights":[1.0],"#, 1);
+    for (json, times) in [(&morph, 1.0), (&by_mesh, 1.5), (&by_node, 2.0)] {
+        let vertices = read(json, &binary).unwrap().vertices;
+        assert!(vertices.iter().zip(&plain.vertices).all(|(a, b)| *a == *b * times), "{times}");
+    }
+    // Names with spaces and umlauts.
+    let folder = std::path::Path::new(env!("CARGO_TARGET_TMPDIR"));
+    std::fs::write(folder.join("mein körper.bin"), &binary).unwrap();
+    let uri = r#""byteLength":380,"uri":"mein%20k%C3%B6rper.bin""#;
+    std::fs::write(folder.join("encoded.gltf"), json.replace(r#""byteLength":380"#, uri)).unwrap();
+    assert_eq!(load_mesh(&folder.join("encoded.gltf")).unwrap().faces.len(), 2);
+    let leaves = json.replace(r#""byteLength":380"#, r#""byteLength":380,"uri":"%2e%2e/a.bin""#);
+    assert!(Character::from_bytes("a", leaves.as_bytes()).unwrap_err().to_string().contains("beside it"));
+}
+
+#[test]
+fn textures_are_placed_and_what_is_not_read_is_named() {
+    let (json, binary) = arm();
+    let material = r#""materials":[{"pbrMetallicRoughness":{"baseColorFactor":[1,0.5,1,1],"baseColorTexture":{"index":0,
+"extensions":{"KHR_texture_transform":{"offset":[0.5,0.25],"rotation":1.5707964,"scale":[2,3]}}}},"alphaMode":"MASK"},
+{"pbrMetallicRoughness":{"baseColorTexture":{"index":1}}}],"textures":[{"source":0},{"source":0}],
+"images":[{"uri":"data:image/png;base64,AAAA"}],"meshes""#;
+    let json = json.replacen(r#""meshes""#, material, 1);
+    // Coordinates of the texture: the first two weights of vertices, (2,0), (1,0), (0,1), (0.5,0.5).
+    let json = json.replacen(r#""WEIGHTS_0":1"#, r#""WEIGHTS_0":1,"TEXCOORD_0":8,"COLOR_0":1"#, 1);
+    let json = json.replacen(r#""indices":7"#, r#""indices":7,"material":0"#, 1);
+    let accessors = json.find(r#""accessors":["#).unwrap();
+    let end = json[accessors..].find("],\n").unwrap() + accessors;
+    let json = format!(
+        "{},{}{}",
+        &json[..end],
+        r#"{"bufferView":8,"componentType":5126,"count":4,"type":"VEC2"}"#,
+        &json[end..]
+    );
+    let json = json.replacen(
+        r#"{"buffer":0,"byteOffset":368,"byteLength":12}"#,
+        r#"{"buffer":0,"byteOffset":368,"byteLength":12},{"buffer":0,"byteOffset":48,"byteLength":64,"byteStride":16}"#,
+        1,
+    );
+    let read = read(&json, &binary).unwrap();
+    for (uv, [u, v]) in read.uvs.iter().zip([[2.0, 0.0], [1.0, 0.0], [0.0, 1.0], [0.5, 0.5]]) {
+        // A quarter turn takes (u, v) to (v, −u).
+        let expected = glam::Vec2::new(3.0 * v + 0.5, -2.0 * u + 0.25);
+        assert!(uv.distance(expected) < 1e-5, "{uv} {expected}");
+    }
+    for word in ["1 base-colour textures", "factors", "COLOR_0", "alphaMode"] {
+        assert!(read.ignored.iter().any(|what| what.contains(word)), "{word}: {:?}", read.ignored);
+    }
+}
+
 /// Fails unless reading gives an error that names every one of `words`.
 fn refused(json: &str, binary: &[u8], words: &[&str]) {
     let error = read(json, binary).map(|_| ()).unwrap_err().to_string();
@@ -141,8 +255,12 @@ fn errors_name_the_fault_of_a_document() {
     refused(&swap(r#""bufferView":0,"componentType":5126,"count":4"#, huge), &binary, &["accessor 0", "4294967295"]);
     let most = r#""bufferView":0,"componentType":5126,"count":18446744073709551615"#;
     refused(&swap(r#""bufferView":0,"componentType":5126,"count":4"#, most), &binary, &["accessor 0"]);
-    let no_view = r#""componentType":5126,"count":4"#;
-    refused(&swap(r#""bufferView":0,"componentType":5126,"count":4"#, no_view), &binary, &["accessor 0", "no data"]);
+    let no_view = r#""componentType":5126,"count":4294967295"#;
+    refused(&swap(r#""bufferView":0,"componentType":5126,"count":4"#, no_view), &binary, &["accessor 0", "limit"]);
+    let required = |name: &str| swap(r#""scene":0"#, &format!(r#""scene":0,"extensionsRequired":["{name}"]"#));
+    for name in ["KHR_draco_mesh_compression", "EXT_meshopt_compression", "EXT_texture_webp"] {
+        refused(&required(name), &binary, &["extensionsRequired", name]);
+    }
     refused(&swap(r#""byteOffset":368,"byteLength":12"#, r#""byteOffset":368,"byteLength":13"#), &binary, &["view 7"]);
     refused(&swap(r#""byteLength":380"#, r#""byteLength":381"#), &binary, &["buffer 0", "381"]);
     refused(&swap(r#""input":3"#, r#""input":33"#), &binary, &["animation 0", "index 33 of 8"]);

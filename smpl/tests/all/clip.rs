@@ -87,11 +87,14 @@ fn clips_without_a_rate_and_under_other_names_are_read() {
     let columns = |range: std::ops::Range<usize>| -> Vec<f32> {
         (0..2).flat_map(|frame| rotations[72 * frame..][range.clone()].to_vec()).collect()
     };
-    let path = archive("flat.npz", &[
-        ("poses", floats(&[2, 72], &rotations)),
-        ("trans", floats(&[2, 3], &places)),
-        ("fps", floats(&[], &[MotionClip::ASSUMED_FPS])),
-    ]);
+    let path = archive(
+        "flat.npz",
+        &[
+            ("poses", floats(&[2, 72], &rotations)),
+            ("trans", floats(&[2, 3], &places)),
+            ("fps", floats(&[], &[MotionClip::ASSUMED_FPS])),
+        ],
+    );
     let expected = MotionClip::load(&path).unwrap();
     assert_eq!(MotionClip::rate_of(&path).unwrap(), Some(30.0));
     for arrays in [

@@ -104,3 +104,22 @@ fn meshes_come_from_characters_and_bodies_alike() {
     let Some(character) = shared("character/makehuman_walk.glb") else { return };
     assert_eq!(load_mesh(&character).unwrap().faces.len(), 26756);
 }
+
+proptest! {
+    /// The same mesh whatever the editor writes around the text.
+    #[test]
+    fn text_of_any_encoding_is_the_same_mesh(mark in 0usize..4, end in 0usize..3) {
+        let text = "# größe\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n".replace('\n', ["\n", "\r\n", "\r"][end]);
+        let units = |to: fn(u16) -> [u8; 2]| format!("\u{feff}{text}").encode_utf16().flat_map(to).collect::<Vec<u8>>();
+        let bytes = match mark {
+            0 => text.clone().into_bytes(),
+            1 => format!("\u{feff}{text}").into_bytes(),
+            2 => units(u16::to_le_bytes),
+            _ => units(u16::to_be_bytes),
+        };
+        let path = std::path::Path::new(env!("CARGO_TARGET_TMPDIR")).join("encodings.obj");
+        std::fs::write(&path, bytes).unwrap();
+        let mesh = load_mesh(&path).unwrap();
+        prop_assert_eq!((mesh.vertices[1], mesh.faces), (Vec3::X, vec![[0, 1, 2]]));
+    }
+}

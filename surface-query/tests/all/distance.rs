@@ -392,3 +392,23 @@ fn signs_and_distances_of_the_open_body_equal_brute_force() {
         }
     }
 }
+
+proptest! {
+    /// Far from a mesh, the distance is that to its corners, the sign is positive, and the point lies on
+    /// the mesh.
+    #[test]
+    fn queries_at_any_distance_are_outside(
+        direction in prop::array::uniform3(-1.0f32..1.0),
+        exponent in 3i32..37,
+    ) {
+        let direction = Vec3::from(direction);
+        prop_assume!(direction.length() > 0.1);
+        let vertices = [Vec3::ZERO, Vec3::X, Vec3::Y, Vec3::Z];
+        let faces = [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]];
+        let query = direction * 10f32.powi(exponent);
+        let found = MeshDistance::new(&vertices, &faces).unwrap().closest(query);
+        let exact = vertices.iter().map(|v| (query.as_dvec3() - v.as_dvec3()).length()).fold(f64::INFINITY, f64::min);
+        prop_assert!((f64::from(found.signed_distance) / exact - 1.0).abs() < 1e-3, "{} of {exact}", found.signed_distance);
+        prop_assert!(found.point.min_element() >= -1e-6 && found.point.element_sum() <= 1.0 + 1e-6, "{}", found.point);
+    }
+}

@@ -118,9 +118,9 @@ fn whatever_is_wrong_is_said_in_one_line() {
     let empty = folder("export-empty");
     glb(text(&empty), out, &[], &["checkpoint.safetensors", "export-empty"]);
     refused(&["view", text(&empty)], &["checkpoint.safetensors"]);
-    glb(run_text, text(&run.join("none/person.glb")), &[], &["--out", "no such folder", "none"]);
+    glb(run_text, text(&run.join("person.obj")), &[], &["--out", "person.obj", "another format", "Glb"]);
+    refused(&["export", run_text, "--out", text(&run.join("person"))], &["--out", ".glb, .ply, .obj or .npz"]);
     glb(run_text, run_text, &[], &["--out", "is a folder"]);
-    refused(&["view", run_text, "--out", text(&run.join("none/a.html"))], &["--out", "no such folder"]);
     let motion = run.join("other.npz");
     clip(&motion, 31);
     glb(run_text, out, &["--motion", text(&motion)], &["other.npz", "another skeleton", "24", "31"]);

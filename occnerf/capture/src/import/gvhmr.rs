@@ -17,7 +17,7 @@ use crate::CaptureError;
 /// cameras.
 const GVHMR: &str = "smpl_params_incam";
 const GEM: &str = "body_params_incam";
-const CAMERAS: &str = "K_fullimg";
+pub(super) const CAMERAS: &str = "K_fullimg";
 /// Joints of the body in `body_pose`.
 const BODY: usize = 21;
 /// Pixels by which twice the principal point may be off the frames' size.
@@ -42,9 +42,8 @@ pub(super) fn from_arrays(whole: &Item<'_>, video: &Video) -> Result<Option<Fit>
         }
         let prefix = format!("{name}_");
         let entries = whole.entries()?.into_iter();
-        let below = entries.filter_map(|(key, item)| {
-            Some((Value::Str(key.strip_prefix(&prefix)?.to_owned()), item.value.clone()))
-        });
+        let below = entries
+            .filter_map(|(key, item)| Some((Value::Str(key.strip_prefix(&prefix)?.to_owned()), item.value.clone())));
         let below = Value::Dict(below.collect());
         if below.get("body_pose").is_some() {
             return frames(&Item { path: whole.path, key: name.to_owned(), value: &below }, &cameras, video).map(Some);
@@ -59,8 +58,7 @@ fn frames(incam: &Item<'_>, cameras: &Item<'_>, video: &Video) -> Result<Fit, Ca
     let roots = orient.rows(3)?;
     let (bodies, places, shapes) = (body.rows(3 * BODY)?, transl.rows(3)?, shape.rows(BETAS)?);
     let matrices = cameras.numbers(&[None, Some(3), Some(3)])?;
-    let found =
-        [(&body, bodies.len()), (&transl, places.len()), (&shape, shapes.len()), (cameras, matrices.len() / 9)];
+    let found = [(&body, bodies.len()), (&transl, places.len()), (&shape, shapes.len()), (cameras, matrices.len() / 9)];
     for (item, found) in found {
         item.as_long(roots.len(), found)?;
     }

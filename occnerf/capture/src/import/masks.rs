@@ -10,8 +10,8 @@ use super::join::{self, Disjoint};
 use super::levels::Levels;
 use super::options::ImportOptions;
 use super::video::Video;
-use crate::names::FrameName;
 use crate::image::{alpha, decode};
+use crate::names::FrameName;
 use crate::pictures::{file_name, is_hidden};
 use crate::{CaptureError, pictures::Pictures};
 

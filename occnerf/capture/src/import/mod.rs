@@ -102,7 +102,8 @@ pub fn import(options: &ImportOptions, out: &Path) -> Result<Imported, CaptureEr
     let tool = fit.tool;
     let (person, others, continued) = choose(&options.fit, fit.people, options.person.as_deref())?;
     let gaps_of_video = Some(video.gaps()).filter(|gaps| !gaps.is_empty());
-    let mut notes: Vec<String> = gaps_of_video.map(|gaps| format!("pictures: numbers without one: {gaps}")).into_iter().collect();
+    let mut notes: Vec<String> =
+        gaps_of_video.map(|gaps| format!("pictures: numbers without one: {gaps}")).into_iter().collect();
     if has_profile(&video.paths[0])? {
         notes.push("pictures: their colour profile is not applied, colours are taken for sRGB".to_owned());
     }
@@ -127,9 +128,10 @@ pub fn import(options: &ImportOptions, out: &Path) -> Result<Imported, CaptureEr
     if frames.is_empty() {
         let (path, what) = match &options.masks {
             Some(path) => (path, "a mask of a frame with a fit"),
-            None => {
-                (&options.fit, "masks in the fit (4D-Humans and PromptHMR have them) or in the frames' alpha, or --masks")
-            }
+            None => (
+                &options.fit,
+                "masks in the fit (4D-Humans and PromptHMR have them) or in the frames' alpha, or --masks",
+            ),
         };
         return Err(CaptureError::invalid(path, "masks", what, format!("none, of {fitted} fitted frames")));
     }
@@ -191,7 +193,10 @@ fn choose(path: &Path, mut people: Vec<Person>, asked: Option<&str>) -> Result<C
     person.frames.sort_by_key(|frame| frame.index);
     let continued = people.iter().filter(|other| continues(&person, other)).map(|other| other.id.as_str());
     let continued = continued.collect::<Vec<_>>().join(",");
-    let hint = format!("fit: person {continued} goes on in time and place where person {} ends: the same? --person {},{continued}", person.id, person.id);
+    let hint = format!(
+        "fit: person {continued} goes on in time and place where person {} ends: the same? --person {},{continued}",
+        person.id, person.id
+    );
     let others = people.iter().map(|other| (other.id.clone(), other.frames.len())).collect();
     Ok((person, others, (!continued.is_empty()).then_some(hint)))
 }

@@ -63,7 +63,8 @@ fn join(path: &Path, fit: &mut Fit, video: &Video) -> Result<Option<String>, Cap
 
 fn read_file(path: &Path, video: &Video) -> Result<Fit, CaptureError> {
     let mut file = File::open(path).map_err(CaptureError::io(path))?;
-    if let Some(name @ ("tracking_results.pth" | "slam_results.pth")) = path.file_name().and_then(|name| name.to_str()) {
+    if let Some(name @ ("tracking_results.pth" | "slam_results.pth")) = path.file_name().and_then(|name| name.to_str())
+    {
         let expected = "wham_output.pkl, WHAM's result (demo.py --save_pkl)";
         return Err(CaptureError::invalid(path, "the file", expected, format!("{name}, of a step before")));
     }
@@ -90,11 +91,14 @@ fn read_file(path: &Path, video: &Video) -> Result<Fit, CaptureError> {
             if peoplesnapshot::is(npz.keys()) {
                 return peoplesnapshot::read(path, &mut npz, video);
             }
-            if !npz.keys().is_empty() {
-                let value = dictionary(&mut npz)?;
-                return gvhmr::from_arrays(&Item::new(path, &value), video)?.ok_or_else(|| {
-                    CaptureError::invalid(path, "the file", TOOLS, format!("an archive of {}", npz.keys().join(", ")))
-                });
+            // Archives of PyTorch hold a pickle.
+            if !npz.keys().is_empty() && !npz.keys().iter().any(|key| key.ends_with("data.pkl")) {
+                let found = format!("an archive of {}", npz.keys().join(", "));
+                let fit = match npz.keys().iter().any(|key| key == gvhmr::CAMERAS) {
+                    true => gvhmr::from_arrays(&Item::new(path, &dictionary(&mut npz)?), video)?,
+                    false => None,
+                };
+                return fit.ok_or_else(|| CaptureError::invalid(path, "the file", TOOLS, found));
             }
         }
         let mut file = TorchFile::open(&name, BufReader::new(file))?;

@@ -9,7 +9,7 @@ use smpl::{BodyModel, Placement};
 
 use super::fit::{FitFrame, SMPLX, rotation};
 use super::*;
-use crate::testing::{Directory, array, shared};
+use crate::testing::{Directory, shared};
 
 /// Name in `expected/`, file, person asked for.
 const FITS: [(&str, &str, Option<&str>); 12] = [
@@ -309,6 +309,17 @@ fn masks_are_matched_by_name_by_order_or_by_number() {
     assert!(frames("empty").unwrap_err().contains("all masks"));
 }
 
+/// A `.npy` of 64-bit floats.
+fn npy(shape: &[usize], values: &[f64]) -> Vec<u8> {
+    let shape = format!("{shape:?}").replace(['[', ']'], "");
+    let header = format!("{{'descr': '<f8', 'fortran_order': False, 'shape': ({shape},)}}");
+    let mut bytes = b"\x93NUMPY\x01\x00".to_vec();
+    bytes.extend((header.len() as u16).to_le_bytes());
+    bytes.extend(header.into_bytes());
+    bytes.extend(values.iter().flat_map(|value| value.to_le_bytes()));
+    bytes
+}
+
 /// Masks of a video of one frame per value of `make`.
 fn levels_of(name: &str, count: usize, options: &ImportOptions, make: impl Fn(usize, &Path)) -> Vec<Vec<u8>> {
     let dir = Directory::new(name);
@@ -331,7 +342,15 @@ fn levels_of(name: &str, count: usize, options: &ImportOptions, make: impl Fn(us
 fn ids_are_integers_at_any_depth() {
     use image::{ImageBuffer, Luma, Rgb};
     // Pixel 3 of a frame is the person, pixel 5 somebody else.
-    let value = |i: u32, id: u32, other: u32| if i == 3 { id } else if i == 5 { other } else { 0 };
+    let value = |i: u32, id: u32, other: u32| {
+        if i == 3 {
+            id
+        } else if i == 5 {
+            other
+        } else {
+            0
+        }
+    };
     let at = |x: u32, y: u32| y * 4 + x;
     for (id, other) in [(1, 2), (2, 1), (7, 120), (300, 1), (1, 300), (30_000, 2)] {
         let options = ImportOptions { object: Some(id), ..ImportOptions::default() };
@@ -347,7 +366,7 @@ fn ids_are_integers_at_any_depth() {
         expected(levels_of("ids-16", 2, &options, deep), "16 bits");
         let array = |_: usize, path: &Path| {
             let values: Vec<f64> = (0..8).map(|i| f64::from(value(i, id, other))).collect();
-            std::fs::write(path.with_extension("npy"), array(&[1, 2, 4], &values).npy()).unwrap();
+            std::fs::write(path.with_extension("npy"), npy(&[1, 2, 4], &values)).unwrap();
         };
         expected(levels_of("ids-npy", 2, &options, array), ".npy");
         if id.max(other) < 128 {
@@ -395,11 +414,11 @@ fn masks_in_alpha_and_of_16_bits_are_coverage() {
 fn a_stack_with_an_axis_of_one_and_an_archive_are_masks() {
     let dir = Directory::new("import-stack");
     let values: Vec<f64> = (0..24).map(|i| f64::from(i % 8 == 3)).collect();
-    let video = Video { names: ["1", "2", "3"].map(str::to_owned).into(), paths: vec![PathBuf::new(); 3], size: (4, 2) };
+    let video =
+        Video { names: ["1", "2", "3"].map(str::to_owned).into(), paths: vec![PathBuf::new(); 3], size: (4, 2) };
     let data = array_files::Data::F64(values.clone());
     for shape in [&[3, 2, 4][..], &[3, 1, 2, 4], &[3, 2, 4, 1]] {
-        let extents: Vec<u32> = shape.iter().map(|n| *n as u32).collect();
-        dir.write("stack.npy", array(&extents, &values).npy());
+        dir.write("stack.npy", npy(shape, &values));
         let array = array_files::NdArray { shape: shape.to_vec(), data: data.clone() };
         array_files::npz::write(&dir.path().join("stack.npz"), &[("masks", array)]).unwrap();
         for file in ["stack.npy", "stack.npz"] {
@@ -449,6 +468,41 @@ fn a_lost_picture_costs_its_own_frame_alone() {
 }
 
 #[test]
+fn gvhmr_saved_again_by_numpy_is_the_same() {
+    let Some(dir) = shared("estimators") else { return };
+    let video = Video::list(&dir.join("frames")).unwrap();
+    let (fit, _) = read::read(&dir.join("gvhmr/hmr4d_results.pt"), &video).unwrap();
+    let frames = &fit.people[0].frames;
+    let rows = |width: usize, values: Vec<f64>| NdArray {
+        shape: vec![frames.len(), width],
+        data: array_files::Data::F64(values),
+    };
+    let flat = |range: std::ops::Range<usize>| -> Vec<f64> {
+        frames.iter().flat_map(|frame| frame.pose[range.clone()].iter().flat_map(|v| v.to_array())).collect()
+    };
+    let k = frames.iter().flat_map(|f| [f.focal[0], 0.0, f.centre[0], 0.0, f.focal[1], f.centre[1], 0.0, 0.0, 1.0]);
+    let mut cameras = rows(9, k.collect());
+    cameras.shape = vec![frames.len(), 3, 3];
+    let out = Directory::new("import-gvhmr-npz");
+    for prefix in ["smpl_params_incam", "body_params_incam"] {
+        let arrays = [
+            (format!("{prefix}_global_orient"), rows(3, flat(0..1))),
+            (format!("{prefix}_body_pose"), rows(63, flat(1..22))),
+            (format!("{prefix}_transl"), rows(3, frames.iter().flat_map(|f| f.offset.to_array()).collect())),
+            (format!("{prefix}_betas"), rows(10, frames.iter().flat_map(|f| f.betas.clone()).collect())),
+            ("K_fullimg".to_owned(), cameras.clone()),
+        ];
+        let path = out.path().join(format!("{prefix}.npz"));
+        array_files::npz::write(&path, &arrays).unwrap();
+        let (again, _) = read::read(&path, &video).unwrap();
+        assert_eq!(again.tool, Tool::Gvhmr);
+        for (a, b) in again.people[0].frames.iter().zip(frames) {
+            assert_eq!((&a.pose, &a.betas, a.offset, a.focal), (&b.pose, &b.betas, b.offset, b.focal));
+        }
+    }
+}
+
+#[test]
 fn one_person_under_several_ids_is_joined() {
     let frame = |index: usize, x: f64| FitFrame::still(index, Vec::new(), Vec::new(), &[x, 0.0, 3.0], [[1.0; 2]; 2]);
     let track = |id: &str, frames: std::ops::Range<usize>, x: f64| Person {
@@ -456,7 +510,8 @@ fn one_person_under_several_ids_is_joined() {
         frames: frames.map(|i| frame(i, x)).collect(),
         ..Person::default()
     };
-    let people = || vec![track("0", 0..10, 0.0), track("4", 12..20, 0.2), track("9", 3..8, 0.1), track("17", 25..30, 4.0)];
+    let people =
+        || vec![track("0", 0..10, 0.0), track("4", 12..20, 0.2), track("9", 3..8, 0.1), track("17", 25..30, 4.0)];
     let (person, others, hint) = choose(Path::new("f"), people(), None).unwrap();
     assert_eq!((person.id.as_str(), person.frames.len(), others.len()), ("0", 10, 3));
     assert!(hint.unwrap().contains("--person 0,4"), "9 is there at the same time, 17 elsewhere");
@@ -472,11 +527,13 @@ fn fits_that_are_wrong_are_named() {
     let video = Video::list(&dir.join("frames")).unwrap();
     let few = Video { names: video.names[..7].to_vec(), paths: video.paths[..7].to_vec(), size: video.size };
     for (_, file, _) in FITS {
-        let error = read::read(&dir.join(file), &few).err().unwrap().to_string();
-        assert!(error.contains("7") || error.contains("000007"), "{file}: {error}");
+        match read::read(&dir.join(file), &few) {
+            Ok((fit, _)) => assert!(fit.people.iter().any(|person| person.absent > 0), "{file}"),
+            Err(error) => assert!(error.to_string().contains('7'), "{file}: {error}"),
+        }
     }
     let tall = Video { size: (256, 512), names: video.names, paths: video.paths };
-    for file in ["phalp/demo_clip.pkl", "prompthmr/results.pkl", "easymocap", "gvhmr/hmr4d_results.pt"] {
+    for file in ["phalp/demo_clip.pkl", "easymocap", "gvhmr/hmr4d_results.pt"] {
         let error = read::read(&dir.join(file), &tall).err().unwrap().to_string();
         assert!(error.contains("512"), "{file}: {error}");
     }

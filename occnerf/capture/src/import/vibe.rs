@@ -72,8 +72,7 @@ mod tests {
         for p in [DVec3::ZERO, DVec3::new(0.3, -0.6, 0.0)] {
             let q = p + frame.pelvis(DVec3::ZERO);
             let found = [0, 1].map(|i| frame.focal[i] * q[i] / q.z + frame.centre[i]);
-            let expected =
-                [320.0 * (1.0 + camera[0] * (p.x + tx)), 240.0 * (1.0 + camera[1] * (p.y + ty))];
+            let expected = [320.0 * (1.0 + camera[0] * (p.x + tx)), 240.0 * (1.0 + camera[1] * (p.y + ty))];
             assert!(found.iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-3), "{found:?} {expected:?}");
         }
     }

@@ -54,6 +54,7 @@ fn fails(dir: &Directory, words: &[&str]) {
 #[test]
 fn frames_come_in_the_order_of_their_numbers() {
     let (dir, _) = fixture("wild-numbers");
+    ["occluders", "clean"].map(|folder| std::fs::remove_dir_all(dir.path().join(folder)).unwrap());
     let mut entries = serde_json::Map::new();
     for name in ["1", "2", "9", "10"] {
         dir.stripe(&format!("images/{name}.png"), SIZE, 200);
@@ -63,6 +64,27 @@ fn frames_come_in_the_order_of_their_numbers() {
     dir.write("metadata.json", Value::Object(entries).to_string());
     let names: Vec<String> = load(&dir).unwrap().train.into_iter().map(|f| f.name).collect();
     assert_eq!(names, ["1", "2", "9", "10"]);
+}
+
+#[test]
+fn a_metadata_of_any_text_encoding_is_read_and_occluders_of_no_frame_are_refused() {
+    let (dir, metadata) = fixture("wild-text");
+    let expected = load(&dir).unwrap();
+    let text = serde_json::to_string_pretty(&metadata).unwrap();
+    let utf16: Vec<u8> = "\u{feff}".chars().chain(text.chars()).flat_map(|c| (c as u16).to_le_bytes()).collect();
+    for bytes in [
+        format!("\u{feff}{text}").into_bytes(),
+        text.replace('\n', "\r").into_bytes(),
+        text.replace('\n', "\r\n").into_bytes(),
+        utf16,
+    ] {
+        dir.write("metadata.json", bytes);
+        let found = load(&dir).unwrap();
+        assert!(found.train.iter().zip(&expected.train).all(|(a, b)| a.pose == b.pose && a.name == b.name));
+    }
+    std::fs::rename(dir.path().join("occluders"), dir.path().join("old")).unwrap();
+    dir.stripe("occluders/mask_77.png", SIZE, 255);
+    fails(&dir, &["occluders", "names of frames", "mask_77"]);
 }
 
 #[test]
@@ -241,7 +263,7 @@ fn faults_of_the_file_are_told() {
         ("{\"00\": 3}".to_owned(), &["00", "an object"]),
         ("{}".to_owned(), &["a frame"]),
         (String::new(), &["EOF"]),
-        ("\u{feff}{}".to_owned(), &["expected value"]),
+        ("\u{feff}{}".to_owned(), &["a frame"]),
     ] {
         dir.write("metadata.json", broken);
         fails(&dir, &[&["metadata.json"], words].concat());

@@ -193,7 +193,9 @@ fn dense(class: &str, state: &Value) -> Result<NdArray, String> {
         let whole = first == Some(0) && last.and_then(|n| usize::try_from(n).ok()) == Some(inner.len());
         if starts.len() != lines.saturating_add(1) || !whole || starts.windows(2).any(|pair| pair[0] > pair[1]) {
             let (starts, values) = (starts.len(), inner.len());
-            return Err(format!("sparse matrix of {lines} lines with {starts} starts up to {last:?} of {values} values"));
+            return Err(format!(
+                "sparse matrix of {lines} lines with {starts} starts up to {last:?} of {values} values"
+            ));
         }
         let spans = starts.windows(2).enumerate();
         let outer = spans.flat_map(|(line, span)| std::iter::repeat_n(line as i64, (span[1] - span[0]) as usize));
