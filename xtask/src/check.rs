@@ -91,7 +91,19 @@ fn tell(found: &Check, all: bool) {
     if more > 0 {
         say!("… and {more} more (--all)");
     }
+    say!("{}", grade(found.mean_iou()));
     say!("{}", verdict(found));
+}
+
+/// The fit's grade by its mean overlap, and what to do about it.
+fn grade(iou: f32) -> &'static str {
+    const GOOD: f32 = 0.85;
+    const USABLE: f32 = 0.65;
+    match iou {
+        iou if iou >= GOOD => "fit: good",
+        iou if iou >= USABLE => "fit: usable (registration moves the bodies onto the pictures before training)",
+        _ => "fit: poor (see the picture: wrong masks, or a fit that training will not mend)",
+    }
 }
 
 fn verdict(found: &Check) -> String {

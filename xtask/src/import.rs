@@ -35,7 +35,8 @@ Run one estimator and one segmenter as their own pages say, on the same frames (
   SAM 2             OUTPUT/CLIP of vos_inference.py: PNGs by value, or a folder an object (--object, --occluder-objects)
   Grounded-SAM-2    OUTPUT with mask_data/mask_*.npy          (--object, --occluder-objects)
   MatAnyone         OUTPUT/CLIP with pha/0000.png
-  any other         PNGs of 0 and 255, or one .npy (frames, height, width); inverted ones are told by the border
+  any other         PNGs of 0 and 255 or with alpha, or one .npy or .npz (frames, height, width); inverted ones are
+                    told by the border; without --masks, the frames' own alpha
 
 --body: SMPL_NEUTRAL.pkl of SMPL_python_v.1.1.0 (smpl.is.tue.mpg.de), or SMPLX_NEUTRAL.npz (smpl-x.is.tue.mpg.de).
 

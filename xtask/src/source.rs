@@ -37,7 +37,7 @@ impl Source {
     /// Takes the registered bodies of the run in `directory`, if it kept them.
     pub fn restore(&mut self, directory: &Path, config: &Config) -> Result<()> {
         let mended = match config.registration.rounds {
-            0 => Mended(self.capture.clone()),
+            0 => Mended::from(self.capture.clone()),
             _ => mend_masks(self.capture.clone(), &self.model)?,
         };
         let restored = Person::restore(directory, mended, &self.model)?;

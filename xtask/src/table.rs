@@ -9,6 +9,9 @@ fn cell(value: Option<f64>, digits: usize) -> String {
 /// A row for each run: novel views where there are any, ranked quantities first.
 pub fn markdown(rows: &[(String, &Metrics)]) -> String {
     let networks: Vec<&str> = rows.iter().filter_map(|(_, m)| m.lpips.as_deref()).collect();
+    // Where pixels are unknown, beside the score of the known ones: their share, and a score of all.
+    let splits = || rows.iter().filter_map(|(_, m)| m.splits.first());
+    let excuses = splits().any(|(_, split)| split.known.is_some_and(|known| known < 1.0));
     let header = "method|occluded|steps|train s|psnr_mask|psnr_hidden|ssim_mask|psnr_vis|ssim_vis|psnr_full|ssim_full|\
         iou|s/frame|params|perceptual term|lpips_full";
     let columns = if networks.is_empty() { 15 } else { 16 };
@@ -36,7 +39,13 @@ pub fn markdown(rows: &[(String, &Metrics)]) -> String {
             let network = m.lpips.as_deref().filter(|_| split.lpips_full.is_some());
             line.push(network.map_or("–".to_owned(), |n| format!("{} ({n})", cell(split.lpips_full, 4))));
         }
+        if excuses {
+            line.splice(5..5, [cell(split.psnr_all, 2), cell(split.known, 3)]);
+        }
         lines.push(line);
+    }
+    if excuses {
+        lines[0].splice(5..5, ["psnr_all", "known"].map(str::to_owned));
     }
     aligned(&lines, 2)
 }

@@ -117,6 +117,9 @@ struct Begun {
     _lock: Lock,
 }
 
+/// Of captures without other cameras, every so many-th frame is held out for scoring.
+const HELD_OUT: usize = 10;
+
 /// A new run.
 fn begun(arguments: &TrainArguments, name: &str) -> Result<Begun> {
     let mut config = arguments.settings.config()?;
@@ -124,6 +127,11 @@ fn begun(arguments: &TrainArguments, name: &str) -> Result<Begun> {
     // What is asked for by itself stays as it is asked for.
     let steps = arguments.settings.steps.map(|_| "steps=".to_owned());
     let set: Vec<String> = arguments.settings.set.iter().cloned().chain(steps).collect();
+    let is_given = set.iter().any(|set| set.starts_with("held_out="));
+    if source.capture.eval.is_empty() && source.capture.train.len() >= 2 * HELD_OUT && !is_given {
+        config.held_out = HELD_OUT;
+        say!("no other camera: every {HELD_OUT}th frame is scored, and nothing is learnt from it (--set held_out=0)");
+    }
     let chosen = capacity::choose(&source, &config, &set, arguments.capacity)?;
     if let Some(capacity) = &chosen {
         capacity.apply(&mut config);
@@ -162,8 +170,14 @@ pub fn scene_name(scene: Option<&str>) -> String {
     name.chars().map(|c| if c.is_alphanumeric() || c == '_' { c } else { '-' }).collect()
 }
 
-/// What registration made of the focal length, if it is more than the noise of one that is right.
-fn say_focal_length(source: &Source, scene: &Scene) {
+/// What was made of the masks, and of the focal length if it is more than the noise of one that is
+/// right.
+fn say_corrections(source: &Source, scene: &Scene) {
+    match scene.registered.growth {
+        0 => {}
+        by if by < 0 => say!("masks: {} pixels larger than the person all around, trimmed", -by),
+        by => say!("masks: {by} pixels smaller than the person all around, grown"),
+    }
     let focal = |capture: &Capture| capture.train.first().map_or(1.0, |frame| frame.camera.focal.x);
     let (given, found) = (focal(&source.capture), focal(&scene.registered.capture));
     if (found / given - 1.0).abs() > 0.1 {
@@ -180,7 +194,7 @@ pub fn run_one(
     options: &RunOptions,
 ) -> Result<Option<Metrics>> {
     let scene = source.scene(&run.train)?;
-    say_focal_length(source, &scene);
+    say_corrections(source, &scene);
     // Before the training, not after it.
     check_pictures(&scene)?;
     if let Some(lpips) = lpips {

@@ -88,6 +88,13 @@ impl CaptureError {
 
     /// A failure of the system on `path`.
     pub fn io(path: &Path) -> impl FnOnce(std::io::Error) -> Self + '_ {
-        move |source| Self::Io { path: path.to_owned(), source }
+        move |source| {
+            let target = std::fs::read_link(path).ok().filter(|_| source.kind() == std::io::ErrorKind::NotFound);
+            let source = match target {
+                Some(to) => std::io::Error::new(source.kind(), format!("a broken link to {}", to.display())),
+                None => source,
+            };
+            Self::Io { path: path.to_owned(), source }
+        }
     }
 }

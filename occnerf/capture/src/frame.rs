@@ -60,7 +60,19 @@ pub struct Capture {
 
 /// A capture with corrected masks, or with masks to be taken as they are.
 #[derive(Clone, Debug)]
-pub struct Mended(pub Capture);
+pub struct Mended {
+    /// The capture.
+    pub capture: Capture,
+    /// Pixels by which the masks were dilated; eroded where negative.
+    pub growth: i32,
+}
+
+impl From<Capture> for Mended {
+    /// Takes the masks as they are.
+    fn from(capture: Capture) -> Self {
+        Self { capture, growth: 0 }
+    }
+}
 
 /// A mended capture with registered bodies, or with bodies to be taken as they are.
 #[derive(Clone, Debug)]
@@ -70,11 +82,13 @@ pub struct Registered {
     /// Registered offset of clothes and hair along each vertex normal, in the capture's units; empty
     /// where unknown.
     pub clothes: Vec<f32>,
+    /// [`Mended::growth`].
+    pub growth: i32,
 }
 
 impl From<Capture> for Registered {
     /// Takes masks and bodies as they are.
     fn from(capture: Capture) -> Self {
-        Self { capture, clothes: Vec::new() }
+        Self { capture, clothes: Vec::new(), growth: 0 }
     }
 }

@@ -21,7 +21,8 @@ const VISIBLE: f32 = 0.001;
 /// a whole side.
 const MIN_HIDDEN_PIXELS: usize = 16;
 
-/// Scores of one picture; `None` where the set of pixels is empty.
+/// Scores of one picture over the pixels that are known, but for `psnr_all`; `None` where the set of
+/// pixels is empty. All pixels are known in views of cameras that training did not use.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct FrameMetrics {
     /// Name of the frame.
@@ -32,8 +33,14 @@ pub struct FrameMetrics {
     pub psnr_vis: Option<f64>,
     /// SSIM over the pixels of `psnr_vis`.
     pub ssim_vis: Option<f64>,
-    /// PSNR (dB) over the true subject's pixels.
+    /// PSNR (dB) over the true subject's known pixels.
     pub psnr_mask: Option<f64>,
+    /// PSNR (dB) over all of the true subject's pixels: what is unknown is not excused.
+    #[serde(default)]
+    pub psnr_all: Option<f64>,
+    /// Share of the true subject's pixels that are known.
+    #[serde(default)]
+    pub known: Option<f64>,
     /// SSIM over the pixels of `psnr_mask`.
     pub ssim_mask: Option<f64>,
     /// PSNR (dB) over the subject's pixels on the quartile of vertices that the training video
@@ -60,6 +67,12 @@ pub struct SplitMetrics {
     pub ssim_vis: Option<f64>,
     /// Mean of [`FrameMetrics::psnr_mask`].
     pub psnr_mask: Option<f64>,
+    /// Mean of [`FrameMetrics::psnr_all`].
+    #[serde(default)]
+    pub psnr_all: Option<f64>,
+    /// Mean of [`FrameMetrics::known`].
+    #[serde(default)]
+    pub known: Option<f64>,
     /// Mean of [`FrameMetrics::ssim_mask`].
     pub ssim_mask: Option<f64>,
     /// Mean of [`FrameMetrics::psnr_hidden`].
@@ -107,8 +120,10 @@ pub fn evaluate(
         let truth = frame.pixels()?;
         let nearest = nearest_vertices(scene, frame, &truth.mask)?;
         let hidden: Vec<bool> = nearest.iter().map(|v| v.is_some_and(|v| least[v as usize])).collect();
-        without_unknown(frame, &truth, &mut rendering);
-        scores.push(score(frame, &truth, &rendering, &hidden, lpips)?);
+        let of_subject: Vec<bool> = truth.mask.iter().map(|&m| m > 0.5).collect();
+        let psnr_all = metrics::psnr_masked(&rendering.image.pixels, &truth.image.pixels, &of_subject);
+        let known = without_unknown(frame, &truth, &mut rendering);
+        scores.push(FrameMetrics { psnr_all, ..score(frame, &truth, &rendering, [&hidden, &known], lpips)? });
     }
     let mean = |pick: &dyn Fn(&FrameMetrics) -> Option<f64>| {
         let values: Vec<f64> = scores.iter().filter_map(pick).filter(|v| v.is_finite()).collect();
@@ -118,6 +133,8 @@ pub fn evaluate(
         psnr_vis: mean(&|f| f.psnr_vis),
         ssim_vis: mean(&|f| f.ssim_vis),
         psnr_mask: mean(&|f| f.psnr_mask),
+        psnr_all: mean(&|f| f.psnr_all),
+        known: mean(&|f| f.known),
         ssim_mask: mean(&|f| f.ssim_mask),
         psnr_hidden: mean(&|f| f.psnr_hidden),
         psnr_full: mean(&|f| f.psnr_full),
@@ -133,13 +150,15 @@ fn score(
     frame: &PreparedFrame,
     truth: &Pixels,
     rendering: &Rendering,
-    hidden: &[bool],
+    [hidden, known]: [&[bool]; 2],
     lpips: Option<&Lpips>,
 ) -> Result<FrameMetrics, Error> {
     let (a, b) = (&rendering.image.pixels[..], &truth.image.pixels[..]);
     let (width, height) = (frame.view.camera.width as usize, frame.view.camera.height as usize);
     let visible: Vec<bool> = rendering.opacity.iter().map(|&o| o > VISIBLE).collect();
-    let mask: Vec<bool> = truth.mask.iter().map(|&m| m > 0.5).collect();
+    let subject = truth.mask.iter().filter(|m| **m > 0.5).count();
+    let mask: Vec<bool> = truth.mask.iter().zip(known).map(|(&m, &known)| m > 0.5 && known).collect();
+    let in_mask = mask.iter().filter(|m| **m).count();
     let solid: Vec<bool> = rendering.opacity.iter().map(|&o| o > 0.5).collect();
     let count = |f: &dyn Fn(bool, bool) -> bool| solid.iter().zip(&mask).filter(|(s, m)| f(**s, **m)).count();
     let union = count(&|s, m| s || m);
@@ -152,24 +171,29 @@ fn score(
         psnr_vis: metrics::psnr_masked(a, b, &visible),
         ssim_vis: metrics::ssim_masked(a, b, &visible, width, height),
         psnr_mask: metrics::psnr_masked(a, b, &mask),
+        psnr_all: None,
+        known: (subject > 0).then(|| in_mask as f64 / subject as f64),
         ssim_mask: metrics::ssim_masked(a, b, &mask, width, height),
         psnr_hidden: if enough { metrics::psnr_masked(a, b, &hidden) } else { None },
-        psnr_full: Some(metrics::psnr(a, b)),
-        ssim_full: metrics::ssim(a, b, width, height).ok(),
+        psnr_full: metrics::psnr_masked(a, b, known),
+        ssim_full: metrics::ssim_masked(a, b, known, width, height),
         lpips_full: lpips_full.and_then(|values| values.first().copied()),
         mask_iou: if union == 0 { 1.0 } else { count(&|s, m| s && m) as f64 / union as f64 },
     })
 }
 
-/// Removes from a picture the pixels that a training image does not show.
-fn without_unknown(frame: &PreparedFrame, truth: &Pixels, rendering: &mut Rendering) {
+/// Removes from a picture the pixels that a training image does not show; which are known.
+fn without_unknown(frame: &PreparedFrame, truth: &Pixels, rendering: &mut Rendering) -> Vec<bool> {
+    let mut known = vec![true; truth.mask.len()];
     for (i, label) in frame.labels.iter().enumerate() {
         if label == Label::Unknown {
             let truth = &truth.image.pixels[3 * i..3 * i + 3];
             rendering.image.pixels[3 * i..3 * i + 3].copy_from_slice(truth);
             rendering.opacity[i] = 0.0;
+            known[i] = false;
         }
     }
+    known
 }
 
 /// The vertex nearest to each pixel's first hit on the posed prior (H × W); `None` where there is

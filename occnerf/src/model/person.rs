@@ -48,7 +48,7 @@ impl Person {
     /// # Errors
     /// Files that cannot be written.
     pub fn save(run: &Path, registered: &Registered, model: &BodyModel, colors: &PriorColors) -> Result<(), Error> {
-        let Registered { capture, clothes } = registered;
+        let Registered { capture, clothes, .. } = registered;
         model.save(&run.join(BODY))?;
         let (joints, betas) = (model.num_joints(), model.num_betas());
         let vectors = |values: &[Vec3]| values.iter().flat_map(|v| v.to_array()).collect::<Vec<f32>>();
@@ -112,7 +112,7 @@ impl Person {
     /// # Errors
     /// [`Error::Io`] and [`Error::File`] for a file that is damaged, or of other frames.
     pub fn restore(run: &Path, mended: Mended, model: &BodyModel) -> Result<Option<Registered>, Error> {
-        let (path, Mended(mut capture)) = (run.join(PERSON), mended);
+        let (path, Mended { mut capture, growth }) = (run.join(PERSON), mended);
         if !path.is_file() {
             return Ok(None);
         }
@@ -149,7 +149,7 @@ impl Person {
         let clothes = if has { contents.floats("clothes", model.num_vertices())? } else { Vec::new() };
         let Aabb { min, max } = Aabb::from_points(&model.v_template);
         below(&contents, "clothes", &clothes, (max - min).length())?;
-        Ok(Some(Registered { capture, clothes }))
+        Ok(Some(Registered { capture, clothes, growth }))
     }
 
     /// Reads the files that [`Person::save`] wrote into the directory `run`.

@@ -28,8 +28,8 @@ const PAIRS: u64 = 100;
 const ENOUGH: usize = 8;
 /// Level sets around a mask: [`LINES`] outside, the edge, and 4 inside.
 const AROUND: usize = LINES + 5;
-/// Least gradient of the outline relative to the largest, and largest gradient of the next level set
-/// outside relative to the outline's.
+/// Least gradient of the outline relative to the largest, and largest gradient of a level set outside
+/// relative to the outline's.
 const NEARLY: f64 = 0.75;
 const RISE: f64 = 0.6;
 /// Passes of growing.
@@ -42,18 +42,20 @@ const NEAR: f32 = 0.1;
 /// # Errors
 /// Pictures that cannot be read.
 pub fn mend_masks(mut capture: Capture, model: &BodyModel) -> Result<Mended, Error> {
-    match excess(&capture.train)? {
+    let growth = match excess(&capture.train)? {
         0 => extend(&mut capture, model)?,
         excess => {
-            let by = -i32::try_from(excess).unwrap_or(i32::MAX);
-            capture.train.iter_mut().for_each(|frame| frame.source.edit(move |pixels| pixels.grow(by)));
+            capture.train.iter_mut().for_each(|frame| frame.source.edit(move |pixels| pixels.grow(-excess)));
+            -excess
         }
-    }
-    Ok(Mended(capture))
+    };
+    Ok(Mended { capture, growth })
 }
 
-/// Number of pixels by which the masks are too large; 0 where no level set stands out.
-fn excess(frames: &[Frame]) -> Result<u32, Error> {
+/// Number of pixels by which the masks are too large; 0 where no level set stands out, or the gradient
+/// does not fall from it towards the mask's edge: photographs are blurred, and the outline of an exact
+/// mask is at its edge.
+fn excess(frames: &[Frame]) -> Result<i32, Error> {
     let sums = total(frames, |frame| Ok(Some(inner_gradients(&frame.pixels()?))))?;
     let crossed = sums.iter().take_while(|sum| sum.1 >= PAIRS);
     let means: Vec<f64> = crossed.map(|(change, pairs)| change / *pairs as f64).collect();
@@ -63,7 +65,8 @@ fn excess(frames: &[Frame]) -> Result<u32, Error> {
     let mut sorted = means.clone();
     sorted.sort_by(f64::total_cmp);
     let most = (BLUR..FARTHEST).max_by(|&a, &b| means[a].total_cmp(&means[b])).unwrap_or(0);
-    Ok(if means[most] > OUTSTANDING * sorted[means.len() / 2] { most as u32 + 1 } else { 0 })
+    let stands_out = means[most] > OUTSTANDING * sorted[means.len() / 2] && means[0] < RISE * means[most];
+    Ok(if stands_out { most as i32 + 1 } else { 0 })
 }
 
 /// Sums over the sampled frames.
@@ -80,13 +83,15 @@ fn total<const N: usize>(
     Ok(sums)
 }
 
-/// Grows the masks into the photographs near the body, away from occluders.
-fn extend(capture: &mut Capture, model: &BodyModel) -> Result<(), Error> {
+/// Grows the masks into the photographs near the body, away from occluders; by how many pixels.
+fn extend(capture: &mut Capture, model: &BodyModel) -> Result<i32, Error> {
+    let mut growth = 0;
     for _ in 0..PASSES {
         let missing = missing(&capture.train, model)?;
         if missing == 0 {
             break;
         }
+        growth += missing as i32;
         capture.train.par_iter_mut().try_for_each(|frame| -> Result<(), Error> {
             let Some(photograph) = frame.source.photograph().transpose()? else { return Ok(()) };
             let pixels = frame.pixels()?;
@@ -96,7 +101,7 @@ fn extend(capture: &mut Capture, model: &BodyModel) -> Result<(), Error> {
             Ok(())
         })?;
     }
-    Ok(())
+    Ok(growth)
 }
 
 /// Number of pixels by which the masks are too small; 0 where no level set outside is the outline.
@@ -232,9 +237,9 @@ mod tests {
             let mut capture = given.clone();
             let noise = Perturbation { mask_pixels, ragged_pixels, ..Perturbation::NONE };
             noise.apply(&mut capture, &body).unwrap();
-            let found = excess(&capture.train).unwrap() as i32;
+            let found = excess(&capture.train).unwrap();
             let corrupted = area(&capture);
-            let Mended(capture) = mend_masks(capture, &body).unwrap();
+            let Mended { capture, .. } = mend_masks(capture, &body).unwrap();
             println!("{mask_pixels} {ragged_pixels}: {found}");
             if mask_pixels < 2 {
                 // Those that are too small grow.
@@ -245,6 +250,41 @@ mod tests {
                 let (left, was) = ((area(&capture) - area(&given)).abs(), corrupted - area(&given));
                 assert!(left < 0.4 * was, "{mask_pixels}: {left} of {was}");
             }
+        }
+    }
+
+    /// Separable binomial blur of variance `passes` / 2.
+    fn blurred(mut image: crate::capture::Image, passes: usize) -> crate::capture::Image {
+        let (width, height) = (image.width as usize, image.height as usize);
+        for (step, count) in std::iter::repeat_n([(3, width), (3 * width, height)], passes).flatten() {
+            let old = image.pixels.clone();
+            for i in 0..old.len() {
+                let at = i / step % count;
+                let before = if at > 0 { old[i - step] } else { old[i] };
+                let after = if at + 1 < count { old[i + step] } else { old[i] };
+                image.pixels[i] = (before + 2.0 * old[i] + after) / 4.0;
+            }
+        }
+        image
+    }
+
+    #[test]
+    fn exact_masks_of_blurred_photographs_are_not_trimmed() {
+        let body = BodyModel::embedded();
+        let (_directory, given) = on_disk("masks-blurred", 192, Layout::Wild);
+        for (passes, mask_pixels) in [(1, 0), (2, 0), (4, 0), (8, 0), (1, 3), (2, 4)] {
+            let mut capture = given.clone();
+            Perturbation { mask_pixels, ..Perturbation::NONE }.apply(&mut capture, &body).unwrap();
+            for frame in &mut capture.train {
+                let photograph = blurred(frame.source.photograph().unwrap().unwrap(), passes);
+                frame.source.edit(move |pixels| {
+                    pixels.image = photograph.clone();
+                    pixels.image.multiply(&pixels.mask.clone());
+                });
+            }
+            let found = excess(&capture.train).unwrap();
+            println!("blurred {passes} times, {mask_pixels}: {found}");
+            assert!((found - mask_pixels).abs() <= 1 && (mask_pixels > 0 || found == 0), "{passes}: {found}");
         }
     }
 
@@ -289,7 +329,7 @@ mod tests {
         let body = BodyModel::embedded();
         let (_directory, mut capture) = on_disk("masks-occluder", 192, Layout::Wild);
         Perturbation { mask_pixels: -2, ..Perturbation::NONE }.apply(&mut capture, &body).unwrap();
-        let Mended(grown_capture) = mend_masks(capture.clone(), &body).unwrap();
+        let grown_capture = mend_masks(capture.clone(), &body).unwrap().capture;
         let mut grown = 0;
         for (frame, small) in grown_capture.train.iter().zip(&capture.train) {
             let (frame, small) = (frame.pixels().unwrap(), small.pixels().unwrap());
@@ -308,7 +348,7 @@ mod tests {
         let config = DemoConfig { size: 32, frames: 2, eval_cameras: 1, ..DemoConfig::default() };
         let mut capture = demo(&config, &body).unwrap();
         Perturbation { mask_pixels: -40, ..Perturbation::NONE }.apply(&mut capture, &body).unwrap();
-        let Mended(capture) = mend_masks(capture, &body).unwrap();
+        let Mended { capture, .. } = mend_masks(capture, &body).unwrap();
         assert_eq!(excess(&capture.train).unwrap(), 0);
         assert_eq!(excess(&[]).unwrap(), 0);
     }

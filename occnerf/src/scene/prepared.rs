@@ -103,7 +103,7 @@ impl Scene {
     /// pictures that cannot be read.
     pub fn prepare(registered: Registered, model: &BodyModel, config: &Config) -> Result<Self, Error> {
         config.validate()?;
-        let Registered { capture, clothes } = &registered;
+        let Registered { capture, clothes, .. } = &registered;
         if let Some(lost) = capture.eval.iter().find(|e| e.train_index >= capture.train.len()) {
             let (name, at, frames) = (&lost.frame.name, lost.train_index, capture.train.len());
             return Err(Error::Scene(format!("view {name} is of training frame {at}, expected one of {frames}")));

@@ -91,7 +91,7 @@ fn a_capture_gets_the_bodies_that_a_run_was_trained_with() {
     other.train.pop();
     larger.train[1].camera = larger.train[1].camera.resized(99, 98);
     for (capture, words) in [(other, "frames, the capture has"), (larger, "the capture in (99, 98)")] {
-        let error = Person::restore(&dir.path(""), Mended(capture), body()).unwrap_err().to_string();
+        let error = Person::restore(&dir.path(""), Mended::from(capture), body()).unwrap_err().to_string();
         assert!(error.contains(PERSON) && error.contains(words), "{error}");
     }
     assert!(Person::restore(&dir.path("elsewhere"), mended, body()).unwrap().is_none());

@@ -44,7 +44,7 @@ impl Character {
             let moved = positions.iter_mut().flatten().zip(displacements.iter().flatten());
             moved.for_each(|(position, by)| *position += weight * by);
         }
-        if let Some(far) = positions.iter().find(|p| p.iter().any(|x| !(x.abs() <= MAX_COORDINATE))) {
+        if let Some(far) = positions.iter().find(|p| p.iter().any(|x| x.is_nan() || x.abs() > MAX_COORDINATE)) {
             return Err(invalid(format!("POSITION {far:?}: expected coordinates of at most {MAX_COORDINATE}")));
         }
         let (first, count) = (self.vertices.len() as u32, positions.len());

@@ -1,6 +1,6 @@
 //! Writing of an imported capture.
 
-use std::path::{Path, PathBuf};
+use std::path::{Component, Path, PathBuf};
 
 use glam::DVec3;
 use image::{GrayImage, ImageFormat};
@@ -120,6 +120,16 @@ fn save(levels: Vec<u8>, size: (u32, u32), path: &Path) -> Result<(), CaptureErr
     })
 }
 
+/// `target` as seen from `folder`, both absolute; `target` itself where they share only the root.
+fn relative(target: &Path, folder: &Path) -> PathBuf {
+    let shared = target.components().zip(folder.components()).take_while(|(a, b)| a == b).count();
+    if shared < 2 {
+        return target.to_owned();
+    }
+    let up = folder.components().skip(shared).map(|_| Component::ParentDir);
+    up.chain(target.components().skip(shared)).collect()
+}
+
 /// Links a picture, or copies it if `copy` or where links fail.
 fn linked(from: &Path, to: &Path, copy: bool) -> Result<(), CaptureError> {
     let whole: PathBuf = from.canonicalize().map_err(CaptureError::io(from))?;
@@ -129,8 +139,12 @@ fn linked(from: &Path, to: &Path, copy: bool) -> Result<(), CaptureError> {
         return Err(CaptureError::Io { path: to.to_owned(), source });
     }
     #[cfg(unix)]
-    if !copy && std::os::unix::fs::symlink(&whole, to).is_ok() {
-        return Ok(());
+    if !copy {
+        let folder = to.parent().unwrap_or(to);
+        let folder = folder.canonicalize().map_err(CaptureError::io(folder))?;
+        if std::os::unix::fs::symlink(relative(&whole, &folder), to).is_ok() {
+            return Ok(());
+        }
     }
     let _ = copy;
     std::fs::copy(&whole, to).map_err(CaptureError::io(from)).map(drop)
@@ -148,4 +162,29 @@ fn record(placed: &Placed, betas: &[f64]) -> Value {
         "cam_intrinsics": [[frame.focal[0], 0.0, frame.centre[0]], [0.0, frame.focal[1], frame.centre[1]], [0.0, 0.0, 1.0]],
         "cam_extrinsics": [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]],
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn links_are_relative_and_broken_ones_are_called_so() {
+        assert_eq!(relative(Path::new("/a/b/x.png"), Path::new("/a/c/images")), Path::new("../../b/x.png"));
+        assert_eq!(relative(Path::new("/a/x.png"), Path::new("/b/images")), Path::new("/a/x.png"));
+        let dir = crate::testing::Directory::new("import-links");
+        dir.picture("frames/1.png", (4, 2), |_, _| 200);
+        std::fs::create_dir_all(dir.path().join("capture/images")).unwrap();
+        let (from, to) = (dir.path().join("frames/1.png"), dir.path().join("capture/images/1.png"));
+        linked(&from, &to, false).unwrap();
+        // Both moved together.
+        let moved = dir.path().with_extension("moved");
+        std::fs::rename(dir.path(), &moved).unwrap();
+        let picture = moved.join("capture/images/1.png");
+        assert!(crate::Image::load(&picture).is_ok());
+        std::fs::remove_file(moved.join("frames/1.png")).unwrap();
+        let error = crate::Image::load(&picture).unwrap_err().to_string();
+        std::fs::remove_dir_all(&moved).unwrap();
+        assert!(error.contains("broken link") && error.contains("../../frames/1.png"), "{error}");
+    }
 }

@@ -54,7 +54,7 @@ fn fails(dir: &Directory, words: &[&str]) {
 #[test]
 fn frames_come_in_the_order_of_their_numbers() {
     let (dir, _) = fixture("wild-numbers");
-    ["occluders", "clean"].map(|folder| std::fs::remove_dir_all(dir.path().join(folder)).unwrap());
+    ["occluders", "clean"].into_iter().for_each(|folder| std::fs::remove_dir_all(dir.path().join(folder)).unwrap());
     let mut entries = serde_json::Map::new();
     for name in ["1", "2", "9", "10"] {
         dir.stripe(&format!("images/{name}.png"), SIZE, 200);

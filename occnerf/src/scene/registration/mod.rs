@@ -101,7 +101,8 @@ struct Registration<'a> {
 ///
 /// # Errors
 /// [`Error::Scene`] for a body of more than 512 joints; pictures that cannot be read.
-pub fn register(Mended(mut capture): Mended, model: &BodyModel, rounds: usize) -> Result<Registered, Error> {
+pub fn register(mended: Mended, model: &BodyModel, rounds: usize) -> Result<Registered, Error> {
+    let Mended { mut capture, growth } = mended;
     let joints = model.num_joints();
     if joints > MOST_JOINTS {
         let other = "`registration.rounds` of 0 leaves the prior as it is";
@@ -141,7 +142,7 @@ pub fn register(Mended(mut capture): Mended, model: &BodyModel, rounds: usize) -
             view.frame.betas.clone_from(betas);
         }
     }
-    Ok(Registered { capture, clothes })
+    Ok(Registered { capture, clothes, growth })
 }
 
 impl<'a> Registration<'a> {

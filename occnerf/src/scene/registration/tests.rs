@@ -14,7 +14,7 @@ pub(super) fn frame(pose: Vec<Vec3>, placement: Placement) -> Frame {
 }
 
 fn registered(capture: &Capture, body: &BodyModel, rounds: usize) -> Capture {
-    register(Mended(capture.clone()), body, rounds).unwrap().capture
+    register(Mended::from(capture.clone()), body, rounds).unwrap().capture
 }
 
 fn small() -> DemoConfig {

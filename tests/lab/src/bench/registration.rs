@@ -102,7 +102,7 @@ pub fn registration(arguments: &RegistrationArguments) -> Result<()> {
     let best_with = |masks: &Perturbation| -> Result<f64> {
         let mut best = truth.clone();
         masks.apply(&mut best, &body)?;
-        psnr(register(Mended(best), &body, rounds)?, &body)
+        psnr(register(Mended::from(best), &body, rounds)?, &body)
     };
     let exact = best_with(&Perturbation::NONE)?;
     for (index, (name, wrong)) in PRIORS.iter().enumerate().filter(|(_, (name, _))| asked(name)) {
@@ -112,7 +112,7 @@ pub fn registration(arguments: &RegistrationArguments) -> Result<()> {
         let before = Error::measure((&truth, &body), (&capture, &model))?;
         let given_psnr = psnr(capture.clone().into(), &model)?;
         let start = Instant::now();
-        let registered = register(Mended(capture), &model, rounds)?;
+        let registered = register(Mended::from(capture), &model, rounds)?;
         let seconds = start.elapsed().as_secs_f64();
         let after = Error::measure((&truth, &body), (&registered.capture, &model))?;
         let mut line = vec![(*name).to_owned()];
