@@ -1,4 +1,4 @@
-//! Natural order of frame names.
+//! Natural order of frame names, and their numbers.
 
 use std::cmp::Ordering;
 
@@ -38,6 +38,13 @@ impl PartialOrd for FrameName<'_> {
 fn split(name: &str) -> (&str, &str) {
     let digit = name.starts_with(|c: char| c.is_ascii_digit());
     name.split_at(name.find(|c: char| c.is_ascii_digit() != digit).unwrap_or(name.len()))
+}
+
+/// The number in a name: its last run of digits.
+pub(super) fn number(name: &str) -> Option<usize> {
+    let end = name.rfind(|c: char| c.is_ascii_digit())? + 1;
+    let digits = name[..end].bytes().rev().take_while(u8::is_ascii_digit).count();
+    name[end - digits..end].parse().ok()
 }
 
 #[cfg(test)]

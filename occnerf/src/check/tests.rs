@@ -170,7 +170,7 @@ fn good_captures_raise_no_alarm() {
 
 #[test]
 fn each_mistake_is_found() {
-    let mut lines = Vec::new();
+    let (mut lines, mut all) = (Vec::new(), [0, 0]);
     for mistake in [
         Mistake::CameraToWorld,
         Mistake::CameraYUp,
@@ -197,8 +197,8 @@ fn each_mistake_is_found() {
         Mistake::WrongPerson,
     ] {
         let (mut trials, mut found, mut others) = (0, 0, Vec::new());
-        // The estimators' files are of one video.
-        for (name, capture, body) in good().iter().take(8) {
+        // Half of the captures each; the estimators' files are of one video.
+        for (name, capture, body) in good().iter().take(8).skip(lines.len() % 2).step_by(2) {
             let window = Capture { train: capture.train[..capture.train.len().min(30)].to_vec(), ..capture.clone() };
             let wrong = made(mistake, &window, body);
             let mistakes = likely(&wrong, body, small_views(&wrong).unwrap()).unwrap();
@@ -209,8 +209,10 @@ fn each_mistake_is_found() {
                 others.push(format!("{name}: {mistakes:?}"));
             }
         }
-        lines.push((format!("{mistake:?}: {found} of {trials}"), found * 100 >= 95 * trials, others));
+        all = [all[0] + found, all[1] + trials];
+        lines.push((format!("{mistake:?}: {found} of {trials}"), found + 1 >= trials, others));
     }
+    assert!(all[0] * 100 >= 95 * all[1], "{all:?} {lines:#?}");
     for (line, ..) in &lines {
         println!("{line}");
     }

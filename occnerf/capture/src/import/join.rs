@@ -3,6 +3,7 @@
 use std::collections::BTreeSet;
 
 use super::video::Video;
+use crate::names::number;
 
 /// The frames of a list of entries.
 #[derive(Debug, PartialEq)]
@@ -20,13 +21,6 @@ pub(super) enum Disjoint {
     Twice(usize),
     /// No name or number of an entry belongs to a frame, and their count is another.
     Apart,
-}
-
-/// The number in a name: its last run of digits.
-pub(super) fn number(name: &str) -> Option<usize> {
-    let end = name.rfind(|c: char| c.is_ascii_digit())? + 1;
-    let digits = name[..end].bytes().rev().take_while(u8::is_ascii_digit).count();
-    name[end - digits..end].parse().ok()
 }
 
 /// The frames of named entries, sorted in the natural order of their names.

@@ -3,10 +3,9 @@
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-use super::join::number;
 use crate::CaptureError;
 use crate::image::dimensions;
-use crate::names::FrameName;
+use crate::names::{FrameName, number};
 use crate::pictures::Pictures;
 
 /// A video's frames as files, in order.
