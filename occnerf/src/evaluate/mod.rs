@@ -176,7 +176,10 @@ fn score(
         ssim_mask: metrics::ssim_masked(a, b, &mask, width, height),
         psnr_hidden: if enough { metrics::psnr_masked(a, b, &hidden) } else { None },
         psnr_full: metrics::psnr_masked(a, b, known),
-        ssim_full: metrics::ssim_masked(a, b, known, width, height),
+        ssim_full: match known.contains(&false) {
+            true => metrics::ssim_masked(a, b, known, width, height),
+            false => metrics::ssim(a, b, width, height).ok(),
+        },
         lpips_full: lpips_full.and_then(|values| values.first().copied()),
         mask_iou: if union == 0 { 1.0 } else { count(&|s, m| s && m) as f64 / union as f64 },
     })
