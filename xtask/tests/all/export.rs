@@ -127,7 +127,8 @@ fn whatever_is_wrong_is_said_in_one_line() {
     refused(&["view", run_text, "--motion", text(&motion)], &["other.npz", "another skeleton"]);
     glb(run_text, out, &["--motion", text(&run.join("absent.npz"))], &["absent.npz"]);
     glb(run_text, out, &["--frame", "1"], &["--frame", "ply or obj"]);
-    let frame = ["export", run_text, "--format", "obj", "--out", text(&run.join("a.obj")), "--frame", "3"];
+    let obj = run.join("a.obj");
+    let frame = ["export", run_text, "--format", "obj", "--out", text(&obj), "--frame", "3"];
     refused(&frame, &["--frame 3", "0 to 2"]);
     for size in ["0x0", "100000x100000", "512x0", "many", "1x-1"] {
         refused(&["render", run_text, "tpose", "--size", size], &["--size"]);
