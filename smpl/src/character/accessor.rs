@@ -218,7 +218,8 @@ impl<'a> Source<'a> {
 fn percent_decoded(uri: &str) -> String {
     let (mut out, mut rest) = (Vec::new(), uri.as_bytes());
     while let Some((&first, after)) = rest.split_first() {
-        let digits = after.get(..2).filter(|_| first == b'%').and_then(|hex| std::str::from_utf8(hex).ok());
+        let is_hex = |hex: &&[u8]| first == b'%' && hex.iter().all(u8::is_ascii_hexdigit);
+        let digits = after.get(..2).filter(is_hex).and_then(|hex| std::str::from_utf8(hex).ok());
         match digits.and_then(|hex| u8::from_str_radix(hex, 16).ok()) {
             Some(byte) => (out.push(byte), rest = &after[2..]).1,
             None => (out.push(first), rest = after).1,

@@ -24,11 +24,18 @@ pub(super) enum Disjoint {
 }
 
 /// The frames of named entries, sorted in the natural order of their names.
+///
+/// Names alone do not decide: of a video whose pictures are counted from 1, masks that a tool counts from
+/// 0 have the names of their neighbours.
 pub(super) fn by_name(video: &Video, names: &[&str]) -> Result<Joined, Disjoint> {
     let at: Vec<Option<usize>> = names.iter().map(|name| video.index(name)).collect();
-    if 2 * at.iter().flatten().count() >= names.len().min(video.names.len()) {
-        return Ok(Joined { at, note: None });
+    let matched = |at: &[Option<usize>]| at.iter().flatten().count();
+    let named = matched(&at);
+    let by_name = |at| Ok(Joined { at, note: None });
+    if named == names.len() {
+        return by_name(at);
     }
+    let is_named = 2 * named >= names.len().min(video.names.len());
     let in_order = |why: &str| {
         if names.len() != video.names.len() {
             return Err(Disjoint::Apart);
@@ -37,20 +44,34 @@ pub(super) fn by_name(video: &Video, names: &[&str]) -> Result<Joined, Disjoint>
         Ok(Joined { at: (0..names.len()).map(Some).collect(), note: Some(note) })
     };
     let numbers: Option<Vec<usize>> = names.iter().map(|name| number(name)).collect();
-    let Some((numbers, frames)) = numbers.zip(video.numbers()) else { return in_order(": not all have numbers") };
+    let Some((numbers, frames)) = numbers.zip(video.numbers()) else {
+        return if is_named { by_name(at) } else { in_order(": not all have numbers") };
+    };
     if let Some(pair) = numbers.windows(2).find(|pair| pair[0] >= pair[1]) {
         return Err(Disjoint::Twice(pair[1]));
     }
     let consecutive = |numbers: &[usize]| numbers.windows(2).all(|pair| pair[1] == pair[0] + 1);
-    if numbers.len() == frames.len() && consecutive(&numbers) {
+    let begins_alike = numbers[0] == frames[0];
+    if numbers.len() == frames.len() && consecutive(&numbers) && !(is_named && begins_alike) {
         return in_order(if consecutive(&frames) { "" } else { ": their numbers have no gaps, the pictures' have" });
     }
     let same_width = names[0].len() == video.names[0].len();
     let offset = offset(&frames, &numbers, same_width).ok_or(Disjoint::Apart)?;
-    let at = numbers.iter().map(|&n| place(&frames, n, offset)).collect::<Vec<_>>();
-    let first = at.iter().position(Option::is_some).unwrap_or(0);
-    let frame = at[first].map_or("", |frame| &video.names[frame]);
-    Ok(Joined { at, note: Some(format!("joined by number, `{}` with picture `{frame}`", names[first])) })
+    let numbered: Vec<Option<usize>> = numbers.iter().map(|&n| place(&frames, n, offset)).collect();
+    // Both begin and end together under another offset.
+    let is_shifted = !begins_alike && numbers[0].abs_diff(frames[0]) == last_difference(&numbers, &frames);
+    if is_named && (named > matched(&numbered) || (named == matched(&numbered) && !is_shifted)) {
+        return by_name(at);
+    }
+    let first = numbered.iter().position(Option::is_some).unwrap_or(0);
+    let frame = numbered[first].map_or("", |frame| &video.names[frame]);
+    let note = format!("joined by number, `{}` with picture `{frame}`", names[first]);
+    Ok(Joined { at: numbered, note: Some(note) })
+}
+
+/// The distance of the last of two lists of numbers.
+fn last_difference(a: &[usize], b: &[usize]) -> usize {
+    a.last().zip(b.last()).map_or(0, |(a, b)| a.abs_diff(*b))
 }
 
 /// The frames of indices that an estimator counted from 0, given in order.
@@ -127,12 +148,12 @@ mod tests {
         ) {
             let video = video((0..count).filter(|i| *i != lost_frame).map(|i| format!("{:06}", i + base)).collect());
             let kept: Vec<usize> = (0..count).filter(|i| Some(*i) != lost_mask).collect();
-            // Named as the frames, or by another tool.
-            let name = |i: &usize| if like { format!("{:06}", i + base) } else { format!("m{:04}", i + mask_base) };
+            // Named alike, or as another tool does; counted as the frames are, or not.
+            let name = |i: &usize| if like { format!("{:06}", i + mask_base) } else { format!("m{:04}", i + mask_base) };
             let names: Vec<String> = kept.iter().map(name).collect();
             let names: Vec<&str> = names.iter().map(String::as_str).collect();
             let joined = by_name(&video, &names).unwrap();
-            prop_assert_eq!(joined.note.is_none(), like);
+            prop_assert_eq!(joined.note.is_none(), like && base == mask_base);
             for (i, at) in kept.iter().zip(&joined.at) {
                 let expected = video.names.iter().position(|name| number(name) == Some(i + base));
                 prop_assert_eq!(*at, expected, "instant {} of {:?}", i, joined.note);

@@ -431,6 +431,15 @@ fn a_stack_with_an_axis_of_one_and_an_archive_are_masks() {
 }
 
 #[test]
+fn a_stack_that_claims_endless_empty_masks_is_refused_at_once() {
+    let dir = Directory::new("import-endless");
+    dir.write("stack.npy", npy(&[1 << 40, 0, 0], &[]));
+    let video = Video { names: vec!["1".to_owned()], paths: vec![PathBuf::new()], size: (4, 2) };
+    let error = Masks::open(&dir.path().join("stack.npy"), &ImportOptions::default(), &video).err().unwrap();
+    assert!(error.to_string().contains("shape"), "{error}");
+}
+
+#[test]
 fn a_lost_picture_costs_its_own_frame_alone() {
     let Some(dir) = shared("estimators") else { return };
     let video = Video::list(&dir.join("frames")).unwrap();
