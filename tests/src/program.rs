@@ -1,4 +1,4 @@
-//! The programs of the workspace as somebody calls them, for tests of their command lines.
+//! The programs of the workspace as users call them, for tests of their command lines.
 
 use std::path::{Path, PathBuf};
 use std::process::Output;

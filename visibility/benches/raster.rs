@@ -69,7 +69,7 @@ fn draw(bencher: Bencher<'_, '_>, mesh: &TriMesh, view: &View, threads: usize, l
     });
 }
 
-/// A picture of 512 × 512, of meshes subdivided so many times, on two threads.
+/// A picture of 512 × 512, of meshes subdivided this many times, on two threads.
 #[divan::bench(args = [0, 1, 2])]
 fn faces_512(bencher: Bencher<'_, '_>, times: u32) {
     draw(bencher, &subdivided(times), &view(512, 512), 2, 1, Samples::One);

@@ -52,7 +52,6 @@ pub struct ExportArguments {
 /// Runs the command.
 pub fn export(arguments: &ExportArguments) -> Result<()> {
     let out = &arguments.out;
-    avatar::check_folder(out)?;
     let format = format(arguments)?;
     if arguments.frame.is_some() && !matches!(format, Format::Ply | Format::Obj) {
         bail!("--frame is of one pose: --format ply or obj");
@@ -61,6 +60,8 @@ pub fn export(arguments: &ExportArguments) -> Result<()> {
     if let Some(path) = &arguments.motion {
         avatar::add_motion(&mut person, path, arguments.fps)?;
     }
+    // The folder is made only now, so that bad input leaves nothing behind.
+    avatar::check_folder(out)?;
     let clip = if arguments.motion.is_some() { person.clips.len() - 1 } else { 0 };
     match format {
         Format::Glb => {

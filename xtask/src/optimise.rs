@@ -85,7 +85,7 @@ pub fn optimise(directory: &Path, trainer: &mut Trainer<'_>, options: &RunOption
         bad += report.bad_gradients;
         if restarts.replace(report.restarts).is_some_and(|previous| previous < report.restarts) {
             let said = format!("step {}: nothing was left of the person", report.step);
-            bar.suspend(|| note!("{said}; begun anew at a tenth of the learning rates"));
+            bar.suspend(|| note!("{said}; restarted at a tenth of the learning rates"));
         }
         let mean = blend(smooth, report);
         smooth = Some(mean);

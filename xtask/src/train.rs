@@ -117,7 +117,7 @@ struct Begun {
     _lock: Lock,
 }
 
-/// Of captures without other cameras, every so many-th frame is held out for scoring.
+/// Of captures without other cameras, one frame in `HELD_OUT` is held out for scoring.
 const HELD_OUT: usize = 10;
 
 /// A new run.
@@ -151,7 +151,7 @@ fn resumed(arguments: &TrainArguments, directory: &Path) -> Result<Begun> {
     let lock = Lock::take(directory)?;
     let capacity = capacity::resumed(directory, arguments.capacity)?;
     let checkpoint = directory.join(CHECKPOINT);
-    // A run that ended before its first checkpoint begins anew.
+    // A run that ended before its first checkpoint restarts.
     let begun = if checkpoint.is_file() { Some(checkpoint_config(&checkpoint)?) } else { None };
     let saved = RunConfig::read(directory)?;
     let config = arguments.settings.resumed(begun.unwrap_or(saved.train), capacity.as_ref())?;
@@ -322,7 +322,7 @@ fn unless_finished(
     let earlier = old.is_some_and(|old| old.train == run.train && old.load == run.load);
     if earlier && directory.join(METRICS).is_file() {
         let metrics = Metrics::read(directory)?;
-        // Scores that lack what is asked for now are made anew from the checkpoint, as are those of
+        // Scores that lack what is asked for now are computed again from the checkpoint, as are those of
         // fewer steps.
         let whole = run.train.method == Method::Prior || metrics.steps >= run.train.steps;
         if whole && (lpips.is_none() || metrics.lpips == network_name(lpips)) {

@@ -77,7 +77,7 @@ impl<'a> Trainer<'a> {
         Ok(Self { scene, model, optimiser, restarts: Restarts::default(), lpips: None, buffers })
     }
 
-    /// Feeds the perceptron with the features of `encoder` in place of the method's, and begins anew.
+    /// Feeds the perceptron with the features of `encoder` in place of the method's, and restarts.
     /// A checkpoint does not hold the encoder: such a run cannot be resumed, nor its model loaded.
     ///
     /// # Panics

@@ -11,7 +11,7 @@ use synth::{SynthConfig, synthesise};
 const SIZE: u32 = 32;
 const STEPS: u64 = 8;
 
-/// A capture on disk, read with room for so many bytes of pictures and to decode one.
+/// A capture on disk, read with room for this many bytes of pictures and to decode one.
 fn read(dir: &TempDir, body: &BodyModel, room: u64) -> Capture {
     let bodies = 8 * body.num_vertices() as u64 * 24;
     let picture = u64::from(SIZE * SIZE) * 16;

@@ -1,4 +1,4 @@
-//! A field that has become empty: training begins anew at lower rates instead of going on with
+//! A field that has become empty: training restarts at lower rates instead of going on with
 //! nothing.
 
 use crate::common;

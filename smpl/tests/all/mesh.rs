@@ -47,7 +47,7 @@ fn errors_of_obj_files_name_the_line() {
     assert!(load_mesh(Path::new("/no/such.obj")).is_err());
 }
 
-/// tobj numbers vertices anew in the order of their first use, so corners are compared by position.
+/// tobj renumbers vertices in the order of their first use, so corners are compared by position.
 fn by_tobj(text: &str) -> Vec<Vec3> {
     let options = tobj::LoadOptions { triangulate: true, ..tobj::LoadOptions::default() };
     let (models, _) = tobj::load_obj_buf(&mut text.as_bytes(), &options, |_| Ok(Default::default())).unwrap();

@@ -121,7 +121,7 @@ fn origin() -> &'static str {
 
 fn found_origin() -> String {
     let arguments = std::env::args().skip(1).map(|argument| {
-        // Paths say where somebody keeps files: of those the name is enough.
+        // Paths say where a user keeps files: of those the name is enough.
         let name = Path::new(&argument).file_name().map(|name| name.to_string_lossy().into_owned());
         if Path::new(&argument).is_absolute() { name.unwrap_or(argument) } else { argument }
     });

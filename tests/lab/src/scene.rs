@@ -103,28 +103,28 @@ pub struct SceneArguments {
     /// single errors of it
     #[arg(long)]
     wrong: Option<WrongName>,
-    /// Turn every bone of the prior by so many degrees (root mean square), to see what a method
+    /// Turn every bone of the prior by this many degrees (root mean square), to see what a method
     /// bears [default: 0]
     #[arg(long, value_name = "DEGREES")]
     wrong_pose: Option<f32>,
-    /// Change every shape coefficient of the prior by so many standard deviations [default: 0]
+    /// Change every shape coefficient of the prior by this many standard deviations [default: 0]
     #[arg(long, value_name = "N")]
     wrong_shape: Option<f32>,
-    /// Move the prior by so many metres of a body 1.7 m high (root mean square) [default: 0]
+    /// Move the prior by this many metres of a body 1.7 m high (root mean square) [default: 0]
     #[arg(long, value_name = "METRES")]
     wrong_translation: Option<f32>,
-    /// Change the prior's distance from the camera by so many per cent (root mean square)
+    /// Change the prior's distance from the camera by this many per cent (root mean square)
     /// [default: 0]
     #[arg(long, value_name = "PERCENT")]
     wrong_depth: Option<f32>,
-    /// Make the bones of the prior's limbs longer or shorter by so many per cent (standard
+    /// Make the bones of the prior's limbs longer or shorter by this many per cent (standard
     /// deviation) [default: 0]
     #[arg(long, value_name = "PERCENT")]
     wrong_limbs: Option<f32>,
-    /// Let the edges of the training masks go to and fro by up to so many pixels [default: 0]
+    /// Let the edges of the training masks go to and fro by up to this many pixels [default: 0]
     #[arg(long, value_name = "PIXELS")]
     wrong_edge: Option<f32>,
-    /// Grow the training masks by so many pixels, or shrink them [default: 0]
+    /// Grow the training masks by this many pixels, or shrink them [default: 0]
     #[arg(long, value_name = "PIXELS", allow_negative_numbers = true)]
     wrong_mask: Option<i32>,
 }

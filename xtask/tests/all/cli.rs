@@ -1,4 +1,4 @@
-//! The command line as somebody meets it: help, and one clear line for whatever is wrong.
+//! The command line as a user meets it: help, and one clear line for whatever is wrong.
 
 use crate::common;
 

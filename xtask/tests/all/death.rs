@@ -2,7 +2,7 @@
 //! nothing had happened.
 //!
 //! A few kills by default; `KILLS=200 cargo test -p xtask death:: -- --nocapture` for the
-//! table: so many of `train`, and so many of all other commands.
+//! table: `KILLS` of `train`, and `KILLS` of all other commands.
 
 use crate::common;
 

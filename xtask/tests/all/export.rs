@@ -38,7 +38,7 @@ fn trained(name: &str) -> PathBuf {
     run
 }
 
-/// Motion capture of so many joints.
+/// Motion capture of this many joints.
 fn clip(path: &Path, joints: usize) {
     let poses = Data::F32(vec![0.1; 4 * 3 * joints]);
     let arrays = [

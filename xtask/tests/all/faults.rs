@@ -178,7 +178,7 @@ fn a_result_that_cannot_be_written_has_an_exit_code_and_leaves_the_old_one() {
     refusal(&training(Path::new("/dev/null/run"), "5"), "/dev/null/run");
 }
 
-/// Runs the program where no file may have more than so many KiB, which ends a write as a full disk
+/// Runs the program where no file may have more than this many KiB, which ends a write as a full disk
 /// does.
 fn cramped(kib: u32, arguments: &[&str]) -> Output {
     // Blocks of 512 bytes.

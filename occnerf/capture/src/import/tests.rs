@@ -341,7 +341,7 @@ fn levels_of(name: &str, count: usize, options: &ImportOptions, make: impl Fn(us
 #[test]
 fn ids_are_integers_at_any_depth() {
     use image::{ImageBuffer, Luma, Rgb};
-    // Pixel 3 of a frame is the person, pixel 5 somebody else.
+    // Pixel 3 of a frame is the person, pixel 5 another person.
     let value = |i: u32, id: u32, other: u32| {
         if i == 3 {
             id

@@ -103,7 +103,7 @@ struct SweepArguments {
 struct CapacityArguments {
     #[command(flatten)]
     sweep: SweepArguments,
-    /// The preset `paper` too, and what is chosen from it, with so many steps and the loss of
+    /// The preset `paper` too, and what is chosen from it, with this many steps and the loss of
     /// `balanced`
     #[arg(long, value_name = "STEPS")]
     paper: Option<u64>,
@@ -188,7 +188,7 @@ impl SceneArguments {
     /// What `bench stability` does to a scene.
     fn axes(&self, scene: &str, side: u32, quick: bool) -> Result<Vec<axes::Axis>> {
         if scene == source::DEMO {
-            ensure!(self.load.command_line().is_empty(), "bench stability makes the demo anew, without options");
+            ensure!(self.load.command_line().is_empty(), "bench stability makes its own demo, without options");
             return Ok(axes::of_demo(side, quick));
         }
         ensure!(Path::new(scene).is_dir(), "{scene}: expected the demo, or a capture on disk (synth makes one)");

@@ -1,4 +1,4 @@
-//! `reproduce`: the paper's table, and others made in the same way, on somebody's data.
+//! `reproduce`: the paper's table, and others made in the same way, on a user's data.
 
 mod curves;
 mod rows;
@@ -159,7 +159,7 @@ impl<'a> Experiment<'a> {
         if sitting.publish {
             let chart = summary.chart(directory, &self.section())?;
             self.publish(&summary.markdown(), &[chart])?;
-            // The one that everybody can make anew.
+            // The one that everybody can reproduce.
             if self.scene == source::DEMO && table == Table::Methods && self.other().is_empty() {
                 results::publish_table(&format!("{}.\n\n{}", results::set_of(&name), summary.front()))?;
             }

@@ -70,7 +70,7 @@ impl Place {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Job {
     pub place: Place,
-    /// At most so many unseen views are scored, evenly chosen.
+    /// At most this many unseen views are scored, evenly chosen.
     pub views: usize,
     pub method: Method,
     pub config: Config,

@@ -24,7 +24,7 @@ pub struct SittingArguments {
     /// Threads of each run [default: all cores]
     #[arg(long)]
     pub threads: Option<usize>,
-    /// Begin no run after so many minutes; the same command goes on later [default: no limit]
+    /// Begin no run after this many minutes; the same command goes on later [default: no limit]
     #[arg(long)]
     minutes: Option<f64>,
     #[command(flatten)]
@@ -185,7 +185,7 @@ impl Runner {
             }
         })?;
         let own = if path.exists() { read(&path)? } else { Vec::new() };
-        // Written anew, so that a line that was cut off does not spoil the next.
+        // Rewritten, so that a line that was cut off does not spoil the next.
         let text: Vec<String> = own.iter().map(serde_json::to_string).collect::<Result<_, _>>()?;
         xtask::run::write(&path, &text.iter().map(|l| format!("{l}\n")).collect::<String>())?;
         let file = File::options().append(true).open(&path).map_err(unwritten(&path))?;

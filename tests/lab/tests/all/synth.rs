@@ -1,4 +1,4 @@
-//! `synth` as somebody meets it: what it writes is trained on, and nothing of the user's is lost.
+//! `synth` as a user meets it: what it writes is trained on, and nothing of the user's is lost.
 
 use crate::common;
 

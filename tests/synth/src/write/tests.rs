@@ -127,7 +127,7 @@ fn a_corrupted_capture_reads_back_from_every_layout() {
         for ((clean, a), b) in clean.iter().zip(&given).zip(&found) {
             same_view(&body, a, b);
             // A pixel whose coverage was changed keeps no more colour in memory than its least
-            // coverage had; on disk the photograph is mixed anew.
+            // coverage had; on disk the photograph is mixed again.
             let [clean, a, b] = [clean, a, b].map(|frame| frame.pixels().unwrap());
             for (i, (m, r)) in a.mask.iter().zip(&b.mask).enumerate() {
                 assert!((m - r).abs() <= 0.5 / 255.0 + 1e-6, "{layout:?} {i}: {m} {r}");

@@ -1,4 +1,4 @@
-//! Every reader of somebody else's files, on damaged ones: no panic, no hang, and no more memory
+//! Every reader of other programs' files, on damaged ones: no panic, no hang, and no more memory
 //! than is said.
 //!
 //! 20 000 inputs by default; `FUZZ=1000000 cargo test -p testkit fuzz:: -- --nocapture`

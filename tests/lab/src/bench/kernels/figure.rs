@@ -8,7 +8,7 @@ use smpl::{BodyModel, Placement, Posed, Shaped};
 
 /// Times that a measurement is repeated; the median holds.
 const REPEATS: usize = 5;
-/// Queries lie within so many metres of the skin.
+/// Queries lie within this many metres of the skin.
 pub const REACH: f32 = 0.05;
 
 /// A way of doing it: what it costs and how far off it is.

@@ -1,4 +1,4 @@
-//! `probe` as somebody with numpy arrays meets it: results against values worked out here, and one
+//! `probe` as a user of numpy meets it: results against values worked out here, and one
 //! clear line for whatever is wrong.
 
 use crate::common;
