@@ -64,7 +64,7 @@ pub use render::picture::{Renderer, Rendering, Supersampled};
 pub use render::prior::PriorRenderer;
 pub use scene::labels::{Label, Labels, label_pixels};
 pub use scene::masks::mend_masks;
-pub use scene::prepared::{PreparedFrame, Scene};
+pub use scene::prepared::{HELD_OUT, PreparedFrame, Scene};
 pub use scene::registration::register;
 pub use train::report::StepReport;
 pub use train::trainer::Trainer;

@@ -19,7 +19,7 @@ use crate::network::{load_lpips, network_name};
 use crate::optimise::logged_seconds;
 use crate::process::{Ending, Lock, note, one_line, say};
 use crate::run::{
-    METRICS, Metrics, NOVEL_VIEWS, RunConfig, Splits, TRAINING_VIEWS, make_directory, peak_rss_bytes, use_threads,
+    METRICS, Metrics, RunConfig, Splits, TRAINING_VIEWS, evaluation_title, make_directory, peak_rss_bytes, use_threads,
 };
 use crate::{baked, pictures, report, table};
 
@@ -156,11 +156,11 @@ pub fn eval(arguments: &EvalArguments) -> Result<()> {
     }
     let mut one = metrics.clone();
     one.method.push_str(if arguments.baked { "-baked" } else { "" });
-    for (name, split) in [(NOVEL_VIEWS, &metrics.splits.novel_view), (TRAINING_VIEWS, &metrics.splits.train_view)] {
-        if let Some(split) = split {
-            one.splits = Splits { novel_view: Some(split.clone()), train_view: None };
-            say!("{name}:\n{}", table::markdown(&[(one.method.clone(), &one)]));
-        }
+    let Splits { novel_view, train_view } = &metrics.splits;
+    let novel = novel_view.as_ref().map(|split| (evaluation_title(split), split));
+    for (name, split) in novel.into_iter().chain(train_view.as_ref().map(|split| (TRAINING_VIEWS, split))) {
+        one.splits = Splits { novel_view: Some(split.clone()), train_view: None };
+        say!("{name}:\n{}", table::markdown(&[(one.method.clone(), &one)]));
     }
     Ok(())
 }

@@ -109,7 +109,11 @@ pub struct Metrics {
 }
 
 /// Title of evaluation views.
-pub const NOVEL_VIEWS: &str = "novel views";
+pub fn evaluation_title(split: &SplitMetrics) -> &'static str {
+    let held_out = !split.frames.is_empty() && split.frames.iter().all(|frame| frame.camera == occnerf::HELD_OUT);
+    if held_out { "held-out frames, over known pixels" } else { "novel views" }
+}
+
 /// Title of training frames.
 pub const TRAINING_VIEWS: &str = "training views, over visible pixels";
 
@@ -127,7 +131,7 @@ pub struct Splits {
 impl Splits {
     /// Title and metrics of the main split: novel views if there are any.
     pub fn first(&self) -> Option<(&'static str, &SplitMetrics)> {
-        let novel = self.novel_view.as_ref().map(|split| (NOVEL_VIEWS, split));
+        let novel = self.novel_view.as_ref().map(|split| (evaluation_title(split), split));
         novel.or(self.train_view.as_ref().map(|split| (TRAINING_VIEWS, split)))
     }
 

@@ -55,7 +55,7 @@ impl PreparedFrame {
 }
 
 /// Camera name of a held-out training frame.
-const HELD_OUT: &str = "held out";
+pub const HELD_OUT: &str = "held out";
 
 /// Immutable input of training and evaluation.
 pub struct Scene {

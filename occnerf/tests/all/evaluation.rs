@@ -6,7 +6,7 @@ use common::{SIZE, body, capture, config, scene};
 use glam::Vec3;
 use occnerf::capture::Image;
 use occnerf::{
-    Error, Label, Method, PosedView, PreparedFrame, Renderer, Rendering, Scene, SplitMetrics, evaluate,
+    Error, Label, Labels, Method, PosedView, PreparedFrame, Renderer, Rendering, Scene, SplitMetrics, evaluate,
     least_seen_quartile,
 };
 
@@ -134,6 +134,31 @@ fn unknown_pixels_of_training_views_are_not_scored() {
         }
     });
     assert!(known.frames[0].psnr_full.is_some_and(|p| p < 10.0));
+}
+
+/// Calling pixels unknown improves no score of the others, and excuses nothing in `psnr_all`.
+#[test]
+fn unknown_pixels_of_the_subject_are_counted_and_not_excused() {
+    let given = &scene().eval[0];
+    let mask = given.pixels().unwrap().mask.clone();
+    let is_unknown = |i: usize| i.is_multiple_of(2);
+    let label = |i: usize| if is_unknown(i) { Label::Unknown } else { Label::Subject };
+    let frame = PreparedFrame {
+        name: given.name.clone(),
+        camera_name: given.camera_name.clone(),
+        view: std::sync::Arc::clone(&given.view),
+        source: given.source.clone(),
+        labels: Labels::new(&(0..mask.len()).map(label).collect::<Vec<_>>()),
+    };
+    let split = scores(&[frame], |_, i, pixel, _| {
+        let error = if is_unknown(i) { 0.3 } else { 0.1 };
+        pixel.iter_mut().for_each(|p| *p += error);
+    });
+    let subject = (0..mask.len()).filter(|i| mask[*i] > 0.5);
+    let (unknown, all) = (subject.clone().filter(|i| is_unknown(*i)).count() as f64, subject.count() as f64);
+    assert!(near(split.known, 1.0 - unknown / all) && near(split.psnr_mask, 20.0), "{split:?}");
+    let squared = (0.09 * unknown + 0.01 * (all - unknown)) / all;
+    assert!(near(split.psnr_all, -10.0 * squared.log10()), "{split:?}");
 }
 
 /// Hidden pixels show vertices that ray casting found least often in the training frames.
