@@ -14,8 +14,11 @@ use crate::run::RunConfig;
 /// The baked person of a run: see [`baked::avatar`].
 pub fn of_run(run: &Path) -> Result<Avatar> {
     ensure!(run.is_dir(), "{}: no such run", run.display());
-    let has_none = RunConfig::read(run).is_ok_and(|run| run.train.method == Method::Prior);
-    ensure!(!has_none, "{} has no field to bake", run.display());
+    let method = RunConfig::read(run).ok().map(|run| run.train.method);
+    ensure!(method != Some(Method::Prior), "{} has no field to bake", run.display());
+    if method == Some(Method::Surface) {
+        return Ok(Avatar::load(&baked::path(run))?);
+    }
     match baked::fresh(run)? {
         Some(avatar) => Ok(avatar),
         None => baked::avatar(run, &Model::load(run)?),

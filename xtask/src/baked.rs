@@ -8,10 +8,7 @@ use occnerf::bake::{Avatar, BakeOptions, bake};
 use occnerf::{Model, Scene};
 
 use crate::process::{note, results_in, say};
-use crate::run::{CHECKPOINT, RunConfig};
-
-/// The avatar's file in a run directory.
-pub const AVATAR: &str = "avatar.safetensors";
+use crate::run::{AVATAR, CHECKPOINT, RunConfig};
 
 /// Path of the avatar of a run.
 pub fn path(run: &Path) -> PathBuf {

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use anyhow::{Context, Result, bail};
 use clap::ValueEnum;
-use occnerf::{Capacity, Config, Method, Preset, Scene, Trainer};
+use occnerf::{Capacity, Config, Preset, Scene, Trainer};
 
 use crate::optimise;
 use crate::process::{note, say, unwritten};
@@ -25,7 +25,7 @@ pub enum CapacityName {
 
 /// Capacity of a scene, relative to `config`; sizes named by `set` are kept.
 pub fn measure(source: &Source, config: &Config, set: &[String]) -> Result<Capacity> {
-    if config.method == Method::Prior {
+    if !config.method.has_field() {
         bail!("--capacity auto: the prior has no sizes to choose");
     }
     Ok(of_scene(&source.scene(config)?, config, set)?)
@@ -45,7 +45,7 @@ pub fn choose(
     asked: Option<CapacityName>,
 ) -> Result<Option<Capacity>> {
     // The preset `paper` is the paper's setting.
-    let own = config.method == Method::Prior || config.preset == Preset::Paper;
+    let own = !config.method.has_field() || config.preset == Preset::Paper;
     match asked {
         Some(CapacityName::Auto) => measure(source, config, set).map(Some),
         None if !own => {

@@ -8,9 +8,10 @@ use clap::{Args, ValueEnum};
 use image::RgbImage;
 use indicatif::ProgressBar;
 use occnerf::bake::{Avatar, BakeOptions, BakedRenderer, bake};
+use occnerf::capture::Light;
 use occnerf::{
-    FieldRenderer, Label, Lpips, Method, Model, PreparedFrame, PriorColors, PriorRenderer, Renderer, Rendering, Scene,
-    SplitMetrics, Supersampled, evaluate,
+    Body, FieldRenderer, Label, Lpips, Method, Model, Person, PreparedFrame, PriorColors, PriorRenderer, Renderer,
+    Rendering, Scene, SplitMetrics, Supersampled, evaluate,
 };
 use rayon::prelude::*;
 use visibility::Samples;
@@ -78,9 +79,7 @@ pub fn unscored(run: &RunConfig, drawn: &Drawn<'_>, train_seconds: f64) -> Metri
     let (steps, parameters, perceptual) = match drawn {
         Drawn::Prior(colors) => (0, 3 * colors.colors.len(), String::new()),
         Drawn::Field { model, perceptual } => (model.steps_done(), model.num_parameters(), perceptual.clone()),
-        Drawn::Baked { model, .. } => {
-            (model.steps_done(), model.num_parameters(), model.config().loss.perceptual_name())
-        }
+        Drawn::Avatar { avatar, .. } => (0, avatar.num_parameters(), String::new()),
     };
     Metrics {
         method: config.method.name().to_owned(),
@@ -107,14 +106,18 @@ pub fn eval(arguments: &EvalArguments) -> Result<()> {
     let _lock = Lock::take(directory)?;
     let source = run.source(directory)?;
     let scene = source.scene(&run.train)?;
-    ensure!(!arguments.baked || run.train.method != Method::Prior, "--baked: a prior is not baked");
+    ensure!(!arguments.baked || run.train.method.has_field(), "--baked: {} has no field", directory.display());
     let (loaded, avatar);
     let drawn = if run.train.method == Method::Prior {
         Drawn::Prior(PriorColors::measure(&scene)?)
+    } else if run.train.method == Method::Surface {
+        avatar = Avatar::load(&baked::path(directory))?;
+        let colors = Person::colors(directory, &source.model)?.unwrap_or_default();
+        Drawn::Avatar { body: &scene.body, light: colors.light, avatar: &avatar }
     } else if arguments.baked {
         loaded = Model::load(directory)?;
         avatar = baked::avatar(directory, &loaded)?;
-        Drawn::Baked { model: &loaded, avatar: &avatar }
+        Drawn::Avatar { body: loaded.body(), light: loaded.light(), avatar: &avatar }
     } else {
         loaded = Model::load(directory)?;
         Drawn::Field { model: &loaded, perceptual: loaded.config().loss.perceptual_name() }
@@ -197,10 +200,12 @@ pub enum Drawn<'a> {
     /// The posed prior in mean colours.
     Prior(PriorColors),
     /// The baked avatar.
-    Baked {
-        /// The model.
-        model: &'a Model,
-        /// Its avatar.
+    Avatar {
+        /// Its body.
+        body: &'a Body,
+        /// Light of the video.
+        light: Light,
+        /// The surface.
         avatar: &'a Avatar,
     },
 }
@@ -211,7 +216,7 @@ impl Drawn<'_> {
         Ok(match self {
             Self::Field { model, .. } => Box::new(FieldRenderer::new(model)?),
             Self::Prior(colors) => Box::new(PriorRenderer::new(&scene.body, colors)),
-            Self::Baked { model, avatar } => Box::new(BakedRenderer::new(model, avatar, Samples::Four)?),
+            Self::Avatar { body, light, avatar } => Box::new(BakedRenderer::new(body, *light, avatar, Samples::Four)?),
         })
     }
 
@@ -321,9 +326,8 @@ pub fn score_baked(
     trained: Metrics,
 ) -> Result<Metrics> {
     let (avatar, report) = bake(model, Some(scene), &BakeOptions::default())?;
-    let (train_seconds, parameters) =
-        (trained.train_seconds + report.seconds, 3 * (report.texels + avatar.num_vertices()));
-    let drawn = Drawn::Baked { model, avatar: &avatar };
+    let (train_seconds, parameters) = (trained.train_seconds + report.seconds, avatar.num_parameters());
+    let drawn = Drawn::Avatar { body: model.body(), light: model.light(), avatar: &avatar };
     score_run(directory, run, scene, &drawn, lpips, Metrics { train_seconds, parameters, ..trained })
 }
 

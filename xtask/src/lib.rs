@@ -2,7 +2,7 @@
 #![warn(clippy::print_stdout, clippy::print_stderr, reason = "printing must never stop work: see process::print")]
 
 mod avatar;
-mod baked;
+pub mod baked;
 pub mod capacity;
 mod check;
 mod commands;

@@ -7,8 +7,8 @@ use anyhow::{Context, Result, bail};
 use clap::{Args, ValueEnum};
 use glam::{Affine3A, Mat3, Vec3};
 use indicatif::ProgressBar;
-use occnerf::bake::BakedRenderer;
 use occnerf::bake::export::fit_motion;
+use occnerf::bake::{Avatar, BakedRenderer};
 use occnerf::{Body, FieldRenderer, Method, Model, Person, PosedFrame, PosedView, PriorRenderer, Renderer, upright};
 use smpl::Placement;
 use visibility::Samples;
@@ -80,14 +80,20 @@ pub fn render(arguments: &RenderArguments) -> Result<()> {
         bail!("--baked: {} has no field to bake", directory.display());
     }
     let (model, person, avatar);
-    let (body, frames, mut renderer): (_, _, Box<dyn Renderer + '_>) = if run.train.method == Method::Prior {
+    let (body, frames, mut renderer): (_, _, Box<dyn Renderer + '_>) = if !run.train.method.has_field() {
         person = Person::load(directory, &run.train)?;
-        (&*person.body, &person.frames[..], Box::new(PriorRenderer::new(&person.body, &person.colors)))
+        let (body, frames, colors) = (&*person.body, &person.frames[..], &person.colors);
+        if run.train.method == Method::Prior {
+            (body, frames, Box::new(PriorRenderer::new(body, colors)))
+        } else {
+            avatar = Avatar::load(&baked::path(directory))?;
+            (body, frames, Box::new(BakedRenderer::new(body, colors.light, &avatar, Samples::Four)?))
+        }
     } else {
         model = Model::load(directory)?;
         let renderer: Box<dyn Renderer + '_> = if arguments.baked {
             avatar = baked::avatar(directory, &model)?;
-            Box::new(BakedRenderer::new(&model, &avatar, Samples::Four)?)
+            Box::new(BakedRenderer::new(model.body(), model.light(), &avatar, Samples::Four)?)
         } else {
             Box::new(FieldRenderer::new(&model)?)
         };

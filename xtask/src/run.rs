@@ -14,6 +14,8 @@ use crate::source::{self, Source};
 /// Parameters, Adam moments and visibility counts.
 pub const CHECKPOINT: &str = "checkpoint.safetensors";
 const CONFIG: &str = "config.toml";
+/// The surface: baked, or fitted by `--method surface`.
+pub const AVATAR: &str = "avatar.safetensors";
 /// Metrics.
 pub const METRICS: &str = "metrics.json";
 /// Log of the training.
@@ -166,7 +168,7 @@ pub fn new_directory(out: Option<&Path>, name: &str) -> Result<(PathBuf, Lock)> 
         None => free_directory(name)?,
     };
     let lock = Lock::take(&directory)?;
-    if directory.join(CHECKPOINT).exists() {
+    if [CHECKPOINT, AVATAR].iter().any(|name| directory.join(name).exists()) {
         bail!("{} already holds a run: go on with --resume, or give another --out", directory.display());
     }
     make_directory(&directory.join("renders"))?;

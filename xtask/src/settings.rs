@@ -7,11 +7,12 @@ use occnerf::{Capacity, Component, Config, Method, OccludedRule, Preset};
 
 const METHODS: &[(Method, &str)] = &[
     (Method::Prior, "The posed prior in mean colours; nothing is trained"),
+    (Method::Surface, "The prior's surface, displaced, with a texture: no field, no steps"),
     (Method::HashPoint, "Point-based, hash encoding"),
     (Method::Occnerf, "Point term, and in `paper` the attended surface term"),
 ];
 const PRESETS: &[(Preset, &str)] = &[
-    (Preset::Fast, "A first look: half a minute"),
+    (Preset::Fast, "A first look: the surface alone, in seconds; fields for half the default's time"),
     (Preset::Balanced, "The default: about a minute"),
     (Preset::Paper, "The paper's method: under ten minutes"),
 ];
@@ -49,7 +50,7 @@ pub struct SettingArguments {
     /// Named settings [default: balanced]
     #[arg(long, value_parser = preset())]
     pub preset: Option<Preset>,
-    /// Which model [default: occnerf]
+    /// Which model [default: surface for the preset fast, else occnerf]
     #[arg(long, value_parser = named(METHODS, Method::name))]
     pub method: Option<Method>,
     /// Components of the method to switch off, comma separated
@@ -77,7 +78,12 @@ pub struct SettingArguments {
 impl SettingArguments {
     /// The preset with everything given on the command line applied.
     pub fn config(&self) -> Result<Config> {
-        let (preset, method) = (self.preset.unwrap_or(Preset::Balanced), self.method.unwrap_or(Method::Occnerf));
+        let preset = self.preset.unwrap_or(Preset::Balanced);
+        let usual = if preset == Preset::Fast { Method::Surface } else { Method::Occnerf };
+        let method = self.method.unwrap_or(usual);
+        if let Some(steps) = self.steps.filter(|_| !method.has_field()) {
+            bail!("--steps {steps}: the method {} takes no steps", method.name());
+        }
         self.apply(Config::preset(preset, method))
     }
 

@@ -5,9 +5,11 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, Error, Result, bail, ensure};
 use clap::Args;
+use occnerf::bake::{BakeOptions, fit};
 use occnerf::capture::Capture;
-use occnerf::{Config, Lpips, Method, Model, Person, PriorColors, Scene, Trainer, checkpoint_config};
+use occnerf::{Config, Lpips, Method, Model, Person, Scene, Trainer, checkpoint_config};
 
+use crate::baked;
 use crate::capacity::{self, CapacityName};
 use crate::eval::{Drawn, Split, check_pictures, score_baked, score_run, scored_frames, unscored};
 use crate::network::{load_lpips, network_name};
@@ -95,12 +97,15 @@ pub fn train(arguments: &TrainArguments) -> Result<()> {
         say!("stopped; go on with --resume --out {}", directory.display());
         return Ok(());
     };
-    let mut rows = vec![(metrics.method.clone(), &metrics)];
-    let prior;
+    // What less of a model reaches.
+    let mut lesser = Vec::new();
     if run.train.method != Method::Prior {
-        prior = prior_metrics(&run, &source, lpips.as_ref())?;
-        rows.insert(0, (prior.method.clone(), &prior));
+        lesser.push(baseline(Method::Prior, &run, &source, lpips.as_ref())?);
     }
+    if run.train.method.has_field() {
+        lesser.push(baseline(Method::Surface, &run, &source, lpips.as_ref())?);
+    }
+    let rows: Vec<_> = lesser.iter().chain([&metrics]).map(|metrics| (metrics.method.clone(), metrics)).collect();
     say!("\n{}:\n{}", metrics.splits.title(), table::markdown(&rows));
     say!("pictures: {}", directory.join("renders").display());
     if run.train.method != Method::Prior {
@@ -216,6 +221,14 @@ pub fn run_one(
         let metrics = unscored(run, &prior, prior_seconds);
         return score_run(directory, run, &scene, &prior, lpips, metrics).map(Some);
     }
+    if run.train.method == Method::Surface {
+        let (avatar, report) = fit(&scene, &BakeOptions::default())?;
+        say!("surface of {} triangles, an atlas of {} × {}", report.faces, report.side, report.side);
+        avatar.save(&baked::path(directory)).map_err(Error::from).map_err(results_in(directory))?;
+        let drawn = Drawn::Avatar { body: &scene.body, light: colors.light, avatar: &avatar };
+        let metrics = unscored(run, &drawn, prior_seconds + report.seconds);
+        return score_run(directory, run, &scene, &drawn, lpips, metrics).map(Some);
+    }
     say_memory(&scene, &run.train)?;
     let mut trainer =
         if resumes { Trainer::resume(&scene, &checkpoint)? } else { Trainer::new(&scene, run.train.clone())? };
@@ -324,7 +337,7 @@ fn unless_finished(
         let metrics = Metrics::read(directory)?;
         // Scores that lack what is asked for now are computed again from the checkpoint, as are those of
         // fewer steps.
-        let whole = run.train.method == Method::Prior || metrics.steps >= run.train.steps;
+        let whole = !run.train.method.has_field() || metrics.steps >= run.train.steps;
         if whole && (lpips.is_none() || metrics.lpips == network_name(lpips)) {
             say!("{name}: finished earlier");
             return Ok(metrics);
@@ -340,19 +353,25 @@ pub fn finished(directory: &Path, config: &Config) -> Result<Option<Metrics>> {
         return Ok(None);
     }
     let metrics = Metrics::read(directory)?;
-    let whole = config.method == Method::Prior || metrics.steps >= config.steps;
+    let whole = !config.method.has_field() || metrics.steps >= config.steps;
     Ok(Some(metrics).filter(|_| whole && RunConfig::read(directory).is_ok_and(|run| run.train == *config)))
 }
 
-/// The scores of the prior baseline on the same frames.
-fn prior_metrics(run: &RunConfig, source: &Source, lpips: Option<&Lpips>) -> Result<Metrics> {
-    let mut prior = run.clone();
-    prior.train.method = Method::Prior;
-    let scene = source.scene(&prior.train)?;
+/// The scores of a method without a field on the same frames, as the main split has them.
+fn baseline(method: Method, run: &RunConfig, source: &Source, lpips: Option<&Lpips>) -> Result<Metrics> {
+    let mut run = run.clone();
+    run.train.method = method;
+    let scene = source.scene(&run.train)?;
     let start = Instant::now();
-    let colors = PriorColors::measure(&scene)?;
-    let drawn = Drawn::Prior(colors);
-    let mut metrics = unscored(&prior, &drawn, start.elapsed().as_secs_f64());
+    let colors = scene.colors()?;
+    let avatar;
+    let drawn = if method == Method::Surface {
+        avatar = fit(&scene, &BakeOptions::default())?.0;
+        Drawn::Avatar { body: &scene.body, light: colors.light, avatar: &avatar }
+    } else {
+        Drawn::Prior(colors.clone())
+    };
+    let mut metrics = unscored(&run, &drawn, start.elapsed().as_secs_f64());
     metrics.lpips = network_name(lpips);
     let split = if scene.eval.is_empty() { Split::TrainView } else { Split::NovelView };
     *split.of(&mut metrics.splits) = Some(drawn.score(&scene, split, lpips, 1, |_, _| {})?);

@@ -107,6 +107,17 @@ impl Avatar {
         self.vertices.len()
     }
 
+    /// Colour values of the texels that triangles cover, and a height of each vertex.
+    #[must_use]
+    pub fn num_parameters(&self) -> usize {
+        let corner = |v: u32| self.uvs[v as usize] * Vec2::new(self.atlas.width as f32, self.atlas.height as f32);
+        let area = |face: &[u32; 3]| {
+            let [a, b, c] = face.map(corner);
+            f64::from((b - a).perp_dot(c - a).abs()) / 2.0
+        };
+        3 * self.faces.iter().map(area).sum::<f64>() as usize + self.num_vertices()
+    }
+
     /// J.
     #[must_use]
     pub fn num_joints(&self) -> usize {

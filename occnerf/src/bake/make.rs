@@ -4,11 +4,12 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use glam::{Affine3A, Vec2, Vec3};
+use rayon::prelude::*;
 use smpl::{MotionClip, SparseRows};
-use volrender::Camera;
 
 use super::avatar::{Atlas, Avatar, Clip, MAX_JOINTS, MAX_SHELLS};
 use super::charts::AtlasLayout;
+use super::displacement::displacements;
 use super::field::CanonicalField;
 use super::motion::{motion_of_bones, turn_upright};
 use super::paint::{Texel, dilate, paint, texels};
@@ -20,7 +21,7 @@ use crate::Error;
 use crate::capture::Light;
 use crate::model::body::Body;
 use crate::model::subdivide::{Anchor, Subdivided, normals, times_until};
-use crate::model::trained::Model;
+use crate::model::trained::{Model, upright};
 use crate::model::view::{PosedView, pixel_width};
 use crate::scene::prepared::Scene;
 
@@ -80,42 +81,111 @@ pub struct BakeReport {
 /// more charts than the atlas has room for; those of frames that cannot be decoded.
 pub fn bake(model: &Model, scene: Option<&Scene>, options: &BakeOptions) -> Result<(Avatar, BakeReport), Error> {
     let start = Instant::now();
-    let refuse = |what: String| Err(Error::Scene(format!("bake: {what}")));
-    if !(1..=MAX_SHELLS).contains(&options.shells) {
-        return refuse(format!("{} shells, expected 1 to {MAX_SHELLS}", options.shells));
-    }
-    if !(64..=2048).contains(&options.atlas) {
-        return refuse(format!("an atlas of {} texels, expected 64 to 2048", options.atlas));
-    }
-    if !(options.fps > 0.0 && options.fps <= 1e6) {
-        return refuse(format!("{} frames a second", options.fps));
-    }
-    let joints = model.body.model.num_joints();
-    if joints > MAX_JOINTS {
-        return refuse(format!("{joints} joints, at most {MAX_JOINTS}"));
-    }
-    let Some(pixel) = pixel_width(model.frames().iter().map(Arc::as_ref)) else {
-        return refuse("no training frame has the body before its camera".to_owned());
-    };
+    let pixel = options.check(&model.body, model.frames())?;
     let vertices = model.body.canonical.vertices.len();
     let seen = scene.map_or_else(|| Ok(vec![1.0; vertices]), seen)?;
     let (mut avatar, mut report) = surface(&model.body, &TrainedField::new(model), &seen, pixel, options)?;
-    avatar.light.slope = turn_upright(model.up()) * model.light().slope;
-    (avatar.clips, avatar.cameras) = motion(model, &avatar, options.fps);
+    let moved = Moved { body: &model.body, frames: model.frames(), light: model.light() };
+    moved.complete(&mut avatar, options.fps);
     if let Some(scene) = scene {
         avatar.name.clone_from(&scene.name);
         if options.refinements > 0 {
-            report.errors = refine(model, scene, &mut avatar, options.refinements)?;
+            report.errors = refine(scene, model.light(), &mut avatar, options.refinements)?;
         }
     }
     report.seconds = start.elapsed().as_secs_f64();
     Ok((avatar, report))
 }
 
+/// Fits a surface and its texture to the training frames of a scene, without a field: heights over the
+/// prior, and the prior's colours refined.
+///
+/// # Errors
+/// Those of [`bake`]; more than one shell.
+pub fn fit(scene: &Scene, options: &BakeOptions) -> Result<(Avatar, BakeReport), Error> {
+    let start = Instant::now();
+    let frames: Vec<Arc<PosedView>> = scene.train.iter().map(|frame| Arc::clone(&frame.view)).collect();
+    let pixel = options.check(&scene.body, &frames)?;
+    if options.shells != 1 {
+        return Err(Error::Scene(format!("fit: {} shells, expected 1", options.shells)));
+    }
+    let colors = scene.colors()?;
+    let (prior, faces) = (&scene.body.canonical.vertices, &scene.body.model.faces);
+    let relief = Relief::new(prior, faces, pixel);
+    let clothes = |anchor: &Anchor| -> f32 {
+        anchor.terms().map(|(v, w)| w * scene.clothes.get(v as usize).copied().unwrap_or_default()).sum()
+    };
+    let dressed: Vec<f32> = relief.mesh.anchors.iter().map(clothes).collect();
+    let heights = vec![displacements(scene, colors.light, &relief.mesh, &relief.feet, &dressed)?];
+    let paint = |texels: &[Texel]| {
+        let colour = |texel: &Texel| (colors.at(texel.parent, relief.barycentric(texel, faces)).truncate(), 1.0);
+        texels.par_iter().map(colour).collect()
+    };
+    let (mut avatar, mut report) = assemble(&scene.body, &relief, &heights, &seen(scene)?, pixel, options, paint)?;
+    Moved { body: &scene.body, frames: &frames, light: colors.light }.complete(&mut avatar, options.fps);
+    avatar.name.clone_from(&scene.name);
+    report.errors = refine(scene, colors.light, &mut avatar, options.refinements)?;
+    report.seconds = start.elapsed().as_secs_f64();
+    Ok((avatar, report))
+}
+
+impl BakeOptions {
+    /// Checks the options against a body and its frames, and returns the width of a pixel of these,
+    /// normalised metres.
+    fn check(&self, body: &Body, frames: &[Arc<PosedView>]) -> Result<f32, Error> {
+        let refuse = |what: String| Err(Error::Scene(format!("bake: {what}")));
+        if !(1..=MAX_SHELLS).contains(&self.shells) {
+            return refuse(format!("{} shells, expected 1 to {MAX_SHELLS}", self.shells));
+        }
+        if !(64..=2048).contains(&self.atlas) {
+            return refuse(format!("an atlas of {} texels, expected 64 to 2048", self.atlas));
+        }
+        if !(self.fps > 0.0 && self.fps <= 1e6) {
+            return refuse(format!("{} frames a second", self.fps));
+        }
+        let joints = body.model.num_joints();
+        if joints > MAX_JOINTS {
+            return refuse(format!("{joints} joints, at most {MAX_JOINTS}"));
+        }
+        match pixel_width(frames.iter().map(Arc::as_ref)) {
+            Some(pixel) => Ok(pixel),
+            None => refuse("no training frame has the body before its camera".to_owned()),
+        }
+    }
+}
+
 /// Confidence of each vertex of the prior, 0 to 1.
 fn seen(scene: &Scene) -> Result<Vec<f32>, Error> {
     let enough = (FULL_CONFIDENCE * scene.train.len() as f32).max(1.0);
     Ok(scene.vertex_frequencies()?.iter().map(|&n| (n as f32 / enough).min(1.0)).collect())
+}
+
+/// The subdivided prior that a surface lies over.
+struct Relief {
+    mesh: Subdivided,
+    /// (V)
+    feet: Vec<NormalRay>,
+}
+
+impl Relief {
+    /// For pixels of `pixel` normalised metres.
+    fn new(prior: &[Vec3], faces: &[[u32; 3]], pixel: f32) -> Self {
+        let mesh = Subdivided::new(prior.len(), faces, times_until(prior, faces, EDGE * pixel, MOST));
+        let feet = normal_rays(&mesh, prior, faces);
+        Self { mesh, feet }
+    }
+
+    /// Weights of the corners of a texel's face of the prior.
+    fn barycentric(&self, texel: &Texel, faces: &[[u32; 3]]) -> [f32; 3] {
+        let weight = |corner: u32| {
+            let of = |(&v, w): (&u32, f32)| {
+                let terms = self.mesh.anchors[v as usize].terms().filter(|term| term.0 == corner);
+                terms.map(|term| w * term.1).sum::<f32>()
+            };
+            texel.corners.iter().zip(texel.weights).map(of).sum()
+        };
+        faces[texel.parent as usize].map(weight)
+    }
 }
 
 /// The avatar without name and motion, for a pixel width of `pixel` normalised metres and a confidence
@@ -127,24 +197,38 @@ pub(super) fn surface(
     pixel: f32,
     options: &BakeOptions,
 ) -> Result<(Avatar, BakeReport), Error> {
+    let relief = Relief::new(&body.canonical.vertices, &body.model.faces, pixel);
+    let (heights, found) = heights(field, &body.surface, &relief.feet, &relief.mesh, options.shells);
+    let paint = |texels: &[Texel]| paint(field, &body.surface, &relief.feet, &heights, texels);
+    let (avatar, report) = assemble(body, &relief, &heights, seen, pixel, options, paint)?;
+    Ok((avatar, BakeReport { surface: found, ..report }))
+}
+
+/// The avatar of shells at `heights` (shells, V) over a relief; `paint` gives texels their colours and
+/// alphas.
+fn assemble(
+    body: &Body,
+    Relief { mesh, feet }: &Relief,
+    heights: &[Vec<f32>],
+    seen: &[f32],
+    pixel: f32,
+    options: &BakeOptions,
+    paint: impl FnOnce(&[Texel]) -> Vec<(Vec3, f32)>,
+) -> Result<(Avatar, BakeReport), Error> {
     let (prior, faces) = (&body.canonical.vertices, &body.model.faces);
-    let mesh = Subdivided::new(prior.len(), faces, times_until(prior, faces, EDGE * pixel, MOST));
-    let feet = normal_rays(&mesh, prior, faces);
-    let (heights, found) = heights(field, &body.surface, &feet, &mesh, options.shells);
     let layout = AtlasLayout::new(prior, faces, options.shells, pixel / TEXELS_A_PIXEL, options.atlas);
     let layout = layout.ok_or_else(|| Error::Scene("bake: too many charts".to_owned()))?;
-    let split = Split::new(&mesh, &layout, options.shells);
-    let places = split.places(&layout, &feet);
+    let split = Split::new(mesh, &layout, options.shells);
+    let places = split.places(&layout, feet);
     let describe = |face: u32| {
-        let per_shell = mesh.faces.len();
-        (face as usize / per_shell, mesh.faces[face as usize % per_shell])
+        let (shell, face) = (face as usize / mesh.faces.len(), face as usize % mesh.faces.len());
+        (shell, mesh.faces[face], mesh.parents[face])
     };
     let texels = texels(layout.side, &places, &split.faces, describe)?;
-    let colours = paint(field, &body.surface, &feet, &heights, &texels);
+    let colours = paint(&texels);
     let interpolated = |anchor: &Anchor| anchor.terms().map(|(v, w)| w * seen[v as usize]).sum();
     let confidence: Vec<f32> = mesh.anchors.iter().map(interpolated).collect();
     let report = BakeReport {
-        surface: found,
         vertices: split.vertices.len(),
         faces: split.faces.len(),
         side: layout.side,
@@ -152,10 +236,10 @@ pub(super) fn surface(
         ..BakeReport::default()
     };
     let atlas = atlas(layout.side, &texels, &colours, &confidence);
-    let (vertices, normals) = split.positions(&mesh, &feet, &heights);
-    let rows = |of: &SparseRows<f32>| split.rows(&mesh, of, |w, value| w * value, |a, b| a + b);
+    let (vertices, normals) = split.positions(mesh, feet, heights);
+    let rows = |of: &SparseRows<f32>| split.rows(mesh, of, |w, value| w * value, |a, b| a + b);
     let (joints, weights) = four_joints(&rows(&body.model.weights));
-    let posedirs = split.rows(&mesh, &body.model.posedirs, |w, value| w * value, |a, b| a + b);
+    let posedirs = split.rows(mesh, &body.model.posedirs, |w, value| w * value, |a, b| a + b);
     let rest: Vec<Vec3> = body.canonical.joints.iter().map(|joint| joint / body.scale).collect();
     let avatar = Avatar {
         name: "person".to_owned(),
@@ -295,24 +379,35 @@ fn atlas(side: u32, texels: &[Texel], colours: &[(Vec3, f32)], confidence: &[f32
     }
 }
 
-/// The corrected motion of the video and the cameras, in the avatar's world.
-fn motion(model: &Model, avatar: &Avatar, fps: f32) -> (Vec<Clip>, Vec<Camera>) {
-    let turn = turn_upright(model.up());
-    let scale = model.body.scale;
-    let bones = |view: &Arc<PosedView>| {
-        let placed = |bone: &Affine3A| {
-            let bone = Affine3A { translation: bone.translation / scale, ..*bone };
-            Affine3A::from_mat3(turn) * bone
+/// The video's motion, cameras and light.
+struct Moved<'a> {
+    body: &'a Body,
+    frames: &'a [Arc<PosedView>],
+    light: Light,
+}
+
+impl Moved<'_> {
+    /// Gives an avatar the corrected motion, the cameras and the light, in its world.
+    fn complete(&self, avatar: &mut Avatar, fps: f32) {
+        let turn = turn_upright(upright(self.body, self.frames.iter().map(Arc::as_ref)));
+        let scale = self.body.scale;
+        let bones = |view: &Arc<PosedView>| {
+            let placed = |bone: &Affine3A| {
+                let bone = Affine3A { translation: bone.translation / scale, ..*bone };
+                Affine3A::from_mat3(turn) * bone
+            };
+            view.posed.bones.iter().map(placed).collect()
         };
-        view.posed.bones.iter().map(placed).collect()
-    };
-    let frames: Vec<Vec<Affine3A>> = model.frames().iter().map(bones).collect();
-    let motion: MotionClip = motion_of_bones(&avatar.skeleton, &frames, fps);
-    let camera = |view: &Arc<PosedView>| {
-        let mut camera = view.camera;
-        camera.world_to_camera.translation /= scale;
-        camera.world_to_camera *= Affine3A::from_mat3(turn.transpose());
-        camera
-    };
-    (vec![Clip { name: "video".to_owned(), motion }], model.frames().iter().map(camera).collect())
+        let frames: Vec<Vec<Affine3A>> = self.frames.iter().map(bones).collect();
+        let motion: MotionClip = motion_of_bones(&avatar.skeleton, &frames, fps);
+        let camera = |view: &Arc<PosedView>| {
+            let mut camera = view.camera;
+            camera.world_to_camera.translation /= scale;
+            camera.world_to_camera *= Affine3A::from_mat3(turn.transpose());
+            camera
+        };
+        avatar.light.slope = turn * self.light.slope;
+        avatar.clips = vec![Clip { name: "video".to_owned(), motion }];
+        avatar.cameras = self.frames.iter().map(camera).collect();
+    }
 }

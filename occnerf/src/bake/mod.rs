@@ -1,7 +1,8 @@
-//! Baking: a trained person as a skinned, textured mesh.
+//! A person as a skinned, textured mesh: baked from a trained field, or fitted to the frames.
 
 mod avatar;
 mod charts;
+mod displacement;
 mod draw;
 pub mod export;
 mod field;
@@ -12,6 +13,7 @@ mod refine;
 mod renderer;
 mod saved;
 mod skeleton;
+mod solve;
 mod surface;
 #[cfg(test)]
 mod tests;
@@ -23,7 +25,7 @@ use crate::Error;
 
 pub use avatar::{Atlas, Avatar, Clip, Joint, MAX_ATLAS_SIDE, MAX_JOINTS, MAX_SHELLS};
 pub use draw::BakedPerson;
-pub use make::{BakeOptions, BakeReport, bake};
+pub use make::{BakeOptions, BakeReport, bake, fit};
 pub use motion::{motion_of_bones, turn_upright};
 pub use renderer::BakedRenderer;
 pub use skeleton::skeleton;

@@ -23,6 +23,8 @@ pub(super) struct Texel {
     /// Vertices of the subdivided prior and their barycentric weights.
     pub corners: [u32; 3],
     pub weights: [f32; 3],
+    /// Face of the prior that it is part of.
+    pub parent: u32,
     pub shell: usize,
 }
 
@@ -40,12 +42,13 @@ impl Texel {
 }
 
 /// Rasterises `faces` with vertices at `places` (V, texels) into a square of `side`: the texels whose
-/// centres are covered. `describe` maps a face to its shell and its vertices in the subdivided prior.
+/// centres are covered. `describe` maps a face to its shell, its vertices in the subdivided prior, and
+/// its face of the prior.
 pub(super) fn texels(
     side: u32,
     places: &[Vec2],
     faces: &[[u32; 3]],
-    describe: impl Fn(u32) -> (usize, [u32; 3]),
+    describe: impl Fn(u32) -> (usize, [u32; 3], u32),
 ) -> Result<Vec<Texel>, Error> {
     let flat: Vec<Vec3> = places.iter().map(|place| place.extend(1.0)).collect();
     let (focal, centre, world_to_camera) = (Vec2::ONE, Vec2::ZERO, glam::Affine3A::IDENTITY);
@@ -53,8 +56,8 @@ pub(super) fn texels(
     let drawn = Rasterizer::default().faces(&flat, faces, &view, &RasterOptions::default())?;
     let texel = |(index, fragment): (u32, Option<visibility::Fragment>)| {
         let fragment = fragment?;
-        let (shell, corners) = describe(fragment.face);
-        Some(Texel { index, corners, weights: fragment.barycentric, shell })
+        let (shell, corners, parent) = describe(fragment.face);
+        Some(Texel { index, corners, weights: fragment.barycentric, parent, shell })
     };
     Ok((0..).zip(drawn).filter_map(texel).collect())
 }

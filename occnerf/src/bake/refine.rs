@@ -6,7 +6,7 @@ use visibility::{Pixel, RasterOptions, Rasterizer, Samples};
 use super::avatar::{Atlas, Avatar};
 use super::draw::{BakedPerson, BilinearCorner, atlas_place, shade};
 use crate::Error;
-use crate::model::trained::Model;
+use crate::capture::Light;
 use crate::model::view::pinhole;
 use crate::scene::labels::Label;
 use crate::scene::prepared::{PreparedFrame, Scene};
@@ -29,10 +29,10 @@ struct PixelEquation {
 /// Fits the colours of the texels to the known pixels of the training frames by `passes` Jacobi steps
 /// of regularised least squares; unobserved texels keep their colours. Returns the mean squared error
 /// before the first step and before the last.
-pub(super) fn refine(model: &Model, scene: &Scene, avatar: &mut Avatar, passes: u32) -> Result<[f64; 2], Error> {
+pub(super) fn refine(scene: &Scene, light: Light, avatar: &mut Avatar, passes: u32) -> Result<[f64; 2], Error> {
     let frames = &scene.train;
     let stride = frames.iter().map(|f| f.labels.num_subject()).sum::<usize>().div_ceil(MAX_PIXELS).max(1);
-    let mut person = BakedPerson::new(avatar, model.body.scale).lit_by(model.base.light);
+    let mut person = BakedPerson::new(avatar, scene.body.scale).lit_by(light);
     let mut all = Vec::new();
     for frame in frames {
         all.extend(equations(avatar, &mut person, frame, stride)?);

@@ -10,7 +10,8 @@ use super::avatar::Avatar;
 use super::draw::BakedPerson;
 use super::field::{CanonicalField, Place};
 use crate::Error;
-use crate::capture::Image;
+use crate::capture::{Image, Light};
+use crate::model::body::Body;
 use crate::model::distance::surface_point;
 use crate::model::extent::Extent;
 use crate::model::field::SampleBatch;
@@ -101,7 +102,7 @@ impl CanonicalField for TrainedField<'_> {
     }
 }
 
-/// Renders views with the baked avatar of a model.
+/// Renders views with an avatar.
 pub struct BakedRenderer<'a> {
     person: BakedPerson<'a>,
     samples: Samples,
@@ -109,16 +110,16 @@ pub struct BakedRenderer<'a> {
 }
 
 impl<'a> BakedRenderer<'a> {
-    /// Renderer for the avatar of `model`.
+    /// Renderer for the avatar of `body` under `light`.
     ///
     /// # Errors
     /// [`Error::Scene`] for the avatar of another skeleton.
-    pub fn new(model: &Model, avatar: &'a Avatar, samples: Samples) -> Result<Self, Error> {
-        let (found, expected) = (avatar.num_joints(), model.body.model.num_joints());
+    pub fn new(body: &Body, light: Light, avatar: &'a Avatar, samples: Samples) -> Result<Self, Error> {
+        let (found, expected) = (avatar.num_joints(), body.model.num_joints());
         if found != expected {
-            return Err(Error::Scene(format!("the avatar has {found} joints, the model {expected}")));
+            return Err(Error::Scene(format!("the avatar has {found} joints, the body {expected}")));
         }
-        let person = BakedPerson::new(avatar, model.body.scale).lit_by(model.base.light);
+        let person = BakedPerson::new(avatar, body.scale).lit_by(light);
         Ok(Self { person, samples, pixels: Vec::new() })
     }
 

@@ -6,14 +6,14 @@ use visibility::Samples;
 use super::charts::{AtlasLayout, PADDING};
 use super::draw::BakedPerson;
 use super::field::{CanonicalField, Place};
-use super::make::{BakeOptions, bake, surface};
+use super::make::{BakeOptions, bake, fit, surface};
 use super::renderer::BakedRenderer;
 use super::{Avatar, BakeReport, skeleton};
-use crate::capture::Light;
+use crate::capture::{Capture, Light};
 use crate::config::{Config, Method, Preset};
 use crate::render::field::FieldRenderer;
 use crate::render::picture::Renderer;
-use crate::scene::prepared::Scene;
+use crate::scene::prepared::{PreparedFrame, Scene};
 use crate::train::trainer::Trainer;
 use synth::{DemoConfig, demo};
 
@@ -375,7 +375,8 @@ fn a_person_in_training_is_baked_refined_and_drawn_alike_on_any_number_of_thread
     let make = || {
         let options = BakeOptions { refinements: 3, ..BakeOptions::default() };
         let (avatar, report) = bake(trainer.model(), Some(&scene), &options).unwrap();
-        let mut renderer = BakedRenderer::new(trainer.model(), &avatar, Samples::Four).unwrap();
+        let mut renderer =
+            BakedRenderer::new(trainer.model().body(), trainer.model().light(), &avatar, Samples::Four).unwrap();
         let rendering = renderer.render(&scene.train[1].view, Vec3::ZERO).unwrap();
         (avatar, report, rendering)
     };
@@ -405,4 +406,49 @@ fn a_person_in_training_is_baked_refined_and_drawn_alike_on_any_number_of_thread
     ] {
         assert!(bake(trainer.model(), None, &options).unwrap_err().to_string().starts_with("scene: bake: "));
     }
+}
+
+/// Intersection over union of a drawn person and the mask, in the mean over frames.
+fn overlap(scene: &Scene, avatar: &Avatar) -> f32 {
+    let light = scene.colors().unwrap().light;
+    let mut renderer = BakedRenderer::new(&scene.body, light, avatar, Samples::Four).unwrap();
+    let one = |frame: &PreparedFrame| {
+        let rendering = renderer.render(&frame.view, Vec3::ZERO).unwrap();
+        let mask = frame.pixels().unwrap().mask;
+        let both: f32 = rendering.opacity.iter().zip(&mask).map(|(a, b)| a.min(*b)).sum();
+        let either: f32 = rendering.opacity.iter().zip(&mask).map(|(a, b)| a.max(*b)).sum();
+        both / either
+    };
+    let all: Vec<f32> = scene.eval.iter().map(one).collect();
+    all.iter().sum::<f32>() / all.len() as f32
+}
+
+#[test]
+fn a_fitted_surface_covers_unseen_views_better_than_the_prior_alike_on_any_number_of_threads() {
+    let body = smpl::BodyModel::embedded();
+    let config = DemoConfig { size: 128, frames: 24, eval_cameras: 2, eval_every: 8, ..DemoConfig::default() };
+    let mut capture = demo(&config, &body).unwrap();
+    let scene = |capture: &Capture| Scene::new(capture, &body, &Config::preset(Preset::Fast, Method::Surface)).unwrap();
+    let given = scene(&capture);
+    let make = || fit(&given, &BakeOptions::default()).unwrap();
+    let [one, three] = [1, 3].map(|n| rayon::ThreadPoolBuilder::new().num_threads(n).build().unwrap().install(make));
+    assert!(one.0 == three.0);
+    let (avatar, report) = one;
+    avatar.validate().unwrap();
+    assert!(report.errors[1] < report.errors[0], "{report:?}");
+    let flat = Known { density: |_, d| if d < 0.0 { 5000.0 } else { 0.0 } };
+    let seen = vec![1.0; given.body.canonical.vertices.len()];
+    let (prior, _) = surface(&given.body, &flat, &seen, 0.012, &BakeOptions::default()).unwrap();
+    let [fitted, bare] = [&avatar, &prior].map(|avatar| overlap(&given, avatar));
+    assert!(1.0 - fitted < 0.8 * (1.0 - bare), "{fitted} for {bare}");
+    // Nothing is learnt from what is not seen, and nothing breaks.
+    for frame in &mut capture.train {
+        let mut pixels = frame.pixels().unwrap();
+        pixels.mask.iter_mut().skip(3).for_each(|m| *m = 0.0);
+        pixels.mask[..3].fill(1.0);
+        frame.source = pixels.into();
+    }
+    fit(&scene(&capture), &BakeOptions::default()).unwrap().0.validate().unwrap();
+    let two = BakeOptions { shells: 2, ..BakeOptions::default() };
+    assert!(fit(&given, &two).unwrap_err().to_string().contains("fit: 2 shells"));
 }

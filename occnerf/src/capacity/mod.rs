@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 pub use self::measure::Measured;
 pub use self::prune::Pruned;
 use crate::Error;
-use crate::config::{Config, Method, Preset};
+use crate::config::{Config, Preset};
 use crate::scene::prepared::Scene;
 
 /// Longest side of the finest cell, in pixels of the video at the subject.
@@ -83,7 +83,7 @@ impl Capacity {
             choices.push(Choice { key: key.to_owned(), preset, chosen, why });
         };
         let cells = measured.cells.max(1) as f64;
-        if config.method != Method::Prior {
+        if config.method.has_field() {
             let grid = &config.encoding;
             let finest = (measured.extent / (PIXELS_A_CELL * measured.metres_a_pixel)).ceil() as u32;
             let n_max = finest.clamp(grid.n_min, grid.n_max.max(MOST.0).max(grid.n_min));

@@ -10,6 +10,8 @@ pub enum Method {
     /// No field: the posed prior mesh, each place of it in the mean colour of the visible training
     /// pixels that saw it.
     Prior,
+    /// No field: the prior's surface, displaced, and its texture, fitted to the training frames.
+    Surface,
     /// Point-based: hash encoding of x̂ alone.
     HashPoint,
     /// The paper: point term and, in the preset `paper`, attended surface term.
@@ -17,10 +19,16 @@ pub enum Method {
 }
 
 impl Method {
+    /// Whether it trains a field.
+    pub fn has_field(self) -> bool {
+        !matches!(self, Self::Prior | Self::Surface)
+    }
+
     /// The name used on the command line and in results.
     pub fn name(self) -> &'static str {
         match self {
             Self::Prior => "prior",
+            Self::Surface => "surface",
             Self::HashPoint => "hash-point",
             Self::Occnerf => "occnerf",
         }

@@ -50,7 +50,7 @@ impl Encoder {
             config.encoding;
         let grid = HashGridConfig { levels, features, log2_table_size, n_min, n_max };
         Ok(match config.method {
-            Method::Prior | Method::HashPoint => Self::Point(HashGrid::new(&grid)?),
+            Method::Prior | Method::Surface | Method::HashPoint => Self::Point(HashGrid::new(&grid)?),
             Method::Occnerf => Self::Surface(HashGrid::new(&grid)?, (distance_min, distance_max)),
         })
     }

@@ -26,7 +26,8 @@ fn config(run: &Path) -> toml::Table {
 fn sizes_are_chosen_once_recorded_kept_on_resuming_and_pruned_at_the_end() {
     let folder = folder("capacity");
     let (capture, run) = (capture(&folder), folder.join("run"));
-    let small = ["--preset", "fast", "--steps", "2", "--set", "patches=1", "--set", "patch_size=8"];
+    let small =
+        ["--preset", "fast", "--method", "occnerf", "--steps", "2", "--set", "patches=1", "--set", "patch_size=8"];
     let auto = ["train", text(&capture), "--out", text(&run), "--capacity", "auto", "--set", "encoding.levels=5"];
     let said = done(&[&auto[..], &small, &["--stop-after", "1"]].concat());
     assert!(said.contains("capacity from the scene") && said.contains("encoding.log2_table_size"), "{said}");

@@ -33,7 +33,7 @@ fn trained(name: &str) -> PathBuf {
     let folder = folder(name);
     let (capture, run) = (folder.join("capture"), folder.join("run"));
     common::capture(&capture, Layout::HumanNerf, 32, 4);
-    let set = ["--preset", "fast", "--steps", "2", "--set", "registration.rounds=0"];
+    let set = ["--preset", "fast", "--method", "occnerf", "--steps", "2", "--set", "registration.rounds=0"];
     done(&[&["train", text(&capture), "--out", text(&run)], &set[..]].concat());
     run
 }

@@ -90,7 +90,7 @@ fn training_views_are_as_good_as_from_the_captures_own_metadata() {
     let Some(dir) = shared("estimators") else { return };
     let folder = folder("import-trained");
     let long = std::env::var_os("OCCNERF_TOOLS").is_some();
-    let how = if long { "--preset fast --steps 100 --seed 1" } else { "--method prior" };
+    let how = if long { "--preset fast" } else { "--method prior" };
     let psnr = |capture: &Path| {
         let run = capture.with_extension("run");
         let how: Vec<&str> = how.split(' ').collect();

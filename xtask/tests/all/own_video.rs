@@ -89,7 +89,7 @@ fn training_says_before_it_begins_what_memory_it_takes() {
     let folder = folder("memory-said");
     let (capture, run) = (folder.join("capture"), folder.join("run"));
     common::capture(&capture, Layout::HumanNerf, 128, 4);
-    let said = done(&["train", text(&capture), "--out", text(&run), "--preset", "fast", "--steps", "40"]);
+    let said = done(&["train", text(&capture), "--out", text(&run), "--method", "hash-point", "--steps", "40"]);
     let mebibytes: f64 = said.split("memory: about ").nth(1).unwrap().split(' ').next().unwrap().parse().unwrap();
     let metrics = std::fs::read_to_string(run.join("metrics.json")).unwrap();
     let metrics: serde_json::Value = serde_json::from_str(&metrics).unwrap();

@@ -1,10 +1,9 @@
 //! A training frame, cropped to the subject and downsampled.
 
 use glam::{Vec2, Vec3};
-use smpl::Posed;
 use volrender::Camera;
 
-use crate::capture::{CaptureError, Frame};
+use crate::capture::Pixels;
 
 /// Height of the subject in a crop, pixels: a tenth of one is below the accuracy of a body's
 /// surface.
@@ -15,7 +14,7 @@ const BORDER: f32 = 0.15;
 const LARGEST: u32 = 1024;
 
 /// The subject in a frame, and the known occluder.
-pub(super) struct Crop {
+pub(crate) struct Crop {
     pub camera: Camera,
     /// Premultiplied colour and coverage, 0 to 255, (H, W).
     pixels: Vec<[u8; 4]>,
@@ -23,61 +22,59 @@ pub(super) struct Crop {
 }
 
 /// A blurred crop: premultiplied colour and coverage, (H, W).
-pub(super) struct Blurred {
+pub(crate) struct Blurred {
     width: usize,
     pixels: Vec<[f32; 4]>,
 }
 
 /// A colour and its image derivatives.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct ColorSample {
+pub(crate) struct ColorSample {
     pub color: Vec3,
     pub dx: Vec3,
     pub dy: Vec3,
 }
 
 impl Crop {
-    /// Crops a frame to `posed`; `None` where that is outside the image.
-    pub fn new(frame: &Frame, posed: &Posed) -> Result<Option<Self>, CaptureError> {
+    /// Crops the picture of `given` to a body's `vertices`; `None` where they are outside it.
+    pub fn new(given: &Camera, shown: &Pixels, vertices: &[Vec3]) -> Option<Self> {
         let (mut low, mut high) = (Vec2::INFINITY, Vec2::NEG_INFINITY);
-        for p in posed.vertices.iter().filter_map(|&v| frame.camera.project(v)) {
+        for p in vertices.iter().filter_map(|&v| given.project(v)) {
             (low, high) = (low.min(p.truncate()), high.max(p.truncate()));
         }
-        let size = Vec2::new(frame.camera.width as f32, frame.camera.height as f32);
+        let size = Vec2::new(given.width as f32, given.height as f32);
         let border = BORDER * (high.y - low.y);
         let factor = ((high.y - low.y).min(size.y) / HEIGHT).round().max(1.0) as u32;
         let (low, high) = ((low - border).clamp(Vec2::ZERO, size), (high + border).clamp(Vec2::ZERO, size));
         // False for NaN.
         if !(low.x < high.x && low.y < high.y) {
-            return Ok(None);
+            return None;
         }
         let (x0, y0) = (low.x as u32, low.y as u32);
         let reduced = |low: u32, high: f32| (high.ceil() as u32 - low).div_ceil(factor).clamp(1, LARGEST);
         let (width, height) = (reduced(x0, high.x), reduced(y0, high.y));
-        let shown = frame.pixels()?;
-        let across = frame.camera.width;
+        let across = given.width;
         // Pixels of the frame under one pixel of the crop.
         let block = |i: u32| {
             let (left, top) = (x0 + i % width * factor, y0 + i / width * factor);
-            let rows = top..(top + factor).min(frame.camera.height);
+            let rows = top..(top + factor).min(given.height);
             rows.flat_map(move |y| (left..(left + factor).min(across)).map(move |x| (y * across + x) as usize))
         };
         let share = 255.0 / (factor * factor) as f32;
         let mean = |i: u32| {
             let mut sum = [0.0f32; 4];
-            // Pixels outside the mask may show an occluder.
-            for p in block(i).filter(|&p| shown.mask[p] > 0.5) {
+            for p in block(i) {
                 sum[3] += shown.mask[p];
                 (0..3).for_each(|c| sum[c] += shown.image.pixels[3 * p + c]);
             }
             sum.map(|sum| (share * sum).round() as u8)
         };
         let covered = |known: &Vec<bool>| (0..width * height).map(|i| block(i).any(|p| known[p])).collect();
-        let mut camera = Camera { width, height, ..frame.camera };
+        let mut camera = Camera { width, height, ..*given };
         camera.focal /= factor as f32;
         camera.centre = (camera.centre - Vec2::new(x0 as f32, y0 as f32)) / factor as f32;
         let pixels = (0..width * height).map(mean).collect();
-        Ok(Some(Self { camera, pixels, occluder: shown.occluder.as_ref().map(covered) }))
+        Some(Self { camera, pixels, occluder: shown.occluder.as_ref().map(covered) })
     }
 
     /// Coverage of every pixel, 0 to 1.

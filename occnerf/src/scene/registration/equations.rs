@@ -125,6 +125,6 @@ impl<'a> Equations<'a> {
 }
 
 /// Weight of the robust loss of Geman and McClure (1985) at three standard deviations.
-fn robust(squared: f32, noise: f32) -> f32 {
+pub(crate) fn robust(squared: f32, noise: f32) -> f32 {
     (1.0 + squared / (9.0 * noise * noise)).powi(-2)
 }

@@ -29,9 +29,11 @@ use volrender::{Aabb, Camera};
 
 use self::colors::Colors;
 use self::corrections::{Correction, corrected};
-use self::crop::Crop;
+pub(crate) use self::crop::Crop;
+pub(crate) use self::equations::robust;
 use self::equations::{BETA_STEP, Equations, Perspective};
-use self::observations::{ObservationOptions, Observations, SharedEdge, observe, shared_edges};
+use self::observations::SharedEdge;
+pub(crate) use self::observations::{Edge, ObservationOptions, Observations, observe, shared_edges};
 use self::pose_error::PoseErrorModel;
 use self::system::{NormalEquations, Prior, Solution, solve};
 use crate::Error;
@@ -153,7 +155,7 @@ impl<'a> Registration<'a> {
         let crop = |&frame: &usize| {
             let frame = &capture.train[frame];
             let posed = model.pose(&model.shaped(&frame.betas), &frame.pose, frame.placement);
-            Ok(Crop::new(frame, &posed)?)
+            Ok(Crop::new(&frame.camera, &frame.pixels()?, &posed.vertices))
         };
         let crops = frames.par_iter().map(crop).collect::<Result<_, Error>>()?;
         let bounds = Aabb::from_points(&model.shaped(&capture.mean_betas).vertices);

@@ -27,7 +27,7 @@ const BEHIND: f32 = 0.02;
 
 /// A vertex on the outline of the posed prior.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) struct Edge {
+pub(crate) struct Edge {
     pub vertex: u32,
     /// Distance from the prior's outline to the mask's, pixels, outward.
     pub distance: f32,
@@ -39,7 +39,7 @@ pub(super) struct Edge {
 
 /// Observations of one frame.
 #[derive(Debug, Default)]
-pub(super) struct Observations {
+pub(crate) struct Observations {
     pub edges: Vec<Edge>,
     /// Colours of vertices that face the camera.
     pub colors: Vec<ColorObservation>,
@@ -50,10 +50,10 @@ pub(super) struct Observations {
 }
 
 /// An edge of a mesh and the faces on its two sides.
-pub(super) type SharedEdge = ([u32; 2], [u32; 2]);
+pub(crate) type SharedEdge = ([u32; 2], [u32; 2]);
 
 /// Edges of a mesh with two faces.
-pub(super) fn shared_edges(faces: &[[u32; 3]]) -> Vec<SharedEdge> {
+pub(crate) fn shared_edges(faces: &[[u32; 3]]) -> Vec<SharedEdge> {
     let mut open: HashMap<[u32; 2], u32> = HashMap::new();
     let mut out = Vec::new();
     for (f, corners) in faces.iter().enumerate() {
@@ -72,7 +72,7 @@ pub(super) fn shared_edges(faces: &[[u32; 3]]) -> Vec<SharedEdge> {
 
 /// Parameters of [`observe`].
 #[derive(Clone, Copy, Debug)]
-pub(super) struct ObservationOptions {
+pub(crate) struct ObservationOptions {
     /// Search distance of the mask's edge from the prior's outline, pixels.
     pub reach: f32,
     /// Standard deviation of the blur of colours, pixels; no colours at 0.
@@ -84,7 +84,7 @@ pub(super) struct ObservationOptions {
 /// Searches the mask's edge along the normals of the outline of `vertices`, and samples the colours
 /// of vertices that face the camera. An edge counts if background lies beyond it, which excludes
 /// edges at an occluder.
-pub(super) fn observe(
+pub(crate) fn observe(
     crop: &Crop,
     vertices: &[Vec3],
     (faces, shared_edges): (&[[u32; 3]], &[SharedEdge]),

@@ -2,7 +2,7 @@
 
 use super::*;
 use crate::capture::{Image, Pixels};
-use glam::{Affine3A, Mat3};
+use glam::{Affine3A, Mat3, Vec2};
 use smpl::Placement;
 use synth::{DemoConfig, Perturbation, demo};
 
@@ -164,7 +164,7 @@ fn clothes_are_found_as_far_out_as_they_are_and_an_occluder_is_no_outline() {
         let mut pixels = frame.pixels().unwrap();
         see(&mut pixels);
         frame.source = pixels.into();
-        let crop = Crop::new(frame, &posed).unwrap().unwrap();
+        let crop = Crop::new(&frame.camera, &frame.pixels().unwrap(), &posed.vertices).unwrap();
         let options = ObservationOptions { reach: 10.0, blur: 0.0, unit: 1.0 };
         let found = observe(&crop, &posed.vertices, (&body.faces, &shared_edges), options).unwrap();
         let each = found.edges.iter().map(|edge| {
@@ -180,6 +180,29 @@ fn clothes_are_found_as_far_out_as_they_are_and_an_occluder_is_no_outline() {
         let median = found[found.len() / 2].0;
         assert!((median - thick).abs() < 0.004, "{median}");
     }
+}
+
+/// The middle of an antialiased edge is where its coverage says, wherever it falls between pixels.
+#[test]
+fn edges_of_antialiased_masks_are_found_without_bias() {
+    let mut errors = Vec::new();
+    for step in 0..20 {
+        let edge = 8.0 + step as f32 / 20.0;
+        let mask: Vec<f32> = (0..256).map(|i| (edge - (i % 16) as f32).clamp(0.0, 1.0)).collect();
+        let image = Image { width: 16, height: 16, pixels: mask.iter().flat_map(|m| [*m; 3]).collect() };
+        let camera = volrender::Camera::new(Mat3::IDENTITY, Affine3A::IDENTITY, 16, 16).unwrap();
+        let corners = [Vec3::new(0.0, 0.0, 1.0), Vec3::new(16.0, 16.0, 1.0)];
+        let crop = Crop::new(&camera, &Pixels { image, mask, occluder: None }, &corners).unwrap();
+        let at = |x: f32| crop.coverage_at(Vec2::new(x, 8.0)).unwrap();
+        let mut found = 4.0;
+        while at(found) >= 0.5 {
+            found += 0.01;
+        }
+        errors.push(found - edge);
+    }
+    let mean = errors.iter().sum::<f32>() / errors.len() as f32;
+    assert!(mean.abs() < 0.02, "{mean}");
+    assert!(errors.iter().all(|error| error.abs() < 0.15), "{errors:?}");
 }
 
 #[test]

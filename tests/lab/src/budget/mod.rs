@@ -7,7 +7,9 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, Result};
 use clap::Args;
 use image::{Rgb, RgbImage};
+use occnerf::bake::Avatar;
 use occnerf::{Lpips, Method, Model, PreparedFrame, PriorColors, Renderer, Rendering, Scene};
+use xtask::baked;
 use xtask::eval::{Drawn, scored_frames};
 use xtask::network::load_lpips;
 use xtask::run::{make_directory, use_threads, write};
@@ -54,9 +56,12 @@ pub fn budget(arguments: &BudgetArguments) -> Result<()> {
     for directory in &arguments.runs {
         let (run, source) = scene::of_run(directory)?;
         let scene = source.scene(&run.train)?;
-        let model;
+        let (model, avatar);
         let drawn = if run.train.method == Method::Prior {
             Drawn::Prior(PriorColors::measure(&scene)?)
+        } else if run.train.method == Method::Surface {
+            avatar = Avatar::load(&baked::path(directory))?;
+            Drawn::Avatar { body: &scene.body, light: scene.colors()?.light, avatar: &avatar }
         } else {
             model = Model::load(directory)?;
             Drawn::Field { model: &model, perceptual: String::new() }

@@ -31,6 +31,8 @@ use xtask::train::finished;
 pub enum Method {
     /// The product's prior in mean colours.
     Prior,
+    /// The product's surface without a field.
+    Surface,
     /// Frequencies of x̂ and a wider perceptron (after Weng et al. 2022).
     Humannerf,
     /// The product's hash encoding of x̂.
@@ -50,19 +52,20 @@ impl Method {
             Self::Humannerf => "humannerf",
             Self::NeuralBody => "neural-body",
             Self::SelfNerf => "self-nerf",
-            Self::Prior | Self::HashPoint | Self::Occnerf => self.base().name(),
+            Self::Prior | Self::Surface | Self::HashPoint | Self::Occnerf => self.base().name(),
         }
     }
 
     /// Whether `cargo xtask train` has it.
     pub fn is_product(self) -> bool {
-        matches!(self, Self::Prior | Self::HashPoint | Self::Occnerf)
+        matches!(self, Self::Prior | Self::Surface | Self::HashPoint | Self::Occnerf)
     }
 
     /// The product's method whose settings it has; only the encoding differs.
     fn base(self) -> occnerf::Method {
         match self {
             Self::Prior => occnerf::Method::Prior,
+            Self::Surface => occnerf::Method::Surface,
             Self::Occnerf => occnerf::Method::Occnerf,
             _ => occnerf::Method::HashPoint,
         }
@@ -94,7 +97,7 @@ impl Method {
             Neighbours::new(&scene.body, config)
         };
         Ok(match self {
-            Self::Prior | Self::HashPoint | Self::Occnerf => None,
+            Self::Prior | Self::Surface | Self::HashPoint | Self::Occnerf => None,
             Self::Humannerf => Some(Arc::new(Frequencies)),
             Self::NeuralBody => Some(Arc::new(NeuralBody::new(neighbours()?))),
             Self::SelfNerf => Some(Arc::new(SelfNerf::new(neighbours()?, &scene.body, config)?)),

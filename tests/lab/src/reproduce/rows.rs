@@ -46,7 +46,7 @@ pub enum Table {
     Robustness,
 }
 
-use Method::{HashPoint, Humannerf, NeuralBody, Occnerf, Prior, SelfNerf};
+use Method::{HashPoint, Humannerf, NeuralBody, Occnerf, Prior, SelfNerf, Surface};
 use OccludedRule::{Background, Unknown};
 
 /// Priors made wrong, each with the name of its directory.
@@ -200,6 +200,7 @@ fn methods() -> Vec<Row> {
     let mut rows = vec![
         as_given(),
         row("prior", Prior, Unknown),
+        row("surface", Surface, Unknown),
         Row { changes: HUMANNERF.to_vec(), ..row("humannerf-style-paper", Humannerf, Background) },
         row("humannerf-style-bg", Humannerf, Background),
         four_times("humannerf-style-bg-4x", Background),
@@ -308,6 +309,7 @@ impl Table {
         match self {
             Self::Methods => &[
                 "prior",
+                "surface",
                 "humannerf-style-bg",
                 "humannerf-style",
                 "hash-point",

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, bail};
 use glam::Vec3;
-use occnerf::bake::bake;
+use occnerf::bake::{BakeOptions, BakedRenderer, bake, fit};
 use occnerf::capture::Capture;
 use occnerf::{
     Config, FieldRenderer, PreparedFrame, PriorColors, PriorRenderer, Renderer, Scene, SplitMetrics, StepTimes,
@@ -15,6 +15,7 @@ use occnerf::{
 };
 use serde::{Deserialize, Serialize};
 use smpl::BodyModel;
+use visibility::Samples;
 
 use crate::bench::{Baking, Difficulty};
 use crate::methods::Method;
@@ -177,6 +178,13 @@ fn measure(job: &Job) -> Result<Outcome> {
         outcome.train_seconds = start.elapsed().as_secs_f64();
         outcome.parameters = 3 * colors.colors.len();
         score(&scene, &mut PriorRenderer::new(&scene.body, &colors), &mut outcome)?;
+    } else if job.method == Method::Surface {
+        let colors = scene.colors()?;
+        let (avatar, _) = fit(&scene, &BakeOptions::default())?;
+        outcome.train_seconds = start.elapsed().as_secs_f64();
+        outcome.parameters = avatar.num_parameters();
+        let mut renderer = BakedRenderer::new(&scene.body, colors.light, &avatar, Samples::Four)?;
+        score(&scene, &mut renderer, &mut outcome)?;
     } else {
         let mut trainer = job.method.trainer(&scene, job.config.clone())?;
         let (mut seconds, mut times) = (Vec::new(), StepTimes::default());

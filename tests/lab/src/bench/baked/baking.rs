@@ -56,7 +56,7 @@ impl Baking {
 
     /// Draws an avatar that was baked with [`Baking::options`].
     pub fn renderer<'a>(self, model: &Model, avatar: &'a Avatar) -> Result<BakedRenderer<'a>> {
-        let renderer = BakedRenderer::new(model, avatar, self.samples())?;
+        let renderer = BakedRenderer::new(model.body(), model.light(), avatar, self.samples())?;
         Ok(if self.vertex_colours { renderer.in_vertex_colours() } else { renderer })
     }
 }

@@ -1,0 +1,323 @@
+//! Displacements of the prior's surface along its normals, from outlines and colours of the
+//! training frames.
+//!
+//! Gauss-Newton steps over all heights at once. Outline residuals are those of registration; each
+//! frame sees the outline elsewhere, so their intersection is the visual hull (Laurentini 1994).
+//! Colour residuals are differences of a vertex's colour between frames: its albedo is eliminated
+//! from the normal equations (variable projection, Golub and Pereyra 1973). Thin-plate
+//! regularisation couples neighbours; conjugate gradients solve.
+
+use glam::Vec3;
+use rayon::prelude::*;
+
+use super::solve::conjugate_gradients;
+use super::surface::NormalRay;
+use crate::Error;
+use crate::capture::Light;
+use crate::model::subdivide::{Subdivided, neighbours};
+use crate::model::view::PosedView;
+use crate::scene::prepared::Scene;
+use crate::scene::registration::{Crop, Edge, ObservationOptions, Observations, observe, robust, shared_edges};
+
+/// Gauss-Newton steps, and those of them with outline residuals alone.
+const ROUNDS: usize = 5;
+const OUTLINES: usize = 2;
+/// Most frames that are observed.
+const MOST_FRAMES: usize = 96;
+/// Search distance of the mask's edge in the first round and in the last, pixels.
+const REACH: [f32; 2] = [10.0, 4.0];
+/// Blur of the colours in their first round and in the last, pixels.
+const BLUR: [f32; 2] = [2.0, 0.5];
+/// Standard deviation of an outline residual, pixels: so small that an outline follows the median of the
+/// frames, not the mean.
+const OUTLINE: f32 = 0.15;
+/// Standard deviation of a colour residual at least, and weight of colour residuals.
+const COLOR: f32 = 0.05;
+const COLOR_WEIGHT: f32 = 2.0;
+/// Standard deviation of the heights' Laplacian, in edge lengths.
+const BEND: f32 = 0.08;
+/// Standard deviation of a height around that of the prior's clothes, normalised metres.
+const SPREAD: f32 = 0.05;
+/// Lowest and highest surface, normalised metres.
+const RANGE: [f32; 2] = [-0.03, 0.12];
+/// Iterations of a step's conjugate gradients.
+const ITERATIONS: usize = 60;
+
+/// A vertex's colour in one frame.
+struct Shown {
+    vertex: u32,
+    color: Vec3,
+    shade: f32,
+    /// Derivative of the colour by the height, a component a channel.
+    change: Vec3,
+}
+
+/// Precision and weighted residual of a height.
+type Term = (f32, f32);
+
+/// Heights of the vertices of `mesh` over their `feet` (V) that explain the frames under `light`,
+/// starting from `heights`.
+///
+/// # Errors
+/// Pictures that cannot be read.
+pub(super) fn displacements(
+    scene: &Scene,
+    light: Light,
+    mesh: &Subdivided,
+    feet: &[NormalRay],
+    prior: &[f32],
+) -> Result<Vec<f32>, Error> {
+    let every = scene.learnt.len().div_ceil(MOST_FRAMES).max(1);
+    let frames: Vec<usize> = scene.learnt.iter().copied().step_by(every).collect();
+    let crop = |&frame: &usize| {
+        let frame = &scene.train[frame];
+        Ok(Crop::new(&frame.view.camera, &frame.pixels()?, &frame.view.posed.vertices))
+    };
+    let crops = frames.par_iter().map(crop).collect::<Result<Vec<_>, Error>>()?;
+    let edges = shared_edges(&mesh.faces);
+    let plate = Plate::new(mesh, feet);
+    let mut heights = prior.to_vec();
+    for round in 0..ROUNDS {
+        let late = round as f32 / (ROUNDS - 1) as f32;
+        let between = |ends: [f32; 2], share: f32| ends[0] + share * (ends[1] - ends[0]);
+        let sharp = (round as f32 - OUTLINES as f32) / (ROUNDS - 1 - OUTLINES) as f32;
+        let blur = if round < OUTLINES { 0.0 } else { between(BLUR, sharp) };
+        let options = ObservationOptions { reach: between(REACH, late), blur, unit: 1.0 };
+        let look = |(&frame, crop): (&usize, &Option<Crop>)| -> Result<_, Error> {
+            let Some(crop) = crop else { return Ok((Vec::new(), Vec::new())) };
+            let (vertices, up) = raised(scene, &scene.train[frame].view, mesh, feet, &heights);
+            let observed = observe(crop, &vertices, (&mesh.faces, &edges), options)?;
+            Ok(terms(&observed, &up, light))
+        };
+        let looked = frames.par_iter().zip(&crops).map(look).collect::<Result<Vec<_>, Error>>()?;
+        let mut sums: Vec<Term> = vec![(0.0, 0.0); heights.len()];
+        for (v, precision, pull) in looked.iter().flat_map(|(outline, _)| outline) {
+            let sum = &mut sums[*v as usize];
+            *sum = (sum.0 + precision, sum.1 + pull);
+        }
+        let shown: Vec<&Shown> = looked.iter().flat_map(|(_, shown)| shown).collect();
+        add_colors(&shown, blur, &mut sums);
+        for ((sum, height), prior) in sums.iter_mut().zip(&heights).zip(prior) {
+            let precision = (SPREAD * SPREAD).recip();
+            *sum = (sum.0 + precision, sum.1 + precision * (prior - height));
+        }
+        let step = plate.step(&sums, &heights);
+        for (height, step) in heights.iter_mut().zip(step) {
+            *height = (*height + step).clamp(RANGE[0], RANGE[1]);
+        }
+    }
+    Ok(heights)
+}
+
+/// Vertices at `heights` in the pose of a view, and their derivatives by the height, (V).
+fn raised(
+    scene: &Scene,
+    view: &PosedView,
+    mesh: &Subdivided,
+    feet: &[NormalRay],
+    heights: &[f32],
+) -> (Vec<Vec3>, Vec<Vec3>) {
+    let weights = &scene.body.model.weights;
+    let turned = |v: usize| -> Vec3 {
+        weights.row(v).map(|(joint, w)| w * (view.posed.bones[joint].matrix3 * feet[v].direction)).sum()
+    };
+    // The first vertices of the subdivided prior are its own.
+    let directions: Vec<Vec3> = (0..view.posed.vertices.len()).map(turned).collect();
+    let each = mesh.anchors.iter().zip(heights).map(|(anchor, height)| {
+        let up = anchor.mix(&directions).normalize_or_zero();
+        (anchor.mix(&view.posed.vertices) + height * up, up)
+    });
+    each.unzip()
+}
+
+/// Outline terms of the vertices, and their colours, of one frame.
+fn terms(observed: &Observations, up: &[Vec3], light: Light) -> (Vec<(u32, f32, f32)>, Vec<Shown>) {
+    let outline = |&Edge { vertex, distance, gradient, .. }: &Edge| {
+        let slope = gradient.dot(up[vertex as usize]);
+        let weight = robust(distance * distance, OUTLINE) / (OUTLINE * OUTLINE);
+        (vertex, weight * slope * slope, weight * slope * distance)
+    };
+    let shown = |((vertex, color, normal), jacobian): (&(u32, Vec3, Vec3), &[Vec3; 3])| Shown {
+        vertex: *vertex,
+        color: *color,
+        shade: light.on(*normal),
+        change: Vec3::from(jacobian.map(|row| row.dot(up[*vertex as usize]))),
+    };
+    (observed.edges.iter().map(outline).collect(), observed.colors.iter().zip(&observed.jacobians).map(shown).collect())
+}
+
+/// Adds the colour terms, with the albedo of each vertex eliminated.
+fn add_colors(shown: &[&Shown], blur: f32, sums: &mut [Term]) {
+    if shown.is_empty() {
+        return;
+    }
+    let mut albedo = vec![(Vec3::ZERO, 0.0f32); sums.len()];
+    for seen in shown {
+        let sum = &mut albedo[seen.vertex as usize];
+        *sum = (sum.0 + seen.shade * seen.color, sum.1 + seen.shade * seen.shade);
+    }
+    let residual = |seen: &Shown, albedo: &[(Vec3, f32)]| {
+        let (sum, squares) = albedo[seen.vertex as usize];
+        seen.color - seen.shade * sum / squares.max(f32::MIN_POSITIVE)
+    };
+    let mut errors: Vec<f32> = shown.iter().map(|seen| residual(seen, &albedo).abs().element_sum() / 3.0).collect();
+    let middle = errors.len() / 2;
+    let noise = (1.48 * *errors.select_nth_unstable_by(middle, f32::total_cmp).1).max(COLOR);
+    // Normal equations of the height and of the albedo of each vertex, by channel.
+    #[derive(Clone, Copy, Default)]
+    struct Block {
+        height: f32,
+        mixed: Vec3,
+        albedo: f32,
+        pull: f32,
+        sum: Vec3,
+    }
+    let mut blocks = vec![Block::default(); sums.len()];
+    // Neighbouring residuals are correlated under a blur.
+    let scale = COLOR_WEIGHT / (noise * noise * (1.0 + blur * blur));
+    for seen in shown {
+        let residual = residual(seen, &albedo);
+        let weight = scale * robust(residual.length_squared(), noise);
+        let block = &mut blocks[seen.vertex as usize];
+        block.height += weight * seen.change.length_squared();
+        block.mixed += weight * seen.shade * seen.change;
+        block.albedo += weight * seen.shade * seen.shade;
+        block.pull += weight * seen.change.dot(residual);
+        block.sum += weight * seen.shade * residual;
+    }
+    // The model is shade · albedo = colour + change · step.
+    for (sum, block) in sums.iter_mut().zip(&blocks).filter(|(_, block)| block.albedo > 0.0) {
+        let precision = block.height - block.mixed.length_squared() / block.albedo;
+        let pull = -(block.pull - block.mixed.dot(block.sum) / block.albedo);
+        *sum = (sum.0 + precision.max(0.0), sum.1 + pull);
+    }
+}
+
+/// Thin-plate energy of the heights: the squared deviation of each from the mean of its neighbours.
+struct Plate {
+    near: Vec<Vec<u32>>,
+    /// Precision of each deviation.
+    stiffness: f32,
+}
+
+impl Plate {
+    fn new(mesh: &Subdivided, feet: &[NormalRay]) -> Self {
+        let near = neighbours(feet.len(), &mesh.faces);
+        let length = |v: usize| near[v].iter().map(move |&n| feet[v].foot.distance(feet[n as usize].foot));
+        let (sum, count) = (0..feet.len()).flat_map(length).fold((0.0, 0usize), |(s, n), l| (s + f64::from(l), n + 1));
+        let edge = (sum / count.max(1) as f64) as f32;
+        Self { near, stiffness: (BEND * edge).max(f32::MIN_POSITIVE).powi(-2) }
+    }
+
+    /// Deviations from the means of the neighbours.
+    fn deviations(&self, heights: &[f32]) -> Vec<f32> {
+        let deviation = |(near, own): (&Vec<u32>, &f32)| {
+            own - near.iter().map(|&n| heights[n as usize]).sum::<f32>() / near.len().max(1) as f32
+        };
+        self.near.par_iter().zip(heights).map(deviation).collect()
+    }
+
+    /// Gradient of half the energy.
+    fn gradient(&self, heights: &[f32]) -> Vec<f32> {
+        let deviations = self.deviations(heights);
+        let own = |(near, own): (&Vec<u32>, &f32)| {
+            let others = near.iter().map(|&n| deviations[n as usize] / self.near[n as usize].len() as f32);
+            self.stiffness * (own - others.sum::<f32>())
+        };
+        self.near.par_iter().zip(&deviations).map(own).collect()
+    }
+
+    /// The step of all heights that the terms and the energy ask for.
+    fn step(&self, terms: &[Term], heights: &[f32]) -> Vec<f32> {
+        let pulls: Vec<f32> = terms.iter().zip(self.gradient(heights)).map(|(term, bent)| term.1 - bent).collect();
+        let diagonal = |(near, term): (&Vec<u32>, &Term)| {
+            let others = near.iter().map(|&n| (self.near[n as usize].len() as f32).powi(-2));
+            term.0 + self.stiffness * (1.0 + others.sum::<f32>())
+        };
+        let diagonal: Vec<f32> = self.near.iter().zip(terms).map(diagonal).collect();
+        let apply = |x: &[f32]| {
+            let bent = self.gradient(x);
+            bent.iter().zip(terms).zip(x).map(|((bent, term), x)| bent + term.0 * x).collect()
+        };
+        conjugate_gradients(apply, &pulls, &diagonal, ITERATIONS, |a, b| f64::from(a * b))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use nalgebra::{Matrix4, Vector4};
+    use proptest::prelude::*;
+
+    fn ball() -> (Subdivided, Vec<NormalRay>) {
+        let ball = testkit::mesh::icosphere(1);
+        let mesh = Subdivided::new(ball.vertices.len(), &ball.faces, 0);
+        let feet = ball.vertices.iter().map(|v| NormalRay { foot: *v, direction: *v }).collect();
+        (mesh, feet)
+    }
+
+    proptest! {
+        #[test]
+        fn the_gradient_of_the_plate_is_that_of_its_energy(
+            heights in prop::collection::vec(-0.1f32..0.1, 42), at in 0usize..42,
+        ) {
+            let (mesh, feet) = ball();
+            let plate = Plate::new(&mesh, &feet);
+            let energy = |heights: &[f32]| -> f64 {
+                let squares = plate.deviations(heights).into_iter().map(|d| f64::from(d).powi(2));
+                0.5 * f64::from(plate.stiffness) * squares.sum::<f64>()
+            };
+            let moved = |by: f32| { let mut moved = heights.clone(); moved[at] += by; energy(&moved) };
+            let numeric = (moved(1e-2) - moved(-1e-2)) / 2e-2;
+            let exact = f64::from(plate.gradient(&heights)[at]);
+            prop_assert!((exact - numeric).abs() < 1e-3 * (1.0 + exact.abs()), "{exact} {numeric}");
+        }
+
+        /// The step solves the dense normal equations of height and albedo together.
+        #[test]
+        fn the_albedo_is_eliminated_exactly(
+            frames in prop::collection::vec(
+                (prop::array::uniform3(0.0f32..1.0), 0.5f32..1.5, prop::array::uniform3(-5.0f32..5.0)), 2..7),
+        ) {
+            let shown: Vec<Shown> = frames.iter().map(|&(color, shade, change)| {
+                Shown { vertex: 0, color: color.into(), shade, change: change.into() }
+            }).collect();
+            let mut sums = [(0.0, 0.0)];
+            add_colors(&shown.iter().collect::<Vec<_>>(), 0.0, &mut sums);
+            let (sum, squares) = shown.iter().fold((Vec3::ZERO, 0.0), |(sum, squares), s| {
+                (sum + s.shade * s.color, squares + s.shade * s.shade)
+            });
+            let residual = |s: &Shown| s.color - s.shade * sum / squares;
+            let mut errors: Vec<f32> = shown.iter().map(|s| residual(s).abs().element_sum() / 3.0).collect();
+            errors.sort_by(f32::total_cmp);
+            let noise = (1.48 * errors[errors.len() / 2]).max(COLOR);
+            let (mut matrix, mut vector) = (Matrix4::<f64>::zeros(), Vector4::<f64>::zeros());
+            for s in &shown {
+                let weight = f64::from(COLOR_WEIGHT / (noise * noise) * robust(residual(s).length_squared(), noise));
+                for channel in 0..3 {
+                    // The residual, shade · albedo − colour, by the albedo and by the height.
+                    let mut row = Vector4::zeros();
+                    (row[0], row[1 + channel]) = (-f64::from(s.change[channel]), f64::from(s.shade));
+                    matrix += weight * row * row.transpose();
+                    vector += weight * f64::from(residual(s)[channel]) * row;
+                }
+            }
+            prop_assume!(sums[0].0 > 1e-2 * matrix[(0, 0)] as f32);
+            let expected = matrix.try_inverse().map_or(0.0, |inverse| (inverse * vector)[0]);
+            let found = f64::from(sums[0].1 / sums[0].0);
+            prop_assert!((found - expected).abs() < 1e-2 * (0.1 + expected.abs()), "{found} {expected}");
+        }
+    }
+
+    #[test]
+    fn a_step_spreads_what_a_few_vertices_say_and_holds_still_where_nothing_is_said() {
+        let (mesh, feet) = ball();
+        let plate = Plate::new(&mesh, &feet);
+        let mut terms = vec![(1.0, 0.0); 42];
+        assert!(plate.step(&terms, &[0.0; 42]).iter().all(|step| step.abs() < 1e-6));
+        terms[7] = (1e6, 1e6 * 0.05);
+        let step = plate.step(&terms, &[0.0; 42]);
+        assert!((step[7] - 0.05).abs() < 5e-3, "{}", step[7]);
+        assert!(plate.near[7].iter().all(|&n| step[n as usize] > 0.02), "{step:?}");
+    }
+}
