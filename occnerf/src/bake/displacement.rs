@@ -10,12 +10,12 @@
 use glam::Vec3;
 use rayon::prelude::*;
 
-use super::solve::conjugate_gradients;
 use super::surface::NormalRay;
 use crate::Error;
 use crate::capture::Light;
-use crate::model::subdivide::{Subdivided, neighbours};
+use crate::model::subdivide::Subdivided;
 use crate::model::view::PosedView;
+use crate::scene::plate::{Plate, Term};
 use crate::scene::prepared::Scene;
 use crate::scene::registration::{Crop, Edge, ObservationOptions, Observations, observe, robust, shared_edges};
 
@@ -40,8 +40,6 @@ const BEND: f32 = 0.08;
 const SPREAD: f32 = 0.05;
 /// Lowest and highest surface, normalised metres.
 const RANGE: [f32; 2] = [-0.03, 0.12];
-/// Iterations of a step's conjugate gradients.
-const ITERATIONS: usize = 60;
 
 /// A vertex's colour in one frame.
 struct Shown {
@@ -51,9 +49,6 @@ struct Shown {
     /// Derivative of the colour by the height, a component a channel.
     change: Vec3,
 }
-
-/// Precision and weighted residual of a height.
-type Term = (f32, f32);
 
 /// Heights of the vertices of `mesh` over their `feet` (V) that explain the frames under `light`,
 /// starting from `heights`.
@@ -75,7 +70,8 @@ pub(super) fn displacements(
     };
     let crops = frames.par_iter().map(crop).collect::<Result<Vec<_>, Error>>()?;
     let edges = shared_edges(&mesh.faces);
-    let plate = Plate::new(mesh, feet);
+    let places: Vec<Vec3> = feet.iter().map(|foot| foot.foot).collect();
+    let plate = Plate::new(&places, &mesh.faces, BEND);
     let mut heights = prior.to_vec();
     for round in 0..ROUNDS {
         let late = round as f32 / (ROUNDS - 1) as f32;
@@ -193,86 +189,13 @@ fn add_colors(shown: &[&Shown], blur: f32, sums: &mut [Term]) {
     }
 }
 
-/// Thin-plate energy of the heights: the squared deviation of each from the mean of its neighbours.
-struct Plate {
-    near: Vec<Vec<u32>>,
-    /// Precision of each deviation.
-    stiffness: f32,
-}
-
-impl Plate {
-    fn new(mesh: &Subdivided, feet: &[NormalRay]) -> Self {
-        let near = neighbours(feet.len(), &mesh.faces);
-        let length = |v: usize| near[v].iter().map(move |&n| feet[v].foot.distance(feet[n as usize].foot));
-        let (sum, count) = (0..feet.len()).flat_map(length).fold((0.0, 0usize), |(s, n), l| (s + f64::from(l), n + 1));
-        let edge = (sum / count.max(1) as f64) as f32;
-        Self { near, stiffness: (BEND * edge).max(f32::MIN_POSITIVE).powi(-2) }
-    }
-
-    /// Deviations from the means of the neighbours.
-    fn deviations(&self, heights: &[f32]) -> Vec<f32> {
-        let deviation = |(near, own): (&Vec<u32>, &f32)| {
-            own - near.iter().map(|&n| heights[n as usize]).sum::<f32>() / near.len().max(1) as f32
-        };
-        self.near.par_iter().zip(heights).map(deviation).collect()
-    }
-
-    /// Gradient of half the energy.
-    fn gradient(&self, heights: &[f32]) -> Vec<f32> {
-        let deviations = self.deviations(heights);
-        let own = |(near, own): (&Vec<u32>, &f32)| {
-            let others = near.iter().map(|&n| deviations[n as usize] / self.near[n as usize].len() as f32);
-            self.stiffness * (own - others.sum::<f32>())
-        };
-        self.near.par_iter().zip(&deviations).map(own).collect()
-    }
-
-    /// The step of all heights that the terms and the energy ask for.
-    fn step(&self, terms: &[Term], heights: &[f32]) -> Vec<f32> {
-        let pulls: Vec<f32> = terms.iter().zip(self.gradient(heights)).map(|(term, bent)| term.1 - bent).collect();
-        let diagonal = |(near, term): (&Vec<u32>, &Term)| {
-            let others = near.iter().map(|&n| (self.near[n as usize].len() as f32).powi(-2));
-            term.0 + self.stiffness * (1.0 + others.sum::<f32>())
-        };
-        let diagonal: Vec<f32> = self.near.iter().zip(terms).map(diagonal).collect();
-        let apply = |x: &[f32]| {
-            let bent = self.gradient(x);
-            bent.iter().zip(terms).zip(x).map(|((bent, term), x)| bent + term.0 * x).collect()
-        };
-        conjugate_gradients(apply, &pulls, &diagonal, ITERATIONS, |a, b| f64::from(a * b))
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use nalgebra::{Matrix4, Vector4};
     use proptest::prelude::*;
 
-    fn ball() -> (Subdivided, Vec<NormalRay>) {
-        let ball = testkit::mesh::icosphere(1);
-        let mesh = Subdivided::new(ball.vertices.len(), &ball.faces, 0);
-        let feet = ball.vertices.iter().map(|v| NormalRay { foot: *v, direction: *v }).collect();
-        (mesh, feet)
-    }
-
     proptest! {
-        #[test]
-        fn the_gradient_of_the_plate_is_that_of_its_energy(
-            heights in prop::collection::vec(-0.1f32..0.1, 42), at in 0usize..42,
-        ) {
-            let (mesh, feet) = ball();
-            let plate = Plate::new(&mesh, &feet);
-            let energy = |heights: &[f32]| -> f64 {
-                let squares = plate.deviations(heights).into_iter().map(|d| f64::from(d).powi(2));
-                0.5 * f64::from(plate.stiffness) * squares.sum::<f64>()
-            };
-            let moved = |by: f32| { let mut moved = heights.clone(); moved[at] += by; energy(&moved) };
-            let numeric = (moved(1e-2) - moved(-1e-2)) / 2e-2;
-            let exact = f64::from(plate.gradient(&heights)[at]);
-            prop_assert!((exact - numeric).abs() < 1e-3 * (1.0 + exact.abs()), "{exact} {numeric}");
-        }
-
         /// The step solves the dense normal equations of height and albedo together.
         #[test]
         fn the_albedo_is_eliminated_exactly(
@@ -307,17 +230,5 @@ mod tests {
             let found = f64::from(sums[0].1 / sums[0].0);
             prop_assert!((found - expected).abs() < 1e-2 * (0.1 + expected.abs()), "{found} {expected}");
         }
-    }
-
-    #[test]
-    fn a_step_spreads_what_a_few_vertices_say_and_holds_still_where_nothing_is_said() {
-        let (mesh, feet) = ball();
-        let plate = Plate::new(&mesh, &feet);
-        let mut terms = vec![(1.0, 0.0); 42];
-        assert!(plate.step(&terms, &[0.0; 42]).iter().all(|step| step.abs() < 1e-6));
-        terms[7] = (1e6, 1e6 * 0.05);
-        let step = plate.step(&terms, &[0.0; 42]);
-        assert!((step[7] - 0.05).abs() < 5e-3, "{}", step[7]);
-        assert!(plate.near[7].iter().all(|&n| step[n as usize] > 0.02), "{step:?}");
     }
 }

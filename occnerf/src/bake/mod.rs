@@ -13,7 +13,6 @@ mod refine;
 mod renderer;
 mod saved;
 mod skeleton;
-mod solve;
 mod surface;
 #[cfg(test)]
 mod tests;

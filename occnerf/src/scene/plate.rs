@@ -1,0 +1,104 @@
+//! Heights over a mesh, coupled like a thin plate.
+
+use glam::Vec3;
+use rayon::prelude::*;
+
+use crate::model::subdivide::neighbours;
+use crate::scene::solve::conjugate_gradients;
+
+/// Iterations of a step's conjugate gradients.
+const ITERATIONS: usize = 60;
+
+/// Precision and weighted residual of a height.
+pub(crate) type Term = (f32, f32);
+
+/// Thin-plate energy of the heights: the squared deviation of each from the mean of its neighbours.
+pub(crate) struct Plate {
+    near: Vec<Vec<u32>>,
+    /// Precision of each deviation.
+    stiffness: f32,
+}
+
+impl Plate {
+    /// Heights over a mesh; `bend` is the standard deviation of a deviation, in mean edge lengths.
+    pub fn new(vertices: &[Vec3], faces: &[[u32; 3]], bend: f32) -> Self {
+        let near = neighbours(vertices.len(), faces);
+        let length = |v: usize| near[v].iter().map(move |&n| vertices[v].distance(vertices[n as usize]));
+        let (sum, count) =
+            (0..vertices.len()).flat_map(length).fold((0.0, 0usize), |(s, n), l| (s + f64::from(l), n + 1));
+        let edge = (sum / count.max(1) as f64) as f32;
+        Self { near, stiffness: (bend * edge).max(f32::MIN_POSITIVE).powi(-2) }
+    }
+
+    /// Deviations from the means of the neighbours.
+    fn deviations(&self, heights: &[f32]) -> Vec<f32> {
+        let deviation = |(near, own): (&Vec<u32>, &f32)| {
+            own - near.iter().map(|&n| heights[n as usize]).sum::<f32>() / near.len().max(1) as f32
+        };
+        self.near.par_iter().zip(heights).map(deviation).collect()
+    }
+
+    /// Gradient of half the energy.
+    fn gradient(&self, heights: &[f32]) -> Vec<f32> {
+        let deviations = self.deviations(heights);
+        let own = |(near, own): (&Vec<u32>, &f32)| {
+            let others = near.iter().map(|&n| deviations[n as usize] / self.near[n as usize].len() as f32);
+            self.stiffness * (own - others.sum::<f32>())
+        };
+        self.near.par_iter().zip(&deviations).map(own).collect()
+    }
+
+    /// The step of all heights that the terms and the energy ask for.
+    pub fn step(&self, terms: &[Term], heights: &[f32]) -> Vec<f32> {
+        let pulls: Vec<f32> = terms.iter().zip(self.gradient(heights)).map(|(term, bent)| term.1 - bent).collect();
+        let diagonal = |(near, term): (&Vec<u32>, &Term)| {
+            let others = near.iter().map(|&n| (self.near[n as usize].len() as f32).powi(-2));
+            term.0 + self.stiffness * (1.0 + others.sum::<f32>())
+        };
+        let diagonal: Vec<f32> = self.near.iter().zip(terms).map(diagonal).collect();
+        let apply = |x: &[f32]| {
+            let bent = self.gradient(x);
+            bent.iter().zip(terms).zip(x).map(|((bent, term), x)| bent + term.0 * x).collect()
+        };
+        conjugate_gradients(apply, &pulls, &diagonal, ITERATIONS, |a, b| f64::from(a * b))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    fn ball() -> Plate {
+        let ball = testkit::mesh::icosphere(1);
+        Plate::new(&ball.vertices, &ball.faces, 0.08)
+    }
+
+    proptest! {
+        #[test]
+        fn the_gradient_of_the_plate_is_that_of_its_energy(
+            heights in prop::collection::vec(-0.1f32..0.1, 42), at in 0usize..42,
+        ) {
+            let plate = ball();
+            let energy = |heights: &[f32]| -> f64 {
+                let squares = plate.deviations(heights).into_iter().map(|d| f64::from(d).powi(2));
+                0.5 * f64::from(plate.stiffness) * squares.sum::<f64>()
+            };
+            let moved = |by: f32| { let mut moved = heights.clone(); moved[at] += by; energy(&moved) };
+            let numeric = (moved(1e-2) - moved(-1e-2)) / 2e-2;
+            let exact = f64::from(plate.gradient(&heights)[at]);
+            prop_assert!((exact - numeric).abs() < 1e-3 * (1.0 + exact.abs()), "{exact} {numeric}");
+        }
+    }
+
+    #[test]
+    fn a_step_spreads_what_a_few_vertices_say_and_holds_still_where_nothing_is_said() {
+        let plate = ball();
+        let mut terms = vec![(1.0, 0.0); 42];
+        assert!(plate.step(&terms, &[0.0; 42]).iter().all(|step| step.abs() < 1e-6));
+        terms[7] = (1e6, 1e6 * 0.05);
+        let step = plate.step(&terms, &[0.0; 42]);
+        assert!((step[7] - 0.05).abs() < 5e-3, "{}", step[7]);
+        assert!(plate.near[7].iter().all(|&n| step[n as usize] > 0.02), "{step:?}");
+    }
+}
