@@ -106,7 +106,9 @@ pub fn eval(arguments: &EvalArguments) -> Result<()> {
     let _lock = Lock::take(directory)?;
     let source = run.source(directory)?;
     let scene = source.scene(&run.train)?;
-    ensure!(!arguments.baked || run.train.method.has_field(), "--baked: {} has no field", directory.display());
+    ensure!(!arguments.baked || run.train.method != Method::Prior, "--baked: a prior is not baked");
+    // A surface is as baked as it can be.
+    let baked = arguments.baked && run.train.method.has_field();
     let (loaded, avatar);
     let drawn = if run.train.method == Method::Prior {
         Drawn::Prior(PriorColors::measure(&scene)?)
@@ -114,7 +116,7 @@ pub fn eval(arguments: &EvalArguments) -> Result<()> {
         avatar = Avatar::load(&baked::path(directory))?;
         let colors = Person::colors(directory, &source.model)?.unwrap_or_default();
         Drawn::Avatar { body: &scene.body, light: colors.light, avatar: &avatar }
-    } else if arguments.baked {
+    } else if baked {
         loaded = Model::load(directory)?;
         avatar = baked::avatar(directory, &loaded)?;
         Drawn::Avatar { body: loaded.body(), light: loaded.light(), avatar: &avatar }
@@ -153,12 +155,12 @@ pub fn eval(arguments: &EvalArguments) -> Result<()> {
         }
     }
     metrics.lpips = network;
-    if arguments.side == 1 && !arguments.baked {
+    if arguments.side == 1 && !baked {
         metrics.write(directory)?;
         report::write(directory, &metrics)?;
     }
     let mut one = metrics.clone();
-    one.method.push_str(if arguments.baked { "-baked" } else { "" });
+    one.method.push_str(if baked { "-baked" } else { "" });
     let Splits { novel_view, train_view } = &metrics.splits;
     let novel = novel_view.as_ref().map(|split| (evaluation_title(split), split));
     for (name, split) in novel.into_iter().chain(train_view.as_ref().map(|split| (TRAINING_VIEWS, split))) {

@@ -74,3 +74,50 @@ pub fn aligned(lines: &[Vec<String>], left: usize) -> String {
     }
     text
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::run::Splits;
+    use occnerf::SplitMetrics;
+
+    fn metrics(known: Option<f64>, lpips: Option<&str>) -> Metrics {
+        let split = SplitMetrics { psnr_mask: Some(20.0), psnr_all: Some(17.0), known, ..SplitMetrics::default() };
+        Metrics {
+            method: "surface".to_owned(),
+            preset: "fast".to_owned(),
+            occluded: "unknown".to_owned(),
+            scene: "demo".to_owned(),
+            seed: 1,
+            steps: 0,
+            train_seconds: 3.0,
+            peak_rss_bytes: 0,
+            parameters: 7,
+            perceptual: String::new(),
+            lpips: lpips.map(str::to_owned),
+            splits: Splits { novel_view: Some(split), train_view: None },
+        }
+    }
+
+    /// The header's and the first row's cells.
+    fn cells(metrics: &Metrics) -> Vec<(String, String)> {
+        let text = markdown(&[("row".to_owned(), metrics)]);
+        let row = |line: usize| -> Vec<String> {
+            text.lines().nth(line).unwrap().split('|').map(|cell| cell.trim().to_owned()).collect()
+        };
+        row(0).into_iter().zip(row(2)).collect()
+    }
+
+    #[test]
+    fn what_unknown_pixels_excuse_is_said_where_there_are_any() {
+        let of = |cells: &[(String, String)], name: &str| cells.iter().find(|c| c.0 == name).map(|c| c.1.clone());
+        let all_known = cells(&metrics(Some(1.0), None));
+        assert_eq!((of(&all_known, "known"), of(&all_known, "psnr_all")), (None, None));
+        let excused = cells(&metrics(Some(0.75), None));
+        assert_eq!(of(&excused, "known").as_deref(), Some("0.750"));
+        assert_eq!(of(&excused, "psnr_all").as_deref(), Some("17.00"));
+        assert_eq!(of(&excused, "psnr_mask").as_deref(), Some("20.00"));
+        assert!(of(&excused, "lpips_full").is_none());
+        assert!(of(&cells(&metrics(None, Some("alex"))), "lpips_full").is_some());
+    }
+}

@@ -59,7 +59,7 @@ pub struct FrameMetrics {
 }
 
 /// Means over the pictures of a split, of those pictures that have the score.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct SplitMetrics {
     /// Mean of [`FrameMetrics::psnr_vis`].
     pub psnr_vis: Option<f64>,

@@ -14,3 +14,4 @@ mod list;
 mod own_video;
 #[path = "../../../occnerf/tests/all/common/stand_in.rs"]
 mod stand_in;
+mod surface;

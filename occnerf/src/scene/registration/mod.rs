@@ -24,7 +24,6 @@ use glam::{Quat, Vec3};
 use nalgebra::DVector;
 use rayon::prelude::*;
 use smpl::{BodyModel, Placement, Posed, Shaped};
-use surface_query::vertex_normals;
 use volrender::{Aabb, Camera};
 
 use self::colors::Colors;
@@ -38,6 +37,7 @@ use self::pose_error::PoseErrorModel;
 use self::system::{NormalEquations, Prior, Solution, solve};
 use crate::Error;
 use crate::capture::{Capture, Frame, Mended, Registered};
+use crate::model::subdivide::normals;
 use crate::scene::seen::dressed;
 
 /// Standard deviation of shape coefficients.
@@ -264,7 +264,7 @@ impl<'a> Registration<'a> {
 
     fn clothed_body(&self, f: usize) -> ClothedBody {
         let (shape, posed) = self.posed(f, &self.betas);
-        let normals = vertex_normals(&posed.vertices, &self.model.faces);
+        let normals = normals(&posed.vertices, &self.model.faces);
         let dressed = dressed(&posed.vertices, &normals, &self.clothes);
         ClothedBody { shape, posed, dressed }
     }

@@ -4,11 +4,11 @@
 use std::collections::HashMap;
 
 use glam::{Mat3, Vec2, Vec3};
-use surface_query::vertex_normals;
 use visibility::{Fragment, RasterOptions, Rasterizer};
 
 use crate::Error;
 use crate::config::OccludedRule;
+use crate::model::subdivide::normals;
 use crate::model::view::pinhole;
 use crate::scene::labels::{Label, Labels, label_pixels};
 use crate::scene::light::ColorObservation;
@@ -95,7 +95,7 @@ pub(crate) fn observe(
     let options = RasterOptions { near: 1e-3 * unit, ..RasterOptions::default() };
     let nearest: Vec<Option<Fragment>> = Rasterizer::default().faces(vertices, faces, &pinhole(camera), &options)?;
     let silhouette: Vec<bool> = nearest.iter().map(Option::is_some).collect();
-    let normals = vertex_normals(vertices, faces);
+    let normals = normals(vertices, faces);
     let (eye, to_camera) = (camera.centre_of_projection(), camera.world_to_camera);
     let centre = vertices.iter().sum::<Vec3>() / vertices.len().max(1) as f32;
     let depth = to_camera.transform_point3(centre).z.max(1e-3 * unit);

@@ -4,6 +4,7 @@ use super::*;
 use crate::capture::{Image, Pixels};
 use glam::{Affine3A, Mat3, Vec2};
 use smpl::Placement;
+use surface_query::vertex_normals;
 use synth::{DemoConfig, Perturbation, demo};
 
 /// A frame without a subject.

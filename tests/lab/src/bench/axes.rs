@@ -48,8 +48,8 @@ impl Level {
     pub fn point(&self, axis: &Axis, method: Method, steps: u64, seed: u64) -> Point {
         let mut config = Config { seed, steps, ..method.preset(Preset::Fast) };
         (config.patches, config.samples) = (2, 32);
-        if method != Method::Prior {
-            // Nothing of this means anything to the prior, which is measured once.
+        if method.has_field() {
+            // Nothing of this means anything to what trains no field.
             config.steps *= self.steps;
             scale_rates(&mut config.rates, self.rates);
         }

@@ -108,11 +108,14 @@ impl Sweep {
         }
         config.validate()?;
         let mut command = format!(
-            "cargo xtask train{} --preset {} --method {} --steps {steps} --seed 1",
+            "cargo xtask train{} --preset {} --method {} --seed 1",
             self.scene_arguments,
             preset.name(),
             method.name()
         );
+        if method.has_field() {
+            command.push_str(&format!(" --steps {steps}"));
+        }
         set.iter().for_each(|assignment| command.push_str(&format!(" --set {assignment}")));
         Ok(Point {
             bench: "pareto".to_owned(),
@@ -133,10 +136,8 @@ impl Sweep {
         };
         let steps = self.steps;
         let mut points = vec![own(Kind::Base, "base", "base", Method::Occnerf, steps, &[])?];
-        for (name, method) in
-            [("prior", Method::Prior), ("hash-point", Method::HashPoint), ("humannerf", Method::Humannerf)]
-        {
-            points.push(own(Kind::Baseline, "method", name, method, steps, &[])?);
+        for method in [Method::Prior, Method::Surface, Method::HashPoint, Method::Humannerf] {
+            points.push(own(Kind::Baseline, "method", method.name(), method, steps, &[])?);
         }
         for (name, steps) in [("half the steps", steps.div_ceil(2)), ("twice the steps", 2 * steps)] {
             points.push(own(Kind::Change, "steps", name, Method::Occnerf, steps, &[])?);

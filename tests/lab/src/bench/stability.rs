@@ -38,9 +38,8 @@ struct Runs<'a> {
 
 impl Runs<'_> {
     fn run(&mut self, point: Point) -> Result<()> {
-        let prior = point.job.method == Method::Prior;
         let known = self.lines.iter().any(|l| l.point.job == point.job);
-        if !prior && !known {
+        if point.job.method.has_field() && !known {
             if self.trained >= self.max_runs {
                 return Ok(());
             }
@@ -66,7 +65,9 @@ impl Sweep {
         let mut runs = Runs { runner, lines: Vec::new(), trained: 0, max_runs: self.max_runs };
         for axis in &self.axes {
             for level in &axis.levels {
-                runs.run(level.point(axis, Method::Prior, self.steps, 1))?;
+                for method in [Method::Prior, Method::Surface] {
+                    runs.run(level.point(axis, method, self.steps, 1))?;
+                }
             }
         }
         for method in TRAINED {
@@ -150,7 +151,7 @@ pub fn course(axis: &Axis, method: Method, lines: &[Line]) -> Course {
 /// Breaking points as a Markdown table, a row an axis.
 pub fn table(axes: &[Axis], lines: &[Line]) -> String {
     let mut text = String::from("| gets harder |");
-    let methods = [&[Method::Prior], &TRAINED[..]].concat();
+    let methods = [&[Method::Prior, Method::Surface], &TRAINED[..]].concat();
     methods.iter().for_each(|m| text.push_str(&format!(" {} |", m.name())));
     text.push_str("\n| --- |");
     methods.iter().for_each(|_| text.push_str(" --- |"));
@@ -208,9 +209,10 @@ pub fn finite(lines: &[Line]) -> String {
 
 /// A panel an axis: psnr_mask of every method, breaking points crossed.
 pub fn charts(scene: &str, axes: &[Axis], lines: &[Line], stem: &Path) -> Result<()> {
-    let methods = [(Method::Prior, 5), (Method::Occnerf, 0), (Method::HashPoint, 4), (Method::Humannerf, 1)];
+    let colors = [5, 2, 0, 4, 1];
+    let methods = [&[Method::Prior, Method::Surface], &TRAINED[..]].concat().into_iter().zip(colors);
     let mut legend: Vec<(String, Style)> =
-        methods.iter().map(|&(m, color)| (m.name().to_owned(), Style(color, Shape::Circle))).collect();
+        methods.clone().map(|(m, color)| (m.name().to_owned(), Style(color, Shape::Circle))).collect();
     legend.push(("broken".to_owned(), Style(6, Shape::Cross)));
     let mut panels = Vec::new();
     for axis in axes {
@@ -224,7 +226,7 @@ pub fn charts(scene: &str, axes: &[Axis], lines: &[Line], stem: &Path) -> Result
             lines: Vec::new(),
             marks: Vec::new(),
         };
-        for (method, color) in methods {
+        for (method, color) in methods.clone() {
             let course = course(axis, method, lines);
             let middle = |values: &[f64]| values.iter().sum::<f64>() / values.len() as f64;
             let points = course.levels.iter().filter(|l| !l.1.is_empty());

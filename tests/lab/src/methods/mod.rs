@@ -56,6 +56,11 @@ impl Method {
         }
     }
 
+    /// Whether it trains a field; what does not depends on no seed.
+    pub fn has_field(self) -> bool {
+        !matches!(self, Self::Prior | Self::Surface)
+    }
+
     /// Whether `cargo xtask train` has it.
     pub fn is_product(self) -> bool {
         matches!(self, Self::Prior | Self::Surface | Self::HashPoint | Self::Occnerf)

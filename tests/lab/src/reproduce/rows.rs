@@ -331,7 +331,7 @@ impl Table {
 impl Row {
     /// Whether there is anything to learn, and so to repeat with another seed.
     pub fn learns(&self) -> bool {
-        self.method != Method::Prior
+        self.method.has_field()
     }
 
     /// Directory, under that of the table, of the run with a seed.
