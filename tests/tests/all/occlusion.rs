@@ -85,8 +85,8 @@ fn the_demo_shows_nothing_behind_its_obstacle() {
     assert!(hidden > 100, "{hidden}");
 }
 
-/// Overwrites the colour of every pixel with this label in every training frame, and its coverage
-/// if it is not one of the subject.
+/// Overwrites the colour of every pixel with this label in every training frame, and of the
+/// background its coverage.
 fn repainted(label: Label) -> Capture {
     let mut changed = capture().clone();
     let mut count = 0;
@@ -97,7 +97,7 @@ fn repainted(label: Label) -> Capture {
                 for c in 0..3 {
                     pixels.image.pixels[3 * i + c] = f32::from(noise((3 * i + c) as u32, 9)) / 255.0;
                 }
-                if label != Label::Subject {
+                if label == Label::Background {
                     pixels.mask[i] = 0.4;
                 }
             }

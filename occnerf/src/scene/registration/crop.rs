@@ -16,8 +16,10 @@ const LARGEST: u32 = 1024;
 /// The subject in a frame, and the known occluder.
 pub(crate) struct Crop {
     pub camera: Camera,
-    /// Premultiplied colour and coverage, 0 to 255, (H, W).
+    /// Premultiplied colour and coverage of pixels over one half, 0 to 255, (H, W).
     pixels: Vec<[u8; 4]>,
+    /// Coverage of all pixels, 0 to 255, (H, W): antialiased edges.
+    coverage: Vec<u8>,
     pub occluder: Option<Vec<bool>>,
 }
 
@@ -63,23 +65,25 @@ impl Crop {
         let share = 255.0 / (factor * factor) as f32;
         let mean = |i: u32| {
             let mut sum = [0.0f32; 4];
-            for p in block(i) {
+            // Pixels outside the mask may show an occluder.
+            for p in block(i).filter(|&p| shown.mask[p] > 0.5) {
                 sum[3] += shown.mask[p];
                 (0..3).for_each(|c| sum[c] += shown.image.pixels[3 * p + c]);
             }
             sum.map(|sum| (share * sum).round() as u8)
         };
+        let coverage = |i: u32| (share * block(i).map(|p| shown.mask[p]).sum::<f32>()).round() as u8;
         let covered = |known: &Vec<bool>| (0..width * height).map(|i| block(i).any(|p| known[p])).collect();
         let mut camera = Camera { width, height, ..*given };
         camera.focal /= factor as f32;
         camera.centre = (camera.centre - Vec2::new(x0 as f32, y0 as f32)) / factor as f32;
-        let pixels = (0..width * height).map(mean).collect();
-        Some(Self { camera, pixels, occluder: shown.occluder.as_ref().map(covered) })
+        let (pixels, coverage) = (0..width * height).map(|i| (mean(i), coverage(i))).unzip();
+        Some(Self { camera, pixels, coverage, occluder: shown.occluder.as_ref().map(covered) })
     }
 
     /// Coverage of every pixel, 0 to 1.
     pub fn coverage(&self) -> Vec<f32> {
-        self.pixels.iter().map(|p| f32::from(p[3]) / 255.0).collect()
+        self.coverage.iter().map(|&c| f32::from(c) / 255.0).collect()
     }
 
     /// Index of the pixel at an image point; `None` outside.
@@ -92,7 +96,7 @@ impl Crop {
     /// Coverage, interpolated bilinearly; `None` beyond the outermost pixel centres.
     pub fn coverage_at(&self, at: Vec2) -> Option<f32> {
         let (corners, share) = corners(at, self.camera.width as usize, self.camera.height as usize)?;
-        let [a, b, c, d] = corners.map(|i| f32::from(self.pixels[i][3]) / 255.0);
+        let [a, b, c, d] = corners.map(|i| f32::from(self.coverage[i]) / 255.0);
         let (top, bottom) = (a + share.x * (b - a), c + share.x * (d - c));
         Some(top + share.y * (bottom - top))
     }

@@ -254,10 +254,6 @@ mod tests {
             for (preset, kind) in [("fast", Kind::Base), ("balanced", Kind::Preset), ("paper", Kind::Preset)] {
                 assert!(points.iter().any(|p| p.kind == kind && p.name.starts_with(preset)), "{preset}");
             }
-            assert!(
-                points.iter().any(|p| p.name == "balanced (twice the steps)")
-                    && points.iter().all(|p| p.name != "balanced")
-            );
         }
     }
 

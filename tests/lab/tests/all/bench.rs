@@ -36,15 +36,15 @@ fn a_sweep_goes_on_where_it_was_cut_off() {
     let sweep = ["bench", "stability", text(&capture), "--quick", "--axes", "hidden"];
     let sweep = [&sweep[..], &["--side", "24", "--steps", "1", "--out", text(&out)]].concat();
     let first = done(&sweep);
-    // Two levels of the prior and of three methods.
-    assert!(first.contains("8 runs in"), "{first}");
+    // Two levels of five methods.
+    assert!(first.contains("10 runs in"), "{first}");
     assert!(first.contains("every loss, gradient and pixel was finite"), "{first}");
     for name in ["bench.jsonl", "stability.md", "stability-zju-mocap.svg", "stability-zju-mocap.png"] {
         assert!(out.join(name).is_file(), "{name}");
         assert!(first.contains(text(&out.join(name))), "{first}");
     }
     let log = std::fs::read_to_string(out.join("bench.jsonl")).unwrap();
-    assert_eq!(log.lines().count(), 8);
+    assert_eq!(log.lines().count(), 10);
     for line in log.lines() {
         let line: serde_json::Value = serde_json::from_str(line).unwrap();
         assert!(line["error"].is_null() && line["psnr_mask"].as_f64().unwrap() > 1.0, "{line}");
@@ -69,7 +69,7 @@ fn captures_are_made_hard_as_their_layout_allows() {
     // One frame of many: more runs of fewer frames than the sweep above.
     let sweep = ["bench", "stability", text(&zju), "--quick", "--side", "24", "--steps", "1", "--out", text(&out)];
     let said = done(&[&sweep[..], &["--axes", "one frame of"]].concat());
-    assert!(said.contains("8 runs in") && said.contains("every loss, gradient and pixel was finite"), "{said}");
+    assert!(said.contains("10 runs in") && said.contains("every loss, gradient and pixel was finite"), "{said}");
     let of_prepared = ["bench", "stability", text(&prepared), "--axes", "hidden", "--out", text(&out)];
     refused(&of_prepared, &["hidden", "mask growth"]);
     refused(&["bench", "stability", text(&folder), "--out", text(&out)], &["hard-captures"]);
