@@ -23,8 +23,8 @@ Run one estimator and one segmenter as their own pages say, on the same frames (
 --fit, told by what is in the file:
   WHAM              output/demo/CLIP/wham_output.pkl          (demo.py --save_pkl)
   4D-Humans, PHALP  outputs/results/demo_CLIP.pkl             (track.py; its masks are used without --masks)
-  GVHMR             outputs/demo/CLIP/hmr4d_results.pt        (wants --body SMPLX_NEUTRAL.npz)
-  PromptHMR         results/CLIP/results.pkl                  (wants --body SMPLX_NEUTRAL.npz; its masks are used, too)
+  GVHMR             outputs/demo/CLIP/hmr4d_results.pt        (SMPL-X)
+  PromptHMR         results/CLIP/results.pkl                  (SMPL-X; its masks are used, too)
   VIBE, PyMAF       output/CLIP/vibe_output.pkl
   ROMP              OUTPUT/video_results.npz                  (romp --mode=video -t)
   EasyMocap         OUTPUT, the folder with smpl/; intri.yml and extri.yml in it or above
@@ -38,7 +38,8 @@ Run one estimator and one segmenter as their own pages say, on the same frames (
   any other         PNGs of 0 and 255 or with alpha, or one .npy or .npz (frames, height, width); inverted ones are
                     told by the border; without --masks, the frames' own alpha
 
---body: SMPL_NEUTRAL.pkl of SMPL_python_v.1.1.0 (smpl.is.tue.mpg.de), or SMPLX_NEUTRAL.npz (smpl-x.is.tue.mpg.de).
+--body: SMPL_NEUTRAL.pkl of SMPL_python_v.1.1.0 (smpl.is.tue.mpg.de), or SMPLX_NEUTRAL.npz (smpl-x.is.tue.mpg.de), if
+you have it; without one the joints' rotations are put on an open body, whose shape training finds.
 
 Then: cargo xtask train CAPTURE";
 
@@ -70,8 +71,8 @@ pub struct ImportArguments {
     /// Focal length in pixels [default: the one that the estimator assumed]
     #[arg(long, value_name = "PX")]
     focal: Option<f64>,
-    /// The body model that the estimator fitted, .npz or .pkl [default: the variable SMPL_MODEL, or
-    /// one that fits in a folder `body` near the fit or the frames]
+    /// The body model that the estimator fitted, .npz or .pkl [default: the variable SMPL_MODEL, one
+    /// that fits in a folder `body` near the fit or the frames, or the open body of this program]
     #[arg(long, value_name = "FILE")]
     body: Option<PathBuf>,
     /// Copy the frames into the capture; else it has links to them
@@ -164,7 +165,17 @@ fn decode(video: &Path, into: &Path) -> Result<()> {
 fn say(imported: &Imported) {
     let Imported { tool, person, frames, video_frames, focal, masks, betas_spread, .. } = imported;
     say!("{}: person {person}, {frames} of {video_frames} frames, focal length {focal:.1} px", tool.name());
-    say!("masks: {masks}; body: {}", imported.body.display());
+    say!("masks: {masks}");
+    match &imported.body {
+        Some(body) => say!("body: {}", body.display()),
+        None => {
+            let own = if tool.joints() > 24 { "SMPLX_NEUTRAL.npz" } else { "SMPL_NEUTRAL.pkl" };
+            say!(
+                "body: the open body of this program, in its mean shape; training finds the person's from the pictures"
+            );
+            say!("      (with --body {own}, which {} fitted, it begins at the shape of the fit)", tool.name());
+        }
+    }
     if !imported.others.is_empty() {
         let each: Vec<String> = imported.others.iter().map(|(id, n)| format!("{id} ({n} frames)")).collect();
         say!("others there (--person ID): {}", each.join(", "));

@@ -128,6 +128,9 @@ const HELD_OUT: usize = 10;
 /// A new run.
 fn begun(arguments: &TrainArguments, name: &str) -> Result<Begun> {
     let mut config = arguments.settings.config()?;
+    // Found missing now, not after registration.
+    let weights = Path::new(&config.loss.perceptual_weights);
+    ensure!(weights.as_os_str().is_empty() || weights.exists(), "{}: no such weights", weights.display());
     let source = source::load(arguments.scene.as_deref(), arguments.body.as_deref(), &arguments.load.options()?)?;
     // What is asked for by itself stays as it is asked for.
     let steps = arguments.settings.steps.map(|_| "steps=".to_owned());
@@ -156,8 +159,10 @@ fn resumed(arguments: &TrainArguments, directory: &Path) -> Result<Begun> {
     let lock = Lock::take(directory)?;
     let capacity = capacity::resumed(directory, arguments.capacity)?;
     let checkpoint = directory.join(CHECKPOINT);
-    // A run that ended before its first checkpoint restarts.
     let begun = if checkpoint.is_file() { Some(checkpoint_config(&checkpoint)?) } else { None };
+    if begun.is_none() {
+        say!("{}: no checkpoint to go on from; from the start", directory.display());
+    }
     let saved = RunConfig::read(directory)?;
     let config = arguments.settings.resumed(begun.unwrap_or(saved.train), capacity.as_ref())?;
     let load = arguments.load.resumed(&saved.load)?;

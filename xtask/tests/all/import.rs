@@ -127,6 +127,39 @@ fn training_views_are_as_good_as_from_the_captures_own_metadata() {
     }
 }
 
+/// Where no body model is at hand, the open body takes the joints' rotations; its shape is found.
+#[test]
+fn without_a_body_model_the_open_body_stands_in() {
+    let Some(dir) = shared("estimators") else { return };
+    let folder = folder("import-open-body");
+    let frames = folder.join("frames");
+    std::fs::create_dir(&frames).unwrap();
+    for frame in std::fs::read_dir(dir.join("frames")).unwrap() {
+        let path = frame.unwrap().path();
+        std::fs::copy(&path, frames.join(path.file_name().unwrap())).unwrap();
+    }
+    let (masks, known) = (dir.join("sam2"), dir.join("../body/open_body.npz"));
+    let mut scores = Vec::new();
+    for (fit, words) in [
+        ("wham/wham_output.pkl", "SMPL_NEUTRAL.pkl, which WHAM fitted"),
+        ("gvhmr/hmr4d_results.pt", "SMPLX_NEUTRAL.npz, which GVHMR fitted"),
+        ("wham/wham_output.pkl", ""),
+    ] {
+        let name = format!("{}{}", fit.split('/').next().unwrap(), scores.len());
+        let (copy, capture, run) = (folder.join(&name), folder.join(name.clone() + "c"), folder.join(name + "r"));
+        std::fs::copy(dir.join(fit), &copy).unwrap();
+        let line = ["import", "--frames", text(&frames), "--fit", text(&copy), "--masks", text(&masks)];
+        let body = if words.is_empty() { vec!["--body", text(&known)] } else { Vec::new() };
+        let said = done(&[&line[..], &["--out", text(&capture)], &body].concat());
+        assert!(said.contains(words) && said.contains("open body of this program") != words.is_empty(), "{said}");
+        let said = done(&["train", text(&capture), "--out", text(&run), "--method", "surface"]);
+        let row = said.lines().find(|line| line.starts_with("| surface")).unwrap();
+        scores.push(row.split('|').nth(5).unwrap().trim().parse::<f64>().unwrap());
+    }
+    println!("psnr_mask: open body under WHAM's and GVHMR's fit, the true body: {scores:?}");
+    assert!(scores[..2].iter().all(|score| *score > scores[2] - 1.0), "{scores:?}");
+}
+
 /// Rewrites every frame of a capture's metadata.json.
 fn rewritten(capture: &Path, change: impl Fn(&mut serde_json::Value)) {
     let path = capture.join("metadata.json");

@@ -16,12 +16,16 @@ use crate::find::near_bodies;
 const HAND: usize = 15;
 
 /// Reads the body of a fit by `tool`: `given`, or the first that fits of the `.npz` and `.pkl` files
-/// in folders `body` beside `near` or above.
-pub(super) fn find(tool: Tool, given: Option<&Path>, near: &[&Path]) -> Result<(PathBuf, BodyModel), CaptureError> {
+/// in folders `body` beside `near` or above; without a path the embedded body, where there is none.
+pub(super) fn find(
+    tool: Tool,
+    given: Option<&Path>,
+    near: &[&Path],
+) -> Result<(Option<PathBuf>, BodyModel), CaptureError> {
     if let Some(path) = given {
         let model = BodyModel::load(path)?;
         return match fits(tool, &model) {
-            true => Ok((path.to_owned(), model)),
+            true => Ok((Some(path.to_owned()), model)),
             false => {
                 let expected = format!("{} joints: {} fits {}", tool.joints(), tool.name(), download(tool));
                 Err(CaptureError::invalid(path, "kintree_table", expected, format!("{} joints", model.num_joints())))
@@ -31,20 +35,17 @@ pub(super) fn find(tool: Tool, given: Option<&Path>, near: &[&Path]) -> Result<(
     let whole = near.iter().filter_map(|place| place.canonicalize().ok());
     for path in whole.flat_map(|place| near_bodies(&place, &["npz", "pkl"])) {
         if let Some(model) = BodyModel::load(&path).ok().filter(|model| fits(tool, model)) {
-            return Ok((path, model));
+            return Ok((Some(path), model));
         }
     }
-    let place = near.first().map_or(Path::new("body"), |place| place);
-    let what =
-        format!("body model with {} joints, as {} fits (--body FILE): {}", tool.joints(), tool.name(), download(tool));
-    Err(CaptureError::missing(place, what))
+    Ok((None, BodyModel::embedded()))
 }
 
 fn fits(tool: Tool, model: &BodyModel) -> bool {
     model.num_joints() == tool.joints() && model.num_betas() >= super::fit::BETAS
 }
 
-/// Download hint for a missing or unsuitable body.
+/// Download hint for an unsuitable body.
 fn download(tool: Tool) -> &'static str {
     match tool.joints() {
         SMPL => "SMPL; download SMPL_NEUTRAL.pkl (SMPL_python_v.1.1.0) from smpl.is.tue.mpg.de and give it as --body",

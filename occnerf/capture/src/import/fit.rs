@@ -7,6 +7,8 @@ use super::rle::Rle;
 /// Joints of SMPL and of SMPL-X.
 pub(super) const SMPL: usize = 24;
 pub(super) const SMPLX: usize = 55;
+/// First joints that SMPL and SMPL-X have alike: all but hands and face.
+pub(super) const SHARED: usize = 22;
 /// Shape coefficients that estimators fit.
 pub(super) const BETAS: usize = 10;
 

@@ -44,7 +44,7 @@ use std::path::{Path, PathBuf};
 use glam::DVec3;
 use smpl::BodyModel;
 
-use self::fit::{BETAS, FitFrame, Person, SMPLX};
+use self::fit::{BETAS, FitFrame, Person, SHARED, SMPLX};
 pub use self::options::ImportOptions;
 
 use self::masks::Masks;
@@ -83,15 +83,15 @@ pub struct Imported {
     pub focal: f64,
     /// Kind of the masks.
     pub masks: &'static str,
-    /// The body model's file.
-    pub body: PathBuf,
+    /// The body model's file; `None` for the embedded body, in its mean shape.
+    pub body: Option<PathBuf>,
 }
 
 /// Writes the capture of `options` into the folder `out`, created if absent.
 ///
 /// # Errors
 /// Files that are missing, malformed, of unknown format, or inconsistent: frames beyond the video,
-/// pictures or masks of unequal sizes, a body model with other joints than the fit's. The error names
+/// pictures or masks of unequal sizes, a named body model with other joints than the fit's. The error names
 /// file, key, expected and actual value. Files already written are left.
 pub fn import(options: &ImportOptions, out: &Path) -> Result<Imported, CaptureError> {
     let video = Video::list(&options.frames)?;
@@ -100,7 +100,7 @@ pub fn import(options: &ImportOptions, out: &Path) -> Result<Imported, CaptureEr
     }
     let (fit, joined) = read::read(&options.fit, &video)?;
     let tool = fit.tool;
-    let (person, others, continued) = choose(&options.fit, fit.people, options.person.as_deref())?;
+    let (mut person, others, continued) = choose(&options.fit, fit.people, options.person.as_deref())?;
     let gaps_of_video = Some(video.gaps()).filter(|gaps| !gaps.is_empty());
     let mut notes: Vec<String> =
         gaps_of_video.map(|gaps| format!("pictures: numbers without one: {gaps}")).into_iter().collect();
@@ -110,10 +110,14 @@ pub fn import(options: &ImportOptions, out: &Path) -> Result<Imported, CaptureEr
     notes.extend(joined.map(|note| format!("fit: {note}")));
     notes.extend(continued);
     let (body_path, model) = body::find(tool, options.body.as_deref(), &[&options.fit, &options.frames])?;
-    let hands = match tool.hands_at_mean() {
-        Some(true) => body::mean_hands(&body_path)?,
+    let hands = match (tool.hands_at_mean(), &body_path) {
+        (Some(true), Some(path)) => body::mean_hands(path)?,
         _ => Vec::new(),
     };
+    if body_path.is_none() {
+        // Shape coefficients of another body.
+        person.frames.iter_mut().for_each(|frame| frame.betas.clear());
+    }
     let (betas, betas_spread) = robust_mean(person.frames.iter().map(|frame| frame.betas.as_slice()));
     let unfitted = gaps(&person, video.names.len());
     let masks = match &options.masks {
@@ -257,6 +261,9 @@ fn placed(mut frame: FitFrame, betas: &[f64], model: &BodyModel, hands: &[DVec3]
         frame.refocused(focal, own);
     }
     let mut pose = frame.pose.clone();
+    if pose.len() > model.num_joints() {
+        pose.truncate(SHARED);
+    }
     pose.resize(model.num_joints(), DVec3::ZERO);
     if pose.len() == SMPLX && !hands.is_empty() {
         let start = SMPLX - hands.len();
