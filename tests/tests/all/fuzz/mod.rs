@@ -267,9 +267,11 @@ fn tensors() {
 
 /// Up to the body model, which is not there: nothing is written.
 fn imports(fit: &std::path::Path, video: &std::path::Path) -> bool {
-    let options = ImportOptions { frames: video.to_owned(), fit: fit.to_owned(), ..ImportOptions::default() };
+    // The body is read after the fit.
+    let body = Some("no-such-body.npz".into());
+    let options = ImportOptions { frames: video.to_owned(), fit: fit.to_owned(), body, ..ImportOptions::default() };
     let refused = import(&options, &place("imported")).err().map(|error| error.to_string());
-    refused.is_none_or(|error| error.contains("missing body model"))
+    refused.is_none_or(|error| error.contains("no-such-body.npz"))
 }
 
 #[test]
