@@ -62,7 +62,7 @@ fn image_rays(focal: f32) -> Vec<(Vec3, Vec3)> {
         .collect()
 }
 
-/// The whole body in view, of which most rays miss, and the chest filling the image, every ray a
+/// The whole body in view, which most rays miss, and the chest filling the image, every ray a
 /// hit.
 const FOCALS: [f32; 2] = [1.2, 12.0];
 

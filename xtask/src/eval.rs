@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-use anyhow::{Result, ensure};
+use anyhow::{Context, Result, ensure};
 use clap::{Args, ValueEnum};
 use image::RgbImage;
 use indicatif::ProgressBar;
@@ -114,7 +114,8 @@ pub fn eval(arguments: &EvalArguments) -> Result<()> {
         Drawn::Prior(PriorColors::measure(&scene)?)
     } else if run.train.method == Method::Surface {
         avatar = Avatar::load(&baked::path(directory))?;
-        let colors = Person::colors(directory, &source.model)?.unwrap_or_default();
+        let colors = Person::colors(directory, &source.model)?;
+        let colors = colors.with_context(|| format!("{} has no person.safetensors", directory.display()))?;
         Drawn::Avatar { body: &scene.body, light: colors.light, avatar: &avatar }
     } else if baked {
         loaded = Model::load(directory)?;

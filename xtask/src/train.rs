@@ -97,14 +97,7 @@ pub fn train(arguments: &TrainArguments) -> Result<()> {
         say!("stopped; go on with --resume --out {}", directory.display());
         return Ok(());
     };
-    // What less of a model reaches.
-    let mut lesser = Vec::new();
-    if run.train.method != Method::Prior {
-        lesser.push(baseline(Method::Prior, &run, &source, lpips.as_ref())?);
-    }
-    if run.train.method.has_field() {
-        lesser.push(baseline(Method::Surface, &run, &source, lpips.as_ref())?);
-    }
+    let lesser = baselines(&run, &source, lpips.as_ref())?;
     let rows: Vec<_> = lesser.iter().chain([&metrics]).map(|metrics| (metrics.method.clone(), metrics)).collect();
     say!("\n{}:\n{}", metrics.splits.title(), table::markdown(&rows));
     say!("pictures: {}", directory.join("renders").display());
@@ -122,12 +115,16 @@ struct Begun {
     _lock: Lock,
 }
 
-/// Of captures without other cameras, one frame in `HELD_OUT` is held out for scoring.
-const HELD_OUT: usize = 10;
+/// Stride of the frames held out for scoring of captures without other cameras.
+const HOLD_OUT: usize = 10;
 
 /// A new run.
 fn begun(arguments: &TrainArguments, name: &str) -> Result<Begun> {
     let mut config = arguments.settings.config()?;
+    let unused = [("--preview", arguments.preview), ("--stop-after", arguments.stop_after.is_some())];
+    if let Some((option, _)) = unused.iter().find(|(_, given)| *given && !config.method.has_field()) {
+        bail!("{option}: the method {} takes no steps", config.method.name());
+    }
     // Found missing now, not after registration.
     let weights = Path::new(&config.loss.perceptual_weights);
     ensure!(weights.as_os_str().is_empty() || weights.exists(), "{}: no such weights", weights.display());
@@ -136,9 +133,9 @@ fn begun(arguments: &TrainArguments, name: &str) -> Result<Begun> {
     let steps = arguments.settings.steps.map(|_| "steps=".to_owned());
     let set: Vec<String> = arguments.settings.set.iter().cloned().chain(steps).collect();
     let is_given = set.iter().any(|set| set.starts_with("held_out="));
-    if source.capture.eval.is_empty() && source.capture.train.len() >= 2 * HELD_OUT && !is_given {
-        config.held_out = HELD_OUT;
-        say!("no other camera: every {HELD_OUT}th frame is scored, and nothing is learnt from it (--set held_out=0)");
+    if source.capture.eval.is_empty() && source.capture.train.len() >= 2 * HOLD_OUT && !is_given {
+        config.held_out = HOLD_OUT;
+        say!("no other camera: every {HOLD_OUT}th frame is scored, and nothing is learnt from it (--set held_out=0)");
     }
     let chosen = capacity::choose(&source, &config, &set, arguments.capacity)?;
     if let Some(capacity) = &chosen {
@@ -362,23 +359,31 @@ pub fn finished(directory: &Path, config: &Config) -> Result<Option<Metrics>> {
     Ok(Some(metrics).filter(|_| whole && RunConfig::read(directory).is_ok_and(|run| run.train == *config)))
 }
 
-/// The scores of a method without a field on the same frames, as the main split has them.
-fn baseline(method: Method, run: &RunConfig, source: &Source, lpips: Option<&Lpips>) -> Result<Metrics> {
-    let mut run = run.clone();
-    run.train.method = method;
+/// What less of a model reaches on the same frames: the scores of the prior and, of a field, of the
+/// surface.
+fn baselines(run: &RunConfig, source: &Source, lpips: Option<&Lpips>) -> Result<Vec<Metrics>> {
+    let method = run.train.method;
+    if method == Method::Prior {
+        return Ok(Vec::new());
+    }
     let scene = source.scene(&run.train)?;
     let start = Instant::now();
     let colors = scene.colors()?;
-    let avatar;
-    let drawn = if method == Method::Surface {
-        avatar = fit(&scene, &BakeOptions::default())?.0;
-        Drawn::Avatar { body: &scene.body, light: colors.light, avatar: &avatar }
-    } else {
-        Drawn::Prior(colors.clone())
-    };
-    let mut metrics = unscored(&run, &drawn, start.elapsed().as_secs_f64());
-    metrics.lpips = network_name(lpips);
+    let seconds = start.elapsed().as_secs_f64();
     let split = if scene.eval.is_empty() { Split::TrainView } else { Split::NovelView };
-    *split.of(&mut metrics.splits) = Some(drawn.score(&scene, split, lpips, 1, |_, _| {})?);
-    Ok(metrics)
+    let scored = |method: Method, drawn: &Drawn<'_>, seconds: f64| -> Result<Metrics> {
+        let mut run = run.clone();
+        run.train.method = method;
+        let mut metrics = unscored(&run, drawn, seconds);
+        metrics.lpips = network_name(lpips);
+        *split.of(&mut metrics.splits) = Some(drawn.score(&scene, split, lpips, 1, |_, _| {})?);
+        Ok(metrics)
+    };
+    let mut all = vec![scored(Method::Prior, &Drawn::Prior(colors.clone()), seconds)?];
+    if method.has_field() {
+        let (avatar, report) = fit(&scene, &BakeOptions::default())?;
+        let drawn = Drawn::Avatar { body: &scene.body, light: colors.light, avatar: &avatar };
+        all.push(scored(Method::Surface, &drawn, seconds + report.seconds)?);
+    }
+    Ok(all)
 }

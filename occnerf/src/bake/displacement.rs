@@ -15,9 +15,10 @@ use crate::Error;
 use crate::capture::Light;
 use crate::model::subdivide::Subdivided;
 use crate::model::view::PosedView;
+use crate::scene::light::{ColorObservation, albedo};
 use crate::scene::plate::{Plate, Term};
 use crate::scene::prepared::Scene;
-use crate::scene::registration::{Crop, Edge, ObservationOptions, Observations, observe, robust, shared_edges};
+use crate::scene::registration::{Crop, Edge, ObservationOptions, Observations, noise, observe, robust, shared_edges};
 
 /// Gauss-Newton steps, and those of them with outline residuals alone.
 const ROUNDS: usize = 5;
@@ -31,8 +32,7 @@ const BLUR: [f32; 2] = [2.0, 0.5];
 /// Standard deviation of an outline residual, pixels: so small that an outline follows the median of the
 /// frames, not the mean.
 const OUTLINE: f32 = 0.15;
-/// Standard deviation of a colour residual at least, and weight of colour residuals.
-const COLOR: f32 = 0.05;
+/// Weight of colour residuals.
 const COLOR_WEIGHT: f32 = 2.0;
 /// Standard deviation of the heights' Laplacian, in edge lengths.
 const BEND: f32 = 0.08;
@@ -41,17 +41,11 @@ const SPREAD: f32 = 0.05;
 /// Lowest and highest surface, normalised metres.
 const RANGE: [f32; 2] = [-0.03, 0.12];
 
-/// A vertex's colour in one frame.
-struct Shown {
-    vertex: u32,
-    color: Vec3,
-    shade: f32,
-    /// Derivative of the colour by the height, a component a channel.
-    change: Vec3,
-}
+/// A vertex's colour in one frame, and its derivative by the height, a component a channel.
+type Shown = (ColorObservation, Vec3);
 
 /// Heights of the vertices of `mesh` over their `feet` (V) that explain the frames under `light`,
-/// starting from `heights`.
+/// starting from those of `prior` (V).
 ///
 /// # Errors
 /// Pictures that cannot be read.
@@ -62,8 +56,8 @@ pub(super) fn displacements(
     feet: &[NormalRay],
     prior: &[f32],
 ) -> Result<Vec<f32>, Error> {
-    let every = scene.learnt.len().div_ceil(MOST_FRAMES).max(1);
-    let frames: Vec<usize> = scene.learnt.iter().copied().step_by(every).collect();
+    let stride = scene.learnt.len().div_ceil(MOST_FRAMES).max(1);
+    let frames: Vec<usize> = scene.learnt.iter().copied().step_by(stride).collect();
     let crop = |&frame: &usize| {
         let frame = &scene.train[frame];
         Ok(Crop::new(&frame.view.camera, &frame.pixels()?, &frame.view.posed.vertices))
@@ -83,7 +77,7 @@ pub(super) fn displacements(
             let Some(crop) = crop else { return Ok((Vec::new(), Vec::new())) };
             let (vertices, up) = raised(scene, &scene.train[frame].view, mesh, feet, &heights);
             let observed = observe(crop, &vertices, (&mesh.faces, &edges), options)?;
-            Ok(terms(&observed, &up, light))
+            Ok(terms(&observed, &up))
         };
         let looked = frames.par_iter().zip(&crops).map(look).collect::<Result<Vec<_>, Error>>()?;
         let mut sums: Vec<Term> = vec![(0.0, 0.0); heights.len()];
@@ -92,7 +86,7 @@ pub(super) fn displacements(
             *sum = (sum.0 + precision, sum.1 + pull);
         }
         let shown: Vec<&Shown> = looked.iter().flat_map(|(_, shown)| shown).collect();
-        add_colors(&shown, blur, &mut sums);
+        add_colors(&shown, light, blur, &mut sums);
         for ((sum, height), prior) in sums.iter_mut().zip(&heights).zip(prior) {
             let precision = (SPREAD * SPREAD).recip();
             *sum = (sum.0 + precision, sum.1 + precision * (prior - height));
@@ -127,59 +121,50 @@ fn raised(
 }
 
 /// Outline terms of the vertices, and their colours, of one frame.
-fn terms(observed: &Observations, up: &[Vec3], light: Light) -> (Vec<(u32, f32, f32)>, Vec<Shown>) {
+fn terms(observed: &Observations, up: &[Vec3]) -> (Vec<(u32, f32, f32)>, Vec<Shown>) {
     let outline = |&Edge { vertex, distance, gradient, .. }: &Edge| {
         let slope = gradient.dot(up[vertex as usize]);
         let weight = robust(distance * distance, OUTLINE) / (OUTLINE * OUTLINE);
         (vertex, weight * slope * slope, weight * slope * distance)
     };
-    let shown = |((vertex, color, normal), jacobian): (&(u32, Vec3, Vec3), &[Vec3; 3])| Shown {
-        vertex: *vertex,
-        color: *color,
-        shade: light.on(*normal),
-        change: Vec3::from(jacobian.map(|row| row.dot(up[*vertex as usize]))),
+    let shown = |(seen, jacobian): (&ColorObservation, &[Vec3; 3])| {
+        (*seen, Vec3::from(jacobian.map(|row| row.dot(up[seen.0 as usize]))))
     };
     (observed.edges.iter().map(outline).collect(), observed.colors.iter().zip(&observed.jacobians).map(shown).collect())
 }
 
+/// Normal equations of a vertex: its height and its albedo.
+#[derive(Clone, Copy, Default)]
+struct Block {
+    height: f32,
+    /// A component a channel.
+    mixed: Vec3,
+    albedo: f32,
+    /// Weighted residuals by the height, and by the albedo, a component a channel.
+    pull: f32,
+    sum: Vec3,
+}
+
 /// Adds the colour terms, with the albedo of each vertex eliminated.
-fn add_colors(shown: &[&Shown], blur: f32, sums: &mut [Term]) {
-    if shown.is_empty() {
-        return;
-    }
-    let mut albedo = vec![(Vec3::ZERO, 0.0f32); sums.len()];
-    for seen in shown {
-        let sum = &mut albedo[seen.vertex as usize];
-        *sum = (sum.0 + seen.shade * seen.color, sum.1 + seen.shade * seen.shade);
-    }
-    let residual = |seen: &Shown, albedo: &[(Vec3, f32)]| {
-        let (sum, squares) = albedo[seen.vertex as usize];
-        seen.color - seen.shade * sum / squares.max(f32::MIN_POSITIVE)
+fn add_colors(shown: &[&Shown], light: Light, blur: f32, sums: &mut [Term]) {
+    let albedo = albedo(shown.iter().map(|(seen, _)| seen), sums.len(), light);
+    let residual = |(vertex, color, normal): &ColorObservation| {
+        let (sum, squares) = albedo[*vertex as usize];
+        *color - light.on(*normal) * sum / squares.max(f32::MIN_POSITIVE)
     };
-    let mut errors: Vec<f32> = shown.iter().map(|seen| residual(seen, &albedo).abs().element_sum() / 3.0).collect();
-    let middle = errors.len() / 2;
-    let noise = (1.48 * *errors.select_nth_unstable_by(middle, f32::total_cmp).1).max(COLOR);
-    // Normal equations of the height and of the albedo of each vertex, by channel.
-    #[derive(Clone, Copy, Default)]
-    struct Block {
-        height: f32,
-        mixed: Vec3,
-        albedo: f32,
-        pull: f32,
-        sum: Vec3,
-    }
+    let Some(noise) = noise(shown.iter().map(|(seen, _)| residual(seen))) else { return };
     let mut blocks = vec![Block::default(); sums.len()];
     // Neighbouring residuals are correlated under a blur.
     let scale = COLOR_WEIGHT / (noise * noise * (1.0 + blur * blur));
-    for seen in shown {
-        let residual = residual(seen, &albedo);
+    for (seen, change) in shown {
+        let (residual, shade) = (residual(seen), light.on(seen.2));
         let weight = scale * robust(residual.length_squared(), noise);
-        let block = &mut blocks[seen.vertex as usize];
-        block.height += weight * seen.change.length_squared();
-        block.mixed += weight * seen.shade * seen.change;
-        block.albedo += weight * seen.shade * seen.shade;
-        block.pull += weight * seen.change.dot(residual);
-        block.sum += weight * seen.shade * residual;
+        let block = &mut blocks[seen.0 as usize];
+        block.height += weight * change.length_squared();
+        block.mixed += weight * shade * *change;
+        block.albedo += weight * shade * shade;
+        block.pull += weight * change.dot(residual);
+        block.sum += weight * shade * residual;
     }
     // The model is shade · albedo = colour + change · step.
     for (sum, block) in sums.iter_mut().zip(&blocks).filter(|(_, block)| block.albedo > 0.0) {
@@ -200,27 +185,30 @@ mod tests {
         #[test]
         fn the_albedo_is_eliminated_exactly(
             frames in prop::collection::vec(
-                (prop::array::uniform3(0.0f32..1.0), 0.5f32..1.5, prop::array::uniform3(-5.0f32..5.0)), 2..7),
+                (prop::array::uniform3(0.0f32..1.0), -1.0f32..1.0, prop::array::uniform3(-5.0f32..5.0)), 2..7),
         ) {
-            let shown: Vec<Shown> = frames.iter().map(|&(color, shade, change)| {
-                Shown { vertex: 0, color: color.into(), shade, change: change.into() }
+            let light = Light { slope: 0.5 * Vec3::X };
+            let shown: Vec<Shown> = frames.iter().map(|&(color, x, change)| {
+                let normal = Vec3::new(x, (1.0 - x * x).sqrt(), 0.0);
+                ((0, color.into(), normal), change.into())
             }).collect();
             let mut sums = [(0.0, 0.0)];
-            add_colors(&shown.iter().collect::<Vec<_>>(), 0.0, &mut sums);
+            add_colors(&shown.iter().collect::<Vec<_>>(), light, 0.0, &mut sums);
+            let shade = |(seen, _): &Shown| light.on(seen.2);
             let (sum, squares) = shown.iter().fold((Vec3::ZERO, 0.0), |(sum, squares), s| {
-                (sum + s.shade * s.color, squares + s.shade * s.shade)
+                (sum + shade(s) * s.0.1, squares + shade(s) * shade(s))
             });
-            let residual = |s: &Shown| s.color - s.shade * sum / squares;
+            let residual = |s: &Shown| s.0.1 - shade(s) * sum / squares;
             let mut errors: Vec<f32> = shown.iter().map(|s| residual(s).abs().element_sum() / 3.0).collect();
             errors.sort_by(f32::total_cmp);
-            let noise = (1.48 * errors[errors.len() / 2]).max(COLOR);
+            let noise = (1.48 * errors[errors.len() / 2]).max(0.05);
             let (mut matrix, mut vector) = (Matrix4::<f64>::zeros(), Vector4::<f64>::zeros());
             for s in &shown {
                 let weight = f64::from(COLOR_WEIGHT / (noise * noise) * robust(residual(s).length_squared(), noise));
                 for channel in 0..3 {
                     // The residual, shade · albedo − colour, by the albedo and by the height.
                     let mut row = Vector4::zeros();
-                    (row[0], row[1 + channel]) = (-f64::from(s.change[channel]), f64::from(s.shade));
+                    (row[0], row[1 + channel]) = (-f64::from(s.1[channel]), f64::from(shade(s)));
                     matrix += weight * row * row.transpose();
                     vector += weight * f64::from(residual(s)[channel]) * row;
                 }

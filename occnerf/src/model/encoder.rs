@@ -238,7 +238,7 @@ fn surface_coordinates(v: Vec3, d: f32, region: &Aabb, (low, high): (f32, f32)) 
     [p.x, p.y, p.z, (d.clamp(low, high) - low) / (high - low)]
 }
 
-/// Makes a buffer of `len` values, all of which the caller writes. It grows by an eighth, where a
+/// Makes a buffer of `len` values, which the caller writes. It grows by an eighth, where a
 /// vector doubles: features are the largest array of a segment of samples.
 pub(crate) fn fit(buffer: &mut Vec<f32>, len: usize) {
     if buffer.capacity() < len {

@@ -60,7 +60,7 @@ impl Plate {
             let bent = self.gradient(x);
             bent.iter().zip(terms).zip(x).map(|((bent, term), x)| bent + term.0 * x).collect()
         };
-        conjugate_gradients(apply, &pulls, &diagonal, ITERATIONS, |a, b| f64::from(a * b))
+        conjugate_gradients(apply, &pulls, &diagonal, ITERATIONS)
     }
 }
 

@@ -13,7 +13,7 @@ const METHODS: [Method; 2] = [Method::Occnerf, Method::HashPoint];
 const SIZES: [&str; 6] =
     ["encoding.n_max", "encoding.levels", "encoding.log2_table_size", "field.width", "samples", "steps"];
 
-/// The most that a scene is given of a size of which its preset has `preset`.
+/// Largest size that a scene is given, for `preset` in its preset.
 fn most(key: &str, preset: f64) -> f64 {
     match key {
         "encoding.n_max" => preset.max(2048.0),

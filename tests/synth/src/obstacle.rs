@@ -76,7 +76,7 @@ impl Obstacle {
         Ok(())
     }
 
-    /// The rows that it hides of `frames`, all of which are of this size.
+    /// The rows that it hides of `frames`, all of this size.
     fn rows(&self, frames: &[Frame], (width, height): (u32, u32)) -> Result<Range<u32>, CaptureError> {
         if self.height >= 1.0 {
             return Ok(0..height);

@@ -112,7 +112,7 @@ mod tests {
 
     use super::*;
 
-    /// `FUZZ` inputs of all readers, of which this one's share is a hundredth; 200 by default.
+    /// `FUZZ` inputs of all readers; this one takes a hundredth; 200 by default.
     #[test]
     fn damaged_logs_are_drawn_or_refused_in_a_second() {
         const PIECES: [&[u8]; 18] = [

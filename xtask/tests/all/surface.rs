@@ -38,6 +38,7 @@ fn a_surface_is_trained_scored_drawn_exported_and_shown() {
     done(&["render", text(&run), "freeview", "--baked", "--size", "16x16"]);
     assert_eq!(scores(&done(&["eval", text(&run), "--baked"])), scores(&said));
     refused(&["train", "--method", "surface", "--steps", "9"], &["--steps 9: the method surface takes no steps"]);
+    refused(&["train", "--method", "surface", "--preview"], &["--preview: the method surface takes no steps"]);
     std::fs::write(&avatar, b"damaged").unwrap();
     refused(&["export", text(&run), "--out", text(&run.join("again.glb"))], &["avatar.safetensors"]);
     std::fs::remove_file(&avatar).unwrap();

@@ -44,7 +44,7 @@ pub(super) fn read(path: &Path, results: &Value, video: &Video) -> Result<Fit, C
     Ok(Fit { tool: Tool::Romp, people: people.into_values().collect(), names: Some(names) })
 }
 
-/// Ids of people at these places, where the file has none: of whoever was last seen nearest, within two
+/// Ids of people at these places, where the file has none: of the person last seen nearest, within two
 /// metres.
 fn tracked(places: &[Vec<f64>], last: &mut BTreeMap<i64, DVec3>) -> Vec<i64> {
     const METRES: f64 = 2.0;

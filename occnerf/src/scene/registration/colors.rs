@@ -28,12 +28,8 @@ impl Colors {
         let sums = albedo(seen(), vertices, light);
         let albedo = sums.iter().zip(counts).map(|(&(sum, squares), n)| (sum / squares.max(f32::MIN_POSITIVE), n));
         let mut colors = Self { albedo: albedo.collect(), light, noise: 1.0 };
-        let mut errors: Vec<f32> =
-            seen().filter_map(|seen| Some(colors.residual(seen)?.abs().element_sum() / 3.0)).collect();
-        if !errors.is_empty() {
-            let middle = errors.len() / 2;
-            // 1.48 scales a median absolute deviation to a normal distribution's σ.
-            colors.noise = (1.48 * *errors.select_nth_unstable_by(middle, f32::total_cmp).1).max(NOISE);
+        if let Some(noise) = noise(seen().filter_map(|seen| colors.residual(seen))) {
+            colors.noise = noise;
         }
         colors
     }
@@ -49,6 +45,16 @@ impl Colors {
         let turn = self.light.change(*normal).cross(*normal);
         self.albedo[*vertex as usize].0.to_array().map(|albedo| albedo * turn)
     }
+}
+
+/// Robust standard deviation of colour residuals (scaled median absolute deviation), at least
+/// [`NOISE`]; `None` for no residuals.
+pub(crate) fn noise(residuals: impl Iterator<Item = Vec3>) -> Option<f32> {
+    let mut errors: Vec<f32> = residuals.map(|residual| residual.abs().element_sum() / 3.0).collect();
+    let middle = errors.len() / 2;
+    let median = if errors.is_empty() { None } else { Some(*errors.select_nth_unstable_by(middle, f32::total_cmp).1) };
+    // 1.48 scales a median absolute deviation to a normal distribution's σ.
+    median.map(|median| (1.48 * median).max(NOISE))
 }
 
 #[cfg(test)]

@@ -34,7 +34,7 @@ impl Output {
         self.numbers(key, shape, values)
     }
 
-    /// Numbers of which some may be infinite or NaN.
+    /// Numbers, possibly infinite or NaN.
     pub fn numbers(&mut self, key: &str, shape: &[usize], values: Vec<f32>) -> Result<()> {
         self.push(key, shape, Data::F32(values))
     }

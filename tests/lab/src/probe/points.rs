@@ -12,7 +12,7 @@ use super::output::{Output, count};
 /// Most levels of a pyramid.
 const MAX_LEVELS: i64 = 32;
 
-/// Points of which there must be some.
+/// Points, at least one.
 fn some_points(input: &mut Input) -> Result<Vec<Vec3>> {
     let points = input.points("points")?;
     ensure!(!points.is_empty(), input.wrong("points", "holds no points"));

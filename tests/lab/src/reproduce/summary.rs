@@ -148,8 +148,11 @@ impl<'a> Summary<'a> {
         for entry in self.rows.iter().filter(|entry| self.table.shown().contains(&&*entry.name)) {
             let splits: Vec<&SplitMetrics> = entry.runs.iter().filter_map(|m| Some(m.splits.first()?.1)).collect();
             let seconds = entry.runs.iter().map(|m| m.train_seconds).sum::<f64>() / entry.runs.len() as f64;
+            // RESULTS has the standard deviations.
             let mean = |pick: fn(&SplitMetrics) -> Option<f64>, digits: usize| {
-                cell(&splits.iter().filter_map(|s| pick(s)).collect::<Vec<_>>(), digits)
+                let values: Vec<f64> = splits.iter().filter_map(|s| pick(s)).collect();
+                let mean = values.iter().sum::<f64>() / values.len() as f64;
+                cell(if values.is_empty() { &[] } else { std::slice::from_ref(&mean) }, digits)
             };
             // The column beside it says what hidden pixels are taken for.
             let name = entry.name.trim_end_matches("-bg").to_owned();
