@@ -1,7 +1,7 @@
 //! `bench`: what every approximation costs and is worth, and where methods break.
 
 mod axes;
-mod baked;
+mod baking;
 pub mod chart;
 mod cost;
 mod difficulty;
@@ -18,7 +18,7 @@ use anyhow::{Result, bail, ensure};
 use clap::{Args, Subcommand};
 use occnerf::capture::Layout;
 
-pub use self::baked::Baking;
+pub use self::baking::Baking;
 pub use self::difficulty::Difficulty;
 use crate::results::{self, Section};
 use crate::sweep::{Line, Place, Runner, SittingArguments, job};
@@ -51,8 +51,6 @@ enum What {
     /// Where the time of a step goes, and how time and memory grow with rays, samples, table,
     /// vertices, frames and pixels.
     Cost(CostArguments),
-    /// A run's baked person against its field: a table of scores and speeds, and pictures.
-    Baked(baked::BakedArguments),
     /// What registration makes of wrong priors: degrees and millimetres against the demo's true
     /// bodies.
     Registration(registration::RegistrationArguments),
@@ -136,7 +134,6 @@ struct KernelArguments {
 /// Runs the command.
 pub fn bench(arguments: &BenchArguments) -> Result<()> {
     match &arguments.what {
-        What::Baked(arguments) => baked::baked(arguments),
         What::Registration(arguments) => registration::registration(arguments),
         What::Pareto(arguments) => pareto(arguments),
         What::Stability(arguments) => stability(arguments),
