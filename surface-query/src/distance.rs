@@ -97,7 +97,7 @@ impl MeshDistance {
     pub fn new(vertices: &[Vec3], faces: &[[u32; 3]]) -> Result<Self, Error> {
         check_mesh(vertices, faces)?;
         if faces.is_empty() {
-            return Err(Error::NoFaces);
+            return Err(Error("no faces".to_owned()));
         }
         let scale = power_of_two_scale(vertices);
         let scaled: Vec<Vec3> = vertices.iter().map(|v| *v * scale).collect();
@@ -124,13 +124,8 @@ impl MeshDistance {
     /// # Panics
     /// If the number of vertices changes.
     pub fn refit(&mut self, vertices: &[Vec3]) {
-        assert_eq!(
-            vertices.len(),
-            self.vertices.len(),
-            "refit: {} vertices, the mesh has {}",
-            vertices.len(),
-            self.vertices.len()
-        );
+        let (found, expected) = (vertices.len(), self.vertices.len());
+        assert_eq!(found, expected, "refit: {found} vertices, the mesh has {expected}");
         self.scale = power_of_two_scale(vertices);
         for (scaled, v) in self.vertices.iter_mut().zip(vertices) {
             *scaled = *v * self.scale;
