@@ -56,13 +56,8 @@ impl VisibilityCounts {
     /// # Panics
     /// If `visible` does not have an entry per vertex.
     pub fn add_visible(&mut self, visible: &[bool]) {
-        assert_eq!(
-            visible.len(),
-            self.counts.len(),
-            "add_visible: {} flags for {} vertices",
-            visible.len(),
-            self.counts.len()
-        );
+        let (flags, vertices) = (visible.len(), self.counts.len());
+        assert_eq!(flags, vertices, "add_visible: {flags} flags for {vertices} vertices");
         for (count, &seen) in self.counts.iter_mut().zip(visible) {
             *count = count.saturating_add(u64::from(seen));
         }

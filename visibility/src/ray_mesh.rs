@@ -177,48 +177,33 @@ impl RayMesh {
             &mut spill
         };
         let mut height = 0;
-        let mut node = 0u32;
-        loop {
-            let n = &self.tree.nodes[node as usize];
-            let t = n.entry(ray.origin, ray.inverse, end);
+        let mut next = Some(0u32);
+        while let Some(node) = next.take() {
+            let node = &self.tree.nodes[node as usize];
+            let t = node.entry(ray.origin, ray.inverse, end);
             let near = usize::from(t[1] < t[0]);
-            let far = 1 - near;
-            let mut next = None;
-            // Boxes at exactly the depth of the hit may hold a face of lower index.
-            if t[near] <= end && t[near] < f32::INFINITY {
-                match n.child(near) {
-                    Child::Leaf(leaf) => match visit(leaf as usize) {
-                        Some(new) => end = new,
-                        None => return,
-                    },
-                    Child::Node(child) => next = Some(child),
+            for side in [near, 1 - near] {
+                // Boxes at exactly the depth of the hit may hold a face of lower index.
+                if t[side] > end || t[side] == f32::INFINITY {
+                    continue;
                 }
-            }
-            if t[far] <= end && t[far] < f32::INFINITY {
-                match n.child(far) {
+                match node.child(side) {
                     Child::Leaf(leaf) => match visit(leaf as usize) {
                         Some(new) => end = new,
                         None => return,
                     },
                     Child::Node(child) if next.is_none() => next = Some(child),
                     Child::Node(child) => {
-                        stack[height] = (t[far], child);
+                        stack[height] = (t[side], child);
                         height += 1;
                     }
                 }
             }
-            node = match next {
-                Some(child) => child,
-                None => loop {
-                    if height == 0 {
-                        return;
-                    }
-                    height -= 1;
-                    if stack[height].0 <= end {
-                        break stack[height].1;
-                    }
-                },
-            };
+            while next.is_none() && height > 0 {
+                height -= 1;
+                let (t, child) = stack[height];
+                next = (t <= end).then_some(child);
+            }
         }
     }
 }

@@ -95,17 +95,10 @@ impl View {
 /// If `usable` does not have `width · height` entries.
 #[must_use]
 pub fn visible_vertices(mesh: &RayMesh, vertices: &[Vec3], view: &View, usable: Option<&[bool]>) -> Vec<bool> {
-    let pixels = view.width as usize * view.height as usize;
-    if let Some(usable) = usable {
-        assert_eq!(
-            usable.len(),
-            pixels,
-            "visible_vertices: {} usable flags for {} × {} pixels",
-            usable.len(),
-            view.width,
-            view.height
-        );
-    }
+    let View { width, height, .. } = *view;
+    let pixels = width as usize * height as usize;
+    let flags = usable.map_or(pixels, <[bool]>::len);
+    assert_eq!(flags, pixels, "visible_vertices: {flags} usable flags for {width} × {height} pixels");
     let Some(centre) = view.centre_of_projection() else {
         return vec![false; vertices.len()];
     };
@@ -114,10 +107,7 @@ pub fn visible_vertices(mesh: &RayMesh, vertices: &[Vec3], view: &View, usable: 
         .enumerate()
         .with_min_len(256)
         .map(|(i, &v)| {
-            let Some(pixel) = view.pixel(v) else {
-                return false;
-            };
-            if usable.is_some_and(|usable| !usable[pixel]) {
+            if view.pixel(v).is_none_or(|pixel| usable.is_some_and(|usable| !usable[pixel])) {
                 return false;
             }
             let own = mesh.is_vertex(i, v);

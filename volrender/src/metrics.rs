@@ -71,13 +71,13 @@ const BORDER: usize = WINDOW / 2;
 /// ```
 ///
 /// # Errors
-/// [`Error::ImageSize`] for an image smaller than the window.
+/// An image smaller than the window.
 ///
 /// # Panics
 /// If the lengths are not 3·H·W.
 pub fn ssim(a: &[f32], b: &[f32], width: usize, height: usize) -> Result<f64, Error> {
     if width < WINDOW || height < WINDOW {
-        return Err(Error::ImageSize { width, height, least: WINDOW });
+        return Err(Error::image_size(width, height, WINDOW));
     }
     let map = ssim_map(a, b, width, height);
     let rows = map.chunks_exact(width).take(height - BORDER).skip(BORDER);

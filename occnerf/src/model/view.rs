@@ -69,7 +69,7 @@ impl PosedView {
     pub(crate) fn silhouette(&self, faces: &[[u32; 3]]) -> Result<Vec<bool>, Error> {
         let vertices = &self.posed.vertices;
         if let Some(vertex) = vertices.iter().position(|v| !v.is_finite()) {
-            return Err(visibility::Error::NotFinite { vertex }.into());
+            return Err(visibility::Error(format!("vertex {vertex} is not finite")).into());
         }
         Ok(silhouette(vertices, faces, &self.camera)?)
     }

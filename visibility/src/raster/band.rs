@@ -2,9 +2,9 @@
 
 use glam::{DVec3, Vec3};
 
-use super::fragment::{Fragment, Pixel};
 use super::project::{Projected, Projection, STEP};
 use super::triangle::{BAND, Chunk, Triangle};
+use super::{Fragment, Pixel};
 
 /// Samples of a row that are tested together.
 const LANES: usize = 8;

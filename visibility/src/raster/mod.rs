@@ -5,12 +5,93 @@
 
 mod band;
 mod clip;
-mod fragment;
-mod options;
 mod project;
 mod rasterizer;
 mod triangle;
 
-pub use fragment::{Fragment, Pixel};
-pub use options::{RasterOptions, Samples};
 pub use rasterizer::Rasterizer;
+
+/// Settings of the rasteriser.
+///
+/// ```
+/// use visibility::{RasterOptions, Samples};
+///
+/// // A closed mesh in millimetres, antialiased.
+/// let options = RasterOptions { samples: Samples::Four, cull_back: true, near: 1.0 };
+/// ```
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct RasterOptions {
+    /// Samples a pixel.
+    pub samples: Samples,
+    /// Culls triangles that are clockwise in the image: the inside of closed meshes.
+    pub cull_back: bool,
+    /// Depth of the near plane, in the units of the vertices; above 0.
+    pub near: f32,
+}
+
+impl Default for RasterOptions {
+    /// One sample a pixel, no culling, near plane at 10⁻⁴ units.
+    fn default() -> Self {
+        Self { samples: Samples::One, cull_back: false, near: 1e-4 }
+    }
+}
+
+/// Samples of a pixel.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Samples {
+    /// At its centre.
+    One,
+    /// At the centres of its four quarters, row by row.
+    Four,
+}
+
+impl Samples {
+    fn per_side(self) -> u32 {
+        match self {
+            Self::One => 1,
+            Self::Four => 2,
+        }
+    }
+}
+
+/// The visible point of a sample, of one layer.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Fragment {
+    /// Index of the face, counted through all layers.
+    pub face: u32,
+    /// Depth: the z coordinate in the camera frame.
+    pub depth: f32,
+    /// Perspective-correct barycentric coordinates: non-negative, sum 1.
+    pub barycentric: [f32; 3],
+}
+
+/// The samples of a pixel, as [`crate::Rasterizer::draw`] passes them to the shader.
+///
+/// ```
+/// use visibility::Pixel;
+///
+/// /// Share of the pixel that the mesh covers.
+/// fn coverage(pixel: Pixel<'_>) -> f32 {
+///     let count = pixel.samples().len().max(1);
+///     pixel.samples().filter(|sample| !sample.is_empty()).count() as f32 / count as f32
+/// }
+/// # let _ = coverage;
+/// ```
+#[derive(Clone, Copy, Debug)]
+pub struct Pixel<'a> {
+    /// Row-major index of the pixel.
+    pub index: usize,
+    fragments: &'a [Fragment],
+    /// Number of fragments of every sample; empty if all samples are.
+    counts: &'a [usize],
+    layers: usize,
+}
+
+impl Pixel<'_> {
+    /// The fragments of every sample, nearest first, at most one a layer. No samples at all for a
+    /// pixel without fragments.
+    #[inline]
+    pub fn samples(&self) -> impl ExactSizeIterator<Item = &[Fragment]> {
+        self.counts.iter().zip(self.fragments.chunks_exact(self.layers.max(1))).map(|(&n, sample)| &sample[..n])
+    }
+}

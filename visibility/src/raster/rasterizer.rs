@@ -4,10 +4,9 @@ use glam::Vec3;
 use rayon::prelude::*;
 
 use super::band::Band;
-use super::fragment::{Fragment, Pixel};
-use super::options::{RasterOptions, Samples};
 use super::project::{Projected, Projection};
 use super::triangle::{BAND, CHUNK, Chunk};
+use super::{Fragment, Pixel, RasterOptions, Samples};
 use crate::error::Error;
 use crate::view::View;
 
@@ -53,8 +52,8 @@ impl Rasterizer {
     /// depend on its size.
     ///
     /// # Errors
-    /// [`Error::FaceIndex`]; [`Error::ImageSize`] for more than 16384 samples a row or column;
-    /// [`Error::TooMany`].
+    /// A face with an index outside `vertices`; more than 16384 samples a row or column, or 2³¹
+    /// vertices and faces.
     ///
     /// # Panics
     /// If `out` does not have `width · height` entries.
@@ -72,11 +71,13 @@ impl Rasterizer {
         let side = options.samples.per_side();
         let most = MOST_SAMPLES / side;
         if view.width > most || view.height > most {
-            return Err(Error::ImageSize { width: view.width, height: view.height, most });
+            let (width, height) = (view.width, view.height);
+            let limit = format!("at most {most} × {most} are supported");
+            return Err(Error(format!("an image of {width} × {height} pixels, {limit}")));
         }
         let count = layers.iter().map(|faces| faces.len()).fold(vertices.len(), usize::saturating_add);
         if count > 1 << 31 {
-            return Err(Error::TooMany { count });
+            return Err(Error::too_many(count));
         }
         if out.is_empty() {
             return Ok(());

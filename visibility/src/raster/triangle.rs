@@ -62,11 +62,8 @@ impl Chunk {
             let mut corners = [&projected[..0]; 3];
             for (corner, &vertex) in corners.iter_mut().zip(face) {
                 let at = vertex as usize;
-                *corner = projected.get(at..=at).ok_or(Error::FaceIndex {
-                    face: self.range.start + i,
-                    vertex,
-                    vertices: projected.len(),
-                })?;
+                let outside = || Error::face_index(self.range.start + i, vertex, projected.len());
+                *corner = projected.get(at..=at).ok_or_else(outside)?;
             }
             let [a, b, c] = corners.map(|corner| &corner[0]);
             let index = (self.first + i) as u32;
