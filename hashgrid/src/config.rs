@@ -13,16 +13,6 @@ const MAX_PARAMETERS: u64 = 1 << 31;
 /// N_l = ⌊n_min · b^l⌋ with b = (n_max / n_min)^(1 / (levels − 1)) (Müller et al. 2022, eq. 2 and
 /// 3); the first and the last level are exactly `n_min` and `n_max`. With one level, only `n_min`
 /// is used.
-///
-/// ```
-/// use hashgrid::{HashGrid, HashGridConfig};
-///
-/// // The paper's settings for a 3-D scene: growth b = 1.38.
-/// let config = HashGridConfig { levels: 16, features: 2, log2_table_size: 19, n_min: 16, n_max: 2048 };
-/// let grid = HashGrid::<3>::new(&config)?;
-/// assert_eq!(grid.resolutions()[..4], [16, 22, 30, 42]);
-/// # Ok::<(), hashgrid::Error>(())
-/// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct HashGridConfig {
     /// L: number of levels, 1 to 64.

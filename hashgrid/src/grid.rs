@@ -87,13 +87,11 @@ impl<const D: usize> HashGrid<D> {
     }
 
     /// Length of the flat table.
-    #[must_use]
     pub fn num_parameters(&self) -> usize {
         self.level_range(self.levels.len() - 1).end
     }
 
     /// L·F, the number of features of one point.
-    #[must_use]
     pub fn num_features(&self) -> usize {
         self.levels.len() * self.features
     }
@@ -102,26 +100,22 @@ impl<const D: usize> HashGrid<D> {
     ///
     /// # Panics
     /// If there is no such level.
-    #[must_use]
     pub fn level_range(&self, level: usize) -> Range<usize> {
         let Level { start, rows, .. } = self.levels[level];
         start..start + rows * self.features
     }
 
     /// Layout of the features of `points` points.
-    #[must_use]
     pub fn layout(&self, points: usize) -> Layout {
         Layout { levels: self.levels.len(), points, features: self.features }
     }
 
     /// Resolutions of the levels in cells per axis (L).
-    #[must_use]
     pub fn resolutions(&self) -> &[u32] {
         &self.resolutions
     }
 
     /// An initial table: uniform in ±1e-4 (Müller et al. 2022, section 3), determined by `seed`.
-    #[must_use]
     pub fn init_table(&self, seed: u64) -> Vec<f32> {
         const AMPLITUDE: f32 = 1e-4;
         let mut table = vec![0.0; self.num_parameters()];

@@ -25,7 +25,6 @@ impl Pyramid {
     /// 6890, 1722, 430, 107.
     ///
     /// A `ratio` outside (0, 1] is clamped into it; NaN counts as 1.
-    #[must_use]
     pub fn new(points: &[Vec3], ratio: f32, levels: usize) -> Self {
         let ratio = if ratio.is_nan() { 1.0 } else { ratio.clamp(0.0, 1.0) };
         // The factor undoes the rounding of a decimal ratio to f32: 10 · 0.7f32 is 6.9999998 in
@@ -57,7 +56,6 @@ impl Pyramid {
 ///
 /// Distances are compared in `f64`, in which the squared distance of two `f32` points is exact or
 /// nearly so. Points that are not finite are chosen last, in the order of their indices.
-#[must_use]
 pub fn farthest_points(points: &[Vec3], count: usize) -> Vec<u32> {
     let (finite, others): (Vec<u32>, Vec<u32>) =
         (0..points.len() as u32).partition(|&i| points[i as usize].is_finite());

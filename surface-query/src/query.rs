@@ -3,7 +3,6 @@ use std::fmt;
 use glam::Vec3;
 
 use crate::blend::{self, Blended};
-use crate::blend_backward;
 use crate::error::check_mesh;
 use crate::grid::CandidateGrid;
 use crate::knn::{Level, MAX_K};
@@ -129,7 +128,6 @@ impl SurfaceQuery {
     }
 
     /// Length of a neighbour list: (coarse levels + 1) · k.
-    #[must_use]
     pub fn neighbours_per_query(&self) -> usize {
         self.levels.len() * self.k
     }
@@ -169,7 +167,6 @@ impl SurfaceQuery {
     ///
     /// # Panics
     /// If `finest` is empty or has an index outside the vertices.
-    #[must_use]
     #[inline]
     pub fn blend(&self, query: Vec3, finest: &[u32]) -> Blended {
         assert!(!finest.is_empty(), "blend: no neighbours");
@@ -196,11 +193,10 @@ impl SurfaceQuery {
     ///
     /// # Panics
     /// If `finest` is empty or has an index outside the vertices.
-    #[must_use]
     pub fn blend_backward(&self, query: Vec3, finest: &[u32], d_point: Vec3, d_signed_distance: f32) -> Vec3 {
         assert!(!finest.is_empty(), "blend_backward: no neighbours");
         let query = self.near(query);
-        blend_backward::blend_backward(&self.vertices, &self.normals, query, finest, d_point, d_signed_distance)
+        blend::blend_backward(&self.vertices, &self.normals, query, finest, d_point, d_signed_distance)
     }
 
     /// The query, moved toward the origin to at most [`FAR`] sizes of the mesh.
@@ -210,13 +206,11 @@ impl SurfaceQuery {
     }
 
     /// Unit normals of the vertices, (V): [`vertex_normals`].
-    #[must_use]
     pub fn normals(&self) -> &[Vec3] {
         &self.normals
     }
 
     /// The levels of the neighbours.
-    #[must_use]
     pub fn pyramid(&self) -> &Pyramid {
         &self.pyramid
     }

@@ -21,19 +21,16 @@ pub struct VisibilityCounts {
 
 impl VisibilityCounts {
     /// Zero counts of `n` vertices.
-    #[must_use]
     pub fn new(n: usize) -> Self {
         Self { counts: vec![0; n] }
     }
 
     /// Restores saved counts, (V).
-    #[must_use]
     pub fn from_counts(counts: Vec<u64>) -> Self {
         Self { counts }
     }
 
     /// The counts, (V).
-    #[must_use]
     pub fn counts(&self) -> &[u64] {
         &self.counts
     }

@@ -36,17 +36,6 @@ pub struct Hit {
 /// watertight: no ray slips through an edge or a vertex that triangles share.
 ///
 /// Queries take `&self` and may run on any number of threads.
-///
-/// ```
-/// use glam::Vec3;
-/// use visibility::RayMesh;
-///
-/// let vertices = [Vec3::ZERO, Vec3::X, Vec3::Y, Vec3::Z];
-/// let mesh = RayMesh::new(&vertices, &[[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])?;
-/// assert_eq!(mesh.first_hit(Vec3::new(0.25, 0.25, -3.0), Vec3::Z).map(|hit| hit.t), Some(3.0));
-/// assert_eq!(mesh.first_hit(Vec3::new(0.25, 0.25, -3.0), Vec3::X), None);
-/// # Ok::<(), visibility::Error>(())
-/// ```
 pub struct RayMesh {
     faces: Vec<[u32; 3]>,
     /// Multiplied by `scale`, a power of two, so that products neither overflow nor vanish.
@@ -79,7 +68,6 @@ impl RayMesh {
     /// `None` without an intersection. A ray in the plane of a triangle does not intersect it, nor
     /// does one of zero direction, one that is not finite, or one from beyond 10¹⁵ sizes of the
     /// mesh.
-    #[must_use]
     pub fn first_hit(&self, origin: Vec3, direction: Vec3) -> Option<Hit> {
         let (ray, to_t) = self.ray(origin, direction)?;
         let mut first: Option<Hit> = None;

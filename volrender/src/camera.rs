@@ -82,20 +82,17 @@ impl Camera {
     }
 
     /// The calibration matrix.
-    #[must_use]
     pub fn intrinsics(&self) -> Mat3 {
         Mat3::from_cols(Vec3::new(self.focal.x, 0.0, 0.0), Vec3::new(0.0, self.focal.y, 0.0), self.centre.extend(1.0))
     }
 
     /// Centre of projection in the world.
-    #[must_use]
     pub fn centre_of_projection(&self) -> Vec3 {
         self.world_to_camera.inverse().translation.into()
     }
 
     /// The ray through image position (`u`, `v`) in pixels. The centre of pixel (column, row) is
     /// (column + 0.5, row + 0.5).
-    #[must_use]
     pub fn ray(&self, u: f32, v: f32) -> Ray {
         let camera_to_world = self.world_to_camera.inverse();
         let p = (Vec2::new(u, v) - self.centre) / self.focal;
@@ -105,7 +102,6 @@ impl Camera {
 
     /// Pixel coordinates and depth (u, v, z) of a world point, inside the image or not. `None` if it
     /// is not in front of the camera or the result is not finite.
-    #[must_use]
     pub fn project(&self, x: Vec3) -> Option<Vec3> {
         let p = self.world_to_camera.transform_point3(x);
         if p.z.is_nan() || p.z <= 0.0 {
@@ -126,7 +122,6 @@ impl Camera {
 
     /// Position in the distorted image of `pixel` in the undistorted one: the lookup that undistorts
     /// an image.
-    #[must_use]
     pub fn distort_pixel(&self, distortion: &Distortion, pixel: Vec2) -> Vec2 {
         let p = (pixel - self.centre) / self.focal;
         self.focal * distortion.distort(p) + self.centre

@@ -144,14 +144,12 @@ impl Occupancy {
     }
 
     /// Bounding box of the mesh and its margin; [`Aabb::EMPTY`] without occupied cells.
-    #[must_use]
     pub fn region(&self) -> Aabb {
         self.region.unwrap_or(Aabb::EMPTY)
     }
 
     /// Whether `point` lies in an occupied cell.
     #[inline]
-    #[must_use]
     pub fn is_occupied(&self, point: Vec3) -> bool {
         // Truncation is the floor of non-negative values; NaN fails the comparison, and huge
         // values saturate.

@@ -27,19 +27,16 @@ pub struct Bins {
 
 impl Bins {
     /// `n` bins between the depths 0 ≤ `near` ≤ `far`; of width 0 if `n` is 0.
-    #[must_use]
     pub fn new(near: f32, far: f32, n: usize) -> Self {
         Self { near, width: if n == 0 { 0.0 } else { (far - near) / n as f32 } }
     }
 
     /// Width δ of a bin.
-    #[must_use]
     pub fn width(&self) -> f32 {
         self.width
     }
 
     /// Depth in bin `i` at `offset`, from 0 at its near end to 1 at its far end.
-    #[must_use]
     pub fn at(&self, i: usize, offset: f32) -> f32 {
         self.near + (i as f32 + offset) * self.width
     }

@@ -10,7 +10,8 @@ use glam::{Mat3, Quat, Vec2, Vec3};
 use occnerf::bake::Avatar;
 use occnerf::bake::export::{Splats, adapt_motion, splats, write_amass, write_obj};
 use occnerf::{Config, Method, Preset, PriorColors, Scene};
-use smpl::{Character, MotionClip};
+use rigged::Character;
+use smpl::MotionClip;
 use synth::{DemoConfig, demo};
 
 fn avatar() -> &'static Avatar {
@@ -98,7 +99,7 @@ fn several_shells_and_many_vertices_stay_whole() {
     assert_eq!(texture.into_rgba8().into_raw(), avatar.atlas.rgba);
     let (vertices, normals) = (avatar.vertices.clone(), avatar.normals.clone());
     write_obj(&avatar, &vertices, &normals, &place("shells.obj")).unwrap();
-    let mesh = smpl::load_mesh(&place("shells.obj")).unwrap();
+    let mesh = rigged::load_mesh(&place("shells.obj")).unwrap();
     assert_eq!((mesh.vertices.len(), mesh.faces.len()), (v, f), "the outermost shell alone");
 }
 

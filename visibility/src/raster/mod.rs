@@ -66,17 +66,6 @@ pub struct Fragment {
 }
 
 /// The samples of a pixel, as [`crate::Rasterizer::draw`] passes them to the shader.
-///
-/// ```
-/// use visibility::Pixel;
-///
-/// /// Share of the pixel that the mesh covers.
-/// fn coverage(pixel: Pixel<'_>) -> f32 {
-///     let count = pixel.samples().len().max(1);
-///     pixel.samples().filter(|sample| !sample.is_empty()).count() as f32 / count as f32
-/// }
-/// # let _ = coverage;
-/// ```
 #[derive(Clone, Copy, Debug)]
 pub struct Pixel<'a> {
     /// Row-major index of the pixel.

@@ -3,7 +3,7 @@
 use anyhow::{Context, Result, ensure};
 use glam::{Affine3A, Mat3, Vec2, Vec3};
 use occnerf::Lpips;
-use smpl::Mesh;
+use rigged::Mesh;
 use visibility::{RayMesh, View, visible_vertices};
 use volrender::metrics;
 use volrender::{RaySamples, SampleGradients, composite_backward};
