@@ -1,6 +1,6 @@
 //! Texture optimisation: the atlas fitted to the training frames through the rasteriser.
 
-use glam::{Vec2, Vec3, Vec4};
+use glam::{Vec2, Vec3};
 use visibility::{Pixel, RasterOptions, Rasterizer, Samples};
 
 use super::avatar::{Atlas, Avatar};
@@ -11,13 +11,13 @@ use crate::model::view::pinhole;
 use crate::scene::labels::Label;
 use crate::scene::prepared::{PreparedFrame, Scene};
 
-/// Regularisation of a texel towards the field's colour, in pixels.
+/// Regularisation of a texel towards its colour before, in pixels.
 const PRIOR: f32 = 0.3;
 
 /// Most sampled training pixels.
 const MAX_PIXELS: usize = 1 << 19;
 
-/// A bilinear lookup in one shell: four texels and their compositing weights.
+/// A bilinear lookup: four texels and their weights.
 type Lookup = ([u32; 4], [f32; 4]);
 
 /// A photographed pixel as a linear function of the texels.
@@ -37,8 +37,8 @@ pub(super) fn refine(scene: &Scene, light: Light, avatar: &mut Avatar, passes: u
     for frame in frames {
         all.extend(equations(avatar, &mut person, frame, stride)?);
     }
-    let Atlas { rgba, .. } = &mut avatar.atlas;
-    let start: Vec<Vec3> = rgba.as_chunks::<4>().0.iter().map(|&[r, g, b, _]| colour([r, g, b])).collect();
+    let Atlas { rgb, .. } = &mut avatar.atlas;
+    let start: Vec<Vec3> = rgb.as_chunks::<3>().0.iter().copied().map(colour).collect();
     let mut values = start.clone();
     let mut errors = [0.0; 2];
     for pass in 0..passes {
@@ -58,9 +58,8 @@ pub(super) fn refine(scene: &Scene, light: Light, avatar: &mut Avatar, passes: u
             *value += (sum + PRIOR * (start - *value)) / (weight + PRIOR);
         }
     }
-    for (texel, value) in rgba.as_chunks_mut::<4>().0.iter_mut().zip(&values) {
-        let bytes = value.clamp(Vec3::ZERO, Vec3::ONE).to_array().map(|x| (x * 255.0 + 0.5) as u8);
-        texel[..3].copy_from_slice(&bytes);
+    for (texel, value) in rgb.as_chunks_mut::<3>().0.iter_mut().zip(&values) {
+        *texel = value.clamp(Vec3::ZERO, Vec3::ONE).to_array().map(|x| (x * 255.0 + 0.5) as u8);
     }
     Ok(errors)
 }
@@ -81,7 +80,6 @@ fn equations(
     let (vertices, shades) = person.posed();
     // Supersampled as by default, so that the texture compensates the pixel footprint.
     let options = RasterOptions { samples: Samples::Four, cull_back: true, near: 1e-3 };
-    let shells: Vec<&[[u32; 3]]> = (0..avatar.shell_ends.len()).map(|shell| avatar.shell(shell)).collect();
     let equation = |pixel: Pixel<'_>| {
         let i = pixel.index;
         // Edge pixels are mixed with the background.
@@ -92,28 +90,29 @@ fn equations(
         }
         let share = 1.0 / count as f32;
         let brightness: f32 = pixel.samples().map(|fragments| share * shade(avatar, shades, &fragments[0])).sum();
-        let lookups = pixel.samples().flat_map(|fragments| {
-            let mut transmittance = share;
-            fragments.iter().map(move |fragment| lookup(avatar, atlas_place(avatar, fragment), &mut transmittance))
-        });
+        let lookups = pixel.samples().map(|fragments| lookup(avatar, atlas_place(avatar, &fragments[0]), share));
         let colour = Vec3::from_slice(&pixels.image.pixels[3 * i..]) / brightness;
         Some(PixelEquation { colour, lookups: lookups.collect() })
     };
     let mut out: Vec<Option<PixelEquation>> = Vec::new();
     out.resize_with(pixels.mask.len(), || None);
-    Rasterizer::default().draw(vertices, &shells, &pinhole(&frame.view.camera), &options, &mut out, equation)?;
+    Rasterizer::default().draw(
+        vertices,
+        &[&avatar.faces],
+        &pinhole(&frame.view.camera),
+        &options,
+        &mut out,
+        equation,
+    )?;
     Ok(out.into_iter().flatten().collect())
 }
 
-/// The lookup at a `place` of the atlas; attenuates the `transmittance` in front of it.
-fn lookup(avatar: &Avatar, place: Vec2, transmittance: &mut f32) -> Lookup {
-    let Atlas { width, height, ref rgba, .. } = avatar.atlas;
+/// The lookup at a `place` of the atlas, with weights that sum to `share`.
+fn lookup(avatar: &Avatar, place: Vec2, share: f32) -> Lookup {
+    let Atlas { width, height, .. } = avatar.atlas;
     let size = Vec2::new(width as f32, height as f32);
     let corner = BilinearCorner::new(place * size, size);
-    let (texels, Vec2 { x, y }) = (corner.texels(width, height), corner.share);
-    let alphas = Vec4::from(texels.map(|i| f32::from(rgba[4 * i + 3]) / 255.0));
-    let shown = Vec4::new((1.0 - x) * (1.0 - y), x * (1.0 - y), (1.0 - x) * y, x * y) * alphas;
-    let weights = *transmittance * shown;
-    *transmittance *= 1.0 - shown.element_sum();
-    (texels.map(|i| i as u32), weights.to_array())
+    let Vec2 { x, y } = corner.share;
+    let weights = [(1.0 - x) * (1.0 - y), x * (1.0 - y), (1.0 - x) * y, x * y].map(|weight| share * weight);
+    (corner.texels(width, height).map(|i| i as u32), weights)
 }

@@ -44,9 +44,6 @@ pub struct BakedArguments {
     /// Longest sides of the atlas, texels
     #[arg(long, value_delimiter = ',', default_value = "2048,256")]
     atlas: Vec<u32>,
-    /// Shells to bake
-    #[arg(long, value_delimiter = ',', default_value = "1,3,5")]
-    shells: Vec<usize>,
     /// Passes of refinement to bake with
     #[arg(long, value_delimiter = ',', default_value = "0,4")]
     refinements: Vec<u32>,
@@ -143,10 +140,6 @@ fn of_run(path: &Path, arguments: &BakedArguments, lpips: Option<&Lpips>, timed:
                 default = Some(scores.points.len());
             }
             scores.add(&baking.name(Some(report.side)), &mut baking.renderer(&model, &avatar)?)?;
-            if timed && whole && refined && baking.shells == 1 {
-                let baking = Baking { vertex_colours: true, ..baking };
-                scores.add(&baking.name(Some(report.side)), &mut baking.renderer(&model, &avatar)?)?;
-            }
             if whole && refined && timed {
                 drawn.extend(speeds(&model, &avatar, &scene.train[0].view, baking)?);
             }
@@ -182,13 +175,12 @@ fn busy() -> String {
     load.split(' ').nth(1).map_or(String::new(), |load| format!("; {load} processes ran or waited at a time"))
 }
 
-/// Every number of shells with every number of refinements, and one surface on smaller atlases.
+/// Every number of refinements, and smaller atlases.
 fn all(arguments: &BakedArguments) -> Vec<Baking> {
-    let BakedArguments { shells, refinements, atlas, .. } = arguments;
-    let of = |shells, refinements, atlas| Baking { shells, refinements, atlas, ..Baking::default() };
-    let pairs = shells.iter().flat_map(|&shells| refinements.iter().map(move |&passes| (shells, passes)));
-    let whole = pairs.flat_map(|(shells, passes)| atlas.first().map(|&side| of(shells, passes, side)));
+    let BakedArguments { refinements, atlas, .. } = arguments;
+    let of = |refinements, atlas| Baking { refinements, atlas, ..Baking::default() };
+    let whole = refinements.iter().flat_map(|&passes| atlas.first().map(|&side| of(passes, side)));
     let smaller =
-        refinements.last().into_iter().flat_map(|&passes| atlas.iter().skip(1).map(move |&side| of(1, passes, side)));
+        refinements.last().into_iter().flat_map(|&passes| atlas.iter().skip(1).map(move |&side| of(passes, side)));
     whole.chain(smaller).collect()
 }

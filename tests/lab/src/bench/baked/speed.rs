@@ -47,15 +47,15 @@ pub fn speeds(model: &Model, avatar: &Avatar, view: &PosedView, baking: Baking) 
     Ok(speeds)
 }
 
-/// A row for each number of shells, samples and threads, a column for each size.
+/// A row for each number of samples and threads, a column for each size.
 pub fn rates(speeds: &[Speed]) -> Vec<Vec<String>> {
-    let titles = ["shells, samples a pixel, threads".to_owned()];
+    let titles = ["samples a pixel, threads".to_owned()];
     let sizes = SIZES.map(|(width, height)| format!("{width} × {height}"));
     let mut rows = vec![titles.into_iter().chain(sizes).collect()];
     for line in speeds.chunks(SIZES.len()) {
         let Speed { baking, threads, .. } = line[0];
         let cells = line.iter().map(|speed| format!("{:.0}", speed.seconds.recip()));
-        rows.push([format!("{}, {}, {threads}", baking.shells, baking.count())].into_iter().chain(cells).collect());
+        rows.push([format!("{}, {threads}", baking.count())].into_iter().chain(cells).collect());
     }
     rows
 }
@@ -70,7 +70,7 @@ pub fn growth(scene: &str, speeds: &[Speed]) -> Picture {
         let mark = |speed: &&Speed| Mark {
             at: at(speed),
             name: String::new(),
-            style: Style(speed.baking.shells, if !speed.baking.smooth { Shape::Circle } else { Shape::Square }),
+            style: Style(1, if !speed.baking.smooth { Shape::Circle } else { Shape::Square }),
         };
         Panel {
             title: format!("{threads} thread{}", if threads == 1 { "" } else { "s" }),
@@ -81,21 +81,16 @@ pub fn growth(scene: &str, speeds: &[Speed]) -> Picture {
             ],
             lines: of
                 .chunks(SIZES.len())
-                .map(|line| chart::Line { points: line.iter().map(at).collect(), color: line[0].baking.shells })
+                .map(|line| chart::Line { points: line.iter().map(at).collect(), color: 1 })
                 .collect(),
             marks: of.iter().map(mark).collect(),
         }
     };
-    let mut shells: Vec<usize> = speeds.iter().map(|speed| speed.baking.shells).collect();
-    shells.dedup();
-    shells.sort_unstable();
-    shells.dedup();
-    let of_shells = shells.into_iter().map(|n| (format!("shells: {n}"), Style(n, Shape::Dash)));
     let of_samples =
         [("1 sample a pixel", Shape::Circle), ("4 samples", Shape::Square)].map(|(n, s)| (n.to_owned(), Style(5, s)));
     Picture {
         title: format!("{scene}: drawing the baked person"),
-        legend: of_shells.chain(of_samples).collect(),
+        legend: of_samples.into(),
         columns: 2,
         size: (480, 360),
         panels: [1, 2].map(panel).into(),
