@@ -89,8 +89,8 @@ pub(crate) fn silhouette(
 ) -> Result<Vec<bool>, visibility::Error> {
     let mut covered = vec![false; camera.width as usize * camera.height as usize];
     let options = RasterOptions::default();
-    let is_covered = |pixel: Pixel<'_>| pixel.samples().any(|sample| !sample.is_empty());
-    Rasterizer::default().draw(vertices, &[faces], &pinhole(camera), &options, &mut covered, is_covered)?;
+    let is_covered = |pixel: Pixel<'_>| !pixel.samples.is_empty();
+    Rasterizer::default().draw(vertices, faces, &pinhole(camera), &options, &mut covered, is_covered)?;
     Ok(covered)
 }
 

@@ -54,10 +54,10 @@ impl Samples {
     }
 }
 
-/// The visible point of a sample, of one layer.
+/// The visible point of a sample.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Fragment {
-    /// Index of the face, counted through all layers.
+    /// Index of the face.
     pub face: u32,
     /// Depth: the z coordinate in the camera frame.
     pub depth: f32,
@@ -70,17 +70,6 @@ pub struct Fragment {
 pub struct Pixel<'a> {
     /// Row-major index of the pixel.
     pub index: usize,
-    fragments: &'a [Fragment],
-    /// Number of fragments of every sample; empty if all samples are.
-    counts: &'a [usize],
-    layers: usize,
-}
-
-impl Pixel<'_> {
-    /// The fragments of every sample, nearest first, at most one a layer. No samples at all for a
-    /// pixel without fragments.
-    #[inline]
-    pub fn samples(&self) -> impl ExactSizeIterator<Item = &[Fragment]> {
-        self.counts.iter().zip(self.fragments.chunks_exact(self.layers.max(1))).map(|(&n, sample)| &sample[..n])
-    }
+    /// The fragment of every sample; no samples for a pixel without fragments.
+    pub samples: &'a [Option<Fragment>],
 }
