@@ -1,9 +1,7 @@
 //! Keyframe animation (glTF 2.0, section 3.11 and appendix C).
 
-use glam::{Quat, Vec3, Vec4};
+use glam::{Affine3A, Quat, Vec3, Vec4};
 use gltf::json::animation::{Interpolation, Property};
-
-use crate::character::Local;
 
 /// Keyframe animation of a character's nodes, applied by [`Character::pose`](crate::Character::pose).
 #[derive(Clone, Debug, PartialEq)]
@@ -25,6 +23,29 @@ pub(crate) struct Channel {
     pub(crate) times: Vec<f32>,
     /// One value per key; in-tangent, value and out-tangent for cubic splines. Vectors have w = 0.
     pub(crate) values: Vec<Vec4>,
+}
+
+/// Transform of a node relative to its parent.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) enum Local {
+    Matrix(Affine3A),
+    /// Scale, then rotation, then translation.
+    Parts {
+        scale: Vec3,
+        rotation: Quat,
+        translation: Vec3,
+    },
+}
+
+impl Local {
+    pub fn matrix(self) -> Affine3A {
+        match self {
+            Self::Matrix(matrix) => matrix,
+            Self::Parts { scale, rotation, translation } => {
+                Affine3A::from_scale_rotation_translation(scale, rotation, translation)
+            }
+        }
+    }
 }
 
 impl Animation {

@@ -1,9 +1,9 @@
 //! Rigged characters from glTF 2.0: mesh, skin, hierarchy, animations.
 
-use glam::{Affine3A, Quat, Vec2, Vec3};
+use glam::{Affine3A, Vec2, Vec3};
 use smpl::SkinningWeights;
 
-use crate::animation::Animation;
+use crate::animation::{Animation, Local};
 
 /// A rigged character: every triangle mesh of a glTF scene merged into one, with V vertices and J
 /// joints.
@@ -65,18 +65,6 @@ pub struct CharacterPose {
 pub(crate) struct Node {
     pub parent: Option<usize>,
     pub rest: Local,
-}
-
-/// Transform of a node relative to its parent.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) enum Local {
-    Matrix(Affine3A),
-    /// Scale, then rotation, then translation.
-    Parts {
-        scale: Vec3,
-        rotation: Quat,
-        translation: Vec3,
-    },
 }
 
 impl Character {
@@ -142,16 +130,5 @@ impl Character {
         let joints: Vec<Affine3A> = self.joint_nodes.iter().map(|&node| world[node]).collect();
         let bones: Vec<Affine3A> = joints.iter().zip(&self.inverse_bind).map(|(joint, bind)| *joint * *bind).collect();
         CharacterPose { vertices: self.skin(&bones), joints, bones }
-    }
-}
-
-impl Local {
-    pub fn matrix(self) -> Affine3A {
-        match self {
-            Self::Matrix(matrix) => matrix,
-            Self::Parts { scale, rotation, translation } => {
-                Affine3A::from_scale_rotation_translation(scale, rotation, translation)
-            }
-        }
     }
 }

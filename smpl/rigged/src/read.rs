@@ -13,8 +13,8 @@ use gltf::json::{Index, Root};
 use smpl::{Error, SparseRows};
 
 use crate::accessor::Source;
-use crate::animation::{Animation, Channel, unit, widen};
-use crate::character::{Character, Local, Node};
+use crate::animation::{Animation, Channel, Local, unit, widen};
+use crate::character::{Character, Node};
 
 impl Character {
     /// Reads a `.glb`, or a `.gltf` whose buffers are data URIs or files beside it.
