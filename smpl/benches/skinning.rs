@@ -4,7 +4,8 @@
 use divan::counter::ItemsCount;
 use divan::{Bencher, black_box};
 use glam::{Mat3, Vec3};
-use smpl::{BodyModel, Placement, SparseRows, SurfaceMotion, WeightVolume, WeightVolumeConfig, rodrigues};
+use rayon::prelude::*;
+use smpl::{BodyModel, Placement, Shaped, SparseRows, SurfaceMotion, WeightVolume, WeightVolumeConfig, rodrigues};
 
 fn main() {
     divan::main();
@@ -101,6 +102,32 @@ mod one_frame {
         let body = body();
         let (shaped, pose) = (body.shaped(&BETAS), pose(0));
         bencher.bench(|| body.pose(&shaped, black_box(&pose), Placement::default()));
+    }
+}
+
+mod batch_of_32 {
+    use super::*;
+
+    /// A shape a frame, as smplx computes it. Divide by 32.
+    fn run(bencher: Bencher<'_, '_>, body: &BodyModel) {
+        let poses: Vec<_> = (0..32).map(pose).collect();
+        bencher.counter(ItemsCount::new(32usize)).bench(|| {
+            let shape = |_| body.shaped(black_box(&BETAS));
+            let shaped: Vec<Shaped> = (0..32).into_par_iter().map(shape).collect();
+            let frames: Vec<_> =
+                (shaped.iter().zip(&poses)).map(|(s, p)| (s, p.as_slice(), Placement::default())).collect();
+            body.pose_batch(&frames)
+        });
+    }
+
+    #[divan::bench]
+    fn sparse(bencher: Bencher<'_, '_>) {
+        run(bencher, &body());
+    }
+
+    #[divan::bench]
+    fn dense(bencher: Bencher<'_, '_>) {
+        run(bencher, &super::dense());
     }
 }
 

@@ -114,6 +114,17 @@ proptest! {
     }
 
     #[test]
+    fn batches_equal_single_frames_bit_for_bit(poses in prop::collection::vec(pose(), 1..20), betas in betas()) {
+        let shaped = BODY.shaped(&betas);
+        let frames: Vec<_> = poses.iter().map(|p| (&shaped, p.as_slice(), pelvis(Vec3::Y))).collect();
+        let batch = BODY.pose_batch(&frames);
+        prop_assert_eq!(batch.len(), poses.len());
+        for (posed, pose) in batch.iter().zip(&poses) {
+            prop_assert_eq!(posed, &BODY.pose(&shaped, pose, pelvis(Vec3::Y)));
+        }
+    }
+
+    #[test]
     fn posed_surface_points_map_back_to_rest(
         pose in pose(),
         face in any::<prop::sample::Index>(),
@@ -171,8 +182,15 @@ fn dense_rows_are_summed_like_any_other() {
     let poses: Vec<Vec<Vec3>> = (0..37)
         .map(|f| (0..24).map(|j| 0.3 * Vec3::new(wave(f + j), wave(2 * f + j), wave(f * j))).collect())
         .collect();
-    for pose in &poses {
-        let posed = body.pose(&shaped, pose, pelvis(Vec3::Z));
+    let frames: Vec<_> = poses.iter().map(|p| (&shaped, p.as_slice(), pelvis(Vec3::Z))).collect();
+    let on = |threads: usize| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        pool.install(|| body.pose_batch(&frames))
+    };
+    let batch = on(1);
+    assert_eq!(batch, on(3));
+    for (posed, pose) in batch.iter().zip(&poses) {
+        assert_eq!(posed, &body.pose(&shaped, pose, pelvis(Vec3::Z)));
         for v in (0..body.num_vertices()).step_by(7) {
             let mut expected = glam::DVec3::ZERO;
             for (term, direction) in body.posedirs.row(v) {
@@ -183,6 +201,7 @@ fn dense_rows_are_summed_like_any_other() {
             assert!(posed.pose_offsets[v].as_dvec3().distance(expected) < 1e-6);
         }
     }
+    assert!(body.pose_batch(&[]).is_empty());
 }
 
 #[test]
