@@ -119,14 +119,13 @@ impl<'a> BakedPerson<'a> {
             Vec3::from((shade(avatar, shades, fragment) * albedo).min(Vec3A::ONE)).extend(1.0)
         };
         let shade = |pixel: Pixel<'_>| {
-            let samples = pixel.samples();
-            let count = samples.len();
+            let count = pixel.samples.len();
             if count == 0 {
                 return Vec4::ZERO;
             }
-            samples.flatten().map(colour).sum::<Vec4>() / count as f32
+            pixel.samples.iter().flatten().map(colour).sum::<Vec4>() / count as f32
         };
-        rasterizer.draw(skinned, &[&avatar.faces], &pinhole(camera), &options, out, shade)?;
+        rasterizer.draw(skinned, &avatar.faces, &pinhole(camera), &options, out, shade)?;
         Ok(())
     }
 }

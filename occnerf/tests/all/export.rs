@@ -10,7 +10,8 @@ use glam::{Mat3, Quat, Vec2, Vec3};
 use occnerf::bake::Avatar;
 use occnerf::bake::export::{Splats, adapt_motion, splats, write_amass, write_obj};
 use occnerf::{Config, Method, Preset, PriorColors, Scene};
-use smpl::{Character, MotionClip};
+use rigged::Character;
+use smpl::MotionClip;
 use synth::{DemoConfig, demo};
 
 fn avatar() -> &'static Avatar {
