@@ -27,11 +27,11 @@ pub fn of_run(run: &Path) -> Result<Avatar> {
 
 /// Reads a motion of `fps` frames per second, by default as many as the file says.
 pub fn load_motion(path: &Path, fps: Option<f32>) -> Result<MotionClip> {
-    let mut motion = MotionClip::load(path)?;
+    let (mut motion, rate) = MotionClip::load_with_rate(path)?;
     if let Some(fps) = fps {
         ensure!((1e-3..=1e6).contains(&fps), "--fps {fps}: expected 0.001 to 1000000");
         motion.fps = fps;
-    } else if MotionClip::rate_of(path)?.is_none() {
+    } else if rate.is_none() {
         say!("{}: no frames per second in it, {} are assumed (--fps)", path.display(), motion.fps);
     }
     Ok(motion)

@@ -8,7 +8,7 @@ use occnerf::{Capacity, Config, Preset, Scene, Trainer};
 
 use crate::optimise;
 use crate::process::{note, say, unwritten};
-use crate::run::write;
+use crate::run::{read_text, write};
 use crate::source::Source;
 
 /// Record in a run directory.
@@ -64,8 +64,7 @@ pub fn read(directory: &Path) -> Result<Option<Capacity>> {
     if !path.is_file() {
         return Ok(None);
     }
-    let text = std::fs::read_to_string(&path).with_context(|| path.display().to_string())?;
-    serde_json::from_str(&text).map(Some).with_context(|| path.display().to_string())
+    serde_json::from_str(&read_text(&path)?).map(Some).with_context(|| path.display().to_string())
 }
 
 /// Writes the record of a new run, or removes an old one.

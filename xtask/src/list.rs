@@ -71,10 +71,8 @@ pub fn train_list(arguments: &TrainArguments) -> Result<()> {
 
 /// A scene a line; empty lines and what follows `#` are left out.
 fn read(path: &Path) -> Result<Vec<String>> {
-    let name = || path.display().to_string();
-    let size = std::fs::metadata(path).with_context(name)?.len();
-    ensure!(size <= MAX_BYTES, "{}: {size} bytes, expected a list of at most {MAX_BYTES}", path.display());
-    let text = array_files::decode_text(&std::fs::read(path).with_context(name)?);
+    let bytes = array_files::read_bounded(path, MAX_BYTES).with_context(|| path.display().to_string())?;
+    let text = array_files::decode_text(&bytes);
     let lines = text.lines().map(|line| line.split('#').next().unwrap_or("").trim());
     let scenes: Vec<String> = lines.filter(|line| !line.is_empty()).map(str::to_owned).collect();
     ensure!(!scenes.is_empty(), "{}: no scene in it", path.display());

@@ -5,7 +5,7 @@ use std::io::{IsTerminal, Write};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-use anyhow::{Context, Error, Result, ensure};
+use anyhow::{Error, Result, ensure};
 use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
 use occnerf::{StepReport, Trainer};
@@ -226,8 +226,7 @@ fn earlier_log(path: &Path, steps: u64) -> Result<EarlierLog> {
     if steps == 0 || !path.exists() {
         return Ok(log);
     }
-    let bytes = std::fs::read(path).with_context(|| path.display().to_string())?;
-    for line in String::from_utf8_lossy(&bytes).lines() {
+    for line in run::read_text(path)?.lines() {
         let Ok(value) = serde_json::from_str::<serde_json::Value>(line) else { continue };
         if value["step"].as_u64().is_some_and(|s| s <= steps) {
             log.text.push_str(line);

@@ -4,6 +4,7 @@ use std::io::{ErrorKind, Write};
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, anyhow, bail, ensure};
+use array_files::read_bounded;
 use occnerf::capture::LoadOptions;
 use occnerf::{Config, SplitMetrics, replace_file};
 use serde::{Deserialize, Serialize};
@@ -48,7 +49,7 @@ impl RunConfig {
     /// Reads a run's config.toml.
     pub fn read(run: &Path) -> Result<Self> {
         let path = run.join(CONFIG);
-        let text = std::fs::read_to_string(&path).with_context(|| format!("{} is not a run", path.display()))?;
+        let text = read_text(&path).with_context(|| format!("{} is not a run", run.display()))?;
         let config = toml::from_str(&text).map_err(|error| anyhow!("{}: {}", path.display(), error.message()));
         let config: Self = config?;
         config.train.validate().with_context(|| path.display().to_string())?;
@@ -147,8 +148,7 @@ impl Metrics {
     /// Reads a run's metrics.json.
     pub fn read(run: &Path) -> Result<Self> {
         let path = run.join(METRICS);
-        let text = std::fs::read_to_string(&path).with_context(|| path.display().to_string())?;
-        serde_json::from_str(&text).with_context(|| path.display().to_string())
+        serde_json::from_str(&read_text(&path)?).with_context(|| path.display().to_string())
     }
 
     /// Writes it.
@@ -202,6 +202,16 @@ pub fn existing_directory(out: Option<&Path>, name: &str) -> Result<PathBuf> {
 fn candidates(name: &str) -> impl Iterator<Item = PathBuf> {
     let name = name.to_owned();
     (1..10_000).map(move |i| Path::new("runs").join(if i == 1 { name.clone() } else { format!("{name}-{i}") }))
+}
+
+/// Largest text file of a run.
+const MAX_TEXT: u64 = 1 << 28;
+
+/// Reads a text file of a run; what is not UTF-8 becomes U+FFFD.
+pub fn read_text(path: &Path) -> Result<String> {
+    ensure!(!path.exists() || path.is_file(), "{}: not a plain file", path.display());
+    let bytes = read_bounded(path, MAX_TEXT).with_context(|| path.display().to_string())?;
+    Ok(String::from_utf8_lossy(&bytes).into_owned())
 }
 
 /// Peak resident set of this process; 0 where unknown.

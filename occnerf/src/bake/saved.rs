@@ -17,8 +17,6 @@ const FORMAT: &str = "occnerf-avatar";
 const VERSION: u32 = 1;
 /// Key of [`Header`] as JSON in the file's metadata.
 const KEY: &str = "avatar";
-/// Largest file.
-const MAX_BYTES: u64 = 1 << 30;
 
 /// Metadata beside the arrays.
 #[derive(Serialize, Deserialize)]
@@ -117,12 +115,7 @@ impl Avatar {
     /// # Errors
     /// [`Error::Io`]; [`Error::File`] for anything but a complete, valid avatar.
     pub fn load(path: &Path) -> Result<Self, Error> {
-        let io = |source| Error::Io { path: path.to_owned(), source };
-        let size = std::fs::metadata(path).map_err(io)?.len();
-        if size > MAX_BYTES {
-            return Err(file(path, format!("has {size} bytes, expected at most {MAX_BYTES}")));
-        }
-        let bytes = std::fs::read(path).map_err(io)?;
+        let bytes = crate::model::file::read(path)?;
         let avatar = parse(&bytes).map_err(|what| file(path, what))?;
         avatar.validate().map_err(|what| file(path, what))?;
         Ok(avatar)

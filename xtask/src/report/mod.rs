@@ -4,9 +4,11 @@ mod curves;
 mod page;
 mod viewer;
 
+use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, ensure};
+use array_files::read_bounded;
 use occnerf::{Capacity, Choice, Pruned};
 
 pub use self::curves::Log;
@@ -112,8 +114,7 @@ pub fn add_runs(page: &mut Page, runs: &[Run], folder: &Path) -> Result<()> {
     }
     page.heading("Configuration");
     for run in runs {
-        let path = run.directory.join("config.toml");
-        let text = std::fs::read_to_string(&path).with_context(|| path.display().to_string())?;
+        let text = run::read_text(&run.directory.join("config.toml"))?;
         page.folded(&format!("{}: config.toml", run.name), &text);
     }
     Ok(())
@@ -170,12 +171,13 @@ pub fn files(directory: &Path, extension: &str) -> Result<Vec<PathBuf>> {
 
 /// The file's bytes; `None` for a large file, which the page names.
 pub fn bytes(page: &mut Page, path: &Path) -> Result<Option<Vec<u8>>> {
-    let size = std::fs::metadata(path).with_context(|| path.display().to_string())?.len();
-    if size > MAX_BYTES {
-        page.paragraph(&format!("{} is left out: {} MB.", path.display(), size >> 20));
-        return Ok(None);
+    match read_bounded(path, MAX_BYTES) {
+        Err(error) if error.kind() == ErrorKind::FileTooLarge => {
+            page.paragraph(&format!("{} is left out: {error}.", path.display()));
+            Ok(None)
+        }
+        read => read.map(Some).with_context(|| path.display().to_string()),
     }
-    std::fs::read(path).map(Some).with_context(|| path.display().to_string())
 }
 
 /// The cells of a Markdown table, without its rule.
