@@ -32,15 +32,11 @@ pub fn replace_file(path: &Path, write: impl FnOnce(&mut BufWriter<File>) -> Res
         write(&mut to)?;
         to.into_inner().map_err(IntoInnerError::into_error)
     };
-    let target = match path.symlink_metadata() {
-        Ok(found) if found.is_symlink() => path.canonicalize()?,
-        _ => path.to_owned(),
-    };
-    let old = match target.metadata() {
+    let (target, old) = match path.metadata() {
         Ok(found) if found.is_dir() => return Err(ErrorKind::IsADirectory.into()),
-        Ok(found) if !found.is_file() => return filled(File::options().write(true).open(&target)?).map(drop),
-        Ok(found) => Some(found.permissions()),
-        Err(error) if error.kind() == ErrorKind::NotFound => None,
+        Ok(found) if !found.is_file() => return filled(File::options().write(true).open(path)?).map(drop),
+        Ok(found) => (path.canonicalize()?, Some(found.permissions())),
+        Err(error) if error.kind() == ErrorKind::NotFound && !path.is_symlink() => (path.to_owned(), None),
         Err(error) => return Err(error),
     };
     let parent = target.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or(Path::new("."));
