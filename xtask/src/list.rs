@@ -6,7 +6,7 @@ use anyhow::{Context, Result, bail, ensure};
 
 use crate::network::load_lpips;
 use crate::process::{Ending, one_line, say};
-use crate::run::{self, Metrics, RunConfig, use_threads};
+use crate::run::{self, Metrics, RunConfig};
 use crate::train::{TrainArguments, finished, run_unless_finished, scene_name};
 use crate::{source, table};
 
@@ -16,7 +16,6 @@ const MAX_BYTES: u64 = 16 << 20;
 /// Trains this job's scenes of the list under OUT/SCENE; `--merge` makes the table. A failed scene is
 /// reported, and is an error after all others.
 pub fn train_list(arguments: &TrainArguments) -> Result<()> {
-    use_threads(arguments.threads)?;
     let lpips = load_lpips(arguments.lpips.as_deref())?;
     let scenes = read(arguments.list.as_deref().context("--list: no file")?)?;
     let out = arguments.out.as_deref().context("--list: give --out, the folder of all runs")?;
@@ -29,19 +28,16 @@ pub fn train_list(arguments: &TrainArguments) -> Result<()> {
         }
         let name = unique_name(&scenes, index);
         let directory = out.join(&name);
-        if arguments.part.merge {
-            match finished(&directory, &config)? {
-                Some(metrics) => rows.push((name, metrics)),
-                None => missing.push(name),
-            }
-            continue;
-        }
         let trained = source::load(Some(scene), arguments.body.as_deref(), &load).and_then(|source| {
-            let run = RunConfig::new(&source, config.clone());
-            run_unless_finished(&directory, &name, &run, &source, lpips.as_ref(), interval)
+            let run = RunConfig::new(&source, config.clone())?;
+            if arguments.part.merge {
+                return finished(&directory, &directory, &run);
+            }
+            run_unless_finished(&directory, &name, &run, &source, lpips.as_ref(), interval).map(Some)
         });
         match trained {
-            Ok(metrics) => rows.push((name, metrics)),
+            Ok(Some(metrics)) => rows.push((name, metrics)),
+            Ok(None) => missing.push(name),
             Err(error) if matches!(error.downcast_ref(), Some(Ending::Busy(_))) => say!("{name}: in another job"),
             Err(error) if error.chain().any(|cause| cause.is::<Ending>()) => return Err(error),
             Err(error) => {

@@ -24,6 +24,8 @@ struct Header {
     format: String,
     version: u32,
     name: String,
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    source: String,
     joints: Vec<String>,
     /// Slope; even light if absent.
     #[serde(default)]
@@ -47,6 +49,7 @@ impl Avatar {
             format: FORMAT.to_owned(),
             version: VERSION,
             name: self.name.clone(),
+            source: self.source.clone(),
             joints: self.skeleton.iter().map(|joint| joint.name.clone()).collect(),
             light: self.light.slope.to_array(),
             clips: self.clips.iter().map(|clip| (clip.name.clone(), clip.motion.fps)).collect(),
@@ -157,6 +160,7 @@ fn parse(bytes: &[u8]) -> Result<Avatar, String> {
     let joints = source.array("joints", Dtype::U16, &[None, Some(4)], u16::from_le_bytes)?;
     Ok(Avatar {
         name: header.name,
+        source: header.source,
         vertices: source.vectors("vertices", &[None, Some(3)])?,
         normals: source.vectors("normals", &[None, Some(3)])?,
         uvs: uvs.chunks_exact(2).map(Vec2::from_slice).collect(),

@@ -4,7 +4,8 @@ mod curves;
 mod page;
 mod viewer;
 
-use std::io::ErrorKind;
+use std::fs::File;
+use std::io::{ErrorKind, Read};
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, ensure};
@@ -15,11 +16,14 @@ pub use self::curves::Log;
 use self::curves::curves;
 pub use self::page::Page;
 use self::viewer::{Views, viewers};
+use crate::process::note;
 use crate::run::{self, LOG, Metrics, PERSON, RunConfig};
 use crate::{capacity, table};
 
 /// Largest embedded file.
 const MAX_BYTES: u64 = 16 << 20;
+/// Bytes of a viewer page that hold its source.
+const PAGE_START: u64 = 4096;
 const NOVEL: &str = "renders/novel_views.png";
 const CAPTIONS: [(&str, &str); 2] = [
     ("novel_views.png", "Views that training never saw: truth left, result right; a row a camera"),
@@ -55,6 +59,9 @@ impl Run {
     pub fn read(directory: &Path) -> Result<Self> {
         RunConfig::read(directory)?;
         let metrics = Metrics::read(directory)?;
+        if metrics.of != run::identity(directory)? && directory.join(run::CHECKPOINT).is_file() {
+            note!("warning: {}: its scores are of an earlier training; cargo xtask eval", directory.display());
+        }
         Ok(Self { name: name(directory), directory: directory.to_owned(), metrics })
     }
 
@@ -126,7 +133,11 @@ fn add_people(page: &mut Page, runs: &[Run], folder: &Path) -> Result<()> {
         let path = std::path::absolute(run.directory.join(PERSON))?;
         if path.is_file() {
             let from = path.strip_prefix(std::path::absolute(folder)?).unwrap_or(&path);
-            page.link(&from.to_string_lossy(), &format!("{}: the person, to turn around and play", run.name));
+            let mut start = Vec::new();
+            File::open(&path)?.take(PAGE_START).read_to_end(&mut start)?;
+            let of = run::identity(&run.directory)?;
+            let stale = if String::from_utf8_lossy(&start).contains(&of) { "" } else { " (before the last training)" };
+            page.link(&from.to_string_lossy(), &format!("{}: the person, to turn around and play{stale}", run.name));
         }
     }
     Ok(())
