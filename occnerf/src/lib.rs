@@ -28,7 +28,6 @@
 //! threads, and so does resuming from a checkpoint.
 
 pub mod bake;
-mod capacity;
 mod check;
 mod config;
 mod error;
@@ -42,7 +41,6 @@ mod train;
 pub use self::lpips::Lpips;
 pub use ::capture;
 pub use array_files::replace_file;
-pub use capacity::{Capacity, Choice, Measured, Pruned};
 pub use check::{Check, Fault, FrameCheck, Mistake, body_silhouette, check, photograph, unknown_pixels};
 pub use config::{
     Component, Config, ConfigError, DistanceKind, EncodingConfig, FieldConfig, LossConfig, Method, MotionConfig,
