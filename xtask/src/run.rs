@@ -334,7 +334,7 @@ pub fn use_threads(threads: Option<usize>) -> Result<()> {
 /// left to its limit of address space.
 pub fn free_bytes() -> Option<u64> {
     let number = |path: &str, key: &str| -> Option<u64> {
-        let text = std::fs::read_to_string(path).ok()?;
+        let text = read_text(Path::new(path)).ok()?;
         let line = text.lines().find_map(|line| line.strip_prefix(key))?;
         line.split_whitespace().next()?.parse().ok()
     };
