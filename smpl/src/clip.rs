@@ -55,9 +55,18 @@ impl MotionClip {
     /// Any [`Error`] of arrays; [`Error::Invalid`] without frames, for a rate that is not positive,
     /// and for rotations beyond 1000 rad or translations beyond 10⁶.
     pub fn load(path: &Path) -> Result<Self, Error> {
+        Self::load_with_rate(path).map(|(clip, _)| clip)
+    }
+
+    /// The same, and the frames per second as the file says them; `None` where it does not.
+    ///
+    /// # Errors
+    /// As [`MotionClip::load`].
+    pub fn load_with_rate(path: &Path) -> Result<(Self, Option<f32>), Error> {
         let mut npz = Npz::open(path)?;
         let file = npz.file().to_owned();
-        let fps = rate(&mut npz)?.unwrap_or(Self::ASSUMED_FPS);
+        let rate = rate(&mut npz)?;
+        let fps = rate.unwrap_or(Self::ASSUMED_FPS);
         let has = |npz: &Npz, key: &str| npz.keys().iter().any(|k| k == key);
         let parts = [["root_orient", "pose_body"], ["global_orient", "body_pose"]];
         let keys = match parts.iter().find(|parts| parts.iter().all(|key| has(&npz, key))) {
@@ -88,20 +97,12 @@ impl MotionClip {
         check_vectors(&file, key, &clip.trans)?;
         match clip.poses.iter().position(|r| r.length() > MAX_ANGLE) {
             Some(i) => Err(Error::invalid(&file, "poses", format!("a rotation of {} rad", clip.poses[i].length()))),
-            None => Ok(clip),
+            None => Ok((clip, rate)),
         }
     }
 
     /// Frames per second of a clip that does not say.
     pub const ASSUMED_FPS: f32 = 30.0;
-
-    /// Frames per second in a file; `None` where it does not say.
-    ///
-    /// # Errors
-    /// As [`MotionClip::load`].
-    pub fn rate_of(path: &Path) -> Result<Option<f32>, Error> {
-        rate(&mut Npz::open(path)?)
-    }
 
     /// Number of frames, T.
     pub fn num_frames(&self) -> usize {

@@ -4,7 +4,7 @@ use std::collections::HashMap;
 use std::io::Write;
 use std::path::Path;
 
-use array_files::Error as FileError;
+use array_files::{Error as FileError, replace_file};
 use glam::Vec3;
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 
@@ -67,17 +67,8 @@ impl BodyModel {
         }
         let header = HashMap::from([(FORMAT.0.to_owned(), FORMAT.1.to_owned())]);
         let bytes = safetensors::serialize(views, Some(header)).map_err(fault)?;
-        let partial = path.with_extension("safetensors.partial");
-        // On the disk before the old file is gone, so that a power cut leaves one of the two.
-        let written = std::fs::File::create(&partial).and_then(|mut file| {
-            file.write_all(&bytes)?;
-            file.sync_all()?;
-            std::fs::rename(&partial, path)
-        });
-        written.map_err(|source| {
-            let _ = std::fs::remove_file(&partial);
-            FileError::Io { path: path.to_owned(), source }.into()
-        })
+        let written = replace_file(path, |to| to.write_all(&bytes));
+        written.map_err(|source| FileError::Io { path: path.to_owned(), source }.into())
     }
 }
 

@@ -5,10 +5,14 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
 use clap::Args;
-use occnerf::capture::{Capture, LoadOptions, Mended, Registered, find_body, load_capture, own_body};
+use occnerf::capture::{Capture, Frame, LoadOptions, Mended, Registered, find_body, load_capture, own_body};
 use occnerf::{Config, Person, Scene, mend_masks};
 use serde::Serialize;
+use sha2::{Digest, Sha256};
 use smpl::BodyModel;
+
+use crate::process::telling;
+use crate::run::hash_file;
 
 /// Name of the scene that needs no other files.
 pub const DEMO: &str = "demo";
@@ -34,6 +38,24 @@ pub struct Source {
 }
 
 impl Source {
+    /// Identity of what is trained on, wherever it lies: SHA-256 of the body's file, and of every
+    /// frame's pictures, camera, pose and shape.
+    ///
+    /// # Errors
+    /// Files that cannot be read.
+    pub fn identity(&self) -> Result<String> {
+        let mut hash = Sha256::new();
+        self.body.iter().try_for_each(|body| hash_file(&mut hash, body))?;
+        let views = self.capture.eval.iter().map(|view| &view.frame);
+        for frame in self.capture.train.iter().chain(views) {
+            let Frame { name, camera, pose, betas, placement, .. } = frame;
+            let (files, decoding) = frame.source.origin();
+            hash.update(format!("{name:?} {camera:?} {pose:?} {betas:?} {placement:?} {decoding}"));
+            files.into_iter().try_for_each(|file| hash_file(&mut hash, file))?;
+        }
+        Ok(format!("{:x}", hash.finalize()))
+    }
+
     /// Takes the registered bodies of the run in `directory`, if it kept them.
     pub fn restore(&mut self, directory: &Path, config: &Config) -> Result<()> {
         let mended = match config.registration.rounds {
@@ -55,7 +77,7 @@ impl Source {
         if let Some((_, registered)) = cache.as_ref().filter(|cached| cached.0.is_none_or(|of| of == rounds)) {
             return Ok(Scene::prepare(registered.clone(), &self.model, config)?);
         }
-        let scene = Scene::new(&self.capture, &self.model, config)?;
+        let scene = telling("preparing the frames", || Scene::new(&self.capture, &self.model, config))?;
         *cache = Some((Some(rounds), scene.registered.clone()));
         Ok(scene)
     }

@@ -47,7 +47,7 @@ impl Npz {
     /// Opens the archive at `path`.
     ///
     /// # Errors
-    /// [`Error::Io`], [`Error::Invalid`] beyond 2 GiB, [`Error::Npy`] if it is no zip archive.
+    /// [`Error::Io`], also beyond 2 GiB; [`Error::Npy`] if it is no zip archive.
     pub fn open(path: &Path) -> Result<Self, Error> {
         Self::from_bytes(&path.display().to_string(), read_file(path)?)
     }
@@ -166,5 +166,5 @@ pub fn write_with_text<K: AsRef<str>>(
         put(key, &format!("<U{}", letters.len() / 4), &[], &letters)?;
     }
     let bytes = archive.finish().map_err(|e| Error::npy(&file, "", e))?.into_inner();
-    std::fs::write(path, bytes).map_err(Error::io(path))
+    crate::replace_file(path, |to| to.write_all(&bytes)).map_err(Error::io(path))
 }

@@ -104,7 +104,9 @@ impl<'a> Source<'a> {
         let charge = || {
             let cost = count.saturating_mul((N * size_of::<T>()) as u64);
             let left = self.left.get().checked_sub(cost);
-            let too_large = || too_large(self.file, &place, u128::from(cost), MAX_DECODED_BYTES);
+            // The limit is of all accessors together.
+            let claimed = u128::from(MAX_DECODED_BYTES - self.left.get()) + u128::from(cost);
+            let too_large = || too_large(self.file, &place, claimed, MAX_DECODED_BYTES);
             left.map(|left| self.left.set(left)).ok_or_else(too_large)
         };
         // Without a view, zeros.

@@ -411,3 +411,16 @@ proptest! {
         prop_assert!(found.point.min_element() >= -1e-6 && found.point.element_sum() <= 1.0 + 1e-6, "{}", found.point);
     }
 }
+
+/// Faces that are equal, or collapsed to a point: a second at most, where pairs of equals were joined
+/// one a pass.
+#[test]
+fn a_tree_of_equal_faces_is_built_in_no_time() {
+    let begun = std::time::Instant::now();
+    for corners in [[Vec3::ZERO, Vec3::X, Vec3::Y], [Vec3::ONE; 3], [Vec3::ZERO; 3]] {
+        let found = MeshDistance::new(&corners, &[[0, 1, 2]; 20_000]).unwrap().closest(Vec3::new(0.0, 0.0, -2.0));
+        let expected = if corners[0] == Vec3::ONE { 11f32.sqrt() } else { 2.0 };
+        assert!((found.signed_distance.abs() - expected).abs() < 1e-5, "{found:?}");
+    }
+    assert!(begun.elapsed().as_secs_f32() < 2.0, "{:?}", begun.elapsed());
+}

@@ -218,3 +218,19 @@ fn first_hits_of_the_open_body_equal_brute_force() {
         check(&body, &built, o, target - o).unwrap();
     }
 }
+
+/// Faces that are equal, collapsed to a point, or so by the scale of one vertex far away: a second at
+/// most, where pairs of equals were joined one a pass.
+#[test]
+fn a_tree_of_equal_faces_is_built_in_no_time() {
+    let body = mesh::open_grid(100);
+    let mut far = body.vertices.clone();
+    far[0] = Vec3::splat(1e12);
+    let corners = [Vec3::ZERO, Vec3::X, Vec3::Y];
+    let begun = std::time::Instant::now();
+    let hit = RayMesh::new(&corners, &[[0, 1, 2]; 20_000]).unwrap();
+    assert!(hit.first_hit(Vec3::new(0.2, 0.2, 1.0), Vec3::NEG_Z).is_some());
+    RayMesh::new(&[Vec3::ZERO; 3], &[[0, 1, 2]; 20_000]).unwrap();
+    RayMesh::new(&far, &body.faces).unwrap();
+    assert!(begun.elapsed().as_secs_f32() < 1.0, "{:?}", begun.elapsed());
+}

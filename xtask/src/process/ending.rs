@@ -23,9 +23,9 @@ pub enum Ending {
         source: io::Error,
     },
     /// Another process works in the folder.
-    #[error("{} is in use by another process: wait for its end, or give another --out", .0.display())]
+    #[error("{} is in use by another process: wait for its end, or take another folder", .0.display())]
     Busy(PathBuf),
-    /// A signal came; everything is saved.
+    /// A signal came; the steps taken are saved.
     #[error("stopped by {}; {after}", name(*.signal))]
     Stopped {
         /// Its number.
@@ -49,6 +49,14 @@ impl Ending {
 /// Converts an I/O error of a result.
 pub fn unwritten(path: &Path) -> impl FnOnce(io::Error) -> Error + '_ {
     move |source| Ending::Unwritten { path: path.to_owned(), source }.into()
+}
+
+/// Whether nothing can be written because that is forbidden.
+pub fn is_read_only(error: &Error) -> bool {
+    let forbidden = |source: &io::Error| {
+        matches!(source.kind(), io::ErrorKind::PermissionDenied | io::ErrorKind::ReadOnlyFilesystem)
+    };
+    matches!(error.downcast_ref(), Some(Ending::Unwritten { source, .. }) if forbidden(source))
 }
 
 /// Converts library errors on files in `place`, where results go; others are returned as they are.

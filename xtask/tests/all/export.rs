@@ -116,8 +116,8 @@ fn whatever_is_wrong_is_said_in_one_line() {
     };
     glb("/no/such/run", out, &[], &["/no/such/run", "no such run"]);
     let empty = folder("export-empty");
-    glb(text(&empty), out, &[], &["checkpoint.safetensors", "export-empty"]);
-    refused(&["view", text(&empty)], &["checkpoint.safetensors"]);
+    glb(text(&empty), out, &[], &["is not a run", "export-empty"]);
+    refused(&["view", text(&empty)], &["is not a run"]);
     glb(run_text, text(&run.join("person.obj")), &[], &["--out", "person.obj", "another format", "Glb"]);
     refused(&["export", run_text, "--out", text(&run.join("person"))], &["--out", ".glb, .ply, .obj or .npz"]);
     glb(run_text, run_text, &[], &["--out", "is a folder"]);

@@ -62,6 +62,9 @@ fn join(path: &Path, fit: &mut Fit, video: &Video) -> Result<Option<String>, Cap
 }
 
 fn read_file(path: &Path, video: &Video) -> Result<Fit, CaptureError> {
+    if path.exists() && !path.is_file() {
+        return Err(CaptureError::invalid(path, "the file", "a plain file", "a device or pipe"));
+    }
     let mut file = File::open(path).map_err(CaptureError::io(path))?;
     if let Some(name @ ("tracking_results.pth" | "slam_results.pth")) = path.file_name().and_then(|name| name.to_str())
     {

@@ -29,7 +29,7 @@ pub use value::{PERSISTENT, Value};
 /// Reads a pickle, plain or compressed by joblib, or a `.npy` file of objects or plain values.
 ///
 /// # Errors
-/// [`Error::Io`], [`Error::Invalid`] beyond 2 GiB, [`Error::Pickle`], [`Error::Npy`].
+/// [`Error::Io`], also beyond 2 GiB; [`Error::Pickle`], [`Error::Npy`].
 pub fn read(path: &Path) -> Result<Value, Error> {
     from_bytes(&path.display().to_string(), read_file(path)?)
 }

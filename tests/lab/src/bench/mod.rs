@@ -176,8 +176,12 @@ impl SceneArguments {
         ensure!(Path::new(scene).is_dir(), "{scene}: expected the demo, or a capture on disk (synth makes one)");
         // The one layout that leaves open what hides the person.
         let obstacle = Layout::detect(Path::new(scene))? == Layout::ZjuMocap;
-        let place = Place::Scene { scene: scene.to_owned(), body: self.body.clone(), load: self.load.options()? };
-        Ok(axes::of_capture(&place, side, obstacle, quick))
+        Ok(axes::of_capture(&self.place(scene)?, side, obstacle, quick))
+    }
+
+    fn place(&self, scene: &str) -> Result<Place> {
+        let load = self.load.options()?.identified(scene, self.body.as_deref())?;
+        Ok(Place::Scene { scene: scene.to_owned(), body: self.body.clone(), load })
     }
 
     /// What makes `train` read the same capture.
@@ -206,7 +210,7 @@ impl SweepArguments {
         let on = &self.on;
         Ok(points::Sweep {
             scene_arguments: on.command_line(scene),
-            place: Place::Scene { scene: scene.to_owned(), body: on.body.clone(), load: on.load.options()? },
+            place: on.place(scene)?,
             views: if self.quick { VIEWS.1 } else { VIEWS.0 },
             steps: self.steps(FULL_STEPS, FULL_STEPS / 5)?,
             full_steps: FULL_STEPS,
