@@ -1,6 +1,5 @@
 //! The run directory: configuration, log, checkpoint, metrics and pictures.
 
-use std::fs::File;
 use std::io::{ErrorKind, Write};
 use std::path::{Path, PathBuf};
 
@@ -12,7 +11,7 @@ use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
 use crate::process::{Lock, still_held, unwritten};
-use crate::source::{self, Source};
+use crate::source::{self, Source, hash_file};
 
 /// Parameters, Adam moments and visibility counts.
 pub const CHECKPOINT: &str = "checkpoint.safetensors";
@@ -199,13 +198,6 @@ pub fn identity(run: &Path) -> Result<String> {
     let mut hash = Sha256::new();
     files.iter().filter(|path| path.is_file()).try_for_each(|path| hash_file(&mut hash, path))?;
     Ok(format!("{:x}", hash.finalize()))
-}
-
-/// Adds the length and the bytes of a file to a hash.
-pub fn hash_file(hash: &mut Sha256, path: &Path) -> Result<()> {
-    let copied = File::open(path).and_then(|mut file| std::io::copy(&mut file, hash));
-    hash.update(copied.with_context(|| path.display().to_string())?.to_le_bytes());
-    Ok(())
 }
 
 /// The trained model of a run.

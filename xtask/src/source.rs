@@ -1,6 +1,7 @@
 //! Where the frames come from: a capture on disk with its body model, or the demo, which is one too.
 
 use std::cell::RefCell;
+use std::fs::File;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
@@ -12,7 +13,6 @@ use sha2::{Digest, Sha256};
 use smpl::BodyModel;
 
 use crate::process::telling;
-use crate::run::hash_file;
 
 /// Name of the scene that needs no other files.
 pub const DEMO: &str = "demo";
@@ -194,6 +194,13 @@ pub fn load_with(
     let model = if scene == DEMO { model } else { model.with_limb_lengths() };
     let (scene, load) = (scene.to_owned(), options.clone());
     Ok(Source { scene, body: file, load, capture, model, registered: RefCell::default() })
+}
+
+/// Adds the length and the bytes of a file to a hash.
+pub fn hash_file(hash: &mut Sha256, path: &Path) -> Result<()> {
+    let copied = File::open(path).and_then(|mut file| std::io::copy(&mut file, hash));
+    hash.update(copied.with_context(|| path.display().to_string())?.to_le_bytes());
+    Ok(())
 }
 
 /// Whether `path` is named like a rigged character.

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use anyhow::Error;
 use occnerf::capture::CaptureError;
 
-use super::print::shown;
+use super::print::{failure, shown};
 
 /// Longest message, characters; some quote a file.
 const LONGEST: usize = 2000;
@@ -49,6 +49,14 @@ impl Ending {
 /// Converts an I/O error of a result.
 pub fn unwritten(path: &Path) -> impl FnOnce(io::Error) -> Error + '_ {
     move |source| Ending::Unwritten { path: path.to_owned(), source }.into()
+}
+
+/// Checks that all was printed, for commands whose result is their output.
+///
+/// # Errors
+/// [`Ending::Unwritten`].
+pub fn delivered() -> Result<(), Error> {
+    failure().map_or(Ok(()), Err).map_err(unwritten(Path::new("standard output")))
 }
 
 /// Whether nothing can be written because that is forbidden.

@@ -2,10 +2,7 @@
 
 use std::fmt::{Arguments, Write as _};
 use std::io::{Error, ErrorKind, Write};
-use std::path::Path;
 use std::sync::atomic::{AtomicI32, Ordering};
-
-use super::ending::unwritten;
 
 /// System's code of the last failed write to standard output; 0 for none.
 static FAILED: AtomicI32 = AtomicI32::new(0);
@@ -31,16 +28,9 @@ pub fn out(text: Arguments<'_>) {
     }
 }
 
-/// Checks that all was printed, for commands whose result is their output. A closed pipe wants no
-/// more.
-///
-/// # Errors
-/// [`Ending::Unwritten`](super::Ending::Unwritten).
-pub fn delivered() -> anyhow::Result<()> {
-    match FAILED.load(Ordering::Relaxed) {
-        0 => Ok(()),
-        code => Err(Error::from_raw_os_error(code)).map_err(unwritten(Path::new("standard output"))),
-    }
+/// Error of the last failed write to standard output, but for a closed pipe, which wants no more.
+pub fn failure() -> Option<Error> {
+    Some(FAILED.load(Ordering::Relaxed)).filter(|code| *code != 0).map(Error::from_raw_os_error)
 }
 
 /// Prints a line on standard error.
