@@ -100,7 +100,7 @@ fn people_of_sam_3d_body_are_told_apart_and_a_body_is_fitted_to_each() {
         let frame = |f: usize| {
             let seen = (0..2).filter(|who| !(*who == 1 && (20..24).contains(&f)));
             let mut list: Vec<Py> = seen.map(|who| person(&people[who][f].0, &mut random, noise, true)).collect();
-            if f % 3 == 0 {
+            if f.is_multiple_of(3) {
                 list.reverse();
             }
             Py::List(list)
