@@ -39,17 +39,14 @@ fn trained() -> &'static Trained {
     })
 }
 
-fn avatar(shells: usize) -> &'static Avatar {
-    static OF: [OnceLock<Avatar>; 6] = [const { OnceLock::new() }; 6];
-    OF[shells].get_or_init(|| {
-        let options = BakeOptions { shells, ..BakeOptions::default() };
-        bake(&trained().model, Some(&trained().scene), &options).unwrap().0
-    })
+fn avatar() -> &'static Avatar {
+    static AVATAR: OnceLock<Avatar> = OnceLock::new();
+    AVATAR.get_or_init(|| bake(&trained().model, Some(&trained().scene), &BakeOptions::default()).unwrap().0)
 }
 
-fn draw(bencher: Bencher<'_, '_>, shells: usize, samples: Samples, size: (u32, u32), threads: usize) {
+fn draw(bencher: Bencher<'_, '_>, samples: Samples, size: (u32, u32), threads: usize) {
     let model = &trained().model;
-    let mut person = BakedPerson::new(avatar(shells), model.body().scale);
+    let mut person = BakedPerson::new(avatar(), model.body().scale);
     let view = &model.frames()[0];
     let bones: Vec<Affine3A> = view.posed.bones.clone();
     // As high as the square picture, in the middle of a wide one.
@@ -66,56 +63,32 @@ const SIZES: [(u32, u32); 4] = [(256, 256), (512, 512), (1024, 1024), (1920, 108
 /// One surface, two threads.
 #[divan::bench(args = SIZES)]
 fn one_surface(bencher: Bencher<'_, '_>, size: (u32, u32)) {
-    draw(bencher, 1, Samples::One, size, 2);
+    draw(bencher, Samples::One, size, 2);
 }
 
 /// One surface, one thread.
 #[divan::bench(args = SIZES)]
 fn one_surface_one_thread(bencher: Bencher<'_, '_>, size: (u32, u32)) {
-    draw(bencher, 1, Samples::One, size, 1);
+    draw(bencher, Samples::One, size, 1);
 }
 
 /// One surface, four samples a pixel, two threads.
 #[divan::bench(args = SIZES)]
 fn one_surface_four_samples(bencher: Bencher<'_, '_>, size: (u32, u32)) {
-    draw(bencher, 1, Samples::Four, size, 2);
+    draw(bencher, Samples::Four, size, 2);
 }
 
 /// One surface, four samples a pixel, one thread.
 #[divan::bench(args = SIZES)]
 fn one_surface_four_samples_one_thread(bencher: Bencher<'_, '_>, size: (u32, u32)) {
-    draw(bencher, 1, Samples::Four, size, 1);
-}
-
-/// Three shells, two threads.
-#[divan::bench(args = SIZES)]
-fn three_shells(bencher: Bencher<'_, '_>, size: (u32, u32)) {
-    draw(bencher, 3, Samples::One, size, 2);
-}
-
-/// Three shells, four samples a pixel, two threads.
-#[divan::bench(args = SIZES)]
-fn three_shells_four_samples(bencher: Bencher<'_, '_>, size: (u32, u32)) {
-    draw(bencher, 3, Samples::Four, size, 2);
-}
-
-/// Three shells, one thread.
-#[divan::bench(args = SIZES)]
-fn three_shells_one_thread(bencher: Bencher<'_, '_>, size: (u32, u32)) {
-    draw(bencher, 3, Samples::One, size, 1);
-}
-
-/// Five shells, two threads.
-#[divan::bench(args = SIZES)]
-fn five_shells(bencher: Bencher<'_, '_>, size: (u32, u32)) {
-    draw(bencher, 5, Samples::One, size, 2);
+    draw(bencher, Samples::Four, size, 1);
 }
 
 /// Skinning alone, one thread.
 #[divan::bench]
 fn skin(bencher: Bencher<'_, '_>) {
     let model = &trained().model;
-    let mut person = BakedPerson::new(avatar(1), model.body().scale);
+    let mut person = BakedPerson::new(avatar(), model.body().scale);
     let bones: Vec<Affine3A> = model.frames()[0].posed.bones.clone();
     let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
     bencher.bench_local(|| {
@@ -125,9 +98,8 @@ fn skin(bencher: Bencher<'_, '_>) {
     });
 }
 
-/// Baking with a surface or three, all threads.
-#[divan::bench(args = [1, 3], sample_count = 3)]
-fn baking(bencher: Bencher<'_, '_>, shells: usize) {
-    let options = BakeOptions { shells, ..BakeOptions::default() };
-    bencher.bench_local(|| bake(&trained().model, Some(&trained().scene), &options).unwrap());
+/// Baking, all threads.
+#[divan::bench(sample_count = 3)]
+fn baking(bencher: Bencher<'_, '_>) {
+    bencher.bench_local(|| bake(&trained().model, Some(&trained().scene), &BakeOptions::default()).unwrap());
 }

@@ -29,7 +29,6 @@
 
 mod atomic;
 pub mod bake;
-mod capacity;
 mod check;
 mod config;
 mod error;
@@ -43,7 +42,6 @@ mod train;
 pub use self::lpips::Lpips;
 pub use ::capture;
 pub use atomic::replace_file;
-pub use capacity::{Capacity, Choice, Measured, Pruned};
 pub use check::{Check, Fault, FrameCheck, Mistake, body_silhouette, check, photograph, unknown_pixels};
 pub use config::{
     Component, Config, ConfigError, DistanceKind, EncodingConfig, FieldConfig, LossConfig, Method, MotionConfig,

@@ -104,13 +104,11 @@ impl MotionClip {
     }
 
     /// Number of frames, T.
-    #[must_use]
     pub fn num_frames(&self) -> usize {
         self.trans.len()
     }
 
     /// Time from the first frame to the last, in seconds.
-    #[must_use]
     pub fn duration(&self) -> f32 {
         self.num_frames().saturating_sub(1) as f32 / self.fps
     }
@@ -125,7 +123,6 @@ impl MotionClip {
     ///
     /// # Panics
     /// If the clip has no frames, or `poses` does not have T·J entries.
-    #[must_use]
     pub fn at(&self, seconds: f32, joints: usize) -> (Vec<Vec3>, Placement) {
         let frames = self.num_frames();
         assert!(frames > 0, "at: a clip without frames");

@@ -3,7 +3,6 @@
 
 mod avatar;
 pub mod baked;
-pub mod capacity;
 mod check;
 mod commands;
 mod convert;

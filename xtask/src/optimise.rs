@@ -68,7 +68,7 @@ pub fn optimise(directory: &Path, trainer: &mut Trainer<'_>, options: &RunOption
     let checkpoint = directory.join(CHECKPOINT);
     let (start, mut saved, mut lined) = (Instant::now(), Instant::now(), Instant::now());
     let mut preview = options.preview.then(|| Preview::new(directory));
-    let (mut smooth, mut bad, mut restarts) = (None::<StepReport>, 0, None);
+    let (mut smooth, mut bad) = (None::<StepReport>, 0);
     while trainer.steps_done() < end && guard.signal().is_none() {
         let report = match trainer.step() {
             Ok(report) => report,
@@ -83,10 +83,6 @@ pub fn optimise(directory: &Path, trainer: &mut Trainer<'_>, options: &RunOption
             }
         };
         bad += report.bad_gradients;
-        if restarts.replace(report.restarts).is_some_and(|previous| previous < report.restarts) {
-            let said = format!("step {}: nothing was left of the person", report.step);
-            bar.suspend(|| note!("{said}; restarted at a tenth of the learning rates"));
-        }
         let mean = blend(smooth, report);
         smooth = Some(mean);
         let seconds = earlier.seconds + start.elapsed().as_secs_f64();

@@ -3,7 +3,7 @@
 use anyhow::{Context, Result, bail};
 use clap::Args;
 use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
-use occnerf::{Capacity, Component, Config, Method, OccludedRule, Preset};
+use occnerf::{Component, Config, Method, OccludedRule, Preset};
 
 const METHODS: &[(Method, &str)] = &[
     (Method::Prior, "The posed prior in mean colours; nothing is trained"),
@@ -104,10 +104,9 @@ impl SettingArguments {
     }
 
     /// Checks that a run to be resumed was trained with what is asked for; the number of steps may
-    /// change. `capacity` replaced the preset's sizes when the run began.
-    pub fn resumed(&self, saved: Config, capacity: Option<&Capacity>) -> Result<Config> {
-        let mut asked = if self.preset.is_some() || self.method.is_some() { self.config()? } else { saved.clone() };
-        capacity.into_iter().for_each(|capacity| capacity.apply(&mut asked));
+    /// change.
+    pub fn resumed(&self, saved: Config) -> Result<Config> {
+        let asked = if self.preset.is_some() || self.method.is_some() { self.config()? } else { saved.clone() };
         let asked = self.apply(asked)?;
         let steps = self.steps.unwrap_or(saved.steps);
         let same = Config { steps, ..asked.clone() } == Config { steps, ..saved.clone() };

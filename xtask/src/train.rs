@@ -10,7 +10,6 @@ use occnerf::capture::Capture;
 use occnerf::{Config, Lpips, Method, Model, Person, Scene, Trainer, checkpoint_config};
 
 use crate::baked;
-use crate::capacity::{self, CapacityName};
 use crate::eval::{Drawn, Split, check_pictures, score_baked, score_run, scored_frames, unscored};
 use crate::network::{load_lpips, network_name};
 use crate::optimise::{RunOptions, SavingArguments, optimise};
@@ -43,9 +42,6 @@ pub struct TrainArguments {
     /// What is trained.
     #[command(flatten)]
     pub settings: SettingArguments,
-    /// Sizes of the model [default: the preset's, larger where the video shows more than they hold]
-    #[arg(long)]
-    pub capacity: Option<CapacityName>,
     /// Threads [default: all cores]; the result does not depend on it
     #[arg(long)]
     pub threads: Option<usize>,
@@ -68,7 +64,7 @@ pub struct TrainArguments {
     pub stop_after: Option<u64>,
     /// Train every scene of FILE, a path a line, each under OUT; finished ones are not trained
     /// again
-    #[arg(long, value_name = "FILE", conflicts_with_all = ["scene", "resume", "stop_after", "capacity"])]
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["scene", "resume", "stop_after"])]
     pub list: Option<PathBuf>,
     /// Which part of a list is trained.
     #[command(flatten)]
@@ -129,39 +125,26 @@ fn begun(arguments: &TrainArguments, name: &str) -> Result<Begun> {
     let weights = Path::new(&config.loss.perceptual_weights);
     ensure!(weights.as_os_str().is_empty() || weights.exists(), "{}: no such weights", weights.display());
     let source = source::load(arguments.scene.as_deref(), arguments.body.as_deref(), &arguments.load.options()?)?;
-    // What is asked for by itself stays as it is asked for.
-    let steps = arguments.settings.steps.map(|_| "steps=".to_owned());
-    let set: Vec<String> = arguments.settings.set.iter().cloned().chain(steps).collect();
-    let is_given = set.iter().any(|set| set.starts_with("held_out="));
+    let is_given = arguments.settings.set.iter().any(|set| set.starts_with("held_out="));
     if source.capture.eval.is_empty() && source.capture.train.len() >= 2 * HOLD_OUT && !is_given {
         config.held_out = HOLD_OUT;
         say!("no other camera: every {HOLD_OUT}th frame is scored, and nothing is learnt from it (--set held_out=0)");
     }
-    let chosen = capacity::choose(&source, &config, &set, arguments.capacity)?;
-    if let Some(capacity) = &chosen {
-        capacity.apply(&mut config);
-        config.validate()?;
-    }
     // The directory is made only now, so that bad input leaves nothing behind.
     let (directory, lock) = new_directory(arguments.out.as_deref(), name)?;
-    capacity::begin(&directory, chosen.as_ref())?;
-    if let Some(capacity) = &chosen {
-        say!("capacity from the scene:\n{}", capacity.to_string().trim_end());
-    }
     Ok(Begun { directory, source, config, _lock: lock })
 }
 
 /// A run that goes on.
 fn resumed(arguments: &TrainArguments, directory: &Path) -> Result<Begun> {
     let lock = Lock::take(directory)?;
-    let capacity = capacity::resumed(directory, arguments.capacity)?;
     let checkpoint = directory.join(CHECKPOINT);
     let begun = if checkpoint.is_file() { Some(checkpoint_config(&checkpoint)?) } else { None };
     if begun.is_none() {
         say!("{}: no checkpoint to go on from; from the start", directory.display());
     }
     let saved = RunConfig::read(directory)?;
-    let config = arguments.settings.resumed(begun.unwrap_or(saved.train), capacity.as_ref())?;
+    let config = arguments.settings.resumed(begun.unwrap_or(saved.train))?;
     let load = arguments.load.resumed(&saved.load)?;
     let scene = arguments.scene.as_deref().unwrap_or(&saved.scene);
     let body = arguments.body.as_deref().or(saved.body.as_deref());
@@ -240,7 +223,6 @@ pub fn run_one(
     if trainer.steps_done() < run.train.steps {
         return Ok(None);
     }
-    capacity::prune(directory, &mut trainer, &checkpoint)?;
     let perceptual = trainer.perceptual();
     let model = trainer.into_model();
     let trained = Drawn::Field { model: &model, perceptual };

@@ -7,8 +7,6 @@ use volrender::Camera;
 
 use crate::capture::Light;
 
-/// Most shells of an avatar.
-pub const MAX_SHELLS: usize = 5;
 /// Most joints of an avatar.
 pub const MAX_JOINTS: usize = 256;
 /// Longest side of an atlas in texels.
@@ -20,7 +18,7 @@ const MAX_SLOPE: f32 = 10.0;
 /// Pose blend-shape terms of a joint other than the root: the entries of R − I.
 const TERMS_PER_JOINT: usize = 9;
 
-/// A person as one to five textured, skinned shells of triangles, with motion clips.
+/// A person as a textured, skinned surface of triangles, with motion clips.
 ///
 /// Everything is in metres in a world that is right-handed and y up. The surface is in the
 /// canonical pose (the T-pose, all rotations zero), facing +z. V vertices, F triangles, J joints, T
@@ -29,18 +27,14 @@ const TERMS_PER_JOINT: usize = 9;
 pub struct Avatar {
     /// Name of the scene, as the capture gives it.
     pub name: String,
-    /// Canonical positions of all shells, (V); a vertex on a seam of the atlas has a copy per chart.
+    /// Canonical positions, (V); a vertex on a seam of the atlas has a copy per chart.
     pub vertices: Vec<Vec3>,
     /// Canonical unit normals, (V).
     pub normals: Vec<Vec3>,
     /// Texture coordinates, (V): u to the right and v downward, 0 to 1 over the atlas.
     pub uvs: Vec<Vec2>,
-    /// Triangles of all shells, the innermost shell's first, (F), counter-clockwise seen from
-    /// outside.
+    /// Triangles, (F), counter-clockwise seen from outside.
     pub faces: Vec<[u32; 3]>,
-    /// One past the last triangle of each shell, from the innermost to the outermost; ascending,
-    /// the last is F.
-    pub shell_ends: Vec<u32>,
     /// Joints of each vertex, (V); unused entries are repeated or 0.
     pub joints: Vec<[u16; 4]>,
     /// Their weights, (V): not negative, summing to 1.
@@ -70,8 +64,8 @@ pub struct Atlas {
     pub width: u32,
     /// Rows.
     pub height: u32,
-    /// 8-bit sRGB and linear alpha, not premultiplied, (H, W, 4), row-major from the top left.
-    pub rgba: Vec<u8>,
+    /// 8-bit sRGB, (H, W, 3), row-major from the top left.
+    pub rgb: Vec<u8>,
     /// Observation confidence of each texel, (H, W): 0 unobserved, 255 full.
     pub confidence: Vec<u8>,
 }
@@ -122,16 +116,6 @@ impl Avatar {
     #[must_use]
     pub fn num_joints(&self) -> usize {
         self.skeleton.len()
-    }
-
-    /// Triangles of shell `shell`, 0 being the innermost.
-    ///
-    /// # Panics
-    /// If there is no such shell.
-    #[must_use]
-    pub fn shell(&self, shell: usize) -> &[[u32; 3]] {
-        let start = shell.checked_sub(1).map_or(0, |previous| self.shell_ends[previous] as usize);
-        &self.faces[start..self.shell_ends[shell] as usize]
     }
 
     /// Canonical to world transform of each joint, (J), for rotations `pose` (J).
@@ -232,13 +216,7 @@ impl Avatar {
         all("uvs", &self.uvs, inside, "numbers from 0 to 1")?;
         let known = |face: &[u32; 3]| face.iter().all(|&i| (i as usize) < v);
         all("faces", &self.faces, known, &format!("vertices below {v}"))?;
-        let ends = &self.shell_ends;
-        let ordered = ends.windows(2).all(|w| w[0] < w[1]) && ends.first().is_some_and(|&end| end > 0);
-        let whole = ends.last().is_some_and(|&last| last as usize == self.faces.len());
-        expect(ordered && whole && ends.len() <= MAX_SHELLS, || {
-            let f = self.faces.len();
-            format!("`shell_ends`: expected 1 to {MAX_SHELLS} ascending numbers above 0 up to {f}, found {ends:?}")
-        })?;
+        expect(!self.faces.is_empty(), || "`faces`: expected some, found none".to_owned())?;
         expect((1..=MAX_JOINTS).contains(&j), || format!("`skeleton`: expected 1 to {MAX_JOINTS} joints, found {j}"))?;
         all("joints", &self.joints, |row| row.iter().all(|&i| usize::from(i) < j), &format!("joints below {j}"))?;
         let sums = |row: &[f32; 4]| {
@@ -317,7 +295,7 @@ impl Atlas {
         })?;
         let texels = self.width as usize * self.height as usize;
         for (key, expected, found) in
-            [("rgba", 4 * texels, self.rgba.len()), ("confidence", texels, self.confidence.len())]
+            [("rgb", 3 * texels, self.rgb.len()), ("confidence", texels, self.confidence.len())]
         {
             expect(found == expected, || format!("`atlas` {key}: expected {expected} bytes, found {found}"))?;
         }

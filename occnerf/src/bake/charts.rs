@@ -20,8 +20,6 @@ pub(super) struct AtlasLayout {
     pub side: u32,
     /// The chart of each face, (F).
     pub charts: Vec<u32>,
-    /// Number of charts of a shell.
-    count: usize,
     /// Projection of each chart.
     places: Vec<Projection>,
 }
@@ -45,16 +43,16 @@ impl Projection {
 }
 
 impl AtlasLayout {
-    /// Charts of a mesh, repeated for `shells` shells, at a texel width of `texel`, or wider to fit a
-    /// square of `most` × `most`. `None` where even charts of one texel do not fit.
-    pub fn new(vertices: &[Vec3], faces: &[[u32; 3]], shells: usize, texel: f32, most: u32) -> Option<Self> {
+    /// Charts of a mesh at a texel width of `texel`, or wider to fit a square of `most` × `most`.
+    /// `None` where even charts of one texel do not fit.
+    pub fn new(vertices: &[Vec3], faces: &[[u32; 3]], texel: f32, most: u32) -> Option<Self> {
         let directions = directions(vertices, faces);
         // Lower bound of the texel width, from the area.
         let area = |face: &[u32; 3]| {
             let [a, b, c] = face.map(|v| vertices[v as usize]);
             0.5 * (b - a).cross(c - a).length()
         };
-        let least = (shells as f32 * faces.iter().map(area).sum::<f32>()).sqrt() / most as f32;
+        let least = faces.iter().map(area).sum::<f32>().sqrt() / most as f32;
         let texel = texel.max(least);
         let charts = charts(vertices, faces, &directions, texel);
         let count = charts.iter().map(|c| c + 1).max().unwrap_or(0) as usize;
@@ -67,7 +65,6 @@ impl AtlasLayout {
                 (*low, *high) = (low.min(flat), high.max(flat));
             }
         }
-        let boxes = boxes.repeat(shells);
         let mut scale = 1.0 / texel;
         while scale * texel > 1e-3 {
             let sizes: Vec<[u32; 2]> = boxes
@@ -81,7 +78,7 @@ impl AtlasLayout {
                     let inner = Vec2::from(corner.map(|c| (c + PADDING) as f32));
                     Projection { direction, scale, offset: inner - scale * low }
                 };
-                return Some(Self { side, charts, count, places: boxes.iter().zip(corners).map(place).collect() });
+                return Some(Self { side, charts, places: boxes.iter().zip(corners).map(place).collect() });
             }
             scale *= 0.93;
         }
@@ -89,8 +86,8 @@ impl AtlasLayout {
     }
 
     /// Atlas coordinates of a point of the mesh, texels.
-    pub fn place(&self, shell: usize, chart: u32, point: Vec3) -> Vec2 {
-        let Projection { direction, scale, offset } = self.places[shell * self.count + chart as usize];
+    pub fn place(&self, chart: u32, point: Vec3) -> Vec2 {
+        let Projection { direction, scale, offset } = self.places[chart as usize];
         scale * Projection::flat(direction, point) + offset
     }
 }

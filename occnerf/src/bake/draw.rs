@@ -22,10 +22,8 @@ pub struct BakedPerson<'a> {
     vertices: Vec<Vec3>,
     /// Length of a unit of the avatar in that of the bones.
     scale: f32,
-    /// Premultiplied colours, (H, W).
-    texels: Vec<Vec4>,
-    /// Premultiplied colours of the vertices, (V); empty under texture lookup.
-    corners: Vec<Vec4>,
+    /// (H, W).
+    texels: Vec<Vec3A>,
     features: Vec<f32>,
     skinned: Vec<Vec3>,
     /// Shading of each vertex, (V).
@@ -38,16 +36,12 @@ impl<'a> BakedPerson<'a> {
     /// For bones and cameras in which an avatar's metre is `scale` long.
     #[must_use]
     pub fn new(avatar: &'a Avatar, scale: f32) -> Self {
-        let texel = |rgba: &[u8; 4]| {
-            let [r, g, b, a] = rgba.map(|byte| f32::from(byte) / 255.0);
-            Vec4::new(r * a, g * a, b * a, a)
-        };
+        let texel = |rgb: &[u8; 3]| Vec3A::from(rgb.map(|byte| f32::from(byte) / 255.0));
         Self {
             avatar,
             vertices: avatar.vertices.iter().map(|v| scale * v).collect(),
             scale,
-            texels: avatar.atlas.rgba.as_chunks().0.iter().map(texel).collect(),
-            corners: Vec::new(),
+            texels: avatar.atlas.rgb.as_chunks().0.iter().map(texel).collect(),
             features: Vec::new(),
             skinned: Vec::new(),
             shades: Vec::new(),
@@ -60,15 +54,6 @@ impl<'a> BakedPerson<'a> {
     #[must_use]
     pub fn lit_by(self, light: Light) -> Self {
         Self { light, ..self }
-    }
-
-    /// Interpolates the colours of the vertices instead of texture lookup.
-    #[must_use]
-    pub fn in_vertex_colours(mut self) -> Self {
-        let size = atlas_size(self.avatar);
-        let colour = |uv: &Vec2| lookup(&self.texels, &self.avatar.atlas, *uv * size);
-        self.corners = self.avatar.uvs.iter().map(colour).collect();
-        self
     }
 
     /// World positions of the vertices, (V): pose blend shapes, then linear blend skinning by
@@ -125,19 +110,22 @@ impl<'a> BakedPerson<'a> {
         out: &mut [Vec4],
     ) -> Result<(), Error> {
         self.skin(bones);
-        let Self { avatar, texels, corners, skinned, shades, rasterizer, scale, .. } = self;
+        let Self { avatar, texels, skinned, shades, rasterizer, scale, .. } = self;
         let options = RasterOptions { samples, cull_back: true, near: 1e-3 * *scale };
-        let shells: Vec<&[[u32; 3]]> = (0..avatar.shell_ends.len()).map(|shell| avatar.shell(shell)).collect();
-        let paint = Paint { avatar, texels, corners, shades, size: atlas_size(avatar) };
+        let atlas = &avatar.atlas;
+        let size = Vec2::new(atlas.width as f32, atlas.height as f32);
+        let colour = |fragment: &Fragment| {
+            let albedo = lookup(texels, atlas, atlas_place(avatar, fragment) * size);
+            Vec3::from((shade(avatar, shades, fragment) * albedo).min(Vec3A::ONE)).extend(1.0)
+        };
         let shade = |pixel: Pixel<'_>| {
-            let samples = pixel.samples();
-            let count = samples.len();
+            let count = pixel.samples.len();
             if count == 0 {
                 return Vec4::ZERO;
             }
-            samples.map(|sample| paint.composite(sample)).sum::<Vec4>() / count as f32
+            pixel.samples.iter().flatten().map(colour).sum::<Vec4>() / count as f32
         };
-        rasterizer.draw(skinned, &shells, &pinhole(camera), &options, out, shade)?;
+        rasterizer.draw(skinned, &avatar.faces, &pinhole(camera), &options, out, shade)?;
         Ok(())
     }
 }
@@ -159,11 +147,6 @@ where
     corners.iter().zip(fragment.barycentric).map(|(&v, b)| b * of(v as usize)).sum()
 }
 
-/// Width and height of the atlas, texels.
-fn atlas_size(avatar: &Avatar) -> Vec2 {
-    Vec2::new(avatar.atlas.width as f32, avatar.atlas.height as f32)
-}
-
 /// R − I of each joint but the root relative to its parent, in units of `scale`.
 fn blend_shape_features(avatar: &Avatar, bones: &[Affine3A], scale: f32, out: &mut Vec<f32>) {
     out.clear();
@@ -175,36 +158,9 @@ fn blend_shape_features(avatar: &Avatar, bones: &[Affine3A], scale: f32, out: &m
     }
 }
 
-/// Inputs of a fragment's colour.
-struct Paint<'a> {
-    avatar: &'a Avatar,
-    texels: &'a [Vec4],
-    corners: &'a [Vec4],
-    shades: &'a [f32],
-    size: Vec2,
-}
-
-impl Paint<'_> {
-    /// Front-to-back compositing of fragments.
-    #[inline]
-    fn composite(&self, sample: &[Fragment]) -> Vec4 {
-        let mut sum = Vec4::ZERO;
-        for fragment in sample {
-            let colour = if self.corners.is_empty() {
-                lookup(self.texels, &self.avatar.atlas, atlas_place(self.avatar, fragment) * self.size)
-            } else {
-                between(self.avatar, fragment, |v| self.corners[v])
-            };
-            let lit = (shade(self.avatar, self.shades, fragment) * colour.truncate()).min(Vec3::splat(colour.w));
-            sum += (1.0 - sum.w) * lit.extend(colour.w);
-        }
-        sum
-    }
-}
-
 /// Bilinear lookup at `place`, in texels.
 #[inline]
-fn lookup(texels: &[Vec4], atlas: &Atlas, place: Vec2) -> Vec4 {
+fn lookup(texels: &[Vec3A], atlas: &Atlas, place: Vec2) -> Vec3A {
     let corner = BilinearCorner::new(place, Vec2::new(atlas.width as f32, atlas.height as f32));
     let [a, b, c, d] = corner.texels(atlas.width, atlas.height).map(|i| texels[i]);
     let (top, bottom) = (a + (b - a) * corner.share.x, c + (d - c) * corner.share.x);

@@ -21,9 +21,6 @@ pub(super) trait CanonicalField: Sync {
     /// overwrites `out`.
     fn evaluate(&self, places: &[Place], out: &mut Vec<(f32, Vec3)>);
 
-    /// Sample spacing along a rendered ray, normalised metres.
-    fn spacing(&self) -> f32;
-
     /// Path length of a ray that grazes the surface, as on the outline, normalised metres.
     fn grazing(&self) -> f32;
 

@@ -7,7 +7,7 @@ use glam::{Affine3A, Vec2, Vec3};
 use rayon::prelude::*;
 use smpl::{MotionClip, SparseRows};
 
-use super::avatar::{Atlas, Avatar, Clip, MAX_JOINTS, MAX_SHELLS};
+use super::avatar::{Atlas, Avatar, Clip, MAX_JOINTS};
 use super::charts::AtlasLayout;
 use super::displacement::displacements;
 use super::field::CanonicalField;
@@ -36,8 +36,6 @@ const FULL_CONFIDENCE: f32 = 0.1;
 /// Options of [`bake`].
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct BakeOptions {
-    /// Number of nested shells, 1 to 5: the innermost is opaque, the others have alpha.
-    pub shells: usize,
     /// Largest side of the atlas, texels; the resolution of the training frames decides below.
     pub atlas: u32,
     /// Steps of texture optimisation on the training frames; 0 keeps the field's colours.
@@ -47,20 +45,20 @@ pub struct BakeOptions {
 }
 
 impl Default for BakeOptions {
-    /// One surface, at most 2048 × 2048 texels.
+    /// At most 2048 × 2048 texels.
     fn default() -> Self {
-        Self { shells: 1, atlas: 2048, refinements: 4, fps: 30.0 }
+        Self { atlas: 2048, refinements: 4, fps: 30.0 }
     }
 }
 
 /// Statistics of [`bake`].
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct BakeReport {
-    /// Surface extraction of the innermost shell.
+    /// Surface extraction.
     pub surface: SurfaceReport,
-    /// Vertices of all shells, a copy for each chart.
+    /// Vertices, a copy for each chart.
     pub vertices: usize,
-    /// Triangles of all shells.
+    /// Triangles.
     pub faces: usize,
     /// Side of the atlas.
     pub side: u32,
@@ -101,14 +99,11 @@ pub fn bake(model: &Model, scene: Option<&Scene>, options: &BakeOptions) -> Resu
 /// prior, and the prior's colours refined.
 ///
 /// # Errors
-/// Those of [`bake`]; more than one shell.
+/// Those of [`bake`].
 pub fn fit(scene: &Scene, options: &BakeOptions) -> Result<(Avatar, BakeReport), Error> {
     let start = Instant::now();
     let frames: Vec<Arc<PosedView>> = scene.train.iter().map(|frame| Arc::clone(&frame.view)).collect();
     let pixel = options.check(&scene.body, &frames)?;
-    if options.shells != 1 {
-        return Err(Error::Scene(format!("fit: {} shells, expected 1", options.shells)));
-    }
     let colors = scene.colors()?;
     let (prior, faces) = (&scene.body.canonical.vertices, &scene.body.model.faces);
     let relief = Relief::new(prior, faces, pixel);
@@ -116,9 +111,9 @@ pub fn fit(scene: &Scene, options: &BakeOptions) -> Result<(Avatar, BakeReport),
         anchor.terms().map(|(v, w)| w * scene.clothes.get(v as usize).copied().unwrap_or_default()).sum()
     };
     let dressed: Vec<f32> = relief.mesh.anchors.iter().map(clothes).collect();
-    let heights = vec![displacements(scene, colors.light, &relief.mesh, &relief.feet, &dressed)?];
+    let heights = displacements(scene, colors.light, &relief.mesh, &relief.feet, &dressed)?;
     let paint = |texels: &[Texel]| {
-        let colour = |texel: &Texel| (colors.at(texel.parent, relief.barycentric(texel, faces)).truncate(), 1.0);
+        let colour = |texel: &Texel| colors.at(texel.parent, relief.barycentric(texel, faces)).truncate();
         texels.par_iter().map(colour).collect()
     };
     let (mut avatar, mut report) = assemble(&scene.body, &relief, &heights, &seen(scene)?, pixel, options, paint)?;
@@ -134,9 +129,6 @@ impl BakeOptions {
     /// normalised metres.
     fn check(&self, body: &Body, frames: &[Arc<PosedView>]) -> Result<f32, Error> {
         let refuse = |what: String| Err(Error::Scene(format!("bake: {what}")));
-        if !(1..=MAX_SHELLS).contains(&self.shells) {
-            return refuse(format!("{} shells, expected 1 to {MAX_SHELLS}", self.shells));
-        }
         if !(64..=2048).contains(&self.atlas) {
             return refuse(format!("an atlas of {} texels, expected 64 to 2048", self.atlas));
         }
@@ -198,32 +190,28 @@ pub(super) fn surface(
     options: &BakeOptions,
 ) -> Result<(Avatar, BakeReport), Error> {
     let relief = Relief::new(&body.canonical.vertices, &body.model.faces, pixel);
-    let (heights, found) = heights(field, &body.surface, &relief.feet, &relief.mesh, options.shells);
+    let (heights, found) = heights(field, &body.surface, &relief.feet, &relief.mesh);
     let paint = |texels: &[Texel]| paint(field, &body.surface, &relief.feet, &heights, texels);
     let (avatar, report) = assemble(body, &relief, &heights, seen, pixel, options, paint)?;
     Ok((avatar, BakeReport { surface: found, ..report }))
 }
 
-/// The avatar of shells at `heights` (shells, V) over a relief; `paint` gives texels their colours and
-/// alphas.
+/// The avatar of a surface at `heights` (V) over a relief; `paint` gives texels their colours.
 fn assemble(
     body: &Body,
     Relief { mesh, feet }: &Relief,
-    heights: &[Vec<f32>],
+    heights: &[f32],
     seen: &[f32],
     pixel: f32,
     options: &BakeOptions,
-    paint: impl FnOnce(&[Texel]) -> Vec<(Vec3, f32)>,
+    paint: impl FnOnce(&[Texel]) -> Vec<Vec3>,
 ) -> Result<(Avatar, BakeReport), Error> {
     let (prior, faces) = (&body.canonical.vertices, &body.model.faces);
-    let layout = AtlasLayout::new(prior, faces, options.shells, pixel / TEXELS_A_PIXEL, options.atlas);
+    let layout = AtlasLayout::new(prior, faces, pixel / TEXELS_A_PIXEL, options.atlas);
     let layout = layout.ok_or_else(|| Error::Scene("bake: too many charts".to_owned()))?;
-    let split = Split::new(mesh, &layout, options.shells);
+    let split = Split::new(mesh, &layout);
     let places = split.places(&layout, feet);
-    let describe = |face: u32| {
-        let (shell, face) = (face as usize / mesh.faces.len(), face as usize % mesh.faces.len());
-        (shell, mesh.faces[face], mesh.parents[face])
-    };
+    let describe = |face: u32| (mesh.faces[face as usize], mesh.parents[face as usize]);
     let texels = texels(layout.side, &places, &split.faces, describe)?;
     let colours = paint(&texels);
     let interpolated = |anchor: &Anchor| anchor.terms().map(|(v, w)| w * seen[v as usize]).sum();
@@ -246,7 +234,6 @@ fn assemble(
         vertices: vertices.into_iter().map(|v| v / body.scale).collect(),
         normals,
         uvs: places.iter().map(|place| (place / layout.side as f32).clamp(Vec2::ZERO, Vec2::ONE)).collect(),
-        shell_ends: (1..=options.shells).map(|shell| (shell * mesh.faces.len()) as u32).collect(),
         faces: split.faces,
         joints,
         weights,
@@ -261,56 +248,46 @@ fn assemble(
     Ok((avatar, report))
 }
 
-/// Vertices of all shells, a copy of each vertex of the subdivided prior for each of its charts.
+/// Vertices of the surface: a copy of each vertex of the subdivided prior for each of its charts.
 struct Split {
-    /// Shell, chart and vertex of the subdivided prior.
-    vertices: Vec<(usize, u32, u32)>,
+    /// Chart and vertex of the subdivided prior.
+    vertices: Vec<(u32, u32)>,
     faces: Vec<[u32; 3]>,
 }
 
 impl Split {
-    fn new(mesh: &Subdivided, layout: &AtlasLayout, shells: usize) -> Self {
-        let mut split = Self { vertices: Vec::new(), faces: Vec::with_capacity(shells * mesh.faces.len()) };
-        for shell in 0..shells {
-            let mut copies: Vec<Vec<(u32, u32)>> = vec![Vec::new(); mesh.anchors.len()];
-            for (face, &parent) in mesh.faces.iter().zip(&mesh.parents) {
-                let chart = layout.charts[parent as usize];
-                split.faces.push(face.map(|v| {
-                    let copies = &mut copies[v as usize];
-                    if let Some(&(_, copy)) = copies.iter().find(|(of, _)| *of == chart) {
-                        return copy;
-                    }
-                    let copy = split.vertices.len() as u32;
-                    split.vertices.push((shell, chart, v));
-                    copies.push((chart, copy));
-                    copy
-                }));
-            }
+    fn new(mesh: &Subdivided, layout: &AtlasLayout) -> Self {
+        let mut split = Self { vertices: Vec::new(), faces: Vec::with_capacity(mesh.faces.len()) };
+        let mut copies: Vec<Vec<(u32, u32)>> = vec![Vec::new(); mesh.anchors.len()];
+        for (face, &parent) in mesh.faces.iter().zip(&mesh.parents) {
+            let chart = layout.charts[parent as usize];
+            split.faces.push(face.map(|v| {
+                let copies = &mut copies[v as usize];
+                if let Some(&(_, copy)) = copies.iter().find(|(of, _)| *of == chart) {
+                    return copy;
+                }
+                let copy = split.vertices.len() as u32;
+                split.vertices.push((chart, v));
+                copies.push((chart, copy));
+                copy
+            }));
         }
         split
     }
 
     /// Atlas coordinates, texels.
     fn places(&self, layout: &AtlasLayout, feet: &[NormalRay]) -> Vec<Vec2> {
-        self.vertices.iter().map(|&(shell, chart, v)| layout.place(shell, chart, feet[v as usize].foot)).collect()
+        self.vertices.iter().map(|&(chart, v)| layout.place(chart, feet[v as usize].foot)).collect()
     }
 
     /// Canonical positions and unit normals, normalised metres.
-    fn positions(&self, mesh: &Subdivided, feet: &[NormalRay], heights: &[Vec<f32>]) -> (Vec<Vec3>, Vec<Vec3>) {
-        let shells: Vec<(Vec<Vec3>, Vec<Vec3>)> = heights
-            .iter()
-            .map(|heights| {
-                let raised = |(normal, height): (&NormalRay, &f32)| normal.foot + height * normal.direction;
-                let vertices: Vec<Vec3> = feet.iter().zip(heights).map(raised).collect();
-                let normals = normals(&vertices, &mesh.faces);
-                let usable = |(normal, foot): (Vec3, &NormalRay)| normal.try_normalize().unwrap_or(foot.direction);
-                let normals = normals.into_iter().zip(feet).map(usable).collect();
-                (vertices, normals)
-            })
-            .collect();
-        let each = self.vertices.iter().map(|&(shell, _, v)| {
-            let (vertices, normals) = &shells[shell];
-            (vertices[v as usize], normals[v as usize])
+    fn positions(&self, mesh: &Subdivided, feet: &[NormalRay], heights: &[f32]) -> (Vec<Vec3>, Vec<Vec3>) {
+        let raised = |(normal, height): (&NormalRay, &f32)| normal.foot + height * normal.direction;
+        let vertices: Vec<Vec3> = feet.iter().zip(heights).map(raised).collect();
+        let normals = normals(&vertices, &mesh.faces);
+        let each = self.vertices.iter().map(|&(_, v)| {
+            let v = v as usize;
+            (vertices[v], normals[v].try_normalize().unwrap_or(feet[v].direction))
         });
         each.unzip()
     }
@@ -336,7 +313,7 @@ impl Split {
             }
             row
         };
-        self.vertices.iter().map(|&(_, _, v)| row(&mesh.anchors[v as usize])).collect()
+        self.vertices.iter().map(|&(_, v)| row(&mesh.anchors[v as usize])).collect()
     }
 }
 
@@ -360,12 +337,12 @@ fn four_joints(rows: &[Vec<(u32, f32)>]) -> (Vec<[u16; 4]>, Vec<[f32; 4]>) {
 }
 
 /// The atlas of painted texels, dilated between the charts.
-fn atlas(side: u32, texels: &[Texel], colours: &[(Vec3, f32)], confidence: &[f32]) -> Atlas {
+fn atlas(side: u32, texels: &[Texel], colours: &[Vec3], confidence: &[f32]) -> Atlas {
     let count = (side * side) as usize;
-    let (mut values, mut known) = (vec![[0.0f32; 5]; count], vec![false; count]);
-    for (texel, (colour, alpha)) in texels.iter().zip(colours) {
+    let (mut values, mut known) = (vec![[0.0f32; 4]; count], vec![false; count]);
+    for (texel, colour) in texels.iter().zip(colours) {
         let seen: f32 = texel.corners.iter().zip(texel.weights).map(|(&v, w)| w * confidence[v as usize]).sum();
-        values[texel.index as usize] = [colour.x, colour.y, colour.z, *alpha, seen];
+        values[texel.index as usize] = [colour.x, colour.y, colour.z, seen];
         known[texel.index as usize] = true;
     }
     dilate(side as usize, &mut values, &mut known);
@@ -373,9 +350,9 @@ fn atlas(side: u32, texels: &[Texel], colours: &[(Vec3, f32)], confidence: &[f32
     Atlas {
         width: side,
         height: side,
-        rgba: values.iter().flat_map(|v| [v[0], v[1], v[2], v[3]].map(byte)).collect(),
+        rgb: values.iter().flat_map(|v| [v[0], v[1], v[2]].map(byte)).collect(),
         // Zero means unobserved, so rounding must not reach it.
-        confidence: values.iter().map(|v| if v[4] > 0.0 { byte(v[4]).max(1) } else { 0 }).collect(),
+        confidence: values.iter().map(|v| if v[3] > 0.0 { byte(v[3]).max(1) } else { 0 }).collect(),
     }
 }
 

@@ -22,7 +22,7 @@ use std::path::Path;
 
 use crate::Error;
 
-pub use avatar::{Atlas, Avatar, Clip, Joint, MAX_ATLAS_SIDE, MAX_JOINTS, MAX_SHELLS};
+pub use avatar::{Atlas, Avatar, Clip, Joint, MAX_ATLAS_SIDE, MAX_JOINTS};
 pub use draw::BakedPerson;
 pub use make::{BakeOptions, BakeReport, bake, fit};
 pub use motion::{motion_of_bones, turn_upright};

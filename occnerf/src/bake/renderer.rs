@@ -4,7 +4,6 @@ use glam::{Vec3, Vec4};
 use rayon::prelude::*;
 use smpl::MotionField;
 use visibility::Samples;
-use volrender::{Aabb, Ray};
 
 use super::avatar::Avatar;
 use super::draw::BakedPerson;
@@ -29,7 +28,6 @@ pub(super) struct TrainedField<'a> {
     model: &'a Model,
     code: VertexCode,
     extent: Extent,
-    spacing: f32,
 }
 
 impl<'a> TrainedField<'a> {
@@ -37,23 +35,8 @@ impl<'a> TrainedField<'a> {
         let mut code = VertexCode::default();
         model.encode_vertices(&mut code);
         let extent = model.measure_extent(&code);
-        let spacing = mean_span(model) / model.config.samples as f32;
-        Self { model, code, extent, spacing }
+        Self { model, code, extent }
     }
-}
-
-/// Mean length of the central ray within the body's bounding box over the training frames.
-fn mean_span(model: &Model) -> f32 {
-    let reach = model.config.motion.reach();
-    let spans = model.frames.iter().filter_map(|view| {
-        let box_of = Aabb::from_points(&view.posed.vertices);
-        let region = Aabb { min: box_of.min - reach, max: box_of.max + reach };
-        let origin = view.camera.centre_of_projection();
-        let ray = Ray { origin, direction: (view.centre() - origin).normalize_or_zero() };
-        region.intersect(&ray).map(|(near, far)| far - near)
-    });
-    let (sum, count) = spans.fold((0.0, 0), |(sum, count), span| (sum + span, count + 1));
-    if count > 0 { sum / count as f32 } else { 0.0 }
 }
 
 impl CanonicalField for TrainedField<'_> {
@@ -89,10 +72,6 @@ impl CanonicalField for TrainedField<'_> {
         out.extend(places.iter().zip(&batch.sigma).zip(&batch.rgb).map(value));
     }
 
-    fn spacing(&self) -> f32 {
-        self.spacing
-    }
-
     fn grazing(&self) -> f32 {
         GRAZING
     }
@@ -121,12 +100,6 @@ impl<'a> BakedRenderer<'a> {
         }
         let person = BakedPerson::new(avatar, body.scale).lit_by(light);
         Ok(Self { person, samples, pixels: Vec::new() })
-    }
-
-    /// As [`BakedPerson::in_vertex_colours`].
-    #[must_use]
-    pub fn in_vertex_colours(self) -> Self {
-        Self { person: self.person.in_vertex_colours(), ..self }
     }
 }
 

@@ -14,7 +14,7 @@ use crate::Error;
 use crate::capture::Light;
 
 const FORMAT: &str = "occnerf-avatar";
-const VERSION: u32 = 1;
+const VERSION: u32 = 2;
 /// Key of [`Header`] as JSON in the file's metadata.
 const KEY: &str = "avatar";
 /// Largest file.
@@ -86,13 +86,12 @@ impl Avatar {
             ("normals", Dtype::F32, vec![v, 3], flat(&self.normals)),
             ("uvs", Dtype::F32, vec![v, 2], floats(self.uvs.iter().flat_map(|x| x.to_array()))),
             ("faces", Dtype::U32, vec![self.faces.len(), 3], words(self.faces.as_flattened())),
-            ("shell_ends", Dtype::U32, vec![self.shell_ends.len()], words(&self.shell_ends)),
             ("joints", Dtype::U16, vec![v, 4], shorts),
             ("weights", Dtype::F32, vec![v, 4], floats(self.weights.as_flattened().iter().copied())),
             ("posedirs.offsets", Dtype::U32, vec![directions.offsets.len()], words(&directions.offsets)),
             ("posedirs.columns", Dtype::U32, vec![directions.columns.len()], words(&directions.columns)),
             ("posedirs.values", Dtype::F32, vec![directions.values.len(), 3], flat(&directions.values)),
-            ("atlas.rgba", Dtype::U8, vec![height, width, 4], atlas.rgba.clone()),
+            ("atlas.rgb", Dtype::U8, vec![height, width, 3], atlas.rgb.clone()),
             ("atlas.confidence", Dtype::U8, vec![height, width], atlas.confidence.clone()),
             ("parents", Dtype::I32, vec![j], self.skeleton.iter().flat_map(parent).collect()),
             ("rest_joints", Dtype::F32, vec![j, 3], flat(&rest)),
@@ -168,7 +167,6 @@ fn parse(bytes: &[u8]) -> Result<Avatar, String> {
         normals: source.vectors("normals", &[None, Some(3)])?,
         uvs: uvs.chunks_exact(2).map(Vec2::from_slice).collect(),
         faces: words("faces", &[None, Some(3)])?.as_chunks().0.to_vec(),
-        shell_ends: words("shell_ends", &[None])?,
         joints: joints.as_chunks().0.to_vec(),
         weights: source.floats("weights", &[None, Some(4)])?.as_chunks().0.to_vec(),
         posedirs: SparseRows {
@@ -179,7 +177,7 @@ fn parse(bytes: &[u8]) -> Result<Avatar, String> {
         atlas: Atlas {
             width: u32::try_from(width).unwrap_or(u32::MAX),
             height: u32::try_from(height).unwrap_or(u32::MAX),
-            rgba: bytes("atlas.rgba", &[Some(height), Some(width), Some(4)])?,
+            rgb: bytes("atlas.rgb", &[Some(height), Some(width), Some(3)])?,
             confidence: bytes("atlas.confidence", &[None, None])?,
         },
         light: Light { slope: header.light.into() },

@@ -8,7 +8,7 @@ use super::field::{CanonicalField, Place};
 use crate::model::subdivide::{Anchor, Subdivided, neighbours, normals};
 
 /// Sampling step of a density profile, normalised metres.
-pub(super) const STEP: f32 = 0.0025;
+const STEP: f32 = 0.0025;
 /// Largest depth of the surface below the prior.
 const DEPTH: f32 = 0.03;
 /// Least ratio of a point's distance from the prior to its height along the normal; below it, the
@@ -20,8 +20,6 @@ const OUTLIER: f32 = 0.01;
 const HALF: f32 = std::f32::consts::LN_2;
 /// Vertices of a batch.
 const CHUNK: usize = 64;
-/// Least gap between shells.
-const APART: f32 = 0.001;
 
 /// Statistics of surface extraction.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -72,14 +70,9 @@ pub(super) fn normal_rays(mesh: &Subdivided, prior: &[Vec3], prior_faces: &[[u32
     mesh.anchors.iter().map(ray).collect()
 }
 
-/// Height along each normal (V) at which the optical depth from outside passes each of the ascending
-/// `depths`, (V · depths), NaN for none; and the number of normals with a second opaque layer.
-fn crossings(
-    field: &impl CanonicalField,
-    prior: &MeshDistance,
-    normals: &[NormalRay],
-    depths: &[f32],
-) -> (Vec<f32>, usize) {
+/// Height along each normal (V) at which the opacity from outside passes ½, NaN for none; and the
+/// number of normals with a second opaque layer.
+fn crossings(field: &impl CanonicalField, prior: &MeshDistance, normals: &[NormalRay]) -> (Vec<f32>, usize) {
     let reach = field.reach();
     let chunks: Vec<(Vec<f32>, usize)> = normals
         .par_chunks(CHUNK)
@@ -96,7 +89,9 @@ fn crossings(
             for heights in &profiles {
                 let densities = &values[start..start + heights.len()];
                 start += heights.len();
-                double += usize::from(profile(heights, densities, field.grazing(), depths, &mut out));
+                let (height, twice) = profile(heights, densities, field.grazing());
+                out.push(height);
+                double += usize::from(twice);
             }
             (out, double)
         })
@@ -107,14 +102,12 @@ fn crossings(
 
 type Scratch = (Vec<(f32, Place)>, Vec<Place>, Vec<(f32, Vec3)>);
 
-/// Appends the heights at which the optical depth passes each of `depths`. The optical depth is the
-/// integral from outside plus a length of `grazing` at the greatest density so far, which puts the
-/// surface of a fuzzy field at its rendered outline. Returns whether a gap, with at most a tenth of
-/// the peak density, separates two opaque layers.
-fn profile(heights: &[f32], densities: &[(f32, Vec3)], grazing: f32, depths: &[f32], out: &mut Vec<f32>) -> bool {
-    let first = out.len();
-    out.resize(first + depths.len(), f32::NAN);
-    let (mut depth, mut next) = (0.0, 0);
+/// The height at which the opacity passes ½, and whether a gap, with at most a tenth of the peak
+/// density, separates two opaque layers. The optical depth is the integral from outside plus a length
+/// of `grazing` at the greatest density so far, which puts the surface of a fuzzy field at its
+/// rendered outline.
+fn profile(heights: &[f32], densities: &[(f32, Vec3)], grazing: f32) -> (f32, bool) {
+    let (mut found, mut depth) = (f32::NAN, 0.0);
     // Greatest density and optical depth since the last gap.
     let (mut peak, mut since, mut gap, mut double) = (0.0f32, 0.0, false, false);
     let (mut thickest, mut previous) = (0.0f32, 0.0);
@@ -122,9 +115,8 @@ fn profile(heights: &[f32], densities: &[(f32, Vec3)], grazing: f32, depths: &[f
         let added = density * STEP;
         thickest = thickest.max(density);
         let here = depth + added + grazing * thickest;
-        while next < depths.len() && here >= depths[next] {
-            out[first + next] = height + STEP * (0.5 - (depths[next] - previous) / (here - previous));
-            next += 1;
+        if found.is_nan() && here >= HALF {
+            found = height + STEP * (0.5 - (HALF - previous) / (here - previous));
         }
         (previous, depth) = (here, depth + added);
         if since >= HALF && density < 0.1 * peak {
@@ -135,41 +127,23 @@ fn profile(heights: &[f32], densities: &[(f32, Vec3)], grazing: f32, depths: &[f
         since += added;
         double |= gap && since >= HALF;
     }
-    double
+    (found, double)
 }
 
-/// Heights of `shells` along each normal (V), from the innermost to the outermost: level sets of the
-/// opacity from outside in equal steps up to ½. Holes are filled, outliers replaced by the median,
-/// and all smoothed.
+/// Heights along each normal (V) at which the opacity from outside is ½. Holes are filled, outliers
+/// replaced by the median, and all smoothed.
 pub(super) fn heights(
     field: &impl CanonicalField,
     prior: &MeshDistance,
     normals: &[NormalRay],
     mesh: &Subdivided,
-    shells: usize,
-) -> (Vec<Vec<f32>>, SurfaceReport) {
-    let opacity = |shell: usize| 0.5 * (shell as f32 + 1.0) / shells as f32;
-    let depths: Vec<f32> = (0..shells).map(|shell| -(1.0 - opacity(shell)).ln()).collect();
-    let (found, double) = crossings(field, prior, normals, &depths);
+) -> (Vec<f32>, SurfaceReport) {
+    let (mut heights, double) = crossings(field, prior, normals);
     let near = neighbours(normals.len(), &mesh.faces);
-    let mut report = SurfaceReport { double, ..SurfaceReport::default() };
-    let mut out: Vec<Vec<f32>> = Vec::with_capacity(shells);
-    for shell in (0..shells).rev() {
-        let mut heights: Vec<f32> = found.iter().skip(shell).step_by(shells).copied().collect();
-        let holes = heights.iter().filter(|h| h.is_nan()).count();
-        fill(&mut heights, &near);
-        let outliers = replace_outliers(&mut heights, &near);
-        heights = smoothed(&heights, &near);
-        if let Some(inner) = out.last() {
-            let above = |(height, inner): (&mut f32, &f32)| *height = height.max(inner + APART);
-            heights.iter_mut().zip(inner).for_each(above);
-        }
-        if out.is_empty() {
-            (report.holes, report.outliers) = (holes, outliers);
-        }
-        out.push(heights);
-    }
-    (out, report)
+    let holes = heights.iter().filter(|h| h.is_nan()).count();
+    fill(&mut heights, &near);
+    let outliers = replace_outliers(&mut heights, &near);
+    (smoothed(&heights, &near), SurfaceReport { holes, double, outliers })
 }
 
 /// Replaces outliers by the median of their neighbours; returns their number.

@@ -35,10 +35,6 @@ impl CanonicalField for Known {
         out.extend(places.iter().map(|p| ((self.density)(p.closest, p.distance), known_colour(p.closest))));
     }
 
-    fn spacing(&self) -> f32 {
-        0.0
-    }
-
     fn grazing(&self) -> f32 {
         0.0
     }
@@ -98,8 +94,8 @@ fn the_surface_is_where_a_known_field_becomes_opaque_and_has_its_colours() {
     let mut errors: Vec<f32> = (avatar.vertices.iter().zip(&avatar.uvs))
         .map(|(v, uv)| {
             let [x, y] = (*uv * size).to_array().map(|x| (x as usize).min(size as usize - 1));
-            let texel = 4 * (y * size as usize + x);
-            let found = Vec3::from([0, 1, 2].map(|c| f32::from(avatar.atlas.rgba[texel + c]) / 255.0));
+            let texel = 3 * (y * size as usize + x);
+            let found = Vec3::from([0, 1, 2].map(|c| f32::from(avatar.atlas.rgb[texel + c]) / 255.0));
             let below = scene.body.surface.closest(scene.body.scale * v).point;
             (found - known_colour(below)).abs().max_element()
         })
@@ -123,50 +119,6 @@ fn holes_take_the_height_of_what_is_about_them_and_gaps_are_counted() {
     assert!(report.surface.holes > 0 && distances(&scene, &avatar).iter().all(|d| d.abs() < 1e-3));
 }
 
-#[test]
-fn shells_lie_over_each_other_and_the_outer_ones_are_at_least_as_opaque_as_the_field_there() {
-    // Opacity 1 − e^−3 from 3 cm down to the prior, solid below.
-    let fog = Known {
-        density: |_, d| {
-            if d < 0.0 {
-                5000.0
-            } else if d < 0.03 {
-                100.0
-            } else {
-                0.0
-            }
-        },
-    };
-    let (_, avatar, _) = baked(&fog, &BakeOptions { shells: 3, ..BakeOptions::default() });
-    assert_eq!(avatar.shell_ends.len(), 3);
-    let n = avatar.num_vertices() / 3;
-    let (mut inverted, off_folds) = (0, off_folds(&avatar));
-    for i in 0..n {
-        let [a, b, c] = [0, 1, 2].map(|shell| avatar.vertices[shell * n + i]);
-        let up = avatar.normals[i];
-        assert!((b - a).dot(c - b) > 0.0, "vertex {i}: {a} {b} {c}");
-        inverted += usize::from(off_folds[i] && up.dot(b - a).min(up.dot(c - b)) < -1e-3);
-    }
-    // In a fold, as below the arms, the shell's own normal turns away from where it was raised.
-    assert!(inverted * 100 < n, "{inverted} of {n}");
-    let alphas: Vec<f32> = (0..3)
-        .map(|shell| {
-            let alpha = |v: usize| {
-                let place = avatar.uvs[v] * avatar.atlas.width as f32;
-                avatar.atlas.rgba[4 * (place.y as usize * avatar.atlas.width as usize + place.x as usize) + 3]
-            };
-            let mut all: Vec<u8> = (shell * n..(shell + 1) * n).map(alpha).collect();
-            all.sort_unstable();
-            f32::from(all[n / 2]) / 255.0
-        })
-        .collect();
-    let fog = 1.0 - (1.0 - alphas[1]) * (1.0 - alphas[2]);
-    assert!(alphas[0] > 0.9 && alphas[1..].iter().all(|alpha| (0.1..0.9).contains(alpha)), "{alphas:?}");
-    // The innermost is at opacity ½, the next at ⅓: between them the fog has let 1/√3 through.
-    let expected = 1.0 - 1.0 / 3f32.sqrt();
-    assert!((fog - expected).abs() < 0.1, "{alphas:?}: {fog}, expected {expected}");
-}
-
 /// Texels of a square atlas whose centres lie inside a triangle, by the signs of three areas.
 fn covered(corners: [Vec2; 3], side: u32) -> Vec<usize> {
     let [a, b, c] = corners.map(|c| c.as_dvec2());
@@ -188,20 +140,18 @@ fn covered(corners: [Vec2; 3], side: u32) -> Vec<usize> {
 fn no_two_faces_share_a_texel_and_charts_keep_their_distance() {
     let scene = scene(&Config::preset(Preset::Fast, Method::Occnerf));
     let (vertices, faces) = (&scene.body.canonical.vertices, &scene.body.model.faces);
-    let layout = AtlasLayout::new(vertices, faces, 2, 0.006, 1024).unwrap();
+    let layout = AtlasLayout::new(vertices, faces, 0.006, 1024).unwrap();
     let side = layout.side;
     let mut owner = vec![None; (side * side) as usize];
     let mut doubles = 0;
-    for shell in 0..2 {
-        for (face, &chart) in faces.iter().zip(&layout.charts) {
-            let corners = face.map(|v| layout.place(shell, chart, vertices[v as usize]));
-            let inside = |c: &Vec2| c.min_element() >= 0.0 && c.max_element() <= side as f32;
-            assert!(corners.iter().all(inside), "{corners:?} in {side}");
-            for i in covered(corners, side) {
-                doubles += usize::from(owner[i].is_some_and(|of| of == (shell, chart)));
-                assert!(owner[i].is_none_or(|of| of == (shell, chart)), "two charts at {i}");
-                owner[i] = Some((shell, chart));
-            }
+    for (face, &chart) in faces.iter().zip(&layout.charts) {
+        let corners = face.map(|v| layout.place(chart, vertices[v as usize]));
+        let inside = |c: &Vec2| c.min_element() >= 0.0 && c.max_element() <= side as f32;
+        assert!(corners.iter().all(inside), "{corners:?} in {side}");
+        for i in covered(corners, side) {
+            doubles += usize::from(owner[i].is_some_and(|of| of == chart));
+            assert!(owner[i].is_none_or(|of| of == chart), "two charts at {i}");
+            owner[i] = Some(chart);
         }
     }
     let used = owner.iter().flatten().count();
@@ -220,22 +170,22 @@ fn no_two_faces_share_a_texel_and_charts_keep_their_distance() {
 #[test]
 fn an_atlas_that_is_too_small_has_wider_texels_and_degenerate_meshes_have_one_too() {
     let scene = scene(&Config::preset(Preset::Fast, Method::Occnerf));
-    let layout = AtlasLayout::new(&scene.body.canonical.vertices, &scene.body.model.faces, 1, 1e-3, 512).unwrap();
+    let layout = AtlasLayout::new(&scene.body.canonical.vertices, &scene.body.model.faces, 1e-3, 512).unwrap();
     assert!(layout.side <= 512);
     // As from pictures of millions of pixels, in no more memory.
-    let finest = AtlasLayout::new(&scene.body.canonical.vertices, &scene.body.model.faces, 1, 1e-6, 512).unwrap();
+    let finest = AtlasLayout::new(&scene.body.canonical.vertices, &scene.body.model.faces, 1e-6, 512).unwrap();
     assert!(finest.side <= 512 && finest.charts == layout.charts);
     for (name, points) in testkit::strategy::degenerate_clouds() {
         if points.iter().all(|p| p.is_finite() && p.abs().max_element() < 1e6) {
             let n = points.len() as u32;
             let faces: Vec<[u32; 3]> = (0..n.saturating_sub(2)).map(|i| [i, i + 1, i + 2]).collect();
-            assert!(AtlasLayout::new(&points, &faces, 1, 0.01, 512).is_some_and(|l| l.side <= 512), "{name}");
+            assert!(AtlasLayout::new(&points, &faces, 0.01, 512).is_some_and(|l| l.side <= 512), "{name}");
         }
     }
 }
 
 /// A square of two triangles, 2 wide, at z = 0, seen from +z, with a joint.
-fn square(rgba: &[[u8; 4]], width: u32) -> Avatar {
+fn square(rgb: &[[u8; 3]], width: u32) -> Avatar {
     let corners = [(-1.0, 1.0), (1.0, 1.0), (-1.0, -1.0), (1.0, -1.0)];
     Avatar {
         name: "square".to_owned(),
@@ -243,15 +193,14 @@ fn square(rgba: &[[u8; 4]], width: u32) -> Avatar {
         normals: vec![Vec3::Z; 4],
         uvs: corners.map(|(x, y)| Vec2::new(0.5 + 0.5 * x, 0.5 - 0.5 * y)).to_vec(),
         faces: vec![[0, 2, 1], [1, 2, 3]],
-        shell_ends: vec![2],
         joints: vec![[0; 4]; 4],
         weights: vec![[1.0, 0.0, 0.0, 0.0]; 4],
         posedirs: smpl::SparseRows::from_rows(vec![Vec::<(u32, Vec3)>::new(); 4]),
         atlas: super::Atlas {
             width,
-            height: rgba.len() as u32 / width,
-            rgba: rgba.as_flattened().to_vec(),
-            confidence: vec![255; rgba.len()],
+            height: rgb.len() as u32 / width,
+            rgb: rgb.as_flattened().to_vec(),
+            confidence: vec![255; rgb.len()],
         },
         skeleton: skeleton(&[None], &[Vec3::ZERO]),
         light: Light::default(),
@@ -277,8 +226,8 @@ fn picture(avatar: &Avatar, bones: &[Affine3A], size: u32, samples: Samples) -> 
 
 #[test]
 fn a_square_shows_its_texels_interpolated_between_their_middles() {
-    let texels: Vec<[u8; 4]> = (0..16).map(|i| [i * 16, 255 - i * 7, i * 3, 255]).collect();
-    let value = |x: usize, y: usize| Vec4::from(texels[4 * y + x].map(|byte| f32::from(byte) / 255.0));
+    let texels: Vec<[u8; 3]> = (0..16).map(|i| [i * 16, 255 - i * 7, i * 3]).collect();
+    let value = |x: usize, y: usize| Vec3::from(texels[4 * y + x].map(|byte| f32::from(byte) / 255.0)).extend(1.0);
     let avatar = square(&texels, 4);
     // A texel a pixel: their middles coincide.
     for (i, pixel) in picture(&avatar, &[Affine3A::IDENTITY], 4, Samples::One).into_iter().enumerate() {
@@ -299,10 +248,9 @@ fn a_square_shows_its_texels_interpolated_between_their_middles() {
 
 #[test]
 fn an_atlas_of_one_texel_and_a_back_that_is_not_drawn() {
-    let avatar = square(&[[51, 102, 204, 128]], 1);
-    let expected = Vec4::new(0.2, 0.4, 0.8, 1.0) * (128.0 / 255.0);
+    let avatar = square(&[[51, 102, 204]], 1);
+    let expected = Vec4::new(0.2, 0.4, 0.8, 1.0);
     for pixel in picture(&avatar, &[Affine3A::IDENTITY], 8, Samples::Four) {
-        let expected = expected.truncate().extend(128.0 / 255.0);
         assert!((pixel - expected).abs().max_element() < 1e-4, "{pixel}");
     }
     let turned = Affine3A::from_rotation_y(std::f32::consts::PI);
@@ -311,7 +259,7 @@ fn an_atlas_of_one_texel_and_a_back_that_is_not_drawn() {
 
 #[test]
 fn a_light_is_as_bright_as_the_surface_is_turned_to_it_and_no_brighter_than_white() {
-    let avatar = square(&[[51, 102, 204, 255]], 1);
+    let avatar = square(&[[51, 102, 204]], 1);
     let albedo = Vec3::new(0.2, 0.4, 0.8);
     for (degrees, slope) in [(0.0f32, 0.5), (0.0, -0.5), (40.0, 0.5), (-40.0, 0.5), (0.0, 0.0)] {
         let turned = Affine3A::from_rotation_y(degrees.to_radians());
@@ -324,43 +272,6 @@ fn a_light_is_as_bright_as_the_surface_is_turned_to_it_and_no_brighter_than_whit
         let expected = (albedo * brightness).min(Vec3::ONE).extend(1.0);
         assert!((out[40] - expected).abs().max_element() < 1e-4, "{degrees} {slope}: {} {expected}", out[40]);
     }
-}
-
-#[test]
-fn colours_at_the_vertices_are_interpolated_over_the_faces() {
-    // A column a corner; the atlas's own middle is grey.
-    let mut avatar = square(&[[255, 0, 0, 255], [99, 99, 99, 255], [0, 0, 255, 255]], 3);
-    let between = |avatar: &Avatar, at: usize| {
-        let mut out = vec![Vec4::ZERO; 81];
-        let mut person = BakedPerson::new(avatar, 1.0).in_vertex_colours();
-        person.draw(&[Affine3A::IDENTITY], &in_front(9), Samples::One, &mut out).unwrap();
-        out[at]
-    };
-    assert!((between(&avatar, 40) - Vec4::new(0.5, 0.0, 0.5, 1.0)).abs().max_element() < 1e-4);
-    // Where the atlas is of one colour it makes no difference.
-    avatar.atlas.rgba = [51, 102, 204, 255].repeat(3);
-    let whole = picture(&avatar, &[Affine3A::IDENTITY], 9, Samples::One);
-    assert!([0, 13, 40, 80].into_iter().all(|at| (between(&avatar, at) - whole[at]).abs().max_element() < 1e-5));
-}
-
-#[test]
-fn shells_are_composited_the_outermost_on_top() {
-    let mut avatar = square(&[[255, 0, 0, 255], [0, 255, 0, 128]], 2);
-    // The first is red and behind, the second green and in front.
-    let front: Vec<Vec3> = avatar.vertices.iter().map(|v| v + Vec3::Z * 0.1).collect();
-    avatar.vertices.extend(front);
-    avatar.uvs = [[Vec2::new(0.1, 0.5); 4], [Vec2::new(0.9, 0.5); 4]].concat();
-    avatar.faces.extend([[4, 6, 5], [5, 6, 7]]);
-    avatar.shell_ends = vec![2, 4];
-    let twice = |rows: &mut Vec<_>| rows.extend_from_within(..);
-    twice(&mut avatar.normals);
-    avatar.joints.extend_from_within(..);
-    avatar.weights.extend_from_within(..);
-    avatar.posedirs = smpl::SparseRows::from_rows(vec![Vec::<(u32, Vec3)>::new(); 8]);
-    avatar.validate().unwrap();
-    let middle = picture(&avatar, &[Affine3A::IDENTITY], 9, Samples::One)[40];
-    let alpha = 128.0 / 255.0;
-    assert!((middle - Vec4::new(1.0 - alpha, alpha, 0.0, 1.0)).abs().max_element() < 1e-4, "{middle}");
 }
 
 #[test]
@@ -398,12 +309,9 @@ fn a_person_in_training_is_baked_refined_and_drawn_alike_on_any_number_of_thread
     for (found, expected) in BakedPerson::new(&avatar, 1.0).skin(&bones).iter().zip(expected) {
         assert!(found.distance(expected) < 1e-4);
     }
-    for options in [
-        BakeOptions { shells: 0, ..BakeOptions::default() },
-        BakeOptions { shells: 6, ..BakeOptions::default() },
-        BakeOptions { atlas: 1, ..BakeOptions::default() },
-        BakeOptions { fps: f32::NAN, ..BakeOptions::default() },
-    ] {
+    for options in
+        [BakeOptions { atlas: 1, ..BakeOptions::default() }, BakeOptions { fps: f32::NAN, ..BakeOptions::default() }]
+    {
         assert!(bake(trainer.model(), None, &options).unwrap_err().to_string().starts_with("scene: bake: "));
     }
 }
@@ -449,6 +357,4 @@ fn a_fitted_surface_covers_unseen_views_better_than_the_prior_alike_on_any_numbe
         frame.source = pixels.into();
     }
     fit(&scene(&capture), &BakeOptions::default()).unwrap().0.validate().unwrap();
-    let two = BakeOptions { shells: 2, ..BakeOptions::default() };
-    assert!(fit(&given, &two).unwrap_err().to_string().contains("fit: 2 shells"));
 }

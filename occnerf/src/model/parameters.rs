@@ -43,8 +43,6 @@ impl Arrays {
 #[derive(Clone, Debug)]
 pub(crate) struct Parameters {
     pub values: Arrays,
-    /// Rows of the table that pruning left, if it dropped any; the others are zero.
-    pub kept_rows: Option<Vec<bool>>,
 }
 
 /// Lengths that do not follow from the field.
@@ -61,7 +59,7 @@ impl Parameters {
         let vertices = if moved { 3 * lengths.vertices } else { 0 };
         let table = field.encoder.initial_table(config.seed);
         let values = Arrays([field.mlp.initial(config.seed), table, vec![0.0; vertices], vec![0.0; lengths.motion]]);
-        Self { values, kept_rows: None }
+        Self { values }
     }
 
     pub fn get(&self, part: Part) -> &[f32] {
@@ -70,14 +68,5 @@ impl Parameters {
 
     pub fn get_mut(&mut self, part: Part) -> &mut Vec<f32> {
         self.values.get_mut(part)
-    }
-
-    /// Numbers of a part without the pruned rows.
-    pub fn count(&self, part: Part) -> usize {
-        let all = self.get(part).len();
-        match &self.kept_rows {
-            Some(kept) if part == Part::Table => all / kept.len().max(1) * kept.iter().filter(|kept| **kept).count(),
-            _ => all,
-        }
     }
 }

@@ -119,7 +119,7 @@ impl Model {
 
     /// Learnable numbers, padding not counted.
     pub fn num_parameters(&self) -> usize {
-        PARTS[1..].iter().map(|&(part, _)| self.parameters.count(part)).sum::<usize>()
+        PARTS[1..].iter().map(|&(part, _)| self.parameters.get(part).len()).sum::<usize>()
             + self.field.mlp.num_true_parameters()
     }
 

@@ -1,16 +1,14 @@
 //! Checkpoints: the model with the state of training, replaced atomically.
 
+use std::borrow::Cow;
 use std::path::Path;
 
 use crate::Error;
-use crate::model::file::{read, write};
+use crate::model::file::{Array, read, write};
 use crate::model::parameters::PARTS;
 use crate::model::saved::{config_of, parse};
 use crate::scene::prepared::Scene;
 use crate::train::trainer::Trainer;
-
-/// Header key of the restarts, as JSON; optional.
-const RESTARTS: &str = "restarts";
 
 impl<'a> Trainer<'a> {
     /// Writes the model and the state of training. An old file survives until the new one is complete
@@ -20,14 +18,11 @@ impl<'a> Trainer<'a> {
     /// [`Error::Diverged`] where a number is not finite: the old file stays; [`Error::Io`].
     pub fn save(&self, path: &Path) -> Result<(), Error> {
         self.check_finite()?;
-        let unwritable = |what: String| Error::File { path: path.to_owned(), what };
-        let mut header = self.model.header(&self.scene.name)?;
-        let restarts = serde_json::to_string(&self.restarts);
-        header.insert(RESTARTS, restarts.map_err(|e| unwritable(format!("{RESTARTS}: {e}")))?);
+        let header = self.model.header(&self.scene.name)?;
         let mut arrays = self.model.arrays();
-        for ((part, name), adam) in PARTS.into_iter().zip(&self.optimiser.moments) {
+        for ((_, name), adam) in PARTS.into_iter().zip(&self.optimiser.moments) {
             for (order, moment) in [("first", &adam.first), ("second", &adam.second)] {
-                arrays.push((format!("{name}.{order}_moment"), self.model.stored(part, moment)));
+                arrays.push((format!("{name}.{order}_moment"), Array::Floats(Cow::Borrowed(moment))));
             }
         }
         write(path, &header, arrays)
@@ -62,19 +57,15 @@ impl<'a> Trainer<'a> {
         let mut trainer = Self::new(scene, config).map_err(|e| contents.corrupt(e.to_string()))?;
         trainer.model.restore(&contents)?;
         let steps_done = trainer.model.steps_done;
-        if let Some(text) = contents.header(RESTARTS) {
-            let wrong = |what: String| contents.corrupt(format!("header `{RESTARTS}`: {what}"));
-            trainer.restarts = serde_json::from_str(text).map_err(|e| wrong(e.to_string()))?;
-            trainer.restarts.check(steps_done).map_err(wrong)?;
-        }
         for ((part, name), adam) in PARTS.into_iter().zip(&mut trainer.optimiser.moments) {
-            adam.first = trainer.model.restored(&contents, part, &format!("{name}.first_moment"))?;
-            adam.second = trainer.model.restored(&contents, part, &format!("{name}.second_moment"))?;
+            let count = trainer.model.parameters.get(part).len();
+            adam.first = contents.floats(&format!("{name}.first_moment"), count)?;
+            adam.second = contents.floats(&format!("{name}.second_moment"), count)?;
             if let Some(at) = adam.second.iter().position(|&v| v < 0.0) {
                 let what = format!("`{name}.second_moment` is {} at {at}, expected at least 0", adam.second[at]);
                 return Err(contents.corrupt(what));
             }
-            adam.steps = steps_done - trainer.restarts.begun;
+            adam.steps = steps_done;
         }
         Ok(trainer)
     }

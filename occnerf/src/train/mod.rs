@@ -11,6 +11,5 @@ pub(crate) mod photometric;
 #[cfg(test)]
 mod plain;
 pub(crate) mod report;
-pub(crate) mod restarts;
 pub(crate) mod step;
 pub(crate) mod trainer;

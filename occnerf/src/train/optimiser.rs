@@ -28,7 +28,6 @@ impl Optimiser {
     /// One Adam step of every part at its rate times `decay`; returns how many gradients were not
     /// finite.
     pub fn step(&mut self, parameters: &mut Parameters, rates: &RateConfig, decay: f32) -> usize {
-        parameters.kept_rows = None;
         let each = [rates.field, rates.table, rates.vertices, rates.motion];
         let parts = parameters.values.0.iter_mut().zip(&self.gradients.0).zip(&mut self.moments);
         parts.zip(each).map(|(((v, g), adam), rate)| adam.step(rate * decay, rates.beta_2, v, g)).sum()

@@ -23,9 +23,6 @@ pub struct StepReport {
     pub rays: usize,
     /// Gradients that were not finite and were left out.
     pub bad_gradients: usize,
-    /// How often training has restarted, each time at a tenth of the rates, because the field had
-    /// become empty.
-    pub restarts: u32,
     /// Time of each stage.
     pub times: StepTimes,
 }

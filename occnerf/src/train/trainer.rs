@@ -7,7 +7,6 @@ use rayon::prelude::*;
 use smpl::MotionFrame;
 
 use crate::Error;
-use crate::capacity::Pruned;
 use crate::config::Config;
 use crate::lpips::Lpips;
 use crate::model::colors::PriorColors;
@@ -25,7 +24,6 @@ use crate::train::batch::Batch;
 use crate::train::optimiser::Optimiser;
 use crate::train::photometric::Photometric;
 use crate::train::report::StepReport;
-use crate::train::restarts::Restarts;
 use crate::train::step::{RayGroup, Step, StepOptions, zero};
 
 /// Rays are dealt row by row to this many groups, each with its own gradient buffers, summed in
@@ -37,7 +35,6 @@ pub struct Trainer<'a> {
     pub(crate) scene: &'a Scene,
     pub(crate) model: Model,
     pub(crate) optimiser: Optimiser,
-    pub(crate) restarts: Restarts,
     /// The perceptual term, where it is not the embedded one.
     lpips: Option<Lpips>,
     pub(crate) buffers: Buffers,
@@ -74,10 +71,10 @@ impl<'a> Trainer<'a> {
             d_volume: Vec::new(),
         };
         let optimiser = Optimiser::new(&model.parameters);
-        Ok(Self { scene, model, optimiser, restarts: Restarts::default(), lpips: None, buffers })
+        Ok(Self { scene, model, optimiser, lpips: None, buffers })
     }
 
-    /// Feeds the perceptron with the features of `encoder` in place of the method's, and restarts.
+    /// Feeds the perceptron with the features of `encoder` in place of the method's, and begins at step 0.
     /// A checkpoint does not hold the encoder: such a run cannot be resumed, nor its model loaded.
     ///
     /// # Panics
@@ -87,7 +84,8 @@ impl<'a> Trainer<'a> {
         let Model { config, body, field, .. } = &mut self.model;
         assert!(!config.has_surface_term(), "the surface term of {} has no encoder", config.method.name());
         *field = Field::new(Encoder::Custom(encoder), config, body.canonical_box);
-        self.begin_anew();
+        self.model.forget();
+        self.optimiser = Optimiser::new(&self.model.parameters);
         self
     }
 
@@ -119,11 +117,6 @@ impl<'a> Trainer<'a> {
         Ok(())
     }
 
-    /// Calls [`Model::prune`]; a step taken afterwards makes all rows learnable again.
-    pub fn prune(&mut self) -> Pruned {
-        self.model.prune()
-    }
-
     /// Which perceptual term the run is trained with: `ms-ssim`, `lpips` with the network's name,
     /// or `none`.
     pub fn perceptual(&self) -> String {
@@ -144,11 +137,6 @@ impl<'a> Trainer<'a> {
     }
 
     /// Resets the parameters.
-    fn begin_anew(&mut self) {
-        self.model.forget();
-        self.optimiser = Optimiser::new(&self.model.parameters);
-    }
-
     /// Takes one optimisation step.
     ///
     /// # Errors
@@ -161,7 +149,7 @@ impl<'a> Trainer<'a> {
     }
 
     pub(crate) fn step_with(&mut self, options: StepOptions) -> Result<StepReport, Error> {
-        let Self { scene, model, optimiser, restarts, lpips, buffers } = self;
+        let Self { scene, model, optimiser, lpips, buffers } = self;
         let Buffers { batch, groups, vertex_code, surface, photometric, transposed, d_volume } = buffers;
         let loss = &model.config.loss;
         if lpips.is_none() && !loss.perceptual_weights.is_empty() && loss.perceptual > 0.0 {
@@ -203,16 +191,7 @@ impl<'a> Trainer<'a> {
         groups.iter().for_each(|group| model.counts.add(&group.terminations));
         let decay = model.config.rates.final_fraction.powf(step as f32 / model.config.steps.max(1) as f32);
         let rates = &model.config.rates;
-        report.bad_gradients = optimiser.step(&mut model.parameters, rates, decay * restarts.rates());
-        for group in &*groups {
-            let subject = |ray: &&usize| frame.labels.at(batch.pixels[**ray]) == Label::Subject;
-            let composites = group.rays.iter().zip(&group.composites).filter(|(ray, _)| subject(ray));
-            composites.for_each(|(_, composite)| restarts.note(composite.opacity));
-        }
-        if self.restarts.due(step + 1) {
-            self.begin_anew();
-        }
-        report.restarts = self.restarts.count;
+        report.bad_gradients = optimiser.step(&mut model.parameters, rates, decay);
         self.model.refresh_volume();
         watch.lap(&mut times.update);
         report.times = times;

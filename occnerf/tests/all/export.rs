@@ -10,7 +10,8 @@ use glam::{Mat3, Quat, Vec2, Vec3};
 use occnerf::bake::Avatar;
 use occnerf::bake::export::{Splats, adapt_motion, splats, write_amass, write_obj};
 use occnerf::{Config, Method, Preset, PriorColors, Scene};
-use smpl::{Character, MotionClip};
+use rigged::Character;
+use smpl::MotionClip;
 use synth::{DemoConfig, demo};
 
 fn avatar() -> &'static Avatar {
@@ -55,8 +56,8 @@ fn a_glb_reads_back_and_moves_as_the_avatar_does() {
         let (found, expected) = (character.pose(0, seconds).vertices, avatar.skin(&avatar.bones_at(0, seconds)));
         assert!(worst(&found, &expected) < 2e-4, "at {seconds} s: {} m", worst(&found, &expected));
     }
-    let texture = image::load_from_memory(&character.texture.unwrap().bytes).unwrap().into_rgba8();
-    assert_eq!(texture.into_raw(), avatar.atlas.rgba);
+    let texture = image::load_from_memory(&character.texture.unwrap().bytes).unwrap().into_rgb8();
+    assert_eq!(texture.into_raw(), avatar.atlas.rgb);
 }
 
 #[test]
@@ -67,39 +68,6 @@ fn a_glb_carries_the_light_beside_the_colours_without_it() {
     let length = u32::from_le_bytes(bytes[12..16].try_into().unwrap()) as usize;
     let text = std::str::from_utf8(&bytes[20..20 + length]).unwrap();
     assert!(text.contains(r#""extras":{"light":[0.5,0.25,-0.125]}"#), "{text}");
-}
-
-#[test]
-fn several_shells_and_many_vertices_stay_whole() {
-    let mut avatar = avatar().clone();
-    // A second shell outside of the first.
-    let (v, f) = (avatar.num_vertices(), avatar.faces.len());
-    let outward: Vec<Vec3> = avatar.vertices.iter().zip(&avatar.normals).map(|(x, n)| *x + 0.01 * *n).collect();
-    avatar.vertices.extend(outward);
-    avatar.normals.extend_from_within(..);
-    avatar.uvs.extend_from_within(..);
-    avatar.joints.extend_from_within(..);
-    avatar.weights.extend_from_within(..);
-    avatar.posedirs = smpl::SparseRows::from_rows((0..2 * v).map(|_| None::<(u32, Vec3)>));
-    avatar.faces.extend_from_within(..);
-    avatar.faces[f..].iter_mut().flatten().for_each(|i| *i += v as u32);
-    avatar.shell_ends = vec![f as u32, 2 * f as u32];
-    avatar.atlas.rgba.iter_mut().skip(3).step_by(8).for_each(|alpha| *alpha = 90);
-    let path = place("shells.glb");
-    std::fs::write(&path, avatar.to_glb().unwrap()).unwrap();
-    let character = Character::load(&path).unwrap();
-    // The reader merges primitives, each with its own vertices.
-    assert_eq!(character.faces.len(), 2 * f);
-    let corner = |at: usize| character.vertices[character.faces[at][0] as usize];
-    for face in [0, f - 1, f, 2 * f - 1] {
-        assert_eq!(corner(face), avatar.vertices[avatar.faces[face][0] as usize]);
-    }
-    let texture = image::load_from_memory(&character.texture.unwrap().bytes).unwrap();
-    assert_eq!(texture.into_rgba8().into_raw(), avatar.atlas.rgba);
-    let (vertices, normals) = (avatar.vertices.clone(), avatar.normals.clone());
-    write_obj(&avatar, &vertices, &normals, &place("shells.obj")).unwrap();
-    let mesh = smpl::load_mesh(&place("shells.obj")).unwrap();
-    assert_eq!((mesh.vertices.len(), mesh.faces.len()), (v, f), "the outermost shell alone");
 }
 
 #[test]
@@ -122,13 +90,13 @@ fn an_obj_holds_the_pose_the_colours_and_the_atlas() {
         assert!(uv.distance(Vec2::new(avatar.uvs[expected].x, 1.0 - avatar.uvs[expected].y)) < 1e-5);
         let (width, color) = (avatar.atlas.width as usize, read(&mesh.vertex_color));
         let texel = (avatar.uvs[expected] * Vec2::new(width as f32, avatar.atlas.height as f32)).as_uvec2();
-        let at = 4 * (texel.y as usize * width + texel.x as usize);
-        let near = Vec3::from_array([0, 1, 2].map(|c| f32::from(avatar.atlas.rgba[at + c]) / 255.0));
+        let at = 3 * (texel.y as usize * width + texel.x as usize);
+        let near = Vec3::from_array([0, 1, 2].map(|c| f32::from(avatar.atlas.rgb[at + c]) / 255.0));
         assert!(color.distance(near) < 0.1, "{color} {near}");
     }
     let picture = materials.unwrap()[0].diffuse_texture.clone().unwrap();
-    let picture = image::open(place(&picture)).unwrap().into_rgba8();
-    assert_eq!(picture.into_raw(), avatar.atlas.rgba);
+    let picture = image::open(place(&picture)).unwrap().into_rgb8();
+    assert_eq!(picture.into_raw(), avatar.atlas.rgb);
     assert!(write_obj(avatar, &vertices[1..], &normals, &path).is_err());
 }
 
@@ -221,8 +189,8 @@ fn splats_cover_the_surface_without_holes_and_show_its_colours() {
                 let uv: Vec2 = (0..3).map(|c| hit.barycentric[c] * avatar.uvs[face[c] as usize]).sum();
                 let size = Vec2::new(avatar.atlas.width as f32, avatar.atlas.height as f32);
                 let texel = (uv * size).as_uvec2();
-                let start = 4 * (texel.y * avatar.atlas.width + texel.x) as usize;
-                Some(Vec3::from_array([0, 1, 2].map(|c| f32::from(avatar.atlas.rgba[start + c]) / 255.0)))
+                let start = 3 * (texel.y * avatar.atlas.width + texel.x) as usize;
+                Some(Vec3::from_array([0, 1, 2].map(|c| f32::from(avatar.atlas.rgb[start + c]) / 255.0)))
             };
             let hits: Vec<Option<Vec3>> = (0..side * side).map(expected).collect();
             let inside = |i: usize| {

@@ -3,7 +3,6 @@
 
 mod allocations;
 mod avatar;
-mod capacity;
 mod checkpoint;
 mod common;
 mod config;
@@ -22,6 +21,5 @@ mod on_demand;
 mod perceptual;
 mod person;
 mod readme;
-mod restarts;
 #[path = "common/stand_in.rs"]
 mod stand_in;

@@ -12,7 +12,7 @@ pub(crate) const MAX_FILE_BYTES: u64 = 1 << 31;
 /// that limit.
 ///
 /// # Errors
-/// [`Error::Io`]; [`Error::TooLarge`]; [`Error::Invalid`] for a web page.
+/// [`Error::Io`]; [`Error::Invalid`] for a larger file and for a web page.
 pub fn read_file(path: &Path) -> Result<Vec<u8>, Error> {
     let file = std::fs::File::open(path).map_err(Error::io(path))?;
     let length = file.metadata().map_err(Error::io(path))?.len();
@@ -38,7 +38,6 @@ pub fn read_file(path: &Path) -> Result<Vec<u8>, Error> {
 /// assert_eq!(decode_text(b"\xef\xbb\xbfv 0 0 0\r\nv 1 0 0\r"), "v 0 0 0\nv 1 0 0\n");
 /// assert_eq!(decode_text(b"\xff\xfe{\0}\0"), "{}");
 /// ```
-#[must_use]
 pub fn decode_text(bytes: &[u8]) -> String {
     let utf16 = |bytes: &[u8], from: fn([u8; 2]) -> u16| {
         let units: Vec<u16> = bytes.chunks(2).map(|pair| from([pair[0], *pair.get(1).unwrap_or(&0)])).collect();

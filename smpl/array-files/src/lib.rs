@@ -42,5 +42,6 @@ pub mod torch;
 struct Readme;
 
 pub use array::{Data, NdArray};
+pub use element::half_to_f32;
 pub use error::Error;
 pub use file::{decode_text, read_file};

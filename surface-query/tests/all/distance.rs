@@ -2,7 +2,7 @@
 
 use glam::{Quat, Vec3};
 use proptest::prelude::*;
-use surface_query::{Closest, Error, MeshDistance};
+use surface_query::{Closest, MeshDistance};
 use testkit::body::Random;
 use testkit::{TriMesh, mesh, oracle, strategy};
 
@@ -270,15 +270,14 @@ fn degenerate_meshes_are_answered_or_refused() {
         let soup = TriMesh { vertices, faces };
         let distance = match MeshDistance::new(&soup.vertices, &soup.faces) {
             Ok(distance) => distance,
-            Err(Error::NotFinite { vertex }) => {
-                assert!(!soup.vertices[vertex].is_finite(), "{name}");
+            Err(error) => {
+                let expected = match soup.vertices.iter().position(|v| !v.is_finite()) {
+                    Some(vertex) => format!("vertex {vertex} is not finite"),
+                    None => "no faces".to_owned(),
+                };
+                assert!(error.to_string() == expected && (expected != "no faces" || n == 0), "{name}: {error}");
                 continue;
             }
-            Err(Error::NoFaces) => {
-                assert!(soup.faces.is_empty(), "{name}");
-                continue;
-            }
-            Err(error) => panic!("{name}: {error}"),
         };
         let size = soup.vertices.iter().fold(0.0, |m: f32, p| m.max(p.abs().max_element()));
         let mut random = Random(5);
@@ -368,9 +367,9 @@ fn outside_two_boxes_that_share_a_wall_every_distance_is_positive() {
 
 #[test]
 fn meshes_without_faces_or_with_indices_out_of_range_are_errors() {
-    assert_eq!(MeshDistance::new(&[Vec3::ZERO], &[]).unwrap_err(), Error::NoFaces);
+    assert_eq!(MeshDistance::new(&[Vec3::ZERO], &[]).unwrap_err().to_string(), "no faces");
     let out_of_range = MeshDistance::new(&[Vec3::ZERO], &[[0, 1, 0]]).unwrap_err();
-    assert_eq!(out_of_range, Error::FaceIndex { face: 0, vertex: 1, vertices: 1 });
+    assert_eq!(out_of_range.to_string(), "face 0 has vertex index 1, but there are only 1 vertices");
 }
 
 #[test]

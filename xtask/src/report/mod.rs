@@ -7,14 +7,13 @@ mod viewer;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, ensure};
-use occnerf::{Capacity, Choice, Pruned};
 
 pub use self::curves::Log;
 use self::curves::curves;
 pub use self::page::Page;
 use self::viewer::{Views, viewers};
 use crate::run::{self, LOG, Metrics, PERSON, RunConfig};
-use crate::{capacity, table};
+use crate::table;
 
 /// Largest embedded file.
 const MAX_BYTES: u64 = 16 << 20;
@@ -76,12 +75,6 @@ pub fn add_runs(page: &mut Page, runs: &[Run], folder: &Path) -> Result<()> {
         vec![r.name.clone(), m.method.clone(), m.scene.clone(), m.preset.clone(), m.seed.to_string(), memory(r)]
     };
     page.table(&std::iter::once(more).chain(runs.iter().map(row)).collect::<Vec<_>>());
-    for run in runs {
-        if let Some(capacity) = capacity::read(&run.directory)? {
-            page.subheading(&format!("{}: sizes from the scene", run.name));
-            add_capacity(page, &capacity);
-        }
-    }
     let (mut views, mut logs) = (Vec::new(), Vec::new());
     for run in runs {
         views.extend(Views::read(&run.directory.join(NOVEL))?.map(|v| (run.name.clone(), v)));
@@ -129,18 +122,6 @@ fn add_people(page: &mut Page, runs: &[Run], folder: &Path) -> Result<()> {
         }
     }
     Ok(())
-}
-
-/// Adds the chosen sizes with their reasons, and pruning.
-fn add_capacity(page: &mut Page, capacity: &Capacity) {
-    let header = ["size", "preset", "chosen", "why"].map(str::to_owned).to_vec();
-    let row = |c: &Choice| vec![c.key.clone(), c.preset.to_string(), c.chosen.to_string(), c.why.clone()];
-    page.table(&std::iter::once(header).chain(capacity.choices.iter().map(row)).collect::<Vec<_>>());
-    if let Some(Pruned { rows, dropped, parameters }) = capacity.pruned {
-        page.paragraph(&format!(
-            "Pruned after training: {dropped} of {rows} rows of the table, which no ray touched; {parameters} parameters left."
-        ));
-    }
 }
 
 /// Every PNG of a directory, if it is there.

@@ -53,18 +53,12 @@ pub fn view(arguments: &ViewArguments) -> Result<()> {
 /// The whole page.
 pub fn page(person: &Avatar) -> Result<String> {
     let name = if person.name.is_empty() { "person" } else { &person.name };
-    let shells = person.shell_ends.len();
     let extra = json!({
         "cameras": person.cameras.iter().map(camera).collect::<Vec<_>>(),
         "light": person.light.slope.to_array(),
         "confidence": STANDARD.encode(person.atlas.confidence_to_png()?),
     });
-    let facts = format!(
-        "{} triangles{}, {} joints",
-        person.faces.len(),
-        if shells > 1 { format!(" in {shells} shells") } else { String::new() },
-        person.num_joints()
-    );
+    let facts = format!("{} triangles, {} joints", person.faces.len(), person.num_joints());
     let glb = STANDARD.encode(person.to_glb()?);
     let mut hasher = DefaultHasher::new();
     (&glb, name).hash(&mut hasher);

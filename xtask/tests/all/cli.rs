@@ -30,7 +30,6 @@ fn help_names_the_commands_and_every_option_of_train() {
         "--camera",
         "--lpips",
         "--perceptual-weights",
-        "--capacity",
     ];
     for option in options {
         assert!(train.contains(option), "{train}");

@@ -1,7 +1,6 @@
 //! The command line as its users see it.
 #![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
 
-mod capacity;
 mod cli;
 mod common;
 #[cfg(target_os = "linux")]

@@ -22,10 +22,9 @@ const CLAMP_TO_EDGE: u32 = 33071;
 impl Avatar {
     /// glTF 2.0 binary (`.glb`).
     ///
-    /// One skinned mesh with a primitive a shell (`POSITION`, `NORMAL`, `TEXCOORD_0`, `JOINTS_0`,
+    /// One skinned mesh (`POSITION`, `NORMAL`, `TEXCOORD_0`, `JOINTS_0`,
     /// `WEIGHTS_0` in 16 bits), `KHR_materials_unlit`, the atlas as PNG, a node a joint with the rest
-    /// pose as bind pose, and an animation a clip. The innermost shell is opaque, those around it are
-    /// blended over it in order. The atlas is under even light; that of the video is the scene's extra
+    /// pose as bind pose, and an animation a clip. The atlas is under even light; that of the video is the scene's extra
     /// `light`, a vector s: a surface with unit normal n is max(1 + s · n + ½ |s| ((ŝ · n)² − ⅓), 0.2)
     /// times as bright, see [`crate::capture::Light`]. Pose blend shapes and confidence are left out.
     ///
@@ -35,13 +34,7 @@ impl Avatar {
         self.validate().map_err(Error::Bake)?;
         let mut file = File::default();
         let attributes = attributes(self, &mut file);
-        let shells = self.shell_ends.len();
-        let primitives: Vec<Value> = (0..shells)
-            .map(|shell| {
-                let indices = file.indices(self.shell(shell), self.num_vertices());
-                json!({ "attributes": attributes, "indices": indices, "material": usize::from(shell > 0) })
-            })
-            .collect();
+        let indices = file.indices(&self.faces, self.num_vertices());
         let bind: Vec<f32> = self.skeleton.iter().flat_map(|joint| inverse_bind(joint.rest)).collect();
         let bind = file.floats(&bind, "MAT4", None);
         let animations: Vec<Value> = self.clips.iter().map(|clip| animation(self, clip, &mut file)).collect();
@@ -61,10 +54,6 @@ impl Avatar {
             })
             .collect();
         nodes.push(json!({ "name": "person", "mesh": 0, "skin": 0 }));
-        let mut materials = vec![material("person", "OPAQUE")];
-        if shells > 1 {
-            materials.push(material("shell", "BLEND"));
-        }
         let mut root = json!({
             "asset": { "version": "2.0", "generator": concat!("occnerf ", env!("CARGO_PKG_VERSION")) },
             "extensionsUsed": ["KHR_materials_unlit"],
@@ -75,9 +64,16 @@ impl Avatar {
                 "extras": { "light": self.light.slope.to_array() },
             }],
             "nodes": nodes,
-            "meshes": [{ "name": "person", "primitives": primitives }],
+            "meshes": [{ "name": "person", "primitives": [{ "attributes": attributes, "indices": indices, "material": 0 }] }],
             "skins": [{ "joints": (0..j).collect::<Vec<_>>(), "skeleton": 0, "inverseBindMatrices": bind }],
-            "materials": materials,
+            "materials": [{
+                "name": "person",
+                "alphaMode": "OPAQUE",
+                "pbrMetallicRoughness": {
+                    "baseColorTexture": { "index": 0 }, "metallicFactor": 0.0, "roughnessFactor": 0.9
+                },
+                "extensions": { "KHR_materials_unlit": {} },
+            }],
             "textures": [{ "source": 0, "sampler": 0 }],
             "samplers": [{ "magFilter": LINEAR, "minFilter": LINEAR, "wrapS": CLAMP_TO_EDGE, "wrapT": CLAMP_TO_EDGE }],
             "images": [{ "name": "atlas", "mimeType": "image/png", "bufferView": picture }],
@@ -108,15 +104,6 @@ fn container(root: &Value, mut binary: Vec<u8>) -> Result<Vec<u8>, Error> {
     out.extend(b"BIN\0");
     out.append(&mut binary);
     Ok(out)
-}
-
-fn material(name: &str, mode: &str) -> Value {
-    json!({
-        "name": name,
-        "alphaMode": mode,
-        "pbrMetallicRoughness": { "baseColorTexture": { "index": 0 }, "metallicFactor": 0.0, "roughnessFactor": 0.9 },
-        "extensions": { "KHR_materials_unlit": {} },
-    })
 }
 
 /// Column-major matrix that takes a joint's rest position to the origin.

@@ -9,36 +9,17 @@ use crate::Error;
 use crate::bake::{Atlas, Avatar, write_whole};
 
 /// Writes `path` (`.obj`) and beside it the same name with `.mtl` and `.png`: the avatar's
-/// outermost shell with `vertices` (V) and `normals` (V) in their places, colours at the vertices
+/// surface with `vertices` (V) and `normals` (V) in their places, colours at the vertices
 /// (`v x y z r g b`, sRGB from 0 to 1) and texture coordinates.
 ///
 /// # Errors
-/// [`Error::Bake`] for other numbers of vertices or normals and for an avatar without shells;
-/// [`Error::Io`].
+/// [`Error::Bake`] for other numbers of vertices or normals; [`Error::Io`].
 pub fn write_obj(avatar: &Avatar, vertices: &[Vec3], normals: &[Vec3], path: &Path) -> Result<(), Error> {
     let v = avatar.num_vertices();
     if vertices.len() != v || normals.len() != v {
         let found = (vertices.len(), normals.len());
         return Err(Error::Bake(format!("mesh: expected {v} vertices and normals, found {found:?}")));
     }
-    let Some(outermost) = avatar.shell_ends.len().checked_sub(1) else {
-        return Err(Error::Bake("mesh: the avatar has no shells".to_owned()));
-    };
-    // Vertices of the shell, in order of first use.
-    let mut places = vec![0u32; v];
-    let mut used: Vec<usize> = Vec::new();
-    let faces: Vec<[u32; 3]> = (avatar.shell(outermost).iter())
-        .map(|face| {
-            face.map(|index| {
-                let place = &mut places[index as usize];
-                if *place == 0 {
-                    used.push(index as usize);
-                    *place = used.len() as u32;
-                }
-                *place
-            })
-        })
-        .collect();
     let file_name = |extension: &str| {
         // OBJ statements are separated by white space.
         let name = path.with_extension(extension).file_name().unwrap_or_default().to_string_lossy().into_owned();
@@ -50,19 +31,18 @@ pub fn write_obj(avatar: &Avatar, vertices: &[Vec3], normals: &[Vec3], path: &Pa
         return Err(Error::Bake(format!("{}: {what}", path.display())));
     }
     let mut text = format!("# metres, y up; colours of vertices in sRGB\nmtllib {material}\no person\nusemtl person\n");
-    for &i in &used {
-        let (at, color) = (vertices[i], avatar.atlas.color(avatar.uvs[i]));
+    for (at, &uv) in vertices.iter().zip(&avatar.uvs) {
+        let color = avatar.atlas.color(uv);
         let _ = writeln!(text, "v {:.6} {:.6} {:.6} {:.4} {:.4} {:.4}", at.x, at.y, at.z, color.x, color.y, color.z);
     }
-    for &i in &used {
+    for uv in &avatar.uvs {
         // OBJ counts v upward.
-        let _ = writeln!(text, "vt {:.6} {:.6}", avatar.uvs[i].x, 1.0 - avatar.uvs[i].y);
+        let _ = writeln!(text, "vt {:.6} {:.6}", uv.x, 1.0 - uv.y);
     }
-    for &i in &used {
-        let n = normals[i];
+    for n in normals {
         let _ = writeln!(text, "vn {:.4} {:.4} {:.4}", n.x, n.y, n.z);
     }
-    for [a, b, c] in faces {
+    for [a, b, c] in avatar.faces.iter().map(|face| face.map(|v| v + 1)) {
         let _ = writeln!(text, "f {a}/{a}/{a} {b}/{b}/{b} {c}/{c}/{c}");
     }
     let library = format!("newmtl person\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd {picture}\n");
@@ -79,7 +59,7 @@ impl Atlas {
         let (low, share) = (at.floor(), at - at.floor());
         let texel = |x: f32, y: f32| {
             let (x, y) = ((x.max(0.0) as usize).min(width - 1), (y.max(0.0) as usize).min(height - 1));
-            let bytes = &self.rgba[4 * (y * width + x)..][..3];
+            let bytes = &self.rgb[3 * (y * width + x)..][..3];
             Vec3::new(f32::from(bytes[0]), f32::from(bytes[1]), f32::from(bytes[2])) / 255.0
         };
         let row = |y: f32| texel(low.x, y).lerp(texel(low.x + 1.0, y), share.x);

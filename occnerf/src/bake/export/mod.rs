@@ -18,16 +18,12 @@ use super::Atlas;
 use crate::Error;
 
 impl Atlas {
-    /// The texture as a PNG, without alpha if opaque.
+    /// The texture as a PNG.
     ///
     /// # Errors
-    /// [`Error::Bake`] of the encoder, as for data that are not (H, W, 4).
+    /// [`Error::Bake`] of the encoder, as for data that are not (H, W, 3).
     pub fn to_png(&self) -> Result<Vec<u8>, Error> {
-        if self.is_opaque() {
-            let rgb: Vec<u8> = self.rgba.chunks_exact(4).flat_map(|texel| [texel[0], texel[1], texel[2]]).collect();
-            return self.encode(&rgb, ExtendedColorType::Rgb8);
-        }
-        self.encode(&self.rgba, ExtendedColorType::Rgba8)
+        self.encode(&self.rgb, ExtendedColorType::Rgb8)
     }
 
     /// The confidence as a grey PNG.
@@ -36,12 +32,6 @@ impl Atlas {
     /// As [`Atlas::to_png`].
     pub fn confidence_to_png(&self) -> Result<Vec<u8>, Error> {
         self.encode(&self.confidence, ExtendedColorType::L8)
-    }
-
-    /// Whether every texel is opaque.
-    #[must_use]
-    pub fn is_opaque(&self) -> bool {
-        self.rgba.chunks_exact(4).all(|texel| texel[3] == 255)
     }
 
     fn encode(&self, values: &[u8], kind: ExtendedColorType) -> Result<Vec<u8>, Error> {

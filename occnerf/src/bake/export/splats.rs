@@ -33,23 +33,23 @@ pub struct Splats {
     pub rotations: Vec<Quat>,
 }
 
-/// Covers the avatar's outermost shell, with `vertices` (V) in their places, by a Gaussian a
+/// Covers the avatar's surface, with `vertices` (V) in their places, by a Gaussian a
 /// triangle; triangles whose longest edge is above `patch` metres are halved until it is not.
 ///
 /// # Errors
 /// [`Error::Bake`] for another number of vertices, a patch that is not above 0, and more than 4
 /// million Gaussians.
 pub fn splats(avatar: &Avatar, vertices: &[Vec3], patch: f32) -> Result<Splats, Error> {
-    if vertices.len() != avatar.num_vertices() || avatar.shell_ends.is_empty() {
+    if vertices.len() != avatar.num_vertices() {
         let (expected, found) = (avatar.num_vertices(), vertices.len());
-        return Err(Error::Bake(format!("splats: expected {expected} vertices of a shell, found {found}")));
+        return Err(Error::Bake(format!("splats: expected {expected} vertices, found {found}")));
     }
     if patch.is_nan() || patch <= 0.0 {
         return Err(Error::Bake(format!("splats: expected patches of more than 0 m, found {patch}")));
     }
     let mut out = Splats::default();
     let mut todo: Vec<[(Vec3, Vec2); 3]> = Vec::new();
-    for face in avatar.shell(avatar.shell_ends.len() - 1) {
+    for face in &avatar.faces {
         todo.push(face.map(|i| (vertices[i as usize], avatar.uvs[i as usize])));
         while let Some(corners) = todo.pop() {
             let edge = |i: usize| corners[i].0.distance(corners[(i + 1) % 3].0);

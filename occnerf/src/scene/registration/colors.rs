@@ -47,14 +47,18 @@ impl Colors {
     }
 }
 
-/// Robust standard deviation of colour residuals (scaled median absolute deviation), at least
-/// [`NOISE`]; `None` for no residuals.
+/// Robust standard deviation of colour residuals, at least [`NOISE`]; `None` for no residuals.
 pub(crate) fn noise(residuals: impl Iterator<Item = Vec3>) -> Option<f32> {
+    Some(deviation(residuals)?.max(NOISE))
+}
+
+/// Scaled median absolute deviation of colour residuals; `None` for no residuals.
+pub(crate) fn deviation(residuals: impl Iterator<Item = Vec3>) -> Option<f32> {
     let mut errors: Vec<f32> = residuals.map(|residual| residual.abs().element_sum() / 3.0).collect();
     let middle = errors.len() / 2;
     let median = if errors.is_empty() { None } else { Some(*errors.select_nth_unstable_by(middle, f32::total_cmp).1) };
     // 1.48 scales a median absolute deviation to a normal distribution's σ.
-    median.map(|median| (1.48 * median).max(NOISE))
+    median.map(|median| 1.48 * median)
 }
 
 #[cfg(test)]

@@ -27,7 +27,7 @@ use smpl::{BodyModel, Placement, Posed, Shaped};
 use volrender::{Aabb, Camera};
 
 use self::colors::Colors;
-pub(crate) use self::colors::noise;
+pub(crate) use self::colors::{deviation, noise};
 use self::corrections::{Correction, corrected};
 pub(crate) use self::crop::Crop;
 pub(crate) use self::equations::robust;

@@ -9,7 +9,7 @@ use volrender::Camera;
 /// Texels a side of the square that a face's colours stand in.
 const CELL: usize = 8;
 
-/// The prior of a prepared scene as an avatar of one shell.
+/// The prior of a prepared scene as an avatar.
 pub fn stand_in(scene: &Scene, colors: &PriorColors) -> Avatar {
     let body = &scene.body;
     let metres = 1.0 / body.scale;
@@ -48,7 +48,7 @@ pub fn stand_in(scene: &Scene, colors: &PriorColors) -> Avatar {
     let mut atlas = Atlas {
         width: width as u32,
         height: height as u32,
-        rgba: vec![255; 4 * width * height],
+        rgb: vec![255; 3 * width * height],
         confidence: vec![0; width * height],
     };
     let (mut uvs, mut vertices, mut joints, mut weights) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
@@ -64,7 +64,7 @@ pub fn stand_in(scene: &Scene, colors: &PriorColors) -> Avatar {
             let mixed = (color[0] * (1.0 - b - c) + color[1] * b + color[2] * c).clamp(Vec3::ZERO, Vec3::ONE);
             let texel = (y0 + y) * width + x0 + x;
             let bytes = (mixed * 255.0).round().to_array().map(|c| c as u8);
-            atlas.rgba[4 * texel..4 * texel + 3].copy_from_slice(&bytes);
+            atlas.rgb[3 * texel..3 * texel + 3].copy_from_slice(&bytes);
             atlas.confidence[texel] = [0, 85, 170, 255][seen];
         }
         for (corner, &v) in face.iter().enumerate() {
@@ -98,7 +98,6 @@ pub fn stand_in(scene: &Scene, colors: &PriorColors) -> Avatar {
         normals: smooth,
         uvs,
         faces: (0..corners as u32).collect::<Vec<_>>().chunks_exact(3).map(|c| [c[0], c[1], c[2]]).collect(),
-        shell_ends: vec![model.faces.len() as u32],
         joints,
         weights,
         posedirs,

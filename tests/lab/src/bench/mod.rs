@@ -1,8 +1,7 @@
 //! `bench`: what every approximation costs and is worth, and where methods break.
 
 mod axes;
-mod baked;
-mod capacity;
+mod baking;
 pub mod chart;
 mod cost;
 mod difficulty;
@@ -19,7 +18,7 @@ use anyhow::{Result, bail, ensure};
 use clap::{Args, Subcommand};
 use occnerf::capture::Layout;
 
-pub use self::baked::Baking;
+pub use self::baking::Baking;
 pub use self::difficulty::Difficulty;
 use crate::results::{self, Section};
 use crate::sweep::{Line, Place, Runner, SittingArguments, job};
@@ -44,9 +43,6 @@ enum What {
     /// Seconds against accuracy of every named approximation, each preset and each method: a table
     /// and charts.
     Pareto(SweepArguments),
-    /// Parameters and memory against accuracy, of fixed sizes and of `train --capacity auto`: a
-    /// table and charts.
-    Capacity(CapacityArguments),
     /// What happens as it gets hard: less to see, worse poses, odd units, …; a table of breaking
     /// points and charts.
     Stability(StabilityArguments),
@@ -55,8 +51,6 @@ enum What {
     /// Where the time of a step goes, and how time and memory grow with rays, samples, table,
     /// vertices, frames and pixels.
     Cost(CostArguments),
-    /// A run's baked person against its field: a table of scores and speeds, and pictures.
-    Baked(baked::BakedArguments),
     /// What registration makes of wrong priors: degrees and millimetres against the demo's true
     /// bodies.
     Registration(registration::RegistrationArguments),
@@ -100,16 +94,6 @@ struct SweepArguments {
 }
 
 #[derive(Args)]
-struct CapacityArguments {
-    #[command(flatten)]
-    sweep: SweepArguments,
-    /// The preset `paper` too, and what is chosen from it, with this many steps and the loss of
-    /// `balanced`
-    #[arg(long, value_name = "STEPS")]
-    paper: Option<u64>,
-}
-
-#[derive(Args)]
 struct StabilityArguments {
     #[command(flatten)]
     sweep: SweepArguments,
@@ -150,10 +134,8 @@ struct KernelArguments {
 /// Runs the command.
 pub fn bench(arguments: &BenchArguments) -> Result<()> {
     match &arguments.what {
-        What::Baked(arguments) => baked::baked(arguments),
         What::Registration(arguments) => registration::registration(arguments),
         What::Pareto(arguments) => pareto(arguments),
-        What::Capacity(arguments) => capacity_bench(arguments),
         What::Stability(arguments) => stability(arguments),
         What::Kernels(arguments) => kernels::run(&arguments.out, arguments.quick, arguments.publish),
         What::Cost(arguments) => {
@@ -219,7 +201,7 @@ impl SweepArguments {
         Ok(steps)
     }
 
-    /// The sweep of `pareto` and `capacity` around a scene.
+    /// The sweep of `pareto` around a scene.
     fn around(&self, scene: &str) -> Result<points::Sweep> {
         let on = &self.on;
         Ok(points::Sweep {
@@ -271,26 +253,14 @@ fn pareto(sweep: &SweepArguments) -> Result<()> {
         Ok(lines)
     };
     sweep.sweep("pareto", &scenes, run, |name, _, lines, stem| {
-        pareto::charts(name, lines, &pareto::SECONDS, stem)?;
-        Ok(pareto::table(lines, pareto::SECONDS[0]))
+        pareto::charts(name, lines, &pareto::COSTS, stem)?;
+        Ok(pareto::table(lines, pareto::COSTS[0]))
     })?;
     let SittingArguments { part, publish, .. } = sweep.sitting;
     if part.merge || part.shard.is_some() {
         return Ok(());
     }
     kernels::run(&sweep.out("pareto"), sweep.quick, publish)
-}
-
-fn capacity_bench(arguments: &CapacityArguments) -> Result<()> {
-    let CapacityArguments { sweep, paper } = arguments;
-    let scenes = sweep.scenes()?;
-    let run = |scene: &str, _: &(), runner: &mut Runner| {
-        runner.run_all(capacity::points(&sweep.around(scene)?, &sweep.on.read(scene)?, *paper)?)
-    };
-    sweep.sweep("capacity", &scenes, run, |name, _, lines, stem| {
-        pareto::charts(name, lines, &pareto::PARAMETERS, stem)?;
-        Ok(pareto::table(lines, pareto::PARAMETERS[0]))
-    })
 }
 
 fn stability(arguments: &StabilityArguments) -> Result<()> {
@@ -328,7 +298,6 @@ fn finish(runner: &Runner, sitting: &SittingArguments, text: &str, name: &str) -
     if sitting.publish && sitting.part.writes_tables() {
         let title = match name {
             "pareto" => "Speed against accuracy",
-            "capacity" => "Parameters against accuracy",
             "stability" => "Where methods break",
             _ => "What a step costs",
         };

@@ -1,4 +1,4 @@
-//! Costs against accuracy of the points of a sweep: `bench pareto` and `bench capacity`.
+//! Costs against accuracy of the points of a sweep: `bench pareto`.
 
 use std::fmt::Write as _;
 use std::path::Path;
@@ -22,19 +22,17 @@ const WORTHS: [(&str, Pick, usize); 3] = [
 /// What it costs: the end of the chart's name, the label, the quantity.
 pub type Cost = (&'static str, &'static str, Pick);
 /// Costs of `bench pareto`, the first that of the fronts in its table.
-pub const SECONDS: [Cost; 2] = [
+pub const COSTS: [Cost; 3] = [
     ("-training", "seconds of training", |l| Some(l.outcome.train_seconds)),
     ("-frame", "seconds a frame", |l| Some(l.outcome.seconds_per_frame)),
+    ("-parameters", "parameters", |l| Some(l.outcome.parameters as f64)),
 ];
-/// Cost of `bench capacity`.
-pub const PARAMETERS: [Cost; 1] = [("", "parameters", |l| Some(l.outcome.parameters as f64))];
 
-const STYLES: [(Kind, &str, Style); 7] = [
+const STYLES: [(Kind, &str, Style); 6] = [
     (Kind::Base, "base", Style(6, Shape::Square)),
     (Kind::Change, "one change", Style(0, Shape::Circle)),
     (Kind::Combination, "combination", Style(3, Shape::Circle)),
     (Kind::Preset, "preset", Style(2, Shape::Triangle)),
-    (Kind::Auto, "auto: sizes from the scene", Style(1, Shape::Square)),
     (Kind::Baseline, "other method", Style(1, Shape::Ring)),
     (Kind::Baked, "baked", Style(4, Shape::Circle)),
 ];
@@ -147,7 +145,7 @@ mod tests {
             failed,
         ];
         (lines[0].outcome.parameters, lines[2].outcome.parameters) = (1000, 125);
-        let text = table(&lines, SECONDS[0]);
+        let text = table(&lines, COSTS[0]);
         let rows: Vec<&str> = text.lines().skip(2).collect();
         assert_eq!(rows.len(), 4);
         assert!(rows[0].ends_with("|  |") && rows[1].contains("(-0.50)") && rows[1].ends_with("|  |"), "{text}");
@@ -156,7 +154,7 @@ mod tests {
         let cells = |row: &str| row.matches('|').count();
         assert!(text.lines().all(|row| cells(row) == cells(rows[0])), "{text}");
         (lines[0].point.kind, lines[0].point.factor) = (Kind::Preset, "k".to_owned());
-        assert!(table(&lines, PARAMETERS[0]).contains("20.25 (+0.25)"));
+        assert!(table(&lines, COSTS[2]).contains("20.25 (+0.25)"));
     }
 
     #[test]
@@ -166,8 +164,8 @@ mod tests {
             let name = |i: usize| format!("point <{i}> & more");
             let of = |i: usize| line(&name(i), "k", Kind::Change, 20.0 + (i % 7) as f64, 1.0 + (i % 5) as f64);
             let lines: Vec<Line> = (0..count).map(of).collect();
-            charts("a scene", &lines, &SECONDS, &stem).unwrap();
-            for (suffix, ..) in SECONDS {
+            charts("a scene", &lines, &COSTS, &stem).unwrap();
+            for (suffix, ..) in COSTS {
                 let path = format!("{}{suffix}", stem.display());
                 let svg = std::fs::read_to_string(format!("{path}.svg")).unwrap();
                 assert!(svg.contains("</svg>") && (count == 0 || svg.contains("point &lt;0&gt; &amp; more")));

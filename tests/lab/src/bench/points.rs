@@ -3,7 +3,7 @@
 use anyhow::Result;
 use occnerf::{Config, Preset};
 
-use super::baked::Baking;
+use super::baking::Baking;
 use crate::methods::Method;
 use crate::sweep::{Job, Kind, Line, Place, Point};
 use xtask::settings;
@@ -53,23 +53,14 @@ pub const CHANGES: [Change; 22] = [
     change("loss", "no perceptual term", &["loss.perceptual=0"], true),
 ];
 
-const fn baked(shells: usize, atlas: u32, vertex_colours: bool, smooth: bool) -> Baking {
-    Baking { shells, atlas, refinements: 4, vertex_colours, smooth }
+const fn baked(atlas: u32, smooth: bool) -> Baking {
+    Baking { atlas, refinements: 4, smooth }
 }
 
 /// Ways to bake the base, and whether the quick form has them; the first is what `render --baked`
 /// draws.
-const BAKED: [(Baking, bool); 9] = [
-    (baked(1, 2048, false, true), true),
-    (baked(1, 2048, false, false), true),
-    (baked(1, 2048, true, true), false),
-    (baked(1, 256, false, true), false),
-    (baked(1, 128, false, true), false),
-    (baked(3, 2048, false, true), true),
-    (baked(3, 2048, false, false), false),
-    (baked(5, 2048, false, true), false),
-    (baked(5, 2048, false, false), false),
-];
+const BAKED: [(Baking, bool); 4] =
+    [(baked(2048, true), true), (baked(2048, false), true), (baked(256, true), false), (baked(128, true), false)];
 
 /// A change that loses less than this, in dB, can be part of the lean combination, and one that
 /// gains more of the rich.

@@ -75,9 +75,6 @@ pub struct Job {
     pub views: usize,
     pub method: Method,
     pub config: Config,
-    /// Whether the trained model is pruned.
-    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
-    pub prune: bool,
     /// How the trained person is baked: what is scored then, instead of the field.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub bake: Option<Baking>,
@@ -100,7 +97,7 @@ pub struct Keep {
 impl Job {
     /// A run that is measured and forgotten.
     pub fn new(place: Place, views: usize, method: Method, config: Config) -> Self {
-        Self { place, views, method, config, prune: false, bake: None, keep: None }
+        Self { place, views, method, config, bake: None, keep: None }
     }
 }
 
@@ -198,9 +195,6 @@ fn measure(job: &Job) -> Result<Outcome> {
             outcome.non_finite += usize::from(!report.loss.is_finite());
             outcome.bad_gradients += report.bad_gradients;
             outcome.live_samples += report.live_samples as f64 / job.config.steps as f64;
-        }
-        if job.prune {
-            trainer.prune();
         }
         let model = trainer.into_model();
         let baked = job.bake.map(|baking| bake(&model, Some(&scene), &baking.options())).transpose()?;

@@ -56,8 +56,6 @@ pub enum Kind {
     Combination,
     /// A named preset as it is.
     Preset,
-    /// Sizes chosen from the scene.
-    Auto,
     /// Another method.
     Baseline,
     /// The base, baked.
@@ -71,7 +69,7 @@ pub enum Kind {
 /// A named run.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Point {
-    /// `pareto`, `stability`, `capacity`, `cost`, or a table of `reproduce`.
+    /// `pareto`, `stability`, `cost`, or a table of `reproduce`.
     pub bench: String,
     pub name: String,
     /// What is changed.

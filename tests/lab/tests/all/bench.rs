@@ -164,27 +164,3 @@ fn what_is_damaged_is_named() {
     refused(&["report", "/no/such/run"], &["/no/such/run", "no such directory"]);
     refused(&["report", folder("empty").to_str().unwrap()], &["neither a run", "bench.jsonl"]);
 }
-
-#[test]
-fn the_bench_has_every_preset_and_its_scene_sized_form() {
-    let folder = folder("bench-capacity");
-    let (capture, out) = (tiny(&folder, "humannerf"), folder.join("out"));
-    let bench = ["bench", "capacity", text(&capture), "--quick", "--steps", "1", "--paper", "1", "--out", text(&out)];
-    let said = done(&bench);
-    assert!(said.contains("7 runs in"), "{said}");
-    let table = std::fs::read_to_string(out.join("capacity.md")).unwrap();
-    for row in ["| balanced |", "| balanced, auto |", "| paper |", "| paper, auto |", "| table 2^13 |", "| width 32 |"]
-    {
-        assert!(table.contains(row), "{row}: {table}");
-    }
-    assert!(out.join("capacity-humannerf.svg").is_file() && out.join("capacity-humannerf.png").is_file());
-    let log = std::fs::read_to_string(out.join("bench.jsonl")).unwrap();
-    let lines: Vec<serde_json::Value> = log.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
-    let of = |name: &str| lines.iter().find(|l| l["name"] == name).unwrap();
-    let (fixed, auto) = (of("balanced"), of("balanced, auto"));
-    assert!(auto["error"].is_null() && auto["parameters"].as_u64() < fixed["parameters"].as_u64(), "{auto}");
-    assert!(auto["command"].as_str().unwrap().ends_with("--capacity auto"), "{auto}");
-    assert!(done(&bench).contains("0 runs in"));
-    refused(&["bench", "capacity", "/no/such/place"], &["/no/such/place"]);
-    refused(&["bench", "capacity", "--steps", "0"], &["--steps 0"]);
-}

@@ -9,12 +9,9 @@ use visibility::Samples;
 /// How a person is baked, and drawn.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Baking {
-    pub shells: usize,
     /// Longest side of the atlas, texels; smaller where the training pictures ask for less.
     pub atlas: u32,
     pub refinements: u32,
-    /// Whether the surface has the atlas's colours at its vertices alone.
-    pub vertex_colours: bool,
     /// Four samples a pixel instead of one.
     pub smooth: bool,
 }
@@ -22,22 +19,16 @@ pub struct Baking {
 impl Default for Baking {
     /// As `render RUN … --baked` bakes and draws.
     fn default() -> Self {
-        let BakeOptions { shells, atlas, refinements, .. } = BakeOptions::default();
-        Self { shells, atlas, refinements, vertex_colours: false, smooth: true }
+        let BakeOptions { atlas, refinements, .. } = BakeOptions::default();
+        Self { atlas, refinements, smooth: true }
     }
 }
 
 impl Baking {
     /// What charts and tables call it; `side` is what the atlas's came to, where that is known.
     pub fn name(self, side: Option<u32>) -> String {
-        let Self { shells, refinements, vertex_colours, .. } = self;
-        let shells = if shells == 1 { "1 shell".to_owned() } else { format!("{shells} shells") };
-        let colours = match side {
-            _ if vertex_colours => "vertex colours".to_owned(),
-            Some(side) => format!("atlas {side}"),
-            None => format!("atlas ≤ {}", self.atlas),
-        };
-        format!("{shells}, {colours}, {refinements} refinements, {} a pixel", self.count())
+        let atlas = side.map_or_else(|| format!("≤ {}", self.atlas), |side| side.to_string());
+        format!("atlas {atlas}, {} refinements, {} a pixel", self.refinements, self.count())
     }
 
     /// Samples a pixel.
@@ -50,13 +41,12 @@ impl Baking {
     }
 
     pub fn options(self) -> BakeOptions {
-        let Self { shells, atlas, refinements, .. } = self;
-        BakeOptions { shells, atlas, refinements, ..BakeOptions::default() }
+        let Self { atlas, refinements, .. } = self;
+        BakeOptions { atlas, refinements, ..BakeOptions::default() }
     }
 
     /// Draws an avatar that was baked with [`Baking::options`].
     pub fn renderer<'a>(self, model: &Model, avatar: &'a Avatar) -> Result<BakedRenderer<'a>> {
-        let renderer = BakedRenderer::new(model.body(), model.light(), avatar, self.samples())?;
-        Ok(if self.vertex_colours { renderer.in_vertex_colours() } else { renderer })
+        Ok(BakedRenderer::new(model.body(), model.light(), avatar, self.samples())?)
     }
 }
