@@ -24,7 +24,7 @@ use xtask::process::say;
 use xtask::run::{peak_rss_bytes, use_threads, write};
 use xtask::{pictures, table, train};
 
-const MADE: [&str; 7] = ["baked", "seconds", "vertices", "faces", "holes", "double", "peak MiB"];
+const MADE: [&str; 6] = ["baked", "seconds", "vertices", "faces", "holes", "peak MiB"];
 /// What the default must not lose.
 const KEPT: [(&str, Pick, usize); 4] = [
     ("psnr_mask", |m| m.psnr_mask, 3),
@@ -128,8 +128,7 @@ fn of_run(path: &Path, arguments: &BakedArguments, lpips: Option<&Lpips>, timed:
             format!("{seconds:.1}"),
             report.vertices.to_string(),
             avatar.faces.len().to_string(),
-            report.surface.holes.to_string(),
-            report.surface.double.to_string(),
+            report.holes.to_string(),
             format!("{:.0}", peak_rss_bytes() as f64 / f64::from(1 << 20)),
         ]);
         let whole = Some(&baking.atlas) == arguments.atlas.first();
@@ -139,7 +138,7 @@ fn of_run(path: &Path, arguments: &BakedArguments, lpips: Option<&Lpips>, timed:
             if baking == Baking::default() {
                 default = Some(scores.points.len());
             }
-            scores.add(&baking.name(Some(report.side)), &mut baking.renderer(&model, &avatar)?)?;
+            scores.add(&baking.name(Some(report.side)), &mut baking.renderer(&model, &avatar))?;
             if whole && refined && timed {
                 drawn.extend(speeds(&model, &avatar, &scene.train[0].view, baking)?);
             }

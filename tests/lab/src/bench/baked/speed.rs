@@ -3,8 +3,8 @@
 use std::time::Instant;
 
 use anyhow::Result;
-use glam::{Affine3A, Vec2, Vec4};
-use occnerf::bake::{Avatar, BakedPerson};
+use glam::{Affine3A, Vec2};
+use occnerf::bake::Avatar;
 use occnerf::{Model, PosedView};
 use volrender::Camera;
 
@@ -33,12 +33,11 @@ pub fn speeds(model: &Model, avatar: &Avatar, view: &PosedView, baking: Baking) 
             let square = view.camera.resized(size.1, size.1);
             let aside = 0.5 * (size.0 - size.1) as f32;
             let camera = Camera { centre: square.centre + Vec2::X * aside, width: size.0, ..square };
-            let mut person = BakedPerson::new(avatar, model.body().scale).lit_by(model.light());
-            let mut out = vec![Vec4::ZERO; (size.0 * size.1) as usize];
+            let mut renderer = baking.renderer(model, avatar);
             let mut best = f64::INFINITY;
             for _ in 0..3 {
                 let start = Instant::now();
-                pool.install(|| (0..10).try_for_each(|_| person.draw(&bones, &camera, baking.samples(), &mut out)))?;
+                pool.install(|| (0..10).try_for_each(|_| renderer.draw(&bones, &camera).map(drop)))?;
                 best = best.min(start.elapsed().as_secs_f64() / 10.0);
             }
             speeds.push(Speed { baking, threads, size, seconds: best });
