@@ -200,8 +200,8 @@ pub(crate) fn row_mut<const W: usize>(table: &mut [f32], stride: usize, offset: 
     &mut table[start..].as_chunks_mut::<W>().0[0]
 }
 
-/// Runs `$kernel::<D, W>(.., stride, offset)` in passes that cover all F features: one pass for F
-/// of 1, 2, 4 or 8, else passes of 8, 4, 2 and 1.
+/// Runs `$kernel::<D, W>(.., stride, offset)` for all F features: one pass for F of 1, 2, 4 or 8,
+/// else one a feature.
 macro_rules! for_widths {
     ($features:expr, $kernel:ident::<$d:ident>($($argument:expr),*)) => {
         match $features {
@@ -209,24 +209,7 @@ macro_rules! for_widths {
             2 => $kernel::<$d, 2>($($argument,)* 2, 0),
             4 => $kernel::<$d, 4>($($argument,)* 4, 0),
             8 => $kernel::<$d, 8>($($argument,)* 8, 0),
-            features => {
-                let mut offset = 0;
-                while features - offset >= 8 {
-                    $kernel::<$d, 8>($($argument,)* features, offset);
-                    offset += 8;
-                }
-                if features - offset >= 4 {
-                    $kernel::<$d, 4>($($argument,)* features, offset);
-                    offset += 4;
-                }
-                if features - offset >= 2 {
-                    $kernel::<$d, 2>($($argument,)* features, offset);
-                    offset += 2;
-                }
-                if features > offset {
-                    $kernel::<$d, 1>($($argument,)* features, offset);
-                }
-            }
+            features => (0..features).for_each(|offset| $kernel::<$d, 1>($($argument,)* features, offset)),
         }
     };
 }

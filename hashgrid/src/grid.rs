@@ -2,7 +2,7 @@ use std::ops::Range;
 
 use rayon::prelude::*;
 
-use crate::config::{self, Error, HashGridConfig, MAX_PARAMETERS};
+use crate::config::{Error, HashGridConfig, check_settings, check_size};
 use crate::layout::Layout;
 
 /// A multiresolution hash encoding of D-dimensional points, D = 2, 3 or 4 (others do not compile).
@@ -69,7 +69,7 @@ impl<const D: usize> HashGrid<D> {
         const {
             assert!(2 <= D && D <= 4, "a hash grid has 2, 3 or 4 dimensions");
         }
-        config::check(resolutions, features, log2_table_size)?;
+        check_settings(resolutions, features, log2_table_size)?;
         let most_rows = 1u64 << log2_table_size;
         let mut levels = Vec::with_capacity(resolutions.len());
         // At most 64 levels · 2^28 rows · 256 features: no overflow.
@@ -81,21 +81,17 @@ impl<const D: usize> HashGrid<D> {
             let rows = dense.unwrap_or(most_rows);
             levels.push(Level { resolution, rows: rows as usize, hashed: dense.is_none(), start: start as usize });
             start += rows * features as u64;
-            if start > MAX_PARAMETERS as u64 {
-                return Err(Error::TooManyParameters { parameters: start });
-            }
+            check_size(start)?;
         }
         Ok(Self { levels, resolutions: resolutions.to_vec(), features })
     }
 
     /// Length of the flat table.
-    #[must_use]
     pub fn num_parameters(&self) -> usize {
         self.level_range(self.levels.len() - 1).end
     }
 
     /// L·F, the number of features of one point.
-    #[must_use]
     pub fn num_features(&self) -> usize {
         self.levels.len() * self.features
     }
@@ -104,27 +100,22 @@ impl<const D: usize> HashGrid<D> {
     ///
     /// # Panics
     /// If there is no such level.
-    #[must_use]
     pub fn level_range(&self, level: usize) -> Range<usize> {
-        assert!(level < self.levels.len(), "level {level} of {}", self.levels.len());
         let Level { start, rows, .. } = self.levels[level];
         start..start + rows * self.features
     }
 
     /// Layout of the features of `points` points.
-    #[must_use]
     pub fn layout(&self, points: usize) -> Layout {
         Layout { levels: self.levels.len(), points, features: self.features }
     }
 
     /// Resolutions of the levels in cells per axis (L).
-    #[must_use]
     pub fn resolutions(&self) -> &[u32] {
         &self.resolutions
     }
 
     /// An initial table: uniform in ±1e-4 (Müller et al. 2022, section 3), determined by `seed`.
-    #[must_use]
     pub fn init_table(&self, seed: u64) -> Vec<f32> {
         const AMPLITUDE: f32 = 1e-4;
         let mut table = vec![0.0; self.num_parameters()];
@@ -137,13 +128,8 @@ impl<const D: usize> HashGrid<D> {
     }
 
     pub(crate) fn assert_table(&self, what: &str, table: &[f32]) {
-        assert_eq!(
-            table.len(),
-            self.num_parameters(),
-            "{what} has {} numbers, expected num_parameters() = {}",
-            table.len(),
-            self.num_parameters()
-        );
+        let (found, expected) = (table.len(), self.num_parameters());
+        assert_eq!(found, expected, "{what} has {found} numbers, expected num_parameters() = {expected}");
     }
 
     /// Passes over the features of `points` points: all levels of `chunk` points, then of the next.
@@ -159,13 +145,8 @@ impl<const D: usize> HashGrid<D> {
     }
 
     pub(crate) fn assert_features(&self, what: &str, features: &[f32], points: usize) {
-        assert_eq!(
-            features.len(),
-            points * self.num_features(),
-            "{what} has {} numbers, expected {points} points × {} features",
-            features.len(),
-            self.num_features()
-        );
+        let (found, width) = (features.len(), self.num_features());
+        assert_eq!(found, points * width, "{what} has {found} numbers, expected {points} points × {width} features");
     }
 }
 

@@ -5,7 +5,6 @@ use crate::simd::{Kernel, arch};
 
 impl<const D: usize> HashGrid<D> {
     /// Length L·Q·D·F of the Jacobian of `points` points.
-    #[must_use]
     pub fn jacobian_len(&self, points: usize) -> usize {
         self.num_features() * D * points
     }

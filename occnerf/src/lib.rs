@@ -27,7 +27,6 @@
 //! same. The same seed and inputs give the same bits on one instruction set, whatever the number of
 //! threads, and so does resuming from a checkpoint.
 
-mod atomic;
 pub mod bake;
 mod check;
 mod config;
@@ -41,7 +40,7 @@ mod train;
 
 pub use self::lpips::Lpips;
 pub use ::capture;
-pub use atomic::replace_file;
+pub use array_files::replace_file;
 pub use check::{Check, Fault, FrameCheck, Mistake, body_silhouette, check, photograph, unknown_pixels};
 pub use config::{
     Component, Config, ConfigError, DistanceKind, EncodingConfig, FieldConfig, LossConfig, Method, MotionConfig,

@@ -55,9 +55,18 @@ impl MotionClip {
     /// Any [`Error`] of arrays; [`Error::Invalid`] without frames, for a rate that is not positive,
     /// and for rotations beyond 1000 rad or translations beyond 10⁶.
     pub fn load(path: &Path) -> Result<Self, Error> {
+        Self::load_with_rate(path).map(|(clip, _)| clip)
+    }
+
+    /// The same, and the frames per second as the file says them; `None` where it does not.
+    ///
+    /// # Errors
+    /// As [`MotionClip::load`].
+    pub fn load_with_rate(path: &Path) -> Result<(Self, Option<f32>), Error> {
         let mut npz = Npz::open(path)?;
         let file = npz.file().to_owned();
-        let fps = rate(&mut npz)?.unwrap_or(Self::ASSUMED_FPS);
+        let rate = rate(&mut npz)?;
+        let fps = rate.unwrap_or(Self::ASSUMED_FPS);
         let has = |npz: &Npz, key: &str| npz.keys().iter().any(|k| k == key);
         let parts = [["root_orient", "pose_body"], ["global_orient", "body_pose"]];
         let keys = match parts.iter().find(|parts| parts.iter().all(|key| has(&npz, key))) {
@@ -88,29 +97,19 @@ impl MotionClip {
         check_vectors(&file, key, &clip.trans)?;
         match clip.poses.iter().position(|r| r.length() > MAX_ANGLE) {
             Some(i) => Err(Error::invalid(&file, "poses", format!("a rotation of {} rad", clip.poses[i].length()))),
-            None => Ok(clip),
+            None => Ok((clip, rate)),
         }
     }
 
     /// Frames per second of a clip that does not say.
     pub const ASSUMED_FPS: f32 = 30.0;
 
-    /// Frames per second in a file; `None` where it does not say.
-    ///
-    /// # Errors
-    /// As [`MotionClip::load`].
-    pub fn rate_of(path: &Path) -> Result<Option<f32>, Error> {
-        rate(&mut Npz::open(path)?)
-    }
-
     /// Number of frames, T.
-    #[must_use]
     pub fn num_frames(&self) -> usize {
         self.trans.len()
     }
 
     /// Time from the first frame to the last, in seconds.
-    #[must_use]
     pub fn duration(&self) -> f32 {
         self.num_frames().saturating_sub(1) as f32 / self.fps
     }
@@ -125,7 +124,6 @@ impl MotionClip {
     ///
     /// # Panics
     /// If the clip has no frames, or `poses` does not have T·J entries.
-    #[must_use]
     pub fn at(&self, seconds: f32, joints: usize) -> (Vec<Vec3>, Placement) {
         let frames = self.num_frames();
         assert!(frames > 0, "at: a clip without frames");

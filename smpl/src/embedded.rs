@@ -1,24 +1,17 @@
-//! The embedded body and its file format.
+//! The embedded body.
 //!
-//! `assets/open_body.bin` is a zlib stream of zigzag-coded 32-bit integers, stored as four byte
-//! planes, least significant first. Lengths are in units of 2⁻¹⁶ m and weights of 2⁻¹⁶; rows of
-//! weights sum to exactly 1. In order: V, F, J, B; template, (3, V); faces, (F, 3); shape blend
-//! shapes, (3, B·V); parents, (J), −1 for the root; pose blend shapes, skinning weights and joint
-//! regressor as sparse rows: length of each row, columns, values ((3, N) for vectors).
-//!
-//! Made from an SMPL-format npz by
+//! `assets/open_body.bin` is the file that [`BodyModel::save`] writes, as four byte planes (byte k of
+//! every 32-bit word, for k from 0 to 3), compressed by zlib. Lengths are multiples of 2⁻¹⁶ m,
+//! weights of 2⁻¹⁶. Made from an SMPL-format npz by
 //! `OPEN_BODY=open_body.npz cargo test -p smpl --lib write_the_asset -- --ignored`.
 
 use std::io::Read;
 
-use glam::Vec3;
-
+use crate::Error;
 use crate::model::BodyModel;
-use crate::sparse::SparseRows;
+use crate::saved;
 
 const PACKED: &[u8] = include_bytes!("../assets/open_body.bin");
-/// Units per metre, and of a weight of 1.
-const SCALE: f32 = 65536.0;
 
 impl BodyModel {
     /// A neutral adult that needs no file: the CC0 *open body*, with SMPL's counts of vertices
@@ -37,117 +30,62 @@ impl BodyModel {
     /// let body = smpl::BodyModel::embedded();
     /// assert_eq!((body.num_vertices(), body.num_joints(), body.num_betas()), (6890, 24, 10));
     /// ```
-    #[must_use]
     pub fn embedded() -> Self {
-        let mut words = Words::unpack(PACKED);
-        let sizes = words.take(4);
-        let [v, f, j, b] = [0, 1, 2, 3].map(|i| sizes[i] as usize);
-        Self {
-            v_template: words.vectors(v),
-            faces: words.take(3 * f).chunks_exact(3).map(|c| [c[0] as u32, c[1] as u32, c[2] as u32]).collect(),
-            shapedirs: words.vectors(b * v),
-            parents: words.take(j).into_iter().map(|p| usize::try_from(p).ok()).collect(),
-            posedirs: words.rows(v, Words::vectors),
-            weights: words.rows(v, Words::scaled),
-            j_regressor: words.rows(j, Words::scaled),
-        }
-    }
-}
-
-/// The remaining integers of the asset.
-struct Words(std::vec::IntoIter<i32>);
-
-impl Words {
-    fn unpack(packed: &[u8]) -> Self {
         let mut planes = Vec::new();
-        let read = flate2::read::ZlibDecoder::new(packed).read_to_end(&mut planes);
-        assert!(read.is_ok(), "embedded: the asset is damaged: {read:?}");
-        let count = planes.len() / 4;
-        let word = |i: usize| {
-            let zigzag = u32::from_le_bytes([0, 1, 2, 3].map(|k| planes[k * count + i]));
-            (zigzag >> 1) as i32 ^ -((zigzag & 1) as i32)
+        let body = match flate2::read::ZlibDecoder::new(PACKED).read_to_end(&mut planes) {
+            Ok(length) => {
+                let bytes: Vec<u8> = (0..length).map(|i| planes[i % 4 * (length / 4) + i / 4]).collect();
+                saved::parse("the embedded body", &bytes)
+            }
+            Err(error) => Err(Error::invalid("the embedded body", "asset", error.to_string())),
         };
-        Self((0..count).map(word).collect::<Vec<i32>>().into_iter())
-    }
-
-    fn take(&mut self, count: usize) -> Vec<i32> {
-        self.0.by_ref().take(count).collect()
-    }
-
-    fn scaled(&mut self, count: usize) -> Vec<f32> {
-        self.0.by_ref().take(count).map(|w| w as f32 / SCALE).collect()
-    }
-
-    fn vectors(&mut self, count: usize) -> Vec<Vec3> {
-        let [x, y, z] = [0; 3].map(|_| self.scaled(count));
-        (0..count).map(|i| Vec3::new(x[i], y[i], z[i])).collect()
-    }
-
-    fn rows<T>(&mut self, count: usize, values: fn(&mut Self, usize) -> Vec<T>) -> SparseRows<T> {
-        let mut offsets = vec![0u32];
-        for length in self.0.by_ref().take(count) {
-            offsets.push(offsets[offsets.len() - 1] + length as u32);
-        }
-        let columns: Vec<u32> = (self.0.by_ref()).take(offsets[count] as usize).map(|c| c as u32).collect();
-        let values = values(self, columns.len());
-        SparseRows { offsets, columns, values }
+        body.unwrap_or_else(|error| panic!("embedded: {error}"))
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::sparse::SparseRows;
 
-    /// Quantises `values`, which sum to 1, to integers that sum to [`SCALE`]: the largest absorbs
+    /// Units per metre, and of a weight of 1.
+    const SCALE: f32 = 65536.0;
+
+    /// Rounds a matrix whose rows sum to 1 to rows that sum to exactly 1: the largest entry absorbs
     /// the rounding.
-    fn units(values: &[f32]) -> Vec<i32> {
-        let mut words: Vec<i32> = values.iter().map(|x| (x * SCALE).round() as i32).collect();
-        let rest = SCALE as i32 - words.iter().sum::<i32>();
-        if let Some(largest) = words.iter_mut().max() {
-            *largest += rest;
-        }
-        words
-    }
-
-    /// The integers of the file, before zigzag coding.
-    fn words(body: &BodyModel) -> Vec<i32> {
-        let size = |n: usize| n as i32;
-        let vectors = |values: &[Vec3]| {
-            let axis = |k: usize| values.iter().map(move |v| (v[k] * SCALE).round() as i32);
-            (0..3).flat_map(axis).collect::<Vec<i32>>()
-        };
-        fn structure<T: Copy>(rows: &SparseRows<T>) -> Vec<i32> {
-            let lengths = rows.offsets.windows(2).map(|w| (w[1] - w[0]) as i32);
-            lengths.chain(rows.columns.iter().map(|&c| c as i32)).collect()
-        }
-        let mut out = [body.num_vertices(), body.faces.len(), body.num_joints(), body.num_betas()].map(size).to_vec();
-        out.extend(vectors(&body.v_template));
-        out.extend(body.faces.as_flattened().iter().map(|&i| i as i32));
-        out.extend(vectors(&body.shapedirs));
-        out.extend(body.parents.iter().map(|p| p.map_or(-1, size)));
-        out.extend(structure(&body.posedirs));
-        out.extend(vectors(&body.posedirs.values));
-        for matrix in [&body.weights, &body.j_regressor] {
-            out.extend(structure(matrix));
-            for row in matrix.offsets.windows(2) {
-                out.extend(units(&matrix.values[row[0] as usize..row[1] as usize]));
+    fn round_rows(matrix: &mut SparseRows<f32>) {
+        for row in matrix.offsets.windows(2) {
+            let row = &mut matrix.values[row[0] as usize..row[1] as usize];
+            row.iter_mut().for_each(|w| *w = (*w * SCALE).round() / SCALE);
+            let rest = 1.0 - row.iter().sum::<f32>();
+            if let Some(largest) = row.iter_mut().max_by(|a, b| a.total_cmp(b)) {
+                *largest += rest;
             }
         }
-        out
+    }
+
+    fn rounded(mut body: BodyModel) -> BodyModel {
+        let vectors = body.v_template.iter_mut().chain(&mut body.shapedirs).chain(&mut body.posedirs.values);
+        vectors.for_each(|v| *v = (*v * SCALE).round() / SCALE);
+        round_rows(&mut body.weights);
+        round_rows(&mut body.j_regressor);
+        body
     }
 
     #[test]
-    fn a_decoded_body_has_the_words_it_was_decoded_from() {
-        assert_eq!(words(&BodyModel::embedded()), Words::unpack(PACKED).0.as_slice());
+    fn the_body_is_rounded_as_documented() {
+        assert_eq!(rounded(BodyModel::embedded()), BodyModel::embedded());
     }
 
     #[test]
     #[ignore = "replaces the asset by the body that OPEN_BODY names"]
     fn write_the_asset() {
         let path = std::env::var("OPEN_BODY").unwrap();
-        let words = words(&BodyModel::load(path.as_ref()).unwrap());
-        let zigzag = |w: i32| (w.wrapping_shl(1) ^ (w >> 31)).to_le_bytes();
-        let planes = (0..4).flat_map(|k| words.iter().map(move |&w| zigzag(w)[k])).collect::<Vec<u8>>();
+        let saved = std::env::temp_dir().join("open_body.safetensors");
+        rounded(BodyModel::load(path.as_ref()).unwrap()).save(&saved).unwrap();
+        let bytes = std::fs::read(saved).unwrap();
+        assert!(bytes.len().is_multiple_of(4));
+        let planes: Vec<u8> = (0..4).flat_map(|k| bytes.iter().skip(k).step_by(4)).copied().collect();
         let mut encoder = flate2::read::ZlibEncoder::new(planes.as_slice(), flate2::Compression::best());
         let mut packed = Vec::new();
         encoder.read_to_end(&mut packed).unwrap();

@@ -34,18 +34,13 @@ pub enum Error {
 }
 
 impl Error {
-    /// Shorthand for [`Error::Invalid`].
-    pub(crate) fn invalid(file: &str, key: &str, message: impl Into<String>) -> Self {
+    /// [`Error::Invalid`] of a file's array, part or line.
+    pub fn invalid(file: &str, key: &str, message: impl Into<String>) -> Self {
         Self::Invalid { file: file.to_owned(), key: key.to_owned(), message: message.into() }
-    }
-
-    /// Content larger than a limit.
-    pub(crate) fn too_large(file: &str, key: &str, claimed: u128, limit: u64) -> Self {
-        Self::File(array_files::Error::TooLarge { file: file.to_owned(), key: key.to_owned(), claimed, limit })
     }
 
     /// A value of `key` that is NaN or infinite, at row-major position `index`.
     pub(crate) fn not_finite(file: &str, key: &str, index: usize) -> Self {
-        Self::File(array_files::Error::NotFinite { file: file.to_owned(), key: key.to_owned(), index })
+        Self::invalid(file, key, format!("not finite at flat index {index}"))
     }
 }

@@ -1,8 +1,7 @@
 //! Parametric bodies in SMPL's form.
 //!
 //! [`BodyModel`] loads, shapes, poses and skins a body, with derivatives; [`MotionField`] maps points
-//! of world space back to the canonical pose. Also rigged glTF characters ([`Character`]), motion
-//! capture ([`MotionClip`]) and triangle meshes ([`load_mesh`]).
+//! of world space back to the canonical pose; [`MotionClip`] is motion capture.
 //!
 //! ```
 //! use glam::Vec3;
@@ -22,13 +21,11 @@
 //! [`WeightVolumeConfig`] assume metres. The canonical space is the rest pose of a [`Shaped`] body.
 //! Arithmetic is `f32` and independent of the number of threads.
 
-mod character;
 mod clip;
 mod embedded;
 mod error;
 mod limbs;
 mod load;
-mod mesh;
 mod model;
 mod motion;
 mod pose;
@@ -44,16 +41,14 @@ struct Readme;
 
 /// Error within [`Error::File`].
 pub use array_files::Error as FileError;
-pub use character::{Animation, Character, CharacterPose, Texture};
 pub use clip::MotionClip;
 pub use error::Error;
 pub use limbs::Limbs;
-pub use mesh::{Mesh, load_mesh};
 pub use model::{BodyModel, Shaped};
 pub use motion::{
     MotionField, MotionFrame, MotionSample, SurfaceMotion, SurfacePoint, WeightVolume, WeightVolumeConfig,
 };
-pub use pose::{Placement, Posed};
+pub use pose::{Placement, Posed, skin};
 pub use pose_backward::PoseGradient;
 pub use rotation::rodrigues;
 pub use sparse::{SkinningWeights, SparseRows};

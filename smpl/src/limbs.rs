@@ -35,7 +35,6 @@ pub struct Limbs<'a> {
 
 impl BodyModel {
     /// The bones of the limbs, in the rest pose with zero betas.
-    #[must_use]
     pub fn limbs(&self) -> Limbs<'_> {
         let joints = self.shaped(&[]).joints;
         let height = |pick: fn(f32, f32) -> f32| self.v_template.iter().map(|v| v.y).reduce(pick).unwrap_or(0.0);
@@ -65,7 +64,6 @@ impl BodyModel {
 
 impl Limbs<'_> {
     /// The pairs, longest bones first.
-    #[must_use]
     pub fn pairs(&self) -> Vec<usize> {
         let mut pairs: Vec<usize> = (0..self.pairs.len()).filter(|&j| self.pairs[j] == Some(j)).collect();
         pairs.sort_by(|&a, &b| self.bone(b).length().total_cmp(&self.bone(a).length()));
@@ -75,7 +73,6 @@ impl Limbs<'_> {
     /// Derivative of the rest vertices, (V), with respect to the relative length of a pair's bones:
     /// vertices of descendant joints translate, those along the bones are stretched. Contributions
     /// of several pairs add.
-    #[must_use]
     pub fn longer(&self, pair: usize) -> Vec<Vec3> {
         let mut moved = vec![Vec3::ZERO; self.joints.len()];
         // Bone to stretch along, by its first joint. A limb that forks is stretched along the first

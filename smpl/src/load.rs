@@ -58,25 +58,13 @@ fn kind(bytes: &[u8]) -> Option<&'static str> {
 
 /// The array under `key` of the model's dictionary, made dense.
 fn from_pickle(file: &str, value: &Value, key: &str) -> Result<NdArray, FileError> {
-    let wrong = |key: &str, expected, value: &Value| FileError::Type {
-        file: file.to_owned(),
-        key: key.to_owned(),
-        expected,
-        actual: value.type_name().to_owned(),
-    };
     let Value::Dict(entries) = value else {
-        return Err(wrong("", "a dictionary", value));
+        return Err(FileError::invalid(file, "", format!("{}, expected a dictionary", value.type_name())));
     };
-    let Some(found) = value.get(key) else {
-        let name = |key: &Value| match key {
-            Value::Str(text) => Some(text.clone()),
-            Value::Bytes(bytes) => Some(String::from_utf8_lossy(bytes).into_owned()),
-            _ => None,
-        };
-        let available = entries.iter().filter_map(|(key, _)| name(key)).collect();
-        return Err(FileError::MissingKey { file: file.to_owned(), key: key.to_owned(), available });
-    };
-    found.to_dense(file, key)?.ok_or_else(|| wrong(key, "an array", found))
+    let present = || entries.iter().filter_map(|(key, _)| key.as_str());
+    let found = value.get(key).ok_or_else(|| FileError::missing(file, key, present()))?;
+    let other = || FileError::invalid(file, key, format!("{}, expected an array", found.type_name()));
+    found.to_dense(file, key)?.ok_or_else(other)
 }
 
 fn build(file: &str, mut array: impl FnMut(&str) -> Result<NdArray, FileError>) -> Result<BodyModel, Error> {

@@ -62,19 +62,16 @@ pub struct Shaped {
 
 impl BodyModel {
     /// Number of vertices, V.
-    #[must_use]
     pub fn num_vertices(&self) -> usize {
         self.v_template.len()
     }
 
     /// Number of joints, J.
-    #[must_use]
     pub fn num_joints(&self) -> usize {
         self.parents.len()
     }
 
     /// Number of shape coefficients, B.
-    #[must_use]
     pub fn num_betas(&self) -> usize {
         self.shapedirs.len() / self.num_vertices().max(1)
     }
@@ -93,7 +90,6 @@ impl BodyModel {
     ///
     /// # Panics
     /// With more betas than [`BodyModel::num_betas`].
-    #[must_use]
     pub fn shaped(&self, betas: &[f32]) -> Shaped {
         assert!(betas.len() <= self.num_betas(), "shaped: {} betas, the model has {}", betas.len(), self.num_betas());
         let mut vertices = self.v_template.clone();
@@ -120,7 +116,7 @@ impl BodyModel {
     /// and below 10⁶ units. `file` names the model in errors; keys are those of SMPL's files.
     ///
     /// # Errors
-    /// [`Error::Invalid`], [`FileError::NotFinite`](crate::FileError::NotFinite).
+    /// [`Error::Invalid`].
     pub fn validate(&self, file: &str) -> Result<(), Error> {
         let invalid = |key: &str, message: String| Err(Error::invalid(file, key, message));
         let (v, j) = (self.num_vertices(), self.num_joints());

@@ -5,6 +5,7 @@ use rayon::prelude::*;
 
 use crate::model::{BodyModel, Shaped, TERMS_PER_JOINT};
 use crate::rotation::rodrigues;
+use crate::sparse::SkinningWeights;
 
 /// Vertices per parallel task.
 pub(crate) const CHUNK: usize = 1024;
@@ -326,6 +327,30 @@ impl pulp::NullaryFnOnce for Tile<'_, '_> {
             }
         }
     }
+}
+
+/// Linear blend skinning, (V): Σ w_vi · bones_i · vertices_v, for vertices (V), weights (V, J) and
+/// bones (J).
+///
+/// ```
+/// use glam::{Affine3A, Vec3};
+///
+/// let weights = smpl::SparseRows::from_rows([[(0, 0.5), (1, 0.5)]]);
+/// let bones = [Affine3A::IDENTITY, Affine3A::from_translation(Vec3::X)];
+/// assert_eq!(smpl::skin(&[Vec3::Y], &weights, &bones), [Vec3::new(0.5, 1.0, 0.0)]);
+/// ```
+///
+/// # Panics
+/// If there are fewer rows than vertices, or fewer bones than columns.
+pub fn skin(vertices: &[Vec3], weights: &SkinningWeights, bones: &[Affine3A]) -> Vec<Vec3> {
+    let mut out = vertices.to_vec();
+    out.par_chunks_mut(CHUNK).enumerate().for_each(|(chunk, out)| {
+        for (i, vertex) in out.iter_mut().enumerate() {
+            let sum = blend(bones, weights.row(chunk * CHUNK + i));
+            *vertex = sum.transform_point3a(Vec3A::from(*vertex)).into();
+        }
+    });
+    out
 }
 
 /// Σ w_i · bones_i.

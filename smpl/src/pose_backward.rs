@@ -77,7 +77,6 @@ impl BodyModel {
     ///
     /// # Panics
     /// If a length is not the model's.
-    #[must_use]
     pub fn pose_backward(
         &self,
         shaped: &Shaped,
@@ -229,7 +228,6 @@ impl BodyModel {
     ///
     /// # Panics
     /// If a length is not the model's.
-    #[must_use]
     pub fn shaped_backward(&self, d_shaped: &Shaped) -> Vec<f32> {
         assert_eq!(d_shaped.vertices.len(), self.num_vertices(), "shaped_backward: vertices");
         assert_eq!(d_shaped.joints.len(), self.num_joints(), "shaped_backward: joints");
@@ -247,7 +245,7 @@ impl BodyModel {
     }
 }
 
-/// Consecutive vertices; see the note on dispatch in `pose.rs`.
+/// Consecutive vertices; a struct for the reason given in `pose.rs`.
 struct Run<'a> {
     body: &'a BodyModel,
     shaped: &'a Shaped,

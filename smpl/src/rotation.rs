@@ -14,7 +14,6 @@ use glam::{DMat3, Mat3, Vec3};
 /// let quarter = smpl::rodrigues(Vec3::Z * std::f32::consts::FRAC_PI_2);
 /// assert!((quarter * Vec3::X).distance(Vec3::Y) < 1e-6);
 /// ```
-#[must_use]
 pub fn rodrigues(axis_angle: Vec3) -> Mat3 {
     // f64, because a product of a dozen of these is held against references in f64.
     let v = axis_angle.as_dvec3();
@@ -39,7 +38,6 @@ pub fn rodrigues(axis_angle: Vec3) -> Mat3 {
 ///
 /// With k the vector of the skew part of D, S = D + Dᵀ and R = I + a K + b (v vᵀ − θ² I):
 /// ∂/∂v = a k + (a'/θ)(k·v) v + b (S v − 2 tr(D) v) + (b'/θ)(vᵀ D v − θ² tr(D)) v.
-#[must_use]
 pub(crate) fn rodrigues_backward(axis_angle: Vec3, d_rotation: DMat3) -> Vec3 {
     let v = axis_angle.as_dvec3();
     let d = d_rotation;

@@ -4,7 +4,7 @@ use std::collections::HashMap;
 use std::io::Write;
 use std::path::Path;
 
-use array_files::Error as FileError;
+use array_files::{Error as FileError, replace_file};
 use glam::Vec3;
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 
@@ -67,17 +67,8 @@ impl BodyModel {
         }
         let header = HashMap::from([(FORMAT.0.to_owned(), FORMAT.1.to_owned())]);
         let bytes = safetensors::serialize(views, Some(header)).map_err(fault)?;
-        let partial = path.with_extension("safetensors.partial");
-        // On the disk before the old file is gone, so that a power cut leaves one of the two.
-        let written = std::fs::File::create(&partial).and_then(|mut file| {
-            file.write_all(&bytes)?;
-            file.sync_all()?;
-            std::fs::rename(&partial, path)
-        });
-        written.map_err(|source| {
-            let _ = std::fs::remove_file(&partial);
-            FileError::Io { path: path.to_owned(), source }.into()
-        })
+        let written = replace_file(path, |to| to.write_all(&bytes));
+        written.map_err(|source| FileError::Io { path: path.to_owned(), source }.into())
     }
 }
 
@@ -92,8 +83,8 @@ pub(crate) fn parse(file: &str, bytes: &[u8]) -> Result<BodyModel, Error> {
     let source = Source { file, tensors: SafeTensors::deserialize(bytes).map_err(fault)? };
     let v_template = source.vectors("v_template", &[None, Some(3)])?;
     let v = v_template.len();
-    let (_, faces) = source.words("f", Dtype::U32, &[None, Some(3)], u32::from_le_bytes)?;
-    let parents = source.words("parents", Dtype::I64, &[None], i64::from_le_bytes)?.1;
+    let faces = source.words("f", Dtype::U32, &[None, Some(3)], u32::from_le_bytes)?;
+    let parents = source.words("parents", Dtype::I64, &[None], i64::from_le_bytes)?;
     let model = BodyModel {
         v_template,
         faces: faces.chunks_exact(3).map(|c| [c[0], c[1], c[2]]).collect(),
@@ -120,42 +111,35 @@ impl Source<'_> {
         kind: Dtype,
         pattern: &[Option<usize>],
         word: fn([u8; N]) -> T,
-    ) -> Result<(Vec<usize>, Vec<T>), Error> {
-        let Ok(view) = self.tensors.tensor(key) else {
-            let mut available: Vec<String> = self.tensors.names().into_iter().map(str::to_owned).collect();
-            available.sort();
-            return Err(FileError::MissingKey { file: self.file.to_owned(), key: key.to_owned(), available }.into());
+    ) -> Result<Vec<T>, Error> {
+        let missing = || {
+            let mut names = self.tensors.names();
+            names.sort_unstable();
+            FileError::missing(self.file, key, names)
         };
+        let view = self.tensors.tensor(key).map_err(|_| missing())?;
         if view.dtype() != kind {
-            let message = format!("its type is {:?}, expected {kind:?}", view.dtype());
-            return Err(Error::invalid(self.file, key, message));
+            return Err(Error::invalid(self.file, key, format!("{:?}, expected {kind:?}", view.dtype())));
         }
-        let shape = view.shape().to_vec();
+        let shape = view.shape();
         if shape.len() != pattern.len() || shape.iter().zip(pattern).any(|(n, p)| p.is_some_and(|p| p != *n)) {
-            let sizes: Vec<String> = pattern.iter().map(|p| p.map_or("_".to_owned(), |n| n.to_string())).collect();
-            return Err(FileError::Shape {
-                file: self.file.to_owned(),
-                key: key.to_owned(),
-                expected: format!("[{}]", sizes.join(", ")),
-                actual: shape,
-            }
-            .into());
+            return Err(FileError::shape(self.file, key, shape, pattern).into());
         }
-        Ok((shape, view.data().as_chunks::<N>().0.iter().map(|&bytes| word(bytes)).collect()))
+        Ok(view.data().as_chunks::<N>().0.iter().map(|&bytes| word(bytes)).collect())
     }
 
     fn floats(&self, key: &str) -> Result<Vec<f32>, Error> {
-        Ok(self.words(key, Dtype::F32, &[None], f32::from_le_bytes)?.1)
+        self.words(key, Dtype::F32, &[None], f32::from_le_bytes)
     }
 
     fn vectors(&self, key: &str, pattern: &[Option<usize>]) -> Result<Vec<Vec3>, Error> {
-        let (_, values) = self.words(key, Dtype::F32, pattern, f32::from_le_bytes)?;
+        let values = self.words(key, Dtype::F32, pattern, f32::from_le_bytes)?;
         Ok(values.chunks_exact(3).map(Vec3::from_slice).collect())
     }
 
     fn rows<T>(&self, key: &str, values: impl Fn(&str) -> Result<Vec<T>, Error>) -> Result<SparseRows<T>, Error> {
         let words = |part: &str| self.words(&format!("{key}.{part}"), Dtype::U32, &[None], u32::from_le_bytes);
-        let (offsets, columns) = (words("offsets")?.1, words("columns")?.1);
+        let (offsets, columns) = (words("offsets")?, words("columns")?);
         Ok(SparseRows { offsets, columns, values: values(&format!("{key}.values"))? })
     }
 }

@@ -38,7 +38,6 @@ impl<T: Copy> SparseRows<T> {
     }
 
     /// Number of rows.
-    #[must_use]
     pub fn num_rows(&self) -> usize {
         self.offsets.len().saturating_sub(1)
     }

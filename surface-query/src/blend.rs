@@ -6,18 +6,6 @@ const MIN_WEIGHT: f32 = 1e-5;
 /// Normal-weighted mean of the nearest vertices (surface-based rendering, OccNeRF §3.2), the result
 /// of [`crate::SurfaceQuery::blend`]. Cheap and smooth for a fixed set of neighbours, but no exact
 /// distance.
-///
-/// ```
-/// use glam::Vec3;
-/// use surface_query::{SurfaceQuery, SurfaceQueryConfig};
-///
-/// let vertices = [Vec3::ZERO, Vec3::X, Vec3::Y];
-/// let surface = SurfaceQuery::new(&vertices, &[[0, 1, 2]], &SurfaceQueryConfig::default())?;
-/// let blended = surface.blend(Vec3::new(0.0, 0.0, -2.0), &[0]);
-/// assert_eq!((blended.point, blended.normal), (Vec3::ZERO, Vec3::Z));
-/// assert_eq!(blended.signed_distance, -2.0);
-/// # Ok::<(), surface_query::Error>(())
-/// ```
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Blended {
     /// v̂ = Σ w_i v_i / Σ w_i.
@@ -84,4 +72,51 @@ pub(crate) fn blend(vertices: &[Vec3], normals: &[Vec3], query: Vec3, finest: &[
     let s = sums(vertices, normals, query, finest);
     let normal = s.normal.normalize_or(normals[finest[0] as usize]);
     Blended { point: s.point, normal, signed_distance: (query - s.point).dot(normal) }
+}
+
+/// Gradient of the blend with respect to the query, the neighbours held fixed.
+pub(crate) fn blend_backward(
+    vertices: &[Vec3],
+    normals: &[Vec3],
+    query: Vec3,
+    finest: &[u32],
+    d_point: Vec3,
+    d_signed_distance: f32,
+) -> Vec3 {
+    let s = sums(vertices, normals, query, finest);
+    let length = s.normal.length();
+    let unit = s.normal.try_normalize();
+    let normal = unit.unwrap_or(normals[finest[0] as usize]);
+
+    // d = (x − v̂) · n̂
+    let mut d_query = normal * d_signed_distance;
+    let d_v = d_point - normal * d_signed_distance;
+    let d_n = (query - s.point) * d_signed_distance;
+    // n̂ = n / |n|; a fallback normal is a constant.
+    let d_sum = match unit {
+        Some(_) => (d_n - normal * normal.dot(d_n)) / length,
+        None => Vec3::ZERO,
+    };
+    for &i in finest {
+        let (v, n) = (vertices[i as usize], normals[i as usize]);
+        let offset = query - v;
+        let r = offset.length();
+        if r == 0.0 {
+            // |cos| has no derivative at the vertex.
+            continue;
+        }
+        let d_w = d_v.dot(v - s.point) / s.weight + d_sum.dot(n);
+        let direction = offset / r;
+        d_query += if s.inverse_distance {
+            direction * (-d_w / (r * r))
+        } else {
+            let cos = direction.dot(n);
+            (n - direction * cos) * (d_w * signum_or_zero(cos) / r)
+        };
+    }
+    d_query
+}
+
+fn signum_or_zero(x: f32) -> f32 {
+    if x == 0.0 { 0.0 } else { x.signum() }
 }

@@ -16,18 +16,7 @@ const FAR: f32 = 32.0;
 /// within 10⁻¹⁰ of the distance, and to which farther queries are moved to find it.
 const HORIZON: f64 = 1e5;
 
-/// The closest point of a mesh.
-///
-/// ```
-/// use glam::Vec3;
-/// use surface_query::MeshDistance;
-///
-/// let vertices = [Vec3::ZERO, Vec3::X, Vec3::Y];
-/// let closest = MeshDistance::new(&vertices, &[[0, 1, 2]])?.closest(Vec3::new(0.5, 0.25, 3.0));
-/// assert_eq!((closest.signed_distance, closest.point), (3.0, Vec3::new(0.5, 0.25, 0.0)));
-/// assert_eq!((closest.face, closest.barycentric), (0, [0.25, 0.5, 0.25]));
-/// # Ok::<(), surface_query::Error>(())
-/// ```
+/// The closest point of a mesh, from [`MeshDistance::closest`].
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Closest {
     /// Index of the face that holds the point; one of them where several share it.
@@ -97,7 +86,7 @@ impl MeshDistance {
     pub fn new(vertices: &[Vec3], faces: &[[u32; 3]]) -> Result<Self, Error> {
         check_mesh(vertices, faces)?;
         if faces.is_empty() {
-            return Err(Error::NoFaces);
+            return Err(Error("no faces".to_owned()));
         }
         let scale = power_of_two_scale(vertices);
         let scaled: Vec<Vec3> = vertices.iter().map(|v| *v * scale).collect();
@@ -124,13 +113,8 @@ impl MeshDistance {
     /// # Panics
     /// If the number of vertices changes.
     pub fn refit(&mut self, vertices: &[Vec3]) {
-        assert_eq!(
-            vertices.len(),
-            self.vertices.len(),
-            "refit: {} vertices, the mesh has {}",
-            vertices.len(),
-            self.vertices.len()
-        );
+        let (found, expected) = (vertices.len(), self.vertices.len());
+        assert_eq!(found, expected, "refit: {found} vertices, the mesh has {expected}");
         self.scale = power_of_two_scale(vertices);
         for (scaled, v) in self.vertices.iter_mut().zip(vertices) {
             *scaled = *v * self.scale;
@@ -184,7 +168,6 @@ impl MeshDistance {
     ///
     /// Its point and distance are NaN for a query that is not finite, and where a refit left no
     /// face with finite vertices. A distance beyond the range of `f32` is infinite.
-    #[must_use]
     pub fn closest(&self, query: Vec3) -> Closest {
         let undefined = Closest { face: 0, barycentric: [1.0, 0.0, 0.0], point: Vec3::NAN, signed_distance: f32::NAN };
         self.closest_within(query, f32::INFINITY).unwrap_or(undefined)
@@ -194,16 +177,6 @@ impl MeshDistance {
     /// the bound, the faster the query.
     ///
     /// `None` also for a query that is not finite, and a `max_distance` that is negative or NaN.
-    ///
-    /// ```
-    /// # use glam::Vec3;
-    /// # use surface_query::MeshDistance;
-    /// let mesh = MeshDistance::new(&[Vec3::ZERO, Vec3::X, Vec3::Y], &[[0, 1, 2]])?;
-    /// assert!(mesh.closest_within(Vec3::Z, 1.0).is_some());
-    /// assert!(mesh.closest_within(Vec3::Z, 0.9).is_none());
-    /// # Ok::<(), surface_query::Error>(())
-    /// ```
-    #[must_use]
     pub fn closest_within(&self, query: Vec3, max_distance: f32) -> Option<Closest> {
         let q = query * self.scale;
         let reach = max_distance * self.scale;
@@ -251,7 +224,6 @@ impl MeshDistance {
     ///
     /// # Panics
     /// If `face` is out of range.
-    #[must_use]
     pub fn distance_to_face(&self, query: Vec3, face: u32) -> f32 {
         let scale = f64::from(self.scale);
         (self.foot(face, query.as_dvec3() * scale).offset.length() / scale) as f32

@@ -41,16 +41,15 @@ impl Level {
         ids.sort_unstable();
         let points: Vec<Vec3> = ids.iter().map(|&i| vertices[i as usize]).collect();
         let coordinates: Vec<[f32; 3]> = points.iter().map(|p| p.to_array()).collect();
-        let tree = ImmutableKdTree::new_from_slice(&coordinates).map_err(|error| Error::Tree(error.to_string()))?;
+        let tree = ImmutableKdTree::new_from_slice(&coordinates)
+            .map_err(|error| Error(format!("nearest-neighbour tree: {error}")))?;
         Ok(Self { ids, points, tree })
     }
 
     /// Upper bound of the distance from `centre` to the k-th nearest point; infinite for fewer than
     /// k points or on overflow.
     pub fn kth_distance(&self, centre: Vec3, k: usize) -> f32 {
-        let Some(k_nonzero) = NonZero::new(k) else {
-            return 0.0;
-        };
+        let Some(k_nonzero) = NonZero::new(k) else { return 0.0 };
         let found = self.tree.query(&centre.to_array()).nearest_n::<SquaredEuclidean<f32>>(k_nonzero).execute();
         if found.len() < k {
             return f32::INFINITY;
@@ -66,14 +65,8 @@ impl Level {
         if !squared.is_finite() {
             return (0..self.points.len() as u32).collect();
         }
-        self.tree
-            .query(&centre.to_array())
-            .within::<SquaredEuclidean<f32>>(squared)
-            .unsorted()
-            .execute()
-            .into_iter()
-            .map(|item| item.item)
-            .collect()
+        let found = self.tree.query(&centre.to_array()).within::<SquaredEuclidean<f32>>(squared).unsorted().execute();
+        found.into_iter().map(|item| item.item).collect()
     }
 
     /// Writes the original indices of the k nearest points into `out` (k), by way of the tree.
@@ -92,14 +85,14 @@ impl Level {
 
     /// Writes the original indices of the k nearest of the candidates `list` into `out` (k).
     #[inline(always)]
-    pub fn nearest_of<I: Copy + Into<u32>>(&self, list: &[I], q: Vec3, out: &mut [u32]) {
+    pub fn nearest_of(&self, list: &[u32], q: Vec3, out: &mut [u32]) {
         // Buffers of common sizes stay in registers.
         match out.len() {
-            1 => self.select::<I, 1>(list, q, out),
-            3 => self.select::<I, 3>(list, q, out),
-            4 => self.select::<I, 4>(list, q, out),
-            5 => self.select::<I, 5>(list, q, out),
-            8 => self.select::<I, 8>(list, q, out),
+            1 => self.select::<1>(list, q, out),
+            3 => self.select::<3>(list, q, out),
+            4 => self.select::<4>(list, q, out),
+            5 => self.select::<5>(list, q, out),
+            8 => self.select::<8>(list, q, out),
             k if k <= SMALL_K => {
                 let mut best = [u64::MAX; SMALL_K];
                 collect(&self.points, list, q, &mut best[..k]);
@@ -107,7 +100,7 @@ impl Level {
             }
             k => {
                 let key_of = |local: u32| key(distance_squared(self.points[local as usize], q), local);
-                let mut keys: Vec<u64> = list.iter().map(|&local| key_of(local.into())).collect();
+                let mut keys: Vec<u64> = list.iter().map(|&local| key_of(local)).collect();
                 if k < keys.len() {
                     keys.select_nth_unstable(k);
                 }
@@ -119,7 +112,7 @@ impl Level {
     }
 
     #[inline(always)]
-    fn select<I: Copy + Into<u32>, const K: usize>(&self, list: &[I], q: Vec3, out: &mut [u32]) {
+    fn select<const K: usize>(&self, list: &[u32], q: Vec3, out: &mut [u32]) {
         let mut best = [u64::MAX; K];
         collect(&self.points, list, q, &mut best);
         self.write(out, |j| best[j], list.len().min(K));
@@ -143,10 +136,9 @@ const SLACK: f32 = 1e-4;
 
 /// Sorts the smallest keys of the list into `best`.
 #[inline(always)]
-fn collect<I: Copy + Into<u32>>(points: &[Vec3], list: &[I], q: Vec3, best: &mut [u64]) {
+fn collect(points: &[Vec3], list: &[u32], q: Vec3, best: &mut [u64]) {
     let last = best.len() - 1;
     for &local in list {
-        let local: u32 = local.into();
         let mut key = key(distance_squared(points[local as usize], q), local);
         if key < best[last] {
             for slot in best.iter_mut() {

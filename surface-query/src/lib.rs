@@ -29,7 +29,6 @@
 #![forbid(unsafe_code)]
 
 mod blend;
-mod blend_backward;
 mod distance;
 mod error;
 mod grid;

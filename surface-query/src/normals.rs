@@ -16,7 +16,6 @@ use glam::{DVec3, Vec3};
 ///
 /// # Panics
 /// If a face has an index outside `vertices`.
-#[must_use]
 pub fn vertex_normals(vertices: &[Vec3], faces: &[[u32; 3]]) -> Vec<Vec3> {
     let mut sums = vec![DVec3::ZERO; vertices.len()];
     for (i, face) in faces.iter().enumerate() {

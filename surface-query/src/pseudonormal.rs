@@ -8,16 +8,11 @@ use glam::{DVec3, Vec3};
 use crate::normals::{corner_angles, face_normal};
 use crate::triangle::Feature;
 
-/// Connectivity with duplicated vertices merged: the seams of textured meshes are no borders.
-struct Topology {
-    /// Edge i of a face goes from corner i to corner i+1.
-    edges: Vec<[u32; 3]>,
-    /// Faces over merged vertices.
-    welded: Vec<[u32; 3]>,
-}
-
 pub(crate) struct Pseudonormals {
-    topology: Topology,
+    /// Edges of each face; edge i goes from corner i to corner i+1.
+    face_edges: Vec<[u32; 3]>,
+    /// Faces with duplicated vertices merged: the seams of textured meshes are no borders.
+    welded: Vec<[u32; 3]>,
     faces: Vec<Vec3>,
     edges: Vec<Vec3>,
     vertices: Vec<Vec3>,
@@ -36,7 +31,7 @@ impl Pseudonormals {
             .collect();
         let welded: Vec<[u32; 3]> = (faces.iter()).map(|face| face.map(|v| merged[v as usize])).collect();
         let mut numbers: HashMap<(u32, u32), u32> = HashMap::with_capacity(faces.len() * 3 / 2);
-        let edges = (welded.iter())
+        let face_edges = (welded.iter())
             .map(|face| {
                 [0, 1, 2].map(|i| {
                     let (a, b) = (face[i], face[(i + 1) % 3]);
@@ -49,7 +44,8 @@ impl Pseudonormals {
             faces: vec![Vec3::ZERO; faces.len()],
             edges: vec![Vec3::ZERO; numbers.len()],
             vertices: vec![Vec3::ZERO; positions.len()],
-            topology: Topology { edges, welded },
+            face_edges,
+            welded,
         }
     }
 
@@ -57,7 +53,7 @@ impl Pseudonormals {
     pub fn update(&mut self, vertices: &[Vec3], faces: &[[u32; 3]]) {
         self.edges.fill(Vec3::ZERO);
         self.vertices.fill(Vec3::ZERO);
-        let topology = self.topology.welded.iter().zip(&self.topology.edges);
+        let topology = self.welded.iter().zip(&self.face_edges);
         for ((face, normal), (welded, edges)) in faces.iter().zip(&mut self.faces).zip(topology) {
             let corners: [DVec3; 3] = face.map(|i| vertices[i as usize].as_dvec3());
             let n = face_normal(corners);
@@ -79,8 +75,8 @@ impl Pseudonormals {
         let face = face as usize;
         match feature {
             Feature::Face => self.faces[face],
-            Feature::Edge(i) => self.edges[self.topology.edges[face][i] as usize],
-            Feature::Vertex(i) => self.vertices[self.topology.welded[face][i] as usize],
+            Feature::Edge(i) => self.edges[self.face_edges[face][i] as usize],
+            Feature::Vertex(i) => self.vertices[self.welded[face][i] as usize],
         }
     }
 }

@@ -3,7 +3,6 @@ use std::fmt;
 use glam::Vec3;
 
 use crate::blend::{self, Blended};
-use crate::blend_backward;
 use crate::error::check_mesh;
 use crate::grid::CandidateGrid;
 use crate::knn::{Level, MAX_K};
@@ -51,22 +50,19 @@ impl Default for SurfaceQueryConfig {
 
 impl SurfaceQueryConfig {
     fn check(&self) -> Result<(), Error> {
-        let fail = |name, value, expected| Err(Error::Config { name, value, expected });
-        if !(1..=MAX_K).contains(&self.k) {
-            return fail("k", self.k as f64, "1 to 65536");
-        }
-        if !(self.ratio > 0.0 && self.ratio <= 1.0) {
-            return fail("ratio", f64::from(self.ratio), "above 0, at most 1");
-        }
-        if self.coarse_levels > 32 {
-            return fail("coarse_levels", self.coarse_levels as f64, "at most 32");
-        }
-        for (name, value) in [("cell", self.cell), ("margin", self.margin)] {
-            if !(0.0..=MAX_COORDINATE).contains(&value) {
-                return fail(name, f64::from(value), "0 to 1e18");
-            }
-        }
-        Ok(())
+        let lengths = 0.0..=MAX_COORDINATE;
+        let fault = if !(1..=MAX_K).contains(&self.k) {
+            format!("k: {}, expected 1 to 65536", self.k)
+        } else if !(self.ratio > 0.0 && self.ratio <= 1.0) {
+            format!("ratio: {}, expected above 0, at most 1", self.ratio)
+        } else if self.coarse_levels > 32 {
+            format!("coarse_levels: {}, expected at most 32", self.coarse_levels)
+        } else if !(lengths.contains(&self.cell) && lengths.contains(&self.margin)) {
+            format!("cell, margin: {}, {}, expected 0 to 1e18", self.cell, self.margin)
+        } else {
+            return Ok(());
+        };
+        Err(Error(fault))
     }
 }
 
@@ -111,10 +107,10 @@ impl SurfaceQuery {
         config.check()?;
         check_mesh(vertices, faces)?;
         if vertices.is_empty() {
-            return Err(Error::NoVertices);
+            return Err(Error("no vertices".to_owned()));
         }
         if let Some(vertex) = vertices.iter().position(|v| v.abs().max_element() > MAX_COORDINATE) {
-            return Err(Error::OutOfRange { vertex });
+            return Err(Error(format!("vertex {vertex} has a coordinate beyond 1e18")));
         }
         let pyramid = Pyramid::new(vertices, config.ratio, config.coarse_levels);
         let levels = (pyramid.levels.iter()).map(|ids| Level::new(vertices, ids)).collect::<Result<Vec<_>, _>>()?;
@@ -132,7 +128,6 @@ impl SurfaceQuery {
     }
 
     /// Length of a neighbour list: (coarse levels + 1) · k.
-    #[must_use]
     pub fn neighbours_per_query(&self) -> usize {
         self.levels.len() * self.k
     }
@@ -149,14 +144,8 @@ impl SurfaceQuery {
     /// If `out` has another length.
     #[inline]
     pub fn neighbours(&self, query: Vec3, out: &mut [u32]) {
-        assert_eq!(
-            out.len(),
-            self.neighbours_per_query(),
-            "neighbours: `out` has {} entries, expected {} levels of k = {}",
-            out.len(),
-            self.levels.len(),
-            self.k
-        );
+        let (found, levels, k) = (out.len(), self.levels.len(), self.k);
+        assert_eq!(found, levels * k, "neighbours: `out` has {found} entries, expected {levels} levels of k = {k}");
         if let Some(grid) = &self.grid
             && grid.nearest(&self.levels, self.k, query, out)
         {
@@ -178,7 +167,6 @@ impl SurfaceQuery {
     ///
     /// # Panics
     /// If `finest` is empty or has an index outside the vertices.
-    #[must_use]
     #[inline]
     pub fn blend(&self, query: Vec3, finest: &[u32]) -> Blended {
         assert!(!finest.is_empty(), "blend: no neighbours");
@@ -205,11 +193,10 @@ impl SurfaceQuery {
     ///
     /// # Panics
     /// If `finest` is empty or has an index outside the vertices.
-    #[must_use]
     pub fn blend_backward(&self, query: Vec3, finest: &[u32], d_point: Vec3, d_signed_distance: f32) -> Vec3 {
         assert!(!finest.is_empty(), "blend_backward: no neighbours");
         let query = self.near(query);
-        blend_backward::blend_backward(&self.vertices, &self.normals, query, finest, d_point, d_signed_distance)
+        blend::blend_backward(&self.vertices, &self.normals, query, finest, d_point, d_signed_distance)
     }
 
     /// The query, moved toward the origin to at most [`FAR`] sizes of the mesh.
@@ -219,13 +206,11 @@ impl SurfaceQuery {
     }
 
     /// Unit normals of the vertices, (V): [`vertex_normals`].
-    #[must_use]
     pub fn normals(&self) -> &[Vec3] {
         &self.normals
     }
 
     /// The levels of the neighbours.
-    #[must_use]
     pub fn pyramid(&self) -> &Pyramid {
         &self.pyramid
     }

@@ -54,16 +54,15 @@ fn pool(threads: usize) -> rayon::ThreadPool {
     rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap()
 }
 
-fn draw(bencher: Bencher<'_, '_>, mesh: &TriMesh, view: &View, threads: usize, layers: usize, samples: Samples) {
+fn draw(bencher: Bencher<'_, '_>, mesh: &TriMesh, view: &View, threads: usize, samples: Samples) {
     let options = RasterOptions { samples, cull_back: true, ..RasterOptions::default() };
     let mut out = vec![0u32; (view.width * view.height) as usize];
     let mut rasterizer = Rasterizer::default();
-    let layers = vec![&mesh.faces[..]; layers];
     let pool = pool(threads);
     bencher.counter(ItemsCount::new(out.len())).bench_local(|| {
         pool.install(|| {
-            rasterizer.draw(&mesh.vertices, &layers, view, &options, &mut out, |pixel| {
-                pixel.samples().next().and_then(|sample| sample.first()).map_or(0, |f| f.face)
+            rasterizer.draw(&mesh.vertices, &mesh.faces, view, &options, &mut out, |pixel| {
+                pixel.samples.first().copied().flatten().map_or(0, |f| f.face)
             })
         })
     });
@@ -72,29 +71,23 @@ fn draw(bencher: Bencher<'_, '_>, mesh: &TriMesh, view: &View, threads: usize, l
 /// A picture of 512 × 512, of meshes subdivided this many times, on two threads.
 #[divan::bench(args = [0, 1, 2])]
 fn faces_512(bencher: Bencher<'_, '_>, times: u32) {
-    draw(bencher, &subdivided(times), &view(512, 512), 2, 1, Samples::One);
+    draw(bencher, &subdivided(times), &view(512, 512), 2, Samples::One);
 }
 
 /// The same on one.
 #[divan::bench(args = [0, 1, 2])]
 fn faces_512_one_thread(bencher: Bencher<'_, '_>, times: u32) {
-    draw(bencher, &subdivided(times), &view(512, 512), 1, 1, Samples::One);
+    draw(bencher, &subdivided(times), &view(512, 512), 1, Samples::One);
 }
 
 /// Four samples a pixel.
 #[divan::bench]
 fn four_samples_512(bencher: Bencher<'_, '_>) {
-    draw(bencher, &subdivided(1), &view(512, 512), 2, 1, Samples::Four);
-}
-
-/// Three layers.
-#[divan::bench]
-fn three_layers_512(bencher: Bencher<'_, '_>) {
-    draw(bencher, &subdivided(1), &view(512, 512), 2, 3, Samples::One);
+    draw(bencher, &subdivided(1), &view(512, 512), 2, Samples::Four);
 }
 
 /// Pictures of other sizes.
 #[divan::bench(args = [(256, 256), (1920, 1080)])]
 fn faces(bencher: Bencher<'_, '_>, (width, height): (u32, u32)) {
-    draw(bencher, &subdivided(1), &view(width, height), 2, 1, Samples::One);
+    draw(bencher, &subdivided(1), &view(width, height), 2, Samples::One);
 }

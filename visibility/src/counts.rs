@@ -21,19 +21,16 @@ pub struct VisibilityCounts {
 
 impl VisibilityCounts {
     /// Zero counts of `n` vertices.
-    #[must_use]
     pub fn new(n: usize) -> Self {
         Self { counts: vec![0; n] }
     }
 
     /// Restores saved counts, (V).
-    #[must_use]
     pub fn from_counts(counts: Vec<u64>) -> Self {
         Self { counts }
     }
 
     /// The counts, (V).
-    #[must_use]
     pub fn counts(&self) -> &[u64] {
         &self.counts
     }
@@ -56,13 +53,8 @@ impl VisibilityCounts {
     /// # Panics
     /// If `visible` does not have an entry per vertex.
     pub fn add_visible(&mut self, visible: &[bool]) {
-        assert_eq!(
-            visible.len(),
-            self.counts.len(),
-            "add_visible: {} flags for {} vertices",
-            visible.len(),
-            self.counts.len()
-        );
+        let (flags, vertices) = (visible.len(), self.counts.len());
+        assert_eq!(flags, vertices, "add_visible: {flags} flags for {vertices} vertices");
         for (count, &seen) in self.counts.iter_mut().zip(visible) {
             *count = count.saturating_add(u64::from(seen));
         }

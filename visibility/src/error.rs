@@ -1,64 +1,39 @@
+use glam::Vec3;
+
 /// Why a mesh or an image is refused.
 ///
 /// ```
-/// use visibility::{Error, RayMesh};
-///
-/// let refused = RayMesh::new(&[glam::Vec3::ZERO], &[[0, 0, 1]]).unwrap_err();
-/// assert_eq!(refused, Error::FaceIndex { face: 0, vertex: 1, vertices: 1 });
+/// let refused = visibility::RayMesh::new(&[glam::Vec3::ZERO], &[[0, 0, 1]]).unwrap_err();
 /// assert_eq!(refused.to_string(), "face 0 has vertex index 1, but there are only 1 vertices");
 /// ```
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
-#[non_exhaustive]
-pub enum Error {
-    /// A face has an index outside the vertices.
-    #[error("face {face} has vertex index {vertex}, but there are only {vertices} vertices")]
-    FaceIndex {
-        /// Index of the face.
-        face: usize,
-        /// The vertex index out of range.
-        vertex: u32,
-        /// Number of vertices.
-        vertices: usize,
-    },
-    /// A vertex has a NaN or infinite coordinate.
-    #[error("vertex {vertex} is not finite")]
-    NotFinite {
-        /// Index of the vertex.
-        vertex: usize,
-    },
-    /// The mesh has more vertices or faces than are supported.
-    #[error("{count} elements, at most 2^31 are supported")]
-    TooMany {
-        /// Number of elements.
-        count: usize,
-    },
-    /// An image too large to rasterise.
-    #[error("an image of {width} × {height} pixels, at most {most} × {most} are supported")]
-    ImageSize {
-        /// Width in pixels.
-        width: u32,
-        /// Height in pixels.
-        height: u32,
-        /// Largest width and height at this number of samples a pixel.
-        most: u32,
-    },
+#[error("{0}")]
+pub struct Error(
+    /// The fault: the index of the vertex or face, the size and its limit.
+    pub String,
+);
+
+impl Error {
+    pub(crate) fn face_index(face: usize, vertex: u32, vertices: usize) -> Self {
+        Self(format!("face {face} has vertex index {vertex}, but there are only {vertices} vertices"))
+    }
+
+    pub(crate) fn too_many(elements: usize) -> Self {
+        Self(format!("{elements} elements, at most 2^31 are supported"))
+    }
 }
 
-pub(crate) fn check_mesh(vertices: &[glam::Vec3], faces: &[[u32; 3]]) -> Result<(), Error> {
-    let limit = 1 << 31;
-    for count in [vertices.len(), faces.len()] {
-        if count > limit {
-            return Err(Error::TooMany { count });
-        }
+pub(crate) fn check_mesh(vertices: &[Vec3], faces: &[[u32; 3]]) -> Result<(), Error> {
+    let (count, most) = (vertices.len(), vertices.len().max(faces.len()));
+    if most > 1 << 31 {
+        return Err(Error::too_many(most));
     }
     if let Some(vertex) = vertices.iter().position(|v| !v.is_finite()) {
-        return Err(Error::NotFinite { vertex });
+        return Err(Error(format!("vertex {vertex} is not finite")));
     }
     for (face, corners) in faces.iter().enumerate() {
-        for &vertex in corners {
-            if vertex as usize >= vertices.len() {
-                return Err(Error::FaceIndex { face, vertex, vertices: vertices.len() });
-            }
+        if let Some(&vertex) = corners.iter().find(|&&v| v as usize >= count) {
+            return Err(Error::face_index(face, vertex, count));
         }
     }
     Ok(())

@@ -36,17 +36,6 @@ pub struct Hit {
 /// watertight: no ray slips through an edge or a vertex that triangles share.
 ///
 /// Queries take `&self` and may run on any number of threads.
-///
-/// ```
-/// use glam::Vec3;
-/// use visibility::RayMesh;
-///
-/// let vertices = [Vec3::ZERO, Vec3::X, Vec3::Y, Vec3::Z];
-/// let mesh = RayMesh::new(&vertices, &[[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])?;
-/// assert_eq!(mesh.first_hit(Vec3::new(0.25, 0.25, -3.0), Vec3::Z).map(|hit| hit.t), Some(3.0));
-/// assert_eq!(mesh.first_hit(Vec3::new(0.25, 0.25, -3.0), Vec3::X), None);
-/// # Ok::<(), visibility::Error>(())
-/// ```
 pub struct RayMesh {
     faces: Vec<[u32; 3]>,
     /// Multiplied by `scale`, a power of two, so that products neither overflow nor vanish.
@@ -79,7 +68,6 @@ impl RayMesh {
     /// `None` without an intersection. A ray in the plane of a triangle does not intersect it, nor
     /// does one of zero direction, one that is not finite, or one from beyond 10¹⁵ sizes of the
     /// mesh.
-    #[must_use]
     pub fn first_hit(&self, origin: Vec3, direction: Vec3) -> Option<Hit> {
         let (ray, to_t) = self.ray(origin, direction)?;
         let mut first: Option<Hit> = None;
@@ -177,48 +165,33 @@ impl RayMesh {
             &mut spill
         };
         let mut height = 0;
-        let mut node = 0u32;
-        loop {
-            let n = &self.tree.nodes[node as usize];
-            let t = n.entry(ray.origin, ray.inverse, end);
+        let mut next = Some(0u32);
+        while let Some(node) = next.take() {
+            let node = &self.tree.nodes[node as usize];
+            let t = node.entry(ray.origin, ray.inverse, end);
             let near = usize::from(t[1] < t[0]);
-            let far = 1 - near;
-            let mut next = None;
-            // Boxes at exactly the depth of the hit may hold a face of lower index.
-            if t[near] <= end && t[near] < f32::INFINITY {
-                match n.child(near) {
-                    Child::Leaf(leaf) => match visit(leaf as usize) {
-                        Some(new) => end = new,
-                        None => return,
-                    },
-                    Child::Node(child) => next = Some(child),
+            for side in [near, 1 - near] {
+                // Boxes at exactly the depth of the hit may hold a face of lower index.
+                if t[side] > end || t[side] == f32::INFINITY {
+                    continue;
                 }
-            }
-            if t[far] <= end && t[far] < f32::INFINITY {
-                match n.child(far) {
+                match node.child(side) {
                     Child::Leaf(leaf) => match visit(leaf as usize) {
                         Some(new) => end = new,
                         None => return,
                     },
                     Child::Node(child) if next.is_none() => next = Some(child),
                     Child::Node(child) => {
-                        stack[height] = (t[far], child);
+                        stack[height] = (t[side], child);
                         height += 1;
                     }
                 }
             }
-            node = match next {
-                Some(child) => child,
-                None => loop {
-                    if height == 0 {
-                        return;
-                    }
-                    height -= 1;
-                    if stack[height].0 <= end {
-                        break stack[height].1;
-                    }
-                },
-            };
+            while next.is_none() && height > 0 {
+                height -= 1;
+                let (t, child) = stack[height];
+                next = (t <= end).then_some(child);
+            }
         }
     }
 }

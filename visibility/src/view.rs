@@ -40,7 +40,6 @@ pub struct View {
 
 impl View {
     /// Position of the camera in the world; `None` if the extrinsics are singular.
-    #[must_use]
     pub fn centre_of_projection(&self) -> Option<Vec3> {
         let rotation = Mat3::from(self.world_to_camera.matrix3).as_dmat3();
         let determinant = rotation.determinant();
@@ -54,7 +53,6 @@ impl View {
 
     /// Row-major index of the pixel that holds the projection of `point`; `None` behind the camera,
     /// outside the image, or for a point that is not finite.
-    #[must_use]
     pub fn pixel(&self, point: Vec3) -> Option<usize> {
         let p = self.world_to_camera.transform_point3(point);
         let projected = self.intrinsics() * p;
@@ -77,35 +75,13 @@ impl View {
 /// faces. Other points are visible only within a relative 10⁻⁵ of the surface or in front of it.
 /// Without a centre of projection nothing is visible.
 ///
-/// ```
-/// use glam::{Affine3A, Vec2, Vec3};
-/// use visibility::{RayMesh, View, visible_vertices};
-///
-/// // A triangle in front of a point.
-/// let corners = [(-1.0, -1.0, 2.0), (1.0, -1.0, 2.0), (0.0, 1.0, 2.0)].map(Vec3::from);
-/// let mesh = RayMesh::new(&corners, &[[0, 1, 2]])?;
-/// let (focal, centre) = (Vec2::splat(10.0), Vec2::splat(10.0));
-/// let view = View { focal, centre, world_to_camera: Affine3A::IDENTITY, width: 20, height: 20 };
-/// assert_eq!(visible_vertices(&mesh, &corners, &view, None), [true; 3]);
-/// assert_eq!(visible_vertices(&mesh, &[3.0 * Vec3::Z], &view, None), [false]);
-/// # Ok::<(), visibility::Error>(())
-/// ```
-///
 /// # Panics
 /// If `usable` does not have `width · height` entries.
-#[must_use]
 pub fn visible_vertices(mesh: &RayMesh, vertices: &[Vec3], view: &View, usable: Option<&[bool]>) -> Vec<bool> {
-    let pixels = view.width as usize * view.height as usize;
-    if let Some(usable) = usable {
-        assert_eq!(
-            usable.len(),
-            pixels,
-            "visible_vertices: {} usable flags for {} × {} pixels",
-            usable.len(),
-            view.width,
-            view.height
-        );
-    }
+    let View { width, height, .. } = *view;
+    let pixels = width as usize * height as usize;
+    let flags = usable.map_or(pixels, <[bool]>::len);
+    assert_eq!(flags, pixels, "visible_vertices: {flags} usable flags for {width} × {height} pixels");
     let Some(centre) = view.centre_of_projection() else {
         return vec![false; vertices.len()];
     };
@@ -114,10 +90,7 @@ pub fn visible_vertices(mesh: &RayMesh, vertices: &[Vec3], view: &View, usable: 
         .enumerate()
         .with_min_len(256)
         .map(|(i, &v)| {
-            let Some(pixel) = view.pixel(v) else {
-                return false;
-            };
-            if usable.is_some_and(|usable| !usable[pixel]) {
+            if view.pixel(v).is_none_or(|pixel| usable.is_some_and(|usable| !usable[pixel])) {
                 return false;
             }
             let own = mesh.is_vertex(i, v);

@@ -34,32 +34,17 @@ pub struct Camera {
 /// Invalid camera parameters, or an image too small for a metric.
 ///
 /// ```
-/// use volrender::{Error, metrics};
-///
-/// let small = metrics::ssim(&[0.5; 75], &[0.5; 75], 5, 5).unwrap_err();
-/// assert_eq!(small, Error::ImageSize { width: 5, height: 5, least: 7 });
+/// let small = volrender::metrics::ssim(&[0.5; 75], &[0.5; 75], 5, 5).unwrap_err();
 /// assert_eq!(small.to_string(), "an image of 5×5 pixels is smaller than 7×7");
 /// ```
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
-#[non_exhaustive]
-pub enum Error {
-    /// The intrinsics are not a matrix of the form \[fx 0 cx; 0 fy cy; 0 0 1\] with positive,
-    /// finite focal lengths.
-    #[error("intrinsics {0} are not [fx 0 cx; 0 fy cy; 0 0 1] with positive focal lengths")]
-    Intrinsics(Mat3),
-    /// Extrinsics with values that are not finite, or with a singular linear part.
-    #[error("extrinsics {0} are not finite and invertible")]
-    Extrinsics(Affine3A),
-    /// An image without pixels, or one smaller than a metric's window.
-    #[error("an image of {width}×{height} pixels is smaller than {least}×{least}")]
-    ImageSize {
-        /// Image width in pixels.
-        width: usize,
-        /// Image height in pixels.
-        height: usize,
-        /// Smallest side allowed.
-        least: usize,
-    },
+#[error("{0}")]
+pub struct Error(String);
+
+impl Error {
+    pub(crate) fn image_size(width: usize, height: usize, least: usize) -> Self {
+        Self(format!("an image of {width}×{height} pixels is smaller than {least}×{least}"))
+    }
 }
 
 /// Skew relative to the focal length that is tolerated as rounding of a calibration file.
@@ -83,33 +68,31 @@ impl Camera {
             && k.y_axis.z == 0.0
             && (k.z_axis.z - 1.0).abs() <= SKEW;
         if !usual {
-            return Err(Error::Intrinsics(k));
+            let message = format!("intrinsics {k} are not [fx 0 cx; 0 fy cy; 0 0 1] with positive focal lengths");
+            return Err(Error(message));
         }
         let inverse = world_to_camera.inverse();
         if !world_to_camera.is_finite() || world_to_camera.matrix3.determinant() == 0.0 || !inverse.is_finite() {
-            return Err(Error::Extrinsics(world_to_camera));
+            return Err(Error(format!("extrinsics {world_to_camera} are not finite and invertible")));
         }
         if width == 0 || height == 0 {
-            return Err(Error::ImageSize { width: width as usize, height: height as usize, least: 1 });
+            return Err(Error::image_size(width as usize, height as usize, 1));
         }
         Ok(Self { focal, centre: Vec2::new(k.z_axis.x, k.z_axis.y), world_to_camera, width, height })
     }
 
     /// The calibration matrix.
-    #[must_use]
     pub fn intrinsics(&self) -> Mat3 {
         Mat3::from_cols(Vec3::new(self.focal.x, 0.0, 0.0), Vec3::new(0.0, self.focal.y, 0.0), self.centre.extend(1.0))
     }
 
     /// Centre of projection in the world.
-    #[must_use]
     pub fn centre_of_projection(&self) -> Vec3 {
         self.world_to_camera.inverse().translation.into()
     }
 
     /// The ray through image position (`u`, `v`) in pixels. The centre of pixel (column, row) is
     /// (column + 0.5, row + 0.5).
-    #[must_use]
     pub fn ray(&self, u: f32, v: f32) -> Ray {
         let camera_to_world = self.world_to_camera.inverse();
         let p = (Vec2::new(u, v) - self.centre) / self.focal;
@@ -119,7 +102,6 @@ impl Camera {
 
     /// Pixel coordinates and depth (u, v, z) of a world point, inside the image or not. `None` if it
     /// is not in front of the camera or the result is not finite.
-    #[must_use]
     pub fn project(&self, x: Vec3) -> Option<Vec3> {
         let p = self.world_to_camera.transform_point3(x);
         if p.z.is_nan() || p.z <= 0.0 {
@@ -140,7 +122,6 @@ impl Camera {
 
     /// Position in the distorted image of `pixel` in the undistorted one: the lookup that undistorts
     /// an image.
-    #[must_use]
     pub fn distort_pixel(&self, distortion: &Distortion, pixel: Vec2) -> Vec2 {
         let p = (pixel - self.centre) / self.focal;
         self.focal * distortion.distort(p) + self.centre

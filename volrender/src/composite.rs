@@ -51,7 +51,6 @@ impl RaySamples<'_> {
     ///
     /// # Panics
     /// If the range exceeds a slice.
-    #[must_use]
     pub fn slice(&self, range: Range<usize>) -> Self {
         Self {
             sigma: &self.sigma[range.clone()],
@@ -78,13 +77,6 @@ impl RaySamples<'_> {
 }
 
 /// One composited ray.
-///
-/// ```
-/// use glam::Vec3;
-///
-/// let pixel = volrender::composite(Default::default(), Vec3::X, &mut []);
-/// assert_eq!((pixel.color, pixel.opacity, pixel.termination), (Vec3::X, 0.0, None));
-/// ```
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Composite {
     /// C = Σ w_i c_i + (1 − Σ w_i) · background.

@@ -34,20 +34,17 @@ const MAX_STEPS: usize = 50;
 
 impl Distortion {
     /// Coefficients in OpenCV's order (k1, k2, p1, p2, k3).
-    #[must_use]
     pub fn from_opencv([k1, k2, p1, p2, k3]: [f32; 5]) -> Self {
         Self { k1, k2, p1, p2, k3 }
     }
 
     /// Whether all coefficients are 0.
-    #[must_use]
     pub fn is_identity(&self) -> bool {
         *self == Self::default()
     }
 
     /// Smallest undistorted radius at which r · (1 + k1 r² + k2 r⁴ + k3 r⁶) stops growing; infinite
     /// if it always grows. Beyond it the model is not invertible.
-    #[must_use]
     pub fn fold_radius(&self) -> f32 {
         let [a, b, c] = [3.0 * f64::from(self.k1), 5.0 * f64::from(self.k2), 7.0 * f64::from(self.k3)];
         let slope = |u: f64| 1.0 + u * (a + u * (b + u * c));
@@ -79,7 +76,6 @@ impl Distortion {
     }
 
     /// Undistorted to distorted coordinates.
-    #[must_use]
     pub fn distort(&self, p: Vec2) -> Vec2 {
         self.distort_with_jacobian(p).0
     }
@@ -88,7 +84,6 @@ impl Distortion {
     ///
     /// `None` if it does not converge. Beyond the [fold radius](Self::fold_radius) there may be no
     /// solution, or the one found lies on another branch.
-    #[must_use]
     pub fn undistort(&self, p: Vec2) -> Option<Vec2> {
         if self.is_identity() {
             return Some(p);

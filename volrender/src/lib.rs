@@ -59,4 +59,4 @@ pub use distortion::Distortion;
 pub use occupancy::{Occupancy, OccupancyConfig};
 pub use random::RandomStream;
 pub use ray::{Aabb, Ray};
-pub use sampling::{Bins, bin_midpoints, bin_widths, patch};
+pub use sampling::{Bins, patch};

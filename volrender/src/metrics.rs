@@ -14,7 +14,6 @@ use crate::camera::Error;
 ///
 /// # Panics
 /// If the lengths differ.
-#[must_use]
 pub fn psnr(a: &[f32], b: &[f32]) -> f64 {
     assert_eq!(a.len(), b.len(), "images of {} and {} values", a.len(), b.len());
     let sum: f64 = a.iter().zip(b).map(|(&a, &b)| squared(a, b)).sum();
@@ -23,15 +22,8 @@ pub fn psnr(a: &[f32], b: &[f32]) -> f64 {
 
 /// [`psnr`] over the pixels where `mask` (H·W) is true. `None` for an empty mask.
 ///
-/// ```
-/// let (a, b) = ([0.5; 6], [0.5, 0.5, 0.5, 0.6, 0.6, 0.6]);
-/// let psnr = volrender::metrics::psnr_masked(&a, &b, &[false, true]).unwrap();
-/// assert!((psnr - 20.0).abs() < 1e-5);
-/// ```
-///
 /// # Panics
 /// If the lengths are not 3·H·W, 3·H·W and H·W.
-#[must_use]
 pub fn psnr_masked(a: &[f32], b: &[f32], mask: &[bool]) -> Option<f64> {
     assert_mask(a, b, mask);
     let mut sum = 0.0;
@@ -71,13 +63,13 @@ const BORDER: usize = WINDOW / 2;
 /// ```
 ///
 /// # Errors
-/// [`Error::ImageSize`] for an image smaller than the window.
+/// An image smaller than the window.
 ///
 /// # Panics
 /// If the lengths are not 3·H·W.
 pub fn ssim(a: &[f32], b: &[f32], width: usize, height: usize) -> Result<f64, Error> {
     if width < WINDOW || height < WINDOW {
-        return Err(Error::ImageSize { width, height, least: WINDOW });
+        return Err(Error::image_size(width, height, WINDOW));
     }
     let map = ssim_map(a, b, width, height);
     let rows = map.chunks_exact(width).take(height - BORDER).skip(BORDER);
@@ -99,7 +91,6 @@ pub fn ssim(a: &[f32], b: &[f32], width: usize, height: usize) -> Result<f64, Er
 ///
 /// # Panics
 /// If the lengths are not 3·H·W, 3·H·W and H·W.
-#[must_use]
 pub fn ssim_masked(a: &[f32], b: &[f32], mask: &[bool], width: usize, height: usize) -> Option<f64> {
     assert_mask(a, b, mask);
     let count = mask.iter().filter(|inside| **inside).count();

@@ -40,11 +40,6 @@ pub struct Occupancy {
 
 /// Thickness of the occupied shell around a mesh and size of the cells, in the unit of its
 /// vertices. [`Occupancy`] has an example.
-///
-/// ```
-/// // 5 cm around a body and its whole inside, in cells of 2 cm.
-/// let config = volrender::OccupancyConfig { margin: 0.05, depth: 1.0, cell: 0.02 };
-/// ```
 #[derive(Clone, Copy, Debug)]
 pub struct OccupancyConfig {
     /// Upper bound of the margins of the faces, to the outside.
@@ -149,14 +144,12 @@ impl Occupancy {
     }
 
     /// Bounding box of the mesh and its margin; [`Aabb::EMPTY`] without occupied cells.
-    #[must_use]
     pub fn region(&self) -> Aabb {
         self.region.unwrap_or(Aabb::EMPTY)
     }
 
     /// Whether `point` lies in an occupied cell.
     #[inline]
-    #[must_use]
     pub fn is_occupied(&self, point: Vec3) -> bool {
         // Truncation is the floor of non-negative values; NaN fails the comparison, and huge
         // values saturate.

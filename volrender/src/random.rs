@@ -19,7 +19,6 @@ pub struct RandomStream(u64);
 
 impl RandomStream {
     /// The stream of an address.
-    #[must_use]
     pub fn new(address: &[u64]) -> Self {
         Self(address.iter().fold(0x9E37_79B9_7F4A_7C15, |state, &word| {
             mix(state.wrapping_mul(0xD134_2543_DE82_EF95).wrapping_add(word).wrapping_add(0x9E37_79B9_7F4A_7C15))

@@ -1,13 +1,6 @@
 use glam::Vec3;
 
 /// A ray x(t) = origin + t · direction.
-///
-/// ```
-/// use glam::Vec3;
-///
-/// let ray = volrender::Ray { origin: Vec3::X, direction: Vec3::Z };
-/// assert_eq!(ray.at(2.0), Vec3::new(1.0, 0.0, 2.0));
-/// ```
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Ray {
     /// The point at t = 0.
@@ -18,7 +11,6 @@ pub struct Ray {
 
 impl Ray {
     /// The point at distance `t`.
-    #[must_use]
     pub fn at(&self, t: f32) -> Vec3 {
         self.origin + self.direction * t
     }
@@ -49,7 +41,6 @@ impl Aabb {
 
     /// The bounding box of `points`, ignoring those that are not finite; [`Aabb::EMPTY`] without
     /// any.
-    #[must_use]
     pub fn from_points(points: &[Vec3]) -> Self {
         points
             .iter()
@@ -58,7 +49,6 @@ impl Aabb {
     }
 
     /// Whether the box contains no point.
-    #[must_use]
     pub fn is_empty(&self) -> bool {
         !self.min.cmple(self.max).all()
     }
@@ -67,7 +57,6 @@ impl Aabb {
     ///
     /// `None` if the ray misses or touches in a single point, if the direction is zero, the box
     /// empty, or anything NaN or infinite. Directions parallel to a face are handled exactly.
-    #[must_use]
     pub fn intersect(&self, ray: &Ray) -> Option<(f32, f32)> {
         if self.is_empty() || !ray.origin.is_finite() || !ray.direction.is_finite() {
             return None;

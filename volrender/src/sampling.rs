@@ -27,54 +27,17 @@ pub struct Bins {
 
 impl Bins {
     /// `n` bins between the depths 0 ≤ `near` ≤ `far`; of width 0 if `n` is 0.
-    #[must_use]
     pub fn new(near: f32, far: f32, n: usize) -> Self {
         Self { near, width: if n == 0 { 0.0 } else { (far - near) / n as f32 } }
     }
 
     /// Width δ of a bin.
-    #[must_use]
     pub fn width(&self) -> f32 {
         self.width
     }
 
     /// Depth in bin `i` at `offset`, from 0 at its near end to 1 at its far end.
-    #[must_use]
     pub fn at(&self, i: usize, offset: f32) -> f32 {
         self.near + (i as f32 + offset) * self.width
     }
-}
-
-/// Writes the midpoint of each bin into `t` (S), for `edges` (S + 1).
-///
-/// ```
-/// let (edges, mut t, mut delta) = ([0.0, 1.0, 3.0], [0.0; 2], [0.0; 2]);
-/// volrender::bin_midpoints(&edges, &mut t);
-/// volrender::bin_widths(&edges, &mut delta);
-/// assert_eq!((t, delta), ([0.5, 2.0], [1.0, 2.0]));
-/// ```
-///
-/// # Panics
-/// If there is not one edge more than bins.
-pub fn bin_midpoints(edges: &[f32], t: &mut [f32]) {
-    assert_bins(edges, t);
-    for (t, bin) in t.iter_mut().zip(edges.windows(2)) {
-        *t = 0.5 * bin[0] + 0.5 * bin[1];
-    }
-}
-
-/// Writes the width δ of each bin into `delta` (S), for `edges` (S + 1); infinite if the difference
-/// of two edges overflows. [`bin_midpoints`] has an example.
-///
-/// # Panics
-/// If there is not one edge more than bins.
-pub fn bin_widths(edges: &[f32], delta: &mut [f32]) {
-    assert_bins(edges, delta);
-    for (delta, bin) in delta.iter_mut().zip(edges.windows(2)) {
-        *delta = bin[1] - bin[0];
-    }
-}
-
-fn assert_bins(edges: &[f32], values: &[f32]) {
-    assert_eq!(edges.len(), values.len() + 1, "{} edges for {} bins", edges.len(), values.len());
 }

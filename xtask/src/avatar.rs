@@ -3,35 +3,39 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, ensure};
+use occnerf::Method;
 use occnerf::bake::{Avatar, Clip, export};
-use occnerf::{Method, Model};
 use smpl::MotionClip;
 
 use crate::baked;
-use crate::process::{say, unwritten};
-use crate::run::RunConfig;
+use crate::process::{Lock, say, unwritten};
+use crate::run::{CHECKPOINT, RunConfig, identity};
 
-/// The baked person of a run: see [`baked::avatar`].
-pub fn of_run(run: &Path) -> Result<Avatar> {
+/// The surface of a run, or its baked person, see [`baked::avatar`]; and the lock on the run.
+pub fn of_run(run: &Path) -> Result<(Avatar, Lock)> {
     ensure!(run.is_dir(), "{}: no such run", run.display());
-    let method = RunConfig::read(run).ok().map(|run| run.train.method);
-    ensure!(method != Some(Method::Prior), "{} has no field to bake", run.display());
-    if method == Some(Method::Surface) {
-        return Ok(Avatar::load(&baked::path(run))?);
-    }
-    match baked::fresh(run)? {
-        Some(avatar) => Ok(avatar),
-        None => baked::avatar(run, &Model::load(run)?),
-    }
+    let config = match RunConfig::read(run) {
+        // A surface stands for itself.
+        Err(_) if baked::path(run).exists() && !run.join(CHECKPOINT).exists() => None,
+        read => Some(read?),
+    };
+    let method = config.as_ref().map_or(Method::Surface, |config| config.train.method);
+    ensure!(method != Method::Prior, "{} has no field to bake", run.display());
+    let lock = Lock::share(run)?;
+    let avatar = match config.filter(|_| method.has_field()) {
+        Some(config) => baked::avatar(run, &config)?,
+        None => Avatar { source: identity(run)?, ..Avatar::load(&baked::path(run))? },
+    };
+    Ok((avatar, lock))
 }
 
 /// Reads a motion of `fps` frames per second, by default as many as the file says.
 pub fn load_motion(path: &Path, fps: Option<f32>) -> Result<MotionClip> {
-    let mut motion = MotionClip::load(path)?;
+    let (mut motion, rate) = MotionClip::load_with_rate(path)?;
     if let Some(fps) = fps {
         ensure!((1e-3..=1e6).contains(&fps), "--fps {fps}: expected 0.001 to 1000000");
         motion.fps = fps;
-    } else if MotionClip::rate_of(path)?.is_none() {
+    } else if rate.is_none() {
         say!("{}: no frames per second in it, {} are assumed (--fps)", path.display(), motion.fps);
     }
     Ok(motion)

@@ -3,7 +3,8 @@
 use anyhow::Result;
 use clap::{Parser, Subcommand};
 
-use crate::process::EXIT_CODES;
+use crate::process::{EXIT_CODES, delivered};
+use crate::run::use_threads;
 use crate::{check, convert, eval, export, import, list, render, train, view};
 
 /// Turns a video of a moving person, partly hidden behind objects, into a 3-D person that renders
@@ -39,15 +40,23 @@ enum Command {
 impl Arguments {
     /// Runs the command.
     pub fn run(self) -> Result<()> {
+        let threads = match &self.command {
+            Command::Train(arguments) => arguments.threads,
+            Command::Eval(arguments) => arguments.threads,
+            Command::Render(arguments) => arguments.threads,
+            _ => None,
+        };
+        use_threads(threads)?;
         match self.command {
             Command::Train(arguments) if arguments.list.is_some() => list::train_list(&arguments),
             Command::Train(arguments) => train::train(&arguments),
-            Command::Eval(arguments) => eval::eval(&arguments),
+            // The results of these are what they print.
+            Command::Eval(arguments) => eval::eval(&arguments).and_then(|()| delivered()),
+            Command::Check(arguments) => check::check(&arguments).and_then(|()| delivered()),
             Command::Render(arguments) => render::render(&arguments),
             Command::Export(arguments) => export::export(&arguments),
             Command::View(arguments) => view::view(&arguments),
             Command::Import(arguments) => import::import(&arguments),
-            Command::Check(arguments) => check::check(&arguments),
             Command::Convert(arguments) => convert::convert(&arguments),
         }
     }

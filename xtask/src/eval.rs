@@ -18,10 +18,8 @@ use visibility::Samples;
 
 use crate::network::{load_lpips, network_name};
 use crate::optimise::logged_seconds;
-use crate::process::{Ending, Lock, note, one_line, say};
-use crate::run::{
-    METRICS, Metrics, RunConfig, Splits, TRAINING_VIEWS, evaluation_title, make_directory, peak_rss_bytes, use_threads,
-};
+use crate::process::{Ending, Lock, is_read_only, note, one_line, say, telling};
+use crate::run::{self, Metrics, RunConfig, Splits, TRAINING_VIEWS, evaluation_title, make_directory, peak_rss_bytes};
 use crate::{baked, pictures, report, table};
 
 /// Stride of scored training frames.
@@ -70,7 +68,7 @@ pub struct EvalArguments {
     baked: bool,
     /// Threads [default: all cores]
     #[arg(long)]
-    threads: Option<usize>,
+    pub threads: Option<usize>,
 }
 
 /// Metrics of a run before scoring.
@@ -82,6 +80,7 @@ pub fn unscored(run: &RunConfig, drawn: &Drawn<'_>, train_seconds: f64) -> Metri
         Drawn::Avatar { avatar, .. } => (0, avatar.num_parameters(), String::new()),
     };
     Metrics {
+        of: String::new(),
         method: config.method.name().to_owned(),
         preset: config.preset.name().to_owned(),
         occluded: config.occluded.name().to_owned(),
@@ -99,11 +98,14 @@ pub fn unscored(run: &RunConfig, drawn: &Drawn<'_>, train_seconds: f64) -> Metri
 
 /// Runs the command.
 pub fn eval(arguments: &EvalArguments) -> Result<()> {
-    use_threads(arguments.threads)?;
     let lpips = load_lpips(arguments.lpips.as_deref())?;
     let directory = &arguments.run;
     let run = RunConfig::read(directory)?;
-    let _lock = Lock::take(directory)?;
+    let writes = arguments.side == 1 && !(arguments.baked && run.train.method.has_field());
+    let _lock = match if writes { Lock::take(directory) } else { Lock::share(directory) } {
+        Err(error) if is_read_only(&error) => Lock::share(directory)?,
+        lock => lock?,
+    };
     let source = run.source(directory)?;
     let scene = source.scene(&run.train)?;
     ensure!(!arguments.baked || run.train.method != Method::Prior, "--baked: a prior is not baked");
@@ -118,23 +120,19 @@ pub fn eval(arguments: &EvalArguments) -> Result<()> {
         let colors = colors.with_context(|| format!("{} has no person.safetensors", directory.display()))?;
         Drawn::Avatar { body: &scene.body, light: colors.light, avatar: &avatar }
     } else if baked {
-        loaded = Model::load(directory)?;
-        avatar = baked::avatar(directory, &loaded)?;
+        loaded = run::model(directory, &run)?;
+        avatar = baked::avatar(directory, &run)?;
         Drawn::Avatar { body: loaded.body(), light: loaded.light(), avatar: &avatar }
     } else {
-        loaded = Model::load(directory)?;
+        loaded = run::model(directory, &run)?;
         Drawn::Field { model: &loaded, perceptual: loaded.config().loss.perceptual_name() }
     };
     let mut network = network_name(lpips.as_ref());
     let mut metrics = unscored(&run, &drawn, 0.0);
     metrics.train_seconds = logged_seconds(directory, metrics.steps)?;
-    if directory.join(METRICS).is_file() {
-        let Metrics { steps, train_seconds, .. } = metrics;
-        metrics = Metrics::read(directory)?;
-        if metrics.steps != steps {
-            // Trained further since the last scores.
-            (metrics.steps, metrics.train_seconds) = (steps, train_seconds);
-        }
+    metrics.of = run::identity(directory)?;
+    if let Some(scored) = Metrics::fresh(directory, directory)? {
+        metrics = scored;
     }
     ensure!(
         !scene.eval.is_empty() || arguments.split != Some(Split::NovelView),
@@ -156,9 +154,11 @@ pub fn eval(arguments: &EvalArguments) -> Result<()> {
         }
     }
     metrics.lpips = network;
-    if arguments.side == 1 && !baked {
-        metrics.write(directory)?;
-        report::write(directory, &metrics)?;
+    if writes {
+        match metrics.write(directory).and_then(|()| report::write(directory, &metrics)) {
+            Err(error) if is_read_only(&error) => note!("{}: the scores are only printed", one_line(&error)),
+            written => written?,
+        }
     }
     let mut one = metrics.clone();
     one.method.push_str(if baked { "-baked" } else { "" });
@@ -305,6 +305,9 @@ pub fn score_run(
     metrics.lpips = network_name(lpips);
     metrics.splits = Splits { novel_view: (!scene.eval.is_empty()).then_some(novel), train_view: Some(train) };
     metrics.scene.clone_from(&run.scene);
+    if metrics.of.is_empty() {
+        metrics.of = run::identity(directory)?;
+    }
     metrics.write(directory)?;
     let cameras = cameras.into_iter().map(|(_, row)| row).collect();
     draw(directory, cameras, row).and_then(|()| report::write(directory, &metrics)).or_else(|error| {
@@ -321,7 +324,7 @@ pub fn score_run(
 }
 
 /// Bakes a trained person and scores it under `directory` as [`score_run`] does. Baking time adds to
-/// the seconds of `trained`, the run's own metrics; parameters are texel colours and vertices.
+/// the seconds of `trained`, the run's own metrics, whose identity it keeps; parameters are texel colours and vertices.
 pub fn score_baked(
     directory: &Path,
     run: &RunConfig,
@@ -330,7 +333,7 @@ pub fn score_baked(
     lpips: Option<&Lpips>,
     trained: Metrics,
 ) -> Result<Metrics> {
-    let (avatar, report) = bake(model, Some(scene), &BakeOptions::default())?;
+    let (avatar, report) = telling("baking", || bake(model, Some(scene), &BakeOptions::default()))?;
     let (train_seconds, parameters) = (trained.train_seconds + report.seconds, avatar.num_parameters());
     let drawn = Drawn::Avatar { body: model.body(), light: model.light(), avatar: &avatar };
     score_run(directory, run, scene, &drawn, lpips, Metrics { train_seconds, parameters, ..trained })

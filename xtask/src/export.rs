@@ -57,7 +57,7 @@ pub fn export(arguments: &ExportArguments) -> Result<()> {
     if arguments.frame.is_some() && !matches!(format, Format::Ply | Format::Obj) {
         bail!("--frame is of one pose: --format ply or obj");
     }
-    let mut person = avatar::of_run(&arguments.run)?;
+    let (mut person, _lock) = avatar::of_run(&arguments.run)?;
     if let Some(path) = &arguments.motion {
         avatar::add_motion(&mut person, path, arguments.fps)?;
     }

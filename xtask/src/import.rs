@@ -27,9 +27,12 @@ Run one estimator and one segmenter as their own pages say, on the same frames (
   PromptHMR         results/CLIP/results.pkl                  (SMPL-X; its masks are used, too)
   VIBE, PyMAF       output/CLIP/vibe_output.pkl
   ROMP              OUTPUT/video_results.npz                  (romp --mode=video -t)
+  SAM 3D Body       its list of dictionaries as .npz, .npy, .pkl or .json: a folder with a file a frame, or one
+                    file with a list of frames; its masks are used without --masks
   EasyMocap         OUTPUT, the folder with smpl/; intri.yml and extri.yml in it or above
   PeopleSnapshot    SUBJECT/poses.npz, as InstantAvatar prepares it, with cameras.npz (--frames images --masks masks)
   NeuMan            SCENE/smpl_output_romp.pkl, with alignments.npy and sparse/ (--frames images --masks segmentations)
+  any other         joints (frames, J, 3) in camera axes and metres, .npy or .npz, with --joints
 
 --masks, of the person as far as it is visible:
   SAM 2             OUTPUT/CLIP of vos_inference.py: PNGs by value, or a folder an object (--object, --occluder-objects)
@@ -51,7 +54,7 @@ pub struct ImportArguments {
     /// ffmpeg is installed
     #[arg(long, value_name = "DIR|VIDEO")]
     frames: PathBuf,
-    /// What the estimator wrote: a file, or EasyMocap's folder
+    /// What the estimator wrote: a file, or a folder
     #[arg(long, value_name = "FILE")]
     fit: PathBuf,
     /// What the segmenter wrote: a folder, a .npy or a .npz file [default: the masks in the fit, or the
@@ -75,6 +78,9 @@ pub struct ImportArguments {
     /// that fits in a folder `body` near the fit or the frames, or the open body of this program]
     #[arg(long, value_name = "FILE")]
     body: Option<PathBuf>,
+    /// The joints of a --fit that is an array of joints: coco17, openpose25, smpl24, h36m17 or mhr70
+    #[arg(long, value_name = "SET")]
+    joints: Option<String>,
     /// Copy the frames into the capture; else it has links to them
     #[arg(long)]
     copy: bool,
@@ -99,6 +105,7 @@ pub fn import(arguments: &ImportArguments) -> Result<()> {
         occluder_objects: arguments.occluder_objects.clone(),
         focal: arguments.focal,
         body: arguments.body.clone().or_else(|| std::env::var_os(BODY_VARIABLE).map(PathBuf::from)),
+        joints: arguments.joints.clone(),
         copy: arguments.copy,
     };
     for (what, path) in
@@ -168,6 +175,7 @@ fn say(imported: &Imported) {
     say!("masks: {masks}");
     match &imported.body {
         Some(body) => say!("body: {}", body.display()),
+        None if tool.is_points() => say!("body: the open body of this program, fitted to the points"),
         None => {
             let own = if tool.joints() > 24 { "SMPLX_NEUTRAL.npz" } else { "SMPL_NEUTRAL.pkl" };
             say!(

@@ -6,7 +6,7 @@ use anyhow::{Context, Result, bail, ensure};
 
 use crate::network::load_lpips;
 use crate::process::{Ending, one_line, say};
-use crate::run::{self, Metrics, RunConfig, use_threads};
+use crate::run::{self, Metrics, RunConfig};
 use crate::train::{TrainArguments, finished, run_unless_finished, scene_name};
 use crate::{source, table};
 
@@ -16,7 +16,6 @@ const MAX_BYTES: u64 = 16 << 20;
 /// Trains this job's scenes of the list under OUT/SCENE; `--merge` makes the table. A failed scene is
 /// reported, and is an error after all others.
 pub fn train_list(arguments: &TrainArguments) -> Result<()> {
-    use_threads(arguments.threads)?;
     let lpips = load_lpips(arguments.lpips.as_deref())?;
     let scenes = read(arguments.list.as_deref().context("--list: no file")?)?;
     let out = arguments.out.as_deref().context("--list: give --out, the folder of all runs")?;
@@ -29,19 +28,16 @@ pub fn train_list(arguments: &TrainArguments) -> Result<()> {
         }
         let name = unique_name(&scenes, index);
         let directory = out.join(&name);
-        if arguments.part.merge {
-            match finished(&directory, &config)? {
-                Some(metrics) => rows.push((name, metrics)),
-                None => missing.push(name),
-            }
-            continue;
-        }
         let trained = source::load(Some(scene), arguments.body.as_deref(), &load).and_then(|source| {
-            let run = RunConfig::new(&source, config.clone());
-            run_unless_finished(&directory, &name, &run, &source, lpips.as_ref(), interval)
+            let run = RunConfig::new(&source, config.clone())?;
+            if arguments.part.merge {
+                return finished(&directory, &directory, &run);
+            }
+            run_unless_finished(&directory, &name, &run, &source, lpips.as_ref(), interval).map(Some)
         });
         match trained {
-            Ok(metrics) => rows.push((name, metrics)),
+            Ok(Some(metrics)) => rows.push((name, metrics)),
+            Ok(None) => missing.push(name),
             Err(error) if matches!(error.downcast_ref(), Some(Ending::Busy(_))) => say!("{name}: in another job"),
             Err(error) if error.chain().any(|cause| cause.is::<Ending>()) => return Err(error),
             Err(error) => {
@@ -71,10 +67,8 @@ pub fn train_list(arguments: &TrainArguments) -> Result<()> {
 
 /// A scene a line; empty lines and what follows `#` are left out.
 fn read(path: &Path) -> Result<Vec<String>> {
-    let name = || path.display().to_string();
-    let size = std::fs::metadata(path).with_context(name)?.len();
-    ensure!(size <= MAX_BYTES, "{}: {size} bytes, expected a list of at most {MAX_BYTES}", path.display());
-    let text = array_files::decode_text(&std::fs::read(path).with_context(name)?);
+    let bytes = array_files::read_bounded(path, MAX_BYTES).with_context(|| path.display().to_string())?;
+    let text = array_files::decode_text(&bytes);
     let lines = text.lines().map(|line| line.split('#').next().unwrap_or("").trim());
     let scenes: Vec<String> = lines.filter(|line| !line.is_empty()).map(str::to_owned).collect();
     ensure!(!scenes.is_empty(), "{}: no scene in it", path.display());

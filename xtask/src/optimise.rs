@@ -5,13 +5,13 @@ use std::io::{IsTerminal, Write};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-use anyhow::{Context, Error, Result, ensure};
+use anyhow::{Error, Result, ensure};
 use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
 use occnerf::{StepReport, Trainer};
 
 use crate::preview::Preview;
-use crate::process::{Ending, Guard, note, one_line, unwritten};
+use crate::process::{Ending, Guard, note, one_line, still_held, unwritten};
 use crate::run::{self, CHECKPOINT, LOG};
 
 const LOG_EVERY: u64 = 10;
@@ -74,9 +74,9 @@ pub fn optimise(directory: &Path, trainer: &mut Trainer<'_>, options: &RunOption
             Ok(report) => report,
             Err(error) => {
                 bar.abandon();
-                let learnt = match trainer.save(&checkpoint) {
+                let learnt = match save(trainer, &checkpoint) {
                     Ok(()) => format!("is in {}", checkpoint.display()),
-                    Err(error) => format!("could not be saved ({error})"),
+                    Err(error) => format!("could not be saved ({error:#})"),
                 };
                 let place = format!("step {}; what was learnt {learnt}", trainer.steps_done() + 1);
                 return Err(Error::from(error).context(place));
@@ -148,6 +148,7 @@ pub fn optimise(directory: &Path, trainer: &mut Trainer<'_>, options: &RunOption
 /// # Errors
 /// [`Ending::Unwritten`]; a diverged training, with the kept checkpoint.
 pub fn save(trainer: &Trainer<'_>, checkpoint: &Path) -> Result<()> {
+    checkpoint.parent().map_or(Ok(()), still_held)?;
     trainer.save(checkpoint).map_err(|error| match error {
         occnerf::Error::Io { path, source } => unwritten(&path)(source),
         error if checkpoint.is_file() => {
@@ -222,8 +223,7 @@ fn earlier_log(path: &Path, steps: u64) -> Result<EarlierLog> {
     if steps == 0 || !path.exists() {
         return Ok(log);
     }
-    let bytes = std::fs::read(path).with_context(|| path.display().to_string())?;
-    for line in String::from_utf8_lossy(&bytes).lines() {
+    for line in run::read_text(path)?.lines() {
         let Ok(value) = serde_json::from_str::<serde_json::Value>(line) else { continue };
         if value["step"].as_u64().is_some_and(|s| s <= steps) {
             log.text.push_str(line);

@@ -9,14 +9,14 @@ use glam::{Affine3A, Mat3, Vec3};
 use indicatif::ProgressBar;
 use occnerf::bake::export::fit_motion;
 use occnerf::bake::{Avatar, BakedRenderer};
-use occnerf::{Body, FieldRenderer, Method, Model, Person, PosedFrame, PosedView, PriorRenderer, Renderer, upright};
+use occnerf::{Body, FieldRenderer, Method, Person, PosedFrame, PosedView, PriorRenderer, Renderer, upright};
 use smpl::Placement;
 use visibility::Samples;
 use volrender::Camera;
 
 use crate::avatar::load_motion;
-use crate::process::say;
-use crate::run::{RunConfig, make_directory, use_threads};
+use crate::process::{Lock, say};
+use crate::run::{self, RunConfig, make_directory};
 use crate::video::{self, FilmFormat};
 use crate::{baked, pictures};
 
@@ -67,15 +67,15 @@ pub struct RenderArguments {
     baked: bool,
     /// Threads [default: all cores]
     #[arg(long)]
-    threads: Option<usize>,
+    pub threads: Option<usize>,
 }
 
 /// Runs the command.
 pub fn render(arguments: &RenderArguments) -> Result<()> {
-    use_threads(arguments.threads)?;
     let size = arguments.size.as_deref().map(parse_size).transpose()?;
     let directory = &arguments.run;
     let run = RunConfig::read(directory)?;
+    let _lock = Lock::share(directory)?;
     if arguments.baked && run.train.method == Method::Prior {
         bail!("--baked: {} has no field to bake", directory.display());
     }
@@ -90,9 +90,9 @@ pub fn render(arguments: &RenderArguments) -> Result<()> {
             (body, frames, Box::new(BakedRenderer::new(&avatar, body.scale, colors.light, Samples::Four)))
         }
     } else {
-        model = Model::load(directory)?;
+        model = run::model(directory, &run)?;
         let renderer: Box<dyn Renderer + '_> = if arguments.baked {
-            avatar = baked::avatar(directory, &model)?;
+            avatar = baked::avatar(directory, &run)?;
             Box::new(BakedRenderer::new(&avatar, model.body().scale, model.light(), Samples::Four))
         } else {
             Box::new(FieldRenderer::new(&model)?)

@@ -4,12 +4,14 @@ use std::io::{ErrorKind, Write};
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, anyhow, bail, ensure};
+use array_files::read_bounded;
 use occnerf::capture::LoadOptions;
-use occnerf::{Config, SplitMetrics, replace_file};
+use occnerf::{Config, Model, SplitMetrics, replace_file};
 use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
 
-use crate::process::{Lock, unwritten};
-use crate::source::{self, Source};
+use crate::process::{Lock, still_held, unwritten};
+use crate::source::{self, Source, hash_file};
 
 /// Parameters, Adam moments and visibility counts.
 pub const CHECKPOINT: &str = "checkpoint.safetensors";
@@ -23,6 +25,9 @@ pub const LOG: &str = "train.jsonl";
 /// Viewer page.
 pub const PERSON: &str = "person.html";
 
+/// [`RunConfig::difference`] of a run whose capture has changed since.
+pub const CHANGED: &str = "the capture as it was then";
+
 /// Contents of config.toml.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -32,6 +37,9 @@ pub struct RunConfig {
     /// The body model's file.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub body: Option<PathBuf>,
+    /// Identity of capture and body ([`Source::identity`]).
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub capture: String,
     /// Options of loading the capture.
     #[serde(default, skip_serializing_if = "is_default")]
     pub load: LoadOptions,
@@ -41,14 +49,18 @@ pub struct RunConfig {
 
 impl RunConfig {
     /// Configuration of a new run.
-    pub fn new(source: &Source, train: Config) -> Self {
-        Self { scene: source.scene.clone(), body: source.body.clone(), load: source.load.clone(), train }
+    ///
+    /// # Errors
+    /// Files of the capture that cannot be read.
+    pub fn new(source: &Source, train: Config) -> Result<Self> {
+        let (scene, body, load) = (source.scene.clone(), source.body.clone(), source.load.clone());
+        Ok(Self { scene, body, capture: source.identity()?, load, train })
     }
 
     /// Reads a run's config.toml.
     pub fn read(run: &Path) -> Result<Self> {
         let path = run.join(CONFIG);
-        let text = std::fs::read_to_string(&path).with_context(|| format!("{} is not a run", path.display()))?;
+        let text = read_text(&path).with_context(|| format!("{} is not a run", run.display()))?;
         let config = toml::from_str(&text).map_err(|error| anyhow!("{}: {}", path.display(), error.message()));
         let config: Self = config?;
         config.train.validate().with_context(|| path.display().to_string())?;
@@ -60,7 +72,17 @@ impl RunConfig {
         write(&run.join(CONFIG), &toml::to_string(self)?)
     }
 
-    /// Whether two runs have the same capture and body.
+    /// What differs between two runs of the same scene, if anything. Runs that do not say what their
+    /// capture was pass.
+    pub fn difference(&self, other: &Self) -> Option<&'static str> {
+        let changed = self.capture != other.capture && !self.capture.is_empty() && !other.capture.is_empty();
+        if changed {
+            return Some(CHANGED);
+        }
+        (self.train != other.train || self.load != other.load).then_some("other settings")
+    }
+
+    /// Whether two runs have the same place of capture and body.
     pub fn same_scene(&self, other: &Self) -> bool {
         let place = |path: &Path| path.canonicalize().unwrap_or_else(|_| path.to_owned());
         place(self.scene.as_ref()) == place(other.scene.as_ref())
@@ -82,6 +104,9 @@ fn is_default(options: &LoadOptions) -> bool {
 /// Contents of metrics.json.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Metrics {
+    /// Identity of what was scored ([`identity`]).
+    #[serde(default)]
+    pub of: String,
     /// Name of the method.
     pub method: String,
     /// Name of the preset.
@@ -147,14 +172,44 @@ impl Metrics {
     /// Reads a run's metrics.json.
     pub fn read(run: &Path) -> Result<Self> {
         let path = run.join(METRICS);
-        let text = std::fs::read_to_string(&path).with_context(|| path.display().to_string())?;
-        serde_json::from_str(&text).with_context(|| path.display().to_string())
+        serde_json::from_str(&read_text(&path)?).with_context(|| path.display().to_string())
+    }
+
+    /// Reads the metrics in `directory` if they are of the model that the run `model` has now.
+    pub fn fresh(directory: &Path, model: &Path) -> Result<Option<Self>> {
+        if !directory.join(METRICS).is_file() {
+            return Ok(None);
+        }
+        let (metrics, of) = (Self::read(directory)?, identity(model)?);
+        Ok(Some(metrics).filter(|metrics| metrics.of == of))
     }
 
     /// Writes it.
     pub fn write(&self, run: &Path) -> Result<()> {
         write(&run.join(METRICS), &serde_json::to_string_pretty(self)?)
     }
+}
+
+/// Identity of what a run has learnt, which all that is made of it carries: SHA-256 of checkpoint or
+/// fitted surface, body and person.
+pub fn identity(run: &Path) -> Result<String> {
+    let learnt = if run.join(CHECKPOINT).exists() { CHECKPOINT } else { AVATAR };
+    let files = [learnt, "body.safetensors", "person.safetensors"].map(|name| run.join(name));
+    let mut hash = Sha256::new();
+    files.iter().filter(|path| path.is_file()).try_for_each(|path| hash_file(&mut hash, path))?;
+    Ok(format!("{:x}", hash.finalize()))
+}
+
+/// The trained model of a run.
+///
+/// # Errors
+/// Files that are damaged; a checkpoint of another run.
+pub fn model(directory: &Path, run: &RunConfig) -> Result<Model> {
+    let model = Model::load(directory)?;
+    // A training that was stopped has taken fewer steps.
+    let same = Config { steps: run.train.steps, ..model.config().clone() } == run.train;
+    ensure!(same, "{}: of another run: its settings are not those of {CONFIG}", directory.join(CHECKPOINT).display());
+    Ok(model)
 }
 
 /// Creates and locks the directory of a new run: `out`, or the first free `runs/NAME`,
@@ -204,6 +259,16 @@ fn candidates(name: &str) -> impl Iterator<Item = PathBuf> {
     (1..10_000).map(move |i| Path::new("runs").join(if i == 1 { name.clone() } else { format!("{name}-{i}") }))
 }
 
+/// Largest text file of a run.
+const MAX_TEXT: u64 = 1 << 28;
+
+/// Reads a text file of a run; what is not UTF-8 becomes U+FFFD.
+pub fn read_text(path: &Path) -> Result<String> {
+    ensure!(!path.exists() || path.is_file(), "{}: not a plain file", path.display());
+    let bytes = read_bounded(path, MAX_TEXT).with_context(|| path.display().to_string())?;
+    Ok(String::from_utf8_lossy(&bytes).into_owned())
+}
+
 /// Peak resident set of this process; 0 where unknown.
 pub fn peak_rss_bytes() -> u64 {
     let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
@@ -224,24 +289,49 @@ pub fn make_directory(path: &Path) -> Result<()> {
 /// # Errors
 /// [`Ending::Unwritten`](crate::process::Ending::Unwritten).
 pub fn write(path: &Path, text: &str) -> Result<()> {
+    path.parent().map_or(Ok(()), still_held)?;
     replace_file(path, |to| to.write_all(text.as_bytes())).map_err(unwritten(path))
 }
 
-/// Most threads.
-const MAX_THREADS: usize = 1024;
+/// Most threads for each processor.
+const OVERBOOKED: usize = 16;
+/// Number of threads without `--threads`.
+const THREADS: &str = "RAYON_NUM_THREADS";
 
-/// Checks `--threads`.
-pub fn check_threads(threads: Option<usize>) -> Result<()> {
-    let fits = threads.is_none_or(|threads| (1..=MAX_THREADS).contains(&threads));
-    ensure!(fits, "--threads {}: expected 1 to {MAX_THREADS}", threads.unwrap_or_default());
-    Ok(())
+/// Checks `--threads`, and what stands in for it; returns the number of threads.
+pub fn check_threads(threads: Option<usize>) -> Result<usize> {
+    let cores = std::thread::available_parallelism().map_or(1, usize::from);
+    let named = std::env::var(THREADS).ok().filter(|text| threads.is_none() && !text.is_empty() && text != "0");
+    let (name, asked) = match (threads, named) {
+        (Some(threads), _) => ("--threads", threads.to_string()),
+        (None, Some(text)) => (THREADS, text),
+        (None, None) => return Ok(cores),
+    };
+    let most = OVERBOOKED * cores;
+    let number = asked.parse().ok().filter(|number| (1..=most).contains(number));
+    number.with_context(|| format!("{name} {asked}: expected 1 to {most}, {OVERBOOKED} for each processor"))
 }
 
-/// Sets the size of the global thread pool.
+/// Starts the global thread pool.
+///
+/// # Errors
+/// A number out of range; threads that the system refuses.
 pub fn use_threads(threads: Option<usize>) -> Result<()> {
-    check_threads(threads)?;
-    if let Some(threads) = threads {
-        rayon::ThreadPoolBuilder::new().num_threads(threads).build_global()?;
-    }
-    Ok(())
+    let number = check_threads(threads)?;
+    let built = rayon::ThreadPoolBuilder::new().num_threads(number).build_global();
+    built.with_context(|| format!("{number} threads cannot be started (--threads gives another number)"))
+}
+
+/// Memory that this process may take in addition, where the system says: what is free, and what is
+/// left to its limit of address space.
+pub fn free_bytes() -> Option<u64> {
+    let number = |path: &str, key: &str| -> Option<u64> {
+        let text = read_text(Path::new(path)).ok()?;
+        let line = text.lines().find_map(|line| line.strip_prefix(key))?;
+        line.split_whitespace().next()?.parse().ok()
+    };
+    let free = number("/proc/meminfo", "MemAvailable:").map(|kib| kib << 10);
+    let taken = number("/proc/self/status", "VmSize:").map(|kib| kib << 10);
+    let limit = number("/proc/self/limits", "Max address space").zip(taken);
+    free.into_iter().chain(limit.map(|(limit, taken)| limit.saturating_sub(taken))).min()
 }

@@ -1,6 +1,8 @@
 //! From the command line to a configuration.
 
-use anyhow::{Context, Result, bail};
+use std::path::Path;
+
+use anyhow::{Context, Result, bail, ensure};
 use clap::Args;
 use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 use occnerf::{Component, Config, Method, OccludedRule, Preset};
@@ -84,7 +86,11 @@ impl SettingArguments {
         if let Some(steps) = self.steps.filter(|_| !method.has_field()) {
             bail!("--steps {steps}: the method {} takes no steps", method.name());
         }
-        self.apply(Config::preset(preset, method))
+        let config = self.apply(Config::preset(preset, method))?;
+        // Found missing now, not after registration.
+        let weights = Path::new(&config.loss.perceptual_weights);
+        ensure!(weights.as_os_str().is_empty() || weights.exists(), "{}: no such weights", weights.display());
+        Ok(config)
     }
 
     /// `config` with everything but preset and method applied.

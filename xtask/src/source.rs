@@ -1,14 +1,18 @@
 //! Where the frames come from: a capture on disk with its body model, or the demo, which is one too.
 
 use std::cell::RefCell;
+use std::fs::File;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
 use clap::Args;
-use occnerf::capture::{Capture, LoadOptions, Mended, Registered, find_body, load_capture, own_body};
+use occnerf::capture::{Capture, Frame, LoadOptions, Mended, Registered, find_body, load_capture, own_body};
 use occnerf::{Config, Person, Scene, mend_masks};
 use serde::Serialize;
+use sha2::{Digest, Sha256};
 use smpl::BodyModel;
+
+use crate::process::telling;
 
 /// Name of the scene that needs no other files.
 pub const DEMO: &str = "demo";
@@ -34,6 +38,24 @@ pub struct Source {
 }
 
 impl Source {
+    /// Identity of what is trained on, wherever it lies: SHA-256 of the body's file, and of every
+    /// frame's pictures, camera, pose and shape.
+    ///
+    /// # Errors
+    /// Files that cannot be read.
+    pub fn identity(&self) -> Result<String> {
+        let mut hash = Sha256::new();
+        self.body.iter().try_for_each(|body| hash_file(&mut hash, body))?;
+        let views = self.capture.eval.iter().map(|view| &view.frame);
+        for frame in self.capture.train.iter().chain(views) {
+            let Frame { name, camera, pose, betas, placement, .. } = frame;
+            let (files, decoding) = frame.source.origin();
+            hash.update(format!("{name:?} {camera:?} {pose:?} {betas:?} {placement:?} {decoding}"));
+            files.into_iter().try_for_each(|file| hash_file(&mut hash, file))?;
+        }
+        Ok(format!("{:x}", hash.finalize()))
+    }
+
     /// Takes the registered bodies of the run in `directory`, if it kept them.
     pub fn restore(&mut self, directory: &Path, config: &Config) -> Result<()> {
         let mended = match config.registration.rounds {
@@ -55,7 +77,7 @@ impl Source {
         if let Some((_, registered)) = cache.as_ref().filter(|cached| cached.0.is_none_or(|of| of == rounds)) {
             return Ok(Scene::prepare(registered.clone(), &self.model, config)?);
         }
-        let scene = Scene::new(&self.capture, &self.model, config)?;
+        let scene = telling("preparing the frames", || Scene::new(&self.capture, &self.model, config))?;
         *cache = Some((Some(rounds), scene.registered.clone()));
         Ok(scene)
     }
@@ -172,6 +194,13 @@ pub fn load_with(
     let model = if scene == DEMO { model } else { model.with_limb_lengths() };
     let (scene, load) = (scene.to_owned(), options.clone());
     Ok(Source { scene, body: file, load, capture, model, registered: RefCell::default() })
+}
+
+/// Adds the length and the bytes of a file to a hash.
+pub fn hash_file(hash: &mut Sha256, path: &Path) -> Result<()> {
+    let copied = File::open(path).and_then(|mut file| std::io::copy(&mut file, hash));
+    hash.update(copied.with_context(|| path.display().to_string())?.to_le_bytes());
+    Ok(())
 }
 
 /// Whether `path` is named like a rigged character.

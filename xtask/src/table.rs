@@ -84,6 +84,7 @@ mod tests {
     fn metrics(known: Option<f64>, lpips: Option<&str>) -> Metrics {
         let split = SplitMetrics { psnr_mask: Some(20.0), psnr_all: Some(17.0), known, ..SplitMetrics::default() };
         Metrics {
+            of: String::new(),
             method: "surface".to_owned(),
             preset: "fast".to_owned(),
             occluded: "unknown".to_owned(),

@@ -13,10 +13,10 @@ use crate::baked;
 use crate::eval::{Drawn, Split, check_pictures, score_baked, score_run, scored_frames, unscored};
 use crate::network::{load_lpips, network_name};
 use crate::optimise::{RunOptions, SavingArguments, optimise};
-use crate::process::{Lock, results_in, say};
+use crate::process::{Lock, note, results_in, say, still_held, telling};
 use crate::run::{
-    CHECKPOINT, METRICS, Metrics, RunConfig, existing_directory, make_directory, new_directory, peak_rss_bytes,
-    use_threads,
+    self, AVATAR, CHECKPOINT, METRICS, Metrics, RunConfig, existing_directory, free_bytes, make_directory,
+    new_directory, peak_rss_bytes,
 };
 use crate::settings::SettingArguments;
 use crate::shard::ShardArguments;
@@ -73,7 +73,6 @@ pub struct TrainArguments {
 
 /// Runs the command.
 pub fn train(arguments: &TrainArguments) -> Result<()> {
-    use_threads(arguments.threads)?;
     let lpips = load_lpips(arguments.lpips.as_deref())?;
     let alone = arguments.part.shard.is_none() && !arguments.part.merge;
     ensure!(alone, "--shard and --merge: of one scene there are no parts; they go with --list");
@@ -86,7 +85,10 @@ pub fn train(arguments: &TrainArguments) -> Result<()> {
     // The lock is held to the end.
     let Begun { directory, source, config, _lock } =
         if arguments.resume { resumed(arguments, &existing_directory(out, &name)?)? } else { begun(arguments, &name)? };
-    let run = RunConfig::new(&source, config);
+    let run = RunConfig::new(&source, config)?;
+    if arguments.resume && RunConfig::read(&directory)?.difference(&run) == Some(run::CHANGED) {
+        note!("warning: the capture is not the one that the run began with");
+    }
     run.write(&directory)?;
     say!("run: {}", directory.display());
     let Some(metrics) = run_one(&directory, &run, &source, lpips.as_ref(), &options)? else {
@@ -121,9 +123,6 @@ fn begun(arguments: &TrainArguments, name: &str) -> Result<Begun> {
     if let Some((option, _)) = unused.iter().find(|(_, given)| *given && !config.method.has_field()) {
         bail!("{option}: the method {} takes no steps", config.method.name());
     }
-    // Found missing now, not after registration.
-    let weights = Path::new(&config.loss.perceptual_weights);
-    ensure!(weights.as_os_str().is_empty() || weights.exists(), "{}: no such weights", weights.display());
     let source = source::load(arguments.scene.as_deref(), arguments.body.as_deref(), &arguments.load.options()?)?;
     let is_given = arguments.settings.set.iter().any(|set| set.starts_with("held_out="));
     if source.capture.eval.is_empty() && source.capture.train.len() >= 2 * HOLD_OUT && !is_given {
@@ -175,6 +174,9 @@ fn say_corrections(source: &Source, scene: &Scene) {
     }
 }
 
+/// Least share of the masks that the registered body covers.
+const LEAST_COVERED: f64 = 0.1;
+
 /// Trains, scores and draws one run; `None` if it stopped early.
 pub fn run_one(
     directory: &Path,
@@ -185,6 +187,13 @@ pub fn run_one(
 ) -> Result<Option<Metrics>> {
     let scene = source.scene(&run.train)?;
     say_corrections(source, &scene);
+    let covered = scene.covered()?;
+    ensure!(
+        covered >= LEAST_COVERED,
+        "{}: nothing can be learnt: the body covers {:.0} % of the person in the masks; `check` names likely mistakes",
+        run.scene,
+        100.0 * covered
+    );
     // Before the training, not after it.
     check_pictures(&scene)?;
     if let Some(lpips) = lpips {
@@ -199,6 +208,7 @@ pub fn run_one(
     let start = Instant::now();
     let colors = scene.colors()?;
     let prior_seconds = start.elapsed().as_secs_f64();
+    still_held(directory)?;
     let kept = Person::save(directory, &scene.registered, &source.model, colors);
     kept.map_err(Error::from).map_err(results_in(directory))?;
     if run.train.method == Method::Prior {
@@ -207,8 +217,9 @@ pub fn run_one(
         return score_run(directory, run, &scene, &prior, lpips, metrics).map(Some);
     }
     if run.train.method == Method::Surface {
-        let (avatar, report) = fit(&scene, &BakeOptions::default())?;
+        let (avatar, report) = telling("fitting the surface", || fit(&scene, &BakeOptions::default()))?;
         say!("surface of {} triangles, an atlas of {} × {}", report.faces, report.side, report.side);
+        still_held(directory)?;
         avatar.save(&baked::path(directory)).map_err(Error::from).map_err(results_in(directory))?;
         let drawn = Drawn::Avatar { body: &scene.body, light: colors.light, avatar: &avatar };
         let metrics = unscored(run, &drawn, prior_seconds + report.seconds);
@@ -252,6 +263,9 @@ fn say_memory(scene: &Scene, config: &Config) -> Result<()> {
     let [whole, capture, parameters, samples] =
         [capture + parameters + samples, capture, parameters, samples].map(|bytes| bytes.div_ceil(1 << 20));
     say!("memory: about {whole} MiB (capture {capture}, parameters {parameters}, samples {samples})");
+    if let Some(free) = free_bytes().map(|free| (free + peak_rss_bytes()) >> 20).filter(|free| *free < whole) {
+        note!("warning: {free} MiB are free: the system may end this (--memory, or smaller sizes by --set)");
+    }
     Ok(())
 }
 
@@ -265,7 +279,7 @@ pub fn run_unless_finished(
     lpips: Option<&Lpips>,
     interval: Duration,
 ) -> Result<Metrics> {
-    unless_finished(directory, name, run, lpips, |earlier| {
+    unless_finished(directory, directory, run, lpips, |earlier| {
         say!("{name}: training");
         run.write(directory)?;
         let options = RunOptions { resume: earlier, stop_after: None, interval, preview: false };
@@ -285,7 +299,7 @@ pub fn baked_unless_finished(
     interval: Duration,
 ) -> Result<Metrics> {
     let [name, of] = [directory, trained].map(|path| path.file_name().unwrap_or_default().to_string_lossy());
-    unless_finished(directory, &name, run, lpips, |_| {
+    unless_finished(directory, trained, run, lpips, |_| {
         let metrics = run_unless_finished(trained, &of, run, source, lpips, interval)?;
         say!("{name}: baking");
         run.write(directory)?;
@@ -293,11 +307,14 @@ pub fn baked_unless_finished(
     })
 }
 
-/// The scores under `directory` if they are of the same settings; else what `make` makes, which is
-/// told whether a run with these settings has begun there.
+/// The scores under `directory` if they are of the same settings and of the model under `trained`;
+/// else what `make` makes, which is told whether a run with these settings has begun there.
+///
+/// # Errors
+/// A run of another scene or with other settings, whose work would be lost.
 fn unless_finished(
     directory: &Path,
-    name: &str,
+    trained: &Path,
     run: &RunConfig,
     lpips: Option<&Lpips>,
     make: impl FnOnce(bool) -> Result<Metrics>,
@@ -316,29 +333,26 @@ fn unless_finished(
             body(run)
         );
     }
-    let earlier = old.is_some_and(|old| old.train == run.train && old.load == run.load);
-    if earlier && directory.join(METRICS).is_file() {
-        let metrics = Metrics::read(directory)?;
-        // Scores that lack what is asked for now are computed again from the checkpoint, as are those of
-        // fewer steps.
-        let whole = !run.train.method.has_field() || metrics.steps >= run.train.steps;
-        if whole && (lpips.is_none() || metrics.lpips == network_name(lpips)) {
-            say!("{name}: finished earlier");
-            return Ok(metrics);
-        }
+    let differs = old.as_ref().and_then(|old| old.difference(run));
+    let begun = [CHECKPOINT, AVATAR, METRICS].iter().any(|name| directory.join(name).exists());
+    if let Some(difference) = differs.filter(|_| begun) {
+        bail!("{} holds a run with {difference}: give another --out, or remove it", directory.display());
     }
-    make(earlier)
+    // Scores that lack what is asked for now are computed again from the checkpoint.
+    let named = |metrics: &Metrics| lpips.is_none() || metrics.lpips == network_name(lpips);
+    if let Some(metrics) = finished(directory, trained, run)?.filter(named) {
+        say!("{}: finished earlier", directory.file_name().unwrap_or_default().to_string_lossy());
+        return Ok(metrics);
+    }
+    make(old.is_some() && differs.is_none())
 }
 
-/// The scores under `directory` of a run with the settings `config`; `None` where it has not come
-/// to them.
-pub fn finished(directory: &Path, config: &Config) -> Result<Option<Metrics>> {
-    if !directory.join("config.toml").is_file() || !directory.join(METRICS).is_file() {
-        return Ok(None);
-    }
-    let metrics = Metrics::read(directory)?;
-    let whole = !config.method.has_field() || metrics.steps >= config.steps;
-    Ok(Some(metrics).filter(|_| whole && RunConfig::read(directory).is_ok_and(|run| run.train == *config)))
+/// The scores under `directory` of the same run and of the model under `trained`; `None` where it has
+/// not come to them.
+pub fn finished(directory: &Path, trained: &Path, run: &RunConfig) -> Result<Option<Metrics>> {
+    let is_same = RunConfig::read(directory).is_ok_and(|old| old.same_scene(run) && old.difference(run).is_none());
+    let metrics = if is_same { Metrics::fresh(directory, trained)? } else { None };
+    Ok(metrics.filter(|metrics| !run.train.method.has_field() || metrics.steps >= run.train.steps))
 }
 
 /// What less of a model reaches on the same frames: the scores of the prior and, of a field, of the

@@ -1,11 +1,10 @@
 //! The files of a frame: header checks and decoding.
 
-use std::io::Read;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use array_files::decode_text;
+use array_files::{decode_text, read_bounded};
 
 use super::camera::Lens;
 use super::gate::Gate;
@@ -46,13 +45,7 @@ pub(super) fn decoding_bytes((width, height): (u32, u32)) -> u64 {
 
 /// Reads a text file of at most `most` bytes, of any encoding of [`decode_text`].
 pub(super) fn read_text(path: &Path, most: u64) -> Result<String, CaptureError> {
-    let file = std::fs::File::open(path).map_err(CaptureError::io(path))?;
-    let mut bytes = Vec::new();
-    file.take(most + 1).read_to_end(&mut bytes).map_err(CaptureError::io(path))?;
-    if bytes.len() as u64 > most {
-        return Err(CaptureError::invalid(path, "size", format!("at most {most} bytes"), "more"));
-    }
-    let text = decode_text(&bytes);
+    let text = decode_text(&read_bounded(path, most).map_err(CaptureError::io(path))?);
     match text.contains(char::REPLACEMENT_CHARACTER) {
         true => Err(CaptureError::invalid(path, "encoding", "UTF-8, or UTF-16 with its mark", "other bytes")),
         false => Ok(text),

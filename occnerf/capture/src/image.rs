@@ -102,6 +102,10 @@ fn picture_error(path: &Path, source: image::ImageError) -> CaptureError {
 }
 
 fn open(path: &Path) -> Result<ImageReader<std::io::BufReader<std::fs::File>>, CaptureError> {
+    // A pipe is read once, a picture twice.
+    if path.metadata().is_ok_and(|found| !found.is_file()) {
+        return Err(CaptureError::invalid(path, "the file", "a plain file", "a device, pipe or folder"));
+    }
     ImageReader::open(path).and_then(ImageReader::with_guessed_format).map_err(CaptureError::io(path))
 }
 

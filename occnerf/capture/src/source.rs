@@ -1,6 +1,7 @@
 //! Sources of a frame's pixels: memory, or files decoded on demand.
 
 use std::fmt;
+use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, OnceLock};
 
@@ -178,6 +179,15 @@ impl PixelSource {
             Place::Disk(disk) => Some(disk.files.photograph()),
             Place::Memory(_) => None,
         }
+    }
+
+    /// Files of picture and masks, and how they are decoded; none for pixels in memory.
+    #[must_use]
+    pub fn origin(&self) -> (Vec<&Path>, String) {
+        let Place::Disk(disk) = &self.0 else { return Default::default() };
+        let Files { image, masks, occluder, labels, hidden, lens, to, .. } = &*disk.files;
+        let paths = [image].into_iter().chain(masks).chain(occluder).map(PathBuf::as_path).collect();
+        (paths, format!("{labels} {hidden:?} {lens:?} {to:?}"))
     }
 
     /// Whether a simulated obstacle, absent from the photograph, masks pixels.

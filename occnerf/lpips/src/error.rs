@@ -40,15 +40,6 @@ pub enum Error {
         what: String,
     },
     /// An image of a size that the network does not take.
-    #[error("LPIPS: an image of {width} × {height} for {network}, expected {expected}")]
-    Size {
-        /// Width in pixels.
-        width: usize,
-        /// Height in pixels.
-        height: usize,
-        /// Name of the network.
-        network: &'static str,
-        /// The bound that is violated.
-        expected: String,
-    },
+    #[error("{0}")]
+    Size(String),
 }

@@ -67,20 +67,6 @@ const MAX_PIXELS: usize = 1 << 21;
 const PIXELS_AT_ONCE: usize = 1 << 13;
 
 /// A network with its weights.
-///
-/// ```
-/// use lpips::{Lpips, Trunk};
-///
-/// // In place of `Lpips::load("weights/".as_ref())`.
-/// let network = Lpips::new(Trunk::SqueezeNet, |_, shape| Ok(vec![0.01; shape.iter().product()]))?;
-/// assert_eq!(network.name(), "squeezenet");
-/// assert!(network.check_size(16, 16).is_err() && network.check_size(1920, 1080).is_ok());
-///
-/// // Two pairs of images of 32 × 32 pixels.
-/// let image: Vec<f32> = (0..3 * 32 * 32).map(|i| (i % 11) as f32 / 10.0).collect();
-/// assert_eq!(network.distance(&image.repeat(2), &image.repeat(2), 32, 32)?, [0.0, 0.0]);
-/// # Ok::<(), lpips::Error>(())
-/// ```
 pub struct Lpips {
     trunk: Trunk,
     network: Network,
@@ -143,7 +129,10 @@ impl Lpips {
     /// [`Error::Size`] for those too small to have an output at every layer, and those of more than
     /// 2²¹ pixels.
     pub fn check_size(&self, width: usize, height: usize) -> Result<(), Error> {
-        let refused = |expected| Err(Error::Size { width, height, network: self.name(), expected });
+        let refused = |expected: String| {
+            let image = format!("LPIPS: an image of {width} × {height} for {}", self.name());
+            Err(Error::Size(format!("{image}, expected {expected}")))
+        };
         if width.checked_mul(height).is_none_or(|pixels| pixels > MAX_PIXELS) {
             return refused(format!("at most {MAX_PIXELS} pixels"));
         }

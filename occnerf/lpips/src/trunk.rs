@@ -10,10 +10,6 @@ use crate::maps::{Maps, Window, max_pool, max_pool_backward, rectify_backward};
 pub(crate) type Reader<'a> = dyn FnMut(&str, &[usize]) -> Result<Vec<f32>, Error> + 'a;
 
 /// Network whose features are compared.
-///
-/// ```
-/// assert_eq!(lpips::Trunk::Vgg16.name(), "vgg16");
-/// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Trunk {
     /// VGG16: 59 MB of weights; images of at least 16 pixels a side.

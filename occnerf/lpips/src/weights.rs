@@ -20,16 +20,19 @@ const MAX_FILES: usize = 256;
 
 /// A tensor of a file, not read yet.
 #[derive(Clone, Debug)]
-struct Tensor {
-    shape: Vec<usize>,
-    place: Place,
+enum Tensor {
+    /// Type, shape and offset in a safetensors file.
+    Bytes(Dtype, Vec<usize>, u64),
+    Torch(torch::Tensor),
 }
 
-#[derive(Clone, Debug)]
-enum Place {
-    /// Type and offset in a safetensors file.
-    Bytes(Dtype, u64),
-    Torch(torch::Tensor),
+impl Tensor {
+    fn shape(&self) -> &[usize] {
+        match self {
+            Self::Bytes(_, shape, _) => shape,
+            Self::Torch(tensor) => &tensor.shape,
+        }
+    }
 }
 
 enum Source {
@@ -160,7 +163,7 @@ impl Weights {
     fn trunk(&self) -> Option<Trunk> {
         let has = |name: &str| self.tensors.contains_key(name);
         let first = self.tensors.get("features.0.weight")?;
-        match first.shape.last() {
+        match first.shape().last() {
             Some(11) => Some(Trunk::AlexNet),
             _ if has("features.3.squeeze.weight") => Some(Trunk::SqueezeNet),
             _ if has("features.28.weight") && !has("features.34.weight") => Some(Trunk::Vgg16),
@@ -173,7 +176,7 @@ impl Weights {
         let taps = trunk.taps();
         let fits = |(i, &channels): (usize, &usize)| {
             let tensor = self.find(&format!("lin{i}.weight"));
-            tensor.is_some_and(|(_, t)| t.shape.iter().product::<usize>() == channels)
+            tensor.is_some_and(|(_, t)| t.shape().iter().product::<usize>() == channels)
         };
         taps.iter().enumerate().all(fits) && self.find(&format!("lin{}.weight", taps.len())).is_none()
     }
@@ -190,20 +193,20 @@ impl Weights {
         let found = self.find(name).map(|(name, tensor)| (name.clone(), tensor.clone()));
         let (name, tensor) = found.ok_or_else(|| fault(path, format!("lacks `{name}`, of shape {shape:?}")))?;
         let bare = |shape: &[usize]| shape.iter().copied().filter(|&n| n != 1).collect::<Vec<_>>();
-        let (known, dtype) = match &tensor.place {
-            Place::Bytes(dtype, _) => {
+        let (known, dtype) = match &tensor {
+            Tensor::Bytes(dtype, ..) => {
                 (matches!(dtype, Dtype::F16 | Dtype::BF16 | Dtype::F32 | Dtype::F64), format!("{dtype:?}"))
             }
-            Place::Torch(tensor) => (tensor.is_float(), tensor.dtype.to_owned()),
+            Tensor::Torch(tensor) => (tensor.is_float(), tensor.dtype.to_owned()),
         };
-        let flat = shape.len() == 1 && bare(&tensor.shape) == bare(shape);
-        if !known || (tensor.shape != shape && !flat) {
-            let found = &tensor.shape;
+        let found = tensor.shape();
+        let flat = shape.len() == 1 && bare(found) == bare(shape);
+        if !known || (found != shape && !flat) {
             return Err(fault(path, format!("`{name}` is {dtype} {found:?}, expected floats {shape:?}")));
         }
         // `shape` is that of a layer: at most 9 MB.
-        match (&mut self.source, &tensor.place) {
-            (Source::Safetensors(file), Place::Bytes(dtype, at)) => {
+        match (&mut self.source, &tensor) {
+            (Source::Safetensors(file), Tensor::Bytes(dtype, _, at)) => {
                 let size = dtype.bitsize() / 8;
                 let mut bytes = vec![0; size * shape.iter().product::<usize>()];
                 let cut = |e: std::io::Error| fault(path, format!("`{name}`, {dtype:?} {shape:?}: {e}"));
@@ -211,7 +214,7 @@ impl Weights {
                 file.read_exact(&mut bytes).map_err(cut)?;
                 Ok(bytes.chunks_exact(size).map(|word| number(*dtype, word)).collect())
             }
-            (Source::Torch(file), Place::Torch(tensor)) => Ok(match file.read(&name, tensor)?.data {
+            (Source::Torch(file), Tensor::Torch(tensor)) => Ok(match file.read(&name, tensor)?.data {
                 Data::F32(values) => values,
                 Data::F64(values) => values.into_iter().map(|value| value as f32).collect(),
                 Data::I64(_) | Data::Bool(_) => Vec::new(),
@@ -229,8 +232,7 @@ fn torch_tensors(file: &TorchFile<BufReader<File>>) -> Result<BTreeMap<String, T
         for (name, value) in items {
             let Some(name) = name.as_str() else { continue };
             if let Some(tensor) = file.tensor(name, value)? {
-                let shape = tensor.shape.clone();
-                tensors.insert(name.to_owned(), Tensor { shape, place: Place::Torch(tensor) });
+                tensors.insert(name.to_owned(), Tensor::Torch(tensor));
             }
         }
     }
@@ -240,24 +242,12 @@ fn torch_tensors(file: &TorchFile<BufReader<File>>) -> Result<BTreeMap<String, T
 /// Converts a little-endian float of any width.
 fn number(dtype: Dtype, word: &[u8]) -> f32 {
     match (dtype, word) {
-        (Dtype::F16, &[a, b]) => half(u16::from_le_bytes([a, b])),
+        (Dtype::F16, &[a, b]) => array_files::half_to_f32(u16::from_le_bytes([a, b])),
         (Dtype::BF16, &[a, b]) => f32::from_le_bytes([0, 0, a, b]),
         (Dtype::F32, &[a, b, c, d]) => f32::from_le_bytes([a, b, c, d]),
         (Dtype::F64, &[a, b, c, d, e, f, g, h]) => f64::from_le_bytes([a, b, c, d, e, f, g, h]) as f32,
         _ => f32::NAN,
     }
-}
-
-/// Converts IEEE half precision, whose exponent has the bias 15 instead of 127.
-fn half(bits: u16) -> f32 {
-    let (sign, rest) = (u32::from(bits & 0x8000) << 16, u32::from(bits & 0x7fff));
-    // Read with the bias 127, normal and subnormal numbers are too small by 2¹¹².
-    let magnitude = if rest >= 0x7c00 {
-        f32::from_bits(rest << 13 | 0x7f80_0000)
-    } else {
-        f32::from_bits(rest << 13) * 2f32.powi(112)
-    };
-    f32::from_bits(sign | magnitude.to_bits())
 }
 
 /// Tensors of a safetensors file, from its header.
@@ -282,8 +272,7 @@ fn safetensors(path: &Path, file: &mut File) -> Result<BTreeMap<String, Tensor>,
             let (dtype, shape) = (info.dtype, &info.shape);
             return Err(fault(path, format!("is cut: `{name}`, {dtype:?} {shape:?}, ends at byte {end} of {found}")));
         }
-        let place = Place::Bytes(info.dtype, 8 + header + start);
-        tensors.insert(name, Tensor { shape: info.shape.clone(), place });
+        tensors.insert(name, Tensor::Bytes(info.dtype, info.shape.clone(), 8 + header + start));
     }
     Ok(tensors)
 }

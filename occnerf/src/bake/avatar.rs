@@ -27,6 +27,8 @@ pub(super) const TERMS_PER_JOINT: usize = 9;
 pub struct Avatar {
     /// Name of the scene, as the capture gives it.
     pub name: String,
+    /// Identity of what it was made of, as the caller has it; may be empty.
+    pub source: String,
     /// Canonical positions, (V); a vertex on a seam of the atlas has a copy per chart.
     pub vertices: Vec<Vec3>,
     /// Canonical unit normals, (V).

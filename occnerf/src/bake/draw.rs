@@ -100,15 +100,14 @@ impl<'a> BakedRenderer<'a> {
             Vec3::from((shade(avatar, shades, fragment) * albedo).min(Vec3A::ONE)).extend(1.0)
         };
         let shade = |pixel: Pixel<'_>| {
-            let samples = pixel.samples();
-            let count = samples.len();
+            let count = pixel.samples.len();
             if count == 0 {
                 return Vec4::ZERO;
             }
-            samples.flatten().map(colour).sum::<Vec4>() / count as f32
+            pixel.samples.iter().flatten().map(colour).sum::<Vec4>() / count as f32
         };
         pixels.resize(camera.width as usize * camera.height as usize, Vec4::ZERO);
-        rasterizer.draw(skinned, &[&avatar.faces], &pinhole(camera), &options, pixels, shade)?;
+        rasterizer.draw(skinned, &avatar.faces, &pinhole(camera), &options, pixels, shade)?;
         Ok(pixels)
     }
 }

@@ -237,6 +237,7 @@ fn assemble(
     let rest: Vec<Vec3> = body.canonical.joints.iter().map(|joint| joint / body.scale).collect();
     let avatar = Avatar {
         name: "person".to_owned(),
+        source: String::new(),
         vertices: vertices.into_iter().map(|v| v / body.scale).collect(),
         normals,
         uvs: places.iter().map(|place| (place / layout.side as f32).clamp(Vec2::ZERO, Vec2::ONE)).collect(),

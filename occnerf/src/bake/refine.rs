@@ -119,26 +119,20 @@ fn equations(
         let i = pixel.index;
         // Edge pixels are mixed with the background.
         let wanted = i.is_multiple_of(stride) && frame.labels.at(i as u32) == Label::Subject && pixels.mask[i] >= 0.99;
-        let count = pixel.samples().len();
-        if !wanted || count == 0 || pixel.samples().any(<[_]>::is_empty) {
+        let count = pixel.samples.len();
+        if !wanted || count == 0 || pixel.samples.contains(&None) {
             return None;
         }
+        let fragments = || pixel.samples.iter().flatten();
         let share = 1.0 / count as f32;
-        let brightness: f32 = pixel.samples().map(|fragments| share * shade(avatar, shades, &fragments[0])).sum();
-        let lookups = pixel.samples().map(|fragments| lookup(avatar, atlas_place(avatar, &fragments[0]), share));
+        let brightness: f32 = fragments().map(|fragment| share * shade(avatar, shades, fragment)).sum();
+        let lookups = fragments().map(|fragment| lookup(avatar, atlas_place(avatar, fragment), share));
         let colour = Vec3::from_slice(&pixels.image.pixels[3 * i..]) / brightness;
         Some(PixelEquation { colour, lookups: lookups.collect() })
     };
     let mut out: Vec<Option<PixelEquation>> = Vec::new();
     out.resize_with(pixels.mask.len(), || None);
-    Rasterizer::default().draw(
-        vertices,
-        &[&avatar.faces],
-        &pinhole(&frame.view.camera),
-        &options,
-        &mut out,
-        equation,
-    )?;
+    Rasterizer::default().draw(vertices, &avatar.faces, &pinhole(&frame.view.camera), &options, &mut out, equation)?;
     Ok(out.into_iter().flatten().collect())
 }
 

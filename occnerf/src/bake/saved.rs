@@ -17,8 +17,6 @@ const FORMAT: &str = "occnerf-avatar";
 const VERSION: u32 = 2;
 /// Key of [`Header`] as JSON in the file's metadata.
 const KEY: &str = "avatar";
-/// Largest file.
-const MAX_BYTES: u64 = 1 << 30;
 /// Any size of an axis.
 const ANY: usize = usize::MAX;
 
@@ -28,6 +26,8 @@ struct Header {
     format: String,
     version: u32,
     name: String,
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    source: String,
     joints: Vec<String>,
     /// Slope; even light if absent.
     #[serde(default)]
@@ -51,6 +51,7 @@ impl Avatar {
             format: FORMAT.to_owned(),
             version: VERSION,
             name: self.name.clone(),
+            source: self.source.clone(),
             joints: self.skeleton.iter().map(|joint| joint.name.clone()).collect(),
             light: self.light.slope.to_array(),
             clips: self.clips.iter().map(|clip| (clip.name.clone(), clip.motion.fps)).collect(),
@@ -113,12 +114,7 @@ impl Avatar {
     /// # Errors
     /// [`Error::Io`]; [`Error::File`] for anything but a complete, valid avatar.
     pub fn load(path: &Path) -> Result<Self, Error> {
-        let io = |source| Error::Io { path: path.to_owned(), source };
-        let size = std::fs::metadata(path).map_err(io)?.len();
-        if size > MAX_BYTES {
-            return Err(file(path, format!("has {size} bytes, expected at most {MAX_BYTES}")));
-        }
-        let bytes = std::fs::read(path).map_err(io)?;
+        let bytes = crate::model::file::read(path)?;
         let avatar = parse(&bytes).map_err(|what| file(path, what))?;
         avatar.validate().map_err(|what| file(path, what))?;
         Ok(avatar)
@@ -161,6 +157,7 @@ fn parse(bytes: &[u8]) -> Result<Avatar, String> {
     let joints = source.array("joints", Dtype::U16, &[ANY, 4], u16::from_le_bytes)?;
     Ok(Avatar {
         name: header.name,
+        source: header.source,
         vertices: source.vectors("vertices", &[ANY, 3])?,
         normals: source.vectors("normals", &[ANY, 3])?,
         uvs: uvs.chunks_exact(2).map(Vec2::from_slice).collect(),

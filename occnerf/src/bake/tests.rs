@@ -168,6 +168,7 @@ fn square(rgb: &[[u8; 3]], width: u32) -> Avatar {
     let corners = [(-1.0, 1.0), (1.0, 1.0), (-1.0, -1.0), (1.0, -1.0)];
     Avatar {
         name: "square".to_owned(),
+        source: "of a test".to_owned(),
         vertices: corners.map(|(x, y)| Vec3::new(x, y, 0.0)).to_vec(),
         normals: vec![Vec3::Z; 4],
         uvs: corners.map(|(x, y)| Vec2::new(0.5 + 0.5 * x, 0.5 - 0.5 * y)).to_vec(),

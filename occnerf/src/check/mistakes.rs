@@ -110,6 +110,11 @@ const SHIFT_BY: f32 = 0.004;
 const UNDONE_VIEWS: usize = 12;
 /// Focal length errors to try, octaves; finer below one, where the overlap changes fast.
 const OCTAVES: [f32; 10] = [0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0];
+/// Focal lengths below this share of the picture's width, and their errors to try.
+const TINY: f32 = 0.05;
+const TINY_OCTAVES: [f32; 8] = [4.5, 5.0, 6.0, 7.0, 8.0, 9.0, 10.0, 11.0];
+/// Share of the picture that no body covers.
+const FILLED: f32 = 0.9;
 /// Sizes of other pictures that intrinsics may be of, and bisections of the best focal length.
 const SCALES: [f32; 10] = [0.25, 1.0 / 3.0, 0.5, 2.0 / 3.0, 0.75, 4.0 / 3.0, 1.5, 2.0, 3.0, 4.0];
 const REFINEMENTS: usize = 5;
@@ -174,6 +179,9 @@ pub(super) fn find(capture: &Capture, body: &BodyModel, views: &[View]) -> Resul
         }
     }
     let focal = OCTAVES.iter().flat_map(|k| [2f32.powf(*k), 2f32.powf(-k)]).map(Mistake::Focal);
+    // A field of view of 169° or more is no camera's: only other focal lengths are likely.
+    let tiny = views.iter().any(|view| view.camera.focal.max_element() < TINY * view.camera.width as f32);
+    let wide = TINY_OCTAVES.map(|k| Mistake::Focal(2f32.powf(-k)));
     let others = [
         Mistake::CameraToWorld,
         Mistake::CameraYUp,
@@ -192,7 +200,8 @@ pub(super) fn find(capture: &Capture, body: &BodyModel, views: &[View]) -> Resul
     }
     let mut best: Option<(Mistake, f32)> = None;
     let pictures = SCALES.map(Mistake::Scaled).into_iter().chain([Mistake::PrincipalPoint, Mistake::Mirrored]);
-    for mistake in others.into_iter().chain(pictures).chain(focal) {
+    let usual = others.into_iter().chain(pictures).filter(|_| !tiny);
+    for mistake in usual.chain(focal).chain(wide.into_iter().filter(|_| tiny)) {
         let is_off = views.iter().any(|view| off_centre(&view.camera) > OFF_CENTRE);
         if mistake == Mistake::PrincipalPoint && !is_off {
             continue;
@@ -302,7 +311,13 @@ impl<'a> Posed<'a> {
         if undo == Some(Mistake::Mirrored) {
             silhouette.chunks_exact_mut(camera.width as usize).for_each(<[bool]>::reverse);
         }
-        Ok(Overlap::of(&silhouette, self.view, undo == Some(Mistake::MaskInverted)))
+        let inverted = undo == Some(Mistake::MaskInverted);
+        // A body before the whole picture fits any mask.
+        let filled = silhouette.iter().filter(|body| **body).count() as f32 > FILLED * silhouette.len() as f32;
+        if filled && undo.is_some() && !inverted {
+            return Ok(Overlap::default());
+        }
+        Ok(Overlap::of(&silhouette, self.view, inverted))
     }
 }
 

@@ -6,10 +6,10 @@ use std::collections::{BTreeMap, HashMap};
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
+use array_files::{read_bounded, replace_file};
 use safetensors::tensor::{Dtype, SafeTensors};
 
 use crate::Error;
-use crate::atomic::replace_file;
 
 /// Larger files are not ours: the paper's table with both moments has 0.3 GB.
 const MAX_BYTES: u64 = 4 << 30;
@@ -84,12 +84,10 @@ pub(crate) fn write(
 
 /// The bytes of a file that is not too large to be ours.
 pub(crate) fn read(path: &Path) -> Result<Vec<u8>, Error> {
-    let io = |source| Error::Io { path: path.to_owned(), source };
-    let size = std::fs::metadata(path).map_err(io)?.len();
-    if size > MAX_BYTES {
-        return Err(corrupt(path, format!("has {size} bytes, expected at most {MAX_BYTES}")));
+    if path.exists() && !path.is_file() {
+        return Err(corrupt(path, "is no plain file".to_owned()));
     }
-    std::fs::read(path).map_err(io)
+    read_bounded(path, MAX_BYTES).map_err(|source| Error::Io { path: path.to_owned(), source })
 }
 
 /// A parsed file.

@@ -30,6 +30,10 @@ const CAMERA: usize = 16;
 /// Numbers of a placement: whether it is about the origin, rotation, translation.
 const PLACEMENT: usize = 7;
 
+/// Largest rotation, radians; largest albedo and slope of the light.
+const MAX_ANGLE: f32 = 1e3;
+const MAX_COLOR: f32 = 10.0;
+
 /// A person before training.
 pub struct Person {
     /// Name of the scene.
@@ -194,7 +198,11 @@ impl Model {
         let bytes = read(&path)?;
         let contents = parse(&path, &bytes)?;
         let config = config_of(&contents)?;
-        let Person { body, frames, colors, .. } = Person::load(run, &config)?;
+        let Person { scene, body, frames, colors } = Person::load(run, &config)?;
+        let trained_on = contents.require("scene")?;
+        if trained_on != scene {
+            return Err(contents.corrupt(format!("was trained on scene {trained_on:?}, the run's is {scene:?}")));
+        }
         let base = if config.field.prior_colors { colors } else { PriorColors::default() };
         let mut model = Self::new(config, body, frames, base)?;
         model.restore(&contents)?;
@@ -211,19 +219,22 @@ fn colors(contents: &Contents<'_>, model: &BodyModel) -> Result<PriorColors, Err
         contents.corrupt(format!("header `subdivisions` is {times:?}, expected a number that fits the body"))
     })?;
     let mesh = Arc::new(Subdivided::new(model.num_vertices(), &model.faces, times));
-    let colors = triples(&contents.floats("colors", mesh.anchors.len() * 3)?);
+    let colors = contents.floats("colors", mesh.anchors.len() * 3)?;
+    below(contents, "colors", &colors, MAX_COLOR)?;
     let seen = contents.bytes("seen", mesh.anchors.len())?.iter().map(|&seen| seen != 0).collect();
-    let light = Light { slope: Vec3::from_slice(&contents.floats("light", 3)?) };
-    Ok(PriorColors { colors, seen, light, mesh })
+    let slope = contents.floats("light", 3)?;
+    below(contents, "light", &slope, MAX_COLOR)?;
+    Ok(PriorColors { colors: triples(&colors), seen, light: Light { slope: Vec3::from_slice(&slope) }, mesh })
 }
 
 /// Joint rotations, shape and placement of a frame.
 type Pose = (Vec<Vec3>, Vec<f32>, Placement);
 
 fn read_poses(contents: &Contents<'_>, frames: usize, (joints, betas): (usize, usize)) -> Result<Vec<Pose>, Error> {
-    let poses = triples(&contents.floats("poses", frames * joints * 3)?);
+    let poses = contents.floats("poses", frames * joints * 3)?;
     let shapes = contents.floats("betas", frames * betas)?;
     let placements = contents.floats("placements", frames * PLACEMENT)?;
+    below(contents, "poses", &poses, MAX_ANGLE)?;
     below(contents, "betas", &shapes, MAX_BETA)?;
     below(contents, "placements", &placements, MAX_DISTANCE)?;
     let pose = |frame: usize| {
@@ -233,13 +244,15 @@ fn read_poses(contents: &Contents<'_>, frames: usize, (joints, betas): (usize, u
             0.0 => Placement::Pelvis { translation },
             _ => Placement::Origin { rotation, translation },
         };
-        (poses[frame * joints..][..joints].to_vec(), shapes[frame * betas..][..betas].to_vec(), placement)
+        let poses = triples(&poses[frame * joints * 3..][..joints * 3]);
+        (poses, shapes[frame * betas..][..betas].to_vec(), placement)
     };
     Ok((0..frames).map(pose).collect())
 }
 
 fn cameras(contents: &Contents<'_>, frames: usize) -> Result<Vec<Camera>, Error> {
     let cameras = contents.floats("cameras", frames * CAMERA)?;
+    below(contents, "cameras", &cameras, MAX_DISTANCE)?;
     let sizes = contents.counts("sizes", frames * 2)?;
     let each = cameras.chunks_exact(CAMERA).zip(sizes.chunks_exact(2)).enumerate();
     each.map(|(frame, (numbers, size))| {

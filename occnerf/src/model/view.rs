@@ -69,7 +69,7 @@ impl PosedView {
     pub(crate) fn silhouette(&self, faces: &[[u32; 3]]) -> Result<Vec<bool>, Error> {
         let vertices = &self.posed.vertices;
         if let Some(vertex) = vertices.iter().position(|v| !v.is_finite()) {
-            return Err(visibility::Error::NotFinite { vertex }.into());
+            return Err(visibility::Error(format!("vertex {vertex} is not finite")).into());
         }
         Ok(silhouette(vertices, faces, &self.camera)?)
     }
@@ -89,8 +89,8 @@ pub(crate) fn silhouette(
 ) -> Result<Vec<bool>, visibility::Error> {
     let mut covered = vec![false; camera.width as usize * camera.height as usize];
     let options = RasterOptions::default();
-    let is_covered = |pixel: Pixel<'_>| pixel.samples().any(|sample| !sample.is_empty());
-    Rasterizer::default().draw(vertices, &[faces], &pinhole(camera), &options, &mut covered, is_covered)?;
+    let is_covered = |pixel: Pixel<'_>| !pixel.samples.is_empty();
+    Rasterizer::default().draw(vertices, faces, &pinhole(camera), &options, &mut covered, is_covered)?;
     Ok(covered)
 }
 

@@ -57,6 +57,9 @@ impl PreparedFrame {
 /// Camera name of a held-out training frame.
 pub const HELD_OUT: &str = "held out";
 
+/// Most frames of [`Scene::covered`].
+const COVERED_FRAMES: usize = 32;
+
 /// Immutable input of training and evaluation.
 pub struct Scene {
     /// Name of the capture.
@@ -221,6 +224,24 @@ impl Scene {
             frame.labels = Labels::new(&each.collect::<Vec<_>>());
         });
         Ok(())
+    }
+
+    /// Share of the training masks' pixels that the prior covers, over up to 32 frames: hardly any where
+    /// cameras or bodies are wrong.
+    ///
+    /// # Errors
+    /// A picture of more than 16384 pixels a side.
+    pub fn covered(&self) -> Result<f64, Error> {
+        let shown: Vec<&PreparedFrame> = self.train.iter().filter(|frame| frame.labels.num_subject() > 0).collect();
+        let every = shown.len().div_ceil(COVERED_FRAMES).max(1);
+        let counts = shown.into_par_iter().step_by(every).map(|frame| {
+            let silhouette = frame.view.silhouette(&self.body.model.faces)?;
+            let both = frame.labels.iter().zip(silhouette).filter(|(label, body)| *label == Label::Subject && *body);
+            Ok((both.count(), frame.labels.num_subject()))
+        });
+        let counts = counts.collect::<Result<Vec<_>, Error>>()?;
+        let sum = |pick: fn(&(usize, usize)) -> usize| counts.iter().map(pick).sum::<usize>() as f64;
+        Ok(sum(|count| count.0) / sum(|count| count.1).max(1.0))
     }
 
     /// Number of training frames in which each vertex of the prior is visible at a subject pixel, by

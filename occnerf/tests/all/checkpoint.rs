@@ -286,18 +286,6 @@ fn files_that_are_not_there_or_not_files_are_named() {
 }
 
 #[test]
-fn an_old_checkpoint_survives_a_save_that_fails() {
-    let dir = TempDir::new("survives");
-    let bytes = good(&dir);
-    let path = dir.path("good.safetensors");
-    // The place of the partial file is taken by a directory.
-    std::fs::create_dir(dir.path("good.safetensors.partial")).unwrap();
-    let trainer = Trainer::new(scene(), config(Method::Occnerf)).unwrap();
-    assert!(trainer.save(&path).is_err());
-    assert!(std::fs::read(&path).unwrap() == bytes);
-}
-
-#[test]
 fn a_training_that_has_diverged_leaves_the_good_checkpoint_alone() {
     let dir = TempDir::new("diverged");
     let mut config = config(Method::HashPoint);

@@ -10,7 +10,8 @@ use glam::{Mat3, Quat, Vec2, Vec3};
 use occnerf::bake::Avatar;
 use occnerf::bake::export::{Splats, fit_motion, splats, write_amass, write_obj};
 use occnerf::{Config, Method, Preset, PriorColors, Scene};
-use smpl::{Character, MotionClip, SparseRows};
+use rigged::Character;
+use smpl::{MotionClip, SparseRows};
 use stand_in::skinned;
 use synth::{DemoConfig, demo};
 

@@ -3,13 +3,6 @@
 use crate::Error;
 
 /// Values of an [`NdArray`], widened to four types.
-///
-/// ```
-/// use array_files::Data;
-///
-/// let Data::I64(values) = Data::I64(vec![1, 2]) else { unreachable!() };
-/// assert_eq!(values.iter().sum::<i64>(), 3);
-/// ```
 #[derive(Clone, Debug, PartialEq)]
 pub enum Data {
     /// 64-bit floats.
@@ -30,7 +23,7 @@ pub enum Data {
 /// let array = NdArray { shape: vec![2, 2], data: Data::F64(vec![1.0, 2.0, 3.0, 4.0]) };
 /// assert_eq!(array.to_f32("a.npz", "k", &[Some(2), None])?, [1.0, 2.0, 3.0, 4.0]);
 /// let error = array.to_f32("a.npz", "k", &[Some(3)]).unwrap_err();
-/// assert_eq!(error.to_string(), "a.npz: `k` has shape [2, 2], expected [3]");
+/// assert_eq!(error.to_string(), "a.npz: `k`: shape [2, 2], expected [3]");
 /// # Ok::<(), array_files::Error>(())
 /// ```
 #[derive(Clone, Debug, PartialEq)]
@@ -43,7 +36,6 @@ pub struct NdArray {
 
 impl NdArray {
     /// Number of values.
-    #[must_use]
     pub fn len(&self) -> usize {
         match &self.data {
             Data::F64(v) => v.len(),
@@ -54,13 +46,11 @@ impl NdArray {
     }
 
     /// Whether there are no values.
-    #[must_use]
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
 
     /// Every value as `f64`, row-major; booleans as 0 and 1.
-    #[must_use]
     pub fn to_f64(&self) -> Vec<f64> {
         match &self.data {
             Data::F64(v) => v.clone(),
@@ -74,7 +64,7 @@ impl NdArray {
     /// `file` and `key` name the array in errors.
     ///
     /// # Errors
-    /// [`Error::Shape`]; [`Error::NotFinite`] for NaN, infinities and values beyond `f32`.
+    /// [`Error::Invalid`] for another shape, and for NaN, infinities and values beyond `f32`.
     pub fn to_f32(&self, file: &str, key: &str, pattern: &[Option<usize>]) -> Result<Vec<f32>, Error> {
         self.check_shape(file, key, pattern)?;
         let values: Vec<f32> = match &self.data {
@@ -84,7 +74,7 @@ impl NdArray {
             Data::Bool(v) => v.iter().map(|&x| f32::from(u8::from(x))).collect(),
         };
         match values.iter().position(|x| !x.is_finite()) {
-            Some(index) => Err(Error::NotFinite { file: file.to_owned(), key: key.to_owned(), index }),
+            Some(index) => Err(Error::invalid(file, key, format!("not finite at flat index {index}"))),
             None => Ok(values),
         }
     }
@@ -92,18 +82,13 @@ impl NdArray {
     /// Every value as `i64`, row-major, if the shape fits `pattern` (`None`: any extent).
     ///
     /// # Errors
-    /// [`Error::Shape`]; [`Error::Type`] for floats.
+    /// [`Error::Invalid`] for another shape and for floats.
     pub fn to_i64(&self, file: &str, key: &str, pattern: &[Option<usize>]) -> Result<Vec<i64>, Error> {
         self.check_shape(file, key, pattern)?;
         match &self.data {
             Data::I64(v) => Ok(v.clone()),
             Data::Bool(v) => Ok(v.iter().map(|&x| i64::from(x)).collect()),
-            Data::F32(_) | Data::F64(_) => Err(Error::Type {
-                file: file.to_owned(),
-                key: key.to_owned(),
-                expected: "an array of integers",
-                actual: "an array of floats".to_owned(),
-            }),
+            Data::F32(_) | Data::F64(_) => Err(Error::invalid(file, key, "floats, expected integers")),
         }
     }
 
@@ -112,12 +97,6 @@ impl NdArray {
         if self.shape.len() == pattern.len() && self.shape.iter().zip(pattern).all(fits) {
             return Ok(());
         }
-        let extents: Vec<String> = pattern.iter().map(|p| p.map_or("_".to_owned(), |n| n.to_string())).collect();
-        Err(Error::Shape {
-            file: file.to_owned(),
-            key: key.to_owned(),
-            expected: format!("[{}]", extents.join(", ")),
-            actual: self.shape.clone(),
-        })
+        Err(Error::shape(file, key, &self.shape, pattern))
     }
 }

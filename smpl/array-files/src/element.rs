@@ -75,7 +75,7 @@ impl ElementType {
             }
             (Kind::Unsigned, _) => Data::I64(self.values(&bytes, |bits| bits as i64)),
             (Kind::Brain, _) => Data::F32(self.values(&bytes, |bits| f32::from_bits((bits as u32) << 16))),
-            (Kind::Float, 2) => Data::F32(self.values(&bytes, |bits| half(bits as u16))),
+            (Kind::Float, 2) => Data::F32(self.values(&bytes, |bits| half_to_f32(bits as u16))),
             (Kind::Float, 4) => Data::F32(self.values(&bytes, |bits| f32::from_bits(bits as u32))),
             (Kind::Float, _) => Data::F64(self.values(&bytes, f64::from_bits)),
         };
@@ -147,8 +147,8 @@ pub(crate) fn gather(storage: &[u8], size: usize, shape: &[usize], strides: &[us
     out
 }
 
-/// IEEE half precision.
-fn half(bits: u16) -> f32 {
+/// Value of an IEEE half-precision number.
+pub fn half_to_f32(bits: u16) -> f32 {
     let sign = if bits >> 15 == 1 { -1.0 } else { 1.0 };
     let exponent = i32::from(bits >> 10 & 31);
     let fraction = f32::from(bits & 0x3ff) / 1024.0;

@@ -5,7 +5,8 @@ use std::path::{Path, PathBuf};
 /// A file that cannot be read, or an array in it that does not fit its use.
 ///
 /// `file` is the path as given, or the name passed along with bytes in memory; `key` is the name of
-/// the array. Control characters of keys are escaped, so that a message is a single line.
+/// the array, empty for the file as a whole. Control characters are escaped, so that a message is a
+/// single line.
 ///
 /// ```
 /// use array_files::{Error, pickle};
@@ -26,79 +27,24 @@ pub enum Error {
         /// The system's reason.
         source: std::io::Error,
     },
-    /// A required array is missing.
-    #[error("{file}: no `{key}` (it holds {})", available.join(", ").escape_debug())]
-    MissingKey {
-        /// The file.
-        file: String,
-        /// The missing name.
-        key: String,
-        /// The names present.
-        available: Vec<String>,
-    },
-    /// An array of another shape than expected.
-    #[error("{file}: `{}` has shape {actual:?}, expected {expected}", key.escape_debug())]
-    Shape {
-        /// The file.
-        file: String,
-        /// The array.
-        key: String,
-        /// Expected extents, `_` for any.
-        expected: String,
-        /// The shape in the file.
-        actual: Vec<usize>,
-    },
-    /// An array or object of another type than expected.
-    #[error("{file}: `{}` is {actual}, expected {expected}", key.escape_debug())]
-    Type {
-        /// The file.
-        file: String,
-        /// The array.
-        key: String,
-        /// The expected type.
-        expected: &'static str,
-        /// The type in the file.
-        actual: String,
-    },
-    /// NaN, an infinity, or a value beyond the range of `f32`.
-    #[error("{file}: `{}` is not finite at flat index {index}", key.escape_debug())]
-    NotFinite {
-        /// The file.
-        file: String,
-        /// The array.
-        key: String,
-        /// Row-major position of the first such value.
-        index: usize,
-    },
-    /// Contradictory content: a tensor outside its storage, a sparse matrix whose parts disagree, a
-    /// shape that does not match the number of values.
-    #[error("{file}: `{}`: {message}", key.escape_debug())]
+    /// A missing array, one of another type or shape than expected, with values that are not finite
+    /// or parts that contradict each other, or one larger than the reader's limit, which is found
+    /// before the memory is allocated.
+    #[error("{file}: {}{message}", prefix(key))]
     Invalid {
         /// The file.
         file: String,
         /// The array.
         key: String,
-        /// The fault.
+        /// Expected and actual.
         message: String,
-    },
-    /// Content larger than the reader's limit. Raised before that memory is allocated.
-    #[error("{file}: `{}` claims {claimed} bytes, more than the limit of {limit}", key.escape_debug())]
-    TooLarge {
-        /// The file.
-        file: String,
-        /// The array; empty for the file as a whole.
-        key: String,
-        /// Bytes needed, as far as known.
-        claimed: u128,
-        /// Bytes allowed.
-        limit: u64,
     },
     /// Malformed or truncated `.npy` or `.npz` structure.
     #[error("{file}: {}malformed array file: {message}", prefix(key))]
     Npy {
         /// The file.
         file: String,
-        /// The array; empty for the archive as a whole.
+        /// The array.
         key: String,
         /// The fault.
         message: String,
@@ -116,16 +62,30 @@ pub enum Error {
 }
 
 impl Error {
-    pub(crate) fn io(path: &Path) -> impl Fn(std::io::Error) -> Self + '_ {
-        move |source| Self::Io { path: path.to_owned(), source }
-    }
-
-    pub(crate) fn invalid(file: &str, key: &str, message: impl ToString) -> Self {
+    /// [`Error::Invalid`] of an array.
+    pub fn invalid(file: &str, key: &str, message: impl ToString) -> Self {
         Self::Invalid { file: file.to_owned(), key: key.to_owned(), message: message.to_string() }
     }
 
-    pub(crate) fn too_large(file: &str, key: &str, claimed: u128, limit: u64) -> Self {
-        Self::TooLarge { file: file.to_owned(), key: key.to_owned(), claimed, limit }
+    /// [`Error::Invalid`] for an array that is not among those present.
+    pub fn missing<S: AsRef<str>>(file: &str, key: &str, present: impl IntoIterator<Item = S>) -> Self {
+        let present: Vec<String> = present.into_iter().map(|name| name.as_ref().escape_debug().to_string()).collect();
+        Self::invalid(file, key, format!("missing, the file holds {}", present.join(", ")))
+    }
+
+    /// [`Error::Invalid`] for an array of another shape than `pattern` (`None`: any extent).
+    pub fn shape(file: &str, key: &str, shape: &[usize], pattern: &[Option<usize>]) -> Self {
+        let extents: Vec<String> = pattern.iter().map(|p| p.map_or("_".to_owned(), |n| n.to_string())).collect();
+        Self::invalid(file, key, format!("shape {shape:?}, expected [{}]", extents.join(", ")))
+    }
+
+    /// [`Error::Invalid`] for content that needs more bytes than `limit`.
+    pub fn too_large(file: &str, key: &str, claimed: u128, limit: u64) -> Self {
+        Self::invalid(file, key, format!("claims {claimed} bytes, more than the limit of {limit}"))
+    }
+
+    pub(crate) fn io(path: &Path) -> impl Fn(std::io::Error) -> Self + '_ {
+        move |source| Self::Io { path: path.to_owned(), source }
     }
 
     pub(crate) fn npy(file: &str, key: &str, message: impl ToString) -> Self {

@@ -1,27 +1,48 @@
 //! Whole files, up to a limit.
 
-use std::io::Read;
+use std::fs::File;
+use std::io::{self, ErrorKind, Read};
 use std::path::Path;
 
 use crate::Error;
 
 /// Largest file that is read, in bytes: 2 GiB.
 pub(crate) const MAX_FILE_BYTES: u64 = 1 << 31;
+/// Most bytes that are read of what is no plain file: 256 MiB.
+const MAX_PIPED_BYTES: u64 = 1 << 28;
 
-/// Reads a whole file of at most 2 GiB. Devices and pipes, which report no length, are read up to
-/// that limit.
+/// Reads a file of at most `limit` bytes; a device or a pipe, whose reported length means nothing, of
+/// at most 256 MiB too.
+///
+/// ```
+/// # let path = std::env::temp_dir().join("array-files-bounded.txt");
+/// std::fs::write(&path, "four")?;
+/// assert_eq!(array_files::read_bounded(&path, 4)?, b"four");
+/// let error = array_files::read_bounded(&path, 3).unwrap_err();
+/// assert_eq!(error.to_string(), "more than 3 bytes, the most that is read of such a file");
+/// # std::fs::remove_file(&path)?;
+/// # Ok::<(), std::io::Error>(())
+/// ```
 ///
 /// # Errors
-/// [`Error::Io`]; [`Error::TooLarge`]; [`Error::Invalid`] for a web page.
+/// Those of the system; [`ErrorKind::FileTooLarge`] beyond the limit; [`ErrorKind::OutOfMemory`].
+pub fn read_bounded(path: &Path, limit: u64) -> io::Result<Vec<u8>> {
+    let file = File::open(path)?;
+    let found = file.metadata()?;
+    let limit = if found.is_file() { limit } else { limit.min(MAX_PIPED_BYTES) };
+    let read = if found.len() > limit { None } else { read_limited(file, found.len() as usize, limit)? };
+    read.ok_or_else(|| {
+        let what = format!("more than {limit} bytes, the most that is read of such a file");
+        io::Error::new(ErrorKind::FileTooLarge, what)
+    })
+}
+
+/// Reads an array file: at most 2 GiB by [`read_bounded`].
+///
+/// # Errors
+/// [`Error::Io`]; [`Error::Invalid`] for a web page.
 pub fn read_file(path: &Path) -> Result<Vec<u8>, Error> {
-    let file = std::fs::File::open(path).map_err(Error::io(path))?;
-    let length = file.metadata().map_err(Error::io(path))?.len();
-    let too_large = |claimed: u64| Error::too_large(&path.display().to_string(), "", claimed.into(), MAX_FILE_BYTES);
-    if length > MAX_FILE_BYTES {
-        return Err(too_large(length));
-    }
-    let bytes = read_limited(file, length as usize, MAX_FILE_BYTES).map_err(Error::io(path))?;
-    let bytes = bytes.ok_or_else(|| too_large(MAX_FILE_BYTES + 1))?;
+    let bytes = read_bounded(path, MAX_FILE_BYTES).map_err(Error::io(path))?;
     let start = decode_text(&bytes[..bytes.len().min(256)]).trim_start().to_ascii_lowercase();
     if start.starts_with("<!doctype html") || start.starts_with("<html") {
         let message = "a web page (HTML), as sites send it in place of a file that needs a login";
@@ -38,7 +59,6 @@ pub fn read_file(path: &Path) -> Result<Vec<u8>, Error> {
 /// assert_eq!(decode_text(b"\xef\xbb\xbfv 0 0 0\r\nv 1 0 0\r"), "v 0 0 0\nv 1 0 0\n");
 /// assert_eq!(decode_text(b"\xff\xfe{\0}\0"), "{}");
 /// ```
-#[must_use]
 pub fn decode_text(bytes: &[u8]) -> String {
     let utf16 = |bytes: &[u8], from: fn([u8; 2]) -> u16| {
         let units: Vec<u16> = bytes.chunks(2).map(|pair| from([pair[0], *pair.get(1).unwrap_or(&0)])).collect();
@@ -55,9 +75,9 @@ pub fn decode_text(bytes: &[u8]) -> String {
 
 /// Everything from `reader`, or `None` if it is more than `limit` bytes; `expected` bytes are
 /// reserved.
-pub(crate) fn read_limited(reader: impl Read, expected: usize, limit: u64) -> std::io::Result<Option<Vec<u8>>> {
+pub(crate) fn read_limited(reader: impl Read, expected: usize, limit: u64) -> io::Result<Option<Vec<u8>>> {
     let mut bytes = Vec::new();
-    bytes.reserve_exact(expected);
+    bytes.try_reserve_exact(expected)?;
     reader.take(limit + 1).read_to_end(&mut bytes)?;
     Ok(Some(bytes).filter(|bytes| bytes.len() as u64 <= limit))
 }

@@ -1,5 +1,6 @@
 //! Readers of the files in which Python programs keep arrays: numpy's `.npy` and `.npz`, pickles,
-//! joblib's compressed pickles and PyTorch's `torch.save`; and a writer of `.npz`.
+//! joblib's compressed pickles and PyTorch's `torch.save`; a writer of `.npz`; and what every file
+//! needs, bounded reading and atomic replacement.
 //!
 //! ```
 //! use array_files::npz::{self, Npz};
@@ -35,6 +36,7 @@ mod npy;
 pub mod npz;
 pub mod pickle;
 pub mod torch;
+mod whole;
 
 /// The README's example, compiled as a test.
 #[cfg(doctest)]
@@ -42,5 +44,7 @@ pub mod torch;
 struct Readme;
 
 pub use array::{Data, NdArray};
+pub use element::half_to_f32;
 pub use error::Error;
-pub use file::{decode_text, read_file};
+pub use file::{decode_text, read_bounded, read_file};
+pub use whole::{replace_file, sweep};

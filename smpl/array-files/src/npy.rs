@@ -87,12 +87,8 @@ impl NpyHeader {
     /// Reads the array's values to the end of `reader`.
     pub(crate) fn read_data(self, file: &str, key: &str, reader: impl Read) -> Result<NdArray, Error> {
         let Self { descr, fortran, shape } = self;
-        let element = ElementType::parse(&descr).ok_or_else(|| Error::Type {
-            file: file.to_owned(),
-            key: key.to_owned(),
-            expected: "booleans, integers or floats",
-            actual: format!("of element type {descr:?}"),
-        })?;
+        let unknown = || format!("element type {descr:?}, expected booleans, integers or floats");
+        let element = ElementType::parse(&descr).ok_or_else(|| Error::invalid(file, key, unknown()))?;
         let bytes_of = |size: usize| byte_count(&shape, size).unwrap_or(u128::MAX);
         let (claimed, in_memory) = (bytes_of(element.size), bytes_of(element.size_in_memory()));
         if in_memory > u128::from(MAX_ARRAY_BYTES) {

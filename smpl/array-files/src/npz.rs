@@ -23,26 +23,13 @@ pub use crate::npy::MAX_ARRAY_BYTES;
 /// Reads a `.npy` file of plain values; [`pickle::read`] reads arrays of Python objects too.
 ///
 /// # Errors
-/// [`Error::Io`], [`Error::TooLarge`], [`Error::Type`] and [`Error::Npy`], with an empty key.
+/// [`Error::Io`], [`Error::Invalid`] and [`Error::Npy`], with an empty key.
 pub fn read_npy(path: &Path) -> Result<NdArray, Error> {
     let bytes = read_file(path)?;
     read_array(&path.display().to_string(), "", bytes.as_slice())
 }
 
 /// Open `.npz` archive, held in memory as it is compressed; arrays are decoded when asked for.
-///
-/// ```
-/// use array_files::npz::{self, Npz};
-/// use array_files::{Data, NdArray};
-///
-/// let path = std::env::temp_dir().join("array-files-npz.npz");
-/// npz::write(&path, &[("faces", NdArray { shape: vec![1, 3], data: Data::I64(vec![0, 1, 2]) })])?;
-/// let mut archive = Npz::open(&path)?;
-/// assert_eq!(archive.i64("faces", &[None, Some(3)])?.1, [0, 1, 2]);
-/// assert!(archive.array("vertices").is_err());
-/// # std::fs::remove_file(&path).unwrap();
-/// # Ok::<(), array_files::Error>(())
-/// ```
 #[derive(Clone)]
 pub struct Npz {
     file: String,
@@ -60,7 +47,7 @@ impl Npz {
     /// Opens the archive at `path`.
     ///
     /// # Errors
-    /// [`Error::Io`], [`Error::TooLarge`] beyond 2 GiB, [`Error::Npy`] if it is no zip archive.
+    /// [`Error::Io`], also beyond 2 GiB; [`Error::Npy`] if it is no zip archive.
     pub fn open(path: &Path) -> Result<Self, Error> {
         Self::from_bytes(&path.display().to_string(), read_file(path)?)
     }
@@ -80,13 +67,11 @@ impl Npz {
     }
 
     /// The file's name in errors.
-    #[must_use]
     pub fn file(&self) -> &str {
         &self.file
     }
 
     /// Names of the arrays, in the archive's order.
-    #[must_use]
     pub fn keys(&self) -> &[String] {
         &self.keys
     }
@@ -94,8 +79,7 @@ impl Npz {
     /// Reads the array `key` of booleans, integers or floats.
     ///
     /// # Errors
-    /// [`Error::MissingKey`], [`Error::TooLarge`], [`Error::Type`] for other element types,
-    /// [`Error::Npy`].
+    /// [`Error::Invalid`] if it is missing, too large or of another element type, [`Error::Npy`].
     pub fn array(&mut self, key: &str) -> Result<NdArray, Error> {
         let file = self.file.clone();
         read_array(&file, key, self.entry(key)?)
@@ -104,7 +88,7 @@ impl Npz {
     /// Reads `key`, an array of plain values or of pickled objects.
     ///
     /// # Errors
-    /// Those of [`Npz::array`]; [`Error::Pickle`]; [`Error::TooLarge`] for an entry that expands by
+    /// Those of [`Npz::array`]; [`Error::Pickle`]; [`Error::Invalid`] for an entry that expands by
     /// more than a factor of 256 and 64 MiB.
     pub fn value(&mut self, key: &str) -> Result<Value, Error> {
         let file = format!("{}: `{key}`", self.file);
@@ -116,11 +100,8 @@ impl Npz {
     }
 
     fn entry(&mut self, key: &str) -> Result<ZipFile<'_, Cursor<Vec<u8>>>, Error> {
-        let index = self.keys.iter().position(|k| k == key).ok_or_else(|| Error::MissingKey {
-            file: self.file.clone(),
-            key: key.to_owned(),
-            available: self.keys.clone(),
-        })?;
+        let index = self.keys.iter().position(|k| k == key);
+        let index = index.ok_or_else(|| Error::missing(&self.file, key, &self.keys))?;
         self.archive.by_index(index).map_err(|e| Error::npy(&self.file, key, e))
     }
 
@@ -185,5 +166,5 @@ pub fn write_with_text<K: AsRef<str>>(
         put(key, &format!("<U{}", letters.len() / 4), &[], &letters)?;
     }
     let bytes = archive.finish().map_err(|e| Error::npy(&file, "", e))?.into_inner();
-    std::fs::write(path, bytes).map_err(Error::io(path))
+    crate::replace_file(path, |to| to.write_all(&bytes)).map_err(Error::io(path))
 }

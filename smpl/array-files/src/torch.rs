@@ -62,20 +62,6 @@ impl<R> fmt::Debug for TorchFile<R> {
 }
 
 /// Description of a tensor whose values have not been read, from [`TorchFile::tensor`].
-///
-/// ```
-/// # use array_files::torch::TorchFile;
-/// # let bytes = [
-/// #     b"\x80\x02\x8a\x0al\xfc\x9cF\xf9 j\xa8P\x19.M\xe9\x03.}.}(S'bias'\nctorch._utils\n_rebuild_tensor_v2\n(".as_slice(),
-/// #     b"(S'storage'\nctorch\nFloatStorage\nS'0'\nS'cpu'\nK\x02NtQK\0(K\x02t(K\x01ttRu.](S'0'\ne.",
-/// #     b"\x02\0\0\0\0\0\0\0\0\0\x80\x3f\0\0\0\x40",
-/// # ]
-/// # .concat();
-/// # let file = TorchFile::open("weights.pth", std::io::Cursor::new(bytes))?;
-/// let bias = file.tensor("bias", file.root().get("bias").unwrap())?.unwrap();
-/// assert!(bias.is_float() && bias.dtype == "float32" && bias.shape == [2]);
-/// # Ok::<(), array_files::Error>(())
-/// ```
 #[derive(Clone, Debug, PartialEq)]
 pub struct Tensor {
     /// PyTorch's name of the element type, such as `float32`.
@@ -90,14 +76,12 @@ pub struct Tensor {
 
 impl Tensor {
     /// Whether the elements are floats of 16, 32 or 64 bits.
-    #[must_use]
     pub fn is_float(&self) -> bool {
         matches!(self.dtype, "float16" | "bfloat16" | "float32" | "float64")
     }
 }
 
 /// Whether a file's first bytes are those of a zip archive or of PyTorch's older form.
-#[must_use]
 pub fn is_torch(start: &[u8]) -> bool {
     start.starts_with(b"PK\x03\x04") || start.starts_with(LEGACY)
 }
@@ -121,7 +105,6 @@ impl<R: Read + Seek> TorchFile<R> {
     }
 
     /// The saved value; tensors in it are objects for [`TorchFile::tensor`].
-    #[must_use]
     pub fn root(&self) -> &Value {
         &self.root
     }
@@ -150,8 +133,7 @@ impl<R: Read + Seek> TorchFile<R> {
     /// out; all values read from one file may take 16 times its size and 64 MiB.
     ///
     /// # Errors
-    /// [`Error::Invalid`] for a tensor outside its storage or a damaged storage;
-    /// [`Error::TooLarge`].
+    /// [`Error::Invalid`] for a tensor outside its storage, a damaged storage, or too many values.
     pub fn read(&mut self, key: &str, tensor: &Tensor) -> Result<NdArray, Error> {
         let Tensor { element, shape, strides, offset, .. } = tensor;
         // Bytes in the file and once widened.

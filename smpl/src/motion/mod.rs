@@ -33,7 +33,6 @@ pub struct MotionFrame<'a> {
 
 impl<'a> MotionFrame<'a> {
     /// Inverts the bones once for all points.
-    #[must_use]
     pub fn new(model: &'a BodyModel, posed: &'a Posed) -> Self {
         Self { model, posed, to_canonical: posed.to_canonical() }
     }
@@ -91,7 +90,6 @@ impl MotionField {
     ///
     /// # Panics
     /// If frame, volume and surface point are not of the same body.
-    #[must_use]
     pub fn map(
         &self,
         frame: &MotionFrame<'_>,

@@ -9,22 +9,7 @@ use crate::pose::{Posed, blend};
 /// Motion field whose weights are those of the nearest point of the posed surface.
 ///
 /// The likelihood is 1 inside the body and outside up to `margin` from it, then falls with a
-/// continuous derivative to 0 at `margin + falloff`.
-///
-/// ```
-/// use glam::Vec3;
-/// use smpl::{BodyModel, Placement, SurfaceMotion};
-///
-/// let body = BodyModel::embedded();
-/// let shaped = body.shaped(&[]);
-/// let posed = body.pose(&shaped, &vec![Vec3::splat(0.1); 24], Placement::default());
-/// // 1 cm outside the first corner of face 10:
-/// let [a, b, c] = body.faces[10].map(|v| posed.vertices[v as usize]);
-/// let x = a + 0.01 * (b - a).cross(c - a).normalize_or_zero();
-/// let sample = SurfaceMotion::default().map(&body, &posed, x, 10, [1.0, 0.0, 0.0], 0.01).unwrap();
-/// let off = sample.canonical.distance(shaped.vertices[body.faces[10][0] as usize]);
-/// assert!((off - 0.01).abs() < 1e-3 && sample.likelihood == 1.0);
-/// ```
+/// continuous derivative to 0 at `margin + falloff`. [`super::MotionField`] has an example.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SurfaceMotion {
     /// Distance from the surface up to which f is 1, in the unit of the model.
@@ -56,7 +41,6 @@ impl SurfaceMotion {
     ///
     /// # Panics
     /// If `face` is not a face of `model`, or `posed` is not of it.
-    #[must_use]
     pub fn map(
         &self,
         model: &BodyModel,
@@ -85,7 +69,6 @@ impl SurfaceMotion {
     }
 
     /// The foreground likelihood f at a signed distance (outside positive); NaN for NaN.
-    #[must_use]
     pub fn likelihood(&self, signed_distance: f32) -> f32 {
         let beyond = signed_distance - self.margin;
         if beyond <= 0.0 {

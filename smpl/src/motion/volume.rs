@@ -6,8 +6,6 @@ use rayon::prelude::*;
 use super::MotionSample;
 use crate::model::{BodyModel, Shaped};
 
-/// Samples per parallel task of the softmax.
-const BLOCK: usize = 2048;
 /// Least prior of the background: with 0, learning could not raise it inside the body.
 const BACKGROUND_FLOOR: f32 = 1e-3;
 /// A bone is switched off at samples where its Gaussian is below this. The tails matter at the
@@ -16,15 +14,6 @@ const GAUSSIAN_CUT: f32 = 1e-4;
 
 /// Layout and prior of a [`WeightVolume`]. Lengths are in the unit of the model; the defaults fit
 /// metres.
-///
-/// ```
-/// use smpl::{BodyModel, WeightVolume, WeightVolumeConfig};
-///
-/// let body = BodyModel::embedded();
-/// let coarse = WeightVolumeConfig { resolution: 16, ..Default::default() };
-/// let volume = WeightVolume::gaussian(&body, &body.shaped(&[]), &coarse);
-/// assert_eq!(volume.weights.len(), 25 * 16 * 16 * 16);
-/// ```
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct WeightVolumeConfig {
     /// Samples per axis, at least 2. 32 is the paper's.
@@ -104,7 +93,6 @@ impl WeightVolume {
     ///
     /// # Panics
     /// If the resolution is below 2, or `shaped` is not of `model`.
-    #[must_use]
     pub fn gaussian(model: &BodyModel, shaped: &Shaped, config: &WeightVolumeConfig) -> Self {
         let n = config.resolution;
         assert!(n >= 2, "weight volume: resolution {n}, need at least 2");
@@ -162,39 +150,25 @@ impl WeightVolume {
     /// Recomputes `weights` from `delta`.
     pub fn update(&mut self) {
         let samples = self.resolution.pow(3);
-        let (log_prior, delta) = (&self.log_prior, &self.delta);
-        let logit = |i: usize| log_prior[i] + delta[i];
-        // Regrouped by block: a task owns one block of all channels.
-        let mut blocks: Vec<Vec<&mut [f32]>> = Vec::new();
-        blocks.resize_with(samples.div_ceil(BLOCK), Vec::new);
-        for channel in self.weights.chunks_exact_mut(samples) {
-            for (block, part) in channel.chunks_mut(BLOCK).enumerate() {
-                blocks[block].push(part);
+        let mut largest = vec![f32::NEG_INFINITY; samples];
+        for (prior, delta) in self.log_prior.chunks_exact(samples).zip(self.delta.chunks_exact(samples)) {
+            for i in 0..samples {
+                largest[i] = largest[i].max(prior[i] + delta[i]);
             }
         }
-        blocks.par_iter_mut().enumerate().for_each(|(block, parts)| {
-            let start = block * BLOCK;
-            let length = parts[0].len();
-            let mut largest = vec![f32::NEG_INFINITY; length];
-            for channel in 0..parts.len() {
-                for i in 0..length {
-                    largest[i] = largest[i].max(logit(channel * samples + start + i));
-                }
+        let logits = self.log_prior.par_chunks_exact(samples).zip(self.delta.par_chunks_exact(samples));
+        self.weights.par_chunks_exact_mut(samples).zip(logits).for_each(|(weights, (prior, delta))| {
+            for i in 0..samples {
+                let is_off = prior[i] == f32::NEG_INFINITY;
+                weights[i] = if is_off { 0.0 } else { (prior[i] + delta[i] - largest[i]).exp() };
             }
-            let mut sum = vec![0.0f32; length];
-            for (channel, part) in parts.iter_mut().enumerate() {
-                for i in 0..length {
-                    let index = channel * samples + start + i;
-                    part[i] =
-                        if log_prior[index] == f32::NEG_INFINITY { 0.0 } else { (logit(index) - largest[i]).exp() };
-                    sum[i] += part[i];
-                }
-            }
-            for part in parts {
-                for i in 0..length {
-                    part[i] /= sum[i];
-                }
-            }
+        });
+        let mut sum = vec![0.0f32; samples];
+        for weights in self.weights.chunks_exact(samples) {
+            sum.iter_mut().zip(weights).for_each(|(sum, w)| *sum += w);
+        }
+        self.weights.par_chunks_exact_mut(samples).for_each(|weights| {
+            weights.iter_mut().zip(&sum).for_each(|(w, sum)| *w /= sum);
         });
     }
 
@@ -206,7 +180,6 @@ impl WeightVolume {
     ///
     /// # Panics
     /// Unless there are K transforms.
-    #[must_use]
     pub fn map(&self, to_canonical: &[Affine3A], point: Vec3, threshold: f32) -> Option<MotionSample> {
         let (sum, mean) = self.blend(to_canonical, point);
         // Not `<`, so that NaN is dead too.

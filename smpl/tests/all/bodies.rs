@@ -8,7 +8,7 @@ use std::sync::LazyLock;
 use array_files::{Data, NdArray, npz};
 use glam::Vec3;
 use proptest::prelude::*;
-use smpl::{BodyModel, Error, FileError, Placement};
+use smpl::{BodyModel, Error, Placement};
 use testkit::files::shared;
 
 fn temporary(name: &str) -> PathBuf {
@@ -168,7 +168,7 @@ fn truncated_and_foreign_files_are_refused() {
         load("swapped.safetensors", &bytes).unwrap_err().to_string()
     };
     assert!(swap("smpl-body 1", "smpl-body 9").contains("smpl-body 9"));
-    assert!(swap("\"parents\"", "\"porents\"").contains("no `parents`"));
+    assert!(swap("\"parents\"", "\"porents\"").contains("`parents`: missing, the file holds J_regressor.columns, "));
     let mut huge = bytes.clone();
     huge[..8].copy_from_slice(&u64::MAX.to_le_bytes());
     assert!(load("huge.safetensors", &huge).is_err());
@@ -280,8 +280,8 @@ fn missing_and_misshapen_arrays_of_a_model_are_named() {
 
         arrays.remove(i);
         let file = write_body(&format!("missing{i}.npz"), &arrays);
-        let error = BodyModel::load(&file).expect_err(key);
-        assert!(matches!(&error, Error::File(FileError::MissingKey { key: k, .. }) if k == key), "{error}");
+        let error = BodyModel::load(&file).expect_err(key).to_string();
+        assert!(error.contains(&format!("`{key}`: missing")), "{error}");
     }
     assert!(matches!(load("plain.py", b"import numpy").unwrap_err(), Error::Extension { .. }));
 }

@@ -96,7 +96,7 @@ fn clips_without_a_rate_and_under_other_names_are_read() {
         ],
     );
     let expected = MotionClip::load(&path).unwrap();
-    assert_eq!(MotionClip::rate_of(&path).unwrap(), Some(30.0));
+    assert_eq!(MotionClip::load_with_rate(&path).unwrap().1, Some(30.0));
     for arrays in [
         vec![("poses", floats(&[2, 24, 3], &rotations)), ("transl", floats(&[2, 3], &places))],
         vec![
@@ -111,8 +111,7 @@ fn clips_without_a_rate_and_under_other_names_are_read() {
         ],
     ] {
         let path = archive("other-names.npz", &arrays);
-        assert_eq!(MotionClip::load(&path).unwrap(), expected);
-        assert_eq!(MotionClip::rate_of(&path).unwrap(), None);
+        assert_eq!(MotionClip::load_with_rate(&path).unwrap(), (expected.clone(), None));
     }
 }
 

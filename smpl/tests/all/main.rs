@@ -3,10 +3,8 @@
 
 mod bodies;
 mod body;
-mod character;
 mod clip;
 mod embedded;
 mod golden;
-mod mesh;
 mod pose_gradient;
 mod volume;

@@ -24,6 +24,9 @@ const CORRUPTED: &str = "lab:";
 pub struct SceneOptions {
     pub files: LoadOptions,
     pub corruption: Corruption,
+    /// Identity of what is read ([`Source::identity`]); empty where unknown.
+    #[serde(skip_serializing_if = "String::is_empty")]
+    pub capture: String,
 }
 
 /// Corruptions of a capture.
@@ -38,6 +41,12 @@ pub struct Corruption {
 }
 
 impl SceneOptions {
+    /// The same for the capture as it is now.
+    pub fn identified(self, scene: &str, body: Option<&Path>) -> Result<Self> {
+        let capture = self.load(scene, body)?.identity()?;
+        Ok(Self { capture, ..self })
+    }
+
     /// The capture, corrupted; the scene of the source names the corruption.
     pub fn load(&self, scene: &str, body: Option<&Path>) -> Result<Source> {
         let mut corruption = self.corruption;
@@ -79,7 +88,7 @@ pub fn of_run(directory: &Path) -> Result<(RunConfig, Source)> {
         Some(text) => serde_json::from_str(text).with_context(|| format!("{}: config.toml", directory.display()))?,
         None => (run.scene.clone(), Corruption::default()),
     };
-    let options = SceneOptions { files: run.load.clone(), corruption };
+    let options = SceneOptions { files: run.load.clone(), corruption, capture: String::new() };
     let mut source = options.load(&scene, run.body.as_deref())?;
     source.restore(directory, &run.train)?;
     Ok((run, source))
@@ -167,7 +176,8 @@ impl SceneArguments {
             ragged_pixels: self.wrong_edge.unwrap_or(as_wrong.ragged_pixels),
             mask_pixels: self.wrong_mask.unwrap_or(as_wrong.mask_pixels),
         };
-        Ok(SceneOptions { files: self.load.options()?, corruption: Corruption { occlusion, wrong } })
+        let (files, corruption) = (self.load.options()?, Corruption { occlusion, wrong });
+        Ok(SceneOptions { files, corruption, capture: String::new() })
     }
 
     /// The same as on the command line: every flag that was given.

@@ -6,7 +6,8 @@ use anyhow::{Context, Error, Result, bail, ensure};
 use clap::{Args, ValueEnum};
 use indicatif::{ProgressBar, ProgressStyle};
 use occnerf::capture::Layout;
-use smpl::{Character, MotionClip};
+use rigged::Character;
+use smpl::MotionClip;
 use synth::{BODY, Obstacle, Occlusion, SynthConfig, Synthetic, synthesise};
 
 use crate::obstacle::ObstacleArguments;

@@ -2,9 +2,9 @@
 
 use glam::{DVec3, Vec3};
 
-use super::fragment::{Fragment, Pixel};
 use super::project::{Projected, Projection, STEP};
 use super::triangle::{BAND, Chunk, Triangle};
+use super::{Fragment, Pixel};
 
 /// Samples of a row that are tested together.
 const LANES: usize = 8;
@@ -21,20 +21,13 @@ pub(super) struct Band<'a> {
     pub projection: &'a Projection,
     pub projected: &'a [Projected],
     pub vertices: &'a [Vec3],
-    pub layers: &'a [&'a [[u32; 3]]],
+    pub faces: &'a [[u32; 3]],
     pub chunks: &'a [Chunk],
 }
 
-/// The samples of a band, layer by layer.
+/// The samples of a band.
 #[derive(Default)]
 pub(super) struct Strip {
-    layers: Vec<Layer>,
-    fragments: Vec<Fragment>,
-    counts: Vec<usize>,
-}
-
-#[derive(Default)]
-struct Layer {
     /// Reciprocal of the depth, 0 for nothing.
     inverse: Vec<f32>,
     face: Vec<u32>,
@@ -46,76 +39,45 @@ struct Layer {
 impl Band<'_> {
     pub fn draw<T>(&self, band: usize, strip: &mut Strip, out: &mut [T], shade: &impl Fn(Pixel<'_>) -> T) {
         let side = self.projection.side;
-        let [low, high] = self.fill(band, strip);
-        let columns = [low / side, high.div_ceil(side)];
-        let Strip { layers, fragments, counts } = strip;
-        let nothing = Fragment { face: NONE, depth: f32::INFINITY, barycentric: [0.0; 3] };
-        fragments.clear();
-        fragments.resize(side * side * self.layers.len(), nothing);
-        counts.clear();
-        counts.resize(side * side, 0);
+        self.fill(band, strip);
+        let columns = strip.columns[0] / side..strip.columns[1].div_ceil(side);
         let width = self.projection.width / side;
         let first = band * BAND / side * width;
+        let mut samples = vec![None; side * side];
         for (row, out) in out.chunks_mut(width).enumerate() {
             for (column, out) in out.iter_mut().enumerate() {
                 let mut any = false;
-                if (columns[0]..columns[1]).contains(&column) {
-                    for (sample, count) in counts.iter_mut().enumerate() {
-                        let at = [column * side + sample % side, row * side + sample / side];
-                        let fragments = &mut fragments[sample * self.layers.len()..][..self.layers.len()];
-                        *count = self.resolve(layers, at, band, fragments);
-                        any |= *count > 0;
+                if columns.contains(&column) {
+                    for (i, sample) in samples.iter_mut().enumerate() {
+                        *sample = self.resolve(strip, [column * side + i % side, row * side + i / side], band);
+                        any |= sample.is_some();
                     }
                 }
-                let counts = if any { &counts[..] } else { &[] };
-                let index = first + row * width + column;
-                *out = shade(Pixel { index, fragments, counts, layers: self.layers.len() });
+                let samples = if any { &samples[..] } else { &[] };
+                *out = shade(Pixel { index: first + row * width + column, samples });
             }
         }
     }
 
-    /// Depth-tests all triangles; returns the range of columns with any.
-    fn fill(&self, band: usize, strip: &mut Strip) -> [usize; 2] {
-        let stride = self.projection.width.next_multiple_of(LANES) + LANES;
-        strip.layers.resize_with(self.layers.len(), Layer::default);
-        for layer in &mut strip.layers {
-            layer.stride = stride;
-            layer.columns = [usize::MAX, 0];
-            layer.inverse.clear();
-            layer.inverse.resize(stride * BAND, 0.0);
-            layer.face.clear();
-            layer.face.resize(stride * BAND, NONE);
-        }
+    /// Depth-tests all triangles.
+    fn fill(&self, band: usize, strip: &mut Strip) {
+        strip.stride = self.projection.width.next_multiple_of(LANES) + LANES;
+        strip.columns = [usize::MAX, 0];
+        strip.inverse.clear();
+        strip.inverse.resize(strip.stride * BAND, 0.0);
+        strip.face.clear();
+        strip.face.resize(strip.stride * BAND, NONE);
         let first_row = (band * BAND) as i32;
         for chunk in self.chunks.iter().filter(|chunk| !chunk.bins[band].is_empty()) {
-            let layer = &mut strip.layers[chunk.layer];
-            arch().dispatch(Fill { layer, first_row, chunk, bin: &chunk.bins[band] });
+            arch().dispatch(Fill { strip: &mut *strip, first_row, chunk, bin: &chunk.bins[band] });
         }
-        strip
-            .layers
-            .iter()
-            .fold([usize::MAX, 0], |[low, high], layer| [low.min(layer.columns[0]), high.max(layer.columns[1])])
     }
 
-    /// Writes the fragments of a sample, nearest first; returns their number.
-    fn resolve(&self, layers: &[Layer], [x, y]: [usize; 2], band: usize, out: &mut [Fragment]) -> usize {
-        let mut count = 0;
-        let (mut first, centre) = (0, Vec3::new(x as f32 + 0.5, (band * BAND + y) as f32 + 0.5, 0.0));
-        for (layer, faces) in layers.iter().zip(self.layers) {
-            let face = layer.face[y * layer.stride + x];
-            if face != NONE {
-                let fragment = self.fragment(face, faces[(face - first) as usize], centre);
-                let mut at = count;
-                while at > 0 && out[at - 1].depth > fragment.depth {
-                    out[at] = out[at - 1];
-                    at -= 1;
-                }
-                out[at] = fragment;
-                count += 1;
-            }
-            first += faces.len() as u32;
-        }
-        count
+    /// The fragment of a sample.
+    fn resolve(&self, strip: &Strip, [x, y]: [usize; 2], band: usize) -> Option<Fragment> {
+        let face = strip.face[y * strip.stride + x];
+        let centre = Vec3::new(x as f32 + 0.5, (band * BAND + y) as f32 + 0.5, 0.0);
+        (face != NONE).then(|| self.fragment(face, self.faces[face as usize], centre))
     }
 
     /// Intersection of a triangle with the ray through the `centre` of a sample, by homogeneous
@@ -164,7 +126,7 @@ fn arch() -> pulp::Arch {
 
 /// Fills the triangles of a bin; a struct, since `pulp` compiles closures for the baseline.
 struct Fill<'a> {
-    layer: &'a mut Layer,
+    strip: &'a mut Strip,
     first_row: i32,
     chunk: &'a Chunk,
     bin: &'a [u32],
@@ -177,17 +139,17 @@ impl pulp::WithSimd for Fill<'_> {
     fn with_simd<S: pulp::Simd>(self, _: S) {
         for &index in self.bin {
             let triangle = &self.chunk.triangles[index as usize];
-            let [low, high] = &mut self.layer.columns;
+            let [low, high] = &mut self.strip.columns;
             *low = (*low).min(triangle.columns[0] as usize);
             *high = (*high).max(triangle.columns[1] as usize + 1);
             for start in (triangle.columns[0]..=triangle.columns[1]).step_by(BLOCK as usize) {
-                self.layer.fill(triangle, start, self.first_row);
+                self.strip.fill(triangle, start, self.first_row);
             }
         }
     }
 }
 
-impl Layer {
+impl Strip {
     /// Draws a block of columns of a triangle, from `start`.
     #[inline(always)]
     fn fill(&mut self, triangle: &Triangle, start: i32, first_row: i32) {

@@ -3,7 +3,7 @@
 use glam::{Affine3A, DVec3, Mat3, Vec3};
 use rayon::prelude::*;
 
-use super::options::RasterOptions;
+use super::RasterOptions;
 use crate::view::View;
 
 /// Steps of fixed-point coordinates between samples.

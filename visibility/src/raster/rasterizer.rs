@@ -4,10 +4,9 @@ use glam::Vec3;
 use rayon::prelude::*;
 
 use super::band::Band;
-use super::fragment::{Fragment, Pixel};
-use super::options::{RasterOptions, Samples};
 use super::project::{Projected, Projection};
 use super::triangle::{BAND, CHUNK, Chunk};
+use super::{Fragment, Pixel, RasterOptions, Samples};
 use crate::error::Error;
 use crate::view::View;
 
@@ -26,8 +25,8 @@ const MOST_SAMPLES: u32 = 1 << 14;
 /// let view = View { focal, centre, world_to_camera: Affine3A::IDENTITY, width: 8, height: 8 };
 /// let options = RasterOptions { samples: Samples::Four, ..Default::default() };
 /// let mut coverage = vec![0.0; 8 * 8];
-/// Rasterizer::default().draw(&vertices, &[&[[0, 1, 2]]], &view, &options, &mut coverage, |pixel| {
-///     pixel.samples().filter(|sample| !sample.is_empty()).count() as f32 / 4.0
+/// Rasterizer::default().draw(&vertices, &[[0, 1, 2]], &view, &options, &mut coverage, |pixel| {
+///     pixel.samples.iter().flatten().count() as f32 / 4.0
 /// })?;
 /// assert_eq!((coverage[4 * 8], coverage[4 * 8 + 7]), (1.0, 0.0));
 /// # Ok::<(), visibility::Error>(())
@@ -39,11 +38,8 @@ pub struct Rasterizer {
 }
 
 impl Rasterizer {
-    /// Draws `layers` of faces over the same `vertices` (V) and writes the result of `shade` for
-    /// each pixel into `out` (H·W, row-major).
-    ///
-    /// Every layer has its own depth buffer, so that a sample has a fragment of each: nested shells
-    /// can be composited. [`Rasterizer::faces`] is the plain visibility buffer of one layer.
+    /// Draws `faces` (F) over `vertices` (V) and writes the result of `shade` for each pixel into
+    /// `out` (H·W, row-major).
     ///
     /// Coverage is exact on corners rounded to 1/256 of the sample spacing, by the top-left rule on
     /// edges: an edge shared by two triangles belongs to one of them. Of faces at the same depth
@@ -53,15 +49,15 @@ impl Rasterizer {
     /// depend on its size.
     ///
     /// # Errors
-    /// [`Error::FaceIndex`]; [`Error::ImageSize`] for more than 16384 samples a row or column;
-    /// [`Error::TooMany`].
+    /// A face with an index outside `vertices`; more than 16384 samples a row or column, or 2³¹
+    /// vertices and faces.
     ///
     /// # Panics
     /// If `out` does not have `width · height` entries.
     pub fn draw<T: Send>(
         &mut self,
         vertices: &[Vec3],
-        layers: &[&[[u32; 3]]],
+        faces: &[[u32; 3]],
         view: &View,
         options: &RasterOptions,
         out: &mut [T],
@@ -72,11 +68,13 @@ impl Rasterizer {
         let side = options.samples.per_side();
         let most = MOST_SAMPLES / side;
         if view.width > most || view.height > most {
-            return Err(Error::ImageSize { width: view.width, height: view.height, most });
+            let (width, height) = (view.width, view.height);
+            let limit = format!("at most {most} × {most} are supported");
+            return Err(Error(format!("an image of {width} × {height} pixels, {limit}")));
         }
-        let count = layers.iter().map(|faces| faces.len()).fold(vertices.len(), usize::saturating_add);
+        let count = vertices.len().saturating_add(faces.len());
         if count > 1 << 31 {
-            return Err(Error::TooMany { count });
+            return Err(Error::too_many(count));
         }
         if out.is_empty() {
             return Ok(());
@@ -84,9 +82,9 @@ impl Rasterizer {
         let projection = Projection::new(view, options);
         projection.project(vertices, &mut self.projected);
         let bands = projection.height.div_ceil(BAND);
-        self.set_up(vertices, layers, &projection, bands)?;
+        self.set_up(vertices, faces, &projection, bands)?;
         let drawing =
-            Band { projection: &projection, projected: &self.projected, vertices, layers, chunks: &self.chunks };
+            Band { projection: &projection, projected: &self.projected, vertices, faces, chunks: &self.chunks };
         out.par_chunks_mut(width * BAND / side as usize)
             .enumerate()
             .with_max_len(1)
@@ -107,35 +105,25 @@ impl Rasterizer {
     ) -> Result<Vec<Option<Fragment>>, Error> {
         let options = RasterOptions { samples: Samples::One, ..*options };
         let mut out = vec![None; view.width as usize * view.height as usize];
-        let first = |pixel: Pixel<'_>| pixel.samples().next().and_then(|sample| sample.first().copied());
-        self.draw(vertices, &[faces], view, &options, &mut out, first)?;
+        let first = |pixel: Pixel<'_>| pixel.samples.first().copied().flatten();
+        self.draw(vertices, faces, view, &options, &mut out, first)?;
         Ok(out)
     }
 
     fn set_up(
         &mut self,
         vertices: &[Vec3],
-        layers: &[&[[u32; 3]]],
+        faces: &[[u32; 3]],
         projection: &Projection,
         bands: usize,
     ) -> Result<(), Error> {
-        let mut used = 0;
-        let mut first = 0;
-        for (layer, faces) in layers.iter().enumerate() {
-            for start in (0..faces.len()).step_by(CHUNK) {
-                if used == self.chunks.len() {
-                    self.chunks.push(Chunk::default());
-                }
-                let end = (start + CHUNK).min(faces.len());
-                self.chunks[used].begin(layer, first + start, start..end, bands);
-                used += 1;
-            }
-            first += faces.len();
+        self.chunks.resize_with(faces.len().div_ceil(CHUNK), Chunk::default);
+        for (i, chunk) in self.chunks.iter_mut().enumerate() {
+            chunk.begin(i * CHUNK..((i + 1) * CHUNK).min(faces.len()), bands);
         }
-        self.chunks.truncate(used);
         let projected = &self.projected;
         self.chunks.par_iter_mut().with_max_len(1).try_for_each(|chunk| {
-            let faces = &layers[chunk.layer][chunk.range.clone()];
+            let faces = &faces[chunk.range.clone()];
             chunk.set_up(faces, projected, vertices, projection)
         })
     }

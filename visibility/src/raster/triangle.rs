@@ -22,7 +22,7 @@ pub(super) struct Triangle {
     /// Samples in its bounding box: first and last column, first and last row.
     pub columns: [i32; 2],
     pub rows: [i32; 2],
-    /// Index of the face, counted through all layers.
+    /// Index of the face.
     pub face: u32,
     /// Reciprocal of the depth: at the first corner, least and most.
     pub inverse: [f32; 3],
@@ -30,22 +30,19 @@ pub(super) struct Triangle {
     pub slope: [f64; 2],
 }
 
-/// Set-up triangles of consecutive faces of a layer.
+/// Set-up triangles of consecutive faces.
 #[derive(Debug, Default)]
 pub(super) struct Chunk {
-    pub layer: usize,
-    /// Faces of the layer.
+    /// Indices of the faces.
     pub range: Range<usize>,
-    /// Index of the first, counted through all layers.
-    first: usize,
     pub triangles: Vec<Triangle>,
     /// Indices of the triangles that overlap each band.
     pub bins: Vec<Vec<u32>>,
 }
 
 impl Chunk {
-    pub fn begin(&mut self, layer: usize, first: usize, range: Range<usize>, bands: usize) {
-        (self.layer, self.first, self.range) = (layer, first, range);
+    pub fn begin(&mut self, range: Range<usize>, bands: usize) {
+        self.range = range;
         self.triangles.clear();
         self.bins.iter_mut().for_each(Vec::clear);
         self.bins.resize_with(bands, Vec::new);
@@ -62,14 +59,11 @@ impl Chunk {
             let mut corners = [&projected[..0]; 3];
             for (corner, &vertex) in corners.iter_mut().zip(face) {
                 let at = vertex as usize;
-                *corner = projected.get(at..=at).ok_or(Error::FaceIndex {
-                    face: self.range.start + i,
-                    vertex,
-                    vertices: projected.len(),
-                })?;
+                let outside = || Error::face_index(self.range.start + i, vertex, projected.len());
+                *corner = projected.get(at..=at).ok_or_else(outside)?;
             }
             let [a, b, c] = corners.map(|corner| &corner[0]);
-            let index = (self.first + i) as u32;
+            let index = (self.range.start + i) as u32;
             if a.inverse > 0.0 && b.inverse > 0.0 && c.inverse > 0.0 {
                 self.push(projection, index, [a, b, c].map(|v| ([v.x, v.y], v.inverse)));
             } else if !(a.inverse.is_nan() || b.inverse.is_nan() || c.inverse.is_nan()) {

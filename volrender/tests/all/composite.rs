@@ -6,7 +6,7 @@ use glam::Vec3;
 use proptest::prelude::*;
 use testkit::gradient::{Tolerance, assert_gradient};
 use testkit::oracle;
-use volrender::{Composite, RaySamples, SampleGradients, bin_midpoints, bin_widths, composite, composite_backward};
+use volrender::{Composite, RaySamples, SampleGradients, composite, composite_backward};
 
 #[derive(Clone, Debug, Default)]
 struct Samples {
@@ -178,9 +178,8 @@ proptest! {
     ) {
         edges.sort_by(f32::total_cmp);
         let n = edges.len() - 1;
-        let (mut t, mut delta) = (vec![0.0; n], vec![0.0; n]);
-        bin_midpoints(&edges, &mut t);
-        bin_widths(&edges, &mut delta);
+        let t: Vec<f32> = edges.windows(2).map(|bin| 0.5 * bin[0] + 0.5 * bin[1]).collect();
+        let delta: Vec<f32> = edges.windows(2).map(|bin| bin[1] - bin[0]).collect();
         let (sigma, likelihood, rgb) = (sigma[..n].to_vec(), vec![likelihood; n], vec![Vec3::X; n]);
         let ray = Samples { sigma, likelihood, delta, t, rgb };
         let (got, weights) = ray.composite(Vec3::ONE);

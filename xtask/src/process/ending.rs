@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use anyhow::Error;
 use occnerf::capture::CaptureError;
 
-use super::print::shown;
+use super::print::{failure, shown};
 
 /// Longest message, characters; some quote a file.
 const LONGEST: usize = 2000;
@@ -23,9 +23,9 @@ pub enum Ending {
         source: io::Error,
     },
     /// Another process works in the folder.
-    #[error("{} is in use by another process: wait for its end, or give another --out", .0.display())]
+    #[error("{} is in use by another process: wait for its end, or take another folder", .0.display())]
     Busy(PathBuf),
-    /// A signal came; everything is saved.
+    /// A signal came; the steps taken are saved.
     #[error("stopped by {}; {after}", name(*.signal))]
     Stopped {
         /// Its number.
@@ -49,6 +49,22 @@ impl Ending {
 /// Converts an I/O error of a result.
 pub fn unwritten(path: &Path) -> impl FnOnce(io::Error) -> Error + '_ {
     move |source| Ending::Unwritten { path: path.to_owned(), source }.into()
+}
+
+/// Checks that all was printed, for commands whose result is their output.
+///
+/// # Errors
+/// [`Ending::Unwritten`].
+pub fn delivered() -> Result<(), Error> {
+    failure().map_or(Ok(()), Err).map_err(unwritten(Path::new("standard output")))
+}
+
+/// Whether nothing can be written because that is forbidden.
+pub fn is_read_only(error: &Error) -> bool {
+    let forbidden = |source: &io::Error| {
+        matches!(source.kind(), io::ErrorKind::PermissionDenied | io::ErrorKind::ReadOnlyFilesystem)
+    };
+    matches!(error.downcast_ref(), Some(Ending::Unwritten { source, .. }) if forbidden(source))
 }
 
 /// Converts library errors on files in `place`, where results go; others are returned as they are.

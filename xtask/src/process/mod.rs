@@ -4,11 +4,13 @@ mod ending;
 mod lock;
 mod print;
 mod program;
+mod progress;
 mod stop;
 
-pub use self::ending::{Ending, described, one_line, results_in, unwritten};
-pub use self::lock::Lock;
+pub use self::ending::{Ending, delivered, described, is_read_only, one_line, results_in, unwritten};
+pub use self::lock::{Lock, still_held};
 pub use self::print::{err, out};
 pub use self::program::{EXIT_CODES, program};
+pub use self::progress::telling;
 pub use self::stop::{Guard, watch};
 pub use crate::{note, say};

@@ -1,7 +1,11 @@
-//! Printing, which ignores failed writes and escapes terminal control characters.
+//! Printing, which never stops work and escapes terminal control characters.
 
 use std::fmt::{Arguments, Write as _};
-use std::io::Write;
+use std::io::{Error, ErrorKind, Write};
+use std::sync::atomic::{AtomicI32, Ordering};
+
+/// System's code of the last failed write to standard output; 0 for none.
+static FAILED: AtomicI32 = AtomicI32::new(0);
 
 /// Prints a line on standard output, as `println!` takes it.
 #[macro_export]
@@ -17,19 +21,28 @@ macro_rules! note {
 
 /// Prints a line on standard output.
 pub fn out(text: Arguments<'_>) {
-    line(&mut std::io::stdout().lock(), text);
+    if let Err(error) = line(&mut std::io::stdout().lock(), text)
+        && error.kind() != ErrorKind::BrokenPipe
+    {
+        FAILED.store(error.raw_os_error().unwrap_or(0), Ordering::Relaxed);
+    }
+}
+
+/// Error of the last failed write to standard output, but for a closed pipe, which wants no more.
+pub fn failure() -> Option<Error> {
+    Some(FAILED.load(Ordering::Relaxed)).filter(|code| *code != 0).map(Error::from_raw_os_error)
 }
 
 /// Prints a line on standard error.
 pub fn err(text: Arguments<'_>) {
-    line(&mut std::io::stderr().lock(), text);
+    // Results do not depend on a closed pipe or a full disk.
+    let _ = line(&mut std::io::stderr().lock(), text);
 }
 
-fn line(to: &mut impl Write, text: Arguments<'_>) {
+fn line(to: &mut impl Write, text: Arguments<'_>) -> std::io::Result<()> {
     let mut text = shown(&text.to_string());
     text.push('\n');
-    // Results do not depend on a closed pipe or a full disk.
-    let _ = to.write_all(text.as_bytes()).and_then(|()| to.flush());
+    to.write_all(text.as_bytes()).and_then(|()| to.flush())
 }
 
 /// Text with control and bidirectional characters, except line breaks and tabs, as `\u{…}`.
@@ -72,6 +85,6 @@ mod tests {
                 Err(Error::from_raw_os_error(28))
             }
         }
-        line(&mut Full, format_args!("lost"));
+        assert!(line(&mut Full, format_args!("lost")).is_err());
     }
 }

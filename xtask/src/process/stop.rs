@@ -8,7 +8,7 @@ static SIGNAL: AtomicI32 = AtomicI32::new(0);
 static GUARDS: AtomicUsize = AtomicUsize::new(0);
 
 /// Defers the first signal; a second one, or one without a guard, ends the program at once. Files
-/// stay whole, see [`occnerf::replace_file`].
+/// stay whole, see [`array_files::replace_file`].
 #[must_use]
 pub struct Guard(());
 
@@ -35,21 +35,35 @@ impl Drop for Guard {
 /// script) stay ignored.
 #[cfg(unix)]
 pub fn watch() -> std::io::Result<()> {
+    use std::thread::{Builder, sleep};
+    use std::time::Duration;
+
     use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
+
+    use super::ending::Ending;
+    use crate::note;
 
     let signals = match ignored() {
         Some(ignored) => [SIGHUP, SIGINT, SIGTERM].into_iter().filter(|s| ignored >> (s - 1) & 1 == 0).collect(),
         None => vec![SIGINT, SIGTERM],
     };
     let mut signals = signal_hook::iterator::Signals::new(signals)?;
-    std::thread::spawn(move || {
+    let listen = move || {
         for signal in signals.forever() {
-            if GUARDS.load(Ordering::SeqCst) == 0 || SIGNAL.swap(signal, Ordering::SeqCst) != 0 {
+            let guarded = GUARDS.load(Ordering::SeqCst) != 0;
+            if !guarded {
+                let after = "the result had not been made, and every file is whole".to_owned();
+                // Standard error may be blocked.
+                let said = Builder::new().spawn(move || note!("{}", Ending::Stopped { signal, after }));
+                let waits = |_: &u32| said.as_ref().is_ok_and(|said| !said.is_finished());
+                (0..50).take_while(waits).for_each(|_| sleep(Duration::from_millis(10)));
+            }
+            if !guarded || SIGNAL.swap(signal, Ordering::SeqCst) != 0 {
                 std::process::exit(128 + signal);
             }
         }
-    });
-    Ok(())
+    };
+    Builder::new().spawn(listen).map(drop)
 }
 
 /// No handling on other systems.

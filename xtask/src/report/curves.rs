@@ -3,9 +3,10 @@
 use std::fmt::Write as _;
 use std::path::Path;
 
-use anyhow::{Context, Result, bail};
+use anyhow::{Result, bail};
 
 use crate::html::escape;
+use crate::run::read_text;
 use crate::scale::{Scale, number};
 
 /// Size of a plot in SVG units.
@@ -27,7 +28,7 @@ impl Log {
         if !path.exists() {
             return Ok(None);
         }
-        let text = std::fs::read_to_string(path).with_context(|| path.display().to_string())?;
+        let text = read_text(path)?;
         let rows: Vec<&str> = text.lines().collect();
         let mut values = Vec::new();
         for (i, row) in rows.iter().enumerate() {

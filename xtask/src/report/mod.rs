@@ -4,19 +4,25 @@ mod curves;
 mod page;
 mod viewer;
 
+use std::fs::File;
+use std::io::{ErrorKind, Read};
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, ensure};
+use array_files::read_bounded;
 
 pub use self::curves::Log;
 use self::curves::curves;
 pub use self::page::Page;
 use self::viewer::{Views, viewers};
+use crate::process::note;
 use crate::run::{self, LOG, Metrics, PERSON, RunConfig};
 use crate::table;
 
 /// Largest embedded file.
 const MAX_BYTES: u64 = 16 << 20;
+/// Bytes of a viewer page that hold its source.
+const PAGE_START: u64 = 4096;
 const NOVEL: &str = "renders/novel_views.png";
 const CAPTIONS: [(&str, &str); 2] = [
     ("novel_views.png", "Views that training never saw: truth left, result right; a row a camera"),
@@ -52,6 +58,9 @@ impl Run {
     pub fn read(directory: &Path) -> Result<Self> {
         RunConfig::read(directory)?;
         let metrics = Metrics::read(directory)?;
+        if metrics.of != run::identity(directory)? && directory.join(run::CHECKPOINT).is_file() {
+            note!("warning: {}: its scores are of an earlier training; cargo xtask eval", directory.display());
+        }
         Ok(Self { name: name(directory), directory: directory.to_owned(), metrics })
     }
 
@@ -105,8 +114,7 @@ pub fn add_runs(page: &mut Page, runs: &[Run], folder: &Path) -> Result<()> {
     }
     page.heading("Configuration");
     for run in runs {
-        let path = run.directory.join("config.toml");
-        let text = std::fs::read_to_string(&path).with_context(|| path.display().to_string())?;
+        let text = run::read_text(&run.directory.join("config.toml"))?;
         page.folded(&format!("{}: config.toml", run.name), &text);
     }
     Ok(())
@@ -118,7 +126,11 @@ fn add_people(page: &mut Page, runs: &[Run], folder: &Path) -> Result<()> {
         let path = std::path::absolute(run.directory.join(PERSON))?;
         if path.is_file() {
             let from = path.strip_prefix(std::path::absolute(folder)?).unwrap_or(&path);
-            page.link(&from.to_string_lossy(), &format!("{}: the person, to turn around and play", run.name));
+            let mut start = Vec::new();
+            File::open(&path)?.take(PAGE_START).read_to_end(&mut start)?;
+            let of = run::identity(&run.directory)?;
+            let stale = if String::from_utf8_lossy(&start).contains(&of) { "" } else { " (before the last training)" };
+            page.link(&from.to_string_lossy(), &format!("{}: the person, to turn around and play{stale}", run.name));
         }
     }
     Ok(())
@@ -151,12 +163,13 @@ pub fn files(directory: &Path, extension: &str) -> Result<Vec<PathBuf>> {
 
 /// The file's bytes; `None` for a large file, which the page names.
 pub fn bytes(page: &mut Page, path: &Path) -> Result<Option<Vec<u8>>> {
-    let size = std::fs::metadata(path).with_context(|| path.display().to_string())?.len();
-    if size > MAX_BYTES {
-        page.paragraph(&format!("{} is left out: {} MB.", path.display(), size >> 20));
-        return Ok(None);
+    match read_bounded(path, MAX_BYTES) {
+        Err(error) if error.kind() == ErrorKind::FileTooLarge => {
+            page.paragraph(&format!("{} is left out: {error}.", path.display()));
+            Ok(None)
+        }
+        read => read.map(Some).with_context(|| path.display().to_string()),
     }
-    std::fs::read(path).map(Some).with_context(|| path.display().to_string())
 }
 
 /// The cells of a Markdown table, without its rule.

@@ -38,7 +38,7 @@ pub struct ViewArguments {
 
 /// Runs the command.
 pub fn view(arguments: &ViewArguments) -> Result<()> {
-    let mut person = avatar::of_run(&arguments.run)?;
+    let (mut person, _lock) = avatar::of_run(&arguments.run)?;
     for path in &arguments.motion {
         avatar::add_motion(&mut person, path, arguments.fps)?;
     }
@@ -68,6 +68,7 @@ pub fn page(person: &Avatar) -> Result<String> {
         PAGE,
         &[
             ("nonce", &nonce),
+            ("source", &escape(&person.source)),
             ("title", &escape(name)),
             ("facts", &escape(&facts)),
             ("style", STYLE),

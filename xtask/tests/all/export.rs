@@ -58,7 +58,7 @@ fn every_format_is_written_and_read_back() {
     let glb = out("person.glb");
     let said = done(&["export", text(&run), "--format", "glb", "--out", text(&glb), "--motion", text(&motion)]);
     assert!(said.contains("person.glb") && said.contains("dance"), "{said}");
-    let character = smpl::Character::load(&glb).unwrap();
+    let character = rigged::Character::load(&glb).unwrap();
     let names: Vec<&str> = character.animations.iter().map(|a| a.name.as_str()).collect();
     assert_eq!(names, [HOSTILE, "dance"]);
     assert!((character.animations[1].duration - 3.0 / 25.0).abs() < 1e-6);
@@ -70,9 +70,9 @@ fn every_format_is_written_and_read_back() {
     let obj = out("person.obj");
     done(&["export", text(&run), "--format", "obj", "--out", text(&obj), "--frame", "1"]);
     assert!(out("person.mtl").exists() && out("person.png").exists());
-    let first = smpl::load_mesh(&obj).unwrap();
+    let first = rigged::load_mesh(&obj).unwrap();
     done(&["export", text(&run), "--format", "obj", "--out", text(&obj), "--frame", "1", "--motion", text(&motion)]);
-    let danced = smpl::load_mesh(&obj).unwrap();
+    let danced = rigged::load_mesh(&obj).unwrap();
     assert_eq!(first.faces, danced.faces);
     assert!(first.vertices[0].distance(danced.vertices[0]) > 0.01);
 
@@ -116,8 +116,8 @@ fn whatever_is_wrong_is_said_in_one_line() {
     };
     glb("/no/such/run", out, &[], &["/no/such/run", "no such run"]);
     let empty = folder("export-empty");
-    glb(text(&empty), out, &[], &["checkpoint.safetensors", "export-empty"]);
-    refused(&["view", text(&empty)], &["checkpoint.safetensors"]);
+    glb(text(&empty), out, &[], &["is not a run", "export-empty"]);
+    refused(&["view", text(&empty)], &["is not a run"]);
     glb(run_text, text(&run.join("person.obj")), &[], &["--out", "person.obj", "another format", "Glb"]);
     refused(&["export", run_text, "--out", text(&run.join("person"))], &["--out", ".glb, .ply, .obj or .npz"]);
     glb(run_text, run_text, &[], &["--out", "is a folder"]);

@@ -42,7 +42,8 @@ pub(super) fn find(
 }
 
 fn fits(tool: Tool, model: &BodyModel) -> bool {
-    model.num_joints() == tool.joints() && model.num_betas() >= super::fit::BETAS
+    let joints = model.num_joints();
+    (joints == tool.joints() || tool.is_points() && joints == SMPLX) && model.num_betas() >= super::fit::BETAS
 }
 
 /// Download hint for an unsuitable body.

@@ -114,6 +114,7 @@ fn frame(path: &Path, index: usize, record: &Record, camera: &Camera) -> Result<
         focal: camera.focal,
         centre: camera.centre,
         mask: None,
+        points: Vec::new(),
     })
 }
 

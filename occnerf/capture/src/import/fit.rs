@@ -35,6 +35,10 @@ pub enum Tool {
     /// A scene of NeuMan (Jiang et al. 2022), `smpl_output_*.pkl` with `alignments.npy` and
     /// `sparse/`.
     NeuMan,
+    /// SAM 3D Body (Yang et al. 2026), its list of dictionaries: points, no body model.
+    Sam3dBody,
+    /// Joints of any estimator, (T, J, 3): points, no body model.
+    Joints,
 }
 
 impl Tool {
@@ -51,6 +55,8 @@ impl Tool {
             Self::EasyMocap => "EasyMocap",
             Self::PeopleSnapshot => "PeopleSnapshot",
             Self::NeuMan => "NeuMan",
+            Self::Sam3dBody => "SAM 3D Body",
+            Self::Joints => "joints",
         }
     }
 
@@ -58,6 +64,12 @@ impl Tool {
     #[must_use]
     pub fn joints(self) -> usize {
         if self.hands_at_mean().is_some() { SMPLX } else { SMPL }
+    }
+
+    /// Whether it gives points of the body, to which a body model is fitted.
+    #[must_use]
+    pub fn is_points(self) -> bool {
+        matches!(self, Self::Sam3dBody | Self::Joints)
     }
 
     /// For SMPL-X, whether the hands have the mean pose rather than a flat one.
@@ -108,6 +120,8 @@ pub(super) struct FitFrame {
     pub focal: [f64; 2],
     pub centre: [f64; 2],
     pub mask: Option<OwnMask>,
+    /// Points of the body in the camera, NaN where missing, of a fit without pose.
+    pub points: Vec<DVec3>,
 }
 
 /// Position of the pelvis in the camera, for its rest position J.
@@ -137,7 +151,7 @@ impl FitFrame {
         [focal, centre]: [[f64; 2]; 2],
     ) -> Self {
         let (world_to_camera, about, offset) = (DMat3::IDENTITY, About::Pelvis, DVec3::from_slice(place));
-        Self { index, pose, betas, world_to_camera, about, offset, focal, centre, mask: None }
+        Self { index, pose, betas, world_to_camera, about, offset, focal, centre, mask: None, points: Vec::new() }
     }
 
     /// The pelvis in the camera, for a body whose pelvis at rest is at `joint`.

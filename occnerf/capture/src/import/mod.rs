@@ -5,6 +5,7 @@
 //!
 //! - fits: WHAM, 4D-Humans / PHALP, GVHMR, PromptHMR, VIBE / PyMAF, ROMP, EasyMocap, and the data sets
 //!   PeopleSnapshot and NeuMan ([`Tool`]);
+//! - points, to which a body is fitted: SAM 3D Body, and arrays of joints of any estimator;
 //! - masks: object ids (SAM 2's palette PNGs or folders, Grounded-SAM-2's `.npy`), coverage
 //!   (MatAnyone, plain 0/255 pictures), or the fit's own (4D-Humans / PHALP, PromptHMR).
 //!
@@ -25,10 +26,14 @@ mod neuman;
 mod options;
 mod peoplesnapshot;
 mod phalp;
+mod points;
+#[cfg(test)]
+mod points_tests;
 mod prompthmr;
 mod read;
 mod rle;
 mod romp;
+mod sam3d;
 #[cfg(test)]
 mod tests;
 mod vibe;
@@ -83,7 +88,7 @@ pub struct Imported {
     pub focal: f64,
     /// Kind of the masks.
     pub masks: &'static str,
-    /// The body model's file; `None` for the embedded body, in its mean shape.
+    /// The body model's file; `None` for the embedded body, in its mean shape unless fitted to points.
     pub body: Option<PathBuf>,
 }
 
@@ -98,7 +103,10 @@ pub fn import(options: &ImportOptions, out: &Path) -> Result<Imported, CaptureEr
     if let Some(focal) = options.focal.filter(|focal| !(*focal >= 1.0 && *focal <= 1e6)) {
         return Err(CaptureError::setting("focal", "1 to 1000000 pixels", focal));
     }
-    let (fit, joined) = read::read(&options.fit, &video)?;
+    let (fit, joined) = match &options.joints {
+        Some(set) => read::joints(&options.fit, set, &video)?,
+        None => read::read(&options.fit, &video)?,
+    };
     let tool = fit.tool;
     let (mut person, others, continued) = choose(&options.fit, fit.people, options.person.as_deref())?;
     let gaps_of_video = Some(video.gaps()).filter(|gaps| !gaps.is_empty());
@@ -114,7 +122,10 @@ pub fn import(options: &ImportOptions, out: &Path) -> Result<Imported, CaptureEr
         (Some(true), Some(path)) => body::mean_hands(path)?,
         _ => Vec::new(),
     };
-    if body_path.is_none() {
+    if tool.is_points() {
+        let set = options.joints.as_deref().unwrap_or(sam3d::SET);
+        notes.push(points::solve(&options.fit, set, &mut person, &model)?);
+    } else if body_path.is_none() {
         // Shape coefficients of another body.
         person.frames.iter_mut().for_each(|frame| frame.betas.clear());
     }

@@ -23,6 +23,8 @@ pub struct ImportOptions {
     pub focal: Option<f64>,
     /// The body model; `None`: one that fits, from a folder `body` near the fit or the frames.
     pub body: Option<PathBuf>,
+    /// Joint set of a fit that is an array of joints, one of [`point_fit::joint_sets`].
+    pub joints: Option<String>,
     /// Whether pictures are copied rather than linked.
     pub copy: bool,
 }

@@ -12,18 +12,30 @@ use array_files::torch::{TorchFile, is_torch};
 use super::fit::{Fit, FitFrame, Person};
 use super::item::{Item, dictionary};
 use super::video::Video;
-use super::{easymocap, gvhmr, join, neuman, peoplesnapshot, phalp, prompthmr, romp, vibe, wham};
+use super::{easymocap, gvhmr, join, neuman, peoplesnapshot, phalp, points, prompthmr, romp, sam3d, vibe, wham};
 use crate::CaptureError;
 use crate::checks::{MAX_ANGLE, MAX_BETA};
 
 /// Expected formats.
-const TOOLS: &str = "a result of WHAM, 4D-Humans / PHALP, GVHMR, PromptHMR, VIBE or ROMP, EasyMocap's folder, \
-    poses.npz of PeopleSnapshot, or smpl_output_*.pkl of NeuMan";
+const TOOLS: &str = "a result of WHAM, 4D-Humans / PHALP, GVHMR, PromptHMR, VIBE, ROMP or SAM 3D Body, EasyMocap's \
+    folder, joints (with --joints), poses.npz of PeopleSnapshot, or smpl_output_*.pkl of NeuMan";
 
 /// Reads a fit; the format is detected by content. Also returns how its frames were joined with the
 /// pictures, unless by name.
 pub(super) fn read(path: &Path, video: &Video) -> Result<(Fit, Option<String>), CaptureError> {
-    let mut fit = if path.is_dir() { easymocap::read(path, video)? } else { read_file(path, video)? };
+    let fit = match path.is_dir() {
+        true => sam3d::folder(path, video)?.map_or_else(|| easymocap::read(path, video), Ok)?,
+        false => read_file(path, video)?,
+    };
+    checked(path, fit, video)
+}
+
+/// Reads an array of joints of the set called `set`.
+pub(super) fn joints(path: &Path, set: &str, video: &Video) -> Result<(Fit, Option<String>), CaptureError> {
+    checked(path, points::read(path, set, points::count(set)?, video)?, video)
+}
+
+fn checked(path: &Path, mut fit: Fit, video: &Video) -> Result<(Fit, Option<String>), CaptureError> {
     let note = join(path, &mut fit, video)?;
     for person in &fit.people {
         check(path, person, video)?;
@@ -40,8 +52,14 @@ fn join(path: &Path, fit: &mut Fit, video: &Video) -> Result<Option<String>, Cap
         Some(names) => {
             let names: Vec<&str> = names.iter().map(String::as_str).collect();
             let expected = || format!("names of pictures, as {}", video.names[0]);
-            let joined = join::by_name(video, &names)
-                .map_err(|_| CaptureError::invalid(path, "pictures", expected(), format!("{} and others", names[0])))?;
+            let joined = join::by_name(video, &names).map_err(|why| match why {
+                join::Disjoint::Twice(number) => {
+                    CaptureError::invalid(path, format!("number {number}"), "one entry a frame", "several")
+                }
+                join::Disjoint::Apart => {
+                    CaptureError::invalid(path, "pictures", expected(), format!("{} and others", names[0]))
+                }
+            })?;
             (joined, (0..names.len()).collect())
         }
         None => {
@@ -62,6 +80,9 @@ fn join(path: &Path, fit: &mut Fit, video: &Video) -> Result<Option<String>, Cap
 }
 
 fn read_file(path: &Path, video: &Video) -> Result<Fit, CaptureError> {
+    if path.exists() && !path.is_file() {
+        return Err(CaptureError::invalid(path, "the file", "a plain file", "a device or pipe"));
+    }
     let mut file = File::open(path).map_err(CaptureError::io(path))?;
     if let Some(name @ ("tracking_results.pth" | "slam_results.pth")) = path.file_name().and_then(|name| name.to_str())
     {
@@ -94,6 +115,15 @@ fn read_file(path: &Path, video: &Video) -> Result<Fit, CaptureError> {
             // Archives of PyTorch hold a pickle.
             if !npz.keys().is_empty() && !npz.keys().iter().any(|key| key.ends_with("data.pkl")) {
                 let found = format!("an archive of {}", npz.keys().join(", "));
+                // People of one picture, or an array of objects.
+                let is_person = npz.keys().iter().any(|key| key == sam3d::POINTS);
+                if is_person || npz.keys().len() == 1 {
+                    match dictionary(&mut npz).map(|value| sam3d::frames(&value, video)) {
+                        Ok(Some(frames)) => return sam3d::read(path, frames, video),
+                        Err(error) if is_person => return Err(error),
+                        _ => {}
+                    }
+                }
                 let fit = match npz.keys().iter().any(|key| key == gvhmr::CAMERAS) {
                     true => gvhmr::from_arrays(&Item::new(path, &dictionary(&mut npz)?), video)?,
                     false => None,
@@ -103,6 +133,9 @@ fn read_file(path: &Path, video: &Video) -> Result<Fit, CaptureError> {
         }
         let mut file = TorchFile::open(&name, BufReader::new(file))?;
         return gvhmr::read(path, &mut file, video);
+    }
+    if matches!(start.trim_ascii_start().first(), Some(b'{' | b'[')) {
+        return parse(path, &sam3d::json(path)?, video);
     }
     // First bytes of pickles and of compressed files.
     let begins = |with: &u8| start.first() == Some(with);
@@ -116,6 +149,9 @@ fn read_file(path: &Path, video: &Video) -> Result<Fit, CaptureError> {
 /// Reads a pickle's value.
 pub(super) fn parse(path: &Path, value: &Value, video: &Video) -> Result<Fit, CaptureError> {
     let root = Item::new(path, value);
+    if let Some(frames) = sam3d::frames(value, video) {
+        return sam3d::read(path, frames, video);
+    }
     if value.get("people").is_some() && value.get("camera").is_some() {
         return prompthmr::read(&root, video);
     }

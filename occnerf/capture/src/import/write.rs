@@ -1,5 +1,6 @@
 //! Writing of an imported capture.
 
+use std::io::Write;
 use std::path::{Component, Path, PathBuf};
 
 use glam::DVec3;
@@ -53,7 +54,7 @@ pub(super) fn capture(parts: &Parts<'_>, out: &Path) -> Result<(), CaptureError>
         parts.placed.iter().map(|placed| (parts.video.names[placed.index].clone(), record(placed, parts.betas)));
     let path = out.join("metadata.json");
     let text = Value::Object(records.collect::<Map<_, _>>()).to_string();
-    std::fs::write(&path, text).map_err(CaptureError::io(&path))
+    array_files::replace_file(&path, |to| to.write_all(text.as_bytes())).map_err(CaptureError::io(&path))
 }
 
 /// Writes the body model for [`crate::own_body`].

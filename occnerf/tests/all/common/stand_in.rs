@@ -95,6 +95,7 @@ pub fn stand_in(scene: &Scene, colors: &PriorColors) -> Avatar {
     let motion = motion_of_bones(&skeleton, &frames, 30.0);
     Avatar {
         name: scene.name.clone(),
+        source: String::new(),
         vertices,
         normals: smooth,
         uvs,

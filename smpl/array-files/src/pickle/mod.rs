@@ -29,7 +29,7 @@ pub use value::{PERSISTENT, Value};
 /// Reads a pickle, plain or compressed by joblib, or a `.npy` file of objects or plain values.
 ///
 /// # Errors
-/// [`Error::Io`], [`Error::TooLarge`] beyond 2 GiB, [`Error::Pickle`], [`Error::Npy`].
+/// [`Error::Io`], also beyond 2 GiB; [`Error::Pickle`], [`Error::Npy`].
 pub fn read(path: &Path) -> Result<Value, Error> {
     from_bytes(&path.display().to_string(), read_file(path)?)
 }
@@ -37,7 +37,7 @@ pub fn read(path: &Path) -> Result<Value, Error> {
 /// [`read`] for a file in memory; `file` names it in errors.
 ///
 /// # Errors
-/// [`Error::TooLarge`], [`Error::Pickle`], [`Error::Npy`].
+/// [`Error::Invalid`] for a bomb, [`Error::Pickle`], [`Error::Npy`].
 pub fn from_bytes(file: &str, bytes: Vec<u8>) -> Result<Value, Error> {
     let bytes = compressed::unpacked(file, bytes)?;
     if !bytes.starts_with(MAGIC) {

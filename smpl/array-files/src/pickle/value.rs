@@ -66,7 +66,6 @@ pub enum Value {
 
 impl Value {
     /// Python's name of the type.
-    #[must_use]
     pub fn type_name(&self) -> &'static str {
         match self {
             Self::None => "None",
@@ -87,7 +86,6 @@ impl Value {
 
     /// The value under the text `key`, or the byte string of that text, of a dict or of an object's
     /// attributes. `None` if there is none, and for other types.
-    #[must_use]
     pub fn get(&self, key: &str) -> Option<&Self> {
         match self {
             Self::Dict(items) => items.iter().rev().find(|(k, _)| k.is_text(key)).map(|(_, value)| value),
@@ -106,7 +104,6 @@ impl Value {
     }
 
     /// The items of a list, tuple, set or array of objects. `None` for other types.
-    #[must_use]
     pub fn items(&self) -> Option<&[Self]> {
         match self {
             Self::List(items) | Self::Tuple(items) | Self::Set(items) => Some(items),
@@ -116,7 +113,6 @@ impl Value {
     }
 
     /// The text of a `str`. `None` for other types.
-    #[must_use]
     pub fn as_str(&self) -> Option<&str> {
         match self {
             Self::Str(text) => Some(text),
@@ -125,7 +121,6 @@ impl Value {
     }
 
     /// This array of numbers, or the one that a chumpy object wraps. `None` for other types.
-    #[must_use]
     pub fn as_array(&self) -> Option<&NdArray> {
         match self {
             Self::Array(array) => Some(array),

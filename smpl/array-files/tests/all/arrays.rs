@@ -46,12 +46,15 @@ fn npz_errors_name_file_key_and_shapes() {
     for part in ["numpy.npz", "`f4`", "[2, 3]", "[6890, _]"] {
         assert!(e.contains(part), "{e:?} lacks {part:?}");
     }
-    let e = npz.f32("nothing", &[]).unwrap_err();
-    assert!(matches!(&e, Error::MissingKey { key, available, .. } if key == "nothing" && available.len() == 10));
-    assert!(matches!(npz.f32("nan", &[None]), Err(Error::NotFinite { index: 1, key, .. }) if key == "nan"));
-    assert!(matches!(npz.f32("huge", &[None]), Err(Error::NotFinite { index: 0, .. })));
-    assert!(matches!(npz.i64("f4", &[None, None]), Err(Error::Type { .. })));
-    assert!(matches!(npz.array("text"), Err(Error::Type { key, .. }) if key == "text"));
+    let refused = |error: Error, expected: &str| {
+        let error = error.to_string();
+        assert!(error.contains(expected), "{error}");
+    };
+    refused(npz.f32("nothing", &[]).unwrap_err(), "`nothing`: missing, the file holds f4, ");
+    refused(npz.f32("nan", &[None]).unwrap_err(), "`nan`: not finite at flat index 1");
+    refused(npz.f32("huge", &[None]).unwrap_err(), "`huge`: not finite at flat index 0");
+    refused(npz.i64("f4", &[None, None]).unwrap_err(), "`f4`: floats, expected integers");
+    refused(npz.array("text").unwrap_err(), "`text`: element type ");
     assert!(matches!(Npz::open(Path::new("/no/such.npz")), Err(Error::Io { .. })));
 }
 
@@ -83,7 +86,9 @@ fn headers_that_claim_too_much_are_refused_before_memory_is_taken() {
         let file = Temporary::new(&format!("claim{i}.npy"), &npy(&header, &[0; 8]));
         let error = read_npy(&file.0).expect_err(shape);
         match error {
-            Error::TooLarge { .. } => assert!(large, "{shape}: {error}"),
+            Error::Invalid { .. } => {
+                assert!(large && error.to_string().contains("more than the limit"), "{shape}: {error}")
+            }
             Error::Npy { .. } => assert!(!large, "{shape}: {error}"),
             _ => panic!("{shape}: {error}"),
         }
@@ -114,7 +119,7 @@ fn malformed_npy_headers_are_errors() {
     {
         let file = Temporary::new(&format!("header{i}.npy"), &npy(header, &[0; 8]));
         let error = read_npy(&file.0).expect_err(header);
-        assert!(matches!(error, Error::Npy { .. } | Error::Type { .. }), "{header}: {error}");
+        assert!(matches!(error, Error::Npy { .. } | Error::Invalid { .. }), "{header}: {error}");
     }
 }
 
@@ -201,5 +206,6 @@ fn the_limit_of_an_array_counts_the_memory_it_takes_decoded() {
     // 200 MB of bytes in the file, 1.6 GB once they are 64-bit integers.
     let header = "{'descr': '|u1', 'fortran_order': False, 'shape': (200000000,), }";
     let file = Temporary::new("widened.npy", &npy(header, &[]));
-    assert!(matches!(read_npy(&file.0), Err(Error::TooLarge { claimed: 1_600_000_000, .. })));
+    let error = read_npy(&file.0).unwrap_err().to_string();
+    assert!(error.contains("claims 1600000000 bytes, more than the limit of 1073741824"), "{error}");
 }

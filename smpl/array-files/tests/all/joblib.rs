@@ -80,7 +80,7 @@ fn run(name: &str, program: Vec<u8>) -> (u64, bool) {
     let mut outcome = None;
     let taken = measure(|| outcome = Some(pickle::from_bytes(name, program))).bytes_max;
     match outcome {
-        Some(Err(Error::Pickle { .. } | Error::TooLarge { .. })) => (taken, true),
+        Some(Err(Error::Pickle { .. } | Error::Invalid { .. })) => (taken, true),
         Some(Ok(_)) => (taken, false),
         other => panic!("{name}: {:?}", other.map(|value| value.map(|v| v.type_name()))),
     }

@@ -1,7 +1,7 @@
 //! `bench`: what every approximation costs and is worth, and where methods break.
 
 mod axes;
-mod baked;
+mod baking;
 pub mod chart;
 mod cost;
 mod difficulty;
@@ -18,7 +18,7 @@ use anyhow::{Result, bail, ensure};
 use clap::{Args, Subcommand};
 use occnerf::capture::Layout;
 
-pub use self::baked::Baking;
+pub use self::baking::Baking;
 pub use self::difficulty::Difficulty;
 use crate::results::{self, Section};
 use crate::sweep::{Line, Place, Runner, SittingArguments, job};
@@ -51,8 +51,6 @@ enum What {
     /// Where the time of a step goes, and how time and memory grow with rays, samples, table,
     /// vertices, frames and pixels.
     Cost(CostArguments),
-    /// A run's baked person against its field: a table of scores and speeds, and pictures.
-    Baked(baked::BakedArguments),
     /// What registration makes of wrong priors: degrees and millimetres against the demo's true
     /// bodies.
     Registration(registration::RegistrationArguments),
@@ -136,7 +134,6 @@ struct KernelArguments {
 /// Runs the command.
 pub fn bench(arguments: &BenchArguments) -> Result<()> {
     match &arguments.what {
-        What::Baked(arguments) => baked::baked(arguments),
         What::Registration(arguments) => registration::registration(arguments),
         What::Pareto(arguments) => pareto(arguments),
         What::Stability(arguments) => stability(arguments),
@@ -179,8 +176,12 @@ impl SceneArguments {
         ensure!(Path::new(scene).is_dir(), "{scene}: expected the demo, or a capture on disk (synth makes one)");
         // The one layout that leaves open what hides the person.
         let obstacle = Layout::detect(Path::new(scene))? == Layout::ZjuMocap;
-        let place = Place::Scene { scene: scene.to_owned(), body: self.body.clone(), load: self.load.options()? };
-        Ok(axes::of_capture(&place, side, obstacle, quick))
+        Ok(axes::of_capture(&self.place(scene)?, side, obstacle, quick))
+    }
+
+    fn place(&self, scene: &str) -> Result<Place> {
+        let load = self.load.options()?.identified(scene, self.body.as_deref())?;
+        Ok(Place::Scene { scene: scene.to_owned(), body: self.body.clone(), load })
     }
 
     /// What makes `train` read the same capture.
@@ -209,7 +210,7 @@ impl SweepArguments {
         let on = &self.on;
         Ok(points::Sweep {
             scene_arguments: on.command_line(scene),
-            place: Place::Scene { scene: scene.to_owned(), body: on.body.clone(), load: on.load.options()? },
+            place: on.place(scene)?,
             views: if self.quick { VIEWS.1 } else { VIEWS.0 },
             steps: self.steps(FULL_STEPS, FULL_STEPS / 5)?,
             full_steps: FULL_STEPS,

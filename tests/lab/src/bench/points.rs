@@ -3,7 +3,7 @@
 use anyhow::Result;
 use occnerf::{Config, Preset};
 
-use super::baked::Baking;
+use super::baking::Baking;
 use crate::methods::Method;
 use crate::sweep::{Job, Kind, Line, Place, Point};
 use xtask::settings;

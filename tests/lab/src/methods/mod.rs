@@ -139,7 +139,7 @@ impl Method {
         }
         xtask::run::make_directory(&directory.join("renders"))?;
         let _lock = Lock::take(directory)?;
-        if let Some(metrics) = finished(directory, &run.train)?.filter(|m| lpips.is_none() || m.lpips.is_some()) {
+        if let Some(metrics) = finished(directory, directory, run)?.filter(|m| lpips.is_none() || m.lpips.is_some()) {
             say!("{name}: finished earlier");
             return Ok(metrics);
         }

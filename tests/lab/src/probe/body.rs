@@ -31,10 +31,9 @@ pub fn skin(mut input: Input, model: &BodyModel, output: &mut Output) -> Result<
     count("vertices", &[bodies, vertices, 3])?;
     let (poses, trans) = (vec3s(&poses), vec3s(&trans));
     let shaped: Vec<_> = (0..bodies).map(|b| model.shaped(&betas[b * columns..][..columns])).collect();
-    let frames: Vec<_> = (0..bodies)
-        .map(|b| (&shaped[b], &poses[b * joints..][..joints], Placement::Pelvis { translation: trans[b] }))
-        .collect();
-    let posed = model.pose_batch(&frames);
+    let pose =
+        |b: usize| model.pose(&shaped[b], &poses[b * joints..][..joints], Placement::Pelvis { translation: trans[b] });
+    let posed: Vec<_> = (0..bodies).map(pose).collect();
     let all = |of: fn(&Posed) -> &[Vec3]| posed.iter().flat_map(of).copied().collect::<Vec<_>>();
     output.vectors("vertices", &[bodies, vertices, 3], &all(|p| &p.vertices))?;
     output.vectors("joints", &[bodies, joints, 3], &all(|p| &p.joints))

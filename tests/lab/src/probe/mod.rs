@@ -12,7 +12,8 @@ use std::path::PathBuf;
 
 use anyhow::{Context, Result, bail};
 use clap::{Args, ValueEnum};
-use smpl::{BodyModel, load_mesh};
+use rigged::load_mesh;
+use smpl::BodyModel;
 
 use input::Input;
 use output::Output;

@@ -3,10 +3,10 @@
 use anyhow::{Context, Result, ensure};
 use glam::{Affine3A, Mat3, Vec2, Vec3};
 use occnerf::Lpips;
-use smpl::Mesh;
+use rigged::Mesh;
 use visibility::{RayMesh, View, visible_vertices};
 use volrender::metrics;
-use volrender::{RaySamples, SampleGradients, bin_midpoints, bin_widths, composite_backward};
+use volrender::{RaySamples, SampleGradients, composite_backward};
 
 use super::input::{Input, vec3s};
 use super::output::{Output, count};
@@ -48,7 +48,6 @@ pub fn composite(mut input: Input, output: &mut Output) -> Result<()> {
 
     count("rgb", &[rays, samples, 3])?;
     let likelihood = vec![1.0; samples];
-    let (mut t, mut delta) = (vec![0.0; samples], vec![0.0; samples]);
     let mut weights = vec![0.0; rays * samples];
     let mut d_sigma = vec![0.0; d_color.as_ref().map_or(0, |_| rays * samples)];
     let mut d_rgb = vec![Vec3::ZERO; d_sigma.len()];
@@ -57,8 +56,8 @@ pub fn composite(mut input: Input, output: &mut Output) -> Result<()> {
     for ray in 0..rays {
         let row = ray * samples..(ray + 1) * samples;
         let edges = &edges[ray * (samples + 1)..][..samples + 1];
-        bin_midpoints(edges, &mut t);
-        bin_widths(edges, &mut delta);
+        let t: Vec<f32> = edges.windows(2).map(|bin| 0.5 * bin[0] + 0.5 * bin[1]).collect();
+        let delta: Vec<f32> = edges.windows(2).map(|bin| bin[1] - bin[0]).collect();
         let (sigma, rgb, weights) = (&sigma[row.clone()], &rgb[row.clone()], &mut weights[row.clone()]);
         let samples = RaySamples { sigma, likelihood: &likelihood, delta: &delta, t: &t, rgb };
         pixels.push(volrender::composite(samples, background, weights));

@@ -3,7 +3,7 @@
 use anyhow::{Context, Result, ensure};
 use glam::Vec3;
 use rayon::prelude::*;
-use smpl::Mesh;
+use rigged::Mesh;
 use surface_query::{MeshDistance, Pyramid, SurfaceQuery, SurfaceQueryConfig};
 
 use super::input::Input;

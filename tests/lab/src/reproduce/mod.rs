@@ -176,6 +176,7 @@ impl<'a> Experiment<'a> {
         directory: &Path,
     ) -> Result<Summary<'a>> {
         let ReproduceArguments { body, seeds, preset, lpips, .. } = self.arguments;
+        let load = load.identified(self.scene, body.as_deref())?;
         let tables = self.arguments.sitting.part.writes_tables();
         let mut summary = Summary::new(self.scene, self.settings, self.table);
         let mut firsts: Vec<(&str, usize)> = Vec::new();

@@ -138,7 +138,7 @@ pub struct Outcome {
 fn keep_run(job: &Job, Keep { directory, trained, lpips }: &Keep) -> Result<Outcome> {
     let Place::Scene { scene, body, load } = &job.place else { bail!("a capture made on the spot is not kept") };
     let source = load.load(scene, body.as_deref())?;
-    let run = RunConfig::new(&source, job.config.clone());
+    let run = RunConfig::new(&source, job.config.clone())?;
     let (lpips, name) = (load_lpips(lpips.as_deref())?, directory.file_name().unwrap_or_default().to_string_lossy());
     let metrics = match trained {
         Some(trained) => baked_unless_finished(directory, trained, &run, &source, lpips.as_ref(), INTERVAL)?,

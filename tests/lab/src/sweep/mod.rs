@@ -15,7 +15,7 @@ use serde::{Deserialize, Serialize};
 pub use self::job::{Job, Keep, Outcome, Place};
 use crate::results::BENCH_LOG;
 use xtask::process::{Lock, say, unwritten};
-use xtask::run::{METRICS, check_threads};
+use xtask::run::{Metrics, check_threads};
 use xtask::shard::{Shard, ShardArguments};
 
 /// How a sweep is run this time.
@@ -210,7 +210,9 @@ impl Runner {
     }
 
     fn run_if(&mut self, mine: bool, point: Point) -> Result<Option<Line>> {
-        let there = point.job.keep.as_ref().is_none_or(|keep| keep.directory.join(METRICS).is_file());
+        let there = point.job.keep.as_ref().is_none_or(|Keep { directory, trained, .. }| {
+            Metrics::fresh(directory, trained.as_ref().unwrap_or(directory)).is_ok_and(|metrics| metrics.is_some())
+        });
         let done = self.lines.iter().find(|l| there && l.point.job == point.job && l.outcome.error.is_none());
         if let Some(done) = done {
             let line = Line { point, outcome: done.outcome.clone() };

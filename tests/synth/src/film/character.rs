@@ -4,7 +4,8 @@ use std::collections::HashMap;
 
 use glam::{Affine3A, DMat4, DVec4, Quat, Vec2, Vec3};
 use rayon::prelude::*;
-use smpl::{BodyModel, Character, MotionClip, SparseRows};
+use rigged::Character;
+use smpl::{BodyModel, MotionClip, SparseRows};
 use visibility::RayMesh;
 
 use super::config::SynthConfig;

@@ -13,7 +13,8 @@ mod tests;
 mod texture;
 
 use rayon::prelude::*;
-use smpl::{BodyModel, Character, MotionClip};
+use rigged::Character;
+use smpl::{BodyModel, MotionClip};
 
 pub use self::config::{Occlusion, SynthConfig};
 

@@ -1,4 +1,5 @@
-use smpl::{Character, MotionClip};
+use rigged::Character;
+use smpl::MotionClip;
 
 use super::*;
 use crate::{DemoConfig, Obstacle, demo};

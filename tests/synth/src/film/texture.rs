@@ -2,7 +2,7 @@
 
 use glam::{Vec2, Vec3};
 use image::{ImageReader, RgbImage};
-use smpl::Character;
+use rigged::Character;
 
 use super::noise::smooth_noise;
 use capture::CaptureError;

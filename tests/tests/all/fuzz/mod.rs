@@ -24,7 +24,8 @@ use mutate::{Form, Random, damaged};
 use occnerf::bake::Avatar;
 use occnerf::capture::{Image, ImportOptions, LoadOptions, import, load_capture};
 use occnerf::{Config, Lpips, Person, Trainer, checkpoint_config};
-use smpl::{BodyModel, Character, MotionClip, load_mesh};
+use rigged::{Character, load_mesh};
+use smpl::{BodyModel, MotionClip};
 
 /// Longest that a reader may take.
 const LONGEST: Duration = Duration::from_secs(1);

@@ -153,6 +153,7 @@ pub fn avatars() -> Vec<Vec<u8>> {
     let motion = MotionClip { num_joints: 2, fps: 30.0, poses: vec![Vec3::splat(0.1); 4], trans: vec![Vec3::Y; 2] };
     let avatar = Avatar {
         name: "tiny".to_owned(),
+        source: String::new(),
         vertices: (0..4).map(|i| Vec3::new((i & 1) as f32, (i >> 1) as f32, 0.0)).collect(),
         normals: vec![Vec3::Z; 4],
         uvs: (0..4).map(|i| Vec2::new((i & 1) as f32, (i >> 1) as f32)).collect(),

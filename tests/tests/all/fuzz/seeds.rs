@@ -27,8 +27,7 @@ pub fn pickles() -> Vec<Vec<u8>> {
 
 /// Of `joblib.dump`: arrays behind their pickle, plain and compressed in every way that it has.
 pub fn joblibs() -> Vec<Vec<u8>> {
-    let kinds =
-        ["plain", "plain", "plain", "protocol2", "protocol2", "old", "zlib", "gzip", "bz2", "lzma", "xz", "old_zlib"];
+    let kinds = ["plain", "plain", "plain", "protocol2", "protocol2", "old", "zlib", "gzip", "old_zlib"];
     kinds.iter().map(|kind| fixture(&format!("joblib.{kind}.pkl"))).collect()
 }
 

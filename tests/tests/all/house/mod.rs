@@ -9,6 +9,19 @@ use std::path::{Path, PathBuf};
 
 use imports::{Imports, imports};
 
+/// The crates that are not tests.
+const PRODUCT: [&str; 10] = [
+    "smpl",
+    "smpl/array-files",
+    "surface-query",
+    "visibility",
+    "hashgrid",
+    "volrender",
+    "occnerf",
+    "occnerf/capture",
+    "occnerf/lpips",
+    "xtask",
+];
 const CRATES: [&str; 5] = ["occnerf", "occnerf/capture", "xtask", "tests/lab", "tests/synth"];
 
 fn workspace() -> PathBuf {
@@ -106,6 +119,27 @@ fn the_folders_of_occnerf_import_each_other_as_drawn() {
         folders.iter().map(line).collect::<Vec<_>>().join("\n")
     };
     assert!(drawn == found, "ARCHITECTURE.md draws\n{}\n\nthe imports say\n{}", text(&drawn), text(&found));
+}
+
+/// The lengths that files report are not trusted: only `read_bounded` reads one whole.
+#[test]
+fn the_product_reads_files_up_to_a_bound() {
+    let mut found = Vec::new();
+    let mut left: Vec<PathBuf> = PRODUCT.iter().map(|name| workspace().join(name).join("src")).collect();
+    while let Some(path) = left.pop() {
+        let is_source = path.extension().is_some_and(|e| e == "rs");
+        if path.is_dir() {
+            let entries = std::fs::read_dir(&path).unwrap().map(|entry| entry.unwrap().path());
+            left.extend(entries.filter(|entry| !entry.ends_with("tests")));
+        } else if is_source && !path.ends_with("tests.rs") && !path.ends_with("damage.rs") {
+            let text = std::fs::read_to_string(&path).unwrap();
+            let own = text.lines().take_while(|line| line.trim() != "#[cfg(test)]");
+            let raw = |line: &&str| line.contains("fs::read(") || line.contains("fs::read_to_string(");
+            let raw = own.filter(raw).filter(|line| !line.trim().starts_with("//") && !line.contains("\"/proc/"));
+            found.extend(raw.map(|line| format!("{}: {}", path.display(), line.trim())));
+        }
+    }
+    assert!(found.is_empty(), "array_files::read_bounded instead:\n{}", found.join("\n"));
 }
 
 /// A crate in a temporary folder.

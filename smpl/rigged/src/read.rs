@@ -1,21 +1,20 @@
 //! Reads a [`Character`] from a glTF document.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::path::Path;
 
 use array_files::read_file;
 use glam::{Affine3A, Mat4, Quat, Vec3, Vec4};
-use gltf::json::animation::{Interpolation as Kind, Property};
+use gltf::json::animation::{Interpolation, Property};
 use gltf::json::material::AlphaMode;
 use gltf::json::mesh::Semantic;
 use gltf::json::validation::Checked;
 use gltf::json::{Index, Root};
+use smpl::{Error, SparseRows};
 
-use super::accessor::Source;
-use super::animation::{Animation, Channel, Interpolation, Part, unit, widen};
-use super::{Character, Local, Node};
-use crate::Error;
-use crate::sparse::SparseRows;
+use crate::accessor::Source;
+use crate::animation::{Animation, Channel, Local, unit, widen};
+use crate::character::{Character, Node};
 
 impl Character {
     /// Reads a `.glb`, or a `.gltf` whose buffers are data URIs or files beside it.
@@ -115,33 +114,20 @@ fn document(json: &[u8]) -> Result<Root, serde_json::Error> {
 
 /// What a document has that a [`Character`] has not, in words.
 fn ignored(root: &Root) -> Vec<String> {
-    let mut out = Vec::new();
-    let mut textures: Vec<usize> = root
-        .materials
-        .iter()
-        .filter_map(|material| {
-            material.pbr_metallic_roughness.base_color_texture.as_ref().map(|info| info.index.value())
-        })
-        .collect();
-    textures.sort_unstable();
-    textures.dedup();
-    let primitives = || root.meshes.iter().flat_map(|mesh| &mesh.primitives);
-    let has_colors = primitives().any(|primitive| {
-        primitive.attributes.keys().any(|semantic| matches!(semantic, Checked::Valid(Semantic::Colors(_))))
-    });
+    let colours = root.materials.iter().filter_map(|m| m.pbr_metallic_roughness.base_color_texture.as_ref());
+    let textures: HashSet<usize> = colours.map(|info| info.index.value()).collect();
+    let mut attributes = root.meshes.iter().flat_map(|mesh| &mesh.primitives).flat_map(|p| p.attributes.keys());
+    let has_colors = attributes.any(|semantic| matches!(semantic, Checked::Valid(Semantic::Colors(_))));
     let is_tinted = root.materials.iter().any(|m| m.pbr_metallic_roughness.base_color_factor.0 != [1.0; 4]);
     let is_cut = root.materials.iter().any(|m| m.alpha_mode != Checked::Valid(AlphaMode::Opaque));
-    for (has, what) in [
-        (textures.len() > 1, format!("{} base-colour textures besides the first", textures.len().saturating_sub(1))),
+    let others = textures.len().saturating_sub(1);
+    let all = [
+        (others > 0, format!("{others} base-colour textures besides the first")),
         (is_tinted, "base-colour factors".to_owned()),
         (has_colors, "colours of vertices (COLOR_0)".to_owned()),
         (is_cut, "transparency (alphaMode)".to_owned()),
-    ] {
-        if has {
-            out.push(what);
-        }
-    }
-    out
+    ];
+    all.into_iter().filter_map(|(has, what)| has.then_some(what)).collect()
 }
 
 /// JSON and binary chunk of a `.glb` (glTF 2.0, section 4.4).
@@ -239,7 +225,7 @@ fn in_scene(source: &Source<'_>) -> Result<Vec<usize>, Error> {
 }
 
 /// Consecutive joints of a [`Character`]: first and count.
-pub(super) type Joints = (u32, u32);
+pub(crate) type Joints = (u32, u32);
 
 impl Character {
     /// Turns faces that a mirroring transform turned inside out.
@@ -294,11 +280,9 @@ fn animations(source: &Source<'_>, nodes: &[Node]) -> Result<Vec<Animation>, Err
         let mut channels = Vec::new();
         for (k, channel) in animation.channels.iter().enumerate() {
             let place = format!("animation {i}, channel {k}");
-            let (part, wide) = match channel.target.path {
-                Checked::Valid(Property::Translation) => (Part::Translation, false),
-                Checked::Valid(Property::Rotation) => (Part::Rotation, true),
-                Checked::Valid(Property::Scale) => (Part::Scale, false),
+            let property = match channel.target.path {
                 Checked::Valid(Property::MorphTargetWeights) => continue,
+                Checked::Valid(property) => property,
                 Checked::Invalid => return Err(source.invalid(&place, "an unknown path")),
             };
             let sampler = source.get(&animation.samplers, channel.sampler, &place)?;
@@ -314,21 +298,19 @@ fn animations(source: &Source<'_>, nodes: &[Node]) -> Result<Vec<Animation>, Err
             if times.is_empty() || times.windows(2).any(|w| w[0] >= w[1]) {
                 return Err(source.invalid(&place, "times do not increase"));
             }
-            let values: Vec<Vec4> = if wide {
+            let values: Vec<Vec4> = if property == Property::Rotation {
                 source.floats::<4>(sampler.output, &place)?.into_iter().map(Vec4::from).collect()
             } else {
                 source.floats::<3>(sampler.output, &place)?.into_iter().map(widen).collect()
             };
-            let (interpolation, values_a_key) = match sampler.interpolation {
-                Checked::Valid(Kind::Step) => (Interpolation::Step, 1),
-                Checked::Valid(Kind::Linear) => (Interpolation::Linear, 1),
-                Checked::Valid(Kind::CubicSpline) => (Interpolation::Cubic, 3),
-                Checked::Invalid => return Err(source.invalid(&place, "an unknown interpolation")),
+            let Checked::Valid(interpolation) = sampler.interpolation else {
+                return Err(source.invalid(&place, "an unknown interpolation"));
             };
+            let values_a_key = if interpolation == Interpolation::CubicSpline { 3 } else { 1 };
             if values.len() != values_a_key * times.len() {
                 return Err(source.invalid(&place, format!("{} values for {} keys", values.len(), times.len())));
             }
-            channels.push(Channel { node, part, interpolation, times, values });
+            channels.push(Channel { node, property, interpolation, times, values });
         }
         let duration = channels.iter().filter_map(|c: &Channel| c.times.last()).copied().fold(0.0, f32::max);
         out.push(Animation { name: animation.name.clone().unwrap_or_default(), duration, channels });

@@ -9,8 +9,7 @@ use gltf::json::accessor::{Accessor, ComponentType};
 use gltf::json::buffer::View;
 use gltf::json::validation::Checked;
 use gltf::json::{Index, Root};
-
-use crate::Error;
+use smpl::Error;
 
 /// Total decoded size of all accessors, in bytes: 256 MiB.
 const MAX_DECODED_BYTES: u64 = 1 << 28;
@@ -18,9 +17,9 @@ const MAX_DECODED_BYTES: u64 = 1 << 28;
 const MAX_RESOLVED_BYTES: u64 = 1 << 29;
 
 /// A document with its buffers. Every index and range is checked where it is used.
-pub(super) struct Source<'a> {
-    pub(super) file: &'a str,
-    pub(super) root: &'a Root,
+pub(crate) struct Source<'a> {
+    pub(crate) file: &'a str,
+    pub(crate) root: &'a Root,
     /// Directory of files it may refer to; `None` allows none.
     folder: Option<&'a Path>,
     data: Vec<Vec<u8>>,
@@ -32,7 +31,7 @@ pub(super) struct Source<'a> {
 
 impl<'a> Source<'a> {
     /// `blob` is the binary chunk of a `.glb`; other buffers are data URIs or files in `folder`.
-    pub(super) fn new(
+    pub(crate) fn new(
         file: &'a str,
         root: &'a Root,
         mut blob: Option<Vec<u8>>,
@@ -62,13 +61,13 @@ impl<'a> Source<'a> {
     }
 
     /// The item at `index`; errors name `place`.
-    pub(super) fn get<'b, T>(&self, items: &'b [T], index: Index<T>, place: &str) -> Result<&'b T, Error> {
+    pub(crate) fn get<'b, T>(&self, items: &'b [T], index: Index<T>, place: &str) -> Result<&'b T, Error> {
         let missing = || self.invalid(place, format!("index {index} of {}", items.len()));
         items.get(index.value()).ok_or_else(missing)
     }
 
     /// The bytes of a buffer view.
-    pub(super) fn view(&self, index: Index<View>, place: &str) -> Result<(&View, &[u8]), Error> {
+    pub(crate) fn view(&self, index: Index<View>, place: &str) -> Result<(&View, &[u8]), Error> {
         let view = self.get(&self.root.buffer_views, index, place)?;
         let bytes = self.data.get(view.buffer.value()).map(Vec::as_slice);
         let start = view.byte_offset.unwrap_or_default().0;
@@ -105,7 +104,9 @@ impl<'a> Source<'a> {
         let charge = || {
             let cost = count.saturating_mul((N * size_of::<T>()) as u64);
             let left = self.left.get().checked_sub(cost);
-            let too_large = || Error::too_large(self.file, &place, u128::from(cost), MAX_DECODED_BYTES);
+            // The limit is of all accessors together.
+            let claimed = u128::from(MAX_DECODED_BYTES - self.left.get()) + u128::from(cost);
+            let too_large = || too_large(self.file, &place, claimed, MAX_DECODED_BYTES);
             left.map(|left| self.left.set(left)).ok_or_else(too_large)
         };
         // Without a view, zeros.
@@ -144,28 +145,28 @@ impl<'a> Source<'a> {
     }
 
     /// Finite floats; integers if normalised, or where the document quantises (KHR_mesh_quantization).
-    pub(super) fn floats<const N: usize>(&self, index: Index<Accessor>, place: &str) -> Result<Vec<[f32; N]>, Error> {
+    pub(crate) fn floats<const N: usize>(&self, index: Index<Accessor>, place: &str) -> Result<Vec<[f32; N]>, Error> {
         let quantized = self.root.extensions_required.iter().any(|name| name == "KHR_mesh_quantization");
-        self.elements(index, place, |kind, normalized, bytes| match kind {
-            ComponentType::F32 => Some(f32::from_le_bytes(bytes.try_into().ok()?)).filter(|x| x.is_finite()),
-            _ if !normalized && !quantized => None,
-            _ if !normalized => match *bytes {
-                [a] if kind == ComponentType::U8 => Some(f32::from(a)),
-                [a] => Some(f32::from(a as i8)),
-                [a, b] if kind == ComponentType::U16 => Some(f32::from(u16::from_le_bytes([a, b]))),
-                [a, b] => Some(f32::from(i16::from_le_bytes([a, b]))),
-                _ => None,
-            },
-            ComponentType::U8 => Some(f32::from(*bytes.first()?) / 255.0),
-            ComponentType::U16 => Some(f32::from(u16::from_le_bytes(bytes.try_into().ok()?)) / 65535.0),
-            ComponentType::I8 => Some((f32::from(*bytes.first()? as i8) / 127.0).max(-1.0)),
-            ComponentType::I16 => Some((f32::from(i16::from_le_bytes(bytes.try_into().ok()?)) / 32767.0).max(-1.0)),
-            ComponentType::U32 => None,
+        self.elements(index, place, |kind, normalized, bytes| {
+            let (value, most) = match kind {
+                ComponentType::F32 => {
+                    return Some(f32::from_le_bytes(bytes.try_into().ok()?)).filter(|x| x.is_finite());
+                }
+                ComponentType::U8 => (f32::from(*bytes.first()?), 255.0),
+                ComponentType::U16 => (f32::from(u16::from_le_bytes(bytes.try_into().ok()?)), 65535.0),
+                ComponentType::I8 => (f32::from(*bytes.first()? as i8), 127.0),
+                ComponentType::I16 => (f32::from(i16::from_le_bytes(bytes.try_into().ok()?)), 32767.0),
+                ComponentType::U32 => return None,
+            };
+            match normalized {
+                true => Some((value / most).max(-1.0)),
+                false => quantized.then_some(value),
+            }
         })
     }
 
     /// Unsigned integers.
-    pub(super) fn indices<const N: usize>(&self, index: Index<Accessor>, place: &str) -> Result<Vec<[u32; N]>, Error> {
+    pub(crate) fn indices<const N: usize>(&self, index: Index<Accessor>, place: &str) -> Result<Vec<[u32; N]>, Error> {
         self.elements(index, place, |kind, _, bytes| match kind {
             ComponentType::U8 => Some(u32::from(*bytes.first()?)),
             ComponentType::U16 => Some(u32::from(u16::from_le_bytes(bytes.try_into().ok()?))),
@@ -176,7 +177,7 @@ impl<'a> Source<'a> {
 
     /// Media type and bytes of a data URI, or of a file in the folder. URIs that leave the folder
     /// are refused.
-    pub(super) fn resolve(&self, place: &str, uri: &str) -> Result<(String, Vec<u8>), Error> {
+    pub(crate) fn resolve(&self, place: &str, uri: &str) -> Result<(String, Vec<u8>), Error> {
         if let Some(rest) = uri.strip_prefix("data:") {
             let Some((mime, text)) = rest.split_once(";base64,") else {
                 return Err(self.invalid(place, "a data URI that is not base64"));
@@ -203,15 +204,19 @@ impl<'a> Source<'a> {
     fn spend(&self, place: &str, bytes: u64) -> Result<(), Error> {
         let left = self.resolvable.get().checked_sub(bytes).ok_or_else(|| {
             let claimed = u128::from(MAX_RESOLVED_BYTES - self.resolvable.get()) + u128::from(bytes);
-            Error::too_large(self.file, place, claimed, MAX_RESOLVED_BYTES)
+            too_large(self.file, place, claimed, MAX_RESOLVED_BYTES)
         })?;
         self.resolvable.set(left);
         Ok(())
     }
 
-    pub(super) fn invalid(&self, place: &str, message: impl Into<String>) -> Error {
+    pub(crate) fn invalid(&self, place: &str, message: impl Into<String>) -> Error {
         Error::invalid(self.file, place, message)
     }
+}
+
+fn too_large(file: &str, place: &str, claimed: u128, limit: u64) -> Error {
+    array_files::Error::too_large(file, place, claimed, limit).into()
 }
 
 /// A URI with its %XX replaced by their bytes.

@@ -4,10 +4,12 @@ use std::path::Path;
 
 use array_files::{decode_text, read_file};
 use glam::Vec3;
+use smpl::{BodyModel, Error};
 
-use crate::Error;
 use crate::character::Character;
-use crate::model::{BodyModel, MAX_COORDINATE, check_vectors};
+
+/// Largest coordinate of a mesh, in its own unit: a kilometre in millimetres.
+pub(crate) const MAX_COORDINATE: f32 = 1e6;
 
 /// A triangle mesh, from [`load_mesh`].
 #[derive(Clone, Debug, PartialEq)]
@@ -25,9 +27,9 @@ pub struct Mesh {
 /// file's order, so that vertex indices agree with other programs.
 ///
 /// ```
-/// let path = std::env::temp_dir().join("smpl_load_mesh_example.obj");
+/// let path = std::env::temp_dir().join("rigged_load_mesh_example.obj");
 /// std::fs::write(&path, "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3 4\n").unwrap();
-/// let mesh = smpl::load_mesh(&path).unwrap();
+/// let mesh = rigged::load_mesh(&path).unwrap();
 /// assert_eq!(mesh.faces, [[0, 1, 2], [0, 2, 3]]);
 /// ```
 ///
@@ -40,8 +42,13 @@ pub fn load_mesh(path: &Path) -> Result<Mesh, Error> {
         "glb" | "gltf" | "vrm" => {
             let character = Character::load(path)?;
             let mesh = Mesh { vertices: character.rest().vertices, faces: character.faces };
-            check_vectors(&path.display().to_string(), "vertices", &mesh.vertices)?;
-            Ok(mesh)
+            match mesh.vertices.iter().find(|v| v.is_nan() || v.abs().max_element() > MAX_COORDINATE) {
+                Some(far) => {
+                    let message = format!("{far}, expected coordinates of at most {MAX_COORDINATE}");
+                    Err(Error::invalid(&path.display().to_string(), "vertices", message))
+                }
+                None => Ok(mesh),
+            }
         }
         "npz" | "pkl" | "safetensors" => {
             let body = BodyModel::load(path)?;

@@ -1,17 +1,9 @@
 //! Rigged characters from glTF 2.0: mesh, skin, hierarchy, animations.
 
-mod accessor;
-mod animation;
-mod primitive;
-mod read;
+use glam::{Affine3A, Vec2, Vec3};
+use smpl::SkinningWeights;
 
-use glam::{Affine3A, Quat, Vec2, Vec3, Vec3A};
-use rayon::prelude::*;
-
-pub use animation::Animation;
-
-use crate::pose::{CHUNK, blend};
-use crate::sparse::SkinningWeights;
+use crate::animation::{Animation, Local};
 
 /// A rigged character: every triangle mesh of a glTF scene merged into one, with V vertices and J
 /// joints.
@@ -19,21 +11,6 @@ use crate::sparse::SkinningWeights;
 /// Meshes without a skin are bound rigidly to an extra joint for their node; morph targets are at
 /// their default weights. Not read: sparse accessors, materials other than the first base-colour
 /// texture ([`Character::ignored`] names what the file has of them). Metres, y up, as in glTF.
-///
-/// ```
-/// // One triangle without a skin: it follows its node, 1 m up.
-/// let gltf = r#"{"asset": {"version": "2.0"},
-///     "nodes": [{"mesh": 0, "translation": [0, 1, 0]}],
-///     "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}],
-///     "accessors": [{"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3",
-///                    "min": [0, 0, 0], "max": [1, 1, 0]}],
-///     "bufferViews": [{"buffer": 0, "byteLength": 36}],
-///     "buffers": [{"byteLength": 36, "uri":
-///         "data:application/octet-stream;base64,AAAAAAAAAAAAAAAAAACAPwAAAAAAAAAAAAAAAAAAgD8AAAAA"}]}"#;
-/// let character = smpl::Character::from_bytes("triangle.gltf", gltf.as_bytes()).unwrap();
-/// assert_eq!((character.num_joints(), character.faces.len()), (1, 1));
-/// assert_eq!(character.rest().vertices[1], glam::Vec3::new(1.0, 1.0, 0.0));
-/// ```
 #[derive(Clone, Debug, PartialEq)]
 pub struct Character {
     /// Vertices in bind space, as in the file, (V).
@@ -57,11 +34,11 @@ pub struct Character {
     pub ignored: Vec<String>,
     /// Animations, in the file's order.
     pub animations: Vec<Animation>,
-    nodes: Vec<Node>,
+    pub(crate) nodes: Vec<Node>,
     /// Nodes, parents before children.
-    order: Vec<usize>,
+    pub(crate) order: Vec<usize>,
     /// Node of each joint, (J).
-    joint_nodes: Vec<usize>,
+    pub(crate) joint_nodes: Vec<usize>,
 }
 
 /// An encoded image, [`Character::texture`].
@@ -85,33 +62,19 @@ pub struct CharacterPose {
 }
 
 #[derive(Clone, Debug, PartialEq)]
-struct Node {
-    parent: Option<usize>,
-    rest: Local,
-}
-
-/// Transform of a node relative to its parent.
-#[derive(Clone, Copy, Debug, PartialEq)]
-enum Local {
-    Matrix(Affine3A),
-    /// Scale, then rotation, then translation.
-    Parts {
-        scale: Vec3,
-        rotation: Quat,
-        translation: Vec3,
-    },
+pub(crate) struct Node {
+    pub parent: Option<usize>,
+    pub rest: Local,
 }
 
 impl Character {
     /// Number of joints, J.
-    #[must_use]
     pub fn num_joints(&self) -> usize {
         self.joint_nodes.len()
     }
 
     /// Parent of each joint, (J): the joint of the nearest ancestor node that is one. Of joints that
     /// share a node, the first is the parent of the others.
-    #[must_use]
     pub fn joint_parents(&self) -> Vec<Option<usize>> {
         let mut first = vec![None; self.nodes.len()];
         for (joint, &node) in self.joint_nodes.iter().enumerate().rev() {
@@ -134,7 +97,6 @@ impl Character {
     }
 
     /// The character in the pose of the file's nodes.
-    #[must_use]
     pub fn rest(&self) -> CharacterPose {
         self.posed(self.nodes.iter().map(|n| n.rest).collect())
     }
@@ -144,7 +106,6 @@ impl Character {
     ///
     /// # Panics
     /// If `animation` is out of range.
-    #[must_use]
     pub fn pose(&self, animation: usize, seconds: f32) -> CharacterPose {
         let mut locals: Vec<Local> = self.nodes.iter().map(|n| n.rest).collect();
         self.animations[animation].apply(seconds, &mut locals);
@@ -155,17 +116,9 @@ impl Character {
     ///
     /// # Panics
     /// Unless there are J bones.
-    #[must_use]
     pub fn skin(&self, bones: &[Affine3A]) -> Vec<Vec3> {
         assert_eq!(bones.len(), self.num_joints(), "skin: bones");
-        let mut out = self.vertices.clone();
-        out.par_chunks_mut(CHUNK).enumerate().for_each(|(chunk, out)| {
-            for (i, vertex) in out.iter_mut().enumerate() {
-                let sum = blend(bones, self.weights.row(chunk * CHUNK + i));
-                *vertex = sum.transform_point3a(Vec3A::from(*vertex)).into();
-            }
-        });
-        out
+        smpl::skin(&self.vertices, &self.weights, bones)
     }
 
     fn posed(&self, locals: Vec<Local>) -> CharacterPose {
@@ -177,16 +130,5 @@ impl Character {
         let joints: Vec<Affine3A> = self.joint_nodes.iter().map(|&node| world[node]).collect();
         let bones: Vec<Affine3A> = joints.iter().zip(&self.inverse_bind).map(|(joint, bind)| *joint * *bind).collect();
         CharacterPose { vertices: self.skin(&bones), joints, bones }
-    }
-}
-
-impl Local {
-    fn matrix(self) -> Affine3A {
-        match self {
-            Self::Matrix(matrix) => matrix,
-            Self::Parts { scale, rotation, translation } => {
-                Affine3A::from_scale_rotation_translation(scale, rotation, translation)
-            }
-        }
     }
 }

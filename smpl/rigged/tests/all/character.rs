@@ -4,7 +4,7 @@
 use base64::Engine;
 use glam::{Affine3A, Vec3};
 use proptest::prelude::*;
-use smpl::{Character, load_mesh};
+use rigged::{Character, Mesh, load_mesh};
 use testkit::files::{glb, shared};
 
 /// A strip of two triangles on two joints, the second 1 above the first and turning about z.
@@ -120,7 +120,7 @@ fn meshes_without_a_skin_follow_their_node() {
 }
 
 /// Six times the volume of a mesh, positive where faces are counter-clockwise seen from outside.
-fn volume(mesh: &smpl::Mesh) -> f32 {
+fn volume(mesh: &Mesh) -> f32 {
     mesh.faces
         .iter()
         .map(|f| {

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use glam::Vec3;
 use proptest::prelude::*;
-use smpl::{Mesh, load_mesh};
+use rigged::{Mesh, load_mesh};
 use testkit::files::shared;
 
 fn written(name: &str, text: impl AsRef<[u8]>) -> PathBuf {

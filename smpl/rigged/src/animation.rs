@@ -1,54 +1,64 @@
 //! Keyframe animation (glTF 2.0, section 3.11 and appendix C).
 
-use glam::{Quat, Vec3, Vec4};
+use glam::{Affine3A, Quat, Vec3, Vec4};
+use gltf::json::animation::{Interpolation, Property};
 
-use super::Local;
-
-/// Keyframe animation of a [`super::Character`]'s nodes, applied by [`super::Character::pose`].
+/// Keyframe animation of a character's nodes, applied by [`Character::pose`](crate::Character::pose).
 #[derive(Clone, Debug, PartialEq)]
 pub struct Animation {
     /// Empty if the file gives none.
     pub name: String,
     /// Time of the last key, in seconds.
     pub duration: f32,
-    pub(super) channels: Vec<Channel>,
+    pub(crate) channels: Vec<Channel>,
 }
 
 #[derive(Clone, Debug, PartialEq)]
-pub(super) struct Channel {
-    pub(super) node: usize,
-    pub(super) part: Part,
-    pub(super) interpolation: Interpolation,
+pub(crate) struct Channel {
+    pub(crate) node: usize,
+    /// Translation, rotation or scale.
+    pub(crate) property: Property,
+    pub(crate) interpolation: Interpolation,
     /// Seconds, increasing, at least one.
-    pub(super) times: Vec<f32>,
+    pub(crate) times: Vec<f32>,
     /// One value per key; in-tangent, value and out-tangent for cubic splines. Vectors have w = 0.
-    pub(super) values: Vec<Vec4>,
+    pub(crate) values: Vec<Vec4>,
 }
 
+/// Transform of a node relative to its parent.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) enum Part {
-    Translation,
-    Rotation,
-    Scale,
+pub(crate) enum Local {
+    Matrix(Affine3A),
+    /// Scale, then rotation, then translation.
+    Parts {
+        scale: Vec3,
+        rotation: Quat,
+        translation: Vec3,
+    },
 }
 
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) enum Interpolation {
-    Step,
-    Linear,
-    Cubic,
+impl Local {
+    pub fn matrix(self) -> Affine3A {
+        match self {
+            Self::Matrix(matrix) => matrix,
+            Self::Parts { scale, rotation, translation } => {
+                Affine3A::from_scale_rotation_translation(scale, rotation, translation)
+            }
+        }
+    }
 }
 
 impl Animation {
     /// Replaces the animated transforms. The reader refuses channels of nodes given as matrices.
-    pub(super) fn apply(&self, seconds: f32, locals: &mut [Local]) {
+    pub(crate) fn apply(&self, seconds: f32, locals: &mut [Local]) {
         for channel in &self.channels {
             let value = channel.at(seconds);
             if let Local::Parts { scale, rotation, translation } = &mut locals[channel.node] {
-                match channel.part {
-                    Part::Translation => *translation = value.truncate(),
-                    Part::Rotation => *rotation = unit(value),
-                    Part::Scale => *scale = value.truncate(),
+                match channel.property {
+                    Property::Translation => *translation = value.truncate(),
+                    Property::Rotation => *rotation = unit(value),
+                    Property::Scale => *scale = value.truncate(),
+                    Property::MorphTargetWeights => {}
                 }
             }
         }
@@ -58,7 +68,7 @@ impl Animation {
 impl Channel {
     fn at(&self, seconds: f32) -> Vec4 {
         let value = |key: usize| match self.interpolation {
-            Interpolation::Cubic => self.values[3 * key + 1],
+            Interpolation::CubicSpline => self.values[3 * key + 1],
             _ => self.values[key],
         };
         // The key at or before `seconds`; NaN counts as before the first.
@@ -74,9 +84,9 @@ impl Channel {
         let (a, b) = (value(key), value(next));
         match self.interpolation {
             Interpolation::Step => a,
-            Interpolation::Linear if self.part == Part::Rotation => Vec4::from(unit(a).slerp(unit(b), s)),
+            Interpolation::Linear if self.property == Property::Rotation => Vec4::from(unit(a).slerp(unit(b), s)),
             Interpolation::Linear => a.lerp(b, s),
-            Interpolation::Cubic => {
+            Interpolation::CubicSpline => {
                 let (out, into) = (self.values[3 * key + 2] * step, self.values[3 * next] * step);
                 let (s2, s3) = (s * s, s * s * s);
                 a * (2.0 * s3 - 3.0 * s2 + 1.0)
@@ -89,11 +99,11 @@ impl Channel {
 }
 
 /// The unit quaternion along `q`; the identity for zero.
-pub(super) fn unit(q: Vec4) -> Quat {
+pub(crate) fn unit(q: Vec4) -> Quat {
     q.try_normalize().map_or(Quat::IDENTITY, Quat::from_vec4)
 }
 
 /// Pads a vector to four components.
-pub(super) fn widen(v: [f32; 3]) -> Vec4 {
+pub(crate) fn widen(v: [f32; 3]) -> Vec4 {
     Vec3::from(v).extend(0.0)
 }

@@ -5,17 +5,17 @@ use gltf::json::accessor::Accessor;
 use gltf::json::mesh::{Mode, Primitive, Semantic};
 use gltf::json::validation::Checked;
 use gltf::json::{Index, material};
+use smpl::Error;
 
-use super::accessor::Source;
-use super::read::Joints;
-use super::{Character, Texture};
-use crate::Error;
-use crate::model::MAX_COORDINATE;
+use crate::accessor::Source;
+use crate::character::{Character, Texture};
+use crate::mesh::MAX_COORDINATE;
+use crate::read::Joints;
 
 impl Character {
     /// Appends a primitive's vertices, morphed by `morph`, and triangles. If `skinned`, its joint
     /// indices are relative to `joints`; else it is bound to the first of those.
-    pub(super) fn add_primitive(
+    pub(crate) fn add_primitive(
         &mut self,
         source: &Source<'_>,
         place: &str,

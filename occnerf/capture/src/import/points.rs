@@ -1,0 +1,110 @@
+//! Fits that are points: arrays of joints, and the body that is fitted to points.
+
+use std::path::Path;
+
+use array_files::npz::{Npz, read_npy};
+use glam::{DVec3, Vec3};
+use point_fit::{Fitted, joint_set, joint_sets};
+use smpl::BodyModel;
+
+use super::fit::{Fit, FitFrame, Person, Tool};
+use super::video::Video;
+use crate::CaptureError;
+
+/// Reads joints (T,J,3) in camera axes, metres, of a `.npy` file or the only such array of an `.npz`;
+/// joints that are NaN are missing. The focal length is not in it: √(W² + H²).
+pub(super) fn read(path: &Path, set: &str, count: usize, video: &Video) -> Result<Fit, CaptureError> {
+    let expected = || format!("shape [frames, {count}, 3], as {set} has");
+    let array = if path.extension().is_some_and(|e| e == "npz") {
+        let mut npz = Npz::open(path)?;
+        let keys = npz.keys().to_vec();
+        let arrays = keys.iter().filter_map(|key| npz.array(key).ok());
+        let mut fitting = arrays.filter(|array| array.shape.len() == 3 && array.shape[1..] == [count, 3]);
+        match (fitting.next(), fitting.next()) {
+            (Some(array), None) => array,
+            (first, _) => {
+                let found = if first.is_some() { "several" } else { "none" };
+                return Err(CaptureError::invalid(
+                    path,
+                    "arrays",
+                    format!("one of {}", expected()),
+                    format!("{found} of {}", keys.join(", ")),
+                ));
+            }
+        }
+    } else {
+        read_npy(path)?
+    };
+    if array.shape.len() != 3 || array.shape[1..] != [count, 3] {
+        return Err(CaptureError::invalid(path, "the file", expected(), format!("shape {:?}", array.shape)));
+    }
+    let [width, height] = video.sides();
+    let lens = [[width.hypot(height); 2], video.middle()];
+    let mut frames = Vec::new();
+    for (index, joints) in array.to_f64().chunks_exact(3 * count).enumerate() {
+        let points: Vec<DVec3> = joints.chunks_exact(3).map(DVec3::from_slice).collect();
+        let seen: Vec<DVec3> = points.iter().copied().filter(|p| p.is_finite()).collect();
+        if let Some(point) = seen.iter().find(|p| p.z <= 0.0) {
+            let expected = "joints in front of the camera, in metres and its axes (x right, y down, z forward)";
+            return Err(CaptureError::invalid(path, format!("frame {index}"), expected, point.to_string()));
+        }
+        if !seen.is_empty() {
+            let middle = seen.iter().sum::<DVec3>() / seen.len() as f64;
+            frames
+                .push(FitFrame { points, ..FitFrame::still(index, Vec::new(), Vec::new(), &middle.to_array(), lens) });
+        }
+    }
+    let person = Person { id: "0".to_owned(), frames, ..Person::default() };
+    Ok(Fit { tool: Tool::Joints, people: vec![person], names: None })
+}
+
+/// Number of points of a joint set.
+pub(super) fn count(set: &str) -> Result<usize, CaptureError> {
+    let points = joint_set(&BodyModel::embedded(), set).map(|points| points.len());
+    points.ok_or_else(|| CaptureError::setting("joints", joint_sets().join(", "), set))
+}
+
+/// Fits `model` to a person's points: poses, places and one shape. Returns what to say of it.
+pub(super) fn solve(path: &Path, set: &str, person: &mut Person, model: &BodyModel) -> Result<String, CaptureError> {
+    let invalid =
+        |expected: String, found: String| CaptureError::invalid(path, format!("person {}", person.id), expected, found);
+    let points = joint_set(model, set)
+        .ok_or_else(|| invalid("a body with SMPL's joints".to_owned(), format!("{} joints", model.num_joints())))?;
+    let anchors: Vec<_> = points.iter().flatten().cloned().collect();
+    let first = person.frames.first().map_or(0, |frame| frame.index);
+    let last = person.frames.last().map_or(0, |frame| frame.index);
+    let mut seen = vec![Vec3::NAN; (last - first + 1) * anchors.len()];
+    for frame in &person.frames {
+        let known = frame.points.iter().zip(&points).filter(|(_, anchor)| anchor.is_some());
+        let row = &mut seen[(frame.index - first) * anchors.len()..][..anchors.len()];
+        row.iter_mut().zip(known).for_each(|(to, (point, _))| *to = point.as_vec3());
+    }
+    let Fitted { betas, frames, noise } = point_fit::fit(model, &anchors, &seen)
+        .map_err(|error| invalid("points of a body".to_owned(), error.to_string()))?;
+    let mut swapped = Vec::new();
+    let mut squares = Vec::new();
+    for frame in &mut person.frames {
+        let found = &frames[frame.index - first];
+        frame.pose = found.pose.iter().map(|v| v.as_dvec3()).collect();
+        frame.offset = found.translation.as_dvec3();
+        frame.betas = betas.iter().map(|b| f64::from(*b)).collect();
+        squares.extend(found.distance.map(|d| f64::from(d).powi(2)));
+        if found.swapped {
+            swapped.push(frame.index.to_string());
+        }
+    }
+    let off = (squares.iter().sum::<f64>() / squares.len().max(1) as f64).sqrt();
+    let swapped = match swapped.len() {
+        0 => String::new(),
+        n => format!(
+            "; left and right exchanged in {n} frames ({}{})",
+            swapped[..n.min(8)].join(", "),
+            if n > 8 { ", …" } else { "" }
+        ),
+    };
+    Ok(format!(
+        "fit: the body's points are {:.0} mm off (noise between frames {:.0} mm){swapped}",
+        1e3 * off,
+        1e3 * noise
+    ))
+}

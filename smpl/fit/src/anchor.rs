@@ -1,0 +1,146 @@
+//! Points of a body that measurements correspond to.
+
+use glam::Vec3;
+use smpl::BodyModel;
+
+/// A point of a body: a weighted sum of its joints and vertices, weights summing to 1.
+///
+/// ```
+/// use glam::Vec3;
+/// use point_fit::Anchor;
+/// let body = smpl::BodyModel::embedded();
+/// let nose = Anchor::farthest(&body, 15, Vec3::Z); // of the head's vertices the one in front
+/// assert!(body.v_template[nose.vertices[0].0].z > 0.1);
+/// ```
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Anchor {
+    /// Joints and weights.
+    pub joints: Vec<(usize, f32)>,
+    /// Vertices and weights.
+    pub vertices: Vec<(usize, f32)>,
+}
+
+impl Anchor {
+    /// A joint.
+    #[must_use]
+    pub fn joint(joint: usize) -> Self {
+        Self { joints: vec![(joint, 1.0)], vertices: Vec::new() }
+    }
+
+    /// The template's vertex farthest in `direction` of those that `joint` and its descendants move
+    /// most: nose, heels, toes and fingertips of any body with the same skeleton. The first of equals;
+    /// vertex 0 of a body where they move none.
+    #[must_use]
+    pub fn farthest(body: &BodyModel, joint: usize, direction: Vec3) -> Self {
+        let mut below = vec![false; body.num_joints()];
+        for (j, parent) in body.parents.iter().enumerate() {
+            below[j] = j == joint || parent.is_some_and(|p| below[p]);
+        }
+        let moved = |v: &usize| body.weights.row(*v).filter(|(j, _)| below[*j]).map(|(_, w)| w).sum::<f32>() > 0.5;
+        let along = |v: &usize| body.v_template[*v].dot(direction);
+        let found = (0..body.num_vertices()).filter(moved).min_by(|a, b| along(b).total_cmp(&along(a)));
+        Self { joints: Vec::new(), vertices: vec![(found.unwrap_or(0), 1.0)] }
+    }
+}
+
+/// Name, joint, and for a vertex the direction in which it is the farthest.
+const LANDMARKS: [(&str, usize, [f32; 3]); 14] = [
+    ("nose", 15, [0.0, 0.0, 1.0]),
+    ("head", 15, [0.0, 1.0, 0.0]),
+    ("lear", 15, [1.0, 0.0, 0.0]),
+    ("rear", 15, [-1.0, 0.0, 0.0]),
+    ("lheel", 7, [0.0, -0.3, -1.0]),
+    ("rheel", 8, [0.0, -0.3, -1.0]),
+    ("ltoe", 10, [-0.3, 0.0, 1.0]),
+    ("rtoe", 11, [0.3, 0.0, 1.0]),
+    ("lsmall", 10, [0.8, 0.0, 0.6]),
+    ("rsmall", 11, [-0.8, 0.0, 0.6]),
+    ("lthumb", 20, [0.5, 0.0, 1.0]),
+    ("rthumb", 21, [-0.5, 0.0, 1.0]),
+    ("lfinger", 20, [1.0, 0.0, 0.0]),
+    ("rfinger", 21, [-1.0, 0.0, 0.0]),
+];
+
+/// Names of joint sets, and their points in order: landmarks, numbers of SMPL's joints, means of two
+/// joints (`16+17`), and `-` for points without a place on the body; joints from 24 are SMPL-X's fingers.
+const SETS: [(&str, &str); 5] = [
+    ("coco17", "nose - - lear rear 16 17 18 19 20 21 1 2 4 5 7 8"),
+    ("openpose25", "nose 16+17 17 19 21 16 18 20 1+2 2 5 8 1 4 7 - - rear lear ltoe lsmall lheel rtoe rsmall rheel"),
+    ("smpl24", "0 1 2 3 4 5 6 7 8 9 10 11 12 13 14 15 16 17 18 19 20 21 22 23"),
+    ("h36m17", "1+2 2 5 8 1 4 7 6 12 - head 16 18 20 17 19 21"),
+    (
+        "mhr70",
+        "nose - - lear rear 16 17 18 19 1 2 4 5 7 8 ltoe lsmall lheel rtoe rsmall rheel \
+         rthumb 54 53 52 - 42 41 40 rfinger 45 44 23 - 51 50 49 - 48 47 46 21 \
+         lthumb 39 38 37 - 27 26 25 lfinger 30 29 22 - 36 35 34 - 33 32 31 20 18 19 - - - - 12",
+    ),
+];
+
+/// Names of the sets of [`joint_set`].
+#[must_use]
+pub fn joint_sets() -> [&'static str; SETS.len()] {
+    SETS.map(|(name, _)| name)
+}
+
+/// The points of a joint set in its order, on a body with SMPL's first 24 joints; `None` for points that
+/// the body does not have. `None` for an unknown name or a body with fewer joints.
+///
+/// - `coco17`: COCO's key points (also ViTPose, RTMPose);
+/// - `openpose25`: OpenPose's BODY_25;
+/// - `smpl24`: SMPL's joints;
+/// - `h36m17`: Human3.6M's, the hips' middle first;
+/// - `mhr70`: SAM 3D Body's, with feet and hands; fingers joint by joint on bodies with SMPL-X's.
+///
+/// ```
+/// let body = smpl::BodyModel::embedded();
+/// let set = point_fit::joint_set(&body, "coco17").unwrap();
+/// assert_eq!(set.len(), 17);
+/// assert_eq!(set[5], Some(point_fit::Anchor::joint(16))); // left shoulder
+/// ```
+#[must_use]
+pub fn joint_set(body: &BodyModel, name: &str) -> Option<Vec<Option<Anchor>>> {
+    let (_, points) = SETS.iter().find(|(set, _)| *set == name).filter(|_| body.num_joints() >= 24)?;
+    let anchor = |point: &str| {
+        if let Some((_, joint, direction)) = LANDMARKS.iter().find(|(landmark, ..)| *landmark == point) {
+            return Some(Anchor::farthest(body, *joint, Vec3::from_array(*direction)));
+        }
+        let joints: Vec<usize> = point.split('+').map(str::parse).collect::<Result<_, _>>().ok()?;
+        joints.iter().all(|&j| j < body.num_joints()).then_some(())?;
+        // The hands of SMPL-X end in fingers, whose middle ones begin where SMPL's hands do.
+        let on_body = |joint: usize| match (joint, body.num_joints()) {
+            (22, 55) => 28,
+            (23, 55) => 43,
+            (joint, _) => joint,
+        };
+        let weight = 1.0 / joints.len() as f32;
+        Some(Anchor { joints: joints.into_iter().map(|j| (on_body(j), weight)).collect(), vertices: Vec::new() })
+    };
+    Some(points.split_whitespace().map(anchor).collect())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn sets_have_the_counts_of_their_names_and_landmarks_lie_where_they_should() {
+        let body = BodyModel::embedded();
+        let rest = body.shaped(&[]);
+        let at = |anchor: &Anchor| {
+            let joints = anchor.joints.iter().map(|(j, w)| *w * rest.joints[*j]);
+            joints.chain(anchor.vertices.iter().map(|(v, w)| *w * rest.vertices[*v])).sum::<Vec3>()
+        };
+        for name in joint_sets() {
+            let set = joint_set(&body, name).unwrap();
+            let count: usize = name.trim_start_matches(char::is_alphabetic).trim_start_matches("36m").parse().unwrap();
+            assert_eq!(set.len(), count, "{name}");
+        }
+        let set: Vec<_> = joint_set(&body, "mhr70").unwrap().iter().map(|a| a.as_ref().map(at)).collect();
+        let [nose, ear, ankle, toe, heel, elbow] = [0, 3, 13, 15, 17, 7].map(|i| set[i].unwrap());
+        assert!(nose.x.abs() < 0.01 && nose.z > ear.z + 0.06 && (nose.y - ear.y).abs() < 0.06);
+        assert!(toe.z > ankle.z + 0.1 && heel.z < ankle.z && heel.y < ankle.y && heel.x > 0.0);
+        assert!(elbow.x > 0.3);
+        // Olecranon and elbow are one joint; the right wrist is 41.
+        assert_eq!((set[63], set[41].unwrap().x < -0.5), (set[7], true));
+    }
+}

@@ -1,0 +1,316 @@
+//! What is made of a run is of that run: nothing stale passes for fresh, nothing finished is replaced
+//! unasked, and commands side by side come to what they come to one after the other.
+
+use crate::common;
+
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output, Stdio};
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::time::{Duration, Instant, SystemTime};
+
+use common::{done, folder, refused, text, xtask};
+use occnerf::capture::Layout;
+use serde_json::Value;
+
+const QUICK: [&str; 8] = ["--preset", "fast", "--method", "hash-point", "--set", "samples=8", "--set", "patches=1"];
+
+fn trained(folder: &Path, seed: &str) -> (PathBuf, PathBuf) {
+    let (capture, run) = (folder.join("capture"), folder.join(seed));
+    if !capture.exists() {
+        common::capture(&capture, Layout::Wild, 32, 4);
+    }
+    done(&[&["train", text(&capture), "--out", text(&run), "--steps", "8", "--seed", seed][..], &QUICK].concat());
+    (capture, run)
+}
+
+fn bytes(path: &Path) -> Vec<u8> {
+    std::fs::read(path).unwrap_or_else(|error| panic!("{}: {error}", path.display()))
+}
+
+fn json(path: &Path) -> Value {
+    serde_json::from_slice(&bytes(path)).unwrap()
+}
+
+fn stderr(output: &Output) -> String {
+    String::from_utf8_lossy(&output.stderr).into_owned()
+}
+
+/// The command with what the shell code before it sets.
+fn limited(limits: &str, arguments: &[&str]) -> Output {
+    let script = format!("{limits} exec \"$@\"");
+    let mut command = Command::new("sh");
+    command.args(["-c", &script, "sh", env!("CARGO_BIN_EXE_xtask")]).args(arguments);
+    command.env_remove("SMPL_MODEL").stdin(Stdio::null()).output().unwrap()
+}
+
+#[test]
+fn an_avatar_of_an_earlier_training_is_baked_again_whatever_its_time() {
+    let folder = folder("stale-avatar");
+    let (_, run) = trained(&folder, "1");
+    let (avatar, glb, page) = (run.join("avatar.safetensors"), run.join("person.glb"), run.join("person.html"));
+    let export = ["export", text(&run), "--out", text(&glb)];
+    done(&export);
+    done(&["view", text(&run)]);
+    let (old, old_scores) = (bytes(&avatar), json(&run.join("metrics.json")));
+    done(&["train", "--resume", "--steps", "12", "--stop-after", "11", "--out", text(&run)]);
+    let future = SystemTime::now() + Duration::from_secs(1 << 20);
+    std::fs::File::options().write(true).open(&avatar).unwrap().set_modified(future).unwrap();
+    // Scores of the earlier checkpoint are not added to.
+    let report = run.join("report.html");
+    done(&["eval", text(&run), "--split", "train-view"]);
+    let scores = json(&run.join("metrics.json"));
+    assert!(scores["of"] != old_scores["of"] && scores["splits"]["novel_view"].is_null(), "{scores}");
+    let names = |page: &Path| String::from_utf8(bytes(page)).unwrap().contains("before the last training");
+    assert!(names(&report));
+    done(&export);
+    let again = bytes(&avatar);
+    assert!(again != old);
+    std::fs::remove_file(&avatar).unwrap();
+    done(&export);
+    assert!(bytes(&avatar) == again);
+    done(&["view", text(&run)]);
+    done(&["eval", text(&run)]);
+    assert!(!names(&report) && String::from_utf8(bytes(&page)).unwrap().contains(scores["of"].as_str().unwrap()));
+    // A checkpoint of another run.
+    let (_, other) = trained(&folder, "2");
+    std::fs::copy(other.join("checkpoint.safetensors"), run.join("checkpoint.safetensors")).unwrap();
+    refused(&["eval", text(&run)], &["checkpoint.safetensors", "of another run"]);
+    refused(&export, &["of another run"]);
+}
+
+#[test]
+fn a_list_does_not_replace_what_is_finished_with_other_settings_or_another_capture() {
+    let folder = folder("list-finished");
+    let capture = folder.join("a");
+    common::capture(&capture, Layout::Wild, 32, 3);
+    let (list, out) = (folder.join("l"), folder.join("lo"));
+    std::fs::write(&list, text(&capture)).unwrap();
+    let command = ["train", "--list", text(&list), "--out", text(&out), "--method", "hash-point"];
+    let with = |more: &[&'static str]| [&command[..], more].concat();
+    done(&with(&["--steps", "2"]));
+    let checkpoint = bytes(&out.join("a/checkpoint.safetensors"));
+    for more in [&["--steps", "3"][..], &["--steps", "2", "--seed", "2"], &["--steps", "2", "--set", "samples=8"]] {
+        let output = xtask(&with(more));
+        let said = String::from_utf8_lossy(&output.stdout).into_owned();
+        assert!(output.status.code() == Some(1) && said.contains("holds a run with other settings"), "{said}");
+        refused(&with(&[more, &["--merge"]].concat()), &["have no scores yet"]);
+    }
+    assert!(bytes(&out.join("a/checkpoint.safetensors")) == checkpoint);
+    assert!(done(&with(&["--steps", "2"])).contains("a: finished earlier"));
+    // One picture is another.
+    std::fs::copy(capture.join("images/000001.png"), capture.join("images/000000.png")).unwrap();
+    let output = xtask(&with(&["--steps", "2"]));
+    let said = String::from_utf8_lossy(&output.stdout).into_owned();
+    assert!(output.status.code() == Some(1) && said.contains("the capture as it was then"), "{said}");
+    assert!(bytes(&out.join("a/checkpoint.safetensors")) == checkpoint);
+}
+
+#[test]
+fn a_run_that_may_not_be_written_is_scored_exported_and_drawn() {
+    let folder = folder("read-only");
+    let (_, run) = trained(&folder, "1");
+    let nobody = ["--reuid", "65534", "--regid", "65534", "--clear-groups"];
+    let as_nobody = |arguments: &[&str]| {
+        let mut command = Command::new("setpriv");
+        command.args(nobody).arg(env!("CARGO_BIN_EXE_xtask")).args(arguments).env_remove("SMPL_MODEL");
+        command.output()
+    };
+    if !as_nobody(&["--version"]).is_ok_and(|output| output.status.success()) {
+        println!("skipped: no other user here");
+        return;
+    }
+    use std::os::unix::fs::PermissionsExt;
+    let results = folder.join("results");
+    std::fs::create_dir(&results).unwrap();
+    std::fs::set_permissions(&results, PermissionsExt::from_mode(0o777)).unwrap();
+    let before = bytes(&run.join("metrics.json"));
+    let (glb, drawn) = (results.join("person.glb"), results.join("drawn"));
+    let each: [(&[&str], &str); 4] = [
+        (&["export", text(&run), "--out", text(&glb)], "is not kept"),
+        (&["eval", text(&run)], "only printed"),
+        (&["eval", text(&run), "--baked"], "is not kept"),
+        (&["render", text(&run), "tpose", "--baked", "--size", "8x8", "--out", text(&drawn)], "is not kept"),
+    ];
+    for (arguments, word) in each {
+        let output = as_nobody(arguments).unwrap();
+        assert!(output.status.success() && stderr(&output).contains(word), "{arguments:?}: {}", stderr(&output));
+    }
+    assert!(glb.is_file() && drawn.join("0000.png").is_file());
+    assert!(bytes(&run.join("metrics.json")) == before && !run.join("avatar.safetensors").exists());
+}
+
+#[test]
+fn devices_and_pipes_are_read_up_to_a_bound_and_written_to_as_they_are() {
+    let folder = folder("devices");
+    let (capture, run) = trained(&folder, "1");
+    let glb = folder.join("person.glb");
+    // 2 GB of address space.
+    let limits = "ulimit -v 2000000;";
+    let refusal = |arguments: &[&str], word: &str| {
+        let output = limited(limits, arguments);
+        let said = stderr(&output);
+        assert!(output.status.code() == Some(1) && said.matches("error").count() == 1 && said.contains(word), "{said}");
+    };
+    refusal(&["train", "--list", "/dev/zero", "--out", text(&folder.join("l"))], "/dev/zero: more than 16777216 bytes");
+    let motion = folder.join("zero.npz");
+    std::os::unix::fs::symlink("/dev/zero", &motion).unwrap();
+    refusal(&["export", text(&run), "--out", text(&glb), "--motion", text(&motion)], "zero.npz: more than");
+    refusal(&["train", text(&capture), "--body", text(&motion)], "zero.npz: more than");
+    // A pipe that nobody writes to, in a run.
+    let metrics = run.join("train.jsonl");
+    std::fs::remove_file(&metrics).unwrap();
+    assert!(Command::new("mkfifo").arg(&metrics).status().unwrap().success());
+    refusal(&["eval", text(&run)], "train.jsonl: not a plain file");
+    for name in ["avatar.safetensors", "config.toml"] {
+        let kept = std::fs::read(run.join(name));
+        let _ = std::fs::remove_file(run.join(name));
+        std::os::unix::fs::symlink("/dev/zero", run.join(name)).unwrap();
+        refusal(&["export", text(&run), "--out", text(&glb)], "plain file");
+        std::fs::remove_file(run.join(name)).unwrap();
+        kept.map_or(Ok(()), |kept| std::fs::write(run.join(name), kept)).unwrap();
+    }
+    let piped = limited("", &["export", text(&run), "--format", "glb", "--out", "/dev/stdout"]);
+    assert!(piped.status.success() && piped.stdout.starts_with(b"glTF"), "{}", stderr(&piped));
+    done(&["export", text(&run), "--format", "glb", "--out", "/dev/null"]);
+    assert!(!Path::new("/dev/null").is_file());
+}
+
+#[test]
+fn nothing_is_learnt_of_a_person_who_is_not_where_the_masks_are() {
+    let folder = folder("nothing");
+    type Edit<'a> = (&'a str, &'a dyn Fn(&mut Value));
+    let edits: [Edit<'_>; 3] = [
+        ("focal", &|frame| {
+            frame["cam_intrinsics"][0][0] = 1.into();
+            frame["cam_intrinsics"][1][1] = 1.into();
+        }),
+        ("far", &|frame| frame["cam_extrinsics"][2][3] = 1000.into()),
+        ("beside", &|frame| {
+            let x = frame["cam_extrinsics"][0][3].as_f64().unwrap() + 1.0;
+            frame["cam_extrinsics"][0][3] = x.into();
+        }),
+    ];
+    for (name, edit) in edits {
+        let capture = folder.join(name);
+        common::capture(&capture, Layout::Wild, 64, 4);
+        let path = capture.join("metadata.json");
+        let mut metadata = json(&path);
+        metadata.as_object_mut().unwrap().values_mut().for_each(edit);
+        std::fs::write(&path, metadata.to_string()).unwrap();
+        let run = folder.join(format!("{name}-run"));
+        let output = xtask(&["train", text(&capture), "--out", text(&run), "--method", "surface"]);
+        let said = stderr(&output);
+        assert!(output.status.code() == Some(1) && said.contains("check"), "{name}: {:?} {said}", output.status);
+        assert!(!run.join("avatar.safetensors").exists() && !run.join("metrics.json").exists());
+        let advice = done(&["check", text(&capture)]);
+        assert!(!advice.contains("centimetres") || name == "far", "{name}: {advice}");
+    }
+}
+
+#[test]
+fn limits_of_the_process_are_said_in_a_line() {
+    let one_line = |output: &Output, word: &str| {
+        let said = stderr(output);
+        assert!(output.status.code() == Some(1) && said.lines().count() == 1 && said.contains(word), "{said}");
+    };
+    for asked in ["1000000", "x"] {
+        one_line(&limited(&format!("export RAYON_NUM_THREADS={asked};"), &["view", "x"]), "RAYON_NUM_THREADS");
+    }
+    // Stacks of 2 MiB each.
+    let threads = std::thread::available_parallelism().map_or(16, |cores| 16 * usize::from(cores)).to_string();
+    let crowd = ["render", "x", "tpose", "--threads", &threads];
+    one_line(&limited("ulimit -v 60000;", &crowd), "threads cannot be started");
+    assert!(limited("ulimit -s 64;", &["check", "--out", "/dev/null"]).status.success());
+}
+
+#[test]
+fn output_that_is_the_result_must_arrive() {
+    let full = || std::fs::File::options().write(true).open("/dev/full").unwrap();
+    for arguments in [&["check", "--out", "/dev/null"][..], &["train", "--help"]] {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_xtask"));
+        assert_eq!(command.args(arguments).stdout(full()).status().unwrap().code(), Some(3), "{arguments:?}");
+    }
+}
+
+#[test]
+fn a_signal_before_the_first_step_says_that_nothing_was_made() {
+    let folder = folder("early-signal");
+    let mut child = Command::new(env!("CARGO_BIN_EXE_xtask"))
+        .args(["train", "--out", text(&folder.join("run")), "--steps", "100"])
+        .stdout(Stdio::null())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
+    std::thread::sleep(Duration::from_millis(500));
+    let sent = Command::new("kill").args(["-TERM", &child.id().to_string()]).status().unwrap();
+    assert!(sent.success() && child.try_wait().unwrap().is_none());
+    let output = child.wait_with_output().unwrap();
+    let said = stderr(&output);
+    assert!(output.status.code() == Some(143) && said.contains("had not been made"), "{said}");
+}
+
+/// Twenty seconds; `STORM=120 cargo test -p xtask storm` for two minutes.
+#[test]
+fn after_a_storm_of_commands_on_one_run_everything_is_as_one_alone_would_make_it() {
+    let length = std::env::var("STORM").ok().map_or(20, |seconds| seconds.parse().expect("STORM is a number"));
+    let folder = folder("storm");
+    let (_, run) = trained(&folder, "1");
+    let (glb, renders) = (folder.join("person.glb"), folder.join("drawn"));
+    let (steps, ends) = (AtomicUsize::new(8), AtomicUsize::new(0));
+    let storm = |n: usize| {
+        let begun = Instant::now();
+        let mut turn = n;
+        while begun.elapsed() < Duration::from_secs(length) {
+            let more = (steps.fetch_add(1, Ordering::SeqCst) + 1).to_string();
+            let train = ["train", "--resume", "--out", text(&run), "--checkpoint-every", "0", "--steps", &more];
+            let each: [&[&str]; 6] = [
+                &train,
+                &["export", text(&run), "--out", text(&glb)],
+                &["view", text(&run)],
+                &["render", text(&run), "tpose", "--baked", "--size", "8x8", "--out", text(&renders)],
+                &["eval", text(&run)],
+                &["eval", text(&run), "--baked"],
+            ];
+            let arguments = each[turn % each.len()];
+            turn += 1;
+            // A training needs the run alone.
+            let patience = if turn % each.len() == 1 { 100 } else { 1 };
+            let mut tries = (0..patience).map(|_| xtask(arguments));
+            let is_busy = |output: &Output| output.status.code() == Some(4);
+            let Some(output) = tries.find(|output| !is_busy(output)) else { continue };
+            std::thread::sleep(Duration::from_millis(100));
+            // The steps may be fewer than another training has taken.
+            let expected = [Some(0), Some(1)];
+            let said = stderr(&output);
+            assert!(expected.contains(&output.status.code()), "{arguments:?}: {:?} {said}", output.status);
+            assert!(output.status.code() != Some(1) || said.contains("steps"), "{arguments:?}: {said}");
+            ends.fetch_add(usize::from(output.status.success()), Ordering::SeqCst);
+        }
+    };
+    std::thread::scope(|scope| (0..3).for_each(|n| drop(scope.spawn(move || storm(2 * n)))));
+    println!("{} commands came to their ends in {length} s", ends.load(Ordering::SeqCst));
+    for arguments in [&["export", text(&run), "--out", text(&glb)][..], &["eval", text(&run)], &["view", text(&run)]] {
+        done(arguments);
+    }
+    let alone = folder.join("alone");
+    std::fs::create_dir(&alone).unwrap();
+    for name in ["config.toml", "checkpoint.safetensors", "body.safetensors", "person.safetensors", "train.jsonl"] {
+        std::fs::copy(run.join(name), alone.join(name)).unwrap();
+    }
+    let fresh = folder.join("fresh.glb");
+    for arguments in
+        [&["export", text(&alone), "--out", text(&fresh)][..], &["eval", text(&alone)], &["view", text(&alone)]]
+    {
+        done(arguments);
+    }
+    assert!(bytes(&glb) == bytes(&fresh));
+    for name in ["avatar.safetensors", "person.html"] {
+        assert!(bytes(&run.join(name)) == bytes(&alone.join(name)), "{name}");
+    }
+    let [ours, theirs] = [&run, &alone].map(|run| json(&run.join("metrics.json")));
+    let scores = |metrics: &Value| ["novel_view", "train_view"].map(|split| metrics["splits"][split]["frames"].clone());
+    assert!(ours["of"] == theirs["of"] && scores(&ours) == scores(&theirs), "{ours}\n{theirs}");
+    assert!(ours["steps"].as_u64().unwrap() > 8, "no training got through: {ours}");
+    let left: Vec<_> = std::fs::read_dir(&run).unwrap().map(|entry| entry.unwrap().file_name()).collect();
+    assert!(left.iter().all(|name| !name.to_string_lossy().contains("unfinished")), "{left:?}");
+}
