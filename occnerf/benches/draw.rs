@@ -5,8 +5,8 @@
 use std::sync::OnceLock;
 
 use divan::Bencher;
-use glam::{Affine3A, Vec4};
-use occnerf::bake::{Avatar, BakeOptions, BakedPerson, bake};
+use glam::Affine3A;
+use occnerf::bake::{Avatar, BakeOptions, BakedRenderer, bake};
 use occnerf::{Config, Method, Model, Preset, Scene, Trainer};
 use visibility::Samples;
 use volrender::Camera;
@@ -46,16 +46,15 @@ fn avatar() -> &'static Avatar {
 
 fn draw(bencher: Bencher<'_, '_>, samples: Samples, size: (u32, u32), threads: usize) {
     let model = &trained().model;
-    let mut person = BakedPerson::new(avatar(), model.body().scale);
+    let mut renderer = BakedRenderer::new(avatar(), model.body().scale, model.light(), samples);
     let view = &model.frames()[0];
     let bones: Vec<Affine3A> = view.posed.bones.clone();
     // As high as the square picture, in the middle of a wide one.
     let mut camera: Camera = view.camera.resized(size.1, size.1);
     camera.centre.x += (size.0 - size.1) as f32 / 2.0;
     camera.width = size.0;
-    let mut out = vec![Vec4::ZERO; (size.0 * size.1) as usize];
     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-    bencher.bench_local(|| pool.install(|| person.draw(&bones, &camera, samples, &mut out)).unwrap());
+    bencher.bench_local(|| pool.install(|| renderer.draw(&bones, &camera).map(drop)).unwrap());
 }
 
 const SIZES: [(u32, u32); 4] = [(256, 256), (512, 512), (1024, 1024), (1920, 1080)];
@@ -88,12 +87,12 @@ fn one_surface_four_samples_one_thread(bencher: Bencher<'_, '_>, size: (u32, u32
 #[divan::bench]
 fn skin(bencher: Bencher<'_, '_>) {
     let model = &trained().model;
-    let mut person = BakedPerson::new(avatar(), model.body().scale);
+    let mut renderer = BakedRenderer::new(avatar(), model.body().scale, model.light(), Samples::Four);
     let bones: Vec<Affine3A> = model.frames()[0].posed.bones.clone();
     let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
     bencher.bench_local(|| {
         pool.install(|| {
-            divan::black_box(person.skin(&bones));
+            divan::black_box(renderer.skin(&bones));
         })
     });
 }

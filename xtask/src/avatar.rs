@@ -44,7 +44,8 @@ pub fn load_motion(path: &Path, fps: Option<f32>) -> Result<MotionClip> {
 /// Adds a motion from a file, named after it.
 pub fn add_motion(avatar: &mut Avatar, path: &Path, fps: Option<f32>) -> Result<()> {
     let motion = load_motion(path, fps)?;
-    let motion = export::adapt_motion(avatar, &motion).with_context(|| path.display().to_string())?;
+    let root = avatar.skeleton[0].rest;
+    let motion = export::fit_motion(&motion, avatar.num_joints(), root).with_context(|| path.display().to_string())?;
     let stem = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
     let taken = |name: &str| avatar.clips.iter().any(|clip| clip.name == name);
     let others = (2..).map(|i| format!("{stem} {i}"));

@@ -219,7 +219,9 @@ impl Drawn<'_> {
         Ok(match self {
             Self::Field { model, .. } => Box::new(FieldRenderer::new(model)?),
             Self::Prior(colors) => Box::new(PriorRenderer::new(&scene.body, colors)),
-            Self::Avatar { body, light, avatar } => Box::new(BakedRenderer::new(body, *light, avatar, Samples::Four)?),
+            Self::Avatar { body, light, avatar } => {
+                Box::new(BakedRenderer::new(avatar, body.scale, *light, Samples::Four))
+            }
         })
     }
 

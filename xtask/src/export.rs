@@ -5,6 +5,7 @@ use std::path::PathBuf;
 
 use anyhow::{Context, Error, Result, bail};
 use clap::{Args, ValueEnum};
+use glam::Vec3;
 use occnerf::bake::{Avatar, export};
 use occnerf::replace_file;
 
@@ -72,13 +73,13 @@ pub fn export(arguments: &ExportArguments) -> Result<()> {
             say!("{}: {size:.1} MB, {} triangles, motions: {}", out.display(), person.faces.len(), names.join(", "));
         }
         Format::Ply => {
-            let Posed { vertices, .. } = posed(&person, clip, arguments)?;
+            let (vertices, _) = posed(&person, clip, arguments)?;
             let splats = export::splats(&person, &vertices, PATCH)?;
             splats.write(out).map_err(Error::from).map_err(results_in(out))?;
             say!("{}: {} splats", out.display(), splats.centres.len());
         }
         Format::Obj => {
-            let Posed { vertices, normals } = posed(&person, clip, arguments)?;
+            let (vertices, normals) = posed(&person, clip, arguments)?;
             export::write_obj(&person, &vertices, &normals, out)
                 .map_err(Error::from)
                 .map_err(results_in(out.parent().unwrap_or(out)))?;
@@ -106,13 +107,8 @@ fn format(arguments: &ExportArguments) -> Result<Format> {
     }
 }
 
-struct Posed {
-    vertices: Vec<glam::Vec3>,
-    normals: Vec<glam::Vec3>,
-}
-
-/// The person at `--frame`.
-fn posed(person: &Avatar, clip: usize, arguments: &ExportArguments) -> Result<Posed> {
+/// Vertices and normals of the person at `--frame`.
+fn posed(person: &Avatar, clip: usize, arguments: &ExportArguments) -> Result<(Vec<Vec3>, Vec<Vec3>)> {
     let motion = &person.clips.get(clip).context("the person has no motion")?.motion;
     let (frame, frames) = (arguments.frame.unwrap_or(0), motion.num_frames());
     if frame >= frames {
@@ -120,5 +116,5 @@ fn posed(person: &Avatar, clip: usize, arguments: &ExportArguments) -> Result<Po
     }
     let pose = &motion.poses[frame * motion.num_joints..][..motion.num_joints];
     let bones = person.bones(pose, motion.trans[frame]);
-    Ok(Posed { vertices: person.skin_with_blend_shapes(&bones, pose), normals: person.turned_normals(&bones) })
+    Ok(person.skin(&bones, pose))
 }

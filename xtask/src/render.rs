@@ -87,13 +87,13 @@ pub fn render(arguments: &RenderArguments) -> Result<()> {
             (body, frames, Box::new(PriorRenderer::new(body, colors)))
         } else {
             avatar = Avatar::load(&baked::path(directory))?;
-            (body, frames, Box::new(BakedRenderer::new(body, colors.light, &avatar, Samples::Four)?))
+            (body, frames, Box::new(BakedRenderer::new(&avatar, body.scale, colors.light, Samples::Four)))
         }
     } else {
         model = run::model(directory, &run)?;
         let renderer: Box<dyn Renderer + '_> = if arguments.baked {
             avatar = baked::avatar(directory, &run)?;
-            Box::new(BakedRenderer::new(model.body(), model.light(), &avatar, Samples::Four)?)
+            Box::new(BakedRenderer::new(&avatar, model.body().scale, model.light(), Samples::Four))
         } else {
             Box::new(FieldRenderer::new(&model)?)
         };

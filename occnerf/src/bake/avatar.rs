@@ -2,7 +2,7 @@
 
 use glam::{Affine3A, Mat3, Mat3A, Vec2, Vec3, Vec3A};
 use rayon::prelude::*;
-use smpl::{MotionClip, Placement, SparseRows};
+use smpl::{MotionClip, SparseRows};
 use volrender::Camera;
 
 use crate::capture::Light;
@@ -16,7 +16,7 @@ const MAX_LENGTH: f32 = 1e6;
 /// Steepest light.
 const MAX_SLOPE: f32 = 10.0;
 /// Pose blend-shape terms of a joint other than the root: the entries of R − I.
-const TERMS_PER_JOINT: usize = 9;
+pub(super) const TERMS_PER_JOINT: usize = 9;
 
 /// A person as a textured, skinned surface of triangles, with motion clips.
 ///
@@ -87,7 +87,7 @@ pub struct Joint {
 /// translations (T) of the root.
 ///
 /// The root joint is at its rest position + translation and rotates about itself
-/// ([`Placement::Pelvis`]).
+/// ([`smpl::Placement::Pelvis`]).
 #[derive(Clone, Debug, PartialEq)]
 pub struct Clip {
     /// Such as `video`; unique.
@@ -138,61 +138,24 @@ impl Avatar {
         frames.into_iter().zip(&self.skeleton).map(about).collect()
     }
 
-    /// Canonical to world transform of each joint, (J), at `seconds` of clip `clip`.
-    ///
-    /// # Panics
-    /// If there is no such clip.
-    #[must_use]
-    pub fn bones_at(&self, clip: usize, seconds: f32) -> Vec<Affine3A> {
-        let (pose, placement) = self.clips[clip].motion.at(seconds, self.num_joints());
-        let (Placement::Pelvis { translation } | Placement::Origin { translation, .. }) = placement;
-        self.bones(&pose, translation)
-    }
-
-    /// Linear blend skinning without pose blend shapes, as glTF has it: Σ w_vi · bones_i ·
-    /// vertices_v, (V).
-    ///
-    /// # Panics
-    /// Unless there are J bones.
-    #[must_use]
-    pub fn skin(&self, bones: &[Affine3A]) -> Vec<Vec3> {
-        self.skinned(bones, &|v| self.vertices[v])
-    }
-
-    /// [`Avatar::skin`] after the pose blend shapes of rotations `pose`, (J).
+    /// World positions and unit normals of the vertices, (V) each: pose blend shapes of rotations
+    /// `pose` (J), then linear blend skinning by `bones` (J).
     ///
     /// # Panics
     /// Unless `bones` and `pose` are J long.
     #[must_use]
-    pub fn skin_with_blend_shapes(&self, bones: &[Affine3A], pose: &[Vec3]) -> Vec<Vec3> {
-        assert_eq!(pose.len(), self.num_joints(), "skin_with_blend_shapes: rotations of joints");
+    pub fn skin(&self, bones: &[Affine3A], pose: &[Vec3]) -> (Vec<Vec3>, Vec<Vec3>) {
+        assert_eq!((bones.len(), pose.len()), (self.num_joints(), self.num_joints()), "skin: bones, rotations");
         let features: Vec<f32> = (pose.iter().skip(1))
             .flat_map(|&turn| (smpl::rodrigues(turn) - Mat3::IDENTITY).transpose().to_cols_array())
             .collect();
-        self.skinned(bones, &|v| {
-            self.vertices[v] + self.posedirs.row(v).map(|(term, d)| features[term] * d).sum::<Vec3>()
-        })
-    }
-
-    fn skinned(&self, bones: &[Affine3A], rest: &(dyn Fn(usize) -> Vec3 + Sync)) -> Vec<Vec3> {
-        assert_eq!(bones.len(), self.num_joints(), "skin: bones");
-        (0..self.num_vertices())
-            .into_par_iter()
-            .map(|v| blend(bones, self.joints[v], self.weights[v]).transform_point3(rest(v)))
-            .collect()
-    }
-
-    /// World normals of each vertex, (V): the canonical ones turned with the bones.
-    ///
-    /// # Panics
-    /// Unless there are J bones.
-    #[must_use]
-    pub fn turned_normals(&self, bones: &[Affine3A]) -> Vec<Vec3> {
-        assert_eq!(bones.len(), self.num_joints(), "turned_normals: bones");
-        let turned = |(v, &normal): (usize, &Vec3)| {
-            blend(bones, self.joints[v], self.weights[v]).transform_vector3(normal).normalize_or(normal)
+        let skinned = |v: usize| {
+            let bone = blend(bones, self.joints[v], self.weights[v]);
+            let offset: Vec3 = self.posedirs.row(v).map(|(term, d)| features[term] * d).sum();
+            let normal = self.normals[v];
+            (bone.transform_point3(self.vertices[v] + offset), bone.transform_vector3(normal).normalize_or(normal))
         };
-        self.normals.par_iter().enumerate().map(turned).collect()
+        (0..self.num_vertices()).into_par_iter().map(skinned).unzip()
     }
 
     /// Checks that the parts fit together.
@@ -306,7 +269,8 @@ impl Atlas {
 }
 
 /// Σ w_i · bones_i.
-fn blend(bones: &[Affine3A], joints: [u16; 4], weights: [f32; 4]) -> Affine3A {
+#[inline]
+pub(super) fn blend(bones: &[Affine3A], joints: [u16; 4], weights: [f32; 4]) -> Affine3A {
     let mut sum = Affine3A { matrix3: Mat3A::ZERO, translation: Vec3A::ZERO };
     for (joint, weight) in joints.into_iter().zip(weights) {
         let bone = &bones[usize::from(joint)];

@@ -10,13 +10,13 @@
 use glam::Vec3;
 use rayon::prelude::*;
 
+use super::plate::{Plate, Term};
 use super::surface::NormalRay;
 use crate::Error;
 use crate::capture::Light;
 use crate::model::subdivide::Subdivided;
 use crate::model::view::PosedView;
 use crate::scene::light::{ColorObservation, albedo};
-use crate::scene::plate::{Plate, Term};
 use crate::scene::prepared::Scene;
 use crate::scene::registration::{Crop, Edge, ObservationOptions, Observations, noise, observe, robust, shared_edges};
 

@@ -5,23 +5,24 @@ use rayon::prelude::*;
 use visibility::{Fragment, Pixel, RasterOptions, Rasterizer, Samples};
 use volrender::Camera;
 
-use super::avatar::{Atlas, Avatar};
+use super::avatar::{Atlas, Avatar, TERMS_PER_JOINT, blend};
 use crate::Error;
-use crate::capture::Light;
-use crate::model::view::pinhole;
+use crate::capture::{Image, Light};
+use crate::model::view::{PosedView, pinhole};
+use crate::render::picture::{Renderer, Rendering};
 
 /// Vertices per parallel task.
 const CHUNK: usize = 1024;
-/// Pose blend-shape terms of a joint other than the root.
-const TERMS: usize = 9;
 
-/// An avatar with the buffers to render it.
-pub struct BakedPerson<'a> {
+/// Draws an avatar by rasterising; keeps its buffers.
+pub struct BakedRenderer<'a> {
     avatar: &'a Avatar,
     /// Canonical positions in the unit of the bones, (V).
     vertices: Vec<Vec3>,
     /// Length of a unit of the avatar in that of the bones.
     scale: f32,
+    light: Light,
+    samples: Samples,
     /// (H, W).
     texels: Vec<Vec3A>,
     features: Vec<f32>,
@@ -29,39 +30,35 @@ pub struct BakedPerson<'a> {
     /// Shading of each vertex, (V).
     shades: Vec<f32>,
     rasterizer: Rasterizer,
-    light: Light,
+    pixels: Vec<Vec4>,
 }
 
-impl<'a> BakedPerson<'a> {
-    /// For bones and cameras in which an avatar's metre is `scale` long.
+impl<'a> BakedRenderer<'a> {
+    /// For bones and cameras in which an avatar's metre is `scale` long, under `light`, with `samples` a
+    /// pixel.
     #[must_use]
-    pub fn new(avatar: &'a Avatar, scale: f32) -> Self {
-        let texel = |rgb: &[u8; 3]| Vec3A::from(rgb.map(|byte| f32::from(byte) / 255.0));
+    pub fn new(avatar: &'a Avatar, scale: f32, light: Light, samples: Samples) -> Self {
         Self {
             avatar,
             vertices: avatar.vertices.iter().map(|v| scale * v).collect(),
             scale,
-            texels: avatar.atlas.rgb.as_chunks().0.iter().map(texel).collect(),
+            light,
+            samples,
+            texels: avatar.atlas.rgb.as_chunks().0.iter().map(|rgb| color(*rgb).into()).collect(),
             features: Vec::new(),
             skinned: Vec::new(),
             shades: Vec::new(),
             rasterizer: Rasterizer::default(),
-            light: Light::default(),
+            pixels: Vec::new(),
         }
     }
 
-    /// Sets the light; even by default.
-    #[must_use]
-    pub fn lit_by(self, light: Light) -> Self {
-        Self { light, ..self }
-    }
-
-    /// World positions of the vertices, (V): pose blend shapes, then linear blend skinning by
-    /// `bones` (J), canonical to world.
+    /// World positions of the vertices, (V), and their shading, (V): pose blend shapes, then linear
+    /// blend skinning by `bones` (J), canonical to world.
     ///
     /// # Panics
     /// Unless there are J bones.
-    pub fn skin(&mut self, bones: &[Affine3A]) -> &[Vec3] {
+    pub fn skin(&mut self, bones: &[Affine3A]) -> (&[Vec3], &[f32]) {
         let Self { avatar, vertices, scale, features, skinned, shades, light, .. } = self;
         assert_eq!(bones.len(), avatar.num_joints(), "skin: bones");
         blend_shape_features(avatar, bones, *scale, features);
@@ -70,52 +67,36 @@ impl<'a> BakedPerson<'a> {
         let rows = skinned.par_chunks_mut(CHUNK).zip(shades.par_chunks_mut(CHUNK)).enumerate();
         rows.for_each(|(chunk, (out, shades))| {
             for (v, (out, shade)) in (chunk * CHUNK..).zip(out.iter_mut().zip(shades)) {
-                let (mut matrix, mut translation) = (Mat3A::ZERO, Vec3A::ZERO);
-                for (joint, weight) in avatar.joints[v].into_iter().zip(avatar.weights[v]) {
-                    let bone = &bones[usize::from(joint)];
-                    matrix += bone.matrix3 * weight;
-                    translation += bone.translation * weight;
-                }
+                let bone = blend(bones, avatar.joints[v], avatar.weights[v]);
                 let mut rest = Vec3A::from(vertices[v]);
                 for (term, direction) in avatar.posedirs.row(v) {
                     rest += features[term] * Vec3A::from(direction);
                 }
-                *out = Vec3::from(matrix * rest + translation);
+                *out = Vec3::from(bone.matrix3 * rest + bone.translation);
                 // Rotated with the bones: equal on both sides of a seam.
                 let normal = avatar.normals[v];
-                *shade = light.on(Vec3::from(matrix * Vec3A::from(normal)).normalize_or(normal));
+                *shade = light.on(Vec3::from(bone.matrix3 * Vec3A::from(normal)).normalize_or(normal));
             }
         });
-        skinned
-    }
-
-    /// Positions (V) and shading (V) of the last skinning.
-    pub(super) fn posed(&self) -> (&[Vec3], &[f32]) {
-        (&self.skinned, &self.shades)
+        (skinned, shades)
     }
 
     /// The person in the pose of `bones` (J) as `camera` sees them: premultiplied colour and
-    /// opacity of each pixel into `out` (H·W, row-major).
+    /// opacity of each pixel, (H·W, row-major).
     ///
     /// # Errors
-    /// [`Error::Visibility`] for pictures that are too large.
-    ///
-    /// # Panics
-    /// Unless there are J bones and H·W pixels.
-    pub fn draw(
-        &mut self,
-        bones: &[Affine3A],
-        camera: &Camera,
-        samples: Samples,
-        out: &mut [Vec4],
-    ) -> Result<(), Error> {
+    /// [`Error::Scene`] for bones of another skeleton; [`Error::Visibility`] for pictures that are too
+    /// large.
+    pub fn draw(&mut self, bones: &[Affine3A], camera: &Camera) -> Result<&[Vec4], Error> {
+        let (expected, found) = (self.avatar.num_joints(), bones.len());
+        if found != expected {
+            return Err(Error::Scene(format!("the avatar has {expected} joints, the body {found}")));
+        }
         self.skin(bones);
-        let Self { avatar, texels, skinned, shades, rasterizer, scale, .. } = self;
-        let options = RasterOptions { samples, cull_back: true, near: 1e-3 * *scale };
-        let atlas = &avatar.atlas;
-        let size = Vec2::new(atlas.width as f32, atlas.height as f32);
+        let Self { avatar, texels, skinned, shades, rasterizer, scale, samples, pixels, .. } = self;
+        let options = RasterOptions { samples: *samples, cull_back: true, near: 1e-3 * *scale };
         let colour = |fragment: &Fragment| {
-            let albedo = lookup(texels, atlas, atlas_place(avatar, fragment) * size);
+            let albedo = bilinear(&avatar.atlas, atlas_place(avatar, fragment), |i| texels[i]);
             Vec3::from((shade(avatar, shades, fragment) * albedo).min(Vec3A::ONE)).extend(1.0)
         };
         let shade = |pixel: Pixel<'_>| {
@@ -125,9 +106,26 @@ impl<'a> BakedPerson<'a> {
             }
             pixel.samples.iter().flatten().map(colour).sum::<Vec4>() / count as f32
         };
-        rasterizer.draw(skinned, &avatar.faces, &pinhole(camera), &options, out, shade)?;
-        Ok(())
+        pixels.resize(camera.width as usize * camera.height as usize, Vec4::ZERO);
+        rasterizer.draw(skinned, &avatar.faces, &pinhole(camera), &options, pixels, shade)?;
+        Ok(pixels)
     }
+}
+
+impl Renderer for BakedRenderer<'_> {
+    fn render(&mut self, view: &PosedView, background: Vec3) -> Result<Rendering, Error> {
+        let drawn = self.draw(&view.posed.bones, &view.camera)?;
+        let over = |p: &Vec4| (p.truncate() + (1.0 - p.w) * background).to_array();
+        let pixels: Vec<f32> = drawn.par_iter().flat_map_iter(over).collect();
+        let opacity = drawn.iter().map(|p| p.w).collect();
+        let Camera { width, height, .. } = view.camera;
+        Ok(Rendering { image: Image { width, height, pixels }, opacity })
+    }
+}
+
+/// Colour from 8 bits a channel.
+pub(super) fn color(rgb: [u8; 3]) -> Vec3 {
+    Vec3::from(rgb.map(|byte| f32::from(byte) / 255.0))
 }
 
 /// Interpolated shading of a fragment.
@@ -150,7 +148,7 @@ where
 /// R − I of each joint but the root relative to its parent, in units of `scale`.
 fn blend_shape_features(avatar: &Avatar, bones: &[Affine3A], scale: f32, out: &mut Vec<f32>) {
     out.clear();
-    out.reserve(TERMS * bones.len());
+    out.reserve(TERMS_PER_JOINT * bones.len());
     for (joint, bone) in avatar.skeleton.iter().zip(bones).skip(1) {
         let parent = joint.parent.map_or(Mat3A::IDENTITY, |parent| bones[usize::from(parent)].matrix3);
         let local = Mat3::from(parent.transpose() * bone.matrix3) - Mat3::IDENTITY;
@@ -158,11 +156,11 @@ fn blend_shape_features(avatar: &Avatar, bones: &[Affine3A], scale: f32, out: &m
     }
 }
 
-/// Bilinear lookup at `place`, in texels.
+/// Bilinear lookup at atlas coordinates `place`, 0 to 1, in texels that are given by their index.
 #[inline]
-fn lookup(texels: &[Vec3A], atlas: &Atlas, place: Vec2) -> Vec3A {
-    let corner = BilinearCorner::new(place, Vec2::new(atlas.width as f32, atlas.height as f32));
-    let [a, b, c, d] = corner.texels(atlas.width, atlas.height).map(|i| texels[i]);
+pub(super) fn bilinear(atlas: &Atlas, place: Vec2, texel: impl Fn(usize) -> Vec3A) -> Vec3A {
+    let corner = BilinearCorner::new(place, atlas);
+    let [a, b, c, d] = corner.texels(atlas).map(texel);
     let (top, bottom) = (a + (b - a) * corner.share.x, c + (d - c) * corner.share.x);
     top + (bottom - top) * corner.share.y
 }
@@ -181,20 +179,22 @@ pub(super) struct BilinearCorner {
 }
 
 impl BilinearCorner {
-    /// At `place`, in texels of an atlas of `size`.
+    /// At atlas coordinates `place`, 0 to 1.
     #[inline]
-    pub fn new(place: Vec2, size: Vec2) -> Self {
+    pub fn new(place: Vec2, atlas: &Atlas) -> Self {
+        let size = Vec2::new(atlas.width as f32, atlas.height as f32);
         // Clamped to the edge.
-        let at = (place - 0.5).clamp(Vec2::ZERO, (size - 1.0).max(Vec2::ZERO));
+        let at = (place * size - 0.5).clamp(Vec2::ZERO, (size - 1.0).max(Vec2::ZERO));
         let corner = at.floor().min((size - 2.0).max(Vec2::ZERO));
         Self { x: corner.x as usize, y: corner.y as usize, share: at - corner }
     }
 
     /// Indices row by row; the only row or column of a thin atlas occurs twice.
     #[inline]
-    pub fn texels(&self, width: u32, height: u32) -> [usize; 4] {
-        let first = self.y * width as usize + self.x;
-        let (right, down) = (usize::from(width > 1), if height > 1 { width as usize } else { 0 });
+    pub fn texels(&self, atlas: &Atlas) -> [usize; 4] {
+        let width = atlas.width as usize;
+        let first = self.y * width + self.x;
+        let (right, down) = (usize::from(width > 1), if atlas.height > 1 { width } else { 0 });
         [first, first + right, first + down, first + right + down]
     }
 }

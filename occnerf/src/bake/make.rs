@@ -1,27 +1,27 @@
 //! Baking of a trained person to an avatar.
 
+use std::ops::{Add, Mul};
 use std::sync::Arc;
 use std::time::Instant;
 
 use glam::{Affine3A, Vec2, Vec3};
 use rayon::prelude::*;
-use smpl::{MotionClip, SparseRows};
+use smpl::SparseRows;
 
 use super::avatar::{Atlas, Avatar, Clip, MAX_JOINTS};
 use super::charts::AtlasLayout;
 use super::displacement::displacements;
-use super::field::CanonicalField;
-use super::motion::{motion_of_bones, turn_upright};
+use super::field::evaluate;
 use super::paint::{Texel, dilate, paint, texels};
 use super::refine::refine;
-use super::renderer::TrainedField;
-use super::skeleton::skeleton;
-use super::surface::{NormalRay, SurfaceReport, heights, normal_rays};
+use super::skeleton::{motion_of_bones, skeleton, turn_upright};
+use super::surface::{CanonicalField, NormalRay, Place, heights, normal_rays};
 use crate::Error;
 use crate::capture::Light;
 use crate::model::body::Body;
 use crate::model::subdivide::{Anchor, Subdivided, normals, times_until};
 use crate::model::trained::{Model, upright};
+use crate::model::vertices::VertexCode;
 use crate::model::view::{PosedView, pixel_width};
 use crate::scene::prepared::Scene;
 
@@ -32,6 +32,9 @@ const MOST: u32 = 2;
 const TEXELS_A_PIXEL: f32 = 2.0;
 /// Share of the training frames with a point visible for full confidence.
 const FULL_CONFIDENCE: f32 = 0.1;
+/// [`CanonicalField::grazing`]; 2 to 6 cm draw outlines that fit those of pictures (IoU .956 to .960
+/// on the demo, whatever the number of samples), 3 to 4 best.
+const GRAZING: f32 = 0.035;
 
 /// Options of [`bake`].
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -54,8 +57,8 @@ impl Default for BakeOptions {
 /// Statistics of [`bake`].
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct BakeReport {
-    /// Surface extraction.
-    pub surface: SurfaceReport,
+    /// Vertices at which a field has no surface, filled from their neighbours.
+    pub holes: usize,
     /// Vertices, a copy for each chart.
     pub vertices: usize,
     /// Triangles.
@@ -82,9 +85,13 @@ pub fn bake(model: &Model, scene: Option<&Scene>, options: &BakeOptions) -> Resu
     let pixel = options.check(&model.body, model.frames())?;
     let vertices = model.body.canonical.vertices.len();
     let seen = scene.map_or_else(|| Ok(vec![1.0; vertices]), seen)?;
-    let (mut avatar, mut report) = surface(&model.body, &TrainedField::new(model), &seen, pixel, options)?;
-    let moved = Moved { body: &model.body, frames: model.frames(), light: model.light() };
-    moved.complete(&mut avatar, options.fps);
+    let mut code = VertexCode::default();
+    model.encode_vertices(&mut code);
+    let extent = model.measure_extent(&code);
+    let evaluate = |places: &[Place]| evaluate(model, &code, &extent, places);
+    let field = CanonicalField { evaluate: &evaluate, grazing: GRAZING, reach: extent.farthest };
+    let (mut avatar, mut report) = surface(&model.body, &field, &seen, pixel, options)?;
+    add_motion(&mut avatar, &model.body, model.frames(), model.light(), options.fps);
     if let Some(scene) = scene {
         avatar.name.clone_from(&scene.name);
         if options.refinements > 0 {
@@ -117,7 +124,7 @@ pub fn fit(scene: &Scene, options: &BakeOptions) -> Result<(Avatar, BakeReport),
         texels.par_iter().map(colour).collect()
     };
     let (mut avatar, mut report) = assemble(&scene.body, &relief, &heights, &seen(scene)?, pixel, options, paint)?;
-    Moved { body: &scene.body, frames: &frames, light: colors.light }.complete(&mut avatar, options.fps);
+    add_motion(&mut avatar, &scene.body, &frames, colors.light, options.fps);
     avatar.name.clone_from(&scene.name);
     report.errors = refine(scene, colors.light, &mut avatar, options.refinements)?;
     report.seconds = start.elapsed().as_secs_f64();
@@ -184,16 +191,16 @@ impl Relief {
 /// `seen` of each vertex of the prior, (V).
 pub(super) fn surface(
     body: &Body,
-    field: &impl CanonicalField,
+    field: &CanonicalField<'_>,
     seen: &[f32],
     pixel: f32,
     options: &BakeOptions,
 ) -> Result<(Avatar, BakeReport), Error> {
     let relief = Relief::new(&body.canonical.vertices, &body.model.faces, pixel);
-    let (heights, found) = heights(field, &body.surface, &relief.feet, &relief.mesh);
+    let (heights, holes) = heights(field, &body.surface, &relief.feet, &relief.mesh);
     let paint = |texels: &[Texel]| paint(field, &body.surface, &relief.feet, &heights, texels);
     let (avatar, report) = assemble(body, &relief, &heights, seen, pixel, options, paint)?;
-    Ok((avatar, BakeReport { surface: found, ..report }))
+    Ok((avatar, BakeReport { holes, ..report }))
 }
 
 /// The avatar of a surface at `heights` (V) over a relief; `paint` gives texels their colours.
@@ -225,9 +232,8 @@ fn assemble(
     };
     let atlas = atlas(layout.side, &texels, &colours, &confidence);
     let (vertices, normals) = split.positions(mesh, feet, heights);
-    let rows = |of: &SparseRows<f32>| split.rows(mesh, of, |w, value| w * value, |a, b| a + b);
-    let (joints, weights) = four_joints(&rows(&body.model.weights));
-    let posedirs = split.rows(mesh, &body.model.posedirs, |w, value| w * value, |a, b| a + b);
+    let (joints, weights) = four_joints(split.rows(mesh, &body.model.weights));
+    let posedirs = SparseRows::from_rows(split.rows(mesh, &body.model.posedirs));
     let rest: Vec<Vec3> = body.canonical.joints.iter().map(|joint| joint / body.scale).collect();
     let avatar = Avatar {
         name: "person".to_owned(),
@@ -238,7 +244,7 @@ fn assemble(
         faces: split.faces,
         joints,
         weights,
-        posedirs: SparseRows::from_rows(posedirs),
+        posedirs,
         atlas,
         light: Light::default(),
         skeleton: skeleton(&body.model.parents, &rest),
@@ -294,20 +300,18 @@ impl Split {
     }
 
     /// Rows of the prior's vertices, interpolated; columns ascending.
-    fn rows<T: Copy>(
-        &self,
-        mesh: &Subdivided,
-        of: &SparseRows<T>,
-        times: impl Fn(f32, T) -> T,
-        plus: impl Fn(T, T) -> T,
-    ) -> Vec<Vec<(u32, T)>> {
+    fn rows<T>(&self, mesh: &Subdivided, of: &SparseRows<T>) -> Vec<Vec<(u32, T)>>
+    where
+        T: Copy + Add<Output = T>,
+        f32: Mul<T, Output = T>,
+    {
         let row = |anchor: &Anchor| {
             let mut row: Vec<(u32, T)> = Vec::new();
             for (v, w) in anchor.terms() {
                 for (column, value) in of.row(v as usize) {
-                    let (column, value) = (column as u32, times(w, value));
+                    let (column, value) = (column as u32, w * value);
                     match row.binary_search_by_key(&column, |entry| entry.0) {
-                        Ok(at) => row[at].1 = plus(row[at].1, value),
+                        Ok(at) => row[at].1 = row[at].1 + value,
                         Err(at) => row.insert(at, (column, value)),
                     }
                 }
@@ -319,9 +323,8 @@ impl Split {
 }
 
 /// The four largest weights of each row, normalised, and their joints.
-fn four_joints(rows: &[Vec<(u32, f32)>]) -> (Vec<[u16; 4]>, Vec<[f32; 4]>) {
-    let heaviest = |row: &Vec<(u32, f32)>| {
-        let mut row = row.clone();
+fn four_joints(rows: Vec<Vec<(u32, f32)>>) -> (Vec<[u16; 4]>, Vec<[f32; 4]>) {
+    let heaviest = |mut row: Vec<(u32, f32)>| {
         row.sort_by(|a, b| b.1.total_cmp(&a.1).then(a.0.cmp(&b.0)));
         row.truncate(4);
         let total: f32 = row.iter().map(|entry| entry.1).sum();
@@ -334,7 +337,7 @@ fn four_joints(rows: &[Vec<(u32, f32)>]) -> (Vec<[u16; 4]>, Vec<[f32; 4]>) {
         }
         (joints, weights)
     };
-    rows.iter().map(heaviest).unzip()
+    rows.into_iter().map(heaviest).unzip()
 }
 
 /// The atlas of painted texels, dilated between the charts.
@@ -357,35 +360,24 @@ fn atlas(side: u32, texels: &[Texel], colours: &[Vec3], confidence: &[f32]) -> A
     }
 }
 
-/// The video's motion, cameras and light.
-struct Moved<'a> {
-    body: &'a Body,
-    frames: &'a [Arc<PosedView>],
-    light: Light,
-}
-
-impl Moved<'_> {
-    /// Gives an avatar the corrected motion, the cameras and the light, in its world.
-    fn complete(&self, avatar: &mut Avatar, fps: f32) {
-        let turn = turn_upright(upright(self.body, self.frames.iter().map(Arc::as_ref)));
-        let scale = self.body.scale;
-        let bones = |view: &Arc<PosedView>| {
-            let placed = |bone: &Affine3A| {
-                let bone = Affine3A { translation: bone.translation / scale, ..*bone };
-                Affine3A::from_mat3(turn) * bone
-            };
-            view.posed.bones.iter().map(placed).collect()
+/// Gives an avatar the motion, cameras and light of a video, in the avatar's world.
+fn add_motion(avatar: &mut Avatar, body: &Body, frames: &[Arc<PosedView>], light: Light, fps: f32) {
+    let turn = turn_upright(upright(body, frames.iter().map(Arc::as_ref)));
+    let bones = |view: &Arc<PosedView>| {
+        let placed = |bone: &Affine3A| {
+            let bone = Affine3A { translation: bone.translation / body.scale, ..*bone };
+            Affine3A::from_mat3(turn) * bone
         };
-        let frames: Vec<Vec<Affine3A>> = self.frames.iter().map(bones).collect();
-        let motion: MotionClip = motion_of_bones(&avatar.skeleton, &frames, fps);
-        let camera = |view: &Arc<PosedView>| {
-            let mut camera = view.camera;
-            camera.world_to_camera.translation /= scale;
-            camera.world_to_camera *= Affine3A::from_mat3(turn.transpose());
-            camera
-        };
-        avatar.light.slope = turn * self.light.slope;
-        avatar.clips = vec![Clip { name: "video".to_owned(), motion }];
-        avatar.cameras = self.frames.iter().map(camera).collect();
-    }
+        view.posed.bones.iter().map(placed).collect()
+    };
+    let bones: Vec<Vec<Affine3A>> = frames.iter().map(bones).collect();
+    let camera = |view: &Arc<PosedView>| {
+        let mut camera = view.camera;
+        camera.world_to_camera.translation /= body.scale;
+        camera.world_to_camera *= Affine3A::from_mat3(turn.transpose());
+        camera
+    };
+    avatar.light.slope = turn * light.slope;
+    avatar.clips = vec![Clip { name: "video".to_owned(), motion: motion_of_bones(&avatar.skeleton, &bones, fps) }];
+    avatar.cameras = frames.iter().map(camera).collect();
 }

@@ -7,10 +7,9 @@ mod draw;
 pub mod export;
 mod field;
 mod make;
-mod motion;
 mod paint;
+mod plate;
 mod refine;
-mod renderer;
 mod saved;
 mod skeleton;
 mod surface;
@@ -23,12 +22,9 @@ use std::path::Path;
 use crate::Error;
 
 pub use avatar::{Atlas, Avatar, Clip, Joint, MAX_ATLAS_SIDE, MAX_JOINTS};
-pub use draw::BakedPerson;
+pub use draw::BakedRenderer;
 pub use make::{BakeOptions, BakeReport, bake, fit};
-pub use motion::{motion_of_bones, turn_upright};
-pub use renderer::BakedRenderer;
-pub use skeleton::skeleton;
-pub use surface::SurfaceReport;
+pub use skeleton::{motion_of_bones, skeleton, turn_upright};
 
 /// Replaces a file atomically.
 fn write_whole(path: &Path, bytes: &[u8]) -> Result<(), Error> {

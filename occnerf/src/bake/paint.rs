@@ -4,8 +4,7 @@ use glam::{Vec2, Vec3};
 use rayon::prelude::*;
 use surface_query::MeshDistance;
 
-use super::field::{CanonicalField, Place};
-use super::surface::NormalRay;
+use super::surface::{CanonicalField, NormalRay, Place};
 use crate::Error;
 use visibility::{RasterOptions, Rasterizer, View};
 
@@ -60,7 +59,7 @@ pub(super) fn texels(
 
 /// Colour of the field at each of `texels`, on the surface at `heights` (V) over the prior's `normals` (V).
 pub(super) fn paint(
-    field: &impl CanonicalField,
+    field: &CanonicalField<'_>,
     prior: &MeshDistance,
     normals: &[NormalRay],
     heights: &[f32],
@@ -70,12 +69,9 @@ pub(super) fn paint(
         let place = |texel: &Texel| {
             let (normal, height) = (texel.normal(normals), texel.mix(heights));
             let at = normal.foot + height * normal.direction;
-            let closest = prior.closest(at);
-            let (face, barycentric, distance) = (closest.face, closest.barycentric, closest.signed_distance);
-            Place { at, closest: closest.point, face, barycentric, distance }
+            Place::new(at, &prior.closest(at))
         };
-        let mut values = Vec::new();
-        field.evaluate(&texels.iter().map(place).collect::<Vec<_>>(), &mut values);
+        let values = (field.evaluate)(&texels.iter().map(place).collect::<Vec<_>>());
         values.into_iter().map(|(_, colour)| colour)
     };
     texels.par_chunks(CHUNK).flat_map_iter(chunk).collect()

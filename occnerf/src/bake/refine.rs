@@ -4,7 +4,7 @@ use glam::{Vec2, Vec3};
 use visibility::{Pixel, RasterOptions, Rasterizer, Samples};
 
 use super::avatar::{Atlas, Avatar};
-use super::draw::{BakedPerson, BilinearCorner, atlas_place, shade};
+use super::draw::{BakedRenderer, BilinearCorner, atlas_place, color, shade};
 use crate::Error;
 use crate::capture::Light;
 use crate::model::view::pinhole;
@@ -48,13 +48,13 @@ impl PixelEquation {
 pub(super) fn refine(scene: &Scene, light: Light, avatar: &mut Avatar, passes: u32) -> Result<[f64; 2], Error> {
     let frames = &scene.train;
     let stride = frames.iter().map(|f| f.labels.num_subject()).sum::<usize>().div_ceil(MAX_PIXELS).max(1);
-    let mut person = BakedPerson::new(avatar, scene.body.scale).lit_by(light);
+    let mut renderer = BakedRenderer::new(avatar, scene.body.scale, light, Samples::Four);
     let mut all = Vec::new();
     for frame in frames {
-        all.extend(equations(avatar, &mut person, frame, stride)?);
+        all.extend(equations(avatar, &mut renderer, frame, stride)?);
     }
     let Atlas { rgb, width, .. } = &mut avatar.atlas;
-    let mut values: Vec<Vec3> = rgb.as_chunks::<3>().0.iter().copied().map(colour).collect();
+    let mut values: Vec<Vec3> = rgb.as_chunks::<3>().0.iter().copied().map(color).collect();
     let errors = solve(&all, *width as usize, &mut values, passes);
     for (texel, value) in rgb.as_chunks_mut::<3>().0.iter_mut().zip(&values) {
         *texel = value.clamp(Vec3::ZERO, Vec3::ONE).to_array().map(|x| (x * 255.0 + 0.5) as u8);
@@ -104,20 +104,15 @@ fn smooth(sums: &mut [(Vec3, f32)], width: usize, share: f32) {
     }
 }
 
-fn colour(bytes: [u8; 3]) -> Vec3 {
-    Vec3::from(bytes.map(|byte| f32::from(byte) / 255.0))
-}
-
 /// Equations of the fully covered subject pixels of a frame.
 fn equations(
     avatar: &Avatar,
-    person: &mut BakedPerson<'_>,
+    renderer: &mut BakedRenderer<'_>,
     frame: &PreparedFrame,
     stride: usize,
 ) -> Result<Vec<PixelEquation>, Error> {
     let pixels = frame.pixels()?;
-    person.skin(&frame.view.posed.bones);
-    let (vertices, shades) = person.posed();
+    let (vertices, shades) = renderer.skin(&frame.view.posed.bones);
     // Supersampled as by default, so that the texture compensates the pixel footprint.
     let options = RasterOptions { samples: Samples::Four, cull_back: true, near: 1e-3 };
     let equation = |pixel: Pixel<'_>| {
@@ -143,12 +138,10 @@ fn equations(
 
 /// The lookup at a `place` of the atlas, with weights that sum to `share`.
 fn lookup(avatar: &Avatar, place: Vec2, share: f32) -> Lookup {
-    let Atlas { width, height, .. } = avatar.atlas;
-    let size = Vec2::new(width as f32, height as f32);
-    let corner = BilinearCorner::new(place * size, size);
+    let corner = BilinearCorner::new(place, &avatar.atlas);
     let Vec2 { x, y } = corner.share;
     let weights = [(1.0 - x) * (1.0 - y), x * (1.0 - y), (1.0 - x) * y, x * y].map(|weight| share * weight);
-    (corner.texels(width, height).map(|i| i as u32), weights)
+    (corner.texels(&avatar.atlas).map(|i| i as u32), weights)
 }
 
 #[cfg(test)]

@@ -17,6 +17,8 @@ const FORMAT: &str = "occnerf-avatar";
 const VERSION: u32 = 2;
 /// Key of [`Header`] as JSON in the file's metadata.
 const KEY: &str = "avatar";
+/// Any size of an axis.
+const ANY: usize = usize::MAX;
 
 /// Metadata beside the arrays.
 #[derive(Serialize, Deserialize)]
@@ -67,47 +69,42 @@ impl Avatar {
 
     /// Name, type, shape and bytes of each array.
     fn tensors(&self) -> Vec<(String, Dtype, Vec<usize>, Vec<u8>)> {
-        let (v, j, atlas) = (self.num_vertices(), self.num_joints(), &self.atlas);
+        let Self { atlas, posedirs, skeleton, cameras, .. } = self;
+        let (v, j, t) = (self.num_vertices(), self.num_joints(), cameras.len());
         let (width, height) = (atlas.width as usize, atlas.height as usize);
         let words = |values: &[u32]| values.iter().flat_map(|x| x.to_le_bytes()).collect::<Vec<u8>>();
         let flat = |values: &[Vec3]| floats(values.iter().flat_map(|x| x.to_array()));
         let parent = |joint: &Joint| joint.parent.map_or(-1, i32::from).to_le_bytes();
-        let rest: Vec<Vec3> = self.skeleton.iter().map(|joint| joint.rest).collect();
-        let directions = &self.posedirs;
-        let shorts = self.joints.iter().flatten().flat_map(|x| x.to_le_bytes()).collect();
-        let cameras = self.cameras.len();
-        let intrinsics = self.cameras.iter().flat_map(|c| [c.focal.x, c.focal.y, c.centre.x, c.centre.y]);
-        let extrinsics = self.cameras.iter().flat_map(|c| {
+        let intrinsics = |c: &Camera| [c.focal.x, c.focal.y, c.centre.x, c.centre.y];
+        let extrinsics = |c: &Camera| {
             let columns = c.world_to_camera.to_cols_array();
             (0..12).map(move |i| columns[3 * (i % 4) + i / 4])
-        });
-        let sizes: Vec<u32> = self.cameras.iter().flat_map(|c| [c.width, c.height]).collect();
-        let mut tensors = vec![
-            ("vertices", Dtype::F32, vec![v, 3], flat(&self.vertices)),
-            ("normals", Dtype::F32, vec![v, 3], flat(&self.normals)),
-            ("uvs", Dtype::F32, vec![v, 2], floats(self.uvs.iter().flat_map(|x| x.to_array()))),
-            ("faces", Dtype::U32, vec![self.faces.len(), 3], words(self.faces.as_flattened())),
-            ("joints", Dtype::U16, vec![v, 4], shorts),
-            ("weights", Dtype::F32, vec![v, 4], floats(self.weights.as_flattened().iter().copied())),
-            ("posedirs.offsets", Dtype::U32, vec![directions.offsets.len()], words(&directions.offsets)),
-            ("posedirs.columns", Dtype::U32, vec![directions.columns.len()], words(&directions.columns)),
-            ("posedirs.values", Dtype::F32, vec![directions.values.len(), 3], flat(&directions.values)),
-            ("atlas.rgb", Dtype::U8, vec![height, width, 3], atlas.rgb.clone()),
-            ("atlas.confidence", Dtype::U8, vec![height, width], atlas.confidence.clone()),
-            ("parents", Dtype::I32, vec![j], self.skeleton.iter().flat_map(parent).collect()),
-            ("rest_joints", Dtype::F32, vec![j, 3], flat(&rest)),
-            ("betas", Dtype::F32, vec![self.betas.len()], floats(self.betas.iter().copied())),
-            ("cameras.intrinsics", Dtype::F32, vec![cameras, 4], floats(intrinsics)),
-            ("cameras.extrinsics", Dtype::F32, vec![cameras, 3, 4], floats(extrinsics)),
-            ("cameras.size", Dtype::U32, vec![cameras, 2], words(&sizes)),
-        ]
-        .into_iter()
-        .map(|(name, kind, shape, bytes)| (name.to_owned(), kind, shape, bytes))
-        .collect::<Vec<_>>();
+        };
+        let mut tensors = Vec::new();
+        let mut add = |name: &str, kind: Dtype, shape: &[usize], bytes: Vec<u8>| {
+            tensors.push((name.to_owned(), kind, shape.to_vec(), bytes));
+        };
+        add("vertices", Dtype::F32, &[v, 3], flat(&self.vertices));
+        add("normals", Dtype::F32, &[v, 3], flat(&self.normals));
+        add("uvs", Dtype::F32, &[v, 2], floats(self.uvs.iter().flat_map(|x| x.to_array())));
+        add("faces", Dtype::U32, &[self.faces.len(), 3], words(self.faces.as_flattened()));
+        add("joints", Dtype::U16, &[v, 4], self.joints.iter().flatten().flat_map(|x| x.to_le_bytes()).collect());
+        add("weights", Dtype::F32, &[v, 4], floats(self.weights.as_flattened().iter().copied()));
+        add("posedirs.offsets", Dtype::U32, &[posedirs.offsets.len()], words(&posedirs.offsets));
+        add("posedirs.columns", Dtype::U32, &[posedirs.columns.len()], words(&posedirs.columns));
+        add("posedirs.values", Dtype::F32, &[posedirs.values.len(), 3], flat(&posedirs.values));
+        add("atlas.rgb", Dtype::U8, &[height, width, 3], atlas.rgb.clone());
+        add("atlas.confidence", Dtype::U8, &[height, width], atlas.confidence.clone());
+        add("parents", Dtype::I32, &[j], skeleton.iter().flat_map(parent).collect());
+        add("rest_joints", Dtype::F32, &[j, 3], floats(skeleton.iter().flat_map(|joint| joint.rest.to_array())));
+        add("betas", Dtype::F32, &[self.betas.len()], floats(self.betas.iter().copied()));
+        add("cameras.intrinsics", Dtype::F32, &[t, 4], floats(cameras.iter().flat_map(intrinsics)));
+        add("cameras.extrinsics", Dtype::F32, &[t, 3, 4], floats(cameras.iter().flat_map(extrinsics)));
+        let sizes: Vec<u32> = cameras.iter().flat_map(|c| [c.width, c.height]).collect();
+        add("cameras.size", Dtype::U32, &[t, 2], words(&sizes));
         for (c, Clip { motion, .. }) in self.clips.iter().enumerate() {
-            let frames = motion.num_frames();
-            tensors.push((format!("clip.{c}.poses"), Dtype::F32, vec![frames, j, 3], flat(&motion.poses)));
-            tensors.push((format!("clip.{c}.trans"), Dtype::F32, vec![frames, 3], flat(&motion.trans)));
+            add(&format!("clip.{c}.poses"), Dtype::F32, &[motion.num_frames(), j, 3], flat(&motion.poses));
+            add(&format!("clip.{c}.trans"), Dtype::F32, &[motion.num_frames(), 3], flat(&motion.trans));
         }
         tensors
     }
@@ -134,11 +131,12 @@ fn parse(bytes: &[u8]) -> Result<Avatar, String> {
         let (format, version) = (header.format, header.version);
         return Err(format!("is {format} version {version}, expected {FORMAT} version {VERSION}"));
     }
-    let source = Source { tensors: SafeTensors::deserialize(bytes).map_err(not_ours)? };
-    let [height, width] = source.shape("atlas.confidence")?;
+    let source = Source(SafeTensors::deserialize(bytes).map_err(not_ours)?);
+    let shape = source.view("atlas.confidence")?.shape().to_vec();
+    let (height, width) = (shape.first().copied().unwrap_or(0), shape.get(1).copied().unwrap_or(0));
     let j = header.joints.len();
-    let parents = source.array("parents", Dtype::I32, &[Some(j)], i32::from_le_bytes)?;
-    let rest = source.vectors("rest_joints", &[Some(j), Some(3)])?;
+    let parents = source.array("parents", Dtype::I32, &[j], i32::from_le_bytes)?;
+    let rest = source.vectors("rest_joints", &[j, 3])?;
     let joint = |((name, parent), rest): ((String, i32), Vec3)| {
         let known = u16::try_from(parent).ok();
         match known.is_some() || parent == -1 {
@@ -148,48 +146,48 @@ fn parse(bytes: &[u8]) -> Result<Avatar, String> {
     };
     let skeleton: Result<Vec<Joint>, String> = header.joints.into_iter().zip(parents).zip(rest).map(joint).collect();
     let clip = |(c, (name, fps)): (usize, (String, f32))| {
-        let poses = source.vectors(&format!("clip.{c}.poses"), &[None, Some(j), Some(3)])?;
-        let trans = source.vectors(&format!("clip.{c}.trans"), &[None, Some(3)])?;
+        let poses = source.vectors(&format!("clip.{c}.poses"), &[ANY, j, 3])?;
+        let trans = source.vectors(&format!("clip.{c}.trans"), &[ANY, 3])?;
         Ok(Clip { name, motion: MotionClip { poses, num_joints: j, trans, fps } })
     };
     let clips: Result<Vec<Clip>, String> = header.clips.into_iter().enumerate().map(clip).collect();
-    let bytes = |key: &str, pattern: &[Option<usize>]| source.array(key, Dtype::U8, pattern, u8::from_le_bytes);
-    let words = |key: &str, pattern: &[Option<usize>]| source.array(key, Dtype::U32, pattern, u32::from_le_bytes);
-    let uvs = source.floats("uvs", &[None, Some(2)])?;
-    let joints = source.array("joints", Dtype::U16, &[None, Some(4)], u16::from_le_bytes)?;
+    let bytes = |key: &str, pattern: &[usize]| source.array(key, Dtype::U8, pattern, u8::from_le_bytes);
+    let words = |key: &str, pattern: &[usize]| source.array(key, Dtype::U32, pattern, u32::from_le_bytes);
+    let uvs = source.floats("uvs", &[ANY, 2])?;
+    let joints = source.array("joints", Dtype::U16, &[ANY, 4], u16::from_le_bytes)?;
     Ok(Avatar {
         name: header.name,
         source: header.source,
-        vertices: source.vectors("vertices", &[None, Some(3)])?,
-        normals: source.vectors("normals", &[None, Some(3)])?,
+        vertices: source.vectors("vertices", &[ANY, 3])?,
+        normals: source.vectors("normals", &[ANY, 3])?,
         uvs: uvs.chunks_exact(2).map(Vec2::from_slice).collect(),
-        faces: words("faces", &[None, Some(3)])?.as_chunks().0.to_vec(),
+        faces: words("faces", &[ANY, 3])?.as_chunks().0.to_vec(),
         joints: joints.as_chunks().0.to_vec(),
-        weights: source.floats("weights", &[None, Some(4)])?.as_chunks().0.to_vec(),
+        weights: source.floats("weights", &[ANY, 4])?.as_chunks().0.to_vec(),
         posedirs: SparseRows {
-            offsets: words("posedirs.offsets", &[None])?,
-            columns: words("posedirs.columns", &[None])?,
-            values: source.vectors("posedirs.values", &[None, Some(3)])?,
+            offsets: words("posedirs.offsets", &[ANY])?,
+            columns: words("posedirs.columns", &[ANY])?,
+            values: source.vectors("posedirs.values", &[ANY, 3])?,
         },
         atlas: Atlas {
             width: u32::try_from(width).unwrap_or(u32::MAX),
             height: u32::try_from(height).unwrap_or(u32::MAX),
-            rgb: bytes("atlas.rgb", &[Some(height), Some(width), Some(3)])?,
-            confidence: bytes("atlas.confidence", &[None, None])?,
+            rgb: bytes("atlas.rgb", &[height, width, 3])?,
+            confidence: bytes("atlas.confidence", &[ANY, ANY])?,
         },
         light: Light { slope: header.light.into() },
         skeleton: skeleton?,
-        betas: source.floats("betas", &[None])?,
+        betas: source.floats("betas", &[ANY])?,
         clips: clips?,
         cameras: cameras(&source)?,
     })
 }
 
 fn cameras(source: &Source<'_>) -> Result<Vec<Camera>, String> {
-    let sizes = source.array("cameras.size", Dtype::U32, &[None, Some(2)], u32::from_le_bytes)?;
+    let sizes = source.array("cameras.size", Dtype::U32, &[ANY, 2], u32::from_le_bytes)?;
     let n = sizes.len() / 2;
-    let intrinsics = source.floats("cameras.intrinsics", &[Some(n), Some(4)])?;
-    let extrinsics = source.floats("cameras.extrinsics", &[Some(n), Some(3), Some(4)])?;
+    let intrinsics = source.floats("cameras.intrinsics", &[n, 4])?;
+    let extrinsics = source.floats("cameras.extrinsics", &[n, 3, 4])?;
     let each = sizes.chunks_exact(2).zip(intrinsics.chunks_exact(4)).zip(extrinsics.chunks_exact(12));
     each.enumerate()
         .map(|(i, ((size, k), e))| {
@@ -203,44 +201,36 @@ fn cameras(source: &Source<'_>) -> Result<Vec<Camera>, String> {
 }
 
 /// The arrays of a file.
-struct Source<'a> {
-    tensors: SafeTensors<'a>,
-}
+struct Source<'a>(SafeTensors<'a>);
 
 impl Source<'_> {
     fn view(&self, key: &str) -> Result<TensorView<'_>, String> {
-        self.tensors.tensor(key).map_err(|_| format!("lacks `{key}`"))
+        self.0.tensor(key).map_err(|_| format!("lacks `{key}`"))
     }
 
-    fn shape<const N: usize>(&self, key: &str) -> Result<[usize; N], String> {
-        let view = self.view(key)?;
-        view.shape().try_into().map_err(|_| format!("`{key}` has shape {:?}, expected {N} axes", view.shape()))
-    }
-
-    /// The tensor `key` of type `kind` and shape `pattern` (`None`: any size), word by word.
+    /// The tensor `key` of type `kind` and shape `pattern`, with [`ANY`] for any size, word by word.
     fn array<const N: usize, T>(
         &self,
         key: &str,
         kind: Dtype,
-        pattern: &[Option<usize>],
+        pattern: &[usize],
         word: fn([u8; N]) -> T,
     ) -> Result<Vec<T>, String> {
         let view = self.view(key)?;
         let shape = view.shape();
-        let fits = shape.len() == pattern.len() && shape.iter().zip(pattern).all(|(n, p)| p.is_none_or(|p| p == *n));
+        let fits = shape.len() == pattern.len() && shape.iter().zip(pattern).all(|(n, p)| *p == ANY || n == p);
         if view.dtype() != kind || !fits {
-            let sizes: Vec<String> = pattern.iter().map(|p| p.map_or("_".to_owned(), |n| n.to_string())).collect();
-            let (found, sizes) = (view.dtype(), sizes.join(", "));
-            return Err(format!("`{key}` is {found:?} {shape:?}, expected {kind:?} [{sizes}]"));
+            let expected = format!("{kind:?} {pattern:?}").replace(&ANY.to_string(), "_");
+            return Err(format!("`{key}` is {:?} {shape:?}, expected {expected}", view.dtype()));
         }
         Ok(view.data().as_chunks::<N>().0.iter().map(|&bytes| word(bytes)).collect())
     }
 
-    fn floats(&self, key: &str, pattern: &[Option<usize>]) -> Result<Vec<f32>, String> {
+    fn floats(&self, key: &str, pattern: &[usize]) -> Result<Vec<f32>, String> {
         self.array(key, Dtype::F32, pattern, f32::from_le_bytes)
     }
 
-    fn vectors(&self, key: &str, pattern: &[Option<usize>]) -> Result<Vec<Vec3>, String> {
+    fn vectors(&self, key: &str, pattern: &[usize]) -> Result<Vec<Vec3>, String> {
         Ok(self.floats(key, pattern)?.chunks_exact(3).map(Vec3::from_slice).collect())
     }
 }

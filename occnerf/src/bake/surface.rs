@@ -2,9 +2,8 @@
 
 use glam::Vec3;
 use rayon::prelude::*;
-use surface_query::MeshDistance;
+use surface_query::{Closest, MeshDistance};
 
-use super::field::{CanonicalField, Place};
 use crate::model::subdivide::{Anchor, Subdivided, neighbours, normals};
 
 /// Sampling step of a density profile, normalised metres.
@@ -21,15 +20,37 @@ const HALF: f32 = std::f32::consts::LN_2;
 /// Vertices of a batch.
 const CHUNK: usize = 64;
 
-/// Statistics of surface extraction.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct SurfaceReport {
-    /// Vertices without an opaque crossing, filled from their neighbours.
-    pub holes: usize,
-    /// Vertices with a second opaque layer behind a gap.
-    pub double: usize,
-    /// Vertices moved to the median of their neighbours.
-    pub outliers: usize,
+/// A point near the canonical prior.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Place {
+    /// Canonical, normalised metres.
+    pub at: Vec3,
+    /// The closest point of the prior, the face it is on, and its weights of that face's corners.
+    pub closest: Vec3,
+    pub face: u32,
+    pub barycentric: [f32; 3],
+    /// Signed distance from there, positive outside.
+    pub distance: f32,
+}
+
+impl Place {
+    pub fn new(at: Vec3, found: &Closest) -> Self {
+        let &Closest { point: closest, face, barycentric, signed_distance: distance } = found;
+        Self { at, closest, face, barycentric, distance }
+    }
+}
+
+/// Densities, in 1 / normalised metre and 0 outside the extent, and colours of places.
+type Values = Vec<(f32, Vec3)>;
+
+/// A field in canonical space.
+pub(super) struct CanonicalField<'a> {
+    /// Evaluates places.
+    pub evaluate: &'a (dyn Fn(&[Place]) -> Values + Sync),
+    /// Path length of a ray that grazes the surface, as on the outline, normalised metres.
+    pub grazing: f32,
+    /// Largest distance of the extent from the prior.
+    pub reach: f32,
 }
 
 /// A normal ray of the prior.
@@ -42,21 +63,19 @@ pub(super) struct NormalRay {
 impl NormalRay {
     /// Heights `high`, `high` − STEP, … down to `low`, outside in, and their points, as far as they
     /// belong to this part of the prior.
-    pub fn places(&self, prior: &MeshDistance, high: f32, low: f32, farthest: f32, out: &mut Vec<(f32, Place)>) {
-        out.clear();
+    fn places(&self, prior: &MeshDistance, high: f32, low: f32) -> (Vec<f32>, Vec<Place>) {
         let steps = ((high - low) / STEP).ceil().max(0.0) as usize;
-        // Inside out, up to the first point of another part.
-        for step in (0..=steps).rev() {
+        let place = |step: usize| {
             let height = high - step as f32 * STEP;
             let at = self.foot + height * self.direction;
-            let Some(closest) = prior.closest_within(at, farthest) else { break };
-            if height > 0.0 && closest.signed_distance < OWN * height {
-                break;
-            }
-            let (face, barycentric, distance) = (closest.face, closest.barycentric, closest.signed_distance);
-            out.push((height, Place { at, closest: closest.point, face, barycentric, distance }));
-        }
-        out.reverse();
+            let found = prior.closest_within(at, high - low)?;
+            let other_part = height > 0.0 && found.signed_distance < OWN * height;
+            (!other_part).then(|| (height, Place::new(at, &found)))
+        };
+        // Inside out, up to the first point of another part.
+        let mut along: Vec<(f32, Place)> = (0..=steps).rev().map_while(place).collect();
+        along.reverse();
+        along.into_iter().unzip()
     }
 }
 
@@ -70,98 +89,66 @@ pub(super) fn normal_rays(mesh: &Subdivided, prior: &[Vec3], prior_faces: &[[u32
     mesh.anchors.iter().map(ray).collect()
 }
 
-/// Height along each normal (V) at which the opacity from outside passes ½, NaN for none; and the
-/// number of normals with a second opaque layer.
-fn crossings(field: &impl CanonicalField, prior: &MeshDistance, normals: &[NormalRay]) -> (Vec<f32>, usize) {
-    let reach = field.reach();
-    let chunks: Vec<(Vec<f32>, usize)> = normals
-        .par_chunks(CHUNK)
-        .map_init(Default::default, |(along, places, values): &mut Scratch, normals| {
-            places.clear();
-            let mut profiles = Vec::with_capacity(normals.len());
-            for normal in normals {
-                normal.places(prior, reach, -DEPTH, reach + DEPTH, along);
-                profiles.push(along.iter().map(|(height, _)| *height).collect::<Vec<f32>>());
-                places.extend(along.iter().map(|(_, place)| *place));
-            }
-            field.evaluate(places, values);
-            let (mut out, mut double, mut start) = (Vec::new(), 0, 0);
-            for heights in &profiles {
-                let densities = &values[start..start + heights.len()];
-                start += heights.len();
-                let (height, twice) = profile(heights, densities, field.grazing());
-                out.push(height);
-                double += usize::from(twice);
-            }
-            (out, double)
-        })
-        .collect();
-    let double = chunks.iter().map(|chunk| chunk.1).sum();
-    (chunks.into_iter().flat_map(|chunk| chunk.0).collect(), double)
+/// Height along each normal (V) at which the opacity from outside passes ½, NaN for none.
+fn crossings(field: &CanonicalField<'_>, prior: &MeshDistance, normals: &[NormalRay]) -> Vec<f32> {
+    let chunk = |normals: &[NormalRay]| {
+        let along = normals.iter().map(|normal| normal.places(prior, field.reach, -DEPTH));
+        let (heights, places): (Vec<Vec<f32>>, Vec<Vec<Place>>) = along.unzip();
+        let values = (field.evaluate)(&places.concat());
+        let mut rest = &values[..];
+        let next = |heights: &Vec<f32>| {
+            let (densities, others) = rest.split_at(heights.len());
+            rest = others;
+            crossing(heights, densities, field.grazing)
+        };
+        heights.iter().map(next).collect::<Vec<f32>>()
+    };
+    normals.par_chunks(CHUNK).flat_map_iter(chunk).collect()
 }
 
-type Scratch = (Vec<(f32, Place)>, Vec<Place>, Vec<(f32, Vec3)>);
-
-/// The height at which the opacity passes ½, and whether a gap, with at most a tenth of the peak
-/// density, separates two opaque layers. The optical depth is the integral from outside plus a length
-/// of `grazing` at the greatest density so far, which puts the surface of a fuzzy field at its
+/// The height at which the opacity passes ½. The optical depth is the integral from outside plus a
+/// length of `grazing` at the greatest density so far, which puts the surface of a fuzzy field at its
 /// rendered outline.
-fn profile(heights: &[f32], densities: &[(f32, Vec3)], grazing: f32) -> (f32, bool) {
-    let (mut found, mut depth) = (f32::NAN, 0.0);
-    // Greatest density and optical depth since the last gap.
-    let (mut peak, mut since, mut gap, mut double) = (0.0f32, 0.0, false, false);
-    let (mut thickest, mut previous) = (0.0f32, 0.0);
+fn crossing(heights: &[f32], densities: &[(f32, Vec3)], grazing: f32) -> f32 {
+    let (mut depth, mut thickest, mut previous) = (0.0, 0.0f32, 0.0);
     for (&height, &(density, _)) in heights.iter().zip(densities) {
         let added = density * STEP;
         thickest = thickest.max(density);
         let here = depth + added + grazing * thickest;
-        if found.is_nan() && here >= HALF {
-            found = height + STEP * (0.5 - (HALF - previous) / (here - previous));
+        if here >= HALF {
+            return height + STEP * (0.5 - (HALF - previous) / (here - previous));
         }
         (previous, depth) = (here, depth + added);
-        if since >= HALF && density < 0.1 * peak {
-            gap = true;
-            (peak, since) = (0.0, 0.0);
-        }
-        peak = peak.max(density);
-        since += added;
-        double |= gap && since >= HALF;
     }
-    (found, double)
+    f32::NAN
 }
 
-/// Heights along each normal (V) at which the opacity from outside is ½. Holes are filled, outliers
-/// replaced by the median, and all smoothed.
+/// Heights along each normal (V) at which the opacity from outside is ½, and the number of normals
+/// without one. These holes are filled, outliers replaced by the median, and all smoothed.
 pub(super) fn heights(
-    field: &impl CanonicalField,
+    field: &CanonicalField<'_>,
     prior: &MeshDistance,
     normals: &[NormalRay],
     mesh: &Subdivided,
-) -> (Vec<f32>, SurfaceReport) {
-    let (mut heights, double) = crossings(field, prior, normals);
+) -> (Vec<f32>, usize) {
+    let mut heights = crossings(field, prior, normals);
     let near = neighbours(normals.len(), &mesh.faces);
     let holes = heights.iter().filter(|h| h.is_nan()).count();
     fill(&mut heights, &near);
-    let outliers = replace_outliers(&mut heights, &near);
-    (smoothed(&heights, &near), SurfaceReport { holes, double, outliers })
+    replace_outliers(&mut heights, &near);
+    (smoothed(&heights, &near), holes)
 }
 
-/// Replaces outliers by the median of their neighbours; returns their number.
-fn replace_outliers(heights: &mut [f32], near: &[Vec<u32>]) -> usize {
+/// Replaces outliers by the median of their neighbours.
+fn replace_outliers(heights: &mut [f32], near: &[Vec<u32>]) {
     let median = |(near, &own): (&Vec<u32>, &f32)| {
         let mut about: Vec<f32> = near.iter().map(|&v| heights[v as usize]).collect();
         about.sort_by(f32::total_cmp);
         about.get(about.len() / 2).copied().unwrap_or(own)
     };
     let medians: Vec<f32> = near.iter().zip(&*heights).map(median).collect();
-    let mut outliers = 0;
-    for (height, median) in heights.iter_mut().zip(medians) {
-        if (*height - median).abs() > OUTLIER {
-            *height = median;
-            outliers += 1;
-        }
-    }
-    outliers
+    let outliers = heights.iter_mut().zip(medians).filter(|(height, median)| (**height - median).abs() > OUTLIER);
+    outliers.for_each(|(height, median)| *height = median);
 }
 
 /// Laplacian smoothing by half a step.

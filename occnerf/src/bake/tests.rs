@@ -4,10 +4,9 @@ use glam::{Affine3A, Mat3, Vec2, Vec3, Vec4};
 use visibility::Samples;
 
 use super::charts::{AtlasLayout, PADDING};
-use super::draw::BakedPerson;
-use super::field::{CanonicalField, Place};
+use super::draw::BakedRenderer;
 use super::make::{BakeOptions, bake, fit, surface};
-use super::renderer::BakedRenderer;
+use super::surface::{CanonicalField, Place};
 use super::{Avatar, BakeReport, skeleton};
 use crate::capture::{Capture, Light};
 use crate::config::{Config, Method, Preset};
@@ -20,28 +19,17 @@ use synth::{DemoConfig, demo};
 /// Height of the known field over the prior.
 const HEIGHT: f32 = 0.0123;
 
-/// Opaque up to a height over the prior, in a colour that changes from place to place.
-struct Known {
-    density: fn(Vec3, f32) -> f32,
-}
-
 fn known_colour(at: Vec3) -> Vec3 {
     Vec3::new((3.0 * at.y).sin(), (4.0 * at.x).cos(), (5.0 * at.z).sin()) * 0.4 + 0.5
 }
 
-impl CanonicalField for Known {
-    fn evaluate(&self, places: &[Place], out: &mut Vec<(f32, Vec3)>) {
-        out.clear();
-        out.extend(places.iter().map(|p| ((self.density)(p.closest, p.distance), known_colour(p.closest))));
-    }
-
-    fn grazing(&self) -> f32 {
-        0.0
-    }
-
-    fn reach(&self) -> f32 {
-        0.06
-    }
+/// The avatar of a field with this density, in a colour that changes from place to place.
+fn known(scene: &Scene, density: impl Fn(Vec3, f32) -> f32 + Sync, options: &BakeOptions) -> (Avatar, BakeReport) {
+    let evaluate =
+        |places: &[Place]| places.iter().map(|p| (density(p.closest, p.distance), known_colour(p.closest))).collect();
+    let field = CanonicalField { evaluate: &evaluate, grazing: 0.0, reach: 0.06 };
+    let seen = vec![1.0; scene.body.canonical.vertices.len()];
+    surface(&scene.body, &field, &seen, 0.012, options).unwrap()
 }
 
 fn scene(config: &Config) -> Scene {
@@ -50,17 +38,12 @@ fn scene(config: &Config) -> Scene {
     Scene::new(&demo(&demo_config, &body).unwrap(), &body, config).unwrap()
 }
 
-fn baked(field: &Known, options: &BakeOptions) -> (Scene, Avatar, BakeReport) {
+fn baked(density: impl Fn(Vec3, f32) -> f32 + Sync) -> (Scene, Avatar, BakeReport) {
     let scene = scene(&Config::preset(Preset::Fast, Method::Occnerf));
-    let (avatar, report) = {
-        let seen = vec![1.0; scene.body.canonical.vertices.len()];
-        surface(&scene.body, field, &seen, 0.012, options).unwrap()
-    };
+    let (avatar, report) = known(&scene, density, &BakeOptions::default());
     avatar.validate().unwrap();
     (scene, avatar, report)
 }
-
-const SOLID: Known = Known { density: |_, d| if d < HEIGHT { 5000.0 } else { 0.0 } };
 
 /// Whether each vertex of an avatar moves with no hand, foot or head: surfaces are smoothed across the
 /// folds of fingers, toes, eyes and lips.
@@ -80,7 +63,7 @@ fn distances(scene: &Scene, avatar: &Avatar) -> Vec<f32> {
 
 #[test]
 fn the_surface_is_where_a_known_field_becomes_opaque_and_has_its_colours() {
-    let (scene, avatar, report) = baked(&SOLID, &BakeOptions::default());
+    let (scene, avatar, report) = baked(|_, d| if d < HEIGHT { 5000.0 } else { 0.0 });
     let mut off: Vec<f32> = (distances(&scene, &avatar).iter().zip(off_folds(&avatar)))
         .filter(|(_, off_folds)| *off_folds)
         .map(|(d, _)| (d - HEIGHT).abs())
@@ -88,7 +71,7 @@ fn the_surface_is_where_a_known_field_becomes_opaque_and_has_its_colours() {
     off.sort_by(f32::total_cmp);
     // Folds, where two parts of the prior are equally near, are smoothed.
     assert!(off[off.len() * 9 / 10] < 0.002, "{:?}", &off[off.len() * 9 / 10..][..5]);
-    assert_eq!(report.surface.holes, 0);
+    assert_eq!(report.holes, 0);
     // Texels at the vertices show the colours of the points of the prior below.
     let size = avatar.atlas.width as f32;
     let mut errors: Vec<f32> = (avatar.vertices.iter().zip(&avatar.uvs))
@@ -105,18 +88,14 @@ fn the_surface_is_where_a_known_field_becomes_opaque_and_has_its_colours() {
 }
 
 #[test]
-fn holes_take_the_height_of_what_is_about_them_and_gaps_are_counted() {
+fn holes_take_the_height_of_what_is_about_them() {
     // Nothing over the left half of the head.
-    let holed = Known { density: |p, d| if d < HEIGHT && !(p.y > 0.5 && p.x > 0.02) { 5000.0 } else { 0.0 } };
-    let (scene, avatar, report) = baked(&holed, &BakeOptions::default());
-    assert!(report.surface.holes > 10, "{report:?}");
+    let holed = |p: Vec3, d| if d < HEIGHT && !(p.y > 0.5 && p.x > 0.02) { 5000.0 } else { 0.0 };
+    let (scene, avatar, report) = baked(holed);
+    assert!(report.holes > 10, "{report:?}");
     assert!(distances(&scene, &avatar).iter().all(|d| (-0.031..0.061).contains(d)));
-    let hull = Known { density: |_, d| if d < 0.0 || (0.02..0.03).contains(&d) { 5000.0 } else { 0.0 } };
-    let (_, _, report) = baked(&hull, &BakeOptions::default());
-    assert!(report.surface.double > report.vertices / 2, "{report:?}");
-    let empty = Known { density: |_, _| 0.0 };
-    let (scene, avatar, report) = baked(&empty, &BakeOptions::default());
-    assert!(report.surface.holes > 0 && distances(&scene, &avatar).iter().all(|d| d.abs() < 1e-3));
+    let (scene, avatar, report) = baked(|_, _| 0.0);
+    assert!(report.holes > 0 && distances(&scene, &avatar).iter().all(|d| d.abs() < 1e-3));
 }
 
 /// Texels of a square atlas whose centres lie inside a triangle, by the signs of three areas.
@@ -220,9 +199,8 @@ fn in_front(size: u32) -> volrender::Camera {
 }
 
 fn picture(avatar: &Avatar, bones: &[Affine3A], size: u32, samples: Samples) -> Vec<Vec4> {
-    let mut out = vec![Vec4::ZERO; (size * size) as usize];
-    BakedPerson::new(avatar, 1.0).draw(bones, &in_front(size), samples, &mut out).unwrap();
-    out
+    let mut renderer = BakedRenderer::new(avatar, 1.0, Light::default(), samples);
+    renderer.draw(bones, &in_front(size)).unwrap().to_vec()
 }
 
 #[test]
@@ -265,13 +243,12 @@ fn a_light_is_as_bright_as_the_surface_is_turned_to_it_and_no_brighter_than_whit
     for (degrees, slope) in [(0.0f32, 0.5), (0.0, -0.5), (40.0, 0.5), (-40.0, 0.5), (0.0, 0.0)] {
         let turned = Affine3A::from_rotation_y(degrees.to_radians());
         let light = Light { slope: Vec3::new(0.0, 0.0, slope) };
-        let mut out = vec![Vec4::ZERO; 81];
-        let mut person = BakedPerson::new(&avatar, 1.0).lit_by(light);
-        person.draw(&[turned], &in_front(9), Samples::One, &mut out).unwrap();
+        let mut renderer = BakedRenderer::new(&avatar, 1.0, light, Samples::One);
+        let found = renderer.draw(&[turned], &in_front(9)).unwrap()[40];
         let along = degrees.to_radians().cos();
         let brightness = 1.0 + slope * along + 0.5 * slope.abs() * (along * along - 1.0 / 3.0);
         let expected = (albedo * brightness).min(Vec3::ONE).extend(1.0);
-        assert!((out[40] - expected).abs().max_element() < 1e-4, "{degrees} {slope}: {} {expected}", out[40]);
+        assert!((found - expected).abs().max_element() < 1e-4, "{degrees} {slope}: {found} {expected}");
     }
 }
 
@@ -287,8 +264,7 @@ fn a_person_in_training_is_baked_refined_and_drawn_alike_on_any_number_of_thread
     let make = || {
         let options = BakeOptions { refinements: 3, ..BakeOptions::default() };
         let (avatar, report) = bake(trainer.model(), Some(&scene), &options).unwrap();
-        let mut renderer =
-            BakedRenderer::new(trainer.model().body(), trainer.model().light(), &avatar, Samples::Four).unwrap();
+        let mut renderer = BakedRenderer::new(&avatar, scene.body.scale, trainer.model().light(), Samples::Four);
         let rendering = renderer.render(&scene.train[1].view, Vec3::ZERO).unwrap();
         (avatar, report, rendering)
     };
@@ -306,10 +282,11 @@ fn a_person_in_training_is_baked_refined_and_drawn_alike_on_any_number_of_thread
     let clip = &avatar.clips[0].motion;
     let pose = &clip.poses[..avatar.num_joints()];
     let bones = avatar.bones(pose, clip.trans[0]);
-    let expected = avatar.skin_with_blend_shapes(&bones, pose);
-    for (found, expected) in BakedPerson::new(&avatar, 1.0).skin(&bones).iter().zip(expected) {
+    let mut renderer = BakedRenderer::new(&avatar, 1.0, Light::default(), Samples::Four);
+    for (found, expected) in renderer.skin(&bones).0.iter().zip(avatar.skin(&bones, pose).0) {
         assert!(found.distance(expected) < 1e-4);
     }
+    assert!(renderer.draw(&bones[1..], &scene.train[0].view.camera).unwrap_err().to_string().contains("joints"));
     for options in
         [BakeOptions { atlas: 1, ..BakeOptions::default() }, BakeOptions { fps: f32::NAN, ..BakeOptions::default() }]
     {
@@ -320,7 +297,7 @@ fn a_person_in_training_is_baked_refined_and_drawn_alike_on_any_number_of_thread
 /// Intersection over union of a drawn person and the mask, in the mean over frames.
 fn overlap(scene: &Scene, avatar: &Avatar) -> f32 {
     let light = scene.colors().unwrap().light;
-    let mut renderer = BakedRenderer::new(&scene.body, light, avatar, Samples::Four).unwrap();
+    let mut renderer = BakedRenderer::new(avatar, scene.body.scale, light, Samples::Four);
     let one = |frame: &PreparedFrame| {
         let rendering = renderer.render(&frame.view, Vec3::ZERO).unwrap();
         let mask = frame.pixels().unwrap().mask;
@@ -345,9 +322,7 @@ fn a_fitted_surface_covers_unseen_views_better_than_the_prior_alike_on_any_numbe
     let (avatar, report) = one;
     avatar.validate().unwrap();
     assert!(report.errors[1] < report.errors[0], "{report:?}");
-    let flat = Known { density: |_, d| if d < 0.0 { 5000.0 } else { 0.0 } };
-    let seen = vec![1.0; given.body.canonical.vertices.len()];
-    let (prior, _) = surface(&given.body, &flat, &seen, 0.012, &BakeOptions::default()).unwrap();
+    let (prior, _) = known(&given, |_, d| if d < 0.0 { 5000.0 } else { 0.0 }, &BakeOptions::default());
     let [fitted, bare] = [&avatar, &prior].map(|avatar| overlap(&given, avatar));
     assert!(1.0 - fitted < 0.8 * (1.0 - bare), "{fitted} for {bare}");
     // Nothing is learnt from what is not seen, and nothing breaks.

@@ -7,7 +7,7 @@ use std::path::PathBuf;
 use glam::{Vec2, Vec3};
 use occnerf::bake::{Avatar, Clip, turn_upright};
 use occnerf::{Config, Method, Preset, PriorColors, Scene};
-use stand_in::stand_in;
+use stand_in::{skinned, stand_in};
 use synth::{DemoConfig, demo};
 
 fn scene() -> Scene {
@@ -40,7 +40,7 @@ fn an_avatar_moves_as_the_prior_that_it_came_from() {
     for (t, frame) in scene.train.iter().enumerate() {
         let pose = &motion.poses[t * motion.num_joints..][..motion.num_joints];
         let bones = avatar.bones(pose, motion.trans[t]);
-        let moved = avatar.skin_with_blend_shapes(&bones, pose);
+        let (moved, _) = avatar.skin(&bones, pose);
         let expected = body.model.faces.iter().flatten().map(|&v| world * frame.view.posed.vertices[v as usize]);
         let worst = moved.iter().zip(expected).map(|(a, b)| a.distance(b)).fold(0.0, f32::max);
         // The betas of the demo's frames are the mean ones; four weights a vertex of at most four.
@@ -53,11 +53,12 @@ fn an_avatar_moves_as_the_prior_that_it_came_from() {
         assert!((here.z * body.scale - there.z).abs() < 1e-3);
         // At a frame's own second the clip is that frame.
         let seconds = t as f32 / motion.fps;
-        let again = avatar.skin(&avatar.bones_at(0, seconds));
-        let same = avatar.skin(&bones).iter().zip(&again).all(|(a, b)| a.distance(*b) < 1e-3);
+        let again = skinned(&avatar, seconds).0;
+        let same = moved.iter().zip(&again).all(|(a, b)| a.distance(*b) < 1e-3);
         assert!(same, "frame {t}");
     }
-    let rest = avatar.skin(&avatar.bones(&vec![Vec3::ZERO; avatar.num_joints()], Vec3::ZERO));
+    let still = vec![Vec3::ZERO; avatar.num_joints()];
+    let (rest, _) = avatar.skin(&avatar.bones(&still, Vec3::ZERO), &still);
     assert!(rest.iter().zip(&avatar.vertices).all(|(a, b)| a.distance(*b) < 1e-5));
 }
 

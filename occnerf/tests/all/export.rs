@@ -8,10 +8,11 @@ use std::sync::OnceLock;
 
 use glam::{Mat3, Quat, Vec2, Vec3};
 use occnerf::bake::Avatar;
-use occnerf::bake::export::{Splats, adapt_motion, splats, write_amass, write_obj};
+use occnerf::bake::export::{Splats, fit_motion, splats, write_amass, write_obj};
 use occnerf::{Config, Method, Preset, PriorColors, Scene};
 use rigged::Character;
-use smpl::MotionClip;
+use smpl::{MotionClip, SparseRows};
+use stand_in::skinned;
 use synth::{DemoConfig, demo};
 
 fn avatar() -> &'static Avatar {
@@ -22,6 +23,16 @@ fn avatar() -> &'static Avatar {
         let scene = Scene::new(&capture, &body, &Config::preset(Preset::Fast, Method::Occnerf)).unwrap();
         stand_in::stand_in(&scene, &PriorColors::measure(&scene).unwrap())
     })
+}
+
+/// The avatar as glTF has it, without pose blend shapes.
+fn bare() -> Avatar {
+    let rows = vec![Vec::<(u32, Vec3)>::new(); avatar().num_vertices()];
+    Avatar { posedirs: SparseRows::from_rows(rows), ..avatar().clone() }
+}
+
+fn adapted(avatar: &Avatar, motion: &MotionClip) -> Result<MotionClip, occnerf::Error> {
+    fit_motion(motion, avatar.num_joints(), avatar.skeleton[0].rest)
 }
 
 fn place(name: &str) -> PathBuf {
@@ -53,7 +64,7 @@ fn a_glb_reads_back_and_moves_as_the_avatar_does() {
     let motion = &avatar.clips[0].motion;
     assert_eq!(character.animations[0].name, "video");
     for seconds in [0.0, 1.0 / motion.fps, 1.5 / motion.fps, motion.duration(), 99.0] {
-        let (found, expected) = (character.pose(0, seconds).vertices, avatar.skin(&avatar.bones_at(0, seconds)));
+        let (found, expected) = (character.pose(0, seconds).vertices, skinned(&bare(), seconds).0);
         assert!(worst(&found, &expected) < 2e-4, "at {seconds} s: {} m", worst(&found, &expected));
     }
     let texture = image::load_from_memory(&character.texture.unwrap().bytes).unwrap().into_rgb8();
@@ -73,8 +84,7 @@ fn a_glb_carries_the_light_beside_the_colours_without_it() {
 #[test]
 fn an_obj_holds_the_pose_the_colours_and_the_atlas() {
     let avatar = avatar();
-    let bones = avatar.bones_at(0, 0.05);
-    let (vertices, normals) = (avatar.skin(&bones), avatar.turned_normals(&bones));
+    let (vertices, normals) = skinned(avatar, 0.05);
     let path = place("a person.obj");
     write_obj(avatar, &vertices, &normals, &path).unwrap();
     let (models, materials) = tobj::load_obj(&path, &tobj::GPU_LOAD_OPTIONS).unwrap();
@@ -110,11 +120,14 @@ fn motion_goes_out_and_comes_back_standing() {
     // As AMASS has it, z is up.
     let up = Quat::from_scaled_axis(clip.poses[0]) * Vec3::Y;
     assert!(up.z > 0.8, "{up}");
-    let back = adapt_motion(avatar, &clip).unwrap();
+    let back = adapted(avatar, &clip).unwrap();
     let motion = &avatar.clips[0].motion;
     for frame in 0..4 {
-        let pose = |m: &MotionClip| avatar.bones(&m.poses[24 * frame..24 * (frame + 1)], m.trans[frame]);
-        assert!(worst(&avatar.skin(&pose(&back)), &avatar.skin(&pose(motion))) < 1e-4);
+        let vertices = |m: &MotionClip| {
+            let pose = &m.poses[24 * frame..24 * (frame + 1)];
+            avatar.skin(&avatar.bones(pose, m.trans[frame]), pose).0
+        };
+        assert!(worst(&vertices(&back), &vertices(motion)) < 1e-4);
     }
     let mut npz = array_files::npz::Npz::open(&path).unwrap();
     assert_eq!(npz.f32("betas", &[None]).unwrap().1, avatar.betas);
@@ -131,9 +144,9 @@ fn a_motion_of_another_skeleton_is_refused_and_smpl_h_is_taken() {
         trans: vec![Vec3::Y; 2],
         fps: 60.0,
     };
-    let error = adapt_motion(avatar, &clip(31)).unwrap_err().to_string();
+    let error = adapted(avatar, &clip(31)).unwrap_err().to_string();
     assert!(error.contains("skeleton") && error.contains("24") && error.contains("31"), "{error}");
-    let fitted = adapt_motion(avatar, &clip(52)).unwrap();
+    let fitted = adapted(avatar, &clip(52)).unwrap();
     assert_eq!((fitted.num_joints, fitted.poses.len(), fitted.fps), (24, 48, 60.0));
     assert_eq!(fitted.poses[23], Vec3::ZERO);
 }
@@ -170,7 +183,7 @@ fn drawn(splats: &Splats, to_view: Mat3, middle: Vec3, scale: f32, side: usize) 
 #[test]
 fn splats_cover_the_surface_without_holes_and_show_its_colours() {
     let avatar = avatar();
-    let vertices = avatar.skin(&avatar.bones_at(0, 0.0));
+    let vertices = skinned(avatar, 0.0).0;
     let splats = splats(avatar, &vertices, 0.009).unwrap();
     assert!(splats.centres.len() > 20_000, "{}", splats.centres.len());
     let mesh = visibility::RayMesh::new(&vertices, &avatar.faces).unwrap();

@@ -6,6 +6,7 @@ use std::path::Path;
 use glam::{Vec2, Vec3};
 
 use crate::Error;
+use crate::bake::draw::{bilinear, color};
 use crate::bake::{Atlas, Avatar, write_whole};
 
 /// Writes `path` (`.obj`) and beside it the same name with `.mtl` and `.png`: the avatar's
@@ -54,15 +55,7 @@ pub fn write_obj(avatar: &Avatar, vertices: &[Vec3], normals: &[Vec3], path: &Pa
 impl Atlas {
     /// Bilinear lookup, sRGB in [0, 1].
     pub(super) fn color(&self, uv: Vec2) -> Vec3 {
-        let (width, height) = (self.width as usize, self.height as usize);
-        let at = uv * Vec2::new(width as f32, height as f32) - 0.5;
-        let (low, share) = (at.floor(), at - at.floor());
-        let texel = |x: f32, y: f32| {
-            let (x, y) = ((x.max(0.0) as usize).min(width - 1), (y.max(0.0) as usize).min(height - 1));
-            let bytes = &self.rgb[3 * (y * width + x)..][..3];
-            Vec3::new(f32::from(bytes[0]), f32::from(bytes[1]), f32::from(bytes[2])) / 255.0
-        };
-        let row = |y: f32| texel(low.x, y).lerp(texel(low.x + 1.0, y), share.x);
-        row(low.y).lerp(row(low.y + 1.0), share.y)
+        let texels = self.rgb.as_chunks().0;
+        bilinear(self, uv, |i| color(texels[i]).into()).into()
     }
 }

@@ -6,7 +6,7 @@ mod motion;
 mod splats;
 
 pub use mesh::write_obj;
-pub use motion::{adapt_motion, fit_motion, write_amass};
+pub use motion::{fit_motion, write_amass};
 pub use splats::{Splats, splats};
 
 use std::io::Cursor;

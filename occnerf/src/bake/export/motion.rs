@@ -46,21 +46,12 @@ fn turned(motion: &MotionClip, turn: Mat3, root: Vec3) -> MotionClip {
     out
 }
 
-/// Fits motion capture to an avatar: y up, and a rotation for each of the avatar's joints (see
-/// [`MotionClip::at`]).
+/// Fits motion capture to a body of `to` joints whose root rests at `root`, in metres: y up, and a
+/// rotation for each joint (see [`MotionClip::at`]).
 ///
 /// # Errors
 /// [`Error::Bake`] for a motion of another skeleton: neither the same number of joints nor both of
 /// SMPL's family.
-pub fn adapt_motion(avatar: &Avatar, motion: &MotionClip) -> Result<MotionClip, Error> {
-    let root = avatar.skeleton.first().map_or(Vec3::ZERO, |joint| joint.rest);
-    fit_motion(motion, avatar.num_joints(), root)
-}
-
-/// [`adapt_motion`] for any body of `to` joints whose root rests at `root`, in metres.
-///
-/// # Errors
-/// As [`adapt_motion`].
 pub fn fit_motion(motion: &MotionClip, to: usize, root: Vec3) -> Result<MotionClip, Error> {
     let from = motion.num_joints;
     if from != to && !(SMPL_FAMILY.contains(&from) && SMPL_FAMILY.contains(&to)) {

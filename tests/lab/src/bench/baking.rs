@@ -1,6 +1,5 @@
 //! Ways to bake a person and to draw them, by name.
 
-use anyhow::Result;
 use occnerf::Model;
 use occnerf::bake::{Avatar, BakeOptions, BakedRenderer};
 use serde::{Deserialize, Serialize};
@@ -46,7 +45,7 @@ impl Baking {
     }
 
     /// Draws an avatar that was baked with [`Baking::options`].
-    pub fn renderer<'a>(self, model: &Model, avatar: &'a Avatar) -> Result<BakedRenderer<'a>> {
-        Ok(BakedRenderer::new(model.body(), model.light(), avatar, self.samples())?)
+    pub fn renderer<'a>(self, model: &Model, avatar: &'a Avatar) -> BakedRenderer<'a> {
+        BakedRenderer::new(avatar, model.body().scale, model.light(), self.samples())
     }
 }

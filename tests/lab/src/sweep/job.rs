@@ -180,7 +180,7 @@ fn measure(job: &Job) -> Result<Outcome> {
         let (avatar, _) = fit(&scene, &BakeOptions::default())?;
         outcome.train_seconds = start.elapsed().as_secs_f64();
         outcome.parameters = avatar.num_parameters();
-        let mut renderer = BakedRenderer::new(&scene.body, colors.light, &avatar, Samples::Four)?;
+        let mut renderer = BakedRenderer::new(&avatar, scene.body.scale, colors.light, Samples::Four);
         score(&scene, &mut renderer, &mut outcome)?;
     } else {
         let mut trainer = job.method.trainer(&scene, job.config.clone())?;

@@ -19,6 +19,7 @@ use std::time::{Duration, Instant};
 use array_files::npz::{Npz, read_npy};
 use array_files::pickle;
 use array_files::torch::TorchFile;
+use glam::Vec3;
 use mutate::{Form, Random, damaged};
 use occnerf::bake::Avatar;
 use occnerf::capture::{Image, ImportOptions, LoadOptions, import, load_capture};
@@ -315,8 +316,9 @@ fn people_of_runs() {
         |bytes| {
             std::fs::write(&path, bytes).unwrap();
             let Ok(avatar) = Avatar::load(&path) else { return false };
-            if !avatar.clips.is_empty() {
-                black_box(avatar.skin(&avatar.bones_at(0, 0.02)));
+            if let Some(clip) = avatar.clips.first() {
+                let (pose, _) = clip.motion.at(0.02, avatar.num_joints());
+                black_box(avatar.skin(&avatar.bones(&pose, Vec3::ZERO), &pose));
             }
             true
         },
