@@ -94,25 +94,6 @@ fn encode_backward_points(bencher: Bencher<'_, '_>, kind: Points) {
     });
 }
 
-/// Forward pass with the Jacobian, and the backward pass to the points by it.
-#[divan::bench(args = [Points::Uniform, Points::Surface])]
-fn encode_jacobian_and_backward_points(bencher: Bencher<'_, '_>, kind: Points) {
-    let Case { grid, table, points, d_features } = case(kind);
-    let width = grid.num_features();
-    let mut d_points = vec![[0.0; 4]; POINTS];
-    let tasks = POINTS / TASK;
-    let mut features = vec![vec![0.0; TASK * width]; tasks];
-    let mut jacobian = vec![vec![0.0; grid.jacobian_len(TASK)]; tasks];
-    bencher.counter(ItemsCount::new(POINTS)).bench_local(|| {
-        let parts = points.par_chunks(TASK).zip(d_features.par_chunks(TASK * width));
-        let buffers = features.par_iter_mut().zip(&mut jacobian).zip(d_points.par_chunks_mut(TASK));
-        parts.zip(buffers).for_each(|((points, d_features), ((features, jacobian), d_points))| {
-            grid.encode_jacobian(black_box(&table), points, features, jacobian);
-            grid.jacobian_backward(jacobian, d_features, d_points);
-        });
-    });
-}
-
 /// The encoding by its definition, point by point.
 #[divan::bench(args = [Points::Uniform, Points::Surface])]
 fn encode_plain(bencher: Bencher<'_, '_>, kind: Points) {

@@ -44,7 +44,6 @@ mod config;
 mod corners;
 mod encode;
 mod grid;
-mod jacobian;
 mod layout;
 mod simd;
 

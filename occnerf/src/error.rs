@@ -33,7 +33,6 @@ pub enum Error {
     #[error("scene: {0}")]
     Scene(String),
     /// Weights or images that LPIPS cannot take.
-    #[cfg(feature = "lpips")]
     #[error(transparent)]
     Lpips(#[from] lpips::Error),
     /// A perceptual term without its weights.

@@ -32,14 +32,13 @@ mod check;
 mod config;
 mod error;
 mod evaluate;
-mod lpips;
 mod model;
 mod render;
 mod scene;
 mod train;
 
-pub use self::lpips::Lpips;
 pub use ::capture;
+pub use ::lpips::Lpips;
 pub use array_files::replace_file;
 pub use check::{Check, Fault, FrameCheck, Mistake, body_silhouette, check, photograph, unknown_pixels};
 pub use config::{

@@ -33,7 +33,7 @@ pub(super) fn evaluate(model: &Model, code: &VertexCode, extent: &Extent, places
             samples.base.push(base.logit(place.face, place.barycentric, 1.0));
         }
     }
-    model.evaluate(code, &mut batch, None);
+    model.evaluate(code, &mut batch);
     let likelihood = surface_motion(&config.motion);
     let value = |((place, sigma), rgb): ((&Place, &f32), &Vec3)| {
         let lives = place.distance <= extent.faces[place.face as usize];

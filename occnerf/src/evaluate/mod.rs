@@ -3,6 +3,7 @@
 use std::time::Instant;
 
 use glam::Vec3;
+use lpips::Lpips;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use visibility::RayMesh;
@@ -10,7 +11,6 @@ use volrender::metrics;
 
 use crate::Error;
 use crate::capture::Pixels;
-use crate::lpips::Lpips;
 use crate::render::picture::{Renderer, Rendering};
 use crate::scene::labels::Label;
 use crate::scene::prepared::{PreparedFrame, Scene};

@@ -82,8 +82,7 @@ impl Encoder {
 
     /// The coordinates that samples are encoded at, in the unit box for a grid.
     pub fn coordinates(&self, samples: &Samples, region: &Aabb, out: &mut Coordinates) {
-        out.point.clear();
-        out.surface.clear();
+        out.clear();
         match self {
             Self::Point(_) => out.point.extend(samples.canonical.iter().map(|&x| in_box(x, region).to_array())),
             Self::Surface(_, range) => out.surface.extend(
@@ -123,25 +122,6 @@ impl Encoder {
         }
     }
 
-    /// Derivatives that [`Encoder::encode_jacobian`] writes for each point; none of the caller's
-    /// encoding.
-    pub fn jacobian_width(&self) -> usize {
-        match self {
-            Self::Point(grid) => grid.jacobian_len(1),
-            Self::Surface(grid, _) => grid.jacobian_len(1),
-            Self::Custom(_) => 0,
-        }
-    }
-
-    /// [`Encoder::encode`], storing the derivatives for [`Encoder::encode_backward_points`].
-    pub fn encode_jacobian(&self, table: &[f32], at: At<'_>, features: &mut [f32], jacobian: &mut [f32]) {
-        match self {
-            Self::Point(grid) => grid.encode_jacobian(table, at.point, features, jacobian),
-            Self::Surface(grid, _) => grid.encode_jacobian(table, at.surface, features, jacobian),
-            Self::Custom(encoder) => encoder.encode(table, at.point, features),
-        }
-    }
-
     /// Adds the gradient of the table from all parts, in their order.
     pub fn encode_backward<'a>(
         &self,
@@ -156,21 +136,13 @@ impl Encoder {
     }
 
     /// Gradients of the coordinates; overwrites `d_at`.
-    pub fn encode_backward_points(&self, from: Jacobian<'_>, at: At<'_>, d_features: &[f32], d_at: &mut Coordinates) {
+    pub fn encode_backward_points(&self, table: &[f32], at: At<'_>, d_features: &[f32], d_at: &mut Coordinates) {
         d_at.clear();
         d_at.point.resize(at.point.len(), [0.0; 3]);
         d_at.surface.resize(at.surface.len(), [0.0; 4]);
         match self {
-            Self::Point(grid) => match from {
-                Jacobian::OfTable(table) => grid.encode_backward_points(table, at.point, d_features, &mut d_at.point),
-                Jacobian::Stored(jacobian) => grid.jacobian_backward(jacobian, d_features, &mut d_at.point),
-            },
-            Self::Surface(grid, _) => match from {
-                Jacobian::OfTable(table) => {
-                    grid.encode_backward_points(table, at.surface, d_features, &mut d_at.surface);
-                }
-                Jacobian::Stored(jacobian) => grid.jacobian_backward(jacobian, d_features, &mut d_at.surface),
-            },
+            Self::Point(grid) => grid.encode_backward_points(table, at.point, d_features, &mut d_at.point),
+            Self::Surface(grid, _) => grid.encode_backward_points(table, at.surface, d_features, &mut d_at.surface),
             Self::Custom(encoder) => encoder.encode_backward_points(at.point, d_features, &mut d_at.point),
         }
     }
@@ -187,15 +159,6 @@ impl Encoder {
             }
         }
     }
-}
-
-/// Where the derivatives of a grid's features by the coordinates come from.
-#[derive(Clone, Copy)]
-pub(crate) enum Jacobian<'a> {
-    /// They are computed from the table.
-    OfTable(&'a [f32]),
-    /// [`Encoder::encode_jacobian`] has written them.
-    Stored(&'a [f32]),
 }
 
 /// Where samples are encoded; one of the two is filled.

@@ -7,7 +7,6 @@ use visibility::VisibilityCounts;
 use volrender::Aabb;
 
 use crate::config::Config;
-use crate::model::arena::Arena;
 use crate::model::encoder::{Coordinates, Encoder, fit};
 use crate::model::perceptron::{Activations, Mlp};
 use crate::model::samples::Samples;
@@ -49,9 +48,6 @@ pub(crate) struct SampleBatch {
     pub attention: Vec<f32>,
     /// The point term, as it lies ([`Encoder::layout`]); after the backward pass its gradient.
     pub features: Vec<f32>,
-    /// Where the derivatives of the features by the coordinates are in the arena that
-    /// [`Field::forward`] was given.
-    pub jacobian: Range<usize>,
     /// Activations of each block, or of the last one where they are recomputed.
     pub blocks: Vec<Activations>,
     /// Activated density and colour of each sample.
@@ -103,20 +99,13 @@ impl Field {
         }
     }
 
-    /// Evaluates density and colour of every sample of the batch. Where gradients of the
-    /// coordinates will be asked for, the derivatives that they take are left in `jacobians`.
-    pub fn forward(&self, learnt: &Learnt<'_>, batch: &mut SampleBatch, jacobians: Option<&mut Arena>) {
+    /// Evaluates density and colour of every sample of the batch.
+    pub fn forward(&self, learnt: &Learnt<'_>, batch: &mut SampleBatch) {
         let (n, width) = (batch.samples.len(), self.encoder.num_features());
         let mut watch = Stopwatch::start();
         self.encoder.coordinates(&batch.samples, &self.region, &mut batch.at);
         fit(&mut batch.features, n * width);
-        if let Some(arena) = jacobians {
-            batch.jacobian = arena.take(n * self.encoder.jacobian_width());
-            let jacobian = arena.piece_mut(&batch.jacobian);
-            self.encoder.encode_jacobian(learnt.table, batch.at.all(), &mut batch.features, jacobian);
-        } else {
-            self.encoder.encode(learnt.table, batch.at.all(), &mut batch.features);
-        }
+        self.encoder.encode(learnt.table, batch.at.all(), &mut batch.features);
         watch.lap(&mut batch.times.encode);
         self.attend(learnt.counts, batch);
         batch.sigma.resize(n, 0.0);

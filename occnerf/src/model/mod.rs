@@ -1,6 +1,5 @@
 //! What a trained person is, and how a ray meets it.
 
-pub(crate) mod arena;
 pub(crate) mod body;
 pub(crate) mod colors;
 pub(crate) mod distance;

@@ -22,9 +22,17 @@ pub(crate) const PARTS: [(Part, &str); 4] =
 
 /// An array for each part: values, or their gradients.
 #[derive(Clone, Debug)]
-pub(crate) struct Arrays(pub [Vec<f32>; 4]);
+pub(crate) struct Parameters(pub [Vec<f32>; 4]);
 
-impl Arrays {
+impl Parameters {
+    /// The values that training starts from, for `vertices` vertices and `motion` log-weights.
+    pub fn new(config: &Config, field: &Field, vertices: usize, motion: usize) -> Self {
+        let moved = field.surface_term && config.rates.vertices > 0.0;
+        let offsets = if moved { 3 * vertices } else { 0 };
+        let table = field.encoder.initial_table(config.seed);
+        Self([field.mlp.initial(config.seed), table, vec![0.0; offsets], vec![0.0; motion]])
+    }
+
     pub fn get(&self, part: Part) -> &[f32] {
         &self.0[part as usize]
     }
@@ -36,37 +44,5 @@ impl Arrays {
     /// Zeros of the same lengths.
     pub fn zeros(&self) -> Self {
         Self(self.0.each_ref().map(|values| vec![0.0; values.len()]))
-    }
-}
-
-/// Values of every part.
-#[derive(Clone, Debug)]
-pub(crate) struct Parameters {
-    pub values: Arrays,
-}
-
-/// Lengths that do not follow from the field.
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct Lengths {
-    pub vertices: usize,
-    pub motion: usize,
-}
-
-impl Parameters {
-    /// The values that training starts from.
-    pub fn new(config: &Config, field: &Field, lengths: Lengths) -> Self {
-        let moved = field.surface_term && config.rates.vertices > 0.0;
-        let vertices = if moved { 3 * lengths.vertices } else { 0 };
-        let table = field.encoder.initial_table(config.seed);
-        let values = Arrays([field.mlp.initial(config.seed), table, vec![0.0; vertices], vec![0.0; lengths.motion]]);
-        Self { values }
-    }
-
-    pub fn get(&self, part: Part) -> &[f32] {
-        self.values.get(part)
-    }
-
-    pub fn get_mut(&mut self, part: Part) -> &mut Vec<f32> {
-        self.values.get_mut(part)
     }
 }

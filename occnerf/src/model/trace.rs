@@ -9,10 +9,11 @@ use crate::Error;
 use crate::capture::Light;
 use crate::config::Config;
 use crate::model::body::Body;
-use crate::model::colors::{PriorColors, shade};
+use crate::model::colors::shade;
 use crate::model::distance::{SurfacePoint, surface_point};
 use crate::model::extent::Extent;
 use crate::model::samples::Samples;
+use crate::model::trained::Model;
 use volrender::RandomStream;
 
 /// Side of an occupancy cell in training, normalised metres: a step has too few rays for a finer
@@ -49,29 +50,13 @@ impl PosedSurface {
     }
 }
 
-/// Cells near the canonical prior.
-pub(crate) fn near_canonical(body: &Body, config: &Config) -> Occupancy {
-    let (mut occupancy, whole) = (Occupancy::default(), Extent::whole(body, config));
-    let size = OccupancyConfig { margin: whole.farthest, depth: config.motion.depth, cell: FINE_CELL };
-    occupancy.rebuild(&body.canonical.vertices, &body.model.faces, &whole.faces, size);
-    occupancy
-}
-
 /// Everything that tracing a ray reads.
 #[derive(Clone, Copy)]
 pub(crate) struct Tracer<'a> {
-    pub body: &'a Body,
-    pub config: &'a Config,
+    pub model: &'a Model,
     pub surface: &'a PosedSurface,
-    pub motion: &'a MotionField,
-    pub frame: &'a MotionFrame<'a>,
-    /// Cells near the canonical prior; read for volumes, which have no posed closest point.
-    pub near_canonical: &'a Occupancy,
     pub extent: &'a Extent,
-    /// Initial colours, see [`Samples::base`]; may be empty.
-    pub base: &'a PriorColors,
-    /// Whether samples need their neighbours.
-    pub neighbours: bool,
+    pub frame: &'a MotionFrame<'a>,
 }
 
 /// State of the march along a ray, front to back.
@@ -124,7 +109,7 @@ impl Tracer<'_> {
     /// Appends the next live samples of a ray, at most `most`, and advances the march.
     pub fn trace(&self, samples: &mut Samples, most: usize, march: &mut March) {
         let ray = march.ray;
-        let count = self.config.samples;
+        let count = self.model.config.samples;
         let first = samples.len();
         let span = self.surface.occupancy.region().intersect(&ray);
         if let Some((near, far)) = span.filter(|(near, far)| far > near) {
@@ -159,7 +144,7 @@ impl Tracer<'_> {
         let mesh = &self.surface.mesh;
         // Rounding may put the face itself a hair beyond its own distance.
         let bound = near.map_or(f32::INFINITY, |face| 1.000_01 * mesh.distance_to_face(point, face) + 1e-6);
-        let farthest = self.extent.farthest.max(self.config.motion.depth);
+        let farthest = self.extent.farthest.max(self.model.config.motion.depth);
         let found = mesh.closest_within(point, farthest.min(bound))?;
         let (face, barycentric, signed_distance) = (found.face, found.barycentric, found.signed_distance);
         Some(Nearest { face, barycentric, signed_distance })
@@ -168,9 +153,10 @@ impl Tracer<'_> {
     /// Maps a point, looks up its surface and appends it if it is live, which is returned with the
     /// closest posed face. `near` is a face that is probably close; `inside` keeps d < 0 alone.
     fn push(&self, samples: &mut Samples, point: Vec3, near: Option<u32>, inside: bool) -> (bool, Option<u32>) {
-        let (reach, depth) = (self.config.motion.reach(), self.config.motion.depth);
+        let Model { body, config, motion, base, near_canonical, .. } = self.model;
+        let (reach, depth) = (config.motion.reach(), config.motion.depth);
         let mut nearest = None;
-        if let MotionField::Surface(_) = self.motion {
+        if let MotionField::Surface(_) = motion {
             let Some(found) = self.nearest(point, near) else { return (false, None) };
             if found.signed_distance > self.extent.faces[found.face as usize] || found.signed_distance < -depth {
                 return (false, Some(found.face));
@@ -178,21 +164,20 @@ impl Tracer<'_> {
             nearest = Some(found);
         }
         let looked_up = nearest.map(|found| found.face);
-        let Some(mapped) = self.motion.map(self.frame, point, || nearest) else { return (false, looked_up) };
-        if nearest.is_none() && !self.near_canonical.is_occupied(mapped.canonical) {
+        let Some(mapped) = motion.map(self.frame, point, || nearest) else { return (false, looked_up) };
+        if nearest.is_none() && !near_canonical.is_occupied(mapped.canonical) {
             return (false, None);
         }
-        let corner = |v: u32| self.body.canonical.vertices[v as usize];
-        let exact = !self.config.surface.distance.needs_neighbours();
+        let corner = |v: u32| body.canonical.vertices[v as usize];
+        let exact = !config.surface.distance.needs_neighbours();
         // The closest point keeps its face and barycentrics in the canonical pose.
         let mut at = nearest.filter(|_| exact).map(|found| {
-            let weighted = self.body.model.faces[found.face as usize].into_iter().zip(found.barycentric);
+            let weighted = body.model.faces[found.face as usize].into_iter().zip(found.barycentric);
             let closest = weighted.map(|(v, b)| b * corner(v)).sum();
             SurfacePoint { closest, distance: found.signed_distance }
         });
-        let look = |neighbours: &[u32]| {
-            surface_point(self.body, &self.config.surface, mapped.canonical, neighbours, reach.max(depth))
-        };
+        let look =
+            |neighbours: &[u32]| surface_point(body, &config.surface, mapped.canonical, neighbours, reach.max(depth));
         if exact && at.is_none() {
             at = look(&[]);
             if at.is_none() {
@@ -200,9 +185,9 @@ impl Tracer<'_> {
             }
         }
         let first = samples.neighbours.len();
-        if self.neighbours {
-            samples.neighbours.resize(first + self.body.query.neighbours_per_query(), 0);
-            self.body.query.neighbours(mapped.canonical, &mut samples.neighbours[first..]);
+        if config.needs_neighbours() {
+            samples.neighbours.resize(first + body.query.neighbours_per_query(), 0);
+            body.query.neighbours(mapped.canonical, &mut samples.neighbours[first..]);
         }
         let within =
             |at: &SurfacePoint| at.distance <= reach && at.distance >= -depth && !(inside && at.distance >= 0.0);
@@ -215,10 +200,10 @@ impl Tracer<'_> {
         samples.canonical.push(mapped.canonical);
         samples.closest.push(at.closest);
         samples.distance.push(at.distance);
-        if let Some(found) = nearest.filter(|_| !self.base.colors.is_empty()) {
-            let corners = self.body.model.faces[found.face as usize];
+        if let Some(found) = nearest.filter(|_| !base.colors.is_empty()) {
+            let corners = body.model.faces[found.face as usize];
             let shade = shade(&self.surface.shades, corners, found.barycentric);
-            samples.base.push(self.base.logit(found.face, found.barycentric, shade));
+            samples.base.push(base.logit(found.face, found.barycentric, shade));
         }
         (true, looked_up)
     }
@@ -262,8 +247,15 @@ mod tests {
             let trainer = Trainer::new(&scene, config.clone()).unwrap();
             let frame: &PosedView = &scene.train[1].view;
             let motion = MotionFrame::new(&body, &frame.posed);
-            let tracer = trainer.model().tracer(&trainer.buffers.surface, &trainer.model().extent, &motion);
-            let MotionField::Volume { weights, threshold } = tracer.motion else { panic!("a volume was asked for") };
+            let tracer = Tracer {
+                model: trainer.model(),
+                surface: &trainer.buffers.surface,
+                extent: &trainer.model().extent,
+                frame: &motion,
+            };
+            let MotionField::Volume { weights, threshold } = &tracer.model.motion else {
+                panic!("a volume was asked for")
+            };
             let (reach, k) = (config.motion.reach(), config.surface.k);
             let low = frame.posed.vertices.iter().copied().reduce(Vec3::min).unwrap() - 2.0 * reach;
             let size = frame.posed.vertices.iter().copied().reduce(Vec3::max).unwrap() + 2.0 * reach - low;

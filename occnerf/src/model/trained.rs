@@ -3,26 +3,26 @@
 use std::sync::Arc;
 
 use glam::Vec3;
-use smpl::{MotionField, MotionFrame, SurfaceMotion, WeightVolume, WeightVolumeConfig};
+use smpl::{MotionField, SurfaceMotion, WeightVolume, WeightVolumeConfig};
 use visibility::VisibilityCounts;
-use volrender::Occupancy;
+use volrender::{Occupancy, OccupancyConfig};
 
 use crate::Error;
 use crate::capture::Light;
 use crate::config::{Config, FALLOFF, MotionConfig, MotionKind};
-use crate::model::arena::Arena;
 use crate::model::body::Body;
 use crate::model::colors::PriorColors;
 use crate::model::encoder::Encoder;
 use crate::model::extent::Extent;
 use crate::model::field::{Field, Learnt, SampleBatch};
-use crate::model::parameters::{Lengths, PARTS, Parameters, Part};
-use crate::model::trace::{PosedSurface, Tracer, near_canonical};
+use crate::model::parameters::{PARTS, Parameters, Part};
 use crate::model::vertices::VertexCode;
 use crate::model::view::PosedView;
 
 /// Σ w below which the weight volume has no correspondence.
 const VOLUME_THRESHOLD: f32 = 1e-3;
+/// Side of a cell near the canonical prior, normalised metres.
+const NEAR_CELL: f32 = 0.01;
 
 /// The field of one person on its body, with the training frames' poses and cameras.
 #[derive(Clone)]
@@ -36,7 +36,7 @@ pub struct Model {
     pub(crate) counts: VisibilityCounts,
     pub(crate) motion: MotionField,
     /// Cells near the canonical prior; empty for the surface motion.
-    near_canonical: Occupancy,
+    pub(crate) near_canonical: Occupancy,
     /// Outer end of the field at its last measurement.
     pub(crate) extent: Extent,
     /// Initial colours; may be empty.
@@ -74,9 +74,8 @@ impl Model {
             MotionField::Volume { weights, .. } => (near_canonical(&body, &config), weights.delta.len()),
         };
         let vertices = body.canonical.vertices.len();
-        let lengths = Lengths { vertices, motion: log_weights };
         Ok(Self {
-            parameters: Parameters::new(&config, &field, lengths),
+            parameters: Parameters::new(&config, &field, vertices, log_weights),
             counts: VisibilityCounts::new(vertices),
             extent: Extent::whole(&body, &config),
             config,
@@ -131,10 +130,10 @@ impl Model {
     /// Resets to step 0, but for `steps_done`.
     pub(crate) fn forget(&mut self) {
         let motion = self.parameters.get(Part::Motion).len();
-        let lengths = Lengths { vertices: self.body.canonical.vertices.len(), motion };
-        self.parameters = Parameters::new(&self.config, &self.field, lengths);
+        let vertices = self.body.canonical.vertices.len();
+        self.parameters = Parameters::new(&self.config, &self.field, vertices, motion);
         self.extent = Extent::whole(&self.body, &self.config);
-        self.counts = VisibilityCounts::new(lengths.vertices);
+        self.counts = VisibilityCounts::new(vertices);
     }
 
     /// Encodes the vertices of the surface term, if there is one, with the current parameters.
@@ -161,26 +160,6 @@ impl Model {
         }
     }
 
-    /// A tracer of the body in the pose of `surface` and `frame`.
-    pub(crate) fn tracer<'b>(
-        &'b self,
-        surface: &'b PosedSurface,
-        extent: &'b Extent,
-        frame: &'b MotionFrame<'b>,
-    ) -> Tracer<'b> {
-        Tracer {
-            body: &self.body,
-            config: &self.config,
-            surface,
-            motion: &self.motion,
-            frame,
-            near_canonical: &self.near_canonical,
-            extent,
-            base: &self.base,
-            neighbours: self.config.needs_neighbours(),
-        }
-    }
-
     /// Parameters for the field, with the rows of [`Model::encode_vertices`].
     pub(crate) fn learnt<'b>(&'b self, code: &'b VertexCode) -> Learnt<'b> {
         Learnt {
@@ -192,8 +171,8 @@ impl Model {
     }
 
     /// Gives every sample of a batch its density and colour; see [`Field::forward`].
-    pub(crate) fn evaluate(&self, code: &VertexCode, batch: &mut SampleBatch, jacobians: Option<&mut Arena>) {
-        self.field.forward(&self.learnt(code), batch, jacobians);
+    pub(crate) fn evaluate(&self, code: &VertexCode, batch: &mut SampleBatch) {
+        self.field.forward(&self.learnt(code), batch);
     }
 
     /// Measures the outer end of the field; the whole margin where the motion is a volume.
@@ -201,7 +180,7 @@ impl Model {
         match self.motion {
             MotionField::Volume { .. } => Extent::whole(&self.body, &self.config),
             MotionField::Surface(_) => Extent::measure(&self.body, &self.config, |batch| {
-                self.evaluate(code, batch, None);
+                self.evaluate(code, batch);
             }),
         }
     }
@@ -211,6 +190,14 @@ impl Model {
     pub fn up(&self) -> Vec3 {
         upright(&self.body, self.frames.iter().map(Arc::as_ref))
     }
+}
+
+/// Cells near the canonical prior.
+fn near_canonical(body: &Body, config: &Config) -> Occupancy {
+    let (mut occupancy, whole) = (Occupancy::default(), Extent::whole(body, config));
+    let size = OccupancyConfig { margin: whole.farthest, depth: config.motion.depth, cell: NEAR_CELL };
+    occupancy.rebuild(&body.canonical.vertices, &body.model.faces, &whole.faces, size);
+    occupancy
 }
 
 /// The surface motion, whose likelihood falls to 0 beyond the margin.

@@ -6,7 +6,7 @@ use rayon::prelude::*;
 use crate::config::SurfaceConfig;
 use crate::model::body::Body;
 use crate::model::distance::{SurfacePoint, surface_point, surface_point_backward};
-use crate::model::encoder::{At, Coordinates, Encoder, Jacobian};
+use crate::model::encoder::{At, Coordinates, Encoder};
 
 const CHUNK: usize = 512;
 /// Farthest that a vertex's distance to its initial mesh is looked up; the encoding clamps earlier.
@@ -95,7 +95,7 @@ impl VertexCode {
             let n = d_offsets.len() / 3;
             let range = chunk * CHUNK..chunk * CHUNK + n;
             encoder.layout(n).from_rows(d_rows, width, 0..n, features);
-            encoder.encode_backward_points(Jacobian::OfTable(table), at.vertices(range.clone()), features, d_at);
+            encoder.encode_backward_points(table, at.vertices(range.clone()), features, d_at);
             for (v, (state, d_offset)) in state[range].iter().zip(d_offsets.chunks_exact_mut(3)).enumerate() {
                 let (d_v, d_d) = encoder.d_metres(d_at, v, &body.canonical_box);
                 let through_distance = if encoder.distance_is_inside(state.1) { d_d * state.2 } else { Vec3::ZERO };

@@ -6,7 +6,7 @@ use smpl::MotionFrame;
 use crate::Error;
 use crate::model::extent::Extent;
 use crate::model::march::{MarchOptions, Segment};
-use crate::model::trace::{FINE_CELL, March, PosedSurface};
+use crate::model::trace::{FINE_CELL, March, PosedSurface, Tracer};
 use crate::model::trained::Model;
 use crate::model::vertices::VertexCode;
 use crate::model::view::PosedView;
@@ -48,13 +48,13 @@ impl Renderer for FieldRenderer<'_> {
         let posed = &view.posed;
         surface.refit(&model.body, posed, extent, &model.config, model.base.light);
         let motion = MotionFrame::new(&model.body.model, posed);
-        let tracer = model.tracer(surface, extent, &motion);
+        let tracer = Tracer { model, surface, extent, frame: &motion };
         paint(view, background, Scratch::default, |scratch, row, columns| {
             let Scratch { segment, marches } = scratch;
             let ray = |column| view.pixel_ray(row * view.camera.width + column);
             marches.clear();
             marches.extend(columns.map(|column| March::new(ray(column), None)));
-            while segment.advance(&tracer, marches, MARCH, |batch| model.evaluate(code, batch, None)) {}
+            while segment.advance(&tracer, marches, MARCH, |batch| model.evaluate(code, batch)) {}
             let over = |m: &March| (m.color + m.transmittance * background, 1.0 - m.transmittance);
             marches.iter().map(over).collect()
         })
@@ -94,13 +94,13 @@ mod tests {
         for (extent, limit) in [(renderer.extent.clone(), MARCH.min_transmittance + 1e-5), whole] {
             renderer.surface.refit(&scene.body, posed, &extent, model.config(), model.base.light);
             let motion = MotionFrame::new(&body, posed);
-            let tracer = model.tracer(&renderer.surface, &extent, &motion);
+            let tracer = Tracer { model, surface: &renderer.surface, extent: &extent, frame: &motion };
             let mut all = SampleBatch::default();
             all.samples.clear();
             for pixel in 0..32 * 32 {
                 tracer.trace_all(&mut all.samples, &view.pixel_ray(pixel));
             }
-            model.evaluate(&renderer.code, &mut all, None);
+            model.evaluate(&renderer.code, &mut all);
             let (mut weights, mut composites) = (Vec::new(), Vec::new());
             composite_batch(&all, background, &mut weights, &mut composites);
             let (mut worst, mut solid) = (0.0f32, 0);

@@ -5,7 +5,6 @@ pub(crate) mod backward;
 pub(crate) mod batch;
 pub(crate) mod checkpoint;
 pub(crate) mod loss;
-pub(crate) mod optimiser;
 pub(crate) mod ordered;
 pub(crate) mod photometric;
 #[cfg(test)]

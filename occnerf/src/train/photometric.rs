@@ -2,12 +2,12 @@
 //! patches.
 
 use glam::Vec3;
+use lpips::Lpips;
 use rayon::prelude::*;
 
 use crate::Error;
 use crate::capture::PixelReader;
 use crate::config::LossConfig;
-use crate::lpips::Lpips;
 use crate::scene::labels::Labels;
 use crate::train::batch::{Batch, target};
 use crate::train::loss::Dissimilarity;

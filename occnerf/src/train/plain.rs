@@ -13,7 +13,7 @@ use visibility::VisibilityCounts;
 use crate::config::{Config, DistanceKind, Method, MotionKind, Preset};
 use crate::model::distance::surface_point;
 use crate::model::encoder::{Coordinates, Encoder};
-use crate::model::parameters::{Arrays, Part};
+use crate::model::parameters::{Parameters, Part};
 use crate::model::samples::Samples;
 use crate::model::trained::Model;
 use crate::scene::prepared::Scene;
@@ -88,7 +88,7 @@ impl Plain<'_, '_> {
     }
 
     /// The loss and the colours of the rays, in the order of the batch.
-    fn step(&self, values: &Arrays) -> (f64, Vec<DVec3>) {
+    fn step(&self, values: &Parameters) -> (f64, Vec<DVec3>) {
         let trainer = self.trainer;
         let (config, batch) = (&trainer.model.config, &trainer.buffers.batch);
         let frame = &trainer.scene.train[batch.frame];
@@ -224,7 +224,7 @@ fn a_step_agrees_with_one_written_straight_from_the_definitions() {
         for (part, size) in [(Part::Table, 0.3), (Part::Vertices, 2e-3)] {
             trainer.model.parameters.get_mut(part).iter_mut().for_each(|x| *x += size * random.normal());
         }
-        let previous = trainer.model.parameters.values.clone();
+        let previous = trainer.model.parameters.clone();
         let counts = trainer.model.counts.clone();
         let report = trainer.step().unwrap();
         let gradients = trainer.optimiser.gradients.clone();

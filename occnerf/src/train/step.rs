@@ -4,10 +4,9 @@ use glam::Vec3;
 use smpl::MotionFrame;
 use volrender::Composite;
 
-use crate::model::arena::Arena;
 use crate::model::march::{MarchOptions, Segment, Segments};
 use crate::model::times::{StepTimes, Stopwatch};
-use crate::model::trace::{March, PosedSurface};
+use crate::model::trace::{March, PosedSurface, Tracer};
 use crate::model::trained::Model;
 use crate::model::vertices::VertexCode;
 use crate::scene::labels::Label;
@@ -30,8 +29,6 @@ pub(crate) struct RayGroup {
     /// The samples of all segments, ray by ray.
     pub ordered: OrderedSamples,
     pub composites: Vec<Composite>,
-    /// Derivatives of the encoding of all segments.
-    pub jacobians: Arena,
     pub times: StepTimes,
     pub d_mlp: Vec<f32>,
     pub d_vertices: Vec<f32>,
@@ -67,20 +64,16 @@ impl Step<'_> {
     pub fn forward(&self, group: &mut RayGroup) {
         let Self { model, frame, batch, .. } = *self;
         let config = &model.config;
-        let tracer = model.tracer(self.surface, &model.extent, self.motion);
-        let RayGroup { rays, segments, ordered, composites, terminations, times, jacobians, .. } = group;
+        let tracer = Tracer { model, surface: self.surface, extent: &model.extent, frame: self.motion };
+        let RayGroup { rays, segments, ordered, composites, terminations, times, .. } = group;
         let label = |ray: usize| frame.labels.at(batch.pixels[ray]);
         let marches = rays.iter().map(|&ray| {
             let jitter = RandomStream::new(&[config.seed, JITTER, model.steps_done, ray as u64]);
             let hidden = label(ray) == Label::Unknown && self.options.skips_unknown;
             March::new(frame.view.pixel_ray(batch.pixels[ray]), Some(jitter)).only_inside(hidden)
         });
-        let mut jacobians = model.volume().is_some().then_some(jacobians);
-        if let Some(arena) = &mut jacobians {
-            arena.clear(rays.len() * config.samples * model.field.encoder.jacobian_width());
-        }
         segments.march(&tracer, marches, self.options.march, |samples| {
-            model.evaluate(self.vertex_code, samples, jacobians.as_deref_mut());
+            model.evaluate(self.vertex_code, samples);
         });
         *times = StepTimes::default();
         for Segment { batch, .. } in segments.all_mut() {
@@ -106,7 +99,7 @@ impl Step<'_> {
     pub fn backward(&self, group: &mut RayGroup, transposed: &[f32], d_colors: &[Vec3]) {
         let mut watch = Stopwatch::start();
         let Self { model, batch, .. } = *self;
-        let RayGroup { rays, segments, ordered, times, jacobians, .. } = group;
+        let RayGroup { rays, segments, ordered, times, .. } = group;
         ordered.composite_backward(batch.background, rays.iter().map(|&ray| d_colors[ray]), segments);
         let learnt = model.learnt(self.vertex_code);
         zero(&mut group.d_mlp, learnt.perceptron.len());
@@ -129,7 +122,7 @@ impl Step<'_> {
             model.field.backward(&learnt, transposed, batch, &mut group.d_mlp, &mut group.d_vertices);
             watch.lap(&mut times.perceptron_backward);
             if let Some(volume) = model.volume() {
-                volume_backward(model, volume, self.motion, batch, jacobians, &mut group.d_volume);
+                volume_backward(model, volume, self.motion, batch, &mut group.d_volume);
             }
             watch.lap(&mut times.motion_backward);
         }

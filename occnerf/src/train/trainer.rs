@@ -3,12 +3,12 @@
 
 use std::sync::Arc;
 
+use lpips::Lpips;
 use rayon::prelude::*;
 use smpl::MotionFrame;
 
 use crate::Error;
 use crate::config::Config;
-use crate::lpips::Lpips;
 use crate::model::colors::PriorColors;
 use crate::model::encoder::{Encoder, PointEncoder};
 use crate::model::field::Field;
@@ -20,8 +20,8 @@ use crate::model::trained::Model;
 use crate::model::vertices::VertexCode;
 use crate::scene::labels::Label;
 use crate::scene::prepared::{PreparedFrame, Scene};
+use crate::train::adam::Optimiser;
 use crate::train::batch::Batch;
-use crate::train::optimiser::Optimiser;
 use crate::train::photometric::Photometric;
 use crate::train::report::StepReport;
 use crate::train::step::{RayGroup, Step, StepOptions, zero};
@@ -136,7 +136,6 @@ impl<'a> Trainer<'a> {
         self.model.config.steps = steps;
     }
 
-    /// Resets the parameters.
     /// Takes one optimisation step.
     ///
     /// # Errors

@@ -8,7 +8,6 @@ mod common;
 mod config;
 mod evaluation;
 mod export;
-#[cfg(feature = "lpips")]
 #[path = "../../lpips/tests/lpips/formula.rs"]
 #[allow(dead_code, reason = "the crate lpips uses all of it")]
 mod formula;
@@ -17,7 +16,6 @@ mod import;
 mod labels;
 mod odd_frames;
 mod on_demand;
-#[cfg(feature = "lpips")]
 mod perceptual;
 mod person;
 mod readme;

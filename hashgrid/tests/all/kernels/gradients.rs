@@ -85,29 +85,6 @@ proptest! {
     }
 
     #[test]
-    fn jacobian_backward_equals_encode_backward_points(
-        points in points::<4>(0..300), features in 1usize..12, log2 in 0u32..12, seed: u64,
-    ) {
-        let grid = HashGrid::<4>::with_resolutions(&[1, 4, 9, 700], features, log2).unwrap();
-        let table = table(&grid, seed);
-        let d_features = noise(points.len() * grid.num_features(), seed ^ 1);
-        let mut expected = vec![[1.0; 4]; points.len()];
-        let mut found = expected.clone();
-        grid.encode_backward_points(&table, &points, &d_features, &mut expected);
-        let mut encoded = vec![0.0; d_features.len()];
-        let mut jacobian = vec![f32::NAN; grid.jacobian_len(points.len())];
-        grid.encode_jacobian(&table, &points, &mut encoded, &mut jacobian);
-        grid.jacobian_backward(&jacobian, &d_features, &mut found);
-        for (found, expected) in encoded.iter().zip(encode(&grid, &table, &points)) {
-            prop_assert!(abs_diff_eq!(found, &expected, epsilon = 2e-6), "{found} {expected}");
-        }
-        for (found, expected) in found.as_flattened().iter().zip(expected.as_flattened()) {
-            // Slopes are up to twice the finest resolution times the features of a level.
-            prop_assert!(abs_diff_eq!(found, expected, epsilon = 1e-6 * 1400.0 * features as f32), "{found} {expected}");
-        }
-    }
-
-    #[test]
     fn backward_passes_add_to_their_outputs(points in points::<3>(1..30), seed: u64) {
         let grid = HashGrid::<3>::with_resolutions(&[4, 40], 2, 8).unwrap();
         let values = table(&grid, seed);
@@ -151,13 +128,10 @@ fn splitting_the_points_into_parts_changes_no_bit() {
     let points: Vec<[f32; 4]> = noise(4 * 40_000, 5).as_chunks::<4>().0.iter().map(|p| p.map(f32::abs)).collect();
     let d_features = noise(points.len() * grid.num_features(), 6);
     let run = |points: &[[f32; 4]], d_features: &[f32]| {
-        let (mut by_table, mut by_jacobian) = (vec![[0.0; 4]; points.len()], vec![[0.0; 4]; points.len()]);
-        grid.encode_backward_points(&table, points, d_features, &mut by_table);
-        let mut features = vec![0.0; d_features.len()];
-        let mut jacobian = vec![0.0; grid.jacobian_len(points.len())];
-        grid.encode_jacobian(&table, points, &mut features, &mut jacobian);
-        grid.jacobian_backward(&jacobian, d_features, &mut by_jacobian);
-        (by_table, by_jacobian, features)
+        let (mut d_points, mut features) = (vec![[0.0; 4]; points.len()], vec![0.0; d_features.len()]);
+        grid.encode_backward_points(&table, points, d_features, &mut d_points);
+        grid.encode(&table, points, &mut features);
+        (d_points, features)
     };
     let whole = run(&points, &d_features);
     let mut d_whole = vec![0.0; table.len()];
@@ -175,9 +149,8 @@ fn splitting_the_points_into_parts_changes_no_bit() {
             (0..points.len()).step_by(size).map(|i| cut(&d_features, i, size.min(points.len() - i))).collect();
         for (part, (points, d_features)) in points.chunks(size).zip(&parts).enumerate() {
             let (first, count) = (part * size, points.len());
-            let (by_table, by_jacobian, features) = run(points, d_features);
-            assert!(by_table == whole.0[first..][..count] && by_jacobian == whole.1[first..][..count], "{size}");
-            assert!(features == cut(&whole.2, first, count), "{size}");
+            let (d_points, features) = run(points, d_features);
+            assert!(d_points == whole.0[first..][..count] && features == cut(&whole.1, first, count), "{size}");
         }
         let mut d_table = vec![0.0; table.len()];
         grid.encode_backward_parts(points.chunks(size).zip(parts.iter().map(Vec::as_slice)), &mut d_table);

@@ -126,7 +126,7 @@ mod tests {
             let mut group = group(n, vertices, 20, &mut RandomStream::new(&[5]));
             let counts = VisibilityCounts::new(vertices);
             let learnt = Learnt { perceptron: &mlp, table: &table, vertices: &features, counts: &counts };
-            field.forward(&learnt, &mut group, None);
+            field.forward(&learnt, &mut group);
             group.d_sigma.clone_from(&d_sigma);
             group.d_rgb = d_rgb.chunks(3).map(Vec3::from_slice).collect();
             let (mut d_mlp, mut d_features) = (vec![0.0; mlp.len()], vec![0.0; features.len()]);
@@ -160,7 +160,7 @@ mod tests {
             let (c_sigma, c_rgb) = (normal(n, &mut random), normal(3 * n, &mut random));
             let value = |group: &mut SampleBatch, mlp: &[f32], table: &[f32], features: &[f32]| -> f64 {
                 let learnt = Learnt { perceptron: mlp, table, vertices: features, counts: &counts };
-                field.forward(&learnt, group, None);
+                field.forward(&learnt, group);
                 let sigma = group.sigma.iter().zip(&c_sigma).map(|(s, c)| f64::from(s * c) * 0.04);
                 let rgb = group.rgb.iter().zip(c_rgb.chunks(3)).map(|(s, c)| f64::from(s.dot(Vec3::from_slice(c))));
                 sigma.chain(rgb).sum()

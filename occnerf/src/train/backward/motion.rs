@@ -3,10 +3,9 @@
 use glam::Vec3;
 use smpl::{MotionFrame, WeightVolume};
 
-use crate::model::arena::Arena;
 use crate::model::distance::{SurfacePoint, surface_point_backward};
-use crate::model::encoder::Jacobian;
 use crate::model::field::SampleBatch;
+use crate::model::parameters::Part;
 use crate::model::trained::Model;
 
 /// Carries the gradients of the encoding's coordinates and of f into the weight volume.
@@ -15,12 +14,11 @@ pub(crate) fn volume_backward(
     volume: &WeightVolume,
     frame: &MotionFrame<'_>,
     batch: &mut SampleBatch,
-    jacobians: &Arena,
     d_volume: &mut [f32],
 ) {
     let encoder = &model.field.encoder;
-    let jacobian = Jacobian::Stored(jacobians.piece(&batch.jacobian));
-    encoder.encode_backward_points(jacobian, batch.at.all(), &batch.features, &mut batch.d_at);
+    let table = model.parameters.get(Part::Table);
+    encoder.encode_backward_points(table, batch.at.all(), &batch.features, &mut batch.d_at);
     let samples = &batch.samples;
     let per_sample = samples.neighbours.len().checked_div(samples.len()).unwrap_or(0);
     let on_surface = !batch.at.surface.is_empty();

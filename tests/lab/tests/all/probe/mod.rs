@@ -342,7 +342,7 @@ fn metrics_are_those_of_the_whole_and_of_the_mask() {
 
 #[test]
 fn metrics_with_weights_give_the_golden_lpips() {
-    let Some(shared) = testkit::files::shared("lpips").filter(|_| cfg!(feature = "lpips")) else { return };
+    let Some(shared) = testkit::files::shared("lpips") else { return };
     let folder = folder("lpips");
     let mut golden = Npz::open(&shared.join("golden.npz")).unwrap();
     let mut picture = |key: &str| {
