@@ -4,10 +4,11 @@ use crate::stand_in;
 
 use std::path::PathBuf;
 
+use crate::skinned;
 use glam::{Vec2, Vec3};
 use occnerf::bake::{Avatar, Clip, turn_upright};
 use occnerf::{Config, Method, Preset, PriorColors, Scene};
-use stand_in::{skinned, stand_in};
+use stand_in::stand_in;
 use synth::{DemoConfig, demo};
 
 fn scene() -> Scene {

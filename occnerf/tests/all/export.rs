@@ -6,13 +6,13 @@ use crate::stand_in;
 use std::path::PathBuf;
 use std::sync::OnceLock;
 
+use crate::skinned;
 use glam::{Mat3, Quat, Vec2, Vec3};
 use occnerf::bake::Avatar;
 use occnerf::bake::export::{Splats, fit_motion, splats, write_amass, write_obj};
 use occnerf::{Config, Method, Preset, PriorColors, Scene};
 use rigged::Character;
 use smpl::{MotionClip, SparseRows};
-use stand_in::skinned;
 use synth::{DemoConfig, demo};
 
 fn avatar() -> &'static Avatar {
