@@ -46,9 +46,6 @@ type Shown = (ColorObservation, Vec3);
 
 /// Heights of the vertices of `mesh` over their `feet` (V) that explain the frames under `light`,
 /// starting from those of `prior` (V).
-///
-/// # Errors
-/// Pictures that cannot be read.
 pub(super) fn displacements(
     scene: &Scene,
     light: Light,

@@ -26,21 +26,15 @@ impl Config {
 /// 2⁻²⁵, half the spacing of f32 below 1: a smaller contribution is lost in rounding.
 const NEGLIGIBLE: f32 = 1.0 / (1 << 25) as f32;
 
-/// The paper's method: the point term and the attended surface term on the blend of vertices, the
-/// completeness term, its sampler and sizes. It leaves the size of F open. Where it departs from the
-/// paper's text, which `reproduce --story` takes back one by one, but for the steps:
+/// The paper's method; it leaves the size of F open. Where it departs from the paper's text, which
+/// `reproduce --story` takes back one by one, but for the steps:
 ///
 /// - `registration`: the prior is corrected first, as it is for every baseline.
-/// - `motion.kind`: weights of the nearest surface point in place of a learnable weight volume of
-///   32³. Where an arm hangs beside a hip, both claim the same points of the volume, and x̂ lies
-///   between: on recorded walking a tenth of the vertices are taken more than 28 cm from where they
-///   rest, with 64³ more than 14 cm.
-/// - `field.prior_colors`, `field.prior_light`: colours start from the corrected prior's in place of
-///   grey. What no frame shows stays as it starts.
-/// - `rates`: 12 to 600 times the paper's, but for the vertices', falling to a tenth. At the 5e-5 of
-///   "the rest" an entry of the table that a tenth of the steps touch has moved by 0.05 at most after
-///   10 000 steps; the code published with the paper trains the encoder at 5e-4.
-/// - `steps`: a tenth of the paper's, which these rates make enough.
+/// - `motion.kind`: weights of the nearest surface point in place of a weight volume of 32³, in which
+///   an arm beside a hip claims the same points: on recorded walking a tenth of the vertices are taken
+///   more than 28 cm from where they rest.
+/// - `field.prior_colors`, `field.prior_light`: colours start from the corrected prior's, not grey.
+/// - `rates`: 12 to 600 times the paper's, but for the vertices', falling to a tenth; `steps`: a tenth.
 fn paper() -> Config {
     Config {
         preset: Preset::Paper,
@@ -94,7 +88,6 @@ fn balanced() -> Config {
         steps: 800,
         patches: 3,
         min_transmittance: 0.05,
-        field: FieldConfig { width: 64, depth: 2, ..paper().field },
         encoding: EncodingConfig {
             levels: 10,
             features: 2,

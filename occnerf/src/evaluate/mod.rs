@@ -212,14 +212,7 @@ pub fn nearest_vertices(scene: &Scene, frame: &PreparedFrame, mask: &[f32]) -> R
         let hit = mesh.first_hit(ray.origin, ray.direction)?;
         let corners = scene.body.model.faces[hit.face as usize];
         let [a, b, c] = hit.barycentric;
-        let corner = if a >= b && a >= c {
-            0
-        } else if b >= c {
-            1
-        } else {
-            2
-        };
-        Some(corners[corner])
+        Some(corners[if a >= b && a >= c { 0 } else { 1 + usize::from(b < c) }])
     };
     Ok((0..width * frame.view.camera.height as usize).into_par_iter().map(nearest).collect())
 }

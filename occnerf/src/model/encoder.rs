@@ -55,15 +55,6 @@ impl Encoder {
         })
     }
 
-    #[cfg(test)]
-    pub fn num_parameters(&self) -> usize {
-        match self {
-            Self::Point(grid) => grid.num_parameters(),
-            Self::Surface(grid, _) => grid.num_parameters(),
-            Self::Custom(encoder) => encoder.initial(0).len(),
-        }
-    }
-
     pub fn num_features(&self) -> usize {
         match self {
             Self::Point(grid) => grid.num_features(),

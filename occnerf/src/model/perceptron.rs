@@ -165,24 +165,6 @@ impl Mlp {
         }
     }
 
-    /// The outputs for one input, in f64 and term by term.
-    #[cfg(test)]
-    pub fn plain(&self, parameters: &[f32], input: &[f64]) -> Vec<f64> {
-        let mut x = input.to_vec();
-        for layer in 0..self.num_layers() {
-            let (weights, biases) = self.layer(parameters, layer);
-            let output = |o: usize| {
-                let products =
-                    x.iter().enumerate().map(|(i, x)| x * f64::from(weights[i * self.widths[layer + 1] + o]));
-                f64::from(biases[o]) + products.sum::<f64>()
-            };
-            let last = layer + 1 == self.num_layers();
-            let outputs = (0..self.true_widths[layer + 1]).map(output);
-            x = outputs.map(|y| if last { y } else { y.max(0.0) }).collect();
-        }
-        x
-    }
-
     fn layer<'a>(&self, parameters: &'a [f32], layer: usize) -> (&'a [f32], &'a [f32]) {
         parameters[self.offsets[layer]..self.offsets[layer + 1]].split_at(self.widths[layer] * self.widths[layer + 1])
     }
@@ -252,6 +234,25 @@ mod tests {
                 (0..inputs * samples).map(|i| d_input[(i / inputs) * mlp.input_width() + i % inputs]).collect();
             let tolerance = Tolerance { abs: 0.02, rel: 0.03 };
             assert_gradient("d_input", &input, &analytic, 2e-4, tolerance, |x| value(&parameters, x));
+        }
+    }
+
+    impl Mlp {
+        /// The outputs for one input, in f64 and term by term.
+        pub fn plain(&self, parameters: &[f32], input: &[f64]) -> Vec<f64> {
+            let mut x = input.to_vec();
+            for layer in 0..self.num_layers() {
+                let (weights, biases) = self.layer(parameters, layer);
+                let output = |o: usize| {
+                    let products =
+                        x.iter().enumerate().map(|(i, x)| x * f64::from(weights[i * self.widths[layer + 1] + o]));
+                    f64::from(biases[o]) + products.sum::<f64>()
+                };
+                let last = layer + 1 == self.num_layers();
+                let outputs = (0..self.true_widths[layer + 1]).map(output);
+                x = outputs.map(|y| if last { y } else { y.max(0.0) }).collect();
+            }
+            x
         }
     }
 }

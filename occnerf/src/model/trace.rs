@@ -207,22 +207,6 @@ impl Tracer<'_> {
         }
         (true, looked_up)
     }
-
-    /// Appends all live samples of a ray, in the middle of their bins.
-    #[cfg(test)]
-    pub fn trace_all(&self, samples: &mut Samples, ray: &Ray) {
-        self.trace(samples, usize::MAX, &mut March::new(*ray, None));
-    }
-
-    /// Appends one point of space, if it lives.
-    #[cfg(test)]
-    pub fn push_point(&self, samples: &mut Samples, point: Vec3) -> bool {
-        let live = self.push(samples, point, None, false).0;
-        if live {
-            samples.world.push(point);
-        }
-        live
-    }
 }
 
 #[cfg(test)]
@@ -233,6 +217,15 @@ mod tests {
     use crate::scene::prepared::Scene;
     use crate::train::trainer::Trainer;
     use synth::{DemoConfig, demo};
+
+    /// Appends one point of space, if it lives.
+    fn push_point(tracer: &Tracer<'_>, samples: &mut Samples, point: Vec3) -> bool {
+        let live = tracer.push(samples, point, None, false).0;
+        if live {
+            samples.world.push(point);
+        }
+        live
+    }
 
     #[test]
     fn with_a_volume_a_sample_lives_where_the_canonical_prior_is_near() {
@@ -264,7 +257,7 @@ mod tests {
             for _ in 0..20_000 {
                 let point = low + size * Vec3::new(random.uniform(), random.uniform(), random.uniform());
                 let Some(mapped) = weights.map(&motion.to_canonical, point, *threshold) else {
-                    assert!(!tracer.push_point(&mut samples, point));
+                    assert!(!push_point(&tracer, &mut samples, point));
                     continue;
                 };
                 let exact = scene.body.surface.closest(mapped.canonical).signed_distance;
@@ -273,7 +266,7 @@ mod tests {
                 let blended = scene.body.query.blend(mapped.canonical, &neighbours[..k]).signed_distance;
                 let used = if distance == DistanceKind::Exact { exact } else { blended };
                 let within = |d: f32| d <= reach && d >= -config.motion.depth;
-                let live = tracer.push_point(&mut samples, point);
+                let live = push_point(&tracer, &mut samples, point);
                 // A little beyond the margin, as far as a cell or the corner of a box, either is
                 // right; nobody is as deep as `depth`.
                 if within(exact) {

@@ -98,7 +98,7 @@ mod tests {
             let mut all = SampleBatch::default();
             all.samples.clear();
             for pixel in 0..32 * 32 {
-                tracer.trace_all(&mut all.samples, &view.pixel_ray(pixel));
+                tracer.trace(&mut all.samples, usize::MAX, &mut March::new(view.pixel_ray(pixel), None));
             }
             model.evaluate(&renderer.code, &mut all);
             let (mut weights, mut composites) = (Vec::new(), Vec::new());

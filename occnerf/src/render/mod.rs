@@ -2,4 +2,3 @@
 
 pub(crate) mod field;
 pub(crate) mod picture;
-pub(crate) mod prior;

@@ -13,7 +13,7 @@ pub enum Label {
     Unknown,
 }
 
-/// The labels of a frame's pixels, 3 bits each.
+/// The labels of a frame's pixels, 2 bits each.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Labels {
     words: Vec<Word>,
@@ -25,22 +25,17 @@ pub struct Labels {
 struct Word {
     subject: u64,
     unknown: u64,
-    /// Subject pixels of all previous words.
-    previous: u32,
 }
 
 impl Labels {
     /// Packs the labels of pixels in row-major order.
     #[must_use]
     pub fn new(labels: &[Label]) -> Self {
-        let mut subject = 0;
         let word = |labels: &[Label]| {
             let bits = |wanted: Label| {
                 labels.iter().enumerate().fold(0, |bits, (i, label)| bits | u64::from(*label == wanted) << i)
             };
-            let word = Word { subject: bits(Label::Subject), unknown: bits(Label::Unknown), previous: subject };
-            subject += word.subject.count_ones();
-            word
+            Word { subject: bits(Label::Subject), unknown: bits(Label::Unknown) }
         };
         Self { words: labels.chunks(64).map(word).collect(), len: labels.len() }
     }
@@ -80,7 +75,7 @@ impl Labels {
     /// Number of subject pixels.
     #[must_use]
     pub fn num_subject(&self) -> usize {
-        self.words.last().map_or(0, |word| word.previous + word.subject.count_ones()) as usize
+        self.words.iter().map(|word| word.subject.count_ones() as usize).sum()
     }
 
     /// The `n`-th subject pixel in order.
@@ -89,15 +84,17 @@ impl Labels {
     /// From [`Labels::num_subject`] on.
     #[must_use]
     pub fn subject(&self, n: usize) -> u32 {
-        assert!(n < self.num_subject(), "subject pixel {n} of {}", self.num_subject());
-        let after = self.words.partition_point(|word| word.previous as usize <= n);
-        let word = self.words[after - 1];
-        let mut bits = word.subject;
-        for _ in word.previous as usize..n {
-            // Clears the lowest set bit.
-            bits &= bits - 1;
+        let mut left = n;
+        for (at, word) in (0..).zip(&self.words) {
+            let (mut bits, count) = (word.subject, word.subject.count_ones() as usize);
+            if left < count {
+                // Clears the lowest set bits.
+                (0..left).for_each(|_| bits &= bits - 1);
+                return 64 * at + bits.trailing_zeros();
+            }
+            left -= count;
         }
-        (after - 1) as u32 * 64 + bits.trailing_zeros()
+        panic!("subject pixel {n} of {}", self.num_subject());
     }
 }
 

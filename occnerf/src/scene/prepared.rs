@@ -12,8 +12,7 @@ use crate::config::Config;
 use crate::model::body::{Body, PosedFrame};
 use crate::model::colors::PriorColors;
 use crate::model::subdivide::Anchor;
-use crate::model::view::PosedView;
-use crate::model::view::pinhole;
+use crate::model::view::{PosedView, pinhole};
 use crate::scene::labels::{Label, Labels, dilate, label_pixels};
 use crate::scene::light::{ColorObservation, measure_light};
 use crate::scene::masks::mend_masks;
@@ -190,7 +189,7 @@ impl Scene {
         }
         let learnt = &self.learnt;
         for (_, frame) in self.train.iter_mut().enumerate().filter(|(i, _)| learnt.binary_search(i).is_err()) {
-            let unknown = Labels::new(&vec![Label::Unknown; frame.labels.iter().count()]);
+            let unknown = Labels::new(&vec![Label::Unknown; frame.labels.len()]);
             let labels = std::mem::replace(&mut frame.labels, unknown);
             self.eval.push(PreparedFrame {
                 name: frame.name.clone(),

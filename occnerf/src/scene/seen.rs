@@ -9,8 +9,7 @@ use visibility::RayMesh;
 use crate::Error;
 use crate::capture::{Light, Pixels};
 use crate::model::subdivide::Anchor;
-use crate::model::view::PosedView;
-use crate::model::view::pinhole;
+use crate::model::view::{PosedView, pinhole};
 use crate::scene::labels::squared_distance;
 use crate::scene::light::{ColorObservation, albedo};
 

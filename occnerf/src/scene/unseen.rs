@@ -8,6 +8,7 @@ use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 
 use crate::model::body::Body;
+use crate::model::subdivide::neighbours;
 
 /// Candidate anisotropies: length of a metre around the bone relative to one along it.
 const AROUND: [f32; 3] = [1.0, 0.1, 10.0];
@@ -82,14 +83,7 @@ impl Guesses<'_> {
 /// Connected components of the vertices that are not `seen` (V); components of fewer than [`FEW`]
 /// vertices are merged.
 fn regions(body: &Body, seen: &[bool]) -> Vec<Vec<usize>> {
-    let mut next = vec![Vec::new(); seen.len()];
-    for corners in &body.model.faces {
-        let [a, b, c] = corners.map(|v| v as usize);
-        for (from, to) in [(a, b), (b, c), (c, a)] {
-            next[from].push(to);
-            next[to].push(from);
-        }
-    }
+    let next = neighbours(seen.len(), &body.model.faces);
     let mut reached = seen.to_vec();
     let (mut pieces, mut small) = (Vec::new(), Vec::new());
     for first in 0..seen.len() {
@@ -97,7 +91,7 @@ fn regions(body: &Body, seen: &[bool]) -> Vec<Vec<usize>> {
         let mut open = if std::mem::replace(&mut reached[first], true) { Vec::new() } else { vec![first] };
         while let Some(v) = open.pop() {
             piece.push(v);
-            open.extend(next[v].iter().filter(|&&to| !std::mem::replace(&mut reached[to], true)));
+            open.extend(next[v].iter().map(|&n| n as usize).filter(|&to| !std::mem::replace(&mut reached[to], true)));
         }
         if piece.len() < FEW { small.extend(piece) } else { pieces.push(piece) }
     }

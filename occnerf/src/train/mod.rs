@@ -9,6 +9,5 @@ pub(crate) mod ordered;
 pub(crate) mod photometric;
 #[cfg(test)]
 mod plain;
-pub(crate) mod report;
 pub(crate) mod step;
 pub(crate) mod trainer;

@@ -11,8 +11,7 @@ use crate::config::LossConfig;
 use crate::scene::labels::Labels;
 use crate::train::batch::{Batch, target};
 use crate::train::loss::Dissimilarity;
-use crate::train::report::StepReport;
-use crate::train::step::RayGroup;
+use crate::train::step::{RayGroup, StepReport};
 
 /// Buffers of the losses, kept from step to step; an entry a ray of the batch.
 #[derive(Default)]

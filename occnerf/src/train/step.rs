@@ -11,13 +11,38 @@ use crate::model::trained::Model;
 use crate::model::vertices::VertexCode;
 use crate::scene::labels::Label;
 use crate::scene::prepared::PreparedFrame;
-use crate::train::backward::motion::volume_backward;
+use crate::train::backward::volume_backward;
 use crate::train::batch::Batch;
 use crate::train::loss::completeness;
 use crate::train::ordered::OrderedSamples;
 use volrender::RandomStream;
 
 const JITTER: u64 = 0x4A49_5454;
+
+/// Losses, counts and times of a training step.
+#[derive(Clone, Copy, Debug, Default, serde::Serialize)]
+pub struct StepReport {
+    /// Number of the step, from 1.
+    pub step: u64,
+    /// Weighted sum of the losses.
+    pub loss: f64,
+    /// Mean squared error over known pixels.
+    pub mse: f64,
+    /// Perceptual term.
+    pub perceptual: f64,
+    /// Completeness term.
+    pub completeness: f64,
+    /// PSNR over the known pixels of the step, decibels.
+    pub psnr: f64,
+    /// Live samples that were evaluated.
+    pub live_samples: usize,
+    /// Rays traced.
+    pub rays: usize,
+    /// Gradients that were not finite and were left out.
+    pub bad_gradients: usize,
+    /// Time of each stage.
+    pub times: StepTimes,
+}
 
 /// Rays that one thread takes through a step, with gradient buffers of their own.
 #[derive(Default)]
@@ -137,11 +162,11 @@ pub(crate) fn zero(buffer: &mut Vec<f32>, len: usize) {
 
 #[cfg(test)]
 mod tests {
+    use super::StepReport;
     use crate::config::{Config, Method, MotionKind, Preset};
     use crate::model::march::MarchOptions;
     use crate::model::parameters::Part;
     use crate::scene::prepared::Scene;
-    use crate::train::report::StepReport;
     use crate::train::step::StepOptions;
     use crate::train::trainer::Trainer;
     use synth::{DemoConfig, demo};

@@ -23,8 +23,7 @@ use crate::scene::prepared::{PreparedFrame, Scene};
 use crate::train::adam::Optimiser;
 use crate::train::batch::Batch;
 use crate::train::photometric::Photometric;
-use crate::train::report::StepReport;
-use crate::train::step::{RayGroup, Step, StepOptions, zero};
+use crate::train::step::{RayGroup, Step, StepOptions, StepReport, zero};
 
 /// Rays are dealt row by row to this many groups, each with its own gradient buffers, summed in
 /// order: the result does not depend on who computes a group. Eight keep two to eight threads busy.

@@ -1,10 +1,13 @@
-//! Backward of the field over a batch of samples.
+//! Backward passes of the field and of the weight volume over a batch of samples.
 
 use glam::Vec3;
+use smpl::{MotionFrame, WeightVolume};
 
-use crate::model::field::{Field, Learnt, SampleBatch, sigmoid};
+use crate::model::distance::{SurfacePoint, surface_point_backward};
+use crate::model::field::{Field, Learnt, Mix, SampleBatch, sigmoid};
 use crate::model::gemm::LANES;
-use crate::model::surface_term::Mix;
+use crate::model::parameters::Part;
+use crate::model::trained::Model;
 
 impl Field {
     /// Backward of [`Field::forward`], with the same parameters, from `d_sigma` and `d_rgb`:
@@ -82,6 +85,40 @@ impl pulp::WithSimd for Scatter<'_> {
     }
 }
 
+/// Carries the gradients of the encoding's coordinates and of f into the weight volume.
+pub(crate) fn volume_backward(
+    model: &Model,
+    volume: &WeightVolume,
+    frame: &MotionFrame<'_>,
+    batch: &mut SampleBatch,
+    d_volume: &mut [f32],
+) {
+    let encoder = &model.field.encoder;
+    let table = model.parameters.get(Part::Table);
+    encoder.encode_backward_points(table, batch.at.all(), &batch.features, &mut batch.d_at);
+    let samples = &batch.samples;
+    let per_sample = samples.neighbours.len().checked_div(samples.len()).unwrap_or(0);
+    let on_surface = !batch.at.surface.is_empty();
+    for s in 0..samples.len() {
+        let (d_point, d_coordinate) = encoder.d_metres(&batch.d_at, s, &model.body.canonical_box);
+        let d_likelihood = batch.d_likelihood[s];
+        if d_point == Vec3::ZERO && [d_coordinate, batch.d_distance[s], d_likelihood] == [0.0; 3] {
+            continue;
+        }
+        let at = SurfacePoint { closest: samples.closest[s], distance: samples.distance[s] };
+        let inside = encoder.distance_is_inside(at.distance);
+        let d_at = SurfacePoint {
+            closest: if on_surface { d_point } else { Vec3::ZERO },
+            distance: batch.d_distance[s] + if inside { d_coordinate } else { 0.0 },
+        };
+        let (x, neighbours) = (samples.canonical[s], &samples.neighbours[s * per_sample..]);
+        let config = &model.config.surface;
+        let through_surface = surface_point_backward(&model.body, config, (x, neighbours), at, d_at, Vec3::ZERO);
+        let d_canonical = through_surface + if on_surface { Vec3::ZERO } else { d_point };
+        volume.map_backward(&frame.to_canonical, samples.world[s], d_canonical, d_likelihood, d_volume);
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use glam::Vec4;
@@ -116,7 +153,7 @@ mod tests {
         let (n, vertices) = (3 * crate::model::field::BLOCK - 100, 12);
         let mut random = RandomStream::new(&[4]);
         let mut normal = |n: usize| (0..n).map(|_| random.normal()).collect::<Vec<f32>>();
-        let (mlp, table) = (field.mlp.initial(1), normal(field.encoder.num_parameters()));
+        let (mlp, table) = (field.mlp.initial(1), normal(field.encoder.initial_table(1).len()));
         let features = normal(vertices * field.encoder.num_features());
         let (d_sigma, d_rgb) = (normal(n), normal(3 * n));
         let mut transposed = Vec::new();
@@ -155,7 +192,7 @@ mod tests {
             let width = field.encoder.num_features();
             let mlp = field.mlp.initial(1);
             let normal = |n: usize, random: &mut RandomStream| (0..n).map(|_| random.normal()).collect::<Vec<f32>>();
-            let table: Vec<f32> = normal(field.encoder.num_parameters(), &mut random);
+            let table: Vec<f32> = normal(field.encoder.initial_table(1).len(), &mut random);
             let features = normal(vertices * width, &mut random);
             let (c_sigma, c_rgb) = (normal(n, &mut random), normal(3 * n, &mut random));
             let value = |group: &mut SampleBatch, mlp: &[f32], table: &[f32], features: &[f32]| -> f64 {
