@@ -7,7 +7,8 @@ use std::path::PathBuf;
 use glam::{Vec2, Vec3};
 use occnerf::bake::{Avatar, Clip, turn_upright};
 use occnerf::{Config, Method, Preset, PriorColors, Scene};
-use stand_in::{skinned, stand_in};
+use smpl::Placement;
+use stand_in::stand_in;
 use synth::{DemoConfig, demo};
 
 fn scene() -> Scene {
@@ -20,6 +21,13 @@ fn scene() -> Scene {
 
 fn avatar(scene: &Scene) -> Avatar {
     stand_in(scene, &PriorColors::measure(scene).unwrap())
+}
+
+/// Vertices and normals of an avatar at `seconds` of its first motion.
+pub fn skinned(avatar: &Avatar, seconds: f32) -> (Vec<Vec3>, Vec<Vec3>) {
+    let (pose, placement) = avatar.clips[0].motion.at(seconds, avatar.num_joints());
+    let (Placement::Pelvis { translation } | Placement::Origin { translation, .. }) = placement;
+    avatar.skin(&avatar.bones(&pose, translation), &pose)
 }
 
 fn place(name: &str) -> PathBuf {

@@ -1,6 +1,7 @@
 //! What other programs are given: read back, compared with the avatar, and refused where it cannot
 //! be.
 
+use crate::avatar::skinned;
 use crate::stand_in;
 
 use std::path::PathBuf;
@@ -12,7 +13,6 @@ use occnerf::bake::export::{Splats, fit_motion, splats, write_amass, write_obj};
 use occnerf::{Config, Method, Preset, PriorColors, Scene};
 use rigged::Character;
 use smpl::{MotionClip, SparseRows};
-use stand_in::skinned;
 use synth::{DemoConfig, demo};
 
 fn avatar() -> &'static Avatar {

@@ -4,7 +4,6 @@ use glam::{Affine3A, Vec2, Vec3};
 use occnerf::bake::{Atlas, Avatar, Clip, motion_of_bones, skeleton, turn_upright};
 use occnerf::capture::Light;
 use occnerf::{PriorColors, Scene, upright};
-use smpl::Placement;
 use volrender::Camera;
 
 /// Texels a side of the square that a face's colours stand in.
@@ -110,11 +109,4 @@ pub fn stand_in(scene: &Scene, colors: &PriorColors) -> Avatar {
         clips: vec![Clip { name: "video".to_owned(), motion }],
         cameras,
     }
-}
-
-/// Vertices and normals of an avatar at `seconds` of its first motion.
-pub fn skinned(avatar: &Avatar, seconds: f32) -> (Vec<Vec3>, Vec<Vec3>) {
-    let (pose, placement) = avatar.clips[0].motion.at(seconds, avatar.num_joints());
-    let (Placement::Pelvis { translation } | Placement::Origin { translation, .. }) = placement;
-    avatar.skin(&avatar.bones(&pose, translation), &pose)
 }

@@ -205,7 +205,7 @@ fn measure(job: &Job) -> Result<Outcome> {
         outcome.stages = times.stages().map(|(name, total)| (name.to_owned(), mean(total))).to_vec();
         outcome.parameters = model.num_parameters();
         match job.bake.zip(baked) {
-            Some((baking, (avatar, _))) => score(&scene, &mut baking.renderer(&model, &avatar)?, &mut outcome)?,
+            Some((baking, (avatar, _))) => score(&scene, &mut baking.renderer(&model, &avatar), &mut outcome)?,
             None => score(&scene, &mut FieldRenderer::new(&model)?, &mut outcome)?,
         }
     }
