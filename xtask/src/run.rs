@@ -20,6 +20,8 @@ const CONFIG: &str = "config.toml";
 pub const AVATAR: &str = "avatar.safetensors";
 /// Metrics.
 pub const METRICS: &str = "metrics.json";
+/// Record of `--method auto`.
+const VERDICT: &str = "auto.json";
 /// Log of the training.
 pub const LOG: &str = "train.jsonl";
 /// Viewer page.
@@ -187,6 +189,38 @@ impl Metrics {
     /// Writes it.
     pub fn write(&self, run: &Path) -> Result<()> {
         write(&run.join(METRICS), &serde_json::to_string_pretty(self)?)
+    }
+}
+
+/// What `--method auto` found that a scene needs, and why.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub struct Verdict {
+    /// Whether a field is trained.
+    pub field: bool,
+    /// A row a part of the body, the first a header.
+    pub parts: Vec<Vec<String>>,
+    /// Gain, costs and decision in a sentence.
+    pub why: String,
+}
+
+impl Verdict {
+    /// The record of a run; `None` where its method was named.
+    pub fn read(run: &Path) -> Result<Option<Self>> {
+        let path = run.join(VERDICT);
+        if !path.is_file() {
+            return Ok(None);
+        }
+        serde_json::from_str(&read_text(&path)?).map(Some).with_context(|| path.display().to_string())
+    }
+
+    /// Writes the record of a new run, or removes an old one.
+    pub fn begin(run: &Path, verdict: Option<&Self>) -> Result<()> {
+        let path = run.join(VERDICT);
+        match verdict {
+            Some(verdict) => write(&path, &serde_json::to_string_pretty(verdict)?),
+            None if path.is_file() => std::fs::remove_file(&path).map_err(unwritten(&path)),
+            None => Ok(()),
+        }
     }
 }
 

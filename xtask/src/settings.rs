@@ -7,11 +7,33 @@ use clap::Args;
 use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 use occnerf::{Component, Config, Method, OccludedRule, Preset};
 
-const METHODS: &[(Method, &str)] = &[
-    (Method::Prior, "The posed prior in mean colours; nothing is trained"),
-    (Method::Surface, "The prior's surface, displaced, with a texture: no field, no steps"),
-    (Method::HashPoint, "Point-based, hash encoding"),
-    (Method::Occnerf, "Point term, and in `paper` the attended surface term"),
+/// Stride of the frames held out for scoring of captures without other cameras, and by `auto`.
+pub const HOLD_OUT: usize = 10;
+
+/// A method, or the choice of one by the scene.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum MethodChoice {
+    /// [`Method::Surface`], or [`Method::Occnerf`] where a field gains on frames held out.
+    Auto,
+    /// This one.
+    Named(Method),
+}
+
+impl MethodChoice {
+    fn name(self) -> &'static str {
+        match self {
+            Self::Auto => "auto",
+            Self::Named(method) => method.name(),
+        }
+    }
+}
+
+const METHODS: &[(MethodChoice, &str)] = &[
+    (MethodChoice::Named(Method::Prior), "The posed prior in mean colours; nothing is trained"),
+    (MethodChoice::Named(Method::Surface), "The prior's surface, displaced, with a texture: no field, no steps"),
+    (MethodChoice::Named(Method::HashPoint), "Point-based, hash encoding"),
+    (MethodChoice::Named(Method::Occnerf), "Point term, and in `paper` the attended surface term"),
+    (MethodChoice::Auto, "The surface, or occnerf where a field gains on frames held out from both"),
 ];
 const PRESETS: &[(Preset, &str)] = &[
     (Preset::Fast, "A first look: the surface alone, in seconds; fields for half the default's time"),
@@ -53,8 +75,8 @@ pub struct SettingArguments {
     #[arg(long, value_parser = preset())]
     pub preset: Option<Preset>,
     /// Which model [default: surface for the preset fast, else occnerf]
-    #[arg(long, value_parser = named(METHODS, Method::name))]
-    pub method: Option<Method>,
+    #[arg(long, value_parser = named(METHODS, MethodChoice::name))]
+    pub method: Option<MethodChoice>,
     /// Components of the method to switch off, comma separated
     #[arg(long, value_delimiter = ',', value_parser = named(COMPONENTS, Component::name))]
     pub ablate: Vec<Component>,
@@ -82,7 +104,11 @@ impl SettingArguments {
     pub fn config(&self) -> Result<Config> {
         let preset = self.preset.unwrap_or(Preset::Balanced);
         let usual = if preset == Preset::Fast { Method::Surface } else { Method::Occnerf };
-        let method = self.method.unwrap_or(usual);
+        let method = match self.method {
+            Some(MethodChoice::Named(method)) => method,
+            Some(MethodChoice::Auto) => Method::Occnerf,
+            None => usual,
+        };
         if let Some(steps) = self.steps.filter(|_| !method.has_field()) {
             bail!("--steps {steps}: the method {} takes no steps", method.name());
         }
@@ -91,6 +117,11 @@ impl SettingArguments {
         let weights = Path::new(&config.loss.perceptual_weights);
         ensure!(weights.as_os_str().is_empty() || weights.exists(), "{}: no such weights", weights.display());
         Ok(config)
+    }
+
+    /// [`SettingArguments::config`] of the surface in place of a field.
+    pub fn without_field(&self) -> Result<Config> {
+        Self { method: Some(MethodChoice::Named(Method::Surface)), steps: None, ..self.clone() }.config()
     }
 
     /// `config` with everything but preset and method applied.

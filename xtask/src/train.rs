@@ -9,16 +9,17 @@ use occnerf::bake::{BakeOptions, fit};
 use occnerf::capture::Capture;
 use occnerf::{Config, Lpips, Method, Model, Person, Scene, Trainer, checkpoint_config};
 
+use crate::auto;
 use crate::baked;
 use crate::eval::{Drawn, Split, check_pictures, score_baked, score_run, scored_frames, unscored};
 use crate::network::{load_lpips, network_name};
 use crate::optimise::{RunOptions, SavingArguments, optimise};
 use crate::process::{Lock, note, results_in, say, still_held, telling};
 use crate::run::{
-    self, AVATAR, CHECKPOINT, METRICS, Metrics, RunConfig, existing_directory, free_bytes, make_directory,
+    self, AVATAR, CHECKPOINT, METRICS, Metrics, RunConfig, Verdict, existing_directory, free_bytes, make_directory,
     new_directory, peak_rss_bytes,
 };
-use crate::settings::SettingArguments;
+use crate::settings::{HOLD_OUT, MethodChoice, SettingArguments};
 use crate::shard::ShardArguments;
 use crate::source::{self, LoadArguments, Source};
 use crate::table;
@@ -76,8 +77,11 @@ pub fn train(arguments: &TrainArguments) -> Result<()> {
     let lpips = load_lpips(arguments.lpips.as_deref())?;
     let alone = arguments.part.shard.is_none() && !arguments.part.merge;
     ensure!(alone, "--shard and --merge: of one scene there are no parts; they go with --list");
-    let method = arguments.settings.config()?.method;
-    let name = format!("{}-{}", scene_name(arguments.scene.as_deref()), method.name());
+    let method = match arguments.settings.method {
+        Some(MethodChoice::Auto) => "auto",
+        _ => arguments.settings.config()?.method.name(),
+    };
+    let name = format!("{}-{method}", scene_name(arguments.scene.as_deref()));
     let out = arguments.out.as_deref();
     let interval = arguments.saving.interval()?;
     let TrainArguments { resume, stop_after, preview, .. } = *arguments;
@@ -113,9 +117,6 @@ struct Begun {
     _lock: Lock,
 }
 
-/// Stride of the frames held out for scoring of captures without other cameras.
-const HOLD_OUT: usize = 10;
-
 /// A new run.
 fn begun(arguments: &TrainArguments, name: &str) -> Result<Begun> {
     let mut config = arguments.settings.config()?;
@@ -129,8 +130,14 @@ fn begun(arguments: &TrainArguments, name: &str) -> Result<Begun> {
         config.held_out = HOLD_OUT;
         say!("no other camera: every {HOLD_OUT}th frame is scored, and nothing is learnt from it (--set held_out=0)");
     }
+    let auto = arguments.settings.method == Some(MethodChoice::Auto);
+    let verdict = if auto { Some(auto::weigh(&source, &config)?) } else { None };
+    if verdict.as_ref().is_some_and(|verdict| !verdict.field) {
+        config = Config { held_out: config.held_out, ..arguments.settings.without_field()? };
+    }
     // The directory is made only now, so that bad input leaves nothing behind.
     let (directory, lock) = new_directory(arguments.out.as_deref(), name)?;
+    Verdict::begin(&directory, verdict.as_ref())?;
     Ok(Begun { directory, source, config, _lock: lock })
 }
 

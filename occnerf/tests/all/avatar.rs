@@ -4,10 +4,10 @@ use crate::stand_in;
 
 use std::path::PathBuf;
 
+use crate::skinned;
 use glam::{Vec2, Vec3};
 use occnerf::bake::{Avatar, Clip, turn_upright};
 use occnerf::{Config, Method, Preset, PriorColors, Scene};
-use smpl::Placement;
 use stand_in::stand_in;
 use synth::{DemoConfig, demo};
 
@@ -21,13 +21,6 @@ fn scene() -> Scene {
 
 fn avatar(scene: &Scene) -> Avatar {
     stand_in(scene, &PriorColors::measure(scene).unwrap())
-}
-
-/// Vertices and normals of an avatar at `seconds` of its first motion.
-pub fn skinned(avatar: &Avatar, seconds: f32) -> (Vec<Vec3>, Vec<Vec3>) {
-    let (pose, placement) = avatar.clips[0].motion.at(seconds, avatar.num_joints());
-    let (Placement::Pelvis { translation } | Placement::Origin { translation, .. }) = placement;
-    avatar.skin(&avatar.bones(&pose, translation), &pose)
 }
 
 fn place(name: &str) -> PathBuf {

@@ -1,12 +1,12 @@
 //! What other programs are given: read back, compared with the avatar, and refused where it cannot
 //! be.
 
-use crate::avatar::skinned;
 use crate::stand_in;
 
 use std::path::PathBuf;
 use std::sync::OnceLock;
 
+use crate::skinned;
 use glam::{Mat3, Quat, Vec2, Vec3};
 use occnerf::bake::Avatar;
 use occnerf::bake::export::{Splats, fit_motion, splats, write_amass, write_obj};

@@ -21,3 +21,14 @@ mod person;
 mod readme;
 #[path = "common/stand_in.rs"]
 mod stand_in;
+
+use glam::Vec3;
+use occnerf::bake::Avatar;
+use smpl::Placement;
+
+/// Vertices and normals of an avatar at `seconds` of its first motion.
+fn skinned(avatar: &Avatar, seconds: f32) -> (Vec<Vec3>, Vec<Vec3>) {
+    let (pose, placement) = avatar.clips[0].motion.at(seconds, avatar.num_joints());
+    let (Placement::Pelvis { translation } | Placement::Origin { translation, .. }) = placement;
+    avatar.skin(&avatar.bones(&pose, translation), &pose)
+}

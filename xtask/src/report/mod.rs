@@ -16,7 +16,7 @@ use self::curves::curves;
 pub use self::page::Page;
 use self::viewer::{Views, viewers};
 use crate::process::note;
-use crate::run::{self, LOG, Metrics, PERSON, RunConfig};
+use crate::run::{self, LOG, Metrics, PERSON, RunConfig, Verdict};
 use crate::table;
 
 /// Largest embedded file.
@@ -86,6 +86,11 @@ pub fn add_runs(page: &mut Page, runs: &[Run], folder: &Path) -> Result<()> {
     page.table(&std::iter::once(more).chain(runs.iter().map(row)).collect::<Vec<_>>());
     let (mut views, mut logs) = (Vec::new(), Vec::new());
     for run in runs {
+        if let Some(verdict) = Verdict::read(&run.directory)? {
+            page.subheading(&format!("{}: what this scene needed, and why", run.name));
+            page.table(&verdict.parts);
+            page.paragraph(&verdict.why);
+        }
         views.extend(Views::read(&run.directory.join(NOVEL))?.map(|v| (run.name.clone(), v)));
         logs.extend(Log::read(&run.directory.join(LOG))?.map(|l| (run.name.clone(), l)));
     }

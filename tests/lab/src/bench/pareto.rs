@@ -162,7 +162,11 @@ mod tests {
         let stem = std::env::temp_dir().join(format!("lab-pareto-{}", std::process::id()));
         for count in [0, 1, 40] {
             let name = |i: usize| format!("point <{i}> & more");
-            let of = |i: usize| line(&name(i), "k", Kind::Change, 20.0 + (i % 7) as f64, 1.0 + (i % 5) as f64);
+            let of = |i: usize| {
+                let mut line = line(&name(i), "k", Kind::Change, 20.0 + (i % 7) as f64, 1.0 + (i % 5) as f64);
+                line.outcome.parameters = 1000 + i;
+                line
+            };
             let lines: Vec<Line> = (0..count).map(of).collect();
             charts("a scene", &lines, &COSTS, &stem).unwrap();
             for (suffix, ..) in COSTS {

@@ -69,7 +69,7 @@ fn whatever_is_wrong_with_the_arrays_is_named_in_one_line() {
         ("hash-encode", with(hash(), "resolutions", whole(&[2], &[2, 1 << 30])), &[], &["`resolutions`"]),
         ("hash-encode", with(hash(), "resolutions", whole(&[2, 1], &[2, 8])), &[], &["`resolutions`", "[2, 1]"]),
         ("hash-encode", with(hash(), "table", floats(&[2, 12, 1], &[0.0; 24])), &[], &["`table`", "12", "power"]),
-        ("hash-encode", with(hash(), "table", floats(&[2, 16, 0], &[])), &[], &["table", "0 features"]),
+        ("hash-encode", with(hash(), "table", floats(&[2, 16, 0], &[])), &[], &["table", "features: 0"]),
         ("hash-encode", with(hash(), "d_features", floats(&[2, 3], &[0.0; 6])), &[], &["`d_features`", "[2, 2]"]),
         ("composite", with(composite(), "sigma", floats(&[2, 2], &[0.0, -1.0, 0.0, 0.0])), &[], &["`sigma`", "-1"]),
         ("composite", with(composite(), "sigma", floats(&[2, 0], &[])), &[], &["`sigma`", "samples"]),
