@@ -54,7 +54,7 @@ pub use model::person::Person;
 pub use model::saved::checkpoint_config;
 pub use model::times::StepTimes;
 pub use model::trained::{Model, upright};
-pub use model::view::PosedView;
+pub use model::view::{PosedView, pinhole};
 pub use render::field::FieldRenderer;
 pub use render::picture::{PriorRenderer, Renderer, Rendering, Supersampled};
 pub use scene::labels::{Label, Labels, label_pixels};

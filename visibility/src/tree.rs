@@ -4,7 +4,7 @@
 use std::collections::HashSet;
 use std::time::Duration;
 
-use glam::{Vec3, Vec3A, Vec4};
+use glam::{DVec3, Vec3, Vec3A, Vec4};
 use obvhs::BvhBuildParams;
 use obvhs::aabb::Aabb;
 use obvhs::bvh2::builder::build_bvh2;
@@ -66,22 +66,20 @@ impl Node {
 const NEARER: f32 = 1.0 - 1e-6;
 const FARTHER: f32 = 1.0 + 1e-6;
 
-/// Bounds of the faces. One that equals another's is grown by a random 10⁻⁵ of the coordinates: the
+/// Bounds of the faces. One that equals another's is grown by up to 10⁻⁵ of the coordinates: the
 /// builder joins boxes that are closest to each other, among equal ones a single pair a pass.
 fn bounds(vertices: &[Vec3], faces: &[[u32; 3]]) -> Vec<Aabb> {
     let most = vertices.iter().map(|v| v.abs().max_element()).fold(1e-6, f32::max);
     let mut seen = HashSet::new();
-    let bounds = |(i, face): (u64, &[u32; 3])| {
+    let bounds = |(i, face): (u32, &[u32; 3])| {
         let [a, b, c] = face.map(|i| Vec3A::from(vertices[i as usize]));
         let (low, high) = (a.min(b).min(c), a.max(b).max(c));
         if seen.insert([low, high].map(|corner| corner.to_array().map(f32::to_bits))) {
             return Aabb::new(low, high);
         }
-        // The finaliser of SplitMix64.
-        let z = (i + 1).wrapping_mul(0x9e37_79b9_7f4a_7c15);
-        let z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        let share = |shift: u32| (z >> shift & 0xffff) as f32 / 65536.0;
-        let growth = 1e-5 * most * Vec3A::new(share(0), share(16), share(32));
+        // A Kronecker sequence: the shares of any two faces differ.
+        let shares = (f64::from(i) * DVec3::new(0.819_172_5, 0.671_043_6, 0.549_700_5)).fract();
+        let growth = 1e-5 * most * shares.as_vec3a();
         Aabb::new(low - growth, high + growth)
     };
     (0..).zip(faces).map(bounds).collect()

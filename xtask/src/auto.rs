@@ -6,8 +6,8 @@
 use anyhow::Result;
 use glam::Vec3;
 use occnerf::bake::{BakeOptions, fit, skeleton};
-use occnerf::{Config, Label, Method, PreparedFrame, Scene, Trainer};
-use visibility::{RasterOptions, Rasterizer, View};
+use occnerf::{Config, Label, Method, PreparedFrame, Scene, Trainer, pinhole};
+use visibility::{RasterOptions, Rasterizer};
 
 use crate::eval::{Drawn, Split};
 use crate::process::say;
@@ -122,16 +122,8 @@ fn parts(scene: &Scene, frame: &PreparedFrame) -> Result<Vec<usize>> {
         |joint: usize| PARTS.iter().position(|(_, words)| words.iter().any(|word| names[joint].name.contains(word)));
     let heaviest =
         |v: u32| model.weights.row(v as usize).max_by(|a, b| a.1.total_cmp(&b.1)).map_or(0, |(joint, _)| joint);
-    let camera = &frame.view.camera;
-    let view = View {
-        focal: camera.focal,
-        centre: camera.centre,
-        world_to_camera: camera.world_to_camera,
-        width: camera.width,
-        height: camera.height,
-    };
-    let drawn =
-        Rasterizer::default().faces(&frame.view.posed.vertices, &model.faces, &view, &RasterOptions::default())?;
+    let (view, options) = (pinhole(&frame.view.camera), RasterOptions::default());
+    let drawn = Rasterizer::default().faces(&frame.view.posed.vertices, &model.faces, &view, &options)?;
     let at = |fragment: Option<visibility::Fragment>| {
         fragment.and_then(|fragment| part(heaviest(model.faces[fragment.face as usize][0]))).unwrap_or(BESIDE)
     };

@@ -19,6 +19,7 @@ pub fn train_list(arguments: &TrainArguments) -> Result<()> {
     let lpips = load_lpips(arguments.lpips.as_deref())?;
     let scenes = read(arguments.list.as_deref().context("--list: no file")?)?;
     let out = arguments.out.as_deref().context("--list: give --out, the folder of all runs")?;
+    ensure!(!arguments.settings.is_auto(), "--method auto chooses for one scene; it does not go with --list");
     let (config, load) = (arguments.settings.config()?, arguments.load.options()?);
     let interval = arguments.saving.interval()?;
     let (mut rows, mut failed, mut missing): (Vec<(String, Metrics)>, Vec<String>, Vec<String>) = Default::default();

@@ -119,6 +119,11 @@ impl SettingArguments {
         Ok(config)
     }
 
+    /// Whether the scene chooses the method.
+    pub fn is_auto(&self) -> bool {
+        self.method == Some(MethodChoice::Auto)
+    }
+
     /// [`SettingArguments::config`] of the surface in place of a field.
     pub fn without_field(&self) -> Result<Config> {
         Self { method: Some(MethodChoice::Named(Method::Surface)), steps: None, ..self.clone() }.config()
@@ -143,7 +148,13 @@ impl SettingArguments {
     /// Checks that a run to be resumed was trained with what is asked for; the number of steps may
     /// change.
     pub fn resumed(&self, saved: Config) -> Result<Config> {
-        let asked = if self.preset.is_some() || self.method.is_some() { self.config()? } else { saved.clone() };
+        // What the scene chose stays.
+        let method = if self.is_auto() { Some(MethodChoice::Named(saved.method)) } else { self.method };
+        let mut asked = match (self.preset, method) {
+            (None, None) => saved.clone(),
+            _ => Self { method, ..self.clone() }.config()?,
+        };
+        asked.held_out = saved.held_out;
         let asked = self.apply(asked)?;
         let steps = self.steps.unwrap_or(saved.steps);
         let same = Config { steps, ..asked.clone() } == Config { steps, ..saved.clone() };
@@ -174,4 +185,25 @@ pub fn set(config: &Config, assignment: &str) -> Result<Config> {
     };
     at.insert(last.to_owned(), new);
     Ok(table.try_into()?)
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_resumed_run_keeps_the_method_that_its_scene_chose_and_its_frames_held_out() {
+        for method in [Method::Occnerf, Method::Surface] {
+            let saved = Config { held_out: HOLD_OUT, ..Config::preset(Preset::Balanced, method) };
+            for choice in [MethodChoice::Auto, MethodChoice::Named(method)] {
+                let asked = SettingArguments { method: Some(choice), ..SettingArguments::default() };
+                assert_eq!(asked.resumed(saved.clone()).unwrap(), saved);
+            }
+            let set = SettingArguments { set: vec!["held_out=5".to_owned()], ..SettingArguments::default() };
+            assert!(set.resumed(saved).is_err());
+        }
+        let other = SettingArguments { method: Some(MethodChoice::Named(Method::HashPoint)), ..Default::default() };
+        assert!(other.resumed(Config::preset(Preset::Balanced, Method::Occnerf)).is_err());
+    }
 }

@@ -19,7 +19,7 @@ use crate::run::{
     self, AVATAR, CHECKPOINT, METRICS, Metrics, RunConfig, Verdict, existing_directory, free_bytes, make_directory,
     new_directory, peak_rss_bytes,
 };
-use crate::settings::{HOLD_OUT, MethodChoice, SettingArguments};
+use crate::settings::{HOLD_OUT, SettingArguments};
 use crate::shard::ShardArguments;
 use crate::source::{self, LoadArguments, Source};
 use crate::table;
@@ -77,10 +77,7 @@ pub fn train(arguments: &TrainArguments) -> Result<()> {
     let lpips = load_lpips(arguments.lpips.as_deref())?;
     let alone = arguments.part.shard.is_none() && !arguments.part.merge;
     ensure!(alone, "--shard and --merge: of one scene there are no parts; they go with --list");
-    let method = match arguments.settings.method {
-        Some(MethodChoice::Auto) => "auto",
-        _ => arguments.settings.config()?.method.name(),
-    };
+    let method = if arguments.settings.is_auto() { "auto" } else { arguments.settings.config()?.method.name() };
     let name = format!("{}-{method}", scene_name(arguments.scene.as_deref()));
     let out = arguments.out.as_deref();
     let interval = arguments.saving.interval()?;
@@ -130,8 +127,7 @@ fn begun(arguments: &TrainArguments, name: &str) -> Result<Begun> {
         config.held_out = HOLD_OUT;
         say!("no other camera: every {HOLD_OUT}th frame is scored, and nothing is learnt from it (--set held_out=0)");
     }
-    let auto = arguments.settings.method == Some(MethodChoice::Auto);
-    let verdict = if auto { Some(auto::weigh(&source, &config)?) } else { None };
+    let verdict = if arguments.settings.is_auto() { Some(auto::weigh(&source, &config)?) } else { None };
     if verdict.as_ref().is_some_and(|verdict| !verdict.field) {
         config = Config { held_out: config.held_out, ..arguments.settings.without_field()? };
     }

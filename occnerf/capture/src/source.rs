@@ -93,7 +93,7 @@ impl OnDisk {
     }
 
     /// A copy without decoded pixels.
-    fn anew(&self) -> Self {
+    fn undecoded(&self) -> Self {
         Self {
             files: Arc::clone(&self.files),
             edits: self.edits.clone(),
@@ -213,7 +213,7 @@ impl PixelSource {
                 *self = pixels.into();
             }
             Place::Disk(disk) => {
-                let mut changed = disk.anew();
+                let mut changed = disk.undecoded();
                 if let Some(Some(Kept(kept))) = disk.kept.get() {
                     let mut pixels = kept.0.pixels();
                     edit(&mut pixels);
@@ -231,7 +231,7 @@ impl PixelSource {
             Place::Memory(_) => self.edit(move |pixels| pixels.hide(&area)),
             Place::Disk(disk) => {
                 let files = Arc::new(disk.files.hidden_behind(&area));
-                *disk = Arc::new(OnDisk { files, ..disk.anew() });
+                *disk = Arc::new(OnDisk { files, ..disk.undecoded() });
             }
         }
     }

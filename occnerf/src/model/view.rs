@@ -76,7 +76,7 @@ impl PosedView {
 }
 
 /// The camera as the visibility crate takes it.
-pub(crate) fn pinhole(camera: &Camera) -> View {
+pub fn pinhole(camera: &Camera) -> View {
     let Camera { focal, centre, world_to_camera, width, height } = *camera;
     View { focal, centre, world_to_camera, width, height }
 }

@@ -12,7 +12,7 @@ use occnerf::{PriorColors, PriorRenderer, Renderer};
 use proptest::prelude::*;
 use surface_query::{MeshDistance, SurfaceQuery, SurfaceQueryConfig};
 use testkit::{oracle, strategy};
-use visibility::{RayMesh, View};
+use visibility::RayMesh;
 
 /// Share of neighbours that two queries have in common, |A ∩ B| / |A ∪ B|.
 fn overlap(query: &SurfaceQuery, scales: usize, a: Vec3, b: Vec3) -> f32 {
@@ -157,13 +157,7 @@ fn cameras_and_views_put_vertices_into_the_same_pixels_and_rays_lead_back_to_the
     let scene = scene();
     let frame = &scene.train[0];
     let camera = &frame.view.camera;
-    let view = View {
-        focal: camera.focal,
-        centre: camera.centre,
-        world_to_camera: camera.world_to_camera,
-        width: camera.width,
-        height: camera.height,
-    };
+    let view = occnerf::pinhole(camera);
     let mesh = RayMesh::new(&frame.view.posed.vertices, &scene.body.model.faces).unwrap();
     let visible = visibility::visible_vertices(&mesh, &frame.view.posed.vertices, &view, None);
     let mut seen = 0;

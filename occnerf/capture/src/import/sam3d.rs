@@ -159,7 +159,7 @@ fn converted(value: serde_json::Value) -> Value {
     }
 }
 
-/// A person somebody is taken for in the next frame.
+/// The state by which a person is found in the next frame.
 struct Track {
     place: DVec3,
     motion: DVec3,
@@ -211,8 +211,8 @@ fn fit(frames: Vec<(Option<String>, Value, &Path)>, video: &Video) -> Result<Fit
     Ok(Fit { tool: Tool::Sam3dBody, people: tracks.into_iter().map(|track| track.person).collect(), names })
 }
 
-/// Gives the people of a frame to those of earlier frames: nearest pairs first, by the place where
-/// somebody moving on would be (depth counts little, it is measured badly) and by the size of bones.
+/// Assigns the people of a frame to those of earlier frames: nearest pairs first, by the distance from
+/// the extrapolated place, in which depth has a low weight, and by the size of bones.
 fn assign(tracks: &mut Vec<Track>, found: Vec<FitFrame>, index: usize) {
     const METRES: f64 = 1.5;
     const DEPTH: f64 = 0.4;
