@@ -31,6 +31,6 @@ fn a_list_of_scenes_is_trained_in_parts() {
     let printed = String::from_utf8_lossy(&output.stdout).into_owned() + &String::from_utf8_lossy(&output.stderr);
     assert!(printed.contains("a: finished earlier") && printed.contains("1 of 2 scenes failed"), "{printed}");
     refused(&["train", "--shard", "1/2"], &["--list"]);
-    refused(&["train", "--list", text(&list), "--method", "auto"], &["--list", "auto"]);
+    refused(&["train", "--list", text(&list), "--out", text(&out), "--method", "auto"], &["--list", "auto"]);
     assert_eq!(xtask(&["train", "--list", text(&list), "--shard", "3/2"]).status.code(), Some(2));
 }
