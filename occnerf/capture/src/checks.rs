@@ -2,17 +2,19 @@
 
 use std::path::Path;
 
-use glam::Vec3;
+use glam::{Vec2, Vec3};
 use smpl::{BodyModel, Placement};
 
 use super::camera::MAX_DISTANCE;
 use super::records::{Record, triples};
-use super::{CaptureError, Frame};
+use super::{CaptureError, Frame, Keypoint};
 
 /// Tolerance of a joint against the file's, as a fraction of the body's largest extent: 4 cm at
 /// 1.7 m. The same model agrees to rounding, others are several times as far off.
 const JOINT_TOLERANCE: f32 = 0.04 / 1.7;
 
+/// Largest coordinate of a key point.
+const FARTHEST_PIXEL: f32 = 1e5;
 /// Largest component of a rotation, radians.
 pub(super) const MAX_ANGLE: f32 = 1e3;
 /// Largest shape coefficient, in standard deviations.
@@ -50,6 +52,36 @@ pub(super) fn pose(record: &Record<'_>, body: &BodyModel) -> Result<Vec<Vec3>, C
         return Err(record.invalid("poses", expected, format!("shape {shape:?}")));
     }
     Ok(triples(&values))
+}
+
+/// Detected joints, (N,4) under `keypoints`; none without the key.
+pub(super) fn keypoints(record: &Record<'_>, body: &BodyModel) -> Result<Vec<Keypoint>, CaptureError> {
+    const KEY: &str = "keypoints";
+    if !record.has(KEY) {
+        return Ok(Vec::new());
+    }
+    let (shape, values) = record.stacked(KEY)?;
+    if values.is_empty() {
+        return Ok(Vec::new());
+    }
+    if shape.len() != 2 || shape[1] != 4 {
+        return Err(record.invalid(KEY, "shape [N, 4]: joint, x, y, confidence", format!("shape {shape:?}")));
+    }
+    if record.has("distortions") {
+        return Err(record.invalid(KEY, "none beside `distortions`", "key points of a distorted picture"));
+    }
+    let joints = body.num_joints();
+    let point = |row: &[f32]| {
+        let [joint, x, y, confidence] = [row[0], row[1], row[2], row[3]];
+        let is_joint = joint >= 0.0 && joint.fract() == 0.0 && (joint as usize) < joints;
+        let is_near = x.abs().max(y.abs()) < FARTHEST_PIXEL;
+        if !(is_joint && is_near && (0.0..=1.0).contains(&confidence)) {
+            let expected = format!("a joint below {joints}, a pixel, a confidence of 0 to 1");
+            return Err(record.invalid(KEY, expected, format!("{row:?}")));
+        }
+        Ok(Keypoint { joint: joint as usize, place: Vec2::new(x, y), confidence })
+    };
+    values.chunks_exact(4).map(point).collect()
 }
 
 /// [`pose`] with a zero root, for a separate global rotation.

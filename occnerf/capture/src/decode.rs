@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use glam::Vec3;
+use glam::{Vec2, Vec3};
 use rayon::prelude::*;
 use smpl::{BodyModel, Placement};
 
@@ -14,7 +14,7 @@ use super::image::dimensions;
 use super::pictures::file_name;
 use super::pixels::Area;
 use super::source::{Allowance, PixelSource};
-use super::{Capture, CaptureError, EvalFrame, Frame, LoadOptions, checks};
+use super::{Capture, CaptureError, EvalFrame, Frame, Keypoint, LoadOptions, checks};
 
 /// Bytes per pixel of a frame: three colours and coverage.
 pub const PIXEL_BYTES: u64 = 16;
@@ -38,6 +38,8 @@ pub(super) struct Planned {
     pub pose: Vec<Vec3>,
     pub placement: Placement,
     pub betas: Vec<f32>,
+    /// In pixels of the files.
+    pub keypoints: Vec<Keypoint>,
 }
 
 /// Memory for packed pictures and for decoding.
@@ -90,13 +92,15 @@ impl View {
         let first = Arc::from(self.frames[0].name.as_str());
         let (size, to) = (self.size, options.resized(self.size));
         let frame = |plan: Planned| {
-            let Planned { name, image, masks, labels, occluder, hidden, lens, pose, placement, betas } = plan;
+            let Planned { name, image, masks, labels, occluder, hidden, lens, pose, placement, betas, mut keypoints } = plan;
+            let scale = Vec2::new(to.0 as f32 / size.0 as f32, to.1 as f32 / size.1 as f32);
+            keypoints.iter_mut().for_each(|point| point.place *= scale);
             let camera = volrender::Camera { width: size.0, height: size.1, ..lens.camera };
             let first = Arc::clone(&first);
             let gate = Arc::clone(&budget.gate);
             let files = Files { image, masks, labels, occluder, hidden, lens, size, to, first, gate };
             let source = PixelSource::on_disk(files, Arc::clone(&budget.kept));
-            Frame { name, source, camera: camera.resized(to.0, to.1), pose, placement, betas }
+            Frame { name, source, camera: camera.resized(to.0, to.1), pose, placement, betas, keypoints }
         };
         let frames: Vec<Frame> = self.frames.into_iter().map(frame).collect();
         // Collected as results first: the first error in order is reported.

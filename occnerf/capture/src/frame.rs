@@ -1,10 +1,21 @@
 //! A capture as plain data: training frames and evaluation views.
 
-use glam::Vec3;
+use glam::{Vec2, Vec3};
 
 use super::CaptureError;
 use super::pixels::Pixels;
 use super::source::PixelSource;
+
+/// A joint of the body as a detector found it in a picture.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Keypoint {
+    /// Joint of the body model.
+    pub joint: usize,
+    /// Pixels, pixel centres at integer + 0.5.
+    pub place: Vec2,
+    /// 0 to 1.
+    pub confidence: f32,
+}
 
 /// One picture of the subject with its camera and body parameters.
 #[derive(Clone, Debug)]
@@ -22,6 +33,8 @@ pub struct Frame {
     pub placement: smpl::Placement,
     /// Shape coefficients, at most as many as the body model has.
     pub betas: Vec<f32>,
+    /// Detected joints; empty where no detector ran.
+    pub keypoints: Vec<Keypoint>,
 }
 
 impl Frame {

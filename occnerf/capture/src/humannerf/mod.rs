@@ -127,6 +127,7 @@ fn plan_frame(
         pose: checks::rootless_pose(parameters, body)?,
         placement: checks::origin(parameters)?,
         betas,
+        keypoints: Vec::new(),
     })
 }
 

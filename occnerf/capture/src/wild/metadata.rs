@@ -15,7 +15,7 @@ use crate::records::Records;
 /// Largest file: tens of thousands of frames.
 const MAX_BYTES: u64 = 64 << 20;
 /// Keys of a frame; others are ignored.
-const KEYS: [&str; 5] = ["poses", "betas", "cam_intrinsics", "cam_extrinsics", "distortions"];
+const KEYS: [&str; 6] = ["poses", "betas", "cam_intrinsics", "cam_extrinsics", "distortions", "keypoints"];
 
 /// Reads the file; memory is bounded by a few times its size, nesting by the parser.
 pub(super) fn read(path: &Path) -> Result<Records, CaptureError> {

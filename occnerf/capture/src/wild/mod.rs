@@ -3,14 +3,15 @@
 //! ```text
 //! images/NAME.png …       masks/NAME.png …      (PNG or JPEG; masks 0 to 255, the visible person)
 //! metadata.json           {NAME: {poses (3J), betas (≤ B), cam_intrinsics (3,3),
-//!                          cam_extrinsics (4,4), distortions (5)?}}
+//!                          cam_extrinsics (4,4), distortions (5)?, keypoints (N,4)?}}
 //! occluders/NAME.png …    where known: 255 for an occluder of the person
 //! clean/images, masks/    some of the frames again without occluders, kept back
 //! ```
 //!
 //! The pose's first joint turns the body about its pelvis; the extrinsics hold the body's
 //! translation. Frames are the entries of `metadata.json` in the order of their names, `10` after
-//! `9`; pictures that it does not mention are left out.
+//! `9`; pictures that it does not mention are left out. A row of `keypoints` is a joint of the body
+//! model, its pixel (x, y; pixel centres at integer + 0.5) and the detector's confidence, 0 to 1.
 
 mod metadata;
 #[cfg(test)]
@@ -104,5 +105,6 @@ fn plan(
         pose: checks::pose(record, body)?,
         placement: Placement::default(),
         betas: checks::betas(record, "betas", body)?,
+        keypoints: checks::keypoints(record, body)?,
     })
 }

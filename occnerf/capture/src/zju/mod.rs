@@ -60,6 +60,7 @@ pub(super) fn load(dir: &Path, body: &BodyModel, options: &LoadOptions) -> Resul
             pose: fitted.pose.clone(),
             placement: fitted.placement,
             betas: fitted.betas.clone(),
+            keypoints: Vec::new(),
         }))
     };
     let mut train = Vec::new();

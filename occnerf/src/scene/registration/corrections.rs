@@ -111,6 +111,24 @@ impl<'a> SurfaceJacobian<'a> {
             self.weights[joint] += weight;
             highest = highest.max(joint);
         }
+        self.propagate(highest, out);
+        let column = |joint: usize| out.columns.iter().position(|&c| c as usize == 3 + 3 * joint);
+        let bones = self.model.weights.row(vertex);
+        out.bones.extend(bones.filter_map(|(joint, weight)| Some((column(joint)?, weight))));
+    }
+
+    /// Jacobian of a point in the world that is fixed to the bone of `joint`.
+    pub fn fixed(&mut self, joint: usize, point: Vec3, out: &mut PointJacobian) {
+        out.columns.clear();
+        out.directions.clear();
+        out.bones.clear();
+        (self.moved[joint], self.weights[joint]) = (point.into(), 1.0);
+        self.propagate(joint, out);
+    }
+
+    /// Derivatives of the sum of `moved` by the rotations of the joints up to `highest` and by the
+    /// translation; clears `moved` and `weights`.
+    fn propagate(&mut self, highest: usize, out: &mut PointJacobian) {
         let mut push = |first: usize, axes: [Vec3A; 3], column: &dyn Fn(Vec3A) -> Vec3A| {
             for (i, axis) in axes.into_iter().enumerate() {
                 out.columns.push((first + i) as u32);
@@ -135,9 +153,6 @@ impl<'a> SurfaceJacobian<'a> {
                 None => push(0, self.axes, &|axis| axis),
             }
         }
-        let column = |joint: usize| out.columns.iter().position(|&c| c as usize == 3 + 3 * joint);
-        let bones = self.model.weights.row(vertex);
-        out.bones.extend(bones.filter_map(|(joint, weight)| Some((column(joint)?, weight))));
     }
 }
 

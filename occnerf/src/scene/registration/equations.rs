@@ -6,6 +6,7 @@ use volrender::Camera;
 
 use crate::scene::registration::colors::Colors;
 use crate::scene::registration::corrections::{PointJacobian, SurfaceJacobian};
+use crate::scene::registration::keypoints::{DetectorModel, FramePoints, PointResidual};
 use crate::scene::registration::observations::{Edge, Observations};
 use crate::scene::registration::system::NormalEquations;
 
@@ -69,15 +70,20 @@ impl<'a> Equations<'a> {
 
     /// Evaluates the Jacobian of a vertex for [`Equations::add`].
     fn at(&mut self, v: usize) {
-        let Self { surface, jacobian, reshaped, posed, perspective, normal, .. } = self;
-        surface.at(v, jacobian);
+        self.surface.at(v, &mut self.jacobian);
+        self.by_globals(|posed| posed.vertices[v]);
+    }
+
+    /// Adds to the Jacobian of a point its derivatives by the global unknowns.
+    fn by_globals(&mut self, point: impl Fn(&Posed) -> Vec3) {
+        let Self { jacobian, reshaped, posed, perspective, normal, .. } = self;
         for (k, more) in reshaped.iter().enumerate() {
             jacobian.columns.push((normal.per_frame + k) as u32);
-            jacobian.directions.push((more.vertices[v] - posed.vertices[v]) / BETA_STEP);
+            jacobian.directions.push((point(more) - point(posed)) / BETA_STEP);
         }
         if let Some((perspective, camera)) = perspective {
             jacobian.columns.push((normal.per_frame + reshaped.len()) as u32);
-            jacobian.directions.push(perspective.derivative(camera, posed.vertices[v]));
+            jacobian.directions.push(perspective.derivative(camera, point(posed)));
         }
     }
 
@@ -105,6 +111,16 @@ impl<'a> Equations<'a> {
             self.at(v);
             let weight = independent * robust(residual * residual, noise) / (noise * noise);
             self.add(weight, residual, gradient, Vec3::ZERO);
+        }
+    }
+
+    /// Adds the residuals of key points.
+    pub fn add_keypoints(&mut self, frame: &FramePoints<'_>, detector: &DetectorModel) {
+        for PointResidual { joint, place, residual, gradients, weight } in detector.residuals(frame) {
+            self.surface.fixed(joint, place, &mut self.jacobian);
+            self.by_globals(|posed| posed.joints[joint]);
+            let rows = gradients.into_iter().zip(residual.to_array());
+            rows.for_each(|(gradient, residual)| self.add(weight, residual, gradient, Vec3::ZERO));
         }
     }
 

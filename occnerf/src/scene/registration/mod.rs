@@ -13,6 +13,7 @@ mod colors;
 mod corrections;
 mod crop;
 mod equations;
+mod keypoints;
 mod observations;
 mod pose_error;
 mod pose_prior;
@@ -32,12 +33,13 @@ use self::corrections::{Correction, corrected};
 pub(crate) use self::crop::Crop;
 pub(crate) use self::equations::robust;
 use self::equations::{BETA_STEP, Equations, Perspective};
+use self::keypoints::{DetectorModel, FramePoints};
 use self::observations::SharedEdge;
 pub(crate) use self::observations::{Edge, ObservationOptions, Observations, observe, shared_edges};
 use self::pose_error::PoseErrorModel;
 use self::system::{NormalEquations, Prior, Solution, solve};
 use crate::Error;
-use crate::capture::{Capture, Frame, Mended, Registered};
+use crate::capture::{Capture, Frame, Keypoint, Mended, Registered};
 use crate::model::subdivide::normals;
 use crate::scene::seen::dressed;
 
@@ -86,6 +88,8 @@ struct Registration<'a> {
     /// Indices of the frames with their own unknowns.
     frames: Vec<usize>,
     crops: Vec<Option<Crop>>,
+    /// Key points of each frame, in pixels of its crop.
+    keypoints: Vec<Vec<Keypoint>>,
     corrections: Vec<Correction>,
     pose_error: PoseErrorModel,
     betas: Vec<f32>,
@@ -158,7 +162,17 @@ impl<'a> Registration<'a> {
             let posed = model.pose(&model.shaped(&frame.betas), &frame.pose, frame.placement);
             Ok(Crop::new(&frame.camera, &frame.pixels()?, &posed.vertices))
         };
-        let crops = frames.par_iter().map(crop).collect::<Result<_, Error>>()?;
+        let crops = frames.par_iter().map(crop).collect::<Result<Vec<_>, Error>>()?;
+        let keypoints = frames.iter().zip(&crops).map(|(&frame, crop): (_, &Option<Crop>)| {
+            let (Some(crop), frame) = (crop, &capture.train[frame]) else { return Vec::new() };
+            let scale = crop.camera.focal / frame.camera.focal;
+            let cropped = |p: &Keypoint| {
+                let place = (p.place - frame.camera.centre) * scale + crop.camera.centre;
+                Keypoint { place, ..*p }
+            };
+            frame.keypoints.iter().map(cropped).collect()
+        });
+        let keypoints = keypoints.collect();
         let bounds = Aabb::from_points(&model.shaped(&capture.mean_betas).vertices);
         let unit = (bounds.max.y - bounds.min.y) / 1.7;
         // A capture with evaluation cameras is calibrated.
@@ -177,6 +191,7 @@ impl<'a> Registration<'a> {
             model,
             frames,
             crops,
+            keypoints,
         })
     }
 
@@ -193,6 +208,12 @@ impl<'a> Registration<'a> {
         let clothes = this.measure_clothes(&observations);
         let thicker: Vec<f32> = clothes.iter().zip(&this.clothes).map(|(next, now)| next - now).collect();
         let colors = Colors::measure(&observations, this.model.num_vertices());
+        let points = |f: usize| {
+            let camera = &this.crops[f].as_ref()?.camera;
+            Some(FramePoints { camera, points: &this.keypoints[f], posed: &bodies[f].posed })
+        };
+        let all: Vec<FramePoints<'_>> = (0..bodies.len()).filter_map(points).collect();
+        let detector = DetectorModel::measure(&all, this.model.num_joints(), this.unit);
         let mut normals: Vec<NormalEquations> = (0..this.frames.len())
             .into_par_iter()
             .map(|f| {
@@ -201,6 +222,9 @@ impl<'a> Registration<'a> {
                 let perspective = this.perspective(f);
                 let mut equations = Equations::new(this.model, (shape, posed), this.reshaped(f), camera, perspective);
                 equations.add_outline(&observations[f], &thicker, this.unit);
+                if let Some(points) = points(f) {
+                    equations.add_keypoints(&points, &detector);
+                }
                 equations.add_colors(&observations[f], &colors, options.blur);
                 equations.normal
             })

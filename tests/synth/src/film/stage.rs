@@ -81,6 +81,7 @@ impl Stage<'_> {
                     pose: self.priors[i].joints.clone(),
                     placement: self.priors[i].placement(),
                     betas: self.betas.clone(),
+                    keypoints: Vec::new(),
                 };
                 if c == 0 {
                     train.push(frame);
