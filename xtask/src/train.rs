@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, Error, Result, bail, ensure};
 use clap::Args;
-use occnerf::bake::{BakeOptions, fit};
+use occnerf::bake::fit;
 use occnerf::capture::Capture;
 use occnerf::{Config, Lpips, Method, Model, Person, Scene, Trainer, checkpoint_config};
 
@@ -220,7 +220,7 @@ pub fn run_one(
         return score_run(directory, run, &scene, &prior, lpips, metrics).map(Some);
     }
     if run.train.method == Method::Surface {
-        let (avatar, report) = telling("fitting the surface", || fit(&scene, &BakeOptions::default()))?;
+        let (avatar, report) = telling("fitting the surface", || fit(&scene))?;
         say!("surface of {} triangles, an atlas of {} × {}", report.faces, report.side, report.side);
         still_held(directory)?;
         avatar.save(&baked::path(directory)).map_err(Error::from).map_err(results_in(directory))?;
@@ -375,12 +375,12 @@ fn baselines(run: &RunConfig, source: &Source, lpips: Option<&Lpips>) -> Result<
         run.train.method = method;
         let mut metrics = unscored(&run, drawn, seconds);
         metrics.lpips = network_name(lpips);
-        *split.of(&mut metrics.splits) = Some(drawn.score(&scene, split, lpips, 1, |_, _| {})?);
+        *split.of(&mut metrics.splits) = Some(drawn.score(&scene, split, lpips, |_, _| {})?);
         Ok(metrics)
     };
     let mut all = vec![scored(Method::Prior, &Drawn::Prior(colors.clone()), seconds)?];
     if method.has_field() {
-        let (avatar, report) = fit(&scene, &BakeOptions::default())?;
+        let (avatar, report) = fit(&scene)?;
         let drawn = Drawn::Avatar { body: &scene.body, light: colors.light, avatar: &avatar };
         all.push(scored(Method::Surface, &drawn, seconds + report.seconds)?);
     }
