@@ -7,7 +7,7 @@ use anyhow::{Context, Result, ensure};
 use clap::{Args, ValueEnum};
 use image::RgbImage;
 use indicatif::ProgressBar;
-use occnerf::bake::{Avatar, BakedRenderer, bake};
+use occnerf::bake::{Avatar, BakedRenderer};
 use occnerf::capture::Light;
 use occnerf::{
     Body, FieldRenderer, Label, Lpips, Method, Model, Person, PreparedFrame, PriorColors, PriorRenderer, Renderer,
@@ -18,7 +18,7 @@ use visibility::Samples;
 
 use crate::network::{load_lpips, network_name};
 use crate::optimise::logged_seconds;
-use crate::process::{Ending, Lock, is_read_only, note, one_line, say, telling};
+use crate::process::{Ending, Lock, is_read_only, note, one_line, say};
 use crate::run::{self, Metrics, RunConfig, Splits, TRAINING_VIEWS, evaluation_title, make_directory, peak_rss_bytes};
 use crate::{baked, pictures, report, table};
 
@@ -311,22 +311,6 @@ pub fn score_run(
         }
     })?;
     Ok(metrics)
-}
-
-/// Bakes a trained person and scores it under `directory` as [`score_run`] does. Baking time adds to
-/// the seconds of `trained`, the run's own metrics, whose identity it keeps; parameters are texel colours and vertices.
-pub fn score_baked(
-    directory: &Path,
-    run: &RunConfig,
-    model: &Model,
-    scene: &Scene,
-    lpips: Option<&Lpips>,
-    trained: Metrics,
-) -> Result<Metrics> {
-    let (avatar, report) = telling("baking", || bake(model, Some(scene)))?;
-    let (train_seconds, parameters) = (trained.train_seconds + report.seconds, avatar.num_parameters());
-    let drawn = Drawn::Avatar { body: model.body(), light: model.light(), avatar: &avatar };
-    score_run(directory, run, scene, &drawn, lpips, Metrics { train_seconds, parameters, ..trained })
 }
 
 /// Writes the contact sheets of both splits.

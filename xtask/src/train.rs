@@ -11,7 +11,7 @@ use occnerf::{Config, Lpips, Method, Model, Person, Scene, Trainer, checkpoint_c
 
 use crate::auto;
 use crate::baked;
-use crate::eval::{Drawn, Split, check_pictures, score_baked, score_run, scored_frames, unscored};
+use crate::eval::{Drawn, Split, check_pictures, score_run, scored_frames, unscored};
 use crate::network::{load_lpips, network_name};
 use crate::optimise::{RunOptions, SavingArguments, optimise};
 use crate::process::{Lock, note, results_in, say, still_held, telling};
@@ -291,31 +291,12 @@ pub fn run_unless_finished(
     })
 }
 
-/// The scores under `directory` of the baked person of the run under `trained`, which is brought to
-/// its end first where it has not come to it.
-pub fn baked_unless_finished(
-    directory: &Path,
-    trained: &Path,
-    run: &RunConfig,
-    source: &Source,
-    lpips: Option<&Lpips>,
-    interval: Duration,
-) -> Result<Metrics> {
-    let [name, of] = [directory, trained].map(|path| path.file_name().unwrap_or_default().to_string_lossy());
-    unless_finished(directory, trained, run, lpips, |_| {
-        let metrics = run_unless_finished(trained, &of, run, source, lpips, interval)?;
-        say!("{name}: baking");
-        run.write(directory)?;
-        score_baked(directory, run, &Model::load(trained)?, &source.scene(&run.train)?, lpips, metrics)
-    })
-}
-
 /// The scores under `directory` if they are of the same settings and of the model under `trained`;
 /// else what `make` makes, which is told whether a run with these settings has begun there.
 ///
 /// # Errors
 /// A run of another scene or with other settings, whose work would be lost.
-fn unless_finished(
+pub fn unless_finished(
     directory: &Path,
     trained: &Path,
     run: &RunConfig,

@@ -1,7 +1,7 @@
 //! A run of a sweep: its description, its outcome, and the child process that takes it there.
 
 use std::io::{BufRead, Read, Write};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
@@ -10,7 +10,8 @@ use glam::Vec3;
 use occnerf::bake::{BakedRenderer, bake, fit};
 use occnerf::capture::Capture;
 use occnerf::{
-    Config, FieldRenderer, PreparedFrame, PriorColors, PriorRenderer, Renderer, Scene, SplitMetrics, evaluate,
+    Config, FieldRenderer, Lpips, Model, PreparedFrame, PriorColors, PriorRenderer, Renderer, Scene, SplitMetrics,
+    evaluate,
 };
 use serde::{Deserialize, Serialize};
 use smpl::BodyModel;
@@ -19,11 +20,13 @@ use visibility::Samples;
 use crate::bench::Difficulty;
 use crate::methods::Method;
 use crate::scene::SceneOptions;
+use xtask::eval::{Drawn, score_run};
 use xtask::network::load_lpips;
-use xtask::process::{Ending, Guard, one_line, say};
+use xtask::process::{Ending, Guard, one_line, say, telling};
 use xtask::run::{Metrics, RunConfig, peak_rss_bytes};
 use xtask::source;
-use xtask::train::baked_unless_finished;
+use xtask::source::Source;
+use xtask::train::{run_unless_finished, unless_finished};
 
 /// Longest job on standard input.
 const MAX_JOB_BYTES: u64 = 1 << 20;
@@ -138,7 +141,7 @@ fn keep_run(job: &Job, Keep { directory, trained, lpips }: &Keep) -> Result<Outc
     let run = RunConfig::new(&source, job.config.clone())?;
     let (lpips, name) = (load_lpips(lpips.as_deref())?, directory.file_name().unwrap_or_default().to_string_lossy());
     let metrics = match trained {
-        Some(trained) => baked_unless_finished(directory, trained, &run, &source, lpips.as_ref(), INTERVAL)?,
+        Some(trained) => baked_unless_finished(directory, trained, &run, &source, lpips.as_ref())?,
         None => job.method.run_unless_finished(directory, &name, &run, &source, lpips.as_ref(), INTERVAL)?,
     };
     let mut outcome = Outcome {
@@ -151,6 +154,28 @@ fn keep_run(job: &Job, Keep { directory, trained, lpips }: &Keep) -> Result<Outc
         outcome.take(split);
     }
     Ok(Outcome { metrics: Some(metrics), ..outcome })
+}
+
+/// The scores under `directory` of the baked person of the run under `trained`, which is trained
+/// first if need be. Baking time adds to the run's seconds; parameters are texel colours and vertices.
+fn baked_unless_finished(
+    directory: &Path,
+    trained: &Path,
+    run: &RunConfig,
+    source: &Source,
+    lpips: Option<&Lpips>,
+) -> Result<Metrics> {
+    let [name, of] = [directory, trained].map(|path| path.file_name().unwrap_or_default().to_string_lossy());
+    unless_finished(directory, trained, run, lpips, |_| {
+        let metrics = run_unless_finished(trained, &of, run, source, lpips, INTERVAL)?;
+        say!("{name}: baking");
+        run.write(directory)?;
+        let (model, scene) = (Model::load(trained)?, source.scene(&run.train)?);
+        let (avatar, report) = telling("baking", || bake(&model, Some(&scene)))?;
+        let (train_seconds, parameters) = (metrics.train_seconds + report.seconds, avatar.num_parameters());
+        let drawn = Drawn::Avatar { body: model.body(), light: model.light(), avatar: &avatar };
+        score_run(directory, run, &scene, &drawn, lpips, Metrics { train_seconds, parameters, ..metrics })
+    })
 }
 
 /// Trains and scores.
