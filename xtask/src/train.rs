@@ -7,7 +7,7 @@ use anyhow::{Context, Error, Result, bail, ensure};
 use clap::Args;
 use occnerf::bake::fit;
 use occnerf::capture::Capture;
-use occnerf::{Config, Lpips, Method, Model, Person, Scene, Trainer, checkpoint_config};
+use occnerf::{Config, Lpips, Method, Person, Scene, Trainer, checkpoint_config};
 
 use crate::auto;
 use crate::baked;
