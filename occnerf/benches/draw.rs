@@ -6,7 +6,7 @@ use std::sync::OnceLock;
 
 use divan::Bencher;
 use glam::Affine3A;
-use occnerf::bake::{Avatar, BakeOptions, BakedRenderer, bake};
+use occnerf::bake::{Avatar, BakedRenderer, bake};
 use occnerf::{Config, Method, Model, Preset, Scene, Trainer};
 use visibility::Samples;
 use volrender::Camera;
@@ -41,7 +41,7 @@ fn trained() -> &'static Trained {
 
 fn avatar() -> &'static Avatar {
     static AVATAR: OnceLock<Avatar> = OnceLock::new();
-    AVATAR.get_or_init(|| bake(&trained().model, Some(&trained().scene), &BakeOptions::default()).unwrap().0)
+    AVATAR.get_or_init(|| bake(&trained().model, Some(&trained().scene)).unwrap().0)
 }
 
 fn draw(bencher: Bencher<'_, '_>, samples: Samples, size: (u32, u32), threads: usize) {
@@ -100,5 +100,5 @@ fn skin(bencher: Bencher<'_, '_>) {
 /// Baking, all threads.
 #[divan::bench(sample_count = 3)]
 fn baking(bencher: Bencher<'_, '_>) {
-    bencher.bench_local(|| bake(&trained().model, Some(&trained().scene), &BakeOptions::default()).unwrap());
+    bencher.bench_local(|| bake(&trained().model, Some(&trained().scene)).unwrap());
 }

@@ -75,28 +75,6 @@ mod one_frame {
         });
     }
 
-    /// Backward of shape and pose, all inputs; the forward is not timed.
-    fn run_backward(bencher: Bencher<'_, '_>, body: &BodyModel) {
-        let (shaped, pose) = (body.shaped(&BETAS), pose(0));
-        let posed = body.pose(&shaped, &pose, Placement::default());
-        let d_joints = vec![Vec3::X; body.num_joints()];
-        bencher.bench(|| {
-            let d_vertices = black_box(&posed.vertices);
-            let gradient = body.pose_backward(&shaped, &pose, Placement::default(), &posed, d_vertices, &d_joints);
-            (body.shaped_backward(&gradient.shaped), gradient)
-        });
-    }
-
-    #[divan::bench]
-    fn sparse_backward(bencher: Bencher<'_, '_>) {
-        run_backward(bencher, &body());
-    }
-
-    #[divan::bench]
-    fn dense_backward(bencher: Bencher<'_, '_>) {
-        run_backward(bencher, &super::dense());
-    }
-
     #[divan::bench]
     fn pose_only(bencher: Bencher<'_, '_>) {
         let body = body();

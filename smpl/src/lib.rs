@@ -29,7 +29,6 @@ mod load;
 mod model;
 mod motion;
 mod pose;
-mod pose_backward;
 mod rotation;
 mod saved;
 mod sparse;
@@ -49,6 +48,5 @@ pub use motion::{
     MotionField, MotionFrame, MotionSample, SurfaceMotion, SurfacePoint, WeightVolume, WeightVolumeConfig,
 };
 pub use pose::{Placement, Posed, skin};
-pub use pose_backward::PoseGradient;
 pub use rotation::rodrigues;
 pub use sparse::{SkinningWeights, SparseRows};

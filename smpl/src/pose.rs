@@ -8,7 +8,7 @@ use crate::rotation::rodrigues;
 use crate::sparse::SkinningWeights;
 
 /// Vertices per parallel task.
-pub(crate) const CHUNK: usize = 1024;
+const CHUNK: usize = 1024;
 
 /// Frames per pass over the pose blend shapes: a cache line of coefficients.
 const LANES: usize = 16;

@@ -5,7 +5,7 @@
 
 use anyhow::Result;
 use glam::Vec3;
-use occnerf::bake::{BakeOptions, fit, skeleton};
+use occnerf::bake::{fit, skeleton};
 use occnerf::{Config, Label, Method, PreparedFrame, Scene, Trainer, pinhole};
 use visibility::{RasterOptions, Rasterizer};
 
@@ -40,7 +40,7 @@ pub fn weigh(source: &Source, config: &Config) -> Result<Verdict> {
     say!("auto: a field of {steps} steps against the surface, on every {HOLD_OUT}th frame");
     let scene = source.scene(&config)?;
     let parts = scene.eval.iter().map(|frame| parts(&scene, frame)).collect::<Result<Vec<_>>>()?;
-    let (avatar, _) = fit(&scene, &BakeOptions::default())?;
+    let (avatar, _) = fit(&scene)?;
     let light = scene.colors()?.light;
     let surface = Trial::of(&Drawn::Avatar { body: &scene.body, light, avatar: &avatar }, &scene, &parts)?;
     let mut trainer = Trainer::new(&scene, config)?;
@@ -93,7 +93,7 @@ struct Trial {
 impl Trial {
     fn of(drawn: &Drawn<'_>, scene: &Scene, parts: &[Vec<usize>]) -> Result<Self> {
         let (mut trial, mut of_frame, mut unread) = (Self::default(), parts.iter(), Ok(()));
-        let scores = drawn.score(scene, Split::NovelView, None, 1, |frame, rendering| {
+        let scores = drawn.score(scene, Split::NovelView, None, |frame, rendering| {
             let Some(parts) = of_frame.next() else { return };
             match frame.pixels() {
                 Ok(truth) => {

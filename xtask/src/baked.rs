@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Error, Result};
 use occnerf::Scene;
-use occnerf::bake::{Avatar, BakeOptions, bake};
+use occnerf::bake::{Avatar, bake};
 
 use crate::process::{is_read_only, note, one_line, results_in, say, telling};
 use crate::run::{AVATAR, RunConfig, identity, model};
@@ -25,7 +25,7 @@ pub fn avatar(run: &Path, config: &RunConfig) -> Result<Avatar> {
     }
     let model = model(run, config)?;
     let scene = scene(run, config).map_err(|error| note!("baking without the capture: {error:#}")).ok();
-    let (mut avatar, report) = telling("baking", || bake(&model, scene.as_ref(), &BakeOptions::default()))?;
+    let (mut avatar, report) = telling("baking", || bake(&model, scene.as_ref()))?;
     avatar.source = source;
     match avatar.save(&path).map_err(Error::from).map_err(results_in(run)) {
         Err(error) if is_read_only(&error) => note!("{}: the baked person is not kept", one_line(&error)),

@@ -5,7 +5,7 @@ use clap::{Parser, Subcommand};
 
 use crate::process::{EXIT_CODES, delivered};
 use crate::run::use_threads;
-use crate::{check, convert, eval, export, import, list, render, train, view};
+use crate::{check, eval, export, import, list, render, train, view};
 
 /// Turns a video of a moving person, partly hidden behind objects, into a 3-D person that renders
 /// from any side.
@@ -33,8 +33,6 @@ enum Command {
     Import(import::ImportArguments),
     /// Checks that a capture's body lies on its person: a picture, a table, and likely mistakes.
     Check(check::CheckArguments),
-    /// Converts a body model, .npz or .pkl, to .safetensors.
-    Convert(convert::ConvertArguments),
 }
 
 impl Arguments {
@@ -57,7 +55,6 @@ impl Arguments {
             Command::Export(arguments) => export::export(&arguments),
             Command::View(arguments) => view::view(&arguments),
             Command::Import(arguments) => import::import(&arguments),
-            Command::Convert(arguments) => convert::convert(&arguments),
         }
     }
 }

@@ -7,18 +7,18 @@ use anyhow::{Context, Result, ensure};
 use clap::{Args, ValueEnum};
 use image::RgbImage;
 use indicatif::ProgressBar;
-use occnerf::bake::{Avatar, BakeOptions, BakedRenderer, bake};
+use occnerf::bake::{Avatar, BakedRenderer};
 use occnerf::capture::Light;
 use occnerf::{
     Body, FieldRenderer, Label, Lpips, Method, Model, Person, PreparedFrame, PriorColors, PriorRenderer, Renderer,
-    Rendering, Scene, SplitMetrics, Supersampled, evaluate,
+    Rendering, Scene, SplitMetrics, evaluate,
 };
 use rayon::prelude::*;
 use visibility::Samples;
 
 use crate::network::{load_lpips, network_name};
 use crate::optimise::logged_seconds;
-use crate::process::{Ending, Lock, is_read_only, note, one_line, say, telling};
+use crate::process::{Ending, Lock, is_read_only, note, one_line, say};
 use crate::run::{self, Metrics, RunConfig, Splits, TRAINING_VIEWS, evaluation_title, make_directory, peak_rss_bytes};
 use crate::{baked, pictures, report, table};
 
@@ -59,9 +59,6 @@ pub struct EvalArguments {
     /// Weights to score LPIPS with, as for `train`
     #[arg(long, value_name = "PATH")]
     lpips: Option<PathBuf>,
-    /// Samples a pixel in each direction; scores of more than one are only printed
-    #[arg(long, default_value_t = 1, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=8))]
-    side: u32,
     /// The baked person, as `render --baked` draws them, in place of the field; scores are only
     /// printed
     #[arg(long)]
@@ -101,7 +98,7 @@ pub fn eval(arguments: &EvalArguments) -> Result<()> {
     let lpips = load_lpips(arguments.lpips.as_deref())?;
     let directory = &arguments.run;
     let run = RunConfig::read(directory)?;
-    let writes = arguments.side == 1 && !(arguments.baked && run.train.method.has_field());
+    let writes = !(arguments.baked && run.train.method.has_field());
     let _lock = match if writes { Lock::take(directory) } else { Lock::share(directory) } {
         Err(error) if is_read_only(&error) => Lock::share(directory)?,
         lock => lock?,
@@ -142,8 +139,7 @@ pub fn eval(arguments: &EvalArguments) -> Result<()> {
     for split in [Split::NovelView, Split::TrainView] {
         let empty = split == Split::NovelView && scene.eval.is_empty();
         if arguments.split.is_none_or(|only| only == split) {
-            let side = arguments.side;
-            let scores = drawn.score_with_bar(&scene, split, lpips.as_ref(), side, |_, _| {})?;
+            let scores = drawn.score_with_bar(&scene, split, lpips.as_ref(), |_, _| {})?;
             *split.of(&mut metrics.splits) = (!empty).then_some(scores);
         } else if let Some(scores) = split.of(&mut metrics.splits).as_mut().filter(|s| s.lpips_full.is_some()) {
             // One network name holds for both splits; scores of another are dropped.
@@ -225,24 +221,19 @@ impl Drawn<'_> {
         })
     }
 
-    /// Scores a split with `side` × `side` samples a pixel; `seen` gets each picture.
+    /// Scores a split; `seen` gets each picture.
     pub fn score(
         &self,
         scene: &Scene,
         split: Split,
         lpips: Option<&Lpips>,
-        side: u32,
         seen: impl FnMut(&PreparedFrame, &Rendering),
     ) -> Result<SplitMetrics> {
         let frames: Vec<&PreparedFrame> = match split {
             Split::NovelView => scene.eval.iter().collect(),
             Split::TrainView => scored_train_frames(scene).collect(),
         };
-        let mut renderer = self.renderer(scene)?;
-        if side > 1 {
-            renderer = Box::new(Supersampled::new(renderer, side));
-        }
-        Ok(evaluate(scene, renderer.as_mut(), &frames, lpips, seen)?)
+        Ok(evaluate(scene, self.renderer(scene)?.as_mut(), &frames, lpips, seen)?)
     }
 
     fn score_with_bar(
@@ -250,7 +241,6 @@ impl Drawn<'_> {
         scene: &Scene,
         split: Split,
         lpips: Option<&Lpips>,
-        side: u32,
         mut seen: impl FnMut(&PreparedFrame, &Rendering),
     ) -> Result<SplitMetrics> {
         let frames = match split {
@@ -258,7 +248,7 @@ impl Drawn<'_> {
             Split::TrainView => scored_train_frames(scene).count(),
         };
         let bar = ProgressBar::new(frames as u64).with_message("scoring");
-        let metrics = self.score(scene, split, lpips, side, |frame, rendering| {
+        let metrics = self.score(scene, split, lpips, |frame, rendering| {
             bar.inc(1);
             seen(frame, rendering);
         })?;
@@ -282,7 +272,7 @@ pub fn score_run(
     let names: BTreeSet<&str> = scene.eval.iter().map(|f| f.camera_name.as_str()).collect();
     let most = pictures::MAX_SHEET_PIXELS / (2 * SHEET_INSTANTS * names.len().max(1)) as u64;
     let mut index = 0;
-    let novel = drawn.score_with_bar(scene, Split::NovelView, lpips, 1, |frame, rendering| {
+    let novel = drawn.score_with_bar(scene, Split::NovelView, lpips, |frame, rendering| {
         if cameras.last().is_none_or(|(name, _)| *name != frame.camera_name) {
             cameras.push((frame.camera_name.clone(), Vec::new()));
             index = 0;
@@ -296,7 +286,7 @@ pub fn score_run(
     })?;
     let mut row = Vec::new();
     let most = pictures::MAX_SHEET_PIXELS / (2 * TRAIN_PICTURES) as u64;
-    let train = drawn.score_with_bar(scene, Split::TrainView, lpips, 1, |frame, rendering| {
+    let train = drawn.score_with_bar(scene, Split::TrainView, lpips, |frame, rendering| {
         if row.len() < TRAIN_PICTURES {
             row.push(beside_truth(frame, rendering, most));
         }
@@ -321,22 +311,6 @@ pub fn score_run(
         }
     })?;
     Ok(metrics)
-}
-
-/// Bakes a trained person and scores it under `directory` as [`score_run`] does. Baking time adds to
-/// the seconds of `trained`, the run's own metrics, whose identity it keeps; parameters are texel colours and vertices.
-pub fn score_baked(
-    directory: &Path,
-    run: &RunConfig,
-    model: &Model,
-    scene: &Scene,
-    lpips: Option<&Lpips>,
-    trained: Metrics,
-) -> Result<Metrics> {
-    let (avatar, report) = telling("baking", || bake(model, Some(scene), &BakeOptions::default()))?;
-    let (train_seconds, parameters) = (trained.train_seconds + report.seconds, avatar.num_parameters());
-    let drawn = Drawn::Avatar { body: model.body(), light: model.light(), avatar: &avatar };
-    score_run(directory, run, scene, &drawn, lpips, Metrics { train_seconds, parameters, ..trained })
 }
 
 /// Writes the contact sheets of both splits.

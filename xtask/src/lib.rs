@@ -6,7 +6,6 @@ mod avatar;
 pub mod baked;
 mod check;
 mod commands;
-mod convert;
 pub mod eval;
 mod export;
 mod html;

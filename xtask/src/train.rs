@@ -5,13 +5,13 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, Error, Result, bail, ensure};
 use clap::Args;
-use occnerf::bake::{BakeOptions, fit};
+use occnerf::bake::fit;
 use occnerf::capture::Capture;
-use occnerf::{Config, Lpips, Method, Model, Person, Scene, Trainer, checkpoint_config};
+use occnerf::{Config, Lpips, Method, Person, Scene, Trainer, checkpoint_config};
 
 use crate::auto;
 use crate::baked;
-use crate::eval::{Drawn, Split, check_pictures, score_baked, score_run, scored_frames, unscored};
+use crate::eval::{Drawn, Split, check_pictures, score_run, scored_frames, unscored};
 use crate::network::{load_lpips, network_name};
 use crate::optimise::{RunOptions, SavingArguments, optimise};
 use crate::process::{Lock, note, results_in, say, still_held, telling};
@@ -220,7 +220,7 @@ pub fn run_one(
         return score_run(directory, run, &scene, &prior, lpips, metrics).map(Some);
     }
     if run.train.method == Method::Surface {
-        let (avatar, report) = telling("fitting the surface", || fit(&scene, &BakeOptions::default()))?;
+        let (avatar, report) = telling("fitting the surface", || fit(&scene))?;
         say!("surface of {} triangles, an atlas of {} × {}", report.faces, report.side, report.side);
         still_held(directory)?;
         avatar.save(&baked::path(directory)).map_err(Error::from).map_err(results_in(directory))?;
@@ -291,31 +291,12 @@ pub fn run_unless_finished(
     })
 }
 
-/// The scores under `directory` of the baked person of the run under `trained`, which is brought to
-/// its end first where it has not come to it.
-pub fn baked_unless_finished(
-    directory: &Path,
-    trained: &Path,
-    run: &RunConfig,
-    source: &Source,
-    lpips: Option<&Lpips>,
-    interval: Duration,
-) -> Result<Metrics> {
-    let [name, of] = [directory, trained].map(|path| path.file_name().unwrap_or_default().to_string_lossy());
-    unless_finished(directory, trained, run, lpips, |_| {
-        let metrics = run_unless_finished(trained, &of, run, source, lpips, interval)?;
-        say!("{name}: baking");
-        run.write(directory)?;
-        score_baked(directory, run, &Model::load(trained)?, &source.scene(&run.train)?, lpips, metrics)
-    })
-}
-
 /// The scores under `directory` if they are of the same settings and of the model under `trained`;
 /// else what `make` makes, which is told whether a run with these settings has begun there.
 ///
 /// # Errors
 /// A run of another scene or with other settings, whose work would be lost.
-fn unless_finished(
+pub fn unless_finished(
     directory: &Path,
     trained: &Path,
     run: &RunConfig,
@@ -375,12 +356,12 @@ fn baselines(run: &RunConfig, source: &Source, lpips: Option<&Lpips>) -> Result<
         run.train.method = method;
         let mut metrics = unscored(&run, drawn, seconds);
         metrics.lpips = network_name(lpips);
-        *split.of(&mut metrics.splits) = Some(drawn.score(&scene, split, lpips, 1, |_, _| {})?);
+        *split.of(&mut metrics.splits) = Some(drawn.score(&scene, split, lpips, |_, _| {})?);
         Ok(metrics)
     };
     let mut all = vec![scored(Method::Prior, &Drawn::Prior(colors.clone()), seconds)?];
     if method.has_field() {
-        let (avatar, report) = fit(&scene, &BakeOptions::default())?;
+        let (avatar, report) = fit(&scene)?;
         let drawn = Drawn::Avatar { body: &scene.body, light: colors.light, avatar: &avatar };
         all.push(scored(Method::Surface, &drawn, seconds + report.seconds)?);
     }

@@ -15,6 +15,7 @@ mod gate;
 mod humannerf;
 mod image;
 mod import;
+mod json;
 mod light;
 mod names;
 mod options;

@@ -32,27 +32,15 @@ const MOST: u32 = 2;
 const TEXELS_A_PIXEL: f32 = 2.0;
 /// Share of the training frames with a point visible for full confidence.
 const FULL_CONFIDENCE: f32 = 0.1;
+/// Largest side of the atlas, texels; the resolution of the training frames decides below.
+const MAX_SIDE: u32 = 2048;
+/// Steps of texture optimisation on the training frames.
+const REFINEMENTS: u32 = 4;
+/// Frames per second of the video's motion.
+const FPS: f32 = 30.0;
 /// [`CanonicalField::grazing`]; 2 to 6 cm draw outlines that fit those of pictures (IoU .956 to .960
 /// on the demo, whatever the number of samples), 3 to 4 best.
 const GRAZING: f32 = 0.035;
-
-/// Options of [`bake`].
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct BakeOptions {
-    /// Largest side of the atlas, texels; the resolution of the training frames decides below.
-    pub atlas: u32,
-    /// Steps of texture optimisation on the training frames; 0 keeps the field's colours.
-    pub refinements: u32,
-    /// Frames per second of the video's motion.
-    pub fps: f32,
-}
-
-impl Default for BakeOptions {
-    /// At most 2048 × 2048 texels.
-    fn default() -> Self {
-        Self { atlas: 2048, refinements: 4, fps: 30.0 }
-    }
-}
 
 /// Statistics of [`bake`].
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -78,11 +66,11 @@ pub struct BakeReport {
 /// optimisation; without it all confidence is 1 and the texture is the field's.
 ///
 /// # Errors
-/// [`Error::Scene`] for options outside their ranges, a body that no camera sees, or one that needs
-/// more charts than the atlas has room for; those of frames that cannot be decoded.
-pub fn bake(model: &Model, scene: Option<&Scene>, options: &BakeOptions) -> Result<(Avatar, BakeReport), Error> {
+/// [`Error::Scene`] for a body of more than [`MAX_JOINTS`] joints, one that no camera sees, or one that
+/// needs more charts than the atlas has room for; those of frames that cannot be decoded.
+pub fn bake(model: &Model, scene: Option<&Scene>) -> Result<(Avatar, BakeReport), Error> {
     let start = Instant::now();
-    let pixel = options.check(&model.body, model.frames())?;
+    let pixel = checked_pixel(&model.body, model.frames())?;
     let vertices = model.body.canonical.vertices.len();
     let seen = scene.map_or_else(|| Ok(vec![1.0; vertices]), seen)?;
     let mut code = VertexCode::default();
@@ -90,13 +78,11 @@ pub fn bake(model: &Model, scene: Option<&Scene>, options: &BakeOptions) -> Resu
     let extent = model.measure_extent(&code);
     let evaluate = |places: &[Place]| evaluate(model, &code, &extent, places);
     let field = CanonicalField { evaluate: &evaluate, grazing: GRAZING, reach: extent.farthest };
-    let (mut avatar, mut report) = surface(&model.body, &field, &seen, pixel, options)?;
-    add_motion(&mut avatar, &model.body, model.frames(), model.light(), options.fps);
+    let (mut avatar, mut report) = surface(&model.body, &field, &seen, pixel)?;
+    add_motion(&mut avatar, &model.body, model.frames(), model.light());
     if let Some(scene) = scene {
         avatar.name.clone_from(&scene.name);
-        if options.refinements > 0 {
-            report.errors = refine(scene, model.light(), &mut avatar, options.refinements)?;
-        }
+        report.errors = refine(scene, model.light(), &mut avatar, REFINEMENTS)?;
     }
     report.seconds = start.elapsed().as_secs_f64();
     Ok((avatar, report))
@@ -107,10 +93,10 @@ pub fn bake(model: &Model, scene: Option<&Scene>, options: &BakeOptions) -> Resu
 ///
 /// # Errors
 /// Those of [`bake`].
-pub fn fit(scene: &Scene, options: &BakeOptions) -> Result<(Avatar, BakeReport), Error> {
+pub fn fit(scene: &Scene) -> Result<(Avatar, BakeReport), Error> {
     let start = Instant::now();
     let frames: Vec<Arc<PosedView>> = scene.train.iter().map(|frame| Arc::clone(&frame.view)).collect();
-    let pixel = options.check(&scene.body, &frames)?;
+    let pixel = checked_pixel(&scene.body, &frames)?;
     let colors = scene.colors()?;
     let (prior, faces) = (&scene.body.canonical.vertices, &scene.body.model.faces);
     let relief = Relief::new(prior, faces, pixel);
@@ -123,34 +109,22 @@ pub fn fit(scene: &Scene, options: &BakeOptions) -> Result<(Avatar, BakeReport),
         let colour = |texel: &Texel| colors.at(texel.parent, relief.barycentric(texel, faces)).truncate();
         texels.par_iter().map(colour).collect()
     };
-    let (mut avatar, mut report) = assemble(&scene.body, &relief, &heights, &seen(scene)?, pixel, options, paint)?;
-    add_motion(&mut avatar, &scene.body, &frames, colors.light, options.fps);
+    let (mut avatar, mut report) = assemble(&scene.body, &relief, &heights, &seen(scene)?, pixel, paint)?;
+    add_motion(&mut avatar, &scene.body, &frames, colors.light);
     avatar.name.clone_from(&scene.name);
-    report.errors = refine(scene, colors.light, &mut avatar, options.refinements)?;
+    report.errors = refine(scene, colors.light, &mut avatar, REFINEMENTS)?;
     report.seconds = start.elapsed().as_secs_f64();
     Ok((avatar, report))
 }
 
-impl BakeOptions {
-    /// Checks the options against a body and its frames, and returns the width of a pixel of these,
-    /// normalised metres.
-    fn check(&self, body: &Body, frames: &[Arc<PosedView>]) -> Result<f32, Error> {
-        let refuse = |what: String| Err(Error::Scene(format!("bake: {what}")));
-        if !(64..=2048).contains(&self.atlas) {
-            return refuse(format!("an atlas of {} texels, expected 64 to 2048", self.atlas));
-        }
-        if !(self.fps > 0.0 && self.fps <= 1e6) {
-            return refuse(format!("{} frames a second", self.fps));
-        }
-        let joints = body.model.num_joints();
-        if joints > MAX_JOINTS {
-            return refuse(format!("{joints} joints, at most {MAX_JOINTS}"));
-        }
-        match pixel_width(frames.iter().map(Arc::as_ref)) {
-            Some(pixel) => Ok(pixel),
-            None => refuse("no training frame has the body before its camera".to_owned()),
-        }
+/// The width of a pixel of the frames, normalised metres, of a body that can be baked.
+fn checked_pixel(body: &Body, frames: &[Arc<PosedView>]) -> Result<f32, Error> {
+    let joints = body.model.num_joints();
+    if joints > MAX_JOINTS {
+        return Err(Error::Scene(format!("bake: {joints} joints, at most {MAX_JOINTS}")));
     }
+    let pixel = pixel_width(frames.iter().map(Arc::as_ref));
+    pixel.ok_or_else(|| Error::Scene("bake: no training frame has the body before its camera".to_owned()))
 }
 
 /// Confidence of each vertex of the prior, 0 to 1.
@@ -194,12 +168,11 @@ pub(super) fn surface(
     field: &CanonicalField<'_>,
     seen: &[f32],
     pixel: f32,
-    options: &BakeOptions,
 ) -> Result<(Avatar, BakeReport), Error> {
     let relief = Relief::new(&body.canonical.vertices, &body.model.faces, pixel);
     let (heights, holes) = heights(field, &body.surface, &relief.feet, &relief.mesh);
     let paint = |texels: &[Texel]| paint(field, &body.surface, &relief.feet, &heights, texels);
-    let (avatar, report) = assemble(body, &relief, &heights, seen, pixel, options, paint)?;
+    let (avatar, report) = assemble(body, &relief, &heights, seen, pixel, paint)?;
     Ok((avatar, BakeReport { holes, ..report }))
 }
 
@@ -210,11 +183,10 @@ fn assemble(
     heights: &[f32],
     seen: &[f32],
     pixel: f32,
-    options: &BakeOptions,
     paint: impl FnOnce(&[Texel]) -> Vec<Vec3>,
 ) -> Result<(Avatar, BakeReport), Error> {
     let (prior, faces) = (&body.canonical.vertices, &body.model.faces);
-    let layout = AtlasLayout::new(prior, faces, pixel / TEXELS_A_PIXEL, options.atlas);
+    let layout = AtlasLayout::new(prior, faces, pixel / TEXELS_A_PIXEL, MAX_SIDE);
     let layout = layout.ok_or_else(|| Error::Scene("bake: too many charts".to_owned()))?;
     let split = Split::new(mesh, &layout);
     let places = split.places(&layout, feet);
@@ -361,7 +333,7 @@ fn atlas(side: u32, texels: &[Texel], colours: &[Vec3], confidence: &[f32]) -> A
 }
 
 /// Gives an avatar the motion, cameras and light of a video, in the avatar's world.
-fn add_motion(avatar: &mut Avatar, body: &Body, frames: &[Arc<PosedView>], light: Light, fps: f32) {
+fn add_motion(avatar: &mut Avatar, body: &Body, frames: &[Arc<PosedView>], light: Light) {
     let turn = turn_upright(upright(body, frames.iter().map(Arc::as_ref)));
     let bones = |view: &Arc<PosedView>| {
         let placed = |bone: &Affine3A| {
@@ -378,6 +350,6 @@ fn add_motion(avatar: &mut Avatar, body: &Body, frames: &[Arc<PosedView>], light
         camera
     };
     avatar.light.slope = turn * light.slope;
-    avatar.clips = vec![Clip { name: "video".to_owned(), motion: motion_of_bones(&avatar.skeleton, &bones, fps) }];
+    avatar.clips = vec![Clip { name: "video".to_owned(), motion: motion_of_bones(&avatar.skeleton, &bones, FPS) }];
     avatar.cameras = frames.iter().map(camera).collect();
 }

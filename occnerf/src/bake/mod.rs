@@ -23,7 +23,7 @@ use crate::Error;
 
 pub use avatar::{Atlas, Avatar, Clip, Joint, MAX_ATLAS_SIDE, MAX_JOINTS};
 pub use draw::BakedRenderer;
-pub use make::{BakeOptions, BakeReport, bake, fit};
+pub use make::{BakeReport, bake, fit};
 pub use skeleton::{motion_of_bones, skeleton, turn_upright};
 
 /// Replaces a file atomically.

@@ -5,7 +5,7 @@ use visibility::Samples;
 
 use super::charts::{AtlasLayout, PADDING};
 use super::draw::BakedRenderer;
-use super::make::{BakeOptions, bake, fit, surface};
+use super::make::{bake, fit, surface};
 use super::surface::{CanonicalField, Place};
 use super::{Avatar, BakeReport, skeleton};
 use crate::capture::{Capture, Light};
@@ -24,12 +24,12 @@ fn known_colour(at: Vec3) -> Vec3 {
 }
 
 /// The avatar of a field with this density, in a colour that changes from place to place.
-fn known(scene: &Scene, density: impl Fn(Vec3, f32) -> f32 + Sync, options: &BakeOptions) -> (Avatar, BakeReport) {
+fn known(scene: &Scene, density: impl Fn(Vec3, f32) -> f32 + Sync) -> (Avatar, BakeReport) {
     let evaluate =
         |places: &[Place]| places.iter().map(|p| (density(p.closest, p.distance), known_colour(p.closest))).collect();
     let field = CanonicalField { evaluate: &evaluate, grazing: 0.0, reach: 0.06 };
     let seen = vec![1.0; scene.body.canonical.vertices.len()];
-    surface(&scene.body, &field, &seen, 0.012, options).unwrap()
+    surface(&scene.body, &field, &seen, 0.012).unwrap()
 }
 
 fn scene(config: &Config) -> Scene {
@@ -40,7 +40,7 @@ fn scene(config: &Config) -> Scene {
 
 fn baked(density: impl Fn(Vec3, f32) -> f32 + Sync) -> (Scene, Avatar, BakeReport) {
     let scene = scene(&Config::preset(Preset::Fast, Method::Occnerf));
-    let (avatar, report) = known(&scene, density, &BakeOptions::default());
+    let (avatar, report) = known(&scene, density);
     avatar.validate().unwrap();
     (scene, avatar, report)
 }
@@ -262,8 +262,7 @@ fn a_person_in_training_is_baked_refined_and_drawn_alike_on_any_number_of_thread
         trainer.step().unwrap();
     }
     let make = || {
-        let options = BakeOptions { refinements: 3, ..BakeOptions::default() };
-        let (avatar, report) = bake(trainer.model(), Some(&scene), &options).unwrap();
+        let (avatar, report) = bake(trainer.model(), Some(&scene)).unwrap();
         let mut renderer = BakedRenderer::new(&avatar, scene.body.scale, trainer.model().light(), Samples::Four);
         let rendering = renderer.render(&scene.train[1].view, Vec3::ZERO).unwrap();
         (avatar, report, rendering)
@@ -287,11 +286,6 @@ fn a_person_in_training_is_baked_refined_and_drawn_alike_on_any_number_of_thread
         assert!(found.distance(expected) < 1e-4);
     }
     assert!(renderer.draw(&bones[1..], &scene.train[0].view.camera).unwrap_err().to_string().contains("joints"));
-    for options in
-        [BakeOptions { atlas: 1, ..BakeOptions::default() }, BakeOptions { fps: f32::NAN, ..BakeOptions::default() }]
-    {
-        assert!(bake(trainer.model(), None, &options).unwrap_err().to_string().starts_with("scene: bake: "));
-    }
 }
 
 /// Intersection over union of a drawn person and the mask, in the mean over frames.
@@ -316,13 +310,13 @@ fn a_fitted_surface_covers_unseen_views_better_than_the_prior_alike_on_any_numbe
     let mut capture = demo(&config, &body).unwrap();
     let scene = |capture: &Capture| Scene::new(capture, &body, &Config::preset(Preset::Fast, Method::Surface)).unwrap();
     let given = scene(&capture);
-    let make = || fit(&given, &BakeOptions::default()).unwrap();
+    let make = || fit(&given).unwrap();
     let [one, three] = [1, 3].map(|n| rayon::ThreadPoolBuilder::new().num_threads(n).build().unwrap().install(make));
     assert!(one.0 == three.0);
     let (avatar, report) = one;
     avatar.validate().unwrap();
     assert!(report.errors[1] < report.errors[0], "{report:?}");
-    let (prior, _) = known(&given, |_, d| if d < 0.0 { 5000.0 } else { 0.0 }, &BakeOptions::default());
+    let (prior, _) = known(&given, |_, d| if d < 0.0 { 5000.0 } else { 0.0 });
     let [fitted, bare] = [&avatar, &prior].map(|avatar| overlap(&given, avatar));
     assert!(1.0 - fitted < 0.8 * (1.0 - bare), "{fitted} for {bare}");
     // Nothing is learnt from what is not seen, and nothing breaks.
@@ -332,5 +326,5 @@ fn a_fitted_surface_covers_unseen_views_better_than_the_prior_alike_on_any_numbe
         pixels.mask[..3].fill(1.0);
         frame.source = pixels.into();
     }
-    fit(&scene(&capture), &BakeOptions::default()).unwrap().0.validate().unwrap();
+    fit(&scene(&capture)).unwrap().0.validate().unwrap();
 }

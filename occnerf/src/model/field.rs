@@ -10,7 +10,6 @@ use crate::config::Config;
 use crate::model::encoder::{Coordinates, Encoder, fit};
 use crate::model::perceptron::{Activations, Mlp};
 use crate::model::samples::Samples;
-use crate::model::times::{StepTimes, Stopwatch};
 
 /// Samples that pass through the perceptron together; their activations fit a second-level cache.
 pub(crate) const BLOCK: usize = 256;
@@ -62,8 +61,6 @@ pub(crate) struct SampleBatch {
     pub d_at: Coordinates,
     pub d_output: Vec<f32>,
     pub d_input: Vec<f32>,
-    /// Where the time of this step went.
-    pub times: StepTimes,
 }
 
 /// Parameters that evaluating a field reads.
@@ -101,11 +98,9 @@ impl Field {
     /// Evaluates density and colour of every sample of the batch.
     pub fn forward(&self, learnt: &Learnt<'_>, batch: &mut SampleBatch) {
         let (n, width) = (batch.samples.len(), self.encoder.num_features());
-        let mut watch = Stopwatch::start();
         self.encoder.coordinates(&batch.samples, &self.region, &mut batch.at);
         fit(&mut batch.features, n * width);
         self.encoder.encode(learnt.table, batch.at.all(), &mut batch.features);
-        watch.lap(&mut batch.times.encode);
         self.attend(learnt.counts, batch);
         batch.sigma.resize(n, 0.0);
         batch.rgb.resize(n, Vec3::ZERO);
@@ -119,7 +114,6 @@ impl Field {
                 batch.rgb[s] = (base.truncate() + base.w * Vec3::from_slice(&raw[1..4])).map(sigmoid);
             }
         }
-        watch.lap(&mut batch.times.perceptron);
     }
 
     /// Index in [`SampleBatch::blocks`], and range, of the samples that pass through the perceptron

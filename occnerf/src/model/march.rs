@@ -6,7 +6,6 @@ use volrender::{Composite, RaySamples, composite};
 
 use crate::model::field::SampleBatch;
 use crate::model::samples::Samples;
-use crate::model::times::Stopwatch;
 use crate::model::trace::{March, Tracer};
 
 /// How far rays are marched.
@@ -54,20 +53,16 @@ impl Segment {
             return false;
         }
         let most = if min_transmittance > 0.0 { segment } else { usize::MAX };
-        let mut watch = Stopwatch::start();
         batch.samples.clear();
         for &ray in &*rays {
             tracer.trace(&mut batch.samples, most, &mut marches[ray]);
         }
-        watch.lap(&mut batch.times.trace);
         evaluate(batch);
         if min_transmittance > 0.0 {
-            let mut watch = Stopwatch::start();
             composite_batch(batch, Vec3::ZERO, weights, composites);
             for (&ray, composite) in rays.iter().zip(&*composites) {
                 marches[ray].pass(composite);
             }
-            watch.lap(&mut batch.times.losses);
         }
         true
     }

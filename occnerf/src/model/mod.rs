@@ -15,7 +15,6 @@ pub(crate) mod person;
 pub(crate) mod samples;
 pub(crate) mod saved;
 pub(crate) mod subdivide;
-pub(crate) mod times;
 pub(crate) mod trace;
 pub(crate) mod trained;
 pub(crate) mod vertices;

@@ -1,7 +1,6 @@
 //! The part of a run directory that is known before training and that drawing needs without the
 //! capture: the body, poses and cameras of the video, the prior's colours.
 
-use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
@@ -15,7 +14,7 @@ use crate::capture::{Frame, Light, MAX_BETA, MAX_DISTANCE, Mended, Registered};
 use crate::config::Config;
 use crate::model::body::{Body, PosedFrame};
 use crate::model::colors::PriorColors;
-use crate::model::file::{Array, Contents, read, write};
+use crate::model::file::{Contents, array, read, write};
 use crate::model::saved::{CHECKPOINT, config_of, parse};
 use crate::model::subdivide::{Subdivided, most_times};
 use crate::model::trained::Model;
@@ -73,19 +72,19 @@ impl Person {
                 }
             });
         }
-        let floats = |values| Array::Floats(Cow::Owned(values));
         let [cameras, poses, shapes, placements] = frames;
-        let arrays = [
-            ("cameras", floats(cameras)),
-            ("poses", floats(poses)),
-            ("betas", floats(shapes)),
-            ("placements", floats(placements)),
-            ("mean_betas", floats(padded(&capture.mean_betas, betas))),
-            ("colors", floats(vectors(&colors.colors))),
-            ("seen", Array::Bytes(colors.seen.iter().map(|&seen| u8::from(seen)).collect())),
-            ("light", floats(colors.light.slope.to_array().to_vec())),
-            ("sizes", Array::Counts(&sizes)),
-            ("clothes", floats(clothes.clone())),
+        let seen: Vec<u8> = colors.seen.iter().map(|&seen| seen.into()).collect();
+        let arrays = vec![
+            array("cameras", cameras),
+            array("poses", poses),
+            array("betas", shapes),
+            array("placements", placements),
+            array("mean_betas", padded(&capture.mean_betas, betas)),
+            array("colors", vectors(&colors.colors)),
+            array("seen", seen),
+            array("light", colors.light.slope.to_array().to_vec()),
+            array("sizes", sizes),
+            array("clothes", &clothes[..]),
         ];
         let header = BTreeMap::from([
             ("format", FORMAT.to_owned()),
@@ -94,13 +93,13 @@ impl Person {
             ("frames", capture.train.len().to_string()),
             ("subdivisions", colors.mesh.times().to_string()),
         ]);
-        write(&run.join(PERSON), &header, arrays.map(|(name, array)| (name.to_owned(), array)).into())
+        write(&run.join(PERSON), &header, arrays)
     }
 
     /// The initial colours of `model` in the run directory `run`; `None` where it has none.
     ///
     /// # Errors
-    /// [`Error::Io`] and [`Error::File`] for a file that is damaged.
+    /// [`Error::Io`], [`Error::Array`] and [`Error::File`] for a file that is damaged.
     pub fn colors(run: &Path, model: &BodyModel) -> Result<Option<PriorColors>, Error> {
         let path = run.join(PERSON);
         if !path.is_file() {
@@ -114,7 +113,7 @@ impl Person {
     /// where it has none.
     ///
     /// # Errors
-    /// [`Error::Io`] and [`Error::File`] for a file that is damaged, or of other frames.
+    /// [`Error::Io`], [`Error::Array`] and [`Error::File`] for a file that is damaged, or of other frames.
     pub fn restore(run: &Path, mended: Mended, model: &BodyModel) -> Result<Option<Registered>, Error> {
         let (path, Mended { mut capture, growth }) = (run.join(PERSON), mended);
         if !path.is_file() {
@@ -159,7 +158,7 @@ impl Person {
     /// Reads the files that [`Person::save`] wrote into the directory `run`.
     ///
     /// # Errors
-    /// [`Error::Io`], [`Error::Body`] and [`Error::File`] for files that are missing or damaged.
+    /// [`Error::Io`], [`Error::Body`], [`Error::Array`] and [`Error::File`] for files that are missing or damaged.
     pub fn load(run: &Path, config: &Config) -> Result<Self, Error> {
         let path = run.join(PERSON);
         if !path.is_file() {
@@ -192,7 +191,7 @@ impl Model {
     /// Reads the model of the run directory `run`, without the capture and the optimiser's moments.
     ///
     /// # Errors
-    /// [`Error::Io`], [`Error::Body`] and [`Error::File`] for files that are missing or damaged.
+    /// [`Error::Io`], [`Error::Body`], [`Error::Array`] and [`Error::File`] for files that are missing or damaged.
     pub fn load(run: &Path) -> Result<Self, Error> {
         let path = run.join(CHECKPOINT);
         let bytes = read(&path)?;
@@ -221,7 +220,7 @@ fn colors(contents: &Contents<'_>, model: &BodyModel) -> Result<PriorColors, Err
     let mesh = Arc::new(Subdivided::new(model.num_vertices(), &model.faces, times));
     let colors = contents.floats("colors", mesh.anchors.len() * 3)?;
     below(contents, "colors", &colors, MAX_COLOR)?;
-    let seen = contents.bytes("seen", mesh.anchors.len())?.iter().map(|&seen| seen != 0).collect();
+    let seen = contents.values("seen", mesh.anchors.len())?.iter().map(|&seen: &u8| seen != 0).collect();
     let slope = contents.floats("light", 3)?;
     below(contents, "light", &slope, MAX_COLOR)?;
     Ok(PriorColors { colors: triples(&colors), seen, light: Light { slope: Vec3::from_slice(&slope) }, mesh })
@@ -253,7 +252,7 @@ fn read_poses(contents: &Contents<'_>, frames: usize, (joints, betas): (usize, u
 fn cameras(contents: &Contents<'_>, frames: usize) -> Result<Vec<Camera>, Error> {
     let cameras = contents.floats("cameras", frames * CAMERA)?;
     below(contents, "cameras", &cameras, MAX_DISTANCE)?;
-    let sizes = contents.counts("sizes", frames * 2)?;
+    let sizes = contents.values("sizes", frames * 2)?;
     let each = cameras.chunks_exact(CAMERA).zip(sizes.chunks_exact(2)).enumerate();
     each.map(|(frame, (numbers, size))| {
         camera(numbers, size).ok_or_else(|| contents.corrupt(format!("`cameras` {frame} is no pinhole camera")))

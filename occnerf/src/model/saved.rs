@@ -1,15 +1,16 @@
 //! The model's part of a checkpoint: configuration, values, counts and the field's outer end. The
 //! trainer adds the state of the optimiser.
 
-use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::path::Path;
+
+use array_files::tensors::Tensor;
 
 use crate::Error;
 use crate::config::Config;
 use crate::model::extent::Extent;
-use crate::model::file::{Array, Contents, read};
-use crate::model::parameters::{PARTS, Part};
+use crate::model::file::{Contents, array, read};
+use crate::model::parameters::PARTS;
 use crate::model::trained::Model;
 
 /// The file in a run directory.
@@ -36,14 +37,13 @@ impl Model {
     }
 
     /// The arrays of a checkpoint that are the model's own.
-    pub(crate) fn arrays(&self) -> Vec<(String, Array<'_>)> {
-        let value =
-            |&(part, name): &(Part, &str)| (name.to_owned(), Array::Floats(Cow::Borrowed(self.parameters.get(part))));
-        let mut arrays: Vec<(String, Array<'_>)> = PARTS.iter().map(value).collect();
+    pub(crate) fn arrays(&self) -> Vec<Tensor<'_>> {
+        let mut arrays: Vec<Tensor<'_>> =
+            PARTS.iter().map(|&(part, name)| array(name, self.parameters.get(part))).collect();
         if self.config.motion.shell_interval > 0 {
-            arrays.push((EXTENT.to_owned(), Array::Floats(Cow::Borrowed(&self.extent.vertices))));
+            arrays.push(array(EXTENT, &self.extent.vertices));
         }
-        arrays.push((COUNTS.to_owned(), Array::Counts(self.counts.counts())));
+        arrays.push(array(COUNTS, self.counts.counts()));
         arrays
     }
 
@@ -58,7 +58,7 @@ impl Model {
             *values = contents.floats(name, values.len())?;
         }
         let vertices = self.body.canonical.vertices.len();
-        self.counts = visibility::VisibilityCounts::from_counts(contents.counts(COUNTS, vertices)?);
+        self.counts = visibility::VisibilityCounts::from_counts(contents.values(COUNTS, vertices)?);
         if self.config.motion.shell_interval > 0 {
             let ends = contents.floats(EXTENT, vertices)?;
             let whole = self.extent.farthest;

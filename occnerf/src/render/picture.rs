@@ -28,35 +28,6 @@ pub trait Renderer: Sync {
     fn render(&mut self, view: &PosedView, background: Vec3) -> Result<Rendering, Error>;
 }
 
-/// A renderer with several samples a pixel, whose mean each pixel shows.
-pub struct Supersampled<'a> {
-    renderer: Box<dyn Renderer + 'a>,
-    side: u32,
-}
-
-impl<'a> Supersampled<'a> {
-    /// `side` × `side` samples a pixel; 0 is taken for 1.
-    pub fn new(renderer: Box<dyn Renderer + 'a>, side: u32) -> Self {
-        Self { renderer, side: side.max(1) }
-    }
-}
-
-impl Renderer for Supersampled<'_> {
-    fn render(&mut self, view: &PosedView, background: Vec3) -> Result<Rendering, Error> {
-        let (width, height, side) = (view.camera.width as usize, view.camera.height as usize, self.side as usize);
-        let camera = view.camera.resized(view.camera.width * self.side, view.camera.height * self.side);
-        let fine = self.renderer.render(&view.seen_by(&camera), background)?;
-        let (mut pixels, mut opacity) = (vec![0.0; 3 * width * height], vec![0.0; width * height]);
-        let share = 1.0 / (side * side) as f32;
-        for (i, (color, alpha)) in fine.image.pixels.chunks_exact(3).zip(&fine.opacity).enumerate() {
-            let pixel = i / (width * side) / side * width + i % (width * side) / side;
-            opacity[pixel] += share * alpha;
-            pixels[3 * pixel..].iter_mut().zip(color).for_each(|(sum, c)| *sum += share * c);
-        }
-        Ok(Rendering { image: Image { width: view.camera.width, height: view.camera.height, pixels }, opacity })
-    }
-}
-
 /// Fills a picture row by row inside the body's box; elsewhere it is the background.
 pub(crate) fn paint<S>(
     view: &PosedView,
@@ -135,44 +106,5 @@ impl Renderer for PriorRenderer<'_> {
                     .collect()
             },
         )
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use glam::{Affine3A, Mat3};
-    use smpl::Posed;
-    use volrender::Camera;
-
-    use super::*;
-
-    /// Draws white left of a line at a third of the picture.
-    struct Edge;
-
-    impl Renderer for Edge {
-        fn render(&mut self, view: &PosedView, background: Vec3) -> Result<Rendering, Error> {
-            let Camera { width, height, .. } = view.camera;
-            let inside = |i: u32| 3.0 * ((i % width) as f32 + 0.5) < width as f32;
-            let opacity: Vec<f32> = (0..width * height).map(|i| f32::from(inside(i))).collect();
-            let pixels = opacity.iter().flat_map(|&a| background.lerp(Vec3::ONE, a).to_array()).collect();
-            Ok(Rendering { image: Image { width, height, pixels }, opacity })
-        }
-    }
-
-    #[test]
-    fn a_pixel_shows_the_part_of_its_samples_that_are_covered() {
-        let (joints, bones, pose_offsets) = (Vec::new(), Vec::new(), Vec::new());
-        let posed = Posed { vertices: vec![Vec3::Z], joints, bones, pose_offsets };
-        let camera = Camera::new(Mat3::IDENTITY, Affine3A::IDENTITY, 4, 2).unwrap();
-        let view = PosedView::new(&camera, posed);
-        for (side, second) in [(1, 0.0), (2, 0.5), (3, 1.0 / 3.0)] {
-            let drawn = Supersampled::new(Box::new(Edge), side).render(&view, Vec3::Y).unwrap();
-            let row = [1.0, second, 0.0, 0.0];
-            for (i, alpha) in drawn.opacity.iter().enumerate() {
-                assert!((alpha - row[i % 4]).abs() < 1e-6, "{side}: {alpha}");
-                let color = Vec3::from_slice(&drawn.image.pixels[3 * i..]);
-                assert!(color.abs_diff_eq(Vec3::Y.lerp(Vec3::ONE, row[i % 4]), 1e-6), "{side}: {color}");
-            }
-        }
     }
 }

@@ -1,10 +1,9 @@
 //! Checkpoints: the model with the state of training, replaced atomically.
 
-use std::borrow::Cow;
 use std::path::Path;
 
 use crate::Error;
-use crate::model::file::{Array, read, write};
+use crate::model::file::{array, read, write};
 use crate::model::parameters::PARTS;
 use crate::model::saved::{config_of, parse};
 use crate::scene::prepared::Scene;
@@ -22,7 +21,7 @@ impl<'a> Trainer<'a> {
         let mut arrays = self.model.arrays();
         for ((_, name), adam) in PARTS.into_iter().zip(&self.optimiser.moments) {
             for (order, moment) in [("first", &adam.first), ("second", &adam.second)] {
-                arrays.push((format!("{name}.{order}_moment"), Array::Floats(Cow::Borrowed(moment))));
+                arrays.push(array(format!("{name}.{order}_moment"), &moment[..]));
             }
         }
         write(path, &header, arrays)
@@ -44,7 +43,7 @@ impl<'a> Trainer<'a> {
     /// Resumes from a checkpoint of the same scene and configuration; the number of steps may differ.
     ///
     /// # Errors
-    /// [`Error::Io`]; [`Error::File`] for a damaged checkpoint, or one of another scene.
+    /// [`Error::Io`]; [`Error::Array`] and [`Error::File`] for a damaged checkpoint, or one of another scene.
     pub fn resume(scene: &'a Scene, path: &Path) -> Result<Self, Error> {
         let bytes = read(path)?;
         let contents = parse(path, &bytes)?;

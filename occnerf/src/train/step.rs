@@ -5,7 +5,6 @@ use smpl::MotionFrame;
 use volrender::Composite;
 
 use crate::model::march::{MarchOptions, Segment, Segments};
-use crate::model::times::{StepTimes, Stopwatch};
 use crate::model::trace::{March, PosedSurface, Tracer};
 use crate::model::trained::Model;
 use crate::model::vertices::VertexCode;
@@ -19,7 +18,7 @@ use volrender::RandomStream;
 
 const JITTER: u64 = 0x4A49_5454;
 
-/// Losses, counts and times of a training step.
+/// Losses and counts of a training step.
 #[derive(Clone, Copy, Debug, Default, serde::Serialize)]
 pub struct StepReport {
     /// Number of the step, from 1.
@@ -40,8 +39,6 @@ pub struct StepReport {
     pub rays: usize,
     /// Gradients that were not finite and were left out.
     pub bad_gradients: usize,
-    /// Time of each stage.
-    pub times: StepTimes,
 }
 
 /// Rays that one thread takes through a step, with gradient buffers of their own.
@@ -54,7 +51,6 @@ pub(crate) struct RayGroup {
     /// The samples of all segments, ray by ray.
     pub ordered: OrderedSamples,
     pub composites: Vec<Composite>,
-    pub times: StepTimes,
     pub d_mlp: Vec<f32>,
     pub d_vertices: Vec<f32>,
     pub d_volume: Vec<f32>,
@@ -90,7 +86,7 @@ impl Step<'_> {
         let Self { model, frame, batch, .. } = *self;
         let config = &model.config;
         let tracer = Tracer { model, surface: self.surface, extent: &model.extent, frame: self.motion };
-        let RayGroup { rays, segments, ordered, composites, terminations, times, .. } = group;
+        let RayGroup { rays, segments, ordered, composites, terminations, .. } = group;
         let label = |ray: usize| frame.labels.at(batch.pixels[ray]);
         let marches = rays.iter().map(|&ray| {
             let jitter = RandomStream::new(&[config.seed, JITTER, model.steps_done, ray as u64]);
@@ -100,14 +96,8 @@ impl Step<'_> {
         segments.march(&tracer, marches, self.options.march, |samples| {
             model.evaluate(self.vertex_code, samples);
         });
-        *times = StepTimes::default();
-        for Segment { batch, .. } in segments.all_mut() {
-            *times += std::mem::take(&mut batch.times);
-        }
-        let mut watch = Stopwatch::start();
         ordered.gather(segments);
         ordered.composite(batch.background, composites);
-        watch.lap(&mut times.losses);
         terminations.clear();
         for (index, &ray) in rays.iter().enumerate() {
             let composite = &composites[index];
@@ -122,9 +112,8 @@ impl Step<'_> {
     /// Backward of [`Step::forward`] with the completeness term added. `transposed` are the
     /// perceptron's weights, `d_colors` the gradients of the batch's rays.
     pub fn backward(&self, group: &mut RayGroup, transposed: &[f32], d_colors: &[Vec3]) {
-        let mut watch = Stopwatch::start();
         let Self { model, batch, .. } = *self;
-        let RayGroup { rays, segments, ordered, times, .. } = group;
+        let RayGroup { rays, segments, ordered, .. } = group;
         ordered.composite_backward(batch.background, rays.iter().map(|&ray| d_colors[ray]), segments);
         let learnt = model.learnt(self.vertex_code);
         zero(&mut group.d_mlp, learnt.perceptron.len());
@@ -143,13 +132,10 @@ impl Step<'_> {
                     batch.d_sigma[s] += scale * slope;
                 }
             }
-            watch.lap(&mut times.losses);
             model.field.backward(&learnt, transposed, batch, &mut group.d_mlp, &mut group.d_vertices);
-            watch.lap(&mut times.perceptron_backward);
             if let Some(volume) = model.volume() {
                 volume_backward(model, volume, self.motion, batch, &mut group.d_volume);
             }
-            watch.lap(&mut times.motion_backward);
         }
     }
 }

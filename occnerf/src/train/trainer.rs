@@ -14,7 +14,6 @@ use crate::model::encoder::{Encoder, PointEncoder};
 use crate::model::field::Field;
 use crate::model::march::MarchOptions;
 use crate::model::parameters::Part;
-use crate::model::times::{StepTimes, Stopwatch};
 use crate::model::trace::{CELL, PosedSurface};
 use crate::model::trained::Model;
 use crate::model::vertices::VertexCode;
@@ -154,7 +153,6 @@ impl<'a> Trainer<'a> {
             return Err(Error::Perceptual("its weights were not loaded".to_owned()));
         }
         let step = model.steps_done;
-        let (mut times, mut watch) = (StepTimes::default(), Stopwatch::start());
         batch.draw(scene, &model.config, step);
         let frame = &scene.train[batch.frame];
         let shown = frame.reader()?;
@@ -168,31 +166,24 @@ impl<'a> Trainer<'a> {
         deal(batch, frame, groups);
         let motion = MotionFrame::new(&scene.body.model, posed);
         let pass = Step { model: &*model, surface, motion: &motion, frame, batch, vertex_code, options };
-        watch.lap(&mut times.prepare);
         groups.par_iter_mut().with_max_len(1).for_each(|group| pass.forward(group));
-        let mut watch = Stopwatch::start();
         let mut report = StepReport { step: step + 1, rays: batch.pixels.len(), ..StepReport::default() };
         photometric.measure(loss, lpips.as_ref(), groups, batch, (&frame.labels, &shown), &mut report)?;
         model.field.mlp.transposed_weights(model.parameters.get(Part::Field), transposed);
-        watch.lap(&mut times.losses);
         let d_colors = &photometric.d_colors;
         groups.par_iter_mut().with_max_len(1).for_each(|group| pass.backward(group, transposed, d_colors));
-        groups.iter().for_each(|group| times += group.times);
         let nominal = (batch.pixels.len() * model.config.samples) as f64;
         report.completeness = groups.iter().map(|g| g.completeness).sum::<f64>() / nominal;
         report.live_samples = groups.iter().map(|g| g.ordered.len()).sum();
         report.loss = f64::from(loss.mse) * report.mse
             + f64::from(loss.perceptual) * report.perceptual
             + f64::from(loss.completeness) * report.completeness;
-        reduce(model, optimiser, groups, vertex_code, d_volume, &mut times);
-        let mut watch = Stopwatch::start();
+        reduce(model, optimiser, groups, vertex_code, d_volume);
         groups.iter().for_each(|group| model.counts.add(&group.terminations));
         let decay = model.config.rates.final_fraction.powf(step as f32 / model.config.steps.max(1) as f32);
         let rates = &model.config.rates;
         report.bad_gradients = optimiser.step(&mut model.parameters, rates, decay);
         self.model.refresh_volume();
-        watch.lap(&mut times.update);
-        report.times = times;
         self.model.steps_done += 1;
         Ok(report)
     }
@@ -219,9 +210,7 @@ fn reduce(
     groups: &[RayGroup],
     vertex_code: &mut VertexCode,
     d_volume: &mut Vec<f32>,
-    times: &mut StepTimes,
 ) {
-    let mut watch = Stopwatch::start();
     optimiser.clear_gradients();
     let gradients = &mut optimiser.gradients;
     let sum = |to: &mut [f32], from: &(dyn Fn(&RayGroup) -> &[f32] + Sync)| {
@@ -235,7 +224,6 @@ fn reduce(
     let d_mlp = gradients.get_mut(Part::Field);
     sum(d_mlp, &|g| &g.d_mlp);
     model.field.mlp.clear_padding(d_mlp);
-    watch.lap(&mut times.update);
     if model.field.surface_term {
         zero(&mut vertex_code.d_rows, vertex_code.rows.len());
         sum(&mut vertex_code.d_rows, &|g| &g.d_vertices);
@@ -245,11 +233,9 @@ fn reduce(
     let samples = groups.iter().flat_map(|group| group.segments.all()).map(|segment| &segment.batch);
     let parts = samples.map(|batch| (batch.at.all(), &batch.features[..])).chain(vertex_code.parts());
     model.field.encoder.encode_backward(parts, gradients.get_mut(Part::Table));
-    watch.lap(&mut times.encode_backward);
     if let Some(volume) = model.volume() {
         zero(d_volume, volume.weights.len());
         sum(d_volume, &|g| &g.d_volume);
         volume.softmax_backward(d_volume, gradients.get_mut(Part::Motion));
     }
-    watch.lap(&mut times.update);
 }

@@ -1,6 +1,6 @@
 //! Readers of the files in which Python programs keep arrays: numpy's `.npy` and `.npz`, pickles,
-//! joblib's compressed pickles and PyTorch's `torch.save`; a writer of `.npz`; and what every file
-//! needs, bounded reading and atomic replacement.
+//! joblib's compressed pickles and PyTorch's `torch.save`; a writer of `.npz`; safetensors, both ways;
+//! and what every file needs, bounded reading and atomic replacement.
 //!
 //! ```
 //! use array_files::npz::{self, Npz};
@@ -35,6 +35,7 @@ mod file;
 mod npy;
 pub mod npz;
 pub mod pickle;
+pub mod tensors;
 pub mod torch;
 mod whole;
 

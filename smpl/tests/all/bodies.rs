@@ -90,8 +90,6 @@ fn bodies_with_hands_and_faces_load_pose_and_survive_saving() {
         let pose: Vec<Vec3> = (0..joints).map(|j| Vec3::new(0.1, 0.0, 0.01) * j as f32).collect();
         let posed = body.pose(&shaped, &pose, Placement::default());
         assert!(posed.vertices.iter().all(|v| v.is_finite()));
-        let gradient = body.pose_backward(&shaped, &pose, Placement::default(), &posed, &posed.vertices, &[]);
-        assert_eq!((gradient.pose.len(), body.shaped_backward(&gradient.shaped).len()), (joints, betas));
 
         let saved = temporary(&format!("hands-{joints}-{betas}.safetensors"));
         body.save(&saved).unwrap();

@@ -6,5 +6,4 @@ mod body;
 mod clip;
 mod embedded;
 mod golden;
-mod pose_gradient;
 mod volume;

@@ -8,7 +8,7 @@ use common::{folder, refused, text, xtask};
 fn help_names_the_commands_and_every_option_of_train() {
     let help = |arguments: &[&str]| String::from_utf8(xtask(arguments).stdout).unwrap();
     let general = help(&["--help"]);
-    for command in ["train", "eval", "render", "export", "convert"] {
+    for command in ["train", "eval", "render", "export"] {
         assert!(general.contains(command), "{general}");
     }
     assert!(general.contains("Exit codes:") && general.contains("a result cannot be written"), "{general}");
@@ -70,22 +70,4 @@ fn runs_that_are_none_are_refused() {
     std::fs::write(empty.join("checkpoint.safetensors"), [0xff; 64]).unwrap();
     refused(&["train", "--resume", "--out", text(&empty)], &["checkpoint.safetensors", "safetensors"]);
     refused(&["train", "--out", text(&empty)], &["already holds a run", "--resume"]);
-}
-
-#[test]
-fn bodies_are_converted_and_nothing_is_overwritten_unasked() {
-    let help = String::from_utf8(xtask(&["convert", "--help"]).stdout).unwrap();
-    assert!(help.contains(".safetensors") && help.contains("--force"), "{help}");
-    let out = folder("convert");
-    let (first, second) = (out.join("a.safetensors"), out.join("b.safetensors"));
-    smpl::BodyModel::embedded().save(&first).unwrap();
-    assert!(xtask(&["convert", text(&first), text(&second)]).status.success());
-    assert_eq!(std::fs::read(&first).unwrap(), std::fs::read(&second).unwrap());
-    refused(&["convert", text(&first), text(&second)], &["b.safetensors", "--force"]);
-    refused(&["convert", text(&first), text(&first), "--force"], &["same file"]);
-    refused(&["convert", text(&first), text(&out.join("a.npz"))], &["a.npz", ".safetensors"]);
-    refused(&["convert", "/no/such.pkl", text(&second)], &["/no/such.pkl"]);
-    std::fs::write(out.join("bad.npz"), b"not a zip").unwrap();
-    refused(&["convert", text(&out.join("bad.npz")), text(&out.join("c.safetensors"))], &["bad.npz"]);
-    assert!(!out.join("c.safetensors").exists());
 }

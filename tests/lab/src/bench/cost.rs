@@ -1,7 +1,4 @@
-//! `bench cost`: where the time of a training step goes, what that is of what the machine can do,
-//! and how time and memory grow with the work.
-
-mod machine;
+//! `bench cost`: what a training step costs, and how time and memory grow with the work.
 
 use std::fmt::Write as _;
 use std::path::Path;
@@ -10,7 +7,6 @@ use anyhow::{Result, bail};
 use occnerf::{Config, Preset};
 use synth::DemoConfig;
 
-use self::machine::Machine;
 use super::chart::{Axis, Line, Mark, Panel, Picture, Shape, Style};
 use super::difficulty::Difficulty;
 use crate::methods::Method;
@@ -56,18 +52,14 @@ const GROWTHS: [Growth; 6] = [
 
 /// Runs everything, writes cost.md, growth.svg and growth.png.
 pub fn run(runner: &mut Runner, out: &Path) -> Result<String> {
-    let machine = Machine::measure();
-    let mut text = format!(
-        "A plain product of 256×64 by 64×64 runs at {:.0} GFLOP/s on one thread, {:.0} on all;\n",
-        machine.gflops.0, machine.gflops.1
-    ) + &format!(
-        "a plain copy of 64 MB at {:.1} GB/s read and {:.1} GB/s on all threads.\n\n",
-        machine.copy.0, machine.copy.1
+    let mut text = String::from(
+        "| preset | s a step | live samples | ns a live sample | MB |\n| --- | ---: | ---: | ---: | ---: |\n",
     );
     // `fast` is `balanced` with fewer steps.
     for preset in [Preset::Balanced, Preset::Paper] {
-        text.push_str(&profile(preset, runner)?);
+        text.push_str(&row(preset, runner)?);
     }
+    text.push('\n');
     let mut panels = Vec::new();
     let mut table = String::from(
         "Seconds to make a capture ready, to take a step and to draw a view; behind each the power of the level that it \
@@ -113,51 +105,19 @@ fn small() -> Difficulty {
     Difficulty { demo, ..Difficulty::default() }
 }
 
-/// Shares of the stages at a preset.
-fn profile(preset: Preset, runner: &mut Runner) -> Result<String> {
-    // So few that poses are taught too, as in all but the first tenth of a run.
+/// Row of a preset.
+fn row(preset: Preset, runner: &mut Runner) -> Result<String> {
     let config = Config { steps: STEPS, ..Method::Occnerf.preset(preset) };
-    let Some(line) = runner.run(point(preset.name().to_owned(), "profile", config.clone(), small()))? else {
+    let Some(line) = runner.run(point(preset.name().to_owned(), "profile", config, small()))? else {
         return Ok(String::new());
     };
     let outcome = &line.outcome;
     if let Some(error) = &outcome.error {
         bail!("{}: {error}", preset.name());
     }
-    let live = outcome.live_samples;
-    let total: f64 = outcome.stages.iter().map(|s| s.1).sum();
-    let mut text = format!(
-        "### `{}`: {:.3} s a step, {live:.0} live samples, {:.0} ns each; {:.0} MB\n\n| stage | share | µs a sample and thread | achieved |\n| --- | ---: | ---: | --- |\n",
-        preset.name(),
-        outcome.step_seconds,
-        1e9 * outcome.step_seconds / live,
-        outcome.peak_rss_bytes as f64 / 1e6,
-    );
-    let flops = flops(&config);
-    let bytes = (config.encoding.levels * 16 * config.encoding.features * 4) as f64;
-    for (stage, seconds) in &outcome.stages {
-        let each = seconds / live;
-        let achieved = match stage.as_str() {
-            "perceptron" => format!("{:.1} GFLOP/s a thread", 1e-9 * flops / each),
-            "perceptron backward" => format!("{:.1} GFLOP/s a thread", 2e-9 * flops / each),
-            "encode" => format!("{:.2} GB/s of table entries a thread", 1e-9 * bytes / each),
-            // Every entry is read and written.
-            "encode backward" => format!("{:.2} GB/s of table entries a thread", 2e-9 * bytes / each),
-            _ => String::new(),
-        };
-        let _ = writeln!(text, "| {stage} | {:.1} % | {:.2} | {achieved} |", 100.0 * seconds / total, 1e6 * each);
-    }
-    text.push('\n');
-    Ok(text)
-}
-
-/// Floating-point operations of a sample through F, forward.
-fn flops(config: &Config) -> f64 {
-    let encoded = config.encoding.levels * config.encoding.features;
-    let mut widths = vec![encoded * (1 + usize::from(config.surface.surface_term))];
-    widths.extend(vec![config.field.width; config.field.depth]);
-    widths.push(4);
-    widths.windows(2).map(|w| 2.0 * (w[0] * w[1]) as f64).sum()
+    let (step, live) = (outcome.step_seconds, outcome.live_samples);
+    let (each, megabytes) = (1e9 * step / live, outcome.peak_rss_bytes as f64 / 1e6);
+    Ok(format!("| `{}` | {step:.3} | {live:.0} | {each:.0} | {megabytes:.0} |\n", preset.name()))
 }
 
 /// What is timed, and its colour.

@@ -1,7 +1,6 @@
 //! `bench`: what every approximation costs and is worth, and where methods break.
 
 mod axes;
-mod baking;
 pub mod chart;
 mod cost;
 mod difficulty;
@@ -18,7 +17,6 @@ use anyhow::{Result, bail, ensure};
 use clap::{Args, Subcommand};
 use occnerf::capture::Layout;
 
-pub use self::baking::Baking;
 pub use self::difficulty::Difficulty;
 use crate::results::{self, Section};
 use crate::sweep::{Line, Place, Runner, SittingArguments, job};
@@ -48,8 +46,8 @@ enum What {
     Stability(StabilityArguments),
     /// Cost against error of the geometric kernels; `pareto` draws it too.
     Kernels(KernelArguments),
-    /// Where the time of a step goes, and how time and memory grow with rays, samples, table,
-    /// vertices, frames and pixels.
+    /// What a step costs, and how time and memory grow with rays, samples, table, vertices, frames
+    /// and pixels.
     Cost(CostArguments),
     /// What registration makes of wrong priors: degrees and millimetres against the demo's true
     /// bodies.

@@ -1,30 +1,32 @@
 //! A run of a sweep: its description, its outcome, and the child process that takes it there.
 
 use std::io::{BufRead, Read, Write};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, bail};
 use glam::Vec3;
-use occnerf::bake::{BakeOptions, BakedRenderer, bake, fit};
+use occnerf::bake::{BakedRenderer, bake, fit};
 use occnerf::capture::Capture;
 use occnerf::{
-    Config, FieldRenderer, PreparedFrame, PriorColors, PriorRenderer, Renderer, Scene, SplitMetrics, StepTimes,
+    Config, FieldRenderer, Lpips, Model, PreparedFrame, PriorColors, PriorRenderer, Renderer, Scene, SplitMetrics,
     evaluate,
 };
 use serde::{Deserialize, Serialize};
 use smpl::BodyModel;
 use visibility::Samples;
 
-use crate::bench::{Baking, Difficulty};
+use crate::bench::Difficulty;
 use crate::methods::Method;
 use crate::scene::SceneOptions;
+use xtask::eval::{Drawn, score_run};
 use xtask::network::load_lpips;
-use xtask::process::{Ending, Guard, one_line, say};
+use xtask::process::{Ending, Guard, one_line, say, telling};
 use xtask::run::{Metrics, RunConfig, peak_rss_bytes};
 use xtask::source;
-use xtask::train::baked_unless_finished;
+use xtask::source::Source;
+use xtask::train::{run_unless_finished, unless_finished};
 
 /// Longest job on standard input.
 const MAX_JOB_BYTES: u64 = 1 << 20;
@@ -75,9 +77,9 @@ pub struct Job {
     pub views: usize,
     pub method: Method,
     pub config: Config,
-    /// How the trained person is baked: what is scored then, instead of the field.
+    /// Scores the baked person instead of the field, with four samples a pixel or one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub bake: Option<Baking>,
+    pub bake: Option<bool>,
     /// Run directory, scored and drawn as `train` does it; measured and forgotten where there is
     /// none.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -119,8 +121,6 @@ pub struct Outcome {
     pub peak_rss_bytes: u64,
     /// Median of a step in the second half of the run, when buffers have grown to size.
     pub step_seconds: f64,
-    /// Mean seconds of each stage of those steps, summed over threads.
-    pub stages: Vec<(String, f64)>,
     /// Mean of a step.
     pub live_samples: f64,
     /// Of the body model.
@@ -141,7 +141,7 @@ fn keep_run(job: &Job, Keep { directory, trained, lpips }: &Keep) -> Result<Outc
     let run = RunConfig::new(&source, job.config.clone())?;
     let (lpips, name) = (load_lpips(lpips.as_deref())?, directory.file_name().unwrap_or_default().to_string_lossy());
     let metrics = match trained {
-        Some(trained) => baked_unless_finished(directory, trained, &run, &source, lpips.as_ref(), INTERVAL)?,
+        Some(trained) => baked_unless_finished(directory, trained, &run, &source, lpips.as_ref())?,
         None => job.method.run_unless_finished(directory, &name, &run, &source, lpips.as_ref(), INTERVAL)?,
     };
     let mut outcome = Outcome {
@@ -154,6 +154,28 @@ fn keep_run(job: &Job, Keep { directory, trained, lpips }: &Keep) -> Result<Outc
         outcome.take(split);
     }
     Ok(Outcome { metrics: Some(metrics), ..outcome })
+}
+
+/// The scores under `directory` of the baked person of the run under `trained`, which is trained
+/// first if need be. Baking time adds to the run's seconds; parameters are texel colours and vertices.
+fn baked_unless_finished(
+    directory: &Path,
+    trained: &Path,
+    run: &RunConfig,
+    source: &Source,
+    lpips: Option<&Lpips>,
+) -> Result<Metrics> {
+    let [name, of] = [directory, trained].map(|path| path.file_name().unwrap_or_default().to_string_lossy());
+    unless_finished(directory, trained, run, lpips, |_| {
+        let metrics = run_unless_finished(trained, &of, run, source, lpips, INTERVAL)?;
+        say!("{name}: baking");
+        run.write(directory)?;
+        let (model, scene) = (Model::load(trained)?, source.scene(&run.train)?);
+        let (avatar, report) = telling("baking", || bake(&model, Some(&scene)))?;
+        let (train_seconds, parameters) = (metrics.train_seconds + report.seconds, avatar.num_parameters());
+        let drawn = Drawn::Avatar { body: model.body(), light: model.light(), avatar: &avatar };
+        score_run(directory, run, &scene, &drawn, lpips, Metrics { train_seconds, parameters, ..metrics })
+    })
 }
 
 /// Trains and scores.
@@ -177,35 +199,36 @@ fn measure(job: &Job) -> Result<Outcome> {
         score(&scene, &mut PriorRenderer::new(&scene.body, &colors), &mut outcome)?;
     } else if job.method == Method::Surface {
         let colors = scene.colors()?;
-        let (avatar, _) = fit(&scene, &BakeOptions::default())?;
+        let (avatar, _) = fit(&scene)?;
         outcome.train_seconds = start.elapsed().as_secs_f64();
         outcome.parameters = avatar.num_parameters();
         let mut renderer = BakedRenderer::new(&avatar, scene.body.scale, colors.light, Samples::Four);
         score(&scene, &mut renderer, &mut outcome)?;
     } else {
         let mut trainer = job.method.trainer(&scene, job.config.clone())?;
-        let (mut seconds, mut times) = (Vec::new(), StepTimes::default());
+        let mut seconds = Vec::new();
         for step in 0..job.config.steps {
             let begun = Instant::now();
             let report = trainer.step()?;
             if 2 * step >= job.config.steps {
                 seconds.push(begun.elapsed().as_secs_f64());
-                times += report.times;
             }
             outcome.non_finite += usize::from(!report.loss.is_finite());
             outcome.bad_gradients += report.bad_gradients;
             outcome.live_samples += report.live_samples as f64 / job.config.steps as f64;
         }
         let model = trainer.into_model();
-        let baked = job.bake.map(|baking| bake(&model, Some(&scene), &baking.options())).transpose()?;
+        let baked = job.bake.map(|_| bake(&model, Some(&scene))).transpose()?;
         outcome.train_seconds = start.elapsed().as_secs_f64();
         seconds.sort_by(f64::total_cmp);
         outcome.step_seconds = seconds.get(seconds.len() / 2).copied().unwrap_or(0.0);
-        let mean = |total: f64| total / seconds.len().max(1) as f64;
-        outcome.stages = times.stages().map(|(name, total)| (name.to_owned(), mean(total))).to_vec();
         outcome.parameters = model.num_parameters();
-        match job.bake.zip(baked) {
-            Some((baking, (avatar, _))) => score(&scene, &mut baking.renderer(&model, &avatar), &mut outcome)?,
+        match &baked {
+            Some((avatar, _)) => {
+                let samples = if job.bake == Some(true) { Samples::Four } else { Samples::One };
+                let mut renderer = BakedRenderer::new(avatar, model.body().scale, model.light(), samples);
+                score(&scene, &mut renderer, &mut outcome)?;
+            }
             None => score(&scene, &mut FieldRenderer::new(&model)?, &mut outcome)?,
         }
     }
