@@ -6,7 +6,7 @@ use anyhow::{Context, Error, Result, ensure};
 use clap::Args;
 use smpl::BodyModel;
 
-use crate::process::{results_in, say};
+use crate::process::{results_in, say, telling};
 
 /// Arguments of `convert`.
 #[derive(Args)]
@@ -29,7 +29,7 @@ pub fn convert(arguments: &ConvertArguments) -> Result<()> {
         "{}: the output's name must end in .safetensors",
         output.display()
     );
-    let model = BodyModel::load(input)?;
+    let model = telling(&format!("reading {}", input.display()), || BodyModel::load(input))?;
     if output.exists() {
         let same = std::fs::canonicalize(input).ok() == std::fs::canonicalize(output).ok();
         ensure!(!same, "{}: input and output are the same file", output.display());

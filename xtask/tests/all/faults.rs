@@ -263,7 +263,8 @@ fn a_run_that_died_before_its_first_checkpoint_is_resumed_from_its_start() {
     done(&training(&whole, "10"));
     std::fs::create_dir(&run).unwrap();
     std::fs::copy(whole.join("config.toml"), run.join("config.toml")).unwrap();
-    done(&["train", "--resume", "--out", text(&run)]);
+    let said = done(&["train", "--resume", "--out", text(&run)]);
+    assert!(said.contains("no checkpoint to go on from; from the start"), "{said}");
     let bytes = |run: &Path| std::fs::read(run.join("checkpoint.safetensors")).unwrap();
     assert!(bytes(&run) == bytes(&whole));
 }
@@ -283,6 +284,9 @@ fn numbers_on_the_command_line_are_blamed_by_their_own_name() {
         assert!(threads.contains("--threads 1000000: expected 1 to ") && threads.lines().count() == 1, "{threads}");
         assert!(begun.elapsed() < Duration::from_secs(20));
     }
+    let begun = Instant::now();
+    let weights = said(&["train", "--set", "loss.perceptual_weights=x"]);
+    assert!(weights.contains("x: no such weights") && begun.elapsed() < Duration::from_secs(5), "{weights}");
     let every = said(&["train", "--checkpoint-every", "nan"]);
     assert!(every.contains("--checkpoint-every"), "{every}");
 }
