@@ -78,11 +78,12 @@ fn read(path: &Path) -> Result<Vec<String>> {
     Ok(scenes)
 }
 
-/// The scene's own name, numbered where another before it has the same.
+/// The scene's own name, numbered where another before it has the same but for upper and lower case,
+/// which not every file system tells apart.
 pub fn unique_name(scenes: &[String], index: usize) -> String {
     let name = |i: usize| scene_name(Some(&scenes[i]));
     let own = name(index);
-    match (0..index).filter(|&i| name(i) == own).count() {
+    match (0..index).filter(|&i| name(i).eq_ignore_ascii_case(&own)).count() {
         0 => own,
         earlier => format!("{own}-{}", earlier + 1),
     }

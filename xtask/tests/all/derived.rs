@@ -233,6 +233,23 @@ fn nothing_is_learnt_of_a_person_who_is_not_where_the_masks_are() {
     }
 }
 
+/// Faces around a camera cover the whole picture, each many times.
+#[test]
+fn a_camera_inside_the_body_is_drawn_in_seconds() {
+    let folder = folder("inside");
+    let capture = folder.join("capture");
+    common::capture(&capture, Layout::Wild, 64, 4);
+    let path = capture.join("metadata.json");
+    let mut metadata = json(&path);
+    // The body of this layout stands about the origin.
+    let first = metadata.as_object_mut().unwrap().values_mut().next().unwrap();
+    (0..3).for_each(|row| first["cam_extrinsics"][row][3] = 0.into());
+    std::fs::write(&path, metadata.to_string()).unwrap();
+    let begun = Instant::now();
+    done(&["train", text(&capture), "--out", text(&folder.join("run")), "--method", "surface"]);
+    assert!(begun.elapsed() < Duration::from_secs(60), "{:?}", begun.elapsed());
+}
+
 #[test]
 fn limits_of_the_process_are_said_in_a_line() {
     let one_line = |output: &Output, word: &str| {
