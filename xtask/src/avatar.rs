@@ -8,7 +8,7 @@ use occnerf::bake::{Avatar, Clip, export};
 use smpl::MotionClip;
 
 use crate::baked;
-use crate::process::{Lock, say, unwritten};
+use crate::process::{Lock, say, telling, unwritten};
 use crate::run::{CHECKPOINT, RunConfig, identity};
 
 /// The surface of a run, or its baked person, see [`baked::avatar`]; and the lock on the run.
@@ -31,7 +31,7 @@ pub fn of_run(run: &Path) -> Result<(Avatar, Lock)> {
 
 /// Reads a motion of `fps` frames per second, by default as many as the file says.
 pub fn load_motion(path: &Path, fps: Option<f32>) -> Result<MotionClip> {
-    let (mut motion, rate) = MotionClip::load_with_rate(path)?;
+    let (mut motion, rate) = telling(&format!("reading {}", path.display()), || MotionClip::load_with_rate(path))?;
     if let Some(fps) = fps {
         ensure!((1e-3..=1e6).contains(&fps), "--fps {fps}: expected 0.001 to 1000000");
         motion.fps = fps;

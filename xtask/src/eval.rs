@@ -18,9 +18,10 @@ use visibility::Samples;
 
 use crate::network::{load_lpips, network_name};
 use crate::optimise::logged_seconds;
-use crate::process::{Ending, Lock, is_read_only, note, one_line, say};
+use crate::process::{Ending, Lock, is_read_only, note, one_line, say, telling};
+use crate::report::{self, SHEETS};
 use crate::run::{self, Metrics, RunConfig, Splits, TRAINING_VIEWS, evaluation_title, make_directory, peak_rss_bytes};
-use crate::{baked, pictures, report, table};
+use crate::{baked, pictures, table};
 
 /// Stride of scored training frames.
 const TRAIN_STRIDE: usize = 10;
@@ -98,9 +99,13 @@ pub fn eval(arguments: &EvalArguments) -> Result<()> {
     let lpips = load_lpips(arguments.lpips.as_deref())?;
     let directory = &arguments.run;
     let run = RunConfig::read(directory)?;
-    let writes = !(arguments.baked && run.train.method.has_field());
+    let mut writes = !(arguments.baked && run.train.method.has_field());
     let _lock = match if writes { Lock::take(directory) } else { Lock::share(directory) } {
-        Err(error) if is_read_only(&error) => Lock::share(directory)?,
+        Err(error) if is_read_only(&error) => {
+            note!("{}: the scores are only printed", one_line(&error));
+            writes = false;
+            Lock::share(directory)?
+        }
         lock => lock?,
     };
     let source = run.source(directory)?;
@@ -128,32 +133,36 @@ pub fn eval(arguments: &EvalArguments) -> Result<()> {
     let mut metrics = unscored(&run, &drawn, 0.0);
     metrics.train_seconds = logged_seconds(directory, metrics.steps)?;
     metrics.of = run::identity(directory)?;
-    if let Some(scored) = Metrics::fresh(directory, directory)? {
-        metrics = scored;
+    match Metrics::fresh(directory, directory)? {
+        Some(scored) => metrics = scored,
+        None if writes => SHEETS.iter().try_for_each(|name| run::remove(&directory.join(name)))?,
+        None => {}
     }
     ensure!(
         !scene.eval.is_empty() || arguments.split != Some(Split::NovelView),
         "{}: the capture keeps no views back; --split train-view scores those that training saw",
         run.scene
     );
-    for split in [Split::NovelView, Split::TrainView] {
-        let empty = split == Split::NovelView && scene.eval.is_empty();
-        if arguments.split.is_none_or(|only| only == split) {
-            let scores = drawn.score_with_bar(&scene, split, lpips.as_ref(), |_, _| {})?;
-            *split.of(&mut metrics.splits) = (!empty).then_some(scores);
-        } else if let Some(scores) = split.of(&mut metrics.splits).as_mut().filter(|s| s.lpips_full.is_some()) {
-            // One network name holds for both splits; scores of another are dropped.
-            match &network {
-                Some(network) if metrics.lpips.as_ref() != Some(network) => scores.lpips_full = None,
-                _ => network = metrics.lpips.clone(),
+    if writes && arguments.split.is_none() {
+        metrics = score_run(directory, &run, &scene, &drawn, lpips.as_ref(), metrics)?;
+    } else {
+        for split in [Split::NovelView, Split::TrainView] {
+            let empty = split == Split::NovelView && scene.eval.is_empty();
+            if arguments.split.is_none_or(|only| only == split) {
+                let scores = drawn.score_with_bar(&scene, split, lpips.as_ref(), |_, _| {})?;
+                *split.of(&mut metrics.splits) = (!empty).then_some(scores);
+            } else if let Some(scores) = split.of(&mut metrics.splits).as_mut().filter(|s| s.lpips_full.is_some()) {
+                // One network name holds for both splits; scores of another are dropped.
+                match &network {
+                    Some(network) if metrics.lpips.as_ref() != Some(network) => scores.lpips_full = None,
+                    _ => network = metrics.lpips.clone(),
+                }
             }
         }
-    }
-    metrics.lpips = network;
-    if writes {
-        match metrics.write(directory).and_then(|()| report::write(directory, &metrics)) {
-            Err(error) if is_read_only(&error) => note!("{}: the scores are only printed", one_line(&error)),
-            written => written?,
+        metrics.lpips = network;
+        if writes {
+            metrics.write(directory)?;
+            report::write(directory, &metrics)?;
         }
     }
     let mut one = metrics.clone();
@@ -291,7 +300,7 @@ pub fn score_run(
             row.push(beside_truth(frame, rendering, most));
         }
     })?;
-    metrics.peak_rss_bytes = peak_rss_bytes();
+    metrics.peak_rss_bytes = metrics.peak_rss_bytes.max(peak_rss_bytes());
     metrics.lpips = network_name(lpips);
     metrics.splits = Splits { novel_view: (!scene.eval.is_empty()).then_some(novel), train_view: Some(train) };
     metrics.scene.clone_from(&run.scene);
@@ -318,9 +327,9 @@ fn draw(directory: &Path, novel: Vec<Vec<Result<[RgbImage; 2]>>>, train: Vec<Res
     make_directory(&directory.join("renders"))?;
     if !novel.is_empty() {
         let rows = novel.into_iter().map(pairs).collect::<Result<Vec<_>>>()?;
-        pictures::save(&pictures::sheet(&rows), &directory.join("renders/novel_views.png"))?;
+        pictures::save(&pictures::sheet(&rows), &directory.join(SHEETS[0]))?;
     }
-    pictures::save(&pictures::sheet(&[pairs(train)?]), &directory.join("renders/train_views.png"))
+    pictures::save(&pictures::sheet(&[pairs(train)?]), &directory.join(SHEETS[1]))
 }
 
 /// Truth and rendering over grey, each reduced to at most `most` pixels.

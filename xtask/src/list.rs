@@ -5,7 +5,7 @@ use std::path::Path;
 use anyhow::{Context, Result, bail, ensure};
 
 use crate::network::load_lpips;
-use crate::process::{Ending, one_line, say};
+use crate::process::{Ending, one_line, say, telling};
 use crate::run::{self, Metrics, RunConfig};
 use crate::train::{TrainArguments, finished, run_unless_finished, scene_name};
 use crate::{source, table};
@@ -68,7 +68,9 @@ pub fn train_list(arguments: &TrainArguments) -> Result<()> {
 
 /// A scene a line; empty lines and what follows `#` are left out.
 fn read(path: &Path) -> Result<Vec<String>> {
-    let bytes = array_files::read_bounded(path, MAX_BYTES).with_context(|| path.display().to_string())?;
+    let name = path.display().to_string();
+    let read = || array_files::read_bounded(path, MAX_BYTES);
+    let bytes = telling(&format!("reading {name}"), read).context(name)?;
     let text = array_files::decode_text(&bytes);
     let lines = text.lines().map(|line| line.split('#').next().unwrap_or("").trim());
     let scenes: Vec<String> = lines.filter(|line| !line.is_empty()).map(str::to_owned).collect();
@@ -76,11 +78,12 @@ fn read(path: &Path) -> Result<Vec<String>> {
     Ok(scenes)
 }
 
-/// The scene's own name, numbered where another before it has the same.
+/// The scene's own name, numbered where another before it has the same but for upper and lower case,
+/// which not every file system tells apart.
 pub fn unique_name(scenes: &[String], index: usize) -> String {
     let name = |i: usize| scene_name(Some(&scenes[i]));
     let own = name(index);
-    match (0..index).filter(|&i| name(i) == own).count() {
+    match (0..index).filter(|&i| name(i).eq_ignore_ascii_case(&own)).count() {
         0 => own,
         earlier => format!("{own}-{}", earlier + 1),
     }

@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
 use crate::process::{Lock, still_held, unwritten};
-use crate::source::{self, Source, hash_file};
+use crate::source::{self, Source, hash_file, hex};
 
 /// Parameters, Adam moments and visibility counts.
 pub const CHECKPOINT: &str = "checkpoint.safetensors";
@@ -218,8 +218,7 @@ impl Verdict {
         let path = run.join(VERDICT);
         match verdict {
             Some(verdict) => write(&path, &serde_json::to_string_pretty(verdict)?),
-            None if path.is_file() => std::fs::remove_file(&path).map_err(unwritten(&path)),
-            None => Ok(()),
+            None => remove(&path),
         }
     }
 }
@@ -231,7 +230,7 @@ pub fn identity(run: &Path) -> Result<String> {
     let files = [learnt, "body.safetensors", "person.safetensors"].map(|name| run.join(name));
     let mut hash = Sha256::new();
     files.iter().filter(|path| path.is_file()).try_for_each(|path| hash_file(&mut hash, path))?;
-    Ok(format!("{:x}", hash.finalize()))
+    Ok(hex(hash))
 }
 
 /// The trained model of a run.
@@ -325,6 +324,11 @@ pub fn make_directory(path: &Path) -> Result<()> {
 pub fn write(path: &Path, text: &str) -> Result<()> {
     path.parent().map_or(Ok(()), still_held)?;
     replace_file(path, |to| to.write_all(text.as_bytes())).map_err(unwritten(path))
+}
+
+/// Removes a file if there is one.
+pub fn remove(path: &Path) -> Result<()> {
+    if path.is_file() { std::fs::remove_file(path).map_err(unwritten(path)) } else { Ok(()) }
 }
 
 /// Most threads for each processor.

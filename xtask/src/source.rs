@@ -2,6 +2,7 @@
 
 use std::cell::RefCell;
 use std::fs::File;
+use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
@@ -53,7 +54,7 @@ impl Source {
             hash.update(format!("{name:?} {camera:?} {pose:?} {betas:?} {placement:?} {decoding}"));
             files.into_iter().try_for_each(|file| hash_file(&mut hash, file))?;
         }
-        Ok(format!("{:x}", hash.finalize()))
+        Ok(hex(hash))
     }
 
     /// Takes the registered bodies of the run in `directory`, if it kept them.
@@ -187,6 +188,9 @@ pub fn load_with(
             })?),
         }
     };
+    if let Some(file) = file.as_deref().filter(|file| file.exists() && !file.is_file()) {
+        bail!("{}: not a plain file, which a run reads again", file.display());
+    }
     let mut model = file.as_deref().map_or_else(|| Ok(BodyModel::embedded()), BodyModel::load)?;
     let mut capture = load_capture(directory, &model, options)?;
     edit(&mut capture, &mut model)?;
@@ -198,9 +202,25 @@ pub fn load_with(
 
 /// Adds the length and the bytes of a file to a hash.
 pub fn hash_file(hash: &mut Sha256, path: &Path) -> Result<()> {
-    let copied = File::open(path).and_then(|mut file| std::io::copy(&mut file, hash));
+    let copied = File::open(path).and_then(|file| {
+        let (mut file, mut length) = (BufReader::with_capacity(1 << 16, file), 0);
+        loop {
+            let bytes = file.fill_buf()?.len();
+            if bytes == 0 {
+                return Ok(length);
+            }
+            hash.update(file.buffer());
+            file.consume(bytes);
+            length += bytes as u64;
+        }
+    });
     hash.update(copied.with_context(|| path.display().to_string())?.to_le_bytes());
     Ok(())
+}
+
+/// A hash in hexadecimal digits.
+pub fn hex(hash: Sha256) -> String {
+    hash.finalize().iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
 /// Whether `path` is named like a rigged character.

@@ -15,6 +15,7 @@ use crate::eval::{Drawn, Split, check_pictures, score_run, scored_frames, unscor
 use crate::network::{load_lpips, network_name};
 use crate::optimise::{RunOptions, SavingArguments, optimise};
 use crate::process::{Lock, note, results_in, say, still_held, telling};
+use crate::report;
 use crate::run::{
     self, AVATAR, CHECKPOINT, METRICS, Metrics, RunConfig, Verdict, existing_directory, free_bytes, make_directory,
     new_directory, peak_rss_bytes,
@@ -233,10 +234,12 @@ pub fn run_one(
         if resumes { Trainer::resume(&scene, &checkpoint)? } else { Trainer::new(&scene, run.train.clone())? };
     trainer.set_steps(run.train.steps);
     trainer.load_perceptual()?;
-    let seconds = optimise(directory, &mut trainer, options)?;
-    if trainer.steps_done() < run.train.steps {
-        return Ok(None);
+    let seconds = optimise(directory, &mut trainer, options);
+    if seconds.is_err() || trainer.steps_done() < run.train.steps {
+        let named = report::refresh(directory);
+        return seconds.and(named).map(|()| None);
     }
+    let seconds = seconds?;
     let perceptual = trainer.perceptual();
     let model = trainer.into_model();
     let trained = Drawn::Field { model: &model, perceptual };

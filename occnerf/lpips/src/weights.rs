@@ -145,6 +145,9 @@ fn files(directory: &Path) -> Result<Vec<PathBuf>, Error> {
 impl Weights {
     /// Reads the names, types and shapes of a file's tensors.
     fn open(path: &Path) -> Result<Self, Error> {
+        if path.exists() && !path.is_file() {
+            return Err(fault(path, "is not a plain file"));
+        }
         let mut file = File::open(path).map_err(io(path))?;
         let mut start = Vec::new();
         (&mut file).take(64).read_to_end(&mut start).map_err(io(path))?;

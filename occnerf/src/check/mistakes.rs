@@ -195,7 +195,7 @@ pub(super) fn find(capture: &Capture, body: &BodyModel, views: &[View]) -> Resul
     // First: an inverted mask overlaps best with a body that fills the image.
     let around = views.iter().map(View::border).sum::<f32>() / views.len().max(1) as f32;
     let (iou, covers) = mean(&overlaps(&posed, body, Some(Mistake::MaskInverted))?);
-    if around > BORDER && iou > given && covers > given {
+    if around > BORDER && iou > BETTER * given && iou > given + BETTER_BY && covers > given {
         return Ok(vec![Mistake::MaskInverted]);
     }
     let mut best: Option<(Mistake, f32)> = None;

@@ -220,6 +220,18 @@ fn each_mistake_is_found() {
     assert!(missed.is_empty(), "{missed:#?}");
 }
 
+/// No usual mistake makes noise of masks.
+#[test]
+fn masks_of_noise_are_said_to_fit_nothing() {
+    let body = BodyModel::embedded();
+    let mut capture = small_demo(&body, 4);
+    for (i, frame) in capture.train.iter_mut().enumerate() {
+        let noise = move |n: usize| f32::from(((n + 7919 * i) as u32).wrapping_mul(0x9e37_79b1) < 1 << 31);
+        frame.source.edit(move |pixels| pixels.mask.iter_mut().enumerate().for_each(|(n, level)| *level = noise(n)));
+    }
+    assert_eq!(likely(&capture, &body, small_views(&capture).unwrap()).unwrap(), [Mistake::NoFit]);
+}
+
 #[test]
 fn a_silhouette_is_where_rays_hit_also_around_a_camera_within_the_body() {
     let body = BodyModel::embedded();

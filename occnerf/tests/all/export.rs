@@ -67,7 +67,7 @@ fn a_glb_reads_back_and_moves_as_the_avatar_does() {
         let (found, expected) = (character.pose(0, seconds).vertices, skinned(&bare(), seconds).0);
         assert!(worst(&found, &expected) < 2e-4, "at {seconds} s: {} m", worst(&found, &expected));
     }
-    let texture = image::load_from_memory(&character.texture.unwrap().bytes).unwrap().into_rgb8();
+    let texture = image::load_from_memory(&character.textures[0].bytes).unwrap().into_rgb8();
     assert_eq!(texture.into_raw(), avatar.atlas.rgb);
 }
 

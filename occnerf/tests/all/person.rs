@@ -156,6 +156,15 @@ fn what_is_missing_or_damaged_is_named() {
         std::fs::write(run.join(PERSON), damaged).unwrap();
         assert!(said().contains(PERSON), "{}", said());
     }
+    // Numbers that no capture has.
+    let parsed = safetensors::SafeTensors::deserialize(&whole).unwrap();
+    for key in ["poses", "betas", "placements", "cameras", "colors", "light"] {
+        let at = parsed.tensor(key).unwrap().data().as_ptr() as usize - whole.as_ptr() as usize + 4;
+        let mut damaged = whole.clone();
+        damaged[at..at + 4].copy_from_slice(&1e38f32.to_le_bytes());
+        std::fs::write(run.join(PERSON), damaged).unwrap();
+        assert!(said().contains(PERSON) && said().contains(key), "{key}: {}", said());
+    }
     let claim = b"\"frames\":\"2\"";
     let claimed = whole.windows(claim.len()).position(|w| w == claim).unwrap();
     let mut damaged = whole.clone();

@@ -25,7 +25,7 @@ pub(crate) struct Source<'a> {
     data: Vec<Vec<u8>>,
     /// Remaining budget of decoded bytes: many accessors may share one range.
     left: Cell<u64>,
-    /// Remaining budget of bytes read through URIs.
+    /// Remaining budget of bytes of URIs and images.
     resolvable: Cell<u64>,
 }
 
@@ -200,8 +200,8 @@ impl<'a> Source<'a> {
         }
     }
 
-    /// Charges the bytes behind a URI to the document's budget.
-    fn spend(&self, place: &str, bytes: u64) -> Result<(), Error> {
+    /// Charges the bytes of a URI or an image to the document's budget.
+    pub(crate) fn spend(&self, place: &str, bytes: u64) -> Result<(), Error> {
         let left = self.resolvable.get().checked_sub(bytes).ok_or_else(|| {
             let claimed = u128::from(MAX_RESOLVED_BYTES - self.resolvable.get()) + u128::from(bytes);
             too_large(self.file, place, claimed, MAX_RESOLVED_BYTES)

@@ -9,16 +9,20 @@ use crate::animation::{Animation, Local};
 /// joints.
 ///
 /// Meshes without a skin are bound rigidly to an extra joint for their node; morph targets are at
-/// their default weights. Not read: sparse accessors, materials other than the first base-colour
-/// texture ([`Character::ignored`] names what the file has of them). Metres, y up, as in glTF.
+/// their default weights. Of materials the base colours are read. Not read: sparse accessors, other
+/// parts of materials, transparency ([`Character::ignored`] names it). Metres, y up, as in glTF.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Character {
     /// Vertices in bind space, as in the file, (V).
     pub vertices: Vec<Vec3>,
     /// Normals in bind space, (V); empty if any primitive has none.
     pub normals: Vec<Vec3>,
-    /// Texture coordinates, (V), v downward; empty if any primitive has none.
+    /// Texture coordinates, (V), v downward; zero for primitives without, empty if none has any.
     pub uvs: Vec<Vec2>,
+    /// Index into [`Character::textures`] of each vertex, (V); `None` without texture or coordinates.
+    pub texture_of: Vec<Option<u32>>,
+    /// Factor of the base colour, linear, (V): the material's times that of the vertex, in [0, 1].
+    pub tints: Vec<Vec3>,
     /// Triangles, (F), counter-clockwise seen from outside.
     pub faces: Vec<[u32; 3]>,
     /// Skinning weights, (V, J), rows summing to 1.
@@ -27,10 +31,9 @@ pub struct Character {
     pub inverse_bind: Vec<Affine3A>,
     /// Names of the joints' nodes, (J); empty where the file gives none.
     pub joint_names: Vec<String>,
-    /// Base colour of the first material that has a texture, as the file encodes it.
-    pub texture: Option<Texture>,
-    /// Features of the file that are not read, in words: more textures, factors, colours of vertices,
-    /// transparency.
+    /// Base colours of the materials, as the file encodes them, each image once.
+    pub textures: Vec<Texture>,
+    /// Features of the file that are not read, in words.
     pub ignored: Vec<String>,
     /// Animations, in the file's order.
     pub animations: Vec<Animation>,
@@ -41,13 +44,15 @@ pub struct Character {
     pub(crate) joint_nodes: Vec<usize>,
 }
 
-/// An encoded image, [`Character::texture`].
+/// An encoded image, of [`Character::textures`].
 #[derive(Clone, Debug, PartialEq)]
 pub struct Texture {
     /// Media type, usually `image/png` or `image/jpeg`; empty if the file does not state it.
     pub mime: String,
     /// The encoded bytes.
     pub bytes: Vec<u8>,
+    /// Index in the document.
+    pub(crate) image: usize,
 }
 
 /// A posed character in world space, from [`Character::pose`].

@@ -1,10 +1,11 @@
 //! Mesh primitives of a character.
 
-use glam::{Vec2, Vec3};
-use gltf::json::accessor::Accessor;
+use glam::{Vec2, Vec3, Vec4};
+use gltf::json::Index;
+use gltf::json::accessor::{Accessor, Type};
 use gltf::json::mesh::{Mode, Primitive, Semantic};
+use gltf::json::texture::Info;
 use gltf::json::validation::Checked;
-use gltf::json::{Index, material};
 use smpl::Error;
 
 use crate::accessor::Source;
@@ -57,10 +58,31 @@ impl Character {
             fits(normals.len(), "NORMAL")?;
             self.normals.extend(normals.into_iter().map(Vec3::from));
         }
-        let colour = match primitive.material {
-            Some(index) => base_colour(source.get(&source.root.materials, index, place)?),
+        let material = match primitive.material {
+            Some(index) => Some(&source.get(&source.root.materials, index, place)?.pbr_metallic_roughness),
             None => None,
         };
+        let [red, green, blue, _] = material.map_or([1.0; 4], |material| material.base_color_factor.0);
+        let factor = Vec3::new(red, green, blue);
+        match attribute(Semantic::Colors(0)) {
+            Some(colours) => {
+                let place = format!("{place}, COLOR_0");
+                let kind = &source.get(&source.root.accessors, colours, &place)?.type_;
+                let colours: Vec<Vec3> = match kind {
+                    Checked::Valid(Type::Vec3) => {
+                        source.floats::<3>(colours, &place)?.into_iter().map(Vec3::from).collect()
+                    }
+                    _ => source.floats::<4>(colours, &place)?.into_iter().map(|c| Vec4::from(c).truncate()).collect(),
+                };
+                fits(colours.len(), "COLOR_0")?;
+                self.tints.extend(colours.into_iter().map(|colour| colour * factor));
+            }
+            None => self.tints.resize(first as usize + count, factor),
+        }
+        for tint in &mut self.tints[first as usize..] {
+            *tint = tint.clamp(Vec3::ZERO, Vec3::ONE);
+        }
+        let colour = material.and_then(|material| material.base_color_texture.as_ref());
         let transform = colour.and_then(|c| c.extensions.as_ref()?.texture_transform.as_ref());
         let set = transform.and_then(|t| t.tex_coord).or(colour.map(|c| c.tex_coord)).unwrap_or(0);
         if let Some(uvs) = attribute(Semantic::TexCoords(set)) {
@@ -70,11 +92,12 @@ impl Character {
                 Some(t) => Vec2::from_angle(-t.rotation.0).rotate(uv * Vec2::from(t.scale.0)) + Vec2::from(t.offset.0),
                 None => uv,
             };
+            self.uvs.resize(first as usize, Vec2::ZERO);
             self.uvs.extend(uvs.into_iter().map(|uv| turned(Vec2::from(uv))));
         }
-        if let (None, Some(colour)) = (&self.texture, colour) {
-            self.texture = Some(texture(source, place, colour)?);
-        }
+        let has_uvs = self.uvs.len() == self.vertices.len();
+        let texture = colour.filter(|_| has_uvs).map(|colour| self.add_texture(source, place, colour)).transpose()?;
+        self.texture_of.resize(self.vertices.len(), texture);
         let corners: Vec<u32> = match primitive.indices {
             Some(accessor) => {
                 source.indices::<1>(accessor, &format!("{place}, indices"))?.into_iter().flatten().collect()
@@ -103,6 +126,34 @@ impl Character {
             self.push_weights(row, joints.0);
         }
         Ok(())
+    }
+
+    /// Index of a base colour's image, read if no primitive before has it.
+    fn add_texture(&mut self, source: &Source<'_>, place: &str, colour: &Info) -> Result<u32, Error> {
+        let root = source.root;
+        let texture = source.get(&root.textures, colour.index, place)?;
+        let index = texture.source;
+        if let Some(known) = self.textures.iter().position(|known| known.image == index.value()) {
+            return Ok(known as u32);
+        }
+        if index.value() >= root.images.len() && texture.extensions.is_some() {
+            let names = texture.extensions.iter().flat_map(|e| e.others.keys()).map(String::as_str).collect::<Vec<_>>();
+            return Err(source.invalid(place, format!("a texture of {} alone, which is not read", names.join(", "))));
+        }
+        let image = source.get(&root.images, index, place)?;
+        let place = format!("image {index}");
+        let (found, bytes) = match (image.buffer_view, &image.uri) {
+            (Some(view), _) => {
+                let bytes = source.view(view, &place)?.1;
+                source.spend(&place, bytes.len() as u64)?;
+                (String::new(), bytes.to_vec())
+            }
+            (None, Some(uri)) => source.resolve(&place, uri)?,
+            (None, None) => return Err(source.invalid(&place, "neither a URI nor a buffer view")),
+        };
+        let mime = image.mime_type.as_ref().map_or(found, |mime| mime.0.clone());
+        self.textures.push(Texture { mime, bytes, image: index.value() });
+        Ok(self.textures.len() as u32 - 1)
     }
 
     /// Appends a vertex's weights, normalised, with one entry per joint. A vertex without weights,
@@ -155,29 +206,4 @@ fn influences(
         }
     }
     Ok(())
-}
-
-fn base_colour(material: &material::Material) -> Option<&gltf::json::texture::Info> {
-    material.pbr_metallic_roughness.base_color_texture.as_ref()
-}
-
-fn texture(source: &Source<'_>, place: &str, colour: &gltf::json::texture::Info) -> Result<Texture, Error> {
-    let root = source.root;
-    let texture = source.get(&root.textures, colour.index, place)?;
-    let index = texture.source;
-    if index.value() >= root.images.len() && texture.extensions.is_some() {
-        let names = texture.extensions.iter().flat_map(|e| e.others.keys()).map(String::as_str).collect::<Vec<_>>();
-        return Err(source.invalid(place, format!("a texture of {} alone, which is not read", names.join(", "))));
-    }
-    let image = source.get(&root.images, index, place)?;
-    let place = format!("image {index}");
-    let mime = image.mime_type.as_ref().map(|m| m.0.clone());
-    match (image.buffer_view, &image.uri) {
-        (Some(view), _) => Ok(Texture { mime: mime.unwrap_or_default(), bytes: source.view(view, &place)?.1.to_vec() }),
-        (None, Some(uri)) => {
-            let (found, bytes) = source.resolve(&place, uri)?;
-            Ok(Texture { mime: mime.unwrap_or(found), bytes })
-        }
-        (None, None) => Err(source.invalid(&place, "neither a URI nor a buffer view")),
-    }
 }

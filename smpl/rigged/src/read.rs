@@ -1,13 +1,12 @@
 //! Reads a [`Character`] from a glTF document.
 
-use std::collections::{HashMap, HashSet};
+use std::collections::HashMap;
 use std::path::Path;
 
 use array_files::read_file;
-use glam::{Affine3A, Mat4, Quat, Vec3, Vec4};
+use glam::{Affine3A, Mat4, Quat, Vec2, Vec3, Vec4};
 use gltf::json::animation::{Interpolation, Property};
 use gltf::json::material::AlphaMode;
-use gltf::json::mesh::Semantic;
 use gltf::json::validation::Checked;
 use gltf::json::{Index, Root};
 use smpl::{Error, SparseRows};
@@ -50,11 +49,13 @@ fn read(file: &str, bytes: &[u8], folder: Option<&Path>) -> Result<Character, Er
         vertices: Vec::new(),
         normals: Vec::new(),
         uvs: Vec::new(),
+        texture_of: Vec::new(),
+        tints: Vec::new(),
         faces: Vec::new(),
         weights: SparseRows { offsets: vec![0], columns: Vec::new(), values: Vec::new() },
         inverse_bind: Vec::new(),
         joint_names: Vec::new(),
-        texture: None,
+        textures: Vec::new(),
         ignored: ignored(&root),
         animations: animations(&source, &nodes)?,
         nodes,
@@ -88,8 +89,8 @@ fn read(file: &str, bytes: &[u8], folder: Option<&Path>) -> Result<Character, Er
     if out.normals.len() != out.vertices.len() {
         out.normals.clear();
     }
-    if out.uvs.len() != out.vertices.len() {
-        out.uvs.clear();
+    if !out.uvs.is_empty() {
+        out.uvs.resize(out.vertices.len(), Vec2::ZERO);
     }
     Ok(out)
 }
@@ -114,20 +115,8 @@ fn document(json: &[u8]) -> Result<Root, serde_json::Error> {
 
 /// What a document has that a [`Character`] has not, in words.
 fn ignored(root: &Root) -> Vec<String> {
-    let colours = root.materials.iter().filter_map(|m| m.pbr_metallic_roughness.base_color_texture.as_ref());
-    let textures: HashSet<usize> = colours.map(|info| info.index.value()).collect();
-    let mut attributes = root.meshes.iter().flat_map(|mesh| &mesh.primitives).flat_map(|p| p.attributes.keys());
-    let has_colors = attributes.any(|semantic| matches!(semantic, Checked::Valid(Semantic::Colors(_))));
-    let is_tinted = root.materials.iter().any(|m| m.pbr_metallic_roughness.base_color_factor.0 != [1.0; 4]);
     let is_cut = root.materials.iter().any(|m| m.alpha_mode != Checked::Valid(AlphaMode::Opaque));
-    let others = textures.len().saturating_sub(1);
-    let all = [
-        (others > 0, format!("{others} base-colour textures besides the first")),
-        (is_tinted, "base-colour factors".to_owned()),
-        (has_colors, "colours of vertices (COLOR_0)".to_owned()),
-        (is_cut, "transparency (alphaMode)".to_owned()),
-    ];
-    all.into_iter().filter_map(|(has, what)| has.then_some(what)).collect()
+    Vec::from_iter(is_cut.then(|| "transparency (alphaMode)".to_owned()))
 }
 
 /// JSON and binary chunk of a `.glb` (glTF 2.0, section 4.4).

@@ -51,16 +51,16 @@ pub fn watch() -> std::io::Result<()> {
     let listen = move || {
         for signal in signals.forever() {
             let guarded = GUARDS.load(Ordering::SeqCst) != 0;
-            if !guarded {
-                let after = "the result had not been made, and every file is whole".to_owned();
-                // Standard error may be blocked.
-                let said = Builder::new().spawn(move || note!("{}", Ending::Stopped { signal, after }));
-                let waits = |_: &u32| said.as_ref().is_ok_and(|said| !said.is_finished());
-                (0..50).take_while(waits).for_each(|_| sleep(Duration::from_millis(10)));
+            if guarded && SIGNAL.swap(signal, Ordering::SeqCst) == 0 {
+                continue;
             }
-            if !guarded || SIGNAL.swap(signal, Ordering::SeqCst) != 0 {
-                std::process::exit(128 + signal);
-            }
+            let made = if guarded { "what was saved before stays" } else { "the result had not been made" };
+            let after = format!("{made}, and every file is whole");
+            // Standard error may be blocked.
+            let said = Builder::new().spawn(move || note!("{}", Ending::Stopped { signal, after }));
+            let waits = |_: &u32| said.as_ref().is_ok_and(|said| !said.is_finished());
+            (0..50).take_while(waits).for_each(|_| sleep(Duration::from_millis(10)));
+            std::process::exit(128 + signal);
         }
     };
     Builder::new().spawn(listen).map(drop)

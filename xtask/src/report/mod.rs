@@ -16,14 +16,17 @@ use self::curves::curves;
 pub use self::page::Page;
 use self::viewer::{Views, viewers};
 use crate::process::note;
-use crate::run::{self, LOG, Metrics, PERSON, RunConfig, Verdict};
+use crate::run::{self, AVATAR, CHECKPOINT, LOG, METRICS, Metrics, PERSON, RunConfig, Verdict};
 use crate::table;
 
 /// Largest embedded file.
 const MAX_BYTES: u64 = 16 << 20;
 /// Bytes of a viewer page that hold its source.
 const PAGE_START: u64 = 4096;
-const NOVEL: &str = "renders/novel_views.png";
+/// Contact sheets of both splits.
+pub const SHEETS: [&str; 2] = ["renders/novel_views.png", "renders/train_views.png"];
+const REPORT: &str = "report.html";
+const STALE: &str = "its scores and pictures are of an earlier training; cargo xtask eval";
 const CAPTIONS: [(&str, &str); 2] = [
     ("novel_views.png", "Views that training never saw: truth left, result right; a row a camera"),
     ("train_views.png", "Training views: what the video showed left, result right"),
@@ -31,11 +34,28 @@ const CAPTIONS: [(&str, &str); 2] = [
 
 /// Writes the report of a run.
 pub fn write(directory: &Path, metrics: &Metrics) -> Result<()> {
-    let run = Run { name: metrics.method.clone(), directory: directory.to_owned(), metrics: metrics.clone() };
+    let run = Run::new(metrics.method.clone(), directory, metrics.clone())?;
     let mut page = Page::default();
     let title = run.title();
     add_runs(&mut page, &[run], directory)?;
-    run::write(&directory.join("report.html"), &page.finish(&title))
+    run::write(&directory.join(REPORT), &page.finish(&title))
+}
+
+/// Writes the report of a run again where there is one that was made of something else.
+pub fn refresh(directory: &Path) -> Result<()> {
+    let path = directory.join(REPORT);
+    if !path.is_file() || !directory.join(METRICS).is_file() {
+        return Ok(());
+    }
+    let run = Run::new(String::new(), directory, Metrics::read(directory)?)?;
+    if carries(&path, &run.source()?)? { Ok(()) } else { write(directory, &run.metrics) }
+}
+
+/// Whether the head of a page has this text.
+fn carries(page: &Path, text: &str) -> Result<bool> {
+    let mut start = Vec::new();
+    File::open(page)?.take(PAGE_START).read_to_end(&mut start)?;
+    Ok(String::from_utf8_lossy(&start).contains(text))
 }
 
 /// Last part of a path.
@@ -51,17 +71,41 @@ pub struct Run {
     pub directory: PathBuf,
     /// Scores.
     pub metrics: Metrics,
+    /// Identity of what it has learnt.
+    learnt: String,
 }
 
 impl Run {
+    fn new(name: String, directory: &Path, metrics: Metrics) -> Result<Self> {
+        Ok(Self { name, directory: directory.to_owned(), metrics, learnt: run::identity(directory)? })
+    }
+
     /// Reads the scores of a run.
     pub fn read(directory: &Path) -> Result<Self> {
         RunConfig::read(directory)?;
-        let metrics = Metrics::read(directory)?;
-        if metrics.of != run::identity(directory)? && directory.join(run::CHECKPOINT).is_file() {
-            note!("warning: {}: its scores are of an earlier training; cargo xtask eval", directory.display());
+        let run = Self::new(name(directory), directory, Metrics::read(directory)?)?;
+        if run.is_stale() {
+            note!("warning: {}: {STALE}", directory.display());
         }
-        Ok(Self { name: name(directory), directory: directory.to_owned(), metrics })
+        Ok(run)
+    }
+
+    /// Whether the scores are of what the run had learnt before.
+    fn is_stale(&self) -> bool {
+        let has_learnt = [CHECKPOINT, AVATAR].iter().any(|name| self.directory.join(name).is_file());
+        has_learnt && self.metrics.of != self.learnt
+    }
+
+    /// Whether the viewer's page shows what the run has learnt; `None` without a page.
+    fn shown(&self) -> Result<Option<bool>> {
+        let page = self.directory.join(PERSON);
+        page.is_file().then(|| carries(&page, &self.learnt)).transpose()
+    }
+
+    /// What a report is made of: identities of what was learnt and of what was scored, and whether the
+    /// viewer's page is of the former.
+    fn source(&self) -> Result<String> {
+        Ok(format!("{} {} {:?}", self.learnt, self.metrics.of, self.shown()?))
     }
 
     /// Title of its page.
@@ -86,12 +130,16 @@ pub fn add_runs(page: &mut Page, runs: &[Run], folder: &Path) -> Result<()> {
     page.table(&std::iter::once(more).chain(runs.iter().map(row)).collect::<Vec<_>>());
     let (mut views, mut logs) = (Vec::new(), Vec::new());
     for run in runs {
+        page.source(&run.source()?);
+        if run.is_stale() {
+            page.paragraph(&format!("{}: {STALE}", run.name));
+        }
         if let Some(verdict) = Verdict::read(&run.directory)? {
             page.subheading(&format!("{}: what this scene needed, and why", run.name));
             page.table(&verdict.parts);
             page.paragraph(&verdict.why);
         }
-        views.extend(Views::read(&run.directory.join(NOVEL))?.map(|v| (run.name.clone(), v)));
+        views.extend(Views::read(&run.directory.join(SHEETS[0]))?.map(|v| (run.name.clone(), v)));
         logs.extend(Log::read(&run.directory.join(LOG))?.map(|l| (run.name.clone(), l)));
     }
     add_people(page, runs, folder)?;
@@ -128,13 +176,10 @@ pub fn add_runs(page: &mut Page, runs: &[Run], folder: &Path) -> Result<()> {
 /// Links the runs' viewer pages from a page in `folder`.
 fn add_people(page: &mut Page, runs: &[Run], folder: &Path) -> Result<()> {
     for run in runs {
-        let path = std::path::absolute(run.directory.join(PERSON))?;
-        if path.is_file() {
+        if let Some(fresh) = run.shown()? {
+            let path = std::path::absolute(run.directory.join(PERSON))?;
             let from = path.strip_prefix(std::path::absolute(folder)?).unwrap_or(&path);
-            let mut start = Vec::new();
-            File::open(&path)?.take(PAGE_START).read_to_end(&mut start)?;
-            let of = run::identity(&run.directory)?;
-            let stale = if String::from_utf8_lossy(&start).contains(&of) { "" } else { " (before the last training)" };
+            let stale = if fresh { "" } else { " (before the last training)" };
             page.link(&from.to_string_lossy(), &format!("{}: the person, to turn around and play{stale}", run.name));
         }
     }

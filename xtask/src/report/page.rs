@@ -16,6 +16,7 @@ const SCRIPT: &str = include_str!("page.js");
 pub struct Page {
     body: String,
     headings: Vec<String>,
+    sources: Vec<String>,
 }
 
 /// Percent-encodes a byte of a relative URL, colons included.
@@ -36,6 +37,11 @@ impl Page {
     pub fn heading(&mut self, text: &str) {
         let _ = writeln!(self.body, "<h2 id=\"s{}\">{}</h2>", self.headings.len(), escape(text));
         self.headings.push(text.to_owned());
+    }
+
+    /// Adds to what the page says in its head that it was made of.
+    pub fn source(&mut self, identity: &str) {
+        self.sources.push(identity.to_owned());
     }
 
     /// A smaller heading.
@@ -96,7 +102,7 @@ impl Page {
 
     /// The whole file.
     pub fn finish(&self, title: &str) -> String {
-        let title = escape(title);
+        let (title, sources) = (escape(title), escape(&self.sources.join("; ")));
         let links: Vec<String> = (self.headings.iter().enumerate())
             .map(|(i, text)| format!("<a href=\"#s{i}\">{}</a>", escape(text)))
             .collect();
@@ -110,6 +116,7 @@ impl Page {
         format!(
             "<!doctype html>\n<html lang=en>\n<meta charset=\"utf-8\">\n\
              <meta http-equiv=\"Content-Security-Policy\" content=\"{policy}\">\n\
+             <meta name=\"source\" content=\"{sources}\">\n\
              <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\n\
              <title>{title}</title>\n<style>{STYLE}</style>\n<h1>{title}</h1>\n{links}{}<script>{SCRIPT}</script>\n</html>\n",
             self.body

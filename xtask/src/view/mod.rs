@@ -14,6 +14,7 @@ use volrender::Camera;
 use crate::avatar;
 use crate::html::escape;
 use crate::process::say;
+use crate::report;
 use crate::run::PERSON;
 
 const PAGE: &str = include_str!("page.html");
@@ -46,6 +47,9 @@ pub fn view(arguments: &ViewArguments) -> Result<()> {
     avatar::check_folder(&out)?;
     let page = page(&person)?;
     crate::run::write(&out, &page)?;
+    if arguments.out.is_none() {
+        report::refresh(&arguments.run)?;
+    }
     say!("{}: {:.1} MB, opens in any browser with WebGL 2", out.display(), page.len() as f64 * 1e-6);
     Ok(())
 }

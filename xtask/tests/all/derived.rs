@@ -3,6 +3,7 @@
 
 use crate::common;
 
+use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -53,6 +54,9 @@ fn an_avatar_of_an_earlier_training_is_baked_again_whatever_its_time() {
     done(&["view", text(&run)]);
     let (old, old_scores) = (bytes(&avatar), json(&run.join("metrics.json")));
     done(&["train", "--resume", "--steps", "12", "--stop-after", "11", "--out", text(&run)]);
+    let says = |page: &Path, what: &str| String::from_utf8(bytes(page)).unwrap().contains(what);
+    // What the report shows is named once training has gone on.
+    assert!(says(&run.join("report.html"), "of an earlier training"));
     let future = SystemTime::now() + Duration::from_secs(1 << 20);
     std::fs::File::options().write(true).open(&avatar).unwrap().set_modified(future).unwrap();
     // Scores of the earlier checkpoint are not added to.
@@ -60,8 +64,11 @@ fn an_avatar_of_an_earlier_training_is_baked_again_whatever_its_time() {
     done(&["eval", text(&run), "--split", "train-view"]);
     let scores = json(&run.join("metrics.json"));
     assert!(scores["of"] != old_scores["of"] && scores["splits"]["novel_view"].is_null(), "{scores}");
-    let names = |page: &Path| String::from_utf8(bytes(page)).unwrap().contains("before the last training");
-    assert!(names(&report));
+    let names = |page: &Path| says(page, "before the last training");
+    assert!(
+        names(&report) && !says(&report, "of an earlier training") && says(&report, scores["of"].as_str().unwrap())
+    );
+    assert!(!run.join("renders/novel_views.png").exists());
     done(&export);
     let again = bytes(&avatar);
     assert!(again != old);
@@ -69,8 +76,10 @@ fn an_avatar_of_an_earlier_training_is_baked_again_whatever_its_time() {
     done(&export);
     assert!(bytes(&avatar) == again);
     done(&["view", text(&run)]);
+    assert!(!names(&report));
     done(&["eval", text(&run)]);
-    assert!(!names(&report) && String::from_utf8(bytes(&page)).unwrap().contains(scores["of"].as_str().unwrap()));
+    assert!(!names(&report) && says(&page, scores["of"].as_str().unwrap()));
+    assert!(run.join("renders/novel_views.png").exists());
     // A checkpoint of another run.
     let (_, other) = trained(&folder, "2");
     std::fs::copy(other.join("checkpoint.safetensors"), run.join("checkpoint.safetensors")).unwrap();
@@ -155,8 +164,25 @@ fn devices_and_pipes_are_read_up_to_a_bound_and_written_to_as_they_are() {
     let motion = folder.join("zero.npz");
     std::os::unix::fs::symlink("/dev/zero", &motion).unwrap();
     refusal(&["export", text(&run), "--out", text(&glb), "--motion", text(&motion)], "zero.npz: more than");
-    refusal(&["train", text(&capture), "--body", text(&motion)], "zero.npz: more than");
-    // A pipe that nobody writes to, in a run.
+    refusal(&["train", text(&capture), "--body", text(&motion)], "zero.npz: not a plain file");
+    // A pipe that nobody writes to yet is waited for where it is read once, and never where it is read again.
+    let pipe = folder.join("pipe.npz");
+    assert!(Command::new("mkfifo").arg(&pipe).status().unwrap().success());
+    refusal(&["train", text(&capture), "--body", text(&pipe)], "pipe.npz: not a plain file");
+    refusal(&["train", text(&capture), "--lpips", text(&pipe)], "pipe.npz");
+    refusal(&["import", "--frames", text(&capture), "--fit", text(&pipe), "--out", "x"], "pipe.npz");
+    let export = ["export", text(&run), "--out", text(&glb), "--motion", text(&pipe)];
+    for waits in [&["train", "--list", text(&pipe), "--out", text(&folder.join("l"))][..], &export] {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_xtask"));
+        command.args(waits).env_remove("SMPL_MODEL").stdout(Stdio::null()).stderr(Stdio::piped());
+        let mut child = command.spawn().unwrap();
+        let lines = BufReader::new(child.stderr.take().unwrap()).lines().map(Result::unwrap);
+        let first = lines.into_iter().find(|line| line.contains("reading")).unwrap_or_default();
+        assert!(first.contains("pipe.npz: 2 s"), "{first}");
+        std::fs::write(&pipe, "no-such-capture").unwrap();
+        assert_eq!(child.wait().unwrap().code(), Some(1));
+    }
+    // In a run that nobody writes to, in a run.
     let metrics = run.join("train.jsonl");
     std::fs::remove_file(&metrics).unwrap();
     assert!(Command::new("mkfifo").arg(&metrics).status().unwrap().success());
@@ -205,6 +231,23 @@ fn nothing_is_learnt_of_a_person_who_is_not_where_the_masks_are() {
         let advice = done(&["check", text(&capture)]);
         assert!(!advice.contains("centimetres") || name == "far", "{name}: {advice}");
     }
+}
+
+/// Faces around a camera cover the whole picture, each many times.
+#[test]
+fn a_camera_inside_the_body_is_drawn_in_seconds() {
+    let folder = folder("inside");
+    let capture = folder.join("capture");
+    common::capture(&capture, Layout::Wild, 64, 4);
+    let path = capture.join("metadata.json");
+    let mut metadata = json(&path);
+    // The body of this layout stands about the origin.
+    let first = metadata.as_object_mut().unwrap().values_mut().next().unwrap();
+    (0..3).for_each(|row| first["cam_extrinsics"][row][3] = 0.into());
+    std::fs::write(&path, metadata.to_string()).unwrap();
+    let begun = Instant::now();
+    done(&["train", text(&capture), "--out", text(&folder.join("run")), "--method", "surface"]);
+    assert!(begun.elapsed() < Duration::from_secs(60), "{:?}", begun.elapsed());
 }
 
 #[test]
@@ -304,10 +347,14 @@ fn after_a_storm_of_commands_on_one_run_everything_is_as_one_alone_would_make_it
         done(arguments);
     }
     assert!(bytes(&glb) == bytes(&fresh));
-    for name in ["avatar.safetensors", "person.html"] {
+    let [ours, theirs] = [&run, &alone].map(|run| json(&run.join("metrics.json")));
+    // Seconds are of the machine: a report of the same scores is the same.
+    std::fs::copy(run.join("metrics.json"), alone.join("metrics.json")).unwrap();
+    std::fs::write(alone.join("report.html"), "stale").unwrap();
+    done(&["view", text(&alone)]);
+    for name in ["avatar.safetensors", "person.html", "report.html"] {
         assert!(bytes(&run.join(name)) == bytes(&alone.join(name)), "{name}");
     }
-    let [ours, theirs] = [&run, &alone].map(|run| json(&run.join("metrics.json")));
     let scores = |metrics: &Value| ["novel_view", "train_view"].map(|split| metrics["splits"][split]["frames"].clone());
     assert!(ours["of"] == theirs["of"] && scores(&ours) == scores(&theirs), "{ours}\n{theirs}");
     assert!(ours["steps"].as_u64().unwrap() > 8, "no training got through: {ours}");

@@ -130,6 +130,41 @@ fn signals_save_first_and_the_end_is_the_same_to_the_bit() {
     }
 }
 
+/// A second signal does not wait for a save; so short that the first may have done it.
+#[test]
+fn a_second_signal_ends_at_once_and_leaves_the_last_checkpoint() {
+    if ignored(15) {
+        println!("skipped: SIGTERM is ignored here");
+        return;
+    }
+    let run = folder("twice").join("run");
+    let child = start(&[training(&run, "100000"), vec!["--checkpoint-every", "0"]].concat());
+    wait_for(&run.join("checkpoint.safetensors"));
+    let kill = format!("kill -TERM {0}; kill -TERM {0}", child.id());
+    assert!(Command::new("sh").args(["-c", &kill]).status().unwrap().success());
+    let begun = Instant::now();
+    let output = child.wait_with_output().unwrap();
+    let said = String::from_utf8(output.stderr).unwrap();
+    assert_eq!(output.status.code(), Some(143), "{said}");
+    assert!(begun.elapsed() < Duration::from_secs(5) && said.contains("stopped by SIGTERM"), "{said}");
+    done(&["train", "--resume", "--stop-after", "1", "--out", text(&run)]);
+}
+
+/// Time in which the process does not run changes nothing that is learnt.
+#[test]
+fn a_training_that_is_stopped_and_continued_ends_the_same_to_the_bit() {
+    let folder = folder("paused");
+    let (run, whole) = (folder.join("run"), folder.join("whole"));
+    done(&training(&whole, "120"));
+    let child = start(&training(&run, "120"));
+    wait_for(&run.join("train.jsonl"));
+    let pause = format!("for i in 1 2 3; do kill -STOP {0}; sleep 0.4; kill -CONT {0}; sleep 0.1; done", child.id());
+    assert!(Command::new("sh").args(["-c", &pause]).status().unwrap().success());
+    assert_eq!(child.wait_with_output().unwrap().status.code(), Some(0));
+    let bytes = |run: &Path| std::fs::read(run.join("checkpoint.safetensors")).unwrap();
+    assert!(bytes(&run) == bytes(&whole) && run.join("metrics.json").is_file());
+}
+
 #[test]
 fn what_the_program_was_started_to_ignore_stays_ignored() {
     let run = folder("nohup").join("run");
@@ -263,7 +298,8 @@ fn a_run_that_died_before_its_first_checkpoint_is_resumed_from_its_start() {
     done(&training(&whole, "10"));
     std::fs::create_dir(&run).unwrap();
     std::fs::copy(whole.join("config.toml"), run.join("config.toml")).unwrap();
-    done(&["train", "--resume", "--out", text(&run)]);
+    let said = done(&["train", "--resume", "--out", text(&run)]);
+    assert!(said.contains("no checkpoint to go on from; from the start"), "{said}");
     let bytes = |run: &Path| std::fs::read(run.join("checkpoint.safetensors")).unwrap();
     assert!(bytes(&run) == bytes(&whole));
 }
@@ -283,6 +319,9 @@ fn numbers_on_the_command_line_are_blamed_by_their_own_name() {
         assert!(threads.contains("--threads 1000000: expected 1 to ") && threads.lines().count() == 1, "{threads}");
         assert!(begun.elapsed() < Duration::from_secs(20));
     }
+    let begun = Instant::now();
+    let weights = said(&["train", "--set", "loss.perceptual_weights=x"]);
+    assert!(weights.contains("x: no such weights") && begun.elapsed() < Duration::from_secs(5), "{weights}");
     let every = said(&["train", "--checkpoint-every", "nan"]);
     assert!(every.contains("--checkpoint-every"), "{every}");
 }

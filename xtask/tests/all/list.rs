@@ -30,6 +30,11 @@ fn a_list_of_scenes_is_trained_in_parts() {
     assert_eq!(output.status.code(), Some(1));
     let printed = String::from_utf8_lossy(&output.stdout).into_owned() + &String::from_utf8_lossy(&output.stderr);
     assert!(printed.contains("a: finished earlier") && printed.contains("1 of 2 scenes failed"), "{printed}");
+    // Names that differ in case alone are one where the file system says so.
+    common::capture(&folder.join("other/A"), Layout::HumanNerf, 32, 3);
+    std::fs::write(&list, format!("{}\n{}\n", of("a"), of("other/A"))).unwrap();
+    done(&with(&[]));
+    assert!(out.join("A-2/metrics.json").is_file());
     refused(&["train", "--shard", "1/2"], &["--list"]);
     refused(&["train", "--list", text(&list), "--out", text(&out), "--method", "auto"], &["--list", "auto"]);
     assert_eq!(xtask(&["train", "--list", text(&list), "--shard", "3/2"]).status.code(), Some(2));

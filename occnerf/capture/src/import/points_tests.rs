@@ -225,6 +225,9 @@ fn damaged_files_of_sam_3d_body_are_refused_in_one_line() {
         out.write(name, with(key, to));
         refused(name, &words);
     }
+    let Py::List(people) = &frames[2] else { unreachable!() };
+    out.write("crowd.pkl", Py::List(vec![Py::List(vec![people[0].clone(); 257])]).pickle());
+    refused("crowd.pkl", &["at most 256 people", "257"]);
     out.write("twice/000002.pkl", frames[0].pickle());
     out.write("twice/2.json", as_json(&frames[1]).to_string());
     refused("twice", &["number 2", "000002.pkl and 2.json"]);

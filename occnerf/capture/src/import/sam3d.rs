@@ -21,6 +21,8 @@ pub(super) const POINTS: &str = "pred_keypoints_3d";
 /// Joint set of the points.
 pub(super) const SET: &str = "mhr70";
 const COUNT: usize = 70;
+/// Most people of a picture, whose pairs with those of earlier ones are compared.
+const MAX_PEOPLE: usize = 256;
 /// Bones that tell people's sizes: upper arms, thighs and shins.
 const BONES: [[usize; 2]; 6] = [[5, 7], [6, 8], [9, 11], [10, 12], [11, 13], [12, 14]];
 
@@ -144,8 +146,11 @@ fn fit(frames: Vec<(Option<String>, Value, &Path)>, video: &Video) -> Result<Fit
     let mut unknown = None;
     for (index, (name, value, path)) in frames.iter().enumerate() {
         let root = Item { path, key: name.clone().unwrap_or_else(|| index.to_string()), value };
-        let mut found = Vec::new();
-        for person in root.list()? {
+        let (mut found, people) = (Vec::new(), root.list()?);
+        if people.len() > MAX_PEOPLE {
+            return Err(root.invalid(format!("at most {MAX_PEOPLE} people"), people.len().to_string()));
+        }
+        for person in people {
             let item = person.get(POINTS)?;
             let (points, at) = (item.numbers(&[Some(1), Some(COUNT), Some(3)])?, person.get("pred_cam_t")?);
             let at = DVec3::from_slice(&at.few(3)?);
@@ -200,12 +205,15 @@ fn assign(tracks: &mut Vec<Track>, found: Vec<FitFrame>, index: usize) {
         let expected = track.place + track.motion * wait.min(15.0);
         for (i, (middle, size)) in described.iter().enumerate() {
             let off = ((*middle - expected) * DVec3::new(1.0, 1.0, DEPTH)).length();
-            pairs.push((off + SIZE * (size / track.size).ln().abs(), t, i));
+            let cost = off + SIZE * (size / track.size).ln().abs();
+            if cost < METRES {
+                pairs.push((cost, t, i));
+            }
         }
     }
     pairs.sort_by(|a, b| a.0.total_cmp(&b.0));
     let mut of: Vec<Option<usize>> = vec![None; found.len()];
-    for (_, t, i) in pairs.into_iter().filter(|(cost, ..)| *cost < METRES) {
+    for (_, t, i) in pairs {
         if of[i].is_none() && !of.contains(&Some(t)) {
             of[i] = Some(t);
         }

@@ -25,10 +25,10 @@ impl Video {
             let entries = std::fs::read_dir(dir).map_err(CaptureError::io(dir))?.filter_map(Result::ok);
             let others = entries.filter_map(|entry| Some(entry.path().extension()?.to_string_lossy().to_lowercase()));
             let others: BTreeSet<String> = others.collect();
-            let found = match others.is_empty() {
-                true => "none".to_owned(),
-                false => format!("files of {} (ffmpeg converts pictures)", Vec::from_iter(others).join(", ")),
-            };
+            let found = others.first().map_or("none".to_owned(), |first| {
+                let all = others.iter().map(String::as_str).collect::<Vec<_>>().join(", ");
+                format!("files of {all} (`mogrify -format png *.{first}` of ImageMagick converts pictures)")
+            });
             return Err(CaptureError::invalid(dir, "files", "the video's frames, .png or .jpg", found));
         };
         let size = dimensions(first)?;
@@ -80,5 +80,24 @@ impl Video {
     /// The image centre, most estimators' principal point.
     pub fn middle(&self) -> [f64; 2] {
         self.sides().map(|side| side / 2.0)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::Directory;
+
+    #[test]
+    fn pictures_of_other_kinds_are_named_with_a_command() {
+        let dir = Directory::new("import-webp");
+        let refused = || Video::list(dir.path()).err().unwrap().to_string();
+        assert!(refused().contains("found none"), "{}", refused());
+        for (name, words) in
+            [("1.webp", "files of webp (`mogrify -format png *.webp`"), ("2.TIF", "files of tif, webp")]
+        {
+            dir.write(name, b"RIFF");
+            assert!(refused().contains(words), "{}", refused());
+        }
     }
 }

@@ -1,7 +1,7 @@
 //! Writing of an imported capture.
 
 use std::io::Write;
-use std::path::{Component, Path, PathBuf};
+use std::path::{Path, PathBuf};
 
 use glam::DVec3;
 use image::{GrayImage, ImageFormat};
@@ -122,12 +122,13 @@ fn save(levels: Vec<u8>, size: (u32, u32), path: &Path) -> Result<(), CaptureErr
 }
 
 /// `target` as seen from `folder`, both absolute; `target` itself where they share only the root.
+#[cfg(unix)]
 fn relative(target: &Path, folder: &Path) -> PathBuf {
     let shared = target.components().zip(folder.components()).take_while(|(a, b)| a == b).count();
     if shared < 2 {
         return target.to_owned();
     }
-    let up = folder.components().skip(shared).map(|_| Component::ParentDir);
+    let up = folder.components().skip(shared).map(|_| std::path::Component::ParentDir);
     up.chain(target.components().skip(shared)).collect()
 }
 

@@ -13,7 +13,7 @@ use super::noise::smooth_noise;
 use super::perform::{Extent, Skeleton, brought, seconds};
 use super::render::{Lamp, Posture};
 use super::stage::{Progress, Stage, ring};
-use super::texture::{decode, pattern, sample};
+use super::texture::{decode, pattern, sample, tinted};
 use crate::demo::DemoConfig;
 use crate::demo::motion::{Pose, TrackerError, track};
 use capture::{Capture, CaptureError};
@@ -86,14 +86,18 @@ pub(super) fn film(
         betas: vec![config.shape_noise],
         progress,
     };
-    let texture = decode(character)?;
+    let textures = decode(character)?;
+    let is_plain = textures.is_empty() && character.tints.iter().all(|tint| *tint == Vec3::ONE);
     let color = |face: u32, weights: [f32; 3]| {
         let corners = character.faces[face as usize].map(|v| v as usize);
-        match &texture {
+        let mean = |values: &[Vec3]| corners.iter().zip(weights).map(|(&v, w)| values[v] * w).sum::<Vec3>();
+        // The corners of a face are of one material.
+        match character.texture_of[corners[0]] {
             Some(texture) => {
                 let uv: Vec2 = corners.iter().zip(weights).map(|(&v, w)| character.uvs[v] * w).sum();
-                sample(texture, uv)
+                tinted(sample(&textures[texture as usize], uv), mean(&character.tints))
             }
+            None if !is_plain => tinted(Vec3::ONE, mean(&character.tints)),
             None => {
                 let place = |v: usize| figure.body.v_template[figure.welded[v] as usize];
                 let at: Vec3 = corners.iter().zip(weights).map(|(&v, w)| place(v) * w).sum();

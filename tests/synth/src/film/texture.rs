@@ -2,23 +2,27 @@
 
 use glam::{Vec2, Vec3};
 use image::{ImageReader, RgbImage};
-use rigged::Character;
+use rigged::{Character, Texture};
 
 use super::noise::smooth_noise;
 use capture::CaptureError;
 use capture::MAX_SIDE;
 
-/// Decodes the base colour texture; `None` where the character has none, or no coordinates in it.
-pub(super) fn decode(character: &Character) -> Result<Option<RgbImage>, CaptureError> {
-    let Some(texture) = character.texture.as_ref().filter(|_| !character.uvs.is_empty()) else { return Ok(None) };
+/// Decodes the base colour textures, of [`MAX_SIDE`]² pixels at most all together.
+pub(super) fn decode(character: &Character) -> Result<Vec<RgbImage>, CaptureError> {
+    let mut left = u64::from(MAX_SIDE).pow(2);
+    character.textures.iter().map(|texture| decoded(texture, &mut left)).collect()
+}
+
+fn decoded(texture: &Texture, left: &mut u64) -> Result<RgbImage, CaptureError> {
     let fault = |found: String| CaptureError::setting("character", "a base colour texture in PNG or JPEG", found);
     let open = || ImageReader::new(std::io::Cursor::new(&texture.bytes)).with_guessed_format();
     let size = open().map_err(|e| fault(e.to_string()))?.into_dimensions().map_err(|e| fault(e.to_string()))?;
-    if size.0.min(size.1) == 0 || size.0.max(size.1) > MAX_SIDE {
-        return Err(fault(format!("one of {}×{} pixels", size.0, size.1)));
-    }
+    let rest = left.checked_sub(u64::from(size.0) * u64::from(size.1));
+    let fits = size.0.min(size.1) > 0 && size.0.max(size.1) <= MAX_SIDE;
+    *left = rest.filter(|_| fits).ok_or_else(|| fault(format!("one of {}×{} pixels", size.0, size.1)))?;
     let decoded = open().map_err(|e| fault(e.to_string()))?.decode().map_err(|e| fault(e.to_string()))?;
-    Ok(Some(decoded.into_rgb8()))
+    Ok(decoded.into_rgb8())
 }
 
 /// The colour at `uv`, bilinear, repeated beyond the edges. Coordinates that are not finite give
@@ -37,7 +41,17 @@ pub(super) fn sample(texture: &RgbImage, uv: Vec2) -> Vec3 {
     row(0).lerp(row(1), t.y)
 }
 
-/// A pattern for characters without a texture: bands of colour that differ from bone to bone. `at`
+/// An sRGB colour times a linear factor.
+pub(super) fn tinted(color: Vec3, factor: Vec3) -> Vec3 {
+    if factor == Vec3::ONE {
+        return color;
+    }
+    let linear = |c: f32| if c <= 0.04045 { c / 12.92 } else { ((c + 0.055) / 1.055).powf(2.4) };
+    let srgb = |c: f32| if c <= 0.003_130_8 { 12.92 * c } else { 1.055 * c.powf(1.0 / 2.4) - 0.055 };
+    (color.map(linear) * factor).map(srgb)
+}
+
+/// A pattern for characters without colours: bands of colour that differ from bone to bone. `at`
 /// is the place at rest in metres of a person 1.7 m tall, `joint` the bone that moves it most.
 pub(super) fn pattern(at: Vec3, joint: usize) -> Vec3 {
     let hue = joint as f32 * 0.618_034;

@@ -285,6 +285,15 @@ fn fits_of_estimators() {
         std::fs::write(&path, bytes).unwrap();
         imports(&path, &video)
     });
+    let seeds = people::sam3d();
+    for (seed, name) in seeds.into_iter().zip(["SAM 3D Body JSON", "SAM 3D Body pickle"]) {
+        let path = place("sam3d.dat");
+        let attack = Attack { name, form: Form::Plain, seeds: vec![seed], share: 10, most: 64 * MIB };
+        attack.run(|bytes| {
+            std::fs::write(&path, bytes).unwrap();
+            imports(&path, &video)
+        });
+    }
     let dir = place("easymocap");
     std::fs::create_dir_all(dir.join("smpl")).unwrap();
     let [frame, cameras] = people::easymocap();

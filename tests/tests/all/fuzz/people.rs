@@ -88,6 +88,25 @@ pub fn phalp() -> Vec<Vec<u8>> {
         .into()
 }
 
+/// SAM 3D Body's people of two frames as JSON and as a pickle: one with a focal length and a mask, one
+/// with pixels.
+pub fn sam3d() -> Vec<Vec<u8>> {
+    let points: Vec<[f64; 3]> = (0..70).map(|i| [f64::from(i % 7) * 0.125, f64::from(i / 7) * 0.125, 0.5]).collect();
+    let pixels: Vec<[f64; 2]> = points.iter().map(|p| [p[0] * 2.0 + 4.0, p[1] * 2.0 + 4.0]).collect();
+    let (place, mask) = ([0.0, 0.0, 4.0], [[1.0; 8]; 8]);
+    let json = serde_json::json!([
+        [{ "pred_keypoints_3d": points, "pred_cam_t": place, "focal_length": 9.0, "mask": mask.map(Vec::from) }],
+        [{ "pred_keypoints_3d": points, "pred_cam_t": place, "pred_keypoints_2d": pixels }],
+    ]);
+    let common = [("pred_keypoints_3d", array(&[70, 3], points.as_flattened())), ("pred_cam_t", array(&[3], &place))];
+    let person = |more: [(&'static str, Vec<u8>); 2]| list(&[dictionary(&[&common[..], &more].concat())]);
+    let first = person([("focal_length", array(&[], &[9.0])), ("mask", array(&[8, 8], mask.as_flattened()))]);
+    let second =
+        person([("focal_length", b"N".to_vec()), ("pred_keypoints_2d", array(&[70, 2], pixels.as_flattened()))]);
+    let pickle = [&b"\x80\x03"[..], &list(&[first, second]), b"."].concat();
+    vec![json.to_string().into_bytes(), pickle]
+}
+
 /// EasyMocap's file of a frame, and one of cameras that serves as both of them.
 pub fn easymocap() -> [Vec<u8>; 2] {
     let row = |count: usize| vec![vec![0.125; count]];
