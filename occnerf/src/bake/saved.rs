@@ -6,10 +6,10 @@ use std::path::Path;
 use glam::{Affine3A, Mat3, Vec2, Vec3};
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use serde::{Deserialize, Serialize};
-use smpl::{MotionClip, SparseRows};
+use smpl::{Joint, MotionClip, SparseRows};
 use volrender::Camera;
 
-use super::avatar::{Atlas, Avatar, Clip, Joint};
+use super::avatar::{Atlas, Avatar, Clip};
 use crate::Error;
 use crate::capture::Light;
 

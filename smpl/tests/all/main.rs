@@ -3,8 +3,10 @@
 
 mod bodies;
 mod body;
+mod bvh;
 mod clip;
 mod embedded;
 mod golden;
+mod ground;
 mod pose_gradient;
 mod volume;
