@@ -12,7 +12,7 @@ use occnerf::replace_file;
 use smpl::{BoneNames, Bvh};
 
 use crate::avatar;
-use crate::process::{results_in, say, unwritten};
+use crate::process::{note, results_in, say, unwritten};
 
 /// Largest triangle edge of a splat, metres.
 const PATCH: f32 = 0.009;
@@ -183,6 +183,9 @@ fn ground(person: &mut Avatar) -> Result<()> {
             found.tilt.to_degrees(),
             1e3 * found.moved
         );
+        if found.standing == [0.0; 2] {
+            note!("{name}: no foot stands still, as of a person who walks in place: none is held");
+        }
         *motion = found.motion;
     }
     // They are of the motion as it was.

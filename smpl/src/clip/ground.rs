@@ -2,15 +2,17 @@
 
 use std::ops::{Add, Mul, Range};
 
-use glam::{Mat3, Quat, Vec3, Vec4};
+use glam::{DMat3, DVec3, Quat, Vec3, Vec4};
 
 use super::bvh::shorter;
 use super::retarget::{LEGS, Roles};
 use super::{Joint, MotionClip, joint_transforms};
 
 /// Fastest and highest smoothed place of a part of the sole that stands, in m/s and metres.
-const STANDING_SPEED: f32 = 0.3;
-const STANDING_HEIGHT: f32 = 0.06;
+const STANDING_SPEED: f32 = 0.4;
+const STANDING_HEIGHT: f32 = 0.05;
+/// Farthest that a standing part may be from its place; contacts that drift farther are divided.
+const DRIFT: f32 = 0.02;
 /// Standard deviation of the smoothing of places, and shortest contact, in seconds.
 const SMOOTH: f32 = 0.05;
 const SHORTEST_CONTACT: f32 = 0.1;
@@ -18,8 +20,8 @@ const SHORTEST_CONTACT: f32 = 0.1;
 const FADE: f32 = 0.2;
 /// Scale of the residuals of the floor, and spread that the places on it must exceed to tell its
 /// slope, in metres.
-const FLOOR_RESIDUAL: f32 = 0.02;
-const FLOOR_SPREAD: f32 = 0.2;
+const FLOOR_RESIDUAL: f64 = 0.02;
+const FLOOR_SPREAD: f64 = 0.2;
 /// Longest distance from hip to ankle, in lengths of a leg.
 const REACH: f32 = 0.9995;
 
@@ -59,7 +61,8 @@ impl MotionClip {
     /// The floor is a plane fitted to the lowest places of the feet; the world is turned until it is
     /// level. Heels and balls of the feet stand while they are slow and low; standing parts are held
     /// at their mean place by inverse kinematics of hip and knee, with corrections that fade within
-    /// 0.2 s, and hips are lowered where a leg is too short.
+    /// 0.2 s, and hips are lowered where a leg is too short. Feet are displaced by some 2 cm at most, a
+    /// knee of a nearly straight leg by several.
     ///
     /// # Errors
     /// What the skeleton lacks by name: hips, legs, feet with toes; their lengths.
@@ -111,10 +114,15 @@ impl MotionClip {
         for t in 0..frames {
             let bones = motion.bones(skeleton, t);
             for side in 0..2 {
-                let at = |joint: usize| bones[joint].transform_point3(skeleton[joint].rest);
-                let (hip, ankle) = (at(legs[side][0]), at(legs[side][2]) + corrections[side][t].by);
+                let [hip, knee, ankle] =
+                    [0, 1, 2].map(|i| bones[legs[side][i]].transform_point3(skeleton[legs[side][i]].rest));
+                // Stretching a leg moves the knee much farther than the foot.
+                let bent = (knee - hip).reject_from(ankle - hip).length();
+                let straighter = if bent.is_finite() { (bent - DRIFT).max(0.0) } else { 0.0 };
+                let half = |bone: f32| (bone * bone - straighter * straighter).max(0.0).sqrt();
+                let reach = REACH * (half(lengths[side][0]) + half(lengths[side][1]));
+                let ankle = ankle + corrections[side][t].by;
                 targets[t][side] = ankle;
-                let reach = REACH * (lengths[side][0] + lengths[side][1]);
                 let away = (hip - ankle).with_y(0.0).length();
                 let highest = ankle.y + (reach * reach - away * away).max(0.0).sqrt();
                 lowered[t] = lowered[t].max(hip.y - highest);
@@ -125,9 +133,8 @@ impl MotionClip {
         let window = |t: usize| t.saturating_sub(half)..(t + half + 1).min(frames);
         let maxima: Vec<f32> = (0..frames).map(|t| lowered[window(t)].iter().copied().fold(0.0, f32::max)).collect();
         for t in 0..frames {
-            motion.trans[t].y -= maxima[window(t)].iter().sum::<f32>() / window(t).len() as f32;
-        }
-        for t in 0..frames {
+            let lower = maxima[window(t)].iter().sum::<f32>() / window(t).len() as f32;
+            motion.trans[t].y -= lower;
             for side in 0..2 {
                 let turn = corrections[side][t].turn;
                 motion.place_foot(skeleton, t, legs[side], lengths[side], targets[t][side], turn);
@@ -172,6 +179,9 @@ impl MotionClip {
         let bones = self.bones(skeleton, frame);
         let [at_hip, at_knee, at_ankle] = [hip, knee, ankle].map(|j| bones[j].transform_point3(skeleton[j].rest));
         let rotation = |joint: usize| Quat::from_mat3a(&bones[joint].matrix3).normalize();
+        if target.distance(at_ankle) < 1e-6 && turn == Quat::IDENTITY {
+            return;
+        }
         let (way, ahead) = (target - at_hip, rotation(hip) * Vec3::Z);
         let distance = way.length().clamp((thigh - shin).abs() + 1e-4, REACH * (thigh + shin));
         let along = way.normalize_or(Vec3::NEG_Y);
@@ -209,10 +219,17 @@ impl Foot {
                 let speed = (smooth[b] - smooth[a]).with_y(0.0).length() * fps / (b - a).max(1) as f32;
                 speed < STANDING_SPEED && smooth[t].y < STANDING_HEIGHT
             };
-            let mut stands: Vec<bool> = (0..smooth.len()).map(slow).collect();
-            for run in runs(&stands) {
-                if (run.len() as f32) < SHORTEST_CONTACT * fps {
-                    stands[run].fill(false);
+            let slow: Vec<bool> = (0..smooth.len()).map(slow).collect();
+            let mut stands = vec![false; slow.len()];
+            let mut todo = runs(&slow);
+            while let Some(run) = todo.pop() {
+                let core = steady(places, run.clone());
+                if core.len() as f32 >= SHORTEST_CONTACT * fps {
+                    stands[core.clone()].fill(true);
+                    // Parts of the run, with time to move the foot between.
+                    let gap = (FADE * fps).ceil() as usize;
+                    let parts = [run.start..core.start.saturating_sub(gap), core.end + gap..run.end];
+                    todo.extend(parts.into_iter().filter(|part| !part.is_empty()));
                 }
             }
             stands
@@ -234,7 +251,8 @@ impl Foot {
         let length = |t: usize| self.places[0][t].distance(self.places[1][t]);
         for (part, run) in contacts {
             let mean = self.places[part][run.clone()].iter().sum::<Vec3>() / run.len() as f32;
-            let mut at = mean.with_y(0.0);
+            // Half of what is allowed is used to bring it to the floor.
+            let mut at = mean.with_y(mean.y - mean.y.clamp(-0.5 * DRIFT, 0.5 * DRIFT));
             // As far from the other part, where that stands, as the foot is long.
             if let Some(other) = held[1 - part][run.start] {
                 at = other + length(run.start) * (at - other).normalize_or(Vec3::Z);
@@ -263,6 +281,25 @@ impl Foot {
             .collect();
         turns.into_iter().zip(faded(&by, fade)).map(|(turn, (by, _))| Correction { turn, by }).collect()
     }
+}
+
+/// The part of a run of frames in which places keep near their mean: the farther end goes first.
+fn steady(places: &[Vec3], mut run: Range<usize>) -> Range<usize> {
+    let mut sum: Vec3 = places[run.clone()].iter().sum();
+    while !run.is_empty() {
+        let mean = sum / run.len() as f32;
+        let [first, last] = [places[run.start], places[run.end - 1]];
+        let (from_first, from_last) = (first.distance(mean), last.distance(mean));
+        if from_first.max(from_last) <= DRIFT {
+            break;
+        }
+        if from_first > from_last {
+            (sum, run.start) = (sum - first, run.start + 1);
+        } else {
+            (sum, run.end) = (sum - last, run.end - 1);
+        }
+    }
+    run
 }
 
 /// Known values, and between them those before and after, whose weights, 1 at their own frames, go
@@ -295,23 +332,27 @@ fn floor(feet: &[[Vec<Vec3>; 3]; 2]) -> (Vec3, f32) {
     let lowest: Vec<Vec3> = (0..all[0].len()).map(lowest).collect();
     let mut heights: Vec<f32> = lowest.iter().map(|at| at.y).collect();
     heights.sort_by(f32::total_cmp);
-    let mut plane = Vec3::new(0.0, heights.get(heights.len() / 2).copied().unwrap_or(0.0), 0.0);
-    let centre = lowest.iter().sum::<Vec3>() / lowest.len().max(1) as f32;
+    let median = heights.get(heights.len() / 2).copied().unwrap_or(0.0);
+    let centre = (lowest.iter().sum::<Vec3>() / lowest.len().max(1) as f32).with_y(median);
+    let mut plane = DVec3::ZERO;
     for _ in 0..30 {
-        let (mut matrix, mut right) = (Mat3::ZERO, Vec3::ZERO);
+        let (mut matrix, mut right, mut total) = (DMat3::ZERO, DVec3::ZERO, 0.0);
         for at in &lowest {
-            let row = (*at - centre).with_y(1.0);
+            let at = (*at - centre).as_dvec3();
+            let row = at.with_y(1.0);
             let residual = (at.y - plane.dot(row)) / FLOOR_RESIDUAL;
             let weight = 1.0 / (1.0 + residual * residual);
-            matrix += Mat3::from_cols(row * row.x, row * row.y, row * row.z) * weight;
+            matrix += DMat3::from_cols(row * row.x, row, row * row.z) * weight;
             right += weight * at.y * row;
+            total += weight;
         }
-        let ridge = matrix.y_axis.y * FLOOR_SPREAD * FLOOR_SPREAD;
-        matrix += Mat3::from_diagonal(Vec3::new(ridge, 1e-9, ridge));
-        plane = matrix.inverse() * right;
+        let ridge = total * FLOOR_SPREAD * FLOOR_SPREAD;
+        matrix += DMat3::from_diagonal(DVec3::new(ridge, 0.0, ridge));
+        plane = Some(matrix.inverse() * right).filter(|plane| plane.is_finite()).unwrap_or(plane);
     }
+    let plane = plane.as_vec3();
     let normal = Vec3::new(-plane.x, 1.0, -plane.z).normalize_or(Vec3::Y);
-    (normal, normal.dot(centre.with_y(plane.y)))
+    (normal, normal.dot(centre + plane.y * Vec3::Y))
 }
 
 /// Mean horizontal speed of the parts that stand from one frame to the next.
