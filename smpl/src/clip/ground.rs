@@ -18,6 +18,8 @@ const SMOOTH: f32 = 0.05;
 const SHORTEST_CONTACT: f32 = 0.1;
 /// Time over which corrections fade in and out, in seconds.
 const FADE: f32 = 0.2;
+/// Longest window of smoothing, in frames.
+const MAX_WINDOW: f32 = 200.0;
 /// Scale of the residuals of the floor, and spread that the places on it must exceed to tell its
 /// slope, in metres.
 const FLOOR_RESIDUAL: f64 = 0.02;
@@ -129,7 +131,7 @@ impl MotionClip {
             }
         }
         // Maxima of a window, averaged over one as wide, are nowhere below the values.
-        let half = (FADE * self.fps).ceil() as usize;
+        let half = (FADE * self.fps).min(MAX_WINDOW).ceil() as usize;
         let window = |t: usize| t.saturating_sub(half)..(t + half + 1).min(frames);
         let maxima: Vec<f32> = (0..frames).map(|t| lowered[window(t)].iter().copied().fold(0.0, f32::max)).collect();
         for t in 0..frames {
@@ -212,7 +214,7 @@ impl Foot {
     fn new([ankles, heels, balls]: [Vec<Vec3>; 3], fps: f32) -> Self {
         let places = [heels, balls];
         let stands = places.each_ref().map(|places| {
-            let smooth = smoothed(places, SMOOTH * fps);
+            let smooth = smoothed(places, (SMOOTH * fps).min(MAX_WINDOW));
             let last = smooth.len().saturating_sub(1);
             let slow = |t: usize| {
                 let (a, b) = (t.saturating_sub(1), (t + 1).min(last));
