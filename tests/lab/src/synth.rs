@@ -9,7 +9,7 @@ use occnerf::bake::skeleton;
 use occnerf::capture::Layout;
 use rigged::Character;
 use smpl::{BodyModel, Bvh, MotionClip};
-use synth::{BODY, Obstacle, Occlusion, SynthConfig, Synthetic, synthesise};
+use synth::{BODY, Obstacle, Occlusion, Outfit, SynthConfig, Synthetic, synthesise};
 
 use crate::obstacle::ObstacleArguments;
 use xtask::place::{beside, not_within, take_place, vacant};
@@ -40,6 +40,16 @@ enum OcclusionName {
     Moving,
     /// A desk and pillars of 3-D geometry, in every frame.
     Objects,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+enum OutfitName {
+    /// Shirt, trousers, shoes and short hair, close to the body.
+    Plain,
+    /// A skirt to the knees.
+    Skirt,
+    /// Loose strands to the shoulder blades.
+    LongHair,
 }
 
 /// Where a capture is written.
@@ -128,6 +138,9 @@ pub struct SynthArguments {
     /// Strength of the light from one side; at 0 as much comes from everywhere [default: 1]
     #[arg(long, value_name = "0 to 1")]
     lamp: Option<f32>,
+    /// What the embedded person wears: a skirt and loose hair are no displacement of the body's surface
+    #[arg(long, default_value = "plain", conflicts_with = "character")]
+    outfit: OutfitName,
 }
 
 impl SynthArguments {
@@ -154,6 +167,11 @@ impl SynthArguments {
             pose_noise_degrees: self.pose_noise.unwrap_or(usual.pose_noise_degrees),
             shape_noise: self.shape_noise.unwrap_or(usual.shape_noise),
             turns: self.turns.unwrap_or(usual.turns),
+            outfit: match self.outfit {
+                OutfitName::Plain => Outfit::Plain,
+                OutfitName::Skirt => Outfit::Skirt,
+                OutfitName::LongHair => Outfit::LongHair,
+            },
             occlusion,
         })
     }

@@ -17,7 +17,7 @@ mod obstacle;
 mod perturbation;
 mod write;
 
-pub use self::demo::{DemoConfig, demo};
+pub use self::demo::{DemoConfig, Outfit, demo};
 pub use self::film::{Occlusion, SynthConfig, Synthetic, synthesise};
 pub use self::obstacle::Obstacle;
 pub use self::perturbation::Perturbation;

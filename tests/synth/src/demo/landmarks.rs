@@ -78,4 +78,9 @@ impl Landmarks {
     pub fn figure(&self, rest: Vec3) -> Vec3 {
         (rest - self.pelvis) / self.unit
     }
+
+    /// A point in figure metres in the rest pose.
+    pub fn rest(&self, figure: Vec3) -> Vec3 {
+        self.pelvis + self.unit * figure
+    }
 }

@@ -4,6 +4,7 @@ mod clothes;
 mod face;
 pub(super) mod landmarks;
 pub(super) mod motion;
+mod outfit;
 mod person;
 #[cfg(test)]
 mod tests;
@@ -17,6 +18,8 @@ use serde::{Deserialize, Serialize};
 use smpl::{BodyModel, Shaped};
 
 use self::landmarks::joint;
+pub use self::outfit::Outfit;
+
 use self::motion::{Pose, TrackerError, track, walk};
 use self::person::Person;
 use self::texture::{Dress, albedo};
@@ -59,6 +62,8 @@ pub struct DemoConfig {
     pub occluded_share: f32,
     /// How far arms and legs are pressed against the body and each other, 0 (a free walk) to 1.
     pub pressed: f32,
+    /// What the person wears over its clothes.
+    pub outfit: Outfit,
     /// Whether training frames say which pixels the obstacle covers. Published captures do not.
     pub known_occluder: bool,
 }
@@ -78,6 +83,7 @@ impl Default for DemoConfig {
             occluded_fraction: 0.5,
             occluded_share: 0.8,
             pressed: 0.0,
+            outfit: Outfit::Plain,
             known_occluder: false,
         }
     }
@@ -143,7 +149,7 @@ pub(super) fn film(
 ) -> Result<(Capture, f32), CaptureError> {
     let (true_betas, betas) = shapes(config, body);
     let shaped = body.shaped(&true_betas);
-    let person = Person::new(body, &shaped);
+    let person = Person::new(body, &shaped, config.outfit);
     let (poses, height) = perform(config, body, &shaped);
     let error = TrackerError {
         seed: config.seed,
@@ -160,7 +166,11 @@ pub(super) fn film(
     let (dress, lamp) = (Dress::new(config.seed), Lamp::new(config.lamp, config.seed));
     let color = |face: u32, weights: [f32; 3]| {
         let corners = person.faces[face as usize].iter().zip(weights);
-        albedo(&person.landmarks, &dress, corners.map(|(&v, w)| person.rest[v as usize] * w).sum())
+        let rest = corners.map(|(&v, w)| person.rest[v as usize] * w).sum();
+        match (face as usize) < person.sheets {
+            true => albedo(&person.landmarks, &dress, rest),
+            false => outfit::color(config.outfit, person.landmarks.figure(rest)),
+        }
     };
     let capture = stage.film("demo", |i| {
         let posed = body.pose(&shaped, &poses[i].joints, poses[i].placement());

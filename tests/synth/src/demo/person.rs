@@ -7,19 +7,21 @@ use glam::{Affine3A, Mat3A, Vec3, Vec3A};
 use smpl::{BodyModel, Posed, Shaped, SparseRows};
 
 use super::landmarks::Landmarks;
+use super::outfit::{Outfit, Sheet};
 
 /// A person at rest, ready to be posed.
 pub(super) struct Person {
     pub landmarks: Landmarks,
     /// Triangles of the finer mesh.
     pub faces: Vec<[u32; 3]>,
-    /// Places on the naked body at rest, one a vertex of the finer mesh: what colours are looked up
-    /// by.
+    /// The first of `faces` that is not the body's.
+    pub sheets: usize,
+    /// Places on the naked body at rest, or on a sheet, one a vertex: what colours are looked up by.
     pub rest: Vec<Vec3>,
     /// `rest` with the clothes on.
     clothed: Vec<Vec3>,
     /// The two vertices of the body's mesh that a vertex lies halfway between; the same twice for
-    /// an old one.
+    /// an old one; none of sheets.
     ends: Vec<[u32; 2]>,
     weights: SparseRows<f32>,
 }
@@ -45,18 +47,23 @@ fn subdivide(vertices: usize, faces: &[[u32; 3]]) -> (Vec<[u32; 3]>, Vec<[u32; 2
 
 impl Person {
     /// Dresses `shaped`, a body of `model` in SMPL's T-pose.
-    pub fn new(model: &BodyModel, shaped: &Shaped) -> Self {
+    pub fn new(model: &BodyModel, shaped: &Shaped, outfit: Outfit) -> Self {
         let landmarks = Landmarks::new(shaped);
-        let (faces, ends) = subdivide(shaped.vertices.len(), &model.faces);
-        let rest: Vec<Vec3> =
+        let (mut faces, ends) = subdivide(shaped.vertices.len(), &model.faces);
+        let mut rest: Vec<Vec3> =
             ends.iter().map(|[a, b]| shaped.vertices[*a as usize].midpoint(shaped.vertices[*b as usize])).collect();
         let normals = surface_query::vertex_normals(&rest, &faces);
-        let clothed = rest
+        let mut clothed: Vec<Vec3> = rest
             .iter()
             .zip(&normals)
             .map(|(&p, &n)| p + n * (landmarks.thickness(landmarks.figure(p)) * landmarks.unit))
             .collect();
-        let weights = SparseRows::from_rows(ends.iter().map(|[a, b]| {
+        let sheet = Sheet::new(outfit, &landmarks);
+        let (sheets, first) = (faces.len(), rest.len() as u32);
+        faces.extend(sheet.faces.iter().map(|face| face.map(|v| first + v)));
+        rest.extend(sheet.places.iter().map(|&q| landmarks.rest(q)));
+        clothed.extend_from_slice(&rest[first as usize..]);
+        let of_body = ends.iter().map(|[a, b]| {
             let mut row: Vec<(u32, f32)> = Vec::new();
             for v in [*a, *b] {
                 for (joint, w) in model.weights.row(v as usize) {
@@ -68,8 +75,9 @@ impl Person {
             }
             row.sort_unstable_by_key(|(joint, _)| *joint);
             row
-        }));
-        Self { landmarks, faces, rest, clothed, ends, weights }
+        });
+        let weights = SparseRows::from_rows(of_body.chain(sheet.weights));
+        Self { landmarks, faces, sheets, rest, clothed, ends, weights }
     }
 
     /// Vertices of the clothed mesh under the bones of `posed`, the same body posed.
@@ -77,15 +85,15 @@ impl Person {
         let offset = |v: u32| posed.pose_offsets[v as usize];
         self.clothed
             .iter()
-            .zip(&self.ends)
             .enumerate()
-            .map(|(v, (&clothed, &[a, b]))| {
+            .map(|(v, &clothed)| {
+                let bent = self.ends.get(v).map_or(Vec3::ZERO, |&[a, b]| offset(a).midpoint(offset(b)));
                 let mut blend = Affine3A { matrix3: Mat3A::ZERO, translation: Vec3A::ZERO };
                 for (joint, w) in self.weights.row(v) {
                     blend.matrix3 += posed.bones[joint].matrix3 * w;
                     blend.translation += posed.bones[joint].translation * w;
                 }
-                blend.transform_point3(clothed + offset(a).midpoint(offset(b)))
+                blend.transform_point3(clothed + bent)
             })
             .collect()
     }

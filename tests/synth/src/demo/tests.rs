@@ -229,3 +229,20 @@ fn one_frame_and_no_evaluation_camera_make_a_capture() {
     let capture = demo(&least, body()).unwrap();
     assert_eq!((capture.train.len(), capture.eval.len()), (1, 0));
 }
+
+#[test]
+fn an_outfit_covers_pixels_beside_the_body_and_leaves_the_motion_as_it_is() {
+    let plain = demo(&small(), body()).unwrap();
+    for (outfit, least) in [(Outfit::Skirt, 1.15), (Outfit::LongHair, 1.01)] {
+        let dressed = demo(&DemoConfig { outfit, ..small() }, body()).unwrap();
+        let [mut covered, mut more] = [0.0, 0.0];
+        for (a, b) in plain.eval.iter().zip(&dressed.eval) {
+            assert_eq!((&a.frame.pose, a.frame.placement), (&b.frame.pose, b.frame.placement));
+            let [a, b] = [a, b].map(|view| view.frame.pixels().unwrap().mask);
+            assert!(a.iter().zip(&b).all(|(a, b)| a <= b), "{outfit:?} hides the person");
+            covered += a.iter().sum::<f32>();
+            more += b.iter().sum::<f32>();
+        }
+        assert!(more > least * covered, "{outfit:?}: {more} of {covered}");
+    }
+}

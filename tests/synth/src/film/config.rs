@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::demo::DemoConfig;
+use crate::demo::{DemoConfig, Outfit};
 use crate::obstacle::Obstacle;
 use capture::CaptureError;
 use capture::PIXEL_BYTES;
@@ -51,6 +51,8 @@ pub struct SynthConfig {
     /// Full turns added over the video to the motion of a clip or a character, −10 to 10, so that
     /// all sides are seen.
     pub turns: f32,
+    /// What the embedded person wears over its clothes.
+    pub outfit: Outfit,
     /// What hides the person.
     pub occlusion: Occlusion,
 }
@@ -68,6 +70,7 @@ impl Default for SynthConfig {
             pose_noise_degrees: demo.pose_noise_degrees,
             shape_noise: 1.0,
             turns: 1.15,
+            outfit: demo.outfit,
             occlusion: Occlusion::Rectangle(Obstacle::default()),
         }
     }
@@ -87,6 +90,7 @@ impl SynthConfig {
             pose_noise_degrees: self.pose_noise_degrees,
             beta_noise: usual.beta_noise * self.shape_noise,
             occluded_fraction: 0.0,
+            outfit: self.outfit,
             ..usual
         }
     }
