@@ -1,6 +1,7 @@
 //! `export`: a trained person in standard formats.
 
 use std::io::Write;
+use std::ops::Range;
 use std::path::PathBuf;
 
 use anyhow::{Context, Error, Result, anyhow, bail};
@@ -107,8 +108,9 @@ pub fn export(arguments: &ExportArguments) -> Result<()> {
     if let Some(path) = &arguments.motion {
         avatar::add_motion(&mut person, path, arguments.fps)?;
     }
+    let clip = if arguments.motion.is_some() { person.clips.len() - 1 } else { 0 };
     if arguments.ground {
-        ground(&mut person)?;
+        ground(&mut person, if has_texture { 0..person.clips.len() } else { clip..clip + 1 })?;
     }
     rename(&mut person, arguments.bones);
     if let Some(side) = arguments.texture {
@@ -116,7 +118,6 @@ pub fn export(arguments: &ExportArguments) -> Result<()> {
     }
     // The folder is made only now, so that bad input leaves nothing behind.
     avatar::check_folder(out)?;
-    let clip = if arguments.motion.is_some() { person.clips.len() - 1 } else { 0 };
     match format {
         Format::Glb | Format::Vrm => {
             let author = arguments.author.as_deref().unwrap_or("unknown");
@@ -170,10 +171,10 @@ fn format(arguments: &ExportArguments) -> Result<Format> {
     }
 }
 
-/// Sets every motion on the floor, and says what became of it.
-fn ground(person: &mut Avatar) -> Result<()> {
+/// Sets some of the motions on the floor, and says what became of them.
+fn ground(person: &mut Avatar, clips: Range<usize>) -> Result<()> {
     let sole = person.vertices.iter().map(|v| v.y).fold(f32::INFINITY, f32::min);
-    for Clip { name, motion } in &mut person.clips {
+    for Clip { name, motion } in person.clips.iter_mut().skip(clips.start).take(clips.len()) {
         let found = motion.grounded(&person.skeleton, sole).map_err(|fault| anyhow!("--ground: {name:?}: {fault}"))?;
         let [before, after] = found.sliding.map(|speed| 1e3 * speed);
         let [left, right] = found.standing.map(|share| 100.0 * share);
