@@ -110,7 +110,8 @@ pub fn export(arguments: &ExportArguments) -> Result<()> {
     }
     let clip = if arguments.motion.is_some() { person.clips.len() - 1 } else { 0 };
     if arguments.ground {
-        ground(&mut person, if has_texture { 0..person.clips.len() } else { clip..clip + 1 })?;
+        let clips = if has_texture { 0..person.clips.len() } else { clip..clip + 1 };
+        ground(&mut person, clips)?;
     }
     rename(&mut person, arguments.bones);
     if let Some(side) = arguments.texture {

@@ -168,7 +168,7 @@ fn rigs_that_do_not_fit_are_told_what_they_lack() {
     let message = rig(4, smpl[1].rest).onto(&smpl).unwrap_err();
     assert!(message.contains("left upper leg has zero length"), "{message}");
     let mut flat = rig(0, Vec3::ZERO);
-    flat.skeleton.iter_mut().for_each(|joint| joint.rest = joint.rest * Vec3::X);
+    flat.skeleton.iter_mut().for_each(|joint| joint.rest *= Vec3::X);
     assert!(flat.onto(&smpl).unwrap_err().contains("no height"));
 }
 
