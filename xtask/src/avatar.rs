@@ -2,10 +2,11 @@
 
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context, Result, ensure};
+use anyhow::{Context, Result, anyhow, ensure};
+use glam::Vec3;
 use occnerf::Method;
 use occnerf::bake::{Avatar, Clip, export};
-use smpl::MotionClip;
+use smpl::{Bvh, Joint, MotionClip};
 
 use crate::baked;
 use crate::process::{Lock, say, telling, unwritten};
@@ -29,23 +30,31 @@ pub fn of_run(run: &Path) -> Result<(Avatar, Lock)> {
     Ok((avatar, lock))
 }
 
-/// Reads a motion of `fps` frames per second, by default as many as the file says.
-pub fn load_motion(path: &Path, fps: Option<f32>) -> Result<MotionClip> {
-    let (mut motion, rate) = telling(&format!("reading {}", path.display()), || MotionClip::load_with_rate(path))?;
+/// Reads a motion for `skeleton`, y up, of `fps` frames per second, by default as many as the file
+/// says.
+pub fn load_motion(path: &Path, fps: Option<f32>, skeleton: &[Joint]) -> Result<MotionClip> {
+    let is_bvh = path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("bvh"));
+    let (mut motion, rate) = if is_bvh {
+        let bvh = telling(&format!("reading {}", path.display()), || Bvh::load(path))?;
+        let motion = bvh.onto(skeleton).map_err(|fault| anyhow!("{}: {fault}", path.display()))?;
+        say!("{}: {} joints, lengths taken for {}", path.display(), bvh.skeleton.len(), bvh.unit);
+        (motion, Some(bvh.motion.fps))
+    } else {
+        telling(&format!("reading {}", path.display()), || MotionClip::load_with_rate(path))?
+    };
     if let Some(fps) = fps {
         ensure!((1e-3..=1e6).contains(&fps), "--fps {fps}: expected 0.001 to 1000000");
         motion.fps = fps;
     } else if rate.is_none() {
         say!("{}: no frames per second in it, {} are assumed (--fps)", path.display(), motion.fps);
     }
-    Ok(motion)
+    let root = skeleton.first().map_or(Vec3::ZERO, |joint| joint.rest);
+    export::fit_motion(&motion, skeleton.len(), root).with_context(|| path.display().to_string())
 }
 
 /// Adds a motion from a file, named after it.
 pub fn add_motion(avatar: &mut Avatar, path: &Path, fps: Option<f32>) -> Result<()> {
-    let motion = load_motion(path, fps)?;
-    let root = avatar.skeleton[0].rest;
-    let motion = export::fit_motion(&motion, avatar.num_joints(), root).with_context(|| path.display().to_string())?;
+    let motion = load_motion(path, fps, &avatar.skeleton)?;
     let stem = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
     let taken = |name: &str| avatar.clips.iter().any(|clip| clip.name == name);
     let others = (2..).map(|i| format!("{stem} {i}"));

@@ -1,16 +1,19 @@
 //! `export`: a trained person in standard formats.
 
 use std::io::Write;
+use std::ops::Range;
 use std::path::PathBuf;
 
-use anyhow::{Context, Error, Result, bail};
+use anyhow::{Context, Error, Result, anyhow, bail};
 use clap::{Args, ValueEnum};
 use glam::Vec3;
-use occnerf::bake::{Avatar, export};
+use occnerf::bake::export::{GlbOptions, VRM_LICENCE, Vrm};
+use occnerf::bake::{Avatar, Clip, export};
 use occnerf::replace_file;
+use smpl::{BoneNames, Bvh};
 
 use crate::avatar;
-use crate::process::{results_in, say, unwritten};
+use crate::process::{note, results_in, say, unwritten};
 
 /// Largest triangle edge of a splat, metres.
 const PATCH: f32 = 0.009;
@@ -20,12 +23,27 @@ enum Format {
     /// Skinned, textured avatar with its motions: glTF binary for Blender, three.js, Unity, Unreal,
     /// Godot.
     Glb,
+    /// The same as VRM 1.0, arms level at rest, for avatars on the web and in games.
+    Vrm,
     /// One pose as 3-D Gaussian splats, for viewers of such scenes.
     Ply,
     /// One pose as a mesh with colours at its vertices, and .mtl and .png beside it.
     Obj,
     /// The corrected poses as motion capture in AMASS's form.
     Npz,
+    /// Skeleton and motion, in centimetres, rotations Z X Y, for Blender and motion capture tools.
+    Bvh,
+}
+
+/// Names of joints.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+enum Bones {
+    /// `pelvis`, `left_knee`
+    Smpl,
+    /// `mixamorig:Hips`, `mixamorig:LeftLeg`
+    Mixamo,
+    /// `hips`, `leftLowerLeg`
+    Vrm,
 }
 
 #[derive(Args)]
@@ -38,9 +56,10 @@ pub struct ExportArguments {
     /// File to write
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
-    /// Motion capture, an .npz with poses, trans and fps, as AMASS has them: added to a glb, in
-    /// place of the video's motion elsewhere
-    #[arg(long, value_name = "CLIP.npz")]
+    /// Motion capture, an .npz with poses, trans and fps, as AMASS has them, or a .bvh of a rig whose
+    /// joints have the names of SMPL, Mixamo, CMU or VRM: added to a glb or vrm, in place of the
+    /// video's motion elsewhere
+    #[arg(long, value_name = "CLIP")]
     motion: Option<PathBuf>,
     /// Frames per second of --motion [default: as the file says]
     #[arg(long, value_name = "N", requires = "motion")]
@@ -48,6 +67,27 @@ pub struct ExportArguments {
     /// Frame of the motion whose pose a ply or an obj shows [default: the first]
     #[arg(long, value_name = "N")]
     frame: Option<usize>,
+    /// Set the motions on level ground: the floor is found from the feet, and feet that stand stay
+    /// in their places
+    #[arg(long)]
+    ground: bool,
+    /// Names of the joints in a glb, vrm or bvh; those of rigged characters stay
+    #[arg(long, value_enum, default_value = "smpl")]
+    bones: Bones,
+    /// Longest side of the texture of a glb or vrm, texels; halved until it is no longer [default:
+    /// as it is]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    texture: Option<u32>,
+    /// Texture of a glb or vrm as JPEG of this quality, 1 to 100, in place of PNG
+    #[arg(long, value_name = "QUALITY", value_parser = clap::value_parser!(u8).range(1..=100))]
+    jpeg: Option<u8>,
+    /// Author that a vrm names [default: unknown]
+    #[arg(long, value_name = "NAME")]
+    author: Option<String>,
+    /// Licence of a vrm, added to the one that the format demands [default:
+    /// https://vrm.dev/licenses/1.0/ alone]
+    #[arg(long, value_name = "URL")]
+    licence: Option<String>,
 }
 
 /// Runs the command.
@@ -57,16 +97,34 @@ pub fn export(arguments: &ExportArguments) -> Result<()> {
     if arguments.frame.is_some() && !matches!(format, Format::Ply | Format::Obj) {
         bail!("--frame is of one pose: --format ply or obj");
     }
+    let has_texture = matches!(format, Format::Glb | Format::Vrm);
+    if !has_texture && (arguments.texture.is_some() || arguments.jpeg.is_some()) {
+        bail!("--texture and --jpeg are of a glb or vrm");
+    }
+    if format != Format::Vrm && (arguments.author.is_some() || arguments.licence.is_some()) {
+        bail!("--author and --licence are of a vrm");
+    }
     let (mut person, _lock) = avatar::of_run(&arguments.run)?;
     if let Some(path) = &arguments.motion {
         avatar::add_motion(&mut person, path, arguments.fps)?;
     }
+    let clip = if arguments.motion.is_some() { person.clips.len() - 1 } else { 0 };
+    if arguments.ground {
+        let clips = if has_texture { 0..person.clips.len() } else { clip..clip + 1 };
+        ground(&mut person, clips)?;
+    }
+    rename(&mut person, arguments.bones);
+    if let Some(side) = arguments.texture {
+        person.atlas.shrink(side);
+    }
     // The folder is made only now, so that bad input leaves nothing behind.
     avatar::check_folder(out)?;
-    let clip = if arguments.motion.is_some() { person.clips.len() - 1 } else { 0 };
     match format {
-        Format::Glb => {
-            let bytes = person.to_glb()?;
+        Format::Glb | Format::Vrm => {
+            let author = arguments.author.as_deref().unwrap_or("unknown");
+            let vrm = Vrm { author, licence: arguments.licence.as_deref().unwrap_or(VRM_LICENCE) };
+            let vrm = Some(vrm).filter(|_| format == Format::Vrm);
+            let bytes = person.to_glb_with(&GlbOptions { jpeg: arguments.jpeg, vrm })?;
             replace_file(out, |to| to.write_all(&bytes)).map_err(unwritten(out))?;
             let names: Vec<&str> = person.clips.iter().map(|clip| clip.name.as_str()).collect();
             let size = bytes.len() as f64 * 1e-6;
@@ -89,6 +147,13 @@ pub fn export(arguments: &ExportArguments) -> Result<()> {
             export::write_amass(&person, clip, out).map_err(Error::from).map_err(results_in(out))?;
             say!("{}: {} frames", out.display(), person.clips[clip].motion.num_frames());
         }
+        Format::Bvh => {
+            let motion = person.clips.get(clip).context("the person has no motion")?.motion.clone();
+            let frames = motion.num_frames();
+            let bvh = Bvh { skeleton: person.skeleton, motion, unit: "centimetres" };
+            bvh.save(out).map_err(Error::from).map_err(results_in(out))?;
+            say!("{}: {frames} frames of {} joints, in centimetres", out.display(), bvh.skeleton.len());
+        }
     }
     Ok(())
 }
@@ -103,8 +168,47 @@ fn format(arguments: &ExportArguments) -> Result<Format> {
             bail!("--out {}: a name of another format than --format {asked:?}", out.display())
         }
         (Some(format), _) | (None, Some(format)) => Ok(format),
-        (None, None) => bail!("--out {}: expected .glb, .ply, .obj or .npz, or --format", out.display()),
+        (None, None) => bail!("--out {}: expected .glb, .vrm, .ply, .obj, .npz or .bvh, or --format", out.display()),
     }
+}
+
+/// Sets some of the motions on the floor, and says what became of them.
+fn ground(person: &mut Avatar, clips: Range<usize>) -> Result<()> {
+    let sole = person.vertices.iter().map(|v| v.y).fold(f32::INFINITY, f32::min);
+    for Clip { name, motion } in person.clips.iter_mut().skip(clips.start).take(clips.len()) {
+        let found = motion.grounded(&person.skeleton, sole).map_err(|fault| anyhow!("--ground: {name:?}: {fault}"))?;
+        let [before, after] = found.sliding.map(|speed| 1e3 * speed);
+        let [left, right] = found.standing.map(|share| 100.0 * share);
+        say!(
+            "{name}: feet slide {before:.0} mm/s, now {after:.1}; standing {left:.0} and {right:.0} % of the time; \
+             world turned by {:.1}°; elsewhere moved by at most {:.0} mm",
+            found.tilt.to_degrees(),
+            1e3 * found.moved
+        );
+        if found.standing == [0.0; 2] {
+            note!("{name}: no foot stands still, as of a person who walks in place: none is held");
+        }
+        *motion = found.motion;
+    }
+    // They are of the motion as it was.
+    person.cameras.clear();
+    Ok(())
+}
+
+/// Gives the joints the names of a scheme, as far as it has such.
+fn rename(person: &mut Avatar, bones: Bones) {
+    let scheme = match bones {
+        Bones::Smpl => BoneNames::Smpl,
+        Bones::Mixamo => BoneNames::Mixamo,
+        Bones::Vrm => BoneNames::Vrm,
+    };
+    let names: Vec<&str> = person.skeleton.iter().map(|joint| joint.name.as_str()).collect();
+    let names = scheme.translate(&names);
+    person.skeleton.iter_mut().zip(names).for_each(|(joint, name)| {
+        if let Some(name) = name {
+            joint.name = name;
+        }
+    });
 }
 
 /// Vertices and normals of the person at `--frame`.

@@ -7,8 +7,7 @@ use anyhow::{Context, Result, bail};
 use clap::{Args, ValueEnum};
 use glam::{Affine3A, Mat3, Vec3};
 use indicatif::ProgressBar;
-use occnerf::bake::export::fit_motion;
-use occnerf::bake::{Avatar, BakedRenderer};
+use occnerf::bake::{Avatar, BakedRenderer, skeleton};
 use occnerf::{Body, FieldRenderer, Method, Person, PosedFrame, PosedView, PriorRenderer, Renderer, upright};
 use smpl::Placement;
 use visibility::Samples;
@@ -46,8 +45,9 @@ pub struct RenderArguments {
     /// Training frame of `freeview` [default: the first]
     #[arg(long, value_name = "N")]
     frame: Option<usize>,
-    /// Motion capture for `pose`, an .npz with poses, trans and fps, as AMASS has them
-    #[arg(long, value_name = "CLIP.npz", required_if_eq("what", "pose"))]
+    /// Motion capture for `pose`: an .npz with poses, trans and fps, as AMASS has them, or a .bvh of
+    /// a rig whose joints have the names of SMPL, Mixamo, CMU or VRM
+    #[arg(long, value_name = "CLIP", required_if_eq("what", "pose"))]
     motion: Option<PathBuf>,
     /// Frames per second of --motion [default: as the file says]
     #[arg(long, value_name = "N", requires = "motion")]
@@ -168,11 +168,10 @@ fn views<'a>(
             Box::new(angles.map(move |angle| rest.seen_by(&resized(&camera_at(frame, centre, angle)))))
         }
         What::Pose => {
-            let path = arguments.motion.as_deref().context("pose: --motion CLIP.npz says which poses")?;
+            let path = arguments.motion.as_deref().context("pose: --motion CLIP says which poses")?;
             let joints = body.model.num_joints();
-            let root = body.canonical.joints.first().map_or(Vec3::ZERO, |&joint| joint / body.scale);
-            let motion = fit_motion(&load_motion(path, arguments.fps)?, joints, root)
-                .with_context(|| path.display().to_string())?;
+            let rest: Vec<Vec3> = body.canonical.joints.iter().map(|&joint| joint / body.scale).collect();
+            let motion = load_motion(path, arguments.fps, &skeleton(&body.model.parents, &rest))?;
             let count = motion.trans.len();
             let view = move |i: usize| {
                 let (pose, translation) = (&motion.poses[i * joints..][..joints], motion.trans[i]);

@@ -2,7 +2,7 @@
 
 use glam::{Affine3A, Mat3, Mat3A, Vec2, Vec3, Vec3A};
 use rayon::prelude::*;
-use smpl::{MotionClip, SparseRows};
+use smpl::{Joint, MotionClip, SparseRows};
 use volrender::Camera;
 
 use crate::capture::Light;
@@ -72,17 +72,6 @@ pub struct Atlas {
     pub confidence: Vec<u8>,
 }
 
-/// A joint of the skeleton.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Joint {
-    /// Such as `left_knee`; unique.
-    pub name: String,
-    /// Parent joint; `None` for the root alone.
-    pub parent: Option<u16>,
-    /// Canonical position.
-    pub rest: Vec3,
-}
-
 /// A named motion: axis-angle rotations (T·J) of each joint relative to its parent, and
 /// translations (T) of the root.
 ///
@@ -126,16 +115,7 @@ impl Avatar {
     /// If `pose` is not J long.
     #[must_use]
     pub fn bones(&self, pose: &[Vec3], translation: Vec3) -> Vec<Affine3A> {
-        assert_eq!(pose.len(), self.num_joints(), "bones: rotations of joints");
-        let mut frames: Vec<Affine3A> = Vec::with_capacity(pose.len());
-        for (joint, &turn) in self.skeleton.iter().zip(pose) {
-            let parent = joint.parent.map(usize::from);
-            let origin = parent.map_or(-translation, |parent| self.skeleton[parent].rest);
-            let local = Affine3A::from_mat3_translation(smpl::rodrigues(turn), joint.rest - origin);
-            frames.push(parent.map_or(local, |parent| frames[parent] * local));
-        }
-        let about = |(frame, joint): (Affine3A, &Joint)| frame * Affine3A::from_translation(-joint.rest);
-        frames.into_iter().zip(&self.skeleton).map(about).collect()
+        smpl::joint_transforms(&self.skeleton, pose, translation)
     }
 
     /// World positions and unit normals of the vertices, (V) each: pose blend shapes of rotations
@@ -252,6 +232,27 @@ impl Avatar {
 }
 
 impl Atlas {
+    /// Halves the sides, by means of four texels, until none is longer than `longest`.
+    pub fn shrink(&mut self, longest: u32) {
+        while self.width.max(self.height) > longest.max(1) {
+            let (width, height) = (self.width.div_ceil(2), self.height.div_ceil(2));
+            let halved = |values: &[u8], channels: usize| -> Vec<u8> {
+                let value = |x: u32, y: u32, c: usize| {
+                    let (x, y) = (x.min(self.width - 1) as usize, y.min(self.height - 1) as usize);
+                    u32::from(values[(y * self.width as usize + x) * channels + c])
+                };
+                let mean = |(y, x, c)| {
+                    let four = [(0, 0), (1, 0), (0, 1), (1, 1)].map(|(i, j)| value(2 * x + i, 2 * y + j, c));
+                    ((four.iter().sum::<u32>() + 2) / 4) as u8
+                };
+                let row = |y| (0..width).flat_map(move |x| (0..channels).map(move |c| (y, x, c)));
+                (0..height).flat_map(row).map(mean).collect()
+            };
+            let (rgb, confidence) = (halved(&self.rgb, 3), halved(&self.confidence, 1));
+            *self = Self { width, height, rgb, confidence };
+        }
+    }
+
     fn validate(&self) -> Result<(), String> {
         let sides = 1..=MAX_ATLAS_SIDE;
         expect(sides.contains(&self.width) && sides.contains(&self.height), || {

@@ -21,10 +21,11 @@ use std::path::Path;
 
 use crate::Error;
 
-pub use avatar::{Atlas, Avatar, Clip, Joint, MAX_ATLAS_SIDE, MAX_JOINTS};
+pub use avatar::{Atlas, Avatar, Clip, MAX_ATLAS_SIDE, MAX_JOINTS};
 pub use draw::BakedRenderer;
 pub use make::{BakeReport, bake, fit};
 pub use skeleton::{motion_of_bones, skeleton, turn_upright};
+pub use smpl::Joint;
 
 /// Replaces a file atomically.
 fn write_whole(path: &Path, bytes: &[u8]) -> Result<(), Error> {

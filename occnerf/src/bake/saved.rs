@@ -5,10 +5,10 @@ use std::path::Path;
 use array_files::tensors::{Tensor, Tensors};
 use glam::{Affine3A, Mat3, Vec2, Vec3};
 use serde::{Deserialize, Serialize};
-use smpl::{MotionClip, SparseRows};
+use smpl::{Joint, MotionClip, SparseRows};
 use volrender::Camera;
 
-use super::avatar::{Atlas, Avatar, Clip, Joint};
+use super::avatar::{Atlas, Avatar, Clip};
 use crate::Error;
 use crate::capture::Light;
 use crate::model::file::{read, write};

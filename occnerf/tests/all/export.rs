@@ -72,6 +72,25 @@ fn a_glb_reads_back_and_moves_as_the_avatar_does() {
 }
 
 #[test]
+fn level_arms_change_the_rest_and_not_the_motion() {
+    let (avatar, level) = (bare(), bare().with_level_arms().unwrap());
+    level.validate().unwrap();
+    let rest = |name: &str| level.skeleton.iter().find(|joint| joint.name == name).unwrap().rest;
+    for (shoulder, wrist) in [("left_shoulder", "left_wrist"), ("right_shoulder", "right_wrist")] {
+        let arm = (rest(wrist) - rest(shoulder)).normalize_or_zero();
+        assert!(arm.x.abs() > 1.0 - 1e-6 && (rest(wrist).x > 0.0) == (wrist == "left_wrist"), "{arm}");
+    }
+    let seconds = 1.0 / avatar.clips[0].motion.fps;
+    // Vertices between two bones keep to the pose in which they were skinned first.
+    let (found, expected) = (skinned(&level, seconds).0, skinned(&avatar, seconds).0);
+    let mean = found.iter().zip(&expected).map(|(a, b)| a.distance(*b)).sum::<f32>() / found.len() as f32;
+    assert!(mean < 3e-3, "{mean}");
+    let mut nameless = avatar;
+    nameless.skeleton[18].name = "tentacle".to_owned();
+    assert!(nameless.with_level_arms().unwrap_err().to_string().contains("leftLowerArm"));
+}
+
+#[test]
 fn a_glb_carries_the_light_beside_the_colours_without_it() {
     let mut lit = avatar().clone();
     lit.light.slope = Vec3::new(0.5, 0.25, -0.125);

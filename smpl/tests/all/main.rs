@@ -3,7 +3,9 @@
 
 mod bodies;
 mod body;
+mod bvh;
 mod clip;
 mod embedded;
 mod golden;
+mod ground;
 mod volume;

@@ -2,12 +2,13 @@
 
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context, Error, Result, bail, ensure};
+use anyhow::{Context, Error, Result, anyhow, bail, ensure};
 use clap::{Args, ValueEnum};
 use indicatif::{ProgressBar, ProgressStyle};
+use occnerf::bake::skeleton;
 use occnerf::capture::Layout;
 use rigged::Character;
-use smpl::MotionClip;
+use smpl::{BodyModel, Bvh, MotionClip};
 use synth::{BODY, Obstacle, Occlusion, Outfit, SynthConfig, Synthetic, synthesise};
 
 use crate::obstacle::ObstacleArguments;
@@ -114,10 +115,10 @@ pub struct SynthArguments {
     /// Views kept back show every n-th frame [default: 10]
     #[arg(long, value_name = "N")]
     eval_every: Option<usize>,
-    /// Motion capture (.npz with poses, trans, fps), for the embedded person or joints with
+    /// Motion capture (.npz with poses, trans, fps, or .bvh), for the embedded person or joints with
     /// MakeHuman's, Mixamo's, Unreal's or SMPL's names [default: a walk; a character's first
     /// animation]
-    #[arg(long, value_name = "CLIP.npz")]
+    #[arg(long, value_name = "CLIP")]
     motion: Option<PathBuf>,
     /// Full turns added to the motion of a clip or a character over the video, so that all sides
     /// are seen [default: 1.15]
@@ -224,7 +225,7 @@ fn film(character: Option<&Path>, motion: Option<&Path>, config: &SynthConfig) -
     for what in character.iter().flat_map(|(character, _)| &character.ignored) {
         say!("of the character is left out: {what}");
     }
-    let motion = motion.map(MotionClip::load).transpose()?;
+    let motion = motion.map(load_motion).transpose()?;
     let bar = bar("filming", config.frames);
     let synthetic = synthesise(character.as_ref().map(|(c, _)| c), motion.as_ref(), config, &|_| bar.inc(1));
     bar.finish_and_clear();
@@ -232,6 +233,16 @@ fn film(character: Option<&Path>, motion: Option<&Path>, config: &SynthConfig) -
         Some((_, name)) => synthetic.context(name),
         None => Ok(synthetic?),
     }
+}
+
+/// A motion of SMPL's joints.
+fn load_motion(path: &Path) -> Result<MotionClip> {
+    if path.extension().is_none_or(|extension| !extension.eq_ignore_ascii_case("bvh")) {
+        return Ok(MotionClip::load(path)?);
+    }
+    let body = BodyModel::embedded();
+    let motion = Bvh::load(path)?.onto(&skeleton(&body.parents, &body.shaped(&[]).joints));
+    motion.map_err(|fault| anyhow!("{}: {fault}", path.display()))
 }
 
 /// A bar of `length` steps.

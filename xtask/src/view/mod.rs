@@ -26,8 +26,8 @@ pub struct ViewArguments {
     /// Run directory
     run: PathBuf,
     /// Another motion to choose, besides the video's: an .npz with poses, trans and fps, as AMASS
-    /// has them; repeatable
-    #[arg(long, value_name = "CLIP.npz")]
+    /// has them, or a .bvh; repeatable
+    #[arg(long, value_name = "CLIP")]
     motion: Vec<PathBuf>,
     /// Frames per second of every --motion [default: as the files say]
     #[arg(long, value_name = "N", requires = "motion")]

@@ -353,11 +353,11 @@ function say(text) {
 async function start() {
   const extra = JSON.parse(element("extra").textContent);
   const person = new Person(bytesOf(element("avatar").textContent));
-  const page = new Page(person, extra);
   const picture = (bytes) => createImageBitmap(new Blob([bytes], { type: "image/png" }),
     { premultiplyAlpha: "none", colorSpaceConversion: "none" });
-  page.scene.paint(await picture(person.picture()), await picture(bytesOf(extra.confidence)));
-  page.stale = true;
+  // Before the first drawing, which would show a grey person.
+  const textures = await Promise.all([picture(person.picture()), picture(bytesOf(extra.confidence))]);
+  new Page(person, extra).scene.paint(...textures);
   document.documentElement.dataset.ready = "true";
 }
 

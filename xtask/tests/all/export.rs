@@ -84,6 +84,55 @@ fn every_format_is_written_and_read_back() {
 }
 
 #[test]
+fn what_others_drive_is_named_as_asked_stands_and_comes_back() {
+    let run = run("export-driven");
+    let export = |name: &str, more: &[&str]| {
+        let out = run.join(name);
+        let said = done(&[&["export", text(&run), "--out", text(&out)], more].concat());
+        (out, said)
+    };
+    let json = |glb: &Path| {
+        let bytes = std::fs::read(glb).unwrap();
+        let length = u32::from_le_bytes(bytes[12..16].try_into().unwrap()) as usize;
+        serde_json::from_slice::<serde_json::Value>(&bytes[20..20 + length]).unwrap()
+    };
+    let meta = ["--author", "A. Person", "--licence", "https://example.org/by"];
+    let small = ["--bones", "vrm", "--texture", "32", "--jpeg", "80"];
+    let (vrm, _) = export("person.vrm", &[&meta[..], &small].concat());
+    let root = json(&vrm);
+    let extension = &root["extensions"]["VRMC_vrm"];
+    assert_eq!((&extension["specVersion"], &extension["meta"]["authors"][0]), (&"1.0".into(), &"A. Person".into()));
+    assert_eq!(extension["meta"]["licenseUrl"], "https://vrm.dev/licenses/1.0/");
+    assert_eq!(extension["meta"]["otherLicenseUrl"], "https://example.org/by");
+    let bones = extension["humanoid"]["humanBones"].as_object().unwrap();
+    assert_eq!(bones.len(), 22);
+    for (name, bone) in bones {
+        assert_eq!(root["nodes"][bone["node"].as_u64().unwrap() as usize]["name"], name.as_str());
+    }
+    assert_eq!(root["images"][0]["mimeType"], "image/jpeg");
+    let side = image::load_from_memory(&rigged::Character::load(&vrm).unwrap().texture.unwrap().bytes).unwrap().width();
+    assert!((17..=32).contains(&side), "{side}");
+    assert_eq!(json(&export("mixamo.glb", &["--bones", "mixamo"]).0)["nodes"][0]["name"], "mixamorig:Hips");
+
+    let (bvh, _) = export("person.bvh", &["--bones", "mixamo"]);
+    let (poses, _) = export("poses.npz", &[]);
+    let (again, said) = export("again.npz", &["--motion", text(&bvh)]);
+    assert!(said.contains("24 joints, lengths taken for centimetres"), "{said}");
+    let [own, read] = [&poses, &again].map(|path| smpl::MotionClip::load(path).unwrap());
+    assert!(own.trans.iter().zip(&read.trans).all(|(a, b)| a.distance(*b) < 1e-4));
+    assert!(own.poses[..22].iter().zip(&read.poses).all(|(a, b)| a.distance(*b) < 1e-3));
+    let (_, said) = export("stands.bvh", &["--ground"]);
+    assert!(said.contains("feet slide") && said.contains("mm/s"), "{said}");
+    let tail = std::fs::read_to_string(&bvh).unwrap().replace("mixamorig:LeftUpLeg", "Tail");
+    std::fs::write(&bvh, tail).unwrap();
+    let glb = run.join("tail.glb");
+    refused(&["export", text(&run), "--out", text(&glb), "--motion", text(&bvh)], &["person.bvh", "left upper leg"]);
+    for option in [["--author", "x"], ["--jpeg", "80"], ["--texture", "64"]] {
+        refused(&[&["export", text(&run), "--out", text(&bvh)], &option[..]].concat(), &[option[0]]);
+    }
+}
+
+#[test]
 fn the_page_is_one_file_that_asks_for_nothing_and_shows_names_as_text() {
     let run = run("view-page");
     let motion = run.join("dance.npz");
@@ -119,7 +168,10 @@ fn whatever_is_wrong_is_said_in_one_line() {
     glb(text(&empty), out, &[], &["is not a run", "export-empty"]);
     refused(&["view", text(&empty)], &["is not a run"]);
     glb(run_text, text(&run.join("person.obj")), &[], &["--out", "person.obj", "another format", "Glb"]);
-    refused(&["export", run_text, "--out", text(&run.join("person"))], &["--out", ".glb, .ply, .obj or .npz"]);
+    refused(
+        &["export", run_text, "--out", text(&run.join("person"))],
+        &["--out", ".glb, .vrm, .ply, .obj, .npz or .bvh"],
+    );
     glb(run_text, run_text, &[], &["--out", "is a folder"]);
     let motion = run.join("other.npz");
     clip(&motion, 31);

@@ -5,6 +5,7 @@ use serde_json::{Value, json};
 use volrender::Aabb;
 
 use crate::Error;
+use crate::bake::export::Vrm;
 use crate::bake::{Avatar, Clip};
 
 /// Component types of glTF.
@@ -19,6 +20,15 @@ const ELEMENT_ARRAY_BUFFER: u32 = 34963;
 const LINEAR: u32 = 9729;
 const CLAMP_TO_EDGE: u32 = 33071;
 
+/// What a glTF holds beside the person.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct GlbOptions<'a> {
+    /// The atlas as JPEG of this quality, 1 to 100, in place of PNG.
+    pub jpeg: Option<u8>,
+    /// Makes a VRM of it, see [`Avatar::to_glb_with`].
+    pub vrm: Option<Vrm<'a>>,
+}
+
 impl Avatar {
     /// glTF 2.0 binary (`.glb`).
     ///
@@ -31,6 +41,22 @@ impl Avatar {
     /// # Errors
     /// [`Error::Bake`] with what [`Avatar::validate`] finds, and for more than 4 GiB.
     pub fn to_glb(&self) -> Result<Vec<u8>, Error> {
+        self.to_glb_with(&GlbOptions::default())
+    }
+
+    /// The same with options. A VRM 1.0 has the extension `VRMC_vrm` with `humanoid` and `meta`; its
+    /// rest pose, and bind pose, is the person with level arms, [`Avatar::with_level_arms`].
+    ///
+    /// # Errors
+    /// As [`Avatar::to_glb`]; [`Error::Bake`] for a VRM of a skeleton without the fifteen joints that
+    /// it must have.
+    pub fn to_glb_with(&self, options: &GlbOptions<'_>) -> Result<Vec<u8>, Error> {
+        let Some(vrm) = &options.vrm else { return self.gltf(options.jpeg, None) };
+        self.validate().map_err(Error::Bake)?;
+        self.with_level_arms()?.gltf(options.jpeg, Some(vrm.extension(self)?))
+    }
+
+    fn gltf(&self, jpeg: Option<u8>, vrm: Option<Value>) -> Result<Vec<u8>, Error> {
         self.validate().map_err(Error::Bake)?;
         let mut file = File::default();
         let attributes = attributes(self, &mut file);
@@ -38,7 +64,11 @@ impl Avatar {
         let bind: Vec<f32> = self.skeleton.iter().flat_map(|joint| inverse_bind(joint.rest)).collect();
         let bind = file.floats(&bind, "MAT4", None);
         let animations: Vec<Value> = self.clips.iter().map(|clip| animation(self, clip, &mut file)).collect();
-        let picture = file.view(&self.atlas.to_png()?, None);
+        let (picture, kind) = match jpeg {
+            Some(quality) => (self.atlas.to_jpeg(quality)?, "image/jpeg"),
+            None => (self.atlas.to_png()?, "image/png"),
+        };
+        let picture = file.view(&picture, None);
 
         let j = self.num_joints();
         let mut nodes: Vec<Value> = (self.skeleton.iter().enumerate())
@@ -76,13 +106,17 @@ impl Avatar {
             }],
             "textures": [{ "source": 0, "sampler": 0 }],
             "samplers": [{ "magFilter": LINEAR, "minFilter": LINEAR, "wrapS": CLAMP_TO_EDGE, "wrapT": CLAMP_TO_EDGE }],
-            "images": [{ "name": "atlas", "mimeType": "image/png", "bufferView": picture }],
+            "images": [{ "name": "atlas", "mimeType": kind, "bufferView": picture }],
             "accessors": file.accessors,
             "bufferViews": file.views,
             "buffers": [{ "byteLength": file.bytes.len() }],
         });
         if !animations.is_empty() {
             root["animations"] = json!(animations);
+        }
+        if let Some(vrm) = vrm {
+            root["extensionsUsed"] = json!(["KHR_materials_unlit", "VRMC_vrm"]);
+            root["extensions"] = json!({ "VRMC_vrm": vrm });
         }
         container(&root, file.bytes)
     }

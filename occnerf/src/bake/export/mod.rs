@@ -4,13 +4,17 @@ mod glb;
 mod mesh;
 mod motion;
 mod splats;
+mod vrm;
 
+pub use glb::GlbOptions;
 pub use mesh::write_obj;
 pub use motion::{fit_motion, write_amass};
 pub use splats::{Splats, splats};
+pub use vrm::{VRM_LICENCE, Vrm};
 
 use std::io::Cursor;
 
+use image::codecs::jpeg::JpegEncoder;
 use image::codecs::png::{CompressionType, FilterType, PngEncoder};
 use image::{ExtendedColorType, ImageEncoder};
 
@@ -26,6 +30,16 @@ impl Atlas {
         self.encode(&self.rgb, ExtendedColorType::Rgb8)
     }
 
+    /// The texture as a JPEG of `quality` 1 to 100.
+    ///
+    /// # Errors
+    /// As [`Atlas::to_png`].
+    pub fn to_jpeg(&self, quality: u8) -> Result<Vec<u8>, Error> {
+        let mut bytes = Vec::new();
+        self.encode_with(JpegEncoder::new_with_quality(&mut bytes, quality), &self.rgb, ExtendedColorType::Rgb8)?;
+        Ok(bytes)
+    }
+
     /// The confidence as a grey PNG.
     ///
     /// # Errors
@@ -36,6 +50,12 @@ impl Atlas {
 
     fn encode(&self, values: &[u8], kind: ExtendedColorType) -> Result<Vec<u8>, Error> {
         let mut bytes = Cursor::new(Vec::new());
+        let encoder = PngEncoder::new_with_quality(&mut bytes, CompressionType::Best, FilterType::Adaptive);
+        self.encode_with(encoder, values, kind)?;
+        Ok(bytes.into_inner())
+    }
+
+    fn encode_with(&self, encoder: impl ImageEncoder, values: &[u8], kind: ExtendedColorType) -> Result<(), Error> {
         let fault = |error: image::ImageError| Error::Bake(format!("atlas: {error}"));
         // The encoder asserts the size.
         let channels = usize::from(kind.channel_count());
@@ -43,9 +63,6 @@ impl Atlas {
             let (w, h) = (self.width, self.height);
             return Err(Error::Bake(format!("atlas: {} values for {w}×{h}×{channels}", values.len())));
         }
-        PngEncoder::new_with_quality(&mut bytes, CompressionType::Best, FilterType::Adaptive)
-            .write_image(values, self.width, self.height, kind)
-            .map_err(fault)?;
-        Ok(bytes.into_inner())
+        encoder.write_image(values, self.width, self.height, kind).map_err(fault)
     }
 }

@@ -4,7 +4,7 @@ use std::f32::consts::{FRAC_PI_2, TAU};
 
 use glam::{Affine3A, Quat, Vec3};
 use rayon::prelude::*;
-use smpl::{BodyModel, MotionClip, Placement, Shaped};
+use smpl::{BodyModel, BoneNames, MotionClip, Placement, Shaped};
 
 use crate::demo::landmarks::joint;
 use crate::demo::motion::Pose;
@@ -105,53 +105,9 @@ fn sample(clip: &MotionClip, seconds: f32, joints: usize) -> (Vec<Vec3>, Vec3) {
 /// SMPL's joint for each of a character's, told by their names; `None` for those that follow their
 /// parents.
 fn assign(names: &[&str]) -> Vec<Option<usize>> {
-    let read: Vec<(Option<usize>, String)> = names.iter().map(|name| side_and_base(name)).collect();
-    let has_collars = read.iter().any(|(_, base)| matches!(base.as_str(), "collar" | "clavicle"));
-    let mut taken = [false; joint::COUNT];
-    let mut spine = joint::SPINE.into_iter();
-    let mut assigned = Vec::with_capacity(names.len());
-    for (side, base) in &read {
-        let found = match (side, base.trim_end_matches(|c: char| c.is_ascii_digit())) {
-            // Left is the first of each of SMPL's pairs.
-            (Some(side), "upleg" | "hip" | "thigh" | "upperleg") => Some(joint::LEFT_HIP + side),
-            (Some(side), "leg" | "knee" | "calf" | "lowerleg" | "shin") => Some(joint::LEFT_KNEE + side),
-            (Some(side), "foot" | "ankle") => Some(joint::LEFT_ANKLE + side),
-            (Some(side), "shoulder") if has_collars => Some(joint::LEFT_SHOULDER + side),
-            (Some(side), "shoulder" | "collar" | "clavicle") => Some(13 + side),
-            (Some(side), "arm" | "upperarm") => Some(joint::LEFT_SHOULDER + side),
-            (Some(side), "forearm" | "lowerarm" | "elbow") => Some(joint::LEFT_ELBOW + side),
-            (Some(side), "hand" | "wrist") => Some(joint::LEFT_ELBOW + 2 + side),
-            (None, "hips" | "pelvis") => Some(joint::PELVIS),
-            (None, "spine" | "lowerback" | "chest" | "abdomen") => spine.next(),
-            (None, "neck") => Some(joint::NECK),
-            (None, "head") => Some(joint::HEAD),
-            _ => None,
-        };
-        assigned.push(found.filter(|&s| !std::mem::replace(&mut taken[s], true)));
-    }
-    assigned
-}
-
-/// Left is 0 and right is 1, of the names of MakeHuman, Mixamo, Unreal and SMPL; and the rest in
-/// small letters.
-fn side_and_base(name: &str) -> (Option<usize>, String) {
-    let name = name.rsplit(':').next().unwrap_or(name).to_ascii_lowercase();
-    let name = name.strip_prefix("mixamorig").unwrap_or(&name);
-    let clean = |text: &str| text.chars().filter(char::is_ascii_alphanumeric).collect::<String>();
-    for (side, word, letter) in [(0, "left", 'l'), (1, "right", 'r')] {
-        if let Some(rest) = name.strip_prefix(word) {
-            return (Some(side), clean(rest));
-        }
-        for separator in ['.', '_', ' '] {
-            if let Some(rest) = name.strip_suffix(letter).and_then(|n| n.strip_suffix(separator)) {
-                return (Some(side), clean(rest));
-            }
-            if let Some(rest) = name.strip_prefix(letter).and_then(|n| n.strip_prefix(separator)) {
-                return (Some(side), clean(rest));
-            }
-        }
-    }
-    (None, clean(name))
+    let smpl = BoneNames::Smpl.of_body(joint::COUNT);
+    let found = BoneNames::Smpl.translate(names).into_iter();
+    found.map(|name| name.and_then(|name| smpl.iter().position(|own| *own == name))).collect()
 }
 
 /// A skeleton to be driven: joints at rest, y up, facing +z, and their parents, each before its
@@ -233,63 +189,15 @@ mod tests {
     use super::*;
 
     #[test]
-    fn names_of_common_rigs_are_read() {
-        for (name, side, base) in [
-            ("mixamorig:LeftUpLeg", Some(0), "upleg"),
-            ("mixamorig:RightForeArm", Some(1), "forearm"),
-            ("Hips", None, "hips"),
-            ("thigh_l", Some(0), "thigh"),
-            ("UpperArm.R", Some(1), "upperarm"),
-            ("L_Elbow", Some(0), "elbow"),
-            ("Armature_mesh", None, "armaturemesh"),
-        ] {
-            assert_eq!(side_and_base(name), (side, base.to_owned()), "{name}");
-        }
-        let makehuman =
-            ["Hips", "LowerBack", "Spine", "Spine1", "Neck", "Neck1", "LHipJoint", "LeftUpLeg", "LeftShoulder"];
-        let expected = [Some(0), Some(3), Some(6), Some(9), Some(12), None, None, Some(1), Some(13)];
-        assert_eq!(assign(&makehuman), expected);
-        assert_eq!(assign(&["left_collar", "left_shoulder", "left_elbow"]), [Some(13), Some(16), Some(18)]);
-    }
-
-    #[test]
     fn the_skeleton_that_a_clip_was_made_for_follows_it() {
         let body = BodyModel::embedded();
         let human = body.shaped(&[]);
-        let names = [
-            "pelvis",
-            "left_hip",
-            "right_hip",
-            "spine1",
-            "left_knee",
-            "right_knee",
-            "spine2",
-            "left_ankle",
-            "right_ankle",
-            "spine3",
-            "left_foot",
-            "right_foot",
-            "neck",
-            "left_collar",
-            "right_collar",
-            "head",
-            "left_shoulder",
-            "right_shoulder",
-            "left_elbow",
-            "right_elbow",
-            "left_wrist",
-            "right_wrist",
-            "left_hand",
-            "right_hand",
-        ];
+        let names = BoneNames::Smpl.of_body(joint::COUNT);
+        let names: Vec<&str> = names.iter().map(String::as_str).collect();
         let mut poses = vec![Vec3::ZERO; 2 * joint::COUNT];
         for (j, pose) in poses.iter_mut().enumerate() {
             let j = j as f32;
             *pose = Vec3::new((1.7 * j).sin(), (2.3 * j).cos(), (3.1 * j).sin()) * 0.3;
-        }
-        // Feet and hands' ends have no counterpart by name.
-        for j in [10, 11, 22, 23] {
-            poses[j] = Vec3::ZERO;
         }
         let clip = MotionClip { poses, num_joints: 24, trans: vec![Vec3::new(0.2, 0.1, 0.3); 2], fps: 30.0 };
         let skeleton = Skeleton { names: &names, joints: &human.joints, parents: &body.parents, unit: 1.0 };

@@ -1,5 +1,10 @@
 //! Motion capture as SMPL parameters.
 
+mod bvh;
+mod ground;
+mod retarget;
+mod skeleton;
+
 use std::path::Path;
 
 use array_files::npz::Npz;
@@ -8,6 +13,10 @@ use glam::{Quat, Vec3};
 use crate::Error;
 use crate::model::check_vectors;
 use crate::pose::Placement;
+
+pub use bvh::Bvh;
+pub use ground::Grounded;
+pub use skeleton::{BoneNames, Joint, joint_transforms};
 
 /// Joints that SMPL, SMPL-H and SMPL-X share: the body without hands and face.
 const SHARED: usize = 22;
