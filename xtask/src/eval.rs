@@ -18,7 +18,7 @@ use visibility::Samples;
 
 use crate::network::{load_lpips, network_name};
 use crate::optimise::logged_seconds;
-use crate::process::{Ending, Lock, is_read_only, note, one_line, say, telling};
+use crate::process::{Ending, Lock, is_read_only, note, one_line, say};
 use crate::report::{self, SHEETS};
 use crate::run::{self, Metrics, RunConfig, Splits, TRAINING_VIEWS, evaluation_title, make_directory, peak_rss_bytes};
 use crate::{baked, pictures, table};

@@ -92,7 +92,8 @@ impl View {
         let first = Arc::from(self.frames[0].name.as_str());
         let (size, to) = (self.size, options.resized(self.size));
         let frame = |plan: Planned| {
-            let Planned { name, image, masks, labels, occluder, hidden, lens, pose, placement, betas, mut keypoints } = plan;
+            let Planned { name, image, masks, labels, occluder, hidden, lens, pose, placement, betas, mut keypoints } =
+                plan;
             let scale = Vec2::new(to.0 as f32 / size.0 as f32, to.1 as f32 / size.1 as f32);
             keypoints.iter_mut().for_each(|point| point.place *= scale);
             let camera = volrender::Camera { width: size.0, height: size.1, ..lens.camera };

@@ -110,7 +110,7 @@ fn what_others_drive_is_named_as_asked_stands_and_comes_back() {
         assert_eq!(root["nodes"][bone["node"].as_u64().unwrap() as usize]["name"], name.as_str());
     }
     assert_eq!(root["images"][0]["mimeType"], "image/jpeg");
-    let side = image::load_from_memory(&rigged::Character::load(&vrm).unwrap().texture.unwrap().bytes).unwrap().width();
+    let side = image::load_from_memory(&rigged::Character::load(&vrm).unwrap().textures[0].bytes).unwrap().width();
     assert!((17..=32).contains(&side), "{side}");
     assert_eq!(json(&export("mixamo.glb", &["--bones", "mixamo"]).0)["nodes"][0]["name"], "mixamorig:Hips");
 

@@ -68,8 +68,11 @@ impl DetectorModel {
 
     /// Scaled median absolute deviation of the coordinates.
     fn deviation(&self, frames: &[FramePoints<'_>]) -> f32 {
-        let mut errors: Vec<f32> =
-            frames.iter().flat_map(|frame| self.residuals(frame)).flat_map(|seen| seen.residual.abs().to_array()).collect();
+        let mut errors: Vec<f32> = frames
+            .iter()
+            .flat_map(|frame| self.residuals(frame))
+            .flat_map(|seen| seen.residual.abs().to_array())
+            .collect();
         let middle = errors.len() / 2;
         let median = if errors.is_empty() { 0.0 } else { *errors.select_nth_unstable_by(middle, f32::total_cmp).1 };
         (1.48 * median).max(NOISE)

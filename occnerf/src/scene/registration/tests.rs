@@ -11,7 +11,15 @@ use synth::{DemoConfig, Perturbation, demo};
 pub(super) fn frame(pose: Vec<Vec3>, placement: Placement) -> Frame {
     let camera = volrender::Camera::new(Mat3::IDENTITY, Affine3A::IDENTITY, 1, 1).unwrap();
     let pixels = Pixels { image: Image::new(1, 1), mask: vec![0.0], occluder: None };
-    Frame { name: String::new(), source: pixels.into(), camera, pose, placement, betas: Vec::new(), keypoints: Vec::new() }
+    Frame {
+        name: String::new(),
+        source: pixels.into(),
+        camera,
+        pose,
+        placement,
+        betas: Vec::new(),
+        keypoints: Vec::new(),
+    }
 }
 
 fn registered(capture: &Capture, body: &BodyModel, rounds: usize) -> Capture {

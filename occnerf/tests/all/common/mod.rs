@@ -65,7 +65,15 @@ fn frame(index: usize, turn: f32, hidden: usize, metres: f32) -> Frame {
         }
     }
     let name = format!("frame_{index:06}");
-    Frame { name, source: Pixels { image, mask, occluder: None }.into(), camera, pose, placement, betas: vec![0.0], keypoints: Vec::new() }
+    Frame {
+        name,
+        source: Pixels { image, mask, occluder: None }.into(),
+        camera,
+        pose,
+        placement,
+        betas: vec![0.0],
+        keypoints: Vec::new(),
+    }
 }
 
 /// Two training frames three metres away, the second half hidden, and two frames kept back.
