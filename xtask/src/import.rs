@@ -81,6 +81,10 @@ pub struct ImportArguments {
     /// The joints of a --fit that is an array of joints: coco17, openpose25, smpl24, h36m17 or mhr70
     #[arg(long, value_name = "SET")]
     joints: Option<String>,
+    /// 2-D key points of the frames, which registration then follows: OpenPose's folder of JSON (BODY_25),
+    /// or one person's COCO points (frames, 17, 3) of ViTPose or RTMPose, .npy, .npz or .pt
+    #[arg(long, value_name = "DIR|FILE")]
+    keypoints: Option<PathBuf>,
     /// Copy the frames into the capture; else it has links to them
     #[arg(long)]
     copy: bool,
@@ -106,11 +110,15 @@ pub fn import(arguments: &ImportArguments) -> Result<()> {
         focal: arguments.focal,
         body: arguments.body.clone().or_else(|| std::env::var_os(BODY_VARIABLE).map(PathBuf::from)),
         joints: arguments.joints.clone(),
+        keypoints: arguments.keypoints.clone(),
         copy: arguments.copy,
     };
-    for (what, path) in
-        [("--frames", Some(&options.frames)), ("--fit", Some(&options.fit)), ("--masks", options.masks.as_ref())]
-    {
+    for (what, path) in [
+        ("--frames", Some(&options.frames)),
+        ("--fit", Some(&options.fit)),
+        ("--masks", options.masks.as_ref()),
+        ("--keypoints", options.keypoints.as_ref()),
+    ] {
         if let Some(path) = path.filter(|path| !path.exists()) {
             bail!("{}: no such file or directory ({what})", path.display());
         }

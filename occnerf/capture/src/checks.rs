@@ -14,7 +14,7 @@ use super::{CaptureError, Frame, Keypoint};
 const JOINT_TOLERANCE: f32 = 0.04 / 1.7;
 
 /// Largest coordinate of a key point.
-const FARTHEST_PIXEL: f32 = 1e5;
+pub(super) const FARTHEST_PIXEL: f32 = 1e5;
 /// Largest component of a rotation, radians.
 pub(super) const MAX_ANGLE: f32 = 1e3;
 /// Largest shape coefficient, in standard deviations.

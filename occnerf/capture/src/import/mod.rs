@@ -7,7 +7,8 @@
 //!   PeopleSnapshot and NeuMan ([`Tool`]);
 //! - points, to which a body is fitted: SAM 3D Body, and arrays of joints of any estimator;
 //! - masks: object ids (SAM 2's palette PNGs or folders, Grounded-SAM-2's `.npy`), coverage
-//!   (MatAnyone, plain 0/255 pictures), or the fit's own (4D-Humans / PHALP, PromptHMR).
+//!   (MatAnyone, plain 0/255 pictures), or the fit's own (4D-Humans / PHALP, PromptHMR);
+//! - 2-D key points: OpenPose's folder, or an array (T, J, 3).
 //!
 //! Estimators place the body in camera space for an assumed focal length. The capture's world has
 //! the camera's axes, or those of the file's cameras; the body's translation is in the extrinsics.
@@ -20,6 +21,9 @@ mod fit;
 mod gvhmr;
 mod item;
 mod join;
+mod keypoints;
+#[cfg(test)]
+mod keypoints_tests;
 mod levels;
 mod masks;
 mod neuman;
@@ -152,7 +156,10 @@ pub fn import(options: &ImportOptions, out: &Path) -> Result<Imported, CaptureEr
     }
     let unmasked = fitted - frames.len();
     let place = |frame| placed(frame, &betas, &model, &hands, options.focal);
-    let placed: Vec<Placed> = frames.into_iter().map(place).collect();
+    let mut placed: Vec<Placed> = frames.into_iter().map(place).collect();
+    if let Some(path) = &options.keypoints {
+        notes.push(keypoints::add(path, &mut placed, &betas, &model, &video)?);
+    }
     let kind = masks.as_ref().map_or("those in the fit", |masks| masks.kind);
     write::capture(
         &write::Parts { options, video: &video, placed: &placed, betas: &betas, masks: masks.as_ref() },
@@ -281,5 +288,5 @@ fn placed(mut frame: FitFrame, betas: &[f64], model: &BodyModel, hands: &[DVec3]
         pose[start..].copy_from_slice(hands);
     }
     let translation = frame.pelvis(own) - frame.world_to_camera * pelvis(betas);
-    Placed { index: frame.index, pose, translation, frame }
+    Placed { index: frame.index, pose, translation, frame, keypoints: Vec::new() }
 }

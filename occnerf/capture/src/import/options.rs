@@ -25,6 +25,8 @@ pub struct ImportOptions {
     pub body: Option<PathBuf>,
     /// Joint set of a fit that is an array of joints, one of [`point_fit::joint_sets`].
     pub joints: Option<String>,
+    /// 2-D key points of a detector: OpenPose's folder, or an array (T, J, 3) of one person.
+    pub keypoints: Option<PathBuf>,
     /// Whether pictures are copied rather than linked.
     pub copy: bool,
 }

@@ -13,7 +13,7 @@ use super::fit::{FitFrame, OwnMask};
 use super::masks::Masks;
 use super::options::ImportOptions;
 use super::video::Video;
-use crate::CaptureError;
+use crate::{CaptureError, Keypoint};
 
 /// A frame in the capture's form.
 pub(super) struct Placed {
@@ -23,6 +23,7 @@ pub(super) struct Placed {
     pub frame: FitFrame,
     /// The extrinsics' translation.
     pub translation: DVec3,
+    pub keypoints: Vec<Keypoint>,
 }
 
 /// Contents of a capture.
@@ -158,12 +159,17 @@ fn record(placed: &Placed, betas: &[f64]) -> Value {
     let poses: Vec<f64> = placed.pose.iter().flat_map(|v| v.to_array()).collect();
     let (r, t) = (frame.world_to_camera.transpose(), placed.translation);
     let row = |axis: usize| [r.col(axis).x, r.col(axis).y, r.col(axis).z, t[axis]];
-    json!({
+    let mut record = json!({
         "poses": poses,
         "betas": betas,
         "cam_intrinsics": [[frame.focal[0], 0.0, frame.centre[0]], [0.0, frame.focal[1], frame.centre[1]], [0.0, 0.0, 1.0]],
         "cam_extrinsics": [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]],
-    })
+    });
+    if !placed.keypoints.is_empty() {
+        let row = |p: &Keypoint| json!([p.joint, p.place.x, p.place.y, p.confidence]);
+        record["keypoints"] = placed.keypoints.iter().map(row).collect();
+    }
+    record
 }
 
 #[cfg(test)]

@@ -100,6 +100,33 @@ fn what_the_lens_never_saw_is_unknown_where_occluders_are_known() {
 }
 
 #[test]
+fn key_points_are_read_at_the_size_of_the_pictures() {
+    let (dir, mut metadata) = fixture("wild-keypoints");
+    metadata["01"]["keypoints"] = json!([[1, 3.0, 2.0, 0.5], [0, -1.0, 9.5, 1.0]]);
+    metadata["02"]["keypoints"] = json!([]);
+    dir.write("metadata.json", metadata.to_string());
+    let options = LoadOptions { resize: Some(3), ..LoadOptions::default() };
+    for (options, scale) in [(LoadOptions::default(), 1.0), (options, 0.5)] {
+        let capture = load_capture(dir.path(), &body(), &options).unwrap();
+        let found = &capture.train[1].keypoints;
+        assert_eq!((found.len(), found[0].joint, found[0].confidence), (2, 1, 0.5));
+        assert_eq!(found[0].place, scale * glam::Vec2::new(3.0, 2.0));
+        assert!(capture.train[0].keypoints.is_empty() && capture.train[2].keypoints.is_empty());
+    }
+    for (points, words) in [
+        (json!([[2, 1.0, 1.0, 1.0]]), ["keypoints", "a joint below 2"]),
+        (json!([[0.5, 1.0, 1.0, 1.0]]), ["keypoints", "a joint below 2"]),
+        (json!([[0, 1e7, 1.0, 1.0]]), ["keypoints", "pixel"]),
+        (json!([[0, 1.0, 1.0, 1.5]]), ["keypoints", "confidence"]),
+        (json!([[0, 1.0, 1.0]]), ["keypoints", "shape [N, 4]"]),
+    ] {
+        metadata["01"]["keypoints"] = points;
+        dir.write("metadata.json", metadata.to_string());
+        fails(&dir, &words);
+    }
+}
+
+#[test]
 fn a_whole_capture_is_read() {
     let (dir, _) = fixture("wild-whole");
     let capture = load(&dir).unwrap();

@@ -226,6 +226,14 @@ mod tests {
                     let exact = column.map_or(Vec3::ZERO, |c| jacobian.directions[c]);
                     prop_assert!(exact.distance(numeric) < 1e-3, "vertex {v}, unknown {unknown}: {exact} {numeric}");
                 }
+                for joint in [0, 4, 20] {
+                    let fixed = |posed: &Posed| posed.joints[joint] + posed.bones[joint].matrix3 * Vec3::new(0.1, 0.05, -0.1);
+                    surface.fixed(joint, fixed(&posed), &mut jacobian);
+                    let numeric = (fixed(&more) - fixed(&less)) / (2.0 * h);
+                    let column = jacobian.columns.iter().position(|&c| c as usize == unknown);
+                    let exact = column.map_or(Vec3::ZERO, |c| jacobian.directions[c]);
+                    prop_assert!(exact.distance(numeric) < 1e-3, "joint {joint}, unknown {unknown}: {exact} {numeric}");
+                }
                 for &v in rigid.iter().step_by(rigid.len() / 9) {
                     surface.at(v, &mut jacobian);
                     let numeric = (more_normals[v] - less_normals[v]) / (2.0 * h);

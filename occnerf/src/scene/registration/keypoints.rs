@@ -100,3 +100,66 @@ fn projected(camera: &Camera, point: Vec3) -> Option<(Vec2, [Vec3; 2])> {
     let y = to_world * (Vec3::new(0.0, 1.0, -p.y / p.z) * (camera.focal.y / p.z));
     Some((at, [x, y]))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::{Affine3A, Mat3};
+    use proptest::prelude::*;
+    use smpl::{BodyModel, Placement};
+    use volrender::RandomStream;
+
+    fn camera() -> Camera {
+        let rotation = Mat3::from_diagonal(Vec3::new(1.0, -1.0, -1.0));
+        let intrinsics = Mat3::from_cols(Vec3::X * 300.0, Vec3::Y * 280.0, Vec3::new(100.0, 90.0, 1.0));
+        let extrinsics = Affine3A::from_mat3_translation(rotation, Vec3::new(0.1, 0.2, 4.0));
+        Camera::new(intrinsics, extrinsics, 200, 180).unwrap()
+    }
+
+    proptest! {
+        #[test]
+        fn gradients_of_projections_are_finite_differences(place in prop::array::uniform3(-1.0f32..1.0)) {
+            let (camera, place) = (camera(), Vec3::from(place));
+            let (_, gradients) = projected(&camera, place).unwrap();
+            for axis in Vec3::AXES {
+                let at = |by: f32| projected(&camera, place + by * axis).unwrap().0;
+                let numeric = (at(1e-2) - at(-1e-2)) / 2e-2;
+                let exact = Vec2::from_array(gradients.map(|gradient| gradient.dot(axis)));
+                prop_assert!(exact.distance(numeric) < 0.02 * (1.0 + exact.length()), "{exact} {numeric}");
+            }
+        }
+    }
+
+    #[test]
+    fn offsets_in_the_axes_of_bones_and_the_noise_are_found_beside_outliers() {
+        let (model, camera) = (BodyModel::embedded(), camera());
+        let mut random = RandomStream::new(&[4]);
+        let mut vector = |size: f32| size * Vec3::new(random.normal(), random.normal(), random.normal());
+        let truth: Vec<Vec3> = (0..model.num_joints()).map(|_| vector(0.03)).collect();
+        let shape = model.shaped(&[]);
+        let mut made = Vec::new();
+        for frame in 0..60 {
+            let mut pose: Vec<Vec3> = (0..model.num_joints()).map(|_| vector(0.3)).collect();
+            pose[0] = Vec3::Y * frame as f32;
+            let posed = model.pose(&shape, &pose, Placement::default());
+            let point = |joint: usize| {
+                let place = posed.joints[joint] + posed.bones[joint].matrix3 * truth[joint];
+                let lost = if (frame + joint).is_multiple_of(7) { 40.0 } else { 0.0 };
+                let place = camera.project(place).unwrap().truncate() + vector(2.0).truncate() + lost;
+                Keypoint { joint, place, confidence: 0.9 }
+            };
+            let points: Vec<Keypoint> = [1, 4, 7, 16, 18, 20].map(point).to_vec();
+            made.push((points, posed));
+        }
+        let frames: Vec<FramePoints<'_>> =
+            made.iter().map(|(points, posed)| FramePoints { camera: &camera, points, posed }).collect();
+        let found = DetectorModel::measure(&frames, model.num_joints(), 1.0);
+        assert!((1.6..2.6).contains(&found.noise), "{}", found.noise);
+        for joint in [1, 4, 7, 16, 18, 20] {
+            let off = found.offsets[joint].distance(truth[joint]);
+            assert!(off < 0.02 && off < 0.5 * truth[joint].length(), "joint {joint}: {off} of {}", truth[joint]);
+        }
+        assert_eq!(found.offsets[2], Vec3::ZERO);
+        assert_eq!(DetectorModel::measure(&[], 24, 1.0).noise, NOISE);
+    }
+}

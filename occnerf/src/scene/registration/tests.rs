@@ -94,6 +94,28 @@ fn what_is_wrong_with_a_prior_is_mostly_mended_whatever_the_number_of_threads() 
 }
 
 #[test]
+fn key_points_mend_poses_that_outlines_do_not_show() {
+    let body = BodyModel::embedded();
+    let exact = DemoConfig { pose_noise_degrees: 0.0, translation_noise: 0.0, beta_noise: 0.0, ..small() };
+    let truth = demo(&exact, &body).unwrap();
+    let mut given = demo(&small(), &body).unwrap();
+    Perturbation { pose_degrees: 5.0, ..Perturbation::default() }.apply(&mut given, &body).unwrap();
+    let without = registered(&given, &body, 8);
+    for (frame, truth) in given.train.iter_mut().zip(&truth.train) {
+        let posed = body.pose(&body.shaped(&truth.betas), &truth.pose, truth.placement);
+        let point = |joint: usize| {
+            // The detector's joints lie 2 cm beside the body's.
+            let place = truth.camera.project(posed.joints[joint] + 0.02 * Vec3::X)?.truncate();
+            Some(Keypoint { joint, place, confidence: 0.9 })
+        };
+        frame.keypoints = [1, 2, 4, 5, 7, 8, 16, 17, 18, 19, 20, 21].into_iter().filter_map(point).collect();
+    }
+    let with = registered(&given, &body, 8);
+    let [given, without, with] = [&given, &without, &with].map(|capture| apart(&truth, capture, &body));
+    assert!(with < 0.8 * without, "{given} pixels before, {without} without key points, {with} with them");
+}
+
+#[test]
 fn limbs_of_a_rig_that_are_too_long_or_too_short_are_mended() {
     let rig = BodyModel { shapedirs: Vec::new(), ..BodyModel::embedded() };
     let exact = DemoConfig { pose_noise_degrees: 0.0, translation_noise: 0.0, beta_noise: 0.0, ..small() };
