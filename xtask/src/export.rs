@@ -1,19 +1,18 @@
 //! `export`: a trained person in standard formats.
 
 use std::io::Write;
-use std::ops::Range;
 use std::path::PathBuf;
 
-use anyhow::{Context, Error, Result, anyhow, bail};
+use anyhow::{Context, Error, Result, bail};
 use clap::{Args, ValueEnum};
 use glam::Vec3;
 use occnerf::bake::export::{GlbOptions, VRM_LICENCE, Vrm};
-use occnerf::bake::{Avatar, Clip, export};
+use occnerf::bake::{Avatar, export};
 use occnerf::replace_file;
 use smpl::{BoneNames, Bvh};
 
 use crate::avatar;
-use crate::process::{note, results_in, say, unwritten};
+use crate::process::{results_in, say, unwritten};
 
 /// Largest triangle edge of a splat, metres.
 const PATCH: f32 = 0.009;
@@ -67,10 +66,6 @@ pub struct ExportArguments {
     /// Frame of the motion whose pose a ply or an obj shows [default: the first]
     #[arg(long, value_name = "N")]
     frame: Option<usize>,
-    /// Set the motions on level ground: the floor is found from the feet, and feet that stand stay
-    /// in their places
-    #[arg(long)]
-    ground: bool,
     /// Names of the joints in a glb, vrm or bvh; those of rigged characters stay
     #[arg(long, value_enum, default_value = "smpl")]
     bones: Bones,
@@ -109,10 +104,6 @@ pub fn export(arguments: &ExportArguments) -> Result<()> {
         avatar::add_motion(&mut person, path, arguments.fps)?;
     }
     let clip = if arguments.motion.is_some() { person.clips.len() - 1 } else { 0 };
-    if arguments.ground {
-        let clips = if has_texture { 0..person.clips.len() } else { clip..clip + 1 };
-        ground(&mut person, clips)?;
-    }
     rename(&mut person, arguments.bones);
     if let Some(side) = arguments.texture {
         person.atlas.shrink(side);
@@ -170,29 +161,6 @@ fn format(arguments: &ExportArguments) -> Result<Format> {
         (Some(format), _) | (None, Some(format)) => Ok(format),
         (None, None) => bail!("--out {}: expected .glb, .vrm, .ply, .obj, .npz or .bvh, or --format", out.display()),
     }
-}
-
-/// Sets some of the motions on the floor, and says what became of them.
-fn ground(person: &mut Avatar, clips: Range<usize>) -> Result<()> {
-    let sole = person.vertices.iter().map(|v| v.y).fold(f32::INFINITY, f32::min);
-    for Clip { name, motion } in person.clips.iter_mut().skip(clips.start).take(clips.len()) {
-        let found = motion.grounded(&person.skeleton, sole).map_err(|fault| anyhow!("--ground: {name:?}: {fault}"))?;
-        let [before, after] = found.sliding.map(|speed| 1e3 * speed);
-        let [left, right] = found.standing.map(|share| 100.0 * share);
-        say!(
-            "{name}: feet slide {before:.0} mm/s, now {after:.1}; standing {left:.0} and {right:.0} % of the time; \
-             world turned by {:.1}°; elsewhere moved by at most {:.0} mm",
-            found.tilt.to_degrees(),
-            1e3 * found.moved
-        );
-        if found.standing == [0.0; 2] {
-            note!("{name}: no foot stands still, as of a person who walks in place: none is held");
-        }
-        *motion = found.motion;
-    }
-    // They are of the motion as it was.
-    person.cameras.clear();
-    Ok(())
 }
 
 /// Gives the joints the names of a scheme, as far as it has such.

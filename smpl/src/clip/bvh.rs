@@ -7,7 +7,8 @@ use std::path::Path;
 use array_files::{decode_text, read_file, replace_file};
 use glam::{DQuat, DVec3, EulerRot, Quat, Vec3};
 
-use super::{Joint, MotionClip};
+use super::motion_clip::MotionClip;
+use super::skeleton::Joint;
 use crate::Error;
 
 /// Most joints.

@@ -3,8 +3,9 @@
 use glam::{Mat3, Quat, Vec3};
 
 use super::bvh::{Bvh, shorter};
+use super::motion_clip::MotionClip;
 use super::skeleton::{BODY, FACE, HANDS, ROLES, roles};
-use super::{Joint, MotionClip, joint_transforms};
+use super::skeleton::{Joint, joint_transforms};
 
 /// Joints that both skeletons must have.
 const NEEDED: [(usize, &str); 9] = [
@@ -18,8 +19,6 @@ const NEEDED: [(usize, &str); 9] = [
     (18, "left forearm"),
     (19, "right forearm"),
 ];
-/// Hips, knees, ankles and toes, left and right.
-pub(super) const LEGS: [[usize; 4]; 2] = [[1, 4, 7, 10], [2, 5, 8, 11]];
 /// Limbs whose directions at rest are aligned, with the joint at their end; and feet, of which only
 /// the heading is.
 const LIMBS: [(usize, usize); 10] =
@@ -28,14 +27,14 @@ const LIMBS: [(usize, usize); 10] =
 const SHORTEST: f32 = 1e-3;
 
 /// A skeleton by roles.
-pub(super) struct Roles<'a> {
+struct Roles<'a> {
     skeleton: &'a [Joint],
     /// Joint of each role.
-    pub joints: [Option<usize>; ROLES],
+    joints: [Option<usize>; ROLES],
 }
 
 impl<'a> Roles<'a> {
-    pub fn new(skeleton: &'a [Joint]) -> Result<Self, String> {
+    fn new(skeleton: &'a [Joint]) -> Result<Self, String> {
         let names: Vec<&str> = skeleton.iter().map(|joint| joint.name.as_str()).collect();
         let mut joints = [None; ROLES];
         for (joint, role) in roles(&names).into_iter().enumerate() {

@@ -7,5 +7,4 @@ mod bvh;
 mod clip;
 mod embedded;
 mod golden;
-mod ground;
 mod volume;

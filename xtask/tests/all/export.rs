@@ -121,8 +121,6 @@ fn what_others_drive_is_named_as_asked_stands_and_comes_back() {
     let [own, read] = [&poses, &again].map(|path| smpl::MotionClip::load(path).unwrap());
     assert!(own.trans.iter().zip(&read.trans).all(|(a, b)| a.distance(*b) < 1e-4));
     assert!(own.poses[..22].iter().zip(&read.poses).all(|(a, b)| a.distance(*b) < 1e-3));
-    let (_, said) = export("stands.bvh", &["--ground"]);
-    assert!(said.contains("feet slide") && said.contains("mm/s"), "{said}");
     let tail = std::fs::read_to_string(&bvh).unwrap().replace("mixamorig:LeftUpLeg", "Tail");
     std::fs::write(&bvh, tail).unwrap();
     let glb = run.join("tail.glb");
