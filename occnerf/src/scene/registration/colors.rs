@@ -89,3 +89,8 @@ mod tests {
         }
     }
 }
+
+/// Weight of the robust loss of Geman and McClure (1985) at three standard deviations.
+pub(crate) fn robust(squared: f32, noise: f32) -> f32 {
+    (1.0 + squared / (9.0 * noise * noise)).powi(-2)
+}

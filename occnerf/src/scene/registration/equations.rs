@@ -4,7 +4,7 @@ use glam::Vec3;
 use smpl::{BodyModel, Posed, Shaped};
 use volrender::Camera;
 
-use crate::scene::registration::colors::Colors;
+use crate::scene::registration::colors::{Colors, robust};
 use crate::scene::registration::corrections::{PointJacobian, SurfaceJacobian};
 use crate::scene::registration::keypoints::{DetectorModel, FramePoints, PointResidual};
 use crate::scene::registration::observations::{Edge, Observations};
@@ -138,9 +138,4 @@ impl<'a> Equations<'a> {
             (0..3).for_each(|c| self.add(weight, residual[c], jacobian[c], by_rotation[c]));
         }
     }
-}
-
-/// Weight of the robust loss of Geman and McClure (1985) at three standard deviations.
-pub(crate) fn robust(squared: f32, noise: f32) -> f32 {
-    (1.0 + squared / (9.0 * noise * noise)).powi(-2)
 }

@@ -7,7 +7,7 @@ use smpl::Posed;
 use volrender::Camera;
 
 use crate::capture::Keypoint;
-use crate::scene::registration::equations::robust;
+use crate::scene::registration::colors::robust;
 
 /// Least standard deviation of a coordinate, pixels.
 const NOISE: f32 = 1.0;

@@ -28,10 +28,9 @@ use smpl::{BodyModel, Placement, Posed, Shaped};
 use volrender::{Aabb, Camera};
 
 use self::colors::Colors;
-pub(crate) use self::colors::{deviation, noise};
+pub(crate) use self::colors::{deviation, noise, robust};
 use self::corrections::{Correction, corrected};
 pub(crate) use self::crop::Crop;
-pub(crate) use self::equations::robust;
 use self::equations::{BETA_STEP, Equations, Perspective};
 use self::keypoints::{DetectorModel, FramePoints};
 use self::observations::SharedEdge;
