@@ -170,7 +170,8 @@ fn devices_and_pipes_are_read_up_to_a_bound_and_written_to_as_they_are() {
     assert!(Command::new("mkfifo").arg(&pipe).status().unwrap().success());
     refusal(&["train", text(&capture), "--body", text(&pipe)], "pipe.npz: not a plain file");
     refusal(&["train", text(&capture), "--lpips", text(&pipe)], "pipe.npz");
-    refusal(&["import", "--frames", text(&capture), "--fit", text(&pipe), "--out", "x"], "pipe.npz");
+    let images = capture.join("images");
+    refusal(&["import", "--frames", text(&images), "--fit", text(&pipe), "--out", "x"], "pipe.npz");
     let export = ["export", text(&run), "--out", text(&glb), "--motion", text(&pipe)];
     for waits in [&["train", "--list", text(&pipe), "--out", text(&folder.join("l"))][..], &export] {
         let mut command = Command::new(env!("CARGO_BIN_EXE_xtask"));

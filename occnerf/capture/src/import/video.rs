@@ -8,6 +8,9 @@ use crate::image::dimensions;
 use crate::names::{FrameName, number};
 use crate::pictures::Pictures;
 
+/// Extensions of pictures that are not read.
+const OTHER_PICTURES: [&str; 9] = ["webp", "tif", "tiff", "bmp", "gif", "heic", "avif", "jp2", "exr"];
+
 /// A video's frames as files, in order.
 pub(super) struct Video {
     pub names: Vec<String>,
@@ -25,10 +28,13 @@ impl Video {
             let entries = std::fs::read_dir(dir).map_err(CaptureError::io(dir))?.filter_map(Result::ok);
             let others = entries.filter_map(|entry| Some(entry.path().extension()?.to_string_lossy().to_lowercase()));
             let others: BTreeSet<String> = others.collect();
-            let found = others.first().map_or("none".to_owned(), |first| {
-                let all = others.iter().map(String::as_str).collect::<Vec<_>>().join(", ");
-                format!("files of {all} (`mogrify -format png *.{first}` of ImageMagick converts pictures)")
-            });
+            let all = others.iter().map(String::as_str).collect::<Vec<_>>().join(", ");
+            let picture = others.iter().find(|other| OTHER_PICTURES.contains(&other.as_str()));
+            let found = match picture {
+                Some(kind) => format!("files of {all} (`mogrify -format png *.{kind}` of ImageMagick converts them)"),
+                None if all.is_empty() => "none".to_owned(),
+                None => format!("files of {all}"),
+            };
             return Err(CaptureError::invalid(dir, "files", "the video's frames, .png or .jpg", found));
         };
         let size = dimensions(first)?;
