@@ -61,6 +61,11 @@ pub(crate) fn deviation(residuals: impl Iterator<Item = Vec3>) -> Option<f32> {
     median.map(|median| 1.48 * median)
 }
 
+/// Weight of the robust loss of Geman and McClure (1985) at three standard deviations.
+pub(crate) fn robust(squared: f32, noise: f32) -> f32 {
+    (1.0 + squared / (9.0 * noise * noise)).powi(-2)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -88,9 +93,4 @@ mod tests {
             prop_assert!(exact.distance(numeric) < 2e-3, "{exact} {numeric}");
         }
     }
-}
-
-/// Weight of the robust loss of Geman and McClure (1985) at three standard deviations.
-pub(crate) fn robust(squared: f32, noise: f32) -> f32 {
-    (1.0 + squared / (9.0 * noise * noise)).powi(-2)
 }
