@@ -15,7 +15,6 @@ mod gate;
 mod humannerf;
 mod image;
 mod import;
-mod json;
 mod light;
 mod names;
 mod options;

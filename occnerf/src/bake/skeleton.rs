@@ -3,7 +3,7 @@
 use glam::{Affine3A, Mat3, Quat, Vec3};
 use smpl::{BoneNames, Joint, MotionClip};
 
-/// Parents of SMPL's 24 joints, of which its successors share the first 22.
+/// Parents of SMPL's 24 joints; its successors share the first 22.
 const SMPL_PARENTS: [usize; 24] = [0, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 20, 21];
 
 /// Joints of a body model's `parents` at canonical positions `rest`, (J). Joints of the trees of

@@ -19,8 +19,8 @@ const NEEDED: [(usize, &str); 9] = [
     (18, "left forearm"),
     (19, "right forearm"),
 ];
-/// Limbs whose directions at rest are aligned, with the joint at their end; and feet, of which only
-/// the heading is.
+/// Limbs whose directions at rest are aligned, with the joint at their end; of feet, only
+/// the heading is aligned.
 const LIMBS: [(usize, usize); 10] =
     [(1, 4), (2, 5), (4, 7), (5, 8), (16, 18), (17, 19), (18, 20), (19, 21), (7, 10), (8, 11)];
 /// Shortest bone of a limb, relative to a leg.

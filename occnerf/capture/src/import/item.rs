@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use array_files::NdArray;
-use array_files::npz::Npz;
+use array_files::npz::{Npz, read_npy};
 use array_files::pickle::Value;
 use glam::{DMat3, DVec3};
 
@@ -205,6 +205,27 @@ pub(super) fn dictionary(npz: &mut Npz) -> Result<Value, CaptureError> {
 }
 
 /// Groups of three numbers.
+/// The array of a `.npy` file, or the only one of an `.npz` archive whose shape `fits`; `expected` says which.
+pub(super) fn array(path: &Path, expected: &str, fits: impl Fn(&[usize]) -> bool) -> Result<NdArray, CaptureError> {
+    if path.extension().is_none_or(|e| e != "npz") {
+        let array = read_npy(path)?;
+        let fits = fits(&array.shape);
+        let found = || CaptureError::invalid(path, "the file", expected, format!("shape {:?}", array.shape));
+        return if fits { Ok(array) } else { Err(found()) };
+    }
+    let mut npz = Npz::open(path)?;
+    let keys = npz.keys().to_vec();
+    let arrays = keys.iter().filter_map(|key| npz.array(key).ok());
+    let mut fitting = arrays.filter(|array| fits(&array.shape));
+    match (fitting.next(), fitting.next()) {
+        (Some(array), None) => Ok(array),
+        (first, _) => {
+            let found = format!("{} of {}", if first.is_some() { "several" } else { "none" }, keys.join(", "));
+            Err(CaptureError::invalid(path, "arrays", format!("one of {expected}"), found))
+        }
+    }
+}
+
 pub(super) fn vectors(values: &[f64]) -> Vec<DVec3> {
     values.chunks_exact(3).map(DVec3::from_slice).collect()
 }

@@ -5,14 +5,12 @@ use std::fs::File;
 use std::io::BufReader;
 use std::path::Path;
 
-use array_files::npz::{Npz, read_npy};
-use array_files::pickle::Value;
 use array_files::torch::TorchFile;
 use glam::Vec2;
 use serde::Deserialize;
 use smpl::{BodyModel, Placement};
 
-use super::item::{Item, text};
+use super::item::{Item, array, text};
 use super::join;
 use super::video::Video;
 use super::write::Placed;
@@ -23,7 +21,7 @@ use crate::{CaptureError, Keypoint};
 const SETS: [(usize, &str); 2] = [(17, "coco17"), (25, "openpose25")];
 /// Points of less confidence are dropped.
 const LEAST: f32 = 0.3;
-/// SMPL's hands and later joints are nobody's key points.
+/// SMPL's first joint that no set of key points has.
 const HANDS: usize = 22;
 
 /// A person in a picture: x, y, confidence of each point.
@@ -49,7 +47,7 @@ pub(super) fn add(
     model: &BodyModel,
     video: &Video,
 ) -> Result<String, CaptureError> {
-    let (found, joined) = if path.is_dir() { folder(path, video)? } else { array(path, video)? };
+    let (found, joined) = if path.is_dir() { folder(path, video)? } else { of_array(path, video)? };
     let count = found.iter().flatten().map(Vec::len).next().unwrap_or_default();
     let invalid = |expected: &str, actual: String| CaptureError::invalid(path, "points", expected, actual);
     let set = SETS.iter().find(|(points, _)| *points == count).map(|(_, set)| *set);
@@ -132,38 +130,29 @@ fn folder(path: &Path, video: &Video) -> Result<Found, CaptureError> {
     Ok((found, joined.note))
 }
 
-/// An array (T, J, 3) of one person.
-fn array(path: &Path, video: &Video) -> Result<Found, CaptureError> {
-    let extension = path.extension().and_then(|e| e.to_str()).unwrap_or_default();
-    let value = match extension {
-        "npz" => {
-            let mut npz = Npz::open(path)?;
-            match npz.keys() {
-                [key] => {
-                    let key = key.clone();
-                    npz.value(&key)?
-                }
-                keys => return Err(CaptureError::invalid(path, "arrays", "one", keys.join(", "))),
-            }
-        }
-        "npy" => Value::Array(read_npy(path)?),
-        _ => {
-            let file = BufReader::new(File::open(path).map_err(CaptureError::io(path))?);
-            let mut file = TorchFile::open(&path.display().to_string(), file)?;
-            let root = file.root().clone();
-            file.resolve("", &root)?
-        }
-    };
-    let item = Item::new(path, &value);
-    let shape = &item.array()?.shape;
+/// An array (T, J, 3) of one person, also as PyTorch saves it.
+fn of_array(path: &Path, video: &Video) -> Result<Found, CaptureError> {
     let expected = format!("shape [{}, points, 3], one person of the video's frames", video.names.len());
-    let [_, points, 3] = shape[..] else { return Err(item.invalid(expected, format!("shape {shape:?}"))) };
-    let frames = shape[0];
-    let joined = join::by_index(video, &(0..frames).collect())
-        .ok_or_else(|| item.invalid(expected, format!("{frames} frames")))?;
-    let values: Vec<f32> = item.numbers(&[None, Some(points), Some(3)])?.into_iter().map(|v| v as f32).collect();
+    let fits = |shape: &[usize]| matches!(shape, [_, _, 3]);
+    let array = if path.extension().is_some_and(|e| e == "npy" || e == "npz") {
+        array(path, &expected, fits)?
+    } else {
+        let file = BufReader::new(File::open(path).map_err(CaptureError::io(path))?);
+        let mut file = TorchFile::open(&path.display().to_string(), file)?;
+        let root = file.root().clone();
+        let value = file.resolve("", &root)?;
+        let item = Item::new(path, &value);
+        item.array().and_then(|array| match fits(&array.shape) {
+            true => Ok(array.clone()),
+            false => Err(item.invalid(&expected, format!("shape {:?}", array.shape))),
+        })?
+    };
+    let frames = array.shape[0];
+    let joined = join::by_index(video, &(0..frames).collect());
+    let joined = joined.ok_or_else(|| CaptureError::invalid(path, "the file", expected, format!("{frames} frames")))?;
+    let values: Vec<f32> = array.to_f64().into_iter().map(|v| v as f32).collect();
     let mut found = vec![Vec::new(); video.names.len()];
-    for (row, at) in values.chunks_exact((3 * points).max(1)).zip(&joined.at) {
+    for (row, at) in values.chunks_exact((3 * array.shape[1]).max(1)).zip(&joined.at) {
         if let Some(at) = *at {
             found[at] = vec![detection(path, "the array", row.to_vec())?];
         }
@@ -174,7 +163,9 @@ fn array(path: &Path, video: &Video) -> Result<Found, CaptureError> {
 /// Finite pixels and confidences of at least 0.
 fn detection(path: &Path, key: &str, values: Vec<f32>) -> Result<Detection, CaptureError> {
     let (points, rest) = values.as_chunks::<3>();
-    let is_point = |[x, y, c]: &[f32; 3]| x.abs().max(y.abs()) < FARTHEST_PIXEL && *c >= 0.0 && c.is_finite();
+    // False for NaN.
+    let is_near = |x: &f32| x.abs() < FARTHEST_PIXEL;
+    let is_point = |[x, y, c]: &[f32; 3]| is_near(x) && is_near(y) && *c >= 0.0 && c.is_finite();
     match points.iter().find(|point| !is_point(point)) {
         None if rest.is_empty() => Ok(points.to_vec()),
         fault => {

@@ -4,7 +4,7 @@ use serde_json::json;
 use super::fit::FitFrame;
 use super::write::Placed;
 use super::*;
-use crate::testing::{Directory, damaged};
+use crate::testing::{Directory, damaged, npy};
 
 const COUNT: usize = 3;
 
@@ -64,14 +64,6 @@ fn points_of_the_nearest_person_become_joints_of_the_body() {
             values.extend([pixels[joint][0] as f32, pixels[joint][1] as f32 + 2.0, confidence]);
         }
     }
-    let npy = |shape: &str, values: &[f32]| {
-        let header = format!("{{'descr': '<f4', 'fortran_order': False, 'shape': {shape}, }}");
-        let mut bytes = b"\x93NUMPY\x01\x00".to_vec();
-        bytes.extend((header.len() as u16).to_le_bytes());
-        bytes.extend(header.as_bytes());
-        bytes.extend(values.iter().flat_map(|v| v.to_le_bytes()));
-        bytes
-    };
     out.write("coco.npy", npy("(3, 17, 3)", &values));
     let said = keypoints::add(&out.path().join("coco.npy"), &mut placed, &[], &model, &video).unwrap();
     assert!(said.contains("coco17 in 2 frames, 2.0 px"), "{said}");
@@ -85,7 +77,7 @@ fn points_of_the_nearest_person_become_joints_of_the_body() {
         let message = error.unwrap_err().to_string();
         assert!(!message.contains('\n') && words.iter().all(|word| message.contains(word)), "{message}");
     };
-    fault("nan.npy", npy("(3, 17, 3)", &values), ["finite", "nan.npy"]);
+    fault("nan.npy", npy("(3, 17, 3)", &values), ["NaN", "nan.npy"]);
     fault("far.npy", npy("(3, 17, 3)", &[1e9; 153]), ["pixels", "1000000000"]);
     fault("four.npy", npy("(3, 4, 3)", &[1.0; 36]), ["17 (COCO) or 25 (OpenPose)", "4"]);
     fault("flat.npy", npy("(153,)", &[1.0; 153]), ["shape [3, points, 3]", "[153]"]);

@@ -2,42 +2,20 @@
 
 use std::path::Path;
 
-use array_files::npz::{Npz, read_npy};
 use glam::{DVec3, Vec3};
 use point_fit::{Fitted, joint_set, joint_sets};
 use smpl::BodyModel;
 
 use super::fit::{Fit, FitFrame, Person, Tool};
+use super::item::array;
 use super::video::Video;
 use crate::CaptureError;
 
 /// Reads joints (T,J,3) in camera axes, metres, of a `.npy` file or the only such array of an `.npz`;
 /// joints that are NaN are missing. The focal length is not in it: √(W² + H²).
 pub(super) fn read(path: &Path, set: &str, count: usize, video: &Video) -> Result<Fit, CaptureError> {
-    let expected = || format!("shape [frames, {count}, 3], as {set} has");
-    let array = if path.extension().is_some_and(|e| e == "npz") {
-        let mut npz = Npz::open(path)?;
-        let keys = npz.keys().to_vec();
-        let arrays = keys.iter().filter_map(|key| npz.array(key).ok());
-        let mut fitting = arrays.filter(|array| array.shape.len() == 3 && array.shape[1..] == [count, 3]);
-        match (fitting.next(), fitting.next()) {
-            (Some(array), None) => array,
-            (first, _) => {
-                let found = if first.is_some() { "several" } else { "none" };
-                return Err(CaptureError::invalid(
-                    path,
-                    "arrays",
-                    format!("one of {}", expected()),
-                    format!("{found} of {}", keys.join(", ")),
-                ));
-            }
-        }
-    } else {
-        read_npy(path)?
-    };
-    if array.shape.len() != 3 || array.shape[1..] != [count, 3] {
-        return Err(CaptureError::invalid(path, "the file", expected(), format!("shape {:?}", array.shape)));
-    }
+    let expected = format!("shape [frames, {count}, 3], as {set} has");
+    let array = array(path, &expected, |shape| shape.len() == 3 && shape[1..] == [count, 3])?;
     let [width, height] = video.sides();
     let lens = [[width.hypot(height); 2], video.middle()];
     let mut frames = Vec::new();

@@ -8,6 +8,7 @@ use std::path::{Path, PathBuf};
 
 use array_files::npz::Npz;
 use array_files::pickle::{self, Value};
+use array_files::{Data, NdArray};
 use glam::{DVec2, DVec3};
 
 use super::fit::{Fit, FitFrame, OwnMask, Person, Tool};
@@ -128,7 +129,37 @@ fn load(path: &Path) -> Result<Value, CaptureError> {
 pub(super) fn json(path: &Path) -> Result<Value, CaptureError> {
     let value: serde_json::Value = serde_json::from_str(&text(path)?)
         .map_err(|e| CaptureError::invalid(path, "the file", "JSON", e.to_string()))?;
-    Ok(crate::json::value(value))
+    Ok(converted(value))
+}
+
+/// The value of a pickle of the same: nested lists of numbers with equally long rows are arrays.
+fn converted(json: serde_json::Value) -> Value {
+    use serde_json::Value as Json;
+    match json {
+        Json::Null => Value::None,
+        Json::Bool(flag) => Value::Bool(flag),
+        Json::Number(number) => Value::Float(number.as_f64().unwrap_or(f64::NAN)),
+        Json::String(text) => Value::Str(text),
+        Json::Object(map) => Value::Dict(map.into_iter().map(|(k, v)| (Value::Str(k), converted(v))).collect()),
+        Json::Array(items) => {
+            let items: Vec<Value> = items.into_iter().map(converted).collect();
+            // Numbers, or arrays of one shape.
+            let part = |item: &Value| match item {
+                Value::Float(x) => Some((Vec::new(), vec![*x])),
+                Value::Bool(flag) => Some((Vec::new(), vec![f64::from(u8::from(*flag))])),
+                Value::Array(NdArray { shape, data: Data::F64(values) }) => Some((shape.clone(), values.clone())),
+                _ => None,
+            };
+            let parts: Option<Vec<(Vec<usize>, Vec<f64>)>> = items.iter().map(part).collect();
+            match parts {
+                Some(parts) if !parts.is_empty() && parts.iter().all(|p| p.0 == parts[0].0) => {
+                    let shape = [vec![parts.len()], parts[0].0.clone()].concat();
+                    Value::Array(NdArray { shape, data: Data::F64(parts.into_iter().flat_map(|p| p.1).collect()) })
+                }
+                _ => Value::List(items),
+            }
+        }
+    }
 }
 
 /// The state by which a person is found in the next frame.

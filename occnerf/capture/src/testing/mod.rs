@@ -34,11 +34,16 @@ fn npy_header(descr: &str, shape: &str) -> Vec<u8> {
     out
 }
 
+/// An array as `numpy.save` writes it.
+pub fn npy(shape: &str, values: &[f32]) -> Vec<u8> {
+    let mut out = npy_header("<f4", shape);
+    out.extend(values.iter().copied().flat_map(f32::to_le_bytes));
+    out
+}
+
 /// An array of points as `numpy.save` writes it.
 pub fn points_npy(points: &[Vec3]) -> Vec<u8> {
-    let mut out = npy_header("<f4", &format!("({}, 3)", points.len()));
-    out.extend(points.iter().flat_map(|p| p.to_array()).flat_map(f32::to_le_bytes));
-    out
+    npy(&format!("({}, 3)", points.len()), &points.iter().flat_map(Vec3::to_array).collect::<Vec<_>>())
 }
 
 pub fn array(shape: &[u32], values: &[f64]) -> Py {

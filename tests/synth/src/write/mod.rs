@@ -20,7 +20,7 @@ use capture::{Capture, CaptureError, Layout};
 
 /// Writes any capture into `dir` in HumanNeRF's prepared layout, with the body model as
 /// `body.safetensors`. Training frames that were read from files keep their photographs, others are
-/// black outside the mask. Masks of occluders are not written: the layout has none.
+/// black outside the mask. Neither masks of occluders nor key points are written: the layout has none.
 ///
 /// # Errors
 /// As of [`Synthetic::write`], and for pictures that cannot be read.
