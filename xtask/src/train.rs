@@ -107,7 +107,7 @@ pub fn train(arguments: &TrainArguments) -> Result<()> {
     Ok(())
 }
 
-/// A run that is about to be trained, and its directory, which nobody else writes.
+/// A run before its training, and its directory, locked for writing.
 struct Begun {
     directory: PathBuf,
     source: Source,

@@ -268,7 +268,7 @@ mod tests {
                 let within = |d: f32| d <= reach && d >= -config.motion.depth;
                 let live = push_point(&tracer, &mut samples, point);
                 // A little beyond the margin, as far as a cell or the corner of a box, either is
-                // right; nobody is as deep as `depth`.
+                // right; no point is as deep as `depth`.
                 if within(exact) {
                     assert_eq!(live, within(used), "{point}: {exact}, {used}");
                     counts[usize::from(live)] += 1;

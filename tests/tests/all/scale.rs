@@ -1,4 +1,4 @@
-//! The unit of length is nobody's business: lengths are normalised before anything with a constant
+//! Independence of the unit of length: lengths are normalised before anything with a constant
 //! in metres.
 
 use crate::common;

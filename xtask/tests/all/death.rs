@@ -220,7 +220,7 @@ fn scores_and_exports_killed_at_any_moment_are_whole_or_absent() {
     } else {
         println!("import is skipped: {} is absent", fit.display());
     }
-    // What a command that nobody kills leaves.
+    // Results of commands that are not killed.
     let results = |name: &str, out: &Path| -> Vec<Vec<u8>> {
         let files: &[&str] = match name {
             "export" => &["person.glb", "avatar.safetensors"],

@@ -165,7 +165,7 @@ fn devices_and_pipes_are_read_up_to_a_bound_and_written_to_as_they_are() {
     std::os::unix::fs::symlink("/dev/zero", &motion).unwrap();
     refusal(&["export", text(&run), "--out", text(&glb), "--motion", text(&motion)], "zero.npz: more than");
     refusal(&["train", text(&capture), "--body", text(&motion)], "zero.npz: not a plain file");
-    // A pipe that nobody writes to yet is waited for where it is read once, and never where it is read again.
+    // A pipe without a writer is waited for where it is read once, and refused where it is read again.
     let pipe = folder.join("pipe.npz");
     assert!(Command::new("mkfifo").arg(&pipe).status().unwrap().success());
     refusal(&["train", text(&capture), "--body", text(&pipe)], "pipe.npz: not a plain file");
@@ -183,7 +183,7 @@ fn devices_and_pipes_are_read_up_to_a_bound_and_written_to_as_they_are() {
         std::fs::write(&pipe, "no-such-capture").unwrap();
         assert_eq!(child.wait().unwrap().code(), Some(1));
     }
-    // In a run that nobody writes to, in a run.
+    // In a run without a writer.
     let metrics = run.join("train.jsonl");
     std::fs::remove_file(&metrics).unwrap();
     assert!(Command::new("mkfifo").arg(&metrics).status().unwrap().success());

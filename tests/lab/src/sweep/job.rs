@@ -275,7 +275,7 @@ pub fn serve() -> Result<()> {
     let mut text = String::new();
     std::io::stdin().lock().take(MAX_JOB_BYTES).read_line(&mut text).context("standard input")?;
     let job: Job = serde_json::from_str(&text).context("standard input is not a job")?;
-    // Standard input ends with the sweep, whatever ends it: nobody waits for the outcome then.
+    // Standard input ends when the sweep does: the outcome is not needed then.
     std::thread::spawn(|| {
         let _ = std::io::copy(&mut std::io::stdin().lock(), &mut std::io::sink());
         std::process::exit(1);

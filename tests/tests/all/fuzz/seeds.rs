@@ -116,7 +116,7 @@ pub fn clips() -> Vec<Vec<u8>> {
     vec![clip(24, "fps"), clip(52, "mocap_framerate")]
 }
 
-/// Two triangles on two joints, one of which turns.
+/// Two triangles on two joints; one joint turns.
 pub fn characters() -> Vec<Vec<u8>> {
     let mut binary: Vec<u8> = Vec::new();
     let mut add = |values: &[f32]| binary.extend(values.iter().flat_map(|v| v.to_le_bytes()));
