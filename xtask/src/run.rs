@@ -360,16 +360,33 @@ pub fn use_threads(threads: Option<usize>) -> Result<()> {
     built.with_context(|| format!("{number} threads cannot be started (--threads gives another number)"))
 }
 
-/// Memory that this process may take in addition, where the system says: what is free, and what is
-/// left to its limit of address space.
+/// A number of a file under /proc, where there is one.
+fn number(path: &str, key: &str) -> Option<u64> {
+    let text = read_text(Path::new(path)).ok()?;
+    let line = text.lines().find_map(|line| line.strip_prefix(key))?;
+    line.split_whitespace().next()?.parse().ok()
+}
+
+/// Free memory of the machine, where the system says.
 pub fn free_bytes() -> Option<u64> {
-    let number = |path: &str, key: &str| -> Option<u64> {
-        let text = read_text(Path::new(path)).ok()?;
-        let line = text.lines().find_map(|line| line.strip_prefix(key))?;
-        line.split_whitespace().next()?.parse().ok()
-    };
-    let free = number("/proc/meminfo", "MemAvailable:").map(|kib| kib << 10);
-    let taken = number("/proc/self/status", "VmSize:").map(|kib| kib << 10);
-    let limit = number("/proc/self/limits", "Max address space").zip(taken);
-    free.into_iter().chain(limit.map(|(limit, taken)| limit.saturating_sub(taken))).min()
+    number("/proc/meminfo", "MemAvailable:").map(|kib| kib << 10)
+}
+
+/// Address space of the program itself: code, stacks and what the allocator reserves, bytes.
+const PROGRAM: u64 = 192 << 20;
+
+/// Checks that the process's address space has room for that much memory in all. An allocation beyond its limit
+/// aborts.
+///
+/// # Errors
+/// If the limit is lower.
+pub fn check_memory(bytes: u64) -> Result<()> {
+    let need = (PROGRAM + bytes) >> 20;
+    let limit = number("/proc/self/limits", "Max address space").map_or(u64::MAX, |limit| limit >> 20);
+    ensure!(
+        need <= limit,
+        "memory: about {need} MiB are needed, the process is limited to {limit} (ulimit -v); raise that, or load \
+         less (--memory, --resize, --max-frames)"
+    );
+    Ok(())
 }

@@ -14,6 +14,7 @@ use sha2::{Digest, Sha256};
 use smpl::BodyModel;
 
 use crate::process::telling;
+use crate::run::check_memory;
 
 /// Name of the scene that needs no other files.
 pub const DEMO: &str = "demo";
@@ -164,6 +165,7 @@ pub fn load_with(
     options: &LoadOptions,
     edit: impl FnOnce(&mut Capture, &mut BodyModel) -> Result<()>,
 ) -> Result<Source> {
+    check_memory(0)?;
     let scene = scene.unwrap_or(DEMO);
     let directory = Path::new(if scene == DEMO { DEMO_FOLDER } else { scene });
     if directory.is_file() && is_character(directory) {

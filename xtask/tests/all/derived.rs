@@ -264,6 +264,11 @@ fn limits_of_the_process_are_said_in_a_line() {
     let threads = std::thread::available_parallelism().map_or(16, |cores| 16 * usize::from(cores)).to_string();
     let crowd = ["render", "x", "tpose", "--threads", &threads];
     one_line(&limited("ulimit -v 60000;", &crowd), "threads cannot be started");
+    let run = folder("little-memory");
+    let train = ["train", "--method", "prior", "--threads", "2", "--out", text(&run)];
+    for limit in ["80000", "200000"] {
+        one_line(&limited(&format!("ulimit -v {limit};"), &train), "error: memory: ");
+    }
     assert!(limited("ulimit -s 64;", &["check", "--out", "/dev/null"]).status.success());
 }
 

@@ -1,5 +1,6 @@
 //! A run of a sweep: its description, its outcome, and the child process that takes it there.
 
+use std::ffi::OsStr;
 use std::io::{BufRead, Read, Write};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
@@ -86,14 +87,22 @@ pub struct Job {
     pub keep: Option<Keep>,
 }
 
-/// The run directory of a job.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+/// The run directory of a job. A sweep's folder may be moved: equality is that of names inside it.
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct Keep {
     pub directory: PathBuf,
     /// Directory of the trained run whose baked person is scored; trained first if need be.
     pub trained: Option<PathBuf>,
     /// Weights of LPIPS.
     pub lpips: Option<PathBuf>,
+}
+
+impl PartialEq for Keep {
+    fn eq(&self, other: &Self) -> bool {
+        let name = |path: &Path| path.iter().rev().take(2).map(OsStr::to_owned).collect::<Vec<_>>();
+        let names = |keep: &Self| (name(&keep.directory), keep.trained.as_deref().map(name));
+        names(self) == names(other) && self.lpips == other.lpips
+    }
 }
 
 impl Job {

@@ -50,4 +50,13 @@ fn parts_of_a_reproduction_make_the_table_that_one_job_makes() {
     let table = |out: &Path| timeless(&out.join("capture/reproduce.md"));
     assert_eq!(table(&many), table(&one));
     assert_eq!(table(&one).len(), 2 * (2 + 4));
+
+    let moved = folder.join("moved");
+    std::fs::rename(&many, &moved).unwrap();
+    let merge = command(&moved, &["--merge"]);
+    run(&merge);
+    assert_eq!(table(&moved), table(&one), "a sweep's folder may be moved");
+    let scores = |seed: u32| moved.join(format!("capture/occnerf-s{seed}/metrics.json"));
+    std::fs::copy(scores(1), scores(2)).unwrap();
+    refused(&merge.iter().map(String::as_str).collect::<Vec<_>>(), &["such as occnerf-s2", "have no scores yet"]);
 }
