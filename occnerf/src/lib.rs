@@ -40,7 +40,7 @@ mod train;
 pub use ::capture;
 pub use ::lpips::Lpips;
 pub use array_files::replace_file;
-pub use check::{Check, Fault, FrameCheck, Mistake, body_silhouette, check, photograph, unknown_pixels};
+pub use check::{Check, Fault, FrameCheck, Limb, Mistake, body_silhouette, check, photograph, unknown_pixels};
 pub use config::{
     Component, Config, ConfigError, DistanceKind, EncodingConfig, FieldConfig, LossConfig, Method, MotionConfig,
     MotionKind, OccludedRule, Preset, RateConfig, RegistrationConfig, SurfaceConfig,

@@ -6,7 +6,7 @@ use anyhow::Result;
 use clap::Args;
 use image::{Rgb, RgbImage, imageops};
 use occnerf::capture::Frame;
-use occnerf::{Check, body_silhouette, photograph, unknown_pixels};
+use occnerf::{Check, Fault, body_silhouette, photograph, unknown_pixels};
 use smpl::BodyModel;
 
 use crate::pictures::{captioned, save, sheet, to_rgb};
@@ -91,18 +91,46 @@ fn tell(found: &Check, all: bool) {
     if more > 0 {
         say!("… and {more} more (--all)");
     }
-    say!("{}", grade(found.mean_iou()));
+    say!("{}", grade(found.mean_iou(), share(found, |fault| matches!(fault, Fault::Limb(_) | Fault::Overlap))));
+    say!("{}", grade_of_masks(share(found, |fault| matches!(fault, Fault::Background | Fault::EmptyMask))));
     say!("{}", verdict(found));
 }
 
-/// The fit's grade by its mean overlap, and what to do about it.
-fn grade(iou: f32) -> &'static str {
-    const GOOD: f32 = 0.85;
-    const USABLE: f32 = 0.65;
-    match iou {
-        iou if iou >= GOOD => "fit: good",
-        iou if iou >= USABLE => "fit: usable (registration moves the bodies onto the pictures before training)",
-        _ => "fit: poor (see the picture: wrong masks, or a fit that training will not mend)",
+/// Share of the frames with such a fault.
+fn share(found: &Check, wanted: impl Fn(Fault) -> bool) -> f32 {
+    let frames = found.frames.iter().filter(|frame| frame.faults.iter().any(|fault| wanted(*fault)));
+    frames.count() as f32 / found.frames.len().max(1) as f32
+}
+
+/// Shares of faulty frames up to which a fit, or masks, are good, and usable.
+const GOOD: f32 = 0.05;
+const USABLE: f32 = 0.3;
+
+/// The fit's grade by its mean overlap and the share of frames that do not fit, and what to do about it.
+fn grade(iou: f32, wrong: f32) -> String {
+    let frames = format!("{:.0} % of the frames do not fit", 100.0 * wrong);
+    if iou >= 0.85 && wrong <= GOOD {
+        "fit: good".to_owned()
+    } else if iou >= 0.65 && wrong <= USABLE {
+        format!(
+            "fit: usable, {frames} (registration moves the bodies onto the pictures; 2-D key points help: import --keypoints)"
+        )
+    } else {
+        format!("fit: poor, {frames} (see the picture: wrong masks, or a fit that training will not mend)")
+    }
+}
+
+/// The masks' grade by the share of frames where they are empty or reach beyond the body.
+fn grade_of_masks(wrong: f32) -> String {
+    let frames = format!("{:.0} % are empty or reach beyond the body", 100.0 * wrong);
+    if wrong <= GOOD {
+        "masks: good".to_owned()
+    } else if wrong <= USABLE {
+        format!("masks: usable, {frames} (segment those frames again, or leave them out)")
+    } else {
+        format!(
+            "masks: poor, {frames} (background or things held are in them: segment again, with points on the person)"
+        )
     }
 }
 

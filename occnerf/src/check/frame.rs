@@ -2,6 +2,8 @@
 
 use volrender::Camera;
 
+use super::limbs::Limb;
+
 /// A fault of one frame.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[non_exhaustive]
@@ -14,6 +16,10 @@ pub enum Fault {
     PlaceJump,
     /// The rotation of a joint is an outlier.
     PoseJump,
+    /// The mask shows a limb elsewhere.
+    Limb(Limb),
+    /// The mask reaches farther from the body than clothes, and no limb explains it: background, or a thing held.
+    Background,
 }
 
 impl Fault {
@@ -25,6 +31,8 @@ impl Fault {
             Self::Overlap => "does not fit",
             Self::PlaceJump => "jump of place or camera",
             Self::PoseJump => "jump of pose",
+            Self::Limb(limb) => limb.words_elsewhere(),
+            Self::Background => "mask beyond the body",
         }
     }
 }

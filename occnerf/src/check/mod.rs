@@ -5,25 +5,28 @@
 
 mod frame;
 mod jumps;
+mod limbs;
 mod mistakes;
 #[cfg(test)]
 mod tests;
 
 pub use self::frame::Fault;
+pub use self::limbs::Limb;
 pub use self::mistakes::Mistake;
 
-use glam::Vec3;
+use glam::{Vec2, Vec3};
 use rayon::prelude::*;
 use smpl::BodyModel;
 use visibility::{RayMesh, visible_vertices};
 use volrender::Camera;
 
 use self::frame::View;
+use self::limbs::Part;
 use self::mistakes::{Overlap, outline, posed};
 use crate::capture::{Capture, CaptureError, Frame, Image, Pixels};
 use crate::config::OccludedRule;
 use crate::error::Error;
-use crate::model::view::pinhole;
+use crate::model::view::{pinhole, silhouette};
 use crate::scene::labels::{Label, label_pixels};
 
 /// Longest side of downsampled frames, pixels.
@@ -80,8 +83,9 @@ impl Check {
 /// Pictures that cannot be read.
 pub fn check(capture: &Capture, body: &BodyModel) -> Result<Check, Error> {
     let small = small_views(capture)?;
+    let parts = limbs::parts(body);
     let checked: Vec<Result<FrameCheck, Error>> =
-        small.par_iter().map(|view| one(&capture.train[view.index], view, body)).collect();
+        small.par_iter().map(|view| one(&capture.train[view.index], view, body, &parts)).collect();
     let mut frames = checked.into_iter().collect::<Result<Vec<_>, _>>()?;
     for (frame, faults) in frames.iter_mut().zip(jumps::find(capture, body)) {
         frame.faults.extend(faults);
@@ -126,22 +130,19 @@ pub fn photograph(frame: &Frame) -> Result<Image, CaptureError> {
 /// Unknown pixels (H × W) of a frame, given the body's `silhouette`.
 #[must_use]
 pub fn unknown_pixels(frame: &Frame, pixels: &Pixels, silhouette: &[bool], body: &BodyModel) -> Vec<bool> {
-    unknown(&pixels.mask, silhouette, pixels.occluder.as_deref(), &frame.camera, frame, body)
+    let posed = body.pose(&body.shaped(&frame.betas), &frame.pose, frame.placement);
+    let scale = metre(&frame.camera, &posed.joints);
+    unknown(&pixels.mask, silhouette, pixels.occluder.as_deref(), frame.camera.width, scale)
 }
 
-fn unknown(
-    mask: &[f32],
-    silhouette: &[bool],
-    occluder: Option<&[bool]>,
-    camera: &Camera,
-    frame: &Frame,
-    body: &BodyModel,
-) -> Vec<bool> {
-    let posed = body.pose(&body.shaped(&frame.betas), &frame.pose, frame.placement);
-    let pelvis = posed.joints.first().copied().unwrap_or(Vec3::ZERO);
-    let depth = camera.world_to_camera.transform_point3(pelvis).z.max(1e-3);
-    let scale = camera.focal.x / depth;
-    let labels = label_pixels(OccludedRule::Unknown, mask, silhouette, occluder, camera.width as usize, scale);
+/// Pixels of a metre at the depth of the first joint.
+fn metre(camera: &Camera, joints: &[Vec3]) -> f32 {
+    let pelvis = joints.first().copied().unwrap_or(Vec3::ZERO);
+    camera.focal.x / camera.world_to_camera.transform_point3(pelvis).z.max(1e-3)
+}
+
+fn unknown(mask: &[f32], silhouette: &[bool], occluder: Option<&[bool]>, width: u32, metre: f32) -> Vec<bool> {
+    let labels = label_pixels(OccludedRule::Unknown, mask, silhouette, occluder, width as usize, metre);
     labels.into_iter().map(|label| label == Label::Unknown).collect()
 }
 
@@ -164,6 +165,13 @@ impl View {
         Ok(Self { index, camera, mask, occluder })
     }
 
+    /// Whether the mask, or a known occluder, is at a pixel position, or the position is outside the image.
+    fn shows(&self, at: Vec2) -> bool {
+        let inside = at.cmpge(Vec2::ZERO).all() && at.x < self.camera.width as f32 && at.y < self.camera.height as f32;
+        let pixel = at.y as usize * self.camera.width as usize + at.x as usize;
+        !inside || self.mask[pixel] || self.occluder.as_ref().is_some_and(|occluder| occluder[pixel])
+    }
+
     /// Share of the image border inside the mask.
     fn border(&self) -> f32 {
         let (width, height) = (self.camera.width as usize, self.camera.height as usize);
@@ -174,10 +182,12 @@ impl View {
     }
 }
 
-fn one(frame: &Frame, view: &View, body: &BodyModel) -> Result<FrameCheck, Error> {
-    let silhouette = outline(frame, &view.camera, body)?;
+fn one(frame: &Frame, view: &View, body: &BodyModel, parts: &[Part]) -> Result<FrameCheck, Error> {
+    let posed = body.pose(&body.shaped(&frame.betas), &frame.pose, frame.placement);
+    let silhouette = silhouette(&posed.vertices, &body.faces, &view.camera)?;
+    let scale = metre(&view.camera, &posed.joints);
     let mask: Vec<f32> = view.mask.iter().map(|&m| f32::from(m)).collect();
-    let unknown = unknown(&mask, &silhouette, view.occluder.as_deref(), &view.camera, frame, body);
+    let unknown = unknown(&mask, &silhouette, view.occluder.as_deref(), view.camera.width, scale);
     let (mut known, mut either, mut hidden) = (0, 0, 0);
     for ((&body, &mask), &unknown) in silhouette.iter().zip(&view.mask).zip(&unknown) {
         known += usize::from(body && (mask || unknown));
@@ -194,6 +204,8 @@ fn one(frame: &Frame, view: &View, body: &BodyModel) -> Result<FrameCheck, Error
         faults.push(Fault::EmptyMask);
     } else if beside || iou.is_some_and(|iou| iou < LEAST_IOU) {
         faults.push(Fault::Overlap);
+    } else {
+        faults.extend(limbs::fault(view, &silhouette, &posed, parts, scale));
     }
     Ok(FrameCheck { name: frame.name.clone(), iou, hidden: hidden as f32 / covered.max(1) as f32, faults })
 }

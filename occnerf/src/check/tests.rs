@@ -269,3 +269,56 @@ fn jumps_empty_masks_and_frames_that_do_not_fit_are_marked() {
     assert!(faults(30).contains(&Fault::PoseJump) && faults(31).contains(&Fault::PoseJump), "{:?}", faults(30));
     assert!(faults(40).is_empty() && found.mistakes.is_empty());
 }
+
+#[test]
+fn limbs_elsewhere_and_background_in_masks_are_named() {
+    let bends = [(16, Vec3::Z * 1.2), (17, Vec3::Z * -1.2), (1, Vec3::X * -1.2), (2, Vec3::X * -1.2)];
+    let (mut lines, mut sums) = (Vec::new(), [[0; 4]; 5]);
+    for (name, capture, body) in good() {
+        let window = Capture { train: capture.train.iter().step_by(4).take(12).cloned().collect(), ..capture.clone() };
+        let parts = limbs::parts(body);
+        let faults = |capture: &Capture| -> Vec<Vec<Fault>> {
+            let small = small_views(capture).unwrap();
+            small.iter().map(|view| one(&capture.train[view.index], view, body, &parts).unwrap().faults).collect()
+        };
+        for kind in 0..5 {
+            let mut wrong = window.clone();
+            for frame in &mut wrong.train {
+                match bends.get(kind) {
+                    Some((joint, bend)) => frame.pose[*joint] += *bend,
+                    None => {
+                        let posed = body.pose(&body.shaped(&frame.betas), &frame.pose, frame.placement);
+                        let camera = frame.camera;
+                        let scale = metre(&camera, &posed.joints);
+                        let at = camera.project(posed.joints[0]).unwrap().truncate() + Vec2::X * 0.35 * scale;
+                        frame.source.edit(move |pixels| {
+                            for (i, level) in pixels.mask.iter_mut().enumerate() {
+                                let (x, y) = (i % camera.width as usize, i / camera.width as usize);
+                                if at.distance(Vec2::new(x as f32, y as f32)) < 0.2 * scale {
+                                    *level = 1.0;
+                                }
+                            }
+                        });
+                    }
+                }
+            }
+            let expected = Limb::ALL.get(kind).map_or(Fault::Background, |limb| Fault::Limb(*limb));
+            let found = faults(&wrong);
+            let counts = [
+                found.iter().filter(|f| f.contains(&expected)).count(),
+                found.iter().flatten().filter(|f| matches!(f, Fault::Limb(_)) && **f != expected).count(),
+                found.iter().flatten().filter(|f| **f == Fault::Background && **f != expected).count(),
+                found.len(),
+            ];
+            lines.push(format!("{name} {expected:?}: {counts:?}"));
+            (0..4).for_each(|i| sums[kind][i] += counts[i]);
+        }
+    }
+    let [right, other, background, _] = [0, 1, 2, 3].map(|i| sums[..4].iter().map(|counts| counts[i]).sum::<usize>());
+    let found = right + other + background;
+    println!("limbs: {right} of {found} named, {other} taken for another, {background} for background");
+    assert!(found > 15 * good().len() && 4 * right >= 3 * found && 10 * other < found, "{lines:#?}");
+    let [right, limb, _, all] = sums[4];
+    println!("background: {right} of {all} named, {limb} taken for a limb");
+    assert!(100 * (right + limb) >= 95 * all && 3 * right >= 2 * all, "{lines:#?}");
+}
