@@ -91,8 +91,10 @@ fn tell(found: &Check, all: bool) {
     if more > 0 {
         say!("… and {more} more (--all)");
     }
-    say!("{}", grade(found.mean_iou(), share(found, |fault| matches!(fault, Fault::Limb(_) | Fault::Overlap))));
-    say!("{}", grade_of_masks(share(found, |fault| matches!(fault, Fault::Background | Fault::EmptyMask))));
+    let wrong = share(found, |fault| matches!(fault, Fault::Limb(_) | Fault::Overlap));
+    say!("{}", grade(found.mean_iou(), wrong));
+    let wrong = share(found, |fault| matches!(fault, Fault::Background | Fault::EmptyMask));
+    say!("{}", grade_of_masks(found.mean_beyond(), wrong));
     say!("{}", verdict(found));
 }
 
@@ -120,18 +122,22 @@ fn grade(iou: f32, wrong: f32) -> String {
     }
 }
 
-/// The masks' grade by the share of frames where they are empty or reach beyond the body.
-fn grade_of_masks(wrong: f32) -> String {
-    let frames = format!("{:.0} % are empty or reach beyond the body", 100.0 * wrong);
-    if wrong <= GOOD {
-        "masks: good".to_owned()
-    } else if wrong <= USABLE {
-        format!("masks: usable, {frames} (segment those frames again, or leave them out)")
-    } else {
-        format!(
-            "masks: poor, {frames} (background or things held are in them: segment again, with points on the person)"
-        )
+/// Shares of the masks beyond 5 cm of the body up to which they are good, and usable.
+const CLOSE: f32 = 0.01;
+const LOOSE: f32 = 0.1;
+
+/// The masks' grade by the share of them that is not close to the body, and the share of frames where they are empty
+/// or reach farther than clothes.
+fn grade_of_masks(beyond: f32, wrong: f32) -> String {
+    if beyond <= CLOSE && wrong <= GOOD {
+        return "masks: good".to_owned();
     }
+    let grade = if beyond <= LOOSE && wrong <= USABLE { "usable" } else { "poor" };
+    let [beyond, wrong] = [beyond, wrong].map(|share| 100.0 * share);
+    format!(
+        "masks: {grade}, {beyond:.0} % of them lie more than 5 cm from the body (loose clothes, background, things \
+         held, or the fit), {wrong:.0} % are empty or reach beyond clothes (segment these frames again)"
+    )
 }
 
 fn verdict(found: &Check) -> String {

@@ -6,7 +6,8 @@ use smpl::{BodyModel, BoneNames, Posed};
 use super::frame::{Fault, View};
 use crate::scene::labels::squared_distance;
 
-/// Largest distance of clothes and hair from the silhouette, metres.
+/// Distance of close clothes from the silhouette, and largest distance of clothes and hair, metres.
+const CLOSE: f32 = 0.05;
 const REACH: f32 = 0.1;
 /// Least share of the mask beyond it that is a fault.
 const BEYOND: f32 = 0.01;
@@ -77,17 +78,22 @@ pub(super) fn parts(body: &BodyModel) -> Vec<Part> {
     Limb::ALL.into_iter().flat_map(|limb| limb.joints().map(|name| part(limb, name))).flatten().collect()
 }
 
-/// The fault of a frame whose mask reaches farther from the body's `outline` than clothes do. `metre`: pixels of a
-/// metre at the body's depth. A limb is elsewhere if that part of the mask lies where the limb would be, rotated
-/// about a joint of its own.
-pub(super) fn fault(view: &View, outline: &[bool], posed: &Posed, parts: &[Part], metre: f32) -> Option<Fault> {
-    let (width, reach) = (view.camera.width as usize, (REACH * metre).powi(2));
+/// Share of the mask beyond close clothes of the body's `outline`, and the fault of a frame whose mask reaches farther
+/// than clothes do. `metre`: pixels of a metre at the body's depth. A limb is elsewhere if that part of the mask lies
+/// where the limb would be, rotated about a joint of its own.
+pub(super) fn beyond(view: &View, outline: &[bool], posed: &Posed, parts: &[Part], metre: f32) -> (f32, Option<Fault>) {
+    let width = view.camera.width as usize;
     let far = squared_distance(outline, width);
-    let beyond: Vec<usize> = (0..far.len()).filter(|&i| view.mask[i] && far[i] > reach).collect();
-    let mask = view.mask.iter().filter(|mask| **mask).count();
-    if (beyond.len() as f32) <= BEYOND * mask as f32 {
-        return None;
-    }
+    let beyond = |reach: f32| -> Vec<usize> { (0..far.len()).filter(|&i| view.mask[i] && far[i] > reach).collect() };
+    let mask = view.mask.iter().filter(|mask| **mask).count().max(1) as f32;
+    let reach = (REACH * metre).powi(2);
+    let (close, beyond) = (beyond((CLOSE * metre).powi(2)), beyond(reach));
+    let fault = (beyond.len() as f32 > BEYOND * mask).then(|| fault(view, &beyond, posed, parts, reach));
+    (close.len() as f32 / mask, fault)
+}
+
+fn fault(view: &View, beyond: &[usize], posed: &Posed, parts: &[Part], reach: f32) -> Fault {
+    let width = view.camera.width as usize;
     let pixels: Vec<Vec2> = beyond
         .iter()
         .step_by(beyond.len().div_ceil(SAMPLES))
@@ -117,7 +123,7 @@ pub(super) fn fault(view: &View, outline: &[bool], posed: &Posed, parts: &[Part]
             }
         }
     }
-    Some(best.map_or(Fault::Background, |(_, limb)| Fault::Limb(limb)))
+    best.map_or(Fault::Background, |(_, limb)| Fault::Limb(limb))
 }
 
 /// Directions of equal density over the sphere (a Fibonacci lattice).

@@ -47,6 +47,8 @@ pub struct FrameCheck {
     pub iou: Option<f32>,
     /// Share of the silhouette that is unknown.
     pub hidden: f32,
+    /// Share of the mask more than 5 cm from the silhouette.
+    pub beyond: f32,
     /// Faults found.
     pub faults: Vec<Fault>,
 }
@@ -68,6 +70,12 @@ impl Check {
     pub fn mean_iou(&self) -> f32 {
         let ious: Vec<f32> = self.frames.iter().filter_map(|frame| frame.iou).collect();
         ious.iter().sum::<f32>() / ious.len().max(1) as f32
+    }
+
+    /// Mean share of the masks more than 5 cm from the silhouette.
+    #[must_use]
+    pub fn mean_beyond(&self) -> f32 {
+        self.frames.iter().map(|frame| frame.beyond).sum::<f32>() / self.frames.len().max(1) as f32
     }
 
     /// Mean share of the silhouette that is unknown.
@@ -199,15 +207,16 @@ fn one(frame: &Frame, view: &View, body: &BodyModel, parts: &[Part]) -> Result<F
     let empty = !view.mask.contains(&true);
     // A fit beside the mask may be unknown to a large part; its coverage of the mask decides.
     let beside = !empty && Overlap::of(&silhouette, view, false).covered() < 0.5;
+    let (beyond, fault) = limbs::beyond(view, &silhouette, &posed, parts, scale);
     let mut faults = Vec::new();
     if empty {
         faults.push(Fault::EmptyMask);
     } else if beside || iou.is_some_and(|iou| iou < LEAST_IOU) {
         faults.push(Fault::Overlap);
     } else {
-        faults.extend(limbs::fault(view, &silhouette, &posed, parts, scale));
+        faults.extend(fault);
     }
-    Ok(FrameCheck { name: frame.name.clone(), iou, hidden: hidden as f32 / covered.max(1) as f32, faults })
+    Ok(FrameCheck { name: frame.name.clone(), iou, hidden: hidden as f32 / covered.max(1) as f32, beyond, faults })
 }
 
 /// Share of the body's vertices visible at a mask pixel in at least one of up to 32 frames.
