@@ -1,13 +1,10 @@
 //! Captures made as hard as one likes.
 
-use std::collections::{BTreeMap, HashMap};
-use std::ops::{Add, Mul};
-
 use anyhow::{Result, ensure};
 use glam::{Quat, Vec3};
 use occnerf::capture::{Capture, Frame, Pixels};
 use serde::{Deserialize, Serialize};
-use smpl::{BodyModel, Placement, SparseRows};
+use smpl::{BodyModel, Placement};
 use synth::{DemoConfig, Perturbation, demo};
 
 /// Moments that a frame's exposure can be made of.
@@ -27,8 +24,6 @@ pub struct Difficulty {
     pub facing_degrees: f32,
     /// Length of one metre in the capture's unit.
     pub unit: f32,
-    /// Times that each triangle of the body is cut into four.
-    pub refined: u32,
 }
 
 impl Default for Difficulty {
@@ -39,7 +34,6 @@ impl Default for Difficulty {
             shutter: 0.0,
             facing_degrees: 180.0,
             unit: 1.0,
-            refined: 0,
         }
     }
 }
@@ -49,11 +43,7 @@ impl Difficulty {
     pub fn make(&self) -> Result<(Capture, BodyModel)> {
         ensure!(self.unit.is_finite() && self.unit > 0.0, "unit is {}: expected a length above 0", self.unit);
         ensure!((0.0..=1.0).contains(&self.shutter), "shutter is {}: expected 0 to 1", self.shutter);
-        ensure!(self.refined <= 3, "refined is {}: expected 0 to 3", self.refined);
         let mut body = BodyModel::embedded();
-        for _ in 0..self.refined {
-            body = refine(&body);
-        }
         if self.unit != 1.0 {
             enlarge(&mut body, self.unit);
         }
@@ -102,50 +92,6 @@ fn enlarge(body: &mut BodyModel, unit: f32) {
     lengths.for_each(|v| *v *= unit);
 }
 
-/// The same body with a new vertex in the middle of each edge, which moves as the mean of its ends.
-fn refine(body: &BodyModel) -> BodyModel {
-    let vertices = body.num_vertices();
-    let mut middles: HashMap<[u32; 2], u32> = HashMap::new();
-    let mut edges: Vec<[u32; 2]> = Vec::new();
-    let mut faces = Vec::with_capacity(4 * body.faces.len());
-    for &[a, b, c] in &body.faces {
-        let mut middle = |a: u32, b: u32| {
-            *middles.entry([a.min(b), a.max(b)]).or_insert_with(|| {
-                edges.push([a, b]);
-                (vertices + edges.len() - 1) as u32
-            })
-        };
-        let (ab, bc, ca) = (middle(a, b), middle(b, c), middle(c, a));
-        faces.extend([[a, ab, ca], [b, bc, ab], [c, ca, bc], [ab, bc, ca]]);
-    }
-    let ends: Vec<[u32; 2]> = (0..vertices as u32).map(|v| [v, v]).chain(edges).collect();
-    let mean = |of: &[Vec3]| ends.iter().map(|e| 0.5 * (of[e[0] as usize] + of[e[1] as usize])).collect::<Vec<Vec3>>();
-    BodyModel {
-        v_template: mean(&body.v_template),
-        faces,
-        shapedirs: body.shapedirs.chunks(vertices).flat_map(mean).collect(),
-        posedirs: mean_rows(&body.posedirs, &ends),
-        weights: mean_rows(&body.weights, &ends),
-        j_regressor: body.j_regressor.clone(),
-        parents: body.parents.clone(),
-    }
-}
-
-/// Means of pairs of rows.
-fn mean_rows<T>(rows: &SparseRows<T>, pairs: &[[u32; 2]]) -> SparseRows<T>
-where
-    T: Copy + Add<Output = T> + Mul<f32, Output = T>,
-{
-    SparseRows::from_rows(pairs.iter().map(|pair| {
-        let mut sums: BTreeMap<u32, T> = BTreeMap::new();
-        for (column, value) in pair.iter().flat_map(|&row| rows.row(row as usize)) {
-            let half = value * 0.5;
-            sums.entry(column as u32).and_modify(|sum| *sum = *sum + half).or_insert(half);
-        }
-        sums
-    }))
-}
-
 /// Angle in degrees between the person's front and the direction to the camera, seen from above.
 fn facing(frame: &Frame) -> f32 {
     let (rotation, at) = match frame.placement {
@@ -189,26 +135,6 @@ mod tests {
 
     fn coverage(capture: &Capture) -> f32 {
         capture.train.iter().map(|f| f.pixels().unwrap().mask.iter().sum::<f32>()).sum()
-    }
-
-    #[test]
-    fn a_refined_body_is_the_same_body_with_four_times_the_triangles() {
-        let body = BodyModel::embedded();
-        let fine = refine(&body);
-        fine.validate("refined").unwrap();
-        assert_eq!(fine.faces.len(), 4 * body.faces.len());
-        // A closed surface has three edges for two triangles.
-        assert_eq!(fine.num_vertices(), body.num_vertices() + body.faces.len() * 3 / 2);
-        let pose: Vec<Vec3> =
-            (0..body.num_joints()).map(|j| Vec3::new(0.1 * j as f32, 0.2, -0.1).clamp_length_max(0.6)).collect();
-        let posed = |body: &BodyModel| {
-            let shaped = body.shaped(&[1.0, -0.5]);
-            body.pose(&shaped, &pose, Placement::Origin { rotation: Vec3::Y, translation: Vec3::X })
-        };
-        let (coarse, fine) = (posed(&body), posed(&fine));
-        for (a, b) in coarse.vertices.iter().zip(&fine.vertices) {
-            assert!(a.distance(*b) < 1e-6, "{a} {b}");
-        }
     }
 
     #[test]

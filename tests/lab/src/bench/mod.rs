@@ -2,13 +2,10 @@
 
 mod axes;
 pub mod chart;
-mod cost;
 mod difficulty;
 mod front;
-mod kernels;
 mod pareto;
 mod points;
-mod registration;
 mod stability;
 
 use std::path::{Path, PathBuf};
@@ -44,14 +41,6 @@ enum What {
     /// What happens as it gets hard: less to see, worse poses, odd units, …; a table of breaking
     /// points and charts.
     Stability(StabilityArguments),
-    /// Cost against error of the geometric kernels; `pareto` draws it too.
-    Kernels(KernelArguments),
-    /// What a step costs, and how time and memory grow with rays, samples, table, vertices, frames
-    /// and pixels.
-    Cost(CostArguments),
-    /// What registration makes of wrong priors: degrees and millimetres against the demo's true
-    /// bodies.
-    Registration(registration::RegistrationArguments),
     /// One run, handed over on standard input.
     #[command(hide = true)]
     Point {
@@ -107,43 +96,11 @@ struct StabilityArguments {
     max_runs: usize,
 }
 
-#[derive(Args)]
-struct CostArguments {
-    /// Where to write; what is there is not run again
-    #[arg(long, default_value = "runs/bench-cost")]
-    out: PathBuf,
-    #[command(flatten)]
-    sitting: SittingArguments,
-}
-
-#[derive(Args)]
-struct KernelArguments {
-    /// Where to write
-    #[arg(long, default_value = "runs/bench-kernels")]
-    out: PathBuf,
-    /// Fewer queries
-    #[arg(long)]
-    quick: bool,
-    /// Make what is found a section of tests/lab/RESULTS.md
-    #[arg(long)]
-    publish: bool,
-}
-
 /// Runs the command.
 pub fn bench(arguments: &BenchArguments) -> Result<()> {
     match &arguments.what {
-        What::Registration(arguments) => registration::registration(arguments),
         What::Pareto(arguments) => pareto(arguments),
         What::Stability(arguments) => stability(arguments),
-        What::Kernels(arguments) => kernels::run(&arguments.out, arguments.quick, arguments.publish),
-        What::Cost(arguments) => {
-            use_threads(arguments.sitting.threads)?;
-            let alone = arguments.sitting.part.shard.is_none();
-            ensure!(alone, "bench cost measures one machine: it has no parts");
-            let mut runner = arguments.sitting.open(&arguments.out)?;
-            let text = cost::run(&mut runner, &arguments.out)?;
-            finish(&runner, &arguments.sitting, &text, "cost")
-        }
         What::Point { threads } => {
             use_threads(*threads)?;
             job::serve()
@@ -257,12 +214,7 @@ fn pareto(sweep: &SweepArguments) -> Result<()> {
     sweep.sweep("pareto", &scenes, run, |name, _, lines, stem| {
         pareto::charts(name, lines, &pareto::COSTS, stem)?;
         Ok(pareto::table(lines, pareto::COSTS[0]))
-    })?;
-    let SittingArguments { part, publish, .. } = sweep.sitting;
-    if part.merge || part.shard.is_some() {
-        return Ok(());
-    }
-    kernels::run(&sweep.out("pareto"), sweep.quick, publish)
+    })
 }
 
 fn stability(arguments: &StabilityArguments) -> Result<()> {
@@ -298,13 +250,8 @@ fn finish(runner: &Runner, sitting: &SittingArguments, text: &str, name: &str) -
     }
     runner.end(&sitting.part)?;
     if sitting.publish && sitting.part.writes_tables() {
-        let title = match name {
-            "pareto" => "Speed against accuracy",
-            "stability" => "Where methods break",
-            _ => "What a step costs",
-        };
-        let stem = if name == "cost" { "growth" } else { name };
-        let charts = results::charts(runner.path().parent().unwrap_or(Path::new(".")), stem)?;
+        let title = if name == "pareto" { "Speed against accuracy" } else { "Where methods break" };
+        let charts = results::charts(runner.path().parent().unwrap_or(Path::new(".")), name)?;
         results::publish(&Section { name, title, body: text, charts: &charts })?;
     }
     Ok(())

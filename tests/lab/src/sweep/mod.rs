@@ -69,7 +69,7 @@ pub enum Kind {
 /// A named run.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Point {
-    /// `pareto`, `stability`, `cost`, or a table of `reproduce`.
+    /// `pareto`, `stability`, or a table of `reproduce`.
     pub bench: String,
     pub name: String,
     /// What is changed.
