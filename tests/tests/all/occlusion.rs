@@ -69,22 +69,6 @@ fn a_loaded_capture_trains_to_the_same_checkpoint_whatever_is_hidden() {
     assert!(one == other);
 }
 
-#[test]
-fn the_demo_shows_nothing_behind_its_obstacle() {
-    let clear = demo(&DemoConfig { occluded_fraction: 0.0, ..common::demo_config() }, body()).unwrap();
-    let mut hidden = 0;
-    for (with, without) in capture().train.iter().zip(&clear.train) {
-        let (with, without) = (with.pixels().unwrap(), without.pixels().unwrap());
-        for (i, (&m, &full)) in with.mask.iter().zip(&without.mask).enumerate() {
-            if m == 0.0 {
-                hidden += usize::from(full > 0.0);
-                assert_eq!(with.image.pixels[3 * i..][..3], [0.0; 3]);
-            }
-        }
-    }
-    assert!(hidden > 100, "{hidden}");
-}
-
 /// Overwrites the colour of every pixel with this label in every training frame, and of the
 /// background its coverage.
 fn repainted(label: Label) -> Capture {

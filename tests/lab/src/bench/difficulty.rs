@@ -22,31 +22,19 @@ pub struct Difficulty {
     /// Keep only training frames in which the person's front is within this angle of the camera;
     /// 180 keeps all.
     pub facing_degrees: f32,
-    /// Length of one metre in the capture's unit.
-    pub unit: f32,
 }
 
 impl Default for Difficulty {
     fn default() -> Self {
-        Self {
-            demo: DemoConfig::default(),
-            wrong: Perturbation::NONE,
-            shutter: 0.0,
-            facing_degrees: 180.0,
-            unit: 1.0,
-        }
+        Self { demo: DemoConfig::default(), wrong: Perturbation::NONE, shutter: 0.0, facing_degrees: 180.0 }
     }
 }
 
 impl Difficulty {
     /// The capture and its body model.
     pub fn make(&self) -> Result<(Capture, BodyModel)> {
-        ensure!(self.unit.is_finite() && self.unit > 0.0, "unit is {}: expected a length above 0", self.unit);
         ensure!((0.0..=1.0).contains(&self.shutter), "shutter is {}: expected 0 to 1", self.shutter);
-        let mut body = BodyModel::embedded();
-        if self.unit != 1.0 {
-            enlarge(&mut body, self.unit);
-        }
+        let body = BodyModel::embedded();
         let mut capture = if self.shutter > 0.0 { self.exposed(&body)? } else { demo(&self.demo, &body)? };
         self.wrong.apply(&mut capture, &body)?;
         if self.facing_degrees < 180.0 {
@@ -84,12 +72,6 @@ impl Difficulty {
         capture.eval.iter_mut().for_each(|view| view.train_index /= MOMENTS);
         Ok(capture)
     }
-}
-
-/// Multiplies every length of a body.
-fn enlarge(body: &mut BodyModel, unit: f32) {
-    let lengths = body.v_template.iter_mut().chain(&mut body.shapedirs).chain(&mut body.posedirs.values);
-    lengths.for_each(|v| *v *= unit);
 }
 
 /// Angle in degrees between the person's front and the direction to the camera, seen from above.
@@ -163,24 +145,5 @@ mod tests {
             assert_eq!(some.train[view.train_index].name, view.frame.name);
         }
         assert!(Difficulty { facing_degrees: 0.0, ..small() }.make().is_err());
-    }
-
-    #[test]
-    fn another_unit_of_length_gives_the_same_pictures() {
-        let (metres, body) = small().make().unwrap();
-        let (large, big) = Difficulty { unit: 128.0, ..small() }.make().unwrap();
-        assert!((big.v_template[5] / 128.0).distance(body.v_template[5]) < 1e-6);
-        for (a, b) in metres.train.iter().zip(&large.train) {
-            let off = a
-                .pixels()
-                .unwrap()
-                .mask
-                .iter()
-                .zip(&b.pixels().unwrap().mask)
-                .filter(|(a, b)| (*a - *b).abs() > 0.3)
-                .count();
-            assert!(off * 100 < a.pixels().unwrap().mask.len(), "{off} pixels differ");
-        }
-        assert!(Difficulty { unit: 0.0, ..small() }.make().is_err());
     }
 }

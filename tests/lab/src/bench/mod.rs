@@ -205,12 +205,7 @@ impl SweepArguments {
 
 fn pareto(sweep: &SweepArguments) -> Result<()> {
     let scenes = sweep.scenes()?;
-    let run = |scene: &str, _: &(), runner: &mut Runner| {
-        let around = sweep.around(scene)?;
-        let mut lines = runner.run_all(around.first()?)?;
-        lines.extend(runner.run_all(around.combinations(&lines)?)?);
-        Ok(lines)
-    };
+    let run = |scene: &str, _: &(), runner: &mut Runner| runner.run_all(sweep.around(scene)?.points()?);
     sweep.sweep("pareto", &scenes, run, |name, _, lines, stem| {
         pareto::charts(name, lines, &pareto::COSTS, stem)?;
         Ok(pareto::table(lines, pareto::COSTS[0]))

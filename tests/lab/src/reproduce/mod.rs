@@ -212,11 +212,7 @@ impl<'a> Experiment<'a> {
 
 impl ReproduceArguments {
     fn table(&self) -> Table {
-        let asked = [
-            (self.story, Table::Story),
-            (self.components, Table::Components),
-            (self.choices, Table::Choices),
-        ];
+        let asked = [(self.story, Table::Story), (self.components, Table::Components), (self.choices, Table::Choices)];
         asked.into_iter().find(|(asked, _)| *asked).map_or(Table::Methods, |(_, table)| table)
     }
 

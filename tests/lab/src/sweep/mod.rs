@@ -52,8 +52,6 @@ pub enum Kind {
     Base,
     /// One factor changed.
     Change,
-    /// Several at once.
-    Combination,
     /// A named preset as it is.
     Preset,
     /// Another method.
