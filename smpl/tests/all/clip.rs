@@ -5,16 +5,10 @@ use std::path::{Path, PathBuf};
 
 use glam::{Quat, Vec3};
 use smpl::{BodyModel, MotionClip, Placement};
-use testkit::files::shared;
+use testkit::files::{npy, shared};
 
 fn floats(shape: &[usize], values: &[f32]) -> Vec<u8> {
-    let shape: String = shape.iter().map(|n| format!("{n},")).collect();
-    let header = format!("{{'descr': '<f4', 'fortran_order': False, 'shape': ({shape}), }}\n");
-    let mut out = b"\x93NUMPY\x01\0".to_vec();
-    out.extend((header.len() as u16).to_le_bytes());
-    out.extend(header.as_bytes());
-    out.extend(values.iter().flat_map(|v| v.to_le_bytes()));
-    out
+    npy("<f4", shape, &values.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>())
 }
 
 fn archive(name: &str, arrays: &[(&str, Vec<u8>)]) -> PathBuf {

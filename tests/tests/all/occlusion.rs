@@ -3,11 +3,12 @@
 use crate::capture_on_disk;
 use crate::common;
 
-use common::{TempDir, body, capture, scene, tiny, train};
+use common::{body, capture, scene, tiny, train};
 use glam::Vec3;
 use occnerf::capture::{Capture, LoadOptions, Pixels, load_capture};
 use occnerf::{Label, Method, MotionKind, OccludedRule, PriorColors, Scene, upright};
 use synth::{DemoConfig, demo};
+use testkit::files::Directory;
 
 const NO_DISTORTION: [f64; 5] = [0.0; 5];
 const BARREL: [f64; 5] = [-0.2, 0.05, 0.001, -0.002, 0.0];
@@ -23,8 +24,8 @@ fn shown(frame: u32, x: u32, y: u32) -> bool {
 }
 
 /// With the files, which frames are read from again.
-fn load(hidden: u32, distortion: [f64; 5]) -> (TempDir, Capture) {
-    let dir = TempDir::new("occluded");
+fn load(hidden: u32, distortion: [f64; 5]) -> (Directory, Capture) {
+    let dir = Directory::new("occluded");
     let color = |frame: u32, x: u32, y: u32| {
         let salt = if shown(frame, x, y) { 1 } else { hidden };
         [0, 1, 2].map(|c| noise(3 * (y * 24 + x) + c + 3000 * frame, salt))
