@@ -68,18 +68,15 @@ pub struct Sweep {
     pub quick: bool,
 }
 
-/// Settings on top of a preset.
-pub struct Setting<'a> {
-    pub preset: Preset,
-    pub method: Method,
-    pub steps: u64,
-    pub set: &'a [&'a str],
-}
-
 impl Sweep {
-    /// A point of `bench pareto`.
-    fn point(&self, name: &str, factor: &str, kind: Kind, setting: &Setting<'_>) -> Result<Point> {
-        let Setting { preset, method, steps, set } = *setting;
+    /// A point of `bench pareto`, with settings on top of those of a preset.
+    fn point(
+        &self,
+        [name, factor]: [&str; 2],
+        kind: Kind,
+        (preset, method, steps): (Preset, Method, u64),
+        set: &[&str],
+    ) -> Result<Point> {
         let mut config = Config { steps, seed: 1, ..method.preset(preset) };
         for assignment in set {
             config = settings::set(&config, assignment)?;
@@ -108,9 +105,8 @@ impl Sweep {
 
     /// Its points, the base first.
     pub fn points(&self) -> Result<Vec<Point>> {
-        let fast = |method, steps, set| Setting { preset: Preset::Fast, method, steps, set };
-        let own = |kind, factor: &str, name: &str, method, steps, set: &'static [&'static str]| {
-            self.point(name, factor, kind, &fast(method, steps, set))
+        let own = |kind, factor: &str, name: &str, method, steps, set: &[&str]| {
+            self.point([name, factor], kind, (Preset::Fast, method, steps), set)
         };
         let steps = self.steps;
         let mut points = vec![own(Kind::Base, "base", "base", Method::Occnerf, steps, &[])?];
@@ -137,8 +133,7 @@ impl Sweep {
             } else {
                 format!("{}, {steps} of {whole} steps", preset.name())
             };
-            let setting = Setting { preset, method: Method::Occnerf, steps, set: &[] };
-            let point = self.point(&name, "preset", Kind::Preset, &setting)?;
+            let point = self.point([&name, "preset"], Kind::Preset, (preset, Method::Occnerf, steps), &[])?;
             // Presets that differ by their steps alone are the base, and a change of its steps.
             let same = |p: &&mut Point| {
                 p.job.bake.is_none()
