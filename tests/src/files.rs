@@ -1,5 +1,6 @@
 //! Test directories, and the shared test data.
 
+use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicUsize, Ordering};
 
@@ -91,6 +92,22 @@ pub fn npy(descr: &str, shape: &[usize], data: &[u8]) -> Vec<u8> {
 #[must_use]
 pub fn npy_of(header: &str, data: &[u8]) -> Vec<u8> {
     [b"\x93NUMPY\x01\0", &(header.len() as u16).to_le_bytes()[..], header.as_bytes(), data].concat()
+}
+
+/// An archive of files by name, not compressed.
+///
+/// # Panics
+/// For two of a name.
+#[must_use]
+pub fn zip<N: AsRef<str>, B: AsRef<[u8]>>(files: impl IntoIterator<Item = (N, B)>) -> Vec<u8> {
+    let mut zip = zip::ZipWriter::new(std::io::Cursor::new(Vec::new()));
+    let stored = zip::write::SimpleFileOptions::default().compression_method(zip::CompressionMethod::Stored);
+    for (name, bytes) in files {
+        let name = name.as_ref();
+        let written = zip.start_file(name, stored).and_then(|()| Ok(zip.write_all(bytes.as_ref())?));
+        written.unwrap_or_else(|error| panic!("{name}: {error}"));
+    }
+    zip.finish().unwrap_or_else(|error| panic!("zip: {error}")).into_inner()
 }
 
 /// A .glb of one JSON and one binary chunk.

@@ -1,7 +1,6 @@
 //! Bodies of every size and form: archives like those of SMPL-H and SMPL-X, the saved form, and
 //! faults that are named.
 
-use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::sync::LazyLock;
 
@@ -9,7 +8,7 @@ use array_files::{Data, NdArray, npz};
 use glam::Vec3;
 use proptest::prelude::*;
 use smpl::{BodyModel, Error, Placement};
-use testkit::files::{npy, shared};
+use testkit::files::{npy, shared, zip};
 
 fn temporary(name: &str) -> PathBuf {
     Path::new(env!("CARGO_TARGET_TMPDIR")).join(name)
@@ -60,13 +59,8 @@ fn archive(name: &str, joints: usize, betas: usize, root: Root) -> PathBuf {
         ("hands_meanl", floats(&[45], wave)),
         ("joint2num", npy("|O", &[], b"not even a pickle")),
     ];
-    let mut zip = zip::ZipWriter::new(std::io::Cursor::new(Vec::new()));
-    for (key, bytes) in arrays {
-        zip.start_file(format!("{key}.npy"), zip::write::SimpleFileOptions::default()).unwrap();
-        zip.write_all(&bytes).unwrap();
-    }
     let path = temporary(name);
-    std::fs::write(&path, zip.finish().unwrap().into_inner()).unwrap();
+    std::fs::write(&path, zip(arrays.map(|(key, bytes)| (format!("{key}.npy"), bytes)))).unwrap();
     path
 }
 

@@ -1,7 +1,7 @@
 //! Small real files of every kind, written by the crates themselves or by hand, and those of other
 //! programs that the repository has.
 
-use std::io::{Cursor, Write};
+use std::io::Cursor;
 use std::path::{Path, PathBuf};
 
 use array_files::{Data, NdArray, npz};
@@ -9,9 +9,7 @@ use glam::Vec3;
 use occnerf::capture::{LoadOptions, load_capture};
 use occnerf::{Config, Method, MotionKind, Preset, Scene, Trainer};
 use smpl::{BodyModel, SparseRows};
-use testkit::files::{glb, npy_of};
-use zip::write::SimpleFileOptions;
-use zip::{CompressionMethod, ZipWriter};
+use testkit::files::{glb, npy_of, zip};
 
 use super::place;
 use crate::common;
@@ -224,13 +222,6 @@ pub fn weights() -> Vec<Vec<u8>> {
         pickle.extend(b"K\x06tQK\x00K\x02K\x03\x86K\x03K\x01\x86\x89ccollections\nOrderedDict\n)RtR");
     }
     pickle.extend(b"u.");
-    let mut zip = ZipWriter::new(Cursor::new(Vec::new()));
-    let stored = SimpleFileOptions::default().compression_method(CompressionMethod::Stored);
-    for (name, bytes) in
-        [("data.pkl", &pickle[..]), ("byteorder", b"little"), ("data/0", &[0; 24]), ("data/1", &[1; 24])]
-    {
-        zip.start_file(format!("weights/{name}"), stored).unwrap();
-        zip.write_all(bytes).unwrap();
-    }
-    vec![zip.finish().unwrap().into_inner()]
+    let files = [("data.pkl", &pickle[..]), ("byteorder", b"little"), ("data/0", &[0; 24]), ("data/1", &[1; 24])];
+    vec![zip(files.map(|(name, bytes)| (format!("weights/{name}"), bytes)))]
 }
