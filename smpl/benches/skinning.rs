@@ -1,11 +1,11 @@
-//! Skinning, motion fields and construction, for the embedded body (6890 vertices, 4 % of the 207
+//! Skinning and motion fields, for the embedded body (6890 vertices, 4 % of the 207
 //! pose terms not zero); `dense` fills every pose term, as in SMPL itself.
 
 use divan::counter::ItemsCount;
 use divan::{Bencher, black_box};
-use glam::{Mat3, Vec3};
+use glam::Vec3;
 use rayon::prelude::*;
-use smpl::{BodyModel, Placement, Shaped, SparseRows, SurfaceMotion, WeightVolume, WeightVolumeConfig, rodrigues};
+use smpl::{BodyModel, Placement, Shaped, SparseRows, SurfaceMotion, WeightVolume, WeightVolumeConfig};
 
 fn main() {
     divan::main();
@@ -47,39 +47,6 @@ mod one_frame {
     #[divan::bench]
     fn dense(bencher: Bencher<'_, '_>) {
         run(bencher, &super::dense());
-    }
-
-    /// The vertices of `dense` from the definition, the bones given: every term and every weight of
-    /// each vertex.
-    #[divan::bench]
-    fn dense_plain(bencher: Bencher<'_, '_>) {
-        let (body, pose) = (super::dense(), pose(0));
-        let bones = body.pose(&body.shaped(&BETAS), &pose, Placement::default()).bones;
-        let turns = pose[1..].iter().map(|&r| rodrigues(r) - Mat3::IDENTITY);
-        let terms: Vec<f32> = turns.flat_map(|r| r.transpose().to_cols_array()).collect();
-        let n = body.num_vertices();
-        let mut weights = vec![0.0; n * bones.len()];
-        for (v, weights) in weights.chunks_exact_mut(bones.len()).enumerate() {
-            body.weights.row(v).for_each(|(joint, w)| weights[joint] = w);
-        }
-        let posedirs: Vec<Vec3> = body.posedirs.values.clone();
-        bencher.bench(|| {
-            let vertex = |v: usize| {
-                let shape = BETAS.iter().zip(body.shapedirs.chunks_exact(n)).map(|(&beta, s)| beta * s[v]);
-                let pose = terms.iter().zip(&posedirs[terms.len() * v..]).map(|(&term, &d)| term * d);
-                let rest = body.v_template[v] + shape.sum::<Vec3>() + pose.sum::<Vec3>();
-                let weights = &weights[bones.len() * v..];
-                bones.iter().zip(weights).map(|(bone, &w)| w * bone.transform_point3(rest)).sum::<Vec3>()
-            };
-            (0..n).map(vertex).collect::<Vec<_>>()
-        });
-    }
-
-    #[divan::bench]
-    fn pose_only(bencher: Bencher<'_, '_>) {
-        let body = body();
-        let (shaped, pose) = (body.shaped(&BETAS), pose(0));
-        bencher.bench(|| body.pose(&shaped, black_box(&pose), Placement::default()));
     }
 }
 
@@ -145,44 +112,5 @@ mod motion {
             }
             sum
         });
-    }
-
-    #[divan::bench]
-    fn volume_backward(bencher: Bencher<'_, '_>) {
-        let body = body();
-        let shaped = body.shaped(&BETAS);
-        let posed = body.pose(&shaped, &pose(0), Placement::default());
-        let to_canonical = posed.to_canonical();
-        let volume = WeightVolume::gaussian(&body, &shaped, &WeightVolumeConfig::default());
-        let mut d_weights = vec![0.0; volume.weights.len()];
-        bencher.counter(ItemsCount::new(posed.vertices.len())).bench_local(|| {
-            for &x in &posed.vertices {
-                volume.map_backward(&to_canonical, x, Vec3::ONE, 1.0, &mut d_weights);
-            }
-        });
-    }
-
-    #[divan::bench]
-    fn volume_update(bencher: Bencher<'_, '_>) {
-        let body = body();
-        let shaped = body.shaped(&BETAS);
-        let mut volume = WeightVolume::gaussian(&body, &shaped, &WeightVolumeConfig::default());
-        bencher.bench_local(|| volume.update());
-    }
-}
-
-mod construction {
-    use super::*;
-
-    #[divan::bench(sample_count = 5)]
-    fn embedded() -> BodyModel {
-        BodyModel::embedded()
-    }
-
-    #[divan::bench(sample_count = 5)]
-    fn volume(bencher: Bencher<'_, '_>) {
-        let body = body();
-        let shaped = body.shaped(&BETAS);
-        bencher.bench(|| WeightVolume::gaussian(&body, &shaped, &WeightVolumeConfig::default()));
     }
 }

@@ -115,25 +115,6 @@ fn neighbours_brute_force(bencher: Bencher<'_, '_>) {
     });
 }
 
-#[divan::bench]
-fn blend(bencher: Bencher<'_, '_>) {
-    let mesh = testkit::body::body_or_ball();
-    let query = SurfaceQuery::new(&mesh.vertices, &mesh.faces, &GRID).unwrap();
-    let points = near(&mesh);
-    let lists: Vec<[u32; 20]> = (points.iter())
-        .map(|&p| {
-            let mut out = [0; 20];
-            query.neighbours(p, &mut out);
-            out
-        })
-        .collect();
-    bencher.counter(ItemsCount::new(points.len())).bench_local(|| {
-        for (&p, list) in points.iter().zip(&lists) {
-            black_box(query.blend(p, &list[..5]));
-        }
-    });
-}
-
 /// Exact closest point with sign, by the largest distance asked for, in cm.
 #[divan::bench(args = [6, 100])]
 fn mesh_distance(bencher: Bencher<'_, '_>, reach: u32) {

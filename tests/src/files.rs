@@ -1,6 +1,8 @@
 //! Test directories, and the shared test data.
 
+use std::io::Write;
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicUsize, Ordering};
 
 /// An empty directory, removed when dropped.
 pub struct Directory(PathBuf);
@@ -12,7 +14,9 @@ impl Directory {
     /// Where the system refuses; so do all methods.
     #[must_use]
     pub fn new(name: &str) -> Self {
-        let dir = std::env::temp_dir().join(format!("occnerf-{name}-{}", std::process::id()));
+        static COUNT: AtomicUsize = AtomicUsize::new(0);
+        let count = COUNT.fetch_add(1, Ordering::Relaxed);
+        let dir = std::env::temp_dir().join(format!("occnerf-{name}-{}-{count}", std::process::id()));
         let _ = std::fs::remove_dir_all(&dir);
         make(&dir);
         Self(dir)
@@ -22,6 +26,12 @@ impl Directory {
     #[must_use]
     pub fn path(&self) -> &Path {
         &self.0
+    }
+
+    /// The path of a file below.
+    #[must_use]
+    pub fn file(&self, below: &str) -> PathBuf {
+        self.0.join(below)
     }
 
     /// Writes a file below, and the directories it is in.
@@ -69,6 +79,35 @@ pub fn shared(below: &str) -> Option<PathBuf> {
     }
     println!("skipped: {} is absent", path.display());
     None
+}
+
+/// A `.npy` of little-endian `data`, row-major: its element type as numpy writes it, and its shape.
+#[must_use]
+pub fn npy(descr: &str, shape: &[usize], data: &[u8]) -> Vec<u8> {
+    let shape: String = shape.iter().map(|n| format!("{n},")).collect();
+    npy_of(&format!("{{'descr': '{descr}', 'fortran_order': False, 'shape': ({shape}), }}\n"), data)
+}
+
+/// A `.npy` of any header.
+#[must_use]
+pub fn npy_of(header: &str, data: &[u8]) -> Vec<u8> {
+    [b"\x93NUMPY\x01\0", &(header.len() as u16).to_le_bytes()[..], header.as_bytes(), data].concat()
+}
+
+/// An archive of files by name, not compressed.
+///
+/// # Panics
+/// For two of a name.
+#[must_use]
+pub fn zip<N: AsRef<str>, B: AsRef<[u8]>>(files: impl IntoIterator<Item = (N, B)>) -> Vec<u8> {
+    let mut zip = zip::ZipWriter::new(std::io::Cursor::new(Vec::new()));
+    let stored = zip::write::SimpleFileOptions::default().compression_method(zip::CompressionMethod::Stored);
+    for (name, bytes) in files {
+        let name = name.as_ref();
+        let written = zip.start_file(name, stored).and_then(|()| Ok(zip.write_all(bytes.as_ref())?));
+        written.unwrap_or_else(|error| panic!("{name}: {error}"));
+    }
+    zip.finish().unwrap_or_else(|error| panic!("zip: {error}")).into_inner()
 }
 
 /// A .glb of one JSON and one binary chunk.

@@ -1,5 +1,5 @@
-//! Cost of casting rays at a body of 13776 triangles (a ball of 20480 where that is not at hand),
-//! and at the same with every triangle split in two.
+//! Cost of casting rays at a body of 13776 triangles (a ball of 20480 where that is not at hand)
+//! with every triangle split in two, and of counting what views see.
 #![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
 
 use std::hint::black_box;
@@ -13,7 +13,6 @@ use obvhs::cwbvh::builder::build_cwbvh_from_tris;
 use obvhs::ray::{Ray, RayHit};
 use obvhs::triangle::Triangle;
 use testkit::TriMesh;
-use testkit::body::Random;
 use visibility::{RayMesh, View, VisibilityCounts, visible_vertices};
 
 fn main() {
@@ -68,17 +67,8 @@ const FOCALS: [f32; 2] = [1.2, 12.0];
 
 /// One ray at a time, one thread.
 #[divan::bench(args = FOCALS)]
-fn first_hit(bencher: Bencher<'_, '_>, focal: f32) {
-    single(bencher, &testkit::body::body_or_ball(), focal);
-}
-
-/// The same at twice the faces.
-#[divan::bench(args = FOCALS)]
 fn first_hit_split(bencher: Bencher<'_, '_>, focal: f32) {
-    single(bencher, &split(&testkit::body::body_or_ball()), focal);
-}
-
-fn single(bencher: Bencher<'_, '_>, mesh: &TriMesh, focal: f32) {
+    let mesh = split(&testkit::body::body_or_ball());
     let mesh = RayMesh::new(&mesh.vertices, &mesh.faces).unwrap();
     let rays = image_rays(focal);
     bencher.counter(ItemsCount::new(rays.len())).bench_local(|| {
@@ -103,31 +93,6 @@ fn first_hit_split_obvhs(bencher: Bencher<'_, '_>, focal: f32) {
             black_box(hit);
         }
     });
-}
-
-/// Random segments through the body's box, one thread.
-#[divan::bench]
-fn first_hit_random(bencher: Bencher<'_, '_>) {
-    let mesh = testkit::body::body_or_ball();
-    let rays = RayMesh::new(&mesh.vertices, &mesh.faces).unwrap();
-    let mut random = Random(3);
-    let segments: Vec<(Vec3, Vec3)> = (0..20_000).map(|_| (random.vec3(1.0), random.vec3(1.0))).collect();
-    bencher.counter(ItemsCount::new(segments.len())).bench_local(|| {
-        for &(o, d) in &segments {
-            black_box(rays.first_hit(o, d));
-        }
-    });
-}
-
-/// All vertices of the body in one view, all threads.
-#[divan::bench]
-fn visible_vertices_of_a_view(bencher: Bencher<'_, '_>) {
-    let mesh = testkit::body::body_or_ball();
-    let rays = RayMesh::new(&mesh.vertices, &mesh.faces).unwrap();
-    let view = view(512, 1.2);
-    bencher
-        .counter(ItemsCount::new(mesh.vertices.len()))
-        .bench_local(|| visible_vertices(&rays, &mesh.vertices, &view, None));
 }
 
 /// Counts of all vertices over 100 views around the body, all threads.
@@ -155,19 +120,4 @@ fn frequency_over_a_capture(bencher: Bencher<'_, '_>) {
 fn build(bencher: Bencher<'_, '_>) {
     let mesh = testkit::body::body_or_ball();
     bencher.bench_local(|| RayMesh::new(&mesh.vertices, &mesh.faces));
-}
-
-/// Attention of 20 neighbours, 10000 times.
-#[divan::bench]
-fn attention(bencher: Bencher<'_, '_>) {
-    let mut random = Random(9);
-    let counts = VisibilityCounts::from_counts((0..6890).map(|_| (random.unit() * 1e6) as u64).collect());
-    let lists: Vec<[u32; 20]> = (0..10_000).map(|_| [0; 20].map(|_: u32| (random.unit() * 6890.0) as u32)).collect();
-    bencher.counter(ItemsCount::new(lists.len())).bench_local(|| {
-        let mut out = [0.0; 20];
-        for list in &lists {
-            counts.attention(list, &mut out);
-            black_box(&out);
-        }
-    });
 }

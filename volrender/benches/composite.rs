@@ -139,21 +139,3 @@ fn forward_and_backward_plain(bencher: Bencher<'_, '_>) {
         });
     });
 }
-
-/// One ray in the cache on one thread: arithmetic without memory traffic.
-#[divan::bench]
-fn forward_and_backward_in_cache(bencher: Bencher<'_, '_>) {
-    let (rays, mut out) = (Rays::new(), Outputs::new());
-    let ray = 0..SAMPLES;
-    bencher.counter(ItemsCount::new(SAMPLES)).bench_local(|| {
-        let samples = black_box(rays.samples(ray.clone()));
-        let weights = &mut out.weights[ray.clone()];
-        let pixel = composite(samples, Vec3::ONE, weights);
-        let gradients = SampleGradients {
-            d_sigma: &mut out.d_sigma[ray.clone()],
-            d_rgb: &mut out.d_rgb[ray.clone()],
-            d_likelihood: &mut out.d_likelihood[ray.clone()],
-        };
-        composite_backward(samples, Vec3::ONE, weights, pixel.color, 0.1, gradients);
-    });
-}

@@ -5,16 +5,17 @@ use crate::common;
 use std::collections::HashMap;
 use std::path::Path;
 
-use common::{TempDir, body, capture, config, scene};
+use common::{body, capture, config, scene};
 use occnerf::{Error, Method, Scene, Trainer, checkpoint_config};
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
+use testkit::files::Directory;
 
 /// A checkpoint after two steps.
-fn good(dir: &TempDir) -> Vec<u8> {
+fn good(dir: &Directory) -> Vec<u8> {
     let mut trainer = Trainer::new(scene(), config(Method::Occnerf)).unwrap();
     trainer.step().unwrap();
     trainer.step().unwrap();
-    let path = dir.path("good.safetensors");
+    let path = dir.file("good.safetensors");
     trainer.save(&path).unwrap();
     std::fs::read(path).unwrap()
 }
@@ -57,9 +58,9 @@ fn forged(bytes: &[u8], change: impl FnOnce(&mut HashMap<String, String>, &mut A
 
 #[test]
 fn a_good_checkpoint_is_accepted_and_saved_again_byte_for_byte() {
-    let dir = TempDir::new("good");
+    let dir = Directory::new("good");
     let bytes = good(&dir);
-    let path = dir.path("copy.safetensors");
+    let path = dir.file("copy.safetensors");
     let trainer = resume(scene(), &path, &bytes).unwrap();
     assert_eq!((trainer.steps_done(), trainer.model().config()), (2, &config(Method::Occnerf)));
     assert_eq!(checkpoint_config(&path).unwrap(), config(Method::Occnerf));
@@ -73,9 +74,9 @@ fn a_good_checkpoint_is_accepted_and_saved_again_byte_for_byte() {
 
 #[test]
 fn a_checkpoint_cut_short_anywhere_is_refused() {
-    let dir = TempDir::new("short");
+    let dir = Directory::new("short");
     let bytes = good(&dir);
-    let path = dir.path("short.safetensors");
+    let path = dir.file("short.safetensors");
     let header = header_length(&bytes);
     let lengths = (0..header).step_by(13).chain(header - 3..header + 3).chain((header..bytes.len()).step_by(997));
     for length in lengths.chain([bytes.len() - 1]) {
@@ -87,9 +88,9 @@ fn a_checkpoint_cut_short_anywhere_is_refused() {
 
 #[test]
 fn a_bit_flipped_in_the_header_never_panics() {
-    let dir = TempDir::new("flip");
+    let dir = Directory::new("flip");
     let bytes = good(&dir);
-    let path = dir.path("flip.safetensors");
+    let path = dir.file("flip.safetensors");
     let (mut accepted, mut refused) = (0, 0);
     for at in 0..header_length(&bytes) {
         let mut flipped = bytes.clone();
@@ -113,9 +114,9 @@ fn a_bit_flipped_in_the_header_never_panics() {
 
 #[test]
 fn numbers_that_are_not_finite_are_refused_by_name() {
-    let dir = TempDir::new("nan");
+    let dir = Directory::new("nan");
     let bytes = good(&dir);
-    let path = dir.path("nan.safetensors");
+    let path = dir.file("nan.safetensors");
     for name in ["field", "table", "vertices.first_moment", "field.second_moment"] {
         for bad in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
             let forged = forged(&bytes, |_, arrays| {
@@ -130,20 +131,20 @@ fn numbers_that_are_not_finite_are_refused_by_name() {
 /// Adam takes its square root.
 #[test]
 fn a_negative_second_moment_is_refused() {
-    let dir = TempDir::new("moment");
+    let dir = Directory::new("moment");
     let bytes = good(&dir);
     let forged = forged(&bytes, |_, arrays| {
         arrays.get_mut("field.second_moment").unwrap().2[..4].copy_from_slice(&(-1.0f32).to_le_bytes());
     });
-    let message = refused(scene(), &dir.path("moment.safetensors"), &forged, "negative");
+    let message = refused(scene(), &dir.file("moment.safetensors"), &forged, "negative");
     assert!(message.contains("field.second_moment"), "{message}");
 }
 
 #[test]
 fn missing_and_misshapen_arrays_are_refused_by_name() {
-    let dir = TempDir::new("shape");
+    let dir = Directory::new("shape");
     let bytes = good(&dir);
-    let path = dir.path("shape.safetensors");
+    let path = dir.file("shape.safetensors");
     for name in ["field", "table.first_moment", "vertices", "visibility_counts"] {
         let missing = forged(&bytes, |_, arrays| drop(arrays.remove(name)));
         assert!(refused(scene(), &path, &missing, name).contains(name));
@@ -168,9 +169,9 @@ fn missing_and_misshapen_arrays_are_refused_by_name() {
 
 #[test]
 fn foreign_headers_are_refused_and_say_what_was_expected() {
-    let dir = TempDir::new("header");
+    let dir = Directory::new("header");
     let bytes = good(&dir);
-    let path = dir.path("header.safetensors");
+    let path = dir.file("header.safetensors");
     let set = |key: &'static str, value: &str| {
         let value = value.to_owned();
         forged(&bytes, move |header, _| drop(header.insert(key.to_owned(), value)))
@@ -198,10 +199,10 @@ fn foreign_headers_are_refused_and_say_what_was_expected() {
 /// Counting on from there would overflow.
 #[test]
 fn an_absurd_number_of_steps_is_refused() {
-    let dir = TempDir::new("steps");
+    let dir = Directory::new("steps");
     let bytes = good(&dir);
     let forged = forged(&bytes, |header, _| drop(header.insert("steps_done".to_owned(), u64::MAX.to_string())));
-    let message = refused(scene(), &dir.path("steps.safetensors"), &forged, "steps_done");
+    let message = refused(scene(), &dir.file("steps.safetensors"), &forged, "steps_done");
     assert!(message.contains("steps_done"), "{message}");
 }
 
@@ -215,9 +216,9 @@ fn edited(bytes: &[u8], key: &str, by: &str) -> Vec<u8> {
 
 #[test]
 fn configurations_that_cannot_be_run_are_refused() {
-    let dir = TempDir::new("config");
+    let dir = Directory::new("config");
     let bytes = good(&dir);
-    let path = dir.path("config.safetensors");
+    let path = dir.file("config.safetensors");
     for (key, by) in [
         ("samples", "samples = 0"),
         ("width", "width = 100000"),
@@ -236,9 +237,9 @@ fn configurations_that_cannot_be_run_are_refused() {
 /// The scene's neighbour lists have another length than the checkpoint's field wants.
 #[test]
 fn surface_queries_unlike_the_scenes_are_refused() {
-    let dir = TempDir::new("queries");
+    let dir = Directory::new("queries");
     let bytes = good(&dir);
-    let path = dir.path("queries.safetensors");
+    let path = dir.file("queries.safetensors");
     for (key, by) in [("k", "k = 20"), ("k", "k = 5"), ("coarse_levels", "coarse_levels = 0")] {
         refused(scene(), &path, &edited(&bytes, key, by), by);
     }
@@ -246,9 +247,9 @@ fn surface_queries_unlike_the_scenes_are_refused() {
 
 #[test]
 fn another_body_or_another_scene_is_refused() {
-    let dir = TempDir::new("scene");
+    let dir = Directory::new("scene");
     let bytes = good(&dir);
-    let path = dir.path("scene.safetensors");
+    let path = dir.file("scene.safetensors");
     let config = config(Method::Occnerf);
     let mut renamed = capture();
     renamed.name = "someone else".to_owned();
@@ -270,8 +271,8 @@ fn another_body_or_another_scene_is_refused() {
 
 #[test]
 fn files_that_are_not_there_or_not_files_are_named() {
-    let dir = TempDir::new("absent");
-    for path in [dir.path("absent.safetensors"), dir.path("")] {
+    let dir = Directory::new("absent");
+    for path in [dir.file("absent.safetensors"), dir.file("")] {
         let name = path.display().to_string();
         for message in [
             Trainer::resume(scene(), &path).err().unwrap().to_string(),
@@ -281,15 +282,15 @@ fn files_that_are_not_there_or_not_files_are_named() {
         }
     }
     let trainer = Trainer::new(scene(), config(Method::HashPoint)).unwrap();
-    let message = trainer.save(&dir.path("no/such/folder.safetensors")).unwrap_err().to_string();
+    let message = trainer.save(&dir.file("no/such/folder.safetensors")).unwrap_err().to_string();
     assert!(message.contains("folder"), "{message}");
 }
 
 #[test]
 fn a_training_that_has_diverged_leaves_the_good_checkpoint_alone() {
-    let dir = TempDir::new("diverged");
+    let dir = Directory::new("diverged");
     let mut config = config(Method::HashPoint);
-    let path = dir.path("good.safetensors");
+    let path = dir.file("good.safetensors");
     let mut trainer = Trainer::new(scene(), config.clone()).unwrap();
     trainer.step().unwrap();
     trainer.save(&path).unwrap();
@@ -313,8 +314,8 @@ fn a_training_that_has_diverged_leaves_the_good_checkpoint_alone() {
 
 #[test]
 fn a_checkpoint_must_say_how_far_its_field_reaches() {
-    let dir = TempDir::new("shell");
-    let path = dir.path("shell.safetensors");
+    let dir = Directory::new("shell");
+    let path = dir.file("shell.safetensors");
     let mut config = config(Method::Occnerf);
     config.motion.shell_interval = 1;
     let mut trainer = Trainer::new(scene(), config).unwrap();

@@ -7,6 +7,7 @@ use crate::formula;
 use std::path::Path;
 
 use occnerf::{Config, Error, FieldRenderer, Lpips, Method, StepReport, Trainer, evaluate};
+use testkit::files::Directory;
 
 /// Writes a SqueezeNet of formula weights.
 fn squeezenet_file(path: &Path) {
@@ -27,8 +28,8 @@ fn losses(reports: &[StepReport]) -> Vec<[u64; 2]> {
 
 #[test]
 fn training_with_lpips_goes_on_after_a_stop_as_if_there_was_none_on_any_number_of_threads() {
-    let directory = common::TempDir::new("lpips-training");
-    let (weights, half) = (directory.path("net.safetensors"), directory.path("half.safetensors"));
+    let directory = Directory::new("lpips-training");
+    let (weights, half) = (directory.file("net.safetensors"), directory.file("half.safetensors"));
     squeezenet_file(&weights);
     let run = |threads: usize, stop: bool| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
@@ -58,8 +59,8 @@ fn training_with_lpips_goes_on_after_a_stop_as_if_there_was_none_on_any_number_o
 
 #[test]
 fn weights_that_are_gone_and_patches_that_are_too_small_are_errors_before_the_first_step() {
-    let directory = common::TempDir::new("lpips-refused");
-    let weights = directory.path("net.safetensors");
+    let directory = Directory::new("lpips-refused");
+    let weights = directory.file("net.safetensors");
     let mut trainer = Trainer::new(common::scene(), config(&weights)).unwrap();
     assert!(matches!(trainer.load_perceptual(), Err(Error::Lpips(lpips::Error::Io { path, .. })) if path == weights));
     squeezenet_file(&weights);
@@ -72,8 +73,8 @@ fn weights_that_are_gone_and_patches_that_are_too_small_are_errors_before_the_fi
 
 #[test]
 fn scoring_reports_lpips_where_weights_are_given() {
-    let directory = common::TempDir::new("lpips-scores");
-    let weights = directory.path("net.safetensors");
+    let directory = Directory::new("lpips-scores");
+    let weights = directory.file("net.safetensors");
     squeezenet_file(&weights);
     let lpips = Lpips::load(&weights).unwrap();
     let scene = common::scene();

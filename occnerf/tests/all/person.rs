@@ -4,7 +4,7 @@ use crate::common;
 
 use std::path::Path;
 
-use common::{TempDir, body, capture, config, scene};
+use common::{body, capture, config, scene};
 use glam::Vec3;
 use occnerf::capture::{Mended, Registered};
 use occnerf::{
@@ -12,6 +12,7 @@ use occnerf::{
     mend_masks,
 };
 use smpl::BodyModel;
+use testkit::files::Directory;
 
 const CHECKPOINT: &str = "checkpoint.safetensors";
 const PERSON: &str = "person.safetensors";
@@ -46,9 +47,9 @@ fn a_model_read_from_its_run_draws_the_same_bits_as_the_trained_one() {
         },
     ];
     for (kind, change) in kinds.into_iter().enumerate() {
-        let dir = TempDir::new(&format!("person-{kind}"));
-        let model = trained(dir.path("").as_path(), change);
-        let loaded = Model::load(dir.path("").as_path()).unwrap();
+        let dir = Directory::new(&format!("person-{kind}"));
+        let model = trained(dir.file("").as_path(), change);
+        let loaded = Model::load(dir.file("").as_path()).unwrap();
         assert_eq!(loaded.config(), model.config());
         assert_eq!((loaded.steps_done(), loaded.num_parameters()), (6, model.num_parameters()));
         assert_eq!(loaded.visibility_counts(), model.visibility_counts());
@@ -59,15 +60,15 @@ fn a_model_read_from_its_run_draws_the_same_bits_as_the_trained_one() {
 
 #[test]
 fn a_capture_gets_the_bodies_that_a_run_was_trained_with() {
-    let dir = TempDir::new("person-registered");
+    let dir = Directory::new("person-registered");
     let mut config = config(Method::Occnerf);
     config.registration.rounds = 3;
     let given = capture();
     let scene = Scene::new(&given, body(), &config).unwrap();
     assert_ne!(scene.registered.capture.train[0].placement, given.train[0].placement);
-    Person::save(&dir.path(""), &scene.registered, body(), &PriorColors::measure(&scene).unwrap()).unwrap();
+    Person::save(&dir.file(""), &scene.registered, body(), &PriorColors::measure(&scene).unwrap()).unwrap();
     let mended = mend_masks(given.clone(), body()).unwrap();
-    let restored = Person::restore(&dir.path(""), mended.clone(), body()).unwrap().unwrap();
+    let restored = Person::restore(&dir.file(""), mended.clone(), body()).unwrap().unwrap();
     assert!(restored.clothes == scene.registered.clothes && restored.clothes.iter().any(|&c| c != 0.0));
     let again = Scene::prepare(restored.clone(), body(), &config).unwrap();
     assert_eq!(again.colors().unwrap(), scene.colors().unwrap());
@@ -79,10 +80,10 @@ fn a_capture_gets_the_bodies_that_a_run_was_trained_with() {
     }
     // A run of before a body had as many shapes goes on.
     let more = BodyModel { shapedirs: [&body().shapedirs[..]; 2].concat(), ..body().clone() };
-    let with_more = Person::restore(&dir.path(""), mended.clone(), &more).unwrap().unwrap();
+    let with_more = Person::restore(&dir.file(""), mended.clone(), &more).unwrap().unwrap();
     assert_eq!(with_more.capture.mean_betas, restored.capture.mean_betas);
     let fewer = BodyModel { shapedirs: Vec::new(), ..body().clone() };
-    let error = Person::restore(&dir.path(""), mended.clone(), &fewer).unwrap_err().to_string();
+    let error = Person::restore(&dir.file(""), mended.clone(), &fewer).unwrap_err().to_string();
     assert!(error.contains("person.safetensors") && error.contains("betas"), "{error}");
     let again = Scene::prepare(with_more, &more, &config).unwrap();
     assert_eq!(again.train[0].view.posed, scene.train[0].view.posed);
@@ -91,16 +92,16 @@ fn a_capture_gets_the_bodies_that_a_run_was_trained_with() {
     other.train.pop();
     larger.train[1].camera = larger.train[1].camera.resized(99, 98);
     for (capture, words) in [(other, "frames, the capture has"), (larger, "the capture in (99, 98)")] {
-        let error = Person::restore(&dir.path(""), Mended::from(capture), body()).unwrap_err().to_string();
+        let error = Person::restore(&dir.file(""), Mended::from(capture), body()).unwrap_err().to_string();
         assert!(error.contains(PERSON) && error.contains(words), "{error}");
     }
-    assert!(Person::restore(&dir.path("elsewhere"), mended, body()).unwrap().is_none());
+    assert!(Person::restore(&dir.file("elsewhere"), mended, body()).unwrap().is_none());
 }
 
 #[test]
 fn a_run_goes_on_with_the_colours_that_it_began_with() {
-    let (dir, fresh) = (TempDir::new("person-colors"), PriorColors::measure(scene()).unwrap());
-    let run = dir.path("");
+    let (dir, fresh) = (Directory::new("person-colors"), PriorColors::measure(scene()).unwrap());
+    let run = dir.file("");
     assert_eq!(Person::colors(&run, body()).unwrap(), None);
     // As runs of before colours lay between the vertices have them, and without the header's line.
     let began = PriorColors::of_vertices(vec![Vec3::X; body().num_vertices()], &body().faces);
@@ -122,9 +123,9 @@ fn a_run_goes_on_with_the_colours_that_it_began_with() {
 
 #[test]
 fn the_prior_of_a_run_draws_the_same_bits_too() {
-    let dir = TempDir::new("person-prior");
+    let dir = Directory::new("person-prior");
     let colors = PriorColors::measure(scene()).unwrap();
-    let run = dir.path("");
+    let run = dir.file("");
     Person::save(&run, &scene().registered, body(), &colors).unwrap();
     let person = Person::load(&run, &config(Method::Prior)).unwrap();
     assert_eq!((person.scene.as_str(), &person.colors), (scene().name.as_str(), &colors));
@@ -136,8 +137,8 @@ fn the_prior_of_a_run_draws_the_same_bits_too() {
 
 #[test]
 fn what_is_missing_or_damaged_is_named() {
-    let dir = TempDir::new("person-damage");
-    let run = dir.path("");
+    let dir = Directory::new("person-damage");
+    let run = dir.file("");
     let said = || Model::load(&run).err().map(|error| error.to_string()).unwrap_or_default();
     assert!(matches!(Model::load(&run), Err(Error::Io { .. })) && said().contains(CHECKPOINT));
     trained(&run, |_| {});

@@ -1,7 +1,6 @@
 //! Bodies of every size and form: archives like those of SMPL-H and SMPL-X, the saved form, and
 //! faults that are named.
 
-use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::sync::LazyLock;
 
@@ -9,25 +8,14 @@ use array_files::{Data, NdArray, npz};
 use glam::Vec3;
 use proptest::prelude::*;
 use smpl::{BodyModel, Error, Placement};
-use testkit::files::shared;
+use testkit::files::{npy, shared, zip};
 
 fn temporary(name: &str) -> PathBuf {
     Path::new(env!("CARGO_TARGET_TMPDIR")).join(name)
 }
 
-/// A `.npy` of little-endian words.
-fn npy(descr: &str, shape: &[usize], bytes: Vec<u8>) -> Vec<u8> {
-    let shape: String = shape.iter().map(|n| format!("{n},")).collect();
-    let header = format!("{{'descr': '{descr}', 'fortran_order': False, 'shape': ({shape}), }}\n");
-    let mut out = b"\x93NUMPY\x01\0".to_vec();
-    out.extend((header.len() as u16).to_le_bytes());
-    out.extend(header.as_bytes());
-    out.extend(bytes);
-    out
-}
-
 fn floats(shape: &[usize], value: impl Fn(usize) -> f32) -> Vec<u8> {
-    npy("<f4", shape, (0..shape.iter().product()).flat_map(|i| value(i).to_le_bytes()).collect())
+    npy("<f4", shape, &(0..shape.iter().product()).flat_map(|i| value(i).to_le_bytes()).collect::<Vec<u8>>())
 }
 
 /// How an archive writes the parent of the root.
@@ -50,31 +38,29 @@ fn archive(name: &str, joints: usize, betas: usize, root: Root) -> PathBuf {
     });
     let tree: Vec<i64> = parents.chain(0..joints as i64).collect();
     let tree = match root {
-        Root::U32 => npy("<u4", &[2, joints], tree.iter().flat_map(|&p| (p as u32).to_le_bytes()).collect()),
-        _ => npy("<i8", &[2, joints], tree.iter().flat_map(|p| p.to_le_bytes()).collect()),
+        Root::U32 => {
+            npy("<u4", &[2, joints], &tree.iter().flat_map(|&p| (p as u32).to_le_bytes()).collect::<Vec<u8>>())
+        }
+        _ => npy("<i8", &[2, joints], &tree.iter().flat_map(|p| p.to_le_bytes()).collect::<Vec<u8>>()),
     };
-    let faces = (0..joints as u32).flat_map(|j| [3 * j, 3 * j + 1, 3 * j + 2]).flat_map(u32::to_le_bytes).collect();
+    let faces =
+        (0..joints as u32).flat_map(|j| [3 * j, 3 * j + 1, 3 * j + 2]).flat_map(u32::to_le_bytes).collect::<Vec<u8>>();
     let arrays = [
         ("v_template", floats(&[v, 3], |i| (i / 9) as f32 * 0.1 + wave(i))),
-        ("f", npy("<u4", &[joints, 3], faces)),
+        ("f", npy("<u4", &[joints, 3], &faces)),
         ("shapedirs", floats(&[v, 3, betas], |i| 0.01 * wave(i))),
         ("posedirs", floats(&[v, 3, 9 * (joints - 1)], |i| if i % 7 == 0 { 0.001 * wave(i) } else { 0.0 })),
         ("weights", floats(&[v, joints], |i| f32::from(u8::from(i / joints / 3 == i % joints)))),
         ("J_regressor", floats(&[joints, v], |i| if i % v / 3 == i / v { 1.0 / 3.0 } else { 0.0 })),
         ("kintree_table", tree),
         // Not read: what SMPL-H and SMPL-X carry besides, objects included.
-        ("lmk_faces_idx", npy("<i8", &[2], vec![0; 16])),
+        ("lmk_faces_idx", npy("<i8", &[2], &[0; 16])),
         ("hands_componentsl", floats(&[45, 45], wave)),
         ("hands_meanl", floats(&[45], wave)),
-        ("joint2num", npy("|O", &[], b"not even a pickle".to_vec())),
+        ("joint2num", npy("|O", &[], b"not even a pickle")),
     ];
-    let mut zip = zip::ZipWriter::new(std::io::Cursor::new(Vec::new()));
-    for (key, bytes) in arrays {
-        zip.start_file(format!("{key}.npy"), zip::write::SimpleFileOptions::default()).unwrap();
-        zip.write_all(&bytes).unwrap();
-    }
     let path = temporary(name);
-    std::fs::write(&path, zip.finish().unwrap().into_inner()).unwrap();
+    std::fs::write(&path, zip(arrays.map(|(key, bytes)| (format!("{key}.npy"), bytes)))).unwrap();
     path
 }
 

@@ -1,30 +1,18 @@
 //! Motion capture: AMASS's forms, and the shared clips.
 
-use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use glam::{Quat, Vec3};
 use smpl::{BodyModel, MotionClip, Placement};
-use testkit::files::shared;
+use testkit::files::{npy, shared, zip};
 
 fn floats(shape: &[usize], values: &[f32]) -> Vec<u8> {
-    let shape: String = shape.iter().map(|n| format!("{n},")).collect();
-    let header = format!("{{'descr': '<f4', 'fortran_order': False, 'shape': ({shape}), }}\n");
-    let mut out = b"\x93NUMPY\x01\0".to_vec();
-    out.extend((header.len() as u16).to_le_bytes());
-    out.extend(header.as_bytes());
-    out.extend(values.iter().flat_map(|v| v.to_le_bytes()));
-    out
+    npy("<f4", shape, &values.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>())
 }
 
 fn archive(name: &str, arrays: &[(&str, Vec<u8>)]) -> PathBuf {
-    let mut zip = zip::ZipWriter::new(std::io::Cursor::new(Vec::new()));
-    for (key, bytes) in arrays {
-        zip.start_file(format!("{key}.npy"), zip::write::SimpleFileOptions::default()).unwrap();
-        zip.write_all(bytes).unwrap();
-    }
     let path = Path::new(env!("CARGO_TARGET_TMPDIR")).join(name);
-    std::fs::write(&path, zip.finish().unwrap().into_inner()).unwrap();
+    std::fs::write(&path, zip(arrays.iter().map(|(key, bytes)| (format!("{key}.npy"), bytes)))).unwrap();
     path
 }
 

@@ -3,7 +3,6 @@
 
 mod bench;
 mod budget;
-mod corrupt;
 mod front;
 mod methods;
 mod obstacle;
@@ -33,7 +32,7 @@ enum Command {
     Reproduce(reproduce::ReproduceArguments),
     /// Measures what every approximation costs and is worth, and where methods break.
     Bench(bench::BenchArguments),
-    /// Splits the error of runs by its causes and by part of the body.
+    /// Splits the error of runs by its causes.
     Budget(budget::BudgetArguments),
     /// Puts runs and benches on one HTML page that needs no other file.
     Report(report::ReportArguments),
@@ -41,8 +40,6 @@ enum Command {
     Front(front::FrontArguments),
     /// Writes an occluded capture of a synthetic person to disk, in a published dataset format.
     Synth(synth::SynthArguments),
-    /// Writes a capture with a corrupted prior, corrupted masks or an obstacle to disk.
-    Corrupt(corrupt::CorruptArguments),
     /// Runs one function of one crate on numpy arrays.
     Probe(probe::ProbeArguments),
 }
@@ -55,7 +52,6 @@ fn run(arguments: Arguments) -> Result<()> {
         Command::Report(arguments) => report::report(&arguments),
         Command::Front(arguments) => front::front(&arguments),
         Command::Synth(arguments) => synth::synth(&arguments),
-        Command::Corrupt(arguments) => corrupt::corrupt(&arguments),
         Command::Probe(arguments) => probe::probe(&arguments),
     }
 }

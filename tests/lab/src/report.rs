@@ -54,7 +54,7 @@ pub fn report(arguments: &ReportArguments) -> Result<()> {
 }
 
 fn is_bench(directory: &Path) -> bool {
-    directory.join(results::BENCH_LOG).is_file() || directory.join(results::KERNELS).is_file()
+    directory.join(results::BENCH_LOG).is_file()
 }
 
 /// The directory itself if it is a run or a bench, else the runs in it.

@@ -54,10 +54,10 @@ enum OutfitName {
 
 /// Where a capture is written.
 #[derive(Args)]
-pub struct OutArguments {
+struct OutArguments {
     /// Directory to write, new or empty
     #[arg(long)]
-    pub out: PathBuf,
+    out: PathBuf,
     /// Replace what the same command wrote to --out earlier
     #[arg(long)]
     force: bool,
@@ -65,13 +65,13 @@ pub struct OutArguments {
 
 impl OutArguments {
     /// Errors unless --out may be written.
-    pub fn vacant(&self, mark: &str) -> Result<()> {
+    fn vacant(&self, mark: &str) -> Result<()> {
         vacant(&self.out, self.force, mark)
     }
 
     /// Fills --out: everything is written beside it, `text` into the file `mark`, and takes its
     /// place when it is complete.
-    pub fn fill(&self, mark: &str, text: &str, write: impl FnOnce(&Path) -> Result<()>) -> Result<()> {
+    fn fill(&self, mark: &str, text: &str, write: impl FnOnce(&Path) -> Result<()>) -> Result<()> {
         let partial = beside(&self.out, "partial")?;
         let written = xtask::run::make_directory(&partial)
             .and_then(|()| write(&partial))
@@ -246,7 +246,7 @@ fn load_motion(path: &Path) -> Result<MotionClip> {
 }
 
 /// A bar of `length` steps.
-pub fn bar(what: &'static str, length: usize) -> ProgressBar {
+fn bar(what: &'static str, length: usize) -> ProgressBar {
     let bar = ProgressBar::new(length as u64);
     if let Ok(style) = ProgressStyle::with_template("{bar:28} {pos}/{len} {msg}  {elapsed}") {
         bar.set_style(style);

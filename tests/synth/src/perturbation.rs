@@ -198,7 +198,7 @@ fn fray(pixels: &mut Pixels, by: f32, frame: u64) {
 }
 
 /// The pose with its global rotation about the origin.
-pub(crate) fn about_origin(frame: &Frame, pelvis: Vec3) -> Pose {
+fn about_origin(frame: &Frame, pelvis: Vec3) -> Pose {
     let mut joints = frame.pose.clone();
     let (rotation, translation) = match frame.placement {
         Placement::Origin { rotation, translation } => (Quat::from_scaled_axis(rotation), translation),

@@ -3,13 +3,14 @@
 
 use crate::common;
 
-use common::{TempDir, bits, body, checkpoint, demo_config, on_threads, scene, tiny, train};
+use common::{bits, body, checkpoint, demo_config, on_threads, scene, tiny, train};
 use glam::Vec3;
 use occnerf::{
     Config, DistanceKind, FieldRenderer, Method, MotionKind, PriorColors, PriorRenderer, Renderer, Scene, Trainer,
     checkpoint_config,
 };
 use synth::demo;
+use testkit::files::Directory;
 
 /// Every method that has a field, the main ones with both kinds of motion, and the paper's blended
 /// distances with its learnable volume.
@@ -58,7 +59,7 @@ fn captures_scenes_colours_and_pictures_are_the_same_on_one_and_on_three_threads
 
 #[test]
 fn stopping_and_going_on_equals_never_having_stopped() {
-    let dir = TempDir::new("resume");
+    let dir = Directory::new("resume");
     let path = dir.path().join("half.safetensors");
     for config in configs() {
         let (reports, whole) = train(scene(), &config, 6);
@@ -80,7 +81,7 @@ fn stopping_and_going_on_equals_never_having_stopped() {
 #[test]
 fn a_resumed_model_draws_the_same_picture() {
     let config = tiny(Method::Occnerf, MotionKind::Volume);
-    let dir = TempDir::new("picture");
+    let dir = Directory::new("picture");
     let path = dir.path().join("model.safetensors");
     let mut trainer = Trainer::new(scene(), config).unwrap();
     for _ in 0..4 {

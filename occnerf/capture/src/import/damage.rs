@@ -13,12 +13,13 @@ use array_files::pickle::{self, Value};
 use array_files::torch::TorchFile;
 use array_files::{Data, NdArray};
 use zip::write::SimpleFileOptions;
-use zip::{CompressionMethod, ZipArchive, ZipWriter};
+use zip::{ZipArchive, ZipWriter};
 
 use super::fit::Fit;
 use super::levels::Levels;
 use super::*;
 use crate::testing::{Directory, shared};
+use testkit::files::zip as zipped;
 use volrender::RandomStream;
 
 /// Longest that a mutation may take, and most memory: pickles take 8 times their
@@ -104,16 +105,6 @@ fn unzipped(bytes: &[u8]) -> Vec<(String, Vec<u8>)> {
     entries
 }
 
-fn zipped(entries: &[(String, Vec<u8>)]) -> Vec<u8> {
-    let mut zip = ZipWriter::new(Cursor::new(Vec::new()));
-    let stored = SimpleFileOptions::default().compression_method(CompressionMethod::Stored);
-    for (name, bytes) in entries {
-        zip.start_file(name.as_str(), stored).unwrap();
-        zip.write_all(bytes).unwrap();
-    }
-    zip.finish().unwrap().into_inner()
-}
-
 /// Runs `read` on a mutation; it may say anything in one line but must not take long or much. What
 /// another process kept waiting is tried again.
 fn bounded(what: &str, case: usize, read: impl Fn() -> Result<(), String>) {
@@ -166,7 +157,7 @@ fn mutated_fits_are_errors_or_fits() {
         for case in 0..each {
             let mut entries = entries.clone();
             entries[at].1 = mutated(&entries[at].1, &places, &mut RandomStream::new(&[2, case as u64]));
-            let bytes = zipped(&entries);
+            let bytes = zipped(entries);
             bounded(name, case, || read_fit(name, &bytes, &video).map(drop).map_err(|e| e.to_string()));
         }
     }
@@ -296,7 +287,7 @@ fn programs_bombs_and_foreign_files_are_refused_by_name() {
     refused("cut.npz", b"PK\x03\x04results", &["expected a whole zip archive"]);
     refused("empty.pkl", b"", &["malformed"]);
     refused("numbers.pkl", b"\x80\x02}(X\x01\x00\x00\x00aK\x01u.", &["WHAM", "dictionary of a"]);
-    refused("other.npz", &zipped(&[("a.npy".to_owned(), vec![1, 2])]), &["WHAM", "an archive of a"]);
+    refused("other.npz", &zipped([("a.npy", [1, 2])]), &["WHAM", "an archive of a"]);
     // Half a gigabyte of zeros in an archive of half a megabyte.
     let mut zip = ZipWriter::new(Cursor::new(Vec::new()));
     zip.start_file("results.npy", SimpleFileOptions::default()).unwrap();

@@ -64,7 +64,7 @@ fn points_of_the_nearest_person_become_joints_of_the_body() {
             values.extend([pixels[joint][0] as f32, pixels[joint][1] as f32 + 2.0, confidence]);
         }
     }
-    out.write("coco.npy", npy("(3, 17, 3)", &values));
+    out.write("coco.npy", npy(&[3, 17, 3], &values));
     let said = keypoints::add(&out.path().join("coco.npy"), &mut placed, &[], &model, &video).unwrap();
     assert!(said.contains("coco17 in 2 frames, 2.0 px"), "{said}");
     assert_eq!(placed.iter().map(|frame| frame.keypoints.len()).collect::<Vec<_>>(), [12, 0, 12]);
@@ -77,12 +77,12 @@ fn points_of_the_nearest_person_become_joints_of_the_body() {
         let message = error.unwrap_err().to_string();
         assert!(!message.contains('\n') && words.iter().all(|word| message.contains(word)), "{message}");
     };
-    fault("nan.npy", npy("(3, 17, 3)", &values), ["NaN", "nan.npy"]);
-    fault("far.npy", npy("(3, 17, 3)", &[1e9; 153]), ["pixels", "1000000000"]);
-    fault("four.npy", npy("(3, 4, 3)", &[1.0; 36]), ["17 (COCO) or 25 (OpenPose)", "4"]);
-    fault("flat.npy", npy("(153,)", &[1.0; 153]), ["shape [3, points, 3]", "[153]"]);
-    fault("none.npy", npy("(3, 17, 3)", &[0.0; 153]), ["a person", "none"]);
-    fault("long.npy", npy("(9, 17, 3)", &[1.0; 459]), ["shape [3, points, 3]", "9 frames"]);
+    fault("nan.npy", npy(&[3, 17, 3], &values), ["NaN", "nan.npy"]);
+    fault("far.npy", npy(&[3, 17, 3], &[1e9; 153]), ["pixels", "1000000000"]);
+    fault("four.npy", npy(&[3, 4, 3], &[1.0; 36]), ["17 (COCO) or 25 (OpenPose)", "4"]);
+    fault("flat.npy", npy(&[153], &[1.0; 153]), ["shape [3, points, 3]", "[153]"]);
+    fault("none.npy", npy(&[3, 17, 3], &[0.0; 153]), ["a person", "none"]);
+    fault("long.npy", npy(&[9, 17, 3], &[1.0; 459]), ["shape [3, points, 3]", "9 frames"]);
     out.write("one/000001_keypoints.json", r#"{"people": [{"pose_keypoints_2d": [1]}]}"#);
     let error = keypoints::add(&out.path().join("one"), &mut frames(&model).1, &[], &model, &video).unwrap_err();
     assert!(error.to_string().contains("1 numbers"), "{error}");

@@ -311,13 +311,7 @@ fn masks_are_matched_by_name_by_order_or_by_number() {
 
 /// A `.npy` of 64-bit floats.
 fn npy(shape: &[usize], values: &[f64]) -> Vec<u8> {
-    let shape = format!("{shape:?}").replace(['[', ']'], "");
-    let header = format!("{{'descr': '<f8', 'fortran_order': False, 'shape': ({shape},)}}");
-    let mut bytes = b"\x93NUMPY\x01\x00".to_vec();
-    bytes.extend((header.len() as u16).to_le_bytes());
-    bytes.extend(header.into_bytes());
-    bytes.extend(values.iter().flat_map(|value| value.to_le_bytes()));
-    bytes
+    testkit::files::npy("<f8", shape, &values.iter().flat_map(|value| value.to_le_bytes()).collect::<Vec<u8>>())
 }
 
 /// Masks of a video of one frame per value of `make`.

@@ -26,24 +26,14 @@ pub fn body() -> BodyModel {
 pub use synth::Py;
 pub use testkit::files::{Directory, shared};
 
-fn npy_header(descr: &str, shape: &str) -> Vec<u8> {
-    let header = format!("{{'descr': '{descr}', 'fortran_order': False, 'shape': {shape}, }}\n");
-    let mut out = b"\x93NUMPY\x01\x00".to_vec();
-    out.extend((header.len() as u16).to_le_bytes());
-    out.extend(header.as_bytes());
-    out
-}
-
 /// An array as `numpy.save` writes it.
-pub fn npy(shape: &str, values: &[f32]) -> Vec<u8> {
-    let mut out = npy_header("<f4", shape);
-    out.extend(values.iter().copied().flat_map(f32::to_le_bytes));
-    out
+pub fn npy(shape: &[usize], values: &[f32]) -> Vec<u8> {
+    testkit::files::npy("<f4", shape, &values.iter().copied().flat_map(f32::to_le_bytes).collect::<Vec<u8>>())
 }
 
 /// An array of points as `numpy.save` writes it.
 pub fn points_npy(points: &[Vec3]) -> Vec<u8> {
-    npy(&format!("({}, 3)", points.len()), &points.iter().flat_map(Vec3::to_array).collect::<Vec<_>>())
+    npy(&[points.len(), 3], &points.iter().flat_map(Vec3::to_array).collect::<Vec<_>>())
 }
 
 pub fn array(shape: &[u32], values: &[f64]) -> Py {

@@ -1,12 +1,10 @@
 //! Files of weights in every form, and damaged ones.
 
-use std::io::{Cursor, Write};
 use std::path::{Path, PathBuf};
 
 use lpips::{Lpips, Trunk};
 use proptest::prelude::*;
-use zip::write::SimpleFileOptions;
-use zip::{CompressionMethod, ZipWriter};
+use testkit::files::zip;
 
 use crate::formula::{Tensors, bytes, network, safetensors, weights};
 use crate::noise;
@@ -61,17 +59,13 @@ fn state_dict(tensors: &Tensors, legacy: bool) -> Vec<u8> {
 }
 
 fn archive(tensors: &Tensors) -> Vec<u8> {
-    let mut zip = ZipWriter::new(Cursor::new(Vec::new()));
-    let stored = SimpleFileOptions::default().compression_method(CompressionMethod::Stored);
-    zip.start_file("weights/data.pkl", stored).unwrap();
-    zip.write_all(&state_dict(tensors, false)).unwrap();
-    zip.start_file("weights/byteorder", stored).unwrap();
-    zip.write_all(b"little").unwrap();
-    for (key, (_, values)) in tensors.values().enumerate() {
-        zip.start_file(format!("weights/data/{key}"), stored).unwrap();
-        zip.write_all(&bytes(values)).unwrap();
-    }
-    zip.finish().unwrap().into_inner()
+    let first = [
+        ("weights/data.pkl".to_owned(), state_dict(tensors, false)),
+        ("weights/byteorder".to_owned(), b"little".to_vec()),
+    ];
+    let storages = tensors.values().enumerate();
+    let storages = storages.map(|(key, tensor)| (format!("weights/data/{key}"), bytes(&tensor.1)));
+    zip(first.into_iter().chain(storages))
 }
 
 fn legacy(tensors: &Tensors) -> Vec<u8> {
@@ -173,10 +167,8 @@ fn what_is_wrong_is_named_with_file_tensor_and_shapes() {
 #[test]
 fn pickles_that_would_run_something_are_refused_by_name() {
     let path = folder("evil").join("net.pth");
-    let mut zip = ZipWriter::new(Cursor::new(Vec::new()));
-    zip.start_file("x/data.pkl", SimpleFileOptions::default()).unwrap();
-    zip.write_all(b"\x80\x02cos\nsystem\nX\x02\x00\x00\x00ls\x85R.").unwrap();
-    std::fs::write(&path, zip.finish().unwrap().into_inner()).unwrap();
+    let pickle = b"\x80\x02cos\nsystem\nX\x02\x00\x00\x00ls\x85R.";
+    std::fs::write(&path, zip([("x/data.pkl", pickle)])).unwrap();
     refused(&path, &["os system", "not allowed"]);
 }
 

@@ -1,7 +1,6 @@
 //! A capture small enough to prepare in no time: an upright ellipsoid with two joints, seen by
 //! three cameras.
 
-use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 
 use glam::{Affine3A, Mat3, Vec3};
@@ -125,25 +124,4 @@ pub fn replace_line(text: &str, key: &str, by: &str) -> String {
     let found = lines.iter().position(|line| *line == key || line.starts_with(&setting));
     lines[found.unwrap_or_else(|| panic!("no `{key}` in\n{text}"))] = by;
     lines.join("\n")
-}
-
-/// A directory that is removed when dropped.
-pub struct TempDir(PathBuf);
-
-impl TempDir {
-    pub fn new(name: &str) -> Self {
-        let path = Path::new(env!("CARGO_TARGET_TMPDIR")).join(format!("occnerf-{name}-{}", std::process::id()));
-        std::fs::create_dir_all(&path).unwrap();
-        Self(path)
-    }
-
-    pub fn path(&self, file: &str) -> PathBuf {
-        self.0.join(file)
-    }
-}
-
-impl Drop for TempDir {
-    fn drop(&mut self) {
-        let _ = std::fs::remove_dir_all(&self.0);
-    }
 }

@@ -2,29 +2,13 @@
 
 use crate::common;
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use array_files::npz::{self, Npz, read_npy};
 use array_files::{Data, Error, NdArray};
 use common::fixture;
 use proptest::prelude::*;
-
-/// A file that is removed at the end of the test.
-struct Temporary(PathBuf);
-
-impl Temporary {
-    fn new(name: &str, bytes: &[u8]) -> Self {
-        let path = std::env::temp_dir().join(format!("array-files-{}-{name}", std::process::id()));
-        std::fs::write(&path, bytes).unwrap();
-        Self(path)
-    }
-}
-
-impl Drop for Temporary {
-    fn drop(&mut self) {
-        let _ = std::fs::remove_file(&self.0);
-    }
-}
+use testkit::files::{Directory, npy_of};
 
 #[test]
 fn npz_arrays_are_read_with_shape_and_type() {
@@ -58,18 +42,10 @@ fn npz_errors_name_file_key_and_shapes() {
     assert!(matches!(Npz::open(Path::new("/no/such.npz")), Err(Error::Io { .. })));
 }
 
-/// The bytes of a `.npy` file with the given header and data.
-fn npy(header: &str, data: &[u8]) -> Vec<u8> {
-    let mut out = b"\x93NUMPY\x01\x00".to_vec();
-    out.extend((header.len() as u16).to_le_bytes());
-    out.extend(header.as_bytes());
-    out.extend(data);
-    out
-}
-
 #[test]
 fn headers_that_claim_too_much_are_refused_before_memory_is_taken() {
-    for (i, (shape, large)) in [
+    let dir = Directory::new("npy-claims");
+    for (shape, large) in [
         ("(4611686018427387904, 4)", true),
         ("(18446744073709551615, 18446744073709551615, 18446744073709551615)", true),
         ("(1000000000,)", true),
@@ -78,13 +54,10 @@ fn headers_that_claim_too_much_are_refused_before_memory_is_taken() {
         // Below the limit, but not there.
         ("(100000000,)", false),
         ("(0, 4611686018427387904)", false),
-    ]
-    .into_iter()
-    .enumerate()
-    {
+    ] {
         let header = format!("{{'descr': '<f4', 'fortran_order': False, 'shape': {shape}, }}");
-        let file = Temporary::new(&format!("claim{i}.npy"), &npy(&header, &[0; 8]));
-        let error = read_npy(&file.0).expect_err(shape);
+        dir.write("claim.npy", npy_of(&header, &[0; 8]));
+        let error = read_npy(&dir.file("claim.npy")).expect_err(shape);
         match error {
             Error::Invalid { .. } => {
                 assert!(large && error.to_string().contains("more than the limit"), "{shape}: {error}")
@@ -97,7 +70,8 @@ fn headers_that_claim_too_much_are_refused_before_memory_is_taken() {
 
 #[test]
 fn malformed_npy_headers_are_errors() {
-    for (i, header) in [
+    let dir = Directory::new("npy-headers");
+    for header in [
         "",
         "{",
         "{}",
@@ -113,12 +87,9 @@ fn malformed_npy_headers_are_errors() {
         "{'descr': '<c8', 'fortran_order': False, 'shape': (1,)}",
         "{'descr': '<f4', 'fortran_order': False, 'shape': (1,)}",
         "{'descr': '<f4', 'fortran_order': False, 'shape': (3,)}",
-    ]
-    .into_iter()
-    .enumerate()
-    {
-        let file = Temporary::new(&format!("header{i}.npy"), &npy(header, &[0; 8]));
-        let error = read_npy(&file.0).expect_err(header);
+    ] {
+        dir.write("header.npy", npy_of(header, &[0; 8]));
+        let error = read_npy(&dir.file("header.npy")).expect_err(header);
         assert!(matches!(error, Error::Npy { .. } | Error::Invalid { .. }), "{header}: {error}");
     }
 }
@@ -177,11 +148,12 @@ proptest! {
 
     #[test]
     fn written_arrays_are_read_back_with_type_shape_and_bits(arrays in prop::collection::vec(any_array(), 0..4)) {
-        let file = Temporary::new("written.npz", b"");
+        let dir = Directory::new("npz-written");
+        let file = dir.file("written.npz");
         let names = ["a", "b_1", "ü", "last"];
         let named: Vec<_> = names.into_iter().zip(arrays).collect();
-        npz::write(&file.0, &named).unwrap();
-        let mut read = Npz::open(&file.0).unwrap();
+        npz::write(&file, &named).unwrap();
+        let mut read = Npz::open(&file).unwrap();
         prop_assert_eq!(read.keys().len(), named.len());
         for (key, array) in &named {
             prop_assert_eq!(&read.array(key).unwrap(), array);
@@ -192,10 +164,11 @@ proptest! {
 #[test]
 fn arrays_that_cannot_be_written_are_errors() {
     let array = |shape| NdArray { shape, data: Data::I64(vec![1, 2, 3]) };
-    let file = Temporary::new("unwritten.npz", b"");
-    let error = npz::write(&file.0, &[("x", array(vec![2, 2]))]).unwrap_err();
+    let dir = Directory::new("npz-unwritten");
+    let file = dir.file("unwritten.npz");
+    let error = npz::write(&file, &[("x", array(vec![2, 2]))]).unwrap_err();
     assert!(matches!(&error, Error::Invalid { key, .. } if key == "x"), "{error}");
-    let error = npz::write(&file.0, &[("x", array(vec![3])), ("x", array(vec![3]))]).unwrap_err();
+    let error = npz::write(&file, &[("x", array(vec![3])), ("x", array(vec![3]))]).unwrap_err();
     assert!(matches!(&error, Error::Npy { key, .. } if key == "x"), "{error}");
     let error = npz::write(Path::new("/no/such/place.npz"), &[("x", array(vec![3]))]).unwrap_err();
     assert!(matches!(error, Error::Io { .. }), "{error}");
@@ -205,7 +178,8 @@ fn arrays_that_cannot_be_written_are_errors() {
 fn the_limit_of_an_array_counts_the_memory_it_takes_decoded() {
     // 200 MB of bytes in the file, 1.6 GB once they are 64-bit integers.
     let header = "{'descr': '|u1', 'fortran_order': False, 'shape': (200000000,), }";
-    let file = Temporary::new("widened.npy", &npy(header, &[]));
-    let error = read_npy(&file.0).unwrap_err().to_string();
+    let dir = Directory::new("npy-widened");
+    dir.write("widened.npy", npy_of(header, &[]));
+    let error = read_npy(&dir.file("widened.npy")).unwrap_err().to_string();
     assert!(error.contains("claims 1600000000 bytes, more than the limit of 1073741824"), "{error}");
 }

@@ -1,13 +1,11 @@
 //! Files of `torch.save`: views of every kind, in both forms, and what is wrong with others.
 
-use std::io::{Cursor, Write};
+use std::io::Cursor;
 
 use allocation_counter::measure;
 use array_files::torch::{TorchFile, is_torch};
 use array_files::{Data, Error, NdArray};
-use testkit::files::shared;
-use zip::write::SimpleFileOptions;
-use zip::{CompressionMethod, ZipWriter};
+use testkit::files::{shared, zip};
 
 /// A tensor to save: name, storage class, key, offset, shape and strides.
 type Saved = (&'static str, &'static str, u8, u32, Vec<u32>, Vec<u32>);
@@ -47,15 +45,8 @@ fn pickled(tensors: &[Saved], legacy: bool) -> Vec<u8> {
 }
 
 fn archive(tensors: &[Saved], storages: &[Vec<u8>]) -> Vec<u8> {
-    let mut zip = ZipWriter::new(Cursor::new(Vec::new()));
-    let stored = SimpleFileOptions::default().compression_method(CompressionMethod::Stored);
-    zip.start_file("x/data.pkl", stored).unwrap();
-    zip.write_all(&pickled(tensors, false)).unwrap();
-    for (key, bytes) in storages.iter().enumerate() {
-        zip.start_file(format!("x/data/{key}"), stored).unwrap();
-        zip.write_all(bytes).unwrap();
-    }
-    zip.finish().unwrap().into_inner()
+    let pickle = ("x/data.pkl".to_owned(), pickled(tensors, false));
+    zip([pickle].into_iter().chain((0..).zip(storages).map(|(key, bytes)| (format!("x/data/{key}"), bytes.clone()))))
 }
 
 fn legacy(tensors: &[Saved], storages: &[Vec<u8>], sizes: &[usize]) -> Vec<u8> {

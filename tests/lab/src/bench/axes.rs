@@ -149,7 +149,6 @@ pub fn of_demo(side: u32, quick: bool) -> Vec<Axis> {
         demo("limbs pressed", "", &[0.0, 1.0], &|d, v| d.pressed = v),
     ];
     axes.extend(around.training());
-    axes.push(made("unit", " m", &[1.0, 0.01, 100.0], &|d, v| d.unit = v));
     shortened(axes, quick)
 }
 

@@ -1,13 +1,10 @@
 //! Captures made as hard as one likes.
 
-use std::collections::{BTreeMap, HashMap};
-use std::ops::{Add, Mul};
-
 use anyhow::{Result, ensure};
 use glam::{Quat, Vec3};
 use occnerf::capture::{Capture, Frame, Pixels};
 use serde::{Deserialize, Serialize};
-use smpl::{BodyModel, Placement, SparseRows};
+use smpl::{BodyModel, Placement};
 use synth::{DemoConfig, Perturbation, demo};
 
 /// Moments that a frame's exposure can be made of.
@@ -25,38 +22,19 @@ pub struct Difficulty {
     /// Keep only training frames in which the person's front is within this angle of the camera;
     /// 180 keeps all.
     pub facing_degrees: f32,
-    /// Length of one metre in the capture's unit.
-    pub unit: f32,
-    /// Times that each triangle of the body is cut into four.
-    pub refined: u32,
 }
 
 impl Default for Difficulty {
     fn default() -> Self {
-        Self {
-            demo: DemoConfig::default(),
-            wrong: Perturbation::NONE,
-            shutter: 0.0,
-            facing_degrees: 180.0,
-            unit: 1.0,
-            refined: 0,
-        }
+        Self { demo: DemoConfig::default(), wrong: Perturbation::NONE, shutter: 0.0, facing_degrees: 180.0 }
     }
 }
 
 impl Difficulty {
     /// The capture and its body model.
     pub fn make(&self) -> Result<(Capture, BodyModel)> {
-        ensure!(self.unit.is_finite() && self.unit > 0.0, "unit is {}: expected a length above 0", self.unit);
         ensure!((0.0..=1.0).contains(&self.shutter), "shutter is {}: expected 0 to 1", self.shutter);
-        ensure!(self.refined <= 3, "refined is {}: expected 0 to 3", self.refined);
-        let mut body = BodyModel::embedded();
-        for _ in 0..self.refined {
-            body = refine(&body);
-        }
-        if self.unit != 1.0 {
-            enlarge(&mut body, self.unit);
-        }
+        let body = BodyModel::embedded();
         let mut capture = if self.shutter > 0.0 { self.exposed(&body)? } else { demo(&self.demo, &body)? };
         self.wrong.apply(&mut capture, &body)?;
         if self.facing_degrees < 180.0 {
@@ -94,56 +72,6 @@ impl Difficulty {
         capture.eval.iter_mut().for_each(|view| view.train_index /= MOMENTS);
         Ok(capture)
     }
-}
-
-/// Multiplies every length of a body.
-fn enlarge(body: &mut BodyModel, unit: f32) {
-    let lengths = body.v_template.iter_mut().chain(&mut body.shapedirs).chain(&mut body.posedirs.values);
-    lengths.for_each(|v| *v *= unit);
-}
-
-/// The same body with a new vertex in the middle of each edge, which moves as the mean of its ends.
-fn refine(body: &BodyModel) -> BodyModel {
-    let vertices = body.num_vertices();
-    let mut middles: HashMap<[u32; 2], u32> = HashMap::new();
-    let mut edges: Vec<[u32; 2]> = Vec::new();
-    let mut faces = Vec::with_capacity(4 * body.faces.len());
-    for &[a, b, c] in &body.faces {
-        let mut middle = |a: u32, b: u32| {
-            *middles.entry([a.min(b), a.max(b)]).or_insert_with(|| {
-                edges.push([a, b]);
-                (vertices + edges.len() - 1) as u32
-            })
-        };
-        let (ab, bc, ca) = (middle(a, b), middle(b, c), middle(c, a));
-        faces.extend([[a, ab, ca], [b, bc, ab], [c, ca, bc], [ab, bc, ca]]);
-    }
-    let ends: Vec<[u32; 2]> = (0..vertices as u32).map(|v| [v, v]).chain(edges).collect();
-    let mean = |of: &[Vec3]| ends.iter().map(|e| 0.5 * (of[e[0] as usize] + of[e[1] as usize])).collect::<Vec<Vec3>>();
-    BodyModel {
-        v_template: mean(&body.v_template),
-        faces,
-        shapedirs: body.shapedirs.chunks(vertices).flat_map(mean).collect(),
-        posedirs: mean_rows(&body.posedirs, &ends),
-        weights: mean_rows(&body.weights, &ends),
-        j_regressor: body.j_regressor.clone(),
-        parents: body.parents.clone(),
-    }
-}
-
-/// Means of pairs of rows.
-fn mean_rows<T>(rows: &SparseRows<T>, pairs: &[[u32; 2]]) -> SparseRows<T>
-where
-    T: Copy + Add<Output = T> + Mul<f32, Output = T>,
-{
-    SparseRows::from_rows(pairs.iter().map(|pair| {
-        let mut sums: BTreeMap<u32, T> = BTreeMap::new();
-        for (column, value) in pair.iter().flat_map(|&row| rows.row(row as usize)) {
-            let half = value * 0.5;
-            sums.entry(column as u32).and_modify(|sum| *sum = *sum + half).or_insert(half);
-        }
-        sums
-    }))
 }
 
 /// Angle in degrees between the person's front and the direction to the camera, seen from above.
@@ -192,26 +120,6 @@ mod tests {
     }
 
     #[test]
-    fn a_refined_body_is_the_same_body_with_four_times_the_triangles() {
-        let body = BodyModel::embedded();
-        let fine = refine(&body);
-        fine.validate("refined").unwrap();
-        assert_eq!(fine.faces.len(), 4 * body.faces.len());
-        // A closed surface has three edges for two triangles.
-        assert_eq!(fine.num_vertices(), body.num_vertices() + body.faces.len() * 3 / 2);
-        let pose: Vec<Vec3> =
-            (0..body.num_joints()).map(|j| Vec3::new(0.1 * j as f32, 0.2, -0.1).clamp_length_max(0.6)).collect();
-        let posed = |body: &BodyModel| {
-            let shaped = body.shaped(&[1.0, -0.5]);
-            body.pose(&shaped, &pose, Placement::Origin { rotation: Vec3::Y, translation: Vec3::X })
-        };
-        let (coarse, fine) = (posed(&body), posed(&fine));
-        for (a, b) in coarse.vertices.iter().zip(&fine.vertices) {
-            assert!(a.distance(*b) < 1e-6, "{a} {b}");
-        }
-    }
-
-    #[test]
     fn an_exposure_smears_the_picture_and_keeps_its_sum() {
         let (sharp, _) = small().make().unwrap();
         let (smeared, _) = Difficulty { shutter: 1.0, ..small() }.make().unwrap();
@@ -237,24 +145,5 @@ mod tests {
             assert_eq!(some.train[view.train_index].name, view.frame.name);
         }
         assert!(Difficulty { facing_degrees: 0.0, ..small() }.make().is_err());
-    }
-
-    #[test]
-    fn another_unit_of_length_gives_the_same_pictures() {
-        let (metres, body) = small().make().unwrap();
-        let (large, big) = Difficulty { unit: 128.0, ..small() }.make().unwrap();
-        assert!((big.v_template[5] / 128.0).distance(body.v_template[5]) < 1e-6);
-        for (a, b) in metres.train.iter().zip(&large.train) {
-            let off = a
-                .pixels()
-                .unwrap()
-                .mask
-                .iter()
-                .zip(&b.pixels().unwrap().mask)
-                .filter(|(a, b)| (*a - *b).abs() > 0.3)
-                .count();
-            assert!(off * 100 < a.pixels().unwrap().mask.len(), "{off} pixels differ");
-        }
-        assert!(Difficulty { unit: 0.0, ..small() }.make().is_err());
     }
 }

@@ -2,13 +2,10 @@
 
 mod axes;
 pub mod chart;
-mod cost;
 mod difficulty;
 mod front;
-mod kernels;
 mod pareto;
 mod points;
-mod registration;
 mod stability;
 
 use std::path::{Path, PathBuf};
@@ -22,7 +19,6 @@ use crate::results::{self, Section};
 use crate::sweep::{Line, Place, Runner, SittingArguments, job};
 use xtask::process::say;
 use xtask::run::{use_threads, write};
-use xtask::source::Source;
 use xtask::{source, train};
 
 /// Steps of a point of `pareto` at which presets run their own number of steps: those of `fast`.
@@ -41,17 +37,9 @@ enum What {
     /// Seconds against accuracy of every named approximation, each preset and each method: a table
     /// and charts.
     Pareto(SweepArguments),
-    /// What happens as it gets hard: less to see, worse poses, odd units, …; a table of breaking
+    /// What happens as it gets hard: less to see, worse poses, shorter videos, …; a table of breaking
     /// points and charts.
     Stability(StabilityArguments),
-    /// Cost against error of the geometric kernels; `pareto` draws it too.
-    Kernels(KernelArguments),
-    /// What a step costs, and how time and memory grow with rays, samples, table, vertices, frames
-    /// and pixels.
-    Cost(CostArguments),
-    /// What registration makes of wrong priors: degrees and millimetres against the demo's true
-    /// bodies.
-    Registration(registration::RegistrationArguments),
     /// One run, handed over on standard input.
     #[command(hide = true)]
     Point {
@@ -107,43 +95,11 @@ struct StabilityArguments {
     max_runs: usize,
 }
 
-#[derive(Args)]
-struct CostArguments {
-    /// Where to write; what is there is not run again
-    #[arg(long, default_value = "runs/bench-cost")]
-    out: PathBuf,
-    #[command(flatten)]
-    sitting: SittingArguments,
-}
-
-#[derive(Args)]
-struct KernelArguments {
-    /// Where to write
-    #[arg(long, default_value = "runs/bench-kernels")]
-    out: PathBuf,
-    /// Fewer queries
-    #[arg(long)]
-    quick: bool,
-    /// Make what is found a section of tests/lab/RESULTS.md
-    #[arg(long)]
-    publish: bool,
-}
-
 /// Runs the command.
 pub fn bench(arguments: &BenchArguments) -> Result<()> {
     match &arguments.what {
-        What::Registration(arguments) => registration::registration(arguments),
         What::Pareto(arguments) => pareto(arguments),
         What::Stability(arguments) => stability(arguments),
-        What::Kernels(arguments) => kernels::run(&arguments.out, arguments.quick, arguments.publish),
-        What::Cost(arguments) => {
-            use_threads(arguments.sitting.threads)?;
-            let alone = arguments.sitting.part.shard.is_none();
-            ensure!(alone, "bench cost measures one machine: it has no parts");
-            let mut runner = arguments.sitting.open(&arguments.out)?;
-            let text = cost::run(&mut runner, &arguments.out)?;
-            finish(&runner, &arguments.sitting, &text, "cost")
-        }
         What::Point { threads } => {
             use_threads(*threads)?;
             job::serve()
@@ -156,13 +112,9 @@ impl SceneArguments {
     fn checked(&self) -> Result<Vec<String>> {
         let scenes = if self.scenes.is_empty() { vec![source::DEMO.to_owned()] } else { self.scenes.clone() };
         for scene in scenes.iter().filter(|s| *s != source::DEMO || !self.load.command_line().is_empty()) {
-            self.read(scene)?;
+            self.load.options()?.load(scene, self.body.as_deref())?;
         }
         Ok(scenes)
-    }
-
-    fn read(&self, scene: &str) -> Result<Source> {
-        self.load.options()?.load(scene, self.body.as_deref())
     }
 
     /// What `bench stability` does to a scene.
@@ -203,30 +155,11 @@ impl SweepArguments {
         Ok(steps)
     }
 
-    /// The sweep of `pareto` around a scene.
-    fn around(&self, scene: &str) -> Result<points::Sweep> {
-        let on = &self.on;
-        Ok(points::Sweep {
-            scene_arguments: on.command_line(scene),
-            place: on.place(scene)?,
-            views: if self.quick { VIEWS.1 } else { VIEWS.0 },
-            steps: self.steps(FULL_STEPS, FULL_STEPS / 5)?,
-            full_steps: FULL_STEPS,
-            quick: self.quick,
-        })
-    }
-
-    /// The scenes, after a look at what is asked of them.
-    fn scenes(&self) -> Result<Vec<(String, ())>> {
-        self.steps(FULL_STEPS, FULL_STEPS / 5)?;
-        Ok(self.on.checked()?.into_iter().map(|scene| (scene, ())).collect())
-    }
-
     /// Runs `run` on each of `scenes`, then `draw`, which gets the stem of its charts and returns a
-    /// section of the table.
+    /// section of the table; prints, writes and publishes the table.
     fn sweep<S>(
         &self,
-        name: &str,
+        [name, title]: [&str; 2],
         scenes: &[(String, S)],
         run: impl Fn(&str, &S, &mut Runner) -> Result<Vec<Line>>,
         draw: impl Fn(&str, &S, &[Line], &Path) -> Result<String>,
@@ -242,27 +175,34 @@ impl SweepArguments {
                 text.push_str(&format!("## {scene}\n\n{}.\n\n{section}\n", results::set_of(&short)));
             }
         }
-        finish(&runner, &self.sitting, &text, name)
+        let SittingArguments { part, publish, .. } = &self.sitting;
+        if part.writes_tables() {
+            let path = out.join(format!("{name}.md"));
+            write(&path, &text)?;
+            say!("\n{text}\nwritten: {}\nwritten: {}", runner.path().display(), path.display());
+        }
+        runner.end(part)?;
+        if *publish && part.writes_tables() {
+            let charts = results::charts(&out, name)?;
+            results::publish(&Section { name, title, body: &text, charts: &charts })?;
+        }
+        Ok(())
     }
 }
 
 fn pareto(sweep: &SweepArguments) -> Result<()> {
-    let scenes = sweep.scenes()?;
+    let (quick, steps) = (sweep.quick, sweep.steps(FULL_STEPS, FULL_STEPS / 5)?);
+    let views = if quick { VIEWS.1 } else { VIEWS.0 };
+    let scenes: Vec<(String, ())> = sweep.on.checked()?.into_iter().map(|scene| (scene, ())).collect();
     let run = |scene: &str, _: &(), runner: &mut Runner| {
-        let around = sweep.around(scene)?;
-        let mut lines = runner.run_all(around.first()?)?;
-        lines.extend(runner.run_all(around.combinations(&lines)?)?);
-        Ok(lines)
+        let (scene_arguments, place) = (sweep.on.command_line(scene), sweep.on.place(scene)?);
+        let around = points::Sweep { scene_arguments, place, views, steps, full_steps: FULL_STEPS, quick };
+        runner.run_all(around.points()?)
     };
-    sweep.sweep("pareto", &scenes, run, |name, _, lines, stem| {
+    sweep.sweep(["pareto", "Speed against accuracy"], &scenes, run, |name, _, lines, stem| {
         pareto::charts(name, lines, &pareto::COSTS, stem)?;
         Ok(pareto::table(lines, pareto::COSTS[0]))
-    })?;
-    let SittingArguments { part, publish, .. } = sweep.sitting;
-    if part.merge || part.shard.is_some() {
-        return Ok(());
-    }
-    kernels::run(&sweep.out("pareto"), sweep.quick, publish)
+    })
 }
 
 fn stability(arguments: &StabilityArguments) -> Result<()> {
@@ -282,30 +222,8 @@ fn stability(arguments: &StabilityArguments) -> Result<()> {
         of_scenes.push((scene, stability::Sweep { axes, steps, quick, max_runs: *max_runs }));
     }
     let run = |_: &str, of_scene: &stability::Sweep, runner: &mut Runner| of_scene.run(runner);
-    sweep.sweep("stability", &of_scenes, run, |name, of_scene, lines, stem| {
+    sweep.sweep(["stability", "Where methods break"], &of_scenes, run, |name, of_scene, lines, stem| {
         stability::charts(name, &of_scene.axes, lines, stem)?;
         Ok(format!("{}\n{}\n", stability::table(&of_scene.axes, lines), stability::finite(lines)))
     })
-}
-
-/// Prints and writes the table, and says what there is.
-fn finish(runner: &Runner, sitting: &SittingArguments, text: &str, name: &str) -> Result<()> {
-    if sitting.part.writes_tables() {
-        let log = runner.path();
-        let path = log.with_file_name(format!("{name}.md"));
-        write(&path, text)?;
-        say!("\n{text}\nwritten: {}\nwritten: {}", log.display(), path.display());
-    }
-    runner.end(&sitting.part)?;
-    if sitting.publish && sitting.part.writes_tables() {
-        let title = match name {
-            "pareto" => "Speed against accuracy",
-            "stability" => "Where methods break",
-            _ => "What a step costs",
-        };
-        let stem = if name == "cost" { "growth" } else { name };
-        let charts = results::charts(runner.path().parent().unwrap_or(Path::new(".")), stem)?;
-        results::publish(&Section { name, title, body: text, charts: &charts })?;
-    }
-    Ok(())
 }

@@ -28,10 +28,9 @@ pub const COSTS: [Cost; 3] = [
     ("-parameters", "parameters", |l| Some(l.outcome.parameters as f64)),
 ];
 
-const STYLES: [(Kind, &str, Style); 6] = [
+const STYLES: [(Kind, &str, Style); 5] = [
     (Kind::Base, "base", Style(6, Shape::Square)),
     (Kind::Change, "one change", Style(0, Shape::Circle)),
-    (Kind::Combination, "combination", Style(3, Shape::Circle)),
     (Kind::Preset, "preset", Style(2, Shape::Triangle)),
     (Kind::Baseline, "other method", Style(1, Shape::Ring)),
     (Kind::Baked, "baked", Style(4, Shape::Circle)),

@@ -1,10 +1,10 @@
-//! The sweep of `bench pareto`: one factor at a time, then what is worth combining.
+//! The sweep of `bench pareto`: one factor at a time.
 
 use anyhow::Result;
 use occnerf::{Config, Preset};
 
 use crate::methods::Method;
-use crate::sweep::{Job, Kind, Line, Place, Point};
+use crate::sweep::{Job, Kind, Place, Point};
 use xtask::settings;
 
 /// One change of one factor.
@@ -55,12 +55,6 @@ pub const CHANGES: [Change; 22] = [
 /// The baked base: with four samples a pixel, as `render --baked` draws, and with one.
 const BAKED: [(&str, bool); 2] = [("baked, four a pixel", true), ("baked, one a pixel", false)];
 
-/// A change that loses less than this, in dB, can be part of the lean combination, and one that
-/// gains more of the rich.
-const NOTHING: f64 = 0.03;
-/// A change that takes more than this part of the base's time does not save any.
-const SAVING: f64 = 0.98;
-
 /// What the sweep is made of.
 pub struct Sweep {
     pub place: Place,
@@ -74,18 +68,15 @@ pub struct Sweep {
     pub quick: bool,
 }
 
-/// Settings on top of a preset.
-pub struct Setting<'a> {
-    pub preset: Preset,
-    pub method: Method,
-    pub steps: u64,
-    pub set: &'a [&'a str],
-}
-
 impl Sweep {
-    /// A point of `bench pareto`.
-    pub fn point(&self, name: &str, factor: &str, kind: Kind, setting: &Setting<'_>) -> Result<Point> {
-        let Setting { preset, method, steps, set } = *setting;
+    /// A point of `bench pareto`, with settings on top of those of a preset.
+    fn point(
+        &self,
+        [name, factor]: [&str; 2],
+        kind: Kind,
+        (preset, method, steps): (Preset, Method, u64),
+        set: &[&str],
+    ) -> Result<Point> {
         let mut config = Config { steps, seed: 1, ..method.preset(preset) };
         for assignment in set {
             config = settings::set(&config, assignment)?;
@@ -112,11 +103,10 @@ impl Sweep {
         })
     }
 
-    /// Everything that does not depend on what others gave.
-    pub fn first(&self) -> Result<Vec<Point>> {
-        let fast = |method, steps, set| Setting { preset: Preset::Fast, method, steps, set };
-        let own = |kind, factor: &str, name: &str, method, steps, set: &'static [&'static str]| {
-            self.point(name, factor, kind, &fast(method, steps, set))
+    /// Its points, the base first.
+    pub fn points(&self) -> Result<Vec<Point>> {
+        let own = |kind, factor: &str, name: &str, method, steps, set: &[&str]| {
+            self.point([name, factor], kind, (Preset::Fast, method, steps), set)
         };
         let steps = self.steps;
         let mut points = vec![own(Kind::Base, "base", "base", Method::Occnerf, steps, &[])?];
@@ -143,8 +133,7 @@ impl Sweep {
             } else {
                 format!("{}, {steps} of {whole} steps", preset.name())
             };
-            let setting = Setting { preset, method: Method::Occnerf, steps, set: &[] };
-            let point = self.point(&name, "preset", Kind::Preset, &setting)?;
+            let point = self.point([&name, "preset"], Kind::Preset, (preset, Method::Occnerf, steps), &[])?;
             // Presets that differ by their steps alone are the base, and a change of its steps.
             let same = |p: &&mut Point| {
                 p.job.bake.is_none()
@@ -163,52 +152,6 @@ impl Sweep {
         }
         Ok(points)
     }
-
-    /// The best combinations of single changes: `lean` takes of each factor the fastest that loses
-    /// nothing, `rich` the one that gains most, `lean and rich` both, gain before speed. None where
-    /// they would be a point there is.
-    pub fn combinations(&self, lines: &[Line]) -> Result<Vec<Point>> {
-        let Some(base) = lines.iter().find(|l| l.point.kind == Kind::Base) else { return Ok(Vec::new()) };
-        let tried: Vec<(&Change, f64, f64)> = CHANGES
-            .iter()
-            .filter_map(|change| {
-                let line = lines.iter().find(|l| l.point.kind == Kind::Change && l.point.name == change.name)?;
-                let gain = worth(line)? - worth(base)?;
-                Some((change, gain, line.outcome.train_seconds / base.outcome.train_seconds))
-            })
-            .collect();
-        let of_factor = |wanted: &dyn Fn(f64, f64) -> bool, rank: &dyn Fn(f64, f64) -> f64| -> Vec<&Change> {
-            let mut best: Vec<(&Change, f64)> = Vec::new();
-            for &(change, gain, time) in tried.iter().filter(|t| wanted(t.1, t.2)) {
-                let rank = rank(gain, time);
-                match best.iter_mut().find(|(b, _)| b.factor == change.factor) {
-                    Some(old) if old.1 < rank => *old = (change, rank),
-                    Some(_) => {}
-                    None => best.push((change, rank)),
-                }
-            }
-            best.into_iter().map(|(change, _)| change).collect()
-        };
-        let lean = of_factor(&|gain, time| gain >= -NOTHING && time < SAVING, &|_, time| -time);
-        let rich = of_factor(&|gain, _| gain > NOTHING, &|gain, _| gain);
-        let mut both = rich.clone();
-        both.extend(lean.iter().copied().filter(|l| rich.iter().all(|r| r.factor != l.factor)));
-        let mut points: Vec<Point> = Vec::new();
-        for (name, changes) in [("lean", lean), ("rich", rich), ("lean and rich", both)] {
-            let set: Vec<&str> = changes.iter().flat_map(|c| c.set.iter().copied()).collect();
-            let setting = Setting { preset: Preset::Fast, method: Method::Occnerf, steps: self.steps, set: &set };
-            let point = self.point(name, "combination", Kind::Combination, &setting)?;
-            if changes.len() > 1 && points.iter().all(|p| p.job.config != point.job.config) {
-                points.push(point);
-            }
-        }
-        Ok(points)
-    }
-}
-
-/// What combinations go by: the mean of the two quantities that methods are ranked by, dB.
-pub fn worth(line: &Line) -> Option<f64> {
-    Some(0.5 * (line.outcome.psnr_mask? + line.outcome.psnr_hidden?))
 }
 
 #[cfg(test)]
@@ -216,7 +159,6 @@ pub fn worth(line: &Line) -> Option<f64> {
 mod tests {
     use super::*;
     use crate::bench::Difficulty;
-    use crate::sweep::tests::line;
 
     fn sweep(quick: bool) -> Sweep {
         let place = Place::Made(Difficulty::default());
@@ -226,7 +168,7 @@ mod tests {
     #[test]
     fn every_point_is_valid_has_a_name_of_its_own_and_a_command() {
         for quick in [false, true] {
-            let points = sweep(quick).first().unwrap();
+            let points = sweep(quick).points().unwrap();
             // "About 25 runs of the fast kind", beside presets and baselines.
             let fast = points.iter().filter(|p| matches!(p.kind, Kind::Base | Kind::Change)).count();
             assert!(fast <= if quick { 15 } else { 25 }, "{fast}");
@@ -244,32 +186,11 @@ mod tests {
     #[test]
     fn all_baked_points_are_of_the_base() {
         for quick in [false, true] {
-            let points = sweep(quick).first().unwrap();
+            let points = sweep(quick).points().unwrap();
             let base = points.iter().find(|p| p.kind == Kind::Base).unwrap();
             let baked: Vec<&Point> = points.iter().filter(|p| p.kind == Kind::Baked).collect();
             assert_eq!(baked.len(), BAKED.len());
             assert!(baked.iter().all(|p| p.job.config == base.job.config && p.job.bake.is_some()));
         }
-    }
-
-    #[test]
-    fn combinations_take_what_loses_nothing_and_what_gains() {
-        let lines = [
-            line("base", "base", Kind::Base, 20.0, 10.0),
-            line("48 samples", "samples", Kind::Change, 20.0, 6.0),
-            line("width 32", "field", Kind::Change, 19.0, 5.0),
-            line("k 1", "neighbours", Kind::Change, 20.0, 9.0),
-            line("4 features", "features", Kind::Change, 20.5, 12.0),
-            line("surface term", "surface term", Kind::Change, 20.2, 9.0),
-        ];
-        let points = sweep(false).combinations(&lines).unwrap();
-        let set = |name: &str| &points.iter().find(|p| p.name == name).unwrap().job.config;
-        let lean = set("lean");
-        assert_eq!((lean.samples, lean.surface.k, lean.surface.coarse_levels), (48, 1, 0));
-        assert_eq!((lean.field.width, lean.encoding.features), (64, 2));
-        assert_eq!((set("rich").samples, set("rich").encoding.features), (128, 4));
-        assert_eq!((set("lean and rich").samples, set("lean and rich").encoding.features), (48, 4));
-        assert!(sweep(false).combinations(&lines[1..]).unwrap().is_empty());
-        assert!(sweep(false).combinations(&lines[..1]).unwrap().is_empty());
     }
 }

@@ -1,9 +1,8 @@
 //! Where the error of a picture comes from.
 
 use glam::{IVec2, Vec3};
-use occnerf::bake::skeleton;
 use occnerf::capture::Pixels;
-use occnerf::{Error, Label, Lpips, PreparedFrame, Renderer, Rendering, Scene, nearest_vertices};
+use occnerf::{Error, Label, PreparedFrame, Renderer, Rendering, Scene, nearest_vertices};
 use serde::{Deserialize, Serialize};
 use volrender::metrics;
 
@@ -68,42 +67,17 @@ pub struct ViewBudget {
     pub psnr_unseen: Option<f64>,
     /// SSIM over the same pixels.
     pub ssim_unseen: Option<f64>,
-    /// LPIPS of the whole picture with everything else shown as it is; `None` without a network,
-    /// and like the others.
-    #[serde(default)]
-    pub lpips_unseen: Option<f64>,
-    /// The error by part of the body, those that are in the picture.
-    #[serde(default)]
-    pub parts: Vec<PartBudget>,
 }
 
-/// The error of a part of the body in one view.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct PartBudget {
-    /// The bone that moves the nearest vertices most; [`BESIDE`] for pixels that only one of person
-    /// and prior covers, or neither, and the picture does.
-    pub name: String,
-    /// Pixels.
-    pub pixels: u64,
-    /// Squared error, summed over them and their channels.
-    pub squared: f64,
-}
-
-/// What pixels are of that lie beside the person or beside the prior.
-pub const BESIDE: &str = "beside person or prior";
-
-/// Draws `frames` over black and splits the error of each by cause and by part of the body;
-/// `progress` hears of each picture and its pixels' shares (H × W).
-///
+/// Draws `frames` over black and splits the error of each by cause; `progress` hears of each
+/// picture and its pixels' shares (H × W).
 pub fn split_error(
     scene: &Scene,
     renderer: &mut dyn Renderer,
     frames: &[&PreparedFrame],
-    lpips: Option<&Lpips>,
     mut progress: impl FnMut(&PreparedFrame, &Rendering, &[Shares]),
 ) -> Result<Vec<ViewBudget>, Error> {
     let frequencies = scene.vertex_frequencies()?;
-    let bones = Bones::new(scene);
     let view = |frame: &&PreparedFrame| {
         let mut rendering = renderer.render(&frame.view, Vec3::ZERO)?;
         let truth = frame.pixels()?;
@@ -120,65 +94,15 @@ pub fn split_error(
         let (a, b) = (&rendering.image.pixels[..], &truth.image.pixels[..]);
         let (width, height) = (truth.image.width as usize, truth.image.height as usize);
         let enough = unseen.iter().filter(|&&unseen| unseen).count() >= FEWEST;
-        let lpips_unseen = match lpips.filter(|_| enough) {
-            Some(lpips) => {
-                let pick = |i: usize| if unseen[i / 3] { a[i] } else { b[i] };
-                lpips.distance(&(0..a.len()).map(pick).collect::<Vec<_>>(), b, width, height)?.first().copied()
-            }
-            None => None,
-        };
         Ok(ViewBudget {
             name: frame.name.clone(),
             camera: frame.camera_name.clone(),
             squared: [0, 1, 2, 3, 4].map(|cause: usize| shares.iter().map(|s| f64::from(s[cause])).sum()),
             psnr_unseen: if enough { metrics::psnr_masked(a, b, &unseen) } else { None },
             ssim_unseen: if enough { metrics::ssim_masked(a, b, &unseen, width, height) } else { None },
-            lpips_unseen,
-            parts: bones.parts(&nearest, &scored(frame, &truth, &rendering), &shares),
         })
     };
     frames.iter().map(view).collect()
-}
-
-/// The pixels (H × W) that the person or the picture of it covers, but unknown ones.
-fn scored(frame: &PreparedFrame, truth: &Pixels, rendering: &Rendering) -> Vec<bool> {
-    let mut scored: Vec<bool> = truth.mask.iter().zip(&rendering.opacity).map(|(&m, &o)| m.max(o) > 0.5).collect();
-    // Views of other cameras have no labels.
-    scored.iter_mut().zip(frame.labels.iter()).for_each(|(scored, label)| *scored &= label != Label::Unknown);
-    scored
-}
-
-/// Which bone moves each vertex most.
-struct Bones {
-    of: Vec<usize>,
-    names: Vec<String>,
-}
-
-impl Bones {
-    fn new(scene: &Scene) -> Self {
-        let (model, rest) = (&scene.body.model, &scene.body.canonical.joints);
-        let heaviest = |v: usize| model.weights.row(v).max_by(|a, b| a.1.total_cmp(&b.1)).map_or(0, |entry| entry.0);
-        let names = skeleton(&model.parents, rest).into_iter().map(|joint| joint.name);
-        Self {
-            of: (0..model.num_vertices()).map(heaviest).collect(),
-            names: names.chain([BESIDE.to_owned()]).collect(),
-        }
-    }
-
-    /// The error of each part, of the pixels that are `scored`.
-    fn parts(&self, nearest: &[Option<u32>], scored: &[bool], shares: &[Shares]) -> Vec<PartBudget> {
-        let mut sums = vec![(0, 0.0); self.names.len()];
-        for (i, shares) in shares.iter().enumerate() {
-            let squared = f64::from(shares.iter().sum::<f32>());
-            if scored[i] || squared > 0.0 {
-                let sum = &mut sums[nearest[i].map_or(self.names.len() - 1, |v| self.of[v as usize])];
-                *sum = (sum.0 + 1, sum.1 + squared);
-            }
-        }
-        let part =
-            |(name, (pixels, squared)): (&String, (u64, f64))| PartBudget { name: name.clone(), pixels, squared };
-        self.names.iter().zip(sums).filter(|(_, sum)| sum.0 > 0).map(part).collect()
-    }
 }
 
 /// Each pixel's error (H × W) by cause.
@@ -320,19 +244,6 @@ mod tests {
         }
         assert_eq!(parts(smaller, |_| false)[0], 1.0);
         assert_eq!(parts(moved, |_| true)[1], 1.0);
-    }
-
-    #[test]
-    fn parts_get_the_error_of_their_pixels_and_what_is_beside_the_prior_the_rest() {
-        let bones = Bones { of: vec![0, 1, 1], names: ["a", "b", BESIDE].map(str::to_owned).to_vec() };
-        let scored = [true, true, true, true, true, false];
-        let nearest = [Some(0), Some(1), Some(2), None, None, None];
-        let mut shares = [Shares::default(); 6];
-        [0.5, 0.25, 0.125, 1.0, 2.0].iter().enumerate().for_each(|(i, &error)| shares[i][i] = error);
-        let found = bones.parts(&nearest, &scored, &shares);
-        let expected = [("a", 1, 0.5), ("b", 2, 0.375), (BESIDE, 2, 3.0)];
-        let part = |(name, pixels, squared): (&str, u64, f64)| PartBudget { name: name.to_owned(), pixels, squared };
-        assert_eq!(found, expected.map(part));
     }
 
     #[test]

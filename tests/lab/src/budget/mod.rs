@@ -8,10 +8,9 @@ use anyhow::{Context, Result};
 use clap::Args;
 use image::{Rgb, RgbImage};
 use occnerf::bake::Avatar;
-use occnerf::{Lpips, Method, Model, PreparedFrame, PriorColors, Renderer, Rendering, Scene};
+use occnerf::{Method, Model, PreparedFrame, PriorColors, Renderer, Rendering, Scene};
 use xtask::baked;
 use xtask::eval::{Drawn, scored_frames};
-use xtask::network::load_lpips;
 use xtask::run::{make_directory, use_threads, write};
 use xtask::{pictures, say, table};
 
@@ -32,7 +31,7 @@ const BRIGHTEST: f32 = 0.5;
 /// Views in the picture.
 const VIEWS: usize = 10;
 /// Scores of never-seen surface.
-const UNSEEN: [&str; 3] = ["psnr_unseen", "ssim_unseen", "lpips_unseen"];
+const UNSEEN: [&str; 2] = ["psnr_unseen", "ssim_unseen"];
 /// Groups of three pictures in a row of it.
 const COLUMNS: usize = 2;
 
@@ -41,9 +40,6 @@ pub struct BudgetArguments {
     /// Run directories; each gets budget.json and renders/budget.png
     #[arg(required = true, value_name = "RUN")]
     runs: Vec<PathBuf>,
-    /// Weights to score LPIPS with, as in train
-    #[arg(long, value_name = "PATH")]
-    lpips: Option<PathBuf>,
     /// Threads [default: all cores]
     #[arg(long)]
     threads: Option<usize>,
@@ -52,7 +48,6 @@ pub struct BudgetArguments {
 /// Runs the command, on unseen views, or on training views where there are no others.
 pub fn budget(arguments: &BudgetArguments) -> Result<()> {
     use_threads(arguments.threads)?;
-    let lpips = load_lpips(arguments.lpips.as_deref())?;
     for directory in &arguments.runs {
         let (run, source) = scene::of_run(directory)?;
         let scene = source.scene(&run.train)?;
@@ -68,23 +63,17 @@ pub fn budget(arguments: &BudgetArguments) -> Result<()> {
         };
         let frames: Vec<&PreparedFrame> =
             if scene.eval.is_empty() { scored_frames(&scene).collect() } else { scene.eval.iter().collect() };
-        split(directory, &scene, drawn.renderer(&scene)?.as_mut(), &frames, lpips.as_ref())?;
+        split(directory, &scene, drawn.renderer(&scene)?.as_mut(), &frames)?;
     }
     Ok(())
 }
 
 /// Splits the error of `frames`, prints it and writes it below `directory`.
-fn split(
-    directory: &Path,
-    scene: &Scene,
-    renderer: &mut dyn Renderer,
-    frames: &[&PreparedFrame],
-    lpips: Option<&Lpips>,
-) -> Result<()> {
+fn split(directory: &Path, scene: &Scene, renderer: &mut dyn Renderer, frames: &[&PreparedFrame]) -> Result<()> {
     let stride = frames.len().div_ceil(VIEWS).max(1);
     let (mut drawn, mut index) = (Vec::new(), 0);
     let most = pictures::MAX_SHEET_PIXELS / (3 * VIEWS) as u64;
-    let views = split_error(scene, renderer, frames, lpips, |frame, rendering, shares| {
+    let views = split_error(scene, renderer, frames, |frame, rendering, shares| {
         if index % stride == 0 {
             drawn.push(pictures_of(frame, rendering, shares, most));
         }
@@ -122,33 +111,7 @@ fn markdown(views: &[ViewBudget]) -> String {
         lines.extend(cameras.iter().map(|camera| row(camera, views, |view| view.camera == *camera)));
     }
     lines.push(row("all", views, |_| true));
-    table::aligned(&lines, 1) + &by_part(views)
-}
-
-/// A row a part of the body over all views, the worst first: its pixels, its part of the error, and
-/// its PSNR. Parts with less than a hundredth of the error are left out. Nothing where no parts were
-/// told apart, as in what older versions wrote.
-fn by_part(views: &[ViewBudget]) -> String {
-    let mut sums: Vec<(&str, u64, f64)> = Vec::new();
-    for part in views.iter().flat_map(|view| &view.parts) {
-        match sums.iter_mut().find(|sum| sum.0 == part.name) {
-            Some(sum) => *sum = (sum.0, sum.1 + part.pixels, sum.2 + part.squared),
-            None => sums.push((&part.name, part.pixels, part.squared)),
-        }
-    }
-    if sums.is_empty() {
-        return String::new();
-    }
-    sums.sort_by(|a, b| b.2.total_cmp(&a.2));
-    let (pixels, squared) = sums.iter().fold((0, 0.0), |all, sum| (all.0 + sum.1, all.1 + sum.2));
-    let percent = |part: f64, whole: f64| format!("{:.1} %", 100.0 * part / whole.max(f64::MIN_POSITIVE));
-    let mut lines = vec![["part", "pixels", "error", "psnr"].map(str::to_owned).to_vec()];
-    for (name, own, error) in sums.into_iter().filter(|sum| sum.2 >= 0.01 * squared) {
-        let psnr = -10.0 * (error / (3.0 * own.max(1) as f64)).max(1e-10).log10();
-        let row = [name.to_owned(), percent(own as f64, pixels as f64), percent(error, squared), format!("{psnr:.2}")];
-        lines.push(row.to_vec());
-    }
-    format!("\n{}", table::aligned(&lines, 1))
+    table::aligned(&lines, 1)
 }
 
 fn row(name: &str, views: &[ViewBudget], takes: impl Fn(&ViewBudget) -> bool) -> Vec<String> {
@@ -168,7 +131,6 @@ fn row(name: &str, views: &[ViewBudget], takes: impl Fn(&ViewBudget) -> bool) ->
     row.extend(sums.iter().map(share));
     row.push(mean(|view| view.psnr_unseen).map_or("–".to_owned(), |v| format!("{v:.2}")));
     row.push(mean(|view| view.ssim_unseen).map_or("–".to_owned(), |v| format!("{v:.4}")));
-    row.push(mean(|view| view.lpips_unseen).map_or("–".to_owned(), |v| format!("{v:.4}")));
     row
 }
 
@@ -190,8 +152,6 @@ fn pictures_of(frame: &PreparedFrame, rendering: &Rendering, shares: &[Shares], 
 
 #[cfg(test)]
 mod tests {
-    use crate::budget::causes::PartBudget;
-
     use super::*;
 
     #[test]
@@ -202,13 +162,10 @@ mod tests {
             squared,
             psnr_unseen: None,
             ssim_unseen: Some(0.5),
-            lpips_unseen: None,
-            parts: vec![PartBudget { name: "head".to_owned(), pixels: 10, squared: squared[4] }],
         };
         let text = markdown(&[view("a", [1.0, 0.0, 0.0, 0.0, 0.0]), view("b", [0.0, 0.0, 0.0, 0.0, 1.0])]);
         let lines: Vec<&str> = text.lines().collect();
-        assert_eq!(lines.len(), 9);
-        assert!(lines[8].contains("head") && lines[8].contains("100.0 %") && lines[8].contains("17.78"), "{text}");
+        assert_eq!(lines.len(), 5);
         assert!(lines[2].contains("100.0 %") && lines[4].matches("50.0 % (+3.01 dB)").count() == 2, "{text}");
         assert!(lines[4].contains("0.5000") && lines[4].contains('–'), "{text}");
     }

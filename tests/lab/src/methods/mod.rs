@@ -19,10 +19,10 @@ use neighbours::Neighbours;
 use neural_body::NeuralBody;
 use self_nerf::SelfNerf;
 use xtask::eval::{Drawn, score_run, unscored};
-use xtask::process::{Lock, say};
+use xtask::process::say;
 use xtask::run::{Metrics, RunConfig};
 use xtask::source::Source;
-use xtask::train::finished;
+use xtask::train::unless_finished;
 
 /// Which model is trained; all share data, sampler, renderer, budget and the losses but
 /// completeness.
@@ -137,27 +137,23 @@ impl Method {
         if self.is_product() {
             return xtask::train::run_unless_finished(directory, name, run, source, lpips, interval);
         }
-        xtask::run::make_directory(&directory.join("renders"))?;
-        let _lock = Lock::take(directory)?;
-        if let Some(metrics) = finished(directory, directory, run)?.filter(|m| lpips.is_none() || m.lpips.is_some()) {
-            say!("{name}: finished earlier");
-            return Ok(metrics);
-        }
-        say!("{name}: training");
-        run.write(directory)?;
-        let scene = source.scene(&run.train)?;
-        let start = Instant::now();
-        let mut trainer = self.trainer(&scene, run.train.clone())?;
-        trainer.load_perceptual()?;
-        for _ in 0..run.train.steps {
-            trainer.step().with_context(|| name.to_owned())?;
-        }
-        let perceptual = trainer.perceptual();
-        let model = trainer.into_model();
-        let drawn = Drawn::Field { model: &model, perceptual };
-        let mut metrics = unscored(run, &drawn, start.elapsed().as_secs_f64());
-        metrics.method = self.name().to_owned();
-        score_run(directory, run, &scene, &drawn, lpips, metrics)
+        unless_finished(directory, directory, run, lpips, |_| {
+            say!("{name}: training");
+            run.write(directory)?;
+            let scene = source.scene(&run.train)?;
+            let start = Instant::now();
+            let mut trainer = self.trainer(&scene, run.train.clone())?;
+            trainer.load_perceptual()?;
+            for _ in 0..run.train.steps {
+                trainer.step().with_context(|| name.to_owned())?;
+            }
+            let perceptual = trainer.perceptual();
+            let model = trainer.into_model();
+            let drawn = Drawn::Field { model: &model, perceptual };
+            let mut metrics = unscored(run, &drawn, start.elapsed().as_secs_f64());
+            metrics.method = self.name().to_owned();
+            score_run(directory, run, &scene, &drawn, lpips, metrics)
+        })
     }
 }
 

@@ -1,6 +1,5 @@
 //! `reproduce`: the paper's table, and others made in the same way, on a user's data.
 
-mod curves;
 mod rows;
 mod summary;
 
@@ -9,17 +8,16 @@ use std::path::{Path, PathBuf};
 use anyhow::{Result, bail, ensure};
 use clap::Args;
 use occnerf::{Config, Preset};
-use synth::Perturbation;
 
 use crate::results::{self, Section};
-use crate::scene::{Corruption, SceneArguments, SceneOptions};
+use crate::scene::{SceneArguments, SceneOptions};
 use crate::sweep::{Job, Keep, Kind, Place, Point, Runner, SittingArguments};
 use rows::{Row, Table};
 use summary::Summary;
 use xtask::list::unique_name;
 use xtask::network::load_lpips;
 use xtask::process::say;
-use xtask::run::{self, make_directory};
+use xtask::run::make_directory;
 use xtask::settings;
 use xtask::source;
 use xtask::train::scene_name;
@@ -54,18 +52,12 @@ pub struct ReproduceArguments {
     /// Only these rows, comma separated, by the names of the table [default: all]
     #[arg(long, value_delimiter = ',', value_name = "ROW")]
     rows: Vec<String>,
-    /// How much wrong poses, shapes and masks cost: the main methods at each, one table
-    #[arg(long, group = "table")]
-    robustness: bool,
     /// The way from the paper's text to the default instead, one change a row
     #[arg(long, group = "table")]
     story: bool,
     /// What each component is worth instead: each left out, from our start, a grey and a faint one
     #[arg(long, group = "table")]
     components: bool,
-    /// How good methods are after fewer and more steps, and at other rates, instead
-    #[arg(long, group = "table")]
-    curves: bool,
     /// Settings of the default instead, one changed a row, scored on every fifth training frame,
     /// from whose pixels nothing is learnt
     #[arg(long, group = "table")]
@@ -78,10 +70,6 @@ pub struct ReproduceArguments {
 pub fn reproduce(arguments: &ReproduceArguments) -> Result<()> {
     let ReproduceArguments { sitting, .. } = arguments;
     let (table, rows, load) = (arguments.table(), arguments.rows()?, arguments.load.options()?);
-    ensure!(
-        table != Table::Robustness || load.corruption.wrong == Perturbation::NONE,
-        "--robustness goes through its own errors: leave --wrong-… out"
-    );
     let steps = arguments.steps.unwrap_or(Config::preset(arguments.preset, occnerf::Method::Occnerf).steps);
     let settings = format!("preset {}, {steps} steps a run, {} seeds", arguments.preset.name(), arguments.seeds);
     let demo = [source::DEMO.to_owned()];
@@ -123,34 +111,15 @@ struct Experiment<'a> {
 }
 
 impl<'a> Experiment<'a> {
-    /// Runs what is left of every level, and makes the tables.
+    /// Runs what is left, and makes the table.
     fn run(&mut self, runner: &mut Runner, load: &SceneOptions, directory: &Path) -> Result<()> {
         let (table, sitting) = (self.table, &self.arguments.sitting);
-        let mut levels = Vec::new();
-        for &(level, wrong) in table.levels() {
-            let robustness = table == Table::Robustness;
-            let at = if robustness { directory.join(level) } else { directory.to_owned() };
-            let wrong = if robustness { wrong } else { load.corruption.wrong };
-            let corruption = Corruption { wrong, ..load.corruption };
-            let summary = self.run_rows(runner, level, SceneOptions { corruption, ..load.clone() }, &at)?;
-            if sitting.part.writes_tables() {
-                levels.push((level, summary));
-            }
+        let summary = self.run_rows(runner, load.clone(), directory)?;
+        if !sitting.part.writes_tables() {
+            return Ok(());
         }
-        let Some((_, summary)) = levels.first() else { return Ok(()) };
         let name = scene_name(Some(self.scene));
-        if table == Table::Robustness {
-            let scores: Vec<_> = levels.iter().map(|(level, summary)| (*level, summary.scores())).collect();
-            let text = summary::by_level(&name, &scores);
-            run::write(&directory.join("robustness.md"), &text)?;
-            run::write(&directory.join("robustness.json"), &serde_json::to_string_pretty(&scores)?)?;
-            say!("\n{text}\nwritten: {}", directory.join("robustness.md").display());
-            return self.publish(&format!("{}.\n\n{text}", results::set_of(&name)), &[]);
-        }
         say!("\n{}", summary.markdown());
-        if table == Table::Curves {
-            summary.chart(directory, table.name())?;
-        }
         for name in ["md", "json", "png"].map(|extension| directory.join(summary.file(extension))) {
             if name.is_file() {
                 say!("written: {}", name.display());
@@ -168,13 +137,7 @@ impl<'a> Experiment<'a> {
     }
 
     /// Trains and scores every row that is not finished, with all its seeds.
-    fn run_rows(
-        &mut self,
-        runner: &mut Runner,
-        level: &str,
-        load: SceneOptions,
-        directory: &Path,
-    ) -> Result<Summary<'a>> {
+    fn run_rows(&mut self, runner: &mut Runner, load: SceneOptions, directory: &Path) -> Result<Summary<'a>> {
         let ReproduceArguments { body, seeds, preset, lpips, .. } = self.arguments;
         let load = load.identified(self.scene, body.as_deref())?;
         let tables = self.arguments.sitting.part.writes_tables();
@@ -199,7 +162,7 @@ impl<'a> Experiment<'a> {
                 let point = Point {
                     bench: self.table.name().to_owned(),
                     name: row.run(seed),
-                    factor: level.to_owned(),
+                    factor: "as-it-is".to_owned(),
                     level: None,
                     kind: Kind::Row,
                     command: None,
@@ -249,13 +212,7 @@ impl<'a> Experiment<'a> {
 
 impl ReproduceArguments {
     fn table(&self) -> Table {
-        let asked = [
-            (self.story, Table::Story),
-            (self.components, Table::Components),
-            (self.curves, Table::Curves),
-            (self.choices, Table::Choices),
-            (self.robustness, Table::Robustness),
-        ];
+        let asked = [(self.story, Table::Story), (self.components, Table::Components), (self.choices, Table::Choices)];
         asked.into_iter().find(|(asked, _)| *asked).map_or(Table::Methods, |(_, table)| table)
     }
 

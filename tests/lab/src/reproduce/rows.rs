@@ -3,8 +3,7 @@
 use anyhow::{Context, Result};
 use occnerf::{Config, OccludedRule, Preset};
 
-use crate::methods::{Method, scale_rates};
-use synth::Perturbation;
+use crate::methods::Method;
 use xtask::settings::set;
 
 /// A row of a table.
@@ -22,8 +21,6 @@ pub struct Row {
     preset: Option<Preset>,
     /// What differs from that, as `--set` takes it.
     changes: Vec<&'static str>,
-    /// Factor on every learning rate.
-    pub rates: f32,
     /// The row with the same settings whose people are baked, and scored so; `None`: people are
     /// trained.
     pub baked: Option<&'static str>,
@@ -38,34 +35,12 @@ pub enum Table {
     Story,
     /// Each component left out, from our start, a grey and a faint one.
     Components,
-    /// Methods by the number of steps, and by their rates.
-    Curves,
     /// Settings of the default, judged by training frames that are held out.
     Choices,
-    /// The main methods with a prior or masks made wrong.
-    Robustness,
 }
 
 use Method::{HashPoint, Humannerf, NeuralBody, Occnerf, Prior, SelfNerf, Surface};
 use OccludedRule::{Background, Unknown};
-
-/// Priors made wrong, each with the name of its directory.
-const LEVELS: [(&str, Perturbation); 9] = {
-    let none = Perturbation::NONE;
-    [
-        ("as-it-is", none),
-        ("pose-2", Perturbation { pose_degrees: 2.0, ..none }),
-        ("pose-5", Perturbation { pose_degrees: 5.0, ..none }),
-        ("pose-10", Perturbation { pose_degrees: 10.0, ..none }),
-        ("shape-1", Perturbation { shape: 1.0, ..none }),
-        ("shape-2", Perturbation { shape: 2.0, ..none }),
-        ("mask-minus-3", Perturbation { mask_pixels: -3, ..none }),
-        ("mask-minus-1", Perturbation { mask_pixels: -1, ..none }),
-        ("mask-plus-3", Perturbation { mask_pixels: 3, ..none }),
-    ]
-};
-/// The methods themselves, each by its best pixel rule, and the baseline's own.
-const MAIN: [&str; 5] = ["prior", "humannerf-style-bg", "humannerf-style", "hash-point", "occnerf"];
 
 /// Changes that make a start know nothing of the prior's colours and of how far its surface is.
 const GREY: [&str; 3] = ["field.prior_colors=false", "field.prior_light=false", "field.density_bias_outside=2"];
@@ -76,17 +51,6 @@ const HUMANNERF: [&str; 6] =
 
 /// A prior that is not corrected, in mean colours.
 const AS_GIVEN: [&str; 2] = ["registration.rounds=0", "field.prior_light=false"];
-
-/// Methods whose curves are drawn, and of each the numbers of steps and the rates, as factors; what
-/// all rows have comes first.
-const CURVES: [(&str, Method, OccludedRule); 4] = [
-    ("humannerf-style-bg", Humannerf, Background),
-    ("humannerf-style", Humannerf, Unknown),
-    ("hash-point", HashPoint, Unknown),
-    ("occnerf", Occnerf, Unknown),
-];
-const CURVE_STEPS: [f64; 6] = [1.0, 0.125, 0.25, 0.5, 2.0, 4.0];
-const CURVE_RATES: [f32; 2] = [0.33, 3.0];
 
 /// The same, with so little density, and samples so deep, that an empty inside can be seen through:
 /// where completeness has something to do.
@@ -181,7 +145,7 @@ const CHOICES: [(&str, &[&str]); 21] = [
 
 fn row(name: &str, method: Method, occluded: OccludedRule) -> Row {
     let (name, changes) = (name.to_owned(), Vec::new());
-    Row { name, method, occluded, times: 1.0, preset: None, changes, rates: 1.0, baked: None }
+    Row { name, method, occluded, times: 1.0, preset: None, changes, baked: None }
 }
 
 fn as_given() -> Row {
@@ -245,15 +209,6 @@ fn components() -> Vec<Row> {
     starts.into_iter().flat_map(of).collect()
 }
 
-fn curves() -> Vec<Row> {
-    let of = |(name, method, occluded): (&str, Method, OccludedRule)| {
-        let steps = CURVE_STEPS.map(|times| Row { times, ..row(&format!("{name}-x{times}"), method, occluded) });
-        let rates = CURVE_RATES.map(|rates| Row { rates, ..row(&format!("{name}-rates-x{rates}"), method, occluded) });
-        [steps.to_vec(), rates.to_vec()].concat()
-    };
-    CURVES.into_iter().flat_map(of).collect()
-}
-
 fn choices() -> Vec<Row> {
     let of = |(name, changes): (&str, &[&'static str])| Row {
         changes: [&[HELD_OUT], changes].concat(),
@@ -269,15 +224,8 @@ impl Table {
             Self::Methods => methods(),
             Self::Story => story(),
             Self::Components => components(),
-            Self::Curves => curves(),
             Self::Choices => choices(),
-            Self::Robustness => methods().into_iter().filter(|row| MAIN.contains(&&*row.name)).collect(),
         }
-    }
-
-    /// Errors of the prior that every row meets.
-    pub fn levels(self) -> &'static [(&'static str, Perturbation)] {
-        if self == Self::Robustness { &LEVELS } else { &LEVELS[..1] }
     }
 
     /// What its files and its section are called.
@@ -286,9 +234,7 @@ impl Table {
             Self::Methods => "reproduce",
             Self::Story => "story",
             Self::Components => "components",
-            Self::Curves => "curves",
             Self::Choices => "choices",
-            Self::Robustness => "robustness",
         }
     }
 
@@ -298,9 +244,7 @@ impl Table {
             Self::Methods => "Methods",
             Self::Story => "From the paper to the default",
             Self::Components => "What each component is worth",
-            Self::Curves => "Steps and rates of methods",
             Self::Choices => "Settings by training frames that are held out",
-            Self::Robustness => "A wrong prior",
         }
     }
 
@@ -323,7 +267,6 @@ impl Table {
             Self::Story => &["prior", "text", "registered-prior", "paper", "balanced"],
             Self::Components => &["ours-full", "ours-surface-term", "grey-full", "grey-surface-term"],
             Self::Choices => &["as-it-is", "samples-48", "surface-term"],
-            Self::Curves | Self::Robustness => &[],
         }
     }
 }
@@ -355,7 +298,6 @@ impl Row {
         for change in &self.changes {
             config = set(&config, change).with_context(|| format!("row {}: {change}", self.name))?;
         }
-        scale_rates(&mut config.rates, self.rates);
         config.validate()?;
         Ok(config)
     }
@@ -365,11 +307,11 @@ impl Row {
 mod tests {
     use super::*;
 
-    use Table::{Choices, Components, Curves, Methods, Robustness, Story};
+    use Table::{Choices, Components, Methods, Story};
 
     #[test]
     fn every_row_of_every_table_can_be_run_and_none_is_there_twice() {
-        for table in [Methods, Story, Components, Curves, Choices, Robustness] {
+        for table in [Methods, Story, Components, Choices] {
             let rows = table.rows();
             for (i, row) in rows.iter().enumerate() {
                 assert!(rows[..i].iter().all(|other| other.name != row.name), "{}", row.name);

@@ -7,7 +7,6 @@ use image::RgbImage;
 use occnerf::SplitMetrics;
 use serde::Serialize;
 
-use super::curves;
 use super::rows::{Row, Table};
 use crate::results;
 use xtask::run::{self, Metrics};
@@ -129,14 +128,9 @@ impl<'a> Summary<'a> {
         scene_name(Some(self.scene))
     }
 
-    /// The pictures of all methods under another name, for a folder with those of other scenes; of
-    /// curves their chart.
+    /// The pictures of all methods under another name, for a folder with those of other scenes.
     pub fn chart(&self, directory: &Path, name: &str) -> Result<PathBuf> {
         let copy = directory.join(format!("{name}.png"));
-        if self.table == Table::Curves {
-            let rows = self.rows.iter().map(|entry| (&*entry.name, &*entry.runs));
-            return curves::draw(&self.name(), rows, &copy);
-        }
         std::fs::copy(directory.join(self.file("png")), &copy).with_context(|| copy.display().to_string())?;
         Ok(copy)
     }
@@ -161,19 +155,6 @@ impl<'a> Summary<'a> {
             lines.push([vec![name, entry.occluded.clone(), steps, seconds], scores.to_vec()].concat());
         }
         table::aligned(&lines, 2)
-    }
-
-    /// What is ranked, row by row.
-    pub fn scores(&self) -> Vec<Score> {
-        let of = |entry: &Entry, pick: fn(&SplitMetrics) -> Option<f64>| {
-            entry.runs.iter().filter_map(|m| m.splits.first()).filter_map(|(_, split)| pick(split)).collect()
-        };
-        let score = |entry: &Entry| Score {
-            name: entry.name.clone(),
-            psnr_mask: of(entry, |s| s.psnr_mask),
-            psnr_hidden: of(entry, |s| s.psnr_hidden),
-        };
-        self.rows.iter().map(score).collect()
     }
 
     /// The name of one of its files, by the extension.
@@ -205,27 +186,6 @@ impl<'a> Summary<'a> {
         }
         pictures::save(&pictures::captioned(&pictures::sheet(&rows), &names)?, &directory.join(self.file("png")))
     }
-}
-
-/// What is ranked, of one row at one level.
-#[derive(Serialize)]
-pub struct Score {
-    name: String,
-    psnr_mask: Vec<f64>,
-    psnr_hidden: Vec<f64>,
-}
-
-/// A table with a line a level and two columns a row: psnr_mask and psnr_hidden.
-pub fn by_level(scene: &str, levels: &[(&str, Vec<Score>)]) -> String {
-    let mut lines = vec![vec!["prior".to_owned()]];
-    for (level, scores) in levels {
-        if lines.len() == 1 {
-            lines[0].extend(scores.iter().flat_map(|s| [s.name.clone(), "hidden".to_owned()]));
-        }
-        let cells = scores.iter().flat_map(|s| [cell(&s.psnr_mask, 2), cell(&s.psnr_hidden, 2)]);
-        lines.push(std::iter::once((*level).to_owned()).chain(cells).collect());
-    }
-    format!("# {scene}: psnr_mask and psnr_hidden with a wrong prior\n\n{}", table::aligned(&lines, 1))
 }
 
 /// Mean and, of several, standard deviation.

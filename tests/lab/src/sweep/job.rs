@@ -128,12 +128,6 @@ pub struct Outcome {
     pub mask_iou: Option<f64>,
     pub parameters: usize,
     pub peak_rss_bytes: u64,
-    /// Median of a step in the second half of the run, when buffers have grown to size.
-    pub step_seconds: f64,
-    /// Mean of a step.
-    pub live_samples: f64,
-    /// Of the body model.
-    pub vertices: usize,
     /// Left out by the optimiser.
     pub bad_gradients: usize,
     /// Losses of steps and numbers of scored pictures that are not finite.
@@ -199,7 +193,7 @@ fn measure(job: &Job) -> Result<Outcome> {
     let scene = Scene::new(&capture, &model, &job.config)?;
     drop(capture);
     let prepare_seconds = start.elapsed().as_secs_f64();
-    let mut outcome = Outcome { prepare_seconds, vertices: model.num_vertices(), ..Outcome::default() };
+    let mut outcome = Outcome { prepare_seconds, ..Outcome::default() };
     let start = Instant::now();
     if job.method == Method::Prior {
         let colors = PriorColors::measure(&scene)?;
@@ -215,22 +209,14 @@ fn measure(job: &Job) -> Result<Outcome> {
         score(&scene, &mut renderer, &mut outcome)?;
     } else {
         let mut trainer = job.method.trainer(&scene, job.config.clone())?;
-        let mut seconds = Vec::new();
-        for step in 0..job.config.steps {
-            let begun = Instant::now();
+        for _ in 0..job.config.steps {
             let report = trainer.step()?;
-            if 2 * step >= job.config.steps {
-                seconds.push(begun.elapsed().as_secs_f64());
-            }
             outcome.non_finite += usize::from(!report.loss.is_finite());
             outcome.bad_gradients += report.bad_gradients;
-            outcome.live_samples += report.live_samples as f64 / job.config.steps as f64;
         }
         let model = trainer.into_model();
         let baked = job.bake.map(|_| bake(&model, Some(&scene))).transpose()?;
         outcome.train_seconds = start.elapsed().as_secs_f64();
-        seconds.sort_by(f64::total_cmp);
-        outcome.step_seconds = seconds.get(seconds.len() / 2).copied().unwrap_or(0.0);
         outcome.parameters = model.num_parameters();
         match &baked {
             Some((avatar, _)) => {

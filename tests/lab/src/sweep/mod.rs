@@ -52,8 +52,6 @@ pub enum Kind {
     Base,
     /// One factor changed.
     Change,
-    /// Several at once.
-    Combination,
     /// A named preset as it is.
     Preset,
     /// Another method.
@@ -69,7 +67,7 @@ pub enum Kind {
 /// A named run.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Point {
-    /// `pareto`, `stability`, `cost`, or a table of `reproduce`.
+    /// `pareto`, `stability`, or a table of `reproduce`.
     pub bench: String,
     pub name: String,
     /// What is changed.

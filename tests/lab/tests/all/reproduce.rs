@@ -74,19 +74,7 @@ fn a_run_on_a_corrupted_capture_is_read_as_such_or_not_at_all() {
 }
 
 #[test]
-fn robustness_is_a_line_for_each_error_of_the_prior() {
-    let folder = folder("robustness");
-    let (capture, out) = (folder.join("capture"), folder.join("out"));
-    done(&["synth", "--out", text(&capture), "--size", "64", "--frames", "3", "--eval-cameras", "1"]);
-    let arguments = ["reproduce", text(&capture), "--robustness", "--out", text(&out), "--steps", "1", "--seeds", "1"];
-    done(&[&arguments[..], &["--rows", "prior,occnerf"]].concat());
-    let table = std::fs::read_to_string(out.join("capture/robustness/robustness.md")).unwrap();
-    assert_eq!(table.lines().filter(|line| line.starts_with('|')).count(), 2 + 9, "{table}");
-}
-
-#[test]
 fn unknown_rows_tables_and_captures_are_refused() {
     refused(&["reproduce", "--rows", "occnerv"], &["occnerv", "hash-point"]);
-    refused(&["reproduce", "--robustness", "--wrong", "real"], &["--wrong-"]);
     refused(&["reproduce", "/nowhere"], &["/nowhere"]);
 }

@@ -66,22 +66,6 @@ fn the_demo_of_the_product_is_what_the_command_writes() {
 }
 
 #[test]
-fn a_capture_is_corrupted_on_disk() {
-    let place = folder("corrupt");
-    let (capture, out) = (place.join("capture"), place.join("wrong"));
-    small(&capture, &[]);
-    let corrupt = ["corrupt", text(&capture), "--out", text(&out), "--wrong-pose", "5", "--wrong-mask", "-1"];
-    assert!(done(&corrupt).contains("4 frames, 2 views"));
-    refused(&corrupt, &["already holds a capture", "--force"]);
-    refused(&["corrupt", text(&out), "--out", text(&out), "--force"], &["lies in --out"]);
-    let read = |directory: &Path| xtask::source::load(Some(text(directory)), None, &LoadOptions::default()).unwrap();
-    let (right, wrong) = (read(&capture), read(&out));
-    let area = |source: &xtask::source::Source| source.capture.train[3].pixels().unwrap().mask.iter().sum::<f32>();
-    assert!(area(&wrong) < area(&right) && wrong.capture.train[0].pose != right.capture.train[0].pose);
-    assert_eq!(files(&place), 2, "nothing else is left beside them");
-}
-
-#[test]
 fn a_character_is_written_and_keeps_its_joints() {
     let Some(character) = testkit::files::shared("character/CesiumMan.glb") else { return };
     let out = folder("synth-character").join("capture");

@@ -5,12 +5,12 @@ use std::collections::HashMap;
 use glam::{Affine3A, DMat4, DVec4, Quat, Vec2, Vec3};
 use rayon::prelude::*;
 use rigged::Character;
-use smpl::{BodyModel, MotionClip, SparseRows};
+use smpl::{BodyModel, Joint, MotionClip, SparseRows};
 use visibility::RayMesh;
 
 use super::config::SynthConfig;
 use super::noise::smooth_noise;
-use super::perform::{Extent, Skeleton, brought, seconds};
+use super::perform::{Extent, brought, driven, seconds};
 use super::render::{Lamp, Posture};
 use super::stage::{Progress, Stage, ring};
 use super::texture::{decode, pattern, sample, tinted};
@@ -217,9 +217,15 @@ impl<'a> Figure<'a> {
     }
 
     fn driven(&self, clip: &MotionClip, frames: usize) -> Result<Vec<Vec<Affine3A>>, CaptureError> {
-        let names: Vec<&str> = self.joints.iter().map(|&old| self.character.joint_names[old].as_str()).collect();
-        let (joints, parents) = (&self.places, &self.body.parents);
-        Skeleton { names: &names, joints, parents, unit: self.unit }.driven(clip, frames)
+        let parts = self.joints.iter().zip(&self.places).zip(&self.body.parents);
+        let skeleton: Vec<Joint> = parts
+            .map(|((&old, &rest), parent)| Joint {
+                name: self.character.joint_names[old].clone(),
+                parent: parent.map(|p| p as u16),
+                rest,
+            })
+            .collect();
+        driven(clip, frames, &skeleton)
     }
 
     /// The rotations of bones that take rest to world; their stretch, if any, is lost.

@@ -4,7 +4,7 @@ use std::f32::consts::{FRAC_PI_2, TAU};
 
 use glam::{Affine3A, Quat, Vec3};
 use rayon::prelude::*;
-use smpl::{BodyModel, BoneNames, MotionClip, Placement, Shaped};
+use smpl::{BodyModel, BoneNames, Bvh, Joint, MotionClip, Placement, Shaped, joint_transforms};
 
 use crate::demo::landmarks::joint;
 use crate::demo::motion::Pose;
@@ -102,86 +102,34 @@ fn sample(clip: &MotionClip, seconds: f32, joints: usize) -> (Vec<Vec3>, Vec3) {
     }
 }
 
-/// SMPL's joint for each of a character's, told by their names; `None` for those that follow their
-/// parents.
-fn assign(names: &[&str]) -> Vec<Option<usize>> {
-    let smpl = BoneNames::Smpl.of_body(joint::COUNT);
-    let found = BoneNames::Smpl.translate(names).into_iter();
-    found.map(|name| name.and_then(|name| smpl.iter().position(|own| *own == name))).collect()
-}
-
-/// A skeleton to be driven: joints at rest, y up, facing +z, and their parents, each before its
-/// children.
-pub(super) struct Skeleton<'a> {
-    pub names: &'a [&'a str],
-    pub joints: &'a [Vec3],
-    pub parents: &'a [Option<usize>],
-    /// Length of a metre of a person 1.7 m tall.
-    pub unit: f32,
-}
-
-impl Skeleton<'_> {
-    /// Rest to world, (J), at each frame of `clip`.
-    ///
-    /// A bone takes the orientation in the world of its counterpart, with the limbs' directions at
-    /// rest made up for.
-    pub fn driven(&self, clip: &MotionClip, frames: usize) -> Result<Vec<Vec<Affine3A>>, CaptureError> {
-        let assigned = assign(self.names);
-        let place_of = |s: usize| assigned.iter().position(|a| *a == Some(s));
-        let needed = [
-            (joint::PELVIS, "hips"),
-            (joint::LEFT_HIP, "left upper leg"),
-            (joint::RIGHT_HIP, "right upper leg"),
-            (joint::LEFT_KNEE, "left lower leg"),
-            (joint::RIGHT_KNEE, "right lower leg"),
-            (joint::LEFT_SHOULDER, "left upper arm"),
-            (joint::RIGHT_SHOULDER, "right upper arm"),
-            (joint::LEFT_ELBOW, "left forearm"),
-            (joint::RIGHT_ELBOW, "right forearm"),
-        ];
-        let missing: Vec<&str> = needed.iter().filter(|(s, _)| place_of(*s).is_none()).map(|(_, name)| *name).collect();
-        if !missing.is_empty() {
-            let expected = "a character whose joints have the names of MakeHuman, Mixamo, Unreal or SMPL";
-            return Err(CaptureError::setting("motion", expected, format!("none for {}", missing.join(", "))));
-        }
-        let body = BodyModel::embedded();
-        let human = body.shaped(&[]);
-        // What turns the limb at rest into the counterpart's.
-        let mut aligned = vec![Quat::IDENTITY; joint::COUNT];
-        for (s, child) in [(1, 4), (2, 5), (4, 7), (5, 8), (16, 18), (17, 19), (18, 20), (19, 21)] {
-            if let (Some(from), Some(to)) = (place_of(s), place_of(child)) {
-                let direction = |a: Vec3, b: Vec3| (b - a).normalize_or(Vec3::NEG_Y);
-                let own = direction(self.joints[from], self.joints[to]);
-                aligned[s] = Quat::from_rotation_arc(own, direction(human.joints[s], human.joints[child]));
-            }
-        }
-        (aligned[20], aligned[21]) = (aligned[18], aligned[19]);
-
-        let up = upright(clip);
-        let frame = |i: usize| {
-            let (pose, translation) = sample(clip, seconds(clip.duration(), i, frames), joint::COUNT);
-            let mut global: Vec<Quat> = Vec::with_capacity(pose.len());
-            for (turn, parent) in pose.iter().zip(&body.parents) {
-                let above = parent.map_or(up, |p| global[p]);
-                global.push((above * Quat::from_scaled_axis(*turn)).normalize());
-            }
-            let root = up * (human.joints[joint::PELVIS] + translation) * self.unit;
-            let mut turns: Vec<Quat> = Vec::with_capacity(self.joints.len());
-            let mut places: Vec<Vec3> = Vec::with_capacity(self.joints.len());
-            for (j, parent) in self.parents.iter().enumerate() {
-                let above = parent.map_or(up, |p| turns[p]);
-                turns.push(assigned[j].map_or(above, |s| global[s] * aligned[s]));
-                places.push(parent.map_or(root, |p| places[p] + above * (self.joints[j] - self.joints[p])));
-            }
-            (0..self.joints.len())
-                .map(|j| {
-                    Affine3A::from_rotation_translation(turns[j], places[j])
-                        * Affine3A::from_translation(-self.joints[j])
-                })
-                .collect()
-        };
-        Ok((0..frames).map(frame).collect())
+/// Rest to world, (J), of a skeleton that rests y up and faces +z, at each of `frames` that show all of
+/// `clip`, which is of SMPL's joints.
+///
+/// # Errors
+/// What the skeleton lacks by name.
+pub(super) fn driven(clip: &MotionClip, frames: usize, skeleton: &[Joint]) -> Result<Vec<Vec<Affine3A>>, CaptureError> {
+    let body = BodyModel::embedded();
+    let human = BoneNames::Smpl.of_body(joint::COUNT).into_iter().zip(&body.parents).zip(body.shaped(&[]).joints);
+    let (mut poses, mut trans) = (Vec::new(), Vec::new());
+    for i in 0..frames {
+        let (pose, translation) = sample(clip, seconds(clip.duration(), i, frames), joint::COUNT);
+        poses.extend(pose);
+        trans.push(translation);
     }
+    let source = Bvh {
+        skeleton: human.map(|((name, parent), rest)| Joint { name, parent: parent.map(|p| p as u16), rest }).collect(),
+        motion: MotionClip { poses, num_joints: joint::COUNT, trans, fps: clip.fps },
+        unit: "m",
+    };
+    let motion = source.onto(skeleton).map_err(|fault| {
+        let expected = "a character whose joints have the names of MakeHuman, Mixamo, Unreal or SMPL";
+        CaptureError::setting("motion", expected, fault)
+    })?;
+    let up = Affine3A::from_quat(upright(clip));
+    let frame = |(pose, &translation): (&[Vec3], &Vec3)| {
+        joint_transforms(skeleton, pose, translation).into_iter().map(|bone| up * bone).collect()
+    };
+    Ok(motion.poses.chunks_exact(motion.num_joints).zip(&motion.trans).map(frame).collect())
 }
 
 #[cfg(test)]
@@ -192,24 +140,26 @@ mod tests {
     fn the_skeleton_that_a_clip_was_made_for_follows_it() {
         let body = BodyModel::embedded();
         let human = body.shaped(&[]);
-        let names = BoneNames::Smpl.of_body(joint::COUNT);
-        let names: Vec<&str> = names.iter().map(String::as_str).collect();
+        let names = BoneNames::Smpl.of_body(joint::COUNT).into_iter().zip(&body.parents);
+        let mut skeleton: Vec<Joint> = (names.zip(&human.joints))
+            .map(|((name, parent), &rest)| Joint { name, parent: parent.map(|p| p as u16), rest })
+            .collect();
         let mut poses = vec![Vec3::ZERO; 2 * joint::COUNT];
         for (j, pose) in poses.iter_mut().enumerate() {
             let j = j as f32;
             *pose = Vec3::new((1.7 * j).sin(), (2.3 * j).cos(), (3.1 * j).sin()) * 0.3;
         }
         let clip = MotionClip { poses, num_joints: 24, trans: vec![Vec3::new(0.2, 0.1, 0.3); 2], fps: 30.0 };
-        let skeleton = Skeleton { names: &names, joints: &human.joints, parents: &body.parents, unit: 1.0 };
-        let bones = &skeleton.driven(&clip, 1).unwrap()[0];
+        let bones = &driven(&clip, 1, &skeleton).unwrap()[0];
         let (pose, placement) = clip.at(0.0, 24);
         let posed = body.pose(&human, &pose, placement);
         for (j, (bone, expected)) in bones.iter().zip(&posed.bones).enumerate() {
             let at = human.joints[j] + Vec3::new(0.1, 0.2, -0.1);
             let off = bone.transform_point3(at).distance(expected.transform_point3(at));
-            assert!(off < 1e-4, "{}: {off}", names[j]);
+            assert!(off < 1e-4, "{}: {off}", skeleton[j].name);
         }
-        let message = Skeleton { names: &[""; 24], ..skeleton }.driven(&clip, 1).unwrap_err().to_string();
+        skeleton.iter_mut().for_each(|joint| joint.name.clear());
+        let message = driven(&clip, 1, &skeleton).unwrap_err().to_string();
         assert!(message.contains("motion") && message.contains("left forearm"), "{message}");
     }
 

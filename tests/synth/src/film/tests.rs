@@ -3,7 +3,7 @@ use smpl::MotionClip;
 
 use super::*;
 use crate::{DemoConfig, Obstacle, demo};
-use testkit::files::shared;
+use testkit::files::{glb, shared};
 
 fn small() -> SynthConfig {
     SynthConfig { size: 64, frames: 6, eval_cameras: 1, eval_every: 3, ..SynthConfig::default() }
@@ -209,7 +209,7 @@ fn plate(matrix: &str, positions: &[[f32; 3]]) -> Character {
     let (faces, count) = (bytes.len(), positions.len());
     bytes.extend([0u16, 1, 2, 0, 2, 3].iter().flat_map(|v| v.to_le_bytes()));
     let all = bytes.len();
-    let mut json = format!(
+    let json = format!(
         r#"{{"asset":{{"version":"2.0"}},"scene":0,"scenes":[{{"nodes":[0]}}],
         "nodes":[{{"mesh":0,"matrix":{matrix}}}],
         "meshes":[{{"primitives":[{{"attributes":{{"POSITION":0}},"indices":1}}]}}],
@@ -218,17 +218,7 @@ fn plate(matrix: &str, positions: &[[f32; 3]]) -> Character {
         "accessors":[{{"bufferView":0,"componentType":5126,"count":{count},"type":"VEC3","min":[0,0,0],"max":[0,0,0]}},
         {{"bufferView":1,"componentType":5123,"count":6,"type":"SCALAR"}}]}}"#
     );
-    while json.len() % 4 > 0 {
-        json.push(' ');
-    }
-    let mut file = b"glTF\x02\0\0\0".to_vec();
-    file.extend((28 + json.len() as u32 + all as u32).to_le_bytes());
-    for (kind, chunk) in [(b"JSON", json.as_bytes()), (b"BIN\0", bytes.as_slice())] {
-        file.extend((chunk.len() as u32).to_le_bytes());
-        file.extend(kind);
-        file.extend(chunk);
-    }
-    Character::from_bytes("plate.glb", &file).unwrap()
+    Character::from_bytes("plate.glb", &glb(json, &bytes)).unwrap()
 }
 
 const UNIT: &str = "[1,0,0,0, 0,1,0,0, 0,0,1,0, 0,0,0,1]";

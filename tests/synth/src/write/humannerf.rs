@@ -1,27 +1,20 @@
 //! HumanNeRF's prepared layout.
 
-use image::RgbImage;
 use smpl::{BodyModel, Placement};
 
-use super::folder::{Folder, extrinsics, flat, frame_mask, rows, unmixed};
+use super::folder::{Folder, extrinsics, flat, frame_mask, origin, rows, unmixed};
 use super::pickle::Py;
-use crate::demo::motion::Pose;
-use crate::perturbation::about_origin;
-use capture::{Capture, CaptureError, Frame};
+use crate::film::Synthetic;
+use capture::{CaptureError, Frame};
 
-/// `photograph` gives the picture of a training frame.
-pub(super) fn write(
-    capture: &Capture,
-    body: &BodyModel,
-    photograph: &(dyn Fn(usize) -> Result<RgbImage, CaptureError> + Sync),
-    folder: &Folder<'_>,
-) -> Result<(), CaptureError> {
+pub(super) fn write(synthetic: &Synthetic, folder: &Folder<'_>) -> Result<(), CaptureError> {
+    let Synthetic { capture, body, .. } = synthetic;
     let train: Vec<&Frame> = capture.train.iter().collect();
     view(body, folder, "", &train)?;
     let names = |kind: &str, below: &str, frames: &[&Frame]| -> Vec<String> {
         frames.iter().map(|f| format!("{below}{kind}/{}.png", f.name)).collect()
     };
-    folder.pictures(&names("images", "", &train), photograph)?;
+    folder.pictures(&names("images", "", &train), |i| synthetic.photograph(i, true))?;
     folder.pictures(&names("masks", "", &train), |i| frame_mask(train[i]))?;
     let shaped = body.shaped(&capture.mean_betas);
     let canonical = Py::record([
@@ -57,18 +50,12 @@ fn view(body: &BodyModel, folder: &Folder<'_>, below: &str, frames: &[&Frame]) -
     folder.file(&format!("{below}cameras.pkl"), Py::Dict(cameras.collect()).pickle())?;
     let infos = frames.iter().map(|frame| {
         let shaped = body.shaped(&frame.betas);
-        let (pose, rh, th) = match frame.placement {
-            Placement::Origin { rotation, translation } => (frame.pose.clone(), rotation, translation),
-            Placement::Pelvis { .. } => {
-                let Pose { joints, rotation, translation } = about_origin(frame, shaped.joints[0]);
-                (joints, rotation.to_scaled_axis(), translation)
-            }
-        };
-        let posed = body.pose(&shaped, &pose, Placement::default());
+        let (rh, th) = origin(frame);
+        let posed = body.pose(&shaped, &frame.pose, Placement::default());
         let info = Py::record([
             ("Rh", Py::floats(&[3], &rh.to_array())),
             ("Th", Py::floats(&[3], &th.to_array())),
-            ("poses", Py::floats(&[3 * pose.len()], &flat(&pose))),
+            ("poses", Py::floats(&[3 * frame.pose.len()], &flat(&frame.pose))),
             ("betas", Py::floats(&[frame.betas.len()], &frame.betas)),
             ("joints", Py::floats(&[posed.joints.len(), 3], &flat(&posed.joints))),
             ("tpose_joints", Py::floats(&[shaped.joints.len(), 3], &flat(&shaped.joints))),

@@ -11,34 +11,11 @@ mod zju;
 use std::path::Path;
 
 use image::RgbImage;
-use smpl::BodyModel;
 
 pub use self::folder::BODY;
 use self::folder::{Folder, rgb, unmixed};
 use crate::film::Synthetic;
-use capture::{Capture, CaptureError, Layout};
-
-/// Writes any capture into `dir` in HumanNeRF's prepared layout, with the body model as
-/// `body.safetensors`. Training frames that were read from files keep their photographs, others are
-/// black outside the mask. Neither masks of occluders nor key points are written: the layout has none.
-///
-/// # Errors
-/// As of [`Synthetic::write`], and for pictures that cannot be read.
-pub fn write_capture(
-    capture: &Capture,
-    body: &BodyModel,
-    dir: &Path,
-    progress: &(dyn Fn(usize) + Sync),
-) -> Result<(), CaptureError> {
-    let photograph = |i: usize| {
-        let source = &capture.train[i].source;
-        match source.photograph() {
-            Some(photograph) if !source.is_hidden() => photograph.map(|image| rgb(&image)),
-            _ => source.pixels().map(|pixels| unmixed(&pixels.image, &pixels.mask)),
-        }
-    };
-    humannerf::write(capture, body, &photograph, &Folder::new(dir, body, progress)?)
-}
+use capture::{CaptureError, Layout};
 
 impl Synthetic {
     /// Writes the capture into `dir`, which is made if it is not there, for `capture::load_capture`
@@ -56,7 +33,7 @@ impl Synthetic {
     pub fn write(&self, dir: &Path, layout: Layout, progress: &(dyn Fn(usize) + Sync)) -> Result<(), CaptureError> {
         let folder = Folder::new(dir, &self.body, progress)?;
         match layout {
-            Layout::HumanNerf => humannerf::write(&self.capture, &self.body, &|i| self.photograph(i, true), &folder),
+            Layout::HumanNerf => humannerf::write(self, &folder),
             Layout::ZjuMocap => zju::write(self, &folder),
             Layout::Wild => wild::write(self, &folder),
         }

@@ -1,6 +1,5 @@
 //! A small demo capture, settings that train it in milliseconds a step, and places for files.
 
-use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 
 use glam::Vec3;
@@ -8,6 +7,7 @@ use occnerf::capture::Capture;
 use occnerf::{Config, Method, MotionKind, PreparedFrame, Preset, Scene, StepReport, Trainer};
 use smpl::{BodyModel, Placement};
 use synth::{DemoConfig, demo};
+use testkit::files::Directory;
 use visibility::RayMesh;
 
 pub const METHODS: [Method; 2] = [Method::Occnerf, Method::HashPoint];
@@ -60,7 +60,7 @@ pub fn train(scene: &Scene, config: &Config, steps: u64) -> (Vec<StepReport>, Ve
 
 /// The bytes that a trainer saves.
 pub fn checkpoint(trainer: &Trainer<'_>) -> Vec<u8> {
-    let dir = TempDir::new("checkpoint");
+    let dir = Directory::new("checkpoint");
     let path = dir.path().join("checkpoint.safetensors");
     trainer.save(&path).unwrap();
     std::fs::read(path).unwrap()
@@ -112,28 +112,4 @@ pub fn placement() -> Placement {
 pub fn quantile(values: &mut [f32], share: f32) -> f32 {
     values.sort_by(f32::total_cmp);
     values[((values.len() - 1) as f32 * share) as usize]
-}
-
-/// A directory that is removed when dropped.
-pub struct TempDir(PathBuf);
-
-impl TempDir {
-    pub fn new(name: &str) -> Self {
-        static COUNT: std::sync::atomic::AtomicUsize = std::sync::atomic::AtomicUsize::new(0);
-        let count = COUNT.fetch_add(1, std::sync::atomic::Ordering::Relaxed);
-        let name = format!("{name}-{}-{count}", std::process::id());
-        let path = Path::new(env!("CARGO_TARGET_TMPDIR")).join(name);
-        std::fs::create_dir_all(&path).unwrap();
-        Self(path)
-    }
-
-    pub fn path(&self) -> &Path {
-        &self.0
-    }
-}
-
-impl Drop for TempDir {
-    fn drop(&mut self) {
-        let _ = std::fs::remove_dir_all(&self.0);
-    }
 }

@@ -1,6 +1,5 @@
 //! Small files of what is known of people: estimators' fits, tensors, and what a run keeps.
 
-use std::io::{Cursor, Write};
 use std::path::Path;
 
 use glam::{Affine3A, Mat3, Vec2, Vec3};
@@ -8,9 +7,8 @@ use occnerf::bake::{Atlas, Avatar, Clip, Joint};
 use occnerf::capture::{Light, LoadOptions, load_capture};
 use occnerf::{Config, Method, Person, Preset, PriorColors};
 use smpl::{MotionClip, SparseRows};
+use testkit::files::zip;
 use volrender::Camera;
-use zip::write::SimpleFileOptions;
-use zip::{CompressionMethod, ZipWriter};
 
 use super::{place, seeds};
 
@@ -137,12 +135,8 @@ pub fn tensors() -> Vec<Vec<u8>> {
         [&b"\x80\x02"[..], &dictionary(&[("a", tensor("0")), ("b", tensor("1"))]), b"."].concat()
     };
     let storages = [[0u8; 24], [63; 24]];
-    let mut zip = ZipWriter::new(Cursor::new(Vec::new()));
-    let stored = SimpleFileOptions::default().compression_method(CompressionMethod::Stored);
-    for (name, bytes) in [("data.pkl", &pickled(false)[..]), ("data/0", &storages[0]), ("data/1", &storages[1])] {
-        zip.start_file(format!("x/{name}"), stored).unwrap();
-        zip.write_all(bytes).unwrap();
-    }
+    let files = [("data.pkl", &pickled(false)[..]), ("data/0", &storages[0]), ("data/1", &storages[1])];
+    let archive = zip(files.map(|(name, bytes)| (format!("x/{name}"), bytes)));
     let mut legacy = b"\x80\x02\x8a\x0al\xfc\x9cF\xf9 j\xa8P\x19.\x80\x02M\xe9\x03.\x80\x02}.".to_vec();
     legacy.extend(pickled(true));
     legacy.extend(b"\x80\x02](U\x010U\x011e.");
@@ -150,7 +144,7 @@ pub fn tensors() -> Vec<Vec<u8>> {
         legacy.extend(6u64.to_le_bytes());
         legacy.extend(bytes);
     }
-    vec![zip.finish().unwrap().into_inner(), legacy]
+    vec![archive, legacy]
 }
 
 /// What a run keeps of a person of four vertices: its settings, and `person.safetensors` beside

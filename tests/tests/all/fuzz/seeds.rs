@@ -1,7 +1,7 @@
 //! Small real files of every kind, written by the crates themselves or by hand, and those of other
 //! programs that the repository has.
 
-use std::io::{Cursor, Write};
+use std::io::Cursor;
 use std::path::{Path, PathBuf};
 
 use array_files::{Data, NdArray, npz};
@@ -9,8 +9,7 @@ use glam::Vec3;
 use occnerf::capture::{LoadOptions, load_capture};
 use occnerf::{Config, Method, MotionKind, Preset, Scene, Trainer};
 use smpl::{BodyModel, SparseRows};
-use zip::write::SimpleFileOptions;
-use zip::{CompressionMethod, ZipWriter};
+use testkit::files::{glb, npy_of, zip};
 
 use super::place;
 use crate::common;
@@ -56,18 +55,11 @@ pub fn archives() -> Vec<Vec<u8>> {
 }
 
 pub fn arrays() -> Vec<Vec<u8>> {
-    let npy = |header: &str, bytes: Vec<u8>| {
-        let mut out = b"\x93NUMPY\x01\0".to_vec();
-        out.extend((header.len() as u16).to_le_bytes());
-        out.extend(header.as_bytes());
-        out.extend(bytes);
-        out
-    };
     vec![
-        npy("{'descr': '<f4', 'fortran_order': False, 'shape': (2, 3), }\n", vec![0; 24]),
-        npy("{'descr': '>i8', 'fortran_order': True, 'shape': (3, 2), }\n", vec![1; 48]),
-        npy("{'descr': '|b1', 'fortran_order': False, 'shape': (), }\n", vec![1]),
-        npy("{'descr': '<f2', 'fortran_order': False, 'shape': (5,), }\n", vec![7; 10]),
+        npy_of("{'descr': '<f4', 'fortran_order': False, 'shape': (2, 3), }\n", &[0; 24]),
+        npy_of("{'descr': '>i8', 'fortran_order': True, 'shape': (3, 2), }\n", &[1; 48]),
+        npy_of("{'descr': '|b1', 'fortran_order': False, 'shape': (), }\n", &[1]),
+        npy_of("{'descr': '<f2', 'fortran_order': False, 'shape': (5,), }\n", &[7; 10]),
     ]
 }
 
@@ -145,15 +137,7 @@ pub fn characters() -> Vec<Vec<u8>> {
 "bufferViews":[{}],"buffers":[{{"byteLength":180}}]}}"#,
         views.join(",")
     );
-    let mut out = b"glTF\x02\0\0\0".to_vec();
-    out.extend((28 + json.len() as u32 + binary.len() as u32).to_le_bytes());
-    out.extend((json.len() as u32).to_le_bytes());
-    out.extend(b"JSON");
-    out.extend(json.as_bytes());
-    out.extend((binary.len() as u32).to_le_bytes());
-    out.extend(b"BIN\0");
-    out.extend(binary);
-    vec![out]
+    vec![glb(json, &binary)]
 }
 
 pub fn meshes() -> Vec<Vec<u8>> {
@@ -238,13 +222,6 @@ pub fn weights() -> Vec<Vec<u8>> {
         pickle.extend(b"K\x06tQK\x00K\x02K\x03\x86K\x03K\x01\x86\x89ccollections\nOrderedDict\n)RtR");
     }
     pickle.extend(b"u.");
-    let mut zip = ZipWriter::new(Cursor::new(Vec::new()));
-    let stored = SimpleFileOptions::default().compression_method(CompressionMethod::Stored);
-    for (name, bytes) in
-        [("data.pkl", &pickle[..]), ("byteorder", b"little"), ("data/0", &[0; 24]), ("data/1", &[1; 24])]
-    {
-        zip.start_file(format!("weights/{name}"), stored).unwrap();
-        zip.write_all(bytes).unwrap();
-    }
-    vec![zip.finish().unwrap().into_inner()]
+    let files = [("data.pkl", &pickle[..]), ("byteorder", b"little"), ("data/0", &[0; 24]), ("data/1", &[1; 24])];
+    vec![zip(files.map(|(name, bytes)| (format!("weights/{name}"), bytes)))]
 }

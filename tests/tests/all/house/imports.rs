@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
-use super::tokens::{Token, closing, tokens, without_tests};
+use super::tokens::{Token, closing, tokens};
 
 /// (importer, where the names are defined) to the names; files relative to the crate's `src`.
 pub type Imports = BTreeMap<(String, String), BTreeSet<String>>;
@@ -53,7 +53,7 @@ pub fn imports(src: &Path) -> std::io::Result<Imports> {
 impl Crate {
     fn read(&mut self, file: &Path, path: Names) -> std::io::Result<()> {
         let text = std::fs::read_to_string(self.src.join(file))?;
-        let tokens = without_tests(&tokens(&text));
+        let tokens = tokens(&text);
         let mut children = Vec::new();
         self.scan(&tokens, &path, file, &mut children);
         for child in children {
