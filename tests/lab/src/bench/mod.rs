@@ -4,6 +4,7 @@ mod axes;
 pub mod chart;
 mod difficulty;
 mod front;
+mod kernels;
 mod pareto;
 mod points;
 mod stability;
@@ -40,6 +41,8 @@ enum What {
     /// What happens as it gets hard: less to see, worse poses, shorter videos, …; a table of breaking
     /// points and charts.
     Stability(StabilityArguments),
+    /// Cost against error of the geometric kernels.
+    Kernels(KernelArguments),
     /// One run, handed over on standard input.
     #[command(hide = true)]
     Point {
@@ -95,11 +98,25 @@ struct StabilityArguments {
     max_runs: usize,
 }
 
+#[derive(Args)]
+struct KernelArguments {
+    /// Where to write
+    #[arg(long, default_value = "runs/bench-kernels")]
+    out: PathBuf,
+    /// Fewer queries
+    #[arg(long)]
+    quick: bool,
+    /// Make what is found a section of tests/lab/RESULTS.md
+    #[arg(long)]
+    publish: bool,
+}
+
 /// Runs the command.
 pub fn bench(arguments: &BenchArguments) -> Result<()> {
     match &arguments.what {
         What::Pareto(arguments) => pareto(arguments),
         What::Stability(arguments) => stability(arguments),
+        What::Kernels(arguments) => kernels::run(&arguments.out, arguments.quick, arguments.publish),
         What::Point { threads } => {
             use_threads(*threads)?;
             job::serve()
