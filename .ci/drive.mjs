@@ -1,4 +1,4 @@
-// The checks of .ci/drive: node drive.mjs FOLDER. FOLDER holds person.glb, person.vrm, small.vrm,
+// The checks of .ci/drive: node drive.mjs FOLDER. FOLDER holds person.glb, lit.glb, person.vrm, small.vrm,
 // person.bvh, again.bvh and node/node_modules.
 import { readFileSync } from "node:fs";
 import { createRequire } from "node:module";
@@ -16,7 +16,7 @@ function check(holds, what) {
   if (!holds) failures += 1;
 }
 
-for (const name of ["person.glb", "person.vrm", "small.vrm"]) {
+for (const name of ["person.glb", "lit.glb", "person.vrm", "small.vrm"]) {
   const bytes = readFileSync(at(name));
   const { issues } = await require("gltf-validator").validateBytes(new Uint8Array(bytes));
   issues.messages.filter((m) => m.severity < 2).slice(0, 4).forEach((m) => console.log(`        ${m.code} ${m.pointer}: ${m.message}`));

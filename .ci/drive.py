@@ -1,9 +1,12 @@
 # Blender's checks of .ci/drive: blender --background --python drive.py -- FOLDER.
+import json
+import re
 import shutil
 import sys
 
 import bpy
 import numpy
+from mathutils import Matrix
 
 # Blender 3.4's reader of glTF beside a newer numpy.
 if "bool" not in numpy.__dict__:
@@ -13,6 +16,7 @@ from io_anim_bvh import import_bvh
 
 import_bvh.open = lambda path, mode="r": open(path, mode.replace("U", ""))
 
+SIDE = 256
 folder = sys.argv[sys.argv.index("--") + 1]
 failures = 0
 
@@ -38,6 +42,51 @@ def places(armature, frames):
     return out
 
 
+def pixels(path):
+    """A picture over white, rows from the bottom, sRGB from 0 to 1."""
+    image = bpy.data.images.load(path)
+    values = numpy.array(image.pixels[:]).reshape(image.size[1], image.size[0], 4)
+    return values[..., :3] * values[..., 3:] + 1 - values[..., 3:]
+
+
+def draw(camera, path):
+    """Cycles from a training camera."""
+    scene = bpy.context.scene
+    scene.render.engine, scene.cycles.samples, scene.cycles.use_denoising = "CYCLES", 32, False
+    scene.cycles.pixel_filter_type, scene.render.film_transparent = "BOX", True
+    scene.view_settings.view_transform = "Standard"
+    size = scene.render.resolution_x, scene.render.resolution_y = SIDE, SIDE * camera["size"][1] // camera["size"][0]
+    if scene.camera is None:
+        scene.camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
+        scene.collection.objects.link(scene.camera)
+    (fx, fy, cx, cy), (width, height) = camera["k"], camera["size"]
+    lens = scene.camera.data
+    lens.sensor_fit, lens.lens = "HORIZONTAL", fx / width * lens.sensor_width
+    scene.render.pixel_aspect_x, scene.render.pixel_aspect_y = 1, fx / fy
+    lens.shift_x, lens.shift_y = 0.5 - cx / width, (cy - height / 2) / width
+    rows = [camera["e"][4 * row : 4 * row + 4] for row in range(3)] + [[0, 0, 0, 1]]
+    # Blender's world has z up, its cameras look along -z.
+    to_world = Matrix.Rotation(numpy.pi / 2, 4, "X") @ Matrix(rows).inverted()
+    scene.camera.matrix_world = to_world @ Matrix.Diagonal((1, -1, -1, 1))
+    scene.render.filepath = path
+    bpy.ops.render.render(write_still=True)
+
+
+def compare(start, end):
+    """Five frames of the unlit person against what `render` draws, dB."""
+    page = open(f"{folder}/person.html").read()
+    cameras = json.loads(re.search(r'<script id="extra"[^>]*>(.*?)</script>', page, re.S)[1])["cameras"]
+    worst, last = numpy.inf, len(cameras) - 1
+    for frame in [i * last // 4 for i in range(5)]:
+        time = start + (end - start) * frame / last
+        bpy.context.scene.frame_set(int(time), subframe=time % 1)
+        path = f"{folder}/blender-{frame:04}.png"
+        draw(cameras[frame], path)
+        error = (pixels(path) - pixels(f"{folder}/movement/{frame:04}.png")) ** 2
+        worst = min(worst, -10 * numpy.log10(error.mean()))
+    check(worst >= 30, f"Blender draws five frames as we do: at least {worst:.2f} dB of 30")
+
+
 shutil.copy(f"{folder}/person.vrm", f"{folder}/vrm.glb")
 glb = read("person.glb", bpy.ops.import_scene.gltf)
 fps = bpy.context.scene.render.fps
@@ -46,6 +95,7 @@ steps = 5
 expected = places(glb, [start + (end - start) * i / steps for i in range(steps)])
 meshes = [o for o in bpy.data.objects if o.type == "MESH" and o.find_armature()]
 check(len(meshes) == 1 and meshes[0].data.materials, f"Blender {bpy.app.version_string} reads the GLB: {len(glb.pose.bones)} bones, {end - start:.0f} frames")
+compare(start, end)
 vrm = read("vrm.glb", bpy.ops.import_scene.gltf)
 found = places(vrm, [start + (end - start) * i / steps for i in range(steps)])
 worst = max((a[name] - b[name]).length for a, b in zip(expected, found) for name in a)

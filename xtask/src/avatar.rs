@@ -3,14 +3,47 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, anyhow, ensure};
+use clap::Args;
 use glam::Vec3;
 use occnerf::Method;
 use occnerf::bake::{Avatar, Clip, export};
 use smpl::{Bvh, Joint, MotionClip};
 
 use crate::baked;
-use crate::process::{Lock, say, telling, unwritten};
+use crate::process::{Lock, note, say, telling, unwritten};
 use crate::run::{CHECKPOINT, RunConfig, identity};
+
+/// Options that make an avatar smaller.
+#[derive(Args)]
+pub struct Sizes {
+    /// Most triangles; vertices are merged, those on seams of the texture along them, until there are
+    /// no more [default: as they are]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    pub triangles: Option<u32>,
+    /// Longest side of the texture, texels; halved until it is no longer [default: as it is]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    pub texture: Option<u32>,
+    /// Texture as JPEG of this quality, 1 to 100, in place of PNG
+    #[arg(long, value_name = "QUALITY", value_parser = clap::value_parser!(u8).range(1..=100))]
+    pub jpeg: Option<u8>,
+}
+
+impl Sizes {
+    /// Reduces triangles and texture.
+    pub fn apply(&self, avatar: &mut Avatar) -> Result<()> {
+        if let Some(most) = self.triangles {
+            avatar.simplify(most as usize)?;
+            let left = avatar.faces.len();
+            if left > most as usize {
+                note!("--triangles {most}: {left} are left, fewer would tear seams or turn triangles over");
+            }
+        }
+        if let Some(side) = self.texture {
+            avatar.atlas.shrink(side);
+        }
+        Ok(())
+    }
+}
 
 /// The surface of a run, or its baked person, see [`baked::avatar`]; and the lock on the run.
 pub fn of_run(run: &Path) -> Result<(Avatar, Lock)> {

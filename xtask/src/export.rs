@@ -1,9 +1,9 @@
 //! `export`: a trained person in standard formats.
 
 use std::io::Write;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
-use anyhow::{Context, Error, Result, bail};
+use anyhow::{Context, Error, Result, bail, ensure};
 use clap::{Args, ValueEnum};
 use glam::Vec3;
 use occnerf::bake::export::{GlbOptions, VRM_LICENCE, Vrm};
@@ -11,7 +11,7 @@ use occnerf::bake::{Avatar, export};
 use occnerf::replace_file;
 use smpl::{BoneNames, Bvh};
 
-use crate::avatar;
+use crate::avatar::{self, Sizes};
 use crate::process::{results_in, say, unwritten};
 
 /// Largest triangle edge of a splat, metres.
@@ -66,16 +66,17 @@ pub struct ExportArguments {
     /// Frame of the motion whose pose a ply or an obj shows [default: the first]
     #[arg(long, value_name = "N")]
     frame: Option<usize>,
+    /// A ply of every frame of the motion, NAME-0000.ply and on
+    #[arg(long, conflicts_with = "frame")]
+    frames: bool,
     /// Names of the joints in a glb, vrm or bvh; those of rigged characters stay
     #[arg(long, value_enum, default_value = "smpl")]
     bones: Bones,
-    /// Longest side of the texture of a glb or vrm, texels; halved until it is no longer [default:
-    /// as it is]
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
-    texture: Option<u32>,
-    /// Texture of a glb or vrm as JPEG of this quality, 1 to 100, in place of PNG
-    #[arg(long, value_name = "QUALITY", value_parser = clap::value_parser!(u8).range(1..=100))]
-    jpeg: Option<u8>,
+    /// A glb or vrm that is shaded by the lights of the scene it stands in [default: drawn as it is]
+    #[arg(long)]
+    lit: bool,
+    #[command(flatten)]
+    sizes: Sizes,
     /// Author that a vrm names [default: unknown]
     #[arg(long, value_name = "NAME")]
     author: Option<String>,
@@ -89,15 +90,22 @@ pub struct ExportArguments {
 pub fn export(arguments: &ExportArguments) -> Result<()> {
     let out = &arguments.out;
     let format = format(arguments)?;
-    if arguments.frame.is_some() && !matches!(format, Format::Ply | Format::Obj) {
-        bail!("--frame is of one pose: --format ply or obj");
-    }
-    let has_texture = matches!(format, Format::Glb | Format::Vrm);
-    if !has_texture && (arguments.texture.is_some() || arguments.jpeg.is_some()) {
-        bail!("--texture and --jpeg are of a glb or vrm");
-    }
-    if format != Format::Vrm && (arguments.author.is_some() || arguments.licence.is_some()) {
-        bail!("--author and --licence are of a vrm");
+    let sizes = &arguments.sizes;
+    let skinned = matches!(format, Format::Glb | Format::Vrm);
+    let still = matches!(format, Format::Ply | Format::Obj);
+    for (given, fits, what) in [
+        (arguments.frame.is_some(), still, "--frame is of one pose: --format ply or obj"),
+        (arguments.frames, format == Format::Ply, "--frames is of a ply"),
+        (sizes.texture.is_some() || sizes.jpeg.is_some(), skinned, "--texture and --jpeg are of a glb or vrm"),
+        (arguments.lit, skinned, "--lit is of a glb or vrm"),
+        (sizes.triangles.is_some(), skinned || still, "--triangles is of a glb, vrm, ply or obj"),
+        (
+            arguments.author.is_some() || arguments.licence.is_some(),
+            format == Format::Vrm,
+            "--author and --licence are of a vrm",
+        ),
+    ] {
+        ensure!(fits || !given, what);
     }
     let (mut person, _lock) = avatar::of_run(&arguments.run)?;
     if let Some(path) = &arguments.motion {
@@ -105,9 +113,7 @@ pub fn export(arguments: &ExportArguments) -> Result<()> {
     }
     let clip = if arguments.motion.is_some() { person.clips.len() - 1 } else { 0 };
     rename(&mut person, arguments.bones);
-    if let Some(side) = arguments.texture {
-        person.atlas.shrink(side);
-    }
+    sizes.apply(&mut person)?;
     // The folder is made only now, so that bad input leaves nothing behind.
     avatar::check_folder(out)?;
     match format {
@@ -115,20 +121,30 @@ pub fn export(arguments: &ExportArguments) -> Result<()> {
             let author = arguments.author.as_deref().unwrap_or("unknown");
             let vrm = Vrm { author, licence: arguments.licence.as_deref().unwrap_or(VRM_LICENCE) };
             let vrm = Some(vrm).filter(|_| format == Format::Vrm);
-            let bytes = person.to_glb_with(&GlbOptions { jpeg: arguments.jpeg, vrm })?;
+            let bytes = person.to_glb_with(&GlbOptions { jpeg: sizes.jpeg, lit: arguments.lit, vrm })?;
             replace_file(out, |to| to.write_all(&bytes)).map_err(unwritten(out))?;
             let names: Vec<&str> = person.clips.iter().map(|clip| clip.name.as_str()).collect();
             let size = bytes.len() as f64 * 1e-6;
             say!("{}: {size:.1} MB, {} triangles, motions: {}", out.display(), person.faces.len(), names.join(", "));
         }
         Format::Ply => {
-            let (vertices, _) = posed(&person, clip, arguments)?;
-            let splats = export::splats(&person, &vertices, PATCH)?;
-            splats.write(out).map_err(Error::from).map_err(results_in(out))?;
-            say!("{}: {} splats", out.display(), splats.centres.len());
+            let write = |frame: usize, out: &Path| -> Result<()> {
+                let (vertices, _) = posed(&person, clip, frame)?;
+                let splats = export::splats(&person, &vertices, PATCH)?;
+                splats.write(out).map_err(Error::from).map_err(results_in(out))?;
+                say!("{}: {} splats", out.display(), splats.centres.len());
+                Ok(())
+            };
+            if !arguments.frames {
+                return write(arguments.frame.unwrap_or(0), out);
+            }
+            let name = out.file_stem().unwrap_or_default().to_string_lossy();
+            for frame in 0..person.clips.get(clip).map_or(0, |clip| clip.motion.num_frames()) {
+                write(frame, &out.with_file_name(format!("{name}-{frame:04}.ply")))?;
+            }
         }
         Format::Obj => {
-            let (vertices, normals) = posed(&person, clip, arguments)?;
+            let (vertices, normals) = posed(&person, clip, arguments.frame.unwrap_or(0))?;
             export::write_obj(&person, &vertices, &normals, out)
                 .map_err(Error::from)
                 .map_err(results_in(out.parent().unwrap_or(out)))?;
@@ -179,10 +195,10 @@ fn rename(person: &mut Avatar, bones: Bones) {
     });
 }
 
-/// Vertices and normals of the person at `--frame`.
-fn posed(person: &Avatar, clip: usize, arguments: &ExportArguments) -> Result<(Vec<Vec3>, Vec<Vec3>)> {
+/// Vertices and normals of the person at a frame of a clip.
+fn posed(person: &Avatar, clip: usize, frame: usize) -> Result<(Vec<Vec3>, Vec<Vec3>)> {
     let motion = &person.clips.get(clip).context("the person has no motion")?.motion;
-    let (frame, frames) = (arguments.frame.unwrap_or(0), motion.num_frames());
+    let frames = motion.num_frames();
     if frame >= frames {
         bail!("--frame {frame}: the motion has frames 0 to {}", frames - 1);
     }

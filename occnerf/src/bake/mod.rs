@@ -11,6 +11,7 @@ mod paint;
 mod plate;
 mod refine;
 mod saved;
+mod simplify;
 mod skeleton;
 mod surface;
 #[cfg(test)]

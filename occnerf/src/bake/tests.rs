@@ -317,8 +317,11 @@ fn a_fitted_surface_covers_unseen_views_better_than_the_prior_alike_on_any_numbe
     avatar.validate().unwrap();
     assert!(report.errors[1] < report.errors[0], "{report:?}");
     let (prior, _) = known(&given, |_, d| if d < 0.0 { 5000.0 } else { 0.0 });
-    let [fitted, bare] = [&avatar, &prior].map(|avatar| overlap(&given, avatar));
+    let mut fewer = avatar.clone();
+    fewer.simplify(avatar.faces.len() / 3).unwrap();
+    let [fitted, bare, fewer] = [&avatar, &prior, &fewer].map(|avatar| overlap(&given, avatar));
     assert!(1.0 - fitted < 0.8 * (1.0 - bare), "{fitted} for {bare}");
+    assert!(fewer > fitted - 0.005, "{fewer} for {fitted} with a third of the triangles");
     // Nothing is learnt from what is not seen, and nothing breaks.
     for frame in &mut capture.train {
         let mut pixels = frame.pixels().unwrap();

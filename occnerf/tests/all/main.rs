@@ -19,6 +19,7 @@ mod on_demand;
 mod perceptual;
 mod person;
 mod readme;
+mod simplify;
 #[path = "common/stand_in.rs"]
 mod stand_in;
 

@@ -8,10 +8,11 @@ use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use clap::Args;
 use occnerf::bake::Avatar;
+use occnerf::bake::export::GlbOptions;
 use serde_json::{Value, json};
 use volrender::Camera;
 
-use crate::avatar;
+use crate::avatar::{self, Sizes};
 use crate::html::escape;
 use crate::process::say;
 use crate::report;
@@ -32,6 +33,8 @@ pub struct ViewArguments {
     /// Frames per second of every --motion [default: as the files say]
     #[arg(long, value_name = "N", requires = "motion")]
     fps: Option<f32>,
+    #[command(flatten)]
+    sizes: Sizes,
     /// Where to [default: RUN/person.html]
     #[arg(long, value_name = "FILE")]
     out: Option<PathBuf>,
@@ -43,9 +46,10 @@ pub fn view(arguments: &ViewArguments) -> Result<()> {
     for path in &arguments.motion {
         avatar::add_motion(&mut person, path, arguments.fps)?;
     }
+    arguments.sizes.apply(&mut person)?;
     let out = arguments.out.clone().unwrap_or_else(|| arguments.run.join(PERSON));
     avatar::check_folder(&out)?;
-    let page = page(&person)?;
+    let page = page(&person, arguments.sizes.jpeg)?;
     crate::run::write(&out, &page)?;
     if arguments.out.is_none() {
         report::refresh(&arguments.run)?;
@@ -54,8 +58,8 @@ pub fn view(arguments: &ViewArguments) -> Result<()> {
     Ok(())
 }
 
-/// The whole page.
-pub fn page(person: &Avatar) -> Result<String> {
+/// The whole page, its texture as JPEG of quality `jpeg` or as PNG.
+fn page(person: &Avatar, jpeg: Option<u8>) -> Result<String> {
     let name = if person.name.is_empty() { "person" } else { &person.name };
     let extra = json!({
         "cameras": person.cameras.iter().map(camera).collect::<Vec<_>>(),
@@ -63,7 +67,7 @@ pub fn page(person: &Avatar) -> Result<String> {
         "confidence": STANDARD.encode(person.atlas.confidence_to_png()?),
     });
     let facts = format!("{} triangles, {} joints", person.faces.len(), person.num_joints());
-    let glb = STANDARD.encode(person.to_glb()?);
+    let glb = STANDARD.encode(person.to_glb_with(&GlbOptions { jpeg, ..Default::default() })?);
     let mut hasher = DefaultHasher::new();
     (&glb, name).hash(&mut hasher);
     let nonce = format!("{:016x}", hasher.finish());

@@ -353,10 +353,10 @@ function say(text) {
 async function start() {
   const extra = JSON.parse(element("extra").textContent);
   const person = new Person(bytesOf(element("avatar").textContent));
-  const picture = (bytes) => createImageBitmap(new Blob([bytes], { type: "image/png" }),
-    { premultiplyAlpha: "none", colorSpaceConversion: "none" });
+  const picture = (blob) => createImageBitmap(blob, { premultiplyAlpha: "none", colorSpaceConversion: "none" });
+  const confidence = new Blob([bytesOf(extra.confidence)], { type: "image/png" });
   // Before the first drawing, which would show a grey person.
-  const textures = await Promise.all([picture(person.picture()), picture(bytesOf(extra.confidence))]);
+  const textures = await Promise.all([picture(person.picture()), picture(confidence)]);
   new Page(person, extra).scene.paint(...textures);
   document.documentElement.dataset.ready = "true";
 }

@@ -64,8 +64,9 @@ class Person {
   }
 
   picture() {
-    const view = this.json.bufferViews[this.json.images[0].bufferView];
-    return this.binary.subarray(view.byteOffset, view.byteOffset + view.byteLength);
+    const { bufferView, mimeType } = this.json.images[0];
+    const view = this.json.bufferViews[bufferView];
+    return new Blob([this.binary.subarray(view.byteOffset, view.byteOffset + view.byteLength)], { type: mimeType });
   }
 
   clip(animation) {

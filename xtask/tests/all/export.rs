@@ -125,8 +125,32 @@ fn what_others_drive_is_named_as_asked_stands_and_comes_back() {
     std::fs::write(&bvh, tail).unwrap();
     let glb = run.join("tail.glb");
     refused(&["export", text(&run), "--out", text(&glb), "--motion", text(&bvh)], &["person.bvh", "left upper leg"]);
-    for option in [["--author", "x"], ["--jpeg", "80"], ["--texture", "64"]] {
-        refused(&[&["export", text(&run), "--out", text(&bvh)], &option[..]].concat(), &[option[0]]);
+    let materials = |name: &str, more: &[&str]| {
+        let root = json(&export(name, more).0);
+        (root["extensionsUsed"].clone(), root["materials"][0].clone())
+    };
+    let (used, material) = materials("lit.glb", &["--lit"]);
+    assert!(used.is_null() && material["extensions"].is_null(), "{used} {material}");
+    assert_eq!(material["pbrMetallicRoughness"]["metallicFactor"], 0.0);
+    assert_eq!(materials("lit.vrm", &["--lit"]).0, serde_json::json!(["VRMC_vrm"]));
+    assert_eq!(materials("unlit.glb", &[]).0, serde_json::json!(["KHR_materials_unlit"]));
+    let faces = |glb: &Path| rigged::Character::load(glb).unwrap().faces.len();
+    // Each triangle of the stand-in is a chart of its own.
+    let least = run.join("least.glb");
+    let output = common::xtask(&["export", text(&run), "--out", text(&least), "--triangles", "1"]);
+    let said = String::from_utf8(output.stderr).unwrap();
+    assert!(output.status.success() && said.contains(&format!("{} are left", faces(&least))), "{said}");
+    export("move.ply", &["--frames"]);
+    assert!((0..3).all(|frame| run.join(format!("move-{frame:04}.ply")).exists()) && !run.join("move.ply").exists());
+    for option in [
+        &["--author", "x"][..],
+        &["--jpeg", "80"],
+        &["--texture", "64"],
+        &["--lit"],
+        &["--frames"],
+        &["--triangles", "9"],
+    ] {
+        refused(&[&["export", text(&run), "--out", text(&bvh)], option].concat(), &[option[0]]);
     }
 }
 

@@ -26,8 +26,16 @@ fn a_surface_is_trained_scored_drawn_exported_and_shown() {
         done(&["export", text(&run), "--out", text(&run.join(out))]);
         assert!(run.join(out).is_file(), "{out}");
     }
+    let (most, small) = (person.faces.len() / 2, run.join("small.glb"));
+    let fewer = ["--triangles", &most.to_string(), "--texture", "128", "--jpeg", "85"];
+    done(&[&["export", text(&run), "--out", text(&small)], &fewer[..]].concat());
+    let faces = rigged::Character::load(&small).unwrap().faces.len();
+    assert!(faces <= most && faces * 10 > most * 9, "{faces} of {most}");
     done(&["view", text(&run)]);
-    assert!(run.join("person.html").is_file());
+    let page = std::fs::read(run.join("person.html")).unwrap();
+    let shared = run.join("shared.html");
+    done(&[&["view", text(&run), "--out", text(&shared)], &fewer[..]].concat());
+    assert!(std::fs::read(&shared).unwrap().len() < page.len());
     done(&["render", text(&run), "freeview", "--size", "16x16"]);
     assert_eq!(std::fs::read(&avatar).unwrap(), written, "drawing bakes nothing");
     // Again, from the start: nothing is lost without a word.

@@ -25,6 +25,9 @@ const CLAMP_TO_EDGE: u32 = 33071;
 pub struct GlbOptions<'a> {
     /// The atlas as JPEG of this quality, 1 to 100, in place of PNG.
     pub jpeg: Option<u8>,
+    /// Shaded by the lights of the scene it stands in, in place of `KHR_materials_unlit`. The atlas is
+    /// the same: the light of the video is in neither.
+    pub lit: bool,
     /// Makes a VRM of it, see [`Avatar::to_glb_with`].
     pub vrm: Option<Vrm<'a>>,
 }
@@ -51,12 +54,12 @@ impl Avatar {
     /// As [`Avatar::to_glb`]; [`Error::Bake`] for a VRM of a skeleton without the fifteen joints that
     /// it must have.
     pub fn to_glb_with(&self, options: &GlbOptions<'_>) -> Result<Vec<u8>, Error> {
-        let Some(vrm) = &options.vrm else { return self.gltf(options.jpeg, None) };
+        let Some(vrm) = &options.vrm else { return self.gltf(options, None) };
         self.validate().map_err(Error::Bake)?;
-        self.with_level_arms()?.gltf(options.jpeg, Some(vrm.extension(self)?))
+        self.with_level_arms()?.gltf(options, Some(vrm.extension(self)?))
     }
 
-    fn gltf(&self, jpeg: Option<u8>, vrm: Option<Value>) -> Result<Vec<u8>, Error> {
+    fn gltf(&self, options: &GlbOptions<'_>, vrm: Option<Value>) -> Result<Vec<u8>, Error> {
         self.validate().map_err(Error::Bake)?;
         let mut file = File::default();
         let attributes = attributes(self, &mut file);
@@ -64,7 +67,7 @@ impl Avatar {
         let bind: Vec<f32> = self.skeleton.iter().flat_map(|joint| inverse_bind(joint.rest)).collect();
         let bind = file.floats(&bind, "MAT4", None);
         let animations: Vec<Value> = self.clips.iter().map(|clip| animation(self, clip, &mut file)).collect();
-        let (picture, kind) = match jpeg {
+        let (picture, kind) = match options.jpeg {
             Some(quality) => (self.atlas.to_jpeg(quality)?, "image/jpeg"),
             None => (self.atlas.to_png()?, "image/png"),
         };
@@ -86,7 +89,6 @@ impl Avatar {
         nodes.push(json!({ "name": "person", "mesh": 0, "skin": 0 }));
         let mut root = json!({
             "asset": { "version": "2.0", "generator": concat!("occnerf ", env!("CARGO_PKG_VERSION")) },
-            "extensionsUsed": ["KHR_materials_unlit"],
             "scene": 0,
             "scenes": [{
                 "name": self.name,
@@ -102,7 +104,6 @@ impl Avatar {
                 "pbrMetallicRoughness": {
                     "baseColorTexture": { "index": 0 }, "metallicFactor": 0.0, "roughnessFactor": 0.9
                 },
-                "extensions": { "KHR_materials_unlit": {} },
             }],
             "textures": [{ "source": 0, "sampler": 0 }],
             "samplers": [{ "magFilter": LINEAR, "minFilter": LINEAR, "wrapS": CLAMP_TO_EDGE, "wrapT": CLAMP_TO_EDGE }],
@@ -114,9 +115,17 @@ impl Avatar {
         if !animations.is_empty() {
             root["animations"] = json!(animations);
         }
+        let mut extensions = Vec::new();
+        if !options.lit {
+            extensions.push("KHR_materials_unlit");
+            root["materials"][0]["extensions"] = json!({ "KHR_materials_unlit": {} });
+        }
         if let Some(vrm) = vrm {
-            root["extensionsUsed"] = json!(["KHR_materials_unlit", "VRMC_vrm"]);
+            extensions.push("VRMC_vrm");
             root["extensions"] = json!({ "VRMC_vrm": vrm });
+        }
+        if !extensions.is_empty() {
+            root["extensionsUsed"] = json!(extensions);
         }
         container(&root, file.bytes)
     }
