@@ -18,9 +18,9 @@ use visibility::Samples;
 
 use crate::network::{load_lpips, network_name};
 use crate::optimise::logged_seconds;
-use crate::process::{Ending, Lock, is_read_only, note, one_line, say};
+use crate::process::{Ending, Lock, is_read_only, note, one_line, peak_rss_bytes, say};
 use crate::report::{self, SHEETS};
-use crate::run::{self, Metrics, RunConfig, Splits, TRAINING_VIEWS, evaluation_title, make_directory, peak_rss_bytes};
+use crate::run::{self, Metrics, RunConfig, Splits, TRAINING_VIEWS, evaluation_title, make_directory};
 use crate::{baked, pictures, table};
 
 /// Stride of scored training frames.

@@ -302,13 +302,6 @@ pub fn read_text(path: &Path) -> Result<String> {
     Ok(String::from_utf8_lossy(&bytes).into_owned())
 }
 
-/// Peak resident set of this process; 0 where unknown.
-pub fn peak_rss_bytes() -> u64 {
-    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
-    let line = status.lines().find_map(|l| l.strip_prefix("VmHWM:"));
-    line.and_then(|l| l.trim().trim_end_matches(" kB").parse::<u64>().ok()).unwrap_or(0) * 1024
-}
-
 /// Creates a directory and its parents.
 ///
 /// # Errors
@@ -358,35 +351,4 @@ pub fn use_threads(threads: Option<usize>) -> Result<()> {
     let number = check_threads(threads)?;
     let built = rayon::ThreadPoolBuilder::new().num_threads(number).build_global();
     built.with_context(|| format!("{number} threads cannot be started (--threads gives another number)"))
-}
-
-/// A number of a file under /proc, where there is one.
-fn number(path: &str, key: &str) -> Option<u64> {
-    let text = read_text(Path::new(path)).ok()?;
-    let line = text.lines().find_map(|line| line.strip_prefix(key))?;
-    line.split_whitespace().next()?.parse().ok()
-}
-
-/// Free memory of the machine, where the system says.
-pub fn free_bytes() -> Option<u64> {
-    number("/proc/meminfo", "MemAvailable:").map(|kib| kib << 10)
-}
-
-/// Address space of the program itself: code, stacks and what the allocator reserves, bytes.
-const PROGRAM: u64 = 192 << 20;
-
-/// Checks that the process's address space has room for that much memory in all. An allocation beyond its limit
-/// aborts.
-///
-/// # Errors
-/// If the limit is lower.
-pub fn check_memory(bytes: u64) -> Result<()> {
-    let need = (PROGRAM + bytes) >> 20;
-    let limit = number("/proc/self/limits", "Max address space").map_or(u64::MAX, |limit| limit >> 20);
-    ensure!(
-        need <= limit,
-        "memory: about {need} MiB are needed, the process is limited to {limit} (ulimit -v); raise that, or load \
-         less (--memory, --resize, --max-frames)"
-    );
-    Ok(())
 }

@@ -13,8 +13,7 @@ use serde::Serialize;
 use sha2::{Digest, Sha256};
 use smpl::BodyModel;
 
-use crate::process::telling;
-use crate::run::check_memory;
+use crate::process::{check_memory, telling};
 
 /// Name of the scene that needs no other files.
 pub const DEMO: &str = "demo";

@@ -14,11 +14,10 @@ use crate::baked;
 use crate::eval::{Drawn, Split, check_pictures, score_run, scored_frames, unscored};
 use crate::network::{load_lpips, network_name};
 use crate::optimise::{RunOptions, SavingArguments, optimise};
-use crate::process::{Lock, note, results_in, say, still_held, telling};
+use crate::process::{Lock, check_memory, free_bytes, note, peak_rss_bytes, results_in, say, still_held, telling};
 use crate::report;
 use crate::run::{
-    self, AVATAR, CHECKPOINT, METRICS, Metrics, RunConfig, Verdict, check_memory, existing_directory, free_bytes,
-    make_directory, new_directory, peak_rss_bytes,
+    self, AVATAR, CHECKPOINT, METRICS, Metrics, RunConfig, Verdict, existing_directory, make_directory, new_directory,
 };
 use crate::settings::{HOLD_OUT, SettingArguments};
 use crate::shard::ShardArguments;

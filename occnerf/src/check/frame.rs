@@ -2,8 +2,6 @@
 
 use volrender::Camera;
 
-use super::limbs::Limb;
-
 /// A fault of one frame.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[non_exhaustive]
@@ -33,6 +31,39 @@ impl Fault {
             Self::PoseJump => "jump of pose",
             Self::Limb(limb) => limb.words_elsewhere(),
             Self::Background => "mask beyond the body",
+        }
+    }
+}
+
+/// A limb, of the person's own left or right.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum Limb {
+    /// From the shoulder.
+    LeftArm,
+    /// From the shoulder.
+    RightArm,
+    /// From the hip.
+    LeftLeg,
+    /// From the hip.
+    RightLeg,
+}
+
+impl Limb {
+    /// All of them.
+    pub const ALL: [Self; 4] = [Self::LeftArm, Self::RightArm, Self::LeftLeg, Self::RightLeg];
+
+    fn words_elsewhere(self) -> &'static str {
+        ["left arm elsewhere", "right arm elsewhere", "left leg elsewhere", "right leg elsewhere"][self as usize]
+    }
+
+    /// Names of the joints that it turns at.
+    pub(super) fn joints(self) -> [&'static str; 2] {
+        match self {
+            Self::LeftArm => ["left_shoulder", "left_elbow"],
+            Self::RightArm => ["right_shoulder", "right_elbow"],
+            Self::LeftLeg => ["left_hip", "left_knee"],
+            Self::RightLeg => ["right_hip", "right_knee"],
         }
     }
 }

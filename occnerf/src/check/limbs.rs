@@ -3,7 +3,7 @@
 use glam::{Quat, Vec2, Vec3};
 use smpl::{BodyModel, BoneNames, Posed};
 
-use super::frame::{Fault, View};
+use super::frame::{Fault, Limb, View};
 use crate::scene::labels::squared_distance;
 
 /// Distance of close clothes from the silhouette, and largest distance of clothes and hair, metres.
@@ -18,39 +18,6 @@ const OUTSIDE: f32 = 0.5;
 /// Directions that limbs are rotated to, and most vertices and pixels that are compared.
 const DIRECTIONS: usize = 48;
 const SAMPLES: usize = 96;
-
-/// A limb, of the person's own left or right.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-#[non_exhaustive]
-pub enum Limb {
-    /// From the shoulder.
-    LeftArm,
-    /// From the shoulder.
-    RightArm,
-    /// From the hip.
-    LeftLeg,
-    /// From the hip.
-    RightLeg,
-}
-
-impl Limb {
-    /// All of them.
-    pub const ALL: [Self; 4] = [Self::LeftArm, Self::RightArm, Self::LeftLeg, Self::RightLeg];
-
-    pub(super) fn words_elsewhere(self) -> &'static str {
-        ["left arm elsewhere", "right arm elsewhere", "left leg elsewhere", "right leg elsewhere"][self as usize]
-    }
-
-    /// Names of the joints that it turns at.
-    fn joints(self) -> [&'static str; 2] {
-        match self {
-            Self::LeftArm => ["left_shoulder", "left_elbow"],
-            Self::RightArm => ["right_shoulder", "right_elbow"],
-            Self::LeftLeg => ["left_hip", "left_knee"],
-            Self::RightLeg => ["right_hip", "right_knee"],
-        }
-    }
-}
 
 /// A limb from one of its joints on.
 pub(super) struct Part {

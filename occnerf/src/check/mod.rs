@@ -10,8 +10,7 @@ mod mistakes;
 #[cfg(test)]
 mod tests;
 
-pub use self::frame::Fault;
-pub use self::limbs::Limb;
+pub use self::frame::{Fault, Limb};
 pub use self::mistakes::Mistake;
 
 use glam::{Vec2, Vec3};

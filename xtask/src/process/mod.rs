@@ -2,6 +2,7 @@
 
 mod ending;
 mod lock;
+mod memory;
 mod print;
 mod program;
 mod progress;
@@ -9,6 +10,7 @@ mod stop;
 
 pub use self::ending::{Ending, delivered, described, is_read_only, one_line, results_in, unwritten};
 pub use self::lock::{Lock, still_held};
+pub use self::memory::{check_memory, free_bytes, peak_rss_bytes};
 pub use self::print::{err, out};
 pub use self::program::{EXIT_CODES, program};
 pub use self::progress::telling;
