@@ -52,6 +52,18 @@ impl<T: Copy> SparseRows<T> {
         self.columns[range.clone()].iter().zip(&self.values[range]).map(|(&column, &value)| (column as usize, value))
     }
 
+    /// The column of the largest value of row `row`, of equal ones the last; `None` for an empty row.
+    ///
+    /// # Panics
+    /// If `row` is out of range.
+    #[must_use]
+    pub fn heaviest(&self, row: usize) -> Option<usize>
+    where
+        T: Into<f64>,
+    {
+        self.row(row).max_by(|a, b| a.1.into().total_cmp(&b.1.into())).map(|(column, _)| column)
+    }
+
     /// The first fault of the structure.
     pub(crate) fn fault(&self, rows: usize, columns: usize) -> Option<String> {
         if self.offsets.len() != rows + 1 {

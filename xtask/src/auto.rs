@@ -120,8 +120,7 @@ fn parts(scene: &Scene, frame: &PreparedFrame) -> Result<Vec<usize>> {
     let names = skeleton(&model.parents, &vec![Vec3::ZERO; model.parents.len()]);
     let part =
         |joint: usize| PARTS.iter().position(|(_, words)| words.iter().any(|word| names[joint].name.contains(word)));
-    let heaviest =
-        |v: u32| model.weights.row(v as usize).max_by(|a, b| a.1.total_cmp(&b.1)).map_or(0, |(joint, _)| joint);
+    let heaviest = |v: u32| model.weights.heaviest(v as usize).unwrap_or(0);
     let (view, options) = (pinhole(&frame.view.camera), RasterOptions::default());
     let drawn = Rasterizer::default().faces(&frame.view.posed.vertices, &model.faces, &view, &options)?;
     let at = |fragment: Option<visibility::Fragment>| {

@@ -110,16 +110,15 @@ const USABLE: f32 = 0.3;
 
 /// The fit's grade by its mean overlap and the share of frames that do not fit, and what to do about it.
 fn grade(iou: f32, wrong: f32) -> String {
-    let frames = format!("{:.0} % of the frames do not fit", 100.0 * wrong);
     if iou >= 0.85 && wrong <= GOOD {
-        "fit: good".to_owned()
-    } else if iou >= 0.65 && wrong <= USABLE {
-        format!(
-            "fit: usable, {frames} (registration moves the bodies onto the pictures; 2-D key points help: import --keypoints)"
-        )
-    } else {
-        format!("fit: poor, {frames} (see the picture: wrong masks, or a fit that training will not mend)")
+        return "fit: good".to_owned();
     }
+    let (grade, advice) = if iou >= 0.65 && wrong <= USABLE {
+        ("usable", "registration moves the bodies onto the pictures; 2-D key points help: import --keypoints")
+    } else {
+        ("poor", "see the picture: wrong masks, or a fit that training will not mend")
+    };
+    format!("fit: {grade}, overlap {iou:.2}, {:.0} % of the frames off ({advice})", 100.0 * wrong)
 }
 
 /// Shares of the masks beyond 5 cm of the body up to which they are good, and usable.

@@ -260,7 +260,7 @@ fn say_memory(scene: &Scene, config: &Config) -> Result<()> {
         return Ok(());
     }
     let mut trial = Trainer::new(scene, config.clone())?;
-    // So few that poses are taught, too.
+    // With this schedule pose corrections are trained within the trial, too.
     trial.set_steps(TRIED);
     trial.load_perceptual()?;
     // Each with its gradient and two moments.

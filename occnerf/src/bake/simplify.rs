@@ -13,10 +13,6 @@ use crate::Error;
 const POSES: usize = 4;
 /// Coordinates of a vertex: its places in all poses, and in the atlas.
 const N: usize = 3 * POSES + 2;
-/// Weight of lengths in the atlas, over those on the surface.
-const TEXTURE: f64 = 1.0;
-/// Weight of the distance from seams and borders.
-const SEAM: f64 = 1.0;
 /// Weight of the distance from collapsed vertices, for triangles of even shape where all is flat.
 const EVEN: f64 = 1e-3;
 /// Least cosine between a triangle's normals before and after a collapse.
@@ -240,7 +236,7 @@ fn places(avatar: &Avatar) -> Vec<Place> {
         DVec2::new((b - a).cross(c - a).length().into(), (q - p).perp_dot(r - p).abs().into())
     };
     let areas: DVec2 = avatar.faces.iter().map(area).sum();
-    let scale = if areas.y > 0.0 { TEXTURE * (areas.x / areas.y).sqrt() } else { 0.0 };
+    let scale = if areas.y > 0.0 { (areas.x / areas.y).sqrt() } else { 0.0 };
     let place = |v: usize| {
         let mut place = [0.0; N];
         for (at, pose) in place.chunks_exact_mut(3).zip(poses.iter().cycle()) {
@@ -273,7 +269,7 @@ fn errors(places: &[Place], faces: &[[u32; 3]]) -> Vec<Quadric> {
             error.add_plane(&up, a, -area);
             if !all.contains(&(w, v)) {
                 for end in [v, w] {
-                    out[end as usize].add_plane(&up, a, SEAM * dot(&edge, &edge));
+                    out[end as usize].add_plane(&up, a, dot(&edge, &edge));
                 }
             }
         }

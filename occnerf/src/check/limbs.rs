@@ -29,9 +29,7 @@ pub(super) struct Part {
 /// The parts of a body's limbs; none where the skeleton is not SMPL's.
 pub(super) fn parts(body: &BodyModel) -> Vec<Part> {
     let names = BoneNames::Smpl.of_body(body.parents.len());
-    let heaviest: Vec<usize> = (0..body.num_vertices())
-        .map(|v| body.weights.row(v).max_by(|a, b| a.1.total_cmp(&b.1)).map_or(0, |(joint, _)| joint))
-        .collect();
+    let heaviest: Vec<usize> = (0..body.num_vertices()).map(|v| body.weights.heaviest(v).unwrap_or(0)).collect();
     let part = |limb: Limb, name: &str| {
         let joint = names.iter().position(|other| other == name)?;
         let mut moves = vec![false; names.len()];

@@ -120,7 +120,7 @@ fn made(mistake: Mistake, capture: &Capture, body: &BodyModel) -> Capture {
                 let other = (i as i32 - by).clamp(0, count as i32 - 1) as usize;
                 frame.source = capture.train[other].source.clone();
             }
-            // Somebody else's motion, one and a half steps aside.
+            // Another person's motion, one and a half steps aside.
             Mistake::WrongPerson => {
                 let other = &capture.train[(i + count / 3) % count];
                 (frame.pose, frame.placement) = (other.pose.clone(), other.placement);

@@ -10,7 +10,7 @@ const PREFIX: &str = ".unfinished-";
 
 /// Replaces the file at `path` by what `write` writes.
 ///
-/// Whoever reads `path`, at any moment and after a power cut, finds the old content or the new one,
+/// A reader of `path`, at any moment and after a power cut, finds the old content or the new one,
 /// whole. Until it is complete the new content has a random name in the same directory; where
 /// anything fails the old file stays. Permissions of the old file are kept. Of a symbolic link the
 /// target is replaced. Devices and pipes are written to as they are.

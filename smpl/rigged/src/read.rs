@@ -221,8 +221,8 @@ impl Character {
     fn wind(&mut self) {
         let bones = self.rest().bones;
         for face in &mut self.faces {
-            let strongest = self.weights.row(face[0] as usize).max_by(|a, b| a.1.total_cmp(&b.1));
-            if strongest.is_some_and(|(joint, _)| bones[joint].matrix3.determinant() < 0.0) {
+            let strongest = self.weights.heaviest(face[0] as usize);
+            if strongest.is_some_and(|joint| bones[joint].matrix3.determinant() < 0.0) {
                 face.swap(1, 2);
             }
         }

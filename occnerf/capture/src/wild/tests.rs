@@ -280,7 +280,7 @@ fn faults_of_the_file_are_told() {
     let (dir, metadata) = fixture("wild-file");
     let text = metadata.to_string();
     for (broken, words) in [
-        // Values that nobody asks for are passed over at any depth.
+        // Values that are not asked for are passed over at any depth.
         ("{\"00\":".repeat(100_000), &["00", "EOF"][..]),
         (format!("{{\"00\":{{\"poses\":{}", "[".repeat(100_000)), &["00: poses", "recursion limit"]),
         (text.replace("0.25", "NaN"), &["poses"]),

@@ -101,8 +101,7 @@ pub(super) fn film(
             None => {
                 let place = |v: usize| figure.body.v_template[figure.welded[v] as usize];
                 let at: Vec3 = corners.iter().zip(weights).map(|(&v, w)| place(v) * w).sum();
-                let strongest = character.weights.row(corners[0]).max_by(|a, b| a.1.total_cmp(&b.1));
-                pattern(at / figure.unit, strongest.map_or(0, |(joint, _)| joint))
+                pattern(at / figure.unit, character.weights.heaviest(corners[0]).unwrap_or(0))
             }
         }
     };
