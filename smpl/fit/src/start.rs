@@ -11,13 +11,35 @@ use crate::skeleton::{Shape, Skeleton, State};
 pub(crate) const LEAST: usize = 4;
 /// Standard deviation of points on a bone, metres.
 const POINT: f64 = 0.03;
+/// Least middle of a joint's limits that makes it a hinge, radians.
+const HINGE: f64 = 0.9;
+/// Squared distance of a guess from bent joints, over that from straight ones, below which it is taken.
+const BETTER: f64 = 0.5;
 /// Rounds of all joints.
 const SWEEPS: usize = 8;
 
-/// A first guess for the points of a frame, at least [`LEAST`] of them finite.
+/// A first guess for the points of a frame, at least [`LEAST`] of them finite. From straight elbows and knees a sharp
+/// bend is found about another axis: then the guess begins with half bent ones.
 pub(crate) fn start(skeleton: &Skeleton, shape: &Shape, seen: &[DVec3]) -> State {
-    let mut state = skeleton.rest();
-    let rest = skeleton.frames(shape, &state);
+    let square = |state: &State| {
+        let points = skeleton.points(shape, &skeleton.frames(shape, state));
+        points.iter().zip(seen).filter(|(_, s)| s.is_finite()).map(|(p, s)| p.distance_squared(*s)).sum::<f64>()
+    };
+    let straight = swept(skeleton, shape, seen, skeleton.rest());
+    let mut bent = skeleton.rest();
+    for (turn, [low, high]) in bent.turns.iter_mut().zip(&skeleton.ranges) {
+        let middle = 0.5 * (*low + *high);
+        if middle.is_finite() && middle.length() > HINGE {
+            *turn = DQuat::from_scaled_axis(middle);
+        }
+    }
+    let bent = swept(skeleton, shape, seen, bent);
+    if square(&bent) < BETTER * square(&straight) { bent } else { straight }
+}
+
+/// A first guess from another.
+fn swept(skeleton: &Skeleton, shape: &Shape, seen: &[DVec3], mut state: State) -> State {
+    let rest = skeleton.frames(shape, &skeleton.rest());
     let points = skeleton.points(shape, &rest);
     // Of a rotation within its limits, an angle about one axis.
     let deviation = |joint: usize| (skeleton.ranges[joint][1] - skeleton.ranges[joint][0]).length() / 7.0;

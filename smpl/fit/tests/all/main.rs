@@ -97,13 +97,19 @@ proptest! {
             pose[[4, 5, 18, 19][joint]] = bend;
         }
         let seen = points(&joints(), &betas, &pose, place);
-        let fitted = fit(&BODY, &joints(), &seen).unwrap();
-        let found = joints_of(&fitted, 0);
-        let worst = found.iter().zip(&seen).map(|(a, b)| a.distance(*b)).fold(0.0, f32::max);
-        prop_assert!(worst < 0.01, "a joint is off by {worst} m");
-        prop_assert!(!fitted.frames[0].swapped);
-        let root = angle(rodrigues(fitted.frames[0].pose[0]), rodrigues(pose[0]));
-        prop_assert!(root < 3.0, "the root is off by {root} degrees");
+        // In one frame the noise cannot be measured and is taken for 1 cm: the prior of rotations then turns the root by
+        // up to 4.4 degrees in 4000 cases, in three frames by .25.
+        for (frames, degrees) in [(1, 6.0), (3, 1.0)] {
+            let seen = seen.repeat(frames);
+            let fitted = fit(&BODY, &joints(), &seen).unwrap();
+            let found = joints_of(&fitted, frames / 2);
+            let worst = found.iter().zip(&seen).map(|(a, b)| a.distance(*b)).fold(0.0, f32::max);
+            prop_assert!(worst < 0.01, "a joint is off by {worst} m");
+            let frame = &fitted.frames[frames / 2];
+            prop_assert!(!frame.swapped);
+            let root = angle(rodrigues(frame.pose[0]), rodrigues(pose[0]));
+            prop_assert!(root < degrees, "the root is off by {root} degrees in {frames} frames");
+        }
     }
 }
 
