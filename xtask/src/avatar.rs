@@ -7,6 +7,7 @@ use clap::Args;
 use glam::Vec3;
 use occnerf::Method;
 use occnerf::bake::{Avatar, Clip, export};
+use point_fit::Grounded;
 use smpl::{Bvh, Joint, MotionClip};
 
 use crate::baked;
@@ -93,6 +94,35 @@ pub fn add_motion(avatar: &mut Avatar, path: &Path, fps: Option<f32>) -> Result<
     let others = (2..).map(|i| format!("{stem} {i}"));
     let name = std::iter::once(stem.clone()).chain(others).find(|name| !taken(name)).unwrap_or(stem);
     avatar.clips.push(Clip { name, motion });
+    Ok(())
+}
+
+/// Sets the motions from `first` on the floor, and reports the feet.
+pub fn ground(avatar: &mut Avatar, first: usize) -> Result<()> {
+    let sole = avatar.vertices.iter().map(|v| v.y).fold(f32::INFINITY, f32::min);
+    for Clip { name, motion } in avatar.clips.iter_mut().skip(first) {
+        let grounded = point_fit::ground(&avatar.skeleton, motion, sole);
+        let Grounded { motion: on_floor, sliding, standing, tilt, moved } =
+            grounded.with_context(|| format!("--ground: {name}"))?;
+        *motion = on_floor;
+        if standing == [0.0; 2] {
+            note!("{name}: no foot stands still, as of a person who walks on the spot: none is held");
+            continue;
+        }
+        say!(
+            "{name}: standing feet, left {:.0} %, right {:.0} % of the frames, slid {:.0} mm/s, now {:.1}; world turned \
+             by {:.1}°; body moved by at most {:.0} mm, legs that do not stand by {:.0}",
+            100.0 * standing[0],
+            100.0 * standing[1],
+            1e3 * sliding[0],
+            1e3 * sliding[1],
+            tilt.to_degrees(),
+            1e3 * moved[0],
+            1e3 * moved[1]
+        );
+    }
+    // They film the motion as it was.
+    avatar.cameras.clear();
     Ok(())
 }
 

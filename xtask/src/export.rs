@@ -69,6 +69,9 @@ pub struct ExportArguments {
     /// A ply of every frame of the motion, NAME-0000.ply and on
     #[arg(long, conflicts_with = "frame")]
     frames: bool,
+    /// Set the motion on level ground, where feet that stand do not slide
+    #[arg(long)]
+    ground: bool,
     /// Names of the joints in a glb, vrm or bvh; those of rigged characters stay
     #[arg(long, value_enum, default_value = "smpl")]
     bones: Bones,
@@ -112,6 +115,9 @@ pub fn export(arguments: &ExportArguments) -> Result<()> {
         avatar::add_motion(&mut person, path, arguments.fps)?;
     }
     let clip = if arguments.motion.is_some() { person.clips.len() - 1 } else { 0 };
+    if arguments.ground {
+        avatar::ground(&mut person, if skinned { 0 } else { clip })?;
+    }
     rename(&mut person, arguments.bones);
     sizes.apply(&mut person)?;
     // The folder is made only now, so that bad input leaves nothing behind.

@@ -163,11 +163,11 @@ pub(crate) fn normal(
     out
 }
 
-fn add(to: &mut DVector<f64>, at: usize, v: DVec3) {
+pub(crate) fn add(to: &mut DVector<f64>, at: usize, v: DVec3) {
     (0..3).for_each(|k| to[at + k] += v[k]);
 }
 
-fn add_block(to: &mut DMatrix<f64>, row: usize, column: usize, block: DMat3) {
+pub(crate) fn add_block(to: &mut DMatrix<f64>, row: usize, column: usize, block: DMat3) {
     for c in 0..3 {
         (0..3).for_each(|r| to[(row + r, column + c)] += block.col(c)[r]);
     }

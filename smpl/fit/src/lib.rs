@@ -1,7 +1,8 @@
 //! Poses, place and shape of a body from 3-D points of every frame.
 //!
 //! [`fit`] takes any [`BodyModel`], measured points of T frames, and for each point its [`Anchor`] on the
-//! body; [`joint_set`] has those of common sets of key points.
+//! body; [`joint_set`] has those of common sets of key points. [`ground`] stops the feet of a motion
+//! from sliding.
 //!
 //! ```
 //! use glam::Vec3;
@@ -35,6 +36,7 @@
 mod anchor;
 mod band;
 mod frame;
+mod ground;
 mod limits;
 mod relax;
 mod skeleton;
@@ -47,6 +49,7 @@ mod swaps;
 struct Readme;
 
 pub use anchor::{Anchor, joint_set, joint_sets};
+pub use ground::{Grounded, ground};
 
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
@@ -112,6 +115,9 @@ pub enum FitError {
         /// Points.
         points: usize,
     },
+    /// Legs that no motion can be grounded by: its reason.
+    #[error("{0}")]
+    Legs(String),
     /// No frame has enough points.
     #[error("expected a frame with {LEAST} finite points or more, found at most {0}")]
     Unseen(usize),

@@ -121,6 +121,12 @@ fn what_others_drive_is_named_as_asked_stands_and_comes_back() {
     let [own, read] = [&poses, &again].map(|path| smpl::MotionClip::load(path).unwrap());
     assert!(own.trans.iter().zip(&read.trans).all(|(a, b)| a.distance(*b) < 1e-4));
     assert!(own.poses[..22].iter().zip(&read.poses).all(|(a, b)| a.distance(*b) < 1e-3));
+    // A pose that is held for four frames stands where it is.
+    let still = run.join("still.npz");
+    clip(&still, 24);
+    let (floor, said) = export("floor.npz", &["--motion", text(&still), "--ground"]);
+    assert!(said.contains("still: standing feet") && said.contains("now 0.0"), "{said}");
+    assert!(smpl::MotionClip::load(&floor).unwrap().trans[0].distance(Vec3::splat(0.5)) > 0.1);
     let tail = std::fs::read_to_string(&bvh).unwrap().replace("mixamorig:LeftUpLeg", "Tail");
     std::fs::write(&bvh, tail).unwrap();
     let glb = run.join("tail.glb");

@@ -1,6 +1,8 @@
 //! Fits to points of known poses.
 #![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
 
+mod ground;
+
 use std::sync::LazyLock;
 use std::time::Instant;
 
