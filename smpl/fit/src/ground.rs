@@ -30,9 +30,10 @@ const WINDOW: f64 = 200.0;
 /// slope, in metres.
 const FLOOR: f64 = 0.02;
 const SPREAD: f64 = 0.1;
-/// Standard deviations in metres: of a standing part along the floor and of its height, of the root,
-/// of other points of the legs, of depth below the floor.
-const HELD: f64 = 3e-4;
+/// Standard deviation of a standing part along the floor, in m/s: metres at one frame per second.
+const HELD: f64 = 0.008;
+/// Standard deviations in metres: of a standing part's height, of the root, of other points of the
+/// legs, of depth below the floor.
 const LEVEL: f64 = 0.01;
 const ROOT: f64 = 0.005;
 const STAYS: f64 = 0.02;
@@ -226,7 +227,7 @@ fn relax(legs: &Legs, before: &[Vec<DVec3>], held: &[Vec<Option<DVec3>>], states
     };
     // Residual and weights, by component, of a point.
     let residual = |t: usize, i: usize, at: DVec3| {
-        let (target, deviation) = held[t][i].map_or((before[t][i], STAYS), |anchor| (anchor, HELD));
+        let (target, deviation) = held[t][i].map_or((before[t][i], STAYS), |anchor| (anchor, HELD / fps));
         let (mut residual, mut weight) = (at - target, DVec3::splat(deviation.powi(-2)));
         if held[t][i].is_some() {
             weight.y = LEVEL.powi(-2);
