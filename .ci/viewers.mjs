@@ -57,6 +57,8 @@ function decibels(page, a, b) {
       const bytes = Uint8Array.from(atob(base64), (c) => c.charCodeAt(0));
       const bitmap = await createImageBitmap(new Blob([bytes], { type: "image/png" }));
       const context = new OffscreenCanvas(bitmap.width, bitmap.height).getContext("2d");
+      context.fillStyle = "white";
+      context.fillRect(0, 0, bitmap.width, bitmap.height);
       context.drawImage(bitmap, 0, 0);
       return context.getImageData(0, 0, bitmap.width, bitmap.height).data;
     };
@@ -84,7 +86,9 @@ const text = ({ whole, painted, share }) =>
 // → PNG.
 const THREE_PAGE = (body) => `<!doctype html><meta charset="utf-8"><link rel="icon" href="data:,">
 <script type="importmap">{"imports":{"three":"/node/node_modules/three/build/three.module.js",
-"three/addons/":"/node/node_modules/three/examples/jsm/","spark":"/node/node_modules/@sparkjsdev/spark/dist/spark.module.js"}}</script>
+"three/addons/":"/node/node_modules/three/examples/jsm/","spark":"/node/node_modules/@sparkjsdev/spark/dist/spark.module.js",
+"splats-3d":"/node/node_modules/@mkkellogg/gaussian-splats-3d/build/gaussian-splats-3d.module.js",
+"gsplat":"/node/node_modules/gsplat/dist/index.es.js"}}</script>
 <script type="module">
 import * as THREE from "three";
 const renderer = new THREE.WebGLRenderer({ antialias: true, preserveDrawingBuffer: true });
@@ -134,23 +138,63 @@ window.shot = (seconds, camera, side) => {
 };
 window.ready = gltf.animations[0].tracks[0].times;`;
 
-const SPLAT_BODY = `
-import { SparkRenderer, SplatMesh } from "spark";
-scene.add(new SparkRenderer({ renderer }));
-const splats = new SplatMesh({ url: "/person.ply" });
-await splats.initialized;
-// Such files have y down.
-splats.rotation.x = Math.PI;
-scene.add(splats);
+// Splat viewers by name. Such files have y down. Sorting is done beside drawing.
+const SHOT = `
 window.shot = async (camera, side) => {
-  // Sorting is done beside drawing.
   for (let i = 0; i < 4; i++) {
     renderer.render(scene, window.camera(camera, side));
     await new Promise((done) => setTimeout(done, 1000));
   }
   return window.png();
+};`;
+const SPLATS = {
+  spark: `
+import { SparkRenderer, SplatMesh } from "spark";
+scene.add(new SparkRenderer({ renderer }));
+const splats = new SplatMesh({ url: "/person.ply" });
+await splats.initialized;
+splats.rotation.x = Math.PI;
+scene.add(splats);
+${SHOT}
+window.ready = splats.packedSplats?.numSplats ?? splats.numSplats;`,
+  "gaussian-splats-3d": `
+import { DropInViewer, SceneRevealMode } from "splats-3d";
+const splats = new DropInViewer({ sharedMemoryForWorkers: false, gpuAcceleratedSort: false, sceneRevealMode: SceneRevealMode.Instant });
+await splats.addSplatScene("/person.ply", { rotation: [1, 0, 0, 0], showLoadingUI: false });
+scene.add(splats);
+${SHOT}
+window.ready = splats.splatMesh?.getSplatCount() ?? splats.viewer.splatMesh.getSplatCount();`,
+  gsplat: `
+import * as SPLAT from "gsplat";
+const world = new SPLAT.Scene();
+const splats = await SPLAT.PLYLoader.LoadAsync("/person.ply", world, () => {});
+// Without passes that fade splats in.
+const drawing = new SPLAT.WebGLRenderer(null, []);
+document.body.append(drawing.canvas);
+window.shot = async ({ k, size, e }, side) => {
+  const scale = side / Math.max(...size);
+  const [w, h] = size.map((n) => Math.round(n * scale));
+  drawing.setSize(w, h);
+  const eye = new SPLAT.Camera(new SPLAT.CameraData());
+  [eye.data.fx, eye.data.fy] = [k[0] * scale, k[1] * scale];
+  // Rotation and place of the camera in a world of y down: half a turn about x.
+  const turn = new THREE.Matrix4().set(e[0], -e[1], -e[2], 0, e[4], -e[5], -e[6], 0, e[8], -e[9], -e[10], 0, 0, 0, 0, 1);
+  turn.transpose();
+  const at = new THREE.Vector3(-e[3], -e[7], -e[11]).applyMatrix4(turn);
+  const q = new THREE.Quaternion().setFromRotationMatrix(turn);
+  eye.position = new SPLAT.Vector3(at.x, at.y, at.z);
+  eye.rotation = new SPLAT.Quaternion(q.x, q.y, q.z, q.w);
+  eye.update();
+  let png = "";
+  for (let i = 0; i < 4; i++) {
+    drawing.render(world, eye);
+    png = drawing.canvas.toDataURL("image/png").split(",")[1];
+    await new Promise((done) => setTimeout(done, 1000));
+  }
+  return png;
 };
-window.ready = splats.packedSplats?.numSplats ?? splats.numSplats;`;
+window.ready = splats.data.vertexCount;`,
+};
 
 async function shots(browser, cameras) {
   writeFileSync(at("three.html"), THREE_PAGE(GLB_BODY));
@@ -172,19 +216,21 @@ async function shots(browser, cameras) {
   check(glb.problems.length === 0, `three.js reports no errors ${glb.problems.slice(0, 3).join("; ")}`);
   await glb.close();
 
-  writeFileSync(at("splats.html"), THREE_PAGE(SPLAT_BODY));
-  const splats = await open(browser, { viewport: { width: 700, height: 700 } }, "http://local/splats.html");
-  await splats.page.waitForFunction(() => window.ready, null, { timeout: 60000 }).catch(() => {});
-  const late = new Promise((done) => setTimeout(() => done(null), 240000));
-  const drawn = await Promise.race([splats.page.evaluate((c) => window.shot?.(c, 512), cameras[0]), late]);
-  check(Boolean(drawn), `a splat viewer reads the PLY: ${await splats.page.evaluate(() => window.ready)} splats ${splats.problems.slice(0, 3).join("; ")}`);
-  if (drawn) {
-    const picture = Buffer.from(drawn, "base64");
-    writeFileSync(at("pictures", "splats.png"), picture);
-    const difference = await decibels(splats.page, picture, readFileSync(at("movement/0000.png")));
-    check(difference.whole >= 25, `and draws it as we do: ${text(difference)}, expected 25`);
+  for (const [viewer, body] of Object.entries(SPLATS)) {
+    writeFileSync(at("splats.html"), THREE_PAGE(body));
+    const splats = await open(browser, { viewport: { width: 700, height: 700 } }, "http://local/splats.html");
+    await splats.page.waitForFunction(() => window.ready, null, { timeout: 60000 }).catch(() => {});
+    const late = new Promise((done) => setTimeout(() => done(null), 240000));
+    const drawn = await Promise.race([splats.page.evaluate((c) => window.shot?.(c, 512), cameras[0]), late]);
+    check(Boolean(drawn), `${viewer} reads the PLY: ${await splats.page.evaluate(() => window.ready)} splats ${splats.problems.slice(0, 3).join("; ")}`);
+    if (drawn) {
+      const picture = Buffer.from(drawn, "base64");
+      writeFileSync(at("pictures", `${viewer}.png`), picture);
+      const difference = await decibels(splats.page, picture, readFileSync(at("movement/0000.png")));
+      check(difference.whole >= 25, `and draws it as we do: ${text(difference)}, expected 25`);
+    }
+    await splats.close();
   }
-  await splats.close();
 }
 
 async function video(browser) {
