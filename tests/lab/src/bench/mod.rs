@@ -8,6 +8,7 @@ mod kernels;
 mod pareto;
 mod points;
 mod stability;
+mod triangles;
 
 use std::path::{Path, PathBuf};
 
@@ -43,6 +44,15 @@ enum What {
     Stability(StabilityArguments),
     /// Cost against error of the geometric kernels.
     Kernels(KernelArguments),
+    /// Size against accuracy of a run's avatar with fewer triangles, its texture as PNG and JPEG: a
+    /// table and a chart.
+    Triangles {
+        /// Run directory, of a surface or baked
+        run: PathBuf,
+        /// Where to write
+        #[arg(long, default_value = "runs/bench-triangles")]
+        out: PathBuf,
+    },
     /// One run, handed over on standard input.
     #[command(hide = true)]
     Point {
@@ -117,6 +127,7 @@ pub fn bench(arguments: &BenchArguments) -> Result<()> {
         What::Pareto(arguments) => pareto(arguments),
         What::Stability(arguments) => stability(arguments),
         What::Kernels(arguments) => kernels::run(&arguments.out, arguments.quick, arguments.publish),
+        What::Triangles { run, out } => triangles::run(run, out),
         What::Point { threads } => {
             use_threads(*threads)?;
             job::serve()
