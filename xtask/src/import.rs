@@ -26,11 +26,14 @@ Run one estimator and one segmenter as their own pages say, on the same frames (
   GVHMR             outputs/demo/CLIP/hmr4d_results.pt        (SMPL-X)
   PromptHMR         results/CLIP/results.pkl                  (SMPL-X; its masks are used, too)
   VIBE, PyMAF       output/CLIP/vibe_output.pkl
+  CLIFF             CLIP/CLIP_cliff_hr48.npz                  (demo.py --save_results)
+  GLAMR             OUT/grecon/CLIP_seed1.pkl
   ROMP              OUTPUT/video_results.npz                  (romp --mode=video -t)
   SAM 3D Body       its list of dictionaries as .npz, .npy, .pkl or .json: a folder with a file a frame, or one
                     file with a list of frames; its masks are used without --masks
   EasyMocap         OUTPUT, the folder with smpl/; intri.yml and extri.yml in it or above
   PeopleSnapshot    SUBJECT/poses.npz, as InstantAvatar prepares it, with cameras.npz (--frames images --masks masks)
+  GaussianAvatar    SUBJECT/train/smpl_parms.pth, with cam_parms.npz (--frames train/images --masks train/masks)
   NeuMan            SCENE/smpl_output_romp.pkl, with alignments.npy and sparse/ (--frames images --masks segmentations)
   any other         joints (frames, J, 3) in camera axes and metres, .npy or .npz, with --joints
 

@@ -12,7 +12,7 @@ pub enum Fault {
     Overlap,
     /// The translation of the body is an outlier.
     PlaceJump,
-    /// The rotation of a joint is an outlier.
+    /// The rotations of half of the joints are outliers.
     PoseJump,
     /// The mask shows a limb elsewhere.
     Limb(Limb),

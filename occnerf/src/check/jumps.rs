@@ -6,13 +6,11 @@ use smpl::BodyModel;
 use super::frame::Fault;
 use crate::capture::{Capture, Frame};
 
-/// Least ratio of a jump to the median step.
-const TIMES: f32 = 8.0;
-/// Least lateral jump of the pelvis in multiples of its depth, and least logarithmic jump of depth.
-const PLACE: f32 = 0.08;
-const DEPTH: f32 = 0.25;
-/// Least jump of a joint's rotation, radians.
-const TURN: f32 = 1.2;
+/// Least lateral jump of the pelvis in multiples of the farthest joint's distance from it, least logarithmic
+/// jump of its depth, least jump of the rotation of half of the joints, radians.
+const LEAST: [f32; 3] = [0.35, 0.25, 0.5];
+/// Least ratios of jumps to the median step.
+const TIMES: [f32; 3] = [8.0, 8.0, 5.0];
 
 /// The jumps of each frame from the previous one.
 pub(super) fn find(capture: &Capture, body: &BodyModel) -> Vec<Vec<Fault>> {
@@ -23,8 +21,7 @@ pub(super) fn find(capture: &Capture, body: &BodyModel) -> Vec<Vec<Fault>> {
         values.sort_by(f32::total_cmp);
         values.get(values.len() / 2).copied().unwrap_or(0.0)
     };
-    let limits = [PLACE, DEPTH, TURN].iter().enumerate().map(|(i, least)| least.max(TIMES * median(i)));
-    let limits: Vec<f32> = limits.collect();
+    let limits = [0, 1, 2].map(|i| LEAST[i].max(TIMES[i] * median(i)));
     let faults = |step: &[f32; 3]| {
         let mut faults = Vec::new();
         // A pelvis behind the camera gives NaN; comparisons with it are false.
@@ -43,6 +40,7 @@ pub(super) fn find(capture: &Capture, body: &BodyModel) -> Vec<Vec<Fault>> {
 /// A body in its camera.
 struct State {
     pelvis: Vec3,
+    reach: f32,
     bones: Vec<Quat>,
 }
 
@@ -52,15 +50,17 @@ impl State {
         let camera = frame.camera.world_to_camera;
         let turn = |bone: &glam::Affine3A| Quat::from_mat3a(&(camera.matrix3 * bone.matrix3));
         let pelvis = posed.joints.first().copied().unwrap_or(Vec3::ZERO);
-        Self { pelvis: camera.transform_point3(pelvis), bones: posed.bones.iter().map(turn).collect() }
+        let reach = posed.joints.iter().map(|joint| joint.distance(pelvis)).fold(f32::MIN_POSITIVE, f32::max);
+        Self { pelvis: camera.transform_point3(pelvis), reach, bones: posed.bones.iter().map(turn).collect() }
     }
 
-    /// Lateral and depth step of the pelvis, and the largest rotation of a joint.
+    /// Lateral and depth step of the pelvis, and the median rotation of the joints.
     fn step(&self, next: &Self) -> [f32; 3] {
         let direction = |p: Vec3| p.truncate() / p.z;
-        let across = direction(self.pelvis).distance(direction(next.pelvis));
+        let across = direction(self.pelvis).distance(direction(next.pelvis)) * self.pelvis.z / self.reach;
         let depth = (next.pelvis.z / self.pelvis.z).ln().abs();
-        let turn = self.bones.iter().zip(&next.bones).map(|(a, b)| a.angle_between(*b));
-        [across, depth, turn.fold(0.0, f32::max)]
+        let mut turns: Vec<f32> = self.bones.iter().zip(&next.bones).map(|(a, b)| a.angle_between(*b)).collect();
+        turns.sort_by(f32::total_cmp);
+        [across, depth, turns.get(turns.len() / 2).copied().unwrap_or(0.0)]
     }
 }

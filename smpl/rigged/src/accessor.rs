@@ -6,15 +6,42 @@ use std::path::{Component, Path};
 use array_files::read_file;
 use base64::Engine;
 use gltf::json::accessor::{Accessor, ComponentType};
-use gltf::json::buffer::View;
+use gltf::json::buffer::{Buffer, View};
 use gltf::json::validation::Checked;
 use gltf::json::{Index, Root};
+use meshoptimizer_rs::Workspace;
+use meshoptimizer_rs::codec::{BufferView, Filter, Mode};
+use serde::Deserialize;
+use serde_json::Value;
 use smpl::Error;
 
 /// Total decoded size of all accessors, in bytes: 256 MiB.
 const MAX_DECODED_BYTES: u64 = 1 << 28;
 /// Total size of buffers and images, in bytes: 512 MiB. A document may name one file many times.
 const MAX_RESOLVED_BYTES: u64 = 1 << 29;
+
+/// Extensions of buffer views that meshoptimizer compressed.
+const MESHOPT: [&str; 2] = ["EXT_meshopt_compression", "KHR_meshopt_compression"];
+
+/// One of [`MESHOPT`].
+#[derive(Deserialize)]
+#[serde(rename_all = "camelCase")]
+struct Compressed {
+    buffer: usize,
+    #[serde(default)]
+    byte_offset: u64,
+    byte_length: u64,
+    byte_stride: usize,
+    count: usize,
+    mode: String,
+    filter: Option<String>,
+}
+
+/// Whether a buffer stands for what compressed views hold.
+fn is_fallback(buffer: &Buffer) -> bool {
+    let others = buffer.extensions.iter().flat_map(|extensions| extensions.others.values());
+    others.into_iter().any(|extension| extension.get("fallback") == Some(&Value::Bool(true)))
+}
 
 /// A document with its buffers. Every index and range is checked where it is used.
 pub(crate) struct Source<'a> {
@@ -23,6 +50,8 @@ pub(crate) struct Source<'a> {
     /// Directory of files it may refer to; `None` allows none.
     folder: Option<&'a Path>,
     data: Vec<Vec<u8>>,
+    /// What is in compressed buffer views.
+    decompressed: Vec<Option<Vec<u8>>>,
     /// Remaining budget of decoded bytes: many accessors may share one range.
     left: Cell<u64>,
     /// Remaining budget of bytes of URIs and images.
@@ -42,6 +71,7 @@ impl<'a> Source<'a> {
             root,
             folder,
             data: Vec::new(),
+            decompressed: Vec::new(),
             left: Cell::new(MAX_DECODED_BYTES),
             resolvable: Cell::new(MAX_RESOLVED_BYTES),
         };
@@ -49,6 +79,10 @@ impl<'a> Source<'a> {
             let place = format!("buffer {i}");
             let bytes = match &buffer.uri {
                 Some(uri) => source.resolve(&place, uri)?.1,
+                None if is_fallback(buffer) => {
+                    source.data.push(Vec::new());
+                    continue;
+                }
                 None => blob.take().ok_or_else(|| source.invalid(&place, "neither a URI nor a binary chunk"))?,
             };
             if buffer.byte_length.0 > bytes.len() as u64 {
@@ -56,6 +90,13 @@ impl<'a> Source<'a> {
                 return Err(source.invalid(&place, message));
             }
             source.data.push(bytes);
+        }
+        for (i, view) in root.buffer_views.iter().enumerate() {
+            let others = view.extensions.as_ref().map(|extensions| &extensions.others);
+            let compressed = MESHOPT.iter().find_map(|name| others?.get(*name));
+            let place = format!("buffer view {i}");
+            let bytes = compressed.map(|compressed| source.decompress(&place, view, compressed)).transpose()?;
+            source.decompressed.push(bytes);
         }
         Ok(source)
     }
@@ -69,14 +110,32 @@ impl<'a> Source<'a> {
     /// The bytes of a buffer view.
     pub(crate) fn view(&self, index: Index<View>, place: &str) -> Result<(&View, &[u8]), Error> {
         let view = self.get(&self.root.buffer_views, index, place)?;
-        let bytes = self.data.get(view.buffer.value()).map(Vec::as_slice);
-        let start = view.byte_offset.unwrap_or_default().0;
-        let range = start
-            .checked_add(view.byte_length.0)
-            .and_then(|end| Some(usize::try_from(start).ok()?..usize::try_from(end).ok()?));
-        let bytes = bytes.zip(range).and_then(|(bytes, range)| bytes.get(range));
+        if let Some(Some(bytes)) = self.decompressed.get(index.value()) {
+            return Ok((view, bytes));
+        }
+        let bytes = self.range(view.buffer.value(), view.byte_offset.unwrap_or_default().0, view.byte_length.0);
         let outside = || self.invalid(place, format!("buffer view {index} leaves its buffer"));
         Ok((view, bytes.ok_or_else(outside)?))
+    }
+
+    fn range(&self, buffer: usize, start: u64, length: u64) -> Option<&[u8]> {
+        let (start, end) = (usize::try_from(start).ok()?, usize::try_from(start.checked_add(length)?).ok()?);
+        self.data.get(buffer)?.get(start..end)
+    }
+
+    fn decompress(&self, place: &str, view: &View, compressed: &Value) -> Result<Vec<u8>, Error> {
+        let Compressed { buffer, byte_offset, byte_length, byte_stride, count, mode, filter } =
+            Compressed::deserialize(compressed).map_err(|error| self.invalid(place, error.to_string()))?;
+        let outside = || self.invalid(place, "its compressed bytes leave their buffer");
+        let bytes = self.range(buffer, byte_offset, byte_length).ok_or_else(outside)?;
+        self.spend(place, view.byte_length.0)?;
+        let decode = || {
+            let filter = filter.map_or(Ok(Filter::None), |filter| Filter::parse(&filter))?;
+            let layout = BufferView::new(Mode::parse(&mode)?, filter, count, byte_stride)?;
+            layout.validate_parent(view.byte_length.0 as usize, view.byte_stride.map(|stride| stride.0))?;
+            layout.decode(bytes, &mut Workspace::default())
+        };
+        decode().map_err(|error| self.invalid(place, format!("not of meshopt ({mode}): {error}")))
     }
 
     /// Elements of N components, decoded by `component` from the bytes of one; `None` from it is an

@@ -9,8 +9,8 @@ use crate::animation::{Animation, Local};
 /// joints.
 ///
 /// Meshes without a skin are bound rigidly to an extra joint for their node; morph targets are at
-/// their default weights. Of materials the base colours are read. Not read: sparse accessors, other
-/// parts of materials, transparency ([`Character::ignored`] names it). Metres, y up, as in glTF.
+/// their default weights. Of materials the base colours are read, and holes by their alpha. Not
+/// read: sparse accessors, other parts of materials, blending ([`Character::ignored`] names it). Metres, y up, as in glTF.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Character {
     /// Vertices in bind space, as in the file, (V).
@@ -23,6 +23,9 @@ pub struct Character {
     pub texture_of: Vec<Option<u32>>,
     /// Factor of the base colour, linear, (V): the material's times that of the vertex, in [0, 1].
     pub tints: Vec<Vec3>,
+    /// Least alpha of the texture that is surface, (V): less is a hole. 0 for opaque materials, the
+    /// cutoff over the factor's alpha for `MASK`, half of that as a cutoff for `BLEND`; 2 at most.
+    pub cutoffs: Vec<f32>,
     /// Triangles, (F), counter-clockwise seen from outside.
     pub faces: Vec<[u32; 3]>,
     /// Skinning weights, (V, J), rows summing to 1.

@@ -3,6 +3,7 @@
 use glam::{Vec2, Vec3, Vec4};
 use gltf::json::Index;
 use gltf::json::accessor::{Accessor, Type};
+use gltf::json::material::AlphaMode;
 use gltf::json::mesh::{Mode, Primitive, Semantic};
 use gltf::json::texture::Info;
 use gltf::json::validation::Checked;
@@ -58,31 +59,34 @@ impl Character {
             fits(normals.len(), "NORMAL")?;
             self.normals.extend(normals.into_iter().map(Vec3::from));
         }
-        let material = match primitive.material {
-            Some(index) => Some(&source.get(&source.root.materials, index, place)?.pbr_metallic_roughness),
-            None => None,
-        };
-        let [red, green, blue, _] = material.map_or([1.0; 4], |material| material.base_color_factor.0);
-        let factor = Vec3::new(red, green, blue);
-        match attribute(Semantic::Colors(0)) {
+        let material = primitive.material.map(|index| source.get(&source.root.materials, index, place)).transpose()?;
+        let base = material.map(|material| &material.pbr_metallic_roughness);
+        let factor = base.map_or(Vec4::ONE, |base| Vec4::from(base.base_color_factor.0));
+        let colours = match attribute(Semantic::Colors(0)) {
             Some(colours) => {
                 let place = format!("{place}, COLOR_0");
                 let kind = &source.get(&source.root.accessors, colours, &place)?.type_;
-                let colours: Vec<Vec3> = match kind {
+                let colours: Vec<Vec4> = match kind {
                     Checked::Valid(Type::Vec3) => {
-                        source.floats::<3>(colours, &place)?.into_iter().map(Vec3::from).collect()
+                        source.floats::<3>(colours, &place)?.into_iter().map(|c| Vec3::from(c).extend(1.0)).collect()
                     }
-                    _ => source.floats::<4>(colours, &place)?.into_iter().map(|c| Vec4::from(c).truncate()).collect(),
+                    _ => source.floats::<4>(colours, &place)?.into_iter().map(Vec4::from).collect(),
                 };
                 fits(colours.len(), "COLOR_0")?;
-                self.tints.extend(colours.into_iter().map(|colour| colour * factor));
+                colours
             }
-            None => self.tints.resize(first as usize + count, factor),
+            None => vec![Vec4::ONE; count],
+        };
+        let cutoff = match material.map(|material| (material.alpha_mode, material.alpha_cutoff)) {
+            Some((Checked::Valid(AlphaMode::Mask), cutoff)) => cutoff.map_or(0.5, |cutoff| cutoff.0),
+            Some((Checked::Valid(AlphaMode::Blend), _)) => 0.5,
+            _ => 0.0,
+        };
+        for colour in colours.into_iter().map(|colour| colour * factor) {
+            self.tints.push(colour.truncate().clamp(Vec3::ZERO, Vec3::ONE));
+            self.cutoffs.push(if cutoff > 0.0 { (cutoff / colour.w.max(0.0)).min(2.0) } else { 0.0 });
         }
-        for tint in &mut self.tints[first as usize..] {
-            *tint = tint.clamp(Vec3::ZERO, Vec3::ONE);
-        }
-        let colour = material.and_then(|material| material.base_color_texture.as_ref());
+        let colour = base.and_then(|base| base.base_color_texture.as_ref());
         let transform = colour.and_then(|c| c.extensions.as_ref()?.texture_transform.as_ref());
         let set = transform.and_then(|t| t.tex_coord).or(colour.map(|c| c.tex_coord)).unwrap_or(0);
         if let Some(uvs) = attribute(Semantic::TexCoords(set)) {

@@ -51,6 +51,7 @@ fn read(file: &str, bytes: &[u8], folder: Option<&Path>) -> Result<Character, Er
         uvs: Vec::new(),
         texture_of: Vec::new(),
         tints: Vec::new(),
+        cutoffs: Vec::new(),
         faces: Vec::new(),
         weights: SparseRows { offsets: vec![0], columns: Vec::new(), values: Vec::new() },
         inverse_bind: Vec::new(),
@@ -96,8 +97,7 @@ fn read(file: &str, bytes: &[u8], folder: Option<&Path>) -> Result<Character, Er
 }
 
 /// Extensions without which a document means something else.
-const UNREAD: [&str; 4] =
-    ["KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_texture_basisu", "EXT_texture_webp"];
+const UNREAD: [&str; 3] = ["KHR_draco_mesh_compression", "KHR_texture_basisu", "EXT_texture_webp"];
 
 /// The document. Channels without a node, which glTF leaves to extensions, are dropped.
 fn document(json: &[u8]) -> Result<Root, serde_json::Error> {
@@ -115,8 +115,8 @@ fn document(json: &[u8]) -> Result<Root, serde_json::Error> {
 
 /// What a document has that a [`Character`] has not, in words.
 fn ignored(root: &Root) -> Vec<String> {
-    let is_cut = root.materials.iter().any(|m| m.alpha_mode != Checked::Valid(AlphaMode::Opaque));
-    Vec::from_iter(is_cut.then(|| "transparency (alphaMode)".to_owned()))
+    let is_blended = root.materials.iter().any(|m| m.alpha_mode == Checked::Valid(AlphaMode::Blend));
+    Vec::from_iter(is_blended.then(|| "blending (alphaMode BLEND): a surface from an alpha of one half on".to_owned()))
 }
 
 /// JSON and binary chunk of a `.glb` (glTF 2.0, section 4.4).

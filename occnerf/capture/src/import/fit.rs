@@ -25,6 +25,10 @@ pub enum Tool {
     PromptHmr,
     /// VIBE (Kocabas et al. 2020), also PyMAF, `vibe_output.pkl`.
     Vibe,
+    /// CLIFF (Li et al. 2022), `NAME_cliff_hr48.npz`.
+    Cliff,
+    /// GLAMR (Yuan et al. 2022), `grecon/NAME_seed1.pkl`.
+    Glamr,
     /// ROMP (Sun et al. 2021), `video_results.npz`.
     Romp,
     /// EasyMocap, a folder with `smpl/`, `intri.yml` and `extri.yml`.
@@ -32,6 +36,8 @@ pub enum Tool {
     /// PeopleSnapshot (Alldieck et al. 2018) in InstantAvatar's preparation, `poses.npz` with
     /// `cameras.npz`.
     PeopleSnapshot,
+    /// GaussianAvatar's (Hu et al. 2024) `smpl_parms.pth` with `cam_parms.npz`.
+    GaussianAvatar,
     /// A scene of NeuMan (Jiang et al. 2022), `smpl_output_*.pkl` with `alignments.npy` and
     /// `sparse/`.
     NeuMan,
@@ -51,9 +57,12 @@ impl Tool {
             Self::Gvhmr => "GVHMR",
             Self::PromptHmr => "PromptHMR",
             Self::Vibe => "VIBE / PyMAF",
+            Self::Cliff => "CLIFF",
+            Self::Glamr => "GLAMR",
             Self::Romp => "ROMP",
             Self::EasyMocap => "EasyMocap",
             Self::PeopleSnapshot => "PeopleSnapshot",
+            Self::GaussianAvatar => "GaussianAvatar",
             Self::NeuMan => "NeuMan",
             Self::Sam3dBody => "SAM 3D Body",
             Self::Joints => "joints",
@@ -131,6 +140,8 @@ pub(super) enum About {
     Pelvis,
     /// At turn · J + offset.
     Origin(DMat3),
+    /// At offset.
+    Place,
 }
 
 /// A mask in the estimator's file.
@@ -159,6 +170,7 @@ impl FitFrame {
         match self.about {
             About::Pelvis => joint + self.offset,
             About::Origin(turn) => turn * joint + self.offset,
+            About::Place => self.offset,
         }
     }
 

@@ -3,8 +3,8 @@
 //! [`import`] reads the frames of a video, a fit and masks, and writes a capture in HumanNeRF's
 //! wild layout for [`super::load_capture`]. Formats are detected by content:
 //!
-//! - fits: WHAM, 4D-Humans / PHALP, GVHMR, PromptHMR, VIBE / PyMAF, ROMP, EasyMocap, and the data sets
-//!   PeopleSnapshot and NeuMan ([`Tool`]);
+//! - fits: WHAM, 4D-Humans / PHALP, GVHMR, PromptHMR, VIBE / PyMAF, CLIFF, GLAMR, ROMP, EasyMocap, and
+//!   the data sets PeopleSnapshot (also as GaussianAvatar has it) and NeuMan ([`Tool`]);
 //! - points, to which a body is fitted: SAM 3D Body, and arrays of joints of any estimator;
 //! - masks: object ids (SAM 2's palette PNGs or folders, Grounded-SAM-2's `.npy`), coverage
 //!   (MatAnyone, plain 0/255 pictures), or the fit's own (4D-Humans / PHALP, PromptHMR);
@@ -14,10 +14,12 @@
 //! the camera's axes, or those of the file's cameras; the body's translation is in the extrinsics.
 
 mod body;
+mod cliff;
 #[cfg(test)]
 mod damage;
 mod easymocap;
 mod fit;
+mod glamr;
 mod gvhmr;
 mod item;
 mod join;

@@ -1,11 +1,14 @@
 //! PeopleSnapshot as InstantAvatar prepares it: `poses.npz` {`betas` (10), `transl` (N,3), and
 //! `thetas` (N,72) or `global_orient` (N,3) and `body_pose` (N,69)}, a row a frame; beside it or in
 //! the folder above `cameras.npz` {`intrinsic` (3,3), `extrinsic` (4,4) world to camera, `height`,
-//! `width`}. The root turns about the pelvis.
+//! `width`}. The root turns about the pelvis. GaussianAvatar makes of it `smpl_parms.pth` {`beta`
+//! (1,10), `body_pose` (N,72), `trans` (N,3)} and `cam_parms.npz` {`intrinsic`, `extrinsic`}.
 
-use std::path::Path;
+use std::io::{Read, Seek};
+use std::path::{Path, PathBuf};
 
 use array_files::npz::Npz;
+use array_files::torch::TorchFile;
 use glam::DVec3;
 
 use super::fit::{About, BETAS, Fit, FitFrame, Person, SMPL, Tool};
@@ -20,10 +23,7 @@ pub(super) fn is(keys: &[String]) -> bool {
 }
 
 pub(super) fn read(path: &Path, npz: &mut Npz, video: &Video) -> Result<Fit, CaptureError> {
-    let beside = path.ancestors().skip(1).take(2).map(|dir| dir.join("cameras.npz")).find(|file| file.is_file());
-    let cameras = beside.ok_or_else(|| {
-        CaptureError::missing(&path.with_file_name("cameras.npz"), "file (nor in the folder above): the camera")
-    })?;
+    let cameras = beside(path, "cameras.npz")?;
     let (camera, fit) = (dictionary(&mut Npz::open(&cameras)?)?, dictionary(npz)?);
     let (camera, fit) = (Item::new(&cameras, &camera), Item::new(path, &fit));
     for (key, side) in ["width", "height"].into_iter().zip(video.sides()) {
@@ -33,14 +33,7 @@ pub(super) fn read(path: &Path, npz: &mut Npz, video: &Video) -> Result<Fit, Cap
             return Err(given.invalid(format!("{side}, as the frames"), found.to_string()));
         }
     }
-    let k = camera.get("intrinsic")?.numbers(&[Some(3), Some(3)])?;
-    let extrinsic = camera.get("extrinsic")?;
-    let e = extrinsic.numbers(&[Some(4), Some(4)])?;
-    let turn = extrinsic.rotation(&[&e[0..3], &e[4..7], &e[8..11]].concat())?;
-    let moved = DVec3::new(e[3], e[7], e[11]);
-
     let place = fit.get("transl")?;
-    let places = place.rows(3)?;
     let poses = match fit.find("thetas") {
         Some(thetas) => thetas.rows(3 * SMPL)?,
         None => {
@@ -49,6 +42,46 @@ pub(super) fn read(path: &Path, npz: &mut Npz, video: &Video) -> Result<Fit, Cap
         }
     };
     let betas = fit.get("betas")?.numbers(&[Some(1), Some(BETAS)])?;
+    frames(Tool::PeopleSnapshot, &camera, &place, &poses, &betas, video)
+}
+
+/// A fit by GaussianAvatar.
+pub(super) fn of_gaussian_avatar<R: Read + Seek>(
+    path: &Path,
+    file: &mut TorchFile<R>,
+    video: &Video,
+) -> Result<Fit, CaptureError> {
+    let cameras = beside(path, "cam_parms.npz")?;
+    let camera = dictionary(&mut Npz::open(&cameras)?)?;
+    let root = file.root().clone();
+    let fit = file.resolve("", &root)?;
+    let fit = Item::new(path, &fit);
+    let (pose, shape) = (fit.get("body_pose")?.rows(3 * SMPL)?, fit.get("beta")?.rows(BETAS)?);
+    let betas = shape.first().ok_or_else(|| fit.invalid("beta of one row", "none"))?;
+    frames(Tool::GaussianAvatar, &Item::new(&cameras, &camera), &fit.get("trans")?, &pose, betas, video)
+}
+
+/// A file beside `path` or in the folder above.
+fn beside(path: &Path, name: &str) -> Result<PathBuf, CaptureError> {
+    let found = path.ancestors().skip(1).take(2).map(|dir| dir.join(name)).find(|file| file.is_file());
+    found.ok_or_else(|| CaptureError::missing(&path.with_file_name(name), "file (nor in the folder above): the camera"))
+}
+
+/// A person before a camera that stands still, a row of `place` and of `poses` a picture.
+fn frames(
+    tool: Tool,
+    camera: &Item<'_>,
+    place: &Item<'_>,
+    poses: &[Vec<f64>],
+    betas: &[f64],
+    video: &Video,
+) -> Result<Fit, CaptureError> {
+    let k = camera.get("intrinsic")?.numbers(&[Some(3), Some(3)])?;
+    let extrinsic = camera.get("extrinsic")?;
+    let e = extrinsic.numbers(&[Some(4), Some(4)])?;
+    let turn = extrinsic.rotation(&[&e[0..3], &e[4..7], &e[8..11]].concat())?;
+    let moved = DVec3::new(e[3], e[7], e[11]);
+    let places = place.rows(3)?;
     place.as_long(poses.len(), places.len())?;
     // The frames of a partial split are unknown.
     if places.len() < video.names.len() {
@@ -60,10 +93,10 @@ pub(super) fn read(path: &Path, npz: &mut Npz, video: &Video) -> Result<Fit, Cap
         world_to_camera: turn,
         about: About::Origin(turn),
         offset: turn * DVec3::from_slice(place) + moved,
-        ..FitFrame::still(index, vectors(pose), betas.clone(), place, lens)
+        ..FitFrame::still(index, vectors(pose), betas.to_vec(), place, lens)
     });
     let person = Person { id: "0".to_owned(), frames: frames.collect(), ..Person::default() };
-    Ok(Fit { tool: Tool::PeopleSnapshot, people: vec![person], names: None })
+    Ok(Fit { tool, people: vec![person], names: None })
 }
 
 #[cfg(test)]
@@ -74,7 +107,8 @@ mod tests {
     use crate::import::fit::{axis_angle, rotation};
     use crate::import::read;
     use crate::import::tests::{Motion, known};
-    use crate::testing::{Directory, shared};
+    use crate::testing::{Directory, Py, shared};
+    use testkit::files::zip;
 
     #[test]
     fn what_is_prepared_from_a_known_motion_is_that_motion() {
@@ -118,18 +152,38 @@ mod tests {
                 ("betas", betas.clone()),
                 ("global_orient", array(&[count, 3], part(0, 3))),
                 ("body_pose", array(&[count, 69], part(3, 72))),
-                ("transl", transl),
+                ("transl", transl.clone()),
             ],
         );
-        for file in ["poses.npz", "poses/train.npz"] {
+        // The same as GaussianAvatar has it, and with the joints of SMPL-X.
+        let parms = |name: &str, width: usize| {
+            let n = count as u32;
+            let bodies = thetas.chunks_exact(72).flat_map(|row| row.iter().copied().chain([0.0; 93]).take(width));
+            let parms = Py::record([
+                ("beta", crate::testing::array(&[1, 10], &betas.to_f64())),
+                ("body_pose", crate::testing::array(&[n, width as u32], &bodies.collect::<Vec<_>>())),
+                ("trans", crate::testing::array(&[n, 3], &transl.to_f64())),
+            ]);
+            out.write(name, zip([("archive/data.pkl", parms.pickle())]));
+        };
+        parms("smpl_parms.pth", 72);
+        parms("smplx.pth", 165);
+        std::fs::copy(out.path().join("cameras.npz"), out.path().join("cam_parms.npz")).unwrap();
+        let error = read::read(&out.path().join("smplx.pth"), &video).err().unwrap().to_string();
+        assert!(["smplx.pth", "body_pose", "72", "165"].iter().all(|word| error.contains(word)), "{error}");
+        for (file, tool) in [
+            ("poses.npz", Tool::PeopleSnapshot),
+            ("poses/train.npz", Tool::PeopleSnapshot),
+            ("smpl_parms.pth", Tool::GaussianAvatar),
+        ] {
             let (fit, _) = read::read(&out.path().join(file), &video).unwrap();
-            assert_eq!((fit.tool, fit.people.len(), fit.people[0].frames.len()), (Tool::PeopleSnapshot, 1, count));
+            assert_eq!((fit.tool, fit.people.len(), fit.people[0].frames.len()), (tool, 1, count));
             for (i, frame) in fit.people[0].frames.iter().enumerate() {
                 assert_eq!((frame.index, frame.focal, frame.centre), (i, [k[0], k[4]], [k[2], k[5]]));
                 assert!(frame.pelvis(joint).distance(pelvises[i]) < 1e-5);
                 let root = frame.world_to_camera * rotation(frame.pose[0]);
                 assert!(root.abs_diff_eq(rotation(poses[i][0]), 1e-5) && frame.world_to_camera == turn);
-                assert!(frame.pose[1..].iter().zip(&poses[i][1..]).all(|(a, b)| a.distance(*b) < 1e-9));
+                assert!(frame.pose[1..].iter().zip(&poses[i][1..]).all(|(a, b)| a.distance(*b) < 1e-6));
             }
         }
         let refused = |words: &[&str]| {

@@ -12,13 +12,16 @@ use array_files::torch::{TorchFile, is_torch};
 use super::fit::{Fit, FitFrame, Person};
 use super::item::{Item, dictionary};
 use super::video::Video;
-use super::{easymocap, gvhmr, join, neuman, peoplesnapshot, phalp, points, prompthmr, romp, sam3d, vibe, wham};
+use super::{
+    cliff, easymocap, glamr, gvhmr, join, neuman, peoplesnapshot, phalp, points, prompthmr, romp, sam3d, vibe, wham,
+};
 use crate::CaptureError;
 use crate::checks::{MAX_ANGLE, MAX_BETA};
 
 /// Expected formats.
-const TOOLS: &str = "a result of WHAM, 4D-Humans / PHALP, GVHMR, PromptHMR, VIBE, ROMP or SAM 3D Body, EasyMocap's \
-    folder, joints (with --joints), poses.npz of PeopleSnapshot, or smpl_output_*.pkl of NeuMan";
+const TOOLS: &str = "a result of WHAM, 4D-Humans / PHALP, GVHMR, PromptHMR, VIBE, CLIFF, GLAMR, ROMP or SAM 3D Body, \
+    EasyMocap's folder, joints (with --joints), poses.npz of PeopleSnapshot, smpl_parms.pth of GaussianAvatar, or \
+    smpl_output_*.pkl of NeuMan";
 
 /// Reads a fit; the format is detected by content. Also returns how its frames were joined with the
 /// pictures, unless by name.
@@ -112,6 +115,9 @@ fn read_file(path: &Path, video: &Video) -> Result<Fit, CaptureError> {
             if peoplesnapshot::is(npz.keys()) {
                 return peoplesnapshot::read(path, &mut npz, video);
             }
+            if cliff::KEYS.iter().all(|name| npz.keys().iter().any(|key| key == name)) {
+                return cliff::read(path, &mut npz, video);
+            }
             // Archives of PyTorch hold a pickle.
             if !npz.keys().is_empty() && !npz.keys().iter().any(|key| key.ends_with("data.pkl")) {
                 let found = format!("an archive of {}", npz.keys().join(", "));
@@ -132,7 +138,10 @@ fn read_file(path: &Path, video: &Video) -> Result<Fit, CaptureError> {
             }
         }
         let mut file = TorchFile::open(&name, BufReader::new(file))?;
-        return gvhmr::read(path, &mut file, video);
+        return match file.root().get("body_pose").and(file.root().get("trans")) {
+            Some(_) => peoplesnapshot::of_gaussian_avatar(path, &mut file, video),
+            None => gvhmr::read(path, &mut file, video),
+        };
     }
     if matches!(start.trim_ascii_start().first(), Some(b'{' | b'[')) {
         return parse(path, &sam3d::json(path)?, video);
@@ -155,13 +164,16 @@ pub(super) fn parse(path: &Path, value: &Value, video: &Video) -> Result<Fit, Ca
     if value.get("people").is_some() && value.get("camera").is_some() {
         return prompthmr::read(&root, video);
     }
+    if value.get("person_data").is_some() && value.get("cam_pose").is_some() {
+        return glamr::read(&root);
+    }
     let entries = root.entries()?;
     let has = |keys: &[&str]| entries.iter().any(|(_, item)| keys.iter().all(|key| item.value.get(key).is_some()));
     if has(&["tid", "smpl", "camera"]) {
         phalp::read(&entries, video)
     } else if has(&["pose", "trans", "frame_ids"]) {
         wham::read(&entries, video)
-    } else if has(&["pose", "orig_cam", "frame_ids"]) {
+    } else if has(&["pose", "betas", "frame_ids"]) && (has(&["orig_cam"]) || has(&["pred_cam", "bboxes"])) {
         vibe::read(&entries, video)
     } else if has(&["pose", "betas"]) && path.with_file_name("alignments.npy").is_file() {
         neuman::read(path, &entries, video)

@@ -46,7 +46,7 @@ pub(super) fn read(path: &Path, results: &Value, video: &Video) -> Result<Fit, C
 
 /// Ids of people at these places, where the file has none: of the person last seen nearest, within two
 /// metres.
-fn tracked(places: &[Vec<f64>], last: &mut BTreeMap<i64, DVec3>) -> Vec<i64> {
+pub(super) fn tracked(places: &[Vec<f64>], last: &mut BTreeMap<i64, DVec3>) -> Vec<i64> {
     const METRES: f64 = 2.0;
     let mut taken = Vec::new();
     for place in places.iter().map(|place| DVec3::from_slice(place)) {

@@ -198,12 +198,75 @@ fn legal_but_rare_documents_are_read() {
     assert!(Character::from_bytes("a", leaves.as_bytes()).unwrap_err().to_string().contains("beside it"));
 }
 
+/// Views as npm's meshoptimizer 1.0.1 (`encodeGltfBuffer`; `encodeFilterExp` of 15 bits, `encodeFilterQuat`
+/// of 16) writes those of positions, rotations and indices.
+#[test]
+fn compressed_views_hold_what_was_compressed() {
+    let (json, binary) = arm();
+    let plain = read(&json, &binary).unwrap();
+    let positions = "a000013f000000403f2000012800000000010c0000004000012800000000000001280000000000000000000000000000000000\
+        000000000000000000f2000000f2000000f2";
+    let rotations = "a001100000000130000000fe0000000001100000000000000000000000000000000000000000000000000000000000000000\
+        0000ff7f";
+    let triangles = "e1f010007687566778a9866589689801690000";
+    for extension in ["EXT_meshopt_compression", "KHR_meshopt_compression"] {
+        let (mut json, mut bytes) = (json.clone(), binary.clone());
+        for (view, length, stride, count, mode, hex) in [
+            (0, 48, 12, 4, r#"ATTRIBUTES","filter":"EXPONENTIAL"#, positions),
+            (248, 16, 8, 2, r#"ATTRIBUTES","filter":"QUATERNION"#, rotations),
+            (368, 12, 2, 6, "TRIANGLES", triangles),
+        ] {
+            let compressed: Vec<u8> =
+                (0..hex.len() / 2).map(|i| u8::from_str_radix(&hex[2 * i..2 * i + 2], 16).unwrap()).collect();
+            let old = json.find(&format!(r#"{{"buffer":0,"byteOffset":{view},"#)).unwrap();
+            let end = old + json[old..].find('}').unwrap() + 1;
+            let new = format!(
+                r#"{{"buffer":1,"byteLength":{length},"extensions":{{"{extension}":{{"buffer":0,"byteOffset":{},
+                "byteLength":{},"byteStride":{stride},"count":{count},"mode":"{mode}"}}}}}}"#,
+                bytes.len(),
+                compressed.len()
+            );
+            json.replace_range(old..end, &new);
+            bytes.extend(compressed);
+        }
+        // Rotations are normalised integers now.
+        let json = json.replacen(
+            r#"{"bufferView":4,"componentType":5126"#,
+            r#"{"bufferView":4,"componentType":5122,"normalized":true"#,
+            1,
+        );
+        let all = bytes.len();
+        let buffers = format!(
+            r#""byteLength":{all}}},{{"byteLength":400,"extensions":{{"{extension}":{{"fallback":true}}}}}}],
+            "extensionsRequired":["{extension}"]}}"#
+        );
+        let json = json.replace(r#""byteLength":380}]}"#, &buffers);
+        let read = read(&json, &bytes).unwrap();
+        assert_eq!((&read.vertices, &read.faces), (&plain.vertices, &plain.faces));
+        for i in 0..5 {
+            let at = 1.0 + 0.5 * i as f32;
+            let close = |(a, b): (&Vec3, &Vec3)| a.distance(*b) < 1e-4;
+            assert!(read.pose(0, at).vertices.iter().zip(&plain.pose(0, at).vertices).all(close));
+        }
+        let wrong = |from: &str, to: &str, words: &[&str]| {
+            assert!(json.contains(from));
+            refused(&json.replacen(from, to, 1), &bytes, words);
+        };
+        wrong(r#""count":6,"mode""#, r#""count":9,"mode""#, &["buffer view 7", "meshopt", "TRIANGLES"]);
+        wrong(r#""mode":"TRIANGLES""#, r#""mode":"STRIPS""#, &["buffer view 7", "meshopt", "STRIPS"]);
+        wrong(r#""byteLength":19"#, r#""byteLength":18"#, &["buffer view 7", "meshopt"]);
+        wrong(r#""byteLength":19"#, r#""byteLength":20"#, &["buffer view 7", "leave"]);
+        wrong(r#""byteLength":48"#, r#""byteLength":4800000000"#, &["buffer view 0", "limit"]);
+    }
+}
+
 #[test]
 fn textures_are_placed_and_what_is_not_read_is_named() {
     let (json, binary) = arm();
-    let material = r#""materials":[{"pbrMetallicRoughness":{"baseColorFactor":[1,0.5,1,1],"baseColorTexture":{"index":0,
+    let material = r#""materials":[{"pbrMetallicRoughness":{"baseColorFactor":[1,0.5,1,0.8],"baseColorTexture":{"index":0,
 "extensions":{"KHR_texture_transform":{"offset":[0.5,0.25],"rotation":1.5707964,"scale":[2,3]}}}},"alphaMode":"MASK"},
-{"pbrMetallicRoughness":{"baseColorTexture":{"index":1}}},{"pbrMetallicRoughness":{"baseColorTexture":{"index":2}}}],
+{"pbrMetallicRoughness":{"baseColorTexture":{"index":1}},"alphaMode":"MASK","alphaCutoff":0.25},
+{"pbrMetallicRoughness":{"baseColorTexture":{"index":2}},"alphaMode":"BLEND"}],
 "textures":[{"source":0},{"source":0},{"source":1}],
 "images":[{"uri":"data:image/png;base64,AAAA"},{"uri":"data:image/jpeg;base64,BBBB"}],"meshes""#;
     let json = json.replacen(r#""meshes""#, material, 1);
@@ -237,7 +300,7 @@ fn textures_are_placed_and_what_is_not_read_is_named() {
         let expected = glam::Vec2::new(3.0 * v + 0.5, -2.0 * u + 0.25);
         assert!(uv.distance(expected) < 1e-5, "{uv} {expected}");
     }
-    assert!(read.ignored.len() == 1 && read.ignored[0].contains("alphaMode"), "{:?}", read.ignored);
+    assert!(read.ignored.len() == 1 && read.ignored[0].contains("alphaMode BLEND"), "{:?}", read.ignored);
     let mimes: Vec<&str> = read.textures.iter().map(|texture| texture.mime.as_str()).collect();
     assert_eq!((mimes, read.uvs.len()), (vec!["image/png", "image/jpeg"], 16));
     assert_eq!(read.texture_of, [[Some(0); 4], [None; 4], [Some(0); 4], [Some(1); 4]].concat());
@@ -245,6 +308,8 @@ fn textures_are_placed_and_what_is_not_read_is_named() {
     let colours = [[1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.5, 0.0], [0.5, 0.25, 0.0]].map(Vec3::from);
     let tints = [colours, [Vec3::new(1.0, 0.5, 1.0); 4], [Vec3::ONE; 4], [Vec3::ONE; 4]].concat();
     assert_eq!(read.tints, tints);
+    // The first primitive's colours have no alpha.
+    assert_eq!(read.cutoffs, [[2.0; 4], [0.625; 4], [0.25; 4], [0.5; 4]].concat());
 }
 
 /// Fails unless reading gives an error that names every one of `words`.
@@ -272,7 +337,7 @@ fn errors_name_the_fault_of_a_document() {
     let no_view = r#""componentType":5126,"count":4294967295"#;
     refused(&swap(r#""bufferView":0,"componentType":5126,"count":4"#, no_view), &binary, &["accessor 0", "limit"]);
     let required = |name: &str| swap(r#""scene":0"#, &format!(r#""scene":0,"extensionsRequired":["{name}"]"#));
-    for name in ["KHR_draco_mesh_compression", "EXT_meshopt_compression", "EXT_texture_webp"] {
+    for name in ["KHR_draco_mesh_compression", "KHR_texture_basisu", "EXT_texture_webp"] {
         refused(&required(name), &binary, &["extensionsRequired", name]);
     }
     refused(&swap(r#""byteOffset":368,"byteLength":12"#, r#""byteOffset":368,"byteLength":13"#), &binary, &["view 7"]);

@@ -167,10 +167,10 @@ pub(super) fn film(
     let color = |face: u32, weights: [f32; 3]| {
         let corners = person.faces[face as usize].iter().zip(weights);
         let rest = corners.map(|(&v, w)| person.rest[v as usize] * w).sum();
-        match (face as usize) < person.sheets {
+        Some(match (face as usize) < person.sheets {
             true => albedo(&person.landmarks, &dress, rest),
             false => outfit::color(config.outfit, person.landmarks.figure(rest)),
-        }
+        })
     };
     let capture = stage.film("demo", |i| {
         let posed = body.pose(&shaped, &poses[i].joints, poses[i].placement());

@@ -91,17 +91,19 @@ pub(super) fn film(
     let color = |face: u32, weights: [f32; 3]| {
         let corners = character.faces[face as usize].map(|v| v as usize);
         let mean = |values: &[Vec3]| corners.iter().zip(weights).map(|(&v, w)| values[v] * w).sum::<Vec3>();
+        let cutoff: f32 = corners.iter().zip(weights).map(|(&v, w)| character.cutoffs[v] * w).sum();
         // The corners of a face are of one material.
         match character.texture_of[corners[0]] {
             Some(texture) => {
                 let uv: Vec2 = corners.iter().zip(weights).map(|(&v, w)| character.uvs[v] * w).sum();
-                tinted(sample(&textures[texture as usize], uv), mean(&character.tints))
+                let texel = sample(&textures[texture as usize], uv);
+                (texel.w >= cutoff).then(|| tinted(texel.truncate(), mean(&character.tints)))
             }
-            None if !is_plain => tinted(Vec3::ONE, mean(&character.tints)),
+            None if !is_plain => (cutoff <= 1.0).then(|| tinted(Vec3::ONE, mean(&character.tints))),
             None => {
                 let place = |v: usize| figure.body.v_template[figure.welded[v] as usize];
                 let at: Vec3 = corners.iter().zip(weights).map(|(&v, w)| place(v) * w).sum();
-                pattern(at / figure.unit, character.weights.heaviest(corners[0]).unwrap_or(0))
+                Some(pattern(at / figure.unit, character.weights.heaviest(corners[0]).unwrap_or(0)))
             }
         }
     };

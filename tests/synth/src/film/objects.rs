@@ -150,11 +150,11 @@ fn picture(camera: &Camera, height: f32, (size, right): (f32, f32), lamp: Lamp) 
     let places = corners.clone();
     let color = |face: u32, weights: [f32; 3]| {
         let at: Vec3 = (0..3).map(|k| places[3 * face as usize + k] * weights[k]).sum::<Vec3>() / height;
-        if face / TRIANGLES_A_BOX < 2 {
+        Some(if face / TRIANGLES_A_BOX < 2 {
             WOOD * (0.75 + 0.5 * smooth_noise(at * Vec3::new(9.0, 60.0, 60.0)))
         } else {
             STONE * (0.8 + 0.3 * smooth_noise(at * 30.0)) * if (at.y * 6.0).rem_euclid(1.0) < 0.06 { 0.7 } else { 1.0 }
-        }
+        })
     };
     Ok(Posture::new(corners, normals, &faces, &color, lamp)?.render(camera))
 }

@@ -11,6 +11,9 @@ use volrender::RandomStream;
 
 /// Rays a pixel, along each axis.
 const SAMPLES: u32 = 2;
+/// Most surfaces with holes along a ray, and by how much farther than a hole it goes on.
+const LAYERS: usize = 32;
+const BEYOND: f32 = 1.000_01;
 /// Light from everywhere, light from above, light of the lamp, and what the lamp gives on average.
 const AMBIENT: f32 = 0.58;
 const SKY: f32 = 0.07;
@@ -61,8 +64,8 @@ pub(crate) fn look_at(eye: Vec3, target: Vec3, size: u32, focal: f32) -> Result<
 /// A picture, colours premultiplied, and its coverage.
 pub(crate) type Picture = (Image, Vec<f32>);
 
-/// The unlit colour of a face at a point given by barycentric weights.
-pub(crate) type Albedo<'a> = dyn Fn(u32, [f32; 3]) -> Vec3 + Sync + 'a;
+/// The unlit colour of a face at a point given by barycentric weights; `None` in a hole.
+pub(crate) type Albedo<'a> = dyn Fn(u32, [f32; 3]) -> Option<Vec3> + Sync + 'a;
 
 /// A mesh in one pose, ready to be looked at.
 pub(crate) struct Posture<'a> {
@@ -133,12 +136,19 @@ impl<'a> Posture<'a> {
     }
 
     fn color(&self, origin: Vec3, direction: Vec3) -> Option<Vec3> {
-        let hit = self.mesh.first_hit(origin, direction)?;
-        let corners = self.faces[hit.face as usize];
-        let mix = |of: &[Vec3]| -> Vec3 { corners.iter().zip(hit.barycentric).map(|(&v, w)| of[v as usize] * w).sum() };
-        let normal = mix(&self.normals).normalize_or(-direction);
-        let color = (self.albedo)(hit.face, hit.barycentric) * self.lamp.on(normal);
-        Some(color.clamp(Vec3::ZERO, Vec3::ONE))
+        let mut t = 0.0;
+        for _ in 0..LAYERS {
+            let hit = self.mesh.first_hit(origin + direction * t, direction)?;
+            let Some(albedo) = (self.albedo)(hit.face, hit.barycentric) else {
+                t = (t + hit.t) * BEYOND;
+                continue;
+            };
+            let corners = self.faces[hit.face as usize];
+            let normals = corners.iter().zip(hit.barycentric).map(|(&v, w)| self.normals[v as usize] * w);
+            let normal = normals.sum::<Vec3>().normalize_or(-direction);
+            return Some((albedo * self.lamp.on(normal)).clamp(Vec3::ZERO, Vec3::ONE));
+        }
+        None
     }
 }
 

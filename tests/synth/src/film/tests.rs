@@ -246,6 +246,48 @@ fn a_body_of_one_rigid_part_without_a_texture_is_filmed() {
     assert!(made.clear.iter().all(|clear| clear.pixels().unwrap().mask.iter().any(|m| *m > 0.5)));
 }
 
+#[test]
+fn what_lies_behind_a_hole_is_seen_through_it() {
+    // A plate, green to the right and a hole to the left, before a red one of half its size.
+    let texture = image::RgbaImage::from_fn(64, 4, |x, _| image::Rgba([0, 255, 0, if x < 32 { 0 } else { 255 }]));
+    let mut png = std::io::Cursor::new(Vec::new());
+    texture.write_to(&mut png, image::ImageFormat::Png).unwrap();
+    let plate = |half: f32, z: f32| [-half, -half, z, half, -half, z, half, half, z, -half, half, z];
+    let uvs = [0.0f32, 1.0, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0];
+    let floats = [&plate(0.5, 0.0)[..], &plate(0.25, -0.05), &uvs].concat();
+    let mut bytes: Vec<u8> = floats.iter().flat_map(|v| v.to_le_bytes()).collect();
+    bytes.extend([0u16, 1, 2, 0, 2, 3].iter().flat_map(|v| v.to_le_bytes()));
+    bytes.extend(png.get_ref());
+    let (all, image) = (bytes.len(), png.get_ref().len());
+    let json = format!(
+        r#"{{"asset":{{"version":"2.0"}},"nodes":[{{"mesh":0}}],
+        "meshes":[{{"primitives":[{{"attributes":{{"POSITION":0,"TEXCOORD_0":2}},"indices":3,"material":0}},
+        {{"attributes":{{"POSITION":1}},"indices":3,"material":1}}]}}],
+        "materials":[{{"alphaMode":"MASK","pbrMetallicRoughness":{{"baseColorTexture":{{"index":0}}}}}},
+        {{"pbrMetallicRoughness":{{"baseColorFactor":[1,0,0,1]}}}}],
+        "textures":[{{"source":0}}],"images":[{{"bufferView":2,"mimeType":"image/png"}}],
+        "buffers":[{{"byteLength":{all}}}],"bufferViews":[{{"buffer":0,"byteLength":128}},
+        {{"buffer":0,"byteOffset":128,"byteLength":12}},{{"buffer":0,"byteOffset":140,"byteLength":{image}}}],
+        "accessors":[{{"bufferView":0,"componentType":5126,"count":4,"type":"VEC3"}},
+        {{"bufferView":0,"byteOffset":48,"componentType":5126,"count":4,"type":"VEC3"}},
+        {{"bufferView":0,"byteOffset":96,"componentType":5126,"count":4,"type":"VEC2"}},
+        {{"bufferView":1,"componentType":5123,"count":6,"type":"SCALAR"}}]}}"#
+    );
+    let character = Character::from_bytes("hole.glb", &glb(json, &bytes)).unwrap();
+    let config = SynthConfig { turns: 0.0, ..small() };
+    let made = synthesise(Some(&character), None, &config, &|_| {}).unwrap();
+    let pixels = made.clear[0].pixels().unwrap();
+    let mut counts = [0; 3];
+    for (i, mask) in pixels.mask.iter().enumerate().filter(|(_, mask)| **mask > 0.99) {
+        let left = 2 * (i as u32 % pixels.image.width) < pixels.image.width;
+        let [red, green] = [0, 1].map(|channel| pixels.image.pixels[3 * i + channel]);
+        counts[if green > red { usize::from(left) } else { 2 }] += 1;
+        assert!(*mask < 0.99 || red.max(green) > 0.2);
+    }
+    let [right, wrong, behind] = counts;
+    assert!(wrong == 0 && right > 200 && (6..10).contains(&(behind * 32 / right)), "{counts:?}");
+}
+
 /// Intersection over union of the posed body's silhouette and the mask, over the pixels that no
 /// known occluder covers.
 fn overlap(frame: &Frame, body: &BodyModel) -> f32 {

@@ -1,7 +1,7 @@
 //! Colours of a character: its base colour texture, else a pattern.
 
-use glam::{Vec2, Vec3};
-use image::{ImageReader, RgbImage};
+use glam::{Vec2, Vec3, Vec4};
+use image::{ImageReader, RgbaImage};
 use rigged::{Character, Texture};
 
 use super::noise::smooth_noise;
@@ -9,12 +9,12 @@ use capture::CaptureError;
 use capture::MAX_SIDE;
 
 /// Decodes the base colour textures, of [`MAX_SIDE`]² pixels at most all together.
-pub(super) fn decode(character: &Character) -> Result<Vec<RgbImage>, CaptureError> {
+pub(super) fn decode(character: &Character) -> Result<Vec<RgbaImage>, CaptureError> {
     let mut left = u64::from(MAX_SIDE).pow(2);
     character.textures.iter().map(|texture| decoded(texture, &mut left)).collect()
 }
 
-fn decoded(texture: &Texture, left: &mut u64) -> Result<RgbImage, CaptureError> {
+fn decoded(texture: &Texture, left: &mut u64) -> Result<RgbaImage, CaptureError> {
     let fault = |found: String| CaptureError::setting("character", "a base colour texture in PNG or JPEG", found);
     let open = || ImageReader::new(std::io::Cursor::new(&texture.bytes)).with_guessed_format();
     let size = open().map_err(|e| fault(e.to_string()))?.into_dimensions().map_err(|e| fault(e.to_string()))?;
@@ -22,12 +22,12 @@ fn decoded(texture: &Texture, left: &mut u64) -> Result<RgbImage, CaptureError> 
     let fits = size.0.min(size.1) > 0 && size.0.max(size.1) <= MAX_SIDE;
     *left = rest.filter(|_| fits).ok_or_else(|| fault(format!("one of {}×{} pixels", size.0, size.1)))?;
     let decoded = open().map_err(|e| fault(e.to_string()))?.decode().map_err(|e| fault(e.to_string()))?;
-    Ok(decoded.into_rgb8())
+    Ok(decoded.into_rgba8())
 }
 
-/// The colour at `uv`, bilinear, repeated beyond the edges. Coordinates that are not finite give
+/// The colour and alpha at `uv`, bilinear, repeated beyond the edges. Coordinates that are not finite give
 /// the corner's.
-pub(super) fn sample(texture: &RgbImage, uv: Vec2) -> Vec3 {
+pub(super) fn sample(texture: &RgbaImage, uv: Vec2) -> Vec4 {
     let size = Vec2::new(texture.width() as f32, texture.height() as f32);
     let uv = if uv.is_finite() { uv - uv.floor() } else { Vec2::ZERO };
     let at = uv * size - Vec2::splat(0.5);
@@ -35,7 +35,7 @@ pub(super) fn sample(texture: &RgbImage, uv: Vec2) -> Vec3 {
     let texel = |dx: i64, dy: i64| {
         let x = (corner.x as i64 + dx).rem_euclid(i64::from(texture.width())) as u32;
         let y = (corner.y as i64 + dy).rem_euclid(i64::from(texture.height())) as u32;
-        Vec3::from(texture.get_pixel(x, y).0.map(f32::from)) / 255.0
+        Vec4::from(texture.get_pixel(x, y).0.map(f32::from)) / 255.0
     };
     let row = |dy: i64| texel(0, dy).lerp(texel(1, dy), t.x);
     row(0).lerp(row(1), t.y)
