@@ -44,7 +44,7 @@ impl Anchor {
 }
 
 /// Name, joint, and for a vertex the direction in which it is the farthest.
-const LANDMARKS: [(&str, usize, [f32; 3]); 14] = [
+const LANDMARKS: [(&str, usize, [f32; 3]); 20] = [
     ("nose", 15, [0.0, 0.0, 1.0]),
     ("head", 15, [0.0, 1.0, 0.0]),
     ("lear", 15, [1.0, 0.0, 0.0]),
@@ -59,6 +59,12 @@ const LANDMARKS: [(&str, usize, [f32; 3]); 14] = [
     ("rthumb", 21, [-0.5, 0.0, 1.0]),
     ("lfinger", 20, [1.0, 0.0, 0.0]),
     ("rfinger", 21, [-1.0, 0.0, 0.0]),
+    ("lfore", 27, [1.0, 0.0, 0.0]),
+    ("rfore", 42, [-1.0, 0.0, 0.0]),
+    ("lring", 36, [1.0, 0.0, 0.0]),
+    ("rring", 51, [-1.0, 0.0, 0.0]),
+    ("lpinky", 33, [1.0, 0.0, 0.0]),
+    ("rpinky", 48, [-1.0, 0.0, 0.0]),
 ];
 
 /// Name, joint, and where at rest from the joint, in metres, the vertex is the nearest.
@@ -83,8 +89,8 @@ const SETS: [(&str, &str); 5] = [
     (
         "mhr70",
         "nose - - lear rear 16 17 18 19 lhip rhip 4 5 7 8 ltoe lsmall lheel rtoe rsmall rheel \
-         rthumb 54 53 52 - 42 41 40 rfinger 45 44 23>21 - 51 50 49 - 48 47 46 21>23 \
-         lthumb 39 38 37 - 27 26 25 lfinger 30 29 22>20 - 36 35 34 - 33 32 31 20>22 \
+         rthumb 54 53 52 rfore 42 41 40 rfinger 45 44 23>21 rring 51 50 49 rpinky 48 47 46 21>23 \
+         lthumb 39 38 37 lfore 27 26 25 lfinger 30 29 22>20 lring 36 35 34 lpinky 33 32 31 20>22 \
          lelbow-back relbow-back lelbow-front relbow-front - - 12",
     ),
 ];
@@ -116,7 +122,8 @@ pub fn joint_set(body: &BodyModel, name: &str) -> Option<Vec<Option<Anchor>>> {
     let joints = body.shaped(&[]).joints;
     let anchor = |point: &str| {
         if let Some((_, joint, direction)) = LANDMARKS.iter().find(|(landmark, ..)| *landmark == point) {
-            return Some(Anchor::farthest(body, *joint, Vec3::from_array(*direction)));
+            let farthest = || Anchor::farthest(body, *joint, Vec3::from_array(*direction));
+            return (*joint < body.num_joints()).then(farthest);
         }
         if let Some((_, joint, offset)) = NEAR.iter().find(|(landmark, ..)| *landmark == point) {
             let place = joints[*joint] + Vec3::from_array(*offset);

@@ -2,12 +2,14 @@
 
 use std::path::Path;
 
+use array_files::npz::Npz;
 use glam::{DVec3, Vec3};
-use point_fit::{Fitted, joint_set, joint_sets};
+use point_fit::{Anchor, Fitted, joint_set, joint_sets};
 use smpl::BodyModel;
 
 use super::fit::{Fit, FitFrame, Person, Tool};
-use super::item::array;
+use super::item::{Item, array, dictionary};
+use super::sam3d::{VERTICES, stride};
 use super::video::Video;
 use crate::CaptureError;
 
@@ -42,12 +44,49 @@ pub(super) fn count(set: &str) -> Result<usize, CaptureError> {
     points.ok_or_else(|| CaptureError::setting("joints", joint_sets().join(", "), set))
 }
 
-/// Fits `model` to a person's points: poses, places and one shape. Returns what to say of it.
-pub(super) fn solve(path: &Path, set: &str, person: &mut Person, model: &BodyModel) -> Result<String, CaptureError> {
+/// The body's points that the vertices of `person` after its key points lie on, from the mapping file
+/// `map`: `triangle_ids` (V) and `baryc_coords` (V,3) of all `vertices`.
+pub(super) fn mapped(fit: &Path, map: &Path, vertices: usize, model: &BodyModel) -> Result<Vec<Anchor>, CaptureError> {
+    if vertices == 0 {
+        return Err(CaptureError::invalid(fit, VERTICES, "this key of SAM 3D Body, for the vertex map", "none"));
+    }
+    let value = dictionary(&mut Npz::open(map)?)?;
+    let root = Item::new(map, &value);
+    let (faces, weights) = (root.get("triangle_ids")?, root.get("baryc_coords")?);
+    let (ids, rows) = (faces.indices()?, weights.rows(3)?);
+    if ids.len() != vertices || rows.len() != vertices {
+        let expected = format!("a triangle of the body for each of {vertices} {VERTICES} (MHR's smpl2mhr_mapping.npz)");
+        return Err(faces.invalid(expected, format!("{} and {} {}", ids.len(), rows.len(), "baryc_coords")));
+    }
+    let anchor = |(id, row): (&usize, &Vec<f64>)| {
+        let of = || faces.invalid(format!("triangles below {}, as the body has", model.faces.len()), id.to_string());
+        let corners = model.faces.get(*id).ok_or_else(of)?.map(|v| v as usize);
+        if (row.iter().sum::<f64>() - 1.0).abs() > 1e-3 {
+            return Err(weights.invalid("weights that sum to 1", format!("{row:?}")));
+        }
+        let vertices = corners.into_iter().zip(row.iter().map(|w| *w as f32)).collect();
+        Ok(Anchor { joints: Vec::new(), vertices })
+    };
+    ids.iter().zip(&rows).step_by(stride(vertices)).map(anchor).collect()
+}
+
+/// Fits `model` to a person's points, and to the vertices after them that lie on `mapped`: poses, places and one shape.
+/// Returns what to say of it.
+pub(super) fn solve(
+    path: &Path,
+    set: &str,
+    mapped: Vec<Anchor>,
+    person: &mut Person,
+    model: &BodyModel,
+) -> Result<String, CaptureError> {
+    /// Largest distance from a mesh that the map is of, beside noise, metres.
+    const MAPPED: f64 = 0.06;
     let invalid =
         |expected: String, found: String| CaptureError::invalid(path, format!("person {}", person.id), expected, found);
-    let points = joint_set(model, set)
+    let is_mapped = !mapped.is_empty();
+    let mut points = joint_set(model, set)
         .ok_or_else(|| invalid("a body with SMPL's joints".to_owned(), format!("{} joints", model.num_joints())))?;
+    points.extend(mapped.into_iter().map(Some));
     let anchors: Vec<_> = points.iter().flatten().cloned().collect();
     let first = person.frames.first().map_or(0, |frame| frame.index);
     let last = person.frames.last().map_or(0, |frame| frame.index);
@@ -72,6 +111,10 @@ pub(super) fn solve(path: &Path, set: &str, person: &mut Person, model: &BodyMod
         }
     }
     let off = (squares.iter().sum::<f64>() / squares.len().max(1) as f64).sqrt();
+    if is_mapped && off > MAPPED + 2.0 * f64::from(noise) {
+        let found = format!("{:.0} mm off", 1e3 * off);
+        return Err(invalid("a body that the vertex map is of (--body)".to_owned(), found));
+    }
     let swapped = match swapped.len() {
         0 => String::new(),
         n => format!(
