@@ -268,7 +268,7 @@ mod tests {
 
     #[test]
     fn the_open_body_stands_where_the_captures_body_stood() {
-        let demo = DemoConfig { size: 16, frames: 60, eval_cameras: 1, ..DemoConfig::default() };
+        let demo = DemoConfig { size: 16, frames: 100, eval_cameras: 1, ..DemoConfig::default() };
         let body = BodyModel::embedded();
         let joints = |capture: &Capture, model: &BodyModel| -> Vec<Vec<Vec3>> {
             let frames = capture.train.iter().chain(capture.eval.iter().map(|view| &view.frame));

@@ -126,11 +126,11 @@ pub fn import(options: &ImportOptions, out: &Path) -> Result<Imported, CaptureEr
         (Some(true), Some(path)) => body::mean_hands(path)?,
         _ => Vec::new(),
     };
-    let map = options.vertex_map.as_deref();
-    let mapped = map.map(|map| points::mapped(&options.fit, map, person.vertices, &model)).transpose()?;
+    let (map, open) = (options.vertex_map.as_deref(), body_path.is_none());
+    let mapped = points::mapped(&options.fit, map, person.vertices, &model, open)?;
     if tool.is_points() {
         let set = options.joints.as_deref().unwrap_or(sam3d::SET);
-        notes.push(points::solve(&options.fit, set, mapped.unwrap_or_default(), &mut person, &model)?);
+        notes.push(points::solve(&options.fit, set, mapped, &mut person, &model)?);
     } else if body_path.is_none() {
         // Shape coefficients of another body.
         person.frames.iter_mut().for_each(|frame| frame.betas.clear());
