@@ -84,6 +84,11 @@ pub struct ImportArguments {
     /// The joints of a --fit that is an array of joints: coco17, openpose25, smpl24, h36m17 or mhr70
     #[arg(long, value_name = "SET")]
     joints: Option<String>,
+    /// Points of the body that SAM 3D Body's pred_vertices lie on, which tell the twist of limbs: of a --body
+    /// SMPL_NEUTRAL.pkl smpl2mhr_mapping.npz, of SMPLX_NEUTRAL.npz smplx2mhr_mapping.npz, both of
+    /// github.com/facebookresearch/MHR (tools/mhr_smpl_conversion/assets)
+    #[arg(long, value_name = "FILE")]
+    vertex_map: Option<PathBuf>,
     /// 2-D key points of the frames, which registration then follows: OpenPose's folder of JSON (BODY_25),
     /// or one person's COCO points (frames, 17, 3) of ViTPose or RTMPose, .npy, .npz or .pt
     #[arg(long, value_name = "DIR|FILE")]
@@ -113,6 +118,7 @@ pub fn import(arguments: &ImportArguments) -> Result<()> {
         focal: arguments.focal,
         body: arguments.body.clone().or_else(|| std::env::var_os(BODY_VARIABLE).map(PathBuf::from)),
         joints: arguments.joints.clone(),
+        vertex_map: arguments.vertex_map.clone(),
         keypoints: arguments.keypoints.clone(),
         copy: arguments.copy,
     };
@@ -120,6 +126,7 @@ pub fn import(arguments: &ImportArguments) -> Result<()> {
         ("--frames", Some(&options.frames)),
         ("--fit", Some(&options.fit)),
         ("--masks", options.masks.as_ref()),
+        ("--vertex-map", options.vertex_map.as_ref()),
         ("--keypoints", options.keypoints.as_ref()),
     ] {
         if let Some(path) = path.filter(|path| !path.exists()) {

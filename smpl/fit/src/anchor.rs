@@ -44,7 +44,7 @@ impl Anchor {
 }
 
 /// Name, joint, and for a vertex the direction in which it is the farthest.
-const LANDMARKS: [(&str, usize, [f32; 3]); 14] = [
+const LANDMARKS: [(&str, usize, [f32; 3]); 20] = [
     ("nose", 15, [0.0, 0.0, 1.0]),
     ("head", 15, [0.0, 1.0, 0.0]),
     ("lear", 15, [1.0, 0.0, 0.0]),
@@ -59,10 +59,28 @@ const LANDMARKS: [(&str, usize, [f32; 3]); 14] = [
     ("rthumb", 21, [-0.5, 0.0, 1.0]),
     ("lfinger", 20, [1.0, 0.0, 0.0]),
     ("rfinger", 21, [-1.0, 0.0, 0.0]),
+    ("lfore", 27, [1.0, 0.0, 0.0]),
+    ("rfore", 42, [-1.0, 0.0, 0.0]),
+    ("lring", 36, [1.0, 0.0, 0.0]),
+    ("rring", 51, [-1.0, 0.0, 0.0]),
+    ("lpinky", 33, [1.0, 0.0, 0.0]),
+    ("rpinky", 48, [-1.0, 0.0, 0.0]),
 ];
 
+/// Name, joint, and where at rest from the joint, in metres, the vertex is the nearest.
+const NEAR: [(&str, usize, [f32; 3]); 4] = [
+    ("lelbow-back", 18, [0.0, 0.0, -0.05]),
+    ("relbow-back", 19, [0.0, 0.0, -0.05]),
+    ("lelbow-front", 18, [0.0, 0.0, 0.05]),
+    ("relbow-front", 19, [0.0, 0.0, 0.05]),
+];
+
+/// Distance of SAM 3D Body's hips in thigh lengths (0.32 to 0.37 in four people).
+const HIPS: f32 = 0.35;
+
 /// Names of joint sets, and their points in order: landmarks, numbers of SMPL's joints, means of two
-/// joints (`16+17`), and `-` for points without a place on the body; joints from 24 are SMPL-X's fingers.
+/// joints (`16+17`), points an eighth of the way from one joint to another (`20>22`), and `-` for points
+/// without a place on the body; joints from 24 are SMPL-X's fingers.
 const SETS: [(&str, &str); 5] = [
     ("coco17", "nose - - lear rear 16 17 18 19 20 21 1 2 4 5 7 8"),
     ("openpose25", "nose 16+17 17 19 21 16 18 20 1+2 2 5 8 1 4 7 - - rear lear ltoe lsmall lheel rtoe rsmall rheel"),
@@ -70,9 +88,10 @@ const SETS: [(&str, &str); 5] = [
     ("h36m17", "1+2 2 5 8 1 4 7 6 12 - head 16 18 20 17 19 21"),
     (
         "mhr70",
-        "nose - - lear rear 16 17 18 19 1 2 4 5 7 8 ltoe lsmall lheel rtoe rsmall rheel \
-         rthumb 54 53 52 - 42 41 40 rfinger 45 44 23 - 51 50 49 - 48 47 46 21 \
-         lthumb 39 38 37 - 27 26 25 lfinger 30 29 22 - 36 35 34 - 33 32 31 20 18 19 - - - - 12",
+        "nose - - lear rear 16 17 18 19 lhip rhip 4 5 7 8 ltoe lsmall lheel rtoe rsmall rheel \
+         rthumb 54 53 52 rfore 42 41 40 rfinger 45 44 23>21 rring 51 50 49 rpinky 48 47 46 21>23 \
+         lthumb 39 38 37 lfore 27 26 25 lfinger 30 29 22>20 lring 36 35 34 lpinky 33 32 31 20>22 \
+         lelbow-back relbow-back lelbow-front relbow-front - - 12",
     ),
 ];
 
@@ -100,20 +119,41 @@ pub fn joint_sets() -> [&'static str; SETS.len()] {
 #[must_use]
 pub fn joint_set(body: &BodyModel, name: &str) -> Option<Vec<Option<Anchor>>> {
     let (_, points) = SETS.iter().find(|(set, _)| *set == name).filter(|_| body.num_joints() >= 24)?;
+    let joints = body.shaped(&[]).joints;
     let anchor = |point: &str| {
         if let Some((_, joint, direction)) = LANDMARKS.iter().find(|(landmark, ..)| *landmark == point) {
-            return Some(Anchor::farthest(body, *joint, Vec3::from_array(*direction)));
+            let farthest = || Anchor::farthest(body, *joint, Vec3::from_array(*direction));
+            return (*joint < body.num_joints()).then(farthest);
         }
-        let joints: Vec<usize> = point.split('+').map(str::parse).collect::<Result<_, _>>().ok()?;
-        joints.iter().all(|&j| j < body.num_joints()).then_some(())?;
+        if let Some((_, joint, offset)) = NEAR.iter().find(|(landmark, ..)| *landmark == point) {
+            let place = joints[*joint] + Vec3::from_array(*offset);
+            let off = |v: &usize| body.v_template[*v].distance_squared(place);
+            let nearest = (0..body.num_vertices()).min_by(|a, b| off(a).total_cmp(&off(b)));
+            return Some(Anchor { vertices: vec![(nearest.unwrap_or(0), 1.0)], ..Anchor::default() });
+        }
+        if let "lhip" | "rhip" = point {
+            let apart = HIPS * joints[1].distance(joints[4]) / joints[1].distance(joints[2]).max(f32::EPSILON);
+            let [own, other] = if point == "lhip" { [1, 2] } else { [2, 1] };
+            // In 256ths the weights sum to 1 exactly.
+            let weight = (128.0 * (1.0 + apart)).round() / 256.0;
+            let joints = vec![(own, weight), (other, 1.0 - weight)];
+            return Some(Anchor { joints, ..Anchor::default() });
+        }
         // The hands of SMPL-X end in fingers, whose middle ones begin where SMPL's hands do.
-        let on_body = |joint: usize| match (joint, body.num_joints()) {
-            (22, 55) => 28,
-            (23, 55) => 43,
-            (joint, _) => joint,
+        let joint = |name: &str| match (name.parse().ok()?, body.num_joints()) {
+            (22, 55) => Some(28),
+            (23, 55) => Some(43),
+            (joint, count) => (joint < count).then_some(joint),
         };
-        let weight = 1.0 / joints.len() as f32;
-        Some(Anchor { joints: joints.into_iter().map(|j| (on_body(j), weight)).collect(), vertices: Vec::new() })
+        let joints = match point.split_once('>') {
+            Some((from, to)) => vec![(joint(from)?, 0.875), (joint(to)?, 0.125)],
+            None => {
+                let all: Vec<usize> = point.split('+').map(joint).collect::<Option<_>>()?;
+                let weight = 1.0 / all.len() as f32;
+                all.into_iter().map(|joint| (joint, weight)).collect()
+            }
+        };
+        Some(Anchor { joints, vertices: Vec::new() })
     };
     Some(points.split_whitespace().map(anchor).collect())
 }
@@ -140,7 +180,10 @@ mod tests {
         assert!(nose.x.abs() < 0.01 && nose.z > ear.z + 0.06 && (nose.y - ear.y).abs() < 0.06);
         assert!(toe.z > ankle.z + 0.1 && heel.z < ankle.z && heel.y < ankle.y && heel.x > 0.0);
         assert!(elbow.x > 0.3);
-        // Olecranon and elbow are one joint; the right wrist is 41.
-        assert_eq!((set[63], set[41].unwrap().x < -0.5), (set[7], true));
+        // Olecranon and cubital fossa lie behind and before the elbow.
+        let [back, front, hips] = [[63, 7], [65, 7], [9, 10]].map(|[a, b]| set[a].unwrap() - set[b].unwrap());
+        assert!(back.z < -0.02 && front.z > 0.02 && [back, front].iter().all(|v| v.length() < 0.06));
+        let thigh = rest.joints[1].distance(rest.joints[4]);
+        assert!((hips.x - HIPS * thigh).abs() < 0.02 && set[41].unwrap().x < -0.5);
     }
 }

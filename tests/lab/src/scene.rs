@@ -5,10 +5,13 @@ use std::path::Path;
 
 use anyhow::{Context, Result, ensure};
 use clap::{Args, ValueEnum};
-use occnerf::capture::{Area, Capture, Layout, LoadOptions};
+use glam::Vec3;
+use occnerf::capture::{Area, Capture, Frame, Layout, LoadOptions};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
+use smpl::{BodyModel, Placement, rodrigues};
 use synth::{Obstacle, Perturbation};
+use volrender::RandomStream;
 use xtask::run::RunConfig;
 use xtask::source::{DEMO, LoadArguments, Source, load_with};
 
@@ -36,6 +39,11 @@ pub struct Corruption {
     /// The simulated obstacle before the training camera of raw ZJU-MoCap. `None`: what
     /// `occlusion.json` says, or the default [`Obstacle`] where there is none.
     pub occlusion: Option<Obstacle>,
+    /// The open body in place of the capture's, which has SMPL's joints: at 0 in its mean shape, with the
+    /// capture's angles; else fitted to SAM 3D Body's key points of the capture's body, normal noise of so
+    /// many millimetres in every coordinate.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub open_body: Option<f32>,
     /// Errors of priors and masks.
     pub wrong: Perturbation,
 }
@@ -52,6 +60,9 @@ impl SceneOptions {
         let mut corruption = self.corruption;
         let mut source = load_with(Some(scene), body, &self.files, |capture, model| {
             corruption.occlusion = occlude(capture, Path::new(scene), corruption.occlusion)?;
+            if let Some(noise) = corruption.open_body {
+                put_open_body(capture, model, 1e-3 * noise)?;
+            }
             corruption.wrong.apply(capture, model)?;
             corruption.wrong.spoil_body(model);
             Ok(())
@@ -61,6 +72,55 @@ impl SceneOptions {
         }
         Ok(source)
     }
+}
+
+/// Puts the open body in place of the capture's: see [`Corruption::open_body`]; `noise` in metres.
+fn put_open_body(capture: &mut Capture, model: &mut BodyModel, noise: f32) -> Result<()> {
+    let open = BodyModel::embedded();
+    let joints = model.num_joints();
+    ensure!(
+        joints == open.num_joints(),
+        "--open-body: expected a body of {} joints, found {joints}",
+        open.num_joints()
+    );
+    let anchors = |body: &BodyModel| point_fit::joint_set(body, "mhr70").unwrap_or_default();
+    // Both bodies have the same points.
+    let [own, other] = [anchors(model), anchors(&open)].map(|set| set.into_iter().flatten().collect::<Vec<_>>());
+    let mut random = RandomStream::new(&[0x4f50_454e]);
+    let mut seen = Vec::new();
+    for frame in &mut capture.train {
+        let shaped = model.shaped(&frame.betas);
+        let posed = model.pose(&shaped, &frame.pose, frame.placement);
+        for anchor in own.iter().filter(|_| noise > 0.0) {
+            let joints = anchor.joints.iter().map(|(j, w)| *w * posed.joints[*j]);
+            let point: Vec3 = joints.chain(anchor.vertices.iter().map(|(v, w)| *w * posed.vertices[*v])).sum();
+            seen.push(point + noise * Vec3::from_array([(); 3].map(|()| random.normal())));
+        }
+        // The pelvis stays.
+        let rest = open.shaped(&[]).joints[0];
+        match &mut frame.placement {
+            Placement::Origin { rotation, translation } => *translation = posed.joints[0] - rodrigues(*rotation) * rest,
+            Placement::Pelvis { translation } => *translation = posed.joints[0] - rest,
+        }
+        frame.betas.clear();
+    }
+    capture.mean_betas.clear();
+    if noise > 0.0 {
+        let fitted = point_fit::fit(&open, &other, &seen)?;
+        for (frame, found) in capture.train.iter_mut().zip(fitted.frames) {
+            (frame.pose, frame.betas) = (found.pose, fitted.betas.clone());
+            frame.placement = Placement::Pelvis { translation: found.translation };
+        }
+        capture.mean_betas = fitted.betas;
+    }
+    for view in &mut capture.eval {
+        if let Some(frame) = capture.train.get(view.train_index) {
+            let Frame { pose, betas, placement, .. } = frame;
+            (view.frame.pose, view.frame.betas, view.frame.placement) = (pose.clone(), betas.clone(), *placement);
+        }
+    }
+    *model = open;
+    Ok(())
 }
 
 /// Puts the simulated obstacle before the training camera of raw ZJU-MoCap, and returns it.
@@ -108,6 +168,10 @@ pub struct SceneArguments {
     #[command(flatten)]
     #[serde(flatten)]
     obstacle: ObstacleArguments,
+    /// Put the open body in place of the capture's: 0 with the capture's angles in its mean shape, else fitted
+    /// to SAM 3D Body's key points with noise of so many millimetres
+    #[arg(long, value_name = "MM")]
+    open_body: Option<f32>,
     /// Make the prior and the masks as wrong as something makes them; the options below change
     /// single errors of it
     #[arg(long)]
@@ -176,7 +240,7 @@ impl SceneArguments {
             ragged_pixels: self.wrong_edge.unwrap_or(as_wrong.ragged_pixels),
             mask_pixels: self.wrong_mask.unwrap_or(as_wrong.mask_pixels),
         };
-        let (files, corruption) = (self.load.options()?, Corruption { occlusion, wrong });
+        let (files, corruption) = (self.load.options()?, Corruption { occlusion, open_body: self.open_body, wrong });
         Ok(SceneOptions { files, corruption, capture: String::new() })
     }
 
@@ -189,8 +253,10 @@ impl SceneArguments {
 }
 
 #[cfg(test)]
+#[allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
 mod tests {
     use clap::Parser;
+    use synth::DemoConfig;
 
     use super::*;
 
@@ -201,9 +267,29 @@ mod tests {
     }
 
     #[test]
+    fn the_open_body_stands_where_the_captures_body_stood() {
+        let demo = DemoConfig { size: 16, frames: 100, eval_cameras: 1, ..DemoConfig::default() };
+        let body = BodyModel::embedded();
+        let joints = |capture: &Capture, model: &BodyModel| -> Vec<Vec<Vec3>> {
+            let frames = capture.train.iter().chain(capture.eval.iter().map(|view| &view.frame));
+            frames.map(|f| model.pose(&model.shaped(&f.betas), &f.pose, f.placement).joints).collect()
+        };
+        for (noise, most) in [(0.0, 0.12), (1e-4, 0.05)] {
+            let (mut capture, mut model) = (synth::demo(&demo, &body).unwrap(), body.clone());
+            let before = joints(&capture, &model);
+            put_open_body(&mut capture, &mut model, noise).unwrap();
+            for (before, after) in before.iter().zip(joints(&capture, &model)) {
+                let off: Vec<f32> = before.iter().zip(&after).map(|(a, b)| a.distance(*b)).collect();
+                let worst = off.iter().copied().fold(0.0, f32::max);
+                assert!(worst > 1e-4 && worst < most && (noise > 0.0 || off[0] < 1e-5), "{noise}: {off:?}");
+            }
+        }
+    }
+
+    #[test]
     fn a_command_line_made_of_options_says_all_of_them() {
         let words = "x --resize 64 --stride 2 --max-frames 9 --eval-stride 3 --camera B2 --occlusion moving --fraction 0.4 \
-                     --share 0.7 --position -0.1 --height 0.5 --memory 2048 --wrong-pose 2.5 --wrong-shape 1 --wrong-mask -3";
+                     --share 0.7 --position -0.1 --height 0.5 --memory 2048 --open-body 15 --wrong-pose 2.5 --wrong-shape 1 --wrong-mask -3";
         let wrong = "x --wrong real --wrong-translation 0.05 --wrong-depth 3 --wrong-limbs 4 --wrong-edge 1";
         for words in [words, wrong, "x"] {
             let load = Line::parse_from(words.split_whitespace()).load;

@@ -110,6 +110,8 @@ pub(super) struct Person {
     pub ghosts: usize,
     /// Frames whose picture is absent.
     pub absent: usize,
+    /// Vertices of SAM 3D Body's mesh, some of which follow the points of frames; 0 where there is none.
+    pub vertices: usize,
 }
 
 /// A person in one frame. Lengths in metres, OpenCV axes.

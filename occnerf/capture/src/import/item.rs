@@ -170,7 +170,7 @@ impl<'a> Item<'a> {
         let values = self.numbers(&[None])?;
         let whole = |(i, value): (usize, &f64)| {
             let fits = *value >= 0.0 && value.fract() == 0.0 && *value < 1e9;
-            fits.then_some(*value as usize).ok_or_else(|| self.invalid("indices of frames", format!("{value} at {i}")))
+            fits.then_some(*value as usize).ok_or_else(|| self.invalid("indices", format!("{value} at {i}")))
         };
         values.iter().enumerate().map(whole).collect()
     }

@@ -128,9 +128,11 @@ pub fn import(options: &ImportOptions, out: &Path) -> Result<Imported, CaptureEr
         (Some(true), Some(path)) => body::mean_hands(path)?,
         _ => Vec::new(),
     };
+    let (map, open) = (options.vertex_map.as_deref(), body_path.is_none());
+    let mapped = points::mapped(&options.fit, map, person.vertices, &model, open)?;
     if tool.is_points() {
         let set = options.joints.as_deref().unwrap_or(sam3d::SET);
-        notes.push(points::solve(&options.fit, set, &mut person, &model)?);
+        notes.push(points::solve(&options.fit, set, mapped, &mut person, &model)?);
     } else if body_path.is_none() {
         // Shape coefficients of another body.
         person.frames.iter_mut().for_each(|frame| frame.betas.clear());
@@ -212,6 +214,7 @@ fn choose(path: &Path, mut people: Vec<Person>, asked: Option<&str>) -> Result<C
         person.frames.extend(new);
         person.ghosts += part.ghosts;
         person.absent += part.absent;
+        person.vertices = part.vertices;
     }
     person.id = ids.join(",");
     person.frames.sort_by_key(|frame| frame.index);

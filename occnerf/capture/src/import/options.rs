@@ -25,6 +25,9 @@ pub struct ImportOptions {
     pub body: Option<PathBuf>,
     /// Joint set of a fit that is an array of joints, one of [`point_fit::joint_sets`].
     pub joints: Option<String>,
+    /// Points of the body that SAM 3D Body's `pred_vertices` lie on: `triangle_ids` (V) and `baryc_coords`
+    /// (V,3) in its faces, as `smpl2mhr_mapping.npz` of MHR has them.
+    pub vertex_map: Option<PathBuf>,
     /// 2-D key points of a detector: OpenPose's folder, or an array (T, J, 3) of one person.
     pub keypoints: Option<PathBuf>,
     /// Whether pictures are copied rather than linked.

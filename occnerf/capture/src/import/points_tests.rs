@@ -1,5 +1,6 @@
 //! SAM 3D Body's files and arrays of joints, made from motions that are known.
 
+use array_files::{Data, NdArray};
 use glam::{DMat3, DVec3, Vec3};
 use point_fit::joint_set;
 use smpl::{MotionClip, Placement};
@@ -22,12 +23,10 @@ fn video(count: usize) -> Video {
     Video { names, paths: vec![PathBuf::new(); count], size: SIZE }
 }
 
-/// The 70 points and 24 joints in the camera, and the pose with the root in it, of every frame.
-fn truth(
-    clip: &MotionClip,
-    frames: usize,
-    place: impl Fn(usize) -> DVec3,
-) -> Vec<(Vec<DVec3>, Vec<DVec3>, Vec<DVec3>)> {
+/// The 70 points and the vertices, the 24 joints, and the pose with the root, all in the camera.
+type Truth = (Vec<DVec3>, Vec<DVec3>, Vec<DVec3>);
+
+fn truth(clip: &MotionClip, frames: usize, place: impl Fn(usize) -> DVec3) -> Vec<Truth> {
     let body = BodyModel::embedded();
     let set = joint_set(&body, "mhr70").unwrap();
     let frame = |f: usize| {
@@ -42,9 +41,35 @@ fn truth(
         };
         let mut pose: Vec<DVec3> = pose.iter().map(|v| v.as_dvec3()).collect();
         pose[0] = axis_angle(turn * rotation(pose[0]));
-        (set.iter().map(point).collect(), posed.joints.iter().map(|j| turn * j.as_dvec3() + at).collect(), pose)
+        let vertices = posed.vertices.iter().map(|v| turn * v.as_dvec3() + at);
+        (
+            set.iter().map(point).chain(vertices).collect(),
+            posed.joints.iter().map(|j| turn * j.as_dvec3() + at).collect(),
+            pose,
+        )
     };
     (0..frames).map(frame).collect()
+}
+
+/// Mean distance of the first 22 joints in metres, and mean angle of their rotations in degrees.
+fn errors(body: &BodyModel, person: &Person, truth: &[Truth]) -> [f64; 2] {
+    let (mut metres, mut degrees, mut n) = (0.0, 0.0, 0.0);
+    for frame in &person.frames {
+        let betas: Vec<f32> = frame.betas.iter().map(|b| *b as f32).collect();
+        let pose: Vec<Vec3> = frame.pose.iter().map(|v| v.as_vec3()).collect();
+        let placement = Placement::Pelvis { translation: frame.offset.as_vec3() };
+        let found = body.pose(&body.shaped(&betas), &pose, placement).joints;
+        let (_, joints, true_pose) = &truth[frame.index];
+        for j in 0..22 {
+            metres += found[j].as_dvec3().distance(joints[j]);
+            let world = |pose: &[DVec3]| {
+                std::iter::successors(Some(j), |&k| body.parents[k]).fold(DMat3::IDENTITY, |r, k| rotation(pose[k]) * r)
+            };
+            degrees += axis_angle(world(&frame.pose).transpose() * world(true_pose)).length().to_degrees();
+            n += 1.0;
+        }
+    }
+    [metres / n, degrees / n]
 }
 
 /// A person as SAM 3D Body writes it, with noise of the points in metres.
@@ -53,14 +78,18 @@ fn person(points: &[DVec3], random: &mut Random, noise: f64, focal: bool) -> Py 
     let noisy = |p: &DVec3| *p + (0..4).map(|_| random.vec3(0.866).as_dvec3()).sum::<DVec3>() * noise;
     let points: Vec<DVec3> = points.iter().map(noisy).collect();
     let pixel = |p: &DVec3| [FOCAL * p.x / p.z + 310.0, FOCAL * p.y / p.z + 250.0];
-    let flat: Vec<f64> = points.iter().flat_map(|p| (*p - at).to_array()).collect();
+    let flat = |points: &[DVec3]| points.iter().flat_map(|p| (*p - at).to_array()).collect::<Vec<_>>();
+    let (points, vertices) = points.split_at(70);
     let mut items = vec![
-        ("pred_keypoints_3d".to_owned(), array(&[70, 3], &flat)),
+        ("pred_keypoints_3d".to_owned(), array(&[70, 3], &flat(points))),
         ("pred_keypoints_2d".to_owned(), array(&[70, 2], &points.iter().flat_map(pixel).collect::<Vec<_>>())),
         ("pred_cam_t".to_owned(), array(&[3], &at.to_array())),
         ("bbox".to_owned(), array(&[4], &[0.0, 0.0, 9.0, 9.0])),
         ("mask".to_owned(), array(&[1, 2, 3], &[0.0, 1.0, 0.0, 0.0, 255.0, 0.0])),
     ];
+    if !vertices.is_empty() {
+        items.push(("pred_vertices".to_owned(), array(&[vertices.len() as u32, 3], &flat(vertices))));
+    }
     if focal {
         items.push(("focal_length".to_owned(), array(&[], &[FOCAL])));
     }
@@ -94,12 +123,12 @@ fn people_of_sam_3d_body_are_told_apart_and_a_body_is_fitted_to_each() {
     ];
     let out = Directory::new("import-sam3d");
     let body = BodyModel::embedded();
-    for (noise, most) in [(0.0, [0.004, 13.0]), (0.015, [0.015, 15.0]), (0.03, [0.024, 18.0]), (0.045, [0.032, 20.0])] {
+    for (noise, most) in [(0.0, [0.004, 8.0]), (0.015, [0.015, 12.0]), (0.03, [0.024, 14.0]), (0.045, [0.032, 17.0])] {
         let mut random = Random(11);
         // The second is not seen for some frames, the order changes.
         let frame = |f: usize| {
             let seen = (0..2).filter(|who| !(*who == 1 && (20..24).contains(&f)));
-            let mut list: Vec<Py> = seen.map(|who| person(&people[who][f].0, &mut random, noise, true)).collect();
+            let mut list: Vec<Py> = seen.map(|who| person(&people[who][f].0[..70], &mut random, noise, true)).collect();
             if f.is_multiple_of(3) {
                 list.reverse();
             }
@@ -133,25 +162,8 @@ fn people_of_sam_3d_body_are_told_apart_and_a_body_is_fitted_to_each() {
                 if file != "video.pkl" {
                     continue;
                 }
-                let said = points::solve(&out.path().join(file), sam3d::SET, &mut person, &body).unwrap();
-                let (mut metres, mut degrees, mut n) = (0.0, 0.0, 0.0);
-                for frame in &person.frames {
-                    let betas: Vec<f32> = frame.betas.iter().map(|b| *b as f32).collect();
-                    let pose: Vec<Vec3> = frame.pose.iter().map(|v| v.as_vec3()).collect();
-                    let placement = Placement::Pelvis { translation: frame.offset.as_vec3() };
-                    let found = body.pose(&body.shaped(&betas), &pose, placement).joints;
-                    let (_, joints, true_pose) = &truth[frame.index];
-                    for j in 0..22 {
-                        metres += found[j].as_dvec3().distance(joints[j]);
-                        let world = |pose: &[DVec3]| {
-                            std::iter::successors(Some(j), |&k| body.parents[k])
-                                .fold(DMat3::IDENTITY, |r, k| rotation(pose[k]) * r)
-                        };
-                        degrees += axis_angle(world(&frame.pose).transpose() * world(true_pose)).length().to_degrees();
-                        n += 1.0;
-                    }
-                }
-                let (metres, degrees) = (metres / n, degrees / n);
+                let said = points::solve(&out.path().join(file), sam3d::SET, Vec::new(), &mut person, &body).unwrap();
+                let [metres, degrees] = errors(&body, &person, truth);
                 println!(
                     "{:.0} mm, person {who}: joints {:.1} mm, rotations {degrees:.1} degrees; {said}",
                     1e3 * noise,
@@ -166,12 +178,190 @@ fn people_of_sam_3d_body_are_told_apart_and_a_body_is_fitted_to_each() {
     }
 }
 
+/// A vertex map that maps every n-th of the body's vertices to itself.
+fn identity_map(body: &BodyModel, n: usize) -> (Vec<f64>, Vec<f64>) {
+    let of = |v: usize| {
+        let face = body.faces.iter().position(|face| face.contains(&(v as u32))).unwrap();
+        (face as f64, body.faces[face].map(|corner| f64::from(u8::from(corner as usize == v))))
+    };
+    let all = (0..body.num_vertices()).step_by(n).map(of);
+    let (ids, weights): (Vec<f64>, Vec<[f64; 3]>) = all.unzip();
+    (ids, weights.concat())
+}
+
+fn write_map(path: &Path, ids: &[f64], weights: &[f64]) {
+    let array = |shape: Vec<usize>, values: &[f64]| NdArray { shape, data: Data::F64(values.to_vec()) };
+    let rows = weights.len() / 3;
+    let parts = [("triangle_ids", array(vec![ids.len()], ids)), ("baryc_coords", array(vec![rows, 3], weights))];
+    array_files::npz::write(path, &parts).unwrap();
+}
+
+/// Prints seconds: `cargo test -p capture --lib a_thousand -- --ignored --nocapture`.
+#[test]
+#[ignore = "a minute"]
+fn a_thousand_frames_take_seconds() {
+    let Some(dir) = shared("mocap") else { return };
+    let clip = MotionClip::load(&dir.join("turn.npz")).unwrap();
+    let (body, out) = (BodyModel::embedded(), Directory::new("import-sam3d-long"));
+    let truth = truth(&clip, 300, |_| DVec3::new(0.0, 0.0, 4.0));
+    let mut random = Random(5);
+    let frame = |f: usize| {
+        // To and fro.
+        let points = &truth[if f / 300 % 2 == 0 { f % 300 } else { 299 - f % 300 }].0;
+        let points: Vec<DVec3> = points[..70].iter().chain(points[70..].iter().step_by(54)).copied().collect();
+        out.picture(&format!("frames/{f:06}.png"), (60, 40), |_, _| 9);
+        Py::List(vec![person(&points, &mut random, 0.015, true)])
+    };
+    let frames: Vec<Py> = (0..1000).map(frame).collect();
+    out.write("video.pkl", Py::List(frames).pickle());
+    let (ids, weights) = identity_map(&body, 54);
+    let (path, map) = (out.path().join("video.pkl"), out.path().join("map.npz"));
+    write_map(&map, &ids, &weights);
+    for vertex_map in [None, Some(map)] {
+        let start = std::time::Instant::now();
+        let (fit, _) = read::read(&path, &video(1000)).unwrap();
+        let read = start.elapsed().as_secs_f32();
+        let mut person = fit.people.into_iter().next().unwrap();
+        let mapped =
+            vertex_map.iter().flat_map(|map| points::mapped(&path, Some(map), person.vertices, &body, true).unwrap());
+        points::solve(&path, sam3d::SET, mapped.collect(), &mut person, &body).unwrap();
+        let solved = start.elapsed().as_secs_f32();
+        let is_mapped = vertex_map.is_some();
+        let options =
+            ImportOptions { frames: out.path().join("frames"), fit: path.clone(), vertex_map, ..Default::default() };
+        let start = std::time::Instant::now();
+        assert_eq!(import(&options, &out.path().join(format!("capture-{is_mapped}"))).unwrap().frames, 1000);
+        let all = start.elapsed().as_secs_f32();
+        println!("mapped {is_mapped}: read {read:.1} s, fitted {:.1} s, the whole import {all:.1} s", solved - read);
+        assert!(all < 120.0, "{all} s");
+    }
+}
+
+/// Fingers that curl, of SMPL-X's form.
+#[test]
+fn fingers_follow_their_points_on_a_body_that_has_them() {
+    let Some(path) = shared("body/open_body_x.npz") else { return };
+    let body = BodyModel::load(&path).unwrap();
+    let set = joint_set(&body, sam3d::SET).unwrap();
+    let curl = |f: usize, joint: usize| match joint {
+        // Fingers of both hands bend towards the palm, thumbs less.
+        25..=36 => Vec3::NEG_Z * (0.3 + 0.05 * f as f32),
+        40..=51 => Vec3::Z * (0.3 + 0.05 * f as f32),
+        _ => Vec3::ZERO,
+    };
+    let (mut frames, mut truth) = (Vec::new(), Vec::new());
+    for f in 0..12 {
+        let pose: Vec<Vec3> = (0..55).map(|joint| curl(f, joint)).collect();
+        let posed = body.pose(&body.shaped(&[]), &pose, Placement::Pelvis { translation: Vec3::Z * 4.0 });
+        let point = |anchor: &Option<point_fit::Anchor>| {
+            let Some(anchor) = anchor else { return DVec3::NAN };
+            let joints = anchor.joints.iter().map(|(j, w)| *w * posed.joints[*j]);
+            let sum: Vec3 = joints.chain(anchor.vertices.iter().map(|(v, w)| *w * posed.vertices[*v])).sum();
+            sum.as_dvec3()
+        };
+        let points = set.iter().map(point).collect();
+        frames.push(FitFrame { points, ..FitFrame::still(f, Vec::new(), Vec::new(), &[0.0; 3], [[FOCAL; 2]; 2]) });
+        truth.push(posed.joints);
+    }
+    let mut person = Person { id: "0".to_owned(), frames, ..Person::default() };
+    println!("{}", points::solve(&path, sam3d::SET, Vec::new(), &mut person, &body).unwrap());
+    for (frame, truth) in person.frames.iter().zip(&truth) {
+        let betas: Vec<f32> = frame.betas.iter().map(|b| *b as f32).collect();
+        let of = |hands: bool| {
+            let joint = |(j, v): (usize, &DVec3)| if j < 25 || hands { v.as_vec3() } else { Vec3::ZERO };
+            let pose: Vec<Vec3> = frame.pose.iter().enumerate().map(joint).collect();
+            let placement = Placement::Pelvis { translation: frame.offset.as_vec3() };
+            let found = body.pose(&body.shaped(&betas), &pose, placement).joints;
+            (25..55).map(|j| found[j].distance(truth[j])).sum::<f32>() / 30.0
+        };
+        println!("frame {}: {:.1} mm, with flat hands {:.1} mm", frame.index, 1e3 * of(true), 1e3 * of(false));
+        assert!(of(true) < 0.006 && of(true) < 0.5 * of(false), "{}", frame.index);
+    }
+}
+
+#[test]
+fn vertices_of_a_mesh_tell_the_twist_of_limbs_through_a_map() {
+    let Some(dir) = shared("mocap") else { return };
+    let clip = MotionClip::load(&dir.join("walk.npz")).unwrap();
+    let body = BodyModel::embedded();
+    let truth = truth(&clip, 40, |_| DVec3::new(0.0, 0.0, 4.0));
+    let out = Directory::new("import-sam3d-map");
+    let (path, map) = (out.path().join("video.pkl"), out.path().join("map.npz"));
+    let count = body.num_vertices();
+    let (ids, weights) = identity_map(&body, 1);
+    let write = |ids: &[f64], weights: &[f64]| write_map(&map, ids, weights);
+    write(&ids, &weights);
+    for (noise, most) in [(0.0, [0.004, 3.0]), (0.015, [0.01, 6.0]), (0.03, [0.016, 9.0]), (0.045, [0.02, 11.0])] {
+        let mut random = Random(5);
+        let frames = truth.iter().map(|(points, ..)| Py::List(vec![person(points, &mut random, noise, true)]));
+        out.write("video.pkl", Py::List(frames.collect()).pickle());
+        let [joints_alone, both] = [false, true].map(|is_mapped| {
+            let (fit, _) = read::read(&path, &video(40)).unwrap();
+            let mut person = fit.people.into_iter().next().unwrap();
+            assert_eq!(person.vertices, count);
+            let mapped =
+                if is_mapped { points::mapped(&path, Some(&map), count, &body, true).unwrap() } else { Vec::new() };
+            let start = std::time::Instant::now();
+            points::solve(&path, sam3d::SET, mapped, &mut person, &body).unwrap();
+            let [metres, degrees] = errors(&body, &person, &truth);
+            println!(
+                "{:.0} mm, mapped {is_mapped}: {:.1} mm, {degrees:.1} degrees, {:.1} s",
+                1e3 * noise,
+                1e3 * metres,
+                start.elapsed().as_secs_f32()
+            );
+            [metres, degrees]
+        });
+        assert!(both[0] < most[0] && both[1] < most[1], "{noise}: {both:?}");
+        assert!(both[1] < 0.8 * joints_alone[1], "{noise}: {both:?}, of joints alone {joints_alone:?}");
+    }
+    // MHR's mesh needs no map on the open body: at its vertices the middles of faces.
+    let faces = points::mapped(&path, None, points::MHR, &body, true).unwrap();
+    assert_eq!((faces.len(), points::mapped(&path, None, points::MHR, &body, false).unwrap().len()), (128, 0));
+    let frame = |(points, ..): &Truth| {
+        let mut all = vec![points[0]; 70 + points::MHR];
+        all[..70].copy_from_slice(&points[..70]);
+        for (point, anchor) in all[70..].iter_mut().step_by(145).zip(&faces) {
+            *point = anchor.vertices.iter().map(|(v, _)| points[70 + v] / 3.0).sum();
+        }
+        Py::List(vec![person(&all, &mut Random(5), 0.0, true)])
+    };
+    out.write("mhr.pkl", Py::List(truth.iter().map(frame).collect()).pickle());
+    let (fit, _) = read::read(&out.path().join("mhr.pkl"), &video(40)).unwrap();
+    let mut mhr = fit.people.into_iter().next().unwrap();
+    points::solve(&path, sam3d::SET, faces, &mut mhr, &body).unwrap();
+    let [metres, degrees] = errors(&body, &mhr, &truth);
+    assert!(metres < 0.004 && degrees < 3.0, "{metres} m, {degrees} degrees");
+    // Of another body.
+    let shifted: Vec<f64> = (0..count).map(|v| ids[(v + 3000) % count]).collect();
+    write(&shifted, &weights);
+    let (fit, _) = read::read(&path, &video(40)).unwrap();
+    let mut person = fit.people.into_iter().next().unwrap();
+    let mapped = points::mapped(&path, Some(&map), count, &body, true).unwrap();
+    let error = points::solve(&path, sam3d::SET, mapped, &mut person, &body).unwrap_err().to_string();
+    assert!(error.contains("vertex map is of (--body), and pred_vertices") && error.contains("mm off"), "{error}");
+    let refused = |vertices: usize, words: &[&str]| {
+        let error = points::mapped(&path, Some(&map), vertices, &body, true).unwrap_err().to_string();
+        assert!(error.lines().count() == 1 && words.iter().all(|word| error.contains(word)), "{error}");
+    };
+    refused(0, &["video.pkl", "pred_vertices", "none"]);
+    refused(18439, &["map.npz", "18439 pred_vertices", "6890"]);
+    write(&vec![13776.0; count], &weights);
+    refused(count, &["triangle_ids", "below 13776", "found 13776"]);
+    write(&ids, &vec![0.5; 3 * count]);
+    refused(count, &["baryc_coords", "sum to 1", "0.5"]);
+    write(&ids, &vec![f64::NAN; 3 * count]);
+    refused(count, &["baryc_coords", "finite", "NaN"]);
+    std::fs::write(&map, b"PK\x03\x04").unwrap();
+    refused(count, &["map.npz"]);
+}
+
 /// One person's file of eight frames, for damage.
 fn still(focal: bool) -> Option<Vec<Py>> {
     let clip = MotionClip::load(&shared("mocap")?.join("walk.npz")).unwrap();
     let mut random = Random(2);
     let frames = truth(&clip, 8, |_| DVec3::new(0.0, 0.0, 4.0));
-    Some(frames.iter().map(|(points, ..)| Py::List(vec![person(points, &mut random, 0.0, focal)])).collect())
+    Some(frames.iter().map(|(points, ..)| Py::List(vec![person(&points[..74], &mut random, 0.0, focal)])).collect())
 }
 
 #[test]
@@ -185,13 +375,13 @@ fn a_camera_without_focal_length_is_solved_and_joints_are_read_as_arrays() {
         assert!((frame.centre[0] - 310.0).hypot(frame.centre[1] - 250.0) < 0.1, "{:?}", frame.centre);
     }
     let points: Vec<f64> =
-        fit.people[0].frames.iter().flat_map(|f| f.points.iter().flat_map(|p| p.to_array())).collect();
-    let data = array_files::NdArray { shape: vec![8, 70, 3], data: array_files::Data::F64(points) };
+        fit.people[0].frames.iter().flat_map(|f| f.points[..70].iter().flat_map(|p| p.to_array())).collect();
+    let data = NdArray { shape: vec![8, 70, 3], data: Data::F64(points) };
     array_files::npz::write(&out.path().join("joints.npz"), &[("joints", data)]).unwrap();
     let path = out.path().join("joints.npz");
     let (again, _) = read::joints(&path, "mhr70", &video(8)).unwrap();
     assert_eq!((again.tool, again.people[0].frames.len()), (Tool::Joints, 8));
-    assert_eq!(again.people[0].frames[3].points, fit.people[0].frames[3].points);
+    assert_eq!(again.people[0].frames[3].points, fit.people[0].frames[3].points[..70]);
     let refused = |set: &str| read::joints(&path, set, &video(8)).err().unwrap().to_string();
     assert!(refused("coco17").contains("[frames, 17, 3]") && refused("coco18").contains("coco17, openpose25"));
 }
@@ -221,6 +411,8 @@ fn damaged_files_of_sam_3d_body_are_refused_in_one_line() {
         ("focal.pkl", "focal_length", array(&[], &[-1.0]), ["frame 2", "focal length"]),
         ("mask.pkl", "mask", array(&[6], &[0.0; 6]), ["2[0].mask", "[_, _]"]),
         ("text.pkl", "pred_cam_t", Py::text("x"), ["2[0].pred_cam_t", "list"]),
+        ("mesh.pkl", "pred_vertices", array(&[2, 2], &[0.0; 4]), ["2[0].pred_vertices", "[_, 3]"]),
+        ("rows.pkl", "pred_vertices", array(&[2, 3], &[0.0; 6]), ["2[0].pred_vertices", "4 rows"]),
     ] {
         out.write(name, with(key, to));
         refused(name, &words);
@@ -236,11 +428,24 @@ fn damaged_files_of_sam_3d_body_are_refused_in_one_line() {
     let long: Vec<Py> = frames.iter().cycle().take(20).cloned().collect();
     out.write("long.pkl", Py::List(long).pickle());
     refused("long.pkl", &["8", "19"]);
-    let whole = Py::List(frames).pickle();
-    for bytes in crate::testing::damaged(&whole, 300) {
-        out.write("mutated.pkl", bytes);
-        if let Err(error) = read::read(&out.path().join("mutated.pkl"), &video(8)) {
-            assert_eq!(error.to_string().lines().count(), 1, "{error}");
+    let npz: Vec<(&str, NdArray)> = vec![
+        ("pred_keypoints_3d", NdArray { shape: vec![70, 3], data: Data::F64(vec![0.5; 210]) }),
+        ("pred_cam_t", NdArray { shape: vec![3], data: Data::F64(vec![0.0, 0.0, 4.0]) }),
+        ("focal_length", NdArray { shape: vec![], data: Data::F64(vec![FOCAL]) }),
+    ];
+    array_files::npz::write(&out.path().join("still.npz"), &npz).unwrap();
+    let (pickle, json) = (Py::List(frames.clone()).pickle(), as_json(&Py::List(frames)).to_string().into_bytes());
+    let npz = std::fs::read(out.path().join("still.npz")).unwrap();
+    for (name, whole) in [("mutated.pkl", pickle), ("mutated.json", json), ("mutated.npz", npz)] {
+        out.write(name, &whole);
+        assert!(read::read(&out.path().join(name), &video(8)).is_ok(), "{name}");
+        let cut = (0..40).map(|i| whole[..whole.len() * i / 40].to_vec());
+        for (case, bytes) in cut.chain(crate::testing::damaged(&whole, 300)).enumerate() {
+            out.write(name, bytes);
+            match read::read(&out.path().join(name), &video(8)) {
+                Err(error) => assert_eq!(error.to_string().lines().count(), 1, "{error}"),
+                Ok(_) => assert!(case >= 40, "{name}: {case} fortieths were read"),
+            }
         }
     }
 }

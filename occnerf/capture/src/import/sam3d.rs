@@ -1,5 +1,6 @@
 //! SAM 3D Body's list of dictionaries, one a person: `pred_keypoints_3d` (70,3) in camera axes from a
-//! place at `pred_cam_t` (3), `focal_length`, `pred_keypoints_2d` (70,2), `mask`. Saved by `.npz`,
+//! place at `pred_cam_t` (3), `focal_length`, `pred_keypoints_2d` (70,2), `mask`, `pred_vertices` (V,3) in
+//! the axes of the points. Saved by `.npz`,
 //! `.npy`, pickle or JSON: a folder with a file a frame, or one file with a list of frames, or a
 //! dictionary of them by name.
 
@@ -22,10 +23,17 @@ pub(super) const POINTS: &str = "pred_keypoints_3d";
 /// Joint set of the points.
 pub(super) const SET: &str = "mhr70";
 const COUNT: usize = 70;
+/// Vertices, of which some follow the points.
+pub(super) const VERTICES: &str = "pred_vertices";
 /// Most people of a picture, whose pairs with those of earlier ones are compared.
 const MAX_PEOPLE: usize = 256;
 /// Bones that tell people's sizes: upper arms, thighs and shins.
 const BONES: [[usize; 2]; 6] = [[5, 7], [6, 8], [9, 11], [10, 12], [11, 13], [12, 14]];
+
+/// Every how many of so many vertices follow the points: at most 128.
+pub(super) fn stride(vertices: usize) -> usize {
+    vertices.div_ceil(128).max(1)
+}
 
 /// The people of one picture; `None` for another kind of value.
 fn people(value: &Value) -> Option<&[Value]> {
@@ -174,7 +182,7 @@ struct Track {
 fn fit(frames: Vec<(Option<String>, Value, &Path)>, video: &Video) -> Result<Fit, CaptureError> {
     let mut tracks: Vec<Track> = Vec::new();
     let mut projected: Vec<(DVec2, DVec2)> = Vec::new();
-    let mut unknown = None;
+    let (mut unknown, mut rows) = (None, None);
     for (index, (name, value, path)) in frames.iter().enumerate() {
         let root = Item { path, key: name.clone().unwrap_or_else(|| index.to_string()), value };
         let (mut found, people) = (Vec::new(), root.list()?);
@@ -185,7 +193,7 @@ fn fit(frames: Vec<(Option<String>, Value, &Path)>, video: &Video) -> Result<Fit
             let item = person.get(POINTS)?;
             let (points, at) = (item.numbers(&[Some(1), Some(COUNT), Some(3)])?, person.get("pred_cam_t")?);
             let at = DVec3::from_slice(&at.few(3)?);
-            let points: Vec<DVec3> = vectors(&points).into_iter().map(|p| p + at).collect();
+            let mut points: Vec<DVec3> = vectors(&points).into_iter().map(|p| p + at).collect();
             if let Some(behind) = points.iter().find(|p| p.z <= 0.0) {
                 return Err(item.invalid("points in front of the camera, with pred_cam_t", behind.to_string()));
             }
@@ -195,6 +203,14 @@ fn fit(frames: Vec<(Option<String>, Value, &Path)>, video: &Video) -> Result<Fit
                 let pairs = points.iter().zip(pixels.chunks_exact(2));
                 projected.extend(pairs.map(|(p, uv)| (p.truncate() / p.z, DVec2::from_slice(uv))));
                 unknown.get_or_insert_with(|| (*path, person.key.clone()));
+            }
+            if let Some(item) = person.find(VERTICES) {
+                let vertices = item.rows(3)?;
+                let known = *rows.get_or_insert(vertices.len());
+                if vertices.len() != known {
+                    return Err(item.invalid(format!("{known} rows, as before"), vertices.len().to_string()));
+                }
+                points.extend(vertices.iter().step_by(stride(known)).map(|p| DVec3::from_slice(p) + at));
             }
             let mask = person.find("mask").map(|item| mask(&item)).transpose()?;
             let lens = [[focal.unwrap_or(0.0); 2], video.middle()];
@@ -214,7 +230,9 @@ fn fit(frames: Vec<(Option<String>, Value, &Path)>, video: &Video) -> Result<Fit
         }
     }
     let names: Option<Vec<String>> = frames.into_iter().map(|(name, ..)| name).collect();
-    Ok(Fit { tool: Tool::Sam3dBody, people: tracks.into_iter().map(|track| track.person).collect(), names })
+    let vertices = rows.unwrap_or(0);
+    let people = tracks.into_iter().map(|track| Person { vertices, ..track.person }).collect();
+    Ok(Fit { tool: Tool::Sam3dBody, people, names })
 }
 
 /// Assigns the people of a frame to those of earlier frames: nearest pairs first, by the distance from
@@ -225,7 +243,7 @@ fn assign(tracks: &mut Vec<Track>, found: Vec<FitFrame>, index: usize) {
     /// Metres that a size of e times another counts.
     const SIZE: f64 = 2.0;
     let describe = |frame: &FitFrame| {
-        let middle = frame.points.iter().sum::<DVec3>() / frame.points.len() as f64;
+        let middle = frame.points[..COUNT].iter().sum::<DVec3>() / COUNT as f64;
         (middle, BONES.iter().map(|[a, b]| frame.points[*a].distance(frame.points[*b])).sum::<f64>().max(1e-3))
     };
     let described: Vec<(DVec3, f64)> = found.iter().map(describe).collect();
