@@ -21,7 +21,7 @@ pub(crate) struct NpyHeader {
     /// numpy's name of the element type, `|O` for pickled objects.
     pub(crate) descr: String,
     fortran: bool,
-    shape: Vec<usize>,
+    pub(crate) shape: Vec<usize>,
 }
 
 impl NpyHeader {

@@ -12,7 +12,7 @@ use smpl::Error;
 use crate::accessor::Source;
 use crate::character::{Character, Texture};
 use crate::mesh::MAX_COORDINATE;
-use crate::read::Joints;
+use crate::read::{Joints, NOT_READ};
 
 impl Character {
     /// Appends a primitive's vertices, morphed by `morph`, and triangles. If `skinned`, its joint
@@ -26,15 +26,17 @@ impl Character {
         morph: &[f32],
     ) -> Result<(), Error> {
         let invalid = |message: String| source.invalid(place, message);
-        match primitive.mode {
-            Checked::Valid(Mode::Triangles) => {}
-            Checked::Valid(Mode::TriangleStrip | Mode::TriangleFan) => {
-                return Err(invalid("triangle strips and fans are not read".to_owned()));
-            }
-            _ => return Ok(()),
-        }
+        let Checked::Valid(mode @ (Mode::Triangles | Mode::TriangleStrip | Mode::TriangleFan)) = primitive.mode else {
+            return Ok(());
+        };
         let attribute = |semantic| primitive.attributes.get(&Checked::Valid(semantic)).copied();
         let positions = attribute(Semantic::Positions).ok_or_else(|| invalid("no positions".to_owned()))?;
+        // Without it a document may have all there is, once more.
+        let others = primitive.extensions.as_ref().map(|extensions| &extensions.others);
+        let is_draco = others.is_some_and(|others| others.contains_key("KHR_draco_mesh_compression"));
+        if is_draco && source.get(&source.root.accessors, positions, place)?.buffer_view.is_none() {
+            return Err(invalid(format!("KHR_draco_mesh_compression {NOT_READ}")));
+        }
         let mut positions = source.floats::<3>(positions, &format!("{place}, POSITION"))?;
         for (target, &weight) in primitive.targets.iter().flatten().zip(morph).filter(|(_, weight)| **weight != 0.0) {
             let Some(displacements) = target.positions else { continue };
@@ -107,6 +109,14 @@ impl Character {
                 source.indices::<1>(accessor, &format!("{place}, indices"))?.into_iter().flatten().collect()
             }
             None => (0..count as u32).collect(),
+        };
+        let corners: Vec<u32> = match mode {
+            Mode::TriangleFan => corners.windows(2).skip(1).flat_map(|pair| [corners[0], pair[0], pair[1]]).collect(),
+            Mode::TriangleStrip => {
+                let turned = |(i, c): (usize, &[u32])| if i % 2 == 0 { [c[0], c[1], c[2]] } else { [c[1], c[0], c[2]] };
+                corners.windows(3).enumerate().flat_map(turned).collect()
+            }
+            _ => corners,
         };
         if !corners.len().is_multiple_of(3) {
             return Err(invalid(format!("{} triangle corners", corners.len())));

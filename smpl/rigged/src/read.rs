@@ -3,12 +3,13 @@
 use std::collections::HashMap;
 use std::path::Path;
 
-use array_files::read_file;
+use array_files::{decode_text, read_file};
 use glam::{Affine3A, Mat4, Quat, Vec2, Vec3, Vec4};
 use gltf::json::animation::{Interpolation, Property};
 use gltf::json::material::AlphaMode;
 use gltf::json::validation::Checked;
 use gltf::json::{Index, Root};
+use serde_json::Value;
 use smpl::{Error, SparseRows};
 
 use crate::accessor::Source;
@@ -35,12 +36,13 @@ impl Character {
 }
 
 fn read(file: &str, bytes: &[u8], folder: Option<&Path>) -> Result<Character, Error> {
-    let (json, blob) = if bytes.starts_with(b"glTF") { chunks(file, bytes)? } else { (bytes, None) };
+    let is_binary = bytes.starts_with(b"glTF");
+    let text = if is_binary { String::new() } else { decode_text(bytes) };
+    let (json, blob) = if is_binary { chunks(file, bytes)? } else { (text.as_bytes(), None) };
     let root = document(json).map_err(|e| Error::invalid(file, "document", e.to_string()))?;
     let known = |extension: &&String| !UNREAD.contains(&extension.as_str());
     if let Some(extension) = root.extensions_required.iter().find(|extension| !known(extension)) {
-        let message = format!("it requires {extension}, which is not read (gltf-transform copy decodes it)");
-        return Err(Error::invalid(file, "extensionsRequired", message));
+        return Err(Error::invalid(file, "extensionsRequired", format!("it requires {extension}, {NOT_READ}")));
     }
     let source = Source::new(file, &root, blob, folder)?;
     let nodes = nodes(&source)?;
@@ -96,19 +98,27 @@ fn read(file: &str, bytes: &[u8], folder: Option<&Path>) -> Result<Character, Er
     Ok(out)
 }
 
-/// Extensions without which a document means something else.
-const UNREAD: [&str; 3] = ["KHR_draco_mesh_compression", "KHR_texture_basisu", "EXT_texture_webp"];
+/// Said of an extension.
+pub(crate) const NOT_READ: &str = "which is not read (gltf-transform copy decodes it)";
 
-/// The document. Channels without a node, which glTF leaves to extensions, are dropped.
+/// Extensions without which a document means something else.
+const UNREAD: [&str; 4] = ["KHR_draco_mesh_compression", "KHR_texture_basisu", "EXT_texture_webp", INSTANCES];
+const INSTANCES: &str = "EXT_mesh_gpu_instancing";
+
+/// The document. Channels without a node, which glTF leaves to extensions, are dropped; scenes may be empty.
 fn document(json: &[u8]) -> Result<Root, serde_json::Error> {
     let first = match gltf::json::deserialize::from_slice(json) {
         Ok(root) => return Ok(root),
         Err(error) => error,
     };
-    let mut value: serde_json::Value = serde_json::from_slice(json)?;
+    let mut value: Value = serde_json::from_slice(json)?;
     let animations = value.get_mut("animations").and_then(|a| a.as_array_mut()).into_iter().flatten();
     for channels in animations.filter_map(|animation| animation.get_mut("channels")?.as_array_mut()) {
         channels.retain(|channel| channel.get("target").is_none_or(|target| target.get("node").is_some()));
+    }
+    let scenes = value.get_mut("scenes").and_then(|scenes| scenes.as_array_mut()).into_iter().flatten();
+    for scene in scenes.filter_map(|scene| scene.as_object_mut()) {
+        scene.entry("nodes").or_insert_with(|| Value::Array(Vec::new()));
     }
     serde_json::from_value(value).map_err(|_| first)
 }
@@ -116,7 +126,14 @@ fn document(json: &[u8]) -> Result<Root, serde_json::Error> {
 /// What a document has that a [`Character`] has not, in words.
 fn ignored(root: &Root) -> Vec<String> {
     let is_blended = root.materials.iter().any(|m| m.alpha_mode == Checked::Valid(AlphaMode::Blend));
-    Vec::from_iter(is_blended.then(|| "blending (alphaMode BLEND): a surface from an alpha of one half on".to_owned()))
+    let has_instances = root.extensions_used.iter().any(|extension| extension == INSTANCES);
+    [
+        is_blended.then(|| "blending (alphaMode BLEND): a surface from an alpha of one half on".to_owned()),
+        has_instances.then(|| format!("{INSTANCES}: one instance of each")),
+    ]
+    .into_iter()
+    .flatten()
+    .collect()
 }
 
 /// JSON and binary chunk of a `.glb` (glTF 2.0, section 4.4).

@@ -75,6 +75,12 @@ impl Tool {
         if self.hands_at_mean().is_some() { SMPLX } else { SMPL }
     }
 
+    /// Pelvis at rest of its body model in the mean shape, which translations are relative to; `None` for points.
+    pub(super) fn pelvis(self) -> Option<DVec3> {
+        let pelvis = if self.joints() == SMPLX { [0.003, -0.351, 0.012] } else { [-0.002, -0.241, 0.029] };
+        (!self.is_points()).then_some(DVec3::from_array(pelvis))
+    }
+
     /// Whether it gives points of the body, to which a body model is fitted.
     #[must_use]
     pub fn is_points(self) -> bool {

@@ -159,7 +159,8 @@ pub fn import(options: &ImportOptions, out: &Path) -> Result<Imported, CaptureEr
         return Err(CaptureError::invalid(path, "masks", what, format!("none, of {fitted} fitted frames")));
     }
     let unmasked = fitted - frames.len();
-    let place = |frame| placed(frame, &betas, &model, &hands, options.focal);
+    let rest = tool.pelvis().filter(|_| body_path.is_none());
+    let place = |frame| placed(frame, rest, &betas, &model, &hands, options.focal);
     let mut placed: Vec<Placed> = frames.into_iter().map(place).collect();
     if let Some(path) = &options.keypoints {
         notes.push(keypoints::add(path, &mut placed, &betas, &model, &video)?);
@@ -273,13 +274,20 @@ fn robust_mean<'a>(frames: impl Iterator<Item = &'a [f64]> + Clone) -> (Vec<f64>
 }
 
 /// Converts a fitted frame to the capture's form: all joints of the body model, and a translation that
-/// keeps the pelvis of the frame's own shape.
-fn placed(mut frame: FitFrame, betas: &[f64], model: &BodyModel, hands: &[DVec3], focal: Option<f64>) -> Placed {
+/// keeps the pelvis of the frame's own shape, at rest at `rest` if the fit is of another body.
+fn placed(
+    mut frame: FitFrame,
+    rest: Option<DVec3>,
+    betas: &[f64],
+    model: &BodyModel,
+    hands: &[DVec3],
+    focal: Option<f64>,
+) -> Placed {
     let pelvis = |betas: &[f64]| {
         let betas: Vec<f32> = betas.iter().take(model.num_betas()).map(|&beta| beta as f32).collect();
         model.shaped(&betas).joints.first().map_or(DVec3::ZERO, |joint| joint.as_dvec3())
     };
-    let own = pelvis(&frame.betas);
+    let own = rest.unwrap_or_else(|| pelvis(&frame.betas));
     if let Some(focal) = focal {
         frame.refocused(focal, own);
     }

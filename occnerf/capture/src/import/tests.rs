@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use array_files::NdArray;
 use array_files::npz::Npz;
 use glam::{DMat3, DVec3};
+use proptest::prelude::*;
 use smpl::{BodyModel, Placement};
 
 use super::fit::{FitFrame, SMPLX, rotation};
@@ -129,7 +130,7 @@ fn cameras_poses_shapes_and_vertices_are_as_another_reader_has_them() {
             let [fx, fy] = frame.focal;
             near(name, &[fx, 0.0, frame.centre[0], 0.0, fy, frame.centre[1], 0.0, 0.0, 1.0], &k, 1e-5);
             near(name, &frame.betas, &betas[10 * i..][..10], 1e-5);
-            let placed = placed(frame.clone(), &frame.betas, &model, &hands, None);
+            let placed = placed(frame.clone(), None, &frame.betas, &model, &hands, None);
             assert_eq!(placed.pose.len(), tool.joints());
             let pose: Vec<f64> = placed.pose.iter().flat_map(|v| v.to_array()).collect();
             near(&format!("{name} pose {i}"), &pose, &poses[pose.len() * i..][..pose.len()], 1e-5);
@@ -332,8 +333,19 @@ fn levels_of(name: &str, count: usize, options: &ImportOptions, make: impl Fn(us
     (0..count).map(|i| masks.levels(&path, i, &video).unwrap().0).collect()
 }
 
-#[test]
-fn ids_are_integers_at_any_depth() {
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(48))]
+    #[test]
+    fn ids_are_integers_at_any_depth(bits in 1u32..16, a in 1u32..1 << 15, b in 1u32..1 << 15) {
+        // As large as the depth holds.
+        let [id, other] = [a, b].map(|id| (id >> (15 - bits)).max(1));
+        prop_assume!(id != other);
+        ids(id, other);
+    }
+}
+
+/// A folder of masks of two people, in every form that holds their ids.
+fn ids(id: u32, other: u32) {
     use image::{ImageBuffer, Luma, Rgb};
     // Pixel 3 of a frame is the person, pixel 5 another person.
     let value = |i: u32, id: u32, other: u32| {
@@ -346,38 +358,60 @@ fn ids_are_integers_at_any_depth() {
         }
     };
     let at = |x: u32, y: u32| y * 4 + x;
-    for (id, other) in [(1, 2), (2, 1), (7, 120), (300, 1), (1, 300), (30_000, 2)] {
-        let options = ImportOptions { object: Some(id), ..ImportOptions::default() };
-        let expected = |levels: Vec<Vec<u8>>, kind: &str| {
-            for (i, level) in levels.iter().flatten().enumerate() {
-                assert_eq!(*level, if i % 8 == 3 { 255 } else { 0 }, "{kind} of {id}, {other}");
-            }
-        };
-        let deep = |_: usize, path: &Path| {
-            let picture = ImageBuffer::from_fn(4, 2, |x, y| Luma([value(at(x, y), id, other) as u16]));
+    let options = ImportOptions { object: Some(id), ..ImportOptions::default() };
+    let expected = |levels: Vec<Vec<u8>>, kind: &str| {
+        for (i, level) in levels.iter().flatten().enumerate() {
+            assert_eq!(*level, if i % 8 == 3 { 255 } else { 0 }, "{kind} of {id}, {other}");
+        }
+    };
+    let deep = |_: usize, path: &Path| {
+        let picture = ImageBuffer::from_fn(4, 2, |x, y| Luma([value(at(x, y), id, other) as u16]));
+        picture.save(path.with_extension("png")).unwrap();
+    };
+    expected(levels_of("ids-16", 2, &options, deep), "16 bits");
+    let array = |_: usize, path: &Path| {
+        let values: Vec<f64> = (0..8).map(|i| f64::from(value(i, id, other))).collect();
+        std::fs::write(path.with_extension("npy"), npy(&[1, 2, 4], &values)).unwrap();
+    };
+    expected(levels_of("ids-npy", 2, &options, array), ".npy");
+    for depth in [2u32, 4, 8].into_iter().filter(|depth| id.max(other) < 1 << depth) {
+        // Larger shades of grey are coverage.
+        let kinds = [png::ColorType::Indexed, png::ColorType::Grayscale];
+        for kind in kinds.into_iter().take(if id.max(other) < 128 { 2 } else { 1 }) {
+            let packed = |_: usize, path: &Path| {
+                let row = |y| (0..4).fold(0u32, |row, x| row << depth | value(at(x, y), id, other)) << (32 - 4 * depth);
+                let rows: Vec<u8> =
+                    (0..2).flat_map(|y| row(y).to_be_bytes()[..(depth as usize).div_ceil(2)].to_vec()).collect();
+                let file = std::fs::File::create(path.with_extension("png")).unwrap();
+                let mut encoder = png::Encoder::new(file, 4, 2);
+                encoder.set_color(kind);
+                encoder.set_depth(png::BitDepth::from_u8(depth as u8).unwrap());
+                encoder.set_palette(vec![77; 3 << depth]);
+                encoder.write_header().unwrap().write_image_data(&rows).unwrap();
+            };
+            expected(levels_of("ids-packed", 2, &options, packed), &format!("{depth} bits, {kind:?}"));
+        }
+    }
+    if id.max(other) < 128 {
+        let color = |_: usize, path: &Path| {
+            let picture = ImageBuffer::from_fn(4, 2, |x, y| Rgb([value(at(x, y), id, other) as u8; 3]));
             picture.save(path.with_extension("png")).unwrap();
         };
-        expected(levels_of("ids-16", 2, &options, deep), "16 bits");
-        let array = |_: usize, path: &Path| {
-            let values: Vec<f64> = (0..8).map(|i| f64::from(value(i, id, other))).collect();
-            std::fs::write(path.with_extension("npy"), npy(&[1, 2, 4], &values)).unwrap();
-        };
-        expected(levels_of("ids-npy", 2, &options, array), ".npy");
-        if id.max(other) < 128 {
-            let color = |_: usize, path: &Path| {
-                let picture = ImageBuffer::from_fn(4, 2, |x, y| Rgb([value(at(x, y), id, other) as u8; 3]));
-                picture.save(path.with_extension("png")).unwrap();
-            };
-            expected(levels_of("ids-rgb", 2, &options, color), "grey of three channels");
-        }
+        expected(levels_of("ids-rgb", 2, &options, color), "grey of three channels");
     }
 }
 
-#[test]
-fn masks_in_alpha_and_of_16_bits_are_coverage() {
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(32))]
+    #[test]
+    fn masks_in_alpha_and_of_16_bits_are_coverage(soft in any::<u8>(), color in any::<[u8; 3]>()) {
+        coverage([0, 0, 0, 255, 0, 0, soft, 0], color);
+    }
+}
+
+fn coverage(expected: [u8; 8], color: [u8; 3]) {
     use image::{ImageBuffer, Luma, LumaA, Rgba};
     let options = ImportOptions::default();
-    let expected = [0, 0, 0, 255, 0, 0, 51, 0];
     let pixel = |x: u32, y: u32| expected[(y * 4 + x) as usize];
     // Cut out of a photograph, or white; the rest of the picture is as background removers leave it.
     let cut = |color: [u8; 3]| {
@@ -396,7 +430,7 @@ fn masks_in_alpha_and_of_16_bits_are_coverage() {
     };
     for levels in [
         levels_of("alpha-white", 2, &options, cut([255; 3])),
-        levels_of("alpha-cut", 2, &options, cut([200, 30, 90])),
+        levels_of("alpha-cut", 2, &options, cut(color)),
         levels_of("alpha-grey", 2, &options, grey),
         levels_of("coverage-16", 2, &options, deep),
     ] {
@@ -496,7 +530,7 @@ fn gvhmr_saved_again_by_numpy_is_the_same() {
             ("K_fullimg".to_owned(), cameras.clone()),
         ];
         let path = out.path().join(format!("{prefix}.npz"));
-        array_files::npz::write(&path, &arrays).unwrap();
+        array_files::npz::write_with_text(&path, &arrays, &[("gender", "neutral")]).unwrap();
         let (again, _) = read::read(&path, &video).unwrap();
         assert_eq!(again.tool, Tool::Gvhmr);
         for (a, b) in again.people[0].frames.iter().zip(frames) {

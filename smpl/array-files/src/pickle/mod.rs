@@ -21,12 +21,13 @@ use std::path::Path;
 use crate::Error;
 use crate::file::read_file;
 use crate::npy::{MAGIC, NpyHeader};
+use globals::Dtype;
 use machine::Machine;
 
 pub(crate) use globals::STORAGES;
 pub use value::{PERSISTENT, Value};
 
-/// Reads a pickle, plain or compressed by joblib, or a `.npy` file of objects or plain values.
+/// Reads a pickle, plain or compressed by joblib, or a `.npy` file of objects, texts or plain values.
 ///
 /// # Errors
 /// [`Error::Io`], also beyond 2 GiB; [`Error::Pickle`], [`Error::Npy`].
@@ -48,7 +49,15 @@ pub fn from_bytes(file: &str, bytes: Vec<u8>) -> Result<Value, Error> {
     if header.descr.trim_start_matches(['|', '<', '>', '=']).starts_with('O') {
         return parse_from(file, &bytes, bytes.len() - rest.len()).map(|(value, _)| value);
     }
-    header.read_data(file, "", rest).map(Value::Array)
+    match Dtype::parse(&header.descr) {
+        Ok(dtype @ (Dtype::ByteText(size) | Dtype::WideText { size, .. })) => {
+            let texts = numpy::texts(dtype, size, &header.shape, rest);
+            let mut items = texts.map_err(|error| Error::npy(file, "", error))?;
+            let only = if header.shape.is_empty() { items.pop() } else { None };
+            Ok(only.unwrap_or(Value::Objects { shape: header.shape, items }))
+        }
+        _ => header.read_data(file, "", rest).map(Value::Array),
+    }
 }
 
 /// Reads an uncompressed pickle in memory; `file` names it in errors. Bytes behind its end are

@@ -5,6 +5,7 @@ use std::borrow::Cow;
 use super::globals::{Dtype, Global, WRAPPER, count};
 use super::machine::{Id, Machine, Node, grown};
 use super::reader::Step;
+use super::value::Value;
 
 impl<'a> Machine<'a> {
     /// Calls `global` with `arguments`.
@@ -168,12 +169,7 @@ impl<'a> Machine<'a> {
                 self.budget.spend(2 * raw.len() + count.saturating_mul(grown::<Id>()))?;
                 let mut items = Vec::with_capacity(count);
                 for item in raw.chunks_exact(size) {
-                    let text = match dtype {
-                        Dtype::WideText { big_endian, .. } => wide_text(item, big_endian)?,
-                        _ => latin1(item),
-                    };
-                    let text = text.trim_end_matches('\0').to_owned();
-                    items.push(self.add(Node::Text(Cow::Owned(text)))?);
+                    items.push(self.add(Node::Text(Cow::Owned(padded_text(dtype, item)?)))?);
                 }
                 Ok(Node::Objects(Box::new((shape, items))))
             }
@@ -212,6 +208,27 @@ impl<'a> Machine<'a> {
 
 fn mismatch(shape: &[usize], found: usize) -> String {
     format!("shape {shape:?} with {found} bytes or items of data")
+}
+
+/// Most texts of a `.npy` file.
+const MAX_TEXTS: usize = 1 << 20;
+
+/// The texts of a `.npy` file, row-major or column-major as they stand.
+pub(super) fn texts(dtype: Dtype, size: usize, shape: &[usize], raw: &[u8]) -> Step<Vec<Value>> {
+    let count = count(shape)?;
+    if count > MAX_TEXTS || count.checked_mul(size) != Some(raw.len()) {
+        return Err(mismatch(shape, raw.len()));
+    }
+    raw.chunks_exact(size).map(|item| padded_text(dtype, item).map(Value::Str)).collect()
+}
+
+/// An item of an array of texts, without its padding.
+fn padded_text(dtype: Dtype, item: &[u8]) -> Step<String> {
+    let text = match dtype {
+        Dtype::WideText { big_endian, .. } => wide_text(item, big_endian)?,
+        _ => latin1(item),
+    };
+    Ok(text.trim_end_matches('\0').to_owned())
 }
 
 pub(super) fn latin1(bytes: &[u8]) -> String {

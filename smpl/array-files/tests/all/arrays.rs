@@ -5,6 +5,7 @@ use crate::common;
 use std::path::Path;
 
 use array_files::npz::{self, Npz, read_npy};
+use array_files::pickle::Value;
 use array_files::{Data, Error, NdArray};
 use common::fixture;
 use proptest::prelude::*;
@@ -39,6 +40,7 @@ fn npz_errors_name_file_key_and_shapes() {
     refused(npz.f32("huge", &[None]).unwrap_err(), "`huge`: not finite at flat index 0");
     refused(npz.i64("f4", &[None, None]).unwrap_err(), "`f4`: floats, expected integers");
     refused(npz.array("text").unwrap_err(), "`text`: element type ");
+    assert_eq!(npz.value("text").unwrap().items(), Some(&[Value::Str("ab".to_owned())][..]));
     assert!(matches!(Npz::open(Path::new("/no/such.npz")), Err(Error::Io { .. })));
 }
 

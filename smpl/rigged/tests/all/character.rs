@@ -188,6 +188,30 @@ fn legal_but_rare_documents_are_read() {
         let vertices = read(json, &binary).unwrap().vertices;
         assert!(vertices.iter().zip(&plain.vertices).all(|(a, b)| *a == *b * times), "{times}");
     }
+    // A strip and a fan of four corners, without indices.
+    let order = |mode: usize| json.replacen(r#""indices":7"#, &format!(r#""mode":{mode}"#), 1);
+    assert_eq!(read(&order(5), &binary).unwrap().faces, [[0, 1, 2], [2, 1, 3]]);
+    assert_eq!(read(&order(6), &binary).unwrap().faces, [[0, 1, 2], [0, 2, 3]]);
+    // Compressed by Draco without being said to be required, beside the plain accessors or instead of them.
+    let draco = r#""extensions":{"KHR_draco_mesh_compression":{"bufferView":0}},"attributes":"#;
+    let both = json.replacen(r#""attributes":"#, draco, 1);
+    assert_eq!(read(&both, &binary).unwrap(), plain);
+    let alone = both.replacen(r#""bufferView":0,"componentType""#, r#""componentType""#, 1);
+    refused(&alone, &binary, &["mesh 0", "KHR_draco_mesh_compression", "not read"]);
+    // Texts as editors write them.
+    let data = base64::engine::general_purpose::STANDARD.encode(&binary);
+    let text = json.replace(r#""byteLength":380"#, &format!(r#""byteLength":380,"uri":"data:a;base64,{data}""#));
+    let utf16: Vec<u8> = "\u{feff}".chars().chain(text.chars()).flat_map(|c| (c as u16).to_le_bytes()).collect();
+    for bytes in [
+        text.clone().into_bytes(),
+        format!("\u{feff}{text}").into_bytes(),
+        text.replace('\n', "\r").into_bytes(),
+        utf16,
+    ] {
+        assert_eq!(Character::from_bytes("a", &bytes).unwrap(), plain);
+    }
+    let used = json.replacen(r#""scene":0"#, r#""scene":0,"extensionsUsed":["EXT_mesh_gpu_instancing"]"#, 1);
+    assert!(read(&used, &binary).unwrap().ignored[0].contains("EXT_mesh_gpu_instancing"));
     // Names with spaces and umlauts.
     let folder = std::path::Path::new(env!("CARGO_TARGET_TMPDIR"));
     std::fs::write(folder.join("mein körper.bin"), &binary).unwrap();
@@ -337,7 +361,7 @@ fn errors_name_the_fault_of_a_document() {
     let no_view = r#""componentType":5126,"count":4294967295"#;
     refused(&swap(r#""bufferView":0,"componentType":5126,"count":4"#, no_view), &binary, &["accessor 0", "limit"]);
     let required = |name: &str| swap(r#""scene":0"#, &format!(r#""scene":0,"extensionsRequired":["{name}"]"#));
-    for name in ["KHR_draco_mesh_compression", "KHR_texture_basisu", "EXT_texture_webp"] {
+    for name in ["KHR_draco_mesh_compression", "KHR_texture_basisu", "EXT_texture_webp", "EXT_mesh_gpu_instancing"] {
         refused(&required(name), &binary, &["extensionsRequired", name]);
     }
     refused(&swap(r#""byteOffset":368,"byteLength":12"#, r#""byteOffset":368,"byteLength":13"#), &binary, &["view 7"]);
@@ -346,8 +370,8 @@ fn errors_name_the_fault_of_a_document() {
     refused(&swap(r#""channels":[{"sampler":0"#, r#""channels":[{"sampler":9"#), &binary, &["animation 0", "index 9"]);
     refused(&swap(r#""joints":[0,1]"#, r#""joints":[0]"#), &binary, &["mesh 0", "joint 1 of 1"]);
     refused(&swap(r#""joints":[0,1]"#, r#""joints":[0,1,1]"#), &binary, &["skin 0", "2 inverse bind matrices for 3"]);
-    refused(&swap(r#""indices":7"#, r#""indices":7,"mode":5"#), &binary, &["strips"]);
     refused(&swap(r#""indices":7"#, r#""indices":7,"mode":0"#), &binary, &["no triangles"]);
+    refused(&swap(r#"[{"nodes":[0,2]}]"#, "[{}]"), &binary, &["no triangles"]);
     refused(&swap(r#""WEIGHTS_0":1,"#, ""), &binary, &["JOINTS_0", "without weights"]);
     refused(&swap(r#""type":"VEC3","min""#, r#""type":"VEC2","min""#), &binary, &["POSITION"]);
     let poke = |at: usize, bytes: &[u8]| {
