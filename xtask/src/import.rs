@@ -84,9 +84,9 @@ pub struct ImportArguments {
     /// The joints of a --fit that is an array of joints: coco17, openpose25, smpl24, h36m17 or mhr70
     #[arg(long, value_name = "SET")]
     joints: Option<String>,
-    /// Points of the body that SAM 3D Body's pred_vertices lie on, which tell the twist of limbs: of a --body
-    /// SMPL_NEUTRAL.pkl smpl2mhr_mapping.npz, of SMPLX_NEUTRAL.npz smplx2mhr_mapping.npz, both of
-    /// github.com/facebookresearch/MHR (tools/mhr_smpl_conversion/assets)
+    /// Points of the body that SAM 3D Body's pred_vertices lie on, which tell the twist of limbs; those of the
+    /// open body are known, for a --body SMPL_NEUTRAL.pkl it is smpl2mhr_mapping.npz, for SMPLX_NEUTRAL.npz
+    /// smplx2mhr_mapping.npz of github.com/facebookresearch/MHR (tools/mhr_smpl_conversion/assets)
     #[arg(long, value_name = "FILE")]
     vertex_map: Option<PathBuf>,
     /// 2-D key points of the frames, which registration then follows: OpenPose's folder of JSON (BODY_25),

@@ -6,8 +6,12 @@ use nalgebra::{DMatrix, DVector};
 use crate::limits::{log, log_derivative};
 use crate::skeleton::{Shape, Skeleton, State};
 
-/// Standard deviation of the prior of a joint's rotation, radians.
+/// Standard deviation of the prior of a joint's rotation, and of those of spine, neck and collars, on which
+/// points are few, radians.
 const PRIOR: f64 = 1.0;
+const TRUNK: f64 = 0.6;
+/// Joints of SMPL's feet.
+const FEET: [usize; 4] = [7, 8, 10, 11];
 /// Standard deviation beyond a limit, radians.
 const LIMIT: f64 = 0.05;
 /// Cauchy's scale, in standard deviations of a point: farther points lose their weight.
@@ -44,12 +48,15 @@ fn held(skeleton: &Skeleton, joint: usize, turn: DQuat, mut add: impl FnMut(DMat
     let [low, high] = skeleton.ranges[joint];
     let beyond = (v - v.clamp(low, high)) / LIMIT;
     let derivative = log_derivative(v);
-    add(derivative * (1.0 / PRIOR), v / PRIOR);
+    // Of SMPL's joints those of the feet and the trunk turn least.
+    let is_trunk = high.max_element() <= 1.0 && !FEET.contains(&joint);
+    let prior = if is_trunk { TRUNK } else { PRIOR };
+    add(derivative * (1.0 / prior), v / prior);
     if beyond != DVec3::ZERO {
         let active = DVec3::select(beyond.cmpne(DVec3::ZERO), DVec3::ONE, DVec3::ZERO) / LIMIT;
         add(DMat3::from_diagonal(active) * derivative, beyond);
     }
-    0.5 * (v.length_squared() / (PRIOR * PRIOR) + beyond.length_squared())
+    0.5 * (v.length_squared() / (prior * prior) + beyond.length_squared())
 }
 
 /// Cost of a frame: points (those that are not finite are missing), prior and limits.

@@ -7,6 +7,7 @@ use anyhow::{Context, Result, ensure};
 use clap::{Args, ValueEnum};
 use glam::Vec3;
 use occnerf::capture::{Area, Capture, Frame, Layout, LoadOptions};
+use point_fit::Anchor;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use smpl::{BodyModel, Placement, rodrigues};
@@ -40,8 +41,8 @@ pub struct Corruption {
     /// `occlusion.json` says, or the default [`Obstacle`] where there is none.
     pub occlusion: Option<Obstacle>,
     /// The open body in place of the capture's, which has SMPL's joints: at 0 in its mean shape, with the
-    /// capture's angles; else fitted to SAM 3D Body's key points of the capture's body, normal noise of so
-    /// many millimetres in every coordinate.
+    /// capture's angles; else fitted to SAM 3D Body's key points of the capture's body, and to vertices if
+    /// its mesh is the same, normal noise of so many millimetres in every coordinate.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub open_body: Option<f32>,
     /// Errors of priors and masks.
@@ -85,7 +86,11 @@ fn put_open_body(capture: &mut Capture, model: &mut BodyModel, noise: f32) -> Re
     );
     let anchors = |body: &BodyModel| point_fit::joint_set(body, "mhr70").unwrap_or_default();
     // Both bodies have the same points.
-    let [own, other] = [anchors(model), anchors(&open)].map(|set| set.into_iter().flatten().collect::<Vec<_>>());
+    let is_mesh = model.faces == open.faces;
+    let mesh = (0..open.num_vertices()).filter(|v| is_mesh && v % 54 == 0);
+    let mesh: Vec<Anchor> = mesh.map(|v| Anchor { vertices: vec![(v, 1.0)], ..Anchor::default() }).collect();
+    let [own, other] = [anchors(model), anchors(&open)]
+        .map(|set| set.into_iter().flatten().chain(mesh.iter().cloned()).collect::<Vec<_>>());
     let mut random = RandomStream::new(&[0x4f50_454e]);
     let mut seen = Vec::new();
     for frame in &mut capture.train {

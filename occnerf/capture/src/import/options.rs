@@ -26,7 +26,7 @@ pub struct ImportOptions {
     /// Joint set of a fit that is an array of joints, one of [`point_fit::joint_sets`].
     pub joints: Option<String>,
     /// Points of the body that SAM 3D Body's `pred_vertices` lie on: `triangle_ids` (V) and `baryc_coords`
-    /// (V,3) in its faces, as `smpl2mhr_mapping.npz` of MHR has them.
+    /// (V,3) in its faces, as `smpl2mhr_mapping.npz` of MHR has them; those of the open body are known.
     pub vertex_map: Option<PathBuf>,
     /// 2-D key points of a detector: OpenPose's folder, or an array (T, J, 3) of one person.
     pub keypoints: Option<PathBuf>,

@@ -123,7 +123,7 @@ fn people_of_sam_3d_body_are_told_apart_and_a_body_is_fitted_to_each() {
     ];
     let out = Directory::new("import-sam3d");
     let body = BodyModel::embedded();
-    for (noise, most) in [(0.0, [0.004, 8.0]), (0.015, [0.015, 12.0]), (0.03, [0.024, 14.0]), (0.045, [0.032, 17.0])] {
+    for (noise, most) in [(0.0, [0.004, 7.0]), (0.015, [0.015, 11.0]), (0.03, [0.024, 13.5]), (0.045, [0.032, 16.0])] {
         let mut random = Random(11);
         // The second is not seen for some frames, the order changes.
         let frame = |f: usize| {
