@@ -87,7 +87,7 @@ fn put_open_body(capture: &mut Capture, model: &mut BodyModel, noise: f32) -> Re
     let anchors = |body: &BodyModel| point_fit::joint_set(body, "mhr70").unwrap_or_default();
     // Both bodies have the same points.
     let is_mesh = model.faces == open.faces;
-    let mesh = (0..open.num_vertices()).filter(|v| is_mesh && v % 54 == 0);
+    let mesh = (0..open.num_vertices()).filter(|v| is_mesh && v.is_multiple_of(54));
     let mesh: Vec<Anchor> = mesh.map(|v| Anchor { vertices: vec![(v, 1.0)], ..Anchor::default() }).collect();
     let [own, other] = [anchors(model), anchors(&open)]
         .map(|set| set.into_iter().flatten().chain(mesh.iter().cloned()).collect::<Vec<_>>());

@@ -207,7 +207,7 @@ fn a_thousand_frames_take_seconds() {
     let mut random = Random(5);
     let frame = |f: usize| {
         // To and fro.
-        let points = &truth[if f / 300 % 2 == 0 { f % 300 } else { 299 - f % 300 }].0;
+        let points = &truth[if (f / 300).is_multiple_of(2) { f % 300 } else { 299 - f % 300 }].0;
         let points: Vec<DVec3> = points[..70].iter().chain(points[70..].iter().step_by(54)).copied().collect();
         out.picture(&format!("frames/{f:06}.png"), (60, 40), |_, _| 9);
         Py::List(vec![person(&points, &mut random, 0.015, true)])
