@@ -42,6 +42,8 @@ const BELOW: f64 = 0.005;
 const TURN: f64 = 0.1;
 /// Standard deviations of accelerations of corrections: m/s² and rad/s².
 const ACCELERATIONS: [f64; 2] = [2.0, 10.0];
+/// Frames at most: 11 kB each.
+const FRAMES: usize = 100_000;
 /// Gauss–Newton steps at most, and the relative gain of the cost below which they end.
 const STEPS: usize = 20;
 const GAIN: f64 = 1e-6;
@@ -95,12 +97,16 @@ pub struct Grounded {
 /// ```
 ///
 /// # Errors
-/// [`FitError::Legs`] names joints that the skeleton lacks by name, and bones without length.
+/// [`FitError::Legs`] names joints that the skeleton lacks by name, and bones without length;
+/// [`FitError::Frames`] of more than 100 000 frames.
 ///
 /// # Panics
 /// If the motion is not of the skeleton's joints.
 pub fn ground(skeleton: &[Joint], motion: &MotionClip, sole: f32) -> Result<Grounded, FitError> {
     assert_eq!(motion.poses.len(), skeleton.len() * motion.num_frames(), "ground: rotations of joints");
+    if motion.num_frames() > FRAMES {
+        return Err(FitError::Frames { most: FRAMES, found: motion.num_frames() });
+    }
     let legs = Legs::new(skeleton, sole)?;
     let root = skeleton[0].rest.as_dvec3();
     let state = |(pose, place): (&[glam::Vec3], &glam::Vec3)| State {

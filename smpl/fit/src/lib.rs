@@ -118,6 +118,14 @@ pub enum FitError {
     /// Legs that no motion can be grounded by: its reason.
     #[error("{0}")]
     Legs(String),
+    /// A motion too long to be held in memory.
+    #[error("expected at most {most} frames, found {found}")]
+    Frames {
+        /// Limit.
+        most: usize,
+        /// Frames of the motion.
+        found: usize,
+    },
     /// No frame has enough points.
     #[error("expected a frame with {LEAST} finite points or more, found at most {0}")]
     Unseen(usize),

@@ -128,6 +128,8 @@ fn skeletons_without_feet_are_refused() {
     assert!(ground(&skeleton, &still, sole).is_ok());
     let none = MotionClip { poses: Vec::new(), trans: Vec::new(), ..still.clone() };
     assert_eq!(ground(&skeleton, &none, sole).unwrap().motion, none);
+    let long = MotionClip { poses: vec![Vec3::ZERO; 24 * 100_001], trans: vec![Vec3::ZERO; 100_001], ..still.clone() };
+    assert_eq!(ground(&skeleton, &long, sole).err(), Some(FitError::Frames { most: 100_000, found: 100_001 }));
     let refused = |edit: fn(&mut Vec<Joint>)| {
         let mut edited = skeleton.clone();
         edit(&mut edited);
