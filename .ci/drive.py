@@ -95,6 +95,7 @@ steps = 5
 expected = places(glb, [start + (end - start) * i / steps for i in range(steps)])
 meshes = [o for o in bpy.data.objects if o.type == "MESH" and o.find_armature()]
 check(len(meshes) == 1 and meshes[0].data.materials, f"Blender {bpy.app.version_string} reads the GLB: {len(glb.pose.bones)} bones, {end - start:.0f} frames")
+faces = sum(len(o.data.polygons) for o in meshes)
 compare(start, end)
 vrm = read("vrm.glb", bpy.ops.import_scene.gltf)
 found = places(vrm, [start + (end - start) * i / steps for i in range(steps)])
@@ -108,4 +109,12 @@ check(moves > 0.05, f"the BVH moves: {len(bvh.pose.bones)} bones, {last - first:
 apart = (found[0]["pelvis"] - expected[0]["pelvis"]).length
 worst = max((found[0][name] - expected[0][name]).length for name in expected[0])
 check(worst < 1e-2, f"its first frame is the GLB's: joints within {1e3 * worst:.2f} mm")
+bpy.ops.wm.read_factory_settings(use_empty=True)
+bpy.ops.wm.obj_import(filepath=f"{folder}/person.obj", forward_axis="NEGATIVE_Z", up_axis="Y")
+mesh = bpy.context.selected_objects[0]
+high = max((mesh.matrix_world @ v.co).z for v in mesh.data.vertices) - min((mesh.matrix_world @ v.co).z for v in mesh.data.vertices)
+check(len(mesh.data.polygons) == faces and 1.4 < high < 2.1, f"the OBJ has {len(mesh.data.polygons)} faces and is {high:.2f} m high")
+bpy.ops.import_mesh.ply(filepath=f"{folder}/person.ply")
+splats = len(bpy.context.selected_objects[0].data.vertices)
+check(splats == int(re.search(rb"element vertex (\d+)", open(f"{folder}/person.ply", "rb").read(500))[1]), f"the PLY has {splats} points")
 sys.exit(1 if failures else 0)
