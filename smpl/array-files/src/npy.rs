@@ -20,7 +20,7 @@ const MAX_HEADER_BYTES: usize = 1 << 16;
 pub(crate) struct NpyHeader {
     /// numpy's name of the element type, `|O` for pickled objects.
     pub(crate) descr: String,
-    fortran: bool,
+    pub(crate) fortran: bool,
     pub(crate) shape: Vec<usize>,
 }
 

@@ -20,6 +20,13 @@ pub(crate) struct Beside {
     pub second: Vec<DVector<f64>>,
 }
 
+impl Beside {
+    pub fn zeros(unknowns: usize, frames: usize) -> Self {
+        let zeros = vec![DVector::zeros(unknowns); frames];
+        Self { first: zeros.clone(), second: zeros }
+    }
+}
+
 impl Band {
     /// Factors the matrix; `None` where it is not positive definite.
     pub fn factor(diagonal: Vec<DMatrix<f64>>, beside: Option<Beside>) -> Option<Self> {

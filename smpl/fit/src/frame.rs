@@ -32,6 +32,19 @@ pub(crate) struct Normal {
     pub corner_gradient: DVector<f64>,
 }
 
+impl Normal {
+    pub fn zeros(unknowns: usize, betas: usize) -> Self {
+        Self {
+            cost: 0.0,
+            hessian: DMatrix::zeros(unknowns, unknowns),
+            gradient: DVector::zeros(unknowns),
+            border: DMatrix::zeros(unknowns, betas),
+            corner: DMatrix::zeros(betas, betas),
+            corner_gradient: DVector::zeros(betas),
+        }
+    }
+}
+
 /// ½ Cauchy's loss of a squared residual in standard deviations, and the weight of its square.
 fn robust(square: f64) -> (f64, f64) {
     let scale = ROBUST * ROBUST;
@@ -129,15 +142,7 @@ pub(crate) fn normal(
     noise: f64,
     betas: usize,
 ) -> Normal {
-    let n = skeleton.unknowns;
-    let mut out = Normal {
-        cost: 0.0,
-        hessian: DMatrix::zeros(n, n),
-        gradient: DVector::zeros(n),
-        border: DMatrix::zeros(n, betas),
-        corner: DMatrix::zeros(betas, betas),
-        corner_gradient: DVector::zeros(betas),
-    };
+    let mut out = Normal::zeros(skeleton.unknowns, betas);
     let (points, by_pose, by_shape) = jacobian(skeleton, shape, state, betas);
     for (i, point) in points.iter().enumerate().filter(|(i, _)| seen[*i].is_finite()) {
         let residual = *point - seen[i];

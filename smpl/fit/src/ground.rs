@@ -8,8 +8,9 @@ use smpl::{BoneNames, Joint, MotionClip};
 
 use crate::FitError;
 use crate::band::{Band, Beside};
-use crate::frame::{add, add_block, jacobian, stepped};
+use crate::frame::{Normal, add, add_block, jacobian, stepped};
 use crate::limits::log;
+use crate::relax::couple;
 use crate::skeleton::{Part, Shape, Skeleton, State};
 
 /// Fastest and highest smoothed place of a part of the sole that stands, in m/s and metres.
@@ -259,37 +260,29 @@ fn relax(legs: &Legs, before: &[Vec<DVec3>], held: &[Vec<Option<DVec3>>], states
     let mut now = cost(states);
     for _ in 0..STEPS {
         let corrections: Vec<_> = start.iter().zip(&*states).map(|(a, b)| legs.correction(a, b)).collect();
-        let zeros = vec![DVector::zeros(n); states.len()];
-        let mut beside = Beside { first: zeros.clone(), second: zeros };
-        let mut diagonal = vec![DMatrix::zeros(n, n); states.len()];
-        let mut sides = vec![DMatrix::zeros(n, 1); states.len()];
-        for (t, state) in states.iter().enumerate() {
+        let mut beside = Beside::zeros(n, states.len());
+        let mut normals: Vec<Normal> = states.iter().map(|_| Normal::zeros(n, 0)).collect();
+        for (t, (state, normal)) in states.iter().zip(&mut normals).enumerate() {
             let (points, by_pose, _) = jacobian(&legs.0, &legs.0.mean, state, 0);
-            let mut gradient = DVector::zeros(n);
             for (i, (at, blocks)) in points.into_iter().zip(by_pose).enumerate() {
                 let (residual, weight) = residual(t, i, at);
                 for (a, block) in &blocks {
                     let weighted = block.transpose() * DMat3::from_diagonal(weight);
-                    add(&mut gradient, *a, weighted * residual);
-                    blocks.iter().for_each(|(b, other)| add_block(&mut diagonal[t], *a, *b, weighted * *other));
+                    add(&mut normal.gradient, *a, weighted * residual);
+                    blocks.iter().for_each(|(b, other)| add_block(&mut normal.hessian, *a, *b, weighted * *other));
                 }
             }
-            sides[t].set_column(0, &gradient);
         }
         // The derivative of a correction is taken as 1: corrections are small.
         for (row, weight) in rows.into_iter().zip([&still, &smooth]) {
-            for (first, window) in corrections.windows(row.len()).enumerate() {
-                let weighted = weight.component_mul(&value(window, row));
-                for (i, a) in row.iter().enumerate() {
-                    sides[first + i] += *a * &weighted;
-                    (0..n).for_each(|k| diagonal[first + i][(k, k)] += a * a * weight[k]);
-                    for (j, b) in row[..i].iter().enumerate() {
-                        let block = if i - j == 1 { &mut beside.first } else { &mut beside.second };
-                        block[first + i] += a * b * weight;
-                    }
-                }
+            for (f, window) in corrections.windows(row.len()).enumerate() {
+                couple(&mut normals[f..], &mut beside, f, row, &value(window, row), weight);
             }
         }
+        let column = |normal: &Normal| DMatrix::from_column_slice(n, 1, normal.gradient.as_slice());
+        let mut sides: Vec<DMatrix<f64>> = normals.iter().map(column).collect();
+        let diagonal = normals.into_iter().map(|normal| normal.hessian).collect();
+        // Not definite only where coordinates or rates are beyond what f64 resolves.
         let Some(band) = Band::factor(diagonal, Some(beside)) else { return };
         band.solve(&mut sides);
         let better = (0..6).find_map(|halving| {

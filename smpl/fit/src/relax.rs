@@ -109,29 +109,36 @@ fn differences(skeleton: &Skeleton, states: &[State]) -> Vec<DVector<f64>> {
 fn smoothed(skeleton: &Skeleton, states: &[State], normals: &mut [Normal]) -> Beside {
     let motion = differences(skeleton, states);
     let weights = stiffness(skeleton);
-    let zeros = vec![DVector::zeros(skeleton.unknowns); states.len()];
-    let mut beside = Beside { first: zeros.clone(), second: zeros };
-    // A row of differences: coefficients of consecutive frames, the value, its weight.
-    let mut add = |start: usize, row: &[f64], value: &DVector<f64>, weight: &DVector<f64>| {
-        for (i, a) in row.iter().enumerate() {
-            let normal = &mut normals[start + i];
-            normal.gradient += *a * weight.component_mul(value);
-            for k in 0..skeleton.unknowns {
-                normal.hessian[(k, k)] += a * a * weight[k];
-            }
-            for (j, b) in row[..i].iter().enumerate() {
-                let block = if i - j == 1 { &mut beside.first } else { &mut beside.second };
-                block[start + i] += a * b * weight;
-            }
-        }
-    };
+    let mut beside = Beside::zeros(skeleton.unknowns, states.len());
     for (f, v) in motion.iter().enumerate() {
-        add(f, &[-1.0, 1.0], v, &weights[0]);
+        couple(&mut normals[f..], &mut beside, f, &[-1.0, 1.0], v, &weights[0]);
     }
     for (f, v) in motion.windows(2).enumerate() {
-        add(f, &[1.0, -2.0, 1.0], &(&v[1] - &v[0]), &weights[1]);
+        couple(&mut normals[f..], &mut beside, f, &[1.0, -2.0, 1.0], &(&v[1] - &v[0]), &weights[1]);
     }
     beside
+}
+
+/// Adds residuals that are linear in the unknowns of consecutive frames, the first of them `start`:
+/// coefficients, values and inverse variances; `normals` from that frame on.
+pub(crate) fn couple(
+    normals: &mut [Normal],
+    beside: &mut Beside,
+    start: usize,
+    row: &[f64],
+    value: &DVector<f64>,
+    weight: &DVector<f64>,
+) {
+    for ((i, a), normal) in row.iter().enumerate().zip(normals) {
+        normal.gradient += *a * weight.component_mul(value);
+        for k in 0..weight.len() {
+            normal.hessian[(k, k)] += a * a * weight[k];
+        }
+        for (j, b) in row[..i].iter().enumerate() {
+            let block = if i - j == 1 { &mut beside.first } else { &mut beside.second };
+            block[start + i] += a * b * weight;
+        }
+    }
 }
 
 /// The damped step of every frame and of the betas; `None` where the system is not definite.

@@ -42,7 +42,7 @@ pub struct Corruption {
     pub occlusion: Option<Obstacle>,
     /// The open body in place of the capture's, which has SMPL's joints: at 0 in its mean shape, with the
     /// capture's angles; else fitted to SAM 3D Body's key points of the capture's body, and to vertices if
-    /// its mesh is the same, normal noise of so many millimetres in every coordinate.
+    /// its mesh is the same, each coordinate with normal noise of this standard deviation, in millimetres.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub open_body: Option<f32>,
     /// Errors of priors and masks.
@@ -174,7 +174,7 @@ pub struct SceneArguments {
     #[serde(flatten)]
     obstacle: ObstacleArguments,
     /// Put the open body in place of the capture's: 0 with the capture's angles in its mean shape, else fitted
-    /// to SAM 3D Body's key points with noise of so many millimetres
+    /// to SAM 3D Body's key points with noise of this standard deviation, in millimetres
     #[arg(long, value_name = "MM")]
     open_body: Option<f32>,
     /// Make the prior and the masks as wrong as something makes them; the options below change

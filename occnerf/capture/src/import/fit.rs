@@ -116,7 +116,7 @@ pub(super) struct Person {
     pub ghosts: usize,
     /// Frames whose picture is absent.
     pub absent: usize,
-    /// Vertices of SAM 3D Body's mesh, some of which follow the points of frames; 0 where there is none.
+    /// Vertices of SAM 3D Body's mesh, a subset of them after each frame's points; 0 without a mesh.
     pub vertices: usize,
 }
 

@@ -2,8 +2,6 @@
 //! {`smpl_pose` (T,69), `smpl_orient_world` (T,3), `root_trans_world` (T,3), the pelvis, `smpl_beta`
 //! (T,10), `exist_frames` (T), `cam_K` (T,3,3), zero where the person is hidden}.
 
-use glam::DVec3;
-
 use super::fit::{About, BETAS, Fit, FitFrame, Person, SMPL, Tool};
 use super::item::{Item, vectors};
 use crate::CaptureError;
@@ -23,9 +21,8 @@ pub(super) fn read(root: &Item<'_>) -> Result<Fit, CaptureError> {
         let seen = lenses.chunks_exact(9).find(|k| k[0] > 0.0);
         let k = seen.ok_or_else(|| lens.invalid("a frame with a focal length", "none"))?;
         let frame = |index: usize| {
-            let e = &cameras[16 * index..][..16];
-            let turn = camera.rotation(&[&e[0..3], &e[4..7], &e[8..11]].concat())?;
-            let offset = turn * places[index] + DVec3::new(e[3], e[7], e[11]);
+            let (turn, moved) = camera.rigid(&cameras[16 * index..][..16])?;
+            let offset = turn * places[index] + moved;
             let body = &bodies[(3 * SMPL - 3) * index..][..3 * SMPL - 3];
             let betas = shapes[BETAS * index..][..BETAS].to_vec();
             let pose = [vec![roots[index]], vectors(body)].concat();
@@ -40,6 +37,8 @@ pub(super) fn read(root: &Item<'_>) -> Result<Fit, CaptureError> {
 
 #[cfg(test)]
 mod tests {
+    use glam::DVec3;
+
     use super::*;
     use crate::import::fit::{axis_angle, rotation};
     use crate::import::read;

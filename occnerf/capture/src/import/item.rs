@@ -187,6 +187,12 @@ impl<'a> Item<'a> {
     pub fn rotation(&self, values: &[f64]) -> Result<DMat3, CaptureError> {
         turn(values).ok_or_else(|| self.invalid("a rotation matrix", format!("{values:?}")))
     }
+
+    /// Rotation and translation of a (4,4) matrix, row by row.
+    pub fn rigid(&self, values: &[f64]) -> Result<(DMat3, DVec3), CaptureError> {
+        let turn = self.rotation(&[&values[0..3], &values[4..7], &values[8..11]].concat())?;
+        Ok((turn, DVec3::new(values[3], values[7], values[11])))
+    }
 }
 
 /// The rotation of nine numbers, row by row; `None` unless they are one.

@@ -78,9 +78,7 @@ fn frames(
 ) -> Result<Fit, CaptureError> {
     let k = camera.get("intrinsic")?.numbers(&[Some(3), Some(3)])?;
     let extrinsic = camera.get("extrinsic")?;
-    let e = extrinsic.numbers(&[Some(4), Some(4)])?;
-    let turn = extrinsic.rotation(&[&e[0..3], &e[4..7], &e[8..11]].concat())?;
-    let moved = DVec3::new(e[3], e[7], e[11]);
+    let (turn, moved) = extrinsic.rigid(&extrinsic.numbers(&[Some(4), Some(4)])?)?;
     let places = place.rows(3)?;
     place.as_long(poses.len(), places.len())?;
     // The frames of a partial split are unknown.

@@ -196,47 +196,6 @@ fn write_map(path: &Path, ids: &[f64], weights: &[f64]) {
     array_files::npz::write(path, &parts).unwrap();
 }
 
-/// Prints seconds: `cargo test -p capture --lib a_thousand -- --ignored --nocapture`.
-#[test]
-#[ignore = "a minute"]
-fn a_thousand_frames_take_seconds() {
-    let Some(dir) = shared("mocap") else { return };
-    let clip = MotionClip::load(&dir.join("turn.npz")).unwrap();
-    let (body, out) = (BodyModel::embedded(), Directory::new("import-sam3d-long"));
-    let truth = truth(&clip, 300, |_| DVec3::new(0.0, 0.0, 4.0));
-    let mut random = Random(5);
-    let frame = |f: usize| {
-        // To and fro.
-        let points = &truth[if (f / 300).is_multiple_of(2) { f % 300 } else { 299 - f % 300 }].0;
-        let points: Vec<DVec3> = points[..70].iter().chain(points[70..].iter().step_by(54)).copied().collect();
-        out.picture(&format!("frames/{f:06}.png"), (60, 40), |_, _| 9);
-        Py::List(vec![person(&points, &mut random, 0.015, true)])
-    };
-    let frames: Vec<Py> = (0..1000).map(frame).collect();
-    out.write("video.pkl", Py::List(frames).pickle());
-    let (ids, weights) = identity_map(&body, 54);
-    let (path, map) = (out.path().join("video.pkl"), out.path().join("map.npz"));
-    write_map(&map, &ids, &weights);
-    for vertex_map in [None, Some(map)] {
-        let start = std::time::Instant::now();
-        let (fit, _) = read::read(&path, &video(1000)).unwrap();
-        let read = start.elapsed().as_secs_f32();
-        let mut person = fit.people.into_iter().next().unwrap();
-        let mapped =
-            vertex_map.iter().flat_map(|map| points::mapped(&path, Some(map), person.vertices, &body, true).unwrap());
-        points::solve(&path, sam3d::SET, mapped.collect(), &mut person, &body).unwrap();
-        let solved = start.elapsed().as_secs_f32();
-        let is_mapped = vertex_map.is_some();
-        let options =
-            ImportOptions { frames: out.path().join("frames"), fit: path.clone(), vertex_map, ..Default::default() };
-        let start = std::time::Instant::now();
-        assert_eq!(import(&options, &out.path().join(format!("capture-{is_mapped}"))).unwrap().frames, 1000);
-        let all = start.elapsed().as_secs_f32();
-        println!("mapped {is_mapped}: read {read:.1} s, fitted {:.1} s, the whole import {all:.1} s", solved - read);
-        assert!(all < 120.0, "{all} s");
-    }
-}
-
 /// Fingers that curl, of SMPL-X's form.
 #[test]
 fn fingers_follow_their_points_on_a_body_that_has_them() {

@@ -23,14 +23,14 @@ pub(super) const POINTS: &str = "pred_keypoints_3d";
 /// Joint set of the points.
 pub(super) const SET: &str = "mhr70";
 const COUNT: usize = 70;
-/// Vertices, of which some follow the points.
+/// Vertices; every [`stride`]-th follows the points.
 pub(super) const VERTICES: &str = "pred_vertices";
 /// Most people of a picture, whose pairs with those of earlier ones are compared.
 const MAX_PEOPLE: usize = 256;
 /// Bones that tell people's sizes: upper arms, thighs and shins.
 const BONES: [[usize; 2]; 6] = [[5, 7], [6, 8], [9, 11], [10, 12], [11, 13], [12, 14]];
 
-/// Every how many of so many vertices follow the points: at most 128.
+/// Step between the vertices that follow the points: at most 128 do.
 pub(super) fn stride(vertices: usize) -> usize {
     vertices.div_ceil(128).max(1)
 }

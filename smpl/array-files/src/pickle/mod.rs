@@ -51,7 +51,7 @@ pub fn from_bytes(file: &str, bytes: Vec<u8>) -> Result<Value, Error> {
     }
     match Dtype::parse(&header.descr) {
         Ok(dtype @ (Dtype::ByteText(size) | Dtype::WideText { size, .. })) => {
-            let texts = numpy::texts(dtype, size, &header.shape, rest);
+            let texts = numpy::texts(dtype, size, &header, rest);
             let mut items = texts.map_err(|error| Error::npy(file, "", error))?;
             let only = if header.shape.is_empty() { items.pop() } else { None };
             Ok(only.unwrap_or(Value::Objects { shape: header.shape, items }))

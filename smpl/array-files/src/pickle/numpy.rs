@@ -6,6 +6,7 @@ use super::globals::{Dtype, Global, WRAPPER, count};
 use super::machine::{Id, Machine, Node, grown};
 use super::reader::Step;
 use super::value::Value;
+use crate::npy::NpyHeader;
 
 impl<'a> Machine<'a> {
     /// Calls `global` with `arguments`.
@@ -159,9 +160,7 @@ impl<'a> Machine<'a> {
                 Ok(Node::Array(Box::new(array.ok_or_else(|| mismatch(&shape, raw.len()))?)))
             }
             Dtype::Object => Err("data of an array".to_owned()),
-            Dtype::ByteText(_) | Dtype::WideText { .. } if fortran && shape.len() > 1 => {
-                Err("column-major array of text".to_owned())
-            }
+            Dtype::ByteText(_) | Dtype::WideText { .. } if fortran && shape.len() > 1 => Err(COLUMN_MAJOR.to_owned()),
             Dtype::ByteText(size) | Dtype::WideText { size, .. } => {
                 if count.checked_mul(size) != Some(raw.len()) {
                     return Err(mismatch(&shape, raw.len()));
@@ -210,12 +209,17 @@ fn mismatch(shape: &[usize], found: usize) -> String {
     format!("shape {shape:?} with {found} bytes or items of data")
 }
 
+const COLUMN_MAJOR: &str = "column-major array of text";
 /// Most texts of a `.npy` file.
 const MAX_TEXTS: usize = 1 << 20;
 
-/// The texts of a `.npy` file, row-major or column-major as they stand.
-pub(super) fn texts(dtype: Dtype, size: usize, shape: &[usize], raw: &[u8]) -> Step<Vec<Value>> {
+/// The texts of a `.npy` file.
+pub(super) fn texts(dtype: Dtype, size: usize, header: &NpyHeader, raw: &[u8]) -> Step<Vec<Value>> {
+    let shape = &header.shape;
     let count = count(shape)?;
+    if header.fortran && shape.len() > 1 {
+        return Err(COLUMN_MAJOR.to_owned());
+    }
     if count > MAX_TEXTS || count.checked_mul(size) != Some(raw.len()) {
         return Err(mismatch(shape, raw.len()));
     }

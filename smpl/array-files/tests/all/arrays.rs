@@ -5,7 +5,7 @@ use crate::common;
 use std::path::Path;
 
 use array_files::npz::{self, Npz, read_npy};
-use array_files::pickle::Value;
+use array_files::pickle::{self, Value};
 use array_files::{Data, Error, NdArray};
 use common::fixture;
 use proptest::prelude::*;
@@ -42,6 +42,18 @@ fn npz_errors_name_file_key_and_shapes() {
     refused(npz.array("text").unwrap_err(), "`text`: element type ");
     assert_eq!(npz.value("text").unwrap().items(), Some(&[Value::Str("ab".to_owned())][..]));
     assert!(matches!(Npz::open(Path::new("/no/such.npz")), Err(Error::Io { .. })));
+}
+
+#[test]
+fn texts_are_read_in_the_order_of_rows_or_not_at_all() {
+    let read = |order: &str| {
+        let header = format!("{{'descr': '|S1', 'fortran_order': {order}, 'shape': (2, 2), }}\n");
+        pickle::from_bytes("names.npy", npy_of(&header, b"abcd"))
+    };
+    let texts = ["a", "b", "c", "d"].map(|text| Value::Str(text.to_owned()));
+    assert_eq!(read("False").unwrap().items(), Some(&texts[..]));
+    let error = read("True").unwrap_err().to_string();
+    assert!(error.contains("names.npy") && error.contains("column-major array of text"), "{error}");
 }
 
 #[test]

@@ -22,8 +22,8 @@ fn skeleton() -> (Vec<Joint>, f32) {
     (names.map(joint).collect(), sole)
 }
 
-/// The recorded walk, with errors of the joints' rotations of so many degrees, root mean square, that
-/// are smooth in time: three waves an axis with periods of 0.7 to 2 s.
+/// The recorded walk with errors of joint rotations, smooth in time: three waves an axis with periods of
+/// 0.7 to 2 s, `degrees` root mean square.
 fn walk(degrees: f32) -> Option<MotionClip> {
     let mut walk = MotionClip::load(&shared("mocap/walk.npz")?).unwrap();
     let mut random = Random(5);
