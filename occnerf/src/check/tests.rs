@@ -342,7 +342,9 @@ fn row(wrong: Wrong, captures: &[&(String, Capture, BodyModel)]) -> ([usize; 4],
     )
 }
 
+/// Each mistake on one capture in `every`, or on all where few are at hand.
 fn table(every: usize) {
+    let every = every.min(good().len() / 2);
     let (mut all, mut missed) = ([0; 4], Vec::new());
     for (i, wrong) in WRONGS.into_iter().enumerate() {
         let captures: Vec<_> = good().iter().skip(i % every).step_by(every).collect();
