@@ -13,6 +13,15 @@ const MAX_PARAMETERS: u64 = 1 << 31;
 /// N_l = ⌊n_min · b^l⌋ with b = (n_max / n_min)^(1 / (levels − 1)) (Müller et al. 2022, eq. 2 and
 /// 3); the first and the last level are exactly `n_min` and `n_max`. With one level, only `n_min`
 /// is used.
+///
+/// ```
+/// use hashgrid::{HashGrid, HashGridConfig};
+///
+/// let config = HashGridConfig { levels: 8, features: 2, log2_table_size: 14, n_min: 16, n_max: 512 };
+/// let grid = HashGrid::<3>::new(&config)?;
+/// assert_eq!((grid.num_features(), grid.resolutions()[7]), (16, 512));
+/// # Ok::<(), hashgrid::Error>(())
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct HashGridConfig {
     /// L: number of levels, 1 to 64.

@@ -17,6 +17,17 @@ const FAR: f32 = 32.0;
 const HORIZON: f64 = 1e5;
 
 /// The closest point of a mesh, from [`MeshDistance::closest`].
+///
+/// ```
+/// use glam::Vec3;
+/// use surface_query::MeshDistance;
+///
+/// let mesh = MeshDistance::new(&[Vec3::ZERO, Vec3::X, Vec3::Y], &[[0, 1, 2]])?;
+/// let closest = mesh.closest(Vec3::new(0.25, 0.5, -3.0));
+/// assert_eq!((closest.face, closest.barycentric), (0, [0.25, 0.25, 0.5]));
+/// assert_eq!((closest.point, closest.signed_distance), (Vec3::new(0.25, 0.5, 0.0), -3.0));
+/// # Ok::<(), surface_query::Error>(())
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Closest {
     /// Index of the face that holds the point; one of them where several share it.

@@ -36,6 +36,16 @@ pub struct Hit {
 /// watertight: no ray slips through an edge or a vertex that triangles share.
 ///
 /// Queries take `&self` and may run on any number of threads.
+///
+/// ```
+/// use glam::Vec3;
+/// use visibility::RayMesh;
+///
+/// let mesh = RayMesh::new(&[Vec3::ZERO, Vec3::X, Vec3::Y], &[[0, 1, 2]])?;
+/// assert!(mesh.first_hit(Vec3::new(0.25, 0.25, 1.0), Vec3::NEG_Z).is_some());
+/// assert!(mesh.first_hit(Vec3::ONE, Vec3::NEG_Z).is_none());
+/// # Ok::<(), visibility::Error>(())
+/// ```
 pub struct RayMesh {
     faces: Vec<[u32; 3]>,
     /// Multiplied by `scale`, a power of two, so that products neither overflow nor vanish.

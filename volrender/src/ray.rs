@@ -1,6 +1,13 @@
 use glam::Vec3;
 
 /// A ray x(t) = origin + t · direction.
+///
+/// ```
+/// use glam::Vec3;
+///
+/// let ray = volrender::Ray { origin: Vec3::X, direction: Vec3::Z };
+/// assert_eq!(ray.at(2.0), Vec3::new(1.0, 0.0, 2.0));
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Ray {
     /// The point at t = 0.

@@ -28,6 +28,16 @@ pub(crate) const HANDS: usize = FACE + 3;
 pub(crate) const ROLES: usize = HANDS + 2;
 
 /// A joint of a skeleton.
+///
+/// ```
+/// use glam::Vec3;
+/// use smpl::{Joint, joint_transforms};
+///
+/// let joint = |name: &str, parent, rest| Joint { name: name.to_owned(), parent, rest };
+/// let arm = [joint("elbow", None, Vec3::ZERO), joint("wrist", Some(0), Vec3::X)];
+/// let bones = joint_transforms(&arm, &[Vec3::Z * std::f32::consts::FRAC_PI_2, Vec3::ZERO], Vec3::ZERO);
+/// assert!(bones[0].transform_point3(arm[1].rest).distance(Vec3::Y) < 1e-6);
+/// ```
 #[derive(Clone, Debug, PartialEq)]
 pub struct Joint {
     /// Such as `left_knee`.

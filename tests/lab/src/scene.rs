@@ -3,24 +3,27 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use anyhow::{Context, Result, ensure};
+use anyhow::{Context, Result, anyhow, bail, ensure};
 use clap::{Args, ValueEnum};
 use glam::Vec3;
 use occnerf::capture::{Area, Capture, Frame, Layout, LoadOptions};
 use point_fit::Anchor;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
-use smpl::{BodyModel, Placement, rodrigues};
+use smpl::{BodyModel, BoneNames, Bvh, Joint, MotionClip, Placement, rodrigues};
 use synth::{Obstacle, Perturbation};
 use volrender::RandomStream;
 use xtask::run::RunConfig;
 use xtask::source::{DEMO, LoadArguments, Source, load_with};
 
 use crate::obstacle::ObstacleArguments;
+use crate::synth::joint_names;
 
 /// Begins the recorded scene of a run on a corrupted capture, before the JSON of the scene and its
 /// [`Corruption`]. No file has such a name, so `xtask` refuses the run.
 const CORRUPTED: &str = "lab:";
+/// Stream of the noise of key points.
+const NOISE: u64 = 0x4f50_454e;
 
 /// How the files of a scene are read, and the capture corrupted.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -62,7 +65,7 @@ impl SceneOptions {
         let mut source = load_with(Some(scene), body, &self.files, |capture, model| {
             corruption.occlusion = occlude(capture, Path::new(scene), corruption.occlusion)?;
             if let Some(noise) = corruption.open_body {
-                put_open_body(capture, model, 1e-3 * noise)?;
+                put_open_body(capture, model, 1e-3 * noise, &joint_names(Path::new(scene))?)?;
             }
             corruption.wrong.apply(capture, model)?;
             corruption.wrong.spoil_body(model);
@@ -76,14 +79,15 @@ impl SceneOptions {
 }
 
 /// Puts the open body in place of the capture's: see [`Corruption::open_body`]; `noise` in metres.
-fn put_open_body(capture: &mut Capture, model: &mut BodyModel, noise: f32) -> Result<()> {
+/// `names` are those of a character's joints.
+fn put_open_body(capture: &mut Capture, model: &mut BodyModel, noise: f32, names: &[String]) -> Result<()> {
     let open = BodyModel::embedded();
     let joints = model.num_joints();
-    ensure!(
-        joints == open.num_joints(),
-        "--open-body: expected a body of {} joints, found {joints}",
-        open.num_joints()
-    );
+    if joints == names.len() {
+        return retarget(capture, model, noise, open, names);
+    }
+    let expected = "--open-body: expected SMPL's 24 joints, or a character of `lab synth`";
+    ensure!(joints == open.num_joints(), "{expected}, found {joints} joints");
     let anchors = |body: &BodyModel| point_fit::joint_set(body, "mhr70").unwrap_or_default();
     // Both bodies have the same points.
     let is_mesh = model.faces == open.faces;
@@ -91,7 +95,7 @@ fn put_open_body(capture: &mut Capture, model: &mut BodyModel, noise: f32) -> Re
     let mesh: Vec<Anchor> = mesh.map(|v| Anchor { vertices: vec![(v, 1.0)], ..Anchor::default() }).collect();
     let [own, other] = [anchors(model), anchors(&open)]
         .map(|set| set.into_iter().flatten().chain(mesh.iter().cloned()).collect::<Vec<_>>());
-    let mut random = RandomStream::new(&[0x4f50_454e]);
+    let mut random = RandomStream::new(&[NOISE]);
     let mut seen = Vec::new();
     for frame in &mut capture.train {
         let shaped = model.shaped(&frame.betas);
@@ -118,14 +122,70 @@ fn put_open_body(capture: &mut Capture, model: &mut BodyModel, noise: f32) -> Re
         }
         capture.mean_betas = fitted.betas;
     }
+    share_bodies(capture);
+    *model = open;
+    Ok(())
+}
+
+/// Puts the open body in place of a character: the shape that fits its joints by their names, with the
+/// character's angles or, with noise, fitted ones.
+fn retarget(capture: &mut Capture, model: &mut BodyModel, noise: f32, open: BodyModel, names: &[String]) -> Result<()> {
+    let smpl = BoneNames::Smpl.of_body(open.num_joints());
+    let names: Vec<&str> = names.iter().map(String::as_str).collect();
+    let roles =
+        BoneNames::Smpl.translate(&names).into_iter().map(|role| smpl.iter().position(|s| role.as_ref() == Some(s)));
+    let roles: Vec<(usize, usize)> = roles.enumerate().filter_map(|(joint, role)| Some((joint, role?))).collect();
+    let Some(&(hips, _)) = roles.iter().find(|(_, role)| *role == 0) else {
+        bail!("--open-body: no joint named for hips")
+    };
+    let skeleton = |names: &[&str], parents: &[Option<usize>], rest: Vec<Vec3>| -> Vec<Joint> {
+        let parts = names.iter().zip(parents).zip(rest);
+        parts.map(|((name, p), rest)| Joint { name: (*name).to_owned(), parent: p.map(|p| p as u16), rest }).collect()
+    };
+    let rest = model.shaped(&capture.mean_betas).joints;
+    let mut random = RandomStream::new(&[NOISE]);
+    let (mut poses, mut trans, mut seen, mut places) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
+    for frame in &capture.train {
+        let posed = model.pose(&model.shaped(&frame.betas), &frame.pose, frame.placement);
+        let root = if let Placement::Origin { rotation, .. } = frame.placement { rotation } else { frame.pose[0] };
+        poses.extend(std::iter::once(root).chain(frame.pose[1..].iter().copied()));
+        trans.push(posed.joints[0] - rest[0]);
+        let mut off = || noise * Vec3::from_array([(); 3].map(|()| random.normal()));
+        seen.extend(roles.iter().map(|(joint, _)| posed.joints[*joint] + off()));
+        places.push(posed.joints[hips]);
+    }
+    let anchors: Vec<Anchor> = roles.iter().map(|(_, role)| Anchor::joint(*role)).collect();
+    let fitted = point_fit::fit(&open, &anchors, &seen)?;
+    let shape = open.shaped(&fitted.betas).joints;
+    let motion = MotionClip { poses, num_joints: names.len(), trans, fps: 30.0 };
+    let source = Bvh { skeleton: skeleton(&names, &model.parents, rest), motion, unit: "m" };
+    let smpl: Vec<&str> = smpl.iter().map(String::as_str).collect();
+    let target = skeleton(&smpl, &open.parents, shape.clone());
+    let motion = source.onto(&target).map_err(|fault| anyhow!("--open-body: {fault}"))?;
+    let carried = motion.poses.chunks(smpl.len()).zip(places).map(|(pose, place)| (pose.to_vec(), place - shape[0]));
+    let carried: Vec<_> = if noise > 0.0 {
+        fitted.frames.into_iter().map(|frame| (frame.pose, frame.translation)).collect()
+    } else {
+        carried.collect()
+    };
+    for (frame, (pose, translation)) in capture.train.iter_mut().zip(carried) {
+        (frame.pose, frame.betas) = (pose, fitted.betas.clone());
+        frame.placement = Placement::Pelvis { translation };
+    }
+    capture.mean_betas = fitted.betas;
+    share_bodies(capture);
+    *model = open;
+    Ok(())
+}
+
+/// Gives views kept back the bodies of their instants.
+fn share_bodies(capture: &mut Capture) {
     for view in &mut capture.eval {
         if let Some(frame) = capture.train.get(view.train_index) {
             let Frame { pose, betas, placement, .. } = frame;
             (view.frame.pose, view.frame.betas, view.frame.placement) = (pose.clone(), betas.clone(), *placement);
         }
     }
-    *model = open;
-    Ok(())
 }
 
 /// Puts the simulated obstacle before the training camera of raw ZJU-MoCap, and returns it.
@@ -282,7 +342,7 @@ mod tests {
         for (noise, most) in [(0.0, 0.12), (1e-4, 0.05)] {
             let (mut capture, mut model) = (synth::demo(&demo, &body).unwrap(), body.clone());
             let before = joints(&capture, &model);
-            put_open_body(&mut capture, &mut model, noise).unwrap();
+            put_open_body(&mut capture, &mut model, noise, &[]).unwrap();
             for (before, after) in before.iter().zip(joints(&capture, &model)) {
                 let off: Vec<f32> = before.iter().zip(&after).map(|(a, b)| a.distance(*b)).collect();
                 let worst = off.iter().copied().fold(0.0, f32::max);

@@ -196,7 +196,8 @@ pub fn synth(arguments: &SynthArguments) -> Result<()> {
         FormatName::Ocmotion => Layout::Wild,
     };
     let synthetic = film(arguments.character.as_deref(), arguments.motion.as_deref(), &config)?;
-    let mark = serde_json::json!({ "config": synthetic.config, "hidden_fraction": synthetic.hidden_fraction });
+    let (hidden, joints) = (synthetic.hidden_fraction, &synthetic.joints);
+    let mark = serde_json::json!({ "config": synthetic.config, "hidden_fraction": hidden, "joints": joints });
     arguments.out.fill(MARK, &serde_json::to_string_pretty(&mark)?, |directory| {
         let bar = bar("writing", synthetic.num_pictures(layout));
         let written = synthetic.write(directory, layout, &|_| bar.inc(1));
@@ -216,6 +217,22 @@ pub fn synth(arguments: &SynthArguments) -> Result<()> {
     );
     say!("train on it: cargo xtask train {}", out.display());
     Ok(())
+}
+
+/// Names of the joints of a character's body in a capture that [`synth`] wrote; none for other captures.
+pub fn joint_names(capture: &Path) -> Result<Vec<String>> {
+    #[derive(Default, serde::Deserialize)]
+    #[serde(default)]
+    struct Mark {
+        joints: Vec<String>,
+    }
+    let path = capture.join(MARK);
+    if !path.is_file() {
+        return Ok(Vec::new());
+    }
+    let mark: Mark =
+        serde_json::from_str(&std::fs::read_to_string(&path)?).with_context(|| path.display().to_string())?;
+    Ok(mark.joints)
 }
 
 /// Films `character`, or the embedded person, with a bar.

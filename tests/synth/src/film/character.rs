@@ -44,14 +44,14 @@ struct Figure<'a> {
     unit: f32,
 }
 
-/// Films `character`; the body model comes with the video and the height that the cameras stand
-/// for.
+/// Films `character`; with the video come the height that the cameras stand for, the body model and the
+/// names of its joints.
 pub(super) fn film(
     character: &Character,
     motion: Option<&MotionClip>,
     config: &SynthConfig,
     progress: &Progress<'_>,
-) -> Result<(Capture, f32, BodyModel), CaptureError> {
+) -> Result<(Capture, f32, BodyModel, Vec<String>), CaptureError> {
     let figure = Figure::new(character)?;
     let mut stances = match motion {
         Some(clip) => figure.driven(clip, config.frames)?,
@@ -112,7 +112,8 @@ pub(super) fn film(
         let normals = figure.normals(&vertices);
         Posture::new(vertices, normals, &character.faces, &color, Lamp::new(config.lamp, config.seed))
     })?;
-    Ok((capture, height, figure.body))
+    let names = figure.joints.iter().map(|&old| character.joint_names[old].clone()).collect();
+    Ok((capture, height, figure.body, names))
 }
 
 fn fault(expected: impl Into<String>, actual: impl ToString) -> CaptureError {

@@ -30,6 +30,8 @@ pub struct Synthetic {
     pub capture: Capture,
     /// The body model that the capture's poses and betas are for.
     pub body: BodyModel,
+    /// Names of a character's joints, in the order of `body`; none for the embedded person.
+    pub joints: Vec<String>,
     /// The configuration it was made of.
     pub config: SynthConfig,
     /// Part of the subject's pixels that is hidden, over the frames in which anything is.
@@ -62,7 +64,7 @@ pub fn synthesise(
     progress: &(dyn Fn(usize) + Sync),
 ) -> Result<Synthetic, CaptureError> {
     config.check()?;
-    let (mut capture, height, body) = match character {
+    let (mut capture, height, body, joints) = match character {
         Some(character) => character::film(character, motion, config, progress)?,
         None => {
             let body = BodyModel::embedded();
@@ -75,7 +77,7 @@ pub fn synthesise(
                     film(&config.demo(), &body, perform, progress)?
                 }
             };
-            (capture, height, body)
+            (capture, height, body, Vec::new())
         }
     };
     let clear: Vec<PixelSource> = capture.train.iter().map(|frame| frame.source.clone()).collect();
@@ -90,7 +92,7 @@ pub fn synthesise(
         }
     }
     let hidden_fraction = hidden_fraction(&clear, &capture.train)?;
-    Ok(Synthetic { capture, body, config: *config, hidden_fraction, clear, hidden, objects })
+    Ok(Synthetic { capture, body, joints, config: *config, hidden_fraction, clear, hidden, objects })
 }
 
 /// Part of the subject's pixels that is gone, over the frames that lost any.
