@@ -43,8 +43,8 @@ pub struct Corruption {
     /// The simulated obstacle before the training camera of raw ZJU-MoCap. `None`: what
     /// `occlusion.json` says, or the default [`Obstacle`] where there is none.
     pub occlusion: Option<Obstacle>,
-    /// The open body in place of the capture's, which has SMPL's joints: at 0 in its mean shape, with the
-    /// capture's angles; else fitted to SAM 3D Body's key points of the capture's body, and to vertices if
+    /// The open body in place of the capture's, which has SMPL's joints or is a character's: at 0 in its mean
+    /// shape, with the capture's angles; else fitted to SAM 3D Body's key points of the capture's body, and to vertices if
     /// its mesh is the same, each coordinate with normal noise of this standard deviation, in millimetres.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub open_body: Option<f32>,
@@ -234,7 +234,8 @@ pub struct SceneArguments {
     #[serde(flatten)]
     obstacle: ObstacleArguments,
     /// Put the open body in place of the capture's: 0 with the capture's angles in its mean shape, else fitted
-    /// to SAM 3D Body's key points with noise of this standard deviation, in millimetres
+    /// to SAM 3D Body's key points (of a character, its joints) with noise of this standard deviation, in
+    /// millimetres
     #[arg(long, value_name = "MM")]
     open_body: Option<f32>,
     /// Make the prior and the masks as wrong as something makes them; the options below change
@@ -339,10 +340,12 @@ mod tests {
             let frames = capture.train.iter().chain(capture.eval.iter().map(|view| &view.frame));
             frames.map(|f| model.pose(&model.shaped(&f.betas), &f.pose, f.placement).joints).collect()
         };
-        for (noise, most) in [(0.0, 0.12), (1e-4, 0.05)] {
+        let names = BoneNames::Smpl.of_body(body.num_joints());
+        for (noise, most, names) in [(0.0, 0.12, &[][..]), (1e-4, 0.05, &[]), (0.0, 0.12, &names), (1e-4, 0.05, &names)]
+        {
             let (mut capture, mut model) = (synth::demo(&demo, &body).unwrap(), body.clone());
             let before = joints(&capture, &model);
-            put_open_body(&mut capture, &mut model, noise, &[]).unwrap();
+            put_open_body(&mut capture, &mut model, noise, names).unwrap();
             for (before, after) in before.iter().zip(joints(&capture, &model)) {
                 let off: Vec<f32> = before.iter().zip(&after).map(|(a, b)| a.distance(*b)).collect();
                 let worst = off.iter().copied().fold(0.0, f32::max);
