@@ -43,7 +43,7 @@ const ARMS: f32 = 0.04;
 /// `BELOW` the hips.
 const WIDER: f32 = 0.015;
 const LOOSE: f32 = 0.04;
-const BELOW: f32 = 0.18;
+const BELOW: f32 = 0.22;
 /// Largest ratio of a radius to the median of its ring.
 const OVAL: f32 = 1.15;
 
