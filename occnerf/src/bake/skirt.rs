@@ -1,9 +1,9 @@
 //! Skirts: a closed surface around both thighs, added to a body where masks reach beyond it.
 //!
-//! Points have cylindrical coordinates about an axis between the legs at rest and belong to pelvis and
-//! thighs by height and side. The frames' masks carve the region (visual hull, Laurentini 1994), and so
-//! do the silhouettes of the dressed prior; the skirt is where the first hull is wider than the second.
-//! Poses, displacement and texture treat the extended body like any other.
+//! Points have cylindrical coordinates about an axis between the legs at rest and belong to pelvis
+//! and thighs by height and side. The frames' masks carve the region (visual hull, Laurentini 1994),
+//! and so do the silhouettes of the dressed prior; the skirt is where the first hull is wider than
+//! the second. Poses, displacement and texture treat the extended body like any other.
 
 use std::f32::consts::TAU;
 
@@ -39,11 +39,13 @@ const CARVED: f32 = 0.35;
 /// Distance of certain background from unknown pixels, and of anything certain from the arms.
 const UNSURE: f32 = 0.25;
 const ARMS: f32 = 0.04;
-/// Least difference of the median radii of a skirt's ring and the prior's, and of those at the distance
-/// `BELOW` the hips.
+/// Least difference of the median radii of a skirt's ring and the prior's, and of those at the
+/// distance `BELOW` the hips.
 const WIDER: f32 = 0.015;
-const LOOSE: f32 = 0.04;
-const BELOW: f32 = 0.22;
+const LOOSE: f32 = 0.035;
+const BELOW: f32 = 0.18;
+/// Least ratio of a ring's median radius to that of the ring above; below the hem are legs.
+const TAPER: f32 = 0.8;
 /// Largest ratio of a radius to the median of its ring.
 const OVAL: f32 = 1.15;
 
@@ -66,17 +68,21 @@ pub fn skirted(scene: &Scene) -> Result<Option<BodyModel>, Error> {
         }
     }
     let [mask, prior] = sums.map(|sums| hull(&sums));
-    let wider = |ring: usize| {
-        let [mask, prior] = [&mask, &prior].map(|radii| radii.get(ring * ANGLES..(ring + 1) * ANGLES).map(median));
-        Some(mask? - prior?)
+    let middle = |radii: &[f32], ring: usize| radii.get(ring * ANGLES..(ring + 1) * ANGLES).map(median);
+    let wider = |ring: usize, least: f32| {
+        let middles = (middle(&mask, ring), middle(&prior, ring));
+        matches!(middles, (Some(mask), Some(prior)) if mask >= prior + least)
     };
-    let (below, wide) =
-        (((tube.axis.y - tube.hip + BELOW) / RING) as usize, |ring: &usize| wider(*ring) >= Some(WIDER));
-    if wider(below).is_none_or(|wider| wider < LOOSE) {
+    let below = ((tube.axis.y - tube.hip + BELOW) / RING) as usize;
+    if !wider(below, LOOSE) {
         return Ok(None);
     }
-    let first = (0..=below).rev().take_while(wide).last().unwrap_or(below);
-    let hem = (below..).take_while(wide).last().unwrap_or(below);
+    let first = (0..=below).rev().take_while(|&ring| wider(ring, WIDER)).last().unwrap_or(below);
+    let goes_on = |&ring: &usize| {
+        let above = middle(&mask, ring.saturating_sub(1));
+        wider(ring, WIDER) && middle(&mask, ring) >= above.map(|above| TAPER * above)
+    };
+    let hem = (below..).take_while(goes_on).last().unwrap_or(below);
     // The uppermost ring is inside the body.
     let first = first.saturating_sub(1);
     let oval = |ring: &[f32]| {
@@ -93,8 +99,8 @@ fn median(values: &[f32]) -> f32 {
     sorted[sorted.len() / 2]
 }
 
-/// Radius of the hull in each direction, (rings, angles), by sums of votes for background and for the
-/// inside, (rings, angles, radii).
+/// Radius of the hull in each direction, (rings, angles), by sums of votes for background and for
+/// the inside, (rings, angles, radii).
 fn hull(sums: &[[f32; 2]]) -> Vec<f32> {
     let inside = |[out, inside]: &&[f32; 2]| inside + out > 0.0 && *out <= CARVED * (out + inside);
     sums.chunks(RADII).map(|along| along.iter().take_while(inside).count() as f32 * STEP).collect()
