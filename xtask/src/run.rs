@@ -195,6 +195,9 @@ impl Metrics {
 /// What `--method auto` found that a scene needs, and why.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct Verdict {
+    /// Whether the body has a skirt.
+    #[serde(default)]
+    pub skirt: bool,
     /// Whether a field is trained.
     pub field: bool,
     /// A row a part of the body, the first a header.

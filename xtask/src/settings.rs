@@ -13,7 +13,8 @@ pub const HOLD_OUT: usize = 10;
 /// A method, or the choice of one by the scene.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum MethodChoice {
-    /// [`Method::Surface`], or [`Method::Occnerf`] where a field gains on frames held out.
+    /// [`Method::Surface`], or [`Method::Occnerf`] where a field gains on frames held out, and a skirt
+    /// where one does.
     Auto,
     /// This one.
     Named(Method),
@@ -33,7 +34,7 @@ const METHODS: &[(MethodChoice, &str)] = &[
     (MethodChoice::Named(Method::Surface), "The prior's surface, displaced, with a texture: no field, no steps"),
     (MethodChoice::Named(Method::HashPoint), "Point-based, hash encoding"),
     (MethodChoice::Named(Method::Occnerf), "Point term, and in `paper` the attended surface term"),
-    (MethodChoice::Auto, "The surface, or occnerf where a field gains on frames held out from both"),
+    (MethodChoice::Auto, "The surface, with a skirt or occnerf's field where they gain on frames held out"),
 ];
 const PRESETS: &[(Preset, &str)] = &[
     (Preset::Fast, "A first look: the surface alone, in seconds; fields for half the default's time"),

@@ -57,8 +57,18 @@ impl Source {
         Ok(hex(hash))
     }
 
-    /// Takes the registered bodies of the run in `directory`, if it kept them.
+    /// The same capture with another body.
+    pub fn with_body(&self, model: BodyModel) -> Self {
+        let (scene, body, load) = (self.scene.clone(), self.body.clone(), self.load.clone());
+        Self { scene, body, load, capture: self.capture.clone(), model, registered: RefCell::default() }
+    }
+
+    /// Takes the body and the registered poses of the run in `directory`, if it kept them.
     pub fn restore(&mut self, directory: &Path, config: &Config) -> Result<()> {
+        let body = directory.join("body.safetensors");
+        if body.is_file() {
+            self.model = BodyModel::load(&body)?;
+        }
         let mended = match config.registration.rounds {
             0 => Mended::from(self.capture.clone()),
             _ => mend_masks(self.capture.clone(), &self.model)?,

@@ -121,13 +121,13 @@ fn begun(arguments: &TrainArguments, name: &str) -> Result<Begun> {
     if let Some((option, _)) = unused.iter().find(|(_, given)| *given && !config.method.has_field()) {
         bail!("{option}: the method {} takes no steps", config.method.name());
     }
-    let source = source::load(arguments.scene.as_deref(), arguments.body.as_deref(), &arguments.load.options()?)?;
+    let mut source = source::load(arguments.scene.as_deref(), arguments.body.as_deref(), &arguments.load.options()?)?;
     let is_given = arguments.settings.set.iter().any(|set| set.starts_with("held_out="));
     if source.capture.eval.is_empty() && source.capture.train.len() >= 2 * HOLD_OUT && !is_given {
         config.held_out = HOLD_OUT;
         say!("no other camera: every {HOLD_OUT}th frame is scored, and nothing is learnt from it (--set held_out=0)");
     }
-    let verdict = if arguments.settings.is_auto() { Some(auto::weigh(&source, &config)?) } else { None };
+    let verdict = if arguments.settings.is_auto() { Some(auto::weigh(&mut source, &config)?) } else { None };
     if verdict.as_ref().is_some_and(|verdict| !verdict.field) {
         config = Config { held_out: config.held_out, ..arguments.settings.without_field()? };
     }

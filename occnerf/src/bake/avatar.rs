@@ -95,7 +95,7 @@ impl Avatar {
     /// Colour values of the texels that triangles cover, and a height of each vertex.
     #[must_use]
     pub fn num_parameters(&self) -> usize {
-        let corner = |v: u32| self.uvs[v as usize] * Vec2::new(self.atlas.width as f32, self.atlas.height as f32);
+        let corner = |v: u32| self.uvs[v as usize] * self.atlas.size();
         let area = |face: &[u32; 3]| {
             let [a, b, c] = face.map(corner);
             f64::from((b - a).perp_dot(c - a).abs()) / 2.0
@@ -232,6 +232,11 @@ impl Avatar {
 }
 
 impl Atlas {
+    /// Width and height.
+    pub(super) fn size(&self) -> Vec2 {
+        Vec2::new(self.width as f32, self.height as f32)
+    }
+
     /// Halves the sides, by means of four texels, until none is longer than `longest`.
     pub fn shrink(&mut self, longest: u32) {
         while self.width.max(self.height) > longest.max(1) {

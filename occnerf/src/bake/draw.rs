@@ -27,8 +27,8 @@ pub struct BakedRenderer<'a> {
     texels: Vec<Vec3A>,
     features: Vec<f32>,
     skinned: Vec<Vec3>,
-    /// Shading of each vertex, (V).
-    shades: Vec<f32>,
+    /// Place in the atlas, texels, and shading of each vertex, (V).
+    looks: Vec<Vec3A>,
     rasterizer: Rasterizer,
     pixels: Vec<Vec4>,
 }
@@ -47,26 +47,25 @@ impl<'a> BakedRenderer<'a> {
             texels: avatar.atlas.rgb.as_chunks().0.iter().map(|rgb| color(*rgb).into()).collect(),
             features: Vec::new(),
             skinned: Vec::new(),
-            shades: Vec::new(),
+            looks: avatar.uvs.iter().map(|uv| (uv * avatar.atlas.size()).extend(1.0).into()).collect(),
             rasterizer: Rasterizer::default(),
             pixels: Vec::new(),
         }
     }
 
-    /// World positions of the vertices, (V), and their shading, (V): pose blend shapes, then linear
-    /// blend skinning by `bones` (J), canonical to world.
+    /// World positions of the vertices, (V), and, as z after their places in the atlas in texels, their
+    /// shading, (V): pose blend shapes, then linear blend skinning by `bones` (J), canonical to world.
     ///
     /// # Panics
     /// Unless there are J bones.
-    pub fn skin(&mut self, bones: &[Affine3A]) -> (&[Vec3], &[f32]) {
-        let Self { avatar, vertices, scale, features, skinned, shades, light, .. } = self;
+    pub fn skin(&mut self, bones: &[Affine3A]) -> (&[Vec3], &[Vec3A]) {
+        let Self { avatar, vertices, scale, features, skinned, looks, light, .. } = self;
         assert_eq!(bones.len(), avatar.num_joints(), "skin: bones");
         blend_shape_features(avatar, bones, *scale, features);
         skinned.resize(vertices.len(), Vec3::ZERO);
-        shades.resize(vertices.len(), 1.0);
-        let rows = skinned.par_chunks_mut(CHUNK).zip(shades.par_chunks_mut(CHUNK)).enumerate();
-        rows.for_each(|(chunk, (out, shades))| {
-            for (v, (out, shade)) in (chunk * CHUNK..).zip(out.iter_mut().zip(shades)) {
+        let rows = skinned.par_chunks_mut(CHUNK).zip(looks.par_chunks_mut(CHUNK)).enumerate();
+        rows.for_each(|(chunk, (out, looks))| {
+            for (v, (out, look)) in (chunk * CHUNK..).zip(out.iter_mut().zip(looks)) {
                 let bone = blend(bones, avatar.joints[v], avatar.weights[v]);
                 let mut rest = Vec3A::from(vertices[v]);
                 for (term, direction) in avatar.posedirs.row(v) {
@@ -75,10 +74,10 @@ impl<'a> BakedRenderer<'a> {
                 *out = Vec3::from(bone.matrix3 * rest + bone.translation);
                 // Rotated with the bones: equal on both sides of a seam.
                 let normal = avatar.normals[v];
-                *shade = light.on(Vec3::from(bone.matrix3 * Vec3A::from(normal)).normalize_or(normal));
+                look.z = light.on(Vec3::from(bone.matrix3 * Vec3A::from(normal)).normalize_or(normal));
             }
         });
-        (skinned, shades)
+        (skinned, looks)
     }
 
     /// The person in the pose of `bones` (J) as `camera` sees them: premultiplied colour and
@@ -93,11 +92,12 @@ impl<'a> BakedRenderer<'a> {
             return Err(Error::Scene(format!("the avatar has {expected} joints, the body {found}")));
         }
         self.skin(bones);
-        let Self { avatar, texels, skinned, shades, rasterizer, scale, samples, pixels, .. } = self;
+        let Self { avatar, texels, skinned, looks, rasterizer, scale, samples, pixels, .. } = self;
         let options = RasterOptions { samples: *samples, cull_back: true, near: 1e-3 * *scale };
         let colour = |fragment: &Fragment| {
-            let albedo = bilinear(&avatar.atlas, atlas_place(avatar, fragment), |i| texels[i]);
-            Vec3::from((shade(avatar, shades, fragment) * albedo).min(Vec3A::ONE)).extend(1.0)
+            let look = look(avatar, looks, fragment);
+            let albedo = bilinear(&avatar.atlas, look.truncate(), |i| texels[i]);
+            Vec3::from((look.z * albedo).min(Vec3A::ONE)).extend(1.0)
         };
         let shade = |pixel: Pixel<'_>| {
             let count = pixel.samples.len();
@@ -128,21 +128,12 @@ pub(super) fn color(rgb: [u8; 3]) -> Vec3 {
     Vec3::from(rgb.map(|byte| f32::from(byte) / 255.0))
 }
 
-/// Interpolated shading of a fragment.
+/// Place in the atlas, texels, and, as z, shading of a fragment, from those of the vertices, (V).
 #[inline]
-pub(super) fn shade(avatar: &Avatar, shades: &[f32], fragment: &Fragment) -> f32 {
-    between(avatar, fragment, |v| shades[v])
-}
-
-/// Barycentric interpolation at a fragment.
-#[inline]
-fn between<T>(avatar: &Avatar, fragment: &Fragment, of: impl Fn(usize) -> T) -> T
-where
-    T: std::iter::Sum<T>,
-    f32: std::ops::Mul<T, Output = T>,
-{
-    let corners = avatar.faces[fragment.face as usize];
-    corners.iter().zip(fragment.barycentric).map(|(&v, b)| b * of(v as usize)).sum()
+pub(super) fn look(avatar: &Avatar, looks: &[Vec3A], fragment: &Fragment) -> Vec3A {
+    let [a, b, c] = avatar.faces[fragment.face as usize].map(|v| looks[v as usize]);
+    let [p, q, r] = fragment.barycentric;
+    p * a + q * b + r * c
 }
 
 /// R − I of each joint but the root relative to its parent, in units of `scale`.
@@ -156,19 +147,13 @@ fn blend_shape_features(avatar: &Avatar, bones: &[Affine3A], scale: f32, out: &m
     }
 }
 
-/// Bilinear lookup at atlas coordinates `place`, 0 to 1, in texels that are given by their index.
+/// Bilinear lookup at a `place` of the atlas, texels, in texels that are given by their index.
 #[inline]
 pub(super) fn bilinear(atlas: &Atlas, place: Vec2, texel: impl Fn(usize) -> Vec3A) -> Vec3A {
     let corner = BilinearCorner::new(place, atlas);
     let [a, b, c, d] = corner.texels(atlas).map(texel);
     let (top, bottom) = (a + (b - a) * corner.share.x, c + (d - c) * corner.share.x);
     top + (bottom - top) * corner.share.y
-}
-
-/// Atlas coordinates of a fragment, 0 to 1.
-#[inline]
-pub(super) fn atlas_place(avatar: &Avatar, fragment: &Fragment) -> Vec2 {
-    between(avatar, fragment, |v| avatar.uvs[v])
 }
 
 /// The first of the four texels of a bilinear lookup, and the fractional offset.
@@ -179,14 +164,16 @@ pub(super) struct BilinearCorner {
 }
 
 impl BilinearCorner {
-    /// At atlas coordinates `place`, 0 to 1.
+    /// At a `place` of the atlas, texels.
     #[inline]
     pub fn new(place: Vec2, atlas: &Atlas) -> Self {
-        let size = Vec2::new(atlas.width as f32, atlas.height as f32);
+        let size = atlas.size();
         // Clamped to the edge.
-        let at = (place * size - 0.5).clamp(Vec2::ZERO, (size - 1.0).max(Vec2::ZERO));
-        let corner = at.floor().min((size - 2.0).max(Vec2::ZERO));
-        Self { x: corner.x as usize, y: corner.y as usize, share: at - corner }
+        let at = (place - 0.5).clamp(Vec2::ZERO, (size - 1.0).max(Vec2::ZERO));
+        let last = (size - 2.0).max(Vec2::ZERO);
+        // Truncation is the floor of what is not negative.
+        let (x, y) = (at.x.min(last.x) as u32, at.y.min(last.y) as u32);
+        Self { x: x as usize, y: y as usize, share: at - Vec2::new(x as f32, y as f32) }
     }
 
     /// Indices row by row; the only row or column of a thin atlas occurs twice.

@@ -28,6 +28,9 @@ use crate::scene::prepared::Scene;
 /// Target edge length of the surface, pixels of the training frames, and most subdivisions.
 const EDGE: f32 = 1.5;
 const MOST: u32 = 2;
+/// Width of a pixel for which a fitted surface is subdivided, at least, normalised metres: that of the
+/// crops which show its outline.
+const FINEST: f32 = 0.007;
 /// Texels across a pixel of the training frames.
 const TEXELS_A_PIXEL: f32 = 2.0;
 /// Share of the training frames with a point visible for full confidence.
@@ -99,7 +102,7 @@ pub fn fit(scene: &Scene) -> Result<(Avatar, BakeReport), Error> {
     let pixel = checked_pixel(&scene.body, &frames)?;
     let colors = scene.colors()?;
     let (prior, faces) = (&scene.body.canonical.vertices, &scene.body.model.faces);
-    let relief = Relief::new(prior, faces, pixel);
+    let relief = Relief::new(prior, faces, pixel.max(FINEST));
     let clothes = |anchor: &Anchor| -> f32 {
         anchor.terms().map(|(v, w)| w * scene.clothes.get(v as usize).copied().unwrap_or_default()).sum()
     };

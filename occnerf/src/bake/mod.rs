@@ -13,6 +13,7 @@ mod refine;
 mod saved;
 mod simplify;
 mod skeleton;
+mod skirt;
 mod surface;
 #[cfg(test)]
 mod tests;
@@ -26,6 +27,7 @@ pub use avatar::{Atlas, Avatar, Clip, MAX_ATLAS_SIDE, MAX_JOINTS};
 pub use draw::BakedRenderer;
 pub use make::{BakeReport, bake, fit};
 pub use skeleton::{motion_of_bones, skeleton, turn_upright};
+pub use skirt::skirted;
 pub use smpl::Joint;
 
 /// Replaces a file atomically.

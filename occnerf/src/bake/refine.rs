@@ -1,10 +1,10 @@
 //! Texture optimisation: the atlas fitted to the training frames through the rasteriser.
 
-use glam::{Vec2, Vec3};
+use glam::{UVec2, Vec2, Vec3};
 use visibility::{Pixel, RasterOptions, Rasterizer, Samples};
 
 use super::avatar::{Atlas, Avatar};
-use super::draw::{BakedRenderer, BilinearCorner, atlas_place, color, shade};
+use super::draw::{BakedRenderer, BilinearCorner, color, look};
 use crate::Error;
 use crate::capture::Light;
 use crate::model::view::pinhole;
@@ -112,11 +112,25 @@ fn equations(
     stride: usize,
 ) -> Result<Vec<PixelEquation>, Error> {
     let pixels = frame.pixels()?;
-    let (vertices, shades) = renderer.skin(&frame.view.posed.bones);
+    let across = frame.view.camera.width as usize;
+    let subject = frame.labels.iter().enumerate().filter(|(_, label)| *label == Label::Subject);
+    let (low, high) = subject.fold((UVec2::MAX, UVec2::ZERO), |(low, high), (i, _)| {
+        let at = UVec2::new((i % across) as u32, (i / across) as u32);
+        (low.min(at), high.max(at + 1))
+    });
+    if low.x >= high.x {
+        return Ok(Vec::new());
+    }
+    // The box of the subject's pixels.
+    let mut view = pinhole(&frame.view.camera);
+    view.centre -= low.as_vec2();
+    (view.width, view.height) = (high - low).into();
+    let (vertices, looks) = renderer.skin(&frame.view.posed.bones);
     // Supersampled as by default, so that the texture compensates the pixel footprint.
     let options = RasterOptions { samples: Samples::Four, cull_back: true, near: 1e-3 };
     let equation = |pixel: Pixel<'_>| {
-        let i = pixel.index;
+        let (x, y) = (pixel.index % view.width as usize, pixel.index / view.width as usize);
+        let i = (y + low.y as usize) * across + x + low.x as usize;
         // Edge pixels are mixed with the background.
         let wanted = i.is_multiple_of(stride) && frame.labels.at(i as u32) == Label::Subject && pixels.mask[i] >= 0.99;
         let count = pixel.samples.len();
@@ -125,18 +139,18 @@ fn equations(
         }
         let fragments = || pixel.samples.iter().flatten();
         let share = 1.0 / count as f32;
-        let brightness: f32 = fragments().map(|fragment| share * shade(avatar, shades, fragment)).sum();
-        let lookups = fragments().map(|fragment| lookup(avatar, atlas_place(avatar, fragment), share));
+        let brightness: f32 = fragments().map(|fragment| share * look(avatar, looks, fragment).z).sum();
+        let lookups = fragments().map(|fragment| lookup(avatar, look(avatar, looks, fragment).truncate(), share));
         let colour = Vec3::from_slice(&pixels.image.pixels[3 * i..]) / brightness;
         Some(PixelEquation { colour, lookups: lookups.collect() })
     };
     let mut out: Vec<Option<PixelEquation>> = Vec::new();
-    out.resize_with(pixels.mask.len(), || None);
-    Rasterizer::default().draw(vertices, &avatar.faces, &pinhole(&frame.view.camera), &options, &mut out, equation)?;
+    out.resize_with(view.width as usize * view.height as usize, || None);
+    Rasterizer::default().draw(vertices, &avatar.faces, &view, &options, &mut out, equation)?;
     Ok(out.into_iter().flatten().collect())
 }
 
-/// The lookup at a `place` of the atlas, with weights that sum to `share`.
+/// The lookup at a `place` of the atlas, texels, with weights that sum to `share`.
 fn lookup(avatar: &Avatar, place: Vec2, share: f32) -> Lookup {
     let corner = BilinearCorner::new(place, &avatar.atlas);
     let Vec2 { x, y } = corner.share;

@@ -7,14 +7,14 @@ use super::charts::{AtlasLayout, PADDING};
 use super::draw::BakedRenderer;
 use super::make::{bake, fit, surface};
 use super::surface::{CanonicalField, Place};
-use super::{Avatar, BakeReport, skeleton};
+use super::{Avatar, BakeReport, skeleton, skirted};
 use crate::capture::{Capture, Light};
 use crate::config::{Config, Method, Preset};
 use crate::render::field::FieldRenderer;
 use crate::render::picture::Renderer;
 use crate::scene::prepared::{PreparedFrame, Scene};
 use crate::train::trainer::Trainer;
-use synth::{DemoConfig, demo};
+use synth::{DemoConfig, Outfit, demo};
 
 /// Height of the known field over the prior.
 const HEIGHT: f32 = 0.0123;
@@ -330,4 +330,33 @@ fn a_fitted_surface_covers_unseen_views_better_than_the_prior_alike_on_any_numbe
         frame.source = pixels.into();
     }
     fit(&scene(&capture)).unwrap().0.validate().unwrap();
+}
+
+#[test]
+fn a_skirt_is_added_where_masks_show_one_and_follows_the_joints_of_other_shapes() {
+    let (body, config) = (smpl::BodyModel::embedded(), Config::preset(Preset::Fast, Method::Surface));
+    let capture = |outfit| {
+        let demo_config = DemoConfig { size: 96, frames: 40, eval_cameras: 1, outfit, ..DemoConfig::default() };
+        demo(&demo_config, &body).unwrap()
+    };
+    let plain = Scene::new(&capture(Outfit::Plain), &body, &config).unwrap();
+    let found = skirted(&plain).unwrap();
+    assert!(found.is_none(), "{:?}", found.map(|model| model.v_template[body.num_vertices()..].to_vec()));
+    let capture = capture(Outfit::Skirt);
+    let scene = Scene::new(&capture, &body, &config).unwrap();
+    let model = skirted(&scene).unwrap().unwrap();
+    model.validate("skirt").unwrap();
+    let mesh = testkit::TriMesh { vertices: model.v_template.clone(), faces: model.faces.clone() };
+    assert!(mesh.is_closed());
+    let wider = Scene::new(&capture, &model, &config).unwrap();
+    let [before, after] = [&scene, &wider].map(|scene| scene.covered().unwrap());
+    assert!(after > 0.95 && before < 0.9, "{before} {after}");
+    let offsets = |betas: &[f32]| -> Vec<Vec3> {
+        let shaped = model.shaped(betas);
+        let centre = |v: usize| model.weights.row(v).map(|(joint, w)| w * shaped.joints[joint]).sum::<Vec3>();
+        (body.num_vertices()..model.num_vertices()).map(|v| shaped.vertices[v] - centre(v)).collect()
+    };
+    for (a, b) in offsets(&[]).into_iter().zip(offsets(&[2.0, -1.0, 0.5])) {
+        assert!(a.distance(b) < 1e-4, "{a} {b}");
+    }
 }

@@ -140,13 +140,43 @@ pub fn label_pixels(
 
 /// Pixels no farther than `radius` pixels from a set one.
 pub(crate) fn dilate(set: &[bool], width: usize, radius: f32) -> Vec<bool> {
-    squared_distance(set, width).iter().map(|&d| d <= radius * radius).collect()
+    around(set, width, radius, |set, width| {
+        squared_distance(set, width).iter().map(|&d| d <= radius * radius).collect()
+    })
 }
 
 /// Erosion; pixels beyond the image count as set.
 fn erode(set: &[bool], width: usize, radius: f32) -> Vec<bool> {
-    let unset: Vec<bool> = set.iter().map(|s| !s).collect();
-    squared_distance(&unset, width).iter().map(|&d| d > radius * radius).collect()
+    around(set, width, 1.0, |set, width| {
+        let unset: Vec<bool> = set.iter().map(|s| !s).collect();
+        squared_distance(&unset, width).iter().map(|&d| d > radius * radius).collect()
+    })
+}
+
+/// The result of `filter` on the rows and columns within `margin` pixels of the set ones, and the default
+/// elsewhere.
+pub(crate) fn around<T: Copy + Default>(
+    set: &[bool],
+    width: usize,
+    margin: f32,
+    filter: impl Fn(&[bool], usize) -> Vec<T>,
+) -> Vec<T> {
+    let mut found = vec![T::default(); set.len()];
+    let rows = || set.chunks(width.max(1));
+    let is_set = |row: &[bool]| row.contains(&true);
+    let (Some(top), Some(bottom)) = (rows().position(is_set), rows().rposition(is_set)) else { return found };
+    let left = rows().filter_map(|row| row.iter().position(|&s| s)).min().unwrap_or(0);
+    let right = rows().filter_map(|row| row.iter().rposition(|&s| s)).max().unwrap_or(0);
+    let margin = margin.ceil() as usize;
+    let columns = left.saturating_sub(margin)..(right + margin + 1).min(width);
+    let (first, last) = (top.saturating_sub(margin), bottom + margin);
+    let inside: Vec<bool> =
+        rows().skip(first).take(last + 1 - first).flat_map(|row| &row[columns.clone()]).copied().collect();
+    let filtered = filter(&inside, columns.len());
+    for (row, of) in found.chunks_mut(width).skip(first).zip(filtered.chunks(columns.len())) {
+        row[columns.clone()].copy_from_slice(of);
+    }
+    found
 }
 
 /// Squared distance in pixels to the nearest set pixel, infinite where there is none (Felzenszwalb
@@ -219,6 +249,22 @@ mod tests {
                     x * x + y * y
                 }).fold(f32::INFINITY, f32::min);
                 prop_assert_eq!(d, brute);
+            }
+        }
+
+        #[test]
+        fn filters_equal_brute_force(
+            width in 1usize..12, height in 1usize..12, bits in prop::collection::vec(prop::bool::weighted(0.1), 144),
+            radius in 0.0f32..4.0, most in prop::bool::ANY,
+        ) {
+            let set: Vec<bool> = bits[..width * height].iter().map(|bit| bit ^ most).collect();
+            let near = |i: usize, wanted: bool| (0..set.len()).any(|j| {
+                let (x, y) = ((i % width) as f32 - (j % width) as f32, (i / width) as f32 - (j / width) as f32);
+                set[j] == wanted && x * x + y * y <= radius * radius
+            });
+            let [dilated, eroded] = [dilate(&set, width, radius), erode(&set, width, radius)];
+            for i in 0..set.len() {
+                prop_assert_eq!((dilated[i], eroded[i]), (near(i, true), !near(i, false)));
             }
         }
 

@@ -10,7 +10,7 @@ use crate::Error;
 use crate::capture::{Light, Pixels};
 use crate::model::subdivide::Anchor;
 use crate::model::view::{PosedView, pinhole};
-use crate::scene::labels::squared_distance;
+use crate::scene::labels::{around, squared_distance};
 use crate::scene::light::{ColorObservation, albedo};
 
 /// Depth inside a mask of reliable pixels.
@@ -46,8 +46,9 @@ pub(crate) fn seen(
     let usable: Vec<bool> = pixels.mask.iter().map(|&m| m > 0.5).collect();
     let points: Vec<Vec3> = anchors.iter().map(|anchor| anchor.mix(&posed)).collect();
     let visible = visibility::visible_vertices(&mesh, &points, &pinhole(camera), Some(&usable));
-    let unusable: Vec<bool> = usable.iter().map(|usable| !usable).collect();
-    let depth = squared_distance(&unusable, camera.width as usize);
+    let depth = around(&usable, camera.width as usize, 1.0, |usable, width| {
+        squared_distance(&usable.iter().map(|usable| !usable).collect::<Vec<_>>(), width)
+    });
     let color = |v: usize| {
         let at = visible[v].then(|| camera.project(points[v])).flatten()?;
         let pixel = at.y as usize * camera.width as usize + at.x as usize;

@@ -25,8 +25,8 @@ pub(super) struct Band<'a> {
     pub chunks: &'a [Chunk],
 }
 
-/// The samples of a band.
-#[derive(Default)]
+/// The samples of a band; what lies outside of its columns is left over from other bands.
+#[derive(Debug, Default)]
 pub(super) struct Strip {
     /// Reciprocal of the depth, 0 for nothing.
     inverse: Vec<f32>,
@@ -45,12 +45,13 @@ impl Band<'_> {
         let first = band * BAND / side * width;
         let mut samples = vec![None; side * side];
         for (row, out) in out.chunks_mut(width).enumerate() {
+            let faces = |y: usize| &strip.face[(row * side + y) * strip.stride..][..self.projection.width];
             for (column, out) in out.iter_mut().enumerate() {
-                let mut any = false;
-                if columns.contains(&column) {
+                let covered = |y: usize| faces(y)[column * side..][..side].iter().any(|&face| face != NONE);
+                let any = columns.contains(&column) && (0..side).any(covered);
+                if any {
                     for (i, sample) in samples.iter_mut().enumerate() {
                         *sample = self.resolve(strip, [column * side + i % side, row * side + i / side], band);
-                        any |= sample.is_some();
                     }
                 }
                 let samples = if any { &samples[..] } else { &[] };
@@ -62,18 +63,30 @@ impl Band<'_> {
     /// Depth-tests all triangles.
     fn fill(&self, band: usize, strip: &mut Strip) {
         strip.stride = self.projection.width.next_multiple_of(LANES) + LANES;
+        let bins = || self.chunks.iter().map(|chunk| (chunk, &chunk.bins[band])).filter(|(_, bin)| !bin.is_empty());
         strip.columns = [usize::MAX, 0];
-        strip.inverse.clear();
+        for (chunk, bin) in bins() {
+            for &index in bin {
+                let [low, high] = chunk.triangles[index as usize].columns;
+                strip.columns = [strip.columns[0].min(low as usize), strip.columns[1].max(high as usize + 1)];
+            }
+        }
         strip.inverse.resize(strip.stride * BAND, 0.0);
-        strip.face.clear();
         strip.face.resize(strip.stride * BAND, NONE);
+        let [low, high] = [strip.columns[0] / self.projection.side * self.projection.side, strip.columns[1]];
+        for start in (0..BAND).map(|row| row * strip.stride).filter(|_| low < high) {
+            // Lanes beyond the last column are tested too.
+            strip.inverse[start + low..start + high + LANES].fill(0.0);
+            strip.face[start + low..start + high + LANES].fill(NONE);
+        }
         let first_row = (band * BAND) as i32;
-        for chunk in self.chunks.iter().filter(|chunk| !chunk.bins[band].is_empty()) {
-            arch().dispatch(Fill { strip: &mut *strip, first_row, chunk, bin: &chunk.bins[band] });
+        for (chunk, bin) in bins() {
+            arch().dispatch(Fill { strip: &mut *strip, first_row, chunk, bin });
         }
     }
 
     /// The fragment of a sample.
+    #[inline]
     fn resolve(&self, strip: &Strip, [x, y]: [usize; 2], band: usize) -> Option<Fragment> {
         let face = strip.face[y * strip.stride + x];
         let centre = Vec3::new(x as f32 + 0.5, (band * BAND + y) as f32 + 0.5, 0.0);
@@ -139,9 +152,6 @@ impl pulp::WithSimd for Fill<'_> {
     fn with_simd<S: pulp::Simd>(self, _: S) {
         for &index in self.bin {
             let triangle = &self.chunk.triangles[index as usize];
-            let [low, high] = &mut self.strip.columns;
-            *low = (*low).min(triangle.columns[0] as usize);
-            *high = (*high).max(triangle.columns[1] as usize + 1);
             for start in (triangle.columns[0]..=triangle.columns[1]).step_by(BLOCK as usize) {
                 self.strip.fill(triangle, start, self.first_row);
             }

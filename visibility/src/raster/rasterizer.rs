@@ -1,9 +1,11 @@
 //! The stages of the rasteriser: projection, set-up, bands.
 
+use std::sync::{Mutex, PoisonError};
+
 use glam::Vec3;
 use rayon::prelude::*;
 
-use super::band::Band;
+use super::band::{Band, Strip};
 use super::project::{Projected, Projection};
 use super::triangle::{BAND, CHUNK, Chunk};
 use super::{Fragment, Pixel, RasterOptions, Samples};
@@ -35,6 +37,8 @@ const MOST_SAMPLES: u32 = 1 << 14;
 pub struct Rasterizer {
     projected: Vec<Projected>,
     chunks: Vec<Chunk>,
+    /// Of the threads.
+    strips: Mutex<Vec<Strip>>,
 }
 
 impl Rasterizer {
@@ -85,10 +89,12 @@ impl Rasterizer {
         self.set_up(vertices, faces, &projection, bands)?;
         let drawing =
             Band { projection: &projection, projected: &self.projected, vertices, faces, chunks: &self.chunks };
-        out.par_chunks_mut(width * BAND / side as usize)
-            .enumerate()
-            .with_max_len(1)
-            .for_each_init(Default::default, |strip, (band, out)| drawing.draw(band, strip, out, &shade));
+        let strips = || self.strips.lock().unwrap_or_else(PoisonError::into_inner);
+        out.par_chunks_mut(width * BAND / side as usize).enumerate().with_max_len(1).for_each(|(band, out)| {
+            let mut strip = strips().pop().unwrap_or_default();
+            drawing.draw(band, &mut strip, out, &shade);
+            strips().push(strip);
+        });
         Ok(())
     }
 

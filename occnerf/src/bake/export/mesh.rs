@@ -56,6 +56,6 @@ impl Atlas {
     /// Bilinear lookup, sRGB in [0, 1].
     pub(super) fn color(&self, uv: Vec2) -> Vec3 {
         let texels = self.rgb.as_chunks().0;
-        bilinear(self, uv, |i| color(texels[i]).into()).into()
+        bilinear(self, uv * self.size(), |i| color(texels[i]).into()).into()
     }
 }
