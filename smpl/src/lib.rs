@@ -24,6 +24,7 @@
 mod clip;
 mod embedded;
 mod error;
+mod hands;
 mod limbs;
 mod load;
 mod model;

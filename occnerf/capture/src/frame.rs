@@ -97,11 +97,13 @@ pub struct Registered {
     pub clothes: Vec<f32>,
     /// [`Mended::growth`].
     pub growth: i32,
+    /// How far the fingers of the left and of the right hand are rolled up, 0 to 1.
+    pub fists: [f32; 2],
 }
 
 impl From<Capture> for Registered {
     /// Takes masks and bodies as they are.
     fn from(capture: Capture) -> Self {
-        Self { capture, clothes: Vec::new(), growth: 0 }
+        Self { capture, clothes: Vec::new(), growth: 0, fists: [0.0; 2] }
     }
 }

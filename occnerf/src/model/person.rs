@@ -51,8 +51,8 @@ impl Person {
     /// # Errors
     /// Files that cannot be written.
     pub fn save(run: &Path, registered: &Registered, model: &BodyModel, colors: &PriorColors) -> Result<(), Error> {
-        let Registered { capture, clothes, .. } = registered;
-        model.save(&run.join(BODY))?;
+        let Registered { capture, clothes, fists, .. } = registered;
+        model.with_fists(*fists).save(&run.join(BODY))?;
         let (joints, betas) = (model.num_joints(), model.num_betas());
         let vectors = |values: &[Vec3]| values.iter().flat_map(|v| v.to_array()).collect::<Vec<f32>>();
         let mut frames: [Vec<f32>; 4] = Default::default();
@@ -85,6 +85,7 @@ impl Person {
             array("light", colors.light.slope.to_array().to_vec()),
             array("sizes", sizes),
             array("clothes", &clothes[..]),
+            array("fists", fists.to_vec()),
         ];
         let header = BTreeMap::from([
             ("format", FORMAT.to_owned()),
@@ -152,7 +153,12 @@ impl Person {
         let clothes = if has { contents.floats("clothes", model.num_vertices())? } else { Vec::new() };
         let Aabb { min, max } = Aabb::from_points(&model.v_template);
         below(&contents, "clothes", &clothes, (max - min).length())?;
-        Ok(Some(Registered { capture, clothes, growth }))
+        let mut fists = [0.0; 2];
+        if contents.len("fists") > 0 {
+            fists.copy_from_slice(&contents.floats("fists", 2)?);
+            below(&contents, "fists", &fists, 1.0)?;
+        }
+        Ok(Some(Registered { capture, clothes, growth, fists }))
     }
 
     /// Reads the files that [`Person::save`] wrote into the directory `run`.

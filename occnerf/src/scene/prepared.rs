@@ -105,7 +105,8 @@ impl Scene {
     /// pictures that cannot be read.
     pub fn prepare(registered: Registered, model: &BodyModel, config: &Config) -> Result<Self, Error> {
         config.validate()?;
-        let Registered { capture, clothes, .. } = &registered;
+        let Registered { capture, clothes, fists, .. } = &registered;
+        let model = &model.with_fists(*fists);
         if let Some(lost) = capture.eval.iter().find(|e| e.train_index >= capture.train.len()) {
             let (name, at, frames) = (&lost.frame.name, lost.train_index, capture.train.len());
             return Err(Error::Scene(format!("view {name} is of training frame {at}, expected one of {frames}")));

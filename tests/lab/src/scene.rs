@@ -266,6 +266,14 @@ pub struct SceneArguments {
     /// Grow the training masks by this many pixels, or shrink them [default: 0]
     #[arg(long, value_name = "PIXELS", allow_negative_numbers = true)]
     wrong_mask: Option<i32>,
+    /// Give the training frames key points, off by this many pixels of a body 250 high [default: 0,
+    /// none]
+    #[arg(long, value_name = "PIXELS")]
+    wrong_keypoints: Option<f32>,
+    /// Blur, exposure, a backdrop with pieces of it in the training masks, feet cut off, a thing that is
+    /// held [default: false]
+    #[arg(long, value_name = "BOOL")]
+    wrong_pictures: Option<bool>,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, ValueEnum)]
@@ -282,8 +290,9 @@ enum ObstacleName {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, ValueEnum)]
 #[serde(rename_all = "kebab-case")]
 enum WrongName {
-    /// What estimators and segmenters make of a real video: poses by 4°, 2 cm, depth by 2 %, limbs
-    /// by 5 %, shape by 1, ragged masks.
+    /// What cameras, estimators and segmenters make of a real video: poses by 2.5°, 1 cm, depth by 2 %,
+    /// limbs by 2.5 %, shape by 0.5, key points by 1.5 pixels, ragged masks with the backdrop in them,
+    /// blur.
     Real,
 }
 
@@ -305,6 +314,8 @@ impl SceneArguments {
             limbs_percent: self.wrong_limbs.unwrap_or(as_wrong.limbs_percent),
             ragged_pixels: self.wrong_edge.unwrap_or(as_wrong.ragged_pixels),
             mask_pixels: self.wrong_mask.unwrap_or(as_wrong.mask_pixels),
+            keypoint_pixels: self.wrong_keypoints.unwrap_or(as_wrong.keypoint_pixels),
+            photographed: self.wrong_pictures.unwrap_or(as_wrong.photographed),
         };
         let (files, corruption) = (self.load.options()?, Corruption { occlusion, open_body: self.open_body, wrong });
         Ok(SceneOptions { files, corruption, capture: String::new() })
@@ -358,7 +369,8 @@ mod tests {
     fn a_command_line_made_of_options_says_all_of_them() {
         let words = "x --resize 64 --stride 2 --max-frames 9 --eval-stride 3 --camera B2 --occlusion moving --fraction 0.4 \
                      --share 0.7 --position -0.1 --height 0.5 --memory 2048 --open-body 15 --wrong-pose 2.5 --wrong-shape 1 --wrong-mask -3";
-        let wrong = "x --wrong real --wrong-translation 0.05 --wrong-depth 3 --wrong-limbs 4 --wrong-edge 1";
+        let wrong = "x --wrong real --wrong-translation 0.05 --wrong-depth 3 --wrong-limbs 4 --wrong-edge 1 \
+                     --wrong-keypoints 2 --wrong-pictures false";
         for words in [words, wrong, "x"] {
             let load = Line::parse_from(words.split_whitespace()).load;
             let again = format!("x{}", load.command_line());

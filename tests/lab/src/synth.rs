@@ -141,6 +141,9 @@ pub struct SynthArguments {
     /// What the embedded person wears: a skirt and loose hair are no displacement of the body's surface
     #[arg(long, default_value = "plain", conflicts_with = "character")]
     outfit: OutfitName,
+    /// The embedded person's hands are fists, the body's stay flat
+    #[arg(long, conflicts_with = "character")]
+    fist: bool,
 }
 
 impl SynthArguments {
@@ -172,6 +175,7 @@ impl SynthArguments {
                 OutfitName::Skirt => Outfit::Skirt,
                 OutfitName::LongHair => Outfit::LongHair,
             },
+            fist: self.fist,
             occlusion,
         })
     }

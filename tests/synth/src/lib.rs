@@ -15,6 +15,7 @@ mod demo;
 mod film;
 mod obstacle;
 mod perturbation;
+mod photograph;
 mod write;
 
 pub use self::demo::{DemoConfig, Outfit, demo};

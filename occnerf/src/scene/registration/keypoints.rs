@@ -28,6 +28,8 @@ pub(super) struct DetectorModel {
     offsets: Vec<Vec3>,
     /// Robust standard deviation of a coordinate, pixels.
     noise: f32,
+    /// Width of the robust loss, in multiples of the usual one: wide while poses are far off.
+    pub width: f32,
 }
 
 /// A residual, x and y, of a point that is fixed to a bone.
@@ -45,7 +47,7 @@ impl DetectorModel {
     /// Estimates offsets by regularised least squares, then the noise. `unit` is the length of a metre of
     /// a body 1.7 high.
     pub fn measure(frames: &[FramePoints<'_>], joints: usize, unit: f32) -> Self {
-        let mut model = Self { offsets: vec![Vec3::ZERO; joints], noise: 1.0 };
+        let mut model = Self { offsets: vec![Vec3::ZERO; joints], noise: 1.0, width: 1.0 };
         model.noise = model.deviation(frames);
         let ridge = (model.noise / (OFFSET * unit)).powi(2);
         let mut sums = vec![(Mat3::from_diagonal(Vec3::splat(ridge)), Vec3::ZERO); joints];
@@ -85,7 +87,7 @@ impl DetectorModel {
             let place = *posed.joints.get(joint)? + posed.bones[joint].matrix3 * self.offsets[joint];
             let (at, gradients) = projected(frame.camera, place)?;
             let residual = at - point.place;
-            let trust = point.confidence * robust(residual.length_squared(), self.noise);
+            let trust = point.confidence * robust(residual.length_squared(), self.width * self.noise);
             Some(PointResidual { joint, place, residual, gradients, weight: trust / (self.noise * self.noise) })
         })
     }

@@ -13,6 +13,7 @@ mod colors;
 mod corrections;
 mod crop;
 mod equations;
+mod hands;
 mod keypoints;
 mod observations;
 mod pose_error;
@@ -20,6 +21,8 @@ mod pose_prior;
 mod system;
 #[cfg(test)]
 mod tests;
+
+use std::cell::OnceCell;
 
 use glam::{Quat, Vec3};
 use nalgebra::DVector;
@@ -55,6 +58,11 @@ const BETAS: usize = 10;
 /// Search distance from the prior's outline to the mask's in the first and in the last round,
 /// pixels.
 const REACH: [f32; 2] = [12.0, 5.0];
+/// Least rounds of outlines before hands are told to be fists: fingers of a body that is not registered lie
+/// outside masks too.
+const FIST_ROUNDS: usize = 4;
+/// [`DetectorModel::width`] in the first round; 1 in the last.
+const WIDTH: f32 = 6.0;
 /// Blur of the colours in their first round, halfway, and in the last, pixels.
 const BLUR: [f32; 2] = [3.0, 0.5];
 /// Shrinkage of clothes, in frames with the vertex on an outline, and largest offset, metres.
@@ -114,11 +122,16 @@ pub fn register(mended: Mended, model: &BodyModel, rounds: usize) -> Result<Regi
         let other = "`registration.rounds` of 0 leaves the prior as it is";
         return Err(Error::Scene(format!("registration: {joints} joints, at most {MOST_JOINTS}; {other}")));
     }
+    let (mut fists, clenched) = ([0.0; 2], OnceCell::new());
     let mut registration = Registration::new(&capture, model)?;
     let outlines = (OUTLINES * rounds as f32) as usize;
     for round in 0..rounds {
         if round == outlines {
             registration.pose_error.rotation = PoseErrorModel::ROTATION;
+            if outlines >= FIST_ROUNDS {
+                fists = hands::curls(&registration);
+                registration.model = clenched.get_or_init(|| model.with_fists(fists));
+            }
         }
         let late = round as f32 / (rounds - 1).max(1) as f32;
         let between = |ends: [f32; 2], share: f32| ends[0] + share * (ends[1] - ends[0]);
@@ -148,7 +161,7 @@ pub fn register(mended: Mended, model: &BodyModel, rounds: usize) -> Result<Regi
             view.frame.betas.clone_from(betas);
         }
     }
-    Ok(Registered { capture, clothes, growth })
+    Ok(Registered { capture, clothes, growth, fists })
 }
 
 impl<'a> Registration<'a> {
@@ -171,7 +184,12 @@ impl<'a> Registration<'a> {
             };
             frame.keypoints.iter().map(cropped).collect()
         });
-        let keypoints = keypoints.collect();
+        let keypoints: Vec<Vec<Keypoint>> = keypoints.collect();
+        // Key points tell of each frame by itself.
+        let pose_error = match keypoints.iter().all(Vec::is_empty) {
+            true => PoseErrorModel::OUTLINES,
+            false => PoseErrorModel::of_motion(rate(capture, &frames)),
+        };
         let bounds = Aabb::from_points(&model.shaped(&capture.mean_betas).vertices);
         let unit = (bounds.max.y - bounds.min.y) / 1.7;
         // A capture with evaluation cameras is calibrated.
@@ -181,7 +199,7 @@ impl<'a> Registration<'a> {
             shared_edges: shared_edges(&model.faces),
             unit,
             corrections: vec![vec![Vec3::ZERO; model.num_joints() + 1]; frames.len()],
-            pose_error: PoseErrorModel::OUTLINES,
+            pose_error,
             betas: vec![0.0; model.num_betas().min(BETAS)],
             root_depths,
             inverse_depth: 1.0,
@@ -212,7 +230,8 @@ impl<'a> Registration<'a> {
             Some(FramePoints { camera, points: &this.keypoints[f], posed: &bodies[f].posed })
         };
         let all: Vec<FramePoints<'_>> = (0..bodies.len()).filter_map(points).collect();
-        let detector = DetectorModel::measure(&all, this.model.num_joints(), this.unit);
+        let mut detector = DetectorModel::measure(&all, this.model.num_joints(), this.unit);
+        detector.width = 1.0 + (WIDTH - 1.0) * (options.reach - REACH[1]) / (REACH[0] - REACH[1]);
         let mut normals: Vec<NormalEquations> = (0..this.frames.len())
             .into_par_iter()
             .map(|f| {
@@ -270,11 +289,16 @@ impl<'a> Registration<'a> {
 
     /// Corrected body of a frame, with `betas` added to its shape coefficients.
     fn posed(&self, f: usize, betas: &[f32]) -> (Shaped, Posed) {
+        self.posed_as(self.model, f, betas)
+    }
+
+    /// [`Registration::posed`] of another body with the same joints.
+    fn posed_as(&self, model: &BodyModel, f: usize, betas: &[f32]) -> (Shaped, Posed) {
         let frame = &self.capture.train[self.frames[f]];
-        let shape = self.model.shaped(&sum(&frame.betas, betas));
-        let (pose, placement) = corrected(frame, self.model, &shape, &self.corrections[f]);
+        let shape = model.shaped(&sum(&frame.betas, betas));
+        let (pose, placement) = corrected(frame, model, &shape, &self.corrections[f]);
         let depth = self.root_depths.as_ref().map_or(Vec3::ZERO, |depths| depths[f]);
-        let posed = self.model.pose(&shape, &pose, rescaled(placement, depth, self.inverse_depth));
+        let posed = model.pose(&shape, &pose, rescaled(placement, depth, self.inverse_depth));
         (shape, posed)
     }
 
@@ -327,6 +351,19 @@ impl<'a> Registration<'a> {
         }
         sums.into_iter().map(|(sum, weight)| sum / (weight + DOUBT)).collect()
     }
+}
+
+/// Root mean square turn of a joint against its parent a frame, between neighbours among
+/// `frames`, radians.
+fn rate(capture: &Capture, frames: &[usize]) -> f64 {
+    let turns = frames.windows(2).flat_map(|pair| {
+        let [a, b] = [pair[0], pair[1]].map(|f| capture.train[f].pose.iter().skip(1));
+        a.zip(b).map(|(a, b)| Quat::from_scaled_axis(*a).angle_between(Quat::from_scaled_axis(*b)))
+    });
+    let (sum, count): (f64, f64) =
+        turns.filter(|turn| turn.is_finite()).fold((0.0, 0.0), |(s, n), t| (s + f64::from(t * t), n + 1.0));
+    let gap = frames.get(1).map_or(1, |second| second - frames[0]);
+    if count > 0.0 { (sum / count).sqrt() / gap as f64 } else { 0.0 }
 }
 
 /// Vector along the optical axis from the camera plane to the root joint of a frame as given; `None`

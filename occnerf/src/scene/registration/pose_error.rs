@@ -6,9 +6,11 @@ use nalgebra::DVector;
 use crate::scene::registration::corrections::Correction;
 
 /// Time constants, frames: the autocorrelation at lag k time constants is (1 + k) e^-k for bone
-/// rotations, which are smooth, and e^-k for the translation.
+/// rotations, which are smooth, and e^-k for the translation. That of rotations is the longest.
 const ROTATION_FRAMES: f64 = 5.0;
 const TRANSLATION_FRAMES: f64 = 1.0;
+/// Turn of a joint within the time constant of rotations, radians.
+const TURN: f64 = 0.25;
 
 /// Standard deviations of the errors of a given pose, per axis.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -18,16 +20,25 @@ pub(super) struct PoseErrorModel {
     pub depth: f64,
     /// World orientation of a bone, radians.
     pub rotation: f64,
+    /// Time constant of rotations, frames.
+    pub frames: f64,
 }
 
 impl PoseErrorModel {
     /// Values for outline residuals alone; tight rotations keep a depth error out of the pose.
-    pub const OUTLINES: Self = Self { lateral: 0.03, depth: 0.05, rotation: 0.02 };
+    pub const OUTLINES: Self = Self { lateral: 0.03, depth: 0.05, rotation: 0.02, frames: ROTATION_FRAMES };
     /// Initial rotation error once colour residuals are used.
     pub const ROTATION: f64 = 0.05;
     /// Bounds of the estimates.
-    const LEAST: Self = Self { lateral: 0.002, depth: 0.002, rotation: 0.01 };
-    const MOST: Self = Self { lateral: 0.2, depth: 0.2, rotation: 0.15 };
+    const LEAST: Self = Self { lateral: 0.002, depth: 0.002, rotation: 0.01, frames: 1.0 };
+    const MOST: Self = Self { lateral: 0.2, depth: 0.2, rotation: 0.15, frames: ROTATION_FRAMES };
+
+    /// Initial model of a video whose poses turn by `rate` radians a frame and joint (root mean square):
+    /// errors change as fast as poses do.
+    pub fn of_motion(rate: f64) -> Self {
+        // Infinite for a person who stands still.
+        Self { frames: (TURN / rate).clamp(Self::LEAST.frames, Self::MOST.frames), ..Self::OUTLINES }
+    }
 
     /// Variances of the unknowns of a frame and their autoregressive coefficients at a frame spacing
     /// of `gap` ([`Prior::ar_coefficients`]), (P) each. `unit` is the length of a metre of a body
@@ -35,7 +46,7 @@ impl PoseErrorModel {
     ///
     /// [`Prior::ar_coefficients`]: crate::scene::registration::system::Prior::ar_coefficients
     pub fn prior(&self, unit: f32, per_frame: usize, gap: usize) -> (Vec<f64>, Vec<[f64; 2]>) {
-        let Self { lateral, depth, rotation } = *self;
+        let Self { lateral, depth, rotation, .. } = *self;
         let unit = f64::from(unit);
         // Roots of the characteristic polynomial: two equal ones, or one.
         let root = |frames: f64| (-(gap as f64) / frames).exp();
@@ -43,7 +54,7 @@ impl PoseErrorModel {
         let each = |i: usize| match i {
             0 | 1 => ((unit * lateral).powi(2), [root(TRANSLATION_FRAMES), 0.0]),
             2 => ((unit * depth).powi(2), [root(TRANSLATION_FRAMES), 0.0]),
-            _ => (rotation * rotation, smooth(root(ROTATION_FRAMES))),
+            _ => (rotation * rotation, smooth(root(self.frames))),
         };
         (0..per_frame).map(each).unzip()
     }
@@ -68,6 +79,7 @@ impl PoseErrorModel {
         Self {
             lateral: (mean(0, Some(2)) / unit).clamp(Self::LEAST.lateral, Self::MOST.lateral),
             depth: (mean(2, Some(3)) / unit).clamp(Self::LEAST.depth, Self::MOST.depth),
+            frames: self.frames,
             rotation: (rotation * rotation / self.rotation).clamp(Self::LEAST.rotation, Self::MOST.rotation),
         }
     }
@@ -123,9 +135,9 @@ mod tests {
     #[test]
     fn estimated_errors_are_the_true_ones_also_of_unobserved_axes() {
         for (seed, truth) in [
-            (1, PoseErrorModel { lateral: 0.005, depth: 0.02, rotation: 0.015 }),
-            (2, PoseErrorModel { lateral: 0.02, depth: 0.1, rotation: 0.05 }),
-            (3, PoseErrorModel { lateral: 0.01, depth: 0.005, rotation: 0.1 }),
+            (1, PoseErrorModel { lateral: 0.005, depth: 0.02, rotation: 0.015, frames: 5.0 }),
+            (2, PoseErrorModel { lateral: 0.02, depth: 0.1, rotation: 0.05, frames: 5.0 }),
+            (3, PoseErrorModel { lateral: 0.01, depth: 0.005, rotation: 0.1, frames: 5.0 }),
         ] {
             let found = estimated(truth, seed);
             for (found, truth) in

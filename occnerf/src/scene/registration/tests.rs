@@ -116,6 +116,33 @@ fn key_points_mend_poses_that_outlines_do_not_show() {
 }
 
 #[test]
+fn fists_are_found_and_flat_hands_stay_flat() {
+    let body = BodyModel::embedded();
+    for fist in [false, true] {
+        let config = DemoConfig { size: 192, frames: 32, fist, occluded_fraction: 0.0, ..small() };
+        let given = demo(&config, &body).unwrap();
+        let fists = register(Mended::from(given), &body, 12).unwrap().fists;
+        assert!(fists.iter().all(|&curl| if fist { curl >= 0.5 } else { curl == 0.0 }), "{fist}: {fists:?}");
+    }
+}
+
+#[test]
+fn errors_of_fast_motion_are_forgotten_in_fewer_frames() {
+    let body = BodyModel::embedded();
+    let capture = demo(&DemoConfig { size: 16, ..small() }, &body).unwrap();
+    let frames: Vec<usize> = (0..capture.train.len()).collect();
+    let slow = rate(&capture, &frames);
+    // A frame in four: up to four times the turn between neighbours, no more a frame of the video.
+    let quarter: Vec<usize> = frames.iter().copied().step_by(4).collect();
+    let apart = rate(&capture, &quarter);
+    assert!(apart > 0.5 * slow && apart < 1.01 * slow, "{slow} {apart}");
+    let fast = Capture { train: quarter.iter().map(|&f| capture.train[f].clone()).collect(), ..capture.clone() };
+    let [slow, fast] = [slow, rate(&fast, &frames[..15])].map(|rate| PoseErrorModel::of_motion(rate).frames);
+    assert!(fast < 0.6 * slow && fast >= 1.0, "{slow} {fast}");
+    assert!(PoseErrorModel::of_motion(rate(&capture, &[3])).frames >= slow);
+}
+
+#[test]
 fn limbs_of_a_rig_that_are_too_long_or_too_short_are_mended() {
     let rig = BodyModel { shapedirs: Vec::new(), ..BodyModel::embedded() };
     let exact = DemoConfig { pose_noise_degrees: 0.0, translation_noise: 0.0, beta_noise: 0.0, ..small() };

@@ -44,6 +44,7 @@ pub(super) struct Landmarks {
     pub shoulder_x: f32,
     pub elbow_x: f32,
     pub wrist_x: f32,
+    wrist_y: f32,
     pub knee: Vec3,
     pub ankle: Vec3,
     pub hip: Vec3,
@@ -68,10 +69,24 @@ impl Landmarks {
             shoulder_x: at(joint::LEFT_SHOULDER).x,
             elbow_x: at(joint::LEFT_ELBOW).x,
             wrist_x: at(joint::LEFT_ELBOW + 2).x,
+            wrist_y: at(joint::LEFT_ELBOW + 2).y,
             knee: at(joint::LEFT_KNEE),
             ankle: at(joint::LEFT_ANKLE),
             hip: at(joint::LEFT_HIP),
         }
+    }
+
+    /// Where a point of a flat hand, figure metres, is in a fist: fingers roll up below the knuckles.
+    pub fn fist(&self, q: Vec3) -> Vec3 {
+        const KNUCKLES: f32 = 0.09;
+        const RADIUS: f32 = 0.025;
+        let along = q.x.abs() - self.wrist_x - KNUCKLES;
+        if along <= 0.0 {
+            return q;
+        }
+        let (angle, from_axis) = (along / RADIUS, RADIUS + q.y - self.wrist_y);
+        let x = self.wrist_x + KNUCKLES + from_axis * angle.sin();
+        Vec3::new(x.copysign(q.x), self.wrist_y - RADIUS + from_axis * angle.cos(), q.z)
     }
 
     /// A point of the rest pose in figure metres.

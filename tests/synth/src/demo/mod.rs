@@ -64,6 +64,8 @@ pub struct DemoConfig {
     pub pressed: f32,
     /// What the person wears over its clothes.
     pub outfit: Outfit,
+    /// Whether the hands are fists; the prior's are flat.
+    pub fist: bool,
     /// Whether training frames say which pixels the obstacle covers. Published captures do not.
     pub known_occluder: bool,
 }
@@ -84,6 +86,7 @@ impl Default for DemoConfig {
             occluded_share: 0.8,
             pressed: 0.0,
             outfit: Outfit::Plain,
+            fist: false,
             known_occluder: false,
         }
     }
@@ -149,7 +152,7 @@ pub(super) fn film(
 ) -> Result<(Capture, f32), CaptureError> {
     let (true_betas, betas) = shapes(config, body);
     let shaped = body.shaped(&true_betas);
-    let person = Person::new(body, &shaped, config.outfit);
+    let person = Person::new(body, &shaped, config.outfit, config.fist);
     let (poses, height) = perform(config, body, &shaped);
     let error = TrackerError {
         seed: config.seed,

@@ -46,8 +46,8 @@ fn subdivide(vertices: usize, faces: &[[u32; 3]]) -> (Vec<[u32; 3]>, Vec<[u32; 2
 }
 
 impl Person {
-    /// Dresses `shaped`, a body of `model` in SMPL's T-pose.
-    pub fn new(model: &BodyModel, shaped: &Shaped, outfit: Outfit) -> Self {
+    /// Dresses `shaped`, a body of `model` in SMPL's T-pose, with flat hands or fists.
+    pub fn new(model: &BodyModel, shaped: &Shaped, outfit: Outfit, fist: bool) -> Self {
         let landmarks = Landmarks::new(shaped);
         let (mut faces, ends) = subdivide(shaped.vertices.len(), &model.faces);
         let mut rest: Vec<Vec3> =
@@ -58,6 +58,9 @@ impl Person {
             .zip(&normals)
             .map(|(&p, &n)| p + n * (landmarks.thickness(landmarks.figure(p)) * landmarks.unit))
             .collect();
+        if fist {
+            clothed.iter_mut().for_each(|v| *v = landmarks.rest(landmarks.fist(landmarks.figure(*v))));
+        }
         let sheet = Sheet::new(outfit, &landmarks);
         let (sheets, first) = (faces.len(), rest.len() as u32);
         faces.extend(sheet.faces.iter().map(|face| face.map(|v| first + v)));

@@ -53,6 +53,8 @@ pub struct SynthConfig {
     pub turns: f32,
     /// What the embedded person wears over its clothes.
     pub outfit: Outfit,
+    /// Whether the embedded person's hands are fists.
+    pub fist: bool,
     /// What hides the person.
     pub occlusion: Occlusion,
 }
@@ -71,6 +73,7 @@ impl Default for SynthConfig {
             shape_noise: 1.0,
             turns: 1.15,
             outfit: demo.outfit,
+            fist: demo.fist,
             occlusion: Occlusion::Rectangle(Obstacle::default()),
         }
     }
@@ -91,6 +94,7 @@ impl SynthConfig {
             beta_noise: usual.beta_noise * self.shape_noise,
             occluded_fraction: 0.0,
             outfit: self.outfit,
+            fist: self.fist,
             ..usual
         }
     }

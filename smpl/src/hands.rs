@@ -1,0 +1,97 @@
+//! Fists of a body whose hands are flat at rest and have no finger joints.
+
+use glam::Vec3;
+
+use crate::model::BodyModel;
+
+/// SMPL's number of joints, and its wrists and hands, left and right.
+const JOINTS: usize = 24;
+const WRISTS: [usize; 2] = [20, 21];
+const HANDS: [usize; 2] = [22, 23];
+/// Radius about which the fingers of a fist roll, relative to the distance from wrist to hand.
+const RADIUS: f32 = 0.3;
+
+impl BodyModel {
+    /// Vertices of the left and of the right hand with their distances beyond the knuckles along the
+    /// fingers, relative to that from wrist to hand; negative on the palm. None of a body without SMPL's
+    /// joints.
+    #[must_use]
+    pub fn hands(&self) -> [Vec<(usize, f32)>; 2] {
+        if self.num_joints() != JOINTS {
+            return Default::default();
+        }
+        let joints = self.shaped(&[]).joints;
+        [0, 1].map(|side| {
+            let (knuckles, palm) = (joints[HANDS[side]], joints[HANDS[side]] - joints[WRISTS[side]]);
+            let along = |v: usize| (self.v_template[v] - knuckles).dot(palm) / palm.length_squared();
+            let of_hand = |(joint, weight): (usize, f32)| {
+                if joint == WRISTS[side] || joint == HANDS[side] { weight } else { 0.0 }
+            };
+            let is_hand = |v: &usize| self.weights.row(*v).map(of_hand).sum::<f32>() > 0.5 && along(*v) > -1.0;
+            (0..self.num_vertices()).filter(is_hand).map(|v| (v, along(v))).collect()
+        })
+    }
+
+    /// The body with the fingers of its left and right hand rolled up, by 0 (flat, as they are) to 1 (a
+    /// fist). The palms of the rest pose look down, as SMPL's do.
+    ///
+    /// ```
+    /// let body = smpl::BodyModel::embedded();
+    /// let fist = body.with_fists([1.0, 0.0]);
+    /// let reach = |body: &smpl::BodyModel| body.v_template.iter().map(|v| v.x).fold(0.0, f32::max);
+    /// assert!(reach(&fist) < reach(&body) - 0.04);
+    /// ```
+    #[must_use]
+    pub fn with_fists(&self, curls: [f32; 2]) -> Self {
+        let mut body = self.clone();
+        let joints = self.shaped(&[]).joints;
+        for (side, vertices) in self.hands().into_iter().enumerate().filter(|(side, _)| curls[*side] > 0.0) {
+            let palm = joints[HANDS[side]] - joints[WRISTS[side]];
+            let (fingers, length) = (palm.normalize_or(Vec3::X), palm.length());
+            let up = Vec3::Y.reject_from_normalized(fingers).normalize_or(Vec3::Y);
+            let radius = RADIUS * length / curls[side];
+            for (v, along) in vertices.into_iter().filter(|(_, along)| *along > 0.0) {
+                let along = along * length;
+                let (angle, from_axis) = (along / radius, radius + (body.v_template[v] - joints[HANDS[side]]).dot(up));
+                let (x, y) = (from_axis * angle.sin() - along, from_axis * angle.cos() - from_axis);
+                body.v_template[v] += x * fingers + y * up;
+            }
+        }
+        body
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    proptest! {
+        /// Fingers roll without stretching: edges near the roll's middle line keep their lengths.
+        #[test]
+        fn fists_move_fingers_alone_and_do_not_tear_them(left in 0.0f32..1.0, right in 0.0f32..1.0) {
+            let body = BodyModel::embedded();
+            let fist = body.with_fists([left, right]);
+            let mut fingers = vec![None; body.num_vertices()];
+            for (hand, curl) in body.hands().into_iter().zip([left, right]) {
+                hand.into_iter().filter(|(_, along)| *along > 0.0).for_each(|(v, _)| fingers[v] = Some(curl));
+            }
+            for (v, (a, b)) in body.v_template.iter().zip(&fist.v_template).enumerate() {
+                prop_assert!(fingers[v].is_some_and(|curl| curl > 0.0) || a == b);
+            }
+            for &[a, b, _] in body.faces.iter().filter(|face| face.iter().any(|v| fingers[*v as usize].is_some())) {
+                let length = |body: &BodyModel| body.v_template[a as usize].distance(body.v_template[b as usize]);
+                prop_assert!(length(&fist) < 2.5 * length(&body) + 1e-4, "{a} {b}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_body_without_smpls_joints_has_no_hands() {
+        let mut body = BodyModel::embedded();
+        assert!(body.hands().iter().all(|hand| hand.len() > 100));
+        body.parents.pop();
+        assert!(body.hands().iter().all(Vec::is_empty));
+        assert_eq!(body.with_fists([1.0; 2]).v_template, body.v_template);
+    }
+}
