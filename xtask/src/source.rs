@@ -66,13 +66,15 @@ impl Source {
     /// Takes the body and the registered poses of the run in `directory`, if it kept them.
     pub fn restore(&mut self, directory: &Path, config: &Config) -> Result<()> {
         let body = directory.join("body.safetensors");
-        if body.is_file() {
-            self.model = BodyModel::load(&body)?;
-        }
+        let model = if body.is_file() { BodyModel::load(&body)? } else { self.model.clone() };
+        // A skirt is added before masks are mended, hands are rolled up after it.
+        let is_skirted = model.num_vertices() != self.model.num_vertices();
+        let mending = if is_skirted { &model } else { &self.model };
         let mended = match config.registration.rounds {
             0 => Mended::from(self.capture.clone()),
-            _ => mend_masks(self.capture.clone(), &self.model)?,
+            _ => mend_masks(self.capture.clone(), mending)?,
         };
+        self.model = model;
         let restored = Person::restore(directory, mended, &self.model)?;
         self.registered.replace(restored.map(|registered| (None, registered)));
         Ok(())

@@ -85,7 +85,6 @@ impl Person {
             array("light", colors.light.slope.to_array().to_vec()),
             array("sizes", sizes),
             array("clothes", &clothes[..]),
-            array("fists", fists.to_vec()),
         ];
         let header = BTreeMap::from([
             ("format", FORMAT.to_owned()),
@@ -153,12 +152,8 @@ impl Person {
         let clothes = if has { contents.floats("clothes", model.num_vertices())? } else { Vec::new() };
         let Aabb { min, max } = Aabb::from_points(&model.v_template);
         below(&contents, "clothes", &clothes, (max - min).length())?;
-        let mut fists = [0.0; 2];
-        if contents.len("fists") > 0 {
-            fists.copy_from_slice(&contents.floats("fists", 2)?);
-            below(&contents, "fists", &fists, 1.0)?;
-        }
-        Ok(Some(Registered { capture, clothes, growth, fists }))
+        // The run's body has them.
+        Ok(Some(Registered { capture, clothes, growth, fists: [0.0; 2] }))
     }
 
     /// Reads the files that [`Person::save`] wrote into the directory `run`.
