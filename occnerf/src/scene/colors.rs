@@ -10,9 +10,9 @@ use crate::capture::Light;
 use crate::model::colors::PriorColors;
 use crate::model::subdivide::{Subdivided, most_times, times_until};
 use crate::model::view::pixel_width;
-use crate::scene::light::{ColorObservation, albedo, measure_light};
+use crate::scene::light::{ColorObservation, measure_light};
 use crate::scene::prepared::Scene;
-use crate::scene::seen::{MOST as MOST_DEPTH, deeper};
+use crate::scene::seen::deeper;
 use crate::scene::unseen::complete;
 
 /// Target edge length of the subdivided prior, pixels of the training frames, and most subdivisions.
@@ -20,117 +20,53 @@ const EDGE: f32 = 0.5;
 const MOST: u32 = 2;
 /// Least foreshortening weight of an observation.
 const SLANT: f32 = 0.05;
-/// Least sum of the reliabilities of an observed point, relative to the number of frames.
-const EVIDENCE: f32 = 0.01;
 /// Frames in flight, at some megabytes of observations each.
 const TOGETHER: usize = 8;
 
 impl PriorColors {
     /// Least-squares albedo over the visible training pixels of each point of the subdivided prior,
-    /// or of its clothes if registered, weighted by foreshortening and [`Reliability`], under the light of
-    /// the scene if the configuration asks for one. Contaminated edge pixels of masks are left out.
-    /// Vertices that no frame shows reliably are completed by inverse distance weighting, other such
-    /// points interpolated from their vertices.
+    /// or of its clothes if registered, weighted by foreshortening, under the light of the scene if
+    /// the configuration asks for one. Contaminated edge pixels of masks are left out. Unobserved
+    /// vertices are completed by inverse distance weighting, other unobserved points interpolated
+    /// from their vertices.
     ///
     /// # Errors
     /// Pictures that cannot be read.
     pub fn measure(scene: &Scene) -> Result<Self, Error> {
         let (prior, faces) = (&scene.body.canonical.vertices, &scene.body.model.faces);
-        let seen = scene.seen()?;
-        let light = if scene.lit { measure_light(&deeper(&seen, scene.edge), prior.len()) } else { Light::default() };
-        let reliability = Reliability::measure(scene, &seen, light);
+        let light =
+            if scene.lit { measure_light(&deeper(&scene.seen()?, scene.edge), prior.len()) } else { Light::default() };
         let pixel = pixel_width(scene.train.iter().map(|frame| &*frame.view));
         let most = MOST.min(most_times(faces.len()));
         let times = pixel.map_or(0, |pixel| times_until(prior, faces, EDGE * pixel, most));
         let mesh = Subdivided::new(prior.len(), faces, times);
         // Terms of Σ s c and Σ s² for colours c under the light s.
-        let shown = |frame: usize| -> Result<Vec<(usize, Vec3, f32, f32)>, Error> {
+        let shown = |frame: usize| -> Result<Vec<(usize, Vec3, f32)>, Error> {
             let seen = scene.seen_in(frame, &mesh.anchors)?;
             let view = &scene.train[frame].view;
             let eye = view.camera.centre_of_projection();
-            let term = |&((v, color, normal), depth): &(ColorObservation, usize)| {
+            let term = |&((v, color, normal), _): &(ColorObservation, usize)| {
                 let place = mesh.anchors[v as usize].mix(&view.posed.vertices);
-                let cosine = normal.dot((eye - place).normalize_or_zero());
-                let trust = reliability.as_ref().map_or(1.0, |of| of.of(depth, cosine));
-                let (size, shade) = (trust * cosine.max(SLANT), light.on(normal));
-                (v as usize, size * shade * color, size * shade * shade, trust)
+                let (size, shade) = (normal.dot((eye - place).normalize_or_zero()).max(SLANT), light.on(normal));
+                (v as usize, size * shade * color, size * shade * shade)
             };
             Ok(seen.iter().filter(|seen| seen.1 > scene.edge).map(term).collect())
         };
-        let mut sums = vec![(Vec3::ZERO, 0.0, 0.0); mesh.anchors.len()];
+        let mut sums = vec![(Vec3::ZERO, 0.0); mesh.anchors.len()];
         for first in (0..scene.train.len()).step_by(TOGETHER) {
             let frames = first..(first + TOGETHER).min(scene.train.len());
             let found: Result<Vec<_>, Error> = frames.into_par_iter().map(shown).collect();
-            for (v, sum, squares, trust) in found?.into_iter().flatten() {
-                sums[v] = (sums[v].0 + sum, sums[v].1 + squares, sums[v].2 + trust);
+            for (v, sum, squares) in found?.into_iter().flatten() {
+                sums[v] = (sums[v].0 + sum, sums[v].1 + squares);
             }
         }
-        let least = reliability.as_ref().map_or(0.0, |_| EVIDENCE * scene.learnt.len() as f32).max(f32::MIN_POSITIVE);
-        let seen: Vec<bool> = sums.iter().map(|sum| sum.2 >= least).collect();
-        let mut colors: Vec<Vec3> =
-            sums.iter().map(|(sum, squares, _)| *sum / squares.max(f32::MIN_POSITIVE)).collect();
+        let seen: Vec<bool> = sums.iter().map(|sum| sum.1 > 0.0).collect();
+        let mut colors: Vec<Vec3> = sums.iter().map(|(sum, squares)| *sum / squares.max(f32::MIN_POSITIVE)).collect();
         let (vertices, between) = colors.split_at_mut(prior.len());
         complete(&scene.body, vertices, &seen[..prior.len()]);
         let rest = between.iter_mut().zip(&mesh.anchors[prior.len()..]).zip(&seen[prior.len()..]);
         rest.filter(|(_, seen)| !**seen).for_each(|((color, anchor), _)| *color = anchor.mix(vertices));
         Ok(Self { colors, seen, light, mesh: Arc::new(mesh) })
-    }
-}
-
-/// Depths in a mask and cosines between normal and view direction that are told apart.
-const BINS: [usize; 2] = [MOST_DEPTH + 1, 5];
-/// Least cosine of a reliable colour, and least observations of a bin.
-const FRONTAL: f32 = 0.6;
-const ENOUGH: u32 = 30;
-/// Reliability of frontal colours at the masks' edges below which the masks are dirty. It is 0.6 where they
-/// are exact, 0.2 with background in them.
-const DIRTY: f32 = 0.25;
-
-/// Inverse variance of colours by depth inside the mask and by slant, relative to that of deep and frontal
-/// ones, at most 1: bodies off their place and background in masks show at rims.
-struct Reliability([[f32; BINS[1]]; BINS[0]]);
-
-impl Reliability {
-    /// `None` where masks are clean: all colours count alike.
-    fn measure(scene: &Scene, frames: &[Vec<(ColorObservation, usize)>], light: Light) -> Option<Self> {
-        let bins = |frame: usize, (seen, depth): &(ColorObservation, usize)| {
-            let view = &scene.train[frame].view;
-            let towards =
-                (view.camera.centre_of_projection() - view.posed.vertices[seen.0 as usize]).normalize_or_zero();
-            Self::bin(*depth, seen.2.dot(towards))
-        };
-        let frontal = (FRONTAL * BINS[1] as f32) as usize;
-        let is_reliable = |[depth, slant]: [usize; 2]| depth + 1 == BINS[0] && slant >= frontal;
-        let each =
-            || frames.iter().enumerate().flat_map(|(f, frame)| frame.iter().map(move |seen| (bins(f, seen), seen.0)));
-        let reliable: Vec<ColorObservation> =
-            each().filter(|(bin, _)| is_reliable(*bin)).map(|(_, seen)| seen).collect();
-        let albedo = albedo(reliable.iter(), scene.body.canonical.vertices.len(), light);
-        let (mut sums, mut best) = ([[(0.0, 0u32); BINS[1]]; BINS[0]], (0.0, 0u32));
-        for (bin, (v, color, normal)) in each() {
-            let (sum, squares) = albedo[v as usize];
-            if squares > 0.0 {
-                let squared = (sum / squares * light.on(normal)).distance_squared(color);
-                let sum = &mut sums[bin[0]][bin[1]];
-                *sum = (sum.0 + squared, sum.1 + 1);
-                if is_reliable(bin) {
-                    best = (best.0 + squared, best.1 + 1);
-                }
-            }
-        }
-        let least = best.0 / best.1.max(1) as f32;
-        let ratio = |(sum, count): (f32, u32)| if count < ENOUGH { 1.0 } else { (least * count as f32 / sum).min(1.0) };
-        let found = Self(sums.map(|row| row.map(ratio)));
-        (found.of(1, 1.0) < DIRTY).then_some(found)
-    }
-
-    fn bin(depth: usize, cosine: f32) -> [usize; 2] {
-        [depth.clamp(1, BINS[0]) - 1, ((cosine.max(0.0) * BINS[1] as f32) as usize).min(BINS[1] - 1)]
-    }
-
-    fn of(&self, depth: usize, cosine: f32) -> f32 {
-        let [depth, slant] = Self::bin(depth, cosine);
-        self.0[depth][slant]
     }
 }
 
@@ -173,7 +109,6 @@ mod tests {
     /// Compares the colours of some places with those that a loop over all pictures and faces finds.
     fn compare(scene: &Scene, clothes: &[f32]) {
         let found = PriorColors::measure(scene).unwrap();
-        let reliability = Reliability::measure(scene, &scene.seen().unwrap(), found.light);
         assert!(found.mesh.times() > 0 && found.colors.len() == found.mesh.anchors.len());
         let mut random = RandomStream::new(&[8]);
         let dressed = |frame: &PreparedFrame| -> (Vec<Vec3>, Vec<Vec3>) {
@@ -186,7 +121,7 @@ mod tests {
         for _ in 0..150 {
             let v = random.below(found.colors.len());
             let anchor = &found.mesh.anchors[v];
-            let (mut sum, mut weights, mut evidence) = (DVec3::ZERO, 0.0, 0.0);
+            let (mut sum, mut weights) = (DVec3::ZERO, 0.0);
             for (frame, (vertices, normals)) in &frames {
                 let (view, pixels) = (&frame.view, frame.pixels().unwrap());
                 let place = anchor.mix(vertices);
@@ -203,22 +138,11 @@ mod tests {
                     continue;
                 }
                 let towards = (eye - anchor.mix(&view.posed.vertices)).normalize_or_zero();
-                let cosine = anchor.mix(normals).normalize_or_zero().dot(towards);
-                let width = view.camera.width as usize;
-                let apart = |other: usize| {
-                    let [x, y] = [pixel % width, pixel / width].map(|c| c as f32);
-                    (x - (other % width) as f32).hypot(y - (other / width) as f32)
-                };
-                let outside = (0..pixels.mask.len()).filter(|&p| pixels.mask[p] <= 0.5);
-                let depth = outside.map(apart).fold(f32::INFINITY, f32::min) as usize;
-                let trust = reliability.as_ref().map_or(1.0, |of| of.of(depth.max(1), cosine));
-                let slant = trust * cosine.max(SLANT);
-                evidence += trust;
+                let slant = anchor.mix(normals).normalize_or_zero().dot(towards).max(SLANT);
                 let color = Vec3::from_slice(&pixels.image.pixels[3 * pixel..]) / coverage;
                 (sum, weights) = (sum + f64::from(slant) * color.as_dvec3(), weights + f64::from(slant));
             }
-            let least = reliability.as_ref().map_or(0.0, |_| EVIDENCE * scene.learnt.len() as f32);
-            if evidence > 0.0 && evidence >= least {
+            if weights > 0.0 {
                 shown += 1;
                 let error = (sum / weights - found.colors[v].as_dvec3()).length();
                 wrong += usize::from(!found.seen[v] || error > 1e-3);
