@@ -45,7 +45,8 @@ impl BodyModel {
     pub fn with_fists(&self, curls: [f32; 2]) -> Self {
         let mut body = self.clone();
         let joints = self.shaped(&[]).joints;
-        for (side, vertices) in self.hands().into_iter().enumerate().filter(|(side, _)| curls[*side] > 0.0) {
+        let is_curled = |(side, vertices): &(usize, Vec<_>)| curls[*side] > 0.0 && !vertices.is_empty();
+        for (side, vertices) in self.hands().into_iter().enumerate().filter(is_curled) {
             let palm = joints[HANDS[side]] - joints[WRISTS[side]];
             let (fingers, length) = (palm.normalize_or(Vec3::X), palm.length());
             let up = Vec3::Y.reject_from_normalized(fingers).normalize_or(Vec3::Y);

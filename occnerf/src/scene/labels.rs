@@ -161,6 +161,9 @@ pub(crate) fn around<T: Copy + Default>(
     margin: f32,
     filter: impl Fn(&[bool], usize) -> Vec<T>,
 ) -> Vec<T> {
+    if margin >= set.len() as f32 {
+        return filter(set, width);
+    }
     let mut found = vec![T::default(); set.len()];
     let rows = || set.chunks(width.max(1));
     let is_set = |row: &[bool]| row.contains(&true);
