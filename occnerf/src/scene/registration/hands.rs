@@ -2,8 +2,9 @@
 
 use glam::Vec3;
 use rayon::prelude::*;
+use smpl::BodyModel;
 
-use super::Registration;
+use crate::scene::registration::crop::Crop;
 
 /// Curls that are compared.
 const CURLS: [f32; 5] = [0.0, 0.25, 0.5, 0.75, 1.0];
@@ -14,17 +15,21 @@ const SHOWN: f32 = 0.9;
 const LEAST_FRAMES: usize = 5;
 
 /// How far the masks say that the fingers of each hand are rolled up, the same in all frames: flat fingers
-/// lie outside the masks of a fist.
-pub(super) fn curls(registration: &Registration<'_>) -> [f32; 2] {
-    let hands = registration.model.hands();
+/// lie outside the masks of a fist. `posed` gives the vertices of a body in the frame of each of `crops`.
+pub(super) fn curls(
+    model: &BodyModel,
+    crops: &[Option<Crop>],
+    posed: impl Fn(&BodyModel, usize) -> Vec<Vec3> + Sync,
+) -> [f32; 2] {
+    let hands = model.hands();
     if hands.iter().any(Vec::is_empty) {
         return [0.0; 2];
     }
-    let bodies = CURLS.map(|curl| registration.model.with_fists([curl; 2]));
+    let bodies = CURLS.map(|curl| model.with_fists([curl; 2]));
     // Share of the fingers outside the mask, of each hand and curl.
     let outside = |f: usize| -> Option<[[Option<f32>; CURLS.len()]; 2]> {
-        let crop = registration.crops[f].as_ref()?;
-        let posed = bodies.each_ref().map(|model| registration.posed_as(model, f, &registration.betas).1.vertices);
+        let crop = crops[f].as_ref()?;
+        let posed = bodies.each_ref().map(|body| posed(body, f));
         let share = |vertices: &[Vec3], hand: &[(usize, f32)], is_finger: bool| {
             let part = || hand.iter().filter(|(_, along)| (*along > 0.0) == is_finger);
             let covered = |&&(v, _): &&(usize, f32)| {
@@ -39,7 +44,7 @@ pub(super) fn curls(registration: &Registration<'_>) -> [f32; 2] {
                 .map(|vertices| (share(vertices, hand, false) >= SHOWN).then(|| 1.0 - share(vertices, hand, true)))
         }))
     };
-    let frames: Vec<_> = (0..registration.frames.len()).into_par_iter().filter_map(outside).collect();
+    let frames: Vec<_> = (0..crops.len()).into_par_iter().filter_map(outside).collect();
     [0, 1].map(|side| {
         let cost = |k: usize| -> f32 {
             let shown: Vec<f32> = frames.iter().filter_map(|frame| frame[side][k]).collect();

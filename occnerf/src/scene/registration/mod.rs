@@ -129,7 +129,8 @@ pub fn register(mended: Mended, model: &BodyModel, rounds: usize) -> Result<Regi
         if round == outlines {
             registration.pose_error.rotation = PoseErrorModel::ROTATION;
             if outlines >= FIST_ROUNDS {
-                fists = hands::curls(&registration);
+                let posed = |body: &_, f| registration.posed_as(body, f, &registration.betas).1.vertices;
+                fists = hands::curls(model, &registration.crops, posed);
                 registration.model = clenched.get_or_init(|| model.with_fists(fists));
             }
         }
