@@ -260,7 +260,7 @@ pub struct SceneArguments {
     /// deviation) [default: 0]
     #[arg(long, value_name = "PERCENT")]
     wrong_limbs: Option<f32>,
-    /// Let the edges of the training masks go to and fro by up to this many pixels [default: 0]
+    /// Displace the edges of the training masks in and out by up to this many pixels [default: 0]
     #[arg(long, value_name = "PIXELS")]
     wrong_edge: Option<f32>,
     /// Grow the training masks by this many pixels, or shrink them [default: 0]

@@ -34,7 +34,7 @@ pub struct Perturbation {
     /// Standard deviation of the error of the lengths of the limbs' bones, per cent, left as right,
     /// 0 to 50: see [`Perturbation::spoil_body`].
     pub limbs_percent: f32,
-    /// Pixels by which the edges of the training masks go to and fro at most, 0 to 64. What is
+    /// Largest displacement of the edges of the training masks, pixels, 0 to 64. What is
     /// added shows black.
     pub ragged_pixels: f32,
     /// Pixels by which the training masks are larger (smaller if negative) than they should be, −64

@@ -1,5 +1,5 @@
 //! Pictures as a camera makes them and masks as a segmenter makes them: a backdrop, blur, exposure,
-//! binary masks with pieces of the backdrop in them and feet cut off, a thing that is held.
+//! binary masks with pieces of the backdrop in them and feet cut off, a thing held in a hand.
 
 use glam::{Vec2, Vec3};
 
@@ -8,18 +8,19 @@ use capture::Pixels;
 
 /// Standard deviation of the blur of all frames, pixels.
 const BLUR: f32 = 0.6;
-/// One frame in so many is blurred by motion, over this part of the body's height.
+/// Interval of the frames blurred by motion, and length of the blur relative to the body's height.
 const MOVING: u64 = 8;
 const MOTION: f32 = 0.03;
 /// Area of the backdrop's pieces relative to the mask's, and their farthest distance from it relative to
 /// the body's height.
 const PATCHES: f32 = 0.055;
 const NEAR: f32 = 0.05;
-/// One frame in so many lacks a foot, as far around its joint.
+/// Interval of the masks without a foot, and radius of the hole around its joint relative to the body's
+/// height.
 const LAME: u64 = 3;
 const FOOT: f32 = 0.06;
-/// Length and radius of what the right hand holds, relative to the body's height; one mask in so many
-/// has it.
+/// Length and radius of the thing in the right hand, relative to the body's height, and interval of the
+/// masks with it.
 const HELD: [f32; 2] = [0.3, 0.012];
 const HELD_IN_MASKS: u64 = 2;
 /// Root mean square change of exposure.
@@ -45,7 +46,7 @@ impl Shot {
         Self { frame, gain: 1.0 + EXPOSURE * light, height: 100.0, hand: None, foot: None }
     }
 
-    /// Whether what is held covers a pixel.
+    /// Whether the thing in the hand covers a pixel.
     fn held(&self, at: Vec2) -> bool {
         self.hand.is_some_and(|(elbow, hand)| {
             let way = (hand - elbow).normalize_or_zero();
