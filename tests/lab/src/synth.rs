@@ -223,7 +223,7 @@ pub fn synth(arguments: &SynthArguments) -> Result<()> {
     Ok(())
 }
 
-/// Names of the joints of a character's body in a capture that [`synth`] wrote; none for other captures.
+/// Names of the joints of a character's body in a capture that [`synth()`] wrote; none for other captures.
 pub fn joint_names(capture: &Path) -> Result<Vec<String>> {
     #[derive(Default, serde::Deserialize)]
     #[serde(default)]
