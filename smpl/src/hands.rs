@@ -12,6 +12,12 @@ const HANDS: [usize; 2] = [22, 23];
 const RADIUS: f32 = 0.3;
 
 impl BodyModel {
+    /// Joints of the left and right wrist; none of a body without SMPL's joints.
+    #[must_use]
+    pub fn wrists(&self) -> Option<[usize; 2]> {
+        (self.num_joints() == JOINTS).then_some(WRISTS)
+    }
+
     /// Vertices of the left and of the right hand with their distances beyond the knuckles along the
     /// fingers, relative to that from wrist to hand; negative on the palm. None of a body without SMPL's
     /// joints.

@@ -95,10 +95,7 @@ impl Crop {
 
     /// Coverage, interpolated bilinearly; `None` beyond the outermost pixel centres.
     pub fn coverage_at(&self, at: Vec2) -> Option<f32> {
-        let (corners, share) = corners(at, self.camera.width as usize, self.camera.height as usize)?;
-        let [a, b, c, d] = corners.map(|i| f32::from(self.coverage[i]) / 255.0);
-        let (top, bottom) = (a + share.x * (b - a), c + share.x * (d - c));
-        Some(top + share.y * (bottom - top))
+        interpolated(|i| f32::from(self.coverage[i]) / 255.0, at, &self.camera)
     }
 
     /// The crop under a Gaussian blur with standard deviation `sigma`, pixels; black and empty beyond
@@ -142,6 +139,14 @@ impl Blurred {
         let (top, bottom) = (a.lerp(b, share.x), c.lerp(d, share.x));
         Some(ColorSample { color: top.lerp(bottom, share.y), dx: (b - a).lerp(d - c, share.y), dy: bottom - top })
     }
+}
+
+/// Values of pixels, interpolated bilinearly; `None` beyond the outermost pixel centres.
+pub(crate) fn interpolated(value: impl Fn(usize) -> f32, at: Vec2, camera: &Camera) -> Option<f32> {
+    let (corners, share) = corners(at, camera.width as usize, camera.height as usize)?;
+    let [a, b, c, d] = corners.map(value);
+    let (top, bottom) = (a + share.x * (b - a), c + share.x * (d - c));
+    Some(top + share.y * (bottom - top))
 }
 
 /// The four pixels around a point, row by row, and its fractional offset from the first centre;

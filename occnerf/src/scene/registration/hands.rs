@@ -9,9 +9,12 @@ use crate::scene::registration::crop::Crop;
 /// Curls that are compared.
 const CURLS: [f32; 5] = [0.0, 0.25, 0.5, 0.75, 1.0];
 /// Share of the finger's vertices that a full curl has to bring into the masks.
-const WORTH: f32 = 0.1;
-/// Share of the palm's vertices in the mask from which a frame shows a hand, and least such frames.
-const SHOWN: f32 = 0.9;
+const WORTH: f32 = 0.15;
+/// A frame shows a hand with this share of the palm's vertices in the mask, and of the flat fingers' beside the
+/// rest of the body by more than this many pixels; least such frames.
+const SHOWN: f32 = 0.75;
+const FREE: f32 = 0.7;
+const BESIDE: i32 = 2;
 const LEAST_FRAMES: usize = 5;
 
 /// How far the masks say that the fingers of each hand are rolled up, the same in all frames: flat fingers
@@ -39,9 +42,9 @@ pub(super) fn curls(
             part().filter(covered).count() as f32 / part().count().max(1) as f32
         };
         Some(hands.each_ref().map(|hand| {
-            posed
-                .each_ref()
-                .map(|vertices| (share(vertices, hand, false) >= SHOWN).then(|| 1.0 - share(vertices, hand, true)))
+            let is_free = free(crop, &posed[0], hand) >= FREE;
+            let shown = |vertices: &Vec<Vec3>| is_free && share(vertices, hand, false) >= SHOWN;
+            posed.each_ref().map(|vertices| shown(vertices).then(|| 1.0 - share(vertices, hand, true)))
         }))
     };
     let frames: Vec<_> = (0..crops.len()).into_par_iter().filter_map(outside).collect();
@@ -57,4 +60,24 @@ pub(super) fn curls(
         let best = (0..CURLS.len()).min_by(|&a, &b| costs[a].total_cmp(&costs[b])).unwrap_or(0);
         CURLS[best]
     })
+}
+
+/// Share of a hand's fingers whose projections lie beside those of the rest of the body.
+fn free(crop: &Crop, vertices: &[Vec3], hand: &[(usize, f32)]) -> f32 {
+    let mut rest: Vec<bool> = vec![true; vertices.len()];
+    hand.iter().for_each(|&(v, _)| rest[v] = false);
+    let (width, height) = (crop.camera.width as usize, crop.camera.height as usize);
+    let pixel = |v: usize| crop.camera.project(vertices[v]).and_then(|at| crop.pixel(at.truncate()));
+    let mut taken = vec![false; width * height];
+    for at in (0..vertices.len()).filter(|&v| rest[v]).filter_map(pixel) {
+        for (dx, dy) in (-BESIDE..=BESIDE).flat_map(|dy| (-BESIDE..=BESIDE).map(move |dx| (dx, dy))) {
+            let (x, y) = ((at % width) as i32 + dx, (at / width) as i32 + dy);
+            if (0..width as i32).contains(&x) && (0..height as i32).contains(&y) {
+                taken[y as usize * width + x as usize] = true;
+            }
+        }
+    }
+    let fingers = || hand.iter().filter(|(_, along)| *along > 0.0);
+    let beside = fingers().filter(|(v, _)| pixel(*v).is_some_and(|at| !taken[at])).count();
+    beside as f32 / fingers().count().max(1) as f32
 }

@@ -129,7 +129,12 @@ pub fn register(mended: Mended, model: &BodyModel, rounds: usize) -> Result<Regi
         if round == outlines {
             registration.pose_error.rotation = PoseErrorModel::ROTATION;
             if outlines >= FIST_ROUNDS {
-                let posed = |body: &_, f| registration.posed_as(body, f, &registration.betas).1.vertices;
+                // Wrists as given: those of flat fingers have turned them into the mask of a fist.
+                let posed = |body: &BodyModel, f: usize| {
+                    let mut correction = registration.corrections[f].clone();
+                    body.wrists().into_iter().flatten().for_each(|wrist| correction[1 + wrist] = Vec3::ZERO);
+                    registration.posed_as(body, f, &registration.betas, &correction).1.vertices
+                };
                 fists = hands::curls(model, &registration.crops, posed);
                 registration.model = clenched.get_or_init(|| model.with_fists(fists));
             }
@@ -290,14 +295,14 @@ impl<'a> Registration<'a> {
 
     /// Corrected body of a frame, with `betas` added to its shape coefficients.
     fn posed(&self, f: usize, betas: &[f32]) -> (Shaped, Posed) {
-        self.posed_as(self.model, f, betas)
+        self.posed_as(self.model, f, betas, &self.corrections[f])
     }
 
     /// [`Registration::posed`] of another body with the same joints.
-    fn posed_as(&self, model: &BodyModel, f: usize, betas: &[f32]) -> (Shaped, Posed) {
+    fn posed_as(&self, model: &BodyModel, f: usize, betas: &[f32], correction: &Correction) -> (Shaped, Posed) {
         let frame = &self.capture.train[self.frames[f]];
         let shape = model.shaped(&sum(&frame.betas, betas));
-        let (pose, placement) = corrected(frame, model, &shape, &self.corrections[f]);
+        let (pose, placement) = corrected(frame, model, &shape, correction);
         let depth = self.root_depths.as_ref().map_or(Vec3::ZERO, |depths| depths[f]);
         let posed = model.pose(&shape, &pose, rescaled(placement, depth, self.inverse_depth));
         (shape, posed)

@@ -1,10 +1,12 @@
-//! Observations of the posed prior in one frame: distances from its outline to the mask's, and the
+//! Observations of the posed prior in one frame: distances from its outline to the mask's of equal coverage, and the
 //! colours of its vertices.
 
 use std::collections::HashMap;
+use std::ops::RangeInclusive;
 
 use glam::{Mat3, Vec2, Vec3};
-use visibility::{Fragment, RasterOptions, Rasterizer};
+use visibility::{Fragment, Pixel, RasterOptions, Rasterizer, Samples, View};
+use volrender::Camera;
 
 use crate::Error;
 use crate::config::OccludedRule;
@@ -12,13 +14,18 @@ use crate::model::subdivide::normals;
 use crate::model::view::pinhole;
 use crate::scene::labels::{Label, Labels, label_pixels};
 use crate::scene::light::ColorObservation;
-use crate::scene::registration::crop::{ColorSample, Crop};
+use crate::scene::registration::crop::{ColorSample, Crop, interpolated};
 
 /// Step of the search for the mask's edge, pixels.
 const STEP: f32 = 0.5;
 /// An outline point needs background this far outside and body this far inside, pixels.
 const OUTSIDE: f32 = 2.0;
 const INSIDE: f32 = 1.5;
+/// Coverage of the rendered outline at a point whose distance is measured: 0.5 on straight edges, less on
+/// thin limbs, more in concave corners.
+const LEVELS: RangeInclusive<f32> = 0.15..=0.85;
+/// Rows and columns of a pixel whose coverage is rendered, of four samples each.
+const FINE: usize = 2;
 /// Least cosine between normal and view direction, and least coverage, of an observed colour.
 const FACING: f32 = 0.4;
 const COVERED: f32 = 0.7;
@@ -82,8 +89,9 @@ pub(crate) struct ObservationOptions {
 }
 
 /// Searches the mask's edge along the normals of the outline of `vertices`, and samples the colours
-/// of vertices that face the camera. An edge counts if background lies beyond it, which excludes
-/// edges at an occluder.
+/// of vertices that face the camera. The edge is where the mask falls below the coverage that the
+/// rendered outline has at its own point: a pixel's footprint shifts both alike on thin limbs and in
+/// corners. It counts if background lies beyond it, which excludes edges at an occluder.
 pub(crate) fn observe(
     crop: &Crop,
     vertices: &[Vec3],
@@ -95,6 +103,7 @@ pub(crate) fn observe(
     let options = RasterOptions { near: 1e-3 * unit, ..RasterOptions::default() };
     let nearest: Vec<Option<Fragment>> = Rasterizer::default().faces(vertices, faces, &pinhole(camera), &options)?;
     let silhouette: Vec<bool> = nearest.iter().map(Option::is_some).collect();
+    let rendered = coverage(vertices, faces, camera, &options)?;
     let normals = normals(vertices, faces);
     let (eye, to_camera) = (camera.centre_of_projection(), camera.world_to_camera);
     let centre = vertices.iter().sum::<Vec3>() / vertices.len().max(1) as f32;
@@ -110,12 +119,13 @@ pub(crate) fn observe(
     let is_background = |p: Vec2| crop.pixel(p).is_some_and(|i| labels.at(i as u32) == Label::Background);
     let is_covered = |p: Vec2| crop.pixel(p).is_some_and(|i| silhouette[i]);
     let end_of_mask = |from: Vec2, along: Vec2| -> Option<f32> {
+        let level = interpolated(|i| rendered[i], from, camera).filter(|level| LEVELS.contains(level))?;
         let count = (reach / STEP) as i32;
         let value = |i: i32| crop.coverage_at(from + along * (i as f32 * STEP));
         let ends = (-count..count).filter_map(|i| {
             let (inside, outside) = (value(i)?, value(i + 1)?);
-            let ends = inside >= 0.5 && outside < 0.5;
-            ends.then(|| STEP * (i as f32 + (inside - 0.5) / (inside - outside)))
+            let ends = inside >= level && outside < level;
+            ends.then(|| STEP * (i as f32 + (inside - level) / (inside - outside)))
         });
         let nearest = ends.min_by(|a, b| a.abs().total_cmp(&b.abs()))?;
         let clear = [1.0, 2.0].iter().all(|beyond| is_background(from + along * (nearest + beyond)));
@@ -173,4 +183,28 @@ pub(crate) fn observe(
         }
     }
     Ok(observed)
+}
+
+/// Share of each pixel that a mesh covers, (H, W).
+fn coverage(
+    vertices: &[Vec3],
+    faces: &[[u32; 3]],
+    camera: &Camera,
+    options: &RasterOptions,
+) -> Result<Vec<f32>, Error> {
+    let (width, height) = (camera.width as usize, camera.height as usize);
+    let View { focal, centre, .. } = pinhole(camera);
+    let fine = FINE as f32;
+    let (across, down) = (FINE as u32 * camera.width, FINE as u32 * camera.height);
+    let view = View { focal: fine * focal, centre: fine * centre, width: across, height: down, ..pinhole(camera) };
+    let options = RasterOptions { samples: Samples::Four, ..*options };
+    let mut covered = vec![0u8; FINE * width * FINE * height];
+    let count = |pixel: Pixel<'_>| pixel.samples.iter().flatten().count() as u8;
+    Rasterizer::default().draw(vertices, faces, &view, &options, &mut covered, count)?;
+    let mut shares = vec![0.0; width * height];
+    for (i, &samples) in covered.iter().enumerate() {
+        let (x, y) = (i % (FINE * width), i / (FINE * width));
+        shares[y / FINE * width + x / FINE] += f32::from(samples) / (4 * FINE * FINE) as f32;
+    }
+    Ok(shares)
 }

@@ -240,6 +240,37 @@ fn clothes_are_found_as_far_out_as_they_are_and_an_occluder_is_no_outline() {
     }
 }
 
+/// Spheres of a few pixels, whose masks are counted on a grid of 16 × 16 samples a pixel: half the
+/// coverage lies inside their outline, the rendered coverage on it.
+#[test]
+fn outlines_of_small_things_are_found_without_bias() {
+    let sphere = testkit::mesh::icosphere(4);
+    let camera = Camera::new(Mat3::from_diagonal(Vec3::new(1e3, 1e3, 1.0)), Affine3A::IDENTITY, 32, 32).unwrap();
+    for radius in [2.2, 3.0, 5.0] {
+        let centre = Vec2::new(15.37, 15.71);
+        let placed: Vec<Vec3> = sphere.vertices.iter().map(|v| centre.extend(1e3) + radius * *v).collect();
+        for off in [0.0, 0.6] {
+            let inside = |x: f32, y: f32| f32::from(u8::from(Vec2::new(x, y).distance(centre) < radius + off));
+            let mask = |i: usize| {
+                let grid = (0..256).map(|k| (k % 16, k / 16));
+                let sample = |(x, y)| {
+                    inside((i % 32) as f32 + (x as f32 + 0.5) / 16.0, (i / 32) as f32 + (y as f32 + 0.5) / 16.0)
+                };
+                grid.map(sample).sum::<f32>() / 256.0
+            };
+            let mask: Vec<f32> = (0..32 * 32).map(mask).collect();
+            let image = Image { width: 32, height: 32, pixels: mask.iter().flat_map(|m| [*m; 3]).collect() };
+            let corners = [Vec3::new(0.0, 0.0, 1e3), Vec3::new(32.0, 32.0, 1e3)];
+            let crop = Crop::new(&camera, &Pixels { image, mask, occluder: None }, &corners).unwrap();
+            let options = ObservationOptions { reach: 4.0, blur: 0.0, unit: 1.0 };
+            let found = observe(&crop, &placed, (&sphere.faces, &shared_edges(&sphere.faces)), options).unwrap().edges;
+            let mean = found.iter().map(|edge| edge.distance).sum::<f32>() / found.len() as f32;
+            assert!(found.len() >= 30, "{}", found.len());
+            assert!((mean - off).abs() < 0.03 + 0.1 * off, "{radius} {off}: {mean}");
+        }
+    }
+}
+
 /// The middle of an antialiased edge is where its coverage says, wherever it falls between pixels.
 #[test]
 fn edges_of_antialiased_masks_are_found_without_bias() {
