@@ -114,17 +114,6 @@ proptest! {
     }
 
     #[test]
-    fn batches_equal_single_frames_bit_for_bit(poses in prop::collection::vec(pose(), 1..20), betas in betas()) {
-        let shaped = BODY.shaped(&betas);
-        let frames: Vec<_> = poses.iter().map(|p| (&shaped, p.as_slice(), pelvis(Vec3::Y))).collect();
-        let batch = BODY.pose_batch(&frames);
-        prop_assert_eq!(batch.len(), poses.len());
-        for (posed, pose) in batch.iter().zip(&poses) {
-            prop_assert_eq!(posed, &BODY.pose(&shaped, pose, pelvis(Vec3::Y)));
-        }
-    }
-
-    #[test]
     fn posed_surface_points_map_back_to_rest(
         pose in pose(),
         face in any::<prop::sample::Index>(),
@@ -155,17 +144,6 @@ fn determinant(posed: &Posed, v: usize) -> f32 {
         sum += posed.bones[joint].matrix3 * w;
     }
     sum.determinant()
-}
-
-#[test]
-fn poses_do_not_depend_on_the_number_of_threads() {
-    let shaped = BODY.shaped(&[1.0]);
-    let pose: Vec<Vec3> = (0..24).map(|i| Vec3::new(0.1, -0.05, 0.02) * i as f32).collect();
-    let on = |threads: usize| {
-        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-        pool.install(|| BODY.pose(&shaped, &pose, Placement::default()))
-    };
-    assert_eq!(on(1), on(5));
 }
 
 #[test]

@@ -208,7 +208,6 @@ mod tests {
     use proptest::prelude::*;
 
     use super::*;
-    use crate::{DemoConfig, demo};
 
     fn bar(width: usize, rows: usize, columns: Range<usize>) -> Vec<f32> {
         (0..width * rows).map(|i| f32::from(columns.contains(&(i % width)))).collect()
@@ -243,25 +242,6 @@ mod tests {
         assert_eq!(always(0.5).columns(&[whole(&mask, 10)]).unwrap()[0], 1..3);
         let columns = always(0.95).columns(&[whole(&mask, 10)]).unwrap();
         assert!(columns[0].start == 0 && columns[0].end >= 4);
-    }
-
-    #[test]
-    fn the_first_share_of_the_frames_is_occluded() {
-        let body = smpl::BodyModel::embedded();
-        let clear =
-            DemoConfig { size: 32, frames: 10, eval_cameras: 1, occluded_fraction: 0.0, ..DemoConfig::default() };
-        let clear = demo(&clear, &body).unwrap();
-        for (share, affected) in [(0.0, 0), (0.3, 3), (0.8, 8), (1.0, 10)] {
-            let mut frames = clear.train.clone();
-            let areas = Obstacle { share, ..Obstacle::default() }.hide(&mut frames).unwrap();
-            for (i, (hidden, whole)) in frames.iter().zip(&clear.train).enumerate() {
-                assert_eq!(
-                    (hidden.pixels().unwrap() != whole.pixels().unwrap(), !areas[i].is_empty()),
-                    (i < affected, i < affected),
-                    "{share} {i}"
-                );
-            }
-        }
     }
 
     #[test]

@@ -277,21 +277,6 @@ mod tests {
     }
 
     #[test]
-    fn nothing_changes_by_default() {
-        let body = BodyModel::embedded();
-        let (before, mut after) = (capture(&body), capture(&body));
-        Perturbation::default().apply(&mut after, &body).unwrap();
-        for (a, b) in before.train.iter().zip(&after.train) {
-            assert!(
-                a.pose == b.pose
-                    && a.betas == b.betas
-                    && a.pixels().unwrap().mask == b.pixels().unwrap().mask
-                    && a.placement == b.placement
-            );
-        }
-    }
-
-    #[test]
     fn bones_turn_by_the_angle_asked_for_about_the_pelvis_in_both_placements() {
         let body = BodyModel::embedded();
         let before = capture(&body);

@@ -150,21 +150,6 @@ fn a_second_signal_ends_at_once_and_leaves_the_last_checkpoint() {
     done(&["train", "--resume", "--stop-after", "1", "--out", text(&run)]);
 }
 
-/// Time in which the process does not run changes nothing that is learnt.
-#[test]
-fn a_training_that_is_stopped_and_continued_ends_the_same_to_the_bit() {
-    let folder = folder("paused");
-    let (run, whole) = (folder.join("run"), folder.join("whole"));
-    done(&training(&whole, "120"));
-    let child = start(&training(&run, "120"));
-    wait_for(&run.join("train.jsonl"));
-    let pause = format!("for i in 1 2 3; do kill -STOP {0}; sleep 0.4; kill -CONT {0}; sleep 0.1; done", child.id());
-    assert!(Command::new("sh").args(["-c", &pause]).status().unwrap().success());
-    assert_eq!(child.wait_with_output().unwrap().status.code(), Some(0));
-    let bytes = |run: &Path| std::fs::read(run.join("checkpoint.safetensors")).unwrap();
-    assert!(bytes(&run) == bytes(&whole) && run.join("metrics.json").is_file());
-}
-
 #[test]
 fn what_the_program_was_started_to_ignore_stays_ignored() {
     let run = folder("nohup").join("run");

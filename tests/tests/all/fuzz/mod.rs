@@ -26,6 +26,7 @@ use occnerf::capture::{Image, ImportOptions, LoadOptions, import, load_capture};
 use occnerf::{Config, Lpips, Person, Trainer, checkpoint_config};
 use rigged::{Character, load_mesh};
 use smpl::{BodyModel, MotionClip};
+use testkit::files::shared;
 
 /// Longest that a reader may take.
 const LONGEST: Duration = Duration::from_secs(1);
@@ -38,7 +39,7 @@ struct Attack {
     seeds: Vec<Vec<u8>>,
     /// Part of all inputs, in thousandths.
     share: u64,
-    /// Most memory, in bytes, that any of these inputs (at most 1 MiB each) may take.
+    /// Most memory, in bytes, that any of these inputs (at most the seed's size or 1 MiB each) may take.
     most: u64,
 }
 
@@ -68,7 +69,8 @@ impl Attack {
                 }
             }
             if outcome.is_err() || seconds >= LONGEST || memory > self.most {
-                let path = PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join(format!("fuzz-{}-{number}", self.name));
+                let path = PathBuf::from(env!("CARGO_TARGET_TMPDIR"))
+                    .join(format!("fuzz-{}-{number}", self.name.replace('/', "-")));
                 std::fs::write(&path, &bytes).unwrap();
                 let panicked = if outcome.is_err() { "panicked" } else { "no panic" };
                 panic!("{}: {panicked}, {seconds:?}, {} MiB: {}", self.name, memory / MIB, path.display());
@@ -309,6 +311,19 @@ fn fits_of_estimators() {
         ["intri.yml", "extri.yml"].iter().for_each(|name| write(name, bytes));
         imports(&dir, &video)
     });
+    let Some(dir) = shared("estimators") else { return };
+    for (name, form) in [
+        ("wham/wham_output.pkl", Form::Plain),
+        ("prompthmr/results.pkl", Form::Plain),
+        ("gvhmr/hmr4d_results.pt", Form::Zip),
+        ("romp/video_results.npz", Form::Zip),
+    ] {
+        let (seed, path) = (std::fs::read(dir.join(name)).unwrap(), place(name.split('/').next_back().unwrap()));
+        Attack { name, form, seeds: vec![seed], share: 5, most: 600 * MIB }.run(|bytes| {
+            std::fs::write(&path, bytes).unwrap();
+            imports(&path, &dir.join("frames"))
+        });
+    }
 }
 
 #[test]

@@ -139,6 +139,7 @@ pub fn damaged(random: &mut Random, form: Form, seeds: &[Vec<u8>]) -> Vec<u8> {
 }
 
 fn harm(random: &mut Random, mut bytes: Vec<u8>, other: &[u8]) -> Vec<u8> {
+    let most = bytes.len().max(1 << 20);
     for _ in 0..=random.below(4) {
         let at = random.below(bytes.len() + 1);
         let end = (at + 1 + random.below(32)).min(bytes.len());
@@ -173,7 +174,7 @@ fn harm(random: &mut Random, mut bytes: Vec<u8>, other: &[u8]) -> Vec<u8> {
             }
             _ => number(random, &mut bytes, at),
         }
-        bytes.truncate(1 << 20);
+        bytes.truncate(most);
     }
     bytes
 }

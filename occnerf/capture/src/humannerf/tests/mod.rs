@@ -2,10 +2,10 @@ mod errors;
 mod fixture;
 
 use glam::Vec3;
-use smpl::{BodyModel, Placement};
+use smpl::Placement;
 
 use self::fixture::Fixture;
-use crate::testing::{body, overlap, shared};
+use crate::testing::body;
 use crate::{LoadOptions, find_body, load_capture};
 
 #[test]
@@ -34,25 +34,6 @@ fn a_whole_capture_is_read() {
     assert_eq!(capture.eval[1].camera_name, "Camera_B2");
     assert_eq!(capture.eval[1].train_index, 2);
     assert_eq!(capture.eval[1].frame.name, "frame_000002");
-}
-
-#[test]
-fn images_hold_nothing_of_what_masks_hide() {
-    let fixture = Fixture::new("hidden");
-    let capture = load_capture(&fixture.dir, &body(), &LoadOptions::default()).unwrap();
-    for frame in &capture.train {
-        let (mut shown, mut hidden) = (0, 0);
-        for (pixel, &mask) in frame.pixels().unwrap().image.pixels.chunks(3).zip(&frame.pixels().unwrap().mask) {
-            if mask > 0.5 {
-                shown += 1;
-                assert!(pixel.iter().all(|&c| (c - 200.0 / 255.0).abs() < 1e-6));
-            } else {
-                hidden += 1;
-                assert_eq!(pixel, [0.0; 3]);
-            }
-        }
-        assert!(shown > 0 && hidden > 0);
-    }
 }
 
 #[test]
@@ -118,31 +99,4 @@ fn the_nearest_body_is_found() {
         std::fs::remove_file(scene.join("body.npz")).unwrap();
         std::fs::remove_file(scene.join(layout)).unwrap();
     }
-}
-
-#[test]
-fn the_shared_capture_is_read() {
-    let Some(scene) = shared("captures/humannerf_demo") else { return };
-    let file = find_body(&scene).unwrap();
-    assert_eq!(file.file_name().unwrap(), "open_body.npz");
-    let body = BodyModel::load(&file).unwrap();
-    let capture = load_capture(&scene, &body, &LoadOptions::default()).unwrap();
-    assert_eq!((capture.train.len(), capture.eval.len()), (100, 100));
-    assert_eq!(capture.mean_betas.len(), 10);
-    for eval in &capture.eval {
-        assert_eq!(capture.train[eval.train_index].name, eval.frame.name);
-        assert_eq!(capture.train[eval.train_index].pose, eval.frame.pose);
-        assert_eq!(capture.train[eval.train_index].placement, eval.frame.placement);
-    }
-    // The posed prior covers the unoccluded subject: poses, placement and cameras are read the
-    // right way.
-    for eval in capture.eval.iter().step_by(9) {
-        let overlap = overlap(&eval.frame, &body);
-        assert!(overlap > 0.6, "{} {}: {overlap}", eval.camera_name, eval.frame.name);
-    }
-    // Another body is told apart.
-    let mut taller = body;
-    taller.v_template.iter_mut().for_each(|v| v.y *= 1.1);
-    let message = load_capture(&scene, &taller, &LoadOptions::default()).err().unwrap().to_string();
-    assert!(message.contains("tpose_joints") && message.contains("body model"), "{message}");
 }
