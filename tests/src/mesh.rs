@@ -174,30 +174,3 @@ pub fn open_grid(n: u32) -> TriMesh {
     }
     TriMesh { vertices, faces }
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn closed_meshes_are_closed_and_wound_outward() {
-        let pi = std::f64::consts::PI;
-        for (name, mesh, volume, tolerance) in [
-            ("icosphere", icosphere(4), 4.0 / 3.0 * pi, 0.02),
-            ("cuboid", cuboid(Vec3::new(0.5, 1.0, 2.0)), 8.0, 1e-6),
-            // 2 π² R r²
-            ("torus", torus(2.0, 0.5, 64, 32), pi * pi, 0.1),
-        ] {
-            assert!(mesh.is_closed(), "{name} is open");
-            let difference = (mesh.volume() - volume).abs();
-            assert!(difference < tolerance, "{name}: volume {} of {volume}", mesh.volume());
-        }
-    }
-
-    #[test]
-    fn a_flipped_face_is_not_closed() {
-        let mut mesh = cuboid(Vec3::ONE);
-        mesh.faces[3].swap(0, 1);
-        assert!(!mesh.is_closed());
-    }
-}

@@ -87,33 +87,7 @@ fn a_checkpoint_cut_short_anywhere_is_refused() {
 }
 
 #[test]
-fn a_bit_flipped_in_the_header_never_panics() {
-    let dir = Directory::new("flip");
-    let bytes = good(&dir);
-    let path = dir.file("flip.safetensors");
-    let (mut accepted, mut refused) = (0, 0);
-    for at in 0..header_length(&bytes) {
-        let mut flipped = bytes.clone();
-        // Every bit has its turn. Lengths are flipped in all of theirs.
-        flipped[at] ^= 1 << (at % 8);
-        match resume(scene(), &path, &flipped) {
-            // Another seed, rate or space is as good as any; it must train.
-            Ok(mut trainer) => {
-                accepted += 1;
-                trainer.step().unwrap();
-            }
-            Err(error) => {
-                refused += 1;
-                let message = error.to_string();
-                assert!(message.contains("flip.safetensors"), "bit {} of byte {at}: `{message}`", at % 8);
-            }
-        }
-    }
-    assert!(refused > 4 * accepted, "{accepted} accepted, {refused} refused");
-}
-
-#[test]
-fn numbers_that_are_not_finite_are_refused_by_name() {
+fn numbers_that_cannot_be_are_refused_by_name() {
     let dir = Directory::new("nan");
     let bytes = good(&dir);
     let path = dir.file("nan.safetensors");
@@ -126,18 +100,11 @@ fn numbers_that_are_not_finite_are_refused_by_name() {
             assert!(message.contains(name) && message.contains("at 2"), "{message}");
         }
     }
-}
-
-/// Adam takes its square root.
-#[test]
-fn a_negative_second_moment_is_refused() {
-    let dir = Directory::new("moment");
-    let bytes = good(&dir);
+    // Adam takes its square root.
     let forged = forged(&bytes, |_, arrays| {
         arrays.get_mut("field.second_moment").unwrap().2[..4].copy_from_slice(&(-1.0f32).to_le_bytes());
     });
-    let message = refused(scene(), &dir.file("moment.safetensors"), &forged, "negative");
-    assert!(message.contains("field.second_moment"), "{message}");
+    assert!(refused(scene(), &path, &forged, "negative").contains("field.second_moment"));
 }
 
 #[test]

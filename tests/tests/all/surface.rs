@@ -1,5 +1,5 @@
-//! Surface queries, ray casts and cameras are written apart from each other; here they must say the
-//! same of a body.
+//! Rasterising, ray casts and cameras are written apart from each other; here they must say the same of a
+//! body.
 
 use crate::common;
 
@@ -8,35 +8,7 @@ use approx::assert_abs_diff_eq;
 use common::{scene, silhouette};
 use glam::Vec3;
 use occnerf::{PriorColors, PriorRenderer, Renderer};
-use proptest::prelude::*;
-use surface_query::MeshDistance;
-use testkit::{oracle, strategy};
-use visibility::RayMesh;
-
-proptest! {
-    #![proptest_config(ProptestConfig::with_cases(24))]
-
-    #[test]
-    fn where_a_ray_first_hits_the_distance_is_zero_and_nothing_is_nearer_than_the_distance(
-        mesh in strategy::bumpy_sphere(), o in strategy::vec3(2.5), d in strategy::unit_vec3(), length in 0.1f32..5.0,
-    ) {
-        let rays = RayMesh::new(&mesh.vertices, &mesh.faces).unwrap();
-        let distances = MeshDistance::new(&mesh.vertices, &mesh.faces).unwrap();
-        let from = distances.closest(o).signed_distance;
-        let hit = rays.first_hit(o, d * length);
-        prop_assert!(hit.is_some() || from > 0.0, "no way out from inside, at {from}");
-        if let Some(hit) = hit {
-            let p = o + hit.t * length * d;
-            let closest = distances.closest(p);
-            prop_assert!(closest.signed_distance.abs() < 1e-5, "{}", closest.signed_distance);
-            prop_assert!(hit.t * length >= from.abs() - 1e-5);
-            // Both name the same point of the same surface.
-            let corners = mesh.faces[hit.face as usize].map(|v| mesh.vertices[v as usize]);
-            let named: Vec3 = corners.iter().zip(hit.barycentric).map(|(&v, b)| v * b).sum();
-            prop_assert!(named.distance(closest.point) < 2e-5);
-        }
-    }
-}
+use testkit::oracle;
 
 /// The picture of the prior against rays cast one by one over all triangles in `f64`.
 #[test]

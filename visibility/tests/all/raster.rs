@@ -191,18 +191,6 @@ proptest! {
     }
 
     #[test]
-    fn the_picture_does_not_depend_on_the_number_of_threads(
-        mesh in strategy::bumpy_sphere(), away in strategy::unit_vec3(),
-    ) {
-        let view = towards_origin(away * 2.0, 60.0, 90);
-        let [one, many] = [1, 3].map(|threads| {
-            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-            pool.install(|| draw(&mesh, &view))
-        });
-        prop_assert_eq!(one, many);
-    }
-
-    #[test]
     fn the_inside_of_a_closed_mesh_is_hidden_from_outside(
         mesh in strategy::bumpy_sphere(), away in strategy::unit_vec3(), r in 1.6f32..6.0,
     ) {

@@ -11,7 +11,7 @@ use std::process::{Child, Command, Output, Stdio};
 use std::sync::OnceLock;
 use std::time::{Duration, Instant};
 
-use common::{done, folder, refused, text, xtask};
+use common::{QUICK, done, folder, refused, text, xtask};
 use occnerf::capture::Layout;
 
 /// A capture that trains at a thousand steps a minute or more.
@@ -25,8 +25,7 @@ fn capture() -> &'static Path {
 }
 
 fn training<'a>(out: &'a Path, steps: &'a str) -> Vec<&'a str> {
-    let quick = ["--preset", "fast", "--method", "hash-point", "--set", "samples=8", "--set", "patches=1"];
-    [&["train", text(capture()), "--out", text(out), "--steps", steps][..], &quick].concat()
+    [&["train", text(capture()), "--out", text(out), "--steps", steps][..], &QUICK].concat()
 }
 
 fn start(arguments: &[&str]) -> Child {

@@ -24,6 +24,27 @@ pub(super) struct Motion {
     pub joint: DVec3,
 }
 
+impl Motion {
+    /// That the person moves so, in the camera.
+    #[track_caller]
+    pub fn is_of(&self, person: &Person) {
+        for (i, frame) in person.frames.iter().enumerate() {
+            let lens = (i, [self.k[0], self.k[4]], [self.k[2], self.k[5]]);
+            assert_eq!((frame.index, frame.focal, frame.centre), lens);
+            assert!(frame.pelvis(self.joint).distance(self.pelvises[i]) < 1e-5);
+            let root = frame.world_to_camera * fit::rotation(frame.pose[0]);
+            assert!(root.abs_diff_eq(fit::rotation(self.poses[i][0]), 1e-5));
+            assert!(frame.pose[1..].iter().zip(&self.poses[i][1..]).all(|(a, b)| a.distance(*b) < 1e-5));
+        }
+    }
+}
+
+/// The rows of a camera's 4 × 4 extrinsics.
+pub(super) fn extrinsics(turn: glam::DMat3, moved: DVec3) -> Vec<f64> {
+    let row = |r: usize| [turn.row(r).x, turn.row(r).y, turn.row(r).z, moved[r]];
+    [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]].concat()
+}
+
 pub(super) fn known(dir: &Path) -> Motion {
     let mut expected = Expected::open(dir, "easymocap");
     let (roots, poses) = (expected.values("root_cam"), expected.values("poses"));

@@ -178,6 +178,7 @@ fn stride_and_limit_keep_frames_and_their_views_together() {
         ("max_frames", LoadOptions { max_frames: Some(0), ..LoadOptions::default() }),
         ("resize", LoadOptions { resize: Some(0), ..LoadOptions::default() }),
         ("camera", LoadOptions { camera: Some("1".to_owned()), ..LoadOptions::default() }),
+        ("pixel_centre", LoadOptions { pixel_centre: f32::NAN, ..LoadOptions::default() }),
     ] {
         let message = load_capture(dir.path(), &body(), &options).unwrap_err().to_string();
         assert!(message.contains(word), "{message}");

@@ -15,6 +15,8 @@ pub enum Py {
     Text(String),
     /// List.
     List(Vec<Py>),
+    /// Opcodes that leave an object.
+    Raw(Vec<u8>),
 }
 
 impl Py {
@@ -74,6 +76,7 @@ impl Py {
                 out.push(b'u');
             }
             Self::Text(words) => text(words, out),
+            Self::Raw(opcodes) => out.extend(opcodes),
             Self::List(items) => {
                 out.extend(b"](");
                 items.iter().for_each(|item| item.write(out));
@@ -114,20 +117,6 @@ fn text(words: &str, out: &mut Vec<u8>) {
 }
 
 impl Py {
-    /// Replaces the entry at a path of keys, or adds it.
-    ///
-    /// # Panics
-    /// For what is not a dictionary.
-    pub fn set(&mut self, keys: &[&str], value: Py) {
-        let Self::Dict(items) = self else { panic!("not a dictionary") };
-        let found = items.iter_mut().find(|(key, _)| key == keys[0]);
-        match (found, &keys[1..]) {
-            (Some((_, slot)), []) => *slot = value,
-            (Some((_, slot)), rest) => slot.set(rest, value),
-            (None, _) => items.push((keys[0].to_owned(), value)),
-        }
-    }
-
     /// Removes the entry at a path of keys.
     ///
     /// # Panics
