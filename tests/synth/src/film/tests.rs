@@ -79,6 +79,7 @@ fn objects_move_where_they_are_told_and_cover_what_they_hide() {
 
 #[test]
 fn settings_that_cannot_be_are_named() {
+    let behind = |obstacle| SynthConfig { occlusion: Occlusion::Rectangle(obstacle), ..small() };
     for (word, config) in [
         ("size", SynthConfig { size: 8, ..small() }),
         ("frames", SynthConfig { frames: 0, ..small() }),
@@ -97,10 +98,9 @@ fn settings_that_cannot_be_are_named() {
             SynthConfig { occlusion: Occlusion::Objects { fraction: 0.5, position: 2.0 }, ..small() },
         ),
         ("32 GiB", SynthConfig { size: 2048, frames: 10_000, ..small() }),
-        ("occlusion.share", {
-            let occlusion = Occlusion::Rectangle(Obstacle { share: 2.0, ..Obstacle::default() });
-            SynthConfig { occlusion, ..small() }
-        }),
+        ("occlusion.share", behind(Obstacle { share: 2.0, ..Obstacle::default() })),
+        ("occlusion.travel", behind(Obstacle { travel: f32::INFINITY, ..Obstacle::default() })),
+        ("occlusion.height", behind(Obstacle { height: 0.0, ..Obstacle::default() })),
     ] {
         let message = synthesise(None, None, &config, &|_| {}).err().expect(word).to_string();
         assert!(message.contains(word) && message.contains("expected"), "{message}");
