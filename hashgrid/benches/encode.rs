@@ -6,6 +6,7 @@ use divan::counter::ItemsCount;
 use divan::{Bencher, black_box};
 use hashgrid::{HashGrid, HashGridConfig};
 use rayon::prelude::*;
+use testkit::body::Random;
 
 const POINTS: usize = 1 << 16;
 /// Points per parallel task.
@@ -32,11 +33,8 @@ enum Points {
 
 fn case(kind: Points) -> Case {
     let grid = HashGrid::new(&CONFIG).expect("a grid");
-    let mut state = 1u64;
-    let mut random = || {
-        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-        (state >> 40) as f32 / (1u32 << 24) as f32
-    };
+    let mut numbers = Random(1);
+    let mut random = || numbers.unit();
     let points = (0..POINTS)
         .map(|i| match kind {
             Points::Uniform => [random(), random(), random(), random()],

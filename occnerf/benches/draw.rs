@@ -1,5 +1,4 @@
-//! Cost of drawing a baked person, skinning included, and of baking one: the demo's person after a
-//! few steps.
+//! Cost of drawing a baked person, skinning included: the demo's person after a few steps.
 #![allow(clippy::unwrap_used, reason = "a failure here is a failed bench")]
 
 use std::sync::OnceLock;
@@ -44,7 +43,8 @@ fn avatar() -> &'static Avatar {
     AVATAR.get_or_init(|| bake(&trained().model, Some(&trained().scene)).unwrap().0)
 }
 
-fn draw(bencher: Bencher<'_, '_>, samples: Samples, size: (u32, u32), threads: usize) {
+/// On one thread.
+fn draw(bencher: Bencher<'_, '_>, samples: Samples, size: (u32, u32)) {
     let model = &trained().model;
     let mut renderer = BakedRenderer::new(avatar(), model.body().scale, model.light(), samples);
     let view = &model.frames()[0];
@@ -53,52 +53,20 @@ fn draw(bencher: Bencher<'_, '_>, samples: Samples, size: (u32, u32), threads: u
     let mut camera: Camera = view.camera.resized(size.1, size.1);
     camera.centre.x += (size.0 - size.1) as f32 / 2.0;
     camera.width = size.0;
-    let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
     bencher.bench_local(|| pool.install(|| renderer.draw(&bones, &camera).map(drop)).unwrap());
 }
 
 const SIZES: [(u32, u32); 4] = [(256, 256), (512, 512), (1024, 1024), (1920, 1080)];
 
-/// One surface, two threads.
-#[divan::bench(args = SIZES)]
-fn one_surface(bencher: Bencher<'_, '_>, size: (u32, u32)) {
-    draw(bencher, Samples::One, size, 2);
-}
-
 /// One surface, one thread.
 #[divan::bench(args = SIZES)]
 fn one_surface_one_thread(bencher: Bencher<'_, '_>, size: (u32, u32)) {
-    draw(bencher, Samples::One, size, 1);
-}
-
-/// One surface, four samples a pixel, two threads.
-#[divan::bench(args = SIZES)]
-fn one_surface_four_samples(bencher: Bencher<'_, '_>, size: (u32, u32)) {
-    draw(bencher, Samples::Four, size, 2);
+    draw(bencher, Samples::One, size);
 }
 
 /// One surface, four samples a pixel, one thread.
 #[divan::bench(args = SIZES)]
 fn one_surface_four_samples_one_thread(bencher: Bencher<'_, '_>, size: (u32, u32)) {
-    draw(bencher, Samples::Four, size, 1);
-}
-
-/// Skinning alone, one thread.
-#[divan::bench]
-fn skin(bencher: Bencher<'_, '_>) {
-    let model = &trained().model;
-    let mut renderer = BakedRenderer::new(avatar(), model.body().scale, model.light(), Samples::Four);
-    let bones: Vec<Affine3A> = model.frames()[0].posed.bones.clone();
-    let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
-    bencher.bench_local(|| {
-        pool.install(|| {
-            divan::black_box(renderer.skin(&bones));
-        })
-    });
-}
-
-/// Baking, all threads.
-#[divan::bench(sample_count = 3)]
-fn baking(bencher: Bencher<'_, '_>) {
-    bencher.bench_local(|| bake(&trained().model, Some(&trained().scene)).unwrap());
+    draw(bencher, Samples::Four, size);
 }

@@ -27,8 +27,8 @@ fn scene() -> &'static Scene {
     })
 }
 
-fn trainer(preset: Preset, method: Method) -> Trainer<'static> {
-    let mut trainer = Trainer::new(scene(), Config::preset(preset, method)).unwrap();
+fn trainer(preset: Preset) -> Trainer<'static> {
+    let mut trainer = Trainer::new(scene(), Config::preset(preset, Method::Occnerf)).unwrap();
     // Buffers have grown to size, and the field is no longer the even fog it starts as.
     for _ in 0..8 {
         trainer.step().unwrap();
@@ -42,22 +42,15 @@ mod occnerf_demo {
 
     #[divan::bench(args = [Preset::Fast, Preset::Balanced])]
     fn training_step(bencher: Bencher<'_, '_>, preset: Preset) {
-        let mut trainer = trainer(preset, Method::Occnerf);
+        let mut trainer = trainer(preset);
         let config = trainer.model().config();
         let rays = config.patches * (config.patch_size * config.patch_size) as usize;
         bencher.counter(ItemsCount::new(rays)).bench_local(|| trainer.step().unwrap());
     }
 
-    /// The point-based method, at the fast preset.
-    #[divan::bench]
-    fn training_step_of_hash_point(bencher: Bencher<'_, '_>) {
-        let mut trainer = trainer(Preset::Fast, Method::HashPoint);
-        bencher.bench_local(|| trainer.step().unwrap());
-    }
-
     #[divan::bench(args = [Preset::Fast, Preset::Balanced])]
     fn rendered_frame(bencher: Bencher<'_, '_>, preset: Preset) {
-        let trainer = trainer(preset, Method::Occnerf);
+        let trainer = trainer(preset);
         let mut renderer = FieldRenderer::new(trainer.model()).unwrap();
         let frame = &scene().eval[0];
         let pixels = (frame.view.camera.width * frame.view.camera.height) as usize;

@@ -10,13 +10,6 @@ use crate::sparse::SkinningWeights;
 /// Vertices per parallel task.
 const CHUNK: usize = 1024;
 
-/// Frames per pass over the pose blend shapes: a cache line of coefficients.
-const LANES: usize = 16;
-
-/// Vertices per parallel task of a batch: their blend shapes fit in the L2 cache, their offsets for
-/// all lanes in L1.
-const TILE: usize = 64;
-
 /// Dense rows of blend shapes summed in an interleaved way, to hide the latency of additions.
 const GROUP: usize = 4;
 
@@ -97,8 +90,7 @@ impl BodyModel {
     /// Poses `shaped` (from [`BodyModel::shaped`] of this model) by the axis-angle rotations
     /// `pose`, (J), of each joint relative to its parent.
     ///
-    /// Runs on the current rayon pool. The result does not depend on its size and equals that of
-    /// [`BodyModel::pose_batch`] bit for bit.
+    /// Runs on the current rayon pool. The result does not depend on its size.
     ///
     /// ```
     /// use glam::Vec3;
@@ -128,71 +120,10 @@ impl BodyModel {
         Posed { vertices, joints: frame.joints, bones: frame.bones, pose_offsets }
     }
 
-    /// [`BodyModel::pose`] for many frames; reads the pose blend shapes once per block of frames.
-    ///
-    /// ```
-    /// use glam::Vec3;
-    /// use smpl::{BodyModel, Placement};
-    ///
-    /// let body = BodyModel::embedded();
-    /// let (shaped, pose) = (body.shaped(&[]), vec![Vec3::splat(0.1); body.num_joints()]);
-    /// let frame = (&shaped, pose.as_slice(), Placement::default());
-    /// assert_eq!(body.pose_batch(&[frame; 3])[2], body.pose(&shaped, &pose, Placement::default()));
-    /// ```
-    ///
-    /// # Panics
-    /// If a length is not the model's.
-    #[must_use]
-    pub fn pose_batch(&self, frames: &[(&Shaped, &[Vec3], Placement)]) -> Vec<Posed> {
-        let kinematics: Vec<Kinematics> =
-            frames.par_iter().map(|&(shaped, pose, placement)| self.kinematics(shaped, pose, placement)).collect();
-        // A block of frames is (P, LANES).
-        let terms = TERMS_PER_JOINT * (self.num_joints() - 1);
-        let mut features = vec![0.0f32; frames.len().div_ceil(LANES) * terms * LANES];
-        for (i, frame) in kinematics.iter().enumerate() {
-            let block = &mut features[i / LANES * terms * LANES..][..terms * LANES];
-            for (term, &value) in frame.features.as_flattened().iter().enumerate() {
-                block[LANES * term + i % LANES] = value;
-            }
-        }
-        let zeros = || vec![Vec3::ZERO; self.num_vertices()];
-        let mut arrays: Vec<(Vec<Vec3>, Vec<Vec3>)> = frames.par_iter().map(|_| (zeros(), zeros())).collect();
-        // A task owns one tile of vertices in every frame.
-        let mut tiles: Vec<Vec<(&mut [Vec3], &mut [Vec3])>> = Vec::new();
-        tiles.resize_with(self.num_vertices().div_ceil(TILE), || Vec::with_capacity(frames.len()));
-        for (vertices, offsets) in &mut arrays {
-            let parts = vertices.chunks_mut(TILE).zip(offsets.chunks_mut(TILE));
-            tiles.iter_mut().zip(parts).for_each(|(tile, part)| tile.push(part));
-        }
-        let features = features.as_slice();
-        tiles.par_iter_mut().enumerate().for_each(|(tile, parts)| {
-            let (start, kinematics) = (tile * TILE, &kinematics);
-            pulp::Arch::new().dispatch(Tile { body: self, frames, kinematics, features, start, parts });
-        });
-        drop(tiles);
-        (kinematics.into_iter().zip(arrays))
-            .map(|(Kinematics { joints, bones, .. }, (vertices, pose_offsets))| Posed {
-                vertices,
-                joints,
-                bones,
-                pose_offsets,
-            })
-            .collect()
-    }
-
-    /// B_P of vertex `v` for N frames; `features` is (P, N).
+    /// B_P of vertex `v`.
     #[inline(always)]
-    fn offset<const N: usize>(&self, v: usize, features: &[f32]) -> [[f32; N]; 3] {
-        let [mut x, mut y, mut z] = [[0.0f32; N]; 3];
-        for (term, direction) in self.posedirs.row(v) {
-            let coefficients = &features[N * term..N * term + N];
-            for lane in 0..N {
-                x[lane] += coefficients[lane] * direction.x;
-                y[lane] += coefficients[lane] * direction.y;
-                z[lane] += coefficients[lane] * direction.z;
-            }
-        }
-        [x, y, z]
+    fn offset(&self, v: usize, features: &[f32]) -> Vec3 {
+        self.posedirs.row(v).fold(Vec3::ZERO, |sum, (term, direction)| sum + features[term] * direction)
     }
 
     /// Σ w_i · bones_i · rest for vertex `v`.
@@ -247,7 +178,7 @@ struct Kinematics {
     bones: Vec<Affine3A>,
 }
 
-// The tasks dispatched by pulp are structs: a closure would not be inlined into the function that
+// The task dispatched by pulp is a struct: a closure would not be inlined into the function that
 // enables the wide instructions.
 
 /// Consecutive vertices of one frame.
@@ -277,8 +208,7 @@ impl pulp::NullaryFnOnce for OneFrame<'_> {
                 self.offsets[i..i + GROUP].copy_from_slice(&dense_offsets(values, features));
                 i += GROUP;
             } else {
-                let [[x], [y], [z]] = self.body.offset::<1>(self.start + i, features);
-                self.offsets[i] = Vec3::new(x, y, z);
+                self.offsets[i] = self.body.offset(self.start + i, features);
                 i += 1;
             }
         }
@@ -300,44 +230,6 @@ fn dense_offsets(values: &[Vec3], features: &[f32]) -> [Vec3; GROUP] {
         }
     }
     sums
-}
-
-/// A tile of vertices in every frame of a batch.
-struct Tile<'a, 'b> {
-    body: &'a BodyModel,
-    frames: &'a [(&'a Shaped, &'a [Vec3], Placement)],
-    kinematics: &'a [Kinematics],
-    /// Blocks of (P, LANES).
-    features: &'a [f32],
-    start: usize,
-    /// Vertices and offsets of each frame.
-    parts: &'a mut [(&'b mut [Vec3], &'b mut [Vec3])],
-}
-
-impl pulp::NullaryFnOnce for Tile<'_, '_> {
-    type Output = ();
-
-    #[inline(always)]
-    fn call(self) {
-        let size = LANES * TERMS_PER_JOINT * (self.body.num_joints() - 1);
-        let mut offsets = [[[0.0f32; LANES]; 3]; TILE];
-        for (block, parts) in self.parts.chunks_mut(LANES).enumerate() {
-            let features = &self.features[block * size..][..size];
-            let count = parts.first().map_or(0, |part| part.0.len());
-            for (i, offset) in offsets[..count].iter_mut().enumerate() {
-                *offset = self.body.offset::<LANES>(self.start + i, features);
-            }
-            for (lane, (vertices, out)) in parts.iter_mut().enumerate() {
-                let frame = block * LANES + lane;
-                let (bones, rest) = (&self.kinematics[frame].bones, &self.frames[frame].0.vertices[self.start..]);
-                for (i, [x, y, z]) in offsets[..count].iter().enumerate() {
-                    let offset = Vec3::new(x[lane], y[lane], z[lane]);
-                    out[i] = offset;
-                    vertices[i] = self.body.skin(self.start + i, bones, rest[i] + offset);
-                }
-            }
-        }
-    }
 }
 
 /// Linear blend skinning, (V): Σ w_vi · bones_i · vertices_v, for vertices (V), weights (V, J) and

@@ -8,8 +8,7 @@ use divan::Bencher;
 use divan::counter::ItemsCount;
 use glam::Vec3;
 use kiddo::{ImmutableKdTree, SquaredEuclidean};
-use rayon::prelude::*;
-use surface_query::{MeshDistance, Pyramid, SurfaceQuery, SurfaceQueryConfig, farthest_points};
+use surface_query::{MeshDistance, Pyramid, SurfaceQuery, SurfaceQueryConfig};
 use testkit::body::Random;
 use testkit::{TriMesh, oracle};
 
@@ -24,9 +23,11 @@ fn near(mesh: &TriMesh) -> Vec<Vec3> {
     Random(1).near_surface(mesh, 20_000, 0.05)
 }
 
-fn whole_query(bencher: Bencher<'_, '_>, config: &SurfaceQueryConfig) {
+/// k = 5 at 4 scales, blend and signed distance, random order, within 5 cm of the surface.
+#[divan::bench]
+fn neighbours_and_blend_grid(bencher: Bencher<'_, '_>) {
     let mesh = testkit::body::body_or_ball();
-    let query = SurfaceQuery::new(&mesh.vertices, &mesh.faces, config).unwrap();
+    let query = SurfaceQuery::new(&mesh.vertices, &mesh.faces, &GRID).unwrap();
     let points = near(&mesh);
     bencher.counter(ItemsCount::new(points.len())).bench_local(|| {
         let mut out = [0; 20];
@@ -37,35 +38,6 @@ fn whole_query(bencher: Bencher<'_, '_>, config: &SurfaceQueryConfig) {
         }
         sum
     });
-}
-
-/// k = 5 at 4 scales, blend and signed distance, random order, within 5 cm of the surface.
-#[divan::bench]
-fn neighbours_and_blend_grid(bencher: Bencher<'_, '_>) {
-    whole_query(bencher, &GRID);
-}
-
-/// The same through the k-d trees.
-#[divan::bench]
-fn neighbours_and_blend_trees(bencher: Bencher<'_, '_>) {
-    whole_query(bencher, &SurfaceQueryConfig::default());
-}
-
-/// As many queries as the peers were given, on two threads.
-#[divan::bench(sample_count = 10)]
-fn neighbours_and_blend_two_threads(bencher: Bencher<'_, '_>) {
-    let mesh = testkit::body::body_or_ball();
-    let query = SurfaceQuery::new(&mesh.vertices, &mesh.faces, &GRID).unwrap();
-    let points = Random(1).near_surface(&mesh, 200_000, 0.05);
-    let pool = rayon::ThreadPoolBuilder::new().num_threads(2).build().unwrap();
-    let one = |p: &Vec3| {
-        let mut out = [0; 20];
-        query.neighbours(*p, &mut out);
-        query.blend(*p, &out[..5]).signed_distance
-    };
-    bencher
-        .counter(ItemsCount::new(points.len()))
-        .bench_local(|| pool.install(|| points.par_iter().with_min_len(1024).map(one).collect::<Vec<f32>>()));
 }
 
 /// Points of the four levels, for the plain searches below.
@@ -128,28 +100,6 @@ fn mesh_distance(bencher: Bencher<'_, '_>, reach: u32) {
     });
 }
 
-/// The same at twice the faces, on two threads.
-#[divan::bench(sample_count = 10)]
-fn mesh_distance_split_two_threads(bencher: Bencher<'_, '_>) {
-    let mesh = testkit::body::body_or_ball();
-    let points = Random(1).near_surface(&mesh, 200_000, 0.05);
-    let mut vertices = mesh.vertices.clone();
-    // Every triangle in two, at the middle of its first edge.
-    let faces: Vec<[u32; 3]> = (mesh.faces.iter())
-        .flat_map(|&[a, b, c]| {
-            let m = vertices.len() as u32;
-            vertices.push((vertices[a as usize] + vertices[b as usize]) / 2.0);
-            [[a, m, c], [m, b, c]]
-        })
-        .collect();
-    let distance = MeshDistance::new(&vertices, &faces).unwrap();
-    let pool = rayon::ThreadPoolBuilder::new().num_threads(2).build().unwrap();
-    let one = |p: &Vec3| distance.closest(*p);
-    bencher
-        .counter(ItemsCount::new(points.len()))
-        .bench_local(|| pool.install(|| points.par_iter().with_min_len(1024).map(one).collect::<Vec<_>>()));
-}
-
 /// Exact closest point by looking at every face.
 #[divan::bench(sample_count = 5)]
 fn mesh_distance_brute_force(bencher: Bencher<'_, '_>) {
@@ -194,11 +144,4 @@ fn mesh_distance_build(bencher: Bencher<'_, '_>) {
 fn surface_query_build(bencher: Bencher<'_, '_>) {
     let mesh = testkit::body::body_or_ball();
     bencher.bench_local(|| SurfaceQuery::new(&mesh.vertices, &mesh.faces, &GRID));
-}
-
-/// Farthest point sampling of a quarter of the vertices.
-#[divan::bench]
-fn farthest_points_quarter(bencher: Bencher<'_, '_>) {
-    let mesh = testkit::body::body_or_ball();
-    bencher.bench_local(|| farthest_points(&mesh.vertices, mesh.vertices.len() / 4));
 }

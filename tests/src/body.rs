@@ -42,17 +42,27 @@ pub fn body_or_ball() -> TriMesh {
     open_body().unwrap_or_else(|| mesh::icosphere(5).map(|p| p * (0.4 + 0.05 * (7.0 * p.x).sin() * (9.0 * p.y).cos())))
 }
 
-/// Splitmix64: points that are the same on every machine.
+/// Splitmix64: the same on every machine.
 pub struct Random(pub u64);
 
 impl Random {
-    /// Uniform in [0, 1).
-    pub fn unit(&mut self) -> f32 {
+    /// Any number.
+    pub fn bits(&mut self) -> u64 {
         self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
         let mut z = self.0;
         z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
         z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
-        ((z ^ (z >> 31)) >> 40) as f32 / (1u64 << 24) as f32
+        z ^ (z >> 31)
+    }
+
+    /// Below `end`; 0 for 0.
+    pub fn below(&mut self, end: usize) -> usize {
+        (self.bits() % end.max(1) as u64) as usize
+    }
+
+    /// Uniform in [0, 1).
+    pub fn unit(&mut self) -> f32 {
+        (self.bits() >> 40) as f32 / (1u64 << 24) as f32
     }
 
     /// Uniform in the cube ±`range`.

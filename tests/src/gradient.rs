@@ -111,12 +111,6 @@ mod tests {
     const X: [f32; 3] = [0.7, -1.3, 0.4];
 
     #[test]
-    fn a_right_gradient_passes() {
-        let tight = Tolerance { abs: 1e-5, rel: 1e-4 };
-        assert_gradient("f", &X, &gradient(&X), 1e-2, tight, f);
-    }
-
-    #[test]
     fn every_wrong_derivative_is_reported_together() {
         let mut wrong = gradient(&X);
         wrong[0] *= -1.0;
@@ -124,11 +118,6 @@ mod tests {
         let message = check("f", &X, &wrong, 1e-2, Tolerance::default(), f).unwrap_err();
         assert!(message.contains("2 of 3"), "{message}");
         assert!(message.contains("[0]") && message.contains("[2]") && !message.contains("[1]"));
-    }
-
-    #[test]
-    fn a_missing_gradient_fails() {
-        assert!(check("f", &X, &[0.0; 3], 1e-2, Tolerance::default(), f).is_err());
     }
 
     #[test]

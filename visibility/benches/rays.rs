@@ -1,5 +1,5 @@
 //! Cost of casting rays at a body of 13776 triangles (a ball of 20480 where that is not at hand)
-//! with every triangle split in two, and of counting what views see.
+//! with every triangle split in two.
 #![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
 
 use std::hint::black_box;
@@ -13,7 +13,7 @@ use obvhs::cwbvh::builder::build_cwbvh_from_tris;
 use obvhs::ray::{Ray, RayHit};
 use obvhs::triangle::Triangle;
 use testkit::TriMesh;
-use visibility::{RayMesh, View, VisibilityCounts, visible_vertices};
+use visibility::{RayMesh, View};
 
 fn main() {
     divan::main();
@@ -93,31 +93,4 @@ fn first_hit_split_obvhs(bencher: Bencher<'_, '_>, focal: f32) {
             black_box(hit);
         }
     });
-}
-
-/// Counts of all vertices over 100 views around the body, all threads.
-#[divan::bench(sample_count = 10)]
-fn frequency_over_a_capture(bencher: Bencher<'_, '_>) {
-    let mesh = testkit::body::body_or_ball();
-    let rays = RayMesh::new(&mesh.vertices, &mesh.faces).unwrap();
-    let views: Vec<View> = (0..100)
-        .map(|i| {
-            let mut view = view(512, 1.2);
-            view.world_to_camera *= Affine3A::from_rotation_y(i as f32 * 0.0628);
-            view
-        })
-        .collect();
-    bencher.counter(ItemsCount::new(views.len() * mesh.vertices.len())).bench_local(|| {
-        let mut counts = VisibilityCounts::new(mesh.vertices.len());
-        for view in &views {
-            counts.add_visible(&visible_vertices(&rays, &mesh.vertices, view, None));
-        }
-        counts
-    });
-}
-
-#[divan::bench]
-fn build(bencher: Bencher<'_, '_>) {
-    let mesh = testkit::body::body_or_ball();
-    bencher.bench_local(|| RayMesh::new(&mesh.vertices, &mesh.faces));
 }

@@ -1,10 +1,11 @@
 //! Compositing 6144 rays (six patches of 32×32) of 128 samples, forward and backward, on two
 //! threads, against the definition. items/s are samples.
 
+use divan::Bencher;
 use divan::counter::ItemsCount;
-use divan::{Bencher, black_box};
 use glam::Vec3;
 use rayon::prelude::*;
+use testkit::body::Random;
 use volrender::{RaySamples, SampleGradients, composite, composite_backward};
 
 const RAYS: usize = 6 * 32 * 32;
@@ -27,11 +28,8 @@ struct Rays {
 
 impl Rays {
     fn new() -> Self {
-        let mut state = 1u64;
-        let mut random = || {
-            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-            (state >> 40) as f32 / (1u32 << 24) as f32
-        };
+        let mut numbers = Random(1);
+        let mut random = || numbers.unit();
         let place = |i: usize| (i % SAMPLES) as f32 / SAMPLES as f32;
         Self {
             sigma: (0..TOTAL).map(|i| 100.0 * (place(i) - 0.3).max(0.0) * random()).collect(),
@@ -84,16 +82,6 @@ fn each_ray(rays: &Rays, out: &mut Outputs, run: &Run<'_>) {
             let ray = i * SAMPLES..(i + 1) * SAMPLES;
             run(rays.samples(ray), weights, SampleGradients { d_sigma, d_rgb, d_likelihood });
         });
-}
-
-#[divan::bench]
-fn forward(bencher: Bencher<'_, '_>) {
-    let (rays, mut out) = (Rays::new(), Outputs::new());
-    bencher.counter(ItemsCount::new(TOTAL)).bench_local(|| {
-        each_ray(&rays, &mut out, &|samples, weights, _| {
-            black_box(composite(samples, Vec3::ONE, weights));
-        });
-    });
 }
 
 #[divan::bench]

@@ -27,9 +27,3 @@ fn ssim_plain(bencher: Bencher<'_, '_>) {
     let (a, b) = images();
     bencher.counter(ItemsCount::new(SIDE * SIDE)).bench_local(|| testkit::oracle::ssim(black_box(&a), &b, SIDE, SIDE));
 }
-
-#[divan::bench]
-fn psnr(bencher: Bencher<'_, '_>) {
-    let (a, b) = images();
-    bencher.counter(ItemsCount::new(SIDE * SIDE)).bench_local(|| metrics::psnr(black_box(&a), &b));
-}

@@ -101,38 +101,6 @@ mod tests {
         assert!((1..=12).all(|i| long(&format!("{i}/12").parse().unwrap()) == 1));
     }
 
-    /// Seconds of the rows of `reproduce` with 400 steps and 20 scored pictures, from 0.163, 0.166
-    /// and 0.229 s a step of `occnerf`, `hash-point` and `humannerf` and 0.25 s a picture, measured
-    /// on a busy machine, and 5 s to load a scene.
-    #[test]
-    fn a_thousand_jobs_wait_little_for_the_last() {
-        let (occnerf, hash_point, humannerf, load) = (65.2, 66.4, 91.6, 5.0);
-        let mut seconds = vec![5.0];
-        for _ in 0..3 {
-            seconds.extend([humannerf, 4.0 * humannerf, occnerf, humannerf, 4.0 * humannerf, occnerf]);
-            seconds.extend([hash_point, hash_point]);
-            seconds.extend([occnerf; 7]);
-        }
-        let scenes = 1000;
-        for (jobs, least) in [(10, 0.98), (100, 0.93), (1000, 0.85)] {
-            let (mut work, mut longest) = (0.0, 0.0f64);
-            for index in 0..jobs {
-                let shard = Shard { index, count: jobs };
-                let mut own = 0.0;
-                for scene in 0..scenes {
-                    let runs = seconds.iter().enumerate();
-                    let mine = runs.filter(|(i, _)| shard.has(scene * seconds.len() + i)).map(|(_, s)| s + 5.0);
-                    let trained: f64 = mine.sum();
-                    work += trained;
-                    own += trained + if trained > 0.0 { load } else { 0.0 };
-                }
-                longest = longest.max(own);
-            }
-            let efficiency = work / (jobs as f64 * longest);
-            assert!(efficiency > least, "{jobs} jobs: {efficiency:.3}");
-        }
-    }
-
     #[test]
     fn parts_that_cannot_be_are_refused() {
         for text in ["0/4", "5/4", "1/0", "1", "a/4", "1/4/2", "-1/4", "1/18446744073709551616", "1/2000000", ""] {

@@ -88,25 +88,3 @@ impl Config {
         Ok(())
     }
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::config::settings::{Method, Preset};
-
-    #[test]
-    fn a_bad_value_is_named_with_its_key() {
-        let mut config = Config::preset(Preset::Fast, Method::Occnerf);
-        config.rates.table = f32::NAN;
-        assert!(config.validate().unwrap_err().to_string().contains("rates.table"));
-        config = Config::preset(Preset::Fast, Method::Occnerf);
-        config.encoding.log2_table_size = 40;
-        assert!(config.validate().unwrap_err().to_string().contains("encoding.log2_table_size"));
-        config = Config::preset(Preset::Fast, Method::Occnerf);
-        config.motion.margin = 5.0;
-        assert!(config.validate().unwrap_err().to_string().contains("motion.margin"));
-        config = Config::preset(Preset::Fast, Method::Occnerf);
-        config.samples = 0;
-        assert!(config.validate().unwrap_err().to_string().contains("`samples` is 0"));
-    }
-}

@@ -184,12 +184,6 @@ impl Model {
             }),
         }
     }
-
-    /// The world's upward direction: the axis that is nearest to the mean direction from the pelvis
-    /// to the head over the training frames.
-    pub fn up(&self) -> Vec3 {
-        upright(&self.body, self.frames.iter().map(Arc::as_ref))
-    }
 }
 
 /// Cells near the canonical prior.

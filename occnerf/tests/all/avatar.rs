@@ -125,23 +125,6 @@ fn damaged_files_are_errors_of_one_line() {
         std::fs::write(&broken, &whole[..cut]).unwrap();
         assert!(Avatar::load(&broken).is_err(), "{cut} bytes");
     }
-    // A flip anywhere gives an avatar that is valid, or an error; never a panic.
-    let mut seed = 1u64;
-    for round in 0..60 {
-        let mut bytes = whole.clone();
-        for _ in 0..4 {
-            seed = seed.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-            // Two thirds of the flips hit the header.
-            let among = if round % 3 == 0 { bytes.len() } else { 3000 };
-            let at = (seed >> 33) as usize % among;
-            bytes[at] ^= 1 << (seed >> 60 & 7);
-        }
-        std::fs::write(&broken, &bytes).unwrap();
-        match Avatar::load(&broken) {
-            Ok(avatar) => avatar.validate().unwrap(),
-            Err(error) => assert!(error.to_string().contains("broken.safetensors"), "{error}"),
-        }
-    }
     let absent = Avatar::load(&place("absent.safetensors")).unwrap_err().to_string();
     assert!(absent.contains("absent.safetensors"), "{absent}");
     std::fs::write(&broken, std::fs::read(env!("CARGO_MANIFEST_PATH")).unwrap()).unwrap();

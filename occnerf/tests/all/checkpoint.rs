@@ -87,33 +87,7 @@ fn a_checkpoint_cut_short_anywhere_is_refused() {
 }
 
 #[test]
-fn a_bit_flipped_in_the_header_never_panics() {
-    let dir = Directory::new("flip");
-    let bytes = good(&dir);
-    let path = dir.file("flip.safetensors");
-    let (mut accepted, mut refused) = (0, 0);
-    for at in 0..header_length(&bytes) {
-        let mut flipped = bytes.clone();
-        // Every bit has its turn. Lengths are flipped in all of theirs.
-        flipped[at] ^= 1 << (at % 8);
-        match resume(scene(), &path, &flipped) {
-            // Another seed, rate or space is as good as any; it must train.
-            Ok(mut trainer) => {
-                accepted += 1;
-                trainer.step().unwrap();
-            }
-            Err(error) => {
-                refused += 1;
-                let message = error.to_string();
-                assert!(message.contains("flip.safetensors"), "bit {} of byte {at}: `{message}`", at % 8);
-            }
-        }
-    }
-    assert!(refused > 4 * accepted, "{accepted} accepted, {refused} refused");
-}
-
-#[test]
-fn numbers_that_are_not_finite_are_refused_by_name() {
+fn numbers_that_cannot_be_are_refused_by_name() {
     let dir = Directory::new("nan");
     let bytes = good(&dir);
     let path = dir.file("nan.safetensors");
@@ -126,18 +100,11 @@ fn numbers_that_are_not_finite_are_refused_by_name() {
             assert!(message.contains(name) && message.contains("at 2"), "{message}");
         }
     }
-}
-
-/// Adam takes its square root.
-#[test]
-fn a_negative_second_moment_is_refused() {
-    let dir = Directory::new("moment");
-    let bytes = good(&dir);
+    // Adam takes its square root.
     let forged = forged(&bytes, |_, arrays| {
         arrays.get_mut("field.second_moment").unwrap().2[..4].copy_from_slice(&(-1.0f32).to_le_bytes());
     });
-    let message = refused(scene(), &dir.file("moment.safetensors"), &forged, "negative");
-    assert!(message.contains("field.second_moment"), "{message}");
+    assert!(refused(scene(), &path, &forged, "negative").contains("field.second_moment"));
 }
 
 #[test]
@@ -184,6 +151,8 @@ fn foreign_headers_are_refused_and_say_what_was_expected() {
         ("steps_done", "-1", "-1"),
         ("steps_done", "many", "many"),
         ("steps_done", "2.5", "2.5"),
+        // Counting on from there would overflow.
+        ("steps_done", "18446744073709551615", "steps_done"),
         ("config", "seed = 1", "config"),
         ("config", "not toml at all [", "config"),
     ] {
@@ -194,16 +163,6 @@ fn foreign_headers_are_refused_and_say_what_was_expected() {
         let without = forged(&bytes, |header, _| drop(header.remove(key)));
         refused(scene(), &path, &without, key);
     }
-}
-
-/// Counting on from there would overflow.
-#[test]
-fn an_absurd_number_of_steps_is_refused() {
-    let dir = Directory::new("steps");
-    let bytes = good(&dir);
-    let forged = forged(&bytes, |header, _| drop(header.insert("steps_done".to_owned(), u64::MAX.to_string())));
-    let message = refused(scene(), &dir.file("steps.safetensors"), &forged, "steps_done");
-    assert!(message.contains("steps_done"), "{message}");
 }
 
 /// The checkpoint with one line of its configuration replaced.
@@ -229,18 +188,11 @@ fn configurations_that_cannot_be_run_are_refused() {
         ("n_min", "n_min = 0"),
         ("margin", "margin = nan"),
         ("method", "method = \"hash-point\""),
+        // The scene's neighbour lists have another length than the field wants.
+        ("k", "k = 20"),
+        ("k", "k = 5"),
+        ("coarse_levels", "coarse_levels = 0"),
     ] {
-        refused(scene(), &path, &edited(&bytes, key, by), by);
-    }
-}
-
-/// The scene's neighbour lists have another length than the checkpoint's field wants.
-#[test]
-fn surface_queries_unlike_the_scenes_are_refused() {
-    let dir = Directory::new("queries");
-    let bytes = good(&dir);
-    let path = dir.file("queries.safetensors");
-    for (key, by) in [("k", "k = 20"), ("k", "k = 5"), ("coarse_levels", "coarse_levels = 0")] {
         refused(scene(), &path, &edited(&bytes, key, by), by);
     }
 }

@@ -51,12 +51,15 @@ fn values_out_of_range_are_refused_before_anything_is_built() {
         ("mse", "mse = nan", "loss.mse"),
         ("perceptual", "perceptual = inf", "loss.perceptual"),
         ("density_scale", "density_scale = 0.0", "field.density_scale"),
+        ("table", "table = nan", "rates.table"),
+        ("log2_table_size", "log2_table_size = 40", "encoding.log2_table_size"),
+        ("margin", "margin = 5.0", "motion.margin"),
     ] {
         let config: Config = toml::from_str(&edited(setting, by)).unwrap();
         let error = config.validate().unwrap_err();
         assert_eq!(error.key, key, "{by}");
         let message = error.to_string();
-        assert!(message.contains(key) && message.contains("expected"), "{message}");
+        assert!(message.contains(key) && (message.contains("expected") || message.contains("at most")), "{message}");
         let Err(Error::Config(of_scene)) = Scene::new(&common::capture(), common::body(), &config) else {
             panic!("{by}: a scene was made");
         };

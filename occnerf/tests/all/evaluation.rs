@@ -203,20 +203,6 @@ fn no_frames_give_no_scores_and_progress_hears_of_every_frame() {
     assert_eq!(heard, [("Camera_B2".to_owned(), pixels), ("Camera_B3".to_owned(), pixels)]);
 }
 
-struct Broken;
-
-impl Renderer for Broken {
-    fn render(&mut self, _: &PosedView, _: Vec3) -> Result<Rendering, Error> {
-        Err(Error::Scene("the paint has run out".to_owned()))
-    }
-}
-
-#[test]
-fn an_error_of_the_renderer_comes_through() {
-    let error = evaluate(scene(), &mut Broken, &[&scene().eval[0]], None, |_, _| {}).unwrap_err();
-    assert!(error.to_string().contains("paint"));
-}
-
 #[test]
 fn captures_that_show_nobody_are_refused() {
     let mut blank = capture();

@@ -6,9 +6,8 @@ use std::sync::LazyLock;
 
 use array_files::{Data, NdArray, npz};
 use glam::Vec3;
-use proptest::prelude::*;
 use smpl::{BodyModel, Error, Placement};
-use testkit::files::{npy, shared, zip};
+use testkit::files::{npy, zip};
 
 fn temporary(name: &str) -> PathBuf {
     Path::new(env!("CARGO_TARGET_TMPDIR")).join(name)
@@ -100,18 +99,6 @@ fn bits(body: &BodyModel) -> Vec<u32> {
 }
 
 #[test]
-fn the_shared_body_is_the_same_from_every_form() {
-    let Some(path) = shared("body/open_body.npz") else { return };
-    let body = BodyModel::load(&path).unwrap();
-    let saved = temporary("open_body.safetensors");
-    body.save(&saved).unwrap();
-    assert_eq!(bits(&BodyModel::load(&saved).unwrap()), bits(&body));
-    let pickled = BodyModel::load(&shared("body/open_body.pkl").unwrap()).unwrap();
-    pickled.save(&saved).unwrap();
-    assert_eq!(bits(&BodyModel::load(&saved).unwrap()), bits(&pickled));
-}
-
-#[test]
 fn invalid_bodies_are_not_saved() {
     let mut body = BodyModel::embedded();
     body.v_template[3].x = f32::NAN;
@@ -159,23 +146,6 @@ fn truncated_and_foreign_files_are_refused() {
     assert!(load("plain.body", b"hello").unwrap_err().to_string().contains(".npz, .pkl or .safetensors"));
 }
 
-proptest! {
-    #[test]
-    fn damaged_files_give_errors_or_bodies_that_pose(
-        edits in prop::collection::vec((any::<prop::sample::Index>(), any::<u8>()), 1..5),
-    ) {
-        let mut bytes = SMALL.clone();
-        for (at, value) in edits {
-            let at = at.index(bytes.len());
-            bytes[at] = value;
-        }
-        if let Ok(body) = load("damaged.safetensors", &bytes) {
-            let pose = vec![Vec3::ONE; body.num_joints()];
-            prop_assert_eq!(body.pose(&body.shaped(&[]), &pose, Placement::default()).vertices.len(), body.num_vertices());
-        }
-    }
-}
-
 #[test]
 fn bodies_without_faces_or_with_huge_coordinates_are_refused() {
     let refused = |change: fn(&mut BodyModel), words: [&str; 2]| {
@@ -215,14 +185,6 @@ fn write_body(name: &str, arrays: &[(&'static str, Vec<usize>, Vec<f64>)]) -> Pa
     };
     npz::write(&path, &arrays.iter().map(array).collect::<Vec<_>>()).unwrap();
     path
-}
-
-#[test]
-fn a_tiny_body_is_read() {
-    let file = write_body("tiny.npz", &tiny_body());
-    let body = BodyModel::load(&file).unwrap();
-    assert_eq!((body.num_vertices(), body.num_joints(), body.num_betas()), (3, 2, 1));
-    assert_eq!(body.parents, [None, Some(0)]);
 }
 
 #[test]

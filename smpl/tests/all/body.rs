@@ -38,16 +38,6 @@ proptest! {
     #![proptest_config(ProptestConfig::with_cases(24))]
 
     #[test]
-    fn zero_pose_gives_the_shaped_body(betas in betas(), translation in vec3(2.0)) {
-        let shaped = BODY.shaped(&betas);
-        let posed = BODY.pose(&shaped, &[Vec3::ZERO; 24], pelvis(translation));
-        let by = Affine3A::from_translation(translation);
-        prop_assert!(largest(&posed.vertices, &moved(&shaped.vertices, by)) < 2e-6);
-        prop_assert!(largest(&posed.joints, &moved(&shaped.joints, by)) < 2e-6);
-        prop_assert!(posed.pose_offsets.iter().all(|&o| o == Vec3::ZERO));
-    }
-
-    #[test]
     fn a_rigid_motion_of_the_placement_moves_the_body_rigidly(
         mut pose in pose(),
         turn in rotation(),
@@ -61,19 +51,6 @@ proptest! {
         let by = Affine3A::from_rotation_translation(turn, shift);
         prop_assert!(largest(&placed.vertices, &moved(&plain.vertices, by)) < 5e-6);
         prop_assert!(largest(&placed.joints, &moved(&plain.joints, by)) < 5e-6);
-    }
-
-    #[test]
-    fn a_turn_of_the_root_is_a_turn_about_the_pelvis(mut pose in pose(), turn in rotation()) {
-        pose[0] = Vec3::ZERO;
-        let shaped = BODY.shaped(&[]);
-        let plain = BODY.pose(&shaped, &pose, Placement::default());
-        pose[0] = turn.to_scaled_axis();
-        let turned = BODY.pose(&shaped, &pose, Placement::default());
-        let about = Affine3A::from_translation(shaped.joints[0])
-            * Affine3A::from_quat(turn)
-            * Affine3A::from_translation(-shaped.joints[0]);
-        prop_assert!(largest(&turned.vertices, &moved(&plain.vertices, about)) < 5e-6);
     }
 
     #[test]
@@ -114,38 +91,28 @@ proptest! {
     }
 
     #[test]
-    fn batches_equal_single_frames_bit_for_bit(poses in prop::collection::vec(pose(), 1..20), betas in betas()) {
-        let shaped = BODY.shaped(&betas);
-        let frames: Vec<_> = poses.iter().map(|p| (&shaped, p.as_slice(), pelvis(Vec3::Y))).collect();
-        let batch = BODY.pose_batch(&frames);
-        prop_assert_eq!(batch.len(), poses.len());
-        for (posed, pose) in batch.iter().zip(&poses) {
-            prop_assert_eq!(posed, &BODY.pose(&shaped, pose, pelvis(Vec3::Y)));
-        }
-    }
-
-    #[test]
-    fn posed_surface_points_map_back_to_rest(
+    fn points_near_the_posed_surface_map_back_to_where_they_are_at_rest(
         pose in pose(),
         face in any::<prop::sample::Index>(),
-        corner in 0usize..3,
+        shares in prop::array::uniform3(0.01f32..1.0),
+        away in vec3(0.05),
     ) {
         let shaped = BODY.shaped(&[0.5, 0.5]);
         let posed = BODY.pose(&shaped, &pose, pelvis(Vec3::new(1.0, 2.0, 3.0)));
         let face = face.index(BODY.faces.len());
-        let mut barycentric = [0.0; 3];
-        barycentric[corner] = 1.0;
-        let v = BODY.faces[face][corner] as usize;
-        if determinant(&posed, v) < 0.06 {
-            // One bone takes over there: not an inverse, but still a finite point.
-            return Ok(());
-        }
-        let sample = SurfaceMotion::default()
-            .map(&BODY, &posed, posed.vertices[v], face as u32, barycentric, 0.0)
-            .unwrap();
+        let barycentric = shares.map(|share| share / shares.iter().sum::<f32>());
+        let corners = || BODY.faces[face].iter().map(|&v| v as usize).zip(barycentric);
+        let rest = away + corners().map(|(v, b)| b * shaped.vertices[v]).sum::<Vec3>();
+        let moved = rest + corners().map(|(v, b)| b * posed.pose_offsets[v]).sum::<Vec3>();
+        let bones = || corners().flat_map(|(v, b)| BODY.weights.row(v).map(move |(joint, w)| (joint, b * w)));
+        let point = bones().map(|(joint, w)| w * posed.bones[joint].transform_point3(moved)).sum();
+        let blended = bones().fold(glam::Mat3A::ZERO, |sum, (joint, w)| sum + posed.bones[joint].matrix3 * w);
+        // One bone takes over below: not an inverse, but still a finite point.
+        prop_assume!(blended.determinant() > 0.06);
+        let sample = SurfaceMotion::default().map(&BODY, &posed, point, face as u32, barycentric, 0.0).unwrap();
         prop_assert_eq!(sample.likelihood, 1.0);
-        let error = sample.canonical.distance(shaped.vertices[v]);
-        prop_assert!(error < 5e-5, "{}", error);
+        let error = sample.canonical.distance(rest);
+        prop_assert!(error < 1e-4, "{}", error);
     }
 }
 
@@ -155,17 +122,6 @@ fn determinant(posed: &Posed, v: usize) -> f32 {
         sum += posed.bones[joint].matrix3 * w;
     }
     sum.determinant()
-}
-
-#[test]
-fn poses_do_not_depend_on_the_number_of_threads() {
-    let shaped = BODY.shaped(&[1.0]);
-    let pose: Vec<Vec3> = (0..24).map(|i| Vec3::new(0.1, -0.05, 0.02) * i as f32).collect();
-    let on = |threads: usize| {
-        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-        pool.install(|| BODY.pose(&shaped, &pose, Placement::default()))
-    };
-    assert_eq!(on(1), on(5));
 }
 
 #[test]
@@ -179,18 +135,15 @@ fn dense_rows_are_summed_like_any_other() {
     }));
     body.validate("dense").unwrap();
     let shaped = body.shaped(&[]);
-    let poses: Vec<Vec<Vec3>> = (0..37)
-        .map(|f| (0..24).map(|j| 0.3 * Vec3::new(wave(f + j), wave(2 * f + j), wave(f * j))).collect())
-        .collect();
-    let frames: Vec<_> = poses.iter().map(|p| (&shaped, p.as_slice(), pelvis(Vec3::Z))).collect();
-    let on = |threads: usize| {
+    let poses: Vec<Vec<Vec3>> =
+        (0..9).map(|f| (0..24).map(|j| 0.3 * Vec3::new(wave(f + j), wave(2 * f + j), wave(f * j))).collect()).collect();
+    let on = |threads: usize, pose: &[Vec3]| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-        pool.install(|| body.pose_batch(&frames))
+        pool.install(|| body.pose(&shaped, pose, pelvis(Vec3::Z)))
     };
-    let batch = on(1);
-    assert_eq!(batch, on(3));
-    for (posed, pose) in batch.iter().zip(&poses) {
-        assert_eq!(posed, &body.pose(&shaped, pose, pelvis(Vec3::Z)));
+    for pose in &poses {
+        let posed = on(1, pose);
+        assert_eq!(posed, on(3, pose));
         for v in (0..body.num_vertices()).step_by(7) {
             let mut expected = glam::DVec3::ZERO;
             for (term, direction) in body.posedirs.row(v) {
@@ -201,22 +154,12 @@ fn dense_rows_are_summed_like_any_other() {
             assert!(posed.pose_offsets[v].as_dvec3().distance(expected) < 1e-6);
         }
     }
-    assert!(body.pose_batch(&[]).is_empty());
-}
-
-#[test]
-fn joints_follow_the_shape() {
-    let plain = BODY.shaped(&[]);
-    let tall = BODY.shaped(&[2.0]);
-    let knee = |s: &smpl::Shaped| s.joints[1].distance(s.joints[4]);
-    assert!(knee(&tall) > 1.04 * knee(&plain));
-    // Betas that are not given are 0.
-    assert_eq!(BODY.shaped(&[0.0; 10]), plain);
 }
 
 #[test]
 #[should_panic(expected = "11 betas, the model has 10")]
-fn too_many_betas_panic() {
+fn betas_that_are_not_given_are_zero_and_too_many_panic() {
+    assert_eq!(BODY.shaped(&[0.0; 10]), BODY.shaped(&[]));
     let _ = BODY.shaped(&[0.0; 11]);
 }
 

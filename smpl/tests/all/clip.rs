@@ -2,9 +2,9 @@
 
 use std::path::{Path, PathBuf};
 
-use glam::{Quat, Vec3};
-use smpl::{BodyModel, MotionClip, Placement};
-use testkit::files::{npy, shared, zip};
+use glam::Vec3;
+use smpl::{MotionClip, Placement};
+use testkit::files::{npy, zip};
 
 fn floats(shape: &[usize], values: &[f32]) -> Vec<u8> {
     npy("<f4", shape, &values.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>())
@@ -138,31 +138,5 @@ fn invalid_clips_are_refused() {
         let named = if bytes == floats(&[3, 72], &[0.0; 216]) { "trans" } else { key };
         let error = with(key, bytes);
         assert!(error.contains(named) && error.contains("wrong-clip.npz"), "{key}: {error}");
-    }
-}
-
-#[test]
-fn the_shared_clips_keep_the_shared_body_on_the_floor() {
-    let (Some(path), Some(turn)) = (shared("body/open_body.npz"), shared("mocap/turn.npz")) else { return };
-    let body = BodyModel::load(&path).unwrap();
-    let shaped = body.shaped(&[]);
-    let lowest = |clip: &MotionClip, seconds: f32| {
-        let (pose, placement) = clip.at(seconds, body.num_joints());
-        body.pose(&shaped, &pose, placement).vertices.iter().map(|v| v.y).fold(f32::INFINITY, f32::min)
-    };
-    let walk = MotionClip::load(&shared("mocap/walk.npz").unwrap()).unwrap();
-    assert_eq!((walk.num_frames(), walk.num_joints, walk.fps), (249, 24, 30.0));
-    for i in 0..60 {
-        let y = lowest(&walk, walk.duration() * i as f32 / 59.0);
-        assert!((-0.05..0.08).contains(&y), "lowest vertex at {y} m");
-    }
-    // Between two frames the root is between theirs.
-    let turn = MotionClip::load(&turn).unwrap();
-    assert_eq!(turn.num_frames(), 312);
-    for frame in (0..300).step_by(13) {
-        let root = |f: f32| Quat::from_scaled_axis(turn.at((frame as f32 + f) / 30.0, 24).0[0]);
-        let (a, b, half) = (root(0.0), root(1.0), root(0.5));
-        let (whole, part) = (a.angle_between(b), a.angle_between(half));
-        assert!((part - 0.5 * whole).abs() < 2e-3, "{frame}: {part} of {whole}");
     }
 }

@@ -51,7 +51,7 @@ proptest! {
         mesh in strategy::bumpy_sphere(), q in strategy::vec3(1.6),
     ) {
         let query = build(&mesh);
-        for q in [q, q * 0.001 + mesh.vertices[3]] {
+        for q in [q, q * 0.001 + mesh.vertices[3], mesh.vertices[3]] {
             let list = finest(&query, q);
             let (point, normal, distance) = plain(&query, &mesh.vertices, q, &list);
             let blended = query.blend(q, &list);
@@ -148,33 +148,6 @@ fn the_gradient_of_inverse_distance_weights_is_that_of_finite_differences() {
     let blended = query.blend(q, &list);
     assert!(blended.point.distance(q) < 0.34, "{blended:?}");
     assert_eq!((blended.normal, blended.signed_distance), (Vec3::Z, 0.0));
-}
-
-#[test]
-fn a_query_on_a_vertex_has_weight_one_there() {
-    let ball = mesh::icosphere(3);
-    let query = build(&ball);
-    for &v in ball.vertices.iter().step_by(17) {
-        let list = finest(&query, v);
-        assert_eq!(ball.vertices[list[0] as usize], v);
-        let blended = query.blend(v, &list);
-        // The neighbours' tangent planes pass close by, so their weights are small.
-        assert!(blended.point.distance(v) < 0.05 && blended.signed_distance.abs() < 0.02, "{blended:?}");
-        assert!(query.blend_backward(v, &list, Vec3::ONE, 1.0).is_finite());
-    }
-}
-
-#[test]
-fn the_sign_is_positive_outside_a_ball_and_negative_inside() {
-    let ball = mesh::icosphere(3);
-    let query = build(&ball);
-    for direction in &mesh::icosphere(2).vertices {
-        for (r, sign) in [(0.3, -1.0), (0.9, -1.0), (1.1, 1.0), (3.0, 1.0)] {
-            let q = *direction * r;
-            let d = query.blend(q, &finest(&query, q)).signed_distance;
-            assert!(d * sign > 0.0 && (d - (r - 1.0)).abs() < 0.05, "{q}: {d}");
-        }
-    }
 }
 
 #[test]

@@ -89,25 +89,11 @@ fn place(mesh: &TriMesh, at: &(prop::sample::Index, [f32; 3], f32, Vec3)) -> Vec
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig::with_cases(96))]
+    #![proptest_config(ProptestConfig::with_cases(128))]
 
     #[test]
-    fn closest_points_and_signs_of_bumpy_spheres_equal_brute_force(
-        mesh in strategy::bumpy_sphere(),
-        queries in strategy::cloud(12..13, 2.0),
-        near in prop::collection::vec(at_a_face(), 12),
-    ) {
-        let distance = build(&mesh);
-        for q in queries.into_iter().chain(near.iter().map(|at| place(&mesh, at))) {
-            let found = distance.closest(q);
-            check(&mesh, q, &found)?;
-            check_sign(&mesh, q, &found)?;
-        }
-    }
-
-    #[test]
-    fn signs_hold_at_sharp_edges_and_corners(
-        mesh in spiky(),
+    fn closest_points_and_signs_equal_brute_force_at_sharp_edges_and_corners_too(
+        mesh in prop_oneof![strategy::bumpy_sphere(), spiky()],
         queries in strategy::cloud(12..13, 2.0),
         near in prop::collection::vec(at_a_face(), 24),
     ) {
@@ -117,15 +103,6 @@ proptest! {
             check(&mesh, q, &found)?;
             check_sign(&mesh, q, &found)?;
         }
-    }
-
-    #[test]
-    fn closest_point_is_never_farther_than_any_vertex(
-        mesh in strategy::bumpy_sphere(), q in strategy::vec3(3.0),
-    ) {
-        let found = build(&mesh).closest(q);
-        let nearest = mesh.vertices.iter().map(|v| v.distance(q)).fold(f32::MAX, f32::min);
-        prop_assert!(found.signed_distance.abs() <= nearest * (1.0 + 1e-6));
     }
 
     #[test]
@@ -217,41 +194,8 @@ proptest! {
 }
 
 #[test]
-fn a_cube_is_measured_exactly() {
-    let cube = mesh::cuboid(Vec3::ONE);
-    let distance = build(&cube);
-    for (q, expected) in [
-        (Vec3::new(0.25, 3.0, -0.5), 2.0),
-        (Vec3::new(0.25, 0.5, -0.5), -0.5),
-        (Vec3::new(4.0, 5.0, 0.5), 5.0),
-        (Vec3::new(3.0, 3.0, -2.0), 3.0),
-        (Vec3::ZERO, -1.0),
-        (Vec3::X, 0.0),
-        (Vec3::ONE, 0.0),
-    ] {
-        assert_eq!(distance.closest(q).signed_distance, expected, "{q}");
-    }
-}
-
-#[test]
-fn distances_of_far_queries_are_right_and_of_infinite_ones_nan() {
-    let ball = mesh::icosphere(2);
-    let distance = build(&ball);
-    for exponent in 0..38 {
-        let q = Vec3::new(0.6, -0.8, 0.0) * 10f32.powi(exponent);
-        let found = distance.closest(q);
-        let length = q.as_dvec3().length();
-        let share = f64::from(found.signed_distance) / length;
-        assert!((share - 1.0).abs() < 1.0 / length + 1e-6, "{q}: {share}");
-        if exponent > 12 {
-            continue;
-        }
-        // The weights stay exact long after the query's own rounding has swallowed the mesh.
-        let [a, b, c] = ball.faces[found.face as usize].map(|i| ball.vertices[i as usize]);
-        let [u, v, w] = found.barycentric;
-        let point = a * u + b * v + c * w;
-        assert!(point.distance(Vec3::new(0.6, -0.8, 0.0)) < 0.1, "{q}: {point}");
-    }
+fn distances_of_infinite_queries_are_nan() {
+    let distance = build(&mesh::icosphere(2));
     let infinite = Vec3::new(f32::INFINITY, 0.0, 0.0);
     for q in [Vec3::NAN, infinite, Vec3::new(0.0, f32::NAN, 1.0)] {
         assert!(distance.closest(q).signed_distance.is_nan() && distance.closest_within(q, f32::INFINITY).is_none());
@@ -366,13 +310,6 @@ fn outside_two_boxes_that_share_a_wall_every_distance_is_positive() {
 }
 
 #[test]
-fn meshes_without_faces_or_with_indices_out_of_range_are_errors() {
-    assert_eq!(MeshDistance::new(&[Vec3::ZERO], &[]).unwrap_err().to_string(), "no faces");
-    let out_of_range = MeshDistance::new(&[Vec3::ZERO], &[[0, 1, 0]]).unwrap_err();
-    assert_eq!(out_of_range.to_string(), "face 0 has vertex index 1, but there are only 1 vertices");
-}
-
-#[test]
 fn signs_and_distances_of_the_open_body_equal_brute_force() {
     let Some(body) = testkit::body::open_body() else {
         return;
@@ -389,26 +326,6 @@ fn signs_and_distances_of_the_open_body_equal_brute_force() {
             check(&mesh, q, &found).unwrap();
             check_sign(&mesh, q, &found).unwrap();
         }
-    }
-}
-
-proptest! {
-    /// Far from a mesh, the distance is that to its corners, the sign is positive, and the point lies on
-    /// the mesh.
-    #[test]
-    fn queries_at_any_distance_are_outside(
-        direction in prop::array::uniform3(-1.0f32..1.0),
-        exponent in 3i32..37,
-    ) {
-        let direction = Vec3::from(direction);
-        prop_assume!(direction.length() > 0.1);
-        let vertices = [Vec3::ZERO, Vec3::X, Vec3::Y, Vec3::Z];
-        let faces = [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]];
-        let query = direction * 10f32.powi(exponent);
-        let found = MeshDistance::new(&vertices, &faces).unwrap().closest(query);
-        let exact = vertices.iter().map(|v| (query.as_dvec3() - v.as_dvec3()).length()).fold(f64::INFINITY, f64::min);
-        prop_assert!((f64::from(found.signed_distance) / exact - 1.0).abs() < 1e-3, "{} of {exact}", found.signed_distance);
-        prop_assert!(found.point.min_element() >= -1e-6 && found.point.element_sum() <= 1.0 + 1e-6, "{}", found.point);
     }
 }
 

@@ -122,27 +122,6 @@ fn neighbours_on_cell_faces_of_a_grid_far_from_the_origin_equal_brute_force() {
 }
 
 #[test]
-fn a_grid_answers_every_query_within_the_margin_like_the_trees_do() {
-    let Some(body) = testkit::body::open_body() else {
-        return;
-    };
-    let grid = SurfaceQuery::new(&body.vertices, &body.faces, &config(5, 0.02, 0.12)).unwrap();
-    let trees = SurfaceQuery::new(&body.vertices, &body.faces, &SurfaceQueryConfig::default()).unwrap();
-    let (mut a, mut b) = ([0; 20], [0; 20]);
-    let mut random = Random(3);
-    let mut queries = random.near_surface(&body, 20_000, 0.2);
-    queries.extend((0..5000).map(|_| random.vec3(1.5)));
-    for (i, q) in queries.into_iter().enumerate() {
-        grid.neighbours(q, &mut a);
-        trees.neighbours(q, &mut b);
-        assert_eq!(a, b, "{q}");
-        if i % 100 == 0 {
-            check(&grid, &body.vertices, 5, q).unwrap();
-        }
-    }
-}
-
-#[test]
 fn more_than_65536_vertices_are_searched_too() {
     let mut random = Random(5);
     let points: Vec<Vec3> = (0..70_000).map(|_| random.vec3(1.0)).collect();
@@ -167,52 +146,6 @@ fn long_lists_equal_brute_force() {
             }
         }
     }
-}
-
-#[test]
-fn a_level_of_fewer_than_k_points_repeats_its_list() {
-    let points = [Vec3::ZERO, Vec3::X, Vec3::X * 3.0];
-    for cell in [0.0, 0.5] {
-        let query = SurfaceQuery::new(&points, &[], &config(5, cell, 1.0)).unwrap();
-        let mut out = [9; 20];
-        query.neighbours(Vec3::X * 0.9, &mut out);
-        assert_eq!(out[..5], [1, 0, 2, 1, 0]);
-        assert_eq!(out[5..], [0; 15], "coarse levels hold vertex 0 alone");
-    }
-}
-
-#[test]
-fn neighbour_sets_overlap_less_with_distance_and_more_with_scales() {
-    let ball = mesh::icosphere(4);
-    let overlap = |coarse_levels: usize, step: f32| {
-        let settings = SurfaceQueryConfig { coarse_levels, ..SurfaceQueryConfig::default() };
-        let query = SurfaceQuery::new(&ball.vertices, &ball.faces, &settings).unwrap();
-        let n = query.neighbours_per_query();
-        let mut random = Random(11);
-        let mut shared = 0;
-        for _ in 0..300 {
-            let p = random.vec3(1.0).normalize_or(Vec3::X);
-            let aside = p.cross(random.vec3(1.0)).normalize_or(Vec3::X);
-            let (mut a, mut b) = (vec![0; n], vec![0; n]);
-            query.neighbours(p, &mut a);
-            query.neighbours(p + aside * step, &mut b);
-            // Within a level, a vertex stands once.
-            shared +=
-                a.chunks(5).zip(b.chunks(5)).map(|(a, b)| a.iter().filter(|i| b.contains(i)).count()).sum::<usize>();
-        }
-        shared as f32 / (300 * n) as f32
-    };
-    let steps = [0.0, 0.01, 0.03, 0.1, 0.3];
-    let fine = steps.map(|s| overlap(0, s));
-    let scaled = steps.map(|s| overlap(3, s));
-    assert_eq!((fine[0], scaled[0]), (1.0, 1.0));
-    for i in 1..steps.len() {
-        assert!(fine[i] < fine[i - 1] && scaled[i] < scaled[i - 1], "{fine:?} {scaled:?}");
-        assert!(scaled[i] > fine[i], "{fine:?} {scaled:?}");
-    }
-    // At a third of the way to the next but one vertex most of the coarse neighbours are still the
-    // same.
-    assert!(scaled[3] > 1.5 * fine[3], "{fine:?} {scaled:?}");
 }
 
 #[test]

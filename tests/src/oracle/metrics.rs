@@ -90,33 +90,3 @@ pub fn mask_iou(mask: &[f32], ignored: Option<&[bool]>, width: usize, covered: i
     }
     both as f32 / either.max(1) as f32
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use approx::assert_abs_diff_eq;
-
-    fn pattern(seed: usize) -> Vec<f32> {
-        (0..12 * 10 * 3).map(|i| ((i * 7919 + seed * 104_729) % 1009) as f32 / 1009.0).collect()
-    }
-
-    #[test]
-    fn psnr_of_a_constant_offset_is_its_decibels() {
-        let a = vec![0.5f32; 30];
-        let b = vec![0.6f32; 30];
-        assert_abs_diff_eq!(psnr(&a, &b), 20.0, epsilon = 1e-5);
-        assert_eq!(psnr(&a, &a), f64::INFINITY);
-    }
-
-    #[test]
-    fn ssim_matches_scikit_image() {
-        let (a, b) = (pattern(0), pattern(3));
-        assert_abs_diff_eq!(ssim(&a, &a, 12, 10), 1.0, epsilon = 1e-12);
-        // scikit-image 0.26.0: structural_similarity(a, b, data_range=1, channel_axis=-1) of the
-        // same patterns, and the mean of its full map.
-        assert!((ssim(&a, &b, 12, 10) + 0.434_589_531_787).abs() < 1e-6, "{}", ssim(&a, &b, 12, 10));
-        let map = ssim_map(&a, &b, 12, 10);
-        let mean = map.iter().sum::<f64>() / map.len() as f64;
-        assert!((mean + 0.441_420_788_028).abs() < 1e-6, "{mean}");
-    }
-}

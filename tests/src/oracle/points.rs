@@ -35,34 +35,3 @@ pub fn farthest_points(points: &[Vec3], count: usize) -> Vec<u32> {
     }
     chosen
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    fn line() -> Vec<Vec3> {
-        [0.0, 1.0, 2.0, 3.0, 10.0].map(|x| Vec3::X * x).to_vec()
-    }
-
-    #[test]
-    fn neighbours_on_a_line_come_nearest_first_and_ties_by_index() {
-        let found = knn(&line(), Vec3::X * 2.0, 4);
-        let indices: Vec<u32> = found.iter().map(|f| f.0).collect();
-        assert_eq!(indices, [2, 1, 3, 0]);
-        assert_eq!(found[3].1, 2.0);
-        assert_eq!(knn(&line(), Vec3::ZERO, 99).len(), 5);
-        assert!(knn(&[], Vec3::ZERO, 3).is_empty());
-    }
-
-    #[test]
-    fn farthest_points_on_a_line_halve_the_gaps() {
-        // 0, then 10, then 3 (gap 3), then 1 and 2 are both 1 from their neighbours: the lower
-        // index.
-        assert_eq!(farthest_points(&line(), 4), [0, 4, 3, 1]);
-    }
-
-    #[test]
-    fn duplicates_are_still_distinct_indices() {
-        assert_eq!(farthest_points(&[Vec3::ONE; 3], 5), [0, 1, 2]);
-    }
-}

@@ -208,7 +208,6 @@ mod tests {
     use proptest::prelude::*;
 
     use super::*;
-    use crate::{DemoConfig, demo};
 
     fn bar(width: usize, rows: usize, columns: Range<usize>) -> Vec<f32> {
         (0..width * rows).map(|i| f32::from(columns.contains(&(i % width)))).collect()
@@ -246,25 +245,6 @@ mod tests {
     }
 
     #[test]
-    fn the_first_share_of_the_frames_is_occluded() {
-        let body = smpl::BodyModel::embedded();
-        let clear =
-            DemoConfig { size: 32, frames: 10, eval_cameras: 1, occluded_fraction: 0.0, ..DemoConfig::default() };
-        let clear = demo(&clear, &body).unwrap();
-        for (share, affected) in [(0.0, 0), (0.3, 3), (0.8, 8), (1.0, 10)] {
-            let mut frames = clear.train.clone();
-            let areas = Obstacle { share, ..Obstacle::default() }.hide(&mut frames).unwrap();
-            for (i, (hidden, whole)) in frames.iter().zip(&clear.train).enumerate() {
-                assert_eq!(
-                    (hidden.pixels().unwrap() != whole.pixels().unwrap(), !areas[i].is_empty()),
-                    (i < affected, i < affected),
-                    "{share} {i}"
-                );
-            }
-        }
-    }
-
-    #[test]
     fn position_moves_the_middle() {
         let mask = bar(40, 3, 10..30);
         assert_eq!(always(0.5).columns(&[whole(&mask, 40)]).unwrap()[0], 15..25);
@@ -281,21 +261,6 @@ mod tests {
         assert_eq!(starts.windows(2).map(|s| s[1] - s[0]).collect::<Vec<_>>(), [2; 4]);
         assert_eq!(columns[2], 15..25);
         assert!(columns.iter().all(|c| c.len() == 10));
-    }
-
-    #[test]
-    fn settings_that_cannot_be_are_named() {
-        for (name, obstacle) in [
-            ("fraction", Obstacle { fraction: 1.0, ..Obstacle::default() }),
-            ("share", Obstacle { share: -0.1, ..Obstacle::default() }),
-            ("position", Obstacle { position: f32::NAN, ..Obstacle::default() }),
-            ("travel", Obstacle { travel: f32::INFINITY, ..Obstacle::default() }),
-            ("height", Obstacle { height: 0.0, ..Obstacle::default() }),
-        ] {
-            let message = obstacle.check().unwrap_err().to_string();
-            assert!(message.contains(name) && message.contains(" to "), "{message}");
-        }
-        assert!(Obstacle::default().check().is_ok());
     }
 
     proptest! {

@@ -277,21 +277,6 @@ mod tests {
     }
 
     #[test]
-    fn nothing_changes_by_default() {
-        let body = BodyModel::embedded();
-        let (before, mut after) = (capture(&body), capture(&body));
-        Perturbation::default().apply(&mut after, &body).unwrap();
-        for (a, b) in before.train.iter().zip(&after.train) {
-            assert!(
-                a.pose == b.pose
-                    && a.betas == b.betas
-                    && a.pixels().unwrap().mask == b.pixels().unwrap().mask
-                    && a.placement == b.placement
-            );
-        }
-    }
-
-    #[test]
     fn bones_turn_by_the_angle_asked_for_about_the_pelvis_in_both_placements() {
         let body = BodyModel::embedded();
         let before = capture(&body);
@@ -367,44 +352,6 @@ mod tests {
             assert!(wrong.depth_percent == 0.0 || (part / wrong.depth_percent - 1.0).abs() < 0.5, "{part}");
             assert_eq!(after.eval[0].frame.placement, after.train[after.eval[0].train_index].placement);
         }
-    }
-
-    #[test]
-    fn limbs_become_longer_or_shorter_alike_on_both_sides_and_nothing_else() {
-        let (body, mut wrong) = (BodyModel::embedded(), BodyModel::embedded());
-        Perturbation { limbs_percent: 5.0, ..Perturbation::NONE }.spoil_body(&mut wrong);
-        wrong.validate("limbs").unwrap();
-        let (a, b) = (body.shaped(&[]).joints, wrong.shaped(&[]).joints);
-        let longer = |j: usize| {
-            let p = body.parents[j].unwrap();
-            (b[j] - b[p]).length() / (a[j] - a[p]).length() - 1.0
-        };
-        // Hips, knees, ankles; shoulders, elbows, wrists of SMPL.
-        let changes: Vec<f32> = [(4, 5), (7, 8), (18, 19), (20, 21)]
-            .map(|(l, r)| {
-                assert!((longer(l) - longer(r)).abs() < 0.01, "{l}: {} and {}", longer(l), longer(r));
-                longer(l).abs()
-            })
-            .into();
-        let mean = changes.iter().sum::<f32>() / 4.0;
-        assert!((0.01..0.12).contains(&mean), "{changes:?}");
-        assert!([3, 6, 9, 12, 15].iter().all(|&j| longer(j).abs() < 0.01));
-    }
-
-    #[test]
-    fn ragged_masks_keep_their_size_and_their_middle() {
-        let body = BodyModel::embedded();
-        let (before, mut after) = (sized(&body, 192), sized(&body, 192));
-        Perturbation { ragged_pixels: 2.0, ..Perturbation::NONE }.apply(&mut after, &body).unwrap();
-        let (mut area, mut changed) = ([0.0, 0.0], 0.0);
-        for (a, b) in before.train.iter().zip(&after.train) {
-            let (a, b) = (a.pixels().unwrap(), b.pixels().unwrap());
-            area = [area[0] + a.mask.iter().sum::<f32>(), area[1] + b.mask.iter().sum::<f32>()];
-            changed += a.mask.iter().zip(&b.mask).map(|(a, b)| (a - b).abs()).sum::<f32>();
-            assert!(b.image.pixels.chunks_exact(3).zip(&b.mask).all(|(p, m)| p.iter().all(|c| *c <= m + 1e-5)));
-        }
-        assert!((area[1] / area[0] - 1.0).abs() < 0.05, "{area:?}");
-        assert!(changed > 0.02 * area[0] && changed < 0.3 * area[0], "{changed} of {}", area[0]);
     }
 
     /// As two real captures have them: intersection over union of prior and mask .67, 11 % of the masks

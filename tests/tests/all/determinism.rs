@@ -79,24 +79,6 @@ fn stopping_and_going_on_equals_never_having_stopped() {
 }
 
 #[test]
-fn a_resumed_model_draws_the_same_picture() {
-    let config = tiny(Method::Occnerf, MotionKind::Volume);
-    let dir = Directory::new("picture");
-    let path = dir.path().join("model.safetensors");
-    let mut trainer = Trainer::new(scene(), config).unwrap();
-    for _ in 0..4 {
-        trainer.step().unwrap();
-    }
-    trainer.save(&path).unwrap();
-    let resumed = Trainer::resume(scene(), &path).unwrap();
-    let draw = |trainer: &Trainer<'_>| {
-        let rendering = FieldRenderer::new(trainer.model()).unwrap().render(&scene().eval[1].view, Vec3::ZERO).unwrap();
-        (rendering.image, rendering.opacity)
-    };
-    assert!(draw(&trainer) == draw(&resumed));
-}
-
-#[test]
 fn another_seed_gives_another_model_and_other_losses() {
     for method in common::METHODS {
         let config = tiny(method, MotionKind::Surface);

@@ -2,7 +2,7 @@
 
 use crate::common;
 
-use common::{METHODS, body, capture, scene, silhouette, tiny};
+use common::{METHODS, scene, silhouette, tiny};
 use glam::Vec3;
 use occnerf::{
     Config, DistanceKind, FieldRenderer, Method, MotionKind, PreparedFrame, Preset, Renderer, Scene, StepReport,
@@ -128,14 +128,4 @@ fn vertices_near_visible_pixels_are_counted_and_the_rest_stay_behind() {
     };
     let (never, often) = (mean(&|s| s == 0), mean(&|s| s >= 3));
     assert!(often > 2.0 * never, "never seen {never}, often seen {often}");
-}
-
-#[test]
-fn the_scene_keeps_capture_and_labels_in_step() {
-    assert_eq!(scene().train.len(), capture().train.len());
-    assert_eq!(scene().eval.len(), capture().eval.len());
-    assert_eq!(scene().body.canonical.vertices.len(), body().num_vertices());
-    let (low, high) =
-        scene().body.canonical.vertices.iter().fold((f32::MAX, f32::MIN), |(l, h), v| (l.min(v.y), h.max(v.y)));
-    assert!((high - low - 1.7).abs() < 1e-5);
 }

@@ -206,19 +206,6 @@ fn degenerate_meshes_are_hit_as_by_brute_force_or_are_errors() {
     assert_eq!(refused.to_string(), "face 0 has vertex index 1, but there are only 1 vertices");
 }
 
-#[test]
-fn first_hits_of_the_open_body_equal_brute_force() {
-    let Some(body) = testkit::body::open_body() else {
-        return;
-    };
-    let built = build(&body);
-    let mut random = Random(6);
-    for target in random.near_surface(&body, 150, 0.05) {
-        let o = random.vec3(1.0).normalize_or(Vec3::Z) * 3.0;
-        check(&body, &built, o, target - o).unwrap();
-    }
-}
-
 /// Faces that are equal, collapsed to a point, or so by the scale of one vertex far away: a second at
 /// most, where pairs of equals were joined one a pass.
 #[test]

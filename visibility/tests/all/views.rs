@@ -3,7 +3,7 @@
 use glam::{Affine3A, Mat3, Vec2, Vec3};
 use proptest::prelude::*;
 use testkit::{TriMesh, mesh, oracle, strategy};
-use visibility::{RayMesh, View, VisibilityCounts, visible_vertices};
+use visibility::{RayMesh, View, visible_vertices};
 
 /// A camera at `eye` that looks at `target`.
 fn look(eye: Vec3, target: Vec3, focal: f32, size: u32) -> View {
@@ -59,57 +59,6 @@ proptest! {
             }
         }
     }
-
-    #[test]
-    fn counts_over_a_capture_are_the_frames_in_which_brute_force_sees_a_vertex(
-        mesh in strategy::bumpy_sphere(), tilt in -0.5f32..0.5, r in 2.0f32..4.0,
-    ) {
-        let rays = RayMesh::new(&mesh.vertices, &mesh.faces).unwrap();
-        // The image's right third is hidden.
-        let usable: Vec<bool> = (0..300 * 300).map(|pixel| pixel % 300 < 200).collect();
-        let views: Vec<View> = (0..5)
-            .map(|i| {
-                let (sin, cos) = (i as f32 * 1.25 + tilt).sin_cos();
-                look(Vec3::new(sin, tilt, cos) * r, Vec3::ZERO, 90.0, 300)
-            })
-            .collect();
-        let mut counts = VisibilityCounts::new(mesh.vertices.len());
-        for view in &views {
-            counts.add_visible(&visible_vertices(&rays, &mesh.vertices, view, Some(&usable)));
-        }
-        for (i, &count) in counts.counts().iter().enumerate() {
-            let seen = |view: &View| match view.pixel(mesh.vertices[i]) {
-                Some(pixel) if usable[pixel] => plain(&mesh, view, i),
-                _ => Some(false),
-            };
-            let answers: Option<Vec<bool>> = views.iter().map(seen).collect();
-            if let Some(answers) = answers {
-                prop_assert_eq!(count, answers.into_iter().filter(|seen| *seen).count() as u64, "vertex {}", i);
-            }
-        }
-    }
-
-    #[test]
-    fn a_convex_mesh_shows_the_vertices_of_the_faces_that_look_at_the_camera(
-        direction in strategy::unit_vec3(), r in 1.5f32..10.0,
-    ) {
-        let ball = mesh::icosphere(3);
-        let eye = direction * r;
-        let mut expected = vec![false; ball.vertices.len()];
-        let mut grazing = expected.clone();
-        for face in &ball.faces {
-            let [a, b, c] = face.map(|i| ball.vertices[i as usize]);
-            let above = (b - a).cross(c - a).normalize_or_zero().dot(eye - a);
-            for &i in face {
-                expected[i as usize] |= above > 0.0;
-                grazing[i as usize] |= above.abs() < 1e-4;
-            }
-        }
-        let found = visible(&ball, &look(eye, Vec3::ZERO, 300.0, 4000));
-        for i in 0..found.len() {
-            prop_assert!(grazing[i] || found[i] == expected[i], "vertex {i}: {}", found[i]);
-        }
-    }
 }
 
 #[test]
@@ -155,20 +104,4 @@ fn a_mask_of_another_size_panics() {
     let rays = RayMesh::new(&[], &[]).unwrap();
     let view = look(-Vec3::Z, Vec3::ZERO, 20.0, 4);
     let _ = visible_vertices(&rays, &[Vec3::ZERO], &view, Some(&[true; 3]));
-}
-
-#[test]
-fn about_half_of_the_open_body_is_visible_from_the_front() {
-    let Some(body) = testkit::body::open_body() else {
-        return;
-    };
-    let view = look(Vec3::new(0.0, -0.2, 4.0), Vec3::new(0.0, -0.2, 0.0), 900.0, 1000);
-    let found = visible(&body, &view);
-    let share = found.iter().filter(|v| **v).count() as f32 / found.len() as f32;
-    assert!((0.35..0.6).contains(&share), "{share}");
-    for i in (0..body.vertices.len()).step_by(61) {
-        if let Some(expected) = plain(&body, &view, i) {
-            assert_eq!(found[i], expected, "vertex {i}");
-        }
-    }
 }

@@ -9,23 +9,6 @@ proptest! {
     #![proptest_config(ProptestConfig::with_cases(24))]
 
     #[test]
-    fn every_point_inside_or_within_the_margin_is_occupied(
-        mesh in testkit::strategy::bumpy_sphere(), margin in 0.02f32..0.3, cell in 0.03f32..0.3,
-        queries in prop::collection::vec(testkit::strategy::vec3(1.6), 60)
-    ) {
-        let mut occupancy = Occupancy::default();
-        occupancy.rebuild(&mesh.vertices, &mesh.faces, &vec![margin; mesh.faces.len()], OccupancyConfig { margin, depth: 10.0, cell });
-        for q in queries {
-            let (_, _, distance) = oracle::closest_point(&mesh.vertices, &mesh.faces, q);
-            if distance < f64::from(margin) || oracle::inside(&mesh.vertices, &mesh.faces, q) {
-                prop_assert!(occupancy.is_occupied(q), "{q} at {distance}");
-            } else if distance > f64::from(margin) * 2.0 + 4.0 * f64::from(cell) + 1.0 {
-                prop_assert!(!occupancy.is_occupied(q), "{q} at {distance}");
-            }
-        }
-    }
-
-    #[test]
     fn every_point_within_its_faces_margin_or_the_depth_is_occupied(
         mesh in testkit::strategy::bumpy_sphere(), near in 0.0f32..0.3, far in 0.0f32..0.3,
         depth in 0.0f32..0.3, cell in 0.02f32..0.1,

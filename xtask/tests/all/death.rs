@@ -10,21 +10,9 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
-use common::{done, folder, text};
+use common::{QUICK, done, folder, text};
 use occnerf::capture::Layout;
-
-/// A small generator of random moments (SplitMix64).
-struct Random(u64);
-
-impl Random {
-    fn below(&mut self, end: u64) -> u64 {
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let mut z = self.0;
-        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        (z ^ (z >> 31)) % end
-    }
-}
+use testkit::body::Random;
 
 fn kills() -> usize {
     std::env::var("KILLS").ok().map_or(3, |kills| kills.parse().expect("KILLS is a number"))
@@ -95,7 +83,7 @@ fn until_it_ends(work: &Work<'_>, longest: u64, random: &mut Random, most: usize
             .spawn()
             .unwrap();
         let begun = Instant::now();
-        let moment = Duration::from_millis(random.below(longest));
+        let moment = Duration::from_millis(random.below(longest as usize) as u64);
         let kill = attempt < most;
         let ended = loop {
             if let Some(status) = child.try_wait().unwrap() {
@@ -149,8 +137,6 @@ fn capture(folder: &Path) -> PathBuf {
     common::capture(&path, Layout::HumanNerf, 32, 4);
     path
 }
-
-const QUICK: [&str; 8] = ["--preset", "fast", "--method", "hash-point", "--set", "samples=8", "--set", "patches=1"];
 
 #[test]
 fn a_training_killed_at_any_moment_ends_the_same_to_the_bit() {

@@ -9,11 +9,9 @@ use std::process::{Command, Output, Stdio};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant, SystemTime};
 
-use common::{done, folder, refused, text, xtask};
+use common::{QUICK, done, folder, refused, text, xtask};
 use occnerf::capture::Layout;
 use serde_json::Value;
-
-const QUICK: [&str; 8] = ["--preset", "fast", "--method", "hash-point", "--set", "samples=8", "--set", "patches=1"];
 
 fn trained(folder: &Path, seed: &str) -> (PathBuf, PathBuf) {
     let (capture, run) = (folder.join("capture"), folder.join(seed));

@@ -11,7 +11,7 @@ use std::process::{Child, Command, Output, Stdio};
 use std::sync::OnceLock;
 use std::time::{Duration, Instant};
 
-use common::{done, folder, refused, text, xtask};
+use common::{QUICK, done, folder, refused, text, xtask};
 use occnerf::capture::Layout;
 
 /// A capture that trains at a thousand steps a minute or more.
@@ -25,8 +25,7 @@ fn capture() -> &'static Path {
 }
 
 fn training<'a>(out: &'a Path, steps: &'a str) -> Vec<&'a str> {
-    let quick = ["--preset", "fast", "--method", "hash-point", "--set", "samples=8", "--set", "patches=1"];
-    [&["train", text(capture()), "--out", text(out), "--steps", steps][..], &quick].concat()
+    [&["train", text(capture()), "--out", text(out), "--steps", steps][..], &QUICK].concat()
 }
 
 fn start(arguments: &[&str]) -> Child {
@@ -148,21 +147,6 @@ fn a_second_signal_ends_at_once_and_leaves_the_last_checkpoint() {
     assert_eq!(output.status.code(), Some(143), "{said}");
     assert!(begun.elapsed() < Duration::from_secs(5) && said.contains("stopped by SIGTERM"), "{said}");
     done(&["train", "--resume", "--stop-after", "1", "--out", text(&run)]);
-}
-
-/// Time in which the process does not run changes nothing that is learnt.
-#[test]
-fn a_training_that_is_stopped_and_continued_ends_the_same_to_the_bit() {
-    let folder = folder("paused");
-    let (run, whole) = (folder.join("run"), folder.join("whole"));
-    done(&training(&whole, "120"));
-    let child = start(&training(&run, "120"));
-    wait_for(&run.join("train.jsonl"));
-    let pause = format!("for i in 1 2 3; do kill -STOP {0}; sleep 0.4; kill -CONT {0}; sleep 0.1; done", child.id());
-    assert!(Command::new("sh").args(["-c", &pause]).status().unwrap().success());
-    assert_eq!(child.wait_with_output().unwrap().status.code(), Some(0));
-    let bytes = |run: &Path| std::fs::read(run.join("checkpoint.safetensors")).unwrap();
-    assert!(bytes(&run) == bytes(&whole) && run.join("metrics.json").is_file());
 }
 
 #[test]

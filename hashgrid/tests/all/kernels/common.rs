@@ -2,6 +2,7 @@
 
 use hashgrid::HashGrid;
 use proptest::prelude::*;
+use testkit::body::Random;
 
 /// The oracle's (L, 2^T, F) table, zero-padded, from the compact one.
 pub fn padded<const D: usize>(grid: &HashGrid<D>, table: &[f32], log2: u32, f: usize) -> Vec<f32> {
@@ -60,13 +61,8 @@ pub fn points<const D: usize>(count: std::ops::Range<usize>) -> impl Strategy<Va
 
 /// Random numbers in ±1.
 pub fn noise(n: usize, seed: u64) -> Vec<f32> {
-    let mut state = seed.wrapping_mul(0x9E37_79B9_7F4A_7C15) | 1;
-    (0..n)
-        .map(|_| {
-            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-            (state >> 40) as f32 / (1u32 << 23) as f32 - 1.0
-        })
-        .collect()
+    let mut random = Random(seed);
+    (0..n).map(|_| 2.0 * random.unit() - 1.0).collect()
 }
 
 pub fn dot(a: &[f32], b: &[f32]) -> f64 {

@@ -42,20 +42,20 @@ mod tests {
     use super::*;
     use crate::import::fit::{axis_angle, rotation};
     use crate::import::read;
-    use crate::import::tests::{Motion, known};
+    use crate::import::tests::{Motion, extrinsics, known};
     use crate::testing::{Directory, Py, array, shared};
 
     #[test]
     fn what_is_written_of_a_known_motion_is_that_motion() {
         let Some(dir) = shared("estimators") else { return };
-        let Motion { video, k, betas, poses, pelvises, joint } = known(&dir);
+        let motion = known(&dir);
+        let Motion { video, k, betas, poses, pelvises, .. } = &motion;
         let count = poses.len();
         let (mut cameras, mut roots, mut places, mut lenses) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
-        for (i, (pose, pelvis)) in poses.iter().zip(&pelvises).enumerate() {
+        for (i, (pose, pelvis)) in poses.iter().zip(pelvises).enumerate() {
             let (turn, moved) =
                 (rotation(DVec3::new(1.7, 0.02 * i as f64, -0.4)), DVec3::new(0.3, -0.2, 0.1 * i as f64));
-            let row = |r: usize| [turn.row(r).x, turn.row(r).y, turn.row(r).z, moved[r]];
-            cameras.extend([row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]].concat());
+            cameras.extend(extrinsics(turn, moved));
             roots.extend(axis_angle(turn.transpose() * rotation(pose[0])).to_array());
             places.extend((turn.transpose() * (*pelvis - moved)).to_array());
             // Hidden in the third frame, not there in the last.
@@ -78,17 +78,11 @@ mod tests {
         };
         let out = Directory::new("import-glamr");
         out.write("clip_seed1.pkl", write(10));
-        let (fit, _) = read::read(&out.path().join("clip_seed1.pkl"), &video).unwrap();
+        let (fit, _) = read::read(&out.path().join("clip_seed1.pkl"), video).unwrap();
         assert_eq!((fit.tool, fit.people[0].frames.len()), (Tool::Glamr, count - 1));
-        for (i, frame) in fit.people[0].frames.iter().enumerate() {
-            assert_eq!((frame.index, frame.focal, frame.centre), (i, [k[0], k[4]], [k[2], k[5]]));
-            assert!(frame.pelvis(joint).distance(pelvises[i]) < 1e-5);
-            let root = frame.world_to_camera * rotation(frame.pose[0]);
-            assert!(root.abs_diff_eq(rotation(poses[i][0]), 1e-5));
-            assert!(frame.pose[1..].iter().zip(&poses[i][1..]).all(|(a, b)| a.distance(*b) < 1e-5));
-        }
+        motion.is_of(&fit.people[0]);
         out.write("clip_seed1.pkl", write(9));
-        let error = read::read(&out.path().join("clip_seed1.pkl"), &video).err().unwrap().to_string();
+        let error = read::read(&out.path().join("clip_seed1.pkl"), video).err().unwrap().to_string();
         assert!(
             ["clip_seed1.pkl", "person_data.0.smpl_beta", "10]", "9]"].iter().all(|w| error.contains(w)),
             "{error}"

@@ -104,19 +104,19 @@ mod tests {
     use super::*;
     use crate::import::fit::{axis_angle, rotation};
     use crate::import::read;
-    use crate::import::tests::{Motion, known};
+    use crate::import::tests::{Motion, extrinsics, known};
     use crate::testing::{Directory, Py, shared};
     use testkit::files::zip;
 
     #[test]
     fn what_is_prepared_from_a_known_motion_is_that_motion() {
         let Some(dir) = shared("estimators") else { return };
-        let Motion { video, k, betas, poses, pelvises, joint } = known(&dir);
+        let motion = known(&dir);
+        let Motion { video, k, betas, poses, pelvises, joint } = &motion;
         let out = Directory::new("import-peoplesnapshot");
         let array = |shape: &[usize], values: Vec<f64>| NdArray { shape: shape.to_vec(), data: Data::F64(values) };
         let (turn, moved) = (rotation(DVec3::new(3.0, 0.2, -0.4)), DVec3::new(0.3, -0.2, 1.5));
-        let row = |i: usize| [turn.row(i).x, turn.row(i).y, turn.row(i).z, moved[i]];
-        let extrinsic = [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]].concat();
+        let extrinsic = extrinsics(turn, moved);
         let write = |name: &str, arrays: &[(&str, NdArray)]| npz::write(&out.path().join(name), arrays).unwrap();
         let cameras = |width: f64| {
             write(
@@ -134,9 +134,9 @@ mod tests {
         let roots: Vec<DVec3> = poses.iter().map(|pose| axis_angle(turn.transpose() * rotation(pose[0]))).collect();
         let thetas = poses.iter().zip(&roots).flat_map(|(pose, root)| [&[*root], &pose[1..]].concat());
         let thetas: Vec<f64> = thetas.flat_map(|v| v.to_array()).collect();
-        let places = pelvises.iter().flat_map(|p| (turn.transpose() * (*p - moved) - joint).to_array());
+        let places = pelvises.iter().flat_map(|p| (turn.transpose() * (*p - moved) - *joint).to_array());
         let transl = array(&[count, 3], places.collect());
-        let betas = array(&[1, 10], betas);
+        let betas = array(&[1, 10], betas.clone());
         write(
             "poses.npz",
             &[("betas", betas.clone()), ("thetas", array(&[count, 72], thetas.clone())), ("transl", transl.clone())],
@@ -167,25 +167,19 @@ mod tests {
         parms("smpl_parms.pth", 72);
         parms("smplx.pth", 165);
         std::fs::copy(out.path().join("cameras.npz"), out.path().join("cam_parms.npz")).unwrap();
-        let error = read::read(&out.path().join("smplx.pth"), &video).err().unwrap().to_string();
+        let error = read::read(&out.path().join("smplx.pth"), video).err().unwrap().to_string();
         assert!(["smplx.pth", "body_pose", "72", "165"].iter().all(|word| error.contains(word)), "{error}");
         for (file, tool) in [
             ("poses.npz", Tool::PeopleSnapshot),
             ("poses/train.npz", Tool::PeopleSnapshot),
             ("smpl_parms.pth", Tool::GaussianAvatar),
         ] {
-            let (fit, _) = read::read(&out.path().join(file), &video).unwrap();
+            let (fit, _) = read::read(&out.path().join(file), video).unwrap();
             assert_eq!((fit.tool, fit.people.len(), fit.people[0].frames.len()), (tool, 1, count));
-            for (i, frame) in fit.people[0].frames.iter().enumerate() {
-                assert_eq!((frame.index, frame.focal, frame.centre), (i, [k[0], k[4]], [k[2], k[5]]));
-                assert!(frame.pelvis(joint).distance(pelvises[i]) < 1e-5);
-                let root = frame.world_to_camera * rotation(frame.pose[0]);
-                assert!(root.abs_diff_eq(rotation(poses[i][0]), 1e-5) && frame.world_to_camera == turn);
-                assert!(frame.pose[1..].iter().zip(&poses[i][1..]).all(|(a, b)| a.distance(*b) < 1e-6));
-            }
+            motion.is_of(&fit.people[0]);
         }
         let refused = |words: &[&str]| {
-            let error = read::read(&out.path().join("poses.npz"), &video).err().unwrap().to_string();
+            let error = read::read(&out.path().join("poses.npz"), video).err().unwrap().to_string();
             assert!(words.iter().all(|word| error.contains(word)), "{error}");
         };
         cameras(1080.0);

@@ -100,6 +100,7 @@ fn as_json(value: &Py) -> serde_json::Value {
     match value {
         Py::Dict(items) => serde_json::Value::Object(items.iter().map(|(k, v)| (k.clone(), as_json(v))).collect()),
         Py::Text(text) => text.as_str().into(),
+        Py::Raw(_) => unreachable!(),
         Py::List(items) => items.iter().map(as_json).collect::<Vec<_>>().into(),
         Py::Array(shape, values) => match shape.split_first() {
             None => values[0].into(),
@@ -164,11 +165,7 @@ fn people_of_sam_3d_body_are_told_apart_and_a_body_is_fitted_to_each() {
                 }
                 let said = points::solve(&out.path().join(file), sam3d::SET, Vec::new(), &mut person, &body).unwrap();
                 let [metres, degrees] = errors(&body, &person, truth);
-                println!(
-                    "{:.0} mm, person {who}: joints {:.1} mm, rotations {degrees:.1} degrees; {said}",
-                    1e3 * noise,
-                    1e3 * metres
-                );
+                println!("{noise} m, person {who}: joints {metres} m, rotations {degrees} degrees; {said}");
                 assert!(metres < most[0] && degrees < most[1], "{noise}: {metres} m, {degrees} degrees");
             }
         }
@@ -260,15 +257,9 @@ fn vertices_of_a_mesh_tell_the_twist_of_limbs_through_a_map() {
             assert_eq!(person.vertices, count);
             let mapped =
                 if is_mapped { points::mapped(&path, Some(&map), count, &body, true).unwrap() } else { Vec::new() };
-            let start = std::time::Instant::now();
             points::solve(&path, sam3d::SET, mapped, &mut person, &body).unwrap();
             let [metres, degrees] = errors(&body, &person, &truth);
-            println!(
-                "{:.0} mm, mapped {is_mapped}: {:.1} mm, {degrees:.1} degrees, {:.1} s",
-                1e3 * noise,
-                1e3 * metres,
-                start.elapsed().as_secs_f32()
-            );
+            println!("{noise} m, mapped {is_mapped}: {metres} m, {degrees} degrees");
             [metres, degrees]
         });
         assert!(both[0] < most[0] && both[1] < most[1], "{noise}: {both:?}");

@@ -24,7 +24,7 @@ pub fn body() -> BodyModel {
 }
 
 pub use synth::Py;
-pub use testkit::files::{Directory, shared};
+pub use testkit::files::{Directory, damaged, shared};
 
 /// An array as `numpy.save` writes it.
 pub fn npy(shape: &[usize], values: &[f32]) -> Vec<u8> {
@@ -42,24 +42,6 @@ pub fn array(shape: &[u32], values: &[f64]) -> Py {
 
 pub fn flat(points: &[Vec3]) -> Vec<f64> {
     points.iter().flat_map(|p| p.to_array()).map(f64::from).collect()
-}
-
-/// Variants of a file, each with a few bytes replaced, left out or repeated; always the same ones.
-pub fn damaged(whole: &[u8], count: usize) -> impl Iterator<Item = Vec<u8>> + '_ {
-    (0..count).map(|case| {
-        let mut stream = volrender::RandomStream::new(&[0x6461_6d61, case as u64]);
-        let mut bytes = whole.to_vec();
-        for _ in 0..=case % 3 {
-            let at = (stream.uniform() * bytes.len() as f32) as usize % bytes.len().max(1);
-            let end = (at + (stream.uniform() * 40.0) as usize).min(bytes.len());
-            match case % 4 {
-                0 => drop(bytes.drain(at..end)),
-                1 => bytes.extend_from_within(at..end),
-                _ => bytes[at] = (stream.uniform() * 256.0) as u8,
-            }
-        }
-        bytes
-    })
 }
 
 /// Intersection over union of the posed body's silhouette and the mask, over the pixels that no

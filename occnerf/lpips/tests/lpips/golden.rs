@@ -141,32 +141,6 @@ fn a_picture_counts_the_same_alone_and_among_others_and_either_way_round() {
 }
 
 #[test]
-fn the_bits_do_not_depend_on_the_number_of_threads() {
-    for trunk in [Trunk::SqueezeNet, Trunk::AlexNet, Trunk::Vgg16] {
-        let lpips = network(trunk);
-        let (a, b) = (noise(6 * 3 * 32 * 32, 6), noise(6 * 3 * 32 * 32, 7));
-        let run = |threads: usize| {
-            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-            let mut d_a = vec![0.0; a.len()];
-            let values = pool.install(|| lpips.distance_backward(&a, &b, 32, 32, 1.0, &mut d_a).unwrap());
-            (values.map_bits(), d_a.iter().map(|d| d.to_bits()).collect::<Vec<_>>())
-        };
-        let one = run(1);
-        assert!(one == run(2) && one == run(3), "{}", trunk.name());
-    }
-}
-
-trait Bits {
-    fn map_bits(&self) -> Vec<u64>;
-}
-
-impl Bits for Vec<f64> {
-    fn map_bits(&self) -> Vec<u64> {
-        self.iter().map(|v| v.to_bits()).collect()
-    }
-}
-
-#[test]
 fn pictures_that_are_too_small_or_too_large_are_refused_with_the_size() {
     for (trunk, least) in [(Trunk::Vgg16, 16), (Trunk::AlexNet, 31), (Trunk::SqueezeNet, 17)] {
         let lpips = network(trunk);

@@ -5,64 +5,7 @@ use std::io::Cursor;
 use allocation_counter::measure;
 use array_files::torch::{TorchFile, is_torch};
 use array_files::{Data, Error, NdArray};
-use testkit::files::{shared, zip};
-
-/// A tensor to save: name, storage class, key, offset, shape and strides.
-type Saved = (&'static str, &'static str, u8, u32, Vec<u32>, Vec<u32>);
-
-fn pickled(tensors: &[Saved], legacy: bool) -> Vec<u8> {
-    let text = |out: &mut Vec<u8>, text: &str| {
-        out.push(b'X');
-        out.extend((text.len() as u32).to_le_bytes());
-        out.extend(text.as_bytes());
-    };
-    let mut out = b"\x80\x02}(".to_vec();
-    for (name, class, key, offset, shape, strides) in tensors {
-        text(&mut out, name);
-        out.extend(b"ctorch._utils\n_rebuild_tensor_v2\n((");
-        text(&mut out, "storage");
-        out.extend(format!("ctorch\n{class}\n").bytes());
-        text(&mut out, &key.to_string());
-        text(&mut out, "cpu");
-        out.extend(b"K\x08");
-        if legacy {
-            out.push(b'N');
-        }
-        out.extend(b"tQJ");
-        out.extend(offset.to_le_bytes());
-        for list in [shape, strides] {
-            out.push(b'(');
-            for n in list {
-                out.push(b'J');
-                out.extend(n.to_le_bytes());
-            }
-            out.push(b't');
-        }
-        out.extend(b"\x89ccollections\nOrderedDict\n)RtR");
-    }
-    out.extend(b"u.");
-    out
-}
-
-fn archive(tensors: &[Saved], storages: &[Vec<u8>]) -> Vec<u8> {
-    let pickle = ("x/data.pkl".to_owned(), pickled(tensors, false));
-    zip([pickle].into_iter().chain((0..).zip(storages).map(|(key, bytes)| (format!("x/data/{key}"), bytes.clone()))))
-}
-
-fn legacy(tensors: &[Saved], storages: &[Vec<u8>], sizes: &[usize]) -> Vec<u8> {
-    let mut out = b"\x80\x02\x8a\x0al\xfc\x9cF\xf9 j\xa8P\x19.\x80\x02M\xe9\x03.\x80\x02}.".to_vec();
-    out.extend(pickled(tensors, true));
-    out.extend(b"\x80\x02](");
-    for key in 0..storages.len() {
-        out.extend([b'U', 1, b'0' + key as u8]);
-    }
-    out.extend(b"e.");
-    for (bytes, size) in storages.iter().zip(sizes) {
-        out.extend((bytes.len() as u64 / *size as u64).to_le_bytes());
-        out.extend(bytes);
-    }
-    out
-}
+use testkit::files::{Tensor, torch};
 
 fn read(bytes: Vec<u8>, name: &str) -> Result<NdArray, Error> {
     assert!(is_torch(&bytes));
@@ -77,8 +20,8 @@ fn views_are_written_out_row_by_row() {
     let halves: Vec<u8> = [0x3c00u16, 0xc000].into_iter().flat_map(u16::to_le_bytes).collect();
     let brains: Vec<u8> = [0x3f80u16, 0xc000].into_iter().flat_map(u16::to_le_bytes).collect();
     let longs: Vec<u8> = [-3i64, 1 << 40].into_iter().flat_map(i64::to_le_bytes).collect();
-    let storages = [floats, halves, brains, longs, vec![0, 1]];
-    let cases: [(Saved, Data); 9] = [
+    let storages = [(floats, 4), (halves, 2), (brains, 2), (longs, 8), (vec![0, 1], 1)];
+    let cases: [(Tensor<'_>, Data); 9] = [
         (("rows", "FloatStorage", 0, 1, vec![2, 3], vec![3, 1]), Data::F32(vec![1., 2., 3., 4., 5., 6.])),
         (("columns", "FloatStorage", 0, 0, vec![2, 3], vec![1, 2]), Data::F32(vec![0., 2., 4., 1., 3., 5.])),
         (("expanded", "FloatStorage", 0, 5, vec![2, 2], vec![0, 1]), Data::F32(vec![5., 6., 5., 6.])),
@@ -89,8 +32,8 @@ fn views_are_written_out_row_by_row() {
         (("brain", "BFloat16Storage", 2, 0, vec![2, 1], vec![1, 999]), Data::F32(vec![1., -2.])),
         (("long", "LongStorage", 3, 0, vec![2], vec![1]), Data::I64(vec![-3, 1 << 40])),
     ];
-    let tensors: Vec<Saved> = cases.iter().map(|(saved, _)| saved.clone()).collect();
-    for bytes in [archive(&tensors, &storages), legacy(&tensors, &storages, &[4, 2, 2, 8, 1])] {
+    let tensors: Vec<Tensor<'_>> = cases.iter().map(|(saved, _)| saved.clone()).collect();
+    for bytes in [false, true].map(|legacy| torch(&tensors, &storages, legacy)) {
         for ((name, _, _, _, shape, _), data) in &cases {
             let array = read(bytes.clone(), name).unwrap_or_else(|e| panic!("{name}: {e}"));
             assert_eq!(array.data, *data, "{name}");
@@ -101,7 +44,7 @@ fn views_are_written_out_row_by_row() {
 
 #[test]
 fn tensors_that_leave_their_storage_or_repeat_it_without_end_are_refused() {
-    let storages = [vec![0u8; 32]];
+    let storages = [(vec![0u8; 32], 4)];
     for (shape, strides, offset, words) in [
         (vec![9], vec![1], 0, "32 bytes"),
         (vec![2], vec![7], 1, "32 bytes"),
@@ -109,26 +52,14 @@ fn tensors_that_leave_their_storage_or_repeat_it_without_end_are_refused() {
         (vec![1 << 30], vec![0], 0, "limit"),
         (vec![u32::MAX / 2; 5], vec![0; 5], 0, "limit"),
     ] {
-        let saved: [Saved; 1] = [("t", "FloatStorage", 0, offset, shape, strides)];
-        for bytes in [archive(&saved, &storages), legacy(&saved, &storages, &[4])] {
+        let saved: [Tensor<'_>; 1] = [("t", "FloatStorage", 0, offset, shape, strides)];
+        for bytes in [false, true].map(|legacy| torch(&saved, &storages, legacy)) {
             let mut error = String::new();
             let taken = measure(|| error = read(bytes, "t").unwrap_err().to_string()).bytes_max;
             assert!(error.contains("`t`") && error.contains(words), "{error}");
             assert!(taken < 1 << 21, "{taken} bytes");
         }
     }
-    let missing: [Saved; 1] = [("t", "FloatStorage", 5, 0, vec![1], vec![1])];
-    assert!(read(archive(&missing, &storages), "t").unwrap_err().to_string().contains("\"5\""));
-}
-
-#[test]
-fn the_tensors_of_an_estimator_are_read() {
-    let Some(path) = shared("estimators/gvhmr/hmr4d_results.pt") else { return };
-    let mut file = TorchFile::open("gvhmr", std::fs::File::open(path).unwrap()).unwrap();
-    let root = file.root().clone();
-    let incam = file.resolve("incam", root.get("smpl_params_incam").unwrap()).unwrap();
-    let shape = |key: &str| incam.get(key).unwrap().as_array().unwrap().shape.clone();
-    assert_eq!([shape("body_pose"), shape("betas"), shape("transl")], [[20, 63], [20, 10], [20, 3]]);
-    let betas = incam.get("betas").unwrap().as_array().unwrap().to_f64();
-    assert_eq!(betas[..10], betas[190..], "expanded");
+    let missing: [Tensor<'_>; 1] = [("t", "FloatStorage", 5, 0, vec![1], vec![1])];
+    assert!(read(torch(&missing, &storages, false), "t").unwrap_err().to_string().contains("\"5\""));
 }

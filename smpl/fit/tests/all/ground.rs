@@ -58,18 +58,9 @@ fn a_recorded_walk_stops_sliding_and_stays_where_it_was_elsewhere() {
     for degrees in [0.0, 1.0, 4.0] {
         let Some(walk) = walk(degrees) else { return };
         let found = ground(&skeleton, &walk, sole).unwrap();
-        let [before, after] = [&walk, &found.motion].map(|motion| feet(motion, &skeleton, sole));
+        let after = feet(&found.motion, &skeleton, sole);
         let lowest = after.iter().flat_map(|feet| &feet[..4]).map(|at| at.y).fold(0.0, f32::min);
-        let knees = before.iter().zip(&after).flat_map(|(a, b)| [4, 5].map(|i| a[i].distance(b[i])));
-        println!(
-            "{degrees}°: feet slide {:?} m/s, stand {:?}; moved {:?} m, knees {:.3} (with the floor's tilt of {:.1}°); \
-             lowest {lowest:.3}",
-            found.sliding,
-            found.standing,
-            found.moved,
-            knees.fold(0.0, f32::max),
-            found.tilt.to_degrees()
-        );
+        println!("{degrees}°: {:?} m/s, moved {:?} m, lowest {lowest:.3}", found.sliding, found.moved);
         assert!(found.sliding[1] < 5e-3, "{:?}", found.sliding);
         assert!(found.moved[0] < 0.02 && found.moved[1] < 0.01, "{:?}", found.moved);
         assert!(found.standing.iter().all(|share| *share > 0.3), "{:?}", found.standing);

@@ -5,55 +5,7 @@ use base64::Engine;
 use glam::{Affine3A, Vec3};
 use proptest::prelude::*;
 use rigged::{Character, Mesh, load_mesh};
-use testkit::files::{glb, shared};
-
-/// A strip of two triangles on two joints, the second 1 above the first and turning about z.
-fn arm() -> (String, Vec<u8>) {
-    let mut bytes: Vec<u8> = Vec::new();
-    let mut floats = |values: &[f32]| bytes.extend(values.iter().flat_map(|v| v.to_le_bytes()));
-    // 0: positions at 0, 4 × 3
-    floats(&[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 2.0, 0.0, 1.0, 2.0, 0.0]);
-    // 1: weights at 48, 4 × 4; not normalised on purpose
-    floats(&[2.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.5, 0.5, 0.0, 0.0]);
-    // 2: inverse bind matrices at 112, 2 × 16: identity, and 1 down
-    floats(&[1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0]);
-    floats(&[1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, -1.0, 0.0, 1.0]);
-    // 3: times at 240, 2
-    floats(&[1.0, 3.0]);
-    // 4: rotations at 248, 2 × 4: none, and a quarter turn about z
-    let half = std::f32::consts::FRAC_1_SQRT_2;
-    floats(&[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, half, half]);
-    // 5: cubic translations at 280, 6 × 3: in, value, out; from (0,1,0) at rest to (2,1,0) at rest
-    floats(&[0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 2.0, 1.0, 0.0, 0.0, 0.0, 0.0]);
-    // 6: joints at 352, 4 × 4 u8
-    bytes.extend([0, 0, 0, 0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0]);
-    // 7: indices at 368, 6 u16
-    bytes.extend([0u16, 1, 2, 2, 1, 3].iter().flat_map(|v| v.to_le_bytes()));
-    let views = [(0, 48), (48, 64), (112, 128), (240, 8), (248, 32), (280, 72), (352, 16), (368, 12)];
-    let views: Vec<String> =
-        (views.iter()).map(|(at, n)| format!(r#"{{"buffer":0,"byteOffset":{at},"byteLength":{n}}}"#)).collect();
-    let json = format!(
-        r#"{{"asset":{{"version":"2.0"}},"scene":0,"scenes":[{{"nodes":[0,2]}}],
-"nodes":[{{"children":[1],"name":"root"}},{{"translation":[0,1,0],"name":"tip"}},{{"mesh":0,"skin":0}}],
-"meshes":[{{"primitives":[{{"attributes":{{"POSITION":0,"WEIGHTS_0":1,"JOINTS_0":6}},"indices":7}}]}}],
-"skins":[{{"joints":[0,1],"inverseBindMatrices":2}}],
-"animations":[{{"name":"bend","samplers":[{{"input":3,"output":4}},{{"input":3,"output":5,"interpolation":"CUBICSPLINE"}},{{"input":3,"output":4,"interpolation":"STEP"}}],
-"channels":[{{"sampler":0,"target":{{"node":1,"path":"rotation"}}}}]}},
-{{"samplers":[{{"input":3,"output":5,"interpolation":"CUBICSPLINE"}}],"channels":[{{"sampler":0,"target":{{"node":1,"path":"translation"}}}}]}},
-{{"samplers":[{{"input":3,"output":4,"interpolation":"STEP"}}],"channels":[{{"sampler":0,"target":{{"node":1,"path":"rotation"}}}}]}}],
-"accessors":[{{"bufferView":0,"componentType":5126,"count":4,"type":"VEC3","min":[0,0,0],"max":[1,2,0]}},
-{{"bufferView":1,"componentType":5126,"count":4,"type":"VEC4"}},
-{{"bufferView":2,"componentType":5126,"count":2,"type":"MAT4"}},
-{{"bufferView":3,"componentType":5126,"count":2,"type":"SCALAR","min":[1],"max":[3]}},
-{{"bufferView":4,"componentType":5126,"count":2,"type":"VEC4"}},
-{{"bufferView":5,"componentType":5126,"count":6,"type":"VEC3"}},
-{{"bufferView":6,"componentType":5121,"count":4,"type":"VEC4"}},
-{{"bufferView":7,"componentType":5123,"count":6,"type":"SCALAR"}}],
-"bufferViews":[{}],"buffers":[{{"byteLength":380}}]}}"#,
-        views.join(",")
-    );
-    (json, bytes)
-}
+use testkit::files::{arm, glb, shared};
 
 fn read(json: &str, binary: &[u8]) -> Result<Character, smpl::Error> {
     Character::from_bytes("made.glb", &glb(json, binary))
@@ -382,6 +334,7 @@ fn errors_name_the_fault_of_a_document() {
     refused(&json, &poke(368, &4u16.to_le_bytes()), &["index 4 of 4"]);
     refused(&json, &poke(112, &f32::NAN.to_le_bytes()), &["skin 0", "not finite"]);
     refused(&json, &poke(0, &f32::INFINITY.to_le_bytes()), &["POSITION", "not finite"]);
+    refused(&json, &poke(0, &1e30f32.to_le_bytes()), &["POSITION", "1000000"]);
     refused(&json, &poke(48, &(-1.0f32).to_le_bytes()), &["set 0", "-1"]);
     refused(&json, &poke(240, &3.0f32.to_le_bytes()), &["animation 0", "times"]);
 }
@@ -411,28 +364,6 @@ fn every_truncation_is_an_error() {
     let whole = glb(&json, &binary);
     for n in 0..whole.len() {
         assert!(Character::from_bytes("cut", &whole[..n]).is_err(), "{n} of {} bytes", whole.len());
-    }
-}
-
-proptest! {
-    #![proptest_config(ProptestConfig::with_cases(1500))]
-
-    #[test]
-    fn damaged_files_give_errors_or_characters_that_pose(
-        edits in prop::collection::vec((any::<prop::sample::Index>(), any::<u8>()), 1..6),
-    ) {
-        let (json, binary) = arm();
-        let mut bytes = glb(&json, &binary);
-        for (at, value) in edits {
-            let at = at.index(bytes.len());
-            bytes[at] = value;
-        }
-        if let Ok(character) = Character::from_bytes("damaged", &bytes) {
-            prop_assert_eq!(character.rest().vertices.len(), character.vertices.len());
-            for animation in 0..character.animations.len() {
-                let _ = character.pose(animation, 1.7);
-            }
-        }
     }
 }
 
@@ -493,15 +424,6 @@ fn the_cesium_man_stands_upright_and_moves() {
 }
 
 #[test]
-fn cut_characters_are_refused() {
-    let Some(path) = shared("character/CesiumMan.glb") else { return };
-    let bytes = std::fs::read(path).unwrap();
-    for part in [0, 3, 11, 12, 19, 500, 5000, 100_000, bytes.len() - 1] {
-        assert!(Character::from_bytes("cut", &bytes[..part]).is_err(), "{part} bytes");
-    }
-}
-
-#[test]
 fn parents_are_the_nearest_ancestor_joints() {
     let Some(character) = shared_character("makehuman_walk.glb") else { return };
     let (names, parents) = (&character.joint_names, character.joint_parents());
@@ -528,12 +450,4 @@ fn one_file_named_many_times_is_refused_before_it_fills_the_memory() {
     std::fs::write(&path, format!(r#"{{"asset":{{"version":"2.0"}},"buffers":[{buffers}]}}"#)).unwrap();
     let message = Character::load(&path).unwrap_err().to_string();
     assert!(message.contains("buffer 16") && message.contains("more than the limit"), "{message}");
-}
-
-#[test]
-fn huge_coordinates_are_refused() {
-    let (json, mut bytes) = arm();
-    bytes[..4].copy_from_slice(&1e30f32.to_le_bytes());
-    let message = Character::from_bytes("arm.glb", &glb(&json, &bytes)).unwrap_err().to_string();
-    assert!(message.contains("POSITION") && message.contains("1000000"), "{message}");
 }

@@ -180,17 +180,9 @@ fn window_sums(values: &[f32], width: i32, height: i32, half: i32) -> Vec<f32> {
 mod tests {
     use super::*;
     use occnerf::capture::Image;
+    use testkit::body::Random;
 
     const SIDE: u32 = 96;
-
-    /// Numbers in [0, 1) (Knuth's linear congruential generator).
-    fn uniform() -> impl FnMut() -> f32 {
-        let mut state = 1u64;
-        move || {
-            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-            (state >> 40) as f32 / (1u64 << 24) as f32
-        }
-    }
 
     /// A disc in a texture that a shift of `shift` pixels moves.
     fn disc(shift: f32) -> (Image, Vec<f32>) {
@@ -232,9 +224,9 @@ mod tests {
         let found = parts(darker, |_| false);
         assert!(found[3] > 0.6 && found[2] < 0.2, "{found:?}");
         let mut noisy = disc(0.0);
-        let mut uniform = uniform();
+        let mut random = Random(1);
         let inside = noisy.1.iter().flat_map(|&m| [m; 3]);
-        noisy.0.pixels.iter_mut().zip(inside).for_each(|(p, m)| *p += m * 0.1 * (uniform() - 0.5));
+        noisy.0.pixels.iter_mut().zip(inside).for_each(|(p, m)| *p += m * 0.1 * (random.unit() - 0.5));
         let found = parts(noisy, |_| false);
         assert!(found[4] > 0.8, "{found:?}");
         let mut smaller = disc(0.0);
@@ -248,9 +240,9 @@ mod tests {
 
     #[test]
     fn sums_of_windows_are_those_of_their_pixels() {
-        let mut uniform = uniform();
+        let mut random = Random(1);
         let (width, height) = (7, 5);
-        let values: Vec<f32> = (0..width * height).map(|_| uniform()).collect();
+        let values: Vec<f32> = (0..width * height).map(|_| random.unit()).collect();
         for half in [0, 1, 3, 9] {
             let found = window_sums(&values, width, height, half);
             for (i, found) in found.iter().enumerate() {

@@ -349,26 +349,6 @@ pub mod tests {
     }
 
     #[test]
-    fn parts_share_points_out_and_read_each_others_logs() {
-        let folder = folder("parts");
-        let shards = ["1/2", "2/2"].map(|text| text.parse::<Shard>().unwrap());
-        let lines: Vec<Line> = (0..9).map(|i| line(&format!("p{i}"), "k", Kind::Change, 20.0, 3.0)).collect();
-        for shard in shards {
-            let mut runner = Runner::open(&folder, None, Duration::ZERO, Some(shard)).unwrap();
-            let own: Vec<&Line> = lines.iter().filter(|l| shard.has_name(&name(&l.point))).collect();
-            assert!((1..9).contains(&own.len()));
-            own.into_iter().for_each(|line| runner.add(line.clone()).unwrap());
-            assert!(Runner::open(&folder, None, Duration::ZERO, Some(shard)).is_err(), "its twin runs");
-        }
-        let mut whole = Runner::open(&folder, None, Duration::ZERO, None).unwrap();
-        for line in &lines {
-            assert_eq!(whole.run(line.point.clone()).unwrap().as_ref(), Some(line));
-        }
-        assert_eq!((whole.begun, whole.left.len()), (0, 0));
-        std::fs::remove_dir_all(&folder).unwrap();
-    }
-
-    #[test]
     fn a_finished_point_is_not_run_again_and_its_later_line_holds() {
         let folder = folder("again");
         let old = line("a", "k", Kind::Change, 20.0, 3.0);

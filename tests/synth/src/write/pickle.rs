@@ -15,6 +15,8 @@ pub enum Py {
     Text(String),
     /// List.
     List(Vec<Py>),
+    /// Opcodes that leave an object.
+    Raw(Vec<u8>),
 }
 
 impl Py {
@@ -74,6 +76,7 @@ impl Py {
                 out.push(b'u');
             }
             Self::Text(words) => text(words, out),
+            Self::Raw(opcodes) => out.extend(opcodes),
             Self::List(items) => {
                 out.extend(b"](");
                 items.iter().for_each(|item| item.write(out));
@@ -114,20 +117,6 @@ fn text(words: &str, out: &mut Vec<u8>) {
 }
 
 impl Py {
-    /// Replaces the entry at a path of keys, or adds it.
-    ///
-    /// # Panics
-    /// For what is not a dictionary.
-    pub fn set(&mut self, keys: &[&str], value: Py) {
-        let Self::Dict(items) = self else { panic!("not a dictionary") };
-        let found = items.iter_mut().find(|(key, _)| key == keys[0]);
-        match (found, &keys[1..]) {
-            (Some((_, slot)), []) => *slot = value,
-            (Some((_, slot)), rest) => slot.set(rest, value),
-            (None, _) => items.push((keys[0].to_owned(), value)),
-        }
-    }
-
     /// Removes the entry at a path of keys.
     ///
     /// # Panics
@@ -153,35 +142,5 @@ impl Py {
             _ => None,
         };
         found.expect("no such item").at(rest)
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use array_files::pickle::{Value, parse};
-
-    use super::Py;
-
-    #[test]
-    fn what_is_written_is_read_back() {
-        let written = Py::record([
-            ("K", Py::floats(&[2, 3], &[1.0, -2.5, 0.1, 4.0, 5.0, f32::MAX])),
-            ("names", Py::List(vec![Py::text("Camera_B1/000000.png"), Py::text("ünï")])),
-            ("none", Py::Dict(Vec::new())),
-        ]);
-        let value = parse("a.pkl", &written.pickle()).unwrap();
-        let Some(Value::Array(array)) = value.get("K") else { panic!("{value:?}") };
-        assert_eq!(array.shape, [2, 3]);
-        assert_eq!(array.to_f64(), [1.0, -2.5, 0.1f32, 4.0, 5.0, f32::MAX].map(f64::from));
-        let names: Vec<&str> = value.get("names").unwrap().items().unwrap().iter().filter_map(Value::as_str).collect();
-        assert_eq!(names, ["Camera_B1/000000.png", "ünï"]);
-        assert_eq!(value.get("none"), Some(&Value::Dict(Vec::new())));
-        let npy = written.npy();
-        let path = std::env::temp_dir().join(format!("occnerf-pickle-{}.npy", std::process::id()));
-        std::fs::write(&path, &npy).unwrap();
-        assert_eq!(array_files::pickle::read(&path).unwrap(), value);
-        std::fs::remove_file(path).unwrap();
-        let start = 10 + usize::from(u16::from_le_bytes([npy[8], npy[9]]));
-        assert_eq!((start % 64, npy[start - 1]), (0, b'\n'));
     }
 }

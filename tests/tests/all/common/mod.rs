@@ -5,7 +5,7 @@ use std::sync::OnceLock;
 use glam::Vec3;
 use occnerf::capture::Capture;
 use occnerf::{Config, Method, MotionKind, PreparedFrame, Preset, Scene, StepReport, Trainer};
-use smpl::{BodyModel, Placement};
+use smpl::{BodyModel, SparseRows};
 use synth::{DemoConfig, demo};
 use testkit::files::Directory;
 use visibility::RayMesh;
@@ -85,31 +85,16 @@ pub fn silhouette(scene: &Scene, frame: &PreparedFrame) -> Vec<bool> {
     rays.map(|ray| mesh.first_hit(ray.origin, ray.direction).is_some()).collect()
 }
 
-/// In mid-stride: a leg forward with a bent knee, arms down and swinging, elbows bent.
-pub fn walking() -> Vec<Vec3> {
-    let mut pose = vec![Vec3::ZERO; body().num_joints()];
-    for (joint, rotation) in [
-        (1, [-0.5, 0.0, 0.0]),
-        (2, [0.35, 0.0, 0.0]),
-        (4, [0.35, 0.0, 0.0]),
-        (5, [0.7, 0.0, 0.0]),
-        (16, [0.3, 0.0, -1.25]),
-        (17, [-0.4, 0.0, 1.25]),
-        (18, [0.0, -0.4, 0.0]),
-        (19, [0.0, 0.6, 0.0]),
-    ] {
-        pose[joint] = Vec3::from(rotation);
+/// Four vertices, two joints, two shapes.
+pub fn tiny_body() -> BodyModel {
+    let corner = |i: usize| Vec3::new((i & 1) as f32, (i >> 1) as f32, 0.3 * i as f32);
+    BodyModel {
+        v_template: (0..4).map(corner).collect(),
+        faces: vec![[0, 1, 2], [1, 3, 2]],
+        shapedirs: vec![Vec3::splat(0.01); 8],
+        posedirs: SparseRows::from_rows((0..4).map(|i| vec![(i as u32, Vec3::splat(0.02))])),
+        weights: SparseRows::from_rows((0..4).map(|i| vec![(u32::from(i > 1), 1.0f32)])),
+        j_regressor: SparseRows::from_rows((0..2).map(|j| vec![(2 * j as u32, 0.5f32), (2 * j as u32 + 1, 0.5)])),
+        parents: vec![None, Some(0)],
     }
-    pose
-}
-
-/// Turned and moved, so that nothing can hide in a pose at the origin.
-pub fn placement() -> Placement {
-    Placement::Origin { rotation: Vec3::new(0.1, 0.7, -0.05), translation: Vec3::new(0.3, -0.2, 0.5) }
-}
-
-/// The value below which a share of `values` lies.
-pub fn quantile(values: &mut [f32], share: f32) -> f32 {
-    values.sort_by(f32::total_cmp);
-    values[((values.len() - 1) as f32 * share) as usize]
 }

@@ -12,7 +12,7 @@ mod seeds;
 use std::hint::black_box;
 use std::io::Cursor;
 use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::LazyLock;
 use std::time::{Duration, Instant};
 
@@ -20,12 +20,14 @@ use array_files::npz::{Npz, read_npy};
 use array_files::pickle;
 use array_files::torch::TorchFile;
 use glam::Vec3;
-use mutate::{Form, Random, damaged};
+use mutate::{Form, damaged};
 use occnerf::bake::Avatar;
 use occnerf::capture::{Image, ImportOptions, LoadOptions, import, load_capture};
 use occnerf::{Config, Lpips, Person, Trainer, checkpoint_config};
 use rigged::{Character, load_mesh};
 use smpl::{BodyModel, MotionClip};
+use testkit::body::Random;
+use testkit::files::shared;
 
 /// Longest that a reader may take.
 const LONGEST: Duration = Duration::from_secs(1);
@@ -38,11 +40,23 @@ struct Attack {
     seeds: Vec<Vec<u8>>,
     /// Part of all inputs, in thousandths.
     share: u64,
-    /// Most memory, in bytes, that any of these inputs (at most 1 MiB each) may take.
+    /// Most memory, in bytes, that any of these inputs (at most the seed's size or 1 MiB each) may take.
     most: u64,
 }
 
+fn attack(name: &'static str, form: Form, seeds: Vec<Vec<u8>>, share: u64) -> Attack {
+    Attack { name, form, seeds, share, most: 64 * MIB }
+}
+
 impl Attack {
+    /// Reads damaged files that are put at a path.
+    fn at(self, path: &Path, mut read: impl FnMut(&Path) -> bool) {
+        self.run(|bytes| {
+            std::fs::write(path, bytes).unwrap();
+            read(path)
+        });
+    }
+
     /// Reads damaged files; `read` says whether one was accepted.
     fn run(self, mut read: impl FnMut(&[u8]) -> bool) {
         let total: u64 = std::env::var("FUZZ").map_or(20_000, |n| n.parse().expect("FUZZ is a number"));
@@ -68,7 +82,8 @@ impl Attack {
                 }
             }
             if outcome.is_err() || seconds >= LONGEST || memory > self.most {
-                let path = PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join(format!("fuzz-{}-{number}", self.name));
+                let path = PathBuf::from(env!("CARGO_TARGET_TMPDIR"))
+                    .join(format!("fuzz-{}-{number}", self.name.replace('/', "-")));
                 std::fs::write(&path, &bytes).unwrap();
                 let panicked = if outcome.is_err() { "panicked" } else { "no panic" };
                 panic!("{}: {panicked}, {seconds:?}, {} MiB: {}", self.name, memory / MIB, path.display());
@@ -107,70 +122,46 @@ fn place(name: &str) -> PathBuf {
 
 #[test]
 fn pickles() {
-    Attack { name: "pickle", form: Form::Plain, seeds: seeds::pickles(), share: 80, most: 64 * MIB }
-        .run(|bytes| pickle::parse("a.pkl", bytes).is_ok());
+    attack("pickle", Form::Plain, seeds::pickles(), 80).run(|bytes| pickle::parse("a.pkl", bytes).is_ok());
+    let joblib = attack("joblib", Form::Plain, seeds::joblibs(), 80);
+    joblib.run(|bytes| pickle::from_bytes("a.pkl", bytes.to_vec()).is_ok());
 }
 
 #[test]
-fn joblib_files() {
-    Attack { name: "joblib", form: Form::Plain, seeds: seeds::joblibs(), share: 80, most: 64 * MIB }
-        .run(|bytes| pickle::from_bytes("a.pkl", bytes.to_vec()).is_ok());
-}
-
-#[test]
-fn archives_of_arrays() {
-    Attack { name: "npz", form: Form::Zip, seeds: seeds::archives(), share: 106, most: 64 * MIB }.run(|bytes| {
+fn arrays() {
+    attack("npz", Form::Zip, seeds::archives(), 106).run(|bytes| {
         let Ok(mut npz) = Npz::from_bytes("a.npz", bytes.to_vec()) else { return false };
         let keys: Vec<String> = npz.keys().iter().take(50).cloned().collect();
         // The seed of numpy's has an array of a type that is refused.
         keys.iter().filter(|key| npz.array(key).is_ok()).count() > 1
     });
-}
-
-#[test]
-fn single_arrays() {
-    let path = place("a.npy");
-    Attack { name: "npy", form: Form::Plain, seeds: seeds::arrays(), share: 80, most: 64 * MIB }.run(|bytes| {
-        std::fs::write(&path, bytes).unwrap();
-        read_npy(&path).is_ok()
-    });
+    attack("npy", Form::Plain, seeds::arrays(), 80).at(&place("a.npy"), |path| read_npy(path).is_ok());
 }
 
 #[test]
 fn bodies() {
-    let path = place("body.npz");
-    let read = |bytes: &[u8]| {
-        std::fs::write(&path, bytes).unwrap();
-        let Ok(body) = BodyModel::load(&path) else { return false };
+    let read = |path: &Path| {
+        let Ok(body) = BodyModel::load(path) else { return false };
         let pose = vec![glam::Vec3::splat(0.1); body.num_joints()];
         black_box(body.pose(&body.shaped(&[]), &pose, smpl::Placement::default()));
         true
     };
-    Attack { name: "body npz", form: Form::Zip, seeds: seeds::body_archives(), share: 60, most: 64 * MIB }.run(read);
-    Attack {
-        name: "body safetensors",
-        form: Form::Safetensors,
-        seeds: seeds::saved_bodies(),
-        share: 60,
-        most: 64 * MIB,
-    }
-    .run(read);
+    attack("body npz", Form::Zip, seeds::body_archives(), 60).at(&place("body.npz"), read);
+    attack("body safetensors", Form::Safetensors, seeds::saved_bodies(), 60).at(&place("body.npz"), read);
 }
 
 #[test]
 fn clips() {
-    let path = place("clip.npz");
-    Attack { name: "motion clip", form: Form::Zip, seeds: seeds::clips(), share: 50, most: 64 * MIB }.run(|bytes| {
-        std::fs::write(&path, bytes).unwrap();
-        let Ok(clip) = MotionClip::load(&path) else { return false };
+    attack("motion clip", Form::Zip, seeds::clips(), 50).at(&place("clip.npz"), |path| {
+        let Ok(clip) = MotionClip::load(path) else { return false };
         black_box(clip.at(clip.duration() * 0.4, 24));
         true
     });
 }
 
 #[test]
-fn characters() {
-    Attack { name: "glTF", form: Form::Glb, seeds: seeds::characters(), share: 100, most: 64 * MIB }.run(|bytes| {
+fn characters_and_meshes() {
+    attack("glTF", Form::Glb, seeds::characters(), 100).run(|bytes| {
         let Ok(character) = Character::from_bytes("a.glb", bytes) else { return false };
         black_box(character.rest());
         for animation in 0..character.animations.len().min(4) {
@@ -179,61 +170,43 @@ fn characters() {
         black_box(character.joint_parents());
         true
     });
-}
-
-#[test]
-fn meshes() {
-    let path = place("a.obj");
-    Attack { name: "OBJ", form: Form::Plain, seeds: seeds::meshes(), share: 70, most: 128 * MIB }.run(|bytes| {
-        std::fs::write(&path, bytes).unwrap();
-        load_mesh(&path).is_ok()
-    });
+    let obj = Attack { most: 128 * MIB, ..attack("OBJ", Form::Plain, seeds::meshes(), 70) };
+    obj.at(&place("a.obj"), |path| load_mesh(path).is_ok());
 }
 
 #[test]
 fn pictures() {
-    let path = place("a.png");
-    let read = |bytes: &[u8]| {
-        std::fs::write(&path, bytes).unwrap();
-        Image::load(&path).is_ok()
-    };
     // 8192 pixels a side is the bound: 16 bytes a pixel of a header that lies, 18 with what is
     // read.
     let most = 8192 * 8192 * 18;
-    Attack { name: "PNG", form: Form::Png, seeds: seeds::pngs(), share: 60, most }.run(read);
-    Attack { name: "JPEG", form: Form::Plain, seeds: seeds::jpegs(), share: 30, most }.run(read);
+    for form in [attack("PNG", Form::Png, seeds::pngs(), 60), attack("JPEG", Form::Plain, seeds::jpegs(), 30)] {
+        Attack { most, ..form }.at(&place("a.png"), |path| Image::load(path).is_ok());
+    }
 }
 
 #[test]
 fn metadata_of_captures() {
     let (dir, body, seed) = seeds::wild_capture(&place("wild"));
-    Attack { name: "metadata.json", form: Form::Plain, seeds: vec![seed], share: 30, most: 64 * MIB }.run(|bytes| {
-        std::fs::write(dir.join("metadata.json"), bytes).unwrap();
-        load_capture(&dir, &body, &LoadOptions::default()).is_ok()
-    });
+    let read = |_: &Path| load_capture(&dir, &body, &LoadOptions::default()).is_ok();
+    attack("metadata.json", Form::Plain, vec![seed], 30).at(&dir.join("metadata.json"), read);
 }
 
 #[test]
 fn configurations() {
-    Attack { name: "TOML", form: Form::Plain, seeds: seeds::configurations(), share: 30, most: 64 * MIB }.run(
-        |bytes| {
-            let Ok(text) = std::str::from_utf8(bytes) else { return false };
-            toml::from_str::<Config>(text).is_ok_and(|config| config.validate().is_ok())
-        },
-    );
+    attack("TOML", Form::Plain, seeds::configurations(), 30).run(|bytes| {
+        let Ok(text) = std::str::from_utf8(bytes) else { return false };
+        toml::from_str::<Config>(text).is_ok_and(|config| config.validate().is_ok())
+    });
 }
 
 /// Sizes are those of the configuration in the file, which is bounded by itself: only the sizes of
 /// the seed are opened.
 #[test]
 fn checkpoints() {
-    let path = place("checkpoint.safetensors");
     let (scene, seed, config) = seeds::checkpoint();
-    let attack = Attack { name: "checkpoint", form: Form::Safetensors, seeds: vec![seed], share: 4, most: 64 * MIB };
-    attack.run(|bytes| {
-        std::fs::write(&path, bytes).unwrap();
-        match checkpoint_config(&path) {
-            Ok(found) if found == config => Trainer::resume(scene, &path).is_ok(),
+    attack("checkpoint", Form::Safetensors, vec![seed], 4).at(&place("checkpoint.safetensors"), |path| {
+        match checkpoint_config(path) {
+            Ok(found) if found == config => Trainer::resume(scene, path).is_ok(),
             other => other.is_ok(),
         }
     });
@@ -241,12 +214,10 @@ fn checkpoints() {
 
 #[test]
 fn weights_of_networks() {
-    let path = place("weights.pth");
+    let [zip, _] = seeds::tensors(["features.0.weight", "features.0.bias"]);
     // The network that is wanted is not there: everything up to the names of the tensors is read.
-    let attack = Attack { name: "torch", form: Form::Zip, seeds: seeds::weights(), share: 10, most: 64 * MIB };
-    attack.run(|bytes| {
-        std::fs::write(&path, bytes).unwrap();
-        let refused = Lpips::load(&path).err().map(|error| error.to_string()).unwrap_or_default();
+    attack("torch", Form::Zip, vec![zip], 10).at(&place("weights.pth"), |path| {
+        let refused = Lpips::load(path).err().map(|error| error.to_string()).unwrap_or_default();
         refused.contains("trunk") || refused.contains("expected floats") || refused.contains("lacks")
     });
 }
@@ -260,15 +231,15 @@ fn tensors() {
         let found = keys.iter().filter_map(|key| file.tensor(key, root.get(key)?).ok()?).collect::<Vec<_>>();
         found.iter().filter(|tensor| file.read("a", tensor).is_ok()).count() > 0
     };
-    let [zip, legacy] = people::tensors().try_into().unwrap();
+    let [zip, legacy] = seeds::tensors(["a", "b"]);
     // 16 times the file and 64 MiB, twice while a vector grows.
     let most = 256 * MIB;
-    Attack { name: "tensors", form: Form::Zip, seeds: vec![zip], share: 20, most }.run(read);
-    Attack { name: "tensors, old form", form: Form::Plain, seeds: vec![legacy], share: 20, most }.run(read);
+    Attack { most, ..attack("tensors", Form::Zip, vec![zip], 20) }.run(read);
+    Attack { most, ..attack("tensors, old form", Form::Plain, vec![legacy], 20) }.run(read);
 }
 
 /// Up to the body model, which is not there: nothing is written.
-fn imports(fit: &std::path::Path, video: &std::path::Path) -> bool {
+fn imports(fit: &Path, video: &Path) -> bool {
     // The body is read after the fit.
     let body = Some("no-such-body.npz".into());
     let options = ImportOptions { frames: video.to_owned(), fit: fit.to_owned(), body, ..ImportOptions::default() };
@@ -278,58 +249,49 @@ fn imports(fit: &std::path::Path, video: &std::path::Path) -> bool {
 
 #[test]
 fn fits_of_estimators() {
-    let (video, path) = (people::video(), place("phalp.pkl"));
-    let attack =
-        Attack { name: "PHALP, COCO runs", form: Form::Plain, seeds: people::phalp(), share: 40, most: 128 * MIB };
-    attack.run(|bytes| {
-        std::fs::write(&path, bytes).unwrap();
-        imports(&path, &video)
-    });
-    let seeds = people::sam3d();
-    for (seed, name) in seeds.into_iter().zip(["SAM 3D Body JSON", "SAM 3D Body pickle"]) {
-        let path = place("sam3d.dat");
-        let attack = Attack { name, form: Form::Plain, seeds: vec![seed], share: 10, most: 64 * MIB };
-        attack.run(|bytes| {
-            std::fs::write(&path, bytes).unwrap();
-            imports(&path, &video)
-        });
+    let video = people::video();
+    let phalp = Attack { most: 128 * MIB, ..attack("PHALP, COCO runs", Form::Plain, people::phalp(), 40) };
+    phalp.at(&place("phalp.pkl"), |path| imports(path, &video));
+    for (seed, name) in people::sam3d().into_iter().zip(["SAM 3D Body JSON", "SAM 3D Body pickle"]) {
+        attack(name, Form::Plain, vec![seed], 10).at(&place("sam3d.dat"), |path| imports(path, &video));
     }
     let dir = place("easymocap");
     std::fs::create_dir_all(dir.join("smpl")).unwrap();
     let [frame, cameras] = people::easymocap();
-    let write = |name: &str, bytes: &[u8]| std::fs::write(dir.join(name), bytes).unwrap();
-    ["intri.yml", "extri.yml"].iter().for_each(|name| write(name, &cameras));
-    let attack = |name, seed| Attack { name, form: Form::Plain, seeds: vec![seed], share: 10, most: 64 * MIB };
-    attack("EasyMocap JSON", frame.clone()).run(|bytes| {
-        write("smpl/000000.json", bytes);
+    let lenses = |bytes: &[u8]| ["intri.yml", "extri.yml"].map(|name| std::fs::write(dir.join(name), bytes).unwrap());
+    lenses(&cameras);
+    let json = attack("EasyMocap JSON", Form::Plain, vec![frame.clone()], 10);
+    json.at(&dir.join("smpl/000000.json"), |_| imports(&dir, &video));
+    std::fs::write(dir.join("smpl/000000.json"), &frame).unwrap();
+    attack("EasyMocap YAML", Form::Plain, vec![cameras], 10).run(|bytes| {
+        lenses(bytes);
         imports(&dir, &video)
     });
-    write("smpl/000000.json", &frame);
-    attack("EasyMocap YAML", cameras).run(|bytes| {
-        ["intri.yml", "extri.yml"].iter().for_each(|name| write(name, bytes));
-        imports(&dir, &video)
-    });
+    let Some(dir) = shared("estimators") else { return };
+    for (name, form) in [
+        ("wham/wham_output.pkl", Form::Plain),
+        ("prompthmr/results.pkl", Form::Plain),
+        ("gvhmr/hmr4d_results.pt", Form::Zip),
+        ("romp/video_results.npz", Form::Zip),
+    ] {
+        let (seed, path) = (std::fs::read(dir.join(name)).unwrap(), place(name.split('/').next_back().unwrap()));
+        let fit = Attack { most: 600 * MIB, ..attack(name, form, vec![seed], 5) };
+        fit.at(&path, |path| imports(path, &dir.join("frames")));
+    }
 }
 
 #[test]
 fn people_of_runs() {
     let run = place("run");
     let (config, seed) = people::person(&run);
-    let attack = Attack { name: "person", form: Form::Safetensors, seeds: vec![seed], share: 20, most: 64 * MIB };
-    attack.run(|bytes| {
-        std::fs::write(run.join("person.safetensors"), bytes).unwrap();
-        Person::load(&run, &config).is_ok()
+    let person = attack("person", Form::Safetensors, vec![seed], 20);
+    person.at(&run.join("person.safetensors"), |_| Person::load(&run, &config).is_ok());
+    attack("avatar", Form::Safetensors, people::avatars(), 30).at(&place("avatar.safetensors"), |path| {
+        let Ok(avatar) = Avatar::load(path) else { return false };
+        if let Some(clip) = avatar.clips.first() {
+            let (pose, _) = clip.motion.at(0.02, avatar.num_joints());
+            black_box(avatar.skin(&avatar.bones(&pose, Vec3::ZERO), &pose));
+        }
+        true
     });
-    let path = place("avatar.safetensors");
-    Attack { name: "avatar", form: Form::Safetensors, seeds: people::avatars(), share: 30, most: 64 * MIB }.run(
-        |bytes| {
-            std::fs::write(&path, bytes).unwrap();
-            let Ok(avatar) = Avatar::load(&path) else { return false };
-            if let Some(clip) = avatar.clips.first() {
-                let (pose, _) = clip.motion.at(0.02, avatar.num_joints());
-                black_box(avatar.skin(&avatar.bones(&pose, Vec3::ZERO), &pose));
-            }
-            true
-        },
-    );
 }

@@ -3,28 +3,12 @@
 
 use std::io::{Cursor, Read, Write};
 
+use testkit::body::Random;
 use zip::write::SimpleFileOptions;
 use zip::{CompressionMethod, ZipArchive, ZipWriter};
 
-/// SplitMix64: the same damage on every machine.
-pub struct Random(pub u64);
-
-impl Random {
-    pub fn next(&mut self) -> u64 {
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let mut z = self.0;
-        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        z ^ (z >> 31)
-    }
-
-    pub fn below(&mut self, end: usize) -> usize {
-        (self.next() % end.max(1) as u64) as usize
-    }
-
-    fn of<'a, T>(&mut self, items: &'a [T]) -> &'a T {
-        &items[self.below(items.len())]
-    }
+fn of<'a, T>(random: &mut Random, items: &'a [T]) -> &'a T {
+    &items[random.below(items.len())]
 }
 
 /// How a file is put together.
@@ -43,88 +27,30 @@ pub enum Form {
 }
 
 /// Words that mean something to some reader, thrown in anywhere.
-const WORDS: [&[u8]; 40] = [
-    b"{",
-    b"}",
-    b"[",
-    b"]",
-    b"[[[[[[[[[[[[[[[[",
-    b"\"",
-    b":",
-    b",",
-    b"null",
-    b"true",
-    b"-1",
-    b"1e308",
-    b"1e-320",
-    b"NaN",
-    b"Infinity",
-    b"-0",
-    b"4294967295",
-    b"18446744073709551615",
-    b"99999999999999999999",
-    b"0.1",
-    b"\\u0000",
-    b"\\",
-    b"'",
-    b"\x80\x04",
-    b"\x80\x02",
-    b"]q\x00",
-    b"}q\x00",
-    b"(",
-    b"t.",
-    b"u",
-    b"s",
-    b"R",
-    b"b",
-    b"0",
-    b"\x95\xff\xff\xff\xff\0\0\0\0",
-    b"\x8a\xff",
-    b"h\x00",
-    b"f -1 0 9",
-    b"\nv nan 1 2\n",
-    b"../",
-];
-/// Integers at which sums and products go wrong.
-const WHOLE: [u64; 14] = [
-    0,
-    1,
-    2,
-    0x7f,
-    0xff,
-    0x7fff,
-    0xffff,
-    0x7fff_ffff,
-    0x8000_0000,
-    0xffff_ffff,
-    1 << 40,
-    1 << 62,
-    i64::MAX as u64,
-    u64::MAX,
-];
-const NUMBERS: [&str; 16] = [
-    "0",
-    "-1",
-    "1",
-    "2",
-    "255",
-    "65536",
-    "2147483648",
-    "4294967296",
-    "1e308",
-    "-1e30",
-    "1e-300",
-    "0.5",
-    "nan",
-    "1e999",
-    "18446744073709551616",
-    "-9223372036854775809",
-];
+const WORDS: &str = "{ } [ ] [[[[[[[[[[[[[[[[ \" : , null true -1 1e308 1e-320 NaN Infinity -0 4294967295 \
+    18446744073709551615 99999999999999999999 0.1 \\u0000 \\ ' ]q\0 }q\0 ( t. u s R b 0 h\0 ../";
+/// Opcodes of pickles and lines of meshes.
+const OPCODES: [&[u8]; 6] =
+    [b"\x80\x04", b"\x80\x02", b"\x95\xff\xff\xff\xff\0\0\0\0", b"\x8a\xff", b"f -1 0 9", b"\nv nan 1 2\n"];
+/// Powers of two at which, or just below which, sums and products go wrong.
+const POWERS: [u32; 10] = [0, 1, 7, 8, 15, 16, 31, 32, 62, 63];
+const NUMBERS: &str = "0 -1 1 2 255 65536 2147483648 4294967296 1e308 -1e30 1e-300 0.5 nan 1e999 \
+    18446744073709551616 -9223372036854775809";
+
+fn word<'a>(random: &mut Random, words: &'a str) -> &'a [u8] {
+    let words: Vec<&str> = words.split(' ').collect();
+    of(random, &words).as_bytes()
+}
+
+/// An integer at which sums and products go wrong.
+fn whole(random: &mut Random) -> u64 {
+    (1u64 << of(random, &POWERS)).wrapping_sub(random.below(3) as u64)
+}
 
 /// One of the seeds, harmed in one to four places.
 pub fn damaged(random: &mut Random, form: Form, seeds: &[Vec<u8>]) -> Vec<u8> {
-    let seed = random.of(seeds).clone();
-    let other = random.of(seeds).clone();
+    let seed = of(random, seeds).clone();
+    let other = of(random, seeds).clone();
     // Now and then the frame itself.
     if form == Form::Plain || random.below(4) == 0 {
         return harm(random, seed, &other);
@@ -139,14 +65,18 @@ pub fn damaged(random: &mut Random, form: Form, seeds: &[Vec<u8>]) -> Vec<u8> {
 }
 
 fn harm(random: &mut Random, mut bytes: Vec<u8>, other: &[u8]) -> Vec<u8> {
+    let most = bytes.len().max(1 << 20);
     for _ in 0..=random.below(4) {
         let at = random.below(bytes.len() + 1);
         let end = (at + 1 + random.below(32)).min(bytes.len());
         match random.below(13) {
             0 => bytes.truncate(at),
             1 if at < bytes.len() => bytes[at] ^= 1 << random.below(8),
-            2 if at < bytes.len() => bytes[at] = random.next() as u8,
-            3 => drop(bytes.splice(at..at, random.of(&WORDS).iter().copied())),
+            2 if at < bytes.len() => bytes[at] = random.bits() as u8,
+            3 => {
+                let word = if random.below(8) == 0 { *of(random, &OPCODES) } else { word(random, WORDS) };
+                drop(bytes.splice(at..at, word.iter().copied()));
+            }
             4 => drop(bytes.drain(at..end.max(at))),
             5 => {
                 // Again and again.
@@ -155,15 +85,15 @@ fn harm(random: &mut Random, mut bytes: Vec<u8>, other: &[u8]) -> Vec<u8> {
                 drop(bytes.splice(at..at, part.repeat(times)));
             }
             6 => {
-                let value = random.of(&WHOLE).to_le_bytes();
-                overwrite(&mut bytes, at, &value[..*random.of(&[1, 2, 4, 8])]);
+                let value = whole(random).to_le_bytes();
+                overwrite(&mut bytes, at, &value[..*of(random, &[1, 2, 4, 8])]);
             }
             7 => {
-                let value = random.of(&WHOLE).to_be_bytes();
-                overwrite(&mut bytes, at, &value[8 - *random.of(&[1, 2, 4, 8])..]);
+                let value = whole(random).to_be_bytes();
+                overwrite(&mut bytes, at, &value[8 - *of(random, &[1, 2, 4, 8])..]);
             }
             8 => {
-                let value = *random.of(&[f32::NAN, f32::INFINITY, 1e30, -1e38, 1e-40, 0.0, -0.0]);
+                let value = *of(random, &[f32::NAN, f32::INFINITY, 1e30, -1e38, 1e-40, 0.0, -0.0]);
                 overwrite(&mut bytes, at & !3, &value.to_le_bytes());
             }
             9 => {
@@ -173,7 +103,7 @@ fn harm(random: &mut Random, mut bytes: Vec<u8>, other: &[u8]) -> Vec<u8> {
             }
             _ => number(random, &mut bytes, at),
         }
-        bytes.truncate(1 << 20);
+        bytes.truncate(most);
     }
     bytes
 }
@@ -189,7 +119,7 @@ fn number(random: &mut Random, bytes: &mut Vec<u8>, at: usize) {
     let digit = |b: &u8| b.is_ascii_digit() || *b == b'.';
     let Some(start) = bytes[at..].iter().take(200).position(|b| b.is_ascii_digit()).map(|i| at + i) else { return };
     let end = start + bytes[start..].iter().take_while(|b| digit(b)).count();
-    drop(bytes.splice(start..end, random.of(&NUMBERS).bytes()));
+    drop(bytes.splice(start..end, word(random, NUMBERS).iter().copied()));
 }
 
 fn zip(random: &mut Random, seed: &[u8]) -> Vec<u8> {

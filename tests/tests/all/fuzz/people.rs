@@ -7,42 +7,13 @@ use occnerf::bake::{Atlas, Avatar, Clip, Joint};
 use occnerf::capture::{Light, LoadOptions, load_capture};
 use occnerf::{Config, Method, Person, Preset, PriorColors};
 use smpl::{MotionClip, SparseRows};
-use testkit::files::zip;
+use synth::Py;
 use volrender::Camera;
 
 use super::{place, seeds};
 
-fn text(text: &str) -> Vec<u8> {
-    let mut out = vec![b'X'];
-    out.extend((text.len() as u32).to_le_bytes());
-    out.extend(text.as_bytes());
-    out
-}
-
-fn dictionary(items: &[(&str, Vec<u8>)]) -> Vec<u8> {
-    let entries = items.iter().flat_map(|(key, value)| [text(key), value.clone()].concat());
-    [&b"}("[..], &entries.collect::<Vec<u8>>(), b"u"].concat()
-}
-
-fn list(items: &[Vec<u8>]) -> Vec<u8> {
-    [&b"]("[..], &items.concat(), b"e"].concat()
-}
-
-/// An array of f64 as numpy pickles it.
-fn array(shape: &[u8], values: &[f64]) -> Vec<u8> {
-    let bytes: Vec<u8> = values.iter().flat_map(|v| v.to_le_bytes()).collect();
-    let extents: Vec<u8> = shape.iter().flat_map(|&n| [b'K', n]).collect();
-    let kind =
-        b"tcnumpy\ndtype\n(X\x02\0\0\0f8\x89\x88tR(K\x03X\x01\0\0\0<NNNJ\xff\xff\xff\xffJ\xff\xff\xff\xffK\0tb\x89B";
-    [
-        &b"cnumpy.core.multiarray\n_reconstruct\n(cnumpy\nndarray\n(K\0tB\x01\0\0\0btR(K\x01("[..],
-        &extents,
-        kind,
-        &(bytes.len() as u32).to_le_bytes(),
-        &bytes,
-        b"tb",
-    ]
-    .concat()
+fn array(shape: &[u32], values: &[f64]) -> Py {
+    Py::Array(shape.to_vec(), values.to_vec())
 }
 
 /// Folder of two frames of 8 × 8 pixels, which fits belong to.
@@ -58,15 +29,16 @@ pub fn video() -> std::path::PathBuf {
 /// PHALP's tracks, whose masks are COCO's run lengths: compressed, and as numbers.
 pub fn phalp() -> Vec<Vec<u8>> {
     let turn = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0];
-    let smpl = dictionary(&[
+    let smpl = Py::record([
         ("global_orient", array(&[1, 3, 3], &turn)),
         ("body_pose", array(&[23, 3, 3], &turn.repeat(23))),
         ("betas", array(&[10], &[0.1; 10])),
     ]);
-    let number = |n: u8| vec![b'K', n];
-    let frame = |counts: Vec<u8>| {
-        let mask = dictionary(&[("size", list(&[number(8), number(8)])), ("counts", counts)]);
-        dictionary(&[
+    let number = |n: u8| Py::Raw(vec![b'K', n]);
+    let list = |items: &[Py]| Py::List(items.to_vec());
+    let frame = |counts: Py| {
+        let mask = Py::record([("size", list(&[number(8), number(8)])), ("counts", counts)]);
+        Py::record([
             ("tid", list(&[number(1)])),
             ("tracked_time", list(&[number(0)])),
             ("size", list(&[list(&[number(8), number(8)])])),
@@ -76,13 +48,10 @@ pub fn phalp() -> Vec<Vec<u8>> {
         ])
     };
     // 20 + 30 + 14 pixels: six bits a character, five of them the number's.
-    let compressed = [&b"B\x05\0\0\0"[..], b"d0n0>"].concat();
+    let compressed = Py::Raw(b"B\x05\0\0\0d0n0>".to_vec());
     let plain = list(&[number(20), number(30), number(14)]);
     [compressed, plain]
-        .map(|counts| {
-            let both = dictionary(&[("1.png", frame(counts.clone())), ("2.png", frame(counts))]);
-            [&b"\x80\x03"[..], &both, b"."].concat()
-        })
+        .map(|counts| Py::record([("1.png", frame(counts.clone())), ("2.png", frame(counts))]).pickle())
         .into()
 }
 
@@ -96,13 +65,16 @@ pub fn sam3d() -> Vec<Vec<u8>> {
         [{ "pred_keypoints_3d": points, "pred_cam_t": place, "focal_length": 9.0, "mask": mask.map(Vec::from) }],
         [{ "pred_keypoints_3d": points, "pred_cam_t": place, "pred_keypoints_2d": pixels }],
     ]);
-    let common = [("pred_keypoints_3d", array(&[70, 3], points.as_flattened())), ("pred_cam_t", array(&[3], &place))];
-    let person = |more: [(&'static str, Vec<u8>); 2]| list(&[dictionary(&[&common[..], &more].concat())]);
+    let person = |[one, two]: [(&str, Py); 2]| {
+        let points = ("pred_keypoints_3d", array(&[70, 3], points.as_flattened()));
+        Py::List(vec![Py::record([points, ("pred_cam_t", array(&[3], &place)), one, two])])
+    };
     let first = person([("focal_length", array(&[], &[9.0])), ("mask", array(&[8, 8], mask.as_flattened()))]);
-    let second =
-        person([("focal_length", b"N".to_vec()), ("pred_keypoints_2d", array(&[70, 2], pixels.as_flattened()))]);
-    let pickle = [&b"\x80\x03"[..], &list(&[first, second]), b"."].concat();
-    vec![json.to_string().into_bytes(), pickle]
+    let second = person([
+        ("focal_length", Py::Raw(b"N".to_vec())),
+        ("pred_keypoints_2d", array(&[70, 2], pixels.as_flattened())),
+    ]);
+    vec![json.to_string().into_bytes(), Py::List(vec![first, second]).pickle()]
 }
 
 /// EasyMocap's file of a frame, and one of cameras that serves as both of them.
@@ -120,31 +92,6 @@ pub fn easymocap() -> [Vec<u8>; 2] {
             + &matrix("R_1", 3, "0.1, 0.2, 0.3")
             + &matrix("T_1", 3, "0, 0, 5e0");
     [person.to_string().into_bytes(), cameras.into_bytes()]
-}
-
-/// A dictionary of two tensors, as `torch.save` writes it and as it did before version 1.6.
-pub fn tensors() -> Vec<Vec<u8>> {
-    let pickled = |legacy: bool| {
-        let tensor = |key: &str| {
-            let of =
-                [&b"ctorch._utils\n_rebuild_tensor_v2\n(("[..], &text("storage"), b"ctorch\nFloatStorage\n"].concat();
-            let device = [text(key), text("cpu"), b"K\x06".to_vec()].concat();
-            let none: &[u8] = if legacy { b"N" } else { b"" };
-            [&of[..], &device, none, b"tQK\0K\x02K\x03\x86K\x03K\x01\x86\x89ccollections\nOrderedDict\n)RtR"].concat()
-        };
-        [&b"\x80\x02"[..], &dictionary(&[("a", tensor("0")), ("b", tensor("1"))]), b"."].concat()
-    };
-    let storages = [[0u8; 24], [63; 24]];
-    let files = [("data.pkl", &pickled(false)[..]), ("data/0", &storages[0]), ("data/1", &storages[1])];
-    let archive = zip(files.map(|(name, bytes)| (format!("x/{name}"), bytes)));
-    let mut legacy = b"\x80\x02\x8a\x0al\xfc\x9cF\xf9 j\xa8P\x19.\x80\x02M\xe9\x03.\x80\x02}.".to_vec();
-    legacy.extend(pickled(true));
-    legacy.extend(b"\x80\x02](U\x010U\x011e.");
-    for bytes in storages {
-        legacy.extend(6u64.to_le_bytes());
-        legacy.extend(bytes);
-    }
-    vec![archive, legacy]
 }
 
 /// What a run keeps of a person of four vertices: its settings, and `person.safetensors` beside

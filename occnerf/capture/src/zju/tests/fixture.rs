@@ -10,21 +10,17 @@ pub struct Fixture {
     pub params: Py,
 }
 
-pub fn record(pairs: &[(&str, Py)]) -> Py {
-    Py::Dict(pairs.iter().map(|(key, value)| ((*key).to_owned(), value.clone())).collect())
-}
-
 fn both(value: Py) -> Py {
     Py::List(vec![value.clone(), value])
 }
 
 impl Fixture {
     pub fn new(name: &str) -> Self {
-        let paths = |list: &[&str]| record(&[("ims", Py::List(list.iter().map(|p| Py::text(p)).collect()))]);
-        let annots = record(&[
+        let paths = |list: &[&str]| Py::record([("ims", Py::List(list.iter().map(|p| Py::text(p)).collect()))]);
+        let annots = Py::record([
             (
                 "cams",
-                record(&[
+                Py::record([
                     ("K", both(array(&[3, 3], &[16.0, 0.0, 6.0, 0.0, 16.0, 4.0, 0.0, 0.0, 1.0]))),
                     ("R", both(array(&[3, 3], &[1.0, 0.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0, -1.0]))),
                     ("T", both(array(&[3, 1], &[0.0, 0.0, 4000.0]))),
@@ -40,7 +36,7 @@ impl Fixture {
                 ]),
             ),
         ]);
-        let params = record(&[
+        let params = Py::record([
             ("Rh", array(&[1, 3], &[0.0, 0.5, 0.0])),
             ("Th", array(&[1, 3], &[0.125, 0.0, 0.0])),
             ("poses", array(&[1, 6], &[0.0, 0.0, 0.0, 0.0, 0.25, 0.0])),
