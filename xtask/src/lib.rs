@@ -1,7 +1,7 @@
 //! The command line of OccNeRF as a library, for programs that train, score and draw as it does.
 #![warn(clippy::print_stdout, clippy::print_stderr, reason = "printing must never stop work: see process::print")]
 
-mod auto;
+pub mod auto;
 mod avatar;
 pub mod baked;
 mod check;

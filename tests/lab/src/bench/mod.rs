@@ -19,6 +19,7 @@ use occnerf::capture::Layout;
 pub use self::difficulty::Difficulty;
 use crate::results::{self, Section};
 use crate::sweep::{Line, Place, Runner, SittingArguments, job};
+use xtask::network::load_lpips;
 use xtask::process::say;
 use xtask::run::{use_threads, write};
 use xtask::{source, train};
@@ -38,7 +39,7 @@ pub struct BenchArguments {
 enum What {
     /// Seconds against accuracy of every named approximation, each preset and each method: a table
     /// and charts.
-    Pareto(SweepArguments),
+    Pareto(ParetoArguments),
     /// What happens as it gets hard: less to see, worse poses, shorter videos, …; a table of breaking
     /// points and charts.
     Stability(StabilityArguments),
@@ -90,6 +91,15 @@ struct SweepArguments {
     steps: Option<u64>,
     #[command(flatten)]
     sitting: SittingArguments,
+}
+
+#[derive(Args)]
+struct ParetoArguments {
+    #[command(flatten)]
+    sweep: SweepArguments,
+    /// Weights to score LPIPS with, as for `train`
+    #[arg(long, value_name = "PATH")]
+    lpips: Option<PathBuf>,
 }
 
 #[derive(Args)]
@@ -218,13 +228,15 @@ impl SweepArguments {
     }
 }
 
-fn pareto(sweep: &SweepArguments) -> Result<()> {
+fn pareto(ParetoArguments { sweep, lpips }: &ParetoArguments) -> Result<()> {
+    load_lpips(lpips.as_deref())?;
     let (quick, steps) = (sweep.quick, sweep.steps(FULL_STEPS, FULL_STEPS / 5)?);
     let views = if quick { VIEWS.1 } else { VIEWS.0 };
     let scenes: Vec<(String, ())> = sweep.on.checked()?.into_iter().map(|scene| (scene, ())).collect();
     let run = |scene: &str, _: &(), runner: &mut Runner| {
         let (scene_arguments, place) = (sweep.on.command_line(scene), sweep.on.place(scene)?);
-        let around = points::Sweep { scene_arguments, place, views, steps, full_steps: FULL_STEPS, quick };
+        let around =
+            points::Sweep { scene_arguments, place, views, steps, full_steps: FULL_STEPS, quick, lpips: lpips.clone() };
         runner.run_all(around.points()?)
     };
     sweep.sweep(["pareto", "Speed against accuracy"], &scenes, run, |name, _, lines, stem| {

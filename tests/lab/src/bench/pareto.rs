@@ -13,10 +13,12 @@ use crate::sweep::{Kind, Line};
 type Pick = fn(&Line) -> Option<f64>;
 
 /// What is worth having, with its digits in tables.
-const WORTHS: [(&str, Pick, usize); 3] = [
+const WORTHS: [(&str, Pick, usize); 4] = [
     ("psnr_mask, dB", |l| l.outcome.psnr_mask, 2),
     ("psnr_hidden, dB", |l| l.outcome.psnr_hidden, 2),
     ("ssim_mask", |l| l.outcome.ssim_mask, 4),
+    // Less is better.
+    ("−LPIPS", |l| l.outcome.lpips.map(|lpips| -lpips), 4),
 ];
 
 /// What it costs: the end of the chart's name, the label, the quantity.
@@ -51,9 +53,15 @@ pub fn charts(scene: &str, lines: &[Line], costs: &[Cost], stem: &Path) -> Resul
     for &(suffix, label, cost) in costs {
         let mut panels = Vec::new();
         for (name, worth, _) in WORTHS {
-            let scored: Vec<(&Line, (f64, f64))> =
-                lines.iter().map(|l| (l, place(l, cost, worth))).filter(|(_, at)| at.0.is_finite()).collect();
+            let scored: Vec<(&Line, (f64, f64))> = lines
+                .iter()
+                .map(|l| (l, place(l, cost, worth)))
+                .filter(|(_, at)| at.0.is_finite() && at.1.is_finite())
+                .collect();
             let all: Vec<(f64, f64)> = scored.iter().map(|s| s.1).collect();
+            if scored.is_empty() && !lines.is_empty() {
+                continue;
+            }
             let close = close_to_base(&scored);
             let panel = |title: &str, zoom: bool| {
                 let shown = scored.iter().zip(&close).filter(|(_, close)| !zoom || **close);
@@ -103,7 +111,7 @@ pub fn table(lines: &[Line], cost: Cost) -> String {
         let (point, outcome) = (&line.point, &line.outcome);
         let _ = write!(text, "| {} | {} |", point.name, point.factor);
         if let Some(error) = &outcome.error {
-            let _ = writeln!(text, " failed: {} | | | | | | | |", error.replace(['|', '\n'], " "));
+            let _ = writeln!(text, " failed: {} | | | | | | | | |", error.replace(['|', '\n'], " "));
             continue;
         }
         let is_base =

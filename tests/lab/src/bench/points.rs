@@ -1,5 +1,7 @@
 //! The sweep of `bench pareto`: one factor at a time.
 
+use std::path::PathBuf;
+
 use anyhow::Result;
 use occnerf::{Config, Preset};
 
@@ -66,6 +68,8 @@ pub struct Sweep {
     /// Steps of the base at which presets run their own number of steps.
     pub full_steps: u64,
     pub quick: bool,
+    /// Weights of LPIPS.
+    pub lpips: Option<PathBuf>,
 }
 
 impl Sweep {
@@ -99,7 +103,7 @@ impl Sweep {
             level: None,
             kind,
             command: method.is_product().then_some(command),
-            job: Job::new(self.place.clone(), self.views, method, config),
+            job: Job { lpips: self.lpips.clone(), ..Job::new(self.place.clone(), self.views, method, config) },
         })
     }
 
@@ -110,9 +114,11 @@ impl Sweep {
         };
         let steps = self.steps;
         let mut points = vec![own(Kind::Base, "base", "base", Method::Occnerf, steps, &[])?];
-        for method in [Method::Prior, Method::Surface, Method::HashPoint, Method::Humannerf] {
+        for method in [Method::Prior, Method::Surface, Method::Auto, Method::HashPoint, Method::Humannerf] {
             points.push(own(Kind::Baseline, "method", method.name(), method, steps, &[])?);
         }
+        let surface = (Preset::Balanced, Method::Surface, steps);
+        points.push(self.point(["surface, balanced", "method"], Kind::Baseline, surface, &[])?);
         for (name, steps) in [("half the steps", steps.div_ceil(2)), ("twice the steps", 2 * steps)] {
             points.push(own(Kind::Change, "steps", name, Method::Occnerf, steps, &[])?);
         }
@@ -162,7 +168,7 @@ mod tests {
 
     fn sweep(quick: bool) -> Sweep {
         let place = Place::Made(Difficulty::default());
-        Sweep { place, scene_arguments: String::new(), views: 5, steps: 400, full_steps: 400, quick }
+        Sweep { place, scene_arguments: String::new(), views: 5, steps: 400, full_steps: 400, quick, lpips: None }
     }
 
     #[test]

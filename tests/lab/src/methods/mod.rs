@@ -43,6 +43,8 @@ pub enum Method {
     SelfNerf,
     /// The product's own.
     Occnerf,
+    /// The product's choice for a scene.
+    Auto,
 }
 
 impl Method {
@@ -52,6 +54,7 @@ impl Method {
             Self::Humannerf => "humannerf",
             Self::NeuralBody => "neural-body",
             Self::SelfNerf => "self-nerf",
+            Self::Auto => "auto",
             Self::Prior | Self::Surface | Self::HashPoint | Self::Occnerf => self.base().name(),
         }
     }
@@ -63,7 +66,7 @@ impl Method {
 
     /// Whether `cargo xtask train` has it.
     pub fn is_product(self) -> bool {
-        matches!(self, Self::Prior | Self::Surface | Self::HashPoint | Self::Occnerf)
+        matches!(self, Self::Prior | Self::Surface | Self::HashPoint | Self::Occnerf | Self::Auto)
     }
 
     /// The product's method whose settings it has; only the encoding differs.
@@ -71,7 +74,7 @@ impl Method {
         match self {
             Self::Prior => occnerf::Method::Prior,
             Self::Surface => occnerf::Method::Surface,
-            Self::Occnerf => occnerf::Method::Occnerf,
+            Self::Occnerf | Self::Auto => occnerf::Method::Occnerf,
             _ => occnerf::Method::HashPoint,
         }
     }
@@ -102,7 +105,7 @@ impl Method {
             Neighbours::new(&scene.body, config)
         };
         Ok(match self {
-            Self::Prior | Self::Surface | Self::HashPoint | Self::Occnerf => None,
+            Self::Prior | Self::Surface | Self::HashPoint | Self::Occnerf | Self::Auto => None,
             Self::Humannerf => Some(Arc::new(Frequencies)),
             Self::NeuralBody => Some(Arc::new(NeuralBody::new(neighbours()?))),
             Self::SelfNerf => Some(Arc::new(SelfNerf::new(neighbours()?, &scene.body, config)?)),

@@ -21,6 +21,7 @@ use visibility::Samples;
 use crate::bench::Difficulty;
 use crate::methods::Method;
 use crate::scene::SceneOptions;
+use xtask::auto::weigh;
 use xtask::eval::{Drawn, score_run};
 use xtask::network::load_lpips;
 use xtask::process::{Ending, Guard, one_line, peak_rss_bytes, say, telling};
@@ -81,6 +82,9 @@ pub struct Job {
     /// Scores the baked person instead of the field, with four samples a pixel or one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub bake: Option<bool>,
+    /// Weights of LPIPS, of a run that is not kept.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub lpips: Option<PathBuf>,
     /// Run directory, scored and drawn as `train` does it; measured and forgotten where there is
     /// none.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -108,7 +112,7 @@ impl PartialEq for Keep {
 impl Job {
     /// A run that is measured and forgotten.
     pub fn new(place: Place, views: usize, method: Method, config: Config) -> Self {
-        Self { place, views, method, config, bake: None, keep: None }
+        Self { place, views, method, config, bake: None, lpips: None, keep: None }
     }
 }
 
@@ -126,6 +130,8 @@ pub struct Outcome {
     pub ssim_mask: Option<f64>,
     pub psnr_hidden: Option<f64>,
     pub mask_iou: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub lpips: Option<f64>,
     pub parameters: usize,
     pub peak_rss_bytes: u64,
     /// Left out by the optimiser.
@@ -181,34 +187,55 @@ fn baked_unless_finished(
     })
 }
 
+/// The prepared scene of a job with its views thinned, and its method; what `auto` chooses counts as training.
+fn prepared(job: &Job, outcome: &mut Outcome) -> Result<(Scene, Method)> {
+    let thin = |capture: &mut Capture| {
+        let stride = capture.eval.len().div_ceil(job.views.max(1)).max(1);
+        capture.eval = std::mem::take(&mut capture.eval).into_iter().step_by(stride).collect();
+    };
+    let (Place::Scene { scene, body, load }, Method::Auto) = (&job.place, job.method) else {
+        let (mut capture, model) = job.place.load()?;
+        thin(&mut capture);
+        let start = Instant::now();
+        let scene = Scene::new(&capture, &model, &job.config)?;
+        outcome.prepare_seconds = start.elapsed().as_secs_f64();
+        return Ok((scene, job.method));
+    };
+    let mut source = load.load(scene, body.as_deref())?;
+    thin(&mut source.capture);
+    let start = Instant::now();
+    source.scene(&job.config)?;
+    outcome.prepare_seconds = start.elapsed().as_secs_f64();
+    let start = Instant::now();
+    let method = if weigh(&mut source, &job.config)?.field { Method::Occnerf } else { Method::Surface };
+    let scene = source.scene(&job.config)?;
+    outcome.train_seconds = start.elapsed().as_secs_f64();
+    Ok((scene, method))
+}
+
 /// Trains and scores.
 fn measure(job: &Job) -> Result<Outcome> {
     if let Some(keep) = &job.keep {
         return keep_run(job, keep);
     }
-    let (mut capture, model) = job.place.load()?;
-    let stride = capture.eval.len().div_ceil(job.views.max(1)).max(1);
-    capture.eval = capture.eval.into_iter().step_by(stride).collect();
+    let lpips = load_lpips(job.lpips.as_deref())?;
+    let mut outcome = Outcome::default();
+    let (scene, method) = prepared(job, &mut outcome)?;
     let start = Instant::now();
-    let scene = Scene::new(&capture, &model, &job.config)?;
-    drop(capture);
-    let prepare_seconds = start.elapsed().as_secs_f64();
-    let mut outcome = Outcome { prepare_seconds, ..Outcome::default() };
-    let start = Instant::now();
-    if job.method == Method::Prior {
+    if method == Method::Prior {
         let colors = PriorColors::measure(&scene)?;
-        outcome.train_seconds = start.elapsed().as_secs_f64();
+        outcome.train_seconds += start.elapsed().as_secs_f64();
         outcome.parameters = 3 * colors.colors.len();
-        score(&scene, &mut PriorRenderer::new(&scene.body, &colors), &mut outcome)?;
-    } else if job.method == Method::Surface {
+        score(&scene, &mut PriorRenderer::new(&scene.body, &colors), lpips.as_ref(), &mut outcome)?;
+    } else if method == Method::Surface {
         let colors = scene.colors()?;
         let (avatar, _) = fit(&scene)?;
-        outcome.train_seconds = start.elapsed().as_secs_f64();
+        outcome.train_seconds += start.elapsed().as_secs_f64();
         outcome.parameters = avatar.num_parameters();
         let mut renderer = BakedRenderer::new(&avatar, scene.body.scale, colors.light, Samples::Four);
-        score(&scene, &mut renderer, &mut outcome)?;
+        score(&scene, &mut renderer, lpips.as_ref(), &mut outcome)?;
     } else {
-        let mut trainer = job.method.trainer(&scene, job.config.clone())?;
+        let mut trainer = method.trainer(&scene, job.config.clone())?;
         for _ in 0..job.config.steps {
             let report = trainer.step()?;
             outcome.non_finite += usize::from(!report.loss.is_finite());
@@ -216,29 +243,29 @@ fn measure(job: &Job) -> Result<Outcome> {
         }
         let model = trainer.into_model();
         let baked = job.bake.map(|_| bake(&model, Some(&scene))).transpose()?;
-        outcome.train_seconds = start.elapsed().as_secs_f64();
+        outcome.train_seconds += start.elapsed().as_secs_f64();
         outcome.parameters = model.num_parameters();
         match &baked {
             Some((avatar, _)) => {
                 let samples = if job.bake == Some(true) { Samples::Four } else { Samples::One };
                 let mut renderer = BakedRenderer::new(avatar, model.body().scale, model.light(), samples);
-                score(&scene, &mut renderer, &mut outcome)?;
+                score(&scene, &mut renderer, lpips.as_ref(), &mut outcome)?;
             }
-            None => score(&scene, &mut FieldRenderer::new(&model)?, &mut outcome)?,
+            None => score(&scene, &mut FieldRenderer::new(&model)?, lpips.as_ref(), &mut outcome)?,
         }
     }
     outcome.peak_rss_bytes = peak_rss_bytes();
     Ok(outcome)
 }
 
-fn score(scene: &Scene, renderer: &mut dyn Renderer, outcome: &mut Outcome) -> Result<()> {
+fn score(scene: &Scene, renderer: &mut dyn Renderer, lpips: Option<&Lpips>, outcome: &mut Outcome) -> Result<()> {
     let frames: Vec<&PreparedFrame> = scene.eval.iter().collect();
     let mut bad = 0;
     // The first picture pays for what later ones find ready.
     if let Some(first) = frames.first() {
         renderer.render(&first.view, Vec3::ZERO)?;
     }
-    let metrics = evaluate(scene, renderer, &frames, None, |_, rendering| {
+    let metrics = evaluate(scene, renderer, &frames, lpips, |_, rendering| {
         let numbers = rendering.image.pixels.iter().chain(&rendering.opacity);
         bad += numbers.filter(|x| !x.is_finite()).count();
     })?;
@@ -254,6 +281,7 @@ impl Outcome {
         self.ssim_mask = split.ssim_mask;
         self.psnr_hidden = split.psnr_hidden;
         self.mask_iou = split.mask_iou;
+        self.lpips = split.lpips_full;
     }
 
     fn failed(error: &anyhow::Error) -> Self {
