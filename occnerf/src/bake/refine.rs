@@ -11,13 +11,14 @@ use crate::model::view::pinhole;
 use crate::scene::labels::Label;
 use crate::scene::prepared::{PreparedFrame, Scene};
 use crate::scene::registration::{deviation, robust};
+use crate::scene::reliability::Reliability;
+use crate::scene::seen::depth_inside;
 
 /// Regularisation of a texel towards its colour before, in pixels.
 const PRIOR: f32 = 0.3;
 
-/// Deviation of the residuals at which updates are half robust and smooth. It is 0.03 where
-/// registration is exact, 0.07 on real video.
-const DISAGREEMENT: f32 = 0.055;
+/// How many times stronger it is where frames disagree.
+const DOUBT: f32 = 4.0;
 
 /// Most sampled training pixels.
 const MAX_PIXELS: usize = 1 << 19;
@@ -29,6 +30,8 @@ type Lookup = ([u32; 4], [f32; 4]);
 struct PixelEquation {
     colour: Vec3,
     lookups: Vec<Lookup>,
+    /// Weight, at most 1.
+    trust: f32,
 }
 
 impl PixelEquation {
@@ -49,27 +52,27 @@ pub(super) fn refine(scene: &Scene, light: Light, avatar: &mut Avatar, passes: u
     let frames = &scene.train;
     let stride = frames.iter().map(|f| f.labels.num_subject()).sum::<usize>().div_ceil(MAX_PIXELS).max(1);
     let mut renderer = BakedRenderer::new(avatar, scene.body.scale, light, Samples::Four);
+    let reliability = Reliability::measure(scene, light)?;
     let mut all = Vec::new();
     for frame in frames {
-        all.extend(equations(avatar, &mut renderer, frame, stride)?);
+        all.extend(equations(avatar, &mut renderer, frame, stride, &reliability)?);
     }
     let Atlas { rgb, width, .. } = &mut avatar.atlas;
     let mut values: Vec<Vec3> = rgb.as_chunks::<3>().0.iter().copied().map(color).collect();
-    let errors = solve(&all, *width as usize, &mut values, passes);
+    let errors = solve(&all, *width as usize, &mut values, passes, reliability.disagreement);
     for (texel, value) in rgb.as_chunks_mut::<3>().0.iter_mut().zip(&values) {
         *texel = value.clamp(Vec3::ZERO, Vec3::ONE).to_array().map(|x| (x * 255.0 + 0.5) as u8);
     }
     Ok(errors)
 }
 
-/// Jacobi steps on the texels' `values` (H · W). Where the frames disagree, residuals are weighted
-/// robustly and steps smoothed: least squares would paint their differences, background in the masks
-/// among them, as a moiré.
-fn solve(all: &[PixelEquation], width: usize, values: &mut [Vec3], passes: u32) -> [f64; 2] {
+/// Jacobi steps on the texels' `values` (H · W). By the share of `disagreement` of the frames, residuals
+/// are weighted robustly, steps smoothed and colours before trusted more: least squares would paint the
+/// differences, background in the masks among them, as a moiré.
+fn solve(all: &[PixelEquation], width: usize, values: &mut [Vec3], passes: u32, disagreement: f32) -> [f64; 2] {
     let start = values.to_vec();
     let spread = deviation(all.iter().map(|equation| equation.residual(&start))).unwrap_or(0.0);
-    let ratio = (spread / DISAGREEMENT).powi(4);
-    let disagreement = ratio / (1.0 + ratio);
+    let prior = PRIOR * (1.0 + (DOUBT - 1.0) * disagreement);
     let mut errors = [0.0; 2];
     for pass in 0..passes {
         let mut sums = vec![(Vec3::ZERO, 0.0f32); values.len()];
@@ -78,7 +81,8 @@ fn solve(all: &[PixelEquation], width: usize, values: &mut [Vec3], passes: u32) 
             let residual = equation.residual(values);
             let squared = residual.length_squared();
             error += f64::from(squared) / 3.0;
-            let trust = 1.0 - disagreement * (1.0 - robust(squared, 2.0 * spread.max(f32::MIN_POSITIVE)));
+            let doubt = 1.0 - robust(squared, 2.0 * spread.max(f32::MIN_POSITIVE));
+            let trust = equation.trust * (1.0 - disagreement * doubt);
             for (i, weight) in equation.texels() {
                 sums[i].0 += trust * weight * residual;
                 sums[i].1 += trust * weight;
@@ -87,7 +91,7 @@ fn solve(all: &[PixelEquation], width: usize, values: &mut [Vec3], passes: u32) 
         errors[usize::from(pass > 0)] = error / all.len().max(1) as f64;
         smooth(&mut sums, width, disagreement);
         for ((value, (sum, weight)), start) in values.iter_mut().zip(sums).zip(&start) {
-            *value += (sum + PRIOR * (start - *value)) / (weight + PRIOR);
+            *value += (sum + prior * (start - *value)) / (weight + prior);
         }
     }
     errors
@@ -110,6 +114,7 @@ fn equations(
     renderer: &mut BakedRenderer<'_>,
     frame: &PreparedFrame,
     stride: usize,
+    reliability: &Reliability,
 ) -> Result<Vec<PixelEquation>, Error> {
     let pixels = frame.pixels()?;
     let across = frame.view.camera.width as usize;
@@ -128,6 +133,12 @@ fn equations(
     let (vertices, looks) = renderer.skin(&frame.view.posed.bones);
     // Supersampled as by default, so that the texture compensates the pixel footprint.
     let options = RasterOptions { samples: Samples::Four, cull_back: true, near: 1e-3 };
+    let depth = depth_inside(&pixels.mask, across);
+    let eye = frame.view.camera.centre_of_projection();
+    let cosine = |face: u32| {
+        let [a, b, c] = avatar.faces[face as usize].map(|v| vertices[v as usize]);
+        (b - a).cross(c - a).normalize_or_zero().dot((eye - a).normalize_or_zero())
+    };
     let equation = |pixel: Pixel<'_>| {
         let (x, y) = (pixel.index % view.width as usize, pixel.index / view.width as usize);
         let i = (y + low.y as usize) * across + x + low.x as usize;
@@ -142,7 +153,8 @@ fn equations(
         let brightness: f32 = fragments().map(|fragment| share * look(avatar, looks, fragment).z).sum();
         let lookups = fragments().map(|fragment| lookup(avatar, look(avatar, looks, fragment).truncate(), share));
         let colour = Vec3::from_slice(&pixels.image.pixels[3 * i..]) / brightness;
-        Some(PixelEquation { colour, lookups: lookups.collect() })
+        let slant = fragments().map(|fragment| share * cosine(fragment.face)).sum();
+        Some(PixelEquation { colour, lookups: lookups.collect(), trust: reliability.at(depth[i], slant) })
     };
     let mut out: Vec<Option<PixelEquation>> = Vec::new();
     out.resize_with(view.width as usize * view.height as usize, || None);
@@ -164,7 +176,7 @@ mod tests {
     use proptest::prelude::*;
 
     fn seen(texel: u32, colour: Vec3) -> PixelEquation {
-        PixelEquation { colour, lookups: vec![([texel; 4], [0.25; 4])] }
+        PixelEquation { colour, lookups: vec![([texel; 4], [0.25; 4])], trust: 1.0 }
     }
 
     proptest! {
@@ -175,7 +187,7 @@ mod tests {
         ) {
             let mut values = vec![Vec3::splat(start); 25];
             let all: Vec<PixelEquation> = off.iter().map(|off| seen(12, Vec3::splat(start + off))).collect();
-            let errors = solve(&all, 5, &mut values, 1);
+            let errors = solve(&all, 5, &mut values, 1, 0.0);
             let expected = start + off.iter().sum::<f32>() / (off.len() as f32 + PRIOR);
             prop_assert!((values[12].x - expected).abs() < 1e-5, "{} {expected}", values[12]);
             prop_assert!(errors[0] < 1e-5 && values.iter().enumerate().all(|(i, v)| i == 12 || v.x == start));
@@ -203,7 +215,7 @@ mod tests {
             all.push(seen(texel as u32, Vec3::splat(if background { 3.0 } else { of_person })));
         }
         let mut values = vec![Vec3::splat(0.4); 64];
-        solve(&all, 8, &mut values, 4);
+        solve(&all, 8, &mut values, 4, 1.0);
         let mean = (0..8).map(|f| if f == 0 { 3.0 } else { 0.4 + noise(27, f) }).sum::<f32>() / 8.0;
         assert!((values[27].x - 0.4).abs() < 0.5 * (mean - 0.4), "{} for {mean}", values[27]);
     }

@@ -12,6 +12,7 @@ use crate::model::subdivide::{Subdivided, most_times, times_until};
 use crate::model::view::pixel_width;
 use crate::scene::light::{ColorObservation, measure_light};
 use crate::scene::prepared::Scene;
+use crate::scene::reliability::Reliability;
 use crate::scene::seen::deeper;
 use crate::scene::unseen::complete;
 
@@ -20,15 +21,17 @@ const EDGE: f32 = 0.5;
 const MOST: u32 = 2;
 /// Least foreshortening weight of an observation.
 const SLANT: f32 = 0.05;
+/// Least sum of the reliabilities of an observed point where frames disagree, frames.
+const EVIDENCE: f32 = 4.0;
 /// Frames in flight, at some megabytes of observations each.
 const TOGETHER: usize = 8;
 
 impl PriorColors {
     /// Least-squares albedo over the visible training pixels of each point of the subdivided prior,
-    /// or of its clothes if registered, weighted by foreshortening, under the light of the scene if
-    /// the configuration asks for one. Contaminated edge pixels of masks are left out. Unobserved
-    /// vertices are completed by inverse distance weighting, other unobserved points interpolated
-    /// from their vertices.
+    /// or of its clothes if registered, weighted by foreshortening and [`Reliability`], under the light
+    /// of the scene if the configuration asks for one. Contaminated edge pixels of masks are left out.
+    /// Vertices that are not observed reliably are completed by inverse distance weighting, other such
+    /// points interpolated from their vertices.
     ///
     /// # Errors
     /// Pictures that cannot be read.
@@ -40,28 +43,33 @@ impl PriorColors {
         let most = MOST.min(most_times(faces.len()));
         let times = pixel.map_or(0, |pixel| times_until(prior, faces, EDGE * pixel, most));
         let mesh = Subdivided::new(prior.len(), faces, times);
-        // Terms of Σ s c and Σ s² for colours c under the light s.
-        let shown = |frame: usize| -> Result<Vec<(usize, Vec3, f32)>, Error> {
+        let reliability = Reliability::measure(scene, light)?;
+        // Terms of Σ s c and Σ s² for colours c under the light s, and reliabilities.
+        let shown = |frame: usize| -> Result<Vec<(usize, Vec3, f32, f32)>, Error> {
             let seen = scene.seen_in(frame, &mesh.anchors)?;
             let view = &scene.train[frame].view;
             let eye = view.camera.centre_of_projection();
-            let term = |&((v, color, normal), _): &(ColorObservation, usize)| {
+            let term = |&((v, color, normal), depth): &(ColorObservation, usize)| {
                 let place = mesh.anchors[v as usize].mix(&view.posed.vertices);
-                let (size, shade) = (normal.dot((eye - place).normalize_or_zero()).max(SLANT), light.on(normal));
-                (v as usize, size * shade * color, size * shade * shade)
+                let cosine = normal.dot((eye - place).normalize_or_zero());
+                let trust = reliability.at(depth as f32, cosine);
+                let (size, shade) = (trust * cosine.max(SLANT), light.on(normal));
+                (v as usize, size * shade * color, size * shade * shade, trust)
             };
             Ok(seen.iter().filter(|seen| seen.1 > scene.edge).map(term).collect())
         };
-        let mut sums = vec![(Vec3::ZERO, 0.0); mesh.anchors.len()];
+        let mut sums = vec![(Vec3::ZERO, 0.0, 0.0); mesh.anchors.len()];
         for first in (0..scene.train.len()).step_by(TOGETHER) {
             let frames = first..(first + TOGETHER).min(scene.train.len());
             let found: Result<Vec<_>, Error> = frames.into_par_iter().map(shown).collect();
-            for (v, sum, squares) in found?.into_iter().flatten() {
-                sums[v] = (sums[v].0 + sum, sums[v].1 + squares);
+            for (v, sum, squares, trust) in found?.into_iter().flatten() {
+                sums[v] = (sums[v].0 + sum, sums[v].1 + squares, sums[v].2 + trust);
             }
         }
-        let seen: Vec<bool> = sums.iter().map(|sum| sum.1 > 0.0).collect();
-        let mut colors: Vec<Vec3> = sums.iter().map(|(sum, squares)| *sum / squares.max(f32::MIN_POSITIVE)).collect();
+        let least = reliability.disagreement * EVIDENCE;
+        let seen: Vec<bool> = sums.iter().map(|sum| sum.1 > 0.0 && sum.2 >= least).collect();
+        let mut colors: Vec<Vec3> =
+            sums.iter().map(|(sum, squares, _)| *sum / squares.max(f32::MIN_POSITIVE)).collect();
         let (vertices, between) = colors.split_at_mut(prior.len());
         complete(&scene.body, vertices, &seen[..prior.len()]);
         let rest = between.iter_mut().zip(&mesh.anchors[prior.len()..]).zip(&seen[prior.len()..]);

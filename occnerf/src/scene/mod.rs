@@ -7,5 +7,6 @@ pub(crate) mod light;
 pub(crate) mod masks;
 pub(crate) mod prepared;
 pub(crate) mod registration;
+pub(crate) mod reliability;
 pub(crate) mod seen;
 mod unseen;

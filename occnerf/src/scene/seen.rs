@@ -46,18 +46,25 @@ pub(crate) fn seen(
     let usable: Vec<bool> = pixels.mask.iter().map(|&m| m > 0.5).collect();
     let points: Vec<Vec3> = anchors.iter().map(|anchor| anchor.mix(&posed)).collect();
     let visible = visibility::visible_vertices(&mesh, &points, &pinhole(camera), Some(&usable));
-    let depth = around(&usable, camera.width as usize, 1.0, |usable, width| {
-        squared_distance(&usable.iter().map(|usable| !usable).collect::<Vec<_>>(), width)
-    });
+    let depth = depth_inside(&pixels.mask, camera.width as usize);
     let color = |v: usize| {
         let at = visible[v].then(|| camera.project(points[v])).flatten()?;
         let pixel = at.y as usize * camera.width as usize + at.x as usize;
         let coverage = *pixels.mask.get(pixel)?;
         // Masked pixels are premultiplied by coverage.
         let color = Vec3::from_slice(&pixels.image.pixels[3 * pixel..]) / coverage.max(0.5);
-        Some(((v as u32, color, anchors[v].mix(&normals).normalize_or_zero()), (depth[pixel].sqrt() as usize).max(1)))
+        Some(((v as u32, color, anchors[v].mix(&normals).normalize_or_zero()), (depth[pixel] as usize).max(1)))
     };
     Ok((0..points.len()).filter_map(color).collect())
+}
+
+/// Distance of each pixel of a mask from those outside, pixels; 0 outside.
+pub(crate) fn depth_inside(mask: &[f32], width: usize) -> Vec<f32> {
+    let inside: Vec<bool> = mask.iter().map(|&m| m > 0.5).collect();
+    let squared = around(&inside, width, 1.0, |inside, width| {
+        squared_distance(&inside.iter().map(|inside| !inside).collect::<Vec<_>>(), width)
+    });
+    squared.into_iter().map(f32::sqrt).collect()
 }
 
 /// Observations more than `edge` pixels inside their masks.
