@@ -1,5 +1,5 @@
-//! Observations of the posed prior in one frame: distances from its outline to the mask's of equal coverage, and the
-//! colours of its vertices.
+//! Observations of the posed prior in one frame: distances from its outline to where the mask has the
+//! same coverage, and the colours of its vertices.
 
 use std::collections::HashMap;
 use std::ops::RangeInclusive;
