@@ -28,7 +28,7 @@ const TOGETHER: usize = 8;
 
 impl PriorColors {
     /// Least-squares albedo over the visible training pixels of each point of the subdivided prior,
-    /// or of its clothes if registered, weighted by foreshortening and [`Reliability`], under the light
+    /// or of its clothes if registered, weighted by foreshortening and reliability, under the light
     /// of the scene if the configuration asks for one. Contaminated edge pixels of masks are left out.
     /// Vertices that are not observed reliably are completed by inverse distance weighting, other such
     /// points interpolated from their vertices.
