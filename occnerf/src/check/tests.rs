@@ -7,6 +7,7 @@ use smpl::{BodyModel, BoneNames, Placement};
 
 use super::*;
 use crate::capture::{ImportOptions, LoadOptions, import, load_capture};
+use crate::model::view::silhouette;
 use synth::{DemoConfig, demo};
 use testkit::files::{Directory, shared};
 
@@ -372,4 +373,76 @@ fn masks_of_noise_are_said_to_fit_nothing() {
         frame.source.edit(move |pixels| pixels.mask.iter_mut().enumerate().for_each(|(n, level)| *level = noise(n)));
     }
     assert_eq!(likely(&capture, &body, small_views(&capture).unwrap()).unwrap(), [Mistake::NoFit]);
+}
+
+#[test]
+fn a_silhouette_is_where_rays_hit_also_around_a_camera_within_the_body() {
+    let body = BodyModel::embedded();
+    let capture = small_demo(&body, 3);
+    for frame in capture.train.iter().step_by(20) {
+        let posed = body.pose(&body.shaped(&frame.betas), &frame.pose, frame.placement);
+        let mesh = RayMesh::new(&posed.vertices, &body.faces).unwrap();
+        let mut within = frame.camera;
+        within.world_to_camera.translation -= within.world_to_camera.transform_point3a(posed.joints[0].into());
+        for camera in [frame.camera, within] {
+            let covered = silhouette(&posed.vertices, &body.faces, &camera).unwrap();
+            let wrong = covered.iter().enumerate().filter(|(i, covered)| {
+                let (x, y) = (*i as u32 % camera.width, *i as u32 / camera.width);
+                let ray = camera.ray(x as f32 + 0.5, y as f32 + 0.5);
+                mesh.first_hit(ray.origin, ray.direction).is_some() != **covered
+            });
+            // Rounding at the outline.
+            assert!(covered.iter().filter(|c| **c).count() > 500 && wrong.count() <= 3);
+        }
+    }
+}
+
+#[test]
+fn jumps_empty_masks_and_frames_that_do_not_fit_are_marked() {
+    let body = BodyModel::embedded();
+    let mut capture = small_demo(&body, 1);
+    capture.train[10].source.edit(|pixels| pixels.mask.fill(0.0));
+    capture.train[20].camera.world_to_camera.translation.x += 1.5;
+    capture.train[30].pose.iter_mut().skip(1).for_each(|axis| *axis += Vec3::splat(0.9));
+    let found = check(&capture, &body).unwrap();
+    let faults = |i: usize| &found.frames[i].faults;
+    assert_eq!(faults(10), &[Fault::EmptyMask]);
+    assert!(faults(20).contains(&Fault::Overlap) && faults(20).contains(&Fault::PlaceJump), "{:?}", faults(20));
+    assert!(faults(21).contains(&Fault::PlaceJump));
+    assert!(faults(30).contains(&Fault::PoseJump) && faults(31).contains(&Fault::PoseJump), "{:?}", faults(30));
+    assert!(faults(40).is_empty() && found.mistakes.is_empty());
+}
+
+#[test]
+fn limbs_elsewhere_and_background_in_masks_are_named() {
+    let (mut lines, mut sums) = (Vec::new(), [[0; 4]; 5]);
+    for (name, capture, body) in good() {
+        let window = Capture { train: capture.train.iter().step_by(4).take(12).cloned().collect(), ..capture.clone() };
+        let parts = limbs::parts(body);
+        let faults = |capture: &Capture| -> Vec<Vec<Fault>> {
+            let small = small_views(capture).unwrap();
+            small.iter().map(|view| one(&capture.train[view.index], view, body, &parts).unwrap().faults).collect()
+        };
+        for kind in 0..5 {
+            let mut wrong = window.clone();
+            let expected = Limb::ALL.get(kind).map_or(Fault::Background, |limb| Fault::Limb(*limb));
+            wrong.train.iter_mut().for_each(|frame| spoil(expected, frame, body));
+            let found = faults(&wrong);
+            let counts = [
+                found.iter().filter(|f| f.contains(&expected)).count(),
+                found.iter().flatten().filter(|f| matches!(f, Fault::Limb(_)) && **f != expected).count(),
+                found.iter().flatten().filter(|f| **f == Fault::Background && **f != expected).count(),
+                found.len(),
+            ];
+            lines.push(format!("{name} {expected:?}: {counts:?}"));
+            (0..4).for_each(|i| sums[kind][i] += counts[i]);
+        }
+    }
+    let [right, other, background, _] = [0, 1, 2, 3].map(|i| sums[..4].iter().map(|counts| counts[i]).sum::<usize>());
+    let found = right + other + background;
+    println!("limbs: {right} of {found} named, {other} taken for another, {background} for background");
+    assert!(found > 15 * good().len() && 4 * right >= 3 * found && 10 * other < found, "{lines:#?}");
+    let [right, limb, _, all] = sums[4];
+    println!("background: {right} of {all} named, {limb} taken for a limb");
+    assert!(100 * (right + limb) >= 95 * all && 3 * right >= 2 * all, "{lines:#?}");
 }

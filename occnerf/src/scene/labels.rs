@@ -270,6 +270,18 @@ mod tests {
                 prop_assert_eq!((dilated[i], eroded[i]), (near(i, true), !near(i, false)));
             }
         }
+
+        #[test]
+        fn subject_pixels_are_never_unknown_and_background_rule_knows_everything(
+            mask in prop::collection::vec(0.0f32..1.0, 100), silhouette in prop::collection::vec(any::<bool>(), 100)
+        ) {
+            let unknown = label_pixels(OccludedRule::Unknown, &mask, &silhouette, None, 10, 100.0);
+            let background = label_pixels(OccludedRule::Background, &mask, &silhouette, None, 10, 100.0);
+            for i in 0..100 {
+                prop_assert_eq!(unknown[i] == Label::Subject, mask[i] > 0.5);
+                prop_assert!(background[i] != Label::Unknown);
+            }
+        }
     }
 
     /// A silhouette of 20 × 20 in 30 × 30 pixels at 1 cm a pixel, mask without its right half.
@@ -286,5 +298,15 @@ mod tests {
         let rim: Vec<f32> = (0..900).map(|i| f32::from(inside(i % 30, i / 30) && i % 30 < 23)).collect();
         let labels = label_pixels(OccludedRule::Unknown, &rim, &silhouette, None, 30, 100.0);
         assert_eq!(labels[15 * 30 + 24], Label::Background, "misregistration is not occlusion");
+    }
+
+    #[test]
+    fn a_known_occluder_joins_what_is_inferred() {
+        let (mask, occluder) = ([1.0, 0.0, 0.0, 0.0, 0.0], [true, false, true, false, false]);
+        let of = |silhouette: &[bool], rule| label_pixels(rule, &mask, silhouette, Some(&occluder), 5, 1.0);
+        use Label::{Background, Subject, Unknown};
+        assert_eq!(of(&[false; 5], OccludedRule::Unknown), [Subject, Background, Unknown, Background, Background]);
+        assert_eq!(of(&[true; 5], OccludedRule::Unknown), [Subject, Unknown, Unknown, Unknown, Unknown]);
+        assert_eq!(of(&[true; 5], OccludedRule::Background)[1..], [Background; 4]);
     }
 }

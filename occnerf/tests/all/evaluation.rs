@@ -212,3 +212,17 @@ fn captures_that_show_nobody_are_refused() {
     blank.train.clear();
     assert!(Scene::new(&blank, body(), &config(Method::Occnerf)).is_err());
 }
+
+struct Broken;
+
+impl Renderer for Broken {
+    fn render(&mut self, _: &PosedView, _: Vec3) -> Result<Rendering, Error> {
+        Err(Error::Scene("the paint has run out".to_owned()))
+    }
+}
+
+#[test]
+fn an_error_of_the_renderer_comes_through() {
+    let error = evaluate(scene(), &mut Broken, &[&scene().eval[0]], None, |_, _| {}).unwrap_err();
+    assert!(error.to_string().contains("paint"));
+}

@@ -127,3 +127,14 @@ fn pictures_of_no_pixels_or_one_and_extreme_scales_have_labels() {
     let found = labels(&[0.0; WIDTH * HEIGHT], &silhouette, 1e5);
     assert!(found.iter().all(|l| *l == Label::Background));
 }
+
+#[test]
+fn a_subject_hidden_as_a_whole_is_unknown_as_a_whole() {
+    let silhouette: Vec<bool> = (0..WIDTH * HEIGHT).map(|i| (6..16).contains(&(i % WIDTH))).collect();
+    let found = labels(&[0.0; WIDTH * HEIGHT], &silhouette, 100.0);
+    for (i, label) in found.iter().enumerate() {
+        // Four pixels of clothes on either side.
+        let expected = if (2..20).contains(&(i % WIDTH)) { Label::Unknown } else { Label::Background };
+        assert_eq!(*label, expected, "pixel {i}");
+    }
+}

@@ -193,3 +193,15 @@ fn levels_of_a_body_have_the_sizes_of_the_paper() {
     assert_eq!(sizes(3), [3, 1, 1, 1]);
     assert_eq!(sizes(0), [0, 0, 0, 0]);
 }
+
+#[test]
+fn a_level_of_fewer_than_k_points_repeats_its_list() {
+    let points = [Vec3::ZERO, Vec3::X, Vec3::X * 3.0];
+    for cell in [0.0, 0.5] {
+        let query = SurfaceQuery::new(&points, &[], &config(5, cell, 1.0)).unwrap();
+        let mut out = [9; 20];
+        query.neighbours(Vec3::X * 0.9, &mut out);
+        assert_eq!(out[..5], [1, 0, 2, 1, 0]);
+        assert_eq!(out[5..], [0; 15], "coarse levels hold vertex 0 alone");
+    }
+}

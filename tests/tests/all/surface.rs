@@ -9,6 +9,7 @@ use common::{scene, silhouette};
 use glam::Vec3;
 use occnerf::{PriorColors, PriorRenderer, Renderer};
 use testkit::oracle;
+use visibility::RayMesh;
 
 /// The picture of the prior against rays cast one by one over all triangles in `f64`.
 #[test]
@@ -37,4 +38,35 @@ fn the_prior_renderers_silhouette_is_that_of_the_ray_casts() {
         assert!(inside > 50, "{inside}");
         assert_eq!(wrong, 0, "pixels in {}", frame.name);
     }
+}
+
+#[test]
+fn cameras_and_views_put_vertices_into_the_same_pixels_and_rays_lead_back_to_them() {
+    let scene = scene();
+    let frame = &scene.train[0];
+    let camera = &frame.view.camera;
+    let view = occnerf::pinhole(camera);
+    let mesh = RayMesh::new(&frame.view.posed.vertices, &scene.body.model.faces).unwrap();
+    let visible = visibility::visible_vertices(&mesh, &frame.view.posed.vertices, &view, None);
+    let mut seen = 0;
+    for (i, (&v, visible)) in frame.view.posed.vertices.iter().zip(visible).enumerate() {
+        let projected = camera.project(v).unwrap();
+        let pixel = view.pixel(v).unwrap();
+        let edge = (projected.fract() - 0.5).abs();
+        if edge.x.max(edge.y) < 0.499 {
+            assert_eq!(pixel, projected.y as usize * camera.width as usize + projected.x as usize);
+        }
+        let ray = camera.ray(projected.x, projected.y);
+        let distance = ray.origin.distance(v);
+        assert!(ray.at(distance).distance(v) < 1e-5);
+        // Toward a vertex of the silhouette the ray may pass by.
+        if let Some(hit) = mesh.first_hit(ray.origin, ray.direction) {
+            seen += usize::from(visible);
+            // Its own faces may be so oblique that a ray a hair beside it meets them far in front.
+            if visible && !scene.body.model.faces[hit.face as usize].contains(&(i as u32)) {
+                assert!(hit.t > distance - 1e-4, "visible at {distance}, but {} is in front", hit.t);
+            }
+        }
+    }
+    assert!(seen > 500, "{seen}");
 }

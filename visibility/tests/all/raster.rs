@@ -205,6 +205,32 @@ proptest! {
         let differ = both.iter().zip(&front).filter(|(a, b)| a != b).count();
         prop_assert!(differ * 200 <= both.len(), "{}", differ);
     }
+
+    #[test]
+    fn a_fan_about_a_point_has_every_pixel_once(seed: u64, on_centre: bool, spokes in 4u32..40) {
+        let mut random = Random(seed);
+        let middle = if on_centre { Vec3::new(20.5, 20.5, 1.0) } else { random.vec3(4.0).with_z(0.0) + Vec3::new(20.0, 20.0, 1.0) };
+        let rim = (0..spokes).map(|i| {
+            let angle = (i as f32 + random.unit() * 0.8) / spokes as f32 * std::f32::consts::TAU;
+            middle + Vec3::new(angle.cos(), angle.sin(), 0.0) * 1000.0
+        });
+        let vertices = std::iter::once(middle).chain(rim).collect();
+        let faces = (0..spokes).map(|i| [0, i + 1, (i + 1) % spokes + 1]).collect();
+        let counts = claims(&TriMesh { vertices, faces }, &flat_view(40));
+        prop_assert!(counts.iter().all(|&c| c == 1), "{:?}", counts);
+    }
+
+    #[test]
+    fn the_picture_does_not_depend_on_the_number_of_threads(
+        mesh in strategy::bumpy_sphere(), away in strategy::unit_vec3(),
+    ) {
+        let view = towards_origin(away * 2.0, 60.0, 90);
+        let [one, many] = [1, 3].map(|threads| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            pool.install(|| draw(&mesh, &view))
+        });
+        prop_assert_eq!(one, many);
+    }
 }
 
 /// Everything that a picture says of every sample.
@@ -322,4 +348,14 @@ fn indices_out_of_range_and_large_images_are_errors() {
 #[should_panic(expected = "3 values for 4 × 4 pixels")]
 fn an_output_of_another_size_panics() {
     let _ = Rasterizer::default().draw(&[], &[], &flat_view(4), &OPTIONS, &mut [0; 3], |_| 0);
+}
+
+#[test]
+fn a_wall_fills_the_picture_however_large_it_is() {
+    let view = camera(Quat::IDENTITY, Vec3::ZERO, 50.0, 40);
+    for extent in [1e3f32, 1e6, 1e12] {
+        let at = |x: f32, y: f32| Vec3::new(x * extent, y * extent, 7.0);
+        let wall = TriMesh { vertices: vec![at(-1.0, -1.0), at(1.0, -1.0), at(0.0, 1.0)], faces: vec![[0, 1, 2]] };
+        assert!(draw(&wall, &view).iter().all(|f| f.is_some_and(|f| (f.depth - 7.0).abs() < 1e-4)), "{extent}");
+    }
 }

@@ -5,12 +5,6 @@ use crate::common;
 use common::{folder, refused, text, xtask};
 
 #[test]
-fn help_tells_the_exit_codes() {
-    let help = String::from_utf8(xtask(&["--help"]).stdout).unwrap();
-    assert!(help.contains("Exit codes:") && help.contains("a result cannot be written"), "{help}");
-}
-
-#[test]
 fn scenes_that_are_none_are_refused_and_leave_no_run_behind() {
     let out = folder("no-scene").join("run");
     refused(&["train", "/no/such/place", "--out", text(&out)], &["/no/such/place", "no such directory"]);
@@ -44,4 +38,36 @@ fn runs_that_are_none_are_refused() {
     std::fs::write(empty.join("checkpoint.safetensors"), [0xff; 64]).unwrap();
     refused(&["train", "--resume", "--out", text(&empty)], &["checkpoint.safetensors", "safetensors"]);
     refused(&["train", "--out", text(&empty)], &["already holds a run", "--resume"]);
+}
+
+#[test]
+fn help_names_the_commands_and_every_option_of_train() {
+    let help = |arguments: &[&str]| String::from_utf8(xtask(arguments).stdout).unwrap();
+    let general = help(&["--help"]);
+    for command in ["train", "eval", "render", "export"] {
+        assert!(general.contains(command), "{general}");
+    }
+    assert!(general.contains("Exit codes:") && general.contains("a result cannot be written"), "{general}");
+    let train = help(&["train", "--help"]);
+    let options = [
+        "--out",
+        "--preset",
+        "--method",
+        "--ablate",
+        "--occluded",
+        "--steps",
+        "--seed",
+        "--threads",
+        "--resume",
+        "--resize",
+        "--stride",
+        "--max-frames",
+        "--eval-stride",
+        "--camera",
+        "--lpips",
+        "--perceptual-weights",
+    ];
+    for option in options {
+        assert!(train.contains(option), "{train}");
+    }
 }

@@ -197,14 +197,35 @@ fn check_names_the_mistake_in_a_capture_on_disk() {
     done(&line);
     let whole = std::fs::read_to_string(capture.join("metadata.json")).unwrap();
     type Change = fn(&mut serde_json::Value);
-    let mistakes: [(&str, Change); 2] = [
+    // The extrinsics of an import are a translation alone.
+    let mistakes: [(&str, Change); 6] = [
+        ("camera to world", |record| {
+            (0..3).for_each(|row| each(&mut record["cam_extrinsics"][row], |x| if x == 1.0 { x } else { -x }));
+        }),
         ("points up (OpenGL)", |record| (1..3).for_each(|row| each(&mut record["cam_extrinsics"][row], |x| -x))),
+        ("millimetres", |record| {
+            (0..3).for_each(|row| each(&mut record["cam_extrinsics"][row], |x| if x == 1.0 { x } else { 1000.0 * x }));
+        }),
         ("in degrees", |record| each(&mut record["poses"], f64::to_degrees)),
+        ("radians already", |record| each(&mut record["poses"], f64::to_radians)),
+        ("times too long", |record| {
+            (0..2).for_each(|row| each(&mut record["cam_intrinsics"][row], |x| if x > 200.0 { 2.0 * x } else { x }));
+        }),
     ];
     for (words, change) in mistakes {
         std::fs::write(capture.join("metadata.json"), &whole).unwrap();
         rewritten(&capture, change);
         let said = done(&["check", text(&capture)]);
         assert!(said.contains("likely mistake") && said.contains(words), "{words}: {said}");
+    }
+}
+
+#[test]
+fn help_says_where_the_tools_leave_their_files() {
+    let help = done(&["import", "--help"]);
+    for word in
+        ["wham_output.pkl", "hmr4d_results.pt", "video_results.npz", "mask_data", "pha/0000.png", "smpl.is.tue.mpg.de"]
+    {
+        assert!(help.contains(word), "{word}");
     }
 }

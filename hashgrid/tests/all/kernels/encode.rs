@@ -80,3 +80,29 @@ fn a_table_of_the_wrong_length_panics() {
     let grid = HashGrid::<2>::with_resolutions(&[5], 1, 7).unwrap();
     grid.encode(&[0.0; 3], &[[0.0; 2]], &mut [0.0]);
 }
+
+#[test]
+fn splitting_the_points_into_calls_changes_no_bit() {
+    let grid = HashGrid::<4>::with_resolutions(&[3, 20, 50], 2, 10).unwrap();
+    let table = table(&grid, 1);
+    let points: Vec<[f32; 4]> =
+        super::common::noise(4 * 40_000, 2).as_chunks::<4>().0.iter().map(|p| p.map(|x| 0.5 + 0.5 * x)).collect();
+    let together = encode_rows(&grid, &table, &points);
+    for size in [1, 7, 16, 17, 5000] {
+        let apart: Vec<f32> = points.chunks(size).flat_map(|p| encode_rows(&grid, &table, p)).collect();
+        assert!(apart == together, "in calls of {size}");
+    }
+}
+
+#[test]
+fn coordinates_outside_are_clamped_and_nan_is_zero() {
+    let grid = HashGrid::<2>::with_resolutions(&[5, 100], 4, 7).unwrap();
+    let table = table(&grid, 4);
+    let at = |x, y| encode(&grid, &table, &[[x, y]]);
+    assert_eq!(at(-1.0, 0.3), at(0.0, 0.3));
+    assert_eq!(at(f32::NEG_INFINITY, 0.3), at(0.0, 0.3));
+    assert_eq!(at(f32::NAN, 0.3), at(0.0, 0.3));
+    assert_eq!(at(0.3, 1.5), at(0.3, 1.0));
+    assert_eq!(at(0.3, f32::INFINITY), at(0.3, 1.0));
+    assert_ne!(at(0.0, 0.3), at(1.0, 0.3));
+}

@@ -174,4 +174,14 @@ mod tests {
             prop_assert_eq!(number(&prefix), None);
         }
     }
+
+    #[test]
+    fn a_mask_that_two_files_claim_or_no_frame_has_is_refused() {
+        let frames = video((1..=4).map(|i| format!("{i:06}")).collect());
+        assert_eq!(by_name(&frames, &["a_01", "b_01"]), Err(Disjoint::Twice(1)));
+        assert_eq!(by_name(&frames, &["00007"]), Err(Disjoint::Apart));
+        assert_eq!(by_name(&frames, &["p", "q"]), Err(Disjoint::Apart));
+        assert_eq!(by_name(&frames, &["p", "q", "r", "s"]).unwrap().at, [Some(0), Some(1), Some(2), Some(3)]);
+        assert_eq!(by_index(&frames, &(0..20).collect()), None);
+    }
 }

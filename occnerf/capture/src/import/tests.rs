@@ -470,3 +470,87 @@ fn fits_that_are_wrong_are_named() {
     }
     assert_eq!(SMPLX, Tool::PromptHmr.joints());
 }
+
+/// Name in `expected/`, file, person asked for.
+const FITS: [(&str, &str, Option<&str>); 12] = [
+    ("wham", "wham/wham_output.pkl", None),
+    ("wham_person1", "wham/wham_output.pkl", Some("1")),
+    ("wham_gap", "wham/wham_output_gap.pkl", None),
+    ("phalp", "phalp/demo_clip.pkl", None),
+    ("phalp_person2", "phalp/demo_clip.pkl", Some("2")),
+    ("gvhmr", "gvhmr/hmr4d_results.pt", None),
+    ("prompthmr", "prompthmr/results.pkl", None),
+    ("prompthmr_person2", "prompthmr/results.pkl", Some("2")),
+    ("romp", "romp/video_results.npz", None),
+    ("romp_person2", "romp/video_results.npz", Some("2")),
+    ("easymocap", "easymocap", None),
+    ("easymocap_person1", "easymocap", Some("1")),
+];
+
+#[track_caller]
+fn near(what: &str, found: &[f64], expected: &[f64], tolerance: f64) {
+    assert_eq!(found.len(), expected.len(), "{what}");
+    let worst = found.iter().zip(expected).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+    assert!(worst <= tolerance, "{what}: off by {worst}");
+}
+
+#[test]
+fn another_focal_length_leaves_the_pelvis_on_its_pixel() {
+    let Some(dir) = shared("estimators") else { return };
+    for (_, file, _) in FITS {
+        let (_, person, _) = fit_of(&dir, file, None);
+        for frame in &person.frames {
+            let joint = DVec3::new(0.0, -0.22, 0.02);
+            let pixel = |frame: &FitFrame| {
+                let p = frame.pelvis(joint);
+                [frame.focal[0] * p.x / p.z, frame.focal[1] * p.y / p.z]
+            };
+            let mut other = frame.clone();
+            other.refocused(700.0, joint);
+            near(file, &pixel(&other), &pixel(frame), 1e-9);
+            near(
+                file,
+                &[other.focal[0], other.pelvis(joint).z / 700.0],
+                &[700.0, frame.pelvis(joint).z / frame.focal[0]],
+                1e-9,
+            );
+        }
+    }
+}
+
+#[test]
+fn a_lost_picture_costs_its_own_frame_alone() {
+    let Some(dir) = shared("estimators") else { return };
+    let video = Video::list(&dir.join("frames")).unwrap();
+    let lost = 6;
+    let mut short = Video::list(&dir.join("frames")).unwrap();
+    short.names.remove(lost);
+    short.paths.remove(lost);
+    for (_, file, person) in FITS {
+        let frames = |video: &Video| {
+            let (fit, note) = read::read(&dir.join(file), video).unwrap();
+            let (person, ..) = choose(Path::new(file), fit.people, person).unwrap();
+            (person, note)
+        };
+        let ((whole, _), (part, note)) = (frames(&video), frames(&short));
+        for frame in &part.frames {
+            let name = &short.names[frame.index];
+            let same = whole.frames.iter().find(|other| video.names[other.index] == *name).unwrap();
+            assert_eq!((&frame.pose, frame.offset), (&same.pose, same.offset), "{file} {name}: {note:?}");
+        }
+        let had = whole.frames.iter().any(|frame| frame.index == lost);
+        assert_eq!((part.frames.len(), part.absent), (whole.frames.len() - usize::from(had), usize::from(had)));
+    }
+    for masks in ["sam2", "sam2_per_object", "matanyone"] {
+        let path = dir.join(masks);
+        let open = |video: &Video| Masks::open(&path, &ImportOptions::default(), video).unwrap();
+        let (all, some) = (open(&video), open(&short));
+        for (i, name) in short.names.iter().enumerate() {
+            let other = video.names.iter().position(|other| other == name).unwrap();
+            assert_eq!(some.has(i), all.has(other), "{masks} {name}");
+            if some.has(i) {
+                assert_eq!(some.levels(&path, i, &short).unwrap(), all.levels(&path, other, &video).unwrap(), "{name}");
+            }
+        }
+    }
+}
