@@ -52,10 +52,10 @@ pub(super) fn refine(scene: &Scene, light: Light, avatar: &mut Avatar, passes: u
     let frames = &scene.train;
     let stride = frames.iter().map(|f| f.labels.num_subject()).sum::<usize>().div_ceil(MAX_PIXELS).max(1);
     let mut renderer = BakedRenderer::new(avatar, scene.body.scale, light, Samples::Four);
-    let reliability = Reliability::measure(scene, light)?;
+    let reliability = scene.reliability(light)?;
     let mut all = Vec::new();
     for frame in frames {
-        all.extend(equations(avatar, &mut renderer, frame, stride, &reliability)?);
+        all.extend(equations(avatar, &mut renderer, frame, stride, reliability)?);
     }
     let Atlas { rgb, width, .. } = &mut avatar.atlas;
     let mut values: Vec<Vec3> = rgb.as_chunks::<3>().0.iter().copied().map(color).collect();

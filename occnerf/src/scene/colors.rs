@@ -12,7 +12,6 @@ use crate::model::subdivide::{Subdivided, most_times, times_until};
 use crate::model::view::pixel_width;
 use crate::scene::light::{ColorObservation, measure_light};
 use crate::scene::prepared::Scene;
-use crate::scene::reliability::Reliability;
 use crate::scene::seen::deeper;
 use crate::scene::unseen::complete;
 
@@ -43,7 +42,7 @@ impl PriorColors {
         let most = MOST.min(most_times(faces.len()));
         let times = pixel.map_or(0, |pixel| times_until(prior, faces, EDGE * pixel, most));
         let mesh = Subdivided::new(prior.len(), faces, times);
-        let reliability = Reliability::measure(scene, light)?;
+        let reliability = scene.reliability(light)?;
         // Terms of Σ s c and Σ s² for colours c under the light s, and reliabilities.
         let shown = |frame: usize| -> Result<Vec<(usize, Vec3, f32, f32)>, Error> {
             let seen = scene.seen_in(frame, &mesh.anchors)?;

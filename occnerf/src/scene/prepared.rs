@@ -2,6 +2,7 @@
 
 use std::sync::{Arc, OnceLock};
 
+use glam::Vec3;
 use rayon::prelude::*;
 use smpl::BodyModel;
 use visibility::{RayMesh, VisibilityCounts};
@@ -17,6 +18,7 @@ use crate::scene::labels::{Label, Labels, dilate, label_pixels};
 use crate::scene::light::{ColorObservation, measure_light};
 use crate::scene::masks::mend_masks;
 use crate::scene::registration::register;
+use crate::scene::reliability::Reliability;
 use crate::scene::seen::{MOST, deeper, seen, strange_edge};
 
 /// A frame with its posed prior.
@@ -81,6 +83,8 @@ pub struct Scene {
     pub(crate) learnt: Vec<usize>,
     /// Cache of [`Scene::colors`].
     pub(crate) colors: OnceLock<PriorColors>,
+    /// Cache of [`Scene::reliability`].
+    pub(crate) reliability: OnceLock<Reliability>,
 }
 
 impl Scene {
@@ -133,6 +137,7 @@ impl Scene {
             edge: 0,
             learnt: Vec::new(),
             colors: OnceLock::new(),
+            reliability: OnceLock::new(),
         };
         let held_out = |i: usize| config.held_out > 0 && i.is_multiple_of(config.held_out);
         scene.learnt = (0..scene.train.len()).filter(|&i| !held_out(i)).collect();
@@ -159,6 +164,18 @@ impl Scene {
         }
         let measured = PriorColors::measure(self)?;
         Ok(self.colors.get_or_init(|| measured))
+    }
+
+    /// Reliability of the frames' colours under the scene's light.
+    pub(crate) fn reliability(&self, light: Light) -> Result<&Reliability, Error> {
+        if let Some(reliability) = self.reliability.get() {
+            return Ok(reliability);
+        }
+        let views = self.train.iter().map(|frame| &frame.view);
+        let views: Vec<(&[Vec3], Vec3)> =
+            views.map(|view| (&view.posed.vertices[..], view.camera.centre_of_projection())).collect();
+        let measured = Reliability::measure(&self.seen()?, &views, light);
+        Ok(self.reliability.get_or_init(|| measured))
     }
 
     /// Sets the colours of a resumed run, which its field is relative to.

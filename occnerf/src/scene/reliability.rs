@@ -2,10 +2,8 @@
 
 use glam::Vec3;
 
-use crate::Error;
 use crate::capture::Light;
 use crate::scene::light::{ColorObservation, albedo};
-use crate::scene::prepared::Scene;
 use crate::scene::registration::deviation;
 use crate::scene::seen::MOST;
 
@@ -28,20 +26,15 @@ pub(crate) struct Reliability {
 }
 
 impl Reliability {
-    /// Of the colours of the training frames under a light.
-    ///
-    /// # Errors
-    /// Pictures that cannot be read.
-    pub fn measure(scene: &Scene, light: Light) -> Result<Self, Error> {
-        let frames = scene.seen()?;
-        let eyes =
-            scene.train.iter().map(|frame| (&frame.view.posed.vertices, frame.view.camera.centre_of_projection()));
-        let seen = frames.iter().zip(eyes).flat_map(|(frame, (vertices, eye))| {
+    /// Of the colours of frames under a light, with depths in their masks; `views`: posed vertices and centre
+    /// of projection of each frame.
+    pub fn measure(frames: &[Vec<(ColorObservation, usize)>], views: &[(&[Vec3], Vec3)], light: Light) -> Self {
+        let seen = frames.iter().zip(views).flat_map(|(frame, &(vertices, eye))| {
             let cosine =
                 move |seen: &ColorObservation| seen.2.dot((eye - vertices[seen.0 as usize]).normalize_or_zero());
             frame.iter().map(move |(seen, depth)| (Self::bin(*depth as f32, cosine(seen)), seen))
         });
-        Ok(Self::of(seen, scene.body.canonical.vertices.len(), light))
+        Self::of(seen, views.first().map_or(0, |view| view.0.len()), light)
     }
 
     /// Of colours in bins.
