@@ -1,4 +1,4 @@
-use crate::corners::{BLOCK, Corners, MAX_CORNERS, for_widths, interpolate_with_slopes, row};
+use crate::corners::{BLOCK, Corners, MAX_CORNERS, for_widths, interpolate_with_gradient, row};
 use crate::encode::CHUNK;
 use crate::grid::{HashGrid, Level};
 use crate::simd::{Kernel, arch};
@@ -62,11 +62,11 @@ fn level_backward_points<const D: usize, const W: usize>(
                 dots[k][b] = [dot];
             }
         }
-        let slopes = interpolate_with_slopes::<D, 1>(&mut dots, &corners.fraction);
+        let gradient = interpolate_with_gradient::<D, 1>(&mut dots, &corners.fraction);
         for j in 0..D {
-            for ((point, d_point), [slope]) in points.iter().zip(&mut *d_points).zip(slopes[j]) {
+            for ((point, d_point), [partial]) in points.iter().zip(&mut *d_points).zip(gradient[j]) {
                 if (0.0..=1.0).contains(&point[j]) {
-                    d_point[j] += n * slope;
+                    d_point[j] += n * partial;
                 }
             }
         }

@@ -1,4 +1,4 @@
-//! Table rows, interpolation weights and slopes at the 2^D cell corners of a block of points.
+//! Table rows, interpolation weights and gradient at the 2^D cell corners of a block of points.
 
 use crate::grid::Level;
 
@@ -139,18 +139,18 @@ pub(crate) fn broadcast<const W: usize>(lanes: &Lanes<f32>) -> Lanes<[f32; W]> {
 /// d-linear interpolation of the corners' `values` into `values[0]`; returns its derivatives along
 /// the axes in units of 1/cell.
 #[inline(always)]
-pub(crate) fn interpolate_with_slopes<const D: usize, const W: usize>(
+pub(crate) fn interpolate_with_gradient<const D: usize, const W: usize>(
     values: &mut Values<W>,
     fraction: &[Lanes<f32>; 4],
 ) -> [Lanes<[f32; W]>; D] {
-    let mut slopes = [[[[0.0f32; W]; BLOCK]; MAX_CORNERS / 2]; D];
+    let mut gradient = [[[[0.0f32; W]; BLOCK]; MAX_CORNERS / 2]; D];
     for axis in (0..D).rev() {
         let half = 1 << axis;
         let t = broadcast::<W>(&fraction[axis]);
         let t = t.as_flattened();
         // Derivatives along the axes done before are interpolated along this one.
-        for slope in &mut slopes[axis + 1..] {
-            let (low, high) = slope.split_at_mut(half);
+        for partial in &mut gradient[axis + 1..] {
+            let (low, high) = partial.split_at_mut(half);
             for k in 0..half {
                 let (low, high) = (low[k].as_flattened_mut(), high[k].as_flattened());
                 for i in 0..BLOCK * W {
@@ -161,15 +161,15 @@ pub(crate) fn interpolate_with_slopes<const D: usize, const W: usize>(
         let (low, high) = values.split_at_mut(half);
         for k in 0..half {
             let (low, high) = (low[k].as_flattened_mut(), high[k].as_flattened());
-            let slope = slopes[axis][k].as_flattened_mut();
+            let partial = gradient[axis][k].as_flattened_mut();
             for i in 0..BLOCK * W {
                 let difference = high[i] - low[i];
-                slope[i] = difference;
+                partial[i] = difference;
                 low[i] += t[i] * difference;
             }
         }
     }
-    slopes.map(|slope| slope[0])
+    gradient.map(|partial| partial[0])
 }
 
 /// Clamped to [0, 1]; NaN is 0.

@@ -189,7 +189,7 @@ impl Wrong {
             Self::MirroredFit => wrong.train.iter_mut().for_each(|frame| mirror(frame, body)),
             Self::Frames(fault, _) => {
                 let frames = wrong.train.iter_mut().enumerate().filter(|(i, _)| self.is_in(*i));
-                frames.for_each(|(_, frame)| spoil(fault, frame, body));
+                frames.for_each(|(_, frame)| corrupt(fault, frame, body));
             }
         }
         wrong
@@ -259,7 +259,7 @@ fn mirror(frame: &mut Frame, body: &BodyModel) {
 }
 
 /// Makes a fault of a frame.
-fn spoil(fault: Fault, frame: &mut Frame, body: &BodyModel) {
+fn corrupt(fault: Fault, frame: &mut Frame, body: &BodyModel) {
     match fault {
         Fault::Limb(limb) => {
             let (joint, bend) = match limb {
@@ -426,7 +426,7 @@ fn limbs_elsewhere_and_background_in_masks_are_named() {
         for kind in 0..5 {
             let mut wrong = window.clone();
             let expected = Limb::ALL.get(kind).map_or(Fault::Background, |limb| Fault::Limb(*limb));
-            wrong.train.iter_mut().for_each(|frame| spoil(expected, frame, body));
+            wrong.train.iter_mut().for_each(|frame| corrupt(expected, frame, body));
             let found = faults(&wrong);
             let counts = [
                 found.iter().filter(|f| f.contains(&expected)).count(),

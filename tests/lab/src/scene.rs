@@ -68,7 +68,7 @@ impl SceneOptions {
                 put_open_body(capture, model, 1e-3 * noise, &joint_names(Path::new(scene))?)?;
             }
             corruption.wrong.apply(capture, model)?;
-            corruption.wrong.spoil_body(model);
+            corruption.wrong.corrupt_body(model);
             Ok(())
         })?;
         if corruption != Corruption::default() {

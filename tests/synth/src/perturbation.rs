@@ -32,7 +32,7 @@ pub struct Perturbation {
     /// Root mean square error of the distance from the camera, per cent, smooth in time, 0 to 50.
     pub depth_percent: f32,
     /// Standard deviation of the error of the lengths of the limbs' bones, per cent, left as right,
-    /// 0 to 50: see [`Perturbation::spoil_body`].
+    /// 0 to 50: see [`Perturbation::corrupt_body`].
     pub limbs_percent: f32,
     /// Largest displacement of the edges of the training masks, pixels, 0 to 64. What is
     /// added shows black.
@@ -95,7 +95,7 @@ impl Perturbation {
     }
 
     /// Makes a capture wrong. Views kept back get the wrong bodies of their instants, but keep
-    /// their pixels. Lengths of limbs are the body's: see [`Perturbation::spoil_body`].
+    /// their pixels. Lengths of limbs are the body's: see [`Perturbation::corrupt_body`].
     ///
     /// # Errors
     /// A value out of its range.
@@ -140,7 +140,7 @@ impl Perturbation {
 
     /// Makes the limbs of a body too long or too short, each bone with its twin on the other side
     /// ([`BodyModel::limbs`]).
-    pub fn spoil_body(&self, body: &mut BodyModel) {
+    pub fn corrupt_body(&self, body: &mut BodyModel) {
         if self.limbs_percent == 0.0 {
             return;
         }
@@ -364,7 +364,7 @@ mod tests {
         let mut after = before.clone();
         Perturbation::REAL.apply(&mut after, &body).unwrap();
         let mut body = body;
-        Perturbation::REAL.spoil_body(&mut body);
+        Perturbation::REAL.corrupt_body(&mut body);
         let (mut overlap, mut dirty, mut apart) = (0.0, 0.0, 0.0);
         for (a, b) in before.train.iter().zip(&after.train) {
             let (truth, mask) = (a.pixels().unwrap().mask, b.pixels().unwrap().mask);

@@ -148,7 +148,7 @@ fn limbs_of_a_rig_that_are_too_long_or_too_short_are_mended() {
     let exact = DemoConfig { pose_noise_degrees: 0.0, translation_noise: 0.0, beta_noise: 0.0, ..small() };
     let truth = demo(&DemoConfig { size: 192, ..exact }, &rig).unwrap();
     let mut longer = rig.clone();
-    Perturbation { limbs_percent: 8.0, ..Perturbation::default() }.spoil_body(&mut longer);
+    Perturbation { limbs_percent: 8.0, ..Perturbation::default() }.corrupt_body(&mut longer);
     let longer = longer.with_limb_lengths();
     let found = registered(&truth, &longer, 12);
     let longest = |body: &BodyModel, betas: &[f32]| -> Vec<f32> {
