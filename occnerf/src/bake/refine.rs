@@ -52,7 +52,7 @@ pub(super) fn refine(scene: &Scene, light: Light, avatar: &mut Avatar, passes: u
     let frames = &scene.train;
     let stride = frames.iter().map(|f| f.labels.num_subject()).sum::<usize>().div_ceil(MAX_PIXELS).max(1);
     let mut renderer = BakedRenderer::new(avatar, scene.body.scale, light, Samples::Four);
-    let reliability = scene.reliability(light)?;
+    let (_, reliability) = scene.lighting()?;
     let mut all = Vec::new();
     for frame in frames {
         all.extend(equations(avatar, &mut renderer, frame, stride, reliability)?);

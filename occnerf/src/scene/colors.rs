@@ -6,13 +6,11 @@ use glam::Vec3;
 use rayon::prelude::*;
 
 use crate::Error;
-use crate::capture::Light;
 use crate::model::colors::PriorColors;
 use crate::model::subdivide::{Subdivided, most_times, times_until};
 use crate::model::view::pixel_width;
-use crate::scene::light::{ColorObservation, measure_light};
+use crate::scene::light::ColorObservation;
 use crate::scene::prepared::Scene;
-use crate::scene::seen::deeper;
 use crate::scene::unseen::complete;
 
 /// Target edge length of the subdivided prior, pixels of the training frames, and most subdivisions.
@@ -36,13 +34,11 @@ impl PriorColors {
     /// Pictures that cannot be read.
     pub fn measure(scene: &Scene) -> Result<Self, Error> {
         let (prior, faces) = (&scene.body.canonical.vertices, &scene.body.model.faces);
-        let light =
-            if scene.lit { measure_light(&deeper(&scene.seen()?, scene.edge), prior.len()) } else { Light::default() };
+        let &(light, ref reliability) = scene.lighting()?;
         let pixel = pixel_width(scene.train.iter().map(|frame| &*frame.view));
         let most = MOST.min(most_times(faces.len()));
         let times = pixel.map_or(0, |pixel| times_until(prior, faces, EDGE * pixel, most));
         let mesh = Subdivided::new(prior.len(), faces, times);
-        let reliability = scene.reliability(light)?;
         // Terms of Σ s c and Σ s² for colours c under the light s, and reliabilities.
         let shown = |frame: usize| -> Result<Vec<(usize, Vec3, f32, f32)>, Error> {
             let seen = scene.seen_in(frame, &mesh.anchors)?;

@@ -83,8 +83,8 @@ pub struct Scene {
     pub(crate) learnt: Vec<usize>,
     /// Cache of [`Scene::colors`].
     pub(crate) colors: OnceLock<PriorColors>,
-    /// Cache of [`Scene::reliability`].
-    pub(crate) reliability: OnceLock<Reliability>,
+    /// Cache of [`Scene::lighting`].
+    pub(crate) lighting: OnceLock<(Light, Reliability)>,
 }
 
 impl Scene {
@@ -137,7 +137,7 @@ impl Scene {
             edge: 0,
             learnt: Vec::new(),
             colors: OnceLock::new(),
-            reliability: OnceLock::new(),
+            lighting: OnceLock::new(),
         };
         let held_out = |i: usize| config.held_out > 0 && i.is_multiple_of(config.held_out);
         scene.learnt = (0..scene.train.len()).filter(|&i| !held_out(i)).collect();
@@ -166,22 +166,32 @@ impl Scene {
         Ok(self.colors.get_or_init(|| measured))
     }
 
-    /// Reliability of the frames' colours under the scene's light.
-    pub(crate) fn reliability(&self, light: Light) -> Result<&Reliability, Error> {
-        if let Some(reliability) = self.reliability.get() {
-            return Ok(reliability);
+    /// Light of the frames, measured on first use if the configuration asks for one or that of a resumed
+    /// run, and reliability of their colours under it.
+    ///
+    /// # Errors
+    /// Pictures that cannot be read.
+    pub(crate) fn lighting(&self) -> Result<&(Light, Reliability), Error> {
+        if let Some(lighting) = self.lighting.get() {
+            return Ok(lighting);
         }
+        let (seen, vertices) = (self.seen()?, self.body.canonical.vertices.len());
+        let light = match self.colors.get() {
+            Some(colors) => colors.light,
+            None if self.lit => measure_light(&deeper(&seen, self.edge), vertices),
+            None => Light::default(),
+        };
         let views = self.train.iter().map(|frame| &frame.view);
         let views: Vec<(&[Vec3], Vec3)> =
             views.map(|view| (&view.posed.vertices[..], view.camera.centre_of_projection())).collect();
-        let measured = Reliability::measure(&self.seen()?, &views, light);
-        Ok(self.reliability.get_or_init(|| measured))
+        let measured = (light, Reliability::measure(&seen, &views, light));
+        Ok(self.lighting.get_or_init(|| measured))
     }
 
     /// Sets the colours of a resumed run, which its field is relative to.
     #[must_use]
     pub fn with_colors(self, colors: PriorColors) -> Self {
-        Self { colors: OnceLock::from(colors), ..self }
+        Self { colors: OnceLock::from(colors), lighting: OnceLock::new(), ..self }
     }
 
     /// Colour observations of the vertices in each training frame, with their depth inside the mask;

@@ -95,6 +95,8 @@ pub(crate) fn strange_edge(frames: &[Vec<(ColorObservation, usize)>], light: Lig
 
 #[cfg(test)]
 mod tests {
+    use std::sync::OnceLock;
+
     use super::*;
     use crate::capture::Capture;
     use crate::config::{Config, Method, Preset};
@@ -133,7 +135,7 @@ mod tests {
             let errors: Vec<f32> = each.map(|v| truth.colors[v].distance_squared(found.colors[v])).collect();
             errors.iter().sum::<f32>() / errors.len() as f32
         };
-        let (without, with) = (error(&ragged), error(&Scene { edge: 0, ..ragged }));
+        let (without, with) = (error(&ragged), error(&Scene { edge: 0, lighting: OnceLock::new(), ..ragged }));
         assert!(without < 0.7 * with, "{without} without edges, {with} with them");
     }
 
