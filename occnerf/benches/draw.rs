@@ -10,7 +10,7 @@ use occnerf::{Config, Method, Model, Preset, Scene, Trainer};
 use visibility::Samples;
 use volrender::Camera;
 
-/// Enough for a surface near the prior; what is drawn does not depend on how good it is.
+/// Enough for a surface near the prior; drawing time does not depend on its quality.
 const STEPS: u64 = 60;
 
 fn main() {

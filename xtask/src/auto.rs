@@ -18,9 +18,9 @@ use crate::table::aligned;
 
 /// Steps of the trial field.
 const TRIAL: u64 = 200;
-/// Least gain of what is added, dB over the known pixels of the frames held out.
+/// Least gain of an addition, dB over the known pixels of the frames held out.
 const WORTH: f64 = 0.3;
-/// Names of what is added.
+/// Names of the additions.
 const SKIRT: &str = "a skirt";
 const FIELD: &str = "a field";
 

@@ -277,7 +277,7 @@ mod tests {
             std::fs::write(&path, hostile).unwrap();
             assert!(earlier_log(&path, 30).unwrap().text.lines().count() <= 1);
         }
-        // Any byte may be any other: what is left are whole lines.
+        // Any byte may be corrupt; only whole lines remain.
         for n in 0..2000usize {
             let mut bytes = text.clone().into_bytes();
             for i in 0..=n % 3 {

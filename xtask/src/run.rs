@@ -298,7 +298,7 @@ fn candidates(name: &str) -> impl Iterator<Item = PathBuf> {
 /// Largest text file of a run.
 const MAX_TEXT: u64 = 1 << 28;
 
-/// Reads a text file of a run; what is not UTF-8 becomes U+FFFD.
+/// Reads a text file of a run; invalid UTF-8 becomes U+FFFD.
 pub fn read_text(path: &Path) -> Result<String> {
     ensure!(!path.exists() || path.is_file(), "{}: not a plain file", path.display());
     let bytes = read_bounded(path, MAX_TEXT).with_context(|| path.display().to_string())?;

@@ -39,7 +39,7 @@ pub struct Source {
 }
 
 impl Source {
-    /// Identity of what is trained on, wherever it lies: SHA-256 of the body's file, and of every
+    /// Identity of the training data, independent of its path: SHA-256 of the body's file, and of every
     /// frame's pictures, camera, pose and shape.
     ///
     /// # Errors
@@ -147,7 +147,7 @@ impl LoadArguments {
         })
     }
 
-    /// How a run to be resumed read its capture, checked against what is asked for.
+    /// Load options of the run to be resumed, checked against those of the command line.
     pub fn resumed(&self, saved: &LoadOptions) -> Result<LoadOptions> {
         let asked = self.options()?;
         if asked != LoadOptions::default() && asked != *saved {

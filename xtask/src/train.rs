@@ -328,7 +328,7 @@ pub fn unless_finished(
     if let Some(difference) = differs.filter(|_| begun) {
         bail!("{} holds a run with {difference}: give another --out, or remove it", directory.display());
     }
-    // Scores that lack what is asked for now are computed again from the checkpoint.
+    // Scores without the requested metric are computed again from the checkpoint.
     let named = |metrics: &Metrics| lpips.is_none() || metrics.lpips == network_name(lpips);
     if let Some(metrics) = finished(directory, trained, run)?.filter(named) {
         say!("{}: finished earlier", directory.file_name().unwrap_or_default().to_string_lossy());

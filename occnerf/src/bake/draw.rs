@@ -171,7 +171,7 @@ impl BilinearCorner {
         // Clamped to the edge.
         let at = (place - 0.5).clamp(Vec2::ZERO, (size - 1.0).max(Vec2::ZERO));
         let last = (size - 2.0).max(Vec2::ZERO);
-        // Truncation is the floor of what is not negative.
+        // Truncation is the floor of a coordinate that is not negative.
         let (x, y) = (at.x.min(last.x) as u32, at.y.min(last.y) as u32);
         Self { x: x as usize, y: y as usize, share: at - Vec2::new(x as f32, y as f32) }
     }

@@ -16,8 +16,8 @@ fn small_demo(body: &BodyModel, seed: u64) -> Capture {
     demo(&config, body).unwrap()
 }
 
-/// Good captures, each with its body: the demo, those that are shared, and what is imported from
-/// each estimator's files.
+/// Good captures, each with its body: the demo, the shared ones, and imports of each estimator's
+/// files.
 fn good() -> &'static [(String, Capture, BodyModel)] {
     static GOOD: OnceLock<Vec<(String, Capture, BodyModel)>> = OnceLock::new();
     GOOD.get_or_init(|| {

@@ -35,7 +35,7 @@ pub struct FrameMetrics {
     pub ssim_vis: Option<f64>,
     /// PSNR (dB) over the true subject's known pixels.
     pub psnr_mask: Option<f64>,
-    /// PSNR (dB) over all of the true subject's pixels: what is unknown is not excused.
+    /// PSNR (dB) over all of the true subject's pixels, unknown ones included.
     #[serde(default)]
     pub psnr_all: Option<f64>,
     /// Share of the true subject's pixels that are known.

@@ -253,7 +253,7 @@ impl Scene {
         Ok(())
     }
 
-    /// Share of the training masks' pixels that the prior covers, over up to 32 frames: hardly any where
+    /// Share of the training masks' pixels that the prior covers, over up to 32 frames; close to 0 where
     /// cameras or bodies are wrong.
     ///
     /// # Errors

@@ -62,7 +62,8 @@ impl Guesses<'_> {
         (sum / weights).as_vec3()
     }
 
-    /// [`AROUND`] if it predicts the vertices of `known` around `unseen` from the others better than 1.
+    /// Anisotropy of the piece `unseen`: [`AROUND`] or 1 (isotropic), whichever predicts the vertices of
+    /// `known` around it from the others with the smaller error.
     fn choose(&self, known: &[usize], unseen: &[usize]) -> f32 {
         let is_near = |v: usize| unseen.iter().any(|&u| self.vertices[u].distance(self.vertices[v]) < RIM);
         let (held, rest): (Vec<usize>, Vec<usize>) = known.par_iter().partition(|&&v| is_near(v));

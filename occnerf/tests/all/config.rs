@@ -1,4 +1,4 @@
-//! Configurations from text: what is wrong is named.
+//! Configurations from text: errors name the key and the value.
 
 use crate::common;
 

@@ -53,7 +53,7 @@ const OUTLINES: f32 = 1.0 / 3.0;
 /// 1.7 high, and the least depth.
 const INVERSE_DEPTH: f32 = 0.3;
 const LEAST_DEPTH: f32 = 0.8;
-/// Number of corrected shape coefficients; later ones hardly change the body.
+/// Number of corrected shape coefficients; later ones change the body little.
 const BETAS: usize = 10;
 /// Search distance from the prior's outline to the mask's in the first and in the last round,
 /// pixels.

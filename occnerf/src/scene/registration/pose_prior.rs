@@ -188,7 +188,7 @@ mod tests {
         let about = |f: usize, joint: usize| steps[f][3 + 3 * joint + 1];
         let (lower, upper) = (about(at, ELBOWS[1]), about(at, 17));
         assert!(lower - upper < -0.4 * f64::from(wrong.y), "{lower} {upper}");
-        // The other elbow, and other frames, hardly.
+        // The other elbow and other frames change little.
         assert!((about(at, ELBOWS[0]) - about(at, 16)).abs() < 0.06, "{}", about(at, ELBOWS[0]));
         assert!(steps[50].amax() < 0.04, "{}", steps[50].amax());
     }

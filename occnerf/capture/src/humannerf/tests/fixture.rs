@@ -46,7 +46,7 @@ impl Fixture {
         fixture
     }
 
-    /// Writes the pickles, after a test has changed what is in them.
+    /// Writes the pickles, after a test has changed their contents.
     pub fn write(&self) {
         self.dir.write("cameras.pkl", self.cameras.pickle());
         self.dir.write("mesh_infos.pkl", self.mesh_infos.pickle());

@@ -61,7 +61,7 @@ impl Fixture {
         self.dir.picture(&format!("mask/{picture}.png"), SIZE, |x, _| shown * u8::from(x == 7));
     }
 
-    /// Writes the pickles, after a test has changed what is in them, and the vertices of the last
+    /// Writes the pickles, after a test has changed their contents, and the vertices of the last
     /// instant.
     pub fn write(&self) {
         self.dir.write("annots.npy", self.annots.npy());
