@@ -6,6 +6,16 @@ use std::path::PathBuf;
 ///
 /// `file` is the path as given, or the name passed along with bytes in memory; `key` is the array,
 /// part or line, with its control characters escaped: a message is a single line.
+///
+/// ```
+/// use smpl::{BodyModel, Error};
+///
+/// let mut body = BodyModel::embedded();
+/// body.faces[5][0] = 7000;
+/// let error = body.validate("body.npz").unwrap_err();
+/// assert!(matches!(&error, Error::Invalid { key, .. } if key == "f"));
+/// assert_eq!(error.to_string(), "body.npz: `f`: face 5 names vertex 7000 of 6890");
+/// ```
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {

@@ -41,7 +41,7 @@ struct Readme;
 
 /// Error within [`Error::File`].
 pub use array_files::Error as FileError;
-pub use clip::{BoneNames, Bvh, Joint, MotionClip, joint_transforms};
+pub use clip::{BoneNames, Bvh, Joint, MotionClip, joint_transforms, skeleton};
 pub use error::Error;
 pub use limbs::Limbs;
 pub use model::{BodyModel, Shaped};

@@ -21,6 +21,15 @@ pub struct SparseRows<T> {
 }
 
 /// Skinning weights, (V, J): rows are vertices, columns joints.
+///
+/// ```
+/// use smpl::SkinningWeights;
+///
+/// // A vertex of joint 0 alone, and one that joint 1 shares.
+/// let weights = SkinningWeights::from_rows([vec![(0, 1.0)], vec![(0, 0.25), (1, 0.75)]]);
+/// assert_eq!([weights.heaviest(0), weights.heaviest(1)], [Some(0), Some(1)]);
+/// assert_eq!(weights.row(1).map(|(_, weight)| weight).sum::<f32>(), 1.0);
+/// ```
 pub type SkinningWeights = SparseRows<f32>;
 
 impl<T: Copy> SparseRows<T> {

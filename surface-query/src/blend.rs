@@ -6,6 +6,18 @@ const MIN_WEIGHT: f32 = 1e-5;
 /// Normal-weighted mean of the nearest vertices (surface-based rendering, OccNeRF §3.2), the result
 /// of [`crate::SurfaceQuery::blend`]. Cheap and smooth for a fixed set of neighbours, but no exact
 /// distance.
+///
+/// ```
+/// use glam::Vec3;
+/// use surface_query::{Blended, SurfaceQuery, SurfaceQueryConfig};
+///
+/// let vertices = [Vec3::ZERO, Vec3::X, Vec3::Y];
+/// let surface = SurfaceQuery::new(&vertices, &[[0, 1, 2]], &SurfaceQueryConfig::default())?;
+/// let Blended { point, normal, signed_distance } = surface.blend(Vec3::new(0.25, 0.25, -0.5), &[0, 1, 2]);
+/// assert_eq!((normal, signed_distance), (Vec3::Z, -0.5)); // behind the triangle
+/// assert!(point.distance(Vec3::new(0.283, 0.283, 0.0)) < 1e-3); // near the closest point, (0.25, 0.25, 0)
+/// # Ok::<(), surface_query::Error>(())
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Blended {
     /// v̂ = Σ w_i v_i / Σ w_i.

@@ -77,6 +77,18 @@ impl RaySamples<'_> {
 }
 
 /// One composited ray.
+///
+/// ```
+/// use glam::Vec3;
+/// use volrender::{Composite, RaySamples, composite};
+///
+/// // Red fog at depth 3 that absorbs half, before a white background.
+/// let (sigma, rgb) = ([2f32.ln()], [Vec3::X]);
+/// let samples = RaySamples { sigma: &sigma, likelihood: &[1.0], delta: &[1.0], t: &[3.0], rgb: &rgb };
+/// let Composite { color, opacity, depth, termination } = composite(samples, Vec3::ONE, &mut [0.0]);
+/// assert!(color.distance(Vec3::new(1.0, 0.5, 0.5)) < 1e-6 && (opacity - 0.5).abs() < 1e-6);
+/// assert!((depth / opacity - 3.0).abs() < 1e-6 && termination == Some(0));
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Composite {
     /// C = Σ w_i c_i + (1 − Σ w_i) · background.

@@ -39,7 +39,19 @@ pub struct Occupancy {
 }
 
 /// Thickness of the occupied shell around a mesh and size of the cells, in the unit of its
-/// vertices. [`Occupancy`] has an example.
+/// vertices.
+///
+/// ```
+/// use glam::Vec3;
+/// use volrender::{Occupancy, OccupancyConfig};
+///
+/// let config = OccupancyConfig { margin: 0.2, depth: 0.1, cell: 0.02 };
+/// let mut occupancy = Occupancy::default();
+/// occupancy.rebuild(&[Vec3::X, Vec3::Y, Vec3::Z], &[[0, 1, 2]], &[0.2], config);
+/// // Heights above the middle of the triangle.
+/// let at = |height: f32| occupancy.is_occupied(Vec3::splat(1.0 / 3.0) + height * Vec3::ONE.normalize());
+/// assert_eq!([-0.15, -0.05, 0.15, 0.25].map(at), [false, true, true, false]);
+/// ```
 #[derive(Clone, Copy, Debug)]
 pub struct OccupancyConfig {
     /// Upper bound of the margins of the faces, to the outside.

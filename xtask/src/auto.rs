@@ -5,8 +5,9 @@
 
 use anyhow::Result;
 use glam::Vec3;
-use occnerf::bake::{fit, skeleton, skirted};
+use occnerf::bake::{fit, skirted};
 use occnerf::{Config, Label, Method, PreparedFrame, Scene, Trainer, pinhole};
+use smpl::{BoneNames, skeleton};
 use visibility::{RasterOptions, Rasterizer};
 
 use crate::eval::{Drawn, Split};
@@ -161,7 +162,7 @@ impl Trial {
 /// The part of the body at each pixel of a frame, (H · W).
 fn parts(scene: &Scene, frame: &PreparedFrame) -> Result<Vec<usize>> {
     let model = &scene.body.model;
-    let names = skeleton(&model.parents, &vec![Vec3::ZERO; model.parents.len()]);
+    let names = skeleton(BoneNames::Smpl, &model.parents, &vec![Vec3::ZERO; model.parents.len()]);
     let part =
         |joint: usize| PARTS.iter().position(|(_, words)| words.iter().any(|word| names[joint].name.contains(word)));
     let heaviest = |v: u32| model.weights.heaviest(v as usize).unwrap_or(0);

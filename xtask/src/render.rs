@@ -7,9 +7,9 @@ use anyhow::{Context, Result, bail};
 use clap::{Args, ValueEnum};
 use glam::{Affine3A, Mat3, Vec3};
 use indicatif::ProgressBar;
-use occnerf::bake::{Avatar, BakedRenderer, skeleton};
+use occnerf::bake::{Avatar, BakedRenderer};
 use occnerf::{Body, FieldRenderer, Method, Person, PosedFrame, PosedView, PriorRenderer, Renderer, upright};
-use smpl::Placement;
+use smpl::{BoneNames, Placement, skeleton};
 use visibility::Samples;
 use volrender::Camera;
 
@@ -171,7 +171,7 @@ fn views<'a>(
             let path = arguments.motion.as_deref().context("pose: --motion CLIP says which poses")?;
             let joints = body.model.num_joints();
             let rest: Vec<Vec3> = body.canonical.joints.iter().map(|&joint| joint / body.scale).collect();
-            let motion = load_motion(path, arguments.fps, &skeleton(&body.model.parents, &rest))?;
+            let motion = load_motion(path, arguments.fps, &skeleton(BoneNames::Smpl, &body.model.parents, &rest))?;
             let count = motion.trans.len();
             let view = move |i: usize| {
                 let (pose, translation) = (&motion.poses[i * joints..][..joints], motion.trans[i]);

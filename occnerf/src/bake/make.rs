@@ -6,7 +6,7 @@ use std::time::Instant;
 
 use glam::{Affine3A, Vec2, Vec3};
 use rayon::prelude::*;
-use smpl::SparseRows;
+use smpl::{BoneNames, SparseRows, skeleton};
 
 use super::avatar::{Atlas, Avatar, Clip, MAX_JOINTS};
 use super::charts::AtlasLayout;
@@ -14,7 +14,7 @@ use super::displacement::displacements;
 use super::field::evaluate;
 use super::paint::{Texel, dilate, paint, texels};
 use super::refine::refine;
-use super::skeleton::{motion_of_bones, skeleton, turn_upright};
+use super::skeleton::{motion_of_bones, turn_upright};
 use super::surface::{CanonicalField, NormalRay, Place, heights, normal_rays};
 use crate::Error;
 use crate::capture::Light;
@@ -222,7 +222,7 @@ fn assemble(
         posedirs,
         atlas,
         light: Light::default(),
-        skeleton: skeleton(&body.model.parents, &rest),
+        skeleton: skeleton(BoneNames::Smpl, &body.model.parents, &rest),
         betas: body.mean_betas.clone(),
         clips: Vec::new(),
         cameras: Vec::new(),

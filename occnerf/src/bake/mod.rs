@@ -26,7 +26,7 @@ use crate::Error;
 pub use avatar::{Atlas, Avatar, Clip, MAX_ATLAS_SIDE, MAX_JOINTS};
 pub use draw::BakedRenderer;
 pub use make::{BakeReport, bake, fit};
-pub use skeleton::{motion_of_bones, skeleton, turn_upright};
+pub use skeleton::{motion_of_bones, turn_upright};
 pub use skirt::skirted;
 pub use smpl::Joint;
 

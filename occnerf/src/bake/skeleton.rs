@@ -1,25 +1,7 @@
-//! The skeleton of a body model with SMPL's joint names, and its motions.
+//! Motions of a skeleton.
 
 use glam::{Affine3A, Mat3, Quat, Vec3};
-use smpl::{BoneNames, Joint, MotionClip};
-
-/// Parents of SMPL's 24 joints; its successors share the first 22.
-const SMPL_PARENTS: [usize; 24] = [0, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 20, 21];
-
-/// Joints of a body model's `parents` at canonical positions `rest`, (J). Joints of the trees of
-/// SMPL, SMPL-H and SMPL-X have SMPL's names, all others `joint_07`.
-#[must_use]
-pub fn skeleton(parents: &[Option<usize>], rest: &[Vec3]) -> Vec<Joint> {
-    let names = BoneNames::Smpl.of_body(parents.len());
-    let shared = if parents.len() == 24 { 24 } else { 22 };
-    let alike = (SMPL_PARENTS[..shared].iter().zip(parents)).all(|(smpl, parent)| parent.unwrap_or(0) == *smpl);
-    let joint = |(j, (parent, &rest)): (usize, (&Option<usize>, &Vec3))| Joint {
-        name: names.get(j).filter(|_| alike).map_or_else(|| format!("joint_{j:02}"), Clone::clone),
-        parent: parent.and_then(|p| u16::try_from(p).ok()),
-        rest,
-    };
-    parents.iter().zip(rest).enumerate().map(joint).collect()
-}
+use smpl::{Joint, MotionClip};
 
 /// Rotation from the direction `up` of a capture's world to +y; the identity for a zero `up`.
 #[must_use]

@@ -9,10 +9,9 @@ use std::f32::consts::TAU;
 
 use glam::Vec3;
 use rayon::prelude::*;
-use smpl::BodyModel;
+use smpl::{BodyModel, BoneNames, skeleton};
 use visibility::{Fragment, RasterOptions, Rasterizer};
 
-use super::skeleton::skeleton;
 use crate::Error;
 use crate::config::OccludedRule;
 use crate::model::body::Body;
@@ -123,7 +122,7 @@ struct Tube {
 impl Tube {
     fn new(body: &Body) -> Option<Self> {
         let rest = &body.canonical.joints;
-        let names = skeleton(&body.model.parents, rest);
+        let names = skeleton(BoneNames::Smpl, &body.model.parents, rest);
         let joint = |name: &str| names.iter().position(|joint| joint.name == name);
         let [pelvis, left, right] = [joint("pelvis")?, joint("left_hip")?, joint("right_hip")?];
         let middle = |a: usize, b: usize| 0.5 * (rest[a] + rest[b]);

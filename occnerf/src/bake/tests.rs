@@ -7,7 +7,7 @@ use super::charts::{AtlasLayout, PADDING};
 use super::draw::BakedRenderer;
 use super::make::{bake, fit, surface};
 use super::surface::{CanonicalField, Place};
-use super::{Avatar, BakeReport, skeleton, skirted};
+use super::{Avatar, BakeReport, skirted};
 use crate::capture::{Capture, Light};
 use crate::config::{Config, Method, Preset};
 use crate::render::field::FieldRenderer;
@@ -182,7 +182,7 @@ fn square(rgb: &[[u8; 3]], width: u32) -> Avatar {
             rgb: rgb.as_flattened().to_vec(),
             confidence: vec![255; rgb.len()],
         },
-        skeleton: skeleton(&[None], &[Vec3::ZERO]),
+        skeleton: smpl::skeleton(smpl::BoneNames::Smpl, &[None], &[Vec3::ZERO]),
         light: Light::default(),
         betas: Vec::new(),
         clips: Vec::new(),

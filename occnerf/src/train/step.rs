@@ -222,7 +222,7 @@ mod tests {
         let body = smpl::BodyModel::embedded();
         let capture = demo(&DemoConfig { size: 40, frames: 4, eval_cameras: 1, ..Default::default() }, &body).unwrap();
         let mut config = Config::preset(Preset::Fast, Method::Occnerf);
-        (config.patches, config.patch_size, config.steps) = (2, 24, 100);
+        (config.patches, config.patch_size, config.steps) = (2, 16, 100);
         config.field.density_scale *= 30.0;
         config.surface.surface_term = true;
         // That of the samples that are evaluated is another one.

@@ -3,10 +3,10 @@
 use std::collections::HashMap;
 
 use glam::{Vec2, Vec3};
-use occnerf::bake::{Atlas, Avatar, skeleton};
+use occnerf::bake::{Atlas, Avatar};
 use occnerf::capture::Light;
 use proptest::prelude::*;
-use smpl::SparseRows;
+use smpl::{BoneNames, SparseRows, skeleton};
 use testkit::mesh::{TriMesh, open_grid, torus};
 use testkit::strategy;
 
@@ -41,7 +41,7 @@ fn charted(mesh: &TriMesh) -> Avatar {
         posedirs: SparseRows::from_rows(vec![Vec::<(u32, Vec3)>::new(); n]),
         atlas: Atlas { width: 1, height: 1, rgb: vec![0; 3], confidence: vec![255] },
         light: Light::default(),
-        skeleton: skeleton(&[None], &[Vec3::ZERO]),
+        skeleton: skeleton(BoneNames::Smpl, &[None], &[Vec3::ZERO]),
         betas: Vec::new(),
         clips: Vec::new(),
         cameras: Vec::new(),

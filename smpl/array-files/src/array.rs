@@ -3,6 +3,16 @@
 use crate::Error;
 
 /// Values of an [`NdArray`], widened to four types.
+///
+/// ```
+/// use array_files::{Data, pickle};
+///
+/// // Two 16-bit integers as numpy saves them.
+/// let header = b"\x93NUMPY\x01\0\x3a\0{'descr': '<i2', 'fortran_order': False, 'shape': (2,), }\n";
+/// let value = pickle::from_bytes("two.npy", [header.as_slice(), b"\x07\0\xff\xff"].concat())?;
+/// assert_eq!(value.as_array().map(|array| &array.data), Some(&Data::I64(vec![7, -1])));
+/// # Ok::<(), array_files::Error>(())
+/// ```
 #[derive(Clone, Debug, PartialEq)]
 pub enum Data {
     /// 64-bit floats.

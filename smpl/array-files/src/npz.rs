@@ -30,6 +30,21 @@ pub fn read_npy(path: &Path) -> Result<NdArray, Error> {
 }
 
 /// Open `.npz` archive, held in memory as it is compressed; arrays are decoded when asked for.
+///
+/// ```
+/// use array_files::npz::{self, Npz};
+/// use array_files::{Data, NdArray, read_file};
+///
+/// # let path = std::env::temp_dir().join("array-files-npz.npz");
+/// let faces = NdArray { shape: vec![1, 3], data: Data::I64(vec![0, 1, 2]) };
+/// npz::write(&path, &[("f", faces.clone())])?;
+/// let mut body = Npz::from_bytes("body.npz", read_file(&path)?)?;
+/// assert_eq!(body.array("f")?, faces);
+/// let error = body.array("weights").unwrap_err();
+/// assert_eq!(error.to_string(), "body.npz: `weights`: missing, the file holds f");
+/// # std::fs::remove_file(&path).unwrap();
+/// # Ok::<(), array_files::Error>(())
+/// ```
 #[derive(Clone)]
 pub struct Npz {
     file: String,

@@ -30,6 +30,16 @@ use serde_json::json;
 use crate::Error;
 
 /// An element of a tensor.
+///
+/// ```
+/// use array_files::tensors::Number;
+///
+/// let mut bytes = Vec::new();
+/// 0x0102u16.write(&mut bytes)?;
+/// assert_eq!(bytes, [2, 1]); // little-endian
+/// assert_eq!(u16::read(&bytes), 0x0102);
+/// # Ok::<(), std::io::Error>(())
+/// ```
 pub trait Number: Copy {
     /// Its type in a file.
     const DTYPE: Dtype;
@@ -68,6 +78,15 @@ numbers!(f32: F32, u8: U8, u16: U16, u32: U32, u64: U64, i32: I32, i64: I64);
 type Values<'a> = Box<dyn Fn(&mut BufWriter<File>) -> io::Result<()> + 'a>;
 
 /// A tensor to be written.
+///
+/// ```
+/// use array_files::tensors::Tensor;
+///
+/// let faces = [[0u32, 1, 2], [0, 2, 3]];
+/// let borrowed = Tensor::new("faces", &[2, 3], faces.as_flattened());
+/// let owned = Tensor::new("height", &[], vec![1.75f32]);
+/// assert_eq!(format!("{borrowed:?}, {owned:?}"), "faces: U32 [2, 3], height: F32 []");
+/// ```
 pub struct Tensor<'a> {
     name: String,
     dtype: Dtype,
@@ -119,6 +138,18 @@ pub fn write(path: &Path, header: &BTreeMap<&str, String>, mut tensors: Vec<Tens
 }
 
 /// A parsed file.
+///
+/// ```
+/// use array_files::tensors::Tensors;
+///
+/// let header = br#"{"ids":{"dtype":"U8","shape":[2],"data_offsets":[0,2]}}"#;
+/// let bytes = [(header.len() as u64).to_le_bytes().as_slice(), header, &[7, 9]].concat();
+/// let file = Tensors::parse("ids.safetensors", &bytes)?;
+/// assert_eq!((file.shape("ids"), file.shape("names")), (Some(vec![2]), None));
+/// let error = file.read::<f32>("ids", &[None]).unwrap_err();
+/// assert_eq!(error.to_string(), "ids.safetensors: `ids`: U8 [2], expected F32 [_]");
+/// # Ok::<(), array_files::Error>(())
+/// ```
 #[derive(Debug)]
 pub struct Tensors<'a> {
     file: String,

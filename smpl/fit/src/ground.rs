@@ -54,6 +54,22 @@ const POINTS: usize = 4;
 const SOLE: [usize; 2] = [2, 3];
 
 /// A motion on the floor, from [`ground`], and its distance from the given one.
+///
+/// ```
+/// # use glam::Vec3;
+/// # use smpl::{BodyModel, BoneNames, MotionClip, skeleton};
+/// # let body = BodyModel::embedded();
+/// # let rest = body.shaped(&[]);
+/// # let sole = rest.vertices.iter().map(|v| v.y).fold(f32::INFINITY, f32::min);
+/// # let skeleton = skeleton(BoneNames::Smpl, &body.parents, &rest.joints);
+/// // A person who stands in the air; skeleton and soles are those of `ground`'s example.
+/// let (poses, trans) = (vec![Vec3::ZERO; 30 * 24], vec![5.0 * Vec3::Y; 30]);
+/// let motion = MotionClip { poses, num_joints: 24, trans, fps: 30.0 };
+/// let grounded = point_fit::ground(&skeleton, &motion, sole)?;
+/// let height = grounded.motion.trans[0].y + sole;
+/// assert!(height.abs() < 1e-3 && grounded.standing == [1.0; 2] && grounded.tilt < 1e-3);
+/// # Ok::<(), point_fit::FitError>(())
+/// ```
 #[derive(Clone, Debug, PartialEq)]
 pub struct Grounded {
     /// The motion on the floor, y = 0.
@@ -78,15 +94,11 @@ pub struct Grounded {
 ///
 /// ```
 /// use glam::Vec3;
-/// use smpl::{BodyModel, BoneNames, Joint, MotionClip};
+/// use smpl::{BodyModel, BoneNames, MotionClip, skeleton};
 ///
 /// let body = BodyModel::embedded();
 /// let rest = body.shaped(&[]);
-/// let names = BoneNames::Smpl.of_body(24).into_iter().zip(&body.parents).zip(rest.joints);
-/// let joint = |((name, parent), rest): ((String, &Option<usize>), Vec3)| {
-///     Joint { name, parent: parent.map(|p| p as u16), rest }
-/// };
-/// let skeleton: Vec<Joint> = names.map(joint).collect();
+/// let skeleton = skeleton(BoneNames::Smpl, &body.parents, &rest.joints);
 /// let sole = rest.vertices.iter().map(|v| v.y).fold(f32::INFINITY, f32::min);
 ///
 /// // A person who stands still while the camera's drift moves them.

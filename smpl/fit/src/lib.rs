@@ -72,6 +72,19 @@ const NOISE: [f64; 3] = [0.01, 0.002, 0.1];
 const FAR: f64 = 1e5;
 
 /// The body in all frames, from [`fit`].
+///
+/// ```
+/// use point_fit::{Anchor, fit};
+///
+/// let body = smpl::BodyModel::embedded();
+/// let anchors: Vec<Anchor> = (0..24).map(Anchor::joint).collect();
+/// // Two frames of a tall person at rest, whose thighs are found to within 5 mm.
+/// let tall = body.shaped(&[1.5]).joints;
+/// let fitted = fit(&body, &anchors, &tall.repeat(2))?;
+/// let found = body.shaped(&fitted.betas).joints;
+/// assert!((found[1].distance(found[4]) - tall[1].distance(tall[4])).abs() < 0.005 && fitted.frames.len() == 2);
+/// # Ok::<(), point_fit::FitError>(())
+/// ```
 #[derive(Clone, Debug, PartialEq)]
 pub struct Fitted {
     /// Shape coefficients of all frames, at most 10.
@@ -83,6 +96,20 @@ pub struct Fitted {
 }
 
 /// The body in one frame.
+///
+/// ```
+/// use glam::Vec3;
+/// use point_fit::{Anchor, Fitted, fit};
+/// use smpl::{BodyModel, Placement};
+///
+/// let (body, anchors): (_, Vec<Anchor>) = (BodyModel::embedded(), (0..24).map(Anchor::joint).collect());
+/// let seen: Vec<Vec3> = body.shaped(&[]).joints.iter().map(|joint| *joint + Vec3::X).collect();
+/// let Fitted { betas, frames, .. } = fit(&body, &anchors, &seen)?;
+/// let placement = Placement::Pelvis { translation: frames[0].translation };
+/// let posed = body.pose(&body.shaped(&betas), &frames[0].pose, placement);
+/// assert!(posed.joints[20].distance(seen[20]) < 0.01); // left wrist, metres
+/// # Ok::<(), point_fit::FitError>(())
+/// ```
 #[derive(Clone, Debug, PartialEq)]
 pub struct FittedFrame {
     /// Axis-angle of each joint relative to its parent, (J). Joints that move no point are at rest.
@@ -96,6 +123,15 @@ pub struct FittedFrame {
 }
 
 /// Points that no body can be fitted to.
+///
+/// ```
+/// use point_fit::{Anchor, FitError, fit};
+///
+/// let body = smpl::BodyModel::embedded();
+/// let error = fit(&body, &[Anchor::joint(0)], &[glam::Vec3::ZERO; 2]).unwrap_err();
+/// assert_eq!(error, FitError::Unseen(1));
+/// assert_eq!(error.to_string(), "expected a frame with 4 finite points or more, found at most 1");
+/// ```
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum FitError {

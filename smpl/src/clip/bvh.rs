@@ -29,14 +29,10 @@ const CENTIMETRES: f32 = 100.0;
 ///
 /// ```
 /// use glam::Vec3;
-/// use smpl::{BodyModel, BoneNames, Bvh, Joint, MotionClip};
+/// use smpl::{BodyModel, BoneNames, Bvh, MotionClip, skeleton};
 ///
 /// let body = BodyModel::embedded();
-/// let names = BoneNames::Mixamo.of_body(24);
-/// let parts = names.into_iter().zip(&body.parents).zip(body.shaped(&[]).joints);
-/// let skeleton: Vec<Joint> = parts
-///     .map(|((name, parent), rest)| Joint { name, parent: parent.map(|p| p as u16), rest })
-///     .collect();
+/// let skeleton = skeleton(BoneNames::Mixamo, &body.parents, &body.shaped(&[]).joints);
 /// let mut poses = vec![Vec3::ZERO; 24];
 /// poses[4].x = 1.0;
 /// let motion = MotionClip { poses, num_joints: 24, trans: vec![Vec3::Y], fps: 30.0 };

@@ -7,4 +7,4 @@ mod skeleton;
 
 pub use bvh::Bvh;
 pub use motion_clip::MotionClip;
-pub use skeleton::{BoneNames, Joint, joint_transforms};
+pub use skeleton::{BoneNames, Joint, joint_transforms, skeleton};

@@ -48,7 +48,40 @@ pub struct Joint {
     pub rest: Vec3,
 }
 
+/// Parents of SMPL's 24 joints; its successors share the first 22.
+const SMPL_PARENTS: [usize; 24] = [0, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 20, 21];
+
+/// Joints of a body model's `parents` at positions `rest`, (J). Joints of the trees of SMPL, SMPL-H and
+/// SMPL-X have names of the scheme, all others `joint_07`.
+///
+/// ```
+/// use smpl::{BodyModel, BoneNames, skeleton};
+///
+/// let body = BodyModel::embedded();
+/// let joints = skeleton(BoneNames::Mixamo, &body.parents, &body.shaped(&[]).joints);
+/// assert_eq!((joints[4].name.as_str(), joints[4].parent), ("mixamorig:LeftLeg", Some(1)));
+/// ```
+pub fn skeleton(scheme: BoneNames, parents: &[Option<usize>], rest: &[Vec3]) -> Vec<Joint> {
+    let names = scheme.of_body(parents.len());
+    let shared = if parents.len() == 24 { 24 } else { 22 };
+    let alike = (SMPL_PARENTS[..shared].iter().zip(parents)).all(|(smpl, parent)| parent.unwrap_or(0) == *smpl);
+    let joint = |(j, (parent, &rest)): (usize, (&Option<usize>, &Vec3))| Joint {
+        name: names.get(j).filter(|_| alike).map_or_else(|| format!("joint_{j:02}"), Clone::clone),
+        parent: parent.and_then(|p| u16::try_from(p).ok()),
+        rest,
+    };
+    parents.iter().zip(rest).enumerate().map(joint).collect()
+}
+
 /// Naming schemes of humanoid skeletons.
+///
+/// ```
+/// use smpl::BoneNames;
+///
+/// let schemes = [BoneNames::Smpl, BoneNames::Mixamo, BoneNames::Vrm];
+/// let knees = schemes.map(|scheme| scheme.of_body(24)[4].clone());
+/// assert_eq!(knees, ["left_knee", "mixamorig:LeftLeg", "leftLowerLeg"]);
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum BoneNames {
     /// `pelvis`, `left_knee`.

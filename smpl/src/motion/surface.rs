@@ -9,7 +9,16 @@ use crate::pose::{Posed, blend};
 /// Motion field whose weights are those of the nearest point of the posed surface.
 ///
 /// The likelihood is 1 inside the body and outside up to `margin` from it, then falls with a
-/// continuous derivative to 0 at `margin + falloff`. [`super::MotionField`] has an example.
+/// continuous derivative to 0 at `margin + falloff`. The example of [`super::MotionField`] maps a
+/// point.
+///
+/// ```
+/// use smpl::SurfaceMotion;
+///
+/// let motion = SurfaceMotion { margin: 16.0, falloff: 32.0 }; // a model in millimetres
+/// let likelihoods = [-100.0, 16.0, 32.0, 48.0].map(|distance| motion.likelihood(distance));
+/// assert_eq!(likelihoods, [1.0, 1.0, 0.5, 0.0]);
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SurfaceMotion {
     /// Distance from the surface up to which f is 1, in the unit of the model.

@@ -14,6 +14,17 @@ const GAUSSIAN_CUT: f32 = 1e-4;
 
 /// Layout and prior of a [`WeightVolume`]. Lengths are in the unit of the model; the defaults fit
 /// metres.
+///
+/// ```
+/// use smpl::{BodyModel, WeightVolume, WeightVolumeConfig};
+///
+/// let (body, config) = (BodyModel::embedded(), WeightVolumeConfig { resolution: 8, ..Default::default() });
+/// let shaped = body.shaped(&[]);
+/// let volume = WeightVolume::gaussian(&body, &shaped, &config);
+/// assert_eq!(volume.weights.len(), (24 + 1) * 8 * 8 * 8);
+/// let top = shaped.vertices.iter().map(|v| v.y).fold(f32::MIN, f32::max);
+/// assert_eq!(volume.max.y, top + config.across);
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct WeightVolumeConfig {
     /// Samples per axis, at least 2. 32 is the paper's.

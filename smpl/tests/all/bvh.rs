@@ -8,8 +8,7 @@ use smpl::{BodyModel, BoneNames, Bvh, Joint, MotionClip, joint_transforms};
 
 fn skeleton(scheme: BoneNames) -> Vec<Joint> {
     let body = BodyModel::embedded();
-    let parts = scheme.of_body(24).into_iter().zip(&body.parents).zip(body.shaped(&[]).joints);
-    parts.map(|((name, parent), rest)| Joint { name, parent: parent.map(|p| p as u16), rest }).collect()
+    smpl::skeleton(scheme, &body.parents, &body.shaped(&[]).joints)
 }
 
 fn file(name: &str, text: &[u8]) -> PathBuf {

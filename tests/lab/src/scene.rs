@@ -274,6 +274,9 @@ pub struct SceneArguments {
     /// held [default: false]
     #[arg(long, value_name = "BOOL")]
     wrong_pictures: Option<bool>,
+    /// Another draw of these errors [default: 0]
+    #[arg(long, value_name = "SEED")]
+    wrong_draw: Option<u64>,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, ValueEnum)]
@@ -316,6 +319,7 @@ impl SceneArguments {
             mask_pixels: self.wrong_mask.unwrap_or(as_wrong.mask_pixels),
             keypoint_pixels: self.wrong_keypoints.unwrap_or(as_wrong.keypoint_pixels),
             photographed: self.wrong_pictures.unwrap_or(as_wrong.photographed),
+            seed: self.wrong_draw.unwrap_or(as_wrong.seed),
         };
         let (files, corruption) = (self.load.options()?, Corruption { occlusion, open_body: self.open_body, wrong });
         Ok(SceneOptions { files, corruption, capture: String::new() })

@@ -45,6 +45,8 @@ pub struct Perturbation {
     pub keypoint_pixels: f32,
     /// Training frames as a camera and a segmenter make them.
     pub photographed: bool,
+    /// Draw of the random errors.
+    pub seed: u64,
 }
 
 impl Perturbation {
@@ -59,6 +61,7 @@ impl Perturbation {
         mask_pixels: 0,
         keypoint_pixels: 0.0,
         photographed: false,
+        seed: 0,
     };
     /// What cameras, estimators and segmenters make of a real video.
     pub const REAL: Self = Self {
@@ -71,6 +74,7 @@ impl Perturbation {
         mask_pixels: 0,
         keypoint_pixels: 1.5,
         photographed: true,
+        seed: 0,
     };
 
     fn check(&self) -> Result<(), CaptureError> {
@@ -102,11 +106,11 @@ impl Perturbation {
     pub fn apply(&self, capture: &mut Capture, body: &BodyModel) -> Result<(), CaptureError> {
         self.check()?;
         if self.keypoint_pixels > 0.0 {
-            detect(capture, body, self.keypoint_pixels);
+            detect(capture, body, self.keypoint_pixels, self.seed);
         }
-        let shots = if self.photographed { shots(capture, body) } else { Vec::new() };
+        let shots = if self.photographed { shots(capture, body, self.seed) } else { Vec::new() };
         if self.shape > 0.0 {
-            let mut stream = RandomStream::new(&[SHAPE]);
+            let mut stream = RandomStream::new(&[SHAPE ^ self.seed]);
             let count = body.num_betas().min(BETAS);
             let error: Vec<f32> = (0..count).map(|_| self.shape * normal(&mut stream)).collect();
             let frames = capture.train.iter_mut().map(|f| &mut f.betas);
@@ -121,6 +125,7 @@ impl Perturbation {
         }
         for (index, frame) in capture.train.iter_mut().enumerate() {
             let (shot, grown, ragged) = (shots.get(index).copied(), self.mask_pixels, self.ragged_pixels);
+            let number = numbered(index, self.seed);
             if shot.is_none() && grown == 0 && ragged == 0.0 {
                 continue;
             }
@@ -128,7 +133,7 @@ impl Perturbation {
                 let photograph = shot.map(|shot| shot.photograph(pixels));
                 pixels.grow(grown);
                 if ragged > 0.0 {
-                    fray(pixels, ragged, index as u64);
+                    fray(pixels, ragged, number);
                 }
                 if let (Some(shot), Some(photograph)) = (shot, photograph) {
                     shot.segment(pixels, &photograph);
@@ -147,7 +152,7 @@ impl Perturbation {
         let limbs = body.limbs();
         let mut moved = body.v_template.clone();
         for pair in limbs.pairs() {
-            let part = 0.01 * self.limbs_percent * normal(&mut RandomStream::new(&[LIMBS, pair as u64]));
+            let part = 0.01 * self.limbs_percent * normal(&mut RandomStream::new(&[LIMBS ^ self.seed, pair as u64]));
             moved.iter_mut().zip(limbs.longer(pair)).for_each(|(v, longer)| *v += part * longer);
         }
         body.v_template = moved;
@@ -161,7 +166,7 @@ impl Perturbation {
         self.turn(capture, body, self.translation * unit);
         // Of three axes each has a third of the square.
         let rms = 3.0f32.sqrt() * 0.01 * self.depth_percent;
-        let nearer = wander(&mut RandomStream::new(&[DEPTH]), capture.train.len(), rms);
+        let nearer = wander(&mut RandomStream::new(&[DEPTH ^ self.seed]), capture.train.len(), rms);
         for (frame, nearer) in capture.train.iter_mut().zip(nearer) {
             let pelvis = body.shaped(&frame.betas).joints.first().copied().unwrap_or(Vec3::ZERO);
             let Pose { rotation, translation, .. } = about_origin(frame, pelvis);
@@ -183,7 +188,7 @@ impl Perturbation {
         let pelvis = |frame: &Frame| body.shaped(&frame.betas).joints.first().copied().unwrap_or(Vec3::ZERO);
         let Some(first) = capture.train.first().map(pelvis) else { return };
         let poses: Vec<Pose> = capture.train.iter().map(|frame| about_origin(frame, pelvis(frame))).collect();
-        let error = TrackerError { seed: 0, rotation: self.pose_degrees.to_radians(), translation };
+        let error = TrackerError { seed: self.seed, rotation: self.pose_degrees.to_radians(), translation };
         for (frame, pose) in capture.train.iter_mut().zip(track(&poses, &body.parents, first, error)) {
             let Pose { joints, rotation, translation } = pose;
             frame.pose = joints;
@@ -199,6 +204,11 @@ impl Perturbation {
             }
         }
     }
+}
+
+/// Number of a frame's noise: a thousand frames a draw.
+fn numbered(frame: usize, seed: u64) -> u64 {
+    (frame as u64).wrapping_add(seed.wrapping_mul(1000))
 }
 
 /// Joints of SMPL's limbs.
@@ -217,8 +227,8 @@ fn projected(frame: &Frame, body: &BodyModel) -> Option<(Vec<Vec2>, f32)> {
 }
 
 /// Gives the training frames key points with this noise.
-fn detect(capture: &mut Capture, body: &BodyModel, noise: f32) {
-    let mut stream = RandomStream::new(&[POINTS]);
+fn detect(capture: &mut Capture, body: &BodyModel, noise: f32, seed: u64) {
+    let mut stream = RandomStream::new(&[POINTS ^ seed]);
     let mut vector = move || noise / 250.0 * Vec2::new(normal(&mut stream), normal(&mut stream));
     let offsets = LIMB_JOINTS.map(|_| vector());
     for frame in &mut capture.train {
@@ -232,16 +242,16 @@ fn detect(capture: &mut Capture, body: &BodyModel, noise: f32) {
 }
 
 /// The cameras' and the segmenter's faults in each training frame.
-fn shots(capture: &Capture, body: &BodyModel) -> Vec<Shot> {
-    let light = wander(&mut RandomStream::new(&[LIGHT]), capture.train.len(), 3.0f32.sqrt());
+fn shots(capture: &Capture, body: &BodyModel, seed: u64) -> Vec<Shot> {
+    let light = wander(&mut RandomStream::new(&[LIGHT ^ seed]), capture.train.len(), 3.0f32.sqrt());
     let shot = |(i, (frame, light)): (usize, (&Frame, Vec3))| match projected(frame, body) {
         Some((joints, height)) => Shot {
             height,
             hand: Some((joints[joint::RIGHT_ELBOW], joints[joint::RIGHT_ELBOW + 4])),
             foot: Some(joints[joint::LEFT_ANKLE + 3]),
-            ..Shot::new(i as u64, light.x)
+            ..Shot::new(numbered(i, seed), light.x)
         },
-        None => Shot::new(i as u64, light.x),
+        None => Shot::new(numbered(i, seed), light.x),
     };
     capture.train.iter().zip(light).enumerate().map(shot).collect()
 }
@@ -307,6 +317,24 @@ mod tests {
             let view = &after.eval[0];
             assert_eq!(view.frame.pose, after.train[view.train_index].pose);
         }
+    }
+
+    #[test]
+    fn every_draw_has_errors_of_its_own() {
+        let body = BodyModel::embedded();
+        let of = |seed: u64| {
+            let (mut capture, mut model) = (capture(&body), body.clone());
+            let wrong = Perturbation { seed, ..Perturbation::REAL };
+            wrong.apply(&mut capture, &body).unwrap();
+            wrong.corrupt_body(&mut model);
+            let frame = &capture.train[5];
+            let mask = frame.pixels().unwrap().mask.clone();
+            (frame.pose.clone(), frame.placement, capture.mean_betas.clone(), frame.keypoints.clone(), mask, model)
+        };
+        let (first, again, other) = (of(1), of(1), of(2));
+        assert!(first.0 == again.0 && first.4 == again.4);
+        assert!(first.0 != other.0 && first.1 != other.1 && first.2 != other.2 && first.3 != other.3);
+        assert!(first.4 != other.4 && first.5.v_template != other.5.v_template);
     }
 
     #[test]

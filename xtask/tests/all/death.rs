@@ -147,7 +147,7 @@ fn a_training_killed_at_any_moment_ends_the_same_to_the_bit() {
         words(&[&run[..], &QUICK, more].concat())
     };
     let whole = folder.join("whole");
-    let first = of(&whole, "240", &[]);
+    let first = of(&whole, "120", &[]);
     done(&first.iter().map(String::as_str).collect::<Vec<_>>());
     let bytes = |run: &Path| std::fs::read(run.join("checkpoint.safetensors")).unwrap();
     let (mut random, mut lives) = (Random(1), 0);
@@ -161,12 +161,12 @@ fn a_training_killed_at_any_moment_ends_the_same_to_the_bit() {
                 let resume = out.join("config.toml").is_file();
                 of(
                     out,
-                    "240",
+                    "120",
                     &[&["--checkpoint-every", interval][..], if resume { &["--resume"] } else { &[] }].concat(),
                 )
             };
             let work = Work { name: "train", out: out.clone(), arguments: &arguments };
-            until_it_ends(&work, 1500, &mut random, 12.min(kills()), &mut toll);
+            until_it_ends(&work, 1000, &mut random, 12.min(kills()), &mut toll);
             assert!(bytes(&out) == bytes(&whole), "{}", out.display());
             std::fs::remove_dir_all(&out).unwrap();
         }

@@ -110,14 +110,14 @@ fn a_folder_in_use_is_refused_until_its_process_has_died() {
 fn signals_save_first_and_the_end_is_the_same_to_the_bit() {
     let folder = folder("signals");
     let whole = folder.join("whole");
-    done(&training(&whole, "120"));
+    done(&training(&whole, "80"));
     for (signal, code) in [("-INT", 130), ("-TERM", 143), ("-HUP", 129)] {
         if ignored(code as u32 - 128) {
             println!("skipped: {signal} is ignored here");
             continue;
         }
         let run = folder.join(code.to_string());
-        let child = start(&training(&run, "120"));
+        let child = start(&training(&run, "80"));
         wait_for(&run.join("train.jsonl"));
         let (ended, said) = stopped(child, signal);
         assert_eq!(ended, code, "{said}");
@@ -153,7 +153,7 @@ fn a_second_signal_ends_at_once_and_leaves_the_last_checkpoint() {
 fn what_the_program_was_started_to_ignore_stays_ignored() {
     let run = folder("nohup").join("run");
     let mut command = Command::new("nohup");
-    let child = command.arg(env!("CARGO_BIN_EXE_xtask")).args(training(&run, "120"));
+    let child = command.arg(env!("CARGO_BIN_EXE_xtask")).args(training(&run, "80"));
     let mut child = child.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
     wait_for(&run.join("train.jsonl"));
     assert!(Command::new("kill").args(["-HUP", &child.id().to_string()]).status().unwrap().success());
@@ -165,7 +165,7 @@ fn what_the_program_was_started_to_ignore_stays_ignored() {
 #[test]
 fn a_periodic_save_that_fails_is_tried_again() {
     let run = folder("save-again").join("run");
-    let child = start(&[training(&run, "400"), vec!["--checkpoint-every", "0.01"]].concat());
+    let child = start(&[training(&run, "150"), vec!["--checkpoint-every", "0.01"]].concat());
     let checkpoint = run.join("checkpoint.safetensors");
     wait_for(&checkpoint);
     while std::fs::remove_file(&checkpoint).and_then(|()| std::fs::create_dir(&checkpoint)).is_err() {}

@@ -1,7 +1,7 @@
 //! A stand-in for a baked person: the posed prior in mean vertex colours, a few texels a face.
 
 use glam::{Affine3A, Vec2, Vec3};
-use occnerf::bake::{Atlas, Avatar, Clip, motion_of_bones, skeleton, turn_upright};
+use occnerf::bake::{Atlas, Avatar, Clip, motion_of_bones, turn_upright};
 use occnerf::capture::Light;
 use occnerf::{PriorColors, Scene, upright};
 use volrender::Camera;
@@ -17,7 +17,7 @@ pub fn stand_in(scene: &Scene, colors: &PriorColors) -> Avatar {
     let world = Affine3A::from_mat3(turn_upright(up) * metres);
     let model = &body.model;
     let rest: Vec<Vec3> = body.canonical.joints.iter().map(|&joint| joint * metres).collect();
-    let skeleton = skeleton(&model.parents, &rest);
+    let skeleton = smpl::skeleton(smpl::BoneNames::Smpl, &model.parents, &rest);
     let frames: Vec<Vec<Affine3A>> = scene
         .train
         .iter()

@@ -14,12 +14,7 @@ fn skeleton() -> (Vec<Joint>, f32) {
     let body = BodyModel::embedded();
     let shaped = body.shaped(&[]);
     let sole = shaped.vertices.iter().map(|v| v.y).fold(f32::INFINITY, f32::min);
-    let names = BoneNames::Smpl.of_body(24).into_iter().zip(&body.parents).zip(shaped.joints);
-    let joint = |((name, parent), rest): ((String, &Option<usize>), Vec3)| {
-        let parent = parent.map(|p| p as u16);
-        Joint { name, parent, rest }
-    };
-    (names.map(joint).collect(), sole)
+    (smpl::skeleton(BoneNames::Smpl, &body.parents, &shaped.joints), sole)
 }
 
 /// The recorded walk with errors of joint rotations, smooth in time: three waves an axis with periods of

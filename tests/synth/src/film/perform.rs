@@ -109,7 +109,6 @@ fn sample(clip: &MotionClip, seconds: f32, joints: usize) -> (Vec<Vec3>, Vec3) {
 /// What the skeleton lacks by name.
 pub(super) fn driven(clip: &MotionClip, frames: usize, skeleton: &[Joint]) -> Result<Vec<Vec<Affine3A>>, CaptureError> {
     let body = BodyModel::embedded();
-    let human = BoneNames::Smpl.of_body(joint::COUNT).into_iter().zip(&body.parents).zip(body.shaped(&[]).joints);
     let (mut poses, mut trans) = (Vec::new(), Vec::new());
     for i in 0..frames {
         let (pose, translation) = sample(clip, seconds(clip.duration(), i, frames), joint::COUNT);
@@ -117,7 +116,7 @@ pub(super) fn driven(clip: &MotionClip, frames: usize, skeleton: &[Joint]) -> Re
         trans.push(translation);
     }
     let source = Bvh {
-        skeleton: human.map(|((name, parent), rest)| Joint { name, parent: parent.map(|p| p as u16), rest }).collect(),
+        skeleton: smpl::skeleton(BoneNames::Smpl, &body.parents, &body.shaped(&[]).joints),
         motion: MotionClip { poses, num_joints: joint::COUNT, trans, fps: clip.fps },
         unit: "m",
     };
@@ -140,10 +139,7 @@ mod tests {
     fn the_skeleton_that_a_clip_was_made_for_follows_it() {
         let body = BodyModel::embedded();
         let human = body.shaped(&[]);
-        let names = BoneNames::Smpl.of_body(joint::COUNT).into_iter().zip(&body.parents);
-        let mut skeleton: Vec<Joint> = (names.zip(&human.joints))
-            .map(|((name, parent), &rest)| Joint { name, parent: parent.map(|p| p as u16), rest })
-            .collect();
+        let mut skeleton = smpl::skeleton(BoneNames::Smpl, &body.parents, &human.joints);
         let mut poses = vec![Vec3::ZERO; 2 * joint::COUNT];
         for (j, pose) in poses.iter_mut().enumerate() {
             let j = j as f32;
