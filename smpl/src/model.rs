@@ -151,7 +151,8 @@ impl BodyModel {
         }
         for (i, &parent) in self.parents.iter().enumerate().skip(1) {
             if parent.is_none_or(|p| p >= i) {
-                let message = format!("parent of joint {i} is {parent:?}, expected a joint before it");
+                let found = parent.map_or("none".to_owned(), |parent| parent.to_string());
+                let message = format!("parent of joint {i} is {found}, expected a joint before it");
                 return invalid("kintree_table", message);
             }
         }

@@ -22,8 +22,10 @@ impl BodyModel {
     ///
     /// let path = std::env::temp_dir().join("smpl_save_example.safetensors");
     /// let body = BodyModel::embedded();
-    /// body.save(&path).unwrap();
-    /// assert_eq!(BodyModel::load(&path).unwrap(), body);
+    /// body.save(&path)?;
+    /// assert_eq!(BodyModel::load(&path)?, body);
+    /// # std::fs::remove_file(&path).unwrap();
+    /// # Ok::<(), smpl::Error>(())
     /// ```
     ///
     /// The header says `format: smpl-body 1`. Tensors: `v_template` (V,3), `f` (F,3), `shapedirs`

@@ -44,10 +44,13 @@ pub trait Number: Copy {
     /// Its type in a file.
     const DTYPE: Dtype;
 
-    /// Reads it from its bytes.
+    /// Reads it from its bytes, little-endian.
+    ///
+    /// # Panics
+    /// Unless there are as many bytes as the number has.
     fn read(bytes: &[u8]) -> Self;
 
-    /// Writes its bytes.
+    /// Writes its bytes, little-endian.
     ///
     /// # Errors
     /// Those of `to`.
@@ -113,7 +116,8 @@ impl fmt::Debug for Tensor<'_> {
     }
 }
 
-/// Replaces the file at `path` as [`replace_file`](crate::replace_file) does. Equal contents are
+/// Writes tensors as safetensors, with `header` as its metadata, and replaces the file at `path` as
+/// [`replace_file`](crate::replace_file) does. Equal contents are
 /// equal files.
 ///
 /// # Errors

@@ -81,7 +81,7 @@ impl<'a> MotionFrame<'a> {
 pub struct SurfacePoint {
     /// The face.
     pub face: u32,
-    /// Barycentric coordinates on it.
+    /// Barycentric coordinates on it, which sum to 1.
     pub barycentric: [f32; 3],
     /// Distance from the surface to the query, outside positive.
     pub signed_distance: f32,
@@ -135,10 +135,7 @@ impl MotionField {
         nearest: impl FnOnce() -> Option<SurfacePoint>,
     ) -> Option<MotionSample> {
         match self {
-            Self::Surface(surface) => {
-                let SurfacePoint { face, barycentric, signed_distance } = nearest()?;
-                surface.map(frame.model, frame.posed, point, face, barycentric, signed_distance)
-            }
+            Self::Surface(surface) => surface.map(frame, point, nearest()?),
             Self::Volume { weights, threshold } => weights.map(&frame.to_canonical, point, *threshold),
         }
     }

@@ -2,9 +2,8 @@
 
 use glam::Vec3;
 
-use super::MotionSample;
-use crate::model::BodyModel;
-use crate::pose::{Posed, blend};
+use super::{MotionFrame, MotionSample, SurfacePoint};
+use crate::pose::blend;
 
 /// Motion field whose weights are those of the nearest point of the posed surface.
 ///
@@ -39,9 +38,8 @@ impl SurfaceMotion {
     /// rigid bones in equal parts reach it at a relative turn of 154°.
     pub const MIN_DETERMINANT: f32 = 0.05;
 
-    /// Maps `point`, whose nearest surface point lies on `face` at `barycentric` and is
-    /// `signed_distance` away (outside positive): x̂ = (Σ w_i A_i)⁻¹ x − B_P, with weights w and
-    /// pose offset B_P interpolated on the face.
+    /// Maps `point`, whose nearest surface point is `nearest`: x̂ = (Σ w_i A_i)⁻¹ x − B_P, with weights
+    /// w and pose offset B_P interpolated on the face.
     ///
     /// `None` (dead) where the likelihood is 0, and for anything not finite.
     ///
@@ -49,16 +47,10 @@ impl SurfaceMotion {
     /// touching limbs), and where a fold is so sharp that one bone takes over.
     ///
     /// # Panics
-    /// If `face` is not a face of `model`, or `posed` is not of it.
-    pub fn map(
-        &self,
-        model: &BodyModel,
-        posed: &Posed,
-        point: Vec3,
-        face: u32,
-        barycentric: [f32; 3],
-        signed_distance: f32,
-    ) -> Option<MotionSample> {
+    /// If `nearest` is not on a face of the frame's body.
+    pub fn map(&self, frame: &MotionFrame<'_>, point: Vec3, nearest: SurfacePoint) -> Option<MotionSample> {
+        let MotionFrame { model, posed, .. } = *frame;
+        let SurfacePoint { face, barycentric, signed_distance } = nearest;
         let likelihood = self.likelihood(signed_distance);
         if likelihood.is_nan() || likelihood <= 0.0 {
             return None;

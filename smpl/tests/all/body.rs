@@ -4,7 +4,7 @@ use std::sync::LazyLock;
 
 use glam::{Affine3A, Quat, Vec3};
 use proptest::prelude::*;
-use smpl::{BodyModel, Placement, Posed, SparseRows, SurfaceMotion, rodrigues};
+use smpl::{BodyModel, MotionFrame, Placement, Posed, SparseRows, SurfaceMotion, SurfacePoint, rodrigues};
 use testkit::strategy::{rotation, vec3};
 
 static BODY: LazyLock<BodyModel> = LazyLock::new(BodyModel::embedded);
@@ -109,7 +109,8 @@ proptest! {
         let blended = bones().fold(glam::Mat3A::ZERO, |sum, (joint, w)| sum + posed.bones[joint].matrix3 * w);
         // One bone takes over below: not an inverse, but still a finite point.
         prop_assume!(blended.determinant() > 0.06);
-        let sample = SurfaceMotion::default().map(&BODY, &posed, point, face as u32, barycentric, 0.0).unwrap();
+        let nearest = SurfacePoint { face: face as u32, barycentric, signed_distance: 0.0 };
+        let sample = SurfaceMotion::default().map(&MotionFrame::new(&BODY, &posed), point, nearest).unwrap();
         prop_assert_eq!(sample.likelihood, 1.0);
         let error = sample.canonical.distance(rest);
         prop_assert!(error < 1e-4, "{}", error);
@@ -189,8 +190,9 @@ fn likelihood_is_one_inside_then_falls_smoothly_to_zero() {
 fn dead_and_broken_samples_are_none() {
     let shaped = BODY.shaped(&[]);
     let posed = BODY.pose(&shaped, &[Vec3::ZERO; 24], Placement::default());
-    let field = SurfaceMotion::default();
-    let map = |p, d| field.map(&BODY, &posed, p, 0, [1.0, 0.0, 0.0], d);
+    let (field, frame) = (SurfaceMotion::default(), MotionFrame::new(&BODY, &posed));
+    let nearest = |signed_distance| SurfacePoint { face: 0, barycentric: [1.0, 0.0, 0.0], signed_distance };
+    let map = |p, d| field.map(&frame, p, nearest(d));
     assert!(map(Vec3::ZERO, 0.0).is_some());
     assert!(map(Vec3::ZERO, 0.11).is_none());
     assert!(map(Vec3::ZERO, f32::NAN).is_none());
@@ -204,12 +206,12 @@ fn a_fold_gives_finite_points_of_the_heaviest_bone() {
     let mut pose = vec![Vec3::ZERO; 24];
     pose[18] = Quat::from_rotation_y(-3.1).to_scaled_axis();
     let posed = BODY.pose(&shaped, &pose, Placement::default());
-    let mut folded = 0;
+    let (frame, mut folded) = (MotionFrame::new(&BODY, &posed), 0);
     for (i, face) in BODY.faces.iter().enumerate() {
         let v = face[0] as usize;
         folded += usize::from(determinant(&posed, v) < 0.05);
-        let sample =
-            SurfaceMotion::default().map(&BODY, &posed, posed.vertices[v], i as u32, [1.0, 0.0, 0.0], 0.0).unwrap();
+        let nearest = SurfacePoint { face: i as u32, barycentric: [1.0, 0.0, 0.0], signed_distance: 0.0 };
+        let sample = SurfaceMotion::default().map(&frame, posed.vertices[v], nearest).unwrap();
         assert!(sample.canonical.distance(shaped.vertices[v]) < 0.15);
     }
     assert!(folded > 0, "the fold reaches no vertex: the test tests nothing");
