@@ -107,7 +107,7 @@ pub fn fit(scene: &Scene) -> Result<(Avatar, BakeReport), Error> {
         anchor.terms().map(|(v, w)| w * scene.clothes.get(v as usize).copied().unwrap_or_default()).sum()
     };
     let dressed: Vec<f32> = relief.mesh.anchors.iter().map(clothes).collect();
-    let heights = displacements(scene, colors.light, &relief.mesh, &relief.feet, &dressed)?;
+    let heights = displacements(scene, &relief.mesh, &relief.feet, &dressed)?;
     let paint = |texels: &[Texel]| {
         let colour = |texel: &Texel| colors.at(texel.parent, relief.barycentric(texel, faces)).truncate();
         texels.par_iter().map(colour).collect()

@@ -5,10 +5,9 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, Error, Result, anyhow, bail, ensure};
 use clap::{Args, ValueEnum};
 use indicatif::{ProgressBar, ProgressStyle};
-use occnerf::bake::skeleton;
 use occnerf::capture::Layout;
 use rigged::Character;
-use smpl::{BodyModel, Bvh, MotionClip};
+use smpl::{BodyModel, BoneNames, Bvh, MotionClip, skeleton};
 use synth::{BODY, Obstacle, Occlusion, Outfit, SynthConfig, Synthetic, synthesise};
 
 use crate::obstacle::ObstacleArguments;
@@ -262,7 +261,7 @@ fn load_motion(path: &Path) -> Result<MotionClip> {
         return Ok(MotionClip::load(path)?);
     }
     let body = BodyModel::embedded();
-    let motion = Bvh::load(path)?.onto(&skeleton(&body.parents, &body.shaped(&[]).joints));
+    let motion = Bvh::load(path)?.onto(&skeleton(BoneNames::Smpl, &body.parents, &body.shaped(&[]).joints));
     motion.map_err(|fault| anyhow!("{}: {fault}", path.display()))
 }
 

@@ -28,8 +28,8 @@ impl Colors {
         let sums = albedo(seen(), vertices, light);
         let albedo = sums.iter().zip(counts).map(|(&(sum, squares), n)| (sum / squares.max(f32::MIN_POSITIVE), n));
         let mut colors = Self { albedo: albedo.collect(), light, noise: 1.0 };
-        if let Some(noise) = noise(seen().filter_map(|seen| colors.residual(seen))) {
-            colors.noise = noise;
+        if let Some(noise) = deviation(seen().filter_map(|seen| colors.residual(seen))) {
+            colors.noise = noise.max(NOISE);
         }
         colors
     }
@@ -45,11 +45,6 @@ impl Colors {
         let turn = self.light.change(*normal).cross(*normal);
         self.albedo[*vertex as usize].0.to_array().map(|albedo| albedo * turn)
     }
-}
-
-/// Robust standard deviation of colour residuals, at least [`NOISE`]; `None` for no residuals.
-pub(crate) fn noise(residuals: impl Iterator<Item = Vec3>) -> Option<f32> {
-    Some(deviation(residuals)?.max(NOISE))
 }
 
 /// Scaled median absolute deviation of colour residuals; `None` for no residuals.

@@ -116,8 +116,8 @@ impl<'a> Equations<'a> {
 
     /// Adds the residuals of key points.
     pub fn add_keypoints(&mut self, frame: &FramePoints<'_>, detector: &DetectorModel) {
-        for PointResidual { joint, place, residual, gradients, weight } in detector.residuals(frame) {
-            self.surface.fixed(joint, place, &mut self.jacobian);
+        for PointResidual { joint, residual, gradients, weight } in detector.residuals(frame) {
+            self.surface.fixed(joint, frame.posed.joints[joint], &mut self.jacobian);
             self.by_globals(|posed| posed.joints[joint]);
             let rows = gradients.into_iter().zip(residual.to_array());
             rows.for_each(|(gradient, residual)| self.add(weight, residual, gradient, Vec3::ZERO));

@@ -31,7 +31,7 @@ use smpl::{BodyModel, Placement, Posed, Shaped};
 use volrender::{Aabb, Camera};
 
 use self::colors::Colors;
-pub(crate) use self::colors::{deviation, noise, robust};
+pub(crate) use self::colors::{deviation, robust};
 use self::corrections::{Correction, corrected};
 pub(crate) use self::crop::Crop;
 use self::equations::{BETA_STEP, Equations, Perspective};
@@ -236,7 +236,7 @@ impl<'a> Registration<'a> {
             Some(FramePoints { camera, points: &this.keypoints[f], posed: &bodies[f].posed })
         };
         let all: Vec<FramePoints<'_>> = (0..bodies.len()).filter_map(points).collect();
-        let mut detector = DetectorModel::measure(&all, this.model.num_joints(), this.unit);
+        let mut detector = DetectorModel::measure(&all);
         detector.width = 1.0 + (WIDTH - 1.0) * (options.reach - REACH[1]) / (REACH[0] - REACH[1]);
         let mut normals: Vec<NormalEquations> = (0..this.frames.len())
             .into_par_iter()

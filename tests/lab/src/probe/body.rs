@@ -2,8 +2,11 @@
 
 use anyhow::{Context, Result, bail, ensure};
 use glam::Vec3;
-use smpl::{BodyModel, MotionSample, Placement, Posed, SurfaceMotion, WeightVolume, WeightVolumeConfig};
-use surface_query::MeshDistance;
+use smpl::{
+    BodyModel, MotionFrame, MotionSample, Placement, Posed, SurfaceMotion, SurfacePoint, WeightVolume,
+    WeightVolumeConfig,
+};
+use surface_query::{Closest, MeshDistance};
 
 use super::input::{Input, vec3s};
 use super::output::{Output, count};
@@ -58,10 +61,10 @@ pub fn motion(mut input: Input, model: &BodyModel, output: &mut Output) -> Resul
         points.iter().map(|&x| volume.map(&to_canonical, x, VOLUME_THRESHOLD)).collect()
     } else {
         let mesh = MeshDistance::new(&posed.vertices, &model.faces).context("the posed body")?;
-        let motion = SurfaceMotion::default();
+        let (motion, frame) = (SurfaceMotion::default(), MotionFrame::new(model, &posed));
         let map = |x| {
-            let near = mesh.closest(x);
-            motion.map(model, &posed, x, near.face, near.barycentric, near.signed_distance)
+            let Closest { face, barycentric, signed_distance, .. } = mesh.closest(x);
+            motion.map(&frame, x, SurfacePoint { face, barycentric, signed_distance })
         };
         points.iter().map(|&x| map(x)).collect()
     };
