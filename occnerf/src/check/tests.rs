@@ -353,12 +353,12 @@ fn table(every: usize) {
 
 #[test]
 fn each_mistake_is_found() {
-    table(12);
+    table(6);
 }
 
 /// Every mistake on every capture: minutes.
 #[test]
-#[ignore = "minutes; a twelfth of it is in each_mistake_is_found"]
+#[ignore = "minutes; a sixth of it is in each_mistake_is_found"]
 fn each_mistake_is_found_on_each_capture() {
     table(1);
 }

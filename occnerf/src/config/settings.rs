@@ -169,7 +169,7 @@ pub struct EncodingConfig {
     /// Cells an axis of the finest level.
     pub n_max: u32,
     /// Lower clamp of d, normalised metres. A wide interval makes cells long in d, along which
-    /// appearance hardly changes, and leaves more of the table to the surface.
+    /// appearance changes little, and leaves more of the table to the surface.
     pub distance_min: f32,
     /// Upper clamp of d, normalised metres.
     pub distance_max: f32,

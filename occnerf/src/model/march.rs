@@ -18,7 +18,7 @@ pub(crate) struct MarchOptions {
 }
 
 impl MarchOptions {
-    /// Segments for training: the samples across a surface. Where hardly any ray terminates, longer
+    /// Segments for training: the samples across a surface. Where few rays terminate, longer
     /// segments make larger batches, which read a table larger than the cache faster.
     pub fn training(min_transmittance: f32) -> Self {
         Self { segment: if min_transmittance < 1e-6 { 24 } else { 6 }, min_transmittance }

@@ -83,7 +83,7 @@ pub(crate) fn read_limited(reader: impl Read, expected: usize, limit: u64) -> io
 }
 
 /// Bytes that `packed` compressed bytes may expand to: 256 times as many and 64 MiB, at most
-/// [`MAX_FILE_BYTES`]. Measurements hardly compress; runs of zeros do a thousandfold.
+/// [`MAX_FILE_BYTES`]. Measurements compress little; runs of zeros do a thousandfold.
 pub(crate) fn unpacked_limit(packed: u64) -> u64 {
     packed.saturating_mul(256).saturating_add(64 << 20).min(MAX_FILE_BYTES)
 }

@@ -11,7 +11,7 @@ use crate::photograph::{Shot, fray};
 use capture::{Capture, CaptureError, Frame, Keypoint};
 use volrender::RandomStream;
 
-/// Coefficients that are wrong at most: what follows hardly changes the body.
+/// Number of corrupted coefficients; later ones change the body little.
 const BETAS: usize = 10;
 const SHAPE: u64 = 0x5348_4150;
 const DEPTH: u64 = 0x4445_5054;

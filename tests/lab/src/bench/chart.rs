@@ -19,7 +19,7 @@ use xtask::scale::{Scale, number};
 const FONT: &str = "sans-serif";
 /// Mean width of a letter as a share of its height.
 const LETTER: f64 = 0.56;
-/// PNGs are drawn so much larger and reduced, for smooth edges.
+/// Factor by which PNGs are drawn larger before they are reduced, for smooth edges.
 const OVERSAMPLING: i32 = 2;
 /// Height of the title and of each legend row, and sizes of text, in pixels.
 const TITLE: i32 = 34;

@@ -36,7 +36,7 @@ fn every_format_is_written_and_trained_on() {
     assert_eq!(files(&place), 3, "nothing else is left beside them");
 }
 
-/// C libraries differ in the last bits of sines: numbers by so much, and hardly any pixel at all.
+/// C libraries differ in the last bits of sines: so do numbers, and few pixels.
 const ROUNDING: f32 = 1e-5;
 
 #[test]
