@@ -1,5 +1,6 @@
 //! A person as a skinned, textured mesh: baked from a trained field, or fitted to the frames.
 
+mod agreement;
 mod avatar;
 mod charts;
 mod displacement;

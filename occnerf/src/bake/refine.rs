@@ -3,6 +3,7 @@
 use glam::{UVec2, Vec2, Vec3};
 use visibility::{Pixel, RasterOptions, Rasterizer, Samples};
 
+use super::agreement::Shown;
 use super::avatar::{Atlas, Avatar};
 use super::draw::{BakedRenderer, BilinearCorner, color, look};
 use crate::Error;
@@ -17,8 +18,12 @@ use crate::scene::seen::depth_inside;
 /// Regularisation of a texel towards its colour before, in pixels.
 const PRIOR: f32 = 0.3;
 
-/// How many times stronger it is where frames disagree.
-const DOUBT: f32 = 4.0;
+/// Parts of the video, which belong to one half of the frames and the other in turn: neighbouring frames
+/// have the same errors of registration.
+const BLOCKS: usize = 8;
+
+/// Least weight of a texel in either half for their agreement, in pixels.
+const EVIDENCE: f32 = 0.05;
 
 /// Most sampled training pixels.
 const MAX_PIXELS: usize = 1 << 19;
@@ -53,59 +58,82 @@ pub(super) fn refine(scene: &Scene, light: Light, avatar: &mut Avatar, passes: u
     let stride = frames.iter().map(|f| f.labels.num_subject()).sum::<usize>().div_ceil(MAX_PIXELS).max(1);
     let mut renderer = BakedRenderer::new(avatar, scene.body.scale, light, Samples::Four);
     let (_, reliability) = scene.lighting()?;
-    let mut all = Vec::new();
-    for frame in frames {
-        all.extend(equations(avatar, &mut renderer, frame, stride, reliability)?);
+    let mut halves = [Vec::new(), Vec::new()];
+    for (f, frame) in frames.iter().enumerate() {
+        let half = &mut halves[f * BLOCKS / frames.len() % 2];
+        half.extend(equations(avatar, &mut renderer, frame, stride, reliability)?);
     }
     let Atlas { rgb, width, .. } = &mut avatar.atlas;
     let mut values: Vec<Vec3> = rgb.as_chunks::<3>().0.iter().copied().map(color).collect();
-    let errors = solve(&all, *width as usize, &mut values, passes, reliability.disagreement);
+    let errors = solve(&mut values, halves, *width as usize, passes, reliability.disagreement);
     for (texel, value) in rgb.as_chunks_mut::<3>().0.iter_mut().zip(&values) {
         *texel = value.clamp(Vec3::ZERO, Vec3::ONE).to_array().map(|x| (x * 255.0 + 0.5) as u8);
     }
     Ok(errors)
 }
 
-/// Jacobi steps on the texels' `values` (H · W). By the share of `disagreement` of the frames, residuals
-/// are weighted robustly, steps smoothed and colours before trusted more: least squares would paint the
-/// differences, background in the masks among them, as a moiré.
-fn solve(all: &[PixelEquation], width: usize, values: &mut [Vec3], passes: u32, disagreement: f32) -> [f64; 2] {
-    let start = values.to_vec();
-    let spread = deviation(all.iter().map(|equation| equation.residual(&start))).unwrap_or(0.0);
-    let prior = PRIOR * (1.0 + (DOUBT - 1.0) * disagreement);
+/// Jacobi steps on the texels' `values` (H · W) for the equations of two halves of the frames, whose details
+/// count as far as the halves agree. Residuals are weighted robustly by the share of `disagreement` of the
+/// frames.
+fn solve(
+    values: &mut [Vec3],
+    halves: [Vec<PixelEquation>; 2],
+    width: usize,
+    passes: u32,
+    disagreement: f32,
+) -> [f64; 2] {
+    let [first, second] = &halves;
+    let estimate = |equations: &[&[PixelEquation]]| jacobi(values, equations, passes, disagreement);
+    let (whole, (a, b)) =
+        rayon::join(|| estimate(&[first, second]), || rayon::join(|| estimate(&[first]), || estimate(&[second])));
+    let shown = Shown::new(width, [&a.weights, &b.weights], EVIDENCE);
+    let update = |estimate: &Estimate| -> Vec<Vec3> {
+        shown.texels.iter().map(|&i| estimate.values[i as usize] - values[i as usize]).collect()
+    };
+    let shrunk = shown.shrunk(&update(&whole), [&update(&a), &update(&b)]);
+    let mut out = whole.values;
+    shown.texels.iter().zip(shrunk).for_each(|(&i, update)| out[i as usize] = values[i as usize] + update);
+    values.copy_from_slice(&out);
+    whole.errors
+}
+
+/// A texture fitted to frames.
+struct Estimate {
+    /// (H · W)
+    values: Vec<Vec3>,
+    /// Sum of the trusted weights of each texel.
+    weights: Vec<f32>,
+    /// Mean squared error before the first step and before the last.
+    errors: [f64; 2],
+}
+
+fn jacobi(start: &[Vec3], equations: &[&[PixelEquation]], passes: u32, disagreement: f32) -> Estimate {
+    let all = || equations.iter().copied().flatten();
+    let mut values = start.to_vec();
+    let spread = deviation(all().map(|equation| equation.residual(start))).unwrap_or(0.0);
     let mut errors = [0.0; 2];
+    let mut weights = vec![0.0f32; start.len()];
     for pass in 0..passes {
-        let mut sums = vec![(Vec3::ZERO, 0.0f32); values.len()];
-        let mut error = 0.0;
-        for equation in all {
-            let residual = equation.residual(values);
+        let mut sums = vec![Vec3::ZERO; start.len()];
+        weights.fill(0.0);
+        let (mut error, mut count) = (0.0, 0usize);
+        for equation in all() {
+            let residual = equation.residual(&values);
             let squared = residual.length_squared();
-            error += f64::from(squared) / 3.0;
+            (error, count) = (error + f64::from(squared) / 3.0, count + 1);
             let doubt = 1.0 - robust(squared, 2.0 * spread.max(f32::MIN_POSITIVE));
             let trust = equation.trust * (1.0 - disagreement * doubt);
             for (i, weight) in equation.texels() {
-                sums[i].0 += trust * weight * residual;
-                sums[i].1 += trust * weight;
+                sums[i] += trust * weight * residual;
+                weights[i] += trust * weight;
             }
         }
-        errors[usize::from(pass > 0)] = error / all.len().max(1) as f64;
-        smooth(&mut sums, width, disagreement);
-        for ((value, (sum, weight)), start) in values.iter_mut().zip(sums).zip(&start) {
-            *value += (sum + prior * (start - *value)) / (weight + prior);
+        errors[usize::from(pass > 0)] = error / count.max(1) as f64;
+        for (((value, sum), weight), start) in values.iter_mut().zip(sums).zip(&weights).zip(start) {
+            *value += (sum + PRIOR * (start - *value)) / (weight + PRIOR);
         }
     }
-    errors
-}
-
-/// Binomial filter [1 2 1] / 4 along both axes of an atlas, in the part `share`.
-fn smooth(sums: &mut [(Vec3, f32)], width: usize, share: f32) {
-    for stride in [1, width] {
-        let before = sums.to_vec();
-        for (sum, near) in sums.iter_mut().skip(stride).zip(before.windows(2 * stride + 1)) {
-            let (a, b, c) = (near[0], near[stride], near[2 * stride]);
-            *sum = (b.0 + 0.25 * share * (a.0 - 2.0 * b.0 + c.0), b.1 + 0.25 * share * (a.1 - 2.0 * b.1 + c.1));
-        }
-    }
+    Estimate { values, weights, errors }
 }
 
 /// Equations of the fully covered subject pixels of a frame.
@@ -174,6 +202,7 @@ fn lookup(avatar: &Avatar, place: Vec2, share: f32) -> Lookup {
 mod tests {
     use super::*;
     use proptest::prelude::*;
+    use volrender::RandomStream;
 
     fn seen(texel: u32, colour: Vec3) -> PixelEquation {
         PixelEquation { colour, lookups: vec![([texel; 4], [0.25; 4])], trust: 1.0 }
@@ -187,22 +216,29 @@ mod tests {
         ) {
             let mut values = vec![Vec3::splat(start); 25];
             let all: Vec<PixelEquation> = off.iter().map(|off| seen(12, Vec3::splat(start + off))).collect();
-            let errors = solve(&all, 5, &mut values, 1, 0.0);
+            let errors = solve(&mut values, [all, Vec::new()], 5, 1, 0.0);
             let expected = start + off.iter().sum::<f32>() / (off.len() as f32 + PRIOR);
             prop_assert!((values[12].x - expected).abs() < 1e-5, "{} {expected}", values[12]);
             prop_assert!(errors[0] < 1e-5 && values.iter().enumerate().all(|(i, v)| i == 12 || v.x == start));
         }
+    }
 
-        /// The filter keeps sums that lie off the border, and does not go below zero.
-        #[test]
-        fn smoothing_keeps_the_sum(at in 0usize..9, share in 0.0f32..1.0) {
-            let mut sums = vec![(Vec3::ZERO, 0.0); 49];
-            sums[(at / 3 + 2) * 7 + at % 3 + 2] = (Vec3::ONE, 2.0);
-            smooth(&mut sums, 7, share);
-            prop_assert!((sums.iter().map(|sum| sum.1).sum::<f32>() - 2.0).abs() < 1e-5);
-            prop_assert!((sums.iter().map(|sum| sum.0).sum::<Vec3>() - Vec3::ONE).abs().max_element() < 1e-5);
-            prop_assert!(sums.iter().all(|sum| sum.1 >= 0.0));
-        }
+    /// Each frame shows streaks of its own.
+    #[test]
+    fn streaks_that_differ_between_frames_vanish() {
+        const SIDE: usize = 48;
+        let streaks = |f: usize| {
+            let mut stream = RandomStream::new(&[f as u64]);
+            let tone: Vec<f32> = (0..SIDE).map(|_| 0.5 + 0.1 * stream.normal()).collect();
+            (0..SIDE * SIDE).map(move |i| seen(i as u32, Vec3::splat(tone[i % SIDE])))
+        };
+        let halves = [0, 1].map(|half| (0..4).flat_map(|f| streaks(2 * f + half)).collect::<Vec<_>>());
+        let mut values = vec![Vec3::splat(0.5); SIDE * SIDE];
+        let roughness =
+            |values: &[Vec3]| (1..values.len()).map(|i| (values[i].x - values[i - 1].x).powi(2)).sum::<f32>();
+        let least_squares = jacobi(&values, &[&halves[0], &halves[1]], 4, 0.0).values;
+        solve(&mut values, halves, SIDE, 4, 0.0);
+        assert!(roughness(&values) < 0.3 * roughness(&least_squares));
     }
 
     #[test]
@@ -214,8 +250,7 @@ mod tests {
             let background = texel == 27 && frame == 0;
             all.push(seen(texel as u32, Vec3::splat(if background { 3.0 } else { of_person })));
         }
-        let mut values = vec![Vec3::splat(0.4); 64];
-        solve(&all, 8, &mut values, 4, 1.0);
+        let values = jacobi(&[Vec3::splat(0.4); 64], &[&all], 4, 1.0).values;
         let mean = (0..8).map(|f| if f == 0 { 3.0 } else { 0.4 + noise(27, f) }).sum::<f32>() / 8.0;
         assert!((values[27].x - 0.4).abs() < 0.5 * (mean - 0.4), "{} for {mean}", values[27]);
     }
