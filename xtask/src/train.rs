@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, Error, Result, bail, ensure};
 use clap::Args;
 use occnerf::bake::fit;
-use occnerf::capture::Capture;
+use occnerf::capture::{Capture, Mending};
 use occnerf::{Config, Lpips, Method, Person, Scene, Trainer, checkpoint_config};
 
 use crate::auto;
@@ -162,13 +162,20 @@ pub fn scene_name(scene: Option<&str>) -> String {
     name.chars().map(|c| if c.is_alphanumeric() || c == '_' { c } else { '-' }).collect()
 }
 
+/// Least share of background in masks that is worth a word.
+const LEAST_BACKGROUND: f32 = 0.01;
+
 /// What was made of the masks, and of the focal length if it is more than the noise of one that is
 /// right.
 fn say_corrections(source: &Source, scene: &Scene) {
-    match scene.registered.growth {
+    let Mending { growth, background } = scene.registered.mending;
+    match growth {
         0 => {}
         by if by < 0 => say!("masks: {} pixels larger than the person all around, trimmed", -by),
         by => say!("masks: {by} pixels smaller than the person all around, grown"),
+    }
+    if background >= LEAST_BACKGROUND {
+        say!("masks: {:.1} % of their pixels look like the background beside them, left out", 100.0 * background);
     }
     let focal = |capture: &Capture| capture.train.first().map_or(1.0, |frame| frame.camera.focal.x);
     let (given, found) = (focal(&source.capture), focal(&scene.registered.capture));

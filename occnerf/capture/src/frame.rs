@@ -76,14 +76,23 @@ pub struct Capture {
 pub struct Mended {
     /// The capture.
     pub capture: Capture,
+    /// What was changed.
+    pub mending: Mending,
+}
+
+/// Corrections of the masks of a capture's training frames.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Mending {
     /// Pixels by which the masks were dilated; eroded where negative.
     pub growth: i32,
+    /// Share of the masks that was removed as background.
+    pub background: f32,
 }
 
 impl From<Capture> for Mended {
     /// Takes the masks as they are.
     fn from(capture: Capture) -> Self {
-        Self { capture, growth: 0 }
+        Self { capture, mending: Mending::default() }
     }
 }
 
@@ -95,8 +104,8 @@ pub struct Registered {
     /// Registered offset of clothes and hair along each vertex normal, in the capture's units; empty
     /// where unknown.
     pub clothes: Vec<f32>,
-    /// [`Mended::growth`].
-    pub growth: i32,
+    /// [`Mended::mending`].
+    pub mending: Mending,
     /// How far the fingers of the left and of the right hand are rolled up, 0 to 1.
     pub fists: [f32; 2],
 }
@@ -104,6 +113,6 @@ pub struct Registered {
 impl From<Capture> for Registered {
     /// Takes masks and bodies as they are.
     fn from(capture: Capture) -> Self {
-        Self { capture, clothes: Vec::new(), growth: 0, fists: [0.0; 2] }
+        Self { capture, clothes: Vec::new(), mending: Mending::default(), fists: [0.0; 2] }
     }
 }

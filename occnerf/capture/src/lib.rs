@@ -34,7 +34,7 @@ pub use self::checks::MAX_BETA;
 pub use self::decode::PIXEL_BYTES;
 pub use self::error::CaptureError;
 pub use self::find::{Layout, find_body, own_body};
-pub use self::frame::{Capture, EvalFrame, Frame, Keypoint, Mended, Registered};
+pub use self::frame::{Capture, EvalFrame, Frame, Keypoint, Mended, Mending, Registered};
 pub use self::image::{Image, MAX_SIDE};
 pub use self::import::{ImportOptions, Imported, Tool, import};
 pub use self::light::Light;

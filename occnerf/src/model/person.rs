@@ -115,7 +115,7 @@ impl Person {
     /// # Errors
     /// [`Error::Io`], [`Error::Array`] and [`Error::File`] for a file that is damaged, or of other frames.
     pub fn restore(run: &Path, mended: Mended, model: &BodyModel) -> Result<Option<Registered>, Error> {
-        let (path, Mended { mut capture, growth }) = (run.join(PERSON), mended);
+        let (path, Mended { mut capture, mending }) = (run.join(PERSON), mended);
         if !path.is_file() {
             return Ok(None);
         }
@@ -153,7 +153,7 @@ impl Person {
         let Aabb { min, max } = Aabb::from_points(&model.v_template);
         below(&contents, "clothes", &clothes, (max - min).length())?;
         // The run's body has them.
-        Ok(Some(Registered { capture, clothes, growth, fists: [0.0; 2] }))
+        Ok(Some(Registered { capture, clothes, mending, fists: [0.0; 2] }))
     }
 
     /// Reads the files that [`Person::save`] wrote into the directory `run`.

@@ -1,4 +1,5 @@
-//! Correction of masks that are dilated or eroded by a constant number of pixels.
+//! Correction of masks that are dilated or eroded by a constant number of pixels, or have background at
+//! their rims.
 //!
 //! The person's outline is the level set of the distance to the mask's edge with the largest mean
 //! colour gradient over all frames. Level sets outside the mask need the unmasked photograph, which
@@ -9,9 +10,10 @@ use rayon::prelude::*;
 use smpl::BodyModel;
 
 use crate::Error;
-use crate::capture::{Capture, Frame, Mended, Pixels};
+use crate::capture::{Capture, Frame, Mended, Mending, Pixels};
 use crate::config::OccludedRule;
 use crate::model::view::PosedView;
+use crate::scene::background::background;
 use crate::scene::labels::{Label, label_pixels, squared_distance};
 
 /// Most sampled frames.
@@ -37,19 +39,43 @@ const PASSES: usize = 3;
 /// Largest distance of grown pixels from the body, metres.
 const NEAR: f32 = 0.1;
 
-/// Erodes or dilates the masks of the training frames to the person's outline.
+/// Erodes or dilates the masks of the training frames to the person's outline, and removes background at
+/// their rims.
 ///
 /// # Errors
 /// Pictures that cannot be read.
 pub fn mend_masks(mut capture: Capture, model: &BodyModel) -> Result<Mended, Error> {
-    let growth = match excess(&capture.train)? {
-        0 => extend(&mut capture, model)?,
+    let growth = resize(&mut capture, model)?;
+    let background = leave_out_background(&mut capture)?;
+    Ok(Mended { capture, mending: Mending { growth, background } })
+}
+
+/// Erodes or dilates the masks to the person's outline; by how many pixels they grow.
+fn resize(capture: &mut Capture, model: &BodyModel) -> Result<i32, Error> {
+    match excess(&capture.train)? {
+        0 => extend(capture, model),
         excess => {
             capture.train.iter_mut().for_each(|frame| frame.source.edit(move |pixels| pixels.grow(-excess)));
-            -excess
+            Ok(-excess)
         }
+    }
+}
+
+/// Removes pixels from the masks that look like the background beside them; their share of the masks.
+fn leave_out_background(capture: &mut Capture) -> Result<f32, Error> {
+    let of_frame = |frame: &mut Frame| -> Result<[usize; 2], Error> {
+        let Some(photograph) = frame.source.photograph().transpose()? else { return Ok([0; 2]) };
+        let pixels = frame.pixels()?;
+        let found = background(&pixels, &photograph);
+        let counts = [found.len(), pixels.mask.iter().filter(|&&m| m > 0.5).count()];
+        if !found.is_empty() {
+            frame.source.edit(move |pixels| found.iter().for_each(|&i| pixels.cover(i, 0.0)));
+        }
+        Ok(counts)
     };
-    Ok(Mended { capture, growth })
+    let counts: Vec<[usize; 2]> = capture.train.par_iter_mut().map(of_frame).collect::<Result<_, _>>()?;
+    let [found, all] = [0, 1].map(|k| counts.iter().map(|count| count[k]).sum::<usize>());
+    Ok(found as f32 / all.max(1) as f32)
 }
 
 /// Number of pixels by which the masks are too large; 0 where no level set stands out, or the gradient
@@ -239,7 +265,7 @@ mod tests {
             noise.apply(&mut capture, &body).unwrap();
             let found = excess(&capture.train).unwrap();
             let corrupted = area(&capture);
-            let Mended { capture, .. } = mend_masks(capture, &body).unwrap();
+            resize(&mut capture, &body).unwrap();
             println!("{mask_pixels} {ragged_pixels}: {found}");
             if mask_pixels < 2 {
                 // Those that are too small grow.
@@ -251,6 +277,9 @@ mod tests {
                 assert!(left < 0.4 * was, "{mask_pixels}: {left} of {was}");
             }
         }
+        // Little of a person looks like the background.
+        let background = leave_out_background(&mut given.clone()).unwrap();
+        assert!(background < 0.005, "{background}");
     }
 
     /// Separable binomial blur of variance `passes` / 2.
@@ -329,7 +358,8 @@ mod tests {
         let body = BodyModel::embedded();
         let (_directory, mut capture) = on_disk("masks-occluder", 192, Layout::Wild);
         Perturbation { mask_pixels: -2, ..Perturbation::NONE }.apply(&mut capture, &body).unwrap();
-        let grown_capture = mend_masks(capture.clone(), &body).unwrap().capture;
+        let mut grown_capture = capture.clone();
+        resize(&mut grown_capture, &body).unwrap();
         let mut grown = 0;
         for (frame, small) in grown_capture.train.iter().zip(&capture.train) {
             let (frame, small) = (frame.pixels().unwrap(), small.pixels().unwrap());

@@ -1,7 +1,8 @@
 //! A capture made ready: normalised lengths, the prior registered, posed bodies, labelled pixels,
 //! colours of the prior and the light on it.
 
-pub(crate) mod colors;
+mod background;
+mod colors;
 pub(crate) mod labels;
 pub(crate) mod light;
 pub(crate) mod masks;

@@ -116,7 +116,7 @@ struct Registration<'a> {
 /// # Errors
 /// [`Error::Scene`] for a body of more than 512 joints; pictures that cannot be read.
 pub fn register(mended: Mended, model: &BodyModel, rounds: usize) -> Result<Registered, Error> {
-    let Mended { mut capture, growth } = mended;
+    let Mended { mut capture, mending } = mended;
     let joints = model.num_joints();
     if joints > MOST_JOINTS {
         let other = "`registration.rounds` of 0 leaves the prior as it is";
@@ -167,7 +167,7 @@ pub fn register(mended: Mended, model: &BodyModel, rounds: usize) -> Result<Regi
             view.frame.betas.clone_from(betas);
         }
     }
-    Ok(Registered { capture, clothes, growth, fists })
+    Ok(Registered { capture, clothes, mending, fists })
 }
 
 impl<'a> Registration<'a> {
