@@ -20,7 +20,7 @@ const PRIOR: f32 = 0.3;
 
 /// Parts of the video, which belong to one half of the frames and the other in turn: neighbouring frames
 /// have the same errors of registration.
-const BLOCKS: usize = 8;
+const BLOCKS: usize = 32;
 
 /// Least weight of a texel in either half for their agreement, in pixels.
 const EVIDENCE: f32 = 0.05;
@@ -58,9 +58,9 @@ pub(super) fn refine(scene: &Scene, light: Light, avatar: &mut Avatar, passes: u
     let stride = frames.iter().map(|f| f.labels.num_subject()).sum::<usize>().div_ceil(MAX_PIXELS).max(1);
     let mut renderer = BakedRenderer::new(avatar, scene.body.scale, light, Samples::Four);
     let (_, reliability) = scene.lighting()?;
-    let mut halves = [Vec::new(), Vec::new()];
+    let (blocks, mut halves) = (BLOCKS.min(frames.len()), [Vec::new(), Vec::new()]);
     for (f, frame) in frames.iter().enumerate() {
-        let half = &mut halves[f * BLOCKS / frames.len() % 2];
+        let half = &mut halves[f * blocks / frames.len() % 2];
         half.extend(equations(avatar, &mut renderer, frame, stride, reliability)?);
     }
     let Atlas { rgb, width, .. } = &mut avatar.atlas;
