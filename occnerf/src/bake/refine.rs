@@ -76,7 +76,7 @@ pub(super) fn refine(scene: &Scene, light: Light, avatar: &mut Avatar, passes: u
 /// count as far as the halves agree. Residuals are weighted robustly by the share of `disagreement` of the
 /// frames.
 fn solve(
-    values: &mut [Vec3],
+    values: &mut Vec<Vec3>,
     halves: [Vec<PixelEquation>; 2],
     width: usize,
     passes: u32,
@@ -91,9 +91,8 @@ fn solve(
         shown.texels.iter().map(|&i| estimate.values[i as usize] - values[i as usize]).collect()
     };
     let shrunk = shown.shrunk(&update(&whole), [&update(&a), &update(&b)]);
-    let mut out = whole.values;
-    shown.texels.iter().zip(shrunk).for_each(|(&i, update)| out[i as usize] = values[i as usize] + update);
-    values.copy_from_slice(&out);
+    let start = std::mem::replace(values, whole.values);
+    shown.texels.iter().zip(shrunk).for_each(|(&i, update)| values[i as usize] = start[i as usize] + update);
     whole.errors
 }
 
@@ -107,6 +106,7 @@ struct Estimate {
     errors: [f64; 2],
 }
 
+/// Regularised least squares of the texels from `start` (H · W).
 fn jacobi(start: &[Vec3], equations: &[&[PixelEquation]], passes: u32, disagreement: f32) -> Estimate {
     let all = || equations.iter().copied().flatten();
     let mut values = start.to_vec();

@@ -16,15 +16,14 @@ const ALIKE: f32 = 0.1;
 const NEARER: f32 = 0.3;
 
 /// Pixels of a mask with the mean colour of the background beside them, unlike the person's deeper inside,
-/// that such pixels join to the background.
-pub(super) fn background(pixels: &Pixels, photograph: &Image) -> Vec<usize> {
+/// that such pixels join to the background. `outside`: known background, beside pixels of the mask.
+pub(super) fn background(pixels: &Pixels, photograph: &Image, mut outside: Vec<bool>) -> Vec<usize> {
     let (width, height) = (photograph.width as usize, photograph.height as usize);
     let inside: Vec<bool> = pixels.mask.iter().map(|&m| m > 0.5).collect();
     let is_row = |y: &usize| inside[y * width..][..width].contains(&true);
     let rows = (0..height).rev().find(is_row).zip((0..height).find(is_row)).map_or(0, |(last, first)| last - first);
     let rim = ((rows as f32 * RIM).round() as usize).max(LEAST_RIM);
-    let is_occluder = |i: usize| pixels.occluder.as_ref().is_some_and(|occluder| occluder[i]);
-    let outside: Vec<bool> = (0..inside.len()).map(|i| !inside[i] && !is_occluder(i)).collect();
+    outside.iter_mut().zip(&inside).for_each(|(outside, inside)| *outside &= !inside);
     let depth = squared_distance(&inside.iter().map(|i| !i).collect::<Vec<_>>(), width);
     let color = |i: usize| Vec3::from_slice(&photograph.pixels[3 * i..]);
     let around = Means::new([width, height], |i| outside[i].then(|| color(i)));
@@ -140,24 +139,22 @@ mod tests {
         fn wall_in_the_mask_is_found_and_nothing_else(seed in any::<u64>(), noise in 0.0f32..0.015) {
             let is_strip = |x: usize, y: usize| (62..68).contains(&x) && (30..50).contains(&y);
             let (pixels, photograph) = scene(noise, seed, is_strip);
-            let found = background(&pixels, &photograph);
+            let found = background(&pixels, &photograph, vec![true; SIDE * SIDE]);
             let is_wall = |i: usize| (i % SIDE) as f32 - 40.0 > 0.0
                 && is_strip(i % SIDE, i / SIDE)
                 && ((i % SIDE) as f32 - 40.0).hypot((i / SIDE) as f32 - 40.0) >= 25.0;
             prop_assert!(found.iter().all(|&i| is_wall(i)));
             let strip = (0..SIDE * SIDE).filter(|&i| is_wall(i)).count();
             prop_assert!(found.len() > strip / 2, "{} of {strip}", found.len());
-            prop_assert!(background(&scene(noise, seed, |_, _| false).0, &photograph).is_empty());
+            prop_assert!(background(&scene(noise, seed, |_, _| false).0, &photograph, vec![true; SIDE * SIDE]).is_empty());
         }
     }
 
     #[test]
-    fn an_occluder_is_no_background_and_an_empty_mask_has_none() {
+    fn without_known_background_and_without_a_mask_there_is_none() {
         let (mut pixels, photograph) = scene(0.0, 1, |x, y| (62..68).contains(&x) && (30..50).contains(&y));
-        pixels.occluder = Some(pixels.mask.iter().map(|&m| m < 0.5).collect());
-        assert!(background(&pixels, &photograph).is_empty());
+        assert!(background(&pixels, &photograph, vec![false; SIDE * SIDE]).is_empty());
         pixels.mask.fill(0.0);
-        pixels.occluder = None;
-        assert!(background(&pixels, &photograph).is_empty());
+        assert!(background(&pixels, &photograph, vec![true; SIDE * SIDE]).is_empty());
     }
 }

@@ -46,7 +46,7 @@ const NEAR: f32 = 0.1;
 /// Pictures that cannot be read.
 pub fn mend_masks(mut capture: Capture, model: &BodyModel) -> Result<Mended, Error> {
     let growth = resize(&mut capture, model)?;
-    let background = leave_out_background(&mut capture)?;
+    let background = leave_out_background(&mut capture, model)?;
     Ok(Mended { capture, mending: Mending { growth, background } })
 }
 
@@ -61,12 +61,14 @@ fn resize(capture: &mut Capture, model: &BodyModel) -> Result<i32, Error> {
     }
 }
 
-/// Removes pixels from the masks that look like the background beside them; their share of the masks.
-fn leave_out_background(capture: &mut Capture) -> Result<f32, Error> {
+/// Removes pixels from the masks that look like the background beside them, which is where neither the person
+/// nor an occluder may be; their share of the masks.
+fn leave_out_background(capture: &mut Capture, model: &BodyModel) -> Result<f32, Error> {
     let of_frame = |frame: &mut Frame| -> Result<[usize; 2], Error> {
         let Some(photograph) = frame.source.photograph().transpose()? else { return Ok([0; 2]) };
         let pixels = frame.pixels()?;
-        let found = background(&pixels, &photograph);
+        let outside = free(frame, &pixels, model, 0, f32::INFINITY)?;
+        let found = background(&pixels, &photograph, outside);
         let counts = [found.len(), pixels.mask.iter().filter(|&&m| m > 0.5).count()];
         if !found.is_empty() {
             frame.source.edit(move |pixels| found.iter().for_each(|&i| pixels.cover(i, 0.0)));
@@ -278,7 +280,7 @@ mod tests {
             }
         }
         // Little of a person looks like the background.
-        let background = leave_out_background(&mut given.clone()).unwrap();
+        let background = leave_out_background(&mut given.clone(), &body).unwrap();
         assert!(background < 0.005, "{background}");
     }
 
@@ -351,6 +353,17 @@ mod tests {
                 assert!(found == 0 && left == was, "{mask_pixels} {ragged_pixels}: {found}");
             }
         }
+    }
+
+    /// The photograph shows the person behind a simulated obstacle.
+    #[test]
+    fn what_is_hidden_is_no_background() {
+        let body = BodyModel::embedded();
+        let (_directory, mut capture) = on_disk("masks-hidden", 192, Layout::HumanNerf);
+        for frame in &mut capture.train {
+            frame.source.hide(crate::capture::Area { columns: 0..96, rows: 0..192 });
+        }
+        assert_eq!(leave_out_background(&mut capture, &body).unwrap(), 0.0);
     }
 
     #[test]
