@@ -9,7 +9,15 @@ const JOINTS: usize = 24;
 const WRISTS: [usize; 2] = [20, 21];
 const HANDS: [usize; 2] = [22, 23];
 /// Radius about which the fingers of a fist roll, relative to the distance from wrist to hand.
-const RADIUS: f32 = 0.3;
+const RADIUS: f32 = 0.2;
+/// Distance of the palm's edge, where the thumb begins, before the middle of the hand, relative to that.
+const EDGE: f32 = 0.45;
+/// Share of their distance from the hand's middle by which the fingers of a fist close up, and where beyond the
+/// knuckles they do in full.
+const CLOSED: f32 = 0.3;
+const SPREAD: f32 = 0.3;
+/// Distance beyond the knuckles from which drooping fingers are kept outside the axis of the roll.
+const KNUCKLES: f32 = 0.1;
 
 impl BodyModel {
     /// Joints of the left and right wrist; none of a body without SMPL's joints.
@@ -18,27 +26,39 @@ impl BodyModel {
         (self.num_joints() == JOINTS).then_some(WRISTS)
     }
 
-    /// Vertices of the left and of the right hand with their distances beyond the knuckles along the
-    /// fingers, relative to that from wrist to hand; negative on the palm. None of a body without SMPL's
-    /// joints.
+    /// Vertices of the left and of the right hand with their distances beyond the knuckles along the fingers, or
+    /// beyond the palm's edge along the thumb, relative to that from wrist to hand; negative on the palm. None of
+    /// a body without SMPL's joints.
     #[must_use]
     pub fn hands(&self) -> [Vec<(usize, f32)>; 2] {
+        let along = |(v, along, thumb): (usize, f32, f32)| (v, if thumb > 0.0 { thumb } else { along });
+        self.fingers().map(|hand| hand.into_iter().map(along).collect())
+    }
+
+    /// Vertices of each hand, distances beyond the knuckles, and of the thumb beyond the palm's edge, as
+    /// [`BodyModel::hands`] has them.
+    fn fingers(&self) -> [Vec<(usize, f32, f32)>; 2] {
         if self.num_joints() != JOINTS {
             return Default::default();
         }
         let joints = self.shaped(&[]).joints;
         [0, 1].map(|side| {
             let (knuckles, palm) = (joints[HANDS[side]], joints[HANDS[side]] - joints[WRISTS[side]]);
-            let along = |v: usize| (self.v_template[v] - knuckles).dot(palm) / palm.length_squared();
+            let aside = Vec3::Z.reject_from(palm).normalize_or(Vec3::Z);
+            let place = |v: usize| {
+                let (way, length) = (self.v_template[v] - knuckles, palm.length());
+                let along = way.dot(palm) / (length * length);
+                (v, along, if along > 0.0 { 0.0 } else { (way.dot(aside) / length - EDGE).max(0.0) })
+            };
             let of_hand = |(joint, weight): (usize, f32)| {
                 if joint == WRISTS[side] || joint == HANDS[side] { weight } else { 0.0 }
             };
-            let is_hand = |v: &usize| self.weights.row(*v).map(of_hand).sum::<f32>() > 0.5 && along(*v) > -1.0;
-            (0..self.num_vertices()).filter(is_hand).map(|v| (v, along(v))).collect()
+            let is_hand = |v: &usize| self.weights.row(*v).map(of_hand).sum::<f32>() > 0.5;
+            (0..self.num_vertices()).filter(is_hand).map(place).filter(|(_, along, _)| *along > -1.0).collect()
         })
     }
 
-    /// The body with the fingers of its left and right hand rolled up, by 0 (flat, as they are) to 1 (a
+    /// The body with the fingers and thumb of its left and right hand rolled up, by 0 (flat, as they are) to 1 (a
     /// fist). The palms of the rest pose look down, as SMPL's do.
     ///
     /// ```
@@ -52,16 +72,23 @@ impl BodyModel {
         let mut body = self.clone();
         let joints = self.shaped(&[]).joints;
         let is_fist = |(side, hand): &(usize, Vec<_>)| curls[*side] > 0.0 && !hand.is_empty();
-        for (side, vertices) in self.hands().into_iter().enumerate().filter(is_fist) {
+        for (side, vertices) in self.fingers().into_iter().enumerate().filter(is_fist) {
             let palm = joints[HANDS[side]] - joints[WRISTS[side]];
             let (fingers, length) = (palm.normalize_or(Vec3::X), palm.length());
+            let aside = Vec3::Z.reject_from_normalized(fingers).normalize_or(Vec3::Z);
             let up = Vec3::Y.reject_from_normalized(fingers).normalize_or(Vec3::Y);
             let radius = RADIUS * length / curls[side];
-            for (v, along) in vertices.into_iter().filter(|(_, along)| *along > 0.0) {
-                let along = along * length;
-                let (angle, from_axis) = (along / radius, radius + (body.v_template[v] - joints[HANDS[side]]).dot(up));
-                let (x, y) = (from_axis * angle.sin() - along, from_axis * angle.cos() - from_axis);
-                body.v_template[v] += x * fingers + y * up;
+            // The thumb rolls about the fingers' direction, the fingers about the thumb's.
+            for (v, along, thumb) in vertices.into_iter().filter(|(_, along, thumb)| *along > 0.0 || *thumb > 0.0) {
+                let (relative, onward) = if thumb > 0.0 { (thumb, aside) } else { (along, fingers) };
+                let (along, way) = (relative * length, body.v_template[v] - joints[HANDS[side]]);
+                let (angle, height) = (along / radius, way.dot(up));
+                // Drooping fingers stay outside the axis, else they would be inside out; knuckles stay as they are.
+                let outside = radius * ((height.min(0.0) / radius).exp() - 1.0) - height.min(0.0);
+                let from_axis = radius + height + (relative / KNUCKLES).min(1.0) * outside;
+                let (x, y) = (from_axis * angle.sin() - along, from_axis * angle.cos() - radius - height);
+                let closer = if thumb > 0.0 { 0.0 } else { CLOSED * curls[side] * (relative / SPREAD).min(1.0) };
+                body.v_template[v] += x * onward + y * up - closer * way.dot(aside) * aside;
             }
         }
         body

@@ -9,6 +9,7 @@ use super::draw::{BakedRenderer, BilinearCorner, color, look};
 use crate::Error;
 use crate::capture::Light;
 use crate::model::view::pinhole;
+use crate::scene::hands::{HandColor, is_arm, near_hands};
 use crate::scene::labels::Label;
 use crate::scene::prepared::{PreparedFrame, Scene};
 use crate::scene::registration::{deviation, robust};
@@ -57,11 +58,16 @@ pub(super) fn refine(scene: &Scene, light: Light, avatar: &mut Avatar, passes: u
     let frames = &scene.train;
     let stride = frames.iter().map(|f| f.labels.num_subject()).sum::<usize>().div_ceil(MAX_PIXELS).max(1);
     let mut renderer = BakedRenderer::new(avatar, scene.body.scale, light, Samples::Four);
-    let (_, reliability) = scene.lighting()?;
+    let (_, reliability, hands) = scene.lighting()?;
+    let arms: Vec<bool> = (avatar.joints.iter().zip(&avatar.weights))
+        .map(|(joints, weights)| is_arm(joints.iter().map(|&joint| usize::from(joint)).zip(*weights)))
+        .collect();
     let (blocks, mut halves) = (BLOCKS.min(frames.len()), [Vec::new(), Vec::new()]);
     for (f, frame) in frames.iter().enumerate() {
         let half = &mut halves[f * blocks / frames.len() % 2];
-        half.extend(equations(avatar, &mut renderer, frame, stride, reliability)?);
+        let near = || near_hands(&scene.body.model, &frame.view);
+        let hands = hands.as_ref().map(|color| Hands { color, arms: &arms, near: near() });
+        half.extend(equations(avatar, &mut renderer, frame, stride, (reliability, hands.as_ref()))?);
     }
     let Atlas { rgb, width, .. } = &mut avatar.atlas;
     let mut values: Vec<Vec3> = rgb.as_chunks::<3>().0.iter().copied().map(color).collect();
@@ -136,13 +142,22 @@ fn jacobi(start: &[Vec3], equations: &[&[PixelEquation]], passes: u32, disagreem
     Estimate { values, weights, errors }
 }
 
+/// What tells a hand that the avatar has beside it.
+struct Hands<'a> {
+    color: &'a HandColor,
+    /// Vertices of forearms and hands, (V).
+    arms: &'a [bool],
+    /// Pixels near a hand, (H × W).
+    near: Vec<bool>,
+}
+
 /// Equations of the fully covered subject pixels of a frame.
 fn equations(
     avatar: &Avatar,
     renderer: &mut BakedRenderer<'_>,
     frame: &PreparedFrame,
     stride: usize,
-    reliability: &Reliability,
+    (reliability, hands): (&Reliability, Option<&Hands<'_>>),
 ) -> Result<Vec<PixelEquation>, Error> {
     let pixels = frame.pixels()?;
     let across = frame.view.camera.width as usize;
@@ -177,10 +192,18 @@ fn equations(
             return None;
         }
         let fragments = || pixel.samples.iter().flatten();
+        let color = Vec3::from_slice(&pixels.image.pixels[3 * i..]);
+        let is_hand_beside = |hands: &Hands<'_>| {
+            let is_arm = |face: u32| hands.arms[avatar.faces[face as usize][0] as usize];
+            hands.near[i] && hands.color.is_like(color) && !fragments().any(|fragment| is_arm(fragment.face))
+        };
+        if hands.is_some_and(is_hand_beside) {
+            return None;
+        }
         let share = 1.0 / count as f32;
         let brightness: f32 = fragments().map(|fragment| share * look(avatar, looks, fragment).z).sum();
         let lookups = fragments().map(|fragment| lookup(avatar, look(avatar, looks, fragment).truncate(), share));
-        let colour = Vec3::from_slice(&pixels.image.pixels[3 * i..]) / brightness;
+        let colour = color / brightness;
         let slant = fragments().map(|fragment| share * cosine(fragment.face)).sum();
         Some(PixelEquation { colour, lookups: lookups.collect(), trust: reliability.at(depth[i], slant) })
     };

@@ -201,7 +201,9 @@ pub(super) fn find(capture: &Capture, body: &BodyModel, views: &[View]) -> Resul
     let mut best: Option<(Mistake, f32)> = None;
     let pictures = SCALES.map(Mistake::Scaled).into_iter().chain([Mistake::PrincipalPoint, Mistake::Mirrored]);
     let usual = others.into_iter().chain(pictures).filter(|_| !tiny);
-    for mistake in usual.chain(focal).chain(wide.into_iter().filter(|_| tiny)) {
+    let all = usual.chain(focal).chain(wide.into_iter().filter(|_| tiny));
+    // No overlap exceeds 1.
+    for mistake in all.filter(|_| BETTER * given < 1.0) {
         let is_off = views.iter().any(|view| off_centre(&view.camera) > OFF_CENTRE);
         if mistake == Mistake::PrincipalPoint && !is_off {
             continue;

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use glam::Vec3;
+use glam::{Mat3A, Vec3};
 use smpl::{MotionField, SurfaceMotion, WeightVolume, WeightVolumeConfig};
 use visibility::VisibilityCounts;
 use volrender::{Occupancy, OccupancyConfig};
@@ -199,15 +199,59 @@ pub(crate) fn surface_motion(config: &MotionConfig) -> SurfaceMotion {
     SurfaceMotion { margin: config.margin, falloff: FALLOFF }
 }
 
-/// The axis of the world, and its sense, that is nearest to the mean direction from the pelvis to
-/// the head of the bodies of `views`.
+/// Tilt of a camera that is taken for level, radians: leaning persons are less upright.
+const LEVEL: f32 = 0.17;
+
+/// Upward direction of the world: its axis nearest to the mean direction from the feet to the head in `views`;
+/// where the world's axes are those of every camera, as in a video without cameras, that direction itself unless
+/// the camera is nearly level.
 pub fn upright<'a>(body: &Body, views: impl Iterator<Item = &'a PosedView>) -> Vec3 {
     let joints = &body.canonical.joints;
-    let head = (0..joints.len()).max_by(|&a, &b| joints[a].y.total_cmp(&joints[b].y)).unwrap_or(0);
-    let upward = |view: &PosedView| (view.posed.joints[head] - view.posed.joints[0]).normalize_or_zero();
-    let sum: Vec3 = views.map(upward).sum();
-    // Leaning averages out; every known layout has an upright axis.
+    let highest = |sign: f32| {
+        (0..joints.len()).max_by(|&a, &b| (sign * joints[a].y).total_cmp(&(sign * joints[b].y))).unwrap_or(0)
+    };
+    let (head, foot) = (highest(1.0), highest(-1.0));
+    let feet: Vec<usize> =
+        (0..joints.len()).filter(|&j| joints[j].y < 0.9 * joints[foot].y + 0.1 * joints[head].y).collect();
+    let (mut sum, mut is_camera) = (Vec3::ZERO, true);
+    for PosedView { camera, posed, .. } in views {
+        let feet = feet.iter().map(|&j| posed.joints[j]).sum::<Vec3>() / feet.len().max(1) as f32;
+        sum += (posed.joints[head] - feet).normalize_or_zero();
+        is_camera &= camera.world_to_camera.matrix3.abs_diff_eq(Mat3A::IDENTITY, 1e-5);
+    }
+    // Leaning averages out; worlds of calibrated cameras have an upright axis.
     let axes = [Vec3::X, Vec3::Y, Vec3::Z].into_iter();
-    let axis = axes.max_by(|a, b| sum.dot(*a).abs().total_cmp(&sum.dot(*b).abs()));
-    axis.map_or(Vec3::Y, |a| a * sum.dot(a).signum())
+    let axis = axes.max_by(|a, b| sum.dot(*a).abs().total_cmp(&sum.dot(*b).abs())).unwrap_or(Vec3::Y);
+    let axis = axis * sum.dot(axis).signum();
+    if is_camera && sum.angle_between(axis) > LEVEL { sum.normalize_or(axis) } else { axis }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::{Method, Preset};
+    use glam::{Affine3A, Mat3, Quat, Vec2};
+    use smpl::{BodyModel, Placement};
+    use volrender::Camera;
+
+    #[test]
+    fn up_is_the_worlds_axis_or_in_the_cameras_world_the_bodys() {
+        let model = BodyModel::embedded();
+        let body = Body::new(&model, &[], &Config::preset(Preset::Fast, Method::Prior)).unwrap();
+        // Of a camera whose y points down and that looks down on the person.
+        let lean = Mat3::from_rotation_x(std::f32::consts::PI - 0.35);
+        let view = |camera: Mat3| {
+            let rotation = Quat::from_mat3(&(camera.transpose() * lean)).to_scaled_axis();
+            let placement = Placement::Origin { rotation, translation: Vec3::new(0.0, 0.0, 3.0) };
+            let posed = model.pose(&model.shaped(&[]), &vec![Vec3::ZERO; model.num_joints()], placement);
+            let world_to_camera = Affine3A::from_mat3(camera);
+            let (focal, centre) = (Vec2::splat(100.0), Vec2::splat(32.0));
+            PosedView::new(&Camera { focal, centre, world_to_camera, width: 64, height: 64 }, posed)
+        };
+        let own = upright(&body, [view(Mat3::IDENTITY)].iter());
+        assert!(own.angle_between(lean * Vec3::Y) < 0.05 && own.y < -0.9, "{own}");
+        let turned = Mat3::from_rotation_y(0.3);
+        assert_eq!(upright(&body, [view(Mat3::IDENTITY), view(turned)].iter()), Vec3::NEG_Y);
+        assert!(upright(&body, [].iter()).is_normalized());
+    }
 }

@@ -9,6 +9,7 @@ use crate::Error;
 use crate::model::colors::PriorColors;
 use crate::model::subdivide::{Subdivided, most_times, times_until};
 use crate::model::view::pixel_width;
+use crate::scene::hands::{is_arm, near_hands};
 use crate::scene::light::ColorObservation;
 use crate::scene::prepared::Scene;
 use crate::scene::unseen::complete;
@@ -34,7 +35,7 @@ impl PriorColors {
     /// Pictures that cannot be read.
     pub fn measure(scene: &Scene) -> Result<Self, Error> {
         let (prior, faces) = (&scene.body.canonical.vertices, &scene.body.model.faces);
-        let &(light, ref reliability) = scene.lighting()?;
+        let &(light, ref reliability, ref hands) = scene.lighting()?;
         let pixel = pixel_width(scene.train.iter().map(|frame| &*frame.view));
         let most = MOST.min(most_times(faces.len()));
         let times = pixel.map_or(0, |pixel| times_until(prior, faces, EDGE * pixel, most));
@@ -51,7 +52,18 @@ impl PriorColors {
                 let (size, shade) = (trust * cosine.max(SLANT), light.on(normal));
                 (v as usize, size * shade * color, size * shade * shade, trust)
             };
-            Ok(seen.iter().filter(|seen| seen.1 > scene.edge).map(term).collect())
+            let near = hands.as_ref().map(|hands| (hands, near_hands(&scene.body.model, view)));
+            let is_hand_beside = |v: u32, color: Vec3| {
+                let Some((_, near)) = near.as_ref().filter(|(hands, _)| hands.is_like(color)) else { return false };
+                let anchor = &mesh.anchors[v as usize];
+                let at = view.camera.project(anchor.mix(&view.posed.vertices));
+                let pixel = at.map(|at| at.y as usize * view.camera.width as usize + at.x as usize);
+                pixel.and_then(|pixel| near.get(pixel)).is_some_and(|near| *near)
+                    && !is_arm(scene.body.model.weights.row(anchor.corners[0] as usize))
+            };
+            let is_allowed =
+                |&&((v, color, _), depth): &&(ColorObservation, usize)| depth > scene.edge && !is_hand_beside(v, color);
+            Ok(seen.iter().filter(is_allowed).map(term).collect())
         };
         let mut sums = vec![(Vec3::ZERO, 0.0, 0.0); mesh.anchors.len()];
         for first in (0..scene.train.len()).step_by(TOGETHER) {

@@ -3,6 +3,7 @@
 
 mod background;
 mod colors;
+pub(crate) mod hands;
 pub(crate) mod labels;
 pub(crate) mod light;
 pub(crate) mod masks;

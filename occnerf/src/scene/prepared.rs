@@ -14,6 +14,7 @@ use crate::model::body::{Body, PosedFrame};
 use crate::model::colors::PriorColors;
 use crate::model::subdivide::Anchor;
 use crate::model::view::{PosedView, pinhole};
+use crate::scene::hands::HandColor;
 use crate::scene::labels::{Label, Labels, dilate, label_pixels};
 use crate::scene::light::{ColorObservation, measure_light};
 use crate::scene::masks::mend_masks;
@@ -84,7 +85,7 @@ pub struct Scene {
     /// Cache of [`Scene::colors`].
     pub(crate) colors: OnceLock<PriorColors>,
     /// Cache of [`Scene::lighting`].
-    pub(crate) lighting: OnceLock<(Light, Reliability)>,
+    pub(crate) lighting: OnceLock<(Light, Reliability, Option<HandColor>)>,
 }
 
 impl Scene {
@@ -167,11 +168,11 @@ impl Scene {
     }
 
     /// Light of the frames, measured on first use if the configuration asks for one or that of a resumed
-    /// run, and reliability of their colours under it.
+    /// run, reliability of their colours under it, and the colour of the hands.
     ///
     /// # Errors
     /// Pictures that cannot be read.
-    pub(crate) fn lighting(&self) -> Result<&(Light, Reliability), Error> {
+    pub(crate) fn lighting(&self) -> Result<&(Light, Reliability, Option<HandColor>), Error> {
         if let Some(lighting) = self.lighting.get() {
             return Ok(lighting);
         }
@@ -184,7 +185,8 @@ impl Scene {
         let views = self.train.iter().map(|frame| &frame.view);
         let views: Vec<(&[Vec3], Vec3)> =
             views.map(|view| (&view.posed.vertices[..], view.camera.centre_of_projection())).collect();
-        let measured = (light, Reliability::measure(&seen, &views, light));
+        let hands = HandColor::measure(&self.body.model, &seen);
+        let measured = (light, Reliability::measure(&seen, &views, light), hands);
         Ok(self.lighting.get_or_init(|| measured))
     }
 

@@ -1,14 +1,16 @@
 //! Colours of unobserved vertices by inverse distance weighting (Shepard 1968).
 //!
 //! Distances are anisotropic about the bone, since hems, belts, cuffs and stripes go around trunk and
-//! limbs more often than along them. Each unobserved piece chooses the anisotropy that predicts the
-//! observed vertices around it best, one along the bone by a margin.
+//! limbs more often than along them. The unobserved vertices of each joint choose the anisotropy that
+//! predicts the observed vertices around them best, one along the bone by a margin. Unseen hair takes
+//! the colours of hair.
 
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 
+use volrender::Aabb;
+
 use crate::model::body::Body;
-use crate::model::subdivide::neighbours;
 
 /// Length of a metre around the bone relative to one along it, where distances are anisotropic: shorter,
 /// or longer.
@@ -20,10 +22,14 @@ const SURE: f32 = 0.8;
 const RIM: f32 = 0.08;
 /// Most validation vertices of a piece.
 const MOST_HELD: usize = 1024;
-/// Least vertices of a piece; smaller ones are merged.
+/// Least vertices of a joint's piece that chooses.
 const FEW: usize = 16;
 /// Least distance of a limb's joint from the plane of symmetry, x = 0, metres of such a body.
 const ASIDE: f32 = 0.03;
+/// Angle of the nape from the whorl of the hair about the centre of the head, and the width of the ring about the
+/// whorl that gives unseen hair its colour, radians.
+const NAPE: f32 = 1.4;
+const RING: f32 = 0.35;
 
 /// Fills the `colors` (V) of the vertices of the canonical `body` that are not `seen` (V); grey
 /// where none is.
@@ -33,24 +39,72 @@ pub(crate) fn complete(body: &Body, colors: &mut [Vec3], seen: &[bool]) {
         colors.fill(Vec3::splat(0.5));
         return;
     }
-    let guesses = Guesses { vertices: &body.canonical.vertices, axes: axes(body), colors };
-    let complete = |region: &Vec<usize>| -> Vec<(usize, Vec3)> {
-        let around = guesses.choose(&known, region);
-        region.par_iter().map(|&v| (v, guesses.guess(v, &known, around))).collect()
+    let joints = strongest(body);
+    let guesses = Guesses::new(body, &joints, colors);
+    let (hair, shown) = hair(body, &joints, &known);
+    let unseen: Vec<usize> = (0..seen.len()).filter(|&v| !seen[v]).collect();
+    let choice = |joint: usize| {
+        let piece: Vec<usize> = unseen.iter().copied().filter(|&v| joints[v] == joint).collect();
+        if piece.len() < FEW { 1.0 } else { guesses.choose(&known, &piece) }
     };
-    let found: Vec<(usize, Vec3)> = regions(body, seen).iter().flat_map(complete).collect();
+    let choices: Vec<f32> = (0..body.model.num_joints()).map(choice).collect();
+    let guess = |&v: &usize| {
+        if hair[v] && !shown.is_empty() {
+            return (v, guesses.guess(v, &shown, 1.0));
+        }
+        // Choices are blended as joints are.
+        let mixed = |around: f32| {
+            let weights = body.model.weights.row(v).filter(|(joint, _)| choices[*joint] == around);
+            let weight: f32 = weights.map(|(_, weight)| weight).sum();
+            if weight > 0.0 { (weight * guesses.guess(v, &known, around), weight) } else { (Vec3::ZERO, 0.0) }
+        };
+        let mixed = [1.0, AROUND, ALONG].map(mixed);
+        let weight: f32 = mixed.iter().map(|mixed| mixed.1).sum();
+        (v, mixed.iter().map(|mixed| mixed.0).sum::<Vec3>() / weight)
+    };
+    let found: Vec<(usize, Vec3)> = unseen.par_iter().map(guess).collect();
     found.into_iter().for_each(|(v, color)| colors[v] = color);
+}
+
+/// Whether hair grows at each vertex (V) where a head has any, and the vertices of `known` from which its colour
+/// is taken: those nearest to the whorl, since hair, caps and bald heads go on from there.
+fn hair(body: &Body, joints: &[usize], known: &[usize]) -> (Vec<bool>, Vec<usize>) {
+    let (vertices, canonical) = (&body.canonical.vertices, &body.canonical.joints);
+    let head = (0..canonical.len()).max_by(|&a, &b| canonical[a].y.total_cmp(&canonical[b].y));
+    let of_head = |v: usize| Some(joints[v]) == head;
+    let skull =
+        Aabb::from_points(&(0..vertices.len()).filter(|&v| of_head(v)).map(|v| vertices[v]).collect::<Vec<_>>());
+    let whorl = Vec3::new(0.0, 1.0, -1.0);
+    let angle = |v: usize| (vertices[v] - 0.5 * (skull.min + skull.max)).angle_between(whorl);
+    let hair: Vec<bool> = (0..vertices.len()).map(|v| of_head(v) && angle(v) < NAPE).collect();
+    let shown: Vec<usize> = known.iter().copied().filter(|&v| hair[v]).collect();
+    let nearest = shown.iter().map(|&v| angle(v)).fold(f32::INFINITY, f32::min);
+    let shown = shown.into_iter().filter(|&v| angle(v) < nearest + RING).collect();
+    (hair, shown)
 }
 
 struct Guesses<'a> {
     vertices: &'a [Vec3],
+    /// Surface area of each vertex, (V).
+    areas: Vec<f64>,
     /// Unit direction of each vertex's bone, (V).
     axes: Vec<Vec3>,
     colors: &'a [Vec3],
 }
 
-impl Guesses<'_> {
-    /// Mean colour of the vertices `known`, weighted by distance⁻⁴.
+impl<'a> Guesses<'a> {
+    fn new(body: &'a Body, joints: &[usize], colors: &'a [Vec3]) -> Self {
+        let vertices = &body.canonical.vertices;
+        let mut areas = vec![1e-12; vertices.len()];
+        for corners in &body.model.faces {
+            let [a, b, c] = corners.map(|v| vertices[v as usize].as_dvec3());
+            let area = (b - a).cross(c - a).length() / 6.0;
+            corners.iter().for_each(|&v| areas[v as usize] += area);
+        }
+        Self { vertices, areas, axes: axes(body, joints), colors }
+    }
+
+    /// Mean colour of the vertices `known`, weighted by area and distance⁻⁴.
     fn guess(&self, v: usize, known: &[usize], around: f32) -> Vec3 {
         let (mut sum, mut weights) = (DVec3::ZERO, 0.0);
         for &k in known {
@@ -59,14 +113,14 @@ impl Guesses<'_> {
             let across = (way.length_squared() - along * along).max(0.0);
             // Vertices of a seam may coincide.
             let squared = f64::from(along * along + around * around * across).max(1e-12);
-            let weight = 1.0 / (squared * squared);
+            let weight = self.areas[k] / (squared * squared);
             sum += weight * self.colors[k].as_dvec3();
             weights += weight;
         }
         (sum / weights).as_vec3()
     }
 
-    /// Anisotropy of the piece `unseen`: [`AROUND`], [`ALONG`] or 1 (isotropic), by the error of predicting
+    /// Anisotropy of the vertices `unseen`: [`AROUND`], [`ALONG`] or 1 (isotropic), by the error of predicting
     /// the vertices of `known` around it from the others.
     fn choose(&self, known: &[usize], unseen: &[usize]) -> f32 {
         let is_near = |v: usize| unseen.iter().any(|&u| self.vertices[u].distance(self.vertices[v]) < RIM);
@@ -88,28 +142,9 @@ impl Guesses<'_> {
     }
 }
 
-/// Connected components of the vertices that are not `seen` (V); components of fewer than [`FEW`]
-/// vertices are merged.
-fn regions(body: &Body, seen: &[bool]) -> Vec<Vec<usize>> {
-    let next = neighbours(seen.len(), &body.model.faces);
-    let mut reached = seen.to_vec();
-    let (mut pieces, mut small) = (Vec::new(), Vec::new());
-    for first in 0..seen.len() {
-        let mut piece = Vec::new();
-        let mut open = if std::mem::replace(&mut reached[first], true) { Vec::new() } else { vec![first] };
-        while let Some(v) = open.pop() {
-            piece.push(v);
-            open.extend(next[v].iter().map(|&n| n as usize).filter(|&to| !std::mem::replace(&mut reached[to], true)));
-        }
-        if piece.len() < FEW { small.extend(piece) } else { pieces.push(piece) }
-    }
-    pieces.extend((!small.is_empty()).then_some(small));
-    pieces
-}
-
 /// Direction of the bone with the largest weight at each vertex, (V): upright in the trunk, along
 /// the limb in a limb.
-fn axes(body: &Body) -> Vec<Vec3> {
+fn axes(body: &Body, strongest: &[usize]) -> Vec<Vec3> {
     let (joints, parents) = (&body.canonical.joints, &body.model.parents);
     let is_aside = |j: usize| joints[j].x.abs() > ASIDE;
     let mut of_joints = vec![Vec3::Y; joints.len()];
@@ -120,8 +155,13 @@ fn axes(body: &Body) -> Vec<Vec3> {
         // A bone that begins in the trunk belongs to it.
         of_joints[j] = if is_aside(j) && is_aside(p) { bone.normalize_or(of_joints[p]) } else { of_joints[p] };
     }
-    let strongest = |v: usize| body.model.weights.row(v).reduce(|a, b| if b.1 > a.1 { b } else { a });
-    (0..body.canonical.vertices.len()).map(|v| strongest(v).map_or(Vec3::Y, |(j, _)| of_joints[j])).collect()
+    strongest.iter().map(|&j| of_joints[j]).collect()
+}
+
+/// Joint with the largest weight at each vertex, (V).
+fn strongest(body: &Body) -> Vec<usize> {
+    let strongest = |v| body.model.weights.row(v).reduce(|a, b| if b.1 > a.1 { b } else { a });
+    (0..body.canonical.vertices.len()).map(|v| strongest(v).map_or(0, |(joint, _)| joint)).collect()
 }
 
 #[cfg(test)]
@@ -151,7 +191,7 @@ mod tests {
         complete(&body, &mut colors, &seen);
         let known: Vec<usize> = (0..seen.len()).filter(|&v| seen[v]).collect();
         assert!(known.iter().all(|&v| colors[v] == truth[v]));
-        let smooth = Guesses { vertices, axes: axes(&body), colors: &truth };
+        let smooth = Guesses::new(&body, &strongest(&body), &truth);
         let mean = |of: &dyn Fn(usize) -> Vec3| {
             unseen.iter().map(|&v| (of(v).x - truth[v].x).abs()).sum::<f32>() / unseen.len() as f32
         };
@@ -167,19 +207,22 @@ mod tests {
     }
 
     #[test]
-    fn regions_are_apart_and_hold_every_vertex_that_was_not_seen_once() {
+    fn unseen_hair_is_as_the_hair_that_is_seen() {
         let body = body();
-        let vertices = &body.canonical.vertices;
-        let seen: Vec<bool> = vertices.iter().map(|v| v.x.abs() < 0.3).collect();
-        let regions = regions(&body, &seen);
-        assert!(regions.iter().filter(|region| region.len() >= FEW).count() >= 2);
-        let mut count = vec![0; seen.len()];
-        regions.iter().flatten().for_each(|&v| count[v] += 1);
-        assert!(count.iter().zip(&seen).all(|(count, seen)| *count == usize::from(!seen)));
-        // The two arms.
-        for region in regions.iter().filter(|region| region.len() >= FEW) {
-            assert!(region.iter().all(|&v| vertices[v].x > 0.0) || region.iter().all(|&v| vertices[v].x < 0.0));
-        }
+        let (vertices, joints) = (&body.canonical.vertices, strongest(&body));
+        let head = body.canonical.joints[15];
+        let of_hair = |v: Vec3| v.y > head.y + 0.08 || v.z < head.z - 0.03;
+        let seen: Vec<bool> = vertices.iter().map(|v| v.z > head.z).collect();
+        let truth: Vec<Vec3> =
+            vertices.iter().map(|v| if of_hair(*v) { Vec3::ZERO } else { Vec3::new(0.8, 0.6, 0.5) }).collect();
+        let mut colors = truth.clone();
+        complete(&body, &mut colors, &seen);
+        let back = |v: &usize| {
+            joints[*v] == 15 && !seen[*v] && vertices[*v].y > head.y + 0.06 && vertices[*v].z < head.z - 0.06
+        };
+        let back: Vec<usize> = (0..vertices.len()).filter(back).collect();
+        let dark = back.iter().filter(|&&v| colors[v].max_element() < 0.3).count();
+        assert!(back.len() > 20 && dark * 10 > back.len() * 8, "{dark} of {}", back.len());
     }
 
     #[test]
@@ -201,7 +244,7 @@ mod tests {
     #[test]
     fn bones_are_upright_in_trunk_and_legs_and_level_in_arms() {
         let body = body();
-        let axes = axes(&body);
+        let axes = axes(&body, &strongest(&body));
         let joints = &body.canonical.joints;
         let near = |place: Vec3| {
             let distance = |v: &usize| body.canonical.vertices[*v].distance_squared(place);

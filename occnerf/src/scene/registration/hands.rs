@@ -1,4 +1,4 @@
-//! Hands that are fists where the prior's are flat.
+//! Curl of the fingers, which the prior's flat hands lack.
 
 use glam::Vec3;
 use rayon::prelude::*;
@@ -7,9 +7,10 @@ use smpl::BodyModel;
 use crate::scene::registration::crop::Crop;
 
 /// Curls that are compared.
-const CURLS: [f32; 5] = [0.0, 0.25, 0.5, 0.75, 1.0];
-/// Share of the finger's vertices that a full curl has to bring into the masks.
-const WORTH: f32 = 0.15;
+const CURLS: [f32; 3] = [0.0, 0.5, 1.0];
+/// Curl of hands that no frames show, and the error of the fingers that a full curl has to gain.
+const RELAXED: f32 = 0.5;
+const WORTH: f32 = 0.1;
 /// A frame shows a hand with this share of the palm's vertices in the mask, and of the flat fingers' beside the
 /// rest of the body by more than this many pixels; least such frames.
 const SHOWN: f32 = 0.75;
@@ -17,8 +18,9 @@ const FREE: f32 = 0.7;
 const BESIDE: i32 = 2;
 const LEAST_FRAMES: usize = 5;
 
-/// How far the masks say that the fingers of each hand are rolled up, the same in all frames: flat fingers
-/// lie outside the masks of a fist. `posed` gives the vertices of a body in the frame of each of `crops`.
+/// Curl of the fingers of each hand, the same in all frames: flat fingers lie outside the masks of a fist, a fist
+/// leaves masks of flat fingers uncovered. A hand that too few frames show is as the other. `posed` gives the
+/// vertices of a body in the frame of each of `crops`.
 pub(super) fn curls(
     model: &BodyModel,
     crops: &[Option<Crop>],
@@ -29,55 +31,60 @@ pub(super) fn curls(
         return [0.0; 2];
     }
     let bodies = CURLS.map(|curl| model.with_fists([curl; 2]));
-    // Share of the fingers outside the mask, of each hand and curl.
-    let outside = |f: usize| -> Option<[[Option<f32>; CURLS.len()]; 2]> {
+    let errors = |f: usize| -> Option<[Option<[f32; CURLS.len()]>; 2]> {
         let crop = crops[f].as_ref()?;
         let posed = bodies.each_ref().map(|body| posed(body, f));
-        let share = |vertices: &[Vec3], hand: &[(usize, f32)], is_finger: bool| {
-            let part = || hand.iter().filter(|(_, along)| (*along > 0.0) == is_finger);
-            let covered = |&&(v, _): &&(usize, f32)| {
-                let at = crop.camera.project(vertices[v]).and_then(|at| crop.coverage_at(at.truncate()));
-                at.is_some_and(|coverage| coverage >= 0.5)
-            };
-            part().filter(covered).count() as f32 / part().count().max(1) as f32
-        };
-        Some(hands.each_ref().map(|hand| {
-            let is_free = free(crop, &posed[0], hand) >= FREE;
-            let shown = |vertices: &Vec<Vec3>| is_free && share(vertices, hand, false) >= SHOWN;
-            posed.each_ref().map(|vertices| shown(vertices).then(|| 1.0 - share(vertices, hand, true)))
-        }))
+        Some(hands.each_ref().map(|hand| errors(crop, &posed, hand)))
     };
-    let frames: Vec<_> = (0..crops.len()).into_par_iter().filter_map(outside).collect();
-    [0, 1].map(|side| {
-        let cost = |k: usize| -> f32 {
-            let shown: Vec<f32> = frames.iter().filter_map(|frame| frame[side][k]).collect();
-            if shown.len() < LEAST_FRAMES {
-                return f32::INFINITY;
-            }
-            shown.iter().sum::<f32>() / shown.len() as f32 + WORTH * CURLS[k]
-        };
+    let frames: Vec<_> = (0..crops.len()).into_par_iter().filter_map(errors).collect();
+    let curls = [0, 1].map(|side| {
+        let shown: Vec<[f32; CURLS.len()]> = frames.iter().filter_map(|frame| frame[side]).collect();
+        let cost = |k: usize| shown.iter().map(|frame| frame[k]).sum::<f32>() / shown.len() as f32 + WORTH * CURLS[k];
         let costs: Vec<f32> = (0..CURLS.len()).map(cost).collect();
         let best = (0..CURLS.len()).min_by(|&a, &b| costs[a].total_cmp(&costs[b])).unwrap_or(0);
-        CURLS[best]
-    })
+        (shown.len() >= LEAST_FRAMES).then_some(CURLS[best])
+    });
+    [0, 1].map(|side: usize| curls[side].or(curls[1 - side]).unwrap_or(RELAXED))
 }
 
-/// Share of a hand's fingers whose projections lie beside those of the rest of the body.
-fn free(crop: &Crop, vertices: &[Vec3], hand: &[(usize, f32)]) -> f32 {
-    let mut rest: Vec<bool> = vec![true; vertices.len()];
-    hand.iter().for_each(|&(v, _)| rest[v] = false);
+/// Error of each curl of a hand in a frame that shows it: the share of its fingers outside the mask, and of the
+/// flat ones inside the mask that it leaves uncovered. `posed` has the vertices of each curl's body.
+fn errors(crop: &Crop, posed: &[Vec<Vec3>; CURLS.len()], hand: &[(usize, f32)]) -> Option<[f32; CURLS.len()]> {
+    let pixel = |vertices: &[Vec3], v: usize| crop.camera.project(vertices[v]).and_then(|at| crop.pixel(at.truncate()));
+    let is_masked = |vertices: &[Vec3], v: usize| {
+        let at = crop.camera.project(vertices[v]);
+        at.and_then(|at| crop.coverage_at(at.truncate())).is_some_and(|coverage| coverage >= 0.5)
+    };
+    let share = |is_finger: bool, is_in: &dyn Fn(usize) -> bool| {
+        let part = || hand.iter().filter(|(_, along)| (*along > 0.0) == is_finger);
+        part().filter(|(v, _)| is_in(*v)).count() as f32 / part().count().max(1) as f32
+    };
+    let [flat, ..] = posed;
+    let mut is_rest = vec![true; flat.len()];
+    hand.iter().for_each(|&(v, _)| is_rest[v] = false);
+    let rest = splat(crop, BESIDE, (0..flat.len()).filter(|&v| is_rest[v]).filter_map(|v| pixel(flat, v)));
+    let free = share(true, &|v| pixel(flat, v).is_some_and(|at| !rest[at]));
+    if free < FREE || share(false, &|v| is_masked(flat, v)) < SHOWN {
+        return None;
+    }
+    Some(posed.each_ref().map(|vertices| {
+        let covered = splat(crop, 1, hand.iter().filter_map(|&(v, _)| pixel(vertices, v)));
+        let uncovered = |v| is_masked(flat, v) && pixel(flat, v).is_some_and(|at| !rest[at] && !covered[at]);
+        share(true, &|v| !is_masked(vertices, v)) + share(true, &uncovered)
+    }))
+}
+
+/// Pixels of a crop `within` pixels of some, (H × W).
+fn splat(crop: &Crop, within: i32, pixels: impl Iterator<Item = usize>) -> Vec<bool> {
     let (width, height) = (crop.camera.width as usize, crop.camera.height as usize);
-    let pixel = |v: usize| crop.camera.project(vertices[v]).and_then(|at| crop.pixel(at.truncate()));
     let mut taken = vec![false; width * height];
-    for at in (0..vertices.len()).filter(|&v| rest[v]).filter_map(pixel) {
-        for (dx, dy) in (-BESIDE..=BESIDE).flat_map(|dy| (-BESIDE..=BESIDE).map(move |dx| (dx, dy))) {
+    for at in pixels {
+        for (dx, dy) in (-within..=within).flat_map(|dy| (-within..=within).map(move |dx| (dx, dy))) {
             let (x, y) = ((at % width) as i32 + dx, (at / width) as i32 + dy);
             if (0..width as i32).contains(&x) && (0..height as i32).contains(&y) {
                 taken[y as usize * width + x as usize] = true;
             }
         }
     }
-    let fingers = || hand.iter().filter(|(_, along)| *along > 0.0);
-    let beside = fingers().filter(|(v, _)| pixel(*v).is_some_and(|at| !taken[at])).count();
-    beside as f32 / fingers().count().max(1) as f32
+    taken
 }
