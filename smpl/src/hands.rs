@@ -10,10 +10,10 @@ const WRISTS: [usize; 2] = [20, 21];
 const HANDS: [usize; 2] = [22, 23];
 /// Radius about which the fingers of a fist roll, relative to the distance from wrist to hand.
 const RADIUS: f32 = 0.2;
-/// Distance of the palm's edge, where the thumb begins, before the middle of the hand, relative to that.
+/// Distance of the palm's front edge, where the thumb begins, from the middle of the hand.
 const EDGE: f32 = 0.45;
-/// Share of their distance from the hand's middle by which the fingers of a fist close up, and where beyond the
-/// knuckles they do in full.
+/// Share of their distance from the hand's middle by which the fingers of a fist close up, and where
+/// beyond the knuckles they do in full.
 const CLOSED: f32 = 0.3;
 const SPREAD: f32 = 0.3;
 /// Distance beyond the knuckles from which drooping fingers are kept outside the axis of the roll.
@@ -26,17 +26,16 @@ impl BodyModel {
         (self.num_joints() == JOINTS).then_some(WRISTS)
     }
 
-    /// Vertices of the left and of the right hand with their distances beyond the knuckles along the fingers, or
-    /// beyond the palm's edge along the thumb, relative to that from wrist to hand; negative on the palm. None of
-    /// a body without SMPL's joints.
+    /// Vertices of the left and of the right hand with their distances beyond the knuckles along the
+    /// fingers, or beyond the palm's edge along the thumb, relative to that from wrist to hand;
+    /// negative on the palm. None of a body without SMPL's joints.
     #[must_use]
     pub fn hands(&self) -> [Vec<(usize, f32)>; 2] {
         let along = |(v, along, thumb): (usize, f32, f32)| (v, if thumb > 0.0 { thumb } else { along });
         self.fingers().map(|hand| hand.into_iter().map(along).collect())
     }
 
-    /// Vertices of each hand, distances beyond the knuckles, and of the thumb beyond the palm's edge, as
-    /// [`BodyModel::hands`] has them.
+    /// Vertices of each hand, distances beyond the knuckles, and of the thumb beyond the palm's edge.
     fn fingers(&self) -> [Vec<(usize, f32, f32)>; 2] {
         if self.num_joints() != JOINTS {
             return Default::default();
@@ -58,8 +57,8 @@ impl BodyModel {
         })
     }
 
-    /// The body with the fingers and thumb of its left and right hand rolled up, by 0 (flat, as they are) to 1 (a
-    /// fist). The palms of the rest pose look down, as SMPL's do.
+    /// The body with the fingers and thumb of its left and right hand rolled up, by 0 (flat, as they
+    /// are) to 1 (a fist). The palms of the rest pose look down, as SMPL's do.
     ///
     /// ```
     /// let body = smpl::BodyModel::embedded();
@@ -83,7 +82,7 @@ impl BodyModel {
                 let (relative, onward) = if thumb > 0.0 { (thumb, aside) } else { (along, fingers) };
                 let (along, way) = (relative * length, body.v_template[v] - joints[HANDS[side]]);
                 let (angle, height) = (along / radius, way.dot(up));
-                // Drooping fingers stay outside the axis, else they would be inside out; knuckles stay as they are.
+                // Drooping fingers stay outside the axis, or they would be inside out.
                 let outside = radius * ((height.min(0.0) / radius).exp() - 1.0) - height.min(0.0);
                 let from_axis = radius + height + (relative / KNUCKLES).min(1.0) * outside;
                 let (x, y) = (from_axis * angle.sin() - along, from_axis * angle.cos() - radius - height);

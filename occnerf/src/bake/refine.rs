@@ -9,7 +9,7 @@ use super::draw::{BakedRenderer, BilinearCorner, color, look};
 use crate::Error;
 use crate::capture::Light;
 use crate::model::view::pinhole;
-use crate::scene::hands::{HandColor, is_arm, near_hands};
+use crate::scene::hands::{HandPixels, is_arm};
 use crate::scene::labels::Label;
 use crate::scene::prepared::{PreparedFrame, Scene};
 use crate::scene::registration::{deviation, robust};
@@ -65,9 +65,8 @@ pub(super) fn refine(scene: &Scene, light: Light, avatar: &mut Avatar, passes: u
     let (blocks, mut halves) = (BLOCKS.min(frames.len()), [Vec::new(), Vec::new()]);
     for (f, frame) in frames.iter().enumerate() {
         let half = &mut halves[f * blocks / frames.len() % 2];
-        let near = || near_hands(&scene.body.model, &frame.view);
-        let hands = hands.as_ref().map(|color| Hands { color, arms: &arms, near: near() });
-        half.extend(equations(avatar, &mut renderer, frame, stride, (reliability, hands.as_ref()))?);
+        let hands = hands.as_ref().map(|color| (color.in_frame(&scene.body.model, &frame.view), &arms[..]));
+        half.extend(equations(avatar, &mut renderer, frame, stride, (reliability, hands))?);
     }
     let Atlas { rgb, width, .. } = &mut avatar.atlas;
     let mut values: Vec<Vec3> = rgb.as_chunks::<3>().0.iter().copied().map(color).collect();
@@ -142,22 +141,14 @@ fn jacobi(start: &[Vec3], equations: &[&[PixelEquation]], passes: u32, disagreem
     Estimate { values, weights, errors }
 }
 
-/// What tells a hand that the avatar has beside it.
-struct Hands<'a> {
-    color: &'a HandColor,
-    /// Vertices of forearms and hands, (V).
-    arms: &'a [bool],
-    /// Pixels near a hand, (H × W).
-    near: Vec<bool>,
-}
-
-/// Equations of the fully covered subject pixels of a frame.
+/// Equations of the fully covered subject pixels of a frame; `hands` has where it may show hands, and
+/// whether each vertex of the avatar (V) belongs to a forearm or hand.
 fn equations(
     avatar: &Avatar,
     renderer: &mut BakedRenderer<'_>,
     frame: &PreparedFrame,
     stride: usize,
-    (reliability, hands): (&Reliability, Option<&Hands<'_>>),
+    (reliability, hands): (&Reliability, Option<(HandPixels<'_>, &[bool])>),
 ) -> Result<Vec<PixelEquation>, Error> {
     let pixels = frame.pixels()?;
     let across = frame.view.camera.width as usize;
@@ -193,11 +184,11 @@ fn equations(
         }
         let fragments = || pixel.samples.iter().flatten();
         let color = Vec3::from_slice(&pixels.image.pixels[3 * i..]);
-        let is_hand_beside = |hands: &Hands<'_>| {
-            let is_arm = |face: u32| hands.arms[avatar.faces[face as usize][0] as usize];
-            hands.near[i] && hands.color.is_like(color) && !fragments().any(|fragment| is_arm(fragment.face))
+        let is_hand_beside = |(hands, arms): &(HandPixels<'_>, &[bool])| {
+            let is_arm = |face: u32| arms[avatar.faces[face as usize][0] as usize];
+            hands.may_show(i, color) && !fragments().any(|fragment| is_arm(fragment.face))
         };
-        if hands.is_some_and(is_hand_beside) {
+        if hands.as_ref().is_some_and(is_hand_beside) {
             return None;
         }
         let share = 1.0 / count as f32;

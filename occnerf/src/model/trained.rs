@@ -202,9 +202,9 @@ pub(crate) fn surface_motion(config: &MotionConfig) -> SurfaceMotion {
 /// Tilt of a camera that is taken for level, radians: leaning persons are less upright.
 const LEVEL: f32 = 0.17;
 
-/// Upward direction of the world: its axis nearest to the mean direction from the feet to the head in `views`;
-/// where the world's axes are those of every camera, as in a video without cameras, that direction itself unless
-/// the camera is nearly level.
+/// Upward direction of the world: its axis nearest to the mean direction from the feet to the head
+/// in `views`; where the world's axes are those of every camera, as in a video without cameras,
+/// that direction itself unless the camera is nearly level.
 pub fn upright<'a>(body: &Body, views: impl Iterator<Item = &'a PosedView>) -> Vec3 {
     let joints = &body.canonical.joints;
     let highest = |sign: f32| {

@@ -9,7 +9,7 @@ use crate::Error;
 use crate::model::colors::PriorColors;
 use crate::model::subdivide::{Subdivided, most_times, times_until};
 use crate::model::view::pixel_width;
-use crate::scene::hands::{is_arm, near_hands};
+use crate::scene::hands::is_arm;
 use crate::scene::light::ColorObservation;
 use crate::scene::prepared::Scene;
 use crate::scene::unseen::complete;
@@ -52,13 +52,12 @@ impl PriorColors {
                 let (size, shade) = (trust * cosine.max(SLANT), light.on(normal));
                 (v as usize, size * shade * color, size * shade * shade, trust)
             };
-            let near = hands.as_ref().map(|hands| (hands, near_hands(&scene.body.model, view)));
+            let hands = hands.as_ref().map(|color| color.in_frame(&scene.body.model, view));
             let is_hand_beside = |v: u32, color: Vec3| {
-                let Some((_, near)) = near.as_ref().filter(|(hands, _)| hands.is_like(color)) else { return false };
-                let anchor = &mesh.anchors[v as usize];
+                let (Some(hands), anchor) = (&hands, &mesh.anchors[v as usize]) else { return false };
                 let at = view.camera.project(anchor.mix(&view.posed.vertices));
                 let pixel = at.map(|at| at.y as usize * view.camera.width as usize + at.x as usize);
-                pixel.and_then(|pixel| near.get(pixel)).is_some_and(|near| *near)
+                pixel.is_some_and(|pixel| hands.may_show(pixel, color))
                     && !is_arm(scene.body.model.weights.row(anchor.corners[0] as usize))
             };
             let is_allowed =

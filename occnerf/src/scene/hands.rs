@@ -1,7 +1,7 @@
 //! Hand pixels beside the registered hand.
 //!
-//! Hands are small and fast, and their poses inaccurate: a hand that is registered a few pixels off would paint the
-//! hip behind it.
+//! Hands are small and fast, and their poses inaccurate: a hand that is registered a few pixels off
+//! would paint the hip behind it.
 
 use glam::{Vec2, Vec3};
 use smpl::BodyModel;
@@ -15,11 +15,11 @@ const REACH: f32 = 0.12;
 const ENOUGH: usize = 200;
 /// Distance from a hand's vertices, relative to the length of its projection, of pixels that may show it.
 const NEAR: f32 = 0.35;
-/// SMPL's first joint beyond the elbows that moves hands, and its joints.
+/// SMPL's joints that move hands, and forearms and hands.
 const HANDS: std::ops::Range<usize> = 20..24;
 const ARMS: std::ops::Range<usize> = 18..24;
 
-/// Whether a vertex with these weights belongs to a forearm or hand, given the joints of [`HANDS`] or [`ARMS`].
+/// Whether a vertex with these weights follows `joints` mostly.
 fn follows(joints: &std::ops::Range<usize>, weights: impl Iterator<Item = (usize, f32)>) -> bool {
     weights.filter(|(joint, _)| joints.contains(joint)).map(|(_, weight)| weight).sum::<f32>() > 0.5
 }
@@ -33,8 +33,8 @@ pub(crate) fn is_arm(weights: impl Iterator<Item = (usize, f32)>) -> bool {
 pub(crate) struct HandColor(Vec3);
 
 impl HandColor {
-    /// Median of what `frames` show of the hands; `None` where they show too little, and of a model without SMPL's
-    /// joints.
+    /// Median of what `frames` show of the hands; `None` where they show too little, and of a model
+    /// without SMPL's joints.
     pub fn measure(model: &BodyModel, frames: &[Vec<(ColorObservation, usize)>]) -> Option<Self> {
         model.wrists()?;
         let is_hand: Vec<bool> = (0..model.num_vertices()).map(|v| follows(&HANDS, model.weights.row(v))).collect();
@@ -48,14 +48,32 @@ impl HandColor {
         (colors.len() >= ENOUGH).then(|| Self(Vec3::new(median(0), median(1), median(2))))
     }
 
-    /// Whether a colour is as that of the hands.
-    pub fn is_like(&self, color: Vec3) -> bool {
+    /// Where a frame may show the hands of `model`.
+    pub fn in_frame(&self, model: &BodyModel, view: &PosedView) -> HandPixels<'_> {
+        HandPixels { color: self, near: near_hands(model, view) }
+    }
+
+    fn is_like(&self, color: Vec3) -> bool {
         (color - self.0).abs().element_sum() / 3.0 < REACH
     }
 }
 
+/// Where a frame may show hands.
+pub(crate) struct HandPixels<'a> {
+    color: &'a HandColor,
+    /// Pixels near a hand, (H × W).
+    near: Vec<bool>,
+}
+
+impl HandPixels<'_> {
+    /// Whether a pixel of this colour may be a hand's.
+    pub fn may_show(&self, pixel: usize, color: Vec3) -> bool {
+        self.near.get(pixel) == Some(&true) && self.color.is_like(color)
+    }
+}
+
 /// Pixels (H × W) near a hand.
-pub(crate) fn near_hands(model: &BodyModel, view: &PosedView) -> Vec<bool> {
+fn near_hands(model: &BodyModel, view: &PosedView) -> Vec<bool> {
     let (width, height) = (view.camera.width as i32, view.camera.height as i32);
     let mut near = vec![false; (width * height) as usize];
     for hand in model.hands() {

@@ -7,13 +7,13 @@
 
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
-
+use smpl::BoneNames;
 use volrender::Aabb;
 
 use crate::model::body::Body;
 
-/// Length of a metre around the bone relative to one along it, where distances are anisotropic: shorter,
-/// or longer.
+/// Length of a metre around the bone relative to one along it, where distances are anisotropic:
+/// shorter, or longer.
 const AROUND: f32 = 0.1;
 const ALONG: f32 = 10.0;
 /// Largest error of [`ALONG`] relative to the others': noise of dirty colours chooses it at random.
@@ -26,8 +26,8 @@ const MOST_HELD: usize = 1024;
 const FEW: usize = 16;
 /// Least distance of a limb's joint from the plane of symmetry, x = 0, metres of such a body.
 const ASIDE: f32 = 0.03;
-/// Angle of the nape from the whorl of the hair about the centre of the head, and the width of the ring about the
-/// whorl that gives unseen hair its colour, radians.
+/// Angle of the nape from the whorl of the hair about the centre of the head, and the width of the
+/// ring about the whorl that gives unseen hair its colour, radians.
 const NAPE: f32 = 1.4;
 const RING: f32 = 0.35;
 
@@ -60,17 +60,19 @@ pub(crate) fn complete(body: &Body, colors: &mut [Vec3], seen: &[bool]) {
         };
         let mixed = [1.0, AROUND, ALONG].map(mixed);
         let weight: f32 = mixed.iter().map(|mixed| mixed.1).sum();
-        (v, mixed.iter().map(|mixed| mixed.0).sum::<Vec3>() / weight)
+        let sum: Vec3 = mixed.iter().map(|mixed| mixed.0).sum();
+        (v, if weight > 0.0 { sum / weight } else { guesses.guess(v, &known, 1.0) })
     };
     let found: Vec<(usize, Vec3)> = unseen.par_iter().map(guess).collect();
     found.into_iter().for_each(|(v, color)| colors[v] = color);
 }
 
-/// Whether hair grows at each vertex (V) where a head has any, and the vertices of `known` from which its colour
-/// is taken: those nearest to the whorl, since hair, caps and bald heads go on from there.
+/// Whether each vertex (V) lies where heads have hair, and the vertices of `known` that give it its
+/// colour: those nearest to the whorl, since hair, caps and bald heads go on from there. None of a
+/// body without SMPL's joints.
 fn hair(body: &Body, joints: &[usize], known: &[usize]) -> (Vec<bool>, Vec<usize>) {
-    let (vertices, canonical) = (&body.canonical.vertices, &body.canonical.joints);
-    let head = (0..canonical.len()).max_by(|&a, &b| canonical[a].y.total_cmp(&canonical[b].y));
+    let vertices = &body.canonical.vertices;
+    let head = BoneNames::Smpl.of_body(body.model.num_joints()).iter().position(|name| name == "head");
     let of_head = |v: usize| Some(joints[v]) == head;
     let skull =
         Aabb::from_points(&(0..vertices.len()).filter(|&v| of_head(v)).map(|v| vertices[v]).collect::<Vec<_>>());
@@ -120,8 +122,8 @@ impl<'a> Guesses<'a> {
         (sum / weights).as_vec3()
     }
 
-    /// Anisotropy of the vertices `unseen`: [`AROUND`], [`ALONG`] or 1 (isotropic), by the error of predicting
-    /// the vertices of `known` around it from the others.
+    /// Anisotropy of the vertices `unseen`: [`AROUND`], [`ALONG`] or 1 (isotropic), by the error of
+    /// predicting the vertices of `known` around them from the others.
     fn choose(&self, known: &[usize], unseen: &[usize]) -> f32 {
         let is_near = |v: usize| unseen.iter().any(|&u| self.vertices[u].distance(self.vertices[v]) < RIM);
         let (held, rest): (Vec<usize>, Vec<usize>) = known.par_iter().partition(|&&v| is_near(v));
@@ -236,6 +238,10 @@ mod tests {
             *color = if *seen { *color } else { Vec3::splat(9.0) };
         }
         complete(&body, &mut colors, &seen);
+        assert!(colors.iter().all(|c| c.min_element() >= 0.199 && c.max_element() <= 0.701));
+        let mut weightless = self::body();
+        weightless.model.weights = smpl::SparseRows::from_rows(vec![Vec::new(); seen.len()]);
+        complete(&weightless, &mut colors, &seen);
         assert!(colors.iter().all(|c| c.min_element() >= 0.199 && c.max_element() <= 0.701));
         complete(&body, &mut colors, &vec![false; seen.len()]);
         assert!(colors.iter().all(|c| *c == Vec3::splat(0.5)));

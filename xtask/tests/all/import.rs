@@ -23,7 +23,7 @@ fn a_newcomer_gets_a_person_with_three_commands() {
         assert!(said.contains(words), "{words}: {said}");
     }
     assert!(image::open(capture.join("check.png")).unwrap().width() > 500);
-    let quick = ["--preset", "fast", "--method", "hash-point", "--steps", "1", "--resize", "96"];
+    let quick = ["--preset", "fast", "--method", "hash-point", "--steps", "1"];
     done(&[&["train", text(&capture), "--out", text(&run)], &quick[..]].concat());
     done(&["render", text(&run), "tpose"]);
     // A second import needs leave to replace the first.
@@ -164,8 +164,7 @@ fn without_a_body_model_the_open_body_stands_in() {
         let body = if words.is_empty() { vec!["--body", text(&known)] } else { Vec::new() };
         let said = done(&[&line[..], &["--out", text(&capture)], &body].concat());
         assert!(said.contains(words) && said.contains("open body of this program") != words.is_empty(), "{said}");
-        let how = ["--method", "surface", "--preset", "fast", "--resize", "160"];
-        let said = done(&[&["train", text(&capture), "--out", text(&run)], &how[..]].concat());
+        let said = done(&["train", text(&capture), "--out", text(&run), "--method", "surface"]);
         let row = said.lines().find(|line| line.starts_with("| surface")).unwrap();
         scores.push(row.split('|').nth(5).unwrap().trim().parse::<f64>().unwrap());
     }
