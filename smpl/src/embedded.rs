@@ -8,8 +8,8 @@
 use std::io::Read;
 
 use crate::Error;
+use crate::load::parse_saved;
 use crate::model::BodyModel;
-use crate::saved;
 
 const PACKED: &[u8] = include_bytes!("../assets/open_body.bin");
 
@@ -35,7 +35,7 @@ impl BodyModel {
         let body = match flate2::read::ZlibDecoder::new(PACKED).read_to_end(&mut planes) {
             Ok(length) => {
                 let bytes: Vec<u8> = (0..length).map(|i| planes[i % 4 * (length / 4) + i / 4]).collect();
-                saved::parse("the embedded body", &bytes)
+                parse_saved("the embedded body", &bytes)
             }
             Err(error) => Err(Error::invalid("the embedded body", "asset", error.to_string())),
         };

@@ -31,7 +31,6 @@ mod model;
 mod motion;
 mod pose;
 mod rotation;
-mod saved;
 mod sparse;
 
 /// The README's example, compiled as a test.
@@ -50,4 +49,4 @@ pub use motion::{
 };
 pub use pose::{Placement, Posed, skin};
 pub use rotation::rodrigues;
-pub use sparse::{SkinningWeights, SparseRows};
+pub use sparse::SparseRows;

@@ -3,7 +3,7 @@
 use glam::Vec3;
 
 use crate::Error;
-use crate::sparse::{SkinningWeights, SparseRows};
+use crate::sparse::SparseRows;
 
 /// Pose blend-shape terms a non-root joint: the entries of R − I.
 pub(crate) const TERMS_PER_JOINT: usize = 9;
@@ -44,7 +44,7 @@ pub struct BodyModel {
     /// belongs to entry (r, c) of R(θ_j) − I. P is 9(J−1), or no row has any entry.
     pub posedirs: SparseRows<Vec3>,
     /// Skinning weights, (V, J), rows non-negative and summing to 1.
-    pub weights: SkinningWeights,
+    pub weights: SparseRows<f32>,
     /// Joint regressor, (J, V), rows summing to 1.
     pub j_regressor: SparseRows<f32>,
     /// Parent of each joint, (J): `None` for joint 0, a smaller index for all others.

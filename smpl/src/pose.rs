@@ -5,7 +5,7 @@ use rayon::prelude::*;
 
 use crate::model::{BodyModel, Shaped, TERMS_PER_JOINT};
 use crate::rotation::rodrigues;
-use crate::sparse::SkinningWeights;
+use crate::sparse::SparseRows;
 
 /// Vertices per parallel task.
 const CHUNK: usize = 1024;
@@ -245,7 +245,7 @@ fn dense_offsets(values: &[Vec3], features: &[f32]) -> [Vec3; GROUP] {
 ///
 /// # Panics
 /// If there are fewer rows than vertices, or fewer bones than columns.
-pub fn skin(vertices: &[Vec3], weights: &SkinningWeights, bones: &[Affine3A]) -> Vec<Vec3> {
+pub fn skin(vertices: &[Vec3], weights: &SparseRows<f32>, bones: &[Affine3A]) -> Vec<Vec3> {
     let mut out = vertices.to_vec();
     out.par_chunks_mut(CHUNK).enumerate().for_each(|(chunk, out)| {
         for (i, vertex) in out.iter_mut().enumerate() {

@@ -9,6 +9,7 @@
 /// let matrix = SparseRows::from_rows([vec![(0, 0.25), (2, 0.75)], vec![]]);
 /// assert_eq!(matrix.num_rows(), 2);
 /// assert_eq!(matrix.row(0).collect::<Vec<_>>(), [(0, 0.25), (2, 0.75)]);
+/// assert_eq!([matrix.heaviest(0), matrix.heaviest(1)], [Some(2), None]);
 /// ```
 #[derive(Clone, Debug, PartialEq)]
 pub struct SparseRows<T> {
@@ -20,22 +21,17 @@ pub struct SparseRows<T> {
     pub values: Vec<T>,
 }
 
-/// Skinning weights, (V, J): rows are vertices, columns joints.
-///
-/// ```
-/// use smpl::SkinningWeights;
-///
-/// // A vertex of joint 0 alone, and one that joint 1 shares.
-/// let weights = SkinningWeights::from_rows([vec![(0, 1.0)], vec![(0, 0.25), (1, 0.75)]]);
-/// assert_eq!([weights.heaviest(0), weights.heaviest(1)], [Some(0), Some(1)]);
-/// assert_eq!(weights.row(1).map(|(_, weight)| weight).sum::<f32>(), 1.0);
-/// ```
-pub type SkinningWeights = SparseRows<f32>;
+impl<T> Default for SparseRows<T> {
+    /// No rows.
+    fn default() -> Self {
+        Self { offsets: vec![0], columns: Vec::new(), values: Vec::new() }
+    }
+}
 
 impl<T: Copy> SparseRows<T> {
     /// Collects (column, value) pairs, row by row.
     pub fn from_rows(rows: impl IntoIterator<Item = impl IntoIterator<Item = (u32, T)>>) -> Self {
-        let mut out = Self { offsets: vec![0], columns: Vec::new(), values: Vec::new() };
+        let mut out = Self::default();
         for row in rows {
             for (column, value) in row {
                 out.columns.push(column);

@@ -20,10 +20,8 @@
 //! of them outside its folder. Metres, y up, as in glTF.
 
 mod accessor;
-mod animation;
 mod character;
 mod mesh;
-mod primitive;
 mod read;
 
 /// The README's example, compiled as a test.
@@ -31,6 +29,5 @@ mod read;
 #[doc = include_str!("../README.md")]
 struct Readme;
 
-pub use animation::Animation;
-pub use character::{Character, CharacterPose, Texture};
+pub use character::{Animation, Character, CharacterPose, Texture};
 pub use mesh::{Mesh, load_mesh};

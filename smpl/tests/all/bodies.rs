@@ -4,17 +4,12 @@
 use std::path::{Path, PathBuf};
 use std::sync::LazyLock;
 
-use array_files::{Data, NdArray, npz};
 use glam::Vec3;
 use smpl::{BodyModel, Error, Placement};
 use testkit::files::{npy, zip};
 
 fn temporary(name: &str) -> PathBuf {
     Path::new(env!("CARGO_TARGET_TMPDIR")).join(name)
-}
-
-fn floats(shape: &[usize], value: impl Fn(usize) -> f32) -> Vec<u8> {
-    npy("<f4", shape, &(0..shape.iter().product()).flat_map(|i| value(i).to_le_bytes()).collect::<Vec<u8>>())
 }
 
 /// How an archive writes the parent of the root.
@@ -25,41 +20,45 @@ enum Root {
     MinusOne,
 }
 
-/// A body of `joints` joints and 3 vertices each, in a chain, with the further arrays of a SMPL-X
-/// archive.
-fn archive(name: &str, joints: usize, betas: usize, root: Root) -> PathBuf {
+/// Key, element type, shape and values.
+type Array = (&'static str, &'static str, Vec<usize>, Vec<f64>);
+
+/// A body of `joints` joints and 3 vertices each, in a chain.
+fn arrays(joints: usize, betas: usize, root: Root) -> [Array; 7] {
     let v = 3 * joints;
-    let wave = |i: usize| (i as f32 * 0.71).sin();
-    let parents = (0..joints as i64).map(|j| match (j, root) {
-        (0, Root::MinusOne) => -1,
-        (0, _) => i64::from(u32::MAX),
-        _ => j - 1,
-    });
-    let tree: Vec<i64> = parents.chain(0..joints as i64).collect();
-    let tree = match root {
-        Root::U32 => {
-            npy("<u4", &[2, joints], &tree.iter().flat_map(|&p| (p as u32).to_le_bytes()).collect::<Vec<u8>>())
-        }
-        _ => npy("<i8", &[2, joints], &tree.iter().flat_map(|p| p.to_le_bytes()).collect::<Vec<u8>>()),
+    let wave = |i: usize| (i as f64 * 0.71).sin();
+    let whole = if matches!(root, Root::U32) { "<u4" } else { "<i8" };
+    let above = if matches!(root, Root::MinusOne) { -1.0 } else { f64::from(u32::MAX) };
+    let parents = (0..joints).map(|j| if j == 0 { above } else { j as f64 - 1.0 });
+    let tree = parents.chain((0..joints).map(|j| j as f64)).collect();
+    let floats = |key, shape: &[usize], value: &dyn Fn(usize) -> f64| -> Array {
+        (key, "<f4", shape.to_vec(), (0..shape.iter().product()).map(value).collect())
     };
-    let faces =
-        (0..joints as u32).flat_map(|j| [3 * j, 3 * j + 1, 3 * j + 2]).flat_map(u32::to_le_bytes).collect::<Vec<u8>>();
-    let arrays = [
-        ("v_template", floats(&[v, 3], |i| (i / 9) as f32 * 0.1 + wave(i))),
-        ("f", npy("<u4", &[joints, 3], &faces)),
-        ("shapedirs", floats(&[v, 3, betas], |i| 0.01 * wave(i))),
-        ("posedirs", floats(&[v, 3, 9 * (joints - 1)], |i| if i % 7 == 0 { 0.001 * wave(i) } else { 0.0 })),
-        ("weights", floats(&[v, joints], |i| f32::from(u8::from(i / joints / 3 == i % joints)))),
-        ("J_regressor", floats(&[joints, v], |i| if i % v / 3 == i / v { 1.0 / 3.0 } else { 0.0 })),
-        ("kintree_table", tree),
-        // Not read: what SMPL-H and SMPL-X carry besides, objects included.
-        ("lmk_faces_idx", npy("<i8", &[2], &[0; 16])),
-        ("hands_componentsl", floats(&[45, 45], wave)),
-        ("hands_meanl", floats(&[45], wave)),
-        ("joint2num", npy("|O", &[], b"not even a pickle")),
-    ];
+    [
+        floats("v_template", &[v, 3], &|i| (i / 9) as f64 * 0.1 + wave(i)),
+        ("f", whole, vec![joints, 3], (0..v).map(|i| i as f64).collect()),
+        floats("shapedirs", &[v, 3, betas], &|i| 0.01 * wave(i)),
+        floats("posedirs", &[v, 3, 9 * (joints - 1)], &|i| if i % 7 == 0 { 0.001 * wave(i) } else { 0.0 }),
+        floats("weights", &[v, joints], &|i| f64::from(u8::from(i / joints / 3 == i % joints))),
+        floats("J_regressor", &[joints, v], &|i| if i % v / 3 == i / v { 1.0 / 3.0 } else { 0.0 }),
+        ("kintree_table", whole, vec![2, joints], tree),
+    ]
+}
+
+/// Writes arrays of a body, and some of what archives of SMPL-H and SMPL-X carry besides.
+fn written(name: &str, arrays: &[Array]) -> PathBuf {
+    let encoded = |(key, descr, shape, values): &Array| {
+        let bytes = |x: &f64| match *descr {
+            "<f4" => (*x as f32).to_le_bytes().to_vec(),
+            "<u4" => (*x as u32).to_le_bytes().to_vec(),
+            _ => (*x as i64).to_le_bytes().to_vec(),
+        };
+        (*key, npy(descr, shape, &values.iter().flat_map(bytes).collect::<Vec<u8>>()))
+    };
+    let more = [("lmk_faces_idx", npy("<i8", &[2], &[0; 16])), ("joint2num", npy("|O", &[], b"not even a pickle"))];
     let path = temporary(name);
-    std::fs::write(&path, zip(arrays.map(|(key, bytes)| (format!("{key}.npy"), bytes)))).unwrap();
+    let files = arrays.iter().map(encoded).chain(more).map(|(key, bytes)| (format!("{key}.npy"), bytes));
+    std::fs::write(&path, zip(files)).unwrap();
     path
 }
 
@@ -68,7 +67,8 @@ fn bodies_with_hands_and_faces_load_pose_and_survive_saving() {
     for (joints, betas, root) in
         [(52, 16, Root::U32), (55, 400, Root::I64Wrapped), (55, 20, Root::MinusOne), (1, 0, Root::MinusOne)]
     {
-        let body = BodyModel::load(&archive(&format!("hands-{joints}-{betas}.npz"), joints, betas, root)).unwrap();
+        let path = written(&format!("hands-{joints}-{betas}.npz"), &arrays(joints, betas, root));
+        let body = BodyModel::load(&path).unwrap();
         assert_eq!((body.num_joints(), body.num_betas(), body.num_vertices()), (joints, betas, 3 * joints));
         assert_eq!(body.parents[0], None);
         let shaped = body.shaped(&vec![0.5; betas]);
@@ -112,7 +112,7 @@ fn invalid_bodies_are_not_saved() {
 /// The saved form of a body of three joints: written once, as tests run at once and would read what
 /// another is writing.
 static SMALL: LazyLock<Vec<u8>> = LazyLock::new(|| {
-    let body = BodyModel::load(&archive("small.npz", 3, 2, Root::U32)).unwrap();
+    let body = BodyModel::load(&written("small.npz", &arrays(3, 2, Root::U32))).unwrap();
     let path = temporary("small.safetensors");
     body.save(&path).unwrap();
     std::fs::read(path).unwrap()
@@ -162,37 +162,12 @@ fn bodies_without_faces_or_with_huge_coordinates_are_refused() {
     refused(|body| body.posedirs.values[5].z = 1e30, ["`posedirs`", "row 5"]);
 }
 
-/// Arrays of a body of three vertices and two joints.
-fn tiny_body() -> Vec<(&'static str, Vec<usize>, Vec<f64>)> {
-    vec![
-        ("v_template", vec![3, 3], vec![0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0]),
-        ("f", vec![1, 3], vec![0.0, 1.0, 2.0]),
-        ("weights", vec![3, 2], vec![1.0, 0.0, 0.5, 0.5, 0.0, 1.0]),
-        ("J_regressor", vec![2, 3], vec![1.0, 0.0, 0.0, 0.0, 0.5, 0.5]),
-        ("kintree_table", vec![2, 2], vec![4294967295.0, 0.0, 0.0, 1.0]),
-        ("shapedirs", vec![3, 3, 1], vec![0.1; 9]),
-        ("posedirs", vec![3, 3, 9], vec![0.0; 81]),
-    ]
-}
-
-fn write_body(name: &str, arrays: &[(&'static str, Vec<usize>, Vec<f64>)]) -> PathBuf {
-    let path = temporary(name);
-    let array = |(key, shape, values): &(&'static str, Vec<usize>, Vec<f64>)| {
-        let integers = matches!(*key, "f" | "kintree_table");
-        let whole = || Data::I64(values.iter().map(|&x| x as i64).collect());
-        let data = if integers { whole() } else { Data::F64(values.clone()) };
-        (*key, NdArray { shape: shape.clone(), data })
-    };
-    npz::write(&path, &arrays.iter().map(array).collect::<Vec<_>>()).unwrap();
-    path
-}
-
 #[test]
 fn faults_of_a_model_name_the_array() {
     let cases: [(&str, usize, f64); 11] = [
         ("v_template", 4, f64::NAN),
         ("v_template", 0, f64::INFINITY),
-        ("f", 2, 3.0),
+        ("f", 2, 6.0),
         ("f", 0, -1.0),
         ("weights", 0, 0.5),
         ("weights", 2, -0.5),
@@ -203,30 +178,27 @@ fn faults_of_a_model_name_the_array() {
         ("posedirs", 80, f64::NAN),
     ];
     for (i, (key, index, value)) in cases.into_iter().enumerate() {
-        let mut arrays = tiny_body();
-        arrays.iter_mut().find(|a| a.0 == key).unwrap().2[index] = value;
-        let file = write_body(&format!("fault{i}.npz"), &arrays);
-        let message = BodyModel::load(&file).expect_err(key).to_string();
+        let mut arrays = arrays(2, 1, Root::MinusOne);
+        arrays.iter_mut().find(|a| a.0 == key).unwrap().3[index] = value;
         let name = format!("fault{i}.npz");
+        let message = BodyModel::load(&written(&name, &arrays)).expect_err(key).to_string();
         assert!(message.contains(&format!("`{key}`")) && message.contains(&name), "{message}");
     }
 }
 
 #[test]
 fn missing_and_misshapen_arrays_of_a_model_are_named() {
-    for i in 0..tiny_body().len() {
-        let mut arrays = tiny_body();
-        let (key, shape, _) = &mut arrays[i];
+    for i in 0..7 {
+        let mut arrays = arrays(2, 1, Root::MinusOne).to_vec();
+        let (key, _, shape, _) = &mut arrays[i];
         let key = *key;
         shape.push(1);
         let shown = format!("{shape:?}");
-        let file = write_body(&format!("shape{i}.npz"), &arrays);
-        let message = BodyModel::load(&file).expect_err(key).to_string();
+        let message = BodyModel::load(&written(&format!("shape{i}.npz"), &arrays)).expect_err(key).to_string();
         assert!(message.contains(&format!("`{key}`")) && message.contains(&shown), "{message}");
 
         arrays.remove(i);
-        let file = write_body(&format!("missing{i}.npz"), &arrays);
-        let error = BodyModel::load(&file).expect_err(key).to_string();
+        let error = BodyModel::load(&written(&format!("missing{i}.npz"), &arrays)).expect_err(key).to_string();
         assert!(error.contains(&format!("`{key}`: missing")), "{error}");
     }
     assert!(matches!(load("plain.py", b"import numpy").unwrap_err(), Error::Extension { .. }));

@@ -224,22 +224,11 @@ impl<'a> Machine<'a> {
                 let items = self.pop_mark()?;
                 self.set_items(&items)
             }
-            b'p' => {
-                let key = self.reader.number::<i64>()?;
-                self.put(key as u64)
-            }
-            b'q' | b'r' => {
-                let key = self.reader.uint(width)?;
-                self.put(key)
-            }
             0x94 => self.put(self.memo.len() as u64),
-            b'g' => {
-                let key = self.reader.number::<i64>()?;
-                self.get(key as u64)
-            }
-            b'h' | b'j' => {
-                let key = self.reader.uint(width)?;
-                self.get(key)
+            b'p' | b'q' | b'r' | b'g' | b'h' | b'j' => {
+                let is_text = matches!(opcode, b'p' | b'g');
+                let key = if is_text { self.reader.number::<i64>()? as u64 } else { self.reader.uint(width)? };
+                if matches!(opcode, b'p' | b'q' | b'r') { self.put(key) } else { self.get(key) }
             }
             b'b' => {
                 let state = self.pop()?;

@@ -5,8 +5,9 @@ use std::borrow::Cow;
 use super::globals::{Dtype, Global, WRAPPER, count};
 use super::machine::{Id, Machine, Node, grown};
 use super::reader::Step;
-use super::value::Value;
-use crate::npy::NpyHeader;
+
+/// Deepest nesting of pickles in pickles; an array of objects is one.
+const MAX_NESTED: usize = 4;
 
 impl<'a> Machine<'a> {
     /// Calls `global` with `arguments`.
@@ -160,7 +161,9 @@ impl<'a> Machine<'a> {
                 Ok(Node::Array(Box::new(array.ok_or_else(|| mismatch(&shape, raw.len()))?)))
             }
             Dtype::Object => Err("data of an array".to_owned()),
-            Dtype::ByteText(_) | Dtype::WideText { .. } if fortran && shape.len() > 1 => Err(COLUMN_MAJOR.to_owned()),
+            Dtype::ByteText(_) | Dtype::WideText { .. } if fortran && shape.len() > 1 => {
+                Err("column-major array of text".to_owned())
+            }
             Dtype::ByteText(size) | Dtype::WideText { size, .. } => {
                 if count.checked_mul(size) != Some(raw.len()) {
                     return Err(mismatch(&shape, raw.len()));
@@ -173,6 +176,44 @@ impl<'a> Machine<'a> {
                 Ok(Node::Objects(Box::new((shape, items))))
             }
         }
+    }
+
+    /// The array described by a wrapper's attributes. Behind the wrapper follow the length of the
+    /// padding (one byte), padding and elements; up to joblib 1.1, which lacks the attribute for
+    /// the alignment, the elements alone; and for elements that are objects a pickle of the array.
+    pub(super) fn joblib_array(&mut self, attributes: &[(Id, Id)]) -> Step<Node<'a>> {
+        let find = |name: &str| {
+            let named = |id: Id| matches!(&self.nodes[id], Node::Text(text) if text == name);
+            attributes.iter().rev().find(|(key, _)| named(*key)).map(|(_, value)| *value)
+        };
+        let demand = |name: &str| find(name).ok_or_else(|| format!("joblib array without `{name}`"));
+        let (shape, order, dtype) = (demand("shape")?, demand("order")?, demand("dtype")?);
+        let aligned = find("numpy_array_alignment_bytes").is_some_and(|id| !matches!(self.nodes[id], Node::None));
+        let (dtype, shape) = (self.dtype(dtype)?, self.shape(shape)?);
+        let fortran = match self.text(order)?.as_ref() {
+            "C" => false,
+            "F" => true,
+            other => return Err(format!("order {other:?} of a joblib array, expected C or F")),
+        };
+        let Some(length) = dtype.raw_bytes(&shape)? else { return self.nested() };
+        if aligned {
+            self.reader.counted(1)?;
+        }
+        let bytes = self.reader.take(length)?;
+        self.raw_array(dtype, shape, fortran, bytes)
+    }
+
+    /// The value of the pickle that starts here, with a stack and a memo of its own.
+    fn nested(&mut self) -> Step<Node<'a>> {
+        if self.nesting >= MAX_NESTED {
+            return Err(format!("pickles nested deeper than {MAX_NESTED}"));
+        }
+        let outer = (std::mem::take(&mut self.stack), std::mem::take(&mut self.marks), std::mem::take(&mut self.memo));
+        self.nesting += 1;
+        let top = self.run_to_stop();
+        self.nesting -= 1;
+        (self.stack, self.marks, self.memo) = outer;
+        Ok(std::mem::replace(&mut self.nodes[top?], Node::None))
     }
 
     pub(super) fn dtype(&self, id: Id) -> Step<Dtype> {
@@ -207,23 +248,6 @@ impl<'a> Machine<'a> {
 
 fn mismatch(shape: &[usize], found: usize) -> String {
     format!("shape {shape:?} with {found} bytes or items of data")
-}
-
-const COLUMN_MAJOR: &str = "column-major array of text";
-/// Most texts of a `.npy` file.
-const MAX_TEXTS: usize = 1 << 20;
-
-/// The texts of a `.npy` file.
-pub(super) fn texts(dtype: Dtype, size: usize, header: &NpyHeader, raw: &[u8]) -> Step<Vec<Value>> {
-    let shape = &header.shape;
-    let count = count(shape)?;
-    if header.fortran && shape.len() > 1 {
-        return Err(COLUMN_MAJOR.to_owned());
-    }
-    if count > MAX_TEXTS || count.checked_mul(size) != Some(raw.len()) {
-        return Err(mismatch(shape, raw.len()));
-    }
-    raw.chunks_exact(size).map(|item| padded_text(dtype, item).map(Value::Str)).collect()
 }
 
 /// An item of an array of texts, without its padding.

@@ -1,15 +1,14 @@
 //! numpy's files: correct values from good files, typed errors from bad ones.
 
-use crate::common;
-
 use std::path::Path;
 
 use array_files::npz::{self, Npz, read_npy};
 use array_files::pickle::{self, Value};
 use array_files::{Data, Error, NdArray};
-use common::fixture;
 use proptest::prelude::*;
 use testkit::files::{Directory, npy_of};
+
+use crate::fixture;
 
 #[test]
 fn npz_arrays_are_read_with_shape_and_type() {
@@ -59,17 +58,19 @@ fn texts_are_read_in_the_order_of_rows_or_not_at_all() {
 #[test]
 fn headers_that_claim_too_much_are_refused_before_memory_is_taken() {
     let dir = Directory::new("npy-claims");
-    for (shape, large) in [
-        ("(4611686018427387904, 4)", true),
-        ("(18446744073709551615, 18446744073709551615, 18446744073709551615)", true),
-        ("(1000000000,)", true),
-        ("(99999999999999999999999,)", false),
-        ("(-1,)", false),
+    for (descr, shape, large) in [
+        ("<f4", "(4611686018427387904, 4)", true),
+        ("<f4", "(18446744073709551615, 18446744073709551615, 18446744073709551615)", true),
+        ("<f4", "(1000000000,)", true),
+        // 200 MB of bytes in the file, 1.6 GB once they are 64-bit integers.
+        ("|u1", "(200000000,)", true),
+        ("<f4", "(99999999999999999999999,)", false),
+        ("<f4", "(-1,)", false),
         // Below the limit, but not there.
-        ("(100000000,)", false),
-        ("(0, 4611686018427387904)", false),
+        ("<f4", "(100000000,)", false),
+        ("<f4", "(0, 4611686018427387904)", false),
     ] {
-        let header = format!("{{'descr': '<f4', 'fortran_order': False, 'shape': {shape}, }}");
+        let header = format!("{{'descr': '{descr}', 'fortran_order': False, 'shape': {shape}, }}");
         dir.write("claim.npy", npy_of(&header, &[0; 8]));
         let error = read_npy(&dir.file("claim.npy")).expect_err(shape);
         match error {
@@ -177,14 +178,4 @@ fn arrays_that_cannot_be_written_are_errors() {
     assert!(matches!(&error, Error::Npy { key, .. } if key == "x"), "{error}");
     let error = npz::write(Path::new("/no/such/place.npz"), &[("x", array(vec![3]))]).unwrap_err();
     assert!(matches!(error, Error::Io { .. }), "{error}");
-}
-
-#[test]
-fn the_limit_of_an_array_counts_the_memory_it_takes_decoded() {
-    // 200 MB of bytes in the file, 1.6 GB once they are 64-bit integers.
-    let header = "{'descr': '|u1', 'fortran_order': False, 'shape': (200000000,), }";
-    let dir = Directory::new("npy-widened");
-    dir.write("widened.npy", npy_of(header, &[]));
-    let error = read_npy(&dir.file("widened.npy")).unwrap_err().to_string();
-    assert!(error.contains("claims 1600000000 bytes, more than the limit of 1073741824"), "{error}");
 }
