@@ -14,10 +14,7 @@ pub enum Error {
     /// A capture that cannot be read.
     #[error(transparent)]
     Data(#[from] CaptureError),
-    /// A body model that cannot be read.
-    #[error(transparent)]
-    Body(#[from] smpl::Error),
-    /// A file of arrays that cannot be read or written.
+    /// A file of arrays, or a body model, that cannot be read or written.
     #[error(transparent)]
     Array(#[from] array_files::Error),
     /// The canonical or a posed mesh, as a set of points.

@@ -17,13 +17,12 @@
 //!
 //! # Conventions
 //! Right-handed, y up, facing +z, the person's left at +x; angles in radians, rotations as
-//! axis-angle vectors. Lengths are in the model's unit: only the defaults of [`SurfaceMotion`] and
-//! [`WeightVolumeConfig`] assume metres. The canonical space is the rest pose of a [`Shaped`] body.
-//! Arithmetic is `f32` and independent of the number of threads.
+//! axis-angle vectors. Lengths are in the model's unit: only the default of [`SurfaceMotion`] and
+//! [`WeightVolume::gaussian`] assume metres. The canonical space is the rest pose of a [`Shaped`]
+//! body. Arithmetic is `f32` and independent of the number of threads.
 
 mod clip;
 mod embedded;
-mod error;
 mod hands;
 mod limbs;
 mod load;
@@ -38,15 +37,12 @@ mod sparse;
 #[doc = include_str!("../README.md")]
 struct Readme;
 
-/// Error within [`Error::File`].
-pub use array_files::Error as FileError;
+/// A file that cannot be read or written, or a model that is not valid.
+pub use array_files::Error;
 pub use clip::{BoneNames, Bvh, Joint, MotionClip, joint_transforms, skeleton};
-pub use error::Error;
 pub use limbs::Limbs;
 pub use model::{BodyModel, Shaped};
-pub use motion::{
-    MotionField, MotionFrame, MotionSample, SurfaceMotion, SurfacePoint, WeightVolume, WeightVolumeConfig,
-};
+pub use motion::{MotionField, MotionFrame, MotionSample, SurfaceMotion, SurfacePoint, WeightVolume};
 pub use pose::{Placement, Posed, skin};
 pub use rotation::rodrigues;
 pub use sparse::SparseRows;

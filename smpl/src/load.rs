@@ -5,7 +5,7 @@ use std::path::Path;
 use array_files::npz::Npz;
 use array_files::pickle::{self, Value};
 use array_files::tensors::{Tensor, Tensors, write};
-use array_files::{Error as FileError, NdArray, read_file};
+use array_files::{NdArray, read_file};
 use glam::Vec3;
 
 use crate::Error;
@@ -43,7 +43,10 @@ impl BodyModel {
                 let value = pickle::parse(&file, &bytes)?;
                 build(&file, |key| from_pickle(&file, &value, key))
             }
-            None => Err(Error::Extension { path: path.to_owned(), expected: ".npz, .pkl or .safetensors" }),
+            None => {
+                let message = "unknown kind of file (expected .npz, .pkl or .safetensors)";
+                Err(Error::invalid(&file, "", message))
+            }
         }
     }
 
@@ -67,7 +70,7 @@ impl BodyModel {
     /// models give equal files.
     ///
     /// # Errors
-    /// What [`BodyModel::validate`] finds; [`Error::File`].
+    /// What [`BodyModel::validate`] finds; [`Error::Io`].
     pub fn save(&self, path: &Path) -> Result<(), Error> {
         self.validate(&path.display().to_string())?;
         let (v, j) = (self.num_vertices(), self.num_joints());
@@ -91,7 +94,7 @@ impl BodyModel {
             }
         }
         let written = write(path, &[(FORMAT.0, FORMAT.1.to_owned())].into(), tensors);
-        written.map_err(|source| FileError::Io { path: path.to_owned(), source }.into())
+        written.map_err(|source| Error::Io { path: path.to_owned(), source })
     }
 }
 
@@ -107,17 +110,17 @@ fn kind(bytes: &[u8]) -> Option<&'static str> {
 }
 
 /// The array under `key` of the model's dictionary, made dense.
-fn from_pickle(file: &str, value: &Value, key: &str) -> Result<NdArray, FileError> {
+fn from_pickle(file: &str, value: &Value, key: &str) -> Result<NdArray, Error> {
     let Value::Dict(entries) = value else {
-        return Err(FileError::invalid(file, "", format!("{}, expected a dictionary", value.type_name())));
+        return Err(Error::invalid(file, "", format!("{}, expected a dictionary", value.type_name())));
     };
     let present = || entries.iter().filter_map(|(key, _)| key.as_str());
-    let found = value.get(key).ok_or_else(|| FileError::missing(file, key, present()))?;
-    let other = || FileError::invalid(file, key, format!("{}, expected an array", found.type_name()));
+    let found = value.get(key).ok_or_else(|| Error::missing(file, key, present()))?;
+    let other = || Error::invalid(file, key, format!("{}, expected an array", found.type_name()));
     found.to_dense(file, key)?.ok_or_else(other)
 }
 
-fn build(file: &str, mut array: impl FnMut(&str) -> Result<NdArray, FileError>) -> Result<BodyModel, Error> {
+fn build(file: &str, mut array: impl FnMut(&str) -> Result<NdArray, Error>) -> Result<BodyModel, Error> {
     let v_template = array("v_template")?.to_f32(file, "v_template", &[None, Some(3)])?;
     let v = v_template.len() / 3;
 
@@ -200,7 +203,7 @@ pub(crate) fn parse_saved(file: &str, bytes: &[u8]) -> Result<BodyModel, Error> 
     let vectors = |key: &str, pattern: &[Option<usize>]| -> Result<Vec<Vec3>, Error> {
         Ok(source.read::<f32>(key, pattern)?.chunks_exact(3).map(Vec3::from_slice).collect())
     };
-    let floats = |key: &str| Ok(source.read::<f32>(key, &[None])?);
+    let floats = |key: &str| source.read::<f32>(key, &[None]);
     let v_template = vectors("v_template", &[None, Some(3)])?;
     let v = v_template.len();
     let parents = source.read::<i64>("parents", &[None])?;

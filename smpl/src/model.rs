@@ -199,7 +199,7 @@ impl BodyModel {
 pub(crate) fn check_vectors(file: &str, key: &str, values: &[Vec3]) -> Result<(), Error> {
     for (i, v) in values.iter().enumerate() {
         if !v.is_finite() {
-            return Err(Error::not_finite(file, key, 3 * i));
+            return Err(Error::invalid(file, key, format!("not finite at flat index {}", 3 * i)));
         }
         if v.abs().max_element() > MAX_COORDINATE {
             let message = format!("{v} at row {i}, expected coordinates of at most {MAX_COORDINATE}");

@@ -120,18 +120,6 @@ impl BodyModel {
         Posed { vertices, joints: frame.joints, bones: frame.bones, pose_offsets }
     }
 
-    /// B_P of vertex `v`.
-    #[inline(always)]
-    fn offset(&self, v: usize, features: &[f32]) -> Vec3 {
-        self.posedirs.row(v).fold(Vec3::ZERO, |sum, (term, direction)| sum + features[term] * direction)
-    }
-
-    /// Σ w_i · bones_i · rest for vertex `v`.
-    #[inline(always)]
-    fn skin(&self, v: usize, bones: &[Affine3A], rest: Vec3) -> Vec3 {
-        blend(bones, self.weights.row(v)).transform_point3a(Vec3A::from(rest)).into()
-    }
-
     fn kinematics(&self, shaped: &Shaped, pose: &[Vec3], placement: Placement) -> Kinematics {
         let joints = self.num_joints();
         assert_eq!(pose.len(), joints, "pose: rotations of joints");
@@ -208,13 +196,15 @@ impl pulp::NullaryFnOnce for OneFrame<'_> {
                 self.offsets[i..i + GROUP].copy_from_slice(&dense_offsets(values, features));
                 i += GROUP;
             } else {
-                self.offsets[i] = self.body.offset(self.start + i, features);
+                let row = self.body.posedirs.row(self.start + i);
+                self.offsets[i] = row.fold(Vec3::ZERO, |sum, (term, by)| sum + features[term] * by);
                 i += 1;
             }
         }
         for (i, (vertex, offset)) in self.vertices.iter_mut().zip(self.offsets).enumerate() {
             let v = self.start + i;
-            *vertex = self.body.skin(v, &self.frame.bones, self.rest[v] + *offset);
+            let bone = blend(&self.frame.bones, self.body.weights.row(v));
+            *vertex = bone.transform_point3a(Vec3A::from(self.rest[v] + *offset)).into();
         }
     }
 }

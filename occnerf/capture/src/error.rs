@@ -20,13 +20,10 @@ pub enum CaptureError {
         /// The codec's reason.
         source: image::ImageError,
     },
-    /// A pickle or array file is truncated or malformed, or an array in it has the wrong type or
-    /// shape.
+    /// A pickle, array file or body model is truncated or malformed, or an array in it has the wrong
+    /// type or shape.
     #[error(transparent)]
     Array(#[from] array_files::Error),
-    /// A body model cannot be read.
-    #[error(transparent)]
-    Body(#[from] smpl::Error),
     /// A file that the layout demands is absent.
     #[error("{}: missing {what}", path.display())]
     Missing {

@@ -159,7 +159,7 @@ impl Person {
     /// Reads the files that [`Person::save`] wrote into the directory `run`.
     ///
     /// # Errors
-    /// [`Error::Io`], [`Error::Body`], [`Error::Array`] and [`Error::File`] for files that are missing or damaged.
+    /// [`Error::Io`], [`Error::Array`] and [`Error::File`] for files that are missing or damaged.
     pub fn load(run: &Path, config: &Config) -> Result<Self, Error> {
         let path = run.join(PERSON);
         if !path.is_file() {
@@ -192,7 +192,7 @@ impl Model {
     /// Reads the model of the run directory `run`, without the capture and the optimiser's moments.
     ///
     /// # Errors
-    /// [`Error::Io`], [`Error::Body`], [`Error::Array`] and [`Error::File`] for files that are missing or damaged.
+    /// [`Error::Io`], [`Error::Array`] and [`Error::File`] for files that are missing or damaged.
     pub fn load(run: &Path) -> Result<Self, Error> {
         let path = run.join(CHECKPOINT);
         let bytes = read(&path)?;

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use glam::{Mat3A, Vec3};
-use smpl::{MotionField, SurfaceMotion, WeightVolume, WeightVolumeConfig};
+use smpl::{MotionField, SurfaceMotion, WeightVolume};
 use visibility::VisibilityCounts;
 use volrender::{Occupancy, OccupancyConfig};
 
@@ -64,8 +64,7 @@ impl Model {
         let motion = match config.motion.kind {
             MotionKind::Surface => MotionField::Surface(surface_motion(&config.motion)),
             MotionKind::Volume => {
-                let layout = WeightVolumeConfig { resolution: config.motion.resolution, ..Default::default() };
-                let weights = WeightVolume::gaussian(&body.model, &body.canonical, &layout);
+                let weights = WeightVolume::gaussian(&body.model, &body.canonical, config.motion.resolution);
                 MotionField::Volume { weights, threshold: VOLUME_THRESHOLD }
             }
         };

@@ -103,10 +103,18 @@ impl NdArray {
     }
 
     fn check_shape(&self, file: &str, key: &str, pattern: &[Option<usize>]) -> Result<(), Error> {
-        let fits = |(&extent, expected): (&usize, &Option<usize>)| expected.is_none_or(|n| n == extent);
-        if self.shape.len() == pattern.len() && self.shape.iter().zip(pattern).all(fits) {
-            return Ok(());
-        }
-        Err(Error::shape(file, key, &self.shape, pattern))
+        let fault = || Error::invalid(file, key, format!("shape {:?}, expected {}", self.shape, shown(pattern)));
+        if fits(&self.shape, pattern) { Ok(()) } else { Err(fault()) }
     }
+}
+
+/// Whether a shape has the extents of `pattern` (`None`: any).
+pub(crate) fn fits(shape: &[usize], pattern: &[Option<usize>]) -> bool {
+    shape.len() == pattern.len() && shape.iter().zip(pattern).all(|(extent, n)| n.is_none_or(|n| n == *extent))
+}
+
+/// The pattern of a shape as errors show it, such as `[6890, _]`.
+pub(crate) fn shown(pattern: &[Option<usize>]) -> String {
+    let extents: Vec<String> = pattern.iter().map(|n| n.map_or("_".to_owned(), |n| n.to_string())).collect();
+    format!("[{}]", extents.join(", "))
 }

@@ -2,11 +2,11 @@
 
 use std::path::{Path, PathBuf};
 
-/// A file that cannot be read, or an array in it that does not fit its use.
+/// A file that cannot be read or written, or an array or part of it that does not fit its use.
 ///
-/// `file` is the path as given, or the name passed along with bytes in memory; `key` is the name of
-/// the array, empty for the file as a whole. Control characters are escaped, so that a message is a
-/// single line.
+/// `file` is the path as given, or the name passed along with bytes in memory; `key` is the array,
+/// part or line, empty for the file as a whole. Control characters are escaped, so that a message is
+/// a single line.
 ///
 /// ```
 /// use array_files::{Error, pickle};
@@ -29,7 +29,7 @@ pub enum Error {
     },
     /// A missing array, one of another type or shape than expected, with values that are not finite
     /// or parts that contradict each other, or one larger than the reader's limit, which is found
-    /// before the memory is allocated.
+    /// before the memory is allocated. Also malformed safetensors, and what other crates read.
     #[error("{file}: {}{message}", prefix(key))]
     Invalid {
         /// The file.
@@ -71,12 +71,6 @@ impl Error {
     pub fn missing<S: AsRef<str>>(file: &str, key: &str, present: impl IntoIterator<Item = S>) -> Self {
         let present: Vec<String> = present.into_iter().map(|name| name.as_ref().escape_debug().to_string()).collect();
         Self::invalid(file, key, format!("missing, the file holds {}", present.join(", ")))
-    }
-
-    /// [`Error::Invalid`] for an array of another shape than `pattern` (`None`: any extent).
-    pub fn shape(file: &str, key: &str, shape: &[usize], pattern: &[Option<usize>]) -> Self {
-        let extents: Vec<String> = pattern.iter().map(|p| p.map_or("_".to_owned(), |n| n.to_string())).collect();
-        Self::invalid(file, key, format!("shape {shape:?}, expected [{}]", extents.join(", ")))
     }
 
     /// [`Error::Invalid`] for content that needs more bytes than `limit`.

@@ -28,6 +28,7 @@ use safetensors::tensor::{Dtype, SafeTensors};
 use serde_json::json;
 
 use crate::Error;
+use crate::array::{fits, shown};
 
 /// An element of a tensor.
 ///
@@ -196,10 +197,8 @@ impl<'a> Tensors<'a> {
         };
         let view = self.tensors.tensor(key).map_err(|_| missing())?;
         let (dtype, shape) = (view.dtype(), view.shape());
-        let fits = |(extent, expected): (&usize, &Option<usize>)| expected.is_none_or(|n| n == *extent);
-        if dtype != T::DTYPE || shape.len() != pattern.len() || !shape.iter().zip(pattern).all(fits) {
-            let extents: Vec<String> = pattern.iter().map(|p| p.map_or("_".to_owned(), |n| n.to_string())).collect();
-            let expected = format!("{:?} [{}]", T::DTYPE, extents.join(", "));
+        if dtype != T::DTYPE || !fits(shape, pattern) {
+            let expected = format!("{:?} {}", T::DTYPE, shown(pattern));
             return Err(Error::invalid(&self.file, key, format!("{dtype:?} {shape:?}, expected {expected}")));
         }
         Ok(view.data().chunks_exact(size_of::<T>()).map(T::read).collect())

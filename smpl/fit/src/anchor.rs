@@ -6,11 +6,10 @@ use smpl::BodyModel;
 /// A point of a body: a weighted sum of its joints and vertices, weights summing to 1.
 ///
 /// ```
-/// use glam::Vec3;
 /// use point_fit::Anchor;
-/// let body = smpl::BodyModel::embedded();
-/// let nose = Anchor::farthest(&body, 15, Vec3::Z); // of the head's vertices the one in front
-/// assert!(body.v_template[nose.vertices[0].0].z > 0.1);
+/// let middle = Anchor { joints: vec![(1, 0.5), (2, 0.5)], ..Anchor::default() }; // of the hips
+/// let marker = Anchor { vertices: vec![(4000, 1.0)], ..Anchor::default() };
+/// assert!(middle != marker && Anchor::joint(1).joints == [(1, 1.0)]);
 /// ```
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Anchor {
@@ -28,10 +27,8 @@ impl Anchor {
     }
 
     /// The template's vertex farthest in `direction` of those that `joint` and its descendants move
-    /// most: nose, heels, toes and fingertips of any body with the same skeleton. The first of equals;
-    /// vertex 0 of a body where they move none.
-    #[must_use]
-    pub fn farthest(body: &BodyModel, joint: usize, direction: Vec3) -> Self {
+    /// most, the first of equals; vertex 0 of a body where they move none.
+    fn farthest(body: &BodyModel, joint: usize, direction: Vec3) -> Self {
         let mut below = vec![false; body.num_joints()];
         for (j, parent) in body.parents.iter().enumerate() {
             below[j] = j == joint || parent.is_some_and(|p| below[p]);

@@ -110,15 +110,14 @@ pub struct Grounded {
 /// ```
 ///
 /// # Errors
-/// [`FitError::Legs`] names joints that the skeleton lacks by name, and bones without length;
-/// [`FitError::Frames`] of more than 100 000 frames.
+/// Names joints that the skeleton lacks by name, and bones without length; for more than 100 000 frames.
 ///
 /// # Panics
 /// If the motion is not of the skeleton's joints.
 pub fn ground(skeleton: &[Joint], motion: &MotionClip, sole: f32) -> Result<Grounded, FitError> {
     assert_eq!(motion.poses.len(), skeleton.len() * motion.num_frames(), "ground: rotations of joints");
     if motion.num_frames() > FRAMES {
-        return Err(FitError::Frames { most: FRAMES, found: motion.num_frames() });
+        return Err(FitError(format!("expected at most {FRAMES} frames, found {}", motion.num_frames())));
     }
     let legs = Legs::new(skeleton, sole)?;
     let root = skeleton[0].rest.as_dvec3();
@@ -184,7 +183,7 @@ impl Legs {
             let find = |part: &str| {
                 let name = format!("{side}_{part}");
                 let found = names.iter().position(|at| at.as_deref() == Some(&name));
-                found.ok_or_else(|| FitError::Legs(format!("no joint by name for {}", name.replace('_', " "))))
+                found.ok_or_else(|| FitError(format!("no joint by name for {}", name.replace('_', " "))))
             };
             let [hip, knee, ankle, toe] = [find("hip")?, find("knee")?, find("ankle")?, find("foot")?];
             for (upper, lower) in [(hip, knee), (knee, ankle), (ankle, toe)] {
@@ -192,7 +191,7 @@ impl Legs {
                 // Also for NaN.
                 if !(1e-3..=1e3).contains(&length) || parents[lower] != Some(upper) {
                     let [upper, lower] = [upper, lower].map(|j| &joints[j].name);
-                    return Err(FitError::Legs(format!("expected a bone from {upper} to {lower}, {length} m long")));
+                    return Err(FitError(format!("expected a bone from {upper} to {lower}, {length} m long")));
                 }
             }
             for joint in [hip, knee, ankle] {

@@ -123,50 +123,18 @@ pub struct FittedFrame {
     pub swapped: bool,
 }
 
-/// Input of [`fit`] or [`ground`] that has no solution.
+/// Input of [`fit`] or [`ground`] that has no solution: what was expected, and found.
 ///
 /// ```
-/// use point_fit::{Anchor, FitError, fit};
+/// use point_fit::{Anchor, fit};
 ///
 /// let body = smpl::BodyModel::embedded();
 /// let error = fit(&body, &[Anchor::joint(0)], &[glam::Vec3::ZERO; 2]).unwrap_err();
-/// assert_eq!(error, FitError::Unseen(1));
 /// assert_eq!(error.to_string(), "expected a frame with 4 finite points or more, found at most 1");
 /// ```
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
-#[non_exhaustive]
-pub enum FitError {
-    /// An anchor without joints and vertices, beyond the body's, or with weights that do not sum to 1.
-    #[error("anchor {anchor}: expected weights of the body's joints and vertices that sum to 1, found {found}")]
-    Anchor {
-        /// Index of the anchor.
-        anchor: usize,
-        /// Its fault.
-        found: String,
-    },
-    /// A number of points that is no multiple of the anchors'.
-    #[error("expected points of whole frames, {anchors} each, found {points} points")]
-    Count {
-        /// Anchors.
-        anchors: usize,
-        /// Points.
-        points: usize,
-    },
-    /// Legs that no motion can be grounded by: its reason.
-    #[error("{0}")]
-    Legs(String),
-    /// A motion too long to be held in memory.
-    #[error("expected at most {most} frames, found {found}")]
-    Frames {
-        /// Limit.
-        most: usize,
-        /// Frames of the motion.
-        found: usize,
-    },
-    /// No frame has enough points.
-    #[error("expected a frame with {LEAST} finite points or more, found at most {0}")]
-    Unseen(usize),
-}
+#[error("{0}")]
+pub struct FitError(String);
 
 /// Fits a body to `seen`, (T, P) points, P of each frame in the order of `anchors`. Points that are not
 /// finite, or farther than 100 km, are missing.
@@ -175,18 +143,20 @@ pub enum FitError {
 /// [`BodyModel::with_limb_lengths`].
 ///
 /// # Errors
-/// [`FitError`]; [`FitError::Unseen`] of 0 for no frames.
+/// For an anchor without joints and vertices, beyond the body's, or with weights that do not sum to 1;
+/// points that are no multiple of the anchors; frames of fewer than four points each.
 pub fn fit(body: &BodyModel, anchors: &[Anchor], seen: &[Vec3]) -> Result<Fitted, FitError> {
     anchors.iter().enumerate().try_for_each(|(i, anchor)| check(body, i, anchor))?;
     let count = anchors.len();
     if count == 0 || !seen.len().is_multiple_of(count) {
-        return Err(FitError::Count { anchors: count, points: seen.len() });
+        let found = seen.len();
+        return Err(FitError(format!("expected points of whole frames, {count} each, found {found} points")));
     }
     let point = |p: &Vec3| Some(p.as_dvec3()).filter(|p| p.abs().cmple(DVec3::splat(FAR)).all()).unwrap_or(DVec3::NAN);
     let mut seen: Vec<Vec<DVec3>> = seen.chunks(count).map(|frame| frame.iter().map(point).collect()).collect();
     let most = seen.iter().map(|frame| visible(frame)).max().unwrap_or(0);
     if most < LEAST {
-        return Err(FitError::Unseen(most));
+        return Err(FitError(format!("expected a frame with {LEAST} finite points or more, found at most {most}")));
     }
     let skeleton = Skeleton::new(body, anchors, body.num_betas().min(BETAS));
     let swapped = swaps::undo(&skeleton, &mut seen);
@@ -253,7 +223,8 @@ fn guesses(skeleton: &Skeleton, shape: &Shape, seen: &[Vec<DVec3>]) -> Vec<State
 }
 
 fn check(body: &BodyModel, i: usize, anchor: &Anchor) -> Result<(), FitError> {
-    let fault = |found: String| Err(FitError::Anchor { anchor: i, found });
+    let expected = "weights of the body's joints and vertices that sum to 1";
+    let fault = |found: String| Err(FitError(format!("anchor {i}: expected {expected}, found {found}")));
     for (what, parts, most) in
         [("joint", &anchor.joints, body.num_joints()), ("vertex", &anchor.vertices, body.num_vertices())]
     {

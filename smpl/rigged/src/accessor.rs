@@ -78,7 +78,7 @@ impl<'a> Source<'a> {
         for (i, buffer) in root.buffers.iter().enumerate() {
             let place = format!("buffer {i}");
             let bytes = match &buffer.uri {
-                Some(uri) => source.resolve(&place, uri)?.1,
+                Some(uri) => source.resolve(&place, uri)?,
                 None if is_fallback(buffer) => {
                     source.data.push(Vec::new());
                     continue;
@@ -234,16 +234,15 @@ impl<'a> Source<'a> {
         })
     }
 
-    /// Media type and bytes of a data URI, or of a file in the folder. URIs that leave the folder
-    /// are refused.
-    pub(crate) fn resolve(&self, place: &str, uri: &str) -> Result<(String, Vec<u8>), Error> {
+    /// Bytes of a data URI, or of a file in the folder. URIs that leave the folder are refused.
+    pub(crate) fn resolve(&self, place: &str, uri: &str) -> Result<Vec<u8>, Error> {
         if let Some(rest) = uri.strip_prefix("data:") {
-            let Some((mime, text)) = rest.split_once(";base64,") else {
+            let Some((_, text)) = rest.split_once(";base64,") else {
                 return Err(self.invalid(place, "a data URI that is not base64"));
             };
             self.spend(place, text.len() as u64 / 4 * 3)?;
             let bytes = base64::engine::general_purpose::STANDARD.decode(text);
-            return Ok((mime.to_owned(), bytes.map_err(|e| self.invalid(place, e.to_string()))?));
+            return bytes.map_err(|e| self.invalid(place, e));
         }
         let decoded = percent_decoded(uri);
         let path = Path::new(&decoded);
@@ -253,7 +252,7 @@ impl<'a> Source<'a> {
                 let path = folder.join(path);
                 // Before it is read.
                 self.spend(place, std::fs::metadata(&path).map_or(0, |file| file.len()))?;
-                Ok((String::new(), read_file(&path)?))
+                read_file(&path)
             }
             _ => Err(self.invalid(place, format!("the URI {uri:?} does not name a file beside it"))),
         }
@@ -269,13 +268,13 @@ impl<'a> Source<'a> {
         Ok(())
     }
 
-    pub(crate) fn invalid(&self, place: &str, message: impl Into<String>) -> Error {
+    pub(crate) fn invalid(&self, place: &str, message: impl ToString) -> Error {
         Error::invalid(self.file, place, message)
     }
 }
 
 fn too_large(file: &str, place: &str, claimed: u128, limit: u64) -> Error {
-    array_files::Error::too_large(file, place, claimed, limit).into()
+    Error::too_large(file, place, claimed, limit)
 }
 
 /// A URI with its %XX replaced by their bytes.

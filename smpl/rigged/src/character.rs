@@ -15,8 +15,6 @@ use smpl::SparseRows;
 pub struct Character {
     /// Vertices in bind space, as in the file, (V).
     pub vertices: Vec<Vec3>,
-    /// Normals in bind space, (V); empty if any primitive has none.
-    pub normals: Vec<Vec3>,
     /// Texture coordinates, (V), v downward; zero for primitives without, empty if none has any.
     pub uvs: Vec<Vec2>,
     /// Index into [`Character::textures`] of each vertex, (V); `None` without texture or coordinates.
@@ -50,8 +48,6 @@ pub struct Character {
 /// An encoded image, of [`Character::textures`].
 #[derive(Clone, Debug, PartialEq)]
 pub struct Texture {
-    /// Media type, usually `image/png` or `image/jpeg`; empty if the file does not state it.
-    pub mime: String,
     /// The encoded bytes.
     pub bytes: Vec<u8>,
     /// Index in the document.
@@ -63,9 +59,8 @@ pub struct Texture {
 pub struct CharacterPose {
     /// Vertices, (V).
     pub vertices: Vec<Vec3>,
-    /// Joint frames, (J).
-    pub joints: Vec<Affine3A>,
-    /// joints · inverse bind, (J): vertex v is at Σ w_vi · bones_i · vertices_v.
+    /// World transforms of the joints times inverse bind matrices, (J): vertex v is at Σ w_vi · bones_i
+    /// · vertices_v.
     pub bones: Vec<Affine3A>,
 }
 
@@ -135,9 +130,9 @@ impl Character {
             let local = locals[node].matrix();
             world[node] = self.nodes[node].parent.map_or(local, |parent| world[parent] * local);
         }
-        let joints: Vec<Affine3A> = self.joint_nodes.iter().map(|&node| world[node]).collect();
-        let bones: Vec<Affine3A> = joints.iter().zip(&self.inverse_bind).map(|(joint, bind)| *joint * *bind).collect();
-        CharacterPose { vertices: self.skin(&bones), joints, bones }
+        let joints = self.joint_nodes.iter().zip(&self.inverse_bind);
+        let bones: Vec<Affine3A> = joints.map(|(&node, bind)| world[node] * *bind).collect();
+        CharacterPose { vertices: self.skin(&bones), bones }
     }
 }
 

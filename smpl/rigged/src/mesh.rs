@@ -54,10 +54,11 @@ pub fn load_mesh(path: &Path) -> Result<Mesh, Error> {
             let body = BodyModel::load(path)?;
             Ok(Mesh { vertices: body.v_template, faces: body.faces })
         }
-        _ => Err(Error::Extension {
-            path: path.to_owned(),
-            expected: ".obj, .glb, .gltf, .vrm, .npz, .pkl or .safetensors",
-        }),
+        _ => {
+            let kinds = ".obj, .glb, .gltf, .vrm, .npz, .pkl or .safetensors";
+            let message = format!("unknown kind of file (expected {kinds})");
+            Err(Error::invalid(&path.display().to_string(), "", message))
+        }
     }
 }
 

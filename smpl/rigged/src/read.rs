@@ -81,9 +81,6 @@ fn read(file: &str, bytes: &[u8], folder: Option<&Path>) -> Result<Character, Er
         return Err(Error::invalid(file, "meshes", "no triangles in the scene"));
     }
     out.wind();
-    if out.normals.len() != out.vertices.len() {
-        out.normals.clear();
-    }
     if !out.uvs.is_empty() {
         out.uvs.resize(out.vertices.len(), Vec2::ZERO);
     }
@@ -344,11 +341,6 @@ impl Character {
         let fits = |n: usize, name: &str| {
             if n == count { Ok(()) } else { Err(invalid(format!("{n} {name} for {count} positions"))) }
         };
-        if let Some(normals) = attribute(Semantic::Normals) {
-            let normals = source.floats::<3>(normals, &format!("{place}, NORMAL"))?;
-            fits(normals.len(), "NORMAL")?;
-            self.normals.extend(normals.into_iter().map(Vec3::from));
-        }
         let material = primitive.material.map(|index| source.get(&source.root.materials, index, place)).transpose()?;
         let base = material.map(|material| &material.pbr_metallic_roughness);
         let factor = base.map_or(Vec4::ONE, |base| Vec4::from(base.base_color_factor.0));
@@ -444,17 +436,16 @@ impl Character {
         }
         let image = source.get(&root.images, index, place)?;
         let place = format!("image {index}");
-        let (found, bytes) = match (image.buffer_view, &image.uri) {
+        let bytes = match (image.buffer_view, &image.uri) {
             (Some(view), _) => {
                 let bytes = source.view(view, &place)?.1;
                 source.spend(&place, bytes.len() as u64)?;
-                (String::new(), bytes.to_vec())
+                bytes.to_vec()
             }
             (None, Some(uri)) => source.resolve(&place, uri)?,
             (None, None) => return Err(source.invalid(&place, "neither a URI nor a buffer view")),
         };
-        let mime = image.mime_type.as_ref().map_or(found, |mime| mime.0.clone());
-        self.textures.push(Texture { mime, bytes, image: index.value() });
+        self.textures.push(Texture { bytes, image: index.value() });
         Ok(self.textures.len() as u32 - 1)
     }
 

@@ -60,7 +60,7 @@ impl Bvh {
     /// `OFFSET`. Positions of other joints are passed over: bones keep their lengths.
     ///
     /// # Errors
-    /// [`Error::File`]; [`Error::Invalid`] with the line, for broken hierarchies, numbers that are
+    /// [`Error::Io`]; [`Error::Invalid`] with the line, for broken hierarchies, numbers that are
     /// none, not finite or beyond 10⁶, more or fewer values than frames times channels, more than 1024
     /// joints or 2²⁴ rotations, and a skeleton without extent.
     pub fn load(path: &Path) -> Result<Self, Error> {
@@ -73,7 +73,7 @@ impl Bvh {
     ///
     /// # Errors
     /// [`Error::Invalid`] for a skeleton whose joints do not come after their parents, or of another
-    /// number of joints than the motion's; [`Error::File`].
+    /// number of joints than the motion's; [`Error::Io`].
     pub fn save(&self, path: &Path) -> Result<(), Error> {
         let (file, j) = (path.display().to_string(), self.skeleton.len());
         let ordered = |(at, joint): (usize, &Joint)| joint.parent.map_or(at == 0, |parent| usize::from(parent) < at);
@@ -99,7 +99,7 @@ impl Bvh {
             }
             Ok(())
         });
-        replaced.map_err(|source| Error::File(array_files::Error::Io { path: path.to_owned(), source }))
+        replaced.map_err(|source| Error::Io { path: path.to_owned(), source })
     }
 
     /// The hierarchy, depth first; `order` takes the joints as they are written.
@@ -317,7 +317,7 @@ impl<'a, I: Iterator<Item = (usize, &'a str)>> Parser<'a, I> {
         self.fault(format!("expected {expected}, found {found:?}"))
     }
 
-    fn fault(&self, message: impl Into<String>) -> Error {
+    fn fault(&self, message: impl ToString) -> Error {
         Error::invalid(&self.file, &format!("line {}", self.line), message)
     }
 }

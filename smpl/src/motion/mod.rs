@@ -4,7 +4,7 @@ mod volume;
 
 use glam::{Affine3A, Vec3};
 
-pub use volume::{WeightVolume, WeightVolumeConfig};
+pub use volume::WeightVolume;
 
 use crate::model::BodyModel;
 use crate::pose::{Posed, blend};
@@ -13,11 +13,11 @@ use crate::pose::{Posed, blend};
 ///
 /// ```
 /// use glam::Affine3A;
-/// use smpl::{BodyModel, WeightVolume, WeightVolumeConfig};
+/// use smpl::{BodyModel, WeightVolume};
 ///
 /// let body = BodyModel::embedded();
 /// let shaped = body.shaped(&[]);
-/// let volume = WeightVolume::gaussian(&body, &shaped, &WeightVolumeConfig::default());
+/// let volume = WeightVolume::gaussian(&body, &shaped, 32);
 /// let points = [shaped.joints[1].midpoint(shaped.joints[4]), shaped.joints[4]]; // thigh and knee
 /// let [thigh, knee] = points.map(|point| volume.map(&[Affine3A::IDENTITY; 24], point, 1e-3).unwrap());
 /// assert!(thigh.canonical.distance(points[0]) < 1e-5 && thigh.likelihood > 2.0 * knee.likelihood);

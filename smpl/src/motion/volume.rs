@@ -12,35 +12,11 @@ const BACKGROUND_FLOOR: f32 = 1e-3;
 /// joints.
 const GAUSSIAN_CUT: f32 = 1e-4;
 
-/// Layout and prior of a [`WeightVolume`]. Lengths are in the unit of the model; the defaults fit
-/// metres.
-///
-/// ```
-/// use smpl::{BodyModel, WeightVolume, WeightVolumeConfig};
-///
-/// let (body, config) = (BodyModel::embedded(), WeightVolumeConfig { resolution: 8, ..Default::default() });
-/// let shaped = body.shaped(&[]);
-/// let volume = WeightVolume::gaussian(&body, &shaped, &config);
-/// assert_eq!(volume.weights.len(), (24 + 1) * 8 * 8 * 8);
-/// let top = shaped.vertices.iter().map(|v| v.y).fold(f32::MIN, f32::max);
-/// assert_eq!(volume.max.y, top + config.across);
-/// ```
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct WeightVolumeConfig {
-    /// Samples per axis, at least 2. 32 is the paper's.
-    pub resolution: usize,
-    /// Standard deviation of a Gaussian along its bone, as a fraction of the bone's length.
-    pub along: f32,
-    /// Standard deviation of a Gaussian across its bone. The box is that much larger than the
-    /// body's on every side.
-    pub across: f32,
-}
-
-impl Default for WeightVolumeConfig {
-    fn default() -> Self {
-        Self { resolution: 32, along: 0.18, across: 0.09 }
-    }
-}
+/// Standard deviation of a Gaussian along its bone, as a fraction of the bone's length.
+const ALONG: f32 = 0.18;
+/// Standard deviation of a Gaussian across its bone, metres. The box is that much larger than the
+/// body's on every side.
+const ACROSS: f32 = 0.09;
 
 /// Motion field of learnable weights on a grid in canonical space.
 ///
@@ -53,11 +29,12 @@ impl Default for WeightVolumeConfig {
 /// come apart until Δ has filled the holes. [`super::SurfaceMotion`] has none.
 ///
 /// ```
-/// use smpl::{BodyModel, Placement, WeightVolume, WeightVolumeConfig};
+/// use smpl::{BodyModel, Placement, WeightVolume};
 ///
 /// let body = BodyModel::embedded();
 /// let shaped = body.shaped(&[]);
-/// let volume = WeightVolume::gaussian(&body, &shaped, &WeightVolumeConfig::default());
+/// let volume = WeightVolume::gaussian(&body, &shaped, 32);
+/// assert_eq!(volume.weights.len(), (24 + 1) * 32 * 32 * 32);
 /// let posed = body.pose(&shaped, &vec![glam::Vec3::ZERO; 24], Placement::default());
 /// let thigh = shaped.joints[1].midpoint(shaped.joints[4]);
 /// let sample = volume.map(&posed.to_canonical(), thigh, 1e-3).unwrap();
@@ -101,14 +78,15 @@ struct Cell {
 impl WeightVolume {
     /// The paper's prior: bone i, from joint i to each of its children (leaves: to twice the mean
     /// of their own vertices), is an oriented Gaussian g_i; the background is 1 − min(Σ g, 1).
+    /// `resolution` samples per axis: 32 are the paper's. The model is in metres.
     ///
     /// # Panics
     /// If the resolution is below 2, or `shaped` is not of `model`.
-    pub fn gaussian(model: &BodyModel, shaped: &Shaped, config: &WeightVolumeConfig) -> Self {
-        let n = config.resolution;
+    pub fn gaussian(model: &BodyModel, shaped: &Shaped, resolution: usize) -> Self {
+        let n = resolution;
         assert!(n >= 2, "weight volume: resolution {n}, need at least 2");
-        let min = shaped.vertices.iter().copied().fold(Vec3::INFINITY, Vec3::min) - config.across;
-        let max = shaped.vertices.iter().copied().fold(Vec3::NEG_INFINITY, Vec3::max) + config.across;
+        let min = shaped.vertices.iter().copied().fold(Vec3::INFINITY, Vec3::min) - ACROSS;
+        let max = shaped.vertices.iter().copied().fold(Vec3::NEG_INFINITY, Vec3::max) + ACROSS;
         let cell = (max - min) / (n - 1) as f32;
         let (samples, joints) = (n.pow(3), model.num_joints());
         let mut prior = vec![0.0f32; samples * (joints + 1)];
@@ -120,7 +98,7 @@ impl WeightVolume {
             if ends.is_empty() {
                 ends.push(2.0 * own_centre(model, shaped, joint) - start);
             }
-            let bones: Vec<Gaussian> = ends.iter().map(|&end| Gaussian::new(start, end, config)).collect();
+            let bones: Vec<Gaussian> = ends.iter().map(|&end| Gaussian::new(start, end)).collect();
             for (i, value) in channel.iter_mut().enumerate() {
                 let x = min + Vec3::new((i % n) as f32, (i / n % n) as f32, (i / (n * n)) as f32) * cell;
                 let g: f32 = bones.iter().map(|g| g.value(x)).sum();
@@ -133,26 +111,17 @@ impl WeightVolume {
         for value in background {
             *value = (1.0 - value.min(1.0)).max(BACKGROUND_FLOOR);
         }
-        Self::from_prior(n, min, max, &prior)
-    }
-
-    /// Builds a volume from a prior, (K+1, n, n, n), whose channels sum to 1 at every sample.
-    fn from_prior(resolution: usize, min: Vec3, max: Vec3, prior: &[f32]) -> Self {
-        let samples = resolution.pow(3);
-        let channels = prior.len() / samples;
         let log_prior: Vec<f32> = prior.iter().map(|p| p.ln()).collect();
-        let support = (log_prior.chunks_exact(samples).take(channels - 1))
-            .map(|channel| Support::of(channel, resolution))
-            .collect();
+        let bones = log_prior.chunks_exact(samples).take(joints);
         let mut volume = Self {
-            resolution,
+            resolution: n,
             min,
             max,
-            channels,
-            delta: vec![0.0; log_prior.len()],
-            weights: vec![0.0; log_prior.len()],
+            channels: joints + 1,
+            delta: vec![0.0; prior.len()],
+            weights: vec![0.0; prior.len()],
+            support: bones.map(|channel| Support::of(channel, n)).collect(),
             log_prior,
-            support,
         };
         volume.update();
         volume
@@ -270,20 +239,15 @@ impl WeightVolume {
         for (bone, transform) in to_canonical.iter().enumerate() {
             let y = transform.transform_point3a(point);
             let Some(cell) = self.cell(bone, y) else { continue };
-            let w = self.sample(&self.weights[bone * samples..][..samples], &cell);
+            let channel = &self.weights[bone * samples..][..samples];
+            let mut w = 0.0;
+            for (corner, mix) in self.corners(cell.corner).into_iter().zip(cell.mix) {
+                w += mix * channel[corner];
+            }
             sum += w;
             mean += w * y;
         }
         (sum, mean)
-    }
-
-    #[inline(always)]
-    fn sample(&self, channel: &[f32], cell: &Cell) -> f32 {
-        let mut w = 0.0;
-        for (corner, mix) in self.corners(cell.corner).into_iter().zip(cell.mix) {
-            w += mix * channel[corner];
-        }
-        w
     }
 
     /// Flat indices of a cell's corners, x fastest.
@@ -344,15 +308,14 @@ struct Gaussian {
 }
 
 impl Gaussian {
-    fn new(start: Vec3, end: Vec3, config: &WeightVolumeConfig) -> Self {
+    fn new(start: Vec3, end: Vec3) -> Self {
         let direction = (end - start).normalize_or(Vec3::Y);
         let (u, v) = direction.any_orthonormal_pair();
         // Short bones (pelvis to hips) would otherwise be sheets.
-        let along = (config.along * start.distance(end)).max(0.5 * config.across);
-        let across = config.across;
+        let along = (ALONG * start.distance(end)).max(0.5 * ACROSS);
         Self {
             centre: start.midpoint(end),
-            whiten: Mat3::from_cols(direction / along, u / across, v / across).transpose(),
+            whiten: Mat3::from_cols(direction / along, u / ACROSS, v / ACROSS).transpose(),
         }
     }
 

@@ -5,8 +5,8 @@ use std::path::{Path, PathBuf};
 use std::sync::LazyLock;
 
 use glam::Vec3;
-use smpl::{BodyModel, Error, Placement};
-use testkit::files::{npy, zip};
+use smpl::{BodyModel, Placement};
+use testkit::files::{npy, shared, zip};
 
 fn temporary(name: &str) -> PathBuf {
     Path::new(env!("CARGO_TARGET_TMPDIR")).join(name)
@@ -201,5 +201,14 @@ fn missing_and_misshapen_arrays_of_a_model_are_named() {
         let error = BodyModel::load(&written(&format!("missing{i}.npz"), &arrays)).expect_err(key).to_string();
         assert!(error.contains(&format!("`{key}`: missing")), "{error}");
     }
-    assert!(matches!(load("plain.py", b"import numpy").unwrap_err(), Error::Extension { .. }));
+    assert!(load("plain.py", b"import numpy").unwrap_err().to_string().contains("unknown kind of file"));
+}
+
+#[test]
+fn the_pickled_body_equals_the_npz_one() {
+    let (Some(npz), Some(pkl)) = (shared("body/open_body.npz"), shared("body/open_body.pkl")) else {
+        return;
+    };
+    let (a, b) = (BodyModel::load(&npz).unwrap(), BodyModel::load(&pkl).unwrap());
+    assert_eq!(a, b);
 }

@@ -1,10 +1,13 @@
-//! Properties of shaping, posing and the surface motion field.
+//! Properties of the embedded body, of shaping, posing and the surface motion field.
 
+use std::collections::HashSet;
 use std::sync::LazyLock;
 
+use array_files::npz::Npz;
 use glam::{Affine3A, Quat, Vec3};
 use proptest::prelude::*;
 use smpl::{BodyModel, MotionFrame, Placement, Posed, SparseRows, SurfaceMotion, SurfacePoint, rodrigues};
+use testkit::files::shared;
 use testkit::strategy::{rotation, vec3};
 
 static BODY: LazyLock<BodyModel> = LazyLock::new(BodyModel::embedded);
@@ -215,4 +218,53 @@ fn a_fold_gives_finite_points_of_the_heaviest_bone() {
         assert!(sample.canonical.distance(shaped.vertices[v]) < 0.15);
     }
     assert!(folded > 0, "the fold reaches no vertex: the test tests nothing");
+}
+
+/// Against `smplx.lbs.lbs` in f64.
+#[test]
+fn posed_bodies_equal_those_of_smplx() {
+    let (Some(model), Some(golden)) = (shared("body/open_body.npz"), shared("body/open_body_poses_golden.npz")) else {
+        return;
+    };
+    let body = BodyModel::load(&model).unwrap();
+    let mut golden = Npz::open(&golden).unwrap();
+    let vectors = |values: Vec<f32>| values.chunks_exact(3).map(Vec3::from_slice).collect::<Vec<_>>();
+    let betas = golden.f32("betas", &[None, Some(10)]).unwrap().1;
+    let poses = vectors(golden.f32("poses", &[Some(8), Some(72)]).unwrap().1);
+    let trans = vectors(golden.f32("trans", &[Some(8), Some(3)]).unwrap().1);
+    let vertices = vectors(golden.f32("vertices", &[Some(8), None, Some(3)]).unwrap().1);
+    let joints = vectors(golden.f32("joints", &[Some(8), Some(24), Some(3)]).unwrap().1);
+    let v = body.num_vertices();
+    let mut worst = 0.0f32;
+    for row in 0..8 {
+        let shaped = body.shaped(&betas[10 * row..][..10]);
+        let placement = Placement::Pelvis { translation: trans[row] };
+        let posed = body.pose(&shaped, &poses[24 * row..][..24], placement);
+        let expected = vertices[v * row..][..v].iter().chain(&joints[24 * row..][..24]);
+        for (a, b) in posed.vertices.iter().chain(&posed.joints).zip(expected) {
+            worst = worst.max(a.distance(*b));
+        }
+    }
+    println!("largest difference {worst:e} m");
+    assert!(worst < 2e-5, "{worst}");
+}
+
+#[test]
+fn the_embedded_body_is_valid_and_has_the_promised_size() {
+    BODY.validate("embedded").unwrap();
+    assert_eq!((BODY.num_joints(), BODY.num_betas()), (24, 10));
+    assert_eq!((BODY.num_vertices(), BODY.faces.len()), (6890, 13776));
+    let (low, high) = BODY.v_template.iter().fold((Vec3::MAX, Vec3::MIN), |(l, h), v| (l.min(*v), h.max(*v)));
+    let size = high - low;
+    assert!((1.6..1.8).contains(&size.y) && (1.6..1.8).contains(&size.x), "{size}");
+}
+
+#[test]
+fn the_embedded_body_is_closed_and_has_no_handles() {
+    let mesh = testkit::TriMesh { vertices: BODY.v_template.clone(), faces: BODY.faces.clone() };
+    assert!(mesh.is_closed());
+    let v = BODY.num_vertices() as i64;
+    let f = BODY.faces.len() as i64;
+    assert_eq!(v - f * 3 / 2 + f, 2, "Euler characteristic of a sphere");
+    assert_eq!(BODY.faces.iter().flatten().collect::<HashSet<_>>().len() as i64, v, "a stray vertex");
 }

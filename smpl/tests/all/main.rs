@@ -5,6 +5,4 @@ mod bodies;
 mod body;
 mod bvh;
 mod clip;
-mod embedded;
-mod golden;
 mod volume;

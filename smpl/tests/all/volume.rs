@@ -4,7 +4,7 @@ use std::sync::LazyLock;
 
 use glam::{Affine3A, Vec3};
 use proptest::prelude::*;
-use smpl::{BodyModel, Placement, Shaped, WeightVolume, WeightVolumeConfig};
+use smpl::{BodyModel, Placement, Shaped, WeightVolume};
 use testkit::gradient::{Tolerance, check};
 
 static BODY: LazyLock<(BodyModel, Shaped)> = LazyLock::new(|| {
@@ -22,7 +22,7 @@ fn f(volume: &WeightVolume, x: Vec3) -> f32 {
 #[test]
 fn the_prior_fills_the_limbs_and_has_holes_at_the_joints() {
     let (body, shaped) = &*BODY;
-    let volume = WeightVolume::gaussian(body, shaped, &WeightVolumeConfig::default());
+    let volume = WeightVolume::gaussian(body, shaped, 32);
     let [hip, knee, elbow] = [1, 4, 18].map(|joint| shaped.joints[joint]);
     let at = |x| f(&volume, x);
     println!("thigh {:.3}, knee {:.3}, elbow {:.3}", at(hip.midpoint(knee)), at(knee), at(elbow));
@@ -65,8 +65,7 @@ fn plain_map(volume: &WeightVolume, to_canonical: &[Affine3A], x: Vec3) -> ([f64
 /// A small volume with bones that disagree, and where to sample it.
 fn small() -> (WeightVolume, Vec<Affine3A>) {
     let (body, shaped) = &*BODY;
-    let config = WeightVolumeConfig { resolution: 6, ..WeightVolumeConfig::default() };
-    let mut volume = WeightVolume::gaussian(body, shaped, &config);
+    let mut volume = WeightVolume::gaussian(body, shaped, 6);
     for (i, d) in volume.delta.iter_mut().enumerate() {
         *d = (i as f32 * 0.37).sin();
     }
@@ -152,8 +151,7 @@ fn gradients_with_respect_to_the_weights_agree_with_finite_differences() {
 #[test]
 fn likelihood_has_no_gradient_where_it_is_capped() {
     let (body, shaped) = &*BODY;
-    let config = WeightVolumeConfig { resolution: 8, ..WeightVolumeConfig::default() };
-    let mut volume = WeightVolume::gaussian(body, shaped, &config);
+    let mut volume = WeightVolume::gaussian(body, shaped, 8);
     volume.weights.iter_mut().for_each(|w| *w = 1.0);
     let mut d_weights = vec![0.0; volume.weights.len()];
     volume.map_backward(&IDENTITY, shaped.joints[0], Vec3::ZERO, 1.0, &mut d_weights);

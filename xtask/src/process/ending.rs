@@ -87,15 +87,10 @@ fn file_and_reason<'a>(cause: &'a (dyn std::error::Error + 'static)) -> Option<(
         let array_files::Error::Io { path, source } = error else { return None };
         Some((path, source))
     }
-    fn of_body(error: &smpl::Error) -> Option<(&Path, &io::Error)> {
-        let smpl::Error::File(error) = error else { return None };
-        of_array(error)
-    }
     fn of_capture(error: &CaptureError) -> Option<(&Path, &io::Error)> {
         match error {
             CaptureError::Io { path, source } => Some((path, source)),
             CaptureError::Array(error) => of_array(error),
-            CaptureError::Body(error) => of_body(error),
             _ => None,
         }
     }
@@ -103,12 +98,10 @@ fn file_and_reason<'a>(cause: &'a (dyn std::error::Error + 'static)) -> Option<(
         Some(occnerf::Error::Io { path, source }) => Some((path, source)),
         Some(occnerf::Error::Data(error)) => of_capture(error),
         Some(occnerf::Error::Array(error)) => of_array(error),
-        Some(occnerf::Error::Body(error)) => of_body(error),
         Some(_) => None,
         None => {
-            let body = || cause.downcast_ref().and_then(of_body);
             let array = || cause.downcast_ref().and_then(of_array);
-            cause.downcast_ref().and_then(of_capture).or_else(body).or_else(array)
+            cause.downcast_ref().and_then(of_capture).or_else(array)
         }
     }
 }

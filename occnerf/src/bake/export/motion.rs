@@ -16,7 +16,7 @@ const SMPL_FAMILY: [usize; 3] = [24, 52, 55];
 /// `betas`, `mocap_framerate`, `gender` (`neutral`). As in AMASS z is up; lengths are metres.
 ///
 /// # Errors
-/// [`Error::Bake`] if there is no such clip; [`Error::Body`] where the file cannot be written.
+/// [`Error::Bake`] if there is no such clip; [`Error::Array`] where the file cannot be written.
 pub fn write_amass(avatar: &Avatar, clip: usize, path: &Path) -> Result<(), Error> {
     let found = avatar.clips.get(clip);
     let motion =

@@ -3,7 +3,7 @@
 use std::f32::consts::TAU;
 
 use glam::{Quat, Vec3};
-use point_fit::{FitError, ground};
+use point_fit::ground;
 use proptest::prelude::*;
 use smpl::{BodyModel, BoneNames, Joint, MotionClip, joint_transforms};
 use testkit::body::Random;
@@ -115,12 +115,12 @@ fn skeletons_without_feet_are_refused() {
     let none = MotionClip { poses: Vec::new(), trans: Vec::new(), ..still.clone() };
     assert_eq!(ground(&skeleton, &none, sole).unwrap().motion, none);
     let long = MotionClip { poses: vec![Vec3::ZERO; 24 * 100_001], trans: vec![Vec3::ZERO; 100_001], ..still.clone() };
-    assert_eq!(ground(&skeleton, &long, sole).err(), Some(FitError::Frames { most: 100_000, found: 100_001 }));
+    let fault = ground(&skeleton, &long, sole).unwrap_err().to_string();
+    assert_eq!(fault, "expected at most 100000 frames, found 100001");
     let refused = |edit: fn(&mut Vec<Joint>)| {
         let mut edited = skeleton.clone();
         edit(&mut edited);
-        let Err(FitError::Legs(fault)) = ground(&edited, &still, sole) else { panic!("accepted") };
-        fault
+        ground(&edited, &still, sole).unwrap_err().to_string()
     };
     assert_eq!(refused(|joints| joints[10].name = "claw".to_owned()), "no joint by name for left foot");
     assert!(refused(|joints| joints[5].rest = joints[2].rest).contains("from right_hip to right_knee, 0 m long"));

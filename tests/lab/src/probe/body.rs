@@ -2,10 +2,7 @@
 
 use anyhow::{Context, Result, bail, ensure};
 use glam::Vec3;
-use smpl::{
-    BodyModel, MotionFrame, MotionSample, Placement, Posed, SurfaceMotion, SurfacePoint, WeightVolume,
-    WeightVolumeConfig,
-};
+use smpl::{BodyModel, MotionFrame, MotionSample, Placement, Posed, SurfaceMotion, SurfacePoint, WeightVolume};
 use surface_query::{Closest, MeshDistance};
 
 use super::input::{Input, vec3s};
@@ -56,7 +53,7 @@ pub fn motion(mut input: Input, model: &BodyModel, output: &mut Output) -> Resul
         bail!("vertex {v} of the posed body overflows: betas, poses or trans are too large");
     }
     let samples: Vec<Option<MotionSample>> = if kind == 0 {
-        let volume = WeightVolume::gaussian(model, &shaped, &WeightVolumeConfig::default());
+        let volume = WeightVolume::gaussian(model, &shaped, 32);
         let to_canonical = posed.to_canonical();
         points.iter().map(|&x| volume.map(&to_canonical, x, VOLUME_THRESHOLD)).collect()
     } else {

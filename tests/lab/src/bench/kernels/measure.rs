@@ -7,7 +7,7 @@ use anyhow::Result;
 use glam::{Affine3A, Vec3};
 use hashgrid::{HashGrid, HashGridConfig};
 use occnerf::{Config, Method, Preset};
-use smpl::{MotionField, MotionFrame, SurfaceMotion, SurfacePoint, WeightVolume, WeightVolumeConfig};
+use smpl::{MotionField, MotionFrame, SurfaceMotion, SurfacePoint, WeightVolume};
 use surface_query::{MeshDistance, SurfaceQuery, SurfaceQueryConfig};
 use volrender::{Aabb, Bins, Ray, RaySamples, composite};
 
@@ -113,12 +113,11 @@ pub fn motion(figure: &Figure) -> Result<Kernel> {
         .collect();
     let frame = MotionFrame::new(body, posed);
     let mesh = MeshDistance::new(&posed.vertices, &body.faces)?;
-    let volume = |resolution| WeightVolumeConfig { resolution, ..WeightVolumeConfig::default() };
     let learnable = |weights| MotionField::Volume { weights, threshold: 1e-3 };
     let fields = [
         ("surface".to_owned(), MotionField::Surface(SurfaceMotion::default()), true),
-        ("volume 32".to_owned(), learnable(WeightVolume::gaussian(body, shaped, &volume(32))), false),
-        ("volume 64".to_owned(), learnable(WeightVolume::gaussian(body, shaped, &volume(64))), false),
+        ("volume 32".to_owned(), learnable(WeightVolume::gaussian(body, shaped, 32)), false),
+        ("volume 64".to_owned(), learnable(WeightVolume::gaussian(body, shaped, 64)), false),
     ];
     for (name, field, default) in fields {
         let map = |x: Vec3| {
