@@ -37,7 +37,6 @@ pub mod npz;
 pub mod pickle;
 pub mod tensors;
 pub mod torch;
-mod whole;
 
 /// The README's example, compiled as a test.
 #[cfg(doctest)]
@@ -47,5 +46,4 @@ struct Readme;
 pub use array::{Data, NdArray};
 pub use element::half_to_f32;
 pub use error::Error;
-pub use file::{decode_text, read_bounded, read_file};
-pub use whole::{replace_file, sweep};
+pub use file::{decode_text, read_bounded, read_file, replace_file, sweep};

@@ -197,6 +197,18 @@ pub(crate) fn stepped(skeleton: &Skeleton, state: &State, step: &DVector<f64>) -
     next
 }
 
+/// Motion of the unknowns from one state to another: the root's way, then rotations as log(L⁻¹ L').
+pub(crate) fn between(skeleton: &Skeleton, from: &State, to: &State) -> DVector<f64> {
+    let mut out = DVector::zeros(skeleton.unknowns);
+    add(&mut out, 0, to.place - from.place);
+    for (joint, column) in skeleton.columns.iter().enumerate() {
+        if let Some(column) = column {
+            add(&mut out, *column, log(from.turns[joint].conjugate() * to.turns[joint]));
+        }
+    }
+    out
+}
+
 #[cfg(test)]
 mod tests {
     use glam::Vec3;

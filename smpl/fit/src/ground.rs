@@ -8,7 +8,7 @@ use smpl::{BoneNames, Joint, MotionClip};
 
 use crate::FitError;
 use crate::band::{Band, Beside};
-use crate::frame::{Normal, add, add_block, jacobian, stepped};
+use crate::frame::{Normal, add, add_block, between, jacobian, stepped};
 use crate::limits::log;
 use crate::relax::couple;
 use crate::skeleton::{Part, Shape, Skeleton, State};
@@ -218,18 +218,6 @@ impl Legs {
     fn points(&self, state: &State) -> Vec<DVec3> {
         self.0.points(&self.0.mean, &self.0.frames(&self.0.mean, state))
     }
-
-    /// Corrections of a frame: the root's way, then rotation vectors.
-    fn correction(&self, from: &State, to: &State) -> DVector<f64> {
-        let mut out = DVector::zeros(self.0.unknowns);
-        add(&mut out, 0, to.place - from.place);
-        for (joint, column) in self.0.columns.iter().enumerate() {
-            if let Some(column) = column {
-                add(&mut out, *column, log(from.turns[joint].conjugate() * to.turns[joint]));
-            }
-        }
-        out
-    }
 }
 
 /// Gauss–Newton over all frames.
@@ -255,7 +243,7 @@ fn relax(legs: &Legs, before: &[Vec<DVec3>], held: &[Vec<Option<DVec3>>], states
         (residual, weight)
     };
     let cost = |states: &[State]| {
-        let corrections: Vec<_> = start.iter().zip(states).map(|(a, b)| legs.correction(a, b)).collect();
+        let corrections: Vec<_> = start.iter().zip(states).map(|(a, b)| between(&legs.0, a, b)).collect();
         let mut sum = 0.0;
         for (t, state) in states.iter().enumerate() {
             for (i, at) in legs.points(state).into_iter().enumerate() {
@@ -270,7 +258,7 @@ fn relax(legs: &Legs, before: &[Vec<DVec3>], held: &[Vec<Option<DVec3>>], states
     };
     let mut now = cost(states);
     for _ in 0..STEPS {
-        let corrections: Vec<_> = start.iter().zip(&*states).map(|(a, b)| legs.correction(a, b)).collect();
+        let corrections: Vec<_> = start.iter().zip(&*states).map(|(a, b)| between(&legs.0, a, b)).collect();
         let mut beside = Beside::zeros(n, states.len());
         let mut normals: Vec<Normal> = states.iter().map(|_| Normal::zeros(n, 0)).collect();
         for (t, (state, normal)) in states.iter().zip(&mut normals).enumerate() {

@@ -1,12 +1,11 @@
 //! Levenberg–Marquardt over the frames of a window.
 
-use glam::{DQuat, DVec3};
+use glam::DVec3;
 use nalgebra::{DMatrix, DVector};
 use rayon::prelude::*;
 
 use crate::band::{Band, Beside};
-use crate::frame::{Normal, cost, normal, stepped};
-use crate::limits::log;
+use crate::frame::{Normal, between, cost, normal, stepped};
 use crate::skeleton::{Skeleton, State};
 
 /// Standard deviations of what smoothness penalises: first and second differences of rotations, in
@@ -87,21 +86,9 @@ fn stiffness(skeleton: &Skeleton) -> [DVector<f64>; 2] {
     })
 }
 
-/// Motion of the unknowns from each frame to the next; rotations as log(L⁻¹ L').
+/// Motion of the unknowns from each frame to the next.
 fn differences(skeleton: &Skeleton, states: &[State]) -> Vec<DVector<f64>> {
-    let between = |pair: &[State]| {
-        let mut out = DVector::zeros(skeleton.unknowns);
-        let mut set = |at: usize, v: DVec3| (0..3).for_each(|k| out[at + k] = v[k]);
-        set(0, pair[1].place - pair[0].place);
-        for (joint, column) in skeleton.columns.iter().enumerate() {
-            let turn = |state: &State| -> DQuat { state.turns[joint] };
-            if let Some(column) = column {
-                set(*column, log(turn(&pair[0]).conjugate() * turn(&pair[1])));
-            }
-        }
-        out
-    };
-    states.windows(2).map(between).collect()
+    states.windows(2).map(|pair| between(skeleton, &pair[0], &pair[1])).collect()
 }
 
 /// Adds smoothness to the normal equations and returns their blocks beside the diagonal. The derivative

@@ -10,7 +10,8 @@ use smpl::SparseRows;
 ///
 /// Meshes without a skin are bound rigidly to an extra joint for their node; morph targets are at
 /// their default weights. Of materials the base colours are read, and holes by their alpha. Not
-/// read: sparse accessors, other parts of materials, blending ([`Character::ignored`] names it). Metres, y up, as in glTF.
+/// read: normals, sparse accessors, other parts of materials, blending ([`Character::ignored`] names
+/// it). Metres, y up, as in glTF.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Character {
     /// Vertices in bind space, as in the file, (V).
