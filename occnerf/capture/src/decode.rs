@@ -23,6 +23,14 @@ const VERTEX_BYTES: u64 = 24;
 /// Ratio of the bytes of a training frame's pixels to its labels', 3 bits a pixel.
 const LABELS_SHARE: u64 = 42;
 
+/// A body as a file poses it.
+#[derive(Clone)]
+pub(super) struct Fitted {
+    pub pose: Vec<Vec3>,
+    pub placement: Placement,
+    pub betas: Vec<f32>,
+}
+
 /// A frame whose pictures have not been read.
 pub(super) struct Planned {
     pub name: String,
@@ -35,9 +43,7 @@ pub(super) struct Planned {
     /// Simulated obstacle, in pixels of the files.
     pub hidden: Option<Area>,
     pub lens: Lens,
-    pub pose: Vec<Vec3>,
-    pub placement: Placement,
-    pub betas: Vec<f32>,
+    pub body: Fitted,
     /// In pixels of the files.
     pub keypoints: Vec<Keypoint>,
 }
@@ -92,8 +98,8 @@ impl View {
         let first = Arc::from(self.frames[0].name.as_str());
         let (size, to) = (self.size, options.resized(self.size));
         let frame = |plan: Planned| {
-            let Planned { name, image, masks, labels, occluder, hidden, lens, pose, placement, betas, mut keypoints } =
-                plan;
+            let Planned { name, image, masks, labels, occluder, hidden, lens, body, mut keypoints } = plan;
+            let Fitted { pose, placement, betas } = body;
             let scale = Vec2::new(to.0 as f32 / size.0 as f32, to.1 as f32 / size.1 as f32);
             keypoints.iter_mut().for_each(|point| point.place *= scale);
             let camera = volrender::Camera { width: size.0, height: size.1, ..lens.camera };

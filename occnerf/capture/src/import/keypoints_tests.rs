@@ -15,8 +15,8 @@ fn frames(model: &BodyModel) -> (Video, Vec<Placed>, Vec<[f64; 2]>) {
     let turn = DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0));
     let translation = DVec3::new(0.1, 0.2, 4.0);
     let placed = |index| {
-        let still = FitFrame::still(index, Vec::new(), Vec::new(), &[0.0; 3], [[500.0; 2], [320.0, 240.0]]);
-        let frame = FitFrame { world_to_camera: turn, ..still };
+        let (focal, centre) = ([500.0; 2], [320.0, 240.0]);
+        let frame = FitFrame { index, world_to_camera: turn, focal, centre, ..FitFrame::default() };
         Placed { index, pose: vec![DVec3::ZERO; model.num_joints()], translation, frame, keypoints: Vec::new() }
     };
     let pixel = |joint: &glam::Vec3| {

@@ -3,17 +3,16 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
-use array_files::npz::{Npz, read_npy};
 use array_files::{Data, NdArray};
 
+use super::file::array;
 use super::join::{self, Disjoint};
 use super::levels::Levels;
 use super::options::ImportOptions;
 use super::video::Video;
+use crate::CaptureError;
 use crate::image::{alpha, decode};
-use crate::names::FrameName;
-use crate::pictures::{file_name, is_hidden};
-use crate::{CaptureError, pictures::Pictures};
+use crate::pictures::{Pictures, file_name, has_extension, listed};
 
 /// The masks of a video.
 pub(super) struct Masks {
@@ -92,16 +91,11 @@ impl Masks {
 
     /// Masks (N,H,W), (N,1,H,W) or (N,H,W,1) in one file.
     fn stack(path: &Path, options: &ImportOptions, video: &Video) -> Result<Self, CaptureError> {
-        let array = match path.extension().is_some_and(|e| e == "npz") {
-            true => only_array(path)?,
-            false => read_npy(path)?,
-        };
-        let (n, height, width) = match array.shape.as_slice() {
-            &[n, height, width] | &[n, 1, height, width] | &[n, height, width, 1] => (n, height, width),
-            shape => {
-                let expected = "(frames, height, width), or the same with an axis of 1";
-                return Err(CaptureError::invalid(path, "shape", expected, format!("{shape:?}")));
-            }
+        let expected = "masks (frames, height, width), or the same with an axis of 1";
+        let array = array(path, expected, |shape| matches!(shape, [_, _, _] | [_, 1, _, _] | [_, _, _, 1]))?;
+        let (n, [height, width]) = match array.shape[..] {
+            [n, height, width] | [n, 1, height, width] | [n, height, width, _] => (n, [height, width]),
+            _ => (0, [0; 2]),
         };
         // At least half of the masks have a picture. A header may claim any number of empty ones.
         let joined = (n <= 2 * video.names.len()).then(|| join::by_index(video, &(0..n).collect())).flatten();
@@ -167,18 +161,6 @@ impl Masks {
 /// Coverage in bytes.
 fn byte(value: u32, full: u32) -> u8 {
     ((u64::from(value.min(full)) * 255 + u64::from(full / 2)) / u64::from(full.max(1))) as u8
-}
-
-/// The only array of an archive.
-fn only_array(path: &Path) -> Result<NdArray, CaptureError> {
-    let mut npz = Npz::open(path)?;
-    match npz.keys() {
-        [key] => {
-            let key = key.clone();
-            Ok(npz.array(&key)?)
-        }
-        keys => Err(CaptureError::invalid(path, "keys", "one array of masks", keys.join(", "))),
-    }
 }
 
 /// Most different values of a video's masks.
@@ -269,29 +251,23 @@ fn object_folders(dir: &Path) -> Result<Option<BTreeMap<u32, PathBuf>>, CaptureE
         let number = file_name(&path).parse::<u32>().ok();
         match number {
             Some(id) if path.is_dir() => drop(folders.insert(id, path)),
-            _ if is_mask(&path) => return Ok(None),
+            _ if has_extension(&path, &["png", "jpg", "jpeg", "npy"]) => return Ok(None),
             _ => {}
         }
     }
     Ok((!folders.is_empty()).then_some(folders))
 }
 
-fn is_mask(path: &Path) -> bool {
-    let extension = path.extension().map(|e| e.to_string_lossy().to_lowercase());
-    !is_hidden(path) && matches!(extension.as_deref(), Some("png" | "jpg" | "jpeg" | "npy"))
-}
-
 /// Mask files by the index of their frame, and how they were joined.
 fn matched(dir: &Path, video: &Video) -> Result<(BTreeMap<usize, PathBuf>, Vec<String>), CaptureError> {
-    let mut files = arrays(dir)?;
+    let mut files = listed(dir, &["npy"])?;
     if files.is_empty() {
-        files = Pictures::list(dir)?.iter().map(|(name, path)| (name.clone(), path.clone())).collect();
+        files = Pictures::list(dir)?.into_vec();
     }
     if files.is_empty() {
         let expected = "masks: .png, .jpg or .npy files, or a folder of them for each object";
         return Err(CaptureError::invalid(dir, "files", expected, "none"));
     }
-    files.sort_by(|a, b| FrameName(&a.0).cmp(&FrameName(&b.0)));
     let names: Vec<&str> = files.iter().map(|(name, _)| name.as_str()).collect();
     let joined = join::by_name(video, &names).map_err(|why| match why {
         Disjoint::Twice(number) => {
@@ -309,17 +285,4 @@ fn matched(dir: &Path, video: &Video) -> Result<(BTreeMap<usize, PathBuf>, Vec<S
     }
     let files = joined.at.iter().zip(files).filter_map(|(at, (_, path))| Some(((*at)?, path)));
     Ok((files.collect(), notes))
-}
-
-/// `.npy` files by name without extension.
-fn arrays(dir: &Path) -> Result<Vec<(String, PathBuf)>, CaptureError> {
-    let mut files = Vec::new();
-    for entry in std::fs::read_dir(dir).map_err(CaptureError::io(dir))? {
-        let path = entry.map_err(CaptureError::io(dir))?.path();
-        if path.extension().is_some_and(|e| e == "npy") && !is_hidden(&path) {
-            let stem = path.file_stem().map_or(String::new(), |s| s.to_string_lossy().into_owned());
-            files.push((stem, path));
-        }
-    }
-    Ok(files)
 }

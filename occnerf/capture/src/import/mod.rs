@@ -14,39 +14,32 @@
 //! the camera's axes, or those of the file's cameras; the body's translation is in the extrinsics.
 
 mod body;
-mod cliff;
 #[cfg(test)]
 mod damage;
+mod datasets;
 mod easymocap;
+mod file;
 mod fit;
-mod glamr;
-mod gvhmr;
-mod item;
 mod join;
 mod keypoints;
 #[cfg(test)]
 mod keypoints_tests;
 mod levels;
 mod masks;
-mod neuman;
 mod options;
-mod peoplesnapshot;
-mod phalp;
 mod points;
 #[cfg(test)]
 mod points_tests;
-mod prompthmr;
 mod read;
 mod rle;
-mod romp;
 mod sam3d;
 #[cfg(test)]
 mod tests;
-mod vibe;
+mod tools;
+#[cfg(test)]
+mod tools_tests;
 mod video;
-mod wham;
 mod write;
-mod yaml;
 
 pub use self::fit::Tool;
 

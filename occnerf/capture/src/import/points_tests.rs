@@ -216,10 +216,10 @@ fn fingers_follow_their_points_on_a_body_that_has_them() {
             sum.as_dvec3()
         };
         let points = set.iter().map(point).collect();
-        frames.push(FitFrame { points, ..FitFrame::still(f, Vec::new(), Vec::new(), &[0.0; 3], [[FOCAL; 2]; 2]) });
+        frames.push(FitFrame { index: f, points, focal: [FOCAL; 2], centre: [FOCAL; 2], ..FitFrame::default() });
         truth.push(posed.joints);
     }
-    let mut person = Person { id: "0".to_owned(), frames, ..Person::default() };
+    let mut person = Person::new(0, frames);
     println!("{}", points::solve(&path, sam3d::SET, Vec::new(), &mut person, &body).unwrap());
     for (frame, truth) in person.frames.iter().zip(&truth) {
         let betas: Vec<f32> = frame.betas.iter().map(|b| *b as f32).collect();
@@ -360,7 +360,7 @@ fn damaged_files_of_sam_3d_body_are_refused_in_one_line() {
         ("behind.pkl", "pred_cam_t", array(&[3], &[0.0, 0.0, -9.0]), ["2[0].pred_keypoints_3d", "in front"]),
         ("focal.pkl", "focal_length", array(&[], &[-1.0]), ["frame 2", "focal length"]),
         ("mask.pkl", "mask", array(&[6], &[0.0; 6]), ["2[0].mask", "[_, _]"]),
-        ("text.pkl", "pred_cam_t", Py::text("x"), ["2[0].pred_cam_t", "list"]),
+        ("text.pkl", "pred_cam_t", Py::text("x"), ["2[0].pred_cam_t", "array"]),
         ("mesh.pkl", "pred_vertices", array(&[2, 2], &[0.0; 4]), ["2[0].pred_vertices", "[_, 3]"]),
         ("rows.pkl", "pred_vertices", array(&[2, 3], &[0.0; 6]), ["2[0].pred_vertices", "4 rows"]),
     ] {

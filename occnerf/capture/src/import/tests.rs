@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use array_files::NdArray;
 use array_files::npz::Npz;
-use glam::DVec3;
+use glam::{DMat3, DVec3};
 use proptest::prelude::*;
 use smpl::BodyModel;
 
@@ -40,7 +40,7 @@ impl Motion {
 }
 
 /// The rows of a camera's 4 × 4 extrinsics.
-pub(super) fn extrinsics(turn: glam::DMat3, moved: DVec3) -> Vec<f64> {
+pub(super) fn extrinsics(turn: DMat3, moved: DVec3) -> Vec<f64> {
     let row = |r: usize| [turn.row(r).x, turn.row(r).y, turn.row(r).z, moved[r]];
     [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]].concat()
 }
@@ -50,8 +50,8 @@ pub(super) fn known(dir: &Path) -> Motion {
     let (roots, poses) = (expected.values("root_cam"), expected.values("poses"));
     let betas = expected.values("betas_mean");
     let poses = poses.chunks_exact(72).zip(roots.chunks_exact(9)).map(|(pose, root)| {
-        let root = fit::axis_angle(item::turn(root).unwrap());
-        [vec![root], item::vectors(&pose[3..])].concat()
+        let root = fit::axis_angle(DMat3::from_cols_slice(root).transpose());
+        [vec![root], fit::vectors(&pose[3..])].concat()
     });
     let body = BodyModel::load(&dir.join("../body/open_body.npz")).unwrap();
     let shape: Vec<f32> = betas.iter().map(|&b| b as f32).collect();
@@ -59,7 +59,7 @@ pub(super) fn known(dir: &Path) -> Motion {
         video: Video::list(&dir.join("frames")).unwrap(),
         k: expected.values("K"),
         poses: poses.collect(),
-        pelvises: item::vectors(&expected.values("pelvis_cam")),
+        pelvises: fit::vectors(&expected.values("pelvis_cam")),
         joint: body.shaped(&shape).joints[0].as_dvec3(),
         betas,
     }
@@ -415,12 +415,8 @@ fn gvhmr_saved_again_by_numpy_is_the_same() {
 
 #[test]
 fn one_person_under_several_ids_is_joined() {
-    let frame = |index: usize, x: f64| FitFrame::still(index, Vec::new(), Vec::new(), &[x, 0.0, 3.0], [[1.0; 2]; 2]);
-    let track = |id: &str, frames: std::ops::Range<usize>, x: f64| Person {
-        id: id.to_owned(),
-        frames: frames.map(|i| frame(i, x)).collect(),
-        ..Person::default()
-    };
+    let frame = |index: usize, x: f64| FitFrame { index, offset: DVec3::new(x, 0.0, 3.0), ..FitFrame::default() };
+    let track = |id: &str, frames: std::ops::Range<usize>, x: f64| Person::new(id, frames.map(|index| frame(index, x)));
     let people =
         || vec![track("0", 0..10, 0.0), track("4", 12..20, 0.2), track("9", 3..8, 0.1), track("17", 25..30, 4.0)];
     let (person, others, hint) = choose(Path::new("f"), people(), None).unwrap();

@@ -13,7 +13,6 @@
 //! `9`; pictures that it does not mention are left out. A row of `keypoints` is a joint of the body
 //! model, its pixel (x, y; pixel centres at integer + 0.5) and the detector's confidence, 0 to 1.
 
-mod metadata;
 #[cfg(test)]
 mod tests;
 
@@ -22,12 +21,14 @@ use std::path::Path;
 use smpl::{BodyModel, Placement};
 
 use super::camera::Lens;
-use super::decode::{Planned, View, capture};
+use super::decode::{Fitted, Planned, View, capture};
+use super::item::Item;
 use super::names::FrameName;
 use super::pictures::{Pictures, is_directory};
-use super::records::Record;
-use super::{Capture, CaptureError, LoadOptions, checks};
+use super::{Capture, CaptureError, LoadOptions, checks, json};
 
+/// Largest `metadata.json`: tens of thousands of frames.
+const MAX_BYTES: u64 = 64 << 20;
 /// Camera name of the frames under `clean`.
 const CLEAN: &str = "clean";
 
@@ -35,8 +36,8 @@ const CLEAN: &str = "clean";
 pub(super) fn load(dir: &Path, body: &BodyModel, options: &LoadOptions) -> Result<Capture, CaptureError> {
     options.only_zju("HumanNeRF's wild layout")?;
     let path = dir.join("metadata.json");
-    let records = metadata::read(&path)?;
-    let all = records.frames()?;
+    let value = json::read(&path, MAX_BYTES)?;
+    let all = Item::new(&path, &value).frames()?;
     let names: Vec<&str> = all.iter().map(|(FrameName(name), _)| *name).collect();
     let frames = options.select(all);
 
@@ -88,7 +89,7 @@ fn optional(dir: &Path, names: &[&str]) -> Result<Option<Pictures>, CaptureError
 
 fn plan(
     name: &str,
-    record: &Record<'_>,
+    record: &Item<'_>,
     [images, masks]: [&Pictures; 2],
     metadata: &Path,
     body: &BodyModel,
@@ -102,9 +103,11 @@ fn plan(
         occluder: None,
         hidden: None,
         lens: Lens::read(record, "cam_intrinsics", "cam_extrinsics", options.pixel_centre)?,
-        pose: checks::pose(record, body)?,
-        placement: Placement::default(),
-        betas: checks::betas(record, "betas", body)?,
+        body: Fitted {
+            pose: checks::pose(record, body)?,
+            placement: Placement::default(),
+            betas: checks::betas(record, "betas", body)?,
+        },
         keypoints: checks::keypoints(record, body)?,
     })
 }

@@ -3,12 +3,10 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Component, Path, PathBuf};
 
-use array_files::pickle::Value;
-use glam::{Affine3A, Vec3};
-use volrender::Distortion;
+use glam::{Affine3A, DVec3};
 
-use crate::camera::{Lens, pinhole, rotation};
-use crate::records::{Record, Records};
+use crate::camera::{Lens, ORTHONORMAL};
+use crate::item::{Item, pickled};
 use crate::{CaptureError, LoadOptions};
 
 /// Lengths of `T` in a metre.
@@ -27,9 +25,10 @@ pub(super) struct Annots {
 impl Annots {
     pub fn read(dir: &Path, options: &LoadOptions) -> Result<Self, CaptureError> {
         let path = dir.join("annots.npy");
-        let records = Records::load(&path)?;
-        let lenses = lenses(&records.record("cams")?, options)?;
-        let lists = lists(&records.whole())?;
+        let value = pickled(&path)?;
+        let whole = Item::new(&path, &value);
+        let lenses = lenses(&whole.get("cams")?, options)?;
+        let lists = lists(&whole)?;
         let names = folders(&path, &lists, lenses.len())?;
         let numbers: BTreeMap<&str, usize> = names.iter().enumerate().map(|(i, n)| (n.as_str(), i)).collect();
         let mut pictures = Vec::with_capacity(lists.len());
@@ -79,67 +78,56 @@ impl Annots {
 }
 
 /// The cameras of `cams`.
-fn lenses(cams: &Record<'_>, options: &LoadOptions) -> Result<Vec<Lens>, CaptureError> {
-    let (shape, k) = cams.stacked("K")?;
-    let &[count, 3, 3] = shape.as_slice() else {
-        return Err(cams.invalid("K", "shape [C, 3, 3]", format!("shape {shape:?}")));
+fn lenses(cams: &Item<'_>, options: &LoadOptions) -> Result<Vec<Lens>, CaptureError> {
+    let k = cams.get("K")?;
+    let (shape, _) = k.values()?;
+    let (&[count, 3, 3], false) = (shape.as_slice(), shape.starts_with(&[0])) else {
+        return Err(k.invalid("shape [C, 3, 3], of a camera or more", format!("shape {shape:?}")));
     };
-    if count == 0 {
-        return Err(cams.invalid("K", "a camera", "none"));
-    }
     // Vectors are stored as rows, columns or neither.
-    let per_camera = |key: &str, wanted: &[usize]| {
-        let (shape, values) = cams.stacked(key)?;
+    let per_camera = |item: &Item<'_>, wanted: &[usize]| {
+        let (shape, values) = item.values()?;
         let axes: Vec<usize> = shape.iter().skip(1).copied().filter(|&n| n != 1).collect();
         if shape.first() == Some(&count) && axes == wanted {
             return Ok(values);
         }
         let expected = format!("shape {wanted:?} for each of the {count} cameras of K");
-        Err(cams.invalid(key, expected, format!("shape {shape:?}")))
+        Err(item.invalid(expected, format!("shape {shape:?}")))
     };
-    let (r, t) = (per_camera("R", &[3, 3])?, per_camera("T", &[3])?);
-    let d = if cams.has("D") { per_camera("D", &[5])? } else { vec![0.0; 5 * count] };
-    (0..count)
-        .map(|camera| {
-            let key = |name: &str| format!("{name}[{camera}]");
-            let values = &r[9 * camera..9 * camera + 9];
-            let rotation =
-                rotation(values, 3).ok_or_else(|| cams.invalid(&key("R"), "a rotation", format!("{values:?}")))?;
-            let translation = Vec3::from_slice(&t[3 * camera..]) / MILLIMETRES;
-            let extrinsics = Affine3A::from_mat3_translation(rotation, translation);
-            let camera_of = pinhole(&k[9 * camera..9 * camera + 9], extrinsics, options.pixel_centre)
-                .map_err(|error| cams.invalid(&key("K"), "a pinhole camera", error))?;
-            let d = &d[5 * camera..5 * camera + 5];
-            let distortion = Distortion::from_opencv([d[0], d[1], d[2], d[3], d[4]]);
-            Ok(Lens { camera: camera_of, distortion })
-        })
-        .collect()
+    let r = cams.get("R")?;
+    let (turns, t) = (per_camera(&r, &[3, 3])?, per_camera(&cams.get("T")?, &[3])?);
+    let d = cams.find("D").map(|d| per_camera(&d, &[5])).transpose()?.unwrap_or_else(|| vec![0.0; 5 * count]);
+    let calibrations = k.floats(&[Some(count), Some(3), Some(3)])?;
+    let lens = |camera: usize| {
+        let key = |item: &Item<'_>| format!("{}[{camera}]", item.key);
+        let rotation = Item { key: key(&r), ..r.clone() }.rotation(&turns[9 * camera..][..9], ORTHONORMAL)?.as_mat3();
+        let translation = DVec3::from_slice(&t[3 * camera..]).as_vec3() / MILLIMETRES;
+        let extrinsics = Affine3A::from_mat3_translation(rotation, translation);
+        let d = std::array::from_fn(|i| d[5 * camera + i] as f32);
+        Lens::new(&calibrations[9 * camera..][..9], extrinsics, d, options.pixel_centre)
+            .map_err(|error| CaptureError::invalid(k.path, key(&k), "a pinhole camera", error))
+    };
+    (0..count).map(lens).collect()
 }
 
 /// The pictures of every instant.
-fn lists(whole: &Record<'_>) -> Result<Vec<Vec<PathBuf>>, CaptureError> {
-    let value = whole.value("ims")?;
-    let items = value.items().ok_or_else(|| whole.invalid("ims", "a list of frames", value.type_name()))?;
+fn lists(whole: &Item<'_>) -> Result<Vec<Vec<PathBuf>>, CaptureError> {
+    let instants = whole.get("ims")?;
+    let items = instants.list()?;
     if items.is_empty() {
-        return Err(whole.invalid("ims", "a frame", "an empty list"));
+        return Err(instants.invalid("a frame", "an empty list"));
     }
-    let list = |(instant, item): (usize, &Value)| {
-        let key = format!("ims[{instant}].ims");
-        let paths = item.get("ims").and_then(Value::items);
-        let paths = paths.ok_or_else(|| whole.invalid(&key, "a list of pictures", item.type_name()))?;
-        let path = |path: &Value| {
-            let text = path.as_str().ok_or_else(|| whole.invalid(&key, "a picture's path", path.type_name()))?;
-            let path = PathBuf::from(text);
-            // Paths must stay within the capture's directory.
-            let inside = path.components().all(|part| matches!(part, Component::Normal(_)));
-            if inside && path.file_name().is_some() {
-                return Ok(path);
-            }
-            Err(whole.invalid(&key, "a path below the capture's directory", format!("{text:?}")))
-        };
-        paths.iter().map(path).collect()
+    let path = |item: &Item<'_>| {
+        let text = item.value.as_str().ok_or_else(|| item.invalid("a picture's path", item.value.type_name()))?;
+        let path = PathBuf::from(text);
+        // Paths must stay within the capture's directory.
+        let inside = path.components().all(|part| matches!(part, Component::Normal(_)));
+        if inside && path.file_name().is_some() {
+            return Ok(path);
+        }
+        Err(item.invalid("a path below the capture's directory", format!("{text:?}")))
     };
-    items.iter().enumerate().map(list).collect()
+    items.iter().map(|item| item.get("ims")?.list()?.iter().map(path).collect()).collect()
 }
 
 fn folder(picture: &Path) -> String {

@@ -19,18 +19,17 @@ mod tests;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use glam::Vec3;
 use rayon::prelude::*;
 use serde::Deserialize;
-use smpl::{BodyModel, Placement};
+use smpl::BodyModel;
 
 use self::annots::Annots;
-use super::decode::{Planned, View, capture};
+use super::decode::{Fitted, Planned, View, capture};
 use super::files::read_text;
 use super::image::dimensions;
+use super::item::{Item, pickled};
 use super::pictures::is_directory;
 use super::pixels::Area;
-use super::records::{Record, Records, triples};
 use super::{Capture, CaptureError, LoadOptions, checks};
 
 /// Tolerance of a vertex against the file's, as a fraction of the body's largest extent, 1 cm at
@@ -48,7 +47,6 @@ pub(super) fn load(dir: &Path, body: &BodyModel, options: &LoadOptions) -> Resul
 
     let plan = |camera: usize, index: usize| -> Result<Option<Planned>, CaptureError> {
         let Some(path) = annots.picture(instants[index], camera) else { return Ok(None) };
-        let fitted = &bodies[index];
         Ok(Some(Planned {
             name: format!("frame_{:06}", instants[index]),
             image: dir.join(path),
@@ -57,9 +55,7 @@ pub(super) fn load(dir: &Path, body: &BodyModel, options: &LoadOptions) -> Resul
             occluder: None,
             hidden: None,
             lens: annots.lenses[camera],
-            pose: fitted.pose.clone(),
-            placement: fitted.placement,
-            betas: fitted.betas.clone(),
+            body: bodies[index].clone(),
             keypoints: Vec::new(),
         }))
     };
@@ -67,10 +63,9 @@ pub(super) fn load(dir: &Path, body: &BodyModel, options: &LoadOptions) -> Resul
     for index in 0..instants.len() {
         train.extend(plan(camera, index)?);
     }
-    if let Some(recorded) = Recorded::read(dir, &annots, camera, &train)? {
-        for (frame, instant) in train.iter_mut().zip(&instants) {
-            frame.hidden = recorded.areas.get(instant).cloned();
-        }
+    let obstacle = obstacle(dir, &annots, camera, &train)?;
+    for (frame, instant) in train.iter_mut().zip(&instants) {
+        frame.hidden = obstacle.get(instant).cloned();
     }
     let mask_dir = |frame: &Planned| frame.masks[0].parent().unwrap_or(dir).to_owned();
     let first_masks = train.first().map_or(dir.to_owned(), mask_dir);
@@ -108,13 +103,6 @@ fn masks(dir: &Path, picture: &Path) -> Result<Vec<PathBuf>, CaptureError> {
     Ok(found)
 }
 
-/// A body fitted to all pictures of an instant.
-struct Fitted {
-    pose: Vec<Vec3>,
-    placement: Placement,
-    betas: Vec<f32>,
-}
-
 /// The fitted bodies of the given instants.
 fn bodies(dir: &Path, annots: &Annots, instants: &[usize], body: &BodyModel) -> Result<Vec<Fitted>, CaptureError> {
     let file = |kind: &str, number: usize| dir.join(kind).join(format!("{number}.npy"));
@@ -130,8 +118,8 @@ fn bodies(dir: &Path, annots: &Annots, instants: &[usize], body: &BodyModel) -> 
                 let what = format!("body parameters of ims[{instant}] in {}", annots.path.display());
                 return Err(CaptureError::missing(&path, what));
             }
-            let records = Records::load(&path)?;
-            let fitted = fit(&records.whole(), body)?;
+            let value = pickled(&path)?;
+            let fitted = checks::about_origin(&Item::new(&path, &value), "shapes", body)?;
             let vertices = file("new_vertices", instant + offset);
             if vertices.is_file() {
                 compare(&vertices, &fitted, body)?;
@@ -142,43 +130,14 @@ fn bodies(dir: &Path, annots: &Annots, instants: &[usize], body: &BodyModel) -> 
     fitted.into_iter().collect()
 }
 
-fn fit(record: &Record<'_>, body: &BodyModel) -> Result<Fitted, CaptureError> {
-    Ok(Fitted {
-        pose: checks::rootless_pose(record, body)?,
-        placement: checks::origin(record)?,
-        betas: checks::betas(record, "shapes", body)?,
-    })
-}
-
 /// Errors unless the model's vertices are those of the file.
 fn compare(path: &Path, fitted: &Fitted, body: &BodyModel) -> Result<(), CaptureError> {
-    let key = "vertices";
-    let pattern = [Some(body.num_vertices()), Some(3)];
-    let expected = triples(&array_files::npz::read_npy(path)?.to_f32(&path.display().to_string(), key, &pattern)?);
+    let value = array_files::pickle::read(path)?;
+    let item = Item { key: "vertices".to_owned(), ..Item::new(path, &value) };
+    let expected = checks::triples(&item.floats(&[Some(body.num_vertices()), Some(3)])?);
     let posed = body.pose(&body.shaped(&fitted.betas), &fitted.pose, fitted.placement);
-    let low = expected.iter().copied().fold(Vec3::INFINITY, Vec3::min);
-    let high = expected.iter().copied().fold(Vec3::NEG_INFINITY, Vec3::max);
-    let tolerance = VERTEX_TOLERANCE * (high - low).max_element();
-    for (vertex, (model, file)) in posed.vertices.iter().zip(&expected).enumerate() {
-        let distance = model.distance(*file);
-        if distance.is_nan() || distance > tolerance {
-            return Err(CaptureError::invalid(
-                path,
-                key,
-                format!(
-                    "the posed body model's vertices within {tolerance:.3} (is it the model that the capture was \
-                     fitted with, and are files numbered as the frames are?)"
-                ),
-                format!("vertex {vertex} at {file}, {distance:.3} from the model's"),
-            ));
-        }
-    }
-    Ok(())
-}
-
-/// The obstacle of `occlusion.json` by instant, in pixels of the files.
-struct Recorded {
-    areas: BTreeMap<usize, Area>,
+    let tolerance = VERTEX_TOLERANCE * checks::extent(&expected);
+    checks::same(&item, "vertex", &posed.vertices, &expected, tolerance)
 }
 
 #[derive(Deserialize)]
@@ -198,43 +157,45 @@ struct Rectangle {
     y1: u32,
 }
 
-impl Recorded {
-    /// `None` without a file, or for one of another camera.
-    fn read(dir: &Path, annots: &Annots, camera: usize, train: &[Planned]) -> Result<Option<Self>, CaptureError> {
-        let path = dir.join("occlusion.json");
-        let (true, Some(first)) = (path.is_file(), train.first()) else { return Ok(None) };
-        let text = read_text(&path, MAX_OCCLUSION_BYTES)?;
-        let OcclusionFile { camera: name, image_size, rect, frames, rects } =
-            serde_json::from_str(&text).map_err(|e| {
-                let expected = "camera, image_size (width, height), rect with x0 y0 x1 y1, and frames";
-                CaptureError::invalid(&path, "the file", expected, e.to_string())
-            })?;
-        if name != annots.names[camera] {
-            return Ok(None);
-        }
-        let (width, height) = dimensions(&first.image)?;
-        if image_size != [width, height] {
-            let expected = format!("[{width}, {height}], as of {}", first.image.display());
-            return Err(CaptureError::invalid(&path, "image_size", expected, format!("{image_size:?}")));
-        }
-        for rect in rects.iter().flatten().chain([&rect]) {
-            if rect.x0 > rect.x1 || rect.y0 > rect.y1 || rect.x1 > width || rect.y1 > height {
-                let expected = format!("0 ≤ x0 ≤ x1 ≤ {width} and 0 ≤ y0 ≤ y1 ≤ {height}");
-                let actual = format!("{} {} {} {}", rect.x0, rect.y0, rect.x1, rect.y1);
-                return Err(CaptureError::invalid(&path, "rect", expected, actual));
-            }
-        }
-        let rects = rects.unwrap_or_else(|| vec![rect; frames.len()]);
-        if rects.len() != frames.len() {
-            let expected = format!("{}, as many as frames", frames.len());
-            return Err(CaptureError::invalid(&path, "rects", expected, rects.len().to_string()));
-        }
-        let count = annots.num_instants();
-        if let Some(beyond) = frames.iter().find(|&&frame| frame >= count) {
-            let expected = format!("indices below {count}, as of ims in {}", annots.path.display());
-            return Err(CaptureError::invalid(&path, "frames", expected, beyond.to_string()));
-        }
-        let area = |r: Rectangle| Area { columns: r.x0..r.x1, rows: r.y0..r.y1 };
-        Ok(Some(Self { areas: frames.into_iter().zip(rects.into_iter().map(area)).collect() }))
+/// The obstacle of `occlusion.json` by instant, in pixels of the files; none without a file, or for
+/// one of another camera.
+fn obstacle(
+    dir: &Path,
+    annots: &Annots,
+    camera: usize,
+    train: &[Planned],
+) -> Result<BTreeMap<usize, Area>, CaptureError> {
+    let path = dir.join("occlusion.json");
+    let (true, Some(first)) = (path.is_file(), train.first()) else { return Ok(BTreeMap::new()) };
+    let text = read_text(&path, MAX_OCCLUSION_BYTES)?;
+    let invalid = |key: &str, expected: String, actual: String| CaptureError::invalid(&path, key, expected, actual);
+    let OcclusionFile { camera: name, image_size, rect, frames, rects } = serde_json::from_str(&text).map_err(|e| {
+        let expected = "camera, image_size (width, height), rect with x0 y0 x1 y1, and frames";
+        invalid("the file", expected.to_owned(), e.to_string())
+    })?;
+    if name != annots.names[camera] {
+        return Ok(BTreeMap::new());
     }
+    let (width, height) = dimensions(&first.image)?;
+    if image_size != [width, height] {
+        let expected = format!("[{width}, {height}], as of {}", first.image.display());
+        return Err(invalid("image_size", expected, format!("{image_size:?}")));
+    }
+    for rect in rects.iter().flatten().chain([&rect]) {
+        if rect.x0 > rect.x1 || rect.y0 > rect.y1 || rect.x1 > width || rect.y1 > height {
+            let expected = format!("0 ≤ x0 ≤ x1 ≤ {width} and 0 ≤ y0 ≤ y1 ≤ {height}");
+            return Err(invalid("rect", expected, format!("{} {} {} {}", rect.x0, rect.y0, rect.x1, rect.y1)));
+        }
+    }
+    let rects = rects.unwrap_or_else(|| vec![rect; frames.len()]);
+    if rects.len() != frames.len() {
+        return Err(invalid("rects", format!("{}, as many as frames", frames.len()), rects.len().to_string()));
+    }
+    let count = annots.num_instants();
+    if let Some(beyond) = frames.iter().find(|&&frame| frame >= count) {
+        let expected = format!("indices below {count}, as of ims in {}", annots.path.display());
+        return Err(invalid("frames", expected, beyond.to_string()));
+    }
+    let area = |r: Rectangle| Area { columns: r.x0..r.x1, rows: r.y0..r.y1 };
+    Ok(frames.into_iter().zip(rects.into_iter().map(area)).collect())
 }
