@@ -21,6 +21,7 @@ use smpl::BodyModel;
 
 use super::camera::Lens;
 use super::decode::{Planned, View, capture};
+use super::files::FrameFiles;
 use super::item::{Item, pickled};
 use super::names::FrameName;
 use super::pictures::{Pictures, file_name, is_directory};
@@ -90,43 +91,22 @@ fn plan(
         return Err(CaptureError::invalid(path, "camera of the image", expected, "none"));
     }
     let chosen = choose(lenses.keys().map(|name| name.0).collect())?;
+    let planned = |&name: &&str| {
+        let (image, masks) = (images.demand(name, cameras)?, vec![masks.demand(name, cameras)?]);
+        let (lens, info) = (&lenses[&FrameName(name)], &infos[&FrameName(name)]);
+        let fitted = checks::about_origin(info, "betas", body)?;
+        checks::joints(info, "tpose_joints", &fitted.betas, body)?;
+        let lens = Lens::read(lens, "intrinsics", "extrinsics", options.pixel_centre)?;
+        let files = FrameFiles { image, masks, labels: false, occluder: None, hidden: None, lens };
+        Ok(Planned { name: name.to_owned(), files, body: fitted, keypoints: Vec::new() })
+    };
     // Collected as results first: the first error in order is reported.
-    let frames: Vec<Result<Planned, CaptureError>> = chosen
-        .par_iter()
-        .map(|&name| {
-            let (image, mask) = (images.demand(name, cameras)?, masks.demand(name, cameras)?);
-            plan_frame(name, image, mask, &lenses[&FrameName(name)], &infos[&FrameName(name)], body, options)
-        })
-        .collect();
+    let frames: Vec<Result<Planned, CaptureError>> = chosen.par_iter().map(planned).collect();
     let frames: Vec<Planned> = frames.into_iter().collect::<Result<_, _>>()?;
     if frames.is_empty() {
         return Ok(None);
     }
     View::new(frames, &dir.join("masks"), cameras).map(Some)
-}
-
-fn plan_frame(
-    name: &str,
-    image: PathBuf,
-    mask: PathBuf,
-    lens: &Item<'_>,
-    parameters: &Item<'_>,
-    body: &BodyModel,
-    options: &LoadOptions,
-) -> Result<Planned, CaptureError> {
-    let fitted = checks::about_origin(parameters, "betas", body)?;
-    checks::joints(parameters, "tpose_joints", &fitted.betas, body)?;
-    Ok(Planned {
-        name: name.to_owned(),
-        image,
-        masks: vec![mask],
-        labels: false,
-        occluder: None,
-        hidden: None,
-        lens: Lens::read(lens, "intrinsics", "extrinsics", options.pixel_centre)?,
-        body: fitted,
-        keypoints: Vec::new(),
-    })
 }
 
 /// The shape of the canonical body, `avg_betas` of `canonical_joints.pkl`, its joints checked

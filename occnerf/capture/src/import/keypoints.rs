@@ -61,7 +61,7 @@ pub(super) fn add(
             )
         };
         let off = |point: &Keypoint| point.place.distance(project(point.joint));
-        let candidates = found[placed.index].iter().map(|person| -> Vec<Keypoint> {
+        let candidates = found[fit.index].iter().map(|person| -> Vec<Keypoint> {
             let points = person.iter().zip(&joints).filter(|([.., confidence], _)| *confidence >= LEAST);
             let point = |(&[x, y, confidence], joint): (&[f32; 3], &Option<usize>)| {
                 Some(Keypoint { joint: (*joint)?, place: Vec2::new(x, y), confidence: confidence.min(1.0) })

@@ -24,7 +24,6 @@ mod join;
 mod keypoints;
 #[cfg(test)]
 mod keypoints_tests;
-mod levels;
 mod masks;
 mod options;
 mod points;
@@ -159,10 +158,7 @@ pub fn import(options: &ImportOptions, out: &Path) -> Result<Imported, CaptureEr
         notes.push(keypoints::add(path, &mut placed, &betas, &model, &video)?);
     }
     let kind = masks.as_ref().map_or("those in the fit", |masks| masks.kind);
-    write::capture(
-        &write::Parts { options, video: &video, placed: &placed, betas: &betas, masks: masks.as_ref() },
-        out,
-    )?;
+    write::capture(options, &video, &placed, &betas, masks.as_ref(), out)?;
     write::body(&model, out)?;
     Ok(Imported {
         tool,
@@ -294,5 +290,5 @@ fn placed(
         pose[start..].copy_from_slice(hands);
     }
     let translation = frame.pelvis(own) - frame.world_to_camera * pelvis(betas);
-    Placed { index: frame.index, pose, translation, frame, keypoints: Vec::new() }
+    Placed { pose, translation, frame, keypoints: Vec::new() }
 }

@@ -8,7 +8,7 @@ use glam::{DMat3, DQuat, DVec3};
 use testkit::files::zip;
 
 use super::fit::{axis_angle, rotation};
-use super::tests::{Motion, extrinsics, known};
+use super::tests::{Motion, extrinsics, known, video};
 use super::*;
 use crate::testing::{self, Directory, Py, shared};
 
@@ -45,8 +45,7 @@ fn a_weak_perspective_camera_of_vibe_and_ours_agree_near_the_body() {
     let camera = [scale, scale * 640.0 / 480.0, tx, ty];
     // The same in a square of 200 pixels about (350, 180).
     let crop = [scale * 640.0 / 200.0, tx - (350.0 - 320.0) / 320.0 / scale, ty - (180.0 - 240.0) / 240.0 / camera[1]];
-    let video =
-        Video { names: (0..6).map(|i| format!("{i:06}")).collect(), paths: vec![PathBuf::new(); 6], size: (640, 480) };
+    let video = video((0..6).map(|i| format!("{i:06}")), (640, 480));
     let square = array(&[2, 4], [350.0, 180.0, 200.0, 200.0].repeat(2));
     for cameras in [
         [("orig_cam", array(&[2, 4], camera.repeat(2))), ("more", square.clone())],
@@ -209,8 +208,7 @@ fn what_neuman_aligns_to_a_known_motion_is_that_motion() {
     let motion = known(&dir);
     let Motion { k, betas, poses, pelvises, joint, .. } = &motion;
     // Pictures are named by the rows of the poses.
-    let names = (0..poses.len()).map(|i| format!("{i:05}")).collect();
-    let video = Video { names, paths: motion.video.paths.clone(), size: motion.video.size };
+    let video = video((0..poses.len()).map(|i| format!("{i:05}")), motion.video.size);
     let out = Directory::new("import-neuman");
     // A camera that moves, and a scene in which a metre is 0.3.
     let (scale, mut images, mut alignments) = (0.3, String::from("# Image list\n"), Vec::new());

@@ -368,7 +368,7 @@ fn pictures_bodies_and_obstacles_that_cannot_be() {
     ] {
         broken(words, |f| f.occlusion("Camera_B1", size, rect, frames));
     }
-    broken(&["occlusion.json", "rect"], |f| f.dir.write("occlusion.json", "{\"camera\": 3}"));
+    broken(&["occlusion.json", "camera", "folder"], |f| f.dir.write("occlusion.json", "{\"camera\": 3}"));
 }
 
 /// Largest difference of two cameras' calibration and extrinsics, in pixels and metres.
