@@ -6,7 +6,8 @@ use glam::{Vec2, Vec3};
 use smpl::{BodyModel, Placement};
 
 use super::camera::MAX_DISTANCE;
-use super::records::{Record, triples};
+use super::decode::Fitted;
+use super::item::Item;
 use super::{CaptureError, Frame, Keypoint};
 
 /// Tolerance of a joint against the file's, as a fraction of the body's largest extent: 4 cm at
@@ -21,85 +22,84 @@ pub(super) const MAX_ANGLE: f32 = 1e3;
 pub const MAX_BETA: f32 = 1e3;
 
 /// Errors for a value above `most` in magnitude.
-pub(super) fn below(record: &Record<'_>, key: &str, values: &[f32], most: f32) -> Result<(), CaptureError> {
+fn below(item: &Item<'_>, values: &[f32], most: f32) -> Result<(), CaptureError> {
     match values.iter().find(|value| value.abs() > most) {
-        Some(value) => Err(record.invalid(key, format!("numbers up to {most} either way"), value.to_string())),
+        Some(value) => Err(item.invalid(format!("numbers up to {most} either way"), value.to_string())),
         None => Ok(()),
     }
 }
 
-/// Shape coefficients, at most as many as the model's.
-pub(super) fn betas(record: &Record<'_>, key: &str, body: &BodyModel) -> Result<Vec<f32>, CaptureError> {
-    let (shape, values) = record.array(key)?;
-    if shape.len() != 1 || values.len() > body.num_betas() || values.is_empty() && body.num_betas() > 0 {
+/// Shape coefficients under `key`, at most as many as the model's.
+pub(super) fn betas(record: &Item<'_>, key: &str, body: &BodyModel) -> Result<Vec<f32>, CaptureError> {
+    let item = record.get(key)?;
+    let values = item.floats(&[None])?;
+    if values.len() > body.num_betas() || values.is_empty() && body.num_betas() > 0 {
         let expected = match body.num_betas() {
             0 => "no numbers: the body model has one shape only".to_owned(),
             most => format!("1 to {most} numbers, as the body model has"),
         };
-        return Err(record.invalid(key, expected, format!("shape {shape:?}")));
+        return Err(item.invalid(expected, format!("shape [{}]", values.len())));
     }
-    below(record, key, &values, MAX_BETA)?;
+    below(&item, &values, MAX_BETA)?;
     Ok(values)
 }
 
 /// The rotation of every joint, (3J) or (J,3) under `poses`.
-pub(super) fn pose(record: &Record<'_>, body: &BodyModel) -> Result<Vec<Vec3>, CaptureError> {
-    let joints = body.num_joints();
-    let (shape, values) = record.array("poses")?;
-    below(record, "poses", &values, MAX_ANGLE)?;
-    if shape != [3 * joints] && shape != [joints, 3] {
+pub(super) fn pose(record: &Item<'_>, body: &BodyModel) -> Result<Vec<Vec3>, CaptureError> {
+    let (item, joints) = (record.get("poses")?, body.num_joints());
+    let shape = item.values()?.0;
+    let values =
+        if shape.ends_with(&[joints, 3]) { item.floats(&[Some(joints), Some(3)]) } else { item.floats(&[None]) }?;
+    below(&item, &values, MAX_ANGLE)?;
+    if values.len() != 3 * joints {
         let expected = format!("shape [{}], 3 for each of the body model's {joints} joints", 3 * joints);
-        return Err(record.invalid("poses", expected, format!("shape {shape:?}")));
+        return Err(item.invalid(expected, format!("shape {shape:?}")));
     }
     Ok(triples(&values))
 }
 
 /// Detected joints, (N,4) under `keypoints`; none without the key.
-pub(super) fn keypoints(record: &Record<'_>, body: &BodyModel) -> Result<Vec<Keypoint>, CaptureError> {
-    const KEY: &str = "keypoints";
-    if !record.has(KEY) {
-        return Ok(Vec::new());
-    }
-    let (shape, values) = record.stacked(KEY)?;
+pub(super) fn keypoints(record: &Item<'_>, body: &BodyModel) -> Result<Vec<Keypoint>, CaptureError> {
+    let Some(item) = record.find("keypoints") else { return Ok(Vec::new()) };
+    let (shape, values) = item.values()?;
     if values.is_empty() {
         return Ok(Vec::new());
     }
     if shape.len() != 2 || shape[1] != 4 {
-        return Err(record.invalid(KEY, "shape [N, 4]: joint, x, y, confidence", format!("shape {shape:?}")));
+        return Err(item.invalid("shape [N, 4]: joint, x, y, confidence", format!("shape {shape:?}")));
     }
-    if record.has("distortions") {
-        return Err(record.invalid(KEY, "none beside `distortions`", "key points of a distorted picture"));
+    if record.find("distortions").is_some() {
+        return Err(item.invalid("none beside `distortions`", "key points of a distorted picture"));
     }
     let joints = body.num_joints();
-    let point = |row: &[f32]| {
-        let [joint, x, y, confidence] = [row[0], row[1], row[2], row[3]];
+    let point = |row: &[f64]| {
+        let [joint, x, y, confidence] = [row[0], row[1], row[2], row[3]].map(|value| value as f32);
         let is_joint = joint >= 0.0 && joint.fract() == 0.0 && (joint as usize) < joints;
         let is_near = x.abs().max(y.abs()) < FARTHEST_PIXEL;
         if !(is_joint && is_near && (0.0..=1.0).contains(&confidence)) {
             let expected = format!("a joint below {joints}, a pixel, a confidence of 0 to 1");
-            return Err(record.invalid(KEY, expected, format!("{row:?}")));
+            return Err(item.invalid(expected, format!("{row:?}")));
         }
         Ok(Keypoint { joint: joint as usize, place: Vec2::new(x, y), confidence })
     };
     values.chunks_exact(4).map(point).collect()
 }
 
-/// [`pose`] with a zero root, for a separate global rotation.
-pub(super) fn rootless_pose(record: &Record<'_>, body: &BodyModel) -> Result<Vec<Vec3>, CaptureError> {
+/// A body in ZJU-MoCap's way: `poses` with a zero root, rotation `Rh` and translation `Th` about the
+/// origin, and shape coefficients under `key`.
+pub(super) fn about_origin(record: &Item<'_>, key: &str, body: &BodyModel) -> Result<Fitted, CaptureError> {
+    let vector = |key: &str, most: f32| {
+        let item = record.get(key)?;
+        let values = item.floats(&[Some(3)])?;
+        below(&item, &values, most).map(|()| Vec3::from_slice(&values))
+    };
     let pose = pose(record, body)?;
     if let Some(root) = pose.first().filter(|root| **root != Vec3::ZERO) {
         let expected = "a zero root (the global rotation is Rh)";
-        return Err(record.invalid("poses", expected, format!("{root} for joint 0")));
+        return Err(record.get("poses")?.invalid(expected, format!("{root} for joint 0")));
     }
-    Ok(pose)
-}
-
-/// ZJU-MoCap's way of placing a body: rotation `Rh` and translation `Th` about the origin.
-pub(super) fn origin(record: &Record<'_>) -> Result<Placement, CaptureError> {
-    let (rotation, translation) = (record.vec3("Rh")?, record.vec3("Th")?);
-    below(record, "Rh", &rotation.to_array(), MAX_ANGLE)?;
-    below(record, "Th", &translation.to_array(), MAX_DISTANCE)?;
-    Ok(Placement::Origin { rotation, translation })
+    let placement = Placement::Origin { rotation: vector("Rh", MAX_ANGLE)?, translation: vector("Th", MAX_DISTANCE)? };
+    Ok(Fitted { pose, placement, betas: betas(record, key, body)? })
 }
 
 /// Mean shape coefficients of all frames, missing ones being 0.
@@ -114,27 +114,44 @@ pub(super) fn mean_betas<'a>(frames: impl ExactSizeIterator<Item = &'a [f32]>) -
 }
 
 /// Compares the T-pose joints under `key` with those of `body` for `betas`.
-pub(super) fn joints(record: &Record<'_>, key: &str, betas: &[f32], body: &BodyModel) -> Result<(), CaptureError> {
-    let why = ": the body model's joints (is it the model that the capture was fitted with?)";
-    let expected = triples(&record.shaped(key, &[body.num_joints(), 3], why)?);
+pub(super) fn joints(record: &Item<'_>, key: &str, betas: &[f32], body: &BodyModel) -> Result<(), CaptureError> {
+    let item = record.get(key)?;
+    let expected = item.floats(&[Some(body.num_joints()), Some(3)])?;
     let shaped = body.shaped(betas);
-    let low = shaped.vertices.iter().copied().fold(Vec3::INFINITY, Vec3::min);
-    let high = shaped.vertices.iter().copied().fold(Vec3::NEG_INFINITY, Vec3::max);
-    let tolerance = JOINT_TOLERANCE * (high - low).max_element();
-    for (joint, (model, file)) in shaped.joints.iter().zip(&expected).enumerate() {
+    same(&item, "joint", &shaped.joints, &triples(&expected), JOINT_TOLERANCE * extent(&shaped.vertices))
+}
+
+/// Largest side of the points' box.
+pub(super) fn extent(points: &[Vec3]) -> f32 {
+    let low = points.iter().copied().fold(Vec3::INFINITY, Vec3::min);
+    let high = points.iter().copied().fold(Vec3::NEG_INFINITY, Vec3::max);
+    (high - low).max_element()
+}
+
+/// Errors unless the model's points, each `what`, are those of the file.
+pub(super) fn same(
+    item: &Item<'_>,
+    what: &str,
+    model: &[Vec3],
+    file: &[Vec3],
+    tolerance: f32,
+) -> Result<(), CaptureError> {
+    for (i, (model, file)) in model.iter().zip(file).enumerate() {
         let distance = model.distance(*file);
-        if distance > tolerance {
-            return Err(record.invalid(
-                key,
-                format!(
-                    "the body model's joints for these betas within {tolerance:.3} (is it the model that the \
-                     capture was fitted with?)"
-                ),
-                format!("joint {joint} at {file}, {distance:.3} from the model's"),
-            ));
+        if distance.is_nan() || distance > tolerance {
+            let expected = format!(
+                "the body model's within {tolerance:.3} (is it the model that the capture was fitted with, and are \
+                 files numbered as the frames are?)"
+            );
+            return Err(item.invalid(expected, format!("{what} {i} at {file}, {distance:.3} from the model's")));
         }
     }
     Ok(())
+}
+
+/// Groups of three numbers.
+pub(super) fn triples(values: &[f32]) -> Vec<Vec3> {
+    values.chunks_exact(3).map(Vec3::from_slice).collect()
 }
 
 /// At least one mask shows the subject. `dir` holds the masks.

@@ -7,12 +7,10 @@ use glam::{Vec2, Vec3};
 use rayon::prelude::*;
 use smpl::{BodyModel, Placement};
 
-use super::camera::Lens;
-use super::files::{Files, decoding_bytes};
+use super::files::{Files, FrameFiles, decoding_bytes};
 use super::gate::Gate;
 use super::image::dimensions;
 use super::pictures::file_name;
-use super::pixels::Area;
 use super::source::{Allowance, PixelSource};
 use super::{Capture, CaptureError, EvalFrame, Frame, Keypoint, LoadOptions, checks};
 
@@ -23,21 +21,19 @@ const VERTEX_BYTES: u64 = 24;
 /// Ratio of the bytes of a training frame's pixels to its labels', 3 bits a pixel.
 const LABELS_SHARE: u64 = 42;
 
-/// A frame whose pictures have not been read.
-pub(super) struct Planned {
-    pub name: String,
-    pub image: PathBuf,
-    /// The subject is their union; at least one.
-    pub masks: Vec<PathBuf>,
-    /// Whether masks hold part labels, with background 0, instead of coverage.
-    pub labels: bool,
-    pub occluder: Option<PathBuf>,
-    /// Simulated obstacle, in pixels of the files.
-    pub hidden: Option<Area>,
-    pub lens: Lens,
+/// A body as a file poses it.
+#[derive(Clone)]
+pub(super) struct Fitted {
     pub pose: Vec<Vec3>,
     pub placement: Placement,
     pub betas: Vec<f32>,
+}
+
+/// A frame whose pictures have not been read.
+pub(super) struct Planned {
+    pub name: String,
+    pub files: FrameFiles,
+    pub body: Fitted,
     /// In pixels of the files.
     pub keypoints: Vec<Keypoint>,
 }
@@ -71,7 +67,7 @@ impl View {
     /// `masks` and `cameras` are named in errors about all frames. There must be a frame.
     pub fn new(frames: Vec<Planned>, masks: &Path, cameras: &Path) -> Result<Self, CaptureError> {
         let first = frames.first().ok_or_else(|| CaptureError::invalid(cameras, "all frames", "a frame", "none"))?;
-        let size = dimensions(&first.image)?;
+        let size = dimensions(&first.files.image)?;
         Ok(Self { frames, size, masks: masks.to_owned(), cameras: cameras.to_owned() })
     }
 
@@ -81,27 +77,21 @@ impl View {
         u64::from(width) * u64::from(height) * PIXEL_BYTES
     }
 
-    /// Bytes for decoding a frame.
-    fn decoding_bytes(&self) -> u64 {
-        decoding_bytes(self.size)
-    }
-
     /// The frames, checked together. Pictures within `budget` are decoded; of the others, headers are
     /// checked.
     fn frames(self, body: &BodyModel, options: &LoadOptions, budget: &Budget) -> Result<Vec<Frame>, CaptureError> {
         let first = Arc::from(self.frames[0].name.as_str());
         let (size, to) = (self.size, options.resized(self.size));
         let frame = |plan: Planned| {
-            let Planned { name, image, masks, labels, occluder, hidden, lens, pose, placement, betas, mut keypoints } =
-                plan;
+            let Planned { name, files, body, mut keypoints } = plan;
+            let Fitted { pose, placement, betas } = body;
             let scale = Vec2::new(to.0 as f32 / size.0 as f32, to.1 as f32 / size.1 as f32);
             keypoints.iter_mut().for_each(|point| point.place *= scale);
-            let camera = volrender::Camera { width: size.0, height: size.1, ..lens.camera };
-            let first = Arc::clone(&first);
-            let gate = Arc::clone(&budget.gate);
-            let files = Files { image, masks, labels, occluder, hidden, lens, size, to, first, gate };
+            let (first, gate) = (Arc::clone(&first), Arc::clone(&budget.gate));
+            let files = Files { of: files, size, to, first, gate };
+            let camera = files.camera().resized(to.0, to.1);
             let source = PixelSource::on_disk(files, Arc::clone(&budget.kept));
-            Frame { name, source, camera: camera.resized(to.0, to.1), pose, placement, betas, keypoints }
+            Frame { name, source, camera, pose, placement, betas, keypoints }
         };
         let frames: Vec<Frame> = self.frames.into_iter().map(frame).collect();
         // Collected as results first: the first error in order is reported.
@@ -153,7 +143,7 @@ fn budget(train: &View, eval: &[View], body: &BodyModel, options: &LoadOptions) 
         (frames + views) as u64 * body_bytes + frames as u64 * train.picture_bytes(options).div_ceil(LABELS_SHARE)
     };
     let bodies = kept(1, 1);
-    let picture = views().map(View::decoding_bytes).max().unwrap_or(0);
+    let picture = views().map(|view| decoding_bytes(view.size)).max().unwrap_or(0);
     if bodies + picture <= limit {
         return Ok(Budget::new(limit - bodies, picture));
     }

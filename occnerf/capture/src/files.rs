@@ -13,9 +13,9 @@ use super::pixels::{Area, Pixels};
 use super::undistort::undistort;
 use super::{CaptureError, Image};
 
-/// The files of a frame, and parameters of decoding.
+/// The files of a frame.
 #[derive(Clone, Debug)]
-pub(super) struct Files {
+pub(super) struct FrameFiles {
     pub image: PathBuf,
     /// The subject is their union; at least one.
     pub masks: Vec<PathBuf>,
@@ -25,6 +25,12 @@ pub(super) struct Files {
     /// Simulated obstacle, in pixels of the files.
     pub hidden: Option<Area>,
     pub lens: Lens,
+}
+
+/// The files of a frame, and parameters of decoding.
+#[derive(Clone, Debug)]
+pub(super) struct Files {
+    pub of: FrameFiles,
     /// Width and height of every file, and after resizing.
     pub size: (u32, u32),
     pub to: (u32, u32),
@@ -53,6 +59,11 @@ pub(super) fn read_text(path: &Path, most: u64) -> Result<String, CaptureError> 
 }
 
 impl Files {
+    /// The camera at the size of the files.
+    pub fn camera(&self) -> volrender::Camera {
+        volrender::Camera { width: self.size.0, height: self.size.1, ..self.of.lens.camera }
+    }
+
     /// The files with a simulated obstacle over an area of the decoded pixels.
     pub fn hidden_behind(&self, area: &Area) -> Self {
         let scaled = |range: &Range<u32>, from: u32, to: u32| {
@@ -62,13 +73,14 @@ impl Files {
         };
         let columns = scaled(&area.columns, self.to.0, self.size.0);
         let rows = scaled(&area.rows, self.to.1, self.size.1);
-        Self { hidden: Some(Area { columns, rows }), ..self.clone() }
+        let of = FrameFiles { hidden: Some(Area { columns, rows }), ..self.of.clone() };
+        Self { of, ..self.clone() }
     }
 
     /// Checks the sizes in the headers against the memory budget's.
     pub fn check(&self) -> Result<(), CaptureError> {
-        self.same_size(&self.image, dimensions(&self.image)?)?;
-        self.masks.iter().chain(&self.occluder).try_for_each(|path| self.same_size(path, dimensions(path)?))
+        self.same_size(&self.of.image, dimensions(&self.of.image)?)?;
+        self.of.masks.iter().chain(&self.of.occluder).try_for_each(|path| self.same_size(path, dimensions(path)?))
     }
 
     fn same_size(&self, path: &Path, found: (u32, u32)) -> Result<(), CaptureError> {
@@ -76,7 +88,7 @@ impl Files {
             return Ok(());
         }
         let text = |(w, h): (u32, u32)| format!("{w}×{h}");
-        let of = if path == self.image { format!("`{}`", self.first) } else { "its image".to_owned() };
+        let of = if path == self.of.image { format!("`{}`", self.first) } else { "its image".to_owned() };
         Err(CaptureError::invalid(path, "size", format!("{}, as of {of}", text(self.size)), text(found)))
     }
 
@@ -89,10 +101,9 @@ impl Files {
     /// The unmasked picture at the size of the pixels.
     pub fn photograph(&self) -> Result<Image, CaptureError> {
         self.gate.pass(decoding_bytes(self.size), || {
-            let image = Image::load(&self.image)?;
-            self.same_size(&self.image, (image.width, image.height))?;
-            let camera = volrender::Camera { width: self.size.0, height: self.size.1, ..self.lens.camera };
-            let whole = undistort(image.pixels, 3, &camera, &self.lens.distortion);
+            let image = Image::load(&self.of.image)?;
+            self.same_size(&self.of.image, (image.width, image.height))?;
+            let whole = undistort(image.pixels, 3, &self.camera(), &self.of.lens.distortion);
             Ok(Image { width: self.to.0, height: self.to.1, pixels: resize(whole, 3, self.size, self.to) })
         })
     }
@@ -105,31 +116,30 @@ impl Files {
 
     fn decode_now(&self) -> Result<Pixels, CaptureError> {
         let size = self.size;
-        let mut image = Image::load(&self.image)?;
-        self.same_size(&self.image, (image.width, image.height))?;
+        let mut image = Image::load(&self.of.image)?;
+        self.same_size(&self.of.image, (image.width, image.height))?;
         let mut mask = vec![0.0f32; size.0 as usize * size.1 as usize];
-        for path in &self.masks {
+        for path in &self.of.masks {
             for (out, level) in mask.iter_mut().zip(self.mask(path)?) {
-                let level = if self.labels && level > 0.0 { 1.0 } else { level };
+                let level = if self.of.labels && level > 0.0 { 1.0 } else { level };
                 *out = out.max(level);
             }
         }
-        if let Some(Area { columns, rows }) = &self.hidden {
+        if let Some(Area { columns, rows }) = &self.of.hidden {
             let columns = columns.start.min(size.0) as usize..columns.end.min(size.0) as usize;
             let rows = (rows.start as usize, rows.end as usize);
             for row in mask.chunks_exact_mut(size.0 as usize).take(rows.1).skip(rows.0) {
                 row[columns.clone()].fill(0.0);
             }
         }
-        let occluder = match &self.occluder {
+        let occluder = match &self.of.occluder {
             Some(path) => Some(self.mask(path)?.into_iter().map(|level| f32::from(level > 0.5)).collect()),
             None => None,
         };
         // Masked first, since interpolation would mix hidden colours into the mask's edge.
         image.multiply(&mask);
 
-        let Lens { camera, distortion } = self.lens;
-        let camera = volrender::Camera { width: size.0, height: size.1, ..camera };
+        let (camera, distortion) = (self.camera(), self.of.lens.distortion);
         let to = self.to;
         let resample = |values: Vec<f32>, channels: usize| {
             resize(undistort(values, channels, &camera, &distortion), channels, size, to)

@@ -87,11 +87,11 @@ impl Image {
 }
 
 /// Nearest of 256 levels. `as` saturates, and takes NaN to 0.
-fn to_byte(value: f32) -> u8 {
+pub(super) fn to_byte(value: f32) -> u8 {
     (value * 255.0 + 0.5) as u8
 }
 
-fn picture_error(path: &Path, source: image::ImageError) -> CaptureError {
+pub(super) fn picture_error(path: &Path, source: image::ImageError) -> CaptureError {
     match source {
         // A truncated file is damaged.
         image::ImageError::IoError(source) if source.kind() != std::io::ErrorKind::UnexpectedEof => {
@@ -191,16 +191,12 @@ pub(super) fn resize(values: Vec<f32>, channels: usize, from: (u32, u32), to: (u
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    fn directory(name: &str) -> std::path::PathBuf {
-        let path = std::env::temp_dir().join(format!("occnerf-image-{name}-{}", std::process::id()));
-        std::fs::create_dir_all(&path).unwrap();
-        path
-    }
+    use crate::testing::Directory;
 
     #[test]
     fn what_is_written_is_read_back_to_the_nearest_level() {
-        let path = directory("round").join("a.png");
+        let dir = Directory::new("round");
+        let path = dir.file("a.png");
         let mut picture = Image::new(5, 3);
         for (i, p) in picture.pixels.iter_mut().enumerate() {
             *p = i as f32 / 44.0;
@@ -243,17 +239,16 @@ mod tests {
 
     #[test]
     fn a_header_of_absurd_size_is_refused_before_decoding() {
-        // A PNG signature and IHDR of 100000×100000 8-bit RGB, and no data at all.
-        let mut header = b"\x89PNG\r\n\x1a\n\0\0\0\x0dIHDR".to_vec();
-        header.extend(100_000u32.to_be_bytes());
-        header.extend(100_000u32.to_be_bytes());
-        header.extend([8, 2, 0, 0, 0]);
-        let crc = crc32(&header[12..]);
-        header.extend(crc.to_be_bytes());
-        header.extend(b"\0\0\0\0IDAT");
-        header.extend(crc32(b"IDAT").to_be_bytes());
-        let path = directory("absurd").join("a.png");
-        std::fs::write(&path, header).unwrap();
+        let mut header = Vec::new();
+        let mut encoder = png::Encoder::new(&mut header, 100_000, 100_000);
+        encoder.set_color(png::ColorType::Rgb);
+        drop(encoder.write_header().unwrap());
+        // Signature and IHDR, then no data at all.
+        header.truncate(33);
+        header.extend(b"\0\0\0\0IDAT\x35\xaf\x06\x1e");
+        let dir = Directory::new("absurd");
+        let path = dir.file("a.png");
+        dir.write("a.png", header);
         let message = Image::load(&path).unwrap_err().to_string();
         assert!(message.contains("100000×100000") && message.contains("8192"), "{message}");
     }
@@ -273,7 +268,7 @@ mod tests {
 
     #[test]
     fn pictures_of_every_orientation_stand_upright() {
-        let dir = directory("upright");
+        let dir = Directory::new("upright");
         // Blocks of eight pixels, which JPEG keeps apart: red, green, blue, white, black, yellow.
         let colors = [[255, 0, 0], [0, 255, 0], [0, 0, 255], [255; 3], [0; 3], [255, 255, 0]];
         let upright = image::RgbImage::from_fn(24, 16, |x, y| image::Rgb(colors[(x / 8 + 3 * (y / 8)) as usize]));
@@ -294,7 +289,7 @@ mod tests {
                 let (x, y) = from(x, y);
                 *upright.get_pixel(x, y)
             });
-            let path = dir.join(format!("{i}.jpg"));
+            let path = dir.file(&format!("{i}.jpg"));
             std::fs::write(&path, oriented(&turned, i as u8 + 1)).unwrap();
             assert_eq!(dimensions(&path).unwrap(), (24, 16), "{}", i + 1);
             let read = Image::load(&path).unwrap();
@@ -306,30 +301,24 @@ mod tests {
         }
     }
 
-    fn crc32(bytes: &[u8]) -> u32 {
-        !bytes.iter().fold(!0u32, |crc, byte| {
-            (0..8).fold(crc ^ u32::from(*byte), |c, _| if c & 1 == 1 { c >> 1 ^ 0xEDB8_8320 } else { c >> 1 })
-        })
-    }
-
     #[test]
     fn jpeg_and_grey_and_16_bit_are_read_and_rubbish_is_named() {
-        let dir = directory("kinds");
+        let dir = Directory::new("kinds");
         let grey = image::GrayImage::from_pixel(4, 2, image::Luma([255]));
-        grey.save(dir.join("grey.jpg")).unwrap();
+        grey.save(dir.file("grey.jpg")).unwrap();
         // The format is told by content, not by extension.
-        std::fs::copy(dir.join("grey.jpg"), dir.join("really_a_jpeg.png")).unwrap();
+        std::fs::copy(dir.file("grey.jpg"), dir.file("really_a_jpeg.png")).unwrap();
         let deep = image::ImageBuffer::<image::Rgb<u16>, _>::from_pixel(4, 2, image::Rgb([65535u16; 3]));
-        deep.save(dir.join("deep.png")).unwrap();
+        deep.save(dir.file("deep.png")).unwrap();
         for name in ["grey.jpg", "really_a_jpeg.png", "deep.png"] {
-            let picture = Image::load(&dir.join(name)).unwrap();
+            let picture = Image::load(&dir.file(name)).unwrap();
             assert!(picture.pixels.iter().all(|p| *p > 0.99), "{name}");
-            assert_eq!(load_mask(&dir.join(name)).unwrap().2.len(), 8);
+            assert_eq!(load_mask(&dir.file(name)).unwrap().2.len(), 8);
         }
-        std::fs::write(dir.join("rubbish.png"), b"not a picture").unwrap();
-        let message = Image::load(&dir.join("rubbish.png")).unwrap_err().to_string();
-        assert!(message.contains("rubbish.png"), "{message}");
-        let message = Image::load(&dir.join("none.png")).unwrap_err().to_string();
-        assert!(message.contains("none.png"), "{message}");
+        dir.write("rubbish.png", b"not a picture");
+        for name in ["rubbish.png", "none.png"] {
+            let message = Image::load(&dir.file(name)).unwrap_err().to_string();
+            assert!(message.contains(name), "{message}");
+        }
     }
 }

@@ -15,13 +15,14 @@ mod gate;
 mod humannerf;
 mod image;
 mod import;
+mod item;
+mod json;
 mod light;
 mod names;
 mod options;
 mod packed;
 mod pictures;
 mod pixels;
-mod records;
 mod source;
 #[cfg(test)]
 pub(crate) mod testing;

@@ -4,22 +4,17 @@ use std::sync::LazyLock;
 
 use glam::Vec3;
 
+use super::image::to_byte;
 use super::{Image, Pixels};
 
 /// A compressed picture with mask and occluder; [`PackedPixels::pixels`] returns the same bits.
 #[derive(Clone, Debug)]
 pub struct PackedPixels {
-    rows: Rows,
-    values: Values,
-}
-
-/// Layout of the values of a picture.
-#[derive(Clone, Debug)]
-struct Rows {
     width: u32,
     spans: Vec<Span>,
     /// 64 pixels of the occluder a word.
     occluder: Option<Vec<u64>>,
+    values: Values,
 }
 
 /// Non-zero columns of a row, and the index of the first value.
@@ -52,19 +47,14 @@ static EVEN: LazyLock<Scale> = LazyLock::new(|| {
     Scale { colour: even, mask: even }
 });
 
-/// `as` saturates, and takes NaN to 0.
-fn nearest(value: f32) -> u8 {
-    (value * 255.0 + 0.5) as u8
-}
-
 impl Scale {
     /// The scale of these values, if they are levels.
     fn of(values: &[[f32; 4]]) -> Self {
         let mut scale = EVEN.clone();
         for [r, g, b, mask] in values {
-            scale.mask[usize::from(nearest(*mask))] = *mask;
+            scale.mask[usize::from(to_byte(*mask))] = *mask;
             if *mask == 1.0 {
-                [r, g, b].iter().for_each(|&&colour| scale.colour[usize::from(nearest(colour))] = colour);
+                [r, g, b].iter().for_each(|&&colour| scale.colour[usize::from(to_byte(colour))] = colour);
             }
         }
         scale
@@ -73,8 +63,8 @@ impl Scale {
     /// The levels that this colour and coverage are made of; `None` if no levels give these very
     /// bits.
     fn levels(&self, [r, g, b, mask]: [f32; 4]) -> Option<[u8; 4]> {
-        let coverage = nearest(mask);
-        let of = |colour: f32| if coverage == 0 { 0 } else { nearest(colour / mask) };
+        let coverage = to_byte(mask);
+        let of = |colour: f32| if coverage == 0 { 0 } else { to_byte(colour / mask) };
         let found = [of(r), of(g), of(b), coverage];
         let same = self.floats(found).map(f32::to_bits) == [r, g, b, mask].map(f32::to_bits);
         same.then_some(found)
@@ -91,59 +81,6 @@ impl PackedPixels {
     /// Packs pixels, in 8-bit levels where those reproduce all of them.
     #[must_use]
     pub fn new(pixels: &Pixels) -> Self {
-        let (rows, values) = Rows::new(pixels);
-        let own = Scale::of(&values);
-        let levels: Option<Vec<[u8; 4]>> = values.iter().map(|&value| own.levels(value)).collect();
-        let scale = (own != *EVEN).then(|| Box::new(own));
-        let values = levels.map_or(Values::Floats(values), |levels| Values::Levels(scale, levels));
-        Self { rows, values }
-    }
-
-    /// Size in bytes.
-    #[must_use]
-    pub fn bytes(&self) -> u64 {
-        let values = match &self.values {
-            Values::Levels(scale, values) => {
-                scale.as_ref().map_or(0, |_| size_of::<Scale>()) + size_of_val(&values[..])
-            }
-            Values::Floats(values) => size_of_val(&values[..]),
-        };
-        let occluder = self.rows.occluder.as_ref().map_or(0, |bits| size_of_val(&bits[..]));
-        (values + size_of_val(&self.rows.spans[..]) + occluder) as u64
-    }
-
-    /// Premultiplied colour and coverage of a pixel.
-    ///
-    /// # Panics
-    /// Outside the picture.
-    #[must_use]
-    pub fn at(&self, pixel: u32) -> (Vec3, f32) {
-        let (row, column) = (pixel / self.rows.width, pixel % self.rows.width);
-        let span = self.rows.spans[row as usize];
-        if !(span.start..span.end).contains(&column) {
-            return (Vec3::ZERO, 0.0);
-        }
-        let [r, g, b, mask] = self.value(span.first + (column - span.start) as usize);
-        (Vec3::new(r, g, b), mask)
-    }
-
-    fn value(&self, at: usize) -> [f32; 4] {
-        match &self.values {
-            Values::Levels(scale, values) => scale.as_deref().unwrap_or(&EVEN).floats(values[at]),
-            Values::Floats(values) => values[at],
-        }
-    }
-
-    /// The pixels as they were packed.
-    #[must_use]
-    pub fn pixels(&self) -> Pixels {
-        self.rows.pixels(|at| self.value(at))
-    }
-}
-
-impl Rows {
-    /// The rows of a picture, and their values one after the other.
-    pub fn new(pixels: &Pixels) -> (Self, Vec<[f32; 4]>) {
         let width = pixels.image.width.max(1) as usize;
         let value = |i: usize| {
             let colour = &pixels.image.pixels[3 * i..3 * i + 3];
@@ -162,18 +99,58 @@ impl Rows {
         }
         let word = |bits: &[bool]| bits.iter().enumerate().fold(0, |word, (i, &bit)| word | u64::from(bit) << i);
         let occluder = pixels.occluder.as_ref().map(|covered| covered.chunks(64).map(word).collect());
-        (Self { width: width as u32, spans, occluder }, values)
+        let own = Scale::of(&values);
+        let levels: Option<Vec<[u8; 4]>> = values.iter().map(|&value| own.levels(value)).collect();
+        let scale = (own != *EVEN).then(|| Box::new(own));
+        let values = levels.map_or(Values::Floats(values), |levels| Values::Levels(scale, levels));
+        Self { width: width as u32, spans, occluder, values }
     }
 
-    /// The pixels that have these values.
-    pub fn pixels(&self, value: impl Fn(usize) -> [f32; 4]) -> Pixels {
+    /// Size in bytes.
+    #[must_use]
+    pub fn bytes(&self) -> u64 {
+        let values = match &self.values {
+            Values::Levels(scale, values) => {
+                scale.as_ref().map_or(0, |_| size_of::<Scale>()) + size_of_val(&values[..])
+            }
+            Values::Floats(values) => size_of_val(&values[..]),
+        };
+        let occluder = self.occluder.as_ref().map_or(0, |bits| size_of_val(&bits[..]));
+        (values + size_of_val(&self.spans[..]) + occluder) as u64
+    }
+
+    /// Premultiplied colour and coverage of a pixel.
+    ///
+    /// # Panics
+    /// Outside the picture.
+    #[must_use]
+    pub fn at(&self, pixel: u32) -> (Vec3, f32) {
+        let (row, column) = (pixel / self.width, pixel % self.width);
+        let span = self.spans[row as usize];
+        if !(span.start..span.end).contains(&column) {
+            return (Vec3::ZERO, 0.0);
+        }
+        let [r, g, b, mask] = self.value(span.first + (column - span.start) as usize);
+        (Vec3::new(r, g, b), mask)
+    }
+
+    fn value(&self, at: usize) -> [f32; 4] {
+        match &self.values {
+            Values::Levels(scale, values) => scale.as_deref().unwrap_or(&EVEN).floats(values[at]),
+            Values::Floats(values) => values[at],
+        }
+    }
+
+    /// The pixels as they were packed.
+    #[must_use]
+    pub fn pixels(&self) -> Pixels {
         let (width, height) = (self.width as usize, self.spans.len());
         let mut image = Image::new(self.width, height as u32);
         let mut mask = vec![0.0; width * height];
         for (row, span) in self.spans.iter().enumerate() {
             for (at, column) in (span.first..).zip(span.start as usize..span.end as usize) {
                 let i = row * width + column;
-                let [r, g, b, coverage] = value(at);
+                let [r, g, b, coverage] = self.value(at);
                 image.pixels[3 * i..3 * i + 3].copy_from_slice(&[r, g, b]);
                 mask[i] = coverage;
             }

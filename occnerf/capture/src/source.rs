@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, OnceLock};
 
-use super::files::Files;
+use super::files::{Files, FrameFiles};
 use super::packed::PackedPixels;
 use super::pixels::{Area, Pixels};
 use super::{CaptureError, Image};
@@ -16,7 +16,7 @@ pub struct PixelSource(Place);
 
 #[derive(Clone, Debug)]
 enum Place {
-    Memory(Arc<PackedPixels>),
+    Memory(PixelReader),
     Disk(Arc<OnDisk>),
 }
 
@@ -28,11 +28,12 @@ struct OnDisk {
     edits: Vec<Edit>,
     allowance: Arc<Allowance>,
     /// Packed pixels after the first decoding; `None` with the allowance exhausted.
-    kept: OnceLock<Option<Kept>>,
+    kept: OnceLock<Option<PixelReader>>,
 }
 
+/// Random access to packed pixels, which are in memory or take room of an allowance.
 #[derive(Clone, Debug)]
-struct Kept(Arc<(PackedPixels, Room)>);
+pub struct PixelReader(Arc<(PackedPixels, Option<Room>)>);
 
 /// Bytes for packed pixels, first come, first served.
 #[derive(Debug)]
@@ -88,7 +89,7 @@ impl OnDisk {
         self.kept.get_or_init(|| {
             let packed = PackedPixels::new(pixels);
             let room = self.allowance.take(packed.bytes())?;
-            Some(Kept(Arc::new((packed, room))))
+            Some(PixelReader(Arc::new((packed, Some(room)))))
         });
     }
 
@@ -103,28 +104,23 @@ impl OnDisk {
     }
 }
 
-/// Random access to packed pixels.
-pub struct PixelReader(Packed);
-
-enum Packed {
-    Memory(Arc<PackedPixels>),
-    Kept(Kept),
-}
-
 impl std::ops::Deref for PixelReader {
     type Target = PackedPixels;
 
     fn deref(&self) -> &PackedPixels {
-        match &self.0 {
-            Packed::Memory(packed) => packed,
-            Packed::Kept(kept) => &kept.0.0,
-        }
+        &self.0.0
+    }
+}
+
+impl From<&Pixels> for PixelReader {
+    fn from(pixels: &Pixels) -> Self {
+        Self(Arc::new((PackedPixels::new(pixels), None)))
     }
 }
 
 impl From<Pixels> for PixelSource {
     fn from(pixels: Pixels) -> Self {
-        Self(Place::Memory(Arc::new(PackedPixels::new(&pixels))))
+        Self(Place::Memory((&pixels).into()))
     }
 }
 
@@ -143,7 +139,7 @@ impl PixelSource {
         match &self.0 {
             Place::Memory(packed) => Ok(packed.pixels()),
             Place::Disk(disk) => match disk.kept.get() {
-                Some(Some(Kept(kept))) => Ok(kept.0.pixels()),
+                Some(Some(kept)) => Ok(kept.pixels()),
                 Some(None) => disk.decode(),
                 None => {
                     let pixels = disk.decode()?;
@@ -160,16 +156,16 @@ impl PixelSource {
     /// As of [`PixelSource::pixels`].
     pub fn reader(&self) -> Result<PixelReader, CaptureError> {
         let disk = match &self.0 {
-            Place::Memory(packed) => return Ok(PixelReader(Packed::Memory(Arc::clone(packed)))),
+            Place::Memory(packed) => return Ok(packed.clone()),
             Place::Disk(disk) => disk,
         };
         if disk.kept.get().is_none() {
             self.pixels()?;
         }
-        Ok(PixelReader(match disk.kept.get() {
-            Some(Some(kept)) => Packed::Kept(kept.clone()),
-            _ => Packed::Memory(Arc::new(PackedPixels::new(&self.pixels()?))),
-        }))
+        match disk.kept.get() {
+            Some(Some(kept)) => Ok(kept.clone()),
+            _ => Ok((&self.pixels()?).into()),
+        }
     }
 
     /// The unmasked picture; `None` for pixels in memory.
@@ -185,15 +181,15 @@ impl PixelSource {
     #[must_use]
     pub fn origin(&self) -> (Vec<&Path>, String) {
         let Place::Disk(disk) = &self.0 else { return Default::default() };
-        let Files { image, masks, occluder, labels, hidden, lens, to, .. } = &*disk.files;
+        let FrameFiles { image, masks, occluder, labels, hidden, lens } = &disk.files.of;
         let paths = [image].into_iter().chain(masks).chain(occluder).map(PathBuf::as_path).collect();
-        (paths, format!("{labels} {hidden:?} {lens:?} {to:?}"))
+        (paths, format!("{labels} {hidden:?} {lens:?} {:?}", disk.files.to))
     }
 
     /// Whether a simulated obstacle, absent from the photograph, masks pixels.
     #[must_use]
     pub fn is_hidden(&self) -> bool {
-        matches!(&self.0, Place::Disk(disk) if disk.files.hidden.is_some())
+        matches!(&self.0, Place::Disk(disk) if disk.files.of.hidden.is_some())
     }
 
     /// Decodes within the allowance, and checks headers beyond it.
@@ -214,8 +210,8 @@ impl PixelSource {
             }
             Place::Disk(disk) => {
                 let mut changed = disk.undecoded();
-                if let Some(Some(Kept(kept))) = disk.kept.get() {
-                    let mut pixels = kept.0.pixels();
+                if let Some(Some(kept)) = disk.kept.get() {
+                    let mut pixels = kept.pixels();
                     edit(&mut pixels);
                     changed.keep(&pixels);
                 }

@@ -54,42 +54,12 @@ mod tests {
         Camera::new(k, Affine3A::IDENTITY, 64, 48).unwrap()
     }
 
-    /// A smooth picture as a function of ideal coordinates.
-    fn scene(p: Vec2) -> f32 {
-        0.5 + 0.3 * (p.x * 9.0).sin() * (p.y * 7.0).cos()
-    }
-
     #[test]
     fn nothing_is_shown_twice() {
         // r − 0.8 r³ turns at r = 0.645; the corner of the picture is at 0.667.
         let distortion = Distortion::from_opencv([-0.8, 0.0, 0.0, 0.0, 0.0]);
         let out = undistort(vec![1.0; 64 * 48], 1, &camera(), &distortion);
         assert_eq!((out[0], out[24 * 64]), (0.0, 1.0));
-    }
-
-    #[test]
-    fn a_perfect_lens_changes_nothing() {
-        let mut image = vec![0.0; 64 * 48 * 3];
-        image[5] = 0.123;
-        assert_eq!(undistort(image.clone(), 3, &camera(), &Distortion::default()), image);
-    }
-
-    #[test]
-    fn undistorting_a_distorted_picture_gives_the_ideal_one() {
-        let camera = camera();
-        let distortion = Distortion::from_opencv([-0.25, 0.08, 0.002, -0.003, 0.0]);
-        let (mut seen, mut ideal) = (Vec::new(), Vec::new());
-        for i in 0..64 * 48 {
-            let pixel = Vec2::new((i % 64) as f32 + 0.5, (i / 64) as f32 + 0.5);
-            let p = (pixel - camera.centre) / camera.focal;
-            ideal.push(scene(p));
-            seen.push(scene(distortion.undistort(p).unwrap()));
-        }
-        let back = undistort(seen.clone(), 1, &camera, &distortion);
-        let error = |a: &[f32]| a.iter().zip(&ideal).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
-        // Bilinear: step² · f″ / 8 in each direction, (1/60)² · 0.3 · (81 + 49) / 8.
-        assert!(error(&back) < 2e-3, "{}", error(&back));
-        assert!(error(&seen) > 2e-2, "the distortion must matter for the test to say anything");
     }
 
     #[test]

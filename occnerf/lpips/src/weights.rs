@@ -5,7 +5,6 @@ use std::fs::File;
 use std::io::{BufReader, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
-use array_files::Data;
 use array_files::pickle::Value;
 use array_files::torch::{self, TorchFile};
 use safetensors::tensor::{Dtype, Metadata};
@@ -18,33 +17,19 @@ const MAX_HEADER: u64 = 100_000_000;
 /// Most files of a directory that are opened.
 const MAX_FILES: usize = 256;
 
-/// A tensor of a file, not read yet.
-#[derive(Clone, Debug)]
-enum Tensor {
-    /// Type, shape and offset in a safetensors file.
-    Bytes(Dtype, Vec<usize>, u64),
-    Torch(torch::Tensor),
-}
+/// Type, shape and offset of each tensor of a safetensors file.
+type Places = BTreeMap<String, (Dtype, Vec<usize>, u64)>;
 
-impl Tensor {
-    fn shape(&self) -> &[usize] {
-        match self {
-            Self::Bytes(_, shape, _) => shape,
-            Self::Torch(tensor) => &tensor.shape,
-        }
-    }
-}
-
+/// An open file, and its tensors by name.
 enum Source {
-    Safetensors(File),
-    Torch(TorchFile<BufReader<File>>),
+    Safetensors(File, Places),
+    Torch(TorchFile<BufReader<File>>, BTreeMap<String, torch::Tensor>),
 }
 
-/// An open file and its tensors.
+/// An open file of weights.
 struct Weights {
     path: PathBuf,
     source: Source,
-    tensors: BTreeMap<String, Tensor>,
 }
 
 /// A trunk with its linear layers, in one file or two.
@@ -82,50 +67,51 @@ fn io(path: &Path) -> impl Fn(std::io::Error) -> Error {
 
 /// Searches `path` as [`Lpips::load`](crate::Lpips::load) describes.
 pub(crate) fn find(path: &Path) -> Result<Found, Error> {
-    if !std::fs::metadata(path).map_err(io(path))?.is_dir() {
-        let weights = Weights::open(path)?;
-        let trunk = weights.trunk().ok_or_else(|| {
-            let names: Vec<&str> = weights.tensors.keys().take(4).map(String::as_str).collect();
-            let expected = "expected `features.0.weight` and the other layers of SqueezeNet 1.1, VGG16 or AlexNet";
-            fault(path, format!("holds no trunk: {expected}; it starts with {}", names.join(", ")))
-        })?;
-        let beside = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-        return with_lin(weights, trunk, beside);
-    }
-    let mut first_error = None;
-    for file in files(path)? {
-        let found = Weights::open(&file).and_then(|weights| match weights.trunk() {
+    if std::fs::metadata(path).map_err(io(path))?.is_dir() {
+        let found = first(path, |weights| match weights.trunk() {
             Some(trunk) => with_lin(weights, trunk, path).map(Some),
             None => Ok(None),
         });
-        match found {
-            Ok(Some(found)) => return Ok(found),
-            Ok(None) => {}
-            Err(error) => first_error = first_error.or(Some(error)),
-        }
+        let absent = || fault(path, "has no .safetensors, .pth or .pt file with a trunk in it");
+        return found?.ok_or_else(absent);
     }
-    Err(first_error.unwrap_or_else(|| fault(path, "has no .safetensors, .pth or .pt file with a trunk in it")))
+    let weights = Weights::open(path)?;
+    let trunk = weights.trunk().ok_or_else(|| {
+        let names = weights.names().into_iter().take(4).collect::<Vec<_>>().join(", ");
+        let expected = "expected `features.0.weight` and the other layers of SqueezeNet 1.1, VGG16 or AlexNet";
+        fault(path, format!("holds no trunk: {expected}; it starts with {names}"))
+    })?;
+    let beside = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    with_lin(weights, trunk, beside)
 }
 
-/// Completes a trunk with linear layers from its own file or from a file in `directory`. A damaged
-/// file there is an error only if no other file has them.
+/// Completes a trunk with linear layers from its own file or from a file in `directory`.
 fn with_lin(weights: Weights, trunk: Trunk, directory: &Path) -> Result<Found, Error> {
     if weights.has_lin(trunk) {
         return Ok(Found { trunk, weights, lin: None });
     }
-    let mut first_error = None;
-    for file in files(directory)? {
-        match Weights::open(&file) {
-            Ok(lin) if lin.has_lin(trunk) => return Ok(Found { trunk, weights, lin: Some(lin) }),
-            Ok(_) => {}
-            Err(error) => first_error = first_error.or(Some(error)),
-        }
-    }
-    Err(first_error.unwrap_or_else(|| {
+    let lin = first(directory, |lin| Ok(lin.has_lin(trunk).then_some(lin)))?;
+    let absent = || {
         let name = trunk.name();
         let what = "without LPIPS's linear layers: no `lin0.weight`";
         fault(&weights.path, format!("is {name} {what} of {name} in it or in a file beside it"))
-    }))
+    };
+    let lin = lin.ok_or_else(absent)?;
+    Ok(Found { trunk, weights, lin: Some(lin) })
+}
+
+/// What `choose` makes of the first file of a directory that it takes. A damaged file is an error only
+/// if it takes no other.
+fn first<T>(directory: &Path, mut choose: impl FnMut(Weights) -> Result<Option<T>, Error>) -> Result<Option<T>, Error> {
+    let mut first_error = None;
+    for file in files(directory)? {
+        match Weights::open(&file).and_then(&mut choose) {
+            Ok(None) => {}
+            Ok(found) => return Ok(found),
+            Err(error) => first_error = first_error.or(Some(error)),
+        }
+    }
+    first_error.map_or(Ok(None), Err)
 }
 
 /// Files of weights in a directory, sorted by name.
@@ -151,22 +137,35 @@ impl Weights {
         let mut file = File::open(path).map_err(io(path))?;
         let mut start = Vec::new();
         (&mut file).take(64).read_to_end(&mut start).map_err(io(path))?;
-        let (source, tensors) = if torch::is_torch(&start) {
+        let source = if torch::is_torch(&start) {
             let file = TorchFile::open(&path.display().to_string(), BufReader::new(file))?;
             let tensors = torch_tensors(&file)?;
-            (Source::Torch(file), tensors)
+            Source::Torch(file, tensors)
         } else {
             let tensors = safetensors(path, &mut file)?;
-            (Source::Safetensors(file), tensors)
+            Source::Safetensors(file, tensors)
         };
-        Ok(Self { path: path.to_owned(), source, tensors })
+        Ok(Self { path: path.to_owned(), source })
+    }
+
+    fn names(&self) -> Vec<&str> {
+        match &self.source {
+            Source::Safetensors(_, tensors) => tensors.keys().map(String::as_str).collect(),
+            Source::Torch(_, tensors) => tensors.keys().map(String::as_str).collect(),
+        }
+    }
+
+    fn shape(&self, name: &str) -> Option<&[usize]> {
+        match &self.source {
+            Source::Safetensors(_, tensors) => tensors.get(name).map(|(_, shape, _)| shape.as_slice()),
+            Source::Torch(_, tensors) => tensors.get(name).map(|tensor| tensor.shape.as_slice()),
+        }
     }
 
     /// The trunk in the file, told by the names of its layers.
     fn trunk(&self) -> Option<Trunk> {
-        let has = |name: &str| self.tensors.contains_key(name);
-        let first = self.tensors.get("features.0.weight")?;
-        match first.shape().last() {
+        let has = |name: &str| self.shape(name).is_some();
+        match self.shape("features.0.weight")?.last() {
             Some(11) => Some(Trunk::AlexNet),
             _ if has("features.3.squeeze.weight") => Some(Trunk::SqueezeNet),
             _ if has("features.28.weight") && !has("features.34.weight") => Some(Trunk::Vgg16),
@@ -176,66 +175,59 @@ impl Weights {
 
     /// Whether the file has the linear layers of `trunk`.
     fn has_lin(&self, trunk: Trunk) -> bool {
+        let channels = |i: usize| Some(self.shape(&self.named(&format!("lin{i}.weight")))?.iter().product::<usize>());
         let taps = trunk.taps();
-        let fits = |(i, &channels): (usize, &usize)| {
-            let tensor = self.find(&format!("lin{i}.weight"));
-            tensor.is_some_and(|(_, t)| t.shape().iter().product::<usize>() == channels)
-        };
-        taps.iter().enumerate().all(fits) && self.find(&format!("lin{}.weight", taps.len())).is_none()
+        taps.iter().enumerate().all(|(i, taps)| channels(i) == Some(*taps)) && channels(taps.len()).is_none()
     }
 
-    /// The tensor `name`. The files of the Python package `lpips` name linear layers
+    /// The name of a tensor in the file. The Python package `lpips` names linear layers
     /// `lin0.model.1.weight`.
-    fn find(&self, name: &str) -> Option<(&String, &Tensor)> {
-        let found = self.tensors.get_key_value(name);
-        found.or_else(|| self.tensors.get_key_value(&name.replace(".weight", ".model.1.weight")))
+    fn named(&self, name: &str) -> String {
+        if self.shape(name).is_some() { name.to_owned() } else { name.replace(".weight", ".model.1.weight") }
     }
 
     fn read(&mut self, name: &str, shape: &[usize]) -> Result<Vec<f32>, Error> {
-        let path = &self.path;
-        let found = self.find(name).map(|(name, tensor)| (name.clone(), tensor.clone()));
-        let (name, tensor) = found.ok_or_else(|| fault(path, format!("lacks `{name}`, of shape {shape:?}")))?;
+        let (own, path) = (self.named(name), &self.path);
         let bare = |shape: &[usize]| shape.iter().copied().filter(|&n| n != 1).collect::<Vec<_>>();
-        let (known, dtype) = match &tensor {
-            Tensor::Bytes(dtype, ..) => {
-                (matches!(dtype, Dtype::F16 | Dtype::BF16 | Dtype::F32 | Dtype::F64), format!("{dtype:?}"))
-            }
-            Tensor::Torch(tensor) => (tensor.is_float(), tensor.dtype.to_owned()),
+        let fits = |found: &[usize]| found == shape || shape.len() == 1 && bare(found) == bare(shape);
+        let wrong = |dtype: &str, found: &[usize]| {
+            fault(path, format!("`{own}` is {dtype} {found:?}, expected floats {shape:?}"))
         };
-        let found = tensor.shape();
-        let flat = shape.len() == 1 && bare(found) == bare(shape);
-        if !known || (found != shape && !flat) {
-            return Err(fault(path, format!("`{name}` is {dtype} {found:?}, expected floats {shape:?}")));
-        }
+        let lacks = || fault(path, format!("lacks `{name}`, of shape {shape:?}"));
         // `shape` is that of a layer: at most 9 MB.
-        match (&mut self.source, &tensor) {
-            (Source::Safetensors(file), Tensor::Bytes(dtype, _, at)) => {
+        match &mut self.source {
+            Source::Safetensors(file, tensors) => {
+                let (dtype, found, at) = tensors.get(&own).ok_or_else(lacks)?;
+                if !matches!(dtype, Dtype::F16 | Dtype::BF16 | Dtype::F32 | Dtype::F64) || !fits(found) {
+                    return Err(wrong(&format!("{dtype:?}"), found));
+                }
                 let size = dtype.bitsize() / 8;
                 let mut bytes = vec![0; size * shape.iter().product::<usize>()];
-                let cut = |e: std::io::Error| fault(path, format!("`{name}`, {dtype:?} {shape:?}: {e}"));
-                file.seek(SeekFrom::Start(*at)).map_err(cut)?;
-                file.read_exact(&mut bytes).map_err(cut)?;
+                let read = file.seek(SeekFrom::Start(*at)).and_then(|_| file.read_exact(&mut bytes));
+                read.map_err(|e| fault(path, format!("`{own}`, {dtype:?} {shape:?}: {e}")))?;
                 Ok(bytes.chunks_exact(size).map(|word| number(*dtype, word)).collect())
             }
-            (Source::Torch(file), Tensor::Torch(tensor)) => Ok(match file.read(&name, tensor)?.data {
-                Data::F32(values) => values,
-                Data::F64(values) => values.into_iter().map(|value| value as f32).collect(),
-                Data::I64(_) | Data::Bool(_) => Vec::new(),
-            }),
-            _ => Err(fault(path, format!("`{name}` is in no open file"))),
+            Source::Torch(file, tensors) => {
+                let tensor = tensors.get(&own).ok_or_else(lacks)?;
+                if !tensor.is_float() || !fits(&tensor.shape) {
+                    return Err(wrong(tensor.dtype, &tensor.shape));
+                }
+                // Exact: floats of 16 and 32 bits are widened and narrowed again.
+                Ok(file.read(&own, tensor)?.to_f64().into_iter().map(|value| value as f32).collect())
+            }
         }
     }
 }
 
 /// Tensors of a state dictionary, saved alone or as `state_dict` of a training checkpoint.
-fn torch_tensors(file: &TorchFile<BufReader<File>>) -> Result<BTreeMap<String, Tensor>, Error> {
+fn torch_tensors(file: &TorchFile<BufReader<File>>) -> Result<BTreeMap<String, torch::Tensor>, Error> {
     let root = file.root();
     let mut tensors = BTreeMap::new();
     if let Value::Dict(items) = root.get("state_dict").unwrap_or(root) {
         for (name, value) in items {
             let Some(name) = name.as_str() else { continue };
             if let Some(tensor) = file.tensor(name, value)? {
-                tensors.insert(name.to_owned(), Tensor::Torch(tensor));
+                tensors.insert(name.to_owned(), tensor);
             }
         }
     }
@@ -254,7 +246,7 @@ fn number(dtype: Dtype, word: &[u8]) -> f32 {
 }
 
 /// Tensors of a safetensors file, from its header.
-fn safetensors(path: &Path, file: &mut File) -> Result<BTreeMap<String, Tensor>, Error> {
+fn safetensors(path: &Path, file: &mut File) -> Result<Places, Error> {
     let length = file.metadata().map_err(io(path))?.len();
     let mut start = [0; 8];
     let not_ours = "is neither a safetensors file nor one that torch.save has written";
@@ -275,7 +267,7 @@ fn safetensors(path: &Path, file: &mut File) -> Result<BTreeMap<String, Tensor>,
             let (dtype, shape) = (info.dtype, &info.shape);
             return Err(fault(path, format!("is cut: `{name}`, {dtype:?} {shape:?}, ends at byte {end} of {found}")));
         }
-        tensors.insert(name, Tensor::Bytes(info.dtype, info.shape.clone(), 8 + header + start));
+        tensors.insert(name, (info.dtype, info.shape.clone(), 8 + header + start));
     }
     Ok(tensors)
 }

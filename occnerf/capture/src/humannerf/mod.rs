@@ -21,9 +21,10 @@ use smpl::BodyModel;
 
 use super::camera::Lens;
 use super::decode::{Planned, View, capture};
+use super::files::FrameFiles;
+use super::item::{Item, pickled};
 use super::names::FrameName;
 use super::pictures::{Pictures, file_name, is_directory};
-use super::records::{Record, Records};
 use super::{Capture, CaptureError, LoadOptions, checks};
 
 /// Reads a capture in this layout.
@@ -72,12 +73,12 @@ fn plan(
     if !dir.is_dir() {
         return Err(CaptureError::missing(dir, "directory"));
     }
-    let cameras = Records::load(&dir.join("cameras.pkl"))?;
-    let bodies = Records::load(&dir.join("mesh_infos.pkl"))?;
-    let (lenses, infos) = (cameras.frames()?, bodies.frames()?);
-    for (has, lacks, has_path, lacks_path) in
-        [(&lenses, &infos, cameras.path(), bodies.path()), (&infos, &lenses, bodies.path(), cameras.path())]
-    {
+    let paths = [dir.join("cameras.pkl"), dir.join("mesh_infos.pkl")];
+    let [cameras, bodies] = &paths;
+    let (camera_values, body_values) = (pickled(cameras)?, pickled(bodies)?);
+    let lenses = Item::new(cameras, &camera_values).frames()?;
+    let infos = Item::new(bodies, &body_values).frames()?;
+    for (has, lacks, has_path, lacks_path) in [(&lenses, &infos, cameras, bodies), (&infos, &lenses, bodies, cameras)] {
         if let Some(name) = has.keys().find(|name| !lacks.contains_key(*name)) {
             let expected = format!("an entry, as in {}", has_path.display());
             return Err(CaptureError::invalid(lacks_path, name.0, expected, "no such key"));
@@ -86,56 +87,34 @@ fn plan(
     let images = Pictures::list(&dir.join("images"))?;
     let masks = Pictures::list(&dir.join("masks"))?;
     if let Some((name, path)) = images.iter().find(|(name, _)| !lenses.contains_key(&FrameName(name))) {
-        let expected = format!("an entry `{name}` in {}", cameras.path().display());
+        let expected = format!("an entry `{name}` in {}", cameras.display());
         return Err(CaptureError::invalid(path, "camera of the image", expected, "none"));
     }
     let chosen = choose(lenses.keys().map(|name| name.0).collect())?;
+    let planned = |&name: &&str| {
+        let (image, masks) = (images.demand(name, cameras)?, vec![masks.demand(name, cameras)?]);
+        let (lens, info) = (&lenses[&FrameName(name)], &infos[&FrameName(name)]);
+        let fitted = checks::about_origin(info, "betas", body)?;
+        checks::joints(info, "tpose_joints", &fitted.betas, body)?;
+        let lens = Lens::read(lens, "intrinsics", "extrinsics", options.pixel_centre)?;
+        let files = FrameFiles { image, masks, labels: false, occluder: None, hidden: None, lens };
+        Ok(Planned { name: name.to_owned(), files, body: fitted, keypoints: Vec::new() })
+    };
     // Collected as results first: the first error in order is reported.
-    let frames: Vec<Result<Planned, CaptureError>> = chosen
-        .par_iter()
-        .map(|&name| {
-            let (image, mask) = (images.demand(name, cameras.path())?, masks.demand(name, cameras.path())?);
-            plan_frame(name, image, mask, &lenses[&FrameName(name)], &infos[&FrameName(name)], body, options)
-        })
-        .collect();
+    let frames: Vec<Result<Planned, CaptureError>> = chosen.par_iter().map(planned).collect();
     let frames: Vec<Planned> = frames.into_iter().collect::<Result<_, _>>()?;
     if frames.is_empty() {
         return Ok(None);
     }
-    View::new(frames, &dir.join("masks"), cameras.path()).map(Some)
-}
-
-fn plan_frame(
-    name: &str,
-    image: PathBuf,
-    mask: PathBuf,
-    lens: &Record<'_>,
-    parameters: &Record<'_>,
-    body: &BodyModel,
-    options: &LoadOptions,
-) -> Result<Planned, CaptureError> {
-    let betas = checks::betas(parameters, "betas", body)?;
-    checks::joints(parameters, "tpose_joints", &betas, body)?;
-    Ok(Planned {
-        name: name.to_owned(),
-        image,
-        masks: vec![mask],
-        labels: false,
-        occluder: None,
-        hidden: None,
-        lens: Lens::read(lens, "intrinsics", "extrinsics", options.pixel_centre)?,
-        pose: checks::rootless_pose(parameters, body)?,
-        placement: checks::origin(parameters)?,
-        betas,
-        keypoints: Vec::new(),
-    })
+    View::new(frames, &dir.join("masks"), cameras).map(Some)
 }
 
 /// The shape of the canonical body, `avg_betas` of `canonical_joints.pkl`, its joints checked
 /// against the model's.
 fn mean_betas(dir: &Path, body: &BodyModel) -> Result<Vec<f32>, CaptureError> {
-    let records = Records::load(&dir.join("canonical_joints.pkl"))?;
-    let canonical = records.whole();
+    let path = dir.join("canonical_joints.pkl");
+    let value = pickled(&path)?;
+    let canonical = Item::new(&path, &value);
     let betas = checks::betas(&canonical, "avg_betas", body)?;
     checks::joints(&canonical, "joints", &betas, body)?;
     Ok(betas)

@@ -2,15 +2,14 @@
 
 use std::path::{Path, PathBuf};
 
-use array_files::NdArray;
-use array_files::npz::Npz;
-use array_files::pickle;
 use glam::DVec3;
 use smpl::BodyModel;
 
-use super::fit::{SMPL, SMPLX, Tool};
+use super::file::value;
+use super::fit::{SMPL, SMPLX, Tool, vectors};
 use crate::CaptureError;
 use crate::find::near_bodies;
+use crate::item::Item;
 
 /// Joints of a hand, and numbers of its pose.
 const HAND: usize = 15;
@@ -60,20 +59,9 @@ fn download(tool: Tool) -> &'static str {
 /// The pose of both hands at rest, left first: 15 joints each. From `hands_meanl` and `hands_meanr`
 /// of an SMPL-X file.
 pub(super) fn mean_hands(path: &Path) -> Result<Vec<DVec3>, CaptureError> {
-    let mut hands = Vec::new();
-    let mut npz = Npz::open(path).ok();
-    let value = if npz.is_none() { Some(pickle::read(path)?) } else { None };
-    for key in ["hands_meanl", "hands_meanr"] {
-        let array: NdArray = match (&mut npz, &value) {
-            (Some(npz), _) => npz.array(key)?,
-            (None, Some(value)) => {
-                let found = value.get(key).and_then(|value| value.as_array());
-                found.cloned().ok_or_else(|| CaptureError::invalid(path, key, "an array of 45 numbers", "none"))?
-            }
-            (None, None) => return Err(CaptureError::missing(path, key)),
-        };
-        let values = array.to_f32(&path.display().to_string(), key, &[Some(3 * HAND)])?;
-        hands.extend(values.chunks_exact(3).map(|v| DVec3::new(v[0].into(), v[1].into(), v[2].into())));
-    }
-    Ok(hands)
+    let value = value(path, "a body model")?;
+    let root = Item::new(path, &value);
+    let of = |key: &str| Ok(vectors(&root.get(key)?.numbers(&[Some(3 * HAND)])?));
+    let hands: Result<Vec<Vec<DVec3>>, CaptureError> = ["hands_meanl", "hands_meanr"].into_iter().map(of).collect();
+    Ok(hands?.concat())
 }

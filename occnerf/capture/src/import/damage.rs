@@ -9,29 +9,50 @@ use array_files::{Data, NdArray};
 use zip::ZipWriter;
 use zip::write::SimpleFileOptions;
 
-use super::levels::Levels;
+use super::masks::Levels;
 use super::*;
 use crate::testing::{Directory, damaged, shared};
 use testkit::files::zip as zipped;
 
 #[test]
-fn damaged_fits_and_masks_are_read_or_errors_of_one_line() {
-    let Some(dir) = shared("estimators") else { return };
+fn damaged_files_are_read_or_errors_of_one_line() {
+    let (Some(dir), Some(people)) = (shared("estimators"), points_tests::files()) else { return };
     let video = Video::list(&dir.join("frames")).unwrap();
     let out = Directory::new("import-damage");
-    let (fits, masks) = (
-        ["wham/wham_output.pkl", "phalp/demo_clip.pkl", "prompthmr/results.pkl", "gvhmr/hmr4d_results.pt"],
-        ["sam2/00000.png", "matanyone/pha/0000.png", "grounded_sam2/mask_data/mask_00000.npy"],
-    );
-    for file in fits.into_iter().chain(["romp/video_results.npz"]).chain(masks) {
-        let (whole, path) = (std::fs::read(dir.join(file)).unwrap(), out.path().join(file));
-        for bytes in damaged(&whole, 60) {
-            out.write(file, bytes);
-            let fit = || read::read(&path, &video).map(drop);
-            let outcome = if masks.contains(&file) { Levels::load(&path).map(drop) } else { fit() };
-            let said = outcome.err().map(|error| error.to_string()).unwrap_or_default();
+    let fit = |path: &Path| read::read(path, &video).map(drop);
+    let mask = |path: &Path| Levels::load(path).map(drop);
+    let model = BodyModel::embedded();
+    let (filmed, _, pixels) = keypoints_tests::frames(&model);
+    let picture = |i: usize| format!("openpose/{i:06}_keypoints.json");
+    let points =
+        serde_json::json!({"people": [{"pose_keypoints_2d": keypoints_tests::body25(&pixels, 0.0)}]}).to_string();
+    (1..=2).for_each(|i| out.write(&picture(i), &points));
+    let keypoints = |path: &Path| {
+        let (folder, mut frames) = (path.parent().unwrap(), keypoints_tests::frames(&model).1);
+        keypoints::add(folder, &mut frames, &[], &model, &filmed).map(drop)
+    };
+    type Read<'a> = &'a dyn Fn(&Path) -> Result<(), CaptureError>;
+    let stored = |file: &'static str| (file.to_owned(), std::fs::read(dir.join(file)).unwrap());
+    let fits = ["wham/wham_output.pkl", "phalp/demo_clip.pkl", "prompthmr/results.pkl", "gvhmr/hmr4d_results.pt"];
+    let masks = ["sam2/00000.png", "matanyone/pha/0000.png", "grounded_sam2/mask_data/mask_00000.npy"];
+    let names = ["sam3d.pkl", "sam3d.json", "sam3d.npz"].map(str::to_owned);
+    let files = (fits.into_iter().chain(["romp/video_results.npz"]).map(|file| (stored(file), 60, &fit as Read<'_>)))
+        .chain(masks.into_iter().map(|file| (stored(file), 60, &mask as Read<'_>)))
+        .chain(names.into_iter().zip(people).map(|file| (file, 300, &fit as Read<'_>)))
+        .chain([((picture(3), points.clone().into_bytes()), 300, &keypoints as Read<'_>)]);
+    for ((file, whole), count, read) in files {
+        let path = out.file(&file);
+        let said = |bytes: &[u8]| {
+            out.write(&file, bytes);
+            let said = read(&path).err().map(|error| error.to_string()).unwrap_or_default();
             assert!(said.lines().count() <= 1, "{file}: {said}");
+            said
+        };
+        assert_eq!(said(&whole), "");
+        for i in (0..40).filter(|_| count == 300) {
+            assert!(!said(&whole[..whole.len() * i / 40]).is_empty(), "{file}: {i} fortieths were read");
         }
+        damaged(&whole, count).for_each(|bytes| drop(said(&bytes)));
     }
 }
 
@@ -121,7 +142,7 @@ fn programs_bombs_and_foreign_files_are_refused_by_name() {
     refused("cut.npz", b"PK\x03\x04results", &["expected a whole zip archive"]);
     refused("empty.pkl", b"", &["malformed"]);
     refused("numbers.pkl", b"\x80\x02}(X\x01\x00\x00\x00aK\x01u.", &["WHAM", "dictionary of a"]);
-    refused("other.npz", &zipped([("a.npy", [1, 2])]), &["WHAM", "an archive of a"]);
+    refused("other.npz", &zipped([("a.npy", [1, 2])]), &["WHAM", "dictionary of a"]);
     // Half a gigabyte of zeros in an archive of half a megabyte.
     let mut zip = ZipWriter::new(Cursor::new(Vec::new()));
     zip.start_file("results.npy", SimpleFileOptions::default()).unwrap();

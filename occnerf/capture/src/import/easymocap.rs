@@ -3,119 +3,80 @@
 //! is R(Rh) · lbs(poses, shapes) + Th, about the origin of a world whose z points up.
 
 use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
+use array_files::pickle::Value;
+use array_files::{Data, NdArray};
 use glam::{DMat3, DVec3};
-use serde::Deserialize;
 
-use super::fit::{About, Fit, FitFrame, Person, SMPL, Tool, axis_angle, rotation};
-use super::item::{text, turn};
+use super::file::{json, text};
+use super::fit::{About, BETAS, Fit, FitFrame, Lens, ORTHONORMAL, People, SMPL, Tool, axis_angle, pinhole, rotation};
 use super::video::Video;
-use super::yaml;
 use crate::CaptureError;
-
-/// A person as `write_smpl` prints it; matrices of one row.
-#[derive(Deserialize)]
-struct Record {
-    id: i64,
-    #[serde(rename = "Rh")]
-    rh: Vec<Vec<f64>>,
-    #[serde(rename = "Th")]
-    th: Vec<Vec<f64>>,
-    poses: Vec<Vec<f64>>,
-    shapes: Vec<Vec<f64>>,
-}
+use crate::item::Item;
+use crate::pictures::listed;
 
 /// The camera that filmed.
 struct Camera {
     rotation: DMat3,
     translation: DVec3,
-    focal: [f64; 2],
-    centre: [f64; 2],
+    lens: Lens,
 }
 
 pub(super) fn read(dir: &Path, video: &Video) -> Result<Fit, CaptureError> {
     let inner = dir.join("smpl");
     let folder = if inner.is_dir() { inner } else { dir.to_owned() };
-    let files = listed(&folder)?;
+    let files = listed(&folder, &["json"])?.into_iter();
+    let files: Vec<_> = files.filter_map(|(stem, path)| Some((stem.parse::<usize>().ok()?, path))).collect();
     if files.is_empty() {
         let expected = "EasyMocap's smpl/000000.json …, intri.yml and extri.yml";
         return Err(CaptureError::invalid(&folder, "files", expected, "no .json file with a number for a name"));
     }
     let camera = camera(&folder, video)?;
-    let mut people: BTreeMap<i64, Person> = BTreeMap::new();
+    let mut people = People::default();
     for (index, path) in &files {
-        let text = text(path)?;
-        let records = records(&text)
-            .map_err(|e| CaptureError::invalid(path, "the file", "JSON of id, Rh, Th, poses, shapes", e.to_string()))?;
-        for record in records {
-            let new = || Person { id: record.id.to_string(), ..Person::default() };
-            people.entry(record.id).or_insert_with(new).frames.push(frame(path, *index, &record, &camera)?);
+        let value = json(path)?;
+        let root = Item::new(path, &value);
+        // A list, a list under `annots`, or a map by ids.
+        let root = root.find("annots").unwrap_or(root);
+        let records: Vec<(String, Item<'_>)> = match root.value {
+            Value::Dict(_) => root.entries()?,
+            _ => root.list()?.into_iter().map(|item| (String::new(), item)).collect(),
+        };
+        for (name, record) in records {
+            let id = match (record.find("id"), name.parse()) {
+                (None, Ok(id)) => id,
+                _ => record.get("id")?.whole()?,
+            };
+            people.get(id).frames.push(frame(*index, &record, &camera)?);
         }
     }
-    Ok(Fit { tool: Tool::EasyMocap, people: people.into_values().collect(), names: None })
+    Ok(Fit::of_video(Tool::EasyMocap, people.into_vec()))
 }
 
-/// The people of a file: a list, a list under `annots`, or a map by their ids.
-fn records(text: &str) -> serde_json::Result<Vec<Record>> {
-    use serde_json::{Value, from_value};
-    let mut file: Value = serde_json::from_str(text)?;
-    if let Some(list) = file.get_mut("annots") {
-        file = list.take();
-    }
-    let Value::Object(map) = file else { return from_value(file) };
-    let with_id = map.into_iter().map(|(key, mut person)| {
-        if let (Value::Object(fields), Ok(id)) = (&mut person, key.parse::<i64>()) {
-            fields.entry("id").or_insert_with(|| id.into());
+/// A person as `write_smpl` prints it: `Rh`, `Th`, `poses` and `shapes`, matrices of one row.
+fn frame(index: usize, record: &Item<'_>, camera: &Camera) -> Result<FitFrame, CaptureError> {
+    let numbers = |name: &str, counts: &[usize]| {
+        let item = record.get(name)?;
+        let values = item.numbers(&[None])?;
+        match counts.contains(&values.len()) {
+            true => Ok(values),
+            false => Err(item.invalid(format!("{counts:?} numbers"), values.len().to_string())),
         }
-        person
-    });
-    from_value(Value::Array(with_id.collect()))
-}
-
-/// The files of frames by their numbers.
-fn listed(folder: &Path) -> Result<BTreeMap<usize, PathBuf>, CaptureError> {
-    let mut files = BTreeMap::new();
-    for entry in std::fs::read_dir(folder).map_err(CaptureError::io(folder))? {
-        let path = entry.map_err(CaptureError::io(folder))?.path();
-        let stem = path.file_stem().and_then(|s| s.to_str()).unwrap_or("");
-        if path.extension().is_some_and(|e| e == "json")
-            && let Ok(number) = stem.parse::<usize>()
-        {
-            files.insert(number, path);
-        }
-    }
-    Ok(files)
-}
-
-fn frame(path: &Path, index: usize, record: &Record, camera: &Camera) -> Result<FitFrame, CaptureError> {
-    let key = |name: &str| format!("person {}, {name}", record.id);
-    let numbers = |name: &str, rows: &[Vec<f64>], counts: &[usize]| match rows {
-        [row] if counts.contains(&row.len()) && row.iter().all(|x| (*x as f32).is_finite()) => Ok(row.clone()),
-        [row] => Err(CaptureError::invalid(path, key(name), format!("{counts:?} numbers"), format!("{}", row.len()))),
-        _ => Err(CaptureError::invalid(path, key(name), "one row", format!("{}", rows.len()))),
     };
-    let rh = DVec3::from_slice(&numbers("Rh", &record.rh, &[3])?);
-    let th = DVec3::from_slice(&numbers("Th", &record.th, &[3])?);
-    let poses = numbers("poses", &record.poses, &[3 * SMPL, 3 * SMPL - 3])?;
-    let mut pose: Vec<DVec3> = poses.chunks_exact(3).map(DVec3::from_slice).collect();
-    if pose.len() < SMPL {
-        pose.insert(0, DVec3::ZERO);
+    let (rh, th) = (DVec3::from_slice(&numbers("Rh", &[3])?), DVec3::from_slice(&numbers("Th", &[3])?));
+    let mut row = numbers("poses", &[3 * SMPL, 3 * SMPL - 3])?;
+    if row.len() < 3 * SMPL {
+        row.splice(..0, [0.0; 3]);
     }
+    row.extend(&numbers("shapes", &[10, 11, 12, 16])?[..BETAS]);
+    row.extend((camera.rotation * th + camera.translation).to_array());
+    let mut frame = FitFrame::still(index, &row, camera.lens);
     // The root's own rotation, where there is one, comes before that about the origin.
-    pose[0] = if pose[0] == DVec3::ZERO { rh } else { axis_angle(rotation(rh) * rotation(pose[0])) };
-    Ok(FitFrame {
-        index,
-        pose,
-        betas: numbers("shapes", &record.shapes, &[10, 11, 12, 16])?.into_iter().take(10).collect(),
-        world_to_camera: camera.rotation,
-        about: About::Origin(camera.rotation * rotation(rh)),
-        offset: camera.rotation * th + camera.translation,
-        focal: camera.focal,
-        centre: camera.centre,
-        mask: None,
-        points: Vec::new(),
-    })
+    let root = &mut frame.pose[0];
+    *root = if *root == DVec3::ZERO { rh } else { axis_angle(rotation(rh) * rotation(*root)) };
+    let about = About::Origin(camera.rotation * rotation(rh));
+    Ok(FitFrame { world_to_camera: camera.rotation, about, ..frame })
 }
 
 /// The camera of `intri.yml` and `extri.yml` in `folder` or the nearest folder above: its only one,
@@ -124,49 +85,82 @@ fn camera(folder: &Path, video: &Video) -> Result<Camera, CaptureError> {
     let whole = folder.canonicalize().map_err(CaptureError::io(folder))?;
     let above = whole.ancestors().take(3).find(|dir| dir.join("intri.yml").is_file());
     let dir = above.ok_or_else(|| {
-        CaptureError::missing(
-            &folder.join("intri.yml"),
-            "file (nor in the two folders above): the cameras of EasyMocap",
-        )
+        let what = "file (nor in the two folders above): the cameras of EasyMocap";
+        CaptureError::missing(&folder.join("intri.yml"), what)
     })?;
     let (intri, extri) = (dir.join("intri.yml"), dir.join("extri.yml"));
-    let (inner, outer) = (yaml::parse(&text(&intri)?), yaml::parse(&text(&extri)?));
-    let name = inner.keys().filter_map(|key| key.strip_prefix("K_")).next();
+    let (inner, outer) = (yaml(&text(&intri)?), yaml(&text(&extri)?));
+    let (inner, outer) = (Item::new(&intri, &inner), Item::new(&extri, &outer));
+    let entries = inner.entries()?;
+    let name = entries.iter().find_map(|(key, _)| key.strip_prefix("K_"));
     let name = name.ok_or_else(|| CaptureError::invalid(&intri, "K_…", "a camera's matrix", "none"))?;
-    let finite = |path: &Path, map: &BTreeMap<String, Vec<f64>>, key: String, count: usize| match map.get(&key) {
-        Some(values) if values.len() == count && values.iter().all(|x| (*x as f32).is_finite()) => Ok(values.clone()),
-        found => {
-            let found = found.map_or("nothing".to_owned(), |values| format!("{values:?}"));
-            Err(CaptureError::invalid(path, key, format!("{count} finite numbers"), found))
-        }
-    };
-    let k = finite(&intri, &inner, format!("K_{name}"), 9)?;
+    let lens = pinhole(&inner.get(&format!("K_{name}"))?.numbers(&[Some(9)])?);
     let [width, height] = video.sides();
     for (key, side) in [("W", width), ("H", height)] {
-        let key = format!("{key}_{name}");
-        if let Some(found) = inner.get(&key).filter(|found| found.as_slice() != [side]) {
+        let Some(item) = inner.find(&format!("{key}_{name}")) else { continue };
+        let found = item.number()?;
+        if found != side {
             let expected = format!("{side}, as the frames' {width}×{height}");
-            let found: Vec<String> = found.iter().map(f64::to_string).collect();
-            return Err(CaptureError::invalid(&intri, key, expected, found.join(", ")));
+            return Err(item.invalid(expected, found.to_string()));
         }
     }
-    if let Some(lens) = inner.get(&format!("dist_{name}")).filter(|lens| lens.iter().any(|d| *d != 0.0)) {
-        let key = format!("dist_{name}");
-        return Err(CaptureError::invalid(
-            &intri,
-            key,
-            "no lens distortion (undistort the frames)",
-            format!("{lens:?}"),
-        ));
-    }
-    let matrix = match outer.contains_key(&format!("Rot_{name}")) {
-        true => {
-            let key = format!("Rot_{name}");
-            let values = finite(&extri, &outer, key.clone(), 9)?;
-            turn(&values).ok_or_else(|| CaptureError::invalid(&extri, key, "a rotation", format!("{values:?}")))?
+    if let Some(item) = inner.find(&format!("dist_{name}")) {
+        let lens = item.values()?.1;
+        if lens.iter().any(|d| *d != 0.0) {
+            return Err(item.invalid("no lens distortion (undistort the frames)", format!("{lens:?}")));
         }
-        false => rotation(DVec3::from_slice(&finite(&extri, &outer, format!("R_{name}"), 3)?)),
+    }
+    let rotation = match outer.find(&format!("Rot_{name}")) {
+        Some(item) => item.rotation(&item.numbers(&[Some(9)])?, ORTHONORMAL)?,
+        None => rotation(DVec3::from_slice(&outer.get(&format!("R_{name}"))?.numbers(&[Some(3)])?)),
     };
-    let translation = DVec3::from_slice(&finite(&extri, &outer, format!("T_{name}"), 3)?);
-    Ok(Camera { rotation: matrix, translation, focal: [k[0], k[4]], centre: [k[2], k[5]] })
+    let translation = DVec3::from_slice(&outer.get(&format!("T_{name}"))?.numbers(&[Some(3)])?);
+    Ok(Camera { rotation, translation, lens })
+}
+
+/// The numbers and matrices, row by row, of OpenCV's YAML (`!!opencv-matrix` with its `data`), in the
+/// order of their names. Everything else is ignored; malformed numbers are NaN.
+fn yaml(text: &str) -> Value {
+    let number = |text: &str| text.trim().parse().unwrap_or(f64::NAN);
+    let mut found = BTreeMap::new();
+    let (mut name, mut list) = (String::new(), None::<String>);
+    for line in text.lines() {
+        // A list may go on over several lines.
+        if let Some(text) = &mut list {
+            text.push_str(line);
+        } else if let Some((key, rest)) = line.split_once(':') {
+            let (indented, key, rest) = (key.starts_with([' ', '%']), key.trim(), rest.trim());
+            if !indented {
+                name = key.trim_matches('"').to_owned();
+                if rest.parse::<f64>().is_ok() {
+                    found.insert(name.clone(), vec![number(rest)]);
+                }
+            } else if key == "data" && rest.starts_with('[') {
+                list = Some(rest.to_owned());
+            }
+        }
+        if let Some(text) = list.take_if(|text| text.contains(']')) {
+            let inside = text.trim_start_matches('[').split(']').next().unwrap_or("");
+            let values = inside.split(',').filter(|item| !item.trim().is_empty()).map(number);
+            found.insert(name.clone(), values.collect());
+        }
+    }
+    let array = |values: Vec<f64>| NdArray { shape: vec![values.len()], data: Data::F64(values) };
+    Value::Dict(found.into_iter().map(|(name, values)| (Value::Str(name), Value::Array(array(values)))).collect())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn matrices_and_numbers_are_found_by_name() {
+        let text = "%YAML:1.0\n---\nnames:\n  - \"1\"\nK_1: !!opencv-matrix\n  rows: 1\n  cols: 3\n  dt: d\n  data: [ 1., 2,\n      -3e0 ]\nH_1: 256\nx: [a]\n";
+        let found = |text: &str, key: &str| yaml(text).get(key).map(|value| value.as_array().unwrap().to_f64());
+        assert_eq!(found(text, "K_1").unwrap(), [1.0, 2.0, -3.0]);
+        assert_eq!(found(text, "H_1").unwrap(), [256.0]);
+        assert!(found(text, "x").is_none() && found(text, "names").is_none());
+        assert!(found("K: !!opencv-matrix\n  data: [1, x]\n", "K").unwrap()[1].is_nan());
+        assert!(found("K: !!opencv-matrix\n  data: [1, ", "K").is_none());
+    }
 }

@@ -1,5 +1,7 @@
 //! Fits of all estimators in one form: people with pose, shape, translation and camera per frame.
 
+use std::collections::BTreeMap;
+
 use glam::{DMat3, DQuat, DVec3};
 
 use super::rle::Rle;
@@ -11,6 +13,8 @@ pub(super) const SMPLX: usize = 55;
 pub(super) const SHARED: usize = 22;
 /// Shape coefficients that estimators fit.
 pub(super) const BETAS: usize = 10;
+/// Largest |R Rᵀ − I| of a rotation matrix: estimators write `f32`, EasyMocap a few decimals.
+pub(super) const ORTHONORMAL: f64 = 1e-2;
 
 /// An estimator.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -106,6 +110,13 @@ pub(super) struct Fit {
     pub names: Option<Vec<String>>,
 }
 
+impl Fit {
+    /// A fit whose indices count the frames of a video.
+    pub fn of_video(tool: Tool, people: Vec<Person>) -> Self {
+        Self { tool, people, names: None }
+    }
+}
+
 /// One person.
 #[derive(Default)]
 pub(super) struct Person {
@@ -120,8 +131,37 @@ pub(super) struct Person {
     pub vertices: usize,
 }
 
+impl Person {
+    pub fn new(id: impl ToString, frames: impl IntoIterator<Item = FitFrame>) -> Self {
+        Self { id: id.to_string(), frames: frames.into_iter().collect(), ..Self::default() }
+    }
+}
+
+/// People by their ids in a file.
+#[derive(Default)]
+pub(super) struct People(BTreeMap<i64, Person>);
+
+impl People {
+    /// The person of an id.
+    pub fn get(&mut self, id: i64) -> &mut Person {
+        self.0.entry(id).or_insert_with(|| Person::new(id, []))
+    }
+
+    pub fn into_vec(self) -> Vec<Person> {
+        self.0.into_values().collect()
+    }
+}
+
+/// Focal lengths and principal point, pixels.
+pub(super) type Lens = [[f64; 2]; 2];
+
+/// The lens of a calibration matrix, row by row.
+pub(super) fn pinhole(k: &[f64]) -> Lens {
+    [[k[0], k[4]], [k[2], k[5]]]
+}
+
 /// A person in one frame. Lengths in metres, OpenCV axes.
-#[derive(Clone)]
+#[derive(Clone, Default)]
 pub(super) struct FitFrame {
     /// Counted from 0.
     pub index: usize,
@@ -142,9 +182,10 @@ pub(super) struct FitFrame {
 }
 
 /// Position of the pelvis in the camera, for its rest position J.
-#[derive(Clone, Copy)]
+#[derive(Clone, Copy, Default)]
 pub(super) enum About {
     /// At J + offset.
+    #[default]
     Pelvis,
     /// At turn · J + offset.
     Origin(DMat3),
@@ -161,16 +202,13 @@ pub(super) enum OwnMask {
 }
 
 impl FitFrame {
-    /// For a static camera: pose and translation in its axes, rotation about the pelvis.
-    pub fn still(
-        index: usize,
-        pose: Vec<DVec3>,
-        betas: Vec<f64>,
-        place: &[f64],
-        [focal, centre]: [[f64; 2]; 2],
-    ) -> Self {
-        let (world_to_camera, about, offset) = (DMat3::IDENTITY, About::Pelvis, DVec3::from_slice(place));
-        Self { index, pose, betas, world_to_camera, about, offset, focal, centre, mask: None, points: Vec::new() }
+    /// For a static camera: axis-angle of each joint, shape coefficients and translation side by side,
+    /// in its axes, rotation about the pelvis.
+    pub fn still(index: usize, row: &[f64], [focal, centre]: Lens) -> Self {
+        let (pose, rest) = row.split_at(row.len().saturating_sub(BETAS + 3));
+        let (betas, place) = rest.split_at(BETAS);
+        let (pose, offset) = (vectors(pose), DVec3::from_slice(place));
+        Self { index, pose, betas: betas.to_vec(), offset, focal, centre, ..Self::default() }
     }
 
     /// The pelvis in the camera, for a body whose pelvis at rest is at `joint`.
@@ -188,6 +226,11 @@ impl FitFrame {
         self.offset.z += self.pelvis(joint).z * (ratio - 1.0);
         self.focal = self.focal.map(|f| f * ratio);
     }
+}
+
+/// Groups of three numbers.
+pub(super) fn vectors(values: &[f64]) -> Vec<DVec3> {
+    values.chunks_exact(3).map(DVec3::from_slice).collect()
 }
 
 /// Axis-angle of a rotation, at most half a turn.

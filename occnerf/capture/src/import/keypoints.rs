@@ -1,20 +1,19 @@
 //! 2-D key points of a detector: OpenPose's folder of JSON, or one array (T, J, 3) of pixels and
 //! confidences as ViTPose and RTMPose write it.
 
-use std::fs::File;
-use std::io::BufReader;
 use std::path::Path;
 
-use array_files::torch::TorchFile;
 use glam::Vec2;
-use serde::Deserialize;
 use smpl::{BodyModel, Placement};
 
-use super::item::{Item, array, text};
+use super::file::{array, json};
 use super::join;
 use super::video::Video;
 use super::write::Placed;
 use crate::checks::FARTHEST_PIXEL;
+use crate::item::Item;
+use crate::names::FrameName;
+use crate::pictures::listed;
 use crate::{CaptureError, Keypoint};
 
 /// Names of the sets of J points, [`point_fit::joint_set`].
@@ -26,17 +25,6 @@ const HANDS: usize = 22;
 
 /// A person in a picture: x, y, confidence of each point.
 type Detection = Vec<[f32; 3]>;
-
-/// A file of OpenPose.
-#[derive(Deserialize)]
-struct Picture {
-    people: Vec<Pose>,
-}
-
-#[derive(Deserialize)]
-struct Pose {
-    pose_keypoints_2d: Vec<f32>,
-}
 
 /// Gives each frame the key points of the person whose joints project nearest to them; returns what to say
 /// of them.
@@ -73,7 +61,7 @@ pub(super) fn add(
             )
         };
         let off = |point: &Keypoint| point.place.distance(project(point.joint));
-        let candidates = found[placed.index].iter().map(|person| -> Vec<Keypoint> {
+        let candidates = found[fit.index].iter().map(|person| -> Vec<Keypoint> {
             let points = person.iter().zip(&joints).filter(|([.., confidence], _)| *confidence >= LEAST);
             let point = |(&[x, y, confidence], joint): (&[f32; 3], &Option<usize>)| {
                 Some(Keypoint { joint: (*joint)?, place: Vec2::new(x, y), confidence: confidence.min(1.0) })
@@ -100,17 +88,9 @@ type Found = (Vec<Vec<Detection>>, Option<String>);
 
 /// OpenPose's `NAME_keypoints.json`, one a picture.
 fn folder(path: &Path, video: &Video) -> Result<Found, CaptureError> {
-    let entries = std::fs::read_dir(path).map_err(CaptureError::io(path))?;
-    let files = entries
-        .filter_map(|entry| Some(entry.ok()?.path()))
-        .filter(|file| file.extension().is_some_and(|e| e == "json"));
-    let mut files: Vec<(String, std::path::PathBuf)> = files
-        .filter_map(|file| {
-            let name = file.file_stem()?.to_str()?;
-            Some((name.strip_suffix("_keypoints").unwrap_or(name).to_owned(), file))
-        })
-        .collect();
-    files.sort_by(|a, b| crate::names::FrameName(&a.0).cmp(&crate::names::FrameName(&b.0)));
+    let name = |name: String| name.strip_suffix("_keypoints").map(str::to_owned).unwrap_or(name);
+    let mut files: Vec<_> = listed(path, &["json"])?.into_iter().map(|(stem, file)| (name(stem), file)).collect();
+    files.sort_by(|a, b| FrameName(&a.0).cmp(&FrameName(&b.0)));
     let names: Vec<&str> = files.iter().map(|(name, _)| name.as_str()).collect();
     let expected = || format!("NAME_keypoints.json of pictures, as {}", video.names[0]);
     if names.is_empty() {
@@ -121,11 +101,11 @@ fn folder(path: &Path, video: &Video) -> Result<Found, CaptureError> {
     let mut found = vec![Vec::new(); video.names.len()];
     for ((_, file), at) in files.iter().zip(&joined.at) {
         let Some(at) = *at else { continue };
-        let picture: Picture = serde_json::from_str(&text(file)?)
-            .map_err(|error| CaptureError::invalid(file, "the file", "OpenPose's people", error.to_string()))?;
-        let people =
-            picture.people.into_iter().map(|pose| detection(file, "pose_keypoints_2d", pose.pose_keypoints_2d));
-        found[at] = people.collect::<Result<_, _>>()?;
+        let value = json(file)?;
+        for person in Item::new(file, &value).get("people")?.list()? {
+            let points = person.get("pose_keypoints_2d")?;
+            found[at].push(detection(file, &points.key, &points.floats(&[None])?)?);
+        }
     }
     Ok((found, joined.note))
 }
@@ -133,20 +113,7 @@ fn folder(path: &Path, video: &Video) -> Result<Found, CaptureError> {
 /// An array (T, J, 3) of one person, also as PyTorch saves it.
 fn of_array(path: &Path, video: &Video) -> Result<Found, CaptureError> {
     let expected = format!("shape [{}, points, 3], one person of the video's frames", video.names.len());
-    let fits = |shape: &[usize]| matches!(shape, [_, _, 3]);
-    let array = if path.extension().is_some_and(|e| e == "npy" || e == "npz") {
-        array(path, &expected, fits)?
-    } else {
-        let file = BufReader::new(File::open(path).map_err(CaptureError::io(path))?);
-        let mut file = TorchFile::open(&path.display().to_string(), file)?;
-        let root = file.root().clone();
-        let value = file.resolve("", &root)?;
-        let item = Item::new(path, &value);
-        item.array().and_then(|array| match fits(&array.shape) {
-            true => Ok(array.clone()),
-            false => Err(item.invalid(&expected, format!("shape {:?}", array.shape))),
-        })?
-    };
+    let array = array(path, &expected, |shape| matches!(shape, [_, _, 3]))?;
     let frames = array.shape[0];
     let joined = join::by_index(video, &(0..frames).collect());
     let joined = joined.ok_or_else(|| CaptureError::invalid(path, "the file", expected, format!("{frames} frames")))?;
@@ -154,14 +121,14 @@ fn of_array(path: &Path, video: &Video) -> Result<Found, CaptureError> {
     let mut found = vec![Vec::new(); video.names.len()];
     for (row, at) in values.chunks_exact((3 * array.shape[1]).max(1)).zip(&joined.at) {
         if let Some(at) = *at {
-            found[at] = vec![detection(path, "the array", row.to_vec())?];
+            found[at] = vec![detection(path, "the array", row)?];
         }
     }
     Ok((found, joined.note))
 }
 
 /// Finite pixels and confidences of at least 0.
-fn detection(path: &Path, key: &str, values: Vec<f32>) -> Result<Detection, CaptureError> {
+fn detection(path: &Path, key: &str, values: &[f32]) -> Result<Detection, CaptureError> {
     let (points, rest) = values.as_chunks::<3>();
     // False for NaN.
     let is_near = |x: &f32| x.abs() < FARTHEST_PIXEL;

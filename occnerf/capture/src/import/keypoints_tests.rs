@@ -4,20 +4,19 @@ use serde_json::json;
 use super::fit::FitFrame;
 use super::write::Placed;
 use super::*;
-use crate::testing::{Directory, damaged, npy};
+use crate::testing::{Directory, npy};
 
 const COUNT: usize = 3;
 
 /// Frames of a body in its rest pose 4 m away, and its joints' pixels.
-fn frames(model: &BodyModel) -> (Video, Vec<Placed>, Vec<[f64; 2]>) {
-    let names = (1..=COUNT).map(|i| format!("{i:06}")).collect();
-    let video = Video { names, paths: vec![PathBuf::new(); COUNT], size: (640, 480) };
+pub(super) fn frames(model: &BodyModel) -> (Video, Vec<Placed>, Vec<[f64; 2]>) {
+    let video = tests::video((1..=COUNT).map(|i| format!("{i:06}")), (640, 480));
     let turn = DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0));
     let translation = DVec3::new(0.1, 0.2, 4.0);
     let placed = |index| {
-        let still = FitFrame::still(index, Vec::new(), Vec::new(), &[0.0; 3], [[500.0; 2], [320.0, 240.0]]);
-        let frame = FitFrame { world_to_camera: turn, ..still };
-        Placed { index, pose: vec![DVec3::ZERO; model.num_joints()], translation, frame, keypoints: Vec::new() }
+        let (focal, centre) = ([500.0; 2], [320.0, 240.0]);
+        let frame = FitFrame { index, world_to_camera: turn, focal, centre, ..FitFrame::default() };
+        Placed { pose: vec![DVec3::ZERO; model.num_joints()], translation, frame, keypoints: Vec::new() }
     };
     let pixel = |joint: &glam::Vec3| {
         let at = turn * joint.as_dvec3() + translation;
@@ -28,7 +27,7 @@ fn frames(model: &BodyModel) -> (Video, Vec<Placed>, Vec<[f64; 2]>) {
 }
 
 /// The 25 points of OpenPose, moved to the right.
-fn body25(pixels: &[[f64; 2]], by: f64) -> Vec<f64> {
+pub(super) fn body25(pixels: &[[f64; 2]], by: f64) -> Vec<f64> {
     let mut points = vec![0.0; 75];
     for (point, joint) in [(2, 17), (3, 19), (4, 21), (5, 16), (9, 2), (10, 5), (13, 4), (14, 7)] {
         points[3 * point..3 * point + 3].copy_from_slice(&[pixels[joint][0] + by, pixels[joint][1], 0.9]);
@@ -86,22 +85,4 @@ fn points_of_the_nearest_person_become_joints_of_the_body() {
     out.write("one/000001_keypoints.json", r#"{"people": [{"pose_keypoints_2d": [1]}]}"#);
     let error = keypoints::add(&out.path().join("one"), &mut frames(&model).1, &[], &model, &video).unwrap_err();
     assert!(error.to_string().contains("1 numbers"), "{error}");
-}
-
-#[test]
-fn damaged_key_points_are_errors_or_read() {
-    let model = BodyModel::embedded();
-    let (video, _, pixels) = frames(&model);
-    let out = Directory::new("import-keypoints-damaged");
-    let whole = json!({"people": [{"pose_keypoints_2d": body25(&pixels, 0.0)}]}).to_string();
-    for i in 1..COUNT {
-        out.write(&format!("json/{i:06}_keypoints.json"), whole.clone());
-    }
-    for bytes in damaged(whole.as_bytes(), 300) {
-        out.write("json/000003_keypoints.json", bytes);
-        let read = keypoints::add(&out.path().join("json"), &mut frames(&model).1, &[], &model, &video);
-        if let Err(error) = read {
-            assert_eq!(error.to_string().lines().count(), 1, "{error}");
-        }
-    }
 }

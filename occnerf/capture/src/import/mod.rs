@@ -14,39 +14,31 @@
 //! the camera's axes, or those of the file's cameras; the body's translation is in the extrinsics.
 
 mod body;
-mod cliff;
 #[cfg(test)]
 mod damage;
+mod datasets;
 mod easymocap;
+mod file;
 mod fit;
-mod glamr;
-mod gvhmr;
-mod item;
 mod join;
 mod keypoints;
 #[cfg(test)]
 mod keypoints_tests;
-mod levels;
 mod masks;
-mod neuman;
 mod options;
-mod peoplesnapshot;
-mod phalp;
 mod points;
 #[cfg(test)]
 mod points_tests;
-mod prompthmr;
 mod read;
 mod rle;
-mod romp;
 mod sam3d;
 #[cfg(test)]
 mod tests;
-mod vibe;
+mod tools;
+#[cfg(test)]
+mod tools_tests;
 mod video;
-mod wham;
 mod write;
-mod yaml;
 
 pub use self::fit::Tool;
 
@@ -166,10 +158,7 @@ pub fn import(options: &ImportOptions, out: &Path) -> Result<Imported, CaptureEr
         notes.push(keypoints::add(path, &mut placed, &betas, &model, &video)?);
     }
     let kind = masks.as_ref().map_or("those in the fit", |masks| masks.kind);
-    write::capture(
-        &write::Parts { options, video: &video, placed: &placed, betas: &betas, masks: masks.as_ref() },
-        out,
-    )?;
+    write::capture(options, &video, &placed, &betas, masks.as_ref(), out)?;
     write::body(&model, out)?;
     Ok(Imported {
         tool,
@@ -301,5 +290,5 @@ fn placed(
         pose[start..].copy_from_slice(hands);
     }
     let translation = frame.pelvis(own) - frame.world_to_camera * pelvis(betas);
-    Placed { index: frame.index, pose, translation, frame, keypoints: Vec::new() }
+    Placed { pose, translation, frame, keypoints: Vec::new() }
 }

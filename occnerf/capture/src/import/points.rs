@@ -2,40 +2,37 @@
 
 use std::path::Path;
 
-use array_files::npz::Npz;
 use glam::{DVec3, Vec3};
 use point_fit::{Anchor, Fitted, joint_set, joint_sets};
 use smpl::BodyModel;
 
-use super::fit::{Fit, FitFrame, Person, Tool};
-use super::item::{Item, array, dictionary};
+use super::file::{array, value};
+use super::fit::{Fit, FitFrame, Person, Tool, vectors};
 use super::sam3d::{VERTICES, stride};
 use super::video::Video;
 use crate::CaptureError;
+use crate::item::Item;
 
 /// Reads joints (T,J,3) in camera axes, metres, of a `.npy` file or the only such array of an `.npz`;
 /// joints that are NaN are missing. The focal length is not in it: √(W² + H²).
 pub(super) fn read(path: &Path, set: &str, count: usize, video: &Video) -> Result<Fit, CaptureError> {
     let expected = format!("shape [frames, {count}, 3], as {set} has");
     let array = array(path, &expected, |shape| shape.len() == 3 && shape[1..] == [count, 3])?;
-    let [width, height] = video.sides();
-    let lens = [[width.hypot(height); 2], video.middle()];
+    let [focal, centre] = video.diagonal();
     let mut frames = Vec::new();
     for (index, joints) in array.to_f64().chunks_exact(3 * count).enumerate() {
-        let points: Vec<DVec3> = joints.chunks_exact(3).map(DVec3::from_slice).collect();
+        let points = vectors(joints);
         let seen: Vec<DVec3> = points.iter().copied().filter(|p| p.is_finite()).collect();
         if let Some(point) = seen.iter().find(|p| p.z <= 0.0) {
             let expected = "joints in front of the camera, in metres and its axes (x right, y down, z forward)";
             return Err(CaptureError::invalid(path, format!("frame {index}"), expected, point.to_string()));
         }
         if !seen.is_empty() {
-            let middle = seen.iter().sum::<DVec3>() / seen.len() as f64;
-            frames
-                .push(FitFrame { points, ..FitFrame::still(index, Vec::new(), Vec::new(), &middle.to_array(), lens) });
+            let offset = seen.iter().sum::<DVec3>() / seen.len() as f64;
+            frames.push(FitFrame { index, points, offset, focal, centre, ..FitFrame::default() });
         }
     }
-    let person = Person { id: "0".to_owned(), frames, ..Person::default() };
-    Ok(Fit { tool: Tool::Joints, people: vec![person], names: None })
+    Ok(Fit::of_video(Tool::Joints, vec![Person::new(0, frames)]))
 }
 
 /// Number of points of a joint set.
@@ -81,7 +78,7 @@ pub(super) fn mapped(
     if vertices == 0 {
         return Err(CaptureError::invalid(fit, VERTICES, "this key of SAM 3D Body, for the vertex map", "none"));
     }
-    let value = dictionary(&mut Npz::open(map)?)?;
+    let value = value(map, "a vertex map (MHR's smpl2mhr_mapping.npz)")?;
     let root = Item::new(map, &value);
     let (faces, weights) = (root.get("triangle_ids")?, root.get("baryc_coords")?);
     let (ids, rows) = (faces.indices()?, weights.rows(3)?);

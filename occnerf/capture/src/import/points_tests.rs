@@ -2,13 +2,13 @@
 
 use array_files::{Data, NdArray};
 use glam::{DMat3, DVec3, Vec3};
-use point_fit::joint_set;
-use smpl::{MotionClip, Placement};
+use point_fit::{Anchor, joint_set};
+use smpl::{MotionClip, Placement, Posed};
 use testkit::body::Random;
 
 use super::fit::{axis_angle, rotation};
 use super::*;
-use crate::testing::{Directory, Py, array, shared};
+use crate::testing::{Directory, Py, array, npy, shared};
 
 const FOCAL: f64 = 900.0;
 const SIZE: (u32, u32) = (640, 480);
@@ -18,9 +18,19 @@ fn to_camera(place: DVec3) -> (DMat3, DVec3) {
     (DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0)), place)
 }
 
+/// The first person of a file.
+fn only(path: &Path, count: usize) -> Person {
+    read::read(path, &video(count)).unwrap().0.people.into_iter().next().unwrap()
+}
+
 fn video(count: usize) -> Video {
-    let names = (1..=count).map(|i| format!("{i:06}")).collect();
-    Video { names, paths: vec![PathBuf::new(); count], size: SIZE }
+    tests::video((1..=count).map(|i| format!("{i:06}")), SIZE)
+}
+
+fn place_of(anchor: &Anchor, posed: &Posed) -> DVec3 {
+    let joints = anchor.joints.iter().map(|(j, w)| *w * posed.joints[*j]);
+    let sum: Vec3 = joints.chain(anchor.vertices.iter().map(|(v, w)| *w * posed.vertices[*v])).sum();
+    sum.as_dvec3()
 }
 
 /// The 70 points and the vertices, the 24 joints, and the pose with the root, all in the camera.
@@ -33,12 +43,8 @@ fn truth(clip: &MotionClip, frames: usize, place: impl Fn(usize) -> DVec3) -> Ve
         let pose = &clip.poses[24 * f..24 * (f + 1)];
         let posed = body.pose(&body.shaped(&[0.8, -0.5]), pose, Placement::default());
         let (turn, at) = to_camera(place(f));
-        let point = |anchor: &Option<point_fit::Anchor>| {
-            let anchor = anchor.clone().unwrap_or_else(|| point_fit::Anchor::joint(15));
-            let joints = anchor.joints.iter().map(|(j, w)| *w * posed.joints[*j]);
-            let sum: Vec3 = joints.chain(anchor.vertices.iter().map(|(v, w)| *w * posed.vertices[*v])).sum();
-            turn * sum.as_dvec3() + at
-        };
+        let point =
+            |anchor: &Option<Anchor>| turn * place_of(anchor.as_ref().unwrap_or(&Anchor::joint(15)), &posed) + at;
         let mut pose: Vec<DVec3> = pose.iter().map(|v| v.as_dvec3()).collect();
         pose[0] = axis_angle(turn * rotation(pose[0]));
         let vertices = posed.vertices.iter().map(|v| turn * v.as_dvec3() + at);
@@ -146,7 +152,7 @@ fn people_of_sam_3d_body_are_told_apart_and_a_body_is_fitted_to_each() {
         }
         let mut all = Vec::new();
         for file in ["video.pkl", "video.json", "named.pkl", &folder] {
-            let (fit, _) = read::read(&out.path().join(file), &video(count)).unwrap_or_else(|e| panic!("{file}: {e}"));
+            let (fit, _) = read::read(&out.file(file), &video(count)).unwrap_or_else(|e| panic!("{file}: {e}"));
             assert_eq!((fit.tool, fit.people.len()), (Tool::Sam3dBody, 2), "{file}");
             let points =
                 |person: &Person| person.frames.iter().map(|f| (f.index, f.points.clone())).collect::<Vec<_>>();
@@ -163,9 +169,8 @@ fn people_of_sam_3d_body_are_told_apart_and_a_body_is_fitted_to_each() {
                 if file != "video.pkl" {
                     continue;
                 }
-                let said = points::solve(&out.path().join(file), sam3d::SET, Vec::new(), &mut person, &body).unwrap();
+                points::solve(&out.file(file), sam3d::SET, Vec::new(), &mut person, &body).unwrap();
                 let [metres, degrees] = errors(&body, &person, truth);
-                println!("{noise} m, person {who}: joints {metres} m, rotations {degrees} degrees; {said}");
                 assert!(metres < most[0] && degrees < most[1], "{noise}: {metres} m, {degrees} degrees");
             }
         }
@@ -175,22 +180,14 @@ fn people_of_sam_3d_body_are_told_apart_and_a_body_is_fitted_to_each() {
     }
 }
 
-/// A vertex map that maps every n-th of the body's vertices to itself.
-fn identity_map(body: &BodyModel, n: usize) -> (Vec<f64>, Vec<f64>) {
+/// A vertex map that maps each of the body's vertices to itself.
+fn identity_map(body: &BodyModel) -> (Vec<f64>, Vec<f64>) {
     let of = |v: usize| {
         let face = body.faces.iter().position(|face| face.contains(&(v as u32))).unwrap();
         (face as f64, body.faces[face].map(|corner| f64::from(u8::from(corner as usize == v))))
     };
-    let all = (0..body.num_vertices()).step_by(n).map(of);
-    let (ids, weights): (Vec<f64>, Vec<[f64; 3]>) = all.unzip();
+    let (ids, weights): (Vec<f64>, Vec<[f64; 3]>) = (0..body.num_vertices()).map(of).unzip();
     (ids, weights.concat())
-}
-
-fn write_map(path: &Path, ids: &[f64], weights: &[f64]) {
-    let array = |shape: Vec<usize>, values: &[f64]| NdArray { shape, data: Data::F64(values.to_vec()) };
-    let rows = weights.len() / 3;
-    let parts = [("triangle_ids", array(vec![ids.len()], ids)), ("baryc_coords", array(vec![rows, 3], weights))];
-    array_files::npz::write(path, &parts).unwrap();
 }
 
 /// Fingers that curl, of SMPL-X's form.
@@ -209,18 +206,13 @@ fn fingers_follow_their_points_on_a_body_that_has_them() {
     for f in 0..12 {
         let pose: Vec<Vec3> = (0..55).map(|joint| curl(f, joint)).collect();
         let posed = body.pose(&body.shaped(&[]), &pose, Placement::Pelvis { translation: Vec3::Z * 4.0 });
-        let point = |anchor: &Option<point_fit::Anchor>| {
-            let Some(anchor) = anchor else { return DVec3::NAN };
-            let joints = anchor.joints.iter().map(|(j, w)| *w * posed.joints[*j]);
-            let sum: Vec3 = joints.chain(anchor.vertices.iter().map(|(v, w)| *w * posed.vertices[*v])).sum();
-            sum.as_dvec3()
-        };
+        let point = |anchor: &Option<Anchor>| anchor.as_ref().map_or(DVec3::NAN, |anchor| place_of(anchor, &posed));
         let points = set.iter().map(point).collect();
-        frames.push(FitFrame { points, ..FitFrame::still(f, Vec::new(), Vec::new(), &[0.0; 3], [[FOCAL; 2]; 2]) });
+        frames.push(FitFrame { index: f, points, focal: [FOCAL; 2], centre: [FOCAL; 2], ..FitFrame::default() });
         truth.push(posed.joints);
     }
-    let mut person = Person { id: "0".to_owned(), frames, ..Person::default() };
-    println!("{}", points::solve(&path, sam3d::SET, Vec::new(), &mut person, &body).unwrap());
+    let mut person = Person::new(0, frames);
+    points::solve(&path, sam3d::SET, Vec::new(), &mut person, &body).unwrap();
     for (frame, truth) in person.frames.iter().zip(&truth) {
         let betas: Vec<f32> = frame.betas.iter().map(|b| *b as f32).collect();
         let of = |hands: bool| {
@@ -230,7 +222,6 @@ fn fingers_follow_their_points_on_a_body_that_has_them() {
             let found = body.pose(&body.shaped(&betas), &pose, placement).joints;
             (25..55).map(|j| found[j].distance(truth[j])).sum::<f32>() / 30.0
         };
-        println!("frame {}: {:.1} mm, with flat hands {:.1} mm", frame.index, 1e3 * of(true), 1e3 * of(false));
         assert!(of(true) < 0.006 && of(true) < 0.5 * of(false), "{}", frame.index);
     }
 }
@@ -242,25 +233,27 @@ fn vertices_of_a_mesh_tell_the_twist_of_limbs_through_a_map() {
     let body = BodyModel::embedded();
     let truth = truth(&clip, 40, |_| DVec3::new(0.0, 0.0, 4.0));
     let out = Directory::new("import-sam3d-map");
-    let (path, map) = (out.path().join("video.pkl"), out.path().join("map.npz"));
+    let (path, map) = (out.file("video.pkl"), out.file("map.npz"));
     let count = body.num_vertices();
-    let (ids, weights) = identity_map(&body, 1);
-    let write = |ids: &[f64], weights: &[f64]| write_map(&map, ids, weights);
+    let (ids, weights) = identity_map(&body);
+    let write = |ids: &[f64], weights: &[f64]| {
+        let array = |shape: Vec<usize>, values: &[f64]| NdArray { shape, data: Data::F64(values.to_vec()) };
+        let weights = array(vec![weights.len() / 3, 3], weights);
+        let parts = [("triangle_ids", array(vec![ids.len()], ids)), ("baryc_coords", weights)];
+        array_files::npz::write(&map, &parts).unwrap();
+    };
     write(&ids, &weights);
     for (noise, most) in [(0.0, [0.004, 3.0]), (0.015, [0.01, 6.0]), (0.03, [0.016, 9.0]), (0.045, [0.02, 11.0])] {
         let mut random = Random(5);
         let frames = truth.iter().map(|(points, ..)| Py::List(vec![person(points, &mut random, noise, true)]));
         out.write("video.pkl", Py::List(frames.collect()).pickle());
         let [joints_alone, both] = [false, true].map(|is_mapped| {
-            let (fit, _) = read::read(&path, &video(40)).unwrap();
-            let mut person = fit.people.into_iter().next().unwrap();
+            let mut person = only(&path, 40);
             assert_eq!(person.vertices, count);
             let mapped =
                 if is_mapped { points::mapped(&path, Some(&map), count, &body, true).unwrap() } else { Vec::new() };
             points::solve(&path, sam3d::SET, mapped, &mut person, &body).unwrap();
-            let [metres, degrees] = errors(&body, &person, &truth);
-            println!("{noise} m, mapped {is_mapped}: {metres} m, {degrees} degrees");
-            [metres, degrees]
+            errors(&body, &person, &truth)
         });
         assert!(both[0] < most[0] && both[1] < most[1], "{noise}: {both:?}");
         assert!(both[1] < 0.8 * joints_alone[1], "{noise}: {both:?}, of joints alone {joints_alone:?}");
@@ -277,16 +270,14 @@ fn vertices_of_a_mesh_tell_the_twist_of_limbs_through_a_map() {
         Py::List(vec![person(&all, &mut Random(5), 0.0, true)])
     };
     out.write("mhr.pkl", Py::List(truth.iter().map(frame).collect()).pickle());
-    let (fit, _) = read::read(&out.path().join("mhr.pkl"), &video(40)).unwrap();
-    let mut mhr = fit.people.into_iter().next().unwrap();
+    let mut mhr = only(&out.file("mhr.pkl"), 40);
     points::solve(&path, sam3d::SET, faces, &mut mhr, &body).unwrap();
     let [metres, degrees] = errors(&body, &mhr, &truth);
     assert!(metres < 0.004 && degrees < 3.0, "{metres} m, {degrees} degrees");
     // Of another body.
     let shifted: Vec<f64> = (0..count).map(|v| ids[(v + 3000) % count]).collect();
     write(&shifted, &weights);
-    let (fit, _) = read::read(&path, &video(40)).unwrap();
-    let mut person = fit.people.into_iter().next().unwrap();
+    let mut person = only(&path, 40);
     let mapped = points::mapped(&path, Some(&map), count, &body, true).unwrap();
     let error = points::solve(&path, sam3d::SET, mapped, &mut person, &body).unwrap_err().to_string();
     assert!(error.contains("vertex map is of (--body), and pred_vertices") && error.contains("mm off"), "{error}");
@@ -306,7 +297,7 @@ fn vertices_of_a_mesh_tell_the_twist_of_limbs_through_a_map() {
     refused(count, &["map.npz"]);
 }
 
-/// One person's file of eight frames, for damage.
+/// One person's file of eight frames.
 fn still(focal: bool) -> Option<Vec<Py>> {
     let clip = MotionClip::load(&shared("mocap")?.join("walk.npz")).unwrap();
     let mut random = Random(2);
@@ -318,20 +309,19 @@ fn still(focal: bool) -> Option<Vec<Py>> {
 fn a_camera_without_focal_length_is_solved_and_joints_are_read_as_arrays() {
     let Some(frames) = still(false) else { return };
     let out = Directory::new("import-sam3d-camera");
-    out.write("video.pkl", Py::List(frames.clone()).pickle());
-    let (fit, _) = read::read(&out.path().join("video.pkl"), &video(8)).unwrap();
-    for frame in &fit.people[0].frames {
+    out.write("video.pkl", Py::List(frames).pickle());
+    let person = only(&out.file("video.pkl"), 8);
+    for frame in &person.frames {
         assert!((frame.focal[0] - FOCAL).abs() < 0.1, "{:?}", frame.focal);
         assert!((frame.centre[0] - 310.0).hypot(frame.centre[1] - 250.0) < 0.1, "{:?}", frame.centre);
     }
-    let points: Vec<f64> =
-        fit.people[0].frames.iter().flat_map(|f| f.points[..70].iter().flat_map(|p| p.to_array())).collect();
-    let data = NdArray { shape: vec![8, 70, 3], data: Data::F64(points) };
-    array_files::npz::write(&out.path().join("joints.npz"), &[("joints", data)]).unwrap();
-    let path = out.path().join("joints.npz");
+    let points = person.frames.iter().flat_map(|f| f.points[..70].iter().flat_map(|p| p.to_array()));
+    let data = NdArray { shape: vec![8, 70, 3], data: Data::F64(points.collect()) };
+    let path = out.file("joints.npz");
+    array_files::npz::write(&path, &[("joints", data)]).unwrap();
     let (again, _) = read::joints(&path, "mhr70", &video(8)).unwrap();
     assert_eq!((again.tool, again.people[0].frames.len()), (Tool::Joints, 8));
-    assert_eq!(again.people[0].frames[3].points, fit.people[0].frames[3].points[..70]);
+    assert_eq!(again.people[0].frames[3].points, person.frames[3].points[..70]);
     let refused = |set: &str| read::joints(&path, set, &video(8)).err().unwrap().to_string();
     assert!(refused("coco17").contains("[frames, 17, 3]") && refused("coco18").contains("coco17, openpose25"));
 }
@@ -341,10 +331,8 @@ fn damaged_files_of_sam_3d_body_are_refused_in_one_line() {
     let Some(frames) = still(true) else { return };
     let out = Directory::new("import-sam3d-damage");
     let refused = |name: &str, words: &[&str]| {
-        let error = read::read(&out.path().join(name), &video(8))
-            .err()
-            .unwrap_or_else(|| panic!("{name} was read"))
-            .to_string();
+        let error =
+            read::read(&out.file(name), &video(8)).err().unwrap_or_else(|| panic!("{name} was read")).to_string();
         assert!(error.lines().count() == 1 && words.iter().all(|word| error.contains(word)), "{name}: {error}");
     };
     let with = |key: &str, to: Py| {
@@ -360,7 +348,7 @@ fn damaged_files_of_sam_3d_body_are_refused_in_one_line() {
         ("behind.pkl", "pred_cam_t", array(&[3], &[0.0, 0.0, -9.0]), ["2[0].pred_keypoints_3d", "in front"]),
         ("focal.pkl", "focal_length", array(&[], &[-1.0]), ["frame 2", "focal length"]),
         ("mask.pkl", "mask", array(&[6], &[0.0; 6]), ["2[0].mask", "[_, _]"]),
-        ("text.pkl", "pred_cam_t", Py::text("x"), ["2[0].pred_cam_t", "list"]),
+        ("text.pkl", "pred_cam_t", Py::text("x"), ["2[0].pred_cam_t", "array"]),
         ("mesh.pkl", "pred_vertices", array(&[2, 2], &[0.0; 4]), ["2[0].pred_vertices", "[_, 3]"]),
         ("rows.pkl", "pred_vertices", array(&[2, 3], &[0.0; 6]), ["2[0].pred_vertices", "4 rows"]),
     ] {
@@ -378,24 +366,15 @@ fn damaged_files_of_sam_3d_body_are_refused_in_one_line() {
     let long: Vec<Py> = frames.iter().cycle().take(20).cloned().collect();
     out.write("long.pkl", Py::List(long).pickle());
     refused("long.pkl", &["8", "19"]);
-    let npz: Vec<(&str, NdArray)> = vec![
-        ("pred_keypoints_3d", NdArray { shape: vec![70, 3], data: Data::F64(vec![0.5; 210]) }),
-        ("pred_cam_t", NdArray { shape: vec![3], data: Data::F64(vec![0.0, 0.0, 4.0]) }),
-        ("focal_length", NdArray { shape: vec![], data: Data::F64(vec![FOCAL]) }),
+}
+
+/// Small files of one person: a pickle, JSON, and an archive of one picture.
+pub(super) fn files() -> Option<[Vec<u8>; 3]> {
+    let frames = Py::List(still(true)?);
+    let archive = [
+        ("pred_keypoints_3d.npy", npy(&[70, 3], &[0.5; 210])),
+        ("pred_cam_t.npy", npy(&[3], &[0.0, 0.0, 4.0])),
+        ("focal_length.npy", npy(&[], &[900.0])),
     ];
-    array_files::npz::write(&out.path().join("still.npz"), &npz).unwrap();
-    let (pickle, json) = (Py::List(frames.clone()).pickle(), as_json(&Py::List(frames)).to_string().into_bytes());
-    let npz = std::fs::read(out.path().join("still.npz")).unwrap();
-    for (name, whole) in [("mutated.pkl", pickle), ("mutated.json", json), ("mutated.npz", npz)] {
-        out.write(name, &whole);
-        assert!(read::read(&out.path().join(name), &video(8)).is_ok(), "{name}");
-        let cut = (0..40).map(|i| whole[..whole.len() * i / 40].to_vec());
-        for (case, bytes) in cut.chain(crate::testing::damaged(&whole, 300)).enumerate() {
-            out.write(name, bytes);
-            match read::read(&out.path().join(name), &video(8)) {
-                Err(error) => assert_eq!(error.to_string().lines().count(), 1, "{error}"),
-                Ok(_) => assert!(case >= 40, "{name}: {case} fortieths were read"),
-            }
-        }
-    }
+    Some([frames.pickle(), as_json(&frames).to_string().into_bytes(), testkit::files::zip(archive)])
 }

@@ -1,22 +1,17 @@
 //! Detection of a fit's format.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::fs::File;
-use std::io::{BufReader, Read};
 use std::path::Path;
 
-use array_files::npz::Npz;
-use array_files::pickle::{self, Value};
-use array_files::torch::{TorchFile, is_torch};
+use array_files::pickle::Value;
 
-use super::fit::{Fit, FitFrame, Person};
-use super::item::{Item, dictionary};
+use super::file::value;
+use super::fit::{Fit, FitFrame, Person, Tool};
 use super::video::Video;
-use super::{
-    cliff, easymocap, glamr, gvhmr, join, neuman, peoplesnapshot, phalp, points, prompthmr, romp, sam3d, vibe, wham,
-};
+use super::{datasets, easymocap, join, points, sam3d, tools};
 use crate::CaptureError;
 use crate::checks::{MAX_ANGLE, MAX_BETA};
+use crate::item::Item;
 
 /// Expected formats.
 const TOOLS: &str = "a result of WHAM, 4D-Humans / PHALP, GVHMR, PromptHMR, VIBE, CLIFF, GLAMR, ROMP or SAM 3D Body, \
@@ -28,7 +23,14 @@ const TOOLS: &str = "a result of WHAM, 4D-Humans / PHALP, GVHMR, PromptHMR, VIBE
 pub(super) fn read(path: &Path, video: &Video) -> Result<(Fit, Option<String>), CaptureError> {
     let fit = match path.is_dir() {
         true => sam3d::folder(path, video)?.map_or_else(|| easymocap::read(path, video), Ok)?,
-        false => read_file(path, video)?,
+        false => {
+            let name = path.file_name().and_then(|name| name.to_str());
+            if let Some(name @ ("tracking_results.pth" | "slam_results.pth")) = name {
+                let expected = "wham_output.pkl, WHAM's result (demo.py --save_pkl)";
+                return Err(CaptureError::invalid(path, "the file", expected, format!("{name}, of a step before")));
+            }
+            parse(path, &value(path, TOOLS)?, video)?
+        }
     };
     checked(path, fit, video)
 }
@@ -82,103 +84,49 @@ fn join(path: &Path, fit: &mut Fit, video: &Video) -> Result<Option<String>, Cap
     Ok(joined.note)
 }
 
-fn read_file(path: &Path, video: &Video) -> Result<Fit, CaptureError> {
-    if path.exists() && !path.is_file() {
-        return Err(CaptureError::invalid(path, "the file", "a plain file", "a device or pipe"));
-    }
-    let mut file = File::open(path).map_err(CaptureError::io(path))?;
-    if let Some(name @ ("tracking_results.pth" | "slam_results.pth")) = path.file_name().and_then(|name| name.to_str())
-    {
-        let expected = "wham_output.pkl, WHAM's result (demo.py --save_pkl)";
-        return Err(CaptureError::invalid(path, "the file", expected, format!("{name}, of a step before")));
-    }
-    let mut start = Vec::new();
-    (&mut file).take(64).read_to_end(&mut start).map_err(CaptureError::io(path))?;
-    let name = path.display().to_string();
-    if is_torch(&start) {
-        // Archives of numpy have the same magic.
-        if start.starts_with(b"PK") {
-            let mut npz = Npz::open(path).map_err(|error| match error {
-                array_files::Error::Npy { message, .. } => {
-                    CaptureError::invalid(path, "the file", "a whole zip archive, of PyTorch or numpy", message)
-                }
-                error => error.into(),
-            })?;
-            if npz.keys().iter().any(|key| key == "results") {
-                let results = npz.value("results")?;
-                if results.get("smpl_thetas").is_some() {
-                    let expected = "ROMP's result of a video (romp --mode=video)";
-                    return Err(CaptureError::invalid(path, "results", expected, "that of one picture"));
-                }
-                return romp::read(path, &results, video);
-            }
-            if peoplesnapshot::is(npz.keys()) {
-                return peoplesnapshot::read(path, &mut npz, video);
-            }
-            if cliff::KEYS.iter().all(|name| npz.keys().iter().any(|key| key == name)) {
-                return cliff::read(path, &mut npz, video);
-            }
-            // Archives of PyTorch hold a pickle.
-            if !npz.keys().is_empty() && !npz.keys().iter().any(|key| key.ends_with("data.pkl")) {
-                let found = format!("an archive of {}", npz.keys().join(", "));
-                // People of one picture, or an array of objects.
-                let is_person = npz.keys().iter().any(|key| key == sam3d::POINTS);
-                if is_person || npz.keys().len() == 1 {
-                    match dictionary(&mut npz).map(|value| sam3d::frames(&value, video)) {
-                        Ok(Some(frames)) => return sam3d::read(path, frames, video),
-                        Err(error) if is_person => return Err(error),
-                        _ => {}
-                    }
-                }
-                let fit = match npz.keys().iter().any(|key| key == gvhmr::CAMERAS) {
-                    true => gvhmr::from_arrays(&Item::new(path, &dictionary(&mut npz)?), video)?,
-                    false => None,
-                };
-                return fit.ok_or_else(|| CaptureError::invalid(path, "the file", TOOLS, found));
-            }
-        }
-        let mut file = TorchFile::open(&name, BufReader::new(file))?;
-        return match file.root().get("body_pose").and(file.root().get("trans")) {
-            Some(_) => peoplesnapshot::of_gaussian_avatar(path, &mut file, video),
-            None => gvhmr::read(path, &mut file, video),
-        };
-    }
-    if matches!(start.trim_ascii_start().first(), Some(b'{' | b'[')) {
-        return parse(path, &sam3d::json(path)?, video);
-    }
-    // First bytes of pickles and of compressed files.
-    let begins = |with: &u8| start.first() == Some(with);
-    if !start.is_empty() && !b"\x80(c}]xB\x1f\xfd\x93".iter().any(begins) {
-        let found = format!("a file that begins with {}", start[..start.len().min(4)].escape_ascii());
-        return Err(CaptureError::invalid(path, "the file", TOOLS, found));
-    }
-    parse(path, &pickle::read(path)?, video)
-}
-
-/// Reads a pickle's value.
+/// Reads a file's value; the format is detected by its keys.
 pub(super) fn parse(path: &Path, value: &Value, video: &Video) -> Result<Fit, CaptureError> {
     let root = Item::new(path, value);
     if let Some(frames) = sam3d::frames(value, video) {
         return sam3d::read(path, frames, video);
     }
-    if value.get("people").is_some() && value.get("camera").is_some() {
-        return prompthmr::read(&root, video);
+    let with = |keys: &[&str]| keys.iter().all(|key| root.find(key).is_some());
+    if with(&["people", "camera"]) {
+        return tools::prompthmr(&root, video);
     }
-    if value.get("person_data").is_some() && value.get("cam_pose").is_some() {
-        return glamr::read(&root);
+    if with(&["person_data", "cam_pose"]) {
+        return tools::glamr(&root);
+    }
+    if let Some(results) = root.find("results") {
+        if results.find("smpl_thetas").is_some() {
+            return Err(results.invalid("ROMP's result of a video (romp --mode=video)", "that of one picture"));
+        }
+        return tools::romp(&results, video);
+    }
+    if with(&["transl", "betas", "thetas"]) || with(&["transl", "betas", "body_pose"]) {
+        return datasets::peoplesnapshot(Tool::PeopleSnapshot, &root, video);
+    }
+    if with(&["body_pose", "trans"]) {
+        return datasets::peoplesnapshot(Tool::GaussianAvatar, &root, video);
+    }
+    if with(&["pose", "shape", "global_t", "focal_l", "detection_all"]) {
+        return tools::cliff(&root, video);
+    }
+    if with(&["K_fullimg"]) {
+        return tools::gvhmr(&root, video);
     }
     let entries = root.entries()?;
     let has = |keys: &[&str]| entries.iter().any(|(_, item)| keys.iter().all(|key| item.value.get(key).is_some()));
     if has(&["tid", "smpl", "camera"]) {
-        phalp::read(&entries, video)
+        tools::phalp(entries, video)
     } else if has(&["pose", "trans", "frame_ids"]) {
-        wham::read(&entries, video)
+        tools::wham(&entries, video)
     } else if has(&["pose", "betas", "frame_ids"]) && (has(&["orig_cam"]) || has(&["pred_cam", "bboxes"])) {
-        vibe::read(&entries, video)
+        tools::vibe(&entries, video)
     } else if has(&["pose", "betas"]) && path.with_file_name("alignments.npy").is_file() {
-        neuman::read(path, &entries, video)
+        datasets::neuman(path, &entries, video)
     } else if has(&["smpl_thetas", "cam_trans"]) {
-        romp::read(path, value, video)
+        tools::romp(&root, video)
     } else {
         let held: Vec<&str> = entries.iter().map(|(name, _)| name.as_str()).take(8).collect();
         Err(root.invalid(TOOLS, format!("a dictionary of {}", held.join(", "))))

@@ -2,9 +2,9 @@
 
 use array_files::pickle::Value;
 
-use super::item::Item;
 use crate::CaptureError;
 use crate::image::MAX_SIDE;
+use crate::item::Item;
 
 /// A mask in runs.
 #[derive(Clone, Debug, PartialEq)]
@@ -19,7 +19,7 @@ impl Rle {
     /// numbers.
     pub fn read(item: &Item<'_>) -> Result<Self, CaptureError> {
         let size = item.get("size")?;
-        let sides = size.few(2)?;
+        let sides = size.numbers(&[Some(2)])?;
         let side = |value: f64| value.fract() == 0.0 && (1.0..=f64::from(MAX_SIDE)).contains(&value);
         if !sides.iter().all(|&value| side(value)) {
             return Err(size.invalid(format!("height and width of 1 to {MAX_SIDE}"), format!("{sides:?}")));
@@ -30,12 +30,9 @@ impl Rle {
         let runs = match counts.value {
             Value::Bytes(bytes) => decompressed(bytes, most),
             Value::Str(text) => decompressed(text.as_bytes(), most),
-            value => {
-                let numbers: Vec<i64> = match value.as_array() {
-                    Some(_) => counts.numbers(&[None])?.iter().map(|n| *n as i64).collect(),
-                    None => counts.list()?.iter().map(Item::whole).collect::<Result<_, _>>()?,
-                };
-                numbers.iter().map(|&n| u32::try_from(n).map_err(|_| format!("a run of {n}"))).collect()
+            _ => {
+                let run = |n: &f64| u32::try_from(*n as i64).map_err(|_| format!("a run of {n}"));
+                counts.numbers(&[None])?.iter().map(run).collect()
             }
         };
         let expected = || format!("runs of {pixels} pixels in all ({height}×{width})");

@@ -7,19 +7,18 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use array_files::npz::Npz;
-use array_files::pickle::{self, Value};
-use array_files::{Data, NdArray};
+use array_files::pickle::Value;
 use glam::{DVec2, DVec3};
 
-use super::fit::{Fit, FitFrame, OwnMask, Person, Tool};
-use super::item::{Item, dictionary, text, vectors};
+use super::file::value;
+use super::fit::{Fit, FitFrame, OwnMask, Person, Tool, vectors};
 use super::video::Video;
 use crate::CaptureError;
+use crate::item::Item;
 use crate::names::{FrameName, number};
-use crate::pictures::{file_name, is_hidden};
+use crate::pictures::{file_name, listed};
 
-pub(super) const POINTS: &str = "pred_keypoints_3d";
+const POINTS: &str = "pred_keypoints_3d";
 /// Joint set of the points.
 pub(super) const SET: &str = "mhr70";
 const COUNT: usize = 70;
@@ -74,13 +73,7 @@ pub(super) fn frames(value: &Value, video: &Video) -> Option<Vec<(Option<String>
 /// Reads a folder with a file a frame; `None` where its first file is not of this kind.
 pub(super) fn folder(dir: &Path, video: &Video) -> Result<Option<Fit>, CaptureError> {
     let mut files: BTreeMap<usize, PathBuf> = BTreeMap::new();
-    for entry in std::fs::read_dir(dir).map_err(CaptureError::io(dir))? {
-        let path = entry.map_err(CaptureError::io(dir))?.path();
-        let stem = path.file_stem().map_or(String::new(), |stem| stem.to_string_lossy().into_owned());
-        let extension = path.extension().map_or(String::new(), |e| e.to_string_lossy().to_lowercase());
-        if is_hidden(&path) || !["npz", "npy", "pkl", "json"].contains(&extension.as_str()) {
-            continue;
-        }
+    for (stem, path) in listed(dir, &["npz", "npy", "pkl", "json"])? {
         let Some(number) = number(&stem) else { continue };
         if let Some(other) = files.insert(number, path.clone()) {
             let mut both = [file_name(&other), file_name(&path)];
@@ -90,17 +83,13 @@ pub(super) fn folder(dir: &Path, video: &Video) -> Result<Option<Fit>, CaptureEr
     }
     let mut named = Vec::new();
     for path in files.values() {
-        let value = load(path)?;
+        let expected = format!("a list of people with {POINTS}");
+        let value = value(path, &expected)?;
         let Some(people) = people(&value) else {
             if named.is_empty() {
                 return Ok(None);
             }
-            return Err(CaptureError::invalid(
-                path,
-                "the file",
-                format!("a list of people with {POINTS}"),
-                value.type_name(),
-            ));
+            return Err(CaptureError::invalid(path, "the file", expected, value.type_name()));
         };
         let stem = path.file_stem().map(|stem| stem.to_string_lossy().into_owned());
         named.push((stem, Value::List(people.to_vec()), path.as_path()));
@@ -122,52 +111,6 @@ pub(super) fn read(path: &Path, frames: Vec<(Option<String>, Value)>, video: &Vi
         }
     }
     fit(frames, video)
-}
-
-/// A file as a value.
-fn load(path: &Path) -> Result<Value, CaptureError> {
-    match path.extension().and_then(|e| e.to_str()) {
-        Some("npz") => dictionary(&mut Npz::open(path)?),
-        Some("json") => json(path),
-        _ => Ok(pickle::read(path)?),
-    }
-}
-
-/// A JSON file as a pickle's value.
-pub(super) fn json(path: &Path) -> Result<Value, CaptureError> {
-    let value: serde_json::Value = serde_json::from_str(&text(path)?)
-        .map_err(|e| CaptureError::invalid(path, "the file", "JSON", e.to_string()))?;
-    Ok(converted(value))
-}
-
-/// The value of a pickle of the same: nested lists of numbers with equally long rows are arrays.
-fn converted(json: serde_json::Value) -> Value {
-    use serde_json::Value as Json;
-    match json {
-        Json::Null => Value::None,
-        Json::Bool(flag) => Value::Bool(flag),
-        Json::Number(number) => Value::Float(number.as_f64().unwrap_or(f64::NAN)),
-        Json::String(text) => Value::Str(text),
-        Json::Object(map) => Value::Dict(map.into_iter().map(|(k, v)| (Value::Str(k), converted(v))).collect()),
-        Json::Array(items) => {
-            let items: Vec<Value> = items.into_iter().map(converted).collect();
-            // Numbers, or arrays of one shape.
-            let part = |item: &Value| match item {
-                Value::Float(x) => Some((Vec::new(), vec![*x])),
-                Value::Bool(flag) => Some((Vec::new(), vec![f64::from(u8::from(*flag))])),
-                Value::Array(NdArray { shape, data: Data::F64(values) }) => Some((shape.clone(), values.clone())),
-                _ => None,
-            };
-            let parts: Option<Vec<(Vec<usize>, Vec<f64>)>> = items.iter().map(part).collect();
-            match parts {
-                Some(parts) if !parts.is_empty() && parts.iter().all(|p| p.0 == parts[0].0) => {
-                    let shape = [vec![parts.len()], parts[0].0.clone()].concat();
-                    Value::Array(NdArray { shape, data: Data::F64(parts.into_iter().flat_map(|p| p.1).collect()) })
-                }
-                _ => Value::List(items),
-            }
-        }
-    }
 }
 
 /// The state by which a person is found in the next frame.
@@ -192,7 +135,7 @@ fn fit(frames: Vec<(Option<String>, Value, &Path)>, video: &Video) -> Result<Fit
         for person in people {
             let item = person.get(POINTS)?;
             let (points, at) = (item.numbers(&[Some(1), Some(COUNT), Some(3)])?, person.get("pred_cam_t")?);
-            let at = DVec3::from_slice(&at.few(3)?);
+            let at = DVec3::from_slice(&at.numbers(&[Some(3)])?);
             let mut points: Vec<DVec3> = vectors(&points).into_iter().map(|p| p + at).collect();
             if let Some(behind) = points.iter().find(|p| p.z <= 0.0) {
                 return Err(item.invalid("points in front of the camera, with pred_cam_t", behind.to_string()));
@@ -213,10 +156,8 @@ fn fit(frames: Vec<(Option<String>, Value, &Path)>, video: &Video) -> Result<Fit
                 points.extend(vertices.iter().step_by(stride(known)).map(|p| DVec3::from_slice(p) + at));
             }
             let mask = person.find("mask").map(|item| mask(&item)).transpose()?;
-            let lens = [[focal.unwrap_or(0.0); 2], video.middle()];
-            let frame =
-                FitFrame { points, mask, ..FitFrame::still(index, Vec::new(), Vec::new(), &at.to_array(), lens) };
-            found.push(frame);
+            let [focal, centre] = video.lens(focal.unwrap_or(0.0));
+            found.push(FitFrame { index, points, mask, offset: at, focal, centre, ..FitFrame::default() });
         }
         assign(&mut tracks, found, index);
     }
@@ -277,7 +218,7 @@ fn assign(tracks: &mut Vec<Track>, found: Vec<FitFrame>, index: usize) {
                 track.person.frames.push(frame);
             }
             None => {
-                let person = Person { id: tracks.len().to_string(), frames: vec![frame], ..Person::default() };
+                let person = Person::new(tracks.len(), [frame]);
                 tracks.push(Track { place, motion: DVec3::ZERO, size, last: index, person });
             }
         }

@@ -3,6 +3,7 @@
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
+use super::fit::Lens;
 use crate::CaptureError;
 use crate::image::dimensions;
 use crate::names::{FrameName, number};
@@ -21,10 +22,8 @@ pub(super) struct Video {
 impl Video {
     /// The pictures of a folder, all of one size.
     pub fn list(dir: &Path) -> Result<Self, CaptureError> {
-        let pictures = Pictures::list(dir)?;
-        let mut found: Vec<(&String, &PathBuf)> = pictures.iter().collect();
-        found.sort_by(|a, b| FrameName(a.0).cmp(&FrameName(b.0)));
-        let Some((_, first)) = found.first() else {
+        let (names, paths): (Vec<String>, Vec<PathBuf>) = Pictures::list(dir)?.into_vec().into_iter().unzip();
+        let Some(first) = paths.first() else {
             let entries = std::fs::read_dir(dir).map_err(CaptureError::io(dir))?.filter_map(Result::ok);
             let others = entries.filter_map(|entry| Some(entry.path().extension()?.to_string_lossy().to_lowercase()));
             let others: BTreeSet<String> = others.collect();
@@ -38,18 +37,14 @@ impl Video {
             return Err(CaptureError::invalid(dir, "files", "the video's frames, .png or .jpg", found));
         };
         let size = dimensions(first)?;
-        for (_, path) in &found {
+        for path in &paths {
             let other = dimensions(path)?;
             if other != size {
                 let expected = format!("{}×{}, as the first frame", size.0, size.1);
                 return Err(CaptureError::invalid(path, "size", expected, format!("{}×{}", other.0, other.1)));
             }
         }
-        Ok(Self {
-            names: found.iter().map(|(name, _)| (*name).clone()).collect(),
-            paths: found.iter().map(|(_, path)| (*path).clone()).collect(),
-            size,
-        })
+        Ok(Self { names, paths, size })
     }
 
     /// The frame called `name`.
@@ -83,9 +78,26 @@ impl Video {
         [self.size.0.into(), self.size.1.into()]
     }
 
+    /// The longer of the two.
+    pub fn longest(&self) -> f64 {
+        let [width, height] = self.sides();
+        width.max(height)
+    }
+
     /// The image centre, most estimators' principal point.
     pub fn middle(&self) -> [f64; 2] {
         self.sides().map(|side| side / 2.0)
+    }
+
+    /// A lens of this focal length about the image centre.
+    pub fn lens(&self, focal: f64) -> Lens {
+        [[focal; 2], self.middle()]
+    }
+
+    /// The lens of files that have none: of the diagonal's length.
+    pub fn diagonal(&self) -> Lens {
+        let [width, height] = self.sides();
+        self.lens(width.hypot(height))
     }
 }
 

@@ -13,11 +13,11 @@ use super::fit::{FitFrame, OwnMask};
 use super::masks::Masks;
 use super::options::ImportOptions;
 use super::video::Video;
+use crate::image::picture_error;
 use crate::{CaptureError, Keypoint};
 
 /// A frame in the capture's form.
 pub(super) struct Placed {
-    pub index: usize,
     /// Axis-angle of every joint of the body model.
     pub pose: Vec<DVec3>,
     pub frame: FitFrame,
@@ -26,33 +26,25 @@ pub(super) struct Placed {
     pub keypoints: Vec<Keypoint>,
 }
 
-/// Contents of a capture.
-pub(super) struct Parts<'a> {
-    pub options: &'a ImportOptions,
-    pub video: &'a Video,
-    pub placed: &'a [Placed],
-    pub betas: &'a [f64],
-    /// `None`: the fit's own.
-    pub masks: Option<&'a Masks>,
-}
-
-/// Writes `images`, `masks`, `occluders` and `metadata.json`.
-pub(super) fn capture(parts: &Parts<'_>, out: &Path) -> Result<(), CaptureError> {
-    let folder = |name: &str| {
+/// Writes `images`, `masks`, `occluders` and `metadata.json`; without `masks` those of the fit.
+pub(super) fn capture(
+    options: &ImportOptions,
+    video: &Video,
+    placed: &[Placed],
+    betas: &[f64],
+    masks: Option<&Masks>,
+    out: &Path,
+) -> Result<(), CaptureError> {
+    let occluders = (!options.occluder_objects.is_empty()).then_some("occluders");
+    for name in ["images", "masks"].into_iter().chain(occluders) {
         let path = out.join(name);
-        std::fs::create_dir_all(&path).map_err(CaptureError::io(&path)).map(|()| path)
-    };
-    let (images, masks) = (folder("images")?, folder("masks")?);
-    let occluders = match parts.options.occluder_objects.is_empty() {
-        true => None,
-        false => Some(folder("occluders")?),
-    };
+        std::fs::create_dir_all(&path).map_err(CaptureError::io(&path))?;
+    }
     // Collected as results first: the first error in order is reported.
     let frames: Vec<Result<(), CaptureError>> =
-        parts.placed.par_iter().map(|placed| frame(parts, placed, &images, &masks, occluders.as_deref())).collect();
+        placed.par_iter().map(|placed| frame(options, video, &placed.frame, masks, out)).collect();
     frames.into_iter().collect::<Result<(), CaptureError>>()?;
-    let records =
-        parts.placed.iter().map(|placed| (parts.video.names[placed.index].clone(), record(placed, parts.betas)));
+    let records = placed.iter().map(|placed| (video.names[placed.frame.index].clone(), record(placed, betas)));
     let path = out.join("metadata.json");
     let text = Value::Object(records.collect::<Map<_, _>>()).to_string();
     array_files::replace_file(&path, |to| to.write_all(text.as_bytes())).map_err(CaptureError::io(&path))
@@ -64,30 +56,23 @@ pub(super) fn body(model: &BodyModel, out: &Path) -> Result<(), CaptureError> {
 }
 
 fn frame(
-    parts: &Parts<'_>,
-    placed: &Placed,
-    images: &Path,
-    masks: &Path,
-    occluders: Option<&Path>,
+    options: &ImportOptions,
+    video: &Video,
+    frame: &FitFrame,
+    masks: Option<&Masks>,
+    out: &Path,
 ) -> Result<(), CaptureError> {
-    let (name, source) = (&parts.video.names[placed.index], &parts.video.paths[placed.index]);
+    let (name, source) = (&video.names[frame.index], &video.paths[frame.index]);
     let extension = source.extension().map_or("png".into(), |e| e.to_string_lossy());
-    linked(source, &images.join(format!("{name}.{extension}")), parts.options.copy)?;
-    let size = parts.video.size;
-    let (mask, front) = match (parts.masks, &placed.frame.mask) {
-        (Some(masks), _) => {
-            let path = parts.options.masks.as_deref().unwrap_or(&parts.options.fit);
-            masks.levels(path, placed.index, parts.video)?
-        }
-        (None, Some(own)) => (own_levels(own, size, &parts.options.fit, name)?, None),
-        (None, None) => return Err(CaptureError::missing(&parts.options.fit, format!("mask of frame {name}"))),
+    linked(source, &out.join("images").join(format!("{name}.{extension}")), options.copy)?;
+    let (mask, front) = match (masks, &frame.mask) {
+        (Some(masks), _) => masks.levels(options.masks.as_deref().unwrap_or(&options.fit), frame.index, video)?,
+        (None, Some(own)) => (own_levels(own, video.size, &options.fit, name)?, None),
+        (None, None) => return Err(CaptureError::missing(&options.fit, format!("mask of frame {name}"))),
     };
     let file = format!("{name}.png");
-    save(mask, size, &masks.join(&file))?;
-    match (occluders, front) {
-        (Some(folder), Some(front)) => save(front, size, &folder.join(&file)),
-        _ => Ok(()),
-    }
+    save(mask, video.size, &out.join("masks").join(&file))?;
+    front.map_or(Ok(()), |front| save(front, video.size, &out.join("occluders").join(&file)))
 }
 
 /// The fit's own mask at the frames' size, resampled by nearest neighbour if its aspect ratio fits.
@@ -116,10 +101,7 @@ fn save(levels: Vec<u8>, size: (u32, u32), path: &Path) -> Result<(), CaptureErr
     let picture = GrayImage::from_raw(size.0, size.1, levels).ok_or_else(|| {
         CaptureError::invalid(path, "size", format!("{}×{} values", size.0, size.1), found.to_string())
     })?;
-    picture.save_with_format(path, ImageFormat::Png).map_err(|source| match source {
-        image::ImageError::IoError(source) => CaptureError::Io { path: path.to_owned(), source },
-        source => CaptureError::Picture { path: path.to_owned(), source },
-    })
+    picture.save_with_format(path, ImageFormat::Png).map_err(|source| picture_error(path, source))
 }
 
 /// `target` as seen from `folder`, both absolute; `target` itself where they share only the root.

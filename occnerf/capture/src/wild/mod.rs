@@ -13,7 +13,6 @@
 //! `9`; pictures that it does not mention are left out. A row of `keypoints` is a joint of the body
 //! model, its pixel (x, y; pixel centres at integer + 0.5) and the detector's confidence, 0 to 1.
 
-mod metadata;
 #[cfg(test)]
 mod tests;
 
@@ -22,12 +21,15 @@ use std::path::Path;
 use smpl::{BodyModel, Placement};
 
 use super::camera::Lens;
-use super::decode::{Planned, View, capture};
+use super::decode::{Fitted, Planned, View, capture};
+use super::files::FrameFiles;
+use super::item::Item;
 use super::names::FrameName;
 use super::pictures::{Pictures, is_directory};
-use super::records::Record;
-use super::{Capture, CaptureError, LoadOptions, checks};
+use super::{Capture, CaptureError, LoadOptions, checks, json};
 
+/// Largest `metadata.json`: tens of thousands of frames.
+const MAX_BYTES: u64 = 64 << 20;
 /// Camera name of the frames under `clean`.
 const CLEAN: &str = "clean";
 
@@ -35,22 +37,31 @@ const CLEAN: &str = "clean";
 pub(super) fn load(dir: &Path, body: &BodyModel, options: &LoadOptions) -> Result<Capture, CaptureError> {
     options.only_zju("HumanNeRF's wild layout")?;
     let path = dir.join("metadata.json");
-    let records = metadata::read(&path)?;
-    let all = records.frames()?;
+    let value = json::read(&path, MAX_BYTES)?;
+    let all = Item::new(&path, &value).frames()?;
     let names: Vec<&str> = all.iter().map(|(FrameName(name), _)| *name).collect();
     let frames = options.select(all);
 
     let (images, masks) = (Pictures::list(&dir.join("images"))?, Pictures::list(&dir.join("masks"))?);
     let occluders = optional(&dir.join("occluders"), &names)?;
-    let train: Result<Vec<Planned>, CaptureError> = frames
-        .iter()
-        .map(|(FrameName(name), record)| {
-            let mut frame = plan(name, record, [&images, &masks], &path, body, options)?;
-            frame.occluder = occluders.as_ref().and_then(|o| o.get(name));
-            Ok(frame)
+    let plan = |name: &str, record: &Item<'_>, [images, masks]: [&Pictures; 2]| {
+        let (image, masks) = (images.demand(name, &path)?, vec![masks.demand(name, &path)?]);
+        let lens = Lens::read(record, "cam_intrinsics", "cam_extrinsics", options.pixel_centre)?;
+        let (pose, betas) = (checks::pose(record, body)?, checks::betas(record, "betas", body)?);
+        Ok::<_, CaptureError>(Planned {
+            name: name.to_owned(),
+            files: FrameFiles { image, masks, labels: false, occluder: None, hidden: None, lens },
+            body: Fitted { pose, placement: Placement::default(), betas },
+            keypoints: checks::keypoints(record, body)?,
         })
-        .collect();
-    let train = View::new(train?, &dir.join("masks"), &path)?;
+    };
+    let mut train = Vec::new();
+    for (FrameName(name), record) in &frames {
+        let mut frame = plan(name, record, [&images, &masks])?;
+        frame.files.occluder = occluders.as_ref().and_then(|o| o.get(name));
+        train.push(frame);
+    }
+    let train = View::new(train, &dir.join("masks"), &path)?;
 
     let clean = dir.join(CLEAN);
     let (mut indices, mut kept) = (Vec::new(), Vec::new());
@@ -60,7 +71,7 @@ pub(super) fn load(dir: &Path, body: &BodyModel, options: &LoadOptions) -> Resul
         for (index, (FrameName(name), record)) in frames.iter().enumerate().step_by(options.eval_stride) {
             if images.get(name).is_some() {
                 indices.push((CLEAN.to_owned(), index));
-                kept.push(plan(name, record, [&images, &masks], &path, body, options)?);
+                kept.push(plan(name, record, [&images, &masks])?);
             }
         }
     }
@@ -84,27 +95,4 @@ fn optional(dir: &Path, names: &[&str]) -> Result<Option<Pictures>, CaptureError
         return Err(CaptureError::invalid(dir, "names", expected, first.as_str()));
     }
     Ok(Some(pictures))
-}
-
-fn plan(
-    name: &str,
-    record: &Record<'_>,
-    [images, masks]: [&Pictures; 2],
-    metadata: &Path,
-    body: &BodyModel,
-    options: &LoadOptions,
-) -> Result<Planned, CaptureError> {
-    Ok(Planned {
-        name: name.to_owned(),
-        image: images.demand(name, metadata)?,
-        masks: vec![masks.demand(name, metadata)?],
-        labels: false,
-        occluder: None,
-        hidden: None,
-        lens: Lens::read(record, "cam_intrinsics", "cam_extrinsics", options.pixel_centre)?,
-        pose: checks::pose(record, body)?,
-        placement: Placement::default(),
-        betas: checks::betas(record, "betas", body)?,
-        keypoints: checks::keypoints(record, body)?,
-    })
 }

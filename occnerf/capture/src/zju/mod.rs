@@ -12,26 +12,24 @@
 //!                              present; of one that moves, also rects, one for each of frames
 //! ```
 
-mod annots;
 #[cfg(test)]
 mod tests;
 
-use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Component, Path, PathBuf};
 
-use glam::Vec3;
+use glam::{Affine3A, DVec3};
 use rayon::prelude::*;
-use serde::Deserialize;
-use smpl::{BodyModel, Placement};
+use smpl::BodyModel;
 
-use self::annots::Annots;
-use super::decode::{Planned, View, capture};
-use super::files::read_text;
+use super::camera::{Lens, ORTHONORMAL};
+use super::decode::{Fitted, Planned, View, capture};
+use super::files::FrameFiles;
 use super::image::dimensions;
+use super::item::{Item, pickled};
 use super::pictures::is_directory;
 use super::pixels::Area;
-use super::records::{Record, Records, triples};
-use super::{Capture, CaptureError, LoadOptions, checks};
+use super::{Capture, CaptureError, LoadOptions, checks, json};
 
 /// Tolerance of a vertex against the file's, as a fraction of the body's largest extent, 1 cm at
 /// 1.7 m.
@@ -48,31 +46,20 @@ pub(super) fn load(dir: &Path, body: &BodyModel, options: &LoadOptions) -> Resul
 
     let plan = |camera: usize, index: usize| -> Result<Option<Planned>, CaptureError> {
         let Some(path) = annots.picture(instants[index], camera) else { return Ok(None) };
-        let fitted = &bodies[index];
-        Ok(Some(Planned {
-            name: format!("frame_{:06}", instants[index]),
-            image: dir.join(path),
-            masks: masks(dir, path)?,
-            labels: true,
-            occluder: None,
-            hidden: None,
-            lens: annots.lenses[camera],
-            pose: fitted.pose.clone(),
-            placement: fitted.placement,
-            betas: fitted.betas.clone(),
-            keypoints: Vec::new(),
-        }))
+        let (image, masks, lens) = (dir.join(path), masks(dir, path)?, annots.lenses[camera]);
+        let files = FrameFiles { image, masks, labels: true, occluder: None, hidden: None, lens };
+        let name = format!("frame_{:06}", instants[index]);
+        Ok(Some(Planned { name, files, body: bodies[index].clone(), keypoints: Vec::new() }))
     };
     let mut train = Vec::new();
     for index in 0..instants.len() {
         train.extend(plan(camera, index)?);
     }
-    if let Some(recorded) = Recorded::read(dir, &annots, camera, &train)? {
-        for (frame, instant) in train.iter_mut().zip(&instants) {
-            frame.hidden = recorded.areas.get(instant).cloned();
-        }
+    let obstacle = obstacle(dir, &annots, camera, &train)?;
+    for (frame, instant) in train.iter_mut().zip(&instants) {
+        frame.files.hidden = obstacle.get(instant).cloned();
     }
-    let mask_dir = |frame: &Planned| frame.masks[0].parent().unwrap_or(dir).to_owned();
+    let mask_dir = |frame: &Planned| frame.files.masks[0].parent().unwrap_or(dir).to_owned();
     let first_masks = train.first().map_or(dir.to_owned(), mask_dir);
     let train = View::new(train, &first_masks, &annots.path)?;
 
@@ -108,13 +95,6 @@ fn masks(dir: &Path, picture: &Path) -> Result<Vec<PathBuf>, CaptureError> {
     Ok(found)
 }
 
-/// A body fitted to all pictures of an instant.
-struct Fitted {
-    pose: Vec<Vec3>,
-    placement: Placement,
-    betas: Vec<f32>,
-}
-
 /// The fitted bodies of the given instants.
 fn bodies(dir: &Path, annots: &Annots, instants: &[usize], body: &BodyModel) -> Result<Vec<Fitted>, CaptureError> {
     let file = |kind: &str, number: usize| dir.join(kind).join(format!("{number}.npy"));
@@ -130,8 +110,8 @@ fn bodies(dir: &Path, annots: &Annots, instants: &[usize], body: &BodyModel) -> 
                 let what = format!("body parameters of ims[{instant}] in {}", annots.path.display());
                 return Err(CaptureError::missing(&path, what));
             }
-            let records = Records::load(&path)?;
-            let fitted = fit(&records.whole(), body)?;
+            let value = pickled(&path)?;
+            let fitted = checks::about_origin(&Item::new(&path, &value), "shapes", body)?;
             let vertices = file("new_vertices", instant + offset);
             if vertices.is_file() {
                 compare(&vertices, &fitted, body)?;
@@ -142,99 +122,211 @@ fn bodies(dir: &Path, annots: &Annots, instants: &[usize], body: &BodyModel) -> 
     fitted.into_iter().collect()
 }
 
-fn fit(record: &Record<'_>, body: &BodyModel) -> Result<Fitted, CaptureError> {
-    Ok(Fitted {
-        pose: checks::rootless_pose(record, body)?,
-        placement: checks::origin(record)?,
-        betas: checks::betas(record, "shapes", body)?,
-    })
-}
-
 /// Errors unless the model's vertices are those of the file.
 fn compare(path: &Path, fitted: &Fitted, body: &BodyModel) -> Result<(), CaptureError> {
-    let key = "vertices";
-    let pattern = [Some(body.num_vertices()), Some(3)];
-    let expected = triples(&array_files::npz::read_npy(path)?.to_f32(&path.display().to_string(), key, &pattern)?);
+    let value = array_files::pickle::read(path)?;
+    let item = Item { key: "vertices".to_owned(), ..Item::new(path, &value) };
+    let expected = checks::triples(&item.floats(&[Some(body.num_vertices()), Some(3)])?);
     let posed = body.pose(&body.shaped(&fitted.betas), &fitted.pose, fitted.placement);
-    let low = expected.iter().copied().fold(Vec3::INFINITY, Vec3::min);
-    let high = expected.iter().copied().fold(Vec3::NEG_INFINITY, Vec3::max);
-    let tolerance = VERTEX_TOLERANCE * (high - low).max_element();
-    for (vertex, (model, file)) in posed.vertices.iter().zip(&expected).enumerate() {
-        let distance = model.distance(*file);
-        if distance.is_nan() || distance > tolerance {
-            return Err(CaptureError::invalid(
-                path,
-                key,
-                format!(
-                    "the posed body model's vertices within {tolerance:.3} (is it the model that the capture was \
-                     fitted with, and are files numbered as the frames are?)"
-                ),
-                format!("vertex {vertex} at {file}, {distance:.3} from the model's"),
-            ));
-        }
+    let tolerance = VERTEX_TOLERANCE * checks::extent(&expected);
+    checks::same(&item, "vertex", &posed.vertices, &expected, tolerance)
+}
+
+/// The obstacle of `occlusion.json` by instant, in pixels of the files; none without a file, or for
+/// one of another camera.
+fn obstacle(
+    dir: &Path,
+    annots: &Annots,
+    camera: usize,
+    train: &[Planned],
+) -> Result<BTreeMap<usize, Area>, CaptureError> {
+    let path = dir.join("occlusion.json");
+    let (true, Some(first)) = (path.is_file(), train.first()) else { return Ok(BTreeMap::new()) };
+    let value = json::read(&path, MAX_OCCLUSION_BYTES)?;
+    let file = Item::new(&path, &value);
+    let name = file.get("camera")?;
+    let name = name.value.as_str().ok_or_else(|| name.invalid("a camera's folder", name.value.type_name()))?;
+    if name != annots.names[camera] {
+        return Ok(BTreeMap::new());
     }
-    Ok(())
-}
-
-/// The obstacle of `occlusion.json` by instant, in pixels of the files.
-struct Recorded {
-    areas: BTreeMap<usize, Area>,
-}
-
-#[derive(Deserialize)]
-struct OcclusionFile {
-    camera: String,
-    image_size: [u32; 2],
-    rect: Rectangle,
-    frames: Vec<usize>,
-    rects: Option<Vec<Rectangle>>,
-}
-
-#[derive(Clone, Copy, Deserialize)]
-struct Rectangle {
-    x0: u32,
-    y0: u32,
-    x1: u32,
-    y1: u32,
-}
-
-impl Recorded {
-    /// `None` without a file, or for one of another camera.
-    fn read(dir: &Path, annots: &Annots, camera: usize, train: &[Planned]) -> Result<Option<Self>, CaptureError> {
-        let path = dir.join("occlusion.json");
-        let (true, Some(first)) = (path.is_file(), train.first()) else { return Ok(None) };
-        let text = read_text(&path, MAX_OCCLUSION_BYTES)?;
-        let OcclusionFile { camera: name, image_size, rect, frames, rects } =
-            serde_json::from_str(&text).map_err(|e| {
-                let expected = "camera, image_size (width, height), rect with x0 y0 x1 y1, and frames";
-                CaptureError::invalid(&path, "the file", expected, e.to_string())
-            })?;
-        if name != annots.names[camera] {
-            return Ok(None);
+    let (width, height) = dimensions(&first.files.image)?;
+    let size = file.get("image_size")?;
+    let found = size.indices()?;
+    if found != [width as usize, height as usize] {
+        let expected = format!("[{width}, {height}], as of {}", first.files.image.display());
+        return Err(size.invalid(expected, format!("{found:?}")));
+    }
+    let area = |rect: &Item<'_>| {
+        let side = |key: &str| Ok::<_, CaptureError>(u32::try_from(rect.get(key)?.whole()?).unwrap_or(u32::MAX));
+        let [x0, y0, x1, y1] = [side("x0")?, side("y0")?, side("x1")?, side("y1")?];
+        if x0 > x1 || y0 > y1 || x1 > width || y1 > height {
+            let expected = format!("0 ≤ x0 ≤ x1 ≤ {width} and 0 ≤ y0 ≤ y1 ≤ {height}");
+            return Err(rect.invalid(expected, format!("{x0} {y0} {x1} {y1}")));
         }
-        let (width, height) = dimensions(&first.image)?;
-        if image_size != [width, height] {
-            let expected = format!("[{width}, {height}], as of {}", first.image.display());
-            return Err(CaptureError::invalid(&path, "image_size", expected, format!("{image_size:?}")));
-        }
-        for rect in rects.iter().flatten().chain([&rect]) {
-            if rect.x0 > rect.x1 || rect.y0 > rect.y1 || rect.x1 > width || rect.y1 > height {
-                let expected = format!("0 ≤ x0 ≤ x1 ≤ {width} and 0 ≤ y0 ≤ y1 ≤ {height}");
-                let actual = format!("{} {} {} {}", rect.x0, rect.y0, rect.x1, rect.y1);
-                return Err(CaptureError::invalid(&path, "rect", expected, actual));
+        Ok(Area { columns: x0..x1, rows: y0..y1 })
+    };
+    let (one, instants) = (area(&file.get("rect")?)?, file.get("frames")?);
+    let frames = instants.indices()?;
+    let areas = match file.find("rects") {
+        Some(rects) => {
+            let areas = rects.list()?.iter().map(area).collect::<Result<Vec<_>, _>>()?;
+            if areas.len() != frames.len() {
+                return Err(rects.invalid(format!("{}, as many as frames", frames.len()), areas.len().to_string()));
             }
+            areas
         }
-        let rects = rects.unwrap_or_else(|| vec![rect; frames.len()]);
-        if rects.len() != frames.len() {
-            let expected = format!("{}, as many as frames", frames.len());
-            return Err(CaptureError::invalid(&path, "rects", expected, rects.len().to_string()));
-        }
-        let count = annots.num_instants();
-        if let Some(beyond) = frames.iter().find(|&&frame| frame >= count) {
-            let expected = format!("indices below {count}, as of ims in {}", annots.path.display());
-            return Err(CaptureError::invalid(&path, "frames", expected, beyond.to_string()));
-        }
-        let area = |r: Rectangle| Area { columns: r.x0..r.x1, rows: r.y0..r.y1 };
-        Ok(Some(Self { areas: frames.into_iter().zip(rects.into_iter().map(area)).collect() }))
+        None => vec![one; frames.len()],
+    };
+    let count = annots.num_instants();
+    if let Some(beyond) = frames.iter().find(|&&frame| frame >= count) {
+        let expected = format!("indices below {count}, as of ims in {}", annots.path.display());
+        return Err(instants.invalid(expected, beyond.to_string()));
     }
+    Ok(frames.into_iter().zip(areas).collect())
+}
+
+/// Lengths of `T` in a metre.
+const MILLIMETRES: f32 = 1000.0;
+
+/// `annots.npy`, checked: cameras, and the pictures of each instant.
+struct Annots {
+    path: PathBuf,
+    /// Each camera's folder.
+    names: Vec<String>,
+    lenses: Vec<Lens>,
+    /// Pictures of each instant by camera.
+    pictures: Vec<BTreeMap<usize, PathBuf>>,
+}
+
+impl Annots {
+    fn read(dir: &Path, options: &LoadOptions) -> Result<Self, CaptureError> {
+        let path = dir.join("annots.npy");
+        let value = pickled(&path)?;
+        let whole = Item::new(&path, &value);
+        let lenses = lenses(&whole.get("cams")?, options)?;
+        let lists = lists(&whole)?;
+        let names = folders(&path, &lists, lenses.len())?;
+        let numbers: BTreeMap<&str, usize> = names.iter().enumerate().map(|(i, n)| (n.as_str(), i)).collect();
+        let mut pictures = Vec::with_capacity(lists.len());
+        for (instant, list) in lists.iter().enumerate() {
+            let mut by_camera = BTreeMap::new();
+            for picture in list {
+                let folder = folder(picture);
+                let camera = numbers.get(folder.as_str()).ok_or_else(|| {
+                    let expected = format!("a picture in one of the folders {}", names.join(", "));
+                    CaptureError::invalid(&path, format!("ims[{instant}].ims"), expected, picture.display().to_string())
+                })?;
+                if let Some(other) = by_camera.insert(*camera, picture.clone()) {
+                    let actual = format!("{} and {}", other.display(), picture.display());
+                    let key = format!("ims[{instant}].ims");
+                    return Err(CaptureError::invalid(&path, key, "one picture a camera", actual));
+                }
+            }
+            pictures.push(by_camera);
+        }
+        Ok(Self { path, names, lenses, pictures })
+    }
+
+    /// Number of the training camera.
+    fn camera(&self, options: &LoadOptions) -> Result<usize, CaptureError> {
+        let Some(wanted) = &options.camera else { return Ok(0) };
+        let count = self.names.len();
+        let number = wanted.parse::<usize>().ok().filter(|n| (1..=count).contains(n)).map(|n| n - 1);
+        self.names.iter().position(|name| name == wanted).or(number).ok_or_else(|| {
+            CaptureError::setting("camera", format!("1 to {count}, or one of {}", self.names.join(", ")), wanted)
+        })
+    }
+
+    /// Number of instants over all cameras.
+    fn num_instants(&self) -> usize {
+        self.pictures.len()
+    }
+
+    /// Instants that `camera` shows.
+    fn instants(&self, camera: usize) -> impl Iterator<Item = usize> {
+        (0..self.pictures.len()).filter(move |&instant| self.pictures[instant].contains_key(&camera))
+    }
+
+    /// The picture of an instant by `camera`, relative to the capture's directory.
+    fn picture(&self, instant: usize, camera: usize) -> Option<&Path> {
+        self.pictures[instant].get(&camera).map(PathBuf::as_path)
+    }
+}
+
+/// The cameras of `cams`.
+fn lenses(cams: &Item<'_>, options: &LoadOptions) -> Result<Vec<Lens>, CaptureError> {
+    let k = cams.get("K")?;
+    let (shape, _) = k.values()?;
+    let (&[count, 3, 3], false) = (shape.as_slice(), shape.starts_with(&[0])) else {
+        return Err(k.invalid("shape [C, 3, 3], of a camera or more", format!("shape {shape:?}")));
+    };
+    // Vectors are stored as rows, columns or neither.
+    let per_camera = |item: &Item<'_>, wanted: &[usize]| {
+        let (shape, values) = item.values()?;
+        let axes: Vec<usize> = shape.iter().skip(1).copied().filter(|&n| n != 1).collect();
+        if shape.first() == Some(&count) && axes == wanted {
+            return Ok(values);
+        }
+        let expected = format!("shape {wanted:?} for each of the {count} cameras of K");
+        Err(item.invalid(expected, format!("shape {shape:?}")))
+    };
+    let r = cams.get("R")?;
+    let (turns, t) = (per_camera(&r, &[3, 3])?, per_camera(&cams.get("T")?, &[3])?);
+    let d = cams.find("D").map(|d| per_camera(&d, &[5])).transpose()?.unwrap_or_else(|| vec![0.0; 5 * count]);
+    let calibrations = k.floats(&[Some(count), Some(3), Some(3)])?;
+    let lens = |camera: usize| {
+        let key = |item: &Item<'_>| format!("{}[{camera}]", item.key);
+        let rotation = Item { key: key(&r), ..r.clone() }.rotation(&turns[9 * camera..][..9], ORTHONORMAL)?.as_mat3();
+        let translation = DVec3::from_slice(&t[3 * camera..]).as_vec3() / MILLIMETRES;
+        let extrinsics = Affine3A::from_mat3_translation(rotation, translation);
+        let d = std::array::from_fn(|i| d[5 * camera + i] as f32);
+        Lens::new(&calibrations[9 * camera..][..9], extrinsics, d, options.pixel_centre)
+            .map_err(|error| CaptureError::invalid(k.path, key(&k), "a pinhole camera", error))
+    };
+    (0..count).map(lens).collect()
+}
+
+/// The pictures of every instant.
+fn lists(whole: &Item<'_>) -> Result<Vec<Vec<PathBuf>>, CaptureError> {
+    let instants = whole.get("ims")?;
+    let items = instants.list()?;
+    if items.is_empty() {
+        return Err(instants.invalid("a frame", "an empty list"));
+    }
+    let path = |item: &Item<'_>| {
+        let text = item.value.as_str().ok_or_else(|| item.invalid("a picture's path", item.value.type_name()))?;
+        let path = PathBuf::from(text);
+        // Paths must stay within the capture's directory.
+        let inside = path.components().all(|part| matches!(part, Component::Normal(_)));
+        if inside && path.file_name().is_some() {
+            return Ok(path);
+        }
+        Err(item.invalid("a path below the capture's directory", format!("{text:?}")))
+    };
+    items.iter().map(|item| item.get("ims")?.list()?.iter().map(path).collect()).collect()
+}
+
+fn folder(picture: &Path) -> String {
+    picture.parent().map(|p| p.to_string_lossy().into_owned()).unwrap_or_default()
+}
+
+/// The folder of each of `count` cameras, by a frame with pictures of all.
+fn folders(path: &Path, lists: &[Vec<PathBuf>], count: usize) -> Result<Vec<String>, CaptureError> {
+    let longest = lists.iter().map(Vec::len).max().unwrap_or(0);
+    if longest != count {
+        let expected = format!("{count} pictures in a frame that all cameras see, as cams has cameras, and never more");
+        return Err(CaptureError::invalid(path, "ims", expected, format!("up to {longest}")));
+    }
+    let full = lists.iter().find(|list| list.len() == count);
+    let names: Vec<String> = full.into_iter().flatten().map(|picture| folder(picture)).collect();
+    let mut seen = BTreeSet::new();
+    if let Some(twice) = names.iter().find(|name| !seen.insert(name.as_str())) {
+        return Err(CaptureError::invalid(
+            path,
+            "ims",
+            "a folder for each camera",
+            format!("two pictures in {twice}/"),
+        ));
+    }
+    Ok(names)
 }

@@ -1,20 +1,12 @@
 //! Files of weights in every form, and damaged ones.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use lpips::{Lpips, Trunk};
-use testkit::files::{torch, zip};
+use testkit::files::{Directory, torch, zip};
 
 use crate::formula::{Tensors, bytes, network, safetensors, weights};
 use crate::noise;
-
-/// An empty folder of a test's own.
-fn folder(name: &str) -> PathBuf {
-    let path = Path::new(env!("CARGO_TARGET_TMPDIR")).join("lpips").join(name);
-    let _ = std::fs::remove_dir_all(&path);
-    std::fs::create_dir_all(&path).unwrap();
-    path
-}
 
 fn saved(tensors: &Tensors, legacy: bool) -> Vec<u8> {
     let whole = |numbers: &[usize]| numbers.iter().map(|&n| n as u32).collect::<Vec<u32>>();
@@ -26,14 +18,6 @@ fn saved(tensors: &Tensors, legacy: bool) -> Vec<u8> {
     torch(&each.collect::<Vec<_>>(), &storages, legacy)
 }
 
-fn archive(tensors: &Tensors) -> Vec<u8> {
-    saved(tensors, false)
-}
-
-fn legacy(tensors: &Tensors) -> Vec<u8> {
-    saved(tensors, true)
-}
-
 fn value(lpips: &Lpips) -> f64 {
     lpips.distance(&noise(3 * 32 * 32, 8), &noise(3 * 32 * 32, 9), 32, 32).unwrap()[0]
 }
@@ -43,22 +27,20 @@ fn every_form_of_file_and_directory_gives_the_same_network() {
     let (trunk, lin) = weights();
     let all: Tensors = trunk.clone().into_iter().chain(lin.clone()).collect();
     let expected = value(&network(Trunk::SqueezeNet));
-    type Form = fn(&Tensors) -> Vec<u8>;
-    let forms: [(&str, Form); 3] = [("safetensors", safetensors), ("pth", archive), ("pt", legacy)];
-    for (end, form) in forms {
-        let one = folder(&format!("one-{end}"));
-        std::fs::write(one.join(format!("all.{end}")), form(&all)).unwrap();
-        assert_eq!(value(&Lpips::load(&one.join(format!("all.{end}"))).unwrap()), expected, "{end}");
-        assert_eq!(value(&Lpips::load(&one).unwrap()), expected, "{end} in a directory");
-        let two = folder(&format!("two-{end}"));
-        std::fs::write(two.join(format!("squeezenet1_1.{end}")), form(&trunk)).unwrap();
-        std::fs::write(two.join(format!("a.{end}")), form(&lin)).unwrap();
-        assert_eq!(
-            value(&Lpips::load(&two.join(format!("squeezenet1_1.{end}"))).unwrap()),
-            expected,
-            "{end}, two files"
-        );
-        assert_eq!(value(&Lpips::load(&two).unwrap()), expected, "{end}, two files in a directory");
+    for end in ["safetensors", "pth", "pt"] {
+        let form = |tensors: &Tensors| match end {
+            "safetensors" => safetensors(tensors),
+            end => saved(tensors, end == "pt"),
+        };
+        let (one, two) = (Directory::new("one"), Directory::new("two"));
+        let [whole, part, lin_file] = ["all", "squeezenet1_1", "a"].map(|stem| format!("{stem}.{end}"));
+        one.write(&whole, form(&all));
+        two.write(&part, form(&trunk));
+        two.write(&lin_file, form(&lin));
+        // A file or its directory, with one file or with two.
+        for path in [one.file(&whole), one.path().into(), two.file(&part), two.path().into()] {
+            assert_eq!(value(&Lpips::load(&path).unwrap()), expected, "{}", path.display());
+        }
     }
 }
 
@@ -71,16 +53,15 @@ fn refused(path: &Path, words: &[&str]) {
 
 #[test]
 fn what_is_wrong_is_named_with_file_tensor_and_shapes() {
-    let folder = folder("wrong");
+    let dir = Directory::new("wrong");
     let (trunk, lin) = weights();
-    let lin_only = lin.clone();
-    let all: Tensors = trunk.clone().into_iter().chain(lin).collect();
-    let path = folder.join("net.pth");
+    let all: Tensors = trunk.clone().into_iter().chain(lin.clone()).collect();
+    let path = dir.file("net.pth");
     let check = |tensors: &Tensors, words: &[&str]| {
-        std::fs::write(&path, archive(tensors)).unwrap();
-        refused(&path, words);
-        std::fs::write(&path, legacy(tensors)).unwrap();
-        refused(&path, words);
+        for legacy in [false, true] {
+            dir.write("net.pth", saved(tensors, legacy));
+            refused(&path, words);
+        }
     };
     check(&trunk, &["squeezenet", "lin0.weight"]);
     let mut wrong = all.clone();
@@ -91,30 +72,23 @@ fn what_is_wrong_is_named_with_file_tensor_and_shapes() {
     wrong.insert("features.4.squeeze.bias".to_owned(), (vec![16], vec![f32::NAN; 16]));
     check(&wrong, &["`features.4.squeeze.bias`", "NaN"]);
     check(&Tensors::from([("fc.weight".to_owned(), (vec![1], vec![0.0]))]), &["no trunk", "fc.weight"]);
-    std::fs::write(&path, b"not weights at all, but long enough to be").unwrap();
+    dir.write("net.pth", b"not weights at all, but long enough to be");
     refused(&path, &["neither"]);
-    refused(&folder.join("none.pth"), &[]);
+    refused(&dir.file("none.pth"), &[]);
     // A damaged file beside the trunk is an error only if no other file has the linear layers.
-    let beside = self::folder("beside");
-    let (lonely, cut) = (beside.join("trunk.pth"), beside.join("zlin.pth"));
-    std::fs::write(&lonely, archive(&trunk)).unwrap();
-    std::fs::write(&cut, &archive(&lin_only)[..200]).unwrap();
-    for path in [&lonely, &beside] {
+    let beside = Directory::new("beside");
+    beside.write("trunk.pth", saved(&trunk, false));
+    beside.write("zlin.pth", &saved(&lin, false)[..200]);
+    let paths = [beside.file("trunk.pth"), beside.path().into()];
+    for path in &paths {
         let error = Lpips::load(path).err().unwrap().to_string();
         assert!(error.contains("zlin.pth"), "{error}");
     }
-    std::fs::write(beside.join("lin.pth"), archive(&lin_only)).unwrap();
-    for path in [&lonely, &beside] {
-        Lpips::load(path).unwrap();
-    }
-    let empty = self::folder("empty");
-    refused(&empty, &["no .safetensors"]);
-}
-
-#[test]
-fn pickles_that_would_run_something_are_refused_by_name() {
-    let path = folder("evil").join("net.pth");
+    beside.write("lin.pth", saved(&lin, false));
+    paths.iter().for_each(|path| drop(Lpips::load(path).unwrap()));
+    refused(Directory::new("empty").path(), &["no .safetensors"]);
+    // A program.
     let pickle = b"\x80\x02cos\nsystem\nX\x02\x00\x00\x00ls\x85R.";
-    std::fs::write(&path, zip([("x/data.pkl", pickle)])).unwrap();
+    dir.write("net.pth", zip([("x/data.pkl", pickle)]));
     refused(&path, &["os system", "not allowed"]);
 }

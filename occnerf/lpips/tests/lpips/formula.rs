@@ -4,17 +4,14 @@ use std::collections::BTreeMap;
 
 use lpips::{Lpips, Trunk};
 use safetensors::tensor::{Dtype, TensorView, serialize};
+use testkit::body::Random;
 
 /// Shape and values of each tensor.
 pub type Tensors = BTreeMap<String, (Vec<usize>, Vec<f32>)>;
 
-/// In [−1, 1), from SplitMix64's finaliser.
+/// In [−1, 1), a function of its address.
 pub fn uniform(address: u64) -> f32 {
-    let mut x = address.wrapping_add(0x9E37_79B9_7F4A_7C15);
-    x = (x ^ (x >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
-    x = (x ^ (x >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
-    x ^= x >> 31;
-    (x >> 40) as f32 * (1.0 / 16_777_216.0) * 2.0 - 1.0
+    Random(address).unit() * 2.0 - 1.0
 }
 
 /// Weight (`bias` false) or bias number `k` of a layer that sees `fan_in` values.

@@ -4,6 +4,8 @@
 use glam::Vec3;
 use smpl::{BodyModel, SparseRows};
 
+use super::{Capture, CaptureError, Frame, LoadOptions, load_capture};
+
 /// A box with a joint at either end and one beta that lengthens it.
 pub fn body() -> BodyModel {
     let corner = |i: u32, axis: u32| if i >> axis & 1 == 1 { 1.0 } else { -1.0 };
@@ -46,7 +48,7 @@ pub fn flat(points: &[Vec3]) -> Vec<f64> {
 
 /// Intersection over union of the posed body's silhouette and the mask, over the pixels that no
 /// known occluder covers.
-pub fn overlap(frame: &super::Frame, body: &BodyModel) -> f32 {
+pub fn overlap(frame: &Frame, body: &BodyModel) -> f32 {
     let posed = body.pose(&body.shaped(&frame.betas), &frame.pose, frame.placement);
     let mesh = visibility::RayMesh::new(&posed.vertices, &body.faces).unwrap();
     let (pixels, width) = (frame.pixels().unwrap(), frame.camera.width as usize);
@@ -54,4 +56,30 @@ pub fn overlap(frame: &super::Frame, body: &BodyModel) -> f32 {
         let ray = frame.camera.ray(x, y);
         mesh.first_hit(ray.origin, ray.direction).is_some()
     })
+}
+
+/// Loads a capture of the tiny body.
+pub fn load(dir: &Directory) -> Result<Capture, CaptureError> {
+    load_with(dir, LoadOptions::default())
+}
+
+pub fn load_with(dir: &Directory, options: LoadOptions) -> Result<Capture, CaptureError> {
+    load_capture(dir.path(), &body(), &options)
+}
+
+/// Checks that a capture is refused in one line that holds all of `words`.
+#[track_caller]
+pub fn fails(dir: &Directory, words: &[&str]) {
+    let message = load(dir).expect_err(words[0]).to_string();
+    assert!(!message.contains('\n') && message.len() < 600, "{message}");
+    words.iter().for_each(|word| assert!(message.contains(word), "`{word}` is not in: {message}"));
+}
+
+pub fn names(frames: &[Frame]) -> Vec<&str> {
+    frames.iter().map(|frame| frame.name.as_str()).collect()
+}
+
+/// Camera and training frame of each view.
+pub fn views(capture: &Capture) -> Vec<(&str, usize)> {
+    capture.eval.iter().map(|view| (view.camera_name.as_str(), view.train_index)).collect()
 }
