@@ -29,7 +29,7 @@ struct Arguments {
 #[derive(Subcommand)]
 enum Command {
     /// The paper's table on captures: every baseline and ablation, several seeds, one budget.
-    Reproduce(reproduce::ReproduceArguments),
+    Reproduce(Box<reproduce::ReproduceArguments>),
     /// Measures what every approximation costs and is worth, and where methods break.
     Bench(bench::BenchArguments),
     /// Splits the error of runs by its causes.

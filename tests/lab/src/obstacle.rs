@@ -1,11 +1,23 @@
 //! The simulated obstacle on the command line.
 
 use anyhow::{Result, ensure};
-use clap::Args;
+use clap::{Args, ValueEnum};
 use synth::Obstacle;
 
 /// How far a moving obstacle moves to the right over the video, in picture widths.
 const TRAVEL: f32 = 0.3;
+
+/// A simulated obstacle.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize, ValueEnum)]
+#[serde(rename_all = "kebab-case")]
+pub enum ObstacleName {
+    /// No obstacle.
+    None,
+    /// The paper's: half of the person on four fifths of the frames.
+    Central,
+    /// The same, moving by three tenths of the picture.
+    Moving,
+}
 
 /// Where the simulated obstacle stands, and how large it is.
 #[derive(Args, Clone, Debug, serde::Serialize)]
@@ -33,26 +45,16 @@ impl ObstacleArguments {
         self.fraction.or(self.share).or(self.position).or(self.height).is_some()
     }
 
-    /// No obstacle at all.
-    pub fn none(&self) -> Result<Obstacle> {
-        ensure!(!self.given(), "--occlusion none has no --fraction, --share, --position or --height");
-        Ok(Obstacle { fraction: 0.0, ..Obstacle::default() })
-    }
-
-    /// The paper's, but for what was asked for.
-    pub fn central(&self) -> Obstacle {
-        let paper = Obstacle::default();
-        Obstacle {
-            fraction: self.fraction.unwrap_or(paper.fraction),
+    /// The obstacle of this name, but for what was asked for.
+    pub fn named(&self, name: ObstacleName) -> Result<Obstacle> {
+        let (none, paper) = (name == ObstacleName::None, Obstacle::default());
+        ensure!(!(none && self.given()), "--occlusion none has no --fraction, --share, --position or --height");
+        Ok(Obstacle {
+            fraction: self.fraction.unwrap_or(if none { 0.0 } else { paper.fraction }),
             share: self.share.unwrap_or(paper.share),
             position: self.position.unwrap_or(paper.position),
             height: self.height.unwrap_or(paper.height),
-            ..paper
-        }
-    }
-
-    /// The same in motion.
-    pub fn moving(&self) -> Obstacle {
-        Obstacle { travel: TRAVEL, ..self.central() }
+            travel: if name == ObstacleName::Moving { TRAVEL } else { paper.travel },
+        })
     }
 }

@@ -11,8 +11,6 @@ use xtask::run;
 
 /// Points of a bench, one JSON line each.
 pub const BENCH_LOG: &str = "bench.jsonl";
-/// What `bench kernels` found.
-pub const KERNELS: &str = "kernels.json";
 
 /// A section of a document.
 pub struct Section<'a> {

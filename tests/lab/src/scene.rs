@@ -16,7 +16,7 @@ use volrender::RandomStream;
 use xtask::run::RunConfig;
 use xtask::source::{DEMO, LoadArguments, Source, load_with};
 
-use crate::obstacle::ObstacleArguments;
+use crate::obstacle::{ObstacleArguments, ObstacleName};
 use crate::synth::joint_names;
 
 /// Begins the recorded scene of a run on a corrupted capture, before the JSON of the scene and its
@@ -281,17 +281,6 @@ pub struct SceneArguments {
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, ValueEnum)]
 #[serde(rename_all = "kebab-case")]
-enum ObstacleName {
-    /// No obstacle.
-    None,
-    /// The paper's: half of the person on four fifths of the frames.
-    Central,
-    /// The same, moving by three tenths of the picture.
-    Moving,
-}
-
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, ValueEnum)]
-#[serde(rename_all = "kebab-case")]
 enum WrongName {
     /// What cameras, estimators and segmenters make of a real video: poses by 2.5°, 1 cm, depth by 2 %,
     /// limbs by 2.5 %, shape by 0.5, key points by 1.5 pixels, ragged masks with the backdrop in them,
@@ -302,12 +291,8 @@ enum WrongName {
 impl SceneArguments {
     /// The same as options.
     pub fn options(&self) -> Result<SceneOptions> {
-        let occlusion = match self.occlusion {
-            Some(ObstacleName::None) => Some(self.obstacle.none()?),
-            Some(ObstacleName::Moving) => Some(self.obstacle.moving()),
-            Some(ObstacleName::Central) => Some(self.obstacle.central()),
-            None => self.obstacle.given().then(|| self.obstacle.central()),
-        };
+        let name = self.occlusion.or(self.obstacle.given().then_some(ObstacleName::Central));
+        let occlusion = name.map(|name| self.obstacle.named(name)).transpose()?;
         let as_wrong = self.wrong.map_or(Perturbation::NONE, |WrongName::Real| Perturbation::REAL);
         let wrong = Perturbation {
             pose_degrees: self.wrong_pose.unwrap_or(as_wrong.pose_degrees),

@@ -10,9 +10,10 @@ use rigged::Character;
 use smpl::{BodyModel, BoneNames, Bvh, MotionClip, skeleton};
 use synth::{BODY, Obstacle, Occlusion, Outfit, SynthConfig, Synthetic, synthesise};
 
-use crate::obstacle::ObstacleArguments;
+use crate::obstacle::{ObstacleArguments, ObstacleName};
 use xtask::place::{beside, not_within, take_place, vacant};
 use xtask::process::{results_in, say};
+use xtask::run::make_directory;
 use xtask::source::is_character;
 
 /// What a finished directory holds, and nothing else does.
@@ -51,46 +52,18 @@ enum OutfitName {
     LongHair,
 }
 
-/// Where a capture is written.
-#[derive(Args)]
-struct OutArguments {
-    /// Directory to write, new or empty
-    #[arg(long)]
-    out: PathBuf,
-    /// Replace what the same command wrote to --out earlier
-    #[arg(long)]
-    force: bool,
-}
-
-impl OutArguments {
-    /// Errors unless --out may be written.
-    fn vacant(&self, mark: &str) -> Result<()> {
-        vacant(&self.out, self.force, mark)
-    }
-
-    /// Fills --out: everything is written beside it, `text` into the file `mark`, and takes its
-    /// place when it is complete.
-    fn fill(&self, mark: &str, text: &str, write: impl FnOnce(&Path) -> Result<()>) -> Result<()> {
-        let partial = beside(&self.out, "partial")?;
-        let written = xtask::run::make_directory(&partial)
-            .and_then(|()| write(&partial))
-            .and_then(|()| xtask::run::write(&partial.join(mark), text))
-            .and_then(|()| take_place(&partial, &self.out, self.force, mark));
-        if written.is_err() {
-            let _ = std::fs::remove_dir_all(&partial);
-        }
-        written
-    }
-}
-
 /// What to make, and where to.
 #[derive(Args)]
 pub struct SynthArguments {
     /// A rigged .glb or .gltf; the embedded person if left out. Its mesh at rest becomes the body
     /// model, with as many joints as the rig has (poses are then 3 numbers a joint, not 72)
     character: Option<PathBuf>,
-    #[command(flatten)]
-    out: OutArguments,
+    /// Directory to write, new or empty
+    #[arg(long)]
+    out: PathBuf,
+    /// Replace what the same command wrote to --out earlier
+    #[arg(long)]
+    force: bool,
     /// Write no body.safetensors: for the demo of xtask, whose program has the embedded person's body
     #[arg(long)]
     no_body: bool,
@@ -148,14 +121,15 @@ pub struct SynthArguments {
 impl SynthArguments {
     fn config(&self) -> Result<SynthConfig> {
         let usual = SynthConfig::default();
+        let rectangle = |name| self.obstacle.named(name).map(Occlusion::Rectangle);
         let occlusion = match self.occlusion {
-            OcclusionName::None => Occlusion::Rectangle(self.obstacle.none()?),
-            OcclusionName::Central => Occlusion::Rectangle(self.obstacle.central()),
-            OcclusionName::Moving => Occlusion::Rectangle(self.obstacle.moving()),
+            OcclusionName::None => rectangle(ObstacleName::None)?,
+            OcclusionName::Central => rectangle(ObstacleName::Central)?,
+            OcclusionName::Moving => rectangle(ObstacleName::Moving)?,
             OcclusionName::Objects => {
                 let said = "--occlusion objects has no --share (they stand in every frame) and no --height";
                 ensure!(self.obstacle.share.or(self.obstacle.height).is_none(), said);
-                let Obstacle { fraction, position, .. } = self.obstacle.central();
+                let Obstacle { fraction, position, .. } = self.obstacle.named(ObstacleName::Central)?;
                 Occlusion::Objects { fraction, position }
             }
         };
@@ -182,12 +156,12 @@ impl SynthArguments {
 
 /// Runs the command.
 pub fn synth(arguments: &SynthArguments) -> Result<()> {
+    let SynthArguments { out, force, .. } = arguments;
     let config = arguments.config()?;
-    let out = &arguments.out.out;
     if let Some(path) = arguments.character.as_deref().filter(|path| !is_character(path)) {
         bail!("{}: not a character; expected a .glb or .gltf", path.display());
     }
-    arguments.out.vacant(MARK)?;
+    vacant(out, *force, MARK)?;
     for (what, path) in [("the character", &arguments.character), ("--motion", &arguments.motion)] {
         if let Some(path) = path {
             not_within(path, out, what)?;
@@ -201,13 +175,21 @@ pub fn synth(arguments: &SynthArguments) -> Result<()> {
     let synthetic = film(arguments.character.as_deref(), arguments.motion.as_deref(), &config)?;
     let (hidden, joints) = (synthetic.hidden_fraction, &synthetic.joints);
     let mark = serde_json::json!({ "config": synthetic.config, "hidden_fraction": hidden, "joints": joints });
-    arguments.out.fill(MARK, &serde_json::to_string_pretty(&mark)?, |directory| {
+    // Everything is written beside the directory, and takes its place when it is complete.
+    let partial = beside(out, "partial")?;
+    let write = || -> Result<()> {
+        make_directory(&partial)?;
         let bar = bar("writing", synthetic.num_pictures(layout));
-        let written = synthetic.write(directory, layout, &|_| bar.inc(1));
+        let written = synthetic.write(&partial, layout, &|_| bar.inc(1));
         bar.finish_and_clear();
-        written.map_err(Error::from).map_err(results_in(directory))?;
-        if arguments.no_body { std::fs::remove_file(directory.join(BODY)).map_err(Error::from) } else { Ok(()) }
-    })?;
+        written.map_err(Error::from).map_err(results_in(&partial))?;
+        if arguments.no_body {
+            std::fs::remove_file(partial.join(BODY))?;
+        }
+        xtask::run::write(&partial.join(MARK), &serde_json::to_string_pretty(&mark)?)?;
+        take_place(&partial, out, *force, MARK)
+    };
+    write().inspect_err(|_| drop(std::fs::remove_dir_all(&partial)))?;
     let capture = &synthetic.capture;
     say!(
         "{}: {} frames, {} views kept back, {:.1} % of the person hidden where anything is, {} joints, {} vertices",

@@ -6,7 +6,6 @@ use smpl::{BodyModel, Placement};
 
 use crate::demo::landmarks::joint;
 use crate::demo::motion::{Pose, TrackerError, track, wander};
-use crate::film::noise::normal;
 use crate::photograph::{Shot, fray};
 use capture::{Capture, CaptureError, Frame, Keypoint};
 use volrender::RandomStream;
@@ -112,7 +111,7 @@ impl Perturbation {
         if self.shape > 0.0 {
             let mut stream = RandomStream::new(&[SHAPE ^ self.seed]);
             let count = body.num_betas().min(BETAS);
-            let error: Vec<f32> = (0..count).map(|_| self.shape * normal(&mut stream)).collect();
+            let error: Vec<f32> = (0..count).map(|_| self.shape * stream.normal()).collect();
             let frames = capture.train.iter_mut().map(|f| &mut f.betas);
             let views = capture.eval.iter_mut().map(|v| &mut v.frame.betas);
             for betas in frames.chain(views).chain([&mut capture.mean_betas]) {
@@ -152,7 +151,7 @@ impl Perturbation {
         let limbs = body.limbs();
         let mut moved = body.v_template.clone();
         for pair in limbs.pairs() {
-            let part = 0.01 * self.limbs_percent * normal(&mut RandomStream::new(&[LIMBS ^ self.seed, pair as u64]));
+            let part = 0.01 * self.limbs_percent * RandomStream::new(&[LIMBS ^ self.seed, pair as u64]).normal();
             moved.iter_mut().zip(limbs.longer(pair)).for_each(|(v, longer)| *v += part * longer);
         }
         body.v_template = moved;
@@ -229,7 +228,7 @@ fn projected(frame: &Frame, body: &BodyModel) -> Option<(Vec<Vec2>, f32)> {
 /// Gives the training frames key points with this noise.
 fn detect(capture: &mut Capture, body: &BodyModel, noise: f32, seed: u64) {
     let mut stream = RandomStream::new(&[POINTS ^ seed]);
-    let mut vector = move || noise / 250.0 * Vec2::new(normal(&mut stream), normal(&mut stream));
+    let mut vector = move || noise / 250.0 * Vec2::new(stream.normal(), stream.normal());
     let offsets = LIMB_JOINTS.map(|_| vector());
     for frame in &mut capture.train {
         let Some((joints, height)) = projected(frame, body) else { continue };

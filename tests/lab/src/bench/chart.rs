@@ -12,7 +12,6 @@ use plotters::prelude::*;
 use plotters::style::FontStyle;
 use plotters::style::text_anchor::{HPos, Pos, VPos};
 
-use super::front::front;
 use xtask::process::say;
 use xtask::scale::{Scale, number};
 
@@ -151,6 +150,15 @@ impl Panel {
             marks,
         }
     }
+}
+
+/// Whether each point (cost, worth) is on the Pareto front: no other has at most its cost and at
+/// least its worth, and one of the two strictly. Equal points stand or fall together; a point that
+/// is not finite is never on it.
+pub fn front(points: &[(f64, f64)]) -> Vec<bool> {
+    let finite = |p: &(f64, f64)| p.0.is_finite() && p.1.is_finite();
+    let beats = |a: &(f64, f64), b: &(f64, f64)| a.0 <= b.0 && a.1 >= b.1 && a != b;
+    points.iter().map(|p| finite(p) && !points.iter().any(|other| finite(other) && beats(other, p))).collect()
 }
 
 /// Entries of a legend.
@@ -353,4 +361,19 @@ fn arrange(spots: &[((i32, i32), &str)], area: (i32, i32), scale: i32) -> Vec<La
         placed.extend(best.map(|(_, label)| label));
     }
     placed
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn of_nothing_there_is_no_front_and_what_is_not_finite_is_not_on_it() {
+        assert!(front(&[]).is_empty());
+        assert_eq!(front(&[(f64::NAN, 1.0), (1.0, f64::INFINITY), (2.0, 2.0)]), [false, false, true]);
+        assert_eq!(
+            front(&[(1.0, 1.0), (1.0, 1.0), (0.0, 0.0), (-0.0, 0.0), (1.0, 0.0)])[..],
+            [true, true, true, true, false]
+        );
+    }
 }

@@ -5,8 +5,7 @@ use std::path::Path;
 
 use anyhow::Result;
 
-use super::chart::{Mark, Panel, Picture, Shape, Style, legend};
-use super::front::front;
+use super::chart::{Mark, Panel, Picture, Shape, Style, front, legend};
 use crate::sweep::{Kind, Line};
 
 /// A measured quantity of a run.
@@ -22,9 +21,9 @@ const WORTHS: [(&str, Pick, usize); 4] = [
 ];
 
 /// What it costs: the end of the chart's name, the label, the quantity.
-pub type Cost = (&'static str, &'static str, Pick);
+type Cost = (&'static str, &'static str, Pick);
 /// Costs of `bench pareto`, the first that of the fronts in its table.
-pub const COSTS: [Cost; 3] = [
+const COSTS: [Cost; 3] = [
     ("-training", "seconds of training", |l| Some(l.outcome.train_seconds)),
     ("-frame", "seconds a frame", |l| Some(l.outcome.seconds_per_frame)),
     ("-parameters", "parameters", |l| Some(l.outcome.parameters as f64)),
@@ -47,10 +46,10 @@ fn place(line: &Line, cost: Pick, worth: Pick) -> (f64, f64) {
 }
 
 /// A picture for each cost, with a panel for each worth, and one of the points around the base.
-pub fn charts(scene: &str, lines: &[Line], costs: &[Cost], stem: &Path) -> Result<()> {
+pub fn charts(scene: &str, lines: &[Line], stem: &Path) -> Result<()> {
     let styles = STYLES.iter().filter(|(kind, ..)| lines.iter().any(|l| l.point.kind == *kind));
     let names: Vec<(&str, Style)> = styles.map(|&(_, name, style)| (name, style)).collect();
-    for &(suffix, label, cost) in costs {
+    for (suffix, label, cost) in COSTS {
         let mut panels = Vec::new();
         for (name, worth, _) in WORTHS {
             let scored: Vec<(&Line, (f64, f64))> = lines
@@ -99,14 +98,15 @@ fn close_to_base(scored: &[(&Line, (f64, f64))]) -> Vec<bool> {
 }
 
 /// A row a point, in brackets its difference to the base, or to the preset that it is a change of;
-/// the last column says on which fronts of `cost` it is.
-pub fn table(lines: &[Line], cost: Cost) -> String {
+/// the last column says on which fronts of training time it is.
+pub fn table(lines: &[Line]) -> String {
     let mut text = String::from("| point | changes | train s | s/frame |");
     WORTHS.iter().for_each(|(name, ..)| text.push_str(&format!(" {name} |")));
     text.push_str(" parameters | MB | on the front of |\n| --- | --- | ---: | ---: |");
     WORTHS.iter().for_each(|_| text.push_str(" ---: |"));
     text.push_str(" ---: | ---: | --- |\n");
-    let fronts = WORTHS.map(|(_, worth, _)| front(&lines.iter().map(|l| place(l, cost.2, worth)).collect::<Vec<_>>()));
+    let fronts =
+        WORTHS.map(|(_, worth, _)| front(&lines.iter().map(|l| place(l, COSTS[0].2, worth)).collect::<Vec<_>>()));
     for (i, line) in lines.iter().enumerate() {
         let (point, outcome) = (&line.point, &line.outcome);
         let _ = write!(text, "| {} | {} |", point.name, point.factor);
@@ -152,7 +152,7 @@ mod tests {
             failed,
         ];
         (lines[0].outcome.parameters, lines[2].outcome.parameters) = (1000, 125);
-        let text = table(&lines, COSTS[0]);
+        let text = table(&lines);
         let rows: Vec<&str> = text.lines().skip(2).collect();
         assert_eq!(rows.len(), 4);
         assert!(rows[0].ends_with("|  |") && rows[1].contains("(-0.50)") && rows[1].ends_with("|  |"), "{text}");
@@ -161,7 +161,7 @@ mod tests {
         let cells = |row: &str| row.matches('|').count();
         assert!(text.lines().all(|row| cells(row) == cells(rows[0])), "{text}");
         (lines[0].point.kind, lines[0].point.factor) = (Kind::Preset, "k".to_owned());
-        assert!(table(&lines, COSTS[2]).contains("20.25 (+0.25)"));
+        assert!(table(&lines).contains("20.25 (+0.25)"));
     }
 
     #[test]
@@ -175,7 +175,7 @@ mod tests {
                 line
             };
             let lines: Vec<Line> = (0..count).map(of).collect();
-            charts("a scene", &lines, &COSTS, &stem).unwrap();
+            charts("a scene", &lines, &stem).unwrap();
             for (suffix, ..) in COSTS {
                 let path = format!("{}{suffix}", stem.display());
                 let svg = std::fs::read_to_string(format!("{path}.svg")).unwrap();

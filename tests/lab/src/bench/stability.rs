@@ -9,7 +9,7 @@ use anyhow::Result;
 use super::axes::Axis;
 use super::chart::{self, Mark, Panel, Picture, Shape, Style};
 use crate::methods::Method;
-use crate::sweep::{Line, Point, Runner};
+use crate::sweep::{Line, Runner};
 
 /// Methods that are trained, ours first.
 const TRAINED: [Method; 3] = [Method::Occnerf, Method::HashPoint, Method::Humannerf];
@@ -27,31 +27,6 @@ pub struct Sweep {
     pub max_runs: usize,
 }
 
-/// Runs of a sweep, by their points.
-struct Runs<'a> {
-    runner: &'a mut Runner,
-    lines: Vec<Line>,
-    /// Trained runs so far, and what they may come to.
-    trained: usize,
-    max_runs: usize,
-}
-
-impl Runs<'_> {
-    fn run(&mut self, point: Point) -> Result<()> {
-        let known = self.lines.iter().any(|l| l.point.job == point.job);
-        if point.job.method.has_field() && !known {
-            if self.trained >= self.max_runs {
-                return Ok(());
-            }
-            self.trained += 1;
-        }
-        if self.lines.iter().all(|l| l.point != point) {
-            self.lines.extend(self.runner.run(point)?);
-        }
-        Ok(())
-    }
-}
-
 /// How one method fared along one axis.
 pub struct Course {
     /// (index of the level, psnr_mask of every seed, why it counts as broken).
@@ -62,46 +37,50 @@ impl Sweep {
     /// Runs what the log does not have: every level of ours, the easy case and the hardest level of
     /// the peers, then the peers where ours breaks first, and more seeds where anything does.
     pub fn run(&self, runner: &mut Runner) -> Result<Vec<Line>> {
-        let mut runs = Runs { runner, lines: Vec::new(), trained: 0, max_runs: self.max_runs };
-        for axis in &self.axes {
-            for level in &axis.levels {
-                for method in [Method::Prior, Method::Surface] {
-                    runs.run(level.point(axis, method, self.steps, 1))?;
+        let (mut lines, mut trained) = (Vec::<Line>::new(), 0);
+        let mut run = |lines: &mut Vec<Line>, (axis, level): (&Axis, usize), method: Method, seed| -> Result<()> {
+            let point = axis.levels[level].point(axis, method, self.steps, seed);
+            if method.has_field() && lines.iter().all(|l| l.point.job != point.job) {
+                if trained >= self.max_runs {
+                    return Ok(());
                 }
+                trained += 1;
             }
+            if lines.iter().all(|l| l.point != point) {
+                lines.extend(runner.run(point)?);
+            }
+            Ok(())
+        };
+        let axes = self.axes.iter();
+        let places = axes.flat_map(|axis| (0..axis.levels.len()).map(move |level| (axis, level)));
+        let places: Vec<(&Axis, usize)> = places.collect();
+        for &place in &places {
+            run(&mut lines, place, Method::Prior, 1)?;
+            run(&mut lines, place, Method::Surface, 1)?;
         }
         for method in TRAINED {
-            for axis in &self.axes {
-                for (i, level) in axis.levels.iter().enumerate() {
-                    if method == Method::Occnerf || level.easy || i + 1 == axis.levels.len() {
-                        runs.run(level.point(axis, method, self.steps, 1))?;
-                    }
-                }
+            let is_end = |axis: &Axis, level: usize| axis.levels[level].easy || level + 1 == axis.levels.len();
+            for &(axis, level) in places.iter().filter(|place| method == Method::Occnerf || is_end(place.0, place.1)) {
+                run(&mut lines, (axis, level), method, 1)?;
             }
         }
-        let broken = |lines: &[Line], axis: &Axis, method| {
-            let levels = course(axis, method, lines).levels;
-            levels.iter().find(|(_, _, why)| why.is_some()).map(|(level, ..)| *level)
+        let broken = |lines: &[Line], method| -> Vec<(&Axis, usize)> {
+            let first = |axis| course(axis, method, lines).levels.iter().find(|l| l.2.is_some()).map(|l| (axis, l.0));
+            self.axes.iter().filter_map(first).collect()
         };
-        for axis in &self.axes {
-            if let Some(level) = broken(&runs.lines, axis, Method::Occnerf) {
-                for method in &TRAINED[1..] {
-                    runs.run(axis.levels[level].point(axis, *method, self.steps, 1))?;
+        for place in broken(&lines, Method::Occnerf) {
+            for method in &TRAINED[1..] {
+                run(&mut lines, place, *method, 1)?;
+            }
+        }
+        for method in TRAINED.into_iter().filter(|_| !self.quick) {
+            for place in broken(&lines, method) {
+                for seed in SEEDS.skip(1) {
+                    run(&mut lines, place, method, seed)?;
                 }
             }
         }
-        if !self.quick {
-            for method in TRAINED {
-                for axis in &self.axes {
-                    if let Some(level) = broken(&runs.lines, axis, method) {
-                        for seed in SEEDS.skip(1) {
-                            runs.run(axis.levels[level].point(axis, method, self.steps, seed))?;
-                        }
-                    }
-                }
-            }
-        }
-        Ok(runs.lines)
+        Ok(lines)
     }
 }
 
@@ -265,7 +244,7 @@ mod tests {
 
     #[test]
     fn a_method_breaks_below_the_prior_by_three_decibels_or_at_anything_not_finite() {
-        let axis = axes::of_demo(96, false).remove(0);
+        let axis = axes::all(96, false).remove(0);
         let prior = lines(&axis, Method::Prior, &[Some(15.0), Some(15.0), Some(14.0), Some(10.0)]);
         let mut all = prior.clone();
         all.extend(lines(&axis, Method::Occnerf, &[Some(19.0), Some(18.0), Some(16.5), Some(15.5)]));

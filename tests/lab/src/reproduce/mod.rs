@@ -10,8 +10,7 @@ use clap::Args;
 use occnerf::{Config, Preset};
 
 use crate::results::{self, Section};
-use crate::scene::{SceneArguments, SceneOptions};
-use crate::sweep::{Job, Keep, Kind, Place, Point, Runner, SittingArguments};
+use crate::sweep::{Captures, Job, Keep, Kind, Line, Point, Runner, SittingArguments};
 use rows::{Row, Table};
 use summary::Summary;
 use xtask::list::unique_name;
@@ -24,13 +23,8 @@ use xtask::train::scene_name;
 
 #[derive(Args)]
 pub struct ReproduceArguments {
-    /// Captures, or demo [default: demo]
-    scenes: Vec<String>,
-    /// The body model of the captures [default: as in train]
-    #[arg(long)]
-    body: Option<PathBuf>,
     #[command(flatten)]
-    load: SceneArguments,
+    on: Captures,
     /// Directory of all runs and results
     #[arg(long, default_value = "runs/reproduce")]
     out: PathBuf,
@@ -68,57 +62,21 @@ pub struct ReproduceArguments {
 
 /// Runs the command.
 pub fn reproduce(arguments: &ReproduceArguments) -> Result<()> {
-    let ReproduceArguments { sitting, .. } = arguments;
-    let (table, rows, load) = (arguments.table(), arguments.rows()?, arguments.load.options()?);
-    let steps = arguments.steps.unwrap_or(Config::preset(arguments.preset, occnerf::Method::Occnerf).steps);
-    let settings = format!("preset {}, {steps} steps a run, {} seeds", arguments.preset.name(), arguments.seeds);
-    let demo = [source::DEMO.to_owned()];
-    let scenes = if arguments.scenes.is_empty() { &demo[..] } else { &arguments.scenes };
+    let ReproduceArguments { on, sitting, .. } = arguments;
+    let (table, rows) = (arguments.table(), arguments.rows()?);
     // Bad input leaves nothing behind. A part need not load all scenes.
     load_lpips(arguments.lpips.as_deref())?;
-    if sitting.part.writes_tables() && !sitting.part.merge {
-        scenes.iter().try_for_each(|scene| load.load(scene, arguments.body.as_deref()).map(drop))?;
-    }
+    let is_whole = sitting.part.writes_tables() && !sitting.part.merge;
+    let scenes = if is_whole { on.checked()? } else { on.scenes() };
     let mut runner = sitting.open(&arguments.out)?;
-    let (mut turn, mut failed) = (0, Vec::new());
+    let mut failed = Vec::new();
     for (index, scene) in scenes.iter().enumerate() {
-        let directory = arguments.out.join(unique_name(scenes, index));
+        let directory = arguments.out.join(unique_name(&scenes, index));
         let directory = if table == Table::Methods { directory } else { directory.join(table.name()) };
-        let mut experiment =
-            Experiment { arguments, table, rows: &rows, scene, steps, settings: &settings, turn, failed };
-        experiment.run(&mut runner, &load, &directory)?;
-        (turn, failed) = (experiment.turn, experiment.failed);
-    }
-    runner.end(&sitting.part)?;
-    match failed.first() {
-        Some(first) => bail!("{} runs failed, such as {first}", failed.len()),
-        None => Ok(()),
-    }
-}
-
-/// A table of one scene.
-struct Experiment<'a> {
-    arguments: &'a ReproduceArguments,
-    table: Table,
-    rows: &'a [Row],
-    scene: &'a str,
-    steps: u64,
-    settings: &'a str,
-    /// Runs of all scenes so far.
-    turn: usize,
-    /// Runs of all scenes that failed, and why.
-    failed: Vec<String>,
-}
-
-impl<'a> Experiment<'a> {
-    /// Runs what is left, and makes the table.
-    fn run(&mut self, runner: &mut Runner, load: &SceneOptions, directory: &Path) -> Result<()> {
-        let (table, sitting) = (self.table, &self.arguments.sitting);
-        let summary = self.run_rows(runner, load.clone(), directory)?;
+        let summary = arguments.run(scene, &rows, &directory, &mut runner, &mut failed)?;
         if !sitting.part.writes_tables() {
-            return Ok(());
+            continue;
         }
-        let name = scene_name(Some(self.scene));
         say!("\n{}", summary.markdown());
         for name in ["md", "json", "png"].map(|extension| directory.join(summary.file(extension))) {
             if name.is_file() {
@@ -126,87 +84,13 @@ impl<'a> Experiment<'a> {
             }
         }
         if sitting.publish {
-            let chart = summary.chart(directory, &self.section())?;
-            self.publish(&summary.markdown(), &[chart])?;
-            // The one that everybody can reproduce.
-            if self.scene == source::DEMO && table == Table::Methods && self.other().is_empty() {
-                results::publish_table(&format!("{}.\n\n{}", results::set_of(&name), summary.front()))?;
-            }
+            arguments.publish(scene, &summary, &directory)?;
         }
-        Ok(())
     }
-
-    /// Trains and scores every row that is not finished, with all its seeds.
-    fn run_rows(&mut self, runner: &mut Runner, load: SceneOptions, directory: &Path) -> Result<Summary<'a>> {
-        let ReproduceArguments { body, seeds, preset, lpips, .. } = self.arguments;
-        let load = load.identified(self.scene, body.as_deref())?;
-        let tables = self.arguments.sitting.part.writes_tables();
-        let mut summary = Summary::new(self.scene, self.settings, self.table);
-        let mut firsts: Vec<(&str, usize)> = Vec::new();
-        for row in self.rows {
-            // Who trains a person bakes them.
-            let trained = firsts.iter().find(|first| row.baked == Some(first.0));
-            let first = trained.map_or(self.turn, |first| first.1);
-            firsts.push((&row.name, self.turn));
-            for seed in 1..=row.runs(*seeds) {
-                let mut config = row.config(*preset, self.steps, seed)?;
-                if let Some(path) = &self.arguments.perceptual_weights {
-                    config.loss.perceptual_weights.clone_from(path);
-                }
-                let keep = Keep {
-                    directory: directory.join(row.run(seed)),
-                    trained: row.baked.map(|row| directory.join(format!("{row}-s{seed}"))),
-                    lpips: lpips.clone(),
-                };
-                let place = Place::Scene { scene: self.scene.to_owned(), body: body.clone(), load: load.clone() };
-                let point = Point {
-                    bench: self.table.name().to_owned(),
-                    name: row.run(seed),
-                    factor: "as-it-is".to_owned(),
-                    level: None,
-                    kind: Kind::Row,
-                    command: None,
-                    job: Job { keep: Some(keep), ..Job::new(place, usize::MAX, row.method, config) },
-                };
-                let line = runner.run_turn(first + seed as usize - 1, point)?;
-                self.turn += 1;
-                let Some(line) = line else { continue };
-                match (line.outcome.metrics, line.outcome.error) {
-                    (Some(metrics), None) => summary.add(row, &directory.join(row.run(seed)), metrics),
-                    (_, error) => {
-                        let what = directory.join(row.run(seed));
-                        self.failed.push(format!("{}: {}", what.display(), error.unwrap_or_default()));
-                    }
-                }
-            }
-            // After every row, so that an end before the last leaves a table.
-            if tables {
-                make_directory(directory)?;
-                summary.write(directory)?;
-            }
-        }
-        Ok(summary)
-    }
-
-    /// Options that set this apart from the scene's main tables.
-    fn other(&self) -> String {
-        let paper = if self.arguments.preset == Preset::Paper { " --preset paper" } else { "" };
-        let lpips = if self.arguments.perceptual_weights.is_some() { " --perceptual-weights" } else { "" };
-        format!("{paper}{lpips}{}", self.arguments.load.command_line())
-    }
-
-    /// Name of the section of the results.
-    fn section(&self) -> String {
-        let other = self.other().replace(" --", "-").replace(' ', "-");
-        format!("{}-{}{other}", self.table.name(), scene_name(Some(self.scene)))
-    }
-
-    fn publish(&self, body: &str, charts: &[PathBuf]) -> Result<()> {
-        if !self.arguments.sitting.publish {
-            return Ok(());
-        }
-        let title = format!("{} on {}{}", self.table.title(), scene_name(Some(self.scene)), self.other());
-        results::publish(&Section { name: &self.section(), title: &title, body, charts })
+    runner.end(&sitting.part)?;
+    match failed.first() {
+        Some(first) => bail!("{} runs failed, such as {first}", failed.len()),
+        None => Ok(()),
     }
 }
 
@@ -224,5 +108,71 @@ impl ReproduceArguments {
         ensure!(unknown.is_none(), "--rows {}: no such row; there are {}", self.rows.join(","), names.join(", "));
         rows.retain(|row| self.rows.is_empty() || self.rows.contains(&row.name));
         Ok(rows)
+    }
+
+    /// Trains and scores every row that is not finished, with all its seeds; `failed` gets the runs that
+    /// did not work out, and why.
+    fn run(
+        &self,
+        scene: &str,
+        rows: &[Row],
+        directory: &Path,
+        runner: &mut Runner,
+        failed: &mut Vec<String>,
+    ) -> Result<Summary> {
+        let steps = self.steps.unwrap_or(Config::preset(self.preset, occnerf::Method::Occnerf).steps);
+        let settings = format!("preset {}, {steps} steps a run, {} seeds", self.preset.name(), self.seeds);
+        let (table, place) = (self.table(), self.on.place(scene)?);
+        let mut summary = Summary::new(scene, settings, table);
+        for row in rows {
+            for seed in 1..=row.runs(self.seeds) {
+                let mut config = row.config(self.preset, steps, seed)?;
+                if let Some(path) = &self.perceptual_weights {
+                    config.loss.perceptual_weights.clone_from(path);
+                }
+                let path = directory.join(row.run(seed));
+                let trained = row.baked.map(|row| directory.join(format!("{row}-s{seed}")));
+                let keep = Some(Keep { directory: path.clone(), trained });
+                let lpips = self.lpips.clone();
+                let point = Point {
+                    bench: table.name().to_owned(),
+                    name: row.run(seed),
+                    factor: "as-it-is".to_owned(),
+                    level: None,
+                    kind: Kind::Row,
+                    command: None,
+                    job: Job { lpips, keep, ..Job::new(place.clone(), usize::MAX, row.method, config) },
+                };
+                let Some(Line { outcome, .. }) = runner.run(point)? else { continue };
+                match (outcome.metrics, outcome.error) {
+                    (Some(metrics), None) => summary.add(row, &path, metrics),
+                    (_, error) => failed.push(format!("{}: {}", path.display(), error.unwrap_or_default())),
+                }
+            }
+            // After every row, so that an end before the last leaves a table.
+            if self.sitting.part.writes_tables() {
+                make_directory(directory)?;
+                summary.write(directory)?;
+            }
+        }
+        Ok(summary)
+    }
+
+    /// Makes a table a section of the results, named by the options that set it apart from the scene's
+    /// main tables.
+    fn publish(&self, scene: &str, summary: &Summary, directory: &Path) -> Result<()> {
+        let (table, name) = (self.table(), scene_name(Some(scene)));
+        let paper = if self.preset == Preset::Paper { " --preset paper" } else { "" };
+        let lpips = if self.perceptual_weights.is_some() { " --perceptual-weights" } else { "" };
+        let other = format!("{paper}{lpips}{}", self.on.load.command_line());
+        let section = format!("{}-{name}{}", table.name(), other.replace(" --", "-").replace(' ', "-"));
+        let title = format!("{} on {name}{other}", table.title());
+        let (body, charts) = (summary.markdown(), [summary.chart(directory, &section)?]);
+        results::publish(&Section { name: &section, title: &title, body: &body, charts: &charts })?;
+        // The one that everybody can reproduce.
+        if scene == source::DEMO && table == Table::Methods && other.is_empty() {
+            results::publish_table(&format!("{}.\n\n{}", results::set_of(&name), summary.front()))?;
+        }
+        Ok(())
     }
 }

@@ -15,10 +15,10 @@ use xtask::{pictures, table};
 
 /// Results of a scene.
 #[derive(Serialize)]
-pub struct Summary<'a> {
-    scene: &'a str,
+pub struct Summary {
+    scene: String,
     /// What every row starts from, and how many runs it has.
-    settings: &'a str,
+    settings: String,
     #[serde(skip)]
     table: Table,
     /// Network of lpips_full, and the perceptual term of training.
@@ -53,9 +53,9 @@ const COLUMNS: [Column; 9] = [
     ("iou", |s| s.mask_iou, 3),
 ];
 
-impl<'a> Summary<'a> {
-    pub fn new(scene: &'a str, settings: &'a str, table: Table) -> Self {
-        Self { scene, settings, table, lpips: None, perceptual: String::new(), rows: Vec::new() }
+impl Summary {
+    pub fn new(scene: &str, settings: String, table: Table) -> Self {
+        Self { scene: scene.to_owned(), settings, table, lpips: None, perceptual: String::new(), rows: Vec::new() }
     }
 
     /// Adds a run of a row.
@@ -124,8 +124,8 @@ impl<'a> Summary<'a> {
     }
 
     /// The scene without the folders that lead to it.
-    pub fn name(&self) -> String {
-        scene_name(Some(self.scene))
+    fn name(&self) -> String {
+        scene_name(Some(&self.scene))
     }
 
     /// The pictures of all methods under another name, for a folder with those of other scenes.

@@ -82,7 +82,7 @@ pub struct Job {
     /// Scores the baked person instead of the field, with four samples a pixel or one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub bake: Option<bool>,
-    /// Weights of LPIPS, of a run that is not kept.
+    /// Weights of LPIPS.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub lpips: Option<PathBuf>,
     /// Run directory, scored and drawn as `train` does it; measured and forgotten where there is
@@ -97,15 +97,13 @@ pub struct Keep {
     pub directory: PathBuf,
     /// Directory of the trained run whose baked person is scored; trained first if need be.
     pub trained: Option<PathBuf>,
-    /// Weights of LPIPS.
-    pub lpips: Option<PathBuf>,
 }
 
 impl PartialEq for Keep {
     fn eq(&self, other: &Self) -> bool {
         let name = |path: &Path| path.iter().rev().take(2).map(OsStr::to_owned).collect::<Vec<_>>();
         let names = |keep: &Self| (name(&keep.directory), keep.trained.as_deref().map(name));
-        names(self) == names(other) && self.lpips == other.lpips
+        names(self) == names(other)
     }
 }
 
@@ -144,11 +142,12 @@ pub struct Outcome {
 }
 
 /// Trains and scores in the run directory, unless it holds the finished run.
-fn keep_run(job: &Job, Keep { directory, trained, lpips }: &Keep) -> Result<Outcome> {
+fn keep_run(job: &Job, Keep { directory, trained }: &Keep) -> Result<Outcome> {
     let Place::Scene { scene, body, load } = &job.place else { bail!("a capture made on the spot is not kept") };
     let source = load.load(scene, body.as_deref())?;
     let run = RunConfig::new(&source, job.config.clone())?;
-    let (lpips, name) = (load_lpips(lpips.as_deref())?, directory.file_name().unwrap_or_default().to_string_lossy());
+    let (lpips, name) =
+        (load_lpips(job.lpips.as_deref())?, directory.file_name().unwrap_or_default().to_string_lossy());
     let metrics = match trained {
         Some(trained) => baked_unless_finished(directory, trained, &run, &source, lpips.as_ref())?,
         None => job.method.run_unless_finished(directory, &name, &run, &source, lpips.as_ref(), INTERVAL)?,

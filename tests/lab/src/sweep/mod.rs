@@ -14,9 +14,52 @@ use serde::{Deserialize, Serialize};
 
 pub use self::job::{Job, Keep, Outcome, Place};
 use crate::results::BENCH_LOG;
+use crate::scene::SceneArguments;
 use xtask::process::{Lock, say, unwritten};
 use xtask::run::{Metrics, check_threads};
 use xtask::shard::{Shard, ShardArguments};
+use xtask::source::DEMO;
+
+/// What a sweep over captures is run on.
+#[derive(Args)]
+pub struct Captures {
+    /// Captures, as `train` takes them [default: the demo]
+    scenes: Vec<String>,
+    /// The body model of the captures [default: as in train]
+    #[arg(long)]
+    body: Option<PathBuf>,
+    #[command(flatten)]
+    pub load: SceneArguments,
+}
+
+impl Captures {
+    /// The scenes.
+    pub fn scenes(&self) -> Vec<String> {
+        if self.scenes.is_empty() { vec![DEMO.to_owned()] } else { self.scenes.clone() }
+    }
+
+    /// The scenes; what is wrong with a capture is said before anything is run.
+    pub fn checked(&self) -> Result<Vec<String>> {
+        let (scenes, load) = (self.scenes(), self.load.options()?);
+        scenes.iter().try_for_each(|scene| load.load(scene, self.body.as_deref()).map(drop))?;
+        Ok(scenes)
+    }
+
+    /// Where the frames of a scene come from.
+    pub fn place(&self, scene: &str) -> Result<Place> {
+        let load = self.load.options()?.identified(scene, self.body.as_deref())?;
+        Ok(Place::Scene { scene: scene.to_owned(), body: self.body.clone(), load })
+    }
+
+    /// What makes `train` read the same capture.
+    pub fn command_line(&self, scene: &str) -> String {
+        let mut text = if scene == DEMO { String::new() } else { format!(" {scene}") };
+        if let Some(body) = &self.body {
+            text.push_str(&format!(" --body {}", body.display()));
+        }
+        text + &self.load.command_line()
+    }
+}
 
 /// How a sweep is run this time.
 #[derive(Args)]
@@ -110,10 +153,7 @@ pub fn read(path: &Path) -> Result<Vec<Line>> {
     let mut lines: Vec<Line> = Vec::new();
     for (at, &(row, content)) in rows.iter().enumerate() {
         match serde_json::from_str::<Line>(content) {
-            Ok(line) => {
-                lines.retain(|old| !line.replaces(old));
-                lines.push(line);
-            }
+            Ok(line) => put(&mut lines, line),
             Err(_) if at + 1 == rows.len() => {}
             Err(error) => bail!("{}, line {}: {error}", path.display(), row + 1),
         }
@@ -135,19 +175,26 @@ fn read_all(directory: &Path) -> Result<Vec<Line>> {
         for line in read(&path)? {
             // A part that failed does not replace one that did not.
             if line.outcome.error.is_none() || lines.iter().all(|old| !line.replaces(old)) {
-                lines.retain(|old| !line.replaces(old));
-                lines.push(line);
+                put(&mut lines, line);
             }
         }
     }
     Ok(lines)
 }
 
-/// What tells a point from all others, the same in every part.
+/// Adds a line in place of an older one of its point.
+fn put(lines: &mut Vec<Line>, line: Line) {
+    lines.retain(|old| !line.replaces(old));
+    lines.push(line);
+}
+
+/// What tells a point from all others, the same in every part; that of the trained run for a baked
+/// person: who trains a person bakes them.
 fn name(point: &Point) -> String {
-    let config = &point.job.config;
-    let place = point.job.place.name();
-    format!("{} {place} {} {} {} {}", point.bench, point.factor, point.name, point.job.method.name(), config.seed)
+    let (config, place) = (&point.job.config, point.job.place.name());
+    let trained = point.job.keep.as_ref().and_then(|keep| keep.trained.as_deref()?.file_name()?.to_str());
+    let (name, method) = (trained.unwrap_or(&point.name), point.job.method.name());
+    format!("{} {place} {} {name} {method} {}", point.bench, point.factor, config.seed)
 }
 
 /// A sweep in progress.
@@ -198,17 +245,7 @@ impl Runner {
     /// Runs a point, unless the log has it with the very same job and no error; `None` when time is
     /// up, or another part has it.
     pub fn run(&mut self, point: Point) -> Result<Option<Line>> {
-        let mine = self.shard.is_none_or(|shard| shard.has_name(&name(&point)));
-        self.run_if(mine, point)
-    }
-
-    /// The same; parts take turns by the number `turn` of the point, the same in every part.
-    pub fn run_turn(&mut self, turn: usize, point: Point) -> Result<Option<Line>> {
-        self.run_if(self.shard.is_none_or(|shard| shard.has(turn)), point)
-    }
-
-    fn run_if(&mut self, mine: bool, point: Point) -> Result<Option<Line>> {
-        let there = point.job.keep.as_ref().is_none_or(|Keep { directory, trained, .. }| {
+        let there = point.job.keep.as_ref().is_none_or(|Keep { directory, trained }| {
             Metrics::fresh(directory, trained.as_ref().unwrap_or(directory)).is_ok_and(|metrics| metrics.is_some())
         });
         let done = self.lines.iter().find(|l| there && l.point.job == point.job && l.outcome.error.is_none());
@@ -219,7 +256,8 @@ impl Runner {
             }
             return Ok(Some(line));
         }
-        if mine && self.start.elapsed() < self.budget {
+        let is_mine = self.shard.is_none_or(|shard| shard.has_name(&name(&point)));
+        if is_mine && self.start.elapsed() < self.budget {
             self.begun += 1;
             if let Some(outcome) = job::run(&point.job, self.threads)? {
                 let line = Line { point, outcome };
@@ -259,8 +297,7 @@ impl Runner {
             let _ = self.file.set_len(length);
         }
         written.map_err(unwritten(&self.path))?;
-        self.lines.retain(|old| !line.replaces(old));
-        self.lines.push(line);
+        put(&mut self.lines, line);
         Ok(())
     }
 

@@ -22,24 +22,16 @@ fn self_contained(page: &str) {
     assert!(page.contains("name=\"viewport\"") && page.contains("prefers-color-scheme"));
 }
 
-/// A tiny capture of a layout, in a folder of the layout's name.
-fn tiny(folder: &Path, format: &str) -> PathBuf {
-    let out = folder.join(format);
-    common::tiny(&out, format);
-    out
-}
-
 #[test]
 fn a_sweep_goes_on_where_it_was_cut_off() {
-    let folder = folder("sweep");
-    let (capture, out) = (tiny(&folder, "zju-mocap"), folder.join("out"));
-    let sweep = ["bench", "stability", text(&capture), "--quick", "--axes", "hidden"];
-    let sweep = [&sweep[..], &["--side", "24", "--steps", "1", "--out", text(&out)]].concat();
+    let out = folder("sweep");
+    let sweep = ["bench", "stability", "--quick", "--axes", "hidden", "--side", "24", "--steps", "1"];
+    let sweep = [&sweep[..], &["--out", text(&out)]].concat();
     let first = done(&sweep);
     // Two levels of five methods.
     assert!(first.contains("10 runs in"), "{first}");
     assert!(first.contains("every loss, gradient and pixel was finite"), "{first}");
-    for name in ["bench.jsonl", "stability.md", "stability-zju-mocap.svg", "stability-zju-mocap.png"] {
+    for name in ["bench.jsonl", "stability.md", "stability-demo.svg", "stability-demo.png"] {
         assert!(out.join(name).is_file(), "{name}");
         assert!(first.contains(text(&out.join(name))), "{first}");
     }
@@ -49,7 +41,7 @@ fn a_sweep_goes_on_where_it_was_cut_off() {
         let line: serde_json::Value = serde_json::from_str(line).unwrap();
         assert!(line["error"].is_null() && line["psnr_mask"].as_f64().unwrap() > 1.0, "{line}");
         assert!(line["peak_rss_bytes"].as_u64().is_some() && line["seconds_per_frame"].as_f64().unwrap() > 0.0);
-        assert_eq!(line["job"]["place"]["scene"]["load"]["files"]["resize"], 24, "{line}");
+        assert_eq!(line["job"]["place"]["made"]["demo"]["size"], 24, "{line}");
     }
     assert!(done(&sweep).contains("0 runs in"));
     std::fs::write(out.join("bench.jsonl"), &log[..log.len() - 200]).unwrap();
@@ -59,20 +51,6 @@ fn a_sweep_goes_on_where_it_was_cut_off() {
     let page = std::fs::read_to_string(out.join("report.html")).unwrap();
     self_contained(&page);
     assert!(page.contains("hidden") && page.contains("data:image/svg+xml;base64,"));
-}
-
-#[test]
-fn captures_are_made_hard_as_their_layout_allows() {
-    let folder = folder("hard-captures");
-    let (zju, prepared) = (tiny(&folder, "zju-mocap"), tiny(&folder, "humannerf"));
-    let out = folder.join("out");
-    // One frame of many: more runs of fewer frames than the sweep above.
-    let sweep = ["bench", "stability", text(&zju), "--quick", "--side", "24", "--steps", "1", "--out", text(&out)];
-    let said = done(&[&sweep[..], &["--axes", "one frame of"]].concat());
-    assert!(said.contains("10 runs in") && said.contains("every loss, gradient and pixel was finite"), "{said}");
-    let of_prepared = ["bench", "stability", text(&prepared), "--axes", "hidden", "--out", text(&out)];
-    refused(&of_prepared, &["hidden", "mask growth"]);
-    refused(&["bench", "stability", text(&folder), "--out", text(&out)], &["hard-captures"]);
 }
 
 #[test]

@@ -23,7 +23,6 @@ pub use self::outfit::Outfit;
 use self::motion::{Pose, TrackerError, track, walk};
 use self::person::Person;
 use self::texture::{Dress, albedo};
-use crate::film::noise::normal;
 use crate::film::render::{Lamp, Posture};
 use crate::film::stage::{Progress, Stage, ring};
 use crate::obstacle::Obstacle;
@@ -189,7 +188,7 @@ fn shapes(config: &DemoConfig, body: &BodyModel) -> (Vec<f32>, Vec<f32>) {
     let count = body.num_betas().min(BETAS);
     let mut stream = RandomStream::new(&[config.seed, 0x6265_7461]);
     let truth: Vec<f32> = (0..count).map(|_| 1.6 * stream.uniform() - 0.8).collect();
-    let guess = truth.iter().map(|b| b + config.beta_noise * normal(&mut stream)).collect();
+    let guess = truth.iter().map(|b| b + config.beta_noise * stream.normal()).collect();
     (truth, guess)
 }
 

@@ -6,7 +6,6 @@ use glam::{Quat, Vec3};
 use smpl::Placement;
 
 use super::landmarks::joint;
-use crate::film::noise::normal;
 use volrender::RandomStream;
 
 /// Turns of the person during the video: every side comes to face the camera, and some twice.
@@ -77,7 +76,7 @@ pub(crate) fn walk(frame: usize, frames: usize, pressed: f32) -> Pose {
 pub(crate) fn wander(stream: &mut RandomStream, frames: usize, rms: f32) -> Vec<Vec3> {
     let mut waves = Vec::new();
     for harmonic in 1..=HARMONICS {
-        let amplitude = Vec3::from_array([(); 3].map(|()| normal(stream)));
+        let amplitude = Vec3::from_array([(); 3].map(|()| stream.normal()));
         let phase = Vec3::from_array([(); 3].map(|()| TAU * stream.uniform()));
         waves.push((harmonic as f32, amplitude, phase));
     }

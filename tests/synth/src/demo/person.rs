@@ -3,7 +3,7 @@
 
 use std::collections::HashMap;
 
-use glam::{Affine3A, Mat3A, Vec3, Vec3A};
+use glam::Vec3;
 use smpl::{BodyModel, Posed, Shaped, SparseRows};
 
 use super::landmarks::Landmarks;
@@ -86,18 +86,8 @@ impl Person {
     /// Vertices of the clothed mesh under the bones of `posed`, the same body posed.
     pub fn posed(&self, posed: &Posed) -> Vec<Vec3> {
         let offset = |v: u32| posed.pose_offsets[v as usize];
-        self.clothed
-            .iter()
-            .enumerate()
-            .map(|(v, &clothed)| {
-                let bent = self.ends.get(v).map_or(Vec3::ZERO, |&[a, b]| offset(a).midpoint(offset(b)));
-                let mut blend = Affine3A { matrix3: Mat3A::ZERO, translation: Vec3A::ZERO };
-                for (joint, w) in self.weights.row(v) {
-                    blend.matrix3 += posed.bones[joint].matrix3 * w;
-                    blend.translation += posed.bones[joint].translation * w;
-                }
-                blend.transform_point3(clothed + bent)
-            })
-            .collect()
+        let bent = self.ends.iter().map(|&[a, b]| offset(a).midpoint(offset(b))).chain(std::iter::repeat(Vec3::ZERO));
+        let bent: Vec<Vec3> = self.clothed.iter().zip(bent).map(|(clothed, bent)| clothed + bent).collect();
+        smpl::skin(&bent, &self.weights, &posed.bones)
     }
 }

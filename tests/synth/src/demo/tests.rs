@@ -48,6 +48,7 @@ fn impossible_settings_are_named() {
         ("occluded_fraction", DemoConfig { occluded_fraction: 1.0, ..small() }),
         ("occluded_share", DemoConfig { occluded_share: -0.1, ..small() }),
         ("pressed", DemoConfig { pressed: f32::NAN, ..small() }),
+        ("lamp", DemoConfig { lamp: 1.5, ..small() }),
         ("pose_noise_degrees", DemoConfig { pose_noise_degrees: f32::NAN, ..small() }),
     ] {
         let message = demo(&config, body()).unwrap_err().to_string();

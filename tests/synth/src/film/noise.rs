@@ -2,8 +2,6 @@
 
 use glam::Vec3;
 
-use volrender::RandomStream;
-
 /// Hermite step from 0 at `from` to 1 at `to`, which may be the smaller one.
 pub(crate) fn smoothstep(from: f32, to: f32, x: f32) -> f32 {
     let t = ((x - from) / (to - from)).clamp(0.0, 1.0);
@@ -29,10 +27,4 @@ pub(crate) fn smooth_noise(p: Vec3) -> f32 {
     let mix = |a: f32, b: f32, t: f32| a + (b - a) * t;
     let along_x = |dy: i32, dz: i32| mix(lattice(x, y + dy, z + dz), lattice(x + 1, y + dy, z + dz), t.x);
     mix(mix(along_x(0, 0), along_x(1, 0), t.y), mix(along_x(0, 1), along_x(1, 1), t.y), t.z)
-}
-
-/// Standard normal (Box and Muller 1958).
-pub(crate) fn normal(stream: &mut RandomStream) -> f32 {
-    let radius = (-2.0 * (1.0 - stream.uniform()).ln()).sqrt();
-    radius * (std::f32::consts::TAU * stream.uniform()).cos()
 }

@@ -81,14 +81,9 @@ fn objects_move_where_they_are_told_and_cover_what_they_hide() {
 fn settings_that_cannot_be_are_named() {
     let behind = |obstacle| SynthConfig { occlusion: Occlusion::Rectangle(obstacle), ..small() };
     for (word, config) in [
-        ("size", SynthConfig { size: 8, ..small() }),
-        ("frames", SynthConfig { frames: 0, ..small() }),
-        ("lamp", SynthConfig { lamp: 1.5, ..small() }),
         ("lamp", SynthConfig { lamp: f32::NAN, ..small() }),
-        ("eval_every", SynthConfig { eval_every: 0, ..small() }),
         ("shape_noise", SynthConfig { shape_noise: f32::NAN, ..small() }),
         ("turns", SynthConfig { turns: f32::INFINITY, ..small() }),
-        ("pose_noise", SynthConfig { pose_noise_degrees: -1.0, ..small() }),
         (
             "occlusion.fraction",
             SynthConfig { occlusion: Occlusion::Objects { fraction: 1.0, position: 0.0 }, ..small() },

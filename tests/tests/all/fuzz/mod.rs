@@ -6,7 +6,6 @@
 //! one that fails is left in `target/tmp`.
 
 mod mutate;
-mod people;
 mod seeds;
 
 use std::hint::black_box;
@@ -27,7 +26,6 @@ use occnerf::{Config, Lpips, Person, Trainer, checkpoint_config};
 use rigged::{Character, load_mesh};
 use smpl::{BodyModel, MotionClip};
 use testkit::body::Random;
-use testkit::files::shared;
 
 /// Longest that a reader may take.
 const LONGEST: Duration = Duration::from_secs(1);
@@ -249,15 +247,12 @@ fn imports(fit: &Path, video: &Path) -> bool {
 
 #[test]
 fn fits_of_estimators() {
-    let video = people::video();
-    let phalp = Attack { most: 128 * MIB, ..attack("PHALP, COCO runs", Form::Plain, people::phalp(), 40) };
+    let video = seeds::video();
+    let phalp = Attack { most: 128 * MIB, ..attack("PHALP, COCO runs", Form::Plain, seeds::phalp(), 40) };
     phalp.at(&place("phalp.pkl"), |path| imports(path, &video));
-    for (seed, name) in people::sam3d().into_iter().zip(["SAM 3D Body JSON", "SAM 3D Body pickle"]) {
-        attack(name, Form::Plain, vec![seed], 10).at(&place("sam3d.dat"), |path| imports(path, &video));
-    }
     let dir = place("easymocap");
     std::fs::create_dir_all(dir.join("smpl")).unwrap();
-    let [frame, cameras] = people::easymocap();
+    let [frame, cameras] = seeds::easymocap();
     let lenses = |bytes: &[u8]| ["intri.yml", "extri.yml"].map(|name| std::fs::write(dir.join(name), bytes).unwrap());
     lenses(&cameras);
     let json = attack("EasyMocap JSON", Form::Plain, vec![frame.clone()], 10);
@@ -267,26 +262,15 @@ fn fits_of_estimators() {
         lenses(bytes);
         imports(&dir, &video)
     });
-    let Some(dir) = shared("estimators") else { return };
-    for (name, form) in [
-        ("wham/wham_output.pkl", Form::Plain),
-        ("prompthmr/results.pkl", Form::Plain),
-        ("gvhmr/hmr4d_results.pt", Form::Zip),
-        ("romp/video_results.npz", Form::Zip),
-    ] {
-        let (seed, path) = (std::fs::read(dir.join(name)).unwrap(), place(name.split('/').next_back().unwrap()));
-        let fit = Attack { most: 600 * MIB, ..attack(name, form, vec![seed], 5) };
-        fit.at(&path, |path| imports(path, &dir.join("frames")));
-    }
 }
 
 #[test]
 fn people_of_runs() {
     let run = place("run");
-    let (config, seed) = people::person(&run);
+    let (config, seed) = seeds::person(&run);
     let person = attack("person", Form::Safetensors, vec![seed], 20);
     person.at(&run.join("person.safetensors"), |_| Person::load(&run, &config).is_ok());
-    attack("avatar", Form::Safetensors, people::avatars(), 30).at(&place("avatar.safetensors"), |path| {
+    attack("avatar", Form::Safetensors, seeds::avatars(), 30).at(&place("avatar.safetensors"), |path| {
         let Ok(avatar) = Avatar::load(path) else { return false };
         if let Some(clip) = avatar.clips.first() {
             let (pose, _) = clip.motion.at(0.02, avatar.num_joints());

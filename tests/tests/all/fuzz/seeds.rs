@@ -5,10 +5,14 @@ use std::io::Cursor;
 use std::path::{Path, PathBuf};
 
 use array_files::{Data, NdArray, npz};
-use occnerf::capture::{LoadOptions, load_capture};
-use occnerf::{Config, Method, MotionKind, Preset, Scene, Trainer};
-use smpl::BodyModel;
+use glam::{Affine3A, Mat3, Vec2, Vec3};
+use occnerf::bake::{Atlas, Avatar, Clip, Joint};
+use occnerf::capture::{Light, LoadOptions, load_capture};
+use occnerf::{Config, Method, MotionKind, Person, Preset, PriorColors, Scene, Trainer};
+use smpl::{BodyModel, MotionClip, SparseRows};
+use synth::Py;
 use testkit::files::{arm, glb, npy_of, torch};
+use volrender::Camera;
 
 use super::place;
 use crate::common;
@@ -172,4 +176,99 @@ pub fn tensors(names: [&str; 2]) -> [Vec<u8>; 2] {
     let (each, storages) = ([(0, names[0]), (1, names[1])].map(tensor), [[0; 24], [63; 24]]);
     let storages = storages.map(|bytes: [u8; 24]| (bytes.to_vec(), 4));
     [false, true].map(|legacy| torch(&each, &storages, legacy))
+}
+
+/// Folder of two frames of 8 × 8 pixels, which fits belong to.
+pub fn video() -> PathBuf {
+    let dir = place("video");
+    std::fs::create_dir_all(&dir).unwrap();
+    for name in ["1.png", "2.png"] {
+        image::RgbImage::from_pixel(8, 8, image::Rgb([9; 3])).save(dir.join(name)).unwrap();
+    }
+    dir
+}
+
+/// PHALP's tracks, whose masks are COCO's run lengths: compressed, and as numbers.
+pub fn phalp() -> Vec<Vec<u8>> {
+    let turn = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0];
+    let smpl = Py::record([
+        ("global_orient", Py::Array(vec![1, 3, 3], turn.to_vec())),
+        ("body_pose", Py::Array(vec![23, 3, 3], turn.repeat(23))),
+        ("betas", Py::Array(vec![10], vec![0.1; 10])),
+    ]);
+    let number = |n: u8| Py::Raw(vec![b'K', n]);
+    let list = |items: &[Py]| Py::List(items.to_vec());
+    let frame = |counts: Py| {
+        let mask = Py::record([("size", list(&[number(8), number(8)])), ("counts", counts)]);
+        Py::record([
+            ("tid", list(&[number(1)])),
+            ("tracked_time", list(&[number(0)])),
+            ("size", list(&[list(&[number(8), number(8)])])),
+            ("smpl", list(std::slice::from_ref(&smpl))),
+            ("camera", list(&[Py::Array(vec![3], vec![0.1, 0.2, 9.0])])),
+            ("mask", list(&[list(&[mask])])),
+        ])
+    };
+    // 20 + 30 + 14 pixels: six bits a character, five of them the number's.
+    let compressed = Py::Raw(b"B\x05\0\0\0d0n0>".to_vec());
+    let plain = list(&[number(20), number(30), number(14)]);
+    [compressed, plain]
+        .map(|counts| Py::record([("1.png", frame(counts.clone())), ("2.png", frame(counts))]).pickle())
+        .into()
+}
+
+/// EasyMocap's file of a frame, and one of cameras that serves as both of them.
+pub fn easymocap() -> [Vec<u8>; 2] {
+    let row = |count: usize| vec![vec![0.125; count]];
+    let person = serde_json::json!([{ "id": 0, "Rh": row(3), "Th": row(3), "poses": row(72), "shapes": row(10) }]);
+    let matrix = |name: &str, rows: usize, data: &str| {
+        format!("{name}: !!opencv-matrix\n  rows: {rows}\n  cols: {rows}\n  dt: d\n  data: [ {data} ]\n")
+    };
+    let cameras =
+        ["%YAML:1.0\n---\nnames:\n  - \"1\"\n".to_owned(), matrix("K_1", 3, "9., 0., 4., 0., 9.,\n   4., 0, 0, 1")]
+            .concat()
+            + "H_1: 8\nW_1: 8\n"
+            + &matrix("dist_1", 1, "0, 0, 0, 0, 0")
+            + &matrix("R_1", 3, "0.1, 0.2, 0.3")
+            + &matrix("T_1", 3, "0, 0, 5e0");
+    [person.to_string().into_bytes(), cameras.into_bytes()]
+}
+
+/// What a run keeps of a person of four vertices: its settings, and `person.safetensors` beside
+/// `body.safetensors` in the folder `run`.
+pub fn person(run: &Path) -> (Config, Vec<u8>) {
+    let (dir, body, _) = wild_capture(&place("person-wild"));
+    let capture = load_capture(&dir, &body, &LoadOptions::default()).unwrap();
+    let colors = PriorColors::of_vertices(vec![Vec3::splat(0.5); 4], &body.faces);
+    std::fs::create_dir_all(run).unwrap();
+    Person::save(run, &capture.into(), &body, &colors).unwrap();
+    (Config::preset(Preset::Fast, Method::HashPoint), std::fs::read(run.join("person.safetensors")).unwrap())
+}
+
+/// A baked person of four vertices, two joints and two frames.
+pub fn avatars() -> Vec<Vec<u8>> {
+    let intrinsics = Mat3::from_cols(Vec3::X * 9.0, Vec3::Y * 9.0, Vec3::new(4.0, 4.0, 1.0));
+    let camera = Camera::new(intrinsics, Affine3A::from_translation(Vec3::Z * 5.0), 8, 8).unwrap();
+    let joint = |name: &str, parent, rest| Joint { name: name.to_owned(), parent, rest };
+    let motion = MotionClip { num_joints: 2, fps: 30.0, poses: vec![Vec3::splat(0.1); 4], trans: vec![Vec3::Y; 2] };
+    let avatar = Avatar {
+        name: "tiny".to_owned(),
+        source: String::new(),
+        vertices: (0..4).map(|i| Vec3::new((i & 1) as f32, (i >> 1) as f32, 0.0)).collect(),
+        normals: vec![Vec3::Z; 4],
+        uvs: (0..4).map(|i| Vec2::new((i & 1) as f32, (i >> 1) as f32)).collect(),
+        faces: vec![[0, 1, 2], [1, 3, 2]],
+        joints: vec![[0, 1, 0, 0]; 4],
+        weights: vec![[0.5, 0.5, 0.0, 0.0]; 4],
+        posedirs: SparseRows::from_rows((0..4).map(|i| vec![(i as u32, Vec3::splat(0.02))])),
+        atlas: Atlas { width: 2, height: 2, rgb: vec![200; 12], confidence: vec![255; 4] },
+        skeleton: vec![joint("root", None, Vec3::ZERO), joint("knee", Some(0), Vec3::Y)],
+        betas: vec![0.5],
+        clips: vec![Clip { name: "video".to_owned(), motion }],
+        cameras: vec![camera; 2],
+        light: Light { slope: 0.2 * Vec3::Z },
+    };
+    let path = place("seed-avatar.safetensors");
+    avatar.save(&path).unwrap();
+    vec![std::fs::read(path).unwrap()]
 }
