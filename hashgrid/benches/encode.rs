@@ -1,6 +1,5 @@
-//! Encoding with the paper's sizes (D 4, L 16, F 2, T 2^19), forward and backward, against the
-//! definition. Uniform points share few corners; points near a surface share more, as in a trained
-//! scene. `cargo bench -p hashgrid`: times are per call of [`POINTS`] points; items/s are points.
+//! Encoding with the paper's sizes (D 4, L 16, F 2, T 2^19), forward and backward. Uniform
+//! points share few corners; points near a surface share more, as in a trained scene. `cargo bench -p hashgrid`: times are per call of [`POINTS`] points; items/s are points.
 
 use divan::counter::ItemsCount;
 use divan::{Bencher, black_box};
@@ -90,45 +89,4 @@ fn encode_backward_points(bencher: Bencher<'_, '_>, kind: Points) {
             },
         );
     });
-}
-
-/// The encoding by its definition, point by point.
-#[divan::bench(args = [Points::Uniform, Points::Surface])]
-fn encode_plain(bencher: Bencher<'_, '_>, kind: Points) {
-    let Case { grid, table, points, .. } = case(kind);
-    let width = grid.num_features();
-    let mut features = vec![0.0; POINTS * width];
-    bencher.counter(ItemsCount::new(POINTS)).bench_local(|| {
-        points
-            .par_iter()
-            .zip(features.par_chunks_mut(width))
-            .with_min_len(TASK)
-            .for_each(|(point, features)| plain(&grid, black_box(&table), point, features));
-    });
-}
-
-fn plain(grid: &HashGrid<4>, table: &[f32], point: &[f32; 4], features: &mut [f32]) {
-    const PRIMES: [u32; 4] = [1, 2_654_435_761, 805_459_861, 3_674_653_429];
-    for (l, &n) in grid.resolutions().iter().enumerate() {
-        let table = &table[grid.level_range(l)];
-        let dense = (u64::from(n) + 1).pow(4) <= 1 << CONFIG.log2_table_size;
-        let cell = point.map(|x| ((x * n as f32) as u32).min(n - 1));
-        let mut sum = [0.0; 2];
-        for corner in 0..16 {
-            let (mut row, mut hash, mut stride, mut weight) = (0, 0, 1, 1.0);
-            for j in 0..4 {
-                let up = corner >> j & 1;
-                let fraction = point[j] * n as f32 - cell[j] as f32;
-                weight *= if up == 1 { fraction } else { 1.0 - fraction };
-                row += (cell[j] + up) * stride;
-                stride = stride.wrapping_mul(n + 1);
-                hash ^= (cell[j] + up).wrapping_mul(PRIMES[j]);
-            }
-            let row = if dense { row as usize } else { hash as usize % (table.len() / 2) };
-            for f in 0..2 {
-                sum[f] += weight * table[row * 2 + f];
-            }
-        }
-        features[l * 2..l * 2 + 2].copy_from_slice(&sum);
-    }
 }

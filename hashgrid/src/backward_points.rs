@@ -1,5 +1,4 @@
 use crate::corners::{BLOCK, Corners, MAX_CORNERS, for_widths, interpolate_with_gradient, row};
-use crate::encode::CHUNK;
 use crate::grid::{HashGrid, Level};
 use crate::simd::{Kernel, arch};
 
@@ -24,7 +23,7 @@ impl<const D: usize> HashGrid<D> {
         self.assert_features("d_features", d_features, points.len());
         assert_eq!(d_points.len(), points.len(), "d_points has {} points, expected {}", d_points.len(), points.len());
         let arch = arch();
-        for pass in self.passes(points.len(), CHUNK) {
+        for pass in self.passes(points.len()) {
             let (points, d_points) = (&points[pass.points.clone()], &mut d_points[pass.points]);
             let (level, table, d_features) = (pass.level, &table[pass.table], &d_features[pass.features]);
             arch.dispatch(Kernel(
@@ -47,7 +46,7 @@ fn level_backward_points<const D: usize, const W: usize>(
 ) {
     let n = level.resolution as f32;
     let mut corners = Corners::new();
-    let mut dots = [[[0.0f32]; BLOCK]; MAX_CORNERS];
+    let mut dots = [[0.0f32; BLOCK]; MAX_CORNERS];
     let blocks = points.chunks(BLOCK).zip(d_features.chunks(BLOCK * stride)).zip(d_points.chunks_mut(BLOCK));
     for ((points, d_features), d_points) in blocks {
         corners.fill(level, points);
@@ -59,12 +58,12 @@ fn level_backward_points<const D: usize, const W: usize>(
                 for f in 0..W {
                     dot += values[f] * d_sum[f];
                 }
-                dots[k][b] = [dot];
+                dots[k][b] = dot;
             }
         }
-        let gradient = interpolate_with_gradient::<D, 1>(&mut dots, &corners.fraction);
+        let gradient = interpolate_with_gradient::<D>(&mut dots, &corners.fraction);
         for j in 0..D {
-            for ((point, d_point), [partial]) in points.iter().zip(&mut *d_points).zip(gradient[j]) {
+            for ((point, d_point), partial) in points.iter().zip(&mut *d_points).zip(gradient[j]) {
                 if (0.0..=1.0).contains(&point[j]) {
                     d_point[j] += n * partial;
                 }

@@ -10,8 +10,6 @@ const PRIMES: [u32; 4] = [1, 2_654_435_761, 805_459_861, 3_674_653_429];
 
 /// One value for every point of a block.
 pub(crate) type Lanes<T> = [T; BLOCK];
-/// Features at the corners of a block's points, corner by corner.
-pub(crate) type Values<const W: usize> = [Lanes<[f32; W]>; MAX_CORNERS];
 
 /// Corner k lies at c_j + 1 where bit j of k is set, at c_j where it is not.
 pub(crate) struct Corners {
@@ -107,65 +105,33 @@ impl Corners {
         }
         weight
     }
-
-    /// Loads the features of all corners up front, which overlaps more cache misses than loading
-    /// each where it is used.
-    #[inline(always)]
-    pub fn gather<const D: usize, const W: usize>(
-        &self,
-        table: &[f32],
-        stride: usize,
-        offset: usize,
-        values: &mut Values<W>,
-    ) {
-        for k in 0..1 << D {
-            for b in 0..BLOCK {
-                values[k][b] = *row::<W>(table, stride, offset, self.row[k][b]);
-            }
-        }
-    }
-}
-
-/// Repeats the value of each point for its W features.
-#[inline(always)]
-pub(crate) fn broadcast<const W: usize>(lanes: &Lanes<f32>) -> Lanes<[f32; W]> {
-    let mut wide = [[0.0; W]; BLOCK];
-    for b in 0..BLOCK {
-        wide[b] = [lanes[b]; W];
-    }
-    wide
 }
 
 /// d-linear interpolation of the corners' `values` into `values[0]`; returns its derivatives along
 /// the axes in units of 1/cell.
 #[inline(always)]
-pub(crate) fn interpolate_with_gradient<const D: usize, const W: usize>(
-    values: &mut Values<W>,
+pub(crate) fn interpolate_with_gradient<const D: usize>(
+    values: &mut [Lanes<f32>; MAX_CORNERS],
     fraction: &[Lanes<f32>; 4],
-) -> [Lanes<[f32; W]>; D] {
-    let mut gradient = [[[[0.0f32; W]; BLOCK]; MAX_CORNERS / 2]; D];
+) -> [Lanes<f32>; D] {
+    let mut gradient = [[[0.0f32; BLOCK]; MAX_CORNERS / 2]; D];
     for axis in (0..D).rev() {
-        let half = 1 << axis;
-        let t = broadcast::<W>(&fraction[axis]);
-        let t = t.as_flattened();
+        let (half, t) = (1 << axis, &fraction[axis]);
         // Derivatives along the axes done before are interpolated along this one.
         for partial in &mut gradient[axis + 1..] {
             let (low, high) = partial.split_at_mut(half);
             for k in 0..half {
-                let (low, high) = (low[k].as_flattened_mut(), high[k].as_flattened());
-                for i in 0..BLOCK * W {
-                    low[i] += t[i] * (high[i] - low[i]);
+                for b in 0..BLOCK {
+                    low[k][b] += t[b] * (high[k][b] - low[k][b]);
                 }
             }
         }
         let (low, high) = values.split_at_mut(half);
         for k in 0..half {
-            let (low, high) = (low[k].as_flattened_mut(), high[k].as_flattened());
-            let partial = gradient[axis][k].as_flattened_mut();
-            for i in 0..BLOCK * W {
-                let difference = high[i] - low[i];
-                partial[i] = difference;
-                low[i] += t[i] * difference;
+            for b in 0..BLOCK {
+                let difference = high[k][b] - low[k][b];
+                gradient[axis][k][b] = difference;
+                low[k][b] += t[b] * difference;
             }
         }
     }

@@ -1,10 +1,6 @@
-use crate::corners::{BLOCK, Corners, MAX_CORNERS, broadcast, for_widths};
+use crate::corners::{BLOCK, Corners, MAX_CORNERS, for_widths, row};
 use crate::grid::{HashGrid, Level};
 use crate::simd::{Kernel, arch};
-
-/// Points encoded at one level before the next level starts: enough to amortise loading the level's
-/// table into the cache, few enough for their coordinates to stay there from level to level.
-pub(crate) const CHUNK: usize = 1 << 15;
 
 impl<const D: usize> HashGrid<D> {
     /// Encodes `points` (Q, D) with `table` ([`HashGrid::num_parameters`]) into `features` (L, Q,
@@ -20,7 +16,7 @@ impl<const D: usize> HashGrid<D> {
         self.assert_table("table", table);
         self.assert_features("features", features, points.len());
         let arch = arch();
-        for pass in self.passes(points.len(), CHUNK) {
+        for pass in self.passes(points.len()) {
             let (table, points, features) = (&table[pass.table], &points[pass.points], &mut features[pass.features]);
             arch.dispatch(Kernel(
                 #[inline(always)]
@@ -44,12 +40,20 @@ fn encode_level<const D: usize, const W: usize>(
     let blocks = points.chunks(BLOCK).zip(features.chunks_mut(BLOCK * stride));
     for (points, features) in blocks {
         corners.fill(level, points);
-        corners.gather::<D, W>(table, stride, offset, &mut values);
+        // Loaded up front, which overlaps more cache misses than loading each where it is used.
+        for k in 0..1 << D {
+            for b in 0..BLOCK {
+                values[k][b] = *row::<W>(table, stride, offset, corners.row[k][b]);
+            }
+        }
         let weight = corners.weights::<D>();
         let mut sum = [[0.0f32; W]; BLOCK];
         for k in 0..1 << D {
-            let weight = broadcast::<W>(&weight[k]);
-            let terms = weight.as_flattened().iter().zip(values[k].as_flattened());
+            let mut wide = [[0.0; W]; BLOCK];
+            for b in 0..BLOCK {
+                wide[b] = [weight[k][b]; W];
+            }
+            let terms = wide.as_flattened().iter().zip(values[k].as_flattened());
             for (sum, (weight, value)) in sum.as_flattened_mut().iter_mut().zip(terms) {
                 *sum += weight * value;
             }

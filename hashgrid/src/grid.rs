@@ -5,6 +5,10 @@ use rayon::prelude::*;
 use crate::config::{Error, HashGridConfig, check_settings, check_size};
 use crate::layout::Layout;
 
+/// Points encoded at one level before the next level starts: enough to amortise loading the level's
+/// table into the cache, few enough for their coordinates to stay there from level to level.
+const CHUNK: usize = 1 << 15;
+
 /// A multiresolution hash encoding of D-dimensional points, D = 2, 3 or 4 (others do not compile).
 ///
 /// Holds the shape only; the table of parameters belongs to the caller, so that optimisers and
@@ -132,9 +136,9 @@ impl<const D: usize> HashGrid<D> {
         assert_eq!(found, expected, "{what} has {found} numbers, expected num_parameters() = {expected}");
     }
 
-    /// Passes over the features of `points` points: all levels of `chunk` points, then of the next.
-    pub(crate) fn passes(&self, points: usize, chunk: usize) -> impl Iterator<Item = Pass<'_>> {
-        let chunks = (0..points).step_by(chunk).map(move |first| first..points.min(first + chunk));
+    /// Passes over the features of `points` points: all levels of a chunk, then of the next.
+    pub(crate) fn passes(&self, points: usize) -> impl Iterator<Item = Pass<'_>> {
+        let chunks = (0..points).step_by(CHUNK).map(move |first| first..points.min(first + CHUNK));
         chunks.flat_map(move |range| {
             self.levels.iter().enumerate().map(move |(l, level)| {
                 let first = l * points;

@@ -9,8 +9,8 @@ use divan::counter::ItemsCount;
 use glam::Vec3;
 use kiddo::{ImmutableKdTree, SquaredEuclidean};
 use surface_query::{MeshDistance, Pyramid, SurfaceQuery, SurfaceQueryConfig};
+use testkit::TriMesh;
 use testkit::body::Random;
-use testkit::{TriMesh, oracle};
 
 /// A grid for a body in metres.
 const GRID: SurfaceQueryConfig = SurfaceQueryConfig { k: 5, coarse_levels: 3, ratio: 0.25, cell: 0.02, margin: 0.12 };
@@ -40,48 +40,21 @@ fn neighbours_and_blend_grid(bencher: Bencher<'_, '_>) {
     });
 }
 
-/// Points of the four levels, for the plain searches below.
-fn level_points(mesh: &TriMesh) -> Vec<Vec<[f32; 3]>> {
-    let pyramid = Pyramid::new(&mesh.vertices, 0.25, 3);
-    (pyramid.levels.iter()).map(|ids| ids.iter().map(|&i| mesh.vertices[i as usize].to_array()).collect()).collect()
-}
-
 /// The 20 neighbours alone, from four trees of plain kiddo (ties as they fall).
 #[divan::bench]
 fn neighbours_plain_kiddo(bencher: Bencher<'_, '_>) {
     let mesh = testkit::body::body_or_ball();
-    let trees: Vec<ImmutableKdTree<f32, 3>> =
-        level_points(&mesh).iter().map(|points| ImmutableKdTree::new_from_slice(points).unwrap()).collect();
+    let tree = |level: &Vec<u32>| {
+        let points: Vec<[f32; 3]> = level.iter().map(|&i| mesh.vertices[i as usize].to_array()).collect();
+        ImmutableKdTree::new_from_slice(&points).unwrap()
+    };
+    let trees: Vec<ImmutableKdTree<f32, 3>> = Pyramid::new(&mesh.vertices, 0.25, 3).levels.iter().map(tree).collect();
     let points = near(&mesh);
     let k = NonZero::new(5).unwrap();
     bencher.counter(ItemsCount::new(points.len())).bench_local(|| {
         for p in &points {
             for tree in &trees {
                 black_box(tree.query(&p.to_array()).nearest_n::<SquaredEuclidean<f32>>(k).execute());
-            }
-        }
-    });
-}
-
-/// The 20 neighbours alone, by looking at every vertex.
-#[divan::bench(sample_count = 10)]
-fn neighbours_brute_force(bencher: Bencher<'_, '_>) {
-    let mesh = testkit::body::body_or_ball();
-    let levels = level_points(&mesh);
-    let points = &near(&mesh)[..500];
-    bencher.counter(ItemsCount::new(points.len())).bench_local(|| {
-        for p in points {
-            for level in &levels {
-                let mut best = [(f32::INFINITY, 0); 5];
-                for (i, v) in (0u32..).zip(level) {
-                    let d = Vec3::from(*v).distance_squared(*p);
-                    if d < best[4].0 {
-                        let at = best.partition_point(|b| b.0 <= d);
-                        best.copy_within(at..4, at + 1);
-                        best[at] = (d, i);
-                    }
-                }
-                black_box(best);
             }
         }
     });
@@ -96,18 +69,6 @@ fn mesh_distance(bencher: Bencher<'_, '_>, reach: u32) {
     bencher.counter(ItemsCount::new(points.len())).bench_local(|| {
         for &p in &points {
             black_box(distance.closest_within(p, reach as f32 * 0.01));
-        }
-    });
-}
-
-/// Exact closest point by looking at every face.
-#[divan::bench(sample_count = 5)]
-fn mesh_distance_brute_force(bencher: Bencher<'_, '_>) {
-    let mesh = testkit::body::body_or_ball();
-    let points = &near(&mesh)[..50];
-    bencher.counter(ItemsCount::new(points.len())).bench_local(|| {
-        for &p in points {
-            black_box(oracle::closest_point(&mesh.vertices, &mesh.faces, p));
         }
     });
 }

@@ -4,7 +4,7 @@ use glam::{DVec3, Vec3, Vec4};
 
 use crate::Error;
 use crate::error::check_mesh;
-use crate::pseudonormal::Pseudonormals;
+use crate::normals::Pseudonormals;
 use crate::search::Search;
 use crate::tree::{Child, STACK, Tree, WIDTH};
 use crate::triangle::{Foot, Pack, closest_on_triangle};

@@ -8,9 +8,6 @@ use crate::simd::Kernel;
 /// Samples per block of SIMD exponentials.
 pub(crate) const BLOCK: usize = 32;
 
-/// Alphas compared at once.
-const LANES: usize = 8;
-
 /// The samples of one ray, nearest first. All slices are (S).
 ///
 /// ```
@@ -137,12 +134,12 @@ fn forward(samples: RaySamples<'_>, background: Vec3, weights: &mut [f32]) -> Co
         for (alpha, ((&sigma, &likelihood), &delta)) in alpha.iter_mut().zip(inputs) {
             *alpha = likelihood * one_minus_exp(optical_depth(sigma, delta)).0;
         }
-        if let Some(i) = first_largest(alpha, &mut largest) {
-            termination = Some((block * BLOCK + i) as u32);
-        }
         // Sequential sums: omitting samples with α = 0 changes no bit.
         let outputs = weights.iter_mut().zip(t).zip(rgb);
-        for (&alpha, ((weight, &t), &rgb)) in alpha.iter().zip(outputs) {
+        for (i, (&alpha, ((weight, &t), &rgb))) in alpha.iter().zip(outputs).enumerate() {
+            if alpha > largest {
+                (largest, termination) = (alpha, Some((block * BLOCK + i) as u32));
+            }
             *weight = transmittance * alpha;
             transmittance *= 1.0 - alpha;
             sum += *weight * rgb.extend(t);
@@ -153,24 +150,6 @@ fn forward(samples: RaySamples<'_>, background: Vec3, weights: &mut [f32]) -> Co
     // The sum of weights may exceed 1 by rounding.
     let opacity = if opacity > 1.0 { 1.0 } else { opacity };
     Composite { color: sum.truncate() + (1.0 - opacity) * background, opacity, depth: sum.w, termination }
-}
-
-/// Lowest index of the maximum of `alpha` (at most [`BLOCK`]) if that exceeds `largest`, which it
-/// then replaces; else `None`. NaN is ignored.
-#[inline(always)]
-fn first_largest(alpha: &[f32], largest: &mut f32) -> Option<usize> {
-    let mut lanes = [0.0f32; LANES];
-    for alpha in alpha.chunks(LANES) {
-        for (lane, &alpha) in lanes.iter_mut().zip(alpha) {
-            *lane = if alpha > *lane { alpha } else { *lane };
-        }
-    }
-    let most = lanes.iter().fold(0.0, |most, &lane| if lane > most { lane } else { most });
-    if most <= *largest {
-        return None;
-    }
-    *largest = most;
-    alpha.iter().position(|&alpha| alpha == most)
 }
 
 /// Transmittance after a block, denormal numbers flushed to 0: they are slow and change no pixel.

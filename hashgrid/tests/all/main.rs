@@ -1,5 +1,7 @@
-//! Encoding and gradients against references.
+//! Encoding and gradients against references, in one binary because compiling the kernels dominates.
 #![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
 
+mod common;
 mod config;
-mod kernels;
+mod encode;
+mod gradients;

@@ -344,27 +344,3 @@ fn a_tree_of_equal_faces_is_built_in_no_time() {
     MeshDistance::new(&grid.vertices, &grid.faces).unwrap();
     assert!(begun.elapsed().as_secs_f32() < 2.0, "{:?}", begun.elapsed());
 }
-
-#[test]
-fn a_cube_is_measured_exactly() {
-    let cube = mesh::cuboid(Vec3::ONE);
-    let distance = build(&cube);
-    for (q, expected) in [
-        (Vec3::new(0.25, 3.0, -0.5), 2.0),
-        (Vec3::new(0.25, 0.5, -0.5), -0.5),
-        (Vec3::new(4.0, 5.0, 0.5), 5.0),
-        (Vec3::new(3.0, 3.0, -2.0), 3.0),
-        (Vec3::ZERO, -1.0),
-        (Vec3::X, 0.0),
-        (Vec3::ONE, 0.0),
-    ] {
-        assert_eq!(distance.closest(q).signed_distance, expected, "{q}");
-    }
-}
-
-#[test]
-fn meshes_without_faces_or_with_indices_out_of_range_are_errors() {
-    assert_eq!(MeshDistance::new(&[Vec3::ZERO], &[]).unwrap_err().to_string(), "no faces");
-    let out_of_range = MeshDistance::new(&[Vec3::ZERO], &[[0, 1, 0]]).unwrap_err();
-    assert_eq!(out_of_range.to_string(), "face 0 has vertex index 1, but there are only 1 vertices");
-}

@@ -2,7 +2,7 @@
 
 use glam::Vec3;
 use proptest::prelude::*;
-use surface_query::{Pyramid, SurfaceQuery, SurfaceQueryConfig, vertex_normals};
+use surface_query::{SurfaceQuery, SurfaceQueryConfig, vertex_normals};
 use testkit::body::Random;
 use testkit::{mesh, strategy};
 
@@ -181,27 +181,4 @@ fn vertex_normals_weigh_faces_by_angle() {
     }
     let lonely = vertex_normals(&[Vec3::ZERO, Vec3::X, Vec3::X * 2.0], &[[0, 1, 2], [0, 0, 0]]);
     assert_eq!(lonely, [Vec3::Y; 3]);
-}
-
-#[test]
-fn levels_of_a_body_have_the_sizes_of_the_paper() {
-    let sizes = |n: usize| {
-        let points: Vec<Vec3> = (0..n).map(|i| Vec3::X * i as f32).collect();
-        Pyramid::new(&points, 0.25, 3).levels.iter().map(Vec::len).collect::<Vec<_>>()
-    };
-    assert_eq!(sizes(6890), [6890, 1722, 430, 107]);
-    assert_eq!(sizes(3), [3, 1, 1, 1]);
-    assert_eq!(sizes(0), [0, 0, 0, 0]);
-}
-
-#[test]
-fn a_level_of_fewer_than_k_points_repeats_its_list() {
-    let points = [Vec3::ZERO, Vec3::X, Vec3::X * 3.0];
-    for cell in [0.0, 0.5] {
-        let query = SurfaceQuery::new(&points, &[], &config(5, cell, 1.0)).unwrap();
-        let mut out = [9; 20];
-        query.neighbours(Vec3::X * 0.9, &mut out);
-        assert_eq!(out[..5], [1, 0, 2, 1, 0]);
-        assert_eq!(out[5..], [0; 15], "coarse levels hold vertex 0 alone");
-    }
 }

@@ -61,8 +61,13 @@ fn sampling_degenerate_clouds_gives_distinct_indices_and_takes_bad_points_last()
 }
 
 #[test]
-fn ratios_that_f32_rounds_down_give_the_decimal_size() {
-    let points: Vec<Vec3> = (0..10).map(|i| Vec3::X * i as f32).collect();
-    let size = |ratio| Pyramid::new(&points, ratio, 1).levels[1].len();
+fn ratios_that_f32_rounds_down_give_the_decimal_size_and_a_body_the_levels_of_the_paper() {
+    let sizes = |n: usize, ratio| {
+        let points: Vec<Vec3> = (0..n).map(|i| Vec3::X * i as f32).collect();
+        Pyramid::new(&points, ratio, 3).levels.iter().map(Vec::len).collect::<Vec<_>>()
+    };
+    let size = |ratio| sizes(10, ratio)[1];
     assert_eq!([0.7, 0.3, 0.1, 1.0, 0.0, 7.0, f32::NAN].map(size), [7, 3, 1, 10, 1, 10, 10]);
+    assert_eq!(sizes(6890, 0.25), [6890, 1722, 430, 107]);
+    assert_eq!((sizes(3, 0.25), sizes(0, 0.25)), (vec![3, 1, 1, 1], vec![0; 4]));
 }

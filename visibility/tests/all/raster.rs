@@ -6,26 +6,12 @@ use testkit::body::Random;
 use testkit::{TriMesh, mesh, strategy};
 use visibility::{Fragment, Pixel, RasterOptions, Rasterizer, RayMesh, Samples, View};
 
+use crate::views::{look, turned};
+
 const OPTIONS: RasterOptions = RasterOptions { samples: Samples::One, cull_back: false, near: 1e-4 };
 
 fn camera(rotation: Quat, eye: Vec3, focal: f32, size: u32) -> View {
-    let rotation = Mat3::from_quat(rotation);
-    let centre = size as f32 / 2.0;
-    View {
-        focal: Vec2::splat(focal),
-        centre: Vec2::splat(centre),
-        world_to_camera: Affine3A::from_mat3_translation(rotation, rotation * -eye),
-        width: size,
-        height: size,
-    }
-}
-
-/// From `eye` towards the origin.
-fn towards_origin(eye: Vec3, focal: f32, size: u32) -> View {
-    let forward = -eye.normalize_or(Vec3::Z);
-    let down = forward.any_orthonormal_vector();
-    let rotation = Mat3::from_cols(down.cross(forward), down, forward).transpose();
-    camera(Quat::from_mat3(&rotation), eye, focal, size)
+    turned(Mat3::from_quat(rotation), eye, focal, size)
 }
 
 fn draw(mesh: &TriMesh, view: &View) -> Vec<Option<Fragment>> {
@@ -150,7 +136,7 @@ proptest! {
     fn a_pixel_sees_the_face_that_a_ray_through_its_centre_meets_first(
         mesh in strategy::bumpy_sphere(), away in strategy::unit_vec3(), r in 1.6f32..6.0, focal in 20.0f32..300.0,
     ) {
-        let hits = check_against_rays(&mesh, &towards_origin(away * r, focal, 70))?;
+        let hits = check_against_rays(&mesh, &look(away * r, Vec3::ZERO, focal, 70))?;
         prop_assert!(hits > 0);
     }
 
@@ -194,7 +180,7 @@ proptest! {
     fn the_inside_of_a_closed_mesh_is_hidden_from_outside(
         mesh in strategy::bumpy_sphere(), away in strategy::unit_vec3(), r in 1.6f32..6.0,
     ) {
-        let view = towards_origin(away * r, 60.0, 80);
+        let view = look(away * r, Vec3::ZERO, 60.0, 80);
         let both = draw(&mesh, &view);
         let options = RasterOptions { cull_back: true, ..OPTIONS };
         let front = Rasterizer::default().faces(&mesh.vertices, &mesh.faces, &view, &options).unwrap();
@@ -207,24 +193,10 @@ proptest! {
     }
 
     #[test]
-    fn a_fan_about_a_point_has_every_pixel_once(seed: u64, on_centre: bool, spokes in 4u32..40) {
-        let mut random = Random(seed);
-        let middle = if on_centre { Vec3::new(20.5, 20.5, 1.0) } else { random.vec3(4.0).with_z(0.0) + Vec3::new(20.0, 20.0, 1.0) };
-        let rim = (0..spokes).map(|i| {
-            let angle = (i as f32 + random.unit() * 0.8) / spokes as f32 * std::f32::consts::TAU;
-            middle + Vec3::new(angle.cos(), angle.sin(), 0.0) * 1000.0
-        });
-        let vertices = std::iter::once(middle).chain(rim).collect();
-        let faces = (0..spokes).map(|i| [0, i + 1, (i + 1) % spokes + 1]).collect();
-        let counts = claims(&TriMesh { vertices, faces }, &flat_view(40));
-        prop_assert!(counts.iter().all(|&c| c == 1), "{:?}", counts);
-    }
-
-    #[test]
     fn the_picture_does_not_depend_on_the_number_of_threads(
         mesh in strategy::bumpy_sphere(), away in strategy::unit_vec3(),
     ) {
-        let view = towards_origin(away * 2.0, 60.0, 90);
+        let view = look(away * 2.0, Vec3::ZERO, 60.0, 90);
         let [one, many] = [1, 3].map(|threads| {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
             pool.install(|| draw(&mesh, &view))
@@ -245,8 +217,8 @@ fn all_samples(mesh: &TriMesh, view: &View, samples: Samples) -> Vec<Vec<Option<
 #[test]
 fn four_samples_are_the_pixels_of_a_picture_twice_as_large() {
     let ball = mesh::icosphere(2);
-    let view = towards_origin(Vec3::new(1.0, 2.0, 0.5), 40.0, 37);
-    let large = draw(&ball, &towards_origin(Vec3::new(1.0, 2.0, 0.5), 80.0, 74));
+    let view = look(Vec3::new(1.0, 2.0, 0.5), Vec3::ZERO, 40.0, 37);
+    let large = draw(&ball, &look(Vec3::new(1.0, 2.0, 0.5), Vec3::ZERO, 80.0, 74));
     for (i, samples) in all_samples(&ball, &view, Samples::Four).iter().enumerate() {
         let (x, y) = (i % 37 * 2, i / 37 * 2);
         let expected = [(x, y), (x + 1, y), (x, y + 1), (x + 1, y + 1)].map(|(x, y)| large[y * 74 + x]);
@@ -258,12 +230,14 @@ fn four_samples_are_the_pixels_of_a_picture_twice_as_large() {
 }
 
 #[test]
-fn a_plane_is_drawn_to_the_horizon_however_large_it_is() {
+fn a_plane_is_drawn_to_the_horizon_and_a_wall_fills_the_picture_however_large_they_are() {
     // Level, 1 above the ground: row v looks at depth focal / (v + ½ − cy).
     let view = camera(Quat::IDENTITY, Vec3::ZERO, 50.0, 100);
     for extent in [1e3f32, 1e6, 1e12] {
         let at = |x: f32, z: f32| Vec3::new(x * extent, 1.0, z * extent);
         let ground = TriMesh { vertices: vec![at(-1.0, -1.0), at(1.0, -1.0), at(0.0, 1.0)], faces: vec![[0, 1, 2]] };
+        let wall = ground.clone().map(|p| Vec3::new(p.x, p.z, 7.0));
+        assert!(draw(&wall, &view).iter().all(|f| f.is_some_and(|f| (f.depth - 7.0).abs() < 1e-4)), "{extent}");
         for (i, fragment) in draw(&ground, &view).iter().enumerate() {
             let (x, row) = (i % 100, i / 100);
             if row >= 51 {
@@ -348,14 +322,4 @@ fn indices_out_of_range_and_large_images_are_errors() {
 #[should_panic(expected = "3 values for 4 × 4 pixels")]
 fn an_output_of_another_size_panics() {
     let _ = Rasterizer::default().draw(&[], &[], &flat_view(4), &OPTIONS, &mut [0; 3], |_| 0);
-}
-
-#[test]
-fn a_wall_fills_the_picture_however_large_it_is() {
-    let view = camera(Quat::IDENTITY, Vec3::ZERO, 50.0, 40);
-    for extent in [1e3f32, 1e6, 1e12] {
-        let at = |x: f32, y: f32| Vec3::new(x * extent, y * extent, 7.0);
-        let wall = TriMesh { vertices: vec![at(-1.0, -1.0), at(1.0, -1.0), at(0.0, 1.0)], faces: vec![[0, 1, 2]] };
-        assert!(draw(&wall, &view).iter().all(|f| f.is_some_and(|f| (f.depth - 7.0).abs() < 1e-4)), "{extent}");
-    }
 }

@@ -6,11 +6,14 @@ use testkit::{TriMesh, mesh, oracle, strategy};
 use visibility::{RayMesh, View, visible_vertices};
 
 /// A camera at `eye` that looks at `target`.
-fn look(eye: Vec3, target: Vec3, focal: f32, size: u32) -> View {
+pub fn look(eye: Vec3, target: Vec3, focal: f32, size: u32) -> View {
     let forward = (target - eye).normalize_or(Vec3::Z);
     let down = (forward.any_orthonormal_vector()).normalize_or(Vec3::Y);
-    let right = down.cross(forward);
-    let rotation = Mat3::from_cols(right, down, forward).transpose();
+    turned(Mat3::from_cols(down.cross(forward), down, forward).transpose(), eye, focal, size)
+}
+
+/// A camera at `eye` of this rotation.
+pub fn turned(rotation: Mat3, eye: Vec3, focal: f32, size: u32) -> View {
     let centre = size as f32 / 2.0;
     View {
         focal: Vec2::splat(focal),

@@ -246,28 +246,6 @@ fn slices_of_different_lengths_panic() {
 }
 
 #[test]
-fn zero_density_has_a_gradient() {
-    let mut ray = wall(0.0);
-    ray.sigma = vec![0.0; 4];
-    let (got, _) = ray.composite(Vec3::X);
-    assert_eq!((got.color, got.opacity, got.depth, got.termination), (Vec3::X, 0.0, 0.0, None));
-    let d = ray.backward(Vec3::X, Vec3::ONE, 0.0);
-    // dC/dσ_i = δ_i (c_i − background).
-    for i in 0..4 {
-        let expected = 0.25 * (ray.rgb[i] - Vec3::X).element_sum();
-        assert_abs_diff_eq!(d.sigma[i], expected, epsilon = 1e-6);
-    }
-}
-
-#[test]
-fn a_ray_without_samples_shows_the_background() {
-    let (got, _) = Samples::default().composite(Vec3::new(0.1, 0.2, 0.3));
-    let expected = Composite { color: Vec3::new(0.1, 0.2, 0.3), opacity: 0.0, depth: 0.0, termination: None };
-    assert_eq!(got, expected);
-    Samples::default().backward(Vec3::ONE, Vec3::ONE, 1.0);
-}
-
-#[test]
 fn transmittance_underflows_to_zero_with_finite_gradients() {
     let mut ray = Samples::default();
     for _ in 0..5000 {

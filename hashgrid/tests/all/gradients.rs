@@ -1,6 +1,6 @@
 //! The backward passes against finite differences, and as adjoints of the forward pass.
 
-use super::common::{dot, encode, noise, points, table};
+use crate::common::{dot, encode, noise, points, table};
 use approx::abs_diff_eq;
 use hashgrid::HashGrid;
 use proptest::prelude::*;

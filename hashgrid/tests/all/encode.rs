@@ -1,7 +1,6 @@
 //! The encoding against the test kit's reference encoding in f64.
 
-use super::common::{encode, encode_rows, oracle, points, table};
-use approx::assert_abs_diff_eq;
+use crate::common::{encode_rows, oracle, points, table};
 use hashgrid::HashGrid;
 use proptest::prelude::*;
 
@@ -50,20 +49,6 @@ proptest! {
 }
 
 #[test]
-fn the_dense_index_and_the_hash_follow_their_definitions() {
-    // At T = 9 in 3-D, 7 cells per axis (8³ corners) is the finest dense level.
-    let grid = HashGrid::<3>::with_resolutions(&[7, 8], 1, 9).unwrap();
-    assert_eq!(grid.level_range(0), 0..512);
-    assert_eq!(grid.level_range(1), 512..1024);
-    let table = table(&grid, 3);
-    // Corner (0, 0, 1) has row 64 in the dense level, π_3 mod 2^9 in the hashed one.
-    let dense = encode(&grid, &table, &[[0.0, 0.0, 1.0 / 7.0]])[0];
-    let hashed = encode(&grid, &table, &[[0.0, 0.0, 1.0 / 8.0]])[1];
-    assert_abs_diff_eq!(dense, table[64], epsilon = 1e-6);
-    assert_eq!(hashed, table[512 + 805_459_861 % 512]);
-}
-
-#[test]
 fn empty_batches_write_nothing() {
     let grid = HashGrid::<2>::with_resolutions(&[5], 1, 7).unwrap();
     let mut table = table(&grid, 4);
@@ -79,30 +64,4 @@ fn empty_batches_write_nothing() {
 fn a_table_of_the_wrong_length_panics() {
     let grid = HashGrid::<2>::with_resolutions(&[5], 1, 7).unwrap();
     grid.encode(&[0.0; 3], &[[0.0; 2]], &mut [0.0]);
-}
-
-#[test]
-fn splitting_the_points_into_calls_changes_no_bit() {
-    let grid = HashGrid::<4>::with_resolutions(&[3, 20, 50], 2, 10).unwrap();
-    let table = table(&grid, 1);
-    let points: Vec<[f32; 4]> =
-        super::common::noise(4 * 40_000, 2).as_chunks::<4>().0.iter().map(|p| p.map(|x| 0.5 + 0.5 * x)).collect();
-    let together = encode_rows(&grid, &table, &points);
-    for size in [1, 7, 16, 17, 5000] {
-        let apart: Vec<f32> = points.chunks(size).flat_map(|p| encode_rows(&grid, &table, p)).collect();
-        assert!(apart == together, "in calls of {size}");
-    }
-}
-
-#[test]
-fn coordinates_outside_are_clamped_and_nan_is_zero() {
-    let grid = HashGrid::<2>::with_resolutions(&[5, 100], 4, 7).unwrap();
-    let table = table(&grid, 4);
-    let at = |x, y| encode(&grid, &table, &[[x, y]]);
-    assert_eq!(at(-1.0, 0.3), at(0.0, 0.3));
-    assert_eq!(at(f32::NEG_INFINITY, 0.3), at(0.0, 0.3));
-    assert_eq!(at(f32::NAN, 0.3), at(0.0, 0.3));
-    assert_eq!(at(0.3, 1.5), at(0.3, 1.0));
-    assert_eq!(at(0.3, f32::INFINITY), at(0.3, 1.0));
-    assert_ne!(at(0.0, 0.3), at(1.0, 0.3));
 }

@@ -4,21 +4,16 @@ use hashgrid::HashGrid;
 use proptest::prelude::*;
 use testkit::body::Random;
 
-/// The oracle's (L, 2^T, F) table, zero-padded, from the compact one.
-pub fn padded<const D: usize>(grid: &HashGrid<D>, table: &[f32], log2: u32, f: usize) -> Vec<f32> {
-    let rows = 1usize << log2;
-    let mut padded = vec![0.0; grid.resolutions().len() * rows * f];
-    for l in 0..grid.resolutions().len() {
-        let level = &table[grid.level_range(l)];
-        padded[l * rows * f..][..level.len()].copy_from_slice(level);
-    }
-    padded
-}
-
+/// The oracle's features, of a table that is zero-padded to (L, 2^T, F).
 pub fn oracle<const D: usize>(grid: &HashGrid<D>, table: &[f32], points: &[[f32; D]], log2: u32, f: usize) -> Vec<f64> {
     let points: Vec<f64> = points.iter().flatten().map(|&x| f64::from(x)).collect();
-    let table = padded(grid, table, log2, f);
-    testkit::oracle::hash_encode(&points, D, grid.resolutions(), &table, log2, f)
+    let size = f << log2;
+    let mut padded = vec![0.0; grid.resolutions().len() * size];
+    for (l, to) in padded.chunks_exact_mut(size).enumerate() {
+        let level = &table[grid.level_range(l)];
+        to[..level.len()].copy_from_slice(level);
+    }
+    testkit::oracle::hash_encode(&points, D, grid.resolutions(), &padded, log2, f)
 }
 
 pub fn encode<const D: usize>(grid: &HashGrid<D>, table: &[f32], points: &[[f32; D]]) -> Vec<f32> {

@@ -1,5 +1,0 @@
-//! Every kernel in every dimension, in one binary because compiling the kernels dominates.
-
-mod common;
-mod encode;
-mod gradients;
