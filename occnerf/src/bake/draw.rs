@@ -9,7 +9,7 @@ use super::avatar::{Atlas, Avatar, TERMS_PER_JOINT, blend};
 use crate::Error;
 use crate::capture::{Image, Light};
 use crate::model::view::{PosedView, pinhole};
-use crate::render::picture::{Renderer, Rendering};
+use crate::render::{Renderer, Rendering};
 
 /// Vertices per parallel task.
 const CHUNK: usize = 1024;

@@ -6,22 +6,21 @@ use std::time::Instant;
 
 use glam::{Affine3A, Vec2, Vec3};
 use rayon::prelude::*;
-use smpl::{BoneNames, SparseRows, skeleton};
+use smpl::{BoneNames, MotionField, SparseRows, skeleton};
 
-use super::avatar::{Atlas, Avatar, Clip, MAX_JOINTS};
+use super::avatar::{Atlas, Avatar, Clip, MAX_JOINTS, motion_of_bones, turn_upright};
 use super::charts::AtlasLayout;
 use super::displacement::displacements;
-use super::field::evaluate;
-use super::paint::{Texel, dilate, paint, texels};
 use super::refine::refine;
-use super::skeleton::{motion_of_bones, turn_upright};
-use super::surface::{CanonicalField, NormalRay, Place, heights, normal_rays};
+use super::surface::{CanonicalField, NormalRay, Place, Texel, dilate, heights, normal_rays, paint, texels};
 use crate::Error;
 use crate::capture::Light;
-use crate::model::body::Body;
+use crate::model::body::{Body, surface_point};
+use crate::model::encoder::VertexCode;
+use crate::model::extent::Extent;
+use crate::model::field::SampleBatch;
 use crate::model::subdivide::{Anchor, Subdivided, normals, times_until};
-use crate::model::trained::{Model, upright};
-use crate::model::vertices::VertexCode;
+use crate::model::trained::{Model, surface_motion, upright};
 use crate::model::view::{PosedView, pixel_width};
 use crate::scene::prepared::Scene;
 
@@ -137,7 +136,7 @@ fn seen(scene: &Scene) -> Result<Vec<f32>, Error> {
 }
 
 /// The subdivided prior that a surface lies over.
-struct Relief {
+pub(super) struct Relief {
     mesh: Subdivided,
     /// (V)
     feet: Vec<NormalRay>,
@@ -145,7 +144,7 @@ struct Relief {
 
 impl Relief {
     /// For pixels of `pixel` normalised metres.
-    fn new(prior: &[Vec3], faces: &[[u32; 3]], pixel: f32) -> Self {
+    pub fn new(prior: &[Vec3], faces: &[[u32; 3]], pixel: f32) -> Self {
         let mesh = Subdivided::new(prior.len(), faces, times_until(prior, faces, EDGE * pixel, MOST));
         let feet = normal_rays(&mesh, prior, faces);
         Self { mesh, feet }
@@ -180,7 +179,7 @@ pub(super) fn surface(
 }
 
 /// The avatar of a surface at `heights` (V) over a relief; `paint` gives texels their colours.
-fn assemble(
+pub(super) fn assemble(
     body: &Body,
     Relief { mesh, feet }: &Relief,
     heights: &[f32],
@@ -336,7 +335,7 @@ fn atlas(side: u32, texels: &[Texel], colours: &[Vec3], confidence: &[f32]) -> A
 }
 
 /// Gives an avatar the motion, cameras and light of a video, in the avatar's world.
-fn add_motion(avatar: &mut Avatar, body: &Body, frames: &[Arc<PosedView>], light: Light) {
+pub(super) fn add_motion(avatar: &mut Avatar, body: &Body, frames: &[Arc<PosedView>], light: Light) {
     let turn = turn_upright(upright(body, frames.iter().map(Arc::as_ref)));
     let bones = |view: &Arc<PosedView>| {
         let placed = |bone: &Affine3A| {
@@ -355,4 +354,36 @@ fn add_motion(avatar: &mut Avatar, body: &Body, frames: &[Arc<PosedView>], light
     avatar.light.slope = turn * light.slope;
     avatar.clips = vec![Clip { name: "video".to_owned(), motion: motion_of_bones(&avatar.skeleton, &bones, FPS) }];
     avatar.cameras = frames.iter().map(camera).collect();
+}
+
+/// Density, in 1 / normalised metre and 0 outside the extent, and colour at each of `places`.
+fn evaluate(model: &Model, code: &VertexCode, extent: &Extent, places: &[Place]) -> Vec<(f32, Vec3)> {
+    let Model { body, config, base, motion, .. } = model;
+    let blended = config.surface.distance.needs_neighbours();
+    let neighbours = config.needs_neighbours();
+    let based = !base.colors.is_empty() && matches!(motion, MotionField::Surface(_));
+    let mut batch = SampleBatch::default();
+    batch.samples.clear();
+    for place in places {
+        let samples = &mut batch.samples;
+        samples.push_canonical(body, place.at, place.closest, place.distance, neighbours);
+        if blended {
+            let own = &samples.neighbours[samples.neighbours.len() - body.query.neighbours_per_query()..];
+            if let Some(point) = surface_point(body, &config.surface, place.at, own, f32::INFINITY)
+                && let (Some(closest), Some(distance)) = (samples.closest.last_mut(), samples.distance.last_mut())
+            {
+                (*closest, *distance) = (point.closest, point.distance);
+            }
+        }
+        if based {
+            samples.base.push(base.logit(place.face, place.barycentric, 1.0));
+        }
+    }
+    model.evaluate(code, &mut batch);
+    let likelihood = surface_motion(&config.motion);
+    let value = |((place, sigma), rgb): ((&Place, &f32), &Vec3)| {
+        let lives = place.distance <= extent.faces[place.face as usize];
+        (if lives { likelihood.likelihood(place.distance) * sigma } else { 0.0 }, *rgb)
+    };
+    places.iter().zip(&batch.sigma).zip(&batch.rgb).map(value).collect()
 }

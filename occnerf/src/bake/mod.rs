@@ -1,19 +1,14 @@
 //! A person as a skinned, textured mesh: baked from a trained field, or fitted to the frames.
 
-mod agreement;
 mod avatar;
 mod charts;
 mod displacement;
 mod draw;
 pub mod export;
-mod field;
 mod make;
-mod paint;
-mod plate;
 mod refine;
 mod saved;
 mod simplify;
-mod skeleton;
 mod skirt;
 mod surface;
 #[cfg(test)]
@@ -25,9 +20,9 @@ use std::path::Path;
 use crate::Error;
 
 pub use avatar::{Atlas, Avatar, Clip, MAX_ATLAS_SIDE, MAX_JOINTS};
+use avatar::{motion_of_bones, turn_upright};
 pub use draw::BakedRenderer;
 pub use make::{BakeReport, bake, fit};
-pub use skeleton::{motion_of_bones, turn_upright};
 pub use skirt::skirted;
 pub use smpl::Joint;
 

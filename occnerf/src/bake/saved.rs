@@ -11,7 +11,7 @@ use volrender::Camera;
 use super::avatar::{Atlas, Avatar, Clip};
 use crate::Error;
 use crate::capture::Light;
-use crate::model::file::{read, write};
+use crate::model::saved::{read, write};
 
 const FORMAT: &str = "occnerf-avatar";
 const VERSION: u32 = 2;

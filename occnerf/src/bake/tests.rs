@@ -1,20 +1,22 @@
 //! A bake of fields that are known, and of a person in training.
 
+use std::sync::Arc;
+
 use glam::{Affine3A, Mat3, Vec2, Vec3, Vec4};
+use synth::{DemoConfig, Outfit, demo};
 use visibility::Samples;
 
 use super::charts::{AtlasLayout, PADDING};
 use super::draw::BakedRenderer;
-use super::make::{bake, fit, surface};
-use super::surface::{CanonicalField, Place};
-use super::{Avatar, BakeReport, skirted};
+use super::make::{Relief, add_motion, assemble, bake, fit, surface};
+use super::surface::{CanonicalField, Place, Texel};
+use super::{Avatar, BakeReport, skirted, turn_upright};
 use crate::capture::{Capture, Light};
 use crate::config::{Config, Method, Preset};
-use crate::render::field::FieldRenderer;
-use crate::render::picture::Renderer;
+use crate::model::trained::upright;
+use crate::render::{FieldRenderer, Renderer};
 use crate::scene::prepared::{PreparedFrame, Scene};
 use crate::train::trainer::Trainer;
-use synth::{DemoConfig, Outfit, demo};
 
 /// Height of the known field over the prior.
 const HEIGHT: f32 = 0.0123;
@@ -286,6 +288,40 @@ fn a_person_in_training_is_baked_refined_and_drawn_alike_on_any_number_of_thread
         assert!(found.distance(expected) < 1e-4);
     }
     assert!(renderer.draw(&bones[1..], &scene.train[0].view.camera).unwrap_err().to_string().contains("joints"));
+}
+
+#[test]
+fn an_avatar_moves_as_the_prior_that_it_came_from() {
+    let mut config = Config::preset(Preset::Fast, Method::Surface);
+    config.registration.rounds = 0;
+    let scene = scene(&config);
+    let (body, faces) = (&scene.body, &scene.body.model.faces);
+    // For pixels so wide that nothing is subdivided.
+    let relief = Relief::new(&body.canonical.vertices, faces, 1.0);
+    let flat = vec![0.0; body.canonical.vertices.len()];
+    let paint = |texels: &[Texel]| vec![Vec3::ZERO; texels.len()];
+    let (mut avatar, _) = assemble(body, &relief, &flat, &flat, 0.012, paint).unwrap();
+    let frames: Vec<_> = scene.train.iter().map(|frame| Arc::clone(&frame.view)).collect();
+    add_motion(&mut avatar, body, &frames, Light::default());
+    avatar.validate().unwrap();
+    let world = turn_upright(upright(body, frames.iter().map(Arc::as_ref))) * (1.0 / body.scale);
+    let motion = &avatar.clips[0].motion;
+    for (t, view) in frames.iter().enumerate() {
+        let pose = &motion.poses[t * motion.num_joints..][..motion.num_joints];
+        let (moved, _) = avatar.skin(&avatar.bones(pose, motion.trans[t]), pose);
+        for (of_avatar, of_prior) in avatar.faces.as_flattened().iter().zip(faces.as_flattened()) {
+            let (here, there) = (moved[*of_avatar as usize], view.posed.vertices[*of_prior as usize]);
+            // The betas of the demo's frames are the mean ones; four weights a vertex of at most four.
+            assert!(here.distance(world * there) < 2e-4, "frame {t}: {here}");
+            // The camera sees it where the capture's camera saw it.
+            let [here, there] = [avatar.cameras[t].project(here).unwrap(), view.camera.project(there).unwrap()];
+            assert!((here - there).truncate().length() < 0.05, "{here} {there}");
+            assert!((here.z * body.scale - there.z).abs() < 1e-3);
+        }
+    }
+    let still = vec![Vec3::ZERO; avatar.num_joints()];
+    let (rest, _) = avatar.skin(&avatar.bones(&still, Vec3::ZERO), &still);
+    assert!(rest.iter().zip(&avatar.vertices).all(|(a, b)| a.distance(*b) < 1e-5));
 }
 
 /// Intersection over union of a drawn person and the mask, in the mean over frames.

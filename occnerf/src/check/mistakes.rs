@@ -5,7 +5,7 @@ use rayon::prelude::*;
 use smpl::{BodyModel, Placement};
 use volrender::Camera;
 
-use super::frame::View;
+use super::faults::View;
 use crate::capture::{Capture, Frame};
 use crate::error::Error;
 use crate::model::view::silhouette;
@@ -326,11 +326,6 @@ impl<'a> Posed<'a> {
 /// Overlap of every view, with a mistake undone.
 fn overlaps(posed: &[Posed<'_>], body: &BodyModel, undo: Option<Mistake>) -> Result<Vec<Overlap>, Error> {
     posed.par_iter().map(|posed| posed.overlap(undo, body)).collect()
-}
-
-/// Pixels of a camera's image that a frame's body covers.
-pub(super) fn outline(frame: &Frame, camera: &Camera, body: &BodyModel) -> Result<Vec<bool>, Error> {
-    Ok(silhouette(&posed(frame, body), &body.faces, camera)?)
 }
 
 /// The vertices of a frame's body.

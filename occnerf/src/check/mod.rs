@@ -3,14 +3,12 @@
 //! [`check`] compares the posed body's silhouette with the mask of every frame, detects temporal
 //! outliers, and diagnoses common convention errors ([`Mistake`]) by undoing them.
 
-mod frame;
-mod jumps;
-mod limbs;
+mod faults;
 mod mistakes;
 #[cfg(test)]
 mod tests;
 
-pub use self::frame::{Fault, Limb};
+pub use self::faults::{Fault, Limb};
 pub use self::mistakes::Mistake;
 
 use glam::{Vec2, Vec3};
@@ -19,9 +17,8 @@ use smpl::BodyModel;
 use visibility::{RayMesh, visible_vertices};
 use volrender::Camera;
 
-use self::frame::View;
-use self::limbs::Part;
-use self::mistakes::{Overlap, outline, posed};
+use self::faults::{Part, View};
+use self::mistakes::{Overlap, posed};
 use crate::capture::{Capture, CaptureError, Frame, Image, Pixels};
 use crate::config::OccludedRule;
 use crate::error::Error;
@@ -67,20 +64,24 @@ impl Check {
     /// Mean overlap of the frames that have one.
     #[must_use]
     pub fn mean_iou(&self) -> f32 {
-        let ious: Vec<f32> = self.frames.iter().filter_map(|frame| frame.iou).collect();
-        ious.iter().sum::<f32>() / ious.len().max(1) as f32
+        self.mean(|frame| frame.iou)
     }
 
     /// Mean share of the masks more than 5 cm from the silhouette.
     #[must_use]
     pub fn mean_beyond(&self) -> f32 {
-        self.frames.iter().map(|frame| frame.beyond).sum::<f32>() / self.frames.len().max(1) as f32
+        self.mean(|frame| Some(frame.beyond))
     }
 
     /// Mean share of the silhouette that is unknown.
     #[must_use]
     pub fn mean_hidden(&self) -> f32 {
-        self.frames.iter().map(|frame| frame.hidden).sum::<f32>() / self.frames.len().max(1) as f32
+        self.mean(|frame| Some(frame.hidden))
+    }
+
+    fn mean(&self, of: impl Fn(&FrameCheck) -> Option<f32>) -> f32 {
+        let values: Vec<f32> = self.frames.iter().filter_map(of).collect();
+        values.iter().sum::<f32>() / values.len().max(1) as f32
     }
 }
 
@@ -90,11 +91,11 @@ impl Check {
 /// Pictures that cannot be read.
 pub fn check(capture: &Capture, body: &BodyModel) -> Result<Check, Error> {
     let small = small_views(capture)?;
-    let parts = limbs::parts(body);
+    let parts = faults::parts(body);
     let checked: Vec<Result<FrameCheck, Error>> =
         small.par_iter().map(|view| one(&capture.train[view.index], view, body, &parts)).collect();
     let mut frames = checked.into_iter().collect::<Result<Vec<_>, _>>()?;
-    for (frame, faults) in frames.iter_mut().zip(jumps::find(capture, body)) {
+    for (frame, faults) in frames.iter_mut().zip(faults::jumps(capture, body)) {
         frame.faults.extend(faults);
     }
     let mistakes = likely(capture, body, small)?;
@@ -120,7 +121,7 @@ fn small_views(capture: &Capture) -> Result<Vec<View>, CaptureError> {
 /// # Errors
 /// A picture of more than 16384 pixels a side.
 pub fn body_silhouette(frame: &Frame, body: &BodyModel) -> Result<Vec<bool>, Error> {
-    outline(frame, &frame.camera, body)
+    Ok(silhouette(&posed(frame, body), &body.faces, &frame.camera)?)
 }
 
 /// The unmasked photograph of a frame, for display; the masked picture of pixels in memory.
@@ -206,7 +207,7 @@ fn one(frame: &Frame, view: &View, body: &BodyModel, parts: &[Part]) -> Result<F
     let empty = !view.mask.contains(&true);
     // A fit beside the mask may be unknown to a large part; its coverage of the mask decides.
     let beside = !empty && Overlap::of(&silhouette, view, false).covered() < 0.5;
-    let (beyond, fault) = limbs::beyond(view, &silhouette, &posed, parts, scale);
+    let (beyond, fault) = faults::beyond(view, &silhouette, &posed, parts, scale);
     let mut faults = Vec::new();
     if empty {
         faults.push(Fault::EmptyMask);

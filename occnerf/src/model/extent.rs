@@ -1,5 +1,5 @@
-//! Outer end of the field over the prior's surface: samples farther out are skipped, in training and
-//! in drawing.
+//! Outer end of the field over the prior's surface: samples farther out are skipped, in training
+//! and in drawing.
 //!
 //! An occupancy grid (Müller et al. 2022, section 5.1) in the coordinates that the field has
 //! anyway: place on the surface and distance from it.
@@ -90,7 +90,7 @@ fn highest(face: &[u32; 3], vertices: &[f32]) -> f32 {
 mod tests {
     use super::*;
     use crate::config::{Method, Preset};
-    use crate::model::vertices::VertexCode;
+    use crate::model::encoder::VertexCode;
     use crate::scene::prepared::Scene;
     use crate::train::trainer::Trainer;
     use synth::{DemoConfig, demo};

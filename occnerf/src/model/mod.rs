@@ -2,20 +2,14 @@
 
 pub(crate) mod body;
 pub(crate) mod colors;
-pub(crate) mod distance;
 pub(crate) mod encoder;
 pub(crate) mod extent;
 pub(crate) mod field;
-pub(crate) mod file;
-pub(crate) mod gemm;
 pub(crate) mod march;
-pub(crate) mod parameters;
 pub(crate) mod perceptron;
 pub(crate) mod person;
 pub(crate) mod samples;
 pub(crate) mod saved;
 pub(crate) mod subdivide;
-pub(crate) mod trace;
 pub(crate) mod trained;
-pub(crate) mod vertices;
 pub(crate) mod view;

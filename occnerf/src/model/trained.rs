@@ -12,11 +12,9 @@ use crate::capture::Light;
 use crate::config::{Config, FALLOFF, MotionConfig, MotionKind};
 use crate::model::body::Body;
 use crate::model::colors::PriorColors;
-use crate::model::encoder::Encoder;
+use crate::model::encoder::{Encoder, VertexCode};
 use crate::model::extent::Extent;
-use crate::model::field::{Field, Learnt, SampleBatch};
-use crate::model::parameters::{PARTS, Parameters, Part};
-use crate::model::vertices::VertexCode;
+use crate::model::field::{Field, Learnt, PARTS, Parameters, Part, SampleBatch};
 use crate::model::view::PosedView;
 
 /// Σ w below which the weight volume has no correspondence.
@@ -227,11 +225,12 @@ pub fn upright<'a>(body: &Body, views: impl Iterator<Item = &'a PosedView>) -> V
 
 #[cfg(test)]
 mod tests {
-    use super::*;
-    use crate::config::{Method, Preset};
     use glam::{Affine3A, Mat3, Quat, Vec2};
     use smpl::{BodyModel, Placement};
     use volrender::Camera;
+
+    use super::*;
+    use crate::config::{Method, Preset};
 
     #[test]
     fn up_is_the_worlds_axis_or_in_the_cameras_world_the_bodys() {

@@ -7,7 +7,7 @@ use glam::{Vec2, Vec3};
 use smpl::BodyModel;
 
 use crate::model::view::PosedView;
-use crate::scene::light::ColorObservation;
+use crate::scene::seen::ColorObservation;
 
 /// Largest distance from the colour of the hands, mean of the channels.
 const REACH: f32 = 0.12;

@@ -109,7 +109,7 @@ const CLOTHES: f32 = 0.04;
 /// occluder pixels, possibly incomplete; `pixels_per_metre`: image scale at the subject's depth.
 /// Unknown are the occluder's pixels, and the silhouette outside the mask, opened by 3 cm and
 /// dilated by 4 cm.
-pub fn label_pixels(
+pub(crate) fn label_pixels(
     rule: OccludedRule,
     mask: &[f32],
     silhouette: &[bool],
@@ -237,76 +237,112 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
+    const WIDTH: usize = 24;
+    const HEIGHT: usize = 20;
+
+    /// A few overlapping rectangles.
+    fn blobs() -> impl Strategy<Value = Vec<bool>> {
+        let rectangle = (0..WIDTH, 0..HEIGHT, 2..14usize, 2..14usize);
+        prop::collection::vec(rectangle, 1..4).prop_map(|rectangles| {
+            let inside = |x: usize, y: usize| {
+                let is_in = |&(left, top, w, h): &(usize, usize, usize, usize)| {
+                    (left..left + w).contains(&x) && (top..top + h).contains(&y)
+                };
+                rectangles.iter().any(is_in)
+            };
+            (0..WIDTH * HEIGHT).map(|i| inside(i % WIDTH, i / WIDTH)).collect()
+        })
+    }
+
+    /// Squared distance of pixel `at` from the nearest one that is `wanted`.
+    fn nearest(set: &[bool], width: usize, at: usize, wanted: bool) -> f32 {
+        let squared = |j: usize| {
+            let (x, y) = ((j % width).abs_diff(at % width), (j / width).abs_diff(at / width));
+            (x * x + y * y) as f32
+        };
+        (0..set.len()).filter(|&j| set[j] == wanted).map(squared).fold(f32::INFINITY, f32::min)
+    }
+
     proptest! {
         #![proptest_config(ProptestConfig::with_cases(64))]
 
         #[test]
-        fn distance_transform_equals_brute_force(
-            width in 1usize..12, height in 1usize..12, bits in prop::collection::vec(prop::bool::weighted(0.15), 144)
-        ) {
-            let set = &bits[..width * height];
-            let fast = squared_distance(set, width);
-            for (i, &d) in fast.iter().enumerate() {
-                let brute = (0..set.len()).filter(|&j| set[j]).map(|j| {
-                    let (x, y) = ((i % width) as f32 - (j % width) as f32, (i / width) as f32 - (j / width) as f32);
-                    x * x + y * y
-                }).fold(f32::INFINITY, f32::min);
-                prop_assert_eq!(d, brute);
-            }
-        }
-
-        #[test]
-        fn filters_equal_brute_force(
-            width in 1usize..12, height in 1usize..12, bits in prop::collection::vec(prop::bool::weighted(0.1), 144),
+        fn distances_and_filters_equal_brute_force(
+            width in 1usize..12, height in 1usize..12,
+            bits in prop::collection::vec(prop::bool::weighted(0.1), 144),
             radius in 0.0f32..4.0, most in prop::bool::ANY,
         ) {
             let set: Vec<bool> = bits[..width * height].iter().map(|bit| bit ^ most).collect();
-            let near = |i: usize, wanted: bool| (0..set.len()).any(|j| {
-                let (x, y) = ((i % width) as f32 - (j % width) as f32, (i / width) as f32 - (j / width) as f32);
-                set[j] == wanted && x * x + y * y <= radius * radius
-            });
+            let fast = squared_distance(&set, width);
             let [dilated, eroded] = [dilate(&set, width, radius), erode(&set, width, radius)];
             for i in 0..set.len() {
-                prop_assert_eq!((dilated[i], eroded[i]), (near(i, true), !near(i, false)));
+                let [on, off] = [true, false].map(|wanted| nearest(&set, width, i, wanted));
+                let reach = radius * radius;
+                prop_assert_eq!((fast[i], dilated[i], eroded[i]), (on, on <= reach, off > reach));
             }
         }
 
         #[test]
-        fn subject_pixels_are_never_unknown_and_background_rule_knows_everything(
-            mask in prop::collection::vec(0.0f32..1.0, 100), silhouette in prop::collection::vec(any::<bool>(), 100)
+        fn packed_labels_say_what_the_labels_say(
+            kinds in prop::collection::vec(0..3usize, 0..12),
+            lengths in prop::collection::vec(1..90usize, 12),
         ) {
-            let unknown = label_pixels(OccludedRule::Unknown, &mask, &silhouette, None, 10, 100.0);
-            let background = label_pixels(OccludedRule::Background, &mask, &silhouette, None, 10, 100.0);
-            for i in 0..100 {
-                prop_assert_eq!(unknown[i] == Label::Subject, mask[i] > 0.5);
-                prop_assert!(background[i] != Label::Unknown);
+            let label = |kind: usize| [Label::Subject, Label::Background, Label::Unknown][kind];
+            let runs = kinds.into_iter().zip(lengths);
+            let plain: Vec<Label> =
+                runs.flat_map(|(kind, length)| std::iter::repeat_n(label(kind), length)).collect();
+            let labels = Labels::new(&plain);
+            prop_assert_eq!(labels.iter().collect::<Vec<_>>(), plain.clone());
+            prop_assert_eq!((labels.len(), labels.is_empty()), (plain.len(), plain.is_empty()));
+            let is_subject = |&i: &u32| plain[i as usize] == Label::Subject;
+            let subject: Vec<u32> = (0..plain.len() as u32).filter(is_subject).collect();
+            let found: Vec<u32> = (0..labels.num_subject()).map(|n| labels.subject(n)).collect();
+            prop_assert_eq!(found, subject);
+        }
+
+        /// What is missing of the silhouette, opened by 3 cm and dilated by 4 cm, and the occluder.
+        #[test]
+        fn labels_are_those_of_their_definition(
+            subject in blobs(), silhouette in blobs(), occluder in prop::option::of(blobs()),
+            scale in 20.0f32..200.0,
+        ) {
+            let within = |set: &[bool], wanted: bool, radius: f32| -> Vec<bool> {
+                let near = |i: usize| nearest(set, WIDTH, i, wanted) <= radius * radius;
+                (0..set.len()).map(near).collect()
+            };
+            let missing: Vec<bool> = silhouette.iter().zip(&subject).map(|(&s, &m)| s && !m).collect();
+            let eroded: Vec<bool> = within(&missing, false, 0.5 * 0.03 * scale).iter().map(|i| !i).collect();
+            let unknown = within(&within(&eroded, true, 0.5 * 0.03 * scale), true, 0.04 * scale);
+            // A coverage of exactly one half is not the subject's yet.
+            let mask: Vec<f32> = subject.iter().map(|&s| if s { 0.6 } else { 0.5 }).collect();
+            let of = |rule| label_pixels(rule, &mask, &silhouette, occluder.as_deref(), WIDTH, scale);
+            let [found, known] = [OccludedRule::Unknown, OccludedRule::Background].map(of);
+            for i in 0..mask.len() {
+                let hidden = unknown[i] || occluder.as_ref().is_some_and(|o| o[i]);
+                let label = |unknown: bool| match (subject[i], unknown) {
+                    (true, _) => Label::Subject,
+                    (false, true) => Label::Unknown,
+                    (false, false) => Label::Background,
+                };
+                prop_assert_eq!((found[i], known[i]), (label(hidden), label(false)), "pixel {}", i);
             }
         }
     }
 
-    /// A silhouette of 20 × 20 in 30 × 30 pixels at 1 cm a pixel, mask without its right half.
     #[test]
-    fn hidden_half_is_unknown_and_a_thin_rim_is_background() {
-        let inside = |x: usize, y: usize| (5..25).contains(&x) && (5..25).contains(&y);
-        let silhouette: Vec<bool> = (0..900).map(|i| inside(i % 30, i / 30)).collect();
-        let hidden: Vec<f32> = (0..900).map(|i| f32::from(inside(i % 30, i / 30) && i % 30 < 15)).collect();
-        let labels = label_pixels(OccludedRule::Unknown, &hidden, &silhouette, None, 30, 100.0);
-        assert_eq!(labels[15 * 30 + 20], Label::Unknown);
-        assert_eq!(labels[15 * 30 + 27], Label::Unknown, "hidden clothes beyond the prior");
-        assert_eq!(labels[15 * 30 + 10], Label::Subject);
-        assert_eq!(labels[15 * 30 + 2], Label::Background, "visible outline keeps its background");
-        let rim: Vec<f32> = (0..900).map(|i| f32::from(inside(i % 30, i / 30) && i % 30 < 23)).collect();
-        let labels = label_pixels(OccludedRule::Unknown, &rim, &silhouette, None, 30, 100.0);
-        assert_eq!(labels[15 * 30 + 24], Label::Background, "misregistration is not occlusion");
-    }
-
-    #[test]
-    fn a_known_occluder_joins_what_is_inferred() {
-        let (mask, occluder) = ([1.0, 0.0, 0.0, 0.0, 0.0], [true, false, true, false, false]);
-        let of = |silhouette: &[bool], rule| label_pixels(rule, &mask, silhouette, Some(&occluder), 5, 1.0);
-        use Label::{Background, Subject, Unknown};
-        assert_eq!(of(&[false; 5], OccludedRule::Unknown), [Subject, Background, Unknown, Background, Background]);
-        assert_eq!(of(&[true; 5], OccludedRule::Unknown), [Subject, Unknown, Unknown, Unknown, Unknown]);
-        assert_eq!(of(&[true; 5], OccludedRule::Background)[1..], [Background; 4]);
+    fn pictures_of_no_pixels_or_one_and_extreme_scales_have_labels() {
+        assert!(label_pixels(OccludedRule::Unknown, &[], &[], None, 0, 100.0).is_empty());
+        assert!(label_pixels(OccludedRule::Unknown, &[], &[], None, 5, 100.0).is_empty());
+        for scale in [0.0, 1e-30, 1.0, 1e6, f32::INFINITY] {
+            let found = label_pixels(OccludedRule::Unknown, &[0.0], &[true], None, 1, scale);
+            // Beyond the border nothing is known, so nothing erodes it.
+            assert_eq!(found, [Label::Unknown], "{scale}");
+        }
+        // So close that the opening is wider than the picture: what the mask leaves free is then
+        // misregistration.
+        let silhouette: Vec<bool> = (0..WIDTH * HEIGHT).map(|i| i % WIDTH > 3).collect();
+        let mask = [0.0; WIDTH * HEIGHT];
+        let found = label_pixels(OccludedRule::Unknown, &mask, &silhouette, None, WIDTH, 1e5);
+        assert!(found.iter().all(|l| *l == Label::Background));
     }
 }

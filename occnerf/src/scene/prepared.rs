@@ -16,11 +16,10 @@ use crate::model::subdivide::Anchor;
 use crate::model::view::{PosedView, pinhole};
 use crate::scene::hands::HandColor;
 use crate::scene::labels::{Label, Labels, dilate, label_pixels};
-use crate::scene::light::{ColorObservation, measure_light};
 use crate::scene::masks::mend_masks;
 use crate::scene::registration::register;
 use crate::scene::reliability::Reliability;
-use crate::scene::seen::{MOST, deeper, seen, strange_edge};
+use crate::scene::seen::{ColorObservation, MOST, deeper, measure_light, seen, strange_edge};
 
 /// A frame with its posed prior.
 pub struct PreparedFrame {

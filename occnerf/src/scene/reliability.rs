@@ -1,11 +1,11 @@
-//! Reliability of photographed colours where frames disagree: by depth inside the mask and by slant.
+//! Reliability of photographed colours where frames disagree: by depth inside the mask and by
+//! slant.
 
 use glam::Vec3;
 
 use crate::capture::Light;
-use crate::scene::light::{ColorObservation, albedo};
 use crate::scene::registration::deviation;
-use crate::scene::seen::MOST;
+use crate::scene::seen::{ColorObservation, MOST, albedo};
 
 /// Depths in a mask and cosines between normal and view direction that are told apart.
 const BINS: [usize; 2] = [MOST + 1, 5];
@@ -82,8 +82,9 @@ impl Reliability {
 
 #[cfg(test)]
 mod tests {
-    use super::*;
     use proptest::prelude::*;
+
+    use super::*;
 
     proptest! {
         /// Colours `rim` times as far off at the edge as inside, by `noise`.

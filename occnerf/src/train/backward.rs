@@ -3,10 +3,9 @@
 use glam::Vec3;
 use smpl::{MotionFrame, WeightVolume};
 
-use crate::model::distance::{SurfacePoint, surface_point_backward};
-use crate::model::field::{Field, Learnt, Mix, SampleBatch, sigmoid};
-use crate::model::gemm::LANES;
-use crate::model::parameters::Part;
+use crate::model::body::{SurfacePoint, surface_point_backward};
+use crate::model::field::{Field, Learnt, Mix, Part, SampleBatch, sigmoid};
+use crate::model::perceptron::LANES;
 use crate::model::trained::Model;
 
 impl Field {
@@ -172,70 +171,5 @@ mod tests {
             (group.features, d_mlp, d_features)
         });
         assert!(recomputed == stored && recomputed.1.iter().any(|&d| d != 0.0));
-    }
-
-    /// Every parameter group of every method at once, along random directions.
-    #[test]
-    fn gradients_of_weights_table_vertices_and_bias_agree_with_central_differences() {
-        let region = Aabb { min: Vec3::splat(-0.1), max: Vec3::splat(1.1) };
-        for method in [Method::Occnerf, Method::HashPoint] {
-            let mut config = Config::preset(Preset::Fast, method);
-            (config.surface.surface_term, config.surface.attention) = (true, true);
-            (config.field.width, config.field.depth) = (20, 2);
-            (config.encoding.levels, config.encoding.n_max, config.encoding.log2_table_size) = (3, 20, 10);
-            let field = Field::new(Encoder::new(&config).unwrap(), &config, region);
-            let mut random = RandomStream::new(&[3, method as u64]);
-            let (n, vertices) = (40, 12);
-            let mut group = group(n, vertices, 20, &mut random);
-            let mut counts = VisibilityCounts::new(vertices);
-            counts.add(&[1, 1, 1, 5, 7, 7]);
-            let width = field.encoder.num_features();
-            let mlp = field.mlp.initial(1);
-            let normal = |n: usize, random: &mut RandomStream| (0..n).map(|_| random.normal()).collect::<Vec<f32>>();
-            let table: Vec<f32> = normal(field.encoder.initial_table(1).len(), &mut random);
-            let features = normal(vertices * width, &mut random);
-            let (c_sigma, c_rgb) = (normal(n, &mut random), normal(3 * n, &mut random));
-            let value = |group: &mut SampleBatch, mlp: &[f32], table: &[f32], features: &[f32]| -> f64 {
-                let learnt = Learnt { perceptron: mlp, table, vertices: features, counts: &counts };
-                field.forward(&learnt, group);
-                let sigma = group.sigma.iter().zip(&c_sigma).map(|(s, c)| f64::from(s * c) * 0.04);
-                let rgb = group.rgb.iter().zip(c_rgb.chunks(3)).map(|(s, c)| f64::from(s.dot(Vec3::from_slice(c))));
-                sigma.chain(rgb).sum()
-            };
-            value(&mut group, &mlp, &table, &features);
-            group.d_sigma = c_sigma.iter().map(|c| c * 0.04).collect();
-            group.d_rgb = c_rgb.chunks(3).map(Vec3::from_slice).collect();
-            let (mut transposed, mut d_mlp) = (Vec::new(), vec![0.0; mlp.len()]);
-            field.mlp.transposed_weights(&mlp, &mut transposed);
-            let mut d_features = vec![0.0; features.len()];
-            let learnt = Learnt { perceptron: &mlp, table: &table, vertices: &features, counts: &counts };
-            field.backward(&learnt, &transposed, &mut group, &mut d_mlp, &mut d_features);
-            field.mlp.clear_padding(&mut d_mlp);
-            let mut d_table = vec![0.0; table.len()];
-            field.encoder.encode_backward(std::iter::once((group.at.all(), &group.features[..])), &mut d_table);
-            for direction in 0..6 {
-                let mut random = RandomStream::new(&[17, direction]);
-                let mut u_mlp = normal(mlp.len(), &mut random);
-                field.mlp.clear_padding(&mut u_mlp);
-                let (u_table, u_features) = (normal(table.len(), &mut random), normal(features.len(), &mut random));
-                let parts: [(&[f32], &[f32]); 3] = [(&d_mlp, &u_mlp), (&d_table, &u_table), (&d_features, &u_features)];
-                for part in 0..3 {
-                    let dot = parts[part].0.iter().zip(parts[part].1).map(|(a, b)| f64::from(a * b)).sum::<f64>();
-                    let mut at = |h: f32| {
-                        let moved = |which: usize, x: &[f32], u: &[f32]| -> Vec<f32> {
-                            x.iter().zip(u).map(|(x, u)| x + if which == part { h * u } else { 0.0 }).collect()
-                        };
-                        let (m, t) = (moved(0, &mlp, &u_mlp), moved(1, &table, &u_table));
-                        value(&mut group, &m, &t, &moved(2, &features, &u_features))
-                    };
-                    let h = 5e-5;
-                    let numeric = (at(h) - at(-h)) / (2.0 * f64::from(h));
-                    // Some ReLU of some sample switches within any step; their share of the
-                    // derivative is small.
-                    let scale = 0.03 * dot.abs().max(1.0);
-                    assert!((numeric - dot).abs() < scale, "{method:?} part {part}: {numeric} {dot}");
-                }
-            }
-        }
     }
 }

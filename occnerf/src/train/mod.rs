@@ -3,9 +3,7 @@
 pub(crate) mod adam;
 pub(crate) mod backward;
 pub(crate) mod batch;
-pub(crate) mod checkpoint;
 pub(crate) mod loss;
-pub(crate) mod ordered;
 pub(crate) mod photometric;
 #[cfg(test)]
 mod plain;

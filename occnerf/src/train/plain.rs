@@ -11,9 +11,9 @@ use testkit::oracle;
 use visibility::VisibilityCounts;
 
 use crate::config::{Config, DistanceKind, Method, MotionKind, Preset};
-use crate::model::distance::surface_point;
+use crate::model::body::surface_point;
 use crate::model::encoder::{Coordinates, Encoder};
-use crate::model::parameters::{Parameters, Part};
+use crate::model::field::{Parameters, Part};
 use crate::model::samples::Samples;
 use crate::model::trained::Model;
 use crate::scene::prepared::Scene;

@@ -1,6 +1,7 @@
 //! Training: a model, an optimiser and the buffers of a step, deterministic whatever the number of
-//! threads.
+//! threads; and its checkpoints, the model with the state of training, replaced atomically.
 
+use std::path::Path;
 use std::sync::Arc;
 
 use lpips::Lpips;
@@ -10,13 +11,11 @@ use smpl::MotionFrame;
 use crate::Error;
 use crate::config::Config;
 use crate::model::colors::PriorColors;
-use crate::model::encoder::{Encoder, PointEncoder};
-use crate::model::field::Field;
-use crate::model::march::MarchOptions;
-use crate::model::parameters::Part;
-use crate::model::trace::{CELL, PosedSurface};
+use crate::model::encoder::{Encoder, PointEncoder, VertexCode};
+use crate::model::field::{Field, PARTS, Part};
+use crate::model::march::{CELL, MarchOptions, PosedSurface};
+use crate::model::saved::{array, config_of, parse, read, write};
 use crate::model::trained::Model;
-use crate::model::vertices::VertexCode;
 use crate::scene::labels::Label;
 use crate::scene::prepared::{PreparedFrame, Scene};
 use crate::train::adam::Optimiser;
@@ -237,5 +236,66 @@ fn reduce(
         zero(d_volume, volume.weights.len());
         sum(d_volume, &|g| &g.d_volume);
         volume.softmax_backward(d_volume, gradients.get_mut(Part::Motion));
+    }
+}
+
+impl<'a> Trainer<'a> {
+    /// Writes the model and the state of training. An old file survives until the new one is complete
+    /// and on the disk.
+    ///
+    /// # Errors
+    /// [`Error::Diverged`] where a number is not finite: the old file stays; [`Error::Io`].
+    pub fn save(&self, path: &Path) -> Result<(), Error> {
+        self.check_finite()?;
+        let header = self.model.header(&self.scene.name)?;
+        let mut arrays = self.model.arrays();
+        for ((_, name), adam) in PARTS.into_iter().zip(&self.optimiser.moments) {
+            for (order, moment) in [("first", &adam.first), ("second", &adam.second)] {
+                arrays.push(array(format!("{name}.{order}_moment"), &moment[..]));
+            }
+        }
+        write(path, &header, arrays)
+    }
+
+    fn check_finite(&self) -> Result<(), Error> {
+        for ((part, name), adam) in PARTS.into_iter().zip(&self.optimiser.moments) {
+            let values = self.model.parameters.get(part);
+            for (suffix, array) in [("", values), (".first_moment", &adam.first), (".second_moment", &adam.second)] {
+                if let Some(at) = array.iter().position(|v| !v.is_finite()) {
+                    let (step, key) = (self.model.steps_done, format!("{name}{suffix}"));
+                    return Err(Error::Diverged { step, key, value: array[at] });
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// Resumes from a checkpoint of the same scene and configuration; the number of steps may differ.
+    ///
+    /// # Errors
+    /// [`Error::Io`]; [`Error::Array`] and [`Error::File`] for a damaged checkpoint, or one of another scene.
+    pub fn resume(scene: &'a Scene, path: &Path) -> Result<Self, Error> {
+        let bytes = read(path)?;
+        let contents = parse(path, &bytes)?;
+        let trained_on = contents.require("scene")?;
+        if trained_on != scene.name {
+            let what = format!("was trained on scene {trained_on:?}, expected {:?}", scene.name);
+            return Err(contents.corrupt(what));
+        }
+        let config = config_of(&contents)?;
+        let mut trainer = Self::new(scene, config).map_err(|e| contents.corrupt(e.to_string()))?;
+        trainer.model.restore(&contents)?;
+        let steps_done = trainer.model.steps_done;
+        for ((part, name), adam) in PARTS.into_iter().zip(&mut trainer.optimiser.moments) {
+            let count = trainer.model.parameters.get(part).len();
+            adam.first = contents.floats(&format!("{name}.first_moment"), count)?;
+            adam.second = contents.floats(&format!("{name}.second_moment"), count)?;
+            if let Some(at) = adam.second.iter().position(|&v| v < 0.0) {
+                let what = format!("`{name}.second_moment` is {} at {at}, expected at least 0", adam.second[at]);
+                return Err(contents.corrupt(what));
+            }
+            adam.steps = steps_done;
+        }
+        Ok(trainer)
     }
 }

@@ -3,41 +3,42 @@
 use crate::common;
 
 use std::collections::HashMap;
-use std::path::Path;
+use std::sync::OnceLock;
 
 use common::{body, capture, config, scene};
-use occnerf::{Error, Method, Scene, Trainer, checkpoint_config};
+use occnerf::capture::Capture;
+use occnerf::{Config, Error, Method, Scene, Trainer, checkpoint_config};
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
+use smpl::SparseRows;
 use testkit::files::Directory;
 
 /// A checkpoint after two steps.
-fn good(dir: &Directory) -> Vec<u8> {
-    let mut trainer = Trainer::new(scene(), config(Method::Occnerf)).unwrap();
-    trainer.step().unwrap();
-    trainer.step().unwrap();
-    let path = dir.file("good.safetensors");
-    trainer.save(&path).unwrap();
-    std::fs::read(path).unwrap()
+fn good() -> &'static [u8] {
+    static GOOD: OnceLock<Vec<u8>> = OnceLock::new();
+    GOOD.get_or_init(|| saved(config(Method::Occnerf), 2))
 }
 
-fn resume<'a>(scene: &'a Scene, path: &Path, bytes: &[u8]) -> Result<Trainer<'a>, Error> {
-    std::fs::write(path, bytes).unwrap();
-    Trainer::resume(scene, path)
+/// A checkpoint after some steps.
+fn saved(config: Config, steps: usize) -> Vec<u8> {
+    let mut trainer = Trainer::new(scene(), config).unwrap();
+    (0..steps).for_each(|_| assert!(trainer.step().unwrap().loss.is_finite()));
+    let dir = Directory::new("saved");
+    trainer.save(&dir.file("good.safetensors")).unwrap();
+    std::fs::read(dir.file("good.safetensors")).unwrap()
+}
+
+fn resume<'a>(scene: &'a Scene, bytes: &[u8]) -> Result<Trainer<'a>, Error> {
+    let dir = Directory::new("resumed");
+    dir.write("resumed.safetensors", bytes);
+    Trainer::resume(scene, &dir.file("resumed.safetensors"))
 }
 
 /// The message of an error that must come and must name the file.
-fn refused(scene: &Scene, path: &Path, bytes: &[u8], case: &str) -> String {
-    let message = match resume(scene, path, bytes) {
-        Ok(_) => panic!("{case}: accepted"),
-        Err(error) => error.to_string(),
-    };
-    let name = path.file_name().unwrap().to_str().unwrap();
-    assert!(message.contains(name), "{case}: `{message}` does not name the file");
+fn refused(scene: &Scene, bytes: &[u8], case: &str) -> String {
+    let Err(error) = resume(scene, bytes) else { panic!("{case}: accepted") };
+    let message = error.to_string();
+    assert!(message.contains("resumed.safetensors"), "{case}: `{message}` does not name the file");
     message
-}
-
-fn header_length(bytes: &[u8]) -> usize {
-    8 + u64::from_le_bytes(bytes[..8].try_into().unwrap()) as usize
 }
 
 type Arrays = HashMap<String, (Dtype, Vec<usize>, Vec<u8>)>;
@@ -58,91 +59,54 @@ fn forged(bytes: &[u8], change: impl FnOnce(&mut HashMap<String, String>, &mut A
 
 #[test]
 fn a_good_checkpoint_is_accepted_and_saved_again_byte_for_byte() {
-    let dir = Directory::new("good");
-    let bytes = good(&dir);
+    let dir = Directory::new("copy");
     let path = dir.file("copy.safetensors");
-    let trainer = resume(scene(), &path, &bytes).unwrap();
+    let trainer = resume(scene(), good()).unwrap();
     assert_eq!((trainer.steps_done(), trainer.model().config()), (2, &config(Method::Occnerf)));
-    assert_eq!(checkpoint_config(&path).unwrap(), config(Method::Occnerf));
     trainer.save(&path).unwrap();
-    assert!(std::fs::read(&path).unwrap() == bytes);
-    assert!(
-        resume(scene(), &path, &forged(&bytes, |_, _| ())).is_ok(),
-        "taking apart and putting together is harmless"
-    );
+    assert_eq!(checkpoint_config(&path).unwrap(), config(Method::Occnerf));
+    assert!(std::fs::read(&path).unwrap() == good());
+    // Taking apart and putting together is harmless.
+    assert!(resume(scene(), &forged(good(), |_, _| ())).is_ok());
+}
+
+/// The checkpoint with the bytes of an array changed from a number on.
+fn with_bytes(bytes: &[u8], name: &str, at: usize, by: f32) -> Vec<u8> {
+    forged(bytes, |_, arrays| arrays.get_mut(name).unwrap().2[at..at + 4].copy_from_slice(&by.to_le_bytes()))
 }
 
 #[test]
-fn a_checkpoint_cut_short_anywhere_is_refused() {
-    let dir = Directory::new("short");
-    let bytes = good(&dir);
-    let path = dir.file("short.safetensors");
-    let header = header_length(&bytes);
-    let lengths = (0..header).step_by(13).chain(header - 3..header + 3).chain((header..bytes.len()).step_by(997));
-    for length in lengths.chain([bytes.len() - 1]) {
-        refused(scene(), &path, &bytes[..length], &format!("{length} of {} bytes", bytes.len()));
-    }
-    let longer = [bytes.as_slice(), b"more"].concat();
-    refused(scene(), &path, &longer, "bytes behind the end");
-}
-
-#[test]
-fn numbers_that_cannot_be_are_refused_by_name() {
-    let dir = Directory::new("nan");
-    let bytes = good(&dir);
-    let path = dir.file("nan.safetensors");
+fn arrays_that_are_missing_misshapen_or_not_finite_are_refused_by_name() {
     for name in ["field", "table", "vertices.first_moment", "field.second_moment"] {
         for bad in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
-            let forged = forged(&bytes, |_, arrays| {
-                arrays.get_mut(name).unwrap().2[8..12].copy_from_slice(&bad.to_le_bytes());
-            });
-            let message = refused(scene(), &path, &forged, name);
+            let message = refused(scene(), &with_bytes(good(), name, 8, bad), name);
             assert!(message.contains(name) && message.contains("at 2"), "{message}");
         }
     }
     // Adam takes its square root.
-    let forged = forged(&bytes, |_, arrays| {
-        arrays.get_mut("field.second_moment").unwrap().2[..4].copy_from_slice(&(-1.0f32).to_le_bytes());
-    });
-    assert!(refused(scene(), &path, &forged, "negative").contains("field.second_moment"));
-}
-
-#[test]
-fn missing_and_misshapen_arrays_are_refused_by_name() {
-    let dir = Directory::new("shape");
-    let bytes = good(&dir);
-    let path = dir.file("shape.safetensors");
+    let negative = with_bytes(good(), "field.second_moment", 0, -1.0);
+    assert!(refused(scene(), &negative, "negative").contains("field.second_moment"));
     for name in ["field", "table.first_moment", "vertices", "visibility_counts"] {
-        let missing = forged(&bytes, |_, arrays| drop(arrays.remove(name)));
-        assert!(refused(scene(), &path, &missing, name).contains(name));
-        let short = forged(&bytes, |_, arrays| {
-            let (dtype, shape, data) = arrays.get_mut(name).unwrap();
-            shape[0] -= 1;
-            data.truncate(shape[0] * if *dtype == Dtype::U64 { 8 } else { 4 });
-        });
-        assert!(refused(scene(), &path, &short, name).contains("expected"));
-        let square = forged(&bytes, |_, arrays| {
-            let shape = &mut arrays.get_mut(name).unwrap().1;
-            *shape = vec![1, shape[0]];
-        });
-        refused(scene(), &path, &square, name);
-        let integers = forged(&bytes, |_, arrays| {
-            let dtype = &mut arrays.get_mut(name).unwrap().0;
-            *dtype = if *dtype == Dtype::U64 { Dtype::I64 } else { Dtype::I32 };
-        });
-        refused(scene(), &path, &integers, name);
+        let missing = forged(good(), |_, arrays| drop(arrays.remove(name)));
+        assert!(refused(scene(), &missing, name).contains(name));
+        type Change = fn(&mut (Dtype, Vec<usize>, Vec<u8>));
+        let changes: [Change; 3] = [
+            |(dtype, shape, data)| {
+                shape[0] -= 1;
+                data.truncate(shape[0] * if *dtype == Dtype::U64 { 8 } else { 4 });
+            },
+            |(_, shape, _)| shape.insert(0, 1),
+            |(dtype, ..)| *dtype = if *dtype == Dtype::U64 { Dtype::I64 } else { Dtype::I32 },
+        ];
+        for change in changes {
+            let forged = forged(good(), |_, arrays| change(arrays.get_mut(name).unwrap()));
+            assert!(refused(scene(), &forged, name).contains("expected"));
+        }
     }
 }
 
 #[test]
 fn foreign_headers_are_refused_and_say_what_was_expected() {
-    let dir = Directory::new("header");
-    let bytes = good(&dir);
-    let path = dir.file("header.safetensors");
-    let set = |key: &'static str, value: &str| {
-        let value = value.to_owned();
-        forged(&bytes, move |header, _| drop(header.insert(key.to_owned(), value)))
-    };
     for (key, value, hint) in [
         ("format", "something-else", "something-else"),
         ("version", "3", "version 3"),
@@ -156,28 +120,16 @@ fn foreign_headers_are_refused_and_say_what_was_expected() {
         ("config", "seed = 1", "config"),
         ("config", "not toml at all [", "config"),
     ] {
-        let message = refused(scene(), &path, &set(key, value), key);
+        let with = forged(good(), |header, _| drop(header.insert(key.to_owned(), value.to_owned())));
+        let message = refused(scene(), &with, key);
         assert!(message.contains(hint), "{key} = {value}: {message}");
+        let without = forged(good(), |header, _| drop(header.remove(key)));
+        refused(scene(), &without, key);
     }
-    for key in ["format", "version", "scene", "steps_done", "config"] {
-        let without = forged(&bytes, |header, _| drop(header.remove(key)));
-        refused(scene(), &path, &without, key);
-    }
-}
-
-/// The checkpoint with one line of its configuration replaced.
-fn edited(bytes: &[u8], key: &str, by: &str) -> Vec<u8> {
-    forged(bytes, |header, _| {
-        let config = header.get_mut("config").unwrap();
-        *config = common::replace_line(config, key, by);
-    })
 }
 
 #[test]
 fn configurations_that_cannot_be_run_are_refused() {
-    let dir = Directory::new("config");
-    let bytes = good(&dir);
-    let path = dir.file("config.safetensors");
     for (key, by) in [
         ("samples", "samples = 0"),
         ("width", "width = 100000"),
@@ -193,32 +145,31 @@ fn configurations_that_cannot_be_run_are_refused() {
         ("k", "k = 5"),
         ("coarse_levels", "coarse_levels = 0"),
     ] {
-        refused(scene(), &path, &edited(&bytes, key, by), by);
+        let edited = forged(good(), |header, _| {
+            let config = header.get_mut("config").unwrap();
+            *config = common::replace_line(config, key, by);
+        });
+        refused(scene(), &edited, by);
     }
 }
 
 #[test]
 fn another_body_or_another_scene_is_refused() {
-    let dir = Directory::new("scene");
-    let bytes = good(&dir);
-    let path = dir.file("scene.safetensors");
     let config = config(Method::Occnerf);
-    let mut renamed = capture();
-    renamed.name = "someone else".to_owned();
+    let renamed = Capture { name: "someone else".to_owned(), ..capture() };
     let other = Scene::new(&renamed, body(), &config).unwrap();
-    let message = refused(&other, &path, &bytes, "name");
+    let message = refused(&other, good(), "name");
     assert!(message.contains("someone else") && message.contains("ellipsoid"), "{message}");
     // The same name, but a body of other vertices.
     let mut finer = body().clone();
     finer.v_template.push(finer.v_template[0]);
     finer.shapedirs.push(finer.shapedirs[0]);
-    finer.posedirs = smpl::SparseRows::from_rows(finer.v_template.iter().map(|_| Vec::<(u32, glam::Vec3)>::new()));
-    let rows = (0..finer.v_template.len() - 1).chain([0]);
-    let rows: Vec<Vec<(u32, f32)>> =
-        rows.map(|v| body().weights.row(v).map(|(joint, w)| (joint as u32, w)).collect()).collect();
-    finer.weights = smpl::SparseRows::from_rows(rows);
+    let vertices = finer.v_template.len();
+    finer.posedirs = SparseRows::from_rows(vec![Vec::<(u32, glam::Vec3)>::new(); vertices]);
+    let row = |v: usize| body().weights.row(v).map(|(joint, w)| (joint as u32, w));
+    finer.weights = SparseRows::from_rows((0..vertices - 1).chain([0]).map(row));
     let other = Scene::new(&capture(), &finer, &config).unwrap();
-    refused(&other, &path, &bytes, "vertices");
+    refused(&other, good(), "vertices");
 }
 
 #[test]
@@ -242,11 +193,7 @@ fn files_that_are_not_there_or_not_files_are_named() {
 fn a_training_that_has_diverged_leaves_the_good_checkpoint_alone() {
     let dir = Directory::new("diverged");
     let mut config = config(Method::HashPoint);
-    let path = dir.file("good.safetensors");
-    let mut trainer = Trainer::new(scene(), config.clone()).unwrap();
-    trainer.step().unwrap();
-    trainer.save(&path).unwrap();
-    let bytes = std::fs::read(&path).unwrap();
+    let (path, bytes) = (dir.file("good.safetensors"), saved(config.clone(), 1));
     (config.rates.field, config.rates.table) = (f32::MAX, f32::MAX);
     let mut wild = Trainer::new(scene(), config).unwrap();
     let mut outcome = wild.save(&path);
@@ -266,22 +213,14 @@ fn a_training_that_has_diverged_leaves_the_good_checkpoint_alone() {
 
 #[test]
 fn a_checkpoint_must_say_how_far_its_field_reaches() {
-    let dir = Directory::new("shell");
-    let path = dir.file("shell.safetensors");
     let mut config = config(Method::Occnerf);
     config.motion.shell_interval = 1;
-    let mut trainer = Trainer::new(scene(), config).unwrap();
-    trainer.step().unwrap();
-    trainer.step().unwrap();
-    trainer.save(&path).unwrap();
-    let bytes = std::fs::read(&path).unwrap();
-    assert!(resume(scene(), &path, &forged(&bytes, |_, _| ())).is_ok());
+    let bytes = saved(config, 2);
+    assert!(resume(scene(), &forged(&bytes, |_, _| ())).is_ok());
     for end in [-0.01f32, 7.0, f32::NAN, f32::INFINITY] {
-        let forged =
-            forged(&bytes, |_, arrays| arrays.get_mut("shell").unwrap().2[4..8].copy_from_slice(&end.to_le_bytes()));
-        let message = refused(scene(), &path, &forged, "an end beyond the margin");
+        let message = refused(scene(), &with_bytes(&bytes, "shell", 4, end), "an end beyond the margin");
         assert!(message.contains("`shell` is") && message.contains("at 1"), "{message}");
     }
     let without = forged(&bytes, |_, arrays| drop(arrays.remove("shell")));
-    assert!(refused(scene(), &path, &without, "no shell").contains("`shell`"));
+    assert!(refused(scene(), &without, "no shell").contains("`shell`"));
 }

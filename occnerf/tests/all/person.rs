@@ -8,8 +8,7 @@ use common::{body, capture, config, scene};
 use glam::Vec3;
 use occnerf::capture::{Mended, Registered};
 use occnerf::{
-    Error, FieldRenderer, Method, Model, MotionKind, Person, PriorColors, PriorRenderer, Renderer, Scene, Trainer,
-    mend_masks,
+    Error, FieldRenderer, Method, Model, MotionKind, Person, PriorColors, Renderer, Scene, Trainer, mend_masks,
 };
 use smpl::BodyModel;
 use synth::{DemoConfig, demo};
@@ -136,20 +135,6 @@ fn a_run_goes_on_with_the_colours_that_it_began_with() {
 }
 
 #[test]
-fn the_prior_of_a_run_draws_the_same_bits_too() {
-    let dir = Directory::new("person-prior");
-    let colors = PriorColors::measure(scene()).unwrap();
-    let run = dir.file("");
-    Person::save(&run, &scene().registered, body(), &colors).unwrap();
-    let person = Person::load(&run, &config(Method::Prior)).unwrap();
-    assert_eq!((person.scene.as_str(), &person.colors), (scene().name.as_str(), &colors));
-    let view = &scene().train[1].view;
-    let drawn = PriorRenderer::new(&scene().body, &colors).render(view, Vec3::ONE).unwrap();
-    let again = PriorRenderer::new(&person.body, &person.colors).render(&person.frames[1], Vec3::ONE).unwrap();
-    assert!(drawn.image.pixels == again.image.pixels);
-}
-
-#[test]
 fn what_is_missing_or_damaged_is_named() {
     let dir = Directory::new("person-damage");
     let run = dir.file("");
@@ -159,40 +144,34 @@ fn what_is_missing_or_damaged_is_named() {
     let whole = std::fs::read(run.join(PERSON)).unwrap();
     std::fs::remove_file(run.join(PERSON)).unwrap();
     assert!(said().contains(PERSON) && said().contains("--resume"), "{}", said());
+    let check = |bytes: &[u8], words: &[&str]| {
+        std::fs::write(run.join(PERSON), bytes).unwrap();
+        let said = said();
+        assert!(words.iter().all(|word| said.contains(word)), "{words:?}: {said}");
+    };
     for cut in [0, 7, 100, whole.len() / 2, whole.len() - 1] {
-        std::fs::write(run.join(PERSON), &whole[..cut]).unwrap();
-        assert!(said().contains(PERSON), "{cut}: {}", said());
+        check(&whole[..cut], &[PERSON]);
     }
-    // A NaN, a camera of no size, and a number of frames that the arrays do not have.
-    let start = 8 + u64::from_le_bytes(whole[..8].try_into().unwrap()) as usize;
-    for (bytes, at) in [([0, 0, 0xc0, 0x7f], start + 64), ([0xff, 0xff, 0xff, 0xff], start)] {
+    let damage = |at: usize, bytes: &[u8], words: &[&str]| {
         let mut damaged = whole.clone();
-        damaged[at..at + 4].copy_from_slice(&bytes);
-        std::fs::write(run.join(PERSON), damaged).unwrap();
-        assert!(said().contains(PERSON), "{}", said());
-    }
+        damaged[at..at + bytes.len()].copy_from_slice(bytes);
+        check(&damaged, words);
+    };
+    // A NaN, and a camera of no size.
+    let start = 8 + u64::from_le_bytes(whole[..8].try_into().unwrap()) as usize;
+    damage(start + 64, &[0, 0, 0xc0, 0x7f], &[PERSON]);
+    damage(start, &[0xff; 4], &[PERSON]);
     // Numbers that no capture has.
     let parsed = safetensors::SafeTensors::deserialize(&whole).unwrap();
     for key in ["poses", "betas", "placements", "cameras", "colors", "light"] {
         let at = parsed.tensor(key).unwrap().data().as_ptr() as usize - whole.as_ptr() as usize + 4;
-        let mut damaged = whole.clone();
-        damaged[at..at + 4].copy_from_slice(&1e38f32.to_le_bytes());
-        std::fs::write(run.join(PERSON), damaged).unwrap();
-        assert!(said().contains(PERSON) && said().contains(key), "{key}: {}", said());
+        damage(at, &1e38f32.to_le_bytes(), &[PERSON, key]);
     }
-    let claim = b"\"frames\":\"2\"";
-    let claimed = whole.windows(claim.len()).position(|w| w == claim).unwrap();
-    let mut damaged = whole.clone();
-    damaged[claimed + 10] = b'9';
-    std::fs::write(run.join(PERSON), damaged).unwrap();
-    assert!(said().contains("expected F32 [144]"), "{}", said());
-    let claim = b"\"subdivisions\":\"";
-    let claimed = whole.windows(claim.len()).position(|w| w == claim).unwrap();
-    for digit in *b"9x" {
-        let mut damaged = whole.clone();
-        damaged[claimed + claim.len()] = digit;
-        std::fs::write(run.join(PERSON), damaged).unwrap();
-        assert!(said().contains("`subdivisions`") && said().contains("fits the body"), "{}", said());
+    // More than the arrays and the body have.
+    let after = |text: &str| whole.windows(text.len()).position(|w| w == text.as_bytes()).unwrap() + text.len();
+    damage(after("\"frames\":\""), b"9", &["expected F32 [144]"]);
+    for digit in [b"9", b"x"] {
+        damage(after("\"subdivisions\":\""), digit, &["`subdivisions`", "fits the body"]);
     }
     std::fs::write(run.join(PERSON), &whole).unwrap();
     assert!(Model::load(&run).is_ok());

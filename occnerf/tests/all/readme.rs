@@ -1,77 +1,35 @@
-//! The README's table of presets is made from the presets.
+//! The README's settings of the presets are made from the presets.
 
-use occnerf::{Config, DistanceKind, Method, MotionKind, Preset};
+use occnerf::{Config, Method, Preset};
 
-fn row(name: &str, cell: impl Fn(&Config) -> String) -> String {
-    let presets = [Preset::Fast, Preset::Balanced, Preset::Paper];
-    let cells = presets.map(|preset| cell(&Config::preset(preset, Method::Occnerf)));
-    format!("| {name} | {} |\n", cells.join(" | "))
-}
-
-fn centimetres(metres: f32) -> f32 {
-    (metres * 1000.0).round() / 10.0
-}
-
-fn table() -> String {
-    let head = "| | `fast` | `balanced` | `paper` |\n| --- | --- | --- | --- |\n".to_owned();
-    let rows = [
-        row("steps", |c| c.steps.to_string()),
-        row("patches a step, side in pixels, samples a ray", |c| {
-            format!("{}, {}, {}", c.patches, c.patch_size, c.samples)
-        }),
-        row("hidden layers of F × width", |c| format!("{} × {}", c.field.depth, c.field.width)),
-        row("hash grid: levels × features, table, cells an axis", |c| {
-            let e = &c.encoding;
-            format!("{} × {}, 2^{}, {} to {}", e.levels, e.features, e.log2_table_size, e.n_min, e.n_max)
-        }),
-        row("d is told apart in, m", |c| format!("{} to {}", c.encoding.distance_min, c.encoding.distance_max)),
-        row("neighbours × levels of the surface term", |c| match c.surface.surface_term {
-            true => format!("{} × {}", c.surface.k, c.surface.coarse_levels + 1),
-            false => "none".to_owned(),
-        }),
-        row("[v̂, d]", |c| {
-            let name = match c.surface.distance {
-                DistanceKind::Blended => "blend of vertices",
-                DistanceKind::Exact => "closest point",
-            };
-            name.to_owned()
-        }),
-        row("motion field", |c| {
-            let name = match c.motion.kind {
-                MotionKind::Volume => "Gaussian volume",
-                MotionKind::Surface => "nearest surface",
-            };
-            name.to_owned()
-        }),
-        row("reach outside, depth inside, cm", |c| {
-            let [reach, depth] = [c.motion.reach(), c.motion.depth].map(centimetres);
-            format!("{reach}, {depth}")
-        }),
-        row("colours start from", |c| if c.field.prior_colors { "the prior's" } else { "grey" }.to_owned()),
-        row("transmittance behind which samples are left out", |c| match c.min_transmittance {
-            0.0 => "none".to_owned(),
-            t if t < 1e-4 => format!("{t:.0e}"),
-            t => t.to_string(),
-        }),
-        row("steps between looks at where the field is empty", |c| match c.motion.shell_interval {
-            0 => "none".to_owned(),
-            steps => steps.to_string(),
-        }),
-        row("λ of squared error, perceptual, completeness", |c| {
-            format!("{}, {}, {}", c.loss.mse, c.loss.perceptual, c.loss.completeness)
-        }),
-        row("rounds of registration, light", |c| format!("{}, {}", c.registration.rounds, c.field.prior_light)),
-        row("rates of F, vertices, table, motion", |c| {
-            let r = &c.rates;
-            format!("{:e}, {:e}, {:e}, {:e}", r.field, r.vertices, r.table, r.motion)
-        }),
-        row("rates fall to", |c| c.rates.final_fraction.to_string()),
-    ];
-    head + &rows.concat()
+/// Keys, with the names of their tables, and values of a preset.
+fn settings(preset: Preset) -> Vec<(String, String)> {
+    let (mut found, mut table) = (Vec::new(), String::new());
+    let text = toml::to_string(&Config::preset(preset, Method::Occnerf)).unwrap();
+    for line in text.lines() {
+        match line.split_once(" = ") {
+            Some((key, value)) => found.push((format!("{table}{key}"), value.to_owned())),
+            None => table = line.trim_matches(['[', ']']).to_owned() + ".",
+        }
+    }
+    // The first two are the names of preset and method.
+    found.split_off(2)
 }
 
 #[test]
 fn the_readme_shows_the_presets_as_they_are() {
+    let presets = [Preset::Fast, Preset::Balanced, Preset::Paper].map(settings);
+    let (mut rows, mut same) = (String::new(), Vec::new());
+    for (i, (key, value)) in presets[0].iter().enumerate() {
+        let cells = presets.each_ref().map(|preset| preset[i].1.as_str());
+        match cells.iter().all(|cell| cell == value) {
+            true => same.push(format!("`{key}` {value}")),
+            false => rows += &format!("| `{key}` | {} |\n", cells.join(" | ")),
+        }
+    }
+    let head = "| | `fast` | `balanced` | `paper` |\n| --- | --- | --- | --- |\n";
+    let shown = format!("{head}{rows}\nThe same in all: {}.\n", same.join(", "));
+    let words = |text: &str| text.split_whitespace().collect::<Vec<_>>().join(" ");
     let readme = include_str!("../../README.md");
-    assert!(readme.contains(&table()), "the table should be\n\n{}", table());
+    assert!(words(readme).contains(&words(&shown)), "the settings should be\n\n{shown}");
 }

@@ -1,16 +1,14 @@
 //! `export` and `view` of a run, and one clear line for whatever is wrong.
 
 use crate::common;
-use crate::stand_in;
-
 use std::path::{Path, PathBuf};
 
 use array_files::{Data, NdArray, npz};
 use common::{done, folder, refused, text};
 use glam::Vec3;
-use occnerf::bake::Avatar;
+use occnerf::bake::fit;
 use occnerf::capture::Layout;
-use occnerf::{Config, Method, Preset, PriorColors, Scene};
+use occnerf::{Config, Method, Preset, Scene};
 use synth::{DemoConfig, demo};
 
 const HOSTILE: &str = "</script><img src=x onerror=alert(1)>\" onload='";
@@ -21,7 +19,7 @@ fn run(name: &str) -> PathBuf {
     let body = smpl::BodyModel::embedded();
     let capture = demo(&DemoConfig { size: 24, frames: 3, eval_cameras: 1, ..Default::default() }, &body).unwrap();
     let scene = Scene::new(&capture, &body, &Config::preset(Preset::Fast, Method::Occnerf)).unwrap();
-    let mut avatar: Avatar = stand_in::stand_in(&scene, &PriorColors::measure(&scene).unwrap());
+    let (mut avatar, _) = fit(&scene).unwrap();
     avatar.name = HOSTILE.to_owned();
     avatar.clips[0].name = HOSTILE.to_owned();
     avatar.save(&directory.join("avatar.safetensors")).unwrap();

@@ -13,6 +13,4 @@ mod faults;
 mod import;
 mod list;
 mod own_video;
-#[path = "../../../occnerf/tests/all/common/stand_in.rs"]
-mod stand_in;
 mod surface;

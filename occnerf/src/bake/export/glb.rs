@@ -1,12 +1,13 @@
-//! glTF 2.0 binary: skinned mesh, skeleton, atlas, motions.
+//! glTF 2.0 binary: skinned mesh, skeleton, atlas, motions; and VRM 1.0, a humanoid in glTF with
+//! its licence.
 
 use glam::{Quat, Vec3};
-use serde_json::{Value, json};
+use serde_json::{Map, Value, json};
+use smpl::{BoneNames, SparseRows};
 use volrender::Aabb;
 
 use crate::Error;
-use crate::bake::export::Vrm;
-use crate::bake::{Avatar, Clip};
+use crate::bake::{Avatar, Clip, Joint, motion_of_bones};
 
 /// Component types of glTF.
 const UNSIGNED_BYTE: u32 = 5121;
@@ -35,24 +36,18 @@ pub struct GlbOptions<'a> {
 impl Avatar {
     /// glTF 2.0 binary (`.glb`).
     ///
-    /// One skinned mesh (`POSITION`, `NORMAL`, `TEXCOORD_0`, `JOINTS_0`,
-    /// `WEIGHTS_0` in 16 bits), `KHR_materials_unlit`, the atlas as PNG, a node a joint with the rest
-    /// pose as bind pose, and an animation a clip. The atlas is under even light; that of the video is the scene's extra
-    /// `light`, a vector s: a surface with unit normal n is max(1 + s · n + ½ |s| ((ŝ · n)² − ⅓), 0.2)
-    /// times as bright, see [`crate::capture::Light`]. Pose blend shapes and confidence are left out.
+    /// One skinned mesh (`POSITION`, `NORMAL`, `TEXCOORD_0`, `JOINTS_0`, `WEIGHTS_0` in 16 bits),
+    /// `KHR_materials_unlit`, the atlas as PNG, a node a joint with the rest pose as bind pose, and an
+    /// animation a clip. The atlas is under even light; that of the video is the scene's extra `light`,
+    /// a vector s: a surface with unit normal n is max(1 + s · n + ½ |s| ((ŝ · n)² − ⅓), 0.2) times as
+    /// bright, see [`crate::capture::Light`]. Pose blend shapes and confidence are left out.
+    ///
+    /// A VRM 1.0 has the extension `VRMC_vrm` with `humanoid` and `meta`; its rest pose, and bind pose,
+    /// is the person with level arms, [`Avatar::with_level_arms`].
     ///
     /// # Errors
-    /// [`Error::Bake`] with what [`Avatar::validate`] finds, and for more than 4 GiB.
-    pub fn to_glb(&self) -> Result<Vec<u8>, Error> {
-        self.to_glb_with(&GlbOptions::default())
-    }
-
-    /// The same with options. A VRM 1.0 has the extension `VRMC_vrm` with `humanoid` and `meta`; its
-    /// rest pose, and bind pose, is the person with level arms, [`Avatar::with_level_arms`].
-    ///
-    /// # Errors
-    /// As [`Avatar::to_glb`]; [`Error::Bake`] for a VRM of a skeleton without the fifteen joints that
-    /// it must have.
+    /// [`Error::Bake`] with what [`Avatar::validate`] finds, for more than 4 GiB, and for a VRM of a
+    /// skeleton without the fifteen joints that it must have.
     pub fn to_glb_with(&self, options: &GlbOptions<'_>) -> Result<Vec<u8>, Error> {
         let Some(vrm) = &options.vrm else { return self.gltf(options, None) };
         self.validate().map_err(Error::Bake)?;
@@ -294,17 +289,117 @@ impl File {
     }
 }
 
+/// Licence document of VRM 1.0, the one that the format admits.
+pub const VRM_LICENCE: &str = "https://vrm.dev/licenses/1.0/";
+/// Human bones that a VRM must have.
+const REQUIRED: [&str; 15] = [
+    "hips",
+    "spine",
+    "head",
+    "leftUpperLeg",
+    "rightUpperLeg",
+    "leftLowerLeg",
+    "rightLowerLeg",
+    "leftFoot",
+    "rightFoot",
+    "leftUpperArm",
+    "rightUpperArm",
+    "leftLowerArm",
+    "rightLowerArm",
+    "leftHand",
+    "rightHand",
+];
+
+/// Authorship and licence of a VRM.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Vrm<'a> {
+    /// Name of the author.
+    pub author: &'a str,
+    /// Address of the licence: [`VRM_LICENCE`], or one that is added to it as `otherLicenseUrl`.
+    pub licence: &'a str,
+}
+
+impl Vrm<'_> {
+    /// The extension `VRMC_vrm`; node j of the glTF is joint j.
+    pub(super) fn extension(&self, avatar: &Avatar) -> Result<Value, Error> {
+        let bones: Map<String, Value> = (human_bones(&avatar.skeleton).into_iter().enumerate())
+            // The ends of SMPL's hands are no human bones.
+            .filter_map(|(j, name)| Some((name.filter(|name| !name.ends_with("End"))?, json!({ "node": j }))))
+            .collect();
+        let missing: Vec<&str> = REQUIRED.into_iter().filter(|bone| !bones.contains_key(*bone)).collect();
+        if !missing.is_empty() {
+            return Err(Error::Bake(format!("VRM: no joint by name for {}", missing.join(", "))));
+        }
+        let name = if avatar.name.is_empty() { "person" } else { &avatar.name };
+        let mut meta = json!({ "name": name, "authors": [self.author], "licenseUrl": VRM_LICENCE });
+        if self.licence != VRM_LICENCE {
+            meta["otherLicenseUrl"] = json!(self.licence);
+        }
+        Ok(json!({ "specVersion": "1.0", "meta": meta, "humanoid": { "humanBones": bones } }))
+    }
+}
+
+/// VRM's name of each joint that has one.
+fn human_bones(skeleton: &[Joint]) -> Vec<Option<String>> {
+    let names: Vec<&str> = skeleton.iter().map(|joint| joint.name.as_str()).collect();
+    BoneNames::Vrm.translate(&names)
+}
+
+impl Avatar {
+    /// The avatar at rest with arms level along x, as a T-pose has them; motions stay what they are.
+    /// Pose blend shapes are left out.
+    ///
+    /// # Errors
+    /// [`Error::Bake`] for a skeleton whose arms are not known by name.
+    pub fn with_level_arms(&self) -> Result<Self, Error> {
+        let bones = human_bones(&self.skeleton);
+        let joint = |name: &str| {
+            let found = bones.iter().position(|bone| bone.as_deref() == Some(name));
+            found.ok_or_else(|| Error::Bake(format!("no joint by name for {name}")))
+        };
+        // Rotations relative to the rest pose, of the joint alone and with those above it.
+        let (mut pose, mut globals) = (vec![Vec3::ZERO; self.num_joints()], vec![Quat::IDENTITY; self.num_joints()]);
+        let mut levelled = vec![None; self.num_joints()];
+        for (side, along) in [("left", Vec3::X), ("right", Vec3::NEG_X)] {
+            let [upper, lower, hand] = ["UpperArm", "LowerArm", "Hand"].map(|bone| joint(&format!("{side}{bone}")));
+            let [upper, lower, hand] = [upper?, lower?, hand?];
+            for (from, to) in [(upper, lower), (lower, hand)] {
+                let arm = self.skeleton[to].rest - self.skeleton[from].rest;
+                levelled[from] = arm.try_normalize().map(|arm| Quat::from_rotation_arc(arm, along));
+            }
+        }
+        for (j, joint) in self.skeleton.iter().enumerate() {
+            let above = joint.parent.map_or(Quat::IDENTITY, |parent| globals[usize::from(parent)]);
+            globals[j] = levelled[j].unwrap_or(above);
+            pose[j] = (above.inverse() * globals[j]).to_scaled_axis();
+        }
+        let to_level = self.bones(&pose, Vec3::ZERO);
+        let mut avatar = self.clone();
+        (avatar.vertices, avatar.normals) = self.skin(&to_level, &pose);
+        avatar.posedirs = SparseRows::from_rows(vec![Vec::<(u32, Vec3)>::new(); self.num_vertices()]);
+        for (joint, bone) in avatar.skeleton.iter_mut().zip(&to_level) {
+            joint.rest = bone.transform_point3(joint.rest);
+        }
+        let from_level: Vec<_> = to_level.iter().map(glam::Affine3A::inverse).collect();
+        for clip in &mut avatar.clips {
+            let motion = &clip.motion;
+            let frames = motion.poses.chunks_exact(motion.num_joints).zip(&motion.trans).map(|(pose, &trans)| {
+                self.bones(pose, trans).into_iter().zip(&from_level).map(|(bone, level)| bone * *level).collect()
+            });
+            clip.motion = motion_of_bones(&avatar.skeleton, &frames.collect::<Vec<_>>(), motion.fps);
+        }
+        Ok(avatar)
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::quantised;
 
     #[test]
     fn weights_add_up_whatever_they_are() {
-        let mut seed = 7u32;
-        let mut next = || {
-            seed = seed.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
-            (seed >> 8) as f32 / (1 << 24) as f32
-        };
+        let mut random = volrender::RandomStream::new(&[7]);
+        let mut next = || random.uniform();
         for _ in 0..2000 {
             let raw = [next(), next().powi(4), next().powi(9), if next() < 0.5 { 0.0 } else { next() * 1e-6 }];
             let sum: f32 = raw.iter().sum();

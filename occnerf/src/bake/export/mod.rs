@@ -4,13 +4,11 @@ mod glb;
 mod mesh;
 mod motion;
 mod splats;
-mod vrm;
 
-pub use glb::GlbOptions;
+pub use glb::{GlbOptions, VRM_LICENCE, Vrm};
 pub use mesh::write_obj;
 pub use motion::{fit_motion, write_amass};
 pub use splats::{Splats, splats};
-pub use vrm::{VRM_LICENCE, Vrm};
 
 use std::io::Cursor;
 

@@ -3,8 +3,8 @@
 use glam::Vec3;
 
 use crate::capture::Light;
-use crate::scene::light::{ColorObservation, albedo, lamp};
 use crate::scene::registration::observations::Observations;
+use crate::scene::seen::{ColorObservation, albedo, lamp};
 
 /// Least standard deviation of a colour residual, and least number of frames that observe a vertex.
 const NOISE: f32 = 0.05;

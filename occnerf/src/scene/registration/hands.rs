@@ -4,7 +4,7 @@ use glam::Vec3;
 use rayon::prelude::*;
 use smpl::BodyModel;
 
-use crate::scene::registration::crop::Crop;
+use crate::scene::registration::observations::Crop;
 
 /// Curls that are compared.
 const CURLS: [f32; 3] = [0.0, 0.5, 1.0];

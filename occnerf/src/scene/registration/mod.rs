@@ -1,22 +1,19 @@
 //! Registration: corrects poses, placement and shape of the prior on all frames before training.
 //!
-//! Outline residuals are distances from the outline of the posed prior to the mask's along the image
-//! normal (Kass, Witkin and Terzopoulos 1988), where no occluder is in front. Clothes are an offset
-//! a vertex, constant over the frames: its mean over the frames with that vertex on the outline.
-//! Colour residuals follow (Lucas and Kanade 1981): one albedo a vertex under one light, whose
-//! shading tells rotations out of the image plane (Horn 1970). Gauss-Newton steps solve for all
-//! frames at once, under a stationary autoregressive model of the pose errors ([`PoseErrorModel`])
-//! and a Gaussian pose prior ([`pose_prior`]), both estimated from the video; so occluded frames
-//! follow their neighbours.
+//! Outline residuals are distances from the outline of the posed prior to the mask's along the
+//! image normal (Kass, Witkin and Terzopoulos 1988), where no occluder is in front. Clothes are an
+//! offset a vertex, constant over the frames: its mean over the frames with that vertex on the
+//! outline. Colour residuals follow (Lucas and Kanade 1981): one albedo a vertex under one light,
+//! whose shading tells rotations out of the image plane (Horn 1970). Gauss-Newton steps solve for
+//! all frames at once, under a stationary autoregressive model of the pose errors
+//! ([`PoseErrorModel`]) and a Gaussian pose prior ([`pose_prior`]), both estimated from the video;
+//! so occluded frames follow their neighbours.
 
 mod colors;
 mod corrections;
-mod crop;
 mod equations;
 mod hands;
-mod keypoints;
 mod observations;
-mod pose_error;
 mod pose_prior;
 mod system;
 #[cfg(test)]
@@ -33,12 +30,10 @@ use volrender::{Aabb, Camera};
 use self::colors::Colors;
 pub(crate) use self::colors::{deviation, robust};
 use self::corrections::{Correction, corrected};
-pub(crate) use self::crop::Crop;
-use self::equations::{BETA_STEP, Equations, Perspective};
-use self::keypoints::{DetectorModel, FramePoints};
+use self::equations::{BETA_STEP, DetectorModel, Equations, FramePoints, Perspective};
 use self::observations::SharedEdge;
-pub(crate) use self::observations::{Edge, ObservationOptions, Observations, observe, shared_edges};
-use self::pose_error::PoseErrorModel;
+pub(crate) use self::observations::{Crop, Edge, ObservationOptions, Observations, observe, shared_edges};
+use self::pose_prior::PoseErrorModel;
 use self::system::{NormalEquations, Prior, Solution, solve};
 use crate::Error;
 use crate::capture::{Capture, Frame, Keypoint, Mended, Registered};

@@ -35,24 +35,24 @@ pub fn body() -> &'static BodyModel {
     })
 }
 
-/// Some metres from the middle, at an angle about the vertical.
-fn camera(turn: f32, metres: f32) -> Camera {
+/// Three metres from the middle, at an angle about the vertical.
+fn camera(turn: f32) -> Camera {
     let flip = Mat3::from_cols(Vec3::X, -Vec3::Y, -Vec3::Z);
     let focal = 1.4 * SIZE as f32;
     let middle = 0.5 * SIZE as f32;
     let intrinsics = Mat3::from_cols(Vec3::X * focal, Vec3::Y * focal, Vec3::new(middle, middle, 1.0));
-    let extrinsics = Affine3A::from_mat3_translation(flip * Mat3::from_rotation_y(-turn), Vec3::Z * metres);
+    let extrinsics = Affine3A::from_mat3_translation(flip * Mat3::from_rotation_y(-turn), Vec3::Z * 3.0);
     Camera::new(intrinsics, extrinsics, SIZE, SIZE).unwrap()
 }
 
 /// What a camera sees of the ellipsoid, coloured by position; the left `hidden` columns are behind
 /// something.
-fn frame(index: usize, turn: f32, hidden: usize, metres: f32) -> Frame {
+fn frame(index: usize, turn: f32, hidden: usize) -> Frame {
     let placement = Placement::Origin { rotation: Vec3::ZERO, translation: Vec3::ZERO };
     let pose = vec![Vec3::ZERO; 2];
     let posed = body().pose(&body().shaped(&[]), &pose, placement);
     let mesh = RayMesh::new(&posed.vertices, &body().faces).unwrap();
-    let camera = camera(turn, metres);
+    let camera = camera(turn);
     let (mut image, mut mask) = (Image::new(SIZE, SIZE), vec![0.0; (SIZE * SIZE) as usize]);
     for i in 0..mask.len() {
         let (column, row) = (i % SIZE as usize, i / SIZE as usize);
@@ -77,20 +77,15 @@ fn frame(index: usize, turn: f32, hidden: usize, metres: f32) -> Frame {
 
 /// Two training frames three metres away, the second half hidden, and two frames kept back.
 pub fn capture() -> Capture {
-    capture_from(3.0)
-}
-
-/// The same from elsewhere.
-pub fn capture_from(metres: f32) -> Capture {
     let eval = [2.0, 4.0].into_iter().enumerate().map(|(train_index, turn)| EvalFrame {
         camera_name: format!("Camera_B{}", train_index + 2),
         train_index,
-        frame: frame(train_index, turn, 0, metres),
+        frame: frame(train_index, turn, 0),
     });
     let half = SIZE as usize / 2;
     Capture {
         name: "ellipsoid".to_owned(),
-        train: vec![frame(0, 0.0, 0, metres), frame(1, 1.0, half, metres)],
+        train: vec![frame(0, 0.0, 0), frame(1, 1.0, half)],
         eval: eval.collect(),
         mean_betas: vec![0.0],
     }

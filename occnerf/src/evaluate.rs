@@ -11,7 +11,7 @@ use volrender::metrics;
 
 use crate::Error;
 use crate::capture::Pixels;
-use crate::render::picture::{Renderer, Rendering};
+use crate::render::{Renderer, Rendering};
 use crate::scene::labels::Label;
 use crate::scene::prepared::{PreparedFrame, Scene};
 
