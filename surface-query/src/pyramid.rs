@@ -1,5 +1,9 @@
 use glam::{DVec3, Vec3};
 
+/// Points of a leaf of the sampling tree: smaller leaves skip more distances but cost more box
+/// tests.
+const BUCKET: usize = 32;
+
 /// Nested subsets of a point set: level 0 holds every point, each further level a farthest point
 /// sampling of the level above it.
 ///
@@ -56,29 +60,141 @@ impl Pyramid {
 /// ```
 ///
 /// Distances are compared in `f64`, in which the squared distance of two `f32` points is exact or
-/// nearly so. Points that are not finite are chosen last, in the order of their indices. Takes a
-/// nanosecond for each pair of a point and a sample.
+/// nearly so. Points that are not finite are chosen last, in the order of their indices.
+///
+/// A k-d tree of buckets (Han et al., *QuickFPS*, 2023) skips the boxes that a new sample cannot
+/// change.
 #[must_use]
 pub fn farthest_points(points: &[Vec3], count: usize) -> Vec<u32> {
     let count = count.min(points.len());
-    let (finite, others): (Vec<u32>, Vec<u32>) =
+    let (mut finite, others): (Vec<u32>, Vec<u32>) =
         (0..points.len() as u32).partition(|&i| points[i as usize].is_finite());
-    let positions: Vec<DVec3> = finite.iter().map(|&i| points[i as usize].as_dvec3()).collect();
-    // Squared distances to the nearest chosen point; −1 once chosen itself.
-    let mut gaps = vec![f64::INFINITY; positions.len()];
     let mut chosen = Vec::with_capacity(count);
-    let mut next = 0;
-    while chosen.len() < count.min(positions.len()) {
-        chosen.push(finite[next]);
-        gaps[next] = -1.0;
-        let (sample, mut farthest) = (positions[next], -1.0);
-        for (i, (gap, position)) in gaps.iter_mut().zip(&positions).enumerate() {
-            *gap = gap.min(position.distance_squared(sample));
-            if *gap > farthest {
-                (farthest, next) = (*gap, i);
-            }
+    if !finite.is_empty() {
+        let mut root = Node::new(points, &mut finite);
+        while chosen.len() < count && root.gap >= 0.0 {
+            let index = root.farthest;
+            chosen.push(index);
+            root.take_farthest();
+            root.update(points[index as usize].as_dvec3());
         }
     }
     chosen.extend(others.into_iter().take(count - chosen.len()));
     chosen
+}
+
+/// A subset of the points, its box, and its largest distance to the chosen points.
+struct Node {
+    min: DVec3,
+    max: DVec3,
+    /// Largest squared distance of a point to the nearest chosen one, infinite before the first; −1
+    /// where all are chosen themselves.
+    gap: f64,
+    /// Lowest index of a point at that distance.
+    farthest: u32,
+    content: Content,
+}
+
+enum Content {
+    Bucket(Bucket),
+    Halves(Box<[Node; 2]>),
+}
+
+/// Points of a leaf, coordinates by axis.
+struct Bucket {
+    /// Ascending.
+    ids: Vec<u32>,
+    x: Vec<f64>,
+    y: Vec<f64>,
+    z: Vec<f64>,
+    /// Squared distance to the nearest chosen point; −1 once chosen itself.
+    gaps: Vec<f64>,
+}
+
+impl Node {
+    /// Halves `ids` (one at least) at the median of the widest axis until they fit a bucket.
+    fn new(points: &[Vec3], ids: &mut [u32]) -> Self {
+        let at = |i: &u32| points[*i as usize].as_dvec3();
+        let min = ids.iter().map(at).fold(DVec3::INFINITY, DVec3::min);
+        let max = ids.iter().map(at).fold(DVec3::NEG_INFINITY, DVec3::max);
+        let content = if ids.len() <= BUCKET {
+            ids.sort_unstable();
+            Content::Bucket(Bucket {
+                ids: ids.to_vec(),
+                x: ids.iter().map(|i| at(i).x).collect(),
+                y: ids.iter().map(|i| at(i).y).collect(),
+                z: ids.iter().map(|i| at(i).z).collect(),
+                gaps: vec![f64::INFINITY; ids.len()],
+            })
+        } else {
+            let axis = (max - min).max_position();
+            let middle = ids.len() / 2;
+            ids.select_nth_unstable_by(middle, |a, b| at(a)[axis].total_cmp(&at(b)[axis]));
+            let (low, high) = ids.split_at_mut(middle);
+            Content::Halves(Box::new([Self::new(points, low), Self::new(points, high)]))
+        };
+        let mut node = Self { min, max, gap: f64::INFINITY, farthest: 0, content };
+        node.refresh();
+        node
+    }
+
+    /// Squared distance to the box. Rounding is monotone and the terms are summed in the same order
+    /// as in [`Node::update`], so this is never above the computed distance of any point in the
+    /// box.
+    #[inline]
+    fn distance_squared(&self, p: DVec3) -> f64 {
+        let d = p - p.clamp(self.min, self.max);
+        d.x * d.x + d.y * d.y + d.z * d.z
+    }
+
+    /// Marks the farthest point as chosen.
+    fn take_farthest(&mut self) {
+        match &mut self.content {
+            Content::Bucket(bucket) => {
+                if let Ok(at) = bucket.ids.binary_search(&self.farthest) {
+                    bucket.gaps[at] = -1.0;
+                }
+            }
+            Content::Halves(halves) => {
+                let side = usize::from(halves[0].farthest != self.farthest);
+                halves[side].take_farthest();
+            }
+        }
+        self.refresh();
+    }
+
+    /// Shortens the distances by a new sample.
+    fn update(&mut self, s: DVec3) {
+        if self.distance_squared(s) >= self.gap {
+            return;
+        }
+        match &mut self.content {
+            Content::Bucket(bucket) => {
+                let points = bucket.x.iter().zip(&bucket.y).zip(&bucket.z);
+                for (gap, ((x, y), z)) in bucket.gaps.iter_mut().zip(points) {
+                    let (dx, dy, dz) = (s.x - x, s.y - y, s.z - z);
+                    let d = dx * dx + dy * dy + dz * dz;
+                    *gap = if d < *gap { d } else { *gap };
+                }
+            }
+            Content::Halves(halves) => halves.iter_mut().for_each(|half| half.update(s)),
+        }
+        self.refresh();
+    }
+
+    fn refresh(&mut self) {
+        match &self.content {
+            Content::Bucket(bucket) => {
+                self.gap = bucket.gaps.iter().fold(-1.0, |m: f64, &g| if g > m { g } else { m });
+                let at = bucket.gaps.iter().position(|&g| g == self.gap).unwrap_or(0);
+                self.farthest = bucket.ids[at];
+            }
+            Content::Halves(halves) => {
+                let [a, b] = halves.as_ref();
+                let second = b.gap > a.gap || b.gap == a.gap && b.farthest < a.farthest;
+                let of = if second { b } else { a };
+                (self.gap, self.farthest) = (of.gap, of.farthest);
+            }
+        }
+    }
 }

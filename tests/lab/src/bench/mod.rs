@@ -3,6 +3,7 @@
 mod axes;
 pub mod chart;
 mod difficulty;
+mod kernels;
 mod pareto;
 mod points;
 mod stability;
@@ -39,6 +40,18 @@ enum What {
     /// What happens to the demo as it gets hard: less to see, worse poses, shorter videos, …; a table
     /// of breaking points and charts.
     Stability(StabilityArguments),
+    /// Cost against error of the geometric kernels.
+    Kernels {
+        /// Where to write
+        #[arg(long, default_value = "runs/bench-kernels")]
+        out: PathBuf,
+        /// Fewer queries
+        #[arg(long)]
+        quick: bool,
+        /// Make what is found a section of tests/lab/RESULTS.md
+        #[arg(long)]
+        publish: bool,
+    },
     /// One run, handed over on standard input.
     #[command(hide = true)]
     Point {
@@ -95,6 +108,7 @@ pub fn bench(arguments: &BenchArguments) -> Result<()> {
     match &arguments.what {
         What::Pareto(arguments) => pareto(arguments),
         What::Stability(arguments) => stability(arguments),
+        What::Kernels { out, quick, publish } => kernels::run(out, *quick, *publish),
         What::Point { threads } => {
             use_threads(*threads)?;
             job::serve()
