@@ -85,7 +85,8 @@ impl PriorColors {
         let mut colors: Vec<Vec3> =
             sums.iter().map(|(sum, squares, _)| *sum / squares.max(f32::MIN_POSITIVE)).collect();
         let (vertices, between) = colors.split_at_mut(prior.len());
-        complete(&scene.body, vertices, &seen[..prior.len()]);
+        let foreshortening = |v: usize| if seen[v] { sums[v].1 / sums[v].2 } else { 0.0 };
+        complete(&scene.body, vertices, &(0..prior.len()).map(foreshortening).collect::<Vec<_>>());
         let rest = between.iter_mut().zip(&mesh.anchors[prior.len()..]).zip(&seen[prior.len()..]);
         rest.filter(|(_, seen)| !**seen).for_each(|((color, anchor), _)| *color = anchor.mix(vertices));
         Ok(Self { colors, seen, light, mesh: Arc::new(mesh) })
@@ -111,18 +112,18 @@ const ASIDE: f32 = 0.03;
 const NAPE: f32 = 1.4;
 const RING: f32 = 0.35;
 
-/// Fills the `colors` (V) of the vertices of the canonical `body` that are not `seen` (V); grey
-/// where none is.
-fn complete(body: &Body, colors: &mut [Vec3], seen: &[bool]) {
-    let known: Vec<usize> = (0..seen.len()).filter(|&v| seen[v]).collect();
+/// Fills the `colors` (V) of the unobserved vertices of the canonical `body`; grey where none is
+/// observed. `foreshortening` (V) is the mean of the observations of each vertex, 0 without any:
+/// colours of grazing surface, which borders on what is unobserved, are mixed with the background.
+fn complete(body: &Body, colors: &mut [Vec3], foreshortening: &[f32]) {
+    let (known, unseen): (Vec<usize>, Vec<usize>) = (0..foreshortening.len()).partition(|&v| foreshortening[v] > 0.0);
     if known.is_empty() {
         colors.fill(Vec3::splat(0.5));
         return;
     }
     let joints = strongest(body);
-    let guesses = Guesses::new(body, &joints, colors);
+    let guesses = Guesses::new(body, &joints, colors, foreshortening);
     let (hair, shown) = hair(body, &joints, &known);
-    let unseen: Vec<usize> = (0..seen.len()).filter(|&v| !seen[v]).collect();
     let choice = |joint: usize| {
         let piece: Vec<usize> = unseen.iter().copied().filter(|&v| joints[v] == joint).collect();
         if piece.len() < FEW { 1.0 } else { guesses.choose(&known, &piece) }
@@ -167,7 +168,7 @@ fn hair(body: &Body, joints: &[usize], known: &[usize]) -> (Vec<bool>, Vec<usize
 
 struct Guesses<'a> {
     vertices: &'a [Vec3],
-    /// Surface area of each vertex, (V).
+    /// Surface area of each vertex times its squared foreshortening, (V).
     areas: Vec<f64>,
     /// Unit direction of each vertex's bone, (V).
     axes: Vec<Vec3>,
@@ -175,7 +176,7 @@ struct Guesses<'a> {
 }
 
 impl<'a> Guesses<'a> {
-    fn new(body: &'a Body, joints: &[usize], colors: &'a [Vec3]) -> Self {
+    fn new(body: &'a Body, joints: &[usize], colors: &'a [Vec3], foreshortening: &[f32]) -> Self {
         let vertices = &body.canonical.vertices;
         let mut areas = vec![1e-12; vertices.len()];
         for corners in &body.model.faces {
@@ -183,6 +184,9 @@ impl<'a> Guesses<'a> {
             let area = (b - a).cross(c - a).length() / 6.0;
             corners.iter().for_each(|&v| areas[v as usize] += area);
         }
+        // Weights of grazing surface alone stay above 0.
+        let squared = foreshortening.iter().map(|f| f64::from(f.max(1e-3)).powi(2));
+        areas.iter_mut().zip(squared).for_each(|(area, squared)| *area *= squared);
         Self { vertices, areas, axes: axes(body, joints), colors }
     }
 
@@ -349,10 +353,10 @@ mod tests {
         assert!(unseen.len() > 50, "{}", unseen.len());
         let mut colors = truth.clone();
         unseen.iter().for_each(|&v| colors[v] = Vec3::ONE);
-        complete(&body, &mut colors, &seen);
+        complete(&body, &mut colors, &frontal(&seen));
         let known: Vec<usize> = (0..seen.len()).filter(|&v| seen[v]).collect();
         assert!(known.iter().all(|&v| colors[v] == truth[v]));
-        let smooth = Guesses::new(&body, &strongest(&body), &truth);
+        let smooth = Guesses::new(&body, &strongest(&body), &truth, &frontal(&seen));
         let mean = |of: &dyn Fn(usize) -> Vec3| {
             unseen.iter().map(|&v| (of(v).x - truth[v].x).abs()).sum::<f32>() / unseen.len() as f32
         };
@@ -367,6 +371,31 @@ mod tests {
         assert!(lengthwise < smooth, "{lengthwise} against {smooth}");
     }
 
+    /// Observed frontally or not at all.
+    fn frontal(seen: &[bool]) -> Vec<f32> {
+        seen.iter().map(|seen| if *seen { 1.0 } else { 0.0 }).collect()
+    }
+
+    #[test]
+    fn background_on_grazing_surface_does_not_spread_to_the_unseen_back() {
+        let body = body();
+        let vertices = &body.canonical.vertices;
+        // Grey in front, white where the surface turns away, unseen behind.
+        let facing = |v: &Vec3| (5.0 * v.z).clamp(0.0, 1.0);
+        let foreshortening: Vec<f32> = vertices.iter().map(facing).collect();
+        let shown: Vec<Vec3> = foreshortening.iter().map(|f| Vec3::splat(if *f < 0.2 { 1.0 } else { 0.3 })).collect();
+        let mean = |foreshortening: &[f32]| {
+            let mut colors = shown.clone();
+            complete(&body, &mut colors, foreshortening);
+            let unseen: Vec<f32> =
+                (0..colors.len()).filter(|&v| foreshortening[v] == 0.0).map(|v| colors[v].x).collect();
+            unseen.iter().sum::<f32>() / unseen.len() as f32
+        };
+        let seen: Vec<bool> = foreshortening.iter().map(|f| *f > 0.0).collect();
+        let [weighted, alike] = [mean(&foreshortening), mean(&frontal(&seen))];
+        assert!(weighted < 0.45 && alike > 0.6, "{weighted} against {alike}");
+    }
+
     #[test]
     fn unseen_hair_is_as_the_hair_that_is_seen() {
         let body = body();
@@ -377,7 +406,7 @@ mod tests {
         let truth: Vec<Vec3> =
             vertices.iter().map(|v| if of_hair(*v) { Vec3::ZERO } else { Vec3::new(0.8, 0.6, 0.5) }).collect();
         let mut colors = truth.clone();
-        complete(&body, &mut colors, &seen);
+        complete(&body, &mut colors, &frontal(&seen));
         let back = |v: &usize| {
             joints[*v] == 15 && !seen[*v] && vertices[*v].y > head.y + 0.06 && vertices[*v].z < head.z - 0.06
         };
@@ -396,13 +425,13 @@ mod tests {
         for (color, seen) in colors.iter_mut().zip(&seen) {
             *color = if *seen { *color } else { Vec3::splat(9.0) };
         }
-        complete(&body, &mut colors, &seen);
+        complete(&body, &mut colors, &frontal(&seen));
         assert!(colors.iter().all(|c| c.min_element() >= 0.199 && c.max_element() <= 0.701));
         let mut weightless = self::body();
         weightless.model.weights = smpl::SparseRows::from_rows(vec![Vec::new(); seen.len()]);
-        complete(&weightless, &mut colors, &seen);
+        complete(&weightless, &mut colors, &frontal(&seen));
         assert!(colors.iter().all(|c| c.min_element() >= 0.199 && c.max_element() <= 0.701));
-        complete(&body, &mut colors, &vec![false; seen.len()]);
+        complete(&body, &mut colors, &vec![0.0; seen.len()]);
         assert!(colors.iter().all(|c| *c == Vec3::splat(0.5)));
     }
 
