@@ -21,8 +21,6 @@ use xtask::process::say;
 use xtask::run::{use_threads, write};
 use xtask::{source, train};
 
-/// Steps of a point of `pareto` at which presets run their own number of steps: those of `fast`.
-const FULL_STEPS: u64 = 400;
 /// Unseen views that a point of `pareto` is scored on, and in the quick form.
 const VIEWS: (usize, usize) = (50, 20);
 
@@ -164,12 +162,11 @@ impl SweepArguments {
 
 fn pareto(ParetoArguments { on, sweep, lpips }: &ParetoArguments) -> Result<()> {
     load_lpips(lpips.as_deref())?;
-    let (quick, steps) = (sweep.quick, sweep.steps(FULL_STEPS, FULL_STEPS / 5)?);
+    let (quick, steps) = (sweep.quick, sweep.steps(points::FULL_STEPS, points::FULL_STEPS / 5)?);
     let views = if quick { VIEWS.1 } else { VIEWS.0 };
     let run = |scene: &str, runner: &mut Runner| {
         let (scene_arguments, place) = (on.command_line(scene), on.place(scene)?);
-        let around =
-            points::Sweep { scene_arguments, place, views, steps, full_steps: FULL_STEPS, quick, lpips: lpips.clone() };
+        let around = points::Sweep { scene_arguments, place, views, steps, quick, lpips: lpips.clone() };
         runner.run_all(around.points()?)
     };
     sweep.sweep(["pareto", "Speed against accuracy"], &on.checked()?, run, |name, lines, stem| {

@@ -57,6 +57,9 @@ pub const CHANGES: [Change; 22] = [
 /// The baked base: with four samples a pixel, as `render --baked` draws, and with one.
 const BAKED: [(&str, bool); 2] = [("baked, four a pixel", true), ("baked, one a pixel", false)];
 
+/// Steps of the base at which presets run their own number of steps: those of `fast`.
+pub const FULL_STEPS: u64 = 400;
+
 /// What the sweep is made of.
 pub struct Sweep {
     pub place: Place,
@@ -65,8 +68,6 @@ pub struct Sweep {
     pub views: usize,
     /// Of the base and its changes.
     pub steps: u64,
-    /// Steps of the base at which presets run their own number of steps.
-    pub full_steps: u64,
     pub quick: bool,
     /// Weights of LPIPS.
     pub lpips: Option<PathBuf>,
@@ -133,7 +134,7 @@ impl Sweep {
         // A tenth of the steps of `paper`: all of them take as long as much of the sweep.
         for (preset, divisor) in [(Preset::Fast, 1), (Preset::Balanced, 1), (Preset::Paper, 10)] {
             let whole = Method::Occnerf.preset(preset).steps;
-            let steps = (whole * self.steps / (self.full_steps * divisor)).max(1);
+            let steps = (whole * self.steps / (FULL_STEPS * divisor)).max(1);
             let name = if steps == whole {
                 preset.name().to_owned()
             } else {
@@ -168,7 +169,7 @@ mod tests {
 
     fn sweep(quick: bool) -> Sweep {
         let place = Place::Made(Difficulty::default());
-        Sweep { place, scene_arguments: String::new(), views: 5, steps: 400, full_steps: 400, quick, lpips: None }
+        Sweep { place, scene_arguments: String::new(), views: 5, steps: FULL_STEPS, quick, lpips: None }
     }
 
     #[test]

@@ -119,15 +119,12 @@ impl Job {
 #[serde(default)]
 pub struct Outcome {
     pub error: Option<String>,
-    /// From the capture to the first step.
-    pub prepare_seconds: f64,
-    /// Pruning and baking included.
+    /// Baking included, and what `auto` tries.
     pub train_seconds: f64,
     pub seconds_per_frame: f64,
     pub psnr_mask: Option<f64>,
     pub ssim_mask: Option<f64>,
     pub psnr_hidden: Option<f64>,
-    pub mask_iou: Option<f64>,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub lpips: Option<f64>,
     pub parameters: usize,
@@ -195,16 +192,11 @@ fn prepared(job: &Job, outcome: &mut Outcome) -> Result<(Scene, Method)> {
     let (Place::Scene { scene, body, load }, Method::Auto) = (&job.place, job.method) else {
         let (mut capture, model) = job.place.load()?;
         thin(&mut capture);
-        let start = Instant::now();
-        let scene = Scene::new(&capture, &model, &job.config)?;
-        outcome.prepare_seconds = start.elapsed().as_secs_f64();
-        return Ok((scene, job.method));
+        return Ok((Scene::new(&capture, &model, &job.config)?, job.method));
     };
     let mut source = load.load(scene, body.as_deref())?;
     thin(&mut source.capture);
-    let start = Instant::now();
     source.scene(&job.config)?;
-    outcome.prepare_seconds = start.elapsed().as_secs_f64();
     let start = Instant::now();
     let method = if weigh(&mut source, &job.config)?.field { Method::Occnerf } else { Method::Surface };
     let scene = source.scene(&job.config)?;
@@ -279,7 +271,6 @@ impl Outcome {
         self.psnr_mask = split.psnr_mask;
         self.ssim_mask = split.ssim_mask;
         self.psnr_hidden = split.psnr_hidden;
-        self.mask_iou = split.mask_iou;
         self.lpips = split.lpips_full;
     }
 
