@@ -139,7 +139,7 @@ fn what_others_drive_is_named_as_asked_stands_and_comes_back() {
     assert_eq!(materials("lit.vrm", &["--lit"]).0, serde_json::json!(["VRMC_vrm"]));
     assert_eq!(materials("unlit.glb", &[]).0, serde_json::json!(["KHR_materials_unlit"]));
     let faces = |glb: &Path| rigged::Character::load(glb).unwrap().faces.len();
-    // Each triangle of the stand-in is a chart of its own.
+    // What the seams of the texture allow.
     let least = run.join("least.glb");
     let output = common::xtask(&["export", text(&run), "--out", text(&least), "--triangles", "1"]);
     let said = String::from_utf8(output.stderr).unwrap();
