@@ -37,7 +37,6 @@ mod anchor;
 mod band;
 mod frame;
 mod ground;
-mod limits;
 mod relax;
 mod skeleton;
 mod start;
@@ -56,7 +55,7 @@ use rayon::prelude::*;
 use smpl::BodyModel;
 
 use relax::{Problem, relax};
-use skeleton::{Shape, Skeleton, State};
+use skeleton::{Shape, Skeleton, State, log};
 use start::{LEAST, start};
 
 /// Betas at most.
@@ -184,7 +183,7 @@ pub fn fit(body: &BodyModel, anchors: &[Anchor], seen: &[Vec3]) -> Result<Fitted
         let squares = points.iter().zip(seen).filter(|(_, seen)| seen.is_finite()).map(|(p, s)| p.distance_squared(*s));
         let mean = squares.sum::<f64>() / visible(seen).max(1) as f64;
         FittedFrame {
-            pose: state.turns.iter().map(|turn| limits::log(*turn).as_vec3()).collect(),
+            pose: state.turns.iter().map(|turn| log(*turn).as_vec3()).collect(),
             translation: (state.place - shape.offsets[0]).as_vec3(),
             distance: (visible(seen) > 0).then_some(mean.sqrt() as f32),
             swapped,
