@@ -109,7 +109,8 @@ pub struct Grounded {
 /// ```
 ///
 /// # Errors
-/// Names joints that the skeleton lacks by name, and bones without length; for more than 100 000 frames.
+/// Names joints that the skeleton lacks by name, and bones without length; for more than 100 000
+/// frames.
 ///
 /// # Panics
 /// If the motion is not of the skeleton's joints.
