@@ -20,8 +20,8 @@ pub enum CaptureError {
         /// The codec's reason.
         source: image::ImageError,
     },
-    /// A pickle, array file or body model is truncated or malformed, or an array in it has the wrong
-    /// type or shape.
+    /// A pickle, array file or body model is truncated or malformed, or an array in it has the
+    /// wrong type or shape.
     #[error(transparent)]
     Array(#[from] array_files::Error),
     /// A file that the layout demands is absent.

@@ -5,8 +5,8 @@ use std::path::{Path, PathBuf};
 /// A file that cannot be read or written, or an array or part of it that does not fit its use.
 ///
 /// `file` is the path as given, or the name passed along with bytes in memory; `key` is the array,
-/// part or line, empty for the file as a whole. Control characters are escaped, so that a message is
-/// a single line.
+/// part or line, empty for the file as a whole. Control characters are escaped, so that a message
+/// is a single line.
 ///
 /// ```
 /// use array_files::{Error, pickle};

@@ -9,9 +9,8 @@ use smpl::{BoneNames, Joint, MotionClip};
 use crate::FitError;
 use crate::band::{Band, Beside};
 use crate::frame::{Normal, add, add_block, between, jacobian, stepped};
-use crate::limits::log;
 use crate::relax::couple;
-use crate::skeleton::{Part, Shape, Skeleton, State};
+use crate::skeleton::{Part, Shape, Skeleton, State, log};
 
 /// Fastest and highest smoothed place of a part of the sole that stands, in m/s and metres.
 const SPEED: f64 = 0.4;
@@ -110,7 +109,8 @@ pub struct Grounded {
 /// ```
 ///
 /// # Errors
-/// Names joints that the skeleton lacks by name, and bones without length; for more than 100 000 frames.
+/// Names joints that the skeleton lacks by name, and bones without length; for more than 100 000
+/// frames.
 ///
 /// # Panics
 /// If the motion is not of the skeleton's joints.

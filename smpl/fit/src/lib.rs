@@ -37,7 +37,6 @@ mod anchor;
 mod band;
 mod frame;
 mod ground;
-mod limits;
 mod relax;
 mod skeleton;
 mod start;
@@ -56,7 +55,7 @@ use rayon::prelude::*;
 use smpl::BodyModel;
 
 use relax::{Problem, relax};
-use skeleton::{Shape, Skeleton, State};
+use skeleton::{Shape, Skeleton, State, log};
 use start::{LEAST, start};
 
 /// Betas at most.
@@ -84,7 +83,8 @@ const FAR: f64 = 1e5;
 /// let fitted = fit(&body, &anchors, &tall.repeat(2))?;
 /// let (found, frame) = (body.shaped(&fitted.betas), &fitted.frames[1]);
 /// assert!((found.joints[1].distance(found.joints[4]) - tall[1].distance(tall[4])).abs() < 0.005);
-/// let posed = body.pose(&found, &frame.pose, Placement::Pelvis { translation: frame.translation });
+/// let placement = Placement::Pelvis { translation: frame.translation };
+/// let posed = body.pose(&found, &frame.pose, placement);
 /// assert!(posed.joints[20].distance(tall[20]) < 0.01); // left wrist, metres
 /// # Ok::<(), point_fit::FitError>(())
 /// ```
@@ -132,8 +132,8 @@ pub struct FitError(String);
 /// [`BodyModel::with_limb_lengths`].
 ///
 /// # Errors
-/// For an anchor without joints and vertices, beyond the body's, or with weights that do not sum to 1;
-/// points that are no multiple of the anchors; frames of fewer than four points each.
+/// For an anchor without joints and vertices, beyond the body's, or with weights that do not sum to
+/// 1; points that are no multiple of the anchors; frames of fewer than four points each.
 pub fn fit(body: &BodyModel, anchors: &[Anchor], seen: &[Vec3]) -> Result<Fitted, FitError> {
     anchors.iter().enumerate().try_for_each(|(i, anchor)| check(body, i, anchor))?;
     let count = anchors.len();
@@ -184,7 +184,7 @@ pub fn fit(body: &BodyModel, anchors: &[Anchor], seen: &[Vec3]) -> Result<Fitted
         let squares = points.iter().zip(seen).filter(|(_, seen)| seen.is_finite()).map(|(p, s)| p.distance_squared(*s));
         let mean = squares.sum::<f64>() / visible(seen).max(1) as f64;
         FittedFrame {
-            pose: state.turns.iter().map(|turn| limits::log(*turn).as_vec3()).collect(),
+            pose: state.turns.iter().map(|turn| log(*turn).as_vec3()).collect(),
             translation: (state.place - shape.offsets[0]).as_vec3(),
             distance: (visible(seen) > 0).then_some(mean.sqrt() as f32),
             swapped,

@@ -4,8 +4,7 @@
 use glam::{DMat3, DQuat, DVec3};
 use nalgebra::Matrix3;
 
-use crate::limits::log;
-use crate::skeleton::{Shape, Skeleton, State};
+use crate::skeleton::{Shape, Skeleton, State, log};
 
 /// Points of a frame from which a first guess is made.
 pub(crate) const LEAST: usize = 4;

@@ -1,5 +1,5 @@
-//! Rigged characters from glTF 2.0: mesh, skin, hierarchy, and keyframe animations (section 3.11 and
-//! appendix C).
+//! Rigged characters from glTF 2.0: mesh, skin, hierarchy, and keyframe animations (section 3.11
+//! and appendix C).
 
 use glam::{Affine3A, Quat, Vec2, Vec3, Vec4};
 use gltf::json::animation::{Interpolation, Property};
@@ -10,8 +10,8 @@ use smpl::SparseRows;
 ///
 /// Meshes without a skin are bound rigidly to an extra joint for their node; morph targets are at
 /// their default weights. Of materials the base colours are read, and holes by their alpha. Not
-/// read: normals, sparse accessors, other parts of materials, blending ([`Character::ignored`] names
-/// it). Metres, y up, as in glTF.
+/// read: normals, sparse accessors, other parts of materials, blending ([`Character::ignored`]
+/// names it). Metres, y up, as in glTF.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Character {
     /// Vertices in bind space, as in the file, (V).
@@ -60,8 +60,8 @@ pub struct Texture {
 pub struct CharacterPose {
     /// Vertices, (V).
     pub vertices: Vec<Vec3>,
-    /// World transforms of the joints times inverse bind matrices, (J): vertex v is at Σ w_vi · bones_i
-    /// · vertices_v.
+    /// World transforms of the joints times inverse bind matrices, (J): vertex v is at
+    /// Σ w_vi · bones_i · vertices_v.
     pub bones: Vec<Affine3A>,
 }
 
