@@ -52,6 +52,12 @@ pub struct BodyModel {
 }
 
 /// The rest pose of one person: template plus shape blend shapes, from [`BodyModel::shaped`].
+///
+/// ```
+/// let body = smpl::BodyModel::embedded();
+/// let [short, tall] = [-1.0, 1.0].map(|height| body.shaped(&[height]));
+/// assert!(tall.joints[15].y - tall.joints[10].y > short.joints[15].y - short.joints[10].y);
+/// ```
 #[derive(Clone, Debug, PartialEq)]
 pub struct Shaped {
     /// Vertices in the rest pose, (V).

@@ -54,6 +54,17 @@ impl Default for Placement {
 }
 
 /// A posed body in world space, from [`BodyModel::pose`].
+///
+/// ```
+/// use smpl::{BodyModel, Placement};
+///
+/// let body = BodyModel::embedded();
+/// let shaped = body.shaped(&[]);
+/// let posed = body.pose(&shaped, &[glam::Vec3::X; 24], Placement::default());
+/// let rest = shaped.vertices[0] + posed.pose_offsets[0];
+/// let blended: glam::Vec3 = body.weights.row(0).map(|(j, w)| w * posed.bones[j].transform_point3(rest)).sum();
+/// assert!(blended.distance(posed.vertices[0]) < 1e-5);
+/// ```
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Posed {
     /// Vertices, (V).

@@ -31,6 +31,16 @@ use crate::Error;
 use crate::array::{fits, shown};
 
 /// An element of a tensor.
+///
+/// ```
+/// use array_files::tensors::Number;
+///
+/// let mut bytes = Vec::new();
+/// 0x0102u16.write(&mut bytes)?;
+/// assert_eq!(bytes, [2, 1]); // little-endian
+/// assert_eq!(u16::read(&bytes), 0x0102);
+/// # Ok::<(), std::io::Error>(())
+/// ```
 pub trait Number: Copy {
     /// Its type in a file.
     const DTYPE: Dtype;

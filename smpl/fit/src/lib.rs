@@ -74,18 +74,14 @@ const FAR: f64 = 1e5;
 ///
 /// ```
 /// use point_fit::{Anchor, fit};
-/// use smpl::{BodyModel, Placement};
 ///
-/// let body = BodyModel::embedded();
+/// let body = smpl::BodyModel::embedded();
 /// let anchors: Vec<Anchor> = (0..24).map(Anchor::joint).collect();
 /// // Two frames of a tall person at rest, whose thighs are found to within 5 mm.
 /// let tall = body.shaped(&[1.5]).joints;
 /// let fitted = fit(&body, &anchors, &tall.repeat(2))?;
-/// let (found, frame) = (body.shaped(&fitted.betas), &fitted.frames[1]);
-/// assert!((found.joints[1].distance(found.joints[4]) - tall[1].distance(tall[4])).abs() < 0.005);
-/// let placement = Placement::Pelvis { translation: frame.translation };
-/// let posed = body.pose(&found, &frame.pose, placement);
-/// assert!(posed.joints[20].distance(tall[20]) < 0.01); // left wrist, metres
+/// let found = body.shaped(&fitted.betas).joints;
+/// assert!((found[1].distance(found[4]) - tall[1].distance(tall[4])).abs() < 0.005 && fitted.frames.len() == 2);
 /// # Ok::<(), point_fit::FitError>(())
 /// ```
 #[derive(Clone, Debug, PartialEq)]
@@ -99,7 +95,21 @@ pub struct Fitted {
     pub noise: f32,
 }
 
-/// The body in one frame, of [`Fitted`].
+/// The body in one frame.
+///
+/// ```
+/// use glam::Vec3;
+/// use point_fit::{Anchor, Fitted, fit};
+/// use smpl::{BodyModel, Placement};
+///
+/// let (body, anchors): (_, Vec<Anchor>) = (BodyModel::embedded(), (0..24).map(Anchor::joint).collect());
+/// let seen: Vec<Vec3> = body.shaped(&[]).joints.iter().map(|joint| *joint + Vec3::X).collect();
+/// let Fitted { betas, frames, .. } = fit(&body, &anchors, &seen)?;
+/// let placement = Placement::Pelvis { translation: frames[0].translation };
+/// let posed = body.pose(&body.shaped(&betas), &frames[0].pose, placement);
+/// assert!(posed.joints[20].distance(seen[20]) < 0.01); // left wrist, metres
+/// # Ok::<(), point_fit::FitError>(())
+/// ```
 #[derive(Clone, Debug, PartialEq)]
 pub struct FittedFrame {
     /// Axis-angle of each joint relative to its parent, (J). Joints that move no point are at rest.

@@ -74,6 +74,14 @@ pub fn skeleton(scheme: BoneNames, parents: &[Option<usize>], rest: &[Vec3]) -> 
 }
 
 /// Naming schemes of humanoid skeletons.
+///
+/// ```
+/// use smpl::BoneNames;
+///
+/// let schemes = [BoneNames::Smpl, BoneNames::Mixamo, BoneNames::Vrm];
+/// let knees = schemes.map(|scheme| scheme.of_body(24)[4].clone());
+/// assert_eq!(knees, ["left_knee", "mixamorig:LeftLeg", "leftLowerLeg"]);
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum BoneNames {
     /// `pelvis`, `left_knee`.
@@ -119,9 +127,7 @@ impl BoneNames {
     ///
     /// ```
     /// use smpl::BoneNames;
-    /// let schemes = [BoneNames::Smpl, BoneNames::Mixamo, BoneNames::Vrm];
-    /// let knees = schemes.map(|scheme| scheme.of_body(24)[4].clone());
-    /// assert_eq!(knees, ["left_knee", "mixamorig:LeftLeg", "leftLowerLeg"]);
+    /// assert_eq!(BoneNames::Vrm.of_body(24)[4], "leftLowerLeg");
     /// assert_eq!(BoneNames::Smpl.of_body(55)[22], "jaw");
     /// ```
     pub fn of_body(self, joints: usize) -> Vec<String> {

@@ -10,6 +10,18 @@ use crate::model::BodyModel;
 use crate::pose::{Posed, blend};
 
 /// A world point mapped to canonical space, from [`MotionField::map`].
+///
+/// ```
+/// use glam::Affine3A;
+/// use smpl::{BodyModel, WeightVolume};
+///
+/// let body = BodyModel::embedded();
+/// let shaped = body.shaped(&[]);
+/// let volume = WeightVolume::gaussian(&body, &shaped, 32);
+/// let points = [shaped.joints[1].midpoint(shaped.joints[4]), shaped.joints[4]]; // thigh and knee
+/// let [thigh, knee] = points.map(|point| volume.map(&[Affine3A::IDENTITY; 24], point, 1e-3).unwrap());
+/// assert!(thigh.canonical.distance(points[0]) < 1e-5 && thigh.likelihood > 2.0 * knee.likelihood);
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct MotionSample {
     /// x̂, in the rest pose before pose blend shapes.
@@ -49,7 +61,20 @@ impl<'a> MotionFrame<'a> {
     }
 }
 
-/// The point of a posed surface nearest to a query, for [`MotionField::map`].
+/// The point of a posed surface nearest to a query.
+///
+/// ```
+/// use glam::Vec3;
+/// use smpl::{BodyModel, MotionField, MotionFrame, Placement, SurfaceMotion, SurfacePoint};
+///
+/// let (body, field) = (BodyModel::embedded(), MotionField::Surface(SurfaceMotion::default()));
+/// let posed = body.pose(&body.shaped(&[]), &[Vec3::ZERO; 24], Placement::Pelvis { translation: Vec3::Y });
+/// // A query in the middle of an edge of face 10.
+/// let [a, b, _] = body.faces[10].map(|v| posed.vertices[v as usize]);
+/// let nearest = SurfacePoint { face: 10, barycentric: [0.5, 0.5, 0.0], signed_distance: 0.0 };
+/// let sample = field.map(&MotionFrame::new(&body, &posed), a.midpoint(b), || Some(nearest)).unwrap();
+/// assert!(sample.canonical.distance(a.midpoint(b) - Vec3::Y) < 1e-5);
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SurfacePoint {
     /// The face.
