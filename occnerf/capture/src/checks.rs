@@ -6,7 +6,6 @@ use glam::{Vec2, Vec3};
 use smpl::{BodyModel, Placement};
 
 use super::camera::MAX_DISTANCE;
-use super::decode::Fitted;
 use super::item::Item;
 use super::{CaptureError, Frame, Keypoint};
 
@@ -20,6 +19,14 @@ pub(super) const FARTHEST_PIXEL: f32 = 1e5;
 pub(super) const MAX_ANGLE: f32 = 1e3;
 /// Largest shape coefficient, in standard deviations.
 pub const MAX_BETA: f32 = 1e3;
+
+/// A body as a file poses it.
+#[derive(Clone)]
+pub(super) struct Fitted {
+    pub pose: Vec<Vec3>,
+    pub placement: Placement,
+    pub betas: Vec<f32>,
+}
 
 /// Errors for a value above `most` in magnitude.
 fn below(item: &Item<'_>, values: &[f32], most: f32) -> Result<(), CaptureError> {

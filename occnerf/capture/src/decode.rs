@@ -3,16 +3,17 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use glam::{Vec2, Vec3};
+use glam::Vec2;
 use rayon::prelude::*;
-use smpl::{BodyModel, Placement};
+use smpl::BodyModel;
 
+use super::checks::{self, Fitted};
 use super::files::{Files, FrameFiles, decoding_bytes};
 use super::gate::Gate;
 use super::image::dimensions;
 use super::pictures::file_name;
 use super::source::{Allowance, PixelSource};
-use super::{Capture, CaptureError, EvalFrame, Frame, Keypoint, LoadOptions, checks};
+use super::{Capture, CaptureError, EvalFrame, Frame, Keypoint, LoadOptions};
 
 /// Bytes per pixel of a frame: three colours and coverage.
 pub const PIXEL_BYTES: u64 = 16;
@@ -20,14 +21,6 @@ pub const PIXEL_BYTES: u64 = 16;
 const VERTEX_BYTES: u64 = 24;
 /// Ratio of the bytes of a training frame's pixels to its labels', 3 bits a pixel.
 const LABELS_SHARE: u64 = 42;
-
-/// A body as a file poses it.
-#[derive(Clone)]
-pub(super) struct Fitted {
-    pub pose: Vec<Vec3>,
-    pub placement: Placement,
-    pub betas: Vec<f32>,
-}
 
 /// A frame whose pictures have not been read.
 pub(super) struct Planned {

@@ -106,9 +106,10 @@ impl<'a> Item<'a> {
     /// Entry `i` of the list under `name`.
     pub fn entry(&self, name: &str, i: usize) -> Result<Item<'a>, CaptureError> {
         let list = self.get(name)?;
-        let items = list.list()?;
+        let items = list.value.items().ok_or_else(|| list.invalid("a list", list.value.type_name()))?;
         let short = || list.invalid(format!("an entry {i}, one a track"), format!("{} entries", items.len()));
-        items.get(i).cloned().ok_or_else(short)
+        let value = items.get(i).ok_or_else(short)?;
+        Ok(Item { path: list.path, key: format!("{}[{i}]", list.key), value })
     }
 
     /// An array, also as nested lists of arrays and numbers.

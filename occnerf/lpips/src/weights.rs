@@ -100,8 +100,8 @@ fn with_lin(weights: Weights, trunk: Trunk, directory: &Path) -> Result<Found, E
     Ok(Found { trunk, weights, lin: Some(lin) })
 }
 
-/// What `choose` makes of the first file of a directory that it takes. A damaged file is an error only
-/// if it takes no other.
+/// What `choose` makes of the first file of a directory that it takes. A damaged file is an error
+/// only if it takes no other.
 fn first<T>(directory: &Path, mut choose: impl FnMut(Weights) -> Result<Option<T>, Error>) -> Result<Option<T>, Error> {
     let mut first_error = None;
     for file in files(directory)? {

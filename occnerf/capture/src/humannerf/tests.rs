@@ -1,5 +1,6 @@
-//! A tiny capture on disk, whole and with every fault, which is told in one line that names the file,
-//! the key, what was expected and what was found. What layouts share is tested with the wild one.
+//! A tiny capture on disk, whole and with every fault, which is told in one line that names the
+//! file, the key, what was expected and what was found. What layouts share is tested with the wild
+//! one.
 
 use glam::Vec3;
 use smpl::Placement;

@@ -118,8 +118,8 @@ fn camera(folder: &Path, video: &Video) -> Result<Camera, CaptureError> {
     Ok(Camera { rotation, translation, lens })
 }
 
-/// The numbers and matrices, row by row, of OpenCV's YAML (`!!opencv-matrix` with its `data`), in the
-/// order of their names. Everything else is ignored; malformed numbers are NaN.
+/// The numbers and matrices, row by row, of OpenCV's YAML (`!!opencv-matrix` with its `data`), in
+/// the order of their names. Everything else is ignored; malformed numbers are NaN.
 fn yaml(text: &str) -> Value {
     let number = |text: &str| text.trim().parse().unwrap_or(f64::NAN);
     let mut found = BTreeMap::new();

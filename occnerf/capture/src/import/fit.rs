@@ -202,8 +202,8 @@ pub(super) enum OwnMask {
 }
 
 impl FitFrame {
-    /// For a static camera: axis-angle of each joint, shape coefficients and translation side by side,
-    /// in its axes, rotation about the pelvis.
+    /// For a static camera: axis-angle of each joint, shape coefficients and translation side by
+    /// side, in its axes, rotation about the pelvis.
     pub fn still(index: usize, row: &[f64], [focal, centre]: Lens) -> Self {
         let (pose, rest) = row.split_at(row.len().saturating_sub(BETAS + 3));
         let (betas, place) = rest.split_at(BETAS);

@@ -23,10 +23,12 @@ pub(super) struct Masks {
     pub kind: &'static str,
     /// How they were joined with the pictures, where that is worth a word.
     pub notes: Vec<String>,
+    /// The folder or file.
+    path: PathBuf,
     frames: BTreeMap<usize, Source>,
     meaning: Meaning,
-    /// Files of each occluder.
-    occluders: Vec<BTreeMap<usize, PathBuf>>,
+    /// Those of each occluder.
+    occluders: Vec<BTreeMap<usize, Source>>,
 }
 
 /// Source of a frame's values.
@@ -34,6 +36,27 @@ enum Source {
     File(PathBuf),
     /// In a stack that has been read: row by row.
     Stack(NdArray),
+}
+
+impl Source {
+    /// The values; `whole` is the stack's file.
+    fn levels(&self, whole: &Path) -> Result<Levels, CaptureError> {
+        match self {
+            Self::File(file) => Levels::load(file),
+            Self::Stack(array) => Levels::from_array(whole, array),
+        }
+    }
+
+    /// The values, checked against the frames' size.
+    fn sized(&self, whole: &Path, size: (u32, u32)) -> Result<Levels, CaptureError> {
+        let levels = self.levels(whole)?;
+        if (levels.width, levels.height) == size {
+            return Ok(levels);
+        }
+        let path = if let Self::File(file) = self { file } else { whole };
+        let expected = format!("{}×{}, as the frames", size.0, size.1);
+        Err(CaptureError::invalid(path, "size", expected, format!("{}×{}", levels.width, levels.height)))
+    }
 }
 
 /// Meaning of a value.
@@ -52,38 +75,32 @@ enum Meaning {
 impl Masks {
     /// Finds the masks of `video` in a folder or a `.npy` file.
     pub fn open(path: &Path, options: &ImportOptions, video: &Video) -> Result<Self, CaptureError> {
-        if path.is_file() {
-            return Self::stack(path, options, video);
-        }
         let inner = ["mask_data", "pha"].map(|name| path.join(name)).into_iter().find(|dir| dir.is_dir());
         let dir = inner.as_deref().unwrap_or(path);
-        let object = options.object.unwrap_or(1);
-        if let Some(folders) = object_folders(dir)? {
-            let find = |id: u32| {
-                folders.get(&id).ok_or_else(|| {
+        let folders = if path.is_file() { None } else { object_folders(dir)? };
+        let ((frames, notes), meaning, kind, occluders) = if let Some(folders) = folders {
+            let of = |id: u32| match folders.get(&id) {
+                Some(folder) => matched(folder, video),
+                None => {
                     let found: Vec<String> = folders.keys().map(u32::to_string).collect();
-                    CaptureError::invalid(dir, "objects", format!("a folder of object {id}"), found.join(", "))
-                })
+                    let expected = format!("a folder of object {id}");
+                    Err(CaptureError::invalid(dir, "objects", expected, found.join(", ")))
+                }
             };
-            let (files, notes) = matched(find(object)?, video)?;
-            let occluders =
-                options.occluder_objects.iter().map(|&id| matched(find(id)?, video).map(|(files, _)| files));
-            return Ok(Self {
-                kind: "one folder an object, as SAM 2 writes them",
-                notes,
-                frames: files.into_iter().map(|(i, path)| (i, Source::File(path))).collect(),
-                meaning: Meaning::Any,
-                occluders: occluders.collect::<Result<_, _>>()?,
-            });
-        }
-        let (files, notes) = matched(dir, video)?;
-        let mut statistics = ValueStatistics::default();
-        for path in files.values() {
-            statistics.add(&Levels::load(path)?);
-        }
-        let (meaning, kind) = statistics.meaning(dir, options)?;
-        let frames = files.into_iter().map(|(i, path)| (i, Source::File(path))).collect();
-        Ok(Self { kind, notes, frames, meaning, occluders: Vec::new() })
+            let person = of(options.object.unwrap_or(1))?;
+            let occluders = options.occluder_objects.iter().map(|&id| of(id).map(|(frames, _)| frames));
+            let occluders = occluders.collect::<Result<_, _>>()?;
+            (person, Meaning::Any, "one folder an object, as SAM 2 writes them", occluders)
+        } else {
+            let joined = if path.is_file() { stack(path, video)? } else { matched(dir, video)? };
+            let mut statistics = ValueStatistics::default();
+            for source in joined.0.values() {
+                statistics.add(&source.levels(path)?);
+            }
+            let (meaning, kind) = statistics.meaning(dir, options)?;
+            (joined, meaning, kind, Vec::new())
+        };
+        Ok(Self { kind, notes, path: path.to_owned(), frames, meaning, occluders })
     }
 
     /// The pictures' own alpha channels, where the first has one.
@@ -92,50 +109,15 @@ impl Masks {
         has_alpha.then(|| Self::open(&options.frames, options, video)).transpose()
     }
 
-    /// Masks (N,H,W), (N,1,H,W) or (N,H,W,1) in one file.
-    fn stack(path: &Path, options: &ImportOptions, video: &Video) -> Result<Self, CaptureError> {
-        let expected = "masks (frames, height, width), or the same with an axis of 1";
-        let array = array(path, expected, |shape| matches!(shape, [_, _, _] | [_, 1, _, _] | [_, _, _, 1]))?;
-        let (n, [height, width]) = match array.shape[..] {
-            [n, height, width] | [n, 1, height, width] | [n, height, width, _] => (n, [height, width]),
-            _ => (0, [0; 2]),
-        };
-        // At least half of the masks have a picture. A header may claim any number of empty ones.
-        let joined = (n <= 2 * video.names.len()).then(|| join::by_index(video, &(0..n).collect())).flatten();
-        let joined = joined.ok_or_else(|| {
-            let expected = format!("at most {} masks, one a frame", video.names.len());
-            CaptureError::invalid(path, "shape", expected, n.to_string())
-        })?;
-        let (each, mut statistics, mut frames) = (height * width, ValueStatistics::default(), BTreeMap::new());
-        for (index, at) in joined.at.into_iter().enumerate() {
-            let Some(at) = at else { continue };
-            let span = index * each..(index + 1) * each;
-            let data = match &array.data {
-                Data::Bool(v) => Data::Bool(v[span].to_vec()),
-                Data::I64(v) => Data::I64(v[span].to_vec()),
-                Data::F32(v) => Data::F32(v[span].to_vec()),
-                Data::F64(v) => Data::F64(v[span].to_vec()),
-            };
-            let part = NdArray { shape: vec![height, width], data };
-            statistics.add(&Levels::from_array(path, &part)?);
-            frames.insert(at, Source::Stack(part));
-        }
-        let (meaning, kind) = statistics.meaning(path, options)?;
-        Ok(Self { kind, notes: joined.note.into_iter().collect(), frames, meaning, occluders: Vec::new() })
-    }
-
     /// Whether a frame has a mask.
     pub fn has(&self, index: usize) -> bool {
         self.frames.contains_key(&index)
     }
 
     /// Coverage of the person and of occluders in a frame, row by row, 0 to 255.
-    pub fn levels(&self, path: &Path, index: usize, video: &Video) -> Result<(Vec<u8>, Option<Vec<u8>>), CaptureError> {
-        let levels = match self.frames.get(&index) {
-            Some(Source::File(file)) => Levels::load(file)?.sized(file, video.size)?,
-            Some(Source::Stack(array)) => Levels::from_array(path, array)?.sized(path, video.size)?,
-            None => return Err(CaptureError::missing(path, format!("mask of frame {}", video.names[index]))),
-        };
+    pub fn levels(&self, index: usize, video: &Video) -> Result<(Vec<u8>, Option<Vec<u8>>), CaptureError> {
+        let absent = || CaptureError::missing(&self.path, format!("mask of frame {}", video.names[index]));
+        let levels = self.frames.get(&index).ok_or_else(absent)?.sized(&self.path, video.size)?;
         let full = |hit: bool| if hit { 255 } else { 0 };
         Ok(match &self.meaning {
             Meaning::Coverage(all) => (levels.values.iter().map(|v| byte(*v, *all)).collect(), None),
@@ -149,8 +131,8 @@ impl Masks {
             Meaning::Any => {
                 let person = levels.values.iter().map(|v| full(*v > 0)).collect();
                 let mut front = (!self.occluders.is_empty()).then(|| vec![0; levels.values.len()]);
-                for file in self.occluders.iter().filter_map(|files| files.get(&index)) {
-                    let other = Levels::load(file)?.sized(file, video.size)?;
+                for source in self.occluders.iter().filter_map(|frames| frames.get(&index)) {
+                    let other = source.sized(&self.path, video.size)?;
                     if let Some(front) = &mut front {
                         front.iter_mut().zip(other.values).for_each(|(front, v)| *front |= full(v > 0));
                     }
@@ -261,8 +243,40 @@ fn object_folders(dir: &Path) -> Result<Option<BTreeMap<u32, PathBuf>>, CaptureE
     Ok((!folders.is_empty()).then_some(folders))
 }
 
-/// Mask files by the index of their frame, and how they were joined.
-fn matched(dir: &Path, video: &Video) -> Result<(BTreeMap<usize, PathBuf>, Vec<String>), CaptureError> {
+/// Masks by the index of their frame, and how they were joined.
+type Joined = (BTreeMap<usize, Source>, Vec<String>);
+
+/// Masks (N,H,W), (N,1,H,W) or (N,H,W,1) in one file.
+fn stack(path: &Path, video: &Video) -> Result<Joined, CaptureError> {
+    let expected = "masks (frames, height, width), or the same with an axis of 1";
+    let array = array(path, expected, |shape| matches!(shape, [_, _, _] | [_, 1, _, _] | [_, _, _, 1]))?;
+    let (n, [height, width]) = match array.shape[..] {
+        [n, height, width] | [n, 1, height, width] | [n, height, width, _] => (n, [height, width]),
+        _ => (0, [0; 2]),
+    };
+    // At least half of the masks have a picture. A header may claim any number of empty ones.
+    let joined = (n <= 2 * video.names.len()).then(|| join::by_index(video, &(0..n).collect())).flatten();
+    let joined = joined.ok_or_else(|| {
+        let expected = format!("at most {} masks, one a frame", video.names.len());
+        CaptureError::invalid(path, "shape", expected, n.to_string())
+    })?;
+    let each = height * width;
+    let part = |(index, at): (usize, Option<usize>)| {
+        let span = index * each..(index + 1) * each;
+        let data = match &array.data {
+            Data::Bool(v) => Data::Bool(v[span].to_vec()),
+            Data::I64(v) => Data::I64(v[span].to_vec()),
+            Data::F32(v) => Data::F32(v[span].to_vec()),
+            Data::F64(v) => Data::F64(v[span].to_vec()),
+        };
+        Some((at?, Source::Stack(NdArray { shape: vec![height, width], data })))
+    };
+    let frames = joined.at.into_iter().enumerate().filter_map(part).collect();
+    Ok((frames, joined.note.into_iter().collect()))
+}
+
+/// The mask files of a folder.
+fn matched(dir: &Path, video: &Video) -> Result<Joined, CaptureError> {
     let mut files = listed(dir, &["npy"])?;
     if files.is_empty() {
         files = Pictures::list(dir)?.into_vec();
@@ -286,7 +300,7 @@ fn matched(dir: &Path, video: &Video) -> Result<(BTreeMap<usize, PathBuf>, Vec<S
     if absent > 0 {
         notes.push(format!("{absent} of {} masks have no picture", files.len()));
     }
-    let files = joined.at.iter().zip(files).filter_map(|(at, (_, path))| Some(((*at)?, path)));
+    let files = joined.at.iter().zip(files).filter_map(|(at, (_, path))| Some(((*at)?, Source::File(path))));
     Ok((files.collect(), notes))
 }
 
@@ -367,15 +381,6 @@ impl Levels {
         };
         let full = if ids { 255 } else { 65535 };
         Ok(Self { width, height, values: values?, full, ids, alpha: false })
-    }
-
-    /// Checks the size against the frames'.
-    pub fn sized(self, path: &Path, size: (u32, u32)) -> Result<Self, CaptureError> {
-        if (self.width, self.height) == size {
-            return Ok(self);
-        }
-        let expected = format!("{}×{}, as the frames", size.0, size.1);
-        Err(CaptureError::invalid(path, "size", expected, format!("{}×{}", self.width, self.height)))
     }
 }
 

@@ -144,7 +144,7 @@ fn masks_are_as_another_reader_has_them() {
             None => {
                 let masks = Masks::open(&path, &ImportOptions::default(), &video).unwrap();
                 let held = (0..20).filter(|&i| masks.has(i));
-                held.map(|i| (i, masks.levels(&path, i, &video).unwrap().0)).collect()
+                held.map(|i| (i, masks.levels(i, &video).unwrap().0)).collect()
             }
         };
         assert_eq!(found.len(), indices.len(), "{name}");
@@ -167,7 +167,7 @@ fn objects_in_front_become_occluders() {
     let by_value = Masks::open(&values, &options, &video).unwrap();
     let by_folder = Masks::open(&folders, &options, &video).unwrap();
     for i in [0, 7, 19] {
-        let (a, b) = (by_value.levels(&values, i, &video).unwrap(), by_folder.levels(&folders, i, &video).unwrap());
+        let (a, b) = (by_value.levels(i, &video).unwrap(), by_folder.levels(i, &video).unwrap());
         assert!(a == b, "frame {i}");
         let front = a.1.unwrap();
         assert!(front.iter().filter(|v| **v == 255).count() > 1000);
@@ -215,7 +215,7 @@ fn masks_are_matched_by_name_by_order_or_by_number() {
     // Masks of all but the person, told by the border.
     dir.picture("inverted/000001.png", (4, 4), |x, y| if x == 1 && y == 1 { 0 } else { 255 });
     let inverted = open("inverted").unwrap();
-    let levels = inverted.levels(&dir.file("inverted"), 0, &video).unwrap().0;
+    let levels = inverted.levels(0, &video).unwrap().0;
     assert!(inverted.kind.contains("all but the person"));
     assert!(levels.iter().enumerate().all(|(i, level)| (*level == 255) == (i == 5)));
     dir.picture("empty/000001.png", (4, 4), |_, _| 0);
@@ -236,7 +236,7 @@ fn levels_of(extension: &str, bytes: &[u8], options: &ImportOptions) -> Vec<u8> 
     }
     dir.write(&format!("masks/000000.{extension}"), bytes);
     let (path, video) = (dir.file("masks"), video(["000000"], (4, 2)));
-    Masks::open(&path, options, &video).unwrap().levels(&path, 0, &video).unwrap().0
+    Masks::open(&path, options, &video).unwrap().levels(0, &video).unwrap().0
 }
 
 /// A PNG of 4 × 2 pixels.
@@ -328,7 +328,7 @@ fn a_stack_with_an_axis_of_one_and_an_archive_are_masks() {
         for file in ["stack.npy", "stack.npz"] {
             let path = dir.path().join(file);
             let masks = Masks::open(&path, &ImportOptions::default(), &video).unwrap();
-            let levels = masks.levels(&path, 2, &video).unwrap().0;
+            let levels = masks.levels(2, &video).unwrap().0;
             assert!(levels.iter().enumerate().all(|(i, level)| (*level == 255) == (i == 3)), "{file} {shape:?}");
         }
     }
@@ -491,7 +491,7 @@ fn a_lost_picture_costs_its_own_frame_alone() {
             let other = video.names.iter().position(|other| other == name).unwrap();
             assert_eq!(some.has(i), all.has(other), "{masks} {name}");
             if some.has(i) {
-                assert_eq!(some.levels(&path, i, &short).unwrap(), all.levels(&path, other, &video).unwrap(), "{name}");
+                assert_eq!(some.levels(i, &short).unwrap(), all.levels(other, &video).unwrap(), "{name}");
             }
         }
     }

@@ -1,5 +1,4 @@
-//! Results of estimators that fit SMPL or SMPL-X to a video, a function a tool. `[id, item]` pairs
-//! are the entries of a pickle's dictionary.
+//! Results of estimators that fit SMPL or SMPL-X to a video, a function a tool.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -34,9 +33,10 @@ pub(super) fn wham(people: &Entries<'_>, video: &Video) -> Result<Fit, CaptureEr
 }
 
 /// VIBE's `vibe_output.pkl`, which PyMAF's demo writes alike: by person id `pose` (T,72)
-/// axis-angle in the camera, `betas` (T,10), `orig_cam` (T,4): scales and translation (sx, sy, tx, ty)
-/// of a weak-perspective camera, x of the picture from −1 to 1 being sx (X + tx); `frame_ids` (T).
-/// Without it, `pred_cam` (T,3): scale and translation in a square of `bboxes` (T,4): centre and sides.
+/// axis-angle in the camera, `betas` (T,10), `orig_cam` (T,4): scales and translation (sx, sy, tx,
+/// ty) of a weak-perspective camera, x of the picture from −1 to 1 being sx (X + tx); `frame_ids`
+/// (T). Without it, `pred_cam` (T,3): scale and translation in a square of `bboxes` (T,4): centre
+/// and sides.
 /// The focal length is not in it: √(W² + H²).
 pub(super) fn vibe(people: &Entries<'_>, video: &Video) -> Result<Fit, CaptureError> {
     /// Least scale of a camera.
@@ -75,8 +75,8 @@ pub(super) fn vibe(people: &Entries<'_>, video: &Video) -> Result<Fit, CaptureEr
 
 /// GVHMR's `hmr4d_results.pt`: `smpl_params_incam` {`body_pose` (L,63), `betas` (L,10),
 /// `global_orient` (L,3), `transl` (L,3)} of SMPL-X, and `K_fullimg` (L,3,3); of its relative GEM
-/// (`smpl_params.pt`) `body_params_incam`. The same re-saved by numpy, nested or with joined names. One
-/// person in every frame.
+/// (`smpl_params.pt`) `body_params_incam`. The same re-saved by numpy, nested or with joined names.
+/// One person in every frame.
 pub(super) fn gvhmr(whole: &Item<'_>, video: &Video) -> Result<Fit, CaptureError> {
     /// Joints of the body in `body_pose`.
     const BODY: usize = 21;
@@ -220,8 +220,8 @@ fn by_picture<'a>(mut entries: Vec<(String, Item<'a>)>) -> (Vec<Item<'a>>, Vec<S
     entries.into_iter().map(|(name, item)| (item, stem(&name))).unzip()
 }
 
-/// Ids of the people of a picture, where the file has none: of the person last seen nearest, within two
-/// metres.
+/// Ids of the people of a picture, where the file has none: of the person last seen nearest, within
+/// two metres.
 fn tracked(people: &[FitFrame], last: &mut BTreeMap<i64, DVec3>) -> Vec<i64> {
     const METRES: f64 = 2.0;
     let mut taken = Vec::new();

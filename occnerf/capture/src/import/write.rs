@@ -66,7 +66,7 @@ fn frame(
     let extension = source.extension().map_or("png".into(), |e| e.to_string_lossy());
     linked(source, &out.join("images").join(format!("{name}.{extension}")), options.copy)?;
     let (mask, front) = match (masks, &frame.mask) {
-        (Some(masks), _) => masks.levels(options.masks.as_deref().unwrap_or(&options.fit), frame.index, video)?,
+        (Some(masks), _) => masks.levels(frame.index, video)?,
         (None, Some(own)) => (own_levels(own, video.size, &options.fit, name)?, None),
         (None, None) => return Err(CaptureError::missing(&options.fit, format!("mask of frame {name}"))),
     };

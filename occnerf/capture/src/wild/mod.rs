@@ -21,12 +21,13 @@ use std::path::Path;
 use smpl::{BodyModel, Placement};
 
 use super::camera::Lens;
-use super::decode::{Fitted, Planned, View, capture};
+use super::checks::{self, Fitted};
+use super::decode::{Planned, View, capture};
 use super::files::FrameFiles;
 use super::item::Item;
 use super::names::FrameName;
 use super::pictures::{Pictures, is_directory};
-use super::{Capture, CaptureError, LoadOptions, checks, json};
+use super::{Capture, CaptureError, LoadOptions, json};
 
 /// Largest `metadata.json`: tens of thousands of frames.
 const MAX_BYTES: u64 = 64 << 20;

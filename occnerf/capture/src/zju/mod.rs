@@ -23,13 +23,14 @@ use rayon::prelude::*;
 use smpl::BodyModel;
 
 use super::camera::{Lens, ORTHONORMAL};
-use super::decode::{Fitted, Planned, View, capture};
+use super::checks::{self, Fitted};
+use super::decode::{Planned, View, capture};
 use super::files::FrameFiles;
 use super::image::dimensions;
 use super::item::{Item, pickled};
 use super::pictures::is_directory;
 use super::pixels::Area;
-use super::{Capture, CaptureError, LoadOptions, checks, json};
+use super::{Capture, CaptureError, LoadOptions, json};
 
 /// Tolerance of a vertex against the file's, as a fraction of the body's largest extent, 1 cm at
 /// 1.7 m.

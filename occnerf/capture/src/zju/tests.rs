@@ -1,6 +1,6 @@
-//! A tiny capture of two cameras and three instants on disk, whole and with every fault, which is told
-//! in one line that names the file, the key, what was expected and what was found; and the shared
-//! capture, against its prepared twin.
+//! A tiny capture of two cameras and three instants on disk, whole and with every fault, which is
+//! told in one line that names the file, the key, what was expected and what was found; and the
+//! shared capture, against its prepared twin.
 
 use glam::{DVec3, Vec2, Vec3};
 use smpl::{BodyModel, Placement};
