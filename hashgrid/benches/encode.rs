@@ -1,5 +1,6 @@
-//! Encoding with the paper's sizes (D 4, L 16, F 2, T 2^19), forward and backward. Uniform
-//! points share few corners; points near a surface share more, as in a trained scene. `cargo bench -p hashgrid`: times are per call of [`POINTS`] points; items/s are points.
+//! Encoding with the paper's sizes (D 4, L 16, F 2, T 2^19), forward and backward. Uniform points
+//! share few corners; points near a surface share more, as in a trained scene. `cargo bench -p
+//! hashgrid`: times are per call of [`POINTS`] points; items/s are points.
 
 use divan::counter::ItemsCount;
 use divan::{Bencher, black_box};

@@ -6,7 +6,7 @@ use std::ops::RangeInclusive;
 /// From 2^20 cells on, an `f32` coordinate has less than 4 bits for the position within a cell.
 pub const MAX_RESOLUTION: u32 = 1 << 24;
 /// Largest number of parameters: 8 GiB of `f32`.
-const MAX_PARAMETERS: u64 = 1 << 31;
+pub(crate) const MAX_PARAMETERS: u64 = 1 << 31;
 
 /// Shape of an encoding whose resolutions grow geometrically from `n_min` to `n_max`.
 ///
@@ -57,21 +57,7 @@ impl HashGridConfig {
     }
 }
 
-/// Validates all settings but the total size.
-pub(crate) fn check_settings(resolutions: &[u32], features: usize, log2_table_size: u32) -> Result<(), Error> {
-    check("levels", resolutions.len(), 1..=64)?;
-    check("features", features, 1..=256)?;
-    check("log2_table_size", log2_table_size, 0..=28)?;
-    let mut levels = resolutions.iter().enumerate();
-    levels.try_for_each(|(level, &n)| check(&format!("resolution of level {level}"), n, 1..=MAX_RESOLUTION))
-}
-
-/// Validates the number of parameters up to and including a level.
-pub(crate) fn check_size(parameters: u64) -> Result<(), Error> {
-    check("number of parameters", parameters, 0..=MAX_PARAMETERS)
-}
-
-fn check<T: PartialOrd + Display>(name: &str, value: T, range: RangeInclusive<T>) -> Result<(), Error> {
+pub(crate) fn check<T: PartialOrd + Display>(name: &str, value: T, range: RangeInclusive<T>) -> Result<(), Error> {
     if range.contains(&value) {
         return Ok(());
     }

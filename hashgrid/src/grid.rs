@@ -2,7 +2,7 @@ use std::ops::Range;
 
 use rayon::prelude::*;
 
-use crate::config::{Error, HashGridConfig, check_settings, check_size};
+use crate::config::{Error, HashGridConfig, MAX_PARAMETERS, MAX_RESOLUTION, check};
 use crate::layout::Layout;
 
 /// Points encoded at one level before the next level starts: enough to amortise loading the level's
@@ -73,19 +73,22 @@ impl<const D: usize> HashGrid<D> {
         const {
             assert!(2 <= D && D <= 4, "a hash grid has 2, 3 or 4 dimensions");
         }
-        check_settings(resolutions, features, log2_table_size)?;
+        check("levels", resolutions.len(), 1..=64)?;
+        check("features", features, 1..=256)?;
+        check("log2_table_size", log2_table_size, 0..=28)?;
         let most_rows = 1u64 << log2_table_size;
         let mut levels = Vec::with_capacity(resolutions.len());
         // At most 64 levels · 2^28 rows · 256 features: no overflow.
         let mut start = 0u64;
-        for &resolution in resolutions {
+        for (level, &resolution) in resolutions.iter().enumerate() {
+            check(&format!("resolution of level {level}"), resolution, 1..=MAX_RESOLUTION)?;
             // A power that overflows u64 exceeds the table, too.
             let corners = (u64::from(resolution) + 1).checked_pow(D as u32);
             let dense = corners.filter(|&corners| corners <= most_rows);
             let rows = dense.unwrap_or(most_rows);
             levels.push(Level { resolution, rows: rows as usize, hashed: dense.is_none(), start: start as usize });
             start += rows * features as u64;
-            check_size(start)?;
+            check("number of parameters", start, 0..=MAX_PARAMETERS)?;
         }
         Ok(Self { levels, resolutions: resolutions.to_vec(), features })
     }

@@ -9,7 +9,6 @@ mod knn;
 mod normals;
 mod pyramid;
 mod query;
-mod search;
 mod tree;
 mod triangle;
 

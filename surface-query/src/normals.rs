@@ -51,8 +51,8 @@ fn corner_angles([a, b, c]: [DVec3; 3]) -> [f64; 3] {
     [angle(ab, -ca), angle(bc, -ab), angle(ca, -bc)]
 }
 
-/// Angle-weighted pseudonormals of faces, edges and vertices (Bærentzen and Aanæs 2005). The sign of
-/// a point is that of its offset from the closest point times the pseudonormal there.
+/// Angle-weighted pseudonormals of faces, edges and vertices (Bærentzen and Aanæs 2005). The sign
+/// of a point is that of its offset from the closest point times the pseudonormal there.
 pub(crate) struct Pseudonormals {
     /// Edges of each face; edge i goes from corner i to corner i+1.
     face_edges: Vec<[u32; 3]>,

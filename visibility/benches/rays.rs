@@ -3,36 +3,15 @@
 #![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
 
 use std::hint::black_box;
-use std::time::Duration;
 
 use divan::Bencher;
 use divan::counter::ItemsCount;
-use glam::{Affine3A, Quat, Vec2, Vec3, Vec3A};
-use obvhs::BvhBuildParams;
-use obvhs::cwbvh::builder::build_cwbvh_from_tris;
-use obvhs::ray::{Ray, RayHit};
-use obvhs::triangle::Triangle;
+use glam::{Affine3A, Quat, Vec2, Vec3};
 use testkit::TriMesh;
 use visibility::{RayMesh, View};
 
 fn main() {
     divan::main();
-}
-
-/// From 3 m in front, with `focal` in sizes of the image.
-fn view(size: u32, focal: f32) -> View {
-    let focal = size as f32 * focal;
-    let centre = size as f32 / 2.0;
-    View {
-        focal: Vec2::splat(focal),
-        centre: Vec2::splat(centre),
-        world_to_camera: Affine3A::from_rotation_translation(
-            Quat::from_rotation_x(std::f32::consts::PI),
-            Vec3::new(0.0, -0.2, 3.0),
-        ),
-        width: size,
-        height: size,
-    }
 }
 
 /// Every triangle in two, at the middle of its first edge.
@@ -48,9 +27,17 @@ fn split(mesh: &TriMesh) -> TriMesh {
     TriMesh { vertices, faces }
 }
 
-/// The rays through the pixels of a 256×256 image, row by row.
+/// The rays through the pixels of a 256×256 image from 3 m in front, row by row; `focal` in sizes
+/// of the image.
 fn image_rays(focal: f32) -> Vec<(Vec3, Vec3)> {
-    let view = view(256, focal);
+    let turn = Quat::from_rotation_x(std::f32::consts::PI);
+    let view = View {
+        focal: Vec2::splat(256.0 * focal),
+        centre: Vec2::splat(128.0),
+        world_to_camera: Affine3A::from_rotation_translation(turn, Vec3::new(0.0, -0.2, 3.0)),
+        width: 256,
+        height: 256,
+    };
     let origin = view.centre_of_projection().unwrap();
     let to_world = view.world_to_camera.inverse();
     (0..256 * 256)
@@ -74,23 +61,6 @@ fn first_hit_split(bencher: Bencher<'_, '_>, focal: f32) {
     bencher.counter(ItemsCount::new(rays.len())).bench_local(|| {
         for &(origin, direction) in &rays {
             black_box(mesh.first_hit(origin, direction));
-        }
-    });
-}
-
-/// The same by obvhs as it comes: its widest tree, its traversal, its triangles.
-#[divan::bench(args = FOCALS)]
-fn first_hit_split_obvhs(bencher: Bencher<'_, '_>, focal: f32) {
-    let mesh = split(&testkit::body::body_or_ball());
-    let corners = |face: &[u32; 3]| face.map(|v| Vec3A::from(mesh.vertices[v as usize]));
-    let triangles: Vec<Triangle> = mesh.faces.iter().map(corners).map(|[v0, v1, v2]| Triangle { v0, v1, v2 }).collect();
-    let tree = build_cwbvh_from_tris(&triangles, BvhBuildParams::medium_build(), &mut Duration::default());
-    let rays = image_rays(focal);
-    bencher.counter(ItemsCount::new(rays.len())).bench_local(|| {
-        for &(origin, direction) in &rays {
-            let (ray, mut hit) = (Ray::new_inf(origin.into(), direction.into()), RayHit::none());
-            tree.ray_traverse(ray, &mut hit, |ray, i| triangles[tree.primitive_indices[i] as usize].intersect(ray));
-            black_box(hit);
         }
     });
 }

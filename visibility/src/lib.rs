@@ -5,7 +5,6 @@ mod counts;
 mod error;
 mod raster;
 mod ray_mesh;
-mod tree;
 mod triangle;
 mod view;
 

@@ -1,14 +1,24 @@
+use std::collections::HashSet;
 use std::fmt;
+use std::time::Duration;
 
-use glam::Vec3;
+use glam::{DVec3, Vec3, Vec3A};
+use obvhs::BvhBuildParams;
+use obvhs::aabb::Aabb;
+use obvhs::bvh2::builder::build_bvh2;
+use obvhs::bvh2::node::Bvh2Node;
+use obvhs::fast_stack;
+use obvhs::faststack::FastStack;
 
 use crate::Error;
 use crate::error::check_mesh;
-use crate::tree::{Child, LANES, MAX_DEPTH, Tree};
-use crate::triangle::{Ray, Triangles};
+use crate::triangle::{LANES, Ray, Triangles};
 
 /// Distance of an origin, in sizes of the mesh, beyond which its rounding exceeds the mesh.
 const FAR: f32 = 1e15;
+/// Padding of the boxes: two ulp of the largest coordinates. A ray along a side of a box is then
+/// inside whatever the sign of its zeros.
+const PADDING: f32 = 2.0 * f32::EPSILON;
 
 /// The intersection of a ray with a mesh.
 ///
@@ -51,9 +61,17 @@ pub struct RayMesh {
     /// Multiplied by `scale`, a power of two, so that products neither overflow nor vanish.
     vertices: Vec<Vec3>,
     scale: f32,
-    tree: Tree,
-    /// The triangles of each leaf of the tree.
-    leaves: Vec<Triangles>,
+    /// Bounding volume hierarchy, the root first; empty for a mesh without faces. `first_index` of
+    /// a leaf is its place in `leaves`.
+    nodes: Vec<Bvh2Node>,
+    leaves: Vec<Leaf>,
+    depth: usize,
+}
+
+/// Four triangles of the tree; fewer repeat the first.
+struct Leaf {
+    faces: [u32; LANES],
+    triangles: Triangles,
 }
 
 impl RayMesh {
@@ -66,10 +84,33 @@ impl RayMesh {
         let largest = vertices.iter().fold(0.0, |largest: f32, v| largest.max(v.abs().max_element()));
         let scale = inverse_power_of_two(largest);
         let vertices: Vec<Vec3> = vertices.iter().map(|v| *v * scale).collect();
+        let mut this = Self { faces: faces.to_vec(), vertices, scale, nodes: Vec::new(), leaves: Vec::new(), depth: 0 };
+        if !faces.is_empty() {
+            this.build();
+        }
+        Ok(this)
+    }
+
+    fn build(&mut self) {
+        let Self { faces, vertices, nodes, leaves, depth, .. } = self;
+        let parameters = BvhBuildParams { max_prims_per_leaf: LANES as u32, ..BvhBuildParams::medium_build() };
+        let bvh = build_bvh2(&bounds(vertices, faces), parameters, &mut Duration::default());
+        *nodes = bvh.nodes;
         let corners = |face: u32| faces[face as usize].map(|v| vertices[v as usize]);
-        let tree = Tree::new(&vertices, faces);
-        let leaves = tree.leaves.iter().map(|leaf| Triangles::new(leaf.map(corners))).collect();
-        Ok(Self { faces: faces.to_vec(), vertices, scale, tree, leaves })
+        let mut stack = vec![(0, 1)];
+        while let Some((place, level)) = stack.pop() {
+            *depth = level.max(*depth);
+            let node: &mut Bvh2Node = &mut nodes[place];
+            let first = node.first_index as usize;
+            if node.is_leaf() {
+                let primitives = &bvh.primitive_indices[first..first + node.prim_count as usize];
+                let faces = [0, 1, 2, 3].map(|lane| *primitives.get(lane).unwrap_or(&primitives[0]));
+                node.first_index = leaves.len() as u32;
+                leaves.push(Leaf { faces, triangles: Triangles::new(faces.map(corners)) });
+            } else {
+                stack.extend([(first, level + 1), (first + 1, level + 1)]);
+            }
+        }
     }
 
     /// The first intersection with the ray from `origin` along `direction`, of any length, at t ≥
@@ -83,10 +124,9 @@ impl RayMesh {
         let mut first: Option<Hit> = None;
         let mut end = f32::INFINITY;
         self.traverse(&ray, f32::INFINITY, |leaf| {
-            let hits = self.leaves[leaf].intersect(&ray);
+            let hits = leaf.triangles.intersect(&ray);
             let t = hits.t.to_array();
-            for lane in 0..LANES {
-                let face = self.tree.leaves[leaf][lane];
+            for (lane, &face) in leaf.faces.iter().enumerate() {
                 let lower = || t[lane] == end && first.is_some_and(|first| face < first.face);
                 if t[lane] < end || lower() {
                     end = t[lane];
@@ -120,10 +160,9 @@ impl RayMesh {
         }
         let mut blocked = false;
         self.traverse(&ray, end, |leaf| {
-            let t = self.leaves[leaf].intersect(&ray).t.to_array();
-            for lane in 0..LANES {
-                let face = self.tree.leaves[leaf][lane] as usize;
-                blocked |= t[lane] < end && counts(&self.faces[face]);
+            let t = leaf.triangles.intersect(&ray).t.to_array();
+            for (t, &face) in t.into_iter().zip(&leaf.faces) {
+                blocked |= t < end && counts(&self.faces[face as usize]);
             }
             (!blocked).then_some(end)
         });
@@ -162,48 +201,56 @@ impl RayMesh {
     /// Visits the leaves whose boxes the ray enters before `end`, nearest first. `visit` returns
     /// the new end, or `None` to stop.
     #[inline(always)]
-    fn traverse(&self, ray: &Ray, mut end: f32, mut visit: impl FnMut(usize) -> Option<f32>) {
-        if self.tree.nodes.is_empty() {
-            return;
-        }
-        let mut fixed = [(0.0f32, 0u32); MAX_DEPTH];
-        let mut spill;
-        let stack: &mut [(f32, u32)] = if self.tree.depth <= MAX_DEPTH {
-            &mut fixed
-        } else {
-            spill = vec![(0.0, 0); self.tree.depth];
-            &mut spill
-        };
-        let mut height = 0;
-        let mut next = Some(0u32);
-        while let Some(node) = next.take() {
-            let node = &self.tree.nodes[node as usize];
-            let t = node.entry(ray.origin, ray.inverse, end);
-            let near = usize::from(t[1] < t[0]);
-            for side in [near, 1 - near] {
+    fn traverse(&self, ray: &Ray, mut end: f32, mut visit: impl FnMut(&Leaf) -> Option<f32>) {
+        fast_stack!((f32, u32), (96), self.depth + 1, stack, {
+            if !self.nodes.is_empty() {
+                // The root.
+                stack.push((0.0, 0));
+            }
+            while let Some((t, node)) = stack.pop() {
                 // Boxes at exactly the depth of the hit may hold a face of lower index.
-                if t[side] > end || t[side] == f32::INFINITY {
+                if t > end {
                     continue;
                 }
-                match node.child(side) {
-                    Child::Leaf(leaf) => match visit(leaf as usize) {
+                let node = &self.nodes[node as usize];
+                if node.is_leaf() {
+                    match visit(&self.leaves[node.first_index as usize]) {
                         Some(new) => end = new,
                         None => return,
-                    },
-                    Child::Node(child) if next.is_none() => next = Some(child),
-                    Child::Node(child) => {
-                        stack[height] = (t[side], child);
-                        height += 1;
+                    }
+                    continue;
+                }
+                let enter = |child: u32| (ray.enters(self.nodes[child as usize].aabb(), end), child);
+                let [a, b] = [node.first_index, node.first_index + 1].map(enter);
+                // The nearer on top.
+                for child in if a.0 < b.0 { [b, a] } else { [a, b] } {
+                    if child.0 < f32::INFINITY {
+                        stack.push(child);
                     }
                 }
             }
-            while next.is_none() && height > 0 {
-                height -= 1;
-                let (t, child) = stack[height];
-                next = (t <= end).then_some(child);
-            }
-        }
+        });
     }
+}
+
+/// Bounds of the faces, padded. One that equals another's is grown by up to 10⁻⁵ of the
+/// coordinates: the builder joins boxes that are closest to each other, among equal ones a single
+/// pair a pass.
+fn bounds(vertices: &[Vec3], faces: &[[u32; 3]]) -> Vec<Aabb> {
+    let most = vertices.iter().map(|v| v.abs().max_element()).fold(1e-6, f32::max);
+    let mut seen = HashSet::new();
+    let bounds = |(i, face): (u32, &[u32; 3])| {
+        let [a, b, c] = face.map(|i| Vec3A::from(vertices[i as usize]));
+        let (low, high) = (a.min(b).min(c) - PADDING, a.max(b).max(c) + PADDING);
+        if seen.insert([low, high].map(|corner| corner.to_array().map(f32::to_bits))) {
+            return Aabb::new(low, high);
+        }
+        // A Kronecker sequence: the shares of any two faces differ.
+        let shares = (f64::from(i) * DVec3::new(0.819_172_5, 0.671_043_6, 0.549_700_5)).fract();
+        let growth = 1e-5 * most * shares.as_vec3a();
+        Aabb::new(low - growth, high + growth)
+    };
+    (0..).zip(faces).map(bounds).collect()
 }
 
 impl fmt::Debug for RayMesh {

@@ -1,9 +1,14 @@
 //! Watertight intersection of a ray with four triangles (Woop, Benthin and Wald 2013): a ray
 //! through an edge shared by two triangles hits at least one of them.
 
-use glam::{Vec3, Vec4};
+use glam::{Vec3, Vec3A, Vec4};
+use obvhs::aabb::Aabb;
 
-use crate::tree::LANES;
+/// Triangles of a leaf: the lanes of a `Vec4`.
+pub(crate) const LANES: usize = 4;
+/// Factors that widen the interval of a ray in a box.
+const NEARER: f32 = 1.0 - 1e-6;
+const FARTHER: f32 = 1.0 + 1e-6;
 
 /// Four triangles in SIMD lanes: corners a, b, c by axis.
 #[derive(Clone, Copy)]
@@ -13,10 +18,10 @@ pub(crate) struct Triangles {
 
 /// A ray with the shear that makes it the z axis, `axes[2]` being its longest axis.
 pub(crate) struct Ray {
-    pub origin: [Vec4; 3],
-    pub inverse: [Vec4; 3],
-    pub axes: [usize; 3],
-    pub shear: [Vec4; 3],
+    origin: Vec3A,
+    inverse: Vec3A,
+    axes: [usize; 3],
+    shear: [Vec4; 3],
 }
 
 impl Ray {
@@ -25,13 +30,10 @@ impl Ray {
         let z = direction.abs().max_position();
         let (x, y) = ((z + 1) % 3, (z + 2) % 3);
         // Finite in place of 1/0: no 0 · ∞ for an origin on the side of a box.
-        let inverse = direction.to_array().map(|d| {
-            let d = if d.abs() < 1e-30 { 1e-30f32.copysign(d) } else { d };
-            Vec4::splat(1.0 / d)
-        });
+        let inverse = direction.to_array().map(|d| 1.0 / if d.abs() < 1e-30 { 1e-30f32.copysign(d) } else { d });
         Self {
-            origin: origin.to_array().map(Vec4::splat),
-            inverse,
+            origin: origin.into(),
+            inverse: inverse.into(),
             axes: [x, y, z],
             shear: [
                 Vec4::splat(direction[x] / direction[z]),
@@ -39,6 +41,16 @@ impl Ray {
                 Vec4::splat(1.0 / direction[z]),
             ],
         }
+    }
+
+    /// Depth at which the ray enters a box, at least 0; infinity for a miss or beyond `end`.
+    /// Conservative: both ends of the interval are widened by more than the rounding error.
+    #[inline(always)]
+    pub fn enters(&self, bounds: &Aabb, end: f32) -> f32 {
+        let (a, b) = ((bounds.min - self.origin) * self.inverse, (bounds.max - self.origin) * self.inverse);
+        let enter = a.min(b).max_element().max(0.0) * NEARER;
+        let leave = a.max(b).min_element().min(end) * FARTHER;
+        if enter <= leave { enter } else { f32::INFINITY }
     }
 }
 

@@ -3,7 +3,6 @@ use std::ops::Range;
 use glam::{Vec3, Vec4};
 
 use crate::exponential::{one_minus_exp, optical_depth};
-use crate::simd::Kernel;
 
 /// Samples per block of SIMD exponentials.
 pub(crate) const BLOCK: usize = 32;
@@ -150,6 +149,21 @@ fn forward(samples: RaySamples<'_>, background: Vec3, weights: &mut [f32]) -> Co
     // The sum of weights may exceed 1 by rounding.
     let opacity = if opacity > 1.0 { 1.0 } else { opacity };
     Composite { color: sum.truncate() + (1.0 - opacity) * background, opacity, depth: sum.w, termination }
+}
+
+/// Closure that [`pulp::Arch::dispatch`] compiles for each instruction set.
+///
+/// `FnMut` inlines the closure's body; `FnOnce`, which `dispatch` accepts directly, calls it
+/// through a shim compiled for the baseline.
+pub(crate) struct Kernel<F>(pub F);
+
+impl<R, F: FnMut() -> R> pulp::WithSimd for Kernel<F> {
+    type Output = R;
+
+    #[inline(always)]
+    fn with_simd<S: pulp::Simd>(mut self, _: S) -> R {
+        (self.0)()
+    }
 }
 
 /// Transmittance after a block, denormal numbers flushed to 0: they are slow and change no pixel.

@@ -1,8 +1,7 @@
 use glam::Vec3;
 
-use crate::composite::{BLOCK, RaySamples, flushed};
+use crate::composite::{BLOCK, Kernel, RaySamples, flushed};
 use crate::exponential::{one_minus_exp, optical_depth, saturated};
-use crate::simd::Kernel;
 
 /// Outputs for the gradients of one ray's samples, each (S); overwritten.
 ///

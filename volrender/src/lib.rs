@@ -10,7 +10,6 @@ mod occupancy;
 mod random;
 mod ray;
 mod sampling;
-mod simd;
 
 pub use camera::{Camera, Error};
 pub use composite::{Composite, RaySamples, composite};

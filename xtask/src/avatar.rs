@@ -1,6 +1,6 @@
 //! The avatar of a run for export, with additional motion clips.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use anyhow::{Context, Result, anyhow, ensure};
 use clap::Args;
@@ -11,8 +11,8 @@ use point_fit::Grounded;
 use smpl::{Bvh, Joint, MotionClip};
 
 use crate::baked;
-use crate::process::{Lock, note, say, telling, unwritten};
-use crate::run::{CHECKPOINT, RunConfig, identity};
+use crate::process::{Lock, note, say, telling};
+use crate::run::{CHECKPOINT, RunConfig, identity, make_directory};
 
 /// Options that make an avatar smaller.
 #[derive(Args)]
@@ -128,11 +128,7 @@ pub fn ground(avatar: &mut Avatar, first: usize) -> Result<()> {
 
 /// Makes the parent folder of the file `out`.
 pub fn check_folder(out: &Path) -> Result<()> {
-    let folder = match out.parent() {
-        Some(parent) if parent != Path::new("") => parent.to_owned(),
-        _ => PathBuf::from("."),
-    };
-    std::fs::create_dir_all(&folder).map_err(unwritten(&folder))?;
+    out.parent().map_or(Ok(()), make_directory)?;
     ensure!(!out.is_dir(), "--out {}: is a folder, expected a file", out.display());
     Ok(())
 }

@@ -3,7 +3,6 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::{Error, Result};
-use occnerf::Scene;
 use occnerf::bake::{Avatar, bake};
 
 use crate::process::{is_read_only, note, one_line, results_in, say, telling};
@@ -24,7 +23,8 @@ pub fn avatar(run: &Path, config: &RunConfig) -> Result<Avatar> {
         return Ok(avatar);
     }
     let model = model(run, config)?;
-    let scene = scene(run, config).map_err(|error| note!("baking without the capture: {error:#}")).ok();
+    let scene = config.source(run).and_then(|source| source.scene(&config.train));
+    let scene = scene.map_err(|error| note!("baking without the capture: {error:#}")).ok();
     let (mut avatar, report) = telling("baking", || bake(&model, scene.as_ref()))?;
     avatar.source = source;
     match avatar.save(&path).map_err(Error::from).map_err(results_in(run)) {
@@ -34,8 +34,4 @@ pub fn avatar(run: &Path, config: &RunConfig) -> Result<Avatar> {
     let (side, faces, seconds) = (report.side, report.faces, report.seconds);
     say!("baked {faces} triangles and an atlas of {side} × {side} in {seconds:.1} s: {}", path.display());
     Ok(avatar)
-}
-
-fn scene(run: &Path, config: &RunConfig) -> Result<Scene> {
-    config.source(run)?.scene(&config.train)
 }

@@ -23,7 +23,7 @@ const SIDE: u32 = 480;
 const LINES: usize = 20;
 
 /// What to check.
-#[derive(Args)]
+#[derive(Args, Default)]
 pub struct CheckArguments {
     /// A capture, as of `train`; the demo if left out
     scene: Option<String>,
@@ -43,8 +43,7 @@ pub struct CheckArguments {
 impl CheckArguments {
     /// A capture as it is.
     pub fn of(capture: &Path) -> Self {
-        let scene = Some(capture.display().to_string());
-        Self { scene, out: None, body: None, all: false, load: LoadArguments::none() }
+        Self { scene: Some(capture.display().to_string()), ..Self::default() }
     }
 }
 
@@ -153,17 +152,12 @@ fn picture(source: &Source, found: &Check) -> Result<RgbImage> {
     let chosen: Vec<usize> = (0..shown).map(|i| (2 * i + 1) * frames.len() / (2 * shown)).collect();
     let mut strips = Vec::new();
     for row in chosen.chunks(COLUMNS) {
-        let mut cells = row.iter().map(|&i| cell(&frames[i], &source.model)).collect::<Result<Vec<_>>>()?;
-        let mut names = Vec::new();
+        let (mut cells, mut names) = (Vec::new(), Vec::new());
         for &i in row {
-            let frame = &found.frames[i];
-            names.push(match frame.iou {
-                _ if !body_silhouette(&frames[i], &source.model)?.contains(&true) => {
-                    format!("{}  body not in view", frame.name)
-                }
-                Some(iou) => format!("{}  {iou:.2}", frame.name),
-                None => format!("{}  -", frame.name),
-            });
+            cells.push(cell(&frames[i], &source.model)?);
+            let is_seen = body_silhouette(&frames[i], &source.model)?.contains(&true);
+            let iou = found.frames[i].iou.map_or("-".to_owned(), |iou| format!("{iou:.2}"));
+            names.push(format!("{}  {}", found.frames[i].name, if is_seen { &iou } else { "body not in view" }));
         }
         // Rows are equally wide.
         let size = cells.first().map_or((1, 1), RgbImage::dimensions);

@@ -20,7 +20,7 @@ use crate::network::{load_lpips, network_name};
 use crate::optimise::logged_seconds;
 use crate::process::{Ending, Lock, is_read_only, note, one_line, peak_rss_bytes, say};
 use crate::report::{self, SHEETS};
-use crate::run::{self, Metrics, RunConfig, Splits, TRAINING_VIEWS, evaluation_title, make_directory};
+use crate::run::{self, Metrics, RunConfig, Splits, make_directory};
 use crate::{baked, pictures, table};
 
 /// Stride of scored training frames.
@@ -45,6 +45,13 @@ impl Split {
         match self {
             Self::NovelView => &mut splits.novel_view,
             Self::TrainView => &mut splits.train_view,
+        }
+    }
+
+    fn frames(self, scene: &Scene) -> Vec<&PreparedFrame> {
+        match self {
+            Self::NovelView => scene.eval.iter().collect(),
+            Self::TrainView => scored_train_frames(scene).collect(),
         }
     }
 }
@@ -78,7 +85,6 @@ pub fn unscored(run: &RunConfig, drawn: &Drawn<'_>, train_seconds: f64) -> Metri
         Drawn::Avatar { avatar, .. } => (0, avatar.num_parameters(), String::new()),
     };
     Metrics {
-        of: String::new(),
         method: config.method.name().to_owned(),
         preset: config.preset.name().to_owned(),
         occluded: config.occluded.name().to_owned(),
@@ -89,8 +95,7 @@ pub fn unscored(run: &RunConfig, drawn: &Drawn<'_>, train_seconds: f64) -> Metri
         peak_rss_bytes: peak_rss_bytes(),
         parameters,
         perceptual,
-        lpips: None,
-        splits: Splits::default(),
+        ..Metrics::default()
     }
 }
 
@@ -167,9 +172,7 @@ pub fn eval(arguments: &EvalArguments) -> Result<()> {
     }
     let mut one = metrics.clone();
     one.method.push_str(if baked { "-baked" } else { "" });
-    let Splits { novel_view, train_view } = &metrics.splits;
-    let novel = novel_view.as_ref().map(|split| (evaluation_title(split), split));
-    for (name, split) in novel.into_iter().chain(train_view.as_ref().map(|split| (TRAINING_VIEWS, split))) {
+    for (name, split) in metrics.splits.titled() {
         one.splits = Splits { novel_view: Some(split.clone()), train_view: None };
         say!("{name}:\n{}", table::markdown(&[(one.method.clone(), &one)]));
     }
@@ -238,11 +241,7 @@ impl Drawn<'_> {
         lpips: Option<&Lpips>,
         seen: impl FnMut(&PreparedFrame, &Rendering),
     ) -> Result<SplitMetrics> {
-        let frames: Vec<&PreparedFrame> = match split {
-            Split::NovelView => scene.eval.iter().collect(),
-            Split::TrainView => scored_train_frames(scene).collect(),
-        };
-        Ok(evaluate(scene, self.renderer(scene)?.as_mut(), &frames, lpips, seen)?)
+        Ok(evaluate(scene, self.renderer(scene)?.as_mut(), &split.frames(scene), lpips, seen)?)
     }
 
     fn score_with_bar(
@@ -252,11 +251,7 @@ impl Drawn<'_> {
         lpips: Option<&Lpips>,
         mut seen: impl FnMut(&PreparedFrame, &Rendering),
     ) -> Result<SplitMetrics> {
-        let frames = match split {
-            Split::NovelView => scene.eval.len(),
-            Split::TrainView => scored_train_frames(scene).count(),
-        };
-        let bar = ProgressBar::new(frames as u64).with_message("scoring");
+        let bar = ProgressBar::new(split.frames(scene).len() as u64).with_message("scoring");
         let metrics = self.score(scene, split, lpips, |frame, rendering| {
             bar.inc(1);
             seen(frame, rendering);

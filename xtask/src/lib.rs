@@ -8,7 +8,6 @@ mod check;
 mod commands;
 pub mod eval;
 mod export;
-mod html;
 mod import;
 pub mod list;
 pub mod network;

@@ -254,41 +254,29 @@ mod tests {
 
     #[test]
     fn a_log_cut_off_or_damaged_anywhere_gives_its_whole_lines() {
-        let folder = std::env::temp_dir().join(format!("xtask-log-{}", std::process::id()));
-        std::fs::create_dir_all(&folder).unwrap();
-        let path = folder.join(LOG);
+        let folder = testkit::files::Directory::new("log");
+        let path = folder.file(LOG);
+        let earlier = |bytes: &[u8]| {
+            std::fs::write(&path, bytes).unwrap();
+            earlier_log(&path, 30).unwrap()
+        };
         let line = |step: u64| format!("{{\"step\":{step},\"seconds\":{}.5,\"loss\":null}}\n", step);
         let text: String = (1..=4).map(|i| line(10 * i)).collect();
         for length in 0..=text.len() {
-            std::fs::write(&path, &text[..length]).unwrap();
-            let log = earlier_log(&path, 30).unwrap();
+            let log = earlier(&text.as_bytes()[..length]);
             let whole = text[..length].matches('\n').count().min(3) as u64;
             // A last line may be whole without its end.
             let least = 10.0 * whole as f64 + if whole > 0 { 0.5 } else { 0.0 };
             assert!(log.seconds == least || log.seconds == least + 10.0 || whole == 0, "{length}: {}", log.seconds);
             assert!(log.text.lines().count() as u64 - whole <= 1);
         }
-        for hostile in [
-            &b"\xff\xfe{\"step\":1,\"seconds\":1e308}\n"[..],
-            b"{\"step\":18446744073709551616,\"seconds\":[[[[[]]]]]}\n",
-            b"[1]\nnull\n\"x\"\n{\"step\":-1}\n{}\n",
-            &[b'['; 100_000],
-        ] {
-            std::fs::write(&path, hostile).unwrap();
-            assert!(earlier_log(&path, 30).unwrap().text.lines().count() <= 1);
+        let deep = [b'['; 100_000];
+        for hostile in [&b"\xff\xfe{\"step\":1,\"seconds\":1e308}\n[1]\nnull\n{\"step\":-1}\n{}\n"[..], &deep] {
+            assert!(earlier(hostile).text.lines().count() <= 1);
         }
-        // Any byte may be corrupt; only whole lines remain.
-        for n in 0..2000usize {
-            let mut bytes = text.clone().into_bytes();
-            for i in 0..=n % 3 {
-                let at = (n * 7919 + i * 104_729) % bytes.len();
-                bytes[at] = (n * 31 + i * 17) as u8;
-            }
-            std::fs::write(&path, bytes).unwrap();
-            let log = earlier_log(&path, 30).unwrap();
-            let whole = log.text.lines().filter(|line| serde_json::from_str::<serde_json::Value>(line).is_ok());
-            assert_eq!(whole.count(), log.text.lines().count());
+        for bytes in testkit::files::damaged(text.as_bytes(), 2000) {
+            let is_whole = |line: &str| serde_json::from_str::<serde_json::Value>(line).is_ok();
+            assert!(earlier(&bytes).text.lines().all(is_whole));
         }
-        std::fs::remove_dir_all(&folder).unwrap();
     }
 }

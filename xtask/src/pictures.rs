@@ -1,15 +1,13 @@
 //! Contact sheets.
 
-use std::fs::File;
-use std::io::BufWriter;
 use std::path::Path;
 
 use ab_glyph::{Font, FontRef, Glyph, ScaleFont, point};
-use anyhow::{Context, Result};
-use image::{ImageError, ImageFormat, ImageResult, Rgb, RgbImage, imageops};
+use anyhow::Result;
+use image::{ImageFormat, Rgb, RgbImage, imageops};
 use occnerf::capture::Image;
 
-use crate::process::unwritten;
+use crate::run::{replace, unquoted};
 
 /// Most pixels of a sheet: 96 MiB in memory, below the limits of image readers.
 pub const MAX_SHEET_PIXELS: u64 = 1 << 25;
@@ -115,24 +113,7 @@ pub fn cells(sheet: &RgbImage) -> Vec<Vec<RgbImage>> {
 
 /// Writes a PNG.
 pub fn save(picture: &RgbImage, path: &Path) -> Result<()> {
-    replace(path, |to| picture.write_to(to, ImageFormat::Png))
-}
-
-/// Replaces a file atomically by the output of `encode`.
-fn replace(path: &Path, encode: impl FnOnce(&mut BufWriter<File>) -> ImageResult<()>) -> Result<()> {
-    let mut failed = None;
-    let written = occnerf::replace_file(path, |to| match encode(to) {
-        Err(ImageError::IoError(error)) => Err(error),
-        Err(error) => {
-            failed = Some(error);
-            Err(std::io::Error::other("not encoded"))
-        }
-        Ok(()) => Ok(()),
-    });
-    match failed {
-        Some(error) => Err(error).with_context(|| path.display().to_string()),
-        None => written.map_err(unwritten(path)),
-    }
+    replace(path, |to| picture.write_to(to, ImageFormat::Png).map_err(unquoted))
 }
 
 #[cfg(test)]

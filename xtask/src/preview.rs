@@ -50,8 +50,7 @@ mod tests {
 
     #[test]
     fn a_picture_is_drawn_when_it_is_due_and_then_not_for_a_while() {
-        let folder = std::env::temp_dir().join(format!("preview-{}", std::process::id()));
-        std::fs::create_dir_all(&folder).unwrap();
+        let folder = testkit::files::Directory::new("preview");
         let body = smpl::BodyModel::embedded();
         let capture =
             demo(&DemoConfig { size: 24, frames: 3, eval_cameras: 1, ..DemoConfig::default() }, &body).unwrap();
@@ -59,7 +58,7 @@ mod tests {
         config.registration.rounds = 0;
         let scene = Scene::new(&capture, &body, &config).unwrap();
         let trainer = Trainer::new(&scene, config).unwrap();
-        let mut preview = Preview::new(&folder);
+        let mut preview = Preview::new(folder.path());
         preview.draw(trainer.model()).unwrap();
         assert!(!preview.path.exists(), "not due yet");
         preview.due = Instant::now();
@@ -71,6 +70,5 @@ mod tests {
         std::fs::remove_file(&preview.path).unwrap();
         preview.draw(trainer.model()).unwrap();
         assert!(!preview.path.exists(), "drawn twice");
-        std::fs::remove_dir_all(&folder).unwrap();
     }
 }

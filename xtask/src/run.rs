@@ -1,6 +1,7 @@
 //! The run directory: configuration, log, checkpoint, metrics and pictures.
 
-use std::io::{ErrorKind, Write};
+use std::fs::File;
+use std::io::{BufWriter, ErrorKind, Write};
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, anyhow, bail, ensure};
@@ -104,7 +105,7 @@ fn is_default(options: &LoadOptions) -> bool {
 }
 
 /// Contents of metrics.json.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Metrics {
     /// Identity of what was scored ([`identity`]).
     #[serde(default)]
@@ -138,13 +139,10 @@ pub struct Metrics {
 }
 
 /// Title of evaluation views.
-pub fn evaluation_title(split: &SplitMetrics) -> &'static str {
+fn evaluation_title(split: &SplitMetrics) -> &'static str {
     let held_out = !split.frames.is_empty() && split.frames.iter().all(|frame| frame.camera == occnerf::HELD_OUT);
     if held_out { "held-out frames, over known pixels" } else { "novel views" }
 }
-
-/// Title of training frames.
-pub const TRAINING_VIEWS: &str = "training views, over visible pixels";
 
 /// Metrics of each split.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -158,10 +156,15 @@ pub struct Splits {
 }
 
 impl Splits {
+    /// Title and metrics of each split.
+    pub fn titled(&self) -> impl Iterator<Item = (&'static str, &SplitMetrics)> {
+        let novel = self.novel_view.iter().map(|split| (evaluation_title(split), split));
+        novel.chain(self.train_view.iter().map(|split| ("training views, over visible pixels", split)))
+    }
+
     /// Title and metrics of the main split: novel views if there are any.
     pub fn first(&self) -> Option<(&'static str, &SplitMetrics)> {
-        let novel = self.novel_view.as_ref().map(|split| (evaluation_title(split), split));
-        novel.or(self.train_view.as_ref().map(|split| (TRAINING_VIEWS, split)))
+        self.titled().next()
     }
 
     /// Title of [`Splits::first`].
@@ -319,7 +322,36 @@ pub fn make_directory(path: &Path) -> Result<()> {
 /// [`Ending::Unwritten`](crate::process::Ending::Unwritten).
 pub fn write(path: &Path, text: &str) -> Result<()> {
     path.parent().map_or(Ok(()), still_held)?;
-    replace_file(path, |to| to.write_all(text.as_bytes())).map_err(unwritten(path))
+    replace(path, |to| Ok(to.write_all(text.as_bytes())?))
+}
+
+/// Replaces a file atomically by what `encode` writes.
+///
+/// # Errors
+/// [`Ending::Unwritten`](crate::process::Ending::Unwritten), and other faults of `encode`.
+pub fn replace(path: &Path, encode: impl FnOnce(&mut BufWriter<File>) -> Result<()>) -> Result<()> {
+    let mut failed = None;
+    let written = replace_file(path, |to| {
+        encode(to).map_err(|error| match error.downcast() {
+            Ok(system) => system,
+            Err(other) => {
+                failed = Some(other);
+                std::io::Error::other("not encoded")
+            }
+        })
+    });
+    match failed {
+        Some(error) => Err(error),
+        None => written.map_err(unwritten(path)),
+    }
+}
+
+/// An error of the image encoders, those of the system as they are.
+pub fn unquoted(error: image::ImageError) -> anyhow::Error {
+    match error {
+        image::ImageError::IoError(error) => error.into(),
+        error => error.into(),
+    }
 }
 
 /// Removes a file if there is one.

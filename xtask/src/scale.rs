@@ -106,11 +106,20 @@ mod tests {
     #[test]
     fn losses_of_a_training_that_blew_up_are_drawn_in_no_time() {
         let start = std::time::Instant::now();
-        for values in [&[1e308, 1e-300, 1.0][..], &[1e99, 1e-99], &[f64::MAX, f64::MIN], &[5e-324], &[1e100, -1e100]] {
+        let far: [&[f64]; 7] = [
+            &[1e308, 1e-300, 1.0],
+            &[1e99, 1e-99],
+            &[f64::MAX, f64::MIN],
+            &[5e-324],
+            &[1e100, -1e100],
+            &[],
+            &[f64::NAN, -1.0, 2.22e5],
+        ];
+        for values in far {
             for logarithmic in [false, true] {
                 let scale = Scale::around(values.iter().copied(), logarithmic);
                 let ticks = scale.ticks();
-                assert!(ticks.len() <= 20, "{values:?}: {ticks:?}");
+                assert!((1..=20).contains(&ticks.len()), "{values:?}: {ticks:?}");
                 let places = values.iter().filter(|v| scale.shows(**v)).map(|v| scale.share(*v));
                 places.for_each(|place| assert!((0.0..=1.0).contains(&place), "{values:?}: {place}"));
                 assert!(ticks.iter().all(|tick| number(*tick).len() < 20));
@@ -131,16 +140,6 @@ mod tests {
             let ticks = scale.ticks();
             prop_assert!((1..=20).contains(&ticks.len()), "{:?}: {:?}", scale, ticks);
             prop_assert!(ticks.iter().all(|t| (-1e-9..=1.0 + 1e-9).contains(&scale.share(*t))));
-        }
-    }
-
-    #[test]
-    fn nothing_and_one_value_have_an_axis_too() {
-        for logarithmic in [false, true] {
-            for values in [vec![], vec![5.0], vec![2.22e5], vec![f64::NAN, -1.0, 5.0]] {
-                let scale = Scale::around(values.into_iter(), logarithmic);
-                assert!(scale.share(5.0).is_finite() && (1..40).contains(&scale.ticks().len()), "{scale:?}");
-            }
         }
     }
 }

@@ -97,7 +97,7 @@ impl Source {
 }
 
 /// What a capture's files leave open.
-#[derive(Args, Clone, Debug, Serialize)]
+#[derive(Args, Clone, Debug, Default, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub struct LoadArguments {
     /// Longest side in pixels that pictures are reduced to [default: as they are]
@@ -123,17 +123,6 @@ pub struct LoadArguments {
 }
 
 impl LoadArguments {
-    /// A capture as it is.
-    pub fn none() -> Self {
-        /// The options alone.
-        #[derive(clap::Parser)]
-        struct Line {
-            #[command(flatten)]
-            load: LoadArguments,
-        }
-        <Line as clap::Parser>::parse_from([""]).load
-    }
-
     /// The same for the library.
     pub fn options(&self) -> Result<LoadOptions> {
         Ok(LoadOptions {
@@ -244,26 +233,17 @@ pub fn is_character(path: &Path) -> bool {
 
 #[cfg(test)]
 mod tests {
-    use clap::Parser;
-
     use super::*;
-
-    #[derive(Parser)]
-    struct Line {
-        #[command(flatten)]
-        load: LoadArguments,
-    }
 
     #[test]
     fn a_run_is_resumed_with_its_own_options_and_any_memory() {
-        let load = |words: &str| Line::parse_from(words.split_whitespace()).load;
-        let saved = load("x --resize 64 --memory 9").options().unwrap();
-        for (words, mebibytes) in
-            [("x", 9), ("x --resize 64", 9), ("x --memory 20", 20), ("x --memory 20 --resize 64", 20)]
-        {
-            let resumed = load(words).resumed(&saved).unwrap();
-            assert_eq!((resumed.max_bytes, &resumed), (mebibytes << 20, &saved));
+        let load = |resize, memory| LoadArguments { resize, memory, ..LoadArguments::default() };
+        let saved = load(Some(64), Some(9)).options().unwrap();
+        for (resize, memory) in [(None, None), (Some(64), None), (None, Some(20)), (Some(64), Some(20))] {
+            let resumed = load(resize, memory).resumed(&saved).unwrap();
+            assert_eq!((resumed.max_bytes, &resumed), (memory.unwrap_or(9) << 20, &saved));
         }
-        assert!(load("x --resize 65").resumed(&saved).is_err() && load("x --stride 2").resumed(&saved).is_err());
+        let stride = LoadArguments { stride: Some(2), ..LoadArguments::default() };
+        assert!(load(Some(65), None).resumed(&saved).is_err() && stride.resumed(&saved).is_err());
     }
 }

@@ -83,21 +83,8 @@ mod tests {
 
     fn metrics(known: Option<f64>, lpips: Option<&str>) -> Metrics {
         let split = SplitMetrics { psnr_mask: Some(20.0), psnr_all: Some(17.0), known, ..SplitMetrics::default() };
-        Metrics {
-            of: String::new(),
-            method: "surface".to_owned(),
-            preset: "fast".to_owned(),
-            occluded: "unknown".to_owned(),
-            scene: "demo".to_owned(),
-            seed: 1,
-            steps: 0,
-            train_seconds: 3.0,
-            peak_rss_bytes: 0,
-            parameters: 7,
-            perceptual: String::new(),
-            lpips: lpips.map(str::to_owned),
-            splits: Splits { novel_view: Some(split), train_view: None },
-        }
+        let splits = Splits { novel_view: Some(split), train_view: None };
+        Metrics { lpips: lpips.map(str::to_owned), splits, ..Metrics::default() }
     }
 
     /// The header's and the first row's cells.

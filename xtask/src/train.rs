@@ -222,10 +222,11 @@ pub fn run_one(
     still_held(directory)?;
     let kept = Person::save(directory, &scene.registered, &source.model, colors);
     kept.map_err(Error::from).map_err(results_in(directory))?;
+    let scored = |drawn: &Drawn<'_>, seconds: f64| {
+        score_run(directory, run, &scene, drawn, lpips, unscored(run, drawn, seconds)).map(Some)
+    };
     if run.train.method == Method::Prior {
-        let prior = Drawn::Prior(colors.clone());
-        let metrics = unscored(run, &prior, prior_seconds);
-        return score_run(directory, run, &scene, &prior, lpips, metrics).map(Some);
+        return scored(&Drawn::Prior(colors.clone()), prior_seconds);
     }
     if run.train.method == Method::Surface {
         let (avatar, report) = telling("fitting the surface", || fit(&scene))?;
@@ -233,8 +234,7 @@ pub fn run_one(
         still_held(directory)?;
         avatar.save(&baked::path(directory)).map_err(Error::from).map_err(results_in(directory))?;
         let drawn = Drawn::Avatar { body: &scene.body, light: colors.light, avatar: &avatar };
-        let metrics = unscored(run, &drawn, prior_seconds + report.seconds);
-        return score_run(directory, run, &scene, &drawn, lpips, metrics).map(Some);
+        return scored(&drawn, prior_seconds + report.seconds);
     }
     say_memory(&scene, &run.train)?;
     let mut trainer =
@@ -249,9 +249,7 @@ pub fn run_one(
     let seconds = seconds?;
     let perceptual = trainer.perceptual();
     let model = trainer.into_model();
-    let trained = Drawn::Field { model: &model, perceptual };
-    let metrics = unscored(run, &trained, seconds);
-    score_run(directory, run, &scene, &trained, lpips, metrics).map(Some)
+    scored(&Drawn::Field { model: &model, perceptual }, seconds)
 }
 
 /// Peak memory over that of the loaded capture: 5.2 and 4.9 on captures of 26 and 47 MiB.

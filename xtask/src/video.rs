@@ -9,7 +9,7 @@ use clap::ValueEnum;
 use image::codecs::gif::{GifEncoder, Repeat};
 use image::{Delay, Frame, RgbImage};
 
-use crate::process::unwritten;
+use crate::run::{replace, unquoted};
 
 /// Video format.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
@@ -45,20 +45,8 @@ pub fn film(
         FilmFormat::Mp4 => anyhow::bail!("--format mp4: this program was built without the feature mp4"),
     };
     let path = path.with_extension(extension);
-    let mut failed = None;
-    let written = occnerf::replace_file(&path, |to| {
-        encode(to, &mut pictures, fps).map_err(|error| match error.downcast() {
-            Ok(system) => system,
-            Err(other) => {
-                failed = Some(other);
-                std::io::Error::other("not encoded")
-            }
-        })
-    });
-    match failed {
-        Some(error) => Err(error),
-        None => written.map_err(unwritten(&path)).map(|()| Some(path)),
-    }
+    replace(&path, |to| encode(to, &mut pictures, fps))?;
+    Ok(Some(path))
 }
 
 /// An endless GIF.
@@ -71,14 +59,6 @@ fn gif(to: &mut BufWriter<File>, pictures: &mut dyn Iterator<Item = Result<RgbIm
         encoder.encode_frame(Frame::from_parts(rgba, 0, 0, delay)).map_err(unquoted)?;
     }
     Ok(())
-}
-
-/// Unwraps an I/O error.
-fn unquoted(error: image::ImageError) -> anyhow::Error {
-    match error {
-        image::ImageError::IoError(error) => error.into(),
-        error => error.into(),
-    }
 }
 
 #[cfg(feature = "mp4")]
@@ -181,10 +161,8 @@ mod tests {
     }
 
     fn write(format: FilmFormat, size: (u32, u32)) -> Result<Vec<u8>> {
-        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../target/films");
-        std::fs::create_dir_all(&folder)?;
-        let path =
-            film(pictures(size).into_iter().map(Ok), format, 15, &folder.join(format!("{}x{}", size.0, size.1)))?;
+        let folder = testkit::files::Directory::new("film");
+        let path = film(pictures(size).into_iter().map(Ok), format, 15, &folder.file("film"))?;
         Ok(path.map(std::fs::read).transpose()?.unwrap_or_default())
     }
 

@@ -1,4 +1,5 @@
-//! Encoding and gradients against references, in one binary because compiling the kernels dominates.
+//! Encoding and gradients against references, in one binary because compiling the kernels
+//! dominates.
 #![allow(clippy::unwrap_used, reason = "a failure here is a failed test")]
 
 mod common;

@@ -4,7 +4,6 @@
 //! task: a depth test of all its triangles, then the barycentrics of the visible faces.
 
 mod band;
-mod clip;
 mod project;
 mod rasterizer;
 mod triangle;

@@ -79,11 +79,7 @@ fn outside_the_image_behind_the_camera_and_behind_occluders_nothing_is_visible()
     view.world_to_camera = Affine3A::from_scale(Vec3::ZERO);
     assert_eq!(view.centre_of_projection(), None);
     assert_eq!(visible_vertices(&rays, &points, &view, None), [false; 5]);
-}
-
-#[test]
-fn image_borders_are_half_open() {
-    let rays = RayMesh::new(&[], &[]).unwrap();
+    // Borders are half open.
     let view = View { focal: Vec2::ONE, centre: Vec2::ZERO, world_to_camera: Affine3A::IDENTITY, width: 2, height: 3 };
     let at = |u: f32, v: f32| visible_vertices(&rays, &[Vec3::new(u, v, 1.0)], &view, None)[0];
     assert!(at(0.0, 0.0) && at(1.99, 2.99));

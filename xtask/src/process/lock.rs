@@ -111,13 +111,9 @@ fn identity(of: io::Result<std::fs::Metadata>) -> io::Result<()> {
 
 #[cfg(test)]
 mod tests {
-    use super::*;
+    use testkit::files::Directory;
 
-    fn folder(name: &str) -> PathBuf {
-        let folder = std::env::temp_dir().join(format!("xtask-{name}-{}", std::process::id()));
-        std::fs::create_dir_all(&folder).unwrap();
-        folder
-    }
+    use super::*;
 
     fn is_busy(lock: Result<Lock>) -> bool {
         matches!(lock.err().unwrap().downcast_ref(), Some(Ending::Busy(_)))
@@ -125,35 +121,35 @@ mod tests {
 
     #[test]
     fn readers_share_a_folder_and_a_writer_has_it_alone() {
-        let folder = folder("lock");
-        let lock = Lock::take(&folder).unwrap();
-        assert!(is_busy(Lock::take(&folder)) && is_busy(Lock::share(&folder)));
+        let folder = Directory::new("lock");
+        let folder = folder.path();
+        let lock = Lock::take(folder).unwrap();
+        assert!(is_busy(Lock::take(folder)) && is_busy(Lock::share(folder)));
         drop(lock);
-        let readers = [Lock::share(&folder).unwrap(), Lock::share(&folder).unwrap()];
-        assert!(is_busy(Lock::take(&folder)));
+        let readers = [Lock::share(folder).unwrap(), Lock::share(folder).unwrap()];
+        assert!(is_busy(Lock::take(folder)));
         drop(readers);
-        drop(Lock::take(&folder).unwrap());
+        drop(Lock::take(folder).unwrap());
         let gone = Lock::take(&folder.join("gone")).err().unwrap();
         assert!(matches!(gone.downcast_ref(), Some(Ending::Unwritten { .. })), "{gone}");
-        std::fs::remove_dir_all(&folder).unwrap();
     }
 
     #[cfg(unix)]
     #[test]
     fn a_folder_in_the_place_of_the_one_that_was_taken_is_not_written() {
-        let folder = folder("replaced");
-        let lock = Lock::take(&folder).unwrap();
-        still_held(&folder).unwrap();
-        std::fs::remove_dir_all(&folder).unwrap();
-        std::fs::create_dir(&folder).unwrap();
-        assert!(still_held(&folder).is_err());
+        let folder = Directory::new("replaced");
+        let folder = folder.path();
+        let lock = Lock::take(folder).unwrap();
+        still_held(folder).unwrap();
+        std::fs::remove_dir_all(folder).unwrap();
+        std::fs::create_dir(folder).unwrap();
+        assert!(still_held(folder).is_err());
         let other = File::create(folder.join(".lock")).unwrap();
         other.try_lock().unwrap();
-        let error = still_held(&folder).unwrap_err();
+        let error = still_held(folder).unwrap_err();
         assert!(error.to_string().contains("another folder has taken its place"), "{error}");
         let write = crate::run::write(&folder.join("metrics.json"), "{}");
         assert!(write.is_err() && !folder.join("metrics.json").exists());
         drop((lock, other));
-        std::fs::remove_dir_all(&folder).unwrap();
     }
 }

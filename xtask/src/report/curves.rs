@@ -5,7 +5,7 @@ use std::path::Path;
 
 use anyhow::{Result, bail};
 
-use crate::html::escape;
+use super::page::escape;
 use crate::run::read_text;
 use crate::scale::{Scale, number};
 
@@ -122,9 +122,8 @@ mod tests {
             let end = if old.ends_with(',') { "," } else { "" };
             numbers.map(|new| whole.replace(old, &format!(":{new}{end}")).into_bytes())
         });
-        let folder = std::env::temp_dir().join(format!("xtask-curves-{}", std::process::id()));
-        std::fs::create_dir_all(&folder).unwrap();
-        let path = folder.join("train.jsonl");
+        let folder = testkit::files::Directory::new("curves");
+        let path = folder.file("train.jsonl");
         let mut drawn = 0;
         for (case, bytes) in replaced.chain(testkit::files::damaged(whole.as_bytes(), 180)).enumerate() {
             std::fs::write(&path, &bytes).unwrap();
@@ -142,6 +141,5 @@ mod tests {
             assert!(quick, "input {case} took longer");
         }
         assert!(drawn > 20, "{drawn} drawn");
-        std::fs::remove_dir_all(&folder).unwrap();
     }
 }

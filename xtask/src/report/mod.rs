@@ -13,7 +13,7 @@ use array_files::read_bounded;
 
 pub use self::curves::Log;
 use self::curves::curves;
-pub use self::page::Page;
+pub use self::page::{Page, escape};
 use self::viewer::{Views, viewers};
 use crate::process::note;
 use crate::run::{self, AVATAR, CHECKPOINT, LOG, METRICS, Metrics, PERSON, RunConfig, Verdict};

@@ -6,8 +6,6 @@ use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use sha2::{Digest, Sha256};
 
-use crate::html::escape;
-
 const STYLE: &str = include_str!("page.css");
 const SCRIPT: &str = include_str!("page.js");
 
@@ -19,17 +17,28 @@ pub struct Page {
     sources: Vec<String>,
 }
 
+/// Escapes text for HTML.
+pub fn escape(text: &str) -> String {
+    let mut out = String::with_capacity(text.len());
+    for c in text.chars() {
+        match c {
+            '&' => out.push_str("&amp;"),
+            '<' => out.push_str("&lt;"),
+            '>' => out.push_str("&gt;"),
+            '"' => out.push_str("&quot;"),
+            '\'' => out.push_str("&#39;"),
+            c => out.push(c),
+        }
+    }
+    out
+}
+
 /// Percent-encodes a byte of a relative URL, colons included.
 fn address_byte(byte: u8) -> String {
     match byte {
         b'a'..=b'z' | b'A'..=b'Z' | b'0'..=b'9' | b'/' | b'.' | b'-' | b'_' => char::from(byte).to_string(),
         other => format!("%{other:02X}"),
     }
-}
-
-/// Data URI.
-pub fn data_uri(kind: &str, bytes: &[u8]) -> String {
-    format!("data:{kind};base64,{}", STANDARD.encode(bytes))
 }
 
 impl Page {
@@ -88,10 +97,10 @@ impl Page {
 
     /// A picture with its caption; `kind` is its media type.
     pub fn picture(&mut self, kind: &str, bytes: &[u8], caption: &str) {
-        let (caption, source) = (escape(caption), data_uri(kind, bytes));
+        let (caption, data) = (escape(caption), STANDARD.encode(bytes));
         let _ = writeln!(
             self.body,
-            "<figure><div class=wide><img alt=\"{caption}\" src=\"{source}\"></div><figcaption>{caption}</figcaption></figure>"
+            "<figure><div class=wide><img alt=\"{caption}\" src=\"data:{kind};base64,{data}\"></div><figcaption>{caption}</figcaption></figure>"
         );
     }
 

@@ -13,9 +13,8 @@ use serde_json::{Value, json};
 use volrender::Camera;
 
 use crate::avatar::{self, Sizes};
-use crate::html::escape;
 use crate::process::say;
-use crate::report;
+use crate::report::{self, escape};
 use crate::run::PERSON;
 
 const PAGE: &str = include_str!("page.html");

@@ -49,25 +49,9 @@ fn help_names_the_commands_and_every_option_of_train() {
     }
     assert!(general.contains("Exit codes:") && general.contains("a result cannot be written"), "{general}");
     let train = help(&["train", "--help"]);
-    let options = [
-        "--out",
-        "--preset",
-        "--method",
-        "--ablate",
-        "--occluded",
-        "--steps",
-        "--seed",
-        "--threads",
-        "--resume",
-        "--resize",
-        "--stride",
-        "--max-frames",
-        "--eval-stride",
-        "--camera",
-        "--lpips",
-        "--perceptual-weights",
-    ];
-    for option in options {
+    let options = "--out --preset --method --ablate --occluded --steps --seed --threads --resume --resize --stride \
+                   --max-frames --eval-stride --camera --lpips --perceptual-weights";
+    for option in options.split_whitespace() {
         assert!(train.contains(option), "{train}");
     }
 }

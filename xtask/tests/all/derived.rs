@@ -1,15 +1,13 @@
-//! What is made of a run is of that run: nothing stale passes for fresh, nothing finished is replaced
-//! unasked, and commands side by side come to what they come to one after the other.
+//! What is made of a run is of that run: nothing stale passes for fresh.
 
 use crate::common;
 
 use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
-use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant, SystemTime};
 
-use common::{QUICK, done, folder, refused, text, xtask};
+use common::{QUICK, bytes, done, folder, json, limited, refused, rewritten, stderr, text, xtask};
 use occnerf::capture::Layout;
 use serde_json::Value;
 
@@ -20,26 +18,6 @@ fn trained(folder: &Path, seed: &str) -> (PathBuf, PathBuf) {
     }
     done(&[&["train", text(&capture), "--out", text(&run), "--steps", "8", "--seed", seed][..], &QUICK].concat());
     (capture, run)
-}
-
-fn bytes(path: &Path) -> Vec<u8> {
-    std::fs::read(path).unwrap_or_else(|error| panic!("{}: {error}", path.display()))
-}
-
-fn json(path: &Path) -> Value {
-    serde_json::from_slice(&bytes(path)).unwrap()
-}
-
-fn stderr(output: &Output) -> String {
-    String::from_utf8_lossy(&output.stderr).into_owned()
-}
-
-/// The command with what the shell code before it sets.
-fn limited(limits: &str, arguments: &[&str]) -> Output {
-    let script = format!("{limits} exec \"$@\"");
-    let mut command = Command::new("sh");
-    command.args(["-c", &script, "sh", env!("CARGO_BIN_EXE_xtask")]).args(arguments);
-    command.env_remove("SMPL_MODEL").stdin(Stdio::null()).output().unwrap()
 }
 
 #[test]
@@ -83,33 +61,16 @@ fn an_avatar_of_an_earlier_training_is_baked_again_whatever_its_time() {
     std::fs::copy(other.join("checkpoint.safetensors"), run.join("checkpoint.safetensors")).unwrap();
     refused(&["eval", text(&run)], &["checkpoint.safetensors", "of another run"]);
     refused(&export, &["of another run"]);
-}
-
-#[test]
-fn a_list_does_not_replace_what_is_finished_with_other_settings_or_another_capture() {
-    let folder = folder("list-finished");
-    let capture = folder.join("a");
-    common::capture(&capture, Layout::Wild, 32, 3);
-    let (list, out) = (folder.join("l"), folder.join("lo"));
-    std::fs::write(&list, text(&capture)).unwrap();
-    let command = ["train", "--list", text(&list), "--out", text(&out), "--method", "hash-point"];
-    let with = |more: &[&'static str]| [&command[..], more].concat();
-    done(&with(&["--steps", "2"]));
-    let checkpoint = bytes(&out.join("a/checkpoint.safetensors"));
-    for more in [&["--steps", "3"][..], &["--steps", "2", "--seed", "2"], &["--steps", "2", "--set", "samples=8"]] {
-        let output = xtask(&with(more));
-        let said = String::from_utf8_lossy(&output.stdout).into_owned();
-        assert!(output.status.code() == Some(1) && said.contains("holds a run with other settings"), "{said}");
-        refused(&with(&[more, &["--merge"]].concat()), &["have no scores yet"]);
+    // One that is cut off, and none.
+    let whole = bytes(&other.join("checkpoint.safetensors"));
+    std::fs::write(run.join("checkpoint.safetensors"), &whole[..whole.len() / 2]).unwrap();
+    std::fs::remove_file(&avatar).unwrap();
+    for words in [&["checkpoint.safetensors", "not a whole"][..], &["checkpoint.safetensors"]] {
+        refused(&export, words);
+        refused(&["view", text(&run)], words);
+        refused(&["render", text(&run), "tpose", "--baked"], words);
+        let _ = std::fs::remove_file(run.join("checkpoint.safetensors"));
     }
-    assert!(bytes(&out.join("a/checkpoint.safetensors")) == checkpoint);
-    assert!(done(&with(&["--steps", "2"])).contains("a: finished earlier"));
-    // One picture is another.
-    std::fs::copy(capture.join("images/000001.png"), capture.join("images/000000.png")).unwrap();
-    let output = xtask(&with(&["--steps", "2"]));
-    let said = String::from_utf8_lossy(&output.stdout).into_owned();
-    assert!(output.status.code() == Some(1) && said.contains("the capture as it was then"), "{said}");
-    assert!(bytes(&out.join("a/checkpoint.safetensors")) == checkpoint);
 }
 
 #[test]
@@ -170,17 +131,14 @@ fn devices_and_pipes_are_read_up_to_a_bound_and_written_to_as_they_are() {
     refusal(&["train", text(&capture), "--lpips", text(&pipe)], "pipe.npz");
     let images = capture.join("images");
     refusal(&["import", "--frames", text(&images), "--fit", text(&pipe), "--out", "x"], "pipe.npz");
-    let export = ["export", text(&run), "--out", text(&glb), "--motion", text(&pipe)];
-    for waits in [&["train", "--list", text(&pipe), "--out", text(&folder.join("l"))][..], &export] {
-        let mut command = Command::new(env!("CARGO_BIN_EXE_xtask"));
-        command.args(waits).env_remove("SMPL_MODEL").stdout(Stdio::null()).stderr(Stdio::piped());
-        let mut child = command.spawn().unwrap();
-        let lines = BufReader::new(child.stderr.take().unwrap()).lines().map(Result::unwrap);
-        let first = lines.into_iter().find(|line| line.contains("reading")).unwrap_or_default();
-        assert!(first.contains("pipe.npz: 2 s"), "{first}");
-        std::fs::write(&pipe, "no-such-capture").unwrap();
-        assert_eq!(child.wait().unwrap().code(), Some(1));
-    }
+    let mut command = Command::new(env!("CARGO_BIN_EXE_xtask"));
+    command.args(["train", "--list", text(&pipe), "--out", text(&folder.join("l"))]).stdout(Stdio::null());
+    let mut child = command.stderr(Stdio::piped()).spawn().unwrap();
+    let lines = BufReader::new(child.stderr.take().unwrap()).lines().map(Result::unwrap);
+    let first = lines.into_iter().find(|line| line.contains("reading")).unwrap_or_default();
+    assert!(first.contains("pipe.npz: 2 s"), "{first}");
+    std::fs::write(&pipe, "no-such-capture").unwrap();
+    assert_eq!(child.wait().unwrap().code(), Some(1));
     // In a run without a writer.
     let metrics = run.join("train.jsonl");
     std::fs::remove_file(&metrics).unwrap();
@@ -218,10 +176,7 @@ fn nothing_is_learnt_of_a_person_who_is_not_where_the_masks_are() {
     for (name, edit) in edits {
         let capture = folder.join(name);
         common::capture(&capture, Layout::Wild, 64, 4);
-        let path = capture.join("metadata.json");
-        let mut metadata = json(&path);
-        metadata.as_object_mut().unwrap().values_mut().for_each(edit);
-        std::fs::write(&path, metadata.to_string()).unwrap();
+        rewritten(&capture, edit);
         let run = folder.join(format!("{name}-run"));
         let output = xtask(&["train", text(&capture), "--out", text(&run), "--method", "surface"]);
         let said = stderr(&output);
@@ -238,12 +193,13 @@ fn a_camera_inside_the_body_is_drawn_in_seconds() {
     let folder = folder("inside");
     let capture = folder.join("capture");
     common::capture(&capture, Layout::Wild, 64, 4);
-    let path = capture.join("metadata.json");
-    let mut metadata = json(&path);
     // The body of this layout stands about the origin.
-    let first = metadata.as_object_mut().unwrap().values_mut().next().unwrap();
-    (0..3).for_each(|row| first["cam_extrinsics"][row][3] = 0.into());
-    std::fs::write(&path, metadata.to_string()).unwrap();
+    let mut is_first = true;
+    rewritten(&capture, |frame| {
+        if std::mem::take(&mut is_first) {
+            (0..3).for_each(|row| frame["cam_extrinsics"][row][3] = 0.into());
+        }
+    });
     let begun = Instant::now();
     done(&["train", text(&capture), "--out", text(&folder.join("run")), "--method", "surface"]);
     assert!(begun.elapsed() < Duration::from_secs(60), "{:?}", begun.elapsed());
@@ -294,74 +250,4 @@ fn a_signal_before_the_first_step_says_that_nothing_was_made() {
     let output = child.wait_with_output().unwrap();
     let said = stderr(&output);
     assert!(output.status.code() == Some(143) && said.contains("had not been made"), "{said}");
-}
-
-/// Twenty seconds; `STORM=120 cargo test -p xtask storm` for two minutes.
-#[test]
-fn after_a_storm_of_commands_on_one_run_everything_is_as_one_alone_would_make_it() {
-    let length = std::env::var("STORM").ok().map_or(20, |seconds| seconds.parse().expect("STORM is a number"));
-    let folder = folder("storm");
-    let (_, run) = trained(&folder, "1");
-    let (glb, renders) = (folder.join("person.glb"), folder.join("drawn"));
-    let (steps, ends) = (AtomicUsize::new(8), AtomicUsize::new(0));
-    let storm = |n: usize| {
-        let begun = Instant::now();
-        let mut turn = n;
-        while begun.elapsed() < Duration::from_secs(length) {
-            let more = (steps.fetch_add(1, Ordering::SeqCst) + 1).to_string();
-            let train = ["train", "--resume", "--out", text(&run), "--checkpoint-every", "0", "--steps", &more];
-            let each: [&[&str]; 6] = [
-                &train,
-                &["export", text(&run), "--out", text(&glb)],
-                &["view", text(&run)],
-                &["render", text(&run), "tpose", "--baked", "--size", "8x8", "--out", text(&renders)],
-                &["eval", text(&run)],
-                &["eval", text(&run), "--baked"],
-            ];
-            let arguments = each[turn % each.len()];
-            turn += 1;
-            // A training needs the run alone.
-            let patience = if turn % each.len() == 1 { 100 } else { 1 };
-            let mut tries = (0..patience).map(|_| xtask(arguments));
-            let is_busy = |output: &Output| output.status.code() == Some(4);
-            let Some(output) = tries.find(|output| !is_busy(output)) else { continue };
-            std::thread::sleep(Duration::from_millis(100));
-            // The steps may be fewer than another training has taken.
-            let expected = [Some(0), Some(1)];
-            let said = stderr(&output);
-            assert!(expected.contains(&output.status.code()), "{arguments:?}: {:?} {said}", output.status);
-            assert!(output.status.code() != Some(1) || said.contains("steps"), "{arguments:?}: {said}");
-            ends.fetch_add(usize::from(output.status.success()), Ordering::SeqCst);
-        }
-    };
-    std::thread::scope(|scope| (0..3).for_each(|n| drop(scope.spawn(move || storm(2 * n)))));
-    println!("{} commands came to their ends in {length} s", ends.load(Ordering::SeqCst));
-    for arguments in [&["export", text(&run), "--out", text(&glb)][..], &["eval", text(&run)], &["view", text(&run)]] {
-        done(arguments);
-    }
-    let alone = folder.join("alone");
-    std::fs::create_dir(&alone).unwrap();
-    for name in ["config.toml", "checkpoint.safetensors", "body.safetensors", "person.safetensors", "train.jsonl"] {
-        std::fs::copy(run.join(name), alone.join(name)).unwrap();
-    }
-    let fresh = folder.join("fresh.glb");
-    for arguments in
-        [&["export", text(&alone), "--out", text(&fresh)][..], &["eval", text(&alone)], &["view", text(&alone)]]
-    {
-        done(arguments);
-    }
-    assert!(bytes(&glb) == bytes(&fresh));
-    let [ours, theirs] = [&run, &alone].map(|run| json(&run.join("metrics.json")));
-    // Seconds are of the machine: a report of the same scores is the same.
-    std::fs::copy(run.join("metrics.json"), alone.join("metrics.json")).unwrap();
-    std::fs::write(alone.join("report.html"), "stale").unwrap();
-    done(&["view", text(&alone)]);
-    for name in ["avatar.safetensors", "person.html", "report.html"] {
-        assert!(bytes(&run.join(name)) == bytes(&alone.join(name)), "{name}");
-    }
-    let scores = |metrics: &Value| ["novel_view", "train_view"].map(|split| metrics["splits"][split]["frames"].clone());
-    assert!(ours["of"] == theirs["of"] && scores(&ours) == scores(&theirs), "{ours}\n{theirs}");
-    assert!(ours["steps"].as_u64().unwrap() > 8, "no training got through: {ours}");
-    let left: Vec<_> = std::fs::read_dir(&run).unwrap().map(|entry| entry.unwrap().file_name()).collect();
-    assert!(left.iter().all(|name| !name.to_string_lossy().contains("unfinished")), "{left:?}");
 }
